@@ -1,0 +1,8 @@
+#!/usr/bin/env bash
+# One trained policy on S3, then the same policy on S1 and S2, then the report.
+set -euo pipefail
+python -m sfkd_jax.train +experiment=s3 "$@"
+for scenario in s1 s2; do
+  python -m sfkd_jax.evaluate +experiment=s3 scenario="$scenario" "$@"
+done
+python -m sfkd_jax.report +experiment=s3 "$@"

@@ -1,0 +1,20 @@
+"""Learned dynamics with a stability certificate, driving sampling-based control, in JAX."""
+
+from importlib import import_module
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from sfkd_jax.artefacts import ArtefactError as ArtefactError
+    from sfkd_jax.policy import Policy as Policy
+    from sfkd_jax.policy import load as load
+
+__version__ = "0.1.0"
+
+_LAZY = {"load": "policy", "Policy": "policy", "ArtefactError": "artefacts"}
+
+
+def __getattr__(name: str) -> Any:
+    """Load on first use what not every importer of a room wants to pay for."""
+    if name not in _LAZY:
+        raise AttributeError(f"module 'sfkd_jax' has no attribute {name!r}")
+    return getattr(import_module(f"sfkd_jax.{_LAZY[name]}"), name)

@@ -1,0 +1,113 @@
+"""What is in a file, apart from the file: trees and flat names, hashes, settings compared, versions."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import math
+import platform
+from collections.abc import Mapping, Sequence
+from importlib import import_module, metadata
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+
+def flatten(tree: Mapping[str, Any]) -> dict[str, np.ndarray]:
+    """The leaves of nested dicts under "a/b/c"; an empty inner dict is kept as "a/b/".
+
+    Raises:
+        ValueError: a key is not a string, is empty or holds "/"; a leaf is neither array nor number.
+    """
+    flat: dict[str, np.ndarray] = {}
+    for key, value in tree.items():
+        if not isinstance(key, str) or not key or "/" in key:
+            raise ValueError(f"cannot flatten the key {key!r}")
+        if isinstance(value, Mapping):
+            inner = flatten(value) or {"": np.zeros(0, np.float32)}
+            flat |= {f"{key}/{name}": leaf for name, leaf in inner.items()}
+        elif hasattr(value, "__array__") or isinstance(value, bool | int | float | complex):
+            flat[key] = np.asarray(value)
+        else:
+            raise ValueError(f"cannot flatten {key!r}: a {type(value).__name__} is neither dict nor array")
+    return flat
+
+
+def unflatten(flat: Mapping[str, Any]) -> dict[str, Any]:
+    """The nested dicts that `flatten` came from; leaves are passed on as they are.
+
+    Raises:
+        ValueError: one name stands for both a leaf and a dict.
+    """
+    tree: dict[str, Any] = {}
+    for name, leaf in flat.items():
+        *branches, last = name.split("/")
+        node = tree
+        for branch in branches:
+            node = node.setdefault(branch, {})
+            if not isinstance(node, dict):
+                raise ValueError(f"{name!r} lies below a leaf")
+        if last and node.setdefault(last, leaf) is not leaf:
+            raise ValueError(f"{name!r} is both a leaf and a dict")
+    return tree
+
+
+def sha256(data: Mapping[str, Any] | Sequence[Any]) -> str:
+    """Hash of the content, whatever its order and memory layout.
+
+    A flat dict of arrays counts by names, dtypes, shapes and values; anything else as the JSON that it would become.
+    """
+    if not (isinstance(data, Mapping) and data and all(_is_array(value) for value in data.values())):
+        return hashlib.sha256(json.dumps(plain(data), sort_keys=True).encode()).hexdigest()
+    digest = hashlib.sha256()
+    for name in sorted(data):
+        array = np.asarray(data[name])
+        digest.update(json.dumps([name, array.dtype.str, array.shape]).encode())
+        digest.update(array.tobytes())
+    return digest.hexdigest()
+
+
+def differences(made: Mapping[str, Any], asked: Mapping[str, Any]) -> list[str]:
+    """Where settings differ, by dotted key: "training.steps was 4000, asked 100" (1 and 1.0 are the same)."""
+    found = []
+    for key in dict.fromkeys([*made, *asked]):
+        a, b = made.get(key, ...), asked.get(key, ...)
+        if isinstance(a, Mapping) and isinstance(b, Mapping):
+            found += [f"{key}.{line}" for line in differences(a, b)]
+        elif isinstance(a, bool) != isinstance(b, bool) or plain(a) != plain(b):
+            found.append(f"{key} was {_shown(a)}, asked {_shown(b)}")
+    return found
+
+
+def versions() -> dict[str, str]:
+    """Versions of Python and of the packages that decide numbers."""
+    found = {"python": platform.python_version()}
+    for name in ("numpy", "jax", "sfkd_jax"):
+        try:
+            found[name] = metadata.version(name)
+        except metadata.PackageNotFoundError:
+            found[name] = import_module(name).__version__
+    return found
+
+
+def plain(value: Any) -> Any:
+    """`value` in the types of JSON where it has them: arrays become lists, NaN and infinities None."""
+    if hasattr(value, "__array__"):
+        value = np.asarray(value).tolist()
+    if isinstance(value, Mapping):
+        return {str(key): plain(item) for key, item in value.items()}
+    if isinstance(value, Sequence) and not isinstance(value, str | bytes):
+        return [plain(item) for item in value]
+    if isinstance(value, float) and not math.isfinite(value):
+        return None
+    return str(value) if isinstance(value, Path) else value
+
+
+def _is_array(value: Any) -> bool:
+    return hasattr(value, "__array__") and not isinstance(value, np.generic)
+
+
+def _shown(value: Any) -> str:
+    text = "absent" if value is ... else str(plain(value))
+    return text if len(text) <= 60 else f"{text[:57]}..."

@@ -1,0 +1,125 @@
+"""How bytes reach the disk and come back: whole or not at all, and every failure as one line."""
+
+from __future__ import annotations
+
+import fcntl
+import glob
+import json
+import os
+import secrets
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager, suppress
+from pathlib import Path
+from typing import Any, BinaryIO
+
+from sfkd_jax.artefacts._content import plain
+
+
+class ArtefactError(Exception):
+    """A file that cannot be read or written: its name and the reason, in one line."""
+
+
+def write_json(path: Path, document: Mapping[str, Any]) -> None:
+    """Replace `path` in one step; arrays become lists, NaN and infinities null.
+
+    Raises:
+        ArtefactError: the disk is full or not writable (an earlier file stays as it was), or a value is not JSON.
+    """
+    write_bytes(path, encode(path, document, indent=2))
+
+
+def read_json(path: Path, *, keys: Sequence[str] = ()) -> dict[str, Any]:
+    """The object in `path`.
+
+    Raises:
+        ArtefactError: the file is missing, truncated, not JSON, not an object, or lacks one of `keys`.
+    """
+    document = decode(path, read_bytes(path))
+    if absent := [key for key in keys if key not in document]:
+        raise failure(path, f"lacks {', '.join(absent)}")
+    return document
+
+
+def failure(path: Path, reason: object) -> ArtefactError:
+    """The error to raise about `path`; `reason` may be an exception of any length."""
+    text = reason.strerror or reason if isinstance(reason, OSError) else reason
+    return ArtefactError(f"{path}: {' '.join(str(text).split())}")
+
+
+def encode(path: Path, document: Mapping[str, Any], *, indent: int | None = None) -> bytes:
+    """JSON text of `document`, or an ArtefactError about `path`."""
+    try:
+        return json.dumps(plain(document), indent=indent, allow_nan=False).encode()
+    except (TypeError, ValueError, RecursionError) as error:
+        raise failure(path, f"not written, {error}") from error
+
+
+def decode(path: Path, text: bytes, *, where: str = "") -> dict[str, Any]:
+    """The JSON object in `text`, or an ArtefactError about `path`."""
+    try:
+        document = json.loads(text)
+    except (ValueError, RecursionError) as error:
+        raise failure(path, f"{where}truncated or not JSON ({error})") from error
+    if not isinstance(document, dict):
+        raise failure(path, f"{where}not a JSON object")
+    return document
+
+
+def read_bytes(path: Path) -> bytes:
+    """All of `path`, or an ArtefactError."""
+    try:
+        return path.read_bytes()
+    except FileNotFoundError:
+        raise failure(path, "missing") from None
+    except OSError as error:
+        raise failure(path, error) from error
+
+
+def write_bytes(path: Path, content: bytes) -> None:
+    """Replace `path` in one step, or leave it as it was and raise an ArtefactError."""
+    with replacement(path) as (file, part):
+        file.write(content)
+        synchronise(file)
+        os.replace(part, path)
+
+
+def synchronise(file: BinaryIO) -> None:
+    """Wait until what was written to `file` is on the disk."""
+    file.flush()
+    os.fsync(file.fileno())
+
+
+@contextmanager
+def replacement(path: Path) -> Iterator[tuple[BinaryIO, Path]]:
+    """A hidden file to fill and to move over `path`; it is removed if it was not moved.
+
+    A killed writer cannot remove its own: the next one does, and knows it by the lock that died with its owner.
+    """
+    part = path
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        for left in path.parent.glob(f".{glob.escape(path.name)}.*.part"):
+            with suppress(OSError), left.open("r+b") as file:
+                fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+                left.unlink()
+        file, part = _claim(path)
+        with file:
+            yield file, part
+    except OSError as error:
+        raise failure(path, error) from error
+    finally:
+        if part != path:
+            with suppress(OSError):
+                part.unlink(missing_ok=True)
+
+
+def _claim(path: Path) -> tuple[BinaryIO, Path]:
+    """A new hidden file beside `path`, locked where the file system has locks."""
+    while True:
+        part = path.with_name(f".{path.name}.{secrets.token_hex(4)}.part")
+        file = part.open("xb")
+        with suppress(OSError):
+            fcntl.flock(file, fcntl.LOCK_EX)
+        if part.exists():  # else another writer took it for left over before it was locked
+            return file, part
+        file.close()

@@ -1,0 +1,120 @@
+"""From plain settings (nested dicts) to vehicles, models, controllers and scenarios; knows no file and no Hydra."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from functools import partial
+from typing import Any, NamedTuple
+
+import jax.numpy as jnp
+
+from sfkd_jax import control, datasets, models, scenarios, vehicle
+from sfkd_jax.types import Control, Controller, Environment, Model, Reference, Space, State
+
+Settings = Mapping[str, Any]
+
+PLANTS = {"kinematic": vehicle.kinematic, "dynamic": vehicle.dynamic}
+INNER_LOOPS = ("none", "speed")
+SAMPLINGS = ("feedback", "plain")
+
+
+class System(NamedTuple):
+    """A row of a table: a model with its parameters, and what it is told about the environment."""
+
+    model: Model
+    params: Any
+    env: str
+
+
+def choose(table: Mapping[str, Any], name: str, what: str) -> Any:
+    """`table[name]`, or an error that lists the choices."""
+    if name not in table:
+        raise ValueError(f"unknown {what} {name!r}; choose one of {', '.join(sorted(table))}")
+    return table[name]
+
+
+def _without(settings: Settings, *names: str) -> dict[str, Any]:
+    """Settings of a factory: the rest after the names that choose it."""
+    return {name: value for name, value in settings.items() if name not in names}
+
+
+def build_vehicle(settings: Settings) -> vehicle.Vehicle:
+    """A plant by name, wrapped in its inner loop."""
+    loop = settings["inner_loop"]
+    if loop not in INNER_LOOPS:
+        raise ValueError(f"unknown vehicle.inner_loop {loop!r}; choose one of {', '.join(INNER_LOOPS)}")
+    factory = choose(PLANTS, settings["name"], "vehicle")
+    plant = factory(**_without(settings, "name", "inner_loop", "speed_gain"))
+    return vehicle.with_speed_loop(plant, gain=settings["speed_gain"]) if loop == "speed" else plant
+
+
+def build_model(settings: Settings, space: Space) -> Model:
+    """A learned model by the name of its factory."""
+    factory = choose(models.FACTORIES, settings["name"], "model")
+    return factory(space, **_without(settings, "name", "system"))
+
+
+def space_to_settings(space: Space) -> dict[str, list[float]]:
+    """Scales as plain lists, to lie in a manifest."""
+    return {name: [float(entry) for entry in value] for name, value in space._asdict().items()}
+
+
+def space_from_settings(settings: Settings) -> Space:
+    """Scales from a manifest."""
+    return Space(**{name: jnp.asarray(settings[name], dtype=jnp.float32) for name in Space._fields})
+
+
+def build_controller(
+    settings: Settings, model: Model, plant: vehicle.Vehicle, *, env_low: Any = None, env_high: Any = None
+) -> Controller:
+    """MPPI around the path-following law, or around nothing (`sampling: plain`)."""
+    if settings["sampling"] not in SAMPLINGS:
+        raise ValueError(f"unknown controller.sampling; choose one of {', '.join(SAMPLINGS)}")
+    loop = plant.speed_loop
+    law = control.no_feedback(speed_loop=loop)
+    if settings["sampling"] == "feedback":
+        law = control.path_feedback(wheelbase=plant.wheelbase, speed_loop=loop, **settings["feedback"])
+    cost = control.tracking_cost(dt=plant.dt, speed_loop=loop, **settings["cost"])
+    return control.mppi(
+        model,
+        cost,
+        law,
+        control_low=plant.control_low,
+        control_high=plant.control_high,
+        env_low=None if env_low is None else tuple(map(float, env_low)),
+        env_high=None if env_high is None else tuple(map(float, env_high)),
+        **settings["mppi"],
+    )
+
+
+def build_scenario(settings: Settings, plant: vehicle.Vehicle, *, duration: float) -> scenarios.Family:
+    """The scenario family that a vehicle is to drive, episodes of `duration` [s]."""
+    return scenarios.scenario(**settings, duration=duration, state_size=len(plant.state_names), dt=plant.dt)
+
+
+def build_driver(plant: vehicle.Vehicle) -> datasets.Driver:
+    """The path-following law that keeps data collection on the road."""
+    law = control.path_feedback(wheelbase=plant.wheelbase, speed_loop=plant.speed_loop)
+
+    def driver(state: State, reference: Reference) -> Control:
+        curvature = control.reference_curvature(reference)[0]
+        return law(control.path_errors(state, reference[0], curvature), curvature, reference[0, 3])
+
+    return driver
+
+
+def reference_systems(plant: vehicle.Vehicle) -> dict[str, System]:
+    """Rows that need no learning: the nominal bicycle, the true plant, and the true plant wrong about e."""
+
+    def biased(entry: int, factor: float) -> Callable[[Environment], Environment]:
+        return lambda env: env.at[entry].multiply(factor)
+
+    oracle = partial(models.physics, plant.step)
+    rows = {
+        "nominal": System(models.physics(plant.nominal), {}, "none"),
+        "oracle": System(oracle(), {}, "measured"),
+    }
+    distortions = {"friction_x0.7": (0, 0.7), "friction_x1.3": (0, 1.3), "wind_x0": (1, 0.0), "wind_x2": (1, 2.0)}
+    for name, change in distortions.items():
+        rows[f"oracle_{name}"] = System(oracle(distort=biased(*change)), {}, "measured")
+    return rows

@@ -1,0 +1,91 @@
+"""The trusted core: numpy float64, no solver, no search. What is proposed elsewhere counts only if it passes here."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from itertools import pairwise
+
+import numpy as np
+from jaxtyping import Float
+
+Matrix = Float[np.ndarray, "_ _"]
+UNIT = np.finfo(np.float64).eps / 2
+TINY = np.finfo(np.float64).tiny
+
+
+def is_positive_definite(matrix: Matrix, error: float = 0.0) -> bool:
+    """Whether every symmetric matrix within `error` (2-norm) of `matrix` is positive definite; rounding included.
+
+    A Cholesky factorisation of M − c I that runs to its end proves it, with c above the sum of `error` and of what
+    the factorisation itself can lose, γ_{n+1}/(1 − γ_{n+1}) tr M (Rump, BIT 46, 2006). False when in doubt.
+    """
+    n = matrix.shape[0]
+    if not np.all(np.isfinite(matrix)) or not np.array_equal(matrix, matrix.T) or np.any(np.diag(matrix) <= 0):
+        return False
+    gamma = (n + 2) * UNIT / (1 - (n + 2) * UNIT)
+    shift = 2 * gamma / (1 - gamma) * float(np.trace(matrix)) + error * (1 + 4 * UNIT) + n * n * TINY
+    try:
+        np.linalg.cholesky(matrix - shift * np.eye(n))
+    except np.linalg.LinAlgError:
+        return False
+    return True
+
+
+def product(left: Matrix, right: Matrix) -> tuple[Matrix, float]:
+    """A product and a bound on the 2-norm of its rounding error."""
+    error = (left.shape[1] + 2) * UNIT * float(np.linalg.norm(np.abs(left) @ np.abs(right)))
+    return left @ right, 2 * error
+
+
+def norm_upper(matrix: Matrix) -> float:
+    """A proven upper bound on ||M||_2, tight to about 1e-12; infinity if M is not finite."""
+    if not np.all(np.isfinite(matrix)):
+        return float("inf")
+    gram, error = product(matrix.T, matrix)
+    gram = 0.5 * (gram + gram.T)
+    guess = float(np.linalg.norm(matrix, 2)) + TINY
+    for slack in (1e-12, 1e-10, 1e-8, 1e-6, 1e-3, 1.0):
+        bound = guess * (1 + slack)
+        if is_positive_definite(bound**2 * (1 - 4 * UNIT) * np.eye(len(gram)) - gram, error):
+            return bound
+    return float(np.linalg.norm(matrix)) * (1 + 1e-9)
+
+
+def check_witness(weights: Sequence[Matrix], multipliers: Sequence[np.ndarray], bound: float) -> bool:
+    """Whether the multipliers prove |f(z) − f(z')| ≤ bound |z − z'| for f = W_L σ(… σ(W_1 z + b_1) …) + b_L.
+
+    For any biases and any σ applied entry by entry with slopes in [0, 1]: with Λ_k = diag λ_k ≥ 0 it suffices that
+
+        [ b² I    −W_1'Λ_1                           ]
+        [   ·      2Λ_1    −W_2'Λ_2                  ]  > 0     (LipSDP with diagonal multipliers)
+        [                     ⋱                      ]
+        [                          2Λ_{L-1} − W_L'W_L ]
+
+    Args:
+        weights: W_1 … W_L. multipliers: λ_1 … λ_{L-1}. bound: b.
+    """
+    values = [np.asarray(part, dtype=np.float64) for part in (*weights, *multipliers)]
+    if len(multipliers) != len(weights) - 1 or not all(np.all(np.isfinite(part)) for part in values):
+        return False
+    if not np.isfinite(bound) or any(np.any(np.asarray(part) <= 0) for part in multipliers):
+        return False
+    matrix, error = witness_matrix(weights, multipliers)
+    inputs = weights[0].shape[1]
+    matrix[:inputs, :inputs] = bound**2 * (1 - 4 * UNIT) * np.eye(inputs)
+    return is_positive_definite(matrix, error)
+
+
+def witness_matrix(weights: Sequence[Matrix], multipliers: Sequence[np.ndarray]) -> tuple[Matrix, float]:
+    """The matrix above with its first block zero, and a bound on its rounding error (2-norm)."""
+    edges = np.cumsum([0, *(weight.shape[1] for weight in weights)])
+    blocks = [slice(a, b) for a, b in pairwise(edges)]
+    matrix, error = np.zeros((edges[-1], edges[-1])), 0.0
+    for k, multiplier in enumerate(multipliers):
+        coupling = multiplier[:, None] * weights[k]
+        error += 4 * UNIT * float(np.linalg.norm(coupling))
+        matrix[blocks[k + 1], blocks[k]] = -coupling
+        matrix[blocks[k], blocks[k + 1]] = -coupling.T
+        matrix[blocks[k + 1], blocks[k + 1]] = np.diag(2 * multiplier)
+    last, rounding = product(weights[-1].T, weights[-1])
+    matrix[blocks[-1], blocks[-1]] -= 0.5 * (last + last.T)
+    return matrix, error + rounding + 4 * UNIT * float(np.linalg.norm(matrix))

@@ -1,0 +1,58 @@
+"""python -m sfkd_jax.certify: recompute what can be proved about the weights of a run. Exit 0, 2 refused, 3 stale."""
+
+from __future__ import annotations
+
+import time
+from typing import Any
+
+from sfkd_jax import artefacts, policy, shelf
+from sfkd_jax.certification import CertificationRefused, certify
+from sfkd_jax.config import Stale, door
+
+
+def renew(settings: dict[str, Any]) -> dict[str, Any]:
+    """Certify the policy of this run as it is now; a refusal is a document too."""
+    began = time.perf_counter()
+    place = shelf.run_directory(settings)
+    weights = artefacts.read_arrays(place / "policy.npz", kind=policy.KIND)[1]["sha256"]
+    trained = policy.load(place)
+    dataset, _ = shelf.read_dataset(settings)
+    options = {name: value for name, value in settings["certification"].items() if name != "renew"}
+    try:
+        document = certify(
+            trained.model,
+            trained.params,
+            validation=dataset.validation,
+            calibration=dataset.calibration,
+            held_out=dataset.test,
+            boxes=shelf.boxes(dataset),
+            **options,
+        )
+    except CertificationRefused as reason:
+        document = {"valid": False, "reason": str(reason)}
+    document |= {"weights_sha256": weights, "versions": artefacts.versions()}
+    document["seconds"] = time.perf_counter() - began
+    artefacts.write_json(place / "certificate.json", document)
+    verdict = f"alpha {document['alpha']:.6f}" if document["valid"] else f"refused: {document['reason']}"
+    shelf.say(f"certificate: {verdict}")
+    return document
+
+
+def run(settings: dict[str, Any]) -> dict[str, Any]:
+    """Certify, unless a certificate about other weights lies there (then `certification.renew=true`)."""
+    place = shelf.run_directory(settings)
+    path = place / "certificate.json"
+    if path.exists() and not settings["certification"]["renew"]:
+        about = artefacts.read_json(path, keys=("weights_sha256",))["weights_sha256"]
+        if about != artefacts.read_arrays(place / "policy.npz", kind=policy.KIND)[1]["sha256"]:
+            raise Stale(f"{path} is about other weights; certification.renew=true replaces it")
+    document = renew(settings)
+    if not document["valid"]:
+        raise CertificationRefused(document["reason"])
+    keys = ("valid", "alpha", "alpha_separate", "rho", "beta", "tightness", "seconds")
+    short = {"certificate": str(path), "reason": None, "d_bar": document["d_bar"]["value"]}
+    return short | {key: document[key] for key in keys}
+
+
+if __name__ == "__main__":
+    door(run)()

@@ -1,0 +1,162 @@
+"""The plan: schemas derived from factory signatures, composition, and what every door does around its work."""
+
+from __future__ import annotations
+
+import dataclasses
+import inspect
+import json
+import sys
+import types
+import typing
+from collections.abc import Callable
+from dataclasses import field, make_dataclass
+from pathlib import Path
+from typing import Any
+
+import hydra
+from hydra.core.config_store import ConfigStore
+from omegaconf import DictConfig, OmegaConf
+
+from sfkd_jax import assembly, control, datasets, models, scenarios, training
+from sfkd_jax.artefacts import ArtefactError
+from sfkd_jax.certification import CertificationRefused, certify
+
+_SYSTEMS = ("self", "nominal", "oracle")
+_SENSORS = (0.015, 0.015, 0.002, 0.03, 0.02, 0.002, 0.001)
+"""Standard deviations of p_x, p_y [m], yaw [rad], v, v_y [m/s], yaw rate [rad/s], steering [rad]: a satellite and
+inertial unit of survey grade."""
+REFUSED = 2
+STALE = 3
+
+
+class Stale(Exception):
+    """A certificate that speaks about other weights."""
+
+
+def conf_path() -> str:
+    """The folder of options: the repository's in a checkout, the package's in an installed wheel."""
+    here = Path(__file__).resolve().parent
+    checkout = here.parents[1]
+    inside = (checkout / "conf" / "config.yaml").exists() and (checkout / "pyproject.toml").exists()
+    return str(checkout / "conf" if inside else here / "conf")
+
+
+def schema(title: str, /, *factories: Callable[..., Any], skip: tuple[str, ...] = (), **extra: Any) -> type:
+    """A dataclass with the keyword-only settings of factories: their types and defaults live once, in Python.
+
+    Args:
+        title: of the dataclass. factories: whose settings. skip: settings that something else decides.
+        extra: further fields by default value, or by type if required.
+    """
+    fields: list[Any] = [_extra(key, value) for key, value in extra.items()]
+    for factory in factories:
+        hints = typing.get_type_hints(factory)
+        for parameter in inspect.signature(factory).parameters.values():
+            if parameter.kind is not parameter.KEYWORD_ONLY or parameter.name in skip:
+                continue
+            if parameter.default is parameter.empty:
+                fields.append((parameter.name, _plain(hints[parameter.name])))
+                continue
+            fields.append(_field(parameter.name, hints[parameter.name], parameter.default))
+    required_first = sorted(fields, key=lambda entry: len(entry) > 2)
+    return make_dataclass(title, required_first)
+
+
+def _extra(name: str, value: Any) -> tuple[Any, ...]:
+    """A field by its type (required) or by its default."""
+    if isinstance(value, type) or typing.get_origin(value):
+        return name, value
+    return _field(name, tuple[type(value[0]), ...] if isinstance(value, tuple) else type(value), value)
+
+
+def _field(name: str, hint: Any, default: Any) -> tuple[str, Any, Any]:
+    """A dataclass field with a default; sequences become lists, as YAML has them."""
+    if isinstance(default, tuple):
+        values = list(default)
+        return name, _plain(hint), field(default_factory=lambda: list(values))
+    return name, _plain(hint), field(default=default)
+
+
+def _plain(hint: Any) -> Any:
+    """Types as OmegaConf knows them: tuple[float, ...] becomes list[float]."""
+    if typing.get_origin(hint) is tuple:
+        return list[typing.get_args(hint)[0]]
+    if typing.get_origin(hint) is types.UnionType:
+        return typing.Any
+    return hint
+
+
+def register() -> None:
+    """Put every schema into Hydra's store."""
+    store = ConfigStore.instance()
+    loop = {"name": str, "inner_loop": "none", "speed_gain": 1.0}
+    for plant in assembly.PLANTS.values():
+        name = f"{plant.__name__}_schema"
+        store.store(group="vehicle", name=name, node=schema("VehicleConfig", plant, **loop))
+    fixed = ("state_size", "dt", "duration")
+    store.store(group="scenario", name="schema", node=schema("ScenarioConfig", scenarios.scenario, skip=fixed))
+    split = {"seed": 0, "shares": list[float], "env_low": list[float], "env_high": list[float]}
+    dataset = schema("DatasetConfig", datasets.generate, **split)
+    store.store(group="dataset", name="schema", node=dataset)
+    for name, factory in models.FACTORIES.items():
+        node = schema("ModelConfig", factory, name=str, system=str)
+        store.store(group="model", name=f"{name}_schema", node=node)
+    store.store(group="controller", name="mppi_schema", node=_controller_schema())
+    loss = schema("LossConfig", training.multi_step_loss)
+    node = make_dataclass(
+        "TrainingConfig", [("loss", loss, field(default_factory=loss)), *_fields(schema("Fit", training.fit))]
+    )
+    store.store(group="training", name="schema", node=node)
+    protocol = {"episodes": 8, "episode_s": 60.0, "seed": 2026, "systems": _SYSTEMS, "observation_noise": _SENSORS}
+    store.store(group="evaluation", name="schema", node=schema("EvaluationConfig", **protocol))
+    skipped = ("validation", "calibration", "held_out", "boxes")
+    node = schema("CertificationConfig", certify, skip=skipped, renew=False)
+    store.store(group="certification", name="schema", node=node)
+
+
+def _fields(node: type) -> list[Any]:
+    """The fields of a dataclass, to be part of another."""
+    return [(entry.name, entry.type, field(default=entry.default)) for entry in dataclasses.fields(node)]
+
+
+def _controller_schema() -> type:
+    """Settings of the planner, its cost and its law, less what the vehicle decides."""
+    fixed = ("dt", "wheelbase", "speed_loop", "control_low", "control_high", "env_low", "env_high")
+    parts = {
+        "mppi": schema("MppiConfig", control.mppi, skip=fixed),
+        "cost": schema("CostConfig", control.tracking_cost, skip=fixed),
+        "feedback": schema("FeedbackConfig", control.path_feedback, skip=fixed),
+    }
+    fields = [(name, part, field(default_factory=part)) for name, part in parts.items()]
+    return make_dataclass("ControllerConfig", [("name", str), ("sampling", str), *fields])
+
+
+def door(run: Callable[[dict[str, Any]], dict[str, Any]]) -> Callable[[], None]:
+    """Make `run(settings) -> document` a command: compose, work, print one JSON object as the last line of stdout.
+
+    What can be expected to go wrong becomes one line on stderr and an exit code: 1 failed, 2 refused, 3 stale.
+    """
+    register()
+
+    def main(config: DictConfig) -> None:
+        settings = OmegaConf.to_container(config, resolve=True)
+        try:
+            document = run(typing.cast(dict[str, Any], settings))
+        except KeyboardInterrupt:
+            _fail("interrupted; the same command continues", 130)
+        except CertificationRefused as reason:
+            _fail(f"refused: {reason}", REFUSED)
+        except Stale as reason:
+            _fail(f"stale: {reason}", STALE)
+        except (ArtefactError, ValueError, training.TrainingStopped, OSError) as reason:
+            _fail(str(reason).splitlines()[0] if str(reason) else type(reason).__name__, 1)
+        else:
+            print(json.dumps(document), flush=True)
+
+    return hydra.main(config_path=conf_path(), config_name="config", version_base="1.3")(main)
+
+
+def _fail(reason: str, code: int) -> typing.NoReturn:
+    """One line on stderr, then the exit code."""
+    print(f"sfkd_jax: {reason}", file=sys.stderr, flush=True)
+    sys.exit(code)

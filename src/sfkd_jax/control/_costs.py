@@ -1,0 +1,54 @@
+"""Stage costs of path tracking."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import NamedTuple, TypeAlias
+
+from sfkd_jax.control._path_frame import PathErrors
+from sfkd_jax.types import Control, Scalar
+
+
+class Stage(NamedTuple):
+    """What a stage cost sees: errors now and one step ago, controls now and one step ago, dt [s], speed [m/s]."""
+
+    errors: PathErrors
+    errors_before: PathErrors
+    control: Control
+    control_before: Control
+    speed: Scalar
+
+
+StageCost: TypeAlias = Callable[[Stage], Scalar]
+
+
+def tracking_cost(
+    *,
+    dt: float,
+    lateral: float = 200.0,
+    course: float = 20.0,
+    speed: float = 1.0,
+    steering_rate: float = 5.0,
+    effort: float = 0.02,
+    speed_loop: bool = False,
+) -> StageCost:
+    """ℓ = q_y e_y² + q_c (Δe_y / v dt)² + q_v e_v² + q_δ̇ (Δδ / dt)² + q_a a².
+
+    Course, Δe_y / (v dt), is the direction of travel against the path: a car that crabs against the wind or
+    through a bend keeps its course, not its body heading, along the path.
+
+    Args:
+        dt: [s]. lateral: [1/m²]. course: [1/rad²]. speed: [s²/m²]. steering_rate: [s²/rad²].
+        effort: on the acceleration [s⁴/m²]; not charged under a speed loop.
+        speed_loop: whether the second control is a speed command.
+    """
+
+    def cost(stage: Stage) -> Scalar:
+        travelled = stage.speed * dt + 1e-3
+        angle = (stage.errors.lateral - stage.errors_before.lateral) / travelled
+        rate = (stage.control[0] - stage.control_before[0]) / dt
+        total = lateral * stage.errors.lateral**2 + course * angle**2 + speed * stage.errors.speed**2
+        total = total + steering_rate * rate**2
+        return total if speed_loop else total + effort * stage.control[1] ** 2
+
+    return cost

@@ -1,0 +1,9 @@
+"""The archive: driving data, its splits, windows and scales."""
+
+from sfkd_jax.datasets._generation import Driver as Driver
+from sfkd_jax.datasets._generation import generate as generate
+from sfkd_jax.datasets._splits import Dataset as Dataset
+from sfkd_jax.datasets._splits import measure_space as measure_space
+from sfkd_jax.datasets._splits import random_windows as random_windows
+from sfkd_jax.datasets._splits import split as split
+from sfkd_jax.datasets._splits import windows as windows

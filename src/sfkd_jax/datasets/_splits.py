@@ -1,0 +1,112 @@
+"""Splits by trajectory, windows, and the scales measured on the training split."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float, Int
+
+from sfkd_jax.se2 import between
+from sfkd_jax.types import BODY, POSE, Key, Space, Trajectory
+
+
+class Dataset(NamedTuple):
+    """Four sets of trajectories, disjoint by trajectory, and the environment box E they were drawn from.
+
+    Attributes:
+        train: fits weights. validation: selects. calibration: sets d_bar. test: reports, nothing else.
+        env_low, env_high: E.
+    """
+
+    train: Trajectory
+    validation: Trajectory
+    calibration: Trajectory
+    test: Trajectory
+    env_low: Float[Array, " environment"]
+    env_high: Float[Array, " environment"]
+
+
+def split(
+    trajectories: Trajectory,
+    key: Key,
+    *,
+    shares: tuple[float, float, float, float],
+    env_low: Float[Array, " environment"],
+    env_high: Float[Array, " environment"],
+) -> Dataset:
+    """Deal whole trajectories to train, validation, calibration and test.
+
+    Raises:
+        ValueError: shares that are not positive and do not sum to 1, a set left empty, an environment outside E.
+    """
+    if min(shares) <= 0 or abs(sum(shares) - 1.0) > 1e-6:
+        raise ValueError(f"dataset.shares must be positive and sum to 1, got {tuple(shares)}")
+    count = trajectories.states.shape[0]
+    edges = np.round(np.cumsum(shares)[:-1] * count).astype(int)
+    if min(np.diff([0, *edges, count])) < 1:
+        raise ValueError(f"{count} trajectories are too few for shares {tuple(shares)}")
+    envs = trajectories.envs.reshape(-1, trajectories.envs.shape[-1])
+    if bool(jnp.any(envs < env_low - 1e-5) | jnp.any(envs > env_high + 1e-5)):
+        raise ValueError(f"environments leave the box [{env_low}, {env_high}]")
+    order = jax.random.permutation(key, count)
+    parts = [jax.tree.map(lambda a, i=index: a[i], trajectories) for index in jnp.split(order, edges)]
+    return Dataset(*parts, env_low=jnp.asarray(env_low), env_high=jnp.asarray(env_high))
+
+
+def measure_space(dataset: Dataset) -> Space:
+    """Centres and half widths of s and u over the training split, of e over its box, moments of the increments."""
+    train = dataset.train
+    increments = jax.vmap(jax.vmap(between))(train.states[:, :-1, POSE], train.states[:, 1:, POSE])
+    increments = increments.reshape(-1, 3)
+    body = _range(train.states[..., BODY])
+    control = _range(train.controls)
+    centre, half = 0.5 * (dataset.env_high + dataset.env_low), 0.5 * (dataset.env_high - dataset.env_low)
+    return Space(*body, *control, centre, half, increments.mean(axis=0), _away_from_zero(increments.std(axis=0)))
+
+
+def windows(
+    trajectories: Trajectory, rows: Int[Array, " batch"], starts: Int[Array, " batch"], *, length: int
+) -> Trajectory:
+    """Cut one window of `length` steps per row, from its start."""
+
+    def cut(row: Int[Array, ""], start: Int[Array, ""]) -> Trajectory:
+        def piece(leaf: Array, size: int) -> Array:
+            return jax.lax.dynamic_slice_in_dim(leaf[row], start, size)
+
+        return Trajectory(
+            piece(trajectories.states, length + 1),
+            piece(trajectories.controls, length),
+            piece(trajectories.envs, length),
+        )
+
+    return jax.vmap(cut)(rows, starts)
+
+
+def random_windows(trajectories: Trajectory, key: Key, *, batch: int, length: int) -> Trajectory:
+    """`batch` windows drawn evenly over trajectories and start times.
+
+    Raises:
+        ValueError: windows longer than the trajectories.
+    """
+    count, steps = trajectories.controls.shape[:2]
+    if length > steps:
+        raise ValueError(f"windows of {length} steps do not fit trajectories of {steps} steps")
+    row_key, start_key = jax.random.split(key)
+    rows = jax.random.randint(row_key, (batch,), 0, count)
+    starts = jax.random.randint(start_key, (batch,), 0, steps - length + 1)
+    return windows(trajectories, rows, starts, length=length)
+
+
+def _range(values: Float[Array, "*batch n"]) -> tuple[Float[Array, " n"], Float[Array, " n"]]:
+    """Centre and half width of the middle 99.8 %, per channel."""
+    flat = values.reshape(-1, values.shape[-1])
+    low, high = jnp.quantile(flat, jnp.asarray([0.001, 0.999]), axis=0)
+    return 0.5 * (low + high), _away_from_zero(0.5 * (high - low))
+
+
+def _away_from_zero(scale: Float[Array, " n"]) -> Float[Array, " n"]:
+    """A channel that never moves gets scale 1."""
+    return jnp.where(scale > 1e-6, scale, 1.0)

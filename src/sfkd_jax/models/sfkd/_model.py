@@ -1,0 +1,206 @@
+"""Assembly of Stable Fiber-Koopman Residual Dynamics."""
+
+from __future__ import annotations
+
+from typing import cast
+
+import jax
+import jax.numpy as jnp
+
+from sfkd_jax.models.sfkd._networks import Encoder, Networks, PerEnvironment, Shared
+from sfkd_jax.models.sfkd._records import SfkdFiber, SfkdLatent
+from sfkd_jax.models.sfkd._sandwich import apply
+from sfkd_jax.models.sfkd._transport import rotate_planes
+from sfkd_jax.se2 import between, compose
+from sfkd_jax.types import (
+    BODY,
+    POSE,
+    Control,
+    Environment,
+    Explicit,
+    Key,
+    Model,
+    Params,
+    Pose,
+    Scalar,
+    Space,
+    State,
+)
+
+FRAMES = ("body", "segment")
+RESIDUALS = ("sandwich", "free", "none")
+SEGMENT_STEPS = 20.0
+"""Increments per unit of the segment-frame pose scale: a window of the paper's horizon."""
+
+
+def sfkd(
+    space: Space,
+    *,
+    rank: int = 32,
+    rho: float = 0.895,
+    beta: float = 0.1,
+    vertices: int = 8,
+    residual_hidden: tuple[int, ...] = (32, 32),
+    decoder_hidden: tuple[int, ...] = (64, 32),
+    encoder_hidden: int = 32,
+    embedding: int = 16,
+    frame: str = "body",
+    residual: str = "sandwich",
+    transport: bool = True,
+    environment: bool = True,
+    soft_penalty: float = 0.0,
+) -> Model:
+    """Environment-conditioned Koopman operators, a β-Lipschitz residual and isometric transport (eq:sfkd).
+
+        z = Q(e) φ(s, ψ(e)),   z⁺ = A(e) z + B(e) u + r(z; u, e),   z ← T(e → e') z on a switch
+        g⁺ = g ∘ D(z; u, e),   s = C z + c
+
+    For every e, by construction and in float32: A(e) = Σ_j w_j(e) A_j with w on the simplex and every ||A_j||_2 ≤ ρ
+    by the Gram bound, so ||A(e)||_2 ≤ ρ by convexity; Lip_z r ≤ β (sandwich layers; u and e are biases); Q
+    orthogonal; Lip_z D bounded; ||C||_2 ≤ 1 in scaled units. α = ρ + β.
+
+    Args:
+        space: measured scales; fixes all sizes.
+        rank: r, even. rho, beta: the hard bounds, ρ + β < 1 for a certificate.
+        vertices: operators to mix. embedding: size of ψ(e).
+        residual_hidden, decoder_hidden, encoder_hidden: hidden widths.
+        frame: "body" composes the pose on SE(2) outside z; "segment" is the paper's reading, the pose relative to
+            the start of the window inside z.
+        residual: "sandwich", "free" (no bound: nothing is certified) or "none".
+        transport: learn Q(e), else the identity. environment: use e at all.
+        soft_penalty: weight of the paper's hinge max(0, ||∂r/∂z||_2 − β)² in the training loss (eq:contr_loss).
+
+    Raises:
+        ValueError: unknown frame or residual, odd rank, or bounds outside (0, 1).
+    """
+    _check(rank, rho, beta, frame, residual)
+    segment = frame == "segment"
+    body = space.body_mean.shape[0]
+    networks = Networks(
+        rank=rank,
+        body=body,
+        control=space.control_mean.shape[0],
+        vertices=vertices,
+        residual_hidden=tuple(residual_hidden),
+        decoder_hidden=tuple(decoder_hidden),
+        embedding=embedding,
+        rho=rho,
+        beta=beta,
+        residual=residual,
+        transport=transport,
+    )
+    encoder = Encoder(rank, encoder_hidden)
+    pose_scale = jnp.asarray(space.increment_scale) * SEGMENT_STEPS
+
+    def init(key: Key) -> Params:
+        network_key, encoder_key = jax.random.split(key)
+        inputs = jnp.zeros(body + 3 if segment else body)
+        return {
+            "networks": networks.init(network_key, jnp.zeros(space.env_mean.shape[0]))["params"],
+            "encoder": encoder.init(encoder_key, inputs, jnp.zeros(embedding))["params"],
+        }
+
+    def scaled_env(env: Environment) -> Environment:
+        scaled = (env - space.env_mean) / space.env_scale
+        return scaled if environment else jnp.zeros_like(scaled)
+
+    def bounded_parts(params: Params) -> Shared:
+        return cast(Shared, networks.apply({"params": params["networks"]}, method="shared"))
+
+    def fiber(params: Params, env: Environment) -> SfkdFiber:
+        shared = bounded_parts(params)
+        found = networks.apply({"params": params["networks"]}, scaled_env(env), method="per_environment")
+        local = cast(PerEnvironment, found)
+        return SfkdFiber(
+            A=jnp.tensordot(local.mixture, shared.vertices, axes=1),
+            B=local.B,
+            residual=shared.residual.matrices,
+            residual_biases=local.residual,
+            decoder=shared.decoder.matrices,
+            decoder_biases=local.decoder,
+            readout=shared.readout,
+            centre=shared.centre,
+            tangents=local.tangents,
+            embedding=local.embedding,
+            encoder=params["encoder"],
+        )
+
+    def lift(fiber: SfkdFiber, pose: Pose, state: State) -> SfkdLatent:
+        inputs = (state[BODY] - space.body_mean) / space.body_scale
+        if segment:
+            inputs = jnp.concatenate([between(pose, state[POSE]) / pose_scale, inputs])
+        z = cast(jax.Array, encoder.apply({"params": fiber.encoder}, inputs, fiber.embedding))
+        return SfkdLatent(pose, rotate_planes(fiber.tangents, z))
+
+    def encode(fiber: SfkdFiber, state: State) -> SfkdLatent:
+        return lift(fiber, state[POSE], state)
+
+    def observe(fiber: SfkdFiber, latent: SfkdLatent, state: State) -> SfkdLatent:
+        return lift(fiber, latent.pose if segment else state[POSE], state)
+
+    def scaled_control(control: Control) -> Control:
+        return (control - space.control_mean) / space.control_scale
+
+    def step(fiber: SfkdFiber, latent: SfkdLatent, control: Control) -> SfkdLatent:
+        u = scaled_control(control)
+        z = fiber.A @ latent.z + fiber.B @ u
+        if residual != "none":
+            z = z + apply(fiber.residual, fiber.residual_biases.at(u), latent.z)
+        if segment:
+            return SfkdLatent(latent.pose, z)
+        motion = apply(fiber.decoder, fiber.decoder_biases.at(u), latent.z)
+        return SfkdLatent(compose(latent.pose, space.increment_mean + space.increment_scale * motion), z)
+
+    def decode(fiber: SfkdFiber, latent: SfkdLatent) -> State:
+        pose = latent.pose
+        if segment:
+            offset = apply(fiber.decoder, fiber.decoder_biases.offsets, latent.z)
+            pose = compose(pose, pose_scale * offset)
+        scaled = fiber.readout @ latent.z + fiber.centre
+        return jnp.concatenate([pose, space.body_mean + space.body_scale * scaled])
+
+    def carry(fiber: SfkdFiber, fiber_next: SfkdFiber, latent: SfkdLatent) -> SfkdLatent:
+        home = rotate_planes(-fiber.tangents, latent.z)
+        return latent._replace(z=rotate_planes(fiber_next.tangents, home))
+
+    def explicit(params: Params) -> Explicit:
+        shared = bounded_parts(params)
+        scale = (pose_scale if segment else jnp.asarray(space.increment_scale))[:, None]
+        return Explicit(
+            vertices=shared.vertices,
+            residual=() if residual == "none" else shared.residual.matrices,
+            residual_multipliers=shared.residual.multipliers,
+            decoder=(*shared.decoder.matrices[:-1], scale * shared.decoder.matrices[-1]),
+            decoder_multipliers=shared.decoder.multipliers,
+            readout=jnp.asarray(space.body_scale)[:, None] * shared.readout,
+        )
+
+    def hinge(fiber: SfkdFiber, latent: SfkdLatent, control: Control) -> Scalar:
+        biases = fiber.residual_biases.at(scaled_control(control))
+        jacobian = jax.jacobian(lambda z: apply(fiber.residual, biases, z))(latent.z)
+        return soft_penalty * jnp.maximum(0.0, jnp.linalg.norm(jacobian, 2) - beta) ** 2
+
+    return Model(
+        init=init,
+        fiber=fiber,
+        encode=encode,
+        step=step,
+        decode=decode,
+        transport=carry,
+        observe=observe,
+        vector=lambda latent: latent.z,
+        explicit=explicit,
+        penalty=hinge if soft_penalty else None,
+    )
+
+
+def _check(rank: int, rho: float, beta: float, frame: str, residual: str) -> None:
+    """Refuse settings that no model can have, naming the choices."""
+    if frame not in FRAMES:
+        raise ValueError(f"model.frame must be one of {', '.join(FRAMES)}, got {frame!r}")
+    if residual not in RESIDUALS:
+        raise ValueError(f"model.residual must be one of {', '.join(RESIDUALS)}, got {residual!r}")
+    if rank < 2 or rank % 2:
+        raise ValueError(f"model.rank must be even and at least 2, got {rank}")
+    if min(rho, beta) <= 0.0 or max(rho, beta) >= 1.0:
+        raise ValueError(f"model.rho and model.beta must lie in (0, 1), got {rho} and {beta}")

@@ -1,0 +1,155 @@
+"""The parts of SFKD that are learned, as one flax module used through init and apply."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import flax.linen as nn
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+from sfkd_jax.models.sfkd._bounds import bounded
+from sfkd_jax.models.sfkd._sandwich import Free, Sandwich, Weights
+from sfkd_jax.types import Scalar
+
+
+class Biases(NamedTuple):
+    """b_k(u, e) = gain_k(e) u + offset_k(e) of every layer of a network, for one e.
+
+    Attributes:
+        gains: (out, control) per layer. offsets: (out,) per layer.
+    """
+
+    gains: tuple[Float[Array, "_ control"], ...]
+    offsets: tuple[Float[Array, " _"], ...]
+
+    def at(self, control: Float[Array, " control"]) -> tuple[Float[Array, " _"], ...]:
+        """The biases under one scaled control."""
+        return tuple(gain @ control + offset for gain, offset in zip(self.gains, self.offsets, strict=True))
+
+
+class Shared(NamedTuple):
+    """What does not depend on e: operator vertices, the two bounded networks, the read-out."""
+
+    vertices: Float[Array, "vertex rank rank"]
+    residual: Weights
+    decoder: Weights
+    readout: Float[Array, "body rank"]
+    centre: Float[Array, " body"]
+    decoder_bound: Scalar
+
+
+class PerEnvironment(NamedTuple):
+    """What depends on e alone: mixture of the vertices, B(e), biases, rotation, embedding."""
+
+    mixture: Float[Array, " vertex"]
+    B: Float[Array, "rank control"]
+    residual: Biases
+    decoder: Biases
+    tangents: Float[Array, " plane"]
+    embedding: Float[Array, " embedding"]
+
+
+class Networks(nn.Module):
+    """Everything learned but the encoder: embedding ψ(e), operators, residual, decoder, transport.
+
+    Attributes:
+        rank: r, even. body, control: sizes of s and u.
+        vertices: number of operator vertices. hidden: widths. embedding: size of ψ(e).
+        rho, beta: the two hard bounds. residual: "sandwich", "free" or "none". transport: whether Q(e) is learned.
+    """
+
+    rank: int
+    body: int
+    control: int
+    vertices: int
+    residual_hidden: Sequence[int]
+    decoder_hidden: Sequence[int]
+    embedding: int
+    rho: float
+    beta: float
+    residual: str
+    transport: bool
+
+    def setup(self) -> None:
+        """Declare the parts."""
+        kinds = {"sandwich": Sandwich, "free": Free, "none": Free}
+        self.psi = nn.Sequential([nn.Dense(64), nn.tanh, nn.Dense(64), nn.tanh, nn.Dense(self.embedding), nn.tanh])
+        self.residual_weights = kinds[self.residual](self.rank, self.residual_hidden, self.rank)
+        self.decoder_weights = Sandwich(self.rank, self.decoder_hidden, 3)
+        small = nn.initializers.variance_scaling(0.1, "fan_in", "truncated_normal")
+        self.mixture_head = nn.Dense(self.vertices, kernel_init=small)
+        self.input_head = nn.Dense(self.rank * self.control)
+        self.residual_head = nn.Dense(self._bias_size(self.residual_hidden, self.rank), kernel_init=small)
+        self.decoder_head = nn.Dense(self._bias_size(self.decoder_hidden, 3))
+        self.tangent_head = nn.Dense(self.rank // 2, kernel_init=small, bias_init=nn.initializers.zeros)
+        shape = (self.vertices, self.rank, self.rank)
+        self.operators = self.param("operators", _near_identity, shape)
+        self.readout = self.param("readout", nn.initializers.orthogonal(), (self.body, self.rank))
+        self.centre = self.param("centre", nn.initializers.zeros, (self.body,))
+        self.log_decoder_bound = self.param("log_decoder_bound", nn.initializers.constant(1.0), ())
+
+    def __call__(self, env: Array) -> tuple[Shared, PerEnvironment]:
+        """Touch every part once, so that init creates all parameters."""
+        return self.shared(), self.per_environment(env)
+
+    def shared(self) -> Shared:
+        """What does not depend on e, with every bound in force."""
+        bound = jnp.exp(self.log_decoder_bound)
+        vertices = jax.vmap(lambda matrix: bounded(matrix, self.rho))(self.operators)
+        residual = self.residual_weights(self.beta)
+        if self.residual == "none":
+            residual = Weights(tuple(jnp.zeros_like(matrix) for matrix in residual.matrices), ())
+        readout = bounded(self.readout, 1.0)
+        return Shared(vertices, residual, self.decoder_weights(bound), readout, self.centre, bound)
+
+    def per_environment(self, env: Float[Array, " environment"]) -> PerEnvironment:
+        """What depends on e alone; `env` is scaled to about [-1, 1]."""
+        embedding = self.psi(env)
+        residual = self._biases(self.residual_head(embedding), self.residual_hidden, self.rank)
+        if self.residual == "none":
+            residual = jax.tree.map(jnp.zeros_like, residual)
+        tangents = self.tangent_head(embedding)
+        return PerEnvironment(
+            mixture=nn.softmax(self.mixture_head(embedding)),
+            B=self.input_head(embedding).reshape(self.rank, self.control),
+            residual=residual,
+            decoder=self._biases(self.decoder_head(embedding), self.decoder_hidden, 3),
+            tangents=tangents if self.transport else jnp.zeros_like(tangents),
+            embedding=embedding,
+        )
+
+    def _bias_size(self, hidden: Sequence[int], outputs: int) -> int:
+        return (sum(hidden) + outputs) * (self.control + 1)
+
+    def _biases(self, flat: Array, hidden: Sequence[int], outputs: int) -> Biases:
+        """Cut one flat vector into gains and offsets per layer."""
+        table = flat.reshape(sum(hidden) + outputs, self.control + 1)
+        edges = [sum(hidden[: k + 1]) for k in range(len(hidden))]
+        parts = jnp.split(table, edges)
+        return Biases(tuple(part[:, :-1] for part in parts), tuple(part[:, -1] for part in parts))
+
+
+class Encoder(nn.Module):
+    """φ(s, ψ(e)), before it is turned into the fibre of e.
+
+    Attributes:
+        rank: r. hidden: width.
+    """
+
+    rank: int
+    hidden: int
+
+    @nn.compact
+    def __call__(self, body: Float[Array, " inputs"], embedding: Float[Array, " embedding"]) -> Array:
+        """z before rotation, shape (rank,)."""
+        hidden = nn.tanh(nn.Dense(self.hidden)(jnp.concatenate([body, embedding])))
+        return nn.Dense(self.rank)(hidden)
+
+
+def _near_identity(key: Array, shape: tuple[int, ...], dtype: jnp.dtype = jnp.float32) -> Array:
+    """Slow dynamics to start from: I plus a little noise."""
+    noise = jax.random.normal(key, shape, dtype) * (0.1 / shape[-1] ** 0.5)
+    return jnp.eye(shape[-1], dtype=dtype) + noise

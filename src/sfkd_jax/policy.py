@@ -1,0 +1,67 @@
+"""A trained controller as other JAX projects import it: no Hydra, no orbax, no solver, no matplotlib."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from sfkd_jax import artefacts, assembly
+from sfkd_jax.types import Controller, Model, Params
+
+KIND = "policy"
+
+
+class Policy(NamedTuple):
+    """What `load` returns.
+
+    Attributes:
+        model, params: the learned rollout model. controller: `Controller(init, act)`, pure; jit, vmap, scan it.
+        certificate: the document in certificate.json, or None if it is missing, refused, or about other weights.
+        settings: how all of it was made.
+    """
+
+    model: Model
+    params: Params
+    controller: Controller
+    certificate: dict[str, Any] | None
+    settings: dict[str, Any]
+
+
+def save(path: Path, params: Params, settings: Mapping[str, Any], *, made_from: Mapping[str, str]) -> dict[str, Any]:
+    """Write policy.npz and its manifest; returns the manifest, whose `sha256` names the weights."""
+    flat = {name: np.asarray(leaf) for name, leaf in artefacts.flatten(params).items()}
+    return artefacts.write_arrays(path, flat, kind=KIND, config=settings, made_from=made_from)
+
+
+def load(path: str | Path) -> Policy:
+    """The policy in a run directory (or a policy.npz with its manifest beside it).
+
+    Raises:
+        ArtefactError: nothing there, truncated, foreign, or changed since it was written.
+    """
+    file = Path(path)
+    file = file / "policy.npz" if file.suffix != ".npz" else file
+    arrays, manifest = artefacts.read_arrays(file, kind=KIND)
+    settings = manifest["config"]
+    plant = assembly.build_vehicle(settings["vehicle"])
+    model = assembly.build_model(settings["model"], assembly.space_from_settings(settings["space"]))
+    box = settings["dataset"]
+    controller = assembly.build_controller(
+        settings["controller"], model, plant, env_low=box["env_low"], env_high=box["env_high"]
+    )
+    params = jax.tree.map(jnp.asarray, artefacts.unflatten(arrays))
+    certificate = _certificate(file.with_name("certificate.json"), manifest["sha256"])
+    return Policy(model, params, controller, certificate, settings)
+
+
+def _certificate(path: Path, weights: str) -> dict[str, Any] | None:
+    """The certificate beside a policy, if it is valid and about these weights."""
+    if not path.exists():
+        return None
+    document = artefacts.read_json(path, keys=("valid", "weights_sha256"))
+    return document if document["valid"] and document["weights_sha256"] == weights else None

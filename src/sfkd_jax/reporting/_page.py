@@ -1,0 +1,82 @@
+"""The report of a run: reads what lies in its directory and writes page, Markdown and figures."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any
+
+from sfkd_jax.reporting import _sections as sections
+from sfkd_jax.reporting._blocks import Block, Heading, Picture, Text, to_html, to_markdown
+from sfkd_jax.reporting._numbers import plain
+from sfkd_jax.reporting._style import label
+from sfkd_jax.reporting._tables import blocks_of
+from sfkd_jax.reporting._words import command, headline, model_of, summary
+
+
+def write_report(run: Path) -> dict[str, Any]:
+    """Write `run/report/`: `index.html` (one self-contained page), `report.md` and `figures/*.png`.
+
+    Reads policy.json, metrics.jsonl, open_loop.json, certificate.json, results.json and episodes.npz of `run`
+    and recomputes none of their numbers; the same inputs give the same bytes.
+
+    Args:
+        run: directory of a run. All but policy.json may be missing; the page names the command that makes it.
+
+    Returns:
+        `report`: path of the page. `figures`: paths of the figures, in the order of the page.
+
+    Raises:
+        FileNotFoundError: no policy.json. ValueError: a file that is not JSON.
+    """
+    policy = _read(run / "policy.json")
+    if policy is None:
+        raise FileNotFoundError(f"{run / 'policy.json'} is missing: {command('train', {})} makes a run")
+    settings = policy.get("settings") or policy.get("config") or {}
+    place = run / "report" / "figures"
+    place.mkdir(parents=True, exist_ok=True)
+    for stale in place.glob("*.png"):
+        stale.unlink()
+    metrics, errors = _metrics(run), _read(run / "open_loop.json")
+    certificate = _about(policy, _read(run / "certificate.json"))
+    results = _read(run / "results.json") or {}
+    rows = blocks_of(results.get("rows") or [])
+    head, name = headline(rows, settings), plain(settings.get("experiment") or "unnamed run")
+    title = f"{label(model_of(settings))} on {name}, seed {plain(settings.get('seed'))}"
+    page: list[Block] = [Heading(1, title), Text(summary(settings, head, certificate, metrics), kind="lead")]
+    page += sections.tiles(settings, head, errors, certificate)
+    page += sections.driving(run, rows, settings, place)
+    page += sections.certified(certificate, settings, place)
+    page += sections.predicting(errors, settings, place)
+    page += sections.training(metrics, settings, place)
+    page += sections.provenance(settings, policy.get("versions") or results.get("versions"))
+    report = run / "report" / "index.html"
+    report.write_text(to_html(title, page), encoding="utf-8")
+    report.with_name("report.md").write_text(to_markdown(page), encoding="utf-8")
+    return {
+        "report": str(report),
+        "figures": [str(block.path) for block in page if isinstance(block, Picture)],
+    }
+
+
+def _read(path: Path) -> dict[str, Any] | None:
+    return json.loads(path.read_text(encoding="utf-8")) if path.exists() else None
+
+
+def _about(policy: dict[str, Any], certificate: dict[str, Any] | None) -> dict[str, Any] | None:
+    """The certificate, or a refusal if it names other weights than the policy's manifest."""
+    mine, named = policy.get("sha256"), (certificate or {}).get("weights_sha256")
+    if mine and named and mine != named:
+        return {"valid": False, "reason": "the certificate in this run is about other weights"}
+    return certificate
+
+
+def _metrics(run: Path) -> list[dict[str, Any]]:
+    """Lines of metrics.jsonl up to one that a kill cut off."""
+    path, found = run / "metrics.jsonl", []
+    for line in path.read_text(encoding="utf-8").splitlines() if path.exists() else []:
+        try:
+            found.append(json.loads(line))
+        except json.JSONDecodeError:
+            break
+    return found

@@ -1,0 +1,180 @@
+"""Sentences: what a run's numbers say, and what they do not say."""
+
+from __future__ import annotations
+
+import shlex
+from typing import Any
+
+from sfkd_jax.reporting._blocks import Text
+from sfkd_jax.reporting._numbers import DASH, dig, interval, is_number, mean_std, number, plain, short, upper
+from sfkd_jax.reporting._style import label
+from sfkd_jax.reporting._tables import PAPER_RMSE_M
+
+
+def command(door: str, settings: dict[str, Any]) -> str:
+    """The command line that opens a door for this run."""
+    name, model = settings.get("experiment"), model_of(settings)
+    parts = ["python", "-m", f"sfkd_jax.{door}"]
+    parts += [f"+experiment={name}"] if name not in (None, "", "default") else []
+    parts += [f"model={model}"] if model != "sfkd" else []
+    return shlex.join([*parts, f"seed={plain(settings.get('seed', 0))}"])
+
+
+def model_of(settings: dict[str, Any]) -> str:
+    """Name of the system a run trained, as in results.json."""
+    return str(dig(settings, "model", "system") or dig(settings, "model", "name") or "sfkd")
+
+
+def headline(blocks: list[list[dict[str, Any]]], settings: dict[str, Any]) -> list[dict[str, Any]]:
+    """The block the summary speaks of: the run's own scenario, else the last; feedback sampling first."""
+    experiment = str(settings.get("experiment"))
+    own = [block for block in blocks if experiment.startswith(str(block[0].get("scenario")))] or blocks
+    last = [block for block in own if block[0].get("scenario") == own[-1][0].get("scenario")] if own else []
+    feedback = [block for block in last if any(row.get("sampling") == "feedback" for row in block)]
+    return (feedback or last or [[]])[0]
+
+
+def row_of(block: list[dict[str, Any]], system: str) -> dict[str, Any]:
+    """The row of a system in a block, preferring the one that sees e; empty if there is none."""
+    rows = [row for row in block if row.get("system") == system]
+    return next((row for row in rows if row.get("env") == "measured"), rows[0] if rows else {})
+
+
+def summary(
+    settings: dict[str, Any],
+    block: list[dict[str, Any]],
+    certificate: dict[str, Any] | None,
+    metrics: list[dict[str, Any]],
+) -> str:
+    """What was trained, what is certified and how well it drives, in one paragraph."""
+    model, vehicle = model_of(settings), dig(settings, "vehicle", "name")
+    plant = f" on the {vehicle} vehicle" if vehicle else ""
+    steps = dig(metrics[-1], "step") if metrics else None
+    trained = f" for {short(steps, 9)} steps" if is_number(steps) else ""
+    sentences = [f"{label(model)} was trained{plant}{trained} (seed {plain(settings.get('seed'))})."]
+    if holds(certificate):
+        alpha = upper(dig(certificate, "alpha"))
+        sentences.append(
+            f"Its latent step is certified to contract, α ≤ {alpha} for every environment in the box below."
+        )
+    elif certificate is not None:
+        sentences.append("It carries no valid certificate.")
+    return " ".join([*sentences, *_driving(model, block)])
+
+
+def _driving(model: str, block: list[dict[str, Any]]) -> list[str]:
+    """How well the model's own row drives, beside oracle, nominal and whoever did better."""
+    own, oracle, nominal = (row_of(block, name) for name in (model, "oracle", "nominal"))
+    mean = dig(own, "rmse_m", "mean")
+    if not is_number(mean):
+        return []
+    bounds = interval(dig(own, "rmse_m", "ci95"))
+    within = f" (95 % interval {bounds})" if bounds != DASH else ""
+    beside = []
+    if is_number(dig(oracle, "rmse_m", "mean")):
+        beside.append(f"{number(oracle.get('rmse_m'))} m for the oracle, which plans with the true vehicle")
+    if is_number(dig(nominal, "rmse_m", "mean")):
+        beside.append(
+            f"{number(nominal.get('rmse_m'))} m for the nominal model, which knows neither friction nor wind"
+        )
+    others = f", beside {', and '.join(beside)}" if beside else ""
+    where = str(own.get("scenario")).upper()
+    said = [f"In scenario {where} it follows the path to a lateral RMSE of {number(mean)} m{within}{others}."]
+    if is_number(own.get("ratio_to_oracle")):
+        said.append(f"Its RMSE is {number(own['ratio_to_oracle'], 2)} times the oracle's.")
+    rivals = [row for row in block if row.get("system") not in (model, "oracle")]
+    better = [row for row in rivals if is_number(dig(row, "rmse_m", "mean")) and row["rmse_m"]["mean"] < mean]
+    if better:
+        best = min(better, key=lambda row: row["rmse_m"]["mean"])
+        said.append(f"{label(str(best['system']))} does better here, with {number(best['rmse_m'])} m.")
+    return said
+
+
+def holds(certificate: dict[str, Any] | None) -> bool:
+    """Whether a certificate says that it is valid, with a contraction factor below one."""
+    alpha = dig(certificate, "alpha")
+    return dig(certificate, "valid") is True and is_number(alpha) and alpha < 1
+
+
+def paper_note(block: list[dict[str, Any]]) -> str | None:
+    """The paper's SFKD figure beside ours, for a scenario for which it reports one."""
+    scenario, own = str(block[0].get("scenario")), row_of(block, "sfkd")
+    if scenario not in PAPER_RMSE_M or not own:
+        return None
+    mean, std = PAPER_RMSE_M[scenario]
+    return (
+        f"SFKD in {scenario.upper()}: {mean_std(own.get('rmse_m'))} m in this run; {mean:.3f} ± {std:.3f} m "
+        "reported by the paper, other simulator. They are not measurements of the same thing."
+    )
+
+
+def certificate_words(record: dict[str, Any]) -> list[Text]:
+    """What is proved, what is measured and what is not claimed."""
+    if not holds(record):
+        reason = plain(record.get("reason")) if record.get("reason") else "the file gives no reason"
+        return [Text(f"No contraction is certified for these weights: {reason}.", "Nothing is proved.")]
+    boxes = "; ".join(f"{name}: {_box(dig(record, 'boxes', name), names)}" for name, names in _AXES.items())
+    limits = (
+        f"Nothing is claimed outside the boxes in which d̄ was measured ({boxes}). The certificate says how a "
+        "prediction error grows; how well the vehicle tracks is the measurement in the section above."
+    )
+    return [
+        Text(_proved(record), "Proved."),
+        Text(_measured(dig(record, "d_bar") or {}), "Measured, not proved."),
+        Text(limits, "Not claimed."),
+    ]
+
+
+def _proved(record: dict[str, Any]) -> str:
+    where = _box(dig(record, "boxes", "env"), _AXES["env"])
+    alpha = upper(record["alpha"])
+    text = (
+        f"For every environment with {where}, every control and any two latent states, one step of the "
+        f"model leaves the two at most α = {alpha} times as far apart as they were. This is a "
+        "bound on all of them, not an average over a sample. So an error made once fades, and errors of at "
+        "most d̄ per step add up to no more than the tube Rₖ"
+    )
+    latent, ultimate = dig(record, "tube", "latent") or [], dig(record, "tube", "ultimate")
+    if latent:
+        text += f": {upper(latent[0])} after one step, {upper(latent[-1])} after {len(latent)}"
+    if is_number(ultimate):
+        text += f", {upper(ultimate)} however far ahead"
+    return text + "."
+
+
+def _measured(bound: dict[str, Any]) -> str:
+    value, level = upper(bound.get("value")), short(bound.get("level"))
+    count = short(bound.get("trajectories"))
+    text = (
+        f"The one-step error bound d̄ = {value}, in latent units, is a conformal quantile at level {level} "
+        f"over {count} calibration trajectories that training never saw; it includes the error of transport "
+        "between environments."
+    )
+    if is_number(bound.get("coverage")):
+        text += f" It covered a fraction of {number(bound['coverage'])} of held-out trajectories"
+        text += f" (95 % interval {interval(bound.get('coverage_ci95'))})."
+    return text
+
+
+_AXES = {
+    "state": (("speed", " m/s"), ("lateral speed", " m/s"), ("yaw rate", " rad/s"), ("steering", " rad")),
+    "control": (("steering", " rad"), ("acceleration or commanded speed", "")),
+    "env": (("friction", ""), ("side wind", " m/s")),
+}
+
+
+def _box(box: Any, names: tuple[tuple[str, str], ...]) -> str:
+    """A box in words; it comes as [lows, highs], or else as [[low, high], …]."""
+    if isinstance(box, list) and box and all(isinstance(side, list) for side in box):
+        sides = list(zip(*box, strict=False)) if len(box) == 2 else []
+        for pairs in (sides, box):
+            if pairs and all(_rising(pair) for pair in pairs):
+                known = [*names, *[("", "")] * len(pairs)]
+                spans = [f"{short(low)} to {short(high)}" for low, high in pairs]
+                named = zip(known, spans, strict=False)
+                return ", ".join(f"{name} {span}{unit}".strip() for (name, unit), span in named)
+    return plain(box)
+
+
+def _rising(pair: Any) -> bool:
+    return len(pair) == 2 and all(map(is_number, pair)) and pair[0] <= pair[1]

@@ -1,0 +1,16 @@
+"""The road: what happens to the truth. Paths, environment schedules, and the scenarios S1, S2, S3."""
+
+from sfkd_jax.scenarios._conditions import gusts as gusts
+from sfkd_jax.scenarios._conditions import switching_road as switching_road
+from sfkd_jax.scenarios._conditions import uniform_road as uniform_road
+from sfkd_jax.scenarios._conditions import wet_road as wet_road
+from sfkd_jax.scenarios._paths import Path as Path
+from sfkd_jax.scenarios._paths import path_from_curvature as path_from_curvature
+from sfkd_jax.scenarios._paths import point_at as point_at
+from sfkd_jax.scenarios._paths import project as project
+from sfkd_jax.scenarios._paths import reference_window as reference_window
+from sfkd_jax.scenarios._paths import smooth_path as smooth_path
+from sfkd_jax.scenarios._scenarios import Family as Family
+from sfkd_jax.scenarios._scenarios import Scenario as Scenario
+from sfkd_jax.scenarios._scenarios import family as family
+from sfkd_jax.scenarios._scenarios import scenario as scenario

@@ -1,0 +1,79 @@
+"""What the road and the air do over time: schedules of e = (friction [-], side wind [m/s])."""
+
+from __future__ import annotations
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+from sfkd_jax.types import Key
+
+Range = tuple[float, float]
+Schedule = Float[Array, "time 2"]
+
+SWITCH_LEVELS = ((0.9, 0.0), (0.6, 4.0), (0.3, 8.0), (0.6, 4.0))
+"""S3's order A, B, C, B, A, …: (friction, |wind|)."""
+
+
+def uniform_road(key: Key, *, steps: int, friction: Range = (0.9, 0.9)) -> Schedule:
+    """S1: one friction level drawn from a range, no wind."""
+    level = jax.random.uniform(key, (), minval=friction[0], maxval=friction[1])
+    return jnp.stack([jnp.full(steps, level), jnp.zeros(steps)], axis=1)
+
+
+def wet_road(
+    key: Key,
+    *,
+    steps: int,
+    dt: float,
+    before: Range = (0.7, 0.7),
+    after: Range = (0.35, 0.35),
+    drop_time: Range = (5.0, 5.0),
+    peak_wind: float = 8.0,
+) -> Schedule:
+    """S2: friction drops abruptly once, while smooth gusts blow.
+
+    Args:
+        key: consumed.
+        steps, dt: length and sampling period [s].
+        before, after: friction levels, drawn from a range. drop_time: when [s], drawn from a range.
+        peak_wind: gusts cover [-peak, peak] [m/s] evenly.
+    """
+    before_key, after_key, time_key, gust_key = jax.random.split(key, 4)
+    high = jax.random.uniform(before_key, (), minval=before[0], maxval=before[1])
+    low = jax.random.uniform(after_key, (), minval=after[0], maxval=after[1])
+    when = jax.random.uniform(time_key, (), minval=drop_time[0], maxval=drop_time[1])
+    friction = jnp.where(jnp.arange(steps) * dt < when - 1e-6, high, low)
+    return jnp.stack([friction, gusts(gust_key, steps=steps, dt=dt, peak=peak_wind)], axis=1)
+
+
+def switching_road(key: Key, *, steps: int, dt: float, period: float = 3.0) -> Schedule:
+    """S3: every `period` seconds the next of A, B, C, B, A, …, each with a random side of the wind."""
+    visits = int(steps * dt / period) + 1
+    sides = jax.random.rademacher(key, (visits,), dtype=float)
+    levels = jnp.asarray(SWITCH_LEVELS)[jnp.arange(visits) % len(SWITCH_LEVELS)]
+    levels = levels.at[:, 1].multiply(sides)
+    visit = jnp.floor(jnp.arange(steps) * dt / period + 1e-6).astype(int)
+    return levels[visit]
+
+
+def gusts(
+    key: Key, *, steps: int, dt: float, peak: float, hold: Range = (1.0, 3.0), ramp: float = 0.5
+) -> Float[Array, " time"]:
+    """Wind levels drawn evenly from [-peak, peak], joined by 1 − cos ramps [m/s].
+
+    Args:
+        key: consumed.
+        steps, dt: length and sampling period [s].
+        peak: [m/s]. hold: range of the time from one ramp to the next [s]. ramp: its duration [s].
+    """
+    level_key, hold_key = jax.random.split(key)
+    count = int(steps * dt / hold[0]) + 2
+    levels = jax.random.uniform(level_key, (count + 1,), minval=-peak, maxval=peak)
+    starts = jnp.cumsum(jax.random.uniform(hold_key, (count,), minval=hold[0], maxval=hold[1]))
+    time = jnp.arange(steps) * dt
+    gust = jnp.searchsorted(starts, time, side="right")
+    since = time - jnp.where(gust > 0, starts[gust - 1], -ramp)
+    blend = 0.5 - 0.5 * jnp.cos(jnp.pi * jnp.clip(since / ramp, 0.0, 1.0))
+    before = levels[jnp.maximum(gust - 1, 0)]
+    return before + (levels[gust] - before) * blend

@@ -1,0 +1,101 @@
+"""Reference paths by arc length: a random smooth family, points on it, and projection onto it."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+from sfkd_jax.types import Key, Reference, Scalar
+
+
+class Path(NamedTuple):
+    """A path sampled at equal arc length.
+
+    Attributes:
+        points: x [m], y [m], yaw [rad], curvature [1/m] at s = 0, h, 2h, …, shape (point, 4).
+        spacing: h [m].
+    """
+
+    points: Float[Array, "point 4"]
+    spacing: Scalar
+
+
+def smooth_path(
+    key: Key,
+    *,
+    length: float,
+    spacing: float = 0.5,
+    peak_curvature: float = 0.02,
+    wavelengths: tuple[float, float] = (50.0, 160.0),
+    run_up: float = 20.0,
+) -> Path:
+    """A random path whose curvature is a sum of three sinusoids, κ(s) = Σᵢ aᵢ sin(2π s/λᵢ + φᵢ), max |κ| = κ_max.
+
+    The first metres are straight and blend in, so that an episode starts on the path.
+
+    Args:
+        key: consumed.
+        length: at least this long [m]. spacing: sampling [m].
+        peak_curvature: κ_max [1/m]. wavelengths: range of λᵢ [m]. run_up: length of the blend [m].
+    """
+    amplitude_key, wavelength_key, phase_key = jax.random.split(key, 3)
+    s = jnp.arange(int(length / spacing) + 2) * spacing
+    amplitudes = jax.random.uniform(amplitude_key, (3, 1), minval=0.3, maxval=1.0)
+    waves = jax.random.uniform(wavelength_key, (3, 1), minval=wavelengths[0], maxval=wavelengths[1])
+    phases = jax.random.uniform(phase_key, (3, 1), maxval=2 * jnp.pi)
+    curvature = jnp.sum(amplitudes * jnp.sin(2 * jnp.pi * s / waves + phases), axis=0)
+    blend = jnp.clip(s / run_up, 0.0, 1.0)
+    curvature = curvature * blend**2 * (3.0 - 2.0 * blend)
+    curvature = curvature * peak_curvature / jnp.max(jnp.abs(curvature))
+    return path_from_curvature(curvature, spacing=spacing)
+
+
+def path_from_curvature(curvature: Float[Array, " point"], *, spacing: float) -> Path:
+    """Integrate κ(s) to a path that starts at the origin, heading along x (trapezoid and midpoint rules)."""
+    yaw_steps = 0.5 * (curvature[1:] + curvature[:-1]) * spacing
+    yaw = jnp.concatenate([jnp.zeros(1), jnp.cumsum(yaw_steps)])
+    middle = yaw[:-1] + 0.5 * yaw_steps
+    x = jnp.concatenate([jnp.zeros(1), jnp.cumsum(jnp.cos(middle))]) * spacing
+    y = jnp.concatenate([jnp.zeros(1), jnp.cumsum(jnp.sin(middle))]) * spacing
+    return Path(jnp.stack([x, y, yaw, curvature], axis=1), jnp.asarray(spacing))
+
+
+def point_at(path: Path, s: Scalar) -> Float[Array, " 4"]:
+    """x, y, yaw, curvature at arc length s [m], along a clothoid from the sample before; s is clamped to the path."""
+    last = path.points.shape[0] - 2
+    index = jnp.clip(jnp.floor(s / path.spacing).astype(int), 0, last)
+    start, end = path.points[index], path.points[index + 1]
+    ahead = jnp.clip(s - index * path.spacing, 0.0, path.spacing)
+    slope = (end[3] - start[3]) / path.spacing
+    yaw = start[2] + start[3] * ahead + 0.5 * slope * ahead**2
+    middle = start[2] + 0.5 * start[3] * ahead + 0.125 * slope * ahead**2
+    x = start[0] + ahead * jnp.cos(middle)
+    y = start[1] + ahead * jnp.sin(middle)
+    return jnp.stack([x, y, yaw, start[3] + slope * ahead])
+
+
+def project(path: Path, position: Float[Array, " 2"], s_guess: Scalar) -> tuple[Scalar, Scalar]:
+    """Arc length of the closest point near `s_guess` and the signed distance to it (left positive), by Newton steps."""
+    s = s_guess
+    for _ in range(3):
+        point = point_at(path, s)
+        along, left = _offsets(point, position)
+        s = s + along / jnp.maximum(1.0 - point[3] * left, 0.2)
+    return s, _offsets(point_at(path, s), position)[1]
+
+
+def reference_window(path: Path, s: Scalar, speed: Scalar, *, dt: float, horizon: int) -> Reference:
+    """The next `horizon` points at the given speed: x, y, yaw, speed, shape (horizon, 4)."""
+    ahead = s + speed * dt * jnp.arange(1, horizon + 1)
+    points = jax.vmap(point_at, in_axes=(None, 0))(path, ahead)
+    return points.at[:, 3].set(speed)
+
+
+def _offsets(point: Float[Array, " 4"], position: Float[Array, " 2"]) -> tuple[Scalar, Scalar]:
+    """How far `position` lies ahead of and left of a point on the path [m]."""
+    dx, dy = position[0] - point[0], position[1] - point[1]
+    c, s = jnp.cos(point[2]), jnp.sin(point[2])
+    return c * dx + s * dy, -s * dx + c * dy

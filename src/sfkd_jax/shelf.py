@@ -1,0 +1,121 @@
+"""Where artefacts lie and what they were made from: the same place for every door."""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from sfkd_jax import artefacts
+from sfkd_jax.datasets import Dataset
+from sfkd_jax.types import BODY, Trajectory
+
+DATASET = "dataset"
+PARTS = ("train", "validation", "calibration", "test")
+IDENTITY = ("vehicle", "dataset", "model", "training", "seed")
+"""Settings that decide the weights; a run made with others is another run."""
+
+
+def run_directory(settings: dict[str, Any]) -> Path:
+    """root/name/system/seed=N."""
+    return Path(settings["root"]) / settings["name"] / settings["model"]["system"] / f"seed={settings['seed']}"
+
+
+def dataset_path(settings: dict[str, Any]) -> Path:
+    """Data sets are shared by all runs with the same vehicle and data settings."""
+    made_with = {"vehicle": settings["vehicle"], "dataset": settings["dataset"]}
+    name = f"{settings['vehicle']['name']}-{artefacts.sha256(made_with)[:8]}"
+    return Path(settings["root"]) / "datasets" / name / "dataset.npz"
+
+
+def dataset_config(settings: dict[str, Any]) -> dict[str, Any]:
+    """What a data set was made with."""
+    return {"vehicle": settings["vehicle"], "dataset": settings["dataset"]}
+
+
+def identity(settings: dict[str, Any]) -> dict[str, Any]:
+    """What a policy was made with."""
+    return {name: settings[name] for name in IDENTITY}
+
+
+def write_dataset(settings: dict[str, Any], dataset: Dataset) -> dict[str, Any]:
+    """Store the four splits; returns the manifest."""
+    arrays = {
+        f"{part}/{name}": np.asarray(leaf) for part in PARTS for name, leaf in getattr(dataset, part)._asdict().items()
+    }
+    path = dataset_path(settings)
+    path.parent.mkdir(parents=True, exist_ok=True)
+    return artefacts.write_arrays(path, arrays, kind=DATASET, config=dataset_config(settings))
+
+
+def read_dataset(settings: dict[str, Any]) -> tuple[Dataset, str]:
+    """The four splits and their hash."""
+    arrays, manifest = artefacts.read_arrays(dataset_path(settings), kind=DATASET, config=dataset_config(settings))
+    parts = [Trajectory(*(jnp.asarray(arrays[f"{part}/{name}"]) for name in Trajectory._fields)) for part in PARTS]
+    low, high = (jnp.asarray(settings["dataset"][name], dtype=jnp.float32) for name in ("env_low", "env_high"))
+    return Dataset(*parts, env_low=low, env_high=high), manifest["sha256"]
+
+
+def claim(settings: dict[str, Any]) -> None:
+    """Mark the run directory as made with these settings, or refuse if it was begun with others.
+
+    Raises:
+        ArtefactError: naming what differs.
+    """
+    path = run_directory(settings) / "settings.json"
+    if path.exists():
+        found = artefacts.differences(artefacts.read_json(path), identity(settings))
+        if found:
+            hint = "pass name=… for another run"
+            raise artefacts.ArtefactError(
+                f"{path.parent} was made with other settings ({'; '.join(found[:3])}); {hint}"
+            )
+        return
+    path.parent.mkdir(parents=True, exist_ok=True)
+    artefacts.write_json(path, identity(settings))
+
+
+def boxes(dataset: Dataset) -> dict[str, Any]:
+    """The domain that measurements come from: hulls of body state and control over training and calibration, and E."""
+
+    def hull(pick: Callable[[Trajectory], jax.Array]) -> list[list[float]]:
+        values = np.concatenate([np.asarray(pick(part)) for part in (dataset.train, dataset.calibration)])
+        flat = values.reshape(-1, values.shape[-1])
+        return [flat.min(axis=0).tolist(), flat.max(axis=0).tolist()]
+
+    return {
+        "state": hull(lambda part: part.states[..., BODY]),
+        "control": hull(lambda part: part.controls),
+        "env": [np.asarray(dataset.env_low).tolist(), np.asarray(dataset.env_high).tolist()],
+    }
+
+
+def open_loop_document(errors: jax.Array, trajectories: Trajectory, dt: float) -> dict[str, Any]:
+    """Prediction error by horizon, as the report reads it."""
+    columns = np.asarray(errors, dtype=np.float64).T
+    return {
+        "steps": list(range(1, columns.shape[1] + 1)),
+        "dt": dt,
+        "trajectories": trajectories.controls.shape[0],
+        "position_rmse_m": np.hypot(columns[0], columns[1]).tolist(),
+        "longitudinal_rmse_m": columns[0].tolist(),
+        "lateral_rmse_m": columns[1].tolist(),
+        "yaw_rmse_rad": columns[2].tolist(),
+        "speed_rmse_m_per_s": columns[3].tolist(),
+    }
+
+
+def say(text: str) -> None:
+    """Progress for a person; stdout's last line belongs to the JSON object."""
+    print(text, file=sys.stderr, flush=True)
+
+
+def streams(seed: int) -> dict[str, jax.Array]:
+    """Independent keys of a run, by purpose."""
+    names = ("training", "evaluation")
+    return {name: jax.random.fold_in(jax.random.key(seed), index) for index, name in enumerate(names)}

@@ -1,0 +1,6 @@
+"""The workshop: takes any `Model` and changes its params. The only room that knows optax and orbax."""
+
+from sfkd_jax.training._checkpoints import Checkpoints as Checkpoints
+from sfkd_jax.training._loop import TrainingStopped as TrainingStopped
+from sfkd_jax.training._loop import fit as fit
+from sfkd_jax.training._losses import multi_step_loss as multi_step_loss

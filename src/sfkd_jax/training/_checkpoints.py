@@ -1,0 +1,58 @@
+"""Latest and best training states on disk, through orbax."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import jax
+import orbax.checkpoint as ocp
+from orbax.checkpoint import checkpoint_managers as managers
+
+
+class Checkpoints:
+    """A directory that always holds the latest and the best state.
+
+    A save is atomic: a process killed in the middle leaves the states before it, and what is half written is
+    removed when the directory is opened again.
+    """
+
+    def __init__(self, directory: Path) -> None:
+        """Open `directory`, created if need be."""
+        def metric(metrics: dict[str, float]) -> float:
+            return metrics["validation_loss"]
+
+        best = managers.BestN(get_metric_fn=metric, reverse=True, n=1)
+        options = ocp.CheckpointManagerOptions(
+            preservation_policy=managers.AnyPreservationPolicy([managers.LatestN(1), best]),
+            best_fn=metric,
+            best_mode="min",
+            cleanup_tmp_directories=True,
+            enable_async_checkpointing=False,
+        )
+        self._manager = ocp.CheckpointManager(Path(directory).resolve(), options=options)
+
+    def save(self, step: int, state: Any, *, validation_loss: float) -> None:
+        """Write the state reached after `step` optimiser steps; a step already there is left alone."""
+        if step not in self._manager.all_steps():
+            metrics = {"validation_loss": float(validation_loss)}
+            self._manager.save(step, args=ocp.args.StandardSave(state), metrics=metrics)
+
+    def latest_step(self) -> int | None:
+        """The step of the newest state, or None."""
+        return self._manager.latest_step()
+
+    def best_step(self) -> int | None:
+        """The step of the state with the lowest validation loss, or None."""
+        scores = {step: self._manager.metrics(step) for step in self._manager.all_steps()}
+        losses = {step: score["validation_loss"] for step, score in scores.items() if score}
+        return min(losses, key=lambda step: losses[step]) if losses else None
+
+    def restore(self, step: int, like: Any) -> Any:
+        """The state saved at `step`, with the structure and types of `like`."""
+        abstract = jax.tree.map(ocp.utils.to_shape_dtype_struct, like)
+        return self._manager.restore(step, args=ocp.args.StandardRestore(abstract))
+
+    def close(self) -> None:
+        """Release the directory."""
+        self._manager.close()

@@ -1,0 +1,74 @@
+"""Where training metrics go: JSON lines and TensorBoard always, a progress bar on a terminal."""
+
+from __future__ import annotations
+
+import json
+import math
+import sys
+from pathlib import Path
+from types import TracebackType
+from typing import Self
+
+from rich.console import Console
+from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
+from tensorboardX import SummaryWriter
+
+
+class TrainingLog:
+    """A context that records metrics of a run; a resumed run forgets the lines after the step it resumes from."""
+
+    def __init__(self, directory: Path, *, steps: int, resumed_at: int) -> None:
+        """Open the log of a run.
+
+        Args:
+            directory: of the run. steps: how many there will be. resumed_at: lines after this step are dropped.
+        """
+        self._steps = steps
+        self._path = directory / "metrics.jsonl"
+        kept = [line for line in self._lines() if line["step"] <= resumed_at]
+        self._path.write_text("".join(json.dumps(line) + "\n" for line in kept))
+        self._board = SummaryWriter(str(directory / "tensorboard"), purge_step=resumed_at or None)
+        columns = (TextColumn("training"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn())
+        console = Console(stderr=True)
+        self._bar = Progress(*columns, TextColumn("{task.fields[note]}"), console=console)
+        self._task = self._bar.add_task("training", total=steps, completed=resumed_at, note="")
+        self._shows_bar = console.is_terminal
+
+    def _lines(self) -> list[dict]:
+        """Complete lines so far; a line cut off by a kill does not count."""
+        lines = self._path.read_text().splitlines() if self._path.exists() else []
+        complete = []
+        for line in lines:
+            try:
+                complete.append(json.loads(line))
+            except json.JSONDecodeError:
+                break
+        return complete
+
+    def __enter__(self) -> Self:
+        """Start the bar, if there is a terminal to show it."""
+        if self._shows_bar:
+            self._bar.start()
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        """Stop the bar, close the files."""
+        if self._shows_bar:
+            self._bar.stop()
+        self._board.close()
+
+    def write(self, record: dict[str, float]) -> None:
+        """Append one record; it must have `step`. What is not finite is left out."""
+        clean = {name: value for name, value in record.items() if math.isfinite(value)}
+        with self._path.open("a") as file:
+            file.write(json.dumps(clean) + "\n")
+        for name, value in clean.items():
+            if name != "step":
+                self._board.add_scalar(name, value, int(clean["step"]))
+        note = " ".join(f"{name} {clean[name]:.3g}" for name in ("loss", "validation_loss") if name in clean)
+        if self._shows_bar:
+            self._bar.update(self._task, completed=int(clean["step"]), note=note)
+        elif "validation_loss" in clean:
+            print(f"training {clean['step']:.0f} / {self._steps}  {note}", file=sys.stderr, flush=True)

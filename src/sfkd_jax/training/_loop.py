@@ -1,0 +1,141 @@
+"""The training loop: deterministic, resumable after a kill at any moment, stopped by a non-finite loss."""
+
+from __future__ import annotations
+
+import math
+import time
+from functools import partial
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import optax
+
+from sfkd_jax.datasets import Dataset, random_windows, windows
+from sfkd_jax.training._checkpoints import Checkpoints
+from sfkd_jax.training._log import TrainingLog
+from sfkd_jax.training._losses import Loss
+from sfkd_jax.training._optimizer import optimizer
+from sfkd_jax.types import Key, Model, Params, Trajectory
+
+
+class TrainingStopped(RuntimeError):
+    """Training cannot go on; the message says why and what is left on disk."""
+
+
+class TrainState(NamedTuple):
+    """Everything that training carries; keys are derived from `step`, so nothing else decides what comes next."""
+
+    step: jax.Array
+    params: Params
+    optimizer: Any
+
+
+def fit(
+    model: Model,
+    loss: Loss,
+    dataset: Dataset,
+    key: Key,
+    directory: Path,
+    *,
+    steps: int = 4000,
+    batch: int = 256,
+    window: int = 20,
+    learning_rate: float = 3e-3,
+    clip_norm: float = 100.0,
+    log_every: int = 50,
+    save_every: int = 500,
+) -> tuple[Params, int]:
+    """Train, or continue what `directory` holds, and return the parameters with the best validation loss.
+
+    Windows are drawn with a key folded with the step, so an interrupted run ends bit-identical to an unbroken one.
+
+    Args:
+        model, loss: what is trained, and by which loss.
+        dataset: windows come from `train`; `validation` selects.
+        key: for the initial parameters and the windows.
+        directory: gets checkpoints/, metrics.jsonl, tensorboard/.
+        steps, batch, window: optimiser steps, windows per step, steps per window.
+        learning_rate, clip_norm: see `optimizer`.
+        log_every: steps per compiled chunk and per log line. save_every: a multiple of it.
+
+    Returns:
+        Best parameters, and the step they were reached at.
+
+    Raises:
+        TrainingStopped: the loss or a gradient is not finite.
+        ValueError: windows longer than the trajectories, or save_every no multiple of log_every.
+    """
+    if save_every % log_every or steps % log_every:
+        raise ValueError(f"training.steps and save_every must be multiples of log_every = {log_every}")
+    init_key, data_key = jax.random.split(key)
+    transform, schedule = optimizer(steps=steps, learning_rate=learning_rate, clip_norm=clip_norm)
+    advance = _chunk(loss, transform, dataset.train, data_key, batch=batch, window=window, length=log_every)
+    held_out = _all_windows(dataset.validation, window)
+    validate = jax.jit(lambda params: loss(params, held_out))
+    params = jax.jit(model.init)(init_key)
+    state = TrainState(jnp.zeros((), jnp.int32), params, transform.init(params))
+    checkpoints = Checkpoints(directory / "checkpoints")
+    try:
+        start = checkpoints.latest_step() or 0
+        state = checkpoints.restore(start, state) if start else state
+        with TrainingLog(directory, steps=steps, resumed_at=start) as log:
+            began = time.perf_counter()
+            for done in range(start + log_every, steps + 1, log_every):
+                state, record = advance(state)
+                record = {name: float(value) for name, value in record.items()}
+                if not math.isfinite(record["loss"]) or not math.isfinite(record["gradient_norm"]):
+                    kept = checkpoints.latest_step()
+                    raise TrainingStopped(f"non-finite loss near step {done}; the last good checkpoint is step {kept}")
+                record |= {
+                    "step": done,
+                    "learning_rate": float(jnp.asarray(schedule(done))),
+                    "seconds": time.perf_counter() - began,
+                }
+                if done % save_every == 0 or done == steps:
+                    total, parts = validate(state.params)
+                    record |= {"validation_loss": float(total), "validation_prediction": float(parts["prediction"])}
+                    checkpoints.save(done, state, validation_loss=float(total))
+                log.write(record)
+        best = checkpoints.best_step() or steps
+        return checkpoints.restore(best, state).params, best
+    finally:
+        checkpoints.close()
+
+
+def _chunk(
+    loss: Loss,
+    transform: optax.GradientTransformation,
+    trajectories: Trajectory,
+    key: Key,
+    *,
+    batch: int,
+    window: int,
+    length: int,
+) -> Any:
+    """`length` optimiser steps as one compiled call: state -> state, mean metrics."""
+    gradient = jax.value_and_grad(loss, has_aux=True)
+
+    def step(state: TrainState, _: None) -> tuple[TrainState, dict[str, jax.Array]]:
+        window_key = jax.random.fold_in(key, state.step)
+        data = random_windows(trajectories, window_key, batch=batch, length=window)
+        (total, parts), grads = gradient(state.params, data)
+        updates, memory = transform.update(grads, state.optimizer, state.params)
+        after = TrainState(state.step + 1, optax.apply_updates(state.params, updates), memory)
+        return after, {"loss": total, "gradient_norm": optax.global_norm(grads), **parts}
+
+    @partial(jax.jit, donate_argnums=0)
+    def chunk(state: TrainState) -> tuple[TrainState, dict[str, jax.Array]]:
+        state, records = jax.lax.scan(step, state, length=length)
+        return state, jax.tree.map(jnp.mean, records)
+
+    return chunk
+
+
+def _all_windows(trajectories: Trajectory, length: int) -> Trajectory:
+    """Every trajectory cut at three places: start, middle and end."""
+    count, steps = trajectories.controls.shape[:2]
+    rows = jnp.tile(jnp.arange(count), 3)
+    starts = jnp.repeat(jnp.asarray([0, (steps - length) // 2, steps - length]), count)
+    return windows(trajectories, rows, starts, length=length)

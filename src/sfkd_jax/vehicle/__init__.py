@@ -1,0 +1,7 @@
+"""Truth: the plants, as pure steps. Nothing here is learned and nothing here decides."""
+
+from sfkd_jax.vehicle._dynamic import dynamic as dynamic
+from sfkd_jax.vehicle._integrators import rk4 as rk4
+from sfkd_jax.vehicle._kinematic import kinematic as kinematic
+from sfkd_jax.vehicle._vehicle import Vehicle as Vehicle
+from sfkd_jax.vehicle._vehicle import with_speed_loop as with_speed_loop

@@ -1,0 +1,143 @@
+"""The high-fidelity plant: a single track on brush tyres, with hidden slip and a steering actuator."""
+
+from __future__ import annotations
+
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+from sfkd_jax.types import Control, Environment, State, Step
+from sfkd_jax.vehicle._vehicle import (
+    ACCELERATION_RANGE,
+    GRAVITY,
+    STEERING_LIMIT,
+    Vehicle,
+    forward_rk4,
+    nominal_derivative,
+    resistance,
+    side_force,
+)
+
+BRAKING_SHARE = 0.95  # of μ g: the drive controller leaves the tyres some lateral grip
+
+
+def dynamic(
+    *,
+    dt: float = 0.1,
+    substeps: int = 5,
+    mass: float = 1500.0,
+    yaw_inertia: float = 2500.0,
+    front_length: float = 1.2,
+    rear_length: float = 1.5,
+    height: float = 0.55,
+    front_stiffness: float = 9.0e4,
+    rear_stiffness: float = 1.05e5,
+    steering_lag: float = 0.1,
+    steering_rate: float = 0.5,
+    wind_force: float = 10.0,
+    wind_lever: float = 0.4,
+    drag: float = 0.4,
+    rolling: float = 0.012,
+    creep_speed: float = 3.0,
+) -> Vehicle:
+    """Single track on brush tyres; x = (p_x, p_y, yaw, v, v_y, yaw rate ω, δ), p at the centre of mass.
+
+        a_x = 0.95 μ g tanh(a / (0.95 μ g)),   N_f, N_r = m (g l_r ∓ a_x h)/L,  m (g l_f ± a_x h)/L,
+        Y_i = −C_i t_i as long as it is small, never above √((μ N_i)² − (N_i a_x/g)²)        (`_brush`)
+        m (v̇ − v_y ω) = a_x (N_f cos δ + N_r)/g − Y_f sin δ − resistance,
+        m (v̇_y + v ω) = (N_f a_x/g) sin δ + Y_f cos δ + Y_r + F,
+        I ω̇ = l_f ((N_f a_x/g) sin δ + Y_f cos δ) − l_r Y_r + l_w F,   δ̇ = δ̇_max tanh((δ_cmd − δ)/(τ δ̇_max)),
+    F = c_w w|w|, t_i the slip (lateral over longitudinal speed in the frame of wheel i). Drive and brakes act
+    on both axles in proportion to load, so both use the same share of their circle. The cornering stiffness does
+    not depend on μ (only the limit does), unlike that of `kinematic`, which is linear in μ.
+
+    Below creep_speed slip is measured against a speed that stays above creep_speed / 2: the tyre is then a strong
+    damper of side slip, which is the kinematic bicycle, and the equations stay finite and non-stiff; the wind
+    fades out with v, because a tyre that does not roll holds the car. Needs dt / substeps ≤ 0.02 s with the given
+    stiffness, and μ > 0. A car that spins past 90° stops at v = 0 instead of rolling backwards.
+
+    Args:
+        dt: sampling period [s].
+        substeps: RK4 steps per period.
+        mass: [kg].
+        yaw_inertia: [kg m²].
+        front_length: front axle to centre of mass [m].
+        rear_length: rear axle to centre of mass [m].
+        height: of the centre of mass [m].
+        front_stiffness: cornering stiffness of the front axle [N/rad].
+        rear_stiffness: cornering stiffness of the rear axle [N/rad].
+        steering_lag: τ [s].
+        steering_rate: δ̇_max [rad/s].
+        wind_force: side force per squared wind speed, c_w [N s²/m²].
+        wind_lever: l_w, how far ahead of the centre of mass the side force acts [m].
+        drag: ρ C_d A / 2 [N s²/m²].
+        rolling: rolling resistance coefficient [-].
+        creep_speed: v_0, below it the tyres are regularised [m/s].
+    """
+    length = front_length + rear_length
+
+    def derivative(state: State, control: Control, env: Environment) -> State:
+        yaw, speed, side_speed, yaw_rate, steering = state[2], state[3], state[4], state[5], state[6]
+        grip = env[0] * GRAVITY
+        cos, sin = jnp.cos(steering), jnp.sin(steering)
+        drive = BRAKING_SHARE * grip * jnp.tanh(control[1] / (BRAKING_SHARE * grip))
+        front_mass = mass * (rear_length - height * drive / GRAVITY) / length
+        left_over = jnp.sqrt(grip**2 - drive**2)
+        rolls = jnp.clip(jnp.abs(speed) / creep_speed, 0.0, 1.0)
+        wind = rolls**2 * (3.0 - 2.0 * rolls) * side_force(env[1], wind_force=wind_force)
+
+        front_side = side_speed + front_length * yaw_rate
+        front_slip = _slip(speed * cos + front_side * sin, front_side * cos - speed * sin, creep_speed)
+        rear_slip = _slip(speed, side_speed - rear_length * yaw_rate, creep_speed)
+        front = _brush(front_slip, front_stiffness, front_mass * left_over)
+        rear = _brush(rear_slip, rear_stiffness, (mass - front_mass) * left_over)
+        forward = front_mass * drive * cos + (mass - front_mass) * drive - front * sin
+        sideways = front_mass * drive * sin + front * cos
+
+        slowed = resistance(speed, mass=mass, drag=drag, rolling=rolling)
+        return jnp.stack(
+            [
+                speed * jnp.cos(yaw) - side_speed * jnp.sin(yaw),
+                speed * jnp.sin(yaw) + side_speed * jnp.cos(yaw),
+                yaw_rate,
+                forward / mass + side_speed * yaw_rate - slowed,
+                (sideways + rear + wind) / mass - speed * yaw_rate,
+                (front_length * sideways - rear_length * rear + wind_lever * wind) / yaw_inertia,
+                steering_rate * jnp.tanh((control[0] - steering) / (steering_lag * steering_rate)),
+            ]
+        )
+
+    return Vehicle(
+        name="dynamic",
+        dt=dt,
+        wheelbase=length,
+        state_names=("p_x", "p_y", "yaw", "v", "v_y", "yaw_rate", "steering"),
+        step=forward_rk4(derivative, dt=dt, substeps=substeps),
+        derivative=derivative,
+        nominal=_quasi_steady(forward_rk4(nominal_derivative(length, rear_length), dt=dt), length, rear_length),
+        control_low=(-STEERING_LIMIT, ACCELERATION_RANGE[0]),
+        control_high=(STEERING_LIMIT, ACCELERATION_RANGE[1]),
+    )
+
+
+def _slip(along: Float[Array, ""], across: Float[Array, ""], creep_speed: float) -> Float[Array, ""]:
+    """Tangent of the slip angle, v_across / |v_along|; below v_0, |v| becomes (v² + v_0²)/(2 v_0) ≥ v_0/2 (C¹)."""
+    below = jnp.minimum(jnp.abs(along), creep_speed)
+    beyond = jnp.maximum(jnp.abs(along), creep_speed) - creep_speed
+    return across / ((below**2 + creep_speed**2) / (2.0 * creep_speed) + beyond)
+
+
+def _brush(slip: Float[Array, ""], stiffness: float, limit: Float[Array, ""]) -> Float[Array, ""]:
+    """Side force of a brush (Fiala) tyre, −F_max (3θ − 3θ|θ| + θ³), θ = C t / (3 F_max) held in [-1, 1]."""
+    bristle = jnp.clip(stiffness * slip / (3.0 * limit), -1.0, 1.0)
+    return -limit * bristle * (3.0 - 3.0 * jnp.abs(bristle) + bristle**2)
+
+
+def _quasi_steady(bicycle: Step, length: float, rear_length: float) -> Step:
+    """A 4-state bicycle on the 7-state vector: δ = δ_cmd, ω = v κ, v_y = l_r ω."""
+
+    def step(state: State, control: Control, env: Environment) -> State:
+        after = bicycle(state[:4], control, env)
+        yaw_rate = after[3] * jnp.tan(control[0]) / length
+        return jnp.concatenate([after, jnp.stack([rear_length * yaw_rate, yaw_rate, control[0]])])
+
+    return step

@@ -1,0 +1,17 @@
+"""Settings of the test run: they go through the environment, before jax is imported, and only where unset."""
+
+import os
+from pathlib import Path
+
+os.environ.setdefault("JAX_COMPILATION_CACHE_DIR", str(Path(__file__).parents[1] / ".jax_cache"))
+os.environ.setdefault("JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS", "0.2")
+os.environ.setdefault("JAX_PERSISTENT_CACHE_MIN_ENTRY_SIZE_BYTES", "-1")
+
+import jax
+import pytest
+
+
+@pytest.fixture
+def key() -> jax.Array:
+    """One key a test: `jax.random.split` it, never use it twice."""
+    return jax.random.key(0)

@@ -1,0 +1,147 @@
+"""Small builders that several test files share."""
+
+from functools import cache, partial
+
+import jax
+import jax.numpy as jnp
+
+from sfkd_jax import control, datasets, models, vehicle
+from sfkd_jax.types import Space, Trajectory
+
+jit = partial(jax.jit, compiler_options={"xla_backend_optimization_level": 0})
+"""jax.jit for what runs once: it compiles two to three times as fast."""
+
+ENV_LOW, ENV_HIGH = (0.3, -8.0), (0.9, 8.0)
+SHARES = (0.4, 0.2, 0.2, 0.2)
+TINY = {
+    "rank": 8,
+    "vertices": 3,
+    "residual_hidden": (8, 8),
+    "decoder_hidden": (8,),
+    "encoder_hidden": 8,
+    "embedding": 4,
+}
+VARIANTS = {
+    "sfkd": {},
+    "no_fiber": {"environment": False},
+    "no_transport": {"transport": False},
+    "no_residual": {"residual": "none"},
+    "no_contraction": {"residual": "free"},
+    "soft": {"residual": "free", "soft_penalty": 1.0},
+    "segment": {"frame": "segment"},
+}
+HARD = ("sfkd", "no_fiber", "no_transport", "segment")
+"""Variants whose residual is bounded by construction (and is there)."""
+STRUCTURE = {"no_contraction": "soft", "no_residual": "soft", "soft": "soft", "segment": "segment"}
+"""Whose initial parameters a variant shares, if not those of sfkd."""
+PHYSICS = ("oracle", "nominal")
+
+
+def space(body=1):
+    """Scales about those of the kinematic plant (body = 1) or the dynamic one (body = 4)."""
+    return Space(
+        body_mean=jnp.zeros(body).at[0].set(10.0),
+        body_scale=jnp.full(body, 0.5).at[0].set(4.0),
+        control_mean=jnp.asarray([0.0, 0.2]),
+        control_scale=jnp.asarray([0.2, 2.0]),
+        env_mean=jnp.asarray([0.6, 0.0]),
+        env_scale=jnp.asarray([0.3, 8.0]),
+        increment_mean=jnp.asarray([1.0, 0.0, 0.0]),
+        increment_scale=jnp.asarray([0.3, 0.05, 0.1]),
+    )
+
+
+def tiny(name="sfkd", **changes):
+    """A tiny SFKD of some variant."""
+    body = changes.pop("body", 1)
+    return models.sfkd(space(body), **TINY | VARIANTS[name] | changes)
+
+
+@cache
+def model_and_params(name="sfkd", scale=1.0):
+    """A model by the name of a variant or of a physics row, and parameters `scale` times as large as at the start."""
+    plant = vehicle.kinematic()
+    if name in PHYSICS:
+        return models.physics(plant.step if name == "oracle" else plant.nominal), {}
+    return tiny(name), jax.tree.map(lambda leaf: scale * leaf, _params(STRUCTURE.get(name, "sfkd")))
+
+
+@cache
+def _params(name):
+    """Initial parameters, once for all variants whose parameters have the same names and shapes."""
+    return jit(tiny(name).init)(jax.random.key(1))
+
+
+def drive(plant, initial, controls, envs):
+    """The plant's own trajectory, x_{k+1} = step(x_k, u_k, e_k), without any model."""
+
+    def step(state, inputs):
+        after = plant.step(state, *inputs)
+        return after, after
+
+    _, states = jax.lax.scan(step, initial, (controls, envs))
+    return Trajectory(jnp.concatenate([initial[None], states]), controls, envs)
+
+
+@cache
+def driven(count=3, steps=12):
+    """A few trajectories of the kinematic plant with bold controls and an environment that switches at every step."""
+    plant = vehicle.kinematic()
+    start_key, control_key, env_key = jax.random.split(jax.random.key(5), 3)
+    spread = jnp.asarray([3.0, 3.0, 4.0, 2.0])
+    initial = jnp.asarray([0.0, 0.0, 0.0, 10.0]) + spread * jax.random.uniform(start_key, (count, 4), minval=-1.0)
+    controls = jnp.asarray([0.1, 1.0]) * jax.random.uniform(control_key, (count, steps, 2), minval=-1.0)
+    low, high = jnp.asarray(ENV_LOW), jnp.asarray(ENV_HIGH)
+    envs = low + (high - low) * jax.random.uniform(env_key, (count, steps, 2))
+    return jit(jax.vmap(partial(drive, plant)))(initial, controls, envs)
+
+
+def driver(plant):
+    """The path-following law that keeps data collection on the road."""
+    law = control.path_feedback(wheelbase=plant.wheelbase, speed_loop=plant.speed_loop)
+
+    def follow(state, reference):
+        curvature = control.reference_curvature(reference)[0]
+        return law(control.path_errors(state, reference[0], curvature), curvature, reference[0, 3])
+
+    return follow
+
+
+@cache
+def segments(count=120, steps=25, seed=0):
+    """A small batch of training segments of the kinematic plant."""
+    plant = vehicle.kinematic()
+    make = partial(datasets.generate, plant, driver(plant), segments=count, steps=steps)
+    return jit(make)(jax.random.key(seed))
+
+
+@cache
+def dataset(count=120, steps=25):
+    """The same, dealt to the four splits."""
+    low, high = jnp.asarray(ENV_LOW), jnp.asarray(ENV_HIGH)
+    return datasets.split(segments(count, steps), jax.random.key(1), shares=SHARES, env_low=low, env_high=high)
+
+
+def straight(horizon, speed=10.0, dt=0.1):
+    """A reference along the x axis."""
+    ahead = speed * dt * jnp.arange(1, horizon + 1)
+    zeros = jnp.zeros(horizon)
+    return jnp.stack([ahead, zeros, zeros, jnp.full(horizon, speed)], axis=1)
+
+
+def at(tree, index):
+    """One entry along the leading axis of every leaf."""
+    return jax.tree.map(lambda leaf: leaf[index], tree)
+
+
+def same(left, right, **tolerance):
+    """Whether two pytrees have the same structure and (nearly) the same leaves; NaN equals NaN, keys count."""
+    if jax.tree.structure(left) != jax.tree.structure(right):
+        return False
+    pairs = zip(jax.tree.leaves(left), jax.tree.leaves(right), strict=True)
+    return all(jnp.allclose(_plain(a), _plain(b), equal_nan=True, **tolerance) for a, b in pairs)
+
+
+def _plain(leaf):
+    """Keys as the numbers behind them."""
+    return jax.random.key_data(leaf) if jnp.issubdtype(leaf.dtype, jax.dtypes.prng_key) else leaf

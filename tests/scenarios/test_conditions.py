@@ -1,0 +1,155 @@
+"""Friction and wind over time: the three schedules of the benchmark, and the gusts."""
+
+from functools import partial
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from helpers import jit
+
+from sfkd_jax.scenarios import gusts, scenario, switching_road, uniform_road, wet_road
+
+STEPS, DT = 600, 0.1
+KEYS = jax.random.split(jax.random.key(7), 64)
+
+
+def many(schedule, keys=KEYS, **settings):
+    return np.asarray(jit(jax.vmap(partial(schedule, **settings)))(keys))
+
+
+@pytest.fixture(scope="module")
+def s3():
+    return many(switching_road, steps=STEPS, dt=DT)
+
+
+@pytest.fixture(scope="module")
+def s2():
+    return many(wet_road, steps=STEPS, dt=DT)
+
+
+def test_s1_is_constant_and_calm():
+    envs = many(uniform_road, steps=20)
+    np.testing.assert_array_equal(envs, np.broadcast_to(np.float32([0.9, 0.0]), envs.shape))
+
+
+def test_s1_with_a_range_draws_one_level_an_episode_evenly():
+    envs = many(uniform_road, steps=5, friction=(0.3, 0.9), keys=jax.random.split(jax.random.key(1), 2000))
+    assert np.all(envs == envs[:, :1])
+    assert kolmogorov_distance(envs[:, 0, 0], 0.3, 0.9) < 1.63 / np.sqrt(2000)
+
+
+def test_s2_drops_once_and_exactly_at_five_seconds(s2):
+    before, after = s2[:, : round(5 / DT), 0], s2[:, round(5 / DT) :, 0]
+    np.testing.assert_array_equal(before, np.full_like(before, 0.7))
+    np.testing.assert_array_equal(after, np.full_like(after, 0.35))
+
+
+@pytest.mark.parametrize("dt", [0.02, 0.05, 0.1, 0.2])
+def test_the_drop_falls_on_the_same_second_whatever_the_sampling(dt):
+    friction = many(wet_road, keys=KEYS[:1], steps=round(10 / dt), dt=dt)[0, :, 0]
+    assert int(np.argmax(friction < 0.5)) == round(5 / dt)
+
+
+def test_s2_with_ranges_stays_in_them_and_drops_at_every_time():
+    settings = {"before": (0.55, 0.9), "after": (0.3, 0.5), "drop_time": (0.0, 5.0)}
+    friction = many(wet_road, steps=50, dt=DT, keys=jax.random.split(jax.random.key(2), 500), **settings)[..., 0]
+    high, low = friction > 0.52, friction < 0.52
+    assert friction[high].min() >= 0.55 - 1e-6
+    assert friction[high].max() <= 0.9
+    assert friction[low].min() >= 0.3
+    assert friction[low].max() <= 0.5
+    assert np.all(np.diff(low.astype(int), axis=1) >= 0)  # never back up
+    assert kolmogorov_distance(high.sum(axis=1) * DT, 0.0, 5.0) < 1.63 / np.sqrt(500) + DT / 5.0
+
+
+def test_gusts_never_exceed_their_peak():
+    assert np.abs(many(gusts, steps=STEPS, dt=DT, peak=8.0)).max() <= 8.0 + 1e-5
+
+
+def test_gusts_cover_the_whole_range_evenly():
+    """Levels are held for 2 s on average and joined by ramps of 0.5 s; one level is independent of the next."""
+    keys = jax.random.split(jax.random.key(11), 3000)
+    wind = many(gusts, keys=keys, steps=60, dt=DT, peak=8.0)
+    # At the start every value is a level: a true Kolmogorov-Smirnov test at 1 %.
+    assert kolmogorov_distance(wind[:, 0], -8.0, 8.0) < 1.63 / np.sqrt(3000)
+    # Later a quarter of the values lies on ramps, which favour the middle a little.
+    assert kolmogorov_distance(wind[:, 40], -8.0, 8.0) < 0.06
+
+
+def test_gusts_are_smooth():
+    """A 1 − cos ramp of height h and duration τ is never steeper than π h / (2 τ)."""
+    wind = many(gusts, steps=STEPS, dt=DT, peak=8.0)
+    assert np.abs(np.diff(wind, axis=1)).max() <= np.pi * 16.0 / (2 * 0.5) * DT + 1e-4
+
+
+def test_gusts_keep_blowing_to_the_end():
+    wind = many(gusts, steps=STEPS, dt=DT, peak=8.0)
+    assert np.all(np.ptp(wind[:, -100:], axis=1) > 0.1)
+
+
+def test_s3_visits_a_b_c_b_a_for_exactly_three_seconds_each(s3):
+    visit = np.arange(STEPS) // round(3 / DT)
+    friction = np.float32([0.9, 0.6, 0.3, 0.6])[visit % 4]
+    wind = np.float32([0.0, 4.0, 8.0, 4.0])[visit % 4]
+    np.testing.assert_array_equal(s3[..., 0], np.broadcast_to(friction, s3.shape[:2]))
+    np.testing.assert_array_equal(np.abs(s3[..., 1]), np.broadcast_to(wind, s3.shape[:2]))
+
+
+@pytest.mark.parametrize(("dt", "steps"), [(0.02, 3000), (0.05, 1200), (0.1, 3000)])
+def test_s3_keeps_its_period_over_long_episodes_and_fine_sampling(dt, steps):
+    friction = many(switching_road, keys=KEYS[:1], steps=steps, dt=dt)[0, :, 0]
+    visit = np.arange(steps) // round(3 / dt)
+    np.testing.assert_array_equal(friction, np.float32([0.9, 0.6, 0.3, 0.6])[visit % 4])
+
+
+def test_s3_holds_the_side_of_the_wind_for_a_visit_and_draws_it_anew_for_the_next(s3):
+    visits = s3[..., 1].reshape(len(KEYS), -1, 30)
+    assert np.all(visits == visits[..., :1])
+    windy = np.sign(visits[:, :, 0][:, np.arange(20) % 4 > 0])
+    assert abs(windy.mean()) < 4 / np.sqrt(windy.size)
+    repeated = np.mean(windy[:, 1:] == windy[:, :-1])
+    assert abs(repeated - 0.5) < 4 * 0.5 / np.sqrt(windy[:, 1:].size)
+
+
+def kolmogorov_distance(values, low, high):
+    """sup |empirical distribution − uniform distribution|."""
+    ranks = np.arange(len(values) + 1) / len(values)
+    uniform = (np.sort(values) - low) / (high - low)
+    return max(np.max(ranks[1:] - uniform), np.max(uniform - ranks[:-1]))
+
+
+def make(name, duration=6.0, **settings):
+    return scenario(name=name, duration=duration, state_size=4, dt=DT, **settings)
+
+
+def test_an_unknown_name_lists_the_choices():
+    with pytest.raises(ValueError, match=r"'s4'.*s1, s2, s3"):
+        make("s4")
+
+
+@pytest.mark.parametrize("name", ["s1", "s2", "s3"])
+def test_a_batch_of_episodes_is_one_pytree_of_different_roads(name):
+    batch = jit(jax.vmap(make(name)))(KEYS[:4])
+    single = jit(make(name))(KEYS[2])
+    assert batch.envs.shape == (4, 60, 2)
+    assert batch.initial_state.shape == (4, 4)
+    for many_leaf, leaf in zip(jax.tree.leaves(batch), jax.tree.leaves(single), strict=True):
+        np.testing.assert_allclose(many_leaf[2], leaf, atol=1e-4)
+    ends = np.asarray(batch.path.points[:, -1, 1])
+    assert len(np.unique(ends.round(3))) == 4
+
+
+def test_an_episode_starts_on_the_path_at_its_speed_and_the_path_outlasts_it():
+    episode = jit(make("s2", duration=20.0, speed=12.0))(KEYS[0])
+    np.testing.assert_array_equal(episode.initial_state, [0.0, 0.0, 0.0, 12.0])
+    np.testing.assert_array_equal(episode.path.points[0, :3], jnp.zeros(3))
+    assert (len(episode.path.points) - 1) * float(episode.path.spacing) >= 12.0 * 20.0 + 12.0 * 2.0
+    assert float(episode.speed) == 12.0
+
+
+def test_road_and_weather_come_from_independent_streams():
+    """The same key drives the same road whatever the weather."""
+    roads = [jit(make(name))(KEYS[0]).path.points for name in ("s1", "s2", "s3")]
+    np.testing.assert_array_equal(roads[0], roads[1])
+    np.testing.assert_array_equal(roads[0], roads[2])

@@ -1,0 +1,172 @@
+"""The house, as stated in ARCHITECTURE.md, held against the source text."""
+
+import ast
+import importlib.util
+import os
+import subprocess
+import sys
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+FUNCTION = (ast.FunctionDef, ast.AsyncFunctionDef)
+SRC = Path(__file__).parents[1] / "src" / "sfkd_jax"
+PACKAGE = SRC.name
+HALLWAY = {"types", "se2", "rollouts"}
+DOORS = {"generate", "train", "certify", "evaluate", "report"}
+ARROWS = {
+    "types": HALLWAY,
+    "se2": HALLWAY,
+    "rollouts": HALLWAY,
+    "artefacts": set(),
+    "vehicle": HALLWAY,
+    "scenarios": HALLWAY | {"vehicle"},
+    "datasets": HALLWAY | {"vehicle", "scenarios"},
+    "models": HALLWAY,
+    "training": HALLWAY,
+    "certification": HALLWAY,
+    "control": HALLWAY,
+    "evaluation": HALLWAY | {"vehicle", "scenarios"},
+    "reporting": {"artefacts"},
+    "assembly": HALLWAY | {"vehicle", "scenarios", "datasets", "models", "control"},
+    "shelf": HALLWAY | {"artefacts", "datasets"},
+    "policy": HALLWAY | {"artefacts", "assembly", "models", "control"},
+    "__init__": {"artefacts", "policy"},
+}
+EVERY_ROOM = set(ARROWS)
+ARROWS |= {"config": EVERY_ROOM} | {door: EVERY_ROOM | DOORS | {"config"} for door in DOORS}
+
+EVERYWHERE = set(sys.stdlib_module_names) | {PACKAGE, "jax", "jaxtyping"}
+FRONT = {"hydra", "omegaconf", "numpy", "rich"}
+THIRD_PARTY = {
+    "artefacts": {"numpy"},
+    "datasets": {"numpy"},
+    "models": {"flax"},
+    "control": {"flax"},
+    "training": {"optax", "orbax", "tensorboardX", "rich"},
+    "certification": {"numpy", "cvxpy", "clarabel"},
+    "evaluation": {"numpy"},
+    "reporting": {"numpy", "matplotlib"},
+    "shelf": {"numpy"},
+    "policy": {"numpy"},
+} | {front: FRONT for front in DOORS | {"config"}}
+
+FILES = {file.relative_to(SRC).as_posix(): ast.parse(file.read_text("utf-8")) for file in SRC.rglob("*.py")}
+ROOMS = {name: name.split("/")[0].removesuffix(".py") for name in FILES}
+WORKSHOP = {"hydra", "omegaconf", "cvxpy", "clarabel", "orbax", "brax", "matplotlib", "optax"}
+WRITES = {f"os.environ.{verb}" for verb in ("update", "setdefault", "pop", "popitem", "clear")}
+FORBIDDEN = WRITES | {"os.putenv", "os.unsetenv", "jax.config"}
+
+
+def imports(name: str) -> Iterator[str]:
+    """Absolute dotted names of all that a file imports, at any depth of its text."""
+    package = ".".join((PACKAGE, *Path(name).parent.parts))
+    for node in ast.walk(FILES[name]):
+        if isinstance(node, ast.Import):
+            yield from (alias.name for alias in node.names)
+        elif isinstance(node, ast.ImportFrom):
+            base = importlib.util.resolve_name("." * node.level + (node.module or ""), package)
+            yield from (f"{base}.{alias.name}" for alias in node.names)
+
+
+def own(name: str) -> Iterator[list[str]]:
+    """The imports from this package, as [room, the rest ...]; the version string belongs to no room."""
+    for imported in imports(name):
+        package, *rest = imported.split(".")
+        if package == PACKAGE and rest != ["__version__"]:
+            yield rest or ["__init__"]
+
+
+def nodes(name: str, *kinds: type) -> list:
+    return [node for node in ast.walk(FILES[name]) if isinstance(node, kinds)]
+
+
+def own_lines(function: ast.FunctionDef) -> int:
+    """Lines of a function that are its own: not its docstring, not the functions defined inside it."""
+    inner = [node for node in ast.walk(function) if isinstance(node, FUNCTION) and node is not function]
+    inner += [function.body[0]] if ast.get_docstring(function) else []
+    taken = {line for node in inner for line in range(node.lineno, node.end_lineno + 1)}
+    return len(set(range(function.lineno, function.end_lineno + 1)) - taken)
+
+
+def unannotated(function: ast.FunctionDef) -> bool:
+    given = function.args
+    arguments = [*given.posonlyargs, *given.args, *given.kwonlyargs, given.vararg, given.kwarg]
+    bare = [a for a in arguments if a and a.annotation is None and a.arg not in ("self", "cls")]
+    return bool(bare) or function.returns is None
+
+
+def fresh(code: str, **settings: str) -> str:
+    """What a fresh process prints; it starts without the settings of the tests."""
+    inherited = {name: value for name, value in os.environ.items() if not name.startswith("JAX_")}
+    inherited.pop("PYTHONDONTWRITEBYTECODE", None)
+    command = [sys.executable, "-c", code]
+    done = subprocess.run(command, env=inherited | settings, capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stderr
+    return done.stdout
+
+
+def test_every_file_has_a_room_and_follows_the_arrows():
+    assert FILES
+    assert set(ROOMS.values()) <= set(ARROWS), "state the new room's arrows here and in ARCHITECTURE.md"
+    reached = {(name, rest[0]) for name in FILES for rest in own(name)}
+    assert sorted(pair for pair in reached if pair[1] not in ARROWS[ROOMS[pair[0]]] | {ROOMS[pair[0]]}) == []
+
+
+def test_rooms_are_entered_through_their_public_names():
+    reached = [(name, rest) for name in FILES for rest in own(name) if rest[0] != ROOMS[name]]
+    assert [(name, rest) for name, rest in reached if any(part.startswith("_") for part in rest[1:])] == []
+
+
+def test_third_party_packages_stay_in_their_rooms():
+    reached = {(name, imported.split(".")[0]) for name in FILES for imported in imports(name)}
+    allowed = {name: EVERYWHERE | THIRD_PARTY.get(room, set()) for name, room in ROOMS.items()}
+    assert sorted((name, package) for name, package in reached if package not in allowed[name]) == []
+
+
+def test_files_and_functions_stay_small():
+    assert [name for name in FILES if len((SRC / name).read_text("utf-8").splitlines()) > 220] == []
+    functions = [(name, node) for name in FILES for node in nodes(name, *FUNCTION)]
+    assert [(name, node.name) for name, node in functions if own_lines(node) > 60] == []
+
+
+def test_public_functions_are_annotated():
+    scopes = [(n, s) for n in FILES for s in (FILES[n], *nodes(n, ast.ClassDef))]
+    functions = [(n, node) for n, scope in scopes for node in scope.body if isinstance(node, FUNCTION)]
+    assert [(n, f.name) for n, f in functions if not f.name.startswith("_") and unannotated(f)] == []
+
+
+def test_only_doors_and_training_compile():
+    library = [name for name in FILES if ROOMS[name] not in DOORS | {"training"}]
+    assert [name for name in library if {"jax.jit", "jax.pmap"} & set(imports(name))] == []
+    uses = [(name, node) for name in library for node in nodes(name, ast.Attribute)]
+    assert [(n, node.lineno) for n, node in uses if ast.unparse(node) in ("jax.jit", "jax.pmap")] == []
+
+
+def test_the_library_leaves_global_settings_alone():
+    library = [name for name in FILES if ROOMS[name] not in DOORS | {"config"}]
+    assert [name for name in library if (FORBIDDEN | {"os.environ"}) & set(imports(name))] == []
+    uses = [(name, node) for name in library for node in nodes(name, ast.Attribute)]
+    assert [(n, node.lineno) for n, node in uses if ast.unparse(node) in FORBIDDEN] == []
+    items = [(name, node) for name in library for node in nodes(name, ast.Subscript)]
+    written = [(n, node) for n, node in items if not isinstance(node.ctx, ast.Load)]
+    assert [(n, node.lineno) for n, node in written if ast.unparse(node.value) == "os.environ"] == []
+
+
+@pytest.mark.parametrize(("module", "kept_out"), [("control", WORKSHOP), ("policy", WORKSHOP - {"optax"})])
+def test_a_controller_is_imported_without_the_workshop(module, kept_out):
+    if importlib.util.find_spec(f"{PACKAGE}.{module}") is None:
+        pytest.skip("not built yet")
+    code = f"import sys, {PACKAGE}.{module}; print(*{{name.split('.')[0] for name in sys.modules}})"
+    assert not kept_out & set(fresh(code).split())
+
+
+def test_importing_the_controller_costs_little_beyond_jax(tmp_path):
+    """Processor seconds, minimum over alternating fresh processes that share one bytecode cache."""
+    timed = "import time; start = time.process_time(); import {}; print(time.process_time() - start)"
+    seconds: dict[str, list[float]] = {"jax": [], f"{PACKAGE}.control": []}
+    for _ in range(5):
+        for module, measured in seconds.items():
+            measured.append(float(fresh(timed.format(module), PYTHONPYCACHEPREFIX=str(tmp_path))))
+    assert min(seconds[f"{PACKAGE}.control"]) <= 1.3 * min(seconds["jax"])

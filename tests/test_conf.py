@@ -1,0 +1,71 @@
+"""Every option of every group composes, builds, and is refused when it is wrong."""
+
+from pathlib import Path
+
+import pytest
+from hydra import compose, initialize_config_dir
+from hydra.errors import HydraException
+from omegaconf import OmegaConf
+from omegaconf.errors import OmegaConfBaseException
+
+from sfkd_jax import assembly, config, models
+from tests.helpers import SPACE
+
+CONF = Path(config.conf_path())
+GROUPS = sorted(folder.name for folder in CONF.iterdir() if folder.is_dir() and not folder.name.startswith("_"))
+OPTIONS = [(group, file.stem) for group in GROUPS for file in sorted((CONF / group).glob("*.yaml"))]
+MODELS = [name for group, name in OPTIONS if group == "model"]
+
+
+def settings(*overrides: str) -> dict:
+    config.register()
+    with initialize_config_dir(str(CONF), version_base="1.3"):
+        return OmegaConf.to_container(compose("config", overrides=list(overrides)), resolve=True)
+
+
+@pytest.mark.parametrize(("group", "option"), OPTIONS)
+def test_every_option_composes(group, option):
+    prefix = "+" if group == "experiment" else ""
+    composed = settings(f"{prefix}{group}={option}")
+    assert composed["seed"] == 0
+
+
+@pytest.mark.parametrize("option", MODELS)
+def test_every_model_option_builds_and_names_its_system(option):
+    composed = settings(f"model={option}")
+    assert composed["model"]["system"] == option
+    assembly.build_model(composed["model"], SPACE)
+
+
+@pytest.mark.parametrize("vehicle", [name for group, name in OPTIONS if group == "vehicle"])
+@pytest.mark.parametrize("controller", [name for group, name in OPTIONS if group == "controller"])
+def test_every_controller_builds_for_every_vehicle(vehicle, controller):
+    composed = settings(f"vehicle={vehicle}", f"controller={controller}")
+    plant = assembly.build_vehicle(composed["vehicle"])
+    system = assembly.reference_systems(plant)["oracle"]
+    assembly.build_controller(composed["controller"], system.model, plant)
+    assembly.build_scenario(composed["scenario"], plant, duration=6.0)
+
+
+def test_every_learned_model_has_an_option_file():
+    assert set(models.FACTORIES) <= set(MODELS)
+
+
+def test_option_files_stay_short():
+    assert all(len((CONF / group / f"{name}.yaml").read_text().splitlines()) <= 15 for group, name in OPTIONS)
+
+
+@pytest.mark.parametrize(
+    ("override", "says"),
+    [
+        ("+experiment=s9", "s1"),
+        ("model=sfdk", "sfkd_no_fiber"),
+        ("model.rnk=3", "rnk"),
+        ("model.rank=abc", "abc"),
+        ("modle.rank=3", "modle"),
+        ("training.loss.growht=1", "growht"),
+    ],
+)
+def test_a_wrong_option_is_refused_by_name(override, says):
+    with pytest.raises((HydraException, OmegaConfBaseException), match=says):
+        settings(override)

@@ -1,0 +1,86 @@
+"""What a model does along a trajectory, where the answer is known: the true plant as a model."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from helpers import at, driven, jit, model_and_params
+
+from sfkd_jax.rollouts import defects, fibers_along, rollout
+
+
+@pytest.fixture(scope="module")
+def one():
+    return at(driven(), 0)
+
+
+def run(function, name, trajectory):
+    model, params = model_and_params(name)
+    return jit(lambda params, data: function(model, params, data))(params, trajectory)
+
+
+def test_the_true_plant_as_a_model_reproduces_the_plants_trajectory(one):
+    states, _, _ = run(rollout, "oracle", one)
+    np.testing.assert_allclose(states, one.states[1:], rtol=0, atol=1e-5)
+
+
+def test_the_true_plant_as_a_model_has_no_defects(one):
+    gaps, predicted = run(defects, "oracle", one)
+    np.testing.assert_allclose(gaps, jnp.zeros_like(gaps), rtol=0, atol=2e-6)
+    np.testing.assert_allclose(predicted, one.states[1:], rtol=0, atol=2e-6)
+
+
+def test_a_wrong_model_has_defects_and_its_errors_grow(one):
+    states, _, _ = run(rollout, "nominal", one)
+    gaps, _ = run(defects, "nominal", one)
+    errors = jnp.linalg.norm(states[:, :2] - one.states[1:, :2], axis=1)
+    assert float(jnp.max(jnp.abs(gaps))) > 1e-3
+    assert float(errors[-1]) > 3 * float(errors[0]) > 0
+
+
+def test_fibres_are_those_of_each_step_and_of_the_one_after(one):
+    now, later = run(fibers_along, "oracle", one)  # the fibre of a physics model is e itself
+    np.testing.assert_array_equal(now, one.envs)
+    np.testing.assert_array_equal(later[:-1], one.envs[1:])
+    np.testing.assert_array_equal(later[-1], one.envs[-1])
+
+
+@pytest.mark.parametrize("name", ["sfkd", "segment"])
+def test_the_first_prediction_is_the_one_step_prediction(one, name):
+    states, _, _ = run(rollout, name, one)
+    _, predicted = run(defects, name, one)
+    np.testing.assert_allclose(states[0], predicted[0], atol=1e-5)
+
+
+@pytest.mark.parametrize("name", ["sfkd", "segment"])
+def test_a_trajectory_that_the_model_made_itself_has_no_defect_where_the_encoder_inverts_the_decoder(one, name):
+    """d_k compares latents: with the rollout's own latents put in place of the encoder's, nothing is left."""
+    model, params = model_and_params(name)
+
+    @jit
+    def gap(params, data):
+        _, latents, (fibers, later) = rollout(model, params, data)
+        start = model.encode(at(fibers, 0), data.states[0])
+        before = jax.tree.map(lambda first, rest: jnp.concatenate([first[None], rest[:-1]]), start, latents)
+        after = jax.vmap(model.transport)(fibers, later, jax.vmap(model.step)(fibers, before, data.controls))
+        return model.vector(jax.tree.map(jnp.subtract, after, latents))
+
+    assert float(jnp.max(jnp.abs(gap(params, one)))) < 1e-6
+
+
+def test_a_defect_is_what_transport_leaves_on_a_switch(one):
+    """With e held, T = I: the defects of the variant without transport agree with the definition by hand."""
+    model, params = model_and_params("no_transport")
+    held = one._replace(envs=jnp.tile(one.envs[:1], (len(one.envs), 1)))
+
+    @jit
+    def by_hand(params, data):
+        fiber = model.fiber(params, data.envs[0])
+        latents = jax.vmap(model.encode, in_axes=(None, 0))(fiber, data.states)
+        before = jax.tree.map(lambda leaf: leaf[:-1], latents)
+        stepped = jax.vmap(model.step, in_axes=(None, 0, 0))(fiber, before, data.controls)
+        return latents.z[1:] - stepped.z
+
+    gaps, _ = run(defects, "no_transport", held)
+    np.testing.assert_allclose(gaps, by_hand(params, held), atol=1e-6)
+    assert float(jnp.max(jnp.abs(gaps))) > 1e-4

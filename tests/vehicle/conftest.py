@@ -1,0 +1,76 @@
+"""Two plants, double precision where mathematics is compared, and a way to drive."""
+
+from collections.abc import Callable, Iterator
+from functools import partial
+from types import SimpleNamespace
+
+import jax
+import jax.numpy as jnp
+import pytest
+
+from sfkd_jax.vehicle import dynamic, kinematic
+
+PLANTS = {"kinematic": kinematic, "dynamic": dynamic}
+LIMITS = {3: (0.0, 25.0), 4: (-4.0, 4.0), 5: (-1.5, 1.5), 6: (-0.5, 0.5)}
+
+
+@pytest.fixture(params=list(PLANTS))
+def factory(request) -> Callable:
+    return PLANTS[request.param]
+
+
+@pytest.fixture
+def vehicle(factory):
+    return factory()
+
+
+@pytest.fixture
+def coasting(factory):
+    """The same plant without drag and rolling resistance: what accelerates it are its tyres and the wind."""
+    return factory(drag=0.0, rolling=0.0)
+
+
+@pytest.fixture
+def x64() -> Iterator[None]:
+    with jax.enable_x64(True):
+        yield
+
+
+@partial(jax.jit, static_argnums=(0, 4))
+def _hold(vehicle, state, control, env, steps):
+    def move(x, _):
+        x = vehicle.step(x, control, env)
+        return x, x
+
+    return jnp.concatenate([state[None], jax.lax.scan(move, state, None, length=steps)[1]])
+
+
+@pytest.fixture
+def hold() -> Callable:
+    """(vehicle, speed or state, control, env, seconds) -> states x_0 … x_T under a control that is held."""
+
+    def drive(vehicle, start, control, env, seconds):
+        size = len(vehicle.state_names)
+        state = jnp.zeros(size).at[3].set(start) if jnp.ndim(start) == 0 else start
+        return _hold(vehicle, state, jnp.array(control), jnp.array(env), round(seconds / vehicle.dt))
+
+    return drive
+
+
+@pytest.fixture
+def sweep() -> Callable:
+    """(vehicle, key, count, overdrive) -> random states, controls and envs; every second row sits on the bounds."""
+
+    def draw(vehicle, key, count, overdrive=1.0):
+        size = len(vehicle.state_names)
+        low, high = jnp.array([(-50.0, 50.0), (-50.0, 50.0), (-3.0, 3.0), *(LIMITS[i] for i in range(3, size))]).T
+        u_low, u_high = jnp.array(vehicle.control_low) * overdrive, jnp.array(vehicle.control_high) * overdrive
+        low, high = jnp.append(low, u_low), jnp.append(high, u_high)
+        low, high = jnp.append(low, jnp.array([0.3, -8.0])), jnp.append(high, jnp.array([0.9, 8.0]))
+        inside, corner = jax.random.split(key)
+        share = jax.random.uniform(inside, (count, low.size))
+        extreme = jax.random.randint(corner, (count, low.size), 0, 3) / 2
+        rows = low + (high - low) * jnp.where(jnp.arange(count)[:, None] % 2 == 0, share, extreme)
+        return SimpleNamespace(states=rows[:, :size], controls=rows[:, size : size + 2], envs=rows[:, size + 2 :])
+
+    return draw
