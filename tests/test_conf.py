@@ -3,13 +3,13 @@
 from pathlib import Path
 
 import pytest
+from helpers import space
 from hydra import compose, initialize_config_dir
 from hydra.errors import HydraException
 from omegaconf import OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
 from sfkd_jax import assembly, config, models
-from tests.helpers import SPACE
 
 CONF = Path(config.conf_path())
 GROUPS = sorted(folder.name for folder in CONF.iterdir() if folder.is_dir() and not folder.name.startswith("_"))
@@ -34,7 +34,7 @@ def test_every_option_composes(group, option):
 def test_every_model_option_builds_and_names_its_system(option):
     composed = settings(f"model={option}")
     assert composed["model"]["system"] == option
-    assembly.build_model(composed["model"], SPACE)
+    assembly.build_model(composed["model"], space())
 
 
 @pytest.mark.parametrize("vehicle", [name for group, name in OPTIONS if group == "vehicle"])

@@ -50,7 +50,15 @@ def test_results_have_the_rows_and_keys_that_others_rely_on(walked):
     place, document = walked
     rows = {row["system"]: row for row in json.loads((place / document["results"]).read_text())["rows"]}
     assert set(rows) == {"sfkd", "nominal", "oracle"}
-    measures = {"rmse_m", "max_deviation_m", "rmse_after_switch_m", "smoothness_rad_per_s", "violation", "ess", "act_ms"}
+    measures = {
+        "rmse_m",
+        "max_deviation_m",
+        "rmse_after_switch_m",
+        "smoothness_rad_per_s",
+        "violation",
+        "ess",
+        "act_ms",
+    }
     about = {"system", "model", "controller", "sampling", "env", "scenario", "vehicle", "seeds", "episodes", "params"}
     assert measures | about | {"episode_s", "departures", "ratio_to_oracle", "difference_to_sfkd"} <= set(rows["sfkd"])
     assert rows["oracle"]["ratio_to_oracle"] == 1.0

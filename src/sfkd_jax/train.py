@@ -10,7 +10,7 @@ import jax
 
 from sfkd_jax import artefacts, assembly, certify, evaluate, generate, policy, report, shelf
 from sfkd_jax.config import door
-from sfkd_jax.datasets import measure_space
+from sfkd_jax.datasets import measure_space, random_windows, spread_windows
 from sfkd_jax.evaluation import open_loop
 from sfkd_jax.training import fit, multi_step_loss
 
@@ -28,14 +28,16 @@ def fit_policy(settings: dict[str, Any]) -> policy.Policy:
     loss = multi_step_loss(model, space, **options.pop("loss"))
     shelf.say(f"training {settings['model']['system']}, {options['steps']} steps, in {place}")
     key = shelf.streams(settings["seed"])["training"]
-    params, best = fit(model, loss, dataset, key, place, **options)
+    horizon = options.pop("window")
+    draw = partial(random_windows, batch=options.pop("batch"), length=horizon)
+    held_out = spread_windows(dataset.validation, length=horizon)
+    params, best = fit(model, loss, draw, dataset.train, held_out, key, place, **options)
     kept = shelf.identity(settings) | {"controller": settings["controller"], "experiment": settings["name"]}
     kept |= {"space": assembly.space_to_settings(space), "best_step": best}
     policy.save(place / "policy.npz", params, kept, made_from={"dataset": data_hash})
-    horizon, dt = options["window"], settings["vehicle"]["dt"]
-    measure = jax.jit(partial(open_loop, model, horizon=horizon))
-    errors = measure(params, dataset.test)
-    artefacts.write_json(place / "open_loop.json", shelf.open_loop_document(errors, dataset.test, dt))
+    errors = jax.jit(partial(open_loop, model, horizon=horizon))(params, dataset.test)
+    document = shelf.open_loop_document(errors, dataset.test, settings["vehicle"]["dt"])
+    artefacts.write_json(place / "open_loop.json", document)
     return policy.load(place)
 
 

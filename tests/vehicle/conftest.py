@@ -1,7 +1,7 @@
 """Two plants, double precision where mathematics is compared, and a way to drive."""
 
 from collections.abc import Callable, Iterator
-from functools import partial
+from functools import cache, partial
 from types import SimpleNamespace
 
 import jax
@@ -10,7 +10,8 @@ import pytest
 
 from sfkd_jax.vehicle import dynamic, kinematic
 
-PLANTS = {"kinematic": kinematic, "dynamic": dynamic}
+PLANTS = {"kinematic": cache(kinematic), "dynamic": cache(dynamic)}  # one object a setting, so one compilation
+LONGEST = 300
 LIMITS = {3: (0.0, 25.0), 4: (-4.0, 4.0), 5: (-1.5, 1.5), 6: (-0.5, 0.5)}
 
 
@@ -36,13 +37,29 @@ def x64() -> Iterator[None]:
         yield
 
 
-@partial(jax.jit, static_argnums=(0, 4))
-def _hold(vehicle, state, control, env, steps):
+@partial(jax.jit, static_argnums=0)
+def _hold(step, state, control, env):
     def move(x, _):
-        x = vehicle.step(x, control, env)
+        x = step(x, control, env)
         return x, x
 
-    return jnp.concatenate([state[None], jax.lax.scan(move, state, None, length=steps)[1]])
+    return jnp.concatenate([state[None], jax.lax.scan(move, state, None, length=LONGEST)[1]])
+
+
+@cache
+def _many(step):
+    return jax.jit(jax.vmap(step))
+
+
+@pytest.fixture
+def many() -> Callable:
+    """Step -> the same step on batches."""
+    return _many
+
+
+@pytest.fixture(scope="session")
+def dynamic_plant() -> Callable:
+    return PLANTS["dynamic"]
 
 
 @pytest.fixture
@@ -50,9 +67,11 @@ def hold() -> Callable:
     """(vehicle, speed or state, control, env, seconds) -> states x_0 … x_T under a control that is held."""
 
     def drive(vehicle, start, control, env, seconds):
+        steps = round(seconds / vehicle.dt)
+        assert steps <= LONGEST
         size = len(vehicle.state_names)
         state = jnp.zeros(size).at[3].set(start) if jnp.ndim(start) == 0 else start
-        return _hold(vehicle, state, jnp.array(control), jnp.array(env), round(seconds / vehicle.dt))
+        return _hold(vehicle.step, state, jnp.array(control), jnp.array(env))[: steps + 1]
 
     return drive
 

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from scipy.linalg import expm
 
-from sfkd_jax.vehicle import dynamic, kinematic
+from sfkd_jax.vehicle import kinematic
 
 MASS, INERTIA, FRONT, REAR, C_FRONT, C_REAR = 1500.0, 2500.0, 1.2, 1.5, 9.0e4, 1.05e5
 HEIGHT, GRAVITY, LAG = 0.55, 9.81, 0.1
@@ -29,47 +29,46 @@ def straight(speed):
 
 @pytest.mark.parametrize("friction", [0.3, 0.9])
 @pytest.mark.parametrize("speed", [5.0, 10.0, 15.0, 20.0])
-def test_the_linearisation_in_straight_driving_is_the_linear_single_track(speed, friction):
-    vehicle, still = dynamic(substeps=40), (jnp.zeros(2), jnp.array([friction, 0.0]))
+def test_the_linearisation_in_straight_driving_is_the_linear_single_track(dynamic_plant, speed, friction):
+    vehicle, still = dynamic_plant(), (jnp.zeros(2), jnp.array([friction, 0.0]))
     continuous = jax.jacobian(vehicle.derivative)(straight(speed), *still)[DRIVING, DRIVING]
     theory = single_track(speed)
     np.testing.assert_allclose(continuous, theory, rtol=1e-12, atol=1e-12)
     sampled = jax.jacobian(vehicle.step)(straight(speed), *still)
-    slowed = jnp.linalg.eigvals(sampled)
     expected = np.linalg.eigvals(expm(0.1 * theory))
-    gap = np.abs(expected[:, None] - slowed[None]).min(axis=1)
-    assert gap.max() < 1e-2
+    gap = np.abs(expected[:, None] - np.linalg.eigvals(sampled)[None]).min(axis=1)
+    assert gap.max() < 5e-3
 
 
 @pytest.mark.parametrize(("speed", "radius"), [(10.0, 0.25), (15.0, 0.40), (20.0, 0.50)])
-def test_the_body_forgets_its_slip_as_fast_as_the_design_notes_say(speed, radius):
-    jacobian = jax.jacobian(dynamic().step)(straight(speed), jnp.zeros(2), jnp.array([0.9, 0.0]))
+def test_the_body_forgets_its_slip_as_fast_as_the_design_notes_say(dynamic_plant, speed, radius):
+    jacobian = jax.jacobian(dynamic_plant().step)(straight(speed), jnp.zeros(2), jnp.array([0.9, 0.0]))
     assert np.abs(np.linalg.eigvals(jacobian[4:6, 4:6])).max() == pytest.approx(radius, abs=0.01)
 
 
 @pytest.mark.parametrize("friction", [0.3, 0.9])
-def test_slip_decays_at_every_speed_down_to_rest(friction):
+def test_slip_decays_at_every_speed_down_to_rest(dynamic_plant, friction):
     speeds = jnp.linspace(0.0, 25.0, 101)
-    jacobian = jax.jit(jax.vmap(jax.jacobian(dynamic().step), in_axes=(0, None, None)))
+    jacobian = jax.jit(jax.vmap(jax.jacobian(dynamic_plant().step), in_axes=(0, None, None)))
     blocks = jacobian(jax.vmap(straight)(speeds), jnp.zeros(2), jnp.array([friction, 0.0]))[:, DRIVING, DRIVING]
     assert np.abs(np.linalg.eigvals(blocks)).max() < 0.7
 
 
 @pytest.mark.parametrize("speed", [0.5, 2.0, 5.0, 20.0])
-def test_the_default_substeps_are_fine_enough(speed, hold):
+def test_the_default_substeps_are_fine_enough(dynamic_plant, speed, hold):
     control, env = (0.1, 1.0), (0.6, 5.0)
-    ends = [hold(dynamic(substeps=n), speed, control, env, 2.0)[-1] for n in (5, 50)]
+    ends = [hold(dynamic_plant(substeps=n), speed, control, env, 2.0)[-1] for n in (5, 50)]
     np.testing.assert_allclose(*ends, rtol=0, atol=1e-3)
 
 
-def test_a_small_steering_step_is_a_first_order_lag(hold):
-    states = hold(dynamic(), 10.0, (1e-3, 0.0), (0.9, 0.0), 0.5)
+def test_a_small_steering_step_is_a_first_order_lag(dynamic_plant, hold):
+    states = hold(dynamic_plant(), 10.0, (1e-3, 0.0), (0.9, 0.0), 0.5)
     time = np.arange(6) * 0.1
     np.testing.assert_allclose(states[:, 6], 1e-3 * (1.0 - np.exp(-time / LAG)), rtol=1e-3)
 
 
-def test_a_large_steering_step_is_limited_in_rate(hold):
-    states = hold(dynamic(), 10.0, (0.5, 0.0), (0.9, 0.0), 2.5)
+def test_a_large_steering_step_is_limited_in_rate(dynamic_plant, hold):
+    states = hold(dynamic_plant(), 10.0, (0.5, 0.0), (0.9, 0.0), 2.5)
     steps = jnp.diff(states[:, 6])
     assert steps.max() <= 0.05
     assert steps[0] > 0.049
@@ -77,30 +76,30 @@ def test_a_large_steering_step_is_limited_in_rate(hold):
 
 
 @pytest.mark.parametrize("acceleration", [-4.0, 0.0, 2.0])
-def test_a_sliding_car_is_turned_by_the_load_that_braking_moves_forward(acceleration):
+def test_a_sliding_car_is_turned_by_the_load_that_braking_moves_forward(dynamic_plant, acceleration):
     """Both axles slide: I ω̇ = l_f Y_f − l_r Y_r = −m a_x h √(μ² − (a_x/g)²)."""
     friction, limit = 0.6, 0.95 * 0.6 * GRAVITY
     state = jnp.zeros(7).at[3:5].set(jnp.array([10.0, -20.0]))
-    turned = dynamic().derivative(state, jnp.array([0.0, acceleration]), jnp.array([friction, 0.0]))[5]
+    turned = dynamic_plant().derivative(state, jnp.array([0.0, acceleration]), jnp.array([friction, 0.0]))[5]
     along = limit * np.tanh(acceleration / limit)
     moment = -MASS * along * HEIGHT * np.sqrt(friction**2 - (along / GRAVITY) ** 2)
     assert float(turned) == pytest.approx(moment / INERTIA, abs=1e-12)
 
 
-def test_a_gust_first_pushes_with_its_force_and_its_moment():
-    rate = dynamic().derivative(straight(15.0), jnp.zeros(2), jnp.array([0.9, -4.0]))
+def test_a_gust_first_pushes_with_its_force_and_its_moment(dynamic_plant):
+    rate = dynamic_plant().derivative(straight(15.0), jnp.zeros(2), jnp.array([0.9, -4.0]))
     np.testing.assert_allclose(rate[4:6], [-160.0 / MASS, -160.0 * 0.4 / INERTIA], rtol=1e-12)
 
 
-def test_slip_is_hidden_two_cars_with_one_pose_and_speed_part(hold):
+def test_slip_is_hidden_two_cars_with_one_pose_and_speed_part(dynamic_plant, hold):
     calm = straight(15.0)
-    ends = [hold(dynamic(), x, (0.0, 0.0), (0.9, 0.0), 1.0)[-1] for x in (calm, calm.at[5].set(0.3))]
+    ends = [hold(dynamic_plant(), x, (0.0, 0.0), (0.9, 0.0), 1.0)[-1] for x in (calm, calm.at[5].set(0.3))]
     assert abs(ends[1][1] - ends[0][1]) > 0.2
 
 
-def test_the_nominal_bicycle_is_that_of_the_kinematic_plant_with_quasi_steady_slip(sweep, key):
-    drawn = sweep(dynamic(), key, 64)
-    full = jax.vmap(dynamic().nominal)(drawn.states, drawn.controls, drawn.envs)
+def test_the_nominal_bicycle_is_that_of_the_kinematic_plant_with_quasi_steady_slip(dynamic_plant, sweep, key):
+    drawn = sweep(dynamic_plant(), key, 64)
+    full = jax.vmap(dynamic_plant().nominal)(drawn.states, drawn.controls, drawn.envs)
     small = jax.vmap(kinematic().nominal)(drawn.states[:, :4], drawn.controls, drawn.envs)
     np.testing.assert_allclose(full[:, :4], small, rtol=0, atol=1e-12)
     yaw_rate = small[:, 3] * np.tan(drawn.controls[:, 0]) / (FRONT + REAR)
@@ -108,9 +107,9 @@ def test_the_nominal_bicycle_is_that_of_the_kinematic_plant_with_quasi_steady_sl
     np.testing.assert_allclose(full[:, 4:], expected, rtol=0, atol=1e-12)
 
 
-def test_at_walking_pace_the_plant_drives_like_its_nominal_bicycle(hold):
+def test_at_walking_pace_the_plant_drives_like_its_nominal_bicycle(dynamic_plant, hold):
     control, env = (0.05, 0.0), (0.9, 0.0)
-    vehicle = dynamic(drag=0.0, rolling=0.0)
+    vehicle = dynamic_plant(drag=0.0, rolling=0.0)
     start = straight(1.5).at[6].set(control[0])
     ends = [hold(v, start, control, env, 4.0)[-1] for v in (vehicle, vehicle._replace(step=vehicle.nominal))]
     np.testing.assert_allclose(*ends, rtol=0, atol=0.02)

@@ -47,7 +47,7 @@ def test_the_demand_is_scaled_onto_the_circle_and_keeps_its_direction():
     lateral = float(rates[0][2]) / 1e-6 * np.tan(0.3) * 20.0
     wanted = np.array([-5.0, lateral])
     given = np.array([rates[1][3], 20.0 * rates[1][2]])
-    assert np.cross(wanted, given) / np.linalg.norm(wanted) == pytest.approx(0.0, abs=1e-6)
+    np.testing.assert_allclose(given / np.linalg.norm(given), wanted / np.linalg.norm(wanted), rtol=1e-6)
     size = np.linalg.norm(wanted) / (0.4 * 9.81)
     assert np.linalg.norm(given) == pytest.approx(0.4 * 9.81 * np.tanh(size), rel=1e-6)
 

@@ -22,8 +22,8 @@ def test_braking_stops_a_car_and_does_not_reverse_it(vehicle, friction, steering
     heading = jnp.stack([jnp.cos(states[:-1, 2]), jnp.sin(states[:-1, 2])], axis=1)
     advance = (jnp.diff(states[:, :2], axis=0) * heading).sum(axis=1)
     assert (states[:, 3] >= 0).all()
-    assert (advance >= 0).all()
-    np.testing.assert_array_equal(states[-10:, 3], 0.0)
+    assert (advance >= -1e-6).all()
+    np.testing.assert_allclose(states[-10:, 3], 0.0, atol=1e-5)
     np.testing.assert_allclose(states[-10:, :2] - states[-1, :2], 0.0, atol=1e-5)
     assert advance.sum() > 0.9 * 8.0**2 / (2 * friction * 9.81)
 

@@ -10,19 +10,10 @@ from sfkd_jax.types import POSE
 from sfkd_jax.vehicle import with_speed_loop
 
 
-def batched(step):
-    return jax.jit(jax.vmap(step))
-
-
-def loss_gradient(step):
-    """Jacobian of the whole next state by state, control and environment."""
-    return jax.jit(jax.vmap(jax.jacrev(step, argnums=(0, 1, 2))))
-
-
 @pytest.mark.usefixtures("x64")
 @pytest.mark.parametrize("which", ["step", "nominal"])
-def test_the_mirrored_drive_is_the_mirror_of_the_drive(vehicle, which, sweep, key):
-    step = batched(getattr(vehicle, which))
+def test_the_mirrored_drive_is_the_mirror_of_the_drive(vehicle, which, many, sweep, key):
+    step = many(getattr(vehicle, which))
     drawn = sweep(vehicle, key, 64)
     flip = jnp.array([1.0, -1.0, -1.0, 1.0, -1.0, -1.0, -1.0])[: drawn.states.shape[1]]
     after = step(drawn.states, drawn.controls, drawn.envs)
@@ -34,8 +25,8 @@ def test_the_mirrored_drive_is_the_mirror_of_the_drive(vehicle, which, sweep, ke
 
 @pytest.mark.usefixtures("x64")
 @pytest.mark.parametrize("which", ["step", "nominal"])
-def test_the_drive_does_not_depend_on_the_frame_it_is_told_in(vehicle, which, sweep, key):
-    step = batched(getattr(vehicle, which))
+def test_the_drive_does_not_depend_on_the_frame_it_is_told_in(vehicle, which, many, sweep, key):
+    step = many(getattr(vehicle, which))
     drawn = sweep(vehicle, key, 64)
     frame = jnp.array([30.0, -20.0, 2.3])
 
@@ -47,33 +38,36 @@ def test_the_drive_does_not_depend_on_the_frame_it_is_told_in(vehicle, which, sw
 
 
 @pytest.mark.usefixtures("x64")
-def test_a_batch_is_driven_as_its_members_are(vehicle, sweep, key):
+def test_a_batch_is_driven_as_its_members_are(vehicle, many, sweep, key):
     drawn = sweep(vehicle, key, 6)
     rows = zip(drawn.states, drawn.controls, drawn.envs, strict=True)
     single = jax.jit(vehicle.step)
     one_by_one = jnp.stack([single(*row) for row in rows])
-    batch = batched(vehicle.step)(drawn.states, drawn.controls, drawn.envs)
+    batch = many(vehicle.step)(drawn.states, drawn.controls, drawn.envs)
     np.testing.assert_allclose(batch, one_by_one, rtol=0, atol=1e-12)
 
 
 @pytest.mark.parametrize("loop", [False, True], ids=["acceleration", "speed"])
-def test_gradients_are_finite_at_rest_at_zero_and_at_the_extremes(vehicle, loop, sweep, key):
+def test_gradients_are_finite_at_rest_at_zero_and_at_the_extremes(factory, loop, sweep, key):
+    """Single precision, one substep (the others repeat it), and the whole Jacobian by state, control, environment."""
+    vehicle = factory(dt=0.02, substeps=1)
     vehicle = with_speed_loop(vehicle) if loop else vehicle
+    jacobian = jax.jit(jax.vmap(jax.jacrev(vehicle.step, argnums=(0, 1, 2))))
     drawn = sweep(vehicle, key, 2000, overdrive=1.5)
     zeros = [jnp.zeros_like(drawn.states), jnp.zeros_like(drawn.controls), drawn.envs * jnp.array([1.0, 0.0])]
     for rows in ((drawn.states, drawn.controls, drawn.envs), zeros):
-        gradients = loss_gradient(vehicle.step)(*rows)
+        gradients = jacobian(*rows)
         assert all(bool(jnp.isfinite(g).all()) for g in gradients)
         assert max(float(jnp.abs(g[:, 2:]).max()) for g in gradients) < 100.0
 
 
 @pytest.mark.usefixtures("x64")
-def test_gradients_are_the_limits_of_difference_quotients(vehicle, sweep, key):
+def test_gradients_are_the_limits_of_difference_quotients(vehicle, many, sweep, key):
     drawn = sweep(vehicle, key, 64)
     rows = tuple(x[::2] for x in (drawn.states.at[:, 3].add(2.0), drawn.controls, drawn.envs))
     tangents = tuple(jax.random.normal(k, x.shape) for k, x in zip(jax.random.split(key, 3), rows, strict=True))
-    slope = jax.jvp(batched(vehicle.step), rows, tangents)[1]
+    slope = jax.jvp(many(vehicle.step), rows, tangents)[1]
     ahead, behind = (
-        batched(vehicle.step)(*(x + h * t for x, t in zip(rows, tangents, strict=True))) for h in (1e-6, -1e-6)
+        many(vehicle.step)(*(x + h * t for x, t in zip(rows, tangents, strict=True))) for h in (1e-6, -1e-6)
     )
     np.testing.assert_allclose(slope, (ahead - behind) / 2e-6, rtol=1e-4, atol=1e-4)

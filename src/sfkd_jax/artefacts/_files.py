@@ -95,22 +95,25 @@ def replacement(path: Path) -> Iterator[tuple[BinaryIO, Path]]:
 
     A killed writer cannot remove its own: the next one does, and knows it by the lock that died with its owner.
     """
-    part = path
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
-        for left in path.parent.glob(f".{glob.escape(path.name)}.*.part"):
-            with suppress(OSError), left.open("r+b") as file:
-                fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
-                left.unlink()
+        _sweep(path)
         file, part = _claim(path)
-        with file:
-            yield file, part
+        try:
+            with file:
+                yield file, part
+        finally:
+            part.unlink(missing_ok=True)
     except OSError as error:
         raise failure(path, error) from error
-    finally:
-        if part != path:
-            with suppress(OSError):
-                part.unlink(missing_ok=True)
+
+
+def _sweep(path: Path) -> None:
+    """Remove the hidden files beside `path` that nobody holds."""
+    for left in path.parent.glob(f".{glob.escape(path.name)}.*.part"):
+        with suppress(OSError), left.open("r+b") as file:
+            fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            left.unlink()
 
 
 def _claim(path: Path) -> tuple[BinaryIO, Path]:

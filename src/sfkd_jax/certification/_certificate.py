@@ -13,7 +13,7 @@ from sfkd_jax.certification._calibration import KINDS, conformal_bounds, coverag
 from sfkd_jax.certification._core import norm_upper
 from sfkd_jax.certification._lipschitz import lipschitz_upper
 from sfkd_jax.certification._tube import latent_tube, physical_tube
-from sfkd_jax.types import POSE, Model, Params, Trajectory
+from sfkd_jax.types import Model, Params, Trajectory
 
 
 class CertificationRefused(Exception):
@@ -56,6 +56,33 @@ def _widened(weights: tuple[np.ndarray, ...], multipliers: list[np.ndarray]) -> 
     return min(lipschitz_upper(weights, [scale * part for part in multipliers]) for scale in scales)
 
 
+def measure(
+    model: Model, params: Params, splits: tuple[Trajectory, Trajectory, Trajectory], *, level: float
+) -> dict[str, Any]:
+    """One-step bounds at `level` for whole trajectories, and how often they hold on trajectories nobody used.
+
+    Args:
+        model, params: what predicts. splits: validation fixes units, calibration sets the bounds, the last tests them.
+        level: 1 − δ.
+
+    Raises:
+        CertificationRefused: too few trajectories, or residuals that are not finite.
+    """
+    validation, calibration, held_out = (disturbances(model, params, part) for part in splits)
+    try:
+        bounds, _ = conformal_bounds(validation, calibration, level=level)
+    except ValueError as reason:
+        raise CertificationRefused(str(reason)) from None
+    share, interval = coverage(bounds, held_out)
+    return {
+        "level": level,
+        "trajectories": len(calibration.scores),
+        "coverage": share,
+        "coverage_ci95": list(interval),
+        "one_step": dict(zip(KINDS, bounds.tolist(), strict=True)),
+    }
+
+
 def certify(
     model: Model,
     params: Params,
@@ -85,24 +112,15 @@ def certify(
     alpha = proved["alpha"]
     if alpha > 1.0 - separate_margin:
         raise CertificationRefused(f"alpha = {alpha:.6f} leaves less than the margin {separate_margin} below 1")
-    measured = [disturbances(model, params, part) for part in (validation, calibration, held_out)]
-    try:
-        bounds, _ = conformal_bounds(measured[0], measured[1], level=level)
-    except ValueError as reason:
-        raise CertificationRefused(str(reason)) from None
-    share, interval = coverage(bounds, measured[2])
-    one_step = dict(zip(KINDS, bounds.tolist(), strict=True))
+    found = measure(model, params, (validation, calibration, held_out), level=level)
+    one_step = found["one_step"]
     latent = latent_tube(alpha, one_step["latent"], horizon)
-    poses = np.asarray(calibration.states)[..., POSE]
+    positions = np.asarray(calibration.states)[..., :2]
     tube = physical_tube(
         latent,
-        position_lipschitz=proved["position"],
-        yaw_lipschitz=proved["yaw"],
-        body_lipschitz=proved["body"],
-        position_error=one_step["position"],
-        yaw_error=one_step["yaw"],
-        body_error=one_step["body"],
-        largest_increment=float(np.max(np.linalg.norm(np.diff(poses[..., :2], axis=-2), axis=-1))),
+        lipschitz={kind: proved[kind] for kind in ("position", "yaw", "body")},
+        residual=one_step,
+        largest_increment=float(np.max(np.linalg.norm(np.diff(positions, axis=-2), axis=-1))),
     )
     return {
         "valid": True,
@@ -115,14 +133,7 @@ def certify(
         "kappa": 1.0,
         "decoder_lipschitz": proved["decoder"],
         "transport_lipschitz": 1.0,
-        "d_bar": {
-            "value": one_step["latent"],
-            "level": level,
-            "trajectories": len(measured[1].scores),
-            "coverage": share,
-            "coverage_ci95": list(interval),
-            "one_step": one_step,
-        },
+        "d_bar": {"value": one_step["latent"], **found},
         "tube": {
             "latent": latent.tolist(),
             "physical": tube,

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
+
 import numpy as np
 from jaxtyping import Float
 
@@ -18,12 +20,8 @@ def latent_tube(alpha: float, d_bar: float, horizon: int, *, initial: float = 0.
 def physical_tube(
     latent: Float[np.ndarray, " horizon"],
     *,
-    position_lipschitz: float,
-    yaw_lipschitz: float,
-    body_lipschitz: float,
-    position_error: float,
-    yaw_error: float,
-    body_error: float,
+    lipschitz: Mapping[str, float],
+    residual: Mapping[str, float],
     largest_increment: float,
 ) -> dict[str, list[float]]:
     """Radii of position [m], yaw [rad] and body state for k = 1 … horizon, from z_0 known exactly.
@@ -32,13 +30,14 @@ def physical_tube(
         |e_yaw,k| ≤ Σ_j (L_yaw R_j + ε_yaw),   |e_p,k| ≤ Σ_j (L_p R_j + ε_p + |dp| |e_yaw,j|),   |e_s,k| ≤ L_s R_k + ε_s
 
     Args:
-        latent: R_1 … R_T. position_lipschitz, yaw_lipschitz, body_lipschitz: of the decoder's parts.
-        position_error, yaw_error, body_error: one-step residuals ε of the decoder at the true latent.
+        latent: R_1 … R_T.
+        lipschitz: L of the decoder's parts, by "position", "yaw", "body".
+        residual: ε, the decoder's one-step residuals at the true latent, by the same names.
         largest_increment: |dp|, the longest step driven [m].
     """
     before = np.concatenate([[0.0], latent[:-1]])
-    yaw = np.cumsum(yaw_lipschitz * before + yaw_error)
+    yaw = np.cumsum(lipschitz["yaw"] * before + residual["yaw"])
     turned = np.concatenate([[0.0], yaw[:-1]])
-    position = np.cumsum(position_lipschitz * before + position_error + largest_increment * turned)
-    body = body_lipschitz * latent + body_error
+    position = np.cumsum(lipschitz["position"] * before + residual["position"] + largest_increment * turned)
+    body = lipschitz["body"] * latent + residual["body"]
     return {"position_m": position.tolist(), "yaw_rad": yaw.tolist(), "body": body.tolist()}

@@ -6,4 +6,5 @@ from sfkd_jax.datasets._splits import Dataset as Dataset
 from sfkd_jax.datasets._splits import measure_space as measure_space
 from sfkd_jax.datasets._splits import random_windows as random_windows
 from sfkd_jax.datasets._splits import split as split
+from sfkd_jax.datasets._splits import spread_windows as spread_windows
 from sfkd_jax.datasets._splits import windows as windows

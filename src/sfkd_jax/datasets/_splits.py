@@ -92,12 +92,30 @@ def random_windows(trajectories: Trajectory, key: Key, *, batch: int, length: in
         ValueError: windows longer than the trajectories.
     """
     count, steps = trajectories.controls.shape[:2]
-    if length > steps:
-        raise ValueError(f"windows of {length} steps do not fit trajectories of {steps} steps")
+    _check_length(length, steps)
     row_key, start_key = jax.random.split(key)
     rows = jax.random.randint(row_key, (batch,), 0, count)
     starts = jax.random.randint(start_key, (batch,), 0, steps - length + 1)
     return windows(trajectories, rows, starts, length=length)
+
+
+def spread_windows(trajectories: Trajectory, *, length: int) -> Trajectory:
+    """Every trajectory cut at three places: start, middle and end.
+
+    Raises:
+        ValueError: windows longer than the trajectories.
+    """
+    count, steps = trajectories.controls.shape[:2]
+    _check_length(length, steps)
+    rows = jnp.tile(jnp.arange(count), 3)
+    starts = jnp.repeat(jnp.asarray([0, (steps - length) // 2, steps - length]), count)
+    return windows(trajectories, rows, starts, length=length)
+
+
+def _check_length(length: int, steps: int) -> None:
+    """Refuse windows that do not fit."""
+    if length > steps:
+        raise ValueError(f"windows of {length} steps do not fit trajectories of {steps} steps")
 
 
 def _range(values: Float[Array, "*batch n"]) -> tuple[Float[Array, " n"], Float[Array, " n"]]:

@@ -19,6 +19,7 @@ class Checkpoints:
 
     def __init__(self, directory: Path) -> None:
         """Open `directory`, created if need be."""
+
         def metric(metrics: dict[str, float]) -> float:
             return metrics["validation_loss"]
 

@@ -7,7 +7,6 @@ import math
 import sys
 from pathlib import Path
 from types import TracebackType
-from typing import Self
 
 from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
@@ -45,7 +44,7 @@ class TrainingLog:
                 break
         return complete
 
-    def __enter__(self) -> Self:
+    def __enter__(self) -> TrainingLog:
         """Start the bar, if there is a terminal to show it."""
         if self._shows_bar:
             self._bar.start()

@@ -4,20 +4,22 @@ from __future__ import annotations
 
 import math
 import time
+from collections.abc import Callable
 from functools import partial
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, TypeAlias
 
 import jax
 import jax.numpy as jnp
 import optax
 
-from sfkd_jax.datasets import Dataset, random_windows, windows
 from sfkd_jax.training._checkpoints import Checkpoints
 from sfkd_jax.training._log import TrainingLog
 from sfkd_jax.training._losses import Loss
 from sfkd_jax.training._optimizer import optimizer
 from sfkd_jax.types import Key, Model, Params, Trajectory
+
+Draw: TypeAlias = Callable[[Trajectory, Key], Trajectory]
 
 
 class TrainingStopped(RuntimeError):
@@ -35,13 +37,13 @@ class TrainState(NamedTuple):
 def fit(
     model: Model,
     loss: Loss,
-    dataset: Dataset,
+    draw: Draw,
+    data: Trajectory,
+    held_out: Trajectory,
     key: Key,
     directory: Path,
     *,
-    steps: int = 4000,
-    batch: int = 256,
-    window: int = 20,
+    steps: int = 5000,
     learning_rate: float = 3e-3,
     clip_norm: float = 100.0,
     log_every: int = 50,
@@ -53,11 +55,10 @@ def fit(
 
     Args:
         model, loss: what is trained, and by which loss.
-        dataset: windows come from `train`; `validation` selects.
-        key: for the initial parameters and the windows.
+        draw: (data, key) -> a batch of windows. data: what it draws from; held_out: windows that select.
+        key: for the initial parameters and the draws.
         directory: gets checkpoints/, metrics.jsonl, tensorboard/.
-        steps, batch, window: optimiser steps, windows per step, steps per window.
-        learning_rate, clip_norm: see `optimizer`.
+        steps: optimiser steps. learning_rate, clip_norm: see `optimizer`.
         log_every: steps per compiled chunk and per log line. save_every: a multiple of it.
 
     Returns:
@@ -65,15 +66,14 @@ def fit(
 
     Raises:
         TrainingStopped: the loss or a gradient is not finite.
-        ValueError: windows longer than the trajectories, or save_every no multiple of log_every.
+        ValueError: steps or save_every are no multiples of log_every.
     """
     if save_every % log_every or steps % log_every:
         raise ValueError(f"training.steps and save_every must be multiples of log_every = {log_every}")
     init_key, data_key = jax.random.split(key)
     transform, schedule = optimizer(steps=steps, learning_rate=learning_rate, clip_norm=clip_norm)
-    advance = _chunk(loss, transform, dataset.train, data_key, batch=batch, window=window, length=log_every)
-    held_out = _all_windows(dataset.validation, window)
-    validate = jax.jit(lambda params: loss(params, held_out))
+    advance = _chunk(loss, transform, draw, data_key, length=log_every)
+    validate = jax.jit(loss)
     params = jax.jit(model.init)(init_key)
     state = TrainState(jnp.zeros((), jnp.int32), params, transform.init(params))
     checkpoints = Checkpoints(directory / "checkpoints")
@@ -83,7 +83,7 @@ def fit(
         with TrainingLog(directory, steps=steps, resumed_at=start) as log:
             began = time.perf_counter()
             for done in range(start + log_every, steps + 1, log_every):
-                state, record = advance(state)
+                state, record = advance(state, data)
                 record = {name: float(value) for name, value in record.items()}
                 if not math.isfinite(record["loss"]) or not math.isfinite(record["gradient_norm"]):
                     kept = checkpoints.latest_step()
@@ -94,7 +94,7 @@ def fit(
                     "seconds": time.perf_counter() - began,
                 }
                 if done % save_every == 0 or done == steps:
-                    total, parts = validate(state.params)
+                    total, parts = validate(state.params, held_out)
                     record |= {"validation_loss": float(total), "validation_prediction": float(parts["prediction"])}
                     checkpoints.save(done, state, validation_loss=float(total))
                 log.write(record)
@@ -107,35 +107,24 @@ def fit(
 def _chunk(
     loss: Loss,
     transform: optax.GradientTransformation,
-    trajectories: Trajectory,
+    draw: Draw,
     key: Key,
     *,
-    batch: int,
-    window: int,
     length: int,
 ) -> Any:
-    """`length` optimiser steps as one compiled call: state -> state, mean metrics."""
+    """`length` optimiser steps as one compiled call: state, data -> state, mean metrics."""
     gradient = jax.value_and_grad(loss, has_aux=True)
 
-    def step(state: TrainState, _: None) -> tuple[TrainState, dict[str, jax.Array]]:
-        window_key = jax.random.fold_in(key, state.step)
-        data = random_windows(trajectories, window_key, batch=batch, length=window)
-        (total, parts), grads = gradient(state.params, data)
-        updates, memory = transform.update(grads, state.optimizer, state.params)
-        after = TrainState(state.step + 1, optax.apply_updates(state.params, updates), memory)
-        return after, {"loss": total, "gradient_norm": optax.global_norm(grads), **parts}
-
     @partial(jax.jit, donate_argnums=0)
-    def chunk(state: TrainState) -> tuple[TrainState, dict[str, jax.Array]]:
+    def chunk(state: TrainState, data: Trajectory) -> tuple[TrainState, dict[str, jax.Array]]:
+        def step(state: TrainState, _: None) -> tuple[TrainState, dict[str, jax.Array]]:
+            batch = draw(data, jax.random.fold_in(key, state.step))
+            (total, parts), grads = gradient(state.params, batch)
+            updates, memory = transform.update(grads, state.optimizer, state.params)
+            after = TrainState(state.step + 1, optax.apply_updates(state.params, updates), memory)
+            return after, {"loss": total, "gradient_norm": optax.tree.norm(grads), **parts}
+
         state, records = jax.lax.scan(step, state, length=length)
         return state, jax.tree.map(jnp.mean, records)
 
     return chunk
-
-
-def _all_windows(trajectories: Trajectory, length: int) -> Trajectory:
-    """Every trajectory cut at three places: start, middle and end."""
-    count, steps = trajectories.controls.shape[:2]
-    rows = jnp.tile(jnp.arange(count), 3)
-    starts = jnp.repeat(jnp.asarray([0, (steps - length) // 2, steps - length]), count)
-    return windows(trajectories, rows, starts, length=length)

@@ -41,7 +41,8 @@ def dynamic(
 ) -> Vehicle:
     """Single track on brush tyres; x = (p_x, p_y, yaw, v, v_y, yaw rate ω, δ), p at the centre of mass.
 
-        a_x = 0.95 μ g tanh(a / (0.95 μ g)),   N_f, N_r = m (g l_r ∓ a_x h)/L,  m (g l_f ± a_x h)/L,
+        a_x = 0.95 μ g tanh(a / (0.95 μ g)), braking fades like tanh(v / 0.2 m/s),
+        N_f, N_r = m (g l_r ∓ a_x h)/L,  m (g l_f ± a_x h)/L,
         Y_i = −C_i t_i as long as it is small, never above √((μ N_i)² − (N_i a_x/g)²)        (`_brush`)
         m (v̇ − v_y ω) = a_x (N_f cos δ + N_r)/g − Y_f sin δ − resistance,
         m (v̇_y + v ω) = (N_f a_x/g) sin δ + Y_f cos δ + Y_r + F,
@@ -80,6 +81,7 @@ def dynamic(
         grip = env[0] * GRAVITY
         cos, sin = jnp.cos(steering), jnp.sin(steering)
         drive = BRAKING_SHARE * grip * jnp.tanh(control[1] / (BRAKING_SHARE * grip))
+        drive = jnp.maximum(drive, 0.0) + jnp.minimum(drive, 0.0) * jnp.tanh(speed / 0.2)
         front_mass = mass * (rear_length - height * drive / GRAVITY) / length
         left_over = jnp.sqrt(grip**2 - drive**2)
         rolls = jnp.clip(jnp.abs(speed) / creep_speed, 0.0, 1.0)

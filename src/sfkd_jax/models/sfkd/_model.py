@@ -76,19 +76,9 @@ def sfkd(
     _check(rank, rho, beta, frame, residual)
     segment = frame == "segment"
     body = space.body_mean.shape[0]
-    networks = Networks(
-        rank=rank,
-        body=body,
-        control=space.control_mean.shape[0],
-        vertices=vertices,
-        residual_hidden=tuple(residual_hidden),
-        decoder_hidden=tuple(decoder_hidden),
-        embedding=embedding,
-        rho=rho,
-        beta=beta,
-        residual=residual,
-        transport=transport,
-    )
+    hidden = tuple(residual_hidden), tuple(decoder_hidden)
+    control = space.control_mean.shape[0]
+    networks = Networks(rank, body, control, vertices, *hidden, embedding, rho, beta, residual, transport)
     encoder = Encoder(rank, encoder_hidden)
     pose_scale = jnp.asarray(space.increment_scale) * SEGMENT_STEPS
 

@@ -1,0 +1,324 @@
+"""The planner: what it converges to, what it never does, and what a compiler sees of it."""
+
+from functools import cache, partial
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from helpers import ENV_HIGH, ENV_LOW, jit, model_and_params, same, straight
+
+from sfkd_jax import control, evaluation, models, scenarios, vehicle
+
+PLANT = vehicle.kinematic()
+LIMITS = {"control_low": PLANT.control_low, "control_high": PLANT.control_high}
+BOX = {"env_low": ENV_LOW, "env_high": ENV_HIGH}
+COST = control.tracking_cost(dt=0.1)
+FEEDBACK = control.path_feedback(wheelbase=PLANT.wheelbase)
+HORIZON = 8
+OFFSET = jnp.asarray([0.0, 0.3, 0.0, 10.0])
+ENV = jnp.asarray([0.7, 3.0])
+REFERENCE = straight(HORIZON)
+FORBIDDEN = ("cholesky", "triangular_solve", "lu", "svd", "custom_linear_solve", "eigh", "qr", "geqrf")
+
+
+def planner(model, law=FEEDBACK, **settings):
+    return control.mppi(model, COST, law, **{"num_samples": 64, "horizon": HORIZON, **LIMITS, **settings})
+
+
+@cache
+def compiled(name="oracle", **settings):
+    """A planner over a model by name: controller, params, compiled act."""
+    model, params = model_and_params(name)
+    controller = planner(model, **settings)
+    return controller, params, jit(controller.act)
+
+
+def act_once(name="oracle", seed=0, observation=OFFSET, env=ENV, state=None, **settings):
+    controller, params, act = compiled(name, **settings)
+    state = controller.init(jax.random.key(seed)) if state is None else state
+    return act(params, state, observation, env, REFERENCE)
+
+
+def finite(tree):
+    return all(np.all(np.isfinite(leaf)) for leaf in jax.tree.leaves(tree._replace(key=())))
+
+
+def test_info_has_the_documented_keys_and_shapes():
+    action, state, info = act_once()
+    keys = {"cost", "mean_cost", "effective_samples", "healthy", "env_inside", "predicted_states"}
+    assert set(info) >= keys
+    assert info["predicted_states"].shape == (HORIZON, 4)
+    assert all(info[key].shape == () for key in keys - {"predicted_states"})
+    assert action.shape == (2,)
+    assert state.plan.shape == state.controls.shape == (HORIZON, 2)
+    assert 1.0 <= float(info["effective_samples"]) <= 64.0
+    assert bool(info["healthy"])
+
+
+def test_as_the_temperature_falls_the_plan_becomes_the_best_samples():
+    """Every sample is rolled out again by hand; the planner must have chosen the cheapest."""
+    wide = {"control_low": (-1e3, -1e3), "control_high": (1e3, 1e3)}
+    _, state, info = act_once(law=control.no_feedback(), temperature=1e-4, **wide)
+    noise_key, _ = jax.random.split(jax.random.key(0))
+    std = jnp.asarray([0.02, 0.3])
+    noise = control.correlated_noise(noise_key, num_samples=64, horizon=HORIZON, std=std, correlation=0.8)
+    plans = np.array(noise)
+    plans[:, 0] = 0.0
+    step = jit(jax.vmap(PLANT.step, in_axes=(0, 0, None)))
+    states = np.broadcast_to(OFFSET, (64, 4))
+    y, before, costs = np.full(64, 0.3), np.zeros(64), np.zeros(64)
+    for k, controls in enumerate(plans):
+        states = np.asarray(step(states, controls, ENV))
+        course = (states[:, 1] - y) / (10.0 * 0.1 + 1e-3)
+        rate = (controls[:, 0] - before) / 0.1
+        stage = 200 * states[:, 1] ** 2 + 20 * course**2 + (states[:, 3] - 10.0) ** 2 + 5 * rate**2
+        costs += (1 + (k == HORIZON - 1)) * (stage + 0.02 * controls[:, 1] ** 2)
+        y, before = states[:, 1], controls[:, 0]
+    best = int(np.argmin(costs))
+    assert best != 0
+    np.testing.assert_allclose(info["cost"], costs[best], rtol=1e-4)
+    np.testing.assert_allclose(info["mean_cost"], costs[best], rtol=1e-4)
+    np.testing.assert_allclose(info["effective_samples"], 1.0, rtol=1e-5)
+    np.testing.assert_allclose(state.plan[:-1], plans[1:, best], atol=1e-6)
+    np.testing.assert_allclose(state.previous, plans[0, best], atol=1e-6)
+
+
+def test_as_the_temperature_rises_every_sample_counts_the_same():
+    _, _, info = act_once(temperature=1e9)
+    np.testing.assert_allclose(info["effective_samples"], 64.0, rtol=1e-3)
+
+
+def test_the_plan_carried_over_is_shifted_by_one_step():
+    _, state, info = act_once(noise_std=(1e-9, 1e-9))
+    np.testing.assert_array_equal(state.plan[-1], state.plan[-2])
+    stepped = PLANT.step(OFFSET, state.previous, ENV)
+    np.testing.assert_allclose(info["predicted_states"][0], stepped, atol=1e-5)
+    then = PLANT.step(stepped, state.controls[0], ENV)
+    np.testing.assert_allclose(info["predicted_states"][1], then, atol=1e-5)
+
+
+@pytest.mark.parametrize("std", [1e3, 1e30])
+def test_controls_stay_inside_their_bounds_however_large_the_noise(std):
+    low, high = np.float32(PLANT.control_low), np.float32(PLANT.control_high)
+    state = None
+    for _ in range(3):
+        action, state, info = act_once(noise_std=(std, std), state=state)
+        assert np.all((low <= action) & (action <= high))
+        assert np.all((low <= state.controls) & (state.controls <= high))
+        assert finite(state)
+        assert bool(info["healthy"])
+
+
+def test_a_plan_never_asks_for_more_than_the_actuators_give():
+    """Perturbations are stored as they were effective after clipping: at most the width of the actuator box."""
+    width = np.subtract(PLANT.control_high, PLANT.control_low)
+    _, state, _ = act_once(noise_std=(1e3, 1e3), law=control.no_feedback())
+    assert np.all(np.abs(state.plan) <= width)
+
+
+def test_compiling_does_not_change_the_action():
+    controller, params, act = compiled(num_samples=16)
+    inputs = (params, controller.init(jax.random.key(0)), OFFSET, ENV, REFERENCE)
+    assert same(act(*inputs), controller.act(*inputs), rtol=1e-4, atol=1e-5)
+
+
+def test_a_batch_of_controllers_acts_as_each_one_alone():
+    controller, params, act = compiled()
+    states = [controller.init(jax.random.key(seed)) for seed in range(3)]
+    observations = [OFFSET + 0.1 * k for k in range(3)]
+    envs = [ENV - 0.1 * k for k in range(3)]
+    stack = partial(jax.tree.map, lambda *leaves: jnp.stack(leaves))
+    together = jit(jax.vmap(controller.act, in_axes=(None, 0, 0, 0, None)))
+    batch = together(params, stack(*states), stack(*observations), stack(*envs), REFERENCE)
+    alone = [act(params, *inputs, REFERENCE) for inputs in zip(states, observations, envs, strict=True)]
+    assert same(batch, stack(*alone), rtol=1e-4, atol=1e-5)
+
+
+def test_it_is_traced_once_while_state_environment_and_reference_change():
+    model, traces = models.physics(PLANT.step), []
+
+    def counting(params, env):
+        traces.append(env)
+        return model.fiber(params, env)
+
+    controller = planner(model._replace(fiber=counting), **BOX)
+    act, state = jit(controller.act), controller.init(jax.random.key(0))
+    for k in range(4):
+        _, state, _ = act({}, state, OFFSET + k, ENV + 9 * k, straight(HORIZON, speed=8.0 + k))
+    assert len(traces) == 1
+
+
+def test_the_same_key_makes_the_same_plan_and_another_key_another():
+    first, again, other = (act_once(seed=seed) for seed in (1, 1, 2))
+    np.testing.assert_array_equal(first[0], again[0])
+    assert same(first[1], again[1], rtol=0, atol=0)
+    assert not np.array_equal(first[1].plan, other[1].plan)
+
+
+def test_successive_steps_draw_fresh_noise():
+    _, state, _ = act_once()
+    rewound = state._replace(key=jax.random.key(0))
+    assert not np.array_equal(act_once(state=state)[1].plan, act_once(state=rewound)[1].plan)
+
+
+@pytest.mark.parametrize("entry", range(4))
+@pytest.mark.parametrize("value", [np.nan, np.inf])
+def test_a_broken_observation_continues_the_last_clean_plan_and_the_next_clean_step_recovers(entry, value):
+    _, clean, _ = act_once()
+    action, held, info = act_once(state=clean, observation=OFFSET.at[entry].set(value))
+    assert not bool(info["healthy"])
+    np.testing.assert_array_equal(action, clean.controls[0])
+    np.testing.assert_array_equal(held.plan[:-1], clean.plan[1:])
+    np.testing.assert_array_equal(held.controls[:-1], clean.controls[1:])
+    assert finite(held)
+    action, recovered, info = act_once(state=held)
+    assert bool(info["healthy"])
+    assert finite(recovered)
+    assert np.all(np.isfinite(action))
+
+
+@pytest.mark.parametrize("entry", range(2))
+def test_a_broken_environment_does_the_same(entry):
+    _, clean, _ = act_once(**BOX)
+    action, held, info = act_once(state=clean, env=ENV.at[entry].set(np.nan), **BOX)
+    assert not bool(info["healthy"])
+    assert not bool(info["env_inside"])
+    np.testing.assert_array_equal(action, clean.controls[0])
+    assert finite(held)
+    assert bool(act_once(state=held, **BOX)[2]["healthy"])
+
+
+def test_a_broken_first_observation_gives_a_finite_control_inside_the_bounds():
+    action, state, info = act_once(observation=jnp.full(4, jnp.nan))
+    assert not bool(info["healthy"])
+    assert np.all(np.isfinite(action))
+    assert finite(state)
+    assert bool(act_once(state=state)[2]["healthy"])
+
+
+def test_a_long_blackout_ends_with_the_last_control_held():
+    _, state, _ = act_once()
+    last = state.controls[-1]
+    for _ in range(HORIZON + 2):
+        action, state, _ = act_once(state=state, observation=jnp.full(4, jnp.nan))
+    np.testing.assert_array_equal(action, last)
+
+
+def breaks_where(condition):
+    """The plant, returning NaN wherever a condition on the control holds."""
+
+    def step(state, action, env):
+        return jnp.where(condition(action), jnp.nan, PLANT.step(state, action, env))
+
+    return models.physics(step)
+
+
+def test_a_model_that_breaks_for_half_of_the_samples_still_gives_a_finite_plan():
+    """Noise with correlation 1 keeps its sign: half of the samples steer left somewhere, and break."""
+    model = breaks_where(lambda action: action[0] > 0)
+    settings = {"law": control.no_feedback(), "noise_correlation": 1.0, "temperature": 1e9}
+    controller = planner(model, **settings)
+    action, state, info = jit(controller.act)({}, controller.init(jax.random.key(0)), OFFSET, ENV, REFERENCE)
+    assert bool(info["healthy"])
+    assert 20 < float(info["effective_samples"]) < 44  # of 64: equal weights on the rest
+    assert finite(state)
+    assert float(action[0]) < 0
+    assert np.all(np.isfinite(info["predicted_states"]))
+
+
+def test_a_model_that_always_breaks_is_reported_and_the_control_stays_finite():
+    controller = planner(breaks_where(lambda action: True))
+    action, state, info = jit(controller.act)({}, controller.init(jax.random.key(0)), OFFSET, ENV, REFERENCE)
+    assert not bool(info["healthy"])
+    assert np.all(np.isfinite(action))
+    assert finite(state)
+
+
+def test_an_environment_outside_the_box_is_clamped_and_flagged():
+    outside, edge = jnp.asarray([1.5, -20.0]), jnp.asarray([0.9, -8.0])
+    strayed, clamped = act_once(env=outside, **BOX), act_once(env=edge, **BOX)
+    assert not bool(strayed[2]["env_inside"])
+    assert bool(clamped[2]["env_inside"])
+    assert bool(strayed[2]["healthy"])
+    np.testing.assert_array_equal(strayed[0], clamped[0])
+    assert not np.array_equal(act_once(env=outside)[1].controls, clamped[1].controls)  # without a box: not clamped
+
+
+def test_the_latent_weight_changes_the_plan():
+    plain = act_once("sfkd")[1].plan
+    weighted = act_once("sfkd", latent_weight=100.0)[1].plan
+    assert np.all(np.isfinite(weighted))
+    assert np.max(np.abs(plain - weighted)) > 1e-5
+
+
+def nested(jaxpr):
+    """Every jaxpr inside the equations of one, with the primitive that holds it."""
+    for equation in jaxpr.eqns:
+        for value in equation.params.values():
+            for part in value if isinstance(value, tuple | list) else (value,):
+                inner = getattr(part, "jaxpr", part)
+                if hasattr(inner, "eqns"):
+                    yield equation.primitive.name, inner
+
+
+def primitives(jaxpr):
+    """Names of all primitives in a jaxpr, at any depth."""
+    names = {equation.primitive.name for equation in jaxpr.eqns}
+    return names.union(*(primitives(inner) for _, inner in nested(jaxpr)))
+
+
+def scan_bodies(jaxpr):
+    for name, inner in nested(jaxpr):
+        if name in ("scan", "while"):
+            yield inner
+        yield from scan_bodies(inner)
+
+
+def jaxpr_of_act(name):
+    model, params = model_and_params(name)
+    controller = planner(model)
+    inputs = (params, controller.init(jax.random.key(0)), OFFSET, ENV, REFERENCE)
+    return jax.make_jaxpr(controller.act)(*inputs).jaxpr
+
+
+@pytest.mark.parametrize("name", ["sfkd", "segment"])
+def test_what_depends_on_the_environment_alone_is_hoisted_out_of_the_horizon(name):
+    jaxpr = jaxpr_of_act(name)
+    bodies = [primitives(body) for body in scan_bodies(jaxpr)]
+    rolling = [body for body in bodies if {"dot_general", "tanh", "cos"} <= body]
+    assert len(rolling) == 2  # all samples, then the plan that was chosen
+    assert not [name for body in bodies for name in body if name in FORBIDDEN]
+    assert [name for name in primitives(jaxpr) if name in FORBIDDEN]  # the factorisation is there, outside
+
+
+@pytest.mark.parametrize("law", ["feedback", "plain"])
+def test_a_nominal_model_of_a_nominal_plant_converges_to_the_path(law):
+    model = models.physics(PLANT.nominal)
+    plain = {"law": control.no_feedback(), "noise_std": (0.06, 0.6)}
+    controller = planner(model, num_samples=128, **({} if law == "feedback" else plain))
+    road = scenarios.Scenario(
+        OFFSET,
+        jnp.tile(jnp.asarray([[0.9, 0.0]]), (60, 1)),
+        scenarios.path_from_curvature(jnp.zeros(300), spacing=0.5),
+        jnp.asarray(10.0),
+    )
+    drive = partial(evaluation.simulate, PLANT.nominal, controller, {}, dt=0.1, horizon=HORIZON)
+    episode = jit(drive)(road, jax.random.key(0))
+    lateral = np.abs(np.asarray(episode.lateral))
+    assert lateral[0] > 0.2
+    assert np.all(lateral[-20:] < (0.03 if law == "feedback" else 0.05))
+    assert np.all(lateral < 0.32)
+    assert np.all(np.abs(np.asarray(episode.states)[-20:, 3] - 10.0) < 0.3)
+    np.testing.assert_allclose(episode.prediction_error, np.zeros(60), atol=1e-4)  # the model is the plant
+    assert np.all(episode.healthy)
+
+
+def test_no_key_is_used_twice():
+    controller = planner(models.physics(PLANT.nominal), num_samples=4)
+
+    def start(key):
+        return controller.act({}, controller.init(key), OFFSET, ENV, REFERENCE)
+
+    with jax.debug_key_reuse(True):
+        jax.jit(start)(jax.random.key(0))

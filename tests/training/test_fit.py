@@ -1,0 +1,148 @@
+"""Training goes down, survives a kill, repeats exactly, and stops when numbers go bad."""
+
+import json
+import signal
+import subprocess
+import sys
+import time
+from functools import partial
+from pathlib import Path
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from helpers import TINY, dataset
+
+from sfkd_jax.datasets import measure_space, random_windows, spread_windows
+from sfkd_jax.models import sfkd
+from sfkd_jax.training import Checkpoints, TrainingStopped, fit, multi_step_loss
+
+OPTIONS = {"steps": 40, "log_every": 10, "save_every": 20}
+DRAW = partial(random_windows, batch=16, length=8)
+
+
+@pytest.fixture(scope="module")
+def task():
+    data = dataset()
+    space = measure_space(data)
+    model = sfkd(space, **TINY)
+    return model, multi_step_loss(model, space), data
+
+
+def train(task, place, seed=3, **changes):
+    model, loss, data = task
+    held_out = spread_windows(data.validation, length=8)
+    return fit(model, loss, DRAW, data.train, held_out, jax.random.key(seed), place, **(OPTIONS | changes))
+
+
+def same(a, b):
+    return all(np.array_equal(x, y) for x, y in zip(jax.tree.leaves(a), jax.tree.leaves(b), strict=True))
+
+
+def lines(place):
+    return [json.loads(line) for line in (place / "metrics.jsonl").read_text().splitlines()]
+
+
+def test_the_loss_falls_and_every_step_is_logged(task, tmp_path):
+    train(task, tmp_path)
+    logged = lines(tmp_path)
+    assert [line["step"] for line in logged] == [10, 20, 30, 40]
+    assert logged[-1]["loss"] < 0.8 * logged[0]["loss"]
+    assert "validation_loss" in logged[1]
+    assert list((tmp_path / "tensorboard").iterdir())
+
+
+def test_the_same_key_gives_the_same_weights_and_another_key_others(task, tmp_path):
+    first, _ = train(task, tmp_path / "a")
+    again, _ = train(task, tmp_path / "b")
+    other, _ = train(task, tmp_path / "c", seed=4)
+    assert same(first, again)
+    assert not same(first, other)
+
+
+def test_an_interrupted_run_ends_bit_identical_to_an_unbroken_one(task, tmp_path, monkeypatch):
+    unbroken, best = train(task, tmp_path / "unbroken")
+    saves = []
+    save = Checkpoints.save
+
+    def save_then_die(self, step, state, *, validation_loss):
+        save(self, step, state, validation_loss=validation_loss)
+        saves.append(step)
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(Checkpoints, "save", save_then_die)
+    with pytest.raises(KeyboardInterrupt):
+        train(task, tmp_path / "broken")
+    monkeypatch.undo()
+    resumed, best_again = train(task, tmp_path / "broken")
+    assert saves == [20]
+    assert same(unbroken, resumed)
+    assert best == best_again
+    assert [line["step"] for line in lines(tmp_path / "broken")] == [10, 20, 30, 40]
+
+
+def test_latest_and_best_are_both_kept(tmp_path):
+    shelf = Checkpoints(tmp_path)
+    for step, score in ((1, 3.0), (2, 1.0), (3, 2.0), (4, 5.0)):
+        shelf.save(step, {"w": jnp.full(3, float(step))}, validation_loss=score)
+    assert (shelf.latest_step(), shelf.best_step()) == (4, 2)
+    assert shelf.restore(2, {"w": jnp.zeros(3)})["w"][0] == 2.0
+    shelf.close()
+    reopened = Checkpoints(tmp_path)
+    assert (reopened.latest_step(), reopened.best_step()) == (4, 2)
+    reopened.close()
+
+
+def test_a_loss_that_is_not_finite_stops_with_the_last_good_checkpoint(task, tmp_path):
+    model, loss, data = task
+    poisoned = data._replace(train=data.train._replace(states=data.train.states.at[..., 3].set(jnp.nan)))
+    train(task, tmp_path, steps=20)
+    with pytest.raises(TrainingStopped, match="last good checkpoint is step 20"):
+        train((model, loss, poisoned), tmp_path)
+    kept = Checkpoints(tmp_path / "checkpoints")
+    assert kept.latest_step() == 20
+    kept.close()
+
+
+@pytest.mark.parametrize(("changes", "says"), [({"steps": 45}, "multiples"), ({"save_every": 15}, "multiples")])
+def test_settings_that_cannot_work_are_refused(task, tmp_path, changes, says):
+    with pytest.raises(ValueError, match=says):
+        train(task, tmp_path, **changes)
+
+
+WORKER = """
+import sys
+sys.path.insert(0, sys.argv[2])
+import jax
+from functools import partial
+from pathlib import Path
+from helpers import TINY, dataset
+from sfkd_jax.datasets import measure_space, random_windows, spread_windows
+from sfkd_jax.models import sfkd
+from sfkd_jax.training import fit, multi_step_loss
+data = dataset()
+space = measure_space(data)
+model = sfkd(space, **TINY)
+draw = partial(random_windows, batch=16, length=8)
+held_out = spread_windows(data.validation, length=8)
+loss, key, place = multi_step_loss(model, space), jax.random.key(3), Path(sys.argv[1])
+fit(model, loss, draw, data.train, held_out, key, place, steps=40, log_every=10, save_every=10)
+"""
+
+
+@pytest.mark.slow
+def test_kill_9_at_random_moments_loses_nothing(task, tmp_path):
+    unbroken, _ = train(task, tmp_path / "unbroken", save_every=10)
+    random, place = np.random.default_rng(0), tmp_path / "killed"
+    for _ in range(4):
+        worker = subprocess.Popen([sys.executable, "-c", WORKER, str(place), str(Path(__file__).parents[1])])
+        patience = time.monotonic() + 60
+        while not (place / "checkpoints").exists() and worker.poll() is None and time.monotonic() < patience:
+            time.sleep(0.05)
+        time.sleep(random.uniform(0.0, 3.0))
+        worker.send_signal(signal.SIGKILL)
+        worker.wait()
+    resumed, _ = train(task, place, save_every=10)
+    assert same(unbroken, resumed)
+    assert [line["step"] for line in lines(place)] == [10, 20, 30, 40]
