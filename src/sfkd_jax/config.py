@@ -105,7 +105,7 @@ def register() -> None:
     loss = schema("LossConfig", training.multi_step_loss)
     node = make_dataclass(
         "TrainingConfig",
-        [("loss", loss, field(default_factory=loss)), *_fields(schema("Fit", training.fit, batch=256, window=20))],
+        [("loss", loss, field(default_factory=loss)), *_fields(schema("Fit", training.fit, batch=128, window=20))],
     )
     store.store(group="training", name="schema", node=node)
     protocol = {"episodes": 8, "episode_s": 60.0, "seed": 2026, "systems": _SYSTEMS, "observation_noise": _SENSORS}

@@ -31,7 +31,7 @@ def test_the_error_falls_with_the_fourth_power_of_the_step(vehicle):
 
     @jax.jit
     def end(steps):
-        step = rk4(vehicle.derivative, dt=1.0 / steps)
+        step = rk4(lambda x, u, e: vehicle.derivative(x, u, e) / steps, dt=1.0)
         return jax.lax.fori_loop(0, steps, lambda _, x: step(x, control, env), state)
 
     steps = np.array([4, 6, 9, 14, 20]) * (10 if vehicle.name == "dynamic" else 1)  # tyres are stiffer than a path

@@ -43,7 +43,7 @@ def fit(
     key: Key,
     directory: Path,
     *,
-    steps: int = 5000,
+    steps: int = 4000,
     learning_rate: float = 3e-3,
     clip_norm: float = 100.0,
     log_every: int = 50,
