@@ -5,7 +5,7 @@ from __future__ import annotations
 import time
 from typing import Any
 
-from sfkd_jax import artefacts, policy, shelf
+from sfkd_jax import artefacts, policy, shelf, walk
 from sfkd_jax.certification import CertificationRefused, certify
 from sfkd_jax.config import Stale, door
 
@@ -14,9 +14,9 @@ def renew(settings: dict[str, Any]) -> dict[str, Any]:
     """Certify the policy of this run as it is now; a refusal is a document too."""
     began = time.perf_counter()
     place = shelf.run_directory(settings)
-    weights = artefacts.read_arrays(place / "policy.npz", kind=policy.KIND)[1]["sha256"]
-    trained = policy.load(place)
-    dataset, _ = shelf.read_dataset(settings)
+    trained = walk.ensure_policy(settings)
+    weights = policy.weights_hash(place)
+    dataset, _ = walk.ensure_dataset(settings)
     options = {name: value for name, value in settings["certification"].items() if name != "renew"}
     try:
         document = certify(
@@ -44,7 +44,7 @@ def run(settings: dict[str, Any]) -> dict[str, Any]:
     path = place / "certificate.json"
     if path.exists() and not settings["certification"]["renew"]:
         about = artefacts.read_json(path, keys=("weights_sha256",))["weights_sha256"]
-        if about != artefacts.read_arrays(place / "policy.npz", kind=policy.KIND)[1]["sha256"]:
+        if about != policy.weights_hash(place):
             raise Stale(f"{path} is about other weights; certification.renew=true replaces it")
     document = renew(settings)
     if not document["valid"]:

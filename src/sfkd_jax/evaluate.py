@@ -10,7 +10,7 @@ from typing import Any
 import jax
 import numpy as np
 
-from sfkd_jax import artefacts, assembly, evaluation, policy, shelf
+from sfkd_jax import artefacts, assembly, evaluation, shelf, walk
 from sfkd_jax.config import door
 from sfkd_jax.types import Controller
 
@@ -22,7 +22,7 @@ def run(settings: dict[str, Any]) -> dict[str, Any]:
     began = time.perf_counter()
     place, protocol = shelf.run_directory(settings), settings["evaluation"]
     plant = assembly.build_vehicle(settings["vehicle"])
-    systems = _systems(settings, plant, place)
+    systems = _systems(settings, plant)
     family = assembly.build_scenario(settings["scenario"], plant, duration=protocol["episode_s"])
     road_key, drive_key = jax.random.split(jax.random.key(protocol["seed"]))
     roads = jax.jit(jax.vmap(family))(jax.random.split(road_key, protocol["episodes"]))
@@ -49,12 +49,12 @@ def run(settings: dict[str, Any]) -> dict[str, Any]:
     return {"results": str(place / "results.json"), "rows": len(rows)}
 
 
-def _systems(settings: dict[str, Any], plant: Any, place: Path) -> dict[str, assembly.System]:
+def _systems(settings: dict[str, Any], plant: Any) -> dict[str, assembly.System]:
     """The systems asked for; "self" is the policy of this run."""
     references, found = assembly.reference_systems(plant), {}
     for name in settings["evaluation"]["systems"]:
         if name == "self":
-            trained = policy.load(place)
+            trained = walk.ensure_policy(settings)
             told = "measured" if trained.settings["model"].get("environment", True) else "none"
             found[trained.settings["model"]["system"]] = assembly.System(trained.model, trained.params, told)
         else:

@@ -38,6 +38,11 @@ def save(path: Path, params: Params, settings: Mapping[str, Any], *, made_from: 
     return artefacts.write_arrays(path, flat, kind=KIND, config=settings, made_from=made_from)
 
 
+def weights_hash(path: Path) -> str:
+    """The hash that names the weights of the policy in a run directory."""
+    return artefacts.read_arrays(path / "policy.npz", kind=KIND)[1]["sha256"]
+
+
 def load(path: str | Path) -> Policy:
     """The policy in a run directory (or a policy.npz with its manifest beside it).
 

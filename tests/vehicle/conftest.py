@@ -6,13 +6,15 @@ from types import SimpleNamespace
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 import pytest
 
 from sfkd_jax.vehicle import dynamic, kinematic
 
 PLANTS = {"kinematic": cache(kinematic), "dynamic": cache(dynamic)}  # one object a setting, so one compilation
 LONGEST = 300
-LIMITS = {3: (0.0, 25.0), 4: (-4.0, 4.0), 5: (-1.5, 1.5), 6: (-0.5, 0.5)}
+STATE_LIMITS = [(-50, 50), (-50, 50), (-3, 3), (0, 25), (-4, 4), (-1.5, 1.5), (-0.5, 0.5)]
+ENV_LIMITS = [(0.3, 0.9), (-8, 8)]
 
 
 @pytest.fixture(params=list(PLANTS))
@@ -78,18 +80,15 @@ def hold() -> Callable:
 
 @pytest.fixture
 def sweep() -> Callable:
-    """(vehicle, key, count, overdrive) -> random states, controls and envs; every second row sits on the bounds."""
+    """(vehicle, count, overdrive) -> random states, controls and envs; every second row sits on the bounds."""
 
-    def draw(vehicle, key, count, overdrive=1.0):
-        size = len(vehicle.state_names)
-        low, high = jnp.array([(-50.0, 50.0), (-50.0, 50.0), (-3.0, 3.0), *(LIMITS[i] for i in range(3, size))]).T
-        u_low, u_high = jnp.array(vehicle.control_low) * overdrive, jnp.array(vehicle.control_high) * overdrive
-        low, high = jnp.append(low, u_low), jnp.append(high, u_high)
-        low, high = jnp.append(low, jnp.array([0.3, -8.0])), jnp.append(high, jnp.array([0.9, 8.0]))
-        inside, corner = jax.random.split(key)
-        share = jax.random.uniform(inside, (count, low.size))
-        extreme = jax.random.randint(corner, (count, low.size), 0, 3) / 2
-        rows = low + (high - low) * jnp.where(jnp.arange(count)[:, None] % 2 == 0, share, extreme)
+    def draw(vehicle, count, overdrive=1.0):
+        random, size = np.random.default_rng(0), len(vehicle.state_names)
+        controls = overdrive * np.array([vehicle.control_low, vehicle.control_high]).T
+        low, high = np.concatenate([STATE_LIMITS[:size], controls, ENV_LIMITS]).T
+        share = random.uniform(size=(count, low.size))
+        share[1::2] = np.round(2 * share[1::2]) / 2
+        rows = jnp.asarray(low + (high - low) * share)
         return SimpleNamespace(states=rows[:, :size], controls=rows[:, size : size + 2], envs=rows[:, size + 2 :])
 
     return draw

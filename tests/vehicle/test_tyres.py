@@ -77,8 +77,8 @@ def test_without_wind_a_straight_drive_stays_straight(vehicle, hold):
     assert (states[:, 4:] == 0).all()
 
 
-def test_no_command_takes_more_from_the_tyres_than_friction_times_load(coasting, sweep, key):
-    drawn = sweep(coasting, key, 20_000, overdrive=3.0)
+def test_no_command_takes_more_from_the_tyres_than_friction_times_load(coasting, sweep):
+    drawn = sweep(coasting, 20_000, overdrive=3.0)
     states = drawn.states.at[:, 3].max(3.0)
     acceleration = jax.vmap(tyre_acceleration, in_axes=(None, 0, 0, 0))(coasting, states, drawn.controls, drawn.envs)
     used = jnp.linalg.norm(acceleration, axis=1) / (drawn.envs[:, 0] * GRAVITY)

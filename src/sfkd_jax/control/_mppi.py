@@ -119,6 +119,7 @@ def mppi(
     def act(
         params: Params, state: PlannerState, observation: State, env: Environment, reference: Reference
     ) -> tuple[Control, PlannerState, dict[str, Array]]:
+        _check_shapes(observation, env, reference, horizon)
         noise_key, next_key = jax.random.split(state.key)
         clean = _all_finite(observation) & _all_finite(env) & _all_finite(reference)
         inside = env if env_low is None or env_high is None else jnp.clip(env, jnp.array(env_low), jnp.array(env_high))
@@ -162,6 +163,16 @@ def mppi(
         return control, shifted, info
 
     return Controller(init, act)
+
+
+def _check_shapes(observation: State, env: Environment, reference: Reference, horizon: int) -> None:
+    """Name the argument that has the wrong shape."""
+    if observation.ndim != 1 or observation.shape[0] < 4:
+        raise ValueError(f"observation must be (p_x, p_y, yaw, v, …), shape (nx,), got {observation.shape}")
+    if env.ndim != 1:
+        raise ValueError(f"env must have shape (ne,), got {env.shape}")
+    if reference.shape != (horizon, 4):
+        raise ValueError(f"reference must have shape ({horizon}, 4): x, y, yaw, speed; got {reference.shape}")
 
 
 def _softmin(costs: Float[Array, " sample"], temperature: float) -> tuple[Float[Array, " sample"], Bool[Array, ""]]:

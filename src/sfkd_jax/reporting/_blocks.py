@@ -132,9 +132,7 @@ def _markdown(block: Block) -> str:
         case Tiles(items):
             return "\n".join(f"- {_plain(name)}: {_plain(value)}" for name, value in items)
         case Table(header, rows, strong, prose):
-            stress = [
-                [f"**{_plain(c)}**" if i in strong else _plain(c) for c in row] for i, row in enumerate(rows)
-            ]
+            stress = [[f"**{_plain(c)}**" if i in strong else _plain(c) for c in row] for i, row in enumerate(rows)]
             rule = [":--"] + [":--" if prose else "--:"] * (len(header) - 1)
             lines = [[_plain(cell) for cell in header], rule, *stress]
             return "\n".join(f"| {' | '.join(line)} |" for line in lines)

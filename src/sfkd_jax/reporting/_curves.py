@@ -17,9 +17,7 @@ def learning(lines: list[dict[str, Any]]) -> Figure:
     rows = {key: _column(lines, key) for key in ("loss", "validation_loss", "alpha")}
     certified = rows["alpha"].shape[1] > 1
     figure = canvas(4.3 if certified else 3.3)
-    panels = figure.subplots(
-        1 + certified, 1, sharex=True, squeeze=False, height_ratios=[3, 1][: 1 + certified]
-    )[:, 0]
+    panels = figure.subplots(1 + certified, 1, sharex=True, squeeze=False, height_ratios=[3, 1][: 1 + certified])[:, 0]
     panels[0].plot(*rows["loss"], color="#9dbbe3", linewidth=1.1, label="training")
     panels[0].plot(*rows["validation_loss"], color=ACCENT, marker="o", markersize=3.5, label="validation")
     panels[0].set(yscale="log", ylabel="loss [-]", title="Learning curves")
@@ -35,9 +33,7 @@ def learning(lines: list[dict[str, Any]]) -> Figure:
 
 def _column(lines: list[dict[str, Any]], key: str) -> np.ndarray:
     """The steps and finite values of one logged quantity, (2, count)."""
-    pairs = [
-        (row["step"], row[key]) for row in lines if isinstance(row.get(key), int | float) and "step" in row
-    ]
+    pairs = [(row["step"], row[key]) for row in lines if isinstance(row.get(key), int | float) and "step" in row]
     values = np.array(pairs, dtype=float).reshape(-1, 2).T
     return values[:, np.isfinite(values).all(axis=0)]
 
@@ -85,9 +81,7 @@ def tube(radii: list[Any], ultimate: Any, alpha: Any) -> Figure:
         f"$R_1$ = {upper(radii[0])},  $R_{{{len(radii)}}}$ = {upper(radii[-1])}",
         f"ultimate bound = {ultimate}",
     ]
-    axes.text(
-        0.03, 0.95, "\n".join(words), transform=axes.transAxes, va="top", linespacing=1.6, color="#30363d"
-    )
+    axes.text(0.03, 0.95, "\n".join(words), transform=axes.transAxes, va="top", linespacing=1.6, color="#30363d")
     axes.set(xlabel="steps ahead k", ylabel="latent radius $R_k$ [-]", xlim=(0.5, len(radii) + 0.5))
     axes.set_ylim(bottom=0.0)
     axes.set_title("Tube that the prediction error cannot leave while ‖d‖ ≤ d̄")

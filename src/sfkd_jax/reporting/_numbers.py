@@ -66,10 +66,7 @@ def plain(value: Any) -> str:
         case int() | float():
             return short(value, 6)
         case dict():
-            parts = [
-                f"{key} ({plain(v)})" if isinstance(v, dict) else f"{key} {plain(v)}"
-                for key, v in value.items()
-            ]
+            parts = [f"{key} ({plain(v)})" if isinstance(v, dict) else f"{key} {plain(v)}" for key, v in value.items()]
             return "; ".join(parts) or DASH
         case list() | tuple():
             shown = ", ".join(plain(entry) for entry in value[:12])

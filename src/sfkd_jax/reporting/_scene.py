@@ -59,10 +59,7 @@ def read_scenes(path: Path) -> dict[str, Scene]:
         }
         road = {part[1]: part[2][0] for part in parts if len(part) == 3 and part[0] == name and len(part[2])}
         lateral = {system: values for system, values in driven["lateral"].items() if values.size}
-        first = [
-            {key: rows[0] for key, rows in driven[kind].items() if rows.size}
-            for kind in ("states", "controls")
-        ]
+        first = [{key: rows[0] for key, rows in driven[kind].items() if rows.size} for kind in ("states", "controls")]
         if lateral:
             found[name] = Scene(name, dt, road.get("envs"), road.get("path"), lateral, *first)
     return found

@@ -57,9 +57,7 @@ def tiles(
     return [Tiles(items)] if items else []
 
 
-def driving(
-    run: Path, rows: list[list[dict[str, Any]]], settings: dict[str, Any], place: Path
-) -> list[Block]:
+def driving(run: Path, rows: list[list[dict[str, Any]]], settings: dict[str, Any], place: Path) -> list[Block]:
     """Closed loop: the table the summary speaks of, the pictures, then every other table."""
     blocks: list[Block] = [Heading(2, "How it drives")]
     head = headline(rows, settings)
@@ -160,11 +158,7 @@ def training(metrics: list[dict[str, Any]], settings: dict[str, Any], place: Pat
 
 def provenance(settings: dict[str, Any], versions: Any) -> list[Block]:
     """Settings, versions, and the commands that make this run again."""
-    found = (
-        [[str(name), plain(version)] for name, version in versions.items()]
-        if isinstance(versions, dict)
-        else []
-    )
+    found = [[str(name), plain(version)] for name, version in versions.items()] if isinstance(versions, dict) else []
     return [
         Heading(2, "How to make it again"),
         Text("This command walks from nothing to this page:"),

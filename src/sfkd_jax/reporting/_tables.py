@@ -82,9 +82,7 @@ def closed_loop(block: list[dict[str, Any]]) -> Table:
 def closed_loop_more(block: list[dict[str, Any]]) -> Table:
     """The remaining measures of a block; a measure that no row has gets no column."""
     columns = {
-        name: cell
-        for name, cell in _MORE.items()
-        if name == "System" or any(cell(row) != DASH for row in block)
+        name: cell for name, cell in _MORE.items() if name == "System" or any(cell(row) != DASH for row in block)
     }
     return _table(columns, block)
 
@@ -111,9 +109,7 @@ def open_loop_table(errors: dict[str, Any]) -> Table:
         place = steps.index(step)
         columns = [errors.get(key) or [] for key in keys.values()]
         cells = [number(values[place], 4) if place < len(values) else DASH for values in columns]
-        rows.append(
-            [str(step), number(step * errors["dt"] if is_number(errors.get("dt")) else None, 1), *cells]
-        )
+        rows.append([str(step), number(step * errors["dt"] if is_number(errors.get("dt")) else None, 1), *cells])
     return Table(["Steps\nahead", "Seconds\nahead", *keys], rows)
 
 

@@ -36,9 +36,7 @@ def track(scene: Scene) -> Figure:
     for name, (index, offset) in drawn.items():
         above.plot(*_widened(path[index], offset, 1), **line(name) | {"linewidth": 1.1})
     above.plot(*path[0, :2], marker="o", markersize=6, color="#30363d", zorder=6)
-    above.annotate(
-        "start", path[0, :2], xytext=(7, -12), textcoords="offset points", color="#57606a", fontsize=9
-    )
+    above.annotate("start", path[0, :2], xytext=(7, -12), textcoords="offset points", color="#57606a", fontsize=9)
     above.add_patch(
         Circle(
             (path[centre, 0], path[centre, 1]),
@@ -60,9 +58,7 @@ def track(scene: Scene) -> Figure:
     for mark in (close.turn @ (path[marks, :2] - path[centre, :2]).T)[0]:
         below.axvline(mark, color=MUTED, linestyle=(0, (4, 3)), linewidth=0.9, zorder=1)
     _scale_bar(below, limits[1][1][0] + 0.6)
-    below.set(
-        xlabel="along the road [m]", yticks=[], title=f"Inside the ring, deviations drawn × {EXAGGERATION}"
-    )
+    below.set(xlabel="along the road [m]", yticks=[], title=f"Inside the ring, deviations drawn × {EXAGGERATION}")
     for axes, (x, y) in zip((above, below), limits, strict=True):
         axes.set(xlim=x, ylim=y, aspect="equal")
     legend(figure, below)
@@ -92,9 +88,7 @@ def _close_up(path: np.ndarray, centre: int, drawn: dict[str, tuple[np.ndarray, 
         heights.append(tracks[name][1, np.abs(tracks[name][0]) < _CLOSE_UP])
     across = np.concatenate(heights)
     across = across[np.abs(across) < 0.6 * _CLOSE_UP]
-    return _CloseUp(
-        turn, road, tracks, np.array([across.min(initial=0.0) - 2.5, across.max(initial=0.0) + 1.0])
-    )
+    return _CloseUp(turn, road, tracks, np.array([across.min(initial=0.0) - 2.5, across.max(initial=0.0) + 1.0]))
 
 
 def _framed(x: np.ndarray, y: np.ndarray, most: float) -> tuple[np.ndarray, np.ndarray]:
@@ -108,9 +102,7 @@ def _framed(x: np.ndarray, y: np.ndarray, most: float) -> tuple[np.ndarray, np.n
 def _scale_bar(axes: Any, foot: float) -> None:
     """A bar as long as 0.1 m of deviation is drawn."""
     height, left = 0.1 * EXAGGERATION, -0.96 * _CLOSE_UP
-    axes.plot(
-        [left, left], [foot, foot + height], color="#30363d", linewidth=2.5, solid_capstyle="butt", zorder=8
-    )
+    axes.plot([left, left], [foot, foot + height], color="#30363d", linewidth=2.5, solid_capstyle="butt", zorder=8)
     axes.text(
         left + 0.7,
         foot + height / 2,

@@ -74,9 +74,7 @@ def _driving(model: str, block: list[dict[str, Any]]) -> list[str]:
     if is_number(dig(oracle, "rmse_m", "mean")):
         beside.append(f"{number(oracle.get('rmse_m'))} m for the oracle, which plans with the true vehicle")
     if is_number(dig(nominal, "rmse_m", "mean")):
-        beside.append(
-            f"{number(nominal.get('rmse_m'))} m for the nominal model, which knows neither friction nor wind"
-        )
+        beside.append(f"{number(nominal.get('rmse_m'))} m for the nominal model, which knows neither friction nor wind")
     others = f", beside {', and '.join(beside)}" if beside else ""
     where = str(own.get("scenario")).upper()
     said = [f"In scenario {where} it follows the path to a lateral RMSE of {number(mean)} m{within}{others}."]

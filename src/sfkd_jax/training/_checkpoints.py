@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import sys
 from pathlib import Path
 from typing import Any
 
@@ -48,6 +49,23 @@ class Checkpoints:
         scores = {step: self._manager.metrics(step) for step in self._manager.all_steps()}
         losses = {step: score["validation_loss"] for step, score in scores.items() if score}
         return min(losses, key=lambda step: losses[step]) if losses else None
+
+    def resume(self, like: Any) -> Any:
+        """The newest state that can be read, or `like` if there is none; a damaged one is told on stderr.
+
+        Raises:
+            OSError: there are states, and none can be read.
+        """
+        steps = sorted(self._manager.all_steps(), reverse=True)
+        for step in steps:
+            try:
+                return self.restore(step, like)
+            except Exception as reason:  # orbax raises whatever its storage raised
+                line = str(reason).splitlines()[0] if str(reason) else type(reason).__name__
+                print(f"checkpoint {step} cannot be read ({line[:120]}); trying an older one", file=sys.stderr)
+        if steps:
+            raise OSError(f"no checkpoint in {self._manager.directory} can be read; remove it to start again")
+        return like
 
     def restore(self, step: int, like: Any) -> Any:
         """The state saved at `step`, with the structure and types of `like`."""

@@ -78,8 +78,8 @@ def fit(
     state = TrainState(jnp.zeros((), jnp.int32), params, transform.init(params))
     checkpoints = Checkpoints(directory / "checkpoints")
     try:
-        start = checkpoints.latest_step() or 0
-        state = checkpoints.restore(start, state) if start else state
+        state = checkpoints.resume(state)
+        start = int(state.step)
         with TrainingLog(directory, steps=steps, resumed_at=start) as log:
             began = time.perf_counter()
             for done in range(start + log_every, steps + 1, log_every):

@@ -116,6 +116,8 @@ def sfkd(
         )
 
     def lift(fiber: SfkdFiber, pose: Pose, state: State) -> SfkdLatent:
+        if state.shape != (3 + body,):
+            raise ValueError(f"state must have shape ({3 + body},), got {state.shape}")
         inputs = (state[BODY] - space.body_mean) / space.body_scale
         if segment:
             inputs = jnp.concatenate([between(pose, state[POSE]) / pose_scale, inputs])

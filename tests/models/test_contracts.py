@@ -1,0 +1,225 @@
+"""What every model must keep: the contract of `Model`, over all variants and the physics rows."""
+
+from functools import cache, partial
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from helpers import HARD, PHYSICS, TINY, VARIANTS, at, driven, jit, model_and_params, same, space, tiny
+
+from sfkd_jax import artefacts, models
+from sfkd_jax.rollouts import defects, rollout
+from sfkd_jax.se2 import compose
+from sfkd_jax.types import POSE
+
+EVERY = (*VARIANTS, *PHYSICS)
+LEARNED = tuple(VARIANTS)
+
+
+def chain(model, params, trajectory):
+    """Everything a model does, in a row: two steps with a switch between them."""
+    here, there = (model.fiber(params, env) for env in (trajectory.envs[0], trajectory.envs[1]))
+    start = model.encode(here, trajectory.states[0])
+    stepped = model.step(here, start, trajectory.controls[0])
+    moved = model.step(there, model.transport(here, there, stepped), trajectory.controls[1])
+    seen = model.observe(there, start, trajectory.states[2])
+    return {
+        "start": model.decode(here, start),
+        "stepped": model.decode(here, stepped),
+        "moved": model.decode(there, moved),
+        "gap": model.vector(moved) - model.vector(seen),
+    }
+
+
+@cache
+def chained(name):
+    """The chain of a model by name, compiled once."""
+    return jit(partial(chain, model_and_params(name)[0]))
+
+
+def run(name, trajectory):
+    return chained(name)(model_and_params(name)[1], trajectory)
+
+
+@pytest.fixture(scope="module")
+def one():
+    return at(driven(), 0)
+
+
+@pytest.mark.parametrize("name", EVERY)
+def test_compiling_changes_nothing(name, one):
+    model, params = model_and_params(name)
+    assert same(run(name, one), chain(model, params, one), rtol=1e-5, atol=1e-5)
+
+
+@pytest.mark.parametrize("name", EVERY)
+def test_a_batch_is_a_loop(name):
+    model, params = model_and_params(name)
+    batch = jit(jax.vmap(partial(chain, model), in_axes=(None, 0)))(params, driven())
+    for k in range(len(driven().states)):
+        assert same(at(batch, k), run(name, at(driven(), k)), rtol=1e-5, atol=1e-5)
+
+
+@pytest.mark.parametrize("name", EVERY)
+def test_states_come_out_in_the_shape_they_went_in_and_finite(name, one):
+    out = run(name, one)
+    assert out["start"].shape == out["stepped"].shape == out["moved"].shape == (4,)
+    assert out["gap"].ndim == 1
+    assert all(np.all(np.isfinite(leaf)) for leaf in jax.tree.leaves(out))
+
+
+@pytest.mark.parametrize("name", EVERY)
+def test_the_pose_that_was_encoded_is_decoded_unchanged(name, one):
+    if name == "segment":
+        pytest.skip("the segment frame holds the pose in a learned latent")
+    np.testing.assert_array_equal(run(name, one)["start"][POSE], one.states[0, POSE])
+
+
+@pytest.mark.parametrize("body", [1, 4])
+def test_sizes_follow_the_space(body):
+    model = tiny(body=body)
+
+    def encoded(key, state, env, control):
+        params = model.init(key)
+        fiber = model.fiber(params, env)
+        latent = model.step(fiber, model.encode(fiber, state), control)
+        return model.vector(latent), model.decode(fiber, latent), model.explicit(params).readout
+
+    two = jax.ShapeDtypeStruct((2,), jnp.float32)
+    state = jax.ShapeDtypeStruct((3 + body,), jnp.float32)
+    z, decoded, readout = jax.eval_shape(encoded, jax.random.key(0), state, two, two)
+    assert (z.shape, decoded.shape, readout.shape) == ((8,), (3 + body,), (body, 8))
+
+
+@pytest.mark.parametrize("name", LEARNED)
+def test_parameters_are_nested_dicts_of_float32_arrays_that_survive_the_shelf(name):
+    _, params = model_and_params(name)
+    flat = artefacts.flatten(params)
+    assert all(array.dtype == np.float32 and np.all(np.isfinite(array)) for array in flat.values())
+    assert same(artefacts.unflatten(flat), params, rtol=0, atol=0)
+
+
+def test_initial_parameters_depend_on_the_key_alone():
+    init = jit(tiny().init)
+    first, again, other = (init(jax.random.key(seed)) for seed in (1, 1, 2))
+    assert same(first, again, rtol=0, atol=0)
+    assert not np.array_equal(first["networks"]["operators"], other["networks"]["operators"])
+
+
+@pytest.mark.parametrize("name", LEARNED)
+def test_gradients_of_a_rollout_are_finite_and_reach_every_parameter_in_use(name, one):
+    model, params = model_and_params(name)
+
+    def loss(params):
+        predicted, _, along = rollout(model, params, one)
+        gap, _ = defects(model, params, one, along)
+        total = jnp.sum((predicted - one.states[1:]) ** 2) + jnp.sum(gap**2)
+        if model.penalty is not None:
+            fiber = model.fiber(params, one.envs[0])
+            total += model.penalty(fiber, model.encode(fiber, one.states[0]), one.controls[0])
+        return total
+
+    flat = artefacts.flatten(jit(jax.grad(loss))(params))
+    assert all(np.all(np.isfinite(gradient)) for gradient in flat.values())
+    unused = {name for name, gradient in flat.items() if not np.any(gradient)}
+    allowed = {
+        "no_transport": ("tangent_head",),
+        "no_residual": ("residual",),
+        "no_fiber": ("psi", "_head/kernel"),  # ψ(0) = 0 at the start: biases alone learn at first
+    }
+    assert not {path for path in unused if not any(part in path for part in allowed.get(name, ()))}
+    if name == "no_residual":
+        assert unused
+
+
+@pytest.mark.parametrize("name", EVERY)
+def test_predictions_move_with_the_frame_of_the_world(name, one):
+    """SE(2): start elsewhere, facing elsewhere, and every predicted pose is moved along; body states stay."""
+    world = jnp.asarray([30.0, -20.0, 1.1])
+    states = jax.vmap(lambda state: state.at[POSE].set(compose(world, state[POSE])))(one.states)
+    here, there = run(name, one), run(name, one._replace(states=states))
+    for part in ("start", "stepped", "moved"):
+        expected = here[part].at[POSE].set(compose(world, here[part][POSE]))
+        np.testing.assert_allclose(there[part], expected, rtol=1e-5, atol=3e-5)
+    np.testing.assert_allclose(there["gap"], here["gap"], atol=3e-5)
+
+
+@pytest.mark.parametrize("name", EVERY)
+def test_only_models_without_an_environment_ignore_it_and_these_exactly(name, one):
+    blind = name in ("no_fiber", "nominal")
+    other = one._replace(envs=one.envs[::-1])
+    assert same(run(name, one), run(name, other), rtol=0, atol=0) == blind
+
+
+@pytest.mark.parametrize("name", EVERY)
+def test_observing_the_state_that_was_encoded_gives_its_latent(name, one):
+    model, params = model_and_params(name)
+
+    @jit
+    def both(params):
+        fiber = model.fiber(params, one.envs[0])
+        latent = model.encode(fiber, one.states[0])
+        return model.vector(latent), model.vector(model.observe(fiber, latent, one.states[0]))
+
+    encoded, observed = both(params)
+    np.testing.assert_allclose(observed, encoded, atol=1e-6)
+
+
+@pytest.mark.parametrize("name", LEARNED)
+def test_what_is_certified_is_what_is_multiplied_by(name, one):
+    model, params = model_and_params(name)
+    explicit, fiber = jit(lambda params: (model.explicit(params), model.fiber(params, one.envs[0])))(params)
+    assert explicit.vertices.shape == (TINY["vertices"], 8, 8)
+    if name != "no_residual":
+        assert same(explicit.residual, fiber.residual, rtol=0, atol=0)
+    assert same(explicit.decoder[:-1], fiber.decoder[:-1], rtol=0, atol=0)
+    scale = np.asarray(space().increment_scale) * (20.0 if name == "segment" else 1.0)
+    np.testing.assert_allclose(explicit.decoder[-1], scale[:, None] * np.asarray(fiber.decoder[-1]), rtol=1e-6)
+    mixture, *_ = np.linalg.lstsq(np.asarray(explicit.vertices).reshape(3, -1).T, np.ravel(fiber.A), rcond=None)
+    np.testing.assert_allclose(np.tensordot(mixture, explicit.vertices, axes=1), fiber.A, atol=1e-5)
+    assert np.all(mixture > 0)
+    np.testing.assert_allclose(mixture.sum(), 1.0, atol=1e-5)
+    assert len(explicit.residual_multipliers) == (2 if name in HARD else 0)
+
+
+@pytest.mark.parametrize(
+    ("setting", "value"),
+    [
+        ("frame", "world"),
+        ("residual", "soft"),
+        ("rank", 7),
+        ("rank", 0),
+        ("rho", 1.0),
+        ("rho", 0.0),
+        ("beta", -0.1),
+        ("beta", 1.5),
+    ],
+)
+def test_settings_that_no_model_can_have_are_refused_by_name(setting, value):
+    with pytest.raises(ValueError, match=rf"model\.{setting}.*{value}"):
+        models.sfkd(space(), **TINY | {setting: value})
+
+
+def test_an_unknown_frame_or_residual_lists_the_choices():
+    with pytest.raises(ValueError, match="body, segment"):
+        tiny(frame="world")
+    with pytest.raises(ValueError, match="sandwich, free, none"):
+        tiny(residual="soft")
+
+
+def test_only_the_soft_variant_has_a_penalty_and_it_is_the_hinge_on_the_jacobian(one):
+    assert [name for name in LEARNED if model_and_params(name)[0].penalty is not None] == ["soft"]
+    model, params = model_and_params("soft")
+
+    @jit
+    def parts(params):
+        fiber = model.fiber(params, one.envs[0])
+        latent = model.encode(fiber, one.states[0])
+        slope = jax.jacobian(lambda z: model.step(fiber, latent._replace(z=z), one.controls[0]).z)(latent.z) - fiber.A
+        return model.penalty(fiber, latent, one.controls[0]), slope
+
+    penalty, slope = parts(params)
+    excess = np.linalg.norm(np.asarray(slope, np.float64), 2) - 0.1
+    assert excess > 0
+    np.testing.assert_allclose(penalty, excess**2, rtol=1e-3)
