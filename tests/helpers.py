@@ -4,6 +4,7 @@ from functools import cache, partial
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 
 from sfkd_jax import control, datasets, models, vehicle
 from sfkd_jax.types import Space, Trajectory
@@ -32,8 +33,6 @@ VARIANTS = {
 }
 HARD = ("sfkd", "no_fiber", "no_transport", "segment")
 """Variants whose residual is bounded by construction (and is there)."""
-STRUCTURE = {"no_contraction": "soft", "no_residual": "soft", "soft": "soft", "segment": "segment"}
-"""Whose initial parameters a variant shares, if not those of sfkd."""
 PHYSICS = ("oracle", "nominal")
 
 
@@ -59,17 +58,60 @@ def tiny(name="sfkd", **changes):
 
 @cache
 def model_and_params(name="sfkd", scale=1.0):
-    """A model by the name of a variant or of a physics row, and parameters `scale` times as large as at the start."""
+    """A model by the name of a variant or of a physics row, and generic parameters, multiplied by `scale`."""
     plant = vehicle.kinematic()
     if name in PHYSICS:
         return models.physics(plant.step if name == "oracle" else plant.nominal), {}
-    return tiny(name), jax.tree.map(lambda leaf: scale * leaf, _params(STRUCTURE.get(name, "sfkd")))
+    return _model(name), jax.tree.map(lambda leaf: scale * leaf, generic(_model(name)))
 
 
 @cache
-def _params(name):
-    """Initial parameters, once for all variants whose parameters have the same names and shapes."""
-    return jit(tiny(name).init)(jax.random.key(1))
+def _model(name):
+    """One object a variant, so that what is compiled for it is compiled once."""
+    return tiny(name)
+
+
+def generic(model, seed=1):
+    """Parameters in the shape of the model's own initial ones, none of them 0: weights of unit gain, small offsets."""
+    random = np.random.default_rng(seed)
+
+    def drawn(leaf):
+        spread = leaf.shape[-2] ** -0.5 if len(leaf.shape) > 1 else 0.3
+        return jnp.asarray(spread * random.standard_normal(leaf.shape), dtype=leaf.dtype)
+
+    return jax.tree.map(drawn, jax.eval_shape(model.init, jax.random.key(0)))
+
+
+def explicit(name="sfkd", scale=1.0):
+    """What a certificate speaks about, in float64."""
+    model, params = model_and_params(name, scale)
+    return jax.tree.map(lambda leaf: np.asarray(leaf, dtype=np.float64), jax.jit(model.explicit)(params))
+
+
+def steepest_pattern(weights, starts=6):
+    """Largest ||W_L D … D W_1||_2 found by flipping slopes between 0 and 1: a lower bound of the Lipschitz constant."""
+    random, best = np.random.default_rng(0), 0.0
+    for start in range(starts):
+        slopes = [np.ones(len(w)) if start == 0 else random.integers(0, 2, len(w)).astype(float) for w in weights[:-1]]
+
+        def gain(slopes):
+            chained = weights[0]
+            for slope, weight in zip(slopes, weights[1:], strict=True):
+                chained = weight @ (slope[:, None] * chained)
+            return np.linalg.norm(chained, 2)
+
+        now, improved = gain(slopes), True
+        while improved:
+            improved = False
+            for slope in slopes:
+                for i in range(len(slope)):
+                    slope[i] = 1 - slope[i]
+                    after = gain(slopes)
+                    improved |= after > now * (1 + 1e-12)
+                    slope[i] = slope[i] if after > now * (1 + 1e-12) else 1 - slope[i]
+                    now = max(now, after)
+        best = max(best, now)
+    return best
 
 
 def drive(plant, initial, controls, envs):
@@ -108,11 +150,16 @@ def driver(plant):
 
 
 @cache
-def segments(count=120, steps=25, seed=0):
-    """A small batch of training segments of the kinematic plant."""
+def generator(count=120, steps=25):
+    """key -> training segments of the kinematic plant, compiled once."""
     plant = vehicle.kinematic()
-    make = partial(datasets.generate, plant, driver(plant), segments=count, steps=steps)
-    return jit(make)(jax.random.key(seed))
+    return jit(partial(datasets.generate, plant, driver(plant), segments=count, steps=steps))
+
+
+@cache
+def segments(count=120, steps=25, seed=0):
+    """A small batch of training segments."""
+    return generator(count, steps)(jax.random.key(seed))
 
 
 @cache

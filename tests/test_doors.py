@@ -5,6 +5,7 @@ import shutil
 import subprocess
 import sys
 import textwrap
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -124,7 +125,7 @@ def test_a_model_without_a_bound_is_driven_but_refused_a_certificate(walked):
     assert done.stderr.strip().splitlines()[-1].startswith("sfkd_jax: refused:")
 
 
-@pytest.mark.parametrize("damage", ["truncate", "foreign", "no manifest", "flip"])
+@pytest.mark.parametrize("damage", ["truncate", "foreign", "flip"])
 def test_a_damaged_policy_is_named_in_one_line(spoiled, damage):
     file = spoiled / "runs/smoke/sfkd/seed=0/policy.npz"
     content = bytearray(file.read_bytes())
@@ -132,8 +133,6 @@ def test_a_damaged_policy_is_named_in_one_line(spoiled, damage):
         file.write_bytes(content[: len(content) // 2])
     elif damage == "foreign":
         file.write_bytes(b"not an archive")
-    elif damage == "no manifest":
-        file.with_suffix(".json").unlink()
     else:
         content[len(content) // 2] ^= 0xFF
         file.write_bytes(content)
@@ -141,6 +140,14 @@ def test_a_damaged_policy_is_named_in_one_line(spoiled, damage):
     assert "policy" in done.stderr
     assert "Traceback" not in done.stderr
     assert (spoiled / "runs/smoke/sfkd/seed=0/results.json").exists()
+
+
+def test_a_policy_without_its_manifest_is_finished_again_from_the_checkpoint(spoiled):
+    file = spoiled / "runs/smoke/sfkd/seed=0/policy.npz"
+    weights = artefacts.read_arrays(file, kind="policy")[1]["sha256"]
+    file.with_suffix(".json").unlink()
+    door("certify", "+experiment=smoke", cwd=spoiled)
+    assert artefacts.read_arrays(file, kind="policy")[1]["sha256"] == weights
 
 
 def test_a_scenario_of_choice_adds_rows_and_keeps_the_others(spoiled):
@@ -169,3 +176,28 @@ def test_bad_input_is_answered_with_the_choices(walked, arguments, says):
     done = door(name, *arguments, cwd=walked[0], code=1)
     assert says in done.stderr
     assert "Traceback" not in done.stderr
+
+
+def test_a_sweep_runs_every_job_and_ends_with_json(tmp_path):
+    done = door("generate", "-m", "+experiment=smoke", "dataset.segments=40", "dataset.seed=0,1", cwd=tmp_path)
+    assert last_line(done)["segments"] == 40
+    assert len(list((tmp_path / "runs/datasets").iterdir())) == 2
+
+
+def test_the_example_in_the_readme_runs(walked):
+    readme = (Path(__file__).parents[1] / "README.md").read_text("utf-8")
+    program = readme.split("```python\n")[1].split("```")[0].replace("runs/s3/", "runs/smoke/")
+    done = subprocess.run([sys.executable, "-c", program], cwd=walked[0], capture_output=True, text=True)
+    assert done.returncode == 0, done.stderr
+
+
+def test_a_door_makes_what_is_missing(tmp_path):
+    small = ("+experiment=smoke", "training.steps=25", "training.save_every=25", "dataset.segments=160")
+    assert last_line(door("certify", *small, cwd=tmp_path))["valid"]
+
+
+@pytest.mark.parametrize("vehicle", ["dynamic", "kinematic_speed"])
+def test_the_walk_works_for_other_vehicles(vehicle, tmp_path):
+    small = ("training.steps=25", "training.save_every=25", "dataset.segments=160", "evaluation.episode_s=4.0")
+    walk = last_line(door("train", "+experiment=smoke", f"vehicle={vehicle}", *small, cwd=tmp_path))
+    assert (tmp_path / walk["report"]).exists()

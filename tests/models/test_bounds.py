@@ -4,7 +4,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from helpers import HARD, at, driven, jit, model_and_params, space
+from helpers import HARD, at, driven, explicit, jit, model_and_params, space, steepest_pattern
 
 from sfkd_jax import models
 from sfkd_jax.certification import lipschitz_upper
@@ -80,7 +80,9 @@ def environments(count=200):
     """Inside the box, far outside it, and at the ends of the earth."""
     random = np.random.default_rng(0)
     near = random.uniform([0.3, -8.0], [0.9, 8.0], (count, 2))
-    return np.concatenate([near, 100.0 * random.standard_normal((count, 2)), [[1e6, -1e6], [0.0, 0.0]]]).astype(np.float32)
+    return np.concatenate([near, 100.0 * random.standard_normal((count, 2)), [[1e6, -1e6], [0.0, 0.0]]]).astype(
+        np.float32
+    )
 
 
 @pytest.mark.parametrize("scale", [1.0, 100.0])
@@ -88,9 +90,8 @@ def environments(count=200):
 def test_the_operator_is_bounded_for_every_environment_and_every_weight(name, scale):
     model, params = model_and_params(name, scale)
     operators = jit(jax.vmap(lambda env: model.fiber(params, env).A))(environments())
-    norms = spectral(operators)
-    assert np.all(norms <= RHO)
-    assert norms.max() > 0.8 * RHO  # and the bound is used, not wasted
+    assert np.all(spectral(operators) <= RHO)
+    assert np.all(spectral(explicit(name, scale).vertices) > 0.97 * RHO)  # and the bound is used, not wasted
 
 
 @pytest.mark.parametrize("seed", range(3))
@@ -142,37 +143,6 @@ def attack(name, scale):
     return float(jnp.max(jit(jax.vmap(climb))(jax.random.split(jax.random.key(3), ATTACK_STARTS))))
 
 
-def steepest_pattern(weights, starts=6):
-    """Largest ||W_L D … D W_1||_2 found by flipping slopes between 0 and 1; a lower bound over all biases, in float64."""
-    random, best = np.random.default_rng(0), 0.0
-    for start in range(starts):
-        slopes = [np.ones(len(w)) if start == 0 else random.integers(0, 2, len(w)).astype(float) for w in weights[:-1]]
-
-        def gain(slopes):
-            chained = weights[0]
-            for slope, weight in zip(slopes, weights[1:], strict=True):
-                chained = weight @ (slope[:, None] * chained)
-            return np.linalg.norm(chained, 2)
-
-        now, improved = gain(slopes), True
-        while improved:
-            improved = False
-            for slope in slopes:
-                for i in range(len(slope)):
-                    slope[i] = 1 - slope[i]
-                    after = gain(slopes)
-                    improved |= after > now * (1 + 1e-12)
-                    slope[i] = slope[i] if after > now * (1 + 1e-12) else 1 - slope[i]
-                    now = max(now, after)
-        best = max(best, now)
-    return best
-
-
-def explicit(name, scale):
-    model, params = model_and_params(name, scale)
-    return jax.tree.map(lambda leaf: np.asarray(leaf, dtype=np.float64), jit(model.explicit)(params))
-
-
 @pytest.mark.parametrize("scale", [1.0, 3.0, 30.0])
 def test_the_residual_keeps_its_lipschitz_bound_under_attack(scale):
     assert attack("sfkd", scale) <= BETA
@@ -213,7 +183,8 @@ def test_the_rows_of_a_cayley_block_are_orthonormal(out, inputs, scale):
     square = scale / np.sqrt(out) * random.standard_normal((20, out, out))
     tall = scale / np.sqrt(inputs) * random.standard_normal((20, inputs, out))
     A, B = (
-        np.asarray(part, np.float64) for part in jit(jax.vmap(cayley))(square.astype(np.float32), tall.astype(np.float32))
+        np.asarray(part, np.float64)
+        for part in jit(jax.vmap(cayley))(square.astype(np.float32), tall.astype(np.float32))
     )
     gram = A @ A.swapaxes(1, 2) + B @ B.swapaxes(1, 2)
     np.testing.assert_allclose(gram, np.broadcast_to(np.eye(out), gram.shape), atol=MARGIN)

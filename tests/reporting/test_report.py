@@ -37,9 +37,7 @@ def drive(rng, path, envs, gain):
         rate += DT * (6.0 * (push - lateral) - 3.5 * rate) + gain * 0.02 * rng.standard_normal()
         lateral += DT * rate
         rows.append(lateral)
-        steer.append(
-            2.7 * path[2 * step + 8, 3] - 0.12 * lateral - 0.05 * rate + 0.004 * rng.standard_normal()
-        )
+        steer.append(2.7 * path[2 * step + 8, 3] - 0.12 * lateral - 0.05 * rate + 0.004 * rng.standard_normal())
     lateral = np.array(rows)
     here = path[2 * np.arange(STEPS + 1)]
     offset = np.concatenate([[0.0], lateral])
@@ -89,10 +87,7 @@ def score(system, scenario, mean, std, ratio, **more):
 
 def documents():
     rows = [
-        *(
-            score(*row)
-            for row in (("oracle", "s3", 0.0163, 0.002, 1.0), ("nominal", "s3", 0.12, 0.021, 7.36))
-        ),
+        *(score(*row) for row in (("oracle", "s3", 0.0163, 0.002, 1.0), ("nominal", "s3", 0.12, 0.021, 7.36))),
         score("sfkd", "s3", 0.0342, 0.006, 2.1),
         *(score(*row) for row in (("sfkd", "s1", 0.014, 0.001, 1.0), ("oracle", "s1", 0.014, 0.001, 1.0))),
     ]
@@ -223,9 +218,7 @@ def test_markdown_says_the_same(whole):
     for target in re.findall(r"\]\((figures/[^)]+)\)", text):
         assert Path(whole[1]["report"]).with_name("figures").joinpath(Path(target).name).exists()
     assert "    python -m sfkd_jax.train +experiment=s3 seed=0" in text
-    widths = [
-        {line.count(" | ") for line in table.splitlines()} for table in re.findall(r"(?m)(?:^\|.*\n)+", text)
-    ]
+    widths = [{line.count(" | ") for line in table.splitlines()} for table in re.findall(r"(?m)(?:^\|.*\n)+", text)]
     assert widths
     assert all(len(width) == 1 for width in widths)
 
@@ -320,10 +313,7 @@ def test_absent_keys_and_empty_lists_do_not_stop_a_report(tmp_path):
     certificate = {"valid": False, "reason": "alpha = 1.02 is not below 1", "alpha": 1.02}
     run = write_run(tmp_path, results={"rows": rows}, certificate=certificate, open_loop={"steps": []})
     page = text_of(report_of(run)[0])
-    assert (
-        "Nothing is proved. No contraction is certified for these weights: alpha = 1.02 is not below 1."
-        in page
-    )
+    assert "Nothing is proved. No contraction is certified for these weights: alpha = 1.02 is not below 1." in page
     assert "It carries no valid certificate." in page
     assert "Certified α" not in page
     assert "Koopman MPC" in page
@@ -349,9 +339,7 @@ def test_text_of_others_is_escaped(tmp_path):
     policy["versions"][hostile] = hostile
     rows = [score(hostile, hostile, 0.1, 0.01, 1.0, vehicle=hostile), *documents_["results.json"]["rows"]]
     certificate = documents_["certificate.json"] | {"mode": hostile, "scope": hostile}
-    page, made = report_of(
-        write_run(tmp_path, policy=policy, results={"rows": rows}, certificate=certificate)
-    )
+    page, made = report_of(write_run(tmp_path, policy=policy, results={"rows": rows}, certificate=certificate))
     assert "<script" not in page
     assert hostile in html.unescape(page)
     parser = Balanced()
@@ -397,9 +385,7 @@ def test_a_baseline_that_wins_is_named(tmp_path):
 
 def test_feedback_and_plain_sampling_are_not_mixed(tmp_path):
     rows = documents()["results.json"]["rows"]
-    rows += [
-        row | {"sampling": "plain", "rmse_m": {"mean": 0.068}} for row in rows if row["system"] == "sfkd"
-    ]
+    rows += [row | {"sampling": "plain", "rmse_m": {"mean": 0.068}} for row in rows if row["system"] == "sfkd"]
     page = text_of(report_of(write_run(tmp_path, episodes=None, results={"rows": rows}))[0])
     assert "plain sampling" in page
     assert "to a lateral RMSE of 0.034 m" in page

@@ -114,7 +114,7 @@ def test_the_peak_curvature_is_reached_and_not_exceeded(peak):
 
 
 def test_the_curvature_is_smooth_at_the_shortest_wavelength(road):
-    """|κ'| ≤ 2π κ_sum / λ_min; the three amplitudes may add up to three times the peak at most, the blend adds little."""
+    """|κ'| ≤ 2π Σ|aᵢ| / λ_min, and three amplitudes add up to three peaks at most; the blend adds little."""
     slope = np.abs(np.diff(np.asarray(road.points)[:, 3])) / 0.5
     assert slope.max() < 3 * 0.03 * 2 * np.pi / 50.0 + 1.5 * 0.03 / 20.0
 

@@ -1,0 +1,204 @@
+"""The trusted core: it may refuse what is true, and never accepts what is false."""
+
+import numpy as np
+import pytest
+
+from sfkd_jax.certification import check_witness, is_positive_definite, norm_upper
+
+
+def rotation(size, seed=0):
+    return np.linalg.qr(np.random.default_rng(seed).standard_normal((size, size)))[0]
+
+
+def with_eigenvalues(values, seed=0):
+    """A symmetric matrix with these eigenvalues, up to 1e-15."""
+    turn = rotation(len(values), seed)
+    matrix = turn @ np.diag(values) @ turn.T
+    return 0.5 * (matrix + matrix.T)
+
+
+@pytest.mark.parametrize("size", [1, 2, 5, 20, 60])
+@pytest.mark.parametrize("smallest", [-1.0, -1e-6, -1e-11])
+def test_an_indefinite_matrix_is_never_accepted(size, smallest):
+    for seed in range(10):
+        values = np.concatenate([[smallest], np.random.default_rng(seed).uniform(0.1, 1.0, size - 1)])
+        assert not is_positive_definite(with_eigenvalues(values, seed))
+
+
+@pytest.mark.parametrize("size", [2, 3, 8, 25])
+def test_an_exactly_singular_matrix_of_integers_is_never_accepted(size):
+    """B'B with fewer rows than columns: every product and sum is exact in float64."""
+    for seed in range(50):
+        half = np.random.default_rng(seed).integers(-9, 10, (size - 1, size)).astype(float)
+        assert not is_positive_definite(half.T @ half)
+
+
+@pytest.mark.parametrize("size", [1, 2, 5, 20, 60])
+def test_a_positive_definite_matrix_with_a_small_margin_is_accepted(size):
+    for seed in range(10):
+        values = np.concatenate([[1e-10], np.random.default_rng(seed).uniform(0.1, 1.0, size - 1)])
+        assert is_positive_definite(with_eigenvalues(values, seed))
+
+
+@pytest.mark.parametrize("scale", [1e-140, 1e-20, 1e20, 1e140])
+def test_the_verdict_does_not_depend_on_the_unit(scale):
+    good, bad = with_eigenvalues([1e-6, 0.5, 1.0]), with_eigenvalues([-1e-6, 0.5, 1.0])
+    assert is_positive_definite(scale * good)
+    assert not is_positive_definite(scale * bad)
+
+
+@pytest.mark.filterwarnings("ignore:invalid value")
+def test_uncertainty_is_part_of_the_claim():
+    matrix = with_eigenvalues([0.5, 0.7, 1.0])
+    assert is_positive_definite(matrix, error=0.499)
+    assert not is_positive_definite(matrix, error=0.5)
+    assert not is_positive_definite(matrix, error=0.501)
+    assert not is_positive_definite(matrix, error=np.inf)
+
+
+@pytest.mark.filterwarnings("ignore:invalid value")
+@pytest.mark.xfail(
+    strict=True, reason="certification/_core.py: Cholesky of NaN does not raise, so a NaN error is accepted"
+)
+def test_an_uncertainty_that_is_not_a_number_is_refused():
+    assert not is_positive_definite(np.eye(3), error=np.nan)
+
+
+@pytest.mark.parametrize("spoiled", [np.nan, np.inf, -np.inf])
+def test_what_is_not_finite_is_refused(spoiled):
+    for entry in ((0, 0), (1, 2)):
+        matrix = np.eye(3)
+        matrix[entry] = matrix[entry[::-1]] = spoiled
+        assert not is_positive_definite(matrix)
+
+
+def test_what_is_not_symmetric_is_refused():
+    matrix = np.eye(3)
+    matrix[0, 1] = 1e-15
+    assert not is_positive_definite(matrix)
+
+
+@pytest.mark.parametrize("size", [1, 3, 16, 40])
+def test_the_norm_bound_of_an_orthogonal_matrix_is_one(size):
+    for seed in range(10):
+        turn = rotation(size, seed)
+        assert 1.0 - 1e-15 * size <= norm_upper(turn) <= 1.0 + 1e-9
+
+
+def test_the_norm_bound_of_known_matrices_is_tight_from_above():
+    random = np.random.default_rng(0)
+    left, right = random.standard_normal(7), random.standard_normal(4)
+    cases = [
+        (np.diag([3.0, -5.0, 0.0]), 5.0),
+        (np.outer(left, right), np.linalg.norm(left) * np.linalg.norm(right)),
+        (np.asarray([[0.0, 2.0], [0.0, 0.0]]), 2.0),
+        (np.asarray([[1.0, 1.0], [0.0, 1.0]]), (1 + np.sqrt(5)) / 2),
+        (np.ones((6, 3)), np.sqrt(18.0)),
+        (rotation(9)[:4], 1.0),
+        (1e-100 * rotation(5), 1e-100),
+        (1e60 * rotation(5), 1e60),
+    ]
+    for matrix, exact in cases:
+        assert exact * (1 - 1e-15) <= norm_upper(matrix) <= exact * (1 + 1e-9)
+
+
+def test_the_norm_bound_is_never_below_what_a_vector_shows():
+    random = np.random.default_rng(1)
+    for size in (2, 8, 24):
+        for _ in range(20):
+            matrix = random.standard_normal((size, size)) * 10.0 ** random.integers(-6, 6, (size, 1))
+            _, values, right = np.linalg.svd(matrix)
+            shown = np.linalg.norm(matrix.astype(np.longdouble) @ right[0].astype(np.longdouble))
+            shown /= np.linalg.norm(right[0].astype(np.longdouble))
+            assert shown <= norm_upper(matrix) <= values[0] * (1 + 1e-9)
+
+
+def test_the_norm_bound_of_nothing_is_nothing_and_of_nonsense_is_infinite():
+    assert norm_upper(np.zeros((4, 3))) == 0.0
+    for spoiled in (np.nan, np.inf):
+        assert norm_upper(np.diag([1.0, spoiled])) == np.inf
+
+
+@pytest.mark.xfail(
+    strict=True,
+    reason="certification/_core.py: a float32 matrix is multiplied in float32, its rounding bounded as float64's",
+)
+def test_the_norm_bound_of_a_float32_matrix_is_not_below_its_norm():
+    random = np.random.default_rng(0)
+    matrices = [random.standard_normal((16, 16)).astype(np.float32) for _ in range(100)]
+    assert all(norm_upper(matrix) >= np.linalg.norm(matrix.astype(np.float64), 2) for matrix in matrices)
+
+
+WEIGHTS = [2.0 * rotation(6, 1), 0.5 * rotation(6, 2), 3.0 * rotation(6, 3)]
+TRUE = 3.0
+"""Lipschitz constant of this network: orthogonal factors, and slopes of 1 are allowed."""
+MULTIPLIERS = [np.full(6, 9.0 * 0.25), np.full(6, 9.0)]
+"""λ_2 = s_3², λ_1 = s_3² s_2²: the product of norms as a witness."""
+
+
+def test_a_witness_proves_the_bound_and_nothing_below_it():
+    assert check_witness(WEIGHTS, MULTIPLIERS, TRUE * (1 + 1e-6))
+    for share in (1 - 1e-9, 0.999, 0.9, 0.0):
+        assert not check_witness(WEIGHTS, MULTIPLIERS, share * TRUE)
+
+
+@pytest.mark.parametrize(
+    "spoil",
+    [
+        lambda first, second: (first, -second),
+        lambda first, second: (0.0 * first, second),
+        lambda first, second: (second, first),
+        lambda first, second: (0.5 * first, 0.5 * second),
+        lambda first, second: (first, 0.5 * second),
+        lambda first, second: (3.0 * first, second),
+        lambda first, second: (np.where(np.arange(6) == 2, np.nan, first), second),
+        lambda first, second: (first, np.where(np.arange(6) == 5, np.inf, second)),
+        lambda first, second: (np.where(np.arange(6) == 0, -1e-12, first), second),
+    ],
+)
+def test_other_multipliers_prove_nothing(spoil):
+    assert not check_witness(WEIGHTS, spoil(*MULTIPLIERS), TRUE * (1 + 1e-6))
+
+
+def test_too_few_or_too_many_multipliers_prove_nothing():
+    assert not check_witness(WEIGHTS, MULTIPLIERS[:1], 1e6)
+    assert not check_witness(WEIGHTS, [*MULTIPLIERS, MULTIPLIERS[0]], 1e6)
+    assert not check_witness(WEIGHTS, [], 1e6)
+
+
+@pytest.mark.parametrize("layer", range(3))
+@pytest.mark.parametrize("spoiled", [np.nan, np.inf])
+def test_weights_that_are_not_finite_prove_nothing(layer, spoiled):
+    weights = [matrix.copy() for matrix in WEIGHTS]
+    weights[layer][3, 2] = spoiled
+    assert not check_witness(weights, MULTIPLIERS, 1e6)
+
+
+@pytest.mark.parametrize("bound", [np.nan, np.inf, 0.0])
+def test_a_bound_that_says_nothing_is_not_proved(bound):
+    assert not check_witness(WEIGHTS, MULTIPLIERS, bound)
+
+
+@pytest.mark.xfail(
+    strict=True, reason="certification/_core.py: only the square of the bound enters, so −b is accepted where b is"
+)
+def test_a_negative_bound_is_not_proved():
+    assert not check_witness(WEIGHTS, MULTIPLIERS, -2 * TRUE)
+
+
+@pytest.mark.xfail(
+    strict=True,
+    reason="certification/_core.py: without hidden layers b² I overwrites −W'W, and every bound is accepted",
+)
+def test_a_network_of_a_single_layer_has_the_norm_of_its_matrix():
+    assert check_witness([np.diag([5.0, 1.0])], [], 5.0 + 1e-6)
+    assert not check_witness([np.diag([5.0, 1.0])], [], 4.9)
+
+
+def test_layers_of_different_widths_fit_together():
+    random = np.random.default_rng(4)
+    weights = [random.standard_normal(shape) for shape in ((5, 3), (7, 5), (2, 7))]
+    norms = [np.linalg.norm(matrix, 2) for matrix in weights]
+    multipliers = [np.full(5, (norms[2] * norms[1]) ** 2), np.full(7, norms[2] ** 2)]
+    assert check_witness(weights, multipliers, np.prod(norms) * (1 + 1e-9))
+    assert not check_witness(weights, multipliers, 0.99 * np.linalg.norm(weights[2] @ weights[1] @ weights[0], 2))

@@ -1,0 +1,274 @@
+"""Scores of hand-made episodes, their statistics, and the rows made of them."""
+
+import numpy as np
+import pytest
+
+from sfkd_jax.evaluation import Episode, bootstrap_mean, compare, merge, paired_difference, row, score, summary
+
+DT, STEPS = 0.1, 200
+TIME = np.arange(1, STEPS + 1) * DT
+CALM = np.broadcast_to([0.9, 0.0], (1, STEPS, 2))
+
+
+def episode(lateral, steering=None, states=None, ess=None, healthy=None):
+    """One episode as a batch, with what matters given and the rest at rest."""
+    steps = len(lateral)
+    controls = np.zeros((1, steps, 2))
+    controls[0, :, 0] = 0.0 if steering is None else steering
+    return Episode(
+        states=np.zeros((1, steps + 1, 4)) if states is None else states[None],
+        controls=controls,
+        lateral=np.asarray(lateral, dtype=float)[None],
+        progress=np.zeros((1, steps)),
+        effective_samples=np.ones((1, steps)) if ess is None else np.asarray(ess, dtype=float)[None],
+        healthy=np.ones((1, steps), bool) if healthy is None else np.asarray(healthy)[None],
+        prediction_error=np.zeros((1, steps)),
+    )
+
+
+def test_a_sinusoid_has_the_rmse_of_a_sinusoid():
+    """Over whole periods: amplitude / √2."""
+    scores = score(episode(0.3 * np.sin(2 * np.pi * TIME / 3.0)), CALM, dt=DT)
+    np.testing.assert_allclose(scores.rmse, [0.3 / np.sqrt(2)], rtol=1e-12)
+    np.testing.assert_allclose(scores.max_deviation, [0.3], rtol=0.01)
+
+
+@pytest.mark.parametrize("offset", [-0.7, 0.0, 0.4])
+def test_a_constant_offset_is_its_own_rmse(offset):
+    scores = score(episode(np.full(STEPS, offset)), CALM, dt=DT)
+    np.testing.assert_allclose(scores.rmse, [abs(offset)], rtol=1e-12)
+    np.testing.assert_allclose(scores.max_deviation, [abs(offset)])
+
+
+def test_the_first_two_seconds_do_not_count():
+    lateral = np.where(TIME <= 2.0 + 1e-9, 5.0, 0.1)
+    scores = score(episode(lateral), CALM, dt=DT)
+    np.testing.assert_allclose(scores.rmse, [0.1], rtol=1e-12)
+    np.testing.assert_allclose(scores.max_deviation, [0.1])
+    assert not scores.departed[0]
+    late = np.where(TIME <= 2.1 + 1e-9, 5.0, 0.1)
+    assert score(episode(late), CALM, dt=DT).max_deviation[0] == 5.0
+
+
+def switching(steps=STEPS, when=100, channel=0, to=0.3):
+    envs = np.array(np.broadcast_to([0.9, 0.0], (1, steps, 2)))
+    envs[0, when:, channel] = to
+    return envs
+
+
+def test_exactly_the_three_seconds_after_a_switch_are_scored_apart():
+    """e_100 is the first after the switch; what it does is seen in the deviation of x_101, which is lateral[100]."""
+    lateral = np.zeros(STEPS)
+    lateral[100:130] = 0.2
+    scores = score(episode(lateral), switching(), dt=DT)
+    np.testing.assert_allclose(scores.rmse_after_switch, [0.2], rtol=1e-12)
+    lateral[99] = lateral[130] = 7.0
+    np.testing.assert_allclose(score(episode(lateral), switching(), dt=DT).rmse_after_switch, [0.2], rtol=1e-12)
+    lateral[129] = 0.0
+    assert score(episode(lateral), switching(), dt=DT).rmse_after_switch[0] < 0.2
+
+
+@pytest.mark.parametrize(
+    ("channel", "to", "counts"), [(0, 0.3, True), (0, 0.88, False), (1, 4.0, True), (1, -4.0, True), (1, 1.0, False)]
+)
+def test_a_switch_is_a_jump_of_friction_or_wind(channel, to, counts):
+    scores = score(episode(np.ones(STEPS)), switching(channel=channel, to=to), dt=DT)
+    assert np.isnan(scores.rmse_after_switch[0]) != counts
+
+
+def test_a_switch_during_settling_is_scored_from_the_end_of_settling_on():
+    lateral = np.where(TIME <= 2.0 + 1e-9, 9.0, 0.5)
+    np.testing.assert_allclose(score(episode(lateral), switching(when=10), dt=DT).rmse_after_switch, [0.5])
+
+
+def test_a_switch_near_the_end_is_scored_until_the_end():
+    lateral = np.where(np.arange(STEPS) >= 190, 0.4, 0.0)
+    np.testing.assert_allclose(score(episode(lateral), switching(when=190), dt=DT).rmse_after_switch, [0.4])
+
+
+@pytest.mark.xfail(
+    strict=True,
+    reason="evaluation/_metrics.py: gusts() ramps by up to 5 m/s a step, more than SWITCH's 1.5 m/s, so most of S2 "
+    "counts as 'after a switch' although it switches once",
+)
+def test_a_smooth_gust_is_not_a_switch():
+    """The ramp of `scenarios.gusts`: 1 − cos over 0.5 s, here from 0 to 8 m/s."""
+    envs = np.array(CALM)
+    envs[0, 100:, 1] = 4.0 - 4.0 * np.cos(np.pi * np.clip(np.arange(100) * DT / 0.5, 0.0, 1.0))
+    assert np.isnan(score(episode(np.ones(STEPS)), envs, dt=DT).rmse_after_switch[0])
+
+
+def test_smoothness_is_the_mean_steering_rate():
+    ramp = score(episode(np.zeros(STEPS), steering=0.05 * TIME), CALM, dt=DT)
+    np.testing.assert_allclose(ramp.smoothness, [0.05], rtol=1e-9)
+    zigzag = score(episode(np.zeros(STEPS), steering=0.01 * (np.arange(STEPS) % 2)), CALM, dt=DT)
+    np.testing.assert_allclose(zigzag.smoothness, [0.01 / DT], rtol=1e-9)
+    assert score(episode(np.zeros(STEPS), steering=np.full(STEPS, 0.3)), CALM, dt=DT).smoothness[0] == 0.0
+
+
+@pytest.mark.parametrize(
+    ("deviation", "departed"), [(0.84, False), (-0.84, False), (0.86, True), (-3.0, True), (np.nan, True)]
+)
+def test_a_car_departs_when_its_side_leaves_the_lane(deviation, departed):
+    """A lane of 3.5 m and a car of 1.8 m leave 0.85 m to either side."""
+    lateral = np.zeros(STEPS)
+    lateral[150] = deviation
+    assert score(episode(lateral), CALM, dt=DT).departed[0] == departed
+
+
+@pytest.mark.parametrize("when", [0, 5, STEPS])
+def test_a_state_that_is_not_finite_is_a_departure_whenever_it_happens(when):
+    states = np.zeros((STEPS + 1, 4))
+    states[when, 3] = np.nan
+    assert score(episode(np.zeros(STEPS), states=states), CALM, dt=DT).departed[0]
+
+
+def test_sample_sizes_and_held_plans_are_summed_up():
+    ess = np.where(np.arange(STEPS) < 150, 10.0, 1000.0)
+    healthy = np.arange(STEPS) >= 20
+    scores = score(episode(np.zeros(STEPS), ess=ess, healthy=healthy), CALM, dt=DT)
+    assert scores.ess[0] == 10.0
+    np.testing.assert_allclose(scores.unhealthy, [0.1])
+
+
+def test_episodes_are_scored_one_by_one():
+    parts = [episode(np.full(STEPS, level), steering=level * TIME) for level in (0.1, 0.2, 2.0)]
+    batch = Episode(*(np.concatenate(leaves) for leaves in zip(*parts, strict=True)))
+    envs = np.concatenate([switching(), switching(when=50), CALM])
+    together = score(batch, envs, dt=DT)
+    for k, part in enumerate(parts):
+        for ours, alone in zip(together, score(part, envs[k : k + 1], dt=DT), strict=True):
+            np.testing.assert_array_equal(ours[k], alone[0])
+
+
+@pytest.mark.xfail(
+    strict=True,
+    raises=ValueError,
+    reason="evaluation/_metrics.py: the mask after a switch does not fit an episode below 3 s",
+)
+def test_an_episode_shorter_than_three_seconds_is_scored():
+    scores = score(episode(np.full(25, 0.2)), switching(steps=25, when=15), dt=DT)
+    np.testing.assert_allclose([scores.rmse[0], scores.rmse_after_switch[0]], [0.2, 0.2])
+
+
+# --- statistics ------------------------------------------------------------------------------------------------------
+
+
+def test_the_interval_of_a_constant_is_that_constant():
+    found = summary(np.full(7, 0.25))
+    assert found == {"mean": 0.25, "std": 0.0, "ci95": [0.25, 0.25], "median": 0.25, "p95": 0.25}
+
+
+def test_a_single_episode_has_no_spread():
+    assert summary(np.asarray([0.3]))["std"] is None
+
+
+def test_a_summary_holds_what_it_says():
+    values = np.random.default_rng(0).normal(3.0, 2.0, 400)
+    found = summary(values)
+    np.testing.assert_allclose(found["mean"], values.mean())
+    np.testing.assert_allclose(found["std"], values.std(ddof=1))
+    np.testing.assert_allclose([found["median"], found["p95"]], np.quantile(values, [0.5, 0.95]))
+    half = 1.96 * values.std() / np.sqrt(400)
+    np.testing.assert_allclose(found["ci95"], [values.mean() - half, values.mean() + half], atol=0.1 * half)
+
+
+def test_bootstrap_intervals_cover_the_mean_about_as_often_as_they_say():
+    random = np.random.default_rng(1)
+    draws = random.standard_exponential((60, 40))
+    intervals = np.asarray([bootstrap_mean(values)[1] for values in draws])
+    hits = np.mean((intervals[:, 0] <= 1.0) & (intervals[:, 1] >= 1.0))
+    assert 0.82 <= hits <= 1.0
+
+
+def test_the_bootstrap_is_repeatable():
+    values = np.random.default_rng(2).standard_normal(30)
+    assert bootstrap_mean(values) == bootstrap_mean(values)
+    assert bootstrap_mean(values)[1] != bootstrap_mean(values, seed=1)[1]
+
+
+def test_pairing_sees_a_small_difference_that_separate_intervals_hide():
+    random = np.random.default_rng(3)
+    difficulty = random.standard_exponential(50)
+    ours, theirs = difficulty + 0.02 * random.standard_normal(50), difficulty + 0.05
+    paired = paired_difference(ours, theirs)
+    np.testing.assert_allclose(paired["mean"], ours.mean() - theirs.mean())
+    assert paired["ci95"][1] < 0
+    ours_alone, theirs_alone = bootstrap_mean(ours)[1], bootstrap_mean(theirs)[1]
+    assert ours_alone[1] > theirs_alone[0]  # unpaired: they overlap
+    assert np.ptp(paired["ci95"]) < 0.1 * np.ptp(ours_alone)
+
+
+def test_a_constant_gain_is_certain_when_paired():
+    values = np.random.default_rng(4).standard_exponential(20)
+    np.testing.assert_allclose(paired_difference(values + 0.125, values)["ci95"], [0.125, 0.125], atol=1e-12)
+
+
+# --- rows ------------------------------------------------------------------------------------------------------------
+
+
+def about(system, **changes):
+    return {
+        "system": system,
+        "scenario": "s3",
+        "vehicle": "kinematic",
+        "sampling": "feedback",
+        "env": "measured",
+        **changes,
+    }
+
+
+def scored(level, count=4):
+    parts = [episode(np.full(STEPS, level * (1 + 0.1 * k))) for k in range(count)]
+    batch = Episode(*(np.concatenate(leaves) for leaves in zip(*parts, strict=True)))
+    return score(batch, np.broadcast_to(CALM, (count, STEPS, 2)), dt=DT)
+
+
+def test_a_row_holds_every_measure_and_null_for_what_does_not_apply():
+    made = row(scored(0.1), about("sfkd"), (1.5, 2.5))
+    keys = {
+        "rmse_m",
+        "max_deviation_m",
+        "rmse_after_switch_m",
+        "smoothness_rad_per_s",
+        "violation",
+        "departures",
+        "ess",
+    }
+    assert keys | {"act_ms", "ratio_to_oracle", "difference_to_sfkd"} | set(about("")) <= set(made)
+    np.testing.assert_allclose(made["rmse_m"]["mean"], 0.115)
+    np.testing.assert_allclose(made["max_deviation_m"], 0.13)
+    assert made["rmse_after_switch_m"] is None
+    assert made["violation"] == {"v0": None, "v1": None, "v1_radius_m": None, "v2": None}
+    assert made["departures"] == 0
+    assert made["act_ms"] == {"p50": 1.5, "p99": 2.5}
+    assert row(scored(2.0), about("sfkd"), None)["act_ms"] is None
+    assert row(scored(2.0), about("sfkd"), None)["departures"] == 4
+
+
+def test_comparisons_are_ratios_to_the_oracle_and_paired_differences_to_ours():
+    scores = {"oracle": scored(0.1), "sfkd": scored(0.2), "nominal": scored(0.5)}
+    rows = {name: row(value, about(name), None) for name, value in scores.items()}
+    compared = {entry["system"]: entry for entry in compare(rows, scores)}
+    np.testing.assert_allclose([compared[name]["ratio_to_oracle"] for name in scores], [1.0, 2.0, 5.0])
+    assert compared["sfkd"]["difference_to_sfkd"] is None
+    np.testing.assert_allclose(compared["nominal"]["difference_to_sfkd"]["mean"], 0.3 * 1.15)
+    assert compared["oracle"]["difference_to_sfkd"]["ci95"][1] < 0
+
+
+def test_without_oracle_or_ours_nothing_is_compared():
+    scores = {"nominal": scored(0.5)}
+    (only,) = compare({"nominal": row(scores["nominal"], about("nominal"), None)}, scores)
+    assert only["ratio_to_oracle"] is None
+    assert only["difference_to_sfkd"] is None
+
+
+def test_new_rows_replace_those_of_the_same_identity_and_leave_the_others():
+    old = [about("sfkd", rmse=1), about("oracle", rmse=2), about("sfkd", scenario="s1", rmse=3)]
+    new = [about("sfkd", rmse=4), about("sfkd", env="none", rmse=5)]
+    merged = merge(old, new)
+    assert sorted(entry["rmse"] for entry in merged) == [2, 3, 4, 5]
+    assert merge([], new) == new
+    assert merge(old, []) == old
+    for name in ("system", "scenario", "vehicle", "sampling", "env"):
+        assert len(merge(old[:1], [old[0] | {name: "other"}])) == 2
