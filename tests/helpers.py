@@ -62,7 +62,7 @@ def model_and_params(name="sfkd", scale=1.0):
     plant = vehicle.kinematic()
     if name in PHYSICS:
         return models.physics(plant.step if name == "oracle" else plant.nominal), {}
-    return _model(name), jax.tree.map(lambda leaf: scale * leaf, generic(_model(name)))
+    return _model(name), jax.tree.map(lambda leaf: scale * leaf, generic(name))
 
 
 @cache
@@ -71,15 +71,16 @@ def _model(name):
     return tiny(name)
 
 
-def generic(model, seed=1):
+@cache
+def generic(name):
     """Parameters in the shape of the model's own initial ones, none of them 0: weights of unit gain, small offsets."""
-    random = np.random.default_rng(seed)
+    random = np.random.default_rng(1)
 
     def drawn(leaf):
         spread = leaf.shape[-2] ** -0.5 if len(leaf.shape) > 1 else 0.3
         return jnp.asarray(spread * random.standard_normal(leaf.shape), dtype=leaf.dtype)
 
-    return jax.tree.map(drawn, jax.eval_shape(model.init, jax.random.key(0)))
+    return jax.tree.map(drawn, jax.eval_shape(_model(name).init, jax.random.key(0)))
 
 
 def explicit(name="sfkd", scale=1.0):

@@ -33,9 +33,10 @@ def choose(table: Mapping[str, Any], name: str, what: str) -> Any:
     return table[name]
 
 
-def _without(settings: Settings, *names: str) -> dict[str, Any]:
-    """Settings of a factory: the rest after the names that choose it."""
-    return {name: value for name, value in settings.items() if name not in names}
+def without(settings: Settings, *names: str) -> dict[str, Any]:
+    """Settings of a factory, sequences as tuples: the rest after the names that choose it."""
+    rest = {name: value for name, value in settings.items() if name not in names}
+    return {name: tuple(value) if isinstance(value, list) else value for name, value in rest.items()}
 
 
 def build_vehicle(settings: Settings) -> vehicle.Vehicle:
@@ -44,14 +45,14 @@ def build_vehicle(settings: Settings) -> vehicle.Vehicle:
     if loop not in INNER_LOOPS:
         raise ValueError(f"unknown vehicle.inner_loop {loop!r}; choose one of {', '.join(INNER_LOOPS)}")
     factory = choose(PLANTS, settings["name"], "vehicle")
-    plant = factory(**_without(settings, "name", "inner_loop", "speed_gain"))
+    plant = factory(**without(settings, "name", "inner_loop", "speed_gain"))
     return vehicle.with_speed_loop(plant, gain=settings["speed_gain"]) if loop == "speed" else plant
 
 
 def build_model(settings: Settings, space: Space) -> Model:
     """A learned model by the name of its factory."""
     factory = choose(models.FACTORIES, settings["name"], "model")
-    return factory(space, **_without(settings, "name", "system"))
+    return factory(space, **without(settings, "name", "system"))
 
 
 def space_to_settings(space: Space) -> dict[str, list[float]]:
@@ -73,8 +74,8 @@ def build_controller(
     loop = plant.speed_loop
     law = control.no_feedback(speed_loop=loop)
     if settings["sampling"] == "feedback":
-        law = control.path_feedback(wheelbase=plant.wheelbase, speed_loop=loop, **settings["feedback"])
-    cost = control.tracking_cost(dt=plant.dt, speed_loop=loop, **settings["cost"])
+        law = control.path_feedback(wheelbase=plant.wheelbase, speed_loop=loop, **without(settings["feedback"]))
+    cost = control.tracking_cost(dt=plant.dt, speed_loop=loop, **without(settings["cost"]))
     return control.mppi(
         model,
         cost,
@@ -83,13 +84,13 @@ def build_controller(
         control_high=plant.control_high,
         env_low=None if env_low is None else tuple(map(float, env_low)),
         env_high=None if env_high is None else tuple(map(float, env_high)),
-        **settings["mppi"],
+        **without(settings["mppi"]),
     )
 
 
 def build_scenario(settings: Settings, plant: vehicle.Vehicle, *, duration: float) -> scenarios.Family:
     """The scenario family that a vehicle is to drive, episodes of `duration` [s]."""
-    return scenarios.scenario(**settings, duration=duration, state_size=len(plant.state_names), dt=plant.dt)
+    return scenarios.scenario(**without(settings), duration=duration, state_size=len(plant.state_names), dt=plant.dt)
 
 
 def build_driver(plant: vehicle.Vehicle) -> datasets.Driver:

@@ -23,7 +23,7 @@ def ensure_dataset(settings: dict[str, Any]) -> tuple[Dataset, str]:
         shelf.say(f"generating {asked['segments']} segments")
         plant = assembly.build_vehicle(settings["vehicle"])
         drive_key, split_key = jax.random.split(jax.random.key(asked["seed"]))
-        options = {name: value for name, value in asked.items() if name not in SPLIT}
+        options = assembly.without(asked, *SPLIT)
         trajectories = jax.jit(partial(generate, plant, assembly.build_driver(plant), **options))(drive_key)
         low, high = jnp.asarray(asked["env_low"]), jnp.asarray(asked["env_high"])
         dataset = split(trajectories, split_key, shares=tuple(asked["shares"]), env_low=low, env_high=high)

@@ -90,6 +90,25 @@ def test_as_the_temperature_falls_the_plan_becomes_the_best_samples():
     np.testing.assert_allclose(state.previous, plans[0, best], atol=1e-6)
 
 
+def test_the_shifted_plan_is_one_of_the_samples():
+    """On the path nothing is to be done: only the plan of zeros costs next to nothing, whatever the others do."""
+    on_path = np.float32([0.0, 0.0, 0.0, 10.0])
+    _, _, info = act_once("nominal", observation=on_path, noise_std=(0.3, 1.0), temperature=1e-4)
+    assert float(info["cost"]) < 1e-6
+    assert float(info["mean_cost"]) < 1e-6
+
+
+def test_the_first_steering_rate_counts_from_the_control_that_was_applied_last():
+    on_path = np.float32([0.0, 0.0, 0.0, 10.0])
+    quiet = {"observation": on_path, "noise_std": (1e-9, 1e-9)}
+    _, state, _ = act_once("nominal", **quiet)
+    turned = state._replace(previous=jnp.asarray([0.1, 0.0]))
+    np.testing.assert_allclose(act_once("nominal", state=state, **quiet)[2]["mean_cost"], 0.0, atol=1e-6)
+    np.testing.assert_allclose(
+        act_once("nominal", state=turned, **quiet)[2]["mean_cost"], 5 * (0.1 / 0.1) ** 2, rtol=1e-4
+    )
+
+
 def test_as_the_temperature_rises_every_sample_counts_the_same():
     _, _, info = act_once(temperature=1e9)
     np.testing.assert_allclose(info["effective_samples"], 64.0, rtol=1e-3)

@@ -85,19 +85,21 @@ def fit(
             for done in range(start + log_every, steps + 1, log_every):
                 state, record = advance(state, data)
                 record = {name: float(value) for name, value in record.items()}
-                if not math.isfinite(record["loss"]) or not math.isfinite(record["gradient_norm"]):
-                    kept = checkpoints.latest_step()
-                    raise TrainingStopped(f"non-finite loss near step {done}; the last good checkpoint is step {kept}")
                 record |= {
                     "step": done,
                     "learning_rate": float(jnp.asarray(schedule(done))),
                     "seconds": time.perf_counter() - began,
                 }
-                if done % save_every == 0 or done == steps:
+                saves = done % save_every == 0 or done == steps
+                if saves:
                     total, parts = validate(state.params, held_out)
                     record |= {"validation_loss": float(total), "validation_prediction": float(parts["prediction"])}
-                    checkpoints.save(done, state, validation_loss=float(total))
-                log.write(record)
+                if not all(math.isfinite(value) for value in record.values()):
+                    kept = checkpoints.latest_step()
+                    raise TrainingStopped(f"non-finite loss near step {done}; the last good checkpoint is step {kept}")
+                log.write(record)  # before the checkpoint: a resumed run drops lines, it cannot invent them
+                if saves:
+                    checkpoints.save(done, state, validation_loss=record["validation_loss"])
         best = checkpoints.best_step() or steps
         return checkpoints.restore(best, state).params, best
     finally:
