@@ -40,6 +40,7 @@ def renew(settings: dict[str, Any]) -> dict[str, Any]:
 
 def run(settings: dict[str, Any]) -> dict[str, Any]:
     """Certify, unless a certificate about other weights lies there (then `certification.renew=true`)."""
+    walk.ensure_policy(settings)
     place = shelf.run_directory(settings)
     path = place / "certificate.json"
     if path.exists() and not settings["certification"]["renew"]:

@@ -130,7 +130,7 @@ def test_controls_stay_inside_their_bounds_however_large_the_noise(std, law):
     low, high = np.float32(PLANT.control_low), np.float32(PLANT.control_high)
     state = None
     for _ in range(3):
-        action, state, info = act_once(noise_std=(std, std), law=law, state=state)
+        action, state, info = act_once(noise_std=(std, std), law=law, temperature=1e9, state=state)
         assert np.all((low <= action) & (action <= high))
         assert np.all((low <= state.controls) & (state.controls <= high))
         assert np.all(np.abs(state.plan) <= 2 * (high - low))
@@ -210,6 +210,18 @@ def test_a_broken_environment_does_the_same(entry):
     assert bool(act_once(state=held)[2]["healthy"])
 
 
+@pytest.mark.parametrize("broken", ["observation", "env", "reference"])
+def test_what_is_not_finite_is_noticed_even_where_the_model_does_not_look(broken):
+    """The nominal bicycle does not read e; the last entry of the reference is read by the cost alone."""
+    inputs = {"observation": OFFSET, "env": ENV, "reference": REFERENCE}
+    inputs[broken] = with_entry(inputs[broken], -1, np.nan)
+    controller, params, act = compiled("nominal")
+    action, state, info = act(params, controller.init(jax.random.key(0)), *inputs.values())
+    assert not bool(info["healthy"])
+    assert np.all(np.isfinite(action))
+    assert finite(state)
+
+
 def test_a_broken_first_observation_gives_a_finite_control_inside_the_bounds():
     action, state, info = act_once(observation=np.full(4, np.nan, np.float32))
     assert not bool(info["healthy"])
@@ -235,12 +247,14 @@ def breaks_where(condition):
     return models.physics(step)
 
 
-def test_a_model_that_breaks_for_half_of_the_samples_still_gives_a_finite_plan():
+@pytest.mark.parametrize("law", [FEEDBACK, control.no_feedback()])
+def test_a_model_that_breaks_for_half_of_the_samples_still_gives_a_finite_plan(law):
     """Noise with correlation 1 keeps its sign: half of the samples steer left somewhere, and break."""
+    on_path = jnp.asarray([0.0, 0.0, 0.0, 10.0])
     model = breaks_where(lambda action: action[0] > 0)
-    settings = {"law": control.no_feedback(), "noise_correlation": 1.0, "temperature": 1e9}
+    settings = {"law": law, "noise_correlation": 1.0, "temperature": 1e9}
     controller = planner(model, **settings)
-    action, state, info = jit(controller.act)({}, controller.init(jax.random.key(0)), OFFSET, ENV, REFERENCE)
+    action, state, info = jit(controller.act)({}, controller.init(jax.random.key(0)), on_path, ENV, REFERENCE)
     assert bool(info["healthy"])
     assert 20 < float(info["effective_samples"]) < 44  # of 64: equal weights on the rest
     assert finite(state)

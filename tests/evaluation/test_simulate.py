@@ -126,6 +126,12 @@ def test_the_noise_reaches_the_controller_and_not_the_truth():
     np.testing.assert_array_equal(quiet.controls, np.zeros((STEPS, 2)))
 
 
+def test_no_key_is_used_twice():
+    still = partial(evaluation.simulate, lambda state, action, env: state, recorder(1.0, 1), {}, dt=0.1, horizon=3)
+    with jax.debug_key_reuse(True):
+        jax.jit(partial(still, observation_noise=SENSORS))(at(roads(), 0), jax.random.key(0))
+
+
 def test_the_first_reference_starts_one_step_ahead():
     road = at(roads(), 0)
     window = jit(partial(evaluation.first_reference, horizon=4, dt=0.1))(road)

@@ -139,6 +139,12 @@ def test_a_batch_of_episodes_is_one_pytree_of_different_roads(name):
     assert len(np.unique(ends.round(3))) == 4
 
 
+@pytest.mark.parametrize("name", ["s1", "s2", "s3"])
+def test_no_key_is_used_twice(name):
+    with jax.debug_key_reuse(True):
+        jax.jit(make(name, duration=1.0))(jax.random.key(0))
+
+
 def test_an_episode_starts_on_the_path_at_its_speed_and_the_path_outlasts_it():
     episode = jit(make("s2", duration=20.0, speed=12.0))(KEYS[0])
     np.testing.assert_array_equal(episode.initial_state, [0.0, 0.0, 0.0, 12.0])

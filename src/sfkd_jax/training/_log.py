@@ -25,7 +25,9 @@ class TrainingLog:
         self._steps = steps
         self._path = directory / "metrics.jsonl"
         kept = [line for line in self._lines() if line["step"] <= resumed_at]
-        self._path.write_text("".join(json.dumps(line) + "\n" for line in kept))
+        rewritten = self._path.with_suffix(".part")
+        rewritten.write_text("".join(json.dumps(line) + "\n" for line in kept))
+        rewritten.replace(self._path)
         self._board = SummaryWriter(str(directory / "tensorboard"), purge_step=resumed_at or None)
         columns = (TextColumn("training"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn())
         console = Console(stderr=True)
