@@ -113,10 +113,6 @@ def test_calibration_scores_that_are_not_finite_are_refused(value):
         conformal_bounds(spoiled(1.0), spoiled(value), level=0.9)
 
 
-@pytest.mark.xfail(
-    strict=True,
-    reason="certification/_calibration.py: np.where(units > 0, units, 1) turns a NaN unit into 1 before the check",
-)
 def test_reference_scores_that_are_not_numbers_are_refused():
     with pytest.raises(ValueError, match="not finite"):
         conformal_bounds(spoiled(np.nan), spoiled(1.0), level=0.9)

@@ -40,7 +40,7 @@ def test_other_weights_do_not_get_past_the_requested_bounds(name, scale):
 def test_the_constants_are_those_of_the_exported_weights():
     weights, proved = explicit("sfkd"), contraction(*model_and_params("sfkd"))
     exact = np.max(np.linalg.norm(weights.vertices, 2, axis=(1, 2)))
-    assert exact * (1 - 1e-14) <= proved["rho"] <= exact * (1 + 1e-9)
+    assert exact <= proved["rho"] <= exact * (1 + 1.1e-6)
     readout = np.linalg.norm(weights.readout, 2)
     assert readout * (1 - 1e-14) <= proved["body"] <= readout * (1 + 1e-9)
 
@@ -121,9 +121,6 @@ def test_a_rate_that_does_not_contract_is_refused_with_the_rate():
 
 
 @pytest.mark.filterwarnings("ignore:invalid value")
-@pytest.mark.xfail(
-    strict=True, reason="certification/_certificate.py: rows of zeros are divided by their norm, 0: the constant is NaN"
-)
 def test_a_decoder_that_emits_a_constant_has_constant_zero():
     model, params = model_and_params("sfkd")
     network = params["networks"]["decoder_weights"]

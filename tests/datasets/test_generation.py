@@ -91,11 +91,6 @@ def test_the_car_stays_near_the_road_while_it_is_excited(data):
     assert np.quantile(turned, 0.95) < 1.0
 
 
-@pytest.mark.xfail(
-    strict=True,
-    raises=jax.errors.KeyReuseError,
-    reason="datasets/_generation.py: start_key draws both the speed offset and the place on the road",
-)
 def test_no_key_is_used_twice():
     plant = vehicle.kinematic()
     with jax.debug_key_reuse(True):

@@ -53,14 +53,14 @@ def conformal_bounds(
     Raises:
         ValueError: too few trajectories for the level, or scores that are not finite.
     """
+    if not np.all(np.isfinite(reference.scores)) or not np.all(np.isfinite(calibration.scores)):
+        raise ValueError("residuals are not finite")
     units = np.quantile(reference.scores, 0.95, axis=0)
     units = np.where(units > 0, units, 1.0)
     scores = np.sort(np.max(calibration.scores / units, axis=1))
     rank = math.ceil((len(scores) + 1) * level)
     if rank > len(scores):
         raise ValueError(f"{len(scores)} calibration trajectories are too few for level {level}")
-    if not np.all(np.isfinite(scores)) or not np.all(np.isfinite(units)):
-        raise ValueError("calibration residuals are not finite")
     return units * scores[rank - 1], float(scores[rank - 1])
 
 

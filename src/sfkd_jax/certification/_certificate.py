@@ -15,6 +15,9 @@ from sfkd_jax.certification._lipschitz import lipschitz_upper
 from sfkd_jax.certification._tube import latent_tube, physical_tube
 from sfkd_jax.types import Model, Params, Trajectory
 
+SERVED = 1.0 + 1e-6
+"""The controller's own compilation may round the same weights differently, by 1.5e-7 at most where it was measured."""
+
 
 class CertificationRefused(Exception):
     """No certificate; the message is the reason."""
@@ -33,8 +36,8 @@ def contraction(model: Model, params: Params) -> dict[str, float]:
     weights = jax.tree.map(lambda leaf: np.asarray(leaf, dtype=np.float64), jax.jit(model.explicit)(params))
     if not all(np.all(np.isfinite(leaf)) for leaf in jax.tree.leaves(weights)):
         raise CertificationRefused("the weights are not finite")
-    rho = max(norm_upper(vertex) for vertex in weights.vertices)
-    beta = lipschitz_upper(weights.residual, weights.residual_multipliers) if weights.residual else 0.0
+    rho = SERVED * max(norm_upper(vertex) for vertex in weights.vertices)
+    beta = SERVED * lipschitz_upper(weights.residual, weights.residual_multipliers) if weights.residual else 0.0
     if not np.isfinite(beta):
         raise CertificationRefused("the residual carries no multipliers that prove a Lipschitz bound")
     alpha = rho + beta
@@ -44,6 +47,9 @@ def contraction(model: Model, params: Params) -> dict[str, float]:
     bounds = {}
     for name, rows in parts.items():
         unit = float(np.linalg.norm(rows, 2))
+        if unit == 0.0:
+            bounds[name] = 0.0
+            continue
         scaled = (*weights.decoder[:-1], rows / unit)
         shrunk = [part / np.max(part) for part in weights.decoder_multipliers]
         bounds[name] = unit * _widened(scaled, shrunk)

@@ -20,7 +20,9 @@ def is_positive_definite(matrix: Matrix, error: float = 0.0) -> bool:
     the factorisation itself can lose, γ_{n+1}/(1 − γ_{n+1}) tr M (Rump, BIT 46, 2006). False when in doubt.
     """
     n = matrix.shape[0]
-    if not np.all(np.isfinite(matrix)) or not np.array_equal(matrix, matrix.T) or np.any(np.diag(matrix) <= 0):
+    if not np.all(np.isfinite(matrix)) or not np.isfinite(error) or error < 0:
+        return False
+    if not np.array_equal(matrix, matrix.T) or np.any(np.diag(matrix) <= 0):
         return False
     gamma = (n + 2) * UNIT / (1 - (n + 2) * UNIT)
     shift = 2 * gamma / (1 - gamma) * float(np.trace(matrix)) + error * (1 + 4 * UNIT) + n * n * TINY
@@ -32,13 +34,15 @@ def is_positive_definite(matrix: Matrix, error: float = 0.0) -> bool:
 
 
 def product(left: Matrix, right: Matrix) -> tuple[Matrix, float]:
-    """A product and a bound on the 2-norm of its rounding error."""
+    """A product in float64 and a bound on the 2-norm of its rounding error."""
+    left, right = np.asarray(left, dtype=np.float64), np.asarray(right, dtype=np.float64)
     error = (left.shape[1] + 2) * UNIT * float(np.linalg.norm(np.abs(left) @ np.abs(right)))
     return left @ right, 2 * error
 
 
 def norm_upper(matrix: Matrix) -> float:
     """A proven upper bound on ||M||_2, tight to about 1e-12; infinity if M is not finite."""
+    matrix = np.asarray(matrix, dtype=np.float64)
     if not np.all(np.isfinite(matrix)):
         return float("inf")
     gram, error = product(matrix.T, matrix)
@@ -67,16 +71,18 @@ def check_witness(weights: Sequence[Matrix], multipliers: Sequence[np.ndarray], 
     values = [np.asarray(part, dtype=np.float64) for part in (*weights, *multipliers)]
     if len(multipliers) != len(weights) - 1 or not all(np.all(np.isfinite(part)) for part in values):
         return False
-    if not np.isfinite(bound) or any(np.any(np.asarray(part) <= 0) for part in multipliers):
+    if not np.isfinite(bound) or bound <= 0 or any(np.any(np.asarray(part) <= 0) for part in multipliers):
         return False
     matrix, error = witness_matrix(weights, multipliers)
     inputs = weights[0].shape[1]
-    matrix[:inputs, :inputs] = bound**2 * (1 - 4 * UNIT) * np.eye(inputs)
+    matrix[:inputs, :inputs] += bound**2 * (1 - 4 * UNIT) * np.eye(inputs)
     return is_positive_definite(matrix, error)
 
 
 def witness_matrix(weights: Sequence[Matrix], multipliers: Sequence[np.ndarray]) -> tuple[Matrix, float]:
-    """The matrix above with its first block zero, and a bound on its rounding error (2-norm)."""
+    """The matrix above without its b² I, and a bound on its rounding error (2-norm)."""
+    weights = [np.asarray(weight, dtype=np.float64) for weight in weights]
+    multipliers = [np.asarray(multiplier, dtype=np.float64) for multiplier in multipliers]
     edges = np.cumsum([0, *(weight.shape[1] for weight in weights)])
     blocks = [slice(a, b) for a, b in pairwise(edges)]
     matrix, error = np.zeros((edges[-1], edges[-1])), 0.0

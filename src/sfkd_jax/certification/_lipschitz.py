@@ -6,7 +6,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from sfkd_jax.certification._core import Matrix, check_witness, witness_matrix
+from sfkd_jax.certification._core import Matrix, check_witness, norm_upper, witness_matrix
 
 SCALES = np.geomspace(0.25, 4.0, 33)
 SLACKS = (1e-9, 1e-7, 1e-5, 1e-3)
@@ -20,6 +20,8 @@ def lipschitz_upper(weights: Sequence[Matrix], multipliers: Sequence[np.ndarray]
     """
     if len(multipliers) != len(weights) - 1:
         return float("inf")
+    if not multipliers:
+        return norm_upper(weights[0])
     best = float("inf")
     for scale in SCALES:
         scaled = [scale * np.asarray(part) for part in multipliers]

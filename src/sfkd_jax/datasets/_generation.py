@@ -92,7 +92,7 @@ def _segment(
     key: Key,
 ) -> Trajectory:
     """One segment; its first environment also holds during the burn-in."""
-    road_key, speed_key, spread_key, noise_key, start_key = jax.random.split(key, 5)
+    road_key, speed_key, spread_key, noise_key, start_key, place_key = jax.random.split(key, 6)
     speed = jax.random.uniform(speed_key, (), minval=speed_range[0], maxval=speed_range[1])
     sample = family(conditions, length=150.0, speed=10.0, state_size=len(vehicle.state_names), **PATH)
     scenario: Scenario = sample(road_key)._replace(speed=speed)
@@ -114,7 +114,7 @@ def _segment(
         progress, _ = project(scenario.path, after[:2], progress + after[3] * vehicle.dt)
         return (after, progress, noise), (after, control)
 
-    start = (initial, jnp.full((), 20.0 * jax.random.uniform(start_key)), spread * white[0])
+    start = (initial, jnp.full((), 20.0 * jax.random.uniform(place_key)), spread * white[0])
     start = (_on_path(scenario, start[1], initial), start[1], start[2])
     _, (states, controls) = jax.lax.scan(step, start, (envs, white))
     return Trajectory(states[BURN_IN - 1 :], controls[BURN_IN:], envs[BURN_IN:])

@@ -49,7 +49,7 @@ def split(
     if min(np.diff([0, *edges, count])) < 1:
         raise ValueError(f"{count} trajectories are too few for shares {tuple(shares)}")
     envs = trajectories.envs.reshape(-1, trajectories.envs.shape[-1])
-    if bool(jnp.any(envs < env_low - 1e-5) | jnp.any(envs > env_high + 1e-5)):
+    if not bool(jnp.all((envs >= env_low - 1e-5) & (envs <= env_high + 1e-5))):
         raise ValueError(f"environments leave the box [{env_low}, {env_high}]")
     order = jax.random.permutation(key, count)
     parts = [jax.tree.map(lambda a, i=index: a[i], trajectories) for index in jnp.split(order, edges)]

@@ -13,8 +13,8 @@ SETTLING = 2.0  # s, not counted: the start is the same for everyone
 AFTER_SWITCH = 3.0  # s
 LANE_HALF_WIDTH = 1.75  # m
 VEHICLE_HALF_WIDTH = 0.9  # m
-SWITCH = (0.05, 1.5)
-"""A step of friction [-] or wind [m/s] larger than this is a switch."""
+SWITCH = (0.05, 6.0)
+"""A step of friction [-] or wind [m/s] larger than this is a switch; the ramps of gusts reach 5 m/s a step."""
 
 
 class Scores(NamedTuple):
@@ -67,6 +67,6 @@ def _after_switch(envs: Float[np.ndarray, "episode time 2"], steps: int) -> np.n
     jumps = np.any(np.abs(np.diff(envs, axis=1)) > np.asarray(SWITCH), axis=2)
     jumps = np.concatenate([np.zeros((len(envs), 1), bool), jumps], axis=1)
     mask = np.zeros_like(jumps)
-    for lag in range(steps):
+    for lag in range(min(steps, jumps.shape[1])):
         mask[:, lag:] |= jumps[:, : jumps.shape[1] - lag]
     return mask

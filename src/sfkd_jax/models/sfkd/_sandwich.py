@@ -10,8 +10,11 @@ import flax.linen as nn
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from sfkd_jax.models.sfkd._bounds import FLOAT32_MARGIN
+from sfkd_jax.models.sfkd._bounds import FLOAT32_MARGIN, bounded
 from sfkd_jax.types import Scalar
+
+CAYLEY_RANGE = 8.0
+"""Largest 2-norm of the free matrices: beyond it I + Z is so ill-conditioned that float32 loses orthogonality."""
 
 
 class Weights(NamedTuple):
@@ -49,8 +52,8 @@ class Sandwich(nn.Module):
         matrices, multipliers = [], []
         left = jnp.sqrt(gamma) * jnp.eye(self.inputs)
         for k, (before, after) in enumerate(pairwise(sizes)):
-            square = self.param(f"square_{k}", spread, (after, after))
-            tall = self.param(f"tall_{k}", spread, (before, after))
+            square = bounded(self.param(f"square_{k}", spread, (after, after)), CAYLEY_RANGE)
+            tall = bounded(self.param(f"tall_{k}", spread, (before, after)), CAYLEY_RANGE)
             A, B = cayley(square, tall)
             if k == len(self.hidden):
                 matrices.append(jnp.sqrt(gamma) * B @ left)
