@@ -34,6 +34,8 @@ VARIANTS = {
 HARD = ("sfkd", "no_fiber", "no_transport", "segment")
 """Variants whose residual is bounded by construction (and is there)."""
 PHYSICS = ("oracle", "nominal")
+OTHERS = tuple(name for name in models.FACTORIES if name != "sfkd")
+"""Learned models that are not ours: with their default settings."""
 
 
 def space(body=1):
@@ -68,7 +70,7 @@ def model_and_params(name="sfkd", scale=1.0):
 @cache
 def _model(name):
     """One object a variant, so that what is compiled for it is compiled once."""
-    return tiny(name)
+    return models.FACTORIES[name](space()) if name in OTHERS else tiny(name)
 
 
 @cache

@@ -6,14 +6,14 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from helpers import HARD, PHYSICS, TINY, VARIANTS, at, driven, jit, model_and_params, same, space, tiny
+from helpers import HARD, OTHERS, PHYSICS, TINY, VARIANTS, at, driven, jit, model_and_params, same, space, tiny
 
 from sfkd_jax import artefacts, models
 from sfkd_jax.rollouts import rollout
 from sfkd_jax.se2 import compose
 from sfkd_jax.types import POSE
 
-EVERY = (*VARIANTS, *PHYSICS)
+EVERY = (*VARIANTS, *OTHERS, *PHYSICS)
 LEARNED = tuple(VARIANTS)
 
 
