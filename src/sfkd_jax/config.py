@@ -109,6 +109,7 @@ def register() -> None:
     )
     store.store(group="training", name="schema", node=node)
     protocol = {"episodes": 8, "episode_s": 60.0, "seed": 2026, "systems": _SYSTEMS, "observation_noise": _SENSORS}
+    protocol |= {"timed_steps": 50}
     store.store(group="evaluation", name="schema", node=schema("EvaluationConfig", **protocol))
     skipped = ("validation", "calibration", "held_out", "boxes")
     node = schema("CertificationConfig", certify, skip=skipped, renew=False)

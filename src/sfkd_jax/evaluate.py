@@ -41,7 +41,8 @@ def run(settings: dict[str, Any]) -> dict[str, Any]:
         episodes = jax.jit(jax.vmap(drive))(roads, keys)
         scores[name] = evaluation.score(episodes, np.asarray(roads.envs), dt=plant.dt)
         about = _about(settings, name, system)
-        rows[name] = evaluation.row(scores[name], about, _act_ms(controller, system.params, roads, keys[0], options))
+        timing = _act_ms(controller, system.params, roads, keys[0], options, protocol["timed_steps"])
+        rows[name] = evaluation.row(scores[name], about, timing)
         for part in ("lateral", "states", "controls"):
             arrays[f"{name}/{scenario}/{part}"] = getattr(episodes, part)
         shelf.say(f"  rmse {rows[name]['rmse_m']['mean']:.4f} m, worst {rows[name]['max_deviation_m']:.3f} m")
@@ -81,13 +82,17 @@ def _about(settings: dict[str, Any], name: str, system: assembly.System) -> dict
     }
 
 
-def _act_ms(controller: Controller, params: Any, roads: Any, key: Any, options: dict[str, Any]) -> tuple[float, float]:
-    """Median and 99 % quantile of one compiled control step [ms]."""
+def _act_ms(
+    controller: Controller, params: Any, roads: Any, key: Any, options: dict[str, Any], steps: int
+) -> tuple[float, float] | None:
+    """Median and 99 % quantile of `steps` compiled control steps after ten to warm up [ms]; None for no steps."""
+    if not steps:
+        return None
     road = jax.tree.map(lambda leaf: leaf[0], roads)
     reference = evaluation.first_reference(road, horizon=options["horizon"], dt=options["dt"])
     act, state = jax.jit(controller.act), controller.init(key)
     times = []
-    for _ in range(60):
+    for _ in range(10 + steps):
         start = time.perf_counter()
         _, state, _ = jax.block_until_ready(act(params, state, road.initial_state, road.envs[0], reference))
         times.append(1e3 * (time.perf_counter() - start))
