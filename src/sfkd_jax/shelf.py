@@ -28,8 +28,7 @@ def run_directory(settings: dict[str, Any]) -> Path:
 
 def dataset_path(settings: dict[str, Any]) -> Path:
     """Data sets are shared by all runs with the same vehicle and data settings."""
-    made_with = {"vehicle": settings["vehicle"], "dataset": settings["dataset"]}
-    name = f"{settings['vehicle']['name']}-{artefacts.sha256(made_with)[:8]}"
+    name = f"{settings['vehicle']['name']}-{artefacts.sha256(dataset_config(settings))[:8]}"
     return Path(settings["root"]) / "datasets" / name / "dataset.npz"
 
 
@@ -113,9 +112,3 @@ def open_loop_document(errors: jax.Array, trajectories: Trajectory, dt: float) -
 def say(text: str) -> None:
     """Progress for a person; stdout's last line belongs to the JSON object."""
     print(text, file=sys.stderr, flush=True)
-
-
-def streams(seed: int) -> dict[str, jax.Array]:
-    """Independent keys of a run, by purpose."""
-    names = ("training", "evaluation")
-    return {name: jax.random.fold_in(jax.random.key(seed), index) for index, name in enumerate(names)}

@@ -54,7 +54,7 @@ def _train(settings: dict[str, Any]) -> None:
     draw = partial(random_windows, batch=options.pop("batch"), length=horizon)
     held_out = spread_windows(dataset.validation, length=horizon)
     shelf.say(f"training {settings['model']['system']}, {options['steps']} steps, in {place}")
-    key = shelf.streams(settings["seed"])["training"]
+    key = jax.random.fold_in(jax.random.key(settings["seed"]), 0)
     params, best = fit(model, loss, draw, dataset.train, held_out, key, place, **options)
     errors = jax.jit(partial(open_loop, model, horizon=horizon))(params, dataset.test)
     document = shelf.open_loop_document(errors, dataset.test, settings["vehicle"]["dt"])
