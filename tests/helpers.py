@@ -6,7 +6,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from sfkd_jax import control, datasets, models, vehicle
+from sfkd_jax import certification, control, datasets, models, vehicle
 from sfkd_jax.types import Space, Trajectory
 
 jit = partial(jax.jit, compiler_options={"xla_backend_optimization_level": 0})
@@ -89,6 +89,12 @@ def explicit(name="sfkd", scale=1.0):
     """What a certificate speaks about, in float64."""
     model, params = model_and_params(name, scale)
     return jax.tree.map(lambda leaf: np.asarray(leaf, dtype=np.float64), jax.jit(model.explicit)(params))
+
+
+@cache
+def certified(name="sfkd", scale=1.0):
+    """A certificate of such a model, nothing attacked."""
+    return certification.certify(*model_and_params(name, scale), (ENV_LOW, ENV_HIGH), attack_starts=0)
 
 
 def steepest_pattern(weights, starts=6):

@@ -31,7 +31,7 @@ ARROWS = {
     "reporting": {"artefacts"},
     "assembly": HALLWAY | {"vehicle", "scenarios", "datasets", "models", "control"},
     "shelf": HALLWAY | {"artefacts", "datasets"},
-    "walk": HALLWAY | {"artefacts", "assembly", "datasets", "evaluation", "policy", "shelf", "training"},
+    "walk": HALLWAY | {"artefacts", "assembly", "certification", "datasets", "evaluation", "policy", "shelf", "training"},
     "policy": HALLWAY | {"artefacts", "assembly", "models", "control"},
     "__init__": {"artefacts", "policy"},
 }
@@ -46,7 +46,7 @@ THIRD_PARTY = {
     "models": {"flax"},
     "control": {"flax"},
     "training": {"optax", "orbax", "tensorboardX", "rich"},
-    "certification": {"numpy", "cvxpy", "clarabel"},
+    "certification": {"numpy", "scipy", "threadpoolctl", "cvxpy", "clarabel"},
     "evaluation": {"numpy"},
     "reporting": {"numpy", "matplotlib"},
     "shelf": {"numpy"},

@@ -5,9 +5,9 @@ from __future__ import annotations
 import time
 from typing import Any
 
-from sfkd_jax import artefacts, policy, shelf, walk
-from sfkd_jax.certification import CertificationRefused, certify
-from sfkd_jax.config import Stale, door
+from sfkd_jax import artefacts, assembly, policy, shelf, walk
+from sfkd_jax.certification import CertificateStale, CertificationRefused, issue
+from sfkd_jax.config import door
 
 
 def renew(settings: dict[str, Any]) -> dict[str, Any]:
@@ -19,18 +19,20 @@ def renew(settings: dict[str, Any]) -> dict[str, Any]:
     dataset, _ = walk.ensure_dataset(settings)
     options = {name: value for name, value in settings["certification"].items() if name != "renew"}
     try:
-        document = certify(
+        document = issue(
             trained.model,
             trained.params,
             validation=dataset.validation,
             calibration=dataset.calibration,
-            held_out=dataset.test,
+            held_out=walk.held_out_drives(settings, dataset),
             boxes=shelf.boxes(dataset),
-            **options,
+            sensor_noise=tuple(settings["evaluation"]["observation_noise"]),
+            **assembly.without(options),
         )
     except CertificationRefused as reason:
         document = {"valid": False, "reason": str(reason)}
-    document |= {"weights_sha256": weights, "versions": artefacts.versions()}
+    versions = artefacts.versions() | document.get("versions", {})
+    document |= {"weights_sha256": weights, "versions": versions}
     document["seconds"] = time.perf_counter() - began
     artefacts.write_json(place / "certificate.json", document)
     verdict = f"alpha {document['alpha']:.6f}" if document["valid"] else f"refused: {document['reason']}"
@@ -46,7 +48,7 @@ def run(settings: dict[str, Any]) -> dict[str, Any]:
     if path.exists() and not settings["certification"]["renew"]:
         about = artefacts.read_json(path, keys=("weights_sha256",))["weights_sha256"]
         if about != policy.weights_hash(place):
-            raise Stale(f"{path} is about other weights; certification.renew=true replaces it")
+            raise CertificateStale(f"{path} is about other weights; certification.renew=true replaces it")
     document = renew(settings)
     if not document["valid"]:
         raise CertificationRefused(document["reason"])

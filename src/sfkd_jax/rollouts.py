@@ -8,7 +8,8 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from sfkd_jax.types import Fiber, Latent, Model, Params, Trajectory
+from sfkd_jax.se2 import between, wrap_angle
+from sfkd_jax.types import BODY, POSE, Control, Fiber, Latent, Model, Params, State, Trajectory
 
 
 def fibers_along(model: Model, params: Params, trajectory: Trajectory) -> tuple[Fiber, Fiber]:
@@ -34,6 +35,44 @@ def rollout(
     return jax.vmap(model.decode)(later, latents), latents, (fibers, later)
 
 
+def every_window(trajectory: Trajectory, *, horizon: int, stride: int) -> Trajectory:
+    """The windows of `horizon` steps that start at every `stride`-th state of one trajectory, leading axis first.
+
+    Raises:
+        ValueError: the horizon does not fit the trajectory.
+    """
+    steps = trajectory.controls.shape[0]
+    if horizon > steps:
+        raise ValueError(f"a horizon of {horizon} steps does not fit trajectories of {steps} steps")
+    starts = jnp.arange(0, steps - horizon + 1, stride)
+    states = trajectory.states[starts[:, None] + jnp.arange(horizon + 1)]
+    inside = starts[:, None] + jnp.arange(horizon)
+    return Trajectory(states, trajectory.controls[inside], trajectory.envs[inside])
+
+
+def window_errors(
+    model: Model, params: Params, trajectory: Trajectory, *, horizon: int, stride: int
+) -> Float[Array, "window horizon 3"]:
+    """Errors of free-running predictions 1 … horizon steps ahead, from every `stride`-th true state.
+
+    Kinds: distance between positions [m], |yaw| [rad] (wrapped), 2-norm of the body state in its own units.
+
+    Args:
+        model, params: any model. trajectory: one, states (T + 1, state). horizon, stride: steps.
+
+    Raises:
+        ValueError: the horizon does not fit the trajectory.
+    """
+
+    def one(window: Trajectory) -> Float[Array, "horizon 3"]:
+        predicted, _, _ = rollout(model, params, window)
+        gap = predicted - window.states[1:]
+        kinds = (jnp.linalg.norm(gap[:, :2], axis=1), jnp.abs(wrap_angle(gap[:, 2])))
+        return jnp.column_stack([*kinds, jnp.linalg.norm(gap[:, BODY], axis=1)])
+
+    return jax.vmap(one)(every_window(trajectory, horizon=horizon, stride=stride))
+
+
 def defects(
     model: Model, params: Params, trajectory: Trajectory, along: tuple[Fiber, Fiber] | None = None
 ) -> tuple[Float[Array, "time rank"], Float[Array, "time state"]]:
@@ -55,6 +94,27 @@ def defects(
     after = seen(later, origin, trajectory.states[1:])
     gap = jax.vmap(model.vector)(after) - jax.vmap(model.vector)(expected)
     return gap, jax.vmap(model.decode)(later, expected)
+
+
+def step_disturbances(
+    model: Model, fiber: Fiber, fiber_next: Fiber, origin: Latent, before: State, control: Control, after: State
+) -> Float[Array, " 4"]:
+    """How far one step fell from its prediction, of each kind: latent, position [m], yaw [rad], body state.
+
+        |z' − ẑ'|, |p(g⁻¹ g') − p(g⁻¹ ĝ')|, |yaw(g⁻¹ g') − yaw(g⁻¹ ĝ')|, |s' − ŝ'|,   ẑ' = T(e → e') F(z, u, e)
+
+    Args:
+        model: any model. fiber, fiber_next: of e and e'.
+        origin: a latent whose frame z and z' share; `model.encode(fiber, before)` starts a new one at x.
+        before, control, after: x, u, x'.
+    """
+    now = model.observe(fiber, origin, before)
+    expected = model.transport(fiber, fiber_next, model.step(fiber, now, control))
+    predicted = model.decode(fiber_next, expected)
+    gap = model.vector(model.observe(fiber_next, origin, after)) - model.vector(expected)
+    motion = between(before[POSE], predicted[POSE]) - between(before[POSE], after[POSE])
+    kinds = (gap, motion[:2], motion[2:], predicted[BODY] - after[BODY])
+    return jnp.stack([jnp.linalg.norm(kind) for kind in kinds])
 
 
 def _at(tree: Any, index: int) -> Any:

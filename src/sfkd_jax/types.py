@@ -7,8 +7,10 @@ Every function named here works on one sample; callers vmap.
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import dataclass
 from typing import Any, NamedTuple, TypeAlias
 
+import jax
 from jaxtyping import Array, Float, PRNGKeyArray
 
 Key: TypeAlias = PRNGKeyArray
@@ -49,27 +51,74 @@ class Space(NamedTuple):
     increment_scale: Float[Array, " 3"]
 
 
-class Explicit(NamedTuple):
-    """What a certificate speaks about: the weights a model multiplies by, and nothing hidden.
-
-    z⁺ = A(e) z + B(e) u + W_L σ(… σ(W_1 z + b_1(u, e)) …) + b_L(u, e), σ with slopes in [0, 1], and
-    A(e) in the convex hull of `vertices` for every e.
+class Polytope(NamedTuple):
+    """A(e) is a convex combination of the vertices for every e.
 
     Attributes:
         vertices: (vertex, rank, rank).
+    """
+
+    vertices: Float[Array, "vertex rank rank"]
+
+
+class Hypernetwork(NamedTuple):
+    """A(e) is what a tanh network of e emits: vec A(e) = V_L tanh(… tanh(V_1 e + c_1) …) + c_L, row by row.
+
+    Attributes:
+        weights: V_1 … V_L, each (out, in). biases: c_1 … c_L.
+    """
+
+    weights: tuple[Float[Array, "_ _"], ...]
+    biases: tuple[Float[Array, " _"], ...]
+
+
+class Samples(NamedTuple):
+    """A(e) at some environments, and nothing about those between them: evidence, never a proof.
+
+    Attributes:
+        operators: (sample, rank, rank).
+    """
+
+    operators: Float[Array, "sample rank rank"]
+
+
+@jax.tree_util.register_static
+@dataclass(frozen=True)
+class Declared:
+    """What a model states about itself in words, for a certificate to accept or refuse.
+
+    Attributes:
+        activation: σ of the residual and the decoder. transport: "identity" or "rotation" (of planes, an isometry).
+        controls: how many there are.
+    """
+
+    activation: str
+    transport: str
+    controls: int
+
+
+class Explicit(NamedTuple):
+    """What a certificate speaks about: the weights a model multiplies by, and nothing hidden.
+
+    z⁺ = A(e) z + B(e) u + W_L σ(… σ(W_1 z + b_1(u, e)) …) + b_L(u, e), σ with slopes in [0, 1].
+
+    Attributes:
+        operators: what is known of A(e) for all e.
         residual: W_1 … W_L of the residual, each (out, in); empty for a model without one.
         residual_multipliers: λ_1 … λ_{L-1}, diagonal multipliers proposed as a Lipschitz witness; () if none.
         decoder: W_1 … W_L of the pose-increment decoder, in physical units over z.
         decoder_multipliers: as for the residual.
         readout: C of the body state, s = C z + c, in physical units, (body, rank).
+        declared: the activation and the kind of transport.
     """
 
-    vertices: Float[Array, "vertex rank rank"]
+    operators: Polytope | Hypernetwork | Samples
     residual: tuple[Float[Array, "_ _"], ...]
     residual_multipliers: tuple[Float[Array, " _"], ...]
     decoder: tuple[Float[Array, "_ _"], ...]
     decoder_multipliers: tuple[Float[Array, " _"], ...]
     readout: Float[Array, "body rank"]
+    declared: Declared
 
 
 class Model(NamedTuple):

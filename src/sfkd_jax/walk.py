@@ -9,11 +9,23 @@ import jax
 import jax.numpy as jnp
 
 from sfkd_jax import artefacts, assembly, policy, shelf
-from sfkd_jax.datasets import Dataset, generate, measure_space, random_windows, split, spread_windows
+from sfkd_jax.certification import progress
+from sfkd_jax.datasets import (
+    Dataset,
+    generate,
+    generate_switching,
+    measure_space,
+    random_windows,
+    split,
+    spread_windows,
+)
 from sfkd_jax.evaluation import open_loop
 from sfkd_jax.training import fit, multi_step_loss
+from sfkd_jax.types import Trajectory
 
 SPLIT = ("shares", "env_low", "env_high", "seed")
+SWITCHING = 2
+"""Folded into the data set's seed; driving and splitting it take the streams 0 and 1."""
 
 
 def ensure_dataset(settings: dict[str, Any]) -> tuple[Dataset, str]:
@@ -29,6 +41,20 @@ def ensure_dataset(settings: dict[str, Any]) -> tuple[Dataset, str]:
         dataset = split(trajectories, split_key, shares=tuple(asked["shares"]), env_low=low, env_high=high)
         shelf.write_dataset(settings, dataset)
     return shelf.read_dataset(settings)
+
+
+def held_out_drives(settings: dict[str, Any], dataset: Dataset) -> dict[str, Trajectory]:
+    """What coverage is counted on: the test split, its S1 and S2 parts, and as many drives under S3's switching."""
+    asked, plant = settings["dataset"], assembly.build_vehicle(settings["vehicle"])
+    options = {name: value for name, value in assembly.without(asked, *SPLIT).items() if name != "fixed_levels"}
+    options["segments"] = dataset.test.controls.shape[0]
+    drive = jax.jit(partial(generate_switching, plant, assembly.build_driver(plant), **options))
+    constant = jnp.all(dataset.test.envs == dataset.test.envs[:, :1], axis=(1, 2))
+    parts = {"test": dataset.test, "s3": drive(jax.random.fold_in(jax.random.key(asked["seed"]), SWITCHING))}
+    for name, chosen in (("s1", constant), ("s2", ~constant)):
+        if chosen.any():
+            parts[name] = jax.tree.map(lambda leaf, chosen=chosen: leaf[chosen], dataset.test)
+    return parts
 
 
 def ensure_policy(settings: dict[str, Any]) -> policy.Policy:
@@ -55,6 +81,7 @@ def _train(settings: dict[str, Any]) -> None:
     held_out = spread_windows(dataset.validation, length=horizon)
     shelf.say(f"training {settings['model']['system']}, {options['steps']} steps, in {place}")
     key = jax.random.fold_in(jax.random.key(settings["seed"]), 0)
+    options["inspect"] = partial(progress, model)
     params, best = fit(model, loss, draw, dataset.train, held_out, key, place, **options)
     errors = jax.jit(partial(open_loop, model, horizon=horizon))(params, dataset.test)
     document = shelf.open_loop_document(errors, dataset.test, settings["vehicle"]["dt"])

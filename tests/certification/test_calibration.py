@@ -58,7 +58,7 @@ def test_conformal_bounds_cover_a_new_trajectory_as_often_as_they_say(level, cou
     """Split conformal, exactly: P(covered) = ⌈(n+1) level⌉/(n+1), here level to 1/(n+1), for all four kinds at once."""
     random, shares = np.random.default_rng(0), []
     for _ in range(250):
-        bounds, _ = conformal_bounds(scores(random, 50), scores(random, count), level=level)
+        bounds = conformal_bounds(scores(random, 50), scores(random, count), level=level)
         shares.append(coverage(bounds, scores(random, 100))[0])
     exact = np.ceil((count + 1) * level) / (count + 1)
     assert abs(np.mean(shares) - exact) < 4 * np.std(shares) / np.sqrt(250)
@@ -68,9 +68,9 @@ def test_conformal_bounds_cover_a_new_trajectory_as_often_as_they_say(level, cou
 def test_conformal_bounds_are_a_calibration_score_in_the_units_of_the_reference():
     random = np.random.default_rng(1)
     reference, calibration = scores(random, 50), scores(random, 40)
-    bounds, factor = conformal_bounds(reference, calibration, level=0.9)
+    bounds = conformal_bounds(reference, calibration, level=0.9)
     units = np.quantile(reference.scores, 0.95, axis=0)
-    np.testing.assert_allclose(bounds, factor * units)
+    np.testing.assert_allclose(bounds / units, np.full(4, bounds[0] / units[0]))
     inside = np.sum(np.all(calibration.scores <= bounds * (1 + 1e-12), axis=1))
     assert inside == np.ceil(41 * 0.9)
 
@@ -79,16 +79,14 @@ def test_bounds_do_not_depend_on_the_units_of_a_kind():
     random = np.random.default_rng(2)
     reference, calibration = scores(random, 50), scores(random, 40)
     scale = np.asarray([1e3, 1e-3, 1.0, 5.0])
-    bounds, _ = conformal_bounds(reference, calibration, level=0.9)
-    scaled, _ = conformal_bounds(
-        Disturbance(scale * reference.scores), Disturbance(scale * calibration.scores), level=0.9
-    )
+    bounds = conformal_bounds(reference, calibration, level=0.9)
+    scaled = conformal_bounds(Disturbance(scale * reference.scores), Disturbance(scale * calibration.scores), level=0.9)
     np.testing.assert_allclose(scaled, scale * bounds)
 
 
 def test_a_kind_that_never_errs_needs_no_unit():
     silent = Disturbance(scores(np.random.default_rng(3), 40).scores * np.asarray([1.0, 0.0, 1.0, 1.0]))
-    bounds, _ = conformal_bounds(silent, silent, level=0.9)
+    bounds = conformal_bounds(silent, silent, level=0.9)
     assert np.all(np.isfinite(bounds))
 
 
@@ -97,7 +95,7 @@ def test_too_few_trajectories_for_the_level_are_refused(count, level):
     random = np.random.default_rng(0)
     with pytest.raises(ValueError, match=f"{count} calibration trajectories are too few for level {level}"):
         conformal_bounds(scores(random, 50), scores(random, count), level=level)
-    bounds, _ = conformal_bounds(scores(random, 50), scores(random, count + 1), level=level)
+    bounds = conformal_bounds(scores(random, 50), scores(random, count + 1), level=level)
     assert np.all(np.isfinite(bounds))
 
 

@@ -4,9 +4,9 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from helpers import at, driven, jit, model_and_params
+from helpers import ENV_HIGH, ENV_LOW, at, certified, driven, jit, model_and_params
 
-from sfkd_jax.certification import contraction, disturbances, latent_tube, physical_tube
+from sfkd_jax.certification import certify, disturbances, latent_tube, physical_tube
 from sfkd_jax.rollouts import rollout
 from sfkd_jax.se2 import wrap_angle
 
@@ -68,7 +68,7 @@ def test_with_bounded_disturbances_the_tube_is_violated_exactly_never(aligned, l
     """Latents under the same u, switching e and transport; one of them is pushed by |d| ≤ d̄ at every step."""
     model, params = model_and_params("sfkd")
     params = scaled_to_the_limit(params) if limit else params
-    alpha, d_bar, steps, episodes = contraction(model, params)["alpha"], 0.05, 120, 16
+    alpha, d_bar, steps, episodes = certify(model, params, (ENV_LOW, ENV_HIGH), attack_starts=0).alpha, 0.05, 120, 16
 
     def episode(params, key):
         start_key, push_key, env_key, control_key = jax.random.split(key, 4)
@@ -104,6 +104,7 @@ def test_the_physical_tube_is_its_finite_sums():
     latent = np.asarray([1.0, 2.0, 4.0])
     tube = physical_tube(
         latent,
+        alpha=0.5,
         lipschitz={"position": 2.0, "yaw": 0.5, "body": 3.0},
         residual={"position": 0.1, "yaw": 0.01, "body": 0.2},
         largest_increment=10.0,
@@ -111,7 +112,7 @@ def test_the_physical_tube_is_its_finite_sums():
     yaw = [0.01, 0.01 + 0.51, 0.01 + 0.51 + 1.01]
     np.testing.assert_allclose(tube["yaw_rad"], yaw)
     np.testing.assert_allclose(tube["position_m"], [0.1, 0.2 + 2.0 + 10 * yaw[0], 0.3 + 6.0 + 10 * (yaw[0] + yaw[1])])
-    np.testing.assert_allclose(tube["body"], [3.2, 6.2, 12.2])
+    np.testing.assert_allclose(tube["body"], [0.2, 0.2 + 3.0 * 0.5 * 1.0, 0.2 + 3.0 * 0.5 * 2.0])
 
 
 @pytest.mark.parametrize("name", ["sfkd", "segment"])
@@ -120,7 +121,7 @@ def test_free_running_predictions_stay_inside_the_physical_tube(name):
     a switch of the environment at every one of them. The theorem leaves no exception."""
     model, params = model_and_params(name)
     data = driven(24)
-    proved = contraction(model, params)
+    proved = certified(name)
     found = dict(zip(("latent", "position", "yaw", "body"), disturbances(model, params, data).scores.T, strict=True))
     predicted = np.asarray(jit(jax.vmap(lambda one: rollout(model, params, one)[0]))(data))
     true = np.asarray(data.states)[:, 1:]
@@ -130,8 +131,9 @@ def test_free_running_predictions_stay_inside_the_physical_tube(name):
     moves = np.linalg.norm(np.diff(np.asarray(data.states)[..., :2], axis=1), axis=-1)
     for k in range(len(predicted)):
         tube = physical_tube(
-            latent_tube(proved["alpha"], found["latent"][k], 12),
-            lipschitz=proved,
+            latent_tube(proved.alpha, found["latent"][k], 12),
+            alpha=proved.alpha,
+            lipschitz=proved.lipschitz,
             residual={kind: found[kind][k] for kind in ("position", "yaw", "body")},
             largest_increment=float(moves[k].max()),
         )

@@ -91,7 +91,7 @@ def test_the_operator_is_bounded_for_every_environment_and_every_weight(name, sc
     model, params = model_and_params(name, scale)
     operators = jit(jax.vmap(lambda env: model.fiber(params, env).A))(environments())
     assert np.all(spectral(operators) <= RHO)
-    assert np.all(spectral(explicit(name, scale).vertices) > 0.97 * RHO)  # and the bound is used, not wasted
+    assert np.all(spectral(explicit(name, scale).operators.vertices) > 0.97 * RHO)  # and the bound is used, not wasted
 
 
 @pytest.mark.parametrize("seed", range(3))
@@ -246,5 +246,5 @@ def test_the_budget_is_the_callers():
     random = np.random.default_rng(0)
     params = jax.tree.map(lambda leaf: 3.0 * random.standard_normal(leaf.shape).astype(np.float32), shapes)
     weights = jax.tree.map(lambda leaf: np.asarray(leaf, dtype=np.float64), jit(model.explicit)(params))
-    assert np.all(spectral(weights.vertices) <= 0.5)
+    assert np.all(spectral(weights.operators.vertices) <= 0.5)
     assert lipschitz_upper(weights.residual, weights.residual_multipliers) <= 0.3

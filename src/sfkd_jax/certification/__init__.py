@@ -1,15 +1,30 @@
 """The notary: what is claimed for all states, controls and environments, and what is only measured."""
 
+from sfkd_jax.certification._attack import attack_slopes as attack_slopes
+from sfkd_jax.certification._attack import attack_step as attack_step
+from sfkd_jax.certification._attack import attack_transport as attack_transport
+from sfkd_jax.certification._calibration import Disturbance as Disturbance
 from sfkd_jax.certification._calibration import clopper_pearson as clopper_pearson
 from sfkd_jax.certification._calibration import conformal_bounds as conformal_bounds
 from sfkd_jax.certification._calibration import coverage as coverage
 from sfkd_jax.certification._calibration import disturbances as disturbances
-from sfkd_jax.certification._certificate import CertificationRefused as CertificationRefused
+from sfkd_jax.certification._certificate import Certificate as Certificate
+from sfkd_jax.certification._certificate import CertificateContradicted as CertificateContradicted
+from sfkd_jax.certification._certificate import CertificateStale as CertificateStale
 from sfkd_jax.certification._certificate import certify as certify
-from sfkd_jax.certification._certificate import contraction as contraction
+from sfkd_jax.certification._certificate import verify as verify
+from sfkd_jax.certification._conformal_tube import conformal_tube as conformal_tube
+from sfkd_jax.certification._core import check_metric as check_metric
 from sfkd_jax.certification._core import check_witness as check_witness
 from sfkd_jax.certification._core import is_positive_definite as is_positive_definite
 from sfkd_jax.certification._core import norm_upper as norm_upper
-from sfkd_jax.certification._lipschitz import lipschitz_upper as lipschitz_upper
+from sfkd_jax.certification._environments import cover as cover
+from sfkd_jax.certification._exported import CertificationRefused as CertificationRefused
+from sfkd_jax.certification._issue import issue as issue
+from sfkd_jax.certification._issue import progress as progress
+from sfkd_jax.certification._proposals import lipschitz_upper as lipschitz_upper
+from sfkd_jax.certification._proposals import propose_multipliers as propose_multipliers
+from sfkd_jax.certification._solvers import solve_metric as solve_metric
+from sfkd_jax.certification._solvers import solve_multipliers as solve_multipliers
 from sfkd_jax.certification._tube import latent_tube as latent_tube
 from sfkd_jax.certification._tube import physical_tube as physical_tube

@@ -3,16 +3,17 @@
 from __future__ import annotations
 
 import math
+from functools import partial
 from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
+from scipy.stats import binomtest
 
-from sfkd_jax.rollouts import defects
-from sfkd_jax.se2 import between
-from sfkd_jax.types import BODY, POSE, Model, Params, Trajectory
+from sfkd_jax.rollouts import fibers_along, step_disturbances
+from sfkd_jax.types import Model, Params, Trajectory
 
 
 class Disturbance(NamedTuple):
@@ -31,20 +32,31 @@ def disturbances(model: Model, params: Params, trajectories: Trajectory) -> Dist
     """One-step residuals from true states, transport defect and switch steps included; maximum over each trajectory."""
 
     def one(trajectory: Trajectory) -> Float[Array, " 4"]:
-        gap, predicted = defects(model, params, trajectory)
-        before, after = trajectory.states[:-1, POSE], trajectory.states[1:, POSE]
-        motion = jax.vmap(between)(before, predicted[:, POSE]) - jax.vmap(between)(before, after)
-        body = predicted[:, BODY] - trajectory.states[1:, BODY]
-        kinds = (gap, motion[:, :2], motion[:, 2:], body)
-        return jnp.stack([jnp.max(jnp.linalg.norm(kind, axis=1)) for kind in kinds])
+        fibers, later = fibers_along(model, params, trajectory)
+        origin = model.encode(jax.tree.map(lambda leaf: leaf[0], fibers), trajectory.states[0])
+        each = jax.vmap(partial(step_disturbances, model), in_axes=(0, 0, None, 0, 0, 0))
+        found = each(fibers, later, origin, trajectory.states[:-1], trajectory.controls, trajectory.states[1:])
+        return jnp.max(found, axis=0)
 
     scores = jax.jit(lambda data: jax.lax.map(one, data, batch_size=64))(trajectories)
     return Disturbance(np.asarray(scores, dtype=np.float64))
 
 
-def conformal_bounds(
-    reference: Disturbance, calibration: Disturbance, *, level: float
-) -> tuple[Float[np.ndarray, " 4"], float]:
+def conformal_quantile(scores: Float[np.ndarray, " trajectory"], level: float) -> float:
+    """The ⌈(n+1) level⌉-th smallest of n scores: a new, exchangeable score exceeds it with probability ≤ 1 − level.
+
+    Raises:
+        ValueError: too few scores for the level, or scores that are not finite.
+    """
+    if not np.all(np.isfinite(scores)):
+        raise ValueError("residuals are not finite")
+    rank = math.ceil((len(scores) + 1) * level)
+    if rank > len(scores):
+        raise ValueError(f"{len(scores)} calibration trajectories are too few for level {level}")
+    return float(np.sort(scores)[rank - 1])
+
+
+def conformal_bounds(reference: Disturbance, calibration: Disturbance, *, level: float) -> Float[np.ndarray, " 4"]:
     """Bounds on all four kinds at once, valid for a whole new trajectory with probability ≥ level.
 
     Split-conformal: the score of a trajectory is its largest kind in units of `reference`'s 95 % quantiles (another
@@ -53,15 +65,11 @@ def conformal_bounds(
     Raises:
         ValueError: too few trajectories for the level, or scores that are not finite.
     """
-    if not np.all(np.isfinite(reference.scores)) or not np.all(np.isfinite(calibration.scores)):
+    if not np.all(np.isfinite(reference.scores)):
         raise ValueError("residuals are not finite")
     units = np.quantile(reference.scores, 0.95, axis=0)
     units = np.where(units > 0, units, 1.0)
-    scores = np.sort(np.max(calibration.scores / units, axis=1))
-    rank = math.ceil((len(scores) + 1) * level)
-    if rank > len(scores):
-        raise ValueError(f"{len(scores)} calibration trajectories are too few for level {level}")
-    return units * scores[rank - 1], float(scores[rank - 1])
+    return units * conformal_quantile(np.max(calibration.scores / units, axis=1), level)
 
 
 def coverage(bounds: Float[np.ndarray, " 4"], held_out: Disturbance) -> tuple[float, tuple[float, float]]:
@@ -71,23 +79,6 @@ def coverage(bounds: Float[np.ndarray, " 4"], held_out: Disturbance) -> tuple[fl
 
 
 def clopper_pearson(successes: int, trials: int, *, level: float = 0.95) -> tuple[float, float]:
-    """The exact interval of a binomial proportion, by bisection on the binomial tail."""
-    tail = (1 - level) / 2
-
-    def at_least(p: float, count: int) -> float:
-        """P(X ≥ count), X ~ Binomial(trials, p), summed in logs."""
-        ks = np.arange(count, trials + 1)
-        logs = np.array([math.lgamma(trials + 1) - math.lgamma(k + 1) - math.lgamma(trials - k + 1) for k in ks])
-        return float(np.sum(np.exp(logs + ks * math.log(p) + (trials - ks) * math.log1p(-p))))
-
-    def bisect(count: int, target: float) -> float:
-        """The p at which P(X ≥ count) reaches the target; it grows with p."""
-        low, high = 1e-12, 1 - 1e-12
-        for _ in range(60):
-            middle = 0.5 * (low + high)
-            low, high = (middle, high) if at_least(middle, count) < target else (low, middle)
-        return 0.5 * (low + high)
-
-    lower = 0.0 if successes == 0 else bisect(successes, tail)
-    upper = 1.0 if successes == trials else bisect(successes + 1, 1 - tail)
-    return lower, upper
+    """The exact interval of a binomial proportion."""
+    low, high = binomtest(successes, trials).proportion_ci(level, method="exact")
+    return float(low), float(high)

@@ -1,152 +1,193 @@
-"""The first certificate: α recomputed from the exported weights, tubes from measured disturbances, or a refusal."""
+"""The certificate: what is proved about the exported weights for all z, u and e, or a refusal with the reason."""
 
 from __future__ import annotations
 
+import dataclasses
 import time
-from collections.abc import Mapping
+from importlib.metadata import version
 from typing import Any
 
 import jax
 import numpy as np
+from threadpoolctl import threadpool_limits
 
-from sfkd_jax.certification._calibration import KINDS, conformal_bounds, coverage, disturbances
-from sfkd_jax.certification._core import norm_upper
-from sfkd_jax.certification._lipschitz import lipschitz_upper
-from sfkd_jax.certification._tube import latent_tube, physical_tube
-from sfkd_jax.types import Model, Params, Trajectory
+from sfkd_jax.certification._attack import attack_slopes, attack_step, attack_transport
+from sfkd_jax.certification._claims import Claims, Refuted, claims_hold, prove
+from sfkd_jax.certification._core import Matrix
+from sfkd_jax.certification._environments import Box
+from sfkd_jax.certification._exported import CertificationRefused, Exported, exported, fingerprint
+from sfkd_jax.types import Model, Params, Polytope
 
-SERVED = 1.0 + 1e-6
-"""The controller's own compilation may round the same weights differently, by 1.5e-7 at most where it was measured."""
+MODES = ("joint", "separate")
+FLOAT32 = 1e-5
+"""An attack runs on the model in float32; a bound is contradicted when it is exceeded by more than this, relatively."""
+PRECISION = "bounds on the float32 weights as real numbers, checked in float64; float32 rounding of a step counts as d"
 
 
-class CertificationRefused(Exception):
-    """No certificate; the message is the reason."""
+class CertificateContradicted(CertificationRefused):
+    """An attack exceeds a proved bound: a fault in this code or in what the model says about itself, never data."""
 
 
-def contraction(model: Model, params: Params) -> dict[str, float]:
-    """ρ, β, α = ρ + β and the decoder's constants, proved for all e, u, z from the float32 weights taken as exact.
+class CertificateStale(Exception):
+    """The certificate is about other weights."""
 
-    ρ holds for every e because A(e) is a convex combination of the vertices; β because u and e are biases.
 
-    Raises:
-        CertificationRefused: no explicit weights, weights not finite, a residual without a witness, α ≥ 1.
+@dataclasses.dataclass(frozen=True)
+class Certificate:
+    """What is proved. Frozen; `document` and `from_document` carry it through JSON unchanged.
+
+    Attributes:
+        mode: "joint" or "separate". scope: how all environments are covered.
+        alpha: contraction factor of a step, |F(z) − F(z')|_P ≤ α |z − z'|_P for all z, z', u and all e of the scope.
+        alpha_separate: ρ + β √κ. alpha_joint: of z ↦ A(e) z + r(z; u, e) as one map, or None.
+        rho: sup_e ||A(e)||_P. beta: Lipschitz constant of r in z. kappa: condition of P, 1 for P = I.
+        lipschitz: of the decoder's parts "position" [m], "yaw" [rad], both ("decoder") and of "body".
+        transport_lipschitz: of T(e → e'). env_box: [low, high].
+        witnesses: multipliers (and P) that prove all of it; `verify` needs no search.
+        params_sha256: of the weights. precision: what float arithmetic is covered how.
+        attack: largest contraction factor that an attack on the running model found. tightness: α / attack.
+        attacks: all lower bounds by name. versions, seconds: of how it was made.
     """
-    if model.explicit is None:
-        raise CertificationRefused("this model exposes no explicit weights to certify")
-    weights = jax.tree.map(lambda leaf: np.asarray(leaf, dtype=np.float64), jax.jit(model.explicit)(params))
-    if not all(np.all(np.isfinite(leaf)) for leaf in jax.tree.leaves(weights)):
-        raise CertificationRefused("the weights are not finite")
-    rho = SERVED * max(norm_upper(vertex) for vertex in weights.vertices)
-    beta = SERVED * lipschitz_upper(weights.residual, weights.residual_multipliers) if weights.residual else 0.0
-    if not np.isfinite(beta):
-        raise CertificationRefused("the residual carries no multipliers that prove a Lipschitz bound")
-    alpha = rho + beta
-    if alpha >= 1.0:
-        raise CertificationRefused(f"alpha = {alpha:.6f} is not below 1 (rho {rho:.6f}, beta {beta:.6f})")
-    parts = {"position": weights.decoder[-1][:2], "yaw": weights.decoder[-1][2:], "decoder": weights.decoder[-1]}
-    bounds = {}
-    for name, rows in parts.items():
-        unit = float(np.linalg.norm(rows, 2))
-        if unit == 0.0:
-            bounds[name] = 0.0
-            continue
-        scaled = (*weights.decoder[:-1], rows / unit)
-        shrunk = [part / np.max(part) for part in weights.decoder_multipliers]
-        bounds[name] = unit * _widened(scaled, shrunk)
-    return {"rho": rho, "beta": beta, "alpha": alpha, "body": norm_upper(weights.readout)} | bounds
 
+    mode: str
+    scope: str
+    alpha: float
+    alpha_separate: float
+    alpha_joint: float | None
+    rho: float
+    beta: float
+    kappa: float
+    lipschitz: dict[str, float]
+    transport_lipschitz: float
+    env_box: list[list[float]]
+    witnesses: dict[str, Any]
+    params_sha256: str
+    precision: str
+    attack: float | None
+    tightness: float | None
+    attacks: dict[str, float]
+    versions: dict[str, str]
+    seconds: float
 
-def _widened(weights: tuple[np.ndarray, ...], multipliers: list[np.ndarray]) -> float:
-    """A Lipschitz bound over a wide range of overall multiplier scales."""
-    scales = np.geomspace(1e-3, 1e6, 28)
-    return min(lipschitz_upper(weights, [scale * part for part in multipliers]) for scale in scales)
+    def document(self) -> dict[str, Any]:
+        """As JSON has it."""
+        return dataclasses.asdict(self)
 
+    @classmethod
+    def from_document(cls, document: dict[str, Any]) -> Certificate:
+        """Back from JSON; keys that are not the certificate's own are left out.
 
-def measure(
-    model: Model, params: Params, splits: tuple[Trajectory, Trajectory, Trajectory], *, level: float
-) -> dict[str, Any]:
-    """One-step bounds at `level` for whole trajectories, and how often they hold on trajectories nobody used.
-
-    Args:
-        model, params: what predicts. splits: validation fixes units, calibration sets the bounds, the last tests them.
-        level: 1 − δ.
-
-    Raises:
-        CertificationRefused: too few trajectories, or residuals that are not finite.
-    """
-    validation, calibration, held_out = (disturbances(model, params, part) for part in splits)
-    try:
-        bounds, _ = conformal_bounds(validation, calibration, level=level)
-    except ValueError as reason:
-        raise CertificationRefused(str(reason)) from None
-    share, interval = coverage(bounds, held_out)
-    return {
-        "level": level,
-        "trajectories": len(calibration.scores),
-        "coverage": share,
-        "coverage_ci95": list(interval),
-        "one_step": dict(zip(KINDS, bounds.tolist(), strict=True)),
-    }
+        Raises:
+            CertificationRefused: a key is missing.
+        """
+        names = [field.name for field in dataclasses.fields(cls)]
+        missing = [name for name in names if name not in document]
+        if missing:
+            raise CertificationRefused(f"not a certificate: {', '.join(missing[:3])} missing")
+        return cls(**{name: document[name] for name in names})
 
 
 def certify(
     model: Model,
     params: Params,
+    env_box: Box,
     *,
-    validation: Trajectory,
-    calibration: Trajectory,
-    held_out: Trajectory,
-    boxes: Mapping[str, Any],
-    horizon: int = 20,
-    level: float = 0.95,
-    separate_margin: float = 1e-4,
-) -> dict[str, Any]:
-    """A certificate as a document: what is proved (α, constants) and, apart from it, what is measured (d̄, coverage).
+    mode: str = "joint",
+    margin: float = 1e-4,
+    metric: Matrix | None = None,
+    attack_starts: int = 6,
+    seed: int = 0,
+) -> Certificate:
+    """Prove a contraction factor for all z, all u and all e, and attack what was proved.
 
     Args:
-        model, params: what is certified, with the weights as exported.
-        validation: fixes the units of the scores. calibration: sets d̄. held_out: measures coverage. All by trajectory.
-        boxes: the domain of s, u and e that the measurements come from; outside it nothing is claimed.
-        horizon: of the tubes. level: 1 − δ of the conformal bound.
-        separate_margin: how far below 1 α must lie.
+        model, params: with `explicit`; the weights as exported. env_box: lower and upper corner of E.
+        mode: "joint" bounds A(e) z + r(z; u, e) as one map; "separate" only ρ + β.
+        margin: how far below 1 α must lie.
+        metric: P of a common Lyapunov function, proposed by anyone; ρ and κ are recomputed (separate mode).
+        attack_starts: of the ascent on the running model; 0 leaves it out and tightness None. seed: of the attacks.
 
     Raises:
-        CertificationRefused: with the reason.
+        CertificationRefused: with the reason. CertificateContradicted: an attack beat the bound.
+        ValueError: unknown mode, a metric in joint mode, or a box that is none.
     """
     began = time.perf_counter()
-    proved = contraction(model, params)
-    alpha = proved["alpha"]
-    if alpha > 1.0 - separate_margin:
-        raise CertificationRefused(f"alpha = {alpha:.6f} leaves less than the margin {separate_margin} below 1")
-    found = measure(model, params, (validation, calibration, held_out), level=level)
-    one_step = found["one_step"]
-    latent = latent_tube(alpha, one_step["latent"], horizon)
-    positions = np.asarray(calibration.states)[..., :2]
-    tube = physical_tube(
-        latent,
-        lipschitz={kind: proved[kind] for kind in ("position", "yaw", "body")},
-        residual=one_step,
-        largest_increment=float(np.max(np.linalg.norm(np.diff(positions, axis=-2), axis=-1))),
+    corners = np.asarray(env_box, dtype=np.float64)
+    if corners.ndim != 2 or len(corners) != 2 or not np.all(corners[0] <= corners[1]):
+        raise ValueError(f"env_box must be a lower and an upper corner, got {env_box}")
+    if mode not in MODES or (metric is not None and mode == "joint"):
+        raise ValueError(f"mode must be one of {', '.join(MODES)}, and separate with a metric; got {mode!r}")
+    weights = exported(model, params)
+    try:
+        with threadpool_limits(1, "blas"):  # matrices of this size lose on two threads, and lose 100-fold on busy cores
+            claims = prove(weights, env_box, joint=mode == "joint", metric=metric)
+    except Refuted as reason:
+        raise CertificationRefused(str(reason)) from None
+    if claims.alpha > 1.0 - margin:
+        shown = f"alpha = {claims.alpha:.6f} (rho {claims.rho:.6f}, beta {claims.beta:.6f}, kappa {claims.kappa:.3g})"
+        raise CertificationRefused(f"{shown} is not below 1 by the margin {margin:g}")
+    attacks = _attacks(model, params, weights, claims, env_box, attack_starts, seed)
+    attack = attacks.get("step")
+    return Certificate(
+        mode=mode,
+        **claims._asdict(),
+        transport_lipschitz=1.0,
+        env_box=corners.tolist(),
+        params_sha256=fingerprint(params),
+        precision=PRECISION,
+        attack=attack,
+        tightness=claims.alpha / attack if attack else None,
+        attacks=attacks,
+        versions={name: version(name) for name in ("jax", "numpy", "scipy")},
+        seconds=time.perf_counter() - began,
     )
-    return {
-        "valid": True,
-        "mode": "separate",
-        "scope": "all e in the environment box, all u, all z",
-        "alpha": alpha,
-        "alpha_separate": alpha,
-        "rho": proved["rho"],
-        "beta": proved["beta"],
-        "kappa": 1.0,
-        "decoder_lipschitz": proved["decoder"],
-        "transport_lipschitz": 1.0,
-        "d_bar": {"value": one_step["latent"], **found},
-        "tube": {
-            "latent": latent.tolist(),
-            "physical": tube,
-            "ultimate": one_step["latent"] / (1.0 - alpha),
-        },
-        "boxes": dict(boxes),
-        "attack": None,
-        "tightness": None,
-        "seconds": time.perf_counter() - began,
-    }
+
+
+def verify(certificate: Certificate, params: Params, *, model: Model) -> None:
+    """Check a certificate against weights, without any search: milliseconds, once `model.explicit` is compiled.
+
+    Args:
+        certificate: of unknown origin. params: weights. model: what turns them into explicit ones.
+
+    Raises:
+        CertificateStale: it is about other weights. CertificationRefused: a claim does not follow from its witness.
+    """
+    if fingerprint(params) != certificate.params_sha256:
+        raise CertificateStale("the certificate is about other weights")
+    weights = exported(model, params)
+    names = [name for name in Claims._fields if hasattr(certificate, name)]
+    claims = Claims(**{name: getattr(certificate, name) for name in names})
+    try:
+        with threadpool_limits(1, "blas"):
+            claims_hold(claims, weights, certificate.env_box)
+    except Refuted as reason:
+        raise CertificationRefused(str(reason)) from None
+    if not claims.alpha < 1.0 or certificate.transport_lipschitz != 1.0:
+        raise CertificationRefused(f"alpha = {claims.alpha} is not below 1, or the transport is not nonexpansive")
+
+
+def _attacks(
+    model: Model, params: Params, weights: Exported, claims: Claims, box: Any, starts: int, seed: int
+) -> dict[str, float]:
+    """Lower bounds by name, none of which may exceed what was proved."""
+    found, limits = {}, {}
+    with threadpool_limits(1, "blas"):
+        if weights.residual:
+            found["residual_slopes"] = attack_slopes(weights.residual, seed=seed)
+            limits["residual_slopes"] = claims.beta
+        if claims.kappa == 1.0 and isinstance(weights.operators, Polytope):
+            slopes = [attack_slopes(weights.residual, vertex, starts=8) for vertex in weights.operators.vertices]
+            found["step_slopes"], limits["step_slopes"] = max(slopes), claims.alpha
+    if starts:
+        step_key, transport_key = jax.random.split(jax.random.key(seed))
+        found["transport"] = attack_transport(model, params, box, transport_key)
+        limits["transport"] = 1.0
+        if claims.kappa == 1.0:
+            found["step"] = attack_step(model, params, box, step_key, starts=starts)
+            limits["step"] = claims.alpha
+    for name, value in found.items():
+        if not value <= limits[name] * (1 + FLOAT32):
+            raise CertificateContradicted(
+                f"INTERNAL ERROR: the attack on the {name} reaches {value:.6f}, above the bound {limits[name]:.6f}"
+            )
+    return found

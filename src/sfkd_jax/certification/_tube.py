@@ -20,6 +20,7 @@ def latent_tube(alpha: float, d_bar: float, horizon: int, *, initial: float = 0.
 def physical_tube(
     latent: Float[np.ndarray, " horizon"],
     *,
+    alpha: float,
     lipschitz: Mapping[str, float],
     residual: Mapping[str, float],
     largest_increment: float,
@@ -27,10 +28,10 @@ def physical_tube(
     """Radii of position [m], yaw [rad] and body state for k = 1 … horizon, from z_0 known exactly.
 
     The pose is a sum of increments on SE(2), so its error is bounded by finite sums, not by a contraction:
-        |e_yaw,k| ≤ Σ_j (L_yaw R_j + ε_yaw),   |e_p,k| ≤ Σ_j (L_p R_j + ε_p + |dp| |e_yaw,j|),   |e_s,k| ≤ L_s R_k + ε_s
+        |e_yaw,k| ≤ Σ_j (L_yaw R_j + ε_yaw),   |e_p,k| ≤ Σ_j (L_p R_j + ε_p + |dp| |e_yaw,j|),   |e_s,k| ≤ L_s α R_{k−1} + ε_s
 
     Args:
-        latent: R_1 … R_T.
+        latent: R_1 … R_T. alpha: the contraction factor behind them.
         lipschitz: L of the decoder's parts, by "position", "yaw", "body".
         residual: ε, the decoder's one-step residuals at the true latent, by the same names.
         largest_increment: |dp|, the longest step driven [m].
@@ -39,5 +40,5 @@ def physical_tube(
     yaw = np.cumsum(lipschitz["yaw"] * before + residual["yaw"])
     turned = np.concatenate([[0.0], yaw[:-1]])
     position = np.cumsum(lipschitz["position"] * before + residual["position"] + largest_increment * turned)
-    body = lipschitz["body"] * latent + residual["body"]
+    body = lipschitz["body"] * alpha * before + residual["body"]
     return {"position_m": position.tolist(), "yaw_rad": yaw.tolist(), "body": body.tolist()}

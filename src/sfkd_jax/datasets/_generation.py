@@ -10,7 +10,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from sfkd_jax.scenarios import Scenario, family, project, reference_window, uniform_road, wet_road
+from sfkd_jax.scenarios import Scenario, family, project, reference_window, switching_road, uniform_road, wet_road
 from sfkd_jax.types import Key, Scalar, State, Trajectory
 from sfkd_jax.vehicle import Vehicle
 
@@ -54,18 +54,38 @@ def generate(
     halves = []
     for index, conditions in enumerate(_conditions(steps, vehicle.dt, fixed_levels)):
         count = segments // 2 if index else segments - segments // 2
+        drive = partial(_segment, vehicle, driver, conditions, steps, speed)
+        drive = partial(drive, jnp.asarray([steering_excitation, speed_excitation]))
         keys = jax.random.split(jax.random.fold_in(key, index), count)
-        drive = partial(
-            _segment,
-            vehicle,
-            driver,
-            conditions,
-            steps,
-            speed,
-            jnp.asarray([steering_excitation, speed_excitation]),
-        )
         halves.append(jax.lax.map(drive, keys, batch_size=500))
     return jax.tree.map(lambda a, b: jnp.concatenate([a, b]), *halves)
+
+
+def generate_switching(
+    vehicle: Vehicle,
+    driver: Driver,
+    key: Key,
+    *,
+    segments: int,
+    steps: int = 50,
+    speed: tuple[float, float] = (7.0, 13.0),
+    steering_excitation: tuple[float, float] = (0.005, 0.1),
+    speed_excitation: tuple[float, float] = (0.1, 1.5),
+) -> Trajectory:
+    """The same driving under S3's switching, from a random moment of its schedule: never for training.
+
+    Args:
+        vehicle, driver, key, segments, steps, speed, steering_excitation, speed_excitation: as for `generate`.
+    """
+
+    def conditions(key: Key) -> Float[Array, "time 2"]:
+        road_key, moment_key = jax.random.split(key)
+        schedule = switching_road(road_key, steps=4 * steps, dt=vehicle.dt)
+        return jax.lax.dynamic_slice_in_dim(schedule, jax.random.randint(moment_key, (), 0, 3 * steps), steps)
+
+    drive = partial(_segment, vehicle, driver, conditions, steps, speed)
+    drive = partial(drive, jnp.asarray([steering_excitation, speed_excitation]))
+    return jax.lax.map(drive, jax.random.split(key, segments), batch_size=500)
 
 
 def _conditions(steps: int, dt: float, fixed: bool) -> list[Callable[[Key], Array]]:

@@ -48,6 +48,7 @@ def fit(
     clip_norm: float = 100.0,
     log_every: int = 50,
     save_every: int = 500,
+    inspect: Callable[[Params], dict[str, float]] | None = None,
 ) -> tuple[Params, int]:
     """Train, or continue what `directory` holds, and return the parameters with the best validation loss.
 
@@ -60,6 +61,7 @@ def fit(
         directory: gets checkpoints/, metrics.jsonl, tensorboard/.
         steps: optimiser steps. learning_rate, clip_norm: see `optimizer`.
         log_every: steps per compiled chunk and per log line. save_every: a multiple of it.
+        inspect: more to log at every checkpoint, finite numbers by name (what can be certified, for example).
 
     Returns:
         Best parameters, and the step they were reached at.
@@ -94,6 +96,7 @@ def fit(
                 if saves:
                     total, parts = validate(state.params, held_out)
                     record |= {"validation_loss": float(total), "validation_prediction": float(parts["prediction"])}
+                    record |= inspect(state.params) if inspect else {}
                 if not all(math.isfinite(value) for value in record.values()):
                     kept = checkpoints.latest_step()
                     raise TrainingStopped(f"non-finite loss near step {done}; the last good checkpoint is step {kept}")

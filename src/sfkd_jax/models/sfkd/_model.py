@@ -16,11 +16,13 @@ from sfkd_jax.types import (
     BODY,
     POSE,
     Control,
+    Declared,
     Environment,
     Explicit,
     Key,
     Model,
     Params,
+    Polytope,
     Pose,
     Scalar,
     Space,
@@ -159,12 +161,13 @@ def sfkd(
         shared = bounded_parts(params)
         scale = (pose_scale if segment else jnp.asarray(space.increment_scale))[:, None]
         return Explicit(
-            vertices=shared.vertices,
+            operators=Polytope(shared.vertices),
             residual=() if residual == "none" else shared.residual.matrices,
             residual_multipliers=shared.residual.multipliers,
             decoder=(*shared.decoder.matrices[:-1], scale * shared.decoder.matrices[-1]),
             decoder_multipliers=shared.decoder.multipliers,
             readout=jnp.asarray(space.body_scale)[:, None] * shared.readout,
+            declared=Declared("tanh", "rotation" if transport else "identity", control),
         )
 
     def hinge(fiber: SfkdFiber, latent: SfkdLatent, control: Control) -> Scalar:

@@ -1,0 +1,164 @@
+"""Attacks: they search for the largest contraction factor that a map really has, a lower bound for any certificate."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from scipy.optimize import minimize
+
+from sfkd_jax.certification._core import Matrix, Vector
+from sfkd_jax.certification._environments import Box
+from sfkd_jax.types import Environment, Key, Model, Params
+
+
+def attack_slopes(weights: Sequence[Matrix], linear: Matrix | None = None, *, starts: int = 24, seed: int = 0) -> float:
+    """Largest ||A + W_L D_{L-1} W_{L-1} … D_1 W_1||_2 found over slopes D_k in [0, 1].
+
+    The norm is convex in each D_k, so its maximum is at 0 or 1: with the top singular pair fixed, each layer's
+    slopes are chosen by the sign of their effect, in turn, until nothing grows.
+
+    Args:
+        weights: W_1 … W_L, or nothing. linear: A. starts: random beginnings, the first all ones. seed: of these.
+    """
+    random, best = np.random.default_rng(seed), 0.0
+    if not weights:
+        return float(np.linalg.norm(np.asarray(linear), 2))
+    base = np.zeros((weights[-1].shape[0], weights[0].shape[1])) if linear is None else np.asarray(linear)
+    for start in range(starts):
+        share = 1.0 if start == 0 else random.uniform(0.2, 1.0)
+        slopes = [(random.uniform(size=len(weight)) < share).astype(float) for weight in weights[:-1]]
+        value = 0.0
+        while True:
+            for k in range(len(slopes)):
+                slopes[k] = _best_layer(weights, slopes, base, k)
+            after = float(np.linalg.norm(base + _chain(weights, slopes), 2))
+            if after <= value * (1 + 1e-12):
+                break
+            value = after
+        best = max(best, value)
+    return best
+
+
+def attack_step(model: Model, params: Params, box: Box, key: Key, *, starts: int = 12, iterations: int = 120) -> float:
+    """Largest ||∂(T(e → e') F(z, u, e))/∂z||_2 of the model as it runs in float32, by ascent over z, u, e, e'.
+
+    F is `model.step` followed by `model.transport`. e and e' stay in the box; z and u are free, as the certificate
+    claims. The ascent follows |J v|²/|v|² over the direction v as well; the value returned is the full norm.
+
+    Args:
+        model: with `explicit`. params: its weights. box: lower and upper corner of E. key: for the beginnings.
+        starts: how many. iterations: of L-BFGS-B, each.
+    """
+    jacobian, sizes = _jacobian(model, params)
+    rank, controls, env = sizes
+    edges = np.cumsum([rank, controls, env, env])
+
+    def parts(flat: Any) -> Any:
+        return jnp.split(flat, edges)
+
+    @jax.jit
+    def objective(flat: Any) -> tuple[Any, Any]:
+        def gain(flat: Any) -> Any:
+            *inputs, direction = parts(flat)
+            moved = jacobian(*inputs) @ direction
+            return 0.5 * (jnp.log(jnp.sum(direction**2)) - jnp.log(jnp.sum(moved**2) + 1e-30))
+
+        return jax.value_and_grad(gain)(flat)
+
+    final = jax.jit(lambda flat: jacobian(*parts(flat)[:-1]))
+    low, high = (np.asarray(side, dtype=np.float64) for side in box)
+    free = [(None, None)]
+    limits = free * (rank + controls) + 2 * list(zip(low, high, strict=True)) + free * rank
+    best = 0.0
+    for number, start_key in enumerate(jax.random.split(key, starts)):
+        start = np.asarray(jax.random.normal(start_key, (int(edges[-1]) + rank,)), dtype=np.float64)
+        start[: edges[1]] *= 10.0 ** (number % 4 - 2)  # small latents see steep slopes, large ones saturated layers
+        start[edges[1] : edges[3]] = np.tile(low, 2) + (np.arctan(start[edges[1] : edges[3]]) / np.pi + 0.5) * np.tile(
+            high - low, 2
+        )
+        found = minimize(
+            _float64(objective), start, method="L-BFGS-B", jac=True, bounds=limits, options={"maxiter": iterations}
+        )
+        best = max(best, float(np.linalg.norm(np.asarray(final(jnp.asarray(found.x, jnp.float32)), np.float64), 2)))
+    return best
+
+
+def attack_transport(model: Model, params: Params, box: Box, key: Key, *, samples: int = 256) -> float:
+    """Largest ||∂T(e → e') z/∂z||_2 at random pairs of environments in the box; T is linear in z.
+
+    Args:
+        model, params: as in `attack_step`. box: of E. key: for the pairs. samples: how many.
+    """
+    inject, latent, rank = _coordinates(model, params)
+    low, high = (jnp.asarray(side, dtype=jnp.float32) for side in box)
+    draws = jax.random.uniform(key, (samples, 2, low.shape[0]), minval=low, maxval=high)
+
+    def matrix(pair: Any) -> Any:
+        before, after = (model.fiber(params, env) for env in pair)
+        return jax.jacobian(lambda z: model.vector(model.transport(before, after, inject(latent, z))))(jnp.zeros(rank))
+
+    found = np.asarray(jax.jit(lambda pairs: jax.lax.map(matrix, pairs, batch_size=32))(draws), dtype=np.float64)
+    return float(np.max(np.linalg.norm(found, 2, axis=(1, 2))))
+
+
+def _chain(weights: Sequence[Matrix], slopes: Sequence[Vector]) -> Matrix:
+    """W_L D_{L-1} … D_1 W_1."""
+    chained = np.asarray(weights[0])
+    for slope, weight in zip(slopes, weights[1:], strict=True):
+        chained = weight @ (slope[:, None] * chained)
+    return chained
+
+
+def _best_layer(weights: Sequence[Matrix], slopes: Sequence[Vector], base: Matrix, layer: int) -> Vector:
+    """The slopes of one layer that raise u'(A + …)v most, (u, v) the top singular pair now."""
+    left, _, right = np.linalg.svd(base + _chain(weights, slopes))
+    before = _chain(weights[: layer + 1], slopes[:layer]) @ right[0]
+    after = left[:, 0] @ _chain(
+        [np.eye(len(slopes[layer])), *weights[layer + 1 :]], [np.ones(len(slopes[layer])), *slopes[layer + 1 :]]
+    )
+    return (before * after > 0).astype(float)
+
+
+def _jacobian(model: Model, params: Params) -> tuple[Callable[..., Any], tuple[int, int, int]]:
+    """(z, u, e, e') -> ∂z⁺/∂z of step and transport, and the sizes of z, u and e."""
+    inject, latent, rank = _coordinates(model, params)
+    assert model.explicit is not None
+    controls = jax.eval_shape(model.explicit, params).declared.controls
+
+    def jacobian(z: Any, control: Any, env: Environment, env_next: Environment) -> Any:
+        fiber, fiber_next = model.fiber(params, env), model.fiber(params, env_next)
+
+        def advance(z: Any) -> Any:
+            return model.vector(model.transport(fiber, fiber_next, model.step(fiber, inject(latent, z), control)))
+
+        return jax.jacobian(advance)(z)
+
+    return jacobian, (rank, controls, 2)
+
+
+def _coordinates(model: Model, params: Params) -> tuple[Callable[[Any, Any], Any], Any, int]:
+    """How to place any z into a latent: `vector` picks z out, its transpose puts z back."""
+    assert model.explicit is not None
+    body = jax.eval_shape(model.explicit, params).readout.shape[0]
+    fiber = model.fiber(params, jnp.zeros(2))
+    latent = jax.tree.map(jnp.zeros_like, model.encode(fiber, jnp.zeros(3 + body)))
+    z, back = jax.vjp(model.vector, latent)
+
+    def inject(latent: Any, z: Any) -> Any:
+        return jax.tree.map(jnp.add, latent, back(z)[0])
+
+    return inject, latent, z.shape[0]
+
+
+def _float64(objective: Callable[[Any], tuple[Any, Any]]) -> Callable[[Vector], tuple[float, Vector]]:
+    """A jitted float32 objective as scipy calls it."""
+
+    def call(flat: Vector) -> tuple[float, Vector]:
+        value, gradient = objective(jnp.asarray(flat, jnp.float32))
+        return float(value), np.nan_to_num(np.asarray(gradient, dtype=np.float64))
+
+    return call

@@ -1,0 +1,52 @@
+"""What a certificate is about: the weights as a model serves them, or the reason why nothing can be said about them."""
+
+from __future__ import annotations
+
+import hashlib
+from typing import Any, TypeAlias
+
+import jax
+import numpy as np
+
+from sfkd_jax.types import Model, Params, Samples
+
+ACTIVATIONS = ("tanh", "relu", "sigmoid", "softplus", "elu")
+"""Those whose slopes lie in [0, 1] everywhere; gelu and silu leave it."""
+TRANSPORTS = ("identity", "rotation")
+Exported: TypeAlias = Any
+"""An `Explicit` whose leaves are float64 numpy arrays."""
+
+
+class CertificationRefused(Exception):
+    """No certificate; the message is the reason."""
+
+
+def exported(model: Model, params: Params) -> Exported:
+    """The explicit weights in float64, as the model serves them.
+
+    Raises:
+        CertificationRefused: none, not finite, sampled operators only, an unknown activation or transport.
+    """
+    if model.explicit is None:
+        raise CertificationRefused("this model exposes no explicit weights to certify")
+    weights = jax.tree.map(lambda leaf: np.asarray(leaf, dtype=np.float64), jax.jit(model.explicit)(params))
+    if not all(np.all(np.isfinite(leaf)) for leaf in jax.tree.leaves(weights)):
+        raise CertificationRefused("the weights are not finite")
+    if isinstance(weights.operators, Samples):
+        count = len(weights.operators.operators)
+        raise CertificationRefused(f"grid-only evidence: {count} sampled environments say nothing about those between")
+    if weights.declared.activation not in ACTIVATIONS:
+        raise CertificationRefused(f"slopes of the activation {weights.declared.activation!r} are not known in [0, 1]")
+    if weights.declared.transport not in TRANSPORTS:
+        raise CertificationRefused(f"the transport {weights.declared.transport!r} is not known to be nonexpansive")
+    return weights
+
+
+def fingerprint(params: Params) -> str:
+    """SHA-256 of all weights with their names, types and shapes."""
+    digest = hashlib.sha256()
+    for path, leaf in jax.tree_util.tree_flatten_with_path(params)[0]:
+        array = np.asarray(leaf)
+        digest.update(f"{jax.tree_util.keystr(path)} {array.dtype} {array.shape} ".encode())
+        digest.update(array.tobytes())
+    return digest.hexdigest()

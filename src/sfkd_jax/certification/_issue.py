@@ -1,0 +1,147 @@
+"""A certificate as the document that lies beside the weights: what is proved, and apart from it what is measured."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Mapping
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from threadpoolctl import threadpool_limits
+
+from sfkd_jax.certification._attack import attack_slopes
+from sfkd_jax.certification._calibration import KINDS, Disturbance, conformal_bounds, coverage, disturbances
+from sfkd_jax.certification._certificate import certify
+from sfkd_jax.certification._claims import joint_bound, residual_bound
+from sfkd_jax.certification._exported import CertificationRefused, exported
+from sfkd_jax.certification._tube import latent_tube, physical_tube
+from sfkd_jax.types import Model, Params, Polytope, Trajectory
+
+
+def issue(
+    model: Model,
+    params: Params,
+    *,
+    validation: Trajectory,
+    calibration: Trajectory,
+    held_out: Mapping[str, Trajectory],
+    boxes: Mapping[str, Any],
+    sensor_noise: tuple[float, ...] = (),
+    mode: str = "joint",
+    horizon: int = 20,
+    level: float = 0.95,
+    margin: float = 1e-4,
+    attack_starts: int = 6,
+    monitor_level: float = 0.99,
+) -> dict[str, Any]:
+    """A certificate with its tubes, as a document.
+
+    Args:
+        model, params: what is certified, with the weights as exported.
+        validation: fixes the units of the scores. calibration: sets d̄. Both by trajectory.
+        held_out: batches of trajectories by name, to count coverage on; "test" is exchangeable with `calibration`.
+        boxes: the domain of s, u and e that the measurements come from; outside it nothing is claimed.
+        sensor_noise: standard deviation per state, for the bounds of the run-time monitor; entries beyond the state
+            are not used.
+        mode, margin, attack_starts: of `certify`.
+        horizon: of the tubes. level: 1 − δ of the conformal bound.
+        monitor_level: the share of calibration trajectories without a false alarm.
+
+    Raises:
+        CertificationRefused: with the reason.
+    """
+    began = time.perf_counter()
+    certificate = certify(model, params, boxes["env"], mode=mode, margin=margin, attack_starts=attack_starts)
+    try:
+        found = _measure(model, params, validation, calibration, held_out, level)
+        alarms = _alarms(model, params, (validation, calibration), sensor_noise, monitor_level)
+    except ValueError as reason:
+        raise CertificationRefused(str(reason)) from None
+    one_step = found["one_step"]
+    latent = latent_tube(certificate.alpha, one_step["latent"], horizon)
+    positions = np.asarray(calibration.states)[..., :2]
+    tube = physical_tube(
+        latent,
+        alpha=certificate.alpha,
+        lipschitz=certificate.lipschitz,
+        residual=one_step,
+        largest_increment=float(np.max(np.linalg.norm(np.diff(positions, axis=-2), axis=-1))),
+    )
+    measured = {
+        "decoder_lipschitz": certificate.lipschitz["decoder"],
+        "d_bar": {"value": one_step["latent"], **found},
+        "tube": {"latent": latent.tolist(), "physical": tube, "ultimate": one_step["latent"] / (1 - certificate.alpha)},
+        "boxes": dict(boxes),
+        "monitor": alarms,
+        "seconds_proof": certificate.seconds,
+        "seconds": time.perf_counter() - began,
+    }
+    return {"valid": True} | certificate.document() | measured
+
+
+def progress(model: Model, params: Params) -> dict[str, float]:
+    """α, joint and separate, and α over the largest factor found by flipping slopes; {} where nothing is provable.
+
+    For the log of a training run: quick, and no certificate.
+    """
+    try:
+        weights = exported(model, params)
+    except CertificationRefused:
+        return {}
+    if not isinstance(weights.operators, Polytope):
+        return {}
+    with threadpool_limits(1, "blas"):
+        rho = max(float(np.linalg.norm(vertex, 2)) for vertex in weights.operators.vertices)
+        separate = rho + residual_bound(weights)
+        joint = joint_bound(weights, iterations=15)
+        slopes = max(attack_slopes(weights.residual, vertex, starts=4) for vertex in weights.operators.vertices)
+    found = {"alpha": min(joint, separate), "alpha_separate": separate, "tightness": min(joint, separate) / slopes}
+    return {name: value for name, value in found.items() if np.isfinite(value)}
+
+
+def _measure(
+    model: Model,
+    params: Params,
+    validation: Trajectory,
+    calibration: Trajectory,
+    held_out: Mapping[str, Trajectory],
+    level: float,
+) -> dict[str, Any]:
+    """One-step bounds at `level` for whole trajectories, and how often they hold where nobody looked before."""
+    units, scores = (disturbances(model, params, part) for part in (validation, calibration))
+    bounds = conformal_bounds(units, scores, level=level)
+    shares = {name: _coverage(bounds, disturbances(model, params, part)) for name, part in held_out.items()}
+    return {
+        "level": level,
+        "trajectories": len(scores.scores),
+        **shares["test"],
+        "by_scenario": {name: share for name, share in shares.items() if name != "test"},
+        "one_step": dict(zip(KINDS, bounds.tolist(), strict=True)),
+        "validation": float(np.quantile(units.scores[:, 0], level)),
+    }
+
+
+def _coverage(bounds: Any, found: Disturbance) -> dict[str, Any]:
+    """Share of trajectories inside all bounds, with its interval."""
+    share, interval = coverage(bounds, found)
+    return {"coverage": share, "coverage_ci95": list(interval), "coverage_trajectories": len(found.scores)}
+
+
+def _alarms(
+    model: Model,
+    params: Params,
+    splits: tuple[Trajectory, Trajectory],
+    sensor_noise: tuple[float, ...],
+    level: float,
+) -> dict[str, Any]:
+    """One-step bounds as a monitor needs them: both states of a pair are seen through the sensors."""
+    size = splits[0].states.shape[-1]
+    spread = jnp.zeros(size).at[: min(size, len(sensor_noise))].set(jnp.asarray(sensor_noise[:size]))
+    noisy = [
+        part._replace(states=part.states + spread * jax.random.normal(key, part.states.shape))
+        for key, part in zip(jax.random.split(jax.random.key(0)), splits, strict=True)
+    ]
+    bounds = conformal_bounds(*(disturbances(model, params, part) for part in noisy), level=level)
+    return {"bounds": bounds.tolist(), "level": level, "sensor_noise": list(sensor_noise)}

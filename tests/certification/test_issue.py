@@ -1,0 +1,87 @@
+"""The document beside the weights: what it states, proved and measured, and that a refusal says why."""
+
+import numpy as np
+import pytest
+from helpers import SHARES, VARIANTS, certified, dataset, model_and_params
+
+from sfkd_jax.certification import CertificationRefused, issue
+
+BOXES = {"state": [[4.0], [16.0]], "control": [[-0.5, -6.0], [0.5, 3.0]], "env": [[0.3, -8.0], [0.9, 8.0]]}
+
+
+@pytest.fixture(scope="module")
+def certificate():
+    return made("sfkd")
+
+
+FAST = {"level": 0.9, "horizon": 10, "monitor_level": 0.9, "attack_starts": 0}
+
+
+def made(name, **settings):
+    model, params = model_and_params(name)
+    data = dataset()
+    splits = {
+        "validation": data.validation,
+        "calibration": data.calibration,
+        "held_out": {"test": data.test, "s1": data.test},
+    }
+    return issue(model, params, **splits, boxes=BOXES, **FAST | settings)
+
+
+def test_a_certificate_has_the_documented_keys(certificate):
+    assert set(certificate) >= {
+        *("valid", "mode", "scope", "alpha", "alpha_separate", "rho", "beta", "kappa", "decoder_lipschitz"),
+        *("transport_lipschitz", "d_bar", "tube", "boxes", "attack", "tightness", "seconds"),
+    }
+    assert set(certificate["d_bar"]) >= {"value", "level", "trajectories", "coverage", "coverage_ci95"}
+    assert set(certificate["tube"]) >= {"latent", "physical", "ultimate"}
+    assert set(certificate["boxes"]) == {"state", "control", "env"}
+    assert certificate["valid"] is True
+
+
+def test_a_certificate_states_what_was_proved_and_measured(certificate):
+    proved = certified("sfkd")
+    for name in ("alpha", "alpha_joint", "rho", "beta", "params_sha256"):
+        assert certificate[name] == getattr(proved, name)
+    assert certificate["decoder_lipschitz"] == proved.lipschitz["decoder"]
+    assert certificate["d_bar"]["trajectories"] == round(SHARES[2] * 120)
+    assert certificate["d_bar"]["level"] == 0.9
+    low, high = certificate["d_bar"]["coverage_ci95"]
+    assert 0.0 <= low <= certificate["d_bar"]["coverage"] <= high <= 1.0
+
+
+def test_the_tubes_of_a_certificate_grow_to_the_ultimate_bound(certificate):
+    tube, d_bar = certificate["tube"], certificate["d_bar"]["value"]
+    assert d_bar > 0
+    assert len(tube["latent"]) == 10
+    np.testing.assert_allclose(tube["latent"][0], d_bar)
+    np.testing.assert_allclose(tube["ultimate"], d_bar / (1 - certificate["alpha"]))
+    assert tube["latent"][-1] < tube["ultimate"]
+    for radii in (tube["latent"], *tube["physical"].values()):
+        assert len(radii) == 10
+        assert np.all(np.diff(radii) > 0)
+        assert np.all(np.isfinite(radii))
+
+
+def test_a_higher_level_gives_a_wider_tube(certificate):
+    wider = made("sfkd", level=0.96)
+    assert wider["d_bar"]["value"] > certificate["d_bar"]["value"]
+    assert wider["d_bar"]["coverage"] >= certificate["d_bar"]["coverage"]
+    assert wider["alpha"] == certificate["alpha"]  # proved, not measured
+
+
+def test_too_few_calibration_trajectories_are_refused():
+    with pytest.raises(CertificationRefused, match=r"24 calibration trajectories are too few for level 0\.99"):
+        made("sfkd", level=0.99)
+
+
+def test_a_rate_within_the_margin_of_one_is_refused():
+    with pytest.raises(CertificationRefused, match=r"is not below 1 by the margin 0\.2"):
+        made("sfkd", margin=0.2)
+
+
+@pytest.mark.parametrize("name", ["no_contraction", "soft", "oracle"])
+def test_what_cannot_be_proved_is_not_certified_however_well_it_predicts(name):
+    assert name in (*VARIANTS, "oracle")
+    with pytest.raises(CertificationRefused):
+        made(name)

@@ -1,0 +1,235 @@
+"""The whole step as one map: exact cases, the hull of vertices, the semidefinite optimum, and mutants of the check."""
+
+import numpy as np
+import pytest
+from helpers import certified, explicit, steepest_pattern
+
+from sfkd_jax.certification import (
+    attack_slopes,
+    check_metric,
+    check_witness,
+    lipschitz_upper,
+    norm_upper,
+    propose_multipliers,
+    solve_metric,
+    solve_multipliers,
+)
+from sfkd_jax.certification._core import witness_matrix
+
+SIZE = 6
+RANDOM = np.random.default_rng(0)
+
+
+def rotation(seed, size=SIZE):
+    return np.linalg.qr(np.random.default_rng(seed).standard_normal((size, size)))[0]
+
+
+def random_network(seed, shapes=((8, 6), (7, 8), (6, 7))):
+    random = np.random.default_rng(seed)
+    return [random.standard_normal(shape) / shape[1] ** 0.5 for shape in shapes]
+
+
+def positive(seed, shapes=((8, 6), (7, 8), (6, 7))):
+    random = np.random.default_rng(seed)
+    return [random.uniform(0.05, 0.5, shape) for shape in shapes], random.uniform(0.05, 0.5, (6, 6))
+
+
+def best(weights, linear=None):
+    return lipschitz_upper(weights, propose_multipliers(weights, (), linear), linear)
+
+
+def aligned(share):
+    """A and the residual stretch the same direction: no joint certificate can be better than the sum of norms."""
+    turn = rotation(3)
+    return [share * turn, rotation(4), rotation(4).T], 0.8 * turn, 0.8 + share
+
+
+JOINT = {
+    "positive": (*positive(0), None),
+    "positive 2": (*positive(1), None),
+    "aligned": aligned(0.15),
+    "aligned, A = I": ([0.3 * np.eye(SIZE), np.eye(SIZE)], 0.6 * np.eye(SIZE), 0.9),
+    "cancelling": ([0.3 * np.eye(SIZE), -np.eye(SIZE)], 0.9 * np.eye(SIZE), 0.9),
+    "diagonal": ([np.diag(np.linspace(0.1, 0.6, SIZE)), np.eye(SIZE)], np.diag(np.linspace(0.9, 0.2, SIZE)), 1.0),
+}
+"""W, A, and the exact constant where it is known by heart (else that of all slopes at 1: positive matrices)."""
+
+
+def exact(weights, linear, known):
+    slopes = [np.ones(len(w)) for w in weights[:-1]]
+    chained = weights[0]
+    for slope, weight in zip(slopes, weights[1:], strict=True):
+        chained = weight @ (slope[:, None] * chained)
+    return known if known is not None else np.linalg.norm(linear + chained, 2)
+
+
+@pytest.mark.parametrize("name", JOINT)
+def test_the_joint_bound_of_a_map_with_a_known_constant_is_tight_from_above(name):
+    weights, linear, known = JOINT[name]
+    constant = exact(weights, linear, known)
+    assert constant * (1 - 1e-12) <= best(weights, linear) <= constant * 1.01
+
+
+@pytest.mark.parametrize("name", JOINT)
+def test_the_slope_attack_reaches_the_known_constant_and_no_more(name):
+    weights, linear, known = JOINT[name]
+    assert attack_slopes(weights, linear) == pytest.approx(exact(weights, linear, known), rel=1e-9)
+
+
+@pytest.mark.parametrize("seed", range(6))
+def test_the_joint_bound_lies_between_the_attack_and_the_sum_of_norms(seed):
+    weights, linear = random_network(seed), 0.9 * rotation(seed)
+    joint = best(weights, linear)
+    attack = attack_slopes(weights, linear)
+    assert attack <= joint <= 0.9 + best(weights) + 1e-6
+    assert joint <= 1.15 * attack
+
+
+def test_generic_maps_have_a_joint_bound_well_below_the_sum_of_norms():
+    gains = []
+    for seed in range(5):
+        weights, linear = random_network(seed), random_network(seed + 9)[0][:6] / 2
+        gains.append(best(weights, linear) / (norm_upper(linear) + best(weights)))
+    assert np.median(gains) < 0.95
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_proposals_from_gradients_match_the_semidefinite_optimum(seed):
+    weights = random_network(seed, ((5, 4), (5, 5), (4, 5)))
+    linear = None if seed % 2 else 0.7 * rotation(seed, 4)
+    optimum = lipschitz_upper(weights, solve_multipliers(weights, linear), linear)
+    assert optimum * (1 - 1e-4) <= best(weights, linear) <= optimum * (1 + 2e-3)
+
+
+def test_witnesses_at_the_vertices_prove_the_bound_everywhere_in_their_hull():
+    weights = random_network(1)
+    vertices = [0.8 * rotation(seed) for seed in range(4)]
+    found = [propose_multipliers(weights, (), vertex) for vertex in vertices]
+    bound = max(lipschitz_upper(weights, part, vertex) for part, vertex in zip(found, vertices, strict=True))
+    for _ in range(50):
+        shares = RANDOM.dirichlet(np.full(4, 0.5))
+        inside = sum(share * vertex for share, vertex in zip(shares, vertices, strict=True))
+        mixed = [sum(share * part[k] for share, part in zip(shares, found, strict=True)) for k in range(2)]
+        assert attack_slopes(weights, inside, starts=3) <= bound
+        assert lipschitz_upper(weights, mixed, inside) <= bound * (1 + 1e-3)
+
+
+@pytest.mark.parametrize("name", ["sfkd", "no_fiber", "segment"])
+def test_slopes_anywhere_in_the_hull_of_a_model_stay_below_its_joint_alpha(name):
+    weights, proved = explicit(name), certified(name)
+    for vertex in weights.operators.vertices:
+        assert attack_slopes(weights.residual, vertex) <= proved.alpha_joint
+    assert attack_slopes(weights.residual, weights.operators.vertices.mean(axis=0)) <= proved.alpha_joint
+    assert proved.alpha_joint <= proved.alpha_separate * (1 + 1e-6)
+
+
+# --- solvers that lie ------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    "garbage",
+    [
+        lambda parts: [np.full_like(part, np.nan) for part in parts],
+        lambda parts: [0.01 * part for part in parts],
+        lambda parts: [-part for part in parts],
+        lambda parts: parts[:1],
+        lambda parts: [],
+        lambda parts: [part * np.exp(RANDOM.normal(0, 0.3, len(part))) for part in parts],
+    ],
+)
+def test_what_a_solver_returns_never_makes_a_bound_smaller(garbage):
+    """Whatever it calls its status: the bound is recomputed from the multipliers, or there is none."""
+    weights, linear, known = JOINT["aligned"]
+    constant = exact(weights, linear, known)
+    proposed = garbage(propose_multipliers(weights, (), linear))
+    assert lipschitz_upper(weights, proposed, linear) >= constant * (1 - 1e-12)
+
+
+# --- common Lyapunov matrices ----------------------------------------------------------------------------------------
+
+
+def skewed(seed=0, rate=0.8, condition=20.0):
+    """Operators that contract at `rate` in the norm of a P of this condition, but not in the 2-norm."""
+    root = rotation(seed) @ np.diag(np.sqrt(np.geomspace(1.0, condition, SIZE))) @ rotation(seed + 1)
+    operators = [np.linalg.solve(root, rate * rotation(k) @ root) for k in range(2, 6)]
+    return operators, root.T @ root
+
+
+def test_a_common_lyapunov_matrix_is_accepted_at_its_rate_and_condition_and_not_below():
+    operators, metric = skewed()
+    assert max(np.linalg.norm(a, 2) for a in operators) > 1
+    condition = np.linalg.cond(metric)
+    assert check_metric(metric, operators, 0.8 * (1 + 1e-6), condition * (1 + 1e-6))
+    assert not check_metric(metric, operators, 0.8 * (1 - 1e-6), condition * (1 + 1e-6))
+    assert not check_metric(metric, operators, 0.8 * (1 + 1e-6), condition * (1 - 1e-6))
+    for spoiled in (-metric, np.zeros_like(metric), np.full_like(metric, np.nan), metric + 1e-12 * np.eye(6, k=1)):
+        assert not check_metric(spoiled, operators, 0.9, 1e6)
+
+
+@pytest.mark.parametrize("scale", [1e-3, 1.0, 1e6])
+def test_scaling_a_lyapunov_matrix_changes_nothing(scale):
+    operators, metric = skewed()
+    condition = np.linalg.cond(metric) * (1 + 1e-6)
+    assert check_metric(scale * metric, operators, 0.8 * (1 + 1e-6), condition)
+    assert not check_metric(scale * metric, operators, 0.8 * (1 - 1e-6), condition)
+
+
+def test_the_solver_finds_a_lyapunov_matrix_that_the_core_accepts():
+    operators, metric = skewed(condition=5.0)
+    found = solve_metric(operators, 0.85)
+    assert check_metric(found, operators, 0.85 * (1 + 1e-6), np.linalg.cond(metric) * 1.01)
+
+
+def test_two_operators_that_are_stable_one_by_one_have_no_common_lyapunov_matrix():
+    switched = [np.asarray([[0.0, 2.0], [0.0, 0.0]]), np.asarray([[0.0, 0.0], [2.0, 0.0]])]
+    found = solve_metric(switched, 0.99)
+    assert found is None or not check_metric(found, switched, 1.0, 1e9)
+
+
+# --- mutants of the joint check --------------------------------------------------------------------------------------
+
+
+def check_with(matrix_of, weights, multipliers, bound, linear):
+    matrix = matrix_of(weights, multipliers, linear)
+    inputs = linear.shape[1]
+    matrix[:inputs, :inputs] += bound**2 * np.eye(inputs)
+    return np.all(np.isfinite(matrix)) and np.linalg.eigvalsh(0.5 * (matrix + matrix.T))[0] > 0
+
+
+def without_coupling(weights, multipliers, linear):
+    """Forgets that A z and W_L h add up: −A'A and −W_L'W_L without −A'W_L."""
+    matrix, _ = witness_matrix(weights, multipliers, None)
+    matrix[: linear.shape[1], : linear.shape[1]] -= linear.T @ linear
+    return matrix
+
+
+def without_linear(weights, multipliers, linear):
+    return witness_matrix(weights, multipliers, None)[0]
+
+
+def wrong_vertex(weights, multipliers, linear):
+    """Certifies the mean of the hull and calls it the hull."""
+    return witness_matrix(weights, multipliers, 0.5 * linear)[0]
+
+
+MUTANTS = {"without coupling": without_coupling, "without A": without_linear, "half of A": wrong_vertex}
+
+
+@pytest.mark.parametrize("mutant", MUTANTS)
+def test_mutants_of_the_joint_check_accept_a_bound_that_is_false(mutant):
+    """So the exact cases above would catch them: each accepts less than the known constant of some map."""
+    fooled = []
+    for weights, linear, known in JOINT.values():
+        false, found = 0.98 * exact(weights, linear, known), propose_multipliers(weights, (), linear)
+        for scale in np.geomspace(0.01, 100, 60):
+            proposed = [scale * part for part in found]
+            assert not check_witness(weights, proposed, false, linear)
+            fooled.append(check_with(MUTANTS[mutant], weights, proposed, false, linear))
+    assert any(fooled)
+
+
+def test_steep_nets_of_the_tests_are_steep_for_two_attackers():
+    """The alternating attack and the flipping one agree where both are used."""
+    for seed in range(3):
+        weights = random_network(seed)
+        assert attack_slopes(weights) >= 0.98 * steepest_pattern(weights)
