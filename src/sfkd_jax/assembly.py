@@ -19,11 +19,12 @@ SAMPLINGS = ("feedback", "plain")
 
 
 class System(NamedTuple):
-    """A row of a table: a model with its parameters, and what it is told about the environment."""
+    """A row of a table: a model with its parameters, what it is told about the environment, and its certificate."""
 
     model: Model
     params: Any
     env: str
+    certificate: dict[str, Any] | None = None
 
 
 def choose(table: Mapping[str, Any], name: str, what: str) -> Any:
@@ -66,9 +67,15 @@ def space_from_settings(settings: Settings) -> Space:
 
 
 def build_controller(
-    settings: Settings, model: Model, plant: vehicle.Vehicle, *, env_low: Any = None, env_high: Any = None
+    settings: Settings,
+    model: Model,
+    plant: vehicle.Vehicle,
+    *,
+    env_low: Any = None,
+    env_high: Any = None,
+    certificate: Settings | None = None,
 ) -> Controller:
-    """MPPI around the path-following law, or around nothing (`sampling: plain`)."""
+    """MPPI around the path-following law, or around nothing (`sampling: plain`); watched if there is a certificate."""
     if settings["sampling"] not in SAMPLINGS:
         raise ValueError(f"unknown controller.sampling; choose one of {', '.join(SAMPLINGS)}")
     loop = plant.speed_loop
@@ -76,7 +83,7 @@ def build_controller(
     if settings["sampling"] == "feedback":
         law = control.path_feedback(wheelbase=plant.wheelbase, speed_loop=loop, **without(settings["feedback"]))
     cost = control.tracking_cost(dt=plant.dt, speed_loop=loop, **without(settings["cost"]))
-    return control.mppi(
+    planner = control.mppi(
         model,
         cost,
         law,
@@ -86,6 +93,12 @@ def build_controller(
         env_high=None if env_high is None else tuple(map(float, env_high)),
         **without(settings["mppi"]),
     )
+    if certificate is None:
+        return planner
+    corners = {name: certificate["boxes"][name] for name in ("state", "control", "env")}
+    boxes = {f"{name}_{side}": tuple(box[k]) for name, box in corners.items() for k, side in enumerate(("low", "high"))}
+    bounds = tuple(certificate["monitor"]["bounds"])
+    return control.monitored(planner, model, bounds=bounds, **boxes, **without(settings["monitor"]))
 
 
 def build_scenario(settings: Settings, plant: vehicle.Vehicle, *, duration: float) -> scenarios.Family:

@@ -56,11 +56,10 @@ def load(path: str | Path) -> Policy:
     plant = assembly.build_vehicle(settings["vehicle"])
     model = assembly.build_model(settings["model"], assembly.space_from_settings(settings["space"]))
     box = settings["dataset"]
-    controller = assembly.build_controller(
-        settings["controller"], model, plant, env_low=box["env_low"], env_high=box["env_high"]
-    )
-    params = jax.tree.map(jnp.asarray, artefacts.unflatten(arrays))
     certificate = _certificate(file.with_name("certificate.json"), manifest["sha256"])
+    limits = {"env_low": box["env_low"], "env_high": box["env_high"], "certificate": certificate}
+    controller = assembly.build_controller(settings["controller"], model, plant, **limits)
+    params = jax.tree.map(jnp.asarray, artefacts.unflatten(arrays))
     return Policy(model, params, controller, certificate, settings)
 
 

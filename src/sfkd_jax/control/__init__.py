@@ -3,6 +3,8 @@
 from sfkd_jax.control._costs import Stage as Stage
 from sfkd_jax.control._costs import StageCost as StageCost
 from sfkd_jax.control._costs import tracking_cost as tracking_cost
+from sfkd_jax.control._monitor import MonitorState as MonitorState
+from sfkd_jax.control._monitor import monitored as monitored
 from sfkd_jax.control._mppi import PlannerState as PlannerState
 from sfkd_jax.control._mppi import mppi as mppi
 from sfkd_jax.control._noise import correlated_noise as correlated_noise
