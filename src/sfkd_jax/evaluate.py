@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import time
+from collections.abc import Callable
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -11,8 +12,12 @@ import jax
 import numpy as np
 
 from sfkd_jax import artefacts, assembly, evaluation, shelf, walk
+from sfkd_jax.certification import conformal_tube, latent_tube
 from sfkd_jax.config import door
-from sfkd_jax.types import Controller
+from sfkd_jax.datasets import Dataset
+from sfkd_jax.scenarios import Scenario
+from sfkd_jax.types import Controller, Trajectory
+from sfkd_jax.vehicle import Vehicle
 
 KIND = "episodes"
 
@@ -29,25 +34,88 @@ def run(settings: dict[str, Any]) -> dict[str, Any]:
     keys = jax.random.split(drive_key, protocol["episodes"])
     scenario, rows, scores = settings["scenario"]["name"], {}, {}
     arrays = {f"{scenario}/envs": roads.envs, f"{scenario}/path": roads.path.points, "dt": np.asarray(plant.dt)}
+    dataset, _ = walk.ensure_dataset(settings)
+    horizon = settings["certification"]["horizon"]
     for name, system in systems.items():
         box = settings["dataset"]
-        controller = assembly.build_controller(
-            settings["controller"], system.model, plant, env_low=box["env_low"], env_high=box["env_high"]
-        )
+        limits = {"env_low": box["env_low"], "env_high": box["env_high"], "certificate": system.certificate}
+        controller = assembly.build_controller(settings["controller"], system.model, plant, **limits)
         shelf.say(f"driving {protocol['episodes']} episodes of {protocol['episode_s']:.0f} s: {name} on {scenario}")
         options = {"horizon": settings["controller"]["mppi"]["horizon"], "dt": plant.dt}
         options["observation_noise"] = tuple(protocol["observation_noise"])
-        drive = partial(evaluation.simulate, plant.step, controller, system.params, **options)
-        episodes = jax.jit(jax.vmap(drive))(roads, keys)
-        scores[name] = evaluation.score(episodes, np.asarray(roads.envs), dt=plant.dt)
+        drive = _driver(plant, controller, system.params, roads, keys, options)
+        assess = _assessor(system, dataset, _claims(settings, system, dataset), roads, plant.dt, horizon)
+        episodes = drive(0.0)
+        scores[name], violation = assess(episodes)
         about = _about(settings, name, system)
         timing = _act_ms(controller, system.params, roads, keys[0], options, protocol["timed_steps"])
-        rows[name] = evaluation.row(scores[name], about, timing)
+        rows[name] = evaluation.row(scores[name], about, timing, violation, watched=system.certificate is not None)
         for part in ("lateral", "states", "controls"):
             arrays[f"{name}/{scenario}/{part}"] = getattr(episodes, part)
         shelf.say(f"  rmse {rows[name]['rmse_m']['mean']:.4f} m, worst {rows[name]['max_deviation_m']:.3f} m")
+        if protocol["side_forces"]:
+            shelf.say(f"  again under side forces of {', '.join(f'{force:g}' for force in protocol['side_forces'])} N")
+            rows[name]["disturbed"] = [
+                evaluation.disturbed(force, *assess(drive(force) if force else episodes))
+                for force in protocol["side_forces"]
+            ]
     _write(place, settings, evaluation.compare(rows, scores), arrays, time.perf_counter() - began)
     return {"results": str(place / "results.json"), "rows": len(rows)}
+
+
+def _driver(
+    plant: Vehicle, controller: Controller, params: Any, roads: Scenario, keys: Any, options: dict[str, Any]
+) -> Callable[[float], evaluation.Episode]:
+    """largest side force [N] -> all episodes of one system; without a force the plant meets what is measured."""
+
+    def one(road: Scenario, key: Any, met: Any) -> evaluation.Episode:
+        return evaluation.simulate(plant.step, controller, params, road, key, met=met, **options)
+
+    compiled = jax.jit(jax.vmap(one))
+
+    def drive(force: float) -> evaluation.Episode:
+        push = jax.jit(jax.vmap(partial(evaluation.pushed, plant, largest=force)))
+        return compiled(roads, keys, push(roads.envs, keys) if force else None)
+
+    return drive
+
+
+def _assessor(
+    system: assembly.System, dataset: Dataset, claims: evaluation.Claims, roads: Scenario, dt: float, horizon: int
+) -> Callable[[evaluation.Episode], tuple[evaluation.Scores, dict[str, Any]]]:
+    """episodes -> how they were driven, and how often predictions along them left what is claimed."""
+    length = dataset.calibration.controls.shape[1]
+    predict = jax.jit(partial(evaluation.predictions, system.model, length=length, horizon=horizon))
+
+    def assess(episodes: evaluation.Episode) -> tuple[evaluation.Scores, dict[str, Any]]:
+        driven = Trajectory(episodes.states, episodes.controls, roads.envs)
+        long_enough = driven.controls.shape[1] >= length
+        found = jax.device_get(predict(system.params, driven)) if long_enough else None
+        scores = evaluation.score(episodes, np.asarray(roads.envs), dt=dt)
+        return scores, evaluation.violations(found, claims)
+
+    return assess
+
+
+def _claims(settings: dict[str, Any], system: assembly.System, dataset: Dataset) -> evaluation.Claims:
+    """What is claimed about a system's predictions: by its certificate if it has one, and by calibration drives."""
+    level, horizon = (settings["certification"][name] for name in ("level", "horizon"))
+    claims = evaluation.Claims(level=level, threshold=settings["evaluation"]["threshold_m"])
+    try:
+        parts = {"validation": dataset.validation, "calibration": dataset.calibration}
+        options = {"level": level, "horizon": horizon, "stride": evaluation.STRIDE}
+        claims = claims._replace(conformal=conformal_tube(system.model, system.params, **parts, **options))
+    except ValueError as reason:
+        shelf.say(f"  no conformal tube: {reason}")
+    proof = system.certificate
+    if proof is None:
+        return claims
+    if (len(proof["tube"]["latent"]), proof["d_bar"]["level"]) != (horizon, level):
+        shelf.say("  the certificate is of another horizon or level and is not compared")
+        return claims
+    d_bar = proof["d_bar"]["value"]
+    latent = latent_tube(proof["alpha"], d_bar, horizon)
+    return claims._replace(certified=proof["tube"]["physical"], latent=latent, d_bar=d_bar)
 
 
 def _systems(settings: dict[str, Any], plant: Any) -> dict[str, assembly.System]:
@@ -57,7 +125,8 @@ def _systems(settings: dict[str, Any], plant: Any) -> dict[str, assembly.System]
         if name == "self":
             trained = walk.ensure_policy(settings)
             told = "measured" if trained.settings["model"].get("environment", True) else "none"
-            found[trained.settings["model"]["system"]] = assembly.System(trained.model, trained.params, told)
+            own = assembly.System(trained.model, trained.params, told, trained.certificate)
+            found[trained.settings["model"]["system"]] = own
         else:
             found[name] = assembly.choose(references | {"self": None}, name, "evaluation.systems entry")
     return found

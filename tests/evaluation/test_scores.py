@@ -215,7 +215,7 @@ def scored(level, count=4):
 
 
 def test_a_row_holds_every_measure_and_null_for_what_does_not_apply():
-    made = row(scored(0.1), about("sfkd"), (1.5, 2.5))
+    made = row(scored(0.1), about("sfkd"), (1.5, 2.5), {"v0": 0.0})
     keys = {
         "rmse_m",
         "max_deviation_m",
@@ -229,16 +229,16 @@ def test_a_row_holds_every_measure_and_null_for_what_does_not_apply():
     np.testing.assert_allclose(made["rmse_m"]["mean"], 0.115)
     np.testing.assert_allclose(made["max_deviation_m"], 0.13)
     assert made["rmse_after_switch_m"] is None
-    assert made["violation"] == {"v0": None, "v1": None, "v1_radius_m": None, "v2": None}
+    assert made["violation"] == {"v0": 0.0}
     assert made["departures"] == 0
     assert made["act_ms"] == {"p50": 1.5, "p99": 2.5}
-    assert row(scored(2.0), about("sfkd"), None)["act_ms"] is None
-    assert row(scored(2.0), about("sfkd"), None)["departures"] == 4
+    assert row(scored(2.0), about("sfkd"), None, {})["act_ms"] is None
+    assert row(scored(2.0), about("sfkd"), None, {})["departures"] == 4
 
 
 def test_comparisons_are_ratios_to_the_oracle_and_paired_differences_to_ours():
     scores = {"oracle": scored(0.1), "sfkd": scored(0.2), "nominal": scored(0.5)}
-    rows = {name: row(value, about(name), None) for name, value in scores.items()}
+    rows = {name: row(value, about(name), None, {}) for name, value in scores.items()}
     compared = {entry["system"]: entry for entry in compare(rows, scores)}
     np.testing.assert_allclose([compared[name]["ratio_to_oracle"] for name in scores], [1.0, 2.0, 5.0])
     assert compared["sfkd"]["difference_to_sfkd"] is None
@@ -248,7 +248,7 @@ def test_comparisons_are_ratios_to_the_oracle_and_paired_differences_to_ours():
 
 def test_without_oracle_or_ours_nothing_is_compared():
     scores = {"nominal": scored(0.5)}
-    (only,) = compare({"nominal": row(scores["nominal"], about("nominal"), None)}, scores)
+    (only,) = compare({"nominal": row(scores["nominal"], about("nominal"), None, {})}, scores)
     assert only["ratio_to_oracle"] is None
     assert only["difference_to_sfkd"] is None
 

@@ -13,6 +13,7 @@ from PIL import Image
 
 from sfkd_jax.reporting import write_report
 from sfkd_jax.reporting._numbers import upper
+from sfkd_jax.reporting._violations import violations
 
 STEPS, DT, EPISODES, SPEED = 600, 0.1, 4, 10.0
 LEVELS = ((0.9, 0.0), (0.6, 4.0), (0.3, 8.0), (0.6, -4.0))
@@ -389,6 +390,71 @@ def test_feedback_and_plain_sampling_are_not_mixed(tmp_path):
     page = text_of(report_of(write_run(tmp_path, episodes=None, results={"rows": rows}))[0])
     assert "plain sampling" in page
     assert "to a lateral RMSE of 0.034 m" in page
+
+
+def violated(row, certified, radius, shares):
+    """The row as it is after drives under side forces: share of V1 (conformal) by force."""
+    kind = "certified" if certified else "conformal"
+    violation = {
+        "v0": 0.0 if certified else None, "v1": 0.021 if certified else shares[0], "v1_tube": kind,
+        "v1_radius_m": 14.2 * radius if certified else radius, "v1_conformal": shares[0],
+        "v1_conformal_radius_m": radius, "v1_level": 0.95, "v2": 0.003, "v2_threshold_m": 6.83, "segments": 96,
+    }  # fmt: skip
+    runs = [
+        {"force_n": force, "rmse_m": {"mean": 0.1}, "v0": violation["v0"], "v1": 0.5 * share, "v1_conformal": share,
+         "v2": 0.1 * share, "departures": 0}
+        for force, share in zip((0.0, 250.0, 500.0, 1000.0), shares, strict=True)
+    ]  # fmt: skip
+    return row | {"violation": violation, "disturbed": runs}
+
+
+def pushed_rows():
+    rows = {row["system"]: row for row in documents()["results.json"]["rows"] if row["scenario"] == "s3"}
+    return [
+        violated(rows["sfkd"], True, 0.137, (0.0625, 0.4, 0.98, 1.0)),
+        violated(rows["nominal"], False, 7.91, (0.0, 0.0, 0.01, 0.02)),
+        violated(rows["oracle"], False, 0.001, (0.0, 1.0, 1.0, 1.0)),
+    ]
+
+
+def test_violations_under_side_forces_are_drawn_and_written(tmp_path):
+    page, made = report_of(write_run(tmp_path, results={"rows": pushed_rows()}))
+    text = text_of(page)
+    assert "figure2.png" in {Path(figure).name for figure in made["figures"]}
+    for words in ("Violations: Scenario S3", "certified tube", "conformal tube", "6.83 m", "96 segments", "0.95"):
+        assert words in text, words
+    assert re.search(r"SFKD 0\.0 2\.1 1\.945 6\.2 0\.137 0\.3", text)
+    assert re.search(r"Oracle – – – 0\.0 0\.001 0\.3", text)
+
+
+def test_figure_2_holds_what_the_rows_hold():
+    rows = pushed_rows()
+    tubes, common, widths = violations(rows).axes
+    lines = {line.get_label(): line.get_xydata() for line in tubes.get_lines()}
+    forces = [0.0, 250.0, 500.0, 1000.0]
+    for label, key in (("SFKD", "v1_conformal"), ("_SFKD, certified tube", "v1"), ("_SFKD, theorem (V0)", "v0")):
+        expected = [[force, run[key]] for force, run in zip(forces, rows[0]["disturbed"], strict=True)]
+        np.testing.assert_array_equal(lines[label], expected)
+    assert {"Nominal", "Oracle"} <= set(lines)
+    assert not {"_Oracle, certified tube", "_Nominal, theorem (V0)"} & set(lines)
+    assert any(np.allclose(line.get_ydata(), 0.05) for line in tubes.get_lines())
+    np.testing.assert_array_equal(common.get_lines()[2].get_ydata(), [0.0, 0.1, 0.1, 0.1])
+    shown = sorted(float(line.get_xdata()[0]) for line in widths.get_lines())
+    np.testing.assert_allclose(shown, [0.001, 0.137, 14.2 * 0.137, 7.91])
+    assert [tick.get_text() for tick in widths.get_yticklabels()] == ["SFKD", "Nominal", "Oracle"]
+
+
+def test_figure_2_survives_nulls_and_rows_that_were_not_pushed(tmp_path):
+    rows = nulled(pushed_rows())
+    for row in rows:
+        row["violation"]["segments"] = 96
+    rows += [
+        score("icode", "s3", 0.03, 0.001, 1.3),
+        violated(score("r2dn", "s1", 0.1, 0.01, 2.0), False, 0.1, (0.0,) * 4),
+    ]
+    page, made = report_of(write_run(tmp_path, episodes=None, results={"rows": rows}))
+    assert [Path(figure).name for figure in made["figures"]][:2] == ["figure2.png", "figure2_2.png"]
+    assert re.search(r"\b(nan|inf|None|null)\b", text_of(page)) is None
 
 
 def test_drawing_leaves_matplotlib_as_it_was(tmp_path):

@@ -2,14 +2,19 @@
 
 from __future__ import annotations
 
+from functools import partial
 from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from sfkd_jax.scenarios import Scenario, project, reference_window
+from sfkd_jax.scenarios import Scenario, project, reference_window, side_pushes
 from sfkd_jax.types import Controller, Key, Params, Scalar, State, Step
+from sfkd_jax.vehicle import Vehicle, equivalent_wind
+
+PUSHES = 2
+"""Folded into an episode's key; `split` gives the planner and the sensors the streams 0 and 1."""
 
 
 class Episode(NamedTuple):
@@ -21,6 +26,7 @@ class Episode(NamedTuple):
         progress: arc length reached [m], (time,).
         effective_samples: of the planner, (time,). healthy: whether it trusted its plan, (time,).
         prediction_error: one-step position error of the planner's model [m], (time,).
+        breach, box_exit: flags of a monitor, False without one, (time,).
     """
 
     states: Float[Array, "time_plus_1 state"]
@@ -30,6 +36,8 @@ class Episode(NamedTuple):
     effective_samples: Float[Array, " time"]
     healthy: Array
     prediction_error: Float[Array, " time"]
+    breach: Array
+    box_exit: Array
 
 
 def simulate(
@@ -42,6 +50,7 @@ def simulate(
     dt: float,
     horizon: int,
     observation_noise: tuple[float, ...] = (),
+    met: Float[Array, "time 2"] | None = None,
 ) -> Episode:
     """Drive one episode with the environment measured at every step.
 
@@ -52,27 +61,45 @@ def simulate(
         scenario: what to drive. key: consumed.
         dt: sampling period [s]. horizon: length of the reference window.
         observation_noise: standard deviation per state, entries beyond the state are not used; () for none.
+        met: the environment that the plant meets, where it is not the one that is measured.
     """
     planner_key, noise_key = jax.random.split(key)
     known = jnp.asarray(observation_noise, dtype=float)[: scenario.initial_state.shape[0]]
     spread = jnp.zeros_like(scenario.initial_state).at[: known.shape[0]].set(known)
     noise_keys = jax.random.split(noise_key, scenario.envs.shape[0])
 
-    def step(carry: tuple[State, Scalar, Any], inputs: tuple[Array, Key]) -> tuple[Any, Any]:
+    def step(carry: tuple[State, Scalar, Any], inputs: tuple[Array, Array, Key]) -> tuple[Any, Any]:
         state, progress, planner = carry
-        env, sensor_key = inputs
+        env, met_env, sensor_key = inputs
         observation = state + spread * jax.random.normal(sensor_key, state.shape)
         reference = reference_window(scenario.path, progress, scenario.speed, dt=dt, horizon=horizon)
         control, planner, info = controller.act(params, planner, observation, env, reference)
-        state = plant(state, control, env)
+        state = plant(state, control, met_env)
         progress, lateral = project(scenario.path, state[:2], progress + scenario.speed * dt)
         miss = jnp.linalg.norm(info["predicted_states"][0, :2] - state[:2])
-        record = (state, control, lateral, progress, info["effective_samples"], info["healthy"], miss)
+        flags = [jnp.asarray(info.get(name, False)) for name in ("breach", "box_exit")]
+        record = (state, control, lateral, progress, info["effective_samples"], info["healthy"], miss, *flags)
         return (state, progress, planner), record
 
     start = (scenario.initial_state, jnp.zeros(()), controller.init(planner_key))
-    _, (states, *rest) = jax.lax.scan(step, start, (scenario.envs, noise_keys))
+    inputs = (scenario.envs, scenario.envs if met is None else met, noise_keys)
+    _, (states, *rest) = jax.lax.scan(step, start, inputs)
     return Episode(jnp.concatenate([scenario.initial_state[None], states]), *rest)
+
+
+def pushed(
+    plant: Vehicle, envs: Float[Array, "time 2"], key: Key, *, largest: float | Float[Array, ""]
+) -> Float[Array, "time 2"]:
+    """The environment that a car meets which is also pushed sideways: the wind holds a force that nobody measures.
+
+    Args:
+        plant: whose wind it is. envs: as measured.
+        key: of the episode, and not consumed: its other streams stay what they are without a push.
+        largest: F, forces lie in [-F, F] [N].
+    """
+    force = side_pushes(jax.random.fold_in(key, PUSHES), steps=envs.shape[0], dt=plant.dt, largest=largest)
+    wind = jax.vmap(partial(equivalent_wind, wind_force=plant.wind_force))(envs[:, 1], force)
+    return envs.at[:, 1].set(wind)
 
 
 def first_reference(scenario: Scenario, *, horizon: int, dt: float) -> Float[Array, "horizon 4"]:

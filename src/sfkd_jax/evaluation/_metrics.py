@@ -25,6 +25,7 @@ class Scores(NamedTuple):
         max_deviation: [m]. smoothness: mean |steering rate| of the applied control [rad/s].
         departed: whether the car left its lane or a state is not finite. ess: median effective sample size.
         unhealthy: share of steps at which the planner held its last plan.
+        breach, box_exit: share of steps that a monitor flagged.
     """
 
     rmse: Float[np.ndarray, " episode"]
@@ -34,6 +35,8 @@ class Scores(NamedTuple):
     departed: np.ndarray
     ess: Float[np.ndarray, " episode"]
     unhealthy: Float[np.ndarray, " episode"]
+    breach: Float[np.ndarray, " episode"]
+    box_exit: Float[np.ndarray, " episode"]
 
 
 def score(episodes: Episode, envs: Float[np.ndarray, "episode time 2"], *, dt: float) -> Scores:
@@ -59,6 +62,8 @@ def score(episodes: Episode, envs: Float[np.ndarray, "episode time 2"], *, dt: f
         departed=~finite | ~(worst + VEHICLE_HALF_WIDTH <= LANE_HALF_WIDTH),
         ess=np.median(np.asarray(episodes.effective_samples), axis=1),
         unhealthy=1.0 - np.mean(np.asarray(episodes.healthy), axis=1),
+        breach=np.mean(np.asarray(episodes.breach), axis=1),
+        box_exit=np.mean(np.asarray(episodes.box_exit), axis=1),
     )
 
 

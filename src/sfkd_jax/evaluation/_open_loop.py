@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+from functools import partial
+
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from sfkd_jax.rollouts import rollout
+from sfkd_jax.rollouts import every_window, rollout
 from sfkd_jax.se2 import rotate, wrap_angle
 from sfkd_jax.types import Model, Params, Trajectory
 
@@ -24,15 +26,8 @@ def open_loop(model: Model, params: Params, trajectories: Trajectory, *, horizon
     Raises:
         ValueError: the horizon does not fit the trajectories.
     """
-    steps = trajectories.controls.shape[1]
-    if horizon > steps:
-        raise ValueError(f"a horizon of {horizon} steps does not fit trajectories of {steps} steps")
-    pieces = []
-    for start in range(0, steps - horizon + 1, horizon):
-        stop = start + horizon
-        states = trajectories.states[:, start : stop + 1]
-        pieces.append(Trajectory(states, trajectories.controls[:, start:stop], trajectories.envs[:, start:stop]))
-    batch = jax.tree.map(lambda *leaves: jnp.concatenate(leaves), *pieces)
+    cut = jax.vmap(partial(every_window, horizon=horizon, stride=horizon))
+    pieces = jax.tree.map(lambda leaf: leaf.reshape(-1, *leaf.shape[2:]), cut(trajectories))
 
     def squares(piece: Trajectory) -> Float[Array, "horizon 4"]:
         predicted, _, _ = rollout(model, params, piece)
@@ -41,4 +36,4 @@ def open_loop(model: Model, params: Params, trajectories: Trajectory, *, horizon
         yaw = wrap_angle(predicted[:, 2] - true[:, 2])
         return jnp.column_stack([position, yaw, predicted[:, 3] - true[:, 3]]) ** 2
 
-    return jnp.sqrt(jnp.mean(jax.lax.map(squares, batch, batch_size=128), axis=0))
+    return jnp.sqrt(jnp.mean(jax.lax.map(squares, pieces, batch_size=128), axis=0))

@@ -13,12 +13,20 @@ IDENTITY = ("system", "scenario", "vehicle", "sampling", "env")
 """What makes a row the same row."""
 
 
-def row(scores: Scores, about: dict[str, Any], act_ms: tuple[float, float] | None) -> dict[str, Any]:
+def row(
+    scores: Scores,
+    about: dict[str, Any],
+    act_ms: tuple[float, float] | None,
+    violation: dict[str, Any],
+    *,
+    watched: bool = False,
+) -> dict[str, Any]:
     """One system on one scenario; what does not apply is None.
 
     Args:
         scores: per episode. about: system, model, controller, sampling, env, scenario, vehicle, seeds, episodes,
-            episode_s, params. act_ms: median and 99 % quantile of one control step.
+            episode_s, params. act_ms: median and 99 % quantile of one control step. violation: from `violations`.
+        watched: whether a monitor looked on.
     """
     after = scores.rmse_after_switch
     return about | {
@@ -26,14 +34,23 @@ def row(scores: Scores, about: dict[str, Any], act_ms: tuple[float, float] | Non
         "max_deviation_m": float(np.max(scores.max_deviation)),
         "rmse_after_switch_m": None if np.all(np.isnan(after)) else float(np.nanmean(after)),
         "smoothness_rad_per_s": float(np.mean(scores.smoothness)),
-        "violation": {"v0": None, "v1": None, "v1_radius_m": None, "v2": None},
+        "violation": violation,
         "departures": int(np.sum(scores.departed)),
         "unhealthy_steps": float(np.mean(scores.unhealthy)),
+        "breach_steps": float(np.mean(scores.breach)) if watched else None,
+        "box_exit_steps": float(np.mean(scores.box_exit)) if watched else None,
         "ess": float(np.median(scores.ess)),
         "act_ms": None if act_ms is None else {"p50": act_ms[0], "p99": act_ms[1]},
         "ratio_to_oracle": None,
         "difference_to_sfkd": None,
     }
+
+
+def disturbed(force: float, scores: Scores, violation: dict[str, Any]) -> dict[str, Any]:
+    """What becomes of a row when forces of up to ±`force` [N], which nobody measures, push the car sideways."""
+    kept = {name: violation[name] for name in ("v0", "v1", "v1_conformal", "v2")}
+    departures = int(np.sum(scores.departed))
+    return {"force_n": force, "rmse_m": summary(scores.rmse), **kept, "departures": departures}
 
 
 def compare(rows: dict[str, dict[str, Any]], scores: dict[str, Scores]) -> list[dict[str, Any]]:

@@ -21,8 +21,10 @@ from sfkd_jax.reporting._tables import (
     closed_loop_more,
     open_loop_table,
     settings_table,
+    violation_table,
 )
 from sfkd_jax.reporting._track import EXAGGERATION, track
+from sfkd_jax.reporting._violations import disturbed, violations
 from sfkd_jax.reporting._words import (
     certificate_words,
     command,
@@ -31,6 +33,7 @@ from sfkd_jax.reporting._words import (
     model_of,
     paper_note,
     row_of,
+    violation_words,
 )
 
 
@@ -77,6 +80,7 @@ def driving(run: Path, rows: list[list[dict[str, Any]]], settings: dict[str, Any
         blocks += _scene_pictures(scene, place, full=scene is scenes[0])
     for block in rows:
         blocks += _scores(block) if block is not head else []
+    blocks += _violating(rows, place)
     more = [(block_title(block), closed_loop_more(block)) for block in rows]
     shown = [[Text(title, kind="sub"), table] for title, table in more if len(table.header) > 1]
     return [
@@ -123,6 +127,27 @@ def _scene_pictures(scene: Scene, place: Path, *, full: bool) -> list[Block]:
         caption = f"{name}, first episode: steering commands over ten seconds around that stretch."
         blocks.append(_picture(place, f"steering_{stem}", caption, steering, scene))
     return blocks
+
+
+def _violating(rows: list[list[dict[str, Any]]], place: Path) -> list[Block]:
+    """How often predictions left what is claimed about them, and Figure 2 where side forces were injected."""
+    blocks: list[Block] = []
+    measured = [block for block in rows if any(is_number(dig(row, "violation", "segments")) for row in block)]
+    figures = (f"figure2{suffix}" for suffix in ["", *(f"_{count}" for count in range(2, len(rows) + 1))])
+    for block in measured:
+        blocks += [Heading(3, f"Violations: {block_title(block)}"), violation_table(block)]
+        pushed = disturbed(block)
+        if pushed:
+            blocks.append(_picture(place, next(figures), _FIGURE2, violations, pushed))
+    return [*blocks, Text(violation_words(measured), kind="note")] if measured else []
+
+
+_FIGURE2 = (
+    "Violations while a side force that nobody measures pushes the car: redrawn every second, evenly up to the value "
+    "on the axis to either side. Circles: conformal tubes, all at one level. Squares: the certified tube. Crosses: "
+    "steps at which the theorem fails. Dashed: the share that the level of the tubes allows. Right: the position "
+    "radius of each tube, mean over the horizon; a tube that is wide enough is never left."
+)
 
 
 def certified(certificate: dict[str, Any] | None, settings: dict[str, Any], place: Path) -> list[Block]:

@@ -87,6 +87,28 @@ def closed_loop_more(block: list[dict[str, Any]]) -> Table:
     return _table(columns, block)
 
 
+def violation_table(block: list[dict[str, Any]]) -> Table:
+    """How often each system of a block left what is claimed about its predictions, and how wide the claim is."""
+
+    def certified(row: dict[str, Any], key: str) -> Any:
+        return dig(row, "violation", key) if dig(row, "violation", "v1_tube") == "certified" else None
+
+    columns: dict[str, Callable[[dict[str, Any]], str]] = {
+        "System": _MAIN["System"],
+        "V0, theorem\n[%]": lambda row: _percent(dig(row, "violation", "v0")),
+        "V1, certified\ntube [%]": lambda row: _percent(certified(row, "v1")),
+        "its mean\nradius [m]": lambda row: number(certified(row, "v1_radius_m")),
+        "V1, conformal\ntube [%]": lambda row: _percent(dig(row, "violation", "v1_conformal")),
+        "mean radius\nof that [m]": lambda row: number(dig(row, "violation", "v1_conformal_radius_m")),
+        "V2, threshold\n[%]": lambda row: _percent(dig(row, "violation", "v2")),
+    }
+    return _table(columns, block)
+
+
+def _percent(share: Any) -> str:
+    return number(100 * share, 1) if is_number(share) else DASH
+
+
 def _table(columns: dict[str, Callable[[dict[str, Any]], str]], block: list[dict[str, Any]]) -> Table:
     strong = tuple(place for place, row in enumerate(block) if row.get("system") == "sfkd")
     return Table(list(columns), [[cell(row) for cell in columns.values()] for row in block], strong)

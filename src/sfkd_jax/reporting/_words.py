@@ -106,6 +106,24 @@ def paper_note(block: list[dict[str, Any]]) -> str | None:
     )
 
 
+def violation_words(blocks: list[list[dict[str, Any]]]) -> str:
+    """What V0, V1 and V2 count."""
+    records = [dig(row, "violation") for block in blocks for row in block]
+    threshold, level, segments = (
+        next((record[key] for record in records if is_number(dig(record, key))), None)
+        for key in ("v2_threshold_m", "v1_level", "segments")
+    )
+    return (
+        f"Drives are cut into {short(segments)} segments as long as a calibration drive, and predicted from true "
+        "states along them. V0 is the share of steps at which the latent error exceeds the certified Rₖ although no "
+        "one-step error exceeded d̄; the theorem says 0. V1 is the share of segments in which any error of position, "
+        f"yaw or body state leaves the tube; the level of the tubes, {short(level)}, is promised for drives like those "
+        "of calibration, and these are others. The certified tube follows from α and one-step errors, the conformal "
+        "one from errors measured at every step ahead. V2 is the share of windows in which the position error "
+        f"exceeds {number(threshold, 2)} m, a mark that is the same for every row."
+    )
+
+
 def certificate_words(record: dict[str, Any]) -> list[Text]:
     """What is proved, what is measured and what is not claimed."""
     if not holds(record):

@@ -1,6 +1,7 @@
 """The road: what happens to the truth. Paths, environment schedules, and the scenarios S1, S2, S3."""
 
 from sfkd_jax.scenarios._conditions import gusts as gusts
+from sfkd_jax.scenarios._conditions import side_pushes as side_pushes
 from sfkd_jax.scenarios._conditions import switching_road as switching_road
 from sfkd_jax.scenarios._conditions import uniform_road as uniform_road
 from sfkd_jax.scenarios._conditions import wet_road as wet_road

@@ -6,7 +6,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from sfkd_jax.types import Key
+from sfkd_jax.types import Key, Scalar
 
 Range = tuple[float, float]
 Schedule = Float[Array, "time 2"]
@@ -55,6 +55,21 @@ def switching_road(key: Key, *, steps: int, dt: float, period: float = 3.0) -> S
     levels = levels.at[:, 1].multiply(sides)
     visit = jnp.floor(jnp.arange(steps) * dt / period + 1e-6).astype(int)
     return levels[visit]
+
+
+def side_pushes(
+    key: Key, *, steps: int, dt: float, largest: float | Scalar, hold: float = 1.0
+) -> Float[Array, " time"]:
+    """Side forces that nobody measures: levels drawn evenly from [-F, F] every `hold` seconds [N].
+
+    Args:
+        key: consumed; the same key gives the same pushes at every F, but for their size.
+        steps, dt: length and sampling period [s].
+        largest: F [N]. hold: how long a level lasts [s].
+    """
+    each = round(hold / dt)
+    levels = jax.random.uniform(key, (-(-steps // each),), minval=-1.0)
+    return largest * jnp.repeat(levels, each)[:steps]
 
 
 def gusts(

@@ -118,6 +118,7 @@ def dynamic(
         nominal=_quasi_steady(forward_rk4(nominal_derivative(length, rear_length), dt=dt), length, rear_length),
         control_low=(-STEERING_LIMIT, ACCELERATION_RANGE[0]),
         control_high=(STEERING_LIMIT, ACCELERATION_RANGE[1]),
+        wind_force=wind_force,
     )
 
 

@@ -99,4 +99,5 @@ def kinematic(
         nominal=forward_rk4(nominal_derivative(length, rear_length), dt=dt),
         control_low=(-STEERING_LIMIT, ACCELERATION_RANGE[0]),
         control_high=(STEERING_LIMIT, ACCELERATION_RANGE[1]),
+        wind_force=wind_force,
     )

@@ -26,6 +26,7 @@ class Vehicle(NamedTuple):
         derivative: dx/dt of the plant before any wrapper.
         nominal: the textbook kinematic bicycle without friction or wind, as a step on the same state.
         control_low, control_high: actuator limits.
+        wind_force: c_w of `side_force` [N s²/m²].
         speed_loop: whether u_2 is a speed command [m/s] instead of an acceleration [m/s²].
     """
 
@@ -38,12 +39,19 @@ class Vehicle(NamedTuple):
     nominal: Step
     control_low: tuple[float, float]
     control_high: tuple[float, float]
+    wind_force: float
     speed_loop: bool = False
 
 
 def side_force(wind: Float[Array, ""], *, wind_force: float) -> Float[Array, ""]:
     """Lateral force of a side wind on the body, F = c_w w|w| [N]."""
     return wind_force * wind * jnp.abs(wind)
+
+
+def equivalent_wind(wind: Float[Array, ""], force: Float[Array, ""], *, wind_force: float) -> Float[Array, ""]:
+    """The wind [m/s] whose side force is that of `wind` and `force` [N] together, c_w w'|w'| = c_w w|w| + F."""
+    total = side_force(wind, wind_force=wind_force) + force
+    return jnp.where(force == 0.0, wind, jnp.sign(total) * jnp.sqrt(jnp.abs(total) / wind_force))
 
 
 def resistance(speed: Float[Array, ""], *, mass: float, drag: float, rolling: float) -> Float[Array, ""]:

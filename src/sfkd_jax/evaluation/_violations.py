@@ -1,0 +1,150 @@
+"""How often predictions leave what is claimed about them, on drives as they were driven."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from functools import partial
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+from sfkd_jax.rollouts import defects, every_window, rollout, window_errors
+from sfkd_jax.types import Model, Params, Trajectory
+
+STRIDE = 5
+"""Steps from the start of one window to that of the next."""
+KINDS = ("position_m", "yaw_rad", "body")
+ROUNDING = (1e-5, 1e-5)
+"""Relative and absolute, of latent errors: latents of size 10 are rounded to 1e-6 in float32, and 20 steps add up."""
+
+Tube = Mapping[str, Sequence[float]]
+
+
+class Predictions(NamedTuple):
+    """Free-running predictions along segments of driving, from every `STRIDE`-th true state.
+
+    Attributes:
+        errors: position [m], |yaw| [rad], body state (2-norm). latent_errors: |e_k|, k = 1 … horizon.
+        defects: |d_j| of the step that leads to each of them.
+    """
+
+    errors: Float[Array, "segment window horizon 3"]
+    latent_errors: Float[Array, "segment window horizon"]
+    defects: Float[Array, "segment window horizon"]
+
+
+class Claims(NamedTuple):
+    """What is claimed about the predictions of a model; None where nothing is.
+
+    Attributes:
+        certified, conformal: tubes, radii by `KINDS`, each (horizon,). level: 1 − δ of both.
+        latent: R_1 … R_T of a certificate. d_bar: the one-step bound that it holds under.
+        threshold: δ*, one position error for all models [m].
+    """
+
+    certified: Tube | None = None
+    conformal: Tube | None = None
+    level: float | None = None
+    latent: Float[np.ndarray, " horizon"] | None = None
+    d_bar: float | None = None
+    threshold: float | None = None
+
+
+def predictions(model: Model, params: Params, driven: Trajectory, *, length: int, horizon: int) -> Predictions:
+    """Cut drives into segments of `length` steps and predict from their true states, controls and environments.
+
+    Args:
+        model, params: any model. driven: a batch; the environments are those that the model is told.
+        length: of a calibration trajectory, so that a segment is to a tube what such a trajectory is.
+        horizon: steps.
+
+    Raises:
+        ValueError: drives shorter than a segment, or segments shorter than the horizon.
+    """
+    cut = jax.vmap(partial(every_window, horizon=length, stride=length))
+    segments = jax.tree.map(lambda leaf: leaf.reshape(-1, *leaf.shape[2:]), cut(driven))
+
+    def one(segment: Trajectory) -> Predictions:
+        errors = window_errors(model, params, segment, horizon=horizon, stride=STRIDE)
+        windows = every_window(segment, horizon=horizon, stride=STRIDE)
+        return Predictions(errors, *jax.vmap(partial(_latent_errors, model, params))(windows))
+
+    return jax.lax.map(one, segments, batch_size=16)
+
+
+def _latent_errors(
+    model: Model, params: Params, window: Trajectory
+) -> tuple[Float[Array, " horizon"], Float[Array, " horizon"]]:
+    """|e_k| = |z_k − ẑ_k| with z_k the latent of the true state, and |d_k|."""
+    _, latents, along = rollout(model, params, window)
+    gaps, _ = defects(model, params, window, along)
+    seen = jax.vmap(model.observe)(along[1], latents, window.states[1:])
+    errors = jax.vmap(model.vector)(seen) - jax.vmap(model.vector)(latents)
+    return jnp.linalg.norm(errors, axis=1), jnp.linalg.norm(gaps, axis=1)
+
+
+def tube_violations(errors: Float[np.ndarray, "segment window horizon 3"], tube: Tube) -> tuple[int, int]:
+    """V1: in how many segments any window, step or kind leaves the tube, and of how many; NaN has left it."""
+    radii = np.stack([np.asarray(tube[kind]) for kind in KINDS], axis=1)
+    inside = np.all(np.asarray(errors) <= radii, axis=(1, 2, 3))
+    return int(np.sum(~inside)), len(inside)
+
+
+def theorem_violations(
+    latent_errors: Float[np.ndarray, "segment window horizon"],
+    defects: Float[np.ndarray, "segment window horizon"],
+    latent: Float[np.ndarray, " horizon"],
+    d_bar: float,
+) -> tuple[int, int]:
+    """V0: at how many steps |e_k| > R_k though |d_1| … |d_k| ≤ d̄, and of how many; the theorem says at none."""
+    applies = np.logical_and.accumulate(np.asarray(defects) <= d_bar, axis=2)
+    relative, absolute = ROUNDING
+    beyond = ~(np.asarray(latent_errors) <= np.asarray(latent) * (1 + relative) + absolute)
+    return int(np.sum(applies & beyond)), int(np.sum(applies))
+
+
+def threshold_violations(errors: Float[np.ndarray, "segment window horizon 3"], threshold: float) -> tuple[int, int]:
+    """V2: in how many windows the position error exceeds δ* at some step, and of how many."""
+    inside = np.all(np.asarray(errors)[..., 0] <= threshold, axis=2)
+    return int(np.sum(~inside)), inside.size
+
+
+def violations(found: Predictions | None, claims: Claims) -> dict[str, Any]:
+    """The record of results.json: shares V0, V1, V2 and mean position radii of the tubes; null for no claim.
+
+    V1 speaks of the certified tube if there is one, else of the conformal one (`v1_tube` says which).
+    """
+    tubes = {"certified": claims.certified, "conformal": claims.conformal}
+    shares = {name: _share(tube_violations, found and found.errors, tube) for name, tube in tubes.items()}
+    radii = {name: tube and float(np.mean(tube["position_m"])) for name, tube in tubes.items()}
+    kind = next((name for name, tube in tubes.items() if tube), None)
+    claimed = (found and found.latent_errors, found and found.defects, claims.latent, claims.d_bar)
+    return {
+        "v0": _share(theorem_violations, *claimed),
+        "v1": shares[kind] if kind else None,
+        "v1_tube": kind,
+        "v1_radius_m": radii[kind] if kind else None,
+        "v1_conformal": shares["conformal"],
+        "v1_conformal_radius_m": radii["conformal"],
+        "v1_level": claims.level,
+        "v2": _share(threshold_violations, found and found.errors, claims.threshold),
+        "v2_threshold_m": claims.threshold,
+        "window_error_m": found and _quantiles(np.max(found.errors[..., 0], axis=2)),
+        "segments": found and len(found.errors),
+    }
+
+
+def _share(count: Any, *inputs: Any) -> float | None:
+    """A count over its total, or None if any input is missing or nothing was counted."""
+    if any(value is None for value in inputs):
+        return None
+    part, total = count(*inputs)
+    return part / total if total else None
+
+
+def _quantiles(errors: Float[np.ndarray, "segment window"]) -> dict[str, float]:
+    """Median and 95 % quantile."""
+    return {"median": float(np.median(errors)), "p95": float(np.quantile(errors, 0.95))}
