@@ -1,19 +1,24 @@
-"""python -m sfkd_jax.report: a page, tables and figures from what lies in a run."""
+"""python -m sfkd_jax.report: a page, tables and figures from what lies in a run, or in many (`report.compare`)."""
 
 from __future__ import annotations
 
+from pathlib import Path
 from typing import Any
 
 from sfkd_jax import shelf
 from sfkd_jax.config import door
-from sfkd_jax.reporting import write_report
+from sfkd_jax.reporting import write_comparison, write_report
 
 
 def run(settings: dict[str, Any]) -> dict[str, Any]:
     """Draw; nothing is recomputed."""
-    pages = write_report(shelf.run_directory(settings))
+    pattern = settings["report"]["compare"]
+    if pattern:
+        pages = write_comparison(Path(settings["root"]), pattern, settings["name"])
+    else:
+        pages = write_report(shelf.run_directory(settings))
     shelf.say(f"report: {pages['report']}")
-    return {"report": str(pages["report"]), "figures": [str(figure) for figure in pages["figures"]]}
+    return pages
 
 
 if __name__ == "__main__":

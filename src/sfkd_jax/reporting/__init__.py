@@ -1,3 +1,4 @@
-"""Ink: what a run directory holds, as one page. Reads artefacts and recomputes nothing."""
+"""Ink: what run directories hold, as pages. Reads artefacts and recomputes nothing."""
 
+from sfkd_jax.reporting._comparison import write_comparison as write_comparison
 from sfkd_jax.reporting._page import write_report as write_report

@@ -8,6 +8,7 @@ from typing import Any
 
 from sfkd_jax.reporting import _sections as sections
 from sfkd_jax.reporting._blocks import Block, Heading, Picture, Text, to_html, to_markdown
+from sfkd_jax.reporting._files import about, read
 from sfkd_jax.reporting._numbers import plain
 from sfkd_jax.reporting._style import label
 from sfkd_jax.reporting._tables import blocks_of
@@ -29,7 +30,7 @@ def write_report(run: Path) -> dict[str, Any]:
     Raises:
         FileNotFoundError: no policy.json. ValueError: a file that is not JSON.
     """
-    policy = _read(run / "policy.json")
+    policy = read(run / "policy.json")
     if policy is None:
         raise FileNotFoundError(f"{run / 'policy.json'} is missing: {command('train', {})} makes a run")
     settings = policy.get("settings") or policy.get("config") or {}
@@ -37,9 +38,9 @@ def write_report(run: Path) -> dict[str, Any]:
     place.mkdir(parents=True, exist_ok=True)
     for stale in place.glob("*.png"):
         stale.unlink()
-    metrics, errors = _metrics(run), _read(run / "open_loop.json")
-    certificate = _about(policy, _read(run / "certificate.json"))
-    results = _read(run / "results.json") or {}
+    metrics, errors = _metrics(run), read(run / "open_loop.json")
+    certificate = about(policy, read(run / "certificate.json"))
+    results = read(run / "results.json") or {}
     rows = blocks_of(results.get("rows") or [])
     head, name = headline(rows, settings), plain(settings.get("experiment") or "unnamed run")
     title = f"{label(model_of(settings))} on {name}, seed {plain(settings.get('seed'))}"
@@ -57,18 +58,6 @@ def write_report(run: Path) -> dict[str, Any]:
         "report": str(report),
         "figures": [str(block.path) for block in page if isinstance(block, Picture)],
     }
-
-
-def _read(path: Path) -> dict[str, Any] | None:
-    return json.loads(path.read_text(encoding="utf-8")) if path.exists() else None
-
-
-def _about(policy: dict[str, Any], certificate: dict[str, Any] | None) -> dict[str, Any] | None:
-    """The certificate, or a refusal if it names other weights than the policy's manifest."""
-    mine, named = policy.get("sha256"), (certificate or {}).get("weights_sha256")
-    if mine and named and mine != named:
-        return {"valid": False, "reason": "the certificate in this run is about other weights"}
-    return certificate
 
 
 def _metrics(run: Path) -> list[dict[str, Any]]:

@@ -1,0 +1,20 @@
+"""What a run left: null where a file is missing, a refusal where the certificate is about other weights."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any
+
+
+def read(path: Path) -> dict[str, Any] | None:
+    """The JSON object in a file, or None where there is no file."""
+    return json.loads(path.read_text(encoding="utf-8")) if path.exists() else None
+
+
+def about(policy: dict[str, Any], certificate: dict[str, Any] | None) -> dict[str, Any] | None:
+    """The certificate, or a refusal if it names other weights than the policy's manifest."""
+    mine, named = policy.get("sha256"), (certificate or {}).get("weights_sha256")
+    if mine and named and mine != named:
+        return {"valid": False, "reason": "the certificate in this run is about other weights"}
+    return certificate
