@@ -31,7 +31,8 @@ ARROWS = {
     "reporting": {"artefacts"},
     "assembly": HALLWAY | {"vehicle", "scenarios", "datasets", "models", "control"},
     "shelf": HALLWAY | {"artefacts", "datasets"},
-    "walk": HALLWAY | {"artefacts", "assembly", "certification", "datasets", "evaluation", "policy", "shelf", "training"},
+    "walk": HALLWAY
+    | {"artefacts", "assembly", "certification", "datasets", "evaluation", "policy", "shelf", "training"},
     "policy": HALLWAY | {"artefacts", "assembly", "models", "control"},
     "__init__": {"artefacts", "policy"},
 }

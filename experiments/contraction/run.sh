@@ -15,6 +15,6 @@ drive() { # vehicle, alpha, beta
 }
 
 for alpha in 0.93 0.995 0.9 0.97; do drive kinematic_speed "$alpha" 0.05 "$@"; done
-for alpha in 0.93 0.97 0.99 0.995; do drive kinematic "$alpha" 0.05 "$@"; done
-for beta in 0.02 0.1 0.2; do drive kinematic_speed 0.93 "$beta" "$@"; done
+for alpha in 0.93 0.97 0.995; do drive kinematic "$alpha" 0.05 "$@"; done
+for beta in 0.02 0.1; do drive kinematic_speed 0.93 "$beta" "$@"; done
 python -m sfkd_jax.report +experiment=contraction "report.compare='contraction/*/*/seed=*'" "$@"

@@ -208,3 +208,14 @@ def test_what_is_not_a_certificate_is_named():
 def test_a_mode_that_does_not_exist_is_an_error(settings):
     with pytest.raises(ValueError, match="mode must be one of joint, separate"):
         certify(*model_and_params("sfkd"), BOX, **settings)
+
+
+@pytest.mark.parametrize(
+    "changes",
+    [{"joint": [[]]}, {"joint": None}, {"residual": "none"}, {"residual": [[1.0]]}, {"metric": [[1.0]]}, {"yaw": None}],
+)
+def test_witnesses_of_another_shape_are_refused(changes):
+    model, params = model_and_params("sfkd")
+    forged = dataclasses.replace(certified("sfkd"), witnesses=certified("sfkd").witnesses | changes)
+    with pytest.raises(CertificationRefused, match=r"malformed|does not follow"):
+        verify(forged, params, model=model)

@@ -75,7 +75,7 @@ def test_levels_are_nested():
 
 def test_it_has_the_parts_of_the_certified_tube():
     names = {"position": 1.0, "yaw": 1.0, "body": 1.0}
-    certified = physical_tube(np.ones(4), lipschitz=names, residual=names, largest_increment=1.0)
+    certified = physical_tube(np.ones(4), alpha=0.5, lipschitz=names, residual=names, largest_increment=1.0)
     assert {kind: len(radii) for kind, radii in tube_of().items()} == {kind: 4 for kind in certified}
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from functools import partial
 from typing import Any
 
 import jax
@@ -12,7 +13,7 @@ from scipy.optimize import minimize
 
 from sfkd_jax.certification._core import Matrix, Vector
 from sfkd_jax.certification._environments import Box
-from sfkd_jax.types import Environment, Key, Model, Params
+from sfkd_jax.types import Key, Model, Params
 
 
 def attack_slopes(weights: Sequence[Matrix], linear: Matrix | None = None, *, starts: int = 24, seed: int = 0) -> float:
@@ -53,37 +54,34 @@ def attack_step(model: Model, params: Params, box: Box, key: Key, *, starts: int
         model: with `explicit`. params: its weights. box: lower and upper corner of E. key: for the beginnings.
         starts: how many. iterations: of L-BFGS-B, each.
     """
-    jacobian, sizes = _jacobian(model, params)
-    rank, controls, env = sizes
-    edges = np.cumsum([rank, controls, env, env])
-
-    def parts(flat: Any) -> Any:
-        return jnp.split(flat, edges)
-
-    @jax.jit
-    def objective(flat: Any) -> tuple[Any, Any]:
-        def gain(flat: Any) -> Any:
-            *inputs, direction = parts(flat)
-            moved = jacobian(*inputs) @ direction
-            return 0.5 * (jnp.log(jnp.sum(direction**2)) - jnp.log(jnp.sum(moved**2) + 1e-30))
-
-        return jax.value_and_grad(gain)(flat)
-
-    final = jax.jit(lambda flat: jacobian(*parts(flat)[:-1]))
+    inject, rank, controls = _coordinates(model, params)
     low, high = (np.asarray(side, dtype=np.float64) for side in box)
-    free = [(None, None)]
-    limits = free * (rank + controls) + 2 * list(zip(low, high, strict=True)) + free * rank
+    inputs = rank + controls + 2 * len(low)
+    envs = slice(rank + controls, inputs)
+
+    def step(params: Params, z: Any, rest: Any) -> Any:
+        control, now, later = jnp.split(rest, [controls, controls + len(low)])
+        fiber, fiber_next = model.fiber(params, now), model.fiber(params, later)
+        return model.vector(model.transport(fiber, fiber_next, model.step(fiber, inject(z), control)))
+
+    def loss(params: Params, point: Any) -> Any:
+        z, rest, direction = point[:rank], point[rank:inputs], point[inputs:]
+        _, gain = jax.jvp(lambda z: step(params, z, rest), (z,), (direction,))
+        return 0.5 * (jnp.log(jnp.sum(direction**2)) - jnp.log(jnp.sum(gain**2) + 1e-30))
+
+    objective = jax.jit(jax.value_and_grad(loss, argnums=1))
+    jacobian = jax.jit(lambda params, point: jax.jacfwd(step, argnums=1)(params, point[:rank], point[rank:inputs]))
+    limits = [(None, None)] * (inputs + rank)
+    limits[envs] = 2 * list(zip(low, high, strict=True))
     best = 0.0
     for number, start_key in enumerate(jax.random.split(key, starts)):
-        start = np.asarray(jax.random.normal(start_key, (int(edges[-1]) + rank,)), dtype=np.float64)
-        start[: edges[1]] *= 10.0 ** (number % 4 - 2)  # small latents see steep slopes, large ones saturated layers
-        start[edges[1] : edges[3]] = np.tile(low, 2) + (np.arctan(start[edges[1] : edges[3]]) / np.pi + 0.5) * np.tile(
-            high - low, 2
-        )
-        found = minimize(
-            _float64(objective), start, method="L-BFGS-B", jac=True, bounds=limits, options={"maxiter": iterations}
-        )
-        best = max(best, float(np.linalg.norm(np.asarray(final(jnp.asarray(found.x, jnp.float32)), np.float64), 2)))
+        start = np.asarray(jax.random.normal(start_key, (inputs + rank,)), dtype=np.float64)
+        start[: rank + controls] *= 10.0 ** (number % 4 - 2)  # small latents see steep slopes, large saturated ones
+        start[envs] = np.tile(low, 2) + (np.arctan(start[envs]) / np.pi + 0.5) * np.tile(high - low, 2)
+        search = {"method": "L-BFGS-B", "jac": True, "bounds": limits, "options": {"maxiter": iterations}}
+        found = minimize(_float64(partial(objective, params)), start, **search)
+        steepest = np.asarray(jacobian(params, jnp.asarray(found.x, jnp.float32)), dtype=np.float64)
+        best = max(best, float(np.linalg.norm(steepest, 2)))
     return best
 
 
@@ -93,15 +91,15 @@ def attack_transport(model: Model, params: Params, box: Box, key: Key, *, sample
     Args:
         model, params: as in `attack_step`. box: of E. key: for the pairs. samples: how many.
     """
-    inject, latent, rank = _coordinates(model, params)
+    inject, rank, _ = _coordinates(model, params)
     low, high = (jnp.asarray(side, dtype=jnp.float32) for side in box)
     draws = jax.random.uniform(key, (samples, 2, low.shape[0]), minval=low, maxval=high)
 
-    def matrix(pair: Any) -> Any:
+    def matrix(params: Params, pair: Any) -> Any:
         before, after = (model.fiber(params, env) for env in pair)
-        return jax.jacobian(lambda z: model.vector(model.transport(before, after, inject(latent, z))))(jnp.zeros(rank))
+        return jax.jacfwd(lambda z: model.vector(model.transport(before, after, inject(z))))(jnp.zeros(rank))
 
-    found = np.asarray(jax.jit(lambda pairs: jax.lax.map(matrix, pairs, batch_size=32))(draws), dtype=np.float64)
+    found = np.asarray(jax.jit(jax.vmap(matrix, in_axes=(None, 0)))(params, draws), dtype=np.float64)
     return float(np.max(np.linalg.norm(found, 2, axis=(1, 2))))
 
 
@@ -123,35 +121,16 @@ def _best_layer(weights: Sequence[Matrix], slopes: Sequence[Vector], base: Matri
     return (before * after > 0).astype(float)
 
 
-def _jacobian(model: Model, params: Params) -> tuple[Callable[..., Any], tuple[int, int, int]]:
-    """(z, u, e, e') -> ∂z⁺/∂z of step and transport, and the sizes of z, u and e."""
-    inject, latent, rank = _coordinates(model, params)
+def _coordinates(model: Model, params: Params) -> tuple[Callable[[Any], Any], int, int]:
+    """z -> a latent that holds it (`vector` picks z out, its transpose puts z back), and the sizes of z and u."""
     assert model.explicit is not None
-    controls = jax.eval_shape(model.explicit, params).declared.controls
-
-    def jacobian(z: Any, control: Any, env: Environment, env_next: Environment) -> Any:
-        fiber, fiber_next = model.fiber(params, env), model.fiber(params, env_next)
-
-        def advance(z: Any) -> Any:
-            return model.vector(model.transport(fiber, fiber_next, model.step(fiber, inject(latent, z), control)))
-
-        return jax.jacobian(advance)(z)
-
-    return jacobian, (rank, controls, 2)
-
-
-def _coordinates(model: Model, params: Params) -> tuple[Callable[[Any, Any], Any], Any, int]:
-    """How to place any z into a latent: `vector` picks z out, its transpose puts z back."""
-    assert model.explicit is not None
-    body = jax.eval_shape(model.explicit, params).readout.shape[0]
-    fiber = model.fiber(params, jnp.zeros(2))
-    latent = jax.tree.map(jnp.zeros_like, model.encode(fiber, jnp.zeros(3 + body)))
-    z, back = jax.vjp(model.vector, latent)
-
-    def inject(latent: Any, z: Any) -> Any:
-        return jax.tree.map(jnp.add, latent, back(z)[0])
-
-    return inject, latent, z.shape[0]
+    weights = jax.eval_shape(model.explicit, params)
+    state = jax.ShapeDtypeStruct((3 + weights.readout.shape[0],), jnp.float32)
+    env = jax.ShapeDtypeStruct((2,), jnp.float32)
+    shapes = jax.eval_shape(lambda env, state: model.encode(model.fiber(params, env), state), env, state)
+    origin = jax.tree.map(lambda leaf: jnp.zeros(leaf.shape, leaf.dtype), shapes)
+    z, back = jax.vjp(model.vector, origin)
+    return lambda z: jax.tree.map(jnp.add, origin, back(z)[0]), z.shape[0], weights.declared.controls
 
 
 def _float64(objective: Callable[[Any], tuple[Any, Any]]) -> Callable[[Vector], tuple[float, Vector]]:

@@ -26,10 +26,22 @@ class Disturbance(NamedTuple):
 
 
 KINDS = ("latent", "position", "yaw", "body")
+CHUNK = 50
+"""Trajectories in one batch."""
 
 
 def disturbances(model: Model, params: Params, trajectories: Trajectory) -> Disturbance:
     """One-step residuals from true states, transport defect and switch steps included; maximum over each trajectory."""
+    count = trajectories.controls.shape[0]
+    filled = jax.tree.map(lambda leaf: leaf[jnp.arange(-(-count // CHUNK) * CHUNK) % count], trajectories)
+    parts = [jax.tree.map(lambda leaf, k=k: leaf[k : k + CHUNK], filled) for k in range(0, count, CHUNK)]
+    scores = np.concatenate([np.asarray(_largest(model, params, part), dtype=np.float64) for part in parts])
+    return Disturbance(scores[:count])
+
+
+@partial(jax.jit, static_argnums=0)
+def _largest(model: Model, params: Params, trajectories: Trajectory) -> Float[Array, "trajectory 4"]:
+    """The same for a batch of one fixed size, so that splits of any length share a compilation."""
 
     def one(trajectory: Trajectory) -> Float[Array, " 4"]:
         fibers, later = fibers_along(model, params, trajectory)
@@ -38,8 +50,7 @@ def disturbances(model: Model, params: Params, trajectories: Trajectory) -> Dist
         found = each(fibers, later, origin, trajectory.states[:-1], trajectory.controls, trajectory.states[1:])
         return jnp.max(found, axis=0)
 
-    scores = jax.jit(lambda data: jax.lax.map(one, data, batch_size=64))(trajectories)
-    return Disturbance(np.asarray(scores, dtype=np.float64))
+    return jax.vmap(one)(trajectories)
 
 
 def conformal_quantile(scores: Float[np.ndarray, " trajectory"], level: float) -> float:

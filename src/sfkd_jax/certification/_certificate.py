@@ -9,13 +9,12 @@ from typing import Any
 
 import jax
 import numpy as np
-from threadpoolctl import threadpool_limits
 
 from sfkd_jax.certification._attack import attack_slopes, attack_step, attack_transport
 from sfkd_jax.certification._claims import Claims, Refuted, claims_hold, prove
 from sfkd_jax.certification._core import Matrix
 from sfkd_jax.certification._environments import Box
-from sfkd_jax.certification._exported import CertificationRefused, Exported, exported, fingerprint
+from sfkd_jax.certification._exported import CertificationRefused, Exported, exported, fingerprint, one_thread
 from sfkd_jax.types import Model, Params, Polytope
 
 MODES = ("joint", "separate")
@@ -119,7 +118,7 @@ def certify(
         raise ValueError(f"mode must be one of {', '.join(MODES)}, and separate with a metric; got {mode!r}")
     weights = exported(model, params)
     try:
-        with threadpool_limits(1, "blas"):  # matrices of this size lose on two threads, and lose 100-fold on busy cores
+        with one_thread():
             claims = prove(weights, env_box, joint=mode == "joint", metric=metric)
     except Refuted as reason:
         raise CertificationRefused(str(reason)) from None
@@ -158,10 +157,12 @@ def verify(certificate: Certificate, params: Params, *, model: Model) -> None:
     names = [name for name in Claims._fields if hasattr(certificate, name)]
     claims = Claims(**{name: getattr(certificate, name) for name in names})
     try:
-        with threadpool_limits(1, "blas"):
+        with one_thread():
             claims_hold(claims, weights, certificate.env_box)
     except Refuted as reason:
         raise CertificationRefused(str(reason)) from None
+    except (LookupError, TypeError, ValueError) as reason:
+        raise CertificationRefused(f"the certificate is malformed: {reason}") from None
     if not claims.alpha < 1.0 or certificate.transport_lipschitz != 1.0:
         raise CertificationRefused(f"alpha = {claims.alpha} is not below 1, or the transport is not nonexpansive")
 
@@ -171,7 +172,7 @@ def _attacks(
 ) -> dict[str, float]:
     """Lower bounds by name, none of which may exceed what was proved."""
     found, limits = {}, {}
-    with threadpool_limits(1, "blas"):
+    with one_thread():
         if weights.residual:
             found["residual_slopes"] = attack_slopes(weights.residual, seed=seed)
             limits["residual_slopes"] = claims.beta

@@ -80,19 +80,21 @@ def claims_hold(claims: Claims, weights: Exported, box: Box) -> None:
     metric, operators = seen["metric"], weights.operators
     checks = {"beta": _bounded(weights.residual, seen["residual"], claims.beta)}
     if isinstance(operators, Hypernetwork):
-        checks["rho"] = _norms(weights, box)[0] <= claims.rho
+        rho, scope = _norms(weights, box)
+        checks["rho"] = rho <= claims.rho
         joint = claims.alpha_joint is None or _joint_cover(weights, box, seen["joint"][0]).upper <= claims.alpha_joint
     elif metric is None:
+        scope = _hull(weights)
         checks["rho"] = all(check_witness((), (), claims.rho, vertex) for vertex in operators.vertices)
         joint = claims.alpha_joint is None or all(
             check_witness(weights.residual, part, claims.alpha_joint, vertex)
             for part, vertex in zip(seen["joint"], operators.vertices, strict=True)
         )
     else:
+        scope = _hull(weights)
         checks["rho"] = check_metric(np.asarray(metric), list(operators.vertices), claims.rho, claims.kappa)
         joint = claims.alpha_joint is None and weights.declared.transport == "identity"
-    expected = _norms(weights, box)[1] if metric is None else _hull(weights)
-    checks["scope"] = claims.scope == expected
+    checks["scope"] = claims.scope == scope
     checks["kappa"] = claims.kappa == 1.0 if metric is None else claims.kappa >= 1.0
     checks["alpha_joint"] = joint
     checks["alpha_separate"] = claims.alpha_separate == claims.rho + claims.beta * claims.kappa**0.5

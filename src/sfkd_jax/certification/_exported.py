@@ -3,10 +3,13 @@
 from __future__ import annotations
 
 import hashlib
+from contextlib import AbstractContextManager
+from functools import cache
 from typing import Any, TypeAlias
 
 import jax
 import numpy as np
+from threadpoolctl import ThreadpoolController
 
 from sfkd_jax.types import Model, Params, Samples
 
@@ -50,3 +53,14 @@ def fingerprint(params: Params) -> str:
         digest.update(f"{jax.tree_util.keystr(path)} {array.dtype} {array.shape} ".encode())
         digest.update(array.tobytes())
     return digest.hexdigest()
+
+
+def one_thread() -> AbstractContextManager[object]:
+    """BLAS on one thread: matrices of this size lose on two, and lose a hundredfold on busy cores."""
+    return _threads().limit(limits=1, user_api="blas")
+
+
+@cache
+def _threads() -> ThreadpoolController:
+    """The libraries of this process; finding them takes milliseconds."""
+    return ThreadpoolController()

@@ -9,13 +9,12 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import numpy as np
-from threadpoolctl import threadpool_limits
 
 from sfkd_jax.certification._attack import attack_slopes
 from sfkd_jax.certification._calibration import KINDS, Disturbance, conformal_bounds, coverage, disturbances
 from sfkd_jax.certification._certificate import certify
 from sfkd_jax.certification._claims import joint_bound, residual_bound
-from sfkd_jax.certification._exported import CertificationRefused, exported
+from sfkd_jax.certification._exported import CertificationRefused, exported, one_thread
 from sfkd_jax.certification._tube import latent_tube, physical_tube
 from sfkd_jax.types import Model, Params, Polytope, Trajectory
 
@@ -92,7 +91,7 @@ def progress(model: Model, params: Params) -> dict[str, float]:
         return {}
     if not isinstance(weights.operators, Polytope):
         return {}
-    with threadpool_limits(1, "blas"):
+    with one_thread():
         rho = max(float(np.linalg.norm(vertex, 2)) for vertex in weights.operators.vertices)
         separate = rho + residual_bound(weights)
         joint = joint_bound(weights, iterations=15)

@@ -28,7 +28,8 @@ def physical_tube(
     """Radii of position [m], yaw [rad] and body state for k = 1 … horizon, from z_0 known exactly.
 
     The pose is a sum of increments on SE(2), so its error is bounded by finite sums, not by a contraction:
-        |e_yaw,k| ≤ Σ_j (L_yaw R_j + ε_yaw),   |e_p,k| ≤ Σ_j (L_p R_j + ε_p + |dp| |e_yaw,j|),   |e_s,k| ≤ L_s α R_{k−1} + ε_s
+        |e_yaw,k| ≤ Σ_j (L_yaw R_j + ε_yaw),   |e_p,k| ≤ Σ_j (L_p R_j + ε_p + |dp| |e_yaw,j|),   j = 0 … k − 1
+        |e_s,k| ≤ L_s α R_{k−1} + ε_s
 
     Args:
         latent: R_1 … R_T. alpha: the contraction factor behind them.
