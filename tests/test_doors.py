@@ -73,6 +73,28 @@ def test_the_certificate_speaks_about_the_saved_weights(walked):
     assert certificate["valid"]
     assert certificate["weights_sha256"] == manifest["sha256"]
     assert len(certificate["tube"]["latent"]) == 20
+    assert set(certificate["d_bar"]["by_scenario"]) == {"s1", "s2", "s3"}
+    assert 1.0 <= certificate["tightness"] <= 1.1
+
+
+def test_training_logs_what_can_be_certified_at_every_checkpoint(walked):
+    place, document = walked
+    lines = [json.loads(line) for line in (place / document["run"] / "metrics.jsonl").read_text().splitlines()]
+    saved = [line for line in lines if "validation_loss" in line]
+    assert saved
+    assert all(0.5 < line["alpha"] <= line["alpha_separate"] * (1 + 1e-6) < 1 for line in saved)
+    assert all(1.0 - 1e-9 <= line["tightness"] <= 1.1 for line in saved)
+
+
+def test_rows_count_violations_and_the_theorem_is_never_one(walked):
+    place, document = walked
+    rows = {row["system"]: row for row in json.loads((place / document["results"]).read_text())["rows"]}
+    assert rows["sfkd"]["violation"]["v0"] == 0.0
+    assert rows["sfkd"]["violation"]["v1_tube"] == "certified"
+    assert rows["nominal"]["violation"]["v0"] is None
+    assert rows["nominal"]["violation"]["v1_tube"] == "conformal"
+    assert 0.0 <= rows["sfkd"]["breach_steps"] <= 1.0
+    assert rows["nominal"]["breach_steps"] is None
 
 
 def test_the_same_command_again_trains_nothing_and_ends_the_same(walked):
@@ -101,6 +123,13 @@ def test_load_gives_a_policy_without_heavy_imports(walked):
         act = jax.jit(policy.controller.act)
         control, state, info = act(policy.params, state, jnp.array([0.0, 0.3, 0.0, 10.0]), env, road)
         assert control.shape == (2,) and bool(info["healthy"]) and policy.certificate["valid"]
+        assert not bool(info["breach"]) and not bool(info["box_exit"])
+        far = jnp.array([0.0, 0.3, 0.0, 40.0])
+        _, state, info = act(policy.params, state, far, env, road)
+        assert bool(info["breach"]) and bool(info["box_exit"]) and int(info["breaches"]) == 1
+        from sfkd_jax.certification import Certificate, verify
+        verify(Certificate.from_document(policy.certificate), policy.params, model=policy.model)
+        assert "cvxpy" not in sys.modules
     """
     done = subprocess.run([sys.executable, "-c", textwrap.dedent(program)], cwd=place, capture_output=True, text=True)
     assert done.returncode == 0, done.stderr

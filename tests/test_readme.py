@@ -36,9 +36,35 @@ def test_an_experiment_is_a_script_an_expectation_and_a_result_that_meets_it(fol
     assert os.access(folder / "run.sh", os.X_OK)
     expected = json.loads((folder / "expected.json").read_text())
     rows = json.loads((folder / "results.json").read_text())["rows"]
-    found = {(row["scenario"], row["system"]): row for row in rows}
-    for scenario, systems in expected["rows"].items():
+    found = {(row.get("scenario"), row["system"]): row for row in rows}
+    for scenario, systems in expected.get("rows", {}).items():
         for system, bounds in systems.items():
             row = found[scenario, system]
-            assert within(row["rmse_m"]["mean"], bounds["rmse_m"]), (scenario, system)
-            assert within(row["ratio_to_oracle"], bounds["ratio_to_oracle"]), (scenario, system)
+            for name, limits in bounds.items():
+                assert within(named(row, name), limits), (scenario, system, name)
+
+
+def named(row, name):
+    """A measure by its path; "rmse_m" is its mean."""
+    value = row
+    for part in name.split("."):
+        value = value[part]
+    return value["mean"] if isinstance(value, dict) else value
+
+
+def test_a_low_certified_rate_costs_little_under_the_speed_loop():
+    """The curve of experiments/contraction: the lowest rate against the highest, and every certificate tight."""
+    folder = ROOT / "experiments" / "contraction"
+    expected = json.loads((folder / "expected.json").read_text())["speed"]
+    rows = json.loads((folder / "results.json").read_text())["rows"]
+    curve = [row for row in rows if row["inner_loop"] == "speed" and row["beta"] == expected["beta"]]
+    highest = max(curve, key=lambda row: row["rho"])
+    low = [row for row in curve if row["alpha"] <= expected["alpha"]]
+    assert low
+    for row in low:
+        predicted = row["open_loop"]["position_rmse_m"] / highest["open_loop"]["position_rmse_m"]
+        driven = named(row["closed_loop"]["s3"], "rmse_m") / named(highest["closed_loop"]["s3"], "rmse_m")
+        assert within(predicted, expected["prediction_ratio"]), row["run"]
+        assert within(driven, expected["rmse_ratio"]), row["run"]
+    assert all(1.0 <= row["tightness"] <= expected["tightness"] for row in rows)
+    assert all(row["closed_loop"]["s3"]["v0"] == 0.0 for row in rows)

@@ -98,7 +98,7 @@ def build_controller(
     corners = {name: certificate["boxes"][name] for name in ("state", "control", "env")}
     boxes = {f"{name}_{side}": tuple(box[k]) for name, box in corners.items() for k, side in enumerate(("low", "high"))}
     bounds = tuple(certificate["monitor"]["bounds"])
-    return control.monitored(planner, model, bounds=bounds, **boxes, **without(settings["monitor"]))
+    return control.monitored(planner, model, bounds=bounds, **boxes, **without(settings.get("monitor", {})))
 
 
 def build_scenario(settings: Settings, plant: vehicle.Vehicle, *, duration: float) -> scenarios.Family:

@@ -95,3 +95,16 @@ def test_no_key_is_used_twice():
     plant = vehicle.kinematic()
     with jax.debug_key_reuse(True):
         jax.jit(partial(datasets.generate, plant, driver(plant), segments=2, steps=2))(jax.random.key(0))
+
+
+def test_drives_under_switching_meet_the_levels_of_s3_and_obey_the_plant():
+    plant = vehicle.kinematic()
+    drive = jit(partial(datasets.generate_switching, plant, driver(plant), segments=40, steps=50))
+    data = jax.tree.map(np.asarray, drive(jax.random.key(0)))
+    levels = {(round(float(mu), 3), abs(round(float(wind), 3))) for mu, wind in data.envs.reshape(-1, 2)}
+    assert levels == {(0.9, 0.0), (0.6, 4.0), (0.3, 8.0)}
+    switches = np.any(np.diff(data.envs, axis=1) != 0, axis=2)
+    assert np.all(switches.sum(axis=1) >= 1)  # 5 s hold at least one switch every 3 s
+    assert len(np.unique(switches.argmax(axis=1))) > 10  # not always at the same moment
+    step = jit(jax.vmap(jax.vmap(plant.step)))
+    np.testing.assert_allclose(data.states[:, 1:], step(data.states[:, :-1], data.controls, data.envs), atol=2e-5)

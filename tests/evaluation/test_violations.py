@@ -214,12 +214,14 @@ def test_the_record_names_the_tube_it_speaks_of_and_is_null_where_nothing_is_cla
     assert violations(found, everything) == {
         "v0": 0.25, "v1": 0.0, "v1_tube": "certified", "v1_radius_m": 2.0, "v1_conformal": 0.25,
         "v1_conformal_radius_m": 1.0, "v1_level": 0.95, "v2": 0.25, "v2_threshold_m": 1.4, "segments": 4,
+        "window_error_m": {"median": 0.0, "p95": pytest.approx(0.85 * 1.5)},
     }  # fmt: skip
     measured = violations(found, Claims(conformal=tube(1.0), level=0.95))
     assert (measured["v0"], measured["v1"], measured["v1_tube"], measured["v2"]) == (None, 0.25, "conformal", None)
-    assert set(violations(found, Claims()).values()) == {None, 4}
+    nothing = violations(found, Claims())
+    assert {name for name, value in nothing.items() if value is not None} == {"segments", "window_error_m"}
     unmeasured = violations(None, everything)
-    assert all(unmeasured[name] is None for name in ("v0", "v1", "v1_conformal", "v2", "segments"))
+    assert all(unmeasured[name] is None for name in ("v0", "v1", "v1_conformal", "v2", "segments", "window_error_m"))
     assert unmeasured["v1_radius_m"] == 2.0
 
 

@@ -20,7 +20,7 @@ def certificate(alpha, separate, d_bar):
     return {
         "valid": True, "alpha": alpha, "alpha_separate": separate, "alpha_joint": alpha, "attack": alpha - 0.125,
         "tightness": alpha / (alpha - 0.125), "weights_sha256": "ab" * 32,
-        "d_bar": {"value": d_bar, "validation": d_bar / 2, "by_scenario": drives},
+        "lipschitz": {"body": 3.0}, "d_bar": {"value": d_bar, "validation": d_bar / 2, "by_scenario": drives},
         "tube": {"latent": radii, "physical": {"position_m": [0.1, 4.5]}, "ultimate": d_bar / (1 - alpha)},
     }  # fmt: skip
 
@@ -85,7 +85,8 @@ def test_a_record_holds_what_the_artefacts_say_and_nothing_else(made):
         "beta": 0.05, "seed": 0, "reason": None, "alpha": 0.75, "alpha_separate": 0.875, "alpha_joint": 0.75,
         "attack": 0.625, "tightness": 1.2, "d_bar": 0.5, "d_bar_validation": 0.25,
         "tube": {"steps": 20, "latent": 2 * (1 - 0.75**20), "position_m": 4.5},
-        "ultimate": 2.0, "ultimate_separate": 4.0, "ultimate_validation": 1.0, "coverage": {"s1": 0.96, "s3": 0.84},
+        "ultimate": 2.0, "ultimate_separate": 4.0, "ultimate_validation": 1.0,
+        "ultimate_body_validation": 3.0, "coverage": {"s1": 0.96, "s3": 0.84},
         "open_loop": {"steps": 20, "position_rmse_m": 0.3, "longitudinal_rmse_m": 0.25, "lateral_rmse_m": 0.15},
         "closed_loop": {"s3": {
             "rmse_m": {"mean": 0.02, "std": 0.005, "ci95": [0.017, 0.024], "median": 0.02, "p95": 0.03},

@@ -88,6 +88,7 @@ def _certified(certificate: dict[str, Any] | None) -> Record:
     bound, tube = dig(proof, "d_bar") or {}, dig(proof, "tube") or {}
     radii, position = tube.get("latent") or [], dig(tube, "physical", "position_m") or []
     drives = bound.get("by_scenario") or {}
+    on_validation = _ultimate(bound.get("validation"), alpha)
     return {
         "reason": reason,
         "alpha": alpha,
@@ -100,7 +101,8 @@ def _certified(certificate: dict[str, Any] | None) -> Record:
         "tube": {"steps": len(radii), "latent": _end(radii), "position_m": _end(position)},
         "ultimate": tube.get("ultimate"),
         "ultimate_separate": _ultimate(bound.get("value"), separate),
-        "ultimate_validation": _ultimate(bound.get("validation"), alpha),
+        "ultimate_validation": on_validation,
+        "ultimate_body_validation": _times(dig(proof, "lipschitz", "body"), on_validation),
         "coverage": {name: dig(drive, "coverage") for name, drive in sorted(drives.items())},
     }
 
@@ -108,6 +110,10 @@ def _certified(certificate: dict[str, Any] | None) -> Record:
 def _ultimate(d_bar: Any, alpha: Any) -> float | None:
     """d̄ / (1 − α), which no α of one or more has."""
     return d_bar / (1 - alpha) if is_number(d_bar) and is_number(alpha) and alpha < 1 else None
+
+
+def _times(left: Any, right: Any) -> float | None:
+    return left * right if is_number(left) and is_number(right) else None
 
 
 def _predicting(errors: dict[str, Any] | None) -> Record:
@@ -141,10 +147,13 @@ def _driven(row: dict[str, Any]) -> Record:
 
 
 def _best(records: list[Record]) -> Record | None:
-    """The smallest ultimate bound on validation drives, where there are several β to choose from."""
-    known = [record for record in records if is_number(record["ultimate_validation"])]
+    """The smallest ultimate bound on validation drives, where there are several β to choose from.
+
+    In units of the body state: the latent's own unit differs from run to run.
+    """
+    known = [record for record in records if is_number(record["ultimate_body_validation"])]
     several = len({record["beta"] for record in known}) > 1
-    return min(known, key=lambda record: record["ultimate_validation"]) if several else None
+    return min(known, key=lambda record: record["ultimate_body_validation"]) if several else None
 
 
 def _rivals(one: Record, other: Record) -> bool:

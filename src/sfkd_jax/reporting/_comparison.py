@@ -86,7 +86,7 @@ _MEASURED: _Columns = {
     "d̄ on\nvalidation": lambda record: upper(record["d_bar_validation"]),
     "Tube at T,\nlatent": lambda record: upper(record["tube"]["latent"]),
     "Ultimate\nbound": lambda record: upper(record["ultimate"]),
-    "Ultimate on\nvalidation": lambda record: upper(record["ultimate_validation"]),
+    "Ultimate on\nvalidation, body": lambda record: upper(record["ultimate_body_validation"]),
     "Tube at T,\nposition [m]": lambda record: upper(record["tube"]["position_m"]),
 }
 
@@ -131,8 +131,9 @@ def _tables(records: list[Record]) -> list[Block]:
 
 
 _MARKED = (
-    "Stressed: the smallest ultimate bound d̄ / (1 − α) on validation drives among runs that share one vehicle, one "
-    "inner loop and one ρ + β; this is what chooses β, and no calibration drive takes part in it."
+    "Stressed: the smallest ultimate bound of the body state, L d̄ / (1 − α), on validation drives among runs that "
+    "share one vehicle, one inner loop and one ρ + β; this is what chooses β, and no calibration drive takes part in "
+    "it. The latent's unit differs from run to run; the body state's does not."
 )
 _COVERED = (
     "Covered: share of drives, calibration aside, of which every one-step error is at most d̄, by the scenario they "
