@@ -68,7 +68,7 @@ def sfkd(
         residual_hidden, decoder_hidden, encoder_hidden: hidden widths.
         frame: "body" composes the pose on SE(2) outside z; "segment" is the paper's reading, the pose relative to
             the start of the window inside z.
-        residual: "sandwich", "free" (no bound: nothing is certified) or "none".
+        residual: "sandwich", "free" (no bound by construction) or "none".
         transport: learn Q(e), else the identity. environment: use e at all.
         soft_penalty: weight of the paper's hinge max(0, ||∂r/∂z||_2 − β)² in the training loss (eq:contr_loss).
 

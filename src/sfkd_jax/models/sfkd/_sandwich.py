@@ -66,7 +66,7 @@ class Sandwich(nn.Module):
 
 
 class Free(nn.Module):
-    """The same network with nothing bounded: an ablation, which no certificate accepts."""
+    """The same network with nothing bounded: an ablation, certified only if it happens to contract."""
 
     inputs: int
     hidden: Sequence[int]
