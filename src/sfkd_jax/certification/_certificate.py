@@ -122,7 +122,7 @@ def certify(
             claims = prove(weights, env_box, joint=mode == "joint", metric=metric)
     except Refuted as reason:
         raise CertificationRefused(str(reason)) from None
-    if claims.alpha > 1.0 - margin:
+    if not claims.alpha <= 1.0 - margin:  # so that NaN is refused as well
         shown = f"alpha = {claims.alpha:.6f} (rho {claims.rho:.6f}, beta {claims.beta:.6f}, kappa {claims.kappa:.3g})"
         raise CertificationRefused(f"{shown} is not below 1 by the margin {margin:g}")
     attacks = _attacks(model, params, weights, claims, env_box, attack_starts, seed)
