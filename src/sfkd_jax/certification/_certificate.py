@@ -154,8 +154,7 @@ def verify(certificate: Certificate, params: Params, *, model: Model) -> None:
     if fingerprint(params) != certificate.params_sha256:
         raise CertificateStale("the certificate is about other weights")
     weights = exported(model, params)
-    names = [name for name in Claims._fields if hasattr(certificate, name)]
-    claims = Claims(**{name: getattr(certificate, name) for name in names})
+    claims = Claims(**{name: getattr(certificate, name) for name in Claims._fields})
     try:
         with one_thread():
             claims_hold(claims, weights, certificate.env_box)
