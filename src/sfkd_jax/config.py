@@ -105,7 +105,7 @@ def register() -> None:
         "TrainingConfig",
         [
             ("loss", loss, field(default_factory=loss)),
-            *_fields(schema("Fit", training.fit, skip=("inspect",), batch=128, window=20)),
+            *_fields(schema("Fit", training.fit, skip=("inspect",), batch=128, window=20, data_share=1.0)),
         ],
     )
     store.store(group="training", name="schema", node=node)

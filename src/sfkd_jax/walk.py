@@ -12,6 +12,7 @@ from sfkd_jax import artefacts, assembly, policy, shelf
 from sfkd_jax.certification import progress
 from sfkd_jax.datasets import (
     Dataset,
+    first_share,
     generate,
     generate_switching,
     measure_space,
@@ -74,6 +75,7 @@ def _train(settings: dict[str, Any]) -> None:
     """Fit, then store the best weights and their prediction error on the test split."""
     place, options = shelf.run_directory(settings), dict(settings["training"])
     dataset, data_hash = ensure_dataset(settings)
+    dataset = dataset._replace(train=first_share(dataset.train, options.pop("data_share")))
     space = measure_space(dataset)
     model = assembly.build_model(settings["model"], space)
     loss, horizon = multi_step_loss(model, space, **options.pop("loss")), options.pop("window")

@@ -56,6 +56,18 @@ def split(
     return Dataset(*parts, env_low=jnp.asarray(env_low), env_high=jnp.asarray(env_high))
 
 
+def first_share(trajectories: Trajectory, share: float) -> Trajectory:
+    """The first of the trajectories, at least one: a smaller data set inside a larger one.
+
+    Raises:
+        ValueError: a share outside (0, 1].
+    """
+    if not 0.0 < share <= 1.0:
+        raise ValueError(f"training.data_share must lie in (0, 1], got {share}")
+    count = max(1, round(share * trajectories.states.shape[0]))
+    return jax.tree.map(lambda leaf: leaf[:count], trajectories)
+
+
 def measure_space(dataset: Dataset) -> Space:
     """Centres and half widths of s and u over the training split, of e over its box, moments of the increments."""
     train = dataset.train

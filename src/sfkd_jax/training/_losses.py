@@ -30,6 +30,7 @@ def multi_step_loss(
     model: Model,
     space: Space,
     *,
+    prediction: float = 1.0,
     one_step: float = 1.0,
     consistency: float = 0.1,
     reconstruction: float = 0.1,
@@ -38,7 +39,7 @@ def multi_step_loss(
 ) -> Loss:
     """Mean over windows and steps of the prediction error in physical units, with four terms beside it.
 
-        |x_k − x̂_k|²_W / (1 + γ (k − 1))² + λ_1 |x_k − x̂_{k|k−1}|²_{W}·10²
+        λ_p |x_k − x̂_k|²_W / (1 + γ (k − 1))² + λ_1 |x_k − x̂_{k|k−1}|²_{W}·10²
             + λ_c |d_k|² + λ_r |s − C Φ(x)|² + λ_t |Φ(x, e') − T(e → e') Φ(x, e)|²
 
     W measures position in units of 0.01 m at the first step; a prediction's error grows about linearly with k, so
@@ -47,6 +48,7 @@ def multi_step_loss(
 
     Args:
         model, space: what is trained and its scales.
+        prediction: λ_p, on free-running predictions; 0 leaves the one-step loss alone.
         one_step: λ_1, on predictions from the true state one step before.
         consistency: λ_c, on the one-step latent defect. reconstruction: λ_r. transport: λ_t, on
             Φ(x, e') − T(e → e') Φ(x, e) with e' another window's environment.
@@ -84,6 +86,7 @@ def multi_step_loss(
         parts = jax.vmap(window, in_axes=(None, 0, 0))(params, batch, others)
         parts = {name: jnp.mean(part) for name, part in parts.items()}
         weights = {
+            "prediction": prediction,
             "one_step": one_step,
             "consistency": consistency,
             "reconstruction": reconstruction,
