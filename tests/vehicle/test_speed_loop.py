@@ -27,7 +27,7 @@ def test_resistance_holds_the_speed_back_by_itself_over_the_gain(vehicle, gain, 
     assert 12.0 - speed == pytest.approx(resistance / gain, rel=1e-2)
 
 
-@pytest.mark.parametrize("which", ["step", "nominal"])
+@pytest.mark.parametrize("which", ["step", "nominal", "nominal_derivative"])
 @pytest.mark.parametrize(("command", "acceleration"), [(1e3, 3.0), (-1e3, -6.0), (10.4, 0.8), (9.5, -1.0)])
 def test_the_loop_asks_for_what_the_actuator_can_give(vehicle, which, command, acceleration):
     state, env, steering = state_at(vehicle, 10.0), jnp.array(ENV), 0.1

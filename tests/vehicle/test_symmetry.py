@@ -11,7 +11,7 @@ from sfkd_jax.vehicle import with_speed_loop
 
 
 @pytest.mark.usefixtures("x64")
-@pytest.mark.parametrize("which", ["step", "nominal"])
+@pytest.mark.parametrize("which", ["step", "nominal", "nominal_derivative"])
 def test_the_mirrored_drive_is_the_mirror_of_the_drive(vehicle, which, many, sweep):
     step = many(getattr(vehicle, which))
     drawn = sweep(vehicle, 64)
@@ -73,3 +73,15 @@ def test_gradients_are_the_limits_of_difference_quotients(factory, many, sweep):
         many(vehicle.step)(*(x + h * t for x, t in zip(rows, tangents, strict=True))) for h in (1e-6, -1e-6)
     )
     np.testing.assert_allclose(slope, (ahead - behind) / 2e-6, rtol=1e-4, atol=1e-4)
+
+
+@pytest.mark.usefixtures("x64")
+def test_the_nominal_derivative_is_the_limit_of_the_nominal_step_and_knows_nothing_of_hidden_states(
+    factory, many, sweep
+):
+    vehicle, drawn = factory(dt=1e-6), sweep(factory(), 64)
+    states = drawn.states.at[:, 3].add(1.0)
+    rates = many(vehicle.nominal_derivative)(states, drawn.controls, drawn.envs)
+    quotient = (many(vehicle.nominal)(states, drawn.controls, drawn.envs) - states) / 1e-6
+    np.testing.assert_allclose(rates[:, :4], quotient[:, :4], rtol=0, atol=1e-3)
+    assert bool(jnp.all(rates[:, 4:] == 0.0))

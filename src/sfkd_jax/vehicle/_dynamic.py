@@ -75,6 +75,7 @@ def dynamic(
         creep_speed: v_0, below it the tyres are regularised [m/s].
     """
     length = front_length + rear_length
+    bicycle = nominal_derivative(length, rear_length)
 
     def derivative(state: State, control: Control, env: Environment) -> State:
         yaw, speed, side_speed, yaw_rate, steering = state[2], state[3], state[4], state[5], state[6]
@@ -115,7 +116,8 @@ def dynamic(
         state_names=("p_x", "p_y", "yaw", "v", "v_y", "yaw_rate", "steering"),
         step=forward_rk4(derivative, dt=dt, substeps=substeps),
         derivative=derivative,
-        nominal=_quasi_steady(forward_rk4(nominal_derivative(length, rear_length), dt=dt), length, rear_length),
+        nominal=_quasi_steady(forward_rk4(bicycle, dt=dt), length, rear_length),
+        nominal_derivative=_unmoved(bicycle),
         control_low=(-STEERING_LIMIT, ACCELERATION_RANGE[0]),
         control_high=(STEERING_LIMIT, ACCELERATION_RANGE[1]),
         wind_force=wind_force,
@@ -144,3 +146,12 @@ def _quasi_steady(bicycle: Step, length: float, rear_length: float) -> Step:
         return jnp.concatenate([after, jnp.stack([rear_length * yaw_rate, yaw_rate, control[0]])])
 
     return step
+
+
+def _unmoved(bicycle: Step) -> Step:
+    """dx/dt of a 4-state bicycle on the 7-state vector; it knows nothing of v_y, ω and δ: their rates are 0."""
+
+    def derivative(state: State, control: Control, env: Environment) -> State:
+        return jnp.concatenate([bicycle(state[:4], control, env), jnp.zeros(3)])
+
+    return derivative

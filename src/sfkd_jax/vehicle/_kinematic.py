@@ -64,6 +64,7 @@ def kinematic(
         rolling: rolling resistance coefficient [-].
     """
     length = front_length + rear_length
+    bicycle = nominal_derivative(length, rear_length)
 
     def derivative(state: State, control: Control, env: Environment) -> State:
         yaw, speed = state[2], state[3]
@@ -96,7 +97,8 @@ def kinematic(
         state_names=("p_x", "p_y", "yaw", "v"),
         step=forward_rk4(derivative, dt=dt, substeps=substeps),
         derivative=derivative,
-        nominal=forward_rk4(nominal_derivative(length, rear_length), dt=dt),
+        nominal=forward_rk4(bicycle, dt=dt),
+        nominal_derivative=bicycle,
         control_low=(-STEERING_LIMIT, ACCELERATION_RANGE[0]),
         control_high=(STEERING_LIMIT, ACCELERATION_RANGE[1]),
         wind_force=wind_force,

@@ -25,6 +25,7 @@ class Vehicle(NamedTuple):
         step: (x, u, e) -> x one sampling period later.
         derivative: dx/dt of the plant before any wrapper.
         nominal: the textbook kinematic bicycle without friction or wind, as a step on the same state.
+        nominal_derivative: dx/dt of that bicycle, for models that add to it.
         control_low, control_high: actuator limits.
         wind_force: c_w of `side_force` [N s²/m²].
         speed_loop: whether u_2 is a speed command [m/s] instead of an acceleration [m/s²].
@@ -37,6 +38,7 @@ class Vehicle(NamedTuple):
     step: Step
     derivative: Step
     nominal: Step
+    nominal_derivative: Step
     control_low: tuple[float, float]
     control_high: tuple[float, float]
     wind_force: float
@@ -111,6 +113,7 @@ def with_speed_loop(vehicle: Vehicle, *, gain: float = 1.0) -> Vehicle:
     return vehicle._replace(
         step=close(vehicle.step),
         nominal=close(vehicle.nominal),
+        nominal_derivative=close(vehicle.nominal_derivative),
         control_low=(vehicle.control_low[0], SPEED_RANGE[0]),
         control_high=(vehicle.control_high[0], SPEED_RANGE[1]),
         speed_loop=True,
