@@ -3,11 +3,27 @@
 from __future__ import annotations
 
 import time
+from pathlib import Path
 from typing import Any
 
 from sfkd_jax import artefacts, assembly, policy, shelf, walk
-from sfkd_jax.certification import CertificateStale, CertificationRefused, issue
+from sfkd_jax.certification import (
+    CertificateStale,
+    CertificationRefused,
+    certify_incremental,
+    claims_a_rate,
+    issue,
+)
 from sfkd_jax.config import door
+
+CERTIFICATE, INCREMENTAL = "certificate.json", "incremental.json"
+"""A rate of a continuous flow lies apart: other doors take a certificate for one with tubes and bounds of a monitor."""
+
+
+def document_in(place: Path) -> Path:
+    """Where what is proved of a run lies, or will lie."""
+    flow = place / INCREMENTAL
+    return flow if flow.exists() else place / CERTIFICATE
 
 
 def renew(settings: dict[str, Any]) -> dict[str, Any]:
@@ -16,35 +32,48 @@ def renew(settings: dict[str, Any]) -> dict[str, Any]:
     place = shelf.run_directory(settings)
     trained = walk.ensure_policy(settings)
     weights = policy.weights_hash(place)
-    dataset, _ = walk.ensure_dataset(settings)
-    options = {name: value for name, value in settings["certification"].items() if name != "renew"}
+    flow = claims_a_rate(trained.model, trained.params)
     try:
-        document = issue(
-            trained.model,
-            trained.params,
-            validation=dataset.validation,
-            calibration=dataset.calibration,
-            held_out=walk.held_out_drives(settings, dataset),
-            boxes=shelf.boxes(dataset),
-            sensor_noise=tuple(settings["evaluation"]["observation_noise"]),
-            **assembly.without(options),
-        )
+        document = _rate(settings, trained) if flow else _tubes(settings, trained)
     except CertificationRefused as reason:
         document = {"valid": False, "reason": str(reason)}
     versions = artefacts.versions() | document.get("versions", {})
     document |= {"weights_sha256": weights, "versions": versions}
     document["seconds"] = time.perf_counter() - began
-    artefacts.write_json(place / "certificate.json", document)
+    kept, other = (INCREMENTAL, CERTIFICATE) if flow else (CERTIFICATE, INCREMENTAL)
+    (place / other).unlink(missing_ok=True)
+    artefacts.write_json(place / kept, document)
     verdict = f"alpha {document['alpha']:.6f}" if document["valid"] else f"refused: {document['reason']}"
     shelf.say(f"certificate: {verdict}")
     return document
+
+
+def _rate(settings: dict[str, Any], trained: policy.Policy) -> dict[str, Any]:
+    """What is proved of a continuous flow: how fast it contracts, and no tube."""
+    return certify_incremental(trained.model, trained.params, dt=settings["vehicle"]["dt"])
+
+
+def _tubes(settings: dict[str, Any], trained: policy.Policy) -> dict[str, Any]:
+    """What is proved of a model's steps, and what is measured on the data of the run."""
+    dataset, _ = walk.ensure_dataset(settings)
+    options = {name: value for name, value in settings["certification"].items() if name != "renew"}
+    return issue(
+        trained.model,
+        trained.params,
+        validation=dataset.validation,
+        calibration=dataset.calibration,
+        held_out=walk.held_out_drives(settings, dataset),
+        boxes=shelf.boxes(dataset),
+        sensor_noise=tuple(settings["evaluation"]["observation_noise"]),
+        **assembly.without(options),
+    )
 
 
 def run(settings: dict[str, Any]) -> dict[str, Any]:
     """Certify, unless a certificate about other weights lies there (then `certification.renew=true`)."""
     walk.ensure_policy(settings)
     place = shelf.run_directory(settings)
-    path = place / "certificate.json"
+    path = document_in(place)
     if path.exists() and not settings["certification"]["renew"]:
         about = artefacts.read_json(path, keys=("weights_sha256",))["weights_sha256"]
         if about != policy.weights_hash(place):
@@ -53,8 +82,9 @@ def run(settings: dict[str, Any]) -> dict[str, Any]:
     if not document["valid"]:
         raise CertificationRefused(document["reason"])
     keys = ("valid", "alpha", "alpha_separate", "rho", "beta", "tightness", "seconds")
-    short = {"certificate": str(path), "reason": None, "d_bar": document["d_bar"]["value"]}
-    return short | {key: document[key] for key in keys}
+    bound = document.get("d_bar", {"value": None})
+    short = {"certificate": str(document_in(place)), "reason": None, "d_bar": bound["value"]}
+    return short | {key: document.get(key) for key in keys}
 
 
 if __name__ == "__main__":

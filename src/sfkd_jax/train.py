@@ -20,7 +20,7 @@ def run(settings: dict[str, Any]) -> dict[str, Any]:
     return {
         "run": str(place),
         "checkpoint": str(place / "checkpoints"),
-        "certificate": str(place / "certificate.json"),
+        "certificate": str(certify.document_in(place)),
         "results": results["results"],
         "report": pages["report"],
         "open_loop_rmse_m": artefacts.read_json(place / "open_loop.json")["position_rmse_m"],

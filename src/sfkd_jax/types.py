@@ -121,6 +121,41 @@ class Explicit(NamedTuple):
     declared: Declared
 
 
+class Incremental(NamedTuple):
+    """A state equation in continuous time, and what is to prove that it contracts.
+
+    ds/dt = A_0 s + A σ(W s + c) + g(u, e) in scaled units of s, per second; σ entry by entry with slopes in [0, 1].
+
+    Attributes:
+        linear: A_0. outer: A = [A_1 … A_M]. inner: W = [W_1; …; W_M].
+        metric: P, symmetric, proposed. multipliers: λ of the diagonal Λ, proposed.
+        declared: the activation and the kind of transport.
+    """
+
+    linear: Float[Array, "body body"]
+    outer: Float[Array, "body hidden"]
+    inner: Float[Array, "hidden body"]
+    metric: Float[Array, "body body"]
+    multipliers: Float[Array, " hidden"]
+    declared: Declared
+
+
+class LinearPredictor(NamedTuple):
+    """z⁺ = A z + B u + d κ + c, x = C z + o, z = lift(x): linear in a lift of the state along a path, for one e.
+
+    x is a `State` whose pose is (progress [m], distance left of the path [m], yaw against it [rad]); κ is the path's
+    curvature [1/m].
+    """
+
+    lift: Callable[[State], Float[Array, " rank"]]
+    A: Float[Array, "rank rank"]
+    B: Float[Array, "rank control"]
+    d: Float[Array, " rank"]
+    c: Float[Array, " rank"]
+    C: Float[Array, "state rank"]
+    o: State
+
+
 class Model(NamedTuple):
     """A rollout model as pure functions over pytrees.
 
@@ -133,8 +168,11 @@ class Model(NamedTuple):
         transport: (fiber, fiber_next, latent) -> latent, on a switch e -> e'.
         observe: (fiber, latent, state) -> the latent a perfect model would hold at `state`, in `latent`'s frame.
         vector: latent -> z, the coordinates a contraction claim is about, shape (rank,).
-        explicit: params -> `Explicit`, or None for a model about which nothing can be certified.
+        explicit: params -> `Explicit`, or `Incremental` for a model in continuous time about whose rate alone something
+            can be proved, or None for a model about which nothing can be certified.
         penalty: (fiber, latent, control) -> an extra term of the training loss, or None.
+        identify: (training, validation trajectories, key) -> params, by regression at once, or None.
+        linear: fiber -> `LinearPredictor`, or None for a model that is not linear in a lift.
     """
 
     init: Callable[[Key], Params]
@@ -145,8 +183,10 @@ class Model(NamedTuple):
     transport: Callable[[Fiber, Fiber, Latent], Latent]
     observe: Callable[[Fiber, Latent, State], Latent]
     vector: Callable[[Latent], Float[Array, " rank"]]
-    explicit: Callable[[Params], Explicit] | None = None
+    explicit: Callable[[Params], Explicit | Incremental] | None = None
     penalty: Callable[[Fiber, Latent, Control], Scalar] | None = None
+    identify: Callable[[Trajectory, Trajectory, Key], Params] | None = None
+    linear: Callable[[Fiber], LinearPredictor] | None = None
 
 
 class Controller(NamedTuple):

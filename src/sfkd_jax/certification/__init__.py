@@ -20,6 +20,11 @@ from sfkd_jax.certification._core import is_positive_definite as is_positive_def
 from sfkd_jax.certification._core import norm_upper as norm_upper
 from sfkd_jax.certification._environments import cover as cover
 from sfkd_jax.certification._exported import CertificationRefused as CertificationRefused
+from sfkd_jax.certification._incremental import attack_growth as attack_growth
+from sfkd_jax.certification._incremental import certify_incremental as certify_incremental
+from sfkd_jax.certification._incremental import check_incremental as check_incremental
+from sfkd_jax.certification._incremental import claims_a_rate as claims_a_rate
+from sfkd_jax.certification._incremental import incremental_rate as incremental_rate
 from sfkd_jax.certification._issue import issue as issue
 from sfkd_jax.certification._issue import progress as progress
 from sfkd_jax.certification._proposals import lipschitz_upper as lipschitz_upper

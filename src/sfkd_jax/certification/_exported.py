@@ -11,13 +11,13 @@ import jax
 import numpy as np
 from threadpoolctl import ThreadpoolController
 
-from sfkd_jax.types import Model, Params, Samples
+from sfkd_jax.types import Incremental, Model, Params, Samples
 
 ACTIVATIONS = ("tanh", "relu", "sigmoid", "softplus", "elu")
 """Those whose slopes lie in [0, 1] everywhere; gelu and silu leave it."""
 TRANSPORTS = ("identity", "rotation")
 Exported: TypeAlias = Any
-"""An `Explicit` whose leaves are float64 numpy arrays."""
+"""An `Explicit` (or an `Incremental`) whose leaves are float64 numpy arrays."""
 
 
 class CertificationRefused(Exception):
@@ -28,21 +28,43 @@ def exported(model: Model, params: Params) -> Exported:
     """The explicit weights in float64, as the model serves them.
 
     Raises:
-        CertificationRefused: none, not finite, sampled operators only, an unknown activation or transport.
+        CertificationRefused: none, not finite, sampled operators only, an unknown activation or transport, or weights
+            of a flow in continuous time.
     """
-    if model.explicit is None:
-        raise CertificationRefused("this model exposes no explicit weights to certify")
-    weights = jax.tree.map(lambda leaf: np.asarray(leaf, dtype=np.float64), jax.jit(model.explicit)(params))
-    if not all(np.all(np.isfinite(leaf)) for leaf in jax.tree.leaves(weights)):
-        raise CertificationRefused("the weights are not finite")
+    weights = served(model, params)
+    if isinstance(weights, Incremental):
+        raise CertificationRefused("what is proved of a continuous flow is its rate; no tube of its steps follows")
+    require_finite(weights)
     if isinstance(weights.operators, Samples):
         count = len(weights.operators.operators)
         raise CertificationRefused(f"grid-only evidence: {count} sampled environments say nothing about those between")
-    if weights.declared.activation not in ACTIVATIONS:
-        raise CertificationRefused(f"slopes of the activation {weights.declared.activation!r} are not known in [0, 1]")
+    require_slopes(weights)
     if weights.declared.transport not in TRANSPORTS:
         raise CertificationRefused(f"the transport {weights.declared.transport!r} is not known to be nonexpansive")
     return weights
+
+
+def served(model: Model, params: Params) -> Exported:
+    """What the model serves, in float64, unchecked.
+
+    Raises:
+        CertificationRefused: nothing.
+    """
+    if model.explicit is None:
+        raise CertificationRefused("this model exposes no explicit weights to certify")
+    return jax.tree.map(lambda leaf: np.asarray(leaf, dtype=np.float64), jax.jit(model.explicit)(params))
+
+
+def require_finite(weights: Exported) -> None:
+    """Refuse weights that are not numbers."""
+    if not all(np.all(np.isfinite(leaf)) for leaf in jax.tree.leaves(weights)):
+        raise CertificationRefused("the weights are not finite")
+
+
+def require_slopes(weights: Exported) -> None:
+    """Refuse an activation that may leave the sector that every claim assumes."""
+    if weights.declared.activation not in ACTIVATIONS:
+        raise CertificationRefused(f"slopes of the activation {weights.declared.activation!r} are not known in [0, 1]")
 
 
 def fingerprint(params: Params) -> str:

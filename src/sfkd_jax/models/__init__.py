@@ -1,7 +1,21 @@
 """Belief: every file one factory that returns a `Model`; `FACTORIES` is the registry by name."""
 
+from sfkd_jax.models._control_synth import control_synth as control_synth
+from sfkd_jax.models._icode import icode as icode
+from sfkd_jax.models._icode_mppi import icode_mppi as icode_mppi
+from sfkd_jax.models._koopman import koopman as koopman
+from sfkd_jax.models._neural_ode import neural_ode as neural_ode
 from sfkd_jax.models._physics import physics as physics
+from sfkd_jax.models._r2dn import r2dn as r2dn
 from sfkd_jax.models.sfkd import sfkd as sfkd
 
-FACTORIES = {"sfkd": sfkd}
+FACTORIES = {
+    "sfkd": sfkd,
+    "neural_ode": neural_ode,
+    "icode": icode,
+    "icode_mppi": icode_mppi,
+    "control_synth": control_synth,
+    "r2dn": r2dn,
+    "koopman_mpc": koopman,
+}
 """Learned models: name -> factory(space, *, settings)."""

@@ -1,0 +1,157 @@
+"""ControlSynth neural ordinary differential equation: contracting by construction, inputs added from outside."""
+
+from __future__ import annotations
+
+from typing import NamedTuple, cast
+
+import flax.linen as nn
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+from sfkd_jax.models._continuous import continuous, network
+from sfkd_jax.types import Control, Declared, Environment, Incremental, Key, Model, Params, Space
+
+GAIN = 0.3
+"""Initial size of the networks in the state: their decay is GAIN² per second, slow against the sampling period."""
+ROUNDING = 1e-5
+"""Of the size of the matrices, added to the rate: so that what is exact on paper still holds in float32."""
+
+
+class Synthesis(NamedTuple):
+    """L s + Σ_j A_j tanh(W_j s + c_j), the M networks stacked.
+
+    Attributes:
+        linear: L. outer: [A_1 … A_M]. inner: [W_1; …; W_M]. offsets: [c_1; …; c_M].
+    """
+
+    linear: Float[Array, "out body"]
+    outer: Float[Array, "out hidden"]
+    inner: Float[Array, "hidden body"]
+    offsets: Float[Array, " hidden"]
+
+    def __call__(self, body: Float[Array, " body"]) -> Float[Array, " out"]:
+        """The value at one scaled body state."""
+        return self.linear @ body + self.outer @ jnp.tanh(self.inner @ body + self.offsets)
+
+
+class ControlSynthFiber(NamedTuple):
+    """The matrices as they are multiplied by; e is one more input.
+
+    Attributes:
+        change: of ds/dt. twist: of the output. inputs: parameters of the input network. env: scaled e.
+    """
+
+    change: Synthesis
+    twist: Synthesis
+    inputs: Params
+    env: Environment
+
+
+def control_synth(
+    space: Space,
+    *,
+    dt: float = 0.1,
+    networks: int = 2,
+    width: int = 48,
+    rate: float = 0.05,
+    input_hidden: tuple[int, ...] = (96, 96),
+    environment: bool = True,
+) -> Model:
+    """Networks of the state beside a network of the input, contracting at a hard rate, solved by RK4 at dt.
+
+        ds/dt = A_0 s + Σ_j A_j tanh(W_j s + c_j) + g(u, e),   twist = C_0 s + Σ_j C_j tanh(V_j s + d_j) + h(u, e)
+
+    By construction, for all weights, two solutions under the same inputs approach each other at γ = `rate`, in the
+    metric of a learned P = T'T: with A = [A_1 … A_M], W = [W_1; …; W_M] and a learned diagonal Λ > 0,
+
+        [ A_0'P + P A_0 + 2γP   PA + W'Λ ]
+        [          ·               −2Λ   ]  ≤  0,   as  T A_0 T⁻¹ = −γI − ¼ BB' − ½ XX' + (Y − Y'),
+                                                        T A = (B − Ŵ') Λ^½,   W T⁻¹ = Λ^(−½) Ŵ
+
+    (Schur's complement of −2Λ leaves −XX'). B, X, Y, Ŵ and Λ are free, T is triangular and well conditioned. The
+    claim is about the continuous flow, not about its RK4 discretisation. Inputs are only added, as in the original:
+    that is a limit of the structure, and it is kept. There the input is a second state of an autonomous system, and
+    the published code has neither A_j nor a matrix inequality; the offsets c_j, d_j leave the proof as it is.
+
+    Args:
+        space: measured scales; fixes all sizes.
+        dt: sampling period [s], the solver's step in training and in use.
+        networks: M, of the state, and as many of the output. width: of each.
+        rate: γ [1/s].
+        input_hidden: widths of the network that holds g and h.
+        environment: use e at all.
+
+    Raises:
+        ValueError: no network, or a rate that is not positive.
+
+    Source: Mei, Zheng and Li, NeurIPS 2024, arXiv 2411.02292.
+    """
+    if networks < 1 or width < 1:
+        raise ValueError(f"model.networks and model.width must be at least 1, got {networks} and {width}")
+    if not 0.0 < rate < float("inf"):
+        raise ValueError(f"model.rate must be positive, got {rate}")
+    body, hidden = space.body_mean.shape[0], networks * width
+    control = space.control_mean.shape[0]
+    inputs = network(input_hidden, 3 + body, (nn.tanh,) * len(input_hidden), last=0.1)
+
+    def init(key: Key) -> Params:
+        keys = jax.random.split(key, 6)
+        return {
+            "free": {
+                "B": 0.1 * jax.random.normal(keys[0], (body, hidden)),
+                "W": jax.random.normal(keys[1], (hidden, body)),
+                "X": 0.1 * jnp.eye(body),
+                "Y": jnp.zeros((body, body)),
+                "T": jnp.zeros((body, body)),
+                "log_multipliers": jnp.zeros(hidden),
+                "offsets": jax.random.uniform(keys[2], (hidden,), minval=-1.0),
+            },
+            "twist": {
+                "linear": jnp.zeros((3, body)),
+                "outer": 0.1 * hidden**-0.5 * jax.random.normal(keys[3], (3, hidden)),
+                "inner": jax.random.normal(keys[4], (hidden, body)),
+                "offsets": jnp.linspace(-1.0, 1.0, hidden),
+            },
+            "inputs": inputs.init(keys[5], jnp.zeros(control + space.env_mean.shape[0]))["params"],
+        }
+
+    def explicit(params: Params) -> Incremental:
+        return contracting(params["free"], rate, Declared("tanh", "identity", control))
+
+    def fiber(params: Params, env: Environment) -> ControlSynthFiber:
+        found = explicit(params)
+        change = Synthesis(found.linear, found.outer, found.inner, params["free"]["offsets"])
+        return ControlSynthFiber(change, Synthesis(**params["twist"]), params["inputs"], env)
+
+    def rates(fiber: ControlSynthFiber, body: Float[Array, " body"], control: Control) -> Float[Array, " rates"]:
+        read = jnp.concatenate([control, fiber.env])
+        added = cast(jax.Array, inputs.apply({"params": fiber.inputs}, read))
+        return jnp.concatenate([fiber.twist(body), fiber.change(body)]) + added
+
+    model = continuous(space, dt=dt, init=init, fiber=fiber, rates=rates, environment=environment)
+    return model._replace(explicit=explicit)
+
+
+def contracting(free: Params, rate: float, declared: Declared) -> Incremental:
+    """Free matrices made into those of a state equation that contracts at `rate` [1/s]: see `control_synth`."""
+    body, hidden = free["B"].shape
+    entries = jnp.tanh(free["T"])  # so that the metric stays well conditioned
+    T = jnp.tril(entries, -1) + jnp.diag(jnp.exp(jnp.diag(entries)))
+    T_inverse, P = jnp.linalg.inv(T), T.T @ T
+    roots = GAIN * hidden**-0.5 * jnp.exp(0.5 * free["log_multipliers"])
+    B, W = hidden**-0.5 * free["B"], GAIN * hidden**-0.5 * free["W"]
+    A = B - W.T
+    linear = free["Y"] - free["Y"].T - 0.25 * B @ B.T - 0.5 * free["X"] @ free["X"].T
+    norms = jnp.stack([jnp.linalg.norm(part) for part in (linear, A, W)])
+    size = rate + jnp.sum(norms) + jnp.sum(norms[1:] ** 2)
+    slack = ROUNDING * jnp.sum(T**2) * jnp.sum(T_inverse**2) * size
+    linear -= (rate + jax.lax.stop_gradient(slack)) * jnp.eye(body)
+    return Incremental(
+        linear=T_inverse @ linear @ T,
+        outer=T_inverse @ A * roots,
+        inner=W @ T / roots[:, None],
+        metric=0.5 * (P + P.T),
+        multipliers=roots**2,
+        declared=declared,
+    )

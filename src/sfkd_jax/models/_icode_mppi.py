@@ -1,0 +1,35 @@
+"""A textbook model with a learned residual that is affine in control and environment."""
+
+from __future__ import annotations
+
+from sfkd_jax.models._continuous import Conditioned, continuous
+from sfkd_jax.models._icode import affine_rates, softplus
+from sfkd_jax.types import Control, Model, Space, State, Step
+
+
+def icode_mppi(
+    space: Space, *, nominal: Step, dt: float = 0.1, hidden: tuple[int, ...] = (64, 64), environment: bool = True
+) -> Model:
+    """Known dynamics plus a residual f(s) + G(s) [u; e], the sum solved by RK4 at dt.
+
+        ẋ = f_nom(x, u) + f(s) + G(s) [u; e],   the pose part of the residual in the frame of the body
+
+    f and G are softplus networks that start near 0: training starts from the known dynamics. The original's residual
+    is f(x) + G(x) u; e joins u.
+
+    Args:
+        space: measured scales; fixes all sizes.
+        nominal: (x, u, e) -> dx/dt of the known dynamics in physical units, passed in by the caller (models never
+            import the vehicle). A model that does not see e gives it the centre of the environment box.
+        dt: sampling period [s], the solver's step in training and in use.
+        hidden: widths of f and of G.
+        environment: use e at all; if not, G(s) [u; 0].
+
+    Source: Song et al., arXiv 2605.03260, eqs. 10 and 11.
+    """
+    init, rates = affine_rates(space, hidden, (softplus,) * len(hidden), last=1e-3)
+
+    def known(fiber: Conditioned, state: State, control: Control) -> State:
+        return nominal(state, control, space.env_mean + space.env_scale * fiber.env)
+
+    return continuous(space, dt=dt, init=init, fiber=Conditioned, rates=rates, environment=environment, known=known)

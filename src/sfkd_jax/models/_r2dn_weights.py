@@ -1,0 +1,95 @@
+"""The learned weights of R2DN in explicit form, with the contraction constraint in force."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import flax.linen as nn
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+from sfkd_jax.models.sfkd._bounds import bounded
+from sfkd_jax.models.sfkd._sandwich import Sandwich, Weights
+
+SMALL = nn.initializers.variance_scaling(0.1, "fan_in", "truncated_normal")
+
+
+class Affine(NamedTuple):
+    """The biases of all layers of a network, one after the other, as [u; e] gain + offset."""
+
+    gain: Float[Array, "inputs all"]
+    offset: Float[Array, " all"]
+
+
+class Shared(NamedTuple):
+    """Plain weights: nothing is left to bound.
+
+    Attributes:
+        A: of z⁺ = A z + W_L tanh(… W_1 z …).
+        feedback: W_1 = V_1 C₁, …, W_L = B₁ V_L with V of φ, and φ's multipliers, which prove α for the whole step.
+        feedback_inputs, decoder_inputs: biases; the last of the feedback is B₂ [u; e] + b.
+        decoder: of the pose increment. readout, centre: of the body state.
+    """
+
+    A: Float[Array, "rank rank"]
+    feedback: Weights
+    feedback_inputs: Affine
+    decoder: Weights
+    decoder_inputs: Affine
+    readout: Float[Array, "body rank"]
+    centre: Float[Array, " body"]
+
+
+class Interconnection(nn.Module):
+    """Everything learned but the encoder.
+
+    Attributes:
+        rank, body: sizes of z and s. inputs: size of [u; e].
+        hidden, decoder_hidden: widths. alpha: α.
+    """
+
+    rank: int
+    body: int
+    inputs: int
+    hidden: Sequence[int]
+    decoder_hidden: Sequence[int]
+    alpha: float
+
+    @nn.compact
+    def __call__(self) -> Shared:
+        """Explicit weights."""
+        square = (self.rank, self.rank)
+        A, B1, C1 = contracting(
+            self.param("A", lambda key, shape: jnp.eye(*shape), square),
+            self.param("B1", SMALL, square),
+            self.param("C1", SMALL, square),
+            self.alpha,
+        )
+        phi = Sandwich(self.rank, self.hidden, self.rank, name="phi")(1.0)
+        first, *middle, last = phi.matrices
+        bound = jnp.exp(self.param("log_decoder_bound", nn.initializers.constant(1.0), ()))
+        return Shared(
+            A=A,
+            feedback=Weights((first @ C1, *middle, B1 @ last), phi.multipliers),
+            feedback_inputs=self._affine("feedback", sum(self.hidden) + self.rank, SMALL),
+            decoder=Sandwich(self.rank, self.decoder_hidden, 3, name="decoder")(bound),
+            decoder_inputs=self._affine("decoder", sum(self.decoder_hidden) + 3, nn.initializers.lecun_normal()),
+            readout=bounded(self.param("readout", nn.initializers.orthogonal(), (self.body, self.rank)), 1.0),
+            centre=self.param("centre", nn.initializers.zeros, (self.body,)),
+        )
+
+    def _affine(self, name: str, size: int, spread: nn.initializers.Initializer) -> Affine:
+        """Learned biases of one network."""
+        gain = self.param(f"{name}_gain", spread, (self.inputs, size))
+        return Affine(gain, self.param(f"{name}_offset", nn.initializers.zeros, (size,)))
+
+
+def contracting(
+    A: Float[Array, "rank rank"], B1: Float[Array, "rank w"], C1: Float[Array, "v rank"], alpha: float
+) -> tuple[Float[Array, "rank rank"], Float[Array, "rank w"], Float[Array, "v rank"]]:
+    """(α Ã, B̃₁, α C̃₁) from free matrices, [Ã B̃₁; C̃₁ 0] = [A B₁; C₁ 0] / max(1, its Gram bound): norm at most 1."""
+    zeros = jnp.zeros((C1.shape[0], B1.shape[1]))
+    block = bounded(jnp.block([[A, B1], [C1, zeros]]), 1.0)
+    rows, columns = A.shape
+    return alpha * block[:rows, :columns], block[:rows, columns:], alpha * block[rows:, :columns]

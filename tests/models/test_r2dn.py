@@ -1,0 +1,190 @@
+"""R2DN: a hard contraction factor for the whole interconnection, under attack, and exact where it is known."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from helpers import ENV_HIGH, ENV_LOW, at, driven, jit, same, space
+
+from sfkd_jax import certification, models
+from sfkd_jax.models._r2dn_weights import contracting
+
+ALPHA, RANK = 0.97, 6
+SETTINGS = {"rank": RANK, "hidden": (RANK,), "decoder_hidden": (8,), "encoder_hidden": 8, "alpha": ALPHA}
+BOX = (ENV_LOW, ENV_HIGH)
+FLOAT32 = 1e-5
+MODEL = models.r2dn(space(), **SETTINGS)
+BLIND = models.r2dn(space(), **SETTINGS, environment=False)
+INIT = jit(MODEL.init)(jax.random.key(0))
+CONTRACTING = jit(jax.vmap(lambda A, B1, C1: contracting(A, B1, C1, ALPHA)))
+
+
+def drawn(scale, seed=0):
+    """Random parameters in the shape of the model's own, but for the decoder's bound."""
+    random = np.random.default_rng(seed)
+    params = jax.tree.map(lambda leaf: jnp.asarray(scale * random.standard_normal(leaf.shape), jnp.float32), INIT)
+    return params | {"weights": params["weights"] | {"log_decoder_bound": INIT["weights"]["log_decoder_bound"]}}
+
+
+def steepest():
+    """Parameters whose loop spends all that the constraint allows along the first axis: the step is α z₁ near 0.
+
+    There A = α/2, B₁ = C₁/α = 1/√2 and φ'(0) = 1: X = 0, Y = √2 − 1 make the Cayley block A = −B = 1/√2, and Y = 1
+    makes it A = 0, B = −1, so that V₂ V₁ = 2 B₂ A₁' B₁ = 1. The block [1/2 1/√2; 1/√2 0] has the norm 1.
+    """
+    zeros, axis = jax.tree.map(jnp.zeros_like, INIT["weights"]), jnp.diag(jnp.eye(RANK)[0])
+    phi = zeros["phi"] | {"tall_0": (2.0**0.5 - 1.0) * jnp.eye(RANK), "tall_1": jnp.eye(RANK)}
+    blocks = {"A": 0.5 * axis, "B1": 0.5**0.5 * axis, "C1": 0.5**0.5 * axis, "phi": phi}
+    return INIT | {"weights": INIT["weights"] | {"feedback_gain": zeros["feedback_gain"]} | blocks}
+
+
+def mutant(layer):
+    """The model with C₁ (layer 0) or B₁ (layer −1) half as long again after the bound, in all that it exposes."""
+
+    def lengthened(matrices):
+        return tuple(1.5 * m if k == layer % len(matrices) else m for k, m in enumerate(matrices))
+
+    def fiber(params, env):
+        found = MODEL.fiber(params, env)
+        return found._replace(feedback=lengthened(found.feedback))
+
+    def explicit(params):
+        found = MODEL.explicit(params)
+        return found._replace(residual=lengthened(found.residual))
+
+    return MODEL._replace(fiber=fiber, explicit=explicit)
+
+
+def certified(model, params):
+    return certification.certify(model, params, BOX, attack_starts=0)
+
+
+def proved_by_construction(model, params):
+    """The factor that the model's own multipliers prove, with no search."""
+    weights = jax.tree.map(lambda leaf: np.asarray(leaf, np.float64), jit(model.explicit)(params))
+    return certification.lipschitz_upper(weights.residual, weights.residual_multipliers, weights.operators.vertices[0])
+
+
+def slope_at_rest(model, params):
+    """∂z⁺/∂z of the running model at z = 0 and u at the middle of its range."""
+
+    def step(z):
+        fiber = model.fiber(params, jnp.asarray([0.6, 0.0]))
+        latent = model.encode(fiber, jnp.zeros(4))._replace(z=z)
+        return model.vector(model.step(fiber, latent, space().control_mean))
+
+    return np.linalg.norm(np.asarray(jit(jax.jacobian(step))(jnp.zeros(RANK)), np.float64), 2)
+
+
+@pytest.mark.parametrize("scale", [0.0, 1e-6, 0.03, 0.3, 1.0, 30.0, 1e6])
+def test_the_constraint_holds_in_float64_and_its_bound_wastes_little(scale):
+    random = np.random.default_rng(0)
+    free = [(scale * random.standard_normal((200, *size))).astype(np.float32) for size in ((6, 6), (6, 5), (4, 6))]
+    A, B1, C1 = (np.asarray(part, np.float64) for part in CONTRACTING(*free))
+    increments = np.block([[A / ALPHA, B1], [C1 / ALPHA, np.zeros((200, 4, 5))]])
+    norms = np.linalg.norm(increments, 2, axis=(1, 2))
+    assert np.all(norms <= 1.0)
+    given = np.linalg.norm(np.block([[free[0], free[1]], [free[2], np.zeros((200, 4, 5))]]), 2, axis=(1, 2))
+    assert np.all(norms >= 0.96 * np.minimum(given, 1.0))  # and what is short stays as it is
+
+
+@pytest.mark.parametrize("scale", [0.1, 1.0, 10.0])
+def test_the_step_in_float32_keeps_its_factor_under_attack(scale):
+    attacked = certification.attack_step(MODEL, drawn(scale), BOX, jax.random.key(1), starts=2, iterations=60)
+    assert attacked <= ALPHA * (1 + FLOAT32)
+
+
+@pytest.mark.parametrize("scale", [0.1, 1.0, 10.0])
+@pytest.mark.parametrize("seed", [0, 1])
+def test_any_parameters_have_a_certificate_and_need_no_search_for_it(scale, seed):
+    params = drawn(scale, seed)
+    certificate = certified(MODEL, params)
+    assert certificate.alpha <= ALPHA
+    assert proved_by_construction(MODEL, params) <= ALPHA
+    certification.verify(certificate, params, model=MODEL)
+
+
+def test_where_the_factor_is_known_the_certificate_finds_it():
+    params = steepest()
+    np.testing.assert_allclose(slope_at_rest(MODEL, params), ALPHA, rtol=1e-4)
+    certificate = certified(MODEL, params)
+    assert ALPHA * (1 - 1e-4) < certificate.alpha <= ALPHA
+    assert ALPHA * (1 - 1e-4) < proved_by_construction(MODEL, params) <= ALPHA
+
+
+@pytest.mark.parametrize("layer", [0, -1])
+def test_a_longer_loop_than_the_constraint_allows_has_no_certificate_and_no_contraction(layer):
+    """α/2 + 1.5 α/2 = 1.25 α at rest."""
+    params = steepest()
+    np.testing.assert_allclose(slope_at_rest(mutant(layer), params), 1.25 * ALPHA, rtol=1e-4)
+    with pytest.raises(certification.CertificationRefused, match=r"alpha = 1\.212"):
+        certified(mutant(layer), params)
+
+
+@pytest.mark.parametrize("layer", [0, -1])
+def test_a_longer_loop_raises_the_certified_factor_of_any_parameters(layer):
+    params = drawn(1.0)
+    assert certified(mutant(layer), params).alpha > 1.02 * certified(MODEL, params).alpha
+
+
+def test_two_trajectories_under_the_same_inputs_come_together_at_the_rate():
+    """The claim itself, over many steps, with an environment that switches at every one."""
+    params, drive = drawn(1.0), at(driven(), 0)
+
+    def along(z):
+        def step(latent, inputs):
+            control, env = inputs
+            after = MODEL.step(MODEL.fiber(params, env), latent, control)
+            return after, MODEL.vector(after)
+
+        start = MODEL.encode(MODEL.fiber(params, drive.envs[0]), drive.states[0])
+        return jax.lax.scan(step, start._replace(z=z), (drive.controls, drive.envs))[1]
+
+    first, second = 3.0 * np.random.default_rng(0).standard_normal((2, 20, RANK)).astype(np.float32)
+    paths = [np.asarray(jit(jax.vmap(along))(starts), np.float64) for starts in (first, second)]
+    gaps = np.linalg.norm(paths[0] - paths[1], axis=-1)
+    allowed = np.linalg.norm(first - second, axis=-1)[:, None] * ALPHA ** np.arange(1, gaps.shape[1] + 1)
+    assert np.all(gaps <= allowed + 1e-5)
+
+
+def test_the_blind_variant_ignores_e_exactly_and_the_other_does_not():
+    params, one = drawn(1.0), at(driven(), 0)
+
+    def stepped(model, env):
+        fiber = model.fiber(params, env)
+        return model.decode(fiber, model.step(fiber, model.encode(fiber, one.states[0]), one.controls[0]))
+
+    seen = jit(lambda envs: [[stepped(model, env) for env in envs] for model in (MODEL, BLIND)])(one.envs[:2])
+    assert not same(*seen[0], rtol=1e-3)
+    assert same(*seen[1], rtol=0, atol=0)
+
+
+def test_what_is_certified_is_what_is_multiplied_by():
+    params = drawn(1.0)
+    explicit, fiber = jit(lambda params: (MODEL.explicit(params), MODEL.fiber(params, jnp.asarray([0.5, 1.0]))))(params)
+    assert same(explicit.operators.vertices[0], fiber.A, rtol=0, atol=0)
+    assert same(explicit.residual, fiber.feedback, rtol=0, atol=0)
+    assert same(explicit.decoder[:-1], fiber.decoder[:-1], rtol=0, atol=0)
+    np.testing.assert_allclose(explicit.decoder[-1], space().increment_scale[:, None] * fiber.decoder[-1], rtol=1e-6)
+    np.testing.assert_allclose(explicit.readout, space().body_scale[:, None] * fiber.readout, rtol=1e-6)
+
+
+def test_gradients_are_finite_and_reach_every_parameter():
+    params, one = drawn(0.5), at(driven(), 0)
+
+    def loss(params):
+        fiber = MODEL.fiber(params, one.envs[0])
+        latent = MODEL.step(fiber, MODEL.encode(fiber, one.states[0]), one.controls[0])
+        return jnp.sum(MODEL.vector(latent) ** 2) + jnp.sum((MODEL.decode(fiber, latent) - one.states[1]) ** 2)
+
+    gradients = jax.tree_util.tree_leaves_with_path(jit(jax.grad(loss))(params))
+    assert all(np.all(np.isfinite(gradient)) for _, gradient in gradients)
+    assert [jax.tree_util.keystr(path) for path, gradient in gradients if not np.any(gradient)] == []
+
+
+@pytest.mark.parametrize(
+    ("setting", "value"), [("rank", 0), ("alpha", 1.0), ("alpha", 0.0), ("hidden", ()), ("decoder_hidden", ())]
+)
+def test_settings_that_no_model_can_have_are_refused_by_name(setting, value):
+    with pytest.raises(ValueError, match=rf"model\.{setting}"):
+        models.r2dn(space(), **SETTINGS | {setting: value})
