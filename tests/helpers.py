@@ -1,5 +1,6 @@
 """Small builders that several test files share."""
 
+import inspect
 from functools import cache, partial
 
 import jax
@@ -21,9 +22,11 @@ TINY = {
     "decoder_hidden": (8,),
     "encoder_hidden": 8,
     "embedding": 4,
+    "budget": "sum",
 }
 VARIANTS = {
     "sfkd": {},
+    "joint": {"budget": "joint"},
     "no_fiber": {"environment": False},
     "no_transport": {"transport": False},
     "no_residual": {"residual": "none"},
@@ -32,7 +35,7 @@ VARIANTS = {
     "segment": {"frame": "segment"},
 }
 HARD = ("sfkd", "no_fiber", "no_transport", "segment")
-"""Variants whose residual is bounded by construction (and is there)."""
+"""Variants whose operator and residual are each bounded by construction (and are there)."""
 PHYSICS = ("oracle", "nominal")
 OTHERS = tuple(name for name in models.FACTORIES if name != "sfkd")
 """Learned models that are not ours: with their default settings."""
@@ -70,7 +73,11 @@ def model_and_params(name="sfkd", scale=1.0):
 @cache
 def _model(name):
     """One object a variant, so that what is compiled for it is compiled once."""
-    return models.FACTORIES[name](space()) if name in OTHERS else tiny(name)
+    if name not in OTHERS:
+        return tiny(name)
+    factory = models.FACTORIES[name]
+    known = {"nominal": vehicle.kinematic().nominal_derivative}
+    return factory(space(), **{key: known[key] for key in known if key in inspect.signature(factory).parameters})
 
 
 @cache

@@ -31,6 +31,7 @@ from sfkd_jax.types import (
 
 FRAMES = ("body", "segment")
 RESIDUALS = ("sandwich", "free", "none")
+BUDGETS = ("joint", "sum")
 SEGMENT_STEPS = 20.0
 """Increments per unit of the segment-frame pose scale: a window of the paper's horizon."""
 
@@ -48,6 +49,7 @@ def sfkd(
     embedding: int = 16,
     frame: str = "body",
     residual: str = "sandwich",
+    budget: str = "joint",
     transport: bool = True,
     environment: bool = True,
     soft_penalty: float = 0.0,
@@ -75,12 +77,12 @@ def sfkd(
     Raises:
         ValueError: unknown frame or residual, odd rank, or bounds outside (0, 1).
     """
-    _check(rank, rho, beta, frame, residual)
+    _check(rank, rho, beta, frame, residual, budget)
     segment = frame == "segment"
     body = space.body_mean.shape[0]
     hidden = tuple(residual_hidden), tuple(decoder_hidden)
     control = space.control_mean.shape[0]
-    networks = Networks(rank, body, control, vertices, *hidden, embedding, rho, beta, residual, transport)
+    networks = Networks(rank, body, control, vertices, *hidden, embedding, rho, beta, residual, transport, budget)
     encoder = Encoder(rank, encoder_hidden)
     pose_scale = jnp.asarray(space.increment_scale) * SEGMENT_STEPS
 
@@ -189,12 +191,14 @@ def sfkd(
     )
 
 
-def _check(rank: int, rho: float, beta: float, frame: str, residual: str) -> None:
+def _check(rank: int, rho: float, beta: float, frame: str, residual: str, budget: str) -> None:
     """Refuse settings that no model can have, naming the choices."""
     if frame not in FRAMES:
         raise ValueError(f"model.frame must be one of {', '.join(FRAMES)}, got {frame!r}")
     if residual not in RESIDUALS:
         raise ValueError(f"model.residual must be one of {', '.join(RESIDUALS)}, got {residual!r}")
+    if budget not in BUDGETS:
+        raise ValueError(f"model.budget must be one of {', '.join(BUDGETS)}, got {budget!r}")
     if rank < 2 or rank % 2:
         raise ValueError(f"model.rank must be even and at least 2, got {rank}")
     if min(rho, beta) <= 0.0 or max(rho, beta) >= 1.0:

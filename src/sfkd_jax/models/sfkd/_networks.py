@@ -11,6 +11,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from sfkd_jax.models.sfkd._bounds import bounded
+from sfkd_jax.models.sfkd._budget import share_budget
 from sfkd_jax.models.sfkd._sandwich import Free, Sandwich, Weights
 from sfkd_jax.types import Scalar
 
@@ -59,6 +60,7 @@ class Networks(nn.Module):
         rank: r, even. body, control: sizes of s and u.
         vertices: number of operator vertices. hidden: widths. embedding: size of ψ(e).
         rho, beta: the two hard bounds. residual: "sandwich", "free" or "none". transport: whether Q(e) is learned.
+        budget: "sum" bounds A(e) by ρ and the residual by β; "joint" bounds their sum, as one map, by ρ + β.
     """
 
     rank: int
@@ -72,6 +74,7 @@ class Networks(nn.Module):
     beta: float
     residual: str
     transport: bool
+    budget: str
 
     def setup(self) -> None:
         """Declare the parts."""
@@ -89,6 +92,8 @@ class Networks(nn.Module):
         self.operators = self.param("operators", _near_identity, shape)
         self.readout = self.param("readout", nn.initializers.orthogonal(), (self.body, self.rank))
         self.centre = self.param("centre", nn.initializers.zeros, (self.body,))
+        if self.budget == "joint" and self.residual == "sandwich":
+            self.couplings = self.param("couplings", _couplings, (2, self.rank, self.rank))
         self.log_decoder_bound = self.param("log_decoder_bound", nn.initializers.constant(1.0), ())
 
     def __call__(self, env: Array) -> tuple[Shared, PerEnvironment]:
@@ -98,12 +103,20 @@ class Networks(nn.Module):
     def shared(self) -> Shared:
         """What does not depend on e, with every bound in force."""
         bound = jnp.exp(self.log_decoder_bound)
+        vertices, residual = self._step()
+        readout = bounded(self.readout, 1.0)
+        return Shared(vertices, residual, self.decoder_weights(bound), readout, self.centre, bound)
+
+    def _step(self) -> tuple[Array, Weights]:
+        """Vertices of A(e) and the residual, such that every step contracts."""
+        if self.budget == "joint" and self.residual == "sandwich":
+            alpha = self.rho + self.beta
+            return share_budget(self.operators, self.couplings, self.residual_weights(1.0), alpha)
         vertices = jax.vmap(lambda matrix: bounded(matrix, self.rho))(self.operators)
         residual = self.residual_weights(self.beta)
         if self.residual == "none":
             residual = Weights(tuple(jnp.zeros_like(matrix) for matrix in residual.matrices), ())
-        readout = bounded(self.readout, 1.0)
-        return Shared(vertices, residual, self.decoder_weights(bound), readout, self.centre, bound)
+        return vertices, residual
 
     def per_environment(self, env: Float[Array, " environment"]) -> PerEnvironment:
         """What depends on e alone; `env` is scaled to about [-1, 1]."""
@@ -147,6 +160,11 @@ class Encoder(nn.Module):
         """z before rotation, shape (rank,)."""
         hidden = nn.tanh(nn.Dense(self.hidden)(jnp.concatenate([body, embedding])))
         return nn.Dense(self.rank)(hidden)
+
+
+def _couplings(key: Array, shape: tuple[int, ...], dtype: jnp.dtype = jnp.float32) -> Array:
+    """Norms of about 0.3 each way, so that the residual begins with a gain of about 0.1."""
+    return jax.random.normal(key, shape, dtype) * (0.15 / shape[-1] ** 0.5)
 
 
 def _near_identity(key: Array, shape: tuple[int, ...], dtype: jnp.dtype = jnp.float32) -> Array:

@@ -1,0 +1,43 @@
+"""One contraction budget for the operator and the residual together."""
+
+from __future__ import annotations
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+from sfkd_jax.models.sfkd._bounds import bounded
+from sfkd_jax.models.sfkd._sandwich import Weights
+
+LARGEST_COUPLING = 0.999
+"""Of ||G||_2 and ||H||_2: what they leave, I − G G' and I − H'H, must keep a Cholesky factor in float32."""
+
+
+def share_budget(
+    operators: Float[Array, "vertex rank rank"],
+    couplings: Float[Array, "2 rank rank"],
+    network: Weights,
+    alpha: float,
+) -> tuple[Float[Array, "vertex rank rank"], Weights]:
+    """Operators and a residual such that z ↦ A_j z + G φ(α H z) is α-Lipschitz for every j, φ 1-Lipschitz.
+
+        A_j = α L M_j R',   L L' = I − G G',   R R' = I − H'H,   ||M_j||_2, ||G||_2, ||H||_2 ≤ 1
+
+    That is Parrott's parametrisation of all matrices [[A_j/α, G], [H, 0]] with norm at most 1; hence
+    |A dz + G dw|² + |α H dz|² ≤ α²|dz|² + |dw|², and |dw| ≤ |α H dz|. A direction that the residual does not use keeps
+    the whole of α for the operator: ||A|| + Lip r may exceed 1 where their sum as one map cannot. By convexity the
+    same holds for every mixture of the A_j. The multipliers of φ are a witness of the joint bound.
+
+    Args:
+        operators, couplings: free, the latter (G, H). network: φ, bounded by 1. alpha: α in (0, 1).
+
+    Returns:
+        A_j, and the residual with G and α H folded into its last and first weights.
+    """
+    out, into = (bounded(matrix, LARGEST_COUPLING) for matrix in couplings)
+    identity = jnp.eye(out.shape[0])
+    left = jnp.linalg.cholesky(identity - out @ out.T)
+    right = jnp.linalg.cholesky(identity - into.T @ into)
+    vertices = alpha * left @ jax.vmap(lambda matrix: bounded(matrix, 1.0))(operators) @ right.T
+    first, *middle, last = network.matrices
+    return vertices, Weights((alpha * first @ into, *middle, out @ last), network.multipliers)
