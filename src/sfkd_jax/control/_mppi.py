@@ -11,6 +11,7 @@ from jaxtyping import Array, Bool, Float
 from sfkd_jax.control._costs import Stage, StageCost
 from sfkd_jax.control._noise import correlated_noise
 from sfkd_jax.control._path_frame import Law, path_errors, reference_curvature
+from sfkd_jax.control._smoothing import plan_smoother
 from sfkd_jax.types import Control, Controller, Environment, Key, Latent, Model, Params, Reference, Scalar, State
 
 
@@ -20,6 +21,7 @@ class PlannerState(NamedTuple):
     Attributes:
         plan: perturbations ν_0 … ν_{T-1} around the law. controls: what they amounted to at the last clean step.
         previous: the control applied last. started: whether there was one. key: for the next samples.
+        past: perturbations applied before the plan, oldest first, as far back as smoothing looks; 0 before the start.
     """
 
     plan: Float[Array, "horizon control"]
@@ -27,6 +29,7 @@ class PlannerState(NamedTuple):
     previous: Control
     started: Bool[Array, ""]
     key: Key
+    past: Float[Array, "past control"]
 
 
 class Rollout(NamedTuple):
@@ -52,6 +55,8 @@ def mppi(
     noise_correlation: float = 0.8,
     terminal_weight: float = 1.0,
     latent_weight: float = 0.0,
+    smoothing_window: int = 0,
+    smoothing_order: int = 2,
     env_low: tuple[float, ...] | None = None,
     env_high: tuple[float, ...] | None = None,
 ) -> Controller:
@@ -61,7 +66,8 @@ def mppi(
         J = Σ_k ℓ(x_k, u_k) + λ_z |z_k − z_k^ref|² + φ(x_T)
 
     ξ is the path-frame error of the *predicted* state. ν^m is the perturbation that was effective after clipping,
-    so a plan never asks for more than the actuators give. Sample 0 is the shifted plan itself.
+    so a plan never asks for more than the actuators give. Sample 0 is the shifted plan itself. A smoothed plan is
+    rolled out, applied and carried over as smoothed, see `plan_smoother`.
 
     What is not finite never enters the plan: a bad rollout gets weight zero; if all are bad, or the observation or
     environment is, the last clean plan is continued and `info["healthy"]` is False.
@@ -74,19 +80,24 @@ def mppi(
         noise_std: per control channel. noise_correlation: of AR(1) noise, from step to step.
         terminal_weight: φ = terminal_weight · ℓ of the last step, on top of it.
         latent_weight: λ_z, on the distance from the latent of the reference state.
+        smoothing_window: steps of a Savitzky-Golay filter on ν, odd, or 0 for none. smoothing_order: its polynomial's.
         env_low, env_high: certified environment box; an environment outside is clamped and flagged.
 
     Returns:
         A `Controller`; `info` has `cost` (best), `mean_cost`, `effective_samples`, `healthy`, `env_inside`,
         `predicted_states` (horizon, state) of the plan that was chosen.
+
+    Raises:
+        ValueError: a filter that does not fit the horizon, or smooths nothing.
     """
     low, high = jnp.asarray(control_low), jnp.asarray(control_high)
     std = jnp.asarray(noise_std)
     weights_by_step = jnp.ones(horizon).at[-1].add(terminal_weight)
+    smooth = plan_smoother(horizon=horizon, window=smoothing_window, order=smoothing_order)
 
     def init(key: Key) -> PlannerState:
         zeros = jnp.zeros((horizon, low.shape[0]))
-        return PlannerState(zeros, zeros, zeros[0], jnp.asarray(False), key)
+        return PlannerState(zeros, zeros, zeros[0], jnp.asarray(False), key, zeros[: smoothing_window // 2])
 
     def advance(fiber: Any, before: Rollout, nu: Control, target: Any) -> tuple[Rollout, Control, State]:
         """One step of one sample: the control, the effective perturbation, the cost of where it leads."""
@@ -139,12 +150,14 @@ def mppi(
         plans = state.plan[:, None] + noise.at[:, 0].set(0.0)
         costs, (_, effective, _) = rollouts(fiber, start, plans, targets)
         weights, usable = _softmin(costs, temperature)
-        plan = jnp.einsum("m,tmc->tc", weights, jnp.where(jnp.isfinite(effective), effective, 0.0))
-        best, (controls, _, states) = rollouts(fiber, start, plan[:, None], targets)
+        plan = smooth(state.past, jnp.einsum("m,tmc->tc", weights, _finite_or_zero(effective)))
+        best, (controls, effective, states) = rollouts(fiber, start, plan[:, None], targets)
         healthy = clean & usable & jnp.isfinite(best[0])
+        if smoothing_window:  # a smoothed plan may have left the limits again
+            plan = _finite_or_zero(effective[:, 0])
 
-        held = PlannerState(state.plan, state.controls, state.previous, state.started, next_key)
-        fresh = PlannerState(plan, controls[:, 0], previous, jnp.asarray(True), next_key)
+        held = state._replace(key=next_key)
+        fresh = PlannerState(plan, controls[:, 0], previous, jnp.asarray(True), next_key, state.past)
         chosen = jax.tree.map(
             lambda new, old: jnp.where(healthy, new, old), fresh._replace(key=()), held._replace(key=())
         )
@@ -157,9 +170,9 @@ def mppi(
             "env_inside": jnp.all(inside == env),
             "predicted_states": states[:, 0],
         }
-        shifted = PlannerState(
-            _shift(chosen.plan), _shift(chosen.controls), control, chosen.started | healthy, next_key
-        )
+        past = jnp.concatenate([chosen.past, chosen.plan[:1]])[1:]
+        started = chosen.started | healthy
+        shifted = PlannerState(_shift(chosen.plan), _shift(chosen.controls), control, started, next_key, past)
         return control, shifted, info
 
     return Controller(init, act)
@@ -182,6 +195,11 @@ def _softmin(costs: Float[Array, " sample"], temperature: float) -> tuple[Float[
     scores = jnp.where(finite, -costs / temperature, -jnp.inf)
     weights = jax.nn.softmax(jnp.where(usable, scores, 0.0))
     return weights, usable
+
+
+def _finite_or_zero(values: Float[Array, "*shape"]) -> Float[Array, "*shape"]:
+    """Zero in place of what is not finite."""
+    return jnp.where(jnp.isfinite(values), values, 0.0)
 
 
 def _shift(plan: Float[Array, "horizon control"]) -> Float[Array, "horizon control"]:
