@@ -9,7 +9,7 @@ from hydra.errors import HydraException
 from omegaconf import OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
-from sfkd_jax import assembly, config, models
+from sfkd_jax import assembly, config, models, vehicle
 
 CONF = Path(config.conf_path())
 GROUPS = sorted(folder.name for folder in CONF.iterdir() if folder.is_dir() and not folder.name.startswith("_"))
@@ -34,7 +34,7 @@ def test_every_option_composes(group, option):
 def test_every_model_option_builds_and_names_its_system(option):
     composed = settings(f"model={option}")
     assert composed["model"]["system"] == option
-    assembly.build_model(composed["model"], space())
+    assembly.build_model(composed["model"], space(), vehicle.kinematic())
 
 
 @pytest.mark.parametrize("vehicle", [name for group, name in OPTIONS if group == "vehicle"])

@@ -230,3 +230,32 @@ def test_the_walk_works_for_other_vehicles(vehicle, tmp_path):
     small = ("training.steps=25", "training.save_every=25", "dataset.segments=160", "evaluation.episode_s=4.0")
     walk = last_line(door("train", "+experiment=smoke", f"vehicle={vehicle}", *small, cwd=tmp_path))
     assert (tmp_path / walk["report"]).exists()
+
+
+COMPARED = ("+experiment=smoke", "comparison=tiny", "evaluation.systems=[self]", "name=table")
+
+
+def test_compare_drives_every_row_and_continues_where_it_was_stopped(tmp_path):
+    first = last_line(door("compare", *COMPARED, cwd=tmp_path))
+    document = json.loads((tmp_path / first["results"]).read_text())
+    rows = {row["system"]: row for row in document["rows"]}
+    assert set(rows) == {"oracle", "sfkd"}
+    assert document["failed"] == {}
+    assert rows["sfkd"]["difference_to_sfkd"] is None
+    assert rows["oracle"]["difference_to_sfkd"]["mean"] < 0
+    assert set(rows["sfkd"]["open_loop_rmse_m"]) == {"1", "5", "10", "20"}
+    assert (tmp_path / first["report"]).exists()
+    kept = tmp_path / "runs/table/cells"
+    before = {file: file.read_bytes() for file in kept.rglob("*.row.json")}
+    (victim,) = (file for file in before if "oracle" in file.name)
+    victim.write_bytes(before[victim][:-9])
+    again = door("compare", *COMPARED, cwd=tmp_path)
+    assert "training" not in again.stderr
+    assert {file: file.read_bytes() for file in kept.rglob("*.row.json")} == before
+
+
+def test_a_row_that_cannot_be_made_is_named_and_the_others_come_out(tmp_path):
+    done = door("compare", *COMPARED, "model.frame=boddy", cwd=tmp_path)
+    assert last_line(done)["rows"] == 1
+    assert last_line(done)["failed"] == 1
+    assert "segment" in done.stderr

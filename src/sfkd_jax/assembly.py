@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import inspect
 from collections.abc import Callable, Mapping
 from functools import partial
 from typing import Any, NamedTuple
@@ -15,7 +16,6 @@ Settings = Mapping[str, Any]
 
 PLANTS = {"kinematic": vehicle.kinematic, "dynamic": vehicle.dynamic}
 INNER_LOOPS = ("none", "speed")
-SAMPLINGS = ("feedback", "plain")
 
 
 class System(NamedTuple):
@@ -50,10 +50,12 @@ def build_vehicle(settings: Settings) -> vehicle.Vehicle:
     return vehicle.with_speed_loop(plant, gain=settings["speed_gain"]) if loop == "speed" else plant
 
 
-def build_model(settings: Settings, space: Space) -> Model:
-    """A learned model by the name of its factory."""
+def build_model(settings: Settings, space: Space, plant: vehicle.Vehicle) -> Model:
+    """A learned model by the name of its factory; those that lean on textbook knowledge get it from the vehicle."""
     factory = choose(models.FACTORIES, settings["name"], "model")
-    return factory(space, **without(settings, "name", "system"))
+    known = {"dt": plant.dt, "nominal": plant.nominal_derivative}
+    given = {name: value for name, value in known.items() if name in inspect.signature(factory).parameters}
+    return factory(space, **given, **without(settings, "name", "system"))
 
 
 def space_to_settings(space: Space) -> dict[str, list[float]]:
@@ -75,30 +77,68 @@ def build_controller(
     env_high: Any = None,
     certificate: Settings | None = None,
 ) -> Controller:
-    """MPPI around the path-following law, or around nothing (`sampling: plain`); watched if there is a certificate."""
-    if settings["sampling"] not in SAMPLINGS:
-        raise ValueError(f"unknown controller.sampling; choose one of {', '.join(SAMPLINGS)}")
-    loop = plant.speed_loop
-    law = control.no_feedback(speed_loop=loop)
-    if settings["sampling"] == "feedback":
-        law = control.path_feedback(wheelbase=plant.wheelbase, speed_loop=loop, **without(settings["feedback"]))
-    cost = control.tracking_cost(dt=plant.dt, speed_loop=loop, **without(settings["cost"]))
-    planner = control.mppi(
-        model,
-        cost,
-        law,
-        control_low=plant.control_low,
-        control_high=plant.control_high,
-        env_low=None if env_low is None else tuple(map(float, env_low)),
-        env_high=None if env_high is None else tuple(map(float, env_high)),
-        **without(settings["mppi"]),
-    )
+    """The planner of the settings, watched by a monitor if there is a certificate."""
+    build = choose(PLANNERS, settings.get("planner", "mppi"), "controller.planner")
+    planner = build(settings, model, plant, env_low, env_high)
     if certificate is None:
         return planner
     corners = {name: certificate["boxes"][name] for name in ("state", "control", "env")}
     boxes = {f"{name}_{side}": tuple(box[k]) for name, box in corners.items() for k, side in enumerate(("low", "high"))}
     bounds = tuple(certificate["monitor"]["bounds"])
     return control.monitored(planner, model, bounds=bounds, **boxes, **without(settings.get("monitor", {})))
+
+
+def _mppi(settings: Settings, model: Model, plant: vehicle.Vehicle, env_low: Any, env_high: Any) -> Controller:
+    """MPPI around the path-following law (`sampling: feedback`) or around nothing (`plain`)."""
+    law = choose({"feedback": _feedback, "plain": _no_feedback}, settings["sampling"], "controller.sampling")
+    return control.mppi(
+        model,
+        control.tracking_cost(dt=plant.dt, speed_loop=plant.speed_loop, **without(settings["cost"])),
+        law(settings, plant),
+        control_low=plant.control_low,
+        control_high=plant.control_high,
+        env_low=_floats(env_low),
+        env_high=_floats(env_high),
+        **without(settings["mppi"]),
+    )
+
+
+def _feedback(settings: Settings, plant: vehicle.Vehicle) -> control.Law:
+    gains = without(settings["feedback"])
+    return control.path_feedback(wheelbase=plant.wheelbase, speed_loop=plant.speed_loop, **gains)
+
+
+def _no_feedback(settings: Settings, plant: vehicle.Vehicle) -> control.Law:
+    del settings
+    return control.no_feedback(speed_loop=plant.speed_loop)
+
+
+def _koopman_mpc(settings: Settings, model: Model, plant: vehicle.Vehicle, env_low: Any, env_high: Any) -> Controller:
+    """A quadratic program over a linear predictor, under the cost that the samplers have."""
+    return control.koopman_mpc(
+        model,
+        dt=plant.dt,
+        control_low=plant.control_low,
+        control_high=plant.control_high,
+        speed_loop=plant.speed_loop,
+        terminal_weight=settings["mppi"]["terminal_weight"],
+        env_low=_floats(env_low),
+        env_high=_floats(env_high),
+        **without(settings["cost"]),
+        **without(settings["koopman_mpc"]),
+    )
+
+
+def _floats(values: Any) -> tuple[float, ...] | None:
+    return None if values is None else tuple(map(float, values))
+
+
+PLANNERS = {"mppi": _mppi, "koopman_mpc": _koopman_mpc}
+
+
+def controller_horizon(settings: Settings) -> int:
+    """How many steps of the reference a controller wants to see."""
+    return settings[settings.get("planner", "mppi")]["horizon"]
 
 
 def build_scenario(settings: Settings, plant: vehicle.Vehicle, *, duration: float) -> scenarios.Family:

@@ -15,9 +15,10 @@ from typing import Any
 
 import hydra
 from hydra.core.config_store import ConfigStore
+from hydra.core.hydra_config import HydraConfig
 from omegaconf import DictConfig, OmegaConf
 
-from sfkd_jax import assembly, control, datasets, models, scenarios, training
+from sfkd_jax import assembly, control, datasets, evaluation, models, scenarios, training
 from sfkd_jax.artefacts import ArtefactError
 from sfkd_jax.certification import CertificateStale, CertificationRefused, issue
 
@@ -62,7 +63,11 @@ def schema(title: str, /, *factories: Callable[..., Any], skip: tuple[str, ...] 
 
 def _extra(name: str, value: Any) -> tuple[Any, ...]:
     """A field by its type (required) or by its default."""
-    if isinstance(value, type) or typing.get_origin(value):
+    if isinstance(value, type):
+        return (name, value) if not dataclasses.is_dataclass(value) else (name, value, field(default_factory=value))
+    if value is None:
+        return name, typing.Any, field(default=None)
+    if typing.get_origin(value):
         return name, value
     return _field(name, tuple[type(next(iter(value), 0.0)), ...] if isinstance(value, tuple) else type(value), value)
 
@@ -97,7 +102,7 @@ def register() -> None:
     dataset = schema("DatasetConfig", datasets.generate, **split)
     store.store(group="dataset", name="schema", node=dataset)
     for name, factory in models.FACTORIES.items():
-        node = schema("ModelConfig", factory, name=str, system=str)
+        node = schema("ModelConfig", factory, skip=("dt", "nominal"), name=str, system=str)
         store.store(group="model", name=f"{name}_schema", node=node)
     store.store(group="controller", name="mppi_schema", node=_controller_schema())
     loss = schema("LossConfig", training.multi_step_loss)
@@ -111,10 +116,18 @@ def register() -> None:
     store.store(group="training", name="schema", node=node)
     protocol = {"episodes": 8, "episode_s": 60.0, "seed": 2026, "systems": _SYSTEMS, "observation_noise": _SENSORS}
     protocol |= {"timed_steps": 50, "side_forces": (), "threshold_m": _THRESHOLD}
+    protocol |= {"variation": None, "told": schema("ToldConfig", evaluation.told, skip=("dt",))}
     store.store(group="evaluation", name="schema", node=schema("EvaluationConfig", **protocol))
     skipped = ("validation", "calibration", "held_out", "boxes", "sensor_noise")
     node = schema("CertificationConfig", issue, skip=skipped, renew=False)
     store.store(group="certification", name="schema", node=node)
+
+
+def compose(*overrides: str) -> dict[str, Any]:
+    """The settings of this command under further overrides, inside a door."""
+    asked = [*HydraConfig.get().overrides.task, *overrides]
+    composed = OmegaConf.to_container(hydra.compose("config", asked), resolve=True)
+    return typing.cast(dict[str, Any], composed)
 
 
 def _fields(node: type) -> list[Any]:
@@ -130,10 +143,13 @@ def _controller_schema() -> type:
         "cost": schema("CostConfig", control.tracking_cost, skip=fixed),
         "feedback": schema("FeedbackConfig", control.path_feedback, skip=fixed),
     }
+    shared = ("lateral", "course", "speed", "steering_rate", "effort", "terminal_weight")
+    parts["koopman_mpc"] = schema("KoopmanMpcConfig", control.koopman_mpc, skip=(*fixed, *shared))
     watched = ("bounds", "state_low", "state_high", *fixed)
     parts["monitor"] = schema("MonitorConfig", control.monitored, skip=watched)
     fields = [(name, part, field(default_factory=part)) for name, part in parts.items()]
-    return make_dataclass("ControllerConfig", [("name", str), ("sampling", str), *fields])
+    head = [("name", str), ("planner", str), ("sampling", typing.Any)]
+    return make_dataclass("ControllerConfig", [*head, *fields])
 
 
 def door(run: Callable[[dict[str, Any]], dict[str, Any]]) -> Callable[[], None]:

@@ -54,7 +54,7 @@ def load(path: str | Path) -> Policy:
     arrays, manifest = artefacts.read_arrays(file, kind=KIND)
     settings = manifest["config"]
     plant = assembly.build_vehicle(settings["vehicle"])
-    model = assembly.build_model(settings["model"], assembly.space_from_settings(settings["space"]))
+    model = assembly.build_model(settings["model"], assembly.space_from_settings(settings["space"]), plant)
     box = settings["dataset"]
     certificate = _certificate(file.with_name("certificate.json"), manifest["sha256"])
     limits = {"env_low": box["env_low"], "env_high": box["env_high"], "certificate": certificate}

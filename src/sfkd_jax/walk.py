@@ -23,6 +23,7 @@ from sfkd_jax.datasets import (
 from sfkd_jax.evaluation import open_loop
 from sfkd_jax.training import fit, multi_step_loss
 from sfkd_jax.types import Trajectory
+from sfkd_jax.vehicle import Vehicle
 
 SPLIT = ("shares", "env_low", "env_high", "seed")
 SWITCHING = 2
@@ -71,20 +72,43 @@ def ensure_policy(settings: dict[str, Any]) -> policy.Policy:
     return policy.load(place)
 
 
+def systems(settings: dict[str, Any], plant: Vehicle) -> dict[str, assembly.System]:
+    """The systems that `evaluation.systems` asks for; "self" is the policy of this run, made if it is missing."""
+    references, found = assembly.reference_systems(plant), {}
+    for name in settings["evaluation"]["systems"]:
+        if name == "self":
+            found[settings["model"]["system"]] = own_system(settings)
+        else:
+            found[name] = assembly.choose(references | {"self": None}, name, "evaluation.systems entry")
+    return found
+
+
+def own_system(settings: dict[str, Any]) -> assembly.System:
+    """The policy of this run as a row of a table."""
+    trained = ensure_policy(settings)
+    told = "measured" if trained.settings["model"]["environment"] else "none"
+    return assembly.System(trained.model, trained.params, told, trained.certificate)
+
+
 def _train(settings: dict[str, Any]) -> None:
     """Fit, then store the best weights and their prediction error on the test split."""
     place, options = shelf.run_directory(settings), dict(settings["training"])
     dataset, data_hash = ensure_dataset(settings)
     dataset = dataset._replace(train=first_share(dataset.train, options.pop("data_share")))
     space = measure_space(dataset)
-    model = assembly.build_model(settings["model"], space)
-    loss, horizon = multi_step_loss(model, space, **options.pop("loss")), options.pop("window")
-    draw = partial(random_windows, batch=options.pop("batch"), length=horizon)
-    held_out = spread_windows(dataset.validation, length=horizon)
-    shelf.say(f"training {settings['model']['system']}, {options['steps']} steps, in {place}")
+    model = assembly.build_model(settings["model"], space, assembly.build_vehicle(settings["vehicle"]))
+    horizon = options.pop("window")
     key = jax.random.fold_in(jax.random.key(settings["seed"]), 0)
-    options["inspect"] = partial(progress, model)
-    params, best = fit(model, loss, draw, dataset.train, held_out, key, place, **options)
+    if model.identify is not None:
+        shelf.say(f"identifying {settings['model']['system']} in {place}")
+        params, best = model.identify(dataset.train, dataset.validation, key), None
+    else:
+        loss = multi_step_loss(model, space, **options.pop("loss"))
+        draw = partial(random_windows, batch=options.pop("batch"), length=horizon)
+        held_out = spread_windows(dataset.validation, length=horizon)
+        shelf.say(f"training {settings['model']['system']}, {options['steps']} steps, in {place}")
+        options["inspect"] = partial(progress, model)
+        params, best = fit(model, loss, draw, dataset.train, held_out, key, place, **options)
     errors = jax.jit(partial(open_loop, model, horizon=horizon))(params, dataset.test)
     document = shelf.open_loop_document(errors, dataset.test, settings["vehicle"]["dt"])
     artefacts.write_json(place / "open_loop.json", document)

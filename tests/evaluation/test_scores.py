@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from sfkd_jax.evaluation import Episode, bootstrap_mean, compare, merge, paired_difference, row, score, summary
+from sfkd_jax.evaluation import Episode, bootstrap_mean, compare, merge, paired_difference, pool, row, score, summary
 
 DT, STEPS = 0.1, 200
 TIME = np.arange(1, STEPS + 1) * DT
@@ -207,6 +207,8 @@ def about(system, **changes):
         "vehicle": "kinematic",
         "sampling": "feedback",
         "env": "measured",
+        "variation": None,
+        "seeds": [0],
         **changes,
     }
 
@@ -242,7 +244,7 @@ def test_a_row_holds_every_measure_and_null_for_what_does_not_apply():
 def test_comparisons_are_ratios_to_the_oracle_and_paired_differences_to_ours():
     scores = {"oracle": scored(0.1), "sfkd": scored(0.2), "nominal": scored(0.5)}
     rows = {name: row(value, about(name), None, {}) for name, value in scores.items()}
-    compared = {entry["system"]: entry for entry in compare(rows, scores)}
+    compared = {entry["system"]: entry for entry in compare(list(rows.values()))}
     np.testing.assert_allclose([compared[name]["ratio_to_oracle"] for name in scores], [1.0, 2.0, 5.0])
     assert compared["sfkd"]["difference_to_sfkd"] is None
     np.testing.assert_allclose(compared["nominal"]["difference_to_sfkd"]["mean"], 0.3 * 1.15)
@@ -250,10 +252,41 @@ def test_comparisons_are_ratios_to_the_oracle_and_paired_differences_to_ours():
 
 
 def test_without_oracle_or_ours_nothing_is_compared():
-    scores = {"nominal": scored(0.5)}
-    (only,) = compare({"nominal": row(scores["nominal"], about("nominal"), None, {})}, scores)
+    (only,) = compare([row(scored(0.5), about("nominal"), None, {})])
     assert only["ratio_to_oracle"] is None
     assert only["difference_to_sfkd"] is None
+
+
+@pytest.mark.parametrize(
+    "change", [{"scenario": "s1"}, {"vehicle": "dynamic"}, {"variation": "late"}, {"sampling": "plain"}]
+)
+def test_rows_that_drove_other_episodes_or_sampled_otherwise_are_not_paired(change):
+    ours = row(scored(0.2), about("sfkd"), None, {})
+    (_, other) = compare([ours, row(scored(0.5), about("icode", **change), None, {})])
+    assert other["difference_to_sfkd"] is None
+
+
+def test_a_quadratic_program_is_paired_with_what_samples_around_feedback():
+    rows = [
+        row(scored(level), about("sfkd", sampling=name), None, {})
+        for name, level in (("plain", 0.1), ("feedback", 0.2))
+    ]
+    compared = compare([*rows, row(scored(0.5), about("koopman_mpc", sampling=None), None, {})])
+    np.testing.assert_allclose(compared[-1]["difference_to_sfkd"]["mean"], 0.3 * 1.15)
+
+
+def test_pooling_joins_the_episodes_of_all_seeds_and_averages_the_rest():
+    levels = (0.1, 0.3)
+    made = [row(scored(level), about("sfkd", seeds=[k]), None, {"v0": level}) for k, level in enumerate(levels)]
+    pooled = pool(made)
+    assert pooled["seeds"] == [0, 1]
+    assert pooled["rmse_episodes_m"] == made[0]["rmse_episodes_m"] + made[1]["rmse_episodes_m"]
+    np.testing.assert_allclose(pooled["rmse_m"]["mean"], 0.2 * 1.15)
+    np.testing.assert_allclose(pooled["violation"]["v0"], 0.2)
+    np.testing.assert_allclose(pooled["max_deviation_m"], made[1]["max_deviation_m"])
+    assert pooled["system"] == "sfkd"
+    assert pooled["rmse_after_switch_m"] is None
+    assert pool(made[:1]) == made[0]
 
 
 def test_new_rows_replace_those_of_the_same_identity_and_leave_the_others():
@@ -263,5 +296,5 @@ def test_new_rows_replace_those_of_the_same_identity_and_leave_the_others():
     assert sorted(entry["rmse"] for entry in merged) == [2, 3, 4, 5]
     assert merge([], new) == new
     assert merge(old, []) == old
-    for name in ("system", "scenario", "vehicle", "sampling", "env"):
+    for name in ("system", "scenario", "vehicle", "sampling", "env", "variation"):
         assert len(merge(old[:1], [old[0] | {name: "other"}])) == 2

@@ -10,10 +10,12 @@ from sfkd_jax.evaluation._open_loop import open_loop as open_loop
 from sfkd_jax.evaluation._rows import compare as compare
 from sfkd_jax.evaluation._rows import disturbed as disturbed
 from sfkd_jax.evaluation._rows import merge as merge
+from sfkd_jax.evaluation._rows import pool as pool
 from sfkd_jax.evaluation._rows import row as row
 from sfkd_jax.evaluation._statistics import bootstrap_mean as bootstrap_mean
 from sfkd_jax.evaluation._statistics import paired_difference as paired_difference
 from sfkd_jax.evaluation._statistics import summary as summary
+from sfkd_jax.evaluation._told import told as told
 from sfkd_jax.evaluation._violations import STRIDE as STRIDE
 from sfkd_jax.evaluation._violations import Claims as Claims
 from sfkd_jax.evaluation._violations import Predictions as Predictions

@@ -9,7 +9,7 @@ import numpy as np
 from sfkd_jax.evaluation._metrics import Scores
 from sfkd_jax.evaluation._statistics import paired_difference, summary
 
-IDENTITY = ("system", "scenario", "vehicle", "sampling", "env")
+IDENTITY = ("system", "scenario", "vehicle", "sampling", "env", "variation")
 """What makes a row the same row."""
 
 
@@ -31,6 +31,7 @@ def row(
     after = scores.rmse_after_switch
     return about | {
         "rmse_m": summary(scores.rmse),
+        "rmse_episodes_m": [float(value) for value in scores.rmse],
         "max_deviation_m": float(np.max(scores.max_deviation)),
         "rmse_after_switch_m": None if np.all(np.isnan(after)) else float(np.nanmean(after)),
         "smoothness_rad_per_s": float(np.mean(scores.smoothness)),
@@ -39,7 +40,7 @@ def row(
         "unhealthy_steps": float(np.mean(scores.unhealthy)),
         "breach_steps": float(np.mean(scores.breach)) if watched else None,
         "box_exit_steps": float(np.mean(scores.box_exit)) if watched else None,
-        "ess": float(np.median(scores.ess)),
+        "ess": None if np.any(np.isnan(scores.ess)) else float(np.median(scores.ess)),
         "act_ms": None if act_ms is None else {"p50": act_ms[0], "p99": act_ms[1]},
         "ratio_to_oracle": None,
         "difference_to_sfkd": None,
@@ -53,17 +54,63 @@ def disturbed(force: float, scores: Scores, violation: dict[str, Any]) -> dict[s
     return {"force_n": force, "rmse_m": summary(scores.rmse), **kept, "departures": departures}
 
 
-def compare(rows: dict[str, dict[str, Any]], scores: dict[str, Scores]) -> list[dict[str, Any]]:
-    """Add the comparisons between systems that drove the same episodes."""
-    for name, entry in rows.items():
-        if "oracle" in rows:
-            entry["ratio_to_oracle"] = float(np.mean(scores[name].rmse) / np.mean(scores["oracle"].rmse))
-        if "sfkd" in rows and name != "sfkd":
-            entry["difference_to_sfkd"] = paired_difference(scores[name].rmse, scores["sfkd"].rmse)
-    return list(rows.values())
+def compare(rows: list[dict[str, Any]]) -> list[dict[str, Any]]:
+    """Rows with comparisons between systems that drove the same episodes with the same sampling.
+
+    A row without sampling (a quadratic program) is compared with those that sample around feedback.
+    """
+    for entry in rows:
+        same = [other for other in rows if _episodes(other) == _episodes(entry)]
+        for system, measure in (("oracle", _ratio), ("sfkd", paired_difference)):
+            other = next((other for other in same if other["system"] == system), None)
+            if other is None or (system == "sfkd" and other is entry):
+                continue
+            name = {"oracle": "ratio_to_oracle", "sfkd": "difference_to_sfkd"}[system]
+            entry[name] = measure(np.asarray(entry["rmse_episodes_m"]), np.asarray(other["rmse_episodes_m"]))
+    return rows
+
+
+def _episodes(entry: dict[str, Any]) -> tuple[Any, ...]:
+    """Which episodes a row drove: those of equal answers are paired."""
+    names = ("scenario", "vehicle", "variation")
+    return *(entry[name] for name in names), entry["sampling"] or "feedback", len(entry["rmse_episodes_m"])
+
+
+def _ratio(values: np.ndarray, reference: np.ndarray) -> float:
+    return float(np.mean(values) / np.mean(reference))
+
+
+def pool(rows: list[dict[str, Any]]) -> dict[str, Any]:
+    """One row of several that differ in the training seed alone: episodes are joined, other measures averaged.
+
+    Args:
+        rows: at least one, in the order of their seeds.
+    """
+    first, *rest = rows
+    if not rest:
+        return first
+    joined = [value for entry in rows for value in entry["rmse_episodes_m"]]
+    pooled = _mean([entry for entry in rows]) | {
+        "seeds": [seed for entry in rows for seed in entry["seeds"]],
+        "rmse_m": summary(np.asarray(joined)),
+        "rmse_episodes_m": joined,
+        "max_deviation_m": max(entry["max_deviation_m"] for entry in rows),
+        "departures": sum(entry["departures"] for entry in rows),
+    }
+    return pooled
+
+
+def _mean(values: list[Any]) -> Any:
+    """The mean of equal structures, leaf by leaf; what is no number stays where all agree, and is None otherwise."""
+    first = values[0]
+    if isinstance(first, dict):
+        return {name: _mean([value[name] for value in values]) for name in first}
+    if all(isinstance(value, float) for value in values):
+        return float(np.mean(values))
+    return first if all(value == first for value in values) else None
 
 
 def merge(old: list[dict[str, Any]], new: list[dict[str, Any]]) -> list[dict[str, Any]]:
     """New rows replace old ones with the same identity; the others stay."""
-    replaced = {tuple(entry[name] for name in IDENTITY) for entry in new}
-    return [entry for entry in old if tuple(entry[name] for name in IDENTITY) not in replaced] + new
+    replaced = {tuple(entry.get(name) for name in IDENTITY) for entry in new}
+    return [entry for entry in old if tuple(entry.get(name) for name in IDENTITY) not in replaced] + new

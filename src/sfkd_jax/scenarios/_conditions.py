@@ -21,6 +21,19 @@ def uniform_road(key: Key, *, steps: int, friction: Range = (0.9, 0.9)) -> Sched
     return jnp.stack([jnp.full(steps, level), jnp.zeros(steps)], axis=1)
 
 
+def steady_road(key: Key, *, steps: int, friction: Range, wind: Range) -> Schedule:
+    """One friction level and one wind, its side drawn too, for a whole episode.
+
+    Args:
+        key: consumed. steps: length. friction: range [-]. wind: range of its strength [m/s].
+    """
+    friction_key, wind_key, side_key = jax.random.split(key, 3)
+    level = jax.random.uniform(friction_key, (), minval=friction[0], maxval=friction[1])
+    strength = jax.random.uniform(wind_key, (), minval=wind[0], maxval=wind[1])
+    pair = jnp.stack([level, strength * jax.random.rademacher(side_key, (), dtype=float)])
+    return jnp.tile(pair, (steps, 1))
+
+
 def wet_road(
     key: Key,
     *,

@@ -9,7 +9,7 @@ from typing import NamedTuple, TypeAlias
 import jax
 import jax.numpy as jnp
 
-from sfkd_jax.scenarios._conditions import Schedule, switching_road, uniform_road, wet_road
+from sfkd_jax.scenarios._conditions import Schedule, steady_road, switching_road, uniform_road, wet_road
 from sfkd_jax.scenarios._paths import Path, smooth_path
 from sfkd_jax.types import Key, Scalar, State
 
@@ -41,7 +41,10 @@ def scenario(
     state_size: int,
     dt: float,
 ) -> Family:
-    """The family `name` ("s1" uniform road, "s2" wet road with gusts, "s3" switching road) of the benchmark.
+    """The family `name` of the benchmark: "s1" uniform road, "s2" wet road with gusts, "s3" switching road.
+
+    Three more hold one pair of friction and wind for an episode: "seen" as training drives have it, "interpolated"
+    between friction levels that they have under wind, "extrapolated" beyond the box that they cover.
 
     Args:
         name: which. duration: of an episode [s]. speed: to hold [m/s].
@@ -57,6 +60,9 @@ def scenario(
         "s1": partial(uniform_road, steps=steps),
         "s2": partial(wet_road, steps=steps, dt=dt),
         "s3": partial(switching_road, steps=steps, dt=dt),
+        "seen": partial(steady_road, steps=steps, friction=(0.55, 0.9), wind=(0.0, 8.0)),
+        "interpolated": partial(steady_road, steps=steps, friction=(0.5, 0.55), wind=(4.0, 8.0)),
+        "extrapolated": partial(steady_road, steps=steps, friction=(0.27, 0.3), wind=(8.0, 9.0)),
     }
     if name not in table:
         raise ValueError(f"unknown scenario {name!r}; choose one of {', '.join(table)}")

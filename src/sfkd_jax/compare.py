@@ -1,0 +1,90 @@
+"""python -m sfkd_jax.compare: train and drive every row of a table, cell by cell; the same command continues."""
+
+from __future__ import annotations
+
+import time
+from pathlib import Path
+from typing import Any
+
+from sfkd_jax import artefacts, assembly, cells, certify, drive, shelf, walk
+from sfkd_jax.config import compose, door
+from sfkd_jax.reporting import benchmark_report
+from sfkd_jax.training import TrainingStopped
+from sfkd_jax.vehicle import Vehicle
+
+
+def run(settings: dict[str, Any]) -> dict[str, Any]:
+    """Whatever is missing is made; then all rows are collected, compared and drawn."""
+    began, comparison = time.perf_counter(), settings["comparison"]
+    wanted = cells.plan(comparison)
+    groups, driven, failed = cells.drivers(wanted), 0, {}
+    for number, group in enumerate(groups):
+        try:
+            driven += _drive(group, comparison)
+        except (TrainingStopped, ValueError, artefacts.ArtefactError) as reason:
+            failed["/".join(map(str, group[0][:4]))] = str(reason)
+            shelf.say(f"failed: {reason}")
+        if driven:
+            _estimate(number + 1, len(groups), time.perf_counter() - began)
+    place = Path(settings["root"]) / settings["name"]
+    rows = cells.collect(wanted, settings)
+    if not rows:
+        raise ValueError(f"nothing to compare: no row came out ({'; '.join(failed.values()) or 'none was asked for'})")
+    document = {"rows": rows, "config": settings, "versions": artefacts.versions(), "failed": failed}
+    artefacts.write_json(place / "results.json", document | {"seconds": time.perf_counter() - began})
+    pages = benchmark_report(place)
+    return {"results": str(place / "results.json"), "rows": len(rows), "failed": len(failed), **pages}
+
+
+def _drive(group: list[cells.Cell], comparison: dict[str, Any]) -> int:
+    """Drive what is missing of one row under one controller; returns how many cells that were."""
+    drivers: dict[str, drive.TestDriver] = {}
+    done = 0
+    for cell in group:
+        settings, of_policy = _settings(cell, comparison)
+        path = cells.place(cell, settings)
+        if cells.is_done(path, settings):
+            continue
+        plant, key = assembly.build_vehicle(settings["vehicle"]), cells.driver_of(of_policy)
+        if key not in drivers:
+            drivers[key] = _driver(of_policy, plant)
+        track = drive.lay(settings, plant)
+        found = drivers[key](track)
+        cells.write(path, settings, track, found)
+        shelf.say(f"{' '.join(map(str, cell))}: {1e3 * found.row['rmse_m']['mean']:.1f} mm")
+        done += 1
+    return done
+
+
+def _driver(settings: dict[str, Any], plant: Vehicle) -> drive.TestDriver:
+    """A row's only system, trained and certified if it learns."""
+    if "self" in settings["evaluation"]["systems"]:
+        _certified(settings)
+    ((name, system),) = walk.systems(settings, plant).items()
+    return drive.prepare(settings, plant, name, system, walk.ensure_dataset(settings)[0])
+
+
+def _certified(settings: dict[str, Any]) -> None:
+    """A policy with what can be proved about it beside it."""
+    walk.ensure_policy(settings)
+    if not certify.document_in(shelf.run_directory(settings)).exists():
+        certify.renew(settings)
+
+
+def _settings(cell: cells.Cell, comparison: dict[str, Any]) -> tuple[dict[str, Any], dict[str, Any]]:
+    """The settings of a cell, under the name of the comparison and under the name of its policy's run."""
+    asked = compose(*cells.overrides(cell, comparison))
+    plain = compose(*cells.overrides(cell._replace(variation=next(iter(comparison["variations"]))), comparison))
+    retrained = shelf.identity(asked) != shelf.identity(plain)
+    asked["evaluation"]["variation"] = None if not comparison["variations"][cell.variation] else cell.variation
+    return asked, asked | {"name": cells.policy_name(cell, comparison, retrained=retrained)}
+
+
+def _estimate(done: int, total: int, seconds: float) -> None:
+    """How far it is and how long it may take."""
+    left = seconds / done * (total - done)
+    shelf.say(f"[{done}/{total}] {seconds / 60:.0f} min so far, about {left / 60:.0f} min left")
+
+
+if __name__ == "__main__":
+    door(run)()

@@ -1,0 +1,73 @@
+"""Extended dynamic mode decomposition: a lift by radial functions, pairs along circles, and ridge regression."""
+
+from __future__ import annotations
+
+import jax
+import jax.numpy as jnp
+from jax.scipy.linalg import solve_triangular
+from jaxtyping import Array, Float
+
+from sfkd_jax.se2 import between, compose, wrap_angle
+from sfkd_jax.types import BODY, POSE, Scalar, State
+
+STRAIGHT = 1e-12
+"""Curvature [1/m] that stands for less, so that nothing divides by 0."""
+
+
+def thin_plate(point: Float[Array, " n"], centres: Float[Array, "function n"]) -> Float[Array, " function"]:
+    """r² log r of the distances r to every centre; 0 at r = 0."""
+    squares = jnp.sum((point - centres) ** 2, axis=1)
+    apart = squares > 0
+    return jnp.where(apart, 0.5 * squares * jnp.log(jnp.where(apart, squares, 1.0)), 0.0)
+
+
+def along_circle(
+    states: Float[Array, "time state"], offset: Float[Array, " 2"], curvature: Scalar
+) -> Float[Array, "time state"]:
+    """States as seen from a circle that is laid so that the first one has a given offset from it.
+
+        e_y = (2Y − κ (X² + Y²)) / (1 + D),   s = atan2(κX, 1 − κY) / κ,   e_ψ = Θ − κ s,   D = |(κX, 1 − κY)|,
+    (X, Y, Θ) the pose in the frame of the circle's point next to the first state.
+
+    Args:
+        states: x_0 … x_T. offset: e_y [m] and e_ψ [rad] of x_0. curvature: κ [1/m].
+
+    Returns:
+        (s, e_y, e_ψ, body state) at every time: exact, and finite up to the centre of the circle.
+    """
+    kappa = jnp.where(jnp.abs(curvature) < STRAIGHT, STRAIGHT, curvature)
+    tangent = states[0, POSE].at[2].add(-offset[1])
+    foot = compose(tangent, jnp.stack([jnp.zeros(()), -offset[0], jnp.zeros(())]))
+
+    def one(state: State) -> State:
+        x, y, yaw = between(foot, state[POSE])
+        across, along = 1.0 - kappa * y, kappa * x
+        turned = jnp.arctan2(along, across)
+        left = (2.0 * y - kappa * (x**2 + y**2)) / (1.0 + jnp.hypot(along, across))
+        return jnp.concatenate([jnp.stack([turned / kappa, left, wrap_angle(yaw - turned)]), state[BODY]])
+
+    return jax.vmap(one)(states)
+
+
+def ridge_regression(
+    inputs: Float[Array, "sample p"], targets: Float[Array, "sample q"], ridges: Float[Array, " ridge"]
+) -> Float[Array, "ridge p q"]:
+    """W = argmin |X W − Y|² + λ N |D W|² for every λ, D the root mean squares of the columns of X.
+
+    By an orthogonal factorisation of [X D⁻¹, Y] and never by X'X, whose condition float32 does not hold.
+
+    Args:
+        inputs: X. targets: Y. ridges: λ > 0.
+    """
+    spread = jnp.sqrt(jnp.mean(inputs**2, axis=0))
+    spread = jnp.where(spread > 0, spread, 1.0)
+    size, columns = inputs.shape
+    triangle = jnp.linalg.qr(jnp.concatenate([inputs / spread, targets], axis=1), mode="r")[:columns]
+
+    def solve(ridge: Scalar) -> Float[Array, "p q"]:
+        stacked = jnp.concatenate([triangle[:, :columns], jnp.sqrt(ridge * size) * jnp.eye(columns)])
+        orthogonal, upper = jnp.linalg.qr(stacked)
+        right = orthogonal[: triangle.shape[0]].T @ triangle[:, columns:]
+        return solve_triangular(upper, right) / spread[:, None]
+
+    return jax.lax.map(solve, ridges)

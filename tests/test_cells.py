@@ -1,0 +1,98 @@
+"""The plan of a comparison: which cells there are, what is composed for them, and when one is done."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from sfkd_jax import cells
+from sfkd_jax.artefacts import write_json
+
+PLAN = {
+    "vehicles": ["kinematic", "dynamic"],
+    "seeds": [0, 1],
+    "controllers": {"mppi": ["s1", "s2"], "mppi_plain": ["s1"]},
+    "own_controllers": {"program": {"mppi": "koopman_mpc", "mppi_plain": None}},
+    "rows": {"ours": "model=sfkd", "program": "model=koopman_mpc model.environment=false"},
+    "variations": {"as it is": None, "late": "evaluation.told.delay_s=0.5"},
+    "policies": "table",
+    "only": [],
+}
+
+
+def test_every_row_meets_every_scenario_under_every_controller_that_it_has():
+    found = cells.plan(PLAN)
+    assert len(found) == len(set(found)) == 2 * 2 * 2 * (3 + 2)
+    assert {cell.controller for cell in found if cell.label == "program"} == {"koopman_mpc"}
+    assert {cell.scenario for cell in found if cell.controller == "mppi_plain"} == {"s1"}
+
+
+def test_rows_can_be_picked_and_an_unknown_one_is_named_with_the_choices():
+    assert {cell.label for cell in cells.plan(PLAN | {"only": ["program"]})} == {"program"}
+    with pytest.raises(ValueError, match="unknown comparison.only iocde; choose of ours, program"):
+        cells.plan(PLAN | {"only": ["iocde"]})
+
+
+def test_what_one_driver_does_lies_together():
+    groups = cells.drivers(cells.plan(PLAN))
+    assert [cell for group in groups for cell in group] == cells.plan(PLAN)
+    assert len(groups) == 2 * 2 * (2 + 1)
+
+
+def test_a_cell_composes_its_row_its_controller_and_its_variation():
+    cell = cells.Cell("dynamic", "program", 1, "koopman_mpc", "late", "s2")
+    asked = ["vehicle=dynamic", "scenario=s2", "controller=koopman_mpc", "seed=1", "model=koopman_mpc"]
+    assert cells.overrides(cell, PLAN) == [*asked, "model.environment=false", "evaluation.told.delay_s=0.5"]
+
+
+def test_a_variation_that_retrains_has_a_policy_of_its_own():
+    cell = cells.Cell("dynamic", "ours", 1, "mppi", "10 % of the data", "s2")
+    assert cells.policy_name(cell, PLAN, retrained=False) == "table/dynamic/ours"
+    assert cells.policy_name(cell, PLAN, retrained=True) == "table/dynamic/ours/10_%_of_the_data"
+
+
+def settings(root, **changes):
+    names = ("dataset", "model", "training", "seed", "controller", "scenario", "certification")
+    asked = {name: {"name": name} for name in names} | {"vehicle": {"dt": 0.1}, "evaluation": {"episodes": 4}}
+    return asked | {"root": str(root), "name": "table"} | changes
+
+
+def rows_file(path):
+    return Path(f"{path}.row.json")
+
+
+def test_a_cell_is_done_only_with_its_own_settings_and_undamaged(tmp_path):
+    cell, asked = cells.plan(PLAN)[0], settings(tmp_path)
+    path = cells.place(cell, asked)
+    assert not cells.is_done(path, asked)
+    path.parent.mkdir(parents=True)
+    write_json(rows_file(path), {"row": {}, "made_with": cells.made_with(asked)})
+    assert cells.is_done(path, asked)
+    assert not cells.is_done(path, settings(tmp_path, evaluation={"episodes": 8}))
+    rows_file(path).write_bytes(rows_file(path).read_bytes()[:-5])
+    assert not cells.is_done(path, asked)
+
+
+def row(system, level, seed):
+    about = {"system": system, "scenario": "s1", "vehicle": "kinematic", "sampling": "feedback", "variation": None}
+    measures = {"max_deviation_m": level, "departures": 0, "ratio_to_oracle": None, "difference_to_sfkd": None}
+    episodes = [level, 2 * level]
+    return about | measures | {"seeds": [seed], "rmse_episodes_m": episodes, "rmse_m": {"mean": np.mean(episodes)}}
+
+
+@pytest.mark.parametrize("seeds", [1, 2])
+def test_collecting_pools_the_seeds_and_compares_what_is_there(tmp_path, seeds):
+    plan = PLAN | {"rows": {"sfkd": "", "icode": "", "missing": ""}, "vehicles": ["kinematic"]}
+    plan |= {"seeds": list(range(seeds)), "variations": {"as it is": None}, "controllers": {"mppi": ["s1"]}}
+    wanted = cells.plan(plan)
+    for cell in wanted:
+        if cell.label != "missing":
+            path = cells.place(cell, settings(tmp_path))
+            path.parent.mkdir(parents=True, exist_ok=True)
+            level = 1.0 if cell.label == "sfkd" else 3.0
+            write_json(rows_file(path), {"row": row(cell.label, level, cell.seed), "made_with": "x"})
+    found = {entry["system"]: entry for entry in cells.collect(wanted, settings(tmp_path))}
+    assert set(found) == {"sfkd", "icode"}
+    assert found["icode"]["seeds"] == list(range(seeds))
+    assert len(found["icode"]["rmse_episodes_m"]) == 2 * seeds
+    assert found["icode"]["difference_to_sfkd"]["mean"] == pytest.approx(3.0)
