@@ -32,7 +32,7 @@ ARROWS = {
     "assembly": HALLWAY | {"vehicle", "scenarios", "datasets", "models", "control"},
     "shelf": HALLWAY | {"artefacts", "datasets"},
     "walk": HALLWAY
-    | {"artefacts", "assembly", "certification", "datasets", "evaluation", "policy", "shelf", "training"},
+    | {"artefacts", "assembly", "certification", "datasets", "evaluation", "policy", "shelf", "training", "vehicle"},
     "policy": HALLWAY | {"artefacts", "assembly", "models", "control"},
     "drive": HALLWAY | {"assembly", "certification", "datasets", "evaluation", "scenarios", "shelf", "vehicle"},
     "cells": {"artefacts", "drive", "evaluation", "shelf"},

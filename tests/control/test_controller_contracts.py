@@ -40,7 +40,7 @@ def monitored():
 
 def koopman_mpc():
     """Over a linear predictor with generic parameters."""
-    model, params = model_and_params("koopman")
+    model, params = model_and_params("koopman_mpc")
     return control.koopman_mpc(model, dt=PLANT.dt, horizon=HORIZON, **LIMITS, **BOX), params
 
 

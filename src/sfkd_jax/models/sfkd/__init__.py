@@ -2,6 +2,7 @@
 
 from sfkd_jax.models.sfkd._bounds import bounded as bounded
 from sfkd_jax.models.sfkd._bounds import gram_bound as gram_bound
+from sfkd_jax.models.sfkd._budget import share_budget as share_budget
 from sfkd_jax.models.sfkd._model import sfkd as sfkd
 from sfkd_jax.models.sfkd._records import SfkdFiber as SfkdFiber
 from sfkd_jax.models.sfkd._records import SfkdLatent as SfkdLatent

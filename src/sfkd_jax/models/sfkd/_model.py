@@ -59,18 +59,20 @@ def sfkd(
         z = Q(e) φ(s, ψ(e)),   z⁺ = A(e) z + B(e) u + r(z; u, e),   z ← T(e → e') z on a switch
         g⁺ = g ∘ D(z; u, e),   s = C z + c
 
-    For every e, by construction and in float32: A(e) = Σ_j w_j(e) A_j with w on the simplex and every ||A_j||_2 ≤ ρ
-    by the Gram bound, so ||A(e)||_2 ≤ ρ by convexity; Lip_z r ≤ β (sandwich layers; u and e are biases); Q
-    orthogonal; Lip_z D bounded; ||C||_2 ≤ 1 in scaled units. α = ρ + β.
+    For every e, by construction and in float32: A(e) = Σ_j w_j(e) A_j with w on the simplex, and z ↦ A_j z + r is
+    α-Lipschitz for every j, hence for every mixture, α = ρ + β; Q orthogonal; Lip_z D bounded; ||C||_2 ≤ 1 in scaled
+    units. With `budget="sum"` ||A_j||_2 ≤ ρ by the Gram bound and Lip_z r ≤ β (sandwich layers; u and e are biases);
+    with "joint" the two share α as one map (see `share_budget`), which holds all of those and more.
 
     Args:
         space: measured scales; fixes all sizes.
-        rank: r, even. rho, beta: the hard bounds, ρ + β < 1 for a certificate.
+        rank: r, even. rho, beta: the hard bounds, ρ + β < 1 for a certificate; of a joint budget only the sum counts.
         vertices: operators to mix. embedding: size of ψ(e).
         residual_hidden, decoder_hidden, encoder_hidden: hidden widths.
         frame: "body" composes the pose on SE(2) outside z; "segment" is the paper's reading, the pose relative to
             the start of the window inside z.
-        residual: "sandwich", "free" (no bound by construction) or "none".
+        residual: "sandwich", "free" (no bound by construction; ||A_j|| ≤ ρ) or "none" (||A_j|| ≤ ρ).
+        budget: "joint" or "sum", of a sandwich residual.
         transport: learn Q(e), else the identity. environment: use e at all.
         soft_penalty: weight of the paper's hinge max(0, ||∂r/∂z||_2 − β)² in the training loss (eq:contr_loss).
 
