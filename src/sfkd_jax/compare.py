@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import Any
 
 from sfkd_jax import artefacts, assembly, cells, certify, drive, shelf, walk
-from sfkd_jax.config import compose, door
+from sfkd_jax.config import command, compose, door
 from sfkd_jax.reporting import benchmark_report
 from sfkd_jax.training import TrainingStopped
 from sfkd_jax.vehicle import Vehicle
@@ -30,7 +30,8 @@ def run(settings: dict[str, Any]) -> dict[str, Any]:
     rows = cells.collect(wanted, settings)
     if not rows:
         raise ValueError(f"nothing to compare: no row came out ({'; '.join(failed.values()) or 'none was asked for'})")
-    document = {"rows": rows, "config": settings, "versions": artefacts.versions(), "failed": failed}
+    made_by = settings | {"command": command("compare")}
+    document = {"rows": rows, "config": made_by, "versions": artefacts.versions(), "failed": failed}
     artefacts.write_json(place / "results.json", document | {"seconds": time.perf_counter() - began})
     pages = benchmark_report(place)
     return {"results": str(place / "results.json"), "rows": len(rows), "failed": len(failed), **pages}

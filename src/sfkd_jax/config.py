@@ -130,6 +130,12 @@ def compose(*overrides: str) -> dict[str, Any]:
     return typing.cast(dict[str, Any], composed)
 
 
+def command(name: str) -> str:
+    """The command that is running, less where its artefacts go."""
+    asked = [word for word in HydraConfig.get().overrides.task if not word.startswith("root=")]
+    return " ".join(["python -m", f"sfkd_jax.{name}", *asked])
+
+
 def _fields(node: type) -> list[Any]:
     """The fields of a dataclass, to be part of another."""
     return [(entry.name, entry.type, field(default=entry.default)) for entry in dataclasses.fields(node)]

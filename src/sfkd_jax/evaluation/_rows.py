@@ -90,14 +90,14 @@ def pool(rows: list[dict[str, Any]]) -> dict[str, Any]:
     if not rest:
         return first
     joined = [value for entry in rows for value in entry["rmse_episodes_m"]]
-    pooled = _mean([entry for entry in rows]) | {
+    return _mean(rows) | {
+        "arrays": first.get("arrays"),
         "seeds": [seed for entry in rows for seed in entry["seeds"]],
         "rmse_m": summary(np.asarray(joined)),
         "rmse_episodes_m": joined,
         "max_deviation_m": max(entry["max_deviation_m"] for entry in rows),
         "departures": sum(entry["departures"] for entry in rows),
     }
-    return pooled
 
 
 def _mean(values: list[Any]) -> Any:

@@ -1,0 +1,168 @@
+"""Figures of a comparison: every row's RMSE, and every row's way through the switches."""
+
+from __future__ import annotations
+
+from itertools import pairwise
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from matplotlib.figure import Figure
+from matplotlib.lines import Line2D
+from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter
+
+from sfkd_jax.reporting._benchmark_rows import ONE_STEP, Contest, Line, measure, scenarios, title, together
+from sfkd_jax.reporting._benchmark_tables import Paper
+from sfkd_jax.reporting._drives import Drive, drives
+from sfkd_jax.reporting._numbers import DASH, dig, interval, is_number
+from sfkd_jax.reporting._scene import switches
+from sfkd_jax.reporting._style import MUTED, canvas, line, literal
+
+FIGURED = "s3"
+"""The scenario of Figure 1 and of the film."""
+_ALWAYS = ("sfkd", "oracle")
+_FAMILIES = ("SFKD and its parts", "told friction and wind", "told neither")
+
+
+def look(one: Line) -> dict[str, Any]:
+    """The line of a row: that of its system; ICODE-MPPI's second training is the first one's in brown, dotted."""
+    style = line("icode_mppi" if one.system == ONE_STEP else one.system)
+    other = {"color": "#8c510a", "linestyle": (0, (1, 1))} if one.system == ONE_STEP else {}
+    return style | other | {"label": literal(one.name)}
+
+
+def overview(group: list[Contest], paper: Paper) -> Figure:
+    """Mean RMSE of every row with its 95 % interval, one panel a scenario, one marker a way of sampling."""
+    rows = together(group).lines
+    names = sorted({name for contest in group for name in scenarios(contest)})
+    figure = canvas(1.5 + 0.235 * len(rows))
+    panels = figure.subplots(1, len(names), sharey=True, squeeze=False)[0]
+    for axes, name in zip(panels, names, strict=True):
+        for shift, contest in enumerate(group):
+            _dots(axes, contest, name, rows, hollow=shift > 0, raised=0.17 * (len(group) - 1 - 2 * shift))
+        printed = [(dig(paper.get(one.system), f"rmse_{name}_m"), place) for place, one in enumerate(rows)]
+        quoted = np.array([pair for pair in printed if is_number(pair[0])], dtype=float).reshape(-1, 2)
+        axes.plot(
+            1e3 * quoted[:, 0], quoted[:, 1], linestyle="none", marker="x", markersize=4, color="#b0b7c0", zorder=2
+        )
+        plain_log(axes.xaxis, axes.set_xscale)
+        axes.set(title=literal(name.upper()), xlabel="RMSE [mm]")
+    panels[0].set_yticks(range(len(rows)), [literal(one.name) for one in rows])
+    panels[0].set_ylim(len(rows) - 0.4, -0.6)
+    kinds = [contest.sampling or "measured" for contest in group]
+    handles = [_mark(kind, "o", hollow=bool(place)) for place, kind in enumerate(kinds)]
+    figure.legend(handles=[*handles, _mark("the paper", "x", hollow=False)], loc="outside upper left", ncols=4)
+    return figure
+
+
+def _mark(name: str, marker: str, *, hollow: bool) -> Line2D:
+    colour = "#b0b7c0" if marker == "x" else MUTED
+    face = "white" if hollow else colour
+    return Line2D([], [], linestyle="none", marker=marker, color=colour, markerfacecolor=face, label=literal(name))
+
+
+def _dots(axes: Any, contest: Contest, name: str, rows: list[Line], *, hollow: bool, raised: float) -> None:
+    """Means and intervals of a contest, each at the place of its row."""
+    places = {one.name: place for place, one in enumerate(rows)}
+    for one in contest.lines:
+        mean = measure(one, name, "rmse_m", "mean")
+        if mean is None or (hollow and not one.rows[name].get("sampling")):
+            continue
+        place, colour = places[one.name] - raised, look(one)["color"]
+        ends = dig(one.rows[name], "rmse_m", "ci95")
+        if interval(ends) != DASH:
+            axes.plot([1e3 * end for end in ends], [place] * 2, color=colour, linewidth=1.4, zorder=3)
+        face = "white" if hollow else colour
+        axes.plot(1e3 * mean, place, marker="o", markersize=4.5, color=colour, markerfacecolor=face, zorder=4)
+
+
+def plain_log(axis: Any, set_scale: Any) -> None:
+    """A logarithmic axis with plain numbers; what is not positive is not shown."""
+    set_scale("log")
+    low, high = axis.get_view_interval()
+    narrow = (1.0, 2.0, 5.0) if high < 30 * low else (1.0, 3.0) if high < 300 * low else (1.0,)
+    axis.set_major_locator(LogLocator(subs=narrow))
+    axis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}"))
+    axis.set_minor_formatter(NullFormatter())
+
+
+def through_switches(directory: Path | None, contest: Contest, seconds: float = 15.0) -> Figure:
+    """Figure 1: lateral deviation of every row in the first episode, over shaded levels of friction and wind."""
+    found, absent = drives(directory, contest, FIGURED) if directory else ([], [])
+    panels = [(name, _family(found, name)) for name in _FAMILIES]
+    panels = [(name, family) for name, family in panels if any(one.line.system not in _ALWAYS for one in family)]
+    panels = panels or [("", found)]
+    figure = canvas(0.9 + 2.05 * len(panels))
+    rows = figure.subplots(len(panels), 1, sharex=True, squeeze=False)[:, 0]
+    end = min([seconds, *(len(one.lateral) * one.dt for one in found)])
+    for axes, (name, family) in zip(rows, panels, strict=True):
+        _panel(axes, family, round(end / family[0].dt) if family else 0)
+        axes.set_title(
+            literal(f"{FIGURED.upper()}, {name}" if name else FIGURED.upper()), pad=30 if axes is rows[0] else 7
+        )
+        axes.set(xlim=(0.0, end), ylabel="deviation [m]")
+    _shade(rows, next((one for one in found if one.envs is not None), None), end)
+    rows[-1].set_xlabel("time [s]")
+    figure.align_ylabels()
+    if absent or not found:
+        said = f"No driven episode of: {', '.join(absent)}." if found else f"No driven episode in: {title(contest)}."
+        figure.supxlabel(literal(said), fontsize=8.5, color="#57606a", wrap=True)
+    return figure
+
+
+def _family(found: list[Drive], name: str) -> list[Drive]:
+    """SFKD and oracle with one group of the others."""
+
+    def group(one: Line) -> str:
+        own, told = _FAMILIES[0], _FAMILIES[1 if one.env == "measured" else 2]
+        return own if one.system.startswith("sfkd") else told
+
+    return [one for one in found if one.line.system in _ALWAYS or group(one.line) == name]
+
+
+def _panel(axes: Any, family: list[Drive], last: int) -> None:
+    """SFKD, oracle and the best two of the others in full, the rest thin; who leaves the frame does so visibly."""
+    score = {one.line.name: measure(one.line, FIGURED, "rmse_m", "mean") or np.inf for one in family}
+    others = sorted((one.line for one in family if one.line.system not in _ALWAYS), key=lambda one: score[one.name])
+    strong = {one.name for one in others[:2]} | {one.line.name for one in family if one.line.system in _ALWAYS}
+    axes.axhline(0.0, color="#9aa1ab", linewidth=0.8, zorder=1.5)
+    for one in family:
+        values = one.lateral[:last]
+        thin = {} if one.line.name in strong else {"linewidth": 0.8, "alpha": 0.65}
+        axes.plot(one.dt * np.arange(1, len(values) + 1), values, **look(one.line) | thin)
+    peaks = [float(np.nanmax(np.abs(one.lateral[:last]), initial=0.0)) for one in family]
+    reach = 1.1 * max(float(np.quantile(peaks, 0.85, method="lower")) if peaks else 0.0, 1e-3)
+    axes.set_ylim(-reach, reach)
+    axes.grid(visible=False, axis="x")
+    if family:
+        axes.legend(loc="center left", bbox_to_anchor=(1.0, 0.5), fontsize=8.5, handlelength=1.8, labelspacing=0.3)
+
+
+def _shade(rows: Any, one: Drive | None, end: float) -> None:
+    """Levels of friction as shades, the darker the more slippery, with (μ, w) above the first panel."""
+    if one is None or one.envs is None:
+        return
+    steps = round(end / one.dt)
+    edges = [0, *(step for step in switches(one.envs) if step < steps), steps]
+    for start, stop in pairwise(edges):
+        friction, wind = one.envs[start]
+        for axes in rows:
+            axes.axvspan(start * one.dt, stop * one.dt, color=shade(friction), linewidth=0, zorder=0)
+            if start:
+                axes.axvline(start * one.dt, color=MUTED, linestyle=(0, (4, 3)), linewidth=0.9, zorder=1)
+        rows[0].text(
+            (start + stop) / 2 * one.dt, 1.02, conditions(friction, wind).replace(", ", "\n"),
+            transform=rows[0].get_xaxis_transform(), ha="center", va="bottom", fontsize=8.5, color="#57606a",
+        )  # fmt: skip
+
+
+def shade(friction: float) -> tuple[float, float, float]:
+    """White for a dry road, blue grey for a slippery one."""
+    depth = float(np.clip((0.9 - friction) / 0.6, 0.0, 1.0))
+    return 1.0 - 0.14 * depth, 1.0 - 0.10 * depth, 1.0 - 0.05 * depth
+
+
+def conditions(friction: float, wind: float) -> str:
+    """Friction and wind in words."""
+    words = f"w {wind:+.2g} m/s".replace("-", "−") if abs(wind) > 1e-3 else "no wind"
+    return f"μ {friction:.2g}, {words}"

@@ -1,0 +1,128 @@
+"""Words around the tables of a comparison: its head, what the marks mean, and how it is made again."""
+
+from __future__ import annotations
+
+import shlex
+from typing import Any
+
+from sfkd_jax.reporting._benchmark_rows import Contest, Row, contests
+from sfkd_jax.reporting._blocks import Block, Code, Heading, Table
+from sfkd_jax.reporting._numbers import DASH, is_number, number, plain
+from sfkd_jax.reporting._tables import settings_table
+
+OVERVIEW = (
+    "Mean lateral RMSE of every row with its 95 % interval over episodes, on a logarithmic axis; crosses: what the "
+    "paper prints for the row's system, measured in another simulator."
+)
+FIGURE_1 = (
+    "signed lateral deviation in the first episode, left positive. Shades and the words above: friction μ and side "
+    "wind w, which switch at the dashed lines. SFKD and the oracle are in every panel; of the others the two best are"
+    " drawn in full, the rest thin. A line that leaves the frame deviates further than the frame shows."
+)
+FIGURE_2 = (
+    "violations while a side force that nobody measures pushes the car, up to the value on the axis to either side. "
+    "Circles: conformal tubes, all at one level. Squares: the certified tube. Crosses: steps at which the theorem "
+    "fails. Right: the mean position radius of each tube; a tube that is wide enough is never left."
+)
+TRACKING = (
+    "RMSE of the lateral deviation of the true state from the path, one number per episode; mean with its 95 % "
+    "interval. (e): the model is told friction and wind; (no e): it is not. The oracle plans with the true vehicle, "
+    "nominal with a bicycle that knows neither. The paper has one row per system, which stands beside every variant "
+    "of it; its simulator is another one."
+)
+AGAINST = (
+    "RMSE of a row minus SFKD's on the same episodes, with the 95 % interval of the paired difference: * lies above "
+    "zero, so SFKD is better; † lies below zero, so SFKD is worse; unmarked intervals hold zero."
+)
+CLAIMS = (
+    "By scenario. V0: steps at which the certified bound fails although no one-step error exceeded its assumption. "
+    "V1: segments that leave the tube around their prediction, with the mean radius of the tube beside it: a wide "
+    "tube is easily kept."
+)
+LIMITS = (
+    "By scenario. V2: windows of prediction beyond one distance that is the same for every row; the paper's rate is "
+    "its own measure. Left the lane: episodes. Unhealthy: steps at which the planner held its last plan."
+)
+COST = (
+    "Time of one compiled control step, all samples included. α is a certified bound; rows without one have no "
+    "certificate."
+)
+
+
+def lead(results: dict[str, Any], found: list[Contest]) -> str:
+    """How much was driven."""
+    rows: list[Row] = [row for contest in found for line in contest.lines for row in line.rows.values()]
+    lines = {line.name for contest in found for line in contest.lines}
+    vehicles = dict.fromkeys(contest.vehicle for contest in found)
+    said = [
+        f"{len(lines)} rows on {len(vehicles)} vehicle{'s' if len(vehicles) != 1 else ''} ({', '.join(vehicles)})",
+        f"{_spread(rows, 'episodes')} episodes of {_spread(rows, 'episode_s')} s per row, scenario and seed",
+        f"training seeds: {_seeds(rows)}",
+    ]
+    seconds: Any = results.get("seconds")
+    lasted = f" The last run of the command took {number(seconds / 60, 1)} minutes." if is_number(seconds) else ""
+    return f"{'; '.join(said)}.{lasted}"
+
+
+def _spread(rows: list[Row], key: str) -> str:
+    """What all rows have, or from the least to the most."""
+    found = sorted({row[key] for row in rows if is_number(row.get(key))})
+    ends = [plain(found[0]), plain(found[-1])] if found else [DASH]
+    return " to ".join(dict.fromkeys(ends))
+
+
+def failures(results: dict[str, Any]) -> list[Block]:
+    """What was asked for and did not come out."""
+    failed = results.get("failed")
+    if not isinstance(failed, dict) or not failed:
+        return []
+    rows = [[str(name), plain(reason)] for name, reason in failed.items()]
+    return [Heading(2, "Asked for, but not driven"), Table(["Row", "Reason"], rows, prose=True)]
+
+
+def provenance(results: dict[str, Any]) -> list[Block]:
+    """Command, settings, versions, seeds and episodes of every contest."""
+    config = results.get("config") or {}
+    versions = results.get("versions") or {}
+    counts = [
+        [f"{contest.vehicle}, {contest.sampling or 'no sampling'}", name, *_counted(contest, name)]
+        for contest in contests(results["rows"])
+        for name in sorted({key for line in contest.lines for key in line.rows})
+    ]
+    return [
+        Heading(2, "How to make it again"),
+        Code(_command(config)),
+        Heading(3, "What was driven"),
+        Table(["Contest", "Scenario", "Episodes", "Seconds each", "Seeds"], counts, prose=True),
+        Heading(3, "Settings"),
+        settings_table(_without_print(config)),
+        Heading(3, "Versions"),
+        Table(["Package", "Version"], [[str(name), plain(one)] for name, one in versions.items()], prose=True),
+    ]
+
+
+def _counted(contest: Contest, name: str) -> list[str]:
+    rows = [line.rows[name] for line in contest.lines if name in line.rows]
+    return [_spread(rows, "episodes"), _spread(rows, "episode_s"), _seeds(rows)]
+
+
+def _seeds(rows: list[Row]) -> str:
+    """All seeds of all rows."""
+    found = {seed for row in rows for seed in row.get("seeds") or [] if is_number(seed)}
+    return ", ".join(map(plain, sorted(found))) or DASH
+
+
+def _command(config: dict[str, Any]) -> str:
+    """The command line: as recorded, else the experiment that the comparison is named after."""
+    if isinstance(config.get("command"), str):
+        return config["command"]
+    name = config.get("name")
+    named = [f"+experiment={name}"] if name not in (None, "", "default") else []
+    return shlex.join(["python", "-m", "sfkd_jax.compare", *named])
+
+
+def _without_print(config: dict[str, Any]) -> dict[str, Any]:
+    """Settings without the paper's numbers, which stand in the tables."""
+    comparison = config.get("comparison")
+    kept = {key: value for key, value in comparison.items() if key != "paper"} if isinstance(comparison, dict) else None
+    return config if kept is None else config | {"comparison": kept}

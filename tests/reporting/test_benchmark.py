@@ -1,0 +1,382 @@
+import copy
+import json
+import math
+import re
+from itertools import product
+from pathlib import Path
+
+import numpy as np
+import pytest
+from PIL import Image
+
+from sfkd_jax.artefacts import ArtefactError, write_arrays
+from sfkd_jax.reporting import benchmark_markdown, benchmark_report
+from sfkd_jax.reporting._animation import MOST_BYTES, film
+from sfkd_jax.reporting._benchmark_figures import overview, through_switches
+from sfkd_jax.reporting._benchmark_rows import contests, line_of, paper_of
+from sfkd_jax.reporting._benchmark_words import beaten
+from sfkd_jax.reporting._blocks import Table
+from sfkd_jax.reporting._latex import latex
+from sfkd_jax.reporting._robustness import level_of, robustness, studies, study_of
+
+ORACLE, SFKD = 0.016, 0.020
+LEVELS = ((0.9, 0.0), (0.6, -4.0), (0.3, 8.0), (0.6, 4.0))
+SYSTEMS = {  # (system, env): RMSE on S3 [m]
+    ("sfkd", "measured"): SFKD, ("sfkd_no_fiber", "none"): 0.060, ("sfkd_no_contraction", "measured"): 0.018,
+    ("koopman_mpc", "measured"): 0.090, ("koopman_mpc", "none"): 0.150, ("neural_ode", "none"): 0.070,
+    ("neural_ode", "measured"): 0.030, ("icode_mppi", "measured"): 0.025, ("icode_mppi", "none"): 0.080,
+    ("icode_mppi_one_step", "measured"): 0.040, ("nominal", "none"): 0.120, ("oracle", "measured"): ORACLE,
+}  # fmt: skip
+PAPER = {
+    "columns": ["rmse_s2_m", "rmse_s2_std", "rmse_s3_m", "rmse_s3_std", "smoothness_rad_per_s", "violation_rate"],
+    "icode_mppi": [0.127, 0.019, 0.174, 0.025, 0.134, 0.29],
+    "sfkd": [0.098, 0.014, 0.120, 0.018, 0.101, 0.03],
+}
+
+
+def row(system, env, scenario="s3", vehicle="kinematic", sampling="feedback", factor=1.0, **more):
+    sampling = None if system == "koopman_mpc" else sampling
+    scale = factor * {"s1": 0.5, "s2": 0.8, "s3": 1.0}[scenario] * (3 if sampling == "plain" else 1)
+    mean = SYSTEMS[system, env] * scale
+    gap = mean - SFKD * scale
+    own = system == "sfkd"
+    violation = {
+        "v0": 0.0 if own else None, "v1": 0.01, "v1_tube": "certified" if own else "conformal", "v1_radius_m": 2.0,
+        "v1_conformal": 0.04, "v1_conformal_radius_m": 0.2, "v1_level": 0.95, "v2": 10 * mean * 1e-2, "segments": 96,
+    }  # fmt: skip
+    learned = system not in ("oracle", "nominal")
+    return {
+        "system": system, "model": system, "controller": "mppi", "sampling": sampling, "env": env,
+        "scenario": scenario, "vehicle": vehicle, "inner_loop": "none", "seeds": [0, 1], "episodes": 8,
+        "episode_s": 60.0, "variation": None,
+        "rmse_m": {"mean": mean, "std": 0.2 * mean, "ci95": [0.9 * mean, 1.1 * mean], "median": mean, "p95": mean},
+        "max_deviation_m": 8 * mean, "rmse_after_switch_m": None if scenario == "s1" else mean,
+        "smoothness_rad_per_s": 0.054, "violation": violation, "departures": 0,
+        "act_ms": {"p50": 9.25, "p99": 20.5}, "ratio_to_oracle": mean / (ORACLE * scale),
+        "difference_to_sfkd": None if own else {"mean": gap, "ci95": [gap - 1e-3, gap + 1e-3]},
+        "params": 12345 if learned else None, "alpha": 0.93211 if own else None,
+        "open_loop_rmse_m": {"1": 0.01 * mean, "5": 0.1 * mean, "10": mean, "20": 5 * mean} if learned else None,
+    } | more  # fmt: skip
+
+
+def pushed(system, env):
+    runs = [{"force_n": force, "v0": 0.0, "v1": 0.1, "v1_conformal": force / 1e3, "v2": 0.0} for force in (0.0, 500.0)]
+    return row(system, env, disturbed=runs)
+
+
+def document(vehicles=("kinematic",), samplings=("feedback", "plain")):
+    rows = []
+    for vehicle, sampling, scenario in product(vehicles, samplings, ("s1", "s2", "s3")):
+        for system, env in SYSTEMS:
+            if system != "koopman_mpc" or sampling == "feedback":
+                rows.append(row(system, env, scenario, vehicle, sampling))
+    for place, entry in enumerate(rows):
+        if (entry["scenario"], entry["sampling"]) == ("s3", "feedback"):
+            rows[place] = entry | {"disturbed": pushed(entry["system"], entry["env"])["disturbed"]}
+    for variation, factor in {
+        "environment 0.5 s late": 1.5,
+        "environment 1 s late": 2.5,
+        "sensor noise x2": 1.25,
+    }.items():
+        rows += [row(*one, factor=factor, variation=variation) for one in SYSTEMS]
+    config = {"name": "table1", "comparison": {"paper": PAPER, "seeds": [0, 1]}, "evaluation": {"episodes": 8}}
+    return {"rows": rows, "config": config, "versions": {"jax": "0.10.2"}, "seconds": 90.0, "failed": {}}
+
+
+def road(length):
+    s = 0.5 * np.arange(2 * length + 400)
+    curvature = 0.02 * np.sin(2 * np.pi * s / 90)
+    yaw = np.cumsum(curvature) * 0.5
+    return np.stack([np.cumsum(np.cos(yaw)) * 0.5, np.cumsum(np.sin(yaw)) * 0.5, yaw, curvature], axis=1)
+
+
+def cell(directory, system, env, sampling="feedback", steps=40, vehicle="kinematic", **changes):
+    """A cell whose deviation follows the wind, as far as the system is wrong."""
+    path, levels = road(steps), np.array(LEVELS)[np.arange(steps) // 30 % len(LEVELS)]
+    time = 0.1 * np.arange(1, steps + 1)
+    gain = 2 * SYSTEMS[system, env]
+    lateral = gain * (levels[:, 1] / 8 * (1 - np.exp(-3 * (time % 3))) + 0.3 * np.sin(1.7 * time + 40 * gain))
+    here = path[2 * np.arange(steps + 1)]
+    offset = np.concatenate([[0.0], lateral])
+    states = np.stack([here[:, 0] - offset * np.sin(here[:, 2]), here[:, 1] + offset * np.cos(here[:, 2])], axis=1)
+    states = np.concatenate([states, here[:, 2:3], np.full((steps + 1, 1), 10.0)], axis=1)
+    arrays = {"lateral": lateral, "states": states, "envs": levels, "path": path}
+    arrays = {name: np.stack([values] * 2).astype(np.float32) for name, values in arrays.items()}
+    kind = "qp" if system == "koopman_mpc" else sampling
+    place = directory / "cells" / vehicle / "s3" / kind
+    place.mkdir(parents=True, exist_ok=True)
+    arrays = {
+        name: values for name, values in (arrays | {"dt": np.float64(0.1)} | changes).items() if values is not None
+    }
+    write_arrays(place / f"{system}-{env}.npz", arrays, kind="cell", config={})
+
+
+@pytest.fixture(scope="module")
+def whole(tmp_path_factory):
+    """Every row, with the cells of all but two."""
+    directory = tmp_path_factory.mktemp("table")
+    (directory / "results.json").write_text(json.dumps(document()))
+    for system, env in SYSTEMS:
+        if system != "neural_ode":
+            cell(directory, system, env)
+    return directory, benchmark_report(directory)
+
+
+def text_of(directory, name):
+    return (directory / "report" / name).read_text("utf-8")
+
+
+def tables_of(markdown, heading):
+    """The cells of the first table under a heading, by row."""
+    part = markdown.split(f"# {heading}")[1].split("\n#")[0]
+    lines = [line.strip("| ").split(" | ") for line in part.splitlines() if line.startswith("|")]
+    lines = [[re.sub(r"^\*\*(.*)\*\*$", r"\1", cell) for cell in line] for line in lines]
+    return {name: cells for name, *cells in (lines[0], *lines[2:])}
+
+
+FEEDBACK = "Kinematic vehicle, sampling around a feedback law"
+
+
+def test_tracking_stands_beside_the_paper_with_intervals_in_millimetres(whole):
+    found = tables_of(text_of(whole[0], "results.md"), f"Tracking: {FEEDBACK}")
+    assert found["SFKD"] == ["10.0 (9.0–11.0)", "16.0 (14.4–17.6)", "98 ± 14", "20.0 (18.0–22.0)", "120 ± 18"]
+    assert found["ICODE-MPPI (e)"][-1] == found["ICODE-MPPI (no e)"][-1] == "174 ± 25"
+    assert found["ICODE-MPPI, one step (e)"][-2:] == ["40.0 (36.0–44.0)", "174 ± 25"]
+    assert found["Oracle"][-1] == "–"
+
+
+def test_differences_are_marked_where_the_interval_leaves_zero_on_either_side(whole):
+    found = tables_of(text_of(whole[0], "results.md"), f"Against SFKD and the oracle: {FEEDBACK}")
+    assert found["ICODE-MPPI (e)"][2] == r"+5.0 (4.0–6.0) \*"
+    assert found["SFKD − contraction"][2] == "−2.0 (−3.0 to −1.0) †"
+    assert found["SFKD"] == ["–", "–", "–", "1.25 / 1.25 / 1.25"]
+
+
+def test_a_quadratic_program_is_compared_with_the_sampling_it_was_compared_with(whole):
+    markdown = text_of(whole[0], "results.md")
+    own = tables_of(markdown, f"Against SFKD and the oracle: {FEEDBACK}")["Koopman MPC (e)"]
+    other = tables_of(markdown, "Against SFKD and the oracle: Kinematic vehicle, plain sampling")["Koopman MPC (e)"]
+    assert own[2].startswith("+70.0")
+    assert own[3] == "5.62 / 5.62 / 5.62"
+    assert other == ["–"] * 4
+
+
+def test_claims_predictions_and_cost_are_there(whole):
+    markdown = text_of(whole[0], "results.md")
+    found = tables_of(markdown, f"Claims: {FEEDBACK}")
+    assert found["SFKD"][:3] == ["0 / 0 / 0", "1.0 / 1.0 / 1.0", "2.00 / 2.00 / 2.00"]
+    assert found["Nominal"][:3] == ["–", "–", "–"]
+    found = tables_of(markdown, f"Threshold and planner: {FEEDBACK}")
+    assert found["SFKD"] == ["0.1 / 0.2 / 0.2", "3.0", "0 / 0 / 0", "–", "–"]
+    assert found["Oracle"][:2] == ["0.1 / 0.1 / 0.2", "–"]
+    assert tables_of(markdown, "Prediction without feedback, position error")["SFKD"] == ["0.2", "2.0", "20.0", "100.0"]
+    assert tables_of(markdown, "Cost and certificate")["SFKD"] == ["9.25", "20.50", "9.25", "20.50", "12345", "0.9322"]
+
+
+def test_the_papers_claim_is_said_beside_ours_with_its_paired_interval(whole):
+    markdown = text_of(whole[0], "results.md")
+    assert "31 % lower than ICODE-MPPI on S3 (120 against 174 mm)" in markdown
+    for name, share, mean, gap in ((" (e)", 20, 25, 5), (" (no e)", 75, 80, 60), (", one step (e)", 50, 40, 20)):
+        interval = f"{gap}.0 mm, 95 % interval {gap - 1}.0 to {gap + 1}.0, so SFKD is better."
+        text = f"20.0 against {mean}.0 mm, {share} % lower; paired difference {interval}"
+        assert markdown.count(f"**SFKD against ICODE-MPPI{name}.** On S3 {text}") == 1
+    text = "20.0 against 18.0 mm, 11 % higher; paired difference −2.0 mm, 95 % interval −3.0 to −1.0"
+    assert f"**SFKD against SFKD − contraction.** On S3 {text}, so SFKD − contraction is better." in markdown
+    assert "1.25 on S1, 1.25 on S2, 1.25 on S3 times that of a planner with the true vehicle" in markdown
+
+
+def test_rows_that_beat_sfkd_are_named_and_no_others():
+    (contest,) = contests([row(*one) for one in SYSTEMS])
+    table, rest = beaten(contest)
+    found = dict(table.rows)
+    assert found["S3 RMSE [mm]: 20.0"] == "SFKD − contraction 18.0 †; Oracle 16.0 †"
+    assert found["prediction, 20 ahead [mm]: 100.0"] == "SFKD − contraction 90.0"
+    assert "S3 steering rate [rad/s]: 0.054" in rest.text
+    assert not any(name.startswith("S3 steering rate") for name in found)
+    worst = [row(*one) for one in SYSTEMS if one != ("sfkd", "measured")] + [row("sfkd", "measured", factor=20)]
+    others = beaten(contests(worst)[0])[0].rows[0][1]
+    assert all(line.name in others for line in contests(worst)[0].lines if line.system != "sfkd")
+    assert not any(isinstance(block, Table) for block in beaten(contests([row("sfkd", "measured")])[0]))
+
+
+def test_latex_is_balanced_and_bold_marks_the_best_learned_row(whole):
+    text = text_of(whole[0], "table1.tex")
+    body = re.sub(r"(?m)^%.*$|\\[{}%]", "", text)
+    depths = np.cumsum([{"{": 1, "}": -1}.get(letter, 0) for letter in body])
+    assert depths.min() == 0
+    assert depths[-1] == 0
+    assert text.count(r"\begin{tabular}") == text.count(r"\end{tabular}") == text.count(r"\bottomrule") == 2
+    assert body.isascii()
+    for tabular in text.split(r"\begin{tabular}")[1:]:
+        width = len(re.match(r"\{l(r+)\}", tabular)[1])
+        lines = [line for line in tabular.splitlines() if line.startswith(("SFKD", "ICODE", "Oracle", "Koopman"))]
+        assert {line.count("&") for line in lines} == {width}
+    feedback = text.split(r"\end{tabular}")[0]
+    bold = {line.split(" &")[0] for line in feedback.splitlines() if r"\textbf{18.0" in line}
+    assert bold == {"SFKD $-$ contraction"}
+    assert not re.search(r"(?m)^(Oracle|Nominal).*textbf", text)
+
+
+def test_the_page_is_one_file_that_asks_for_nothing(whole):
+    directory, made = whole
+    page = text_of(directory, "index.html")
+    assert made["report"] == str(directory / "report" / "index.html")
+    links = re.findall(r'(?:src|href)="([^"]*)"', page)
+    assert len(links) == len(made["figures"])
+    assert sum(link.startswith("data:image/gif;base64,") for link in links) == 1
+    assert all(link.startswith("data:image/") for link in links)
+    assert re.search(r"https?://|url\(|@import|<script", page) is None
+    assert len(page.encode()) < 5e6
+    assert re.search(r"\b(nan|None|null)\b", re.sub(r"<style>.*?</style>|base64,[^\"]*", "", page, flags=re.S)) is None
+
+
+def test_markdown_depends_on_the_results_alone_and_links_what_is_drawn(whole):
+    directory, made = whole
+    markdown = text_of(directory, "results.md")
+    assert markdown == benchmark_markdown(json.loads((directory / "results.json").read_text()))
+    links = re.findall(r"\]\(([^)]*)\)", markdown)
+    assert {f"results_files/{Path(figure).name}" for figure in made["figures"] if figure.endswith("png")} == set(links)
+    assert all((directory / "report" / link).exists() for link in links)
+    assert "data:" not in markdown
+    widths = [{line.count(" | ") for line in table.splitlines()} for table in re.findall(r"(?m)(?:^\|.*\n)+", markdown)]
+    assert all(len(width) == 1 for width in widths)
+
+
+def test_every_figure_is_drawn_once_per_study_and_access(whole):
+    names = [Path(figure).name for figure in whole[1]["figures"]]
+    assert names == [
+        "rmse_kinematic.png", "figure1_kinematic.png", "s3_kinematic.gif", "figure2_kinematic_feedback_measured.png",
+        "figure2_kinematic_feedback_none.png", "environment_late_kinematic_feedback.png",
+        "sensor_noise_kinematic_feedback.png",
+    ]  # fmt: skip
+
+
+def test_the_film_is_small_and_moves(whole):
+    file = Path(next(figure for figure in whole[1]["figures"] if figure.endswith(".gif")))
+    assert file.stat().st_size <= MOST_BYTES
+    with Image.open(file) as image:
+        assert image.n_frames == 40
+        assert image.info["duration"] == 100
+        first = np.asarray(image.convert("RGB")).astype(int)
+        image.seek(36)
+        later = np.asarray(image.convert("RGB")).astype(int)
+    assert np.mean(np.abs(first - later).max(axis=2) > 30) > 0.01
+
+
+def test_figure_1_draws_what_lies_there_and_names_what_does_not(whole):
+    (contest, _) = contests(document()["rows"])
+    figure = through_switches(whole[0], contest)
+    drawn = {str(line.get_label()) for axes in figure.axes for line in axes.get_lines()}
+    assert {"SFKD", "Oracle", "Nominal", "ICODE-MPPI (e)", "ICODE-MPPI, one step (e)", "Koopman MPC (no e)"} <= drawn
+    assert not any("Neural ODE" in name for name in drawn)
+    assert figure._supxlabel.get_text() == "No driven episode of: Neural ODE (e), Neural ODE (no e)."
+    assert any(text.get_text() == "μ 0.6\nw −4 m/s" for text in figure.axes[0].texts)
+    curve = next(line for line in figure.axes[0].get_lines() if line.get_label() == "SFKD")
+    assert len(curve.get_xdata()) == 40
+    assert len(through_switches(None, contest).axes) == 1
+
+
+def test_a_row_that_says_where_its_arrays_lie_is_believed(tmp_path):
+    cell(tmp_path, "sfkd", "measured")
+    for end in ("npz", "json"):
+        (tmp_path / f"cells/kinematic/s3/feedback/sfkd-measured.{end}").rename(tmp_path / f"elsewhere.{end}")
+    (contest,) = contests([row("sfkd", "measured")])
+    assert film(tmp_path, contest, tmp_path / "s3.gif", seconds=0.5) is None
+    (contest,) = contests([row("sfkd", "measured", arrays="elsewhere.npz")])
+    assert film(tmp_path, contest, tmp_path / "s3.gif", seconds=0.5)[1] == ["SFKD"]
+
+
+def test_robustness_divides_by_the_same_row_as_it_is(whole):
+    rows = document()["rows"]
+    (contest, plain) = contests(rows)
+    late, noise = studies(rows, contest)
+    assert (late.name, noise.name) == ("environment late", "sensor noise")
+    assert late.levels == ["environment 0.5 s late", "environment 1 s late"]
+    assert set(np.round(list(noise.ratios.values()), 9)) == {1.25}
+    assert len(noise.ratios) == len(SYSTEMS)
+    assert studies(rows, plain) == []
+    assert len(robustness(late).axes) == 1
+    found = tables_of(text_of(whole[0], "results.md"), f"Environment late: {FEEDBACK}")
+    assert found["Nominal"] == ["1.50", "2.50"]
+
+
+@pytest.mark.parametrize(
+    ("variation", "study", "level"),
+    [
+        ("environment 0.5 s late", "environment late", "0.5 s"),
+        ("environment friction bias 0.1", "environment bias", "friction 0.1"),
+        ("environment noise x2", "environment noise", "x2"),
+        ("data share 0.25", "data share", "0.25"),
+        ("side force 500 N", "side force", "500 N"),
+        ("levels fixed", "levels", "fixed"),
+        ("tyres worn", "tyres worn", "tyres worn"),
+    ],
+)
+def test_variations_are_grouped_by_their_words(variation, study, level):
+    assert study_of(variation) == study
+    assert level_of(variation, study) == level
+
+
+def emptied(value, hole):
+    """Every number of a row replaced."""
+    if isinstance(value, dict):
+        return {key: emptied(entry, hole) for key, entry in value.items()}
+    if isinstance(value, list):
+        return [emptied(entry, hole) for entry in value]
+    return hole if isinstance(value, int | float) and not isinstance(value, bool) else value
+
+
+@pytest.mark.parametrize("hole", [None, math.nan, math.inf])
+def test_what_was_not_measured_is_a_dash_and_never_a_zero(tmp_path, hole):
+    results = document(samplings=("feedback",))
+    results["rows"] = [emptied(copy.deepcopy(entry), hole) for entry in results["rows"]]
+    markdown = benchmark_markdown(results)
+    found = tables_of(markdown, f"Tracking: {FEEDBACK}")
+    assert {cell for name, cells in found.items() if name != "Row" for cell in cells if "±" not in cell} == {"–"}
+    assert set(tables_of(markdown, "Cost and certificate")["SFKD"]) == {"–"}
+    assert re.search(r"\b(nan|inf|None|null)\b", markdown) is None
+    text = latex(contests(results["rows"]), paper_of(results))
+    assert r"\textbf" not in text
+    overview(contests(results["rows"]), paper_of(results))
+    if hole is None:
+        (tmp_path / "results.json").write_text(json.dumps(results))
+        assert len(benchmark_report(tmp_path)["figures"]) == 4
+
+
+def test_rows_with_next_to_nothing_still_make_a_page(tmp_path):
+    bare = {"system": "sfkd", "env": "measured", "scenario": "s3", "vehicle": "kinematic", "sampling": None}
+    (tmp_path / "results.json").write_text(json.dumps({"rows": [bare]}))
+    made = benchmark_report(tmp_path)
+    assert "–" in Path(made["report"]).read_text("utf-8")
+    (tmp_path / "results.json").write_text(json.dumps({"rows": []}))
+    assert benchmark_report(tmp_path)["figures"] == []
+    assert not list((tmp_path / "report" / "results_files").iterdir())
+
+
+def test_failed_rows_are_told(tmp_path):
+    markdown = benchmark_markdown(document() | {"failed": {"dynamic/r2dn": "loss is not finite"}})
+    assert tables_of(markdown, "Asked for, but not driven")["dynamic/r2dn"] == ["loss is not finite"]
+    with pytest.raises(ArtefactError, match=r"results\.json: missing"):
+        benchmark_report(tmp_path)
+
+
+def test_the_way_back_is_told(whole):
+    markdown = text_of(whole[0], "results.md")
+    assert "    python -m sfkd_jax.compare +experiment=table1\n" in markdown
+    assert "| jax | 0.10.2 |" in markdown
+    assert "The last run of the command took 1.5 minutes." in markdown
+    assert "training seeds: 0, 1" in markdown
+
+
+def test_the_same_results_give_the_same_bytes_and_no_stale_figure(whole):
+    directory, made = whole
+    before = text_of(directory, "index.html")
+    (directory / "report" / "results_files" / "old.png").write_bytes(b"")
+    assert benchmark_report(directory) == made
+    assert text_of(directory, "index.html") == before
+    assert sorted(map(str, (directory / "report" / "results_files").iterdir())) == sorted(made["figures"])
+
+
+def test_sfkd_is_the_line_that_sees_the_environment():
+    rows = [row("sfkd", "measured") | {"env": "none"}, row("sfkd", "measured")]
+    assert line_of(contests(rows)[0], "sfkd").env == "measured"
