@@ -241,7 +241,8 @@ def test_two_latents_under_the_same_inputs_approach_at_least_as_fast_as_alpha(na
 
 
 def test_the_budget_is_the_callers():
-    model = models.sfkd(space(), rank=8, vertices=2, residual_hidden=(4,), decoder_hidden=(4,), rho=0.5, beta=0.3)
+    budget = {"rho": 0.5, "beta": 0.3, "budget": "sum"}
+    model = models.sfkd(space(), rank=8, vertices=2, residual_hidden=(4,), decoder_hidden=(4,), **budget)
     shapes = jax.eval_shape(model.init, jax.random.key(0))
     random = np.random.default_rng(0)
     params = jax.tree.map(lambda leaf: 3.0 * random.standard_normal(leaf.shape).astype(np.float32), shapes)

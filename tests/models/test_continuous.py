@@ -148,6 +148,19 @@ def test_the_learned_rates_are_exactly_affine_in_all_inputs():
     assert np.linalg.matrix_rank(gain) == 4
 
 
+@pytest.mark.parametrize("reads_env", [False, True])
+def test_the_gain_of_the_steering_depends_on_the_environment_only_where_it_is_read(reads_env):
+    init, rates = affine_rates(space(), (8,), (jnp.tanh,), last=1.0, reads_env=reads_env)
+    params, body, way = init(jax.random.key(0)), jnp.asarray([0.3]), jnp.asarray([0.7, -0.4])
+
+    def change(env, t):
+        fiber = Conditioned(params, jnp.asarray(env))
+        return rates(fiber, body, t * way) - rates(fiber, body, 0.0 * way)
+
+    np.testing.assert_allclose(change([0.5, 0.5], 3.0), 3.0 * change([0.5, 0.5], 1.0), rtol=1e-5)
+    assert np.allclose(change([0.5, 0.5], 1.0), change([-0.5, 0.9], 1.0), rtol=1e-5) != reads_env
+
+
 @pytest.mark.parametrize("name", LEARNED)
 def test_a_blind_model_ignores_the_environment_exactly_and_any_other_does_not(name):
     other = jnp.asarray([0.8, -5.0])

@@ -20,7 +20,12 @@ def softplus(x: Float[Array, "*shape"]) -> Float[Array, "*shape"]:
 
 
 def affine_rates(
-    space: Space, hidden: Sequence[int], activations: Sequence[Callable[[Array], Array]], *, last: float
+    space: Space,
+    hidden: Sequence[int],
+    activations: Sequence[Callable[[Array], Array]],
+    *,
+    last: float,
+    reads_env: bool = False,
 ) -> tuple[Callable[[Key], Params], Callable[[Conditioned, Array, Control], Array]]:
     """`init` and `rates` of a model in continuous time with rates f(s) + G(s) [u; e], two networks of one shape.
 
@@ -28,20 +33,24 @@ def affine_rates(
         space: measured scales; fixes all sizes.
         hidden, activations: widths of f and of G, and what follows each.
         last: initial scale of both last layers.
+        reads_env: f(s, e) + G(s, e) u instead: affine in the control alone.
     """
-    body = space.body_mean.shape[0]
-    outputs, inputs = 3 + body, space.control_mean.shape[0] + space.env_mean.shape[0]
+    body, control, env = (part.shape[0] for part in (space.body_mean, space.control_mean, space.env_mean))
+    outputs, inputs = 3 + body, control + (0 if reads_env else env)
+    start = jnp.zeros(body + (env if reads_env else 0))
     f = network(hidden, outputs, activations, last=last)
     G = network(hidden, outputs * inputs, activations, last=last)
 
     def init(key: Key) -> Params:
         f_key, G_key = jax.random.split(key)
-        return {"f": f.init(f_key, jnp.zeros(body))["params"], "G": G.init(G_key, jnp.zeros(body))["params"]}
+        return {"f": f.init(f_key, start)["params"], "G": G.init(G_key, start)["params"]}
 
     def rates(fiber: Conditioned, body: Float[Array, " body"], control: Control) -> Float[Array, " rates"]:
-        free = cast(jax.Array, f.apply({"params": fiber.params["f"]}, body))
-        gain = cast(jax.Array, G.apply({"params": fiber.params["G"]}, body)).reshape(outputs, inputs)
-        return free + gain @ jnp.concatenate([control, fiber.env])
+        read = jnp.concatenate([body, fiber.env]) if reads_env else body
+        driven = control if reads_env else jnp.concatenate([control, fiber.env])
+        free = cast(jax.Array, f.apply({"params": fiber.params["f"]}, read))
+        gain = cast(jax.Array, G.apply({"params": fiber.params["G"]}, read)).reshape(outputs, inputs)
+        return free + gain @ driven
 
     return init, rates
 

@@ -8,7 +8,13 @@ from sfkd_jax.types import Control, Model, Space, State, Step
 
 
 def icode_mppi(
-    space: Space, *, nominal: Step, dt: float = 0.1, hidden: tuple[int, ...] = (64, 64), environment: bool = True
+    space: Space,
+    *,
+    nominal: Step,
+    dt: float = 0.1,
+    hidden: tuple[int, ...] = (64, 64),
+    environment: bool = True,
+    reads_env: bool = False,
 ) -> Model:
     """Known dynamics plus a residual f(s) + G(s) [u; e], the sum solved by RK4 at dt.
 
@@ -24,10 +30,12 @@ def icode_mppi(
         dt: sampling period [s], the solver's step in training and in use.
         hidden: widths of f and of G.
         environment: use e at all; if not, G(s) [u; 0].
+        reads_env: f(s, e) + G(s, e) u instead, so that the gain of the steering may depend on friction: more than the
+            original has, and the most that a residual affine in the control can be given.
 
     Source: Song et al., arXiv 2605.03260, eqs. 10 and 11.
     """
-    init, rates = affine_rates(space, hidden, (softplus,) * len(hidden), last=1e-3)
+    init, rates = affine_rates(space, hidden, (softplus,) * len(hidden), last=1e-3, reads_env=reads_env)
 
     def known(fiber: Conditioned, state: State, control: Control) -> State:
         return nominal(state, control, space.env_mean + space.env_scale * fiber.env)
