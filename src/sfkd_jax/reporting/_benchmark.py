@@ -14,8 +14,6 @@ from sfkd_jax.reporting import _benchmark_tables as tables
 from sfkd_jax.reporting._animation import film
 from sfkd_jax.reporting._benchmark_figures import FIGURED, overview, through_switches
 from sfkd_jax.reporting._benchmark_rows import (
-    ONE_STEP,
-    SHORT,
     Contest,
     Row,
     contests,
@@ -40,8 +38,6 @@ TITLE = "The paper's table, row by row"
 FILES = "results_files"
 MOST_BYTES = 5_000_000
 """Of the page."""
-_GIF = "R0lGOD"
-"""How every GIF begins in base64."""
 
 
 def benchmark_report(directory: Path) -> dict[str, Any]:
@@ -87,13 +83,13 @@ def benchmark_markdown(results: dict[str, Any]) -> str:
 
 
 def _html(page: list[Block]) -> str:
-    """The page with its films under their own type; from the last one on, as names where it would become too heavy."""
+    """The page; its films, from the last one on, as names where it would become too heavy."""
     text, films = to_html(TITLE, page), [block for block in page if isinstance(block, Picture) and _moves(block)]
     while len(text.encode()) > MOST_BYTES and films:
         heavy = films.pop()
         page = [_named(heavy) if block is heavy else block for block in page]
         text = to_html(TITLE, page)
-    return text.replace(f"data:image/png;base64,{_GIF}", f"data:image/gif;base64,{_GIF}")
+    return text
 
 
 def _moves(picture: Picture) -> bool:
@@ -171,8 +167,7 @@ def _under_forces(contest: Contest) -> list[Row]:
     found = [(name, line, row) for line in contest.lines for name, row in line.rows.items() if disturbed([row])]
     hardest = max((name for name, *_ in found), default=None)
     pushed = [(line, row) for name, line, row in found if name == hardest]
-    rows = [row | {"system": SHORT} if line.system == ONE_STEP else row for line, row in pushed]
-    return drawn_for(contest, rows)
+    return drawn_for(contest, [row for _, row in pushed])
 
 
 def _robust(rows: list[Row], contest: Contest, ink: _Ink) -> list[Block]:

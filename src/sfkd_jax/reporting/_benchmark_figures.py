@@ -11,7 +11,7 @@ from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter
 
-from sfkd_jax.reporting._benchmark_rows import ONE_STEP, Contest, Line, measure, scenarios, title, together
+from sfkd_jax.reporting._benchmark_rows import Contest, Line, measure, scenarios, title, together
 from sfkd_jax.reporting._benchmark_tables import Paper
 from sfkd_jax.reporting._drives import Drive, drives
 from sfkd_jax.reporting._numbers import DASH, dig, interval, is_number
@@ -25,10 +25,8 @@ _FAMILIES = ("SFKD and its parts", "told friction and wind", "told neither")
 
 
 def look(one: Line) -> dict[str, Any]:
-    """The line of a row: that of its system; ICODE-MPPI's second training is the first one's in brown, dotted."""
-    style = line("icode_mppi" if one.system == ONE_STEP else one.system)
-    other = {"color": "#8c510a", "linestyle": (0, (1, 1))} if one.system == ONE_STEP else {}
-    return style | other | {"label": literal(one.name)}
+    """The line of a row: that of its system, under the name that says what it is told."""
+    return line(one.system) | {"label": literal(one.name)}
 
 
 def overview(group: list[Contest], paper: Paper) -> Figure:

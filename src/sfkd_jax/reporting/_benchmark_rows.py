@@ -9,10 +9,8 @@ from sfkd_jax.reporting._style import SYSTEMS, label, ordered
 
 Row: TypeAlias = dict[str, Any]
 
-ONE_STEP = "icode_mppi_one_step"
-"""ICODE-MPPI as its authors train it: the paper's row of that name stands beside both trainings."""
-SHORT = "ICODE-MPPI, 1 step"
-"""Its name in a legend of many columns."""
+VARIANTS = {"icode_mppi_one_step": "icode_mppi", "icode_mppi_reads_env": "icode_mppi"}
+"""Systems that the paper has under one name."""
 SELF_EVIDENT = ("nominal", "oracle")
 """Systems whose name says what they are told; so do those of SFKD and its parts."""
 _SAMPLINGS = {"feedback": "sampling around a feedback law", "plain": "plain sampling"}
@@ -40,7 +38,7 @@ class Contest(NamedTuple):
 def name_of(row: Row) -> str:
     """What a reader sees for a row: its system, and for learned rivals whether it is told the environment."""
     system, env = str(row.get("system")), str(row.get("env"))
-    shown = f"{label('icode_mppi')}, one step" if system == ONE_STEP and system not in SYSTEMS else label(system)
+    shown = label(system)
     if system in SELF_EVIDENT or system.startswith("sfkd"):
         return shown
     return f"{shown} (e)" if env == "measured" else f"{shown} (no e)" if env == "none" else shown
@@ -80,10 +78,9 @@ def together(group: list[Contest]) -> Contest:
 
 
 def rank(system: str) -> tuple[int, str]:
-    """The place of a system in every table: the order of the house, ICODE-MPPI's second training after its first."""
+    """The place of a system in every table: the order of the house."""
     order = ordered([*SYSTEMS])
-    near = "icode_mppi" if system == ONE_STEP else system
-    return (order.index(near) if near in order else len(order), system)
+    return (order.index(system) if system in order else len(order), system)
 
 
 def _place(name: str, known: tuple[str, ...]) -> int:
@@ -171,4 +168,4 @@ def paper_of(results: dict[str, Any]) -> dict[str, dict[str, float]]:
     columns = paper.get("columns") or []
     found = {name: values for name, values in paper.items() if name != "columns" and isinstance(values, list)}
     table = {name: dict(zip(columns, values, strict=False)) for name, values in found.items()}
-    return {ONE_STEP: table["icode_mppi"], **table} if "icode_mppi" in table else table
+    return {name: table[printed] for name, printed in VARIANTS.items() if printed in table} | table

@@ -30,7 +30,7 @@ from sfkd_jax.reporting._blocks import Block, Heading, Table, Text
 from sfkd_jax.reporting._numbers import DASH, dig, is_number, number, short
 from sfkd_jax.reporting._style import label
 
-_RIVALS = ("icode_mppi", "icode_mppi_one_step", "sfkd_no_fiber", "sfkd_no_contraction")
+_RIVALS = ("icode_mppi", "icode_mppi_one_step", "icode_mppi_reads_env", "sfkd_no_fiber", "sfkd_no_contraction")
 """Whom the paper's text says that SFKD beats."""
 
 _Value = Callable[[Line], Any]

@@ -100,7 +100,8 @@ def _html(block: Block) -> str:
             return _html_table(block)
         case Picture(path, caption):
             data = base64.b64encode(path.read_bytes()).decode("ascii")
-            image = f'<img alt="{escape(caption)}" src="data:image/png;base64,{data}">'
+            kind = path.suffix.removeprefix(".")
+            image = f'<img alt="{escape(caption)}" src="data:image/{kind};base64,{data}">'
             return f"<figure>{image}<figcaption>{_bound(escape(caption))}</figcaption></figure>"
         case Code(text):
             return f"<pre><code>{escape(text)}</code></pre>"

@@ -23,6 +23,8 @@ SYSTEMS: dict[str, tuple[str, str, Any, float]] = {
     "icode": ("ICODE", "#56b4e9", (0, (5, 1, 1, 1)), 1.3),
     "control_synth": ("ControlSynth", "#cc79a7", (0, (5, 1, 1, 1)), 1.3),
     "icode_mppi": ("ICODE-MPPI", "#d55e00", (0, (5, 1, 1, 1)), 1.3),
+    "icode_mppi_one_step": ("ICODE-MPPI, one step", "#8c510a", (0, (1, 1)), 1.3),
+    "icode_mppi_reads_env": ("ICODE-MPPI, reads e", "#b8860b", (0, (3, 1)), 1.3),
     "r2dn": ("R2DN", "#999933", (0, (5, 1, 1, 1)), 1.3),
     "nominal": ("Nominal", "#e8a33d", "-", 1.4),
     "oracle": ("Oracle", "#3c3c3c", (0, (3, 1.2)), 1.4),
