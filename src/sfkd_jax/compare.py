@@ -17,7 +17,7 @@ def run(settings: dict[str, Any]) -> dict[str, Any]:
     """Whatever is missing is made; then all rows are collected, compared and drawn."""
     began, comparison = time.perf_counter(), settings["comparison"]
     wanted = cells.plan(comparison)
-    groups, driven, failed = cells.drivers(wanted), 0, {}
+    groups, driven, failed = cells.drivers(wanted) if comparison["drive"] else [], 0, {}
     for number, group in enumerate(groups):
         try:
             driven += _drive(group, comparison)

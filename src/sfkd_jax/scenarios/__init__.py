@@ -2,6 +2,7 @@
 
 from sfkd_jax.scenarios._conditions import gusts as gusts
 from sfkd_jax.scenarios._conditions import side_pushes as side_pushes
+from sfkd_jax.scenarios._conditions import steady_road as steady_road
 from sfkd_jax.scenarios._conditions import switching_road as switching_road
 from sfkd_jax.scenarios._conditions import uniform_road as uniform_road
 from sfkd_jax.scenarios._conditions import wet_road as wet_road
