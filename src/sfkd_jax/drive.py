@@ -190,5 +190,5 @@ def _spread(batch: Any) -> Any:
     devices = jax.devices()
     if len(devices) == 1 or len(jax.tree.leaves(batch)[0]) % len(devices):
         return batch
-    mesh = jax.make_mesh((len(devices),), ("episode",))
+    mesh = jax.sharding.Mesh(devices, ("episode",))
     return jax.device_put(batch, jax.sharding.NamedSharding(mesh, jax.sharding.PartitionSpec("episode")))
