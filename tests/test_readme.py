@@ -7,6 +7,8 @@ from pathlib import Path
 
 import pytest
 
+from sfkd_jax.reporting import benchmark_markdown
+
 ROOT = Path(__file__).parents[1]
 README = (ROOT / "README.md").read_text("utf-8")
 EXPERIMENTS = sorted(folder for folder in (ROOT / "experiments").iterdir() if folder.is_dir())
@@ -36,6 +38,12 @@ def test_an_experiment_is_a_script_an_expectation_and_a_result_that_meets_it(fol
     assert os.access(folder / "run.sh", os.X_OK)
     expected = json.loads((folder / "expected.json").read_text())
     rows = json.loads((folder / "results.json").read_text())["rows"]
+    for claim in expected.get("claims", []):
+        about = [row for row in rows if all(row[name] in wanted for name, wanted in claim["where"].items())]
+        assert about, claim
+        for row in about:
+            for name, limits in claim["bounds"].items():
+                assert within(named(row, name), limits), (row["system"], row["scenario"], row["vehicle"], name)
     found = {(row.get("scenario"), row["system"]): row for row in rows}
     for scenario, systems in expected.get("rows", {}).items():
         for system, bounds in systems.items():
@@ -44,11 +52,19 @@ def test_an_experiment_is_a_script_an_expectation_and_a_result_that_meets_it(fol
                 assert within(named(row, name), limits), (scenario, system, name)
 
 
+@pytest.mark.parametrize(("folder", "page"), [("table1_closed_loop", "results"), ("robustness", "robustness")])
+def test_a_page_of_results_says_what_the_results_say(folder, page):
+    results = json.loads((ROOT / "experiments" / folder / "results.json").read_text())
+    shown = benchmark_markdown(results).replace("results_files/", f"{page}_files/")
+    assert (ROOT / "docs" / f"{page}.md").read_text("utf-8") == shown
+    assert all((ROOT / "docs" / figure).exists() for figure in re.findall(r"\]\((\S+\.png)\)", shown))
+
+
 def named(row, name):
     """A measure by its path; "rmse_m" is its mean."""
     value = row
     for part in name.split("."):
-        value = value[part]
+        value = value[int(part) if isinstance(value, list) else part]
     return value["mean"] if isinstance(value, dict) else value
 
 

@@ -1,7 +1,5 @@
 #!/usr/bin/env bash
-# What the paper lacks: e measured late, noisy or biased, worse sensors, unseen levels, small training sets; the rows of
-# table1_closed_loop, with its policies.
+# What the paper lacks: e told late, noisy or biased, and worse sensors, on S3, with the policies of table1_closed_loop.
+# Rows by comparison.only=[…]; unseen levels and small training sets: +experiment=levels, +experiment=small_data.
 set -euo pipefail
-for study in robustness levels small_data; do
-  python -m sfkd_jax.compare +experiment="$study" "$@"
-done
+python -m sfkd_jax.compare +experiment=robustness "$@"

@@ -32,7 +32,8 @@ def run(settings: dict[str, Any]) -> dict[str, Any]:
         raise ValueError(f"nothing to compare: no row came out ({'; '.join(failed.values()) or 'none was asked for'})")
     made_by = settings | {"command": command("compare")}
     document = {"rows": rows, "config": made_by, "versions": artefacts.versions(), "failed": failed}
-    artefacts.write_json(place / "results.json", document | {"seconds": time.perf_counter() - began})
+    seconds = time.perf_counter() - began if driven else None
+    artefacts.write_json(place / "results.json", document | {"seconds": seconds})
     pages = benchmark_report(place)
     return {"results": str(place / "results.json"), "rows": len(rows), "failed": len(failed), **pages}
 

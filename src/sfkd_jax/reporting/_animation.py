@@ -83,7 +83,7 @@ def _write(cast: _Cast, steps: range, path: Path, rate: float) -> None:
         figure = Figure(figsize=(6.0, 4.9))
         FigureCanvasAgg(figure)
         above, strip = figure.subplots(2, 1, height_ratios=[2.4, 1])
-        figure.subplots_adjust(left=0.11, right=0.985, top=0.94, bottom=0.1, hspace=0.08)
+        figure.subplots_adjust(left=0.125, right=0.985, top=0.94, bottom=0.1, hspace=0.08)
         moving = [*_road(above, cast, steps.stop), *_strip(strip, cast, steps.stop)]
         writer = _Writer(fps=max(1, round(rate)))
         with writer.saving(figure, str(path), dpi=90):
