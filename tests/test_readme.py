@@ -52,7 +52,10 @@ def test_an_experiment_is_a_script_an_expectation_and_a_result_that_meets_it(fol
                 assert within(named(row, name), limits), (scenario, system, name)
 
 
-@pytest.mark.parametrize(("folder", "page"), [("table1_closed_loop", "results"), ("robustness", "robustness")])
+@pytest.mark.parametrize(
+    ("folder", "page"),
+    [("table1_closed_loop", "results"), ("robustness", "robustness"), ("figure2_disturbance", "disturbance")],
+)
 def test_a_page_of_results_says_what_the_results_say(folder, page):
     results = json.loads((ROOT / "experiments" / folder / "results.json").read_text())
     shown = benchmark_markdown(results).replace("results_files/", f"{page}_files/")
