@@ -83,7 +83,7 @@ def driver_of(settings: dict[str, Any]) -> str:
 
 
 def made_with(settings: dict[str, Any]) -> str:
-    """The hash of all settings that decide what a cell comes out as; wall-clock settings do not."""
+    """The hash of the settings that a cell comes from; neither the code nor where the artefacts lie is in it."""
     asked = {name: settings[name] for name in (*shelf.IDENTITY, "controller", "scenario", "evaluation")}
     return artefacts.sha256(asked | {"certification": settings["certification"]})
 

@@ -75,9 +75,10 @@ def _certified(settings: dict[str, Any]) -> None:
 
 def _settings(cell: cells.Cell, comparison: dict[str, Any]) -> tuple[dict[str, Any], dict[str, Any]]:
     """The settings of a cell, under the name of the comparison and under the name of its policy's run."""
-    asked = compose(*cells.overrides(cell, comparison))
-    plain = compose(*cells.overrides(cell._replace(variation=next(iter(comparison["variations"]))), comparison))
-    retrained = shelf.identity(asked) != shelf.identity(plain)
+    asked, usual = compose(*cells.overrides(cell, comparison)), next(iter(comparison["variations"]))
+    retrained = cell.variation != usual and shelf.identity(asked) != shelf.identity(
+        compose(*cells.overrides(cell._replace(variation=usual), comparison))
+    )
     asked["evaluation"]["variation"] = None if not comparison["variations"][cell.variation] else cell.variation
     return asked, asked | {"name": cells.policy_name(cell, comparison, retrained=retrained)}
 

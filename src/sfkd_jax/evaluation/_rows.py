@@ -61,11 +61,10 @@ def compare(rows: list[dict[str, Any]]) -> list[dict[str, Any]]:
     """
     for entry in rows:
         same = [other for other in rows if _episodes(other) == _episodes(entry)]
-        for system, measure in (("oracle", _ratio), ("sfkd", paired_difference)):
+        for system, name, measure in _COMPARISONS:
             other = next((other for other in same if other["system"] == system), None)
             if other is None or (system == "sfkd" and other is entry):
                 continue
-            name = {"oracle": "ratio_to_oracle", "sfkd": "difference_to_sfkd"}[system]
             entry[name] = measure(np.asarray(entry["rmse_episodes_m"]), np.asarray(other["rmse_episodes_m"]))
     return rows
 
@@ -78,6 +77,9 @@ def _episodes(entry: dict[str, Any]) -> tuple[Any, ...]:
 
 def _ratio(values: np.ndarray, reference: np.ndarray) -> float:
     return float(np.mean(values) / np.mean(reference))
+
+
+_COMPARISONS = (("oracle", "ratio_to_oracle", _ratio), ("sfkd", "difference_to_sfkd", paired_difference))
 
 
 def pool(rows: list[dict[str, Any]]) -> dict[str, Any]:

@@ -8,6 +8,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
+from sfkd_jax.models._continuous import scaled_env
 from sfkd_jax.models._r2dn_weights import Affine, Interconnection, Shared
 from sfkd_jax.models.sfkd._networks import Biases, Encoder
 from sfkd_jax.models.sfkd._records import SfkdLatent
@@ -95,8 +96,7 @@ def r2dn(
 
     def fiber(params: Params, env: Environment) -> R2dnFiber:
         shared = explicit_weights(params)
-        scaled = (env - space.env_mean) / space.env_scale
-        scaled = scaled if environment else jnp.zeros_like(scaled)
+        scaled = scaled_env(space, env, environment)
         return R2dnFiber(
             A=shared.A,
             feedback=shared.feedback.matrices,

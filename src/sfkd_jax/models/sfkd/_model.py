@@ -7,6 +7,7 @@ from typing import cast
 import jax
 import jax.numpy as jnp
 
+from sfkd_jax.models._continuous import scaled_env
 from sfkd_jax.models.sfkd._networks import Encoder, Networks, PerEnvironment, Shared
 from sfkd_jax.models.sfkd._records import SfkdFiber, SfkdLatent
 from sfkd_jax.models.sfkd._sandwich import apply
@@ -96,16 +97,14 @@ def sfkd(
             "encoder": encoder.init(encoder_key, inputs, jnp.zeros(embedding))["params"],
         }
 
-    def scaled_env(env: Environment) -> Environment:
-        scaled = (env - space.env_mean) / space.env_scale
-        return scaled if environment else jnp.zeros_like(scaled)
-
     def bounded_parts(params: Params) -> Shared:
         return cast(Shared, networks.apply({"params": params["networks"]}, method="shared"))
 
     def fiber(params: Params, env: Environment) -> SfkdFiber:
         shared = bounded_parts(params)
-        found = networks.apply({"params": params["networks"]}, scaled_env(env), method="per_environment")
+        found = networks.apply(
+            {"params": params["networks"]}, scaled_env(space, env, environment), method="per_environment"
+        )
         local = cast(PerEnvironment, found)
         return SfkdFiber(
             A=jnp.tensordot(local.mixture, shared.vertices, axes=1),
