@@ -32,7 +32,7 @@ def multi_step_loss(
     *,
     prediction: float = 1.0,
     one_step: float = 1.0,
-    consistency: float = 0.1,
+    consistency: float = 0.001,
     reconstruction: float = 0.1,
     transport: float = 0.1,
     growth: float = 0.5,
@@ -50,7 +50,8 @@ def multi_step_loss(
         model, space: what is trained and its scales.
         prediction: λ_p, on free-running predictions; 0 leaves the one-step loss alone.
         one_step: λ_1, on predictions from the true state one step before.
-        consistency: λ_c, on the one-step latent defect. reconstruction: λ_r. transport: λ_t, on
+        consistency: λ_c, on the one-step latent defect: larger gives a tighter tube and a less accurate model, see
+            `docs/certificate.md`. reconstruction: λ_r. transport: λ_t, on
             Φ(x, e') − T(e → e') Φ(x, e) with e' another window's environment.
         growth: γ.
 

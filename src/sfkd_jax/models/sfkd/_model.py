@@ -47,6 +47,7 @@ def sfkd(
     residual_hidden: tuple[int, ...] = (32, 32),
     decoder_hidden: tuple[int, ...] = (64, 32),
     encoder_hidden: int = 32,
+    linear_lift: bool = True,
     embedding: int = 16,
     frame: str = "body",
     residual: str = "sandwich",
@@ -69,7 +70,7 @@ def sfkd(
         space: measured scales; fixes all sizes.
         rank: r, even. rho, beta: the hard bounds, ρ + β < 1 for a certificate; of a joint budget only the sum counts.
         vertices: operators to mix. embedding: size of ψ(e).
-        residual_hidden, decoder_hidden, encoder_hidden: hidden widths.
+        residual_hidden, decoder_hidden, encoder_hidden: hidden widths. linear_lift: φ holds W_0 s, see `Encoder`.
         frame: "body" composes the pose on SE(2) outside z; "segment" is the paper's reading, the pose relative to
             the start of the window inside z.
         residual: "sandwich", "free" (no bound by construction; ||A_j|| ≤ ρ) or "none" (||A_j|| ≤ ρ).
@@ -86,7 +87,7 @@ def sfkd(
     hidden = tuple(residual_hidden), tuple(decoder_hidden)
     control = space.control_mean.shape[0]
     networks = Networks(rank, body, control, vertices, *hidden, embedding, rho, beta, residual, transport, budget)
-    encoder = Encoder(rank, encoder_hidden)
+    encoder = Encoder(rank, encoder_hidden, linear_lift)
     pose_scale = jnp.asarray(space.increment_scale) * SEGMENT_STEPS
 
     def init(key: Key) -> Params:

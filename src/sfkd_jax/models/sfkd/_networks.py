@@ -146,20 +146,24 @@ class Networks(nn.Module):
 
 
 class Encoder(nn.Module):
-    """φ(s, ψ(e)), before it is turned into the fibre of e.
+    """φ(s, ψ(e)) = W_0 s + W_2 tanh(W_1 [s; ψ(e)] + b_1) + b_2, before it is turned into the fibre of e.
+
+    The read-out of s is linear in z: a lift that holds s itself, W_0 s, need not rebuild it from saturating functions.
 
     Attributes:
-        rank: r. hidden: width.
+        rank: r. hidden: width. linear: whether W_0 is there.
     """
 
     rank: int
     hidden: int
+    linear: bool = True
 
     @nn.compact
     def __call__(self, body: Float[Array, " inputs"], embedding: Float[Array, " embedding"]) -> Array:
         """z before rotation, shape (rank,)."""
         hidden = nn.tanh(nn.Dense(self.hidden)(jnp.concatenate([body, embedding])))
-        return nn.Dense(self.rank)(hidden)
+        z = nn.Dense(self.rank)(hidden)
+        return z + nn.Dense(self.rank, use_bias=False)(body) if self.linear else z
 
 
 def _couplings(key: Array, shape: tuple[int, ...], dtype: jnp.dtype = jnp.float32) -> Array:
