@@ -17,7 +17,8 @@ PROGRAM = """
     law = control.path_feedback(wheelbase=plant.wheelbase)
     limits = {"control_low": plant.control_low, "control_high": plant.control_high}
     cost = control.tracking_cost(dt=plant.dt)
-    planner = control.mppi(models.physics(plant.nominal), cost, law, num_samples=16, horizon=5, **limits)
+    task = control.path_tracking(models.physics(plant.nominal), cost, law, dt=plant.dt, **limits)
+    planner = control.mppi(task, num_samples=16, horizon=5)
     def one(road, key):
         return evaluation.simulate(plant.step, planner, {}, road, key, dt=plant.dt, horizon=5).lateral
     lateral = jax.jit(jax.vmap(one))(track.roads, track.keys)

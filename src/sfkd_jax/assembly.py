@@ -88,19 +88,22 @@ def build_controller(
     return control.monitored(planner, model, bounds=bounds, **boxes, **without(settings.get("monitor", {})))
 
 
-def _mppi(settings: Settings, model: Model, plant: vehicle.Vehicle, env_low: Any, env_high: Any) -> Controller:
-    """MPPI around the path-following law (`sampling: feedback`) or around nothing (`plain`)."""
+def _sampled(
+    search: str, settings: Settings, model: Model, plant: vehicle.Vehicle, env_low: Any, env_high: Any
+) -> Controller:
+    """A planner that searches around the path-following law (`sampling: feedback`) or around nothing (`plain`)."""
     law = choose({"feedback": _feedback, "plain": _no_feedback}, settings["sampling"], "controller.sampling")
-    return control.mppi(
+    task = control.path_tracking(
         model,
         control.tracking_cost(dt=plant.dt, speed_loop=plant.speed_loop, **without(settings["cost"])),
         law(settings, plant),
+        dt=plant.dt,
         control_low=plant.control_low,
         control_high=plant.control_high,
-        env_low=_floats(env_low),
-        env_high=_floats(env_high),
-        **without(settings["mppi"]),
+        **without(settings["task"]),
     )
+    boxes = {"env_low": _floats(env_low), "env_high": _floats(env_high)}
+    return SEARCHES[search](task, **boxes, **without(settings[search]))
 
 
 def _feedback(settings: Settings, plant: vehicle.Vehicle) -> control.Law:
@@ -121,7 +124,7 @@ def _koopman_mpc(settings: Settings, model: Model, plant: vehicle.Vehicle, env_l
         control_low=plant.control_low,
         control_high=plant.control_high,
         speed_loop=plant.speed_loop,
-        terminal_weight=settings["mppi"]["terminal_weight"],
+        terminal_weight=settings["task"]["terminal_weight"],
         env_low=_floats(env_low),
         env_high=_floats(env_high),
         **without(settings["cost"]),
@@ -133,7 +136,8 @@ def _floats(values: Any) -> tuple[float, ...] | None:
     return None if values is None else tuple(map(float, values))
 
 
-PLANNERS = {"mppi": _mppi, "koopman_mpc": _koopman_mpc}
+SEARCHES = {"mppi": control.mppi, "cem": control.cem, "gradient": control.gradient_planner}
+PLANNERS = {search: partial(_sampled, search) for search in SEARCHES} | {"koopman_mpc": _koopman_mpc}
 
 
 def controller_horizon(settings: Settings) -> int:

@@ -18,7 +18,7 @@ from hydra.core.config_store import ConfigStore
 from hydra.core.hydra_config import HydraConfig
 from omegaconf import DictConfig, OmegaConf
 
-from sfkd_jax import assembly, control, datasets, evaluation, models, scenarios, training
+from sfkd_jax import assembly, control, datasets, evaluation, exporting, models, scenarios, training
 from sfkd_jax.artefacts import ArtefactError
 from sfkd_jax.certification import CertificateStale, CertificationRefused, issue
 
@@ -44,14 +44,16 @@ def schema(title: str, /, *factories: Callable[..., Any], skip: tuple[str, ...] 
     """A dataclass with the keyword-only settings of factories: their types and defaults live once, in Python.
 
     Args:
-        title: of the dataclass. factories: whose settings. skip: settings that something else decides.
+        title: of the dataclass. factories: whose settings; of a name that several have, the first counts.
+        skip: settings that something else decides.
         extra: further fields by default value, or by type if required.
     """
     fields: list[Any] = [_extra(key, value) for key, value in extra.items()]
     for factory in factories:
         hints = typing.get_type_hints(factory)
         for parameter in inspect.signature(factory).parameters.values():
-            if parameter.kind is not parameter.KEYWORD_ONLY or parameter.name in skip:
+            known = parameter.name in skip or parameter.name in {name for name, *_ in fields}
+            if parameter.kind is not parameter.KEYWORD_ONLY or known:
                 continue
             if parameter.default is parameter.empty:
                 fields.append((parameter.name, _plain(hints[parameter.name])))
@@ -121,6 +123,8 @@ def register() -> None:
     skipped = ("validation", "calibration", "held_out", "boxes", "sensor_noise")
     node = schema("CertificationConfig", issue, skip=skipped, renew=False)
     store.store(group="certification", name="schema", node=node)
+    node = schema("ExportConfig", exporting.write_controller, skip=("made_from",))
+    store.store(group="export", name="schema", node=node)
 
 
 def compose(*overrides: str) -> dict[str, Any]:
@@ -142,10 +146,14 @@ def _fields(node: type) -> list[Any]:
 
 
 def _controller_schema() -> type:
-    """Settings of the planner, its cost and its law, less what the vehicle decides."""
+    """Settings of the planners, their task, cost and law, less what the vehicle and the machine decide."""
     fixed = ("dt", "wheelbase", "speed_loop", "control_low", "control_high", "env_low", "env_high")
+    placed, weighted = (*fixed, "sharding", "actuator"), ("effective_samples", "temperature")
     parts = {
-        "mppi": schema("MppiConfig", control.mppi, skip=fixed),
+        "mppi": schema("MppiConfig", control.mppi, control.planner, skip=placed),
+        "cem": schema("CemConfig", control.cem, control.planner, skip=(*placed, *weighted)),
+        "gradient": schema("GradientConfig", control.gradient_planner, control.planner, skip=(*placed, *weighted)),
+        "task": schema("TaskConfig", control.path_tracking, skip=placed),
         "cost": schema("CostConfig", control.tracking_cost, skip=fixed),
         "feedback": schema("FeedbackConfig", control.path_feedback, skip=fixed),
     }

@@ -25,7 +25,8 @@ def mppi(law, **settings):
     """A tiny planner over the textbook bicycle, and its parameters."""
     model, params = model_and_params("nominal")
     cost = control.tracking_cost(dt=PLANT.dt)
-    return control.mppi(model, cost, law, num_samples=16, horizon=HORIZON, **LIMITS, **BOX, **settings), params
+    task = control.path_tracking(model, cost, law, dt=PLANT.dt, **LIMITS)
+    return control.mppi(task, num_samples=16, horizon=HORIZON, **BOX, **settings), params
 
 
 def monitored():

@@ -275,10 +275,8 @@ def planner(samples=8):
     model, _ = model_and_params("oracle")
     limits = {"control_low": PLANT.control_low, "control_high": PLANT.control_high}
     law = control.path_feedback(wheelbase=PLANT.wheelbase)
-    return control.mppi(
-        model, control.tracking_cost(dt=0.1), law, num_samples=samples, horizon=HORIZON, **limits,
-        env_low=ENV_LOW, env_high=ENV_HIGH,
-    )  # fmt: skip
+    task = control.path_tracking(model, control.tracking_cost(dt=0.1), law, dt=0.1, **limits)
+    return control.mppi(task, num_samples=samples, horizon=HORIZON, env_low=ENV_LOW, env_high=ENV_HIGH)
 
 
 def guarded(fallback="none", **settings):

@@ -12,6 +12,7 @@ from sfkd_jax import control, evaluation, models, scenarios, vehicle
 
 PLANT = vehicle.kinematic()
 LIMITS = {"control_low": PLANT.control_low, "control_high": PLANT.control_high}
+WIDE = {"control_low": (-1e3, -1e3), "control_high": (1e3, 1e3)}
 BOX = {"env_low": ENV_LOW, "env_high": ENV_HIGH}
 COST = control.tracking_cost(dt=0.1)
 FEEDBACK = control.path_feedback(wheelbase=PLANT.wheelbase)
@@ -22,8 +23,10 @@ REFERENCE = np.asarray(straight(HORIZON))
 FORBIDDEN = ("cholesky", "triangular_solve", "lu", "svd", "custom_linear_solve", "eigh", "qr", "geqrf")
 
 
-def planner(model, law=FEEDBACK, **settings):
-    return control.mppi(model, COST, law, **{"num_samples": 64, "horizon": HORIZON, **LIMITS, **BOX, **settings})
+def planner(model, law=FEEDBACK, limits="actuators", latent_weight=0.0, **settings):
+    limits = {"actuators": LIMITS, "wide": WIDE}[limits]
+    task = control.path_tracking(model, COST, law, dt=0.1, latent_weight=latent_weight, **limits)
+    return control.mppi(task, **{"num_samples": 64, "horizon": HORIZON, **BOX, **settings})
 
 
 @cache
@@ -64,8 +67,7 @@ def test_info_has_the_documented_keys_and_shapes():
 
 def test_as_the_temperature_falls_the_plan_becomes_the_best_samples():
     """Every sample is rolled out again by hand; the planner must have chosen the cheapest."""
-    wide = {"control_low": (-1e3, -1e3), "control_high": (1e3, 1e3)}
-    _, state, info = act_once(law=control.no_feedback(), temperature=1e-4, **wide)
+    _, state, info = act_once(law=control.no_feedback(), temperature=1e-4, limits="wide")
     noise_key, _ = jax.random.split(jax.random.key(0))
     std = jnp.asarray([0.02, 0.3])
     noise = control.correlated_noise(noise_key, num_samples=64, horizon=HORIZON, std=std, correlation=0.8)

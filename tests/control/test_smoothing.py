@@ -106,9 +106,12 @@ def test_filters_that_cannot_be_meant_are_refused(settings, words):
 
 
 def planner(law, **settings):
-    settings = {"num_samples": 16, "horizon": HORIZON, "smoothing_window": 5, **LIMITS, **settings}
+    settings = {"num_samples": 16, "horizon": HORIZON, "smoothing_window": 5, **settings}
     box = {"env_low": ENV_LOW, "env_high": ENV_HIGH}
-    return control.mppi(models.physics(PLANT.nominal), control.tracking_cost(dt=0.1), LAWS[law], **settings, **box)
+    cost = control.tracking_cost(dt=0.1)
+    limits = {name: settings.pop(name, LIMITS[name]) for name in LIMITS}
+    task = control.path_tracking(models.physics(PLANT.nominal), cost, LAWS[law], dt=0.1, **limits)
+    return control.mppi(task, **settings, **box)
 
 
 @cache

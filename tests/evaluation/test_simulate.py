@@ -25,15 +25,15 @@ def roads(count=2):
 @cache
 def driving(step, noise=SENSORS):
     """Episodes with a planner over a one-step function, compiled once."""
-    controller = control.mppi(
+    task = control.path_tracking(
         models.physics(step),
         control.tracking_cost(dt=0.1),
         control.path_feedback(wheelbase=PLANT.wheelbase),
+        dt=0.1,
         control_low=PLANT.control_low,
         control_high=PLANT.control_high,
-        num_samples=96,
-        horizon=HORIZON,
     )
+    controller = control.mppi(task, num_samples=96, horizon=HORIZON)
     drive = partial(evaluation.simulate, PLANT.step, controller, {}, dt=0.1, horizon=HORIZON, observation_noise=noise)
     return jit(jax.vmap(drive))
 

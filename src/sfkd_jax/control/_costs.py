@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import NamedTuple, TypeAlias
+from typing import Any, NamedTuple
 
 from sfkd_jax.control._path_frame import PathErrors
 from sfkd_jax.types import Control, Scalar
@@ -19,7 +19,15 @@ class Stage(NamedTuple):
     speed: Scalar
 
 
-StageCost: TypeAlias = Callable[[Stage], Scalar]
+class Cost(NamedTuple):
+    """A stage cost whose weights are data: they may change from step to step without a compilation.
+
+    Attributes:
+        weights: a pytree of numbers. stage: (weights, `Stage`) -> cost of one step.
+    """
+
+    weights: Any
+    stage: Callable[[Any, Stage], Scalar]
 
 
 def tracking_cost(
@@ -31,8 +39,8 @@ def tracking_cost(
     steering_rate: float = 5.0,
     effort: float = 0.02,
     speed_loop: bool = False,
-) -> StageCost:
-    """ℓ = q_y e_y² + q_c (Δe_y / v dt)² + q_v e_v² + q_δ̇ (Δδ / dt)² + q_a a².
+) -> Cost:
+    """ℓ = q_y e_y² + q_c (Δe_y / v dt)² + q_v e_v² + q_δ̇ (Δδ / dt)² + q_a a²; its weights by the names below.
 
     Course, Δe_y / (v dt), is the direction of travel against the path: a car that crabs against the wind or
     through a bend keeps its course, not its body heading, along the path.
@@ -42,13 +50,14 @@ def tracking_cost(
         effort: on the acceleration [s⁴/m²]; not charged under a speed loop.
         speed_loop: whether the second control is a speed command.
     """
+    weights = {"lateral": lateral, "course": course, "speed": speed, "steering_rate": steering_rate, "effort": effort}
 
-    def cost(stage: Stage) -> Scalar:
-        travelled = stage.speed * dt + 1e-3
-        angle = (stage.errors.lateral - stage.errors_before.lateral) / travelled
-        rate = (stage.control[0] - stage.control_before[0]) / dt
-        total = lateral * stage.errors.lateral**2 + course * angle**2 + speed * stage.errors.speed**2
-        total = total + steering_rate * rate**2
-        return total if speed_loop else total + effort * stage.control[1] ** 2
+    def stage(weights: dict[str, Scalar], seen: Stage) -> Scalar:
+        travelled = seen.speed * dt + 1e-3
+        angle = (seen.errors.lateral - seen.errors_before.lateral) / travelled
+        rate = (seen.control[0] - seen.control_before[0]) / dt
+        total = weights["lateral"] * seen.errors.lateral**2 + weights["course"] * angle**2
+        total = total + weights["speed"] * seen.errors.speed**2 + weights["steering_rate"] * rate**2
+        return total if speed_loop else total + weights["effort"] * seen.control[1] ** 2
 
-    return cost
+    return Cost(weights, stage)

@@ -9,8 +9,9 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
 from sfkd_jax.control._box_qp import box_qp
-from sfkd_jax.control._mppi import _all_finite, _check_shapes, _shift
 from sfkd_jax.control._path_frame import path_errors, reference_curvature
+from sfkd_jax.control._path_tracking import check_path
+from sfkd_jax.control._plans import all_finite, shift
 from sfkd_jax.se2 import between, compose
 from sfkd_jax.types import (
     BODY,
@@ -133,8 +134,8 @@ def koopman_mpc(
     def act(
         params: Params, state: KoopmanMpcState, observation: State, env: Environment, reference: Reference
     ) -> tuple[Control, KoopmanMpcState, dict[str, Array]]:
-        _check_shapes(observation, env, reference, horizon)
-        clean = _all_finite(observation) & _all_finite(env) & _all_finite(reference)
+        check_path(observation, env, reference, horizon)
+        clean = all_finite((observation, env, reference))
         inside = env if env_low is None or env_high is None else jnp.clip(env, jnp.array(env_low), jnp.array(env_high))
         curvature = reference_curvature(reference)
         errors = path_errors(observation, reference[0], curvature[0])
@@ -160,7 +161,7 @@ def koopman_mpc(
             "predicted_states": _in_world(found.free + found.gain @ plan.ravel(), observation, reference, curvature),
             "residual": solution.residual,
         }
-        return control, KoopmanMpcState(_shift(plan), control, state.started | healthy), info
+        return control, KoopmanMpcState(shift(plan, jnp.ones(())), control, state.started | healthy), info
 
     return Controller(init, act)
 
