@@ -76,7 +76,11 @@ def read_bytes(path: Path) -> bytes:
 
 
 def write_bytes(path: Path, content: bytes) -> None:
-    """Replace `path` in one step, or leave it as it was and raise an ArtefactError."""
+    """Replace `path` in one step.
+
+    Raises:
+        ArtefactError: the disk is full or not writable; an earlier file stays as it was.
+    """
     with replacement(path) as (file, part):
         file.write(content)
         synchronise(file)

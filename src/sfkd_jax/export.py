@@ -1,0 +1,36 @@
+"""python -m sfkd_jax.export: the controller of a run for processes without sfkd_jax, and for C and C++ through IREE."""
+
+from __future__ import annotations
+
+from typing import Any
+
+from sfkd_jax import artefacts, assembly, policy, shelf
+from sfkd_jax.config import door
+from sfkd_jax.exporting import write_controller
+
+FOLDER = "export"
+
+
+def run(settings: dict[str, Any]) -> dict[str, Any]:
+    """Write what lies there; nothing is trained or certified now.
+
+    Raises:
+        ArtefactError: no policy was trained there, it is damaged, or it was trained with other settings.
+    """
+    place = shelf.run_directory(settings)
+    if not artefacts.exists(place / "policy.npz"):
+        raise artefacts.ArtefactError(f"{place} holds no trained controller; run train with the same options first")
+    shelf.claim(settings)
+    _, manifest = artefacts.read_arrays(place / "policy.npz", kind=policy.KIND)
+    trained = policy.load(place, controller=settings["controller"])
+    if trained.certificate is None:
+        shelf.say("certificate: refused, missing or about other weights; exported without one, and without a monitor")
+    folder = place / FOLDER
+    write_controller(trained, folder, made_from=manifest["made_from"], **assembly.without(settings["export"]))
+    shelf.say(f"exported: {folder}; python {folder / 'run_controller.py'} runs it without sfkd_jax")
+    files = {"blob": "controller.stablehlo", "manifest": "controller.json", "npz": "policy.npz"}
+    return {key: str(folder / name) for key, name in files.items()}
+
+
+if __name__ == "__main__":
+    door(run)()

@@ -1,0 +1,124 @@
+"""The export folder: programs, their manifest, the weights for users of jax, and a script that runs it all."""
+
+from __future__ import annotations
+
+import hashlib
+from collections.abc import Mapping
+from importlib import resources
+from pathlib import Path
+from typing import Any
+
+import jax
+import jax.export
+import numpy as np
+
+from sfkd_jax import artefacts, assembly, policy
+from sfkd_jax.exporting._iree import compile_iree
+from sfkd_jax.exporting._programs import Leaf, Program, flat_programs, specifications
+from sfkd_jax.types import Params
+
+FORMAT = 1
+"""Version of the manifest and of the order of arguments; run_controller.py refuses every other one."""
+PLATFORMS = ("cpu", "cuda", "rocm", "tpu")
+FILES = {"act": "controller", "init": "initial_state"}
+MANIFEST, CERTIFICATE, SCRIPT = "controller.json", "certificate.json", "run_controller.py"
+
+
+def write_controller(
+    trained: policy.Policy,
+    folder: Path,
+    *,
+    made_from: Mapping[str, str],
+    platforms: tuple[str, ...] = ("cpu", "cuda"),
+    iree: bool = False,
+    iree_flags: tuple[str, ...] = ("--iree-llvmcpu-target-cpu=host",),
+) -> dict[str, Any]:
+    """Write a controller for processes without sfkd_jax; the manifest comes last and is returned.
+
+    Args:
+        trained: what to write. folder: where; what an earlier export left there is replaced.
+        made_from: hashes of what the weights were made from.
+        platforms: where the programs are to run. iree: compile for C and C++ as well. iree_flags: for iree-compile.
+
+    Raises:
+        ValueError: unknown platform, a controller that cannot be exported, or IREE missing or failing.
+        ArtefactError: the folder is not writable.
+    """
+    if not platforms or not set(platforms) <= set(PLATFORMS):
+        raise ValueError(f"export.platforms must be some of {', '.join(PLATFORMS)}, got {list(platforms)}")
+    found = flat_programs(trained)
+    programs = {name: getattr(found, name) for name in FILES}
+    modules = {name: compile_iree(program, flags=iree_flags) for name, program in programs.items() if iree}
+    exported = {name: _lowered(program, platforms) for name, program in programs.items()}
+    for stale in (MANIFEST, CERTIFICATE, *(f"{stem}.vmfb" for stem in FILES.values())):
+        (folder / stale).unlink(missing_ok=True)
+    weights = policy.save(folder / "policy.npz", trained.params, trained.settings, made_from=made_from)["sha256"]
+    manifest = {
+        "kind": "controller",
+        "format": FORMAT,
+        "jax": jax.__version__,
+        "calling_convention_version": exported["act"].calling_convention_version,
+        "platforms": list(platforms),
+        "key_implementation": found.key_implementation,
+        "programs": {
+            name: _stored(folder / f"{FILES[name]}.stablehlo", bytes(exported[name].serialize()))
+            | {"inputs": _listed(program.inputs), "outputs": _listed(program.outputs)}
+            for name, program in programs.items()
+        },
+        "iree": {name: _stored(folder / f"{FILES[name]}.vmfb", module) for name, module in modules.items()} or None,
+        "iree_flags": list(iree_flags) if iree else None,
+        "weights_sha256": weights,
+        "certificate_sha256": _certificate(trained, folder),
+        **_vehicle(trained),
+        "parameters": _count(trained.params),
+        "settings": trained.settings,
+        "versions": artefacts.versions(),
+    }
+    script = resources.files("sfkd_jax.exporting").joinpath(f"_{SCRIPT}").read_bytes()
+    artefacts.write_bytes(folder / SCRIPT, script)
+    artefacts.write_json(folder / MANIFEST, manifest)
+    return manifest
+
+
+def _lowered(program: Program, platforms: tuple[str, ...]) -> jax.export.Exported:
+    """A program as StableHLO; no argument is dropped, also if nothing depends on it."""
+    return jax.export.export(jax.jit(program.function, keep_unused=True), platforms=platforms)(*specifications(program))
+
+
+def _stored(path: Path, content: bytes) -> dict[str, Any]:
+    """Write a file; what a reader needs to know that it is whole."""
+    artefacts.write_bytes(path, content)
+    return {"file": path.name, "bytes": len(content), "sha256": hashlib.sha256(content).hexdigest()}
+
+
+def _listed(leaves: tuple[Leaf, ...]) -> list[dict[str, Any]]:
+    return [leaf._asdict() for leaf in leaves]
+
+
+def _certificate(trained: policy.Policy, folder: Path) -> str | None:
+    """Copy the certificate if there is one; returns the hash of the file."""
+    if trained.certificate is None:
+        return None
+    artefacts.write_json(folder / CERTIFICATE, trained.certificate)
+    return hashlib.sha256((folder / CERTIFICATE).read_bytes()).hexdigest()
+
+
+def _vehicle(trained: policy.Policy) -> dict[str, Any]:
+    """What the numbers mean: names, units and limits."""
+    plant, settings = assembly.build_vehicle(trained.settings["vehicle"]), trained.settings
+    drive = "speed command [m/s]" if plant.speed_loop else "acceleration [m/s^2]"
+    limits = zip(("steering [rad]", drive), plant.control_low, plant.control_high, strict=True)
+    box = {side: list(settings["dataset"][f"env_{side}"]) for side in ("low", "high")}
+    return {
+        "sampling_period_s": plant.dt,
+        "horizon": assembly.controller_horizon(settings["controller"]),
+        "controls": [{"name": name, "low": low, "high": high} for name, low, high in limits],
+        "observation": list(plant.state_names),
+        "environment": {"names": ["friction [-]", "lateral wind [m/s]"], **box},
+        "reference": ["x [m]", "y [m]", "yaw [rad]", "speed [m/s]"],
+    }
+
+
+def _count(params: Params) -> int:
+    """How many weights."""
+    return sum(int(np.size(leaf)) for leaf in jax.tree.leaves(params))

@@ -1,0 +1,354 @@
+"""What is exported runs without this package, to the last bit, and a damaged file is named in one line."""
+
+import hashlib
+import importlib.util
+import json
+import shutil
+import subprocess
+import sys
+import textwrap
+from pathlib import Path
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from helpers import ENV_HIGH, ENV_LOW, jit, space, straight
+from hydra import compose, initialize_config_dir
+from omegaconf import OmegaConf
+
+import sfkd_jax
+from sfkd_jax import artefacts, assembly, config, export, exporting, policy, shelf
+from sfkd_jax.types import Controller
+
+HORIZON, STEPS = 5, 6
+SMALL = (
+    "+experiment=smoke",
+    "model.rank=8",
+    "model.vertices=3",
+    "model.residual_hidden=[8]",
+    "model.decoder_hidden=[8]",
+    "model.encoder_hidden=8",
+    "model.embedding=4",
+    "controller.mppi.num_samples=16",
+    f"controller.mppi.horizon={HORIZON}",
+)
+BOXES = {"state": [[0.0], [20.0]], "control": [[-0.5, -5.0], [0.5, 5.0]], "env": [list(ENV_LOW), list(ENV_HIGH)]}
+HEAVY = {"sfkd_jax", "flax", "hydra", "orbax", "optax", "jaxtyping", "matplotlib", "iree"}
+
+
+def settings(root, *overrides):
+    config.register()
+    with initialize_config_dir(config.conf_path(), version_base="1.3"):
+        composed = compose("config", overrides=[*SMALL, f"root={root}", *overrides])
+    return OmegaConf.to_container(composed, resolve=True)
+
+
+@pytest.fixture(scope="module")
+def exported(tmp_path_factory):
+    """A run with weights as they were drawn and a monitor, and what the door wrote and printed."""
+    asked = settings(tmp_path_factory.mktemp("export") / "runs")
+    plant = assembly.build_vehicle(asked["vehicle"])
+    params = jit(assembly.build_model(asked["model"], space(), plant).init)(jax.random.key(0))
+    kept = asked | {"space": assembly.space_to_settings(space())}
+    shelf.claim(asked)
+    place = shelf.run_directory(asked)
+    weights = policy.save(place / "policy.npz", params, kept, made_from={"dataset": "d" * 64})["sha256"]
+    certificate = {"valid": True, "weights_sha256": weights, "boxes": BOXES, "monitor": {"bounds": [1.0] * 4}}
+    artefacts.write_json(place / "certificate.json", certificate)
+    return asked, export.run(asked)
+
+
+@pytest.fixture(scope="module")
+def loaded(exported):
+    return sfkd_jax.load(Path(exported[1]["npz"]).parent)
+
+
+@pytest.fixture
+def spoiled(exported, tmp_path):
+    """The root of all runs, to spoil."""
+    return Path(shutil.copytree(exported[0]["root"], tmp_path / "runs"))
+
+
+@pytest.fixture
+def folder(exported, tmp_path):
+    """The export folder, to spoil."""
+    return Path(shutil.copytree(Path(exported[1]["blob"]).parent, tmp_path / "export"))
+
+
+def shipped(folder):
+    """The script of an export folder as a module."""
+    found = importlib.util.spec_from_file_location("run_controller", folder / "run_controller.py")
+    module = importlib.util.module_from_spec(found)
+    found.loader.exec_module(module)
+    return module
+
+
+def drive():
+    """Measurements of a few steps; one of them is not finite, and friction and wind switch."""
+    random = np.random.default_rng(3)
+    observations = np.asarray([0.0, 0.2, 0.0, 9.0]) + 0.3 * random.standard_normal((STEPS, 4))
+    observations[3, 2] = np.nan
+    envs = np.where(np.arange(STEPS)[:, None] < 2, [0.9, 0.0], [0.4, 6.0])
+    return observations.astype(np.float32), envs.astype(np.float32), np.asarray(straight(HORIZON))
+
+
+def plain(tree):
+    """Leaves as numpy arrays, keys as their data."""
+    leaves = jax.tree.leaves(tree)
+    opened = (jax.random.key_data(x) if jnp.issubdtype(x.dtype, jax.dtypes.prng_key) else x for x in leaves)
+    return [np.asarray(leaf) for leaf in opened]
+
+
+@pytest.fixture(scope="module")
+def in_process(loaded):
+    """Every leaf of every step of the policy's own controller, jitted here."""
+    act, state, steps = jax.jit(loaded.controller.act), loaded.controller.init(jax.random.key(7)), []
+    observations, envs, reference = drive()
+    for observation, env in zip(observations, envs, strict=True):
+        control, state, info = act(loaded.params, state, observation, env, reference)
+        steps.append(plain((control, state, info)))
+    return steps
+
+
+@pytest.mark.parametrize(("platforms", "exact"), [(("cpu",), ("",)), (("cpu", "cuda"), ("control", "state."))])
+def test_a_process_without_this_package_repeats_every_bit(loaded, in_process, tmp_path, platforms, exact):
+    """With several platforms a product of matrices is a choice, and XLA may round otherwise what is only reported."""
+    manifest = exporting.write_controller(loaded, tmp_path, made_from={}, platforms=platforms)
+    np.savez(tmp_path / "drive.npz", **dict(zip(("observations", "envs", "reference"), drive(), strict=True)))
+    program = f"""
+        import sys
+        for name in {HEAVY!r}:
+            sys.modules[name] = None  # an import of it fails
+        import numpy as np
+        from run_controller import ExportedController
+        controller = ExportedController()
+        state, found = controller.init(seed=7), {{}}
+        with np.load("drive.npz") as drive:
+            for k, (observation, env) in enumerate(zip(drive["observations"], drive["envs"])):
+                control, state, info = controller.act(state, observation, env, drive["reference"])
+                leaves = [control, *state.values(), *info.values()]
+                found |= {{f"{{k}}/{{i}}": np.asarray(leaf) for i, leaf in enumerate(leaves)}}
+        np.savez("found.npz", **found)
+        packages = {{name.split(".")[0] for name, module in sys.modules.items() if module is not None}}
+        assert not packages & {HEAVY!r}, packages
+        assert "flatbuffers" in packages
+    """
+    command = [sys.executable, "-c", textwrap.dedent(program)]
+    done = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True)
+    assert done.returncode == 0, done.stderr
+    with np.load(tmp_path / "found.npz") as found:
+        steps = [[found[f"{k}/{i}"] for i in range(len(leaves))] for k, leaves in enumerate(in_process)]
+        assert len(found.files) == sum(map(len, in_process))
+    names = [leaf["name"] for leaf in manifest["programs"]["act"]["outputs"]]
+    for k, (ours, theirs) in enumerate(zip(in_process, steps, strict=True)):
+        different = [n for n, a, b in zip(names, ours, theirs, strict=True) if a.tobytes() != b.tobytes()]
+        assert [name for name in different if name.startswith(exact)] == [], f"step {k}"
+        for mine, found_there in zip(ours, theirs, strict=True):
+            np.testing.assert_allclose(mine, found_there, rtol=1e-5, atol=1e-5)
+    healthy = names.index("info.healthy")
+    assert [bool(leaves[healthy]) for leaves in steps] == [True, True, True, False, True, True]
+
+
+def test_the_manifest_says_what_the_programs_take_and_what_they_were_made_from(exported, loaded):
+    asked, printed = exported
+    manifest = json.loads(Path(printed["manifest"]).read_text())
+    place = Path(printed["blob"]).parent
+    assert set(printed) == {"blob", "manifest", "npz"}
+    for program in manifest["programs"].values():
+        content = (place / program["file"]).read_bytes()
+        assert program["sha256"] == hashlib.sha256(content).hexdigest()
+        read = jax.export.deserialize(bytearray(content))
+        assert read.platforms == ("cpu", "cuda") == tuple(manifest["platforms"])
+        assert read.calling_convention_version == manifest["calling_convention_version"]
+        for avals, leaves in ((read.in_avals, program["inputs"]), (read.out_avals, program["outputs"])):
+            assert [(aval.shape, str(aval.dtype)) for aval in avals] == [
+                (tuple(x["shape"]), x["dtype"]) for x in leaves
+            ]
+    act = manifest["programs"]["act"]
+    assert [leaf["name"] for leaf in act["inputs"][-3:]] == ["observation", "env", "reference"]
+    assert act["outputs"][0]["name"] == "control"
+    states = [leaf for leaf in act["outputs"] if leaf["name"].startswith("state.")]
+    assert states == act["inputs"][:-3] == manifest["programs"]["init"]["outputs"]
+    assert {"name": "state.inner.key", "shape": [2], "dtype": "uint32"} in states
+    assert manifest["weights_sha256"] == policy.weights_hash(shelf.run_directory(asked))
+    assert manifest["certificate_sha256"] == hashlib.sha256((place / "certificate.json").read_bytes()).hexdigest()
+    assert (manifest["sampling_period_s"], manifest["horizon"], manifest["iree"]) == (0.1, HORIZON, None)
+    plant = assembly.build_vehicle(asked["vehicle"])
+    assert tuple(control["high"] for control in manifest["controls"]) == plant.control_high
+    assert manifest["environment"]["low"] == list(ENV_LOW)
+    assert loaded.certificate["boxes"] == BOXES
+
+
+def test_the_controller_of_the_command_is_what_is_exported(spoiled):
+    printed = export.run(settings(spoiled, "controller.mppi.horizon=4", "export.platforms=[cpu]"))
+    assert json.loads(Path(printed["manifest"]).read_text())["horizon"] == 4
+    folder = Path(printed["npz"]).parent
+    assert sfkd_jax.load(folder).settings["controller"]["mppi"]["horizon"] == 4
+    assert sfkd_jax.load(folder.parent).settings["controller"]["mppi"]["horizon"] == HORIZON
+
+
+def test_a_refused_certificate_leaves_the_export_without_one(spoiled, capsys):
+    asked = settings(spoiled)
+    place = shelf.run_directory(asked)
+    assert (place / "export" / "certificate.json").exists()
+    artefacts.write_json(place / "certificate.json", {"valid": False, "weights_sha256": policy.weights_hash(place)})
+    printed = export.run(asked)
+    assert "refused" in capsys.readouterr().err
+    manifest = json.loads(Path(printed["manifest"]).read_text())
+    assert manifest["certificate_sha256"] is None
+    assert not Path(printed["blob"]).with_name("certificate.json").exists()
+    assert "info.breach" not in {leaf["name"] for leaf in manifest["programs"]["act"]["outputs"]}
+
+
+@pytest.mark.parametrize(
+    ("file", "damage", "says"),
+    [
+        ("controller.stablehlo", lambda content: content[:-1], "truncated"),
+        ("controller.stablehlo", lambda content: content[:-1] + bytes([content[-1] ^ 1]), "changed, sha256"),
+        ("initial_state.stablehlo", lambda content: content[::-1], "changed, sha256"),
+        ("initial_state.stablehlo", None, "No such file"),
+        ("controller.json", lambda content: content[:50], "truncated or not JSON"),
+        ("controller.json", lambda content: b'{"kind": "policy"}', "not the manifest"),
+        ("controller.json", lambda content: content.replace(b'"format": 1', b'"format": 2'), "format 2"),
+    ],
+)
+def test_a_damaged_export_is_named_in_one_line(folder, file, damage, says):
+    if damage is None:
+        (folder / file).unlink()
+    else:
+        (folder / file).write_bytes(damage((folder / file).read_bytes()))
+    run_controller = shipped(folder)
+    with pytest.raises(run_controller.ExportError, match=says) as raised:
+        run_controller.ExportedController(folder)
+    assert file in str(raised.value)
+    assert "\n" not in str(raised.value)
+
+
+def test_a_blob_that_jax_refuses_is_named_with_the_jax_that_wrote_it(folder):
+    (folder / "initial_state.stablehlo").write_bytes(b"no program")
+    manifest = json.loads((folder / "controller.json").read_text())
+    about = {"bytes": 10, "sha256": hashlib.sha256(b"no program").hexdigest()}
+    manifest["programs"]["init"] |= about
+    (folder / "controller.json").write_text(json.dumps(manifest | {"jax": "9.9"}))
+    run_controller = shipped(folder)
+    with pytest.raises(run_controller.ExportError, match=r"written by jax 9\.9"):
+        run_controller.ExportedController(folder)
+
+
+def test_arguments_of_the_wrong_shape_are_named(exported):
+    controller = shipped(Path(exported[1]["blob"]).parent).ExportedController()
+    observations, envs, reference = drive()
+    state = controller.init()
+    with pytest.raises(ValueError, match=r"observation must have shape \(4,\), got \(3,\)"):
+        controller.act(state, observations[0, :3], envs[0], reference)
+    with pytest.raises(ValueError, match=r"reference must have shape \(5, 4\)"):
+        controller.act(state, observations[0], envs[0], reference[:-1])
+    with pytest.raises(ValueError, match="state must be"):
+        controller.act(dict(list(state.items())[1:]), observations[0], envs[0], reference)
+
+
+def test_the_script_steps_a_controller_by_itself(exported):
+    script = Path(exported[1]["blob"]).with_name("run_controller.py")
+    done = subprocess.run([sys.executable, script, "--steps", "2"], capture_output=True, text=True)
+    assert done.returncode == 0, done.stderr
+    assert len(json.loads(done.stdout)["controls"]) == 2
+    done = subprocess.run([sys.executable, script, script.parent.parent], capture_output=True, text=True)
+    assert done.returncode == 1
+    assert done.stderr.strip().endswith("controller.json: No such file or directory")
+
+
+def test_a_run_without_a_policy_is_sent_to_train(tmp_path):
+    with pytest.raises(artefacts.ArtefactError, match="run train with the same options"):
+        export.run(settings(tmp_path))
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_what_cannot_be_exported_is_refused(loaded, tmp_path):
+    with pytest.raises(ValueError, match="platforms must be some of cpu, cuda"):
+        exporting.write_controller(loaded, tmp_path, made_from={}, platforms=("gpu",))
+
+    def act(params, state, *measured):
+        control, after, info = loaded.controller.act(params, state, *measured)
+        return control, (after, control), info
+
+    growing = loaded._replace(controller=Controller(loaded.controller.init, act))
+    with pytest.raises(ValueError, match="state changes"):
+        exporting.flat_programs(growing)
+
+
+def test_warm_up_gives_the_same_bits_and_keeps_the_machine_code_in_a_cache(loaded, tmp_path):
+    def act(params, key, observation, env, reference):
+        key, noise = jax.random.split(key)
+        return jnp.tanh(env * observation[1]) + jax.random.normal(noise, (2,)), key, {"speed": reference[0, 3]}
+
+    def kept():
+        return {file.name for file in (tmp_path / "cache").iterdir() if file.name.endswith("-cache")}
+
+    simple = loaded._replace(controller=Controller(lambda key: key, act))
+    observations, envs, reference = drive()
+    measured = jnp.asarray(observations[0]), jnp.asarray(envs[0]), jnp.asarray(reference)
+    expected = plain(jax.jit(act)(simple.params, jax.random.key(7), *measured))
+    before = jax.config.jax_compilation_cache_dir, jax.config.jax_persistent_cache_min_compile_time_secs
+    sfkd_jax.warm_up(simple, cache=tmp_path / "cache")
+    first = kept()
+    assert len(first) == 1
+    compiled = sfkd_jax.warm_up(simple, cache=tmp_path / "cache")
+    sfkd_jax.warm_up(loaded._replace(controller=Controller(lambda key: key, lambda *given: act(*given))))
+    assert kept() == first
+    assert (jax.config.jax_compilation_cache_dir, jax.config.jax_persistent_cache_min_compile_time_secs) == before
+    found = plain(compiled(simple.params, jax.random.key(7), *measured))
+    assert [leaf.tobytes() for leaf in found] == [leaf.tobytes() for leaf in expected]
+    with pytest.raises(TypeError):
+        compiled(simple.params, jax.random.key(7), measured[0][:3], *measured[1:])
+
+
+def flat_steps(run, first):
+    """Controls of a few steps of a flat program."""
+    observations, envs, reference = drive()
+    state, controls = first, []
+    for observation, env in zip(observations, envs, strict=True):
+        control, *rest = run(*state, observation, env, reference)
+        state = rest[: len(first)]
+        controls.append(np.asarray(control))
+    return np.stack(controls)
+
+
+def test_evaluating_the_weights_first_leaves_the_function_and_no_factorisation(loaded, in_process):
+    plant = assembly.build_vehicle(loaded.settings["vehicle"])
+    watched_by_nobody = assembly.build_controller(
+        loaded.settings["controller"], loaded.model, plant, env_low=ENV_LOW, env_high=ENV_HIGH
+    )
+    programs = exporting.flat_programs(loaded._replace(controller=watched_by_nobody))
+    first = programs.init.function(jax.random.key_data(jax.random.key(7)))
+    ahead = exporting.weights_first(programs.act)
+    shapes = [jax.ShapeDtypeStruct(leaf.shape, leaf.dtype) for leaf in programs.act.inputs]
+    assert "lapack" in jax.jit(programs.act.function).lower(*shapes).as_text()
+    assert "custom_call" not in jax.jit(ahead).lower(*shapes).as_text()
+    expected = np.stack([leaves[0] for leaves in in_process])
+    np.testing.assert_allclose(flat_steps(jax.jit(ahead), first), expected, atol=1e-5)
+
+
+def test_iree_runs_the_controller_without_jax(loaded, in_process, tmp_path):
+    pytest.importorskip("iree.compiler")
+    runtime = pytest.importorskip("iree.runtime")
+    with pytest.raises(ValueError, match="nonsense"):
+        exporting.write_controller(loaded, tmp_path, made_from={}, iree=True, iree_flags=("--nonsense",))
+    assert list(tmp_path.iterdir()) == []
+    manifest = exporting.write_controller(loaded, tmp_path, made_from={}, iree=True)
+    modules = {}
+    for name, entry in manifest["iree"].items():
+        content = (tmp_path / entry["file"]).read_bytes()
+        assert hashlib.sha256(content).hexdigest() == entry["sha256"]
+        modules[name] = runtime.load_vm_flatbuffer(content, driver="local-sync")["main"]
+    key = np.asarray(jax.random.key_data(jax.random.key(7)))
+    first = [np.asarray(leaf) for leaf in modules["init"](key)]
+    found = flat_steps(lambda *leaves: [np.asarray(leaf) for leaf in modules["act"](*leaves)], first)
+    np.testing.assert_allclose(found, np.stack([leaves[0] for leaves in in_process]), atol=1e-5)
+
+
+@pytest.mark.skipif(importlib.util.find_spec("iree") is not None, reason="IREE is installed")
+def test_iree_that_is_not_installed_is_named_with_its_extra(loaded, tmp_path):
+    with pytest.raises(ValueError, match=r"sfkd-jax\[cpp\]"):
+        exporting.write_controller(loaded, tmp_path, made_from={}, iree=True)
+    assert list(tmp_path.iterdir()) == []
