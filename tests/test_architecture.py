@@ -14,7 +14,7 @@ FUNCTION = (ast.FunctionDef, ast.AsyncFunctionDef)
 SRC = Path(__file__).parents[1] / "src" / "sfkd_jax"
 PACKAGE = SRC.name
 HALLWAY = {"types", "se2", "rollouts"}
-DOORS = {"generate", "train", "certify", "evaluate", "compare", "report"}
+DOORS = {"generate", "train", "certify", "evaluate", "compare", "report", "export"}
 ARROWS = {
     "types": HALLWAY,
     "se2": HALLWAY,
@@ -36,7 +36,9 @@ ARROWS = {
     "policy": HALLWAY | {"artefacts", "assembly", "models", "control"},
     "drive": HALLWAY | {"assembly", "certification", "datasets", "evaluation", "scenarios", "shelf", "vehicle"},
     "cells": {"artefacts", "drive", "evaluation", "shelf"},
-    "__init__": {"artefacts", "policy"},
+    "adapters": HALLWAY | {"vehicle", "scenarios", "assembly"},
+    "exporting": HALLWAY | {"artefacts", "assembly", "policy"},
+    "__init__": {"artefacts", "exporting", "policy"},
 }
 EVERY_ROOM = set(ARROWS)
 ARROWS |= {"config": EVERY_ROOM} | {door: EVERY_ROOM | DOORS | {"config"} for door in DOORS}
@@ -56,13 +58,21 @@ THIRD_PARTY = {
     "policy": {"numpy"},
     "drive": {"numpy"},
     "cells": {"numpy"},
+    "adapters": {"brax", "gymnasium", "numpy"},
+    "exporting": {"numpy", "iree"},
 } | {front: FRONT for front in DOORS | {"config"}}
 
 FILES = {file.relative_to(SRC).as_posix(): ast.parse(file.read_text("utf-8")) for file in SRC.rglob("*.py")}
 ROOMS = {name: name.split("/")[0].removesuffix(".py") for name in FILES}
+FOREIGN = {"brax": {"adapters/_brax.py", "adapters/_brax_system.py"}, "gymnasium": {"adapters/_gymnasium.py"}}
+FOREIGN |= {"iree": {"exporting/_iree.py"}}
 WORKSHOP = {"hydra", "omegaconf", "cvxpy", "clarabel", "orbax", "brax", "matplotlib", "optax"}
 WRITES = {f"os.environ.{verb}" for verb in ("update", "setdefault", "pop", "popitem", "clear")}
+HOST = {"walk", "drive", "training", "certification", "exporting"}
+"""Besides the doors and gymnasium's adapter, where code runs on the host and may compile."""
 FORBIDDEN = WRITES | {"os.putenv", "os.unsetenv", "jax.config"}
+GIVES_BACK = "exporting/_warm_up.py"
+"""The only library file that touches settings of jax: it sets a cache for one compilation, on request, and restores."""
 
 
 def imports(name: str) -> Iterator[str]:
@@ -131,6 +141,11 @@ def test_third_party_packages_stay_in_their_rooms():
     assert sorted((name, package) for name, package in reached if package not in allowed[name]) == []
 
 
+def test_foreign_interfaces_are_known_to_their_adapters_only():
+    reached = {(imported.split(".")[0], name) for name in FILES for imported in imports(name)}
+    assert {package: {name for found, name in reached if found == package} for package in FOREIGN} == FOREIGN
+
+
 def test_files_and_functions_stay_small():
     assert [name for name in FILES if len((SRC / name).read_text("utf-8").splitlines()) > 220] == []
     functions = [(name, node) for name in FILES for node in nodes(name, *FUNCTION)]
@@ -144,14 +159,14 @@ def test_public_functions_are_annotated():
 
 
 def test_only_doors_and_host_rooms_compile():
-    library = [name for name in FILES if ROOMS[name] not in DOORS | {"walk", "drive", "training", "certification"}]
+    library = [name for name in FILES if ROOMS[name] not in DOORS | HOST and name not in FOREIGN["gymnasium"]]
     assert [name for name in library if {"jax.jit", "jax.pmap"} & set(imports(name))] == []
     uses = [(name, node) for name in library for node in nodes(name, ast.Attribute)]
     assert [(n, node.lineno) for n, node in uses if ast.unparse(node) in ("jax.jit", "jax.pmap")] == []
 
 
 def test_the_library_leaves_global_settings_alone():
-    library = [name for name in FILES if ROOMS[name] not in DOORS | {"config"}]
+    library = [name for name in FILES if ROOMS[name] not in DOORS | {"config"} and name != GIVES_BACK]
     assert [name for name in library if (FORBIDDEN | {"os.environ"}) & set(imports(name))] == []
     uses = [(name, node) for name in library for node in nodes(name, ast.Attribute)]
     assert [(n, node.lineno) for n, node in uses if ast.unparse(node) in FORBIDDEN] == []
@@ -166,6 +181,29 @@ def test_a_controller_is_imported_without_the_workshop(module, kept_out):
         pytest.skip("not built yet")
     code = f"import sys, {PACKAGE}.{module}; print(*{{name.split('.')[0] for name in sys.modules}})"
     assert not kept_out & set(fresh(code).split())
+
+
+@pytest.mark.parametrize("module", [PACKAGE, f"{PACKAGE}.adapters"])
+def test_a_foreign_package_is_loaded_when_its_adapter_is_asked_for(module):
+    code = f"import sys, {module}; print(*{{name.split('.')[0] for name in sys.modules}})"
+    assert not {"brax", "mujoco", "gymnasium"} & set(fresh(code).split())
+
+
+@pytest.mark.parametrize(
+    ("name", "package", "extra"),
+    [("BraxVehicle", "brax", "brax"), ("brax_step", "brax", "brax"), ("GymnasiumVehicle", "gymnasium", "gym")],
+)
+def test_an_adapter_without_its_package_names_the_extra(name, package, extra):
+    code = f"""
+import sys
+sys.modules["{package}"] = None
+from {PACKAGE} import adapters
+try:
+    adapters.{name}
+except ImportError as refusal:
+    print(refusal)
+"""
+    assert fresh(code).strip() == f'{PACKAGE}.adapters.{name} needs {package}: pip install "sfkd-jax[{extra}]"'
 
 
 def test_importing_the_controller_costs_little_beyond_jax(tmp_path):

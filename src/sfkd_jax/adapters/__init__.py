@@ -1,0 +1,48 @@
+"""Other projects' interfaces: the vehicles as brax and gymnasium environments, brax systems as plants.
+
+Nothing here is loaded before it is asked for by name, and brax and gymnasium only by what needs them.
+"""
+
+from importlib import import_module
+from typing import TYPE_CHECKING, Any
+
+from sfkd_jax.adapters._task import Moment as Moment
+from sfkd_jax.adapters._task import Outcome as Outcome
+from sfkd_jax.adapters._task import Task as Task
+from sfkd_jax.adapters._task import tracking_task as tracking_task
+
+if TYPE_CHECKING:
+    from sfkd_jax.adapters._brax import BraxVehicle as BraxVehicle
+    from sfkd_jax.adapters._brax import register_brax as register_brax
+    from sfkd_jax.adapters._brax_system import BraxPlant as BraxPlant
+    from sfkd_jax.adapters._brax_system import brax_plant as brax_plant
+    from sfkd_jax.adapters._brax_system import brax_step as brax_step
+    from sfkd_jax.adapters._brax_system import collect as collect
+    from sfkd_jax.adapters._gymnasium import GymnasiumVehicle as GymnasiumVehicle
+    from sfkd_jax.adapters._gymnasium import register_gymnasium as register_gymnasium
+
+_LAZY = {
+    "BraxVehicle": ("_brax", "brax"),
+    "register_brax": ("_brax", "brax"),
+    "BraxPlant": ("_brax_system", "brax"),
+    "brax_plant": ("_brax_system", "brax"),
+    "brax_step": ("_brax_system", "brax"),
+    "collect": ("_brax_system", "brax"),
+    "GymnasiumVehicle": ("_gymnasium", "gym"),
+    "register_gymnasium": ("_gymnasium", "gym"),
+}
+"""Public name -> its file, and the extra that installs what the file imports."""
+
+
+def __getattr__(name: str) -> Any:
+    """Load an adapter on first use, or say which extra it needs."""
+    if name not in _LAZY:
+        raise AttributeError(f"module 'sfkd_jax.adapters' has no attribute {name!r}")
+    file, extra = _LAZY[name]
+    try:
+        module = import_module(f"sfkd_jax.adapters.{file}")
+    except ModuleNotFoundError as missing:
+        package = str(missing.name).partition(".")[0]
+        command = f'pip install "sfkd-jax[{extra}]"'
+        raise ImportError(f"sfkd_jax.adapters.{name} needs {package}: {command}") from missing
+    return getattr(module, name)

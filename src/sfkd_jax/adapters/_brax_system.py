@@ -1,0 +1,159 @@
+"""A brax system as a plant of this project: one step from (state, control, e), and trajectories of it."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from operator import attrgetter
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+from brax.envs.base import Env, PipelineEnv
+from brax.generalized import pipeline
+from jaxtyping import Array, Float
+
+from sfkd_jax.types import BODY, Control, Environment, Key, State, Step, Trajectory
+
+SCALED = {
+    "gravity": ("gravity", "opt.gravity"),
+    "damping": ("dof.damping",),
+    "motor": ("actuator.gear",),
+}
+"""What an entry of e may scale (viscous friction is that of all joints), and where it stands in a system."""
+
+
+class BraxPlant(NamedTuple):
+    """A brax system whose physical parameters are the environment e; x = (0, 0, 0, q, q̇).
+
+    The system has no pose in the plane, so the pose that leads every state of this project is 0 and stays 0.
+
+    Attributes:
+        dt: sampling period [s]. state_names: pose first. control_low, control_high: limits of the motors.
+        parameters: what the entries of e scale; 1 is the system as it is.
+        step: (x, u, e) -> x one sampling period later, u in the units of the motors.
+        start: key -> x at the start of an episode of the environment.
+    """
+
+    dt: float
+    state_names: tuple[str, ...]
+    control_low: tuple[float, ...]
+    control_high: tuple[float, ...]
+    parameters: tuple[str, ...]
+    step: Step
+    start: Callable[[Key], State]
+
+
+def brax_step(env: Env, *, parameters: tuple[str, ...] = ("gravity",)) -> Step:
+    """The step of `brax_plant`."""
+    return brax_plant(env, parameters=parameters).step
+
+
+def brax_plant(env: Env, *, parameters: tuple[str, ...] = ("gravity",)) -> BraxPlant:
+    """x⁺ = (0, q⁺, q̇⁺), (q⁺, q̇⁺) what the environment's own physics makes of (q, q̇, u) with parameters scaled by e.
+
+    Args:
+        env: from `brax.envs.get_environment(name, backend="generalized")`; wrappers are taken off.
+        parameters: what the entries of e scale, of "gravity", "damping", "motor".
+
+    Raises:
+        ValueError: an unknown or repeated parameter, an environment without a brax system, or a backend other than
+            "generalized": only there is (q, q̇) the whole state.
+    """
+    inner = env.unwrapped
+    _check(inner, parameters)
+    assert isinstance(inner, PipelineEnv)
+    system, coordinates = inner.sys, inner.sys.q_size()
+    frames = round(float(inner.dt) / float(system.opt.timestep))
+
+    def step(state: State, control: Control, env: Environment) -> State:
+        places = [(place, factor) for name, factor in zip(parameters, env, strict=True) for place in SCALED[name]]
+        changed: Any = system.tree_replace({place: factor * attrgetter(place)(system) for place, factor in places})
+        body = state[BODY]
+        moment = pipeline.init(changed, body[:coordinates], body[coordinates:])
+
+        def frame(moment: Any, _: None) -> tuple[Any, None]:
+            return pipeline.step(changed, moment, control), None
+
+        moment, _ = jax.lax.scan(frame, moment, None, length=frames)
+        return _state(moment)
+
+    def start(key: Key) -> State:
+        return _state(inner.reset(key).pipeline_state)
+
+    limits = jnp.asarray(system.actuator.ctrl_range).T.tolist()
+    names = [f"q_{k}" for k in range(coordinates)] + [f"qd_{k}" for k in range(system.qd_size())]
+    return BraxPlant(
+        dt=float(inner.dt),
+        state_names=("p_x", "p_y", "yaw", *names),
+        control_low=tuple(limits[0]),
+        control_high=tuple(limits[1]),
+        parameters=parameters,
+        step=step,
+        start=start,
+    )
+
+
+def collect(
+    plant: BraxPlant,
+    key: Key,
+    *,
+    trajectories: int,
+    steps: int,
+    env_low: tuple[float, ...],
+    env_high: tuple[float, ...],
+    excitation: float = 0.3,
+    memory: float = 0.85,
+) -> Trajectory:
+    """Trajectories under random controls, each with its own e, drawn evenly from a box.
+
+    u_k = clip(centre + half range · n_k), n_{k+1} = ϱ n_k + √(1 − ϱ²) σ w_k, w white and n_0 = σ w.
+
+    Args:
+        plant: whose. key: consumed.
+        trajectories, steps: how many, how long.
+        env_low, env_high: box of e, one entry a parameter.
+        excitation: σ, spread of the controls in shares of half their range. memory: ϱ.
+
+    Returns:
+        A batch of trajectories, states (trajectory, steps + 1, state).
+
+    Raises:
+        ValueError: a box whose corners do not have one entry a parameter.
+    """
+    for name, corner in (("env_low", env_low), ("env_high", env_high)):
+        if len(corner) != len(plant.parameters):
+            raise ValueError(f"{name} must have an entry for each of {', '.join(plant.parameters)}, got {corner}")
+    low, high = jnp.asarray(plant.control_low), jnp.asarray(plant.control_high)
+
+    def one(key: Key) -> Trajectory:
+        start_key, env_key, noise_key = jax.random.split(key, 3)
+        env = jax.random.uniform(env_key, (len(env_low),), minval=jnp.asarray(env_low), maxval=jnp.asarray(env_high))
+        fresh = excitation * jax.random.normal(noise_key, (steps, low.shape[0]))
+
+        def advance(carry: tuple[State, Array], white: Float[Array, " control"]) -> tuple[Any, Any]:
+            state, noise = carry
+            control = jnp.clip(0.5 * (low + high) + 0.5 * (high - low) * noise, low, high)
+            after = plant.step(state, control, env)
+            return (after, memory * noise + jnp.sqrt(1.0 - memory**2) * white), (after, control)
+
+        initial = plant.start(start_key)
+        _, (states, controls) = jax.lax.scan(advance, (initial, fresh[0]), jnp.roll(fresh, -1, axis=0))
+        return Trajectory(jnp.concatenate([initial[None], states]), controls, jnp.tile(env, (steps, 1)))
+
+    return jax.vmap(one)(jax.random.split(key, trajectories))
+
+
+def _state(moment: Any) -> State:
+    """(0, 0, 0, q, q̇) of a state of brax."""
+    return jnp.concatenate([jnp.zeros(3), moment.q, moment.qd])
+
+
+def _check(env: Env, parameters: tuple[str, ...]) -> None:
+    """Refuse what has no such step."""
+    if not isinstance(env, PipelineEnv):
+        raise ValueError(f"{type(env).__name__} has no brax system to step")
+    if env.backend != "generalized":
+        raise ValueError(f'backend must be "generalized", where (q, q̇) is the whole state, got {env.backend!r}')
+    unknown = [name for name in parameters if name not in SCALED]
+    if unknown or len(set(parameters)) != len(parameters):
+        raise ValueError(f"parameters must be different ones of {', '.join(SCALED)}, got {parameters}")

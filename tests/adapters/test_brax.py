@@ -1,0 +1,269 @@
+"""The vehicles as a brax environment: its own physics, brax's wrappers, the end of episodes, and refusals."""
+
+import inspect
+from functools import cache, partial
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from brax import envs
+from brax.envs.wrappers.training import EvalWrapper, wrap
+from helpers import at, jit
+
+from sfkd_jax import adapters, assembly, control, evaluation, se2, vehicle
+from sfkd_jax.types import Controller
+
+STEPS = 25
+SEEN = {"scenario": "seen", "duration": STEPS * 0.1}
+GUSTS = {"vehicle": "dynamic", "scenario": "s2", "duration": 6.0}
+adapters.register_brax()
+
+
+@cache
+def env(name="kinematic"):
+    """The kinematic car on steady roads of 25 steps, and the dynamic one in gusts."""
+    return envs.get_environment("sfkd_vehicle", **{"kinematic": SEEN, "dynamic": GUSTS}[name])
+
+
+@cache
+def compiled(name="kinematic"):
+    """reset, and the states of an episode under a list of actions."""
+    inner = env(name)
+
+    def drive(state, actions):
+        def step(state, action):
+            after = inner.step(state, action)
+            return after, after
+
+        return jax.lax.scan(step, state, actions)[1]
+
+    return jit(inner.reset), jit(drive)
+
+
+def driven(actions, name="kinematic"):
+    reset, drive = compiled(name)
+    start = reset(jax.random.key(0))
+    return start, drive(start, jnp.asarray(actions))
+
+
+def gentle(steps=STEPS, seed=3):
+    """Random actions about going on straight at the same speed."""
+    spread = jnp.asarray([0.1, 0.3])
+    return jnp.asarray([0.0, 0.34]) + spread * jax.random.uniform(jax.random.key(seed), (steps, 2), minval=-1.0)
+
+
+@pytest.mark.parametrize("name", ["kinematic", "dynamic"])
+def test_it_steps_the_plant_and_nothing_else(name):
+    plant = getattr(vehicle, name)()
+    start, after = driven(gentle(), name)
+    moments, road = after.pipeline_state, start.info["road"]
+    states = jnp.concatenate([start.pipeline_state.state[None], moments.state])
+    low, high = np.asarray(plant.control_low), np.asarray(plant.control_high)
+    np.testing.assert_allclose(moments.control, low + (high - low) * (np.asarray(gentle()) + 1) / 2, atol=1e-6)
+    expected = jit(jax.vmap(plant.step))(states[:-1], moments.control, road.envs[:STEPS])
+    np.testing.assert_allclose(states[1:], expected, atol=2e-5)
+    assert start.obs.shape == (env(name).observation_size,)
+    assert env(name).action_size == 2
+
+
+def test_a_controller_drives_it_as_the_test_track_has_it_driven():
+    """The controls of a simulated episode, as actions: the same motion, and the same questions to the controller."""
+    plant, law = vehicle.kinematic(), assembly.build_driver(vehicle.kinematic())
+
+    def act(params, state, observation, env, reference):
+        info = {"predicted_states": observation[None], "effective_samples": jnp.ones(()), "healthy": jnp.asarray(True)}
+        return law(observation, reference), state, info
+
+    start = compiled()[0](jax.random.key(0))
+    controller = Controller(lambda key: (), act)
+    drive = jit(partial(evaluation.simulate, plant.step, controller, {}, dt=plant.dt, horizon=10))
+    episode = drive(start.info["road"], jax.random.key(0))
+    _, after = driven(jax.vmap(env().action)(episode.controls))
+    np.testing.assert_allclose(after.pipeline_state.state, episode.states[1:], atol=2e-4)
+    np.testing.assert_allclose(after.pipeline_state.lateral, episode.lateral, atol=2e-4)
+    asked = jit(jax.vmap(lambda state: law(*env().situation(state)[::2])))(after)
+    np.testing.assert_allclose(asked[:-1], episode.controls[1:], atol=1e-4)
+
+
+def test_the_observation_is_laid_out_as_documented():
+    start, after = driven(gentle(), "dynamic")
+    last, road = at(after, -1), start.info["road"]
+
+    @jit
+    def told(state):
+        pose, environment, reference = env("dynamic").situation(state)
+        rows = state.obs[10:].reshape(10, 4)
+        back = jax.vmap(se2.compose, in_axes=(None, 0))(pose[:3], rows[:, :3])
+        return environment, reference, jnp.concatenate([back, rows[:, 3:]], axis=1)
+
+    environment, reference, seen = told(last)
+    moment = last.pipeline_state
+    np.testing.assert_allclose(last.obs[0], moment.lateral, atol=1e-6)
+    np.testing.assert_allclose(last.obs[2:6], moment.state[3:], atol=1e-6)
+    np.testing.assert_allclose(last.obs[6:8], gentle()[-1], atol=1e-5)
+    np.testing.assert_allclose(last.obs[8:10], environment)
+    np.testing.assert_allclose(environment, road.envs[STEPS])
+    np.testing.assert_allclose(seen, reference, atol=2e-5)
+    np.testing.assert_allclose(reference[:, 3], road.speed)
+
+
+def test_the_observation_does_not_depend_on_where_the_road_lies():
+    start, after = driven(gentle())
+    place = jnp.asarray([30.0, -20.0, 2.0])
+
+    @jit
+    def both(road, moment):
+        moved = jax.vmap(se2.compose, in_axes=(None, 0))(place, road.path.points[:, :3])
+        elsewhere = road._replace(path=road.path._replace(points=road.path.points.at[:, :3].set(moved)))
+        there = moment._replace(state=moment.state.at[:3].set(se2.compose(place, moment.state[:3])))
+        return env().task.observe(elsewhere, there), env().task.observe(road, moment)
+
+    there, here = both(start.info["road"], at(after, -1).pipeline_state)
+    np.testing.assert_allclose(there, here, atol=1e-4)
+
+
+def test_the_reward_is_minus_the_cost_of_lateral_speed_and_steering_rate_as_the_planner_weighs_them():
+    start, after = driven(gentle())
+    moments = jax.tree.map(np.asarray, after.pipeline_state)
+    steering = np.concatenate([start.pipeline_state.control[None, :1], moments.control[:, :1]])[:, 0]
+    parts = (moments.lateral, moments.state[:, 3] - 10.0, np.diff(steering) / env().dt)
+    names = ("lateral", "speed", "steering_rate")
+    planner, task = (inspect.signature(f).parameters for f in (control.tracking_cost, adapters.tracking_task))
+    weights = [planner[name].default for name in names]
+    assert weights == [task[name].default for name in names]
+    cost = sum(weight * part**2 for weight, part in zip(weights, parts, strict=True))
+    np.testing.assert_allclose(after.reward, -cost, rtol=1e-4)
+    for name, part in zip(("lateral", "speed_error", "steering_rate"), parts, strict=True):
+        np.testing.assert_allclose(after.metrics[name], np.abs(part), atol=1e-4)
+
+
+def test_every_key_is_another_episode_and_a_raw_key_is_the_typed_one():
+    reset = compiled()[0]
+    first, again, other = reset(jax.random.key(1)), reset(jax.random.PRNGKey(1)), reset(jax.random.key(2))
+    for leaf, same in zip(jax.tree.leaves(first), jax.tree.leaves(again), strict=True):
+        np.testing.assert_array_equal(leaf, same)
+    assert np.abs(first.info["road"].path.points - other.info["road"].path.points).max() > 1.0
+    assert np.any(np.asarray(first.info["road"].envs) != np.asarray(other.info["road"].envs))
+
+
+def test_leaving_the_lane_ends_an_episode_and_costs_what_it_says():
+    hard = jnp.tile(jnp.asarray([1.0, 0.34]), (STEPS, 1))
+    _, after = driven(hard)
+    outside = np.abs(np.asarray(after.pipeline_state.lateral)) > 3.0
+    first = int(np.argmax(outside))
+    assert 5 < first < STEPS
+    assert after.done[: first + 1].tolist() == [0.0] * first + [1.0]
+    assert after.info["time_out"][first] == 0.0
+    moments = at(after.pipeline_state, first)
+    staying = 200.0 * moments.lateral**2 + (moments.state[3] - 10.0) ** 2
+    np.testing.assert_allclose(after.reward[first], -staying - 2e4, rtol=1e-5)
+
+
+def test_what_is_not_finite_ends_an_episode_and_does_not_get_out():
+    actions = gentle().at[3].set(jnp.nan)
+    _, after = driven(actions)
+    assert after.done[:4].tolist() == [0.0, 0.0, 0.0, 1.0]
+    assert all(np.all(np.isfinite(leaf)) for leaf in jax.tree.leaves((after.obs, after.reward, after.pipeline_state)))
+
+
+def test_the_end_of_the_road_is_a_time_out_and_no_failure():
+    _, after = driven(gentle())
+    assert env().task.steps == STEPS
+    assert after.done.tolist() == after.info["time_out"].tolist() == [0.0] * (STEPS - 1) + [1.0]
+    assert np.all(np.asarray(after.reward) > -2e4)
+
+
+def test_driving_beyond_the_path_is_a_time_out_and_facing_backwards_is_not():
+    reset, drive = compiled()
+    start = reset(jax.random.key(0))
+    moment, path = start.pipeline_state, start.info["road"].path
+    length = float((path.points.shape[0] - 1) * path.spacing)
+    near = path.points[-11]
+    placed = moment.state.at[:3].set(near[:3])
+    after = drive(start.replace(pipeline_state=moment._replace(state=placed, progress=length - 5.0)), gentle())
+    first = int(np.argmax(after.done))
+    assert 3 <= first <= 7
+    assert after.info["time_out"][first] == 1.0
+    turned = moment.state.at[2].add(jnp.pi)
+    after = drive(start.replace(pipeline_state=moment._replace(state=turned)), gentle())
+    assert (after.done[0], after.info["time_out"][0]) == (1.0, 0.0)
+    assert after.reward[0] < -2e4
+
+
+@cache
+def wrapped(kind):
+    """A batch of three, episodes of 10 steps, 24 steps driven by brax's wrappers; typed keys where these allow it."""
+    if kind == "create":
+        outer, keys = envs.create("sfkd_vehicle", episode_length=10, batch_size=3, **SEEN), jax.random.key(0)
+    else:
+        outer = EvalWrapper(wrap(env(), episode_length=10, action_repeat=2))
+        keys = jax.random.split(jax.random.PRNGKey(0), 3)
+
+    def drive(keys, actions):
+        start = outer.reset(keys)
+
+        def step(state, action):
+            after = outer.step(state, jnp.tile(action, (3, 1)))
+            return after, after
+
+        return start, jax.lax.scan(step, start, actions)[1]
+
+    return jit(drive)(keys, gentle(24))
+
+
+@pytest.mark.parametrize(("kind", "repeat"), [("create", 1), ("wrap", 2)])
+def test_under_brax_wrappers_episodes_end_in_time_and_begin_again(kind, repeat):
+    start, after = wrapped(kind)
+    ends = [k for k in range(24) if (k + 1) * repeat % 10 == 0]
+    assert after.done.shape == (24, 3)
+    for car in range(3):
+        assert np.flatnonzero(after.done[:, car]).tolist() == ends
+    np.testing.assert_array_equal(after.info["truncation"], after.done)
+    np.testing.assert_array_equal(after.obs[ends[0]], start.obs)
+    np.testing.assert_array_equal(after.pipeline_state.count[ends[0]], np.zeros(3))
+    assert np.all(np.asarray(after.pipeline_state.count[ends[0] + 1]) == repeat)
+    paths = np.asarray(start.info["road"].path.points)
+    assert min(np.abs(paths[0] - paths[1]).max(), np.abs(paths[1] - paths[2]).max()) > 1.0
+
+
+def test_a_wrapped_car_drives_as_the_bare_one():
+    """Before the first end of an episode; each car by its own key."""
+    reset, drive = compiled()
+    _, after = wrapped("create")
+    for car, key in enumerate(jax.random.split(jax.random.key(0), 3)):
+        alone = drive(reset(key), gentle())
+        np.testing.assert_allclose(after.pipeline_state.state[:9, car], alone.pipeline_state.state[:9], atol=1e-4)
+        np.testing.assert_allclose(after.reward[:9, car], alone.reward[:9], rtol=1e-3, atol=1e-3)
+
+
+@pytest.mark.parametrize(
+    ("settings", "message"),
+    [
+        ({"vehicle": "boat"}, "unknown vehicle 'boat'; choose one of dynamic, kinematic"),
+        ({"scenario": "s9"}, "unknown scenario 's9'"),
+        ({"inner_loop": "steering"}, "unknown vehicle.inner_loop 'steering'"),
+        ({"duration": 0.05}, "duration must be finite and at least one step"),
+        ({"preview": 0}, "preview must be a whole number of at least 1"),
+        ({"lane": 0.0}, "lane must be positive"),
+        ({"lateral": -1.0}, "lateral must be finite and at least 0"),
+        ({"leaving": float("nan")}, "leaving must be finite and at least 0"),
+        ({"vehicle": "dynamic", "scenario": "family"}, r"the scenario starts in a state of shape \(4,\), 'dynamic'"),
+    ],
+)
+def test_bad_settings_are_refused_in_one_line(settings, message):
+    if settings.get("scenario") == "family":
+        settings = settings | {"scenario": assembly.build_scenario({"name": "s1"}, vehicle.kinematic(), duration=2.0)}
+    with pytest.raises(ValueError, match=message) as refusal:
+        envs.get_environment("sfkd_vehicle", **settings)
+    assert "\n" not in str(refusal.value)
+
+
+def test_a_plant_and_a_family_of_ones_own():
+    plant = vehicle.with_speed_loop(vehicle.dynamic(dt=0.05))
+    family = assembly.build_scenario({"name": "seen"}, plant, duration=1.0)
+    task = adapters.BraxVehicle(vehicle=plant, scenario=family).task
+    assert (task.plant.dt, task.steps, task.observation_size) == (0.05, 20, 50)
+    control = jnp.asarray([0.1, 12.0])
+    np.testing.assert_allclose(task.control(task.action(control)), control, atol=1e-5)
+    np.testing.assert_allclose(task.control(jnp.asarray([-9.0, 9.0])), [-0.5, 25.0])

@@ -1,0 +1,126 @@
+"""A brax system as a plant: brax's own motion where nothing is changed, known motions where something is."""
+
+from functools import cache, partial
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from brax import envs
+from helpers import at, jit
+
+from sfkd_jax import adapters, datasets
+from sfkd_jax.types import BODY, POSE
+
+PARAMETERS = ("gravity", "damping", "motor")
+AS_IT_IS = jnp.ones(3)
+
+
+@cache
+def pendulum():
+    return envs.get_environment("inverted_pendulum", backend="generalized")
+
+
+@cache
+def plant():
+    return adapters.brax_plant(pendulum(), parameters=PARAMETERS)
+
+
+@cache
+def stepper():
+    return jit(plant().step)
+
+
+def step(body, control, env):
+    """(cart [m], pole [rad], their rates) one sampling period later."""
+    state = jnp.concatenate([jnp.zeros(3), jnp.asarray(body, dtype=float)])
+    return stepper()(state, jnp.asarray([control], dtype=float), jnp.asarray(env, dtype=float))[BODY]
+
+
+@cache
+def collected():
+    options = {"trajectories": 10, "steps": 12, "env_low": (0.5, 0.5, 0.5), "env_high": (1.5, 1.5, 1.5)}
+    return jit(partial(adapters.collect, plant(), **options))(jax.random.key(0))
+
+
+def test_unmodified_it_moves_as_the_environment_itself():
+    low, high = plant().control_low[0], plant().control_high[0]
+    assert (low, high) == (-3.0, 3.0)
+    actions = 0.2 * jax.random.uniform(jax.random.key(1), (15, 1), minval=-1.0)
+    state, advance = jit(pendulum().reset)(jax.random.key(0)), jit(pendulum().step)
+    ours = jnp.concatenate([jnp.zeros(3), state.obs])
+    for action in actions:
+        state = advance(state, action)
+        ours = stepper()(ours, low + (high - low) * (action + 1.0) / 2.0, AS_IT_IS)
+        np.testing.assert_allclose(ours[BODY], state.obs, atol=1e-4)
+    assert np.abs(ours[BODY]).max() > 0.1
+
+
+def test_the_sampling_period_and_the_names_are_the_environments():
+    assert plant().dt == pytest.approx(float(pendulum().dt))
+    assert plant().state_names == ("p_x", "p_y", "yaw", "q_0", "q_1", "qd_0", "qd_1")
+
+
+def test_without_gravity_a_pole_at_rest_rests_and_with_more_it_falls_faster():
+    leaning = (0.0, 0.1, 0.0, 0.0)
+    np.testing.assert_allclose(step(leaning, 0.0, (0.0, 1.0, 1.0)), leaning, atol=1e-6)
+    rates = [float(step(leaning, 0.0, (factor, 0.0, 1.0))[3]) for factor in (1.0, 2.0)]
+    assert rates[0] > 0.05
+    assert rates[1] == pytest.approx(2.0 * rates[0], rel=0.05)
+
+
+def test_without_friction_a_cart_with_an_upright_pole_keeps_its_speed():
+    """The pole's centre of mass stands half a millimetre beside its joint, so upright is not quite angle 0."""
+    gliding = (0.0, 0.0, 0.4, 0.0)
+    after = step(gliding, 0.0, (0.0, 0.0, 1.0))
+    np.testing.assert_allclose(after, [0.4 * plant().dt, 0.0, 0.4, 0.0], atol=1e-5)
+    assert float(step(gliding, 0.0, (0.0, 1.0, 1.0))[2]) < 0.4 - 1e-3
+
+
+def test_a_motor_of_twice_the_force_is_twice_the_control():
+    body = (0.1, -0.05, 0.2, 0.3)
+    doubled, unchanged = step(body, 0.4, (1.0, 1.0, 2.0)), step(body, 0.8, (1.0, 1.0, 1.0))
+    np.testing.assert_allclose(doubled, unchanged, atol=1e-5)
+    assert np.abs(doubled - step(body, 0.4, (1.0, 1.0, 1.0))).max() > 1e-2
+
+
+def test_collected_trajectories_are_the_plants_and_a_data_set_of_this_project():
+    driven = collected()
+    assert driven.states.shape == (10, 13, 7)
+    assert driven.controls.shape == (10, 12, 1)
+    assert np.all(np.asarray(driven.states)[..., POSE] == 0.0)
+    one = at(driven, 0)
+    for before, after, control, env in zip(one.states, one.states[1:], one.controls, one.envs, strict=False):
+        np.testing.assert_allclose(after, stepper()(before, control, env), atol=1e-4)
+    assert np.all(np.asarray(driven.envs) == np.asarray(driven.envs)[:, :1])
+    assert np.std(np.asarray(driven.envs)[:, 0], axis=0).min() > 0.05
+    low, high = jnp.full(3, 0.5), jnp.full(3, 1.5)
+    shares = {"shares": (0.4, 0.2, 0.2, 0.2), "env_low": low, "env_high": high}
+    space = datasets.measure_space(datasets.split(driven, jax.random.key(1), **shares))
+    np.testing.assert_array_equal(space.increment_mean, np.zeros(3))
+    np.testing.assert_array_equal(space.increment_scale, np.ones(3))
+
+
+@pytest.mark.parametrize(
+    ("environment", "parameters", "message"),
+    [
+        ("pendulum", ("colour",), "parameters must be different ones of gravity, damping, motor"),
+        ("pendulum", ("gravity", "gravity"), "parameters must be different ones of"),
+        ("spring", ("gravity",), 'backend must be "generalized"'),
+        ("vehicle", ("gravity",), "BraxVehicle has no brax system to step"),
+    ],
+)
+def test_what_is_no_such_system_is_refused_in_one_line(environment, parameters, message):
+    given = {
+        "pendulum": pendulum,
+        "spring": lambda: envs.get_environment("inverted_pendulum", backend="spring"),
+        "vehicle": adapters.BraxVehicle,
+    }[environment]()
+    with pytest.raises(ValueError, match=message) as refusal:
+        adapters.brax_step(given, parameters=parameters)
+    assert "\n" not in str(refusal.value)
+
+
+def test_a_box_of_another_length_is_refused():
+    with pytest.raises(ValueError, match="env_low must have an entry for each of gravity, damping, motor"):
+        adapters.collect(plant(), jax.random.key(0), trajectories=1, steps=2, env_low=(0.5,), env_high=(1.0, 1.0, 1.0))
