@@ -91,8 +91,9 @@ def build_controller(
 def _sampled(
     search: str, settings: Settings, model: Model, plant: vehicle.Vehicle, env_low: Any, env_high: Any
 ) -> Controller:
-    """A planner that searches around the path-following law (`sampling: feedback`) or around nothing (`plain`)."""
-    law = choose({"feedback": _feedback, "plain": _no_feedback}, settings["sampling"], "controller.sampling")
+    """A planner that searches around the path-following law (`sampling: feedback`), the model's own, or nothing."""
+    laws = {"feedback": _feedback, "model": _model_law, "plain": _no_feedback}
+    law = choose(laws, settings["sampling"], "controller.sampling")
     task = control.path_tracking(
         model,
         control.tracking_cost(dt=plant.dt, speed_loop=plant.speed_loop, **without(settings["cost"])),
@@ -109,6 +110,10 @@ def _sampled(
 def _feedback(settings: Settings, plant: vehicle.Vehicle) -> control.Law:
     gains = without(settings["feedback"])
     return control.path_feedback(wheelbase=plant.wheelbase, speed_loop=plant.speed_loop, **gains)
+
+
+def _model_law(settings: Settings, plant: vehicle.Vehicle) -> control.ModelLaw:
+    return control.ModelLaw(dt=plant.dt, **without(settings["model_law"]))
 
 
 def _no_feedback(settings: Settings, plant: vehicle.Vehicle) -> control.Law:

@@ -11,6 +11,8 @@ from sfkd_jax.control._delay import compensated as compensated
 from sfkd_jax.control._gradient import gradient_planner as gradient_planner
 from sfkd_jax.control._koopman_mpc import KoopmanMpcState as KoopmanMpcState
 from sfkd_jax.control._koopman_mpc import koopman_mpc as koopman_mpc
+from sfkd_jax.control._model_law import ModelLaw as ModelLaw
+from sfkd_jax.control._model_law import SteadyTurn as SteadyTurn
 from sfkd_jax.control._monitor import MonitorState as MonitorState
 from sfkd_jax.control._monitor import monitored as monitored
 from sfkd_jax.control._mppi import mppi as mppi

@@ -9,6 +9,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from sfkd_jax.control._costs import Cost, Stage
+from sfkd_jax.control._model_law import ModelLaw
 from sfkd_jax.control._path_frame import Law, path_errors, reference_curvature
 from sfkd_jax.control._task import Actuator, Advanced, Applied, Began, Environments, Task, actuator_limits
 from sfkd_jax.types import Control, Environment, Model, Params, Reference, Scalar, State
@@ -25,7 +26,7 @@ class PathSample(NamedTuple):
 def path_tracking(
     model: Model,
     cost: Cost,
-    law: Law,
+    law: Law | ModelLaw,
     *,
     dt: float,
     control_low: tuple[float, ...],
@@ -41,7 +42,7 @@ def path_tracking(
 
     Args:
         model: rolled out; `fiber` and `encode` are evaluated once a step, outside the scan.
-        cost: ℓ, see `tracking_cost`. law: u_ff + K ξ; see `path_feedback`, `no_feedback`.
+        cost: ℓ, see `tracking_cost`. law: u_ff + K ξ; see `path_feedback`, `ModelLaw`, `no_feedback`.
         dt: [s]. control_low, control_high: actuator limits, in control units. control_rate: per second, or None.
         terminal_weight: w_T, on top of the last step's ℓ. latent_weight: λ_z.
         actuator: where the actuators stand, from the observation; else rates count from the control applied last.
@@ -52,22 +53,32 @@ def path_tracking(
     limit = actuator_limits(control_low, control_high, control_rate, dt)
     low, high = jnp.asarray(control_low, dtype=float), jnp.asarray(control_high, dtype=float)
 
+    def asked(state: State, target: Any) -> Control:
+        """What the law wants at a state."""
+        point, curvature, _, turn = target
+        if isinstance(law, ModelLaw):
+            return law.control(turn, state, point, curvature)
+        return law(path_errors(state, point, curvature), curvature, point[3])
+
     def begin(params: Params, observation: State, env: Environment, reference: Reference, applied: Applied) -> Began:
         fiber = model.fiber(params, env)
         curvature = reference_curvature(reference)
         goals = jax.vmap(lambda point: model.encode(fiber, _on_path(observation, point)))(reference)
         errors = path_errors(observation, reference[0], curvature[0])
-        lawful = jnp.clip(law(errors, curvature[0], reference[0, 3]), low, high)
+        turns = None
+        if isinstance(law, ModelLaw):
+            turns = law.prepare(model, fiber, observation, reference, curvature)
+        targets = (reference, curvature, goals, turns)
+        lawful = jnp.clip(asked(observation, jax.tree.map(lambda leaf: leaf[0], targets)), low, high)
         before = jnp.where(applied.known, applied.control, lawful)
         if actuator is not None:
             before = actuator(observation)
         start = PathSample(model.encode(fiber, observation), errors, before)
-        return Began(fiber, start, (reference, curvature, goals))
+        return Began(fiber, start, targets)
 
     def advance(weights: Any, fiber: Any, before: PathSample, nu: Control, target: Any, last: Scalar) -> Advanced:
-        point, curvature, goal = target
-        state = model.decode(fiber, before.latent)
-        lawful = law(path_errors(state, point, curvature), curvature, point[3])
+        point, curvature, goal, _ = target
+        lawful = asked(model.decode(fiber, before.latent), target)
         control = limit(lawful + nu, before.control)
         latent = model.step(fiber, before.latent, control)
         after = model.decode(fiber, latent)

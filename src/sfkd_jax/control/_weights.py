@@ -11,8 +11,8 @@ from jaxtyping import Array, Bool, Float
 from sfkd_jax.types import Scalar
 
 BISECTIONS = 24
-DECADES = 6.0
-"""Temperatures are looked for between 10^-6 and 10^6 times the spread of the costs."""
+DECADES = (-12.0, 4.0)
+"""Temperatures are looked for between 10^-12 and 10^4 times the spread of the costs: one far off stretches it."""
 
 
 def softmin(costs: Float[Array, " sample"], temperature: Scalar) -> tuple[Float[Array, " sample"], Bool[Array, ""]]:
@@ -51,6 +51,6 @@ def temperature_for(costs: Float[Array, " sample"], wanted: Scalar) -> Scalar:
         few = count_effective(softmin(above, jnp.exp(middle))[0]) < wanted
         return jnp.where(few, middle, low), jnp.where(few, high, middle)
 
-    ends = jnp.log(10.0) * jnp.asarray([-DECADES, DECADES])
+    ends = jnp.log(10.0) * jnp.asarray(DECADES)
     low, high = jax.lax.fori_loop(0, BISECTIONS, narrow, (ends[0], ends[1]))
     return spread * jnp.exp(0.5 * (low + high))

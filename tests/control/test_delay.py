@@ -1,0 +1,71 @@
+"""Actuators that answer late."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from helpers import jit, straight
+
+from sfkd_jax import control, models, vehicle
+
+PLANT = vehicle.kinematic()
+HORIZON, DELAY = 8, 3
+ENV = jnp.asarray([0.7, 3.0])
+START = jnp.asarray([0.0, 0.4, 0.1, 10.0])
+MODEL = models.physics(PLANT.step)
+
+
+def planner():
+    limits = {"control_low": PLANT.control_low, "control_high": PLANT.control_high}
+    law = control.path_feedback(wheelbase=PLANT.wheelbase)
+    task = control.path_tracking(MODEL, control.tracking_cost(dt=0.1), law, dt=0.1, **limits)
+    return control.mppi(task, num_samples=64, horizon=HORIZON)
+
+
+def drive(controller, steps=12):
+    """A plant that applies what was sent DELAY steps before; zero until then."""
+    reference = straight(HORIZON)
+
+    @jit
+    def run(key):
+        def step(carry, _):
+            state, pipe, inner = carry
+            action, inner, info = controller.act({}, inner, state, ENV, reference.at[:, 0].add(state[0]))
+            pipe = jnp.concatenate([pipe, action[None]])
+            state = PLANT.step(state, pipe[0], ENV)
+            return (state, pipe[1:], inner), (state, action, info)
+
+        carry = (START, jnp.zeros((DELAY, 2)), controller.init(key))
+        return jax.lax.scan(step, carry, None, length=steps)[1]
+
+    return run(jax.random.key(0))
+
+
+def test_the_state_it_plans_from_is_the_one_that_comes():
+    states, _, info = drive(control.compensated(planner(), MODEL, delay=DELAY))
+    # At step k it foresees the state in which the control of step k begins to act.
+    np.testing.assert_allclose(info["arrival_state"][:-DELAY], states[DELAY - 1 : -1], atol=1e-4)
+
+
+def test_it_acts_as_the_planner_alone_would_from_that_state():
+    _, actions, info = drive(control.compensated(planner(), MODEL, delay=DELAY), steps=1)
+    alone = planner()
+    reference = straight(HORIZON).at[:, 0].add(START[0])
+    expected, _, _ = jit(alone.act)({}, alone.init(jax.random.key(0)), info["arrival_state"][0], ENV, reference)
+    np.testing.assert_allclose(actions[0], expected, atol=1e-6)
+
+
+def test_an_observation_that_cannot_be_read_is_reported_and_the_next_clean_one_recovers():
+    controller = control.compensated(planner(), MODEL, delay=DELAY)
+    act, state = jit(controller.act), controller.init(jax.random.key(0))
+    seen = []
+    for observation in (START, START * jnp.nan, START):
+        action, state, info = act({}, state, observation, ENV, straight(HORIZON))
+        assert np.all(np.isfinite(action))
+        seen.append(bool(info["healthy"]))
+    assert seen == [True, False, True]
+
+
+def test_a_delay_below_one_period_is_refused():
+    with pytest.raises(ValueError, match="delay must be at least 1"):
+        control.compensated(planner(), MODEL, delay=0)
