@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 from helpers import jit
 
+from sfkd_jax import scenarios
 from sfkd_jax.scenarios import path_from_curvature, point_at, project, reference_window, smooth_path
 
 RADIUS = 50.0
@@ -140,3 +141,36 @@ def test_the_reference_window_holds_the_next_points_at_the_given_speed(circle):
     expected = np.asarray(POINTS(circle, np.float32(3.0 + 0.8 * np.arange(1, 6))))
     np.testing.assert_allclose(np.asarray(window)[:, :3], expected[:, :3], atol=1e-6)
     np.testing.assert_array_equal(np.asarray(window)[:, 3], np.full(5, 8.0))
+
+
+def test_a_path_through_positions_on_a_circle_has_its_curvature_and_runs_through_them():
+    radius, angle = 40.0, np.linspace(0.0, 1.5, 400)
+    points = np.column_stack([radius * np.sin(angle), radius * (1 - np.cos(angle))])
+    path = scenarios.path_through(jnp.asarray(points, dtype=jnp.float32))
+    inside = np.asarray(path.points)[3:-3]
+    np.testing.assert_allclose(inside[:, 3], 1 / radius, rtol=0.02)
+    np.testing.assert_allclose(np.hypot(inside[:, 0], inside[:, 1] - radius), radius, atol=1e-3)
+    for s in (3.0, 17.3, 41.9):
+        expected = [radius * np.sin(s / radius), radius * (1 - np.cos(s / radius)), s / radius]
+        np.testing.assert_allclose(scenarios.point_at(path, jnp.asarray(s))[:3], expected, atol=5e-3)
+
+
+def test_a_path_keeps_turning_beyond_half_a_turn():
+    angle = np.linspace(0.0, 6.0, 600)
+    points = jnp.asarray(np.column_stack([10 * np.cos(angle), 10 * np.sin(angle)]), dtype=jnp.float32)
+    yaw = np.asarray(scenarios.path_through(points).points)[:, 2]
+    assert np.all(np.abs(np.diff(yaw)) < 0.1)
+    assert abs((yaw[-1] - yaw[0]) - 6.0) < 0.1
+
+
+@pytest.mark.parametrize(
+    ("points", "words"),
+    [
+        ([[0.0, 0.0], [0.0, 0.0], [5.0, 0.0]], "no two in a row"),
+        ([[0.0, 0.0], [jnp.nan, 0.0]], "finite"),
+        ([[0.0, 0.0], [0.3, 0.0]], "too few samples"),
+    ],
+)
+def test_positions_that_make_no_path_are_refused(points, words):
+    with pytest.raises(ValueError, match=words):
+        scenarios.path_through(jnp.asarray(points))

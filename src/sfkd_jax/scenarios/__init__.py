@@ -8,6 +8,7 @@ from sfkd_jax.scenarios._conditions import uniform_road as uniform_road
 from sfkd_jax.scenarios._conditions import wet_road as wet_road
 from sfkd_jax.scenarios._paths import Path as Path
 from sfkd_jax.scenarios._paths import path_from_curvature as path_from_curvature
+from sfkd_jax.scenarios._paths import path_through as path_through
 from sfkd_jax.scenarios._paths import point_at as point_at
 from sfkd_jax.scenarios._paths import project as project
 from sfkd_jax.scenarios._paths import reference_window as reference_window

@@ -63,6 +63,28 @@ def path_from_curvature(curvature: Float[Array, " point"], *, spacing: float) ->
     return Path(jnp.stack([x, y, yaw, curvature], axis=1), jnp.asarray(spacing))
 
 
+def path_through(points: Float[Array, "point 2"], *, spacing: float = 0.5) -> Path:
+    """A path along given positions [m], sampled anew at equal distances; yaw and curvature by central differences.
+
+    Between the positions it runs straight, so they should lie closer than the path bends: a few to every `spacing`
+    on a sharp turn. Its length is a multiple of `spacing`.
+
+    Raises:
+        ValueError: a path too short for its spacing, positions that are not finite, or two in a row that coincide.
+    """
+    steps = jnp.linalg.norm(jnp.diff(points, axis=0), axis=1)
+    if not bool(jnp.all(jnp.isfinite(points)) & jnp.all(steps > 0)):
+        raise ValueError("a path needs finite positions, no two in a row the same")
+    along = jnp.concatenate([jnp.zeros(1), jnp.cumsum(steps)])
+    count = int(along[-1] / spacing) + 1
+    if count < 3:
+        raise ValueError(f"a path of {float(along[-1]):.3g} m has too few samples at a spacing of {spacing} m")
+    s = jnp.arange(count) * spacing
+    x, y = (jnp.interp(s, along, points[:, axis]) for axis in (0, 1))
+    yaw = jnp.unwrap(jnp.arctan2(jnp.gradient(y), jnp.gradient(x)))
+    return Path(jnp.stack([x, y, yaw, jnp.gradient(yaw) / spacing], axis=1), jnp.asarray(spacing))
+
+
 def point_at(path: Path, s: Scalar) -> Float[Array, " 4"]:
     """x, y, yaw, curvature at arc length s [m], along a clothoid from the sample before; s is clamped to the path."""
     last = path.points.shape[0] - 2
