@@ -21,12 +21,29 @@ BLACKOUTS = {"observation": 1, "infinite": 3, "env": 5}
 """Steps of the drive at which something cannot be read; the step after each is clean."""
 
 
-def mppi(law, **settings):
-    """A tiny planner over the textbook bicycle, and its parameters."""
+def along_path(law, **settings):
+    """The task of following a path with the textbook bicycle, and its parameters."""
     model, params = model_and_params("nominal")
     cost = control.tracking_cost(dt=PLANT.dt)
-    task = control.path_tracking(model, cost, law, dt=PLANT.dt, **LIMITS)
+    return control.path_tracking(model, cost, law, dt=PLANT.dt, **LIMITS, **settings), params
+
+
+def mppi(law, **settings):
+    """A tiny planner, and its parameters."""
+    task, params = along_path(law)
     return control.mppi(task, num_samples=16, horizon=HORIZON, **BOX, **settings), params
+
+
+def searched(search, **settings):
+    """The same by another search, and with slew limits."""
+    task, params = along_path(FEEDBACK, control_rate=(0.5, 20.0))
+    return search(task, horizon=HORIZON, **BOX, **settings), params
+
+
+def compensated():
+    """For actuators two steps late."""
+    controller, params = mppi(FEEDBACK)
+    return control.compensated(controller, model_and_params("nominal")[0], delay=2), params
 
 
 def monitored():
@@ -50,11 +67,15 @@ BUILDERS = {
     "mppi": partial(mppi, FEEDBACK),
     "mppi_plain": partial(mppi, control.no_feedback(), noise_std=(0.06, 0.6)),
     "mppi_smoothed": partial(mppi, FEEDBACK, smoothing_window=5),
+    "mppi_knots": partial(mppi, FEEDBACK, noise="rbf", noise_knots=3, effective_samples=4.0, iterations=2),
+    "cem": partial(searched, control.cem, num_samples=16, elites=4, iterations=2),
+    "gradient": partial(searched, control.gradient_planner, iterations=2, steps=4),
+    "compensated": compensated,
     "monitored": monitored,
     "koopman_mpc": koopman_mpc,
 }
 """Name -> () -> (controller, params), for `HORIZON` steps of the kinematic plant within `LIMITS`."""
-SAMPLING = ("mppi", "mppi_plain", "mppi_smoothed", "monitored")
+SAMPLING = ("mppi", "mppi_plain", "mppi_smoothed", "mppi_knots", "cem", "compensated", "monitored")
 """Those whose plan depends on the key."""
 
 every = pytest.mark.parametrize("name", BUILDERS)

@@ -1,0 +1,117 @@
+"""The law that comes out of a model: steady turns that are steady, and gains that solve the Riccati equation."""
+
+from functools import cache
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+import scipy.linalg
+from helpers import jit, model_and_params, straight
+
+from sfkd_jax import control, models, vehicle
+from sfkd_jax.control._model_law import _along_circle, solve
+
+LAW = control.ModelLaw(dt=0.1)
+PLANTS = {"kinematic": vehicle.kinematic(), "dynamic": vehicle.dynamic()}
+ENV = jnp.asarray([0.6, 5.0])
+CURVATURE = jnp.asarray([0.0, 0.01, -0.02])
+
+
+@cache
+def turns(name, bend=1.0):
+    """Steady turns of a plant for three curvatures, and the step in path coordinates that they belong to."""
+    plant = PLANTS[name]
+    model, size = models.physics(plant.step), len(plant.state_names)
+
+    @jit
+    def prepared(env, curvature):
+        fiber = model.fiber({}, env)
+        return LAW.prepare(model, fiber, jnp.zeros(size), straight(3), curvature)
+
+    step = jit(lambda *inputs: _along_circle(model, model.fiber({}, ENV), size, 0.1)(*inputs))
+    return prepared(ENV, bend * CURVATURE), step
+
+
+@pytest.mark.parametrize("name", PLANTS)
+def test_a_steady_turn_stays_what_it_is_on_the_path_at_the_speed_asked_for(name):
+    found, step = turns(name)
+    for k, kappa in enumerate(CURVATURE):
+        after = step(found.state[k], found.control[k], kappa, jnp.asarray(10.0))
+        np.testing.assert_allclose(after, found.state[k], atol=2e-3)
+        np.testing.assert_allclose(np.asarray(found.state[k])[[0, 2]], [0.0, 10.0], atol=1e-6)
+    assert abs(float(found.control[0, 0])) > 1e-3  # side wind: even straight on, it steers against it
+
+
+def test_the_textbook_bicycle_turns_as_its_geometry_says():
+    plant = PLANTS["kinematic"]
+    model = models.physics(plant.nominal)
+    found = LAW.prepare(model, model.fiber({}, ENV), jnp.zeros(4), straight(3), CURVATURE)
+    _, _, speed = found.state[1]
+    np.testing.assert_allclose(speed, 10.0)
+    np.testing.assert_allclose(found.control[:, 1], 0.0, atol=1e-5)
+    np.testing.assert_allclose(np.tan(found.control[:, 0]), plant.wheelbase * CURVATURE, rtol=2e-2, atol=1e-5)
+
+
+@pytest.mark.parametrize("name", PLANTS)
+def test_the_gain_is_that_of_the_riccati_equation_and_stabilises(name):
+    found, step = turns(name)
+    at = (found.state[0], found.control[0], CURVATURE[0], jnp.asarray(10.0))
+    A, B = (np.asarray(part, dtype=float) for part in jax.jacfwd(step, argnums=(0, 1))(*at))
+    Q = np.zeros((len(A), len(A)))
+    Q[:3, :3] = np.diag([LAW.lateral, LAW.heading, LAW.speed])
+    R = np.diag([LAW.steering, LAW.drive])
+    value = scipy.linalg.solve_discrete_are(A, B, Q + 1e-9 * np.eye(len(A)), R)
+    gain = np.linalg.solve(R + B.T @ value @ B, B.T @ value @ A)
+    np.testing.assert_allclose(found.gain[0], gain, rtol=2e-2, atol=2e-3)
+    assert np.max(np.abs(np.linalg.eigvals(A - B @ np.asarray(found.gain[0])))) < 1.0
+
+
+def test_a_turn_that_no_tyre_can_hold_falls_back_to_driving_straight():
+    tight, _ = turns("dynamic", bend=20.0)
+    plain, _ = turns("dynamic")
+    assert np.all(np.isfinite(jnp.concatenate([tight.state, tight.control], axis=1)))
+    np.testing.assert_allclose(tight.control[1], plain.control[0], atol=1e-4)
+    assert np.all(np.isfinite(tight.gain))
+
+
+def test_a_planner_around_it_needs_no_samples_to_stay_near_the_path_in_side_wind():
+    """The plan of zeros, the law alone, against the hand-made law: a steady crosswind on a straight road."""
+    plant, model = PLANTS["kinematic"], models.physics(PLANTS["kinematic"].step)
+    limits = {"control_low": plant.control_low, "control_high": plant.control_high}
+    aside = {}
+    for name, law in (("model", LAW), ("textbook", control.path_feedback(wheelbase=plant.wheelbase))):
+        task = control.path_tracking(model, control.tracking_cost(dt=0.1), law, dt=0.1, **limits)
+        planner = control.mppi(task, num_samples=1, horizon=5, noise_std=(1e-6, 1e-6))
+
+        @jit
+        def drive(key, planner=planner):
+            def step(carry, _):
+                state, memory = carry
+                reference = straight(5).at[:, 0].add(state[0])
+                action, memory, _ = planner.act({}, memory, state, ENV, reference)
+                return (plant.step(state, action, ENV), memory), state[1]
+
+            start = (jnp.asarray([0.0, 0.3, 0.0, 10.0]), planner.init(key))
+            return jax.lax.scan(step, start, None, length=80)[1]
+
+        aside[name] = np.max(np.abs(np.asarray(drive(jax.random.key(0)))[60:]))
+    assert aside["model"] < 0.01
+    assert aside["model"] < 0.2 * aside["textbook"]
+
+
+@pytest.mark.parametrize("name", ["sfkd", "nominal"])
+def test_a_learned_model_has_a_law_too(name):
+    model, params = model_and_params(name)
+    found = LAW.prepare(model, model.fiber(params, ENV), jnp.zeros(4), straight(3), CURVATURE)
+    assert found.gain.shape == (3, 2, 3)
+    assert all(np.all(np.isfinite(part)) for part in found)
+
+
+@pytest.mark.parametrize("size", [1, 3, 7])
+def test_elimination_solves_what_needs_pivots(size):
+    random = np.random.default_rng(size)
+    matrix, right = random.normal(size=(size, size)), random.normal(size=(size, 2))
+    matrix[0, 0] = 0.0 if size > 1 else matrix[0, 0]
+    found = jit(solve)(jnp.asarray(matrix, dtype=jnp.float32), jnp.asarray(right, dtype=jnp.float32))
+    np.testing.assert_allclose(matrix @ np.asarray(found), right, atol=2e-4)
