@@ -1,6 +1,6 @@
 """One control step of every contender, round-robin, each in its own process; prints a table and writes JSON.
 
-python benchmarks/control_step.py [--samples 1500 --horizon 20 --rounds 4 --steps 40 --only sfkd_jax pytorch_mppi --out FILE]
+python benchmarks/control_step.py [--samples 1500 --horizon 20 --rounds 4 --steps 40 --only NAME ... --out FILE]
 Needs torch and pytorch-mppi beside this package for the second; a contender that does not import is named and left out.
 """
 

@@ -1,6 +1,9 @@
 """Small builders that several test files share."""
 
 import inspect
+import json
+import subprocess
+import sys
 from functools import cache, partial
 
 import jax
@@ -208,3 +211,16 @@ def same(left, right, **tolerance):
 def _plain(leaf):
     """Keys as the numbers behind them."""
     return jax.random.key_data(leaf) if jnp.issubdtype(leaf.dtype, jax.dtypes.prng_key) else leaf
+
+
+def door(name, *arguments, cwd, code=0):
+    """Open a door in a process of its own, and expect this exit status."""
+    command = [sys.executable, "-m", f"sfkd_jax.{name}", *arguments]
+    done = subprocess.run(command, cwd=cwd, capture_output=True, text=True, timeout=600)
+    assert done.returncode == code, done.stderr[-2000:]
+    return done
+
+
+def last_line(done):
+    """What a door prints for other programs."""
+    return json.loads(done.stdout.strip().splitlines()[-1])

@@ -9,19 +9,9 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from helpers import door, last_line
 
 from sfkd_jax import artefacts
-
-
-def door(name, *arguments, cwd, code=0):
-    command = [sys.executable, "-m", f"sfkd_jax.{name}", *arguments]
-    done = subprocess.run(command, cwd=cwd, capture_output=True, text=True, timeout=600)
-    assert done.returncode == code, done.stderr[-2000:]
-    return done
-
-
-def last_line(done):
-    return json.loads(done.stdout.strip().splitlines()[-1])
 
 
 @pytest.fixture(scope="session")
@@ -207,55 +197,8 @@ def test_bad_input_is_answered_with_the_choices(walked, arguments, says):
     assert "Traceback" not in done.stderr
 
 
-def test_a_sweep_runs_every_job_and_ends_with_json(tmp_path):
-    done = door("generate", "-m", "+experiment=smoke", "dataset.segments=40", "dataset.seed=0,1", cwd=tmp_path)
-    assert last_line(done)["segments"] == 40
-    assert len(list((tmp_path / "runs/datasets").iterdir())) == 2
-
-
 def test_the_example_in_the_readme_runs(walked):
     readme = (Path(__file__).parents[1] / "README.md").read_text("utf-8")
     program = readme.split("```python\n")[1].split("```")[0].replace("runs/s3/", "runs/smoke/")
     done = subprocess.run([sys.executable, "-c", program], cwd=walked[0], capture_output=True, text=True)
     assert done.returncode == 0, done.stderr
-
-
-def test_a_door_makes_what_is_missing(tmp_path):
-    small = ("+experiment=smoke", "training.steps=25", "training.save_every=25", "dataset.segments=160")
-    assert last_line(door("certify", *small, cwd=tmp_path))["valid"]
-
-
-@pytest.mark.parametrize("vehicle", ["dynamic", "kinematic_speed"])
-def test_the_walk_works_for_other_vehicles(vehicle, tmp_path):
-    small = ("training.steps=25", "training.save_every=25", "dataset.segments=160", "evaluation.episode_s=4.0")
-    walk = last_line(door("train", "+experiment=smoke", f"vehicle={vehicle}", *small, cwd=tmp_path))
-    assert (tmp_path / walk["report"]).exists()
-
-
-COMPARED = ("+experiment=smoke", "comparison=tiny", "evaluation.systems=[self]", "name=table")
-
-
-def test_compare_drives_every_row_and_continues_where_it_was_stopped(tmp_path):
-    first = last_line(door("compare", *COMPARED, cwd=tmp_path))
-    document = json.loads((tmp_path / first["results"]).read_text())
-    rows = {row["system"]: row for row in document["rows"]}
-    assert set(rows) == {"oracle", "sfkd"}
-    assert document["failed"] == {}
-    assert rows["sfkd"]["difference_to_sfkd"] is None
-    assert rows["oracle"]["difference_to_sfkd"]["mean"] < 0
-    assert set(rows["sfkd"]["open_loop_rmse_m"]) == {"1", "5", "10", "20"}
-    assert (tmp_path / first["report"]).exists()
-    kept = tmp_path / "runs/table/cells"
-    before = {file: file.read_bytes() for file in kept.rglob("*.row.json")}
-    (victim,) = (file for file in before if "oracle" in file.name)
-    victim.write_bytes(before[victim][:-9])
-    again = door("compare", *COMPARED, cwd=tmp_path)
-    assert "training" not in again.stderr
-    assert {file: file.read_bytes() for file in kept.rglob("*.row.json")} == before
-
-
-def test_a_row_that_cannot_be_made_is_named_and_the_others_come_out(tmp_path):
-    done = door("compare", *COMPARED, "model.frame=boddy", cwd=tmp_path)
-    assert last_line(done)["rows"] == 1
-    assert last_line(done)["failed"] == 1
-    assert "segment" in done.stderr

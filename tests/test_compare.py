@@ -1,0 +1,33 @@
+"""A table, cell by cell."""
+
+import json
+
+from helpers import door, last_line
+
+COMPARED = ("+experiment=smoke", "comparison=tiny", "evaluation.systems=[self]", "name=table")
+
+
+def test_compare_drives_every_row_and_continues_where_it_was_stopped(tmp_path):
+    first = last_line(door("compare", *COMPARED, cwd=tmp_path))
+    document = json.loads((tmp_path / first["results"]).read_text())
+    rows = {row["system"]: row for row in document["rows"]}
+    assert set(rows) == {"oracle", "sfkd"}
+    assert document["failed"] == {}
+    assert rows["sfkd"]["difference_to_sfkd"] is None
+    assert rows["oracle"]["difference_to_sfkd"]["mean"] < 0
+    assert set(rows["sfkd"]["open_loop_rmse_m"]) == {"1", "5", "10", "20"}
+    assert (tmp_path / first["report"]).exists()
+    kept = tmp_path / "runs/table/cells"
+    before = {file: file.read_bytes() for file in kept.rglob("*.row.json")}
+    (victim,) = (file for file in before if "oracle" in file.name)
+    victim.write_bytes(before[victim][:-9])
+    again = door("compare", *COMPARED, cwd=tmp_path)
+    assert "training" not in again.stderr
+    assert {file: file.read_bytes() for file in kept.rglob("*.row.json")} == before
+
+
+def test_a_row_that_cannot_be_made_is_named_and_the_others_come_out(tmp_path):
+    done = door("compare", *COMPARED, "model.frame=boddy", cwd=tmp_path)
+    assert last_line(done)["rows"] == 1
+    assert last_line(done)["failed"] == 1
+    assert "segment" in done.stderr

@@ -1,0 +1,22 @@
+"""Doors opened from nothing: what is missing is made, for every vehicle and every job of a sweep."""
+
+import pytest
+from helpers import door, last_line
+
+
+def test_a_sweep_runs_every_job_and_ends_with_json(tmp_path):
+    done = door("generate", "-m", "+experiment=smoke", "dataset.segments=40", "dataset.seed=0,1", cwd=tmp_path)
+    assert last_line(done)["segments"] == 40
+    assert len(list((tmp_path / "runs/datasets").iterdir())) == 2
+
+
+def test_a_door_makes_what_is_missing(tmp_path):
+    small = ("+experiment=smoke", "training.steps=25", "training.save_every=25", "dataset.segments=160")
+    assert last_line(door("certify", *small, cwd=tmp_path))["valid"]
+
+
+@pytest.mark.parametrize("vehicle", ["dynamic", "kinematic_speed"])
+def test_the_walk_works_for_other_vehicles(vehicle, tmp_path):
+    small = ("training.steps=25", "training.save_every=25", "dataset.segments=160", "evaluation.episode_s=4.0")
+    walk = last_line(door("train", "+experiment=smoke", f"vehicle={vehicle}", *small, cwd=tmp_path))
+    assert (tmp_path / walk["report"]).exists()
