@@ -81,8 +81,10 @@ def path_through(points: Float[Array, "point 2"], *, spacing: float = 0.5) -> Pa
         raise ValueError(f"a path of {float(along[-1]):.3g} m has too few samples at a spacing of {spacing} m")
     s = jnp.arange(count) * spacing
     x, y = (jnp.interp(s, along, points[:, axis]) for axis in (0, 1))
-    yaw = jnp.unwrap(jnp.arctan2(jnp.gradient(y), jnp.gradient(x)))
-    return Path(jnp.stack([x, y, yaw, jnp.gradient(yaw) / spacing], axis=1), jnp.asarray(spacing))
+    along_x, along_y = jnp.asarray(jnp.gradient(x)), jnp.asarray(jnp.gradient(y))
+    yaw = jnp.unwrap(jnp.arctan2(along_y, along_x))
+    curvature = jnp.asarray(jnp.gradient(yaw)) / spacing
+    return Path(jnp.stack([x, y, yaw, curvature], axis=1), jnp.asarray(spacing))
 
 
 def point_at(path: Path, s: Scalar) -> Float[Array, " 4"]:
