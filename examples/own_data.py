@@ -58,7 +58,7 @@ def main(logs: str | None = None, drives: int = 400, steps: int = 500) -> dict[s
         draw = partial(random_windows, batch=64, length=20)
         held_out = spread_windows(data.validation, length=20)
         params, _ = fit(model, loss, draw, data.train, held_out, jax.random.key(1), Path(scratch) / "run", steps=steps)
-    proof = certification.certify(model, params, attack_starts=0)
+    proof = certification.certify(model, params, (data.env_low, data.env_high), attack_starts=0)
 
     low, high = (tuple(bound.tolist()) for bound in (data.train.controls.min((0, 1)), data.train.controls.max((0, 1))))
     cost, law = control.tracking_cost(dt=DT), control.no_feedback()

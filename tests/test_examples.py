@@ -19,7 +19,7 @@ def example(name, monkeypatch):
 
 
 def test_the_pendulum_ends_upright(monkeypatch):
-    assert example("mppi_own_dynamics", monkeypatch)["main"](samples=256) > 0.95
+    assert example("mppi_own_dynamics", monkeypatch)["main"](samples=128) > 0.95
 
 
 def test_the_pendulum_example_is_short():
@@ -93,6 +93,7 @@ def node(monkeypatch):
     """The example's node, with a tiny policy of random weights behind it."""
     import sfkd_jax
     from sfkd_jax import control, models, vehicle
+    from sfkd_jax.policy import Policy
 
     modules = {
         "rclpy": {}, "rclpy.node": {"Node": StubNode}, "ackermann_msgs": {}, "nav_msgs": {}, "std_msgs": {},
@@ -110,7 +111,7 @@ def node(monkeypatch):
     task = control.path_tracking(model, control.tracking_cost(dt=0.1), law, dt=0.1, **limits)
     controller = control.mppi(task, horizon=6, num_samples=16)
     settings = {"vehicle": {"dt": 0.1}, "controller": {"mppi": {"horizon": 6}}, "space": {"body_mean": [0.0]}}
-    policy = sfkd_jax.policy.Policy(model, {}, controller, None, settings)
+    policy = Policy(model, {}, controller, None, settings)
     monkeypatch.setattr(sfkd_jax, "load", lambda path: policy)
     monkeypatch.setattr(sfkd_jax, "warm_up", lambda policy: jax.jit(policy.controller.act))
     return runpy.run_path(str(EXAMPLES / "ros2" / "controller_node.py"))["ControllerNode"]()
