@@ -159,7 +159,8 @@ def test_a_hypernetwork_is_certified_by_branch_and_bound_and_refused_when_it_is_
     proved = certify(declaring(model, operators=hypernetwork(0.3)), params, BOX, attack_starts=0)
     assert "branch and bound" in proved.scope
     assert 0.3 < proved.rho < 0.9
-    assert proved.alpha_joint <= proved.alpha_separate * 1.02
+    # Cells widen the joint inequality and the sum of norms by different amounts: neither need be the smaller here.
+    assert proved.alpha == min(proved.alpha_joint, proved.alpha_separate)
     verify(proved, params, model=declaring(model, operators=hypernetwork(0.3)))
     with pytest.raises(CertificationRefused, match="is not below 1"):
         certify(declaring(model, operators=hypernetwork(3.0)), params, BOX, attack_starts=0)

@@ -98,7 +98,7 @@ def test_the_cost_is_the_tracking_cost_of_what_is_predicted(speed_loop):
     moved = jnp.asarray([1.0, 0.25, 0.04, 9.6])
     action, after, info = act(moved, state=state, speed_loop=speed_loop)
     linear = model.linear(model.fiber(params, ENV))
-    charge = control.tracking_cost(dt=0.1, speed_loop=speed_loop)
+    tracking = control.tracking_cost(dt=0.1, speed_loop=speed_loop)
     curvature = control.reference_curvature(BEND)
     errors = control.path_errors(moved, BEND[0], curvature[0])
     z = linear.lift(moved.at[:3].set(jnp.stack([0.0, errors.lateral, errors.heading])))
@@ -107,7 +107,7 @@ def test_the_cost_is_the_tracking_cost_of_what_is_predicted(speed_loop):
         z = linear.A @ z + linear.B @ now + linear.d * curvature[k] + linear.c
         x = linear.C @ z + linear.o
         later = control.PathErrors(x[1], x[2], x[3] - BEND[k, 3])
-        cost = charge(Stage(later, errors, now, before, BEND[k, 3]))
+        cost = tracking.stage(tracking.weights, Stage(later, errors, now, before, BEND[k, 3]))
         total, errors, before = total + (1 + (k == HORIZON - 1)) * cost, later, now
     np.testing.assert_allclose(info["cost"], total, rtol=2e-3)
     assert np.isnan(info["effective_samples"])
