@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from typing import Any, NamedTuple
 
 from sfkd_jax.control._path_frame import PathErrors
@@ -52,7 +52,7 @@ def tracking_cost(
     """
     weights = {"lateral": lateral, "course": course, "speed": speed, "steering_rate": steering_rate, "effort": effort}
 
-    def stage(weights: dict[str, Scalar], seen: Stage) -> Scalar:
+    def stage(weights: Mapping[str, Any], seen: Stage) -> Scalar:
         travelled = seen.speed * dt + 1e-3
         angle = (seen.errors.lateral - seen.errors_before.lateral) / travelled
         rate = (seen.control[0] - seen.control_before[0]) / dt
