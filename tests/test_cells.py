@@ -100,14 +100,11 @@ def test_collecting_pools_the_seeds_and_compares_what_is_there(tmp_path, seeds):
 
 def test_rows_are_dealt_to_processes_whole_and_each_to_one():
     """Two controllers of one row share its policy: no two processes may train it."""
-    from sfkd_jax.compare import _mine
-
     groups = cells.drivers(cells.plan(PLAN))
-    parts = [_mine(groups, PLAN | {"drive": True, "share": [k, 3]}) for k in range(3)]
+    parts = [cells.dealt(groups, [k, 3]) for k in range(3)]
     assert sorted(str(group) for part in parts for group in part) == sorted(map(str, groups))
     policies = [row for part in parts for row in {group[0][:3] for group in part}]
     assert len(policies) == len(set(policies))
-    assert _mine(groups, PLAN | {"drive": True, "share": None}) == groups
-    assert _mine(groups, PLAN | {"drive": False, "share": None}) == []
+    assert cells.dealt(groups, None) == groups
     with pytest.raises(ValueError, match=r"comparison\.share"):
-        _mine(groups, PLAN | {"drive": True, "share": [3, 3]})
+        cells.dealt(groups, [3, 3])

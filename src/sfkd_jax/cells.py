@@ -56,6 +56,23 @@ def drivers(wanted: list[Cell]) -> list[list[Cell]]:
     return [list(group) for _, group in itertools.groupby(wanted, key=lambda cell: cell[:4])]
 
 
+def dealt(groups: list[list[Cell]], share: list[int] | None) -> list[list[Cell]]:
+    """Those of every n-th row from the k-th on, share = [k, n]; all for None.
+
+    All controllers and cells of a row lie in one share, for they share its policy.
+
+    Raises:
+        ValueError: a share that there is not.
+    """
+    if share is None:
+        return groups
+    first, count = share
+    if not 0 <= first < count:
+        raise ValueError(f"comparison.share must be [k, n] with 0 <= k < n, got {share}")
+    rows = {row: number for number, row in enumerate(dict.fromkeys(group[0][:3] for group in groups))}
+    return [group for group in groups if rows[group[0][:3]] % count == first]
+
+
 def overrides(cell: Cell, comparison: dict[str, Any]) -> list[str]:
     """What must be composed for a cell, beyond what the command asked for."""
     row, variation = comparison["rows"][cell.label], comparison["variations"][cell.variation]

@@ -17,7 +17,8 @@ def run(settings: dict[str, Any]) -> dict[str, Any]:
     """Whatever is missing is made; then all rows are collected, compared and drawn."""
     began, comparison = time.perf_counter(), settings["comparison"]
     wanted = cells.plan(comparison)
-    groups, driven, failed = _mine(cells.drivers(wanted), comparison), 0, {}
+    groups = cells.dealt(cells.drivers(wanted), comparison["share"]) if comparison["drive"] else []
+    driven, failed = 0, {}
     for number, group in enumerate(groups):
         try:
             driven += _drive(group, comparison)
@@ -38,19 +39,6 @@ def run(settings: dict[str, Any]) -> dict[str, Any]:
     artefacts.write_json(place / "results.json", document | {"seconds": seconds})
     pages = benchmark_report(place)
     return {"results": str(place / "results.json"), "rows": len(rows), "failed": len(failed), **pages}
-
-
-def _mine(groups: list[list[cells.Cell]], comparison: dict[str, Any]) -> list[list[cells.Cell]]:
-    """The drivers of this process: all, none, or those of every n-th row from the k-th on; a row is trained once."""
-    if not comparison["drive"]:
-        return []
-    if comparison["share"] is None:
-        return groups
-    first, count = comparison["share"]
-    if not 0 <= first < count:
-        raise ValueError(f"comparison.share must be [k, n] with 0 <= k < n, got {comparison['share']}")
-    rows = {row: number for number, row in enumerate(dict.fromkeys(group[0][:3] for group in groups))}
-    return [group for group in groups if rows[group[0][:3]] % count == first]
 
 
 def _drive(group: list[cells.Cell], comparison: dict[str, Any]) -> int:

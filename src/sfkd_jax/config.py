@@ -156,9 +156,7 @@ def _controller_schema() -> type:
         "task": schema("TaskConfig", control.path_tracking, skip=placed),
         "cost": schema("CostConfig", control.tracking_cost, skip=fixed),
         "feedback": schema("FeedbackConfig", control.path_feedback, skip=fixed),
-        "model_law": schema(
-            "ModelLawConfig", **{name: value for name, value in control.ModelLaw._field_defaults.items()}
-        ),
+        "model_law": schema("ModelLawConfig", **control.ModelLaw._field_defaults),
     }
     shared = ("lateral", "course", "speed", "steering_rate", "effort", "terminal_weight")
     parts["koopman_mpc"] = schema("KoopmanMpcConfig", control.koopman_mpc, skip=(*fixed, *shared))

@@ -6,9 +6,9 @@ Nothing here is loaded before it is asked for by name, and brax and gymnasium on
 from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
+from sfkd_jax.adapters._task import DrivingTask as DrivingTask
 from sfkd_jax.adapters._task import Moment as Moment
 from sfkd_jax.adapters._task import Outcome as Outcome
-from sfkd_jax.adapters._task import Task as Task
 from sfkd_jax.adapters._task import tracking_task as tracking_task
 
 if TYPE_CHECKING:

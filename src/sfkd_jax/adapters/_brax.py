@@ -9,7 +9,7 @@ import jax.numpy as jnp
 from brax import envs
 from brax.envs.base import Env, State
 
-from sfkd_jax.adapters._task import MEASURES, Task, tracking_task
+from sfkd_jax.adapters._task import MEASURES, DrivingTask, tracking_task
 from sfkd_jax.types import Control, Environment, Reference
 from sfkd_jax.types import State as VehicleState
 
@@ -67,7 +67,7 @@ class BraxVehicle(Env):
         return self._task.action(control)
 
     @property
-    def task(self) -> Task:
+    def task(self) -> DrivingTask:
         """The pure functions behind the environment."""
         return self._task
 

@@ -48,7 +48,7 @@ class Outcome(NamedTuple):
     measures: dict[str, Scalar]
 
 
-class Task(NamedTuple):
+class DrivingTask(NamedTuple):
     """Following a path, for one car; callers vmap.
 
     Attributes:
@@ -83,7 +83,7 @@ def tracking_task(
     speed: float = 1.0,
     steering_rate: float = 5.0,
     leaving: float = 2e4,
-) -> Task:
+) -> DrivingTask:
     """ℓ = q_y e_y² + q_v e_v² + q_δ̇ (Δδ / dt)², and once the cost of leaving.
 
     Road, friction and wind are drawn anew by every `reset`. The observation is, in this order, n = state size:
@@ -155,7 +155,7 @@ def tracking_task(
         return jnp.concatenate([errors, state[BODY], action(moment.control), env, points])
 
     size = 2 + (len(plant.state_names) - 3) + len(plant.control_low) + 2 + 4 * preview
-    return Task(plant, steps, size, len(plant.control_low), reset, step, observe, situation, control, action)
+    return DrivingTask(plant, steps, size, len(plant.control_low), reset, step, observe, situation, control, action)
 
 
 def _now(road: Scenario, moment: Moment) -> Environment:

@@ -10,7 +10,15 @@ from jaxtyping import Array
 
 from sfkd_jax.control._noise import sampler
 from sfkd_jax.control._planner import planner
-from sfkd_jax.control._plans import Evaluate, Found, PlannerState, finite_or_zero
+from sfkd_jax.control._plans import (
+    Evaluate,
+    Found,
+    PlannerState,
+    drawn_around,
+    finite_or_dear,
+    finite_or_zero,
+    weighted,
+)
 from sfkd_jax.control._task import Task
 from sfkd_jax.types import Controller, Key
 
@@ -55,16 +63,12 @@ def cem(
     def search(key: Key, state: PlannerState, evaluate: Evaluate) -> Found:
         def improve(carry: tuple[Array, Array], key: Key) -> tuple[tuple[Array, Array], Found]:
             plan, scale = carry
-            drawn = draw(key, num_samples, state.tuning.noise_std).at[:, 0].set(0.0) * scale[:, None]
-            plans = jnp.concatenate([plan[:, None] + drawn, state.proposals.swapaxes(0, 1)], axis=1)
-            costs, effective = evaluate(plans)
-            ranked = jnp.where(jnp.isfinite(costs), costs, jnp.inf)
-            lowest, chosen = jax.lax.top_k(-ranked, elites)
+            noise = draw(key, num_samples, state.tuning.noise_std) * scale[:, None]
+            costs, effective = evaluate(drawn_around(plan, noise, state))
+            lowest, chosen = jax.lax.top_k(-finite_or_dear(costs), elites)
             counts = jnp.isfinite(lowest).astype(float)
             weights = counts / jnp.maximum(jnp.sum(counts), 1.0)
-            best = finite_or_zero(effective)[:, chosen]
-            mean = jnp.einsum("m,tmc->tc", weights, best)
-            spread = jnp.sqrt(jnp.einsum("m,tmc->tc", weights, (best - mean[:, None]) ** 2))
+            mean, spread = weighted(weights, finite_or_zero(effective)[:, chosen])
             scale = jnp.maximum(spread / state.tuning.noise_std, smallest_scale)
             return (mean, scale), Found(mean, jnp.any(counts > 0), -lowest[0], jnp.sum(counts))
 

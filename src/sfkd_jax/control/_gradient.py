@@ -9,7 +9,7 @@ import jax.numpy as jnp
 from jaxtyping import Array
 
 from sfkd_jax.control._planner import planner
-from sfkd_jax.control._plans import Evaluate, Found, PlannerState, finite_or_zero
+from sfkd_jax.control._plans import Evaluate, Found, PlannerState, finite_or_dear, finite_or_zero
 from sfkd_jax.control._task import Task
 from sfkd_jax.types import Controller, Key, Scalar
 
@@ -54,7 +54,7 @@ def gradient_planner(
 
         def choose(plans: Array) -> tuple[Array, Found]:
             costs, effective = evaluate(plans)
-            ranked = jnp.where(jnp.isfinite(costs), costs, jnp.inf)
+            ranked = finite_or_dear(costs)
             best = jnp.argmin(ranked)
             plan = finite_or_zero(effective[:, best])
             return plan, Found(plan, jnp.isfinite(ranked[best]), ranked[best], jnp.ones(()))

@@ -10,7 +10,17 @@ from jaxtyping import Array, Float
 
 from sfkd_jax.control._noise import sampler
 from sfkd_jax.control._planner import planner
-from sfkd_jax.control._plans import Evaluate, Found, PlannerState, Plans, finite_or_zero
+from sfkd_jax.control._plans import (
+    Evaluate,
+    Found,
+    Plan,
+    PlannerState,
+    Plans,
+    drawn_around,
+    finite_or_dear,
+    finite_or_zero,
+    weighted,
+)
 from sfkd_jax.control._task import Task
 from sfkd_jax.control._weights import count_effective, softmin, temperature_for
 from sfkd_jax.types import Controller, Key
@@ -64,9 +74,9 @@ def mppi(
     def search(key: Key, state: PlannerState, evaluate: Evaluate) -> Found:
         std = state.tuning.noise_std
 
-        def improve(plan: Array, scale: Array, key: Key) -> tuple[Array, Array, Found]:
-            drawn = draw(key, num_samples, std).at[:, 0].set(0.0) * scale[:, None]
-            plans = jnp.concatenate([plan[:, None] + drawn, state.proposals.swapaxes(0, 1)], axis=1)
+        def improve(carry: tuple[Plan, Plan], key: Key) -> tuple[tuple[Plan, Plan], Found]:
+            plan, scale = carry
+            plans = drawn_around(plan, draw(key, num_samples, std) * scale[:, None], state)
             costs, effective = evaluate(plans)
             charged = costs
             if control_cost:
@@ -74,23 +84,16 @@ def mppi(
             wanted = state.tuning.effective_samples
             temperature = temperature_for(charged, wanted) if effective_samples else state.tuning.temperature
             weights, usable = softmin(charged, temperature)
-            effective = finite_or_zero(effective)
-            better = jnp.einsum("m,tmc->tc", weights, effective)
+            better, spread = weighted(weights, finite_or_zero(effective))
             if adapt:
-                spread = jnp.sqrt(jnp.einsum("m,tmc->tc", weights, (effective - better[:, None]) ** 2)) / std
-                scale = jnp.maximum((1 - adapt) * scale + adapt * spread, SMALLEST_SCALE)
-            best = jnp.min(jnp.where(jnp.isfinite(costs), costs, jnp.inf))
-            return better, scale, Found(better, usable, best, count_effective(weights))
+                scale = jnp.maximum((1 - adapt) * scale + adapt * spread / std, SMALLEST_SCALE)
+            best = jnp.min(finite_or_dear(costs))
+            return (better, scale), Found(better, usable, best, count_effective(weights))
 
-        plan, scale = state.plan, jnp.ones_like(state.plan)
+        start = (state.plan, jnp.ones_like(state.plan))
         if iterations == 1:
-            return improve(plan, scale, key)[2]
-
-        def again(carry: tuple[Array, Array], key: Key) -> tuple[tuple[Array, Array], Found]:
-            plan, scale, found = improve(*carry, key)
-            return (plan, scale), found
-
-        _, founds = jax.lax.scan(again, (plan, scale), jax.random.split(key, iterations))
+            return improve(start, key)[1]
+        _, founds = jax.lax.scan(improve, start, jax.random.split(key, iterations))
         return jax.tree.map(lambda leaf: leaf[-1], founds)
 
     return planner(task, search, horizon=horizon, effective_samples=effective_samples, **options)

@@ -71,6 +71,22 @@ Evaluate: TypeAlias = Callable[[Plans], tuple[Float[Array, " sample"], Plans]]
 Search: TypeAlias = Callable[[Key, PlannerState, Evaluate], Found]
 
 
+def drawn_around(plan: Plan, noise: Plans, state: PlannerState) -> Float[Array, "horizon candidate control"]:
+    """Candidates: the plan itself, the plan perturbed, and the proposals of the user."""
+    return jnp.concatenate([plan[:, None] + noise.at[:, 0].set(0.0), state.proposals.swapaxes(0, 1)], axis=1)
+
+
+def weighted(weights: Float[Array, " sample"], plans: Plans) -> tuple[Plan, Plan]:
+    """Mean and standard deviation of plans, step by step and control by control."""
+    mean = jnp.einsum("m,tmc->tc", weights, plans)
+    return mean, jnp.sqrt(jnp.einsum("m,tmc->tc", weights, (plans - mean[:, None]) ** 2))
+
+
+def finite_or_dear(costs: Float[Array, " sample"]) -> Float[Array, " sample"]:
+    """Infinity in place of what is not finite: a bad rollout is never the cheapest."""
+    return jnp.where(jnp.isfinite(costs), costs, jnp.inf)
+
+
 def shift(plan: Plan, elapsed: Scalar) -> Plan:
     """The plan as it stands `elapsed` sampling periods later: linear between its steps, its last step held."""
     last = plan.shape[0] - 1
