@@ -21,3 +21,8 @@ import pytest  # noqa: E402
 def key() -> jax.Array:
     """One key a test: `jax.random.split` it, never use it twice."""
     return jax.random.key(0)
+
+
+def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+    """The doors first: some of their files take minutes, and a file that starts last decides when the run ends."""
+    items.sort(key=lambda item: len(item.path.parts))

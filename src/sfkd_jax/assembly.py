@@ -101,6 +101,7 @@ def _sampled(
         dt=plant.dt,
         control_low=plant.control_low,
         control_high=plant.control_high,
+        ancillary=_model_law(settings, plant) if settings["ancillary"] else None,
         **without(settings["task"]),
     )
     boxes = {"env_low": _floats(env_low), "env_high": _floats(env_high)}

@@ -153,7 +153,7 @@ def _controller_schema() -> type:
         "mppi": schema("MppiConfig", control.mppi, control.planner, skip=placed),
         "cem": schema("CemConfig", control.cem, control.planner, skip=(*placed, *weighted)),
         "gradient": schema("GradientConfig", control.gradient_planner, control.planner, skip=(*placed, *weighted)),
-        "task": schema("TaskConfig", control.path_tracking, skip=placed),
+        "task": schema("TaskConfig", control.path_tracking, skip=(*placed, "ancillary")),
         "cost": schema("CostConfig", control.tracking_cost, skip=fixed),
         "feedback": schema("FeedbackConfig", control.path_feedback, skip=fixed),
         "model_law": schema("ModelLawConfig", **control.ModelLaw._field_defaults),
@@ -163,7 +163,7 @@ def _controller_schema() -> type:
     watched = ("bounds", "state_low", "state_high", *fixed)
     parts["monitor"] = schema("MonitorConfig", control.monitored, skip=watched)
     fields = [(name, part, field(default_factory=part)) for name, part in parts.items()]
-    head = [("name", str), ("planner", str), ("sampling", typing.Any)]
+    head = [("name", str), ("planner", str), ("sampling", typing.Any), ("ancillary", bool, field(default=False))]
     return make_dataclass("ControllerConfig", [*head, *fields])
 
 

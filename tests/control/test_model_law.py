@@ -115,3 +115,35 @@ def test_elimination_solves_what_needs_pivots(size):
     matrix[0, 0] = 0.0 if size > 1 else matrix[0, 0]
     found = jit(solve)(jnp.asarray(matrix, dtype=jnp.float32), jnp.asarray(right, dtype=jnp.float32))
     np.testing.assert_allclose(matrix @ np.asarray(found), right, atol=2e-4)
+
+
+def test_as_an_ancillary_it_is_one_more_sample_of_a_planner_around_another_law():
+    """The cheapest of two plans: the hand-made law's, which is the plan of zeros, and the model's own."""
+    plant, model = PLANTS["kinematic"], models.physics(PLANTS["kinematic"].step)
+    limits = {"control_low": plant.control_low, "control_high": plant.control_high}
+    textbook, state = control.path_feedback(wheelbase=plant.wheelbase), jnp.asarray([0.0, 0.3, 0.05, 10.0])
+
+    def cheapest(law, ancillary=None):
+        task = control.path_tracking(model, control.tracking_cost(dt=0.1), law, dt=0.1, ancillary=ancillary, **limits)
+        planner = control.mppi(task, num_samples=1, temperature=1e-3, horizon=8, noise_std=(1e-6, 1e-6))
+        start = planner.init(jax.random.key(0))._replace(previous=jnp.zeros(2), started=jnp.asarray(True))
+        action, after, info = jit(planner.act)({}, start, state, ENV, straight(8))
+        assert jax.tree.map(jnp.shape, after) == jax.tree.map(jnp.shape, start)
+        return float(info["cost"]), np.asarray(action)
+
+    (ours, steered), (theirs, _), (both, chosen) = cheapest(LAW), cheapest(textbook), cheapest(textbook, LAW)
+    assert ours < theirs
+    assert both == pytest.approx(ours, rel=1e-4)
+    np.testing.assert_allclose(chosen, steered, atol=1e-3)
+
+
+def test_over_several_environments_the_ancillary_plan_is_that_of_the_first():
+    plant, model = PLANTS["kinematic"], models.physics(PLANTS["kinematic"].step)
+    limits = {"control_low": plant.control_low, "control_high": plant.control_high}
+    law, state = control.path_feedback(wheelbase=plant.wheelbase), jnp.asarray([0.0, 0.3, 0.05, 10.0])
+    task = control.path_tracking(model, control.tracking_cost(dt=0.1), law, dt=0.1, ancillary=LAW, **limits)
+    planner = control.mppi(task, num_samples=1, temperature=1e-3, horizon=8, noise_std=(1e-6, 1e-6))
+    start, act = planner.init(jax.random.key(0)), jit(planner.act)
+    alone, _, _ = act({}, start, state, ENV, straight(8))
+    twice, _, _ = act({}, start, state, jnp.stack([ENV, ENV]), straight(8))
+    np.testing.assert_allclose(twice, alone, atol=1e-4)

@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import Any
 
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
+from sfkd_jax.control._curvature import curvature_factor, shaped
 from sfkd_jax.control._noise import sampler
 from sfkd_jax.control._planner import planner
 from sfkd_jax.control._plans import (
@@ -41,6 +43,7 @@ def mppi(
     noise_exponent: float = 2.0,
     noise_knots: int = 5,
     halton: bool = False,
+    curvature: bool = False,
     adapt: float = 0.0,
     control_cost: float = 0.0,
     **options: Any,
@@ -57,6 +60,8 @@ def mppi(
         effective_samples: choose λ anew each time so that 1 / Σ w² is this; 0 keeps λ at `temperature`. The number
             and λ itself are data of the state, see `Tuning`.
         noise, noise_correlation, noise_exponent, noise_knots, halton: see `sampler`.
+        curvature: shape the noise by the second derivative of the plan's own cost, see `curvature_factor`; the task
+            must be differentiable, and white noise is the natural choice then.
         adapt: share in [0, 1] by which the noise's spread, per step and control, moves to that of the weighted
             samples after each iteration; it starts anew at every control step.
         control_cost: γ, in units of cost; Williams et al. have λ (1 − α).
@@ -68,15 +73,26 @@ def mppi(
     Source: Williams et al. (2018), Information-Theoretic Model Predictive Control, T-RO 34(6).
     """
     _check(num_samples, iterations, effective_samples, adapt)
+    if curvature and control_cost:
+        raise ValueError("curvature and control_cost exclude each other: the latter wants independent noise")
     shape = {"correlation": noise_correlation, "exponent": noise_exponent, "knots": noise_knots, "halton": halton}
     draw = sampler(noise, horizon=horizon, **shape)
 
+    def around(state: PlannerState, evaluate: Evaluate) -> Callable[[Key], Plans]:
+        """The noise of this control step."""
+        std = state.tuning.noise_std
+        if not curvature:
+            return lambda key: draw(key, num_samples, std)
+        factor = curvature_factor(lambda plan: evaluate(plan[:, None])[0][0], state.plan, std)
+        return lambda key: shaped(factor, draw(key, num_samples, jnp.ones_like(std)))
+
     def search(key: Key, state: PlannerState, evaluate: Evaluate) -> Found:
         std = state.tuning.noise_std
+        noise_of = around(state, evaluate)
 
         def improve(carry: tuple[Plan, Plan], key: Key) -> tuple[tuple[Plan, Plan], Found]:
             plan, scale = carry
-            plans = drawn_around(plan, draw(key, num_samples, std) * scale[:, None], state)
+            plans = drawn_around(plan, noise_of(key) * scale[:, None], state)
             costs, effective = evaluate(plans)
             charged = costs
             if control_cost:

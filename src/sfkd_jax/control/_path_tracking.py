@@ -35,6 +35,7 @@ def path_tracking(
     terminal_weight: float = 1.0,
     latent_weight: float = 0.0,
     actuator: Actuator | None = None,
+    ancillary: ModelLaw | None = None,
 ) -> Task:
     """Follow a path with a learned model, around a feedback law on the *predicted* state.
 
@@ -46,6 +47,7 @@ def path_tracking(
         dt: [s]. control_low, control_high: actuator limits, in control units. control_rate: per second, or None.
         terminal_weight: w_T, on top of the last step's ℓ. latent_weight: λ_z.
         actuator: where the actuators stand, from the observation; else rates count from the control applied last.
+        ancillary: a second law; what it would do along the whole horizon is one more sample.
 
     Raises:
         ValueError: limits that cannot be meant.
@@ -74,7 +76,25 @@ def path_tracking(
         if actuator is not None:
             before = actuator(observation)
         start = PathSample(model.encode(fiber, observation), errors, before)
-        return Began(fiber, start, targets)
+        proposals = None
+        if ancillary is not None:
+            turns = ancillary.prepare(model, fiber, observation, reference, curvature)
+            proposals = followed(ancillary, turns, fiber, start, targets)
+        return Began(fiber, start, targets, proposals)
+
+    def followed(other: ModelLaw, turns: Any, fiber: Any, start: PathSample, targets: Any) -> Array:
+        """What another law does along the horizon, as a perturbation of the law: (1, horizon, control)."""
+
+        def step(before: PathSample, inputs: Any) -> tuple[PathSample, Control]:
+            target, turn = inputs
+            point, curvature, _, _ = target
+            state = model.decode(fiber, before.latent)
+            control = limit(other.control(turn, state, point, curvature), before.control)
+            latent = model.step(fiber, before.latent, control)
+            errors = path_errors(model.decode(fiber, latent), point, curvature)
+            return PathSample(latent, errors, control), control - asked(state, target)
+
+        return jax.lax.scan(step, start, (targets, turns))[1][None]
 
     def advance(weights: Any, fiber: Any, before: PathSample, nu: Control, target: Any, last: Scalar) -> Advanced:
         point, curvature, goal, _ = target

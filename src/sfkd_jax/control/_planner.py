@@ -120,7 +120,11 @@ def planner(
             costs, (_, effective, _) = by_chunks(lambda part: rolled(state.tuning.cost, began, part), plans, chunk)
             return (measure(costs), jnp.mean(effective, axis=0)) if several else (costs, effective)
 
-        found = search(search_key, state, evaluate)
+        searched = state
+        if began.proposals is not None:
+            suggested = began.proposals[0] if several else began.proposals
+            searched = state._replace(proposals=jnp.concatenate([state.proposals, suggested]))
+        found = search(search_key, searched, evaluate)
         plan = smooth(state.past, found.plan)
         best, tracks = rolled(state.tuning.cost, began, plan[:, None])
         mean_cost = measure(best)[0] if several else best[0]

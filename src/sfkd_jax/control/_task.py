@@ -30,11 +30,13 @@ class Began(NamedTuple):
     Attributes:
         context: shared by all samples and steps. start: a sample before its first step.
         targets: what differs from step to step; every leaf has the horizon as leading axis.
+        proposals: plans that the task itself suggests, sampled beside the planner's, if it has any.
     """
 
     context: Any
     start: Any
     targets: Any
+    proposals: Float[Array, "*particle proposal horizon control"] | None = None
 
 
 class Advanced(NamedTuple):
