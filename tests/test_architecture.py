@@ -191,7 +191,7 @@ def test_a_foreign_package_is_loaded_when_its_adapter_is_asked_for(module):
 
 @pytest.mark.parametrize(
     ("name", "package", "extra"),
-    [("BraxVehicle", "brax", "brax"), ("brax_step", "brax", "brax"), ("GymnasiumVehicle", "gymnasium", "gym")],
+    [("BraxVehicle", "brax", "brax"), ("brax_plant", "brax", "brax"), ("GymnasiumVehicle", "gymnasium", "gym")],
 )
 def test_an_adapter_without_its_package_names_the_extra(name, package, extra):
     code = f"""

@@ -30,7 +30,8 @@ def spoiled(walked, tmp_path):
 def test_train_walks_from_nothing_to_a_report(walked):
     place, document = walked
     keys = {"run", "checkpoint", "certificate", "results", "report", "open_loop_rmse_m", "alpha", "seconds"}
-    assert set(document) == keys
+    assert set(document) == keys | {"objective"}
+    assert 0 < document["objective"] < np.inf
     for name in ("run", "checkpoint", "certificate", "results", "report"):
         assert (place / document[name]).exists()
     assert len(document["open_loop_rmse_m"]) == 20

@@ -5,6 +5,7 @@ from __future__ import annotations
 import dataclasses
 import inspect
 import json
+import math
 import sys
 import types
 import typing
@@ -16,6 +17,7 @@ from typing import Any
 import hydra
 from hydra.core.config_store import ConfigStore
 from hydra.core.hydra_config import HydraConfig
+from hydra.types import RunMode
 from omegaconf import DictConfig, OmegaConf
 
 from sfkd_jax import assembly, control, datasets, evaluation, exporting, models, scenarios, training
@@ -170,29 +172,39 @@ def _controller_schema() -> type:
 def door(run: Callable[[dict[str, Any]], dict[str, Any]]) -> Callable[[], None]:
     """Make `run(settings) -> document` a command: compose, work, print one JSON object as the last line of stdout.
 
-    What can be expected to go wrong becomes one line on stderr and an exit code: 1 failed, 2 refused, 3 stale.
+    What can be expected to go wrong becomes one line on stderr and an exit code: 1 failed, 2 refused, 3 stale. A job
+    of a sweep returns the document's "objective" to the sweeper, and infinity where it failed: the others go on.
     """
     register()
 
-    def main(config: DictConfig) -> None:
+    def main(config: DictConfig) -> float | None:
         settings = OmegaConf.to_container(config, resolve=True)
+        sweeping = HydraConfig.get().mode == RunMode.MULTIRUN
+        fail = _report if sweeping else _fail
         try:
             document = run(typing.cast(dict[str, Any], settings))
         except KeyboardInterrupt:
             _fail("interrupted; the same command continues", 130)
         except CertificationRefused as reason:
-            _fail(f"refused: {reason}", REFUSED)
+            return fail(f"refused: {reason}", REFUSED)
         except CertificateStale as reason:
-            _fail(f"stale: {reason}", STALE)
+            return fail(f"stale: {reason}", STALE)
         except (ArtefactError, ValueError, training.TrainingStopped, OSError) as reason:
-            _fail(str(reason).splitlines()[0] if str(reason) else type(reason).__name__, 1)
-        else:
-            print(json.dumps(document), flush=True)
+            return fail(str(reason).splitlines()[0] if str(reason) else type(reason).__name__, 1)
+        print(json.dumps(document), flush=True)
+        return document.get("objective") if sweeping else None
 
     return hydra.main(config_path=conf_path(), config_name="config", version_base="1.3")(main)
 
 
+def _report(reason: str, code: int) -> float:
+    """One line on stderr, and the objective of a job that failed."""
+    del code
+    print(f"sfkd_jax: {reason}", file=sys.stderr, flush=True)
+    return math.inf
+
+
 def _fail(reason: str, code: int) -> typing.NoReturn:
     """One line on stderr, then the exit code."""
-    print(f"sfkd_jax: {reason}", file=sys.stderr, flush=True)
+    _report(reason, code)
     sys.exit(code)

@@ -19,6 +19,8 @@ DATASET = "dataset"
 PARTS = ("train", "validation", "calibration", "test")
 IDENTITY = ("vehicle", "dataset", "model", "training", "seed")
 """Settings that decide the weights; a run made with others is another run."""
+UNREADABLE = frozenset("[]")
+"""Characters that the checkpoint library takes for a pattern when it reads, though not when it writes."""
 
 
 def run_directory(settings: dict[str, Any]) -> Path:
@@ -64,9 +66,12 @@ def claim(settings: dict[str, Any]) -> None:
     """Mark the run directory as made with these settings, or refuse if it was begun with others.
 
     Raises:
-        ArtefactError: naming what differs.
+        ArtefactError: naming what differs. ValueError: a path from which orbax cannot read.
     """
     path = run_directory(settings) / "settings.json"
+    unreadable = UNREADABLE & set(str(path.resolve()))
+    if unreadable:
+        raise ValueError(f"checkpoints cannot be read back from a path with {' '.join(sorted(unreadable))}: {path}")
     if path.exists():
         found = artefacts.differences(artefacts.read_json(path), identity(settings))
         if found:

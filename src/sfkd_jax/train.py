@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import time
+from pathlib import Path
 from typing import Any
 
 from sfkd_jax import artefacts, certify, evaluate, report, shelf, walk
@@ -25,8 +26,15 @@ def run(settings: dict[str, Any]) -> dict[str, Any]:
         "report": pages["report"],
         "open_loop_rmse_m": artefacts.read_json(place / "open_loop.json")["position_rmse_m"],
         "alpha": certificate.get("alpha"),
+        "objective": _objective(place),
         "seconds": time.perf_counter() - began,
     }
+
+
+def _objective(place: Path) -> float | None:
+    """What a sweep minimises: the least validation loss; None for a model that is identified at once."""
+    lines = artefacts.read_jsonl(place / "metrics.jsonl") if (place / "metrics.jsonl").exists() else []
+    return min((line["validation_loss"] for line in lines if "validation_loss" in line), default=None)
 
 
 if __name__ == "__main__":
