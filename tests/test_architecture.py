@@ -14,7 +14,7 @@ FUNCTION = (ast.FunctionDef, ast.AsyncFunctionDef)
 SRC = Path(__file__).parents[1] / "src" / "sfkd_jax"
 PACKAGE = SRC.name
 HALLWAY = {"types", "se2", "rollouts"}
-DOORS = {"generate", "train", "certify", "evaluate", "compare", "report", "export", "doctor"}
+DOORS = {"generate", "train", "certify", "evaluate", "compare", "report", "export", "doctor", "demo"}
 ARROWS = {
     "types": HALLWAY,
     "se2": HALLWAY,

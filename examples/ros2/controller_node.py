@@ -31,7 +31,8 @@ class ControllerNode(Node):
         defaults = {"policy": "runs/s3/sfkd/seed=0", "speed": 10.0, "timeout": 0.3, "patience": 5, "seed": 0}
         for name, value in defaults.items():
             self.declare_parameter(name, value)
-        self.policy = sfkd_jax.load(self.setting("policy"))
+        policy = sfkd_jax.load(self.setting("policy"))
+        self.policy = policy._replace(params=jax.jit(policy.model.fold)(policy.params))  # once, not at every step
         self.dt = self.policy.settings["vehicle"]["dt"]
         self.horizon = self.policy.settings["controller"]["mppi"]["horizon"]
         self.act = sfkd_jax.warm_up(self.policy)

@@ -59,13 +59,14 @@ def lay(settings: dict[str, Any], plant: Vehicle) -> Track:
 
 
 def prepare(
-    settings: dict[str, Any], plant: Vehicle, name: str, system: assembly.System, dataset: Dataset
+    settings: dict[str, Any], plant: Vehicle, name: str, system: assembly.System, dataset: Dataset | None
 ) -> TestDriver:
     """Compile a system for driving; the same driver serves every track of one length, with one compilation.
 
     Args:
         settings: of the run. plant: the truth. name: of the system. system: who drives.
-        dataset: whose calibration drives give the conformal tube, and whose test drives the open-loop error.
+        dataset: whose calibration drives give the conformal tube, and whose test drives the open-loop error; without
+            it there is neither.
     """
     protocol, box = settings["evaluation"], settings["dataset"]
     limits = {"env_low": box["env_low"], "env_high": box["env_high"], "certificate": system.certificate}
@@ -73,8 +74,10 @@ def prepare(
     options = {"horizon": assembly.controller_horizon(settings["controller"]), "dt": plant.dt}
     options["observation_noise"] = tuple(protocol["observation_noise"])
 
+    params = jax.jit(system.model.fold)(system.params)
+
     def one(road: Scenario, key: Any, met: Any) -> evaluation.Episode:
-        return evaluation.simulate(plant.step, controller, system.params, road, key, met=met, **options)
+        return evaluation.simulate(plant.step, controller, params, road, key, met=met, **options)
 
     compiled = jax.jit(jax.vmap(one))
     assess = _assessor(settings, system, dataset, plant.dt)
@@ -84,7 +87,7 @@ def prepare(
     def drive(track: Track) -> Drive:
         episodes, scores, violation = pushed(track, 0.0)
         if not timing:
-            timing.append(_act_ms(controller, system.params, track, options, protocol["timed_steps"]))
+            timing.append(_act_ms(controller, params, track, options, protocol["timed_steps"]))
         where = about | {"scenario": track.scenario, "variation": track.variation}
         row = evaluation.row(scores, where, timing[0], violation, watched=system.certificate is not None)
         if protocol["side_forces"]:
@@ -104,9 +107,11 @@ def prepare(
     return drive
 
 
-def _assessor(settings: dict[str, Any], system: assembly.System, dataset: Dataset, dt: float) -> Callable[..., Any]:
+def _assessor(
+    settings: dict[str, Any], system: assembly.System, dataset: Dataset | None, dt: float
+) -> Callable[..., Any]:
     """episodes, track -> how they were driven, and how often predictions along them left what is claimed."""
-    length, horizon = dataset.calibration.controls.shape[1], settings["certification"]["horizon"]
+    length, horizon = settings["dataset"]["steps"], settings["certification"]["horizon"]
     predict = jax.jit(partial(evaluation.predictions, system.model, length=length, horizon=horizon))
     claims = _claims(settings, system, dataset)
 
@@ -120,16 +125,17 @@ def _assessor(settings: dict[str, Any], system: assembly.System, dataset: Datase
     return assess
 
 
-def _claims(settings: dict[str, Any], system: assembly.System, dataset: Dataset) -> evaluation.Claims:
+def _claims(settings: dict[str, Any], system: assembly.System, dataset: Dataset | None) -> evaluation.Claims:
     """What is claimed about a system's predictions: by its certificate if it has one, and by calibration drives."""
     level, horizon = (settings["certification"][name] for name in ("level", "horizon"))
     claims = evaluation.Claims(level=level, threshold=settings["evaluation"]["threshold_m"])
-    try:
-        parts = {"validation": dataset.validation, "calibration": dataset.calibration}
-        options = {"level": level, "horizon": horizon, "stride": evaluation.STRIDE}
-        claims = claims._replace(conformal=conformal_tube(system.model, system.params, **parts, **options))
-    except ValueError as reason:
-        shelf.say(f"  no conformal tube: {reason}")
+    if dataset is not None:
+        try:
+            parts = {"validation": dataset.validation, "calibration": dataset.calibration}
+            options = {"level": level, "horizon": horizon, "stride": evaluation.STRIDE}
+            claims = claims._replace(conformal=conformal_tube(system.model, system.params, **parts, **options))
+        except ValueError as reason:
+            shelf.say(f"  no conformal tube: {reason}")
     proof = system.certificate
     if proof is None:
         return claims
@@ -141,8 +147,10 @@ def _claims(settings: dict[str, Any], system: assembly.System, dataset: Dataset)
     return claims._replace(certified=proof["tube"]["physical"], latent=latent, d_bar=d_bar)
 
 
-def _open_loop(settings: dict[str, Any], system: assembly.System, dataset: Dataset) -> dict[str, float]:
+def _open_loop(settings: dict[str, Any], system: assembly.System, dataset: Dataset | None) -> dict[str, float] | None:
     """Position RMSE of free-running predictions on the test split, by steps ahead [m]."""
+    if dataset is None:
+        return None
     horizon = settings["certification"]["horizon"]
     errors = jax.jit(partial(evaluation.open_loop, system.model, horizon=horizon))(system.params, dataset.test)
     distance = np.hypot(*np.asarray(errors, dtype=np.float64).T[:2])

@@ -173,6 +173,8 @@ class Model(NamedTuple):
         penalty: (fiber, latent, control) -> an extra term of the training loss, or None.
         identify: (training, validation trajectories, key) -> params, by regression at once, or None.
         linear: fiber -> `LinearPredictor`, or None for a model that is not linear in a lift.
+        fold: params -> params that `fiber` takes as well, with all that depends on no environment evaluated. To drive
+            with: what it saves is what a control step would do anew each time.
     """
 
     init: Callable[[Key], Params]
@@ -187,6 +189,7 @@ class Model(NamedTuple):
     penalty: Callable[[Fiber, Latent, Control], Scalar] | None = None
     identify: Callable[[Trajectory, Trajectory, Key], Params] | None = None
     linear: Callable[[Fiber], LinearPredictor] | None = None
+    fold: Callable[[Params], Params] = lambda params: params
 
 
 class Controller(NamedTuple):

@@ -218,3 +218,23 @@ def test_only_the_soft_variant_has_a_penalty_and_it_is_the_hinge_on_the_jacobian
     excess = np.linalg.norm(np.asarray(slope, np.float64), 2) - 0.1
     assert excess > 0
     np.testing.assert_allclose(penalty, excess**2, rtol=1e-3)
+
+
+@pytest.mark.parametrize("name", EVERY)
+def test_folded_parameters_are_the_same_model_and_the_same_claim(name, one):
+    model, params = model_and_params(name)
+    folded = jit(model.fold)(params)
+    there = jit(model.fiber)(folded, one.envs[0])
+    assert same(there, jit(model.fiber)(params, one.envs[0]), rtol=1e-6, atol=1e-6)
+    if model.explicit is not None:
+        assert same(jit(model.explicit)(folded), jit(model.explicit)(params), rtol=1e-6, atol=1e-6)
+
+
+@pytest.mark.parametrize("name", ["sfkd", "r2dn"])
+def test_nothing_is_factorised_in_a_control_step_with_folded_parameters(name, one):
+    """A linear algebra library's own threads wait in circles on a busy host: one inverse may cost a sampling period."""
+    model, params = model_and_params(name)
+    program = [jax.jit(model.fiber).lower(given, one.envs[0]).as_text() for given in (params, jit(model.fold)(params))]
+    raw, folded = ("lapack" in text or "linalg" in text or "triangular_solve" in text for text in program)
+    assert raw
+    assert not folded

@@ -94,8 +94,11 @@ def r2dn(
     def explicit_weights(params: Params) -> Shared:
         return cast(Shared, weights.apply({"params": params["weights"]}))
 
+    def fold(params: Params) -> Params:
+        return params | {"shared": explicit_weights(params)}
+
     def fiber(params: Params, env: Environment) -> R2dnFiber:
-        shared = explicit_weights(params)
+        shared = params["shared"] if "shared" in params else explicit_weights(params)
         scaled = scaled_env(space, env, environment)
         return R2dnFiber(
             A=shared.A,
@@ -148,6 +151,7 @@ def r2dn(
         observe=lambda fiber, latent, state: encode(fiber, state),
         vector=lambda latent: latent.z,
         explicit=explicit,
+        fold=fold,
     )
 
 

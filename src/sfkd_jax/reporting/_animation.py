@@ -1,4 +1,4 @@
-"""A film of S3: cars from above, deviations widened, over a strip of the deviation and the weather they meet."""
+"""A film of a drive: cars from above, deviations widened, over a strip of the deviation and the weather they meet."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from matplotlib.figure import Figure
 from matplotlib.patches import Polygon
 
 from sfkd_jax.reporting._benchmark_figures import FIGURED, conditions, look, shade
-from sfkd_jax.reporting._benchmark_rows import SELF_EVIDENT, Contest
+from sfkd_jax.reporting._benchmark_rows import SELF_EVIDENT, Contest, Row, contests, stem
 from sfkd_jax.reporting._drives import Drive, drives
 from sfkd_jax.reporting._scene import switches
 from sfkd_jax.reporting._style import PLATE, literal
@@ -49,18 +49,27 @@ class _Cast(NamedTuple):
     offset: list[np.ndarray]
 
 
-def film(directory: Path, contest: Contest, path: Path, seconds: float = SECONDS) -> tuple[Path, list[str]] | None:
+def animate(directory: Path, rows: list[Row], scenario: str) -> Path | None:
+    """Write `scenario`_`vehicle`.gif of rows whose arrays lie in a directory; None where no states and path do."""
+    contest = contests(rows)[0]
+    made = film(directory, contest, directory / f"{scenario}_{stem(contest)}.gif", scenario=scenario)
+    return made and made[0]
+
+
+def film(
+    directory: Path, contest: Contest, path: Path, *, seconds: float = SECONDS, scenario: str = FIGURED
+) -> tuple[Path, list[str]] | None:
     """Write a GIF of at most MOST_BYTES in real time, dropping frames until it fits.
 
     Returns:
         The file and the names of the cars; None where nobody's states and path are there.
     """
-    cast = _cast(drives(directory, contest, FIGURED)[0])
+    cast = _cast(drives(directory, contest, scenario)[0])
     if not cast.drives:
         return None
     last = min([round(seconds / cast.drives[0].dt), *(len(one.lateral) for one in cast.drives)])
     for stride in (1, 2, 5):
-        _write(cast, range(0, last, stride), path, rate=1 / (stride * cast.drives[0].dt))
+        _write(cast, scenario, range(0, last, stride), path, rate=1 / (stride * cast.drives[0].dt))
         if path.stat().st_size <= MOST_BYTES:
             break
     return path, [one.line.name for one in cast.drives]
@@ -77,13 +86,16 @@ def _cast(found: list[Drive]) -> _Cast:
     return _Cast(chosen, [near for near, _ in pairs], [offset for _, offset in pairs])
 
 
-def _write(cast: _Cast, steps: range, path: Path, rate: float) -> None:
+def _write(cast: _Cast, scenario: str, steps: range, path: Path, rate: float) -> None:
     with matplotlib.rc_context():
         matplotlib.rcdefaults()
         figure = Figure(figsize=(6.0, 4.9))
         FigureCanvasAgg(figure)
         above, strip = figure.subplots(2, 1, height_ratios=[2.4, 1])
         figure.subplots_adjust(left=0.125, right=0.985, top=0.94, bottom=0.1, hspace=0.08)
+        above.set_title(
+            f"{scenario.upper()}, deviations × {_widening(cast, steps.stop)}", fontsize=9.5, loc="right", pad=4
+        )
         moving = [*_road(above, cast, steps.stop), *_strip(strip, cast, steps.stop)]
         writer = _Writer(fps=max(1, round(rate)))
         with writer.saving(figure, str(path), dpi=90):
@@ -109,7 +121,6 @@ def _road(axes: Any, cast: _Cast, last: int) -> list[Any]:
         names.append(axes.text(3.2, shift, literal(one.line.name), bbox=PLATE | {"alpha": 0.75}, **words))
     axes.set(xlim=(-_BEHIND, _AHEAD), ylim=(-0.5 * _SPACING, shifts[0] + 0.5 * _SPACING), xticks=[], yticks=[])
     axes.set_aspect("equal")
-    axes.set_title(f"{FIGURED.upper()}, deviations × {factor}", fontsize=9.5, loc="right", pad=4)
     weather = axes.set_title("", fontsize=10.5, loc="left", pad=4)
     arrow: dict[str, Any] = {"arrowstyle": "-|>", "color": "#30363d", "lw": 2.5}
     wind = axes.annotate("", (0.0, 0.0), (0.0, 0.0), arrowprops=arrow, zorder=9)

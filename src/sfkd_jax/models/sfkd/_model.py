@@ -101,8 +101,11 @@ def sfkd(
     def bounded_parts(params: Params) -> Shared:
         return cast(Shared, networks.apply({"params": params["networks"]}, method="shared"))
 
+    def fold(params: Params) -> Params:
+        return params | {"shared": bounded_parts(params)}
+
     def fiber(params: Params, env: Environment) -> SfkdFiber:
-        shared = bounded_parts(params)
+        shared = params["shared"] if "shared" in params else bounded_parts(params)
         found = networks.apply(
             {"params": params["networks"]}, scaled_env(space, env, environment), method="per_environment"
         )
@@ -190,6 +193,7 @@ def sfkd(
         vector=lambda latent: latent.z,
         explicit=explicit,
         penalty=hinge if soft_penalty else None,
+        fold=fold,
     )
 
 

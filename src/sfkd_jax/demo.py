@@ -1,0 +1,74 @@
+"""python -m sfkd_jax.demo: a controller that ships with the package drives beside nominal and oracle; no training."""
+
+from __future__ import annotations
+
+import time
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from sfkd_jax import artefacts, assembly, drive, evaluation, policy, shelf
+from sfkd_jax.certification import Certificate, verify
+from sfkd_jax.config import door
+from sfkd_jax.reporting import animate
+
+SHIPPED = Path(__file__).with_name("pretrained")
+"""vehicle -> policy.npz, its manifest and its certificate, as `train` left them."""
+
+
+def run(settings: dict[str, Any]) -> dict[str, Any]:
+    """Check the certificate, drive, print a table, draw an animation.
+
+    Raises:
+        ValueError: a vehicle for which nothing ships, or one whose settings differ.
+    """
+    began, vehicle = time.perf_counter(), settings["vehicle"]["name"]
+    trained = _shipped(settings, vehicle)
+    settings = settings | {"evaluation": settings["evaluation"] | settings["demo"]}
+    plant = assembly.build_vehicle(settings["vehicle"])
+    track = drive.lay(settings, plant)
+    systems = {"sfkd": assembly.System(trained.model, trained.params, "measured", trained.certificate)}
+    systems |= {name: assembly.reference_systems(plant)[name] for name in ("nominal", "oracle")}
+    place, rows = Path(settings["root"]) / "demo" / f"{track.scenario}_{vehicle}", []
+    place.mkdir(parents=True, exist_ok=True)
+    for name, system in systems.items():
+        shelf.say(f"driving {settings['demo']['episodes']} x {settings['demo']['episode_s']:.0f} s: {name}")
+        driven = drive.prepare(settings, plant, name, system, None)(track)
+        road = {"envs": track.roads.envs, "path": track.roads.path.points, "dt": plant.dt}
+        arrays = driven.arrays | {part: np.asarray(array) for part, array in road.items()}
+        artefacts.write_arrays(place / f"{name}.npz", arrays, kind="cell", config=settings["scenario"])
+        rows.append(driven.row | {"arrays": f"{name}.npz"})
+    rows = evaluation.compare(rows)
+    artefacts.write_json(place / "results.json", {"rows": rows, "config": settings, "versions": artefacts.versions()})
+    _print(rows)
+    film = animate(place, rows, track.scenario)
+    shelf.say(f"animation: {film}; {time.perf_counter() - began:.0f} s in all")
+    return {"animation": film and str(film), "rows": len(rows), "results": str(place / "results.json")}
+
+
+def _shipped(settings: dict[str, Any], vehicle: str) -> policy.Policy:
+    """The policy for a vehicle, its certificate checked from the witnesses."""
+    known = sorted(place.name for place in SHIPPED.iterdir() if place.is_dir())
+    trained = policy.load(SHIPPED / vehicle, controller=settings["controller"]) if vehicle in known else None
+    if trained is None or trained.settings["vehicle"] != settings["vehicle"]:
+        raise ValueError(f"controllers ship for {' and '.join(known)} as they are; for another vehicle run train")
+    began = time.perf_counter()
+    proof = Certificate.from_document(trained.certificate)
+    verify(proof, trained.params, model=trained.model)
+    shelf.say(f"certificate: holds, alpha {proof.alpha:.4f}, checked in {time.perf_counter() - began:.1f} s")
+    return trained
+
+
+def _print(rows: list[dict[str, Any]]) -> None:
+    """The table, for a person."""
+    shelf.say(f"{'':10}{'deviation [mm]':>16}{'largest [mm]':>14}{'steering [rad/s]':>18}{'outside the proof':>19}")
+    for row in rows:
+        left, largest = 1e3 * row["rmse_m"]["mean"], 1e3 * row["max_deviation_m"]
+        broken = row["violation"]["v0"]
+        outside = "nothing proved" if broken is None else f"{100 * broken:.0f} %"
+        shelf.say(f"{row['system']:10}{left:16.1f}{largest:14.0f}{row['smoothness_rad_per_s']:18.3f}{outside:>19}")
+
+
+if __name__ == "__main__":
+    door(run)()

@@ -1,0 +1,41 @@
+"""The demo: what ships with the package drives, its certificate holds, and it beats what knows nothing of e."""
+
+import json
+
+import pytest
+from helpers import door, last_line
+
+from sfkd_jax import demo, policy
+from sfkd_jax.certification import Certificate, verify
+
+VEHICLES = sorted(place.name for place in demo.SHIPPED.iterdir())
+
+
+def test_the_demo_drives_without_training_and_draws_an_animation(tmp_path):
+    done = door("demo", "controller=mppi_tiny", "demo.episode_s=9.0", cwd=tmp_path)
+    found = last_line(done)
+    assert set(found) == {"animation", "rows", "results"}
+    assert (tmp_path / found["animation"]).read_bytes()[:6] == b"GIF89a"
+    rows = {row["system"]: row for row in json.loads((tmp_path / found["results"]).read_text())["rows"]}
+    assert set(rows) == {"sfkd", "nominal", "oracle"}
+    assert rows["sfkd"]["rmse_m"]["mean"] < 0.5 * rows["nominal"]["rmse_m"]["mean"]
+    assert rows["sfkd"]["violation"]["v0"] == 0.0
+    assert rows["sfkd"]["departures"] == 0
+    assert "certificate: holds" in done.stderr
+
+
+@pytest.mark.parametrize("other", ["vehicle=kinematic_speed", "vehicle.mass=900.0", "vehicle.name=hovercraft"])
+def test_a_vehicle_for_which_nothing_ships_is_refused_before_it_drives(tmp_path, other):
+    done = door("demo", other, cwd=tmp_path, code=1)
+    assert done.stderr.startswith("sfkd_jax: controllers ship for ")
+    assert len(done.stderr.strip().splitlines()) == 1
+    assert list(tmp_path.iterdir()) == []
+
+
+@pytest.mark.parametrize("vehicle", VEHICLES)
+def test_what_ships_loads_and_its_certificate_follows_from_its_witnesses(vehicle):
+    trained = policy.load(demo.SHIPPED / vehicle)
+    proof = Certificate.from_document(trained.certificate)
+    verify(proof, trained.params, model=trained.model)
+    assert proof.alpha < 1.0
+    assert trained.settings["vehicle"]["name"] == vehicle
