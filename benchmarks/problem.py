@@ -1,4 +1,4 @@
-"""One control problem for every contender: a latent model with residual and decoder networks, in numpy arrays.
+"""One control problem for every contender: a latent model with residual and decoder networks, in any array library.
 
 z⁺ = A z + B u + W_3 tanh(W_2 tanh(W_1 [z; u] + b_1) + b_2)
 y = D_3 tanh(D_2 tanh(D_1 z)),  cost |y − y_ref|² + 0.01 |u|²
@@ -31,6 +31,22 @@ def weights():
         "D2": layer(WIDTH, WIDTH),
         "D3": layer(OUTPUTS, WIDTH),
     }
+
+
+def advance(xp, w, z, u):
+    """z⁺ of one sample, or of samples as rows; `xp` is numpy, jax.numpy or torch, and w its arrays."""
+    hidden = xp.tanh(xp.concatenate((z, u), -1) @ w["W1"].T + w["b1"])
+    return z @ w["A"].T + u @ w["B"].T + xp.tanh(hidden @ w["W2"].T + w["b2"]) @ w["W3"].T
+
+
+def output(xp, w, z):
+    """y, likewise."""
+    return xp.tanh(xp.tanh(z @ w["D1"].T) @ w["D2"].T) @ w["D3"].T
+
+
+def charge(xp, w, z, u, target):
+    """The cost of arriving at z by u, likewise."""
+    return xp.sum((output(xp, w, z) - target) ** 2, -1) + EFFORT * xp.sum(u**2, -1)
 
 
 def start():

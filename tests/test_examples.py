@@ -49,6 +49,22 @@ def test_logged_drives_are_read_from_a_file_of_ones_own(monkeypatch, tmp_path):
     assert data.env_low.shape == (2,)
 
 
+def test_the_brax_pendulum_is_learned_certified_and_driven(monkeypatch, capsys):
+    """In two seconds a pole left alone lies. So short a training gives a certificate, not yet a good driver."""
+    sizes = {"drives": 50, "steps": 50, "samples": 64, "horizon": 20, "seconds": 2.0}
+    found = example("brax_pendulum", monkeypatch)["main"](**sizes)
+    proof, rows = found["certificate"], found["rows"]
+    assert proof["valid"]
+    assert proof["attacks"]["step_slopes"] <= proof["alpha"] < 1.0
+    assert len(proof["tube"]["latent"]) == 20
+    assert np.isfinite(rows["SFKD"]["rms_m"])
+    assert rows["SFKD"] == rows["SFKD, told e = 1"]  # e is 1 for the first three seconds
+    assert not any(rows[way]["fallen"] for way in ("true dynamics", "true dynamics, no gain", "gain alone"))
+    assert rows["true dynamics"]["rms_m"] < rows["gain alone"]["rms_m"]
+    printed = capsys.readouterr().out
+    assert all(f"{way} " in printed for way in rows)
+
+
 # ---- ROS 2, against a stub of it -----------------------------------------------------------------------------------
 
 

@@ -117,7 +117,7 @@ def test_what_is_no_such_system_is_refused_in_one_line(environment, parameters, 
         "vehicle": adapters.BraxVehicle,
     }[environment]()
     with pytest.raises(ValueError, match=message) as refusal:
-        adapters.brax_step(given, parameters=parameters)
+        adapters.brax_plant(given, parameters=parameters)
     assert "\n" not in str(refusal.value)
 
 

@@ -16,7 +16,6 @@ if TYPE_CHECKING:
     from sfkd_jax.adapters._brax import register_brax as register_brax
     from sfkd_jax.adapters._brax_system import BraxPlant as BraxPlant
     from sfkd_jax.adapters._brax_system import brax_plant as brax_plant
-    from sfkd_jax.adapters._brax_system import brax_step as brax_step
     from sfkd_jax.adapters._brax_system import collect as collect
     from sfkd_jax.adapters._gymnasium import GymnasiumVehicle as GymnasiumVehicle
     from sfkd_jax.adapters._gymnasium import register_gymnasium as register_gymnasium
@@ -26,7 +25,6 @@ _LAZY = {
     "register_brax": ("_brax", "brax"),
     "BraxPlant": ("_brax_system", "brax"),
     "brax_plant": ("_brax_system", "brax"),
-    "brax_step": ("_brax_system", "brax"),
     "collect": ("_brax_system", "brax"),
     "GymnasiumVehicle": ("_gymnasium", "gym"),
     "register_gymnasium": ("_gymnasium", "gym"),

@@ -43,11 +43,6 @@ class BraxPlant(NamedTuple):
     start: Callable[[Key], State]
 
 
-def brax_step(env: Env, *, parameters: tuple[str, ...] = ("gravity",)) -> Step:
-    """The step of `brax_plant`."""
-    return brax_plant(env, parameters=parameters).step
-
-
 def brax_plant(env: Env, *, parameters: tuple[str, ...] = ("gravity",)) -> BraxPlant:
     """x⁺ = (0, q⁺, q̇⁺), (q⁺, q̇⁺) what the environment's own physics makes of (q, q̇, u) with parameters scaled by e.
 
