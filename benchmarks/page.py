@@ -28,11 +28,19 @@ TABLES = {
 }
 
 
+def built(build):
+    """A table, or that there is nothing to make it from yet."""
+    try:
+        return build()
+    except FileNotFoundError as absent:
+        return f"Not measured yet: there is no {timing.HERE.name}/{absent.filename.rsplit('/', 1)[-1]}."
+
+
 def main():
     """Parse, print or write."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--write", action="store_true", help="put the tables into docs/performance.md")
-    made = {name: build() for name, build in TABLES.items()}
+    made = {name: built(build) for name, build in TABLES.items()}
     if not parser.parse_args().write:
         print("\n\n".join(f"<!-- {name} -->\n{text}\n<!-- end -->" for name, text in made.items()))
         return

@@ -146,8 +146,12 @@ def runs():
     """Under which settings, and beside how much other work, the files were made."""
     rows = []
     for name in FILES:
+        if not (timing.HERE / f"{name}.json").exists():
+            continue
         found = read(name)
         asked = ", ".join(f"{key} {value}" for key, value in found.get("settings", {}).items())
         versions = ", ".join(f"{key} {value}" for key, value in found["machine"]["versions"].items())
-        rows.append([f"{name}.json", asked, found["machine"].get("load", "not recorded"), versions])
+        load = found["machine"].get("load", "not recorded")
+        load = load if isinstance(load, str) else f"{load:.1f}"
+        rows.append([f"{name}.json", asked, load, versions])
     return table(["file", "settings", "load average before", "versions"], rows)
