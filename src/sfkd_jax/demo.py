@@ -21,7 +21,7 @@ def run(settings: dict[str, Any]) -> dict[str, Any]:
     """Check the certificate, drive, print a table, draw an animation.
 
     Raises:
-        ValueError: a vehicle for which nothing ships, or one whose settings differ.
+        ArtefactError: what ships was changed. ValueError: a vehicle for which nothing ships, or one whose settings differ.
     """
     began, vehicle = time.perf_counter(), settings["vehicle"]["name"]
     trained = _shipped(settings, vehicle)
@@ -53,6 +53,8 @@ def _shipped(settings: dict[str, Any], vehicle: str) -> policy.Policy:
     trained = policy.load(SHIPPED / vehicle, controller=settings["controller"]) if vehicle in known else None
     if trained is None or trained.settings["vehicle"] != settings["vehicle"]:
         raise ValueError(f"controllers ship for {' and '.join(known)} as they are; for another vehicle run train")
+    if trained.certificate is None:
+        raise artefacts.ArtefactError(f"{SHIPPED / vehicle} was changed: its certificate is about other weights")
     began = time.perf_counter()
     proof = Certificate.from_document(trained.certificate)
     verify(proof, trained.params, model=trained.model)
