@@ -21,7 +21,7 @@ def run(settings: dict[str, Any]) -> dict[str, Any]:
     """Check the certificate, drive, print a table, draw an animation.
 
     Raises:
-        ArtefactError: what ships was changed. ValueError: a vehicle for which nothing ships, or one whose settings differ.
+        ArtefactError: what ships was changed. ValueError: a vehicle for which nothing ships, also by its settings.
     """
     began, vehicle = time.perf_counter(), settings["vehicle"]["name"]
     trained = _shipped(settings, vehicle)
