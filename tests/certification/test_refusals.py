@@ -8,8 +8,9 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from helpers import ENV_HIGH, ENV_LOW, certified, model_and_params, tiny
+from helpers import ENV_HIGH, ENV_LOW, TINY, certified, model_and_params, space, tiny
 
+from sfkd_jax import models
 from sfkd_jax.certification import (
     CertificateContradicted,
     CertificationRefused,
@@ -223,3 +224,11 @@ def _distance(z, other, controls, envs, later):
 
     each = jax.vmap(moved)
     return jnp.linalg.norm(each(z, controls, envs, later) - each(other, controls, envs, later), axis=1)
+
+
+@pytest.mark.parametrize("entries", [1, 3])
+def test_attacks_take_environments_of_any_size(entries):
+    sizes = {"env_mean": jnp.zeros(entries), "env_scale": jnp.ones(entries)}
+    model = models.sfkd(space()._replace(**sizes), **TINY)
+    params, box = model.init(jax.random.key(0)), ((-1.0,) * entries, (1.0,) * entries)
+    assert attack_transport(model, params, box, jax.random.key(1)) == pytest.approx(1.0, abs=1e-5)

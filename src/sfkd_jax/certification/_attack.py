@@ -54,7 +54,7 @@ def attack_step(model: Model, params: Params, box: Box, key: Key, *, starts: int
         model: with `explicit`. params: its weights. box: lower and upper corner of E. key: for the beginnings.
         starts: how many. iterations: of L-BFGS-B, each.
     """
-    inject, rank, controls = _coordinates(model, params)
+    inject, rank, controls = _coordinates(model, params, len(box[0]))
     low, high = (np.asarray(side, dtype=np.float64) for side in box)
     inputs = rank + controls + 2 * len(low)
     envs = slice(rank + controls, inputs)
@@ -91,7 +91,7 @@ def attack_transport(model: Model, params: Params, box: Box, key: Key, *, sample
     Args:
         model, params: as in `attack_step`. box: of E. key: for the pairs. samples: how many.
     """
-    inject, rank, _ = _coordinates(model, params)
+    inject, rank, _ = _coordinates(model, params, len(box[0]))
     low, high = (jnp.asarray(side, dtype=jnp.float32) for side in box)
     draws = jax.random.uniform(key, (samples, 2, low.shape[0]), minval=low, maxval=high)
 
@@ -121,12 +121,16 @@ def _best_layer(weights: Sequence[Matrix], slopes: Sequence[Vector], base: Matri
     return (before * after > 0).astype(float)
 
 
-def _coordinates(model: Model, params: Params) -> tuple[Callable[[Any], Any], int, int]:
-    """z -> a latent that holds it (`vector` picks z out, its transpose puts z back), and the sizes of z and u."""
+def _coordinates(model: Model, params: Params, entries: int) -> tuple[Callable[[Any], Any], int, int]:
+    """z -> a latent that holds it (`vector` picks z out, its transpose puts z back), and the sizes of z and u.
+
+    Args:
+        model, params: of a claim. entries: of e.
+    """
     assert model.explicit is not None
     weights = jax.eval_shape(model.explicit, params)
     state = jax.ShapeDtypeStruct((3 + weights.readout.shape[0],), jnp.float32)
-    env = jax.ShapeDtypeStruct((2,), jnp.float32)
+    env = jax.ShapeDtypeStruct((entries,), jnp.float32)
     shapes = jax.eval_shape(lambda env, state: model.encode(model.fiber(params, env), state), env, state)
     origin = jax.tree.map(lambda leaf: jnp.zeros(leaf.shape, leaf.dtype), shapes)
     z, back = jax.vjp(model.vector, origin)
