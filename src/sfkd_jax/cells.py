@@ -113,8 +113,8 @@ def is_done(path: Path, settings: dict[str, Any]) -> bool:
         return False
 
 
-def write(path: Path, settings: dict[str, Any], track: Track, driven: Drive) -> None:
-    """Store arrays of the first episodes, then the row: a kill between leaves a cell that is not done."""
+def write(path: Path, settings: dict[str, Any], track: Track, driven: Drive) -> dict[str, Any]:
+    """Store arrays of the first episodes, then the row, which is returned: a kill between leaves a cell not done."""
     path.parent.mkdir(parents=True, exist_ok=True)
     arrays = driven.arrays | {"envs": track.roads.envs, "path": track.roads.path.points}
     kept = {name: np.asarray(array)[:FIGURED] for name, array in arrays.items()}
@@ -123,6 +123,7 @@ def write(path: Path, settings: dict[str, Any], track: Track, driven: Drive) -> 
     artefacts.write_arrays(file, kept, kind=KIND, config=settings["scenario"])
     row = driven.row | {"arrays": str(file.relative_to(Path(settings["root"], settings["name"])))}
     artefacts.write_json(_row_file(path), {"row": row, "made_with": made_with(settings)})
+    return row
 
 
 def collect(cells: list[Cell], settings: dict[str, Any]) -> list[dict[str, Any]]:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import functools
 import inspect
 import json
 import math
@@ -180,11 +181,11 @@ def door(run: Callable[[dict[str, Any]], dict[str, Any]]) -> Callable[[], None]:
     def main(config: DictConfig) -> float | None:
         settings = OmegaConf.to_container(config, resolve=True)
         sweeping = HydraConfig.get().mode == RunMode.MULTIRUN
-        fail = _report if sweeping else _fail
+        fail = functools.partial(_fail, sweeping=sweeping)
         try:
             document = run(typing.cast(dict[str, Any], settings))
         except KeyboardInterrupt:
-            _fail("interrupted; the same command continues", 130)
+            return _fail("interrupted; the same command continues", 130)
         except CertificationRefused as reason:
             return fail(f"refused: {reason}", REFUSED)
         except CertificateStale as reason:
@@ -197,14 +198,7 @@ def door(run: Callable[[dict[str, Any]], dict[str, Any]]) -> Callable[[], None]:
     return hydra.main(config_path=conf_path(), config_name="config", version_base="1.3")(main)
 
 
-def _report(reason: str, code: int) -> float:
-    """One line on stderr, and the objective of a job that failed."""
-    del code
+def _fail(reason: str, code: int, *, sweeping: bool = False) -> float:
+    """One line on stderr, then the exit code; in a sweep, the objective of a job that failed."""
     print(f"sfkd_jax: {reason}", file=sys.stderr, flush=True)
-    return math.inf
-
-
-def _fail(reason: str, code: int) -> typing.NoReturn:
-    """One line on stderr, then the exit code."""
-    _report(reason, code)
-    sys.exit(code)
+    return math.inf if sweeping else sys.exit(code)

@@ -6,9 +6,7 @@ import time
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-
-from sfkd_jax import artefacts, assembly, drive, evaluation, policy, shelf
+from sfkd_jax import artefacts, assembly, cells, drive, evaluation, policy, shelf
 from sfkd_jax.certification import Certificate, verify
 from sfkd_jax.config import door
 from sfkd_jax.reporting import animate
@@ -25,26 +23,23 @@ def run(settings: dict[str, Any]) -> dict[str, Any]:
     """
     began, vehicle = time.perf_counter(), settings["vehicle"]["name"]
     trained = _shipped(settings, vehicle)
-    settings = settings | {"evaluation": settings["evaluation"] | settings["demo"]}
+    settings = settings | {"name": "demo", "evaluation": settings["evaluation"] | settings["demo"]}
     plant = assembly.build_vehicle(settings["vehicle"])
     track = drive.lay(settings, plant)
     systems = {"sfkd": assembly.System(trained.model, trained.params, "measured", trained.certificate)}
     systems |= {name: assembly.reference_systems(plant)[name] for name in ("nominal", "oracle")}
-    place, rows = Path(settings["root"]) / "demo" / f"{track.scenario}_{vehicle}", []
-    place.mkdir(parents=True, exist_ok=True)
+    place, rows = Path(settings["root"]) / settings["name"], []
+    folder = place / f"{track.scenario}_{vehicle}"
     for name, system in systems.items():
         shelf.say(f"driving {settings['demo']['episodes']} x {settings['demo']['episode_s']:.0f} s: {name}")
         driven = drive.prepare(settings, plant, name, system, None)(track)
-        road = {"envs": track.roads.envs, "path": track.roads.path.points, "dt": plant.dt}
-        arrays = driven.arrays | {part: np.asarray(array) for part, array in road.items()}
-        artefacts.write_arrays(place / f"{name}.npz", arrays, kind="cell", config=settings["scenario"])
-        rows.append(driven.row | {"arrays": f"{name}.npz"})
+        rows.append(cells.write(folder / name, settings, track, driven))
     rows = evaluation.compare(rows)
-    artefacts.write_json(place / "results.json", {"rows": rows, "config": settings, "versions": artefacts.versions()})
+    artefacts.write_json(folder / "results.json", {"rows": rows, "config": settings, "versions": artefacts.versions()})
     _print(rows)
     film = animate(place, rows, track.scenario)
     shelf.say(f"animation: {film}; {time.perf_counter() - began:.0f} s in all")
-    return {"animation": film and str(film), "rows": len(rows), "results": str(place / "results.json")}
+    return {"animation": film and str(film), "rows": len(rows), "results": str(folder / "results.json")}
 
 
 def _shipped(settings: dict[str, Any], vehicle: str) -> policy.Policy:

@@ -257,9 +257,12 @@ PROGRAM = """
         control_low=(-9.0,), control_high=(9.0,),
     )
     settings = {"num_samples": 64, "noise_std": (2.0,), "effective_samples": 8.0}
-    controller = control.mppi(task, horizon=12, sharding=spread, **settings)
-    _, state, _ = jax.jit(controller.act)({}, controller.init(jax.random.key(0)), jnp.ones(2), jnp.zeros(1), ())
-    print(len(jax.devices()), *np.asarray(state.plan).ravel().tolist())
+    plans = []
+    for curvature in (False, True):
+        controller = control.mppi(task, horizon=12, sharding=spread, curvature=curvature, **settings)
+        _, state, _ = jax.jit(controller.act)({}, controller.init(jax.random.key(0)), jnp.ones(2), jnp.zeros(1), ())
+        plans += np.asarray(state.plan).ravel().tolist()
+    print(len(jax.devices()), *plans)
 """
 
 

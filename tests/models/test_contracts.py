@@ -238,3 +238,12 @@ def test_nothing_is_factorised_in_a_control_step_with_folded_parameters(name, on
     raw, folded = ("lapack" in text or "linalg" in text or "triangular_solve" in text for text in program)
     assert raw
     assert not folded
+
+
+@pytest.mark.parametrize("name", ["sfkd", "r2dn"])
+def test_a_claim_about_folded_parameters_is_about_the_matrices_that_run(name):
+    """Spoiled after folding, they must not be certified as what they were folded from."""
+    model, params = model_and_params(name)
+    folded = jit(model.fold)(params)
+    spoiled = folded | {"shared": jax.tree.map(lambda leaf: 2.0 * leaf, folded["shared"])}
+    assert same(model.explicit(spoiled).readout, 2.0 * model.explicit(params).readout, rtol=1e-6, atol=1e-6)

@@ -89,10 +89,9 @@ def path_tracking(
             target, turn = inputs
             point, curvature, _, _ = target
             state = model.decode(fiber, before.latent)
-            control = limit(other.control(turn, state, point, curvature), before.control)
-            latent = model.step(fiber, before.latent, control)
-            errors = path_errors(model.decode(fiber, latent), point, curvature)
-            return PathSample(latent, errors, control), control - asked(state, target)
+            nu = other.control(turn, state, point, curvature) - asked(state, target)
+            after = advance(cost.weights, fiber, before, nu, target, jnp.zeros(()))
+            return after.sample, after.perturbation
 
         return jax.lax.scan(step, start, (targets, turns))[1][None]
 

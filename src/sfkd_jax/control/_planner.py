@@ -115,7 +115,7 @@ def planner(
         rolled = jax.vmap(roll, in_axes=(None, 0, None)) if several else roll
 
         def evaluate(plans: Plans) -> tuple[Array, Plans]:
-            if sharding is not None:
+            if sharding is not None and plans.shape[1] > 1:  # a single plan cannot be dealt out
                 plans = jax.lax.with_sharding_constraint(plans, sharding)
             costs, (_, effective, _) = by_chunks(lambda part: rolled(state.tuning.cost, began, part), plans, chunk)
             return (measure(costs), jnp.mean(effective, axis=0)) if several else (costs, effective)

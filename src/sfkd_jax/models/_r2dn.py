@@ -92,13 +92,15 @@ def r2dn(
         }
 
     def explicit_weights(params: Params) -> Shared:
+        if "shared" in params:  # folded: what runs is then also what is certified
+            return params["shared"]
         return cast(Shared, weights.apply({"params": params["weights"]}))
 
     def fold(params: Params) -> Params:
         return params | {"shared": explicit_weights(params)}
 
     def fiber(params: Params, env: Environment) -> R2dnFiber:
-        shared = params["shared"] if "shared" in params else explicit_weights(params)
+        shared = explicit_weights(params)
         scaled = scaled_env(space, env, environment)
         return R2dnFiber(
             A=shared.A,

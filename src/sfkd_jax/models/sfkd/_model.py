@@ -99,13 +99,15 @@ def sfkd(
         }
 
     def bounded_parts(params: Params) -> Shared:
+        if "shared" in params:  # folded: what runs is then also what is certified
+            return params["shared"]
         return cast(Shared, networks.apply({"params": params["networks"]}, method="shared"))
 
     def fold(params: Params) -> Params:
         return params | {"shared": bounded_parts(params)}
 
     def fiber(params: Params, env: Environment) -> SfkdFiber:
-        shared = params["shared"] if "shared" in params else bounded_parts(params)
+        shared = bounded_parts(params)
         found = networks.apply(
             {"params": params["networks"]}, scaled_env(space, env, environment), method="per_environment"
         )
