@@ -136,9 +136,8 @@ def closed_loop():
 
 def profile():
     """Parts of the step with the project's own model."""
-    rows = [
-        [label, *numbers(row, {"best_ms": 2, "median_ms": 2})] for label, row in read("own_profile")["parts"].items()
-    ]
+    shown = {"best_ms": 2, "median_ms": 2, "cpu_ms": 2}
+    rows = [[label, *numbers(row, shown)] for label, row in read("own_profile")["parts"].items()]
     return table(["part", "best [ms]", "median [ms]", "CPU [ms]"], rows)
 
 

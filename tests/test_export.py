@@ -104,9 +104,10 @@ def plain(tree):
 def in_process(loaded):
     """Every leaf of every step of the policy's own controller, jitted here."""
     act, state, steps = jax.jit(loaded.controller.act), loaded.controller.init(jax.random.key(7)), []
+    folded = jax.jit(loaded.model.fold)(loaded.params)
     observations, envs, reference = drive()
     for observation, env in zip(observations, envs, strict=True):
-        control, state, info = act(loaded.params, state, observation, env, reference)
+        control, state, info = act(folded, state, observation, env, reference)
         steps.append(plain((control, state, info)))
     return steps
 

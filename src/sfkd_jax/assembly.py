@@ -14,6 +14,8 @@ from sfkd_jax.types import Control, Controller, Environment, Model, Reference, S
 
 Settings = Mapping[str, Any]
 
+ENVS = ("measured", "estimated", "none")
+"""How a controller learns of the environment."""
 PLANTS = {"kinematic": vehicle.kinematic, "dynamic": vehicle.dynamic}
 INNER_LOOPS = ("none", "speed")
 
@@ -76,16 +78,28 @@ def build_controller(
     env_low: Any = None,
     env_high: Any = None,
     certificate: Settings | None = None,
+    env: str = "measured",
 ) -> Controller:
-    """The planner of the settings, watched by a monitor if there is a certificate."""
+    """The planner of the settings, watched by a monitor if there is a certificate, told an estimate if `env` asks."""
     build = choose(PLANNERS, settings.get("planner", "mppi"), "controller.planner")
     planner = build(settings, model, plant, env_low, env_high)
-    if certificate is None:
-        return planner
+    watched = planner if certificate is None else _monitored(planner, settings, model, certificate)
+    return _estimated(watched, settings, model, plant, env_low, env_high) if env == "estimated" else watched
+
+
+def _monitored(planner: Controller, settings: Settings, model: Model, certificate: Settings) -> Controller:
     corners = {name: certificate["boxes"][name] for name in ("state", "control", "env")}
     boxes = {f"{name}_{side}": tuple(box[k]) for name, box in corners.items() for k, side in enumerate(("low", "high"))}
     bounds = tuple(certificate["monitor"]["bounds"])
     return control.monitored(planner, model, bounds=bounds, **boxes, **without(settings.get("monitor", {})))
+
+
+def _estimated(
+    planner: Controller, settings: Settings, model: Model, plant: vehicle.Vehicle, env_low: Any, env_high: Any
+) -> Controller:
+    box = {"env_low": _floats(env_low), "env_high": _floats(env_high)}
+    sizes = {"states": len(plant.state_names), "controls": len(plant.control_low)}
+    return control.estimated(planner, model, **box, **sizes, **without(settings.get("estimator", {})))
 
 
 def _sampled(

@@ -95,13 +95,13 @@ def place(cell: Cell, settings: dict[str, Any]) -> Path:
 def driver_of(settings: dict[str, Any]) -> str:
     """The hash of what a driver is compiled from: cells that share it share the driver."""
     protocol = {name: value for name, value in settings["evaluation"].items() if name not in ("told", "variation")}
-    asked = {name: settings[name] for name in (*shelf.IDENTITY, "controller", "certification", "name")}
+    asked = {name: settings[name] for name in (*shelf.IDENTITY, "env", "controller", "certification", "name")}
     return artefacts.sha256(asked | {"evaluation": protocol})
 
 
 def made_with(settings: dict[str, Any]) -> str:
     """The hash of the settings that a cell comes from; neither the code nor where the artefacts lie is in it."""
-    asked = {name: settings[name] for name in (*shelf.IDENTITY, "controller", "scenario", "evaluation")}
+    asked = {name: settings[name] for name in (*shelf.IDENTITY, "env", "controller", "scenario", "evaluation")}
     return artefacts.sha256(asked | {"certification": settings["certification"]})
 
 

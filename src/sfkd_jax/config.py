@@ -133,8 +133,7 @@ def register() -> None:
 def compose(*overrides: str) -> dict[str, Any]:
     """The settings of this command under further overrides, inside a door."""
     asked = [*HydraConfig.get().overrides.task, *overrides]
-    composed = OmegaConf.to_container(hydra.compose("config", asked), resolve=True)
-    return typing.cast(dict[str, Any], composed)
+    return _settings(hydra.compose("config", asked))
 
 
 def command(name: str) -> str:
@@ -164,6 +163,9 @@ def _controller_schema() -> type:
     shared = ("lateral", "course", "speed", "steering_rate", "effort", "terminal_weight")
     parts["koopman_mpc"] = schema("KoopmanMpcConfig", control.koopman_mpc, skip=(*fixed, *shared))
     watched = ("bounds", "state_low", "state_high", *fixed)
+    parts["estimator"] = schema(
+        "EstimatorConfig", control.estimated, skip=("env_low", "env_high", "states", "controls")
+    )
     parts["monitor"] = schema("MonitorConfig", control.monitored, skip=watched)
     fields = [(name, part, field(default_factory=part)) for name, part in parts.items()]
     head = [("name", str), ("planner", str), ("sampling", typing.Any), ("ancillary", bool, field(default=False))]
@@ -179,11 +181,10 @@ def door(run: Callable[[dict[str, Any]], dict[str, Any]]) -> Callable[[], None]:
     register()
 
     def main(config: DictConfig) -> float | None:
-        settings = OmegaConf.to_container(config, resolve=True)
         sweeping = HydraConfig.get().mode == RunMode.MULTIRUN
         fail = functools.partial(_fail, sweeping=sweeping)
         try:
-            document = run(typing.cast(dict[str, Any], settings))
+            document = run(_settings(config))
         except KeyboardInterrupt:
             return _fail("interrupted; the same command continues", 130)
         except CertificationRefused as reason:
@@ -196,6 +197,22 @@ def door(run: Callable[[dict[str, Any]], dict[str, Any]]) -> Callable[[], None]:
         return document.get("objective") if sweeping else None
 
     return hydra.main(config_path=conf_path(), config_name="config", version_base="1.3")(main)
+
+
+def _settings(config: DictConfig) -> dict[str, Any]:
+    """Plain settings; a model that is told nothing of the environment has no use for it.
+
+    Raises:
+        ValueError: an `env` that there is not, or an estimate of what the model does not read.
+    """
+    settings = typing.cast(dict[str, Any], OmegaConf.to_container(config, resolve=True))
+    env, model = settings["env"], settings["model"]
+    if env not in assembly.ENVS:
+        raise ValueError(f"unknown env {env!r}; choose one of {', '.join(assembly.ENVS)}")
+    if env == "estimated" and not model["environment"]:
+        raise ValueError("env=estimated needs a model that reads the environment; drop model.environment=false")
+    model["environment"] &= env != "none"
+    return settings
 
 
 def _fail(reason: str, code: int, *, sweeping: bool = False) -> float:

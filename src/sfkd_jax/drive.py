@@ -70,6 +70,7 @@ def prepare(
     """
     protocol, box = settings["evaluation"], settings["dataset"]
     limits = {"env_low": box["env_low"], "env_high": box["env_high"], "certificate": system.certificate}
+    limits["env"] = system.env
     controller = assembly.build_controller(settings["controller"], system.model, plant, **limits)
     options = {"horizon": assembly.controller_horizon(settings["controller"]), "dt": plant.dt}
     options["observation_noise"] = tuple(protocol["observation_noise"])
@@ -116,7 +117,7 @@ def _assessor(
     claims = _claims(settings, system, dataset)
 
     def assess(episodes: evaluation.Episode, track: Track) -> tuple[evaluation.Scores, dict[str, Any]]:
-        driven = Trajectory(episodes.states, episodes.controls, track.told)
+        driven = Trajectory(episodes.states, episodes.controls, episodes.believed)
         long_enough = driven.controls.shape[1] >= length
         found = jax.device_get(predict(system.params, driven)) if long_enough else None
         scores = evaluation.score(episodes, np.asarray(track.roads.envs), dt=dt)

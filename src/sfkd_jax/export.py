@@ -22,7 +22,7 @@ def run(settings: dict[str, Any]) -> dict[str, Any]:
         raise artefacts.ArtefactError(f"{place} holds no trained controller; run train with the same options first")
     shelf.claim(settings)
     _, manifest = artefacts.read_arrays(place / "policy.npz", kind=policy.KIND)
-    trained = policy.load(place, controller=settings["controller"])
+    trained = policy.load(place, controller=settings["controller"], env=settings["env"])
     if trained.certificate is None:
         shelf.say("certificate: refused, missing or about other weights; exported without one, and without a monitor")
     folder = place / FOLDER

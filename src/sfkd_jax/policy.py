@@ -43,11 +43,12 @@ def weights_hash(path: Path) -> str:
     return artefacts.read_arrays(path / "policy.npz", kind=KIND)[1]["sha256"]
 
 
-def load(path: str | Path, *, controller: Mapping[str, Any] | None = None) -> Policy:
+def load(path: str | Path, *, controller: Mapping[str, Any] | None = None, env: str = "measured") -> Policy:
     """The policy in a run directory (or a policy.npz with its manifest beside it).
 
     Args:
         path: where. controller: settings of a controller to build instead of the one it was saved with.
+        env: "estimated" for a controller that infers the environment and does not read the one it is given.
 
     Raises:
         ArtefactError: nothing there, truncated, foreign, or changed since it was written.
@@ -55,12 +56,12 @@ def load(path: str | Path, *, controller: Mapping[str, Any] | None = None) -> Po
     file = Path(path)
     file = file / "policy.npz" if file.suffix != ".npz" else file
     arrays, manifest = artefacts.read_arrays(file, kind=KIND)
-    settings = manifest["config"] | ({} if controller is None else {"controller": dict(controller)})
+    settings = manifest["config"] | {"env": env} | ({} if controller is None else {"controller": dict(controller)})
     plant = assembly.build_vehicle(settings["vehicle"])
     model = assembly.build_model(settings["model"], assembly.space_from_settings(settings["space"]), plant)
     box = settings["dataset"]
     certificate = _certificate(file.with_name("certificate.json"), manifest["sha256"])
-    limits = {"env_low": box["env_low"], "env_high": box["env_high"], "certificate": certificate}
+    limits = {"env_low": box["env_low"], "env_high": box["env_high"], "certificate": certificate, "env": env}
     planner = assembly.build_controller(settings["controller"], model, plant, **limits)
     params = jax.tree.map(jnp.asarray, artefacts.unflatten(arrays))
     return Policy(model, params, planner, certificate, settings)

@@ -86,7 +86,7 @@ def systems(settings: dict[str, Any], plant: Vehicle) -> dict[str, assembly.Syst
 def own_system(settings: dict[str, Any]) -> assembly.System:
     """The policy of this run as a row of a table."""
     trained = ensure_policy(settings)
-    told = "measured" if trained.settings["model"]["environment"] else "none"
+    told = settings["env"] if trained.settings["model"]["environment"] else "none"
     return assembly.System(trained.model, trained.params, told, trained.certificate)
 
 

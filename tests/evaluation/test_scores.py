@@ -23,6 +23,7 @@ def episode(lateral, steering=None, states=None, ess=None, healthy=None, breach=
         effective_samples=np.ones((1, steps)) if ess is None else np.asarray(ess, dtype=float)[None],
         healthy=np.ones((1, steps), bool) if healthy is None else np.asarray(healthy)[None],
         prediction_error=np.zeros((1, steps)),
+        believed=np.zeros((1, steps, 2)),
         breach=np.zeros((1, steps), bool) if breach is None else np.asarray(breach)[None],
         box_exit=np.zeros((1, steps), bool),
     )

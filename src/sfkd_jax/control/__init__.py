@@ -8,6 +8,8 @@ from sfkd_jax.control._costs import Stage as Stage
 from sfkd_jax.control._costs import tracking_cost as tracking_cost
 from sfkd_jax.control._delay import DelayState as DelayState
 from sfkd_jax.control._delay import compensated as compensated
+from sfkd_jax.control._estimation import EstimatorState as EstimatorState
+from sfkd_jax.control._estimation import estimated as estimated
 from sfkd_jax.control._gradient import gradient_planner as gradient_planner
 from sfkd_jax.control._koopman_mpc import KoopmanMpcState as KoopmanMpcState
 from sfkd_jax.control._koopman_mpc import koopman_mpc as koopman_mpc

@@ -26,6 +26,7 @@ class Episode(NamedTuple):
         progress: arc length reached [m], (time,).
         effective_samples: of the planner, (time,). healthy: whether it trusted its plan, (time,).
         prediction_error: one-step position error of the planner's model [m], (time,).
+        believed: e as the controller took it to be, its own estimate or what it was told, (time, environment).
         breach, box_exit: flags of a monitor, False without one, (time,).
     """
 
@@ -36,6 +37,7 @@ class Episode(NamedTuple):
     effective_samples: Float[Array, " time"]
     healthy: Array
     prediction_error: Float[Array, " time"]
+    believed: Float[Array, "time environment"]
     breach: Array
     box_exit: Array
 
@@ -78,7 +80,8 @@ def simulate(
         progress, lateral = project(scenario.path, state[:2], progress + scenario.speed * dt)
         miss = jnp.linalg.norm(info["predicted_states"][0, :2] - state[:2])
         flags = [jnp.asarray(info.get(name, False)) for name in ("breach", "box_exit")]
-        record = (state, control, lateral, progress, info["effective_samples"], info["healthy"], miss, *flags)
+        seen = (info["effective_samples"], info["healthy"], miss, info.get("env_estimate", env))
+        record = (state, control, lateral, progress, *seen, *flags)
         return (state, progress, planner), record
 
     start = (scenario.initial_state, jnp.zeros(()), controller.init(planner_key))

@@ -56,7 +56,7 @@ def example_inputs(policy: Policy) -> tuple[Any, ...]:
 
 
 def flat_programs(policy: Policy) -> Programs:
-    """The controller of a policy over flat arrays, its weights inside.
+    """The controller of a policy over flat arrays, its weights inside, folded.
 
     Names are paths: `state.inner.plan`, `info.cost`. Typed keys do not cross a border, so their uint32 data do.
 
@@ -67,6 +67,7 @@ def flat_programs(policy: Policy) -> Programs:
     implementation = str(jax.random.key_impl(jax.random.key(0)))
     wrap = partial(jax.random.wrap_key_data, impl=implementation)
     template, structure = jax.tree.flatten(state)
+    folded = jax.jit(policy.model.fold)(policy.params)
 
     def init(key_data: Array) -> tuple[Array, ...]:
         return tuple(_opened(policy.controller.init(wrap(key_data))))
@@ -78,11 +79,11 @@ def flat_programs(policy: Policy) -> Programs:
     def act(*leaves: Array) -> tuple[Array, ...]:
         *before, observation, env, reference = leaves
         # Without the barrier XLA evaluates at compile time what depends on weights alone, and rounds otherwise.
-        params = jax.lax.optimization_barrier(policy.params)
+        params = jax.lax.optimization_barrier(folded)
         control, after, info = policy.controller.act(params, closed(before), observation, env, reference)
         return control, *_opened(after), *jax.tree.leaves(info)
 
-    control, after, info = jax.eval_shape(policy.controller.act, policy.params, state, *measured)
+    control, after, info = jax.eval_shape(policy.controller.act, folded, state, *measured)
     if _named("state", after) != _named("state", state) or jax.tree.structure(after) != structure:
         raise ValueError("cannot export a controller whose state changes its structure, shapes or dtypes")
     arguments = zip(("observation", "env", "reference"), measured, strict=True)

@@ -36,9 +36,11 @@ class Contest(NamedTuple):
 
 
 def name_of(row: Row) -> str:
-    """What a reader sees for a row: its system, and for learned rivals whether it is told the environment."""
+    """What a reader sees for a row: its system, and what it is told of the environment where that is not plain."""
     system, env = str(row.get("system")), str(row.get("env"))
     shown = label(system)
+    if env == "estimated":
+        return f"{shown} (e estimated)"
     if system in SELF_EVIDENT or system.startswith("sfkd"):
         return shown
     return f"{shown} (e)" if env == "measured" else f"{shown} (no e)" if env == "none" else shown
