@@ -28,11 +28,6 @@ def test_ci_runs_the_test_command_of_the_readme():
     assert "pytest -q -n 2" in (ROOT / ".ci" / "run").read_text("utf-8")
 
 
-def test_every_relative_link_and_named_file_exists():
-    names = re.findall(r"\]\(([^)#:]+)\)", README) + re.findall(r"`(\w+\.md|docs/[\w./-]+)`", README)
-    assert [name for name in names if not (ROOT / name).exists()] == []
-
-
 @pytest.mark.parametrize("folder", EXPERIMENTS, ids=lambda folder: folder.name)
 def test_an_experiment_is_a_script_an_expectation_and_a_result_that_meets_it(folder):
     assert os.access(folder / "run.sh", os.X_OK)
