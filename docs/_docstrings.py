@@ -12,8 +12,10 @@ from typing import Any
 import griffe
 
 HEADS = {"Args:", "Attributes:", "Raises:"}
-ITEM = re.compile(r"(?:^|(?<=[.;\])] ))((?:\w+, )*\w+): (?=\S)")
+ITEM = re.compile(r"(?:^|(?<=[.;,\])] ))((?:\w+, )*\w+): (?=\S)")
 NAME = re.compile(r"(?<![`\w])`([A-Za-z_]\w*)`(?!`)")
+STAR = re.compile(r"(?<=\w)\*(?=\()")
+ZERO_WIDTH_SPACE = "\u200b"
 
 
 def one_a_line(text: str, known: set[str]) -> str:
@@ -48,8 +50,19 @@ def _split(line: str, known: set[str]) -> list[str]:
 
 
 def linked(text: str, places: dict[str, str]) -> str:
-    """Turn `name` into a link where a name is public."""
+    """Turn `name` into a link where a name is public, and keep Markdown away from units in brackets and from u*(κ)."""
+    text = STAR.sub(r"\\*", text.replace("] [", f"]{ZERO_WIDTH_SPACE} ["))
     return NAME.sub(lambda match: f"[{match[0]}][{places[match[1]]}]" if match[1] in places else match[0], text)
+
+
+def _has_an_entry(seen: Any) -> bool:
+    """Whether the reference shows a member of a room."""
+    if seen.name.startswith("_") or (seen.is_alias and not seen.public):
+        return False
+    try:
+        return seen.docstring is not None
+    except griffe.AliasResolutionError:  # of another package
+        return False
 
 
 class Docstrings(griffe.Extension):
@@ -58,9 +71,10 @@ class Docstrings(griffe.Extension):
     def on_package(self, *, pkg: griffe.Module, **kwargs: Any) -> None:
         """Walk the package."""
         del kwargs
-        rooms = {name: room for name, room in pkg.members.items() if not name.startswith("_") and room.is_module}
-        for room in rooms.values():
-            places = {name: f"{room.path}.{name}" for name, seen in room.members.items() if not name.startswith("_")}
+        for room in pkg.members.values():
+            if room.is_alias or not room.is_module:
+                continue
+            places = {name: f"{room.path}.{name}" for name, seen in room.members.items() if _has_an_entry(seen)}
             self._walk(room, places)
 
     def _walk(self, place: Any, places: dict[str, str]) -> None:
@@ -74,7 +88,7 @@ class Docstrings(griffe.Extension):
         """Rewrite one docstring."""
         if seen.docstring is None:
             return
-        known = {name for name, member in seen.members.items() if member.is_attribute}
+        known = set(seen.members)
         known |= {parameter.name for parameter in seen.parameters} if seen.is_function else set()
         known |= set(re.findall(r"\b[A-Z]\w+(?=: )", seen.docstring.value))  # errors
         seen.docstring.value = linked(one_a_line(seen.docstring.value, known), places)
