@@ -44,7 +44,7 @@ def _split(line: str, known: set[str]) -> list[str]:
     parts = [indent + before.strip()] if before.strip() else []
     for place, match in enumerate(starts):
         end = starts[place + 1].start() if place + 1 < len(starts) else len(body)
-        said = body[match.end() : end].strip()
+        said = body[match.end() : end].strip().rstrip(",")
         parts += [f"    {name}: {said}" for name in match[1].split(", ")]
     return parts
 

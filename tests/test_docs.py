@@ -101,8 +101,8 @@ def test_every_program_names_what_the_package_has(page):
         tree = ast.parse(block)
         rooms = {"sfkd_jax": ()}
         for node in ast.walk(tree):
-            if isinstance(node, ast.ImportFrom) and (node.module or "").split(".")[0] == "sfkd_jax":
-                place = tuple(node.module.split(".")[1:])
+            package, *place = (getattr(node, "module", None) or "").split(".")
+            if isinstance(node, ast.ImportFrom) and package == "sfkd_jax":
                 assert {alias.name for alias in node.names} <= names_in(*place), node.module
                 rooms |= {alias.asname or alias.name: (alias.name,) for alias in node.names if alias.name in ROOMS}
         for node in ast.walk(tree):
