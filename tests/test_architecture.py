@@ -47,7 +47,7 @@ EVERYWHERE = set(sys.stdlib_module_names) | {PACKAGE, "jax", "jaxtyping"}
 FRONT = {"hydra", "omegaconf", "numpy", "rich"}
 THIRD_PARTY = {
     "artefacts": {"numpy"},
-    "datasets": {"numpy"},
+    "datasets": {"numpy", "pyarrow"},
     "models": {"flax"},
     "control": {"flax"},
     "training": {"optax", "orbax", "tensorboardX", "rich"},
@@ -65,7 +65,7 @@ THIRD_PARTY = {
 FILES = {file.relative_to(SRC).as_posix(): ast.parse(file.read_text("utf-8")) for file in SRC.rglob("*.py")}
 ROOMS = {name: name.split("/")[0].removesuffix(".py") for name in FILES}
 FOREIGN = {"brax": {"adapters/_brax.py", "adapters/_brax_system.py"}, "gymnasium": {"adapters/_gymnasium.py"}}
-FOREIGN |= {"iree": {"exporting/_iree.py"}}
+FOREIGN |= {"iree": {"exporting/_iree.py"}, "pyarrow": {"datasets/_tables.py"}}
 WORKSHOP = {"hydra", "omegaconf", "cvxpy", "clarabel", "orbax", "brax", "matplotlib", "optax"}
 WRITES = {f"os.environ.{verb}" for verb in ("update", "setdefault", "pop", "popitem", "clear")}
 HOST = {"walk", "drive", "training", "certification", "exporting"}

@@ -40,7 +40,8 @@ def test_every_model_option_builds_and_names_its_system(option):
 @pytest.mark.parametrize("vehicle", [name for group, name in OPTIONS if group == "vehicle"])
 @pytest.mark.parametrize("controller", [name for group, name in OPTIONS if group == "controller"])
 def test_every_controller_builds_for_every_vehicle(vehicle, controller):
-    composed = settings(f"vehicle={vehicle}", f"controller={controller}")
+    limits = ("vehicle.control_low=[-0.4,-3.0]", "vehicle.control_high=[0.4,2.0]") if vehicle == "own" else ()
+    composed = settings(f"vehicle={vehicle}", f"controller={controller}", *limits)
     plant = assembly.build_vehicle(composed["vehicle"])
     model = assembly.reference_systems(plant)["oracle"].model
     if composed["controller"]["planner"] == "koopman_mpc":  # the only planner that needs a linear predictor
@@ -71,3 +72,10 @@ def test_option_files_stay_short():
 def test_a_wrong_option_is_refused_by_name(override, says):
     with pytest.raises((HydraException, OmegaConfBaseException), match=says):
         settings(override)
+
+
+def test_logs_are_of_a_robot_of_ones_own_unless_a_plant_is_named():
+    columns = "dataset.columns.state=[x,y,heading,speed,rate]"
+    assert settings("dataset=files", columns)["vehicle"]["state_names"] == ["x", "y", "heading", "speed", "rate"]
+    assert settings("dataset=files")["vehicle"]["name"] == "own"
+    assert settings("dataset=files", "vehicle=dynamic")["vehicle"]["name"] == "dynamic"

@@ -16,7 +16,7 @@ Settings = Mapping[str, Any]
 
 ENVS = ("measured", "estimated", "none")
 """How a controller learns of the environment."""
-PLANTS = {"kinematic": vehicle.kinematic, "dynamic": vehicle.dynamic}
+PLANTS = {"kinematic": vehicle.kinematic, "dynamic": vehicle.dynamic, "own": vehicle.own}
 INNER_LOOPS = ("none", "speed")
 
 
@@ -48,7 +48,10 @@ def build_vehicle(settings: Settings) -> vehicle.Vehicle:
     if loop not in INNER_LOOPS:
         raise ValueError(f"unknown vehicle.inner_loop {loop!r}; choose one of {', '.join(INNER_LOOPS)}")
     factory = choose(PLANTS, settings["name"], "vehicle")
-    plant = factory(**without(settings, "name", "inner_loop", "speed_gain"))
+    options = without(settings, "name", "inner_loop", "speed_gain")
+    if options.get("step") is not None:
+        options["step"] = vehicle.step_named(options["step"])
+    plant = factory(**options)
     return vehicle.with_speed_loop(plant, gain=settings["speed_gain"]) if loop == "speed" else plant
 
 
@@ -80,7 +83,13 @@ def build_controller(
     certificate: Settings | None = None,
     env: str = "measured",
 ) -> Controller:
-    """The planner of the settings, watched by a monitor if there is a certificate, told an estimate if `env` asks."""
+    """The planner of the settings, watched by a monitor if there is a certificate, told an estimate if `env` asks.
+
+    Raises:
+        ValueError: an unknown planner, or a vehicle without limits of its controls.
+    """
+    if not plant.control_low:
+        raise ValueError("a controller needs vehicle.control_low and vehicle.control_high, as in [-0.4,-3.0]")
     build = choose(PLANNERS, settings.get("planner", "mppi"), "controller.planner")
     planner = build(settings, model, plant, env_low, env_high)
     watched = planner if certificate is None else _monitored(planner, settings, model, certificate)

@@ -57,14 +57,17 @@ def _tubes(settings: dict[str, Any], trained: policy.Policy) -> dict[str, Any]:
     """What is proved of a model's steps, and what is measured on the data of the run."""
     dataset, _ = walk.ensure_dataset(settings)
     options = {name: value for name, value in settings["certification"].items() if name != "renew"}
+    boxes, noise = shelf.boxes(dataset), tuple(settings["evaluation"]["observation_noise"])
+    if shelf.is_logged(settings):  # the robot's own sensors are in its logs already
+        boxes, noise = boxes | {"names": shelf.channel_names(settings)}, ()
     return issue(
         trained.model,
         trained.params,
         validation=dataset.validation,
         calibration=dataset.calibration,
         held_out=walk.held_out_drives(settings, dataset),
-        boxes=shelf.boxes(dataset),
-        sensor_noise=tuple(settings["evaluation"]["observation_noise"]),
+        boxes=boxes,
+        sensor_noise=noise,
         **assembly.without(options),
     )
 

@@ -98,14 +98,15 @@ def register() -> None:
     """Put every schema into Hydra's store."""
     store = ConfigStore.instance()
     loop = {"name": str, "inner_loop": "none", "speed_gain": 1.0}
-    for plant in assembly.PLANTS.values():
-        name = f"{plant.__name__}_schema"
-        store.store(group="vehicle", name=name, node=schema("VehicleConfig", plant, **loop))
+    for name, plant in assembly.PLANTS.items():
+        store.store(group="vehicle", name=f"{name}_schema", node=schema("VehicleConfig", plant, **loop))
     fixed = ("state_size", "dt", "duration")
     store.store(group="scenario", name="schema", node=schema("ScenarioConfig", scenarios.scenario, skip=fixed))
     split = {"seed": 0, "shares": list[float], "env_low": list[float], "env_high": list[float]}
-    dataset = schema("DatasetConfig", datasets.generate, **split)
-    store.store(group="dataset", name="schema", node=dataset)
+    store.store(group="dataset", name="schema", node=schema("DatasetConfig", datasets.generate, **split))
+    logs = {"path": str, "columns": schema("ColumnsConfig", **datasets.Columns._field_defaults)}
+    node = schema("LogsConfig", datasets.from_logs, skip=("dt", "wheelbase", "limits", "told", "say"), **logs)
+    store.store(group="dataset", name="files_schema", node=node)
     for name, factory in models.FACTORIES.items():
         node = schema("ModelConfig", factory, skip=("dt", "nominal"), name=str, system=str)
         store.store(group="model", name=f"{name}_schema", node=node)
@@ -120,11 +121,11 @@ def register() -> None:
     )
     store.store(group="training", name="schema", node=node)
     protocol = {"episodes": 8, "episode_s": 60.0, "seed": 2026, "systems": _SYSTEMS, "observation_noise": _SENSORS}
-    protocol |= {"timed_steps": 50, "side_forces": (), "threshold_m": _THRESHOLD}
-    protocol |= {"variation": None, "told": schema("ToldConfig", evaluation.told, skip=("dt",))}
+    protocol |= {"timed_steps": 50, "side_forces": (), "threshold_m": _THRESHOLD, "variation": None}
+    protocol |= {"told": schema("ToldConfig", evaluation.told, skip=("dt",))}
     store.store(group="evaluation", name="schema", node=schema("EvaluationConfig", **protocol))
-    skipped = ("validation", "calibration", "held_out", "boxes", "sensor_noise")
-    node = schema("CertificationConfig", issue, skip=skipped, renew=False)
+    measured = ("validation", "calibration", "held_out", "boxes", "sensor_noise")
+    node = schema("CertificationConfig", issue, skip=measured, renew=False)
     store.store(group="certification", name="schema", node=node)
     node = schema("ExportConfig", exporting.write_controller, skip=("made_from",))
     store.store(group="export", name="schema", node=node)
@@ -163,9 +164,7 @@ def _controller_schema() -> type:
     shared = ("lateral", "course", "speed", "steering_rate", "effort", "terminal_weight")
     parts["koopman_mpc"] = schema("KoopmanMpcConfig", control.koopman_mpc, skip=(*fixed, *shared))
     watched = ("bounds", "state_low", "state_high", *fixed)
-    parts["estimator"] = schema(
-        "EstimatorConfig", control.estimated, skip=("env_low", "env_high", "states", "controls")
-    )
+    parts["estimator"] = schema("EstimatorConfig", control.estimated, skip=(*fixed, "states", "controls"))
     parts["monitor"] = schema("MonitorConfig", control.monitored, skip=watched)
     fields = [(name, part, field(default_factory=part)) for name, part in parts.items()]
     head = [("name", str), ("planner", str), ("sampling", typing.Any), ("ancillary", bool, field(default=False))]

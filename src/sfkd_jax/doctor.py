@@ -20,6 +20,7 @@ EXTRAS = {
     "certify": ("cvxpy", "clarabel"),
     "brax": ("brax",),
     "gym": ("gymnasium",),
+    "parquet": ("pyarrow",),
     "cpp": ("iree.compiler", "iree.runtime"),
     "sweeps": ("hydra_plugins.hydra_joblib_launcher", "hydra_plugins.hydra_optuna_sweeper", "submitit"),
 }

@@ -15,7 +15,7 @@ from sfkd_jax.certification import conformal_tube, latent_tube
 from sfkd_jax.datasets import Dataset
 from sfkd_jax.scenarios import Scenario
 from sfkd_jax.types import Trajectory
-from sfkd_jax.vehicle import Vehicle
+from sfkd_jax.vehicle import Vehicle, check_step
 
 OPEN_LOOP_STEPS = (1, 5, 10, 20)
 
@@ -47,7 +47,12 @@ TestDriver: TypeAlias = Callable[[Track], Drive]
 
 
 def lay(settings: dict[str, Any], plant: Vehicle) -> Track:
-    """The episodes of a scenario; on several devices they are spread over all of them."""
+    """The episodes of a scenario; on several devices they are spread over all of them.
+
+    Raises:
+        ValueError: a vehicle that nothing can drive.
+    """
+    check_step(plant)
     protocol = settings["evaluation"]
     family = assembly.build_scenario(settings["scenario"], plant, duration=protocol["episode_s"])
     road_key, drive_key = jax.random.split(jax.random.key(protocol["seed"]))
@@ -71,6 +76,8 @@ def prepare(
     protocol, box = settings["evaluation"], settings["dataset"]
     limits = {"env_low": box["env_low"], "env_high": box["env_high"], "certificate": system.certificate}
     limits["env"] = system.env
+    if dataset is not None:
+        limits |= {"env_low": dataset.env_low.tolist(), "env_high": dataset.env_high.tolist()}
     controller = assembly.build_controller(settings["controller"], system.model, plant, **limits)
     options = {"horizon": assembly.controller_horizon(settings["controller"]), "dt": plant.dt}
     options["observation_noise"] = tuple(protocol["observation_noise"])

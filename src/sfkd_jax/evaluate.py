@@ -19,8 +19,8 @@ def run(settings: dict[str, Any]) -> dict[str, Any]:
     began = time.perf_counter()
     place, protocol = shelf.run_directory(settings), settings["evaluation"]
     plant = assembly.build_vehicle(settings["vehicle"])
+    track = drive.lay(settings, plant)  # first: a vehicle that nothing can drive is refused before anything is trained
     systems = walk.systems(settings, plant)
-    track = drive.lay(settings, plant)
     dataset, _ = walk.ensure_dataset(settings)
     rows: list[dict[str, Any]] = []
     arrays: dict[str, Any] = {

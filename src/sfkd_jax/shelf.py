@@ -12,7 +12,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from sfkd_jax import artefacts
-from sfkd_jax.datasets import Dataset
+from sfkd_jax.datasets import Dataset, environment_box, fingerprint
 from sfkd_jax.types import BODY, Trajectory
 
 DATASET = "dataset"
@@ -35,13 +35,22 @@ def dataset_path(settings: dict[str, Any]) -> Path:
 
 
 def dataset_config(settings: dict[str, Any]) -> dict[str, Any]:
-    """What a data set was made with."""
-    return {"vehicle": settings["vehicle"], "dataset": settings["dataset"]}
+    """What a data set was made with: of logs their contents, not where they lie."""
+    asked = dict(settings["dataset"])
+    if is_logged(settings):
+        path, told = asked.pop("path"), settings.get("env") != "none"
+        asked |= {"contents": fingerprint(path), "environment_known": told}
+    return {"vehicle": settings["vehicle"], "dataset": asked}
+
+
+def is_logged(settings: dict[str, Any]) -> bool:
+    """Whether the data set is read from logs instead of driven."""
+    return "path" in settings["dataset"]
 
 
 def identity(settings: dict[str, Any]) -> dict[str, Any]:
     """What a policy was made with."""
-    return {name: settings[name] for name in IDENTITY}
+    return {name: settings[name] for name in IDENTITY} | dataset_config(settings)
 
 
 def write_dataset(settings: dict[str, Any], dataset: Dataset) -> dict[str, Any]:
@@ -58,7 +67,9 @@ def read_dataset(settings: dict[str, Any]) -> tuple[Dataset, str]:
     """The four splits and their hash."""
     arrays, manifest = artefacts.read_arrays(dataset_path(settings), kind=DATASET, config=dataset_config(settings))
     parts = [Trajectory(*(jnp.asarray(arrays[f"{part}/{name}"]) for name in Trajectory._fields)) for part in PARTS]
-    low, high = (jnp.asarray(settings["dataset"][name], dtype=jnp.float32) for name in ("env_low", "env_high"))
+    asked = settings["dataset"]
+    envs = np.concatenate([np.asarray(part.envs) for part in parts])
+    low, high = environment_box(envs, asked["env_low"], asked["env_high"])
     return Dataset(*parts, env_low=low, env_high=high), manifest["sha256"]
 
 
@@ -96,6 +107,16 @@ def boxes(dataset: Dataset) -> dict[str, Any]:
         "state": hull(lambda part: part.states[..., BODY]),
         "control": hull(lambda part: part.controls),
         "env": [np.asarray(dataset.env_low).tolist(), np.asarray(dataset.env_high).tolist()],
+    }
+
+
+def channel_names(settings: dict[str, Any]) -> dict[str, list[str]]:
+    """How logs name what the boxes bound; an environment that the model does not read has no name."""
+    columns, known = settings["dataset"]["columns"], settings.get("env") != "none"
+    return {
+        "state": columns["state"][BODY],
+        "control": columns["control"],
+        "env": columns["environment"] if known else [],
     }
 
 

@@ -6,17 +6,25 @@ import time
 from pathlib import Path
 from typing import Any
 
-from sfkd_jax import artefacts, certify, evaluate, report, shelf, walk
+from sfkd_jax import artefacts, assembly, certify, evaluate, report, shelf, walk
 from sfkd_jax.config import door
+from sfkd_jax.vehicle import check_step
 
 
 def run(settings: dict[str, Any]) -> dict[str, Any]:
-    """Walk: data, weights, certificate, closed loop, report."""
+    """Walk: data, weights, certificate, closed loop if there is a step to drive with, report."""
     began = time.perf_counter()
+    plant = assembly.build_vehicle(settings["vehicle"])
+    if plant.simulated:
+        check_step(plant)
     walk.ensure_policy(settings)
     place = shelf.run_directory(settings)
     certificate = certify.renew(settings)
-    results = evaluate.run(settings)
+    if plant.simulated:
+        results = evaluate.run(settings)
+    else:
+        results = {"results": None}
+        shelf.say("not driven: vehicle=own is known from logs alone; vehicle.step=package.module:function drives it")
     pages = report.run(settings)
     return {
         "run": str(place),

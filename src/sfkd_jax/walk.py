@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from functools import partial
 from typing import Any
 
@@ -11,8 +12,10 @@ import jax.numpy as jnp
 from sfkd_jax import artefacts, assembly, policy, shelf
 from sfkd_jax.certification import progress
 from sfkd_jax.datasets import (
+    Columns,
     Dataset,
     first_share,
+    from_logs,
     generate,
     generate_switching,
     measure_space,
@@ -31,22 +34,63 @@ SWITCHING = 2
 
 
 def ensure_dataset(settings: dict[str, Any]) -> tuple[Dataset, str]:
-    """The data set and its hash, driven now if it does not lie on the shelf."""
-    asked = settings["dataset"]
+    """The data set and its hash, read from logs or driven now if it does not lie on the shelf."""
     if not artefacts.exists(shelf.dataset_path(settings)):
-        shelf.say(f"generating {asked['segments']} segments")
-        plant = assembly.build_vehicle(settings["vehicle"])
-        drive_key, split_key = jax.random.split(jax.random.key(asked["seed"]))
-        options = assembly.without(asked, *SPLIT)
-        trajectories = jax.jit(partial(generate, plant, assembly.build_driver(plant), **options))(drive_key)
-        low, high = jnp.asarray(asked["env_low"]), jnp.asarray(asked["env_high"])
-        dataset = split(trajectories, split_key, shares=tuple(asked["shares"]), env_low=low, env_high=high)
+        dataset = _from_logs(settings) if shelf.is_logged(settings) else _driven(settings)
         shelf.write_dataset(settings, dataset)
     return shelf.read_dataset(settings)
 
 
+def _driven(settings: dict[str, Any]) -> Dataset:
+    """A data set that the vehicle's own step drives."""
+    asked = settings["dataset"]
+    shelf.say(f"generating {asked['segments']} segments")
+    plant = assembly.build_vehicle(settings["vehicle"])
+    drive_key, split_key = jax.random.split(jax.random.key(asked["seed"]))
+    options = assembly.without(asked, *SPLIT)
+    trajectories = jax.jit(partial(generate, plant, assembly.build_driver(plant), **options))(drive_key)
+    low, high = jnp.asarray(asked["env_low"]), jnp.asarray(asked["env_high"])
+    return split(trajectories, split_key, shares=tuple(asked["shares"]), env_low=low, env_high=high)
+
+
+def _from_logs(settings: dict[str, Any]) -> Dataset:
+    """A data set from logs; what they cover is said, and kept beside it."""
+    asked, plant = settings["dataset"], assembly.build_vehicle(settings["vehicle"])
+    columns = Columns(**assembly.without(asked["columns"]))
+    if len(columns.state) != len(plant.state_names):
+        named = f"vehicle {plant.name} has {', '.join(plant.state_names)}"
+        raise ValueError(
+            f"dataset.columns.state names {len(columns.state)} columns, {named}; name as many, in this order"
+        )
+    shelf.say(f"reading {asked['path']}")
+    known = {"dt": plant.dt, "wheelbase": plant.wheelbase, "told": settings.get("env") != "none"}
+    known["limits"] = (plant.control_low or None, plant.control_high or None)
+    logged = from_logs(asked["path"], columns, say=shelf.say, **known, **assembly.without(asked, "path", "columns"))
+    artefacts.write_json(shelf.dataset_path(settings).with_name("coverage.json"), logged.coverage)
+    return logged.dataset
+
+
+def _check_enough(settings: dict[str, Any]) -> None:
+    """Refuse logs, or levels that so few segments cannot support, before a run is begun.
+
+    Raises:
+        ValueError: naming the settings and the levels that can be asked for.
+    """
+    count = ensure_dataset(settings)[0].calibration.controls.shape[0]
+    asked = {name: settings["certification"][name] for name in ("level", "monitor_level")}
+    if most := [name for name, level in asked.items() if math.ceil((count + 1) * level) > count]:
+        wanted = " ".join(f"certification.{name}={asked[name]:g}" for name in most)
+        possible = " ".join(f"certification.{name}={math.floor(100 * count / (count + 1)) / 100:g}" for name in most)
+        raise ValueError(f"{count} calibration segments are too few for {wanted}: record more, or pass {possible}")
+
+
 def held_out_drives(settings: dict[str, Any], dataset: Dataset) -> dict[str, Trajectory]:
-    """What coverage is counted on: the test split, its S1 and S2 parts, and as many drives under S3's switching."""
+    """What coverage is counted on: the test split, its S1 and S2 parts, and as many drives under S3's switching.
+
+    Of logged drives the test split alone: where they were driven has no name, and nothing drives them elsewhere.
+    """
+    if shelf.is_logged(settings):
+        return {"test": dataset.test}
     asked, plant = settings["dataset"], assembly.build_vehicle(settings["vehicle"])
     options = {name: value for name, value in assembly.without(asked, *SPLIT).items() if name != "fixed_levels"}
     options["segments"] = dataset.test.controls.shape[0]
@@ -66,8 +110,11 @@ def ensure_policy(settings: dict[str, Any]) -> policy.Policy:
         ArtefactError: what lies there was made with other settings, or is damaged.
     """
     place = shelf.run_directory(settings)
+    trained = artefacts.exists(place / "policy.npz")
+    if shelf.is_logged(settings) and not trained:
+        _check_enough(settings)
     shelf.claim(settings)
-    if not artefacts.exists(place / "policy.npz"):
+    if not trained:
         _train(settings)
     return policy.load(place)
 
@@ -94,6 +141,7 @@ def _train(settings: dict[str, Any]) -> None:
     """Fit, then store the best weights and their prediction error on the test split."""
     place, options = shelf.run_directory(settings), dict(settings["training"])
     dataset, data_hash = ensure_dataset(settings)
+    kept = _concrete(settings, dataset)
     dataset = dataset._replace(train=first_share(dataset.train, options.pop("data_share")))
     space = measure_space(dataset)
     model = assembly.build_model(settings["model"], space, assembly.build_vehicle(settings["vehicle"]))
@@ -112,6 +160,18 @@ def _train(settings: dict[str, Any]) -> None:
     errors = jax.jit(partial(open_loop, model, horizon=horizon))(params, dataset.test)
     document = shelf.open_loop_document(errors, dataset.test, settings["vehicle"]["dt"])
     artefacts.write_json(place / "open_loop.json", document)
-    kept = shelf.identity(settings) | {"controller": settings["controller"], "experiment": settings["name"]}
+    kept |= {"controller": settings["controller"], "experiment": settings["name"]}
     kept |= {"space": assembly.space_to_settings(space), "best_step": best}
     policy.save(place / "policy.npz", params, kept, made_from={"dataset": data_hash})
+
+
+def _concrete(settings: dict[str, Any], dataset: Dataset) -> dict[str, Any]:
+    """What a policy was made with, and of logs what only they can say: the box E and how far controls went."""
+    kept = shelf.identity(settings)
+    if not shelf.is_logged(settings):
+        return kept
+    box = {"env_low": dataset.env_low.tolist(), "env_high": dataset.env_high.tolist()}
+    if kept["vehicle"]["name"] == "own" and not kept["vehicle"]["control_low"]:
+        low, high = shelf.boxes(dataset)["control"]
+        kept |= {"vehicle": kept["vehicle"] | {"control_low": low, "control_high": high}}
+    return kept | {"dataset": kept["dataset"] | box}

@@ -1,8 +1,14 @@
 """The archive: driving data, its splits, windows and scales."""
 
+from sfkd_jax.datasets._coverage import coverage as coverage
+from sfkd_jax.datasets._files import fingerprint as fingerprint
+from sfkd_jax.datasets._from_logs import Logged as Logged
+from sfkd_jax.datasets._from_logs import environment_box as environment_box
+from sfkd_jax.datasets._from_logs import from_logs as from_logs
 from sfkd_jax.datasets._generation import Driver as Driver
 from sfkd_jax.datasets._generation import generate as generate
 from sfkd_jax.datasets._generation import generate_switching as generate_switching
+from sfkd_jax.datasets._logs import Columns as Columns
 from sfkd_jax.datasets._splits import Dataset as Dataset
 from sfkd_jax.datasets._splits import first_share as first_share
 from sfkd_jax.datasets._splits import measure_space as measure_space

@@ -76,7 +76,9 @@ def measure_space(dataset: Dataset) -> Space:
     body = _range(train.states[..., BODY])
     control = _range(train.controls)
     centre, half = 0.5 * (dataset.env_high + dataset.env_low), 0.5 * (dataset.env_high - dataset.env_low)
-    return Space(*body, *control, centre, half, increments.mean(axis=0), _away_from_zero(increments.std(axis=0)))
+    return Space(
+        *body, *control, centre, _away_from_zero(half), increments.mean(axis=0), _away_from_zero(increments.std(axis=0))
+    )
 
 
 def windows(

@@ -99,7 +99,12 @@ def pushed(
         plant: whose wind it is. envs: as measured.
         key: of the episode, and not consumed: its other streams stay what they are without a push.
         largest: F, forces lie in [-F, F] [N].
+
+    Raises:
+        ValueError: a plant on which wind has no force.
     """
+    if not plant.wind_force:
+        raise ValueError("evaluation.side_forces push through the wind, and vehicle.wind_force is 0")
     force = side_pushes(jax.random.fold_in(key, PUSHES), steps=envs.shape[0], dt=plant.dt, largest=largest)
     wind = jax.vmap(partial(equivalent_wind, wind_force=plant.wind_force))(envs[:, 1], force)
     return envs.at[:, 1].set(wind)

@@ -64,6 +64,8 @@ def driving(run: Path, rows: list[list[dict[str, Any]]], settings: dict[str, Any
     """Closed loop: the table the summary speaks of, the pictures, then every other table."""
     blocks: list[Block] = [Heading(2, "How it drives")]
     head = headline(rows, settings)
+    if not head and dig(settings, "vehicle", "name") == "own" and not dig(settings, "vehicle", "step"):
+        return [*blocks, Text("Not driven: the robot is known from logs alone, so there is nothing here to drive.")]
     if head:
         blocks += [*_scores(head), Text(_EXPLAINED, kind="note")]
     else:

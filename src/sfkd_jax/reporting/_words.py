@@ -15,7 +15,11 @@ def command(door: str, settings: dict[str, Any]) -> str:
     """The command line that opens a door for this run."""
     name, model = settings.get("experiment"), model_of(settings)
     parts = ["python", "-m", f"sfkd_jax.{door}"]
-    parts += [f"+experiment={name}"] if name not in (None, "", "default") else []
+    if dig(settings, "dataset", "contents"):
+        parts += ["dataset=files", "dataset.path=LOGS"]
+        parts += [f"name={name}"] if name not in (None, "", "default") else []
+    else:
+        parts += [f"+experiment={name}"] if name not in (None, "", "default") else []
     parts += [f"model={model}"] if model != "sfkd" else []
     return shlex.join([*parts, f"seed={plain(settings.get('seed', 0))}"])
 
@@ -49,6 +53,7 @@ def summary(
     """What was trained, what is certified and how well it drives, in one paragraph."""
     model, vehicle = model_of(settings), dig(settings, "vehicle", "name")
     plant = f" on the {vehicle} vehicle" if vehicle else ""
+    plant = " from logged drives" if dig(settings, "dataset", "contents") else plant
     steps = dig(metrics[-1], "step") if metrics else None
     trained = f" for {short(steps, 9)} steps" if is_number(steps) else ""
     sentences = [f"{label(model)} was trained{plant}{trained} (seed {plain(settings.get('seed'))})."]
@@ -129,7 +134,9 @@ def certificate_words(record: dict[str, Any]) -> list[Text]:
     if not holds(record):
         reason = plain(record.get("reason")) if record.get("reason") else "the file gives no reason"
         return [Text(f"No contraction is certified for these weights: {reason}.", "Nothing is proved.")]
-    boxes = "; ".join(f"{name}: {_box(dig(record, 'boxes', name), names)}" for name, names in _AXES.items())
+    boxes = "; ".join(
+        f"{name}: {_box(dig(record, 'boxes', name), _axes(record, name))}" for name in _AXES if _axes(record, name)
+    )
     limits = (
         f"Nothing is claimed outside the boxes in which d̄ was measured ({boxes}). The certificate says how a "
         "prediction error grows; how well the vehicle tracks is the measurement in the section above."
@@ -142,10 +149,11 @@ def certificate_words(record: dict[str, Any]) -> list[Text]:
 
 
 def _proved(record: dict[str, Any]) -> str:
-    where = _box(dig(record, "boxes", "env"), _AXES["env"])
+    axes = _axes(record, "env")
+    where = f" with {_box(dig(record, 'boxes', 'env'), axes)}" if axes else ", which the model does not read"
     alpha = upper(record["alpha"])
     text = (
-        f"For every environment with {where}, every control and any two latent states, one step of the "
+        f"For every environment{where}, every control and any two latent states, one step of the "
         f"model leaves the two at most α = {alpha} times as far apart as they were. This is a "
         "bound on all of them, not an average over a sample. So an error made once fades, and errors of at "
         "most d̄ per step add up to no more than the tube Rₖ"
@@ -177,6 +185,12 @@ _AXES = {
     "control": (("steering", " rad"), ("acceleration or commanded speed", "")),
     "env": (("friction", ""), ("side wind", " m/s")),
 }
+
+
+def _axes(record: dict[str, Any], box: str) -> tuple[tuple[str, str], ...]:
+    """Name and unit of every side of a box: as the logs name them, or else as the benchmark's plants do."""
+    named = dig(record, "boxes", "names", box)
+    return _AXES[box] if named is None else tuple((str(name), "") for name in named)
 
 
 def _box(box: Any, names: tuple[tuple[str, str], ...]) -> str:

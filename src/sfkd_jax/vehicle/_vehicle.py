@@ -29,6 +29,7 @@ class Vehicle(NamedTuple):
         control_low, control_high: actuator limits.
         wind_force: c_w of `side_force` [N s²/m²].
         speed_loop: whether u_2 is a speed command [m/s] instead of an acceleration [m/s²].
+        simulated: whether there is a step to drive with; False for a robot that is known from logs alone.
     """
 
     name: str
@@ -39,10 +40,11 @@ class Vehicle(NamedTuple):
     derivative: Step
     nominal: Step
     nominal_derivative: Step
-    control_low: tuple[float, float]
-    control_high: tuple[float, float]
+    control_low: tuple[float, ...]
+    control_high: tuple[float, ...]
     wind_force: float
     speed_loop: bool = False
+    simulated: bool = True
 
 
 def side_force(wind: Float[Array, ""], *, wind_force: float) -> Float[Array, ""]:
@@ -100,7 +102,14 @@ def with_speed_loop(vehicle: Vehicle, *, gain: float = 1.0) -> Vehicle:
     Args:
         vehicle: any plant whose second control is an acceleration.
         gain: k_v [1/s].
+
+    Raises:
+        ValueError: the vehicle takes speed commands already, or has no limits.
     """
+    if vehicle.speed_loop or not vehicle.control_low:
+        raise ValueError(
+            "vehicle.inner_loop=speed needs limits of the acceleration; of speed commands: speed_loop=true"
+        )
     low, high = vehicle.control_low[1], vehicle.control_high[1]
 
     def close(step: Step) -> Step:

@@ -1,0 +1,74 @@
+"""Whether controls were excited, and whether controls and environments stay where they are said to stay."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from typing import TypeAlias
+
+import numpy as np
+from jaxtyping import Float
+
+from sfkd_jax.datasets._checks import Finding
+from sfkd_jax.datasets._logs import Columns, Log
+
+Ends: TypeAlias = tuple[tuple[float, ...] | None, tuple[float, ...] | None]
+"""Lowest and highest of every channel, or None where nothing is asked."""
+ROUNDED = 1e-5
+"""How far outside its range a channel may be: float32 rounds."""
+
+
+def check_ranges(logs: list[Log], columns: Columns, *, limits: Ends, box: Ends) -> Iterator[Finding]:
+    """Refuses controls that never move and environments outside E; warns of poor excitation and limits that are left.
+
+    Args:
+        logs: all drives. columns: their names. limits: of the controls. box: E.
+    """
+    where = span(logs)
+    for k, name in enumerate(columns.control):
+        held = np.concatenate([log.controls[:, k] for log in logs])
+        kinds = len(np.unique(held))
+        if np.ptp(held) <= 1e-9 * max(1.0, float(np.abs(held).max())):
+            yield Finding(f"{where}: {name} is always {held[0]:.4g}; without excitation nothing can be learned of it")
+        elif kinds < 5:
+            yield Finding(f"{where}: {name} takes only {kinds} values; richer excitation teaches more", refused=False)
+    if limits[0] and limits[1]:
+        yield from _outside(logs, columns.control, "controls", (limits[0], limits[1]), "vehicle.control", refused=False)
+    low, high = box
+    if low is None and high is None:
+        return
+    size = logs[0].envs.shape[1]
+    if low is None or high is None or {len(low), len(high)} != {size} or np.any(np.greater(low, high)):
+        yield Finding(
+            f"dataset.env_low and dataset.env_high must be {size} numbers each, the low ones not above the high"
+        )
+        return
+    names = columns.environment if len(columns.environment) == size else ("environment",) * size
+    yield from _outside(logs, names, "envs", (low, high), "dataset.env", refused=True)
+
+
+def span(logs: list[Log]) -> str:
+    """Where several drives stand, for a person."""
+    return logs[0].whole + (f" and {len(logs) - 1} drives more" if len(logs) > 1 else "")
+
+
+def _outside(
+    logs: list[Log],
+    names: tuple[str, ...],
+    field: str,
+    ends: tuple[tuple[float, ...], tuple[float, ...]],
+    setting: str,
+    *,
+    refused: bool,
+) -> Iterator[Finding]:
+    """Per channel, the first row that leaves its range."""
+    for k, (name, low, high) in enumerate(zip(names, *ends, strict=True)):
+        for log in logs:
+            values: Float[np.ndarray, " time"] = getattr(log, field)[:, k]
+            slack = ROUNDED * max(1.0, abs(low), abs(high))
+            left = (values < low - slack) | (values > high + slack)
+            if left.any():
+                first = int(left.argmax())
+                says = f"{name} is {values[first]:.4g}, outside {low:g} to {high:g} of {setting}_low and {setting}_high"
+                rows = f" ({int(left.sum())} rows like this)" if left.sum() > 1 else ""
+                yield Finding(f"{log.at(first)}: {says}{rows}", refused)
+                break

@@ -1,0 +1,116 @@
+"""Logs of one's own through the door: from csv files to a certified policy that loads."""
+
+import json
+import shutil
+import sys
+from pathlib import Path
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from helpers import door, last_line
+from hydra import compose, initialize_config_dir
+from omegaconf import OmegaConf
+
+import sfkd_jax
+from sfkd_jax import config, evaluate, shelf, walk
+
+sys.path.append(str(Path(__file__).parent / "datasets"))
+from recorded import drive, write_csv
+
+STATE = "dataset.columns.state=[p_x,p_y,yaw,v,yaw_rate]"
+SMALL = ("+experiment=smoke", "dataset=files", "dataset.path=logs", "dataset.steps=10", STATE, "env=none")
+TINY = (
+    "model.rank=8",
+    "model.vertices=3",
+    "model.residual_hidden=[8,8]",
+    "model.decoder_hidden=[8]",
+    "model.budget=sum",
+)
+FAST = (
+    "training.steps=25",
+    "training.save_every=25",
+    "training.window=5",
+    "certification.horizon=5",
+    "certification.attack_starts=0",
+)
+
+
+def settings(*overrides):
+    config.register()
+    with initialize_config_dir(config.conf_path(), version_base="1.3"):
+        return OmegaConf.to_container(compose("config", overrides=list(overrides)), resolve=True)
+
+
+@pytest.fixture(scope="module")
+def logs(tmp_path_factory):
+    """Eight drives with a yaw rate; nobody measured friction or wind."""
+    place = tmp_path_factory.mktemp("own") / "logs"
+    place.mkdir()
+    for k in range(8):
+        columns = drive(seconds=12.0, phase=0.8 * k)
+        columns["yaw_rate"] = np.gradient(columns["yaw"], columns["t"])
+        write_csv(place / f"{k}.csv", {name: columns[name] for name in columns if name not in ("friction", "wind")})
+    return place
+
+
+@pytest.mark.slow
+def test_logs_become_a_certified_policy_of_a_robot_that_nothing_drives(logs, monkeypatch):
+    monkeypatch.setenv("XLA_FLAGS", "--xla_backend_optimization_level=0")  # what runs once compiles faster
+    walked = last_line(done := door("train", *SMALL, *TINY, *FAST, "model.environment=false", cwd=logs.parent))
+    assert walked["results"] is None
+    assert "not driven" in done.stderr
+    certificate = json.loads((logs.parent / walked["certificate"]).read_text())
+    assert certificate["valid"]
+    assert certificate["boxes"]["names"] == {
+        "state": ["v", "yaw_rate"],
+        "control": ["steering", "acceleration"],
+        "env": [],
+    }
+    assert "Not driven" in (logs.parent / walked["report"]).read_text()
+    policy = sfkd_jax.load(logs.parent / walked["run"])
+    assert policy.certificate is not None
+    limits = [policy.settings["vehicle"][f"control_{side}"] for side in ("low", "high")]
+    assert limits == certificate["boxes"]["control"]
+    assert not {"path"} & set(policy.settings["dataset"])
+    init = jax.eval_shape(policy.controller.init, jax.random.key(0))
+    shapes = (jnp.zeros(5), jnp.zeros(2), jnp.zeros((20, 4)))
+    assert jax.eval_shape(policy.controller.act, policy.params, init, *shapes)[0].shape == (2,)
+
+
+def test_logs_lie_on_the_shelf_with_their_coverage_and_test_drives_alone_are_held_out(logs, monkeypatch):
+    monkeypatch.chdir(logs.parent)
+    asked = settings(*SMALL)
+    dataset, _ = walk.ensure_dataset(asked)
+    assert [part.states.shape[1:] for part in dataset[:4]] == [(11, 5)] * 4
+    assert sum(len(part.states) for part in dataset[:4]) == 8 * 12
+    held_out = walk.held_out_drives(asked, dataset)
+    assert set(held_out) == {"test"}
+    assert held_out["test"] is dataset.test
+    covered = json.loads((shelf.dataset_path(asked).parent / "coverage.json").read_text())
+    assert set(covered["state"]) == {"v", "yaw_rate"}
+    assert 4.0 <= covered["state"]["v"]["low"] < covered["state"]["v"]["high"] <= 6.0
+
+
+def test_what_logs_cannot_support_is_refused_before_a_run_is_begun(logs, monkeypatch):
+    monkeypatch.chdir(logs.parent)
+    asked = settings(*SMALL, "name=other", "certification.level=0.99")
+    with pytest.raises(ValueError, match="12 calibration segments are too few for"):
+        walk.ensure_policy(asked)
+    with pytest.raises(ValueError, match="no column friction for the environment; pass env=none"):
+        walk.ensure_policy(settings(*SMALL, "env=measured", "name=other"))
+    with pytest.raises(ValueError, match="vehicle=own is known from logs alone, so nothing can drive it"):
+        evaluate.run(settings(*SMALL, "name=other"))
+    assert not (logs.parent / "runs" / "other").exists()
+
+
+def test_logs_that_moved_are_the_same_data_set_and_changed_ones_are_not(logs, tmp_path):
+    def identity(place):
+        return shelf.identity(settings(*SMALL, f"dataset.path={place}"))
+
+    here = identity(logs)
+    shutil.copytree(logs, tmp_path / "moved")
+    assert identity(tmp_path / "moved") == here
+    (tmp_path / "moved" / "0.csv").unlink()
+    assert identity(tmp_path / "moved") != here
