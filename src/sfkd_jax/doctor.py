@@ -21,6 +21,7 @@ EXTRAS = {
     "brax": ("brax",),
     "gym": ("gymnasium",),
     "parquet": ("pyarrow",),
+    "docs": ("mkdocs", "material", "mkdocstrings"),
     "cpp": ("iree.compiler", "iree.runtime"),
     "sweeps": ("hydra_plugins.hydra_joblib_launcher", "hydra_plugins.hydra_optuna_sweeper", "submitit"),
 }
