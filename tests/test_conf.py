@@ -74,6 +74,23 @@ def test_a_wrong_option_is_refused_by_name(override, says):
         settings(override)
 
 
+@pytest.mark.parametrize(
+    ("overrides", "says"),
+    [
+        (["env=guessed"], "measured, estimated, none"),
+        (["env=estimated", "model=sfkd_no_fiber"], "reads the environment"),
+    ],
+)
+def test_an_environment_that_nobody_can_learn_of_is_refused(overrides, says):
+    with pytest.raises(ValueError, match=says):
+        config._settings(OmegaConf.create(settings(*overrides)))
+
+
+def test_without_an_environment_no_model_reads_one():
+    assert config._settings(OmegaConf.create(settings()))["model"]["environment"]
+    assert not config._settings(OmegaConf.create(settings("env=none")))["model"]["environment"]
+
+
 def test_logs_are_of_a_robot_of_ones_own_unless_a_plant_is_named():
     columns = "dataset.columns.state=[x,y,heading,speed,rate]"
     assert settings("dataset=files", columns)["vehicle"]["state_names"] == ["x", "y", "heading", "speed", "rate"]

@@ -2,8 +2,11 @@
 
 import json
 
+import jax
+import jax.numpy as jnp
+import numpy as np
 import pytest
-from helpers import door, last_line
+from helpers import door, last_line, straight
 
 from sfkd_jax import demo, policy
 from sfkd_jax.certification import Certificate, verify
@@ -39,3 +42,14 @@ def test_what_ships_loads_and_its_certificate_follows_from_its_witnesses(vehicle
     verify(proof, trained.params, model=trained.model)
     assert proof.alpha < 1.0
     assert trained.settings["vehicle"]["name"] == vehicle
+
+
+def test_what_ships_also_drives_where_the_environment_is_not_measured():
+    trained = policy.load(demo.SHIPPED / "kinematic", env="estimated")
+    act, state = jax.jit(trained.controller.act), trained.controller.init(jax.random.key(0))
+    observation, reference = jnp.asarray([0.0, 0.3, 0.0, 10.0]), straight(20)
+    control, _, info = act(trained.params, state, observation, jnp.full(2, jnp.nan), reference)
+    other, _, _ = act(trained.params, state, observation, jnp.asarray([0.3, 8.0]), reference)
+    np.testing.assert_array_equal(control, other)
+    np.testing.assert_allclose(info["env_estimate"], [0.6, 0.0], atol=1e-4)  # nothing has moved yet
+    assert not info["box_exit"]
