@@ -58,7 +58,7 @@ THIRD_PARTY = {
     "policy": {"numpy"},
     "drive": {"numpy"},
     "cells": {"numpy"},
-    "adapters": {"brax", "gymnasium", "numpy"},
+    "adapters": {"brax", "gymnasium", "numpy", "scipy", "vehiclemodels"},
     "exporting": {"numpy", "iree"},
 } | {front: FRONT for front in DOORS | {"config"}}
 
@@ -66,6 +66,7 @@ FILES = {file.relative_to(SRC).as_posix(): ast.parse(file.read_text("utf-8")) fo
 ROOMS = {name: name.split("/")[0].removesuffix(".py") for name in FILES}
 FOREIGN = {"brax": {"adapters/_brax.py", "adapters/_brax_system.py"}, "gymnasium": {"adapters/_gymnasium.py"}}
 FOREIGN |= {"iree": {"exporting/_iree.py"}, "pyarrow": {"datasets/_tables.py"}}
+FOREIGN |= {"vehiclemodels": {"adapters/_commonroad_equations.py"}}
 WORKSHOP = {"hydra", "omegaconf", "cvxpy", "clarabel", "orbax", "brax", "matplotlib", "optax"}
 WRITES = {f"os.environ.{verb}" for verb in ("update", "setdefault", "pop", "popitem", "clear")}
 HOST = {"walk", "drive", "training", "certification", "exporting"}
@@ -186,12 +187,17 @@ def test_a_controller_is_imported_without_the_workshop(module, kept_out):
 @pytest.mark.parametrize("module", [PACKAGE, f"{PACKAGE}.adapters"])
 def test_a_foreign_package_is_loaded_when_its_adapter_is_asked_for(module):
     code = f"import sys, {module}; print(*{{name.split('.')[0] for name in sys.modules}})"
-    assert not {"brax", "mujoco", "gymnasium"} & set(fresh(code).split())
+    assert not {"brax", "mujoco", "gymnasium", "vehiclemodels"} & set(fresh(code).split())
 
 
 @pytest.mark.parametrize(
     ("name", "package", "extra"),
-    [("BraxVehicle", "brax", "brax"), ("brax_plant", "brax", "brax"), ("GymnasiumVehicle", "gymnasium", "gym")],
+    [
+        ("BraxVehicle", "brax", "brax"),
+        ("brax_plant", "brax", "brax"),
+        ("GymnasiumVehicle", "gymnasium", "gym"),
+        ("commonroad_vehicle", "vehiclemodels", "plants"),
+    ],
 )
 def test_an_adapter_without_its_package_names_the_extra(name, package, extra):
     code = f"""

@@ -1,6 +1,6 @@
-"""Other projects' interfaces: the vehicles as brax and gymnasium environments, brax systems as plants.
+"""Foreign interfaces: our vehicles as brax and gymnasium environments, brax systems and CommonRoad's cars as plants.
 
-Nothing here is loaded before it is asked for by name, and brax and gymnasium only by what needs them.
+Nothing here is loaded before it is asked for by name, and another project's package only by what needs it.
 """
 
 from importlib import import_module
@@ -17,6 +17,9 @@ if TYPE_CHECKING:
     from sfkd_jax.adapters._brax_system import BraxPlant as BraxPlant
     from sfkd_jax.adapters._brax_system import brax_plant as brax_plant
     from sfkd_jax.adapters._brax_system import collect as collect
+    from sfkd_jax.adapters._commonroad import commonroad_controller as commonroad_controller
+    from sfkd_jax.adapters._commonroad import commonroad_observation as commonroad_observation
+    from sfkd_jax.adapters._commonroad import commonroad_vehicle as commonroad_vehicle
     from sfkd_jax.adapters._gymnasium import GymnasiumVehicle as GymnasiumVehicle
     from sfkd_jax.adapters._gymnasium import register_gymnasium as register_gymnasium
 
@@ -26,6 +29,9 @@ _LAZY = {
     "BraxPlant": ("_brax_system", "brax"),
     "brax_plant": ("_brax_system", "brax"),
     "collect": ("_brax_system", "brax"),
+    "commonroad_controller": ("_commonroad", "plants"),
+    "commonroad_observation": ("_commonroad", "plants"),
+    "commonroad_vehicle": ("_commonroad", "plants"),
     "GymnasiumVehicle": ("_gymnasium", "gym"),
     "register_gymnasium": ("_gymnasium", "gym"),
 }
