@@ -44,6 +44,18 @@ def lines(place):
     return [json.loads(line) for line in (place / "metrics.jsonl").read_text().splitlines()]
 
 
+def test_training_goes_on_from_parameters_that_init_returns(task, tmp_path):
+    """A parabola in place of a model's loss: ten small steps move towards its minimum, from where `init` stands."""
+    model, _, data = task
+
+    def parabola(params, batch):
+        return (params - 3.0) ** 2, {"prediction": (params - 3.0) ** 2}
+
+    given = model._replace(init=lambda key: jnp.asarray(2.0)), parabola, data
+    reached, _ = train(given, tmp_path, steps=10, save_every=10, learning_rate=1e-3)
+    assert 2.0 < float(reached) <= 2.0 + 10 * 1.1e-3
+
+
 def test_the_loss_falls_and_every_step_is_logged(task, tmp_path):
     train(task, tmp_path)
     logged = lines(tmp_path)

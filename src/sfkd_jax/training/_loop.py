@@ -55,7 +55,8 @@ def fit(
     Windows are drawn with a key folded with the step, so an interrupted run ends bit-identical to an unbroken one.
 
     Args:
-        model, loss: what is trained, and by which loss.
+        model, loss: what is trained, and by which loss. To train on from parameters at hand, a model whose `init`
+            returns them: `model._replace(init=lambda key: params)`.
         draw: (data, key) -> a batch of windows. data: what it draws from; held_out: windows that select.
         key: for the initial parameters and the draws.
         directory: gets checkpoints/, metrics.jsonl, tensorboard/.
