@@ -36,6 +36,17 @@ def built(build):
         return f"Not measured yet: there is no {timing.HERE.name}/{absent.filename.rsplit('/', 1)[-1]}."
 
 
+def put(path, made):
+    """Tables into their places in a page."""
+    page = path.read_text()
+    for name, text in made.items():
+        pattern = re.compile(rf"<!-- {name} -->\n.*?<!-- end -->", re.DOTALL)
+        page, count = pattern.subn(lambda _, text=text, name=name: f"<!-- {name} -->\n{text}\n<!-- end -->", page)
+        if count != 1:
+            raise SystemExit(f"{path.name} has {count} places for the table {name!r}, not 1")
+    path.write_text(page)
+
+
 def main():
     """Parse, print or write."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
@@ -44,13 +55,7 @@ def main():
     if not parser.parse_args().write:
         print("\n\n".join(f"<!-- {name} -->\n{text}\n<!-- end -->" for name, text in made.items()))
         return
-    page = PAGE.read_text()
-    for name, text in made.items():
-        pattern = re.compile(rf"<!-- {name} -->\n.*?<!-- end -->", re.DOTALL)
-        page, count = pattern.subn(lambda _, text=text, name=name: f"<!-- {name} -->\n{text}\n<!-- end -->", page)
-        if count != 1:
-            raise SystemExit(f"docs/performance.md has {count} places for the table {name!r}, not 1")
-    PAGE.write_text(page)
+    put(PAGE, made)
 
 
 if __name__ == "__main__":

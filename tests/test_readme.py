@@ -3,6 +3,8 @@
 import json
 import os
 import re
+import subprocess
+import sys
 from pathlib import Path
 
 import pytest
@@ -56,6 +58,15 @@ def test_a_page_of_results_says_what_the_results_say(folder, page):
     shown = benchmark_markdown(results).replace("results_files/", f"{page}_files/")
     assert (ROOT / "docs" / f"{page}.md").read_text("utf-8") == shown
     assert all((ROOT / "docs" / figure).exists() for figure in re.findall(r"\]\((\S+\.png)\)", shown))
+
+
+def test_the_page_about_foreign_plants_says_what_the_results_say():
+    command = [sys.executable, str(ROOT / "benchmarks" / "commonroad_page.py")]
+    printed = subprocess.run(command, capture_output=True, text=True, check=True).stdout
+    page = (ROOT / "docs" / "plants.md").read_text("utf-8")
+    tables = printed.strip().split("\n\n")
+    assert len(tables) == 5
+    assert [table for table in tables if table not in page] == []
 
 
 def named(row, name):

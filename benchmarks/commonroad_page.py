@@ -1,0 +1,140 @@
+"""Print the tables of docs/plants.md from experiments/commonroad/results.json; with --write put them there.
+
+python benchmarks/commonroad_page.py [--write]
+--write draws the page's figure as well.
+"""
+
+import argparse
+import json
+
+import tables
+from page import put
+from timing import HERE
+
+ROOT = HERE.parent
+FIGURE = ROOT / "docs" / "plants_files" / "rmse.png"
+SYSTEMS = {
+    # row: (label, colour, line)
+    "sfkd": ("SFKD, dynamic", "#0b57b0", "-"),
+    "sfkd_kinematic": ("SFKD, kinematic", "#009e73", "-"),
+    "sfkd_tuned": ("SFKD, dynamic, tuned", "#0b57b0", "--"),
+    "sfkd_kinematic_tuned": ("SFKD, kinematic, tuned", "#009e73", "--"),
+    "nominal": ("nominal", "#e8a33d", "-"),
+    "nominal_this_car": ("nominal, this car's wheelbase", "#d55e00", "-"),
+}
+FRICTIONS = (0.9, 0.6, 0.3)
+CARS = {"commonroad_std": "single-track drift", "commonroad_mb": "multi-body"}
+
+
+def results():
+    """The document of the last run."""
+    return json.loads((ROOT / "experiments" / "commonroad" / "results.json").read_text())
+
+
+def deviations():
+    """Lateral RMSE by car, friction and system [mm], and how many episodes left the lane."""
+    rows, lines = results()["rows"], []
+    for name, (label, *_) in SYSTEMS.items():
+        mine = [row for row in rows if row["system"] == name]
+        lines.append([label, *map(deviation, mine), sum(row["departures"] for row in mine)])
+    first = [row for row in rows if row["system"] == "nominal"]
+    return tables.table(["", *(f"{CARS[row['vehicle']]}, {row['friction']}" for row in first), "left the lane"], lines)
+
+
+def deviation(row):
+    """In millimetres, with the departures."""
+    mean, left = row["rmse_m"]["mean"], row["departures"]
+    return ("spun" if mean is None else f"{1e3 * mean:.1f}") + (f" ({left} left)" if left else "")
+
+
+def ratios():
+    """Every SFKD row over the nominal bicycle (all paths, worst path), over itself before, and the monitor's flags."""
+    lines = []
+    for name, (label, *_) in SYSTEMS.items():
+        for car, words in CARS.items():
+            mine = [row for row in results()["rows"] if (row["system"], row["vehicle"]) == (name, car)]
+            if name.startswith("nominal"):
+                continue
+            entries = [f"{times(row['ratio_to_nominal'])} ({times(row['worst_ratio_to_nominal'])})" for row in mine]
+            untuned = " / ".join(times(row["ratio_to_untuned"]) for row in mine) if name.endswith("_tuned") else ""
+            flags = " / ".join(f"{100 * row['breach_steps']:.0f}" for row in mine)
+            lines.append([f"{label}, {words}", *entries, untuned, flags])
+    heads = [f"over nominal, {friction} (worst path)" for friction in FRICTIONS]
+    return tables.table(["RMSE", *heads, "over the same untuned", "steps flagged [%]"], lines)
+
+
+def times(ratio):
+    """A ratio, or a dash where a car spun."""
+    return "–" if ratio is None else f"{ratio:.2f}"
+
+
+def tuning():
+    """What training on did to prediction and certificate."""
+    found = results()["tuning"]
+    lines = []
+    for name, row in found.items():
+        if name == "drives":
+            continue
+        error = row["position_rmse_2s_m"]
+        numbers = [f"{error['before']:.3f}", f"{error['after']:.3f}", f"{row['alpha']:.4f}", f"{row['d_bar']:.3f}"]
+        lines.append([SYSTEMS[name][0], *numbers, f"{100 * row['coverage']:.0f} %", f"{row['cpu_seconds']:.0f}"])
+    heads = ["", "2 s ahead, before [m]", "after [m]", "α, certified", "d̄", "held-out drives inside d̄", "CPU [s]"]
+    return tables.table(heads, lines)
+
+
+def handling():
+    """Curvature in a steady turn over that of the textbook bicycle."""
+    names = {"kinematic": "our kinematic plant", "dynamic": "our dynamic plant"}
+    names |= {"std": CARS["commonroad_std"], "mb": CARS["commonroad_mb"]}
+    lines = [[names[name], *(f"{value:.3f}" for value in row)] for name, row in results()["handling"].items()]
+    return tables.table(["curvature over the bicycle's", *(f"friction {each}" for each in FRICTIONS)], lines)
+
+
+def export():
+    """The exported controller beside the one in Python."""
+    found = results()["export"]
+    numbers = [found["steps"], f"{1e3 * found['rmse_m']:.1f}", f"{found['largest_difference']:g}"]
+    return tables.table(["steps", "RMSE [mm]", "largest difference of a control"], [numbers])
+
+
+TABLES = {"deviations": deviations, "ratios": ratios, "handling": handling, "tuning": tuning, "export": export}
+
+
+def draw():
+    """Lateral RMSE over friction, one panel a car, where all paths were driven in the lane."""
+    from matplotlib.figure import Figure
+
+    figure = Figure(figsize=(6.9, 3.4), layout="constrained")
+    panels = figure.subplots(1, len(CARS), sharey=True)
+    for axes, (car, words) in zip(panels, CARS.items(), strict=True):
+        for name, (label, colour, line) in SYSTEMS.items():
+            mine = [row for row in results()["rows"] if (row["system"], row["vehicle"]) == (name, car)]
+            sound = [row for row in mine if not row["departures"]]
+            points = [row["friction"] for row in sound], [1e3 * row["rmse_m"]["mean"] for row in sound]
+            if not sound:
+                continue
+            axes.plot(*points, color=colour, linestyle=line, marker="o", markersize=4, label=label)
+        axes.set(title=words, xlabel="friction", xticks=(0.3, 0.6, 0.9), yscale="log")
+        axes.grid(visible=True, which="both", color="#e3e6ea", linewidth=0.6)
+    panels[0].set_ylabel("lateral RMSE [mm]")
+    figure.legend(
+        *panels[0].get_legend_handles_labels(), loc="outside upper center", ncols=3, fontsize=8, frameon=False
+    )
+    FIGURE.parent.mkdir(exist_ok=True)
+    figure.savefig(FIGURE, dpi=150, metadata={"Software": None})
+
+
+def main():
+    """Parse, print or write."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--write", action="store_true", help="put the tables into docs/plants.md and draw its figure")
+    made = {name: build() for name, build in TABLES.items()}
+    if not parser.parse_args().write:
+        print("\n\n".join(made.values()))
+        return
+    put(ROOT / "docs" / "plants.md", made)
+    draw()
+
+
+if __name__ == "__main__":
+    main()
