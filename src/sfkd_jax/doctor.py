@@ -22,6 +22,7 @@ EXTRAS = {
     "gym": ("gymnasium",),
     "parquet": ("pyarrow",),
     "docs": ("mkdocs", "material", "mkdocstrings"),
+    "plants": ("vehiclemodels",),
     "cpp": ("iree.compiler", "iree.runtime"),
     "sweeps": ("hydra_plugins.hydra_joblib_launcher", "hydra_plugins.hydra_optuna_sweeper", "submitit"),
 }
