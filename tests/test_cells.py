@@ -54,7 +54,7 @@ def test_a_variation_that_retrains_has_a_policy_of_its_own():
 def settings(root, **changes):
     names = ("dataset", "model", "training", "seed", "controller", "scenario", "certification")
     asked = {name: {"name": name} for name in names} | {"vehicle": {"dt": 0.1}, "evaluation": {"episodes": 4}}
-    return asked | {"root": str(root), "name": "table"} | changes
+    return asked | {"env": "measured", "root": str(root), "name": "table"} | changes
 
 
 def rows_file(path):
@@ -69,6 +69,7 @@ def test_a_cell_is_done_only_with_its_own_settings_and_undamaged(tmp_path):
     write_json(rows_file(path), {"row": {}, "made_with": cells.made_with(asked)})
     assert cells.is_done(path, asked)
     assert not cells.is_done(path, settings(tmp_path, evaluation={"episodes": 8}))
+    assert not cells.is_done(path, settings(tmp_path, env="estimated"))
     rows_file(path).write_bytes(rows_file(path).read_bytes()[:-5])
     assert not cells.is_done(path, asked)
 

@@ -9,12 +9,8 @@ def test_a_sweep_runs_every_job_and_ends_with_json(tmp_path):
     assert len(list((tmp_path / "runs/datasets").iterdir())) == 2
 
 
-def test_a_door_makes_what_is_missing(tmp_path):
-    small = ("+experiment=smoke", "training.steps=25", "training.save_every=25", "dataset.segments=160")
-    assert last_line(door("certify", *small, cwd=tmp_path))["valid"]
-
-
 def test_the_walk_works_for_another_vehicle_under_its_speed_loop(tmp_path):
     small = ("training.steps=25", "training.save_every=25", "dataset.segments=160", "evaluation.episode_s=4.0")
+    small += ("evaluation.systems=[self]",)
     walk = last_line(door("train", "+experiment=smoke", "vehicle=dynamic_speed", *small, cwd=tmp_path))
     assert (tmp_path / walk["report"]).exists()

@@ -46,7 +46,8 @@ def test_an_episode_has_the_documented_shapes():
     one = at(episodes(PLANT.step), 0)
     assert one.states.shape == (STEPS + 1, 4)
     assert one.controls.shape == (STEPS, 2)
-    assert all(leaf.shape == (STEPS,) for leaf in one[2:])
+    assert one.believed.shape == (STEPS, 2)
+    assert all(leaf.shape == (STEPS,) for leaf in one._replace(believed=one.lateral)[2:])
 
 
 def test_the_states_of_an_episode_are_the_plants():
