@@ -151,6 +151,19 @@ def test_a_jump_that_nothing_explains_moves_the_states_and_not_the_belief():
     np.testing.assert_allclose(info["seen"][30], seen[30], atol=1e-4)
 
 
+def test_hypotheses_whose_model_breaks_are_left_out_and_poison_nothing():
+    def breaks(state, control, env):
+        return jnp.where(env[0] < 0.45, jnp.nan, PLANT.step(state, control, env))
+
+    planner = control.estimated(scripted(), models.physics(breaks), **BOX)
+    state, act = planner.init(jax.random.key(0)), jit(planner.act)
+    for observation in driven(np.tile([0.7, -6.0], (STEPS, 1)), NOISE)[:25]:
+        _, state, info = act({}, state, jnp.asarray(observation), jnp.zeros(2), jnp.zeros((1, 4)))
+    assert abs(info["env_estimate"][1] + 6.0) < 2.0
+    assert info["env_estimate"][0] > 0.5
+    assert all(bool(jnp.isfinite(leaf).all()) for leaf in (state.states, state.covariance, state.probabilities))
+
+
 def test_the_state_that_is_planned_from_is_nearer_to_the_truth_than_the_sensors():
     truth, seen = driven(np.tile(STORM, (STEPS, 1))), driven(np.tile(STORM, (STEPS, 1)), NOISE)
     smooth, _ = follow(seen)

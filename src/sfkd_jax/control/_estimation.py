@@ -117,6 +117,10 @@ def estimated(
         slope = jax.jacfwd(advance)(origin + state.probabilities @ gaps, state.probabilities @ grid)
         ahead = slope @ state.covariance @ slope.T + jnp.diag(disturbance)
         corrected, left, fit = _corrected(predicted, ahead, observation, sensors)
+        # A hypothesis whose prediction is not finite explains nothing, and must not reach the others by mixing.
+        sound = jnp.isfinite(fit) & jnp.isfinite(corrected).all(axis=1)
+        fit, corrected = jnp.where(sound, fit, -jnp.inf), jnp.where(sound[:, None], corrected, observation)
+        left = jnp.where(jnp.isfinite(left).all(), left, jnp.diag(sensors))
         weights = expected * (jnp.exp(fit) + math.exp(OUTLIER))
 
         clean, lost = jnp.isfinite(observation).all(), jnp.max(fit) < OUTLIER
