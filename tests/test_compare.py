@@ -4,7 +4,8 @@ import json
 
 from helpers import door, last_line
 
-COMPARED = ("+experiment=smoke", "comparison=tiny", "evaluation.systems=[self]", "name=table")
+SMALL = ("training.steps=75", "training.save_every=75", "dataset.segments=200")
+COMPARED = ("+experiment=smoke", "comparison=tiny", "evaluation.systems=[self]", "name=table", *SMALL)
 
 
 def test_compare_drives_every_row_and_continues_where_it_was_stopped(tmp_path):

@@ -139,9 +139,10 @@ def test_certify_exits_0_then_3_when_weights_changed_then_0_when_renewed(spoiled
 
 def test_a_model_without_a_bound_is_driven_but_refused_a_certificate(walked):
     place = walked[0]
-    walk = last_line(door("train", "+experiment=smoke", "model=sfkd_no_contraction", cwd=place))
+    small = ("model=sfkd_no_contraction", "training.steps=25", "training.save_every=25", "evaluation.systems=[self]")
+    walk = last_line(door("train", "+experiment=smoke", *small, cwd=place))
     assert walk["alpha"] is None
-    done = door("certify", "+experiment=smoke", "model=sfkd_no_contraction", cwd=place, code=2)
+    done = door("certify", "+experiment=smoke", *small, cwd=place, code=2)
     assert done.stderr.strip().splitlines()[-1].startswith("sfkd_jax: refused:")
 
 
