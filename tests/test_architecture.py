@@ -213,7 +213,7 @@ except ImportError as refusal:
 
 
 def test_importing_the_controller_costs_little_beyond_jax(tmp_path):
-    """Processor seconds, minimum over alternating fresh processes on one bytecode cache; more of them on a busy host."""
+    """Processor seconds, minimum over alternating fresh processes on one bytecode cache; a busy host needs more."""
     timed = "import time; start = time.process_time(); import {}; print(time.process_time() - start)"
     seconds: dict[str, list[float]] = {"jax": [], f"{PACKAGE}.control": []}
     for turn in range(15):
