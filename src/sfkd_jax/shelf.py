@@ -38,14 +38,18 @@ def dataset_config(settings: dict[str, Any]) -> dict[str, Any]:
     """What a data set was made with: of logs their contents, not where they lie."""
     asked = dict(settings["dataset"])
     if is_logged(settings):
-        path, told = asked.pop("path"), settings.get("env") != "none"
-        asked |= {"contents": fingerprint(path), "environment_known": told}
+        asked |= {"contents": fingerprint(asked.pop("path")), "environment_known": is_told(settings)}
     return {"vehicle": settings["vehicle"], "dataset": asked}
 
 
 def is_logged(settings: dict[str, Any]) -> bool:
     """Whether the data set is read from logs instead of driven."""
     return "path" in settings["dataset"]
+
+
+def is_told(settings: dict[str, Any]) -> bool:
+    """Whether there is an environment that somebody measured or infers."""
+    return settings.get("env") != "none"
 
 
 def identity(settings: dict[str, Any]) -> dict[str, Any]:
@@ -112,11 +116,11 @@ def boxes(dataset: Dataset) -> dict[str, Any]:
 
 def channel_names(settings: dict[str, Any]) -> dict[str, list[str]]:
     """How logs name what the boxes bound; an environment that the model does not read has no name."""
-    columns, known = settings["dataset"]["columns"], settings.get("env") != "none"
+    columns = settings["dataset"]["columns"]
     return {
         "state": columns["state"][BODY],
         "control": columns["control"],
-        "env": columns["environment"] if known else [],
+        "env": columns["environment"] if is_told(settings) else [],
     }
 
 

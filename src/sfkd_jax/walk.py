@@ -63,7 +63,7 @@ def _from_logs(settings: dict[str, Any]) -> Dataset:
             f"dataset.columns.state names {len(columns.state)} columns, {named}; name as many, in this order"
         )
     shelf.say(f"reading {asked['path']}")
-    known = {"dt": plant.dt, "wheelbase": plant.wheelbase, "told": settings.get("env") != "none"}
+    known = {"dt": plant.dt, "wheelbase": plant.wheelbase, "told": shelf.is_told(settings)}
     known["limits"] = (plant.control_low or None, plant.control_high or None)
     logged = from_logs(asked["path"], columns, say=shelf.say, **known, **assembly.without(asked, "path", "columns"))
     artefacts.write_json(shelf.dataset_path(settings).with_name("coverage.json"), logged.coverage)

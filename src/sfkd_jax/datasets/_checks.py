@@ -38,13 +38,13 @@ def check_rows(log: Log, columns: Columns) -> Iterator[Finding]:
     for name, values in channels(log, columns).items():
         bad = ~np.isfinite(values)
         if bad.any():
-            yield Finding(f"{_first(log, bad)}: {name} is {values[bad.argmax()]}{_more(bad)}")
+            yield Finding(f"{_first(log, bad)}: {name} is {values[bad.argmax()]}{more(bad)}")
     if np.isfinite(log.time).all() and (back := np.diff(log.time) <= 0).any():
         k = int(back.argmax())
         before, after = log.time[k], log.time[k + 1]
         says = f"repeats {after:.12g}" if before == after else f"goes back from {before:.12g} to {after:.12g}"
         yield Finding(
-            f"{log.at(k + 1)}: {columns.time} {says}{_more(back)}; two drives in one file? dataset.columns.drive"
+            f"{log.at(k + 1)}: {columns.time} {says}{more(back)}; two drives in one file? dataset.columns.drive"
         )
 
 
@@ -60,13 +60,13 @@ def check_motion(log: Log, columns: Columns, *, dt: float, gap: float) -> Iterat
     if gaps.any():
         k = int(gaps.argmax())
         yield Finding(
-            f"{log.at(k + 1)}: {waits[k]:.4g} s without rows; drives are split there{_more(gaps)}", refused=False
+            f"{log.at(k + 1)}: {waits[k]:.4g} s without rows; drives are split there{more(gaps)}", refused=False
         )
     uneven = (np.abs(waits - period) > 0.5 * period) & ~gaps
     if uneven.mean() > 0.1:
         yield Finding(
             f"{_first(log, uneven, 1)}: uneven sampling, {waits[uneven.argmax()]:.4g} s after the row before"
-            f"{_more(uneven)}",
+            f"{more(uneven)}",
             refused=False,
         )
     moved = np.linalg.norm(np.diff(log.states[:, :2], axis=0), axis=1)
@@ -76,7 +76,7 @@ def check_motion(log: Log, columns: Columns, *, dt: float, gap: float) -> Iterat
     if stale.sum() > STALE * max(driving.sum(), 1):
         yield Finding(
             f"{_first(log, stale, 1)}: the position of the row before at {log.states[stale.argmax() + 1, 3]:.3g} m/s"
-            f"{_more(stale)}; log positions as often as {columns.time}, or leave rows out"
+            f"{more(stale)}; log positions as often as {columns.time}, or leave rows out"
         )
         return
     jumps = moved - said > said + 15.0 * 1.4826 * np.median(np.abs(moved - said)) + 1e-6
@@ -84,7 +84,7 @@ def check_motion(log: Log, columns: Columns, *, dt: float, gap: float) -> Iterat
     if jumps.any():
         k = int(jumps.argmax())
         where = f"{columns.state[0]}, {columns.state[1]} jump {moved[k]:.3g} m at {log.states[k, 3]:.3g} m/s"
-        yield Finding(f"{_first(log, jumps, 1)}: {where}{_more(jumps)}")
+        yield Finding(f"{_first(log, jumps, 1)}: {where}{more(jumps)}")
     yield from _check_turns(log, columns, ~gaps)
 
 
@@ -94,7 +94,7 @@ def _check_turns(log: Log, columns: Columns, near: Bool[np.ndarray, " step"]) ->
     spins = near & (turned > max(1.0, 10.0 * float(np.median(turned))))
     if spins.any():
         yield Finding(
-            f"{_first(log, spins, 1)}: {columns.state[2]} jumps by {turned[spins.argmax()]:.3g} rad{_more(spins)}"
+            f"{_first(log, spins, 1)}: {columns.state[2]} jumps by {turned[spins.argmax()]:.3g} rad{more(spins)}"
         )
 
 
@@ -103,6 +103,6 @@ def _first(log: Log, bad: Bool[np.ndarray, " time"], shift: int = 0) -> str:
     return log.at(int(bad.argmax()) + shift)
 
 
-def _more(bad: Bool[np.ndarray, " time"]) -> str:
+def more(bad: Bool[np.ndarray, " time"]) -> str:
     """How many rows there are like the first."""
     return f" ({int(bad.sum())} rows like this)" if bad.sum() > 1 else ""

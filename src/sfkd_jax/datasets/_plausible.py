@@ -69,15 +69,15 @@ def _stretches(log: Log, speed: Float[np.ndarray, " time"]) -> Stretches:
     """The stretches of a drive that moved, by position or by what a speed says."""
     waits = np.diff(log.time)
     period = float(np.median(waits))
-    span = min(max(1, round(LOOK / period)), len(log.time) - 1)
+    reach = min(max(1, round(LOOK / period)), len(log.time) - 1)
     along = np.concatenate([[0.0], np.cumsum(0.5 * (speed[1:] + speed[:-1]) * waits)])
-    chord = log.states[span:, :2] - log.states[:-span, :2]
-    travelled, said = np.linalg.norm(chord, axis=1), along[span:] - along[:-span]
-    whole = log.time[span:] - log.time[:-span] < 1.5 * span * period  # no gap inside
+    chord = log.states[reach:, :2] - log.states[:-reach, :2]
+    travelled, said = np.linalg.norm(chord, axis=1), along[reach:] - along[:-reach]
+    whole = log.time[reach:] - log.time[:-reach] < 1.5 * reach * period  # no gap inside
     enough = [0.2 * np.max(np.abs(lengths), where=whole, initial=0.0) for lengths in (travelled, said)]
     moving = whole & ((travelled > enough[0]) | (np.abs(said) > enough[1]))
     course = np.arctan2(chord[:, 1], chord[:, 0]) + np.pi * (said < 0)
-    return Stretches(travelled[moving], said[moving], course[moving], np.flatnonzero(moving) + span // 2)
+    return Stretches(travelled[moving], said[moving], course[moving], np.flatnonzero(moving) + reach // 2)
 
 
 def _cause(log: Log, columns: Columns, ratio: float) -> str:

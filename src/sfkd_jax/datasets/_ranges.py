@@ -8,7 +8,7 @@ from typing import TypeAlias
 import numpy as np
 from jaxtyping import Float
 
-from sfkd_jax.datasets._checks import Finding
+from sfkd_jax.datasets._checks import Finding, more
 from sfkd_jax.datasets._logs import Columns, Log
 
 Ends: TypeAlias = tuple[tuple[float, ...] | None, tuple[float, ...] | None]
@@ -69,6 +69,5 @@ def _outside(
             if left.any():
                 first = int(left.argmax())
                 says = f"{name} is {values[first]:.4g}, outside {low:g} to {high:g} of {setting}_low and {setting}_high"
-                rows = f" ({int(left.sum())} rows like this)" if left.sum() > 1 else ""
-                yield Finding(f"{log.at(first)}: {says}{rows}", refused)
+                yield Finding(f"{log.at(first)}: {says}{more(left)}", refused)
                 break
