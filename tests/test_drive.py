@@ -1,5 +1,6 @@
 """A test drive on several devices drives the same episodes as on one."""
 
+import functools
 import os
 import subprocess
 import sys
@@ -26,8 +27,9 @@ PROGRAM = """
 """
 
 
+@functools.cache
 def driven(devices):
-    flags = {"XLA_FLAGS": f"--xla_force_host_platform_device_count={devices}"}
+    flags = {"XLA_FLAGS": f"{os.environ['XLA_FLAGS']} --xla_force_host_platform_device_count={devices}"}
     command = [sys.executable, "-c", textwrap.dedent(PROGRAM)]
     done = subprocess.run(command, env=os.environ | flags, capture_output=True, text=True, timeout=300)
     assert done.returncode == 0, done.stderr[-2000:]
