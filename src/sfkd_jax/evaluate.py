@@ -7,15 +7,19 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from hydra.core.hydra_config import HydraConfig
 
 from sfkd_jax import artefacts, assembly, drive, evaluation, shelf, walk
-from sfkd_jax.config import door
+from sfkd_jax.config import command, door
 
 KIND = "episodes"
 
 
-def run(settings: dict[str, Any]) -> dict[str, Any]:
-    """Rows of results.json and the episodes behind them; rows of other scenarios in the same run stay."""
+def run(settings: dict[str, Any], asked_by: str = "evaluate") -> dict[str, Any]:
+    """Rows of results.json and the episodes behind them; rows of other scenarios in the same run stay.
+
+    `asked_by` is the door that was opened; its command is kept with the results.
+    """
     began = time.perf_counter()
     place, protocol = shelf.run_directory(settings), settings["evaluation"]
     plant = assembly.build_vehicle(settings["vehicle"])
@@ -35,7 +39,8 @@ def run(settings: dict[str, Any]) -> dict[str, Any]:
         arrays |= {f"{name}/{track.scenario}/{part}": array for part, array in driven.arrays.items()}
         shelf.say(f"  rmse {driven.row['rmse_m']['mean']:.4f} m, worst {driven.row['max_deviation_m']:.3f} m")
     arrays["dt"] = np.asarray(plant.dt)
-    _write(place, settings, evaluation.compare(rows), arrays, time.perf_counter() - began)
+    made_by = settings | ({"command": command(asked_by)} if HydraConfig.initialized() else {})
+    _write(place, made_by, evaluation.compare(rows), arrays, time.perf_counter() - began)
     return {"results": str(place / "results.json"), "rows": len(rows)}
 
 

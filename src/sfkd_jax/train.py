@@ -21,7 +21,7 @@ def run(settings: dict[str, Any]) -> dict[str, Any]:
     place = shelf.run_directory(settings)
     certificate = certify.renew(settings)
     if plant.simulated:
-        results = evaluate.run(settings)
+        results = evaluate.run(settings, asked_by="train")
     else:
         results = {"results": None}
         shelf.say("not driven: vehicle=own is known from logs alone; vehicle.step=package.module:function drives it")

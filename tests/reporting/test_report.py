@@ -13,6 +13,8 @@ from PIL import Image
 
 from sfkd_jax.reporting import write_report
 from sfkd_jax.reporting._numbers import upper
+from sfkd_jax.reporting._scene import scenes_of
+from sfkd_jax.reporting._tube import tube_on_drive
 from sfkd_jax.reporting._violations import violations
 
 STEPS, DT, EPISODES, SPEED = 600, 0.1, 4, 10.0
@@ -195,10 +197,11 @@ def test_every_section_and_number_is_there(whole):
     assert "missing" not in page
     for number in (
         "0.034 ± 0.006", "0.032 to 0.036", "0.137", "2.10", "0.120 ± 0.021", "7.36", "0.086", "0.081",
-        "0.084 to 0.088", "0.9321", "0.1812", "0.0275", "0.1100", "0.4400", "0.957", "0.930 to 0.980",
+        "0.0840 to 0.0880", "0.9321", "0.1812", "0.0275", "0.1100", "0.4400", "0.957", "0.930 to 0.980",
         "position [m] 0.8765", "steering −0.4 to 0.45 rad, acceleration or commanded speed 0 to 14",
         "speed 0 to 15 m/s", "friction 0.3 to 0.9, side wind −8 to 8 m/s", "4000 steps", "jax 0.10.2",
-        "learning_rate 0.003",
+        "learning_rate 0.003", "Control step, median 3.2 ms", "Effective samples", "42 3.21 4.50",
+        "a new control is due every 100 ms",
     ):  # fmt: skip
         assert number in page, number
     assert page.count("python -m sfkd_jax.train +experiment=s3 seed=0") == 1
@@ -242,8 +245,8 @@ def test_the_page_is_one_file_that_asks_for_nothing(whole):
 def test_figures_are_pictures(whole):
     names = [Path(figure).name for figure in whole[1]["figures"]]
     assert names == [
-        "deviation_s3.png", "episodes_s3.png", "track_s3.png", "steering_s3.png", "tube.png", "open_loop.png",
-        "learning.png",
+        "deviation_s3.png", "episodes_s3.png", "track_s3.png", "steering_s3.png", "tube.png",
+        "tube_on_drive.png", "open_loop.png", "learning.png",
     ]  # fmt: skip
     for figure in whole[1]["figures"]:
         with Image.open(figure) as image:
@@ -359,7 +362,7 @@ def test_names_are_not_formulas(tmp_path):
     arrays |= {f"{name}/s3/{part}": arrays[f"oracle/s3/{part}"] for part in ("lateral", "states", "controls")}
     arrays |= {f"a$x_$b/{name}/lateral": arrays["oracle/s3/lateral"][:, :50]}
     np.savez(run / "episodes.npz", **arrays)
-    assert len(report_of(run)[1]["figures"]) == 8
+    assert len(report_of(run)[1]["figures"]) == 9
 
 
 def test_a_cut_off_log_a_lost_vehicle_and_one_short_episode(tmp_path):
@@ -390,6 +393,46 @@ def test_feedback_and_plain_sampling_are_not_mixed(tmp_path):
     page = text_of(report_of(write_run(tmp_path, episodes=None, results={"rows": rows}))[0])
     assert "plain sampling" in page
     assert "to a lateral RMSE of 0.034 m" in page
+
+
+def test_the_tube_is_drawn_about_the_states_that_follow_one_that_was_driven(tmp_path):
+    np.savez(tmp_path / "episodes.npz", **episodes())
+    (scene,) = scenes_of(tmp_path)
+    radii = [0.1, 0.4, 0.9, 1.6, 2.5]
+    above, below = tube_on_drive(scene, "sfkd", radii, [0.01, None, 0.02]).axes
+    discs = {disc.radius: np.array(disc.center) for disc in above.patches}
+    assert sorted(discs) == radii
+    (way,) = [line.get_xydata() for line in above.get_lines() if len(line.get_xydata()) == 1 + len(radii)]
+    np.testing.assert_allclose([discs[radius] for radius in radii], way[1:])
+    np.testing.assert_allclose(way[0], 0.0, atol=1e-9)
+    np.testing.assert_allclose(way[-1, 1], 0.0, atol=1e-6)
+    steps = np.linalg.norm(np.diff(scene.states["sfkd"][:, :2], axis=0), axis=1)
+    assert np.min(np.abs(steps - np.linalg.norm(way[1] - way[0]))) < 1e-4
+    proved, measured = (line.get_ydata() for line in below.get_lines())
+    np.testing.assert_array_equal(proved, radii)
+    np.testing.assert_array_equal(measured, [0.01, np.nan, 0.02, np.nan, np.nan])
+    assert len(tube_on_drive(scene, "sfkd", [1.0] * 9, []).axes) == 2
+
+
+def test_the_command_is_the_one_that_was_typed_where_it_was_kept(tmp_path):
+    rows = documents()["results.json"]["rows"]
+    typed = "python -m sfkd_jax.train +experiment=s3 evaluation.episodes=4"
+    for command, shown in ((typed, 1), (typed.replace("train", "evaluate"), 2), (None, 1)):
+        results = {"rows": rows, "config": {"command": command}}
+        page, _ = report_of(write_run(tmp_path, episodes=None, results=results))
+        code = [html.unescape(text) for text in re.findall(r"<pre><code>(.*?)</code>", page)]
+        walked = [text for text in code if ".train" in text or ".evaluate +experiment=s3 evaluation" in text]
+        assert len(walked) == shown
+        assert walked[-1] == (command or "python -m sfkd_jax.train +experiment=s3 seed=0")
+
+
+def test_two_rows_of_a_system_are_told_apart(tmp_path):
+    rows = documents()["results.json"]["rows"]
+    rows = [*rows, score("sfkd", "s3", 0.05, 0.01, 3.0, env="estimated")]
+    made = report_of(write_run(tmp_path, episodes=None, results={"rows": rows}))[1]
+    text = Path(made["report"]).with_name("report.md").read_text("utf-8")
+    assert "| SFKD (e estimated) | 0.050 ± 0.010 |" in text
+    assert "| **SFKD** | **0.034 ± 0.006** |" in text
 
 
 def violated(row, certified, radius, shares):
@@ -423,8 +466,8 @@ def test_violations_under_side_forces_are_drawn_and_written(tmp_path):
     assert "figure2.png" in {Path(figure).name for figure in made["figures"]}
     for words in ("Violations: Scenario S3", "certified tube", "conformal tube", "6.83 m", "96 segments", "0.95"):
         assert words in text, words
-    assert re.search(r"SFKD 0\.0 2\.1 1\.945 6\.2 0\.137 0\.3", text)
-    assert re.search(r"Oracle – – – 0\.0 0\.001 0\.3", text)
+    assert re.search(r"SFKD 0 2\.1 1\.945 6\.2 0\.137 0\.3", text)
+    assert re.search(r"Oracle – – – 0 0\.001 0\.3", text)
 
 
 def test_figure_2_holds_what_the_rows_hold():

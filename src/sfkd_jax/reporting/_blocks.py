@@ -4,11 +4,14 @@ from __future__ import annotations
 
 import base64
 import re
+from collections.abc import Callable
 from html import escape
 from pathlib import Path
-from typing import NamedTuple, TypeAlias
+from typing import Any, NamedTuple, TypeAlias
 
-from sfkd_jax.reporting._style import CSS
+from matplotlib.figure import Figure
+
+from sfkd_jax.reporting._style import CSS, save
 
 
 class Heading(NamedTuple):
@@ -62,6 +65,11 @@ class Missing(NamedTuple):
 
     what: str
     command: str
+
+
+def picture(place: Path, name: str, caption: str, draw: Callable[..., Figure], *inputs: Any) -> Picture:
+    """Draw a figure into a folder."""
+    return Picture(save(place / f"{name}.png", draw, *inputs), caption)
 
 
 Block: TypeAlias = Heading | Text | Tiles | Table | Picture | Code | Missing

@@ -7,10 +7,11 @@ from pathlib import Path
 from typing import Any
 
 from sfkd_jax.artefacts import write_json
+from sfkd_jax.reporting._benchmark_tables import percent
 from sfkd_jax.reporting._blocks import Block, Code, Heading, Picture, Table, Text, to_html, to_markdown
 from sfkd_jax.reporting._compared import Record, curves, records_of, scenario_of, steps_of
 from sfkd_jax.reporting._comparison_words import paragraph
-from sfkd_jax.reporting._numbers import dig, is_number, mean_std, number, plain, short, upper
+from sfkd_jax.reporting._numbers import dig, mean_std, number, plain, short, upper
 from sfkd_jax.reporting._style import save
 from sfkd_jax.reporting._tradeoff import tradeoff
 
@@ -100,10 +101,10 @@ _DRIVEN: _Columns = {
     "RMSE [m]\nmean ± std": lambda row: mean_std(row.get("rmse_m"), 4),
     "RMSE over\noracle": lambda row: number(row.get("ratio_to_oracle"), 2),
     "Steering rate\n[rad/s]": lambda row: number(row.get("smoothness_rad_per_s")),
-    "V0, theorem\n[%]": lambda row: _percent(row.get("v0")),
-    "V1, certified\ntube [%]": lambda row: _percent(row.get("v1_certified")),
+    "V0, theorem\n[%]": lambda row: percent(row.get("v0")),
+    "V1, certified\ntube [%]": lambda row: percent(row.get("v1_certified")),
     "its mean\nradius [m]": lambda row: number(row.get("v1_certified_radius_m")),
-    "V1, conformal\ntube [%]": lambda row: _percent(row.get("v1_conformal")),
+    "V1, conformal\ntube [%]": lambda row: percent(row.get("v1_conformal")),
     "mean radius\nof that [m]": lambda row: number(row.get("v1_conformal_radius_m")),
 }
 
@@ -142,7 +143,7 @@ _COVERED = (
 
 
 def _coverage(name: str) -> Callable[[Record], str]:
-    return lambda record: _percent(record["coverage"].get(name))
+    return lambda record: percent(record["coverage"].get(name))
 
 
 def _of(scenario: str, cell: Callable[[Record], str]) -> Callable[[Record], str]:
@@ -170,7 +171,3 @@ def _short(places: list[str]) -> list[str]:
     while len({path[-1] for path in paths}) == 1 < min(map(len, paths)):
         paths = [path[:-1] for path in paths]
     return ["/".join(path) for path in paths] if len(places) > 1 else places
-
-
-def _percent(share: Any) -> str:
-    return number(100 * share, 1) if is_number(share) else number(None)

@@ -1,4 +1,4 @@
-"""Figures of the model: learning curves, open-loop error, certified tube; from JSON to matplotlib Figures."""
+"""Figures of the model: learning curves and open-loop error; from JSON to matplotlib Figures."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ import numpy as np
 from matplotlib.figure import Figure
 from matplotlib.ticker import MaxNLocator
 
-from sfkd_jax.reporting._numbers import is_number, upper
+from sfkd_jax.reporting._numbers import is_number
 from sfkd_jax.reporting._style import ACCENT, SECOND, THIRD, canvas
 
 
@@ -47,11 +47,11 @@ def open_loop(errors: dict[str, Any]) -> Figure:
     ahead = np.asarray(errors["steps"], dtype=float) * (errors["dt"] if known else 1.0)
     parts = (("position_rmse_m", "position", ACCENT), ("longitudinal_rmse_m", "along", SECOND))
     for key, name, colour in (*parts, ("lateral_rmse_m", "across", THIRD)):
-        panels[0].plot(ahead, _numbers(errors.get(key), len(ahead)), color=colour, label=name)
+        panels[0].plot(ahead, numbers(errors.get(key), len(ahead)), color=colour, label=name)
     unit = "seconds ahead" if known else "steps ahead"
     panels[0].legend(loc="upper left")
-    panels[1].plot(ahead, _numbers(errors.get("yaw_rmse_rad"), len(ahead)), color=ACCENT)
-    panels[2].plot(ahead, _numbers(errors.get("speed_rmse_m_per_s"), len(ahead)), color=ACCENT)
+    panels[1].plot(ahead, numbers(errors.get("yaw_rmse_rad"), len(ahead)), color=ACCENT)
+    panels[2].plot(ahead, numbers(errors.get("speed_rmse_m_per_s"), len(ahead)), color=ACCENT)
     for axes, name in zip(panels, ("position RMSE [m]", "yaw [rad]", "speed [m/s]"), strict=True):
         axes.set(ylabel=name, xlim=(0, ahead[-1]))
         axes.set_ylim(bottom=0.0)
@@ -62,28 +62,7 @@ def open_loop(errors: dict[str, Any]) -> Figure:
     return figure
 
 
-def _numbers(values: Any, count: int) -> np.ndarray:
+def numbers(values: Any, count: int) -> np.ndarray:
     """A list from JSON as floats, null as NaN, of the length asked for."""
     row = [float("nan") if value is None else float(value) for value in values or []]
     return np.array((row + [float("nan")] * count)[:count], dtype=float)
-
-
-def tube(radii: list[Any], ultimate: Any, alpha: Any) -> Figure:
-    """The certified latent radius R_k by prediction step, with its limit in words."""
-    figure = canvas(3.2)
-    axes = figure.subplots()
-    steps = np.arange(1, len(radii) + 1)
-    values = _numbers(radii, len(radii))
-    axes.fill_between(steps, 0.0, values, color=ACCENT, alpha=0.12, linewidth=0)
-    axes.plot(steps, values, color=ACCENT, marker="o", markersize=4)
-    words = [
-        f"α = {alpha}",
-        f"$R_1$ = {upper(radii[0])},  $R_{{{len(radii)}}}$ = {upper(radii[-1])}",
-        f"ultimate bound = {ultimate}",
-    ]
-    axes.text(0.03, 0.95, "\n".join(words), transform=axes.transAxes, va="top", linespacing=1.6, color="#30363d")
-    axes.set(xlabel="steps ahead k", ylabel="latent radius $R_k$ [-]", xlim=(0.5, len(radii) + 0.5))
-    axes.set_ylim(bottom=0.0)
-    axes.set_title("Tube that the prediction error cannot leave while ‖d‖ ≤ d̄")
-    axes.xaxis.set_major_locator(MaxNLocator(integer=True))
-    return figure

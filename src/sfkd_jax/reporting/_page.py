@@ -8,8 +8,9 @@ from typing import Any
 
 from sfkd_jax.reporting import _sections as sections
 from sfkd_jax.reporting._blocks import Block, Heading, Picture, Text, to_html, to_markdown
+from sfkd_jax.reporting._driving import driving
 from sfkd_jax.reporting._files import about, read
-from sfkd_jax.reporting._numbers import plain
+from sfkd_jax.reporting._numbers import dig, plain
 from sfkd_jax.reporting._style import label
 from sfkd_jax.reporting._tables import blocks_of
 from sfkd_jax.reporting._words import command, headline, model_of, summary
@@ -46,11 +47,12 @@ def write_report(run: Path) -> dict[str, Any]:
     title = f"{label(model_of(settings))} on {name}, seed {plain(settings.get('seed'))}"
     page: list[Block] = [Heading(1, title), Text(summary(settings, head, certificate, metrics), kind="lead")]
     page += sections.tiles(settings, head, errors, certificate)
-    page += sections.driving(run, rows, settings, place)
-    page += sections.certified(certificate, settings, place)
+    page += driving(run, rows, settings, place)
+    page += sections.certified(run, certificate, errors, settings, place)
     page += sections.predicting(errors, settings, place)
     page += sections.training(metrics, settings, place)
-    page += sections.provenance(settings, policy.get("versions") or results.get("versions"))
+    versions = policy.get("versions") or results.get("versions")
+    page += sections.provenance(settings, versions, dig(results, "config", "command"))
     report = run / "report" / "index.html"
     report.write_text(to_html(title, page), encoding="utf-8")
     report.with_name("report.md").write_text(to_markdown(page), encoding="utf-8")

@@ -45,6 +45,13 @@ def hardest_step(scene: Scene) -> int:
     return int(np.argmax(row))
 
 
+def scenes_of(run: Path) -> list[Scene]:
+    """What a run drove, the scenario with the most switches first; empty without an `episodes.npz`."""
+    file = run / "episodes.npz"
+    found = read_scenes(file).values() if file.exists() else []
+    return sorted(found, key=lambda scene: len(switches(scene.envs)), reverse=True)
+
+
 def read_scenes(path: Path) -> dict[str, Scene]:
     """The scenarios in an `episodes.npz` that have at least one lateral deviation, by name in order."""
     with np.load(path, allow_pickle=False) as archive:

@@ -5,9 +5,11 @@ from __future__ import annotations
 from collections.abc import Callable
 from typing import Any
 
+from sfkd_jax.reporting._benchmark_rows import name_of
+from sfkd_jax.reporting._benchmark_tables import certified, percent
 from sfkd_jax.reporting._blocks import Table
 from sfkd_jax.reporting._numbers import DASH, dig, interval, is_number, mean_std, number, plain, short, upper
-from sfkd_jax.reporting._style import label, ordered
+from sfkd_jax.reporting._style import ordered
 
 PAPER_RMSE_M = {"s2": (0.098, 0.014), "s3": (0.120, 0.018)}
 """Mean and standard deviation that the paper reports for SFKD, by scenario; its simulator is another one."""
@@ -51,7 +53,7 @@ def block_title(block: list[dict[str, Any]]) -> str:
 
 
 _MAIN: dict[str, Callable[[dict[str, Any]], str]] = {
-    "System": lambda row: label(str(row.get("system"))),
+    "System": name_of,
     "RMSE [m]\nmean ± std": lambda row: mean_std(row.get("rmse_m")),
     "RMSE over\noracle": lambda row: number(row.get("ratio_to_oracle"), 2),
     "95 % interval\n[m]": lambda row: interval(dig(row, "rmse_m", "ci95")),
@@ -65,12 +67,18 @@ _MORE: dict[str, Callable[[dict[str, Any]], str]] = {
     "Median\n[m]": lambda row: number(dig(row, "rmse_m", "median")),
     "95th perc.\n[m]": lambda row: number(dig(row, "rmse_m", "p95")),
     "After a\nswitch [m]": lambda row: number(row.get("rmse_after_switch_m")),
-    "RMSE minus\nSFKD [m]": lambda row: number(dig(row, "difference_to_sfkd", "mean")),
-    "its 95 %\ninterval [m]": lambda row: interval(dig(row, "difference_to_sfkd", "ci95")),
+    "RMSE minus\nSFKD [m]": lambda row: number(dig(row, "difference_to_sfkd", "mean"), 4),
+    "its 95 %\ninterval [m]": lambda row: interval(dig(row, "difference_to_sfkd", "ci95"), 4),
     "Left the\nlane": lambda row: short(row.get("departures")),
-    "Effective\nsamples": lambda row: number(row.get("ess"), 0),
-    "Control,\nmedian [ms]": lambda row: number(dig(row, "act_ms", "p50"), 2),
     "Parameters": lambda row: short(row.get("params")),
+}
+
+_PLANNER: dict[str, Callable[[dict[str, Any]], str]] = {
+    "System": _MAIN["System"],
+    "Effective\nsamples": lambda row: number(row.get("ess"), 0),
+    "Control step,\nmedian [ms]": lambda row: number(dig(row, "act_ms", "p50"), 2),
+    "Control step,\n99 % [ms]": lambda row: number(dig(row, "act_ms", "p99"), 2),
+    "Plan held,\nsteps [%]": lambda row: percent(row.get("unhealthy_steps")),
 }
 
 
@@ -80,37 +88,37 @@ def closed_loop(block: list[dict[str, Any]]) -> Table:
 
 
 def closed_loop_more(block: list[dict[str, Any]]) -> Table:
-    """The remaining measures of a block; a measure that no row has gets no column."""
-    columns = {
-        name: cell for name, cell in _MORE.items() if name == "System" or any(cell(row) != DASH for row in block)
-    }
-    return _table(columns, block)
+    """The remaining measures of a block."""
+    return _measured(_MORE, block)
+
+
+def planner_table(block: list[dict[str, Any]]) -> Table:
+    """What the planner of each system of a block made of its samples, and what a control step takes."""
+    return _measured(_PLANNER, block)
+
+
+def _measured(columns: dict[str, Callable[[dict[str, Any]], str]], block: list[dict[str, Any]]) -> Table:
+    """A table in which a measure that no row has gets no column."""
+    known = {name for name, cell in columns.items() if name == "System" or any(cell(row) != DASH for row in block)}
+    return _table({name: cell for name, cell in columns.items() if name in known}, block)
 
 
 def violation_table(block: list[dict[str, Any]]) -> Table:
     """How often each system of a block left what is claimed about its predictions, and how wide the claim is."""
-
-    def certified(row: dict[str, Any], key: str) -> Any:
-        return dig(row, "violation", key) if dig(row, "violation", "v1_tube") == "certified" else None
-
     columns: dict[str, Callable[[dict[str, Any]], str]] = {
         "System": _MAIN["System"],
-        "V0, theorem\n[%]": lambda row: _percent(dig(row, "violation", "v0")),
-        "V1, certified\ntube [%]": lambda row: _percent(certified(row, "v1")),
+        "V0, theorem\n[%]": lambda row: percent(dig(row, "violation", "v0")),
+        "V1, certified\ntube [%]": lambda row: percent(certified(row, "v1")),
         "its mean\nradius [m]": lambda row: number(certified(row, "v1_radius_m")),
-        "V1, conformal\ntube [%]": lambda row: _percent(dig(row, "violation", "v1_conformal")),
+        "V1, conformal\ntube [%]": lambda row: percent(dig(row, "violation", "v1_conformal")),
         "mean radius\nof that [m]": lambda row: number(dig(row, "violation", "v1_conformal_radius_m")),
-        "V2, threshold\n[%]": lambda row: _percent(dig(row, "violation", "v2")),
+        "V2, threshold\n[%]": lambda row: percent(dig(row, "violation", "v2")),
     }
     return _table(columns, block)
 
 
-def _percent(share: Any) -> str:
-    return number(100 * share, 1) if is_number(share) else DASH
-
-
 def _table(columns: dict[str, Callable[[dict[str, Any]], str]], block: list[dict[str, Any]]) -> Table:
-    strong = tuple(place for place, row in enumerate(block) if row.get("system") == "sfkd")
+    strong = tuple(place for place, row in enumerate(block) if name_of(row) == "SFKD")
     return Table(list(columns), [[cell(row) for cell in columns.values()] for row in block], strong)
 
 
