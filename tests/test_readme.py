@@ -3,6 +3,7 @@
 import json
 import os
 import re
+import runpy
 import subprocess
 import sys
 from pathlib import Path
@@ -12,6 +13,7 @@ import pytest
 from sfkd_jax.reporting import benchmark_markdown
 
 ROOT = Path(__file__).parents[1]
+PAGES = runpy.run_path(str(ROOT / "benchmarks" / "result_pages.py"))["PAGES"]
 README = (ROOT / "README.md").read_text("utf-8")
 EXPERIMENTS = sorted(folder for folder in (ROOT / "experiments").iterdir() if folder.is_dir())
 
@@ -51,13 +53,14 @@ def test_an_experiment_is_a_script_an_expectation_and_a_result_that_meets_it(fol
 
 @pytest.mark.parametrize(
     ("folder", "page"),
-    [("table1_closed_loop", "results"), ("robustness", "robustness"), ("figure2_disturbance", "disturbance")],
+    [found for found in PAGES.values() if (ROOT / "experiments" / found[0] / "results.json").exists()],
 )
 def test_a_page_of_results_says_what_the_results_say(folder, page):
     results = json.loads((ROOT / "experiments" / folder / "results.json").read_text())
     shown = benchmark_markdown(results).replace("results_files/", f"{page}_files/")
     assert (ROOT / "docs" / f"{page}.md").read_text("utf-8") == shown
-    assert all((ROOT / "docs" / figure).exists() for figure in re.findall(r"\]\((\S+\.png)\)", shown))
+    linked = {(ROOT / "docs" / figure).name for figure in re.findall(r"\]\((\S+\.png)\)", shown)}
+    assert {file.name for file in (ROOT / "docs" / f"{page}_files").glob("*.png")} == linked
 
 
 def test_the_page_about_foreign_plants_says_what_the_results_say():

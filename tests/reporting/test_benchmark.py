@@ -13,11 +13,12 @@ from sfkd_jax.artefacts import ArtefactError, write_arrays
 from sfkd_jax.reporting import benchmark_markdown, benchmark_report
 from sfkd_jax.reporting._animation import MOST_BYTES, film
 from sfkd_jax.reporting._benchmark_figures import overview, through_switches
-from sfkd_jax.reporting._benchmark_rows import contests, line_of, paper_of
+from sfkd_jax.reporting._benchmark_rows import contests, line_of, paper_of, scenarios
 from sfkd_jax.reporting._benchmark_words import beaten
 from sfkd_jax.reporting._blocks import Table
+from sfkd_jax.reporting._forces import forces_figure, forces_tables, pushed
 from sfkd_jax.reporting._latex import latex
-from sfkd_jax.reporting._robustness import level_of, robustness, studies, study_of
+from sfkd_jax.reporting._robustness import columns, robustness, robustness_table, studies
 
 ORACLE, SFKD = 0.016, 0.020
 LEVELS = ((0.9, 0.0), (0.6, -4.0), (0.3, 8.0), (0.6, 4.0))
@@ -59,8 +60,10 @@ def row(system, env, scenario="s3", vehicle="kinematic", sampling="feedback", fa
     } | more  # fmt: skip
 
 
-def pushed(system, env):
+def driven_under_forces(system, env):
     runs = [{"force_n": force, "v0": 0.0, "v1": 0.1, "v1_conformal": force / 1e3, "v2": 0.0} for force in (0.0, 500.0)]
+    runs[0] |= {"rmse_m": {"mean": SYSTEMS[system, env]}, "departures": 2}
+    runs[1] |= {"departures": 0}
     return row(system, env, disturbed=runs)
 
 
@@ -72,13 +75,14 @@ def document(vehicles=("kinematic",), samplings=("feedback", "plain")):
                 rows.append(row(system, env, scenario, vehicle, sampling))
     for place, entry in enumerate(rows):
         if (entry["scenario"], entry["sampling"]) == ("s3", "feedback"):
-            rows[place] = entry | {"disturbed": pushed(entry["system"], entry["env"])["disturbed"]}
+            rows[place] = entry | {"disturbed": driven_under_forces(entry["system"], entry["env"])["disturbed"]}
     for variation, factor in {
         "environment 0.5 s late": 1.5,
         "environment 1 s late": 2.5,
-        "sensor noise x2": 1.25,
+        "sensor noise x 2": 1.25,
     }.items():
-        rows += [row(*one, factor=factor, variation=variation) for one in SYSTEMS]
+        left = 2 if factor == 1.25 else 0
+        rows += [row(*one, factor=factor, variation=variation, departures=left) for one in SYSTEMS]
     config = {"name": "table1", "comparison": {"paper": PAPER, "seeds": [0, 1]}, "evaluation": {"episodes": 8}}
     return {"rows": rows, "config": config, "versions": {"jax": "0.10.2"}, "seconds": 90.0, "failed": {}}
 
@@ -245,9 +249,8 @@ def test_markdown_depends_on_the_results_alone_and_links_what_is_drawn(whole):
 def test_every_figure_is_drawn_once_per_study_and_access(whole):
     names = [Path(figure).name for figure in whole[1]["figures"]]
     assert names == [
-        "rmse_kinematic.png", "figure1_kinematic.png", "s3_kinematic.gif", "figure2_kinematic_feedback_measured.png",
-        "figure2_kinematic_feedback_none.png", "environment_late_kinematic_feedback.png",
-        "sensor_noise_kinematic_feedback.png",
+        "variations_kinematic_feedback_s3.png", "figure2_kinematic_feedback.png", "rmse_kinematic.png",
+        "figure1_kinematic.png", "s3_kinematic.gif",
     ]  # fmt: skip
 
 
@@ -286,35 +289,106 @@ def test_a_row_that_says_where_its_arrays_lie_is_believed(tmp_path):
     assert film(tmp_path, contest, tmp_path / "s3.gif", seconds=0.5)[1] == ["SFKD"]
 
 
-def test_robustness_divides_by_the_same_row_as_it_is(whole):
+def test_a_study_sets_every_row_beside_itself_as_it_is(whole):
     rows = document()["rows"]
     (contest, plain) = contests(rows)
-    late, noise = studies(rows, contest)
-    assert (late.name, noise.name) == ("environment late", "sensor noise")
-    assert late.levels == ["environment 0.5 s late", "environment 1 s late"]
-    assert set(np.round(list(noise.ratios.values()), 9)) == {1.25}
-    assert len(noise.ratios) == len(SYSTEMS)
+    (study,) = studies(rows, contest)
+    assert columns(study) == ["as it is", "environment 0.5 s late", "environment 1 s late", "sensor noise x 2"]
     assert studies(rows, plain) == []
-    assert len(robustness(late).axes) == 1
-    found = tables_of(text_of(whole[0], "results.md"), f"Environment late: {FEEDBACK}")
-    assert found["Nominal"] == ["1.50", "2.50"]
+    found = tables_of(text_of(whole[0], "results.md"), f"What changes cost, S3: {FEEDBACK}")
+    assert found["Row"][1] == "environment 0.5 s late \\[mm\\]"
+    assert found["Nominal"] == ["120.0", "180.0 (× 1.50)", "300.0 (× 2.50)", "150.0 (× 1.25), 2 left"]
+    assert set(found) == {"Row", *(line.name for line in contest.lines)}
+    figure = robustness(study)
+    assert [axes.get_title(loc="left").replace("\n", " ") for axes in figure.axes][2] == "sensor noise ×\u00a02"
+    for axes, factor in zip(figure.axes, (1.5, 2.5, 1.25), strict=True):
+        ends = [line.get_xdata() for line in axes.get_lines() if line.get_gid() and len(line.get_xdata()) == 2]
+        assert len(ends) == len(SYSTEMS)
+        np.testing.assert_allclose([after / before for before, after in ends], factor)
+    assert len({axes.get_xlim() for axes in figure.axes}) == 1
 
 
-@pytest.mark.parametrize(
-    ("variation", "study", "level"),
-    [
-        ("environment 0.5 s late", "environment late", "0.5 s"),
-        ("environment friction bias 0.1", "environment bias", "friction 0.1"),
-        ("environment noise x2", "environment noise", "x2"),
-        ("data share 0.25", "data share", "0.25"),
-        ("side force 500 N", "side force", "500 N"),
-        ("levels fixed", "levels", "fixed"),
-        ("tyres worn", "tyres worn", "tyres worn"),
-    ],
-)
-def test_variations_are_grouped_by_their_words(variation, study, level):
-    assert study_of(variation) == study
-    assert level_of(variation, study) == level
+def test_shares_of_the_data_rise_to_the_whole_of_it():
+    rows = [row(*one) for one in SYSTEMS]
+    for share, factor in (("10", 1.5), ("1", 3.0)):
+        rows += [row(*one, factor=factor, variation=f"data share {share} %") for one in SYSTEMS]
+    results = {"rows": rows, "config": {"name": "small_data"}}
+    (study,) = studies(rows, contests(rows)[0])
+    assert columns(study) == ["data share 1 %", "data share 10 %", "data share 100 %"]
+    markdown = benchmark_markdown(results)
+    assert markdown.startswith("# Less training data, row by row\n\nThe policies are trained anew on a share of")
+    found = tables_of(markdown, f"Share of the training data, S3: {FEEDBACK}")
+    assert found["SFKD"] == ["60.0 (× 3.00)", "30.0 (× 1.50)", "20.0"]
+    assert markdown.index("Share of the training data") < markdown.index("Tracking: ")
+
+
+def test_a_row_that_estimates_e_stands_beside_itself_with_e_measured():
+    estimated = row("sfkd", "measured", factor=2.0) | {"env": "estimated", "variation": "environment estimated"}
+    rows = [row("sfkd", "measured"), row("oracle", "measured"), estimated]
+    (study,) = studies(rows, contests(rows)[0])
+    assert {name: cells for name, *cells in robustness_table(study).rows} == {
+        "SFKD": ["20.0", "40.0 (× 2.00)"],
+        "Oracle": ["16.0", "–"],
+    }
+
+
+def test_steady_levels_come_from_seen_to_extrapolated_and_are_not_held_against_the_paper():
+    names = {"s1": "seen", "s2": "interpolated", "s3": "extrapolated"}
+    rows = [row(*one, scenario) | {"scenario": names[scenario]} for scenario in names for one in SYSTEMS]
+    results = {"rows": rows, "config": {"name": "levels", "comparison": {"paper": PAPER}}}
+    markdown = benchmark_markdown(results)
+    found = tables_of(markdown, f"Tracking: {FEEDBACK}")
+    assert found["Row"] == [rf"{name} RMSE \[mm\] (95 %)" for name in names.values()]
+    assert found["SFKD"] == ["10.0 (9.0–11.0)", "16.0 (14.4–17.6)", "20.0 (18.0–22.0)"]
+    assert "At extrapolated levels 20.0 against 25.0 mm, 20 % lower" in markdown
+    assert "On S3" not in markdown
+    assert "crosses" not in markdown
+    assert markdown.startswith("# Steady friction and wind")
+    figure = overview(contests(rows), paper_of(results))
+    assert [axes.get_title(loc="left") for axes in figure.axes] == list(names.values())
+
+
+def test_a_row_that_only_another_contest_drove_adds_no_scenario():
+    rows = [row("koopman_mpc", "measured", "s1"), row("sfkd", "measured", "s1"), row("sfkd", "measured", "s3")]
+    rows.append(row("sfkd", "measured", "s3", sampling="plain"))
+    assert [scenarios(contest) for contest in contests(rows)] == [["s1", "s3"], ["s3"]]
+
+
+def test_rows_stand_by_what_they_are_told_and_then_by_what_they_reach(whole):
+    (contest, _) = contests(document()["rows"])
+    figure = overview([contest], {})
+    shown = [text.get_text() for text in figure.axes[0].get_yticklabels()]
+    split = shown.index("told neither")
+    assert shown[0] == "told friction and wind"
+    assert shown[1:4] == ["Oracle", "SFKD − contraction", "SFKD"]
+    assert shown[split + 1 :] == [
+        "SFKD − fiber",
+        "Neural ODE (no e)",
+        "ICODE-MPPI (no e)",
+        "Nominal",
+        "Koopman MPC (no e)",
+    ]
+    places = [text.get_position()[1] for text in figure.axes[0].get_yticklabels()]
+    assert places == sorted(places)
+    own = next(text for text in figure.axes[0].get_yticklabels() if text.get_text() == "SFKD")
+    assert own.get_fontweight() == "bold"
+
+
+def test_side_forces_are_in_a_table_and_in_a_figure_that_hold_the_same(whole):
+    found = tables_of(text_of(whole[0], "results.md"), f"Side forces: {FEEDBACK}")
+    assert found["Row"] == [r"RMSE \[mm\] 0 N", r"RMSE \[mm\] 500 N", "Left the lane"]
+    assert found["SFKD"] == ["20.0", "–", "2 / 0"]
+    scenario, lines = pushed(contests(document()["rows"])[0])
+    claimed = {name: cells for name, *cells in forces_tables(scenario, lines)[1].rows}
+    assert claimed["SFKD"] == ["0 / 0", "10.0 / 10.0", "0 / 50.0", "0 / 0"]
+    assert claimed["Nominal"] == ["–", "–", "0 / 50.0", "0 / 0"]
+    assert (scenario, len(lines)) == ("s3", len(SYSTEMS) - 2)  # the quadratic programs were not pushed
+    panels = forces_figure(scenario, lines).axes
+    shares = [line.get_xdata() for line in panels[1].get_lines() if line.get_gid()]
+    np.testing.assert_allclose(shares, [[0.0, 50.0]] * len(lines))
+    radii = sorted(float(line.get_xdata()[0]) for line in panels[3].get_lines() if line.get_gid())
+    np.testing.assert_allclose(radii, [0.2] * len(lines) + [2.0])
+    assert pushed(contests(document()["rows"])[1]) is None
 
 
 def emptied(value, hole):

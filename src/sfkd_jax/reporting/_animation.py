@@ -17,7 +17,7 @@ from sfkd_jax.reporting._benchmark_figures import FIGURED, conditions, look, sha
 from sfkd_jax.reporting._benchmark_rows import SELF_EVIDENT, Contest, Row, contests, stem
 from sfkd_jax.reporting._drives import Drive, drives
 from sfkd_jax.reporting._scene import switches
-from sfkd_jax.reporting._style import PLATE, literal
+from sfkd_jax.reporting._style import PLATE, literal, scenario_label
 from sfkd_jax.reporting._track import EXAGGERATION, _projected, _widened
 
 MOST_BYTES = 2_000_000
@@ -94,7 +94,7 @@ def _write(cast: _Cast, scenario: str, steps: range, path: Path, rate: float) ->
         above, strip = figure.subplots(2, 1, height_ratios=[2.4, 1])
         figure.subplots_adjust(left=0.125, right=0.985, top=0.94, bottom=0.1, hspace=0.08)
         above.set_title(
-            f"{scenario.upper()}, deviations × {_widening(cast, steps.stop)}", fontsize=9.5, loc="right", pad=4
+            f"{scenario_label(scenario)}, deviations × {_widening(cast, steps.stop)}", fontsize=9.5, loc="right", pad=4
         )
         moving = [*_road(above, cast, steps.stop), *_strip(strip, cast, steps.stop)]
         writer = _Writer(fps=max(1, round(rate)))

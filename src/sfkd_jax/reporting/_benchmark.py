@@ -17,24 +17,25 @@ from sfkd_jax.reporting._benchmark_rows import (
     Contest,
     Row,
     contests,
-    drawn_for,
+    is_quoted,
     paper_of,
     stem,
     title,
     together,
     vehicle_title,
 )
+from sfkd_jax.reporting._benchmark_tables import slashed
 from sfkd_jax.reporting._benchmark_words import beaten, words
 from sfkd_jax.reporting._blocks import Block, Heading, Picture, Text, to_html, to_markdown
+from sfkd_jax.reporting._forces import forces_figure, forces_of, forces_tables, pushed
 from sfkd_jax.reporting._latex import latex
-from sfkd_jax.reporting._robustness import caption, robustness, robustness_table, studies
-from sfkd_jax.reporting._style import save
-from sfkd_jax.reporting._violations import disturbed, violations
+from sfkd_jax.reporting._numbers import plain
+from sfkd_jax.reporting._robustness import caption, heading, note, robustness, robustness_table, studies
+from sfkd_jax.reporting._style import save, scenario_label
 
 _Ink: TypeAlias = Callable[..., Picture]
 """(name of the file, caption, how to draw it, from what) -> the picture."""
 
-TITLE = "The paper's table, row by row"
 FILES = "results_files"
 MOST_BYTES = 5_000_000
 """Of the page."""
@@ -84,11 +85,12 @@ def benchmark_markdown(results: dict[str, Any]) -> str:
 
 def _html(page: list[Block]) -> str:
     """The page; its films, from the last one on, as names where it would become too heavy."""
-    text, films = to_html(TITLE, page), [block for block in page if isinstance(block, Picture) and _moves(block)]
+    name = next((block.text for block in page if isinstance(block, Heading)), "")
+    text, films = to_html(name, page), [block for block in page if isinstance(block, Picture) and _moves(block)]
     while len(text.encode()) > MOST_BYTES and films:
         heavy = films.pop()
         page = [_named(heavy) if block is heavy else block for block in page]
-        text = to_html(TITLE, page)
+        text = to_html(name, page)
     return text
 
 
@@ -103,21 +105,26 @@ def _named(picture: Picture) -> Text:
 def _page(results: dict[str, Any], ink: _Ink, directory: Path | None) -> list[Block]:
     rows: list[Row] = results["rows"]
     found, paper = contests(rows), paper_of(results)
-    page: list[Block] = [Heading(1, TITLE), Text(notes.lead(results, found), kind="lead"), *notes.failures(results)]
-    page += words(found, paper)
+    page: list[Block] = [Heading(1, notes.heading(results)), Text(notes.lead(results, found), kind="lead")]
+    page += notes.failures(results)
+    claims = words(found, paper)
+    studied = not is_quoted(found, paper) or any(pushed(contest) or studies(rows, contest) for contest in found)
+    page += [] if studied else claims
     groups: dict[str, list[Contest]] = {vehicle_title(contest): [] for contest in found}
     for contest in found:
         groups[vehicle_title(contest)].append(contest)
     for name, group in groups.items():
-        page += [Heading(2, name), ink(f"rmse_{stem(group[0])}", notes.OVERVIEW, overview, group, paper)]
+        page.append(Heading(2, name))
+        for contest in group:
+            page += [*_robust(rows, contest, ink), *_forces(contest, ink)]
+        page += [Heading(3, "Every row")] if studied else []
+        page.append(ink(f"rmse_{stem(group[0])}", notes.overview(group, paper), overview, group, paper))
         page += _driven(group[0], ink, directory)
         for contest in group:
             page += _contest(contest, paper, ink)
         page += [Heading(3, "Prediction without feedback, position error"), tables.prediction(together(group))]
         page += [Heading(3, "Cost and certificate"), tables.cost(group), Text(notes.COST, kind="note")]
-        for contest in group:
-            page += _robust(rows, contest, ink)
-    return [*page, *notes.provenance(results)]
+    return [*page, *(claims if studied else []), *notes.provenance(results)]
 
 
 def _driven(contest: Contest, ink: _Ink, directory: Path | None) -> list[Block]:
@@ -129,16 +136,16 @@ def _driven(contest: Contest, ink: _Ink, directory: Path | None) -> list[Block]:
     blocks: list[Block] = [ink(f"figure1_{stem(contest)}", said, through_switches, directory, contest)]
     made = film(directory, contest, directory / "report" / FILES / f"{name}.gif") if directory else None
     if made:
-        blocks.append(Picture(made[0], f"{FIGURED.upper()} in real time: {', '.join(made[1])}."))
+        blocks.append(Picture(made[0], f"{scenario_label(FIGURED)} in real time: {', '.join(made[1])}."))
     return blocks
 
 
 def _contest(contest: Contest, paper: tables.Paper, ink: _Ink) -> list[Block]:
     """The tables of a contest, each with what its marks mean, and Figure 2."""
-    blocks: list[Block] = [
+    return [
         Heading(3, f"Tracking: {title(contest)}"),
         tables.tracking(contest, paper),
-        Text(notes.TRACKING, kind="note"),
+        Text(notes.tracking(contest, paper), kind="note"),
         Heading(3, f"Against SFKD and the oracle: {title(contest)}"),
         tables.against(contest),
         Text(notes.AGAINST, kind="note"),
@@ -153,30 +160,34 @@ def _contest(contest: Contest, paper: tables.Paper, ink: _Ink) -> list[Block]:
         Heading(3, f"Rows that beat SFKD: {title(contest)}"),
         *beaten(contest),
     ]
-    for env, told in (("measured", "told friction and wind"), ("none", "told neither")):
-        pushed = [row for row in _under_forces(contest) if row.get("env") == env]
-        if pushed:
-            name = f"figure2_{stem(contest)}_{contest.sampling or 'qp'}_{env}"
-            said = f"{title(contest)}, rows that are {told}: {notes.FIGURE_2}"
-            blocks.append(ink(name, said, violations, pushed))
-    return blocks
 
 
-def _under_forces(contest: Contest) -> list[Row]:
-    """The rows that were pushed, on the hardest scenario on which any was, one access to the environment at a time."""
-    found = [(name, line, row) for line in contest.lines for name, row in line.rows.items() if disturbed([row])]
-    hardest = max((name for name, *_ in found), default=None)
-    pushed = [(line, row) for name, line, row in found if name == hardest]
-    return drawn_for(contest, [row for _, row in pushed])
+def _forces(contest: Contest, ink: _Ink) -> list[Block]:
+    """Figure 2 and its table, where rows were pushed."""
+    found = pushed(contest)
+    if found is None:
+        return []
+    tracked, claimed = forces_tables(*found)
+    name = f"figure2_{stem(contest)}_{contest.sampling or 'qp'}"
+    said = f"{title(contest)}, {scenario_label(found[0])}: {notes.FIGURE_2}"
+    return [
+        Heading(3, f"Side forces: {title(contest)}"),
+        ink(name, said, forces_figure, *found),
+        tracked,
+        Heading(3, f"Claims under side forces: {title(contest)}"),
+        claimed,
+        Text(f"{notes.FORCES}: {slashed([plain(force) for force in forces_of(*found)])} N.", kind="note"),
+    ]
 
 
 def _robust(rows: list[Row], contest: Contest, ink: _Ink) -> list[Block]:
     blocks: list[Block] = []
     for study in studies(rows, contest):
-        name = f"{study.name.replace(' ', '_')}_{stem(contest)}_{contest.sampling or 'qp'}"
+        name = f"variations_{stem(contest)}_{contest.sampling or 'qp'}_{study.scenario}"
         blocks += [
-            Heading(3, f"{study.name.capitalize()}: {title(contest)}"),
+            Heading(3, heading(study)),
             ink(name, caption(study), robustness, study),
             robustness_table(study),
+            Text(note(study), kind="note"),
         ]
     return blocks

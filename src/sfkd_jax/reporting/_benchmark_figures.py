@@ -8,18 +8,27 @@ from typing import Any
 
 import numpy as np
 from matplotlib.figure import Figure
-from matplotlib.lines import Line2D
-from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter
 
-from sfkd_jax.reporting._benchmark_rows import Contest, Line, measure, scenarios, title, together
+from sfkd_jax.reporting._benchmark_rows import (
+    Contest,
+    Line,
+    by_hardness,
+    is_quoted,
+    measure,
+    scenarios,
+    title,
+    together,
+)
 from sfkd_jax.reporting._benchmark_tables import Paper
+from sfkd_jax.reporting._dots import colour, common_range, dot_panels, mark
 from sfkd_jax.reporting._drives import Drive, drives
 from sfkd_jax.reporting._numbers import DASH, dig, interval, is_number
 from sfkd_jax.reporting._scene import switches
-from sfkd_jax.reporting._style import MUTED, canvas, line, literal
+from sfkd_jax.reporting._style import MUTED, canvas, line, literal, scenario_label
 
 FIGURED = "s3"
 """The scenario of Figure 1 and of the film."""
+_QUOTED = "#9aa1ab"
 _ALWAYS = ("sfkd", "oracle")
 _FAMILIES = ("SFKD and its parts", "told friction and wind", "told neither")
 
@@ -32,56 +41,43 @@ def look(one: Line) -> dict[str, Any]:
 def overview(group: list[Contest], paper: Paper) -> Figure:
     """Mean RMSE of every row with its 95 % interval, one panel a scenario, one marker a way of sampling."""
     rows = together(group).lines
-    names = sorted({name for contest in group for name in scenarios(contest)})
-    figure = canvas(1.5 + 0.235 * len(rows))
-    panels = figure.subplots(1, len(names), sharey=True, squeeze=False)[0]
-    for axes, name in zip(panels, names, strict=True):
+    names = by_hardness({name for contest in group for name in scenarios(contest)})
+
+    def score(one: Line) -> float | None:
+        return measure(one, names[-1], "rmse_m", "mean") if names else None
+
+    figure, panels, places = dot_panels(rows, score, [scenario_label(name) for name in names] or [""])
+    for axes, name in zip(panels, names, strict=False):
         for shift, contest in enumerate(group):
-            _dots(axes, contest, name, rows, hollow=shift > 0, raised=0.17 * (len(group) - 1 - 2 * shift))
-        printed = [(dig(paper.get(one.system), f"rmse_{name}_m"), place) for place, one in enumerate(rows)]
+            _dots(axes, contest, name, places, hollow=shift > 0, raised=0.17 * (len(group) - 1 - 2 * shift))
+        printed = [(dig(paper.get(one.system), f"rmse_{name}_m"), places[one.name]) for one in rows]
         quoted = np.array([pair for pair in printed if is_number(pair[0])], dtype=float).reshape(-1, 2)
-        axes.plot(
-            1e3 * quoted[:, 0], quoted[:, 1], linestyle="none", marker="x", markersize=4, color="#b0b7c0", zorder=2
-        )
-        plain_log(axes.xaxis, axes.set_xscale)
-        axes.set(title=literal(name.upper()), xlabel="RMSE [mm]")
-    panels[0].set_yticks(range(len(rows)), [literal(one.name) for one in rows])
-    panels[0].set_ylim(len(rows) - 0.4, -0.6)
+        cross: dict[str, Any] = {"marker": "x", "markersize": 4, "color": _QUOTED, "zorder": 2}
+        axes.plot(1e3 * quoted[:, 0], quoted[:, 1], linestyle="none", gid="row", **cross)
+        axes.set_xlabel("RMSE [mm]")
+    common_range(panels, sparse=False)
     kinds = [contest.sampling or "measured" for contest in group]
-    handles = [_mark(kind, "o", hollow=bool(place)) for place, kind in enumerate(kinds)]
-    figure.legend(handles=[*handles, _mark("the paper", "x", hollow=False)], loc="outside upper left", ncols=4)
+    faces = [{} if not place else {"markerfacecolor": "white"} for place in range(len(kinds))]
+    handles = [mark(kind, marker="o", **face) for kind, face in zip(kinds, faces, strict=True)]
+    if is_quoted(group, paper):
+        handles.append(mark("the paper", marker="x", color=_QUOTED))
+    if len(handles) > 1:
+        figure.legend(handles=handles, loc="outside upper left", ncols=4)
     return figure
 
 
-def _mark(name: str, marker: str, *, hollow: bool) -> Line2D:
-    colour = "#b0b7c0" if marker == "x" else MUTED
-    face = "white" if hollow else colour
-    return Line2D([], [], linestyle="none", marker=marker, color=colour, markerfacecolor=face, label=literal(name))
-
-
-def _dots(axes: Any, contest: Contest, name: str, rows: list[Line], *, hollow: bool, raised: float) -> None:
+def _dots(axes: Any, contest: Contest, name: str, places: dict[str, float], *, hollow: bool, raised: float) -> None:
     """Means and intervals of a contest, each at the place of its row."""
-    places = {one.name: place for place, one in enumerate(rows)}
     for one in contest.lines:
         mean = measure(one, name, "rmse_m", "mean")
         if mean is None or (hollow and not one.rows[name].get("sampling")):
             continue
-        place, colour = places[one.name] - raised, look(one)["color"]
+        place, ink = places[one.name] - raised, colour(one)
         ends = dig(one.rows[name], "rmse_m", "ci95")
         if interval(ends) != DASH:
-            axes.plot([1e3 * end for end in ends], [place] * 2, color=colour, linewidth=1.4, zorder=3)
-        face = "white" if hollow else colour
-        axes.plot(1e3 * mean, place, marker="o", markersize=4.5, color=colour, markerfacecolor=face, zorder=4)
-
-
-def plain_log(axis: Any, set_scale: Any) -> None:
-    """A logarithmic axis with plain numbers; what is not positive is not shown."""
-    set_scale("log")
-    low, high = axis.get_view_interval()
-    narrow = (1.0, 2.0, 5.0) if high < 30 * low else (1.0, 3.0) if high < 300 * low else (1.0,)
-    axis.set_major_locator(LogLocator(subs=narrow))
-    axis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}"))
-    axis.set_minor_formatter(NullFormatter())
+            axes.plot([1e3 * end for end in ends], [place] * 2, color=ink, linewidth=1.4, zorder=3, gid="row")
+        face = "white" if hollow else ink
+        axes.plot(1e3 * mean, place, marker="o", markersize=4.5, color=ink, markerfacecolor=face, zorder=4, gid="row")
 
 
 def through_switches(directory: Path | None, contest: Contest, seconds: float = 15.0) -> Figure:
@@ -96,7 +92,8 @@ def through_switches(directory: Path | None, contest: Contest, seconds: float = 
     for axes, (name, family) in zip(rows, panels, strict=True):
         _panel(axes, family, round(end / family[0].dt) if family else 0)
         axes.set_title(
-            literal(f"{FIGURED.upper()}, {name}" if name else FIGURED.upper()), pad=30 if axes is rows[0] else 7
+            literal(", ".join([scenario_label(FIGURED), name] if name else [scenario_label(FIGURED)])),
+            pad=30 if axes is rows[0] else 7,
         )
         axes.set(xlim=(0.0, end), ylabel="deviation [m]")
     _shade(rows, next((one for one in found if one.envs is not None), None), end)

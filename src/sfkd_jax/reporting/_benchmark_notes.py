@@ -5,31 +5,59 @@ from __future__ import annotations
 import shlex
 from typing import Any
 
-from sfkd_jax.reporting._benchmark_rows import Contest, Row, contests
+from sfkd_jax.reporting._benchmark_rows import Contest, Row, contests, is_quoted, scenarios
 from sfkd_jax.reporting._blocks import Block, Code, Heading, Table
-from sfkd_jax.reporting._numbers import DASH, is_number, number, plain
+from sfkd_jax.reporting._numbers import DASH, dig, is_number, number, plain
 from sfkd_jax.reporting._tables import settings_table
 
-OVERVIEW = (
-    "Mean lateral RMSE of every row with its 95 % interval over episodes, on a logarithmic axis; crosses: what the "
-    "paper prints for the row's system, measured in another simulator."
-)
 FIGURE_1 = (
     "signed lateral deviation in the first episode, left positive. Shades and the words above: friction μ and side "
     "wind w, which switch at the dashed lines. SFKD and the oracle are in every panel; of the others the two best are"
     " drawn in full, the rest thin. A line that leaves the frame deviates further than the frame shows."
 )
 FIGURE_2 = (
-    "violations while a side force that nobody measures pushes the car, up to the value on the axis to either side. "
-    "Circles: conformal tubes, all at one level. Squares: the certified tube. Crosses: steps at which the theorem "
-    "fails. Right: the mean position radius of each tube; a tube that is wide enough is never left."
+    "while a side force that nobody measures pushes the car, redrawn every second, up to the named value to either "
+    "side; the marker grows with it. Circles: conformal tubes, all at one level; squares: the certified tube. Right: "
+    "the mean position radius of each tube; a tube that is wide enough is never left. Rows that are told friction and "
+    "wind above, those that are not below, each group by its RMSE without a force."
 )
-TRACKING = (
+FORCES = (
+    "V0: steps at which the certified bound fails although no one-step error exceeded its assumption; the theorem says "
+    "0. V1: segments that leave the tube around their prediction. V2: windows of prediction beyond one distance that "
+    "is the same for every row. Left the lane: episodes. Numbers between slashes, one a force"
+)
+TITLES = {
+    "table1": "The paper's table, row by row",
+    "figure2": "Unmeasured side forces, row by row",
+    "robustness": "Late, noisy and biased e, and worse sensors, row by row",
+    "levels": "Steady friction and wind: seen, interpolated, extrapolated",
+    "small_data": "Less training data, row by row",
+    "estimated": "e inferred while driving",
+}
+_INTRODUCED = {
+    "figure2": "A force that nobody measures pushes the car from the side, as in the paper's Figure 2.",
+    "robustness": "What is told of friction and wind comes late, noisy or biased, or the sensors are worse than in the "
+    "table; the plant and the policies stay as they are.",
+    "levels": "Friction and wind stay what they are for a whole episode. Seen: as training drives have them; "
+    "interpolated: friction between the levels that training drives have under wind; extrapolated: beyond the box that "
+    "training drives cover.",
+    "small_data": "The policies are trained anew on a share of the training segments; the rest of the protocol stays "
+    "as it is.",
+}
+
+
+def heading(results: dict[str, Any]) -> str:
+    """What the page is called, by the name of the comparison."""
+    name = str(dig(results, "config", "name"))
+    return TITLES.get(name, "A comparison, row by row")
+
+
+_TRACKING = (
     "RMSE of the lateral deviation of the true state from the path, one number per episode; mean with its 95 % "
     "interval. (e): the model is told friction and wind; (no e): it is not. The oracle plans with the true vehicle, "
-    "nominal with a bicycle that knows neither. The paper has one row per system, which stands beside every variant "
-    "of it; its simulator is another one."
+    "nominal with a bicycle that knows neither."
 )
+_PRINTED = " The paper has one row per system, which stands beside every variant of it; its simulator is another one."
 AGAINST = (
     "RMSE of a row minus SFKD's on the same episodes, with the 95 % interval of the paired difference: * lies above "
     "zero, so SFKD is better; † lies below zero, so SFKD is worse; unmarked intervals hold zero."
@@ -49,6 +77,21 @@ COST = (
 )
 
 
+def overview(group: list[Contest], paper: dict[str, Any]) -> str:
+    """What the figure of all rows shows."""
+    crosses = "; crosses: what the paper prints for the row's system, measured in another simulator"
+    crosses = crosses if is_quoted(group, paper) else ""
+    return (
+        f"Mean lateral RMSE of every row with its 95 % interval over episodes, on a logarithmic axis{crosses}. Rows "
+        "that are told friction and wind above, those that are not below, each group by its RMSE in the last panel."
+    )
+
+
+def tracking(contest: Contest, paper: dict[str, Any]) -> str:
+    """What the first table of a contest holds."""
+    return _TRACKING + (_PRINTED if is_quoted([contest], paper) else "")
+
+
 def lead(results: dict[str, Any], found: list[Contest]) -> str:
     """How much was driven."""
     rows: list[Row] = [row for contest in found for line in contest.lines for row in line.rows.values()]
@@ -61,7 +104,8 @@ def lead(results: dict[str, Any], found: list[Contest]) -> str:
     ]
     seconds: Any = results.get("seconds")
     lasted = f" The last run of the command took {number(seconds / 60, 1)} minutes." if is_number(seconds) else ""
-    return f"{'; '.join(said)}.{lasted}"
+    begin = _INTRODUCED.get(str(dig(results, "config", "name")))
+    return " ".join(filter(None, [begin, f"{'; '.join(said)}.{lasted}"]))
 
 
 def _spread(rows: list[Row], key: str) -> str:
@@ -87,7 +131,7 @@ def provenance(results: dict[str, Any]) -> list[Block]:
     counts = [
         [f"{contest.vehicle}, {contest.sampling or 'no sampling'}", name, *_counted(contest, name)]
         for contest in contests(results["rows"])
-        for name in sorted({key for line in contest.lines for key in line.rows})
+        for name in scenarios(contest)
     ]
     return [
         Heading(2, "How to make it again"),

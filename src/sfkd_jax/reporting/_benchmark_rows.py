@@ -15,6 +15,7 @@ SELF_EVIDENT = ("nominal", "oracle")
 """Systems whose name says what they are told; so do those of SFKD and its parts."""
 _SAMPLINGS = {"feedback": "sampling around a feedback law", "plain": "plain sampling"}
 _VEHICLES = ("kinematic", "dynamic")
+_LEVELS = ("seen", "interpolated", "extrapolated")
 
 
 class Line(NamedTuple):
@@ -108,8 +109,20 @@ def stem(contest: Contest) -> str:
 
 
 def scenarios(contest: Contest) -> list[str]:
-    """The scenarios that any line drove, by name."""
-    return sorted({name for line in contest.lines for name in line.rows})
+    """The scenarios of a contest, the hardest last; not those of a line alone that stands in other contests too."""
+    rows = [(name, row) for line in contest.lines for name, row in line.rows.items()]
+    return by_hardness({name for name, row in rows if contest.sampling in (None, row.get("sampling"))})
+
+
+def by_hardness(names: set[str]) -> list[str]:
+    """Scenarios by name, but steady levels by how far they lie from training."""
+    return sorted(names, key=lambda name: (_place(name, _LEVELS) % len(_LEVELS), name))
+
+
+def is_quoted(group: list[Contest], paper: dict[str, dict[str, float]]) -> bool:
+    """Whether the paper has a number for any scenario of these contests."""
+    driven = {name for contest in group for name in scenarios(contest)}
+    return any(f"rmse_{name}_m" in row for name in driven for row in paper.values())
 
 
 def measure(line: Line, scenario: str, *keys: str) -> float | None:

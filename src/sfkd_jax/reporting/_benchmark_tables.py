@@ -8,6 +8,7 @@ from typing import Any
 from sfkd_jax.reporting._benchmark_rows import Contest, Line, difference, known, ratio, scenarios, side, together
 from sfkd_jax.reporting._blocks import Table
 from sfkd_jax.reporting._numbers import DASH, dig, interval, is_number, number, short, upper
+from sfkd_jax.reporting._style import scenario_label
 
 Paper = dict[str, dict[str, float]]
 _Columns = dict[str, Callable[[Line], str]]
@@ -51,9 +52,9 @@ def tracking(contest: Contest, paper: Paper) -> Table:
     """Lateral RMSE with its interval, the paper's beside ours."""
     columns: _Columns = {}
     for name in scenarios(contest):
-        columns[f"{name.upper()} RMSE\n[mm] (95 %)"] = _cell(name, lambda row: with_interval(row.get("rmse_m")))
+        columns[f"{scenario_label(name)} RMSE\n[mm] (95 %)"] = _cell(name, lambda row: with_interval(row.get("rmse_m")))
         if any(f"rmse_{name}_m" in row for row in paper.values()):
-            columns[f"{name.upper()} in the\npaper [mm]"] = _paper(paper, name)
+            columns[f"{scenario_label(name)} in the\npaper [mm]"] = _paper(paper, name)
     return _table(contest, columns)
 
 
@@ -61,9 +62,9 @@ def against(contest: Contest) -> Table:
     """Paired difference to SFKD, and ratio to the oracle."""
     columns: _Columns = {}
     for name in scenarios(contest):
-        columns[f"{name.upper()} minus SFKD\n[mm] (95 %)"] = _minus_sfkd(contest, name)
+        columns[f"{scenario_label(name)} minus SFKD\n[mm] (95 %)"] = _minus_sfkd(contest, name)
     names = scenarios(contest)
-    columns[f"Over the oracle\n{_heads(names)}"] = lambda line: _slashed(
+    columns[f"Over the oracle\n{_heads(names)}"] = lambda line: slashed(
         [number(ratio(contest, line, name), 2) for name in names]
     )
     return _table(contest, columns)
@@ -146,14 +147,15 @@ def _cell(scenario: str, show: Callable[[dict[str, Any]], str]) -> Callable[[Lin
 
 def _each(names: list[str], show: Callable[[dict[str, Any]], str]) -> Callable[[Line], str]:
     """One entry per scenario, divided by slashes."""
-    return lambda line: _slashed([show(line.rows.get(name) or {}) for name in names])
+    return lambda line: slashed([show(line.rows.get(name) or {}) for name in names])
 
 
 def _heads(names: list[str]) -> str:
-    return _slashed([name.upper() for name in names])
+    return slashed([scenario_label(name) for name in names])
 
 
-def _slashed(words: list[str]) -> str:
+def slashed(words: list[str]) -> str:
+    """One entry per scenario or level, a dash if none is known."""
     return DASH if set(words) == {DASH} else " / ".join(words)
 
 

@@ -9,6 +9,7 @@ from sfkd_jax.reporting._benchmark_rows import (
     Contest,
     Line,
     difference,
+    is_quoted,
     known,
     line_of,
     measure,
@@ -28,7 +29,7 @@ from sfkd_jax.reporting._benchmark_tables import (
 )
 from sfkd_jax.reporting._blocks import Block, Heading, Table, Text
 from sfkd_jax.reporting._numbers import DASH, dig, is_number, number, short
-from sfkd_jax.reporting._style import label
+from sfkd_jax.reporting._style import label, scenario_label
 
 _RIVALS = ("icode_mppi", "icode_mppi_one_step", "icode_mppi_reads_env", "sfkd_no_fiber", "sfkd_no_contraction")
 """Whom the paper's text says that SFKD beats."""
@@ -38,7 +39,9 @@ _Value = Callable[[Line], Any]
 
 def words(found: list[Contest], paper: Paper) -> list[Block]:
     """The paper's claims, then ours contest by contest."""
-    blocks: list[Block] = [Heading(2, "The paper's claims, and what came out here"), *_printed(paper)]
+    blocks: list[Block] = [Heading(2, "SFKD and its rivals")]
+    if is_quoted(found, paper):
+        blocks = [Heading(2, "The paper's claims, and what came out here"), *_printed(paper)]
     for contest in found:
         if line_of(contest, "sfkd") is None:
             blocks.append(Text("SFKD was not driven, so nothing is compared with it.", f"{title(contest)}.", ""))
@@ -85,7 +88,8 @@ def _measures(contest: Contest) -> Iterator[tuple[str, _Value, Callable[[Any], s
     ]
     for name, value, show in parts:
         for scenario in names:
-            yield f"{scenario.upper()} {name}", _at(scenario, value), show, scenario if name == "RMSE [mm]" else None
+            paired = scenario if name == "RMSE [mm]" else None
+            yield f"{scenario_label(scenario)} {name}", _at(scenario, value), show, paired
     for step in STEPS:
         yield f"prediction, {step} ahead [mm]", _ahead(step), millimetres, None
     yield "control step, median [ms]", lambda line: known(line, "act_ms", "p50"), lambda value: number(value, 2), None
@@ -113,7 +117,7 @@ def _printed(paper: Paper) -> list[Block]:
             ours, theirs = (dig(paper.get(system), f"rmse_{name}_m") for system in ("sfkd", rival))
             if is_number(ours) and is_number(theirs):
                 pair = f"{millimetres(ours, 0)} against {millimetres(theirs, 0)} mm"
-                said.append(f"{_change(ours, theirs)} than {label(rival)} on {name.upper()} ({pair})")
+                said.append(f"{_change(ours, theirs)} than {label(rival)} on {scenario_label(name)} ({pair})")
     rates = [(system, dig(paper.get(system), "violation_rate")) for system in ("sfkd", "icode_mppi")]
     told = [f"{percent(rate)} % for {label(system)}" for system, rate in rates if is_number(rate)]
     text = [f"SFKD's RMSE is {'; '.join(said)}."] if said else []
@@ -131,17 +135,25 @@ def _claims(contest: Contest) -> list[Block]:
 
 def _rest(contest: Contest) -> Iterator[tuple[str, str]]:
     yield "Against the oracle", _oracle(contest)
-    yield "Violations on S3", _violating(contest)
+    yield f"Violations {_on(scenarios(contest)[-1])}", _violating(contest)
+
+
+def _on(scenario: str) -> str:
+    """Where: on S3, at seen levels."""
+    shown = scenario_label(scenario)
+    return f"at {shown} levels" if shown == scenario else f"on {shown}"
 
 
 def _against(contest: Contest, line: Line) -> str:
-    """SFKD's RMSE beside a rival's on S3, in percent, with the paired difference."""
-    own = line_of(contest, "sfkd")
-    ours, theirs = (one and measure(one, "s3", "rmse_m", "mean") for one in (own, line))
+    """SFKD's RMSE beside a rival's on the hardest scenario, in percent, with the paired difference."""
+    own, hardest = line_of(contest, "sfkd"), scenarios(contest)[-1]
+    ours, theirs = (one and measure(one, hardest, "rmse_m", "mean") for one in (own, line))
+    where = _on(hardest)
     if ours is None or theirs is None:
-        return "Not measured on S3."
-    text = f"On S3 {millimetres(ours)} against {millimetres(theirs)} mm, {_change(ours, theirs)}"
-    found = difference(contest, line, "s3")
+        return f"Not measured {where}."
+    pair = f"{millimetres(ours)} against {millimetres(theirs)} mm"
+    text = f"{where[:1].upper()}{where[1:]} {pair}, {_change(ours, theirs)}"
+    found = difference(contest, line, hardest)
     shown = bounds(dig(found, "ci95"))
     if shown == DASH:
         return f"{text}."
@@ -161,15 +173,15 @@ def _change(ours: float, theirs: float) -> str:
 def _oracle(contest: Contest) -> str:
     own = line_of(contest, "sfkd")
     found = [(name, ratio(contest, own, name)) for name in scenarios(contest)] if own else []
-    said = [f"{number(value, 2)} on {name.upper()}" for name, value in found if value is not None]
+    said = [f"{number(value, 2)} {_on(name)}" for name, value in found if value is not None]
     return f"SFKD's RMSE is {', '.join(said)} times that of a planner with the true vehicle." if said else ""
 
 
 def _violating(contest: Contest) -> str:
-    """V0, V1 and V2 on S3 of SFKD and of the paper's main rival."""
+    """V0, V1 and V2 on the hardest scenario of SFKD and of the paper's main rival."""
     said = []
     for line in contest.lines:
-        row = line.rows.get("s3")
+        row = line.rows.get(scenarios(contest)[-1])
         if row is None or line.system not in ("sfkd", "icode_mppi"):
             continue
         pairs = [

@@ -12,7 +12,7 @@ from sfkd_jax.reporting._blocks import Block, Code, Heading, Picture, Table, Tex
 from sfkd_jax.reporting._compared import Record, curves, records_of, scenario_of, steps_of
 from sfkd_jax.reporting._comparison_words import paragraph
 from sfkd_jax.reporting._numbers import dig, mean_std, number, plain, short, upper
-from sfkd_jax.reporting._style import save
+from sfkd_jax.reporting._style import save, scenario_label
 from sfkd_jax.reporting._tradeoff import tradeoff
 
 
@@ -61,7 +61,7 @@ def _command(root: Path, pattern: str, name: str) -> str:
 
 
 def _caption(beta: str, scenario: str | None) -> str:
-    driven = f" Whiskers: 95 % interval of the mean over episodes of {scenario.upper()}." if scenario else ""
+    driven = f" Whiskers: 95 % interval of the mean over episodes of {scenario_label(scenario)}." if scenario else ""
     return (
         f"Runs with β = {beta}, one point a run, against the contraction factor that is certified.{driven} Hollow: "
         "the same run, if only the separate bounds ρ and β were added. Latent units are those of each run."
@@ -112,7 +112,7 @@ _DRIVEN: _Columns = {
 def _tables(records: list[Record]) -> list[Block]:
     scenarios = sorted({name for record in records for name in record["closed_loop"]})
     covered = sorted({name for record in records for name in record["coverage"]})
-    coverage: _Columns = {f"Covered,\n{name.upper()} [%]": _coverage(name) for name in covered}
+    coverage: _Columns = {f"Covered,\n{scenario_label(name)} [%]": _coverage(name) for name in covered}
     best = [record["smallest_of_its_betas"] for record in records]
     marked = f"{_MARKED} " if any(best) else ""
     blocks: list[Block] = [
@@ -127,7 +127,7 @@ def _tables(records: list[Record]) -> list[Block]:
     ]
     for name in scenarios:
         rows = {key: _of(name, cell) for key, cell in _DRIVEN.items()}
-        blocks += [Heading(2, f"Driven: scenario {name.upper()}"), _table(records, rows)]
+        blocks += [Heading(2, f"Driven: scenario {scenario_label(name)}"), _table(records, rows)]
     return blocks
 
 

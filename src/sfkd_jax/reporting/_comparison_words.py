@@ -7,6 +7,7 @@ from typing import Any
 
 from sfkd_jax.reporting._compared import Record, curves, scenario_of, steps_of
 from sfkd_jax.reporting._numbers import DASH, dig, interval, is_number, number, plain, short, upper
+from sfkd_jax.reporting._style import scenario_label
 from sfkd_jax.reporting._tradeoff import title_of
 
 
@@ -29,7 +30,7 @@ def _along(line: list[Record], records: list[Record]) -> list[str]:
     driven = _change(first, last, "closed_loop", scenario, "rmse_m", "mean", unit=" m")
     parts = {
         f"the position error after {ahead} steps": _change(first, last, "open_loop", "position_rmse_m", unit=" m"),
-        f"the lateral RMSE on {scenario.upper()}": driven and driven + _overlap(first, last, scenario),
+        f"the lateral RMSE on {scenario_label(scenario)}": driven and driven + _overlap(first, last, scenario),
         f"the latent tube after {horizon} steps": _change(first, last, "tube", "latent", write=upper),
         "the ultimate bound": _change(first, last, "ultimate", write=upper),
     }

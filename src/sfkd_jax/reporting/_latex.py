@@ -8,6 +8,7 @@ from typing import Any, NamedTuple
 from sfkd_jax.reporting._benchmark_rows import SELF_EVIDENT, Contest, Line, scenarios, title
 from sfkd_jax.reporting._benchmark_tables import Paper, conformal, millimetres, percent
 from sfkd_jax.reporting._numbers import DASH, dig, is_number, number
+from sfkd_jax.reporting._style import scenario_label
 
 _ESCAPES = {
     "\\": r"\textbackslash{}", "&": r"\&", "%": r"\%", "$": r"\$", "#": r"\#", "_": r"\_", "{": r"\{", "}": r"\}",
@@ -62,7 +63,7 @@ def _tabular(contest: Contest, paper: Paper) -> str:
 def _columns(contest: Contest, paper: Paper) -> list[_Column]:
     columns = []
     for name in scenarios(contest):
-        group = f"{name.upper()} RMSE [mm]"
+        group = f"{scenario_label(name)} RMSE [mm]"
         columns.append(_Column(group, "ours", _spread(name), _of(name, "rmse_m", "mean")))
         if any(f"rmse_{name}_m" in row for row in paper.values()):
             columns.append(_Column(group, "paper", _printed(paper, f"rmse_{name}_m", lambda x: millimetres(x, 0))))

@@ -1,70 +1,62 @@
-"""Robustness: RMSE under a changed protocol over the same row's RMSE as it is, one figure per study."""
+"""Studies: every row under a changed protocol beside the same row as it is, one table and one figure a contest."""
 
 from __future__ import annotations
 
 import re
+import textwrap
 from typing import Any, NamedTuple
 
-import numpy as np
 from matplotlib.figure import Figure
-from matplotlib.lines import Line2D
 
-from sfkd_jax.reporting._benchmark_figures import plain_log
-from sfkd_jax.reporting._benchmark_rows import Contest, Row, drawn_for, name_of, rank, title
+from sfkd_jax.reporting._benchmark_rows import Contest, Line, Row, by_hardness, drawn_for, measure, name_of, title
+from sfkd_jax.reporting._benchmark_tables import millimetres
 from sfkd_jax.reporting._blocks import Table
-from sfkd_jax.reporting._numbers import dig, is_number, number
-from sfkd_jax.reporting._style import canvas, literal
+from sfkd_jax.reporting._dots import colour, common_range, dot_panels, mark
+from sfkd_jax.reporting._numbers import DASH, dig, is_number, number
+from sfkd_jax.reporting._style import MUTED, scenario_label
 
-_STUDIES = ("environment late", "environment noise", "environment bias", "sensor noise", "side force", "data share")
-_COLOURS = ("#0b57b0", "#e8a33d", "#009e73", "#882255", "#56b4e9", "#3c3c3c")
-_MARKERS = "osD^vP"
-_PANELS = 3
+AS_IT_IS = "as it is"
+_WHOLE = {"data share": "data share 100 %"}
+"""What the plain protocol is called among variations that begin with these words; it is then the last of them."""
 
 
 class Study(NamedTuple):
-    """Ratios of one group of variations in one contest.
+    """The variations of one contest on one scenario.
 
     Attributes:
-        name: of the study. contest: whose rows. scenarios: with any ratio. levels: variations, in words.
-        names: of the rows. ratios: by (row, scenario, level), RMSE over that of the same row as it is.
+        contest: whose rows. scenario: that was driven. levels: variations in words, by size.
+        plain: what the protocol without a variation is called.
+        rows: by (name of the line, level).
     """
 
-    name: str
     contest: Contest
-    scenarios: list[str]
+    scenario: str
     levels: list[str]
-    names: list[str]
-    ratios: dict[tuple[str, str, str], float]
+    plain: str
+    rows: dict[tuple[str, str], Row]
 
 
 def studies(rows: list[Row], contest: Contest) -> list[Study]:
-    """All studies whose rows drove the contest's vehicle with its sampling."""
-    mine = [row for row in rows if isinstance(row.get("variation"), str) and _belongs(row, contest)]
-    found = []
-    for name in dict.fromkeys(study_of(row["variation"]) for row in mine):
-        group = drawn_for(contest, sorted((row for row in mine if study_of(row["variation"]) == name), key=_order))
-        ratios = {(name_of(row), str(row.get("scenario")), row["variation"]): _ratio(row, contest) for row in group}
-        ratios = {key: value for key, value in ratios.items() if value is not None}
-        if ratios:
-            names, where, levels = (list(dict.fromkeys(key[place] for key in ratios)) for place in range(3))
-            found.append(Study(name, contest, sorted(where), sorted(levels, key=_level), names, ratios))
-    return found
+    """What was driven with the contest's vehicle and sampling under a variation, by scenario."""
+    mine = drawn_for(contest, [row for row in rows if isinstance(row.get("variation"), str) and _belongs(row, contest)])
+    return [_study(contest, name, mine) for name in by_hardness({str(row.get("scenario")) for row in mine})]
 
 
-def study_of(variation: str) -> str:
-    """The study that a variation belongs to: its words without numbers, as "environment late" of 0.5 s late."""
-    words = set(re.findall(r"[a-z]+", variation.lower()))
-    for name in _STUDIES:
-        if set(name.split()) <= words:
-            return name
-    plain = re.findall(r"[a-z]+", variation.lower())
-    return "levels" if plain[:1] == ["levels"] else " ".join(plain[:2]) or variation
+def _study(contest: Contest, scenario: str, mine: list[Row]) -> Study:
+    here = [row for row in mine if str(row.get("scenario")) == scenario]
+    names = {line.name for line in contest.lines}
+    found = {(_name(row), str(row["variation"])): row for row in here if _name(row) in names}
+    levels = list(dict.fromkeys(str(row["variation"]) for row in here))
+    kinds = list(dict.fromkeys(map(_words, levels)))
+    levels.sort(key=lambda level: (kinds.index(_words(level)), _numbers(level)))
+    whole = [name for start, name in _WHOLE.items() if all(level.startswith(start) for level in levels)]
+    found |= {(line.name, (*whole, AS_IT_IS)[0]): line.rows.get(scenario) or {} for line in contest.lines}
+    return Study(contest, scenario, levels, (*whole, AS_IT_IS)[0], found)
 
 
-def level_of(variation: str, study: str) -> str:
-    """What is left of a variation beside the words of its study."""
-    left = [word for word in variation.split() if word.lower() not in study.split()]
-    return " ".join(left) or variation
+def columns(study: Study) -> list[str]:
+    """All levels in the order of the table: the plain protocol first, or last where it is the largest of them."""
+    return [*study.levels, study.plain] if study.plain != AS_IT_IS else [study.plain, *study.levels]
 
 
 def _belongs(row: Row, contest: Contest) -> bool:
@@ -72,66 +64,99 @@ def _belongs(row: Row, contest: Contest) -> bool:
     return same and row.get("sampling") in (contest.sampling, None)
 
 
-def _order(row: Row) -> tuple[Any, ...]:
-    return (*rank(str(row.get("system"))), str(row.get("env")))
+def _name(row: Row) -> str:
+    """What the row is called as it is: where e is estimated under a variation, it is measured without."""
+    return name_of(row | {"env": "measured"} if row.get("env") == "estimated" else row)
 
 
-def _level(variation: str) -> tuple[Any, ...]:
-    """By the words first, then by the numbers."""
-    words = re.sub(r"[\d.]+", "", variation)
-    return words, [float(found) for found in re.findall(r"\d+(?:\.\d+)?", variation)]
+def _words(variation: str) -> str:
+    return re.sub(r"[\d.]+", "", variation)
 
 
-def _ratio(row: Row, contest: Contest) -> float | None:
-    """RMSE over that of the same row without the variation."""
-    for line in contest.lines:
-        if (line.system, line.env) == (str(row.get("system")), str(row.get("env"))):
-            plain = dig(line.rows.get(str(row.get("scenario"))), "rmse_m", "mean")
-            mean = dig(row, "rmse_m", "mean")
-            return mean / plain if is_number(mean) and is_number(plain) and plain > 0 else None
-    return None
+def _numbers(variation: str) -> list[float]:
+    return [float(found) for found in re.findall(r"\d+(?:\.\d+)?", variation)]
+
+
+def _rmse(study: Study, name: str, level: str) -> float | None:
+    mean = dig(study.rows.get((name, level)), "rmse_m", "mean")
+    return mean if is_number(mean) else None
 
 
 def robustness(study: Study) -> Figure:
-    """One line a row, one marker a level, one panel a scenario."""
-    names = study.scenarios[-_PANELS:]
-    figure = canvas(1.6 + 0.235 * len(study.names))
-    panels = figure.subplots(1, len(names), sharey=True, squeeze=False)[0]
-    looks = [(_COLOURS[place % 6], _MARKERS[place % 6]) for place in range(len(study.levels))]
-    for axes, name in zip(panels, names, strict=True):
-        axes.axvline(1.0, color="#9aa1ab", linewidth=1.0, zorder=1)
-        for place, who in enumerate(study.names):
-            values = [study.ratios.get((who, name, level), np.nan) for level in study.levels]
-            if np.any(np.isfinite(values)):
-                axes.plot([np.nanmin(values), np.nanmax(values)], [place] * 2, color="#d5dae1", linewidth=2, zorder=2)
-            for value, (colour, marker) in zip(values, looks, strict=True):
-                axes.plot(value, place, color=colour, marker=marker, markersize=5, linestyle="none", zorder=3)
-        plain_log(axes.xaxis, axes.set_xscale)
-        axes.set(title=literal(name.upper()), xlabel="RMSE over its own\nwithout the change")
-    panels[0].set_yticks(range(len(study.names)), [literal(who) for who in study.names])
-    panels[0].set_ylim(len(study.names) - 0.4, -0.6)
-    shown = [literal(level_of(level, study.name)) for level in study.levels]
-    handles = [
-        Line2D([], [], color=colour, marker=marker, linestyle="none", label=text)
-        for text, (colour, marker) in zip(shown, looks, strict=True)
-    ]
-    figure.legend(handles=handles, loc="outside upper left", ncols=min(4, len(handles)), columnspacing=1.2)
+    """One panel a variation: RMSE of every row under it, filled, and as it is, hollow."""
+    titles = [textwrap.fill(_shown(level), 66 // len(study.levels)) for level in study.levels]
+
+    def score(line: Line) -> float | None:
+        return measure(line, study.scenario, "rmse_m", "mean")
+
+    figure, panels, places = dot_panels(study.contest.lines, score, titles)
+    for axes, level in zip(panels, study.levels, strict=True):
+        for line in study.contest.lines:
+            plain, varied = (_rmse(study, line.name, name) for name in (study.plain, level))
+            shown = [1e3 * value for value in (plain, varied) if value is not None]
+            axes.plot(shown, [places[line.name]] * len(shown), color=colour(line), linewidth=1.6, alpha=0.45, gid="row")
+            for value, face in ((plain, "white"), (varied, colour(line))):
+                if value is not None:
+                    style: dict[str, Any] = {"markerfacecolor": face, "markersize": 4.6, "zorder": 4}
+                    axes.plot(1e3 * value, places[line.name], marker="o", color=colour(line), **style)
+    common_range(panels)
+    panels[len(panels) // 2].set_xlabel(f"lateral RMSE on {scenario_label(study.scenario)} [mm]")
+    marks = [mark(study.plain, marker="o", markerfacecolor="white"), mark("as the title says", marker="o", color=MUTED)]
+    figure.legend(handles=marks, loc="outside upper left", ncols=2)
     return figure
 
 
 def robustness_table(study: Study) -> Table:
-    """The ratios of the figure, two decimals."""
-    columns = [(name, level) for name in study.scenarios for level in study.levels]
-    columns = [pair for pair in columns if any((who, *pair) in study.ratios for who in study.names)]
-    head = [f"{name.upper()}\n{level_of(level, study.name)}" for name, level in columns]
+    """RMSE of every row at every level, over that of the same row as it is."""
+    head = [f"{_shown(level)}\n[mm]" for level in columns(study)]
+    rows = [[line.name, *(_cell(study, line, level) for level in columns(study))] for line in study.contest.lines]
+    return Table(["Row", *head], rows, tuple(place for place, line in enumerate(study.contest.lines) if _own(line)))
 
-    rows = [[who, *(number(study.ratios.get((who, *pair)), 2) for pair in columns)] for who in study.names]
-    return Table(["Row", *head], rows, tuple(place for place, who in enumerate(study.names) if who == "SFKD"))
+
+def _shown(level: str) -> str:
+    """A variation with the signs of print."""
+    return re.sub(r"(?<=\d)\s+(?=%|m/s|s\b)", "\u00a0", level.replace("-", "−").replace(" x ", " ×\u00a0"))
+
+
+def _own(line: Line) -> bool:
+    return line.system == "sfkd" and line.env == "measured"
+
+
+def _cell(study: Study, line: Line, level: str) -> str:
+    """The mean, the ratio, and how many episodes left the lane."""
+    mean, plain = (_rmse(study, line.name, name) for name in (level, study.plain))
+    if mean is None:
+        return DASH
+    ratio = f" (× {number(mean / plain, 2)})" if level != study.plain and plain else ""
+    left = dig(study.rows.get((line.name, level)), "departures")
+    return f"{millimetres(mean)}{ratio}" + (f", {left} left" if is_number(left) and left else "")
+
+
+def heading(study: Study) -> str:
+    """What is varied, and whose rows these are."""
+    what = "Share of the training data" if _shares(study) else "What changes cost"
+    return f"{what}, {scenario_label(study.scenario)}: {title(study.contest)}"
 
 
 def caption(study: Study) -> str:
     """What the figure shows."""
+    changed = "trained on the share that the panel names" if _shares(study) else "under the change that the panel names"
     return (
-        f"{study.name.capitalize()}, {title(study.contest).lower()}: mean lateral RMSE over that of the same row "
-        "without the change; 1 means that nothing is lost."
+        f"{title(study.contest)}, {scenario_label(study.scenario)}: mean lateral RMSE of every row. Hollow: "
+        f"{study.plain}; filled: {changed}. Rows that are told friction and wind above, those that are not below, "
+        "each group by its RMSE without the change; the scale is logarithmic and the same in every panel."
     )
+
+
+def note(study: Study) -> str:
+    """What the numbers of the table are."""
+    said = (
+        "Mean lateral RMSE over the same episodes for all rows of a column; in brackets, over that of the same row at "
+        f"“{study.plain}”. “2 left”, where it stands: two episodes left the lane."
+    )
+    unheard = " Rows that are not told friction and wind do not hear what is wrong about them."
+    return said + (" Nominal and oracle learn nothing." if _shares(study) else unheard)
+
+
+def _shares(study: Study) -> bool:
+    return study.plain in _WHOLE.values()

@@ -9,7 +9,7 @@ from sfkd_jax.reporting._blocks import Block, Code, Heading, Missing, Table, Tex
 from sfkd_jax.reporting._curves import learning, open_loop
 from sfkd_jax.reporting._numbers import dig, is_number, number, plain, short, upper
 from sfkd_jax.reporting._scene import scenes_of
-from sfkd_jax.reporting._style import label
+from sfkd_jax.reporting._style import label, scenario_label
 from sfkd_jax.reporting._tables import certificate_table, open_loop_table, settings_table
 from sfkd_jax.reporting._tube import tube, tube_on_drive
 from sfkd_jax.reporting._words import certificate_words, command, holds, model_of, row_of
@@ -26,7 +26,7 @@ def tiles(
     for system in (model_of(settings), "oracle", "nominal"):
         mean = dig(row_of(head, system), "rmse_m", "mean")
         if is_number(mean):
-            where = str(head[0].get("scenario")).upper()
+            where = scenario_label(str(head[0].get("scenario")))
             items.append((f"{where} RMSE, {label(system)}", f"{number(mean)} m"))
     miss = (dig(errors, "position_rmse_m") or [None])[-1]
     if is_number(miss):

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Callable, Iterable
 from pathlib import Path
 from typing import Any
@@ -111,8 +112,9 @@ font:.88rem/1.5 ui-monospace,SFMono-Regular,Menlo,Consolas,monospace}
 box-shadow:1px 0 0 var(--line)}
 .data tbody tr.strong th{background:#eef4fc}th,td{padding:.36rem .45rem}}
 @media print{@page{margin:16mm}body{font-size:10.5pt}main{max-width:none;padding:0}
-.scroll{overflow:visible}figure,tr,pre,.tiles,.missing{break-inside:avoid}h2,h3{break-after:avoid}
-table{font-size:8.5pt}th,td{padding:.25rem .35rem}figure img{max-width:150mm}}
+.scroll{overflow:visible}figure,tr,pre,.tiles,.missing,.data{break-inside:avoid}h2,h3,.sub{break-after:avoid}
+.data td{white-space:normal}
+table{font-size:8.5pt}th,td{padding:.25rem .35rem}figure img{width:auto;max-width:150mm;max-height:128mm}}
 """
 
 
@@ -125,6 +127,11 @@ def ordered(systems: Iterable[str]) -> list[str]:
 def label(system: str) -> str:
     """What a reader sees for a system."""
     return SYSTEMS[system][0] if system in SYSTEMS else system
+
+
+def scenario_label(name: str) -> str:
+    """What a reader sees for a scenario: S3, but seen as it is."""
+    return name.upper() if re.fullmatch(r"s\d+", name) else name
 
 
 def literal(text: str) -> str:

@@ -9,7 +9,7 @@ from sfkd_jax.reporting._benchmark_rows import name_of
 from sfkd_jax.reporting._benchmark_tables import certified, percent
 from sfkd_jax.reporting._blocks import Table
 from sfkd_jax.reporting._numbers import DASH, dig, interval, is_number, mean_std, number, plain, short, upper
-from sfkd_jax.reporting._style import ordered
+from sfkd_jax.reporting._style import ordered, scenario_label
 
 PAPER_RMSE_M = {"s2": (0.098, 0.014), "s3": (0.120, 0.018)}
 """Mean and standard deviation that the paper reports for SFKD, by scenario; its simulator is another one."""
@@ -40,7 +40,7 @@ def block_title(block: list[dict[str, Any]]) -> str:
     row = block[0]
     kind = next((r["sampling"] for r in block if r.get("sampling")), None)
     ways = {"feedback": "sampling around a feedback law", "plain": "plain sampling"}
-    parts = [f"Scenario {str(row.get('scenario')).upper()}"]
+    parts = [f"Scenario {scenario_label(str(row.get('scenario')))}"]
     if row.get("vehicle"):
         loop = " under a speed loop" if row.get("inner_loop") == "speed" else ""
         parts.append(f"{row['vehicle']} vehicle{loop}")

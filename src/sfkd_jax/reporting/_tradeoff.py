@@ -12,7 +12,7 @@ from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter
 
 from sfkd_jax.reporting._compared import Record, curves, scenario_of, steps_of
 from sfkd_jax.reporting._numbers import DASH, dig, interval, is_number
-from sfkd_jax.reporting._style import ACCENT, MUTED, SECOND, THIRD, canvas, label, literal
+from sfkd_jax.reporting._style import ACCENT, MUTED, SECOND, THIRD, canvas, label, literal, scenario_label
 
 _LOOKS = [("o", ACCENT), ("s", SECOND), ("D", THIRD), ("^", "#882255"), ("v", MUTED)]
 _LOOPS = {"none": "no inner loop", "speed": "speed loop"}
@@ -46,7 +46,7 @@ def tradeoff(records: list[Record]) -> Figure:
     ahead, horizon = steps_of(records, "open_loop"), steps_of(records, "tube")
     measures = {
         f"position error after\n{ahead} steps [m]": ("open_loop", "position_rmse_m"),
-        f"lateral RMSE driven,\n{literal(scenario.upper())} [m]": ("closed_loop", scenario, "rmse_m", "mean"),
+        f"lateral RMSE driven,\n{literal(scenario_label(scenario))} [m]": ("closed_loop", scenario, "rmse_m", "mean"),
         f"tube after {horizon} steps,\n$R_{{{horizon}}}$ [latent units]": ("tube", "latent"),
         "ultimate bound\n[latent units]": ("ultimate",),
     }

@@ -7,7 +7,7 @@ from typing import Any
 
 from sfkd_jax.reporting._blocks import Text
 from sfkd_jax.reporting._numbers import DASH, dig, interval, is_number, mean_std, number, plain, short, upper
-from sfkd_jax.reporting._style import label
+from sfkd_jax.reporting._style import label, scenario_label
 from sfkd_jax.reporting._tables import PAPER_RMSE_M
 
 
@@ -81,7 +81,7 @@ def _driving(model: str, block: list[dict[str, Any]]) -> list[str]:
     if is_number(dig(nominal, "rmse_m", "mean")):
         beside.append(f"{number(nominal.get('rmse_m'))} m for the nominal model, which knows neither friction nor wind")
     others = f", beside {', and '.join(beside)}" if beside else ""
-    where = str(own.get("scenario")).upper()
+    where = scenario_label(str(own.get("scenario")))
     said = [f"In scenario {where} it follows the path to a lateral RMSE of {number(mean)} m{within}{others}."]
     if is_number(own.get("ratio_to_oracle")):
         said.append(f"Its RMSE is {number(own['ratio_to_oracle'], 2)} times the oracle's.")
@@ -106,7 +106,7 @@ def paper_note(block: list[dict[str, Any]]) -> str | None:
         return None
     mean, std = PAPER_RMSE_M[scenario]
     return (
-        f"SFKD in {scenario.upper()}: {mean_std(own.get('rmse_m'))} m in this run; {mean:.3f} ± {std:.3f} m "
+        f"SFKD in {scenario_label(scenario)}: {mean_std(own.get('rmse_m'))} m in this run; {mean:.3f} ± {std:.3f} m "
         "reported by the paper, other simulator. They are not measurements of the same thing."
     )
 
