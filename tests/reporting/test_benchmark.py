@@ -209,6 +209,9 @@ def test_latex_is_balanced_and_bold_marks_the_best_learned_row(whole):
     depths = np.cumsum([{"{": 1, "}": -1}.get(letter, 0) for letter in body])
     assert depths.min() == 0
     assert depths[-1] == 0
+    assert r"\usepackage{booktabs,graphicx}" in text.splitlines()[0]
+    assert text.count(r"\begin{table}") == text.count(r"\resizebox") == text.count(r"\end{table}") == 2
+    assert len(set(re.findall(r"\\label\{[^}]*\}", text))) == 2
     assert text.count(r"\begin{tabular}") == text.count(r"\end{tabular}") == text.count(r"\bottomrule") == 2
     assert body.isascii()
     for tabular in text.split(r"\begin{tabular}")[1:]:

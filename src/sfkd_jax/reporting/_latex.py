@@ -1,11 +1,11 @@
-"""Table 1 for a paper: one booktabs tabular per vehicle and sampling, the paper's own numbers beside ours."""
+"""Table 1 for a paper: one booktabs table per vehicle and sampling, the paper's own numbers beside ours."""
 
 from __future__ import annotations
 
 from collections.abc import Callable
 from typing import Any, NamedTuple
 
-from sfkd_jax.reporting._benchmark_rows import SELF_EVIDENT, Contest, Line, scenarios, title
+from sfkd_jax.reporting._benchmark_rows import SELF_EVIDENT, Contest, Line, scenarios, stem, title
 from sfkd_jax.reporting._benchmark_tables import Paper, conformal, millimetres, percent
 from sfkd_jax.reporting._numbers import DASH, dig, is_number, number
 from sfkd_jax.reporting._style import scenario_label
@@ -16,9 +16,10 @@ _ESCAPES = {
     "−": "$-$", "±": r"$\pm$", "–": "--", "α": r"$\alpha$", "<": "$<$", ">": "$>$",
 }  # fmt: skip
 _PREAMBLE = (
-    "% Needs \\usepackage{booktabs}. Mean and standard deviation over episodes; bold: best learned row of a column.\n"
-    "% Paper: what the paper prints for the row's system, measured in another simulator.\n"
+    "% Needs \\usepackage{booktabs,graphicx}. Every table stands alone; it is shrunk to the width of the text where\n"
+    "% it is wider (about 450 pt for S1 to S3): in two columns use table* for table, on narrow pages landscape.\n"
 )
+_FIT = r"\resizebox{\ifdim\width>\linewidth\linewidth\else\width\fi}{!}{%"
 
 
 class _Column(NamedTuple):
@@ -31,8 +32,31 @@ class _Column(NamedTuple):
 
 
 def latex(found: list[Contest], paper: Paper) -> str:
-    """Tabulars divided by empty lines; every one stands alone."""
-    return _PREAMBLE + "\n".join(_tabular(contest, paper) for contest in found)
+    """Tables divided by empty lines; every one stands alone."""
+    return _PREAMBLE + "\n".join(_table(contest, paper) for contest in found)
+
+
+def _table(contest: Contest, paper: Paper) -> str:
+    """A float with its caption, no wider than the text."""
+    name = "-".join([stem(contest), contest.sampling or "table"]).replace("_", "-")
+    lines = [
+        r"\begin{table}[p]",
+        r"\centering\footnotesize\setlength{\tabcolsep}{3pt}",
+        rf"\caption{{{_escaped(_caption(contest))}}}\label{{tab:{name}}}\vspace{{1ex}}",
+        _FIT,
+        f"{_tabular(contest, paper)}}}",
+        r"\end{table}",
+    ]
+    return "\n".join(lines) + "\n"
+
+
+def _caption(contest: Contest) -> str:
+    hardest = scenario_label(scenarios(contest)[-1])
+    return (
+        f"{title(contest)}. Lateral RMSE: mean and standard deviation over episodes. Steering rate, V1 (segments that "
+        f"leave their conformal tube) and V2 (windows beyond one threshold): on {hardest}. Bold: the best learned row "
+        "of a column. Paper: what the paper prints for the row's system, measured in another simulator."
+    )
 
 
 def _tabular(contest: Contest, paper: Paper) -> str:
@@ -47,8 +71,6 @@ def _tabular(contest: Contest, paper: Paper) -> str:
     lines = [
         rf"\begin{{tabular}}{{l{'r' * len(columns)}}}",
         r"\toprule",
-        rf"\multicolumn{{{len(columns) + 1}}}{{l}}{{{_escaped(title(contest))}}} \\",
-        r"\midrule",
         rf" & {' & '.join(above)} \\",
         "".join(rules),
         rf"Row & {' & '.join(_escaped(column.head) for column in columns)} \\",
@@ -57,7 +79,7 @@ def _tabular(contest: Contest, paper: Paper) -> str:
         r"\bottomrule",
         r"\end{tabular}",
     ]
-    return "\n".join(lines) + "\n"
+    return "\n".join(lines)
 
 
 def _columns(contest: Contest, paper: Paper) -> list[_Column]:
