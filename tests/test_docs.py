@@ -138,3 +138,51 @@ def test_every_result_on_the_tuning_page_is_in_the_file_it_cites():
     known |= {f"{row['smoothness_rad_per_s']:.3f}" for row in table}
     settings = {"0.02", "0.3", "0.06", "0.6", "0.8", "0.5"}  # noise of both kinds, its correlation, a cost, a delay [s]
     assert set(re.findall(r"\d+\.\d+", text)) - known - settings == set()
+
+
+def test_the_page_about_an_estimated_environment_says_what_the_results_say():
+    """Every number of its table, and the differences that the text draws from it."""
+    found, table = (
+        json.loads((ROOT / "experiments" / name / "results.json").read_text())["rows"]
+        for name in ("estimated", "table1_closed_loop")
+    )
+    drives = [(vehicle, scenario) for vehicle in ("kinematic", "dynamic") for scenario in ("s2", "s3")]
+
+    def driven(variation):
+        return [
+            next(
+                1e3 * row["rmse_m"]["mean"]
+                for row in found
+                if (row["vehicle"], row["scenario"], row["variation"], row["system"]) == (*drive, variation, "sfkd")
+            )
+            for drive in drives
+        ]
+
+    untold = [
+        min(
+            1e3 * row["rmse_m"]["mean"]
+            for row in table
+            if (row["vehicle"], row["scenario"], row["env"]) == (*drive, "none")
+            and row["system"] != "nominal"
+            and row["sampling"] != "plain"
+        )
+        for drive in drives
+    ]
+    measured, estimated = driven(None), driven("environment estimated")
+    sharp = driven("environment estimated by sensors ten times as good")
+    ratios = [one / other for one, other in zip(estimated, measured, strict=True)]
+    rows = {"e measured": measured, "e estimated": estimated, "over measured": ratios}
+    rows |= {"e estimated, sensors ten times as good": sharp, "not told e, best row": untold}
+    page = (DOCS / "estimation.md").read_text("utf-8")
+    lines = [[cell.strip("* ") for cell in line.strip("|").split("|")] for line in re.findall(r"^\|.*\|$", page, re.M)]
+    shown = {name: cells for name, *cells in lines}
+    for name, values in rows.items():
+        digits = 2 if name == "over measured" else 1
+        assert shown.pop(name) == [f"{value:.{digits}f}" for value in values], name
+    assert list(shown) == ["", "---"]
+    gaps = [one - other for one, other in zip(untold, estimated, strict=True)]
+    text = " ".join(page.split())
+    assert f"the estimate costs {estimated[3] - measured[3]:.1f} mm on S3" in text
+    assert f"the best by {gaps[3]:.1f} mm worse" in text
+    assert f"{-gaps[2]:.1f} mm better" in text
+    assert f"{gaps[0]:.0f} and {gaps[1]:.0f} mm below every row that is not told e" in text
