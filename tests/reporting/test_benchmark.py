@@ -300,7 +300,7 @@ def test_a_study_sets_every_row_beside_itself_as_it_is(whole):
     assert studies(rows, plain) == []
     found = tables_of(text_of(whole[0], "results.md"), f"What changes cost, S3: {FEEDBACK}")
     assert found["Row"][1] == "environment 0.5 s late \\[mm\\]"
-    assert found["Nominal"] == ["120.0", "180.0 (× 1.50)", "300.0 (× 2.50)", "150.0 (× 1.25), 2 left"]
+    assert found["Nominal"] == ["120.0", "180.0 (1.50)", "300.0 (2.50)", "150.0 (1.25), 2 left"]
     assert set(found) == {"Row", *(line.name for line in contest.lines)}
     figure = robustness(study)
     assert [axes.get_title(loc="left").replace("\n", " ") for axes in figure.axes][2] == "sensor noise ×\u00a02"
@@ -321,7 +321,7 @@ def test_shares_of_the_data_rise_to_the_whole_of_it():
     markdown = benchmark_markdown(results)
     assert markdown.startswith("# Less training data, row by row\n\nThe policies are trained anew on a share of")
     found = tables_of(markdown, f"Share of the training data, S3: {FEEDBACK}")
-    assert found["SFKD"] == ["60.0 (× 3.00)", "30.0 (× 1.50)", "20.0"]
+    assert found["SFKD"] == ["60.0 (3.00)", "30.0 (1.50)", "20.0"]
     assert markdown.index("Share of the training data") < markdown.index("Tracking: ")
 
 
@@ -330,7 +330,7 @@ def test_a_row_that_estimates_e_stands_beside_itself_with_e_measured():
     rows = [row("sfkd", "measured"), row("oracle", "measured"), estimated]
     (study,) = studies(rows, contests(rows)[0])
     assert {name: cells for name, *cells in robustness_table(study).rows} == {
-        "SFKD": ["20.0", "40.0 (× 2.00)"],
+        "SFKD": ["20.0", "40.0 (2.00)"],
         "Oracle": ["16.0", "–"],
     }
 

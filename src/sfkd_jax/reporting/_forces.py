@@ -14,7 +14,7 @@ from sfkd_jax.reporting._dots import colour, common_range, dot_panels, mark
 from sfkd_jax.reporting._numbers import dig, is_number, plain, short
 from sfkd_jax.reporting._violations import disturbed
 
-_SQUARE: dict[str, Any] = {"marker": "s", "markerfacecolor": "white", "markersize": 4.5, "linestyle": "none"}
+_SQUARE: dict[str, Any] = {"marker": "s", "markerfacecolor": "none", "markersize": 5.5, "linestyle": "none"}
 
 
 def pushed(contest: Contest) -> tuple[str, list[Line]] | None:

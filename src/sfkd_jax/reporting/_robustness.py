@@ -127,7 +127,7 @@ def _cell(study: Study, line: Line, level: str) -> str:
     mean, plain = (_rmse(study, line.name, name) for name in (level, study.plain))
     if mean is None:
         return DASH
-    ratio = f" (× {number(mean / plain, 2)})" if level != study.plain and plain else ""
+    ratio = f" ({number(mean / plain, 2)})" if level != study.plain and plain else ""
     left = dig(study.rows.get((line.name, level)), "departures")
     return f"{millimetres(mean)}{ratio}" + (f", {left} left" if is_number(left) and left else "")
 

@@ -77,7 +77,7 @@ CSS = """
 *{box-sizing:border-box}
 body{margin:0;background:#fff;color:var(--ink);
 font:16px/1.55 system-ui,-apple-system,"Segoe UI",Roboto,sans-serif}
-main{max-width:860px;margin:0 auto;padding:2.2rem 1.25rem 4rem}
+main{max-width:900px;margin:0 auto;padding:2.2rem 1.25rem 4rem}
 h1{font-size:1.75rem;line-height:1.2;margin:0 0 .3rem;letter-spacing:-.01em}
 h2{font-size:1.25rem;margin:2.8rem 0 .6rem;padding-top:1.1rem;border-top:1px solid var(--line)}
 h3{font-size:1rem;margin:1.8rem 0 .4rem}
