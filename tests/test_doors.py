@@ -40,7 +40,9 @@ def test_train_walks_from_nothing_to_a_report(walked):
 
 def test_results_have_the_rows_and_keys_that_others_rely_on(walked):
     place, document = walked
-    rows = {row["system"]: row for row in json.loads((place / document["results"]).read_text())["rows"]}
+    results = json.loads((place / document["results"]).read_text())
+    assert results["config"]["command"] == "python -m sfkd_jax.train +experiment=smoke"
+    rows = {row["system"]: row for row in results["rows"]}
     assert set(rows) == {"sfkd", "nominal", "oracle"}
     measures = {
         "rmse_m",
