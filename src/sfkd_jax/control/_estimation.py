@@ -14,6 +14,7 @@ from jaxtyping import Array, Bool, Float
 from sfkd_jax.se2 import wrap_angle
 from sfkd_jax.types import POSE, Control, Controller, Environment, Key, Model, Params, State
 
+YAW = POSE.stop - 1
 OUTLIER = -12.0
 """Log-likelihood, against a perfect match, below which a hypothesis is not blamed any further: about five deviations.
 An observation that nothing explains then changes no probability."""
@@ -142,7 +143,7 @@ def _advance(model: Model, params: Params, control: Control, state: State, env: 
 def _difference(states: Float[Array, "hypothesis state"], origin: State) -> Float[Array, "hypothesis state"]:
     """x_i − x with the yaw wrapped."""
     gap = states - origin
-    return gap.at[:, POSE.stop - 1].set(wrap_angle(gap[:, POSE.stop - 1]))
+    return gap.at[:, YAW].set(wrap_angle(gap[:, YAW]))
 
 
 def _grid(low: tuple[float, ...], high: tuple[float, ...], points: tuple[int, ...]) -> Float[Array, "hypothesis n"]:
@@ -169,7 +170,8 @@ def _corrected(
     """x̄_i + K ν_i, (I − K) P̄ and −½ ν_iᵀ S⁻¹ ν_i, one sensor after the other, so that nothing is inverted."""
     fit = jnp.zeros(states.shape[0])
     for entry in range(observation.shape[0]):
-        innovation = -_difference(states, observation)[:, entry]
+        gap = states[:, entry] - observation[entry]
+        innovation = -(wrap_angle(gap) if entry == YAW else gap)
         variance = covariance[entry, entry] + sensors[entry]
         gain = covariance[:, entry] / variance
         states = states + innovation[:, None] * gain
