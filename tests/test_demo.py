@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from helpers import door, last_line, straight
 
-from sfkd_jax import demo, policy
+from sfkd_jax import artefacts, demo, policy
 from sfkd_jax.certification import Certificate, verify
 
 VEHICLES = sorted(place.name for place in demo.SHIPPED.iterdir())
@@ -42,6 +42,21 @@ def test_what_ships_loads_and_its_certificate_follows_from_its_witnesses(vehicle
     verify(proof, trained.params, model=trained.model)
     assert proof.alpha < 1.0
     assert trained.settings["vehicle"]["name"] == vehicle
+
+
+@pytest.mark.parametrize(
+    ("change", "says"),
+    [
+        (lambda controller: controller.pop("task"), "'task'"),
+        (lambda controller: controller["mppi"].update(latent_weight=0.0), "latent_weight"),
+    ],
+)
+def test_a_policy_with_settings_of_another_version_is_named_in_one_line(tmp_path, change, says):
+    arrays, manifest = artefacts.read_arrays(demo.SHIPPED / "kinematic" / "policy.npz", kind=policy.KIND)
+    change(manifest["config"]["controller"])
+    artefacts.write_arrays(tmp_path / "policy.npz", arrays, kind=policy.KIND, config=manifest["config"])
+    with pytest.raises(artefacts.ArtefactError, match=rf"policy\.npz has settings of sfkd_jax .*{says}.*: train again"):
+        policy.load(tmp_path)
 
 
 def test_what_ships_also_drives_where_the_environment_is_not_measured():

@@ -51,20 +51,32 @@ def load(path: str | Path, *, controller: Mapping[str, Any] | None = None, env: 
         env: "estimated" for a controller that infers the environment and does not read the one it is given.
 
     Raises:
-        ArtefactError: nothing there, truncated, foreign, or changed since it was written.
+        ArtefactError: nothing there, truncated, foreign, changed since it was written, or saved with settings that
+            this version does not have.
     """
     file = Path(path)
     file = file / "policy.npz" if file.suffix != ".npz" else file
     arrays, manifest = artefacts.read_arrays(file, kind=KIND)
     settings = manifest["config"] | {"env": env} | ({} if controller is None else {"controller": dict(controller)})
+    certificate = _certificate(file.with_name("certificate.json"), manifest["sha256"])
+    try:
+        model, planner = _built(settings, certificate)
+    except (KeyError, TypeError) as reason:  # a setting that is missing, or that no factory takes any more
+        saved = manifest.get("versions", {}).get("sfkd_jax", "unknown")
+        raise artefacts.ArtefactError(
+            f"{file} has settings of sfkd_jax {saved} that this version does not read ({reason}): train again"
+        ) from None
+    params = jax.tree.map(jnp.asarray, artefacts.unflatten(arrays))
+    return Policy(model, params, planner, certificate, settings)
+
+
+def _built(settings: Mapping[str, Any], certificate: dict[str, Any] | None) -> tuple[Model, Controller]:
+    """The model and the controller that the settings name."""
     plant = assembly.build_vehicle(settings["vehicle"])
     model = assembly.build_model(settings["model"], assembly.space_from_settings(settings["space"]), plant)
     box = settings["dataset"]
-    certificate = _certificate(file.with_name("certificate.json"), manifest["sha256"])
-    limits = {"env_low": box["env_low"], "env_high": box["env_high"], "certificate": certificate, "env": env}
-    planner = assembly.build_controller(settings["controller"], model, plant, **limits)
-    params = jax.tree.map(jnp.asarray, artefacts.unflatten(arrays))
-    return Policy(model, params, planner, certificate, settings)
+    limits = {"env_low": box["env_low"], "env_high": box["env_high"], "certificate": certificate}
+    return model, assembly.build_controller(settings["controller"], model, plant, **limits, env=settings["env"])
 
 
 def _certificate(path: Path, weights: str) -> dict[str, Any] | None:
