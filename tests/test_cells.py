@@ -91,12 +91,30 @@ def test_collecting_pools_the_seeds_and_compares_what_is_there(tmp_path, seeds):
             path = cells.place(cell, settings(tmp_path))
             path.parent.mkdir(parents=True, exist_ok=True)
             level = 1.0 if cell.label == "sfkd" else 3.0
-            write_json(rows_file(path), {"row": row(cell.label, level, cell.seed), "made_with": "x"})
-    found = {entry["system"]: entry for entry in cells.collect(wanted, settings(tmp_path))}
+            write_json(rows_file(path), {"row": row(cell.label, level, cell.seed), "made_with": cell.label})
+    found = {entry["system"]: entry for entry in cells.collect(wanted, settings(tmp_path), lambda cell: cell.label)}
     assert set(found) == {"sfkd", "icode"}
     assert found["icode"]["seeds"] == list(range(seeds))
     assert len(found["icode"]["rmse_episodes_m"]) == 2 * seeds
     assert found["icode"]["difference_to_sfkd"]["mean"] == pytest.approx(3.0)
+
+
+@pytest.mark.parametrize(
+    ("older", "systems", "says"),
+    [(False, {"sfkd"}, "left out; comparison.older=true takes them"), (True, {"sfkd", "icode"}, "taken all the same")],
+)
+def test_a_row_that_was_made_with_other_settings_enters_no_table_unseen(tmp_path, capsys, older, systems, says):
+    wanted = [cells.Cell("kinematic", label, 0, "mppi", "as it is", "s1") for label in ("sfkd", "icode")]
+    for cell in wanted:
+        path = cells.place(cell, settings(tmp_path))
+        path.parent.mkdir(parents=True, exist_ok=True)
+        write_json(rows_file(path), {"row": row(cell.label, 1.0, 0), "made_with": cell.label})
+    found = cells.collect(wanted, settings(tmp_path), lambda cell: "sfkd", older=older)
+    assert {entry["system"] for entry in found} == systems
+    said = capsys.readouterr().err
+    assert said.startswith("1 cells were made with other settings, such as")
+    assert "icode-seed=0" in said
+    assert says in said
 
 
 def test_rows_are_dealt_to_processes_whole_and_each_to_one():

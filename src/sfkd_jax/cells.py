@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import itertools
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -126,14 +127,29 @@ def write(path: Path, settings: dict[str, Any], track: Track, driven: Drive) -> 
     return row
 
 
-def collect(cells: list[Cell], settings: dict[str, Any]) -> list[dict[str, Any]]:
-    """The rows of all cells that are done, seeds pooled, systems compared."""
+def collect(
+    cells: list[Cell], settings: dict[str, Any], expected: Callable[[Cell], str], *, older: bool = False
+) -> list[dict[str, Any]]:
+    """The rows of all cells that are done, seeds pooled, systems compared; how many were left out is said.
+
+    Args:
+        cells: of the plan. settings: of the comparison.
+        expected: what `made_with` is for a cell. older: take rows of cells made with other settings as well.
+    """
     found: dict[Cell, list[dict[str, Any]]] = {}
+    others = []
     for cell in cells:
         path = _row_file(place(cell, settings))
-        if path.exists():
-            row = artefacts.read_json(path, keys=("row",))["row"]
-            found.setdefault(cell._replace(seed=0), []).append(row)
+        if not path.exists():
+            continue
+        kept = artefacts.read_json(path, keys=("row", "made_with"))
+        if kept["made_with"] != expected(cell):
+            others.append(path)
+        if older or kept["made_with"] == expected(cell):
+            found.setdefault(cell._replace(seed=0), []).append(kept["row"])
+    if others:
+        done = "taken all the same" if older else "left out; comparison.older=true takes them"
+        shelf.say(f"{len(others)} cells were made with other settings, such as {others[0]}: {done}")
     return evaluation.compare([evaluation.pool(rows) for rows in found.values()])
 
 

@@ -19,9 +19,10 @@ def run(settings: dict[str, Any]) -> dict[str, Any]:
     wanted = cells.plan(comparison)
     groups = cells.dealt(cells.drivers(wanted), comparison["share"]) if comparison["drive"] else []
     driven, failed = 0, {}
+    made_with: dict[cells.Cell, str] = {}
     for number, group in enumerate(groups):
         try:
-            driven += _drive(group, comparison)
+            driven += _drive(group, comparison, made_with)
         except (TrainingStopped, ValueError, artefacts.ArtefactError) as reason:
             failed["/".join(map(str, group[0][:4]))] = str(reason)
             shelf.say(f"failed: {reason}")
@@ -30,7 +31,13 @@ def run(settings: dict[str, Any]) -> dict[str, Any]:
     place = Path(settings["root"]) / settings["name"]
     if comparison["share"] is not None:  # others drive the rest: whoever comes last collects
         return {"results": None, "rows": driven, "failed": len(failed)}
-    rows = cells.collect(wanted, settings)
+
+    def expected(cell: cells.Cell) -> str:
+        if cell not in made_with:
+            made_with[cell] = cells.made_with(_asked(cell, comparison))
+        return made_with[cell]
+
+    rows = cells.collect(wanted, settings, expected, older=comparison["older"])
     if not rows:
         raise ValueError(f"nothing to compare: no row came out ({'; '.join(failed.values()) or 'none was asked for'})")
     made_by = settings | {"command": command("compare")}
@@ -41,13 +48,13 @@ def run(settings: dict[str, Any]) -> dict[str, Any]:
     return {"results": str(place / "results.json"), "rows": len(rows), "failed": len(failed), **pages}
 
 
-def _drive(group: list[cells.Cell], comparison: dict[str, Any]) -> int:
-    """Drive what is missing of one row under one controller; returns how many cells that were."""
+def _drive(group: list[cells.Cell], comparison: dict[str, Any], made_with: dict[cells.Cell, str]) -> int:
+    """Drive what is missing of one row under one controller; notes all hashes, returns how many cells were missing."""
     drivers: dict[str, drive.TestDriver] = {}
     done = 0
     for cell in group:
         settings, of_policy = _settings(cell, comparison)
-        path = cells.place(cell, settings)
+        path, made_with[cell] = cells.place(cell, settings), cells.made_with(settings)
         if cells.is_done(path, settings):
             continue
         plant, key = assembly.build_vehicle(settings["vehicle"]), cells.driver_of(of_policy)
@@ -76,13 +83,19 @@ def _certified(settings: dict[str, Any]) -> None:
         certify.renew(settings)
 
 
+def _asked(cell: cells.Cell, comparison: dict[str, Any]) -> dict[str, Any]:
+    """The settings of a cell, under the name of the comparison."""
+    asked = compose(*cells.overrides(cell, comparison))
+    asked["evaluation"]["variation"] = None if not comparison["variations"][cell.variation] else cell.variation
+    return asked
+
+
 def _settings(cell: cells.Cell, comparison: dict[str, Any]) -> tuple[dict[str, Any], dict[str, Any]]:
     """The settings of a cell, under the name of the comparison and under the name of its policy's run."""
-    asked, usual = compose(*cells.overrides(cell, comparison)), next(iter(comparison["variations"]))
+    asked, usual = _asked(cell, comparison), next(iter(comparison["variations"]))
     retrained = cell.variation != usual and shelf.identity(asked) != shelf.identity(
         compose(*cells.overrides(cell._replace(variation=usual), comparison))
     )
-    asked["evaluation"]["variation"] = None if not comparison["variations"][cell.variation] else cell.variation
     return asked, asked | {"name": cells.policy_name(cell, comparison, retrained=retrained)}
 
 
