@@ -16,8 +16,9 @@ from sfkd_jax.exporting._programs import Program, specifications
 def weights_first(program: Program) -> Callable[..., list[Array]]:
     """The same function, with everything that no input enters evaluated now and kept as constants.
 
-    What turns weights into bounded operators needs factorisations, which a compiler without LAPACK cannot take over;
-    they depend on the weights alone. The rounding is not that of one program.
+    A compiler without LAPACK cannot take factorisations over. With folded parameters one model has any left that depend
+    on the weights alone, ControlSynth (the inverse of its metric's factor). Those of every control step stay: the
+    quadratic program of `koopman_mpc`, the eigenvectors of `curvature`. The rounding is not that of one program.
     """
     closed = jax.make_jaxpr(program.function)(*specifications(program))
     jaxpr = closed.jaxpr
