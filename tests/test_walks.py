@@ -1,5 +1,8 @@
-"""Doors opened from nothing: what is missing is made, for every vehicle and every job of a sweep."""
+"""Doors opened from nothing: what is missing is made, for a vehicle of one's own and every job of a sweep."""
 
+import json
+
+import numpy as np
 from helpers import door, last_line
 
 
@@ -9,8 +12,30 @@ def test_a_sweep_runs_every_job_and_ends_with_json(tmp_path):
     assert len(list((tmp_path / "runs/datasets").iterdir())) == 2
 
 
-def test_the_walk_works_for_another_vehicle_under_its_speed_loop(tmp_path):
+ROBOT = """
+import jax.numpy as jnp
+
+
+def step(x, u, e):
+    p_x, p_y, yaw, v, rate = x
+    wanted = v * jnp.tan(u[0]) * jnp.minimum(1.0, 0.5 + e[0])
+    heading = yaw + 0.1 * rate
+    ahead = jnp.stack([p_x + 0.1 * v * jnp.cos(heading), p_y + 0.1 * v * jnp.sin(heading), heading])
+    return jnp.append(ahead, jnp.stack([v + 0.1 * u[1], rate + 0.5 * (wanted - rate)]))
+"""
+
+
+def test_the_walk_works_for_a_step_function_of_ones_own_under_a_speed_loop(tmp_path):
+    """From a file in the current directory to data, weights, a certificate, driven episodes and a report."""
+    (tmp_path / "my_robot.py").write_text(ROBOT)
+    own = ("vehicle=own", "vehicle.step=my_robot:step", "vehicle.state_names=[p_x,p_y,yaw,v,yaw_rate]")
+    own += ("vehicle.control_low=[-0.4,-3.0]", "vehicle.control_high=[0.4,2.0]", "vehicle.wheelbase=1.0")
     small = ("training.steps=25", "training.save_every=25", "dataset.segments=160", "evaluation.episode_s=4.0")
-    small += ("evaluation.systems=[self]",)
-    walk = last_line(door("train", "+experiment=smoke", "vehicle=dynamic_speed", *small, cwd=tmp_path))
+    small += ("evaluation.systems=[self]", "vehicle.inner_loop=speed", "name=robot")
+    walk = last_line(door("train", "+experiment=smoke", *own, *small, cwd=tmp_path))
     assert (tmp_path / walk["report"]).exists()
+    assert 0 < walk["alpha"] < 1
+    (row,) = json.loads((tmp_path / walk["results"]).read_text())["rows"]
+    assert (row["system"], row["vehicle"], row["episodes"]) == ("sfkd", "own", 2)
+    assert np.isfinite(row["rmse_m"]["mean"])
+    assert row["violation"]["v0"] == 0.0
