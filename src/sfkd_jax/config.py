@@ -112,14 +112,10 @@ def register() -> None:
         store.store(group="model", name=f"{name}_schema", node=node)
     store.store(group="controller", name="mppi_schema", node=_controller_schema())
     loss = schema("LossConfig", training.multi_step_loss)
-    node = make_dataclass(
-        "TrainingConfig",
-        [
-            ("loss", loss, field(default_factory=loss)),
-            *_fields(schema("Fit", training.fit, skip=("inspect",), batch=128, window=20, data_share=1.0)),
-        ],
-    )
-    store.store(group="training", name="schema", node=node)
+    for name, start in {"schema": {}, "started_schema": {"start": "random"}}.items():
+        options = schema("Fit", training.fit, skip=("inspect",), batch=128, window=20, data_share=1.0, **start)
+        node = make_dataclass("TrainingConfig", [("loss", loss, field(default_factory=loss)), *_fields(options)])
+        store.store(group="training", name=name, node=node)
     protocol = {"episodes": 8, "episode_s": 60.0, "seed": 2026, "systems": _SYSTEMS, "observation_noise": _SENSORS}
     protocol |= {"timed_steps": 50, "side_forces": (), "threshold_m": _THRESHOLD, "variation": None}
     protocol |= {"told": schema("ToldConfig", evaluation.told, skip=("dt",))}

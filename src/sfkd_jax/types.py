@@ -172,6 +172,7 @@ class Model(NamedTuple):
             can be proved, or None for a model about which nothing can be certified.
         penalty: (fiber, latent, control) -> an extra term of the training loss, or None.
         identify: (training, validation trajectories, key) -> params, by regression at once, or None.
+        start: (params, training trajectories, key) -> params to train from, linear part by regression, or None.
         linear: fiber -> `LinearPredictor`, or None for a model that is not linear in a lift.
         fold: params -> params that `fiber` takes as well, with all that depends on no environment evaluated. To drive
             with: what it saves is what a control step would do anew each time.
@@ -188,6 +189,7 @@ class Model(NamedTuple):
     explicit: Callable[[Params], Explicit | Incremental] | None = None
     penalty: Callable[[Fiber, Latent, Control], Scalar] | None = None
     identify: Callable[[Trajectory, Trajectory, Key], Params] | None = None
+    start: Callable[[Params, Trajectory, Key], Params] | None = None
     linear: Callable[[Fiber], LinearPredictor] | None = None
     fold: Callable[[Params], Params] = lambda params: params
 

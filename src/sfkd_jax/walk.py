@@ -25,10 +25,13 @@ from sfkd_jax.datasets import (
 )
 from sfkd_jax.evaluation import open_loop
 from sfkd_jax.training import fit, multi_step_loss
-from sfkd_jax.types import Trajectory
+from sfkd_jax.types import Model, Trajectory
 from sfkd_jax.vehicle import Vehicle
 
 SPLIT = ("shares", "env_low", "env_high", "seed")
+STARTS = ("random", "identified")
+START = 1
+"""Folded into the run's seed; initial weights and windows take the stream 0."""
 SWITCHING = 2
 """Folded into the data set's seed; driving and splitting it take the streams 0 and 1."""
 
@@ -145,7 +148,7 @@ def _train(settings: dict[str, Any]) -> None:
     dataset = dataset._replace(train=first_share(dataset.train, options.pop("data_share")))
     space = measure_space(dataset)
     model = assembly.build_model(settings["model"], space, assembly.build_vehicle(settings["vehicle"]))
-    horizon = options.pop("window")
+    horizon, start = options.pop("window"), options.pop("start", "random")
     key = jax.random.fold_in(jax.random.key(settings["seed"]), 0)
     if model.identify is not None:
         shelf.say(f"identifying {settings['model']['system']} in {place}")
@@ -156,13 +159,30 @@ def _train(settings: dict[str, Any]) -> None:
         held_out = spread_windows(dataset.validation, length=horizon)
         shelf.say(f"training {settings['model']['system']}, {options['steps']} steps, in {place}")
         options["inspect"] = partial(progress, model)
-        params, best = fit(model, loss, draw, dataset.train, held_out, key, place, **options)
+        begun = _started(model, start, dataset.train, settings["seed"])
+        params, best = fit(begun, loss, draw, dataset.train, held_out, key, place, **options)
     errors = jax.jit(partial(open_loop, model, horizon=horizon))(params, dataset.test)
     document = shelf.open_loop_document(errors, dataset.test, settings["vehicle"]["dt"])
     artefacts.write_json(place / "open_loop.json", document)
     kept |= {"controller": settings["controller"], "experiment": settings["name"]}
     kept |= {"space": assembly.space_to_settings(space), "best_step": best}
     policy.save(place / "policy.npz", params, kept, made_from={"dataset": data_hash})
+
+
+def _started(model: Model, start: str, train: Trajectory, seed: int) -> Model:
+    """The model that training starts from: as drawn, or with the linear part that regression finds for it.
+
+    Raises:
+        ValueError: a start that there is not, or that this model does not have.
+    """
+    if start not in STARTS:
+        raise ValueError(f"training.start must be one of {', '.join(STARTS)}, got {start!r}")
+    if start == "random":
+        return model
+    if model.start is None:
+        raise ValueError("training.start=identified needs a model=sfkd…, whose linear part can be identified")
+    start_from, key = model.start, jax.random.fold_in(jax.random.key(seed), START)
+    return model._replace(init=lambda drawn: start_from(model.init(drawn), train, key))
 
 
 def _concrete(settings: dict[str, Any], dataset: Dataset) -> dict[str, Any]:

@@ -1,10 +1,9 @@
-"""Extended dynamic mode decomposition: a lift by radial functions, pairs along circles, and ridge regression."""
+"""Extended dynamic mode decomposition: a lift by radial functions, and pairs along circles."""
 
 from __future__ import annotations
 
 import jax
 import jax.numpy as jnp
-from jax.scipy.linalg import solve_triangular
 from jaxtyping import Array, Float
 
 from sfkd_jax.se2 import between, compose, wrap_angle
@@ -47,27 +46,3 @@ def along_circle(
         return jnp.concatenate([jnp.stack([turned / kappa, left, wrap_angle(yaw - turned)]), state[BODY]])
 
     return jax.vmap(one)(states)
-
-
-def ridge_regression(
-    inputs: Float[Array, "sample p"], targets: Float[Array, "sample q"], ridges: Float[Array, " ridge"]
-) -> Float[Array, "ridge p q"]:
-    """W = argmin |X W − Y|² + λ N |D W|² for every λ, D the root mean squares of the columns of X.
-
-    By an orthogonal factorisation of [X D⁻¹, Y] and never by X'X, whose condition float32 does not hold.
-
-    Args:
-        inputs: X. targets: Y. ridges: λ > 0.
-    """
-    spread = jnp.sqrt(jnp.mean(inputs**2, axis=0))
-    spread = jnp.where(spread > 0, spread, 1.0)
-    size, columns = inputs.shape
-    triangle = jnp.linalg.qr(jnp.concatenate([inputs / spread, targets], axis=1), mode="r")[:columns]
-
-    def solve(ridge: Scalar) -> Float[Array, "p q"]:
-        stacked = jnp.concatenate([triangle[:, :columns], jnp.sqrt(ridge * size) * jnp.eye(columns)])
-        orthogonal, upper = jnp.linalg.qr(stacked)
-        right = orthogonal[: triangle.shape[0]].T @ triangle[:, columns:]
-        return solve_triangular(upper, right) / spread[:, None]
-
-    return jax.lax.map(solve, ridges)

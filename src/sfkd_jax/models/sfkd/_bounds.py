@@ -11,7 +11,10 @@ FLOAT32_MARGIN = 1e-5
 """Relative slack that float32 rounding inside the Gram iteration cannot use up (measured: 2.2e-6)."""
 
 
-def gram_bound(matrix: Float[Array, "rows columns"], *, iterations: int = 6) -> Scalar:
+GRAM_ITERATIONS = 6
+
+
+def gram_bound(matrix: Float[Array, "rows columns"], *, iterations: int = GRAM_ITERATIONS) -> Scalar:
     """An upper bound on ||M||_2 by Gram iteration, at most r^(1/2^(k+1)) too large.
 
     G_0 = M, G_{k+1} = G_k' G_k rescaled to unit Frobenius norm; ||M||_2 ≤ ||G_k||_F^(1/2^k), scales undone.
@@ -38,6 +41,19 @@ def bounded(matrix: Float[Array, "rows columns"], bound: float) -> Float[Array, 
     """M · ρ / max(ρ, gram(M)(1 + margin)): M itself while it is small enough, never longer than ρ."""
     norm = gram_bound(matrix) * (1.0 + FLOAT32_MARGIN)
     return matrix * (bound * (1.0 - FLOAT32_MARGIN) / jnp.maximum(bound, norm))
+
+
+def unbounded(matrix: Float[Array, "rows columns"]) -> Float[Array, "rows columns"]:
+    """What `bounded` maps to this matrix, whose norm is at most `attainable`."""
+    return matrix / (1.0 - FLOAT32_MARGIN)
+
+
+def attainable(bound: float, size: int) -> float:
+    """The norm up to which `bounded` reaches every square matrix of this size; beyond, the Gram bound may exceed ρ.
+
+    All singular values alike are the worst case: the Gram bound is then size^(1/2^(k+1)) times the norm.
+    """
+    return bound * (1.0 - 3.0 * FLOAT32_MARGIN) / size ** (0.5 ** (GRAM_ITERATIONS + 1))
 
 
 def _frobenius(matrix: Float[Array, "rows columns"]) -> Scalar:

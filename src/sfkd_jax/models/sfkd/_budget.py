@@ -35,9 +35,23 @@ def share_budget(
         A_j, and the residual with G and α H folded into its last and first weights.
     """
     out, into = (bounded(matrix, LARGEST_COUPLING) for matrix in couplings)
-    identity = jnp.eye(out.shape[0])
-    left = jnp.linalg.cholesky(identity - out @ out.T)
-    right = jnp.linalg.cholesky(identity - into.T @ into)
+    left, right = _left_over(out, into)
     vertices = alpha * left @ jax.vmap(lambda matrix: bounded(matrix, 1.0))(operators) @ right.T
     first, *middle, last = network.matrices
     return vertices, Weights((alpha * first @ into, *middle, out @ last), network.multipliers)
+
+
+def budget_factors(
+    couplings: Float[Array, "2 rank rank"],
+) -> tuple[Float[Array, "rank rank"], Float[Array, "rank rank"]]:
+    """L and R of `share_budget`: lower triangular, of what the residual leaves to the operators."""
+    out, into = (bounded(matrix, LARGEST_COUPLING) for matrix in couplings)
+    return _left_over(out, into)
+
+
+def _left_over(
+    out: Float[Array, "rank rank"], into: Float[Array, "rank rank"]
+) -> tuple[Float[Array, "rank rank"], Float[Array, "rank rank"]]:
+    """Cholesky factors of I − G G' and I − H'H."""
+    identity = jnp.eye(out.shape[0])
+    return jnp.linalg.cholesky(identity - out @ out.T), jnp.linalg.cholesky(identity - into.T @ into)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from functools import partial
 from typing import cast
 
 import jax
@@ -11,6 +12,7 @@ from sfkd_jax.models._continuous import scaled_env
 from sfkd_jax.models.sfkd._networks import Encoder, Networks, PerEnvironment, Shared
 from sfkd_jax.models.sfkd._records import SfkdFiber, SfkdLatent
 from sfkd_jax.models.sfkd._sandwich import apply
+from sfkd_jax.models.sfkd._start import identified
 from sfkd_jax.models.sfkd._transport import rotate_planes
 from sfkd_jax.se2 import between, compose
 from sfkd_jax.types import (
@@ -184,7 +186,7 @@ def sfkd(
         jacobian = jax.jacobian(lambda z: apply(fiber.residual, biases, z))(latent.z)
         return soft_penalty * jnp.maximum(0.0, jnp.linalg.norm(jacobian, 2) - beta) ** 2
 
-    return Model(
+    model = Model(
         init=init,
         fiber=fiber,
         encode=encode,
@@ -197,6 +199,7 @@ def sfkd(
         penalty=hinge if soft_penalty else None,
         fold=fold,
     )
+    return model._replace(start=partial(identified, model, networks, space, environment))
 
 
 def _check(rank: int, rho: float, beta: float, frame: str, residual: str, budget: str) -> None:
