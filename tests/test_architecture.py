@@ -41,7 +41,8 @@ ARROWS = {
     "__init__": {"artefacts", "exporting", "policy"},
 }
 EVERY_ROOM = set(ARROWS)
-ARROWS |= {"config": EVERY_ROOM} | {door: EVERY_ROOM | DOORS | {"config"} for door in DOORS}
+ARROWS |= {"ranges": set(), "schemas": EVERY_ROOM, "config": EVERY_ROOM | {"ranges", "schemas"}}
+ARROWS |= {door: EVERY_ROOM | DOORS | {"config", "ranges", "schemas"} for door in DOORS}
 
 EVERYWHERE = set(sys.stdlib_module_names) | {PACKAGE, "jax", "jaxtyping"}
 FRONT = {"hydra", "omegaconf", "numpy", "rich"}
@@ -60,7 +61,7 @@ THIRD_PARTY = {
     "cells": {"numpy"},
     "adapters": {"brax", "gymnasium", "numpy", "scipy", "vehiclemodels"},
     "exporting": {"numpy", "iree"},
-} | {front: FRONT for front in DOORS | {"config"}}
+} | {front: FRONT for front in DOORS | {"config", "schemas"}}
 
 FILES = {file.relative_to(SRC).as_posix(): ast.parse(file.read_text("utf-8")) for file in SRC.rglob("*.py")}
 ROOMS = {name: name.split("/")[0].removesuffix(".py") for name in FILES}

@@ -24,10 +24,11 @@ def settings(*overrides: str) -> dict:
 
 
 @pytest.mark.parametrize(("group", "option"), OPTIONS)
-def test_every_option_composes(group, option):
+def test_every_option_composes_and_is_within_the_ranges(group, option):
     prefix = "+" if group == "experiment" else ""
     composed = settings(f"{prefix}{group}={option}")
     assert composed["seed"] == 0
+    config._settings(OmegaConf.create(composed))
 
 
 @pytest.mark.parametrize("option", MODELS)

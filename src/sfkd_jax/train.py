@@ -17,6 +17,7 @@ def run(settings: dict[str, Any]) -> dict[str, Any]:
     plant = assembly.build_vehicle(settings["vehicle"])
     if plant.simulated:
         check_step(plant)
+    walk.check(settings, plant)
     walk.ensure_policy(settings)
     place = shelf.run_directory(settings)
     certificate = certify.renew(settings)
@@ -32,11 +33,16 @@ def run(settings: dict[str, Any]) -> dict[str, Any]:
         "certificate": str(certify.document_in(place)),
         "results": results["results"],
         "report": pages["report"],
-        "open_loop_rmse_m": artefacts.read_json(place / "open_loop.json")["position_rmse_m"],
+        "open_loop_rmse_m": _errors(place),
         "alpha": certificate.get("alpha"),
         "objective": _objective(place),
         "seconds": time.perf_counter() - began,
     }
+
+
+def _errors(place: Path) -> list[float]:
+    """Error of free-running predictions by steps ahead [m]."""
+    return artefacts.read_json(place / "open_loop.json", keys=("position_rmse_m",))["position_rmse_m"]
 
 
 def _objective(place: Path) -> float | None:

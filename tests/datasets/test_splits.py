@@ -53,7 +53,7 @@ def test_the_deal_is_shuffled_by_its_key():
     "shares", [(0.5, 0.5, 0.1, -0.1), (0.5, 0.3, 0.2, 0.0), (0.5, 0.2, 0.2, 0.2), (0.1, 0.1, 0.1, 0.1)]
 )
 def test_bad_shares_are_refused_by_name(shares):
-    with pytest.raises(ValueError, match=r"shares.*positive and sum to 1"):
+    with pytest.raises(ValueError, match=r"shares.*positive numbers of sum 1"):
         deal(numbered(43), shares=shares)
 
 

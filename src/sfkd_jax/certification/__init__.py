@@ -8,6 +8,7 @@ from sfkd_jax.certification._calibration import clopper_pearson as clopper_pears
 from sfkd_jax.certification._calibration import conformal_bounds as conformal_bounds
 from sfkd_jax.certification._calibration import coverage as coverage
 from sfkd_jax.certification._calibration import disturbances as disturbances
+from sfkd_jax.certification._certificate import MODES as MODES
 from sfkd_jax.certification._certificate import Certificate as Certificate
 from sfkd_jax.certification._certificate import CertificateContradicted as CertificateContradicted
 from sfkd_jax.certification._certificate import CertificateStale as CertificateStale

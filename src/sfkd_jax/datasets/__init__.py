@@ -10,6 +10,7 @@ from sfkd_jax.datasets._generation import generate as generate
 from sfkd_jax.datasets._generation import generate_switching as generate_switching
 from sfkd_jax.datasets._logs import Columns as Columns
 from sfkd_jax.datasets._splits import Dataset as Dataset
+from sfkd_jax.datasets._splits import check_shares as check_shares
 from sfkd_jax.datasets._splits import first_share as first_share
 from sfkd_jax.datasets._splits import measure_space as measure_space
 from sfkd_jax.datasets._splits import random_windows as random_windows

@@ -7,6 +7,8 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Int
 
+from sfkd_jax.datasets._splits import check_shares
+
 ATTEMPTS = 200
 """Orders of the drives that are tried before drives are cut."""
 TOLERANCE = 2.0
@@ -29,8 +31,7 @@ def deal(drives: Int[np.ndarray, " segment"], *, shares: tuple[float, ...], seed
     Raises:
         ValueError: shares that are not four positive numbers of sum 1, or too few segments for them.
     """
-    if len(shares) != 4 or min(shares) <= 0 or abs(sum(shares) - 1.0) > 1e-6:
-        raise ValueError(f"dataset.shares must be four positive numbers of sum 1, got {tuple(shares)}")
+    check_shares(shares)
     names, sizes = np.unique(drives, return_counts=True)
     random = np.random.default_rng(seed)
     for _ in range(ATTEMPTS if len(names) >= len(shares) else 0):

@@ -29,6 +29,16 @@ class Dataset(NamedTuple):
     env_high: Float[Array, " environment"]
 
 
+def check_shares(shares: tuple[float, ...]) -> None:
+    """Of training, validation, calibration and test.
+
+    Raises:
+        ValueError: shares that are not four, positive and of sum 1.
+    """
+    if len(shares) != 4 or not min(shares) > 0 or not abs(sum(shares) - 1.0) <= 1e-6:
+        raise ValueError(f"dataset.shares must be four positive numbers of sum 1, got {tuple(shares)}")
+
+
 def split(
     trajectories: Trajectory,
     key: Key,
@@ -40,15 +50,19 @@ def split(
     """Deal whole trajectories to train, validation, calibration and test.
 
     Raises:
-        ValueError: shares that are not positive and do not sum to 1, a set left empty, an environment outside E.
+        ValueError: shares that are not four, positive and of sum 1, a set left empty, numbers that are not finite, an
+            environment outside E.
     """
-    if min(shares) <= 0 or abs(sum(shares) - 1.0) > 1e-6:
-        raise ValueError(f"dataset.shares must be positive and sum to 1, got {tuple(shares)}")
+    check_shares(shares)
     count = trajectories.states.shape[0]
     edges = np.round(np.cumsum(shares)[:-1] * count).astype(int)
     if min(np.diff([0, *edges, count])) < 1:
         raise ValueError(f"{count} trajectories are too few for shares {tuple(shares)}")
+    if not all(bool(jnp.all(jnp.isfinite(leaf))) for leaf in trajectories):
+        raise ValueError("the driven segments are not finite: check the numbers of vehicle.* and its step")
     envs = trajectories.envs.reshape(-1, trajectories.envs.shape[-1])
+    if not envs.shape[-1:] == jnp.shape(env_low) == jnp.shape(env_high):
+        raise ValueError(f"dataset.env_low and env_high need {envs.shape[-1]} entries, got {env_low} and {env_high}")
     if not bool(jnp.all((envs >= env_low - 1e-5) & (envs <= env_high + 1e-5))):
         raise ValueError(f"environments leave the box [{env_low}, {env_high}]")
     order = jax.random.permutation(key, count)

@@ -1,0 +1,180 @@
+"""What a setting may be: what cannot be meant is one line that names it, whichever setting of whichever option."""
+
+import math
+import random
+import re
+from functools import cache
+
+import pytest
+from hydra import compose, initialize_config_dir
+from omegaconf import OmegaConf
+from omegaconf.errors import OmegaConfBaseException
+
+from sfkd_jax import assembly, config, ranges, walk
+
+MODELS = ("sfkd", "koopman_mpc", "control_synth", "icode", "icode_mppi", "neural_ode", "r2dn")
+OPTIONS = (*(f"model={name}" for name in MODELS), "vehicle=dynamic", "vehicle=own", "dataset=files", "comparison=paper")
+SIGNED = {"vehicle.wind_lever", "vehicle.control_low", "vehicle.control_high", "dataset.env_low", "dataset.env_high"}
+SIGNED |= {"evaluation.told.bias"}
+"""Settings whose numbers may be negative."""
+FREE = {"evaluation.variation", "comparison.paper", "comparison.controllers", "hydra"}
+SAMPLE = 160
+UNKNOWN = {
+    "vehicle.name": "boat",
+    "vehicle.inner_loop": "torque",
+    "scenario.name": "s9",
+    "model.name": "sfdk",
+    "model.frame": "boddy",
+    "model.residual": "some",
+    "model.budget": "all",
+    "controller.planner": "mpppi",
+    "controller.sampling": "none",
+    "controller.mppi.noise": "brown",
+    "controller.mppi.risk": "most",
+    "controller.monitor.fallback": "stop",
+    "certification.mode": "both",
+    "evaluation.systems": ["self", "oracel"],
+    "env": "guessed",
+}
+TOGETHER = {
+    "dataset.shares": [0.5, 0.5, 0.5, 0.5],
+    "training.window": 51,
+    "dataset.env_low": [0.95, -8.0],
+    "model.rank": 7,
+    "controller.mppi.effective_samples": 1501.0,
+    "controller.mppi.smoothing_window": 4,
+    "controller.cem.elites": 501,
+    "dataset.speed": [13.0, 7.0],
+}
+"""Each may be, but not with the rest."""
+
+
+@cache
+def composed(option):
+    config.register()
+    with initialize_config_dir(config.conf_path(), version_base="1.3"):
+        return compose("config", overrides=[option])
+
+
+def leaves(settings, above=""):
+    for key, value in settings.items():
+        if isinstance(value, dict):
+            yield from leaves(value, f"{above}{key}.")
+        else:
+            yield f"{above}{key}", value
+
+
+def names(option):
+    return dict(leaves(OmegaConf.to_container(composed(option), resolve=True)))
+
+
+def use(settings):
+    """What `train` does before anything is made."""
+    plant = assembly.build_vehicle(settings["vehicle"])
+    assembly.build_scenario(settings["scenario"], plant, duration=settings["evaluation"]["episode_s"])
+    walk.check(settings, plant)
+
+
+def refusal(option, name, value):
+    """The line with which a setting is refused, by its type or by what it says; None if it is not."""
+    settings = composed(option)
+    before = OmegaConf.select(settings, name)
+    before = OmegaConf.to_container(before) if OmegaConf.is_config(before) else before
+    try:
+        OmegaConf.update(settings, name, value)
+        use(config._settings(settings))
+    except OmegaConfBaseException as reason:
+        return f"{name}: {config._one_line(reason)}"
+    except ValueError as reason:
+        return str(reason)
+    else:
+        return None
+    finally:
+        OmegaConf.update(settings, name, before, merge=False)
+
+
+def impossible(name, value):
+    """Values that a setting cannot have, whatever the tables say: of another type, not finite, or below 0."""
+    sample = value[0] if isinstance(value, list) and value else value
+    if value == []:
+        return ["word", [math.nan], [{"a": 1}]]
+    if isinstance(value, bool):
+        return ["perhaps", 2.5, [True], None]
+    if isinstance(sample, str):
+        return [[], ["a"], None] if not isinstance(value, list) else ["word", [""], 7]
+    numbers = ["many", math.nan, math.inf, -math.inf, 1e39, {"a": 1}]
+    numbers += [] if name in SIGNED else [-1]
+    numbers += [2.5, 10**12] if isinstance(sample, int) else []
+    return [[number] * len(value) for number in numbers] + [7, "word"] if isinstance(value, list) else [*numbers, []]
+
+
+def wrong():
+    """Name and value of every wrong setting of every option, each name once, then a sample of them."""
+    found = {}
+    for option in OPTIONS:
+        for name, value in names(option).items():
+            if name.partition(".")[0] in ("comparison", "report") or value is None or name in FREE:
+                continue
+            found |= {(name, repr(one)): (option, name, one) for one in impossible(name, value)}
+    return random.Random(0).sample(list(found.values()), SAMPLE)
+
+
+def test_settings_of_the_wrong_type_or_size_are_refused_in_one_line_that_names_them():
+    accepted, odd = [], []
+    for option, name, value in wrong():
+        line = refusal(option, name, value)
+        accepted += [(name, value)] if line is None else []
+        odd += [(name, value, line)] if line and ("\n" in line or name.split(".")[-1] not in line) else []
+    assert accepted == []
+    assert odd == []
+
+
+@pytest.mark.parametrize("name", UNKNOWN)
+def test_an_unknown_choice_is_refused_before_anything_is_made(name):
+    line = refusal("model=sfkd", name, UNKNOWN[name])
+    assert line
+    assert "\n" not in line
+    value = UNKNOWN[name]
+    assert (value if isinstance(value, str) else value[-1]) in line
+
+
+@pytest.mark.parametrize("name", TOGETHER)
+def test_settings_that_do_not_go_together_are_refused_before_anything_is_made(name):
+    planner = {"controller.cem.elites": "controller=cem"}.get(name, "model=sfkd")
+    line = refusal(planner, name, TOGETHER[name])
+    assert line
+    assert "\n" not in line
+    assert re.search(name.split(".")[-1].replace("env_low", "env_low|environments"), line)
+
+
+@pytest.mark.parametrize(
+    ("name", "value", "says"),
+    [
+        ("training.batch", 0, "training.batch must be in [1, inf), got 0"),
+        ("dataset.segments", -5, "dataset.segments must be in [4, inf), got -5"),
+        ("certification.level", 1.5, "certification.level must be in (0, 1), got 1.5"),
+        ("controller.mppi.num_samples", 0, "controller.mppi.num_samples must be in [1, inf), got 0"),
+        ("evaluation.episodes", 0, "evaluation.episodes must be in [1, inf), got 0"),
+        ("scenario.speed", math.nan, "scenario.speed must be in (0, inf), got nan"),
+        ("scenario.wavelengths", [50.0], "scenario.wavelengths must be 2 entries, got [50.0]"),
+        ("scenario.wavelengths", [160.0, 50.0], "scenario.wavelengths must be in rising order, got [160.0, 50.0]"),
+        ("model.residual_hidden", [], "model.residual_hidden must be at least one entry, got []"),
+        ("seed", "abc", "seed must be a whole number, got 'abc'"),
+        ("seed", True, "seed must be a whole number, got True"),
+        ("name", 5, "name must be words, got 5"),
+        ("name", " ", "name must be words, not nothing, got ' '"),
+        ("root", None, "root must be set, got None"),
+        ("demo", 5, "demo.episodes must be set, got None"),
+        ("evaluation.episode_s", 1.0, "evaluation.episode_s must be in (2, inf), got 1.0"),
+        ("comparison.seeds", [-1], "comparison.seeds must be in [0, inf) each, got [-1]"),
+        ("comparison.share", 5, "comparison.share must be 2 entries, got 5"),
+        ("comparison.rows.sfkd", 5, "comparison.rows.sfkd must be words, got 5"),
+    ],
+)
+def test_the_line_says_what_a_setting_must_be_and_what_it_is(name, value, says):
+    assert refusal("comparison=paper", name, value) == says
+
+
+def test_every_name_in_the_tables_is_a_setting():
+    known = {name for option in OPTIONS for name in names(option)}
+    assert [one for one in ranges.patterns() if not any(ranges.fits(name, one) for name in known)] == []
