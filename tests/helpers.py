@@ -2,15 +2,17 @@
 
 import inspect
 import json
+import resource
 import subprocess
 import sys
+from contextlib import contextmanager
 from functools import cache, partial
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 
-from sfkd_jax import certification, control, datasets, models, vehicle
+from sfkd_jax import artefacts, certification, control, datasets, models, vehicle
 from sfkd_jax.types import Space, Trajectory
 
 jit = partial(jax.jit, compiler_options={"xla_backend_optimization_level": 0})
@@ -224,3 +226,26 @@ def door(name, *arguments, cwd, code=0):
 def last_line(done):
     """What a door prints for other programs."""
     return json.loads(done.stdout.strip().splitlines()[-1])
+
+
+@contextmanager
+def largest_file(size):
+    """The kernel stops every write beyond `size` bytes, in the middle of a write if need be."""
+    soft, hard = resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (size, hard))
+    try:
+        yield
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, (soft, hard))
+
+
+def refusal_of(action):
+    """The one line with which an action fails as a door says it; None if it does not fail."""
+    try:
+        action()
+    except (artefacts.ArtefactError, ValueError, OSError) as reason:
+        line = str(reason)
+    else:
+        return None
+    assert "\n" not in line
+    return line

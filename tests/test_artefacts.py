@@ -4,18 +4,17 @@ import json
 import os
 import pickle
 import random
-import resource
 import signal
 import subprocess
 import sys
 import textwrap
 import time
-from contextlib import contextmanager
 from pathlib import Path
 
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from helpers import largest_file
 
 from sfkd_jax import artefacts
 from sfkd_jax.artefacts import ArtefactError
@@ -327,17 +326,6 @@ def test_reading_while_another_process_writes_gives_the_new_arrays(path, monkeyp
 
 def full(*_):
     raise OSError(28, "No space left on device")
-
-
-@contextmanager
-def largest_file(size):
-    """The kernel stops every write beyond `size` bytes, in the middle of a write if need be."""
-    soft, hard = resource.getrlimit(resource.RLIMIT_FSIZE)
-    resource.setrlimit(resource.RLIMIT_FSIZE, (size, hard))
-    try:
-        yield
-    finally:
-        resource.setrlimit(resource.RLIMIT_FSIZE, (soft, hard))
 
 
 @pytest.mark.parametrize(("call", "working"), [("fsync", 0), ("fsync", 1), ("replace", 1), ("replace", 2)])

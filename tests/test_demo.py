@@ -55,7 +55,7 @@ def test_a_policy_with_settings_of_another_version_is_named_in_one_line(tmp_path
     arrays, manifest = artefacts.read_arrays(demo.SHIPPED / "kinematic" / "policy.npz", kind=policy.KIND)
     change(manifest["config"]["controller"])
     artefacts.write_arrays(tmp_path / "policy.npz", arrays, kind=policy.KIND, config=manifest["config"])
-    with pytest.raises(artefacts.ArtefactError, match=rf"policy\.npz has settings of sfkd_jax .*{says}.*: train again"):
+    with pytest.raises(artefacts.ArtefactError, match=rf"policy\.json.*{says}.*saved by sfkd_jax .*: train again"):
         policy.load(tmp_path)
 
 

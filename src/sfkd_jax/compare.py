@@ -37,14 +37,16 @@ def run(settings: dict[str, Any]) -> dict[str, Any]:
             made_with[cell] = cells.made_with(_asked(cell, comparison))
         return made_with[cell]
 
-    rows = cells.collect(wanted, settings, expected, older=comparison["older"])
+    with artefacts.understood(place / "cells"):
+        rows = cells.collect(wanted, settings, expected, older=comparison["older"])
     if not rows:
         raise ValueError(f"nothing to compare: no row came out ({'; '.join(failed.values()) or 'none was asked for'})")
     made_by = settings | {"command": command("compare")}
     document = {"rows": rows, "config": made_by, "versions": artefacts.versions(), "failed": failed}
     seconds = time.perf_counter() - began if driven else None
     artefacts.write_json(place / "results.json", document | {"seconds": seconds})
-    pages = benchmark_report(place)
+    with artefacts.understood(place):
+        pages = benchmark_report(place)
     return {"results": str(place / "results.json"), "rows": len(rows), "failed": len(failed), **pages}
 
 

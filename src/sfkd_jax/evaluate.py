@@ -23,7 +23,9 @@ def run(settings: dict[str, Any], asked_by: str = "evaluate") -> dict[str, Any]:
     began = time.perf_counter()
     place, protocol = shelf.run_directory(settings), settings["evaluation"]
     plant = assembly.build_vehicle(settings["vehicle"])
+    walk.check(settings, plant)
     track = drive.lay(settings, plant)  # first: a vehicle that nothing can drive is refused before anything is trained
+    _kept(place)  # first: nobody drives for an hour to hear that the earlier rows are damaged
     systems = walk.systems(settings, plant)
     dataset, _ = walk.ensure_dataset(settings)
     rows: list[dict[str, Any]] = []
@@ -44,17 +46,24 @@ def run(settings: dict[str, Any], asked_by: str = "evaluate") -> dict[str, Any]:
     return {"results": str(place / "results.json"), "rows": len(rows)}
 
 
+def _kept(place: Path) -> tuple[list[dict[str, Any]], dict[str, Any]]:
+    """Rows and episodes that lie in a run."""
+    results, episodes = place / "results.json", place / "episodes.npz"
+    rows = artefacts.read_json(results, keys=("rows",))["rows"] if results.exists() else []
+    with artefacts.understood(results):
+        evaluation.merge(rows, rows)
+    return rows, artefacts.read_arrays(episodes, kind=KIND)[0] if artefacts.exists(episodes) else {}
+
+
 def _write(place: Path, settings: dict[str, Any], rows: list, arrays: dict[str, Any], seconds: float) -> None:
     """Store rows and episodes; what other scenarios left in this run stays."""
     place.mkdir(parents=True, exist_ok=True)
-    results, episodes = place / "results.json", place / "episodes.npz"
-    kept = artefacts.read_json(results, keys=("rows",))["rows"] if results.exists() else []
-    old = artefacts.read_arrays(episodes, kind=KIND)[0] if artefacts.exists(episodes) else {}
+    kept, old = _kept(place)
     config = {name: settings[name] for name in ("vehicle", "controller", "evaluation")}
     arrays = old | {name: np.asarray(array) for name, array in arrays.items()}
-    artefacts.write_arrays(episodes, arrays, kind=KIND, config=config)
+    artefacts.write_arrays(place / "episodes.npz", arrays, kind=KIND, config=config)
     document = {"rows": evaluation.merge(kept, rows), "config": settings, "versions": artefacts.versions()}
-    artefacts.write_json(results, document | {"seconds": seconds})
+    artefacts.write_json(place / "results.json", document | {"seconds": seconds})
 
 
 if __name__ == "__main__":

@@ -11,7 +11,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from sfkd_jax import artefacts, assembly
-from sfkd_jax.types import Controller, Model, Params
+from sfkd_jax.types import Controller, Model, Params, Space
 
 KIND = "policy"
 
@@ -58,30 +58,46 @@ def load(path: str | Path, *, controller: Mapping[str, Any] | None = None, env: 
     file = file / "policy.npz" if file.suffix != ".npz" else file
     arrays, manifest = artefacts.read_arrays(file, kind=KIND)
     settings = manifest["config"] | {"env": env} | ({} if controller is None else {"controller": dict(controller)})
-    certificate = _certificate(file.with_name("certificate.json"), manifest["sha256"])
-    try:
-        model, planner = _built(settings, certificate)
-    except (KeyError, TypeError) as reason:  # a setting that is missing, or that no factory takes any more
-        saved = manifest.get("versions", {}).get("sfkd_jax", "unknown")
-        raise artefacts.ArtefactError(
-            f"{file} has settings of sfkd_jax {saved} that this version does not read ({reason}): train again"
-        ) from None
+    manifest_file, blamed = file.with_suffix(".json"), () if controller else (ValueError,)
+    saved = f"saved by sfkd_jax {manifest.get('versions', {}).get('sfkd_jax', 'unknown')}: train again"
+    with artefacts.understood(manifest_file, ValueError, advice=saved):
+        plant = assembly.build_vehicle(settings["vehicle"])
+        space = assembly.space_from_settings(settings["space"])
+        model, box = assembly.build_model(settings["model"], space, plant), settings["dataset"]
+        limits = {"env_low": box["env_low"], "env_high": box["env_high"], "env": env}
+    certificate = _certificate(file.with_name("certificate.json"), manifest["sha256"], space)
+    with artefacts.understood(manifest_file, *blamed, advice=saved):
+        planner = assembly.build_controller(settings["controller"], model, plant, certificate=certificate, **limits)
     params = jax.tree.map(jnp.asarray, artefacts.unflatten(arrays))
     return Policy(model, params, planner, certificate, settings)
 
 
-def _built(settings: Mapping[str, Any], certificate: dict[str, Any] | None) -> tuple[Model, Controller]:
-    """The model and the controller that the settings name."""
-    plant = assembly.build_vehicle(settings["vehicle"])
-    model = assembly.build_model(settings["model"], assembly.space_from_settings(settings["space"]), plant)
-    box = settings["dataset"]
-    limits = {"env_low": box["env_low"], "env_high": box["env_high"], "certificate": certificate}
-    return model, assembly.build_controller(settings["controller"], model, plant, **limits, env=settings["env"])
+def _certificate(path: Path, weights: str, space: Space) -> dict[str, Any] | None:
+    """The certificate beside a policy, if it is valid and about these weights.
 
-
-def _certificate(path: Path, weights: str) -> dict[str, Any] | None:
-    """The certificate beside a policy, if it is valid and about these weights."""
+    Raises:
+        ArtefactError: it holds no boxes and bounds that a monitor could use.
+    """
     if not path.exists():
         return None
     document = artefacts.read_json(path, keys=("valid", "weights_sha256"))
-    return document if document["valid"] and document["weights_sha256"] == weights else None
+    if not document["valid"] or document["weights_sha256"] != weights:
+        return None
+    sizes = {"state": space.body_mean.size, "control": space.control_mean.size, "env": space.env_mean.size}
+    with artefacts.understood(path):
+        corners = {name: _numbers(document["boxes"][name], (2, size)) for name, size in sizes.items()}
+        sound = all(corners.values()) and _numbers(document["monitor"]["bounds"], (4,))
+        sound = sound and _numbers(document["tube"]["latent"], None) and _numbers(document["d_bar"]["value"], ())
+    if not sound or not _numbers(document.get("alpha"), ()):
+        raise artefacts.ArtefactError(f"{path}: malformed, its boxes, bounds or tube are no numbers for this model")
+    return document
+
+
+def _numbers(values: Any, shape: tuple[int, ...] | None) -> bool:
+    """Whether a part of a document is finite numbers, of one shape."""
+    try:
+        array = np.asarray(values)
+    except ValueError:  # lists of different lengths
+        return False
+    numbers = array.dtype.kind in "if" and bool(np.isfinite(array).all())
+    return numbers and (shape is None or array.shape == shape)

@@ -5,7 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Any
 
-from sfkd_jax import shelf
+from sfkd_jax import artefacts, shelf
 from sfkd_jax.config import door
 from sfkd_jax.reporting import write_comparison, write_report
 
@@ -13,10 +13,9 @@ from sfkd_jax.reporting import write_comparison, write_report
 def run(settings: dict[str, Any]) -> dict[str, Any]:
     """Draw; nothing is recomputed."""
     pattern = settings["report"]["compare"]
-    if pattern:
-        pages = write_comparison(Path(settings["root"]), pattern, settings["name"])
-    else:
-        pages = write_report(shelf.run_directory(settings))
+    place = Path(settings["root"]) if pattern else shelf.run_directory(settings)
+    with artefacts.understood(place):
+        pages = write_comparison(place, pattern, settings["name"]) if pattern else write_report(place)
     shelf.say(f"report: {pages['report']}")
     return pages
 

@@ -70,7 +70,8 @@ def write_dataset(settings: dict[str, Any], dataset: Dataset) -> dict[str, Any]:
 def read_dataset(settings: dict[str, Any]) -> tuple[Dataset, str]:
     """The four splits and their hash."""
     arrays, manifest = artefacts.read_arrays(dataset_path(settings), kind=DATASET, config=dataset_config(settings))
-    parts = [Trajectory(*(jnp.asarray(arrays[f"{part}/{name}"]) for name in Trajectory._fields)) for part in PARTS]
+    with artefacts.understood(dataset_path(settings)):
+        parts = [Trajectory(*(jnp.asarray(arrays[f"{part}/{name}"]) for name in Trajectory._fields)) for part in PARTS]
     asked = settings["dataset"]
     envs = np.concatenate([np.asarray(part.envs) for part in parts])
     low, high = environment_box(envs, asked["env_low"], asked["env_high"])

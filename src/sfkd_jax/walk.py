@@ -58,9 +58,9 @@ def check(settings: dict[str, Any], plant: Vehicle) -> None:
     model = assembly.build_model(settings["model"], Space(*scales), plant)
     if plant.control_low:
         boxes = {name: ((-1.0,) * size, (1.0,) * size) for name, size in sizes.items()}
-        limits = dict(zip(("env_low", "env_high"), boxes["env"], strict=True)) | {"env": settings["env"]}
-        anything = {"boxes": boxes, "monitor": {"bounds": (1.0,) * 4}}
-        assembly.build_controller(settings["controller"], model, plant, certificate=anything, **limits)
+        limits: dict[str, Any] = dict(zip(("env_low", "env_high"), boxes["env"], strict=True))
+        limits |= {"certificate": {"boxes": boxes, "monitor": {"bounds": (1.0,) * 4}}, "env": settings["env"]}
+        assembly.build_controller(settings["controller"], model, plant, **limits)
 
 
 def ensure_dataset(settings: dict[str, Any]) -> tuple[Dataset, str]:

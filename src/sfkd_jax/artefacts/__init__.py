@@ -10,6 +10,7 @@ from sfkd_jax.artefacts._content import unflatten as unflatten
 from sfkd_jax.artefacts._content import versions as versions
 from sfkd_jax.artefacts._files import ArtefactError as ArtefactError
 from sfkd_jax.artefacts._files import read_json as read_json
+from sfkd_jax.artefacts._files import understood as understood
 from sfkd_jax.artefacts._files import write_bytes as write_bytes
 from sfkd_jax.artefacts._files import write_json as write_json
 from sfkd_jax.artefacts._lines import append_jsonl as append_jsonl

@@ -46,6 +46,21 @@ def failure(path: Path, reason: object) -> ArtefactError:
     return ArtefactError(f"{path}: {' '.join(str(text).split())}")
 
 
+@contextmanager
+def understood(path: Path, *also: type[Exception], advice: str = "") -> Iterator[None]:
+    """What is missing or of another kind inside a file that could be read becomes an ArtefactError about it.
+
+    Args:
+        path: of the file. also: further exceptions that nothing else than the file can be the reason of.
+        advice: what the line ends with.
+    """
+    try:
+        yield
+    except (KeyError, TypeError, IndexError, AttributeError, OverflowError, *also) as reason:
+        said = f"malformed, {type(reason).__name__}: {reason}"
+        raise failure(path, f"{said}; {advice}" if advice else said) from reason
+
+
 def encode(path: Path, document: Mapping[str, Any], *, indent: int | None = None) -> bytes:
     """JSON text of `document`, or an ArtefactError about `path`."""
     try:

@@ -160,8 +160,8 @@ def verify(certificate: Certificate, params: Params, *, model: Model) -> None:
             claims_hold(claims, weights, certificate.env_box)
     except Refuted as reason:
         raise CertificationRefused(str(reason)) from None
-    except (LookupError, TypeError, ValueError) as reason:
-        raise CertificationRefused(f"the certificate is malformed: {reason}") from None
+    except (LookupError, TypeError, ValueError, OverflowError) as reason:
+        raise CertificationRefused(f"the certificate is malformed: {' '.join(str(reason).split())}") from None
     if not claims.alpha < 1.0 or certificate.transport_lipschitz != 1.0:
         raise CertificationRefused(f"alpha = {claims.alpha} is not below 1, or the transport is not nonexpansive")
 

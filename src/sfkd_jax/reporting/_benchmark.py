@@ -8,7 +8,7 @@ from typing import Any, TypeAlias
 
 from matplotlib.figure import Figure
 
-from sfkd_jax.artefacts import read_json
+from sfkd_jax.artefacts import read_json, write_bytes
 from sfkd_jax.reporting import _benchmark_notes as notes
 from sfkd_jax.reporting import _benchmark_tables as tables
 from sfkd_jax.reporting._animation import film
@@ -67,10 +67,10 @@ def benchmark_report(directory: Path) -> dict[str, Any]:
 
     page = _page(results, drawn, directory)
     report = place.with_name("index.html")
-    report.write_text(_html(page), encoding="utf-8")
-    report.with_name("results.md").write_text(benchmark_markdown(results), encoding="utf-8")
+    write_bytes(report, _html(page).encode())
+    write_bytes(report.with_name("results.md"), benchmark_markdown(results).encode())
     table = latex(contests(results["rows"]), paper_of(results))
-    report.with_name("table1.tex").write_text(table, encoding="utf-8")
+    write_bytes(report.with_name("table1.tex"), table.encode())
     return {"report": str(report), "figures": [str(block.path) for block in page if isinstance(block, Picture)]}
 
 

@@ -6,7 +6,7 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-from sfkd_jax.artefacts import write_json
+from sfkd_jax.artefacts import write_bytes, write_json
 from sfkd_jax.reporting._benchmark_tables import percent
 from sfkd_jax.reporting._blocks import Block, Code, Heading, Picture, Table, Text, to_html, to_markdown
 from sfkd_jax.reporting._compared import Record, curves, records_of, scenario_of, steps_of
@@ -45,8 +45,8 @@ def write_comparison(root: Path, pattern: str, name: str) -> dict[str, Any]:
     page += _tables(records)
     page += [Heading(2, "How to make it again"), Code(_command(root, pattern, name))]
     write_json(place / "comparison.json", {"pattern": pattern, "rows": records})
-    (place / "index.html").write_text(to_html(title, page), encoding="utf-8")
-    (place / "report.md").write_text(to_markdown(page), encoding="utf-8")
+    write_bytes(place / "index.html", to_html(title, page).encode())
+    write_bytes(place / "report.md", to_markdown(page).encode())
     return {
         "report": str(place / "index.html"),
         "comparison": str(place / "comparison.json"),

@@ -2,14 +2,15 @@
 
 from __future__ import annotations
 
-import json
 from pathlib import Path
 from typing import Any
+
+from sfkd_jax.artefacts import read_json
 
 
 def read(path: Path) -> dict[str, Any] | None:
     """The JSON object in a file, or None where there is no file."""
-    return json.loads(path.read_text(encoding="utf-8")) if path.exists() else None
+    return read_json(path) if path.exists() else None
 
 
 def about(policy: dict[str, Any], certificate: dict[str, Any] | None) -> dict[str, Any] | None:

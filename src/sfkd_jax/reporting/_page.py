@@ -6,6 +6,7 @@ import json
 from pathlib import Path
 from typing import Any
 
+from sfkd_jax.artefacts import ArtefactError, write_bytes
 from sfkd_jax.reporting import _sections as sections
 from sfkd_jax.reporting._blocks import Block, Heading, Picture, Text, to_html, to_markdown
 from sfkd_jax.reporting._driving import driving
@@ -54,8 +55,8 @@ def write_report(run: Path) -> dict[str, Any]:
     versions = policy.get("versions") or results.get("versions")
     page += sections.provenance(settings, versions, dig(results, "config", "command"))
     report = run / "report" / "index.html"
-    report.write_text(to_html(title, page), encoding="utf-8")
-    report.with_name("report.md").write_text(to_markdown(page), encoding="utf-8")
+    write_bytes(report, to_html(title, page).encode())
+    write_bytes(report.with_name("report.md"), to_markdown(page).encode())
     return {
         "report": str(report),
         "figures": [str(block.path) for block in page if isinstance(block, Picture)],
@@ -65,9 +66,11 @@ def write_report(run: Path) -> dict[str, Any]:
 def _metrics(run: Path) -> list[dict[str, Any]]:
     """Lines of metrics.jsonl up to one that a kill cut off."""
     path, found = run / "metrics.jsonl", []
-    for line in path.read_text(encoding="utf-8").splitlines() if path.exists() else []:
+    for line in path.read_text("utf-8", "replace").splitlines() if path.exists() else []:
         try:
             found.append(json.loads(line))
         except json.JSONDecodeError:
             break
+        if not isinstance(found[-1], dict):
+            raise ArtefactError(f"{path}: line {len(found)} is not a JSON object")
     return found

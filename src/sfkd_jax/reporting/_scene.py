@@ -8,6 +8,8 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Float
 
+from sfkd_jax.artefacts import ArtefactError
+
 
 class Scene(NamedTuple):
     """One scenario as it was driven; only the first episode's tracks are kept.
@@ -54,8 +56,11 @@ def scenes_of(run: Path) -> list[Scene]:
 
 def read_scenes(path: Path) -> dict[str, Scene]:
     """The scenarios in an `episodes.npz` that have at least one lateral deviation, by name in order."""
-    with np.load(path, allow_pickle=False) as archive:
-        arrays = {name: archive[name] for name in archive.files}
+    try:
+        with np.load(path, allow_pickle=False) as archive:
+            arrays = {name: archive[name] for name in archive.files}
+    except Exception as reason:  # a damaged archive raises nearly anything
+        raise ArtefactError(f"{path}: damaged, not an archive of arrays ({type(reason).__name__})") from reason
     dt = float(arrays.pop("dt", 0.1))
     parts = [(*name.split("/"), values) for name, values in arrays.items()]
     found: dict[str, Scene] = {}

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 import sys
 from pathlib import Path
 from typing import Any
@@ -9,6 +10,8 @@ from typing import Any
 import jax
 import orbax.checkpoint as ocp
 from orbax.checkpoint import checkpoint_managers as managers
+
+from sfkd_jax.training._log import GOES_ON
 
 
 class Checkpoints:
@@ -35,10 +38,23 @@ class Checkpoints:
         self._manager = ocp.CheckpointManager(Path(directory).resolve(), options=options)
 
     def save(self, step: int, state: Any, *, validation_loss: float) -> None:
-        """Write the state reached after `step` optimiser steps; a step already there is left alone."""
-        if step not in self._manager.all_steps():
-            metrics = {"validation_loss": float(validation_loss)}
+        """Write the state reached after `step` optimiser steps; a step already there is left alone.
+
+        Raises:
+            OSError: it cannot be written; the states before it stay.
+        """
+        if step in self._manager.all_steps():
+            return
+        metrics, logger = {"validation_loss": float(validation_loss)}, logging.getLogger("absl")
+        level = logger.level
+        logger.setLevel(logging.CRITICAL)  # orbax logs the trace of what it then raises
+        try:
             self._manager.save(step, args=ocp.args.StandardSave(state), metrics=metrics)
+        except Exception as reason:  # orbax raises whatever its storage raised
+            line = " ".join(str(reason).split()).rsplit(": ", 1)[-1][:120]
+            raise OSError(f"{self._manager.directory}: step {step} was not saved ({line}); {GOES_ON}") from reason
+        finally:
+            logger.setLevel(level)
 
     def latest_step(self) -> int | None:
         """The step of the newest state, or None."""

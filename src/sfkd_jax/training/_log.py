@@ -5,12 +5,18 @@ from __future__ import annotations
 import json
 import math
 import sys
+import time
+from contextlib import suppress
 from pathlib import Path
 from types import TracebackType
 
 from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
-from tensorboardX import SummaryWriter
+from tensorboardX.event_file_writer import EventsWriter
+from tensorboardX.proto.event_pb2 import Event, SessionLog  # pyright: ignore[reportAttributeAccessIssue] made by protobuf
+from tensorboardX.summary import scalar
+
+GOES_ON = "the same command goes on from the last checkpoint"
 
 
 class TrainingLog:
@@ -28,7 +34,12 @@ class TrainingLog:
         rewritten = self._path.with_suffix(".part")
         rewritten.write_text("".join(json.dumps(line) + "\n" for line in kept))
         rewritten.replace(self._path)
-        self._board = SummaryWriter(str(directory / "tensorboard"), purge_step=resumed_at or None)
+        board = directory / "tensorboard" / "events"
+        board.parent.mkdir(exist_ok=True)
+        # Not SummaryWriter: of a full disk its thread would tell at the end of the process, with a trace.
+        self._board = EventsWriter(str(board), f".{resumed_at}")
+        if resumed_at:
+            self._board.write_event(Event(step=resumed_at, session_log=SessionLog(status=SessionLog.START)))
         columns = (TextColumn("training"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn())
         console = Console(stderr=True)
         self._bar = Progress(*columns, TextColumn("{task.fields[note]}"), console=console)
@@ -41,9 +52,12 @@ class TrainingLog:
         complete = []
         for line in lines:
             try:
-                complete.append(json.loads(line))
+                record = json.loads(line)
             except json.JSONDecodeError:
                 break
+            if not isinstance(record, dict) or not isinstance(record.get("step"), int):
+                break
+            complete.append(record)
         return complete
 
     def __enter__(self) -> TrainingLog:
@@ -58,16 +72,22 @@ class TrainingLog:
         """Stop the bar, close the files."""
         if self._shows_bar:
             self._bar.stop()
-        self._board.close()
+        with suppress(OSError):  # a full disk has been told of by then
+            self._board.close()
 
     def write(self, record: dict[str, float]) -> None:
         """Append one record; it must have `step`. What is not finite is left out."""
         clean = {name: value for name, value in record.items() if math.isfinite(value)}
-        with self._path.open("a") as file:
-            file.write(json.dumps(clean) + "\n")
-        for name, value in clean.items():
-            if name != "step":
-                self._board.add_scalar(name, value, int(clean["step"]))
+        step = int(clean["step"])
+        try:
+            with self._path.open("a") as file:
+                file.write(json.dumps(clean) + "\n")
+            for name, value in clean.items():
+                if name != "step":
+                    self._board.write_event(Event(wall_time=time.time(), step=step, summary=scalar(name, value)))
+            self._board.flush()
+        except OSError as reason:
+            raise OSError(f"{self._path.parent}: step {step} was not logged ({reason.strerror}); {GOES_ON}") from reason
         note = " ".join(f"{name} {clean[name]:.3g}" for name in ("loss", "validation_loss") if name in clean)
         if self._shows_bar:
             self._bar.update(self._task, completed=int(clean["step"]), note=note)

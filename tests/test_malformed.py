@@ -1,0 +1,288 @@
+"""Files that are damaged, foreign or of another kind: each is one line that names it, and no other file is lost."""
+
+import copy
+import json
+import os
+import pickle
+import random
+import shutil
+import sys
+from functools import cache
+from pathlib import Path
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from helpers import ENV_HIGH, ENV_LOW, SHARES, dataset, refusal_of
+from jaxtyping import TypeCheckError
+
+from sfkd_jax import artefacts, config, datasets, demo, evaluate, policy, report, shelf, training
+from sfkd_jax.certification import Certificate, CertificateStale, CertificationRefused, verify
+
+sys.path.append(str(Path(__file__).parent / "datasets"))
+from recorded import drive, write_csv, write_npz
+
+SHIPPED = demo.SHIPPED / "kinematic"
+WORSE = (None, "word", [], {}, -1, float("nan"), [[1, 2], 3], True, 10**400)
+"""What a value of a document is replaced by."""
+DOCUMENTS = {"policy.json": 60, "certificate.json": 60, "results.json": 20, "settings.json": 10}
+"""Document -> how many times it is spoiled."""
+BYTES = {"policy.npz": 12, "policy.json": 8, "certificate.json": 8, "dataset.npz": 12}
+LOGS = {"a.csv": 20, "a.npz": 12, "a.parquet": 12}
+ROW = {"system": "sfkd", "scenario": "s3", "vehicle": "kinematic", "env": "measured"}
+SETTINGS = {
+    **{name: {"name": "kinematic"} for name in ("vehicle", "model", "controller", "training")},
+    "dataset": {"env_low": [0.3, -8.0], "env_high": [0.9, 8.0]},
+    "seed": 0,
+}
+
+
+class Bomb:
+    """Loading it fails the test."""
+
+    def __reduce__(self):
+        return pytest.fail, ("a pickle was loaded",)
+
+
+@pytest.fixture
+def run(tmp_path):
+    """A run directory as `train` leaves it, as far as readers of documents are concerned."""
+    place = tmp_path / "runs" / "smoke" / "sfkd" / "seed=0"
+    shutil.copytree(SHIPPED, place)
+    artefacts.write_json(place / "results.json", {"rows": [ROW]})
+    artefacts.write_json(place / "settings.json", {"seed": 0, "model": {"rank": 32}, "training": {"steps": 100}})
+    return place
+
+
+def settings_of(run):
+    """Settings that lead to a run directory."""
+    root, name = run.parents[2], run.parents[1].name
+    return SETTINGS | {
+        "root": str(root),
+        "name": name,
+        "model": {"system": run.parent.name},
+        "report": {"compare": None},
+    }
+
+
+@cache
+def shipped():
+    """As it ships: one object, so that what is compiled for it is compiled once."""
+    return policy.load(SHIPPED)
+
+
+def read_policy(run):
+    """What `demo` does with a policy and its certificate."""
+    certificate = policy.load(run).certificate
+    if certificate is not None:
+        try:
+            verify(Certificate.from_document(certificate), shipped().params, model=shipped().model)
+        except (CertificationRefused, CertificateStale) as reason:
+            raise ValueError(f"certificate: {reason}") from None
+        except TypeCheckError:  # under test, types are checked before `verify` is asked
+            raise ValueError("certificate: of other types") from None
+
+
+def read(run, name):
+    """Read a file as the doors do."""
+    if name == "results.json":
+        evaluate._kept(run)
+    elif name == "settings.json":
+        shelf.claim(settings_of(run))
+    else:
+        read_policy(run)
+
+
+def places(value, at=()):
+    """Where values lie in a document."""
+    entries = value.items() if isinstance(value, dict) else enumerate(value[:2]) if isinstance(value, list) else ()
+    for key, entry in entries:
+        yield (*at, key)
+        yield from places(entry, (*at, key))
+
+
+def spoiled(document, draw):
+    """The document with one value gone or replaced."""
+    changed, (*above, last) = copy.deepcopy(document), draw.choice(list(places(document)))
+    inner = changed
+    for key in above:
+        inner = inner[key]
+    if isinstance(inner, dict) and draw.random() < 0.4:
+        del inner[last]
+    else:
+        inner[last] = draw.choice(WORSE)
+    return changed
+
+
+def damaged(content, draw):
+    """Bytes that were cut, changed, doubled, or that never were of this kind."""
+    at = draw.randrange(len(content))
+    flipped = bytes([content[at] ^ (1 << draw.randrange(8))])
+    foreign = (b"", pickle.dumps(Bomb()), draw.randbytes(500), b"PK\x03\x04" + draw.randbytes(200), b"\xff\xfe\x00")
+    changes = (content[:at], content[:at] + flipped + content[at + 1 :], content[at:] + content, draw.choice(foreign))
+    return draw.choice(changes)
+
+
+def snapshot(folder):
+    return {file: file.read_bytes() for file in sorted(folder.rglob("*")) if file.is_file()}
+
+
+def survives(action, file, content):
+    """Write what is wrong, read it, put back what was there: the line of the refusal; nothing else has changed."""
+    folder, before = file.parent, file.read_bytes()
+    file.write_bytes(content)
+    held = snapshot(folder)
+    line = refusal_of(action)
+    assert snapshot(folder) == held
+    file.write_bytes(before)
+    return line
+
+
+@pytest.mark.parametrize("name", DOCUMENTS)
+def test_a_document_with_a_value_gone_or_of_another_kind_is_refused_in_one_line_or_does_as_well(run, name):
+    draw, good, lines = random.Random(1), json.loads((run / name).read_text()), []
+    for _ in range(DOCUMENTS[name]):
+        text = json.dumps(spoiled(good, draw)).encode()
+        lines.append(survives(lambda: read(run, name), run / name, text))
+    refused = [line for line in lines if line]
+    assert len(refused) >= len(lines) // 5  # most values of a certificate are told and not used
+    assert [line for line in refused if not any(word in line for word in (name, "certificate", run.name))] == []
+    assert refusal_of(lambda: read(run, "policy.json")) is None
+
+
+@pytest.mark.parametrize("name", BYTES)
+def test_bytes_that_were_damaged_are_refused_or_say_the_same(run, name):
+    draw, file, read_it = random.Random(2), run / name, read_policy
+    if name == "dataset.npz":
+        settings = settings_of(run)
+        shelf.write_dataset(settings, dataset(count=20, steps=8))
+        file = shelf.dataset_path(settings)
+
+        def read_it(_):
+            shelf.read_dataset(settings)
+
+    lines = [survives(lambda: read_it(run), file, damaged(file.read_bytes(), draw)) for _ in range(BYTES[name])]
+    refused = [line for line in lines if line]
+    assert len(refused) >= 0.7 * len(lines)
+    assert [line for line in refused if file.stem not in line] == []
+    assert refusal_of(lambda: read_it(run)) is None
+
+
+@pytest.mark.parametrize(
+    "name", ["results.json", "open_loop.json", "certificate.json", "metrics.jsonl", "episodes.npz"]
+)
+def test_a_report_names_the_file_that_it_cannot_draw(run, name):
+    for text in (b'{"rows": [', b"\xff\xfe", b"[1, 2]", b"7\n7\n", b"PK\x03\x04 not an archive"):
+        (run / name).write_bytes(text)
+        line = refusal_of(lambda: report.run(settings_of(run)))
+        assert line is None or name in line
+    assert (name == "metrics.jsonl") or line
+
+
+@pytest.mark.parametrize("name", LOGS)
+def test_a_damaged_log_is_refused_in_one_line_or_read_as_a_log(tmp_path, name):
+    file = tmp_path / name
+    if name.endswith("parquet"):
+        pyarrow, parquet = pytest.importorskip("pyarrow"), pytest.importorskip("pyarrow.parquet")
+        parquet.write_table(pyarrow.table(drive(seconds=10.0)), file)
+    else:
+        (write_csv if name.endswith("csv") else write_npz)(file, drive(seconds=10.0))
+
+    def read_log():
+        datasets.from_logs(str(file), datasets.Columns(), dt=0.1, wheelbase=2.7, steps=5, say=lambda line: None)
+
+    draw = random.Random(3)
+    lines = [survives(read_log, file, damaged(file.read_bytes(), draw)) for _ in range(LOGS[name])]
+    refused = [line for line in lines if line]
+    assert len(refused) >= 0.6 * len(lines)
+    assert refusal_of(read_log) is None
+
+
+def test_lines_of_a_training_log_that_are_none_are_dropped(tmp_path):
+    good = b'{"step": 5, "loss": 1.0}\n'
+    for tail in (b"7\n", b"{}\n", b'{"step": "a"}\n', b'{"step": 1', b"\x00\n"):
+        (tmp_path / "metrics.jsonl").write_bytes(good + tail)
+        training._log.TrainingLog(tmp_path, steps=10, resumed_at=5)
+        assert artefacts.read_jsonl(tmp_path / "metrics.jsonl") == [json.loads(good)]
+
+
+# ---- a door with what cannot be composed; a full disk; a place that cannot be written
+
+
+def opened(run_door, monkeypatch, capsys, *arguments):
+    """The exit status of a door in this process, and its lines on stderr."""
+    monkeypatch.setattr("sys.argv", ["door", *arguments])
+    try:
+        config.door(run_door)()
+        status = 0
+    except SystemExit as ended:
+        status = ended.code
+    return status, capsys.readouterr().err.strip().splitlines()
+
+
+@pytest.mark.parametrize(
+    ("argument", "says"),
+    [
+        ("model.rank=abc", "model.rank"),
+        ("model=sfdk", "sfkd_no_fiber"),
+        ("+experiment=s9", "smoke"),
+        ("model.rnk=3", "rnk"),
+        ("modle.rank=3", "modle"),
+        ("training.loss.growht=1", "growht"),
+        ("seed=[", "seed=["),
+        ("dataset.seed=null", "dataset.seed"),
+    ],
+)
+def test_what_cannot_be_composed_is_one_line_of_a_door(monkeypatch, capsys, argument, says):
+    status, lines = opened(lambda settings: pytest.fail("a door was opened"), monkeypatch, capsys, argument)
+    assert status == 1
+    assert len(lines) == 1
+    assert says in lines[0]
+
+
+def full(*_):
+    raise OSError(28, "No space left on device")
+
+
+@pytest.mark.parametrize("call", ["fsync", "replace"])
+def test_a_full_disk_is_one_line_keeps_what_was_there_and_the_same_call_continues(run, monkeypatch, call):
+    settings, root, drives = settings_of(run), run.parents[2], dataset(count=20, steps=8)
+
+    def work():
+        artefacts.write_json(run / "results.json", {"rows": [ROW, ROW]})
+        shelf.write_dataset(settings, drives)
+
+    before = snapshot(root)
+    with monkeypatch.context() as disk:
+        disk.setattr(os, call, full)
+        assert refusal_of(work) == f"{run / 'results.json'}: No space left on device"
+    assert snapshot(root) == before
+    work()
+    assert len(artefacts.read_json(run / "results.json")["rows"]) == 2
+    shelf.read_dataset(settings)
+
+
+def refuse(*_, **__):
+    raise OSError(30, "Read-only file system", "runs")
+
+
+@pytest.mark.parametrize("call", ["mkdir", "open"])
+def test_a_place_that_cannot_be_written_is_one_line_and_keeps_what_was_there(run, monkeypatch, call):
+    settings, root = settings_of(run) | {"name": "another"}, run.parents[2]
+    before = snapshot(root)
+    with monkeypatch.context() as read_only:
+        read_only.setattr(Path, call, refuse)
+        assert "Read-only file system" in refusal_of(lambda: shelf.claim(settings))
+        assert "Read-only file system" in refusal_of(lambda: artefacts.write_json(run / "results.json", {"rows": []}))
+    assert {file: content for file, content in snapshot(root).items() if file in before} == before
+    shelf.claim(settings)
+
+
+def test_segments_that_are_not_finite_are_no_data_set():
+    good = dataset(count=20, steps=8).train
+    for value in (np.nan, np.inf):
+        bad = good._replace(states=good.states.at[0, 3, 3].set(value))
+        low, high = jnp.asarray(ENV_LOW), jnp.asarray(ENV_HIGH)
+        with pytest.raises(ValueError, match="not finite"):
+            datasets.split(bad, jax.random.key(0), shares=SHARES, env_low=low, env_high=high)
