@@ -150,6 +150,19 @@ def test_a_sideways_shove_is_flagged_at_the_step_that_shows_it_and_only_there(sh
     assert flagged(info["breach"]) == breaches
 
 
+def test_a_frozen_observation_is_a_breach_at_every_step_while_the_car_moves():
+    states = np.array(CLEAN.states)
+    states[6:] = states[5]
+    info = watched(CLEAN._replace(states=states), bounds=(0.1,) * 4)
+    assert flagged(info["breach"]) == list(range(6, len(states) - 1))
+    assert not np.any(info["box_exit"])
+
+
+def test_an_observation_that_jumps_for_one_step_is_a_breach_there_and_on_its_way_back():
+    info = watched(changed(CLEAN, "states", 6, 0, CLEAN.states[6, 0] + 3.0), bounds=(0.1,) * 4)
+    assert flagged(info["breach"]) == [6, 7]
+
+
 @pytest.mark.parametrize("name", ["sfkd", "segment"])
 def test_on_a_switch_the_latent_is_transported(name):
     model, params = model_and_params(name)

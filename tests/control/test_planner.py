@@ -97,6 +97,21 @@ def test_the_gradient_planner_never_goes_up_and_ends_at_the_optimal_plan():
 
 
 @every
+@pytest.mark.parametrize("elapsed", [0.5, 1.0, 2.0, 2.75])
+def test_a_call_that_comes_late_continues_the_plan_from_where_it_would_be_by_then(search, elapsed):
+    """Nothing can be read at that call, so what it does is the plan alone; a plan is kept as of one period later."""
+    controller = SEARCHES[search](double_integrator(), horizon=HORIZON, noise_std=(2.0,))
+    plan, state = 0.1 * jnp.arange(HORIZON, dtype=float)[:, None], controller.init(jax.random.key(0))
+    tuning = state.tuning._replace(elapsed=jnp.asarray(elapsed))
+    state = state._replace(plan=plan, controls=plan, tuning=tuning)
+    action, after, info = jit(controller.act)({}, state, START * jnp.nan, NOTHING, ())
+    assert not bool(info["healthy"])
+    late = max(elapsed - 1.0, 0.0)
+    np.testing.assert_allclose(action, 0.1 * late, atol=1e-6)
+    np.testing.assert_allclose(after.controls[0], 0.1 * (late + min(elapsed, 1.0)), atol=1e-6)
+
+
+@every
 def test_everything_a_driver_may_turn_is_data_and_compiles_nothing(search):
     traces = []
 

@@ -105,6 +105,9 @@ def planner(
         reference: Any,
     ) -> tuple[Control, PlannerState, dict[str, Array]]:
         task.check(observation, env, reference, horizon)
+        # A plan is kept as of one period after it was made; of a call that comes later, only the call knows.
+        late = jnp.maximum(state.tuning.elapsed - 1.0, 0.0)
+        state = state._replace(plan=shift(state.plan, late), controls=shift(state.controls, late))
         search_key, next_key = jax.random.split(state.key)
         clean = all_finite((observation, env, reference))
         inside = env if env_low is None or env_high is None else jnp.clip(env, jnp.array(env_low), jnp.array(env_high))
@@ -144,7 +147,7 @@ def planner(
             "env_inside": jnp.all(inside == env),
             "predicted_states": states,
         }
-        elapsed = state.tuning.elapsed
+        elapsed = jnp.minimum(state.tuning.elapsed, 1.0)
         shifted = state._replace(
             plan=shift(plan, elapsed),
             controls=shift(controls, elapsed),
