@@ -12,11 +12,12 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from helpers import TINY, dataset
+from helpers import TINY, dataset, largest_file
 
 from sfkd_jax.datasets import measure_space, random_windows, spread_windows
 from sfkd_jax.models import sfkd
 from sfkd_jax.training import Checkpoints, TrainingStopped, fit, multi_step_loss
+from sfkd_jax.training._log import TrainingLog
 
 OPTIONS = {"steps": 40, "log_every": 10, "save_every": 20}
 DRAW = partial(random_windows, batch=16, length=8)
@@ -104,6 +105,37 @@ def test_latest_and_best_are_both_kept(tmp_path):
     reopened = Checkpoints(tmp_path)
     assert (reopened.latest_step(), reopened.best_step()) == (4, 2)
     reopened.close()
+
+
+@pytest.mark.parametrize("size", [0, 1000])
+def test_a_checkpoint_on_a_full_disk_is_one_line_and_leaves_the_one_before(tmp_path, capfd, size):
+    state = {"w": jax.random.normal(jax.random.key(0), (60, 60))}
+    shelf = Checkpoints(tmp_path)
+    shelf.save(1, state, validation_loss=2.0)
+    with largest_file(size), pytest.raises(OSError, match=r"step 2 was not saved.*File too large.*goes on") as told:
+        shelf.save(2, state, validation_loss=1.0)
+    assert "\n" not in str(told.value)
+    assert "Traceback" not in capfd.readouterr().err
+    shelf.close()
+    reopened = Checkpoints(tmp_path)
+    assert reopened.latest_step() == 1
+    assert same(reopened.restore(1, state), state)
+    reopened.save(2, state, validation_loss=1.0)
+    assert reopened.latest_step() == 2
+    reopened.close()
+
+
+def test_a_log_on_a_full_disk_is_one_line_and_keeps_its_lines(tmp_path):
+    with TrainingLog(tmp_path, steps=20, resumed_at=0) as log:
+        log.write({"loss": 1.0, "step": 10})
+        with (
+            largest_file(30),
+            pytest.raises(OSError, match=r"step 20 was not logged .File too large.; the same command"),
+        ):
+            log.write({"loss": 1.0, "step": 20})
+    with TrainingLog(tmp_path, steps=20, resumed_at=10) as log:
+        log.write({"loss": 1.0, "step": 20})
+    assert [line["step"] for line in lines(tmp_path)] == [10, 20]
 
 
 def test_a_loss_that_is_not_finite_stops_with_the_last_good_checkpoint(task, tmp_path):

@@ -55,7 +55,7 @@ class TrainingLog:
                 record = json.loads(line)
             except json.JSONDecodeError:
                 break
-            if not isinstance(record, dict) or not isinstance(record.get("step"), int):
+            if not isinstance(record, dict) or not isinstance(record.get("step"), int | float):
                 break
             complete.append(record)
         return complete
