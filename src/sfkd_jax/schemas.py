@@ -103,7 +103,14 @@ def register() -> None:
     measured = ("validation", "calibration", "held_out", "boxes", "sensor_noise")
     node = schema("CertificationConfig", issue, skip=measured, renew=False)
     store.store(group="certification", name="schema", node=node)
-    words = {"policies": str, "vehicles": list[str], "seeds": list[int], "only": list[str], "drive": True, "older": False}
+    words = {
+        "policies": str,
+        "vehicles": list[str],
+        "seeds": list[int],
+        "only": list[str],
+        "drive": True,
+        "older": False,
+    }
     words |= {name: dict[str, Any] for name in ("rows", "variations", "paper")}
     words |= {"controllers": dict[str, list[str]], "own_controllers": dict[str, dict[str, Any]]}
     store.store(group="comparison", name="schema", node=schema("ComparisonConfig", **words, share=None))
