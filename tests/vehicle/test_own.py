@@ -50,6 +50,16 @@ def test_a_step_of_another_size_is_refused_by_its_shapes():
         vehicle.check_step(plant)
 
 
+def test_a_step_that_takes_other_sizes_is_told_which_it_is_given():
+    def step(x, u, e):
+        p_x, p_y, yaw, v, rate = x
+        return jnp.stack([p_x, p_y, yaw, v, rate])
+
+    plant = vehicle.own(step=step, **LIMITS)
+    with pytest.raises(ValueError, match=r"fails on 4 states \(vehicle.state_names\), .*: not enough values to unpack"):
+        vehicle.check_step(plant)
+
+
 def test_a_robot_known_from_logs_alone_is_not_driven():
     plant = vehicle.own(state_names=NAMES)
     assert not plant.simulated

@@ -102,8 +102,11 @@ def check_step(plant: Vehicle) -> None:
     sizes = (len(plant.state_names), 2, 2)
     try:
         after = jax.eval_shape(plant.step, *(jnp.zeros(size) for size in sizes))
-    except TypeError as reason:
-        raise ValueError(f"the step of vehicle {plant.name} fails on {sizes[0]} states: {reason}") from None
+    except (TypeError, ValueError, IndexError) as reason:
+        if str(reason).startswith("vehicle"):  # it names its setting already
+            raise
+        given = f"{sizes[0]} states (vehicle.state_names), 2 controls and 2 environments"
+        raise ValueError(f"the step of vehicle {plant.name} fails on {given}: {reason}") from None
     if getattr(after, "shape", None) != (sizes[0],):
         shape = getattr(after, "shape", type(after).__name__)
         raise ValueError(f"the step of vehicle {plant.name} returns {shape}, vehicle.state_names has {sizes[0]} names")
