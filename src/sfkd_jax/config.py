@@ -97,7 +97,8 @@ def _one_line(reason: BaseException) -> str:
     behind = reason.__cause__ if isinstance(reason.__cause__, OmegaConfBaseException) else None
     asked = f"{reason.override}: " if isinstance(reason, OverrideParseException) else ""
     text = f"{asked}{reason}" + (f": {behind}" if behind else "")
-    return " ".join(re.split(r"Config search path|\n\s*full_key:|\nSee https", text)[0].split())
+    words = re.split(r"Config search path|\n\s*full_key:|\nSee https", text)[0].split()
+    return " ".join(word for word in words if not word.endswith("schema"))  # options for other options alone
 
 
 def _settings(config: DictConfig) -> dict[str, Any]:
