@@ -86,8 +86,8 @@ class Job:
             return "reporting"
         if not any((self.place / "runs" / "datasets").glob("*/dataset.json")):
             return "writing data"
-        trained = (self.place / "runs/smoke/sfkd/seed=0/policy.json").exists()
-        return "certifying" if trained and not last.startswith("training") else "training"
+        began = [line.split(", in ")[1] for line in self.lines() if line.startswith("training") and ", in " in line]
+        return "training" if began and not (self.place / began[-1] / "policy.json").exists() else "certifying"
 
 
 def without_times(value):
