@@ -31,6 +31,7 @@ ARROWS = {
     "reporting": {"artefacts"},
     "assembly": HALLWAY | {"vehicle", "scenarios", "datasets", "models", "control"},
     "shelf": HALLWAY | {"artefacts", "datasets"},
+    "rehearsal": HALLWAY | {"assembly", "certification", "datasets", "shelf", "vehicle"},
     "walk": HALLWAY
     | {"artefacts", "assembly", "certification", "datasets", "evaluation", "policy", "shelf", "training", "vehicle"},
     "policy": HALLWAY | {"artefacts", "assembly", "models", "control"},

@@ -10,7 +10,7 @@ from hydra import compose, initialize_config_dir
 from omegaconf import OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
-from sfkd_jax import assembly, config, ranges, walk
+from sfkd_jax import assembly, config, ranges, rehearsal
 
 MODELS = ("sfkd", "koopman_mpc", "control_synth", "icode", "icode_mppi", "neural_ode", "r2dn")
 OPTIONS = (*(f"model={name}" for name in MODELS), "vehicle=dynamic", "vehicle=own", "dataset=files", "comparison=paper")
@@ -72,7 +72,7 @@ def use(settings):
     """What `train` does before anything is made."""
     plant = assembly.build_vehicle(settings["vehicle"])
     assembly.build_scenario(settings["scenario"], plant, duration=settings["evaluation"]["episode_s"])
-    walk.check(settings, plant)
+    rehearsal.check(settings, plant)
 
 
 def refusal(option, name, value):

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 from hydra.core.hydra_config import HydraConfig
 
-from sfkd_jax import artefacts, assembly, drive, evaluation, shelf, walk
+from sfkd_jax import artefacts, assembly, drive, evaluation, rehearsal, shelf, walk
 from sfkd_jax.config import command, door
 
 KIND = "episodes"
@@ -23,7 +23,7 @@ def run(settings: dict[str, Any], asked_by: str = "evaluate") -> dict[str, Any]:
     began = time.perf_counter()
     place, protocol = shelf.run_directory(settings), settings["evaluation"]
     plant = assembly.build_vehicle(settings["vehicle"])
-    walk.check(settings, plant)
+    rehearsal.check(settings, plant)
     track = drive.lay(settings, plant)  # first: a vehicle that nothing can drive is refused before anything is trained
     _kept(place)  # first: nobody drives for an hour to hear that the earlier rows are damaged
     systems = walk.systems(settings, plant)

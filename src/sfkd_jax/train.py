@@ -6,7 +6,7 @@ import time
 from pathlib import Path
 from typing import Any
 
-from sfkd_jax import artefacts, assembly, certify, evaluate, report, shelf, walk
+from sfkd_jax import artefacts, assembly, certify, evaluate, rehearsal, report, shelf, walk
 from sfkd_jax.config import door
 from sfkd_jax.vehicle import check_step
 
@@ -17,7 +17,7 @@ def run(settings: dict[str, Any]) -> dict[str, Any]:
     plant = assembly.build_vehicle(settings["vehicle"])
     if plant.simulated:
         check_step(plant)
-    walk.check(settings, plant)
+    rehearsal.check(settings, plant)
     walk.ensure_policy(settings)
     place = shelf.run_directory(settings)
     certificate = certify.renew(settings)

@@ -10,11 +10,10 @@ import jax
 import jax.numpy as jnp
 
 from sfkd_jax import artefacts, assembly, policy, shelf
-from sfkd_jax.certification import MODES, progress
+from sfkd_jax.certification import progress
 from sfkd_jax.datasets import (
     Columns,
     Dataset,
-    check_shares,
     first_share,
     from_logs,
     generate,
@@ -26,7 +25,7 @@ from sfkd_jax.datasets import (
 )
 from sfkd_jax.evaluation import open_loop
 from sfkd_jax.training import fit, multi_step_loss
-from sfkd_jax.types import Model, Space, Trajectory
+from sfkd_jax.types import Model, Trajectory
 from sfkd_jax.vehicle import Vehicle
 
 SPLIT = ("shares", "env_low", "env_high", "seed")
@@ -35,32 +34,6 @@ START = 1
 """Folded into the run's seed; initial weights and windows take the stream 0."""
 SWITCHING = 2
 """Folded into the data set's seed; driving and splitting it take the streams 0 and 1."""
-
-
-def check(settings: dict[str, Any], plant: Vehicle) -> None:
-    """Build what settings choose, on scales of 1 and under a certificate of anything, and forget it.
-
-    What cannot be built is refused before anything is made that takes long.
-
-    Raises:
-        ValueError: naming the setting, or the choices.
-    """
-    data, window = settings["dataset"], settings["training"]["window"]
-    check_shares(tuple(data["shares"]))
-    if window > data["steps"]:
-        raise ValueError(f"training.window={window} does not fit segments of dataset.steps={data['steps']}")
-    assembly.choose(dict.fromkeys(MODES), settings["certification"]["mode"], "certification.mode")
-    for name in settings["evaluation"]["systems"]:
-        assembly.choose({"self": None} | assembly.reference_systems(plant), name, "evaluation.systems entry")
-    told = data["columns"]["environment"] if shelf.is_logged(settings) else ()
-    sizes = {"state": len(plant.state_names) - 3, "control": 2, "env": len(told) or 2}
-    scales = (part(size) for size in (*sizes.values(), 3) for part in (jnp.zeros, jnp.ones))
-    model = assembly.build_model(settings["model"], Space(*scales), plant)
-    if plant.control_low:
-        boxes = {name: ((-1.0,) * size, (1.0,) * size) for name, size in sizes.items()}
-        limits: dict[str, Any] = dict(zip(("env_low", "env_high"), boxes["env"], strict=True))
-        limits |= {"certificate": {"boxes": boxes, "monitor": {"bounds": (1.0,) * 4}}, "env": settings["env"]}
-        assembly.build_controller(settings["controller"], model, plant, **limits)
 
 
 def ensure_dataset(settings: dict[str, Any]) -> tuple[Dataset, str]:

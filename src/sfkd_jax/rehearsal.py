@@ -1,0 +1,37 @@
+"""A rehearsal: whether what settings choose can be built, asked before anything is made that takes long."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import jax.numpy as jnp
+
+from sfkd_jax import assembly, shelf
+from sfkd_jax.certification import MODES
+from sfkd_jax.datasets import check_shares
+from sfkd_jax.types import Space
+from sfkd_jax.vehicle import Vehicle
+
+
+def check(settings: dict[str, Any], plant: Vehicle) -> None:
+    """Build what settings choose, on scales of 1 and under a certificate of anything, and forget it.
+
+    Raises:
+        ValueError: naming the setting, or the choices.
+    """
+    data, window = settings["dataset"], settings["training"]["window"]
+    check_shares(tuple(data["shares"]))
+    if window > data["steps"]:
+        raise ValueError(f"training.window={window} does not fit segments of dataset.steps={data['steps']}")
+    assembly.choose(dict.fromkeys(MODES), settings["certification"]["mode"], "certification.mode")
+    for name in settings["evaluation"]["systems"]:
+        assembly.choose({"self": None} | assembly.reference_systems(plant), name, "evaluation.systems entry")
+    told = data["columns"]["environment"] if shelf.is_logged(settings) else ()
+    sizes = {"state": len(plant.state_names) - 3, "control": 2, "env": len(told) or 2}
+    scales = (part(size) for size in (*sizes.values(), 3) for part in (jnp.zeros, jnp.ones))
+    model = assembly.build_model(settings["model"], Space(*scales), plant)
+    if plant.control_low:
+        boxes = {name: ((-1.0,) * size, (1.0,) * size) for name, size in sizes.items()}
+        limits: dict[str, Any] = dict(zip(("env_low", "env_high"), boxes["env"], strict=True))
+        limits |= {"certificate": {"boxes": boxes, "monitor": {"bounds": (1.0,) * 4}}, "env": settings["env"]}
+        assembly.build_controller(settings["controller"], model, plant, **limits)
