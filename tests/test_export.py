@@ -57,6 +57,7 @@ def exported(tmp_path_factory):
     place = shelf.run_directory(asked)
     weights = policy.save(place / "policy.npz", params, kept, made_from={"dataset": "d" * 64})["sha256"]
     certificate = {"valid": True, "weights_sha256": weights, "boxes": BOXES, "monitor": {"bounds": [1.0] * 4}}
+    certificate |= {"alpha": 0.9, "d_bar": {"value": 0.1}, "tube": {"latent": [0.1]}}
     artefacts.write_json(place / "certificate.json", certificate)
     return asked, export.run(asked)
 
@@ -102,7 +103,8 @@ def plain(tree):
     return [np.asarray(leaf) for leaf in opened]
 
 
-optimised = partial(jax.jit, compiler_options={"xla_backend_optimization_level": 3})
+fused = {"xla_cpu_use_fusion_emitters": True} if "fusion_emitters" in os.environ["XLA_FLAGS"] else {}
+optimised = partial(jax.jit, compiler_options={"xla_backend_optimization_level": 3, **fused})
 """jax.jit as it is where conftest.py does not speed compiling up: to the last bit, programs agree only like this."""
 
 

@@ -23,8 +23,8 @@ def run(settings: dict[str, Any], asked_by: str = "evaluate") -> dict[str, Any]:
     began = time.perf_counter()
     place, protocol = shelf.run_directory(settings), settings["evaluation"]
     plant = assembly.build_vehicle(settings["vehicle"])
-    rehearsal.check(settings, plant)
     track = drive.lay(settings, plant)  # first: a vehicle that nothing can drive is refused before anything is trained
+    rehearsal.check(settings, plant)
     _kept(place)  # first: nobody drives for an hour to hear that the earlier rows are damaged
     systems = walk.systems(settings, plant)
     dataset, _ = walk.ensure_dataset(settings)
