@@ -51,13 +51,15 @@ def main() -> None:
         if not source.exists():
             shutil.copyfile(kept, Path(scratch, "results.json"))
         figures = benchmark_report(source.parent if source.exists() else Path(scratch))["figures"]
+        text = page_of(json.loads(kept.read_text("utf-8")), page)
+        there = set(files.iterdir())
         stays = set() if source.exists() else {file for kind in DRIVEN for file in files.glob(kind)}
-        for old in set(files.iterdir()) - stays:
+        for old in there - stays:
             old.unlink()
         for figure in map(Path, figures):
-            if files / figure.name not in stays:
-                shutil.copyfile(figure, files / figure.name)
-    text = page_of(json.loads(kept.read_text("utf-8")), page)
+            place = files / figure.name  # films are not linked; other pages show one that lies there
+            if place not in stays and (figure.name in text or place in there):
+                shutil.copyfile(figure, place)
     (HOME / "docs" / f"{page}.md").write_text(text, encoding="utf-8")
     print(f"docs/{page}.md, {len(list(files.iterdir()))} figures")
 
