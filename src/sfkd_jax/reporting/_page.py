@@ -2,11 +2,10 @@
 
 from __future__ import annotations
 
-import json
 from pathlib import Path
 from typing import Any
 
-from sfkd_jax.artefacts import ArtefactError, write_bytes
+from sfkd_jax.artefacts import read_jsonl, write_bytes
 from sfkd_jax.reporting import _sections as sections
 from sfkd_jax.reporting._blocks import Block, Heading, Picture, Text, to_html, to_markdown
 from sfkd_jax.reporting._driving import driving
@@ -40,7 +39,8 @@ def write_report(run: Path) -> dict[str, Any]:
     place.mkdir(parents=True, exist_ok=True)
     for stale in place.glob("*.png"):
         stale.unlink()
-    metrics, errors = _metrics(run), read(run / "open_loop.json")
+    log, errors = run / "metrics.jsonl", read(run / "open_loop.json")
+    metrics = read_jsonl(log) if log.exists() else []
     certificate = about(policy, read(run / "certificate.json"))
     results = read(run / "results.json") or {}
     rows = blocks_of(results.get("rows") or [])
@@ -61,16 +61,3 @@ def write_report(run: Path) -> dict[str, Any]:
         "report": str(report),
         "figures": [str(block.path) for block in page if isinstance(block, Picture)],
     }
-
-
-def _metrics(run: Path) -> list[dict[str, Any]]:
-    """Lines of metrics.jsonl up to one that a kill cut off."""
-    path, found = run / "metrics.jsonl", []
-    for line in path.read_text("utf-8", "replace").splitlines() if path.exists() else []:
-        try:
-            found.append(json.loads(line))
-        except json.JSONDecodeError:
-            break
-        if not isinstance(found[-1], dict):
-            raise ArtefactError(f"{path}: line {len(found)} is not a JSON object")
-    return found

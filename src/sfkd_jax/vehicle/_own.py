@@ -11,6 +11,10 @@ from sfkd_jax.types import Control, Environment, State, Step
 from sfkd_jax.vehicle._vehicle import Vehicle, forward_rk4, nominal_derivative
 
 
+class _NoStep(ValueError):
+    """There is no step to try; the message names the setting."""
+
+
 def own(
     *,
     dt: float = 0.1,
@@ -71,7 +75,7 @@ def own(
 
 def _undriven(state: State, control: Control, env: Environment) -> State:
     """The step of a robot that is known from logs alone."""
-    raise ValueError("vehicle=own is known from logs alone, so nothing can drive it: pass vehicle.step=module:function")
+    raise _NoStep("vehicle=own is known from logs alone, so nothing can drive it: pass vehicle.step=module:function")
 
 
 def step_named(name: str) -> Step:
@@ -87,7 +91,7 @@ def step_named(name: str) -> Step:
         try:
             found = getattr(import_module(module), function)
         except (ImportError, AttributeError, ValueError) as reason:
-            raise ValueError(f"vehicle.step={name}: {reason}; name it as package.module:function") from None
+            raise _NoStep(f"vehicle.step={name}: {reason}; name it as package.module:function") from None
         return found(state, control, env)
 
     return step
@@ -102,9 +106,9 @@ def check_step(plant: Vehicle) -> None:
     sizes = (len(plant.state_names), 2, 2)
     try:
         after = jax.eval_shape(plant.step, *(jnp.zeros(size) for size in sizes))
+    except _NoStep:
+        raise
     except (TypeError, ValueError, IndexError) as reason:
-        if str(reason).startswith("vehicle"):  # it names its setting already
-            raise
         given = f"{sizes[0]} states (vehicle.state_names), 2 controls and 2 environments"
         raise ValueError(f"the step of vehicle {plant.name} fails on {given}: {reason}") from None
     if getattr(after, "shape", None) != (sizes[0],):
