@@ -32,3 +32,10 @@ def test_a_row_that_cannot_be_made_is_named_and_the_others_come_out(tmp_path):
     assert last_line(done)["rows"] == 1
     assert last_line(done)["failed"] == 1
     assert "segment" in done.stderr
+
+
+def test_a_row_that_could_not_be_certified_is_refused_before_it_is_trained(tmp_path):
+    done = door("compare", *COMPARED, "certification.mode=boxes", cwd=tmp_path)
+    assert last_line(done)["failed"] == 1
+    assert "certification.mode" in done.stderr
+    assert "training" not in done.stderr.replace("training.", "")

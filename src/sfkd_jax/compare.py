@@ -2,15 +2,20 @@
 
 from __future__ import annotations
 
+import functools
 import time
+from collections.abc import Callable
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeAlias
 
-from sfkd_jax import artefacts, assembly, cells, certify, drive, shelf, walk
+from sfkd_jax import artefacts, assembly, cells, certify, drive, rehearsal, shelf, walk
 from sfkd_jax.config import command, compose, door
 from sfkd_jax.reporting import benchmark_report
 from sfkd_jax.training import TrainingStopped
 from sfkd_jax.vehicle import Vehicle
+
+_Composed: TypeAlias = Callable[[cells.Cell], dict[str, Any]]
+"""The settings of a cell, under the name of the comparison."""
 
 
 def run(settings: dict[str, Any]) -> dict[str, Any]:
@@ -19,10 +24,10 @@ def run(settings: dict[str, Any]) -> dict[str, Any]:
     wanted = cells.plan(comparison)
     groups = cells.dealt(cells.drivers(wanted), comparison["share"]) if comparison["drive"] else []
     driven, failed = 0, {}
-    made_with: dict[cells.Cell, str] = {}
+    composed = functools.cache(functools.partial(_compose, comparison=comparison))
     for number, group in enumerate(groups):
         try:
-            driven += _drive(group, comparison, made_with)
+            driven += _drive(group, comparison, composed)
         except (TrainingStopped, ValueError, artefacts.ArtefactError) as reason:
             failed["/".join(map(str, group[0][:4]))] = str(reason)
             shelf.say(f"failed: {reason}")
@@ -32,13 +37,8 @@ def run(settings: dict[str, Any]) -> dict[str, Any]:
     if comparison["share"] is not None:  # others drive the rest: whoever comes last collects
         return {"results": None, "rows": driven, "failed": len(failed)}
 
-    def expected(cell: cells.Cell) -> str:
-        if cell not in made_with:
-            made_with[cell] = cells.made_with(_asked(cell, comparison))
-        return made_with[cell]
-
     with artefacts.understood(place / "cells"):
-        rows = cells.collect(wanted, settings, expected, older=comparison["older"])
+        rows = cells.collect(wanted, settings, lambda cell: cells.made_with(composed(cell)), older=comparison["older"])
     if not rows:
         raise ValueError(f"nothing to compare: no row came out ({'; '.join(failed.values()) or 'none was asked for'})")
     made_by = settings | {"command": command("compare")}
@@ -50,19 +50,19 @@ def run(settings: dict[str, Any]) -> dict[str, Any]:
     return {"results": str(place / "results.json"), "rows": len(rows), "failed": len(failed), **pages}
 
 
-def _drive(group: list[cells.Cell], comparison: dict[str, Any], made_with: dict[cells.Cell, str]) -> int:
-    """Drive what is missing of one row under one controller; notes all hashes, returns how many cells were missing."""
+def _drive(group: list[cells.Cell], comparison: dict[str, Any], composed: _Composed) -> int:
+    """Drive what is missing of one row under one controller; returns how many cells that were."""
     drivers: dict[str, drive.TestDriver] = {}
     done = 0
     for cell in group:
-        settings, of_policy = _settings(cell, comparison)
-        path, made_with[cell] = cells.place(cell, settings), cells.made_with(settings)
+        settings = composed(cell)
+        path, of_policy = cells.place(cell, settings), _of_policy(cell, comparison, composed)
         if cells.is_done(path, settings):
             continue
         plant, key = assembly.build_vehicle(settings["vehicle"]), cells.driver_of(of_policy)
+        track = drive.lay(settings, plant)  # first: a road that there is not is refused before anything is trained
         if key not in drivers:
             drivers[key] = _driver(of_policy, plant)
-        track = drive.lay(settings, plant)
         found = drivers[key](track)
         cells.write(path, settings, track, found)
         shelf.say(f"{' '.join(map(str, cell))}: {1e3 * found.row['rmse_m']['mean']:.1f} mm")
@@ -73,6 +73,7 @@ def _drive(group: list[cells.Cell], comparison: dict[str, Any], made_with: dict[
 def _driver(settings: dict[str, Any], plant: Vehicle) -> drive.TestDriver:
     """A row's only system, trained and certified if it learns."""
     if "self" in settings["evaluation"]["systems"]:
+        rehearsal.check(settings, plant)
         _certified(settings)
     ((name, system),) = walk.systems(settings, plant).items()
     return drive.prepare(settings, plant, name, system, walk.ensure_dataset(settings)[0])
@@ -85,20 +86,18 @@ def _certified(settings: dict[str, Any]) -> None:
         certify.renew(settings)
 
 
-def _asked(cell: cells.Cell, comparison: dict[str, Any]) -> dict[str, Any]:
+def _compose(cell: cells.Cell, comparison: dict[str, Any]) -> dict[str, Any]:
     """The settings of a cell, under the name of the comparison."""
     asked = compose(*cells.overrides(cell, comparison))
     asked["evaluation"]["variation"] = None if not comparison["variations"][cell.variation] else cell.variation
     return asked
 
 
-def _settings(cell: cells.Cell, comparison: dict[str, Any]) -> tuple[dict[str, Any], dict[str, Any]]:
-    """The settings of a cell, under the name of the comparison and under the name of its policy's run."""
-    asked, usual = _asked(cell, comparison), next(iter(comparison["variations"]))
-    retrained = cell.variation != usual and shelf.identity(asked) != shelf.identity(
-        compose(*cells.overrides(cell._replace(variation=usual), comparison))
-    )
-    return asked, asked | {"name": cells.policy_name(cell, comparison, retrained=retrained)}
+def _of_policy(cell: cells.Cell, comparison: dict[str, Any], composed: _Composed) -> dict[str, Any]:
+    """The settings of a cell, under the name of its policy's run."""
+    asked, usual = composed(cell), cell._replace(variation=next(iter(comparison["variations"])))
+    retrained = shelf.identity(asked) != shelf.identity(composed(usual))
+    return asked | {"name": cells.policy_name(cell, comparison, retrained=retrained)}
 
 
 def _estimate(done: int, total: int, seconds: float) -> None:

@@ -175,6 +175,22 @@ def test_bootstrap_intervals_cover_the_mean_about_as_often_as_they_say():
     assert 0.82 <= hits <= 1.0
 
 
+def test_trainings_count_once_however_many_episodes_they_drive():
+    """Each of 5 trainings is good or bad on all of its 20 episodes: that many episodes are not that many trials."""
+    random = np.random.default_rng(6)
+    drawn = random.standard_normal((80, 5, 1)) + 0.3 * random.standard_normal((80, 1, 20))
+    joined, crossed = (
+        np.asarray([bootstrap_mean(values)[1] for values in shaped]) for shaped in (drawn.reshape(80, -1), drawn)
+    )
+    covers = [np.mean((ends[:, 0] <= 0.0) & (ends[:, 1] >= 0.0)) for ends in (joined, crossed)]
+    assert covers[0] < 0.6 < 0.75 < covers[1]
+
+
+def test_one_training_has_the_interval_of_its_episodes():
+    values = np.random.default_rng(7).standard_exponential(12)
+    assert bootstrap_mean(values[None]) == bootstrap_mean(values)
+
+
 def test_the_bootstrap_is_repeatable():
     values = np.random.default_rng(2).standard_normal(30)
     assert bootstrap_mean(values) == bootstrap_mean(values)
@@ -265,6 +281,12 @@ def test_rows_that_drove_other_episodes_or_sampled_otherwise_are_not_paired(chan
     ours = row(scored(0.2), about("sfkd"), None, {})
     (_, other) = compare([ours, row(scored(0.5), about("icode", **change), None, {})])
     assert other["difference_to_sfkd"] is None
+
+
+def test_two_trainings_of_three_episodes_are_not_paired_with_three_of_two():
+    ours = pool([row(scored(0.2, count=3), about("sfkd", seeds=[k]), None, {}) for k in range(2)])
+    theirs = pool([row(scored(0.5, count=2), about("icode", seeds=[k]), None, {}) for k in range(3)])
+    assert compare([ours, theirs])[1]["difference_to_sfkd"] is None
 
 
 def test_a_quadratic_program_is_paired_with_what_samples_around_feedback():

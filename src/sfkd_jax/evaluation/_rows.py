@@ -65,14 +65,19 @@ def compare(rows: list[dict[str, Any]]) -> list[dict[str, Any]]:
             other = next((other for other in same if other["system"] == system), None)
             if other is None or (system == "sfkd" and other is entry):
                 continue
-            entry[name] = measure(np.asarray(entry["rmse_episodes_m"]), np.asarray(other["rmse_episodes_m"]))
+            entry[name] = measure(_by_seed(entry), _by_seed(other))
     return rows
 
 
 def _episodes(entry: dict[str, Any]) -> tuple[Any, ...]:
     """Which episodes a row drove: those of equal answers are paired."""
     names = ("scenario", "vehicle", "variation")
-    return *(entry[name] for name in names), entry["sampling"] or "feedback", len(entry["rmse_episodes_m"])
+    return *(entry[name] for name in names), entry["sampling"] or "feedback", _by_seed(entry).shape
+
+
+def _by_seed(entry: dict[str, Any]) -> np.ndarray:
+    """RMSE, one line per training seed, one column per episode."""
+    return np.asarray(entry["rmse_episodes_m"]).reshape(len(entry["seeds"]), -1)
 
 
 def _ratio(values: np.ndarray, reference: np.ndarray) -> float:
@@ -86,17 +91,17 @@ def pool(rows: list[dict[str, Any]]) -> dict[str, Any]:
     """One row of several that differ in the training seed alone: episodes are joined, other measures averaged.
 
     Args:
-        rows: at least one, in the order of their seeds.
+        rows: at least one, in the order of their seeds; all drove the same episodes.
     """
     first, *rest = rows
     if not rest:
         return first
-    joined = [value for entry in rows for value in entry["rmse_episodes_m"]]
+    driven = [entry["rmse_episodes_m"] for entry in rows]
     return _mean(rows) | {
         "arrays": first.get("arrays"),
         "seeds": [seed for entry in rows for seed in entry["seeds"]],
-        "rmse_m": summary(np.asarray(joined)),
-        "rmse_episodes_m": joined,
+        "rmse_m": summary(np.asarray(driven)),
+        "rmse_episodes_m": [value for episodes in driven for value in episodes],
         "max_deviation_m": max(entry["max_deviation_m"] for entry in rows),
         "departures": sum(entry["departures"] for entry in rows),
     }

@@ -1,4 +1,4 @@
-"""Summaries with intervals: bootstrap over episodes, paired where two systems drove the same ones."""
+"""Summaries with intervals: bootstrap over trainings and episodes, paired where two systems drove the same ones."""
 
 from __future__ import annotations
 
@@ -8,20 +8,31 @@ from jaxtyping import Float
 RESAMPLES = 10_000
 
 
-def bootstrap_mean(values: Float[np.ndarray, " episode"], *, seed: int = 0) -> tuple[float, list[float]]:
-    """Mean and its 95 % percentile-bootstrap interval."""
-    values = np.asarray(values, dtype=np.float64)
-    draws = np.random.default_rng(seed).integers(0, len(values), (RESAMPLES, len(values)))
-    means = np.mean(values[draws], axis=1)
-    return float(np.mean(values)), [float(edge) for edge in np.quantile(means, [0.025, 0.975])]
+def bootstrap_mean(values: Float[np.ndarray, "*seed episode"], *, seed: int = 0) -> tuple[float, list[float]]:
+    """Mean and its 95 % percentile-bootstrap interval.
+
+    With several training seeds, trainings and episodes are both drawn anew: all trainings drive the same episodes, so
+    a fortunate training is fortunate in each, and joining the episodes would count it as often as there are episodes.
+
+    Args:
+        values: one per episode, or one per training seed and episode.
+        seed: of the resampling.
+
+    Source: Owen, The pigeonhole bootstrap, Annals of Applied Statistics 1(2), 2007.
+    """
+    table = np.atleast_2d(np.asarray(values, dtype=np.float64))
+    rng = np.random.default_rng(seed)
+    episodes, trainings = (rng.integers(0, size, (RESAMPLES, size)) for size in reversed(table.shape))
+    draws = table[trainings[:, :, None], episodes[:, None, :]].reshape(RESAMPLES, -1)
+    return float(np.mean(table)), [float(edge) for edge in np.quantile(np.mean(draws, axis=1), [0.025, 0.975])]
 
 
-def summary(values: Float[np.ndarray, " episode"]) -> dict[str, object]:
-    """mean, std, ci95, median, p95 of one number per episode."""
+def summary(values: Float[np.ndarray, "*seed episode"]) -> dict[str, object]:
+    """mean, std, ci95, median, p95 of one number per episode, or per training seed and episode."""
     mean, interval = bootstrap_mean(values)
     return {
         "mean": mean,
-        "std": float(np.std(values, ddof=1)) if len(values) > 1 else None,
+        "std": float(np.std(values, ddof=1)) if np.size(values) > 1 else None,
         "ci95": interval,
         "median": float(np.median(values)),
         "p95": float(np.quantile(values, 0.95)),
@@ -29,8 +40,8 @@ def summary(values: Float[np.ndarray, " episode"]) -> dict[str, object]:
 
 
 def paired_difference(
-    values: Float[np.ndarray, " episode"], reference: Float[np.ndarray, " episode"]
+    values: Float[np.ndarray, "*seed episode"], reference: Float[np.ndarray, "*seed episode"]
 ) -> dict[str, object]:
-    """Mean of values − reference over the same episodes, with its interval."""
+    """Mean of values − reference over the same seeds and episodes, with its interval."""
     mean, interval = bootstrap_mean(np.asarray(values) - np.asarray(reference))
     return {"mean": mean, "ci95": interval}
