@@ -21,6 +21,7 @@ PAGES = {
     "robustness": ("robustness", "robustness"),
     "levels": ("levels", "levels"),
     "small_data": ("small_data", "small-data"),
+    "seeds": ("seeds", "seeds"),
 }
 """Name of a comparison -> its folder in experiments/ and its page in docs/."""
 DRIVEN = ("figure1_*", "*.gif")

@@ -325,6 +325,19 @@ def test_shares_of_the_data_rise_to_the_whole_of_it():
     assert markdown.index("Share of the training data") < markdown.index("Tracking: ")
 
 
+def test_every_training_of_a_row_is_drawn_and_told_apart():
+    episodes = {"sfkd": [0.016, 0.020, 0.021, 0.023], "oracle": [0.015, 0.017] * 2}
+    rows = [row(name, "measured", rmse_episodes_m=values) for name, values in episodes.items()]
+    markdown = benchmark_markdown({"rows": rows, "config": {"name": "seeds"}})
+    found = tables_of(markdown, f"Trainings apart: {FEEDBACK}")
+    assert found == {"Row": ["S3 \\[mm\\], seed 0, 1"], "SFKD": ["18.0, 22.0 ± 2.8"], "Oracle": ["16.0"]}
+    assert "interval over trainings and episodes" in markdown
+    strokes = [one for one in overview(contests(rows), {}).axes[0].get_lines() if one.get_marker() == "|"]
+    np.testing.assert_allclose([one.get_xdata() for one in strokes], [[18.0, 22.0]])
+    alone = [one | {"seeds": [0]} for one in rows]
+    assert "Trainings apart" not in benchmark_markdown({"rows": alone})
+
+
 def test_a_row_that_estimates_e_stands_beside_itself_with_e_measured():
     estimated = row("sfkd", "measured", factor=2.0) | {"env": "estimated", "variation": "environment estimated"}
     rows = [row("sfkd", "measured"), row("oracle", "measured"), estimated]

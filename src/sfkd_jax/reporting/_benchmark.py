@@ -24,6 +24,7 @@ from sfkd_jax.reporting._benchmark_rows import (
     together,
     vehicle_title,
 )
+from sfkd_jax.reporting._benchmark_seeds import apart
 from sfkd_jax.reporting._benchmark_tables import slashed
 from sfkd_jax.reporting._benchmark_words import beaten, words
 from sfkd_jax.reporting._blocks import Block, Heading, Picture, Text, to_html, to_markdown
@@ -45,7 +46,7 @@ def benchmark_report(directory: Path) -> dict[str, Any]:
     """Write `directory/report/`: index.html (one self-contained page), results.md, table1.tex and results_files/.
 
     Reads results.json and the arrays of the rows' cells. The only arithmetic is on printed means: RMSE relative to
-    another row's in percent, and over the same row's without a variation.
+    another row's in percent, over the same row's without a variation, and mean and spread of single trainings.
 
     Args:
         directory: of a comparison. Of its files only results.json must be there.
@@ -146,6 +147,7 @@ def _contest(contest: Contest, paper: tables.Paper, ink: _Ink) -> list[Block]:
         Heading(3, f"Tracking: {title(contest)}"),
         tables.tracking(contest, paper),
         Text(notes.tracking(contest, paper), kind="note"),
+        *apart(contest),
         Heading(3, f"Against SFKD and the oracle: {title(contest)}"),
         tables.against(contest),
         Text(notes.AGAINST, kind="note"),

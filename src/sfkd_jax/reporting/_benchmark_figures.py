@@ -19,6 +19,7 @@ from sfkd_jax.reporting._benchmark_rows import (
     title,
     together,
 )
+from sfkd_jax.reporting._benchmark_seeds import has_trainings, trainings
 from sfkd_jax.reporting._benchmark_tables import Paper
 from sfkd_jax.reporting._dots import colour, common_range, dot_panels, mark
 from sfkd_jax.reporting._drives import Drive, drives
@@ -39,7 +40,7 @@ def look(one: Line) -> dict[str, Any]:
 
 
 def overview(group: list[Contest], paper: Paper) -> Figure:
-    """Mean RMSE of every row with its 95 % interval, one panel a scenario, one marker a way of sampling."""
+    """Mean RMSE of every row with its interval and its single trainings, a panel a scenario, a marker a sampling."""
     rows = together(group).lines
     names = by_hardness({name for contest in group for name in scenarios(contest)})
 
@@ -61,6 +62,8 @@ def overview(group: list[Contest], paper: Paper) -> Figure:
     handles = [mark(kind, marker="o", **face) for kind, face in zip(kinds, faces, strict=True)]
     if is_quoted(group, paper):
         handles.append(mark("the paper", marker="x", color=_QUOTED))
+    if has_trainings(group):
+        handles.append(mark("one training", marker="|", markersize=7))
     if len(handles) > 1:
         figure.legend(handles=handles, loc="outside upper left", ncols=4)
     return figure
@@ -76,6 +79,9 @@ def _dots(axes: Any, contest: Contest, name: str, places: dict[str, float], *, h
         ends = dig(one.rows[name], "rmse_m", "ci95")
         if interval(ends) != DASH:
             axes.plot([1e3 * end for end in ends], [place] * 2, color=ink, linewidth=1.4, zorder=3, gid="row")
+        single = [1e3 * value for value in trainings(one.rows[name])]
+        if len(single) > 1:
+            axes.plot(single, [place] * len(single), marker="|", markersize=7, color=ink, linestyle="none", gid="row")
         face = "white" if hollow else ink
         axes.plot(1e3 * mean, place, marker="o", markersize=4.5, color=ink, markerfacecolor=face, zorder=4, gid="row")
 

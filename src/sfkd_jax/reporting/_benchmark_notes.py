@@ -6,6 +6,7 @@ import shlex
 from typing import Any
 
 from sfkd_jax.reporting._benchmark_rows import Contest, Row, contests, is_quoted, scenarios
+from sfkd_jax.reporting._benchmark_seeds import has_trainings
 from sfkd_jax.reporting._blocks import Block, Code, Heading, Table
 from sfkd_jax.reporting._numbers import DASH, dig, is_number, number, plain
 from sfkd_jax.reporting._tables import settings_table
@@ -33,6 +34,7 @@ TITLES = {
     "levels": "Steady friction and wind: seen, interpolated, extrapolated",
     "small_data": "Less training data, row by row",
     "estimated": "e inferred while driving",
+    "seeds": "Trained from several seeds, row by row",
 }
 _INTRODUCED = {
     "figure2": "A force that nobody measures pushes the car from the side, as in the paper's Figure 2.",
@@ -43,6 +45,8 @@ _INTRODUCED = {
     "training drives cover.",
     "small_data": "The policies are trained anew on a share of the training segments; the rest of the protocol stays "
     "as it is.",
+    "seeds": "The same rows, trained from several seeds on the same data: which differences are those of the systems, "
+    "and which those of one training.",
 }
 
 
@@ -81,8 +85,10 @@ def overview(group: list[Contest], paper: dict[str, Any]) -> str:
     """What the figure of all rows shows."""
     crosses = "; crosses: what the paper prints for the row's system, measured in another simulator"
     crosses = crosses if is_quoted(group, paper) else ""
+    over = "trainings and episodes" if has_trainings(group) else "episodes"
+    crosses = f"{'; strokes: single trainings' if has_trainings(group) else ''}{crosses}"
     return (
-        f"Mean lateral RMSE of every row with its 95 % interval over episodes, on a logarithmic axis{crosses}. Rows "
+        f"Mean lateral RMSE of every row with its 95 % interval over {over}, on a logarithmic axis{crosses}. Rows "
         "that are told friction and wind above, those that are not below, each group by its RMSE in the last panel."
     )
 

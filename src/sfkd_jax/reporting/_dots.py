@@ -79,6 +79,7 @@ def plain_log(axis: Any, set_scale: Any, *, sparse: bool = False) -> None:
     narrow = (1.0, 3.0) if sparse and high < 100 * low else (1.0,)
     if not sparse:
         narrow = (1.0, 2.0, 5.0) if high < 30 * low else (1.0, 3.0) if high < 300 * low else (1.0,)
+        narrow = (1.0, 1.5, 2.0, 3.0, 5.0, 7.0) if high < 5 * low else narrow
     axis.set_major_locator(LogLocator(subs=narrow, numticks=None if not sparse else 5 if high < 1e4 * low else 3))
     axis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}"))
     axis.set_minor_formatter(NullFormatter())
