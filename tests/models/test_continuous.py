@@ -7,11 +7,12 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 import scipy.linalg
+import scipy.special
 from helpers import at, driven, jit, same, space
 
 from sfkd_jax import models, vehicle
 from sfkd_jax.models._continuous import Conditioned, continuous
-from sfkd_jax.models._icode import affine_rates
+from sfkd_jax.models._icode import affine_rates, softplus
 from sfkd_jax.rollouts import rollout
 from sfkd_jax.se2 import compose
 from sfkd_jax.types import BODY, POSE
@@ -146,6 +147,14 @@ def test_the_learned_rates_are_exactly_affine_in_all_inputs():
     gain = jax.jacobian(lambda inputs: rates(Conditioned(params, inputs[2:]), body, inputs[:2]))(jnp.zeros(4))
     np.testing.assert_allclose(along(1.0) - along(0.0), gain @ way, rtol=1e-12, atol=1e-14)
     assert np.linalg.matrix_rank(gain) == 4
+
+
+def test_the_quick_softplus_is_as_exact_as_float32_and_rises_by_the_sigmoid():
+    x = np.concatenate([np.linspace(-80.0, 80.0, 20_001), [0.0, -1e-30, 1e4]]).astype(np.float32)
+    exact = np.logaddexp(0.0, x.astype(np.float64))
+    np.testing.assert_allclose(softplus(jnp.asarray(x)), exact, rtol=4e-7)
+    np.testing.assert_allclose(jax.vmap(jax.grad(softplus))(jnp.asarray(x)), scipy.special.expit(x), rtol=4e-7)
+    assert np.isnan(softplus(jnp.asarray(jnp.nan)))
 
 
 @pytest.mark.parametrize("reads_env", [False, True])

@@ -14,9 +14,24 @@ from sfkd_jax.models._continuous import Conditioned, continuous, network
 from sfkd_jax.types import Control, Key, Model, Params, Space
 
 
+@jax.custom_jvp
 def softplus(x: Float[Array, "*shape"]) -> Float[Array, "*shape"]:
-    """log(1 + exp x), without the branches for NaN that cost `jax.nn.softplus` a quarter of its time."""
-    return jnp.maximum(x, 0.0) + jnp.log1p(jnp.exp(-jnp.abs(x)))
+    """log(1 + exp x), a quarter of the time of `log1p`: that branches per element, and rollouts spend most here.
+
+    With t = exp −|x| in (0, 1], log(1 + t) = 2 artanh(t / (2 + t)), whose argument is at most 1/3: seven terms of the
+    series leave 2e-8, less than float32 resolves.
+    """
+    t = jnp.exp(-jnp.abs(x))
+    s = t / (2.0 + t)
+    series = jnp.full_like(s, 1 / 13)
+    for odd in (11, 9, 7, 5, 3, 1):
+        series = 1 / odd + s * s * series
+    return jnp.maximum(x, 0.0) + 2.0 * s * series
+
+
+@softplus.defjvp
+def _(primals: tuple[Array], tangents: tuple[Array]) -> tuple[Array, Array]:
+    return softplus(*primals), nn.sigmoid(*primals) * tangents[0]
 
 
 def affine_rates(
