@@ -2,4 +2,4 @@
 # Steady friction and wind that training drives had, that lie between theirs, and beyond: rows of table1_closed_loop with their policies.
 # Rows by comparison.only=[…].
 set -euo pipefail
-python -m sfkd_jax.compare +experiment=levels "$@"
+bash "$(dirname "${BASH_SOURCE[0]}")/../on_every_core.sh" levels "$@"

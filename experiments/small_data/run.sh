@@ -3,4 +3,4 @@
 # Two trainings a row; every learned row of the table by comparison.only=[].
 set -euo pipefail
 rows=koopman_mpc,sfkd,sfkd_no_fiber,sfkd_no_contraction,neural_ode,icode,control_synth,r2dn
-python -m sfkd_jax.compare +experiment=small_data "comparison.only=[$rows]" "$@"
+bash "$(dirname "${BASH_SOURCE[0]}")/../on_every_core.sh" small_data "comparison.only=[$rows]" "$@"
