@@ -22,6 +22,7 @@ PAGES = {
     "levels": ("levels", "levels"),
     "small_data": ("small_data", "small-data"),
     "seeds": ("seeds", "seeds"),
+    "longer": ("longer", "longer"),
 }
 """Name of a comparison -> its folder in experiments/ and its page in docs/."""
 DRIVEN = ("figure1_*", "*.gif")

@@ -58,8 +58,10 @@ def split(
     edges = np.round(np.cumsum(shares)[:-1] * count).astype(int)
     if min(np.diff([0, *edges, count])) < 1:
         raise ValueError(f"{count} trajectories are too few for shares {tuple(shares)}")
-    if not all(bool(jnp.all(jnp.isfinite(leaf))) for leaf in trajectories[:2]):
-        raise ValueError("the driven segments are not finite: check the numbers of vehicle.* and its step")
+    finite = [jnp.all(jnp.isfinite(leaf)) for leaf in trajectories[:2]]
+    if not all(map(bool, finite)):
+        names = " and ".join(name for name, good in zip(Trajectory._fields, finite, strict=False) if not good)
+        raise ValueError(f"{names} of the trajectories are not finite: check the vehicle that drove them")
     envs = trajectories.envs.reshape(-1, trajectories.envs.shape[-1])
     if not envs.shape[-1:] == jnp.shape(env_low) == jnp.shape(env_high):
         raise ValueError(f"dataset.env_low and env_high need {envs.shape[-1]} entries, got {env_low} and {env_high}")

@@ -154,8 +154,10 @@ def note(study: Study) -> str:
         "Mean lateral RMSE over the same episodes for all rows of a column; in brackets, over that of the same row at "
         f"“{study.plain}”. “2 left”, where it stands: two episodes left the lane."
     )
-    unheard = " Rows that are not told friction and wind do not hear what is wrong about them."
-    return said + (" Nominal and oracle learn nothing." if _shares(study) else unheard)
+    if _shares(study):
+        return f"{said} Nominal and oracle learn nothing."
+    deaf = any(line.env == "none" for line in study.contest.lines)
+    return said + (" Rows that are not told friction and wind do not hear what is wrong about them." if deaf else "")
 
 
 def _shares(study: Study) -> bool:
