@@ -78,8 +78,9 @@ def extremes(contest: Contest, paper: Paper) -> Table:
         f"Largest [mm]\n{below}": _each(names, lambda row: millimetres(row.get("max_deviation_m"), 0)),
         f"After a switch [mm]\n{below}": _each(names, lambda row: millimetres(row.get("rmse_after_switch_m"))),
         f"Steering rate [rad/s]\n{below}": _each(names, lambda row: number(row.get("smoothness_rad_per_s"))),
-        "Rate in the\npaper": lambda line: number(dig(paper.get(line.system), "smoothness_rad_per_s")),
     }
+    if paper:
+        columns["Rate in the\npaper"] = lambda line: number(dig(paper.get(line.system), "smoothness_rad_per_s"))
     return _table(contest, columns)
 
 
@@ -102,9 +103,10 @@ def limits(contest: Contest, paper: Paper) -> Table:
     """Windows beyond one threshold, departures from the lane, and how the planner fared."""
     names = scenarios(contest)
     below = _heads(names)
-    columns: _Columns = {
-        f"V2 [%]\n{below}": _each(names, lambda row: percent(dig(row, "violation", "v2"))),
-        "Rate in the\npaper [%]": lambda line: percent(dig(paper.get(line.system), "violation_rate")),
+    columns: _Columns = {f"V2 [%]\n{below}": _each(names, lambda row: percent(dig(row, "violation", "v2")))}
+    if paper:
+        columns["Rate in the\npaper [%]"] = lambda line: percent(dig(paper.get(line.system), "violation_rate"))
+    columns |= {
         f"Left the lane\n{below}": _each(names, lambda row: short(row.get("departures"))),
         f"Unhealthy steps [%]\n{below}": _each(names, lambda row: percent(row.get("unhealthy_steps"))),
         f"Effective samples\n{below}": _each(names, lambda row: number(row.get("ess"), 0)),
