@@ -54,8 +54,8 @@ def main() -> None:
             shutil.copyfile(kept, Path(scratch, "results.json"))
         figures = benchmark_report(source.parent if source.exists() else Path(scratch))["figures"]
         text = page_of(json.loads(kept.read_text("utf-8")), page)
-        there = set(files.iterdir())
-        stays = set() if source.exists() else {file for kind in DRIVEN for file in files.glob(kind)}
+        there, driven = set(files.iterdir()), [file for kind in DRIVEN for file in files.glob(kind)]
+        stays = set() if source.exists() else {file for file in driven if file.suffix == ".gif" or file.name in text}
         for old in there - stays:
             old.unlink()
         for figure in map(Path, figures):

@@ -109,7 +109,8 @@ def _page(results: dict[str, Any], ink: _Ink, directory: Path | None) -> list[Bl
     page: list[Block] = [Heading(1, notes.heading(results)), Text(notes.lead(results, found), kind="lead")]
     page += notes.failures(results)
     claims = words(found, paper)
-    studied = not is_quoted(found, paper) or any(pushed(contest) or studies(rows, contest) for contest in found)
+    varied = any(pushed(contest) or studies(rows, contest) for contest in found)
+    studied = varied or not is_quoted(found, paper)
     page += [] if studied else claims
     groups: dict[str, list[Contest]] = {vehicle_title(contest): [] for contest in found}
     for contest in found:
@@ -120,7 +121,7 @@ def _page(results: dict[str, Any], ink: _Ink, directory: Path | None) -> list[Bl
             page += [*_robust(rows, contest, ink), *_forces(contest, ink)]
         page += [Heading(3, "Every row")] if studied else []
         page.append(ink(f"rmse_{stem(group[0])}", notes.overview(group, paper), overview, group, paper))
-        page += _driven(group[0], ink, directory)
+        page += [] if varied else _driven(group[0], ink, directory)  # the rows as they are have theirs in the table
         for contest in group:
             page += _contest(contest, paper, ink)
         page += [Heading(3, "Prediction without feedback, position error"), tables.prediction(together(group))]

@@ -85,12 +85,12 @@ COST = (
 
 def overview(group: list[Contest], paper: dict[str, Any]) -> str:
     """What the figure of all rows shows."""
-    crosses = "; crosses: what the paper prints for the row's system, measured in another simulator"
-    crosses = crosses if is_quoted(group, paper) else ""
-    over = "trainings and episodes" if has_trainings(group) else "episodes"
-    crosses = f"{'; strokes: single trainings' if has_trainings(group) else ''}{crosses}"
+    drawn = "over trainings and episodes" if has_trainings(group) else "over episodes"
+    marks = "; strokes: single trainings" if has_trainings(group) else ""
+    if is_quoted(group, paper):
+        marks += "; crosses: what the paper prints for the row's system, measured in another simulator"
     return (
-        f"Mean lateral RMSE of every row with its 95 % interval over {over}, on a logarithmic axis{crosses}. Rows "
+        f"Mean lateral RMSE of every row with its 95 % interval {drawn}, on a logarithmic axis{marks}. Rows "
         "that are told friction and wind above, those that are not below, each group by its RMSE in the last panel."
     )
 

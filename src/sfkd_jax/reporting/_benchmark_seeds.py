@@ -18,9 +18,9 @@ _NOTE = (
 def trainings(row: Row | None) -> list[float]:
     """Mean RMSE of every training of a row [m], in the order of its seeds; equal ones, of what learns nothing, once."""
     seeds, episodes = (row or {}).get("seeds") or [], (row or {}).get("rmse_episodes_m") or []
-    count = len(episodes) // max(1, len(seeds))
-    found = [sum(episodes[start : start + count]) / count for start in range(0, count * len(seeds), max(1, count))]
-    return list(dict.fromkeys(found))
+    count = len(episodes) // max(1, len(seeds)) if all(map(is_number, episodes)) else 0
+    starts = range(0, count * len(seeds), max(1, count))
+    return list(dict.fromkeys(sum(episodes[start : start + count]) / count for start in starts))
 
 
 def has_trainings(group: list[Contest]) -> bool:
