@@ -15,6 +15,11 @@ from sfkd_jax.reporting._style import MUTED, canvas, line, literal
 
 _PER_ROW = 0.205  # height of a row [in]
 _BAND = "#eef4fc"
+_NARROW = (2.0, (1.0, 1.2, 1.5, 2.0, 3.0, 4.0, 5.0, 6.0, 7.0, 8.0, 9.0))
+_WIDE = (float("inf"), (1.0,))
+_FEW = (_NARROW, (100.0, (1.0, 3.0)), _WIDE)
+_MANY = (_NARROW, (5.0, (1.0, 1.5, 2.0, 3.0, 5.0, 7.0)), (30.0, (1.0, 2.0, 5.0)), (300.0, (1.0, 3.0)), _WIDE)
+"""(range of a logarithmic axis, its ticks in a decade), the narrowest first."""
 
 
 def dot_panels(
@@ -76,11 +81,9 @@ def plain_log(axis: Any, set_scale: Any, *, sparse: bool = False) -> None:
     """A logarithmic axis with plain numbers, `sparse` in a narrow panel; what is not positive is not shown."""
     set_scale("log")
     low, high = axis.get_view_interval()
-    narrow = (1.0, 3.0) if sparse and high < 100 * low else (1.0,)
-    if not sparse:
-        narrow = (1.0, 2.0, 5.0) if high < 30 * low else (1.0, 3.0) if high < 300 * low else (1.0,)
-        narrow = (1.0, 1.5, 2.0, 3.0, 5.0, 7.0) if high < 5 * low else narrow
-    axis.set_major_locator(LogLocator(subs=narrow, numticks=None if not sparse else 5 if high < 1e4 * low else 3))
+    subs = next(subs for most, subs in (_FEW if sparse else _MANY) if high < most * low)
+    few = sparse and high >= 2 * low
+    axis.set_major_locator(LogLocator(subs=subs, numticks=None if not few else 5 if high < 1e4 * low else 3))
     axis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}"))
     axis.set_minor_formatter(NullFormatter())
 
