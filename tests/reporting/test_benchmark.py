@@ -293,6 +293,7 @@ def test_figure_1_draws_what_lies_there_and_names_what_does_not(whole):
     assert any(text.get_text() == "μ 0.6\nw −4 m/s" for text in figure.axes[0].texts)
     curve = next(line for line in figure.axes[0].get_lines() if line.get_label() == "SFKD")
     assert len(curve.get_xdata()) == 40
+    assert figure.axes[0].get_ylim()[1] > np.max(np.abs(curve.get_ydata()))
     assert len(through_switches(None, contest).axes) == 1
 
 

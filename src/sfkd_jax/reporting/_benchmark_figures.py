@@ -132,7 +132,8 @@ def _panel(axes: Any, family: list[Drive], last: int) -> None:
         thin = {} if one.line.name in strong else {"linewidth": 0.8, "alpha": 0.65}
         axes.plot(one.dt * np.arange(1, len(values) + 1), values, **look(one.line) | thin)
     peaks = [float(np.nanmax(np.abs(one.lateral[:last]), initial=0.0)) for one in family]
-    reach = 1.1 * max(float(np.quantile(peaks, 0.85, method="lower")) if peaks else 0.0, 1e-3)
+    whole = [peak for one, peak in zip(family, peaks, strict=True) if one.line.system in _ALWAYS]
+    reach = 1.1 * max([float(np.quantile(peaks, 0.85, method="lower")) if peaks else 0.0, *whole, 1e-3])
     axes.set_ylim(-reach, reach)
     axes.grid(visible=False, axis="x")
     if family:
