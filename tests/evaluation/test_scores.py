@@ -305,6 +305,7 @@ def test_pooling_joins_the_episodes_of_all_seeds_and_averages_the_rest():
     assert pooled["seeds"] == [0, 1]
     assert pooled["rmse_episodes_m"] == made[0]["rmse_episodes_m"] + made[1]["rmse_episodes_m"]
     np.testing.assert_allclose(pooled["rmse_m"]["mean"], 0.2 * 1.15)
+    np.testing.assert_allclose(pooled["rmse_trainings_m"], [0.1 * 1.15, 0.3 * 1.15])
     np.testing.assert_allclose(pooled["violation"]["v0"], 0.2)
     np.testing.assert_allclose(pooled["max_deviation_m"], made[1]["max_deviation_m"])
     assert pooled["system"] == "sfkd"

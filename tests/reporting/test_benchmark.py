@@ -341,15 +341,15 @@ def test_shares_of_the_data_rise_to_the_whole_of_it():
 
 
 def test_every_training_of_a_row_is_drawn_and_told_apart():
-    episodes = {"sfkd": [0.016, 0.020, 0.021, 0.023], "oracle": [0.015, 0.017] * 2}
-    rows = [row(name, "measured", rmse_episodes_m=values) for name, values in episodes.items()]
+    trained = {"sfkd": [0.018, 0.022], "oracle": [0.016, 0.016]}
+    rows = [row(name, "measured", rmse_trainings_m=values) for name, values in trained.items()]
     markdown = benchmark_markdown({"rows": rows, "config": {"name": "seeds"}})
     found = tables_of(markdown, f"Trainings apart: {FEEDBACK}")
     assert found == {"Row": ["S3 \\[mm\\], seed 0, 1"], "SFKD": ["18.0, 22.0 ± 2.8"], "Oracle": ["16.0"]}
     assert "interval over trainings and episodes" in markdown
     strokes = [one for one in overview(contests(rows), {}).axes[0].get_lines() if one.get_marker() == "|"]
     np.testing.assert_allclose([one.get_xdata() for one in strokes], [[18.0, 22.0]])
-    alone = [one | {"seeds": [0]} for one in rows]
+    alone = [row(name, "measured") for name in trained]
     assert "Trainings apart" not in benchmark_markdown({"rows": alone})
 
 
@@ -434,7 +434,7 @@ def emptied(value, hole):
 @pytest.mark.parametrize("hole", [None, math.nan, math.inf])
 def test_what_was_not_measured_is_a_dash_and_never_a_zero(tmp_path, hole):
     results = document(samplings=("feedback",))
-    results["rows"] = [emptied(entry | {"rmse_episodes_m": [0.1, 0.2]}, hole) for entry in results["rows"]]
+    results["rows"] = [emptied(entry | {"rmse_trainings_m": [0.1, 0.2]}, hole) for entry in results["rows"]]
     markdown = benchmark_markdown(results)
     found = tables_of(markdown, f"Tracking: {FEEDBACK}")
     assert {cell for name, cells in found.items() if name != "Row" for cell in cells if "±" not in cell} == {"–"}

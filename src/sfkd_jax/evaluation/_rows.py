@@ -102,6 +102,7 @@ def pool(rows: list[dict[str, Any]]) -> dict[str, Any]:
         "seeds": [seed for entry in rows for seed in entry["seeds"]],
         "rmse_m": summary(np.asarray(driven)),
         "rmse_episodes_m": [value for episodes in driven for value in episodes],
+        "rmse_trainings_m": [float(np.mean(episodes)) for episodes in driven],
         "max_deviation_m": max(entry["max_deviation_m"] for entry in rows),
         "departures": sum(entry["departures"] for entry in rows),
     }

@@ -46,7 +46,7 @@ def benchmark_report(directory: Path) -> dict[str, Any]:
     """Write `directory/report/`: index.html (one self-contained page), results.md, table1.tex and results_files/.
 
     Reads results.json and the arrays of the rows' cells. The only arithmetic is on printed means: RMSE relative to
-    another row's in percent, over the same row's without a variation, and mean and spread of single trainings.
+    another row's in percent, over the same row's without a variation, and the spread of trainings.
 
     Args:
         directory: of a comparison. Of its files only results.json must be there.

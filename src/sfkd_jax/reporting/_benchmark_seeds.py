@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import statistics
+
 from sfkd_jax.reporting._benchmark_rows import Contest, Line, Row, scenarios, title
 from sfkd_jax.reporting._benchmark_tables import millimetres
 from sfkd_jax.reporting._blocks import Block, Heading, Table, Text
@@ -17,10 +19,8 @@ _NOTE = (
 
 def trainings(row: Row | None) -> list[float]:
     """Mean RMSE of every training of a row [m], in the order of its seeds; equal ones, of what learns nothing, once."""
-    seeds, episodes = (row or {}).get("seeds") or [], (row or {}).get("rmse_episodes_m") or []
-    count = len(episodes) // max(1, len(seeds)) if all(map(is_number, episodes)) else 0
-    starts = range(0, count * len(seeds), max(1, count))
-    return list(dict.fromkeys(sum(episodes[start : start + count]) / count for start in starts))
+    found = (row or {}).get("rmse_trainings_m") or []
+    return list(dict.fromkeys(found)) if all(map(is_number, found)) else []
 
 
 def has_trainings(group: list[Contest]) -> bool:
@@ -47,7 +47,5 @@ def apart(contest: Contest) -> list[Block]:
 
 def _shown(line: Line, name: str) -> str:
     found = trainings(line.rows.get(name))
-    mean = sum(found) / max(1, len(found))
-    spread = (sum((value - mean) ** 2 for value in found) / max(1, len(found) - 1)) ** 0.5
-    behind = f" ± {number(1e3 * spread, 1)}" if len(found) > 1 else ""
+    behind = f" ± {number(1e3 * statistics.stdev(found), 1)}" if len(found) > 1 else ""
     return ", ".join(millimetres(value) for value in found) + behind if found else DASH
