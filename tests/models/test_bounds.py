@@ -89,7 +89,7 @@ def environments(count=200):
 @pytest.mark.parametrize("name", ["sfkd", "no_residual", "segment"])
 def test_the_operator_is_bounded_for_every_environment_and_every_weight(name, scale):
     model, params = model_and_params(name, scale)
-    operators = jit(jax.vmap(lambda env: model.fiber(params, env).A))(environments())
+    operators = jit(jax.vmap(lambda env: model.fiber(model.fold(params), env).A))(environments())
     assert np.all(spectral(operators) <= RHO)
     assert np.all(spectral(explicit(name, scale).operators.vertices) > 0.97 * RHO)  # and the bound is used, not wasted
 
@@ -100,7 +100,7 @@ def test_opposed_operators_mix_within_the_bound(seed):
     model, params = model_and_params("sfkd")
     free = np.random.default_rng(seed).standard_normal((3, 8, 8)).astype(np.float32)
     params = params | {"networks": params["networks"] | {"operators": 50.0 * np.stack([free[0], -free[0], free[1]])}}
-    norms = spectral(jit(jax.vmap(lambda env: model.fiber(params, env).A))(environments(50)))
+    norms = spectral(jit(jax.vmap(lambda env: model.fiber(model.fold(params), env).A))(environments(50)))
     assert np.all(norms <= RHO)
     assert norms.min() < 0.9 * RHO
 

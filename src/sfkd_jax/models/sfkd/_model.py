@@ -10,7 +10,7 @@ import jax.numpy as jnp
 
 from sfkd_jax.models._continuous import scaled_env
 from sfkd_jax.models.sfkd._networks import Encoder, Networks, PerEnvironment, Shared
-from sfkd_jax.models.sfkd._records import SfkdFiber, SfkdLatent
+from sfkd_jax.models.sfkd._records import Mixture, SfkdFiber, SfkdLatent
 from sfkd_jax.models.sfkd._sandwich import apply
 from sfkd_jax.models.sfkd._start import identified
 from sfkd_jax.models.sfkd._transport import rotate_planes
@@ -114,8 +114,9 @@ def sfkd(
             {"params": params["networks"]}, scaled_env(space, env, environment), method="per_environment"
         )
         local = cast(PerEnvironment, found)
+        operator = Mixture(local.mixture, shared.vertices)
         return SfkdFiber(
-            A=jnp.tensordot(local.mixture, shared.vertices, axes=1),
+            A=operator.summed() if "shared" in params else operator,  # folded is what drives: many steps under one e
             B=local.B,
             residual=shared.residual.matrices,
             residual_biases=local.residual,

@@ -90,7 +90,7 @@ def _pairs(
     seen = jax.vmap(model.observe, in_axes=(0, None, 0))
     before = seen(fibers, origin, driven.states[:-1])
     after = jax.vmap(model.transport)(later, fibers, seen(later, origin, driven.states[1:]))
-    alone = fibers._replace(A=jnp.zeros_like(fibers.A), B=jnp.zeros_like(fibers.B))
+    alone = fibers._replace(A=jax.tree.map(jnp.zeros_like, fibers.A), B=jnp.zeros_like(fibers.B))
     residual = jax.vmap(model.step)(alone, before, driven.controls)
 
     def features(env: Array, control: Array) -> tuple[Array, Array]:
