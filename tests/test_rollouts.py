@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from helpers import at, driven, jit, model_and_params
 
-from sfkd_jax.rollouts import defects, fibers_along, rollout
+from sfkd_jax.rollouts import defects, fibers_along, in_batches, rollout
 
 
 @pytest.fixture(scope="module")
@@ -84,3 +84,17 @@ def test_a_defect_is_what_its_definition_says_on_every_switch(one, name):
         gap = by_hand(params, *one.envs[k : k + 2], *one.states[k : k + 2], one.controls[k])
         np.testing.assert_allclose(gaps[k], gap, atol=3e-6)
     assert float(jnp.max(jnp.abs(gaps))) > 1e-4
+
+
+@pytest.mark.parametrize("size", [1, 3, 7, 50])
+def test_batches_of_any_size_leave_every_item_what_it_is_and_trace_one_program(size):
+    items, traced = {"a": jnp.arange(14.0).reshape(7, 2), "b": jnp.arange(7)}, []
+
+    def function(item):
+        traced.append(item)
+        return {"sum": item["a"].sum() + item["b"], "twice": 2.0 * item["a"]}
+
+    found = in_batches(function, items, size=size)
+    np.testing.assert_array_equal(found["sum"], items["a"].sum(axis=1) + items["b"])
+    np.testing.assert_array_equal(found["twice"], 2.0 * items["a"])
+    assert len(traced) == 1

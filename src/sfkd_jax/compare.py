@@ -16,6 +16,8 @@ from sfkd_jax.vehicle import Vehicle
 
 _Composed: TypeAlias = Callable[[cells.Cell], dict[str, Any]]
 """The settings of a cell, under the name of the comparison."""
+_Lay: TypeAlias = Callable[[dict[str, Any], Vehicle], drive.Track]
+"""The episodes of a cell's settings."""
 
 
 def run(settings: dict[str, Any]) -> dict[str, Any]:
@@ -24,10 +26,10 @@ def run(settings: dict[str, Any]) -> dict[str, Any]:
     wanted = cells.plan(comparison)
     groups = cells.dealt(cells.drivers(wanted), comparison["share"]) if comparison["drive"] else []
     driven, failed = 0, {}
-    composed = functools.cache(functools.partial(_compose, comparison=comparison))
+    composed, lay = functools.cache(functools.partial(_compose, comparison=comparison)), _surveyor()
     for number, group in enumerate(groups):
         try:
-            driven += _drive(group, comparison, composed)
+            driven += _drive(group, comparison, composed, lay)
         except (TrainingStopped, ValueError, artefacts.ArtefactError) as reason:
             failed["/".join(map(str, group[0][:4]))] = str(reason)
             shelf.say(f"failed: {reason}")
@@ -50,7 +52,7 @@ def run(settings: dict[str, Any]) -> dict[str, Any]:
     return {"results": str(place / "results.json"), "rows": len(rows), "failed": len(failed), **pages}
 
 
-def _drive(group: list[cells.Cell], comparison: dict[str, Any], composed: _Composed) -> int:
+def _drive(group: list[cells.Cell], comparison: dict[str, Any], composed: _Composed, lay: _Lay) -> int:
     """Drive what is missing of one row under one controller; returns how many cells that were."""
     drivers: dict[str, drive.TestDriver] = {}
     done = 0
@@ -60,7 +62,7 @@ def _drive(group: list[cells.Cell], comparison: dict[str, Any], composed: _Compo
         if cells.is_done(path, settings):
             continue
         plant, key = assembly.build_vehicle(settings["vehicle"]), cells.driver_of(of_policy)
-        track = drive.lay(settings, plant)  # first: a road that there is not is refused before anything is trained
+        track = lay(settings, plant)  # first: a road that there is not is refused before anything is trained
         if key not in drivers:
             drivers[key] = _driver(of_policy, plant)
         found = drivers[key](track)
@@ -68,6 +70,19 @@ def _drive(group: list[cells.Cell], comparison: dict[str, Any], composed: _Compo
         shelf.say(f"{' '.join(map(str, cell))}: {1e3 * found.row['rmse_m']['mean']:.1f} mm")
         done += 1
     return done
+
+
+def _surveyor() -> _Lay:
+    """`drive.lay` with a memory: rows that are compared meet the same roads."""
+    known: dict[str, drive.Track] = {}
+
+    def lay(settings: dict[str, Any], plant: Vehicle) -> drive.Track:
+        place = artefacts.sha256({name: settings[name] for name in ("vehicle", "scenario", "evaluation")})
+        if place not in known:
+            known[place] = drive.lay(settings, plant)
+        return known[place]
+
+    return lay
 
 
 def _driver(settings: dict[str, Any], plant: Vehicle) -> drive.TestDriver:

@@ -82,20 +82,21 @@ def prepare(
     options = {"horizon": assembly.controller_horizon(settings["controller"]), "dt": plant.dt}
     options["observation_noise"] = tuple(protocol["observation_noise"])
 
-    params = jax.jit(system.model.fold)(system.params)
+    about = _about(settings, name, system)
+    system = system._replace(params=jax.jit(system.model.fold)(system.params))  # or every step evaluates it anew
 
     def one(road: Scenario, key: Any, met: Any) -> evaluation.Episode:
-        return evaluation.simulate(plant.step, controller, params, road, key, met=met, **options)
+        return evaluation.simulate(plant.step, controller, system.params, road, key, met=met, **options)
 
     compiled = jax.jit(jax.vmap(one))
     assess = _assessor(settings, system, dataset, plant.dt)
-    about = _about(settings, name, system) | {"open_loop_rmse_m": _open_loop(settings, system, dataset)}
+    about |= {"open_loop_rmse_m": _open_loop(settings, system, dataset)}
     timing: list[Any] = []
 
     def drive(track: Track) -> Drive:
         episodes, scores, violation = pushed(track, 0.0)
         if not timing:
-            timing.append(_act_ms(controller, params, track, options, protocol["timed_steps"]))
+            timing.append(_act_ms(controller, system.params, track, options, protocol["timed_steps"]))
         where = about | {"scenario": track.scenario, "variation": track.variation}
         row = evaluation.row(scores, where, timing[0], violation, watched=system.certificate is not None)
         if protocol["side_forces"]:

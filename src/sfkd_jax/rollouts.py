@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import Any
 
 import jax
@@ -53,9 +54,7 @@ def every_window(trajectory: Trajectory, *, horizon: int, stride: int) -> Trajec
 def window_errors(
     model: Model, params: Params, trajectory: Trajectory, *, horizon: int, stride: int
 ) -> Float[Array, "window horizon 3"]:
-    """Errors of free-running predictions 1 … horizon steps ahead, from every `stride`-th true state.
-
-    Kinds: distance between positions [m], |yaw| [rad] (wrapped), 2-norm of the body state in its own units.
+    """`prediction_errors` 1 … horizon steps ahead, from every `stride`-th true state.
 
     Args:
         model, params: any model. trajectory: one, states (T + 1, state). horizon, stride: steps.
@@ -65,12 +64,28 @@ def window_errors(
     """
 
     def one(window: Trajectory) -> Float[Array, "horizon 3"]:
-        predicted, _, _ = rollout(model, params, window)
-        gap = predicted - window.states[1:]
-        kinds = (jnp.linalg.norm(gap[:, :2], axis=1), jnp.abs(wrap_angle(gap[:, 2])))
-        return jnp.column_stack([*kinds, jnp.linalg.norm(gap[:, BODY], axis=1)])
+        return prediction_errors(rollout(model, params, window)[0], window)
 
     return jax.vmap(one)(every_window(trajectory, horizon=horizon, stride=stride))
+
+
+def prediction_errors(predicted: Float[Array, "horizon state"], window: Trajectory) -> Float[Array, "horizon 3"]:
+    """Distance between positions [m], |yaw| [rad] (wrapped), 2-norm of the body state in its own units."""
+    gap = predicted - window.states[1:]
+    kinds = (jnp.linalg.norm(gap[:, :2], axis=1), jnp.abs(wrap_angle(gap[:, 2])))
+    return jnp.column_stack([*kinds, jnp.linalg.norm(gap[:, BODY], axis=1)])
+
+
+def in_batches(function: Callable[[Any], Any], items: Any, *, size: int) -> Any:
+    """`function` of every item along the leading axis, `size` of them at a time.
+
+    The last batch is filled up and what fills it is dropped: `jax.lax.map` would compile a second program for the rest.
+    """
+    count = jax.tree.leaves(items)[0].shape[0]
+    size = min(size, count)
+    rows = (jnp.arange(-(-count // size) * size) % count).reshape(-1, size)
+    found = jax.lax.map(lambda chosen: jax.vmap(function)(jax.tree.map(lambda leaf: leaf[chosen], items)), rows)
+    return jax.tree.map(lambda leaf: leaf.reshape(-1, *leaf.shape[2:])[:count], found)
 
 
 def defects(

@@ -161,7 +161,8 @@ def _train(settings: dict[str, Any]) -> None:
         options["inspect"] = partial(progress, model)
         begun = _started(model, start, dataset.train, settings["seed"])
         params, best = fit(begun, loss, draw, dataset.train, held_out, key, place, **options)
-    errors = jax.jit(partial(open_loop, model, horizon=horizon))(params, dataset.test)
+    predict = jax.jit(lambda params, data: open_loop(model, model.fold(params), data, horizon=horizon))
+    errors = predict(params, dataset.test)
     document = shelf.open_loop_document(errors, dataset.test, settings["vehicle"]["dt"])
     artefacts.write_json(place / "open_loop.json", document)
     kept |= {"controller": settings["controller"], "experiment": settings["name"]}

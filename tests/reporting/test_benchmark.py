@@ -353,6 +353,15 @@ def test_every_training_of_a_row_is_drawn_and_told_apart():
     assert "Trainings apart" not in benchmark_markdown({"rows": alone})
 
 
+def test_a_row_that_leaves_the_road_is_written_and_the_others_keep_the_axis():
+    rows = [row("sfkd", "measured"), row("oracle", "measured"), row("nominal", "none", factor=60.0)]
+    (axes,) = overview(contests(rows), {}).axes
+    assert [text.get_text() for text in axes.texts] == ["7.2 m →"]
+    assert axes.get_xlim()[1] < 30.0  # SFKD's 20 mm and their interval, not 7200
+    assert "means beyond 1 m are written at the edge" in benchmark_markdown({"rows": rows, "config": {}})
+    assert "written at the edge" not in benchmark_markdown({"rows": rows[:2], "config": {}})
+
+
 def test_a_row_that_estimates_e_stands_beside_itself_with_e_measured():
     estimated = row("sfkd", "measured", factor=2.0) | {"env": "estimated", "variation": "environment estimated"}
     rows = [row("sfkd", "measured"), row("oracle", "measured"), estimated]

@@ -180,10 +180,11 @@ def _attacks(
             found["step_slopes"], limits["step_slopes"] = max(slopes), claims.alpha
     if starts:
         step_key, transport_key = jax.random.split(jax.random.key(seed))
-        found["transport"] = attack_transport(model, params, box, transport_key)
+        driving = jax.jit(model.fold)(params)
+        found["transport"] = attack_transport(model, driving, box, transport_key)
         limits["transport"] = 1.0
         if claims.kappa == 1.0:
-            found["step"] = attack_step(model, params, box, step_key, starts=starts)
+            found["step"] = attack_step(model, driving, box, step_key, starts=starts)
             limits["step"] = claims.alpha
     for name, value in found.items():
         if not value <= limits[name] * (1 + FLOAT32):

@@ -5,11 +5,12 @@ from __future__ import annotations
 from functools import partial
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
 from sfkd_jax.certification._calibration import conformal_quantile
-from sfkd_jax.rollouts import window_errors
+from sfkd_jax.rollouts import in_batches, window_errors
 from sfkd_jax.types import Model, Params, Trajectory
 
 KINDS = ("position_m", "yaw_rad", "body")
@@ -47,10 +48,11 @@ def conformal_tube(
 
     def along(params: Params, data: Trajectory) -> Float[Array, "trajectory window horizon 3"]:
         one = partial(window_errors, model, params, horizon=horizon, stride=stride)
-        return jax.lax.map(one, data, batch_size=64)
+        return in_batches(one, data, size=64)
 
-    measure = jax.jit(along)
-    seen, errors = (np.asarray(measure(params, part), dtype=np.float64) for part in (validation, calibration))
+    both = jax.tree.map(lambda *parts: jnp.concatenate(parts), validation, calibration)
+    found = np.asarray(jax.jit(along)(params, both), dtype=np.float64)
+    seen, errors = np.split(found, [validation.controls.shape[0]])
     if not np.all(np.isfinite(seen)):
         raise ValueError("prediction errors are not finite")
     units = np.maximum(np.quantile(seen, 0.95, axis=(0, 1)), RESOLUTION)

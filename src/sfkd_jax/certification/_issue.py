@@ -53,9 +53,10 @@ def issue(
     """
     began = time.perf_counter()
     certificate = certify(model, params, boxes["env"], mode=mode, margin=margin, attack_starts=attack_starts)
+    driving = jax.jit(model.fold)(params)
     try:
-        found = _measure(model, params, validation, calibration, held_out, level)
-        alarms = _alarms(model, params, (validation, calibration), sensor_noise, monitor_level)
+        found = _measure(model, driving, validation, calibration, held_out, level)
+        alarms = _alarms(model, driving, (validation, calibration), sensor_noise, monitor_level)
     except ValueError as reason:
         raise CertificationRefused(str(reason)) from None
     one_step = found["one_step"]

@@ -8,7 +8,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from sfkd_jax.rollouts import every_window, rollout
+from sfkd_jax.rollouts import every_window, in_batches, rollout
 from sfkd_jax.se2 import rotate, wrap_angle
 from sfkd_jax.types import Model, Params, Trajectory
 
@@ -36,4 +36,4 @@ def open_loop(model: Model, params: Params, trajectories: Trajectory, *, horizon
         yaw = wrap_angle(predicted[:, 2] - true[:, 2])
         return jnp.column_stack([position, yaw, predicted[:, 3] - true[:, 3]]) ** 2
 
-    return jnp.sqrt(jnp.mean(jax.lax.map(squares, pieces, batch_size=128), axis=0))
+    return jnp.sqrt(jnp.mean(in_batches(squares, pieces, size=128), axis=0))

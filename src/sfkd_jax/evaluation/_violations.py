@@ -11,7 +11,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from sfkd_jax.rollouts import defects, every_window, rollout, window_errors
+from sfkd_jax.rollouts import defects, every_window, in_batches, prediction_errors, rollout
 from sfkd_jax.types import Model, Params, Trajectory
 
 STRIDE = 5
@@ -68,22 +68,23 @@ def predictions(model: Model, params: Params, driven: Trajectory, *, length: int
     segments = jax.tree.map(lambda leaf: leaf.reshape(-1, *leaf.shape[2:]), cut(driven))
 
     def one(segment: Trajectory) -> Predictions:
-        errors = window_errors(model, params, segment, horizon=horizon, stride=STRIDE)
         windows = every_window(segment, horizon=horizon, stride=STRIDE)
-        return Predictions(errors, *jax.vmap(partial(_latent_errors, model, params))(windows))
+        return jax.vmap(partial(_along_window, model, params))(windows)
 
-    return jax.lax.map(one, segments, batch_size=16)
+    return in_batches(one, segments, size=16)
 
 
-def _latent_errors(
-    model: Model, params: Params, window: Trajectory
-) -> tuple[Float[Array, " horizon"], Float[Array, " horizon"]]:
-    """|e_k| = |z_k − ẑ_k| with z_k the latent of the true state, and |d_k|."""
-    _, latents, along = rollout(model, params, window)
+def _along_window(model: Model, params: Params, window: Trajectory) -> Predictions:
+    """Predictions of one window; |e_k| = |z_k − ẑ_k| with z_k the latent of the true state."""
+    predicted, latents, along = rollout(model, params, window)
     gaps, _ = defects(model, params, window, along)
     seen = jax.vmap(model.observe)(along[1], latents, window.states[1:])
-    errors = jax.vmap(model.vector)(seen) - jax.vmap(model.vector)(latents)
-    return jnp.linalg.norm(errors, axis=1), jnp.linalg.norm(gaps, axis=1)
+    gone = jax.vmap(model.vector)(seen) - jax.vmap(model.vector)(latents)
+    return Predictions(
+        errors=prediction_errors(predicted, window),
+        latent_errors=jnp.linalg.norm(gone, axis=1),
+        defects=jnp.linalg.norm(gaps, axis=1),
+    )
 
 
 def tube_violations(errors: Float[np.ndarray, "segment window horizon 3"], tube: Tube) -> tuple[int, int]:

@@ -10,6 +10,7 @@ import numpy as np
 from matplotlib.figure import Figure
 
 from sfkd_jax.reporting._benchmark_rows import (
+    OFF_THE_ROAD_M,
     Contest,
     Line,
     by_hardness,
@@ -76,6 +77,10 @@ def _dots(axes: Any, contest: Contest, name: str, places: dict[str, float], *, h
         if mean is None or (hollow and not one.rows[name].get("sampling")):
             continue
         place, ink = places[one.name] - raised, colour(one)
+        if mean > OFF_THE_ROAD_M:
+            words: dict[str, Any] = {"transform": axes.get_yaxis_transform(), "ha": "right", "va": "center"}
+            axes.text(0.99, place, f"{mean:.1f} m \N{RIGHTWARDS ARROW}", color=ink, fontsize=7.5, **words)
+            continue
         ends = dig(one.rows[name], "rmse_m", "ci95")
         if interval(ends) != DASH:
             axes.plot([1e3 * end for end in ends], [place] * 2, color=ink, linewidth=1.4, zorder=3, gid="row")

@@ -5,7 +5,7 @@ from __future__ import annotations
 import shlex
 from typing import Any
 
-from sfkd_jax.reporting._benchmark_rows import Contest, Row, contests, is_quoted, scenarios
+from sfkd_jax.reporting._benchmark_rows import OFF_THE_ROAD_M, Contest, Row, contests, is_quoted, measure, scenarios
 from sfkd_jax.reporting._benchmark_seeds import has_trainings
 from sfkd_jax.reporting._blocks import Block, Code, Heading, Table
 from sfkd_jax.reporting._numbers import DASH, dig, is_number, number, plain
@@ -89,6 +89,9 @@ def overview(group: list[Contest], paper: dict[str, Any]) -> str:
     marks = "; strokes: single trainings" if has_trainings(group) else ""
     if is_quoted(group, paper):
         marks += "; crosses: what the paper prints for the row's system, measured in another simulator"
+    means = [measure(line, name, "rmse_m", "mean") for one in group for line in one.lines for name in line.rows]
+    if any(mean is not None and mean > OFF_THE_ROAD_M for mean in means):
+        marks += f"; means beyond {OFF_THE_ROAD_M:g} m are written at the edge"
     return (
         f"Mean lateral RMSE of every row with its 95 % interval {drawn}, on a logarithmic axis{marks}. Rows "
         "that are told friction and wind above, those that are not below, each group by its RMSE in the last panel."

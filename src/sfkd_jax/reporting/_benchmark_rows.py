@@ -11,6 +11,8 @@ Row: TypeAlias = dict[str, Any]
 
 VARIANTS = {"icode_mppi_one_step": "icode_mppi", "icode_mppi_reads_env": "icode_mppi"}
 """Systems that the paper has under one name."""
+OFF_THE_ROAD_M = 1.0
+"""A mean deviation beyond it is not driving: figures write it, so that the rows that drive share the axis."""
 SELF_EVIDENT = ("nominal", "oracle")
 """Systems whose name says what they are told; so do those of SFKD and its parts."""
 _SAMPLINGS = {"feedback": "sampling around a feedback law", "plain": "plain sampling"}
