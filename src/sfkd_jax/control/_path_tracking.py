@@ -63,7 +63,7 @@ def path_tracking(
         return law(path_errors(state, point, curvature), curvature, point[3])
 
     def begin(params: Params, observation: State, env: Environment, reference: Reference, applied: Applied) -> Began:
-        fiber = model.fiber(params, env)
+        fiber = model.fiber(model.fold(params), env)  # of many rollouts; nothing is left to fold if that was done ahead
         curvature = reference_curvature(reference)
         goals = jax.vmap(lambda point: model.encode(fiber, _on_path(observation, point)))(reference)
         errors = path_errors(observation, reference[0], curvature[0])
