@@ -4,6 +4,8 @@ import json
 
 from helpers import door, last_line
 
+from sfkd_jax import compare, vehicle
+
 SMALL = ("training.steps=75", "training.save_every=75", "dataset.segments=200")
 COMPARED = ("+experiment=smoke", "comparison=tiny", "evaluation.systems=[self]", "name=table", *SMALL)
 
@@ -39,3 +41,14 @@ def test_a_row_that_could_not_be_certified_is_refused_before_it_is_trained(tmp_p
     assert last_line(done)["failed"] == 1
     assert "certification.mode" in done.stderr
     assert "training" not in done.stderr.replace("training.", "")
+
+
+def test_roads_are_laid_once_for_all_rows_and_anew_for_another_protocol():
+    told = {"delay_s": 0.0, "noise": [0.0, 0.0], "bias": [0.0, 0.0]}
+    protocol = {"episodes": 2, "episode_s": 2.0, "seed": 1, "told": told, "variation": None}
+    asked = {"vehicle": {"name": "kinematic"}, "scenario": {"name": "s1"}, "evaluation": protocol}
+    lay, plant = compare._surveyor(), vehicle.kinematic()
+    first, second = (lay(asked | {"model": {"name": model}}, plant) for model in ("sfkd", "icode"))
+    assert second is first
+    others = [{"evaluation": protocol | {"seed": 2}}, {"scenario": {"name": "s3"}}, {"vehicle": {"name": "other"}}]
+    assert len({id(lay(asked | other, plant)) for other in others} | {id(first)}) == 4
