@@ -1,4 +1,5 @@
 #!/usr/bin/env bash
-# Twice the training steps for SFKD with and without its bound, dynamic plant: what of their difference is want of training.
+# SFKD with and without its bound, dynamic plant, with twice the training steps and with a rate nearer to 1: whether their
+# difference is want of training, or of the rate.
 set -euo pipefail
 bash "$(dirname "${BASH_SOURCE[0]}")/../on_every_core.sh" longer "$@"

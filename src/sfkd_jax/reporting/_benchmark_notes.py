@@ -35,7 +35,7 @@ TITLES = {
     "small_data": "Less training data, row by row",
     "estimated": "e inferred while driving",
     "seeds": "Trained from several seeds, row by row",
-    "longer": "Twice the training",
+    "longer": "Twice the training, or a rate nearer to 1",
 }
 _INTRODUCED = {
     "figure2": "A force that nobody measures pushes the car from the side, as in the paper's Figure 2.",
@@ -48,7 +48,8 @@ _INTRODUCED = {
     "as it is.",
     "seeds": "The same rows, trained from several seeds on the same data: which differences are those of the systems, "
     "and which those of one training.",
-    "longer": "Whether the rows with and without the bound differ because one of them is not yet trained to its end.",
+    "longer": "Whether the rows with and without the bound differ because one of them is not yet trained to its end, "
+    "or because the rate that the bound asks for is too far below 1.",
 }
 
 
