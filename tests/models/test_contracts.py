@@ -237,6 +237,22 @@ def test_folded_parameters_are_the_same_model_and_the_same_claim(name, one):
         assert same(jit(model.explicit)(folded), jit(model.explicit)(params), rtol=1e-6, atol=1e-6)
 
 
+def test_no_gradient_of_training_passes_through_a_matrix_for_every_environment():
+    """One copy of such a gradient took half of a training step; folded parameters, made for driving, have it."""
+    model, params = model_and_params("sfkd")
+    data = driven()
+    count, steps = data.controls.shape[:2]
+
+    def miss(given):
+        predicted = jax.vmap(lambda one: rollout(model, given, one)[0])(data)
+        return jnp.sum((predicted - data.states[:, 1:]) ** 2)
+
+    program = [str(jax.make_jaxpr(jax.grad(miss))(given)) for given in (params, jit(model.fold)(params))]
+    raw, folded = (f"f32[{count},{steps},8,8]" in text for text in program)
+    assert folded
+    assert not raw
+
+
 @pytest.mark.parametrize("name", ["sfkd", "r2dn"])
 def test_nothing_is_factorised_in_a_control_step_with_folded_parameters(name, one):
     """A linear algebra library's own threads wait in circles on a busy host: one inverse may cost a sampling period."""
