@@ -71,7 +71,8 @@ def tune(trained, data, asked, place, steps):
         monitor_level=LEVEL,
     )
     manifest = policy.save(place / "policy.npz", params, settings | {"best_step": best}, made_from={})
-    artefacts.write_json(place / "certificate.json", proof | {"weights_sha256": manifest["sha256"]})
+    about = {"weights_sha256": manifest["sha256"], "policy_sha256": policy.policy_hash(manifest)}
+    artefacts.write_json(place / "certificate.json", proof | about)
     errors = {"before": trained.params, "after": params}
     predict = jax.jit(partial(evaluation.open_loop, trained.model, horizon=WINDOWS["length"]))
     found = {name: jnp.hypot(*predict(weights, data.test).T[:2])[-1].item() for name, weights in errors.items()}

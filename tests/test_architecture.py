@@ -34,7 +34,7 @@ ARROWS = {
     "rehearsal": HALLWAY | {"assembly", "certification", "datasets", "shelf", "vehicle"},
     "walk": HALLWAY
     | {"artefacts", "assembly", "certification", "datasets", "evaluation", "policy", "shelf", "training", "vehicle"},
-    "policy": HALLWAY | {"artefacts", "assembly", "models", "control"},
+    "policy": HALLWAY | {"artefacts", "assembly", "certification", "control", "models", "vehicle"},
     "drive": HALLWAY | {"assembly", "certification", "datasets", "evaluation", "scenarios", "shelf", "vehicle"},
     "cells": {"artefacts", "drive", "evaluation", "shelf"},
     "adapters": HALLWAY | {"vehicle", "scenarios", "assembly"},

@@ -15,12 +15,12 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from helpers import ENV_HIGH, ENV_LOW, jit, space, straight
+from helpers import ENV_HIGH, ENV_LOW, dataset, jit, space, straight
 from hydra import compose, initialize_config_dir
 from omegaconf import OmegaConf
 
 import sfkd_jax
-from sfkd_jax import artefacts, assembly, config, export, exporting, policy, shelf
+from sfkd_jax import artefacts, assembly, certification, config, export, exporting, policy, shelf
 from sfkd_jax.types import Controller
 
 HORIZON, STEPS = 5, 6
@@ -55,10 +55,12 @@ def exported(tmp_path_factory):
     kept = asked | {"space": assembly.space_to_settings(space())}
     shelf.claim(asked)
     place = shelf.run_directory(asked)
-    weights = policy.save(place / "policy.npz", params, kept, made_from={"dataset": "d" * 64})["sha256"]
-    certificate = {"valid": True, "weights_sha256": weights, "boxes": BOXES, "monitor": {"bounds": [1.0] * 4}}
-    certificate |= {"alpha": 0.9, "d_bar": {"value": 0.1}, "tube": {"latent": [0.1]}}
-    artefacts.write_json(place / "certificate.json", certificate)
+    policy.save(place / "policy.npz", params, kept, made_from={"dataset": "d" * 64})
+    trained, data = policy.restore(place), dataset()
+    splits = {"validation": data.validation, "calibration": data.calibration, "held_out": {"test": data.test}}
+    options = {"level": 0.9, "monitor_level": 0.9, "attack_starts": 0}
+    certificate = certification.issue(trained.model, trained.params, **splits, boxes=BOXES, **options)
+    artefacts.write_json(place / "certificate.json", certificate | {"policy_sha256": trained.sha256})
     return asked, export.run(asked)
 
 
@@ -180,7 +182,7 @@ def test_the_manifest_says_what_the_programs_take_and_what_they_were_made_from(e
     states = [leaf for leaf in act["outputs"] if leaf["name"].startswith("state.")]
     assert states == act["inputs"][:-3] == manifest["programs"]["init"]["outputs"]
     assert {"name": "state.inner.key", "shape": [2], "dtype": "uint32"} in states
-    assert manifest["weights_sha256"] == policy.weights_hash(shelf.run_directory(asked))
+    assert manifest["weights_sha256"] == policy.restore(shelf.run_directory(asked)).weights_sha256
     assert manifest["certificate_sha256"] == hashlib.sha256((place / "certificate.json").read_bytes()).hexdigest()
     assert (manifest["sampling_period_s"], manifest["horizon"], manifest["iree"]) == (0.1, HORIZON, None)
     plant = assembly.build_vehicle(asked["vehicle"])
@@ -201,7 +203,7 @@ def test_a_refused_certificate_leaves_the_export_without_one(spoiled, capsys):
     asked = settings(spoiled)
     place = shelf.run_directory(asked)
     assert (place / "export" / "certificate.json").exists()
-    artefacts.write_json(place / "certificate.json", {"valid": False, "weights_sha256": policy.weights_hash(place)})
+    artefacts.write_json(place / "certificate.json", {"valid": False, "reason": "alpha is not below 1"})
     printed = export.run(asked)
     assert "refused" in capsys.readouterr().err
     manifest = json.loads(Path(printed["manifest"]).read_text())

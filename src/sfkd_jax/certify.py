@@ -16,14 +16,14 @@ from sfkd_jax.certification import (
 )
 from sfkd_jax.config import door
 
-CERTIFICATE, INCREMENTAL = "certificate.json", "incremental.json"
+INCREMENTAL = "incremental.json"
 """A rate of a continuous flow lies apart: other doors take a certificate for one with tubes and bounds of a monitor."""
 
 
 def document_in(place: Path) -> Path:
     """Where what is proved of a run lies, or will lie."""
     flow = place / INCREMENTAL
-    return flow if flow.exists() else place / CERTIFICATE
+    return flow if flow.exists() else place / policy.CERTIFICATE
 
 
 def renew(settings: dict[str, Any]) -> dict[str, Any]:
@@ -31,29 +31,30 @@ def renew(settings: dict[str, Any]) -> dict[str, Any]:
     began = time.perf_counter()
     place = shelf.run_directory(settings)
     trained = walk.ensure_policy(settings)
-    weights = policy.weights_hash(place)
     flow = claims_a_rate(trained.model, trained.params)
     try:
         document = _rate(settings, trained) if flow else _tubes(settings, trained)
     except CertificationRefused as reason:
         document = {"valid": False, "reason": str(reason)}
     versions = artefacts.versions() | document.get("versions", {})
-    document |= {"weights_sha256": weights, "versions": versions}
+    document |= {"weights_sha256": trained.weights_sha256, "policy_sha256": trained.sha256, "versions": versions}
     document["seconds"] = time.perf_counter() - began
-    kept, other = (INCREMENTAL, CERTIFICATE) if flow else (CERTIFICATE, INCREMENTAL)
+    kept, other = (INCREMENTAL, policy.CERTIFICATE) if flow else (policy.CERTIFICATE, INCREMENTAL)
     (place / other).unlink(missing_ok=True)
     artefacts.write_json(place / kept, document)
     verdict = f"alpha {document['alpha']:.6f}" if document["valid"] else f"refused: {document['reason']}"
+    if "d_bar" in document:
+        verdict += f"; d_bar {document['d_bar']['value']:.4g} holds for {document['d_bar']['holds_for']}"
     shelf.say(f"certificate: {verdict}")
     return document
 
 
-def _rate(settings: dict[str, Any], trained: policy.Policy) -> dict[str, Any]:
+def _rate(settings: dict[str, Any], trained: policy.Trained) -> dict[str, Any]:
     """What is proved of a continuous flow: how fast it contracts, and no tube."""
     return certify_incremental(trained.model, trained.params, dt=settings["vehicle"]["dt"])
 
 
-def _tubes(settings: dict[str, Any], trained: policy.Policy) -> dict[str, Any]:
+def _tubes(settings: dict[str, Any], trained: policy.Trained) -> dict[str, Any]:
     """What is proved of a model's steps, and what is measured on the data of the run."""
     dataset, _ = walk.ensure_dataset(settings)
     options = {name: value for name, value in settings["certification"].items() if name != "renew"}
@@ -67,6 +68,7 @@ def _tubes(settings: dict[str, Any], trained: policy.Policy) -> dict[str, Any]:
         calibration=dataset.calibration,
         held_out=walk.held_out_drives(settings, dataset),
         boxes=boxes,
+        drives=dataset.drives,
         sensor_noise=noise,
         **assembly.without(options),
     )
@@ -74,13 +76,13 @@ def _tubes(settings: dict[str, Any], trained: policy.Policy) -> dict[str, Any]:
 
 def run(settings: dict[str, Any]) -> dict[str, Any]:
     """Certify, unless a certificate about other weights lies there (then `certification.renew=true`)."""
-    walk.ensure_policy(settings)
+    trained = walk.ensure_policy(settings)
     place = shelf.run_directory(settings)
     path = document_in(place)
     if path.exists() and not settings["certification"]["renew"]:
-        about = artefacts.read_json(path, keys=("weights_sha256",))["weights_sha256"]
-        if about != policy.weights_hash(place):
-            raise CertificateStale(f"{path} is about other weights; certification.renew=true replaces it")
+        about = artefacts.read_json(path).get("policy_sha256")
+        if about != trained.sha256:
+            raise CertificateStale(f"{path} is about other weights or settings; certification.renew=true replaces it")
     document = renew(settings)
     if not document["valid"]:
         raise CertificationRefused(document["reason"])

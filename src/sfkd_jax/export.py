@@ -24,7 +24,7 @@ def run(settings: dict[str, Any]) -> dict[str, Any]:
     _, manifest = artefacts.read_arrays(place / "policy.npz", kind=policy.KIND)
     trained = policy.load(place, controller=settings["controller"], env=settings["env"])
     if trained.certificate is None:
-        shelf.say("certificate: refused, missing or about other weights; exported without one, and without a monitor")
+        shelf.say("exported without a certificate and without a monitor")
     folder = place / FOLDER
     write_controller(trained, folder, made_from=manifest["made_from"], **assembly.without(settings["export"]))
     shelf.say(f"exported: {folder}; python {folder / 'run_controller.py'} runs it without sfkd_jax")

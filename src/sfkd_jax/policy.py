@@ -1,8 +1,11 @@
-"""A trained controller as other JAX projects import it: no Hydra, no orbax, no solver, no matplotlib."""
+"""A trained controller as other JAX projects import it: no Hydra, no orbax, no convex solver, no matplotlib."""
 
 from __future__ import annotations
 
+import json
+import warnings
 from collections.abc import Mapping
+from functools import lru_cache
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -11,9 +14,29 @@ import jax.numpy as jnp
 import numpy as np
 
 from sfkd_jax import artefacts, assembly
-from sfkd_jax.types import Controller, Model, Params, Space
+from sfkd_jax.types import Controller, Model, Params
+from sfkd_jax.vehicle import Vehicle
 
 KIND = "policy"
+CERTIFICATE = "certificate.json"
+BOXES = {"state": "body", "control": "control", "env": "env"}
+"""Box of a certificate -> scales of the model of the same size."""
+
+
+class Trained(NamedTuple):
+    """A model with its weights, as they lie in a run directory.
+
+    Attributes:
+        model, params: the learned rollout model. vehicle: that it was trained for. settings: how all of it was made.
+        weights_sha256: of the weights alone. sha256: of them and of every setting; a certificate is about this one.
+    """
+
+    model: Model
+    params: Params
+    vehicle: Vehicle
+    settings: dict[str, Any]
+    weights_sha256: str
+    sha256: str
 
 
 class Policy(NamedTuple):
@@ -21,7 +44,7 @@ class Policy(NamedTuple):
 
     Attributes:
         model, params: the learned rollout model. controller: `Controller(init, act)`, pure; jit, vmap, scan it.
-        certificate: the document in certificate.json, or None if it is missing, refused, or about other weights.
+        certificate: the document in certificate.json, verified, or None if it is missing, refused or stale.
         settings: how all of it was made.
     """
 
@@ -38,66 +61,129 @@ def save(path: Path, params: Params, settings: Mapping[str, Any], *, made_from: 
     return artefacts.write_arrays(path, flat, kind=KIND, config=settings, made_from=made_from)
 
 
-def weights_hash(path: Path) -> str:
-    """The hash that names the weights of the policy in a run directory."""
-    return artefacts.read_arrays(path / "policy.npz", kind=KIND)[1]["sha256"]
+def policy_hash(manifest: Mapping[str, Any]) -> str:
+    """The hash of all that a policy computes with: its weights, and every setting of vehicle, model and controller."""
+    return artefacts.sha256({"weights": manifest["sha256"], "settings": manifest["config"]})
+
+
+def restore(path: str | Path) -> Trained:
+    """The model and weights in a run directory (or a policy.npz with its manifest beside it).
+
+    Raises:
+        ArtefactError: nothing there, truncated, foreign, changed since it was written, saved with settings that this
+            version does not have, or weights that are not finite or do not fit the model.
+    """
+    file = _file(path)
+    arrays, manifest = artefacts.read_arrays(file, kind=KIND)
+    settings = manifest["config"]
+    with artefacts.understood(file.with_suffix(".json"), ValueError, advice=_advice(manifest)):
+        plant, model = _built(json.dumps({name: settings[name] for name in ("vehicle", "space", "model")}))
+    params = _weights(file, arrays, model)
+    return Trained(model, params, plant, settings, manifest["sha256"], policy_hash(manifest))
 
 
 def load(path: str | Path, *, controller: Mapping[str, Any] | None = None, env: str = "measured") -> Policy:
-    """The policy in a run directory (or a policy.npz with its manifest beside it).
+    """The policy in a run directory (or a policy.npz with its manifest beside it), its certificate verified.
+
+    Where nothing is certified, a warning says why; with `controller.monitor.fallback` other than "none", which
+    needs a certificate, that is an error.
 
     Args:
         path: where. controller: settings of a controller to build instead of the one it was saved with.
         env: "estimated" for a controller that infers the environment and does not read the one it is given.
 
     Raises:
-        ArtefactError: nothing there, truncated, foreign, changed since it was written, or saved with settings that
-            this version does not have.
+        ArtefactError: as `restore`; a certificate that does not hold; none where a fallback asks for one.
     """
-    file = Path(path)
-    file = file / "policy.npz" if file.suffix != ".npz" else file
-    arrays, manifest = artefacts.read_arrays(file, kind=KIND)
-    settings = manifest["config"] | {"env": env} | ({} if controller is None else {"controller": dict(controller)})
-    manifest_file, blamed = file.with_suffix(".json"), () if controller else (ValueError,)
-    saved = f"saved by sfkd_jax {manifest.get('versions', {}).get('sfkd_jax', 'unknown')}: train again"
-    with artefacts.understood(manifest_file, ValueError, advice=saved):
-        plant = assembly.build_vehicle(settings["vehicle"])
-        space = assembly.space_from_settings(settings["space"])
-        model, box = assembly.build_model(settings["model"], space, plant), settings["dataset"]
-        limits = {"env_low": box["env_low"], "env_high": box["env_high"], "env": env}
-    certificate = _certificate(file.with_name("certificate.json"), manifest["sha256"], space)
-    with artefacts.understood(manifest_file, *blamed, advice=saved):
-        planner = assembly.build_controller(settings["controller"], model, plant, certificate=certificate, **limits)
-    params = jax.tree.map(jnp.asarray, artefacts.unflatten(arrays))
-    return Policy(model, params, planner, certificate, settings)
+    trained = restore(path)
+    file = _file(path)
+    certificate, reason = read_certificate(path, trained)
+    settings: dict[str, Any] = trained.settings | {"env": env}
+    blamed: tuple[type[Exception], ...] = (ValueError,)
+    if controller is not None:
+        settings, blamed = settings | {"controller": dict(controller)}, ()
+    with artefacts.understood(file.with_suffix(".json"), *blamed, advice="train again with this version"):
+        asked, box = settings["controller"], settings["dataset"]
+        fallback = asked.get("monitor", {}).get("fallback", "none")
+        limits = {"env_low": box["env_low"], "env_high": box["env_high"], "env": env, "certificate": certificate}
+        planner = assembly.build_controller(asked, trained.model, trained.vehicle, **limits)
+    if certificate is None and fallback != "none":
+        raise artefacts.ArtefactError(f"{file}: controller.monitor.fallback={fallback} needs a certificate; {reason}")
+    if certificate is None:
+        warnings.warn(f"{file}: nothing is certified and nothing is monitored; {reason}", stacklevel=2)
+    return Policy(trained.model, trained.params, planner, certificate, settings)
 
 
-def _certificate(path: Path, weights: str, space: Space) -> dict[str, Any] | None:
-    """The certificate beside a policy, if it is valid and about these weights.
+def read_certificate(path: str | Path, trained: Trained) -> tuple[dict[str, Any] | None, str]:
+    """The verified certificate beside a policy, or None and the reason why there is none.
 
     Raises:
-        ArtefactError: it holds no boxes and bounds that a monitor could use.
+        ArtefactError: it is damaged, or does not follow from its witnesses.
     """
-    if not path.exists():
-        return None
-    document = artefacts.read_json(path, keys=("valid", "weights_sha256"))
-    if not document["valid"] or document["weights_sha256"] != weights:
-        return None
-    sizes = {"state": space.body_mean.size, "control": space.control_mean.size, "env": space.env_mean.size}
-    with artefacts.understood(path):
-        corners = {name: _numbers(document["boxes"][name], (2, size)) for name, size in sizes.items()}
-        sound = all(corners.values()) and _numbers(document["monitor"]["bounds"], (4,))
-        sound = sound and _numbers(document["tube"]["latent"], None) and _numbers(document["d_bar"]["value"], ())
-    if not sound or not _numbers(document.get("alpha"), ()):
-        raise artefacts.ArtefactError(f"{path}: malformed, its boxes, bounds or tube are no numbers for this model")
-    return document
+    from sfkd_jax import certification  # what it needs is loaded only where something is to be verified
 
-
-def _numbers(values: Any, shape: tuple[int, ...] | None) -> bool:
-    """Whether a part of a document is finite numbers, of one shape."""
+    file = _file(path).with_name(CERTIFICATE)
+    if not file.exists():
+        return None, f"{CERTIFICATE} is missing"
+    document = artefacts.read_json(file, keys=("valid",))
+    if document["valid"] is not True:
+        return None, f"the certificate was refused: {document.get('reason')}"
     try:
-        array = np.asarray(values)
-    except ValueError:  # lists of different lengths
-        return False
-    numbers = array.dtype.kind in "if" and bool(np.isfinite(array).all())
-    return numbers and (shape is None or array.shape == shape)
+        with artefacts.understood(file):
+            bound = {"model": trained.model, "policy_sha256": trained.sha256}
+            certification.verify_document(document, trained.params, **bound)
+    except certification.CertificateStale as reason:
+        return None, f"{reason}; certify again"
+    except certification.CertificationRefused as reason:
+        raise artefacts.ArtefactError(f"{file}: {reason}") from None
+    sizes = {name: len(trained.settings["space"][f"{part}_mean"]) for name, part in BOXES.items()}
+    if wrong := [name for name, size in sizes.items() if len(document["boxes"][name][0]) != size]:
+        raise artefacts.ArtefactError(f"{file}: boxes.{wrong[0]} is of another size than the model")
+    return document, ""
+
+
+@lru_cache(maxsize=8)
+def _built(settings: str) -> tuple[Vehicle, Model]:
+    """The vehicle and the model of settings as JSON; the same objects again, so that nothing is compiled twice."""
+    asked = json.loads(settings)
+    plant = assembly.build_vehicle(asked["vehicle"])
+    return plant, assembly.build_model(asked["model"], assembly.space_from_settings(asked["space"]), plant)
+
+
+def _file(path: str | Path) -> Path:
+    """policy.npz of a run directory, or the file itself."""
+    return Path(path) if Path(path).suffix == ".npz" else Path(path) / "policy.npz"
+
+
+def _advice(manifest: Mapping[str, Any]) -> str:
+    versions = manifest.get("versions")
+    version = versions.get("sfkd_jax", "unknown") if isinstance(versions, Mapping) else "unknown"
+    return f"saved by sfkd_jax {version}: train again"
+
+
+def _weights(file: Path, arrays: Mapping[str, np.ndarray], model: Model) -> Params:
+    """Arrays as the parameters of a model.
+
+    Raises:
+        ArtefactError: a name, shape or kind that the model does not have, or a number that is not finite.
+    """
+    with artefacts.understood(file, ValueError):
+        params = artefacts.unflatten(arrays)
+    expected = _listed(jax.eval_shape(model.init, jax.random.key(0)))
+    found = _listed(params)
+    if wrong := sorted(expected.keys() ^ found.keys()):
+        verb = "lacks" if wrong[0] in expected else "holds"
+        raise artefacts.ArtefactError(f"{file}: {verb} weights {wrong[0]}, which does not fit the model")
+    for name, leaf in found.items():
+        if (leaf.shape, leaf.dtype) != (expected[name].shape, expected[name].dtype):
+            wanted = f"{expected[name].dtype}{list(expected[name].shape)}"
+            raise artefacts.ArtefactError(f"{file}: weights {name} are {leaf.dtype}{list(leaf.shape)}, not {wanted}")
+        if not np.all(np.isfinite(leaf)):
+            raise artefacts.ArtefactError(f"{file}: weights {name} are not finite")
+    return jax.tree.map(jnp.asarray, params)
+
+
+def _listed(tree: Any) -> dict[str, Any]:
+    """Leaves by their path."""
+    leaves = jax.tree_util.tree_flatten_with_path(tree)[0]
+    return {"/".join(str(getattr(key, "key", key)) for key in path): leaf for path, leaf in leaves}

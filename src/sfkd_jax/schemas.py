@@ -100,7 +100,7 @@ def register() -> None:
     protocol |= {"timed_steps": 50, "side_forces": (), "threshold_m": _THRESHOLD, "variation": None}
     protocol |= {"told": schema("ToldConfig", evaluation.told, skip=("dt",))}
     store.store(group="evaluation", name="schema", node=schema("EvaluationConfig", **protocol))
-    measured = ("validation", "calibration", "held_out", "boxes", "sensor_noise")
+    measured = ("validation", "calibration", "held_out", "boxes", "drives", "sensor_noise")
     node = schema("CertificationConfig", issue, skip=measured, renew=False)
     store.store(group="certification", name="schema", node=node)
     words = {

@@ -62,6 +62,8 @@ def write_dataset(settings: dict[str, Any], dataset: Dataset) -> dict[str, Any]:
     arrays = {
         f"{part}/{name}": np.asarray(leaf) for part in PARTS for name, leaf in getattr(dataset, part)._asdict().items()
     }
+    if dataset.drives is not None:
+        arrays["drives"] = np.asarray([dataset.drives[part] for part in PARTS])
     path = dataset_path(settings)
     path.parent.mkdir(parents=True, exist_ok=True)
     return artefacts.write_arrays(path, arrays, kind=DATASET, config=dataset_config(settings))
@@ -75,7 +77,9 @@ def read_dataset(settings: dict[str, Any]) -> tuple[Dataset, str]:
     asked = settings["dataset"]
     envs = np.concatenate([np.asarray(part.envs) for part in parts])
     low, high = environment_box(envs, asked["env_low"], asked["env_high"])
-    return Dataset(*parts, env_low=low, env_high=high), manifest["sha256"]
+    counts = arrays.get("drives")
+    drives = None if counts is None else {part: int(count) for part, count in zip(PARTS, counts, strict=True)}
+    return Dataset(*parts, env_low=low, env_high=high, drives=drives), manifest["sha256"]
 
 
 def claim(settings: dict[str, Any]) -> None:

@@ -114,7 +114,7 @@ def _switching(asked: str) -> Trajectory:
     return drive(jax.random.fold_in(jax.random.key(data["seed"]), SWITCHING))
 
 
-def ensure_policy(settings: dict[str, Any]) -> policy.Policy:
+def ensure_policy(settings: dict[str, Any]) -> policy.Trained:
     """The policy of this run: from the shelf, or trained now, continuing what was begun.
 
     Raises:
@@ -127,7 +127,7 @@ def ensure_policy(settings: dict[str, Any]) -> policy.Policy:
     shelf.claim(settings)
     if not trained:
         _train(settings)
-    return policy.load(place)
+    return policy.restore(place)
 
 
 def systems(settings: dict[str, Any], plant: Vehicle) -> dict[str, assembly.System]:
@@ -142,10 +142,19 @@ def systems(settings: dict[str, Any], plant: Vehicle) -> dict[str, assembly.Syst
 
 
 def own_system(settings: dict[str, Any]) -> assembly.System:
-    """The policy of this run as a row of a table."""
-    trained = ensure_policy(settings)
+    """The policy of this run as a row of a table, with its certificate if there is one.
+
+    Raises:
+        ValueError: there is none, and the monitor's fallback asks for one.
+    """
+    trained, fallback = ensure_policy(settings), settings["controller"].get("monitor", {}).get("fallback", "none")
+    certificate, reason = policy.read_certificate(shelf.run_directory(settings), trained)
+    if certificate is None:
+        shelf.say(f"nothing is certified and nothing is monitored: {reason}")
+        if fallback != "none":
+            raise ValueError(f"controller.monitor.fallback={fallback} needs a certificate; {reason}")
     told = settings["env"] if trained.settings["model"]["environment"] else "none"
-    return assembly.System(trained.model, trained.params, told, trained.certificate)
+    return assembly.System(trained.model, trained.params, told, certificate)
 
 
 def _train(settings: dict[str, Any]) -> None:

@@ -1,11 +1,21 @@
 """What is measured: intervals of proportions, conformal bounds, disturbances."""
 
+from functools import partial
+
 import jax
 import numpy as np
 import pytest
 from helpers import driven, model_and_params
 
-from sfkd_jax.certification import clopper_pearson, conformal_bounds, coverage, disturbances
+from sfkd_jax.certification import (
+    clopper_pearson,
+    conformal_bounds,
+    coverage,
+    disturbances,
+    even_units,
+    interval,
+    tube_units,
+)
 from sfkd_jax.certification._calibration import Disturbance
 
 
@@ -58,8 +68,9 @@ def test_conformal_bounds_cover_a_new_trajectory_as_often_as_they_say(level, cou
     """Split conformal, exactly: P(covered) = ⌈(n+1) level⌉/(n+1), here level to 1/(n+1), for all four kinds at once."""
     random, shares = np.random.default_rng(0), []
     for _ in range(250):
-        bounds = conformal_bounds(scores(random, 50), scores(random, count), level=level)
-        shares.append(coverage(bounds, scores(random, 100))[0])
+        units = (even_units, partial(tube_units, level=level))[len(shares) % 2](scores(random, 50))
+        bounds = conformal_bounds(units, scores(random, count), level=level)
+        shares.append(coverage(bounds, scores(random, 100)))
     exact = np.ceil((count + 1) * level) / (count + 1)
     assert abs(np.mean(shares) - exact) < 4 * np.std(shares) / np.sqrt(250)
     assert level - 1e-12 <= exact <= level + 1 / (count + 1)
@@ -68,7 +79,7 @@ def test_conformal_bounds_cover_a_new_trajectory_as_often_as_they_say(level, cou
 def test_conformal_bounds_are_a_calibration_score_in_the_units_of_the_reference():
     random = np.random.default_rng(1)
     reference, calibration = scores(random, 50), scores(random, 40)
-    bounds = conformal_bounds(reference, calibration, level=0.9)
+    bounds = conformal_bounds(even_units(reference), calibration, level=0.9)
     units = np.quantile(reference.scores, 0.95, axis=0)
     np.testing.assert_allclose(bounds / units, np.full(4, bounds[0] / units[0]))
     inside = np.sum(np.all(calibration.scores <= bounds * (1 + 1e-12), axis=1))
@@ -79,14 +90,15 @@ def test_bounds_do_not_depend_on_the_units_of_a_kind():
     random = np.random.default_rng(2)
     reference, calibration = scores(random, 50), scores(random, 40)
     scale = np.asarray([1e3, 1e-3, 1.0, 5.0])
-    bounds = conformal_bounds(reference, calibration, level=0.9)
-    scaled = conformal_bounds(Disturbance(scale * reference.scores), Disturbance(scale * calibration.scores), level=0.9)
+    bounds = conformal_bounds(even_units(reference), calibration, level=0.9)
+    moved = Disturbance(scale * reference.scores), Disturbance(scale * calibration.scores)
+    scaled = conformal_bounds(even_units(moved[0]), moved[1], level=0.9)
     np.testing.assert_allclose(scaled, scale * bounds)
 
 
 def test_a_kind_that_never_errs_needs_no_unit():
     silent = Disturbance(scores(np.random.default_rng(3), 40).scores * np.asarray([1.0, 0.0, 1.0, 1.0]))
-    bounds = conformal_bounds(silent, silent, level=0.9)
+    bounds = conformal_bounds(even_units(silent), silent, level=0.9)
     assert np.all(np.isfinite(bounds))
 
 
@@ -94,9 +106,36 @@ def test_a_kind_that_never_errs_needs_no_unit():
 def test_too_few_trajectories_for_the_level_are_refused(count, level):
     random = np.random.default_rng(0)
     with pytest.raises(ValueError, match=f"{count} calibration trajectories are too few for level {level}"):
-        conformal_bounds(scores(random, 50), scores(random, count), level=level)
-    bounds = conformal_bounds(scores(random, 50), scores(random, count + 1), level=level)
+        conformal_bounds(even_units(scores(random, 50)), scores(random, count), level=level)
+    bounds = conformal_bounds(even_units(scores(random, 50)), scores(random, count + 1), level=level)
     assert np.all(np.isfinite(bounds))
+
+
+def test_in_the_units_of_a_tube_the_latent_kind_decides():
+    """The other kinds hardly ever do, and the bound is hardly above the one of the latent kind alone."""
+    random, ratios = np.random.default_rng(4), []
+    for _ in range(40):
+        reference, calibration = scores(random, 200), scores(random, 199)
+        alone = np.sort(calibration.scores[:, 0])[int(np.ceil(200 * 0.95)) - 1]
+        even = conformal_bounds(even_units(reference), calibration, level=0.95)
+        ours = conformal_bounds(tube_units(reference, level=0.95), calibration, level=0.95)
+        ratios.append((even[0] / alone, ours[0] / alone))
+    inflated, tight = np.mean(ratios, axis=0)
+    assert 1.0 <= tight < 1.25 < 1.6 < inflated
+
+
+@pytest.mark.parametrize("level", [0.0, 1.0, -0.5, 1.5, np.nan])
+def test_a_level_that_is_none_is_refused(level):
+    with pytest.raises(ValueError, match="level must lie between 0 and 1"):
+        conformal_bounds(np.ones(4), scores(np.random.default_rng(0), 50), level=level)
+
+
+def test_segments_of_few_drives_give_the_interval_of_few_trials():
+    assert interval(0.9, 60) == list(clopper_pearson(54, 60))
+    assert interval(0.9, 2) == [clopper_pearson(1, 2)[0], clopper_pearson(2, 2)[1]]
+    assert interval(1.0, 1) == list(clopper_pearson(1, 1))
+    narrow, wide = interval(0.95, 600), interval(0.95, 4)
+    assert wide[0] < narrow[0] < 0.95 < narrow[1] < wide[1]
 
 
 def spoiled(value, row=3, kind=0):
@@ -108,19 +147,17 @@ def spoiled(value, row=3, kind=0):
 @pytest.mark.parametrize("value", [np.nan, np.inf])
 def test_calibration_scores_that_are_not_finite_are_refused(value):
     with pytest.raises(ValueError, match="not finite"):
-        conformal_bounds(spoiled(1.0), spoiled(value), level=0.9)
+        conformal_bounds(np.ones(4), spoiled(value), level=0.9)
 
 
 def test_reference_scores_that_are_not_numbers_are_refused():
     with pytest.raises(ValueError, match="not finite"):
-        conformal_bounds(spoiled(np.nan), spoiled(1.0), level=0.9)
+        even_units(spoiled(np.nan))
 
 
 def test_coverage_counts_trajectories_inside_all_bounds():
     held_out = Disturbance(np.asarray([[1.0, 1, 1, 1], [2, 1, 1, 1], [1, 1, 1, 1.0001], [0, 0, 0, 0]]))
-    share, interval = coverage(np.ones(4), held_out)
-    assert share == 0.5
-    assert interval == clopper_pearson(2, 4)
+    assert coverage(np.ones(4), held_out) == 0.5
 
 
 def test_the_true_plant_has_no_disturbance():

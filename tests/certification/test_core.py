@@ -1,9 +1,12 @@
 """The trusted core: it may refuse what is true, and never accepts what is false."""
 
+from fractions import Fraction
+
 import numpy as np
 import pytest
+from exact import exact_witness, forged_witness, is_definite, search
 
-from sfkd_jax.certification import check_witness, is_positive_definite, norm_upper
+from sfkd_jax.certification import _core, check_metric, check_witness, is_positive_definite, norm_upper
 
 
 def rotation(size, seed=0):
@@ -188,3 +191,171 @@ def test_layers_of_different_widths_fit_together():
     multipliers = [np.full(5, (norms[2] * norms[1]) ** 2), np.full(7, norms[2] ** 2)]
     assert check_witness(weights, multipliers, np.prod(norms) * (1 + 1e-9))
     assert not check_witness(weights, multipliers, 0.99 * np.linalg.norm(weights[2] @ weights[1] @ weights[0], 2))
+
+
+# --- nothing that LAPACK, the processor or an enemy does is believed --------------------------------------------------
+
+
+def test_a_witness_whose_factorisation_meets_a_pivot_that_is_no_number_proves_nothing():
+    weights, multipliers, bound = forged_witness()
+    assert np.linalg.norm(weights[1] @ weights[0], 2) == pytest.approx(52.0)
+    assert not check_witness(weights, multipliers, bound)
+
+
+def test_thousands_of_hostile_matrices_and_witnesses_against_exact_arithmetic():
+    """`benchmarks/trusted_core.py` is the same search with more cases."""
+    counts = search(4000, seed=0)
+    assert counts["accepted"] > 0.8 * counts["true"] > 0
+
+
+INDEFINITE = {
+    "clearly": with_eigenvalues([-0.5, 0.7, 1.0]),
+    "barely": with_eigenvalues([-1e-9, 0.7, 1.0]),
+    "graded": np.asarray([[1e-12, 2e-6], [2e-6, 1.0]]),
+    "huge": 1e300 * with_eigenvalues([-0.1, 1.0]),
+    "tiny": 1e-300 * with_eigenvalues([-0.1, 1.0]),
+}
+LIES = {
+    "nothing": lambda matrix: np.zeros_like(matrix),
+    "no number": lambda matrix: np.full_like(matrix, np.nan),
+    "one pivot that is no number": lambda matrix: np.diag([*np.sqrt(np.abs(np.diag(matrix)))[:-1], np.nan]),
+    "infinity": lambda matrix: np.tril(np.full_like(matrix, np.inf)),
+    "overflow": lambda matrix: np.tril(np.full_like(matrix, 1e200)),
+    "the root of the diagonal": lambda matrix: np.diag(np.sqrt(np.abs(np.diag(matrix)))),
+    "the root of the positive part": lambda matrix: positive_root(matrix),
+    "a random factor": lambda matrix: np.tril(np.random.default_rng(0).standard_normal(matrix.shape)),
+    "the matrix itself": lambda matrix: matrix,
+}
+
+
+def positive_root(matrix):
+    values, vectors = np.linalg.eigh(matrix)
+    return vectors * np.sqrt(np.maximum(values, 0.0))
+
+
+@pytest.mark.parametrize("lie", LIES)
+@pytest.mark.parametrize("matrix", INDEFINITE)
+def test_whatever_a_factorisation_returns_an_indefinite_matrix_is_refused(matrix, lie, monkeypatch):
+    monkeypatch.setattr(np.linalg, "cholesky", LIES[lie])
+    assert not is_positive_definite(INDEFINITE[matrix])
+
+
+def test_a_factor_that_is_a_little_wrong_proves_nothing(monkeypatch):
+    """By more than the shift allows, which is about 1e-14 of the trace."""
+    matrix, true = with_eigenvalues([0.3, 0.7, 1.0]), np.linalg.cholesky
+    for wrong, accepted in ((1e-16, True), (1e-12, False), (1e-6, False)):
+        monkeypatch.setattr(np.linalg, "cholesky", lambda shifted, wrong=wrong: true(shifted) * (1 + wrong))
+        assert is_positive_definite(matrix) == accepted
+
+
+def test_nothing_is_proved_on_a_processor_that_flushes_denormal_numbers(monkeypatch):
+    assert is_positive_definite(np.eye(2))
+    monkeypatch.setattr(_core, "SMALLEST", 0.0)
+    assert not is_positive_definite(np.eye(2))
+
+
+def test_an_error_below_zero_or_an_empty_matrix_is_refused():
+    assert not is_positive_definite(np.eye(2), error=-1e-300)
+    assert not is_positive_definite(np.zeros((0, 0)))
+
+
+def exactly(matrix):
+    return [[Fraction(float(entry)) for entry in row] for row in matrix]
+
+
+def squared_distance(exact, rounded):
+    """||X − Y||_F² of a matrix of fractions and one of floats, exactly."""
+    return sum(
+        (a - b) ** 2
+        for row, other in zip(exact, exactly(rounded), strict=True)
+        for a, b in zip(row, other, strict=True)
+    )
+
+
+def exact_product(left, right):
+    return [
+        [sum(a * b for a, b in zip(row, column, strict=True)) for column in zip(*right, strict=True)] for row in left
+    ]
+
+
+SCALES = [1.0, 1e-90, 1e-160, 1e90]
+
+
+@pytest.mark.parametrize("scale", SCALES)
+@pytest.mark.parametrize("shape", [(1, 1, 1), (3, 1, 3), (3, 7, 2), (2, 40, 2)])
+def test_the_error_of_a_product_is_at_most_what_is_said_of_it(scale, shape):
+    random = np.random.default_rng(0)
+    rows, inner, columns = shape
+    for _ in range(20):
+        left, right = scale * random.standard_normal((rows, inner)), random.standard_normal((inner, columns)) / 3
+        rounded, error = _core.product(left, right)
+        assert squared_distance(exact_product(exactly(left), exactly(right)), rounded) <= Fraction(error) ** 2
+        assert error <= 1e-12 * np.linalg.norm(np.abs(left) @ np.abs(right) / scale) * scale + 1e-300
+
+
+@pytest.mark.parametrize("scale", SCALES)
+def test_the_size_of_a_matrix_is_not_lost_to_underflow(scale):
+    matrix = scale * np.asarray([[3.0, 0.0], [0.0, 4.0]])
+    assert _core.frobenius(matrix) == pytest.approx(5.0 * scale, rel=1e-15)
+    assert _core.frobenius(np.zeros((2, 2))) == 0.0
+    assert not np.isfinite(_core.frobenius(np.asarray([[np.nan, 1.0]])))
+
+
+@pytest.mark.parametrize("metric", [None, "given"])
+@pytest.mark.parametrize("kind", ["network", "linear", "both", "one layer"])
+def test_the_error_of_a_witness_matrix_is_at_most_what_is_said_of_it(kind, metric):
+    random = np.random.default_rng(0)
+    for case in range(25):
+        grading = 10.0 ** random.integers(-8, 9, 3) if case % 2 else np.ones(3)
+        weights = [grading[:, None] * random.standard_normal((3, 3)) / 3, random.standard_normal((3, 3)) / 7]
+        weights = {"network": weights, "linear": [], "both": weights, "one layer": weights[:1]}[kind]
+        linear = None if kind == "network" else random.standard_normal((3, 3)) / 3
+        multipliers = [random.uniform(0.1, 3.0, 3) / grading for _ in weights[1:]]
+        norm = None if metric is None else with_eigenvalues([0.1, 0.5, 3.0], case)
+        given = weights, multipliers, float(random.uniform(0.1, 2.0)), linear, norm
+        matrix, error = _core.witness_matrix(*given)
+        assert squared_distance(exact_witness(*given)[0], matrix) <= Fraction(error) ** 2
+        assert error <= 1e-12 * (np.linalg.norm(matrix) + 100)
+
+
+def test_a_metric_that_is_none_proves_nothing():
+    matrix = 0.5 * np.eye(2)
+    assert check_witness((), (), 0.6, matrix, metric=np.diag([1.0, 3.0]))
+    for metric in (
+        np.diag([1.0, 0.0]),
+        np.diag([1.0, -1.0]),
+        np.full((2, 2), np.nan),
+        np.asarray([[1.0, 0.1], [0.2, 1.0]]),
+    ):
+        assert not check_witness((), (), 0.6, matrix, metric=metric)
+
+
+def test_a_rate_in_a_metric_is_not_a_rate_in_the_2_norm():
+    root = np.diag([1.0, 10.0])
+    operator = np.linalg.solve(root, 0.8 * rotation(2) @ root)
+    metric = root.T @ root
+    assert check_witness((), (), 0.8 * (1 + 1e-9), operator, metric=metric)
+    assert not check_witness((), (), 0.8 * (1 - 1e-9), operator, metric=metric)
+    assert not check_witness((), (), 0.8 * (1 + 1e-9), operator)
+
+
+def test_a_metric_of_another_condition_is_refused():
+    metric = np.diag([1.0, 4.0])
+    for condition, holds in (
+        (4.0001, True),
+        (3.9999, False),
+        (0.5, False),
+        (np.nan, False),
+        (np.inf, False),
+        (-4.1, False),
+    ):
+        assert check_metric(metric, [0.5 * np.eye(2)], 0.6, condition) == holds
+    for rate, holds in ((0.50001, True), (0.49999, False), (-0.6, False), (np.nan, False)):
+        assert check_metric(metric, [0.5 * np.eye(2)], rate, 5.0) == holds
+
+
+def test_exact_arithmetic_knows_the_edge():
+    assert is_definite([[2.0, 1.0], [1.0, 1.0]])
+    assert not is_definite([[1.0, 1.0], [1.0, 1.0]])
+    assert not is_definite([[0.0, 0.0], [0.0, 1.0]])
+    assert is_definite([[1.0, 1.0], [1.0, 1.0 + 2**-52]])

@@ -208,8 +208,8 @@ def test_the_door_writes_the_rate_apart_from_certificates_of_steps(tmp_path, mon
     assert file.name == "incremental.json"
     assert not (file.parent / "certificate.json").exists()
     assert policy.load(file.parent).certificate is None  # nothing that a monitor could take for its bounds
-    assert document["weights_sha256"] == policy.weights_hash(file.parent)
-    artefacts.write_json(file, document | {"weights_sha256": "others"})
+    assert document["weights_sha256"] == policy.restore(file.parent).weights_sha256
+    artefacts.write_json(file, document | {"policy_sha256": "others"})
     with pytest.raises(CertificateStale, match="other weights"):
         certify.run(settings)
     assert certify.renew(settings)["alpha"] == document["alpha"]

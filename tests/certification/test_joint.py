@@ -198,18 +198,18 @@ def check_with(matrix_of, weights, multipliers, bound, linear):
 
 def without_coupling(weights, multipliers, linear):
     """Forgets that A z and W_L h add up: −A'A and −W_L'W_L without −A'W_L."""
-    matrix, _ = witness_matrix(weights, multipliers, None)
+    matrix, _ = witness_matrix(weights, multipliers, 0.0)
     matrix[: linear.shape[1], : linear.shape[1]] -= linear.T @ linear
     return matrix
 
 
 def without_linear(weights, multipliers, linear):
-    return witness_matrix(weights, multipliers, None)[0]
+    return witness_matrix(weights, multipliers, 0.0)[0]
 
 
 def wrong_vertex(weights, multipliers, linear):
     """Certifies the mean of the hull and calls it the hull."""
-    return witness_matrix(weights, multipliers, 0.5 * linear)[0]
+    return witness_matrix(weights, multipliers, 0.0, 0.5 * linear)[0]
 
 
 MUTANTS = {"without coupling": without_coupling, "without A": without_linear, "half of A": wrong_vertex}

@@ -13,6 +13,7 @@ from sfkd_jax.evaluation import (
     Claims,
     Predictions,
     predictions,
+    theorem_reach,
     theorem_violations,
     threshold_violations,
     tube_violations,
@@ -203,6 +204,14 @@ def test_the_latent_errors_of_the_true_plant_are_nothing_and_those_of_its_segmen
     np.testing.assert_allclose(wrong.latent_errors, wrong.errors[..., 2], atol=1e-6)  # the latent is the body state
 
 
+def test_the_reach_is_the_largest_error_in_units_of_its_bound_where_the_hypothesis_holds():
+    errors = np.asarray([[[0.1, 0.9, 9.0], [0.2, 0.3, 0.4]]])
+    defects = np.asarray([[[0.1, 0.1, 0.5], [0.1, 0.1, 0.1]]])
+    assert theorem_reach(errors, defects, np.asarray([0.2, 0.3, 0.4]), 0.2) == pytest.approx([1.0, 3.0, 1.0])
+    assert theorem_reach(errors, defects, np.asarray([0.1, 0.15, 0.2]), 0.2) == pytest.approx([2.0, 6.0, 2.0])
+    assert theorem_reach(errors, defects, np.asarray([0.2, 0.3, 0.4]), 0.05) == [None, None, None]
+
+
 # --- the record ------------------------------------------------------------------------------------------------------
 
 
@@ -212,7 +221,8 @@ def test_the_record_names_the_tube_it_speaks_of_and_is_null_where_nothing_is_cla
     found = Predictions(errors, np.full((4, 1, 4), 0.3), np.full((4, 1, 4), 0.1))
     everything = Claims(tube(2.0), tube(1.0), 0.95, np.asarray([0.2, 0.4, 0.4, 0.4]), 0.1, 1.4)
     assert violations(found, everything) == {
-        "v0": 0.25, "v1": 0.0, "v1_tube": "certified", "v1_radius_m": 2.0, "v1_conformal": 0.25,
+        "v0": 0.25, "v0_reach": pytest.approx([1.5, 0.75, 0.75, 0.75]),
+        "v1": 0.0, "v1_tube": "certified", "v1_radius_m": 2.0, "v1_conformal": 0.25,
         "v1_conformal_radius_m": 1.0, "v1_level": 0.95, "v2": 0.25, "v2_threshold_m": 1.4, "segments": 4,
         "window_error_m": {"median": 0.0, "p95": pytest.approx(0.85 * 1.5)},
     }  # fmt: skip

@@ -1,5 +1,6 @@
 """The notary: what is claimed for all states, controls and environments, and what is only measured."""
 
+from sfkd_jax.certification._attack import attack_decoder as attack_decoder
 from sfkd_jax.certification._attack import attack_slopes as attack_slopes
 from sfkd_jax.certification._attack import attack_step as attack_step
 from sfkd_jax.certification._attack import attack_transport as attack_transport
@@ -8,6 +9,9 @@ from sfkd_jax.certification._calibration import clopper_pearson as clopper_pears
 from sfkd_jax.certification._calibration import conformal_bounds as conformal_bounds
 from sfkd_jax.certification._calibration import coverage as coverage
 from sfkd_jax.certification._calibration import disturbances as disturbances
+from sfkd_jax.certification._calibration import even_units as even_units
+from sfkd_jax.certification._calibration import interval as interval
+from sfkd_jax.certification._calibration import tube_units as tube_units
 from sfkd_jax.certification._certificate import MODES as MODES
 from sfkd_jax.certification._certificate import Certificate as Certificate
 from sfkd_jax.certification._certificate import CertificateContradicted as CertificateContradicted
@@ -19,6 +23,7 @@ from sfkd_jax.certification._core import check_metric as check_metric
 from sfkd_jax.certification._core import check_witness as check_witness
 from sfkd_jax.certification._core import is_positive_definite as is_positive_definite
 from sfkd_jax.certification._core import norm_upper as norm_upper
+from sfkd_jax.certification._document import verify_document as verify_document
 from sfkd_jax.certification._environments import cover as cover
 from sfkd_jax.certification._exported import CertificationRefused as CertificationRefused
 from sfkd_jax.certification._incremental import attack_growth as attack_growth

@@ -13,7 +13,7 @@ from scipy.optimize import minimize
 
 from sfkd_jax.certification._core import Matrix, Vector
 from sfkd_jax.certification._environments import Box
-from sfkd_jax.types import Key, Model, Params
+from sfkd_jax.types import POSE, Key, Model, Params
 
 
 def attack_slopes(weights: Sequence[Matrix], linear: Matrix | None = None, *, starts: int = 24, seed: int = 0) -> float:
@@ -54,35 +54,68 @@ def attack_step(model: Model, params: Params, box: Box, key: Key, *, starts: int
         model: with `explicit`. params: its weights. box: lower and upper corner of E. key: for the beginnings.
         starts: how many. iterations: of L-BFGS-B, each.
     """
-    inject, rank, controls = _coordinates(model, params, len(box[0]))
+    inject, *_ = _coordinates(model, params, len(box[0]))
+
+    def step(params: Params, z: Any, control: Any, env: Any, later: Any) -> Any:
+        fiber, fiber_next = model.fiber(params, env), model.fiber(params, later)
+        return model.vector(model.transport(fiber, fiber_next, model.step(fiber, inject(z), control)))
+
+    found = _steepest(step, model, params, box, key, starts=starts, iterations=iterations)
+    return max(float(np.linalg.norm(jacobian, 2)) for jacobian in found)
+
+
+def attack_decoder(
+    model: Model, params: Params, box: Box, key: Key, *, starts: int = 12, iterations: int = 60
+) -> dict[str, float]:
+    """Largest ||∂/∂z|| of what the model emits as it runs: "position" [m], "yaw" [rad], "decoder" (both), "body".
+
+    The pose increment is that of a step and, where the pose lies in the latent, that of reading it; see `attack_step`.
+    """
+    inject, *_ = _coordinates(model, params, len(box[0]))
+
+    def emitted(params: Params, z: Any, control: Any, env: Any, later: Any) -> Any:
+        del later
+        fiber, latent = model.fiber(params, env), inject(z)  # at the origin, so that an increment is a pose
+        after, read = model.decode(fiber, model.step(fiber, latent, control)), model.decode(fiber, latent)
+        return jnp.concatenate([after[POSE], read])
+
+    found = _steepest(emitted, model, params, box, key, starts=starts, iterations=iterations)
+    rows = {"position": slice(0, 2), "yaw": slice(2, 3), "decoder": slice(0, 3)}
+    poses = [part for jacobian in found for part in (jacobian[:3], jacobian[3:6])]
+    steepest = {name: max(float(np.linalg.norm(part[row], 2)) for part in poses) for name, row in rows.items()}
+    return steepest | {"body": max(float(np.linalg.norm(jacobian[6:], 2)) for jacobian in found)}
+
+
+def _steepest(
+    function: Callable[..., Any], model: Model, params: Params, box: Box, key: Key, *, starts: int, iterations: int
+) -> list[Matrix]:
+    """Jacobians by z of `function(params, z, u, e, e')`, each where an ascent over all four ended."""
+    _, rank, controls = _coordinates(model, params, len(box[0]))
     low, high = (np.asarray(side, dtype=np.float64) for side in box)
     inputs = rank + controls + 2 * len(low)
     envs = slice(rank + controls, inputs)
 
-    def step(params: Params, z: Any, rest: Any) -> Any:
-        control, now, later = jnp.split(rest, [controls, controls + len(low)])
-        fiber, fiber_next = model.fiber(params, now), model.fiber(params, later)
-        return model.vector(model.transport(fiber, fiber_next, model.step(fiber, inject(z), control)))
+    def at(params: Params, z: Any, rest: Any) -> Any:
+        return function(params, z, *jnp.split(rest, [controls, controls + len(low)]))
 
     def loss(params: Params, point: Any) -> Any:
         z, rest, direction = point[:rank], point[rank:inputs], point[inputs:]
-        _, gain = jax.jvp(lambda z: step(params, z, rest), (z,), (direction,))
+        _, gain = jax.jvp(lambda z: at(params, z, rest), (z,), (direction,))
         return 0.5 * (jnp.log(jnp.sum(direction**2)) - jnp.log(jnp.sum(gain**2) + 1e-30))
 
     objective = jax.jit(jax.value_and_grad(loss, argnums=1))
-    jacobian = jax.jit(lambda params, point: jax.jacfwd(step, argnums=1)(params, point[:rank], point[rank:inputs]))
+    jacobian = jax.jit(lambda params, point: jax.jacfwd(at, argnums=1)(params, point[:rank], point[rank:inputs]))
     limits = [(None, None)] * (inputs + rank)
     limits[envs] = 2 * list(zip(low, high, strict=True))
-    best = 0.0
+    found = []
     for number, start_key in enumerate(jax.random.split(key, starts)):
         start = np.asarray(jax.random.normal(start_key, (inputs + rank,)), dtype=np.float64)
         start[: rank + controls] *= 10.0 ** (number % 4 - 2)  # small latents see steep slopes, large saturated ones
         start[envs] = np.tile(low, 2) + (np.arctan(start[envs]) / np.pi + 0.5) * np.tile(high - low, 2)
         search = {"method": "L-BFGS-B", "jac": True, "bounds": limits, "options": {"maxiter": iterations}}
-        found = minimize(_float64(partial(objective, params)), start, **search)
-        steepest = np.asarray(jacobian(params, jnp.asarray(found.x, jnp.float32)), dtype=np.float64)
-        best = max(best, float(np.linalg.norm(steepest, 2)))
-    return best
+        ended = minimize(_float64(partial(objective, params)), start, **search)
+        found.append(np.asarray(jacobian(params, jnp.asarray(ended.x, jnp.float32)), dtype=np.float64))
+    return found
 
 
 def attack_transport(model: Model, params: Params, box: Box, key: Key, *, samples: int = 256) -> float:

@@ -10,16 +10,19 @@ from typing import Any
 import jax
 import numpy as np
 
-from sfkd_jax.certification._attack import attack_slopes, attack_step, attack_transport
-from sfkd_jax.certification._claims import Claims, Refuted, claims_hold, prove
+from sfkd_jax.certification._attack import attack_decoder, attack_slopes, attack_step, attack_transport
+from sfkd_jax.certification._claims import Claims, Refuted, claims_hold, decoders
 from sfkd_jax.certification._core import Matrix
 from sfkd_jax.certification._environments import Box
 from sfkd_jax.certification._exported import CertificationRefused, Exported, exported, fingerprint, one_thread
+from sfkd_jax.certification._proofs import prove
 from sfkd_jax.types import Model, Params, Polytope
 
 MODES = ("joint", "separate")
 FLOAT32 = 1e-5
 """An attack runs on the model in float32; a bound is contradicted when it is exceeded by more than this, relatively."""
+MALFORMED = (LookupError, TypeError, ValueError, OverflowError, AttributeError, RecursionError)
+"""What Python raises about a document whose parts are of other kinds than they should be."""
 PRECISION = "bounds on the float32 weights as real numbers, checked in float64; float32 rounding of a step counts as d"
 
 
@@ -158,37 +161,69 @@ def verify(certificate: Certificate, params: Params, *, model: Model) -> None:
     try:
         with one_thread():
             claims_hold(claims, weights, certificate.env_box)
+        _require_consistent(certificate, claims, weights)
     except Refuted as reason:
         raise CertificationRefused(str(reason)) from None
-    except (LookupError, TypeError, ValueError, OverflowError) as reason:
+    except MALFORMED as reason:
         raise CertificationRefused(f"the certificate is malformed: {' '.join(str(reason).split())}") from None
+
+
+def _require_consistent(certificate: Certificate, claims: Claims, weights: Exported) -> None:
+    """Refuse a certificate whose parts contradict each other.
+
+    Raises:
+        Refuted: naming the first part.
+    """
     if not claims.alpha < 1.0 or certificate.transport_lipschitz != 1.0:
-        raise CertificationRefused(f"alpha = {claims.alpha} is not below 1, or the transport is not nonexpansive")
+        raise Refuted(f"alpha = {claims.alpha} is not below 1, or the transport is not nonexpansive")
+    if certificate.mode not in MODES or (certificate.mode == "joint") != (claims.alpha_joint is not None):
+        raise Refuted(f"mode {certificate.mode!r} does not fit alpha_joint = {claims.alpha_joint}")
+    if certificate.precision != PRECISION:
+        raise Refuted("precision is not what is covered")
+    limits = _limits(claims, weights)
+    for name, value in certificate.attacks.items():
+        if name not in limits or not 0 <= value <= limits[name] * (1 + FLOAT32):
+            raise Refuted(f"the attack {name} = {value!r} contradicts the bound {limits.get(name)}")
+    step = certificate.attacks.get("step")
+    if certificate.attack != step or certificate.tightness != (claims.alpha / step if step else None):
+        raise Refuted("attack or tightness is not what the attacks found")
 
 
 def _attacks(
     model: Model, params: Params, weights: Exported, claims: Claims, box: Any, starts: int, seed: int
 ) -> dict[str, float]:
     """Lower bounds by name, none of which may exceed what was proved."""
-    found, limits = {}, {}
+    limits, found = _limits(claims, weights), {}
     with one_thread():
-        if weights.residual:
-            found["residual_slopes"] = attack_slopes(weights.residual, seed=seed)
-            limits["residual_slopes"] = claims.beta
-        if claims.kappa == 1.0 and isinstance(weights.operators, Polytope):
+        for name, network in {"residual": weights.residual, **decoders(weights)}.items():
+            if network:
+                found[f"{name}_slopes"] = attack_slopes(network, seed=seed)
+        if "step_slopes" in limits:
             slopes = [attack_slopes(weights.residual, vertex, starts=8) for vertex in weights.operators.vertices]
-            found["step_slopes"], limits["step_slopes"] = max(slopes), claims.alpha
+            found["step_slopes"] = max(slopes)
     if starts:
-        step_key, transport_key = jax.random.split(jax.random.key(seed))
+        step_key, transport_key, decoder_key = jax.random.split(jax.random.key(seed), 3)
         driving = jax.jit(model.fold)(params)
         found["transport"] = attack_transport(model, driving, box, transport_key)
-        limits["transport"] = 1.0
+        emitted = attack_decoder(model, driving, box, decoder_key, starts=starts)
+        found |= {name: value for name, value in emitted.items() if name in limits}
         if claims.kappa == 1.0:
             found["step"] = attack_step(model, driving, box, step_key, starts=starts)
-            limits["step"] = claims.alpha
     for name, value in found.items():
         if not value <= limits[name] * (1 + FLOAT32):
             raise CertificateContradicted(
                 f"INTERNAL ERROR: the attack on the {name} reaches {value:.6f}, above the bound {limits[name]:.6f}"
             )
     return found
+
+
+def _limits(claims: Claims, weights: Exported) -> dict[str, float]:
+    """What an attack may reach at most, by its name; in another metric than I the step is not attacked."""
+    limits = {"residual_slopes": claims.beta, "transport": 1.0, "body": claims.lipschitz["body"]}
+    for name in decoders(weights):
+        limits |= {name: claims.lipschitz[name], f"{name}_slopes": claims.lipschitz[name]}
+    if claims.kappa == 1.0:
+        limits["step"] = claims.alpha
+        if isinstance(weights.operators, Polytope):
+            limits["step_slopes"] = claims.alpha
+    return limits

@@ -12,33 +12,55 @@ Matrix = Float[np.ndarray, "_ _"]
 Vector = Float[np.ndarray, " _"]
 UNIT = np.finfo(np.float64).eps / 2
 TINY = np.finfo(np.float64).tiny
+SMALLEST = np.nextafter(0.0, 1.0)
+"""The smallest denormal number. Some libraries make the processor flush these to zero; nothing is proved then."""
+MARGIN = 1e-6
+"""Relative; far above what norms, sums and differences of fewer than 10^4 rows lose by rounding."""
 
 
+@np.errstate(over="ignore", invalid="ignore")  # NaN and infinity are refused by the comparisons
 def is_positive_definite(matrix: Matrix, error: float = 0.0) -> bool:
     """Whether every symmetric matrix within `error` (2-norm) of `matrix` is positive definite; rounding included.
 
-    A Cholesky factorisation of M − c I that runs to its end proves it, with c above the sum of `error` and of what
-    the factorisation itself can lose, γ_{n+1}/(1 − γ_{n+1}) tr M (Rump, BIT 46, 2006). False when in doubt.
+    For every real L and every c, M = L L' + c I + R, and L L' ≥ 0: M is positive definite if ||R|| + error < c. The
+    Cholesky factor of M − c I is one such L. It is proposed by LAPACK and not believed: R is computed from it and its
+    norm bounded. M is scaled by a power of two to a largest entry in [1/2, 1), so that no intermediate result
+    overflows and what underflows is at most `lost`. False when in doubt: every comparison with NaN is false.
     """
-    n = matrix.shape[0]
-    if not np.all(np.isfinite(matrix)) or not np.isfinite(error) or error < 0:
+    size = len(matrix)
+    if not (np.all(np.isfinite(matrix)) and np.array_equal(matrix, matrix.T) and 0 <= error < np.inf and SMALLEST > 0):
         return False
-    if not np.array_equal(matrix, matrix.T) or np.any(np.diag(matrix) <= 0):
-        return False
-    gamma = (n + 2) * UNIT / (1 - (n + 2) * UNIT)
-    shift = 2 * gamma / (1 - gamma) * float(np.trace(matrix)) + error * (1 + 4 * UNIT) + n * n * TINY
+    exponent = -int(np.frexp(np.max(np.abs(matrix), initial=0.0))[1])
+    scaled, error, identity = np.ldexp(matrix, exponent), float(np.ldexp(error, exponent)), np.eye(size)
+    lost = 4 * size**2 * TINY
+    # Above what a factorisation and the product below can lose, γ_{n+1} tr M each (Rump, BIT 46, 2006).
+    shift = 4 * (size + 2) * UNIT * float(np.trace(scaled)) + error * (1 + 4 * MARGIN) + 4 * lost
     try:
-        np.linalg.cholesky(matrix - shift * np.eye(n))
+        factor = np.linalg.cholesky(scaled - shift * identity)
     except np.linalg.LinAlgError:
         return False
-    return True
+    squared, rounding = product(factor, factor.T)
+    rest = frobenius(scaled - squared - shift * identity) + rounding
+    return bool(rest * (1 + MARGIN) + error + lost < shift * (1 - MARGIN))
+
+
+def frobenius(matrix: Matrix) -> float:
+    """||M||_F, which is at least ||M||_2, without overflow or underflow of the squares."""
+    size = float(np.linalg.norm(matrix))
+    if 1e-140 < size < 1e140:
+        return size
+    largest = float(np.max(np.abs(matrix), initial=0.0))
+    return largest * float(np.linalg.norm(matrix / largest)) if largest > 0 else largest
 
 
 def product(left: Matrix, right: Matrix) -> tuple[Matrix, float]:
-    """A product in float64 and a bound on the 2-norm of its rounding error."""
+    """A product in float64, and a bound on its rounding error (Frobenius norm) for any order of summation.
+
+    |fl(X Y) − X Y| ≤ γ_k |X| |Y| entry by entry for k columns of X, and || |X| |Y| ||_F ≤ ||X||_F ||Y||_F.
+    """
     left, right = np.asarray(left, dtype=np.float64), np.asarray(right, dtype=np.float64)
-    error = (left.shape[1] + 2) * UNIT * float(np.linalg.norm(np.abs(left) @ np.abs(right)))
-    return left @ right, 2 * error + left.size * right.shape[1] * TINY
+    error = (left.shape[1] + 2) * UNIT * frobenius(left) * frobenius(right) * (1 + MARGIN)
+    return left @ right, error + left.size * right.shape[1] * TINY
 
 
 def norm_upper(matrix: Matrix) -> float:
@@ -46,61 +68,76 @@ def norm_upper(matrix: Matrix) -> float:
     matrix = np.asarray(matrix, dtype=np.float64)
     if not np.all(np.isfinite(matrix)):
         return float("inf")
-    gram, error = product(matrix.T, matrix)
-    guess = float(np.linalg.norm(matrix, 2)) + TINY
+    guess = float(np.linalg.norm(matrix, 2))
     for slack in (1e-12, 1e-10, 1e-8, 1e-6, 1e-3, 1.0):
-        bound = guess * (1 + slack)
-        if is_positive_definite(bound**2 * (1 - 4 * UNIT) * np.eye(len(gram)) - 0.5 * (gram + gram.T), error):
+        if check_witness((), (), bound := guess * (1 + slack), matrix):
             return bound
-    return float(np.sum(np.abs(matrix))) * (1 + 1e-9)
+    return float(np.sum(np.abs(matrix))) * (1 + MARGIN)
 
 
+@np.errstate(over="ignore", invalid="ignore")
 def check_witness(
-    weights: Sequence[Matrix], multipliers: Sequence[Vector], bound: float, linear: Matrix | None = None
+    weights: Sequence[Matrix],
+    multipliers: Sequence[Vector],
+    bound: float,
+    linear: Matrix | None = None,
+    metric: Matrix | None = None,
 ) -> bool:
-    """Whether the multipliers prove |f(z) − f(z')| ≤ bound |z − z'| for f = A z + W_L σ(… σ(W_1 z + b_1) …) + b_L.
+    """Whether the multipliers prove |f(z) − f(z')|_P ≤ b |z − z'|_P for f = A z + W_L σ(… σ(W_1 z + b_1) …) + b_L.
 
-    For any biases and any σ applied entry by entry with slopes in [0, 1]: with Λ_k = diag λ_k > 0 it suffices that
+    For any biases and any σ applied entry by entry with slopes in [0, 1]: with Λ_k = diag λ_k > 0 and P > 0 it
+    suffices that
 
-        [ b² I  −W_1'Λ_1           ]
-        [   ·    2Λ_1   −W_2'Λ_2 … ]  −  [A 0 … W_L]' [A 0 … W_L]  >  0    (LipSDP with diagonal multipliers)
+        [ b² P  −W_1'Λ_1           ]
+        [   ·    2Λ_1   −W_2'Λ_2 … ]  −  [A 0 … W_L]' P [A 0 … W_L]  >  0    (LipSDP with diagonal multipliers)
 
     By Schur's complement this is linear in (A, Λ, b²): witnesses at the vertices of a polytope of A prove the largest
-    of their bounds for every A in it. No weights: f = A z. No A: it is 0.
+    of their bounds for every A in it. No weights: f = A z. No A: it is 0. No P: it is I, also where the sizes of
+    z and f differ.
     """
-    if len(multipliers) != max(len(weights) - 1, 0) or not np.isfinite(bound) or bound <= 0:
+    if len(multipliers) != max(len(weights) - 1, 0) or not 0 < bound < np.inf:
         return False
     if any(not np.all(np.asarray(part) > 0) for part in multipliers):
         return False
-    matrix, error = witness_matrix(weights, multipliers, linear)  # NaN or infinity in any part stays in it
-    inputs = len(matrix) - sum(len(part) for part in multipliers)
-    matrix[:inputs, :inputs] += bound**2 * (1 - 4 * UNIT) * np.eye(inputs)
-    return is_positive_definite(matrix, error)
+    if metric is not None and not is_positive_definite(metric):
+        return False
+    return is_positive_definite(*witness_matrix(weights, multipliers, bound, linear, metric))
 
 
 def witness_matrix(
-    weights: Sequence[Matrix], multipliers: Sequence[Vector], linear: Matrix | None = None
+    weights: Sequence[Matrix],
+    multipliers: Sequence[Vector],
+    bound: float,
+    linear: Matrix | None = None,
+    metric: Matrix | None = None,
 ) -> tuple[Matrix, float]:
-    """The matrix above without its b² I, and a bound on its rounding error (2-norm)."""
-    weights = [np.asarray(weight, dtype=np.float64) for weight in weights]
-    first = weights[0] if weights else np.asarray(linear, dtype=np.float64)
+    """The matrix above, and a bound on its rounding error (2-norm)."""
+    first = np.asarray(weights[0] if weights else linear, dtype=np.float64)
+    start = bound**2 * (np.eye(first.shape[1]) if metric is None else np.asarray(metric, dtype=np.float64))
     edges = np.cumsum([0, first.shape[1], *(len(part) for part in multipliers)])
     blocks = [slice(a, b) for a, b in pairwise(edges)]
     matrix, error = np.zeros((edges[-1], edges[-1])), 0.0
+    matrix[blocks[0], blocks[0]] = start
     for k, multiplier in enumerate(multipliers):
-        coupling = np.asarray(multiplier, dtype=np.float64)[:, None] * weights[k]
-        error += 4 * UNIT * float(np.linalg.norm(coupling))
+        multiplier = np.asarray(multiplier, dtype=np.float64)
+        coupling = multiplier[:, None] * np.asarray(weights[k], dtype=np.float64)
         matrix[blocks[k + 1], blocks[k]] = -coupling
         matrix[blocks[k], blocks[k + 1]] = -coupling.T
-        matrix[blocks[k + 1], blocks[k + 1]] = np.diag(2 * np.asarray(multiplier, dtype=np.float64))
+        matrix[blocks[k + 1], blocks[k + 1]] = np.diag(2 * multiplier)
+        error += 4 * UNIT * frobenius(coupling)
     output = np.zeros((len(weights[-1] if weights else first), edges[-1]))
     if weights:
         output[:, blocks[-1]] = weights[-1]
     if linear is not None:
         output[:, blocks[0]] += linear
-    emitted, rounding = product(output.T, output)
-    matrix -= 0.5 * (emitted + emitted.T)
-    return matrix, error + 2 * rounding + 4 * UNIT * float(np.linalg.norm(matrix))
+    weighted, before = (output, 0.0) if metric is None else product(metric, output)
+    squared, rounding = product(output.T, weighted)
+    error += (
+        frobenius(output) * (2 * before + 4 * UNIT * frobenius(weighted)) + 2 * rounding + 4 * UNIT * frobenius(squared)
+    )
+    matrix -= 0.5 * (squared + squared.T)
+    error += 4 * UNIT * (frobenius(start) + frobenius(matrix)) + matrix.size * TINY
+    return matrix, error
 
 
 def check_metric(metric: Matrix, operators: Sequence[Matrix], rate: float, condition: float) -> bool:
@@ -109,11 +146,8 @@ def check_metric(metric: Matrix, operators: Sequence[Matrix], rate: float, condi
     Then |A z|_P ≤ ρ |z|_P, also for every A in the convex hull, and β in the 2-norm is at most β √κ in the P-norm.
     """
     largest, size = norm_upper(metric), len(metric)
+    if not (1 <= condition < np.inf and largest < np.inf):
+        return False
     smallest = largest / condition * (1 + 4 * UNIT)  # P is at least this, or κ is too small
-    proved = [is_positive_definite(metric - smallest * np.eye(size), 2 * UNIT * largest)]
-    for operator in operators:
-        half, first = product(metric, operator)
-        moved, second = product(np.asarray(operator).T, half)
-        error = first * norm_upper(operator) + second + 8 * UNIT * size * (rate**2 + 1) * largest
-        proved.append(is_positive_definite(rate**2 * metric - 0.5 * (moved + moved.T), error))
-    return all(proved) and rate > 0 and bool(1 <= condition < np.inf)
+    proved = is_positive_definite(metric - smallest * np.eye(size), 4 * UNIT * size * largest)
+    return proved and all(check_witness((), (), rate, operator, metric=metric) for operator in operators)

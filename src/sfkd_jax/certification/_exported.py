@@ -16,6 +16,8 @@ from sfkd_jax.types import Incremental, Model, Params, Samples
 ACTIVATIONS = ("tanh", "relu", "sigmoid", "softplus", "elu")
 """Those whose slopes lie in [0, 1] everywhere; gelu and silu leave it."""
 TRANSPORTS = ("identity", "rotation")
+ONCE = {"xla_backend_optimization_level": 0}
+"""Of what is compiled to run once: optimising takes longer than running it."""
 Exported: TypeAlias = Any
 """An `Explicit` (or an `Incremental`) whose leaves are float64 numpy arrays."""
 
@@ -52,7 +54,8 @@ def served(model: Model, params: Params) -> Exported:
     """
     if model.explicit is None:
         raise CertificationRefused("this model exposes no explicit weights to certify")
-    return jax.tree.map(lambda leaf: np.asarray(leaf, dtype=np.float64), jax.jit(model.explicit)(params))
+    evaluate = jax.jit(model.explicit, compiler_options=ONCE)
+    return jax.tree.map(lambda leaf: np.asarray(leaf, dtype=np.float64), evaluate(params))
 
 
 def require_finite(weights: Exported) -> None:

@@ -11,7 +11,7 @@ import numpy as np
 
 from sfkd_jax.certification._certificate import CertificateContradicted
 from sfkd_jax.certification._claims import SERVED
-from sfkd_jax.certification._core import UNIT, Matrix, Vector, is_positive_definite, product
+from sfkd_jax.certification._core import TINY, UNIT, Matrix, Vector, frobenius, is_positive_definite, product
 from sfkd_jax.certification._exported import (
     CertificationRefused,
     Exported,
@@ -121,9 +121,9 @@ def check_incremental(weights: Exported, rate: float) -> bool:
     sensed = (multipliers * balance)[:, None] * weights.inner
     top, coupling = drift + drift.T + 2 * rate * P, forced.T + sensed
     matrix = -np.block([[top, coupling.T], [coupling, -np.diag(2 * multipliers * balance**2)]])
-    rounded = 2 * _size(P, weights.linear) + _size(P, weights.outer * balance) + float(np.linalg.norm(sensed))
-    summed = 8 * UNIT * (float(np.linalg.norm(matrix)) + 2 * rate * float(np.linalg.norm(P)) + rounded)
-    error = (SERVED - 1.0) * rounded + 2 * drift_error + forced_error + summed
+    rounded = 2 * _size(P, weights.linear) + 2 * _size(P, weights.outer * balance) + 2 * frobenius(sensed)
+    summed = 8 * UNIT * (frobenius(matrix) + 2 * rate * frobenius(P) + rounded) + matrix.size * TINY
+    error = (SERVED - 1.0) * rounded + 2 * drift_error + 2 * forced_error + summed
     return is_positive_definite(matrix, error)
 
 
@@ -166,4 +166,4 @@ def _symmetric(matrix: Matrix) -> Matrix:
 
 def _size(left: Matrix, right: Matrix) -> float:
     """How large a product is if nothing cancels."""
-    return float(np.linalg.norm(np.abs(left) @ np.abs(right)))
+    return frobenius(np.abs(left) @ np.abs(right))

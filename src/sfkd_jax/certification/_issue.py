@@ -11,10 +11,20 @@ import jax.numpy as jnp
 import numpy as np
 
 from sfkd_jax.certification._attack import attack_slopes
-from sfkd_jax.certification._calibration import KINDS, Disturbance, conformal_bounds, coverage, disturbances
+from sfkd_jax.certification._calibration import (
+    KINDS,
+    Disturbance,
+    conformal_bounds,
+    coverage,
+    disturbances,
+    even_units,
+    interval,
+    supports,
+    tube_units,
+)
 from sfkd_jax.certification._certificate import certify
-from sfkd_jax.certification._claims import joint_bound, residual_bound
 from sfkd_jax.certification._exported import CertificationRefused, exported, one_thread
+from sfkd_jax.certification._proofs import joint_bound, residual_bound
 from sfkd_jax.certification._tube import latent_tube, physical_tube
 from sfkd_jax.types import Model, Params, Polytope, Trajectory
 
@@ -27,6 +37,7 @@ def issue(
     calibration: Trajectory,
     held_out: Mapping[str, Trajectory],
     boxes: Mapping[str, Any],
+    drives: Mapping[str, int] | None = None,
     sensor_noise: tuple[float, ...] = (),
     mode: str = "joint",
     horizon: int = 20,
@@ -42,6 +53,8 @@ def issue(
         validation: fixes the units of the scores. calibration: sets d̄. Both by trajectory.
         held_out: batches of trajectories by name, to count coverage on; "test" is exchangeable with `calibration`.
         boxes: the domain of s, u and e that the measurements come from; outside it nothing is claimed.
+        drives: how many independent drives the trajectories of "calibration" and "test" were cut from; where it is not
+            said, every trajectory is one. Guarantees are about new drives only if there are enough of them.
         sensor_noise: standard deviation per state, for the bounds of the run-time monitor; entries beyond the state
             are not used.
         mode, margin, attack_starts: of `certify`.
@@ -55,24 +68,30 @@ def issue(
     certificate = certify(model, params, boxes["env"], mode=mode, margin=margin, attack_starts=attack_starts)
     driving = jax.jit(model.fold)(params)
     try:
-        found = _measure(model, driving, validation, calibration, held_out, level)
+        found = _measure(model, driving, validation, calibration, held_out, level, drives or {})
         alarms = _alarms(model, driving, (validation, calibration), sensor_noise, monitor_level)
     except ValueError as reason:
         raise CertificationRefused(str(reason)) from None
     one_step = found["one_step"]
     latent = latent_tube(certificate.alpha, one_step["latent"], horizon)
-    positions = np.asarray(calibration.states)[..., :2]
+    positions = np.asarray(calibration.states, dtype=np.float64)[..., :2]
+    largest = float(np.max(np.linalg.norm(np.diff(positions, axis=-2), axis=-1)))
     tube = physical_tube(
         latent,
         alpha=certificate.alpha,
         lipschitz=certificate.lipschitz,
         residual=one_step,
-        largest_increment=float(np.max(np.linalg.norm(np.diff(positions, axis=-2), axis=-1))),
+        largest_increment=largest,
     )
     measured = {
         "decoder_lipschitz": certificate.lipschitz["decoder"],
         "d_bar": {"value": one_step["latent"], **found},
-        "tube": {"latent": latent.tolist(), "physical": tube, "ultimate": one_step["latent"] / (1 - certificate.alpha)},
+        "tube": {
+            "latent": latent.tolist(),
+            "physical": tube,
+            "ultimate": one_step["latent"] / (1 - certificate.alpha),
+            "largest_increment_m": largest,
+        },
         "boxes": dict(boxes),
         "monitor": alarms,
         "seconds_proof": certificate.seconds,
@@ -108,25 +127,34 @@ def _measure(
     calibration: Trajectory,
     held_out: Mapping[str, Trajectory],
     level: float,
+    drives: Mapping[str, int],
 ) -> dict[str, Any]:
     """One-step bounds at `level` for whole trajectories, and how often they hold where nobody looked before."""
-    units, scores = (disturbances(model, params, part) for part in (validation, calibration))
-    bounds = conformal_bounds(units, scores, level=level)
-    shares = {name: _coverage(bounds, disturbances(model, params, part)) for name, part in held_out.items()}
+    reference, scores = (disturbances(model, params, part) for part in (validation, calibration))
+    bounds = conformal_bounds(tube_units(reference, level=level), scores, level=level)
+    shares = {
+        name: _coverage(bounds, disturbances(model, params, part), drives.get(name)) for name, part in held_out.items()
+    }
+    independent = drives.get("calibration", len(scores.scores))
+    same = f"further segments of the same {independent} drives"
     return {
         "level": level,
         "trajectories": len(scores.scores),
+        "drives": independent,
+        "holds_for": "new drives like these" if supports(independent, level) else same,
         **shares["test"],
         "by_scenario": {name: share for name, share in shares.items() if name != "test"},
         "one_step": dict(zip(KINDS, bounds.tolist(), strict=True)),
-        "validation": float(np.quantile(units.scores[:, 0], level)),
+        "validation": float(np.quantile(reference.scores[:, 0], level)),
     }
 
 
-def _coverage(bounds: Any, found: Disturbance) -> dict[str, Any]:
-    """Share of trajectories inside all bounds, with its interval."""
-    share, interval = coverage(bounds, found)
-    return {"coverage": share, "coverage_ci95": list(interval), "coverage_trajectories": len(found.scores)}
+def _coverage(bounds: Any, found: Disturbance, drives: int | None) -> dict[str, Any]:
+    """Share of trajectories inside all bounds, with the interval that so many independent drives give it."""
+    count = len(found.scores)
+    share, independent = coverage(bounds, found), drives or count
+    sizes = {"coverage_trajectories": count, "coverage_drives": independent}
+    return {"coverage": share, "coverage_ci95": interval(share, independent), **sizes}
 
 
 def _alarms(
@@ -143,5 +171,6 @@ def _alarms(
         part._replace(states=part.states + spread * jax.random.normal(key, part.states.shape))
         for key, part in zip(jax.random.split(jax.random.key(0)), splits, strict=True)
     ]
-    bounds = conformal_bounds(*(disturbances(model, params, part) for part in noisy), level=level)
+    reference, scores = (disturbances(model, params, part) for part in noisy)
+    bounds = conformal_bounds(even_units(reference), scores, level=level)
     return {"bounds": bounds.tolist(), "level": level, "sensor_noise": list(sensor_noise)}

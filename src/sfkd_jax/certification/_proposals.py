@@ -116,7 +116,7 @@ def _reduced(
     weights: Sequence[Matrix], multipliers: Sequence[Vector], linear: Matrix | None
 ) -> tuple[Vector, Matrix, list[Matrix]]:
     """Eigenvalues (ascending) and vectors of C'S⁻¹C − K of the witness matrix, and the hidden y; not rigorous."""
-    matrix, _ = witness_matrix(weights, multipliers, linear)
+    matrix, _ = witness_matrix(weights, multipliers, 0.0, linear)
     widths = np.cumsum([len(part) for part in multipliers])
     inputs = len(matrix) - widths[-1]
     coupling, lower = matrix[inputs:, :inputs], matrix[inputs:, inputs:]

@@ -132,12 +132,13 @@ def _summary(logs: list[Log], cut: Segments, counts: list[int], dt: float) -> st
 
 def _dataset(cut: Segments, parts: Int[np.ndarray, " segment"], box: Ends) -> Dataset:
     """Arrays as models take them."""
+    drives = {name: len(np.unique(cut.drives[parts == k])) for k, name in enumerate(Dataset._fields[:4])}
     dealt = [
         Trajectory(*(jnp.asarray(part[parts == k], dtype=jnp.float32) for part in (cut.states, cut.controls, cut.envs)))
         for k in range(4)
     ]
     low, high = environment_box(cut.envs, *box)
-    return Dataset(*dealt, env_low=low, env_high=high)
+    return Dataset(*dealt, env_low=low, env_high=high, drives=drives)
 
 
 def environment_box(

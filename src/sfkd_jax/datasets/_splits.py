@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from typing import NamedTuple
 
 import jax
@@ -19,6 +20,7 @@ class Dataset(NamedTuple):
     Attributes:
         train: fits weights. validation: selects. calibration: sets d_bar. test: reports, nothing else.
         env_low, env_high: E.
+        drives: how many independent drives each part was cut from, by its name; None where every trajectory is one.
     """
 
     train: Trajectory
@@ -27,6 +29,7 @@ class Dataset(NamedTuple):
     test: Trajectory
     env_low: Float[Array, " environment"]
     env_high: Float[Array, " environment"]
+    drives: Mapping[str, int] | None = None
 
 
 def check_shares(shares: tuple[float, ...]) -> None:

@@ -20,6 +20,7 @@ from sfkd_jax.evaluation._violations import STRIDE as STRIDE
 from sfkd_jax.evaluation._violations import Claims as Claims
 from sfkd_jax.evaluation._violations import Predictions as Predictions
 from sfkd_jax.evaluation._violations import predictions as predictions
+from sfkd_jax.evaluation._violations import theorem_reach as theorem_reach
 from sfkd_jax.evaluation._violations import theorem_violations as theorem_violations
 from sfkd_jax.evaluation._violations import threshold_violations as threshold_violations
 from sfkd_jax.evaluation._violations import tube_violations as tube_violations

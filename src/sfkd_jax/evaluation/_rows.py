@@ -112,7 +112,7 @@ def _mean(values: list[Any]) -> Any:
     """The mean of equal structures, leaf by leaf; what is no number stays where all agree, and is None otherwise."""
     first = values[0]
     if isinstance(first, dict):
-        return {name: _mean([value[name] for value in values]) for name in first}
+        return {name: _mean([value.get(name) for value in values]) for name in first}  # older rows lack newer measures
     if all(isinstance(value, float) for value in values):
         return float(np.mean(values))
     return first if all(value == first for value in values) else None

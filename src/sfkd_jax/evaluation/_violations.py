@@ -107,6 +107,22 @@ def theorem_violations(
     return int(np.sum(applies & beyond)), int(np.sum(applies))
 
 
+def theorem_reach(
+    latent_errors: Float[np.ndarray, "segment window horizon"],
+    defects: Float[np.ndarray, "segment window horizon"],
+    latent: Float[np.ndarray, " horizon"],
+    d_bar: float,
+) -> list[float | None]:
+    """The largest |e_k| / R_k for every k, where |d_1| … |d_k| ≤ d̄; None where that never holds.
+
+    At most 1 by the theorem. V0 counts what is above and is 0 for any bound that is loose enough; this says how near
+    to the bound the errors came, so it moves when α, d̄ or the model is not what is claimed.
+    """
+    applies = np.logical_and.accumulate(np.asarray(defects) <= d_bar, axis=2)
+    shares = np.where(applies, np.asarray(latent_errors) / np.asarray(latent), -np.inf).max(axis=(0, 1))
+    return [float(share) if np.isfinite(share) else None for share in shares]
+
+
 def threshold_violations(errors: Float[np.ndarray, "segment window horizon 3"], threshold: float) -> tuple[int, int]:
     """V2: in how many windows the position error exceeds δ* at some step, and of how many."""
     inside = np.all(np.asarray(errors)[..., 0] <= threshold, axis=2)
@@ -125,6 +141,7 @@ def violations(found: Predictions | None, claims: Claims) -> dict[str, Any]:
     claimed = (found and found.latent_errors, found and found.defects, claims.latent, claims.d_bar)
     return {
         "v0": _share(theorem_violations, *claimed),
+        "v0_reach": None if any(part is None for part in claimed) else theorem_reach(*claimed),
         "v1": shares[kind] if kind else None,
         "v1_tube": kind,
         "v1_radius_m": radii[kind] if kind else None,

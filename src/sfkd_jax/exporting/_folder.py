@@ -52,7 +52,7 @@ def write_controller(
     exported = {name: _lowered(program, platforms) for name, program in programs.items()}
     for stale in (MANIFEST, CERTIFICATE, *(f"{stem}.vmfb" for stem in FILES.values())):
         (folder / stale).unlink(missing_ok=True)
-    weights = policy.save(folder / "policy.npz", trained.params, trained.settings, made_from=made_from)["sha256"]
+    stored = policy.save(folder / "policy.npz", trained.params, trained.settings, made_from=made_from)
     manifest = {
         "kind": "controller",
         "format": FORMAT,
@@ -67,8 +67,8 @@ def write_controller(
         },
         "iree": {name: _stored(folder / f"{FILES[name]}.vmfb", module) for name, module in modules.items()} or None,
         "iree_flags": list(iree_flags) if iree else None,
-        "weights_sha256": weights,
-        "certificate_sha256": _certificate(trained, folder),
+        "weights_sha256": stored["sha256"],
+        "certificate_sha256": _certificate(trained, folder, policy.policy_hash(stored)),
         **_vehicle(trained),
         "parameters": _count(trained.params),
         "settings": trained.settings,
@@ -95,11 +95,14 @@ def _listed(leaves: tuple[Leaf, ...]) -> list[dict[str, Any]]:
     return [leaf._asdict() for leaf in leaves]
 
 
-def _certificate(trained: policy.Policy, folder: Path) -> str | None:
-    """Copy the certificate if there is one; returns the hash of the file."""
+def _certificate(trained: policy.Policy, folder: Path, policy_sha256: str) -> str | None:
+    """Copy the certificate, which was verified when the policy was loaded, if there is one; returns the file's hash.
+
+    It is about the same model, and bound to the settings as they are exported: another controller, perhaps.
+    """
     if trained.certificate is None:
         return None
-    artefacts.write_json(folder / CERTIFICATE, trained.certificate)
+    artefacts.write_json(folder / CERTIFICATE, trained.certificate | {"policy_sha256": policy_sha256})
     return hashlib.sha256((folder / CERTIFICATE).read_bytes()).hexdigest()
 
 

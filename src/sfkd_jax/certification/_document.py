@@ -1,0 +1,109 @@
+"""The document beside the weights, checked again: proofs from their witnesses, arithmetic by repeating it."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+
+from sfkd_jax.certification._calibration import KINDS, interval, supports
+from sfkd_jax.certification._certificate import MALFORMED, Certificate, CertificateStale, verify
+from sfkd_jax.certification._claims import Refuted
+from sfkd_jax.certification._exported import CertificationRefused
+from sfkd_jax.certification._tube import latent_tube, physical_tube
+from sfkd_jax.types import Model, Params
+
+REPEATED = 1e-9
+"""Relative; what is computed again from the same numbers may differ by the order of summation and no more."""
+
+
+def verify_document(document: Mapping[str, Any], params: Params, *, model: Model, policy_sha256: str) -> None:
+    """Check a document of unknown origin against a policy, without any search.
+
+    Re-derived: every proved constant from its witness, tubes from α, d̄ and L, the limit, counts and intervals of the
+    coverage. d̄ and the other measured bounds cannot be: they are checked to be numbers that fit together.
+
+    Args:
+        document: as `issue` makes it, with `policy_sha256`. params: weights. model: that they belong to.
+        policy_sha256: of the weights and of every setting that model and controller compute with.
+
+    Raises:
+        CertificateStale: it is about other weights or settings. CertificationRefused: it does not hold; why.
+    """
+    if document.get("valid") is not True:
+        raise CertificationRefused(str(document.get("reason")))
+    if document.get("policy_sha256") != policy_sha256:
+        raise CertificateStale("the certificate is about other weights or settings")
+    proof = Certificate.from_document(dict(document))
+    verify(proof, params, model=model)
+    try:
+        _require_boxes(document["boxes"], proof)
+        _require_statistics(document["d_bar"], document["monitor"])
+        _require_tubes(document["tube"], proof, document["d_bar"])
+        _require_equal("decoder_lipschitz", document["decoder_lipschitz"], proof.lipschitz.get("decoder"))
+    except Refuted as reason:
+        raise CertificationRefused(str(reason)) from None
+    except MALFORMED as reason:
+        raise CertificationRefused(f"the certificate is malformed: {' '.join(str(reason).split())}") from None
+
+
+def _require_boxes(boxes: Mapping[str, Any], proof: Certificate) -> None:
+    """Boxes of body state, control and environment: finite, not reversed."""
+    for name in ("state", "control", "env"):
+        corners = _numbers(f"boxes.{name}", boxes[name])
+        if corners.ndim != 2 or len(corners) != 2 or not np.all(corners[0] <= corners[1]):
+            raise Refuted(f"boxes.{name} is no lower and upper corner")
+    if not np.array_equal(np.asarray(boxes["env"], float), np.asarray(proof.env_box, float)):
+        raise Refuted("boxes.env is not the box that was certified")
+
+
+def _require_statistics(d_bar: Mapping[str, Any], monitor: Mapping[str, Any]) -> None:
+    """Levels, counts, shares and intervals that go together; bounds that are positive."""
+    one_step = _numbers("d_bar.one_step", [d_bar["one_step"][kind] for kind in KINDS])
+    bounds = _numbers("monitor.bounds", monitor["bounds"])
+    if bounds.shape != (len(KINDS),) or not np.all(bounds > 0) or not np.all(one_step >= 0):
+        raise Refuted("measured bounds must be four numbers above 0")
+    _require_equal("d_bar.value", d_bar["value"], d_bar["one_step"]["latent"])
+    for name, level in (("d_bar.level", d_bar["level"]), ("monitor.level", monitor["level"])):
+        if not 0 < level < 1 or not supports(d_bar["trajectories"], level):
+            raise Refuted(f"{name} = {level!r} cannot be had from {d_bar['trajectories']!r} trajectories")
+    if not 1 <= d_bar["drives"] <= d_bar["trajectories"]:
+        raise Refuted(f"d_bar.drives = {d_bar['drives']!r} does not fit {d_bar['trajectories']!r} trajectories")
+    for name, part in {"d_bar": d_bar, **d_bar["by_scenario"]}.items():
+        count, drives = part["coverage_trajectories"], part["coverage_drives"]
+        inside = round(part["coverage"] * count)
+        if not 0 <= inside <= count or not 1 <= drives <= count:
+            raise Refuted(f"{name}: a coverage of {part['coverage']!r} of {count!r} trajectories is none")
+        _require_equal(f"{name}: coverage", part["coverage"], inside / count)
+        _require_equal(f"{name}: coverage_ci95", part["coverage_ci95"], interval(part["coverage"], drives))
+
+
+def _require_tubes(tube: Mapping[str, Any], proof: Certificate, d_bar: Mapping[str, Any]) -> None:
+    """R_k, what it means in metres and radians, and its limit."""
+    latent = latent_tube(proof.alpha, d_bar["value"], len(tube["latent"]))
+    _require_equal("tube.latent", tube["latent"], latent)
+    _require_equal("tube.ultimate", tube["ultimate"], d_bar["value"] / (1 - proof.alpha))
+    largest = float(_numbers("tube.largest_increment_m", tube["largest_increment_m"]))
+    known = {"lipschitz": proof.lipschitz, "residual": d_bar["one_step"], "largest_increment": largest}
+    physical = physical_tube(latent, alpha=proof.alpha, **known)
+    if largest < 0 or set(tube["physical"]) != set(physical):
+        raise Refuted("tube.physical is not of position, yaw and body state")
+    for name, radii in physical.items():
+        _require_equal(f"tube.physical.{name}", tube["physical"][name], radii)
+
+
+def _numbers(name: str, values: Any) -> np.ndarray:
+    """A part of the document as an array of finite numbers."""
+    array = np.asarray(values)
+    if array.dtype.kind not in "if" or not np.all(np.isfinite(array)):
+        raise Refuted(f"{name} holds what is no number")
+    return array
+
+
+def _require_equal(name: str, stated: Any, derived: Any) -> None:
+    """Refuse what is not what it follows from."""
+    expected = np.asarray(derived, dtype=np.float64)
+    found = _numbers(name, stated)
+    if found.shape != expected.shape or not np.allclose(found, expected, rtol=REPEATED, atol=0.0):
+        raise Refuted(f"{name} does not follow from what it is computed from")

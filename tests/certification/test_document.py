@@ -1,0 +1,305 @@
+"""A certificate that was forged, or that lies beside other settings, is refused in one line; an honest one verifies."""
+
+import copy
+import json
+import math
+import shutil
+import warnings
+from functools import cache
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from helpers import refusal_of
+from jaxtyping import TypeCheckError
+
+from sfkd_jax import artefacts, demo, policy
+from sfkd_jax.certification import CertificateStale, CertificationRefused, verify_document
+
+PLANTS = ("kinematic", "dynamic")
+
+
+@cache
+def shipped(plant="kinematic"):
+    return policy.restore(demo.SHIPPED / plant)
+
+
+@cache
+def honest(plant="kinematic"):
+    return artefacts.read_json(demo.SHIPPED / plant / "certificate.json")
+
+
+def check(document, plant="kinematic"):
+    trained = shipped(plant)
+    try:
+        verify_document(document, trained.params, model=trained.model, policy_sha256=trained.sha256)
+    except TypeCheckError as reason:  # under test, types are checked before anything is verified
+        raise CertificationRefused("of another type") from reason
+
+
+def put(document, path, value):
+    """A copy with the value at a dotted path replaced."""
+    changed = copy.deepcopy(document)
+    *above, last = path.split(".")
+    inner = changed
+    for key in above:
+        inner = inner[int(key) if isinstance(inner, list) else key]
+    inner[int(last) if isinstance(inner, list) else last] = value
+    return changed
+
+
+def at(document, path):
+    for key in path.split("."):
+        document = document[int(key) if isinstance(document, list) else key]
+    return document
+
+
+@pytest.mark.parametrize("plant", PLANTS)
+def test_what_ships_verifies(plant):
+    check(honest(plant), plant)
+
+
+PROVED = (
+    "alpha",
+    "alpha_separate",
+    "alpha_joint",
+    "rho",
+    "beta",
+    "lipschitz.body",
+    "lipschitz.position",
+    "lipschitz.yaw",
+)
+NONSENSE = (math.nan, math.inf, -math.inf, -4.1, 0.0, None, "0.5", [0.5], 1e400)
+
+
+@pytest.mark.parametrize("claim", [*PROVED, "lipschitz.decoder", "kappa", "transport_lipschitz"])
+def test_no_proved_constant_can_be_replaced_by_nonsense(claim):
+    for value in NONSENSE:
+        with pytest.raises(CertificationRefused):
+            check(put(honest(), claim, value))
+
+
+@pytest.mark.parametrize("claim", PROVED)
+def test_no_proved_constant_can_be_made_smaller(claim):
+    for factor in (0.5, 1 - 1e-5):
+        with pytest.raises(CertificationRefused):
+            check(put(honest(), claim, factor * at(honest(), claim)))
+
+
+@pytest.mark.parametrize("claim", ["beta", "rho", "lipschitz.position"])
+def test_a_constant_that_is_larger_than_proved_does_not_go_unnoticed_where_others_follow_from_it(claim):
+    with pytest.raises(CertificationRefused):
+        check(put(honest(), claim, 1.01 * at(honest(), claim)))
+
+
+def test_constants_of_networks_that_there_are_not_are_refused():
+    forged = copy.deepcopy(honest())
+    forged["lipschitz"]["height"] = 7.0
+    with pytest.raises(CertificationRefused, match="lipschitz must be of"):
+        check(forged)
+    del forged["lipschitz"]["height"], forged["lipschitz"]["yaw"]
+    with pytest.raises(CertificationRefused, match="lipschitz must be of"):
+        check(forged)
+
+
+DERIVED = (
+    *("tube.latent.0", "tube.latent.19", "tube.ultimate", "tube.physical.position_m.19", "tube.physical.yaw_rad.3"),
+    *("tube.physical.body.7", "tube.largest_increment_m", "d_bar.value", "d_bar.one_step.latent", "d_bar.one_step.yaw"),
+    *("d_bar.coverage", "d_bar.coverage_ci95.0", "d_bar.by_scenario.s3.coverage", "decoder_lipschitz"),
+    *("d_bar.by_scenario.s3.coverage_ci95.1", "boxes.env.0.0", "env_box.1.1", "tightness", "attack", "attacks.step"),
+)
+
+
+@pytest.mark.parametrize("number", DERIVED)
+def test_what_is_arithmetic_is_computed_again(number):
+    for value in (0.9 * at(honest(), number), 1.001 * at(honest(), number), math.nan, "many"):
+        with pytest.raises(CertificationRefused):
+            check(put(honest(), number, value))
+
+
+@pytest.mark.parametrize(
+    ("path", "value"),
+    [
+        ("d_bar.level", 0.0),
+        ("d_bar.level", 1.0),
+        ("d_bar.level", 0.9999),  # of 600 trajectories none is high enough
+        ("d_bar.level", math.nan),
+        ("monitor.level", 0.9999),
+        ("d_bar.trajectories", 12),
+        ("d_bar.trajectories", -600),
+        ("d_bar.drives", 0),
+        ("d_bar.drives", 601),
+        ("d_bar.coverage_trajectories", 1),
+        ("d_bar.coverage_drives", 0),
+        ("monitor.bounds", [1.0, 1.0, 1.0]),
+        ("monitor.bounds", [1.0, -1.0, 1.0, 1.0]),
+        ("monitor.bounds", [1.0, math.inf, 1.0, 1.0]),
+        ("boxes.state", [[20.0], [3.0]]),
+        ("boxes.control", [[-0.5, -4.0], [math.nan, 3.0]]),
+        ("boxes.env", [[0.9, 8.0], [0.3, -8.0]]),
+        ("env_box", [[0.9, 8.0], [0.3, -8.0]]),
+        ("env_box", [[0.3, -8.0]]),
+        ("mode", "separate"),
+        ("mode", "grid"),
+        ("scope", "all e in the universe"),
+        ("precision", "exact"),
+        ("attacks.flattery", 0.0),
+        ("attacks.residual_slopes", 52.0),
+        ("tube.physical.height", [0.0]),
+        ("witnesses.joint", []),
+        ("witnesses.residual", [[math.nan] * 32, [1.0] * 32]),
+    ],
+)
+def test_what_does_not_go_together_is_refused(path, value):
+    with pytest.raises(CertificationRefused):
+        check(put(honest(), path, value))
+
+
+def test_a_document_that_lacks_anything_is_refused():
+    spare = {"seconds", "seconds_proof", "versions", "weights_sha256"}  # needed by readers of the page
+    for key in honest():
+        lacking = {name: value for name, value in honest().items() if name != key}
+        if key in spare:
+            continue
+        with pytest.raises((CertificationRefused, CertificateStale)):
+            check(lacking)
+
+
+# --- bound to everything that model and controller compute with -----------------------------------------------------
+
+
+def leaves(value, path=()):
+    """Where the numbers, words and switches of nested settings lie."""
+    if isinstance(value, dict | list):
+        for key, entry in value.items() if isinstance(value, dict) else enumerate(value):
+            yield from leaves(entry, (*path, str(key)))
+    else:
+        yield ".".join(path), value
+
+
+def another(value):
+    """A value of the same kind that is another one."""
+    if isinstance(value, bool) or value is None:
+        return not value
+    return f"{value}_" if isinstance(value, str) else value * 1.01 + 1
+
+
+@pytest.fixture
+def copied(tmp_path):
+    shutil.copytree(demo.SHIPPED / "kinematic", tmp_path / "run")
+    return tmp_path / "run"
+
+
+def test_the_hash_changes_with_every_single_setting():
+    manifest = artefacts.read_json(demo.SHIPPED / "kinematic" / "policy.json")
+    settings = dict(leaves(manifest["config"]))
+    changed = {
+        policy.policy_hash(manifest | {"config": put(manifest["config"], path, another(value))})
+        for path, value in settings.items()
+    }
+    assert len(settings) > 120
+    assert len(changed) == len(settings)
+    assert shipped().sha256 == policy.policy_hash(manifest) not in changed
+    assert policy.policy_hash(manifest | {"sha256": "0" * 64}) not in {*changed, shipped().sha256}
+
+
+@pytest.mark.parametrize(
+    ("path", "value"),
+    [
+        ("space.body_scale.0", 5.0),
+        ("vehicle.dt", 0.05),
+        ("controller.cost.lateral", 2.0),
+        ("controller.feedback.heading_gain", 4.0),
+        ("model.transport", False),
+        ("dataset.env_low.0", 0.1),
+    ],
+)
+def test_a_setting_that_changed_leaves_nothing_certified_and_says_so(copied, path, value):
+    manifest = artefacts.read_json(copied / "policy.json")
+    artefacts.write_json(copied / "policy.json", manifest | {"config": put(manifest["config"], path, value)})
+    with pytest.warns(UserWarning, match="nothing is certified and nothing is monitored; .* other weights or settings"):
+        found = policy.load(copied)
+    assert found.certificate is None
+
+
+def test_a_certificate_is_loaded_without_a_word_and_its_monitor_with_it(copied):
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        assert policy.load(copied).certificate["valid"]
+
+
+@pytest.mark.parametrize("fallback", ["hold", "slow"])
+def test_a_fallback_needs_a_certificate(copied, fallback):
+    asked = shipped().settings["controller"]
+    asked = asked | {"monitor": asked["monitor"] | {"fallback": fallback}}
+    policy.load(copied, controller=asked)
+    (copied / "certificate.json").unlink()
+    line = refusal_of(lambda: policy.load(copied, controller=asked))
+    assert f"controller.monitor.fallback={fallback} needs a certificate; certificate.json is missing" in line
+    with pytest.warns(UserWarning, match=r"certificate.json is missing"):
+        assert policy.load(copied).certificate is None
+
+
+def test_a_forged_certificate_is_an_error_that_names_the_file(copied):
+    forged = put(honest(), "alpha", 0.5)
+    artefacts.write_json(copied / "certificate.json", forged)
+    assert "certificate.json: " in refusal_of(lambda: policy.load(copied))
+
+
+def test_a_refusal_is_told_with_its_reason(copied):
+    artefacts.write_json(copied / "certificate.json", {"valid": False, "reason": "alpha = 2.0 is not below 1"})
+    with pytest.warns(UserWarning, match="refused: alpha = 2.0 is not below 1"):
+        policy.load(copied)
+
+
+# --- weights ---------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("spoil", "told"),
+    [
+        (lambda name, leaf: leaf.astype(np.float64), "are float64"),
+        (lambda name, leaf: leaf[..., :-1], "weights networks/operators are"),
+        (lambda name, leaf: np.full_like(leaf, np.nan), "are not finite"),
+        (lambda name, leaf: None, "lacks weights networks/operators"),
+    ],
+)
+def test_weights_that_do_not_fit_the_model_are_refused_in_one_line(copied, spoil, told):
+    arrays, manifest = artefacts.read_arrays(copied / "policy.npz", kind=policy.KIND)
+    changed = spoil("networks/operators", arrays["networks/operators"])
+    arrays = {name: leaf for name, leaf in arrays.items() if name != "networks/operators"}
+    arrays |= {} if changed is None else {"networks/operators": changed}
+    artefacts.write_arrays(copied / "policy.npz", arrays, kind=policy.KIND, config=manifest["config"])
+    line = refusal_of(lambda: policy.load(copied))
+    assert told in line
+    assert "policy.npz" in line
+
+
+def test_weights_that_the_model_does_not_have_are_refused(copied):
+    arrays, manifest = artefacts.read_arrays(copied / "policy.npz", kind=policy.KIND)
+    arrays["networks/extra"] = np.zeros(3, np.float32)
+    artefacts.write_arrays(copied / "policy.npz", arrays, kind=policy.KIND, config=manifest["config"])
+    assert "holds weights networks/extra" in refusal_of(lambda: policy.load(copied))
+
+
+def test_a_document_survives_a_walk_through_json_unchanged():
+    check(json.loads(json.dumps(honest())))
+
+
+def test_a_certificate_of_one_policy_is_stale_beside_another():
+    with pytest.raises(CertificateStale):
+        check(honest("dynamic"), "kinematic")
+    forged = honest("dynamic") | {"policy_sha256": shipped("kinematic").sha256}
+    with pytest.raises((CertificationRefused, CertificateStale)):
+        check(forged, "kinematic")
+
+
+def test_one_weight_that_moved_by_the_smallest_step_is_noticed():
+    trained = shipped()
+    leaf = trained.params["networks"]["operators"]
+    nudged = leaf.at[0, 0, 0].set(jnp.nextafter(leaf[0, 0, 0], jnp.inf))
+    params = trained.params | {"networks": trained.params["networks"] | {"operators": nudged}}
+    assert jax.tree.structure(params) == jax.tree.structure(trained.params)
+    with pytest.raises(CertificateStale):
+        verify_document(honest(), params, model=trained.model, policy_sha256=trained.sha256)
