@@ -30,6 +30,8 @@ TRAIN = ("train", *SMALL)
 CEM = ("controller=cem", "controller.cem.num_samples=16")
 DRILLS = {
     # name: (kills, processes at once, whether they start in a run that is trained already)
+    "two that evaluate": (25, (("evaluate", *SMALL), ("evaluate", *SMALL, *CEM)), True),
+    "two that train": (15, (TRAIN, TRAIN), False),
     "generate": (25, (("generate", *SMALL),), False),
     "train": (40, (TRAIN,), False),
     "sweep": (10, ((*TRAIN, "seed=0,1", "--multirun"),), False),
@@ -38,8 +40,6 @@ DRILLS = {
     "evaluate": (20, (("evaluate", *SMALL, *CEM),), True),
     "export": (10, (("export", *SMALL),), True),
     "report": (10, (("report", *SMALL),), True),
-    "two that evaluate": (25, (("evaluate", *SMALL), ("evaluate", *SMALL, *CEM)), True),
-    "two that train": (15, (TRAIN, TRAIN), False),
 }
 TIMES = ("seconds", "seconds_proof", "versions", "act_ms", "root", "created", "config", "made_with")
 """Keys of documents that differ between equal runs, or that belong to whoever wrote last."""
@@ -254,7 +254,7 @@ def main():
     asked = parser.parse_args()
     with tempfile.TemporaryDirectory() as temporary:
         scratch = Path(temporary)
-        os.environ.update(COMPILING | {"JAX_COMPILATION_CACHE_DIR": str(scratch / "cache")})
+        os.environ.update(COMPILING | {"JAX_COMPILATION_CACHE_DIR": str(Path(__file__).parents[1] / ".jax_cache")})
         for door in {commands[0][0] for _, commands, _ in DRILLS.values()}:
             importlib.import_module(f"sfkd_jax.{door}")
         timing = importlib.import_module("timing")

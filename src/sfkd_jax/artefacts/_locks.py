@@ -76,7 +76,8 @@ def _held(lock: BaseFileLock, directory: Path, wait: bool) -> BaseFileLock:
     try:
         lock.acquire(timeout=GRACE_S)
     except Timeout:
-        taken = f"{directory}: {_who(directory)} is writing there"
+        soft = f" (if it is gone, remove {lock.lock_file})" if isinstance(lock, SoftFileLock) else ""
+        taken = f"{directory}: {_who(directory)} is writing there{soft}"
         if not wait:
             raise DirectoryTaken(f"{taken}; try again when it has ended") from None
         tell(f"waiting: {taken}")
