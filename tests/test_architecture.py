@@ -24,7 +24,7 @@ ARROWS = {
     "scenarios": HALLWAY | {"vehicle"},
     "datasets": HALLWAY | {"vehicle", "scenarios"},
     "models": HALLWAY,
-    "training": HALLWAY,
+    "training": HALLWAY | {"artefacts"},
     "certification": HALLWAY,
     "control": HALLWAY,
     "evaluation": HALLWAY | {"vehicle", "scenarios"},
@@ -48,7 +48,7 @@ ARROWS |= {door: EVERY_ROOM | DOORS | {"config", "ranges", "schemas"} for door i
 EVERYWHERE = set(sys.stdlib_module_names) | {PACKAGE, "jax", "jaxtyping"}
 FRONT = {"hydra", "omegaconf", "numpy", "rich"}
 THIRD_PARTY = {
-    "artefacts": {"numpy"},
+    "artefacts": {"numpy", "filelock"},
     "datasets": {"numpy", "pyarrow"},
     "models": {"flax"},
     "control": {"flax"},

@@ -74,6 +74,7 @@ def _tubes(settings: dict[str, Any], trained: policy.Trained) -> dict[str, Any]:
     )
 
 
+@shelf.exclusive
 def run(settings: dict[str, Any]) -> dict[str, Any]:
     """Certify, unless a certificate about other weights lies there (then `certification.renew=true`)."""
     trained = walk.ensure_policy(settings)

@@ -35,17 +35,28 @@ def run(settings: dict[str, Any]) -> dict[str, Any]:
             shelf.say(f"failed: {reason}")
         if driven:
             _estimate(number + 1, len(groups), time.perf_counter() - began)
-    place = Path(settings["root"]) / settings["name"]
     if comparison["share"] is not None:  # others drive the rest: whoever comes last collects
         return {"results": None, "rows": driven, "failed": len(failed)}
+    place = Path(settings["root"]) / settings["name"]
+    with artefacts.locked(place, wait=True):
+        return _collect(wanted, settings, composed, failed, time.perf_counter() - began if driven else None)
 
+
+def _collect(
+    wanted: list[cells.Cell],
+    settings: dict[str, Any],
+    composed: _Composed,
+    failed: dict[str, str],
+    seconds: float | None,
+) -> dict[str, Any]:
+    """Write the results of all cells that are done, and what is drawn of them."""
+    comparison, place = settings["comparison"], Path(settings["root"]) / settings["name"]
     with artefacts.understood(place / "cells"):
         rows = cells.collect(wanted, settings, lambda cell: cells.made_with(composed(cell)), older=comparison["older"])
     if not rows:
         raise ValueError(f"nothing to compare: no row came out ({'; '.join(failed.values()) or 'none was asked for'})")
     made_by = settings | {"command": command("compare")}
     document = {"rows": rows, "config": made_by, "versions": artefacts.versions(), "failed": failed}
-    seconds = time.perf_counter() - began if driven else None
     artefacts.write_json(place / "results.json", document | {"seconds": seconds})
     with artefacts.understood(place):
         pages = benchmark_report(place)
@@ -96,9 +107,14 @@ def _driver(settings: dict[str, Any], plant: Vehicle) -> drive.TestDriver:
 
 def _certified(settings: dict[str, Any]) -> None:
     """A policy with what can be proved about it beside it."""
-    walk.ensure_policy(settings)
-    if not certify.document_in(shelf.run_directory(settings)).exists():
-        certify.renew(settings)
+    place = shelf.run_directory(settings)
+    if artefacts.exists(place / "policy.npz") and certify.document_in(place).exists():
+        walk.ensure_policy(settings)
+        return
+    with artefacts.locked(place, wait=True):  # a process with another share may train it for us
+        walk.ensure_policy(settings)
+        if not certify.document_in(place).exists():
+            certify.renew(settings)
 
 
 def _compose(cell: cells.Cell, comparison: dict[str, Any]) -> dict[str, Any]:

@@ -27,6 +27,7 @@ from sfkd_jax.schemas import register as register
 
 REFUSED = 2
 STALE = 3
+INTERRUPTED = 130
 
 
 def conf_path() -> str:
@@ -63,7 +64,8 @@ def door(run: Callable[[dict[str, Any]], dict[str, Any]]) -> Callable[[], None]:
         try:
             document = run(_settings(config))
         except KeyboardInterrupt:
-            return _fail("interrupted; the same command continues", 130)
+            print("sfkd_jax: interrupted; the same command continues", file=sys.stderr, flush=True)
+            os._exit(INTERRUPTED)  # the interpreter would first wait for compiled code that nobody needs any more
         except CertificationRefused as reason:
             return fail(f"refused: {reason}", REFUSED)
         except CertificateStale as reason:

@@ -29,14 +29,16 @@ def run(settings: dict[str, Any]) -> dict[str, Any]:
     systems |= {name: assembly.reference_systems(plant)[name] for name in ("nominal", "oracle")}
     place, rows = Path(settings["root"]) / settings["name"], []
     folder = place / f"{track.scenario}_{vehicle}"
-    for name, system in systems.items():
-        shelf.say(f"driving {settings['demo']['episodes']} x {settings['demo']['episode_s']:.0f} s: {name}")
-        driven = drive.prepare(settings, plant, name, system, None)(track)
-        rows.append(cells.write(folder / name, settings, track, driven))
-    rows = evaluation.compare(rows)
-    artefacts.write_json(folder / "results.json", {"rows": rows, "config": settings, "versions": artefacts.versions()})
-    _print(rows)
-    film = animate(place, rows, track.scenario)
+    with artefacts.locked(folder):
+        for name, system in systems.items():
+            shelf.say(f"driving {settings['demo']['episodes']} x {settings['demo']['episode_s']:.0f} s: {name}")
+            driven = drive.prepare(settings, plant, name, system, None)(track)
+            rows.append(cells.write(folder / name, settings, track, driven))
+        rows = evaluation.compare(rows)
+        document = {"rows": rows, "config": settings, "versions": artefacts.versions()}
+        artefacts.write_json(folder / "results.json", document)
+        _print(rows)
+        film = animate(place, rows, track.scenario)
     shelf.say(f"animation: {film}; {time.perf_counter() - began:.0f} s in all")
     return {"animation": film and str(film), "rows": len(rows), "results": str(folder / "results.json")}
 

@@ -173,6 +173,7 @@ def _about(settings: dict[str, Any], name: str, system: assembly.System) -> dict
         "system": name,
         "model": settings["model"]["name"] if system.params else name,
         "controller": settings["controller"]["name"],
+        "planner": settings["controller"]["planner"],
         "sampling": settings["controller"]["sampling"],
         "env": system.env,
         "vehicle": settings["vehicle"]["name"],

@@ -16,7 +16,7 @@ KIND = "episodes"
 
 
 def run(settings: dict[str, Any], asked_by: str = "evaluate") -> dict[str, Any]:
-    """Rows of results.json and the episodes behind them; rows of other scenarios in the same run stay.
+    """Rows of results.json and the episodes behind them; rows of other drives in the same run stay.
 
     `asked_by` is the door that was opened; its command is kept with the results.
     """
@@ -29,16 +29,15 @@ def run(settings: dict[str, Any], asked_by: str = "evaluate") -> dict[str, Any]:
     systems = walk.systems(settings, plant)
     dataset, _ = walk.ensure_dataset(settings)
     rows: list[dict[str, Any]] = []
-    arrays: dict[str, Any] = {
-        f"{track.scenario}/envs": track.roads.envs,
-        f"{track.scenario}/path": track.roads.path.points,
-    }
+    roads = dict(zip(artefacts.ROAD, (track.roads.envs, track.roads.path.points), strict=True))
+    arrays: dict[str, Any] = {}
     for name, system in systems.items():
         length = f"{protocol['episodes']} episodes of {protocol['episode_s']:.0f} s"
         shelf.say(f"driving {length}: {name} on {track.scenario}")
         driven = drive.prepare(settings, plant, name, system, dataset)(track)
         rows.append(driven.row)
-        arrays |= {f"{name}/{track.scenario}/{part}": array for part, array in driven.arrays.items()}
+        drive_name = artefacts.drive_name(driven.row)
+        arrays |= {f"{drive_name}/{part}": array for part, array in (driven.arrays | roads).items()}
         shelf.say(f"  rmse {driven.row['rmse_m']['mean']:.4f} m, worst {driven.row['max_deviation_m']:.3f} m")
     arrays["dt"] = np.asarray(plant.dt)
     made_by = settings | ({"command": command(asked_by)} if HydraConfig.initialized() else {})
@@ -50,20 +49,20 @@ def _kept(place: Path) -> tuple[list[dict[str, Any]], dict[str, Any]]:
     """Rows and episodes that lie in a run."""
     results, episodes = place / "results.json", place / "episodes.npz"
     rows = artefacts.read_json(results, keys=("rows",))["rows"] if results.exists() else []
+    arrays = artefacts.read_arrays(episodes, kind=KIND)[0] if artefacts.exists(episodes) else {}
     with artefacts.understood(results):
-        evaluation.merge(rows, rows)
-    return rows, artefacts.read_arrays(episodes, kind=KIND)[0] if artefacts.exists(episodes) else {}
+        return artefacts.merge([], rows), artefacts.renamed(arrays, rows)
 
 
 def _write(place: Path, settings: dict[str, Any], rows: list, arrays: dict[str, Any], seconds: float) -> None:
-    """Store rows and episodes; what other scenarios left in this run stays."""
-    place.mkdir(parents=True, exist_ok=True)
-    kept, old = _kept(place)
+    """Store rows and episodes; what other drives left in this run stays, whoever writes it meanwhile."""
     config = {name: settings[name] for name in ("vehicle", "controller", "evaluation")}
-    arrays = old | {name: np.asarray(array) for name, array in arrays.items()}
-    artefacts.write_arrays(place / "episodes.npz", arrays, kind=KIND, config=config)
-    document = {"rows": evaluation.merge(kept, rows), "config": settings, "versions": artefacts.versions()}
-    artefacts.write_json(place / "results.json", document | {"seconds": seconds})
+    with artefacts.locked(place, wait=True):
+        kept, old = _kept(place)
+        arrays = old | {name: np.asarray(array) for name, array in arrays.items()}
+        artefacts.write_arrays(place / "episodes.npz", arrays, kind=KIND, config=config)
+        document = {"rows": artefacts.merge(kept, rows), "config": settings, "versions": artefacts.versions()}
+        artefacts.write_json(place / "results.json", document | {"seconds": seconds})
 
 
 if __name__ == "__main__":

@@ -20,6 +20,13 @@ def run(settings: dict[str, Any]) -> dict[str, Any]:
     place = shelf.run_directory(settings)
     if not artefacts.exists(place / "policy.npz"):
         raise artefacts.ArtefactError(f"{place} holds no trained controller; run train with the same options first")
+    return _write(settings)
+
+
+@shelf.exclusive
+def _write(settings: dict[str, Any]) -> dict[str, Any]:
+    """Export the policy that lies there."""
+    place = shelf.run_directory(settings)
     shelf.claim(settings)
     _, manifest = artefacts.read_arrays(place / "policy.npz", kind=policy.KIND)
     trained = policy.load(place, controller=settings["controller"], env=settings["env"])

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from contextlib import nullcontext
 from pathlib import Path
 from typing import Any
 
@@ -14,7 +15,8 @@ def run(settings: dict[str, Any]) -> dict[str, Any]:
     """Draw; nothing is recomputed."""
     pattern = settings["report"]["compare"]
     place = Path(settings["root"]) if pattern else shelf.run_directory(settings)
-    with artefacts.understood(place):
+    alone = artefacts.locked(place) if place.exists() else nullcontext()  # or it makes what it then finds empty
+    with alone, artefacts.understood(place):
         pages = write_comparison(place, pattern, settings["name"]) if pattern else write_report(place)
     shelf.say(f"report: {pages['report']}")
     return pages

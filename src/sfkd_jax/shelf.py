@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 import sys
 from collections.abc import Callable
 from pathlib import Path
@@ -26,6 +27,17 @@ UNREADABLE = frozenset("[]")
 def run_directory(settings: dict[str, Any]) -> Path:
     """root/name/system/seed=N."""
     return Path(settings["root"]) / settings["name"] / settings["model"]["system"] / f"seed={settings['seed']}"
+
+
+def exclusive(run: Callable[[dict[str, Any]], Any]) -> Callable[[dict[str, Any]], Any]:
+    """Make `run(settings)` the only one that writes into the run directory while it works."""
+
+    @functools.wraps(run)
+    def alone(settings: dict[str, Any]) -> Any:
+        with artefacts.locked(run_directory(settings)):
+            return run(settings)
+
+    return alone
 
 
 def dataset_path(settings: dict[str, Any]) -> Path:

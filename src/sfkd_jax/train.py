@@ -18,10 +18,16 @@ def run(settings: dict[str, Any]) -> dict[str, Any]:
     if plant.simulated:
         check_step(plant)
     rehearsal.check(settings, plant)
+    return _walk(settings) | {"seconds": time.perf_counter() - began}
+
+
+@shelf.exclusive
+def _walk(settings: dict[str, Any]) -> dict[str, Any]:
+    """All steps in the run directory."""
     walk.ensure_policy(settings)
     place = shelf.run_directory(settings)
     certificate = certify.renew(settings)
-    if plant.simulated:
+    if assembly.build_vehicle(settings["vehicle"]).simulated:
         results = evaluate.run(settings, asked_by="train")
     else:
         results = {"results": None}
@@ -36,7 +42,6 @@ def run(settings: dict[str, Any]) -> dict[str, Any]:
         "open_loop_rmse_m": _errors(place),
         "alpha": certificate.get("alpha"),
         "objective": _objective(place),
-        "seconds": time.perf_counter() - began,
     }
 
 
@@ -47,7 +52,8 @@ def _errors(place: Path) -> list[float]:
 
 def _objective(place: Path) -> float | None:
     """What a sweep minimises: the least validation loss; None for a model that is identified at once."""
-    lines = artefacts.read_jsonl(place / "metrics.jsonl") if (place / "metrics.jsonl").exists() else []
+    log = place / "metrics.jsonl"
+    lines = artefacts.read_jsonl(log, damaged=artefacts.tell) if log.exists() else []
     return min((line["validation_loss"] for line in lines if "validation_loss" in line), default=None)
 
 

@@ -39,9 +39,12 @@ SWITCHING = 2
 
 def ensure_dataset(settings: dict[str, Any]) -> tuple[Dataset, str]:
     """The data set and its hash, read from logs or driven now if it does not lie on the shelf."""
-    if not artefacts.exists(shelf.dataset_path(settings)):
-        dataset = _from_logs(settings) if shelf.is_logged(settings) else _driven(settings)
-        shelf.write_dataset(settings, dataset)
+    path = shelf.dataset_path(settings)
+    if not artefacts.exists(path):
+        with artefacts.locked(path.parent, wait=True):  # whoever makes it now makes it for all
+            if not artefacts.exists(path):
+                dataset = _from_logs(settings) if shelf.is_logged(settings) else _driven(settings)
+                shelf.write_dataset(settings, dataset)
     return shelf.read_dataset(settings)
 
 
@@ -118,15 +121,18 @@ def ensure_policy(settings: dict[str, Any]) -> policy.Trained:
     """The policy of this run: from the shelf, or trained now, continuing what was begun.
 
     Raises:
-        ArtefactError: what lies there was made with other settings, or is damaged.
+        ArtefactError: what lies there was made with other settings, is damaged, or is being trained by another process.
     """
     place = shelf.run_directory(settings)
-    trained = artefacts.exists(place / "policy.npz")
-    if shelf.is_logged(settings) and not trained:
+    if artefacts.exists(place / "policy.npz"):
+        shelf.claim(settings)
+        return policy.restore(place)
+    if shelf.is_logged(settings):
         _check_enough(settings)
-    shelf.claim(settings)
-    if not trained:
-        _train(settings)
+    with artefacts.locked(place):
+        shelf.claim(settings)
+        if not artefacts.exists(place / "policy.npz"):
+            _train(settings)
     return policy.restore(place)
 
 

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from sfkd_jax.evaluation import Episode, bootstrap_mean, compare, merge, paired_difference, pool, row, score, summary
+from sfkd_jax.evaluation import Episode, bootstrap_mean, compare, paired_difference, pool, row, score, summary
 
 DT, STEPS = 0.1, 200
 TIME = np.arange(1, STEPS + 1) * DT
@@ -311,14 +311,3 @@ def test_pooling_joins_the_episodes_of_all_seeds_and_averages_the_rest():
     assert pooled["system"] == "sfkd"
     assert pooled["rmse_after_switch_m"] is None
     assert pool(made[:1]) == made[0]
-
-
-def test_new_rows_replace_those_of_the_same_identity_and_leave_the_others():
-    old = [about("sfkd", rmse=1), about("oracle", rmse=2), about("sfkd", scenario="s1", rmse=3)]
-    new = [about("sfkd", rmse=4), about("sfkd", env="none", rmse=5)]
-    merged = merge(old, new)
-    assert sorted(entry["rmse"] for entry in merged) == [2, 3, 4, 5]
-    assert merge([], new) == new
-    assert merge(old, []) == old
-    for name in ("system", "scenario", "vehicle", "sampling", "env", "variation"):
-        assert len(merge(old[:1], [old[0] | {name: "other"}])) == 2

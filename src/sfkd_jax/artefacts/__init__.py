@@ -8,6 +8,13 @@ from sfkd_jax.artefacts._content import flatten as flatten
 from sfkd_jax.artefacts._content import sha256 as sha256
 from sfkd_jax.artefacts._content import unflatten as unflatten
 from sfkd_jax.artefacts._content import versions as versions
+from sfkd_jax.artefacts._drives import ROAD as ROAD
+from sfkd_jax.artefacts._drives import SHARED as SHARED
+from sfkd_jax.artefacts._drives import drive_name as drive_name
+from sfkd_jax.artefacts._drives import drive_of as drive_of
+from sfkd_jax.artefacts._drives import identity as identity
+from sfkd_jax.artefacts._drives import merge as merge
+from sfkd_jax.artefacts._drives import renamed as renamed
 from sfkd_jax.artefacts._files import ArtefactError as ArtefactError
 from sfkd_jax.artefacts._files import read_json as read_json
 from sfkd_jax.artefacts._files import understood as understood
@@ -15,4 +22,7 @@ from sfkd_jax.artefacts._files import write_bytes as write_bytes
 from sfkd_jax.artefacts._files import write_json as write_json
 from sfkd_jax.artefacts._lines import append_jsonl as append_jsonl
 from sfkd_jax.artefacts._lines import read_jsonl as read_jsonl
+from sfkd_jax.artefacts._lines import tell as tell
 from sfkd_jax.artefacts._lines import truncate_jsonl as truncate_jsonl
+from sfkd_jax.artefacts._locks import DirectoryTaken as DirectoryTaken
+from sfkd_jax.artefacts._locks import locked as locked

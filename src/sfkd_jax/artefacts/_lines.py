@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import errno
 import os
-from collections.abc import Callable, Mapping
+import sys
+from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
 from pathlib import Path
 from typing import Any
@@ -35,27 +36,55 @@ def append_jsonl(path: Path, record: Mapping[str, Any]) -> None:
         raise failure(path, error) from error
 
 
-def read_jsonl(path: Path) -> list[dict[str, Any]]:
+def read_jsonl(
+    path: Path, *, keys: Sequence[str] = (), damaged: Callable[[str], None] | None = None
+) -> list[dict[str, Any]]:
     """The records of `path`, without a last line that was cut short.
 
+    Args:
+        path: of the file. keys: what every record must have.
+        damaged: told of every other line that is no such record, which is then left out; `tell`, for example.
+
     Raises:
-        ArtefactError: the file is missing, or a line before the last is not a JSON object.
+        ArtefactError: the file is missing; or a line before the last is no such record, and `damaged` is None.
     """
     *lines, last = read_bytes(path).split(b"\n")
-    records = [decode(path, line, where=f"line {n} ") for n, line in enumerate(lines, 1) if line.strip()]
+    records = []
+    for number, line in enumerate(lines, 1):
+        try:
+            record = decode(path, line, where=f"line {number} ") if line.strip() else None
+            if record is not None and (absent := [key for key in keys if key not in record]):
+                raise failure(path, f"line {number} lacks {', '.join(absent)}")
+            records += [record] if record is not None else []
+        except ArtefactError as reason:
+            if damaged is None:
+                raise
+            damaged(f"{reason}; left out, the other lines stay")
     with suppress(ArtefactError):
         records.append(decode(path, last))
     return records
 
 
-def truncate_jsonl(path: Path, keep: Callable[[dict[str, Any]], bool]) -> None:
+def tell(line: str) -> None:
+    """Say something on stderr."""
+    print(line, file=sys.stderr, flush=True)
+
+
+def truncate_jsonl(
+    path: Path,
+    keep: Callable[[dict[str, Any]], bool],
+    *,
+    keys: Sequence[str] = (),
+    damaged: Callable[[str], None] | None = None,
+) -> None:
     """Rewrite `path` in one step with the records to keep, as a resumed run needs; where no file is, none is made.
 
     Raises:
         ArtefactError: see `read_jsonl` and `write_json`.
     """
     if path.exists():
-        write_bytes(path, b"".join(encode(path, record) + b"\n" for record in read_jsonl(path) if keep(record)))
+        kept = [record for record in read_jsonl(path, keys=keys, damaged=damaged) if keep(record)]
+        write_bytes(path, b"".join(encode(path, record) + b"\n" for record in kept))
 
 
 def _cut_short(path: Path) -> bool:

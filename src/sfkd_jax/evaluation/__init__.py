@@ -9,7 +9,6 @@ from sfkd_jax.evaluation._metrics import score as score
 from sfkd_jax.evaluation._open_loop import open_loop as open_loop
 from sfkd_jax.evaluation._rows import compare as compare
 from sfkd_jax.evaluation._rows import disturbed as disturbed
-from sfkd_jax.evaluation._rows import merge as merge
 from sfkd_jax.evaluation._rows import pool as pool
 from sfkd_jax.evaluation._rows import row as row
 from sfkd_jax.evaluation._statistics import bootstrap_mean as bootstrap_mean

@@ -9,9 +9,6 @@ import numpy as np
 from sfkd_jax.evaluation._metrics import Scores
 from sfkd_jax.evaluation._statistics import paired_difference, summary
 
-IDENTITY = ("system", "scenario", "vehicle", "sampling", "env", "variation")
-"""What makes a row the same row."""
-
 
 def row(
     scores: Scores,
@@ -57,10 +54,12 @@ def disturbed(force: float, scores: Scores, violation: dict[str, Any]) -> dict[s
 def compare(rows: list[dict[str, Any]]) -> list[dict[str, Any]]:
     """Rows with comparisons between systems that drove the same episodes with the same sampling.
 
-    A row without sampling (a quadratic program) is compared with those that sample around feedback.
+    A row without sampling (a quadratic program) is compared with those that sample around feedback. Of several rows
+    of a system, the one with the same controller and planner is taken.
     """
     for entry in rows:
         same = [other for other in rows if _episodes(other) == _episodes(entry)]
+        same.sort(key=lambda other, entry=entry: _search(other) != _search(entry))
         for system, name, measure in _COMPARISONS:
             other = next((other for other in same if other["system"] == system), None)
             if other is None or (system == "sfkd" and other is entry):
@@ -73,6 +72,11 @@ def _episodes(entry: dict[str, Any]) -> tuple[Any, ...]:
     """Which episodes a row drove: those of equal answers are paired."""
     names = ("scenario", "vehicle", "variation")
     return *(entry[name] for name in names), entry["sampling"] or "feedback", _by_seed(entry).shape
+
+
+def _search(entry: dict[str, Any]) -> tuple[Any, ...]:
+    """How the controls of a row were found."""
+    return entry.get("controller"), entry.get("planner")
 
 
 def _by_seed(entry: dict[str, Any]) -> np.ndarray:
@@ -116,9 +120,3 @@ def _mean(values: list[Any]) -> Any:
     if all(isinstance(value, float) for value in values):
         return float(np.mean(values))
     return first if all(value == first for value in values) else None
-
-
-def merge(old: list[dict[str, Any]], new: list[dict[str, Any]]) -> list[dict[str, Any]]:
-    """New rows replace old ones with the same identity; the others stay."""
-    replaced = {tuple(entry.get(name) for name in IDENTITY) for entry in new}
-    return [entry for entry in old if tuple(entry.get(name) for name in IDENTITY) not in replaced] + new

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from typing import Any, NamedTuple, TypeAlias
 
+from sfkd_jax.artefacts import identity
 from sfkd_jax.reporting._numbers import dig, is_number
 from sfkd_jax.reporting._style import SYSTEMS, label, ordered
 
@@ -47,6 +48,16 @@ def name_of(row: Row) -> str:
     if system in SELF_EVIDENT or system.startswith("sfkd"):
         return shown
     return f"{shown} (e)" if env == "measured" else f"{shown} (no e)" if env == "none" else shown
+
+
+def search_words(row: Row) -> str:
+    """How the controls of a row were searched; controller and planner where they are not the usual ones."""
+    sampling, controller = row.get("sampling"), row.get("controller")
+    words = [_SAMPLINGS.get(str(sampling), str(sampling))] if sampling else []
+    words += [f"controller {controller}"] if controller not in (None, "mppi") else []
+    planner = identity(row)["planner"]
+    words += [f"planner {planner}"] if planner != identity({"controller": controller})["planner"] else []
+    return ", ".join(words)
 
 
 def contests(rows: list[Row]) -> list[Contest]:

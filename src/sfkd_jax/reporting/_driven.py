@@ -10,7 +10,7 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import MaxNLocator
 
 from sfkd_jax.reporting._scene import Scene, hardest_step, switches
-from sfkd_jax.reporting._style import MUTED, PLATE, canvas, legend, line, literal, ordered, principal, scenario_label
+from sfkd_jax.reporting._style import MUTED, PLATE, canvas, legend, line, literal, ordered, principal
 
 
 def deviation(scene: Scene, seconds: float = 15.0) -> Figure:
@@ -27,7 +27,7 @@ def deviation(scene: Scene, seconds: float = 15.0) -> Figure:
     top.set(
         ylabel="lateral deviation [m]",
         xlim=(0.0, end),
-        title=f"{literal(scenario_label(scene.name))}, first episode: deviation from the path",
+        title=f"{literal(scene.label)}, first episode: deviation from the path",
     )
     low, high = top.get_ylim()
     top.set_ylim(low, high + 0.2 * (high - low))
@@ -92,7 +92,7 @@ def spread(scene: Scene) -> Figure:
     for step in switches(scene.envs):
         axes.axvline(step * scene.dt, color=MUTED, linestyle=(0, (4, 3)), linewidth=0.5, alpha=0.5, zorder=1)
     count = max(values.shape[0] for values in scene.lateral.values())
-    title = f"{literal(scenario_label(scene.name))}: " + (
+    title = f"{literal(scene.label)}: " + (
         "the one episode" if count == 1 else f"median and 5–95 % band of {count} episodes"
     )
     axes.set(xlabel="time [s]", ylabel="|lateral deviation| [m]", title=title, xlim=(0, time[-1]))
@@ -119,7 +119,7 @@ def steering(scene: Scene, seconds: float = 10.0) -> Figure:
             axes.axvline(step * scene.dt, color=MUTED, linestyle=(0, (4, 3)), linewidth=0.9, zorder=1)
     limits = (start * scene.dt, (start + span) * scene.dt)
     axes.set(xlabel="time [s]", ylabel="steering command [rad]", xlim=limits)
-    axes.set_title(f"{literal(scenario_label(scene.name))}, first episode: steering around the hardest moment")
+    axes.set_title(f"{literal(scene.label)}, first episode: steering around the hardest moment")
     axes.grid(visible=False, axis="x")
     legend(figure, axes)
     return figure

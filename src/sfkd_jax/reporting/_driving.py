@@ -9,7 +9,6 @@ from sfkd_jax.reporting._blocks import Block, Heading, Missing, Text, picture
 from sfkd_jax.reporting._driven import deviation, spread, steering
 from sfkd_jax.reporting._numbers import dig, is_number, short
 from sfkd_jax.reporting._scene import Scene, scenes_of
-from sfkd_jax.reporting._style import scenario_label
 from sfkd_jax.reporting._tables import block_title, closed_loop, closed_loop_more, planner_table, violation_table
 from sfkd_jax.reporting._track import EXAGGERATION, track
 from sfkd_jax.reporting._violations import disturbed, violations
@@ -60,12 +59,12 @@ def _scores(block: list[dict[str, Any]]) -> list[Block]:
 
 def _scene_pictures(scene: Scene, place: Path, *, full: bool) -> list[Block]:
     """Deviation of one scenario; with `full` also all episodes, the road from above and the steering."""
-    name = scenario_label(scene.name)
+    name = scene.label
     caption = (
         f"{name}, first episode: signed lateral deviation from the path, left positive. Dashed lines mark "
         "where friction and wind switch; below, what they are."
     )
-    stem = "".join(letter if letter.isalnum() else "_" for letter in scene.name)
+    stem = scene.stem
     blocks: list[Block] = [picture(place, f"deviation_{stem}", caption, deviation, scene)]
     if not full:
         return blocks

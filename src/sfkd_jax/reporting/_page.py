@@ -5,7 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Any
 
-from sfkd_jax.artefacts import read_jsonl, write_bytes
+from sfkd_jax.artefacts import read_jsonl, tell, write_bytes
 from sfkd_jax.reporting import _sections as sections
 from sfkd_jax.reporting._blocks import Block, Heading, Picture, Text, to_html, to_markdown
 from sfkd_jax.reporting._driving import driving
@@ -40,7 +40,7 @@ def write_report(run: Path) -> dict[str, Any]:
     for stale in place.glob("*.png"):
         stale.unlink()
     log, errors = run / "metrics.jsonl", read(run / "open_loop.json")
-    metrics = read_jsonl(log) if log.exists() else []
+    metrics = read_jsonl(log, damaged=tell) if log.exists() else []
     certificate = about(policy, read(run / "certificate.json"))
     results = read(run / "results.json") or {}
     rows = blocks_of(results.get("rows") or [])

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from typing import Any
 
-from sfkd_jax.reporting._benchmark_rows import name_of
+from sfkd_jax.reporting._benchmark_rows import name_of, search_words
 from sfkd_jax.reporting._benchmark_tables import certified, percent
 from sfkd_jax.reporting._blocks import Table
 from sfkd_jax.reporting._numbers import DASH, dig, interval, is_number, mean_std, number, plain, short, upper
@@ -18,7 +18,7 @@ _SEES = {"measured": "measured", "estimated": "estimated", "none": "no"}
 
 
 def blocks_of(rows: list[dict[str, Any]]) -> list[list[dict[str, Any]]]:
-    """Closed-loop rows that may be compared: one list per scenario, vehicle and sampling.
+    """Closed-loop rows that may be compared: one list per scenario, vehicle, sampling, controller and planner.
 
     A row without sampling (its controller draws none) stands in every block of its scenario and vehicle.
     """
@@ -27,9 +27,9 @@ def blocks_of(rows: list[dict[str, Any]]) -> list[list[dict[str, Any]]]:
     found = []
     for place in places:
         here = [row for row in rows if tuple(str(row.get(key)) for key in where) == place]
-        kinds = sorted({row["sampling"] for row in here if row.get("sampling")}) or [None]
-        for kind in kinds:
-            block = [row for row in here if row.get("sampling") in (kind, None)]
+        kinds = {(row["sampling"], search_words(row)) for row in here if row.get("sampling")}
+        for kind in sorted(kinds) or [None]:
+            block = [row for row in here if not row.get("sampling") or (row["sampling"], search_words(row)) == kind]
             rank = {name: index for index, name in enumerate(ordered({str(r.get("system")) for r in block}))}
             found.append(sorted(block, key=lambda row: rank[str(row.get("system"))]))
     return found
@@ -38,14 +38,13 @@ def blocks_of(rows: list[dict[str, Any]]) -> list[list[dict[str, Any]]]:
 def block_title(block: list[dict[str, Any]]) -> str:
     """What a block of rows has in common, in words."""
     row = block[0]
-    kind = next((r["sampling"] for r in block if r.get("sampling")), None)
-    ways = {"feedback": "sampling around a feedback law", "plain": "plain sampling"}
+    way = search_words(next((r for r in block if r.get("sampling")), {}))
     parts = [f"Scenario {scenario_label(str(row.get('scenario')))}"]
     if row.get("vehicle"):
         loop = " under a speed loop" if row.get("inner_loop") == "speed" else ""
         parts.append(f"{row['vehicle']} vehicle{loop}")
-    if kind:
-        parts.append(ways.get(str(kind), str(kind)))
+    if way:
+        parts.append(way)
     if is_number(row.get("episodes")):
         length = f" of {short(row['episode_s'])} s" if is_number(row.get("episode_s")) else ""
         parts.append(f"{short(row['episodes'])} episodes{length}")

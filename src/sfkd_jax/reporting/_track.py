@@ -9,7 +9,7 @@ from matplotlib.figure import Figure
 from matplotlib.patches import Circle
 
 from sfkd_jax.reporting._scene import Scene, hardest_step, switches
-from sfkd_jax.reporting._style import MUTED, PLATE, WIDTH, canvas, legend, line, literal, ordered, scenario_label
+from sfkd_jax.reporting._style import MUTED, PLATE, WIDTH, canvas, legend, line, literal, ordered
 
 EXAGGERATION = 10
 """How many times the overhead close-up widens a deviation."""
@@ -50,7 +50,7 @@ def track(scene: Scene) -> Figure:
     above.set(
         xlabel="x [m]",
         ylabel="y [m]",
-        title=f"{literal(scenario_label(scene.name))}, first episode: the road from above",
+        title=f"{literal(scene.label)}, first episode: the road from above",
     )
     below.plot(*close.road, color="#d5dae1", linewidth=4, zorder=1, label="Path")
     for name, points in close.tracks.items():

@@ -13,7 +13,7 @@ from matplotlib.ticker import FuncFormatter, MaxNLocator
 from sfkd_jax.reporting._curves import numbers
 from sfkd_jax.reporting._numbers import short, upper
 from sfkd_jax.reporting._scene import Scene, hardest_step
-from sfkd_jax.reporting._style import ACCENT, MUTED, PLATE, SECOND, canvas, literal, scenario_label
+from sfkd_jax.reporting._style import ACCENT, MUTED, PLATE, SECOND, canvas, literal
 
 _WASH = "#dce8f7"
 _REACH = (4.0, 11.0)  # least and most of half the height of the picture from above [m]
@@ -55,7 +55,7 @@ def tube_on_drive(scene: Scene, system: str, radii: list[float], errors: list[An
     figure = canvas(5.6)
     above, below = figure.subplots(2, 1, height_ratios=[1.25, 1])
     _from_above(above, scene, states[:, :2], start, radii)
-    above.set_title(f"{literal(scenario_label(scene.name))}, first episode: the certified tube about the way driven")
+    above.set_title(f"{literal(scene.label)}, first episode: the certified tube about the way driven")
     below.fill_between(steps, radii, 1e-9, color=_WASH, linewidth=0)
     below.plot(steps, radii, color=ACCENT, marker="o", markersize=3.5)
     measured = numbers(errors, len(radii))

@@ -5,6 +5,7 @@ from __future__ import annotations
 import shlex
 from typing import Any
 
+from sfkd_jax.artefacts import identity
 from sfkd_jax.reporting._blocks import Text
 from sfkd_jax.reporting._numbers import DASH, dig, interval, is_number, mean_std, number, plain, short, upper
 from sfkd_jax.reporting._style import label, scenario_label
@@ -30,12 +31,20 @@ def model_of(settings: dict[str, Any]) -> str:
 
 
 def headline(blocks: list[list[dict[str, Any]]], settings: dict[str, Any]) -> list[dict[str, Any]]:
-    """The block the summary speaks of: the run's own scenario, else the last; feedback sampling first."""
+    """The block the summary speaks of: the run's own scenario, else the last; feedback, then its controller first."""
     experiment = str(settings.get("experiment"))
     own = [block for block in blocks if experiment.startswith(str(block[0].get("scenario")))] or blocks
     last = [block for block in own if block[0].get("scenario") == own[-1][0].get("scenario")] if own else []
     feedback = [block for block in last if any(row.get("sampling") == "feedback" for row in block)]
-    return (feedback or last or [[]])[0]
+    same = [block for block in feedback or last if any(_own_controller(row, settings) for row in block)]
+    return (same or feedback or last or [[]])[0]
+
+
+def _own_controller(row: dict[str, Any], settings: dict[str, Any]) -> bool:
+    """Whether a row drove with the controller that the run was made with."""
+    own = settings.get("controller") or {}
+    usual = identity({"controller": own.get("name")} | {key: own[key] for key in ("planner",) if key in own})
+    return all(identity(row)[key] == usual[key] for key in ("controller", "planner"))
 
 
 def row_of(block: list[dict[str, Any]], system: str) -> dict[str, Any]:

@@ -9,6 +9,7 @@ import time
 from contextlib import suppress
 from pathlib import Path
 from types import TracebackType
+from typing import Any
 
 from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
@@ -16,7 +17,15 @@ from tensorboardX.event_file_writer import EventsWriter
 from tensorboardX.proto.event_pb2 import Event, SessionLog  # pyright: ignore[reportAttributeAccessIssue] made by protobuf
 from tensorboardX.summary import scalar
 
+from sfkd_jax.artefacts import tell, truncate_jsonl
+
 GOES_ON = "the same command goes on from the last checkpoint"
+
+
+def _step(line: dict[str, Any]) -> int | float:
+    """The step of a line; what is no number belongs to no step that is kept."""
+    step = line["step"]
+    return step if isinstance(step, int | float) else math.inf
 
 
 class TrainingLog:
@@ -30,10 +39,9 @@ class TrainingLog:
         """
         self._steps = steps
         self._path = directory / "metrics.jsonl"
-        kept = [line for line in self._lines() if line["step"] <= resumed_at]
-        rewritten = self._path.with_suffix(".part")
-        rewritten.write_text("".join(json.dumps(line) + "\n" for line in kept))
-        rewritten.replace(self._path)
+        self._path.parent.mkdir(parents=True, exist_ok=True)
+        self._path.touch()
+        truncate_jsonl(self._path, lambda line: _step(line) <= resumed_at, keys=("step",), damaged=tell)
         board = directory / "tensorboard" / "events"
         board.parent.mkdir(exist_ok=True)
         # Not SummaryWriter: of a full disk its thread would tell at the end of the process, with a trace.
@@ -45,20 +53,6 @@ class TrainingLog:
         self._bar = Progress(*columns, TextColumn("{task.fields[note]}"), console=console)
         self._task = self._bar.add_task("training", total=steps, completed=resumed_at, note="")
         self._shows_bar = console.is_terminal
-
-    def _lines(self) -> list[dict]:
-        """Complete lines so far; a line cut off by a kill does not count."""
-        lines = self._path.read_text().splitlines() if self._path.exists() else []
-        complete = []
-        for line in lines:
-            try:
-                record = json.loads(line)
-            except json.JSONDecodeError:
-                break
-            if not isinstance(record, dict) or not isinstance(record.get("step"), int | float):
-                break
-            complete.append(record)
-        return complete
 
     def __enter__(self) -> TrainingLog:
         """Start the bar, if there is a terminal to show it."""

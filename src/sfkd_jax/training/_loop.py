@@ -5,7 +5,6 @@ from __future__ import annotations
 import math
 import time
 from collections.abc import Callable
-from functools import partial
 from pathlib import Path
 from typing import Any, NamedTuple, TypeAlias
 
@@ -14,6 +13,7 @@ import jax.numpy as jnp
 import optax
 
 from sfkd_jax.training._checkpoints import Checkpoints
+from sfkd_jax.training._interruption import Interrupted, Interruption
 from sfkd_jax.training._log import TrainingLog
 from sfkd_jax.training._losses import Loss
 from sfkd_jax.training._optimizer import optimizer
@@ -53,6 +53,7 @@ def fit(
     """Train, or continue what `directory` holds, and return the parameters with the best validation loss.
 
     Windows are drawn with a key folded with the step, so an interrupted run ends bit-identical to an unbroken one.
+    SIGINT or SIGTERM saves the state of the last log line before it raises.
 
     Args:
         model, loss: what is trained, and by which loss. To train on from parameters at hand, a model whose `init`
@@ -68,25 +69,25 @@ def fit(
         Best parameters, and the step they were reached at.
 
     Raises:
-        TrainingStopped: the loss or a gradient is not finite.
+        TrainingStopped: the loss or a gradient is not finite. KeyboardInterrupt: on SIGINT or SIGTERM.
         ValueError: steps or save_every are no multiples of log_every.
     """
     if save_every % log_every or steps % log_every:
         raise ValueError(f"training.steps and save_every must be multiples of log_every = {log_every}")
     init_key, data_key = jax.random.split(key)
     transform, schedule = optimizer(steps=steps, learning_rate=learning_rate, clip_norm=clip_norm)
-    advance = _chunk(loss, transform, draw, data_key, length=log_every)
-    validate = jax.jit(loss)
     params = jax.jit(model.init)(init_key)
     state = TrainState(jnp.zeros((), jnp.int32), params, transform.init(params))
     checkpoints = Checkpoints(directory / "checkpoints")
     try:
         state = checkpoints.resume(state)
-        start = int(state.step)
-        with TrainingLog(directory, steps=steps, resumed_at=start) as log:
+        start, logged = int(state.step), state
+        with TrainingLog(directory, steps=steps, resumed_at=start) as log, Interruption() as interruption:
+            advance = interruption.compiled(_chunk(loss, transform, draw, data_key, length=log_every), state, data)
+            validate = interruption.compiled(jax.jit(loss), params, held_out)
             began = time.perf_counter()
             for done in range(start + log_every, steps + 1, log_every):
-                state, record = advance(state, data)
+                state, record = interruption.ready(advance(state, data))
                 record = {name: float(value) for name, value in record.items()}
                 record |= {
                     "step": done,
@@ -95,17 +96,22 @@ def fit(
                 }
                 saves = done % save_every == 0 or done == steps
                 if saves:
-                    total, parts = validate(state.params, held_out)
+                    total, parts = interruption.ready(validate(state.params, held_out))
                     record |= {"validation_loss": float(total), "validation_prediction": float(parts["prediction"])}
                     record |= inspect(state.params) if inspect else {}
                 if not all(math.isfinite(value) for value in record.values()):
                     kept = checkpoints.latest_step()
                     raise TrainingStopped(f"non-finite loss near step {done}; the last good checkpoint is step {kept}")
                 log.write(record)  # before the checkpoint: a resumed run drops lines, it cannot invent them
+                logged = state
                 if saves:
                     checkpoints.save(done, state, validation_loss=record["validation_loss"])
         best = checkpoints.best_step() or steps
         return checkpoints.restore(best, state).params, best
+    except Interrupted:
+        if int(logged.step) > start:  # never the best one: an unbroken run does not choose among these
+            checkpoints.save(int(logged.step), logged, validation_loss=math.inf)
+        raise
     finally:
         checkpoints.close()
 
@@ -121,7 +127,7 @@ def _chunk(
     """`length` optimiser steps as one compiled call: state, data -> state, mean metrics."""
     gradient = jax.value_and_grad(loss, has_aux=True)
 
-    @partial(jax.jit, donate_argnums=0)
+    @jax.jit  # not donated: an interrupted run saves the state from which a chunk started
     def chunk(state: TrainState, data: Trajectory) -> tuple[TrainState, dict[str, jax.Array]]:
         def step(state: TrainState, _: None) -> tuple[TrainState, dict[str, jax.Array]]:
             batch = draw(data, jax.random.fold_in(key, state.step))

@@ -1,0 +1,217 @@
+"""Several processes at one directory: nothing is lost, and whoever finds it taken is told by whom."""
+
+import json
+import re
+import signal
+import subprocess
+import sys
+import textwrap
+import time
+from pathlib import Path
+
+import numpy as np
+import pytest
+from helpers import refusal_of
+
+from sfkd_jax import artefacts, evaluate
+from sfkd_jax.artefacts import DirectoryTaken, locked
+from sfkd_jax.reporting._scene import scenes_of
+from sfkd_jax.reporting._tables import block_title, blocks_of
+
+ROW = {
+    "system": "sfkd", "scenario": "s3", "vehicle": "kinematic", "inner_loop": "none", "controller": "mppi",
+    "planner": "mppi", "sampling": "feedback", "env": "measured", "variation": None,
+}  # fmt: skip
+SETTINGS = {"vehicle": {}, "controller": {}, "evaluation": {}}
+HOLD = """
+    import sys, time
+    from pathlib import Path
+    from sfkd_jax.artefacts import locked
+    with locked(Path(sys.argv[1])):
+        print("held", flush=True)
+        time.sleep(float(sys.argv[2]))
+"""
+
+
+def started(program, *arguments):
+    """A process that runs a program; its first line of output says that it is ready."""
+    command = [sys.executable, "-c", textwrap.dedent(program), *map(str, arguments)]
+    process = subprocess.Popen(command, stdout=subprocess.PIPE, stdin=subprocess.PIPE, text=True)
+    assert process.stdout.readline().strip()
+    return process
+
+
+def driven(row, value=0.0, episodes=2, steps=40):
+    """Arrays of a row as `evaluate` stores them, filled with a value."""
+    shapes = {"lateral": (steps,), "states": (steps + 1, 4), "controls": (steps, 2), "envs": (steps, 2), "path": (9, 4)}
+    name = artefacts.drive_name(row)
+    return {f"{name}/{part}": np.full((episodes, *shape), float(value)) for part, shape in shapes.items()}
+
+
+def store(place, row, value=0.0):
+    evaluate._write(place, SETTINGS, [row], driven(row, value) | {"dt": np.asarray(0.1)}, 0.0)
+
+
+def stored(place):
+    """Rows, and the arrays by the name of their drive."""
+    rows = artefacts.read_json(place / "results.json")["rows"]
+    return rows, artefacts.read_arrays(place / "episodes.npz", kind="episodes")[0]
+
+
+# ---- the lock
+
+
+def test_a_taken_directory_is_refused_at_once_in_a_line_that_says_by_whom(tmp_path):
+    holder = started(HOLD, tmp_path, 60)
+    began = time.monotonic()
+    with pytest.raises(DirectoryTaken) as told, locked(tmp_path):
+        pass
+    assert time.monotonic() - began < 5.0
+    holder.kill()
+    holder.wait()
+    line = str(told.value)
+    assert "\n" not in line
+    assert line.startswith(f"{tmp_path}: process {holder.pid} on ")
+    assert re.search(r"\(python -c .*since \d{4}-\d\d-\d\d \d\d:\d\d:\d\d\+00:00\) is writing there", line)
+
+
+def test_kill_9_frees_a_directory(tmp_path):
+    holder = started(HOLD, tmp_path, 60)
+    holder.send_signal(signal.SIGKILL)
+    holder.wait()
+    with locked(tmp_path):
+        assert artefacts.read_json(tmp_path / ".lock.json")["pid"] != holder.pid
+    assert not (tmp_path / ".lock.json").exists()
+
+
+def test_who_waits_is_told_and_gets_it(tmp_path, capfd):
+    holder = started(HOLD, tmp_path, 3.5)
+    with locked(tmp_path, wait=True):
+        assert holder.wait(10) == 0
+    (line,) = capfd.readouterr().err.splitlines()
+    assert line.startswith(f"waiting: {tmp_path}: process {holder.pid} on ")
+
+
+def test_a_process_enters_what_it_holds_again_and_leaves_it_once(tmp_path):
+    with locked(tmp_path):
+        with locked(tmp_path / "." / ""):
+            pass
+        process = subprocess.run(
+            [sys.executable, "-c", textwrap.dedent(HOLD), str(tmp_path), "0"], capture_output=True, text=True
+        )
+        assert "is writing there" in process.stderr
+    assert started(HOLD, tmp_path, 0).wait() == 0
+
+
+@pytest.mark.parametrize("errno", [38, 95, 37])
+def test_a_file_system_without_locks_gets_a_file_with_the_process_in_it(tmp_path, monkeypatch, errno):
+    """Such a file outlives its process, so another one must see that it is of nobody."""
+
+    def absent(descriptor):
+        raise OSError(errno, "no locks here")
+
+    monkeypatch.setattr("filelock._unix.lock_fd_nonblocking", absent)
+    with locked(tmp_path):
+        assert (tmp_path / ".lock.soft").exists()
+    assert not (tmp_path / ".lock.soft").exists()
+
+
+def test_a_directory_that_cannot_be_made_is_one_line(tmp_path):
+    (tmp_path / "file").touch()
+
+    def take():
+        with locked(tmp_path / "file" / "run"):
+            pass
+
+    assert str(tmp_path / "file" / "run") in refusal_of(take)
+
+
+# ---- rows and episodes
+
+
+WRITER = """
+    import sys, time
+    sys.path.insert(0, sys.argv[3])
+    from pathlib import Path
+    from test_writers import ROW, store
+    place, me = Path(sys.argv[1]), int(sys.argv[2])
+    print("ready", flush=True)
+    begins = float(sys.stdin.readline())
+    for number in range(10):
+        time.sleep(max(0.0, begins + 0.3 * number + 0.02 * me - time.time()))
+        store(place, ROW | {"system": f"writer{me}", "scenario": f"road{number}"}, 10 * me + number)
+"""
+
+
+def test_two_processes_20_ms_apart_lose_no_row_and_no_episode(tmp_path):
+    writers = [started(WRITER, tmp_path, me, Path(__file__).parent) for me in (0, 1)]
+    begins = time.time() + 0.5
+    for writer in writers:
+        writer.communicate(f"{begins}\n", timeout=120)
+        assert writer.returncode == 0
+    rows, arrays = stored(tmp_path)
+    assert {(row["system"], row["scenario"]) for row in rows} == {
+        (f"writer{me}", f"road{number}") for me in (0, 1) for number in range(10)
+    }
+    assert len(rows) == 20
+    for row in rows:
+        value = 10 * int(row["system"][-1]) + int(row["scenario"][4:])
+        assert np.all(arrays[f"{artefacts.drive_name(row)}/lateral"] == value)
+
+
+def test_three_planners_in_one_directory_keep_three_rows_with_their_episodes(tmp_path):
+    rows = [ROW | {"controller": name, "planner": name} for name in ("mppi", "cem", "gradient")]
+    for value, row in enumerate(rows, 1):
+        store(tmp_path, row, value)
+    kept, arrays = stored(tmp_path)
+    assert [row["planner"] for row in kept] == ["mppi", "cem", "gradient"]
+    for value, row in enumerate(kept, 1):
+        for part in ("lateral", "states", "controls", "envs", "path"):
+            assert np.all(arrays[f"{artefacts.drive_name(row)}/{part}"] == value)
+    scenes = scenes_of(tmp_path)
+    assert {scene.lateral["sfkd"][0, 0]: "cem" in scene.label for scene in scenes} == {1: False, 2: True, 3: False}
+    assert len({scene.stem for scene in scenes}) == 3
+    blocks = blocks_of(kept)
+    assert [len(block) for block in blocks] == [1, 1, 1]
+    assert len({block_title(block) for block in blocks}) == 3
+    store(tmp_path, rows[1], 7.0)
+    kept, arrays = stored(tmp_path)
+    assert len(kept) == 3
+    assert np.all(arrays[f"{artefacts.drive_name(rows[1])}/lateral"] == 7.0)
+
+
+@pytest.mark.parametrize("name", list(ROW))
+def test_rows_that_differ_in_one_part_of_their_identity_are_two(name):
+    other = ROW | {name: "other"}
+    assert artefacts.merge([ROW], [other]) == [ROW, other]
+    assert artefacts.merge([ROW], [dict(ROW)]) == [ROW]
+    assert artefacts.drive_name(ROW) != artefacts.drive_name(other)
+    known = {key: value for key, value in artefacts.identity(other).items() if value is not None}
+    assert artefacts.drive_of(artefacts.drive_name(other)) == known
+
+
+def test_rows_and_episodes_of_an_earlier_version_are_read_and_replaced(tmp_path):
+    """It had no planner in its rows, and named arrays by system and scenario alone."""
+    old = {name: value for name, value in ROW.items() if name not in ("planner", "inner_loop")}
+    arrays = {f"sfkd/s3/{name.rpartition('/')[2]}": array for name, array in driven(ROW, 1.0).items()}
+    arrays |= {f"s3/{part}": arrays.pop(f"sfkd/s3/{part}") for part in artefacts.ROAD}
+    artefacts.write_arrays(tmp_path / "episodes.npz", arrays | {"dt": np.asarray(0.1)}, kind="episodes", config={})
+    artefacts.write_json(tmp_path / "results.json", {"rows": [old]})
+    (scene,) = scenes_of(tmp_path)
+    assert (scene.label, scene.stem, list(scene.lateral)) == ("S3", "s3", ["sfkd"])
+    store(tmp_path, ROW | {"planner": "cem"}, 2.0)
+    rows, kept = stored(tmp_path)
+    assert len(rows) == 2
+    for part in ("lateral", *artefacts.ROAD):
+        assert np.all(kept[f"{artefacts.drive_name(ROW)}/{part}"] == 1.0)
+    store(tmp_path, ROW, 3.0)
+    assert json.loads((tmp_path / "results.json").read_text())["rows"] == [ROW | {"planner": "cem"}, ROW]
+    assert len(scenes_of(tmp_path)) == 2
+
+
+def test_drives_on_other_roads_are_other_scenes(tmp_path):
+    """As when the rest of the systems are driven again with more episodes."""
+    store(tmp_path, ROW | {"system": "nominal", "env": "none"}, 1.0)
+    store(tmp_path, ROW | {"system": "oracle"}, 1.0)
+    store(tmp_path, ROW, 2.0)
+    assert sorted(sorted(scene.lateral) for scene in scenes_of(tmp_path)) == [["nominal", "oracle"], ["sfkd"]]
