@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 import errno
+import io
 import os
 from collections.abc import Callable, Mapping
-from contextlib import suppress
+from contextlib import nullcontext, suppress
 from pathlib import Path
 from typing import Any
 
-from sfkd_jax.artefacts._files import ArtefactError, decode, encode, failure, read_bytes, write_bytes
+from sfkd_jax.artefacts._files import ArtefactError, decode, encode, failure, open_regular, read_bytes, write_bytes
 
 
 def append_jsonl(path: Path, record: Mapping[str, Any]) -> None:
@@ -41,10 +42,10 @@ def read_jsonl(path: Path) -> list[dict[str, Any]]:
     Raises:
         ArtefactError: the file is missing, or a line before the last is not a JSON object.
     """
-    *lines, last = read_bytes(path).split(b"\n")
-    records = [decode(path, line, where=f"line {n} ") for n, line in enumerate(lines, 1) if line.strip()]
-    with suppress(ArtefactError):
-        records.append(decode(path, last))
+    content, records = read_bytes(path), []
+    for number, line in enumerate(io.BytesIO(content), 1):
+        with nullcontext() if line.endswith(b"\n") else suppress(ArtefactError):
+            records += [decode(path, line, where=f"line {number} ")] if line.strip() else []
     return records
 
 
@@ -62,6 +63,6 @@ def _cut_short(path: Path) -> bool:
     """Whether the last byte is not the end of a line."""
     if not path.exists() or not path.stat().st_size:
         return False
-    with path.open("rb") as file:
+    with open_regular(path) as file:
         file.seek(-1, os.SEEK_END)
-        return file.read() != b"\n"
+        return file.read(1) != b"\n"

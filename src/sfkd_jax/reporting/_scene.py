@@ -8,7 +8,7 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Float
 
-from sfkd_jax.artefacts import ArtefactError
+from sfkd_jax.artefacts import read_npz
 
 
 class Scene(NamedTuple):
@@ -56,11 +56,7 @@ def scenes_of(run: Path) -> list[Scene]:
 
 def read_scenes(path: Path) -> dict[str, Scene]:
     """The scenarios in an `episodes.npz` that have at least one lateral deviation, by name in order."""
-    try:
-        with np.load(path, allow_pickle=False) as archive:
-            arrays = {name: archive[name] for name in archive.files}
-    except Exception as reason:  # a damaged archive raises nearly anything
-        raise ArtefactError(f"{path}: damaged, not an archive of arrays ({type(reason).__name__})") from reason
+    arrays = read_npz(path)
     dt = float(arrays.pop("dt", 0.1))
     parts = [(*name.split("/"), values) for name, values in arrays.items()]
     found: dict[str, Scene] = {}
