@@ -52,9 +52,23 @@ def read_json(path: Path, *, keys: Sequence[str] = ()) -> dict[str, Any]:
 def failure(path: Path, reason: object) -> ArtefactError:
     """The error to raise about `path`; `reason` may be an exception of any length."""
     text = reason.strerror or reason if isinstance(reason, OSError) else reason
+    return ArtefactError(f"{path}: {one_line(text)}")
+
+
+def one_line(text: object) -> str:
+    """A reason as a terminal shows it: nothing that breaks or colours the line, and not all that a file holds."""
     line = " ".join(str(text)[: 4 * LONGEST_LINE].split())
     line = "".join(letter if letter.isprintable() else ascii(letter)[1:-1] for letter in line)
-    return ArtefactError(f"{path}: {line if len(line) <= LONGEST_LINE else f'{line[:LONGEST_LINE]}...'}")
+    return line if len(line) <= LONGEST_LINE else f"{line[:LONGEST_LINE]}..."
+
+
+@contextmanager
+def writing(path: Path) -> Iterator[None]:
+    """What the disk refuses while several files are made becomes an ArtefactError about the file, or about `path`."""
+    try:
+        yield
+    except OSError as reason:
+        raise failure(Path(os.fsdecode(reason.filename)) if reason.filename else path, reason) from reason
 
 
 @contextmanager
