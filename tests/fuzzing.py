@@ -160,6 +160,7 @@ def main() -> None:
         seconds = {"slowest_s": round(slowest, 3), "seconds": round(time.monotonic() - started, 1)}
         found["readers"][name] = {"cases": len(numbers), **outcomes, **seconds}
         found["faults"] += faults
+        print(name, found["readers"][name], file=sys.stderr, flush=True)
     peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
     found |= {"cases": sum(entry["cases"] for entry in found["readers"].values()), "seed": asked.seed}
     found |= {"memory_MiB": {"before": before >> 10, "grown_by": (peak - before) >> 10, "bound": MEMORY >> 20}}

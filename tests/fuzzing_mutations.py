@@ -91,7 +91,7 @@ def json_change(draw: random.Random, content: bytes) -> bytes:
     for _ in range(draw.choice((1, 1, 1, 2, 4))):
         document = value_change(draw, document)
     text = json.dumps(document, indent=draw.choice((None, 2)))
-    while "@@raw" in text:
+    for _ in range(text.count('"@@raw"')):
         text = text.replace('"@@raw"', draw.choice(LITERALS), 1)
     return text.encode("utf-8", "surrogatepass")
 
@@ -117,7 +117,7 @@ def value_change(draw: random.Random, document: Any) -> Any:
         other, place = draw.choice(places)
         inner[key] = json.loads(json.dumps(other[place]))
     elif kind == 6 and isinstance(value, list):
-        inner[key] = draw.choice((value[:1], value[1:], value * 3, value[::-1], value + [None]))
+        inner[key] = draw.choice((value[:1], value[1:], value * 3, value[::-1], [*value, None]))
     else:
         inner[key] = draw.choice(VALUES)
     return document
@@ -255,7 +255,7 @@ def _header(draw: random.Random, member: bytes) -> bytes:
     else:
         at = draw.randrange(len(text))
         text = text[:at] + new + text[at:]
-    version, width = draw.choice((((1, "<H"),) * 8 + ((2, "<I"), (3, "<I"), (0, "<H"), (9, "<H"))))
+    version, width = draw.choice(((1, "<H"),) * 8 + ((2, "<I"), (3, "<I"), (0, "<H"), (9, "<H")))
     declared = draw.choice((len(text),) * 6 + (0, 1, 65535, len(text) + 7))
     if width == "<I":
         declared = draw.choice((declared, declared, 2**32 - 1))
@@ -287,11 +287,11 @@ def _fields(draw: random.Random, content: bytes) -> bytes:
 def bomb(size: int) -> bytes:
     """An archive with one array of so many MiB of zeros, of which it holds a thousandth."""
     packed, header = io.BytesIO(), b"{'descr': '|u1', 'fortran_order': False, 'shape': (%d,), }\n" % (size << 20)
-    with zipfile.ZipFile(packed, "w", zipfile.ZIP_DEFLATED, compresslevel=1) as archive:
-        with archive.open("t.npy", "w") as entry:
-            entry.write(b"\x93NUMPY\x01\0" + struct.pack("<H", len(header)) + header)
-            for _ in range(size):
-                entry.write(bytes(1 << 20))
+    archive = zipfile.ZipFile(packed, "w", zipfile.ZIP_DEFLATED, compresslevel=1)
+    with archive, archive.open("t.npy", "w") as entry:
+        entry.write(b"\x93NUMPY\x01\0" + struct.pack("<H", len(header)) + header)
+        for _ in range(size):
+            entry.write(bytes(1 << 20))
     return packed.getvalue()
 
 

@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 from PIL import Image
 
+from sfkd_jax.artefacts import ArtefactError
 from sfkd_jax.reporting import write_report
 from sfkd_jax.reporting._numbers import upper
 from sfkd_jax.reporting._scene import scenes_of
@@ -281,7 +282,7 @@ def test_a_missing_input_is_named_with_the_command_that_makes_it(tmp_path, name,
 
 
 def test_a_policy_alone_is_enough_and_no_policy_is_refused(tmp_path):
-    with pytest.raises(FileNotFoundError, match=r"sfkd_jax\.train"):
+    with pytest.raises(ArtefactError, match=r"sfkd_jax\.train"):
         write_report(tmp_path)
     settings = documents()["policy.json"]["settings"] | {"experiment": "default", "seed": 3}
     settings["model"] = {"name": "sfkd", "system": "sfkd_soft"}

@@ -9,7 +9,7 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Float, Int
 
-from sfkd_jax.artefacts import ArtefactError, read_npz
+from sfkd_jax.artefacts import ArtefactError, one_line, read_npz
 from sfkd_jax.datasets._files import digest, log_files
 from sfkd_jax.datasets._tables import Table, read_csv, read_parquet
 
@@ -79,7 +79,7 @@ def read_logs(path: str, columns: Columns, *, dt: float, told: bool) -> tuple[li
         try:
             logs += _open(file, columns, dt, told)
         except (ArtefactError, ValueError) as reason:
-            lines.append(str(reason))
+            lines.append(one_line(reason))
     return logs, sorted(lines)
 
 
