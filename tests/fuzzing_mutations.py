@@ -8,6 +8,7 @@ import random
 import socket
 import struct
 import zipfile
+from copy import deepcopy
 from functools import cache
 from pathlib import Path
 from typing import Any
@@ -100,7 +101,7 @@ def value_change(draw: random.Random, document: Any) -> Any:
     """One value gone, replaced, doubled, moved or made larger, anywhere in a document."""
     places = list(_places(document))
     if not places:
-        return draw.choice(VALUES)
+        return deepcopy(draw.choice(VALUES))
     inner, key = draw.choice(places)
     value, kind = inner[key], draw.randrange(8)
     if kind == 0:
@@ -110,16 +111,16 @@ def value_change(draw: random.Random, document: Any) -> Any:
     elif kind == 2 and isinstance(inner, dict):
         inner[draw.choice(("x", "", "a\0", "kind", "..", "é"))] = inner.pop(key)
     elif kind == 3:
-        inner[key] = draw.choice(([value], {"a": value}, str(value), [value, value]))
+        inner[key] = draw.choice(([value], {"a": value}, str(value), [value, deepcopy(value)]))
     elif kind == 4 and isinstance(value, (int, float)):
         inner[key] = draw.choice((-value, value * 1e30, value + 1, float(value), str(value)))
     elif kind == 5:
         other, place = draw.choice(places)
         inner[key] = json.loads(json.dumps(other[place]))
     elif kind == 6 and isinstance(value, list):
-        inner[key] = draw.choice((value[:1], value[1:], value * 3, value[::-1], [*value, None]))
+        inner[key] = draw.choice((value[:1], value[1:], deepcopy(value) + value, value[::-1], [*value, None]))
     else:
-        inner[key] = draw.choice(VALUES)
+        inner[key] = deepcopy(draw.choice(VALUES))  # of which later changes would else change all
     return document
 
 
