@@ -22,7 +22,7 @@ ARROWS = {
     "artefacts": set(),
     "vehicle": HALLWAY,
     "scenarios": HALLWAY | {"vehicle"},
-    "datasets": HALLWAY | {"vehicle", "scenarios"},
+    "datasets": HALLWAY | {"vehicle", "scenarios", "artefacts"},
     "models": HALLWAY,
     "training": HALLWAY | {"artefacts"},
     "certification": HALLWAY,

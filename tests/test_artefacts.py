@@ -261,9 +261,18 @@ def test_foreign_files_are_refused_each_in_its_own_words(path, tmp_path):
     np.savez(path, a=np.zeros(3))
     assert "does not match its manifest: sha256" in refusal(read, path)
     np.savez(path, a=np.array([Unpicklable()]))
+    assert "does not match its manifest: sha256" in refusal(read, path)
+    without_file_hash(path)
     assert refusal(read, path) == f"{path}: holds pickled objects, refused"
     path.write_bytes(b"PK" + random_bytes)
     assert "truncated" in refusal(read, path)
+
+
+def without_file_hash(path):
+    """Make a manifest one of an earlier version, which knew no hash of the file."""
+    manifest = artefacts.read_json(path.with_suffix(".json"))
+    del manifest["file_sha256"]
+    artefacts.write_json(path.with_suffix(".json"), manifest)
 
 
 class Unpicklable:

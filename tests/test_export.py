@@ -212,6 +212,12 @@ def test_a_refused_certificate_leaves_the_export_without_one(spoiled, capsys):
     assert "info.breach" not in {leaf["name"] for leaf in manifest["programs"]["act"]["outputs"]}
 
 
+def sealed(path, manifest):
+    """A manifest with the hash that belongs to it."""
+    said = {name: value for name, value in manifest.items() if name != "sha256"}
+    path.write_text(json.dumps(said | {"sha256": artefacts.sha256(said)}))
+
+
 @pytest.mark.parametrize(
     ("file", "damage", "says"),
     [
@@ -221,7 +227,8 @@ def test_a_refused_certificate_leaves_the_export_without_one(spoiled, capsys):
         ("initial_state.stablehlo", None, "No such file"),
         ("controller.json", lambda content: content[:50], "truncated or not JSON"),
         ("controller.json", lambda content: b'{"kind": "policy"}', "not the manifest"),
-        ("controller.json", lambda content: content.replace(b'"format": 1', b'"format": 2'), "format 2"),
+        ("controller.json", lambda content: content.replace(b'"format": 2', b'"format": 1'), "format 1"),
+        ("controller.json", lambda content: content.replace(b'"horizon": 5', b'"horizon": 6'), "changed, its sha256"),
     ],
 )
 def test_a_damaged_export_is_named_in_one_line(folder, file, damage, says):
@@ -241,7 +248,7 @@ def test_a_blob_that_jax_refuses_is_named_with_the_jax_that_wrote_it(folder):
     manifest = json.loads((folder / "controller.json").read_text())
     about = {"bytes": 10, "sha256": hashlib.sha256(b"no program").hexdigest()}
     manifest["programs"]["init"] |= about
-    (folder / "controller.json").write_text(json.dumps(manifest | {"jax": "9.9"}))
+    sealed(folder / "controller.json", manifest | {"jax": "9.9"})
     run_controller = shipped(folder)
     with pytest.raises(run_controller.ExportError, match=r"written by jax 9\.9"):
         run_controller.ExportedController(folder)

@@ -6,7 +6,6 @@ import os
 import pickle
 import random
 import shutil
-import sys
 from functools import cache
 from pathlib import Path
 
@@ -19,16 +18,12 @@ from jaxtyping import TypeCheckError
 
 from sfkd_jax import artefacts, config, datasets, demo, evaluate, policy, report, shelf, training
 
-sys.path.append(str(Path(__file__).parent / "datasets"))
-from recorded import drive, write_csv, write_npz
-
 SHIPPED = demo.SHIPPED / "kinematic"
 WORSE = (None, "word", [], {}, -1, float("nan"), [[1, 2], 3], True, 10**400)
 """What a value of a document is replaced by."""
 DOCUMENTS = {"policy.json": 60, "certificate.json": 60, "results.json": 20, "settings.json": 10}
 """Document -> how many times it is spoiled."""
 BYTES = {"policy.npz": 12, "policy.json": 8, "certificate.json": 8, "dataset.npz": 12}
-LOGS = {"a.csv": 20, "a.npz": 12, "a.parquet": 12}
 ROW = {"system": "sfkd", "scenario": "s3", "vehicle": "kinematic", "env": "measured"}
 SETTINGS = {
     **{name: {"name": "kinematic"} for name in ("vehicle", "model", "controller", "training")},
@@ -177,25 +172,6 @@ def test_a_report_names_the_file_that_it_cannot_draw(run, name):
         line = refusal_of(lambda: report.run(settings_of(run)))
         assert line is None or name in line
     assert (name == "metrics.jsonl") or line
-
-
-@pytest.mark.parametrize("name", LOGS)
-def test_a_damaged_log_is_refused_in_one_line_or_read_as_a_log(tmp_path, name):
-    file = tmp_path / name
-    if name.endswith("parquet"):
-        pyarrow, parquet = pytest.importorskip("pyarrow"), pytest.importorskip("pyarrow.parquet")
-        parquet.write_table(pyarrow.table(drive(seconds=10.0)), file)
-    else:
-        (write_csv if name.endswith("csv") else write_npz)(file, drive(seconds=10.0))
-
-    def read_log():
-        datasets.from_logs(str(file), datasets.Columns(), dt=0.1, wheelbase=2.7, steps=5, say=lambda line: None)
-
-    draw = random.Random(3)
-    lines = [survives(read_log, file, damaged(file.read_bytes(), draw)) for _ in range(LOGS[name])]
-    refused = [line for line in lines if line]
-    assert len(refused) >= 0.6 * len(lines)
-    assert refusal_of(read_log) is None
 
 
 def test_lines_of_a_training_log_that_are_none_are_dropped(tmp_path):

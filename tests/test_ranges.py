@@ -64,8 +64,12 @@ def leaves(settings, above=""):
             yield f"{above}{key}", value
 
 
+def container(option):
+    return OmegaConf.to_container(composed(option), resolve=True)
+
+
 def names(option):
-    return dict(leaves(OmegaConf.to_container(composed(option), resolve=True)))
+    return dict(leaves(container(option)))
 
 
 def use(settings):
@@ -178,3 +182,31 @@ def test_the_line_says_what_a_setting_must_be_and_what_it_is(name, value, says):
 def test_every_name_in_the_tables_is_a_setting():
     known = {name for option in OPTIONS for name in names(option)}
     assert [one for one in ranges.patterns() if not any(ranges.fits(name, one) for name in known)] == []
+
+
+@pytest.mark.parametrize("name", ["../../x", "a/../b", "/tmp/x", "a//b", "a/", "./a", "a\\b", "a\0b", "a\nb", ".."])
+@pytest.mark.parametrize("setting", ["name", "model.system", "comparison.policies"])
+def test_a_run_stays_below_the_root(setting, name):
+    asked = container("model=sfkd")
+    *above, last = setting.split(".")
+    inner = asked[above[0]] if above else asked
+    inner[last] = name
+    with pytest.raises(ValueError, match=rf"^{re.escape(setting)} must be a path below root") as refused:
+        ranges.check(asked)
+    assert "\n" not in str(refused.value)
+
+
+@pytest.mark.parametrize(
+    "name", ["smoke", "a/b", "tune/learning_rate=0.003,consistency=0.001", "Läufe 2", "a..b", ".a"]
+)
+def test_names_with_folders_and_settings_in_them_are_names(name):
+    ranges.check(container("model=sfkd") | {"name": name})
+
+
+def test_the_keys_of_a_comparison_are_names_of_files():
+    asked = container("model=sfkd")
+    asked["comparison"]["rows"] = {"noise 0.1 and 2 m/s": "model=sfkd"}
+    ranges.check(asked)
+    asked["comparison"]["rows"] = {" ../../x": "model=sfkd"}
+    with pytest.raises(ValueError, match=r"comparison\.rows must have keys that are names of files"):
+        ranges.check(asked)

@@ -52,6 +52,10 @@ _EMPTY = {
 }
 _PAIRS = (("dataset.env_low", "dataset.env_high"), ("vehicle.control_low", "vehicle.control_high"))
 _BOXES = {name for pair in _PAIRS for name in pair}
+_FOLDERS = ("name", "model.system", "comparison.policies")
+"""Settings that become folders below `root`."""
+_LABELS = ("comparison.rows", "comparison.variations", "comparison.own_controllers")
+"""Mappings whose keys become files or folders there."""
 _KINDS = {
     int: "seed demo.episodes demo.timed_steps comparison.share",
     float: "demo.episode_s controller.task.control_rate dataset.env_low dataset.env_high",
@@ -98,10 +102,23 @@ def check(settings: Mapping[str, Any]) -> None:
         rule = rule_of(name)
         if said := _wrong(name, value, rule):
             raise ValueError(f"{name} must be {said}, got {value!r}")
+    for name in _FOLDERS:
+        if isinstance(flat.get(name), str) and not is_below(flat[name]):
+            raise ValueError(f"{name} must be a path below root without '..', empty parts or \\, got {flat[name]!r}")
+    for name in _LABELS:
+        for label in (settings.get("comparison") or {}).get(name.removeprefix("comparison."), ()):
+            if not is_below("_".join(str(label).split())):  # as the folder of a cell is called
+                raise ValueError(f"{name} must have keys that are names of files, got {label!r}")
     for low, high in _PAIRS:
         below, above = flat.get(low) or (), flat.get(high) or ()
         if len(below) != len(above) or not all(a <= b for a, b in zip(below, above, strict=True)):
             raise ValueError(f"{low} must not lie above {high}, entry by entry, got {below} and {above}")
+
+
+def is_below(path: str) -> bool:
+    """Whether a relative path stays below the folder that it starts from, on any system, and can be shown."""
+    parts = path.split("/")
+    return path.isprintable() and "\\" not in path and not {"", ".", ".."} & set(parts)
 
 
 @cache

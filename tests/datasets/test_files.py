@@ -262,7 +262,7 @@ def test_a_malformed_csv_is_one_line_with_its_place(tmp_path, kind):
 
 
 ARRAYS = {
-    "objects": ({"t": np.array([None, 1])}, "not a readable npz file of plain arrays"),
+    "objects": ({"t": np.array([None, 1])}, "a.npz: holds pickled objects, refused"),
     "shapes": ({"t": np.zeros(3), "p_x": np.zeros(4)}, "p_x has shape (4,), t (3,)"),
     "x alone": (
         {"x": np.zeros((2, 5, 4)), "u": np.zeros((2, 5, 2)), "e": np.zeros((2, 4, 2))},

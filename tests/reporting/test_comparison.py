@@ -7,6 +7,7 @@ import pytest
 from PIL import Image
 
 from sfkd_jax import report
+from sfkd_jax.artefacts import ArtefactError
 from sfkd_jax.reporting import write_comparison
 from sfkd_jax.reporting._compared import curves, records_of
 from sfkd_jax.reporting._tradeoff import tradeoff
@@ -208,5 +209,5 @@ def test_the_door_compares_when_it_is_asked_to(root):
     settings = {"root": str(root), "name": "curve", "report": {"compare": PATTERN}}
     assert report.run(settings)["report"] == str(root / "curve" / "comparison" / "index.html")
     own = {"name": "none", "model": {"system": "sfkd"}, "seed": 0, "report": {"compare": None}}
-    with pytest.raises(FileNotFoundError, match=r"policy\.json"):
+    with pytest.raises(ArtefactError, match=r"policy\.json"):
         report.run(settings | own)

@@ -16,13 +16,17 @@ from sfkd_jax.artefacts._drives import identity as identity
 from sfkd_jax.artefacts._drives import merge as merge
 from sfkd_jax.artefacts._drives import renamed as renamed
 from sfkd_jax.artefacts._files import ArtefactError as ArtefactError
+from sfkd_jax.artefacts._files import one_line as one_line
+from sfkd_jax.artefacts._files import open_regular as open_regular
 from sfkd_jax.artefacts._files import read_json as read_json
 from sfkd_jax.artefacts._files import understood as understood
 from sfkd_jax.artefacts._files import write_bytes as write_bytes
 from sfkd_jax.artefacts._files import write_json as write_json
+from sfkd_jax.artefacts._files import writing as writing
 from sfkd_jax.artefacts._lines import append_jsonl as append_jsonl
 from sfkd_jax.artefacts._lines import read_jsonl as read_jsonl
 from sfkd_jax.artefacts._lines import tell as tell
 from sfkd_jax.artefacts._lines import truncate_jsonl as truncate_jsonl
 from sfkd_jax.artefacts._locks import DirectoryTaken as DirectoryTaken
 from sfkd_jax.artefacts._locks import locked as locked
+from sfkd_jax.artefacts._npz import read_npz as read_npz

@@ -3,30 +3,42 @@
 A writer that is killed, whenever that is, leaves the old pair or the new one readable. Both files are completed under
 hidden names; the arrays then wait under a name made of their hash, replacing the manifest commits, and only then do the
 arrays take their place. A manifest whose arrays still wait is read from there, and the next writer moves them.
+
+A manifest records two hashes. `sha256` names the content, whatever its order and layout, and is what other documents
+speak about; it can be computed of arrays alone, and so only after compressed members were inflated. `file_sha256` is
+of the file, byte by byte: it is compared before the archive is opened, so that nothing is parsed or inflated that the
+writer did not write. Manifests of earlier versions have no `file_sha256`; for them, and for whoever strikes it out, the
+bounds of `_npz` hold, as they do for files without a manifest.
 """
 
 from __future__ import annotations
 
-import io
+import hashlib
 import json
 import os
 import re
-import zipfile
 from collections.abc import Mapping
 from contextlib import suppress
 from datetime import UTC, datetime
 from pathlib import Path
-from typing import Any, BinaryIO
+from typing import Any
 
 import numpy as np
 
 from sfkd_jax.artefacts._content import differences, plain, sha256, versions
-from sfkd_jax.artefacts._files import ArtefactError, encode, failure, read_bytes, read_json, replacement, synchronise
+from sfkd_jax.artefacts._files import (
+    ArtefactError,
+    encode,
+    failure,
+    open_regular,
+    read_json,
+    replacement,
+    synchronise,
+)
+from sfkd_jax.artefacts._npz import PORTABLE, check_archive, members, write_npz
 
 FORMAT = 1
 """Version of the manifest; a reader refuses every other one."""
-PORTABLE = "biufcSUmM"
-"""Kinds of dtype that an .npz file gives back as they were."""
 
 
 def write_arrays(
@@ -49,24 +61,27 @@ def write_arrays(
     arrays = {name: np.asarray(array) for name, array in arrays.items()}
     if odd := [name for name, array in arrays.items() if array.dtype.kind not in PORTABLE]:
         raise failure(path, f"not written, {odd[0]} is of dtype {arrays[odd[0]].dtype}, which is not portable")
-    digest, manifest_path = sha256(arrays), path.with_suffix(".json")
-    manifest = {"kind": kind, "format": FORMAT, "sha256": digest, "config": config, "made_from": made_from or {}}
-    manifest |= {"versions": versions(), "created": datetime.now(UTC).isoformat(timespec="seconds")}
-    text = encode(path, manifest, indent=2)
+    manifest_path = path.with_suffix(".json")
+    manifest = {"kind": kind, "format": FORMAT, "sha256": sha256(arrays), "config": config}
+    manifest |= {"made_from": made_from or {}, "versions": versions()}
+    manifest["created"] = datetime.now(UTC).isoformat(timespec="seconds")
     _complete(path)
     with replacement(manifest_path) as (manifest_file, manifest_part), replacement(path) as (file, part):
-        _save(file, arrays, zipfile.ZIP_DEFLATED if compressed else zipfile.ZIP_STORED)
+        write_npz(file, arrays, compressed=compressed)
+        synchronise(file)
+        manifest["file_sha256"] = _digest(part)
+        text = encode(path, manifest, indent=2)
         manifest_file.write(text)
-        for written in (file, manifest_file):
-            synchronise(written)
-        os.replace(part, _waiting(path, digest))
+        synchronise(manifest_file)
+        waiting = _waiting(path, manifest)
+        os.replace(part, waiting)
         try:
             os.replace(manifest_part, manifest_path)
         except OSError:
-            _waiting(path, digest).unlink(missing_ok=True)
+            waiting.unlink(missing_ok=True)
             raise
         with suppress(FileNotFoundError):  # another writer has completed this
-            os.replace(_waiting(path, digest), path)
+            os.replace(waiting, path)
     return json.loads(text)
 
 
@@ -83,13 +98,12 @@ def read_arrays(
     if config is not None and (found := differences(manifest["config"], plain(config))):
         more = f" and {len(found) - 3} more" if len(found) > 3 else ""
         raise failure(path, f"made with other settings: {'; '.join(found[:3])}{more}")
-    arrays = _load(path, manifest["sha256"])
-    actual = sha256(arrays)
-    if actual == manifest["sha256"]:
-        return arrays, manifest
-    if _manifest(path, kind)["sha256"] != manifest["sha256"]:  # rewritten while it was being read
-        return read_arrays(path, kind=kind, config=config)
-    raise failure(path, f"does not match its manifest: sha256 {actual[:12]}, recorded {manifest['sha256'][:12]}")
+    try:
+        return _load(path, manifest), manifest
+    except ArtefactError:
+        if _manifest(path, kind) == manifest:
+            raise
+    return read_arrays(path, kind=kind, config=config)  # rewritten while it was being read
 
 
 def exists(path: Path) -> bool:
@@ -97,15 +111,17 @@ def exists(path: Path) -> bool:
     return path.is_file() and path.with_suffix(".json").is_file()
 
 
-def _waiting(path: Path, digest: str) -> Path:
+def _waiting(path: Path, manifest: Mapping[str, Any]) -> Path:
     """Where complete arrays wait for their manifest to be committed."""
+    digest = manifest.get("file_sha256", manifest["sha256"])
     return path.with_name(f".{path.name}.{digest[:16]}.part")
 
 
 def _complete(path: Path) -> None:
     """Move the arrays that a writer killed after its commit left waiting."""
     with suppress(ArtefactError, OSError, TypeError, ValueError):  # a damaged manifest commits nothing
-        os.replace(_waiting(path, read_json(path.with_suffix(".json"), keys=("sha256",))["sha256"]), path)
+        manifest = read_json(path.with_suffix(".json"), keys=("sha256",))
+        os.replace(_waiting(path, manifest), path)
 
 
 def _manifest(path: Path, kind: str) -> dict[str, Any]:
@@ -117,34 +133,40 @@ def _manifest(path: Path, kind: str) -> dict[str, Any]:
     manifest = read_json(manifest_path, keys=("kind", "format", "sha256", "config"))
     if manifest["kind"] != kind:
         raise failure(path, f"is of kind {manifest['kind']}, not {kind}")
-    if manifest["format"] != FORMAT:
+    if manifest["format"] != FORMAT or isinstance(manifest["format"], bool):
         raise failure(path, f"is of format {manifest['format']}, this version reads {FORMAT}")
-    if not isinstance(manifest["config"], dict) or not re.fullmatch("[0-9a-f]{64}", str(manifest["sha256"])):
-        raise failure(manifest_path, "not a manifest, config or sha256 is malformed")
+    hashes = (manifest["sha256"], manifest.get("file_sha256", manifest["sha256"]))
+    if odd := [name for name in ("config", "made_from", "versions") if not isinstance(manifest.get(name, {}), dict)]:
+        raise failure(manifest_path, f"not a manifest, {odd[0]} is malformed")
+    if not all(isinstance(digest, str) and re.fullmatch("[0-9a-f]{64}", digest) for digest in hashes):
+        raise failure(manifest_path, "not a manifest, sha256 or file_sha256 is malformed")
     return manifest
 
 
-def _save(file: BinaryIO, arrays: Mapping[str, np.ndarray], compression: int) -> None:
-    """As np.savez, for any names and without pickles."""
-    with zipfile.ZipFile(file, "w", compression) as archive:
-        for name, array in arrays.items():
-            with archive.open(f"{name}.npy", "w", force_zip64=True) as entry:
-                np.lib.format.write_array(entry, array, allow_pickle=False)
+def _load(path: Path, manifest: Mapping[str, Any]) -> dict[str, np.ndarray]:
+    """The arrays that a manifest is about.
 
-
-def _load(path: Path, digest: str) -> dict[str, np.ndarray]:
-    """The arrays that a manifest with `digest` is about, not yet compared with it."""
+    Raises:
+        ArtefactError: other bytes or other arrays than the manifest speaks of.
+    """
     try:
-        content = read_bytes(_waiting(path, digest))
+        opened = open_regular(_waiting(path, manifest))
     except ArtefactError:
-        content = read_bytes(path)
-    if not b"PK".startswith(content[:2]):
-        raise failure(path, "foreign, not an archive of arrays")
-    if not zipfile.is_zipfile(io.BytesIO(content)):
-        raise failure(path, "truncated, the end of the archive is missing")
-    try:
-        with np.load(io.BytesIO(content), allow_pickle=False) as archive:
-            return {name: np.asarray(archive[name]) for name in archive.files}
-    except Exception as error:  # a damaged archive raises nearly anything
-        pickled = "allow_pickle" in str(error)
-        raise failure(path, "holds pickled objects, refused" if pickled else f"damaged ({error})") from error
+        opened = open_regular(path)
+    with opened as file:
+        check_archive(path, file)
+        file.seek(0)
+        recorded = manifest.get("file_sha256", "")
+        actual = hashlib.file_digest(file, "sha256").hexdigest() if recorded else ""
+        if actual == recorded:
+            arrays = members(path, file)
+            actual, recorded = sha256(arrays), manifest["sha256"]
+            if actual == recorded:
+                return arrays
+    raise failure(path, f"does not match its manifest: sha256 {actual[:12]}, recorded {recorded[:12]}")
+
+
+def _digest(path: Path) -> str:
+    """Hash of a file, byte by byte."""
+    with path.open("rb") as file:
+        return hashlib.file_digest(file, "sha256").hexdigest()

@@ -64,7 +64,7 @@ def sha256(data: Mapping[str, Any] | Sequence[Any]) -> str:
     for name in sorted(data):
         array = np.asarray(data[name])
         digest.update(json.dumps([name, array.dtype.str, array.shape]).encode())
-        digest.update(array.tobytes())
+        digest.update(np.ascontiguousarray(array).reshape(-1).view(np.uint8).data)
     return digest.hexdigest()
 
 

@@ -4,15 +4,23 @@ from __future__ import annotations
 
 import fcntl
 import glob
+import io
 import json
 import os
 import secrets
+import stat
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any, BinaryIO
 
 from sfkd_jax.artefacts._content import plain
+from sfkd_jax.artefacts._json import parse
+
+LARGEST = 1 << 24
+"""Bytes of a document; the largest of this package has 0.6 MB, and what JSON becomes takes up to 35 times as much."""
+LONGEST_LINE = 400
+"""Letters of a reason; one may quote the file that it is about."""
 
 
 class ArtefactError(Exception):
@@ -32,7 +40,8 @@ def read_json(path: Path, *, keys: Sequence[str] = ()) -> dict[str, Any]:
     """The object in `path`.
 
     Raises:
-        ArtefactError: the file is missing, truncated, not JSON, not an object, or lacks one of `keys`.
+        ArtefactError: the file is missing, no regular file, larger than LARGEST, truncated, not strictly JSON (see
+            `parse`), not an object, or lacks one of `keys`.
     """
     document = decode(path, read_bytes(path))
     if absent := [key for key in keys if key not in document]:
@@ -43,7 +52,23 @@ def read_json(path: Path, *, keys: Sequence[str] = ()) -> dict[str, Any]:
 def failure(path: Path, reason: object) -> ArtefactError:
     """The error to raise about `path`; `reason` may be an exception of any length."""
     text = reason.strerror or reason if isinstance(reason, OSError) else reason
-    return ArtefactError(f"{path}: {' '.join(str(text).split())}")
+    return ArtefactError(f"{path}: {one_line(text)}")
+
+
+def one_line(text: object) -> str:
+    """A reason as a terminal shows it: nothing that breaks or colours the line, and not all that a file holds."""
+    line = " ".join(str(text)[: 4 * LONGEST_LINE].split())
+    line = "".join(letter if letter.isprintable() else ascii(letter)[1:-1] for letter in line)
+    return line if len(line) <= LONGEST_LINE else f"{line[:LONGEST_LINE]}..."
+
+
+@contextmanager
+def writing(path: Path) -> Iterator[None]:
+    """What the disk refuses while several files are made becomes an ArtefactError about the file, or about `path`."""
+    try:
+        yield
+    except OSError as reason:
+        raise failure(Path(os.fsdecode(reason.filename)) if reason.filename else path, reason) from reason
 
 
 @contextmanager
@@ -72,8 +97,8 @@ def encode(path: Path, document: Mapping[str, Any], *, indent: int | None = None
 def decode(path: Path, text: bytes, *, where: str = "") -> dict[str, Any]:
     """The JSON object in `text`, or an ArtefactError about `path`."""
     try:
-        document = json.loads(text)
-    except (ValueError, RecursionError) as error:
+        document = parse(text)
+    except ValueError as error:
         raise failure(path, f"{where}truncated or not JSON ({error})") from error
     if not isinstance(document, dict):
         raise failure(path, f"{where}not a JSON object")
@@ -81,11 +106,33 @@ def decode(path: Path, text: bytes, *, where: str = "") -> dict[str, Any]:
 
 
 def read_bytes(path: Path) -> bytes:
-    """All of `path`, or an ArtefactError."""
+    """All of `path`, or an ArtefactError; more than LARGEST is not read."""
+    with open_regular(path) as file:
+        content = _up_to(path, file, LARGEST + 1)
+    if len(content) > LARGEST:
+        raise failure(path, f"larger than {LARGEST >> 20} MiB")
+    return content
+
+
+def open_regular(path: Path) -> io.FileIO:
+    """A regular file to read from, or an ArtefactError; a pipe, a socket or a device does not make the caller wait."""
     try:
-        return path.read_bytes()
+        number = os.open(path, os.O_RDONLY | os.O_NONBLOCK | os.O_NOCTTY | os.O_CLOEXEC)
     except FileNotFoundError:
         raise failure(path, "missing") from None
+    except (OSError, ValueError) as error:  # a ValueError: of a name that no file can have
+        raise failure(path, error) from error
+    mode = os.fstat(number).st_mode
+    if stat.S_ISREG(mode):
+        return io.FileIO(number)
+    os.close(number)
+    raise failure(path, "Is a directory" if stat.S_ISDIR(mode) else "not a regular file")
+
+
+def _up_to(path: Path, file: io.FileIO, most: int) -> bytes:
+    """The first bytes of a file."""
+    try:
+        return io.BufferedReader(file).read(min(most, os.fstat(file.fileno()).st_size + 1))
     except OSError as error:
         raise failure(path, error) from error
 

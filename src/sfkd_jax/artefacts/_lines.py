@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import errno
+import io
 import os
 import sys
 from collections.abc import Callable, Mapping, Sequence
@@ -10,7 +11,7 @@ from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
-from sfkd_jax.artefacts._files import ArtefactError, decode, encode, failure, read_bytes, write_bytes
+from sfkd_jax.artefacts._files import ArtefactError, decode, encode, failure, open_regular, read_bytes, write_bytes
 
 
 def append_jsonl(path: Path, record: Mapping[str, Any]) -> None:
@@ -48,20 +49,19 @@ def read_jsonl(
     Raises:
         ArtefactError: the file is missing; or a line before the last is no such record, and `damaged` is None.
     """
-    *lines, last = read_bytes(path).split(b"\n")
     records = []
-    for number, line in enumerate(lines, 1):
+    for number, line in enumerate(io.BytesIO(read_bytes(path)), 1):
+        whole = line.endswith(b"\n")
         try:
             record = decode(path, line, where=f"line {number} ") if line.strip() else None
             if record is not None and (absent := [key for key in keys if key not in record]):
                 raise failure(path, f"line {number} lacks {', '.join(absent)}")
             records += [record] if record is not None else []
         except ArtefactError as reason:
-            if damaged is None:
+            if whole and damaged is None:
                 raise
-            damaged(f"{reason}; left out, the other lines stay")
-    with suppress(ArtefactError):
-        records.append(decode(path, last))
+            if whole and damaged is not None:
+                damaged(f"{reason}; left out, the other lines stay")
     return records
 
 
@@ -91,6 +91,6 @@ def _cut_short(path: Path) -> bool:
     """Whether the last byte is not the end of a line."""
     if not path.exists() or not path.stat().st_size:
         return False
-    with path.open("rb") as file:
+    with open_regular(path) as file:
         file.seek(-1, os.SEEK_END)
-        return file.read() != b"\n"
+        return file.read(1) != b"\n"

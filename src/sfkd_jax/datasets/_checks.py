@@ -12,6 +12,8 @@ from sfkd_jax.datasets._logs import Columns, Log
 
 SLOWER = 1.2
 """A log whose period is this many times the model's is refused: rows between its own would be invented."""
+LARGEST = 1e38
+"""What float32, in which segments are held, holds of a difference of two."""
 STALE = 0.2
 """Share of rows with the very position of the row before, though driving, from which positions count as stale."""
 
@@ -34,9 +36,9 @@ def channels(log: Log, columns: Columns) -> dict[str, Float[np.ndarray, " time"]
 
 
 def check_rows(log: Log, columns: Columns) -> Iterator[Finding]:
-    """Numbers that are not finite, and time that does not increase."""
+    """Numbers that are not finite in float32, and time that does not increase."""
     for name, values in channels(log, columns).items():
-        bad = ~np.isfinite(values)
+        bad = ~np.isfinite(values) | (np.abs(values) > LARGEST)
         if bad.any():
             yield Finding(f"{_first(log, bad)}: {name} is {values[bad.argmax()]}{more(bad)}")
     if np.isfinite(log.time).all() and (back := np.diff(log.time) <= 0).any():

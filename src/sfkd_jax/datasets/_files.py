@@ -7,6 +7,8 @@ import hashlib
 from functools import cache
 from pathlib import Path
 
+from sfkd_jax.artefacts import open_regular
+
 SUFFIXES = (".csv", ".npz", ".parquet")
 
 
@@ -15,6 +17,7 @@ def log_files(path: str) -> list[Path]:
 
     Raises:
         ValueError: there are none, some are of another kind, or two have the same contents.
+        ArtefactError: one is a pipe, a device or a folder, or cannot be read.
     """
     if path in ("", "???"):
         raise ValueError("dataset.path is not set: pass dataset.path=FILE, dataset.path=FOLDER or 'dataset.path=GLOB'")
@@ -56,5 +59,5 @@ def digest(file: Path) -> str:
 @cache
 def _digest(file: Path, size: int, written: int) -> str:
     del size, written  # they are the key of the cache
-    with file.open("rb") as stream:
+    with open_regular(file) as stream:
         return hashlib.file_digest(stream, "sha256").hexdigest()

@@ -9,8 +9,9 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Float, Int
 
+from sfkd_jax.artefacts import ArtefactError, one_line, read_npz
 from sfkd_jax.datasets._files import digest, log_files
-from sfkd_jax.datasets._tables import Table, read_csv, read_npz, read_parquet
+from sfkd_jax.datasets._tables import Table, read_csv, read_parquet
 
 STACKED = ("x", "u", "e")
 """Arrays of an npz file of whole drives, each (drive, time, entry); x has one moment more."""
@@ -77,8 +78,8 @@ def read_logs(path: str, columns: Columns, *, dt: float, told: bool) -> tuple[li
     for file in sorted(log_files(path), key=digest):
         try:
             logs += _open(file, columns, dt, told)
-        except ValueError as reason:
-            lines.append(str(reason))
+        except (ArtefactError, ValueError) as reason:
+            lines.append(one_line(reason))
     return logs, sorted(lines)
 
 
@@ -178,7 +179,10 @@ def _stacked(source: str, arrays: dict[str, np.ndarray], columns: Columns, dt: f
             raise ValueError(f"{source}: {name} has shape {array.shape}, expected {(drives, long, sizes[name])}")
     if steps < 1 or not drives:
         raise ValueError(f"{source}: no steps in x of shape {wanted['x'].shape}")
-    time = np.asarray(arrays.get(columns.time, dt * np.arange(steps + 1)), dtype=np.float64)
+    time = arrays[columns.time] if columns.time in arrays else dt * np.arange(steps + 1)
+    if time.dtype.kind not in "iuf":
+        raise ValueError(f"{source}: {columns.time} must be numbers, got {time.dtype}")
+    time = time.astype(np.float64)
     if time.shape not in ((steps + 1,), (drives, steps + 1)):
         raise ValueError(f"{source}: {columns.time} has shape {time.shape}, expected {(drives, steps + 1)}")
     time = np.broadcast_to(time, (drives, steps + 1))

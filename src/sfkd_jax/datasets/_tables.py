@@ -1,15 +1,21 @@
-"""Columns of numbers from npz, csv and parquet; what cannot be read is told in one line with its place."""
+"""Columns of numbers from csv and parquet; what cannot be read is told in one line with its place."""
 
 from __future__ import annotations
 
 import csv
 import io
-import zipfile
 from pathlib import Path
-from typing import NamedTuple, NoReturn
+from typing import Any, NamedTuple, NoReturn
 
 import numpy as np
 from jaxtyping import Float, Int, Shaped
+
+from sfkd_jax.artefacts import open_regular
+
+WIDEST = 64
+"""Letters of a cell up to which a column of a csv file is held as text of one width; numbers are shorter."""
+DECODED = 1 << 29
+"""Bytes that a parquet file may become: it can repeat a value without end in a few bytes."""
 
 
 class Table(NamedTuple):
@@ -33,20 +39,22 @@ class Table(NamedTuple):
             ValueError: a cell that is not a number.
         """
         values = self.columns[name]
-        if values.dtype.kind == "M":
-            return (values - values[0]) / np.timedelta64(1, "s")
         try:
-            return values.astype(np.float64)
-        except (TypeError, ValueError):
-            self._blame(name)
+            if values.dtype.kind == "M":
+                return (values - values[0]) / np.timedelta64(1, "s")
+            if values.dtype.kind in "biufSUO":
+                return values.astype(np.float64)
+        except (TypeError, ValueError, OverflowError):
+            pass
+        self._blame(name)
 
     def _blame(self, name: str) -> NoReturn:
         """Name the first cell of a column that is not a number."""
         for row, value in zip(self.rows, self.columns[name], strict=True):
             try:
                 float(value)
-            except (TypeError, ValueError):
-                said = repr(str(value)) if str(value).strip() else "empty"
+            except (TypeError, ValueError, OverflowError):
+                said = repr(str(value)[:WIDEST]) if str(value).strip() else "empty"
                 raise ValueError(f"{self.source}, {self.counted} {row}: {name} is {said}, not a number") from None
         raise ValueError(f"{self.source}: {name} cannot be read as numbers")
 
@@ -58,7 +66,8 @@ def read_csv(file: Path) -> Table:
         ValueError: not text, no header, no rows, or rows of another length than the header.
     """
     try:
-        text = file.read_text(encoding="utf-8-sig")
+        with open_regular(file) as stream:
+            text = io.TextIOWrapper(io.BufferedReader(stream), encoding="utf-8-sig").read()
     except UnicodeDecodeError:
         raise ValueError(f"{file}: not a text file in UTF-8") from None
     head = text.split("\n", 1)[0]
@@ -81,8 +90,13 @@ def read_csv(file: Path) -> Table:
         raise ValueError(f"{file}, line {line}: {len(row)} cells below a header of {len(names)}")
     if not rest:
         raise ValueError(f"{file}: no rows below the header")
-    body = np.array([row for _, row in rest])
-    return Table(str(file), {name: body[:, k] for k, name in enumerate(names)}, np.array([n for n, _ in rest]), "line")
+    columns = {name: _column([row[k] for _, row in rest]) for k, name in enumerate(names)}
+    return Table(str(file), columns, np.array([number for number, _ in rest]), "line")
+
+
+def _column(cells: list[str]) -> Shaped[np.ndarray, " time"]:
+    """Cells as an array; one long cell does not make all others as wide."""
+    return np.array(cells, dtype=object if max(map(len, cells)) > WIDEST else str)
 
 
 def _check_header(where: str, names: list[str]) -> None:
@@ -105,34 +119,34 @@ def read_parquet(file: Path) -> Table:
     """A parquet file.
 
     Raises:
-        ValueError: pyarrow is missing, or the file is not what its name says.
+        ValueError: pyarrow is missing, the file is not what its name says, or it becomes more than DECODED bytes.
     """
     try:
         from pyarrow import parquet  # pyright: ignore[reportMissingImports]
     except ImportError:
         raise ValueError(f'{file}: parquet files need pyarrow: pip install "sfkd-jax[parquet]"') from None
-    try:
-        held = parquet.read_table(file)
-    except (OSError, ValueError) as reason:
-        raise ValueError(f"{file}: not a readable parquet file ({str(reason).splitlines()[0]})") from None
+    with open_regular(file) as stream:
+        try:
+            opened = parquet.ParquetFile(io.BufferedReader(stream))
+            if (size := _decoded(opened.metadata)) > DECODED:
+                raise ValueError(f"{size >> 20} MiB once decoded, at most {DECODED >> 20} are read")
+            held = opened.read()
+            columns = {name: held.column(k).to_numpy() for k, name in enumerate(held.column_names)}
+        except Exception as reason:  # a damaged file raises nearly anything
+            said = (str(reason).splitlines() or [type(reason).__name__])[0]
+            raise ValueError(f"{file}: not a readable parquet file ({said})") from None
     if not held.num_rows:
         raise ValueError(f"{file}: no rows")
-    columns = {name: held.column(name).to_numpy() for name in held.column_names}
+    if len(columns) < len(held.column_names):
+        raise ValueError(f"{file}: two columns have one name")
     return Table(str(file), columns, np.arange(held.num_rows), "row")
 
 
-def read_npz(file: Path) -> dict[str, np.ndarray]:
-    """The arrays of an npz file; nothing pickled is ever loaded.
-
-    Raises:
-        ValueError: damaged, or not plain arrays.
-    """
-    try:
-        held = np.load(file, allow_pickle=False)
-        if isinstance(held, np.ndarray):
-            raise ValueError("a single array without a name")
-        with held:
-            return {name: held[name] for name in held.files}
-    except (OSError, ValueError, EOFError, zipfile.BadZipFile) as reason:
-        said = str(reason).splitlines()[0] if str(reason) else type(reason).__name__
-        raise ValueError(f"{file}: not a readable npz file of plain arrays ({said})") from None
+def _decoded(about: Any) -> int:
+    """At least how many bytes a parquet file says that it becomes: by its values, and by its pages."""
+    groups = [about.row_group(k) for k in range(about.num_row_groups)]
+    columns = [group.column(k) for group in groups for k in range(group.num_columns)]
+    values = sum(max(column.num_values, 0) for column in columns)
+    rows = sum(max(group.num_rows, 0) * group.num_columns for group in groups)
+    pages = sum(max(column.total_uncompressed_size, 0) for column in columns)
+    return max(8 * values, 8 * rows, 8 * max(about.num_rows, 0) * about.num_columns, pages)

@@ -17,7 +17,7 @@ from sfkd_jax.exporting._iree import compile_iree
 from sfkd_jax.exporting._programs import Leaf, Program, flat_programs, specifications
 from sfkd_jax.types import Params
 
-FORMAT = 1
+FORMAT = 2
 """Version of the manifest and of the order of arguments; run_controller.py refuses every other one."""
 PLATFORMS = ("cpu", "cuda", "rocm", "tpu")
 FILES = {"act": "controller", "init": "initial_state"}
@@ -76,6 +76,7 @@ def write_controller(
     }
     script = resources.files("sfkd_jax.exporting").joinpath(f"_{SCRIPT}").read_bytes()
     artefacts.write_bytes(folder / SCRIPT, script)
+    manifest["sha256"] = artefacts.sha256(manifest)
     artefacts.write_json(folder / MANIFEST, manifest)
     return manifest
 

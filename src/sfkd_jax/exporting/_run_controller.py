@@ -19,6 +19,8 @@ from __future__ import annotations
 import argparse
 import hashlib
 import json
+import os
+import stat
 import sys
 import time
 from pathlib import Path
@@ -28,8 +30,12 @@ import jax
 import jax.export
 import numpy as np
 
-FORMAT = 1
+FORMAT = 2
 """Version of controller.json that this file reads."""
+LARGEST = 1 << 24
+"""Bytes of controller.json; it has some 20 kB."""
+MALFORMED = (KeyError, TypeError, ValueError, IndexError, AttributeError, OverflowError, RecursionError)
+"""What is raised about a manifest that says of itself what it is not."""
 
 
 class ExportError(Exception):
@@ -47,16 +53,23 @@ class ExportedController:
         """Read and compile.
 
         Raises:
-            ExportError: a file is missing, truncated, changed, or made for another jax or platform.
+            ExportError: a file is missing, no regular file, truncated, changed, malformed, or made for another jax or
+                platform.
         """
-        folder = Path(folder)
-        self.manifest = _manifest(folder / "controller.json")
-        self._init, self._act = (_compiled(folder, self.manifest, name) for name in ("init", "act"))
+        path = Path(folder) / "controller.json"
+        self.manifest = _manifest(path)
+        try:
+            self._init, self._act = (_compiled(path.parent, self.manifest, name) for name in ("init", "act"))
+            key, first = self._key(0), self.manifest["programs"]["init"]["inputs"][0]
+            known = isinstance(self.manifest["key_implementation"], str)
+            if not known or key.shape != tuple(first["shape"]) or str(key.dtype) != first["dtype"]:
+                raise ValueError("key_implementation")
+        except MALFORMED as error:
+            raise ExportError(_line(f"{path}: malformed, {type(error).__name__}: {error}")) from None
 
     def init(self, seed: int = 0) -> dict[str, jax.Array]:
         """The state before the first step; the seed fixes all samples that will be drawn."""
-        key = jax.random.key(seed, impl=self.manifest["key_implementation"])
-        return self._named("init", "state", self._init(jax.random.key_data(key)))
+        return self._named("init", "state", self._init(self._key(seed)))
 
     def act(
         self, state: dict[str, jax.Array], observation: Any, env: Any, reference: Any
@@ -84,6 +97,10 @@ class ExportedController:
         found = self._act(*given.values())
         return found[0], self._named("act", "state", found), self._named("act", "info", found)
 
+    def _key(self, seed: int) -> jax.Array:
+        """A random key as the programs take it."""
+        return jax.random.key_data(jax.random.key(seed, impl=self.manifest["key_implementation"]))
+
     def _named(self, program: str, root: str, values: Any) -> dict[str, jax.Array]:
         """The results of a program whose names begin with `root`, without it."""
         names = [leaf["name"] for leaf in self.manifest["programs"][program]["outputs"]]
@@ -92,41 +109,69 @@ class ExportedController:
 
 
 def _manifest(path: Path) -> dict[str, Any]:
-    """What controller.json says, if it is one."""
+    """What controller.json says, if it says what was written."""
     try:
-        manifest = json.loads(_content(path))
-    except ValueError:
+        manifest = json.loads(_content(path, LARGEST))
+        if not isinstance(manifest, dict) or manifest.get("kind") != "controller":
+            raise ExportError(f"{path}: not the manifest of a controller")
+        if manifest.get("format") != FORMAT:
+            raise ExportError(_line(f"{path}: is of format {manifest.get('format')}, this file reads {FORMAT}"))
+        said = {name: value for name, value in manifest.items() if name != "sha256"}
+        digest = hashlib.sha256(json.dumps(said, sort_keys=True, allow_nan=False).encode()).hexdigest()
+    except (ValueError, RecursionError):
         raise ExportError(f"{path}: truncated or not JSON") from None
-    if not isinstance(manifest, dict) or manifest.get("kind") != "controller":
-        raise ExportError(f"{path}: not the manifest of a controller")
-    if manifest.get("format") != FORMAT:
-        raise ExportError(f"{path}: is of format {manifest.get('format')}, this file reads {FORMAT}")
+    if digest != manifest.get("sha256"):
+        raise ExportError(f"{path}: changed, its sha256 is not that of what it says")
     return manifest
 
 
 def _compiled(folder: Path, manifest: dict[str, Any], name: str) -> Any:
     """A program of the export, compiled for the device that jax uses by itself."""
     program = manifest["programs"][name]
+    if Path(program["file"]).name != program["file"]:
+        raise ValueError(f"{program['file']!r} is not the name of a file in this folder")
     path = folder / program["file"]
-    content = _content(path)
+    content = _content(path, int(program["bytes"]))
     if len(content) < program["bytes"]:
         raise ExportError(f"{path}: truncated, {len(content)} of {program['bytes']} bytes")
     digest = hashlib.sha256(content).hexdigest()
     if digest != program["sha256"]:
         raise ExportError(f"{path}: changed, sha256 {digest[:12]}, recorded {program['sha256'][:12]}")
-    inputs = [jax.ShapeDtypeStruct(tuple(leaf["shape"]), leaf["dtype"]) for leaf in program["inputs"]]
     try:
-        return jax.jit(jax.export.deserialize(bytearray(content)).call).lower(*inputs).compile()
+        exported = jax.export.deserialize(bytearray(content))
+        inputs = [jax.ShapeDtypeStruct(value.shape, value.dtype) for value in exported.in_avals]
+        compiled = jax.jit(exported.call).lower(*inputs).compile()
     except Exception as error:  # a blob of another version raises nearly anything
-        reason = " ".join(str(error).split())[:200]
-        raise ExportError(f"{path}: written by jax {manifest['jax']}, refused by {jax.__version__}: {reason}") from None
+        reason = f"{path}: written by jax {manifest['jax']}, refused by {jax.__version__}: {error}"
+        raise ExportError(_line(reason)) from None
+    for side, values in (("inputs", exported.in_avals), ("outputs", exported.out_avals)):
+        listed = [(str(leaf["name"]), tuple(leaf["shape"]), leaf["dtype"]) for leaf in program[side]]
+        if [leaf[1:] for leaf in listed] != [(value.shape, str(value.dtype)) for value in values]:
+            raise ExportError(f"{path}: has other {side} than its manifest says")
+    return compiled
 
 
-def _content(path: Path) -> bytes:
+def _content(path: Path, most: int) -> bytes:
+    """The bytes of a regular file that has at most so many; nothing else is waited for."""
     try:
-        return path.read_bytes()
-    except OSError as error:
-        raise ExportError(f"{path}: {error.strerror}") from None
+        number = os.open(path, os.O_RDONLY | os.O_NONBLOCK | os.O_NOCTTY | os.O_CLOEXEC)
+        try:
+            status = os.fstat(number)
+            if not stat.S_ISREG(status.st_mode):
+                raise ExportError(f"{path}: not a regular file")
+            if status.st_size > most:
+                raise ExportError(f"{path}: {status.st_size} bytes, at most {most} belong to it")
+            with open(number, "rb", closefd=False) as file:
+                return file.read(most)
+        finally:
+            os.close(number)
+    except (OSError, ValueError) as error:  # a ValueError: of a name that no file can have
+        raise ExportError(_line(f"{path}: {getattr(error, 'strerror', None) or error}")) from None
+
+
+def _line(text: str) -> str:
+    """What a terminal shows as one line, and not more than it should."""
+    return "".join(letter if letter.isprintable() else " " for letter in " ".join(text.split()))[:500]
 
 
 def main() -> None:
@@ -138,22 +183,31 @@ def main() -> None:
     asked = parser.parse_args()
     try:
         controller = ExportedController(asked.folder)
+        observation, env, reference = _straight(controller.manifest)
+        names = [entry["name"] for entry in controller.manifest["controls"]]
     except ExportError as reason:
         sys.exit(f"run_controller: {reason}")
-    manifest, speed = controller.manifest, 10.0
-    ahead = speed * manifest["sampling_period_s"] * np.arange(1, manifest["horizon"] + 1)
-    reference = np.stack([ahead, 0 * ahead, 0 * ahead, np.full_like(ahead, speed)], axis=1)
-    observation = np.zeros(len(manifest["observation"]))
-    observation[1], observation[3] = 0.3, speed
-    env = np.mean([manifest["environment"]["low"], manifest["environment"]["high"]], axis=0)
+    except MALFORMED as reason:
+        sys.exit(_line(f"run_controller: {asked.folder}: malformed, {type(reason).__name__}: {reason}"))
     state, controls, times = controller.init(asked.seed), [], []
     for _ in range(asked.steps):
         began = time.perf_counter()
         control, state, _ = controller.act(state, observation, env, reference)
         controls.append(np.asarray(control).tolist())
         times.append(1e3 * (time.perf_counter() - began))
-    names = [entry["name"] for entry in manifest["controls"]]
     print(json.dumps({"names": names, "controls": controls, "median_ms": float(np.median(times))}))
+
+
+def _straight(manifest: dict[str, Any]) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Observation, environment and reference of a car that stands 0.3 m beside a straight road."""
+    *_, observed, _, ahead = manifest["programs"]["act"]["inputs"]
+    speed, observation = 10.0, np.zeros(observed["shape"])
+    observation[1], observation[3] = 0.3, speed
+    reference = np.zeros(ahead["shape"])
+    reference[:, 0] = speed * manifest["sampling_period_s"] * np.arange(1, len(reference) + 1)
+    reference[:, 3] = speed
+    env = np.mean([manifest["environment"]["low"], manifest["environment"]["high"]], axis=0)
+    return observation, env, reference
 
 
 if __name__ == "__main__":

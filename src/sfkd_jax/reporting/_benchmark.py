@@ -8,7 +8,7 @@ from typing import Any, TypeAlias
 
 from matplotlib.figure import Figure
 
-from sfkd_jax.artefacts import read_json, write_bytes
+from sfkd_jax.artefacts import read_json, understood, write_bytes, writing
 from sfkd_jax.reporting import _benchmark_notes as notes
 from sfkd_jax.reporting import _benchmark_tables as tables
 from sfkd_jax.reporting._animation import film
@@ -55,8 +55,15 @@ def benchmark_report(directory: Path) -> dict[str, Any]:
         `report`: path of the page. `figures`: paths of the figures and films, in the order of the page.
 
     Raises:
-        ArtefactError: results.json is missing or not JSON, or a cell's arrays are damaged.
+        ArtefactError: results.json is missing, not JSON or without rows that a page can be made of; a cell's arrays
+            are damaged; or the disk refuses the page.
     """
+    with writing(directory / "report"), understood(directory / "results.json", ValueError):
+        return _write(directory)
+
+
+def _write(directory: Path) -> dict[str, Any]:
+    """`benchmark_report`, errors as they come."""
     results = read_json(directory / "results.json", keys=("rows",))
     place = directory / "report" / FILES
     place.mkdir(parents=True, exist_ok=True)

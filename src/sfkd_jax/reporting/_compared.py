@@ -7,6 +7,7 @@ from collections import Counter
 from pathlib import Path
 from typing import Any, TypeAlias
 
+from sfkd_jax.artefacts import understood
 from sfkd_jax.reporting._files import about, read
 from sfkd_jax.reporting._numbers import dig, is_number
 from sfkd_jax.reporting._tables import blocks_of
@@ -61,19 +62,18 @@ def _record(run: Path, place: str) -> Record:
     settings, errors = read(run / "settings.json") or {}, read(run / "open_loop.json")
     certificate = about(read(run / "policy.json") or {}, read(run / "certificate.json"))
     rows = (read(run / "results.json") or {}).get("rows") or []
-    model, system = settings.get("model"), model_of(settings)
-    asked = {"rho": dig(model, "rho"), "beta": dig(model, "beta"), "seed": settings.get("seed")}
-    loop = dig(settings, "vehicle", "inner_loop")
-    return {
-        "run": place,
-        "system": system,
-        "vehicle": dig(settings, "vehicle", "name"),
-        "inner_loop": loop,
-        **asked,
-        **_certified(certificate),
-        "open_loop": _predicting(errors),
-        "closed_loop": _driving(rows, system),
-    }
+    with understood(run / "settings.json", ValueError):
+        model, system = settings.get("model"), model_of(settings)
+        asked = {"rho": dig(model, "rho"), "beta": dig(model, "beta"), "seed": settings.get("seed")}
+        vehicle = {"vehicle": dig(settings, "vehicle", "name"), "inner_loop": dig(settings, "vehicle", "inner_loop")}
+    with understood(run / "certificate.json", ValueError):
+        certified = _certified(certificate)
+    with understood(run / "open_loop.json", ValueError):
+        predicting = _predicting(errors)
+    with understood(run / "results.json", ValueError):
+        driving = _driving(rows, system)
+    found = {"run": place, "system": system, **vehicle, **asked, **certified}
+    return found | {"open_loop": predicting, "closed_loop": driving}
 
 
 def _certified(certificate: dict[str, Any] | None) -> Record:

@@ -6,7 +6,7 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-from sfkd_jax.artefacts import write_bytes, write_json
+from sfkd_jax.artefacts import write_bytes, write_json, writing
 from sfkd_jax.reporting._benchmark_tables import percent
 from sfkd_jax.reporting._blocks import Block, Code, Heading, Picture, Table, Text, to_html, to_markdown
 from sfkd_jax.reporting._compared import Record, curves, records_of, scenario_of, steps_of
@@ -30,8 +30,14 @@ def write_comparison(root: Path, pattern: str, name: str) -> dict[str, Any]:
         `report`, `comparison`: paths of the page and of the records. `figures`: paths of the figures.
 
     Raises:
-        ValueError: no run matches, or a file that is not JSON.
+        ValueError: no run matches. ArtefactError: a file that is not JSON, or the disk refuses the page.
     """
+    with writing(root / name / "comparison"):
+        return _write(root, pattern, name)
+
+
+def _write(root: Path, pattern: str, name: str) -> dict[str, Any]:
+    """`write_comparison`, errors as they come."""
     records = records_of(root, pattern)
     place, figure = root / name / "comparison", Path(name).name
     (place / "figures").mkdir(parents=True, exist_ok=True)

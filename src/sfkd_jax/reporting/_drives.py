@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-from pathlib import Path
+from pathlib import Path, PurePath
 from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Float
 
-from sfkd_jax.artefacts import exists, read_arrays
+from sfkd_jax.artefacts import ArtefactError, exists, read_arrays
 from sfkd_jax.reporting._benchmark_rows import Contest, Line
 
 KIND = "cell"
@@ -53,6 +53,8 @@ def _file(directory: Path, line: Line, scenario: str) -> Path:
     """Where a row says that its arrays lie, else where they lie by its identity."""
     row = line.rows[scenario]
     if isinstance(row.get("arrays"), str):
+        if PurePath(row["arrays"]).is_absolute() or ".." in PurePath(row["arrays"]).parts:
+            raise ArtefactError(f"{directory / 'results.json'}: arrays of a row lie outside this folder")
         return directory / row["arrays"]
     place = directory / "cells" / str(row.get("vehicle")) / scenario / str(row.get("sampling") or "qp")
     return place / f"{line.system}-{line.env}.npz"

@@ -5,7 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Any
 
-from sfkd_jax.artefacts import read_jsonl, tell, write_bytes
+from sfkd_jax.artefacts import ArtefactError, read_jsonl, tell, understood, write_bytes, writing
 from sfkd_jax.reporting import _sections as sections
 from sfkd_jax.reporting._blocks import Block, Heading, Picture, Text, to_html, to_markdown
 from sfkd_jax.reporting._driving import driving
@@ -29,11 +29,18 @@ def write_report(run: Path) -> dict[str, Any]:
         `report`: path of the page. `figures`: paths of the figures, in the order of the page.
 
     Raises:
-        FileNotFoundError: no policy.json. ValueError: a file that is not JSON.
+        ArtefactError: no policy.json; a file that is not JSON, or holds what no page can be made of; or the disk
+            refuses the page.
     """
+    with writing(run / "report"):
+        return _write(run)
+
+
+def _write(run: Path) -> dict[str, Any]:
+    """`write_report`, errors as they come."""
     policy = read(run / "policy.json")
     if policy is None:
-        raise FileNotFoundError(f"{run / 'policy.json'} is missing: {command('train', {})} makes a run")
+        raise ArtefactError(f"{run / 'policy.json'} is missing: {command('train', {})} makes a run")
     settings = policy.get("settings") or policy.get("config") or {}
     place = run / "report" / "figures"
     place.mkdir(parents=True, exist_ok=True)
@@ -43,17 +50,25 @@ def write_report(run: Path) -> dict[str, Any]:
     metrics = read_jsonl(log, damaged=tell) if log.exists() else []
     certificate = about(policy, read(run / "certificate.json"))
     results = read(run / "results.json") or {}
-    rows = blocks_of(results.get("rows") or [])
-    head, name = headline(rows, settings), plain(settings.get("experiment") or "unnamed run")
-    title = f"{label(model_of(settings))} on {name}, seed {plain(settings.get('seed'))}"
-    page: list[Block] = [Heading(1, title), Text(summary(settings, head, certificate, metrics), kind="lead")]
-    page += sections.tiles(settings, head, errors, certificate)
-    page += driving(run, rows, settings, place)
-    page += sections.certified(run, certificate, errors, settings, place)
-    page += sections.predicting(errors, settings, place)
-    page += sections.training(metrics, settings, place)
-    versions = policy.get("versions") or results.get("versions")
-    page += sections.provenance(settings, versions, dig(results, "config", "command"))
+    with understood(run / "policy.json", ValueError):
+        name, seed = plain(settings.get("experiment") or "unnamed run"), plain(settings.get("seed"))
+        title = f"{label(model_of(settings))} on {name}, seed {seed}"
+        made = sections.provenance(
+            settings, policy.get("versions") or results.get("versions"), dig(results, "config", "command")
+        )
+    with understood(run / "results.json", ValueError):
+        rows = blocks_of(results.get("rows") or [])
+        head = headline(rows, settings)
+        driven = driving(run, rows, settings, place)
+    with understood(run / "open_loop.json", ValueError):
+        predicted = sections.predicting(errors, settings, place)
+    with understood(log, ValueError):
+        trained = sections.training(metrics, settings, place)
+    with understood(run / "certificate.json", ValueError):
+        lead = Text(summary(settings, head, certificate, metrics), kind="lead")
+        tiles = sections.tiles(settings, head, errors, certificate)
+        certified = sections.certified(run, certificate, errors, settings, place)
+    page: list[Block] = [Heading(1, title), lead, *tiles, *driven, *certified, *predicted, *trained, *made]
     report = run / "report" / "index.html"
     write_bytes(report, to_html(title, page).encode())
     write_bytes(report.with_name("report.md"), to_markdown(page).encode())

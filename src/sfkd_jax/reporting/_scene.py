@@ -9,7 +9,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from jaxtyping import Float
 
-from sfkd_jax.artefacts import ROAD, SHARED, ArtefactError, drive_of
+from sfkd_jax.artefacts import ROAD, SHARED, drive_of, read_npz
 from sfkd_jax.reporting._benchmark_rows import search_words
 from sfkd_jax.reporting._style import scenario_label
 
@@ -77,11 +77,7 @@ def read_scenes(path: Path) -> list[Scene]:
 
     A scene holds the systems that met the same road under the same controller.
     """
-    try:
-        with np.load(path, allow_pickle=False) as archive:
-            arrays = {name: archive[name] for name in archive.files}
-    except Exception as reason:  # a damaged archive raises nearly anything
-        raise ArtefactError(f"{path}: damaged, not an archive of arrays ({type(reason).__name__})") from reason
+    arrays = read_npz(path)
     dt = float(arrays.pop("dt", 0.1))
     parts: dict[str, dict[str, np.ndarray]] = {}
     for name, values in arrays.items():

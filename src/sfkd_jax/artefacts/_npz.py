@@ -1,0 +1,162 @@
+"""Arrays of an .npz archive, read so that a file decides neither how much is allocated nor what is evaluated.
+
+All that a directory and a header declare is compared with the bytes that are there before an array is allocated. A
+stored member takes as many bytes as the file has for it. A compressed one is inflated to its declared size and never
+beyond; that size must be one that deflate can reach, and all of them together at most INFLATED. Headers are matched
+against the one form that they have and not evaluated, and objects, which would be unpickled, are refused.
+"""
+
+from __future__ import annotations
+
+import io
+import math
+import re
+import zipfile
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any, BinaryIO, Literal
+
+import numpy as np
+
+from sfkd_jax.artefacts._files import ArtefactError, failure, open_regular
+
+PORTABLE = "biufcSUmM"
+"""Kinds of dtype that an .npz file gives back as they were."""
+INFLATED = 1 << 29
+"""Bytes that the compressed members of one file may inflate to together; stored ones are bounded by the file."""
+DEFLATE_RATIO = 1032
+"""No stream of deflate inflates by more."""
+LONGEST_HEADER = 2048
+"""Bytes; numpy itself writes 118 for most arrays."""
+CHUNK = 1 << 20
+DIRECTORY = 1 << 22
+"""Bytes of a zip directory, about 40000 arrays: the zip library holds twenty times as much for it."""
+_DATE = (1980, 1, 1, 0, 0, 0)
+_ENTRY = (
+    r"'descr':\s*'(?P<order>[<>|=]?)(?P<kind>[A-Za-z?])(?P<size>\d*(?:\[\w+\])?)'",
+    r"'fortran_order':\s*(?P<fortran>True|False)",
+    r"'shape':\s*\((?P<shape>[\d\s,L]*)\)",
+)
+_HEADER = re.compile(rf"\{{\s*(?:(?:{'|'.join(_ENTRY)})\s*(?:,\s*)?){{3}}\}}\s*")
+
+
+class _Reader(io.BufferedReader):
+    """A file of which no call reads, and so allocates, more than DIRECTORY bytes, whatever a directory declares."""
+
+    def read(self, size: int | None = -1, /) -> bytes:
+        return super().read(DIRECTORY if size is None or size < 0 else min(size, DIRECTORY))
+
+
+def read_npz(path: Path) -> dict[str, np.ndarray]:
+    """The arrays of a file that has no manifest; nothing pickled is ever loaded.
+
+    Raises:
+        ArtefactError: missing, no regular file, truncated, damaged or foreign; objects; or more than INFLATED bytes
+            of compressed arrays.
+    """
+    with open_regular(path) as file:
+        check_archive(path, file)
+        return members(path, file)
+
+
+def check_archive(path: Path, file: BinaryIO) -> None:
+    """Refuse, without reading more than both ends, what is no whole archive."""
+    if not b"PK".startswith(file.read(2)):
+        raise failure(path, "foreign, not an archive of arrays")
+    if not zipfile.is_zipfile(file):
+        raise failure(path, "truncated, the end of the archive is missing")
+
+
+def members(path: Path, file: io.FileIO) -> dict[str, np.ndarray]:
+    """The arrays of an open archive; see `read_npz`. Closes the file."""
+    size = file.seek(0, io.SEEK_END)
+    try:
+        with zipfile.ZipFile(_Reader(file)) as archive:
+            listed = archive.infolist()
+            _check_directory(path, listed, size)
+            return {info.filename.removesuffix(".npy"): _array(path, archive, info) for info in listed}
+    except ArtefactError:
+        raise
+    except Exception as error:  # a damaged archive raises nearly anything
+        raise failure(path, f"damaged ({error or type(error).__name__})") from error
+
+
+def write_npz(file: BinaryIO, arrays: Mapping[str, np.ndarray], *, compressed: bool) -> None:
+    """As np.savez, for any names and without pickles; the same arrays give the same bytes."""
+    with zipfile.ZipFile(file, "w") as archive:
+        for name, array in arrays.items():
+            info = zipfile.ZipInfo(f"{name}.npy", _DATE)
+            info.compress_type = zipfile.ZIP_DEFLATED if compressed else zipfile.ZIP_STORED
+            with archive.open(info, "w", force_zip64=True) as entry:
+                np.lib.format.write_array(entry, array, allow_pickle=False)
+
+
+def _check_directory(path: Path, listed: list[zipfile.ZipInfo], size: int) -> None:
+    """Refuse what the directory declares and the file cannot hold."""
+    names = [info.filename for info in listed]
+    if odd := [name for name in names if not name.endswith(".npy")]:
+        raise failure(path, f"holds {odd[0][:60]!r}, which is no array")
+    if len(set(names)) < len(names):
+        raise failure(path, "holds two arrays of one name")
+    packed = [info for info in listed if info.compress_type == zipfile.ZIP_DEFLATED]
+    stored = [info for info in listed if info.compress_type == zipfile.ZIP_STORED]
+    if len(packed) + len(stored) < len(listed):
+        raise failure(path, "is compressed by another method than deflate")
+    if sum(info.file_size for info in stored) > size or sum(info.compress_size for info in packed) > size:
+        raise failure(path, f"damaged (its arrays are declared larger than its {size} bytes)")
+    if any(info.file_size > DEFLATE_RATIO * info.compress_size for info in packed):
+        raise failure(path, "damaged (a member is declared larger than it can inflate to)")
+    if (inflated := sum(info.file_size for info in packed)) > INFLATED:
+        raise failure(path, f"inflates to {inflated >> 20} MiB, more than {INFLATED >> 20}; store it uncompressed")
+
+
+def _array(path: Path, archive: zipfile.ZipFile, info: zipfile.ZipInfo) -> np.ndarray:
+    """One member; its checksum is compared by the zip library with the last byte."""
+    with archive.open(info) as entry:
+        kind, shape, order, begins = _header(path, entry)
+        size = math.prod(shape) * kind.itemsize
+        if begins + size != info.file_size:
+            raise ValueError(f"{info.filename} declares {size} bytes and holds {info.file_size - begins}")
+        content = np.empty(size, np.uint8)
+        for start in range(0, size, CHUNK):
+            part = content[start : start + CHUNK]
+            part[:] = np.frombuffer(_exactly(entry, len(part)), np.uint8)
+    array = content.view(kind).reshape(shape, order=order)
+    if kind.kind == "U" and not _is_text(content.view(f"{kind.byteorder}u4")):
+        raise ValueError(f"{info.filename} holds text that is not Unicode")
+    return array
+
+
+def _header(path: Path, entry: Any) -> tuple[np.dtype, tuple[int, ...], Literal["C", "F"], int]:
+    """Dtype, shape and order of a .npy file, and where its data begin."""
+    magic = _exactly(entry, 8)
+    if magic[:6] != b"\x93NUMPY" or magic[6] not in (1, 2, 3):
+        raise ValueError(f"{entry.name} is no array of numpy")
+    width = 2 if magic[6] == 1 else 4
+    length = int.from_bytes(_exactly(entry, width), "little")
+    if length > LONGEST_HEADER:
+        raise ValueError(f"{entry.name} has a header of {length} bytes")
+    found = _HEADER.fullmatch(_exactly(entry, length).decode("latin1"))
+    if not found or None in found.group("kind", "fortran", "shape"):
+        raise ValueError(f"{entry.name} has no header of plain numbers")
+    if found["kind"] == "O":
+        raise failure(path, "holds pickled objects, refused")
+    if found["kind"] not in PORTABLE:
+        raise ValueError(f"{entry.name} is of a dtype that is not portable")
+    kind, listed = np.dtype("".join(found.group("order", "kind", "size"))), found["shape"].strip()
+    if not kind.itemsize or (listed and "," not in listed):
+        raise ValueError(f"{entry.name} has no shape or no size")
+    shape = tuple(int(length.strip().removesuffix("L")) for length in listed.rstrip(",").split(",") if listed)
+    return kind, shape, "F" if found["fortran"] == "True" else "C", 8 + width + length
+
+
+def _exactly(entry: Any, count: int) -> bytes:
+    content = entry.read(count)
+    if len(content) < count:
+        raise ValueError(f"{entry.name} ends too early")
+    return content
+
+
+def _is_text(letters: np.ndarray) -> bool:
+    """Whether all are code points, none of them half of a surrogate pair."""
+    return not np.any((letters > 0x10FFFF) | ((letters >= 0xD800) & (letters <= 0xDFFF)))

@@ -1,0 +1,375 @@
+"""What the fuzzer reads: how a sound folder is made, how a file of it is changed, and what reading it must give."""
+
+import contextlib
+import hashlib
+import io
+import json
+import random
+import shutil
+import sys
+from collections.abc import Callable
+from functools import cache
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import fuzzing_mutations as mutations
+import jax
+import jax.export
+import jax.numpy as jnp
+import numpy as np
+
+from sfkd_jax import artefacts, datasets, evaluation, policy, reporting
+from sfkd_jax.exporting import _run_controller as loader
+
+ROOT = Path(__file__).parents[1]
+SHIPPED = ROOT / "src" / "sfkd_jax" / "pretrained" / "kinematic"
+Change = Callable[[random.Random, bytes], bytes]
+
+
+class Reader(NamedTuple):
+    """One way of reading.
+
+    Attributes:
+        make: writes a sound folder. files: file -> how it is changed.
+        read: reads the folder. holds: whether what was read means what lies in the folder.
+        refusals: types of a refusal.
+    """
+
+    make: Callable[[Path], None]
+    files: dict[str, Change]
+    read: Callable[[Path], Any]
+    holds: Callable[[Any, Path], bool]
+    refusals: tuple[type[Exception], ...] = (artefacts.ArtefactError,)
+
+
+# ---- documents
+
+
+def plain_json(content: bytes) -> Any:
+    """What Python's own reader makes of a document, which must say everything once."""
+
+    def once(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
+        assert len(dict(pairs)) == len(pairs)
+        return dict(pairs)
+
+    return json.loads(content.decode("utf-8-sig"), object_pairs_hook=once)
+
+
+def equal(a: Any, b: Any) -> bool:
+    """Whether two documents are the same, with 1, 1.0 and true told apart."""
+    return repr(a) == repr(b)
+
+
+def make_document(folder: Path) -> None:
+    shutil.copy(SHIPPED / "policy.json", folder / "a.json")
+
+
+def read_document(folder: Path) -> Any:
+    return artefacts.read_json(folder / "a.json")
+
+
+def document_holds(found: Any, folder: Path) -> bool:
+    return equal(found, plain_json((folder / "a.json").read_bytes())) and equal(artefacts.sha256(found)[:0], "")
+
+
+def make_lines(folder: Path) -> None:
+    for step in range(12):
+        artefacts.append_jsonl(folder / "a.jsonl", {"step": step, "loss": 0.5**step, "parts": {"x": [step]}, "w": "é"})
+
+
+def read_lines(folder: Path) -> Any:
+    return artefacts.read_jsonl(folder / "a.jsonl")
+
+
+def lines_hold(found: Any, folder: Path) -> bool:
+    *lines, last = (folder / "a.jsonl").read_bytes().split(b"\n")
+    expected = [plain_json(line) for line in lines if line.strip()]
+    return equal(found, expected) or equal(found, [*expected, plain_json(last)])
+
+
+# ---- arrays
+
+ARRAYS = {
+    "t": np.arange(20) * 0.1,
+    "params/A": np.arange(12, dtype=np.float32).reshape(3, 4),
+    "fortran": np.asfortranarray(np.arange(6.0).reshape(2, 3)),
+    "scalar": np.array(2.5),
+    "empty": np.zeros((0, 3), np.int8),
+    "flags": np.array([True, False]),
+    "words": np.array(["S1", "σ"]),
+    "when": np.array(["2020-01-01"], "<M8[s]"),
+}
+
+
+def make_arrays(folder: Path) -> None:
+    artefacts.write_arrays(folder / "a.npz", ARRAYS, kind="fuzzed", config={"seed": 0, "model": {"rank": 3}})
+    manifest = artefacts.read_json(folder / "a.json")
+    manifest.pop("file_sha256", None)  # as an earlier version, or somebody who wants to be read, writes it
+    shutil.copy(folder / "a.npz", folder / "b.npz")
+    artefacts.write_json(folder / "b.json", manifest)
+
+
+def read_arrays(folder: Path) -> Any:
+    return [artefacts.read_arrays(folder / f"{name}.npz", kind="fuzzed") for name in "ab"]
+
+
+def arrays_hold(found: Any, folder: Path) -> bool:
+    return all(
+        same_arrays(arrays, ARRAYS) and equal(manifest, plain_json((folder / f"{name}.json").read_bytes()))
+        for name, (arrays, manifest) in zip("ab", found, strict=True)
+    )
+
+
+def same_arrays(a: dict[str, np.ndarray], b: dict[str, np.ndarray]) -> bool:
+    """Whether names, dtypes, shapes and every bit agree."""
+    agree = (a[n].dtype == b[n].dtype and a[n].shape == b[n].shape and a[n].tobytes() == b[n].tobytes() for n in a)
+    return a.keys() == b.keys() and all(agree)
+
+
+def make_npz(folder: Path) -> None:
+    with (folder / "a.npz").open("wb") as file:
+        np.savez(file, **{name.replace("/", "_"): array for name, array in ARRAYS.items()})
+
+
+def read_npz(folder: Path) -> Any:
+    return artefacts.read_npz(folder / "a.npz")
+
+
+def npz_holds(found: Any, folder: Path) -> bool:
+    with np.load(folder / "a.npz", allow_pickle=False) as archive:
+        return same_arrays(found, {name: np.asarray(archive[name]) for name in archive.files})
+
+
+# ---- logs
+
+
+@cache
+def recorded() -> dict[str, np.ndarray]:
+    sys.path.append(str(Path(__file__).parent / "datasets"))
+    from recorded import drive
+
+    return drive(seconds=6.0)
+
+
+def make_csv(folder: Path) -> None:
+    rows = zip(*recorded().values(), strict=True)
+    body = "\n".join(",".join(f"{value:.9g}" for value in row) for row in rows)
+    (folder / "a.csv").write_text(f"{','.join(recorded())}\n{body}\n")
+
+
+def make_log_npz(folder: Path) -> None:
+    np.savez(folder / "a.npz", **recorded())
+
+
+def make_parquet(folder: Path) -> None:
+    import pyarrow
+    from pyarrow import parquet
+
+    parquet.write_table(pyarrow.table(recorded()), folder / "a.parquet")
+
+
+def log_reader(name: str, make: Callable[[Path], None], change: Change) -> Reader:
+    """Reading one log, as `generate` does."""
+
+    def read(folder: Path) -> Any:
+        file = str(folder / name)
+        return datasets.from_logs(file, datasets.Columns(), dt=0.1, wheelbase=2.7, steps=5, say=lambda line: None)
+
+    return Reader(make, {name: change}, read, log_holds, (artefacts.ArtefactError, ValueError))
+
+
+def log_holds(found: Any, folder: Path) -> bool:
+    """Whether a data set is of finite numbers."""
+    parts = [getattr(found.dataset, part) for part in ("train", "validation", "calibration", "test")]
+    return all(bool(np.isfinite(np.asarray(leaf)).all()) for part in parts for leaf in part)
+
+
+# ---- runs
+
+
+@cache
+def results() -> dict[str, Any]:
+    """Two rows of a committed result, without the side forces that a figure would be drawn of."""
+    document = json.loads((ROOT / "experiments" / "violations" / "results.json").read_bytes())
+    rows = [{name: value for name, value in row.items() if name != "disturbed"} for row in document["rows"][:2]]
+    return document | {"rows": rows}
+
+
+def make_run(folder: Path) -> None:
+    artefacts.write_json(folder / "results.json", results())
+    shutil.copy(SHIPPED / "policy.json", folder / "policy.json")
+
+
+def read_rows(folder: Path) -> Any:
+    path = folder / "results.json"
+    rows = artefacts.read_json(path, keys=("rows",))["rows"]
+    with artefacts.understood(path):
+        return evaluation.merge(rows, rows)
+
+
+def rows_hold(found: Any, folder: Path) -> bool:
+    return equal(found, plain_json((folder / "results.json").read_bytes())["rows"])
+
+
+def read_report(folder: Path) -> Any:
+    return reporting.write_report(folder)
+
+
+def page_holds(found: Any, folder: Path) -> bool:
+    return Path(found["report"]).read_text().endswith("</html>\n")
+
+
+def read_benchmark(folder: Path) -> Any:
+    path = folder / "results.json"
+    document = artefacts.read_json(path, keys=("rows",))
+    with artefacts.understood(path):
+        return reporting.benchmark_markdown(document)
+
+
+def make_runs(folder: Path) -> None:
+    for seed in range(2):
+        run = folder / "runs" / f"seed={seed}"
+        make_run(run) if run.mkdir(parents=True) is None else None
+        artefacts.write_json(
+            run / "settings.json", {"seed": seed, "model": {"system": "sfkd", "rho": 0.9, "beta": 0.1}}
+        )
+
+
+def read_comparison(folder: Path) -> Any:
+    return reporting.write_comparison(folder, "runs/*", "page")
+
+
+def load(folder: Path) -> Any:
+    return policy.load(folder)
+
+
+def make_policy(folder: Path) -> None:
+    for file in SHIPPED.iterdir():
+        shutil.copy(file, folder / file.name)
+
+
+def policy_holds(found: Any, folder: Path) -> bool:
+    """Weights and settings are those that ship, and so is a certificate that is believed."""
+    shipped = policy.load(SHIPPED)
+    same = [np.array_equal(a, b) for a, b in zip(*map(jax.tree.leaves, (found.params, shipped.params)), strict=True)]
+    believed = found.certificate is None or equal(found.certificate, shipped.certificate)
+    return all(same) and equal(found.settings, shipped.settings) and believed
+
+
+# ---- exported controllers
+
+
+def make_export(folder: Path) -> None:
+    """A folder as `export` writes it, of the smallest controller."""
+
+    def init(key: jax.Array) -> tuple[jax.Array]:
+        return (key,)
+
+    def act(key: jax.Array, observation: jax.Array, env: jax.Array, reference: jax.Array) -> tuple[jax.Array, ...]:
+        return observation[:2] + env + reference[0, :2], key, observation.sum()
+
+    key, leaves = jax.ShapeDtypeStruct((2,), "uint32"), {"observation": (4,), "env": (2,), "reference": (3, 4)}
+    taken = {name: jax.ShapeDtypeStruct(shape, "float32") for name, shape in leaves.items()}
+    programs = {}
+    for name, function, inputs, outputs in (
+        ("init", init, {"key": key}, ["state.key"]),
+        ("act", act, {"state.key": key} | taken, ["control", "state.key", "info.cost"]),
+    ):
+        exported = jax.export.export(jax.jit(function), platforms=("cpu",))(*inputs.values())
+        content = bytes(exported.serialize())
+        artefacts.write_bytes(folder / f"{name}.stablehlo", content)
+        programs[name] = {
+            "file": f"{name}.stablehlo",
+            "bytes": len(content),
+            "sha256": hashlib.sha256(content).hexdigest(),
+            "inputs": described(inputs, exported.in_avals),
+            "outputs": described(outputs, exported.out_avals),
+        }
+    manifest = {"kind": "controller", "format": loader.FORMAT, "jax": jax.__version__, "programs": programs}
+    manifest |= {"key_implementation": "threefry2x32", "sampling_period_s": 0.1, "controls": [{"name": "a"}]}
+    manifest |= {"environment": {"low": [0.3, -8.0], "high": [0.9, 8.0]}, "horizon": 3}
+    (folder / "controller.json").write_bytes(sealed(manifest))
+
+
+def described(names: Any, values: Any) -> list[dict[str, Any]]:
+    pairs = zip(names, values, strict=True)
+    return [{"name": name, "shape": list(value.shape), "dtype": str(value.dtype)} for name, value in pairs]
+
+
+def sealed(manifest: dict[str, Any]) -> bytes:
+    """A manifest with the hash that belongs to it."""
+    said = {name: value for name, value in manifest.items() if name != "sha256"}
+    with contextlib.suppress(RecursionError, ValueError):
+        said["sha256"] = hashlib.sha256(json.dumps(said, sort_keys=True).encode()).hexdigest()
+    return json.dumps(said).encode()
+
+
+def manifest_change(draw: random.Random, content: bytes) -> bytes:
+    """A manifest changed, every second time with a hash that says it was written so."""
+    changed = mutations.json_change(draw, content)
+    if draw.random() < 0.5:
+        with contextlib.suppress(ValueError, RecursionError, AttributeError):
+            return sealed(json.loads(changed))
+    return changed
+
+
+def read_export(folder: Path) -> Any:
+    controller = loader.ExportedController(folder)
+    state = controller.init(3)
+    measured = {leaf["name"]: jnp.ones(leaf["shape"]) for leaf in controller.manifest["programs"]["act"]["inputs"][1:]}
+    with contextlib.redirect_stdout(io.StringIO()):
+        return controller.manifest, [state, measured]
+
+
+def export_holds(found: Any, folder: Path) -> bool:
+    return equal(found[0], plain_json((folder / "controller.json").read_bytes()))
+
+
+READERS = {
+    "read_json": Reader(make_document, {"a.json": mutations.json_change}, read_document, document_holds),
+    "read_jsonl": Reader(make_lines, {"a.jsonl": mutations.lines_change}, read_lines, lines_hold),
+    "read_arrays": Reader(
+        make_arrays,
+        {
+            name: mutations.json_change if name.endswith("json") else mutations.npz_change
+            for name in ("a.json", "b.json")
+        }
+        | {"a.npz": mutations.npz_change, "b.npz": mutations.npz_change},
+        read_arrays,
+        arrays_hold,
+    ),
+    "read_npz": Reader(make_npz, {"a.npz": mutations.npz_change}, read_npz, npz_holds),
+    "log_csv": log_reader("a.csv", make_csv, mutations.csv_change),
+    "log_npz": log_reader("a.npz", make_log_npz, mutations.npz_change),
+    "log_parquet": log_reader("a.parquet", make_parquet, mutations.byte_change),
+    "merge": Reader(make_run, {"results.json": mutations.json_change}, read_rows, rows_hold),
+    "report": Reader(
+        make_run, dict.fromkeys(("results.json", "policy.json"), mutations.json_change), read_report, page_holds
+    ),
+    "benchmark": Reader(
+        make_run, {"results.json": mutations.json_change}, read_benchmark, lambda found, _: bool(found)
+    ),
+    "comparison": Reader(
+        make_runs,
+        dict.fromkeys(("runs/seed=0/settings.json", "runs/seed=0/results.json"), mutations.json_change),
+        read_comparison,
+        page_holds,
+    ),
+    "exported": Reader(
+        make_export,
+        {"controller.json": manifest_change, "act.stablehlo": mutations.byte_change},
+        read_export,
+        export_holds,
+        (loader.ExportError,),
+    ),
+    "load": Reader(
+        make_policy,
+        {
+            "policy.json": mutations.json_change,
+            "certificate.json": mutations.json_change,
+            "policy.npz": mutations.npz_change,
+        },
+        load,
+        policy_holds,
+    ),
+}
