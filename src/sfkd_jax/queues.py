@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import subprocess
 import sys
+import time
 from collections import Counter
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -11,14 +12,16 @@ from typing import Any
 
 from hydra.core.utils import JobReturn, JobStatus
 
-ENDED = frozenset("BOOT_FAIL CANCELLED COMPLETED DEADLINE FAILED NODE_FAIL OUT_OF_MEMORY TIMEOUT".split())
-"""States of Slurm from which a job does not go on by itself."""
+KILLED = frozenset({"BOOT_FAIL", "CANCELLED", "DEADLINE", "NODE_FAIL", "OUT_OF_MEMORY", "TIMEOUT"})
+"""States of Slurm from which a job does not go on by itself, and which leave no result to wait for."""
+ENDED = KILLED | {"COMPLETED", "FAILED"}
 GONE, NEVER = "GONE", "NEVER_STARTS"
 """States for a job that Slurm no longer knows, and for one that is pending for a reason that will not pass."""
-HOPELESS = frozenset(
-    "BadConstraints DependencyNeverSatisfied InvalidAccount InvalidQOS PartitionNodeLimit PartitionTimeLimit".split()
-)
+_PARTITION = {"PartitionConfig", "PartitionNodeLimit", "PartitionTimeLimit"}
+HOPELESS = _PARTITION | {"BadConstraints", "DependencyNeverSatisfied", "InvalidAccount", "InvalidQOS"}
 """Slurm's reasons for a pending job that only other settings or an administrator can remove."""
+HOPELESS_S = 30
+"""How long such a reason must last to be believed; Slurm also gives it for a moment before it has looked."""
 POLL_S = 30
 """Longest time between two questions to Slurm, which forgets a job some time after its end (MinJobAge, 300 s)."""
 
@@ -46,14 +49,17 @@ def patient(launcher: Any) -> Iterator[list[str]]:
 
     def results(job: submitit.Job) -> list[Any]:
         logs.append(str(job.paths.stderr))
+        job.wait()
+        known = job.get_info(mode="cache")
         try:
-            return wait(job)
+            if known.get("State") not in (*KILLED, NEVER) or job.paths.result_pickle.exists():
+                return wait(job)
+            told = _said(known)
         except (submitit.core.utils.FailedJobError, submitit.core.utils.UncompletedJobError) as reason:
-            state = job.get_info(mode="cache")
-            if state.get("State") == NEVER:
-                job.cancel(check=False)
-            told = f"Slurm says {state['State']} ({state['Reason']})" if "Reason" in state else one_line(reason)
-            return [JobReturn(status=JobStatus.FAILED, _return_value=RuntimeError(told))]
+            told = _said(known) if "Reason" in known else one_line(reason)
+        if known.get("State") == NEVER:
+            job.cancel(check=False)
+        return [JobReturn(status=JobStatus.FAILED, _return_value=RuntimeError(told))]
 
     setattr(submitit.Job, "results", results)  # noqa: B010
     submitit.SlurmJob.watcher = _queue()
@@ -80,7 +86,10 @@ def _queue() -> Any:
     from submitit.slurm.slurm import SlurmInfoWatcher
 
     class Queue(SlurmInfoWatcher):
-        said = ""
+        def __init__(self) -> None:
+            super().__init__(delay_s=POLL_S)
+            self._hopeless_since: dict[str, float] = {}
+            self._line = ""
 
         def _make_command(self) -> list[str] | None:
             if not self._registered - self._finished:
@@ -90,32 +99,43 @@ def _queue() -> Any:
         def read_info(self, string: bytes | str) -> dict[str, dict[str, str]]:
             text = string if isinstance(string, str) else string.decode()
             listed = dict(line.strip().split("|", 1) for line in text.splitlines() if "|" in line)
+            arrays = {job.split("_")[0] for job in self._registered if "_" in job}
             found = {}
-            for job in self._registered - self._finished:
-                state, reason = listed.get(job, f"{GONE}|no result, and not in the queue").split("|")
-                hopeless = state == "PENDING" and reason in HOPELESS
-                found[job] = {"State": NEVER if hopeless else state, "Reason": reason}
-            self._tell(found)
+            for job in self._registered - self._finished - arrays:
+                state, reason = listed.get(job, f"{GONE}|not in the queue any more").split("|")
+                found[job] = {"State": NEVER if self._never(job, state, reason) else state, "Reason": reason}
+            line = _counted(self._info_dict | found)
+            if line != self._line:
+                self._line = line
+                _say(f"Slurm: {line}")
             return found
 
         def is_done(self, job_id: str, mode: str = "standard") -> bool:
             return self.get_state(job_id, mode=mode) in (*ENDED, GONE, NEVER)
 
-        def _tell(self, found: dict[str, dict[str, str]]) -> None:
-            states = {job: known["State"].lower() for job, known in self._info_dict.items()} | {
-                job: " ".join(word for word in (info["State"].lower(), _why(info)) if word)
-                for job, info in found.items()
-            }
-            line = ", ".join(f"{count} {state}" for state, count in sorted(Counter(states.values()).items()))
-            if line != self.said:
-                self.said = line
-                _say(f"Slurm: {line}")
+        def _never(self, job: str, state: str, reason: str) -> bool:
+            if state != "PENDING" or reason not in HOPELESS:
+                self._hopeless_since.pop(job, None)
+                return False
+            return time.monotonic() - self._hopeless_since.setdefault(job, time.monotonic()) >= HOPELESS_S
 
-    return Queue(delay_s=POLL_S)
+    return Queue()
 
 
-def _why(info: dict[str, str]) -> str:
-    return f"({info['Reason']})" if info["State"] == "PENDING" and info["Reason"] != "None" else ""
+def _counted(jobs: dict[str, dict[str, str]]) -> str:
+    """How many jobs are in which state, and why some wait."""
+
+    def words(known: dict[str, str]) -> str:
+        waits = known["State"] == "PENDING" and known["Reason"] != "None"
+        return known["State"].lower() + (f" ({known['Reason']})" if waits else "")
+
+    states = Counter(words(known) for known in jobs.values())
+    return ", ".join(f"{count} {state}" for state, count in sorted(states.items()))
+
+
+def _said(known: dict[str, str]) -> str:
+    """Slurm's last word on a job."""
+    return f"Slurm says {known['State']} ({known['Reason']})"
 
 
 def _say(text: str) -> None:

@@ -72,14 +72,10 @@ class _NamedJobs(Launcher):
     def __init__(self, inner: Launcher, sweep: Sweep) -> None:
         self._inner, self._sweep = inner, sweep
 
-    def setup(
-        self, *, hydra_context: HydraContext, task_function: TaskFunction, config: DictConfig
-    ) -> None:
+    def setup(self, *, hydra_context: HydraContext, task_function: TaskFunction, config: DictConfig) -> None:
         """Nothing to do: the inner launcher is set up."""
 
-    def launch(
-        self, job_overrides: Sequence[Sequence[str]], initial_job_idx: int
-    ) -> Sequence[JobReturn]:
+    def launch(self, job_overrides: Sequence[Sequence[str]], initial_job_idx: int) -> Sequence[JobReturn]:
         """Launch, and wait for all.
 
         Raises:
