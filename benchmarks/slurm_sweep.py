@@ -156,6 +156,7 @@ def main():
     asked = parser.parse_args()
     found = {}
     with tempfile.TemporaryDirectory() as scratch:
+        Path(scratch).chmod(0o755)  # munge wants every user to reach its socket
         for name in asked.only:
             place = Path(scratch) / name
             place.mkdir()

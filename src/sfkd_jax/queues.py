@@ -44,6 +44,7 @@ def patient(launcher: Any) -> Iterator[list[str]]:
         yield logs
         return
     import submitit
+    from submitit.core.utils import FailedJobError, UncompletedJobError
 
     wait, watcher = submitit.Job.results, submitit.SlurmJob.watcher
 
@@ -55,7 +56,7 @@ def patient(launcher: Any) -> Iterator[list[str]]:
             if known.get("State") not in (*KILLED, NEVER) or job.paths.result_pickle.exists():
                 return wait(job)
             told = _said(known)
-        except (submitit.core.utils.FailedJobError, submitit.core.utils.UncompletedJobError) as reason:
+        except (FailedJobError, UncompletedJobError) as reason:
             told = _said(known) if "Reason" in known else one_line(reason)
         if known.get("State") == NEVER:
             job.cancel(check=False)
