@@ -68,7 +68,9 @@ class Sweep:
     def ended(self):
         """Exit status, how long it took, and what it said."""
         status = self.process.wait(timeout=900)
-        return {"status": status, "seconds": time.monotonic() - self.began, "said": self.lines()}
+        found = {"status": status, "seconds": round(time.monotonic() - self.began), "said": self.lines()}
+        print(json.dumps(found, indent=1), flush=True)
+        return found
 
     def left(self, rate):
         """What a finished job left, less its times."""

@@ -55,7 +55,7 @@ def printed(done, word="{"):
 
 
 def test_every_job_has_a_run_that_its_settings_name_and_one_line_if_it_fails(sweep):
-    done = sweep("-m", "+experiment=smoke", RATES, "model.residual_hidden=[8,8],[16]", "seed=0,1,2", "root=else where")
+    done = sweep("-m", "+experiment=smoke", RATES, "model.residual_hidden=[8,8],[16]", "seed=0,1,2")
     assert done.returncode == 1
     runs = [json.loads(line)["run"] for line in printed(done)]
     assert len(set(runs)) == 4
@@ -65,7 +65,7 @@ def test_every_job_has_a_run_that_its_settings_name_and_one_line_if_it_fails(swe
     assert {name.split(",")[1] for name in names} == {"training.learning_rate=0.001", "training.learning_rate=0.003"}
     jobs, total = told(done)
     assert total == "sfkd_jax: 8 of 12 jobs failed; the same sweep again skips what is finished"
-    words = "+experiment=smoke training.learning_rate=0.001 model.residual_hidden=[8,8] seed=1 root=else where"
+    words = "+experiment=smoke training.learning_rate=0.001 model.residual_hidden=[8,8] seed=1"
     assert jobs[0] == f"sfkd_jax: job 1 ({words}) failed: a job that cannot be done"
     assert sum(line.endswith("failed: TypeError: a job with a bug") for line in jobs) == 4
 
@@ -97,14 +97,14 @@ def test_what_workers_of_joblib_could_not_do_is_told(sweep):
 
 
 def test_what_submitit_could_not_do_is_told_with_its_log_and_a_job_that_died_too(sweep):
-    done = sweep("-m", RATES, "seed=1,4", "hydra/launcher=submitit_local")
+    done = sweep("-m", RATES.replace(",0.003", ""), "seed=1,4", "hydra/launcher=submitit_local")
     jobs, total = told(done)
     assert [("a job that cannot be done" in job, "_log.err" in job) for job in jobs] == 2 * [
         (True, True),
         (False, True),
     ]
     assert "has not produced any output" in jobs[1]
-    assert total.startswith("sfkd_jax: 4 of 4 jobs failed")
+    assert total.startswith("sfkd_jax: 2 of 2 jobs failed")
     assert "Traceback" not in done.stderr
     assert done.returncode == 1
 

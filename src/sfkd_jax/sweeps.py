@@ -14,7 +14,6 @@ from hydra.core.override_parser.overrides_parser import OverridesParser
 from hydra.core.plugins import Plugins
 from hydra.core.utils import JobReturn, JobStatus, filter_overrides
 from hydra.plugins.launcher import Launcher
-from hydra.types import HydraContext, TaskFunction
 from omegaconf import DictConfig, OmegaConf
 
 from sfkd_jax import artefacts, queues, shelf
@@ -72,7 +71,7 @@ class _NamedJobs(Launcher):
     def __init__(self, inner: Launcher, sweep: Sweep) -> None:
         self._inner, self._sweep = inner, sweep
 
-    def setup(self, *, hydra_context: HydraContext, task_function: TaskFunction, config: DictConfig) -> None:
+    def setup(self, **_: Any) -> None:
         """Nothing to do: the inner launcher is set up."""
 
     def launch(self, job_overrides: Sequence[Sequence[str]], initial_job_idx: int) -> Sequence[JobReturn]:
