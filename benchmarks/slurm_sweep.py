@@ -17,7 +17,7 @@ import drills
 import timing
 from slurm_cluster import Cluster
 
-LAUNCHER = ("-m", "hydra/launcher=cluster", "hydra.launcher.cpus_per_task=1", "hydra.launcher.mem_gb=3")
+LAUNCHER = ("hydra/launcher=cluster", "hydra.launcher.cpus_per_task=1", "hydra.launcher.mem_gb=3")
 SWEPT = "training.learning_rate"
 LONG = ("training.steps=6000", "training.log_every=25", "training.save_every=25")
 """Training of about a minute, so that there is time to disturb it."""
@@ -29,10 +29,17 @@ class Sweep:
     def __init__(self, cluster, place, rates, *options, minutes=20):
         """Start it."""
         place.mkdir(exist_ok=True)
-        cache = str(cluster.place / "cache")
-        env = cluster.env | {"JAX_COMPILATION_CACHE_DIR": cache, "JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS": "0"}
+        cache = str(cluster.place.parents[1] / "cache")
+        env = {"JAX_COMPILATION_CACHE_DIR": cache, "JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS": "0"} | cluster.env
         env |= {"XLA_FLAGS": "--xla_backend_optimization_level=0", "TF_CPP_MIN_LOG_LEVEL": "3"}
-        asked = [*drills.JOB, *LAUNCHER, f"hydra.launcher.timeout_min={minutes}", f"{SWEPT}={rates}", *options]
+        asked = [
+            *drills.JOB,
+            *LAUNCHER,
+            f"hydra.launcher.timeout_min={minutes}",
+            f"{SWEPT}={rates}",
+            *options,
+            "--multirun",
+        ]
         self.place, self.cluster, self.began = place, cluster, time.monotonic()
         self._said = (place / f"said{len(list(place.glob('said*')))}.txt").open("w+")
         command = [sys.executable, "-m", "sfkd_jax.train", *asked]

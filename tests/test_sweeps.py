@@ -65,7 +65,7 @@ def test_every_job_has_a_run_that_its_settings_name_and_one_line_if_it_fails(swe
     assert {name.split(",")[1] for name in names} == {"training.learning_rate=0.001", "training.learning_rate=0.003"}
     jobs, total = told(done)
     assert total == "sfkd_jax: 8 of 12 jobs failed; the same sweep again skips what is finished"
-    words = "+experiment=smoke training.learning_rate=0.001 model.residual_hidden=[8,8] seed=1"
+    words = "training.learning_rate=0.001 model.residual_hidden=[8,8] seed=1"
     assert jobs[0] == f"sfkd_jax: job 1 ({words}) failed: a job that cannot be done"
     assert sum(line.endswith("failed: TypeError: a job with a bug") for line in jobs) == 4
 

@@ -48,8 +48,7 @@ def compose(*overrides: str) -> dict[str, Any]:
 def command(name: str) -> str:
     """The command that is running, less where its artefacts go, as it is typed in a shell."""
     asked = [word for word in HydraConfig.get().overrides.task if not word.startswith("root=")]
-    typed = (f'"{word}"' if "'" in word else shlex.quote(word) for word in asked)  # Hydra's quotes within the shell's
-    return " ".join(["python -m", f"sfkd_jax.{name}", *typed])
+    return " ".join(["python -m", f"sfkd_jax.{name}", shlex.join(asked)]).strip()
 
 
 def door(run: Callable[[dict[str, Any]], dict[str, Any]]) -> Callable[[], None]:

@@ -12,7 +12,7 @@ from typing import Any, NamedTuple
 
 from hydra.core.override_parser.overrides_parser import OverridesParser
 from hydra.core.plugins import Plugins
-from hydra.core.utils import JobReturn, JobStatus, filter_overrides
+from hydra.core.utils import JobReturn, JobStatus
 from hydra.plugins.launcher import Launcher
 from omegaconf import DictConfig, OmegaConf
 
@@ -82,19 +82,20 @@ class _NamedJobs(Launcher):
         """
         inner: Any = self._inner
         swept = swept_settings(inner.config)
+        named = {key for key in swept if key.split(".")[0] in (*shelf.IDENTITY, "env")} - NAMED
         load = inner.hydra_context.config_loader.load_sweep_config
         jobs = []
         for overrides in job_overrides:
             composed = load(inner.config, list(overrides))
-            jobs.append(with_name(list(overrides), directory(composed, swept), composed.name))
+            jobs.append(with_name(list(overrides), directory(composed, named), composed.name))
         try:
             with queues.patient(inner) as logs:
                 returned = inner.launch(jobs, initial_job_idx=initial_job_idx)
         except Exception as reason:  # each launcher raises what its own libraries raise
             raise SweepError(f"the sweep stopped: {queues.one_line(reason)}") from reason
         for number, (job, log) in enumerate(zip_longest(returned, logs)):
-            asked = " ".join(filter_overrides(job_overrides[number]))
-            self._note(job, f"job {initial_job_idx + number} ({asked})", log)
+            varied = (word for word in job_overrides[number] if word.lstrip("+").split("=")[0] in swept)
+            self._note(job, f"job {initial_job_idx + number} ({' '.join(varied)})", log)
         return returned
 
     def _note(self, job: JobReturn, name: str, log: str | None) -> None:
@@ -126,16 +127,11 @@ def watched() -> Iterator[Sweep]:
 
 
 def swept_settings(config: DictConfig) -> set[str]:
-    """The settings that a sweep varies and a run directory does not name by itself.
-
-    Args:
-        config: of the sweep, before any job is composed.
-    """
+    """The settings that a sweep varies, of its composed `config`."""
     params = (config.hydra.sweeper or {}).get("params") or {}
     asked = chain(config.hydra.overrides.task, (f"{key}={value}" for key, value in params.items()))
     parsed = OverridesParser.create().parse_overrides(list(asked))
-    swept = {found.key_or_group for found in parsed if found.is_sweep_override()} - NAMED
-    return {key for key in swept if key.split(".")[0] in (*shelf.IDENTITY, "env")}
+    return {found.key_or_group for found in parsed if found.is_sweep_override()}
 
 
 def directory(config: DictConfig, swept: set[str]) -> str:
@@ -157,7 +153,8 @@ def with_name(overrides: list[str], added: str, name: str) -> list[str]:
     if not added:
         return overrides
     kept = [word for word in overrides if not word.startswith("name=")]
-    return [*kept, f"name='{name}/{added}'"]
+    escaped = re.sub(r"([\\()\[\]{}:=, \t])", r"\\\1", f"{name}/{added}")  # what Hydra reads as its own grammar
+    return [*kept, f"name={escaped}"]
 
 
 def _spelled(value: Any) -> str:
