@@ -45,7 +45,7 @@ PartitionName=main Nodes=ALL Default=YES MaxTime=60 State=UP
 class Cluster:
     """Two CPUs and 8 GB, without accounting; `with Cluster(folder) as cluster:` starts and stops it."""
 
-    def __init__(self, place, first_port=27817):
+    def __init__(self, place):
         """Write its configuration below `place`."""
         self.place, self._daemons = place, []
         for name, mode in (("munge", 0o755), ("state", 0o700), ("spool", 0o755)):
@@ -54,7 +54,10 @@ class Cluster:
         key = place / "munge/key"
         key.write_bytes(secrets.token_bytes(128))
         key.chmod(0o400)
-        ports = (first_port, first_port + 1, first_port + 2, first_port + 99)
+        with socket.socket() as free:
+            free.bind(("127.0.0.1", 0))
+            first = min(free.getsockname()[1], 65000)
+        ports = (first, first + 1, first + 2, first + 99)
         self._config = place / "slurm.conf"
         self._config.write_text(CONFIG.format(place=place, host=socket.gethostname(), ports=ports))
         self.env = os.environ | {"SLURM_CONF": str(self._config)}

@@ -19,8 +19,8 @@ from slurm_cluster import Cluster
 
 LAUNCHER = ("hydra/launcher=cluster", "hydra.launcher.cpus_per_task=1", "hydra.launcher.mem_gb=3")
 SWEPT = "training.learning_rate"
-LONG = ("training.steps=6000", "training.log_every=25", "training.save_every=25")
-"""Training of about a minute, so that there is time to disturb it."""
+LONG = ("training.steps=2000", "training.log_every=25", "training.save_every=25")
+"""Training of some minutes, so that there is time to disturb it."""
 
 
 class Sweep:
@@ -102,35 +102,30 @@ def failures(cluster, place):
 
 def requeue(cluster, place):
     """Of four jobs on two CPUs one is requeued while it trains, a running and a pending one are cancelled."""
-    measure = Sweep(cluster, place / "unbroken", "0.001,0.002", *LONG)
-    unbroken = measure.ended()
+    measure = _undisturbed(cluster, place.parent / "undisturbed")
     sweep = Sweep(cluster, place / "disturbed", "0.001,0.002,0.003,0.004", *LONG)
     sweep.until(lambda: sweep.step(0.001) >= 100 and sweep.step(0.002) >= 100)
-    first = min(int(job.split("_")[0]) for job, state in cluster.jobs().items() if state == "RUNNING")
+    array = next(job.split("_")[0] for job, state in cluster.jobs().items() if state == "RUNNING")
     at = sweep.step(0.001)
-    cluster.ask("scontrol", "requeue", f"{first}_0")
-    cluster.ask("scancel", f"{first}_3")
-    sweep.until(lambda: cluster.jobs()[f"{first}_2"] == "RUNNING")
-    cluster.ask("scancel", f"{first}_2")
-    found = {"unbroken_status": unbroken["status"], "requeued_at_step": at, "sweep": sweep.ended()}
-    found["different"] = _different(measure, sweep, (0.001, 0.002))
-    found["resumed_at_steps"] = _resumed(sweep, (0.001, 0.002))
-    return found
+    cluster.ask("scontrol", "requeue", f"{array}_0")
+    cluster.ask("scancel", f"{array}_3")
+    sweep.until(lambda: cluster.jobs()[f"{array}_2"] == "RUNNING")
+    cluster.ask("scancel", f"{array}_2")
+    found = {"requeued_at_step": at, "sweep": sweep.ended()}
+    found["different"] = _different(measure, sweep)
+    return found | {"resumed_at_steps": _resumed(sweep)}
 
 
 def limit(cluster, place):
-    """A time limit of a minute: the job is queued again until it is done, or told in one line if it must not be."""
-    measure = Sweep(cluster, place / "unbroken", "0.001,0.002", *LONG)
-    unbroken = measure.ended()
-    short = ("hydra.launcher.signal_delay_s=30",)
-    sweep = Sweep(cluster, place / "limited", "0.001,0.002", *LONG, *short, minutes=1)
-    found = {"unbroken_status": unbroken["status"], "queued_again": sweep.ended()}
-    found["different"] = _different(measure, sweep, (0.001, 0.002))
-    found["resumed_at_steps"] = _resumed(sweep, (0.001, 0.002))
-    once = ("hydra.launcher.max_num_timeout=0",)
-    sweep = Sweep(cluster, place / "once", "0.001,0.002", *LONG, *short, *once, minutes=1)
-    found["not_queued_again"] = sweep.ended()
-    return found
+    """A time limit in mid-training: the job is queued again until it is done, or told in a line if it must not be."""
+    measure = _undisturbed(cluster, place.parent / "undisturbed")
+    short = (*LONG, "hydra.launcher.signal_delay_s=20")
+    sweep = Sweep(cluster, place / "limited", "0.001,0.002", *short, minutes=2)
+    found = {"minutes": 2, "queued_again": sweep.ended()}
+    found["different"] = _different(measure, sweep)
+    found["resumed_at_steps"] = _resumed(sweep)
+    once = Sweep(cluster, place / "once", "0.001,0.002", *short, "hydra.launcher.max_num_timeout=0", minutes=2)
+    return found | {"not_queued_again": once.ended()}
 
 
 def large(cluster, place):
@@ -142,15 +137,27 @@ def large(cluster, place):
     return found
 
 
-def _different(one, other, rates):
+def _undisturbed(cluster, place):
+    """The measure of two drills: the good jobs, left alone.
+
+    Raises:
+        SystemExit: they fail.
+    """
+    sweep = Sweep(cluster, place, "0.001,0.002", *LONG)  # the second time there is nothing to do
+    if sweep.ended()["status"]:
+        raise SystemExit("undisturbed jobs failed")
+    return sweep
+
+
+def _different(one, other):
     """What two sweeps left that is not the same, bit for bit less times."""
-    pairs = [(rate, one.left(rate), other.left(rate)) for rate in rates]
+    pairs = [(rate, one.left(rate), other.left(rate)) for rate in (0.001, 0.002)]
     return [f"{rate}: {name}" for rate, a, b in pairs for name in a if a[name] != b[name]]
 
 
-def _resumed(sweep, rates):
-    """At which steps the training of each job went on, by the names of its event files."""
-    boards = {rate: (sweep.run(rate) / "tensorboard").glob("*.*") for rate in rates}
+def _resumed(sweep):
+    """At which steps the training of each job began or went on, by the names of its event files."""
+    boards = {rate: (sweep.run(rate) / "tensorboard").glob("*.*") for rate in (0.001, 0.002)}
     return {rate: sorted(int(file.suffix[1:]) for file in files) for rate, files in boards.items()}
 
 

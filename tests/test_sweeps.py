@@ -172,6 +172,16 @@ def test_a_value_is_spelled_so_that_files_can_be_called_by_it(value, spelled):
     assert len(found) == len(spelled) + (8 if spelled.endswith("-") else 0)
 
 
+def test_policies_of_a_comparison_lie_apart_as_its_results_do():
+    known = {"name": "table1", "comparison": {"policies": "table1"}}
+    asked = ["+experiment=table1", "training.a=1", "name=other"]
+    assert sweeps.with_name(asked, OmegaConf.create(known), "") == asked
+    found = sweeps.with_name(asked, OmegaConf.create(known), "training.a=1")
+    assert found == [*asked[:2], r"name=table1/training.a\=1"]
+    found = sweeps.with_name(asked, OmegaConf.create(known | {"name": "seeds"}), "training.a=1")
+    assert found[2:] == [r"name=seeds/training.a\=1", r"comparison.policies=table1/training.a\=1"]
+
+
 def test_directories_differ_where_settings_do_and_not_with_their_order():
     sizes = [composed(model={"sizes": sizes}) for sizes in ([8, 8], [88], [8, [8]], ["8", 8], "8-8")]
     assert len({sweeps.directory(config, {"model.sizes"}) for config in sizes}) == len(sizes)

@@ -87,7 +87,7 @@ class _NamedJobs(Launcher):
         jobs = []
         for overrides in job_overrides:
             composed = load(inner.config, list(overrides))
-            jobs.append(with_name(list(overrides), directory(composed, named), composed.name))
+            jobs.append(with_name(list(overrides), composed, directory(composed, named)))
         try:
             with queues.patient(inner) as logs:
                 returned = inner.launch(jobs, initial_job_idx=initial_job_idx)
@@ -148,13 +148,15 @@ def directory(config: DictConfig, swept: set[str]) -> str:
     return name if len(name) <= LONGEST_NAME else f"{len(parts)}-settings-{_hash(name)}"
 
 
-def with_name(overrides: list[str], added: str, name: str) -> list[str]:
-    """The overrides of a job whose run is called name/added."""
-    if not added:
-        return overrides
-    kept = [word for word in overrides if not word.startswith("name=")]
-    escaped = re.sub(r"([\\()\[\]{}:=, \t])", r"\\\1", f"{name}/{added}")  # what Hydra reads as its own grammar
-    return [*kept, f"name={escaped}"]
+def with_name(overrides: list[str], config: DictConfig, added: str) -> list[str]:
+    """The overrides of a job whose run is called name/added, and so are the policies of a comparison if it is one."""
+    names = {"name": config.name, "comparison.policies": config.comparison.policies}
+    for key, name in names.items() if added else ():
+        if key != "name" and name == config.name:
+            continue  # it follows
+        escaped = re.sub(r"([\\()\[\]{}:=, \t])", r"\\\1", f"{name}/{added}")  # what Hydra reads as its own grammar
+        overrides = [*(word for word in overrides if not word.startswith(f"{key}=")), f"{key}={escaped}"]
+    return overrides
 
 
 def _spelled(value: Any) -> str:
