@@ -206,6 +206,7 @@ def queue(monkeypatch):
         watcher._info_dict.update(watcher.read_info("\n".join(lines)))
         return [watcher.is_done(job, mode="cache") for job in ("7_0", "7_1")]
 
+    says.watcher = watcher
     return says
 
 
@@ -223,6 +224,9 @@ def test_what_can_never_start_is_not_waited_for(queue):
     lines = ("7_0|PENDING|PartitionTimeLimit", "7_1|PENDING|Priority")
     assert queue(*lines) == [False, False]
     assert queue(*lines, seconds=queues.HOPELESS_S) == [True, False]
+    assert "never start (Slurm says PartitionTimeLimit)" in queues._said(queue.watcher.get_info("7_0", mode="cache"))
+    assert queue("7_0|PENDING|Priority", "7_1|PENDING|Priority", seconds=queues.HOPELESS_S) == [False, False]
+    assert queue(*lines) == [False, False]
 
 
 def test_what_was_raised_becomes_one_line():

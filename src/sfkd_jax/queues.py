@@ -37,7 +37,7 @@ def patient(launcher: Any) -> Iterator[list[str]]:
         launcher: of Hydra; one that does not use submitit is left alone.
 
     Yields:
-        The log file of each job, in the order in which they were launched.
+        The log file of each job, in the order in which they were launched; "" of one that never began.
     """
     logs: list[str] = []
     if not type(launcher).__module__.startswith("hydra_plugins.hydra_submitit_launcher"):
@@ -49,8 +49,8 @@ def patient(launcher: Any) -> Iterator[list[str]]:
     wait, watcher = submitit.Job.results, submitit.SlurmJob.watcher
 
     def results(job: submitit.Job) -> list[Any]:
-        logs.append(str(job.paths.stderr))
         job.wait()
+        logs.append(str(job.paths.stderr) if job.paths.stderr.exists() else "")
         known = job.get_info(mode="cache")
         try:
             if known.get("State") not in (*KILLED, NEVER) or job.paths.result_pickle.exists():
@@ -136,6 +136,8 @@ def _counted(jobs: dict[str, dict[str, str]]) -> str:
 
 def _said(known: dict[str, str]) -> str:
     """Slurm's last word on a job."""
+    if known["State"] == NEVER:
+        return f"it can never start (Slurm says {known['Reason']}); hydra.launcher asks for too much"
     return f"Slurm says {known['State']} ({known['Reason']})"
 
 
