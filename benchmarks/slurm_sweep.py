@@ -2,7 +2,8 @@
 
 python benchmarks/slurm_sweep.py [--only failures requeue limit large --out benchmarks/slurm_sweep.json]
 As root on Debian: apt-get install munge slurmctld slurmd slurm-client. The cluster (slurm_cluster.py) is one node with
-two CPUs on the loopback address and goes when the script ends. A job is the small walk of drills.py.
+two CPUs on the loopback address and goes when the script ends. A job is the small walk of drills.py. What the file
+says of drills that are not asked for stays.
 """
 
 import argparse
@@ -181,8 +182,9 @@ def main():
                 found[name] = DRILLS[name](cluster, place)
             print(json.dumps({name: found[name]}, indent=1), flush=True)
     slurm = subprocess.run(["slurmctld", "-V"], capture_output=True, text=True, check=True).stdout.strip()
-    settings = {"job": drills.JOB, "launcher": LAUNCHER, "long": LONG, "only": asked.only}
-    timing.write(asked.out, found | {"settings": settings, "slurm": slurm, "machine": timing.machine()})
+    settings = {"job": drills.JOB, "launcher": LAUNCHER, "long": LONG}
+    kept = json.loads(Path(asked.out).read_text()) if asked.out and Path(asked.out).exists() else {}
+    timing.write(asked.out, kept | found | {"settings": settings, "slurm": slurm, "machine": timing.machine()})
 
 
 if __name__ == "__main__":
