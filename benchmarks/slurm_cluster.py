@@ -47,7 +47,7 @@ class Cluster:
 
     def __init__(self, place):
         """Write its configuration below `place`."""
-        self.place, self._daemons = place, []
+        self.place, self._daemons, self.clients = place, [], []
         for name, mode in (("munge", 0o755), ("state", 0o700), ("spool", 0o755)):
             (place / name).mkdir(mode=mode)
         place.chmod(0o755)
@@ -74,7 +74,10 @@ class Cluster:
         return self
 
     def __exit__(self, *_):
-        """Cancel what runs, and stop the daemons in the reverse order."""
+        """Stop who waits for jobs, cancel what runs, and stop the daemons in the reverse order."""
+        for client in self.clients:
+            if client.poll() is None:
+                client.kill()
         self.ask("scancel", "--full", "--state=running")
         self.ask("scancel", "--me")
         time.sleep(2)

@@ -46,6 +46,7 @@ class Sweep:
         command = [sys.executable, "-m", "sfkd_jax.train", *asked]
         out = {"stdout": subprocess.DEVNULL, "stderr": self._said}
         self.process = subprocess.Popen(command, cwd=place, env=env, start_new_session=True, **out)
+        cluster.clients.append(self.process)
 
     def run(self, rate):
         """The run directory of a job."""
@@ -73,9 +74,9 @@ class Sweep:
         said = Path(self._said.name).read_text().replace(str(self.place), "")
         return [line for line in said.splitlines() if line.startswith("sfkd_jax: ") or "Traceback" in line]
 
-    def ended(self):
+    def ended(self, seconds=900):
         """Exit status, how long it took, and what it said."""
-        status = self.process.wait(timeout=900)
+        status = self.process.wait(timeout=seconds)
         found = {"status": status, "seconds": round(time.monotonic() - self.began), "said": self.lines()}
         print(json.dumps(found, indent=1), flush=True)
         return found
@@ -121,11 +122,11 @@ def limit(cluster, place):
     """A time limit in mid-training: the job is queued again until it is done, or told in a line if it must not be."""
     measure = _undisturbed(cluster, place.parent / "undisturbed")
     short = (*LONG, "hydra.launcher.signal_delay_s=20")
-    sweep = Sweep(cluster, place / "limited", "0.001,0.002", *short, minutes=2)
-    found = {"minutes": 2, "queued_again": sweep.ended()}
+    sweep = Sweep(cluster, place / "limited", "0.001,0.002", *short, minutes=4)
+    found = {"minutes": [4, 1], "queued_again": sweep.ended(seconds=3000)}
     found["different"] = _different(measure, sweep)
     found["resumed_at_steps"] = _resumed(sweep)
-    once = Sweep(cluster, place / "once", "0.001,0.002", *short, "hydra.launcher.max_num_timeout=0", minutes=2)
+    once = Sweep(cluster, place / "once", "0.001,0.002", *short, "hydra.launcher.max_num_timeout=0", minutes=1)
     return found | {"not_queued_again": once.ended()}
 
 

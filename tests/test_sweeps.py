@@ -88,22 +88,20 @@ def test_what_a_run_directory_names_already_or_what_decides_no_weights_is_not_na
 
 
 def test_what_workers_of_joblib_could_not_do_is_told(sweep):
-    done = sweep("-m", RATES.replace(",0.003", ""), "seed=0,1", "hydra/launcher=cores")
+    done = sweep("-m", "seed=0,1", "hydra/launcher=cores")
     jobs, total = told(done)
-    assert jobs == ["sfkd_jax: job 1 (training.learning_rate=0.001 seed=1) failed: a job that cannot be done"]
+    assert jobs == ["sfkd_jax: job 1 (seed=1) failed: a job that cannot be done"]
     assert total.startswith("sfkd_jax: 1 of 2 jobs failed")
     assert "Traceback" not in done.stderr
     assert done.returncode == 1
 
 
 def test_what_submitit_could_not_do_is_told_with_its_log_and_a_job_that_died_too(sweep):
-    done = sweep("-m", RATES.replace(",0.003", ""), "seed=1,4", "hydra/launcher=submitit_local")
+    done = sweep("-m", "seed=1,4", "hydra/launcher=submitit_local")
     jobs, total = told(done)
-    assert [("a job that cannot be done" in job, "_log.err" in job) for job in jobs] == 2 * [
-        (True, True),
-        (False, True),
-    ]
+    assert ["a job that cannot be done" in job for job in jobs] == [True, False]
     assert "has not produced any output" in jobs[1]
+    assert all("_log.err" in job for job in jobs)
     assert total.startswith("sfkd_jax: 2 of 2 jobs failed")
     assert "Traceback" not in done.stderr
     assert done.returncode == 1
