@@ -42,7 +42,8 @@ ARROWS = {
     "__init__": {"artefacts", "exporting", "policy"},
 }
 EVERY_ROOM = set(ARROWS)
-ARROWS |= {"ranges": set(), "schemas": EVERY_ROOM, "config": EVERY_ROOM | {"ranges", "schemas"}}
+ARROWS |= {"ranges": set(), "schemas": EVERY_ROOM, "queues": set(), "sweeps": {"artefacts", "queues", "shelf"}}
+ARROWS |= {"config": EVERY_ROOM | {"queues", "ranges", "schemas", "sweeps"}}
 ARROWS |= {door: EVERY_ROOM | DOORS | {"config", "ranges", "schemas"} for door in DOORS}
 
 EVERYWHERE = set(sys.stdlib_module_names) | {PACKAGE, "jax", "jaxtyping"}
@@ -62,6 +63,8 @@ THIRD_PARTY = {
     "cells": {"numpy"},
     "adapters": {"brax", "gymnasium", "numpy", "scipy", "vehiclemodels"},
     "exporting": {"numpy", "iree"},
+    "queues": {"hydra", "submitit"},
+    "sweeps": {"hydra", "omegaconf"},
 } | {front: FRONT for front in DOORS | {"config", "schemas"}}
 
 FILES = {file.relative_to(SRC).as_posix(): ast.parse(file.read_text("utf-8")) for file in SRC.rglob("*.py")}

@@ -7,7 +7,9 @@ import json
 import math
 import os
 import re
+import shlex
 import sys
+import traceback
 import typing
 from collections.abc import Callable
 from pathlib import Path
@@ -20,7 +22,7 @@ from hydra.types import RunMode
 from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
-from sfkd_jax import assembly, ranges, training
+from sfkd_jax import assembly, queues, ranges, sweeps, training
 from sfkd_jax.artefacts import ArtefactError
 from sfkd_jax.certification import CertificateStale, CertificationRefused
 from sfkd_jax.schemas import register as register
@@ -45,20 +47,21 @@ def compose(*overrides: str) -> dict[str, Any]:
 
 
 def command(name: str) -> str:
-    """The command that is running, less where its artefacts go."""
+    """The command that is running, less where its artefacts go, as it is typed in a shell."""
     asked = [word for word in HydraConfig.get().overrides.task if not word.startswith("root=")]
-    return " ".join(["python -m", f"sfkd_jax.{name}", *asked])
+    return " ".join(["python -m", f"sfkd_jax.{name}", shlex.join(asked)]).strip()
 
 
 def door(run: Callable[[dict[str, Any]], dict[str, Any]]) -> Callable[[], None]:
     """Make `run(settings) -> document` a command: compose, work, print one JSON object as the last line of stdout.
 
     What can be expected to go wrong becomes one line on stderr and an exit code: 1 failed, 2 refused, 3 stale. A job
-    of a sweep returns the document's "objective" to the sweeper, and infinity where it failed: the others go on.
+    of a sweep returns the document's "objective" to the sweeper, and infinity where it failed: the others go on, and
+    the sweep ends with a line for each that failed and status 1 (`sweeps.Sweep.status`).
     """
     register()
 
-    def main(config: DictConfig) -> float | None:
+    def main(config: DictConfig) -> sweeps.Outcome | None:
         sweeping = HydraConfig.get().mode == RunMode.MULTIRUN
         fail = functools.partial(_fail, sweeping=sweeping)
         try:
@@ -74,24 +77,37 @@ def door(run: Callable[[dict[str, Any]], dict[str, Any]]) -> Callable[[], None]:
             return fail(_one_line(reason), 1)
         except (ArtefactError, ValueError, training.TrainingStopped, OSError) as reason:
             return fail(str(reason).splitlines()[0] if str(reason) else type(reason).__name__, 1)
+        except Exception as reason:
+            if not sweeping:
+                raise
+            traceback.print_exc()  # to the job's own log: nobody expected this
+            return fail(queues.one_line(reason), 1)
         print(json.dumps(document), flush=True)
-        return document.get("objective") if sweeping else None
+        return sweeps.Outcome(document.get("objective")) if sweeping else None
 
     opened = hydra.main(config_path=conf_path(), config_name="config", version_base="1.3")(main)
     return functools.partial(_open, opened)
 
 
 def _open(opened: Callable[[], None]) -> None:
-    """Open a door; what cannot be composed is one line, unless HYDRA_FULL_ERROR asks for all of it."""
-    if "HYDRA_FULL_ERROR" in os.environ:
-        return opened()
+    """Open a door; what cannot be composed or launched is one line, unless HYDRA_FULL_ERROR asks for all of it."""
+    loud = "HYDRA_FULL_ERROR" in os.environ
     os.environ["HYDRA_FULL_ERROR"] = "1"  # else Hydra prints what is wrong in its own words and exits
     try:
-        return opened()
-    except (HydraException, OmegaConfBaseException) as reason:
+        with sweeps.watched() as sweep:
+            opened()
+    except (HydraException, OmegaConfBaseException, sweeps.SweepError) as reason:
+        if loud:
+            raise
         _fail(_one_line(reason), 1)
+    except KeyboardInterrupt:
+        _fail("interrupted; the same command continues", 130)
     finally:
-        del os.environ["HYDRA_FULL_ERROR"]
+        if not loud:
+            del os.environ["HYDRA_FULL_ERROR"]
+    sweep.report()
+    if sweep.status():
+        sys.exit(sweep.status())
 
 
 def _one_line(reason: BaseException) -> str:
@@ -121,7 +137,7 @@ def _settings(config: DictConfig) -> dict[str, Any]:
     return settings
 
 
-def _fail(reason: str, code: int, *, sweeping: bool = False) -> float:
-    """One line on stderr, then the exit code; in a sweep, the objective of a job that failed."""
+def _fail(reason: str, code: int, *, sweeping: bool = False) -> sweeps.Outcome:
+    """One line on stderr, then the exit code; in a sweep, the outcome of a job that failed."""
     print(f"sfkd_jax: {reason}", file=sys.stderr, flush=True)
-    return math.inf if sweeping else sys.exit(code)
+    return sweeps.Outcome(math.inf, reason) if sweeping else sys.exit(code)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 import shlex
 from typing import Any
 
@@ -20,9 +21,18 @@ def command(door: str, settings: dict[str, Any]) -> str:
         parts += ["dataset=files", "dataset.path=LOGS"]
         parts += [f"name={name}"] if name not in (None, "", "default") else []
     else:
-        parts += [f"+experiment={name}"] if name not in (None, "", "default") else []
+        parts += _of_experiment(str(name), settings) if name not in (None, "", "default") else []
     parts += [f"model={model}"] if model != "sfkd" else []
     return shlex.join([*parts, f"seed={plain(settings.get('seed', 0))}"])
+
+
+def _of_experiment(name: str, settings: dict[str, Any]) -> list[str]:
+    """An experiment; of a job of a sweep, called experiment/key=value,..., also its settings and its name."""
+    words = []
+    for key, _, spelled in (word.partition("=") for word in name.partition("/")[2].split(",") if "=" in word):
+        words.append(f"{key}={value if isinstance(value := dig(settings, *key.split('.')), list) else spelled}")
+    escaped = re.sub("([=,])", r"\\\1", name)  # = and , mean something to Hydra
+    return [f"+experiment={name.split('/')[0]}", *words, f"name={escaped}"] if words else [f"+experiment={name}"]
 
 
 def model_of(settings: dict[str, Any]) -> str:
