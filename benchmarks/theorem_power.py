@@ -3,6 +3,8 @@
 python benchmarks/theorem_power.py [--segments 400 --out benchmarks/theorem_power.json]
 Shipped policies on drives that neither training nor calibration saw: S1 and S2, and S3's switching. V0 counts steps at
 which |e_k| > R_k though every |d_j| ≤ d̄; reach is the largest |e_k| / R_k there, which the theorem keeps below 1.
+Beside it: the share of single steps whose error leaves each measured bound while a side force that nobody measures
+pushes the car, constant over the step and drawn from [-F, F].
 """
 
 import argparse
@@ -11,13 +13,17 @@ from functools import partial
 from pathlib import Path
 
 import jax
+import numpy as np
 
-from sfkd_jax import artefacts, assembly, datasets, demo, policy
+from sfkd_jax import artefacts, assembly, datasets, demo, evaluation, policy
 from sfkd_jax.certification import latent_tube
 from sfkd_jax.evaluation import predictions, theorem_reach, theorem_violations
+from sfkd_jax.rollouts import step_disturbances
 
 HORIZON, SEED = 20, 12345
 FORGED_ALPHA, FORGED_D_BAR = (0.98, 0.95, 0.9, 0.5), (0.5, 0.25)
+FORCES = (0, 250, 500, 1000)
+KINDS = ("latent", "position", "yaw", "body")
 SHORTER = (1.02, 1.1, 1.3)
 """Factors of A(e): a model that does not contract as its certificate says."""
 
@@ -44,6 +50,22 @@ def measured(found, alpha, d_bar):
     return {"broken": broken, "applied": applied, "reach": round(max(reach), 3) if reach else None, **where}
 
 
+def pushed(trained, params, drives, bounds, force):
+    """Share of steps that leave the bound of each kind when the step itself is pushed sideways."""
+    plant, model = trained.vehicle, trained.model
+
+    def one(key, before, control, env):
+        met = evaluation.pushed(plant, env[None], key, largest=force)[0] if force else env
+        fiber = model.fiber(params, env)
+        origin = model.encode(fiber, before)
+        return step_disturbances(model, fiber, fiber, origin, before, control, plant.step(before, control, met))
+
+    steps = drives.controls.shape[1]
+    keys = jax.random.split(jax.random.key(SEED + 1), (drives.controls.shape[0], steps))
+    found = jax.jit(jax.vmap(jax.vmap(one)))(keys, drives.states[:, :-1], drives.controls, drives.envs)
+    return {kind: round(float(np.mean(np.asarray(found[..., k]) > bounds[kind])), 4) for k, kind in enumerate(KINDS)}
+
+
 def lengthened(params, factor):
     """Folded parameters with every A_j multiplied."""
     shared = params["shared"]
@@ -59,6 +81,9 @@ def rows(plant, segments):
     length = trained.settings["dataset"]["steps"]
     predict = jax.jit(partial(predictions, trained.model, length=length, horizon=HORIZON))
     for scenario, drives in driven(trained, segments).items():
+        for force in FORCES:
+            left = pushed(trained, params, drives, certificate["d_bar"]["one_step"], force)
+            yield {"vehicle": plant, "scenario": scenario, "force_n": force, "left": left}
         found = jax.device_get(predict(params, drives))
         about = {"vehicle": plant, "scenario": scenario}
         yield about | {"claim": "as certified", **measured(found, alpha, d_bar)}

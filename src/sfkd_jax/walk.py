@@ -124,15 +124,14 @@ def ensure_policy(settings: dict[str, Any]) -> policy.Trained:
         ArtefactError: what lies there was made with other settings, is damaged, or is being trained by another process.
     """
     place = shelf.run_directory(settings)
-    if artefacts.exists(place / "policy.npz"):
-        shelf.claim(settings)
-        return policy.restore(place)
-    if shelf.is_logged(settings):
-        _check_enough(settings)
-    with artefacts.locked(place):
-        shelf.claim(settings)
-        if not artefacts.exists(place / "policy.npz"):
-            _train(settings)
+    if not artefacts.exists(place / "policy.npz"):
+        if shelf.is_logged(settings):
+            _check_enough(settings)
+        with artefacts.locked(place):
+            shelf.claim(settings)
+            if not artefacts.exists(place / "policy.npz"):
+                _train(settings)
+    shelf.claim(settings)
     return policy.restore(place)
 
 

@@ -4,6 +4,7 @@ from sfkd_jax.certification._attack import attack_decoder as attack_decoder
 from sfkd_jax.certification._attack import attack_slopes as attack_slopes
 from sfkd_jax.certification._attack import attack_step as attack_step
 from sfkd_jax.certification._attack import attack_transport as attack_transport
+from sfkd_jax.certification._attack_all import CertificateContradicted as CertificateContradicted
 from sfkd_jax.certification._calibration import Disturbance as Disturbance
 from sfkd_jax.certification._calibration import clopper_pearson as clopper_pearson
 from sfkd_jax.certification._calibration import conformal_bounds as conformal_bounds
@@ -14,7 +15,6 @@ from sfkd_jax.certification._calibration import interval as interval
 from sfkd_jax.certification._calibration import tube_units as tube_units
 from sfkd_jax.certification._certificate import MODES as MODES
 from sfkd_jax.certification._certificate import Certificate as Certificate
-from sfkd_jax.certification._certificate import CertificateContradicted as CertificateContradicted
 from sfkd_jax.certification._certificate import CertificateStale as CertificateStale
 from sfkd_jax.certification._certificate import certify as certify
 from sfkd_jax.certification._certificate import verify as verify

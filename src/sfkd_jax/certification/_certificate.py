@@ -7,27 +7,20 @@ import time
 from importlib.metadata import version
 from typing import Any
 
-import jax
 import numpy as np
 
-from sfkd_jax.certification._attack import attack_decoder, attack_slopes, attack_step, attack_transport
-from sfkd_jax.certification._claims import Claims, Refuted, claims_hold, decoders
+from sfkd_jax.certification._attack_all import FLOAT32, attack_all, limits_of
+from sfkd_jax.certification._claims import Claims, Refuted, claims_hold
 from sfkd_jax.certification._core import Matrix
 from sfkd_jax.certification._environments import Box
 from sfkd_jax.certification._exported import CertificationRefused, Exported, exported, fingerprint, one_thread
 from sfkd_jax.certification._proofs import prove
-from sfkd_jax.types import Model, Params, Polytope
+from sfkd_jax.types import Model, Params
 
 MODES = ("joint", "separate")
-FLOAT32 = 1e-5
-"""An attack runs on the model in float32; a bound is contradicted when it is exceeded by more than this, relatively."""
 MALFORMED = (LookupError, TypeError, ValueError, OverflowError, AttributeError, RecursionError)
 """What Python raises about a document whose parts are of other kinds than they should be."""
 PRECISION = "bounds on the float32 weights as real numbers, checked in float64; float32 rounding of a step counts as d"
-
-
-class CertificateContradicted(CertificationRefused):
-    """An attack exceeds a proved bound: a fault in this code or in what the model says about itself, never data."""
 
 
 class CertificateStale(Exception):
@@ -128,7 +121,7 @@ def certify(
     if not claims.alpha <= 1.0 - margin:  # so that NaN is refused as well
         shown = f"alpha = {claims.alpha:.6f} (rho {claims.rho:.6f}, beta {claims.beta:.6f}, kappa {claims.kappa:.3g})"
         raise CertificationRefused(f"{shown} is not below 1 by the margin {margin:g}")
-    attacks = _attacks(model, params, weights, claims, env_box, attack_starts, seed)
+    attacks = attack_all(model, params, weights, claims, env_box, attack_starts, seed)
     attack = attacks.get("step")
     return Certificate(
         mode=mode,
@@ -180,50 +173,10 @@ def _require_consistent(certificate: Certificate, claims: Claims, weights: Expor
         raise Refuted(f"mode {certificate.mode!r} does not fit alpha_joint = {claims.alpha_joint}")
     if certificate.precision != PRECISION:
         raise Refuted("precision is not what is covered")
-    limits = _limits(claims, weights)
+    limits = limits_of(claims, weights)
     for name, value in certificate.attacks.items():
         if name not in limits or not 0 <= value <= limits[name] * (1 + FLOAT32):
             raise Refuted(f"the attack {name} = {value!r} contradicts the bound {limits.get(name)}")
     step = certificate.attacks.get("step")
     if certificate.attack != step or certificate.tightness != (claims.alpha / step if step else None):
         raise Refuted("attack or tightness is not what the attacks found")
-
-
-def _attacks(
-    model: Model, params: Params, weights: Exported, claims: Claims, box: Any, starts: int, seed: int
-) -> dict[str, float]:
-    """Lower bounds by name, none of which may exceed what was proved."""
-    limits, found = _limits(claims, weights), {}
-    with one_thread():
-        for name, network in {"residual": weights.residual, **decoders(weights)}.items():
-            if network:
-                found[f"{name}_slopes"] = attack_slopes(network, seed=seed)
-        if "step_slopes" in limits:
-            slopes = [attack_slopes(weights.residual, vertex, starts=8) for vertex in weights.operators.vertices]
-            found["step_slopes"] = max(slopes)
-    if starts:
-        step_key, transport_key, decoder_key = jax.random.split(jax.random.key(seed), 3)
-        driving = jax.jit(model.fold)(params)
-        found["transport"] = attack_transport(model, driving, box, transport_key)
-        emitted = attack_decoder(model, driving, box, decoder_key, starts=starts)
-        found |= {name: value for name, value in emitted.items() if name in limits}
-        if claims.kappa == 1.0:
-            found["step"] = attack_step(model, driving, box, step_key, starts=starts)
-    for name, value in found.items():
-        if not value <= limits[name] * (1 + FLOAT32):
-            raise CertificateContradicted(
-                f"INTERNAL ERROR: the attack on the {name} reaches {value:.6f}, above the bound {limits[name]:.6f}"
-            )
-    return found
-
-
-def _limits(claims: Claims, weights: Exported) -> dict[str, float]:
-    """What an attack may reach at most, by its name; in another metric than I the step is not attacked."""
-    limits = {"residual_slopes": claims.beta, "transport": 1.0, "body": claims.lipschitz["body"]}
-    for name in decoders(weights):
-        limits |= {name: claims.lipschitz[name], f"{name}_slopes": claims.lipschitz[name]}
-    if claims.kappa == 1.0:
-        limits["step"] = claims.alpha
-        if isinstance(weights.operators, Polytope):
-            limits["step_slopes"] = claims.alpha
-    return limits

@@ -9,7 +9,7 @@ from typing import Any
 import jax
 import numpy as np
 
-from sfkd_jax.certification._certificate import CertificateContradicted
+from sfkd_jax.certification._attack_all import CertificateContradicted
 from sfkd_jax.certification._claims import SERVED
 from sfkd_jax.certification._core import TINY, UNIT, Matrix, Vector, frobenius, is_positive_definite, product
 from sfkd_jax.certification._exported import (

@@ -141,7 +141,7 @@ def violations(found: Predictions | None, claims: Claims) -> dict[str, Any]:
     claimed = (found and found.latent_errors, found and found.defects, claims.latent, claims.d_bar)
     return {
         "v0": _share(theorem_violations, *claimed),
-        "v0_reach": None if any(part is None for part in claimed) else theorem_reach(*claimed),
+        "v0_reach": _unless_missing(theorem_reach, *claimed),
         "v1": shares[kind] if kind else None,
         "v1_tube": kind,
         "v1_radius_m": radii[kind] if kind else None,
@@ -157,10 +157,13 @@ def violations(found: Predictions | None, claims: Claims) -> dict[str, Any]:
 
 def _share(count: Any, *inputs: Any) -> float | None:
     """A count over its total, or None if any input is missing or nothing was counted."""
-    if any(value is None for value in inputs):
-        return None
-    part, total = count(*inputs)
-    return part / total if total else None
+    counted = _unless_missing(count, *inputs)
+    return counted[0] / counted[1] if counted and counted[1] else None
+
+
+def _unless_missing(measure: Any, *inputs: Any) -> Any:
+    """A measure, or None if any input is missing."""
+    return None if any(value is None for value in inputs) else measure(*inputs)
 
 
 def _quantiles(errors: Float[np.ndarray, "segment window"]) -> dict[str, float]:

@@ -6,13 +6,14 @@ from pathlib import Path
 from typing import Any
 
 from sfkd_jax.reporting._blocks import Block, Code, Heading, Missing, Table, Text, Tiles, picture
+from sfkd_jax.reporting._certificate_words import certificate_words
 from sfkd_jax.reporting._curves import learning, open_loop
 from sfkd_jax.reporting._numbers import dig, is_number, number, plain, short, upper
 from sfkd_jax.reporting._scene import scenes_of
 from sfkd_jax.reporting._style import label, scenario_label
 from sfkd_jax.reporting._tables import certificate_table, open_loop_table, settings_table
 from sfkd_jax.reporting._tube import tube, tube_on_drive
-from sfkd_jax.reporting._words import certificate_words, command, holds, model_of, row_of
+from sfkd_jax.reporting._words import command, holds, model_of, row_of
 
 
 def tiles(
