@@ -27,7 +27,7 @@ SMALL = (
     *("model.encoder_hidden=8", "model.embedding=4", "controller.mppi.num_samples=16"),
 )
 TRAIN = ("train", *SMALL)
-CEM = ("controller=cem", "controller.cem.num_samples=16")
+CEM = ("controller=cem", "controller.cem.num_samples=16", "controller.cem.elites=4")
 DRILLS = {
     # name: (kills, processes at once, whether they start in a run that is trained already)
     "generate": (25, (("generate", *SMALL),), False),
