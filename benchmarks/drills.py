@@ -27,7 +27,7 @@ SMALL = (
     *("model.encoder_hidden=8", "model.embedding=4", "controller.mppi.num_samples=16"),
 )
 TRAIN = ("train", *SMALL)
-CEM = ("controller=cem", "controller.cem.num_samples=16")
+CEM = ("controller=cem", "controller.cem.num_samples=16", "controller.cem.elites=4")
 DRILLS = {
     # name: (kills, processes at once, whether they start in a run that is trained already)
     "generate": (25, (("generate", *SMALL),), False),
@@ -245,6 +245,18 @@ def drill(name, found, scratch, seed, save):
         save()
 
 
+def table(document):
+    """What was found, as docs/failures.md has it."""
+    rows = {name: found for name, found in document.items() if name not in ("settings", "machine")}
+    counted, listed = ("kills", "rounds", "resumed", "refused"), ("damaged", "failed", "different")
+    lines = ["| job | kills | rounds | hit | refused | damaged | failed | different |", "|---|" + 7 * "---|"]
+    for name, group in [(name, [found]) for name, found in rows.items()] + [("all", list(rows.values()))]:
+        numbers = [sum(found[key] for found in group) for key in counted]
+        numbers += [sum(len(found[key]) for found in group) for key in listed]
+        lines.append(f"| {' | '.join(map(str, (name, *numbers)))} |")
+    return "\n".join(lines)
+
+
 def main():
     """Parse, kill, compare, print, write."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
@@ -270,7 +282,7 @@ def main():
         for name in asked.only or DRILLS:
             found = document.setdefault(name, empty | {key: [] for key in ("damaged", "failed", "different")})
             drill(name, found, scratch, asked.seed, save)
-        print(sum(document[name]["kills"] for name in DRILLS if name in document), "kills", flush=True)
+        print(table(document), flush=True)
 
 
 if __name__ == "__main__":
