@@ -6,6 +6,7 @@ import os
 import pickle
 import random
 import shutil
+import warnings
 from functools import cache
 from pathlib import Path
 

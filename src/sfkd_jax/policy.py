@@ -29,6 +29,7 @@ class Trained(NamedTuple):
     Attributes:
         model, params: the learned rollout model. vehicle: that it was trained for. settings: how all of it was made.
         weights_sha256: of the weights alone. sha256: of them and of every setting; a certificate is about this one.
+        version: of the package that saved it.
     """
 
     model: Model
@@ -37,6 +38,7 @@ class Trained(NamedTuple):
     settings: dict[str, Any]
     weights_sha256: str
     sha256: str
+    version: str
 
 
 class Policy(NamedTuple):
@@ -76,10 +78,11 @@ def restore(path: str | Path) -> Trained:
     file = _file(path)
     arrays, manifest = artefacts.read_arrays(file, kind=KIND)
     settings = manifest["config"]
-    with artefacts.understood(file.with_suffix(".json"), ValueError, advice=_advice(manifest)):
+    version = _version(manifest)
+    with artefacts.understood(file.with_suffix(".json"), ValueError, advice=_advice(version)):
         plant, model = _built(json.dumps({name: settings[name] for name in ("vehicle", "space", "model")}))
     params = _weights(file, arrays, model)
-    return Trained(model, params, plant, settings, manifest["sha256"], policy_hash(manifest))
+    return Trained(model, params, plant, settings, manifest["sha256"], policy_hash(manifest), version)
 
 
 def load(path: str | Path, *, controller: Mapping[str, Any] | None = None, env: str = "measured") -> Policy:
@@ -102,7 +105,7 @@ def load(path: str | Path, *, controller: Mapping[str, Any] | None = None, env: 
     blamed: tuple[type[Exception], ...] = (ValueError,)
     if controller is not None:
         settings, blamed = settings | {"controller": dict(controller)}, ()
-    with artefacts.understood(file.with_suffix(".json"), *blamed, advice="train again with this version"):
+    with artefacts.understood(file.with_suffix(".json"), *blamed, advice=_advice(trained.version)):
         asked, box = settings["controller"], settings["dataset"]
         fallback = asked.get("monitor", {}).get("fallback", "none")
         limits = {"env_low": box["env_low"], "env_high": box["env_high"], "env": env, "certificate": certificate}
@@ -155,9 +158,12 @@ def _file(path: str | Path) -> Path:
     return Path(path) if Path(path).suffix == ".npz" else Path(path) / "policy.npz"
 
 
-def _advice(manifest: Mapping[str, Any]) -> str:
+def _version(manifest: Mapping[str, Any]) -> str:
     versions = manifest.get("versions")
-    version = versions.get("sfkd_jax", "unknown") if isinstance(versions, Mapping) else "unknown"
+    return str(versions.get("sfkd_jax", "unknown")) if isinstance(versions, Mapping) else "unknown"
+
+
+def _advice(version: str) -> str:
     return f"saved by sfkd_jax {version}: train again"
 
 

@@ -6,6 +6,7 @@ from typing import Any
 
 from sfkd_jax.reporting._blocks import Text
 from sfkd_jax.reporting._numbers import dig, interval, is_number, number, plain, short, upper
+from sfkd_jax.reporting._words import holds
 
 
 def certificate_words(record: dict[str, Any]) -> list[Text]:
