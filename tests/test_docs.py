@@ -141,6 +141,39 @@ def test_every_result_on_the_tuning_page_is_in_the_file_it_cites():
     assert set(re.findall(r"\d+\.\d+", text)) - known - settings == set()
 
 
+def test_the_tables_of_the_certificates_page_are_those_of_their_files():
+    """Every line below a comment that names the file; and the size of the core, and what was searched."""
+    page, readme = (file.read_text("utf-8") for file in (DOCS / "certificate.md", ROOT / "README.md"))
+    found = json.loads((ROOT / "benchmarks" / "theorem_power.json").read_text())["rows"]
+    rows = [row for row in found if (row["vehicle"], row["scenario"]) == ("kinematic", "s1, s2")]
+    shown = [
+        [cell.strip() for cell in line.strip("|").split("|")]
+        for table in re.findall(r"<!-- from benchmarks/theorem_power.json -->\n\|.*\n\|[-|]*\n((?:\|.*\n)*)", page)
+        for line in table.splitlines()
+    ]
+    reach = ("reach", "reach_1", "reach_5", "reach_20")
+    expected = {
+        row["claim"]: [str(row["broken"]), str(row["applied"]), *(f"{row[name]:.2f}" for name in reach)]
+        for row in rows
+        if row.get("reach") is not None
+    }
+    expected |= {
+        str(row["force_n"]): [f"{100 * row['left'][kind]:.1f} %" for kind in ("latent", "position", "yaw", "body")]
+        for row in rows
+        if "force_n" in row
+    }
+    assert len(shown) == 12
+    assert [cells for cells in shown if expected[cells[0]] != cells[1:]] == []
+    lines = len((ROOT / "src/sfkd_jax/certification/_core.py").read_text("utf-8").splitlines())
+    assert lines <= 150
+    assert f"`certification/_core.py`, {lines} lines" in page
+    assert f"a core of {lines} lines" in readme
+    searched = json.loads((ROOT / "benchmarks" / "trusted_core.json").read_text())
+    assert searched["false_and_accepted"] == 0
+    assert f"{searched['cases']:_}".replace("_", " ") + " hostile" in page
+    assert f"{100 * searched['accepted'] / searched['true']:.0f} % of those that hold" in " ".join(page.split())
+
+
 def test_the_page_about_an_estimated_environment_says_what_the_results_say():
     """Every number of its table, and the differences that the text draws from it."""
     found, table = (

@@ -10,8 +10,7 @@ from jaxtyping import Float
 
 Matrix = Float[np.ndarray, "_ _"]
 Vector = Float[np.ndarray, " _"]
-UNIT = np.finfo(np.float64).eps / 2
-TINY = np.finfo(np.float64).tiny
+UNIT, TINY = np.finfo(np.float64).eps / 2, np.finfo(np.float64).tiny
 SMALLEST = np.nextafter(0.0, 1.0)
 """The smallest denormal number. Some libraries make the processor flush these to zero; nothing is proved then."""
 MARGIN = 1e-6
@@ -23,9 +22,9 @@ def is_positive_definite(matrix: Matrix, error: float = 0.0) -> bool:
     """Whether every symmetric matrix within `error` (2-norm) of `matrix` is positive definite; rounding included.
 
     For every real L and every c, M = L L' + c I + R, and L L' ≥ 0: M is positive definite if ||R|| + error < c. The
-    Cholesky factor of M − c I is one such L. It is proposed by LAPACK and not believed: R is computed from it and its
-    norm bounded. M is scaled by a power of two to a largest entry in [1/2, 1), so that no intermediate result
-    overflows and what underflows is at most `lost`. False when in doubt: every comparison with NaN is false.
+    Cholesky factor of M − c I is one such L. LAPACK proposes it and is not believed: the norm of R is bounded here.
+    M is scaled by a power of two to entries below 1, so that nothing overflows and what underflows is at most `lost`.
+    False when in doubt: every comparison with NaN is false.
     """
     size = len(matrix)
     if not (np.all(np.isfinite(matrix)) and np.array_equal(matrix, matrix.T) and 0 <= error < np.inf and SMALLEST > 0):
@@ -33,7 +32,6 @@ def is_positive_definite(matrix: Matrix, error: float = 0.0) -> bool:
     exponent = -int(np.frexp(np.max(np.abs(matrix), initial=0.0))[1])
     scaled, error, identity = np.ldexp(matrix, exponent), float(np.ldexp(error, exponent)), np.eye(size)
     lost = 4 * size**2 * TINY
-    # Above what a factorisation and the product below can lose, γ_{n+1} tr M each (Rump, BIT 46, 2006).
     shift = 4 * (size + 2) * UNIT * float(np.trace(scaled)) + error * (1 + 4 * MARGIN) + 4 * lost
     try:
         factor = np.linalg.cholesky(scaled - shift * identity)
@@ -92,8 +90,7 @@ def check_witness(
         [   ·    2Λ_1   −W_2'Λ_2 … ]  −  [A 0 … W_L]' P [A 0 … W_L]  >  0    (LipSDP with diagonal multipliers)
 
     By Schur's complement this is linear in (A, Λ, b²): witnesses at the vertices of a polytope of A prove the largest
-    of their bounds for every A in it. No weights: f = A z. No A: it is 0. No P: it is I, also where the sizes of
-    z and f differ.
+    of their bounds for every A in it. No weights: f = A z. No A: it is 0. No P: it is I, for z and f of any sizes.
     """
     if len(multipliers) != max(len(weights) - 1, 0) or not 0 < bound < np.inf:
         return False
