@@ -183,7 +183,7 @@ def disturbed(place, commands, moments):
                 del jobs[number]
                 yield job
                 if job.taken():
-                    jobs[number] = Job(place, job.command, f"said{number}"), next(moments, None)
+                    jobs[number] = Job(place, job.command, f"said{number}"), moment
             elif moment is not None and time.monotonic() - job.began > moment:
                 job.kill()
                 yield job
