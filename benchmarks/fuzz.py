@@ -2,7 +2,7 @@
 
 python benchmarks/fuzz.py [--cases 100000 --seed 1 --out benchmarks/fuzz.json]
 The engine is tests/fuzzing.py, of which the tests run 10^4 cases with another seed. It runs in a process of its own,
-whose address space may grow by 1 GiB, and each case has 10 s.
+whose address space may grow by 1 GiB, and each case has 30 s.
 """
 
 import argparse

@@ -25,7 +25,7 @@ MIB = 1 << 20
 
 
 @contextmanager
-def bounded(seconds=5, mebibytes=64):
+def bounded(seconds=20, mebibytes=64):
     """Neither so long nor so large: a hang or an allocation fails the test."""
 
     def expire(*_):
