@@ -21,12 +21,16 @@ INNER_LOOPS = ("none", "speed")
 
 
 class System(NamedTuple):
-    """A row of a table: a model with its parameters, what it is told about the environment, and its certificate."""
+    """A row of a table: a model with its parameters, what it is told about the environment, and its certificate.
+
+    Of a model in path coordinates also the law that it was learned around.
+    """
 
     model: Model
     params: Any
     env: str
     certificate: dict[str, Any] | None = None
+    law: control.PathLaw | None = None
 
 
 def choose(table: Mapping[str, Any], name: str, what: str) -> Any:
@@ -82,15 +86,26 @@ def build_controller(
     env_high: Any = None,
     certificate: Settings | None = None,
     env: str = "measured",
+    law: control.PathLaw | None = None,
 ) -> Controller:
     """The planner of the settings, watched by a monitor if there is a certificate, told an estimate if `env` asks.
 
+    Args:
+        law: of a model in path coordinates, the one that it was learned around.
+
     Raises:
-        ValueError: an unknown planner, or a vehicle without limits of its controls.
+        ValueError: an unknown planner, a vehicle without limits of its controls, or a model and a planner of
+            different frames.
     """
     if not plant.control_low:
         raise ValueError("a controller needs vehicle.control_low and vehicle.control_high, as in [-0.4,-3.0]")
     build = choose(PLANNERS, settings.get("planner", "mppi"), "controller.planner")
+    if model.along_path:
+        if settings["sampling"] != "law" or env == "estimated" or law is None:
+            raise ValueError(
+                "a model in path coordinates needs controller.sampling=law, its law, and env=measured or none"
+            )
+        return build(settings, model, plant, env_low, env_high, law)
     planner = build(settings, model, plant, env_low, env_high)
     watched = planner if certificate is None else _monitored(planner, settings, model, certificate)
     return _estimated(watched, settings, model, plant, env_low, env_high) if env == "estimated" else watched
@@ -112,21 +127,27 @@ def _estimated(
 
 
 def _sampled(
-    search: str, settings: Settings, model: Model, plant: vehicle.Vehicle, env_low: Any, env_high: Any
+    search: str,
+    settings: Settings,
+    model: Model,
+    plant: vehicle.Vehicle,
+    env_low: Any,
+    env_high: Any,
+    law: control.PathLaw | None = None,
 ) -> Controller:
-    """A planner that searches around the path-following law (`sampling: feedback`), the model's own, or nothing."""
-    laws = {"feedback": _feedback, "model": _model_law, "plain": _no_feedback}
-    law = choose(laws, settings["sampling"], "controller.sampling")
-    task = control.path_tracking(
-        model,
-        control.tracking_cost(dt=plant.dt, speed_loop=plant.speed_loop, **without(settings["cost"])),
-        law(settings, plant),
-        dt=plant.dt,
-        control_low=plant.control_low,
-        control_high=plant.control_high,
-        ancillary=_model_law(settings, plant) if settings["ancillary"] else None,
-        **without(settings["task"]),
-    )
+    """A planner that searches around a law: the path-following one (`sampling: feedback`), the model's own, none.
+
+    In path coordinates it is the law of the policy, and the model already holds it (`sampling: law`).
+    """
+    cost = control.tracking_cost(dt=plant.dt, speed_loop=plant.speed_loop, **without(settings["cost"]))
+    limits = {"dt": plant.dt, "control_low": plant.control_low, "control_high": plant.control_high}
+    if law is not None:
+        task = control.following_law(model, cost, law, **limits, **without(settings["task"], "latent_weight"))
+    else:
+        laws = {"feedback": _feedback, "model": _model_law, "plain": _no_feedback}
+        around = choose(laws, settings["sampling"], "controller.sampling")(settings, plant)
+        ancillary = _model_law(settings, plant) if settings["ancillary"] else None
+        task = control.path_tracking(model, cost, around, **limits, ancillary=ancillary, **without(settings["task"]))
     boxes = {"env_low": _floats(env_low), "env_high": _floats(env_high)}
     return SEARCHES[search](task, **boxes, **without(settings[search]))
 
@@ -190,18 +211,36 @@ def build_driver(plant: vehicle.Vehicle) -> datasets.Driver:
     return driver
 
 
-def reference_systems(plant: vehicle.Vehicle) -> dict[str, System]:
-    """Rows that need no learning: the nominal bicycle, the true plant, and the true plant wrong about e."""
+def build_law(settings: Settings, plant: vehicle.Vehicle) -> control.PathLaw | None:
+    """The law of a data set in path coordinates, derived from the vehicle's own step; None for other data sets.
+
+    Args:
+        settings: of the data set. plant: any vehicle with limits of its controls.
+    """
+    if "law" not in settings:
+        return None
+    box = {name: _floats(settings[name]) for name in ("env_low", "env_high")}
+    size = len(plant.state_names) - 1
+    return control.derive_path_law(plant.step, coordinates=size, **box, **without(settings["law"]))
+
+
+def reference_systems(plant: vehicle.Vehicle, law: control.PathLaw | None = None) -> dict[str, System]:
+    """Rows that need no learning: the nominal bicycle, the true plant, and the true plant wrong about e.
+
+    With a law they are those of the loop around the plant, in path coordinates.
+    """
 
     def biased(entry: int, factor: float) -> Callable[[Environment], Environment]:
         return lambda env: env.at[entry].multiply(factor)
 
-    oracle = partial(models.physics, plant.step)
+    along = law is not None
+    plant = plant if law is None else vehicle.along_path(plant, law)
+    oracle = partial(models.physics, plant.step, along_path=along)
     rows = {
-        "nominal": System(models.physics(plant.nominal), {}, "none"),
+        "nominal": System(models.physics(plant.nominal, along_path=along), {}, "none"),
         "oracle": System(oracle(), {}, "measured"),
     }
     distortions = {"friction_x0.7": (0, 0.7), "friction_x1.3": (0, 1.3), "wind_x0": (1, 0.0), "wind_x2": (1, 2.0)}
     for name, change in distortions.items():
         rows[f"oracle_{name}"] = System(oracle(distort=biased(*change)), {}, "measured")
-    return rows
+    return {name: row._replace(law=law) for name, row in rows.items()}

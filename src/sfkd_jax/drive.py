@@ -75,7 +75,7 @@ def prepare(
     """
     protocol, box = settings["evaluation"], settings["dataset"]
     limits = {"env_low": box["env_low"], "env_high": box["env_high"], "certificate": system.certificate}
-    limits["env"] = system.env
+    limits |= {"env": system.env, "law": system.law}
     if dataset is not None:
         limits |= {"env_low": dataset.env_low.tolist(), "env_high": dataset.env_high.tolist()}
     controller = assembly.build_controller(settings["controller"], system.model, plant, **limits)

@@ -11,9 +11,10 @@ import jax.numpy as jnp
 import numpy as np
 
 from sfkd_jax import artefacts, assembly
+from sfkd_jax.control import PathLaw, law_arrays, law_from_arrays
 from sfkd_jax.types import Controller, Model, Params, Space
 
-KIND = "policy"
+KIND, LAW = "policy", "law"
 
 
 class Policy(NamedTuple):
@@ -22,7 +23,7 @@ class Policy(NamedTuple):
     Attributes:
         model, params: the learned rollout model. controller: `Controller(init, act)`, pure; jit, vmap, scan it.
         certificate: the document in certificate.json, or None if it is missing, refused, or about other weights.
-        settings: how all of it was made.
+        settings: how all of it was made. law: of a model in path coordinates, the one it was learned around.
     """
 
     model: Model
@@ -30,11 +31,20 @@ class Policy(NamedTuple):
     controller: Controller
     certificate: dict[str, Any] | None
     settings: dict[str, Any]
+    law: PathLaw | None = None
 
 
-def save(path: Path, params: Params, settings: Mapping[str, Any], *, made_from: Mapping[str, str]) -> dict[str, Any]:
-    """Write policy.npz and its manifest; returns the manifest, whose `sha256` names the weights."""
-    flat = {name: np.asarray(leaf) for name, leaf in artefacts.flatten(params).items()}
+def save(
+    path: Path,
+    params: Params,
+    settings: Mapping[str, Any],
+    *,
+    made_from: Mapping[str, str],
+    law: PathLaw | None = None,
+) -> dict[str, Any]:
+    """Write policy.npz and its manifest; returns the manifest, whose `sha256` names the weights and the law."""
+    tree = params if law is None else params | {LAW: law_arrays(law)}
+    flat = {name: np.asarray(leaf) for name, leaf in artefacts.flatten(tree).items()}
     return artefacts.write_arrays(path, flat, kind=KIND, config=settings, made_from=made_from)
 
 
@@ -66,10 +76,12 @@ def load(path: str | Path, *, controller: Mapping[str, Any] | None = None, env: 
         model, box = assembly.build_model(settings["model"], space, plant), settings["dataset"]
         limits = {"env_low": box["env_low"], "env_high": box["env_high"], "env": env}
     certificate = _certificate(file.with_name("certificate.json"), manifest["sha256"], space)
+    params = jax.tree.map(jnp.asarray, artefacts.unflatten(arrays))
+    with artefacts.understood(manifest_file, KeyError, advice=saved):
+        limits["law"] = law_from_arrays(params.pop(LAW)) if model.along_path else None
     with artefacts.understood(manifest_file, *blamed, advice=saved):
         planner = assembly.build_controller(settings["controller"], model, plant, certificate=certificate, **limits)
-    params = jax.tree.map(jnp.asarray, artefacts.unflatten(arrays))
-    return Policy(model, params, planner, certificate, settings)
+    return Policy(model, params, planner, certificate, settings, limits["law"])
 
 
 def _certificate(path: Path, weights: str, space: Space) -> dict[str, Any] | None:

@@ -12,12 +12,16 @@ import jax.numpy as jnp
 
 from sfkd_jax import artefacts, assembly, policy, shelf
 from sfkd_jax.certification import progress
+from sfkd_jax.control import PathLaw, law_arrays, law_from_arrays
 from sfkd_jax.datasets import (
     Columns,
     Dataset,
+    check_on_path,
     first_share,
     from_logs,
     generate,
+    generate_along_path,
+    generate_s3_along_path,
     generate_switching,
     measure_space,
     random_windows,
@@ -27,7 +31,7 @@ from sfkd_jax.datasets import (
 from sfkd_jax.evaluation import open_loop
 from sfkd_jax.training import fit, multi_step_loss
 from sfkd_jax.types import Model, Trajectory
-from sfkd_jax.vehicle import Vehicle
+from sfkd_jax.vehicle import Vehicle, along_path
 
 SPLIT = ("shares", "env_low", "env_high", "seed")
 STARTS = ("random", "identified")
@@ -45,14 +49,38 @@ def ensure_dataset(settings: dict[str, Any]) -> tuple[Dataset, str]:
     return shelf.read_dataset(settings)
 
 
+def ensure_law(settings: dict[str, Any]) -> PathLaw | None:
+    """The law of a data set in path coordinates, derived now if it does not lie on the shelf; None for others."""
+    if not shelf.is_along_path(settings):
+        return None
+    if not artefacts.exists(shelf.law_path(settings)):
+        plant = assembly.build_vehicle(settings["vehicle"])
+        shelf.say(f"deriving the law of vehicle {plant.name}")
+        law = jax.jit(partial(assembly.build_law, settings["dataset"], plant))()
+        shelf.write_law(settings, law_arrays(law))
+    return law_from_arrays(shelf.read_law(settings))
+
+
+def path_loop(settings: dict[str, Any]) -> Vehicle:
+    """The vehicle with the law of its data set closed around it."""
+    return along_path(assembly.build_vehicle(settings["vehicle"]), ensure_law(settings))
+
+
 def _driven(settings: dict[str, Any]) -> Dataset:
     """A data set that the vehicle's own step drives."""
     asked = settings["dataset"]
-    shelf.say(f"generating {asked['segments']} segments")
-    plant = assembly.build_vehicle(settings["vehicle"])
     drive_key, split_key = jax.random.split(jax.random.key(asked["seed"]))
-    options = assembly.without(asked, *SPLIT)
-    trajectories = jax.jit(partial(generate, plant, assembly.build_driver(plant), **options))(drive_key)
+    options = assembly.without(asked, *SPLIT, "law")
+    if shelf.is_along_path(settings):
+        box = {name: tuple(asked[name]) for name in ("env_low", "env_high")}
+        drives = partial(generate_along_path, path_loop(settings), **options, **box)
+    else:
+        plant = assembly.build_vehicle(settings["vehicle"])
+        drives = partial(generate, plant, assembly.build_driver(plant), **options)
+    shelf.say(f"generating {asked['segments']} segments")
+    trajectories = jax.jit(drives)(drive_key)
+    if shelf.is_along_path(settings):
+        check_on_path(trajectories)
     low, high = jnp.asarray(asked["env_low"]), jnp.asarray(asked["env_high"])
     return split(trajectories, split_key, shares=tuple(asked["shares"]), env_low=low, env_high=high)
 
@@ -96,7 +124,9 @@ def held_out_drives(settings: dict[str, Any], dataset: Dataset) -> dict[str, Tra
     if shelf.is_logged(settings):
         return {"test": dataset.test}
     constant = jnp.all(dataset.test.envs == dataset.test.envs[:, :1], axis=(1, 2))
-    asked = {name: settings[name] for name in ("vehicle", "dataset")} | {"segments": dataset.test.controls.shape[0]}
+    asked = {name: settings[name] for name in ("vehicle", "dataset", "root")} | {
+        "segments": dataset.test.controls.shape[0]
+    }
     parts = {"test": dataset.test, "s3": _switching(json.dumps(asked))}
     for name, chosen in (("s1", constant), ("s2", ~constant)):
         if chosen.any():
@@ -108,9 +138,14 @@ def held_out_drives(settings: dict[str, Any], dataset: Dataset) -> dict[str, Tra
 def _switching(asked: str) -> Trajectory:
     """Drives under S3's switching, of these settings as JSON; kept, for every row of a comparison asks for the same."""
     settings = json.loads(asked)
-    plant, data = assembly.build_vehicle(settings["vehicle"]), settings["dataset"] | {"segments": settings["segments"]}
-    options = {name: value for name, value in assembly.without(data, *SPLIT).items() if name != "fixed_levels"}
-    drive = jax.jit(partial(generate_switching, plant, assembly.build_driver(plant), **options))
+    data = settings["dataset"] | {"segments": settings["segments"]}
+    options = assembly.without(data, *SPLIT, "law", "fixed_levels")
+    if shelf.is_along_path(settings):
+        drives = partial(generate_s3_along_path, path_loop(settings), **options)
+    else:
+        plant = assembly.build_vehicle(settings["vehicle"])
+        drives = partial(generate_switching, plant, assembly.build_driver(plant), **options)
+    drive = jax.jit(drives)
     return drive(jax.random.fold_in(jax.random.key(data["seed"]), SWITCHING))
 
 
@@ -132,7 +167,7 @@ def ensure_policy(settings: dict[str, Any]) -> policy.Policy:
 
 def systems(settings: dict[str, Any], plant: Vehicle) -> dict[str, assembly.System]:
     """The systems that `evaluation.systems` asks for; "self" is the policy of this run, made if it is missing."""
-    references, found = assembly.reference_systems(plant), {}
+    references, found = assembly.reference_systems(plant, ensure_law(settings)), {}
     for name in settings["evaluation"]["systems"]:
         if name == "self":
             found[settings["model"]["system"]] = own_system(settings)
@@ -145,7 +180,7 @@ def own_system(settings: dict[str, Any]) -> assembly.System:
     """The policy of this run as a row of a table."""
     trained = ensure_policy(settings)
     told = settings["env"] if trained.settings["model"]["environment"] else "none"
-    return assembly.System(trained.model, trained.params, told, trained.certificate)
+    return assembly.System(trained.model, trained.params, told, trained.certificate, trained.law)
 
 
 def _train(settings: dict[str, Any]) -> None:
@@ -175,7 +210,7 @@ def _train(settings: dict[str, Any]) -> None:
     artefacts.write_json(place / "open_loop.json", document)
     kept |= {"controller": settings["controller"], "experiment": settings["name"]}
     kept |= {"space": assembly.space_to_settings(space), "best_step": best}
-    policy.save(place / "policy.npz", params, kept, made_from={"dataset": data_hash})
+    policy.save(place / "policy.npz", params, kept, made_from={"dataset": data_hash}, law=ensure_law(settings))
 
 
 def _started(model: Model, start: str, train: Trajectory, seed: int) -> Model:
