@@ -10,9 +10,8 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 
-from sfkd_jax import artefacts, assembly, policy, shelf
+from sfkd_jax import artefacts, assembly, path_law, policy, shelf
 from sfkd_jax.certification import progress
-from sfkd_jax.control import PathLaw, law_arrays, law_from_arrays
 from sfkd_jax.datasets import (
     Columns,
     Dataset,
@@ -31,7 +30,7 @@ from sfkd_jax.datasets import (
 from sfkd_jax.evaluation import open_loop
 from sfkd_jax.training import fit, multi_step_loss
 from sfkd_jax.types import Model, Trajectory
-from sfkd_jax.vehicle import Vehicle, along_path
+from sfkd_jax.vehicle import Vehicle
 
 SPLIT = ("shares", "env_low", "env_high", "seed")
 STARTS = ("random", "identified")
@@ -49,23 +48,6 @@ def ensure_dataset(settings: dict[str, Any]) -> tuple[Dataset, str]:
     return shelf.read_dataset(settings)
 
 
-def ensure_law(settings: dict[str, Any]) -> PathLaw | None:
-    """The law of a data set in path coordinates, derived now if it does not lie on the shelf; None for others."""
-    if not shelf.is_along_path(settings):
-        return None
-    if not artefacts.exists(shelf.law_path(settings)):
-        plant = assembly.build_vehicle(settings["vehicle"])
-        shelf.say(f"deriving the law of vehicle {plant.name}")
-        law = jax.jit(partial(assembly.build_law, settings["dataset"], plant))()
-        shelf.write_law(settings, law_arrays(law))
-    return law_from_arrays(shelf.read_law(settings))
-
-
-def path_loop(settings: dict[str, Any]) -> Vehicle:
-    """The vehicle with the law of its data set closed around it."""
-    return along_path(assembly.build_vehicle(settings["vehicle"]), ensure_law(settings))
-
-
 def _driven(settings: dict[str, Any]) -> Dataset:
     """A data set that the vehicle's own step drives."""
     asked = settings["dataset"]
@@ -73,7 +55,7 @@ def _driven(settings: dict[str, Any]) -> Dataset:
     options = assembly.without(asked, *SPLIT, "law")
     if shelf.is_along_path(settings):
         box = {name: tuple(asked[name]) for name in ("env_low", "env_high")}
-        drives = partial(generate_along_path, path_loop(settings), **options, **box)
+        drives = partial(generate_along_path, path_law.loop(settings), **options, **box)
     else:
         plant = assembly.build_vehicle(settings["vehicle"])
         drives = partial(generate, plant, assembly.build_driver(plant), **options)
@@ -141,7 +123,7 @@ def _switching(asked: str) -> Trajectory:
     data = settings["dataset"] | {"segments": settings["segments"]}
     options = assembly.without(data, *SPLIT, "law", "fixed_levels")
     if shelf.is_along_path(settings):
-        drives = partial(generate_s3_along_path, path_loop(settings), **options)
+        drives = partial(generate_s3_along_path, path_law.loop(settings), **options)
     else:
         plant = assembly.build_vehicle(settings["vehicle"])
         drives = partial(generate_switching, plant, assembly.build_driver(plant), **options)
@@ -167,7 +149,7 @@ def ensure_policy(settings: dict[str, Any]) -> policy.Policy:
 
 def systems(settings: dict[str, Any], plant: Vehicle) -> dict[str, assembly.System]:
     """The systems that `evaluation.systems` asks for; "self" is the policy of this run, made if it is missing."""
-    references, found = assembly.reference_systems(plant, ensure_law(settings)), {}
+    references, found = assembly.reference_systems(plant, path_law.ensure(settings)), {}
     for name in settings["evaluation"]["systems"]:
         if name == "self":
             found[settings["model"]["system"]] = own_system(settings)
@@ -210,7 +192,7 @@ def _train(settings: dict[str, Any]) -> None:
     artefacts.write_json(place / "open_loop.json", document)
     kept |= {"controller": settings["controller"], "experiment": settings["name"]}
     kept |= {"space": assembly.space_to_settings(space), "best_step": best}
-    policy.save(place / "policy.npz", params, kept, made_from={"dataset": data_hash}, law=ensure_law(settings))
+    policy.save(place / "policy.npz", params, kept, made_from={"dataset": data_hash}, law=path_law.ensure(settings))
 
 
 def _started(model: Model, start: str, train: Trajectory, seed: int) -> Model:

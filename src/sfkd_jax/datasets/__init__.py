@@ -22,3 +22,6 @@ from sfkd_jax.datasets._splits import random_windows as random_windows
 from sfkd_jax.datasets._splits import split as split
 from sfkd_jax.datasets._splits import spread_windows as spread_windows
 from sfkd_jax.datasets._splits import windows as windows
+from sfkd_jax.datasets._to_path import check_logged as check_logged
+from sfkd_jax.datasets._to_path import logged_path as logged_path
+from sfkd_jax.datasets._to_path import to_path as to_path
