@@ -9,7 +9,7 @@ import jax
 
 from sfkd_jax import artefacts, assembly, shelf
 from sfkd_jax.control import PathLaw, law_arrays, law_from_arrays
-from sfkd_jax.vehicle import Vehicle, along_path
+from sfkd_jax.vehicle import Vehicle
 
 
 def ensure(settings: dict[str, Any]) -> PathLaw | None:
@@ -33,4 +33,4 @@ def loop(settings: dict[str, Any]) -> Vehicle:
     law = ensure(settings)
     if law is None:
         raise ValueError("a loop along a path needs dataset=path")
-    return along_path(assembly.build_vehicle(settings["vehicle"]), law)
+    return assembly.build_loop(assembly.build_vehicle(settings["vehicle"]), law)

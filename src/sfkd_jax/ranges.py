@@ -23,7 +23,8 @@ _INTERVALS = {
     "controller.task.control_rate controller.model_law.steering controller.model_law.drive "
     "controller.estimator.model_error "
     "training.learning_rate training.clip_norm evaluation.threshold_m dataset.peak_curvature "
-    "dataset.lateral_acceleration dataset.law.peak_curvature dataset.law.speed dataset.law.curvature dataset.law.drive",
+    "dataset.lateral_acceleration dataset.law.lateral_acceleration dataset.law.perturbation dataset.law.speed "
+    "dataset.law.curvature dataset.law.drive",
     "(0, 1)": "dataset.shares model.rho model.beta model.alpha certification.level certification.monitor_level "
     "controller.gradient.shrink",
     "[0, 1)": "certification.margin",
@@ -38,7 +39,7 @@ _INTERVALS = {
 _ENTRIES = {
     2: "scenario.wavelengths dataset.speed dataset.steering_excitation dataset.speed_excitation *.noise_std "
     "controller.task.control_rate evaluation.told.noise evaluation.told.bias comparison.share "
-    "dataset.law.speed dataset.wavelengths",
+    "dataset.law.speed dataset.law.perturbation dataset.wavelengths",
     3: "dataset.law.points",
     4: "dataset.shares",
 }

@@ -48,4 +48,4 @@ def _any_law(sizes: dict[str, int]) -> PathLaw:
     """A law that asks for nothing."""
     axes, corners = 2 + sizes["env"], (2,) * (2 + sizes["env"])
     tables = (jnp.zeros((*corners, *shape)) for shape in ((sizes["state"],), (2,), (2, sizes["state"])))
-    return PathLaw(jnp.zeros(axes), jnp.ones(axes), *tables)
+    return PathLaw(jnp.zeros(axes), jnp.ones(axes), jnp.ones(2), *tables)

@@ -18,4 +18,5 @@ from sfkd_jax.assembly._plants import space_from_settings as space_from_settings
 from sfkd_jax.assembly._plants import space_to_settings as space_to_settings
 from sfkd_jax.assembly._systems import System as System
 from sfkd_jax.assembly._systems import build_law as build_law
+from sfkd_jax.assembly._systems import build_loop as build_loop
 from sfkd_jax.assembly._systems import reference_systems as reference_systems

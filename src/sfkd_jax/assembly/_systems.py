@@ -37,6 +37,12 @@ def build_law(settings: Settings, plant: vehicle.Vehicle) -> control.PathLaw | N
     return control.derive_path_law(plant.step, coordinates=size, **box, **without(settings["law"]))
 
 
+def build_loop(plant: vehicle.Vehicle, law: control.PathLaw) -> vehicle.Vehicle:
+    """The plant with a law closed around it: states and controls of `path_frame`."""
+    steering, drive = (float(largest) for largest in law.perturbation)
+    return vehicle.along_path(plant, law, perturbation=(steering, drive))
+
+
 def reference_systems(plant: vehicle.Vehicle, law: control.PathLaw | None = None) -> dict[str, System]:
     """Rows that need no learning: the nominal bicycle, the true plant, and the true plant wrong about e.
 
@@ -47,7 +53,7 @@ def reference_systems(plant: vehicle.Vehicle, law: control.PathLaw | None = None
         return lambda env: env.at[entry].multiply(factor)
 
     along = law is not None
-    plant = plant if law is None else vehicle.along_path(plant, law)
+    plant = plant if law is None else build_loop(plant, law)
     oracle = partial(models.physics, plant.step, along_path=along)
     rows = {
         "nominal": System(models.physics(plant.nominal, along_path=along), {}, "none"),

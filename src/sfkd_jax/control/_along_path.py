@@ -64,7 +64,7 @@ def following_law(
 
     The observation and the reference are those of any other controller, poses in the world. They are projected
     once a step; rollouts know ξ and the curvature ahead, and predicted states are put beside the reference
-    points at the end.
+    points at the end. |ν| stays within `law.perturbation`, as it did in the data.
 
     Args:
         model: of path states, `along_path`. cost: ℓ, see `tracking_cost`. law: the one that the model was
@@ -94,7 +94,7 @@ def following_law(
     def advance(weights: Any, fiber: Any, before: AlongSample, nu: Control, target: Any, last: Scalar) -> Advanced:
         point, sideways, curvature, turn = target
         lawful = at_turn(turn, before.coordinates)
-        control = limit(lawful + nu, before.control)
+        control = limit(lawful + jnp.clip(nu, -law.perturbation, law.perturbation), before.control)
         effective = control - lawful
         inputs = jnp.concatenate([effective, jnp.stack([curvature, point[3]])])
         latent = model.step(fiber, before.latent, inputs)

@@ -31,16 +31,17 @@ def derive_path_law(
     coordinates: int,
     env_low: tuple[float, ...],
     env_high: tuple[float, ...],
-    peak_curvature: float = 0.022,
-    speed: tuple[float, float] = (7.5, 11.0),
-    points: tuple[int, ...] = (9, 3, 7),
+    lateral_acceleration: float = 2.2,
+    speed: tuple[float, float] = (8.0, 10.5),
+    points: tuple[int, ...] = (13, 3, 7),
+    perturbation: tuple[float, float] = (0.03, 1.0),
     lateral: float = 1.0,
     heading: float = 20.0,
     velocity: float = 5.0,
     curvature: float = 200.0,
     drive: float = 0.5,
 ) -> PathLaw:
-    """Steady turns and gains on a grid of (κ, v_ref, e), from a step alone.
+    """Steady turns and gains on a grid of (v_ref² κ, v_ref, e), from a step alone.
 
         ξ* = F(ξ*, u*; κ, e),  e_y* = 0,  v* = v_ref;   K from Riccati's equation of F linearised there
 
@@ -51,8 +52,9 @@ def derive_path_law(
 
     Args:
         step: (x, u, e) -> x. coordinates: size of ξ. env_low, env_high: ends of the axes of e.
-        peak_curvature: end of the κ axis, to both sides [1/m]. speed: ends of the v_ref axis [m/s].
-        points: on the axes of κ (odd), of v_ref, and of every entry of e.
+        lateral_acceleration: end of the axis of v_ref² κ, to both sides [m/s²]. speed: ends of the v_ref axis [m/s].
+        points: on the axes of v_ref² κ (odd), of v_ref, and of every entry of e.
+        perturbation: largest |ν|, kept with the law.
         lateral: [1/m²], heading: [1/rad²], velocity: [s²/m²], curvature: [m²], drive: per control unit²: weights
             of Riccati's equation; those of other coordinates are zero. Steering is charged by the curvature that
             it makes on the steady turns: where tyres give less, the wheel turns more, and the loop stays as fast.
@@ -60,7 +62,7 @@ def derive_path_law(
     Raises:
         ValueError: axes that cannot be meant.
     """
-    low, high = (-peak_curvature, speed[0], *env_low), (peak_curvature, speed[1], *env_high)
+    low, high = (-lateral_acceleration, speed[0], *env_low), (lateral_acceleration, speed[1], *env_high)
     counts = (*points[:2], *points[2:] * len(env_low))
     if (
         len(points) != 3
@@ -68,32 +70,32 @@ def derive_path_law(
         or min(counts) < 2
         or not all(a < b for a, b in zip(low, high, strict=True))
     ):
-        raise ValueError(f"a law needs rising axes and an odd number of curvatures, got {low}, {high}, {counts}")
+        raise ValueError(f"a law needs rising axes and an odd number of accelerations, got {low}, {high}, {counts}")
     along = path_step(step)
     axes = [jnp.linspace(a, b, n) for a, b, n in zip(low, high, counts, strict=True)]
     grid = jnp.stack(jnp.meshgrid(*axes[1:], indexing="ij"), axis=-1).reshape(-1, len(axes) - 1)
     weights = jnp.diag(jnp.zeros(coordinates).at[:3].set(jnp.asarray([lateral, heading, velocity])))
 
     def row(place: Array) -> tuple[Array, Array, Array]:
-        """Turns and gains over the κ axis, for one speed and environment."""
-        middle = points[0] // 2
+        """Turns and gains over all curvatures, for one speed and environment."""
+        middle, curvatures = points[0] // 2, axes[0] / place[0] ** 2
 
         def outward(side: Scalar) -> Array:
             """Turns to one side, from straight driving on."""
             follow = partial(_next_turn, along, place)
-            return jax.lax.scan(follow, jnp.zeros(coordinates + 2), side * axes[0][middle:])[1]
+            return jax.lax.scan(follow, jnp.zeros(coordinates + 2), side * curvatures[middle:])[1]
 
         left, right = jax.vmap(outward)(jnp.asarray([-1.0, 1.0]))
         turns = jnp.concatenate([left[:0:-1], right])
-        steering = jnp.gradient(turns[:, -2], axes[0])
+        steering = jnp.gradient(turns[:, -2], curvatures[1] - curvatures[0])
         steering = jnp.clip(steering, *(limit * steering[middle] for limit in STEEPER))
         charges = jax.vmap(jnp.diag)(jnp.stack([curvature / steering**2, jnp.full(points[0], drive)], axis=1))
         gains = jax.vmap(lambda kappa, turn, charge: _gain(along, turn, kappa, place, weights, charge))
-        return turns[:, :-2], turns[:, -2:], gains(axes[0], turns, charges)
+        return turns[:, :-2], turns[:, -2:], gains(curvatures, turns, charges)
 
     tables = jax.lax.map(row, grid, batch_size=64)
     shaped = [jnp.moveaxis(table, 0, 1).reshape(*counts, *table.shape[2:]) for table in tables]
-    return PathLaw(jnp.asarray(low), jnp.asarray(high), *shaped)
+    return PathLaw(jnp.asarray(low), jnp.asarray(high), jnp.asarray(perturbation), *shaped)
 
 
 def _next_turn(along: Along, place: Array, known: Array, kappa: Scalar) -> tuple[Array, Array]:

@@ -15,18 +15,21 @@ from sfkd_jax.types import Control, Environment, Scalar
 
 
 class PathLaw(NamedTuple):
-    """u = u*(κ, v, e) − K(κ, v, e) (ξ − ξ*(κ, v, e)), every table linear between its points.
+    """u = u*(a, v, e) − K(a, v, e) (ξ − ξ*(a, v, e)), a = v² κ, every table linear between its points.
 
+    Tables are over the lateral acceleration a that a turn asks for, not over κ: what the tyres hold is a box then.
     A pytree of arrays: it is stored beside the weights that were learned around it.
 
     Attributes:
-        low, high: ends of the axes (κ [1/m], v_ref [m/s], e_1, …), each divided evenly.
+        low, high: ends of the axes (a [m/s²], v_ref [m/s], e_1, …), each divided evenly.
+        perturbation: largest |ν| that data and planners add to u [rad, control unit], (2,).
         state: ξ* of the steady turns, (*axes, coordinate). control: u*, (*axes, 2).
         gain: K, (*axes, 2, coordinate).
     """
 
     low: Float[Array, " axis"]
     high: Float[Array, " axis"]
+    perturbation: Float[Array, " 2"]
     state: Float[Array, "*axes coordinate"]
     control: Float[Array, "*axes 2"]
     gain: Float[Array, "*axes 2 coordinate"]
@@ -36,7 +39,7 @@ class PathLaw(NamedTuple):
 
         The steady speed is the one that is asked for, whatever the tables hold.
         """
-        at = jnp.concatenate([jnp.stack([curvature, speed]), env])
+        at = jnp.concatenate([jnp.stack([curvature * speed**2, speed]), env])
         counts = self.control.shape[:-1]
         rows, weights = _corners(at, self.low, self.high, counts)
 

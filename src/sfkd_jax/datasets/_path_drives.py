@@ -34,8 +34,8 @@ def generate_along_path(
     peak_curvature: float = 0.02,
     wavelengths: tuple[float, float] = (50.0, 200.0),
     lateral_acceleration: float = 2.0,
-    steering_excitation: tuple[float, float] = (0.002, 0.03),
-    speed_excitation: tuple[float, float] = (0.05, 0.8),
+    steering_excitation: tuple[float, float] = (0.002, 0.025),
+    speed_excitation: tuple[float, float] = (0.05, 0.6),
     env_low: tuple[float, ...],
     env_high: tuple[float, ...],
 ) -> Trajectory:
@@ -89,15 +89,15 @@ def drive_along_path(
     peak_curvature: float = 0.02,
     wavelengths: tuple[float, float] = (50.0, 200.0),
     lateral_acceleration: float = 2.0,
-    steering_excitation: tuple[float, float] = (0.002, 0.03),
-    speed_excitation: tuple[float, float] = (0.05, 0.8),
+    steering_excitation: tuple[float, float] = (0.002, 0.025),
+    speed_excitation: tuple[float, float] = (0.05, 0.6),
 ) -> Trajectory:
     """Drives in environments of one's own, one schedule a drive.
 
     Speed varies slowly within its range. A third of the roads is one circle, the others bend as a sum of three
     sinusoids; none asks for more than `peak_curvature` or `lateral_acceleration`. ν is, drive by drive, what a planner
     does (an AR(1) process) or what nobody should (its sign alone, held for random times: bang-bang), the spread drawn
-    log-uniformly.
+    log-uniformly and ν held within the limits of the loop.
 
     Args:
         loop: of `vehicle.along_path`. envs: what is met. key: consumed.
@@ -115,6 +115,7 @@ def drive_along_path(
         road_key, nu_key, start_key = jax.random.split(given[1], 3)
         speeds, curvatures = road(road_key, steps=envs.shape[0])
         nus = _perturbations(nu_key, steps=envs.shape[0], spread=limits)
+        nus = jnp.clip(nus, jnp.asarray(loop.control_low[:2]), jnp.asarray(loop.control_high[:2]))
         inputs = jnp.concatenate([nus, curvatures[:, None], speeds[:, None]], axis=1)
         offset = jax.random.uniform(start_key, (3,), minval=-1.0) * jnp.asarray([0.1, 0.02, 0.5])
         start = jnp.zeros(len(loop.state_names) - 3).at[:3].set(offset.at[2].add(speeds[0]))

@@ -10,7 +10,7 @@ STEEPEST = 0.2
 """Largest curvature of a path [1/m]: tighter than any car turns."""
 
 
-def along_path(vehicle: Vehicle, law: PathFeedback) -> Vehicle:
+def along_path(vehicle: Vehicle, law: PathFeedback, *, perturbation: tuple[float, float] = (0.03, 1.0)) -> Vehicle:
     """The loop of a vehicle and a law as a plant: states (0, 0, 0, ξ), controls w = (ν, κ, v_ref).
 
     See `sfkd_jax.path_frame`. One step is exact on a circle of curvature κ, whatever the
@@ -19,6 +19,7 @@ def along_path(vehicle: Vehicle, law: PathFeedback) -> Vehicle:
 
     Args:
         vehicle: any with limits of its controls. law: (ξ, κ, v_ref, e) -> u.
+        perturbation: largest |ν| [rad, control unit], the limits of w; no step enforces them.
 
     Raises:
         ValueError: the vehicle has no limits.
@@ -36,13 +37,12 @@ def along_path(vehicle: Vehicle, law: PathFeedback) -> Vehicle:
     def nominal_derivative(state: State, control: Control, env: Environment) -> State:
         return (nominal(state, control, env) - state) / vehicle.dt
 
-    span = [high - low for low, high in zip(*limits, strict=True)]
     return vehicle._replace(
         state_names=("p_x", "p_y", "yaw", "e_y", "e_psi", *vehicle.state_names[3:]),
         step=step,
         derivative=derivative,
         nominal=nominal,
         nominal_derivative=nominal_derivative,
-        control_low=(*(-width for width in span), -STEEPEST, SPEED_RANGE[0]),
-        control_high=(*span, STEEPEST, SPEED_RANGE[1]),
+        control_low=(*(-largest for largest in perturbation), -STEEPEST, SPEED_RANGE[0]),
+        control_high=(*perturbation, STEEPEST, SPEED_RANGE[1]),
     )
