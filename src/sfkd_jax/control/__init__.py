@@ -32,6 +32,7 @@ from sfkd_jax.control._path_frame import path_errors as path_errors
 from sfkd_jax.control._path_frame import path_feedback as path_feedback
 from sfkd_jax.control._path_frame import reference_curvature as reference_curvature
 from sfkd_jax.control._path_law import PathLaw as PathLaw
+from sfkd_jax.control._path_law import at_turn as at_turn
 from sfkd_jax.control._path_law import law_arrays as law_arrays
 from sfkd_jax.control._path_law import law_from_arrays as law_from_arrays
 from sfkd_jax.control._path_tracking import path_tracking as path_tracking

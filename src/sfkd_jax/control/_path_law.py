@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from itertools import product
 from math import prod
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import jax.numpy as jnp
 from jaxtyping import Array, Float, Int
@@ -82,7 +83,7 @@ def law_arrays(law: PathLaw) -> dict[str, Array]:
     return law._asdict()
 
 
-def law_from_arrays(arrays: dict[str, Array]) -> PathLaw:
+def law_from_arrays(arrays: Mapping[str, Any]) -> PathLaw:
     """The law that was stored.
 
     Raises:
