@@ -32,7 +32,7 @@ ARROWS = {
     "reporting": {"artefacts"},
     "assembly": HALLWAY | {"vehicle", "scenarios", "datasets", "models", "control"},
     "shelf": HALLWAY | {"artefacts", "datasets"},
-    "path_law": HALLWAY | {"artefacts", "assembly", "control", "shelf", "vehicle"},
+    "path_law": HALLWAY | {"artefacts", "assembly", "control", "datasets", "shelf", "vehicle"},
     "rehearsal": HALLWAY | {"assembly", "certification", "control", "datasets", "shelf", "vehicle"},
     "walk": HALLWAY
     | {"artefacts", "assembly", "certification", "datasets", "evaluation", "path_law", "policy", "shelf"}

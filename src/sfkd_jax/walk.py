@@ -18,10 +18,6 @@ from sfkd_jax.datasets import (
     check_on_path,
     first_share,
     from_logs,
-    generate,
-    generate_along_path,
-    generate_s3_along_path,
-    generate_switching,
     measure_space,
     random_windows,
     split,
@@ -53,12 +49,7 @@ def _driven(settings: dict[str, Any]) -> Dataset:
     asked = settings["dataset"]
     drive_key, split_key = jax.random.split(jax.random.key(asked["seed"]))
     options = assembly.without(asked, *SPLIT, "law")
-    if shelf.is_along_path(settings):
-        box = {name: tuple(asked[name]) for name in ("env_low", "env_high")}
-        drives = partial(generate_along_path, path_law.loop(settings), **options, **box)
-    else:
-        plant = assembly.build_vehicle(settings["vehicle"])
-        drives = partial(generate, plant, assembly.build_driver(plant), **options)
+    drives = path_law.drives(settings, options)
     shelf.say(f"generating {asked['segments']} segments")
     trajectories = jax.jit(drives)(drive_key)
     if shelf.is_along_path(settings):
@@ -106,9 +97,8 @@ def held_out_drives(settings: dict[str, Any], dataset: Dataset) -> dict[str, Tra
     if shelf.is_logged(settings):
         return {"test": dataset.test}
     constant = jnp.all(dataset.test.envs == dataset.test.envs[:, :1], axis=(1, 2))
-    asked = {name: settings[name] for name in ("vehicle", "dataset", "root")} | {
-        "segments": dataset.test.controls.shape[0]
-    }
+    asked = {name: settings[name] for name in ("vehicle", "dataset", "root")}
+    asked |= {"segments": dataset.test.controls.shape[0]}
     parts = {"test": dataset.test, "s3": _switching(json.dumps(asked))}
     for name, chosen in (("s1", constant), ("s2", ~constant)):
         if chosen.any():
@@ -122,12 +112,7 @@ def _switching(asked: str) -> Trajectory:
     settings = json.loads(asked)
     data = settings["dataset"] | {"segments": settings["segments"]}
     options = assembly.without(data, *SPLIT, "law", "fixed_levels")
-    if shelf.is_along_path(settings):
-        drives = partial(generate_s3_along_path, path_law.loop(settings), **options)
-    else:
-        plant = assembly.build_vehicle(settings["vehicle"])
-        drives = partial(generate_switching, plant, assembly.build_driver(plant), **options)
-    drive = jax.jit(drives)
+    drive = jax.jit(path_law.drives(settings, options, switching=True))
     return drive(jax.random.fold_in(jax.random.key(data["seed"]), SWITCHING))
 
 
