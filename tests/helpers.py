@@ -38,6 +38,7 @@ VARIANTS = {
     "no_contraction": {"residual": "free"},
     "soft": {"residual": "free", "soft_penalty": 1.0},
     "segment": {"frame": "segment"},
+    "path": {"frame": "path"},
 }
 HARD = ("sfkd", "no_fiber", "no_transport", "segment")
 """Variants whose operator and residual are each bounded by construction (and are there)."""
@@ -58,6 +59,15 @@ def space(body=1):
         increment_mean=jnp.asarray([1.0, 0.0, 0.0]),
         increment_scale=jnp.asarray([0.3, 0.05, 0.1]),
     )
+
+
+def any_law(coordinates=3):
+    """A law that follows a path slowly, the same in every environment."""
+    corners = (2, 2, 2, 2)
+    gain = jnp.zeros((*corners, 2, coordinates)).at[..., 0, 0].set(0.05).at[..., 0, 1].set(0.5).at[..., 1, 2].set(1.0)
+    control_table = jnp.zeros((*corners, 2)).at[..., 0].add(jnp.asarray([-0.06, 0.06])[:, None, None, None])
+    ends = (jnp.asarray([-2.0, 8.0, 0.3, -8.0]), jnp.asarray([2.0, 10.5, 0.9, 8.0]))
+    return control.PathLaw(*ends, jnp.asarray([0.03, 1.0]), jnp.zeros((*corners, coordinates)), control_table, gain)
 
 
 def tiny(name="sfkd", **changes):

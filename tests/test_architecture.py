@@ -13,11 +13,12 @@ import pytest
 FUNCTION = (ast.FunctionDef, ast.AsyncFunctionDef)
 SRC = Path(__file__).parents[1] / "src" / "sfkd_jax"
 PACKAGE = SRC.name
-HALLWAY = {"types", "se2", "rollouts"}
+HALLWAY = {"types", "se2", "path_frame", "rollouts"}
 DOORS = {"generate", "train", "certify", "evaluate", "compare", "report", "export", "doctor", "demo"}
 ARROWS = {
     "types": HALLWAY,
     "se2": HALLWAY,
+    "path_frame": HALLWAY,
     "rollouts": HALLWAY,
     "artefacts": set(),
     "vehicle": HALLWAY,
@@ -31,9 +32,11 @@ ARROWS = {
     "reporting": {"artefacts"},
     "assembly": HALLWAY | {"vehicle", "scenarios", "datasets", "models", "control"},
     "shelf": HALLWAY | {"artefacts", "datasets"},
-    "rehearsal": HALLWAY | {"assembly", "certification", "datasets", "shelf", "vehicle"},
+    "path_law": HALLWAY | {"artefacts", "assembly", "control", "datasets", "shelf", "vehicle"},
+    "rehearsal": HALLWAY | {"assembly", "certification", "control", "datasets", "shelf", "vehicle"},
     "walk": HALLWAY
-    | {"artefacts", "assembly", "certification", "datasets", "evaluation", "policy", "shelf", "training", "vehicle"},
+    | {"artefacts", "assembly", "certification", "datasets", "evaluation", "path_law", "policy", "shelf"}
+    | {"training", "vehicle"},
     "policy": HALLWAY | {"artefacts", "assembly", "certification", "control", "models", "vehicle"},
     "drive": HALLWAY | {"assembly", "certification", "datasets", "evaluation", "scenarios", "shelf", "vehicle"},
     "cells": {"artefacts", "drive", "evaluation", "shelf"},
@@ -74,7 +77,7 @@ FOREIGN |= {"iree": {"exporting/_iree.py"}, "pyarrow": {"datasets/_tables.py"}}
 FOREIGN |= {"vehiclemodels": {"adapters/_commonroad_equations.py"}}
 WORKSHOP = {"hydra", "omegaconf", "cvxpy", "clarabel", "orbax", "brax", "matplotlib", "optax"}
 WRITES = {f"os.environ.{verb}" for verb in ("update", "setdefault", "pop", "popitem", "clear")}
-HOST = {"walk", "drive", "training", "certification", "exporting"}
+HOST = {"walk", "path_law", "drive", "training", "certification", "exporting"}
 """Besides the doors and gymnasium's adapter, where code runs on the host and may compile."""
 FORBIDDEN = WRITES | {"os.putenv", "os.unsetenv", "jax.config"}
 GIVES_BACK = "exporting/_warm_up.py"

@@ -3,7 +3,7 @@
 from pathlib import Path
 
 import pytest
-from helpers import space
+from helpers import any_law, space
 from hydra import compose, initialize_config_dir
 from hydra.errors import HydraException
 from omegaconf import OmegaConf
@@ -44,10 +44,11 @@ def test_every_controller_builds_for_every_vehicle(vehicle, controller):
     limits = ("vehicle.control_low=[-0.4,-3.0]", "vehicle.control_high=[0.4,2.0]") if vehicle == "own" else ()
     composed = settings(f"vehicle={vehicle}", f"controller={controller}", *limits)
     plant = assembly.build_vehicle(composed["vehicle"])
-    model = assembly.reference_systems(plant)["oracle"].model
+    law = any_law(len(plant.state_names) - 1) if composed["controller"]["sampling"] == "law" else None
+    model = assembly.reference_systems(plant, law)["oracle"].model
     if composed["controller"]["planner"] == "koopman_mpc":  # the only planner that needs a linear predictor
         model = models.FACTORIES["koopman_mpc"](space(len(plant.state_names) - 3))
-    assembly.build_controller(composed["controller"], model, plant)
+    assembly.build_controller(composed["controller"], model, plant, law=law)
     assembly.build_scenario(composed["scenario"], plant, duration=6.0)
 
 

@@ -13,7 +13,14 @@ from omegaconf.errors import OmegaConfBaseException
 from sfkd_jax import assembly, config, ranges, rehearsal
 
 MODELS = ("sfkd", "koopman_mpc", "control_synth", "icode", "icode_mppi", "neural_ode", "r2dn")
-OPTIONS = (*(f"model={name}" for name in MODELS), "vehicle=dynamic", "vehicle=own", "dataset=files", "comparison=paper")
+OPTIONS = (
+    *(f"model={name}" for name in MODELS),
+    "vehicle=dynamic",
+    "vehicle=own",
+    "dataset=files",
+    "dataset=path",
+    "comparison=paper",
+)
 SIGNED = {"vehicle.wind_lever", "vehicle.control_low", "vehicle.control_high", "dataset.env_low", "dataset.env_high"}
 SIGNED |= {"evaluation.told.bias"}
 """Settings whose numbers may be negative."""

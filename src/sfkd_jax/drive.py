@@ -8,11 +8,12 @@ from functools import partial
 from typing import Any, NamedTuple, TypeAlias
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 
 from sfkd_jax import assembly, evaluation, shelf
 from sfkd_jax.certification import conformal_tube, latent_tube
-from sfkd_jax.datasets import Dataset
+from sfkd_jax.datasets import Dataset, to_path
 from sfkd_jax.scenarios import Scenario
 from sfkd_jax.types import Trajectory
 from sfkd_jax.vehicle import Vehicle, check_step
@@ -75,7 +76,7 @@ def prepare(
     """
     protocol, box = settings["evaluation"], settings["dataset"]
     limits = {"env_low": box["env_low"], "env_high": box["env_high"], "certificate": system.certificate}
-    limits["env"] = system.env
+    limits |= {"env": system.env, "law": system.law}
     if dataset is not None:
         limits |= {"env_low": dataset.env_low.tolist(), "env_high": dataset.env_high.tolist()}
     controller = assembly.build_controller(settings["controller"], system.model, plant, **limits)
@@ -124,8 +125,16 @@ def _assessor(
     predict = jax.jit(partial(evaluation.predictions, system.model, length=length, horizon=horizon))
     claims = _claims(settings, system, dataset)
 
+    def seen(driven: Trajectory, road: Scenario) -> Trajectory:
+        """A drive as the model sees it."""
+        law = system.law
+        if law is None:
+            return driven
+        return to_path(driven, road.path, law, jnp.full(driven.controls.shape[0], road.speed))
+
     def assess(episodes: evaluation.Episode, track: Track) -> tuple[evaluation.Scores, dict[str, Any]]:
         driven = Trajectory(episodes.states, episodes.controls, episodes.believed)
+        driven = jax.jit(jax.vmap(seen))(driven, track.roads)
         long_enough = driven.controls.shape[1] >= length
         found = jax.device_get(predict(system.params, driven)) if long_enough else None
         scores = evaluation.score(episodes, np.asarray(track.roads.envs), dt=dt)

@@ -14,10 +14,11 @@ import jax.numpy as jnp
 import numpy as np
 
 from sfkd_jax import artefacts, assembly
+from sfkd_jax.control import PathLaw, law_arrays, law_from_arrays
 from sfkd_jax.types import Controller, Model, Params
 from sfkd_jax.vehicle import Vehicle
 
-KIND = "policy"
+KIND, LAW = "policy", "law"
 CERTIFICATE = "certificate.json"
 BOXES = {"state": "body", "control": "control", "env": "env"}
 """Box of a certificate -> scales of the model of the same size."""
@@ -29,7 +30,7 @@ class Trained(NamedTuple):
     Attributes:
         model, params: the learned rollout model. vehicle: that it was trained for. settings: how all of it was made.
         weights_sha256: of the weights alone. sha256: of them and of every setting; a certificate is about this one.
-        version: of the package that saved it.
+        version: of the package that saved it. law: of a model in path coordinates, the one it was learned around.
     """
 
     model: Model
@@ -39,6 +40,7 @@ class Trained(NamedTuple):
     weights_sha256: str
     sha256: str
     version: str
+    law: PathLaw | None = None
 
 
 class Policy(NamedTuple):
@@ -47,7 +49,7 @@ class Policy(NamedTuple):
     Attributes:
         model, params: the learned rollout model. controller: `Controller(init, act)`, pure; jit, vmap, scan it.
         certificate: the document in certificate.json, verified, or None if it is missing, refused or stale.
-        settings: how all of it was made.
+        settings: how all of it was made. law: of a model in path coordinates, the one it was learned around.
     """
 
     model: Model
@@ -55,11 +57,20 @@ class Policy(NamedTuple):
     controller: Controller
     certificate: dict[str, Any] | None
     settings: dict[str, Any]
+    law: PathLaw | None = None
 
 
-def save(path: Path, params: Params, settings: Mapping[str, Any], *, made_from: Mapping[str, str]) -> dict[str, Any]:
-    """Write policy.npz and its manifest; returns the manifest, whose `sha256` names the weights."""
-    flat = {name: np.asarray(leaf) for name, leaf in artefacts.flatten(params).items()}
+def save(
+    path: Path,
+    params: Params,
+    settings: Mapping[str, Any],
+    *,
+    made_from: Mapping[str, str],
+    law: PathLaw | None = None,
+) -> dict[str, Any]:
+    """Write policy.npz and its manifest; returns the manifest, whose `sha256` names the weights and the law."""
+    tree = params if law is None else params | {LAW: law_arrays(law)}
+    flat = {name: np.asarray(leaf) for name, leaf in artefacts.flatten(tree).items()}
     return artefacts.write_arrays(path, flat, kind=KIND, config=settings, made_from=made_from)
 
 
@@ -81,8 +92,10 @@ def restore(path: str | Path) -> Trained:
     version = _version(manifest)
     with artefacts.understood(file.with_suffix(".json"), ValueError, advice=_advice(version)):
         plant, model = _built(json.dumps({name: settings[name] for name in ("vehicle", "space", "model")}))
-    params = _weights(file, arrays, model)
-    return Trained(model, params, plant, settings, manifest["sha256"], policy_hash(manifest), version)
+    mine = {name: leaf for name, leaf in arrays.items() if not name.startswith(f"{LAW}/")}
+    law = _law(file, {name: leaf for name, leaf in arrays.items() if name not in mine}) if model.along_path else None
+    params = _weights(file, mine if model.along_path else arrays, model)
+    return Trained(model, params, plant, settings, manifest["sha256"], policy_hash(manifest), version, law)
 
 
 def load(path: str | Path, *, controller: Mapping[str, Any] | None = None, env: str = "measured") -> Policy:
@@ -109,12 +122,13 @@ def load(path: str | Path, *, controller: Mapping[str, Any] | None = None, env: 
         asked, box = settings["controller"], settings["dataset"]
         fallback = asked.get("monitor", {}).get("fallback", "none")
         limits = {"env_low": box["env_low"], "env_high": box["env_high"], "env": env, "certificate": certificate}
+        limits["law"] = trained.law
         planner = assembly.build_controller(asked, trained.model, trained.vehicle, **limits)
     if certificate is None and fallback != "none":
         raise artefacts.ArtefactError(f"{file}: controller.monitor.fallback={fallback} needs a certificate; {reason}")
     if certificate is None:
         warnings.warn(f"{file}: nothing is certified and nothing is monitored; {reason}", stacklevel=2)
-    return Policy(trained.model, trained.params, planner, certificate, settings)
+    return Policy(trained.model, trained.params, planner, certificate, settings, trained.law)
 
 
 def read_certificate(path: str | Path, trained: Trained) -> tuple[dict[str, Any] | None, str]:
@@ -165,6 +179,18 @@ def _version(manifest: Mapping[str, Any]) -> str:
 
 def _advice(version: str) -> str:
     return f"saved by sfkd_jax {version}: train again"
+
+
+def _law(file: Path, arrays: Mapping[str, np.ndarray]) -> PathLaw:
+    """Arrays as the law that a model in path coordinates was learned around.
+
+    Raises:
+        ArtefactError: some are missing, of another shape, or not finite.
+    """
+    if not all(np.all(np.isfinite(leaf)) for leaf in arrays.values()):
+        raise artefacts.ArtefactError(f"{file}: the law's arrays are not finite")
+    with artefacts.understood(file, ValueError):
+        return law_from_arrays(artefacts.unflatten(arrays)[LAW])
 
 
 def _weights(file: Path, arrays: Mapping[str, np.ndarray], model: Model) -> Params:

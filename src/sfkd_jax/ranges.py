@@ -18,10 +18,13 @@ _INTERVALS = {
     "*.smoothing_order *.chunk",
     "(0, inf)": f"{' '.join(f'vehicle.{name}' for name in _PLANTS.split())} vehicle.dt vehicle.creep_speed "
     "vehicle.wheelbase vehicle.speed_gain scenario.speed scenario.wavelengths dataset.speed dataset.gap "
-    "dataset.steering_excitation dataset.speed_excitation model.rate model.ridges model.lateral_range "
-    "model.heading_range model.curvature_range *.temperature *.noise_std controller.task.control_rate "
-    "controller.model_law.steering controller.model_law.drive controller.estimator.model_error "
-    "training.learning_rate training.clip_norm evaluation.threshold_m",
+    "dataset.wavelengths dataset.steering_excitation dataset.speed_excitation model.rate model.ridges "
+    "model.lateral_range model.heading_range model.curvature_range *.temperature *.noise_std "
+    "controller.task.control_rate controller.model_law.steering controller.model_law.drive "
+    "controller.estimator.model_error "
+    "training.learning_rate training.clip_norm evaluation.threshold_m dataset.peak_curvature "
+    "dataset.lateral_acceleration dataset.law.lateral_acceleration dataset.law.perturbation dataset.law.speed "
+    "dataset.law.curvature dataset.law.drive",
     "(0, 1)": "dataset.shares model.rho model.beta model.alpha certification.level certification.monitor_level "
     "controller.gradient.shrink",
     "[0, 1)": "certification.margin",
@@ -30,20 +33,30 @@ _INTERVALS = {
     "(1, inf)": "controller.estimator.dwell",
     "(2, inf)": "evaluation.episode_s demo.episode_s",  # what settles at the start is not scored
     "[2, inf)": "controller.*.horizon model.horizon controller.gradient.steps controller.estimator.points "
-    "*.noise_knots",
+    "*.noise_knots dataset.law.points",
     "[4, inf)": "dataset.segments",
 }
 _ENTRIES = {
     2: "scenario.wavelengths dataset.speed dataset.steering_excitation dataset.speed_excitation *.noise_std "
-    "controller.task.control_rate evaluation.told.noise evaluation.told.bias comparison.share",
+    "controller.task.control_rate evaluation.told.noise evaluation.told.bias comparison.share "
+    "dataset.law.speed dataset.law.perturbation dataset.wavelengths",
+    3: "dataset.law.points",
     4: "dataset.shares",
 }
-_RISING = {"scenario.wavelengths", "dataset.speed", "dataset.steering_excitation", "dataset.speed_excitation"}
+_RISING = {
+    "scenario.wavelengths",
+    "dataset.wavelengths",
+    "dataset.speed",
+    "dataset.law.speed",
+    "dataset.steering_excitation",
+    "dataset.speed_excitation",
+}
 _EMPTY = {
     "vehicle.control_low",
     "vehicle.control_high",
     "dataset.columns.environment",
     "evaluation.side_forces",
+    "training.loss.tube",
     "evaluation.observation_noise",
     "export.iree_flags",
     "comparison.vehicles",

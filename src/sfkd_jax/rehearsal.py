@@ -8,6 +8,7 @@ import jax.numpy as jnp
 
 from sfkd_jax import assembly, shelf
 from sfkd_jax.certification import MODES
+from sfkd_jax.control import PathLaw
 from sfkd_jax.datasets import check_shares
 from sfkd_jax.types import Space
 from sfkd_jax.vehicle import Vehicle
@@ -27,11 +28,24 @@ def check(settings: dict[str, Any], plant: Vehicle) -> None:
     for name in settings["evaluation"]["systems"]:
         assembly.choose({"self": None} | assembly.reference_systems(plant), name, "evaluation.systems entry")
     told = data["columns"]["environment"] if shelf.is_logged(settings) else ()
+    along = shelf.is_along_path(settings)
     sizes = {"state": len(plant.state_names) - 3, "control": 2, "env": len(told) or 2}
+    if along:
+        sizes |= {"state": sizes["state"] + 2, "control": 4}
     scales = (part(size) for size in (*sizes.values(), 3) for part in (jnp.zeros, jnp.ones))
     model = assembly.build_model(settings["model"], Space(*scales), plant)
+    if model.along_path != along:
+        raise ValueError("model.frame=path and dataset=path go together: path coordinates for both or for neither")
     if plant.control_low:
         boxes = {name: ((-1.0,) * size, (1.0,) * size) for name, size in sizes.items()}
         limits: dict[str, Any] = dict(zip(("env_low", "env_high"), boxes["env"], strict=True))
+        limits |= {"law": _any_law(sizes) if along else None}
         limits |= {"certificate": {"boxes": boxes, "monitor": {"bounds": (1.0,) * 4}}, "env": settings["env"]}
         assembly.build_controller(settings["controller"], model, plant, **limits)
+
+
+def _any_law(sizes: dict[str, int]) -> PathLaw:
+    """A law that asks for nothing."""
+    axes, corners = 2 + sizes["env"], (2,) * (2 + sizes["env"])
+    tables = (jnp.zeros((*corners, *shape)) for shape in ((sizes["state"],), (2,), (2, sizes["state"])))
+    return PathLaw(jnp.zeros(axes), jnp.ones(axes), jnp.ones(2), *tables)

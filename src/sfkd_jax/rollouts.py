@@ -9,6 +9,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
+from sfkd_jax.path_frame import HEADING, LATERAL, PATH_SPEED
 from sfkd_jax.se2 import between, wrap_angle
 from sfkd_jax.types import BODY, POSE, Control, Fiber, Latent, Model, Params, State, Trajectory
 
@@ -64,16 +65,28 @@ def window_errors(
     """
 
     def one(window: Trajectory) -> Float[Array, "horizon 3"]:
-        return prediction_errors(rollout(model, params, window)[0], window)
+        return prediction_errors(rollout(model, params, window)[0], window, along_path=model.along_path)
 
     return jax.vmap(one)(every_window(trajectory, horizon=horizon, stride=stride))
 
 
-def prediction_errors(predicted: Float[Array, "horizon state"], window: Trajectory) -> Float[Array, "horizon 3"]:
-    """Distance between positions [m], |yaw| [rad] (wrapped), 2-norm of the body state in its own units."""
+def prediction_errors(
+    predicted: Float[Array, "horizon state"], window: Trajectory, *, along_path: bool = False
+) -> Float[Array, "horizon 3"]:
+    """Distance between positions [m], |yaw| [rad] (wrapped), 2-norm of the body state in its own units.
+
+    Along a path: |e_y| [m], |e_ψ| [rad], 2-norm of the vehicle's own body state.
+    """
     gap = predicted - window.states[1:]
-    kinds = (jnp.linalg.norm(gap[:, :2], axis=1), jnp.abs(wrap_angle(gap[:, 2])))
-    return jnp.column_stack([*kinds, jnp.linalg.norm(gap[:, BODY], axis=1)])
+    kinds = _kinds_along_path(gap) if along_path else (gap[:, :2], gap[:, 2:3], gap[:, BODY])
+    position, yaw, body = kinds
+    return jnp.column_stack([jnp.linalg.norm(kind, axis=1) for kind in (position, wrap_angle(yaw), body)])
+
+
+def _kinds_along_path(gap: Float[Array, "*batch state"]) -> tuple[Array, Array, Array]:
+    """Of path states, what stands for position, yaw and body state: e_y, e_ψ, and the rest."""
+    xi = gap[..., BODY]
+    return xi[..., LATERAL, None], xi[..., HEADING, None], xi[..., PATH_SPEED:]
 
 
 def in_batches(function: Callable[[Any], Any], items: Any, *, size: int) -> Any:
@@ -116,6 +129,8 @@ def step_disturbances(
 ) -> Float[Array, " 4"]:
     """How far one step fell from its prediction, of each kind: latent, position [m], yaw [rad], body state.
 
+    Along a path the last three are e_y [m], e_ψ [rad] and the vehicle's own body state.
+
         |z' − ẑ'|, |p(g⁻¹ g') − p(g⁻¹ ĝ')|, |yaw(g⁻¹ g') − yaw(g⁻¹ ĝ')|, |s' − ŝ'|,   ẑ' = T(e → e') F(z, u, e)
 
     Args:
@@ -128,8 +143,10 @@ def step_disturbances(
     predicted = model.decode(fiber_next, expected)
     gap = model.vector(model.observe(fiber_next, origin, after)) - model.vector(expected)
     motion = between(before[POSE], predicted[POSE]) - between(before[POSE], after[POSE])
-    kinds = (gap, motion[:2], motion[2:], predicted[BODY] - after[BODY])
-    return jnp.stack([jnp.linalg.norm(kind) for kind in kinds])
+    kinds = (motion[:2], motion[2:], predicted[BODY] - after[BODY])
+    if model.along_path:
+        kinds = _kinds_along_path(predicted - after)
+    return jnp.stack([jnp.linalg.norm(kind) for kind in (gap, *kinds)])
 
 
 def _at(tree: Any, index: int) -> Any:

@@ -84,6 +84,10 @@ def register() -> None:
     store.store(group="scenario", name="schema", node=schema("ScenarioConfig", scenarios.scenario, skip=fixed))
     split = {"seed": 0, "shares": list[float], "env_low": list[float], "env_high": list[float]}
     store.store(group="dataset", name="schema", node=schema("DatasetConfig", datasets.generate, **split))
+    boxed = ("coordinates", "env_low", "env_high")
+    law = {"law": schema("LawConfig", control.derive_path_law, skip=boxed)}
+    node = schema("PathDatasetConfig", datasets.generate_along_path, skip=boxed, **split, **law)
+    store.store(group="dataset", name="path_schema", node=node)
     logs = {"path": str, "columns": schema("ColumnsConfig", **datasets.Columns._field_defaults)}
     node = schema("LogsConfig", datasets.from_logs, skip=("dt", "wheelbase", "limits", "told", "say"), **logs)
     store.store(group="dataset", name="files_schema", node=node)

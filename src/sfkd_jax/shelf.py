@@ -17,6 +17,7 @@ from sfkd_jax.datasets import Dataset, environment_box, fingerprint
 from sfkd_jax.types import BODY, Trajectory
 
 DATASET = "dataset"
+LAW = "law"
 PARTS = ("train", "validation", "calibration", "test")
 IDENTITY = ("vehicle", "dataset", "model", "training", "seed")
 """Settings that decide the weights; a run made with others is another run."""
@@ -92,6 +93,29 @@ def read_dataset(settings: dict[str, Any]) -> tuple[Dataset, str]:
     counts = arrays.get("drives")
     drives = None if counts is None else {part: int(count) for part, count in zip(PARTS, counts, strict=True)}
     return Dataset(*parts, env_low=low, env_high=high, drives=drives), manifest["sha256"]
+
+
+def write_law(settings: dict[str, Any], arrays: dict[str, Any]) -> None:
+    """Store the law of a data set in path coordinates beside it."""
+    path = law_path(settings)
+    path.parent.mkdir(parents=True, exist_ok=True)
+    plain = {name: np.asarray(array) for name, array in arrays.items()}
+    artefacts.write_arrays(path, plain, kind=LAW, config=dataset_config(settings))
+
+
+def read_law(settings: dict[str, Any]) -> dict[str, np.ndarray]:
+    """The arrays of that law."""
+    return artefacts.read_arrays(law_path(settings), kind=LAW, config=dataset_config(settings))[0]
+
+
+def law_path(settings: dict[str, Any]) -> Path:
+    """Where it lies."""
+    return dataset_path(settings).with_name("law.npz")
+
+
+def is_along_path(settings: dict[str, Any]) -> bool:
+    """Whether the data set is in path coordinates."""
+    return "law" in settings["dataset"]
 
 
 def claim(settings: dict[str, Any]) -> None:

@@ -52,11 +52,7 @@ class Space(NamedTuple):
 
 
 class Polytope(NamedTuple):
-    """A(e) is a convex combination of the vertices for every e.
-
-    Attributes:
-        vertices: (vertex, rank, rank).
-    """
+    """A(e) is a convex combination of the vertices (vertex, rank, rank) for every e."""
 
     vertices: Float[Array, "vertex rank rank"]
 
@@ -73,11 +69,7 @@ class Hypernetwork(NamedTuple):
 
 
 class Samples(NamedTuple):
-    """A(e) at some environments, and nothing about those between them: evidence, never a proof.
-
-    Attributes:
-        operators: (sample, rank, rank).
-    """
+    """A(e) at some environments, (sample, rank, rank), and nothing about those between: evidence, never a proof."""
 
     operators: Float[Array, "sample rank rank"]
 
@@ -176,6 +168,8 @@ class Model(NamedTuple):
         linear: fiber -> `LinearPredictor`, or None for a model that is not linear in a lift.
         fold: params -> params that `fiber` takes as well, with all that depends on no environment evaluated. To drive
             with: what it saves is what a control step would do anew each time.
+        rate: params -> α that `step` contracts with by construction, or None. along_path: whether states and controls
+            are those of `path_frame`, which have no pose to predict.
     """
 
     init: Callable[[Key], Params]
@@ -192,6 +186,8 @@ class Model(NamedTuple):
     start: Callable[[Params, Trajectory, Key], Params] | None = None
     linear: Callable[[Fiber], LinearPredictor] | None = None
     fold: Callable[[Params], Params] = lambda params: params
+    rate: Callable[[Params], Scalar] | None = None
+    along_path: bool = False
 
 
 class Controller(NamedTuple):
@@ -207,7 +203,7 @@ class Controller(NamedTuple):
 
 
 class Trajectory(NamedTuple):
-    """What was driven: the one record that walks through every room.
+    """What was driven.
 
     Attributes:
         states: x_0 … x_T, shape (*batch, time + 1, state).

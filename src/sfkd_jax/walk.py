@@ -10,15 +10,14 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 
-from sfkd_jax import artefacts, assembly, policy, shelf
+from sfkd_jax import artefacts, assembly, path_law, policy, shelf
 from sfkd_jax.certification import progress
 from sfkd_jax.datasets import (
     Columns,
     Dataset,
+    check_on_path,
     first_share,
     from_logs,
-    generate,
-    generate_switching,
     measure_space,
     random_windows,
     split,
@@ -51,11 +50,13 @@ def ensure_dataset(settings: dict[str, Any]) -> tuple[Dataset, str]:
 def _driven(settings: dict[str, Any]) -> Dataset:
     """A data set that the vehicle's own step drives."""
     asked = settings["dataset"]
-    shelf.say(f"generating {asked['segments']} segments")
-    plant = assembly.build_vehicle(settings["vehicle"])
     drive_key, split_key = jax.random.split(jax.random.key(asked["seed"]))
-    options = assembly.without(asked, *SPLIT)
-    trajectories = jax.jit(partial(generate, plant, assembly.build_driver(plant), **options))(drive_key)
+    options = assembly.without(asked, *SPLIT, "law")
+    drives = path_law.drives(settings, options)
+    shelf.say(f"generating {asked['segments']} segments")
+    trajectories = jax.jit(drives)(drive_key)
+    if shelf.is_along_path(settings):
+        check_on_path(trajectories)
     low, high = jnp.asarray(asked["env_low"]), jnp.asarray(asked["env_high"])
     return split(trajectories, split_key, shares=tuple(asked["shares"]), env_low=low, env_high=high)
 
@@ -99,7 +100,8 @@ def held_out_drives(settings: dict[str, Any], dataset: Dataset) -> dict[str, Tra
     if shelf.is_logged(settings):
         return {"test": dataset.test}
     constant = jnp.all(dataset.test.envs == dataset.test.envs[:, :1], axis=(1, 2))
-    asked = {name: settings[name] for name in ("vehicle", "dataset")} | {"segments": dataset.test.controls.shape[0]}
+    asked = {name: settings[name] for name in ("vehicle", "dataset", "root")}
+    asked |= {"segments": dataset.test.controls.shape[0]}
     parts = {"test": dataset.test, "s3": _switching(json.dumps(asked))}
     for name, chosen in (("s1", constant), ("s2", ~constant)):
         if chosen.any():
@@ -111,9 +113,9 @@ def held_out_drives(settings: dict[str, Any], dataset: Dataset) -> dict[str, Tra
 def _switching(asked: str) -> Trajectory:
     """Drives under S3's switching, of these settings as JSON; kept, for every row of a comparison asks for the same."""
     settings = json.loads(asked)
-    plant, data = assembly.build_vehicle(settings["vehicle"]), settings["dataset"] | {"segments": settings["segments"]}
-    options = {name: value for name, value in assembly.without(data, *SPLIT).items() if name != "fixed_levels"}
-    drive = jax.jit(partial(generate_switching, plant, assembly.build_driver(plant), **options))
+    data = settings["dataset"] | {"segments": settings["segments"]}
+    options = assembly.without(data, *SPLIT, "law", "fixed_levels")
+    drive = jax.jit(path_law.drives(settings, options, switching=True))
     return drive(jax.random.fold_in(jax.random.key(data["seed"]), SWITCHING))
 
 
@@ -137,7 +139,7 @@ def ensure_policy(settings: dict[str, Any]) -> policy.Trained:
 
 def systems(settings: dict[str, Any], plant: Vehicle) -> dict[str, assembly.System]:
     """The systems that `evaluation.systems` asks for; "self" is the policy of this run, made if it is missing."""
-    references, found = assembly.reference_systems(plant), {}
+    references, found = assembly.reference_systems(plant, path_law.ensure(settings)), {}
     for name in settings["evaluation"]["systems"]:
         if name == "self":
             found[settings["model"]["system"]] = own_system(settings)
@@ -159,7 +161,7 @@ def own_system(settings: dict[str, Any]) -> assembly.System:
         if fallback != "none":
             raise ValueError(f"controller.monitor.fallback={fallback} needs a certificate; {reason}")
     told = settings["env"] if trained.settings["model"]["environment"] else "none"
-    return assembly.System(trained.model, trained.params, told, certificate)
+    return assembly.System(trained.model, trained.params, told, certificate, trained.law)
 
 
 def _train(settings: dict[str, Any]) -> None:
@@ -189,7 +191,7 @@ def _train(settings: dict[str, Any]) -> None:
     artefacts.write_json(place / "open_loop.json", document)
     kept |= {"controller": settings["controller"], "experiment": settings["name"]}
     kept |= {"space": assembly.space_to_settings(space), "best_step": best}
-    policy.save(place / "policy.npz", params, kept, made_from={"dataset": data_hash})
+    policy.save(place / "policy.npz", params, kept, made_from={"dataset": data_hash}, law=path_law.ensure(settings))
 
 
 def _started(model: Model, start: str, train: Trajectory, seed: int) -> Model:

@@ -1,5 +1,8 @@
 """Decision: planners over any rollout model. Imports jax only; takes models and costs as arguments."""
 
+from sfkd_jax.control._along_path import curvature_ahead as curvature_ahead
+from sfkd_jax.control._along_path import following_law as following_law
+from sfkd_jax.control._along_path import path_coordinates as path_coordinates
 from sfkd_jax.control._box_qp import BoxSolution as BoxSolution
 from sfkd_jax.control._box_qp import box_qp as box_qp
 from sfkd_jax.control._cem import cem as cem
@@ -8,6 +11,7 @@ from sfkd_jax.control._costs import Stage as Stage
 from sfkd_jax.control._costs import tracking_cost as tracking_cost
 from sfkd_jax.control._delay import DelayState as DelayState
 from sfkd_jax.control._delay import compensated as compensated
+from sfkd_jax.control._derived_law import derive_path_law as derive_path_law
 from sfkd_jax.control._estimation import EstimatorState as EstimatorState
 from sfkd_jax.control._estimation import estimated as estimated
 from sfkd_jax.control._gradient import gradient_planner as gradient_planner
@@ -27,6 +31,10 @@ from sfkd_jax.control._path_frame import no_feedback as no_feedback
 from sfkd_jax.control._path_frame import path_errors as path_errors
 from sfkd_jax.control._path_frame import path_feedback as path_feedback
 from sfkd_jax.control._path_frame import reference_curvature as reference_curvature
+from sfkd_jax.control._path_law import PathLaw as PathLaw
+from sfkd_jax.control._path_law import at_turn as at_turn
+from sfkd_jax.control._path_law import law_arrays as law_arrays
+from sfkd_jax.control._path_law import law_from_arrays as law_from_arrays
 from sfkd_jax.control._path_tracking import path_tracking as path_tracking
 from sfkd_jax.control._planner import planner as planner
 from sfkd_jax.control._plans import Found as Found

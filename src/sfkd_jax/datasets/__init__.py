@@ -9,6 +9,11 @@ from sfkd_jax.datasets._generation import Driver as Driver
 from sfkd_jax.datasets._generation import generate as generate
 from sfkd_jax.datasets._generation import generate_switching as generate_switching
 from sfkd_jax.datasets._logs import Columns as Columns
+from sfkd_jax.datasets._path_drives import check_on_path as check_on_path
+from sfkd_jax.datasets._path_drives import drive_along_path as drive_along_path
+from sfkd_jax.datasets._path_drives import drive_switching as drive_switching
+from sfkd_jax.datasets._path_drives import generate_along_path as generate_along_path
+from sfkd_jax.datasets._path_drives import generate_s3_along_path as generate_s3_along_path
 from sfkd_jax.datasets._splits import Dataset as Dataset
 from sfkd_jax.datasets._splits import check_shares as check_shares
 from sfkd_jax.datasets._splits import first_share as first_share
@@ -17,3 +22,6 @@ from sfkd_jax.datasets._splits import random_windows as random_windows
 from sfkd_jax.datasets._splits import split as split
 from sfkd_jax.datasets._splits import spread_windows as spread_windows
 from sfkd_jax.datasets._splits import windows as windows
+from sfkd_jax.datasets._to_path import check_logged as check_logged
+from sfkd_jax.datasets._to_path import logged_path as logged_path
+from sfkd_jax.datasets._to_path import to_path as to_path

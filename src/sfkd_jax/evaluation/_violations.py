@@ -81,7 +81,7 @@ def _along_window(model: Model, params: Params, window: Trajectory) -> Predictio
     seen = jax.vmap(model.observe)(along[1], latents, window.states[1:])
     gone = jax.vmap(model.vector)(seen) - jax.vmap(model.vector)(latents)
     return Predictions(
-        errors=prediction_errors(predicted, window),
+        errors=prediction_errors(predicted, window, along_path=model.along_path),
         latent_errors=jnp.linalg.norm(gone, axis=1),
         defects=jnp.linalg.norm(gaps, axis=1),
     )

@@ -13,6 +13,7 @@ from sfkd_jax.se2 import rotate
 from sfkd_jax.types import BODY, Control, Environment, Explicit, Fiber, Key, Model, Params, Space, State
 
 SOLVERS = ("rk4", "euler")
+FRAMES = ("body", "path")
 
 
 class Conditioned(NamedTuple):
@@ -37,6 +38,7 @@ def continuous(
     solver: str = "rk4",
     known: Callable[[Fiber, State, Control], State] | None = None,
     explicit: Callable[[Params], Explicit] | None = None,
+    frame: str = "body",
 ) -> Model:
     """A model ds/dt = r_s(s, u; e) whose latent is the state itself, one step of a fixed-step solver per period.
 
@@ -56,13 +58,14 @@ def continuous(
         known: (fiber, state, control) -> dx/dt known beforehand, in the world and in physical units, equivariant
             under SE(2). The rates are then added to it, and m_g is left out.
         explicit: as in `Model`.
+        frame: "body", or "path" for path coordinates: no pose, so r_g counts for nothing.
 
     Raises:
         ValueError: an unknown solver; a state of the wrong length, when it is encoded.
     """
     if solver not in SOLVERS:
         raise ValueError(f"model.solver must be one of {', '.join(SOLVERS)}, got {solver!r}")
-    size = 3 + space.body_mean.shape[0]
+    size, pose = 3 + space.body_mean.shape[0], has_pose(frame)
     drift = jnp.asarray(space.increment_mean) if known is None else jnp.zeros(3)
 
     def scaled_fiber(params: Params, env: Environment) -> Fiber:
@@ -71,6 +74,8 @@ def continuous(
     def derivative(at: Fiber, state: State, control: Control) -> State:
         scaled_control = (control - space.control_mean) / space.control_scale
         rate = rates(at, scaled_body(state), scaled_control)
+        if not pose:
+            return jnp.concatenate([jnp.zeros(3), space.body_scale * rate[3:]])
         twist = (drift + space.increment_scale * rate[:3]) / dt
         change = jnp.concatenate([rotate(state[2], twist[:2]), twist[2:], space.body_scale * rate[3:]])
         return change if known is None else change + known(at, state, control)
@@ -103,7 +108,19 @@ def continuous(
         observe=lambda at, latent, state: encode(at, state),
         vector=scaled_body,
         explicit=explicit,
+        along_path=not pose,
     )
+
+
+def has_pose(frame: str) -> bool:
+    """Whether a model predicts a pose: in the frame of the body; along a path there is none.
+
+    Raises:
+        ValueError: an unknown frame.
+    """
+    if frame not in FRAMES:
+        raise ValueError(f"model.frame must be one of {', '.join(FRAMES)}, got {frame!r}")
+    return frame == "body"
 
 
 def scaled_env(space: Space, env: Environment, environment: bool) -> Environment:

@@ -13,7 +13,14 @@ from sfkd_jax.models._continuous import Conditioned, continuous, network
 from sfkd_jax.types import Control, Key, Model, Params, Space
 
 
-def neural_ode(space: Space, *, dt: float = 0.1, hidden: tuple[int, ...] = (96, 96), environment: bool = True) -> Model:
+def neural_ode(
+    space: Space,
+    *,
+    dt: float = 0.1,
+    hidden: tuple[int, ...] = (96, 96),
+    environment: bool = True,
+    frame: str = "body",
+) -> Model:
     """Rates of the body state and the pose from one tanh network, solved by RK4 at dt.
 
         (ġ, ṡ) = W_L tanh(… tanh(W_1 [s; u; e] + b_1) …) + b_L,   ġ in the frame of the body
@@ -24,7 +31,7 @@ def neural_ode(space: Space, *, dt: float = 0.1, hidden: tuple[int, ...] = (96, 
         space: measured scales; fixes all sizes.
         dt: sampling period [s], the solver's step in training and in use.
         hidden: widths.
-        environment: use e at all.
+        environment: use e at all. frame: "body", or "path" for path coordinates.
 
     Source: Chen et al., NeurIPS 2018, arXiv 1806.07366.
     """
@@ -39,4 +46,4 @@ def neural_ode(space: Space, *, dt: float = 0.1, hidden: tuple[int, ...] = (96, 
         read = jnp.concatenate([body, control, fiber.env])
         return cast(jax.Array, net.apply({"params": fiber.params}, read))
 
-    return continuous(space, dt=dt, init=init, fiber=Conditioned, rates=rates, environment=environment)
+    return continuous(space, dt=dt, init=init, fiber=Conditioned, rates=rates, environment=environment, frame=frame)

@@ -8,7 +8,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from sfkd_jax.models._continuous import scaled_env
+from sfkd_jax.models._continuous import has_pose, scaled_env
 from sfkd_jax.models._r2dn_weights import Affine, Interconnection, Shared
 from sfkd_jax.models.sfkd._networks import Biases, Encoder
 from sfkd_jax.models.sfkd._records import SfkdLatent
@@ -53,6 +53,7 @@ def r2dn(
     decoder_hidden: tuple[int, ...] = (64, 32),
     encoder_hidden: int = 32,
     environment: bool = True,
+    frame: str = "body",
 ) -> Model:
     """Robust recurrent deep network: an LTI system in feedback with a 1-Lipschitz network, the pose on SE(2) outside.
 
@@ -73,15 +74,16 @@ def r2dn(
         space: measured scales; fixes all sizes.
         rank: of z, and of what φ takes in and gives out. alpha: α, below 1 for a certificate.
         hidden, decoder_hidden, encoder_hidden: hidden widths of φ, D and the encoder.
-        environment: use e at all.
+        environment: use e at all. frame: "body", or "path" for path coordinates, which have no pose.
 
     Raises:
-        ValueError: rank below 1, α outside (0, 1), or no hidden layer in φ or D.
+        ValueError: an unknown frame, rank below 1, α outside (0, 1), or no hidden layer in φ or D.
     """
     _check(rank, alpha, hidden, decoder_hidden)
+    pose = has_pose(frame)
     body, control = space.body_mean.shape[0], space.control_mean.shape[0]
     inputs = control + space.env_mean.shape[0]
-    weights = Interconnection(rank, body, inputs, tuple(hidden), tuple(decoder_hidden), alpha)
+    weights = Interconnection(rank, body, inputs, tuple(hidden), tuple(decoder_hidden), alpha, pose)
     encoder = Encoder(rank, encoder_hidden)
 
     def init(key: Key) -> Params:
@@ -123,6 +125,8 @@ def r2dn(
     def step(fiber: R2dnFiber, latent: SfkdLatent, control: Control) -> SfkdLatent:
         u = (control - space.control_mean) / space.control_scale
         z = fiber.A @ latent.z + apply(fiber.feedback, fiber.feedback_biases.at(u), latent.z)
+        if not pose:
+            return SfkdLatent(latent.pose, z)
         motion = apply(fiber.decoder, fiber.decoder_biases.at(u), latent.z)
         return SfkdLatent(compose(latent.pose, space.increment_mean + space.increment_scale * motion), z)
 
@@ -132,12 +136,14 @@ def r2dn(
 
     def explicit(params: Params) -> Explicit:
         shared = explicit_weights(params)
-        *inner, last = shared.decoder.matrices
+        decoder = shared.decoder.matrices
+        if pose:
+            decoder = (*decoder[:-1], jnp.asarray(space.increment_scale)[:, None] * decoder[-1])
         return Explicit(
             operators=Polytope(shared.A[None]),
             residual=shared.feedback.matrices,
             residual_multipliers=shared.feedback.multipliers,
-            decoder=(*inner, jnp.asarray(space.increment_scale)[:, None] * last),
+            decoder=decoder,
             decoder_multipliers=shared.decoder.multipliers,
             readout=jnp.asarray(space.body_scale)[:, None] * shared.readout,
             declared=Declared("tanh", "identity", control),
@@ -154,11 +160,15 @@ def r2dn(
         vector=lambda latent: latent.z,
         explicit=explicit,
         fold=fold,
+        rate=lambda params: jnp.asarray(alpha),
+        along_path=not pose,
     )
 
 
-def _biases(inputs: Affine, matrices: tuple[Float[Array, "_ _"], ...], env: Environment) -> Biases:
+def _biases(inputs: Affine | None, matrices: tuple[Float[Array, "_ _"], ...], env: Environment) -> Biases:
     """b_k(u, e) of every layer for one e: all of [u; e] enters linearly, so e only shifts the offsets."""
+    if inputs is None:
+        return Biases((), ())
     widths = [matrix.shape[0] for matrix in matrices]
     edges = [sum(widths[: k + 1]) for k in range(len(widths) - 1)]
     controls = inputs.gain.shape[0] - env.shape[0]

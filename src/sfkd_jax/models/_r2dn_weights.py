@@ -29,14 +29,15 @@ class Shared(NamedTuple):
         A: of z⁺ = A z + W_L tanh(… W_1 z …).
         feedback: W_1 = V_1 C₁, …, W_L = B₁ V_L with V of φ, and φ's multipliers, which prove α for the whole step.
         feedback_inputs, decoder_inputs: biases; the last of the feedback is B₂ [u; e] + b.
-        decoder: of the pose increment. readout, centre: of the body state.
+        decoder: of the pose increment; without a pose it is empty and its inputs are None.
+        readout, centre: of the body state.
     """
 
     A: Float[Array, "rank rank"]
     feedback: Weights
     feedback_inputs: Affine
     decoder: Weights
-    decoder_inputs: Affine
+    decoder_inputs: Affine | None
     readout: Float[Array, "body rank"]
     centre: Float[Array, " body"]
 
@@ -46,7 +47,7 @@ class Interconnection(nn.Module):
 
     Attributes:
         rank, body: sizes of z and s. inputs: size of [u; e].
-        hidden, decoder_hidden: widths. alpha: α.
+        hidden, decoder_hidden: widths. alpha: α. pose: whether there is a decoder of the pose.
     """
 
     rank: int
@@ -55,6 +56,7 @@ class Interconnection(nn.Module):
     hidden: Sequence[int]
     decoder_hidden: Sequence[int]
     alpha: float
+    pose: bool = True
 
     @nn.compact
     def __call__(self) -> Shared:
@@ -68,16 +70,22 @@ class Interconnection(nn.Module):
         )
         phi = Sandwich(self.rank, self.hidden, self.rank, name="phi")(1.0)
         first, *middle, last = phi.matrices
-        bound = jnp.exp(self.param("log_decoder_bound", nn.initializers.constant(1.0), ()))
+        decoder, decoder_inputs = self._decoder() if self.pose else (Weights((), ()), None)
         return Shared(
             A=A,
             feedback=Weights((first @ C1, *middle, B1 @ last), phi.multipliers),
             feedback_inputs=self._affine("feedback", sum(self.hidden) + self.rank, SMALL),
-            decoder=Sandwich(self.rank, self.decoder_hidden, 3, name="decoder")(bound),
-            decoder_inputs=self._affine("decoder", sum(self.decoder_hidden) + 3, nn.initializers.lecun_normal()),
+            decoder=decoder,
+            decoder_inputs=decoder_inputs,
             readout=bounded(self.param("readout", nn.initializers.orthogonal(), (self.body, self.rank)), 1.0),
             centre=self.param("centre", nn.initializers.zeros, (self.body,)),
         )
+
+    def _decoder(self) -> tuple[Weights, Affine]:
+        """Of the pose increment, and its biases."""
+        bound = jnp.exp(self.param("log_decoder_bound", nn.initializers.constant(1.0), ()))
+        weights = Sandwich(self.rank, self.decoder_hidden, 3, name="decoder")(bound)
+        return weights, self._affine("decoder", sum(self.decoder_hidden) + 3, nn.initializers.lecun_normal())
 
     def _affine(self, name: str, size: int, spread: nn.initializers.Initializer) -> Affine:
         """Learned biases of one network."""

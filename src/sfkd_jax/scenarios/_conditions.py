@@ -105,3 +105,38 @@ def gusts(
     blend = 0.5 - 0.5 * jnp.cos(jnp.pi * jnp.clip(since / ramp, 0.0, 1.0))
     before = levels[jnp.maximum(gust - 1, 0)]
     return before + (levels[gust] - before) * blend
+
+
+def held_road(
+    key: Key, *, steps: int, low: tuple[float, ...], high: tuple[float, ...]
+) -> Float[Array, "time environment"]:
+    """One environment out of the box E, held; a third of every entry lies at an end of its range."""
+    return jnp.tile(_anywhere(key, low, high), (steps, 1))
+
+
+def random_switching(
+    key: Key,
+    *,
+    steps: int,
+    dt: float,
+    low: tuple[float, ...],
+    high: tuple[float, ...],
+    dwell: Range = (3.0, 6.0),
+) -> Float[Array, "time environment"]:
+    """Environments out of the box E, each as in `held_road`, held for a time drawn from `dwell` [s].
+
+    Args:
+        key: consumed. steps, dt: length and sampling period [s]. low, high: E.
+    """
+    level_key, hold_key = jax.random.split(key)
+    count = int(steps * dt / dwell[0]) + 2
+    levels = jax.vmap(lambda key: _anywhere(key, low, high))(jax.random.split(level_key, count))
+    ends = jnp.cumsum(jax.random.uniform(hold_key, (count,), minval=dwell[0], maxval=dwell[1]))
+    return levels[jnp.searchsorted(ends, jnp.arange(steps) * dt, side="right")]
+
+
+def _anywhere(key: Key, low: tuple[float, ...], high: tuple[float, ...]) -> Float[Array, " environment"]:
+    """A point of a box; evenly inside, and a third of every entry at an end."""
+    share = jnp.clip(jax.random.uniform(key, (len(low),), minval=-0.25, maxval=1.25), 0.0, 1.0)
+    bottom, top = jnp.asarray(low), jnp.asarray(high)
+    return bottom + share * (top - bottom)

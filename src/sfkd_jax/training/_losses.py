@@ -3,15 +3,16 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import TypeAlias
+from typing import TypeAlias, cast
 
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
+from sfkd_jax.path_frame import HEADING, LATERAL
 from sfkd_jax.rollouts import defects, rollout
 from sfkd_jax.se2 import rotate, wrap_angle
-from sfkd_jax.types import BODY, Model, Params, Scalar, Space, Trajectory
+from sfkd_jax.types import BODY, Explicit, Model, Params, Scalar, Space, Trajectory
 
 Loss: TypeAlias = Callable[[Params, Trajectory], tuple[Scalar, dict[str, Scalar]]]
 
@@ -19,11 +20,29 @@ YAW_LENGTH = 5.0
 """What 1 rad of yaw is worth in the loss [m]: its lever over half a second at the benchmark's speed."""
 
 
+def power_mean(values: Float[Array, "*shape"], power: int = 8) -> Scalar:
+    """(mean |x|^p)^(1/p), scaled so that float32 holds the powers: near the maximum, and smooth."""
+    largest = jax.lax.stop_gradient(jnp.max(values))
+    return largest * jnp.mean((values / largest) ** power) ** (1.0 / power)
+
+
 def state_errors(predicted: Float[Array, "time state"], true: Float[Array, "time state"]) -> Float[Array, "time state"]:
     """Predicted minus true: position along and across the true heading [m], yaw wrapped [rad], body state."""
     position = jax.vmap(rotate)(-true[:, 2], predicted[:, :2] - true[:, :2])
     yaw = wrap_angle(predicted[:, 2:3] - true[:, 2:3])
     return jnp.concatenate([position, yaw, predicted[:, BODY] - true[:, BODY]], axis=1)
+
+
+def error_units(model: Model, space: Space) -> Float[Array, " state"]:
+    """What multiplies each of `state_errors` to count as metres.
+
+    1 for the position, 5 m for a radian of yaw, 0.2 m for the half width of what else the body state holds. Along a
+    path, e_y and e_ψ are position and yaw.
+    """
+    others = 0.2 / jnp.asarray(space.body_scale)
+    if model.along_path:
+        others = others.at[LATERAL].set(1.0).at[HEADING].set(YAW_LENGTH)
+    return jnp.concatenate([jnp.asarray([1.0, 1.0, YAW_LENGTH]), others])
 
 
 def multi_step_loss(
@@ -36,14 +55,18 @@ def multi_step_loss(
     reconstruction: float = 0.1,
     transport: float = 0.1,
     growth: float = 0.5,
+    tube: tuple[float, ...] = (),
 ) -> Loss:
     """Mean over windows and steps of the prediction error in physical units, with four terms beside it.
 
         λ_p |x_k − x̂_k|²_W / (1 + γ (k − 1))² + λ_1 |x_k − x̂_{k|k−1}|²_{W}·10²
             + λ_c |d_k|² + λ_r |s − C Φ(x)|² + λ_t |Φ(x, e') − T(e → e') Φ(x, e)|²
+            + Σ_i λ_i (|c_i| q(|d|) / (1 − α))²_W
 
     W measures position in units of 0.01 m at the first step; a prediction's error grows about linearly with k, so
     the division by its expected growth lets the near steps, which the planner leans on, count as much as the far ones.
+    The last sum is what a certificate will say: the tube of body coordinate i for ever, c_i its row of the read-out,
+    q the 8th power mean over the batch, in the place of the quantile that calibration takes.
     The one-step term, in units of 0.001 m, sees what the sums over a window hide: slip, a lateral millimetre per step.
 
     Args:
@@ -54,15 +77,25 @@ def multi_step_loss(
             `docs/certificate.md`. reconstruction: λ_r. transport: λ_t, on
             Φ(x, e') − T(e → e') Φ(x, e) with e' another window's environment.
         growth: γ.
+        tube: λ_i of the first entries of the body state; () for none. For a model with a rate by construction.
 
     Returns:
-        (params, batch of windows) -> loss, parts.
+        (params, batch of windows) -> loss, parts; of a model with a tube in its loss also the first one's radius.
+
+    Raises:
+        ValueError: a tube of a model that has none, or of more entries than the body state has.
     """
+    if tube and (model.rate is None or model.explicit is None):
+        raise ValueError("training.loss.tube needs a model that contracts by construction: model=sfkd… or model=r2dn")
+    if len(tube) > space.body_mean.shape[0]:
+        raise ValueError(
+            f"training.loss.tube has {len(tube)} weights, the body state {space.body_mean.shape[0]} entries"
+        )
+    units = error_units(model, space)
 
     def window(params: Params, data: Trajectory, other: Float[Array, " environment"]) -> dict[str, Scalar]:
         predicted, _, along = rollout(model, params, data)
         errors = state_errors(predicted, data.states[1:])
-        units = jnp.concatenate([jnp.asarray([1.0, 1.0, YAW_LENGTH]), 0.1 / space.body_scale * 2.0])
         steps = 1.0 + growth * jnp.arange(errors.shape[0])
         weighted = (errors * units / 0.01 / steps[:, None]) ** 2
         gap, single = defects(model, params, data, along)
@@ -78,6 +111,8 @@ def multi_step_loss(
             "reconstruction": jnp.sum(rebuilt**2) / 1e-4,
             "transport": jnp.sum(moved**2) / 1e-4,
         }
+        if tube:
+            parts["gap"] = jnp.sqrt(jnp.sum(gap**2, axis=1) + 1e-16)
         if model.penalty is not None:
             parts["penalty"] = model.penalty(fiber, here, data.controls[0])
         return parts
@@ -85,7 +120,12 @@ def multi_step_loss(
     def loss(params: Params, batch: Trajectory) -> tuple[Scalar, dict[str, Scalar]]:
         others = jnp.roll(batch.envs[:, -1], 1, axis=0)
         parts = jax.vmap(window, in_axes=(None, 0, 0))(params, batch, others)
+        gaps = parts.pop("gap", None)
         parts = {name: jnp.mean(part) for name, part in parts.items()}
+        charged = jnp.zeros(())
+        if gaps is not None:
+            radii = tubes(params, gaps)
+            charged = jnp.sum(jnp.asarray(tube) * (radii * units[BODY][: len(tube)] / 0.01) ** 2)
         weights = {
             "prediction": prediction,
             "one_step": one_step,
@@ -93,6 +133,13 @@ def multi_step_loss(
             "reconstruction": reconstruction,
             "transport": transport,
         }
-        return sum((weights.get(name, 1.0) * part for name, part in parts.items()), jnp.zeros(())), parts
+        total = sum((weights.get(name, 1.0) * part for name, part in parts.items()), charged)
+        return total, parts if gaps is None else parts | {"tube": radii[0]}
+
+    def tubes(params: Params, gaps: Float[Array, "window time"]) -> Float[Array, " weighted"]:
+        """|c_i| q(|d|) / (1 − α) of the weighted coordinates, in their own units."""
+        rows = cast(Explicit, cast(Callable, model.explicit)(params)).readout[: len(tube)]
+        rate = cast(Callable, model.rate)(params)
+        return jnp.linalg.norm(rows, axis=1) * power_mean(gaps) / (1.0 - rate)
 
     return loss

@@ -1,5 +1,6 @@
 """Truth: the plants, as pure steps. Nothing here is learned and nothing here decides."""
 
+from sfkd_jax.vehicle._along_path import along_path as along_path
 from sfkd_jax.vehicle._dynamic import dynamic as dynamic
 from sfkd_jax.vehicle._integrators import rk4 as rk4
 from sfkd_jax.vehicle._kinematic import kinematic as kinematic

@@ -8,6 +8,7 @@ from jaxtyping import Array, Float
 
 from sfkd_jax.models.sfkd._bounds import bounded
 from sfkd_jax.models.sfkd._sandwich import Weights
+from sfkd_jax.types import Scalar
 
 LARGEST_COUPLING = 0.999
 """Of ||G||_2 and ||H||_2: what they leave, I − G G' and I − H'H, must keep a Cholesky factor in float32."""
@@ -17,7 +18,7 @@ def share_budget(
     operators: Float[Array, "vertex rank rank"],
     couplings: Float[Array, "2 rank rank"],
     network: Weights,
-    alpha: float,
+    alpha: float | Scalar,
 ) -> tuple[Float[Array, "vertex rank rank"], Weights]:
     """Operators and a residual such that z ↦ A_j z + G φ(α H z) is α-Lipschitz for every j, φ 1-Lipschitz.
 

@@ -12,6 +12,7 @@ from sfkd_jax.models._continuous import scaled_env
 from sfkd_jax.models.sfkd._networks import Encoder, Networks, PerEnvironment, Shared
 from sfkd_jax.models.sfkd._records import Mixture, SfkdFiber, SfkdLatent
 from sfkd_jax.models.sfkd._sandwich import apply
+from sfkd_jax.models.sfkd._settings import check_settings
 from sfkd_jax.models.sfkd._start import identified
 from sfkd_jax.models.sfkd._transport import rotate_planes
 from sfkd_jax.se2 import between, compose
@@ -32,9 +33,6 @@ from sfkd_jax.types import (
     State,
 )
 
-FRAMES = ("body", "segment")
-RESIDUALS = ("sandwich", "free", "none")
-BUDGETS = ("joint", "sum")
 SEGMENT_STEPS = 20.0
 """Increments per unit of the segment-frame pose scale: a window of the paper's horizon."""
 
@@ -57,6 +55,7 @@ def sfkd(
     transport: bool = True,
     environment: bool = True,
     soft_penalty: float = 0.0,
+    learn_alpha: bool = False,
 ) -> Model:
     """Environment-conditioned Koopman operators, a β-Lipschitz residual and isometric transport (eq:sfkd).
 
@@ -74,21 +73,23 @@ def sfkd(
         vertices: operators to mix. embedding: size of ψ(e).
         residual_hidden, decoder_hidden, encoder_hidden: hidden widths. linear_lift: φ holds W_0 s, see `Encoder`.
         frame: "body" composes the pose on SE(2) outside z; "segment" is the paper's reading, the pose relative to
-            the start of the window inside z.
+            the start of the window inside z; "path" has path coordinates as body (see `path_frame`) and no pose.
         residual: "sandwich", "free" (no bound by construction; ||A_j|| ≤ ρ) or "none" (||A_j|| ≤ ρ).
         budget: "joint" or "sum", of a sandwich residual.
         transport: learn Q(e), else the identity. environment: use e at all.
+        learn_alpha: let training choose α of a joint budget between `LOWEST_RATE` and ρ + β, from the latter on.
         soft_penalty: weight of the paper's hinge max(0, ||∂r/∂z||_2 − β)² in the training loss (eq:contr_loss).
 
     Raises:
         ValueError: unknown frame or residual, odd rank, or bounds outside (0, 1).
     """
-    _check(rank, rho, beta, frame, residual, budget)
-    segment = frame == "segment"
+    check_settings(rank, rho, beta, frame, residual, budget, learn_alpha)
+    segment, pose = frame == "segment", frame != "path"
     body = space.body_mean.shape[0]
     hidden = tuple(residual_hidden), tuple(decoder_hidden)
     control = space.control_mean.shape[0]
-    networks = Networks(rank, body, control, vertices, *hidden, embedding, rho, beta, residual, transport, budget)
+    bounds = (rho, beta, residual, transport, budget, pose, learn_alpha)
+    networks = Networks(rank, body, control, vertices, *hidden, embedding, *bounds)
     encoder = Encoder(rank, encoder_hidden, linear_lift)
     pose_scale = jnp.asarray(space.increment_scale) * SEGMENT_STEPS
 
@@ -129,14 +130,17 @@ def sfkd(
             encoder=params["encoder"],
         )
 
-    def lift(fiber: SfkdFiber, pose: Pose, state: State) -> SfkdLatent:
+    def rate(params: Params) -> Scalar:
+        return cast(Scalar, networks.apply({"params": params["networks"]}, method="rate"))
+
+    def lift(fiber: SfkdFiber, at: Pose, state: State) -> SfkdLatent:
         if state.shape != (3 + body,):
             raise ValueError(f"state must have shape ({3 + body},), got {state.shape}")
         inputs = (state[BODY] - space.body_mean) / space.body_scale
         if segment:
-            inputs = jnp.concatenate([between(pose, state[POSE]) / pose_scale, inputs])
+            inputs = jnp.concatenate([between(at, state[POSE]) / pose_scale, inputs])
         z = cast(jax.Array, encoder.apply({"params": fiber.encoder}, inputs, fiber.embedding))
-        return SfkdLatent(pose, rotate_planes(fiber.tangents, z))
+        return SfkdLatent(at, rotate_planes(fiber.tangents, z))
 
     def encode(fiber: SfkdFiber, state: State) -> SfkdLatent:
         return lift(fiber, state[POSE], state)
@@ -152,18 +156,18 @@ def sfkd(
         z = fiber.A @ latent.z + fiber.B @ u
         if residual != "none":
             z = z + apply(fiber.residual, fiber.residual_biases.at(u), latent.z)
-        if segment:
+        if segment or not pose:
             return SfkdLatent(latent.pose, z)
         motion = apply(fiber.decoder, fiber.decoder_biases.at(u), latent.z)
         return SfkdLatent(compose(latent.pose, space.increment_mean + space.increment_scale * motion), z)
 
     def decode(fiber: SfkdFiber, latent: SfkdLatent) -> State:
-        pose = latent.pose
+        reached = latent.pose
         if segment:
             offset = apply(fiber.decoder, fiber.decoder_biases.offsets, latent.z)
-            pose = compose(pose, pose_scale * offset)
+            reached = compose(reached, pose_scale * offset)
         scaled = fiber.readout @ latent.z + fiber.centre
-        return jnp.concatenate([pose, space.body_mean + space.body_scale * scaled])
+        return jnp.concatenate([reached, space.body_mean + space.body_scale * scaled])
 
     def carry(fiber: SfkdFiber, fiber_next: SfkdFiber, latent: SfkdLatent) -> SfkdLatent:
         home = rotate_planes(-fiber.tangents, latent.z)
@@ -172,11 +176,12 @@ def sfkd(
     def explicit(params: Params) -> Explicit:
         shared = bounded_parts(params)
         scale = (pose_scale if segment else jnp.asarray(space.increment_scale))[:, None]
+        decoder = (*shared.decoder.matrices[:-1], scale * shared.decoder.matrices[-1]) if pose else ()
         return Explicit(
             operators=Polytope(shared.vertices),
             residual=() if residual == "none" else shared.residual.matrices,
             residual_multipliers=shared.residual.multipliers,
-            decoder=(*shared.decoder.matrices[:-1], scale * shared.decoder.matrices[-1]),
+            decoder=decoder,
             decoder_multipliers=shared.decoder.multipliers,
             readout=jnp.asarray(space.body_scale)[:, None] * shared.readout,
             declared=Declared("tanh", "rotation" if transport else "identity", control),
@@ -199,19 +204,7 @@ def sfkd(
         explicit=explicit,
         penalty=hinge if soft_penalty else None,
         fold=fold,
+        rate=rate if residual != "free" else None,
+        along_path=not pose,
     )
     return model._replace(start=partial(identified, model, networks, space, environment))
-
-
-def _check(rank: int, rho: float, beta: float, frame: str, residual: str, budget: str) -> None:
-    """Refuse settings that no model can have, naming the choices."""
-    if frame not in FRAMES:
-        raise ValueError(f"model.frame must be one of {', '.join(FRAMES)}, got {frame!r}")
-    if residual not in RESIDUALS:
-        raise ValueError(f"model.residual must be one of {', '.join(RESIDUALS)}, got {residual!r}")
-    if budget not in BUDGETS:
-        raise ValueError(f"model.budget must be one of {', '.join(BUDGETS)}, got {budget!r}")
-    if rank < 2 or rank % 2:
-        raise ValueError(f"model.rank must be even and at least 2, got {rank}")
-    if min(rho, beta) <= 0.0 or max(rho, beta) >= 1.0:
-        raise ValueError(f"model.rho and model.beta must lie in (0, 1), got {rho} and {beta}")

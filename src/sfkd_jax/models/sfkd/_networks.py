@@ -15,6 +15,11 @@ from sfkd_jax.models.sfkd._budget import share_budget
 from sfkd_jax.models.sfkd._sandwich import Free, Sandwich, Weights
 from sfkd_jax.types import Scalar
 
+LOWEST_RATE = 0.5
+"""Of a learned α: no car comes back to its path faster than that in a tenth of a second."""
+ALPHA_START = 2.0
+"""Logit of a learned α to begin with: 88 % of the way from the lowest to the largest."""
+
 
 class Biases(NamedTuple):
     """b_k(u, e) = gain_k(e) u + offset_k(e) of every layer of a network, for one e.
@@ -39,7 +44,6 @@ class Shared(NamedTuple):
     decoder: Weights
     readout: Float[Array, "body rank"]
     centre: Float[Array, " body"]
-    decoder_bound: Scalar
 
 
 class PerEnvironment(NamedTuple):
@@ -61,6 +65,7 @@ class Networks(nn.Module):
         vertices: number of operator vertices. hidden: widths. embedding: size of ψ(e).
         rho, beta: the two hard bounds. residual: "sandwich", "free" or "none". transport: whether Q(e) is learned.
         budget: "sum" bounds A(e) by ρ and the residual by β; "joint" bounds their sum, as one map, by ρ + β.
+        pose: whether there is a decoder of the pose. learn_alpha: whether a joint budget may choose α below ρ + β.
     """
 
     rank: int
@@ -75,26 +80,42 @@ class Networks(nn.Module):
     residual: str
     transport: bool
     budget: str
+    pose: bool = True
+    learn_alpha: bool = False
 
     def setup(self) -> None:
         """Declare the parts."""
         kinds = {"sandwich": Sandwich, "free": Free, "none": Free}
         self.psi = nn.Sequential([nn.Dense(64), nn.tanh, nn.Dense(64), nn.tanh, nn.Dense(self.embedding), nn.tanh])
         self.residual_weights = kinds[self.residual](self.rank, self.residual_hidden, self.rank)
-        self.decoder_weights = Sandwich(self.rank, self.decoder_hidden, 3)
         small = nn.initializers.variance_scaling(0.1, "fan_in", "truncated_normal")
         self.mixture_head = nn.Dense(self.vertices, kernel_init=small)
         self.input_head = nn.Dense(self.rank * self.control)
         self.residual_head = nn.Dense(self._bias_size(self.residual_hidden, self.rank), kernel_init=small)
-        self.decoder_head = nn.Dense(self._bias_size(self.decoder_hidden, 3))
+        if self.pose:
+            self.decoder_weights = Sandwich(self.rank, self.decoder_hidden, 3)
+            self.decoder_head = nn.Dense(self._bias_size(self.decoder_hidden, 3))
+            self.log_decoder_bound = self.param("log_decoder_bound", nn.initializers.constant(1.0), ())
         self.tangent_head = nn.Dense(self.rank // 2, kernel_init=small, bias_init=nn.initializers.zeros)
         shape = (self.vertices, self.rank, self.rank)
         self.operators = self.param("operators", _near_identity, shape)
         self.readout = self.param("readout", nn.initializers.orthogonal(), (self.body, self.rank))
         self.centre = self.param("centre", nn.initializers.zeros, (self.body,))
-        if self.budget == "joint" and self.residual == "sandwich":
+        if self._joint:
             self.couplings = self.param("couplings", _couplings, (2, self.rank, self.rank))
-        self.log_decoder_bound = self.param("log_decoder_bound", nn.initializers.constant(1.0), ())
+            if self.learn_alpha:
+                self.alpha_logit = self.param("alpha_logit", nn.initializers.constant(ALPHA_START), ())
+
+    @property
+    def _joint(self) -> bool:
+        return self.budget == "joint" and self.residual == "sandwich"
+
+    def rate(self) -> Scalar:
+        """α, that a joint budget holds; ρ + β, or less if it is learned."""
+        most = jnp.asarray(self.rho + self.beta)
+        if not (self._joint and self.learn_alpha):
+            return most
+        return LOWEST_RATE + (most - LOWEST_RATE) * nn.sigmoid(self.alpha_logit)
 
     def __call__(self, env: Array) -> tuple[Shared, PerEnvironment]:
         """Touch every part once, so that init creates all parameters."""
@@ -102,16 +123,14 @@ class Networks(nn.Module):
 
     def shared(self) -> Shared:
         """What does not depend on e, with every bound in force."""
-        bound = jnp.exp(self.log_decoder_bound)
         vertices, residual = self._step()
-        readout = bounded(self.readout, 1.0)
-        return Shared(vertices, residual, self.decoder_weights(bound), readout, self.centre, bound)
+        decoder = self.decoder_weights(jnp.exp(self.log_decoder_bound)) if self.pose else Weights((), ())
+        return Shared(vertices, residual, decoder, bounded(self.readout, 1.0), self.centre)
 
     def _step(self) -> tuple[Array, Weights]:
         """Vertices of A(e) and the residual, such that every step contracts."""
-        if self.budget == "joint" and self.residual == "sandwich":
-            alpha = self.rho + self.beta
-            return share_budget(self.operators, self.couplings, self.residual_weights(1.0), alpha)
+        if self._joint:
+            return share_budget(self.operators, self.couplings, self.residual_weights(1.0), self.rate())
         vertices = jax.vmap(lambda matrix: bounded(matrix, self.rho))(self.operators)
         residual = self.residual_weights(self.beta)
         if self.residual == "none":
@@ -129,7 +148,7 @@ class Networks(nn.Module):
             mixture=nn.softmax(self.mixture_head(embedding)),
             B=self.input_head(embedding).reshape(self.rank, self.control),
             residual=residual,
-            decoder=self._biases(self.decoder_head(embedding), self.decoder_hidden, 3),
+            decoder=self._biases(self.decoder_head(embedding), self.decoder_hidden, 3) if self.pose else Biases((), ()),
             tangents=tangents if self.transport else jnp.zeros_like(tangents),
             embedding=embedding,
         )

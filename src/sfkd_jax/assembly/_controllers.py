@@ -1,0 +1,127 @@
+"""Controllers out of plain settings."""
+
+from __future__ import annotations
+
+from functools import partial
+from typing import Any
+
+from sfkd_jax import control, vehicle
+from sfkd_jax.assembly._choices import Settings, choose, floats, without
+from sfkd_jax.types import Controller, Model
+
+ENVS = ("measured", "estimated", "none")
+"""How a controller learns of the environment."""
+
+
+def build_controller(
+    settings: Settings,
+    model: Model,
+    plant: vehicle.Vehicle,
+    *,
+    env_low: Any = None,
+    env_high: Any = None,
+    certificate: Settings | None = None,
+    env: str = "measured",
+    law: control.PathLaw | None = None,
+) -> Controller:
+    """The planner of the settings, watched by a monitor if there is a certificate, told an estimate if `env` asks.
+
+    Args:
+        law: of a model in path coordinates, the one that it was learned around.
+
+    Raises:
+        ValueError: an unknown planner, a vehicle without limits of its controls, or a model and a planner of
+            different frames.
+    """
+    if not plant.control_low:
+        raise ValueError("a controller needs vehicle.control_low and vehicle.control_high, as in [-0.4,-3.0]")
+    build = choose(PLANNERS, settings.get("planner", "mppi"), "controller.planner")
+    if model.along_path:
+        if settings["sampling"] != "law" or env == "estimated" or law is None:
+            raise ValueError(
+                "a model in path coordinates needs controller.sampling=law, its law, and env=measured or none"
+            )
+        return build(settings, model, plant, env_low, env_high, law)
+    planner = build(settings, model, plant, env_low, env_high)
+    watched = planner if certificate is None else _monitored(planner, settings, model, certificate)
+    return _estimated(watched, settings, model, plant, env_low, env_high) if env == "estimated" else watched
+
+
+def _monitored(planner: Controller, settings: Settings, model: Model, certificate: Settings) -> Controller:
+    corners = {name: certificate["boxes"][name] for name in ("state", "control", "env")}
+    boxes = {f"{name}_{side}": tuple(box[k]) for name, box in corners.items() for k, side in enumerate(("low", "high"))}
+    bounds = tuple(certificate["monitor"]["bounds"])
+    return control.monitored(planner, model, bounds=bounds, **boxes, **without(settings.get("monitor", {})))
+
+
+def _estimated(
+    planner: Controller, settings: Settings, model: Model, plant: vehicle.Vehicle, env_low: Any, env_high: Any
+) -> Controller:
+    box = {"env_low": floats(env_low), "env_high": floats(env_high)}
+    sizes = {"states": len(plant.state_names), "controls": len(plant.control_low)}
+    return control.estimated(planner, model, **box, **sizes, **without(settings.get("estimator", {})))
+
+
+def _sampled(
+    search: str,
+    settings: Settings,
+    model: Model,
+    plant: vehicle.Vehicle,
+    env_low: Any,
+    env_high: Any,
+    law: control.PathLaw | None = None,
+) -> Controller:
+    """A planner that searches around a law: the path-following one (`sampling: feedback`), the model's own, none.
+
+    In path coordinates it is the law of the policy, and the model already holds it (`sampling: law`).
+    """
+    cost = control.tracking_cost(dt=plant.dt, speed_loop=plant.speed_loop, **without(settings["cost"]))
+    limits = {"dt": plant.dt, "control_low": plant.control_low, "control_high": plant.control_high}
+    if law is not None:
+        task = control.following_law(model, cost, law, **limits, **without(settings["task"], "latent_weight"))
+    else:
+        laws = {"feedback": _feedback, "model": _model_law, "plain": _no_feedback}
+        around = choose(laws, settings["sampling"], "controller.sampling")(settings, plant)
+        ancillary = _model_law(settings, plant) if settings["ancillary"] else None
+        task = control.path_tracking(model, cost, around, **limits, ancillary=ancillary, **without(settings["task"]))
+    boxes = {"env_low": floats(env_low), "env_high": floats(env_high)}
+    return SEARCHES[search](task, **boxes, **without(settings[search]))
+
+
+def _feedback(settings: Settings, plant: vehicle.Vehicle) -> control.Law:
+    gains = without(settings["feedback"])
+    return control.path_feedback(wheelbase=plant.wheelbase, speed_loop=plant.speed_loop, **gains)
+
+
+def _model_law(settings: Settings, plant: vehicle.Vehicle) -> control.ModelLaw:
+    return control.ModelLaw(dt=plant.dt, **without(settings["model_law"]))
+
+
+def _no_feedback(settings: Settings, plant: vehicle.Vehicle) -> control.Law:
+    del settings
+    return control.no_feedback(speed_loop=plant.speed_loop)
+
+
+def _koopman_mpc(settings: Settings, model: Model, plant: vehicle.Vehicle, env_low: Any, env_high: Any) -> Controller:
+    """A quadratic program over a linear predictor, under the cost that the samplers have."""
+    return control.koopman_mpc(
+        model,
+        dt=plant.dt,
+        control_low=plant.control_low,
+        control_high=plant.control_high,
+        speed_loop=plant.speed_loop,
+        terminal_weight=settings["task"]["terminal_weight"],
+        env_low=floats(env_low),
+        env_high=floats(env_high),
+        **without(settings["cost"]),
+        **without(settings["koopman_mpc"]),
+    )
+
+
+SEARCHES = {"mppi": control.mppi, "cem": control.cem, "gradient": control.gradient_planner}
+PLANNERS = {search: partial(_sampled, search) for search in SEARCHES} | {"koopman_mpc": _koopman_mpc}
+
+
+def controller_horizon(settings: Settings) -> int:
+    """How many steps of the reference a controller wants to see."""
+    return settings[settings.get("planner", "mppi")]["horizon"]

@@ -1,0 +1,105 @@
+"""Planning in path coordinates: what is projected, previewed, added to the law, and never left."""
+
+from functools import partial
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from helpers import any_law, tiny
+
+from sfkd_jax import assembly, control, vehicle
+from sfkd_jax.control import at_turn, curvature_ahead, path_coordinates
+from sfkd_jax.scenarios import path_from_curvature, reference_window
+from sfkd_jax.se2 import compose
+
+PLANT = vehicle.kinematic()
+LAW = any_law()
+ENV = jnp.asarray([0.6, 2.0])
+LIMITS = {"dt": PLANT.dt, "control_low": PLANT.control_low, "control_high": PLANT.control_high}
+
+
+def bend(slope=1e-4):
+    """A reference window from 30 m along a clothoid, and the curvature where it begins."""
+    path = path_from_curvature(slope * 0.5 * jnp.arange(400), spacing=0.5)
+    return reference_window(path, jnp.asarray(30.0), jnp.asarray(9.0), dt=0.1, horizon=20), path
+
+
+def planner(samples, **options):
+    model = assembly.reference_systems(PLANT, LAW)["oracle"].model
+    task = control.following_law(model, control.tracking_cost(dt=0.1), LAW, **LIMITS)
+    return control.mppi(task, num_samples=samples, noise_std=(0.01, 0.2), **options)
+
+
+def test_the_curvature_of_every_step_is_seen_ahead():
+    reference, _ = bend()
+    middles = 30.0 + 0.9 * (np.arange(20) + 0.5)
+    np.testing.assert_allclose(curvature_ahead(reference), 1e-4 * middles, atol=2e-5)
+
+
+def test_an_observation_is_projected_on_the_circle_that_it_drives_along():
+    reference, path = bend(0.0)
+    curvature = jnp.asarray(0.02)
+    back = jnp.asarray([-np.sin(0.018) / 0.02, (1 - np.cos(0.018)) / 0.02, -0.018])
+    foot = compose(reference[0, :3], back)
+    pose = compose(foot, jnp.asarray([0.0, 0.3, -0.1]))
+    xi = path_coordinates(jnp.append(pose, 8.5), reference[0], curvature)
+    np.testing.assert_allclose(xi, (0.3, -0.1, 8.5), atol=1e-4)
+    assert path.points.shape[1] == 4
+
+
+def test_without_samples_the_law_alone_drives():
+    reference, _ = bend()
+    controller = planner(1)
+    state = jnp.asarray([30.0, 0.4, 0.1, 8.0])
+    action, _, info = jax.jit(controller.act)({}, controller.init(jax.random.key(0)), state, ENV, reference)
+    curvature = curvature_ahead(reference)[0]
+    xi = path_coordinates(state, reference[0], curvature)
+    np.testing.assert_allclose(action, at_turn(LAW.turn(curvature, jnp.asarray(9.0), ENV), xi), atol=1e-6)
+    assert bool(info["healthy"])
+
+
+def test_what_is_added_to_the_law_stays_within_its_bounds():
+    """However much noise is drawn, and with a cost that asks for more."""
+    reference, _ = bend()
+    controller = planner(64, temperature=0.1)
+    loud = controller.init(jax.random.key(0))
+    loud = loud._replace(tuning=loud.tuning._replace(noise_std=jnp.asarray([1.0, 10.0])))
+    state = jnp.asarray([30.0, 2.5, 0.3, 6.0])
+    action, after, _ = jax.jit(controller.act)({}, loud, state, ENV, reference)
+    curvature = curvature_ahead(reference)[0]
+    xi = path_coordinates(state, reference[0], curvature)
+    added = action - at_turn(LAW.turn(curvature, jnp.asarray(9.0), ENV), xi)
+    assert np.all(np.abs(added) <= LAW.perturbation + 1e-6)
+    assert np.all(np.abs(after.plan) <= LAW.perturbation + 1e-6)
+
+
+def test_predicted_states_lie_where_the_car_then_is():
+    """On a bend, with the true plant as the model: within a centimetre across, and the speed's error along."""
+    reference, path = bend()
+    controller = planner(1)
+    point = jnp.asarray([reference[0, 0] - 0.9 * jnp.cos(reference[0, 2]), reference[0, 1], reference[0, 2], 9.0])
+    memory = controller.init(jax.random.key(0))
+    act = jax.jit(controller.act)
+    action, _, info = act({}, memory, point, ENV, reference)
+    after = PLANT.step(point, action, ENV)
+    np.testing.assert_allclose(info["predicted_states"][0, :2], after[:2], atol=0.05)
+    np.testing.assert_allclose(info["predicted_states"][0, 2:], after[2:], atol=0.01)
+    assert path.points.shape[0] == 400
+
+
+def test_what_is_not_finite_never_reaches_the_car():
+    reference, _ = bend()
+    controller = planner(16)
+    memory = controller.init(jax.random.key(0))
+    act = jax.jit(controller.act)
+    for bad in (jnp.full(4, jnp.nan), jnp.asarray([1e9, 1e9, 0.0, jnp.inf])):
+        action, _, info = act({}, memory, bad, ENV, reference)
+        assert np.all(np.isfinite(action))
+        assert not bool(info["healthy"])
+
+
+def test_a_model_of_the_world_is_refused():
+    build = partial(control.following_law, law=LAW, cost=control.tracking_cost(dt=0.1), **LIMITS)
+    with pytest.raises(ValueError, match=r"model\.frame=path"):
+        build(tiny())

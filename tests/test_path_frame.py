@@ -1,0 +1,78 @@
+"""Path coordinates against their geometry, and a closed loop against the same drive in the world."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from sfkd_jax import vehicle
+from sfkd_jax.path_frame import closed_loop, is_valid, on_circle, path_state
+from sfkd_jax.scenarios import path_from_curvature, project
+from sfkd_jax.se2 import compose
+from sfkd_jax.types import BODY
+
+CURVATURES = (-0.08, -1e-6, 0.0, 1e-6, 0.02, 0.1)
+
+
+def foot(curvature: float, progress: float) -> jax.Array:
+    """The pose on a circle through the origin, after some arc length; by its chord."""
+    half = 0.5 * curvature * progress
+    chord = progress * np.sinc(half / np.pi)
+    return jnp.asarray([chord * np.cos(half), chord * np.sin(half), 2 * half])
+
+
+@pytest.mark.parametrize("curvature", CURVATURES)
+@pytest.mark.parametrize("progress", [-2.0, 0.0, 1.3])
+def test_a_pose_beside_a_circle_is_found_again(curvature, progress):
+    for lateral, heading in ((0.0, 0.0), (0.7, -0.2), (-1.5, 0.4)):
+        pose = compose(foot(curvature, progress), jnp.asarray([0.0, lateral, heading]))
+        np.testing.assert_allclose(on_circle(pose, jnp.asarray(curvature)), (lateral, heading), atol=2e-5)
+
+
+@pytest.mark.parametrize("curvature", CURVATURES)
+def test_derivatives_exist_also_without_curvature_and_beyond_the_centre(curvature):
+    for y in (0.0, 0.3, 1e3, -1e3):
+        rates = jax.jacfwd(on_circle, argnums=(0, 1))(jnp.asarray([1.0, y, 0.1]), jnp.asarray(curvature))
+        assert all(bool(jnp.all(jnp.isfinite(leaf))) for leaf in jax.tree.leaves(rates))
+
+
+def test_a_car_near_the_centre_of_curvature_is_told_and_stays_finite():
+    assert bool(is_valid(jnp.asarray(7.9), jnp.asarray(0.1)))
+    assert not bool(is_valid(jnp.asarray(8.1), jnp.asarray(0.1)))
+    assert not bool(is_valid(jnp.asarray(jnp.nan), jnp.asarray(0.1)))
+    lateral, heading = on_circle(jnp.asarray([0.5, 9.9, 0.0]), jnp.asarray(0.1))
+    assert np.all(np.isfinite([lateral, heading]))
+    assert not bool(is_valid(lateral, jnp.asarray(0.1)))
+
+
+@pytest.mark.parametrize("plant", [vehicle.kinematic(), vehicle.dynamic()], ids=lambda plant: plant.name)
+@pytest.mark.parametrize("curvature", [-0.02, 0.0, 0.015])
+def test_the_loop_in_path_coordinates_drives_what_the_vehicle_drives_in_the_world(plant, curvature):
+    """The same feedback, once on ξ and once on the projection onto a path of constant curvature."""
+
+    def law(xi, kappa, speed, env):
+        del env
+        return jnp.stack([2.7 * kappa - 0.05 * xi[0] - 0.4 * xi[1], speed - xi[2]])
+
+    size = len(plant.state_names)
+    env = jnp.asarray([0.7, 3.0])
+    inputs = jnp.asarray([0.004, 0.1, curvature, 9.0])
+    step = jax.jit(closed_loop(plant.step, law, plant.control_low, plant.control_high))
+    path = path_from_curvature(jnp.full(400, curvature), spacing=0.5)
+    world = jnp.zeros(size).at[1].set(0.3).at[3].set(9.5)
+    along = path_state(world[1:])
+    place = jnp.zeros(())
+    for _ in range(40):
+        heading = world[2] - curvature * place
+        xi = jnp.concatenate([jnp.stack([project(path, world[:2], place)[1], heading]), world[3:]])
+        world = plant.step(world, law(xi, curvature, 9.0, env) + inputs[:2], env)
+        place, lateral = project(path, world[:2], place + 0.9)
+        along = step(along, inputs, env)
+        np.testing.assert_allclose(along[BODY][0], lateral, atol=2e-4)
+    np.testing.assert_allclose(along[BODY][2:], world[3:], atol=2e-4)
+    assert not np.any(np.asarray(along[:3]))
+
+
+def test_a_vehicle_without_limits_cannot_be_closed_around():
+    with pytest.raises(ValueError, match="control_low"):
+        vehicle.along_path(vehicle.own(), lambda xi, kappa, speed, env: jnp.zeros(2))
