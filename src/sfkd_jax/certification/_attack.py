@@ -80,6 +80,9 @@ def attack_decoder(
         return jnp.concatenate([after[POSE], read])
 
     found = _steepest(emitted, model, params, box, key, starts=starts, iterations=iterations)
+    if model.along_path:  # the pose is read from z with the body state: e_y, e_ψ, then the rest
+        parts = {"position": slice(6, 7), "yaw": slice(7, 8), "body": slice(8, None)}
+        return {name: max(float(np.linalg.norm(part[row], 2)) for part in found) for name, row in parts.items()}
     rows = {"position": slice(0, 2), "yaw": slice(2, 3), "decoder": slice(0, 3)}
     poses = [part for jacobian in found for part in (jacobian[:3], jacobian[3:6])]
     steepest = {name: max(float(np.linalg.norm(part[row], 2)) for part in poses) for name, row in rows.items()}

@@ -49,9 +49,8 @@ def attack_all(
 
 def limits_of(claims: Claims, weights: Exported) -> dict[str, float]:
     """What an attack may reach at most, by its name; in another metric than I the step is not attacked."""
-    limits = {"residual_slopes": claims.beta, "transport": 1.0, "body": claims.lipschitz["body"]}
-    for name in decoders(weights):
-        limits |= {name: claims.lipschitz[name], f"{name}_slopes": claims.lipschitz[name]}
+    limits = {"residual_slopes": claims.beta, "transport": 1.0, **claims.lipschitz}
+    limits |= {f"{name}_slopes": claims.lipschitz[name] for name in decoders(weights)}
     if claims.kappa == 1.0:
         limits["step"] = claims.alpha
         if isinstance(weights.operators, Polytope):

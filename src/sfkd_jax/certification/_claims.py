@@ -46,8 +46,10 @@ def claims_hold(claims: Claims, weights: Exported, box: Box) -> None:
     for name, value in _constants(claims):
         if not (isinstance(value, int | float) and 0 <= value < math.inf):
             raise Refuted(f"{name} is no bound: {value!r}")
-    if set(claims.lipschitz) != {"body", *networks}:
-        raise Refuted(f"lipschitz must be of body, {', '.join(networks)}, got {', '.join(map(str, claims.lipschitz))}")
+    linear = readouts(weights)
+    if set(claims.lipschitz) != {*linear, *networks}:
+        expected, got = (", ".join(map(str, names)) for names in ((*linear, *networks), claims.lipschitz))
+        raise Refuted(f"lipschitz must be of {expected}, got {got}")
     _require_box(weights, box)
     seen = {name: _arrays(value) for name, value in claims.witnesses.items()}
     metric, operators = seen["metric"], weights.operators
@@ -73,7 +75,8 @@ def claims_hold(claims: Claims, weights: Exported, box: Box) -> None:
     checks["alpha_separate"] = claims.alpha_separate == claims.rho + claims.beta * claims.kappa**0.5
     known = [claims.alpha_separate] + ([] if claims.alpha_joint is None else [claims.alpha_joint])
     checks["alpha"] = claims.alpha == min(known)
-    checks["body"] = check_witness((), (), claims.lipschitz["body"], weights.readout)
+    for name, rows in linear.items():
+        checks[name] = not np.any(rows) or check_witness((), (), claims.lipschitz[name], rows)
     for name, network in networks.items():
         checks[name] = _bounded(network, seen[name], claims.lipschitz[name])
     for name, holds in checks.items():
@@ -130,6 +133,16 @@ def joint_cover(weights: Exported, box: Box, multipliers: Sequence[Vector]) -> C
 def hull(weights: Exported) -> str:
     """What "all environments" rests on for a polytope."""
     return f"all e: A(e) lies in the hull of {len(weights.operators[0])} vertices; all u, all z"
+
+
+def readouts(weights: Exported) -> dict[str, Matrix]:
+    """What is read from z linearly, by name: the body state; along a path e_y [m], e_ψ [rad] and the rest.
+
+    A model whose pose is not emitted by a decoder holds it in the first two rows of its read-out.
+    """
+    if weights.decoder:
+        return {"body": weights.readout}
+    return {"position": weights.readout[:1], "yaw": weights.readout[1:2], "body": weights.readout[2:]}
 
 
 def decoders(weights: Exported) -> dict[str, list[Matrix]]:

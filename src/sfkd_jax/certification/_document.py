@@ -11,7 +11,7 @@ from sfkd_jax.certification._calibration import KINDS, interval, supports
 from sfkd_jax.certification._certificate import MALFORMED, Certificate, CertificateStale, verify
 from sfkd_jax.certification._claims import Refuted
 from sfkd_jax.certification._exported import CertificationRefused
-from sfkd_jax.certification._tube import latent_tube, physical_tube
+from sfkd_jax.certification._tube import for_ever, latent_tube, path_tube, physical_tube
 from sfkd_jax.types import Model, Params
 
 REPEATED = 1e-9
@@ -41,7 +41,8 @@ def verify_document(document: Mapping[str, Any], params: Params, *, model: Model
         _require_boxes(document["boxes"], proof)
         _require_statistics(document["d_bar"], document["monitor"])
         _require_tubes(document["tube"], proof, document["d_bar"])
-        _require_equal("decoder_lipschitz", document["decoder_lipschitz"], proof.lipschitz.get("decoder"))
+        if document["decoder_lipschitz"] != proof.lipschitz.get("decoder"):
+            raise Refuted("decoder_lipschitz is not that of lipschitz")
     except Refuted as reason:
         raise CertificationRefused(str(reason)) from None
     except MALFORMED as reason:
@@ -83,12 +84,18 @@ def _require_tubes(tube: Mapping[str, Any], proof: Certificate, d_bar: Mapping[s
     """R_k, what it means in metres and radians, and its limit."""
     latent = latent_tube(proof.alpha, d_bar["value"], len(tube["latent"]))
     _require_equal("tube.latent", tube["latent"], latent)
-    _require_equal("tube.ultimate", tube["ultimate"], d_bar["value"] / (1 - proof.alpha))
-    largest = float(_numbers("tube.largest_increment_m", tube["largest_increment_m"]))
-    known = {"lipschitz": proof.lipschitz, "residual": d_bar["one_step"], "largest_increment": largest}
-    physical = physical_tube(latent, alpha=proof.alpha, **known)
-    if largest < 0 or set(tube["physical"]) != set(physical):
-        raise Refuted("tube.physical is not of position, yaw and body state")
+    ultimate = d_bar["value"] / (1 - proof.alpha)
+    _require_equal("tube.ultimate", tube["ultimate"], ultimate)
+    known = {"alpha": proof.alpha, "lipschitz": proof.lipschitz, "residual": d_bar["one_step"]}
+    if "decoder" in proof.lipschitz:
+        largest = float(_numbers("tube.largest_increment_m", tube["largest_increment_m"]))
+        physical, always = physical_tube(latent, **known, largest_increment=abs(largest)), None
+    else:
+        largest, physical, always = 0.0, path_tube(latent, **known), for_ever(ultimate, **known)
+    if largest < 0 or set(tube["physical"]) != set(physical) or (tube["for_ever"] is None) != (always is None):
+        raise Refuted("tube is not of position, yaw and body state")
+    for name, radius in (always or {}).items():
+        _require_equal(f"tube.for_ever.{name}", tube["for_ever"][name], radius)
     for name, radii in physical.items():
         _require_equal(f"tube.physical.{name}", tube["physical"][name], radii)
 

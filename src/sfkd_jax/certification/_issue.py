@@ -25,7 +25,7 @@ from sfkd_jax.certification._calibration import (
 from sfkd_jax.certification._certificate import certify
 from sfkd_jax.certification._exported import CertificationRefused, exported, one_thread
 from sfkd_jax.certification._proofs import joint_bound, residual_bound
-from sfkd_jax.certification._tube import latent_tube, physical_tube
+from sfkd_jax.certification._tube import for_ever, latent_tube, path_tube, physical_tube
 from sfkd_jax.types import Model, Params, Polytope, Trajectory
 
 
@@ -76,21 +76,19 @@ def issue(
     latent = latent_tube(certificate.alpha, one_step["latent"], horizon)
     positions = np.asarray(calibration.states, dtype=np.float64)[..., :2]
     largest = float(np.max(np.linalg.norm(np.diff(positions, axis=-2), axis=-1)))
-    tube = physical_tube(
-        latent,
-        alpha=certificate.alpha,
-        lipschitz=certificate.lipschitz,
-        residual=one_step,
-        largest_increment=largest,
-    )
+    known = {"alpha": certificate.alpha, "lipschitz": certificate.lipschitz, "residual": one_step}
+    ultimate = one_step["latent"] / (1 - certificate.alpha)
+    along_path = model.along_path
+    tube = path_tube(latent, **known) if along_path else physical_tube(latent, **known, largest_increment=largest)
     measured = {
-        "decoder_lipschitz": certificate.lipschitz["decoder"],
+        "decoder_lipschitz": certificate.lipschitz.get("decoder"),
         "d_bar": {"value": one_step["latent"], **found},
         "tube": {
             "latent": latent.tolist(),
             "physical": tube,
-            "ultimate": one_step["latent"] / (1 - certificate.alpha),
-            "largest_increment_m": largest,
+            "ultimate": ultimate,
+            "for_ever": for_ever(ultimate, **known) if along_path else None,
+            "largest_increment_m": None if along_path else largest,
         },
         "boxes": dict(boxes),
         "monitor": alarms,

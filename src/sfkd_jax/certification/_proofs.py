@@ -7,7 +7,16 @@ from typing import Any
 
 import numpy as np
 
-from sfkd_jax.certification._claims import SERVED, Claims, Refuted, decoders, hull, joint_cover, operator_norms
+from sfkd_jax.certification._claims import (
+    SERVED,
+    Claims,
+    Refuted,
+    decoders,
+    hull,
+    joint_cover,
+    operator_norms,
+    readouts,
+)
 from sfkd_jax.certification._core import Matrix, Vector, check_metric, norm_upper
 from sfkd_jax.certification._environments import Box, operator_at
 from sfkd_jax.certification._exported import Exported
@@ -39,7 +48,7 @@ def prove(weights: Exported, box: Box, *, joint: bool, metric: Matrix | None = N
     alpha_joint = None
     if joint:
         alpha_joint, witnesses["joint"] = _joint(weights, box, residual[1])
-    lipschitz = {"body": SERVED * norm_upper(weights.readout)}
+    lipschitz = {name: SERVED * norm_upper(rows) for name, rows in readouts(weights).items()}
     for name, network in decoders(weights).items():
         bound, witnesses[name] = _best_multipliers(network, weights.decoder_multipliers)
         lipschitz[name] = SERVED * bound

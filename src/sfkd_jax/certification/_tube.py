@@ -17,6 +17,33 @@ def latent_tube(alpha: float, d_bar: float, horizon: int, *, initial: float = 0.
     return np.asarray(radii)
 
 
+def path_tube(
+    latent: Float[np.ndarray, " horizon"],
+    *,
+    alpha: float,
+    lipschitz: Mapping[str, float],
+    residual: Mapping[str, float],
+) -> dict[str, list[float]]:
+    """Radii of e_y [m], e_ψ [rad] and the rest of the state along a path, for k = 1 … horizon, from z_0 known exactly.
+
+        |e_i,k| ≤ L_i α R_{k−1} + ε_i
+
+    Position and heading are read from z like everything else, so nothing adds up over the horizon: with the limit of
+    R_k the radii hold for ever. Arguments as `physical_tube`.
+    """
+    before = np.concatenate([[0.0], latent[:-1]])
+    kinds = {"position_m": "position", "yaw_rad": "yaw", "body": "body"}
+    return {name: (lipschitz[kind] * alpha * before + residual[kind]).tolist() for name, kind in kinds.items()}
+
+
+def for_ever(
+    ultimate: float, *, alpha: float, lipschitz: Mapping[str, float], residual: Mapping[str, float]
+) -> dict[str, float]:
+    """`path_tube` at the limit d̄/(1 − α) of R_k: what holds at every step, however many there are."""
+    radii = path_tube(np.asarray([ultimate, ultimate]), alpha=alpha, lipschitz=lipschitz, residual=residual)
+    return {name: values[-1] for name, values in radii.items()}
+
+
 def physical_tube(
     latent: Float[np.ndarray, " horizon"],
     *,
