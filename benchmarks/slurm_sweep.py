@@ -122,8 +122,8 @@ def limit(cluster, place):
     """A time limit in mid-training: the job is queued again until it is done, or told in a line if it must not be."""
     measure = _undisturbed(cluster, place.parent / "undisturbed")
     short = (*LONG, "hydra.launcher.signal_delay_s=20")
-    sweep = Sweep(cluster, place / "limited", "0.001,0.002", *short, minutes=4)
-    found = {"minutes": [4, 1], "queued_again": sweep.ended(seconds=3000)}
+    sweep = Sweep(cluster, place / "limited", "0.001,0.002", *short, minutes=3)
+    found = {"minutes": [3, 1], "queued_again": sweep.ended(seconds=3000)}
     found["different"] = _different(measure, sweep)
     found["resumed_at_steps"] = _resumed(sweep)
     once = Sweep(cluster, place / "once", "0.001,0.002", *short, "hydra.launcher.max_num_timeout=0", minutes=1)
