@@ -18,7 +18,7 @@ import jax.export
 import jax.numpy as jnp
 import numpy as np
 
-from sfkd_jax import artefacts, datasets, evaluation, policy, reporting
+from sfkd_jax import artefacts, datasets, policy, reporting
 from sfkd_jax.exporting import _run_controller as loader
 
 ROOT = Path(__file__).parents[1]
@@ -204,11 +204,11 @@ def read_rows(folder: Path) -> Any:
     path = folder / "results.json"
     rows = artefacts.read_json(path, keys=("rows",))["rows"]
     with artefacts.understood(path):
-        return evaluation.merge(rows, rows)
+        return artefacts.merge([], rows)
 
 
 def rows_hold(found: Any, folder: Path) -> bool:
-    return equal(found, plain_json((folder / "results.json").read_bytes())["rows"])
+    return equal(found, list(plain_json((folder / "results.json").read_bytes())["rows"]))
 
 
 def read_report(folder: Path) -> Any:
