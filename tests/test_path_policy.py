@@ -1,0 +1,68 @@
+"""A policy in path coordinates on its way through the store: law and weights are one artefact."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from helpers import TINY, any_law, space
+from hydra import compose, initialize_config_dir
+from omegaconf import OmegaConf
+
+from sfkd_jax import artefacts, assembly, config, policy, rehearsal, vehicle
+from sfkd_jax.types import Space
+
+
+def settings(*overrides):
+    config.register()
+    with initialize_config_dir(config.conf_path(), version_base="1.3"):
+        composed = compose("config", overrides=["+experiment=s3_path", *overrides])
+    return {name: value for name, value in OmegaConf.to_container(composed, resolve=True).items() if name != "hydra"}
+
+
+def saved(place, *, law, samples=4):
+    asked = settings("controller=mppi_tiny", "controller.sampling=law", f"controller.mppi.num_samples={samples}")
+    asked["model"] |= {name: list(value) if isinstance(value, tuple) else value for name, value in TINY.items()}
+    asked["model"] |= {"budget": "joint"}
+    measured = space(3)
+    controls = {"control_mean": jnp.asarray([0.0, 0.0, 0.0, 9.0]), "control_scale": jnp.asarray([0.03, 1.0, 0.02, 1.5])}
+    scales = Space(**measured._asdict() | controls)
+    model = assembly.build_model(asked["model"], scales, vehicle.kinematic())
+    asked |= {"space": assembly.space_to_settings(scales)}
+    return policy.save(place / "policy.npz", model.init(jax.random.key(0)), asked, made_from={}, law=law)
+
+
+def test_the_law_is_stored_hashed_and_loaded_with_the_weights(tmp_path):
+    (tmp_path / "other").mkdir()
+    first = saved(tmp_path, law=any_law())
+    faster = any_law()._replace(gain=1.1 * any_law().gain)
+    assert saved(tmp_path / "other", law=faster)["sha256"] != first["sha256"]
+    loaded = policy.load(tmp_path)
+    assert "law" not in loaded.params
+    assert loaded.model.along_path
+    for name, leaf in any_law()._asdict().items():
+        np.testing.assert_array_equal(getattr(loaded.law, name), leaf)
+    reference = jnp.stack([0.9 * jnp.arange(1, 21), *(jnp.zeros((2, 20))), jnp.full(20, 9.0)], axis=1)
+    act = jax.jit(loaded.controller.act)
+    memory = loaded.controller.init(jax.random.key(1))
+    control, _, info = act(loaded.params, memory, jnp.asarray([0.0, 0.2, 0.0, 9.0]), jnp.asarray([0.6, 0.0]), reference)
+    assert np.all(np.isfinite(control))
+    assert bool(info["healthy"])
+
+
+def test_a_policy_that_lost_its_law_is_refused(tmp_path):
+    saved(tmp_path, law=None)
+    with pytest.raises(artefacts.ArtefactError, match=r"policy\.json"):
+        policy.load(tmp_path)
+
+
+@pytest.mark.parametrize("overrides", [("dataset=standard",), ("model=sfkd", "controller=mppi")])
+def test_path_coordinates_for_data_and_model_or_for_neither(overrides):
+    asked = settings(*overrides)
+    with pytest.raises(ValueError, match="go together"):
+        rehearsal.check(asked, assembly.build_vehicle(asked["vehicle"]))
+
+
+@pytest.mark.parametrize("model", ["sfkd_path", "sfkd_path_no_contraction", "neural_ode_path", "r2dn_path"])
+def test_every_path_model_is_rehearsed_with_its_planner(model):
+    asked = settings(f"model={model}", *(() if "sfkd" in model and "no" not in model else ("training.loss.tube=[]",)))
+    rehearsal.check(asked, assembly.build_vehicle(asked["vehicle"]))
