@@ -82,7 +82,6 @@ def prepare(
     controller = assembly.build_controller(settings["controller"], system.model, plant, **limits)
     options = {"horizon": assembly.controller_horizon(settings["controller"]), "dt": plant.dt}
     options["observation_noise"] = tuple(protocol["observation_noise"])
-
     about = _about(settings, name, system)
     system = system._replace(params=jax.jit(system.model.fold)(system.params))  # or every step evaluates it anew
 

@@ -101,8 +101,7 @@ def restore(path: str | Path) -> Trained:
 def load(path: str | Path, *, controller: Mapping[str, Any] | None = None, env: str = "measured") -> Policy:
     """The policy in a run directory (or a policy.npz with its manifest beside it), its certificate verified.
 
-    Where nothing is certified, a warning says why; with `controller.monitor.fallback` other than "none", which
-    needs a certificate, that is an error.
+    Where nothing is certified, a warning says why; where `controller.monitor.fallback` needs it, that is an error.
 
     Args:
         path: where. controller: settings of a controller to build instead of the one it was saved with.

@@ -155,6 +155,18 @@ def boxes(dataset: Dataset) -> dict[str, Any]:
     }
 
 
+def policy_settings(settings: dict[str, Any], dataset: Dataset) -> dict[str, Any]:
+    """What a policy was made with, and of logs what only they can say: the box E and how far controls went."""
+    kept = identity(settings)
+    if not is_logged(settings):
+        return kept
+    box = {"env_low": dataset.env_low.tolist(), "env_high": dataset.env_high.tolist()}
+    if kept["vehicle"]["name"] == "own" and not kept["vehicle"]["control_low"]:
+        low, high = boxes(dataset)["control"]
+        kept |= {"vehicle": kept["vehicle"] | {"control_low": low, "control_high": high}}
+    return kept | {"dataset": kept["dataset"] | box}
+
+
 def channel_names(settings: dict[str, Any]) -> dict[str, list[str]]:
     """How logs name what the boxes bound; an environment that the model does not read has no name."""
     columns = settings["dataset"]["columns"]

@@ -168,7 +168,7 @@ def _train(settings: dict[str, Any]) -> None:
     """Fit, then store the best weights and their prediction error on the test split."""
     place, options = shelf.run_directory(settings), dict(settings["training"])
     dataset, data_hash = ensure_dataset(settings)
-    kept = _concrete(settings, dataset)
+    kept = shelf.policy_settings(settings, dataset)
     dataset = dataset._replace(train=first_share(dataset.train, options.pop("data_share")))
     space = measure_space(dataset)
     model = assembly.build_model(settings["model"], space, assembly.build_vehicle(settings["vehicle"]))
@@ -208,15 +208,3 @@ def _started(model: Model, start: str, train: Trajectory, seed: int) -> Model:
         raise ValueError("training.start=identified needs a model=sfkd…, whose linear part can be identified")
     start_from, key = model.start, jax.random.fold_in(jax.random.key(seed), START)
     return model._replace(init=lambda drawn: start_from(model.init(drawn), train, key))
-
-
-def _concrete(settings: dict[str, Any], dataset: Dataset) -> dict[str, Any]:
-    """What a policy was made with, and of logs what only they can say: the box E and how far controls went."""
-    kept = shelf.identity(settings)
-    if not shelf.is_logged(settings):
-        return kept
-    box = {"env_low": dataset.env_low.tolist(), "env_high": dataset.env_high.tolist()}
-    if kept["vehicle"]["name"] == "own" and not kept["vehicle"]["control_low"]:
-        low, high = shelf.boxes(dataset)["control"]
-        kept |= {"vehicle": kept["vehicle"] | {"control_low": low, "control_high": high}}
-    return kept | {"dataset": kept["dataset"] | box}

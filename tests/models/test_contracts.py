@@ -167,15 +167,17 @@ def test_what_is_certified_is_what_is_multiplied_by(name, one):
     if name != "no_residual":
         assert same(explicit.residual, fiber.residual, rtol=0, atol=0)
     assert same(explicit.decoder[:-1], fiber.decoder[:-1], rtol=0, atol=0)
-    scale = np.asarray(space().increment_scale) * (20.0 if name == "segment" else 1.0)
-    np.testing.assert_allclose(explicit.decoder[-1], scale[:, None] * np.asarray(fiber.decoder[-1]), rtol=1e-6)
+    assert bool(explicit.decoder) == (not model.along_path)
+    if explicit.decoder:
+        scale = np.asarray(space().increment_scale) * (20.0 if name == "segment" else 1.0)
+        np.testing.assert_allclose(explicit.decoder[-1], scale[:, None] * np.asarray(fiber.decoder[-1]), rtol=1e-6)
     mixture, *_ = np.linalg.lstsq(
         np.asarray(explicit.operators.vertices).reshape(3, -1).T, np.ravel(fiber.A), rcond=None
     )
     np.testing.assert_allclose(np.tensordot(mixture, explicit.operators.vertices, axes=1), fiber.A, atol=1e-5)
     assert np.all(mixture > 0)
     np.testing.assert_allclose(mixture.sum(), 1.0, atol=1e-5)
-    assert len(explicit.residual_multipliers) == (2 if name in (*HARD, "joint") else 0)
+    assert len(explicit.residual_multipliers) == (2 if name in (*HARD, "joint", "path") else 0)
 
 
 @pytest.mark.parametrize(

@@ -71,7 +71,7 @@ def members(path: Path, file: io.FileIO) -> dict[str, np.ndarray]:
     """The arrays of an open archive; see `read_npz`. Closes the file."""
     size = file.seek(0, io.SEEK_END)
     try:
-        with zipfile.ZipFile(_Reader(file)) as archive:
+        with _Reader(file) as bounded, zipfile.ZipFile(bounded) as archive:
             listed = archive.infolist()
             _check_directory(path, listed, size)
             return {info.filename.removesuffix(".npy"): _array(path, archive, info) for info in listed}

@@ -99,8 +99,8 @@ def following_law(
         inputs = jnp.concatenate([effective, jnp.stack([curvature, point[3]])])
         latent = model.step(fiber, before.latent, inputs)
         coordinates = model.decode(fiber, latent)[BODY]
-        errors = (_errors(xi, point[3]) for xi in (coordinates, before.coordinates))
-        charge = cost.stage(weights, Stage(*errors, control, before.control, point[3]))
+        here, there = _errors(coordinates, point[3]), _errors(before.coordinates, point[3])
+        charge = cost.stage(weights, Stage(here, there, control, before.control, point[3]))
         charge = charge * (1.0 + terminal_weight * last)
         position = point[:2] + coordinates[LATERAL] * sideways
         yaw = point[2] + coordinates[HEADING]

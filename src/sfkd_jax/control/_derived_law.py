@@ -87,7 +87,7 @@ def derive_path_law(
 
         left, right = jax.vmap(outward)(jnp.asarray([-1.0, 1.0]))
         turns = jnp.concatenate([left[:0:-1], right])
-        steering = jnp.gradient(turns[:, -2], curvatures[1] - curvatures[0])
+        steering = jnp.asarray(jnp.gradient(turns[:, -2], curvatures[1] - curvatures[0]))
         steering = jnp.clip(steering, *(limit * steering[middle] for limit in STEEPER))
         charges = jax.vmap(jnp.diag)(jnp.stack([curvature / steering**2, jnp.full(points[0], drive)], axis=1))
         gains = jax.vmap(lambda kappa, turn, charge: _gain(along, turn, kappa, place, weights, charge))

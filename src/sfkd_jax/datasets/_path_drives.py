@@ -10,6 +10,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
+from sfkd_jax.datasets._path_excitation import perturbations, profile
 from sfkd_jax.path_frame import is_valid, path_state
 from sfkd_jax.rollouts import in_batches
 from sfkd_jax.scenarios import held_road, random_switching, switching_road, uniform_road, wet_road
@@ -107,14 +108,14 @@ def drive_along_path(
     """
     limits = jnp.asarray([steering_excitation, speed_excitation])
     road = partial(
-        _road, dt=loop.dt, speed=speed, peak=peak_curvature, wavelengths=wavelengths, most=lateral_acceleration
+        profile, dt=loop.dt, speed=speed, peak=peak_curvature, wavelengths=wavelengths, most=lateral_acceleration
     )
 
     def one(given: tuple[Array, Key]) -> Trajectory:
         envs = jnp.concatenate([jnp.repeat(given[0][:1], BURN_IN, axis=0), given[0]])
         road_key, nu_key, start_key = jax.random.split(given[1], 3)
         speeds, curvatures = road(road_key, steps=envs.shape[0])
-        nus = _perturbations(nu_key, steps=envs.shape[0], spread=limits)
+        nus = perturbations(nu_key, steps=envs.shape[0], spread=limits)
         nus = jnp.clip(nus, jnp.asarray(loop.control_low[:2]), jnp.asarray(loop.control_high[:2]))
         inputs = jnp.concatenate([nus, curvatures[:, None], speeds[:, None]], axis=1)
         offset = jax.random.uniform(start_key, (3,), minval=-1.0) * jnp.asarray([0.1, 0.02, 0.5])
@@ -184,48 +185,3 @@ def check_on_path(trajectories: Trajectory) -> None:
         raise ValueError(
             f"{lost} of {total} drives left their path (1 - kappa e_y <= 0.2): dataset.law does not hold the car"
         )
-
-
-def _road(
-    key: Key,
-    *,
-    steps: int,
-    dt: float,
-    speed: tuple[float, float],
-    peak: float,
-    wavelengths: tuple[float, float],
-    most: float,
-) -> tuple[Float[Array, " time"], Float[Array, " time"]]:
-    """v_ref [m/s] and κ [1/m] at every step."""
-    level_key, swing_key, wave_key, phase_key, size_key, kind_key, circle_key = jax.random.split(key, 7)
-    level = jax.random.uniform(level_key, (), minval=speed[0], maxval=speed[1])
-    swing, period, begins = jax.random.uniform(swing_key, (3,))
-    time = jnp.arange(steps) * dt
-    speeds = level + 0.8 * swing * jnp.sin(2 * jnp.pi * (time / (5.0 + 15.0 * period) + begins))
-    speeds = jnp.clip(speeds, *speed)
-    waves = jax.random.uniform(wave_key, (3, 1), minval=wavelengths[0], maxval=wavelengths[1])
-    phases = jax.random.uniform(phase_key, (3, 1), maxval=2 * jnp.pi)
-    along = jnp.cumsum(speeds) * dt
-    bends = jnp.mean(jnp.sin(2 * jnp.pi * along / waves + phases), axis=0)
-    # Three sinusoids seldom peak together: twice their mean, clipped, holds the extremes for a while as well.
-    bends = jnp.sqrt(jax.random.uniform(size_key)) * jnp.clip(2.0 * bends, -1.0, 1.0)
-    circle = jnp.clip(jax.random.uniform(circle_key, minval=-1.5, maxval=1.5), -1.0, 1.0)
-    wanted = peak * jnp.where(jax.random.uniform(kind_key) < 1.0 / 3.0, circle, bends)
-    tightest = jnp.minimum(peak, most / speeds**2)
-    return speeds, jnp.clip(wanted, -tightest, tightest)
-
-
-def _perturbations(key: Key, *, steps: int, spread: Float[Array, "2 2"]) -> Float[Array, "time 2"]:
-    """ν: an AR(1) process, or its sign alone, of a spread drawn log-uniformly for each channel."""
-    spread_key, white_key, kind_key = jax.random.split(key, 3)
-    logs = jnp.log(spread)
-    size = jnp.exp(jax.random.uniform(spread_key, (2,), minval=logs[:, 0], maxval=logs[:, 1]))
-    white = jax.random.normal(white_key, (steps, 2))
-
-    def follow(noise: Array, fresh: Array) -> tuple[Array, Array]:
-        noise = 0.85 * noise + jnp.sqrt(1.0 - 0.85**2) * fresh
-        return noise, noise
-
-    noise = jax.lax.scan(follow, white[0], white)[1]
-    bang = jax.random.uniform(kind_key) < 0.25
-    return size * jnp.where(bang, jnp.sign(noise), noise)
