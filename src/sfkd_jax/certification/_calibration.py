@@ -10,7 +10,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
-from scipy.stats import binomtest
+from scipy.special import betaincinv
 
 from sfkd_jax.rollouts import fibers_along, step_disturbances
 from sfkd_jax.types import Model, Params, Trajectory
@@ -130,6 +130,8 @@ def interval(share: float, drives: int) -> list[float]:
 
 
 def clopper_pearson(successes: int, trials: int, *, level: float = 0.95) -> tuple[float, float]:
-    """The exact interval of a binomial proportion."""
-    low, high = binomtest(successes, trials).proportion_ci(level, method="exact")
+    """The exact interval of a binomial proportion (Clopper and Pearson, 1934)."""
+    tail, failures = 0.5 * (1.0 - level), trials - successes
+    low = betaincinv(successes, failures + 1, tail) if successes else 0.0
+    high = betaincinv(successes + 1, failures, 1.0 - tail) if failures else 1.0
     return float(low), float(high)
