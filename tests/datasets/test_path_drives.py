@@ -48,7 +48,7 @@ def test_half_of_the_environments_are_held_and_reach_the_corners(drives):
     held = drives.envs[32:]
     assert np.all(held == held[:, :1])
     ends = (held[:, 0] <= np.asarray(ENV_LOW)) | (held[:, 0] >= np.asarray(ENV_HIGH))
-    assert 0.1 < np.mean(np.all(ends, axis=1)) < 0.35
+    assert 0.02 < np.mean(np.all(ends, axis=1)) < 0.3  # a ninth
 
 
 def test_every_step_is_one_of_the_loop(drives):
@@ -64,7 +64,7 @@ def test_switching_drives_dwell_and_s3_keeps_its_levels():
         assert np.all(np.diff(np.flatnonzero(drive)) >= 29)
     assert jumps.any()
     s3 = jax.jit(partial(generate_s3_along_path, LOOP, segments=4, steps=40))(jax.random.key(0))
-    assert set(np.unique(np.asarray(s3.envs[..., 0])).round(3)) <= {0.3, 0.6, 0.9}
+    assert set(np.unique(np.asarray(s3.envs[..., 0], np.float64).round(3)).tolist()) <= {0.3, 0.6, 0.9}
 
 
 def test_drives_that_left_their_path_are_refused(drives):
