@@ -44,7 +44,7 @@ def test_lateral_error_and_heading_count_as_position_and_yaw(learned):
     model, space = learned[:2]
     units = error_units(model, space)
     np.testing.assert_allclose(units[3:5], (1.0, 5.0))
-    np.testing.assert_allclose(units[5], 0.2 / space.body_scale[2])
+    np.testing.assert_allclose(units[5], 0.05 / space.body_scale[2])
 
 
 def test_alpha_follows_the_loss_and_stays_below_its_largest(learned):

@@ -37,9 +37,9 @@ def error_units(model: Model, space: Space) -> Float[Array, " state"]:
     """What multiplies each of `state_errors` to count as metres.
 
     1 for the position, 5 m for a radian of yaw, 0.2 m for the half width of what else the body state holds. Along a
-    path, e_y and e_ψ are position and yaw.
+    path, e_y and e_ψ are position and yaw, and the rest, which no longer moves the position, is worth 0.05 m.
     """
-    others = 0.2 / jnp.asarray(space.body_scale)
+    others = (0.05 if model.along_path else 0.2) / jnp.asarray(space.body_scale)
     if model.along_path:
         others = others.at[LATERAL].set(1.0).at[HEADING].set(YAW_LENGTH)
     return jnp.concatenate([jnp.asarray([1.0, 1.0, YAW_LENGTH]), others])
