@@ -113,10 +113,8 @@ def witness_matrix(
 ) -> tuple[Matrix, float]:
     """The matrix above, and a bound on its rounding error (2-norm)."""
     first = np.asarray(weights[0] if weights else linear, dtype=np.float64)
-    # numpy's float, whose square overflows to infinity, which is refused: Python's would raise
-    start = np.float64(bound) ** 2 * (
-        np.eye(first.shape[1]) if metric is None else np.asarray(metric, dtype=np.float64)
-    )
+    # The square of numpy's float overflows to infinity, which is refused; Python's raises.
+    start = np.float64(bound) ** 2 * (np.eye(first.shape[1]) if metric is None else np.asarray(metric, np.float64))
     edges = np.cumsum([0, first.shape[1], *(len(part) for part in multipliers)])
     blocks = [slice(a, b) for a, b in pairwise(edges)]
     matrix, error = np.zeros((edges[-1], edges[-1])), 0.0
