@@ -486,7 +486,7 @@ def test_a_proved_rate_that_does_not_contract_is_no_certificate(kind, length):
         verified(dataclasses.replace(proof, mode="separate", **claims._asdict()))
     kind.weights = KINDS["bare"][0]._replace(operators=Polytope((1 - 1e-9) * POLYTOPE.vertices[1:2]))
     claims = consistent(_proofs.prove(kind.weights, BOX, joint=False)._replace(rho=1.0))
-    with pytest.raises(CertificationRefused, match="alpha = 1.0 is not below 1"):
+    with pytest.raises(CertificationRefused, match=r"alpha = 1\.0 is not below 1"):
         verified(dataclasses.replace(proof, mode="separate", **claims._asdict()))
 
 
