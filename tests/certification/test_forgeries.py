@@ -97,7 +97,7 @@ def test_the_constants_are_those_of_the_matrices():
     assert turned.kappa == pytest.approx(9.0, rel=1e-5)
     assert turned.alpha == pytest.approx(0.5 + 3 * turned.beta, rel=1e-5)
     still = honest("bare")
-    assert (still.beta, set(still.lipschitz)) == (0.0, {"body"})
+    assert (still.beta, set(still.lipschitz)) == (0.0, {"position", "yaw", "body"})  # along a path
     assert honest("linear").beta == pytest.approx(np.linalg.norm(FIRST.T @ FIRST, 2), rel=2e-6)
     assert honest("silent").beta == 0.0
     assert "hull of 3 vertices; all u, all z" in found.scope
@@ -152,9 +152,8 @@ def test_what_is_no_number_is_no_bound(value):
 
 def test_zero_is_a_bound_of_what_does_not_move():
     still = KINDS["bare"][0]._replace(readout=np.zeros((1, 3)))
-    claims = honest("bare")
-    refuted(replaced(claims, "body", 0.0), still, "body does not follow")  # `check_witness` proves no bound of 0
-    claims_hold(replaced(claims, "body", 1e-300), still, BOX)
+    claims_hold(replaced(honest("bare"), "position", 0.0), still, BOX)
+    refuted(replaced(honest("bare"), "position", 0.0), KINDS["bare"][0], "position does not follow")
 
 
 def consistent(claims):
@@ -167,7 +166,7 @@ def consistent(claims):
 SMALLER = {
     "joint": ("rho", "beta", "alpha_joint", "body", "position", "yaw", "decoder"),
     "separate": ("rho", "beta", "body", "position", "yaw", "decoder"),
-    "bare": ("rho", "alpha_joint", "body"),
+    "bare": ("rho", "alpha_joint", "position"),
     "linear": ("rho", "beta", "alpha_joint", "body", "decoder"),
     "silent": ("rho", "yaw"),
     "metric": ("rho", "beta", "kappa", "body", "position", "yaw", "decoder"),
@@ -265,7 +264,8 @@ def test_what_all_environments_rests_on_is_part_of_the_claim():
     for kind in KINDS:
         refuted(honest(kind)._replace(scope="all e in the universe"), KINDS[kind][0], "scope does not follow")
         refuted(honest(kind)._replace(scope=""), KINDS[kind][0], "scope does not follow")
-    refuted(honest("joint"), NETWORK._replace(operators=Polytope(POLYTOPE.vertices[:2])), "")
+    fewer = NETWORK._replace(operators=Polytope(POLYTOPE.vertices[:2]))
+    refuted(honest("separate"), fewer, "scope does not follow")
 
 
 def test_kappa_is_one_without_a_metric_and_proved_with_one():
@@ -333,7 +333,7 @@ MODEL = SimpleNamespace()
 @pytest.fixture
 def kind(monkeypatch):
     """Which network the model serves, and what attacks on it find."""
-    chosen = SimpleNamespace(name="joint", weights=None, attacks={"step": 0.4, "transport": 1.0})
+    chosen = SimpleNamespace(name="joint", weights=None, attacks={"step": 0.2, "transport": 1.0})
     served = lambda model, params: KINDS[chosen.name][0] if chosen.weights is None else chosen.weights  # noqa: E731
     monkeypatch.setattr(_certificate, "exported", served)
     monkeypatch.setattr(_certificate, "attack_all", lambda *args: dict(chosen.attacks))
@@ -356,6 +356,7 @@ def verified(certificate, params=PARAMS):
 
 def test_a_certificate_of_each_kind_verifies_and_survives_json(kind):
     for kind.name in KINDS:
+        kind.attacks = {"transport": 1.0} | ({} if kind.name == "metric" else {"step": 0.2})
         proof = certified(kind.name)
         again = Certificate.from_document(json.loads(json.dumps(proof.document())) | {"other": 1})
         assert again == proof
@@ -365,7 +366,8 @@ def test_a_certificate_of_each_kind_verifies_and_survives_json(kind):
         assert proof.transport_lipschitz == 1.0
         assert proof.env_box == BOX
         assert proof.params_sha256 == fingerprint(PARAMS)
-        assert (proof.attack, proof.tightness) == (0.4, proof.alpha / 0.4)
+        found = (None, None) if kind.name == "metric" else (0.2, proof.alpha / 0.2)
+        assert (proof.attack, proof.tightness) == found
         assert 0 <= proof.seconds < 100
         assert set(proof.versions) == {"jax", "numpy", "scipy"}
         assert proof.precision.startswith("bounds on the float32 weights as real numbers")
@@ -524,7 +526,7 @@ def test_an_attack_may_reach_its_bound_and_no_more(kind, name):
         (np.nan, False),
         (np.inf, False),
     ):
-        attacks = {"step": 0.4} | {name: value}
+        attacks = {"step": 0.2} | {name: value}
         step = attacks["step"]
         proof = dataclasses.replace(
             certified(), attacks=attacks, attack=step, tightness=certified().alpha / step if step else None
@@ -545,7 +547,7 @@ def test_attack_and_tightness_are_of_the_attacks(kind):
     told = "attack or tightness is not what the attacks found"
     for attack in (0.3, 0.5, None, np.nan):
         forged(told, attack=attack)
-    for tightness in (alpha / 0.41, alpha / 0.39, None, 1.0, np.nan):
+    for tightness in (alpha / 0.21, alpha / 0.19, None, 1.0, np.nan):
         forged(told, tightness=tightness)
     forged(told, attacks={"step": 0.3})
     forged(told, attacks={})
@@ -556,11 +558,8 @@ def test_attack_and_tightness_are_of_the_attacks(kind):
 @pytest.mark.parametrize(
     "changes",
     [
-        {"attacks": None},
         {"witnesses": {}},
         {"witnesses": {"residual": 3, "metric": None, "joint": None}},
-        {"env_box": [["a"], ["b"]]},
-        {"lipschitz": None},
     ],
 )
 def test_what_is_malformed_is_refused_in_one_line(kind, changes):
