@@ -173,6 +173,14 @@ def test_the_state_that_is_planned_from_is_nearer_to_the_truth_than_the_sensors(
     assert np.all(error(smooth["seen"]) < 0.9 * error(seen))
 
 
+def test_the_state_keeps_its_types_so_that_act_is_compiled_once():
+    before = jax.eval_shape(estimator().init, jax.random.key(0))
+    inputs = jnp.zeros(4), jnp.zeros(2), jnp.zeros((1, 4))
+    _, after, _ = jax.eval_shape(estimator().act, {}, before, *inputs)
+    pairs = zip(jax.tree.leaves(before), jax.tree.leaves(after), strict=True)
+    assert [(a, b) for a, b in pairs if (a.shape, a.dtype, a.weak_type) != (b.shape, b.dtype, b.weak_type)] == []
+
+
 def test_it_drives_as_any_controller_under_jit_and_vmap():
     planner = estimator()
     keys = jax.random.split(jax.random.key(1), 3)

@@ -284,6 +284,19 @@ def test_holding_waits_for_a_first_clean_step():
     assert flagged(info["fallback_active"]) == [2, 3]
 
 
+def test_holding_ends_with_the_plan_and_begins_again_once_all_was_well():
+    """A car that left its box while its plan was held would else be steered by the last control for ever."""
+    drive = CLEAN
+    for step in (*range(8), 11):
+        drive = changed(drive, "envs", step, 0, 1.5)
+    info = watched(drive, bounds=WIDE, fallback="hold", release=2)
+    assert flagged(info["box_exit"]) == [*range(8), 11]
+    held = [*range(1, 1 + HORIZON), 11]  # from the first step on there is a plan, which ends after step 6
+    assert flagged(info["fallback_active"]) == held
+    assert flagged(np.isnan(info["observation"][:, 0])) == held
+    assert flagged(watched(drive, bounds=WIDE, fallback="slow", release=2)["fallback_active"]) == [*range(9), 11]
+
+
 def planner(samples=8):
     model, _ = model_and_params("oracle")
     limits = {"control_low": PLANT.control_low, "control_high": PLANT.control_high}
@@ -337,8 +350,9 @@ def test_a_monitor_that_only_reports_changes_nothing_of_what_is_done():
     for env in (ENV, OUTSIDE, ENV):
         action, state, info = act({}, state, NOW, env, REFERENCE)
         expected, alone, plain = inner({}, alone, NOW, env, REFERENCE)
-        assert same((action, state.inner), (expected, alone), rtol=0, atol=0)
-        assert same({name: info[name] for name in plain}, plain, rtol=0, atol=0)
+        # Two programs, in which the compiler rounds sums differently.
+        assert same((action, state.inner), (expected, alone), rtol=0, atol=1e-6)
+        assert same({name: info[name] for name in plain}, plain, rtol=0, atol=1e-6)
         assert set(info) - set(plain) == {
             "breach", "box_exit", "breaches", "box_exits", "disturbance", "fallback_active",
         }  # fmt: skip

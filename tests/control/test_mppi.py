@@ -232,6 +232,18 @@ def test_a_broken_first_observation_gives_a_finite_control_inside_the_bounds():
     assert bool(act_once(state=state)[2]["healthy"])
 
 
+@pytest.mark.parametrize("law", [FEEDBACK, control.ModelLaw(dt=0.1)])
+def test_a_reading_far_off_leaves_no_more_in_the_plan_than_the_actuators_can_do(law):
+    """The law then asks for thousands of radians in vain; a perturbation that made up for them would outlast them."""
+    controller, params, act = compiled(law=law)
+    span = np.subtract(PLANT.control_high, PLANT.control_low)
+    for entry, value in ((0, 1e5), (1, -1e5), (3, 1e6)):
+        state = controller.init(jax.random.key(0))
+        _, state, info = act(params, state, with_entry(OFFSET, entry, value), ENV, REFERENCE)
+        assert bool(info["healthy"])
+        assert np.all(np.abs(state.plan) <= span * (1 + 1e-6))
+
+
 def test_a_long_blackout_ends_with_the_last_control_held():
     _, state, _ = act_once()
     last = state.controls[-1]

@@ -11,7 +11,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from helpers import jit
+from helpers import jit, same
 
 from sfkd_jax import control
 
@@ -109,6 +109,21 @@ def test_a_call_that_comes_late_continues_the_plan_from_where_it_would_be_by_the
     late = max(elapsed - 1.0, 0.0)
     np.testing.assert_allclose(action, 0.1 * late, atol=1e-6)
     np.testing.assert_allclose(after.controls[0], 0.1 * (late + min(elapsed, 1.0)), atol=1e-6)
+
+
+@every
+def test_a_clock_that_tells_no_number_counts_as_a_call_in_time(search):
+    """Else the plan would be NaN from then on, and with it every control."""
+    controller = SEARCHES[search](double_integrator(), horizon=HORIZON, noise_std=(2.0,))
+    act, seen = jit(controller.act), []
+    for elapsed in (jnp.nan, 1.0):
+        state = controller.init(jax.random.key(0))
+        for told in (1.0, elapsed, 1.0):
+            state = state._replace(tuning=state.tuning._replace(elapsed=jnp.asarray(told)))
+            action, state, info = act({}, state, START, NOTHING, ())
+            assert bool(info["healthy"])
+        seen.append((action, state.plan))
+    assert same(*seen, rtol=0, atol=0)
 
 
 @every

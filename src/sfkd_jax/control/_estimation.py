@@ -86,8 +86,9 @@ def estimated(
 
     def init(key: Key) -> EstimatorState:
         count = grid.shape[0]
-        unseen = jnp.full((count, states), jnp.nan)
-        alike = jnp.full(count, 1.0 / count)
+        # Without a dtype they would be weakly typed, and the second call of a jitted `act` would compile it again.
+        unseen = jnp.full((count, states), jnp.nan, dtype=float)
+        alike = jnp.full(count, 1.0 / count, dtype=float)
         nothing = jnp.zeros(controls), jnp.asarray(False)
         return EstimatorState(controller.init(key), unseen, jnp.diag(sensors), alike, *nothing)
 

@@ -24,6 +24,7 @@ class MonitorState(NamedTuple):
         observation, env: at the last clean step; NaN before the first one. control: applied last.
         primed: whether the step before was clean, so that there is something to compare with.
         breaches, box_exits: steps so far with one. remaining: steps that the fallback still lasts.
+        held: steps in a row that the last plan was held.
     """
 
     inner: Any
@@ -34,6 +35,7 @@ class MonitorState(NamedTuple):
     breaches: Int[Array, ""]
     box_exits: Int[Array, ""]
     remaining: Int[Array, ""]
+    held: Int[Array, ""]
 
 
 def monitored(
@@ -62,7 +64,9 @@ def monitored(
     A fallback is in force at the step of a breach or box exit and ends `release` steps after the last one:
         "none": report only.
         "hold": continue the last plan open loop; for controllers that do so when the observation is NaN, as `mppi`
-            does. Before the first clean step there is no plan, and nothing is changed.
+            does. Before the first clean step there is no plan, and nothing is changed. Held for as many steps as the
+            reference has, a plan has ended: from then on the controller plans from what it sees, until `release` steps
+            have passed without a flag. A car that left its box while nothing was planned could not come back else.
         "slow": follow the same path at `slow_factor` times its speed.
 
     Args:
@@ -89,7 +93,15 @@ def monitored(
         control = jnp.clip(jnp.zeros(len(control_low)), jnp.asarray(control_low), jnp.asarray(control_high))
         none, nothing = jnp.zeros((), dtype=jnp.int32), jnp.asarray(False)
         return MonitorState(
-            controller.init(key), unseen(3 + len(state_low)), unseen(len(env_low)), control, nothing, none, none, none
+            inner=controller.init(key),
+            observation=unseen(3 + len(state_low)),
+            env=unseen(len(env_low)),
+            control=control,
+            primed=nothing,
+            breaches=none,
+            box_exits=none,
+            remaining=none,
+            held=none,
         )
 
     def act(
@@ -104,7 +116,7 @@ def monitored(
         box_exit = ~(clean & jnp.all((low <= point) & (point <= high)))
 
         remaining = jnp.where(breach | box_exit, release, jnp.maximum(state.remaining - 1, 0))
-        planned = jnp.isfinite(state.observation).all()
+        planned = jnp.isfinite(state.observation).all() & (state.held < reference.shape[0])
         active = (remaining > 0) & {"none": False, "hold": planned, "slow": True}[fallback]
         seen, wanted = fall_back(active, observation, reference)
         control, inner, info = controller.act(params, state.inner, seen, env, wanted)
@@ -118,6 +130,7 @@ def monitored(
             breaches=state.breaches + breach,
             box_exits=state.box_exits + box_exit,
             remaining=remaining,
+            held=jnp.where(remaining > 0, state.held + active, 0),
         )
         report = {"breach": breach, "box_exit": box_exit, "disturbance": disturbance, "fallback_active": active}
         return control, after, info | report | {"breaches": after.breaches, "box_exits": after.box_exits}

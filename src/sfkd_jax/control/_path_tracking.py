@@ -39,7 +39,7 @@ def path_tracking(
 ) -> Task:
     """Follow a path with a learned model, around a feedback law on the *predicted* state.
 
-        u_k = limit(u_ff(κ_k) + K ξ_k + ν_k),   J = Σ_k ℓ(x_k, u_k) + λ_z |z_k − z_k^ref|² + w_T ℓ(x_T, u_T)
+        u_k = limit(clip(u_ff(κ_k) + K ξ_k) + ν_k),   J = Σ_k ℓ(x_k, u_k) + λ_z |z_k − z_k^ref|² + w_T ℓ(x_T, u_T)
 
     Args:
         model: rolled out; `fiber` and `encode` are evaluated once a step, outside the scan.
@@ -56,11 +56,15 @@ def path_tracking(
     low, high = jnp.asarray(control_low, dtype=float), jnp.asarray(control_high, dtype=float)
 
     def asked(state: State, target: Any) -> Control:
-        """What the law wants at a state."""
+        """What the law wants at a state, as far as the actuators can give it."""
         point, curvature, _, turn = target
         if isinstance(law, ModelLaw):
-            return law.control(turn, state, point, curvature)
-        return law(path_errors(state, point, curvature), curvature, point[3])
+            wanted = law.control(turn, state, point, curvature)
+        else:
+            wanted = law(path_errors(state, point, curvature), curvature, point[3])
+        # Else a perturbation would also make up for what the law asks in vain: of a reading far off, thousands of
+        # radians, which stay in the plan when the readings are right again.
+        return jnp.clip(wanted, low, high)
 
     def begin(params: Params, observation: State, env: Environment, reference: Reference, applied: Applied) -> Began:
         fiber = model.fiber(model.fold(params), env)  # of many rollouts; nothing is left to fold if that was done ahead
@@ -71,7 +75,7 @@ def path_tracking(
         if isinstance(law, ModelLaw):
             turns = law.prepare(model, fiber, observation, reference, curvature)
         targets = (reference, curvature, goals, turns)
-        lawful = jnp.clip(asked(observation, jax.tree.map(lambda leaf: leaf[0], targets)), low, high)
+        lawful = asked(observation, jax.tree.map(lambda leaf: leaf[0], targets))
         before = jnp.where(applied.known, applied.control, lawful)
         if actuator is not None:
             before = actuator(observation)

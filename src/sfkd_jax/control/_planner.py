@@ -106,7 +106,9 @@ def planner(
     ) -> tuple[Control, PlannerState, dict[str, Array]]:
         task.check(observation, env, reference, horizon)
         # A plan is kept as of one period after it was made; of a call that comes later, only the call knows.
-        late = jnp.maximum(state.tuning.elapsed - 1.0, 0.0)
+        # Without a number, as from a clock that fails, the call counts as one that comes in time.
+        elapsed = jnp.where(jnp.isnan(state.tuning.elapsed), 1.0, state.tuning.elapsed)
+        late = jnp.maximum(elapsed - 1.0, 0.0)
         state = state._replace(plan=shift(state.plan, late), controls=shift(state.controls, late))
         search_key, next_key = jax.random.split(state.key)
         clean = all_finite((observation, env, reference))
@@ -147,7 +149,7 @@ def planner(
             "env_inside": jnp.all(inside == env),
             "predicted_states": states,
         }
-        elapsed = jnp.minimum(state.tuning.elapsed, 1.0)
+        elapsed = jnp.minimum(elapsed, 1.0)
         shifted = state._replace(
             plan=shift(plan, elapsed),
             controls=shift(controls, elapsed),

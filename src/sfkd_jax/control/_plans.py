@@ -21,7 +21,8 @@ class Tuning(NamedTuple):
     Attributes:
         temperature: λ of MPPI, in units of cost. effective_samples: what λ is chosen for instead, if the planner was
             built to. noise_std: per control channel, in control units.
-        elapsed: sampling periods since the last call; the plan is shifted by as many, also by fractions.
+        elapsed: sampling periods since the last call; the plan is shifted by as many, also by fractions, and by one
+            where this is NaN.
         cost: weights of the task's cost.
     """
 
