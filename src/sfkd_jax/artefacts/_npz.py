@@ -130,7 +130,7 @@ def _array(path: Path, archive: zipfile.ZipFile, info: zipfile.ZipInfo) -> np.nd
 def _header(path: Path, entry: Any) -> tuple[np.dtype, tuple[int, ...], Literal["C", "F"], int]:
     """Dtype, shape and order of a .npy file, and where its data begin."""
     magic = _exactly(entry, 8)
-    if magic[:6] != b"\x93NUMPY" or magic[6] not in (1, 2, 3):
+    if magic[:6] != b"\x93NUMPY" or magic[6] not in (1, 2, 3) or magic[7]:
         raise ValueError(f"{entry.name} is no array of numpy")
     width = 2 if magic[6] == 1 else 4
     length = int.from_bytes(_exactly(entry, width), "little")

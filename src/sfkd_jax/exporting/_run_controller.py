@@ -111,7 +111,7 @@ class ExportedController:
 def _manifest(path: Path) -> dict[str, Any]:
     """What controller.json says, if it says what was written."""
     try:
-        manifest = json.loads(_content(path, LARGEST))
+        manifest = json.loads(_content(path, LARGEST).decode())
         if not isinstance(manifest, dict) or manifest.get("kind") != "controller":
             raise ExportError(f"{path}: not the manifest of a controller")
         if manifest.get("format") != FORMAT:
@@ -128,7 +128,7 @@ def _manifest(path: Path) -> dict[str, Any]:
 def _compiled(folder: Path, manifest: dict[str, Any], name: str) -> Any:
     """A program of the export, compiled for the device that jax uses by itself."""
     program = manifest["programs"][name]
-    if Path(program["file"]).name != program["file"]:
+    if Path(program["file"]).name != program["file"] or program["file"] in ("", ".."):
         raise ValueError(f"{program['file']!r} is not the name of a file in this folder")
     path = folder / program["file"]
     content = _content(path, int(program["bytes"]))
@@ -145,8 +145,8 @@ def _compiled(folder: Path, manifest: dict[str, Any], name: str) -> Any:
         reason = f"{path}: written by jax {manifest['jax']}, refused by {jax.__version__}: {error}"
         raise ExportError(_line(reason)) from None
     for side, values in (("inputs", exported.in_avals), ("outputs", exported.out_avals)):
-        listed = [(str(leaf["name"]), tuple(leaf["shape"]), leaf["dtype"]) for leaf in program[side]]
-        if [leaf[1:] for leaf in listed] != [(value.shape, str(value.dtype)) for value in values]:
+        listed = [(type(leaf["name"]), tuple(leaf["shape"]), leaf["dtype"]) for leaf in program[side]]
+        if listed != [(str, value.shape, str(value.dtype)) for value in values]:
             raise ExportError(f"{path}: has other {side} than its manifest says")
     return compiled
 
