@@ -35,10 +35,10 @@ def derive_path_law(
     speed: tuple[float, float] = (8.0, 10.5),
     points: tuple[int, ...] = (13, 3, 7),
     perturbation: tuple[float, float] = (0.03, 1.0),
-    lateral: float = 1.0,
-    heading: float = 20.0,
+    lateral: float = 10.0,
+    heading: float = 60.0,
     velocity: float = 5.0,
-    curvature: float = 200.0,
+    curvature: float = 300.0,
     drive: float = 0.5,
 ) -> PathLaw:
     """Steady turns and gains on a grid of (v_ref² κ, v_ref, e), from a step alone.
