@@ -51,7 +51,7 @@ def test_alpha_follows_the_loss_and_stays_below_its_largest(learned):
     """A heavy tube alone drives α down; the weights hold whatever α says."""
     model, space, params, batch = learned
     loss = multi_step_loss(
-        model, space, prediction=0, one_step=0, consistency=0, reconstruction=0, transport=0, tube=(1.0,)
+        model, space, prediction=0.0, one_step=0.0, consistency=0.0, reconstruction=0.0, transport=0.0, tube=(1.0,)
     )
     slope = jax.jit(jax.grad(lambda params: loss(params, batch)[0]))(params)
     assert float(slope["networks"]["alpha_logit"]) > 0

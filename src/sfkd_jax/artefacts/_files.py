@@ -132,7 +132,8 @@ def open_regular(path: Path) -> io.FileIO:
 def _up_to(path: Path, file: io.FileIO, most: int) -> bytes:
     """The first bytes of a file."""
     try:
-        return io.BufferedReader(file).read(min(most, os.fstat(file.fileno()).st_size + 1))
+        with io.BufferedReader(file) as buffered:
+            return buffered.read(min(most, os.fstat(file.fileno()).st_size + 1))
     except OSError as error:
         raise failure(path, error) from error
 
