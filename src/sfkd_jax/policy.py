@@ -200,7 +200,7 @@ def _weights(file: Path, arrays: Mapping[str, np.ndarray], model: Model) -> Para
     """
     with artefacts.understood(file, ValueError):
         params = artefacts.unflatten(arrays)
-    expected = _listed(jax.eval_shape(model.init, jax.random.key(0)))
+        expected = _listed(jax.eval_shape(model.init, jax.random.key(0)))  # settings of another kind fail only here
     found = _listed(params)
     if wrong := sorted(expected.keys() ^ found.keys()):
         verb = "lacks" if wrong[0] in expected else "holds"
