@@ -1,6 +1,7 @@
 """Settings of the test run: they go through the environment, before jax is imported, and only where unset."""
 
 import os
+from collections.abc import Iterator
 from importlib.metadata import version
 from pathlib import Path
 
@@ -21,6 +22,18 @@ if _worker and hasattr(os, "sched_setaffinity"):
 
 import jax  # noqa: E402
 import pytest  # noqa: E402
+
+MAPPINGS = 15000
+"""Of memory, where compiled functions are dropped: each holds some, and Linux ends a process that has 65530."""
+
+
+@pytest.fixture(autouse=True, scope="module")
+def _few_mappings() -> Iterator[None]:
+    """Drop what was compiled, after a file of tests, before the process has more mappings than it may."""
+    yield
+    listed = Path("/proc/self/maps")
+    if listed.exists() and listed.read_bytes().count(b"\n") > MAPPINGS:
+        jax.clear_caches()
 
 
 @pytest.fixture
