@@ -14,13 +14,19 @@ from sfkd_jax.datasets._path_excitation import perturbations, profile
 from sfkd_jax.path_frame import is_valid, path_state
 from sfkd_jax.rollouts import in_batches
 from sfkd_jax.scenarios import held_road, random_switching, switching_road, uniform_road, wet_road
-from sfkd_jax.types import BODY, Key, Trajectory
+from sfkd_jax.types import BODY, Control, Environment, Key, State, Trajectory
 from sfkd_jax.vehicle import Vehicle
 
 Conditions: TypeAlias = Callable[[Key], Float[Array, "time environment"]]
+Admit: TypeAlias = Callable[[State, Float[Array, "time 4"], Float[Array, "time environment"]], Float[Array, "time 4"]]
+"""(first path state, w, e) -> w: what a filter lets through of the perturbations of a whole drive."""
+Sensors: TypeAlias = Callable[[Key, State, Control, Environment], Control]
+"""(key, path state, w, e) -> what the law adds to ν because it sees a measurement of the state."""
 
 BURN_IN = 20
 """Steps driven before a drive starts, so that the car is where the law brings it and not where it was put."""
+SENSORS = 3
+"""Folded into a drive's key, of which road, ν and start take a split each."""
 BATCH = 500
 """Drives simulated at once."""
 
@@ -92,6 +98,10 @@ def drive_along_path(
     lateral_acceleration: float = 2.0,
     steering_excitation: tuple[float, float] = (0.002, 0.025),
     speed_excitation: tuple[float, float] = (0.05, 0.6),
+    offset: tuple[float, float, float] = (0.1, 0.02, 0.5),
+    burn_in: int = BURN_IN,
+    admit: Admit | None = None,
+    sensors: Sensors | None = None,
 ) -> Trajectory:
     """Drives in environments of one's own, one schedule a drive.
 
@@ -105,6 +115,9 @@ def drive_along_path(
         speed: range of v_ref [m/s]. peak_curvature: [1/m]. wavelengths: of the road [m].
         lateral_acceleration: largest v_ref² |κ| [m/s²].
         steering_excitation: range of the spread of ν_1 [rad]. speed_excitation: of ν_2 [m/s² or m/s].
+        offset: largest e_y [m], e_ψ [rad] and v − v_ref [m/s] at the start. burn_in: steps driven before a drive starts.
+        admit: a filter of ν that sees the drive's conditions and not the car; what it lets through is w.
+        sensors: of the law; what they add to ν is not part of w.
     """
     limits = jnp.asarray([steering_excitation, speed_excitation])
     road = partial(
@@ -112,21 +125,26 @@ def drive_along_path(
     )
 
     def one(given: tuple[Array, Key]) -> Trajectory:
-        envs = jnp.concatenate([jnp.repeat(given[0][:1], BURN_IN, axis=0), given[0]])
+        envs = jnp.concatenate([jnp.repeat(given[0][:1], burn_in, axis=0), given[0]])
         road_key, nu_key, start_key = jax.random.split(given[1], 3)
+        sensor_keys = jax.random.split(jax.random.fold_in(given[1], SENSORS), envs.shape[0])
         speeds, curvatures = road(road_key, steps=envs.shape[0])
         nus = perturbations(nu_key, steps=envs.shape[0], spread=limits)
         nus = jnp.clip(nus, jnp.asarray(loop.control_low[:2]), jnp.asarray(loop.control_high[:2]))
         inputs = jnp.concatenate([nus, curvatures[:, None], speeds[:, None]], axis=1)
-        offset = jax.random.uniform(start_key, (3,), minval=-1.0) * jnp.asarray([0.1, 0.02, 0.5])
-        start = jnp.zeros(len(loop.state_names) - 3).at[:3].set(offset.at[2].add(speeds[0]))
+        beside = jax.random.uniform(start_key, (3,), minval=-1.0) * jnp.asarray(offset)
+        start = path_state(jnp.zeros(len(loop.state_names) - 3).at[:3].set(beside.at[2].add(speeds[0])))
+        inputs = inputs if admit is None else admit(start, inputs, envs)
 
-        def step(state: Array, given: tuple[Array, Array]) -> tuple[Array, Array]:
-            after = loop.step(state, *given)
+        def step(state: State, given: tuple[Control, Environment, Key]) -> tuple[State, State]:
+            wanted, env, key = given
+            seen = wanted if sensors is None else wanted.at[:2].add(sensors(key, state, wanted, env))
+            after = loop.step(state, seen, env)
             return after, after
 
-        _, states = jax.lax.scan(step, path_state(start), (inputs, envs))
-        return Trajectory(states[BURN_IN - 1 :], inputs[BURN_IN:], envs[BURN_IN:])
+        _, states = jax.lax.scan(step, start, (inputs, envs, sensor_keys))
+        states = jnp.concatenate([start[None], states])
+        return Trajectory(states[burn_in:], inputs[burn_in:], envs[burn_in:])
 
     keys = jax.random.split(key, envs.shape[0])
     return in_batches(one, (envs, keys), size=BATCH)

@@ -56,6 +56,7 @@ def sfkd(
     environment: bool = True,
     soft_penalty: float = 0.0,
     learn_alpha: bool = False,
+    forcing_hidden: int = 0,
 ) -> Model:
     """Environment-conditioned Koopman operators, a β-Lipschitz residual and isometric transport (eq:sfkd).
 
@@ -77,6 +78,8 @@ def sfkd(
         residual: "sandwich", "free" (no bound by construction; ||A_j|| ≤ ρ) or "none" (||A_j|| ≤ ρ).
         budget: "joint" or "sum", of a sandwich residual.
         transport: learn Q(e), else the identity. environment: use e at all.
+        forcing_hidden: width of f(u, e) = V tanh(G(e) u + h(e)), added to B(e) u: it is no function of z, so every bound
+            stands as it is; 0 for none.
         learn_alpha: let training choose α of a joint budget between `LOWEST_RATE` and ρ + β, from the latter on.
         soft_penalty: weight of the paper's hinge max(0, ||∂r/∂z||_2 − β)² in the training loss (eq:contr_loss).
 
@@ -88,7 +91,7 @@ def sfkd(
     body = space.body_mean.shape[0]
     hidden = tuple(residual_hidden), tuple(decoder_hidden)
     control = space.control_mean.shape[0]
-    bounds = (rho, beta, residual, transport, budget, pose, learn_alpha)
+    bounds = (rho, beta, residual, transport, budget, pose, learn_alpha, forcing_hidden)
     networks = Networks(rank, body, control, vertices, *hidden, embedding, *bounds)
     encoder = Encoder(rank, encoder_hidden, linear_lift)
     pose_scale = jnp.asarray(space.increment_scale) * SEGMENT_STEPS
@@ -123,6 +126,8 @@ def sfkd(
             residual_biases=local.residual,
             decoder=shared.decoder.matrices,
             decoder_biases=local.decoder,
+            forcing=shared.forcing,
+            forcing_biases=local.forcing,
             readout=shared.readout,
             centre=shared.centre,
             tangents=local.tangents,
@@ -154,6 +159,8 @@ def sfkd(
     def step(fiber: SfkdFiber, latent: SfkdLatent, control: Control) -> SfkdLatent:
         u = scaled_control(control)
         z = fiber.A @ latent.z + fiber.B @ u
+        if forcing_hidden:
+            z = z + fiber.forcing[0] @ jnp.tanh(fiber.forcing_biases.at(u)[0])
         if residual != "none":
             z = z + apply(fiber.residual, fiber.residual_biases.at(u), latent.z)
         if segment or not pose:

@@ -42,6 +42,7 @@ class Shared(NamedTuple):
     vertices: Float[Array, "vertex rank rank"]
     residual: Weights
     decoder: Weights
+    forcing: tuple[Float[Array, "_ _"], ...]
     readout: Float[Array, "body rank"]
     centre: Float[Array, " body"]
 
@@ -53,6 +54,7 @@ class PerEnvironment(NamedTuple):
     B: Float[Array, "rank control"]
     residual: Biases
     decoder: Biases
+    forcing: Biases
     tangents: Float[Array, " plane"]
     embedding: Float[Array, " embedding"]
 
@@ -66,6 +68,7 @@ class Networks(nn.Module):
         rho, beta: the two hard bounds. residual: "sandwich", "free" or "none". transport: whether Q(e) is learned.
         budget: "sum" bounds A(e) by ρ and the residual by β; "joint" bounds their sum, as one map, by ρ + β.
         pose: whether there is a decoder of the pose. learn_alpha: whether a joint budget may choose α below ρ + β.
+        forcing_hidden: width of f(u, e), which is added to B(e) u; 0 for none.
     """
 
     rank: int
@@ -82,6 +85,7 @@ class Networks(nn.Module):
     budget: str
     pose: bool = True
     learn_alpha: bool = False
+    forcing_hidden: int = 0
 
     def setup(self) -> None:
         """Declare the parts."""
@@ -96,6 +100,9 @@ class Networks(nn.Module):
             self.decoder_weights = Sandwich(self.rank, self.decoder_hidden, 3)
             self.decoder_head = nn.Dense(self._bias_size(self.decoder_hidden, 3))
             self.log_decoder_bound = self.param("log_decoder_bound", nn.initializers.constant(1.0), ())
+        if self.forcing_hidden:
+            self.forcing_head = nn.Dense(self.forcing_hidden * (self.control + 1))
+            self.forcing_weights = self.param("forcing", nn.initializers.zeros, (self.rank, self.forcing_hidden))
         self.tangent_head = nn.Dense(self.rank // 2, kernel_init=small, bias_init=nn.initializers.zeros)
         shape = (self.vertices, self.rank, self.rank)
         self.operators = self.param("operators", _near_identity, shape)
@@ -125,7 +132,8 @@ class Networks(nn.Module):
         """What does not depend on e, with every bound in force."""
         vertices, residual = self._step()
         decoder = self.decoder_weights(jnp.exp(self.log_decoder_bound)) if self.pose else Weights((), ())
-        return Shared(vertices, residual, decoder, bounded(self.readout, 1.0), self.centre)
+        forcing = (self.forcing_weights,) if self.forcing_hidden else ()
+        return Shared(vertices, residual, decoder, forcing, bounded(self.readout, 1.0), self.centre)
 
     def _step(self) -> tuple[Array, Weights]:
         """Vertices of A(e) and the residual, such that every step contracts."""
@@ -149,9 +157,17 @@ class Networks(nn.Module):
             B=self.input_head(embedding).reshape(self.rank, self.control),
             residual=residual,
             decoder=self._biases(self.decoder_head(embedding), self.decoder_hidden, 3) if self.pose else Biases((), ()),
+            forcing=self._forcing(embedding),
             tangents=tangents if self.transport else jnp.zeros_like(tangents),
             embedding=embedding,
         )
+
+    def _forcing(self, embedding: Array) -> Biases:
+        """Biases of the hidden layer of f."""
+        if not self.forcing_hidden:
+            return Biases((), ())
+        table = self.forcing_head(embedding).reshape(self.forcing_hidden, self.control + 1)
+        return Biases((table[:, :-1],), (table[:, -1],))
 
     def _bias_size(self, hidden: Sequence[int], outputs: int) -> int:
         return (sum(hidden) + outputs) * (self.control + 1)

@@ -45,6 +45,8 @@ class SfkdFiber(NamedTuple):
     residual_biases: Biases
     decoder: tuple[Float[Array, "_ _"], ...]
     decoder_biases: Biases
+    forcing: tuple[Float[Array, "_ _"], ...]
+    forcing_biases: Biases
     readout: Float[Array, "body rank"]
     centre: Float[Array, " body"]
     tangents: Float[Array, " plane"]
