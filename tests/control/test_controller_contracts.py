@@ -6,9 +6,9 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from helpers import ENV_HIGH, ENV_LOW, any_law, jit, model_and_params, same, straight
+from helpers import ENV_HIGH, ENV_LOW, TINY, any_law, jit, model_and_params, path_space, same, straight
 
-from sfkd_jax import assembly, control, evaluation, scenarios, vehicle
+from sfkd_jax import control, evaluation, models, scenarios, vehicle
 
 PLANT = vehicle.kinematic()
 LIMITS = {"control_low": PLANT.control_low, "control_high": PLANT.control_high}
@@ -57,12 +57,13 @@ def monitored():
 
 
 def shielded():
-    """A planner in path coordinates, filtered; the true plant is the model."""
-    law = any_law()
-    model = assembly.reference_systems(PLANT, law)["oracle"].model
+    """A planner in path coordinates, filtered; with a tiny model as it is drawn, folded."""
+    law, limits = any_law(), LIMITS | BOX
+    model = models.sfkd(path_space(), **TINY | {"budget": "joint"}, frame="path")
     task = control.following_law(model, control.tracking_cost(dt=PLANT.dt), law, dt=PLANT.dt, **LIMITS)
     planner = control.mppi(task, num_samples=16, horizon=HORIZON, noise_std=(0.01, 0.3), **BOX)
-    return control.shielded(planner, model, law, width=0.5, tube=0.2, horizon=8, **LIMITS, **BOX), {}
+    filtered = control.shielded(planner, model, law, width=0.5, tube=0.2, horizon=8, **limits)
+    return filtered, jit(model.fold)(jit(model.init)(jax.random.key(0)))
 
 
 def koopman_mpc():

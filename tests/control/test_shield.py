@@ -6,7 +6,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from helpers import TINY, any_law, jit, same, space, tiny
+from helpers import TINY, any_law, jit, path_space, same, tiny
 
 from sfkd_jax import control, models
 from sfkd_jax.control import admit, curvature_ahead, path_coordinates, shielded
@@ -62,12 +62,13 @@ def circle(curvature=0.0, horizon=HORIZON, speed=SPEED):
 
 
 def scripted():
-    """A planner that adds params[k] to the law at step k, whatever that leads to."""
+    """A planner that adds params[k] to the law at step k, whatever that leads to; or params["script"][k]."""
 
     def act(params, k, observation, env, reference):
+        script = params["script"] if isinstance(params, dict) else params
         curvature = curvature_ahead(reference)[0]
         xi = path_coordinates(observation, reference[0], curvature)
-        return LAW(xi, curvature, reference[0, 3], env) + params[k], k + 1, {"cost": jnp.zeros(())}
+        return LAW(xi, curvature, reference[0, 3], env) + script[k], k + 1, {"cost": jnp.zeros(())}
 
     return Controller(lambda key: jnp.zeros((), jnp.int32), act)
 
@@ -363,57 +364,32 @@ def test_where_law_and_planner_are_at_the_same_limit_nothing_was_asked_for():
     assert float(info["intervention"]) == 0.0
 
 
-@cache
-def learned():
-    """A filter over an untrained SFKD around a planner over the same, and parameters."""
-    scales = {"control_mean": jnp.asarray([0.0, 0.0, 0.0, 9.0]), "control_scale": jnp.asarray([0.03, 1.0, 0.02, 1.5])}
-    model = models.sfkd(space(3)._replace(**scales), **TINY | {"budget": "joint"}, frame="path")
-    limits = {"control_low": LOW, "control_high": HIGH}
-    task = control.following_law(model, control.tracking_cost(dt=0.1), LAW, dt=0.1, **limits)
-    planner = control.mppi(task, num_samples=8, horizon=6)
-    boxes = {"env_low": (0.3, -8.0), "env_high": (0.9, 8.0), "state_low": (-9.0,) * 2 + (0.0,)}
-    controller = shielded(planner, model, LAW, width=0.5, tube=0.3, **limits, **boxes)
-    return controller, model.fold(model.init(jax.random.key(0)))
-
-
-def test_a_learned_model_is_filtered_in_a_scan_as_call_by_call_with_one_compilation():
-    controller, params = learned()
-    traces, reference = [], circle(0.003, horizon=6)
+def test_it_is_exported_in_a_scan_and_does_as_call_by_call():
+    """A tiny SFKD as it is drawn, a switch of e and one that cannot be read; jit and vmap are in the contracts."""
+    model = models.sfkd(path_space(), **TINY | {"budget": "joint"}, frame="path")
+    params = jit(lambda key: model.fold(model.init(key)))(jax.random.key(0))
+    controller = shielded(scripted(), model, LAW, width=0.5, tube=0.3, control_low=LOW, control_high=HIGH)
     envs = jnp.asarray([[0.6, 2.0], [0.6, 2.0], [0.4, -5.0], [jnp.nan, 0.0]])
-    xi = beside(jnp.asarray([0.2, 0.01, SPEED]))
+    xi, reference = beside(jnp.asarray([0.2, 0.01, SPEED])), circle(0.003, horizon=6)
+    asked = jnp.asarray(scripts()["random"][:4], dtype=float)
 
-    def act(memory, env):
-        traces.append(1)
-        action, memory, info = controller.act(params, memory, xi, env, reference)
+    def step(memory, env):
+        given = params | {"script": asked}
+        action, memory, info = controller.act(given, memory, xi, env, reference)
         return memory, (action, info)
 
-    memory, called, call = controller.init(jax.random.key(1)), [], jit(act)
+    def run(envs):
+        return jax.lax.scan(step, controller.init(jax.random.key(1)), envs)[1]
+
+    exported = jax.export.export(jax.jit(run))(envs).serialize()
+    scanned = jax.export.deserialize(exported).call(envs)
+    memory, called, call = controller.init(jax.random.key(1)), [], jit(step)
     for env in envs:
         memory, out = call(memory, env)
         called.append(out)
-    assert len(traces) == 1
-    last, scanned = jit(lambda memory: jax.lax.scan(act, memory, envs))(controller.init(jax.random.key(1)))
     assert same(scanned, jax.tree.map(lambda *leaves: jnp.stack(leaves), *called), rtol=1e-4, atol=1e-4)
-    assert same(last, memory, rtol=1e-4, atol=1e-4)
     assert np.all(np.isfinite(scanned[1]["margin"]))
-
-
-def test_it_is_exported_and_gives_the_same_when_read_again():
-    controller, params = learned()
-    memory = controller.init(jax.random.key(1))
-    inputs = (memory, beside(jnp.asarray([0.2, 0.01, SPEED])), ENV, circle(0.003, horizon=6))
-    leaves, structure = jax.tree.flatten(inputs)
-    key_at = next(k for k, leaf in enumerate(leaves) if jnp.issubdtype(leaf.dtype, jax.dtypes.prng_key))
-    leaves[key_at] = jax.random.key_data(leaves[key_at])
-
-    def act(*leaves):
-        leaves = list(leaves)
-        leaves[key_at] = jax.random.wrap_key_data(leaves[key_at])
-        action, _, info = controller.act(params, *jax.tree.unflatten(structure, leaves))
-        return action, info
-
-    again = jax.export.deserialize(jax.export.export(jax.jit(act))(*leaves).serialize())
-    assert same(again.call(*leaves), jit(act)(*leaves), rtol=1e-4, atol=1e-4)
+    assert call._cache_size() == 1
 
 
 @pytest.mark.parametrize(
