@@ -61,6 +61,12 @@ def space(body=1):
     )
 
 
+def path_space():
+    """Scales about those of the kinematic plant along a path."""
+    controls = {"control_mean": jnp.asarray([0.0, 0.0, 0.0, 9.0]), "control_scale": jnp.asarray([0.03, 1.0, 0.02, 1.5])}
+    return space(3)._replace(**controls)
+
+
 def any_law(coordinates=3):
     """A law that follows a path slowly, the same in every environment."""
     corners = (2, 2, 2, 2)

@@ -4,12 +4,11 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from helpers import TINY, any_law, space
+from helpers import TINY, any_law, path_space
 from hydra import compose, initialize_config_dir
 from omegaconf import OmegaConf
 
 from sfkd_jax import artefacts, assembly, config, policy, rehearsal, vehicle
-from sfkd_jax.types import Space
 
 
 def settings(*overrides):
@@ -23,9 +22,7 @@ def saved(place, *, law, samples=4):
     asked = settings("controller=mppi_tiny", "controller.sampling=law", f"controller.mppi.num_samples={samples}")
     asked["model"] |= {name: list(value) if isinstance(value, tuple) else value for name, value in TINY.items()}
     asked["model"] |= {"budget": "joint"}
-    measured = space(3)
-    controls = {"control_mean": jnp.asarray([0.0, 0.0, 0.0, 9.0]), "control_scale": jnp.asarray([0.03, 1.0, 0.02, 1.5])}
-    scales = Space(**measured._asdict() | controls)
+    scales = path_space()
     model = assembly.build_model(asked["model"], scales, vehicle.kinematic())
     asked |= {"space": assembly.space_to_settings(scales)}
     return policy.save(place / "policy.npz", model.init(jax.random.key(0)), asked, made_from={}, law=law)

@@ -6,9 +6,9 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from helpers import ENV_HIGH, ENV_LOW, jit, model_and_params, same, straight
+from helpers import ENV_HIGH, ENV_LOW, TINY, any_law, jit, model_and_params, path_space, same, straight
 
-from sfkd_jax import control, evaluation, scenarios, vehicle
+from sfkd_jax import control, evaluation, models, scenarios, vehicle
 
 PLANT = vehicle.kinematic()
 LIMITS = {"control_low": PLANT.control_low, "control_high": PLANT.control_high}
@@ -56,6 +56,16 @@ def monitored():
     return watched, params
 
 
+def shielded():
+    """A planner in path coordinates, filtered; with a tiny model as it is drawn, folded."""
+    law, limits = any_law(), LIMITS | BOX
+    model = models.sfkd(path_space(), **TINY | {"budget": "joint"}, frame="path")
+    task = control.following_law(model, control.tracking_cost(dt=PLANT.dt), law, dt=PLANT.dt, **LIMITS)
+    planner = control.mppi(task, num_samples=16, horizon=HORIZON, noise_std=(0.01, 0.3), **BOX)
+    filtered = control.shielded(planner, model, law, width=0.5, tube=0.2, horizon=8, **limits)
+    return filtered, jit(model.fold)(jit(model.init)(jax.random.key(0)))
+
+
 def koopman_mpc():
     """Over a linear predictor with generic parameters."""
     model, params = model_and_params("koopman_mpc")
@@ -72,6 +82,7 @@ BUILDERS = {
     "gradient": partial(searched, control.gradient_planner, iterations=2, steps=4),
     "compensated": compensated,
     "monitored": monitored,
+    "shielded": shielded,
     "koopman_mpc": koopman_mpc,
 }
 """Name -> () -> (controller, params), for `HORIZON` steps of the kinematic plant within `LIMITS`."""

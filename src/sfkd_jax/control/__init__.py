@@ -1,5 +1,8 @@
 """Decision: planners over any rollout model. Imports jax only; takes models and costs as arguments."""
 
+from sfkd_jax.control._admission import SHARES as SHARES
+from sfkd_jax.control._admission import Admitted as Admitted
+from sfkd_jax.control._admission import admit as admit
 from sfkd_jax.control._along_path import curvature_ahead as curvature_ahead
 from sfkd_jax.control._along_path import following_law as following_law
 from sfkd_jax.control._along_path import path_coordinates as path_coordinates
@@ -42,6 +45,8 @@ from sfkd_jax.control._plans import PlannerState as PlannerState
 from sfkd_jax.control._plans import Search as Search
 from sfkd_jax.control._plans import Tuning as Tuning
 from sfkd_jax.control._risk import risk_measure as risk_measure
+from sfkd_jax.control._shield import ShieldState as ShieldState
+from sfkd_jax.control._shield import shielded as shielded
 from sfkd_jax.control._smoothing import plan_smoother as plan_smoother
 from sfkd_jax.control._smoothing import savitzky_golay_weights as savitzky_golay_weights
 from sfkd_jax.control._task import Advanced as Advanced
