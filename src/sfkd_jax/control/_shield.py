@@ -74,12 +74,12 @@ def shielded(
 
     The copy ẑ is the model driven with the car's own inputs and never corrected. `tube` is
     a certified bound of |e_y − ê_y|; see `admit` for what is let through. A control whose
-    request passes whole is returned as it came. Source: Wabersich and Zeilinger,
-    Automatica 129 (2021) 109597.
+    request passes whole is returned as it came. Slew limits of the actuators are not known
+    here. Source: Wabersich and Zeilinger, Automatica 129 (2021) 109597.
 
-    - Observation or reference not finite: ξ is that of the copy (`dead_reckoning`), the
-      preview moves on, and the certificate does not speak, since the law is not closed
-      around the car. Environment not finite: the last finite one.
+    - Observation or reference not finite: ξ is that of the copy (`dead_reckoning`), and the
+      certificate does not speak, since the law is not closed around the car; without a
+      reference the last preview moves on. Environment not finite: the last finite one.
     - Before the first step at which all three were finite there is no copy: the controller's
       control passes, clipped, or 0 if it is not finite.
     - ξ, κ_0, v_0 or e outside its box, or ξ beyond `path_frame.is_valid`: `void`, the
@@ -103,11 +103,12 @@ def shielded(
         preview_low, preview_high: box of (κ, v_ref). None: no limit.
 
     Returns:
-        A `Controller`; `info` gains `margin` [m], `intervention` (1 − s, 0 if untouched),
+        A `Controller`; `info` gains `margin` [m], `intervention` (1 − s, of the request
+        clipped to `limit`; 0 if it passed, 1 if `void` or steered back),
         `perturbation` ν', `copy` (its ξ), `copy_distance` |e_y − ê_y| [m] (NaN where there
         is nothing to compare), `corridor` = width + tube [m], `feasible`, `broken`, `void`,
         `dead_reckoning`, `request_finite`, `env_inside`, `interventions`, `broken_steps`,
-        and `shield_healthy`: the corridor is certified at this step.
+        and `shield_healthy`: feasible, and nothing at this step speaks against the corridor.
 
     Raises:
         ValueError: a model of another frame, or settings or limits that cannot be meant.
