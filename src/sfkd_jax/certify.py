@@ -12,9 +12,11 @@ from sfkd_jax.certification import (
     CertificationRefused,
     certify_incremental,
     claims_a_rate,
+    claims_of,
     issue,
 )
 from sfkd_jax.config import door
+from sfkd_jax.corridor import certify_corridor
 
 INCREMENTAL = "incremental.json"
 """A rate of a continuous flow lies apart: other doors take a certificate for one with tubes and bounds of a monitor."""
@@ -57,11 +59,11 @@ def _rate(settings: dict[str, Any], trained: policy.Trained) -> dict[str, Any]:
 def _tubes(settings: dict[str, Any], trained: policy.Trained) -> dict[str, Any]:
     """What is proved of a model's steps, and what is measured on the data of the run."""
     dataset, _ = walk.ensure_dataset(settings)
-    options = {name: value for name, value in settings["certification"].items() if name != "renew"}
+    options = {name: value for name, value in settings["certification"].items() if name not in ("renew", "corridor")}
     boxes, noise = shelf.boxes(dataset), tuple(settings["evaluation"]["observation_noise"])
     if shelf.is_logged(settings):  # the robot's own sensors are in its logs already
         boxes, noise = boxes | {"names": shelf.channel_names(settings)}, ()
-    return issue(
+    document = issue(
         trained.model,
         trained.params,
         validation=dataset.validation,
@@ -72,6 +74,11 @@ def _tubes(settings: dict[str, Any], trained: policy.Trained) -> dict[str, Any]:
         sensor_noise=noise,
         **assembly.without(options),
     )
+    if document["outputs"] and not shelf.is_logged(settings):
+        asked = assembly.without(settings["certification"]["corridor"])
+        proved = claims_of(document["outputs"])
+        document["corridor"] = certify_corridor(settings, trained, proved, **asked)
+    return document
 
 
 @shelf.exclusive

@@ -14,6 +14,7 @@ from hydra.core.config_store import ConfigStore
 
 from sfkd_jax import assembly, control, datasets, evaluation, exporting, models, scenarios, training
 from sfkd_jax.certification import issue
+from sfkd_jax.corridor import certify_corridor
 
 _SYSTEMS = ("self", "nominal", "oracle")
 _SENSORS = (0.015, 0.015, 0.002, 0.03, 0.02, 0.002, 0.001)
@@ -105,7 +106,8 @@ def register() -> None:
     protocol |= {"told": schema("ToldConfig", evaluation.told, skip=("dt",))}
     store.store(group="evaluation", name="schema", node=schema("EvaluationConfig", **protocol))
     measured = ("validation", "calibration", "held_out", "boxes", "drives", "sensor_noise")
-    node = schema("CertificationConfig", issue, skip=measured, renew=False)
+    corridor = schema("CorridorConfig", certify_corridor, skip=("settings", "trained", "outputs"))
+    node = schema("CertificationConfig", issue, skip=measured, renew=False, corridor=corridor)
     store.store(group="certification", name="schema", node=node)
     words = {
         "policies": str,
@@ -147,4 +149,5 @@ def _controller_schema() -> type:
     parts["monitor"] = schema("MonitorConfig", control.monitored, skip=watched)
     fields = [(name, part, field(default_factory=part)) for name, part in parts.items()]
     head = [("name", str), ("planner", str), ("sampling", typing.Any), ("ancillary", bool, field(default=False))]
+    head.append(("shield", bool, field(default=False)))
     return make_dataclass("ControllerConfig", [*head, *fields])

@@ -9,6 +9,10 @@ from sfkd_jax import control, vehicle
 from sfkd_jax.assembly._choices import Settings, choose, floats, without
 from sfkd_jax.types import Controller, Model
 
+ROAD_MARGIN = 0.05
+"""Relative, of the box of κ and v_ref: a reference of points has a curvature that is a little off."""
+ALLOWANCE = 3.0
+"""Standard deviations of a measured position that are not held against the tube."""
 ENVS = ("measured", "estimated", "none")
 """How a controller learns of the environment."""
 
@@ -27,6 +31,7 @@ def build_controller(
     """The planner of the settings, watched by a monitor if there is a certificate, told an estimate if `env` asks.
 
     Args:
+        certificate: what watches the planner; with a corridor and `settings["shield"]`, what its shield keeps.
         law: of a model in path coordinates, the one that it was learned around.
 
     Raises:
@@ -41,10 +46,44 @@ def build_controller(
             raise ValueError(
                 "a model in path coordinates needs controller.sampling=law, its law, and env=measured or none"
             )
-        return build(settings, model, plant, env_low, env_high, law)
+        planner = build(settings, model, plant, env_low, env_high, law)
+        if certificate and certificate.get("corridor") and settings.get("shield"):
+            return _shielded(planner, model, plant, law, certificate)
+        return planner
     planner = build(settings, model, plant, env_low, env_high)
     watched = planner if certificate is None else _monitored(planner, settings, model, certificate)
     return _estimated(watched, settings, model, plant, env_low, env_high) if env == "estimated" else watched
+
+
+def _shielded(
+    planner: Controller,
+    model: Model,
+    plant: vehicle.Vehicle,
+    law: control.PathLaw,
+    certificate: Settings,
+) -> Controller:
+    """The planner inside the corridor of a certificate; outside the boxes of ξ, e, κ and v_ref the law drives alone."""
+    corridor, boxes = certificate["corridor"], certificate["boxes"]
+    bounds, sensors = corridor["bounds"], corridor["class"]["sensor_noise"]
+    low = tuple(edge - ROAD_MARGIN * abs(edge) for edge in boxes["control"][0][2:])
+    high = tuple(edge + ROAD_MARGIN * abs(edge) for edge in boxes["control"][1][2:])
+    return control.shielded(
+        planner,
+        model,
+        law,
+        width=bounds["nominal"],
+        tube=bounds["followed_position"],
+        horizon=corridor["shield_horizon"],
+        noise_allowance=ALLOWANCE * max(sensors[:2], default=0.0),
+        control_low=plant.control_low,
+        control_high=plant.control_high,
+        env_low=tuple(boxes["env"][0]),
+        env_high=tuple(boxes["env"][1]),
+        state_low=tuple(boxes["state"][0]),
+        state_high=tuple(boxes["state"][1]),
+        preview_low=low,
+        preview_high=high,
+    )
 
 
 def _monitored(planner: Controller, settings: Settings, model: Model, certificate: Settings) -> Controller:

@@ -23,6 +23,10 @@ from sfkd_jax.certification._core import check_metric as check_metric
 from sfkd_jax.certification._core import check_witness as check_witness
 from sfkd_jax.certification._core import is_positive_definite as is_positive_definite
 from sfkd_jax.certification._core import norm_upper as norm_upper
+from sfkd_jax.certification._corridor_claims import DriveScores as DriveScores
+from sfkd_jax.certification._corridor_claims import calibrate as calibrate
+from sfkd_jax.certification._corridor_claims import covered as covered
+from sfkd_jax.certification._corridor_claims import drive_scores as drive_scores
 from sfkd_jax.certification._document import verify_document as verify_document
 from sfkd_jax.certification._environments import cover as cover
 from sfkd_jax.certification._exported import CertificationRefused as CertificationRefused
@@ -33,8 +37,13 @@ from sfkd_jax.certification._incremental import claims_a_rate as claims_a_rate
 from sfkd_jax.certification._incremental import incremental_rate as incremental_rate
 from sfkd_jax.certification._issue import issue as issue
 from sfkd_jax.certification._issue import progress as progress
+from sfkd_jax.certification._output_metrics import OUTPUTS as OUTPUTS
+from sfkd_jax.certification._output_metrics import OutputMetric as OutputMetric
+from sfkd_jax.certification._output_tubes import claims_of as claims_of
 from sfkd_jax.certification._proposals import lipschitz_upper as lipschitz_upper
 from sfkd_jax.certification._proposals import propose_multipliers as propose_multipliers
+from sfkd_jax.certification._radii import radii as radii
+from sfkd_jax.certification._radii import residuals as residuals
 from sfkd_jax.certification._solvers import solve_metric as solve_metric
 from sfkd_jax.certification._solvers import solve_multipliers as solve_multipliers
 from sfkd_jax.certification._tube import latent_tube as latent_tube

@@ -10,7 +10,10 @@ import numpy as np
 from sfkd_jax.certification._calibration import KINDS, interval, supports
 from sfkd_jax.certification._certificate import MALFORMED, Certificate, CertificateStale, verify
 from sfkd_jax.certification._claims import Refuted
-from sfkd_jax.certification._exported import CertificationRefused
+from sfkd_jax.certification._corridor_claims import require_corridor
+from sfkd_jax.certification._exported import CertificationRefused, exported, one_thread
+from sfkd_jax.certification._output_metrics import OUTPUTS, OutputMetric, require_output_metric
+from sfkd_jax.certification._output_tubes import FORMS
 from sfkd_jax.certification._tube import for_ever, latent_tube, path_tube, physical_tube
 from sfkd_jax.types import Model, Params
 
@@ -41,6 +44,7 @@ def verify_document(document: Mapping[str, Any], params: Params, *, model: Model
         _require_boxes(document["boxes"], proof)
         _require_statistics(document["d_bar"], document["monitor"])
         _require_tubes(document["tube"], proof, document["d_bar"])
+        _require_outputs(document, params, model)
         if document["decoder_lipschitz"] != proof.lipschitz.get("decoder"):
             raise Refuted("decoder_lipschitz is not that of lipschitz")
     except Refuted as reason:
@@ -98,6 +102,27 @@ def _require_tubes(tube: Mapping[str, Any], proof: Certificate, d_bar: Mapping[s
         _require_equal(f"tube.for_ever.{name}", tube["for_ever"][name], radius)
     for name, radii in physical.items():
         _require_equal(f"tube.physical.{name}", tube["physical"][name], radii)
+
+
+def _require_outputs(document: Mapping[str, Any], params: Params, model: Model) -> None:
+    """Constants in other metrics from their witnesses; tubes and corridor as far as arithmetic goes."""
+    outputs, corridor = document.get("outputs", {}), document.get("corridor")
+    if outputs and set(outputs) != set(OUTPUTS):
+        raise Refuted(f"outputs must be {' and '.join(OUTPUTS)}, got {', '.join(map(str, outputs))}")
+    weights = exported(model, params) if outputs else None
+    for name, part in outputs.items():
+        with one_thread():
+            require_output_metric(name, OutputMetric.from_document(part), weights)
+        for form in FORMS:
+            if not _numbers(f"outputs.{name}.tube", part["tube"][form]) > 0:
+                raise Refuted(f"outputs.{name}.tube.{form} is no radius")
+            share, drives = part["coverage"][form], part["coverage_drives"]
+            _require_equal(f"outputs.{name}: coverage", share, round(share * drives) / drives)
+            _require_equal(f"outputs.{name}: coverage_ci95", part["coverage_ci95"][form], interval(share, drives))
+    if corridor is not None:
+        if not outputs:
+            raise Refuted("a corridor needs a metric of every output")
+        require_corridor(corridor)
 
 
 def _numbers(name: str, values: Any) -> np.ndarray:

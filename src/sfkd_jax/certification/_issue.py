@@ -24,6 +24,7 @@ from sfkd_jax.certification._calibration import (
 )
 from sfkd_jax.certification._certificate import certify
 from sfkd_jax.certification._exported import CertificationRefused, exported, one_thread
+from sfkd_jax.certification._output_tubes import output_tubes
 from sfkd_jax.certification._proofs import joint_bound, residual_bound
 from sfkd_jax.certification._tube import for_ever, latent_tube, path_tube, physical_tube
 from sfkd_jax.types import Model, Params, Polytope, Trajectory
@@ -69,6 +70,7 @@ def issue(
     driving = jax.jit(model.fold)(params)
     try:
         found = _measure(model, driving, validation, calibration, held_out, level, drives or {})
+        outputs = _outputs(model, params, driving, (validation, calibration, held_out["test"]), level)
         alarms = _alarms(model, driving, (validation, calibration), sensor_noise, monitor_level)
     except ValueError as reason:
         raise CertificationRefused(str(reason)) from None
@@ -90,6 +92,7 @@ def issue(
             "for_ever": for_ever(ultimate, **known) if along_path else None,
             "largest_increment_m": None if along_path else largest,
         },
+        "outputs": outputs,
         "boxes": dict(boxes),
         "monitor": alarms,
         "seconds_proof": certificate.seconds,
@@ -145,6 +148,17 @@ def _measure(
         "one_step": dict(zip(KINDS, bounds.tolist(), strict=True)),
         "validation": float(np.quantile(reference.scores[:, 0], level)),
     }
+
+
+def _outputs(
+    model: Model, params: Params, driving: Params, splits: tuple[Trajectory, ...], level: float
+) -> dict[str, Any]:
+    """Tubes in metrics of their own; only along a path is the pose an output."""
+    if not model.along_path:
+        return {}
+    validation, calibration, test = splits
+    known = {"validation": validation, "calibration": calibration, "test": test}
+    return output_tubes(model, driving, exported(model, params), level=level, **known)
 
 
 def _coverage(bounds: Any, found: Disturbance, drives: int | None) -> dict[str, Any]:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from functools import partial
+from itertools import pairwise
 from typing import Any
 
 import jax
@@ -102,15 +103,15 @@ def _objective(weights: Exported, rows: Matrix, gaps: Any) -> Callable[..., tupl
     operators = jnp.asarray(weights.operators.vertices)
     rank, hidden = operators.shape[-1], sum(len(part) for part in weights.residual[:-1])
     lower = jnp.tril_indices(rank)
-    rows, gaps = jnp.asarray(rows), jnp.asarray(gaps)
+    read, driven = jnp.asarray(rows.T), jnp.asarray(gaps)
 
     def value(flat: Array, sharpness: Array) -> Array:
         factor = jnp.zeros((rank, rank)).at[lower].set(flat[: len(lower[0])])
         logs = flat[len(lower[0]) :].reshape(len(operators), hidden)
         found = jax.vmap(partial(_squares, weights.residual, factor))(jnp.exp(logs), operators)
         alpha = jnp.sqrt(_power_mean(jnp.maximum(found, 1e-12).reshape(-1), sharpness, mean=False))
-        reach = jnp.linalg.norm(jax.scipy.linalg.solve_triangular(factor, rows.T, lower=True))
-        sizes = jnp.linalg.norm(gaps @ factor, axis=-1)
+        reach = jnp.linalg.norm(jax.scipy.linalg.solve_triangular(factor, read, lower=True))
+        sizes = jnp.linalg.norm(driven @ factor, axis=-1)
         worst = jax.vmap(lambda drive: _power_mean(drive, 32.0, mean=False))(sizes)
         return jnp.log(reach * _power_mean(worst, DRIVES, mean=True)) - jnp.log(1.0 - alpha)
 
@@ -132,10 +133,10 @@ def _squares(weights: Sequence[Matrix], factor: Array, multipliers: Array, opera
     if not weights:
         return jnp.linalg.eigvalsh(linear.T @ linear)
     edges = np.cumsum([0, *(len(part) for part in weights[:-1])])
-    blocks = [slice(a, b) for a, b in zip(edges[:-1], edges[1:], strict=True)]
+    blocks = [slice(a, b) for a, b in pairwise(edges)]
     output = jnp.zeros((len(factor), edges[-1])).at[:, blocks[-1]].set(factor.T @ weights[-1])
     inner = 2 * jnp.diag(multipliers) - output.T @ output
-    for k, (before, here) in enumerate(zip(blocks[:-1], blocks[1:], strict=True)):
+    for k, (before, here) in enumerate(pairwise(blocks)):
         coupling = multipliers[here, None] * weights[k + 1]
         inner = inner.at[here, before].add(-coupling).at[before, here].add(-coupling.T)
     entry = multipliers[blocks[0], None] * (weights[0] @ inverse.T)

@@ -63,10 +63,7 @@ class OutputMetric(NamedTuple):
             KeyError, TypeError, ValueError: it is not one.
         """
         witness = document["witness"]
-        joint = [
-            [np.asarray(part, dtype=np.float64) for part in vertex]
-            for vertex in witness["joint"]
-        ]
+        joint = [[np.asarray(part, dtype=np.float64) for part in vertex] for vertex in witness["joint"]]
         metric = np.asarray(witness["metric"], dtype=np.float64)
         return cls(document["alpha"], document["lipschitz"], metric, joint)
 

@@ -23,6 +23,8 @@ Admit: TypeAlias = Callable[[State, Float[Array, "time 4"], Float[Array, "time e
 Sensors: TypeAlias = Callable[[Key, State, Control, Environment], Control]
 """(key, path state, w, e) -> what the law adds to ν because it sees a measurement of the state."""
 
+SWITCHES = (1.5, 6.0)
+"""Range of times between switches in the data [s]."""
 BURN_IN = 20
 """Steps driven before a drive starts, so that the car is where the law brings it and not where it was put."""
 SENSORS = 3
@@ -46,10 +48,10 @@ def generate_along_path(
     env_low: tuple[float, ...],
     env_high: tuple[float, ...],
 ) -> Trajectory:
-    """Independent drives under any ν: a quarter on S1, a quarter on S2, half with e held anywhere in E.
+    """Independent drives under any ν: a quarter each on S1, on S2, with e held anywhere in E, and under any switching.
 
-    Of the held environments a third of every entry lies at an end of its range, so that the corners of E are
-    driven. Roads and ν are those of `drive_along_path`.
+    Of the last two a third of every entry of e lies at an end of its range, so that the corners of E are driven;
+    switches are `SWITCHES` apart. Roads and ν are those of `drive_along_path`.
 
     Args:
         loop: of `vehicle.along_path`. key: consumed. segments, steps: how many, how long.
@@ -67,7 +69,11 @@ def generate_along_path(
             partial(wet_road, steps=steps, dt=loop.dt, before=(0.55, 0.9), after=(0.3, 0.5), drop_time=during),
             segments // 4,
         ),
-        (partial(held_road, steps=steps, low=env_low, high=env_high), segments - 2 * (segments // 4)),
+        (partial(held_road, steps=steps, low=env_low, high=env_high), segments // 4),
+        (
+            partial(random_switching, steps=steps, dt=loop.dt, low=env_low, high=env_high, dwell=SWITCHES),
+            segments - 3 * (segments // 4),
+        ),
     ]
     env_key, drive_key = jax.random.split(key)
     envs = [
@@ -115,7 +121,7 @@ def drive_along_path(
         speed: range of v_ref [m/s]. peak_curvature: [1/m]. wavelengths: of the road [m].
         lateral_acceleration: largest v_ref² |κ| [m/s²].
         steering_excitation: range of the spread of ν_1 [rad]. speed_excitation: of ν_2 [m/s² or m/s].
-        offset: largest e_y [m], e_ψ [rad] and v − v_ref [m/s] at the start. burn_in: steps driven before a drive starts.
+        offset: largest e_y [m], e_ψ [rad] and v − v_ref [m/s] at the start. burn_in: steps before a drive starts.
         admit: a filter of ν that sees the drive's conditions and not the car; what it lets through is w.
         sensors: of the law; what they add to ν is not part of w.
     """

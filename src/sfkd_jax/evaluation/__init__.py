@@ -4,6 +4,11 @@ from sfkd_jax.evaluation._closed_loop import Episode as Episode
 from sfkd_jax.evaluation._closed_loop import first_reference as first_reference
 from sfkd_jax.evaluation._closed_loop import pushed as pushed
 from sfkd_jax.evaluation._closed_loop import simulate as simulate
+from sfkd_jax.evaluation._corridor_attack import AIMS as AIMS
+from sfkd_jax.evaluation._corridor_attack import Outcome as Outcome
+from sfkd_jax.evaluation._corridor_attack import Tube as Tube
+from sfkd_jax.evaluation._corridor_attack import attack_corridor as attack_corridor
+from sfkd_jax.evaluation._corridor_attack import outcome_of as outcome_of
 from sfkd_jax.evaluation._metrics import Scores as Scores
 from sfkd_jax.evaluation._metrics import score as score
 from sfkd_jax.evaluation._open_loop import open_loop as open_loop

@@ -78,7 +78,7 @@ def sfkd(
         residual: "sandwich", "free" (no bound by construction; ||A_j|| ≤ ρ) or "none" (||A_j|| ≤ ρ).
         budget: "joint" or "sum", of a sandwich residual.
         transport: learn Q(e), else the identity. environment: use e at all.
-        forcing_hidden: width of f(u, e) = V tanh(G(e) u + h(e)), added to B(e) u: it is no function of z, so every bound
+        forcing_hidden: width of f(u, e) = V tanh(G(e) u + h(e)), added to B(e) u: no function of z, so every bound
             stands as it is; 0 for none.
         learn_alpha: let training choose α of a joint budget between `LOWEST_RATE` and ρ + β, from the latter on.
         soft_penalty: weight of the paper's hinge max(0, ||∂r/∂z||_2 − β)² in the training loss (eq:contr_loss).
@@ -88,9 +88,8 @@ def sfkd(
     """
     check_settings(rank, rho, beta, frame, residual, budget, learn_alpha)
     segment, pose = frame == "segment", frame != "path"
-    body = space.body_mean.shape[0]
+    body, control = space.body_mean.shape[0], space.control_mean.shape[0]
     hidden = tuple(residual_hidden), tuple(decoder_hidden)
-    control = space.control_mean.shape[0]
     bounds = (rho, beta, residual, transport, budget, pose, learn_alpha, forcing_hidden)
     networks = Networks(rank, body, control, vertices, *hidden, embedding, *bounds)
     encoder = Encoder(rank, encoder_hidden, linear_lift)
