@@ -99,6 +99,8 @@ def require_corridor(corridor: Mapping[str, Any]) -> None:
     drives, level = corridor["drives"], corridor["level"]
     if not (isinstance(drives, int) and drives > 0 and 0 < level < 1 and supports(drives, level)):
         raise Refuted(f"corridor.level = {level!r} cannot be had from {drives!r} drives")
+    if not corridor["attack"]["over_tube"] <= 1.0:
+        raise Refuted("corridor.attack is a car outside of its tube whose disturbances kept their bound")
     for name, part in {"corridor": corridor, **corridor["by_scenario"]}.items():
         count = part["coverage_trajectories"]
         inside = round(part["coverage"] * count)

@@ -98,6 +98,7 @@ def require_output_metric(name: str, claim: OutputMetric, weights: Exported) -> 
         raise Refuted(f"outputs.{name}.lipschitz does not follow from its witness")
 
 
+@np.errstate(over="ignore", invalid="ignore")  # NaN and infinity are refused by the core
 def reads_within(rows: Matrix, bound: float, metric: Matrix) -> bool:
     """Whether |C z| < b |z|_P for every z, which is b² P − C'C > 0."""
     squared, rounding = product(rows.T, rows)
