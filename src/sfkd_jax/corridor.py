@@ -203,7 +203,7 @@ def _attack(
     return {"steps": options["steps"]} | worst | shares
 
 
-def _seen(loop: _Loop, key: Key, state: State, inputs: Control, env: Environment) -> Control:
+def _seen(loop: _Loop, key: Key, state: State, inputs: Control, env: Environment) -> jax.Array:
     """What the law adds to ν because it sees ξ through the sensors."""
     coordinates, road = state[BODY], inputs[PERTURBATION.stop :]
     spread = _spread(loop.noise, state.shape[-1])[BODY]

@@ -1,0 +1,145 @@
+"""The corridor of a policy, end to end: an untrained one, for what is claimed does not depend on training."""
+
+import copy
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from helpers import any_law
+from test_path_policy import saved, settings
+
+from sfkd_jax import assembly, datasets, policy
+from sfkd_jax.certification import CertificationRefused, claims_of, issue, verify_document
+from sfkd_jax.corridor import certify_corridor
+from sfkd_jax.types import Trajectory
+from sfkd_jax.vehicle import along_path, kinematic
+
+DRIVEN = {"env_low": (0.3, -8.0), "env_high": (0.9, 8.0)}
+SMALL = {"drives": 24, "duration": 4.0, "attack_steps": 3000}
+
+
+@pytest.fixture(scope="module")
+def trained(tmp_path_factory):
+    place = tmp_path_factory.mktemp("policy")
+    saved(place, law=any_law())
+    return policy.restore(place)
+
+
+@pytest.fixture(scope="module")
+def asked():
+    return settings("certification.level=0.9", "certification=tiny")
+
+
+@pytest.fixture(scope="module")
+def document(trained, asked):
+    """As `certify` makes it, with fewer and shorter drives."""
+    loop = along_path(kinematic(), trained.law)
+    make = jax.jit(lambda key: datasets.generate_along_path(loop, key, segments=120, steps=20, **DRIVEN))
+    driven = make(jax.random.key(1))
+    parts = {
+        name: jax.tree.map(lambda leaf, k=k: leaf[k::3], driven)
+        for k, name in enumerate(("validation", "calibration", "test"))
+    }
+    held_out = {"test": parts.pop("test")}
+    body = np.asarray(driven.states)[..., 3:].reshape(-1, 3)
+    boxes = {"state": [body.min(0).tolist(), body.max(0).tolist()], "env": [list(side) for side in DRIVEN.values()]}
+    boxes["control"] = [[-0.03, -1.0, -0.02, 8.0], [0.03, 1.0, 0.02, 10.5]]
+    options = {"level": 0.9, "monitor_level": 0.9, "attack_starts": 0}
+    found = issue(trained.model, trained.params, **parts, held_out=held_out, boxes=boxes, **options)
+    found["corridor"] = certify_corridor(asked, trained, claims_of(found["outputs"]), **SMALL)
+    return found | {"policy_sha256": trained.sha256}
+
+
+def check(document, trained):
+    verify_document(document, trained.params, model=trained.model, policy_sha256=trained.sha256)
+
+
+def test_the_document_verifies_and_a_changed_one_does_not(document, trained):
+    check(document, trained)
+    for part, name, value in (
+        ("corridor", "corridor_m", 0.01),
+        ("corridor", "coverage", 1.5),
+        ("outputs", "position", document["outputs"]["yaw"]),
+    ):
+        changed = copy.deepcopy(document)
+        changed[part][name] = value
+        with pytest.raises(CertificationRefused):
+            check(changed, trained)
+    without = copy.deepcopy(document)
+    without["outputs"] = {}
+    with pytest.raises(CertificationRefused, match="needs a metric"):
+        check(without, trained)
+
+
+def test_what_is_claimed_is_one_sum_of_what_is_calibrated(document):
+    found = document["corridor"]
+    assert found["corridor_m"] == pytest.approx(found["bounds"]["nominal"] + found["bounds"]["followed_position"])
+    assert found["bounds"]["followed_position"] <= found["bounds"]["for_ever_position"]
+    assert 0.6 <= found["coverage"] <= 1.0
+    assert found["drives"] == SMALL["drives"]
+    assert found["attack"]["over_tube"] <= 1.0
+
+
+def test_the_same_seed_gives_the_same_corridor(document, trained, asked):
+    again = certify_corridor(asked, trained, claims_of(document["outputs"]), **SMALL)
+    assert {**again, "seconds": 0.0} == {**document["corridor"], "seconds": 0.0}
+
+
+def test_a_policy_without_a_law_has_no_corridor(trained, asked, document):
+    with pytest.raises(ValueError, match="with its law"):
+        certify_corridor(asked, trained._replace(law=None), claims_of(document["outputs"]), **SMALL)
+
+
+def test_a_controller_with_a_corridor_is_shielded_when_asked(document, trained, asked):
+    """And then a request beyond its limits is cut, the copy reported, and both are off without `shield`."""
+    plant = kinematic()
+    reference = jnp.column_stack([jnp.arange(1, 21.0), jnp.zeros(20), jnp.zeros(20), jnp.full(20, 9.0)])
+    state = jnp.asarray([0.0, 0.0, 0.0, 9.0])
+    for shield in (True, False):
+        chosen = asked["controller"] | {"shield": shield}
+        chosen["mppi"] = chosen["mppi"] | {"num_samples": 4}
+        built = assembly.build_controller(chosen, trained.model, plant, certificate=document, law=trained.law, **DRIVEN)
+        _, _, info = jax.jit(built.act)(
+            trained.params, built.init(jax.random.key(0)), state, jnp.asarray([0.6, 0.0]), reference
+        )
+        assert ("corridor" in info) == shield
+        if shield:
+            assert info["corridor"] == pytest.approx(document["corridor"]["corridor_m"], rel=1e-5)
+            assert not info["void"]
+
+
+def test_what_sensors_add_is_no_part_of_the_recorded_perturbation(trained):
+    """A class drive with sensors records the ν that was asked for; the car moves otherwise."""
+    loop = along_path(kinematic(), trained.law)
+    asked = {"drives": 2, "steps": 30, "offset": (0.0, 0.0, 0.0), "burn_in": 0, **DRIVEN}
+
+    def noisy(key, state, inputs, env):
+        del state, inputs, env
+        return jnp.asarray([0.01, 0.0]) * jax.random.normal(key, (2,))
+
+    plain, seen = (
+        jax.jit(lambda key, hook=hook: datasets.drive_switching(loop, key, sensors=hook, **asked))(jax.random.key(4))
+        for hook in (None, noisy)
+    )
+    assert isinstance(plain, Trajectory)
+    np.testing.assert_allclose(plain.controls, seen.controls, rtol=1e-5)
+    assert float(jnp.max(jnp.abs(plain.states - seen.states))) > 1e-3
+    np.testing.assert_array_equal(plain.states[:, 0, 3:5], np.zeros((2, 2)))
+
+
+def test_a_filter_of_a_drive_sees_it_whole_and_its_answer_is_what_is_driven(trained):
+    loop = along_path(kinematic(), trained.law)
+    asked = {"drives": 2, "steps": 30, "burn_in": 0, **DRIVEN}
+
+    def halve(start, inputs, envs):
+        assert (start.shape, inputs.shape, envs.shape) == ((6,), (30, 4), (30, 2))
+        return inputs.at[:, :2].multiply(0.5)
+
+    plain, cut = (
+        jax.jit(lambda key, hook=hook: datasets.drive_switching(loop, key, admit=hook, **asked))(jax.random.key(5))
+        for hook in (None, halve)
+    )
+    np.testing.assert_allclose(cut.controls[..., :2], 0.5 * plain.controls[..., :2], rtol=1e-6)
+    again = jax.vmap(jax.vmap(loop.step))(cut.states[:, :-1], cut.controls, cut.envs)
+    np.testing.assert_allclose(again, cut.states[:, 1:], atol=1e-5)
