@@ -138,18 +138,19 @@ def certify(
     )
 
 
-def verify(certificate: Certificate, params: Params, *, model: Model) -> None:
+def verify(certificate: Certificate, params: Params, *, model: Model, weights: Exported | None = None) -> None:
     """Check a certificate against weights, without any search: milliseconds, once `model.explicit` is compiled.
 
     Args:
         certificate: of unknown origin. params: weights. model: what turns them into explicit ones.
+        weights: the explicit ones, where they are at hand.
 
     Raises:
         CertificateStale: it is about other weights. CertificationRefused: a claim does not follow from its witness.
     """
     if fingerprint(params) != certificate.params_sha256:
         raise CertificateStale("the certificate is about other weights")
-    weights = exported(model, params)
+    weights = exported(model, params) if weights is None else weights
     claims = Claims(**{name: getattr(certificate, name) for name in Claims._fields})
     try:
         with one_thread():

@@ -11,7 +11,7 @@ from sfkd_jax.certification._calibration import KINDS, interval, supports
 from sfkd_jax.certification._certificate import MALFORMED, Certificate, CertificateStale, verify
 from sfkd_jax.certification._claims import Refuted
 from sfkd_jax.certification._corridor_claims import require_corridor
-from sfkd_jax.certification._exported import CertificationRefused, exported, one_thread
+from sfkd_jax.certification._exported import CertificationRefused, Exported, exported, one_thread
 from sfkd_jax.certification._output_metrics import OUTPUTS, OutputMetric, require_output_metric
 from sfkd_jax.certification._output_tubes import FORMS
 from sfkd_jax.certification._tube import for_ever, latent_tube, path_tube, physical_tube
@@ -39,12 +39,13 @@ def verify_document(document: Mapping[str, Any], params: Params, *, model: Model
     if document.get("policy_sha256") != policy_sha256:
         raise CertificateStale("the certificate is about other weights or settings")
     proof = Certificate.from_document(dict(document))
-    verify(proof, params, model=model)
+    weights = exported(model, params)
+    verify(proof, params, model=model, weights=weights)
     try:
         _require_boxes(document["boxes"], proof)
         _require_statistics(document["d_bar"], document["monitor"])
         _require_tubes(document["tube"], proof, document["d_bar"])
-        _require_outputs(document, params, model)
+        _require_outputs(document, weights)
         if document["decoder_lipschitz"] != proof.lipschitz.get("decoder"):
             raise Refuted("decoder_lipschitz is not that of lipschitz")
     except Refuted as reason:
@@ -104,12 +105,11 @@ def _require_tubes(tube: Mapping[str, Any], proof: Certificate, d_bar: Mapping[s
         _require_equal(f"tube.physical.{name}", tube["physical"][name], radii)
 
 
-def _require_outputs(document: Mapping[str, Any], params: Params, model: Model) -> None:
+def _require_outputs(document: Mapping[str, Any], weights: Exported) -> None:
     """Constants in other metrics from their witnesses; tubes and corridor as far as arithmetic goes."""
     outputs, corridor = document.get("outputs", {}), document.get("corridor")
     if outputs and set(outputs) != set(OUTPUTS):
         raise Refuted(f"outputs must be {' and '.join(OUTPUTS)}, got {', '.join(map(str, outputs))}")
-    weights = exported(model, params) if outputs else None
     for name, part in outputs.items():
         with one_thread():
             require_output_metric(name, OutputMetric.from_document(part), weights)

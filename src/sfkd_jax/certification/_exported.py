@@ -16,8 +16,8 @@ from sfkd_jax.types import Incremental, Model, Params, Samples
 ACTIVATIONS = ("tanh", "relu", "sigmoid", "softplus", "elu")
 """Those whose slopes lie in [0, 1] everywhere; gelu and silu leave it."""
 TRANSPORTS = ("identity", "rotation")
-ONCE = {"xla_backend_optimization_level": 0}
-"""Of what is compiled to run once: optimising takes longer than running it."""
+ONCE = {"xla_backend_optimization_level": 1}
+"""Of what is compiled to run a few times: full optimisation takes longer than it saves, none at all costs milliseconds."""
 Exported: TypeAlias = Any
 """An `Explicit` (or an `Incremental`) whose leaves are float64 numpy arrays."""
 
