@@ -229,3 +229,11 @@ def test_the_table_of_drills_is_that_of_the_run():
     shown = (DOCS / "failures.md").read_text("utf-8").split("<!-- drills -->")[1].split("<!-- end of drills -->")[0]
     assert shown.strip() == table
     assert table.endswith("| 0 | 0 | 0 |")
+
+
+def test_the_page_about_the_corridor_says_what_the_certificates_say():
+    """Its table is what benchmarks/corridor.py makes of the shipped certificates and the committed rows."""
+    made = runpy.run_path(str(ROOT / "benchmarks" / "corridor.py"))
+    text = (DOCS / "corridor.md").read_text("utf-8")
+    assert made["table"]() in text
+    assert made["page"](text) == text

@@ -11,7 +11,8 @@ from sfkd_jax.config import door
 from sfkd_jax.reporting import animate
 
 SHIPPED = Path(__file__).with_name("pretrained")
-"""vehicle -> policy.npz, its manifest and its certificate, as `train` left them."""
+"""vehicle, or vehicle_path in path coordinates -> policy.npz, its manifest and its certificate, as `train` left them."""
+ALONG_PATH = "_path"
 
 
 def run(settings: dict[str, Any]) -> dict[str, Any]:
@@ -47,7 +48,8 @@ def _shipped(settings: dict[str, Any], vehicle: str) -> policy.Policy:
     """The policy for a vehicle, with a certificate that holds."""
     if settings["env"] == "none":
         raise ValueError("the controllers that ship read the environment; choose env=measured or env=estimated")
-    known = sorted(place.name for place in SHIPPED.iterdir() if place.is_dir())
+    places = sorted(place.name for place in SHIPPED.iterdir() if place.is_dir())
+    known = [name for name in places if not name.endswith(ALONG_PATH)]
     began = time.perf_counter()
     trained = policy.load(SHIPPED / vehicle, controller=settings["controller"]) if vehicle in known else None
     if trained is None or trained.settings["vehicle"] != settings["vehicle"]:

@@ -55,7 +55,7 @@ def at(document, path):
     return document
 
 
-@pytest.mark.parametrize("plant", PLANTS)
+@pytest.mark.parametrize("plant", [*PLANTS, *(f"{plant}_path" for plant in PLANTS)])
 def test_what_ships_verifies(plant):
     check(honest(plant), plant)
 

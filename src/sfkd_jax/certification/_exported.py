@@ -17,7 +17,7 @@ ACTIVATIONS = ("tanh", "relu", "sigmoid", "softplus", "elu")
 """Those whose slopes lie in [0, 1] everywhere; gelu and silu leave it."""
 TRANSPORTS = ("identity", "rotation")
 ONCE = {"xla_backend_optimization_level": 1}
-"""Of what is compiled to run a few times: full optimisation takes longer than it saves, none at all costs milliseconds."""
+"""Of what is compiled to run a few times: full optimisation takes longer than it saves, none costs milliseconds."""
 Exported: TypeAlias = Any
 """An `Explicit` (or an `Incremental`) whose leaves are float64 numpy arrays."""
 
