@@ -4,6 +4,7 @@ import ast
 import json
 import re
 import runpy
+from collections import Counter
 from functools import cache
 from pathlib import Path
 
@@ -172,6 +173,28 @@ def test_the_tables_of_the_certificates_page_are_those_of_their_files():
     assert searched["false_and_accepted"] == 0
     assert f"{searched['cases']:_}".replace("_", " ") + " hostile" in page
     assert f"{100 * searched['accepted'] / searched['true']:.0f} % of those that hold" in " ".join(page.split())
+
+
+def rows_between(page, mark):
+    """Cells of the lines below the head of a table between two marks."""
+    table = page.split(f"<!-- {mark} -->\n")[1].split(f"<!-- end of {mark} -->")[0]
+    return [[cell.strip() for cell in line.strip("|").split("|")] for line in table.splitlines()[2:]]
+
+
+def test_what_the_tests_of_a_certificate_notice_is_what_was_counted():
+    """Changes by file, and by reason those that none notices, each of which is argued."""
+    files = json.loads((ROOT / "benchmarks" / "mutants.json").read_text())["files"]
+    page = (DOCS / "certificate.md").read_text("utf-8")
+    total, killed = (sum(row[key] for row in files.values()) for key in ("total", "killed"))
+    counted = [[f"`{name}`", str(row["total"]), str(row["killed"])] for name, row in files.items()]
+    assert rows_between(page, "mutants") == [*counted, ["all", str(total), f"{killed} ({100 * killed / total:.1f} %)"]]
+    reasons = Counter(reason for row in files.values() for reason in row["survived"].values())
+    assert {reason: int(count) for reason, count in rows_between(page, "survivors")} == reasons
+    assert "not argued" not in reasons
+    assert killed + reasons.total() == total
+    assert killed >= 0.95 * total
+    assert f"by hand {sum(row['named'] for row in files.values())} mistakes" in " ".join(page.split())
+    assert not [what for row in files.values() for what in row["survived"] if what.startswith("named")]
 
 
 def test_the_page_about_an_estimated_environment_says_what_the_results_say():
