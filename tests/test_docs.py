@@ -245,6 +245,19 @@ def test_the_page_about_an_estimated_environment_says_what_the_results_say():
     assert f"{gaps[0]:.0f} and {gaps[1]:.0f} mm below every row that is not told e" in text
 
 
+def test_what_the_fuzzer_found_is_what_the_page_says():
+    """Every file was accepted or refused."""
+    found = json.loads((ROOT / "benchmarks/fuzz.json").read_text())
+    page = " ".join((DOCS / "failures.md").read_text("utf-8").split())
+    accepted, refused = (sum(row.get(key, 0) for row in found["readers"].values()) for key in ("accepted", "refused"))
+    told = f"accepted {accepted:_} files, refused {refused:_}, and found {len(found['faults'])} faults".replace(
+        "_", " "
+    )
+    assert told in page
+    assert f"memory grew by {found['memory_MiB']['grown_by']} MiB" in page
+    assert accepted + refused == found["cases"] == 100_000
+
+
 def test_the_table_of_drills_is_that_of_the_run():
     """And nothing was damaged, failed or ended differently."""
     drills = json.loads((ROOT / "benchmarks/drills.json").read_text())
