@@ -265,3 +265,18 @@ def test_the_table_of_drills_is_that_of_the_run():
     shown = (DOCS / "failures.md").read_text("utf-8").split("<!-- drills -->")[1].split("<!-- end of drills -->")[0]
     assert shown.strip() == table
     assert table.endswith("| 0 | 0 | 0 |")
+
+
+def test_the_table_of_the_long_drive_is_that_of_its_run(monkeypatch):
+    """Every leg is there, and none failed at what is asked of all."""
+    monkeypatch.syspath_prepend(str(ROOT / "benchmarks"))
+    found = json.loads((ROOT / "benchmarks/soak.json").read_text())
+    soak = runpy.run_path(str(ROOT / "benchmarks/soak.py"))
+    shown = (DOCS / "failures.md").read_text("utf-8").split("<!-- soak -->")[1].split("<!-- end of soak -->")[0]
+    assert shown.strip() == soak["table"](found)
+    assert found["legs"].keys() == soak["LEGS"].keys()
+    for leg in found["legs"].values():
+        assert leg["outside_limits"] == leg["not_finite"] == leg["compiled_later"] == leg["state_not_finite_after"] == 0
+        assert leg["compilations"] == 1
+        assert leg["arrays"]["start"] == leg["arrays"]["end"]
+        assert all(fault["until_healthy"]["never"] == 0 for fault in leg["faults"].values())
