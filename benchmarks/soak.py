@@ -1,6 +1,7 @@
 """Drive the shipped policies for 10^5 steps and more while what they are told is wrong every few seconds.
 
 python benchmarks/soak.py [--steps 100000 --short 5000 --full 2000 --only LEG ... --out benchmarks/soak.json]
+Legs that a file of the same settings has already are kept beside those that are driven.
 The controller is a user's: certified, watched, holding its plan where the monitor objects, its `act` jitted once and
 its state never started anew, while roads of 1000 steps follow each other. Every leg has a process of its own. Asked
 for: no control outside the limits, one compilation, memory that does not grow, a state that is finite after a fault.
@@ -146,6 +147,24 @@ def spread(counts):
     return {"median": statistics.median(ended), "max": max(ended), "never": len(counts) - len(ended)}
 
 
+def table(document):
+    """What was found, as docs/failures.md has it."""
+    heads = ["leg", "steps", "controls outside limits or not finite", "compilations of `act`"]
+    heads += [f"memory [MB] {when}" for when in ("at the start", "in the middle", "at the end")]
+    heads += ["growth in the second half [kB per 1000 steps]", "longest until `healthy` [steps]"]
+    heads += ["steps off the lane", "of those 10 s after a fault", "put back"]
+    lines = [heads, ["---"] * len(heads)]
+    for name, leg in ((name, document["legs"][name]) for name in LEGS if name in document["legs"]):
+        memory, waits = leg["memory"], [fault["until_healthy"] for fault in leg["faults"].values()]
+        longest = "never" if any(wait["never"] for wait in waits) else max(wait["max"] or 0 for wait in waits)
+        cells = [name.replace("_", " "), leg["steps"], leg["outside_limits"] + leg["not_finite"]]
+        cells += [leg["compilations"] + leg["compiled_later"]]
+        cells += [f"{memory[f'{when}_kb'] / 1024:.1f}" for when in ("start", "middle", "end")]
+        cells += [f"{round(memory['slope_kb_per_1000_steps'], 1) + 0.0:.1f}", longest]  # no -0.0
+        lines.append([*cells, leg["off_lane"]["steps"], leg["off_lane"]["settled_steps"], leg["put_back"]])
+    return "\n".join(f"| {' | '.join(map(str, cells))} |" for cells in lines)
+
+
 def main():
     """Parse, drive every leg in a process of its own, print, write."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
@@ -163,15 +182,15 @@ def main():
         return
     settings = {key: getattr(asked, key) for key in ("steps", "short", "full", "seed")}
     words = [word for key, value in settings.items() for word in (f"--{key}", value)]
-    document = {
-        "legs": {},
-        "settings": settings | {"samples": SAMPLES, "horizon": HORIZON},
-        "machine": timing.machine(),
-    }
+    settings |= {"samples": SAMPLES, "horizon": HORIZON}
+    known = json.loads(Path(asked.out).read_text()) if asked.out and Path(asked.out).exists() else {}
+    legs = known["legs"] if known.get("settings") == settings else {}
+    document = {"legs": legs, "settings": settings, "machine": timing.machine()}
     for leg in asked.only:
         document["legs"][leg] = timing.in_own_process("soak.py", "--measure", leg, *words, environment=ENVIRONMENT)
         print(leg, json.dumps(document["legs"][leg]), flush=True)
         timing.write(asked.out, document)
+    print(table(document), flush=True)
 
 
 if __name__ == "__main__":

@@ -1,5 +1,6 @@
 """Small builders that several test files share."""
 
+import copy
 import inspect
 import json
 import resource
@@ -265,3 +266,21 @@ def refusal_of(action):
         return None
     assert "\n" not in line
     return line
+
+
+def put(document, path, value):
+    """A copy with the value at a dotted path replaced."""
+    changed = copy.deepcopy(document)
+    *above, last = path.split(".")
+    inner = changed
+    for key in above:
+        inner = inner[int(key) if isinstance(inner, list) else key]
+    inner[int(last) if isinstance(inner, list) else last] = value
+    return changed
+
+
+def entry_at(document, path):
+    """The value at a dotted path."""
+    for key in path.split("."):
+        document = document[int(key) if isinstance(document, list) else key]
+    return document

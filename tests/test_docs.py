@@ -4,6 +4,7 @@ import ast
 import json
 import re
 import runpy
+from collections import Counter
 from functools import cache
 from pathlib import Path
 
@@ -174,6 +175,28 @@ def test_the_tables_of_the_certificates_page_are_those_of_their_files():
     assert f"{100 * searched['accepted'] / searched['true']:.0f} % of those that hold" in " ".join(page.split())
 
 
+def rows_between(page, mark):
+    """Cells of the lines below the head of a table between two marks."""
+    table = page.split(f"<!-- {mark} -->\n")[1].split(f"<!-- end of {mark} -->")[0]
+    return [[cell.strip() for cell in line.strip("|").split("|")] for line in table.splitlines()[2:]]
+
+
+def test_what_the_tests_of_a_certificate_notice_is_what_was_counted():
+    """Changes by file, and by reason those that none notices, each of which is argued."""
+    files = json.loads((ROOT / "benchmarks" / "mutants.json").read_text())["files"]
+    page = (DOCS / "certificate.md").read_text("utf-8")
+    total, killed = (sum(row[key] for row in files.values()) for key in ("total", "killed"))
+    counted = [[f"`{name}`", str(row["total"]), str(row["killed"])] for name, row in files.items()]
+    assert rows_between(page, "mutants") == [*counted, ["all", str(total), f"{killed} ({100 * killed / total:.1f} %)"]]
+    reasons = Counter(reason for row in files.values() for reason in row["survived"].values())
+    assert {reason: int(count) for reason, count in rows_between(page, "survivors")} == reasons
+    assert "not argued" not in reasons
+    assert killed + reasons.total() == total
+    assert killed >= 0.95 * total
+    assert f"by hand {sum(row['named'] for row in files.values())} mistakes" in " ".join(page.split())
+    assert not [what for row in files.values() for what in row["survived"] if what.startswith("named")]
+
+
 def test_the_page_about_an_estimated_environment_says_what_the_results_say():
     """Every number of its table, and the differences that the text draws from it."""
     found, table = (
@@ -222,6 +245,19 @@ def test_the_page_about_an_estimated_environment_says_what_the_results_say():
     assert f"{gaps[0]:.0f} and {gaps[1]:.0f} mm below every row that is not told e" in text
 
 
+def test_what_the_fuzzer_found_is_what_the_page_says():
+    """Every file was accepted or refused."""
+    found = json.loads((ROOT / "benchmarks/fuzz.json").read_text())
+    page = " ".join((DOCS / "failures.md").read_text("utf-8").split())
+    accepted, refused = (sum(row.get(key, 0) for row in found["readers"].values()) for key in ("accepted", "refused"))
+    told = f"accepted {accepted:_} files, refused {refused:_}, and found {len(found['faults'])} faults".replace(
+        "_", " "
+    )
+    assert told in page
+    assert f"memory grew by {found['memory_MiB']['grown_by']} MiB" in page
+    assert accepted + refused == found["cases"] == 100_000
+
+
 def test_the_table_of_drills_is_that_of_the_run():
     """And nothing was damaged, failed or ended differently."""
     drills = json.loads((ROOT / "benchmarks/drills.json").read_text())
@@ -237,3 +273,18 @@ def test_the_page_about_the_corridor_says_what_the_certificates_say():
     text = (DOCS / "corridor.md").read_text("utf-8")
     assert made["table"]() in text
     assert made["page"](text) == text
+
+
+def test_the_table_of_the_long_drive_is_that_of_its_run(monkeypatch):
+    """Every leg is there, and none failed at what is asked of all."""
+    monkeypatch.syspath_prepend(str(ROOT / "benchmarks"))
+    found = json.loads((ROOT / "benchmarks/soak.json").read_text())
+    soak = runpy.run_path(str(ROOT / "benchmarks/soak.py"))
+    shown = (DOCS / "failures.md").read_text("utf-8").split("<!-- soak -->")[1].split("<!-- end of soak -->")[0]
+    assert shown.strip() == soak["table"](found)
+    assert found["legs"].keys() == soak["LEGS"].keys()
+    for leg in found["legs"].values():
+        assert leg["outside_limits"] == leg["not_finite"] == leg["compiled_later"] == leg["state_not_finite_after"] == 0
+        assert leg["compilations"] == 1
+        assert leg["arrays"]["start"] == leg["arrays"]["end"]
+        assert all(fault["until_healthy"]["never"] == 0 for fault in leg["faults"].values())

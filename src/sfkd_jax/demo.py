@@ -11,7 +11,7 @@ from sfkd_jax.config import door
 from sfkd_jax.reporting import animate
 
 SHIPPED = Path(__file__).with_name("pretrained")
-"""vehicle, or vehicle_path in path coordinates -> policy.npz, its manifest and its certificate, as `train` left them."""
+"""vehicle, or vehicle_path in path coordinates -> policy.npz, its manifest and certificate, as `train` left them."""
 ALONG_PATH = "_path"
 
 

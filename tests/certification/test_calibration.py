@@ -1,13 +1,16 @@
 """What is measured: intervals of proportions, conformal bounds, disturbances."""
 
+import inspect
 from functools import partial
+from types import SimpleNamespace
 
-import jax
+import jax.numpy as jnp
 import numpy as np
 import pytest
 from helpers import driven, model_and_params
 
 from sfkd_jax.certification import (
+    _calibration,
     clopper_pearson,
     conformal_bounds,
     coverage,
@@ -17,6 +20,7 @@ from sfkd_jax.certification import (
     tube_units,
 )
 from sfkd_jax.certification._calibration import Disturbance
+from sfkd_jax.types import Trajectory
 
 
 @pytest.mark.parametrize(
@@ -98,8 +102,9 @@ def test_bounds_do_not_depend_on_the_units_of_a_kind():
 
 def test_a_kind_that_never_errs_needs_no_unit():
     silent = Disturbance(scores(np.random.default_rng(3), 40).scores * np.asarray([1.0, 0.0, 1.0, 1.0]))
-    bounds = conformal_bounds(even_units(silent), silent, level=0.9)
-    assert np.all(np.isfinite(bounds))
+    assert even_units(silent)[1] == 1.0
+    assert np.all(even_units(silent)[[0, 2, 3]] == even_units(scores(np.random.default_rng(3), 40))[[0, 2, 3]])
+    assert np.all(np.isfinite(conformal_bounds(even_units(silent), silent, level=0.9)))
 
 
 @pytest.mark.parametrize(("count", "level"), [(18, 0.95), (8, 0.9), (98, 0.99)])
@@ -160,6 +165,36 @@ def test_coverage_counts_trajectories_inside_all_bounds():
     assert coverage(np.ones(4), held_out) == 0.5
 
 
+@pytest.mark.parametrize("count", [1, 49, 50, 51, 120])
+def test_a_split_of_any_length_is_measured_in_batches_of_one_size(monkeypatch, count):
+    """Every trajectory once and in order; what fills the last batch is dropped."""
+    batches = []
+
+    def largest(model, params, part):
+        batches.append(part)
+        return part.controls[:, 0, :1] * np.ones(4)
+
+    monkeypatch.setattr(_calibration, "_largest", largest)
+    each = np.arange(count, dtype=np.float32)[:, None, None]
+    data = Trajectory(*(jnp.asarray(each + np.zeros(shape)) for shape in ((4, 5), (3, 2), (3, 2))))
+    found = inspect.unwrap(disturbances)(None, None, data)
+    np.testing.assert_array_equal(found.scores, each[:, :, 0] * np.ones(4))
+    assert len(batches) == -(-count // _calibration.CHUNK)
+    assert {len(leaf) for part in batches for leaf in part} == {_calibration.CHUNK}
+
+
+def test_every_step_is_measured_in_the_frame_of_the_first_state_and_environment(monkeypatch):
+    """What each step is given, as the largest entries of a trajectory that only grows."""
+    model = SimpleNamespace(encode=lambda fiber, state: 1000 * fiber + state[0])
+    monkeypatch.setattr(_calibration, "fibers_along", lambda model, params, trajectory: 2 * (trajectory.envs[:, 0],))
+    given = lambda model, fiber, later, origin, *step: jnp.stack([origin, *(part[0] for part in step)])  # noqa: E731
+    monkeypatch.setattr(_calibration, "step_disturbances", given)
+    states = np.arange(10, dtype=np.float32).reshape(2, 5, 1)
+    data = Trajectory(*map(jnp.asarray, (states, 100 + states[:, :-1], 7 + states[:, :-1])))
+    found = inspect.unwrap(_calibration._largest)(model, {}, data)
+    np.testing.assert_array_equal(found, [[7000.0, 3.0, 103.0, 4.0], [12005.0, 8.0, 108.0, 9.0]])
+
+
 def test_the_true_plant_has_no_disturbance():
     model, params = model_and_params("oracle")
     assert np.all(disturbances(model, params, driven()).scores < 5e-6)
@@ -173,7 +208,7 @@ def test_a_disturbance_is_the_largest_along_the_trajectory():
     yaw = np.asarray(data.states)[1, 5:, 2]
     states = np.array(data.states)
     states[1, 5:, 3] += 0.25  # from step 5 on; steps 6, 7, … then differ because the plant depends on v
-    pushed = disturbances(model, params, data._replace(states=jax.numpy.asarray(states))).scores
+    pushed = disturbances(model, params, data._replace(states=jnp.asarray(states))).scores
     assert yaw.size
     np.testing.assert_allclose(pushed[[0, 2]], kinds[[0, 2]], atol=1e-7)
     assert pushed[1, 3] >= 0.25 - 1e-5
@@ -186,8 +221,8 @@ def test_position_and_yaw_disturbances_are_those_of_the_pose_increment():
     states = np.array(data.states)
     states[2, 4:, 0] += 0.3
     states[2, 4:, 1] += 0.4
-    moved = disturbances(model, params, data._replace(states=jax.numpy.asarray(states))).scores
+    moved = disturbances(model, params, data._replace(states=jnp.asarray(states))).scores
     np.testing.assert_allclose(moved[2], [0.0, 0.5, 0.0, 0.0], atol=1e-5)
     states[2, 4:, 2] += 0.1
-    turned = disturbances(model, params, data._replace(states=jax.numpy.asarray(states))).scores
+    turned = disturbances(model, params, data._replace(states=jnp.asarray(states))).scores
     np.testing.assert_allclose(turned[2], [0.0, 0.5, 0.1, 0.0], atol=1e-5)

@@ -11,7 +11,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from helpers import refusal_of
+from helpers import entry_at, put, refusal_of
 from jaxtyping import TypeCheckError
 
 from sfkd_jax import artefacts, demo, policy
@@ -36,23 +36,6 @@ def check(document, plant="kinematic"):
         verify_document(document, trained.params, model=trained.model, policy_sha256=trained.sha256)
     except TypeCheckError as reason:  # under test, types are checked before anything is verified
         raise CertificationRefused("of another type") from reason
-
-
-def put(document, path, value):
-    """A copy with the value at a dotted path replaced."""
-    changed = copy.deepcopy(document)
-    *above, last = path.split(".")
-    inner = changed
-    for key in above:
-        inner = inner[int(key) if isinstance(inner, list) else key]
-    inner[int(last) if isinstance(inner, list) else last] = value
-    return changed
-
-
-def at(document, path):
-    for key in path.split("."):
-        document = document[int(key) if isinstance(document, list) else key]
-    return document
 
 
 @pytest.mark.parametrize("plant", [*PLANTS, *(f"{plant}_path" for plant in PLANTS)])
@@ -84,13 +67,13 @@ def test_no_proved_constant_can_be_replaced_by_nonsense(claim):
 def test_no_proved_constant_can_be_made_smaller(claim):
     for factor in (0.5, 1 - 1e-5):
         with pytest.raises(CertificationRefused):
-            check(put(honest(), claim, factor * at(honest(), claim)))
+            check(put(honest(), claim, factor * entry_at(honest(), claim)))
 
 
 @pytest.mark.parametrize("claim", ["beta", "rho", "lipschitz.position"])
 def test_a_constant_that_is_larger_than_proved_does_not_go_unnoticed_where_others_follow_from_it(claim):
     with pytest.raises(CertificationRefused):
-        check(put(honest(), claim, 1.01 * at(honest(), claim)))
+        check(put(honest(), claim, 1.01 * entry_at(honest(), claim)))
 
 
 def test_constants_of_networks_that_there_are_not_are_refused():
@@ -113,7 +96,7 @@ DERIVED = (
 
 @pytest.mark.parametrize("number", DERIVED)
 def test_what_is_arithmetic_is_computed_again(number):
-    for value in (0.9 * at(honest(), number), 1.001 * at(honest(), number), math.nan, "many"):
+    for value in (0.9 * entry_at(honest(), number), 1.001 * entry_at(honest(), number), math.nan, "many"):
         with pytest.raises(CertificationRefused):
             check(put(honest(), number, value))
 
