@@ -62,8 +62,8 @@ def load(run):
     return Car(trained.vehicle, trained, trained.law, jax.jit(trained.model.fold)(trained.params), certificate)
 
 
-def scripted(car, kind):
-    """A planner of `SCRIPTS`, by its index, that may be traced."""
+def scripted(car, kind, onset=0):
+    """A planner of `SCRIPTS`, by its index, that may be traced; before step `onset` it asks for nothing."""
     low, high = jnp.asarray(car.plant.control_low), jnp.asarray(car.plant.control_high)
 
     def act(params, state, observation, env, reference):
@@ -84,7 +84,7 @@ def scripted(car, kind):
         }
         lawful = car.law(xi, curvature, reference[0, 3], env)
         asked = [lawful + share * car.law.perturbation for share in shares.values()]
-        control = jnp.stack([*asked, jnp.where(side > 0.0, high, low)])[kind]
+        control = jnp.stack([*asked, jnp.where(side > 0.0, high, low)])[jnp.where(step < onset, 0, kind)]
         return jnp.clip(control, low, high), (key, step + 1), {}
 
     return Controller(lambda key: (key, jnp.zeros((), jnp.int32)), act)
@@ -146,8 +146,9 @@ def batches(driven, roads, keys):
 def summary(lateral, said, bounds):
     """What some drives come to."""
     worst = np.max(np.where(np.isfinite(lateral), np.abs(lateral), np.inf), axis=1)
-    known = np.abs(lateral)[np.isfinite(lateral)]
-    found = {"drives": len(worst), "departures": int(np.sum(~(worst <= LANE))), "largest_m": float(np.max(known))}
+    largest = float(np.max(worst))
+    found = {"drives": len(worst), "departures": int(np.sum(~(worst <= LANE)))}
+    found |= {"largest_m": largest if np.isfinite(largest) else None}
     if not said:
         return found
     apart = np.abs(lateral[:, :-1] - said["copy"])
@@ -245,7 +246,8 @@ def _of(summary):
 
 
 def _metres(summary):
-    return f"{summary['largest_m']:.2f}" if summary["largest_m"] < 10.0 else "> 10"
+    largest = summary["largest_m"]
+    return "not finite" if largest is None else f"{largest:.3f}" if largest < 10.0 else "> 10"
 
 
 def _percent(share):
