@@ -8,6 +8,7 @@ from sfkd_jax.assembly._controllers import PLANNERS as PLANNERS
 from sfkd_jax.assembly._controllers import SEARCHES as SEARCHES
 from sfkd_jax.assembly._controllers import build_controller as build_controller
 from sfkd_jax.assembly._controllers import controller_horizon as controller_horizon
+from sfkd_jax.assembly._controllers import in_corridor as in_corridor
 from sfkd_jax.assembly._plants import INNER_LOOPS as INNER_LOOPS
 from sfkd_jax.assembly._plants import PLANTS as PLANTS
 from sfkd_jax.assembly._plants import build_driver as build_driver

@@ -48,21 +48,27 @@ def build_controller(
             )
         planner = build(settings, model, plant, env_low, env_high, law)
         if certificate and certificate.get("corridor") and settings.get("shield"):
-            return _shielded(planner, model, plant, law, certificate)
+            return in_corridor(planner, model, plant, law, certificate)
         return planner
     planner = build(settings, model, plant, env_low, env_high)
     watched = planner if certificate is None else _monitored(planner, settings, model, certificate)
     return _estimated(watched, settings, model, plant, env_low, env_high) if env == "estimated" else watched
 
 
-def _shielded(
+def in_corridor(
     planner: Controller,
     model: Model,
     plant: vehicle.Vehicle,
     law: control.PathLaw,
     certificate: Settings,
 ) -> Controller:
-    """The planner inside the corridor of a certificate; outside the boxes of ξ, e, κ and v_ref the law drives alone."""
+    """The planner inside the corridor of a certificate; outside the boxes of ξ, e, κ and v_ref the law drives alone.
+
+    Args:
+        planner: any controller that needs no more than `Controller.act` is given. model: along a path.
+        plant: whose limits of the controls hold. law: around which the model was learned.
+        certificate: with a corridor.
+    """
     corridor, boxes = certificate["corridor"], certificate["boxes"]
     bounds, sensors = corridor["bounds"], corridor["class"]["sensor_noise"]
     low = tuple(edge - ROAD_MARGIN * abs(edge) for edge in boxes["control"][0][2:])

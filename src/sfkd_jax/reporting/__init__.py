@@ -4,4 +4,5 @@ from sfkd_jax.reporting._animation import animate as animate
 from sfkd_jax.reporting._benchmark import benchmark_markdown as benchmark_markdown
 from sfkd_jax.reporting._benchmark import benchmark_report as benchmark_report
 from sfkd_jax.reporting._comparison import write_comparison as write_comparison
+from sfkd_jax.reporting._corridor import draw_hostile as draw_hostile
 from sfkd_jax.reporting._page import write_report as write_report

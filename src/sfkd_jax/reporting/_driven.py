@@ -7,8 +7,8 @@ from typing import Any
 
 import numpy as np
 from matplotlib.figure import Figure
-from matplotlib.ticker import MaxNLocator
 
+from sfkd_jax.reporting._conditions import conditions, mark
 from sfkd_jax.reporting._scene import Scene, hardest_step, switches
 from sfkd_jax.reporting._style import MUTED, PLATE, canvas, legend, line, literal, ordered, principal
 
@@ -33,9 +33,7 @@ def deviation(scene: Scene, seconds: float = 15.0) -> Figure:
     top.set_ylim(low, high + 0.2 * (high - low))
     changes = [step for step in switches(scene.envs) if step < last]
     for axes in (top, friction, wind):
-        axes.grid(visible=False, axis="x")
-        for step in changes:
-            axes.axvline(step * scene.dt, color=MUTED, linestyle=(0, (4, 3)), linewidth=0.9, zorder=1)
+        mark(axes, changes, scene.dt)
     if scene.envs is None:
         friction.set_visible(False)
         wind.set_visible(False)
@@ -43,16 +41,7 @@ def deviation(scene: Scene, seconds: float = 15.0) -> Figure:
         top.tick_params(labelbottom=True)
     else:
         _label_conditions(top, scene.envs[:last], changes, scene.dt)
-        time = scene.dt * np.arange(min(last, len(scene.envs)) + 1)
-        for axes, column, name in ((friction, 0, "friction\nμ [-]"), (wind, 1, "wind\n[m/s]")):
-            values = scene.envs[: len(time) - 1, column]
-            axes.stairs(values, time, baseline=0.0, fill=True, color="#b9c6d6", linewidth=0.0)
-            axes.stairs(values, time, baseline=None, color="#4a5a6d", linewidth=1.1)
-            axes.set_ylabel(name)
-        friction.set(ylim=(0.0, 1.0), yticks=[0.0, 0.5, 1.0])
-        peak = max(1.0, float(np.max(np.abs(scene.envs[:last, 1]))))
-        wind.set(ylim=(-1.15 * peak, 1.15 * peak))
-        wind.yaxis.set_major_locator(MaxNLocator(nbins=2, symmetric=True))
+        conditions(friction, wind, scene.envs[:last], scene.dt)
     wind.set(xlabel="time [s]")
     figure.align_ylabels()
     legend(figure, top)

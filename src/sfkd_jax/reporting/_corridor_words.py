@@ -1,0 +1,134 @@
+"""The corridor of a certificate in words and numbers: what is promised, for what, what is proved and what measured."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+from sfkd_jax.reporting._blocks import Block, Heading, Table, Text, picture
+from sfkd_jax.reporting._corridor import Corridor, around_drives
+from sfkd_jax.reporting._numbers import DASH, dig, interval, is_number, number, short, upper
+from sfkd_jax.reporting._scene import scenes_of
+from sfkd_jax.reporting._words import model_of
+
+
+def corridor(run: Path, record: dict[str, Any], settings: dict[str, Any], place: Path) -> list[Block]:
+    """The section of a certificate that has a corridor; nothing for another."""
+    found = dig(record, "corridor")
+    width, tube = (dig(found, "bounds", name) for name in ("nominal", "followed_position"))
+    if not isinstance(found, dict) or not is_number(found.get("corridor_m")):
+        return []
+    blocks: list[Block] = [Heading(3, "How far the car strays"), *corridor_words(record), corridor_table(found)]
+    system = model_of(settings)
+    scenes = [scene for scene in scenes_of(run) if system in scene.lateral]
+    if scenes and is_number(width) and is_number(tube):
+        half = Corridor(float(width), float(tube))
+        blocks.append(picture(place, "corridor", _CAPTION, around_drives, scenes[0], system, half))
+    return blocks
+
+
+_CAPTION = (
+    "Signed lateral deviation of every episode in the certified corridor, left positive. Dark: where the shield keeps "
+    "the nominal copy of the car. Light: how far the car may be from that copy."
+)
+
+
+def corridor_words(record: dict[str, Any]) -> list[Text]:
+    """What is promised and as long as what, what of it is proved, what is measured, and what an attack reached."""
+    found = record["corridor"]
+    level, bounds = _share(found.get("level")), found.get("bounds")
+    promised = (
+        f"With this certificate the car stays within {upper(found['corridor_m'], 3)} m of its path, whatever planner "
+        f"drives it through the shield, as long as {_class(found.get('class'))}. It is promised for at least {level} "
+        f"of such drives: the shield keeps a nominal copy of the car within W = {upper(dig(bounds, 'nominal'), 3)} m "
+        f"of the path, and the car stays within {upper(dig(bounds, 'followed_position'), 3)} m of that copy. A step "
+        "at which the shield cannot keep W, or at which the car is farther from its copy than that, is reported while "
+        "driving."
+    )
+    alpha = upper(dig(record, "outputs", "position", "alpha"))
+    proved = (
+        f"In a metric for the lateral deviation, car and copy come to at most {alpha} times their distance in every "
+        "step, for every perturbation, road, speed and environment in the box, and for any switching. So their "
+        "distance follows from the one-step disturbances of a drive, and no planner adds to it."
+    )
+    return [
+        Text(promised, "The corridor."),
+        Text(proved, "Proved."),
+        Text(_measured(found), "Measured, not proved."),
+        *([Text(_attacked(found), "Attacked.")] if isinstance(found.get("attack"), dict) else []),
+    ]
+
+
+def _class(about: Any) -> str:
+    """What a drive must be like."""
+    low, high = (_entries(dig(about, "env_box"), side, 2) for side in (0, 1))
+    speed, dwell = (_entries(about, name, 2) for name in ("speed", "dwell_s"))
+    steering, drive = _entries(about, "perturbation", 2)
+    return (
+        f"it drives at {short(speed[0])} to {short(speed[1])} m/s on a road of a curvature of at most "
+        f"{short(dig(about, 'peak_curvature'))} 1/m and a lateral acceleration of at most "
+        f"{short(dig(about, 'lateral_acceleration'))} m/s²; friction lies in {short(low[0])} to {short(high[0])}, side "
+        f"wind in {short(low[1])} to {short(high[1])} m/s, and they hold for at least {short(dwell[0])} s between two "
+        f"switches; the planner adds at most {short(steering)} rad of steering and {short(drive)} of drive to the law; "
+        f"and the drive lasts at most {short(dig(about, 'duration_s'))} s"
+    )
+
+
+def _entries(record: Any, key: Any, count: int) -> list[Any]:
+    """That many entries of a list in a record or list; None for each where there are not."""
+    listed = isinstance(record, list) and len(record) > key if isinstance(key, int) else isinstance(record, dict)
+    values = (record[key] if isinstance(key, int) else record.get(key)) if listed else None
+    return values if isinstance(values, list) and len(values) == count else [None] * count
+
+
+def _measured(found: dict[str, Any]) -> str:
+    drives, s3 = short(found.get("drives")), dig(found, "by_scenario", "s3")
+    text = (
+        f"How large those disturbances are, and W. Of the drives on the true vehicle {drives} fix units, {drives} "
+        f"calibrate and {drives} test: on {_share(found.get('coverage'))} of the last all bounds hold (95 % interval "
+        f"of that fraction {interval(found.get('coverage_ci95'))})"
+    )
+    if is_number(dig(s3, "coverage")):
+        text += f", and on {_share(dig(s3, 'coverage'))} of {short(dig(s3, 'coverage_drives'))} drives of S3, "
+        text += f"whose schedule no calibration saw ({interval(dig(s3, 'coverage_ci95'))})"
+    lateral, distance = (dig(found, "seen", name) for name in ("lateral_m", "distance_m"))
+    if is_number(lateral) and is_number(distance):
+        text += f". The test drives came to {number(lateral)} m from the path and {number(distance)} m from their copy"
+    return text + "."
+
+
+def _attacked(found: dict[str, Any]) -> str:
+    attack = found["attack"]
+    text = (
+        f"A search over {short(attack.get('steps'))} steps of the true vehicle, for perturbations, roads, winds and "
+        f"switches that do harm together, brought the car to {number(attack.get('lateral_m'))} m from its path, and to "
+        f"{number(attack.get('shielded_lateral_m'))} m with the shield. Such drives are not promised to keep the "
+        "bounds on the disturbances"
+    )
+    if is_number(attack.get("over_corridor")) and is_number(attack.get("kept_lateral_m")):
+        text += (
+            f"; where they did keep them, the car came to {number(attack['kept_lateral_m'])} m, "
+            f"{number(attack['over_corridor'], 2)} times the corridor"
+        )
+    return text + "."
+
+
+def corridor_table(found: dict[str, Any]) -> Table:
+    """Every bound, with what it is and whether it holds together with the others."""
+    together, alone = "with the others", "by itself"
+    named = (
+        ("corridor_m", "Corridor: car from its path, W + tube [m]", together),
+        ("nominal", "W: nominal copy from the path [m]", together),
+        ("followed_position", "Tube: car from its copy, across [m]", together),
+        ("followed_yaw", "Tube: car from its copy, heading [rad]", together),
+        ("for_ever_position", "The same from the largest disturbance alone, across [m]", alone),
+        ("for_ever_yaw", "The same from the largest disturbance alone, heading [rad]", alone),
+    )
+    values = found | (found.get("bounds") if isinstance(found.get("bounds"), dict) else {})
+    level = _share(found.get("level"))
+    rows = [[name, upper(values.get(key), 3), f"{level}, {kind}"] for key, name, kind in named]
+    return Table(["Bound", "At most", "Holds on a share of drives of"], rows, prose=True)
+
+
+def _share(value: Any) -> str:
+    return f"{short(100 * value, 4)} %" if is_number(value) else DASH
