@@ -33,6 +33,7 @@ ARROWS = {
     "assembly": HALLWAY | {"vehicle", "scenarios", "datasets", "models", "control"},
     "shelf": HALLWAY | {"artefacts", "datasets"},
     "path_law": HALLWAY | {"artefacts", "assembly", "control", "datasets", "shelf", "vehicle"},
+    "corridor": HALLWAY | {"assembly", "certification", "control", "datasets", "evaluation", "policy", "vehicle"},
     "rehearsal": HALLWAY | {"assembly", "certification", "control", "datasets", "shelf", "vehicle"},
     "walk": HALLWAY
     | {"artefacts", "assembly", "certification", "datasets", "evaluation", "path_law", "policy", "shelf"}
@@ -63,6 +64,7 @@ THIRD_PARTY = {
     "shelf": {"numpy"},
     "policy": {"numpy"},
     "drive": {"numpy"},
+    "corridor": {"numpy"},
     "cells": {"numpy"},
     "adapters": {"brax", "gymnasium", "numpy", "scipy", "vehiclemodels"},
     "exporting": {"numpy", "iree"},
@@ -77,7 +79,7 @@ FOREIGN |= {"iree": {"exporting/_iree.py"}, "pyarrow": {"datasets/_tables.py"}}
 FOREIGN |= {"vehiclemodels": {"adapters/_commonroad_equations.py"}}
 WORKSHOP = {"hydra", "omegaconf", "cvxpy", "clarabel", "orbax", "brax", "matplotlib", "optax"}
 WRITES = {f"os.environ.{verb}" for verb in ("update", "setdefault", "pop", "popitem", "clear")}
-HOST = {"walk", "path_law", "drive", "training", "certification", "exporting"}
+HOST = {"walk", "path_law", "corridor", "drive", "training", "certification", "exporting"}
 """Besides the doors and gymnasium's adapter, where code runs on the host and may compile."""
 FORBIDDEN = WRITES | {"os.putenv", "os.unsetenv", "jax.config"}
 GIVES_BACK = "exporting/_warm_up.py"
