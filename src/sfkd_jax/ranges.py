@@ -14,7 +14,7 @@ _INTERVALS = {
     "(-inf, inf)": "vehicle.wind_lever vehicle.control_low vehicle.control_high dataset.env_low dataset.env_high "
     "evaluation.told.bias",
     "[0, inf)": "seed dataset.seed evaluation.seed comparison.seeds comparison.share evaluation.timed_steps "
-    "demo.timed_steps certification.attack_starts model.environment_degree *.num_proposals *.smoothing_window "
+    "demo.timed_steps certification.attack_starts model.environment_degree model.forcing_hidden *.num_proposals *.smoothing_window "
     "*.smoothing_order *.chunk",
     "(0, inf)": f"{' '.join(f'vehicle.{name}' for name in _PLANTS.split())} vehicle.dt vehicle.creep_speed "
     "vehicle.wheelbase vehicle.speed_gain scenario.speed scenario.wavelengths dataset.speed dataset.gap "
@@ -24,14 +24,14 @@ _INTERVALS = {
     "controller.estimator.model_error "
     "training.learning_rate training.clip_norm evaluation.threshold_m dataset.peak_curvature "
     "dataset.lateral_acceleration dataset.law.lateral_acceleration dataset.law.perturbation dataset.law.speed "
-    "dataset.law.curvature dataset.law.drive",
+    "dataset.law.curvature dataset.law.drive certification.corridor.dwell",
     "(0, 1)": "dataset.shares model.rho model.beta model.alpha certification.level certification.monitor_level "
     "controller.gradient.shrink",
     "[0, 1)": "certification.margin",
     "(0, 1]": "*.risk_level controller.monitor.slow_factor training.data_share",
     "[0, 1]": "*.noise_correlation controller.mppi.adapt",
     "(1, inf)": "controller.estimator.dwell",
-    "(2, inf)": "evaluation.episode_s demo.episode_s",  # what settles at the start is not scored
+    "(2, inf)": "evaluation.episode_s demo.episode_s certification.corridor.duration",  # what settles at the start is not scored
     "[2, inf)": "controller.*.horizon model.horizon controller.gradient.steps controller.estimator.points "
     "*.noise_knots dataset.law.points",
     "[4, inf)": "dataset.segments",
@@ -39,7 +39,7 @@ _INTERVALS = {
 _ENTRIES = {
     2: "scenario.wavelengths dataset.speed dataset.steering_excitation dataset.speed_excitation *.noise_std "
     "controller.task.control_rate evaluation.told.noise evaluation.told.bias comparison.share "
-    "dataset.law.speed dataset.law.perturbation dataset.wavelengths",
+    "dataset.law.speed dataset.law.perturbation dataset.wavelengths certification.corridor.dwell",
     3: "dataset.law.points",
     4: "dataset.shares",
 }
@@ -50,6 +50,7 @@ _RISING = {
     "dataset.law.speed",
     "dataset.steering_excitation",
     "dataset.speed_excitation",
+    "certification.corridor.dwell",
 }
 _EMPTY = {
     "vehicle.control_low",
