@@ -25,8 +25,9 @@ every_kind = pytest.mark.parametrize("kind", KINDS)
 
 @pytest.fixture(autouse=True)
 def proof_is_verified(monkeypatch):
-    """All but what `verify` asks."""
+    """All but what `verify` asks; the weights are a word."""
     asked = []
+    monkeypatch.setattr(_document, "exported", lambda model, params: "weights")
     monkeypatch.setattr(_document, "verify", lambda *given, **named: asked.append((given, named)))
     return asked
 
@@ -62,7 +63,7 @@ def test_honest_documents_hold_and_their_proof_is_verified(kind, proof_is_verifi
     check(honest(kind))
     (((proof, params), named),) = proof_is_verified
     assert (proof.alpha, proof.witnesses) == (honest(kind)["alpha"], honest(kind)["witnesses"])
-    assert (params, named) == ({}, {"model": MODEL})
+    assert (params, named) == ({}, {"model": MODEL, "weights": "weights"})
 
 
 def test_a_refusal_says_its_reason_and_other_weights_are_stale():
@@ -228,8 +229,7 @@ def output(alpha, coverages=(0.95, 0.9), drives=60):
 @pytest.fixture
 def outputs(monkeypatch):
     """A document with both outputs, and what is asked of their proofs."""
-    asked = {"metric": [], "corridor": [], "exported": []}
-    monkeypatch.setattr(_document, "exported", lambda *given: asked["exported"].append(given) or "weights")
+    asked = {"metric": [], "corridor": []}
     monkeypatch.setattr(_document, "require_output_metric", lambda *given: asked["metric"].append(given))
     monkeypatch.setattr(_document, "require_corridor", lambda *given: asked["corridor"].append(given))
     return honest("path") | {"outputs": {"position": output(0.8), "yaw": output(0.7)}}, asked
@@ -238,7 +238,6 @@ def outputs(monkeypatch):
 def test_every_output_is_proved_in_its_metric(outputs):
     document, asked = outputs
     check(document)
-    assert asked["exported"] == [(MODEL, {})]
     assert asked["corridor"] == []
     assert [(name, claim.alpha, claim.lipschitz, weights) for name, claim, weights in asked["metric"]] == [
         ("position", 0.8, 2.0, "weights"),
@@ -253,7 +252,7 @@ def test_without_outputs_none_is_proved(outputs):
     asked = outputs[1]
     for parts in ({}, {"outputs": {}}, {"outputs": {}, "corridor": None}):
         check(honest("path") | parts)
-    assert asked == {"metric": [], "corridor": [], "exported": []}
+    assert asked == {"metric": [], "corridor": []}
 
 
 def test_a_corridor_needs_both_outputs(outputs, monkeypatch):
