@@ -50,7 +50,9 @@ COMPILING = {
     "JAX_PERSISTENT_CACHE_MIN_ENTRY_SIZE_BYTES": "-1",
     "XLA_FLAGS": "--xla_backend_optimization_level=0 --xla_cpu_multi_thread_eigen=false",
     "TF_CPP_MIN_LOG_LEVEL": "3",
+    "JAX_TRACEBACK_IN_LOCATIONS_LIMIT": "1",
 }
+"""The last: exported programs record who called, and a job is forked from here and there in this script."""
 
 
 class Job:

@@ -86,7 +86,7 @@ NAMED = {
         ("held_out.scores <= bounds", "held_out.scores[:, :1] <= bounds[:1]"),
     ],
     "_document": [
-        ("    verify(proof, params, model=model)\n", ""),
+        ("    verify(proof, params, model=model, weights=weights)\n", ""),
         ('        _require_tubes(document["tube"], proof, document["d_bar"])\n', ""),
         ('{"d_bar": d_bar, **d_bar["by_scenario"]}', '{"d_bar": d_bar}'),
         (' or not supports(d_bar["trajectories"], level)', ""),

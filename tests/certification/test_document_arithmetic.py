@@ -16,15 +16,18 @@ from helpers import entry_at, put
 from sfkd_jax import demo
 from sfkd_jax.certification import CertificateStale, CertificationRefused, _document, interval
 from sfkd_jax.certification._tube import for_ever, latent_tube, path_tube, physical_tube
+from sfkd_jax.types import Model
 
 KINDS = ("kinematic", "dynamic", "path")
+MODEL = Model._make((None,) * len(Model._fields))
 every_kind = pytest.mark.parametrize("kind", KINDS)
 
 
 @pytest.fixture(autouse=True)
 def proof_is_verified(monkeypatch):
-    """All but what `verify` asks."""
+    """All but what `verify` asks; the weights are a word."""
     asked = []
+    monkeypatch.setattr(_document, "exported", lambda model, params: "weights")
     monkeypatch.setattr(_document, "verify", lambda *given, **named: asked.append((given, named)))
     return asked
 
@@ -45,7 +48,7 @@ def honest(kind="kinematic"):
 
 def check(document, sha=None):
     sha = document["policy_sha256"] if sha is None else sha
-    inspect.unwrap(_document.verify_document)(document, {}, model=None, policy_sha256=sha)
+    inspect.unwrap(_document.verify_document)(document, {}, model=MODEL, policy_sha256=sha)
 
 
 def refused(document, told):
@@ -60,7 +63,7 @@ def test_honest_documents_hold_and_their_proof_is_verified(kind, proof_is_verifi
     check(honest(kind))
     (((proof, params), named),) = proof_is_verified
     assert (proof.alpha, proof.witnesses) == (honest(kind)["alpha"], honest(kind)["witnesses"])
-    assert (params, named) == ({}, {"model": None})
+    assert (params, named) == ({}, {"model": MODEL, "weights": "weights"})
 
 
 def test_a_refusal_says_its_reason_and_other_weights_are_stale():
@@ -204,6 +207,87 @@ def test_a_tube_has_the_parts_of_its_kind():
     for other in (0.0, 1.001 * length):
         refused(put(honest(), "tube.largest_increment_m", other), "tube.physical.position_m does not follow")
     refused(put(honest(), "tube.largest_increment_m", None), "tube.largest_increment_m holds what is no number")
+
+
+FORMS = ("for_ever", "followed")
+
+
+def output(alpha, coverages=(0.95, 0.9), drives=60):
+    """What a document says of one output in a metric of its own."""
+    shares = dict(zip(FORMS, coverages, strict=True))
+    return {
+        "alpha": alpha,
+        "lipschitz": 2.0,
+        "witness": {"metric": [[4.0]], "joint": [[[1.0, 2.0]]]},
+        "tube": {"for_ever": 0.3, "followed": 0.2},
+        "coverage": shares,
+        "coverage_ci95": {form: interval(share, drives) for form, share in shares.items()},
+        "coverage_drives": drives,
+    }
+
+
+@pytest.fixture
+def outputs(monkeypatch):
+    """A document with both outputs, and what is asked of their proofs."""
+    asked = {"metric": [], "corridor": []}
+    monkeypatch.setattr(_document, "require_output_metric", lambda *given: asked["metric"].append(given))
+    monkeypatch.setattr(_document, "require_corridor", lambda *given: asked["corridor"].append(given))
+    return honest("path") | {"outputs": {"position": output(0.8), "yaw": output(0.7)}}, asked
+
+
+def test_every_output_is_proved_in_its_metric(outputs):
+    document, asked = outputs
+    check(document)
+    assert asked["corridor"] == []
+    assert [(name, claim.alpha, claim.lipschitz, weights) for name, claim, weights in asked["metric"]] == [
+        ("position", 0.8, 2.0, "weights"),
+        ("yaw", 0.7, 2.0, "weights"),
+    ]
+    for _, claim, _ in asked["metric"]:
+        np.testing.assert_array_equal(claim.metric, [[4.0]])
+        np.testing.assert_array_equal(claim.joint, [[[1.0, 2.0]]])
+
+
+def test_without_outputs_none_is_proved(outputs):
+    asked = outputs[1]
+    for parts in ({}, {"outputs": {}}, {"outputs": {}, "corridor": None}):
+        check(honest("path") | parts)
+    assert asked == {"metric": [], "corridor": []}
+
+
+def test_a_corridor_needs_both_outputs(outputs, monkeypatch):
+    document, asked = outputs
+    check(document | {"corridor": {"bounds": 1}})
+    assert asked["corridor"] == [({"bounds": 1},)]
+    for nothing in ({"outputs": {}}, {}):
+        refused(honest("path") | nothing | {"corridor": {}}, "a corridor needs a metric of every output")
+    for names in ("position", "yaw"):
+        told = f"outputs must be position and yaw, got {names}"
+        refused(document | {"outputs": {names: output(0.8)}}, told)
+    monkeypatch.setattr(_document, "require_corridor", lambda corridor: corridor["drives"] / corridor["count"])
+    refused(document | {"corridor": {"drives": 0, "count": 0}}, "the certificate is malformed: division by zero")
+    more = document["outputs"] | {"body": output(0.8)}
+    refused(document | {"outputs": more}, "outputs must be position and yaw, got position, yaw, body")
+
+
+@pytest.mark.parametrize("name", ["position", "yaw"])
+@pytest.mark.parametrize("form", FORMS)
+def test_the_tube_of_an_output_is_above_zero_and_its_coverage_one_of_drives(outputs, name, form):
+    document, part = outputs[0], f"outputs.{name}"
+    for radius in (0.0, -0.1):
+        refused(put(document, f"{part}.tube.{form}", radius), f"{part}.tube.{form} is no radius")
+    for radius in (math.nan, math.inf, None, "0.3"):
+        refused(put(document, f"{part}.tube.{form}", radius), f"{part}.tube holds what is no number")
+    check(put(document, f"{part}.tube.{form}", 5e-324))
+    share = entry_at(document, f"{part}.coverage.{form}")
+    refused(put(document, f"{part}.coverage.{form}", share + 1e-8), f"{part}: coverage does not follow")
+    for other in (share - 1 / 60, 1.5, -0.05):
+        refused(put(document, f"{part}.coverage.{form}", other), f"{part}: coverage_ci95 does not follow")
+    for side in (0, 1):
+        path = f"{part}.coverage_ci95.{form}.{side}"
+        refused(put(document, path, entry_at(document, path) + 1e-8), f"{part}: coverage_ci95 does not follow")
+    for drives, told in ((0, "malformed"), (120, "coverage_ci95 does not follow"), (61, "coverage does not follow")):
+        refused(put(document, f"{part}.coverage_drives", drives), told)
 
 
 @every_kind

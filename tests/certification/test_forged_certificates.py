@@ -159,6 +159,15 @@ def test_a_model_that_serves_something_else_is_noticed(kind):
         verified(proof)
 
 
+def test_weights_that_are_at_hand_are_not_served_again(kind, monkeypatch):
+    proof = certified()
+    monkeypatch.setattr(_certificate, "exported", lambda model, params: pytest.fail("served again"))
+    bare(_certificate.verify)(proof, PARAMS, model=MODEL, weights=NETWORK)
+    other = NETWORK._replace(residual=(FIRST, 2 * LAST))
+    with pytest.raises(CertificationRefused, match="beta does not follow"):
+        bare(_certificate.verify)(proof, PARAMS, model=MODEL, weights=other)
+
+
 def forged(told, name="joint", **changes):
     """A certificate with some parts replaced is refused, and why."""
     with pytest.raises(CertificationRefused, match=told):

@@ -18,7 +18,7 @@ from sfkd_jax.certification._proofs import prove
 from sfkd_jax.types import Model, Params
 
 MODES = ("joint", "separate")
-MALFORMED = (LookupError, TypeError, ValueError, OverflowError, AttributeError, RecursionError)
+MALFORMED = (LookupError, TypeError, ValueError, ArithmeticError, AttributeError, RecursionError)
 """What Python raises about a document whose parts are of other kinds than they should be."""
 PRECISION = "bounds on the float32 weights as real numbers, checked in float64; float32 rounding of a step counts as d"
 
