@@ -36,7 +36,7 @@ class Hostile(NamedTuple):
         dt: sampling period [s]. envs: friction and wind at every step. corridor: certified. lane: its half width, less
             the car's [m].
         kept: planner -> e_y with the shield [m], (drive, time). onset: step from which on each drive of the next two
-            is hostile. held, free: e_y of such drives with the shield and without it [m]. name: what their planner does.
+            is hostile. held, free: e_y of such drives with the shield and without it [m]. name: what they do.
     """
 
     dt: float

@@ -9,16 +9,16 @@ from sfkd_jax.reporting._blocks import Block, Heading, Table, Text, picture
 from sfkd_jax.reporting._corridor import Corridor, around_drives
 from sfkd_jax.reporting._numbers import DASH, dig, interval, is_number, number, short, upper
 from sfkd_jax.reporting._scene import scenes_of
-from sfkd_jax.reporting._words import model_of
+from sfkd_jax.reporting._words import holds, model_of
 
 
-def corridor(run: Path, record: dict[str, Any], settings: dict[str, Any], place: Path) -> list[Block]:
-    """The section of a certificate that has a corridor; nothing for another."""
+def corridor(run: Path, record: dict[str, Any] | None, settings: dict[str, Any], place: Path) -> list[Block]:
+    """The section of a certificate that holds and has a corridor; nothing for another."""
     found = dig(record, "corridor")
     width, tube = (dig(found, "bounds", name) for name in ("nominal", "followed_position"))
-    if not isinstance(found, dict) or not is_number(found.get("corridor_m")):
+    if record is None or not holds(record) or not is_number(dig(found, "corridor_m")):
         return []
-    blocks: list[Block] = [Heading(3, "How far the car strays"), *corridor_words(record), corridor_table(found)]
+    blocks: list[Block] = [Heading(2, "How far the car strays"), *corridor_words(record), corridor_table(found)]
     system = model_of(settings)
     scenes = [scene for scene in scenes_of(run) if system in scene.lateral]
     if scenes and is_number(width) and is_number(tube):
