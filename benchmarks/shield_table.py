@@ -2,7 +2,7 @@
 
 ASKED = {"departures": 0, "rmse_ratio": 1.02, "intervened": 0.01, "added_ms": 1.0}
 FLAGS = ("infeasible", "void", "broken")
-"""What the shield says of a step: no way back into the corridor; outside the certificate's boxes; too far from the copy."""
+"""Of a step: no way back into the corridor; beyond the certificate's boxes; too far from the copy."""
 
 
 def table(document):
