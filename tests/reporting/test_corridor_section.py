@@ -16,10 +16,11 @@ def certificate(**changes):
         "class": {
             "speed": [8.0, 10.5], "peak_curvature": 0.02, "lateral_acceleration": 2.0, "duration_s": 60.0,
             "env_box": [[0.3, -8.0], [0.9, 8.0]], "dwell_s": [3.0, 6.0], "perturbation": [0.03, 1.0],
+            "steering_excitation": [0.002, 0.025], "speed_excitation": [0.05, 0.6],
         },
-        "level": 0.95, "drives": 150, "corridor_m": 0.2131,
+        "level": 0.95, "drives": 150, "corridor_m": 0.21311,
         "bounds": {
-            "nominal": 0.1111, "followed_position": 0.102, "followed_yaw": 0.04211, "for_ever_position": 0.1533,
+            "nominal": 0.11111, "followed_position": 0.10201, "followed_yaw": 0.04211, "for_ever_position": 0.1533,
             "for_ever_yaw": 0.0802,
         },
         "coverage": 0.9733, "coverage_ci95": [0.9331, 0.9926], "coverage_drives": 150,
@@ -44,21 +45,20 @@ def page(tmp_path_factory):
 @pytest.mark.parametrize(
     "words",
     [
-        "the car stays within 0.214 m of its path, whatever planner drives it through the shield, as long as it drives "
-        "at 8 to 10.5 m/s on a road of a curvature of at most 0.02 1/m",
+        "the car stays within 0.2132 m of its path as long as it drives at 8 to 10.5 m/s on a road of a curvature of at most 0.02 1/m",
         "a lateral acceleration of at most 2 m/s²; friction lies in 0.3 to 0.9, side wind in −8 to 8 m/s, and they "
         "hold for at least 3 s between two switches",
-        "at most 0.03 rad of steering and 1 of drive to the law; and the drive lasts at most 60 s",
-        "promised for at least 95 % of such drives",
-        "within W = 0.112 m of the path, and the car stays within 0.102 m of that copy",
+        "at most 0.03 rad of steering and 1 of drive to the law, with a spread of 0.002 to 0.025 rad and 0.05 to 0.6; "
+        "and the drive lasts at most 60 s. At least 95 % of such drives keep it.",
+        "within W = 0.1112 m of the path, and the car stays within 0.1021 m of that copy",
         "at most 0.8439 times their distance",
         "on 97.33 % of the last all bounds hold (95 % interval of that fraction 0.933 to 0.993)",
         "on 96 % of 140 drives of S3, whose schedule no calibration saw (0.915 to 0.985)",
         "The test drives came to 0.093 m from the path and 0.050 m from their copy",
         "brought the car to 0.636 m from its path, and to 0.515 m with the shield",
         "the car came to 0.181 m, 0.85 times the corridor",
-        "Certified corridor ± 0.214 m",
-        "heading [rad] 0.0422 95 %, with the others",
+        "Certified corridor ± 0.2132 m",
+        "heading [rad] 0.04211 95 %, with the others",
         "heading [rad] 0.0802 95 %, by itself",
     ],
 )
@@ -70,8 +70,8 @@ def test_bounds_are_rounded_up_and_what_is_measured_is_not_called_proved(page):
     section = page[0].split(HEADING)[1].split("What is certified")[0]
     proved = section.split("Proved.")[1].split("Measured, not proved.")[0]
     assert "0.8439" in proved
-    assert not any(number in proved for number in ("0.214", "0.112", "0.102", "95 %"))
-    assert "0.213 m" not in section
+    assert not any(number in proved for number in ("0.2132", "0.1112", "0.1021", "95 %"))
+    assert "0.2131 m" not in section
 
 
 def test_the_corridor_is_drawn_around_the_drives_of_the_page(page):
@@ -89,10 +89,10 @@ def test_no_corridor_no_section(tmp_path):
 
 
 def test_missing_entries_read_as_an_en_dash(tmp_path):
-    bare = certificate() | {"corridor": nulled(certificate()["corridor"]) | {"corridor_m": 0.2131}}
-    for number, document in enumerate((bare, certificate() | {"corridor": {"corridor_m": 0.2131}})):
+    bare = certificate() | {"corridor": nulled(certificate()["corridor"]) | {"corridor_m": 0.21311}}
+    for number, document in enumerate((bare, certificate() | {"corridor": {"corridor_m": 0.21311}})):
         found = text_of(report_of(write_run(tmp_path / str(number), certificate=document, episodes=None))[0])
-        assert "within 0.214 m" in found
+        assert "within 0.2132 m" in found
         assert "at – to – m/s" in found
         assert "None" not in found
 

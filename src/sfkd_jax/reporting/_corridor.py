@@ -11,7 +11,7 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import MultipleLocator
 
 from sfkd_jax.reporting._conditions import conditions, mark
-from sfkd_jax.reporting._numbers import number, upper
+from sfkd_jax.reporting._numbers import number
 from sfkd_jax.reporting._scene import Scene, switches
 from sfkd_jax.reporting._style import ACCENT, PLATE, canvas, legend, line, literal, save
 
@@ -58,10 +58,10 @@ def band(axes: Any, corridor: Corridor, *, named: bool) -> None:
     for side in (-edge, edge):
         axes.axhline(side, color=ACCENT, linewidth=1.2, zorder=2)
     if named:
-        words = {"fontsize": 8.5, "color": ACCENT, "va": "bottom", "ha": "right", "zorder": 6}
+        words = {"fontsize": 8.5, "color": ACCENT, "va": "bottom", "ha": "right", "zorder": 6, "bbox": PLATE}
         for height, name in ((edge, "W + tube"), (corridor.width, "W")):
             where = {"transform": axes.get_yaxis_transform()}
-            axes.text(0.995, height, f"{name} = {upper(height, 3)} m", **where, **words)
+            axes.text(0.995, height + 0.03 * edge, f"{name} = {number(height)} m", **where, **words)
 
 
 def draw_hostile(path: Path, *, width: float, tube: float, **drives: Any) -> Path:

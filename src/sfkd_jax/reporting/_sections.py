@@ -25,7 +25,7 @@ def tiles(
     """The few figures a reader looks for first."""
     items = [("Certified α", upper(dig(certificate, "alpha")))] if holds(certificate) else []
     if holds(certificate) and is_number(dig(certificate, "corridor", "corridor_m")):
-        items.append(("Certified corridor", f"± {upper(dig(certificate, 'corridor', 'corridor_m'), 3)} m"))
+        items.append(("Certified corridor", f"± {upper(dig(certificate, 'corridor', 'corridor_m'))} m"))
     for system in (model_of(settings), "oracle", "nominal"):
         mean = dig(row_of(head, system), "rmse_m", "mean")
         if is_number(mean):
