@@ -50,7 +50,9 @@ def _metres(summary):
 
 def _percent(share):
     """As few digits as tell a share that is not 0 or 1 from both."""
-    return f"{100 * share:.0f} %" if share in (0.0, 1.0) else f"{100 * share:.2f} %"
+    if share in (0.0, 1.0):
+        return f"{100 * share:.0f} %"
+    return "< 0.01 %" if share < 1e-4 else f"{100 * share:.2f} %"
 
 
 def misses(document):

@@ -17,7 +17,7 @@ def summary(departures=0, largest=0.0981, **shares):
 def document(**changes):
     scripts = {
         "full lock": {"with": summary(intervened=0.98765), "without": summary(200, 84.0)},
-        "NaN": {"with": summary(), "without": summary(200, None)},
+        "NaN": {"with": summary(void=1e-5), "without": summary(200, None)},
     }
     planner = {"with": summary(intervened=0.0004) | {"rmse_m": 0.0093}, "without": summary() | {"rmse_m": 0.0092}}
     step = {"with": {"median_ms": 4.5}, "without": {"median_ms": 4.0}, "added_ms": 0.5}
@@ -33,6 +33,7 @@ def test_the_tables_hold_every_planner_and_what_it_came_to():
         in text
     )
     assert "| NaN | 200 of 200 → 0 of 200 | not finite → 0.098 |" in text
+    assert "| 0.041 | 100 % | 0 % | 0 % | < 0.01 % | 0 % |" in text
     assert "| its own | 0 of 200 → 0 of 200 |" in text
     assert "| dynamic | 9.2 → 9.3 | 1.011 | 0.04 % | 4.00 → 4.50 | 0.50 |" in text
     for block in text.strip().split("\n\n"):

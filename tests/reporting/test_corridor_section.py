@@ -45,12 +45,13 @@ def page(tmp_path_factory):
 @pytest.mark.parametrize(
     "words",
     [
-        "the car stays within 0.2132 m of its path as long as it drives at 8 to 10.5 m/s on a road of a curvature of at most 0.02 1/m",
+        "the car stays within 0.2132 m of its path as long as it drives at 8 to 10.5 m/s on a road of a curvature of "
+        "at most 0.02 1/m",
         "a lateral acceleration of at most 2 m/s²; friction lies in 0.3 to 0.9, side wind in −8 to 8 m/s, and they "
         "hold for at least 3 s between two switches",
         "at most 0.03 rad of steering and 1 of drive to the law, with a spread of 0.002 to 0.025 rad and 0.05 to 0.6; "
         "and the drive lasts at most 60 s. At least 95 % of such drives keep it.",
-        "within W = 0.1112 m of the path, and the car stays within 0.1021 m of that copy",
+        "within W = 0.1112 m of the path; and the car stays within 0.1021 m of that copy while the disturbances",
         "at most 0.8439 times their distance",
         "on 97.33 % of the last all bounds hold (95 % interval of that fraction 0.933 to 0.993)",
         "on 96 % of 140 drives of S3, whose schedule no calibration saw (0.915 to 0.985)",
