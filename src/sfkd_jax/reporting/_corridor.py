@@ -113,9 +113,10 @@ def around_drives(scene: Scene, system: str, corridor: Corridor) -> Figure:
     figure = canvas(3.4)
     axes = figure.subplots()
     band(axes, corridor, named=True)
-    style = line(system) | {"linewidth": 0.6}
+    style: dict[str, Any] = line(system) | {"linewidth": 0.6}
     for row, values in enumerate(scene.lateral[system]):
-        axes.plot(_time(values, scene.dt), values, **style | ({"label": f"_{row}"} if row else {}))
+        axes.plot(_time(values, scene.dt), values, **style)
+        style["label"] = f"_{row}"
     values = np.abs(scene.lateral[system])
     farthest = float(np.max(values, where=np.isfinite(values), initial=0.0))
     reach = 1.25 * max(corridor.width + corridor.tube, farthest)

@@ -77,10 +77,11 @@ def _class(about: Any) -> str:
     )
 
 
-def _entries(record: Any, key: Any, count: int) -> list[Any]:
-    """That many entries of a list in a record or list; None for each where there are not."""
-    listed = isinstance(record, list) and len(record) > key if isinstance(key, int) else isinstance(record, dict)
-    values = (record[key] if isinstance(key, int) else record.get(key)) if listed else None
+def _entries(record: Any, key: str | int, count: int) -> list[Any]:
+    """That many entries of a list in a record, or of one in a list; None for each where there are not."""
+    values = dig(record, key) if isinstance(key, str) else None
+    if isinstance(key, int) and isinstance(record, list) and len(record) > key:
+        values = record[key]
     return values if isinstance(values, list) and len(values) == count else [None] * count
 
 
@@ -127,7 +128,8 @@ def corridor_table(found: dict[str, Any]) -> Table:
         ("for_ever_position", "The same from the largest disturbance alone, across [m]", alone),
         ("for_ever_yaw", "The same from the largest disturbance alone, heading [rad]", alone),
     )
-    values = found | (found.get("bounds") if isinstance(found.get("bounds"), dict) else {})
+    bounds = found.get("bounds")
+    values = found | (bounds if isinstance(bounds, dict) else {})
     level = _share(found.get("level"))
     rows = [[name, upper(values.get(key)), f"{level}, {kind}"] for key, name, kind in named]
     return Table(["Bound", "At most", "Holds on a share of drives of"], rows, prose=True)
