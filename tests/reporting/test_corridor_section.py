@@ -32,7 +32,9 @@ def certificate(**changes):
         },
     }  # fmt: skip
     outputs = {"position": {"alpha": 0.84384}}
-    return documents()["certificate.json"] | {"outputs": outputs, "corridor": corridor | changes}
+    found = documents()["certificate.json"]
+    boxes = found["boxes"] | {"state": [[-0.2, -0.1, 7.0], [0.3, 0.1, 11.0]]}
+    return found | {"outputs": outputs, "boxes": boxes, "corridor": corridor | changes}
 
 
 @pytest.fixture(scope="module")
@@ -52,7 +54,8 @@ def page(tmp_path_factory):
         "at most 0.03 rad of steering and 1 of drive to the law, with a spread of 0.002 to 0.025 rad and 0.05 to 0.6; "
         "and the drive lasts at most 60 s. At least 95 % of such drives keep it.",
         "within W = 0.1112 m of the path; and the car stays within 0.1021 m of that copy while the disturbances",
-        "at most 0.8439 times their distance",
+        "brings two states to at most 0.8439 times their distance",
+        "state: lateral deviation −0.2 to 0.3 m, heading error −0.1 to 0.1 rad, speed 7 to 11 m/s; control: steering",
         "on 97.33 % of the last all bounds hold (95 % interval of that fraction 0.933 to 0.993)",
         "on 96 % of 140 drives of S3, whose schedule no calibration saw (0.915 to 0.985)",
         "The test drives came to 0.093 m from the path and 0.050 m from their copy",

@@ -13,7 +13,7 @@ from matplotlib.ticker import MultipleLocator
 from sfkd_jax.reporting._conditions import conditions, mark
 from sfkd_jax.reporting._numbers import number
 from sfkd_jax.reporting._scene import Scene, switches
-from sfkd_jax.reporting._style import ACCENT, PLATE, canvas, legend, line, literal, save
+from sfkd_jax.reporting._style import ACCENT, PLATE, canvas, literal, save
 
 _INNER, _OUTER = "#cfe0f5", "#e9f1fb"
 _LEAVES, _LANE = "#c2410c", "#30363d"
@@ -113,10 +113,8 @@ def around_drives(scene: Scene, system: str, corridor: Corridor) -> Figure:
     figure = canvas(3.4)
     axes = figure.subplots()
     band(axes, corridor, named=True)
-    style: dict[str, Any] = line(system) | {"linewidth": 0.6}
-    for row, values in enumerate(scene.lateral[system]):
-        axes.plot(_time(values, scene.dt), values, **style)
-        style["label"] = f"_{row}"
+    for values in scene.lateral[system]:
+        axes.plot(_time(values, scene.dt), values, color=ACCENT, linewidth=0.6)
     values = np.abs(scene.lateral[system])
     farthest = float(np.max(values, where=np.isfinite(values), initial=0.0))
     reach = 1.25 * max(corridor.width + corridor.tube, farthest)
@@ -126,7 +124,6 @@ def around_drives(scene: Scene, system: str, corridor: Corridor) -> Figure:
     count = "the one episode" if len(values) == 1 else f"{len(values)} episodes"
     axes.set_title(f"{literal(scene.label)}: {count}, at most {number(farthest)} m from the path")
     mark(axes, switches(scene.envs) if len(values) == 1 else (), scene.dt)
-    legend(figure, axes)
     return figure
 
 

@@ -48,9 +48,9 @@ def corridor_words(record: dict[str, Any]) -> list[Text]:
     )
     alpha = upper(dig(record, "outputs", "position", "alpha"))
     proved = (
-        f"In a metric for the lateral deviation, car and copy come to at most {alpha} times their distance in every "
-        "step, for every perturbation, road, speed and environment in the box, and for any switching. So their "
-        "distance follows from the one-step disturbances of a drive and from nothing else."
+        f"In a metric for the lateral deviation, a step of the model brings two states to at most {alpha} times their "
+        "distance, for every perturbation, road, speed and environment in the box, and for any switching. So how far "
+        "the car is from its copy follows from the one-step disturbances of a drive and from nothing else."
     )
     return [
         Text(promised, "The corridor."),
