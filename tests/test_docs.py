@@ -295,3 +295,18 @@ def test_the_table_of_the_long_drive_is_that_of_its_run(monkeypatch):
         assert leg["compilations"] == 1
         assert leg["arrays"]["start"] == leg["arrays"]["end"]
         assert all(fault["until_healthy"]["never"] == 0 for fault in leg["faults"].values())
+
+
+def test_the_tables_of_the_shield_are_those_of_the_run():
+    """And no car left its lane behind the shield."""
+    measured = json.loads((ROOT / "benchmarks/shield.json").read_text())
+    table = runpy.run_path(str(ROOT / "benchmarks/shield_table.py"))["table"](measured)
+    shown = (DOCS / "corridor.md").read_text("utf-8").split("<!-- shield -->")[1].split("<!-- end of shield -->")[0]
+    assert shown.strip() == table.strip()
+    rows = [row for car in measured["cars"].values() for row in (*car["scripts"].values(), car["planner"])]
+    assert not any(row["with"]["departures"] for row in rows)
+    policies = {name: PACKAGE / "pretrained" / f"{name}_path" / "certificate.json" for name in measured["cars"]}
+    for name, place in policies.items():
+        certificate = json.loads(place.read_text())
+        assert measured["cars"][name]["policy_sha256"] == certificate["policy_sha256"]
+        assert measured["cars"][name]["bounds"] == certificate["corridor"]["bounds"]

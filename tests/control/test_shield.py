@@ -8,10 +8,11 @@ import numpy as np
 import pytest
 from helpers import TINY, any_law, jit, path_space, same, tiny
 
-from sfkd_jax import control, models
+from sfkd_jax import assembly, control, models
 from sfkd_jax.control import admit, curvature_ahead, path_coordinates, shielded
 from sfkd_jax.path_frame import beside, path_state
 from sfkd_jax.types import BODY, Controller, Model
+from sfkd_jax.vehicle import kinematic
 
 LAW = any_law()
 ENV = jnp.asarray([0.6, 2.0])
@@ -421,3 +422,18 @@ def test_a_model_of_the_world_and_an_environment_of_another_size_are_refused():
     memory, xi = controller.init(jax.random.key(0)), beside(jnp.asarray([0.0, 0.0, SPEED]))
     with pytest.raises(ValueError, match=r"env must have shape \(2,\), got \(3,\)"):
         controller.act(jnp.zeros((9, 2)), memory, xi, jnp.zeros(3), circle())
+
+
+def test_the_box_of_a_certificate_holds_its_corridor(monkeypatch):
+    """A data set that strayed to one side only must not make the other side of the corridor void."""
+    corridor = {"bounds": {"nominal": 0.08, "followed_position": 0.06}, "corridor_m": 0.14, "shield_horizon": 20}
+    corridor["class"] = {"sensor_noise": [0.01, 0.01, 0.002]}
+    boxes = {"state": [[-0.05, -0.1, 7.0], [0.4, 0.1, 11.0]], "env": [[0.3, -8.0], [0.9, 8.0]]}
+    boxes["control"] = [[-0.03, -1.0, -0.02, 8.0], [0.03, 1.0, 0.02, 10.0]]
+    made = {}
+    monkeypatch.setattr(control, "shielded", lambda inner, *_, **options: made.update(options) or inner)
+    assembly.in_corridor(scripted(), TOY, kinematic(), LAW, {"corridor": corridor, "boxes": boxes})
+    assert made["state_low"] == (pytest.approx(-0.17), -0.1, 7.0)
+    assert made["state_high"] == (0.4, 0.1, 11.0)
+    assert boxes["state"][0][0] == -0.05
+    assert (made["width"], made["tube"], made["noise_allowance"]) == (0.08, 0.06, pytest.approx(0.03))

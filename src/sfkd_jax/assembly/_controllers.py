@@ -7,6 +7,7 @@ from typing import Any
 
 from sfkd_jax import control, vehicle
 from sfkd_jax.assembly._choices import Settings, choose, floats, without
+from sfkd_jax.path_frame import LATERAL
 from sfkd_jax.types import Controller, Model
 
 ROAD_MARGIN = 0.05
@@ -64,6 +65,8 @@ def in_corridor(
 ) -> Controller:
     """The planner inside the corridor of a certificate; outside the boxes of ξ, e, κ and v_ref the law drives alone.
 
+    The box of e_y is at least the corridor: whoever drives further out than the data did is still where it is claimed.
+
     Args:
         planner: any controller that needs no more than `Controller.act` is given. model: along a path.
         plant: whose limits of the controls hold. law: around which the model was learned.
@@ -73,6 +76,10 @@ def in_corridor(
     bounds, sensors = corridor["bounds"], corridor["class"]["sensor_noise"]
     low = tuple(edge - ROAD_MARGIN * abs(edge) for edge in boxes["control"][0][2:])
     high = tuple(edge + ROAD_MARGIN * abs(edge) for edge in boxes["control"][1][2:])
+    allowance = ALLOWANCE * max(sensors[:2], default=0.0)
+    edge = corridor["corridor_m"] + allowance
+    state_low, state_high = (list(side) for side in boxes["state"])
+    state_low[LATERAL], state_high[LATERAL] = min(state_low[LATERAL], -edge), max(state_high[LATERAL], edge)
     return control.shielded(
         planner,
         model,
@@ -80,13 +87,13 @@ def in_corridor(
         width=bounds["nominal"],
         tube=bounds["followed_position"],
         horizon=corridor["shield_horizon"],
-        noise_allowance=ALLOWANCE * max(sensors[:2], default=0.0),
+        noise_allowance=allowance,
         control_low=plant.control_low,
         control_high=plant.control_high,
         env_low=tuple(boxes["env"][0]),
         env_high=tuple(boxes["env"][1]),
-        state_low=tuple(boxes["state"][0]),
-        state_high=tuple(boxes["state"][1]),
+        state_low=tuple(state_low),
+        state_high=tuple(state_high),
         preview_low=low,
         preview_high=high,
     )

@@ -66,11 +66,17 @@ _AXES = {
     "env": (("friction", ""), ("side wind", " m/s")),
 }
 
+_ALONG = _AXES | {
+    "state": (("lateral deviation", " m"), ("heading error", " rad"), *_AXES["state"]),
+    "control": (("steering added", " rad"), ("drive added", ""), ("curvature", " 1/m"), ("speed asked for", " m/s")),
+}
+
 
 def _axes(record: dict[str, Any], box: str) -> tuple[tuple[str, str], ...]:
     """Name and unit of every side of a box: as the logs name them, or else as the benchmark's plants do."""
     named = dig(record, "boxes", "names", box)
-    return _AXES[box] if named is None else tuple((str(name), "") for name in named)
+    along = dig(record, "corridor") is not None
+    return (_ALONG if along else _AXES)[box] if named is None else tuple((str(name), "") for name in named)
 
 
 def _box(box: Any, names: tuple[tuple[str, str], ...]) -> str:

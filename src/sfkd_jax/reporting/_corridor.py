@@ -11,9 +11,9 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import MultipleLocator
 
 from sfkd_jax.reporting._conditions import conditions, mark
-from sfkd_jax.reporting._numbers import number, upper
+from sfkd_jax.reporting._numbers import number
 from sfkd_jax.reporting._scene import Scene, switches
-from sfkd_jax.reporting._style import ACCENT, PLATE, canvas, legend, line, literal, save
+from sfkd_jax.reporting._style import ACCENT, PLATE, canvas, literal, save
 
 _INNER, _OUTER = "#cfe0f5", "#e9f1fb"
 _LEAVES, _LANE = "#c2410c", "#30363d"
@@ -36,7 +36,7 @@ class Hostile(NamedTuple):
         dt: sampling period [s]. envs: friction and wind at every step. corridor: certified. lane: its half width, less
             the car's [m].
         kept: planner -> e_y with the shield [m], (drive, time). onset: step from which on each drive of the next two
-            is hostile. held, free: e_y of such drives with the shield and without it [m]. name: what their planner does.
+            is hostile. held, free: e_y of such drives with the shield and without it [m]. name: what they do.
     """
 
     dt: float
@@ -58,10 +58,10 @@ def band(axes: Any, corridor: Corridor, *, named: bool) -> None:
     for side in (-edge, edge):
         axes.axhline(side, color=ACCENT, linewidth=1.2, zorder=2)
     if named:
-        words = {"fontsize": 8.5, "color": ACCENT, "va": "bottom", "ha": "right", "zorder": 6}
+        words = {"fontsize": 8.5, "color": ACCENT, "va": "bottom", "ha": "right", "zorder": 6, "bbox": PLATE}
         for height, name in ((edge, "W + tube"), (corridor.width, "W")):
             where = {"transform": axes.get_yaxis_transform()}
-            axes.text(0.995, height, f"{name} = {upper(height, 3)} m", **where, **words)
+            axes.text(0.995, height + 0.03 * edge, f"{name} = {number(height)} m", **where, **words)
 
 
 def draw_hostile(path: Path, *, width: float, tube: float, **drives: Any) -> Path:
@@ -113,9 +113,8 @@ def around_drives(scene: Scene, system: str, corridor: Corridor) -> Figure:
     figure = canvas(3.4)
     axes = figure.subplots()
     band(axes, corridor, named=True)
-    style = line(system) | {"linewidth": 0.6}
-    for row, values in enumerate(scene.lateral[system]):
-        axes.plot(_time(values, scene.dt), values, **style | ({"label": f"_{row}"} if row else {}))
+    for values in scene.lateral[system]:
+        axes.plot(_time(values, scene.dt), values, color=ACCENT, linewidth=0.6)
     values = np.abs(scene.lateral[system])
     farthest = float(np.max(values, where=np.isfinite(values), initial=0.0))
     reach = 1.25 * max(corridor.width + corridor.tube, farthest)
@@ -125,7 +124,6 @@ def around_drives(scene: Scene, system: str, corridor: Corridor) -> Figure:
     count = "the one episode" if len(values) == 1 else f"{len(values)} episodes"
     axes.set_title(f"{literal(scene.label)}: {count}, at most {number(farthest)} m from the path")
     mark(axes, switches(scene.envs) if len(values) == 1 else (), scene.dt)
-    legend(figure, axes)
     return figure
 
 

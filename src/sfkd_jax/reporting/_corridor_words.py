@@ -9,16 +9,16 @@ from sfkd_jax.reporting._blocks import Block, Heading, Table, Text, picture
 from sfkd_jax.reporting._corridor import Corridor, around_drives
 from sfkd_jax.reporting._numbers import DASH, dig, interval, is_number, number, short, upper
 from sfkd_jax.reporting._scene import scenes_of
-from sfkd_jax.reporting._words import model_of
+from sfkd_jax.reporting._words import holds, model_of
 
 
-def corridor(run: Path, record: dict[str, Any], settings: dict[str, Any], place: Path) -> list[Block]:
-    """The section of a certificate that has a corridor; nothing for another."""
+def corridor(run: Path, record: dict[str, Any] | None, settings: dict[str, Any], place: Path) -> list[Block]:
+    """The section of a certificate that holds and has a corridor; nothing for another."""
     found = dig(record, "corridor")
     width, tube = (dig(found, "bounds", name) for name in ("nominal", "followed_position"))
-    if not isinstance(found, dict) or not is_number(found.get("corridor_m")):
+    if record is None or not holds(record) or not is_number(dig(found, "corridor_m")):
         return []
-    blocks: list[Block] = [Heading(3, "How far the car strays"), *corridor_words(record), corridor_table(found)]
+    blocks: list[Block] = [Heading(2, "How far the car strays"), *corridor_words(record), corridor_table(found)]
     system = model_of(settings)
     scenes = [scene for scene in scenes_of(run) if system in scene.lateral]
     if scenes and is_number(width) and is_number(tube):
@@ -38,18 +38,19 @@ def corridor_words(record: dict[str, Any]) -> list[Text]:
     found = record["corridor"]
     level, bounds = _share(found.get("level")), found.get("bounds")
     promised = (
-        f"With this certificate the car stays within {upper(found['corridor_m'], 3)} m of its path, whatever planner "
-        f"drives it through the shield, as long as {_class(found.get('class'))}. It is promised for at least {level} "
-        f"of such drives: the shield keeps a nominal copy of the car within W = {upper(dig(bounds, 'nominal'), 3)} m "
-        f"of the path, and the car stays within {upper(dig(bounds, 'followed_position'), 3)} m of that copy. A step "
-        "at which the shield cannot keep W, or at which the car is farther from its copy than that, is reported while "
-        "driving."
+        f"With this certificate the car stays within {upper(found['corridor_m'])} m of its path as long as "
+        f"{_class(found.get('class'))}. At least {level} of such drives keep it. Whatever a planner asks for, the "
+        f"shield lets no more of it through than keeps a nominal copy of the car within W = "
+        f"{upper(dig(bounds, 'nominal'))} m of the path; and the car stays within "
+        f"{upper(dig(bounds, 'followed_position'))} m of that copy while the disturbances are those of such drives. A "
+        "step at which the shield cannot keep W, or at which the car is farther from its copy than that, is reported "
+        "while driving."
     )
     alpha = upper(dig(record, "outputs", "position", "alpha"))
     proved = (
-        f"In a metric for the lateral deviation, car and copy come to at most {alpha} times their distance in every "
-        "step, for every perturbation, road, speed and environment in the box, and for any switching. So their "
-        "distance follows from the one-step disturbances of a drive, and no planner adds to it."
+        f"In a metric for the lateral deviation, a step of the model brings two states to at most {alpha} times their "
+        "distance, for every perturbation, road, speed and environment in the box, and for any switching. So how far "
+        "the car is from its copy follows from the one-step disturbances of a drive and from nothing else."
     )
     return [
         Text(promised, "The corridor."),
@@ -64,20 +65,23 @@ def _class(about: Any) -> str:
     low, high = (_entries(dig(about, "env_box"), side, 2) for side in (0, 1))
     speed, dwell = (_entries(about, name, 2) for name in ("speed", "dwell_s"))
     steering, drive = _entries(about, "perturbation", 2)
+    spread, push = (_entries(about, name, 2) for name in ("steering_excitation", "speed_excitation"))
     return (
         f"it drives at {short(speed[0])} to {short(speed[1])} m/s on a road of a curvature of at most "
         f"{short(dig(about, 'peak_curvature'))} 1/m and a lateral acceleration of at most "
         f"{short(dig(about, 'lateral_acceleration'))} m/s²; friction lies in {short(low[0])} to {short(high[0])}, side "
         f"wind in {short(low[1])} to {short(high[1])} m/s, and they hold for at least {short(dwell[0])} s between two "
-        f"switches; the planner adds at most {short(steering)} rad of steering and {short(drive)} of drive to the law; "
-        f"and the drive lasts at most {short(dig(about, 'duration_s'))} s"
+        f"switches; what the shield lets through adds at most {short(steering)} rad of steering and {short(drive)} of "
+        f"drive to the law, with a spread of {short(spread[0])} to {short(spread[1])} rad and {short(push[0])} to "
+        f"{short(push[1])}; and the drive lasts at most {short(dig(about, 'duration_s'))} s"
     )
 
 
-def _entries(record: Any, key: Any, count: int) -> list[Any]:
-    """That many entries of a list in a record or list; None for each where there are not."""
-    listed = isinstance(record, list) and len(record) > key if isinstance(key, int) else isinstance(record, dict)
-    values = (record[key] if isinstance(key, int) else record.get(key)) if listed else None
+def _entries(record: Any, key: str | int, count: int) -> list[Any]:
+    """That many entries of a list in a record, or of one in a list; None for each where there are not."""
+    values = dig(record, key) if isinstance(key, str) else None
+    if isinstance(key, int) and isinstance(record, list) and len(record) > key:
+        values = record[key]
     return values if isinstance(values, list) and len(values) == count else [None] * count
 
 
@@ -124,9 +128,10 @@ def corridor_table(found: dict[str, Any]) -> Table:
         ("for_ever_position", "The same from the largest disturbance alone, across [m]", alone),
         ("for_ever_yaw", "The same from the largest disturbance alone, heading [rad]", alone),
     )
-    values = found | (found.get("bounds") if isinstance(found.get("bounds"), dict) else {})
+    bounds = found.get("bounds")
+    values = found | (bounds if isinstance(bounds, dict) else {})
     level = _share(found.get("level"))
-    rows = [[name, upper(values.get(key), 3), f"{level}, {kind}"] for key, name, kind in named]
+    rows = [[name, upper(values.get(key)), f"{level}, {kind}"] for key, name, kind in named]
     return Table(["Bound", "At most", "Holds on a share of drives of"], rows, prose=True)
 
 

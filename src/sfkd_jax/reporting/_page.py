@@ -8,6 +8,7 @@ from typing import Any
 from sfkd_jax.artefacts import ArtefactError, read_jsonl, tell, understood, write_bytes, writing
 from sfkd_jax.reporting import _sections as sections
 from sfkd_jax.reporting._blocks import Block, Heading, Picture, Text, to_html, to_markdown
+from sfkd_jax.reporting._corridor_words import corridor
 from sfkd_jax.reporting._driving import driving
 from sfkd_jax.reporting._files import about, read
 from sfkd_jax.reporting._numbers import dig, plain
@@ -67,7 +68,8 @@ def _write(run: Path) -> dict[str, Any]:
     with understood(run / "certificate.json", ValueError):
         lead = Text(summary(settings, head, certificate, metrics), kind="lead")
         tiles = sections.tiles(settings, head, errors, certificate)
-        certified = sections.certified(run, certificate, errors, settings, place)
+        certified = corridor(run, certificate, settings, place)
+        certified += sections.certified(run, certificate, errors, settings, place)
     page: list[Block] = [Heading(1, title), lead, *tiles, *driven, *certified, *predicted, *trained, *made]
     report = run / "report" / "index.html"
     write_bytes(report, to_html(title, page).encode())

@@ -7,7 +7,6 @@ from typing import Any
 
 from sfkd_jax.reporting._blocks import Block, Code, Heading, Missing, Table, Text, Tiles, picture
 from sfkd_jax.reporting._certificate_words import certificate_words
-from sfkd_jax.reporting._corridor_words import corridor
 from sfkd_jax.reporting._curves import learning, open_loop
 from sfkd_jax.reporting._numbers import dig, is_number, number, plain, short, upper
 from sfkd_jax.reporting._scene import scenes_of
@@ -25,6 +24,8 @@ def tiles(
 ) -> list[Block]:
     """The few figures a reader looks for first."""
     items = [("Certified α", upper(dig(certificate, "alpha")))] if holds(certificate) else []
+    if holds(certificate) and is_number(dig(certificate, "corridor", "corridor_m")):
+        items.append(("Certified corridor", f"± {upper(dig(certificate, 'corridor', 'corridor_m'))} m"))
     for system in (model_of(settings), "oracle", "nominal"):
         mean = dig(row_of(head, system), "rmse_m", "mean")
         if is_number(mean):
@@ -46,13 +47,11 @@ def certified(
     settings: dict[str, Any],
     place: Path,
 ) -> list[Block]:
-    """The certificate in words, its corridor, its tube by step and on a drive, and all of its numbers."""
+    """The certificate in words, its tube by step and on a drive, and all of its numbers."""
     blocks: list[Block] = [Heading(2, "What is certified")]
     if certificate is None:
         return [*blocks, Missing("certificate.json", command("certify", settings))]
     blocks += certificate_words(certificate)
-    if holds(certificate):
-        blocks += corridor(run, certificate, settings, place)
     radii = dig(certificate, "tube", "latent") or []
     if holds(certificate) and radii and all(map(is_number, radii)):
         caption = f"Radius Rₖ of the latent prediction error up to {len(radii)} steps ahead."
