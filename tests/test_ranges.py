@@ -124,7 +124,7 @@ def wrong():
     found = {}
     for option in OPTIONS:
         for name, value in names(option).items():
-            if name.partition(".")[0] in ("comparison", "report") or value is None or name in FREE:
+            if name.partition(".")[0] in ("comparison", "report") or value in (None, "???") or name in FREE:
                 continue
             found |= {(name, repr(one)): (option, name, one) for one in impossible(name, value)}
     return random.Random(0).sample(list(found.values()), SAMPLE)

@@ -14,7 +14,8 @@ _INTERVALS = {
     "(-inf, inf)": "vehicle.wind_lever vehicle.control_low vehicle.control_high dataset.env_low dataset.env_high "
     "evaluation.told.bias",
     "[0, inf)": "seed dataset.seed evaluation.seed comparison.seeds comparison.share evaluation.timed_steps "
-    "demo.timed_steps certification.attack_starts model.environment_degree model.forcing_hidden *.num_proposals *.smoothing_window "
+    "demo.timed_steps certification.attack_starts model.environment_degree model.forcing_hidden "
+    "*.num_proposals *.smoothing_window "
     "*.smoothing_order *.chunk",
     "(0, inf)": f"{' '.join(f'vehicle.{name}' for name in _PLANTS.split())} vehicle.dt vehicle.creep_speed "
     "vehicle.wheelbase vehicle.speed_gain scenario.speed scenario.wavelengths dataset.speed dataset.gap "
@@ -31,7 +32,8 @@ _INTERVALS = {
     "(0, 1]": "*.risk_level controller.monitor.slow_factor training.data_share",
     "[0, 1]": "*.noise_correlation controller.mppi.adapt",
     "(1, inf)": "controller.estimator.dwell",
-    "(2, inf)": "evaluation.episode_s demo.episode_s certification.corridor.duration",  # what settles at the start is not scored
+    # What settles at the start is not scored.
+    "(2, inf)": "evaluation.episode_s demo.episode_s certification.corridor.duration",
     "[2, inf)": "controller.*.horizon model.horizon controller.gradient.steps controller.estimator.points "
     "*.noise_knots dataset.law.points",
     "[4, inf)": "dataset.segments",
@@ -39,7 +41,8 @@ _INTERVALS = {
 _ENTRIES = {
     2: "scenario.wavelengths dataset.speed dataset.steering_excitation dataset.speed_excitation *.noise_std "
     "controller.task.control_rate evaluation.told.noise evaluation.told.bias comparison.share "
-    "dataset.law.speed dataset.law.perturbation dataset.wavelengths certification.corridor.dwell",
+    "dataset.law.speed dataset.law.perturbation dataset.wavelengths "
+    "certification.corridor.dwell",
     3: "dataset.law.points",
     4: "dataset.shares",
 }
