@@ -34,7 +34,7 @@ def _facts(plant: str) -> dict[str, str]:
     bounds, attack, s3 = corridor["bounds"], corridor["attack"], corridor["by_scenario"]["s3"]
     low, high = corridor["coverage_ci95"]
     return {
-        "**corridor \\|e_y\\| of the class, any planner [m]**": f"**{corridor['corridor_m']:.3f}**",
+        "**corridor \\|e_y\\| on drives of the class [m]**": f"**{corridor['corridor_m']:.3f}**",
         "half width W of the nominal corridor [m]": f"{bounds['nominal']:.3f}",
         "tube around the copy, `followed` [m]": f"{bounds['followed_position']:.3f}",
         "tube around the copy, `for_ever` [m]": f"{bounds['for_ever_position']:.3f}",
