@@ -44,9 +44,12 @@ def test_roads_speeds_and_perturbations_are_as_asked(drives):
     assert np.ptp(speed, axis=1).max() > 0.2
 
 
-def test_half_of_the_environments_are_held_and_reach_the_corners(drives):
+def test_a_quarter_of_the_environments_is_held_another_switches_and_both_reach_the_corners(drives):
     held = drives.envs[32:]
-    assert np.all(held == held[:, :1])
+    assert np.all(held[:16] == held[:16, :1])
+    jumps = np.any(np.diff(held[16:], axis=1) != 0, axis=2)
+    for drive in jumps:
+        assert np.all(np.diff(np.flatnonzero(drive)) >= 14)  # 1.5 s, less a step
     ends = (held[:, 0] <= np.asarray(ENV_LOW)) | (held[:, 0] >= np.asarray(ENV_HIGH))
     assert 0.0 < np.mean(np.all(ends, axis=1)) < 0.35  # of 32, a ninth in the mean
 
