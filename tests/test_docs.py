@@ -274,6 +274,23 @@ def test_the_table_of_drills_is_that_of_the_run():
     assert (told in (DOCS / "failures.md").read_text("utf-8")) == (done < asked)
 
 
+def test_the_readme_says_of_the_corridor_what_its_page_says():
+    """Every row of its table is one of that table, and the first sentence has both corridors, rounded."""
+    page, readme = (file.read_text("utf-8") for file in (DOCS / "corridor.md", ROOT / "README.md"))
+    rows = [text.split("<!-- corridor -->")[1].split("<!-- /corridor -->")[0].splitlines() for text in (readme, page)]
+    assert len(rows[0]) > 8
+    assert set(rows[0]) <= set(rows[1])
+    half = [
+        json.loads((PACKAGE / "pretrained" / f"{plant}_path" / "certificate.json").read_text())["corridor"][
+            "corridor_m"
+        ]
+        for plant in ("dynamic", "kinematic")
+    ]
+    assert f"±{half[0]:.2f} m (dynamic single track) and ±{half[1]:.2f} m (kinematic) on 95 %" in " ".join(
+        readme.split()
+    )
+
+
 def test_the_page_about_the_corridor_says_what_the_certificates_say():
     """Its table is what benchmarks/corridor.py makes of the shipped certificates and the committed rows."""
     made = runpy.run_path(str(ROOT / "benchmarks" / "corridor.py"))

@@ -202,8 +202,11 @@ def test_bad_input_is_answered_with_the_choices(walked, arguments, says):
     assert len(done.stderr.strip().splitlines()) == 1
 
 
-def test_the_example_in_the_readme_runs(walked):
-    readme = (Path(__file__).parents[1] / "README.md").read_text("utf-8")
-    program = readme.split("```python\n")[1].split("```")[0].replace("runs/s3/", "runs/smoke/")
-    done = subprocess.run([sys.executable, "-c", program], cwd=walked[0], capture_output=True, text=True)
+def test_the_example_in_the_readme_runs_with_a_policy_of_its_first_command():
+    root = Path(__file__).parents[1]
+    program = (root / "README.md").read_text("utf-8").split("```python\n")[1].split("```")[0]
+    shipped = root / "src/sfkd_jax/pretrained/kinematic_path"
+    program = program.replace('"runs/s3/sfkd_path/seed=0"', repr(str(shipped)))
+    assert str(shipped) in program
+    done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True)
     assert done.returncode == 0, done.stderr

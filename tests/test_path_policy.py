@@ -14,7 +14,7 @@ from sfkd_jax import artefacts, assembly, config, policy, rehearsal, vehicle
 def settings(*overrides):
     config.register()
     with initialize_config_dir(config.conf_path(), version_base="1.3"):
-        composed = compose("config", overrides=["+experiment=s3_path", *overrides])
+        composed = compose("config", overrides=["+experiment=s3", *overrides])
     return {name: value for name, value in OmegaConf.to_container(composed, resolve=True).items() if name != "hydra"}
 
 

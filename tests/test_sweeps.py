@@ -80,9 +80,11 @@ def test_what_a_job_typed_names_its_run_in_a_shell_as_well(sweep):
 
 
 def test_what_a_run_directory_names_already_or_what_decides_no_weights_is_not_named(sweep):
-    done = sweep("-m", "+experiment=s1,s2", "model=sfkd,icode", "seed=0", "training.steps=50", "evaluation=tiny,quick")
+    done = sweep(
+        "-m", "+experiment=s1,s2", "model=sfkd_path,r2dn_path", "seed=0", "training.steps=50", "evaluation=tiny,quick"
+    )
     runs = [json.loads(line)["run"] for line in printed(done)]
-    places = [f"runs/{name}/{model}/seed=0" for name in ("s1", "s2") for model in ("sfkd", "icode")]
+    places = [f"runs/{name}/{model}/seed=0" for name in ("s1", "s2") for model in ("sfkd_path", "r2dn_path")]
     assert runs == [place for place in places for _ in range(2)]
     assert done.returncode == 0
 

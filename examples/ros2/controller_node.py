@@ -1,6 +1,6 @@
 """A ROS 2 node around a trained controller: odometry, path and road condition in, drive commands out, at 10 Hz.
 
-ros2 run, or python controller_node.py --ros-args -p policy:=runs/s3/sfkd/seed=0
+ros2 run, or python controller_node.py --ros-args -p policy:=runs/s3/sfkd_path/seed=0
 Needs rclpy, nav_msgs, std_msgs and ackermann_msgs of a ROS 2 installation beside this package.
 """
 
@@ -28,7 +28,7 @@ class ControllerNode(Node):
 
     def __init__(self) -> None:
         super().__init__("sfkd_controller")
-        defaults = {"policy": "runs/s3/sfkd/seed=0", "speed": 10.0, "timeout": 0.3, "patience": 5, "seed": 0}
+        defaults = {"policy": "runs/s3/sfkd_path/seed=0", "speed": 10.0, "timeout": 0.3, "patience": 5, "seed": 0}
         for name, value in defaults.items():
             self.declare_parameter(name, value)
         policy = sfkd_jax.load(self.setting("policy"))

@@ -3,6 +3,6 @@
 # What ships in src/sfkd_jax/pretrained/*_path was made by this. Extra arguments are Hydra overrides.
 set -euo pipefail
 for vehicle in dynamic kinematic; do
-  python -m sfkd_jax.train +experiment=s3_path vehicle="$vehicle" name="corridor_$vehicle" \
+  python -m sfkd_jax.train +experiment=s3 vehicle="$vehicle" name="corridor_$vehicle" \
     certification.corridor.attack_steps=1000000 evaluation.episodes=16 "$@"
 done
