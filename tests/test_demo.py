@@ -27,6 +27,17 @@ def test_the_demo_drives_without_training_and_draws_an_animation(tmp_path):
     assert "certificate: holds" in done.stderr
 
 
+def test_along_a_path_the_demo_drives_in_the_corridor_of_its_policy(tmp_path):
+    done = door("demo", "+experiment=s3", "demo.episode_s=9.0", "controller.mppi.num_samples=30", cwd=tmp_path)
+    found = last_line(done)
+    assert (tmp_path / found["animation"]).read_bytes()[:6] == b"GIF89a"
+    rows = {row["system"]: row for row in json.loads((tmp_path / found["results"]).read_text())["rows"]}
+    assert set(rows) == {"sfkd_path", "nominal", "oracle"}
+    certificate = json.loads((demo.SHIPPED / "kinematic_path" / "certificate.json").read_text())
+    assert rows["sfkd_path"]["max_deviation_m"] <= certificate["corridor"]["corridor_m"]
+    assert "corridor: 0.38 m to each side" in done.stderr
+
+
 @pytest.mark.parametrize("other", ["vehicle=kinematic_speed", "vehicle.mass=900.0", "vehicle.name=hovercraft"])
 def test_a_vehicle_for_which_nothing_ships_is_refused_before_it_drives(tmp_path, other):
     done = door("demo", other, cwd=tmp_path, code=1)

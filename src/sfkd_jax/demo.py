@@ -21,15 +21,16 @@ def run(settings: dict[str, Any]) -> dict[str, Any]:
     Raises:
         ArtefactError: what ships was changed. ValueError: a vehicle for which nothing ships, also by its settings.
     """
-    began, vehicle = time.perf_counter(), settings["vehicle"]["name"]
-    trained = _shipped(settings, vehicle)
+    began = time.perf_counter()
+    trained = _shipped(settings)
     settings = settings | {"name": "demo", "evaluation": settings["evaluation"] | settings["demo"]}
     plant = assembly.build_vehicle(settings["vehicle"])
     track = drive.lay(settings, plant)
-    systems = {"sfkd": assembly.System(trained.model, trained.params, settings["env"], trained.certificate)}
-    systems |= {name: assembly.reference_systems(plant)[name] for name in ("nominal", "oracle")}
+    own = assembly.System(trained.model, trained.params, settings["env"], trained.certificate, trained.law)
+    systems = {trained.settings["model"]["system"]: own}
+    systems |= {name: assembly.reference_systems(plant, trained.law)[name] for name in ("nominal", "oracle")}
     place, rows = Path(settings["root"]) / settings["name"], []
-    folder = place / f"{track.scenario}_{vehicle}"
+    folder = place / f"{track.scenario}_{_name(settings)}"
     with artefacts.locked(folder):
         for name, system in systems.items():
             shelf.say(f"driving {settings['demo']['episodes']} x {settings['demo']['episode_s']:.0f} s: {name}")
@@ -44,20 +45,28 @@ def run(settings: dict[str, Any]) -> dict[str, Any]:
     return {"animation": film and str(film), "rows": len(rows), "results": str(folder / "results.json")}
 
 
-def _shipped(settings: dict[str, Any], vehicle: str) -> policy.Policy:
+def _name(settings: dict[str, Any]) -> str:
+    """Of the policy that is asked for."""
+    return settings["vehicle"]["name"] + ALONG_PATH * shelf.is_along_path(settings)
+
+
+def _shipped(settings: dict[str, Any]) -> policy.Policy:
     """The policy for a vehicle, with a certificate that holds."""
     if settings["env"] == "none":
         raise ValueError("the controllers that ship read the environment; choose env=measured or env=estimated")
-    places = sorted(place.name for place in SHIPPED.iterdir() if place.is_dir())
-    known = [name for name in places if not name.endswith(ALONG_PATH)]
+    name, places = _name(settings), sorted(place.name for place in SHIPPED.iterdir() if place.is_dir())
     began = time.perf_counter()
-    trained = policy.load(SHIPPED / vehicle, controller=settings["controller"]) if vehicle in known else None
+    trained = policy.load(SHIPPED / name, controller=settings["controller"]) if name in places else None
     if trained is None or trained.settings["vehicle"] != settings["vehicle"]:
-        raise ValueError(f"controllers ship for {' and '.join(known)} as they are; for another vehicle run train")
+        known = " and ".join(place for place in places if not place.endswith(ALONG_PATH))
+        raise ValueError(f"controllers ship for {known} as they are; for another vehicle run train")
     if trained.certificate is None:
-        raise artefacts.ArtefactError(f"{SHIPPED / vehicle} was changed: its certificate is about other weights")
+        raise artefacts.ArtefactError(f"{SHIPPED / name} was changed: its certificate is about other weights")
     alpha, seconds = trained.certificate["alpha"], time.perf_counter() - began
     shelf.say(f"certificate: holds, alpha {alpha:.4f}; loaded and verified in {seconds:.1f} s")
+    if corridor := trained.certificate.get("corridor"):
+        share = 100 * corridor["level"]
+        shelf.say(f"corridor: {corridor['corridor_m']:.2f} m to each side, on {share:.0f} % of the drives of its class")
     return trained
 
 

@@ -80,7 +80,7 @@ def _cast(found: list[Drive]) -> _Cast:
     whole = [one for one in found if one.states is not None and one.path is not None]
     rivals = [one for one in whole if not one.line.system.startswith("sfkd") and one.line.system not in SELF_EVIDENT]
     rivals.sort(key=lambda one: (one.line.system != "icode_mppi", one.line.env != "measured"))
-    named = [[one for one in whole if one.line.system == name] for name in ("sfkd", "nominal")]
+    named = [[one for one in whole if one.line.system in names] for names in (("sfkd", "sfkd_path"), ("nominal",))]
     chosen = [group[0] for group in (*named, rivals) if group] or whole[:1]
     pairs = [_projected(np.asarray(one.states)[:, :2], np.asarray(one.path)) for one in chosen]
     return _Cast(chosen, [near for near, _ in pairs], [offset for _, offset in pairs])
