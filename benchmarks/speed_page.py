@@ -37,7 +37,10 @@ def answer(found, room):
     speeds = fastest(found["cells"], room)
     if all(speed == ends for speed in speeds.values()):
         return f"With {room:g} m of room: up to {ends:g} m/s at every friction; the box ends first."
-    words = [f"friction {friction:g} {_speed(speed, ends)}" for friction, speed in speeds.items()]
+    if not any(speeds.values()):
+        return f"With {room:g} m of room: at no speed of the box."
+    words = [f"friction {friction:g} {_speed(speed)}" for friction, speed in speeds.items() if speed != ends]
+    words += [f"up to {ends:g} m/s elsewhere, where the box ends first"] if ends in speeds.values() else []
     return f"With {room:g} m of room: {', '.join(words)}."
 
 
@@ -45,14 +48,13 @@ def tables(document):
     """All of them, with what was counted."""
     lines = []
     for name, found in document["cars"].items():
-        low, high = found["coverage_ci95"]
-        shares = sorted(cell["coverage"] for cell in found["cells"])
+        shares = [found["coverage"], *found["coverage_ci95"], *_ends(cell["coverage"] for cell in found["cells"])]
+        inside = "{:.1f} % of all test drives are inside ({:.1f} to {:.1f} %), {:.1f} to {:.1f} % by cell"
         lines += [table(name, found)]
         lines += [f"- {answer(found, room)}" for room in sorted({*ROOMS, document["room_m"]})]
         lines += [
-            f"- {found['drives']} drives of {found['duration_s']:g} s fix the units of a cell, as many calibrate and as "
-            f"many test it at level {100 * found['level']:g} %: {100 * found['coverage']:.1f} % of all test drives are "
-            f"inside ({100 * low:.1f} to {100 * high:.1f} %), {100 * shares[0]:.1f} to {100 * shares[-1]:.1f} % by cell.",
+            f"- {found['drives']} drives of {found['duration_s']:g} s fix the units of a cell, as many calibrate and "
+            f"as many test at level {100 * found['level']:g} %: {inside.format(*(100 * share for share in shares))}.",
             "",
         ]
     return "\n".join(lines)
@@ -68,10 +70,13 @@ def _row(cells):
     return f"| {' | '.join(cells)} |"
 
 
-def _speed(speed, ends):
-    if speed is None:
-        return "not at all"
-    return f"up to {speed:g} m/s" + (" (the box ends)" if speed == ends else "")
+def _ends(values):
+    found = sorted(values)
+    return found[0], found[-1]
+
+
+def _speed(speed):
+    return "at no speed of the box" if speed is None else f"up to {speed:g} m/s"
 
 
 if __name__ == "__main__":

@@ -33,8 +33,8 @@ def against_speed(cars: Mapping[str, Sequence[Mapping[str, Any]]], room: float) 
             style = {"color": _COLOURS[row % len(_COLOURS)], "marker": _MARKS[row % len(_MARKS)], "markersize": 4}
             panel.plot(*zip(*chosen, strict=True), label=f"friction {friction:g}", linewidth=1.3, **style)
         panel.axhline(room, color=MUTED, linestyle=(0, (6, 2)), linewidth=1.2, zorder=2)
-        words = {"fontsize": 8.5, "color": MUTED, "va": "bottom", "ha": "right", "bbox": PLATE}
-        panel.text(0.99, room, f"room: {room:g} m", transform=panel.get_yaxis_transform(), **words)
+        words = {"fontsize": 8.5, "color": MUTED, "va": "bottom", "ha": "left", "bbox": PLATE}
+        panel.text(0.01, 1.02 * room, f"room: {room:g} m", transform=panel.get_yaxis_transform(), **words)
         panel.set(xlabel="speed [m/s]", title=literal(name))
     widest = max(cell["corridor_m"] for cells in cars.values() for cell in cells)
     panels[0].set(ylabel="corridor, on either side [m]", ylim=(0.0, 1.2 * max(room, min(widest, 3.0 * room))))
