@@ -32,6 +32,7 @@ def _facts(plant: str) -> dict[str, str]:
     own, oracle = rows["sfkd_path"], rows["oracle"]
     output, corridor = certificate["outputs"]["position"], certificate["corridor"]
     bounds, attack, s3 = corridor["bounds"], corridor["attack"], corridor["by_scenario"]["s3"]
+    rest = [corridor["fixed_points"][name] for name in ("corridor_m", "after_switch_m")]
     low, high = corridor["coverage_ci95"]
     return {
         "**corridor \\|e_y\\| on drives of the class [m]**": f"**{corridor['corridor_m']:.3f}**",
@@ -43,6 +44,10 @@ def _facts(plant: str) -> dict[str, str]:
         "largest \\|e_y − ê_y\\| of those fresh drives [m]": f"{corridor['seen']['distance_m']:.3f}",
         "tube on 5 s drives like the data, `for_ever` [m]": f"{output['tube']['for_ever']:.3f}",
         "tube on 5 s drives like the data, `followed` [m]": f"{output['tube']['followed']:.3f}",
+        "without a copy: the law alone [m]; right after a switch": "; ".join(f"{part['law']:.3f}" for part in rest),
+        "without a copy: any ν in its limits [m]; right after a switch": "; ".join(
+            f"{part['planner']:.3f}" for part in rest
+        ),
         "α in the metric of e_y, proved; in the 2-norm": f"{output['alpha']:.3f}; {certificate['alpha']:.3f}",
         "attack, r_k within its bound: share of the tube": f"{attack['over_tube']:.2f}",
         "attack, any disturbance: \\|e_y\\| [m]": f"{attack['shielded_lateral_m']:.2f}",

@@ -11,7 +11,7 @@ from test_path_policy import saved, settings
 
 from sfkd_jax import assembly, datasets, policy
 from sfkd_jax.certification import CertificationRefused, claims_of, issue, verify_document
-from sfkd_jax.corridor import certify_corridor
+from sfkd_jax.corridor import certify_corridor, corridor_by_speed, fastest
 from sfkd_jax.types import Trajectory
 from sfkd_jax.vehicle import along_path, kinematic
 
@@ -60,6 +60,7 @@ def test_the_document_verifies_and_a_changed_one_does_not(document, trained):
     for part, name, value in (
         ("corridor", "corridor_m", 0.01),
         ("corridor", "coverage", 1.5),
+        ("corridor", "fixed_points", document["corridor"]["fixed_points"] | {"push": 0.0}),
         ("outputs", "position", document["outputs"]["yaw"]),
     ):
         changed = copy.deepcopy(document)
@@ -79,6 +80,54 @@ def test_what_is_claimed_is_one_sum_of_what_is_calibrated(document):
     assert 0.6 <= found["coverage"] <= 1.0
     assert found["drives"] == SMALL["drives"]
     assert found["attack"]["over_tube"] <= 1.0
+
+
+def test_without_a_copy_the_corridor_is_wider_and_no_drive_of_the_class_leaves_it(document):
+    found, part = document["corridor"], document["corridor"]["fixed_points"]
+    between, after = part["corridor_m"], part["after_switch_m"]
+    assert found["bounds"]["for_ever_position"] < between["law"] < between["planner"] < after["planner"]
+    assert after["law"] - between["law"] == pytest.approx(after["planner"] - between["planner"])
+    assert found["seen"]["lateral_m"] < part["after_switch_m"]["planner"]
+    assert part["steps_between_switches"] == 30
+    assert part["points"] == 3 * 3 * SMALL["drives"] * 2 * 25
+
+
+def test_every_friction_and_speed_gets_a_corridor_of_its_own(document, trained):
+    frictions, speeds = [0.3, 0.9], [8.0, 10.5]
+    found = corridor_by_speed(trained, document, frictions=frictions, speeds=speeds, drives=24)
+    cells = found["cells"]
+    assert [(cell["friction"], cell["speed"]) for cell in cells] == [(f, v) for f in frictions for v in speeds]
+    assert [cell["curvature"] for cell in cells] == pytest.approx([0.02, 2.0 / 10.5**2] * 2)
+    for cell in cells:
+        assert cell["corridor_m"] == pytest.approx(cell["nominal_m"] + cell["tube_m"])
+        assert cell["lateral_m"] > 0.0
+        assert cell["coverage_drives"] == 24
+    assert len({cell["corridor_m"] for cell in cells}) == 4
+    assert found["coverage"] == pytest.approx(np.mean([cell["coverage"] for cell in cells]))
+    assert found["coverage_ci95"][1] - found["coverage_ci95"][0] < 0.25
+    alone = corridor_by_speed(trained, document, frictions=frictions[:1], speeds=speeds[:1], drives=24)
+    assert alone["cells"] == cells[:1]
+
+
+def test_nothing_is_said_of_speeds_and_frictions_outside_the_box(document, trained):
+    for name, values in (
+        ("friction", {"frictions": [0.2], "speeds": [9.0]}),
+        ("speed", {"frictions": [0.3], "speeds": [11.0]}),
+    ):
+        with pytest.raises(ValueError, match=f"{name} .* lies outside what is certified"):
+            corridor_by_speed(trained, document, **values)
+
+
+def test_the_fastest_speed_is_one_below_which_every_corridor_fits():
+    """Also where a faster one fits again by chance, and where none does."""
+    widths = {0.3: (0.6, 0.4, 0.4), 0.6: (0.4, 0.6, 0.4), 0.9: (0.5, 0.4, 0.5), 0.75: (0.4, 0.4, float("nan"))}
+    cells = [
+        {"friction": friction, "speed": speed, "corridor_m": width}
+        for friction, row in widths.items()
+        for speed, width in zip((8.0, 9.0, 10.0), row, strict=True)
+    ]
+    assert fastest(cells[::-1], 0.5) == {0.3: None, 0.6: 8.0, 0.75: 9.0, 0.9: 10.0}
+    assert fastest(cells, 0.1) == dict.fromkeys(widths)
 
 
 def test_the_same_seed_gives_the_same_corridor(document, trained, asked):

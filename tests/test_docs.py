@@ -299,6 +299,21 @@ def test_the_page_about_the_corridor_says_what_the_certificates_say():
     assert made["page"](text) == text
 
 
+def test_the_tables_about_speed_are_those_of_their_run(monkeypatch):
+    """Of the policies that ship, over the whole of their box; and it is the box that ends where the page says so."""
+    monkeypatch.syspath_prepend(str(ROOT / "benchmarks"))
+    measured = json.loads((ROOT / "benchmarks/speed.json").read_text())
+    text = (DOCS / "corridor.md").read_text("utf-8")
+    assert runpy.run_path(str(ROOT / "benchmarks/speed_page.py"))["page"](text, measured) == text
+    for name, found in measured["cars"].items():
+        certificate = json.loads((PACKAGE / "pretrained" / f"{name}_path" / "certificate.json").read_text())
+        assert found["policy_sha256"] == certificate["policy_sha256"]
+        about = certificate["corridor"]["class"]
+        for key, ends in (("speed", about["speed"]), ("friction", [side[0] for side in about["env_box"]])):
+            values = {cell[key] for cell in found["cells"]}
+            assert [min(values), max(values)] == ends
+
+
 def test_the_table_of_the_long_drive_is_that_of_its_run(monkeypatch):
     """Every leg is there, and none failed at what is asked of all."""
     monkeypatch.syspath_prepend(str(ROOT / "benchmarks"))

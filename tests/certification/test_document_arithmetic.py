@@ -258,13 +258,13 @@ def test_without_outputs_none_is_proved(outputs):
 def test_a_corridor_needs_both_outputs(outputs, monkeypatch):
     document, asked = outputs
     check(document | {"corridor": {"bounds": 1}})
-    assert asked["corridor"] == [({"bounds": 1},)]
+    assert asked["corridor"] == [({"bounds": 1}, document["outputs"]["position"])]
     for nothing in ({"outputs": {}}, {}):
         refused(honest("path") | nothing | {"corridor": {}}, "a corridor needs a metric of every output")
     for names in ("position", "yaw"):
         told = f"outputs must be position and yaw, got {names}"
         refused(document | {"outputs": {names: output(0.8)}}, told)
-    monkeypatch.setattr(_document, "require_corridor", lambda corridor: corridor["drives"] / corridor["count"])
+    monkeypatch.setattr(_document, "require_corridor", lambda part, output: part["drives"] / part["count"])
     refused(document | {"corridor": {"drives": 0, "count": 0}}, "the certificate is malformed: division by zero")
     more = document["outputs"] | {"body": output(0.8)}
     refused(document | {"outputs": more}, "outputs must be position and yaw, got position, yaw, body")

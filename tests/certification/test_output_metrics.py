@@ -14,11 +14,13 @@ from sfkd_jax import models
 from sfkd_jax.certification import (
     OUTPUTS,
     DriveScores,
+    FixedPoints,
     OutputMetric,
     _corridor_claims,
     _output_metrics,
     calibrate,
     covered,
+    fixed_point_corridor,
     radii,
     residuals,
 )
@@ -213,6 +215,9 @@ def test_bounds_hold_together_as_often_as_they_say():
     assert 0.895 <= np.mean(shares) <= 0.93
 
 
+PROVED = {"alpha": 0.8, "lipschitz": 0.02}
+
+
 @cache
 def corridor():
     bounds = calibrate(scores(60, 0), scores(60, 1), level=0.9)
@@ -225,6 +230,12 @@ def corridor():
         **part,
         "by_scenario": {"s3": part},
         "attack": {"over_tube": 0.7, "over_corridor": 0.5},
+        "fixed_points": fixed_point_corridor(
+            FixedPoints(0.01, 0.7, 0.9, 1.1, 500),
+            **PROVED,
+            for_ever=bounds["for_ever_position"],
+            steps_between_switches=30,
+        ),
     }
 
 
@@ -240,11 +251,25 @@ FORGED = {
     "an interval": lambda c: c.update(coverage_ci95=[0.99, 1.0]),
     "another scenario": lambda c: c["by_scenario"]["s3"].update(coverage=2.0),
     "an attack beyond the tube": lambda c: c["attack"].update(over_tube=1.1),
+    "no fixed points": lambda c: c.update(fixed_points=c["fixed_points"] | {"points": 0}),
+    "a fixed point off by less": lambda c: c["fixed_points"].update(centre_m=0.0),
+    "a smaller move of the road": lambda c: c["fixed_points"].update(road=0.6),
+    "a smaller switch": lambda c: c["fixed_points"].update(switch=0.1),
+    "a smaller push": lambda c: c["fixed_points"].update(push=1.0),
+    "a push NaN": lambda c: c["fixed_points"].update(push=float("nan")),
+    "a negative push": lambda c: c["fixed_points"].update(push=-1.0),
+    "rarer switches": lambda c: c["fixed_points"].update(steps_between_switches=10**6),
+    "switches at no step": lambda c: c["fixed_points"].update(steps_between_switches=0),
+    "half a step": lambda c: c["fixed_points"].update(steps_between_switches=30.5),
+    "a narrower corridor": lambda c: c["fixed_points"]["corridor_m"].update(law=0.1),
+    "another corridor": lambda c: c["fixed_points"]["corridor_m"].update(more=0.1),
+    "no switch in it": lambda c: c["fixed_points"].update(after_switch_m=c["fixed_points"]["corridor_m"]),
+    "a larger tube": lambda c: c["bounds"].update(for_ever_position=2.0 * c["bounds"]["for_ever_position"]),
 }
 
 
 def test_an_honest_corridor_passes():
-    _corridor_claims.require_corridor(corridor())
+    _corridor_claims.require_corridor(corridor(), PROVED)
 
 
 @pytest.mark.parametrize("forge", FORGED.values(), ids=list(FORGED))
@@ -252,4 +277,10 @@ def test_a_corridor_whose_parts_do_not_go_together_is_refused(forge):
     changed = copy.deepcopy(corridor())
     forge(changed)
     with pytest.raises(Refuted):
-        _corridor_claims.require_corridor(changed)
+        _corridor_claims.require_corridor(changed, PROVED)
+
+
+@pytest.mark.parametrize("constant", ["alpha", "lipschitz"])
+def test_fixed_points_rest_on_what_is_proved(constant):
+    with pytest.raises(Refuted, match="fixed_points"):
+        _corridor_claims.require_corridor(corridor(), PROVED | {constant: 1.01 * PROVED[constant]})

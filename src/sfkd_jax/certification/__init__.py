@@ -30,6 +30,9 @@ from sfkd_jax.certification._corridor_claims import drive_scores as drive_scores
 from sfkd_jax.certification._document import verify_document as verify_document
 from sfkd_jax.certification._environments import cover as cover
 from sfkd_jax.certification._exported import CertificationRefused as CertificationRefused
+from sfkd_jax.certification._fixed_points import FixedPoints as FixedPoints
+from sfkd_jax.certification._fixed_points import fixed_point_corridor as fixed_point_corridor
+from sfkd_jax.certification._fixed_points import fixed_points as fixed_points
 from sfkd_jax.certification._incremental import attack_growth as attack_growth
 from sfkd_jax.certification._incremental import certify_incremental as certify_incremental
 from sfkd_jax.certification._incremental import check_incremental as check_incremental

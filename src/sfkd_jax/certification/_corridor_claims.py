@@ -10,6 +10,7 @@ from jaxtyping import Float
 
 from sfkd_jax.certification._calibration import conformal_quantile, interval, supports
 from sfkd_jax.certification._claims import Refuted
+from sfkd_jax.certification._fixed_points import require_fixed_points
 from sfkd_jax.certification._output_metrics import OUTPUTS, OutputMetric
 from sfkd_jax.certification._radii import Residuals, radii
 
@@ -83,8 +84,11 @@ def covered(bounds: Mapping[str, float], scores: DriveScores) -> dict[str, Any]:
     }
 
 
-def require_corridor(corridor: Mapping[str, Any]) -> None:
+def require_corridor(corridor: Mapping[str, Any], output: Mapping[str, Any]) -> None:
     """Check what is arithmetic in the document's part: sums, levels and counts that go together.
+
+    Args:
+        corridor: the part. output: the document's part about e_y, its constants proved.
 
     Raises:
         Refuted: naming what does not follow.
@@ -107,3 +111,4 @@ def require_corridor(corridor: Mapping[str, Any]) -> None:
         exact = 0 <= inside <= count and np.isclose(part["coverage"], inside / count, rtol=1e-9)
         if not exact or not np.allclose(part["coverage_ci95"], interval(part["coverage"], part["coverage_drives"])):
             raise Refuted(f"{name}: coverage does not fit {count!r} drives")
+    require_fixed_points(corridor["fixed_points"], output, bounds["for_ever_position"])

@@ -122,7 +122,7 @@ def _require_outputs(document: Mapping[str, Any], weights: Exported) -> None:
     if corridor is not None:
         if not outputs:
             raise Refuted("a corridor needs a metric of every output")
-        require_corridor(corridor)
+        require_corridor(corridor, outputs["position"])
 
 
 def _numbers(name: str, values: Any) -> np.ndarray:

@@ -14,7 +14,7 @@ from sfkd_jax.datasets._path_excitation import perturbations, profile
 from sfkd_jax.path_frame import is_valid, path_state
 from sfkd_jax.rollouts import in_batches
 from sfkd_jax.scenarios import held_road, random_switching, switching_road, uniform_road, wet_road
-from sfkd_jax.types import BODY, Control, Environment, Key, State, Trajectory
+from sfkd_jax.types import BODY, Control, Environment, Key, Scalar, State, Trajectory
 from sfkd_jax.vehicle import Vehicle
 
 Conditions: TypeAlias = Callable[[Key], Float[Array, "time environment"]]
@@ -98,7 +98,7 @@ def drive_along_path(
     envs: Float[Array, "drive time environment"],
     key: Key,
     *,
-    speed: tuple[float, float] = (8.0, 10.5),
+    speed: tuple[float | Scalar, float | Scalar] = (8.0, 10.5),
     peak_curvature: float = 0.02,
     wavelengths: tuple[float, float] = (50.0, 200.0),
     lateral_acceleration: float = 2.0,
@@ -179,8 +179,8 @@ def drive_switching(
     *,
     drives: int,
     steps: int,
-    env_low: tuple[float, ...],
-    env_high: tuple[float, ...],
+    env_low: tuple[float, ...] | Environment,
+    env_high: tuple[float, ...] | Environment,
     dwell: tuple[float, float] = (3.0, 6.0),
     **options: Any,
 ) -> Trajectory:

@@ -6,7 +6,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from sfkd_jax.types import Key
+from sfkd_jax.types import Key, Scalar
 
 
 def profile(
@@ -14,7 +14,7 @@ def profile(
     *,
     steps: int,
     dt: float,
-    speed: tuple[float, float],
+    speed: tuple[float | Scalar, float | Scalar],
     peak: float,
     wavelengths: tuple[float, float],
     most: float,

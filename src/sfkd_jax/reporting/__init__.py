@@ -6,3 +6,4 @@ from sfkd_jax.reporting._benchmark import benchmark_report as benchmark_report
 from sfkd_jax.reporting._comparison import write_comparison as write_comparison
 from sfkd_jax.reporting._corridor import draw_hostile as draw_hostile
 from sfkd_jax.reporting._page import write_report as write_report
+from sfkd_jax.reporting._speed import draw_speed as draw_speed

@@ -56,6 +56,11 @@ def corridor_words(record: dict[str, Any]) -> list[Text]:
         Text(promised, "The corridor."),
         Text(proved, "Proved."),
         Text(_measured(found), "Measured, not proved."),
+        *(
+            [Text(_at_rest(found["fixed_points"]), "Without a copy.")]
+            if dig(found, "fixed_points", "corridor_m")
+            else []
+        ),
         *([Text(_attacked(found), "Attacked.")] if isinstance(found.get("attack"), dict) else []),
     ]
 
@@ -99,6 +104,19 @@ def _measured(found: dict[str, Any]) -> str:
     if is_number(lateral) and is_number(distance):
         text += f". The test drives came to {number(lateral)} m from the path and {number(distance)} m from their copy"
     return text + "."
+
+
+def _at_rest(part: dict[str, Any]) -> str:
+    between, after = (
+        [upper(dig(part, name, who)) for who in ("law", "planner")] for name in ("corridor_m", "after_switch_m")
+    )
+    return (
+        "On every road the model alone would come to rest at one point, and the car follows it at a distance that the "
+        f"rate bounds: it stays within {between[0]} m of its path under the law alone and within {between[1]} m "
+        f"whatever a planner asks for within the limits, {after[0]} and {after[1]} m right after a switch, once the "
+        "start is forgotten, with no shield and no copy, while the disturbances are those of such drives. How far "
+        f"those points move is measured on {short(part.get('points'), 6)} of them, not proved."
+    )
 
 
 def _attacked(found: dict[str, Any]) -> str:

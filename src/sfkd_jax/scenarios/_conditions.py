@@ -6,9 +6,10 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from sfkd_jax.types import Key, Scalar
+from sfkd_jax.types import Environment, Key, Scalar
 
 Range = tuple[float, float]
+Corner = tuple[float, ...] | Environment
 Schedule = Float[Array, "time 2"]
 
 SWITCH_LEVELS = ((0.9, 0.0), (0.6, 4.0), (0.3, 8.0), (0.6, 4.0))
@@ -119,8 +120,8 @@ def random_switching(
     *,
     steps: int,
     dt: float,
-    low: tuple[float, ...],
-    high: tuple[float, ...],
+    low: Corner,
+    high: Corner,
     dwell: Range = (3.0, 6.0),
 ) -> Float[Array, "time environment"]:
     """Environments out of the box E, each as in `held_road`, held for a time drawn from `dwell` [s].
@@ -135,7 +136,7 @@ def random_switching(
     return levels[jnp.searchsorted(ends, jnp.arange(steps) * dt, side="right")]
 
 
-def _anywhere(key: Key, low: tuple[float, ...], high: tuple[float, ...]) -> Float[Array, " environment"]:
+def _anywhere(key: Key, low: Corner, high: Corner) -> Float[Array, " environment"]:
     """A point of a box; evenly inside, and a third of every entry at an end."""
     share = jnp.clip(jax.random.uniform(key, (len(low),), minval=-0.25, maxval=1.25), 0.0, 1.0)
     bottom, top = jnp.asarray(low), jnp.asarray(high)

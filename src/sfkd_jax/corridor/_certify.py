@@ -1,50 +1,36 @@
-"""The corridor of a policy along a path: drives of its class on the true plant, what they bound, and an attack."""
+"""The corridor in a certificate: drives of its class on the true plant, what they bound, and an attack."""
 
 from __future__ import annotations
 
+import math
 import time
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from functools import partial
-from typing import Any, NamedTuple
+from typing import Any
 
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jaxtyping import Float
 
 from sfkd_jax import assembly, policy
 from sfkd_jax.certification import (
-    OUTPUTS,
     CertificateContradicted,
-    DriveScores,
     OutputMetric,
     calibrate,
     covered,
-    drive_scores,
-    residuals,
+    fixed_point_corridor,
+    fixed_points,
 )
-from sfkd_jax.control import PathLaw, admit
+from sfkd_jax.control import admit
+from sfkd_jax.corridor._drives import EXCITATION, ROADS, Loop, closed, driving, measuring
 from sfkd_jax.datasets import drive_switching, generate_s3_along_path
 from sfkd_jax.evaluation import Outcome, Tube, attack_corridor, outcome_of
-from sfkd_jax.path_frame import LATERAL, PERTURBATION
-from sfkd_jax.rollouts import in_batches, rollout
-from sfkd_jax.types import BODY, Control, Environment, Key, Model, Params, State, Trajectory
-from sfkd_jax.vehicle import Vehicle
+from sfkd_jax.path_frame import PATH_SPEED, path_state
+from sfkd_jax.types import Control, Key
 
-ROADS = ("speed", "peak_curvature", "wavelengths", "lateral_acceleration")
-EXCITATION = ("steering_excitation", "speed_excitation")
 STREAM = 4
 """Folded into the data set's seed; its drives take the streams 0 to 2."""
-BATCH = 20
-
-
-class _Loop(NamedTuple):
-    """The true plant with the law of a policy around it, and that policy's model beside it, folded."""
-
-    plant: Vehicle
-    law: PathLaw
-    model: Model
-    params: Params
-    noise: tuple[float, ...]
 
 
 def certify_corridor(
@@ -73,26 +59,25 @@ def certify_corridor(
         ValueError: too few drives for the level, or a policy without a law.
     """
     began = time.perf_counter()
-    loop = _closed(settings, trained)
+    loop = closed(assembly.build_vehicle(settings["vehicle"]), trained, settings["evaluation"]["observation_noise"])
     level, data = settings["certification"]["level"], assembly.without(settings["dataset"])
     roads = {name: data[name] for name in ROADS}
     box = {name: data[name] for name in ("env_low", "env_high")}
     asked = roads | {name: data[name] for name in EXCITATION}
     *drive_keys, sensor_key, attack_key = jax.random.split(jax.random.fold_in(jax.random.key(data["seed"]), STREAM), 6)
-    options = asked | {"sensors": partial(_seen, loop), "offset": (0.0, 0.0, 0.0), "burn_in": 0}
-    options["steps"] = round(duration / loop.plant.dt)
+    options = driving(loop, asked, duration)
     switching = partial(drive_switching, loop.plant, drives=drives, dwell=dwell, **box, **options)
     held_out = partial(generate_s3_along_path, loop.plant, segments=drives, **options)
     kinds = (switching, switching, switching, held_out)
-    driven = [jax.jit(kind)(key) for kind, key in zip(kinds, drive_keys, strict=True)]
-    copies = [_copied(loop, part) for part in driven]
-    scores = [
-        _scores(loop, outputs, part, copied, key)
-        for part, copied, key in zip(driven, copies, jax.random.split(sensor_key, len(driven)), strict=True)
+    measure = measuring(loop, outputs)
+    found = [
+        measure(jax.jit(kind)(drive_key), key)
+        for kind, drive_key, key in zip(kinds, drive_keys, jax.random.split(sensor_key, len(kinds)), strict=True)
     ]
-    bounds = calibrate(scores[0], scores[1], level=level)
+    units, known, fresh, s3 = (part.scores for part in found)
+    bounds = calibrate(units, known, level=level)
     searching = box | roads | {"dwell": dwell[0], "steps": attack_steps}
-    lateral = np.asarray(driven[2].states, dtype=np.float64)[:, 1:, BODY][..., LATERAL]
+    lateral, copied = found[2].lateral, found[2].copied
     about = {"env_box": [*box.values()], "dwell_s": dwell, "duration_s": duration, "sensor_noise": loop.noise}
     return {
         "class": asked | about | {"perturbation": loop.law.perturbation.tolist()},
@@ -100,60 +85,50 @@ def certify_corridor(
         "drives": drives,
         "bounds": bounds,
         "corridor_m": bounds["nominal"] + bounds["followed_position"],
-        **covered(bounds, scores[2]),
-        "by_scenario": {"s3": covered(bounds, scores[3])},
+        **covered(bounds, fresh),
+        "by_scenario": {"s3": covered(bounds, s3)},
         "seen": {
-            "distance_m": float(np.max(np.abs(lateral - copies[2]))),
+            "distance_m": float(np.max(np.abs(lateral - copied))),
             "lateral_m": float(np.max(np.abs(lateral))),
         },
+        "fixed_points": _at_rest(loop, outputs["position"], [part.roads for part in found[:3]], bounds, about),
         "attack": _attack(loop, attack_key, outputs["position"], bounds, searching, horizon),
         "shield_horizon": horizon,
         "seconds": time.perf_counter() - began,
     }
 
 
-def _closed(settings: Mapping[str, Any], trained: policy.Trained) -> _Loop:
-    """The loop of a policy, with the weights as they drive.
+def _at_rest(
+    loop: Loop,
+    claim: OutputMetric,
+    roads: Sequence[Float[np.ndarray, "drive time 2"]],
+    bounds: Mapping[str, float],
+    about: Mapping[str, Any],
+) -> dict[str, Any]:
+    """The corridor that needs no copy, from the steps of every road that tell most.
 
-    Raises:
-        ValueError: the policy has no law.
+    Those at which curvature changes most, speed does, and v² κ is largest.
     """
-    if trained.law is None:
-        raise ValueError("a corridor needs a policy in path coordinates, with its law: model.frame=path")
-    plant = assembly.build_loop(assembly.build_vehicle(settings["vehicle"]), trained.law)
-    params = jax.jit(trained.model.fold)(trained.params)
-    return _Loop(plant, trained.law, trained.model, params, tuple(settings["evaluation"]["observation_noise"]))
-
-
-def _copied(loop: _Loop, drives: Trajectory) -> np.ndarray:
-    """ê_y of a copy that starts where the car does, (drive, time)."""
-
-    def one(drive: Trajectory) -> jax.Array:
-        return rollout(loop.model, loop.params, drive)[0][:, BODY][:, LATERAL]
-
-    return np.asarray(jax.jit(partial(in_batches, one, size=BATCH))(drives), dtype=np.float64)
-
-
-def _scores(
-    loop: _Loop, outputs: Mapping[str, OutputMetric], drives: Trajectory, copied: np.ndarray, key: Key
-) -> DriveScores:
-    """What the corridor would have had to be; a real copy starts from what the sensors say."""
-    model, spread = loop.model, _spread(loop.noise, drives.states.shape[-1])
-
-    def apart(state: State, env: Environment, key: Key) -> jax.Array:
-        fiber = model.fiber(loop.params, env)
-        seen = state + spread * jax.random.normal(key, state.shape)
-        return model.vector(model.encode(fiber, seen)) - model.vector(model.encode(fiber, state))
-
-    keys = jax.random.split(key, len(drives.states))
-    gaps = np.asarray(jax.jit(jax.vmap(apart))(drives.states[:, 0], drives.envs[:, 0], keys), dtype=np.float64)
-    initial = {name: np.linalg.norm(gaps @ np.linalg.cholesky(outputs[name].metric), axis=1) for name in OUTPUTS}
-    found = residuals(model, loop.params, drives)
-    return drive_scores(found, outputs, np.max(np.abs(copied), axis=1), initial)
+    driven = np.concatenate(roads)
+    steps = np.stack([driven[:, :-1], driven[:, 1:]], axis=2)
+    changes = np.abs(steps[:, :, 1] - steps[:, :, 0])
+    sharpness = np.abs(steps[:, :, 0, 0]) * steps[:, :, 0, 1] ** 2
+    chosen = [np.argmax(size, axis=1) for size in (changes[..., 0], changes[..., 1], sharpness)]
+    telling = np.concatenate([steps[np.arange(len(steps)), index] for index in chosen])
+    start = path_state(jnp.zeros(len(loop.plant.state_names) - 3).at[PATH_SPEED].set(telling[0, 0, 1]))
+    asked = {"env_box": about["env_box"], "perturbation": loop.law.perturbation, "start": start}
+    found = fixed_points(loop.model, loop.params, claim, jnp.asarray(telling), **asked)
+    return fixed_point_corridor(
+        found,
+        alpha=claim.alpha,
+        lipschitz=claim.lipschitz,
+        for_ever=bounds["for_ever_position"],
+        steps_between_switches=math.floor(about["dwell_s"][0] / loop.plant.dt + 1e-9),
+    )
 
 
 def _attack(
-    loop: _Loop,
+    loop: Loop,
     key: Key,
     claim: OutputMetric,
     bounds: Mapping[str, float],
@@ -201,17 +176,3 @@ def _attack(
             f"INTERNAL ERROR: {worst['kept_distance_m']:.4f} m from the copy, and the tube is {bound:.4f} m"
         )
     return {"steps": options["steps"]} | worst | shares
-
-
-def _seen(loop: _Loop, key: Key, state: State, inputs: Control, env: Environment) -> jax.Array:
-    """What the law adds to ν because it sees ξ through the sensors."""
-    coordinates, road = state[BODY], inputs[PERTURBATION.stop :]
-    spread = _spread(loop.noise, state.shape[-1])[BODY]
-    measured = coordinates + spread * jax.random.normal(key, coordinates.shape)
-    return loop.law(measured, road[0], road[1], env) - loop.law(coordinates, road[0], road[1], env)
-
-
-def _spread(noise: tuple[float, ...], size: int) -> jax.Array:
-    """Standard deviations along a path state: e_y has that of a position, e_ψ that of yaw, the rest its own."""
-    known = noise[1 : size - 2]
-    return jnp.zeros(size).at[3 : 3 + len(known)].set(jnp.asarray(known))

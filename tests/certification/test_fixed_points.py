@@ -1,0 +1,109 @@
+"""The corridor that needs no copy: of a linear loop, whose fixed points are known, and which attains the bound."""
+
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from sfkd_jax.certification import FixedPoints, OutputMetric, fixed_point_corridor, fixed_points
+from sfkd_jax.types import Model
+
+RATES = np.diag([0.8, 0.7, 0.6])
+CONTROL = np.asarray([[2.0, 0.1, 30.0, 0.01], [0.5, 0.3, -4.0, 0.0], [0.0, 0.2, 1.0, 0.02]])
+ENVIRONMENT = np.asarray([[0.1, 0.02], [0.05, -0.01], [0.0, 0.03]])
+METRIC = np.diag([4.0, 1.0, 9.0])
+CLAIM = OutputMetric(0.8, 0.5, METRIC, [])
+ENV_BOX = [[0.3, -8.0], [0.9, 8.0]]
+LIMIT = np.asarray([0.03, 1.0])
+
+
+def linear(rates=RATES, control=CONTROL, environment=ENVIRONMENT):
+    """z⁺ = A z + B w + E e, where z is (e_y, e_ψ, v) itself."""
+    A, B, E = (jnp.asarray(part, dtype=float) for part in (rates, control, environment))
+    return Model(
+        init=lambda key: {},
+        fiber=lambda params, env: env,
+        encode=lambda fiber, state: state[3:],
+        step=lambda fiber, latent, control: A @ latent + B @ control + E @ fiber,
+        decode=lambda fiber, latent: jnp.concatenate([jnp.zeros(3), latent]),
+        transport=lambda fiber, later, latent: latent,
+        observe=lambda fiber, latent, state: state[3:],
+        vector=lambda latent: latent,
+        along_path=True,
+    )
+
+
+def roads(count=40, seed=0):
+    """Steps of roads, (κ, v) before and after."""
+    random = np.random.default_rng(seed)
+    before = np.stack([random.uniform(-0.02, 0.02, count), random.uniform(8.0, 10.5, count)], axis=1)
+    return np.stack([before, before + random.uniform(-1.0, 1.0, (count, 2)) * [0.004, 0.1]], axis=1)
+
+
+def length(gaps):
+    return np.sqrt(np.einsum("...i,ij,...j", gaps, METRIC, gaps))
+
+
+def test_the_fixed_points_of_a_linear_loop_are_found():
+    steps = roads()
+    found = fixed_points(
+        linear(),
+        {},
+        CLAIM,
+        jnp.asarray(steps, dtype=float),
+        start=jnp.zeros(6),
+        env_box=ENV_BOX,
+        perturbation=jnp.asarray(LIMIT, dtype=float),
+    )
+    settled = np.linalg.inv(np.eye(3) - RATES)
+    corners = np.asarray([[friction, wind] for friction in (0.3, 0.9) for wind in (-8.0, 8.0)])
+    roads_only = steps @ (settled @ CONTROL[:, 2:]).T
+    rests = roads_only[:, :, None] + corners @ (settled @ ENVIRONMENT).T
+    assert found.centre_m == pytest.approx(np.max(np.abs(rests[..., 0])), rel=1e-4)
+    assert found.road == pytest.approx(np.max(length(roads_only[:, 1] - roads_only[:, 0])), rel=1e-4)
+    far = settled @ ENVIRONMENT @ (corners[None] - corners[:, None])[..., None]
+    assert found.switch == pytest.approx(np.max(length(far[..., 0])), rel=1e-4)
+    nus = LIMIT * np.asarray([[1, 1], [1, -1]])
+    assert found.push == pytest.approx(np.max(length(nus @ CONTROL[:, :2].T)), rel=1e-4)
+    assert found.points == len(steps) * 2 * 25
+
+
+def worst_drive(alpha, scale, road, switch, push, disturbance, every, steps=2000):
+    """e_y against c'z* of z⁺ = α z + (1 − α) z* + ν + d on a line: everything drives it the same way."""
+    rest, latent, apart = 0.0, 0.0, []
+    for step in range(steps):
+        latent = alpha * latent + (1.0 - alpha) * rest + (push + disturbance) / scale
+        apart.append(latent - rest)
+        rest -= (road + (switch if step % every == 0 else 0.0)) / scale
+    return np.asarray(apart[steps // 2 :])
+
+
+@pytest.mark.parametrize("every", [1, 4, 30])
+@pytest.mark.parametrize("alpha", [0.5, 0.93])
+def test_the_bound_is_attained_by_a_loop_on_a_line(alpha, every):
+    """|z|_P = scale |z|, so L = 1 / scale; each of the four terms is needed in full, also right after a switch."""
+    scale, sizes = 3.0, {"road": 0.2, "switch": 0.7, "push": 0.3}
+    disturbance = 0.1
+    apart = worst_drive(alpha, scale, **sizes, disturbance=disturbance, every=every)
+    for_ever = (alpha * disturbance / (1.0 - alpha) + disturbance) / scale
+    found = FixedPoints(centre_m=0.05, **sizes, points=1)
+    claimed = fixed_point_corridor(
+        found, alpha=alpha, lipschitz=1.0 / scale, for_ever=for_ever, steps_between_switches=every
+    )
+    assert np.max(apart) + 0.05 == pytest.approx(claimed["after_switch_m"]["planner"], rel=1e-6)
+    quiet = worst_drive(alpha, scale, **(sizes | {"push": 0.0, "switch": 0.0}), disturbance=disturbance, every=every)
+    assert np.max(quiet) + 0.05 == pytest.approx(claimed["corridor_m"]["law"], rel=1e-6)
+
+
+def test_a_loop_that_rests_on_its_path_whatever_happens_needs_its_tube_alone():
+    still = linear(control=np.zeros((3, 4)), environment=np.zeros((3, 2)))
+    found = fixed_points(
+        still,
+        {},
+        CLAIM,
+        jnp.asarray(roads(), dtype=float),
+        start=jnp.ones(6),
+        env_box=ENV_BOX,
+        perturbation=jnp.asarray(LIMIT, dtype=float),
+    )
+    claimed = fixed_point_corridor(found, alpha=0.8, lipschitz=0.5, for_ever=0.2, steps_between_switches=30)
+    assert claimed["after_switch_m"]["planner"] == pytest.approx(0.2, abs=1e-5)
