@@ -56,8 +56,8 @@ def page(tmp_path_factory):
         "at most 0.02 1/m",
         "a lateral acceleration of at most 2 m/s²; friction lies in 0.3 to 0.9, side wind in −8 to 8 m/s, and they "
         "hold for at least 3 s between two switches",
-        "at most 0.03 rad of steering and 1 of drive to the law, with a spread of 0.002 to 0.025 rad and 0.05 to 0.6; "
-        "and the drive lasts at most 60 s. At least 95 % of such drives keep it.",
+        "at most 0.03 rad of steering and 1 m/s² of drive to the law, with a spread of 0.002 to 0.025 rad and 0.05 to "
+        "0.6 m/s²; and the drive lasts at most 60 s. At least 95 % of such drives keep it.",
         "within W = 0.1112 m of the path; and the car stays within 0.1021 m of that copy while the disturbances",
         "brings two states to at most 0.8439 times their distance",
         "state: lateral deviation −0.2 to 0.3 m, heading error −0.1 to 0.1 rad, speed 7 to 11 m/s; control: steering",

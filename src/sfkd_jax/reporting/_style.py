@@ -118,15 +118,20 @@ table{font-size:8.5pt}th,td{padding:.25rem .35rem}figure img{width:auto;max-widt
 """
 
 
+def family(system: str) -> str:
+    """A system in path coordinates looks like what it is in the others; where both are meant, the title says so."""
+    return system.removesuffix("_path")
+
+
 def ordered(systems: Iterable[str]) -> list[str]:
     """Sort system names in the one order every table and legend uses; unknown names come last."""
     rank = {name: place for place, name in enumerate(SYSTEMS)}
-    return sorted(systems, key=lambda name: (rank.get(name, len(rank)), name))
+    return sorted(systems, key=lambda name: (rank.get(family(name), len(rank)), name))
 
 
 def label(system: str) -> str:
     """What a reader sees for a system."""
-    return SYSTEMS[system][0] if system in SYSTEMS else system
+    return SYSTEMS[family(system)][0] if family(system) in SYSTEMS else system
 
 
 def scenario_label(name: str) -> str:
@@ -141,8 +146,8 @@ def literal(text: str) -> str:
 
 def line(system: str) -> dict[str, Any]:
     """Keyword arguments of the line that stands for a system in every figure."""
-    name, colour, dashes, width = SYSTEMS.get(system, (system, MUTED, (0, (1, 1)), 1.2))
-    top = {"sfkd": 5, "oracle": 4}.get(system, 3)
+    name, colour, dashes, width = SYSTEMS.get(family(system), (system, MUTED, (0, (1, 1)), 1.2))
+    top = {"sfkd": 5, "oracle": 4}.get(family(system), 3)
     return {"label": literal(name), "color": colour, "linestyle": dashes, "linewidth": width, "zorder": top}
 
 
