@@ -77,8 +77,8 @@ def _class(about: Any) -> str:
         f"{short(dig(about, 'lateral_acceleration'))} m/s²; friction lies in {short(low[0])} to {short(high[0])}, side "
         f"wind in {short(low[1])} to {short(high[1])} m/s, and they hold for at least {short(dwell[0])} s between two "
         f"switches; what the shield lets through adds at most {short(steering)} rad of steering and {short(drive)} "
-        f"m/s² of drive to the law, with a spread of {short(spread[0])} to {short(spread[1])} rad and {short(push[0])} to "
-        f"{short(push[1])} m/s²; and the drive lasts at most {short(dig(about, 'duration_s'))} s"
+        f"m/s² of drive to the law, with a spread of {short(spread[0])} to {short(spread[1])} rad and "
+        f"{short(push[0])} to {short(push[1])} m/s²; and the drive lasts at most {short(dig(about, 'duration_s'))} s"
     )
 
 
