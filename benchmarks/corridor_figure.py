@@ -1,9 +1,10 @@
 """Draw docs/corridor.png: hostile planners on one S3 road, with the shield of a certified policy and without it.
 
-python benchmarks/corridor_figure.py DIR [--seconds 30 --seed 3 --out docs/corridor.png]
+python benchmarks/corridor_figure.py DIR [--seconds 30 --seed 3 --out docs/corridor.png] [--film docs/corridor.gif]
 """
 
 import argparse
+from functools import partial
 from pathlib import Path
 
 import jax
@@ -12,9 +13,11 @@ import numpy as np
 import shield
 from soak import LANE
 
-from sfkd_jax.reporting import draw_hostile
+from sfkd_jax.reporting import draw_film, draw_hostile
 
 SHOWN = ("worst", "bang-bang", "random", "constant", "full lock")
+LOCKED = 5
+"""When the planner of the film goes to full lock [s]."""
 EACH, LATE = 4, 10
 """Drives of every planner; of the one that is hostile from a later moment on."""
 
@@ -51,6 +54,30 @@ def drives(car, seconds, seed):
     }
 
 
+def film(car, seconds, seed):
+    """What the film shows: the policy's own planner, and one that loses the car, with the shield and without it."""
+    roads, keys = shield.episodes(car, 1, seconds, seed)
+    road, bounds = jax.tree.map(lambda leaf: leaf[0], roads), car.certificate["corridor"]["bounds"]
+    lock = shield.scripted(car, shield.SCRIPTS.index("full lock"), round(LOCKED / car.plant.dt))
+    controllers = {
+        "own planner, with shield": shield.planner(car, shield=True),
+        f"full lock at {LOCKED} s, with shield": shield.shielded(car, lock),
+        f"full lock at {LOCKED} s, without shield": lock,
+    }
+    cars = {}
+    for name, controller in controllers.items():
+        states, lateral, _ = jax.jit(partial(shield.drive_states, car, controller))(road, keys[0])
+        cars[name] = np.asarray(lateral)[1:], np.asarray(states)
+    return {
+        "cars": cars,
+        "title": f"{car.plant.name} car on S3",
+        "dt": car.plant.dt,
+        "points": np.asarray(road.path.points),
+        "envs": np.asarray(road.envs),
+        "corridor": bounds["nominal"] + bounds["followed_position"],
+    }
+
+
 def main():
     """Parse, drive, draw."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
@@ -58,8 +85,10 @@ def main():
     parser.add_argument("--seconds", type=float, default=30.0)
     parser.add_argument("--seed", type=int, default=3)
     parser.add_argument("--out", type=Path, default=Path(__file__).parents[1] / "docs" / "corridor.png")
+    parser.add_argument("--film", type=Path, metavar="GIF", help="make this, and no figure")
     asked = parser.parse_args()
-    print(draw_hostile(asked.out, **drives(shield.load(asked.run), asked.seconds, asked.seed)))
+    draw, path, shown = (draw_film, asked.film, film) if asked.film else (draw_hostile, asked.out, drives)
+    print(draw(path, **shown(shield.load(asked.run), asked.seconds, asked.seed)))
 
 
 if __name__ == "__main__":

@@ -103,6 +103,11 @@ def shielded(car, controller):
 
 def drive(car, controller, road, key):
     """e_y before every step and after the last one [m], (time + 1,), and what the shield said at every step."""
+    return drive_states(car, controller, road, key)[1:]
+
+
+def drive_states(car, controller, road, key):
+    """States before every step and after the last one, (time + 1, state), and the rest as `drive` returns it."""
     planner_key, noise_key = jax.random.split(key)
     horizon = assembly.controller_horizon(car.settings)
 
@@ -118,11 +123,13 @@ def drive(car, controller, road, key):
         if "copy" in info:
             said = {name: info[name] for name in ("void", "broken")} | {"infeasible": ~info["feasible"]}
             said |= {"copy": info["copy"][LATERAL], "intervened": info["intervention"] > 0.0}
-        return (state, progress, memory), (lateral, said)
+        return (state, progress, memory), (state, lateral, said)
 
     start = road.initial_state, jnp.zeros(()), controller.init(planner_key)
-    _, (lateral, said) = jax.lax.scan(step, start, (road.envs, jax.random.split(noise_key, len(road.envs))))
-    return jnp.concatenate([jnp.zeros(1), lateral]), said
+    given = road.envs, jax.random.split(noise_key, len(road.envs))
+    _, (states, lateral, said) = jax.lax.scan(step, start, given)
+    states = jnp.concatenate([road.initial_state[None], states])
+    return states, jnp.concatenate([jnp.zeros(1), lateral]), said
 
 
 def episodes(car, count, seconds, seed):

@@ -304,7 +304,10 @@ def test_a_row_that_says_where_its_arrays_lie_is_believed(tmp_path):
     (contest,) = contests([row("sfkd", "measured")])
     assert film(tmp_path, contest, tmp_path / "s3.gif", seconds=0.5) is None
     (contest,) = contests([row("sfkd", "measured", arrays="elsewhere.npz")])
-    assert film(tmp_path, contest, tmp_path / "s3.gif", seconds=0.5)[1] == ["SFKD"]
+    place, names = film(tmp_path, contest, tmp_path / "s3.gif", seconds=0.5)
+    assert names == ["SFKD"]
+    within, _ = film(tmp_path, contest, tmp_path / "corridor.gif", seconds=0.5, corridor=0.1)
+    assert within.read_bytes() != place.read_bytes()
 
 
 def test_a_study_sets_every_row_beside_itself_as_it_is(whole):

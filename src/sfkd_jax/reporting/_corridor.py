@@ -13,10 +13,10 @@ from matplotlib.ticker import MultipleLocator
 from sfkd_jax.reporting._conditions import conditions, mark
 from sfkd_jax.reporting._numbers import number
 from sfkd_jax.reporting._scene import Scene, switches
-from sfkd_jax.reporting._style import ACCENT, PLATE, canvas, literal, save
+from sfkd_jax.reporting._style import ACCENT, LEAVES, PLATE, canvas, literal, save
 
 _INNER, _OUTER = "#cfe0f5", "#e9f1fb"
-_LEAVES, _LANE = "#c2410c", "#30363d"
+_LANE = "#30363d"
 _COLOURS = ("#0b57b0", "#009e73", "#8b5fbf", "#b8860b", "#56b4e9", "#6b7280")
 _VIEW = 2.2
 """Of the distance from the path at which the lane ends: how far the second panel reaches."""
@@ -93,7 +93,7 @@ def hostile(drives: Hostile) -> Figure:
         begin, outside = int(began), np.flatnonzero(~(np.abs(free) < 1.2 * reach))
         end = int(outside[0]) + 1 if len(outside) else len(free)
         time, quiet = _time(free, drives.dt), "_" if row else ""
-        lost.plot(time[begin:end], free[begin:end], color=_LEAVES, linewidth=1.0, label=f"{quiet}without the shield")
+        lost.plot(time[begin:end], free[begin:end], color=LEAVES, linewidth=1.0, label=f"{quiet}without the shield")
         lost.plot(time[begin:], held[begin:], color=ACCENT, linewidth=0.7, label=f"{quiet}with the shield", zorder=4)
     lost.set(ylim=(-reach, reach), ylabel="lateral deviation [m]")
     lost.yaxis.set_major_locator(MultipleLocator(1.0))

@@ -33,6 +33,8 @@ SYSTEMS: dict[str, tuple[str, str, Any, float]] = {
 """One colour and one dash per system, everywhere (after Okabe and Ito, and Tol: colour-blind safe)."""
 
 ACCENT, SECOND, THIRD, MUTED, GRID = "#0b57b0", "#e8a33d", "#009e73", "#6b7280", "#e3e6ea"
+LEAVES = "#c2410c"
+"""Of a car that leaves its lane."""
 PLATE = {"facecolor": "white", "edgecolor": "none", "pad": 1.5}
 """Behind words that lie on lines."""
 WIDTH = 6.9
