@@ -40,7 +40,7 @@ def run(settings: dict[str, Any]) -> dict[str, Any]:
         document = {"rows": rows, "config": settings, "versions": artefacts.versions()}
         artefacts.write_json(folder / "results.json", document)
         _print(rows)
-        film = animate(place, rows, track.scenario)
+        film = animate(place, rows, track.scenario, corridor=_corridor(trained))
     shelf.say(f"animation: {film}; {time.perf_counter() - began:.0f} s in all")
     return {"animation": film and str(film), "rows": len(rows), "results": str(folder / "results.json")}
 
@@ -64,10 +64,15 @@ def _shipped(settings: dict[str, Any]) -> policy.Policy:
         raise artefacts.ArtefactError(f"{SHIPPED / name} was changed: its certificate is about other weights")
     alpha, seconds = trained.certificate["alpha"], time.perf_counter() - began
     shelf.say(f"certificate: holds, alpha {alpha:.4f}; loaded and verified in {seconds:.1f} s")
-    if corridor := trained.certificate.get("corridor"):
-        share = 100 * corridor["level"]
-        shelf.say(f"corridor: {corridor['corridor_m']:.2f} m to each side, on {share:.0f} % of the drives of its class")
+    if half := _corridor(trained):
+        share = 100 * trained.certificate["corridor"]["level"]
+        shelf.say(f"corridor: {half:.2f} m to each side, on {share:.0f} % of the drives of its class")
     return trained
+
+
+def _corridor(trained: policy.Policy) -> float | None:
+    """How far from its path the car is certified to stay [m], if along a path."""
+    return (trained.certificate or {}).get("corridor", {}).get("corridor_m")
 
 
 def _print(rows: list[dict[str, Any]]) -> None:

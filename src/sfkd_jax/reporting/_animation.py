@@ -16,7 +16,7 @@ from sfkd_jax.reporting._benchmark_rows import SELF_EVIDENT, Contest, Row, conte
 from sfkd_jax.reporting._drives import Drive, drives
 from sfkd_jax.reporting._film import Car, Film, strip
 from sfkd_jax.reporting._film_road import extent, road
-from sfkd_jax.reporting._style import ACCENT, LEAVES, THIRD, scenario_label
+from sfkd_jax.reporting._style import ACCENT, LEAVES, THIRD, family, scenario_label
 
 MOST_BYTES = 2_000_000
 SECONDS = 13.5
@@ -90,7 +90,7 @@ def _chosen(found: list[Drive]) -> list[Drive]:
     whole = [one for one in found if one.states is not None and one.path is not None]
     rivals = [one for one in whole if not one.line.system.startswith("sfkd") and one.line.system not in SELF_EVIDENT]
     rivals.sort(key=lambda one: (one.line.system != "icode_mppi", one.line.env != "measured"))
-    named = [[one for one in whole if one.line.system in names] for names in (("sfkd", "sfkd_path"), ("nominal",))]
+    named = [[one for one in whole if family(one.line.system) == name] for name in ("sfkd", "nominal")]
     return [group[0] for group in (*named, rivals) if group] or whole[:1]
 
 
