@@ -65,8 +65,12 @@ NAMED = {
         (" and not is_positive_definite(metric)", " and False"),
     ],
     "_claims": [
-        ("[()] * len(vertices), claims.rho, vertices)", "[()], claims.rho, vertices[:1])"),
-        ('seen["joint"], claims.alpha_joint, vertices', 'seen["joint"][:1], claims.alpha_joint, vertices[:1]'),
+        ("for vertex in operators.vertices)", "for vertex in operators.vertices[:1])"),
+        ('zip(seen["joint"], operators.vertices, strict=True)', 'zip(seen["joint"][:1], operators.vertices[:1])'),
+        (
+            'for part, vertex in zip(seen["joint"], operators.vertices, strict=True)',
+            'for part, vertex in zip(seen["joint"], operators.vertices)',
+        ),
         (' and weights.declared.transport == "identity"', ""),
         ('checks["scope"] = claims.scope == scope', 'checks["scope"] = True'),
         ('checks["kappa"] = claims.kappa == 1.0 if metric is None else claims.kappa >= 1.0', ""),
@@ -109,12 +113,10 @@ NAMED = {
 """Of each file: text and what replaces it."""
 ARGUED = {
     "what passes is refused by the comparison beside it, or by the core": (
-        *("<= error != np.inf", "< bound != np.inf", "<= condition != np.inf", "<= value != math.inf"),
-        *(
-            "zip(witnesses, vertices, strict=False)",
-            "largest <= np.inf and",
-            "largest != np.inf and",
-        ),  # what is not finite has no trace, or no factor
+        *("<= error != np.inf", "< bound != np.inf", "<= condition != np.inf"),
+        *("<= value != math.inf", "< value != math.inf", "exact = -1 <= inside"),
+        *("largest <= np.inf and", "largest != np.inf and"),  # the rest contains the entry that is not finite
+        "zip(witnesses, vertices, strict=False)",
         *("claims.kappa != 1.0", "claims.kappa > 1.0", "claims.kappa >= 0.0"),  # with P the core proves no κ ≤ 1
         *("< level != 1", "< level <= 1", "< level < 2"),  # no number of trajectories supports such a level
     ),
@@ -123,7 +125,8 @@ ARGUED = {
         *("1e-140 == size", "size == 1e140", "1e-140 <= size", "size <= 1e140", "if 1.0 < size"),
     ),
     "the only entry of a list, one of several alike, or the first of two words": (
-        *('seen["joint"][ -1]', "weights.operators[ -1]", "witness[ -1]", "witness[0][ -1]", 'mode <= "joint"'),
+        *('seen["joint"][ -1]', "weights.operators[ -1]", "witness[ -1]", "witness[0][ -1]"),
+        *('mode <= "joint"', "if name <= JOINT[0]"),
     ),
     "nothing that is proved or measured depends on it": (
         *("np.nextafter(0.0, 2.0)", "initial= -1.0", "largest, physical, always = 1.0", "strict=False)])"),

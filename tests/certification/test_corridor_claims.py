@@ -85,6 +85,13 @@ def test_an_honest_corridor_passes():
     _corridor_claims.require_corridor(corridor())
 
 
+def test_what_was_added_up_in_another_order_is_the_same():
+    changed = copy.deepcopy(corridor())
+    changed["corridor_m"] *= 1 + 1e-12
+    counted(changed, coverage=changed["coverage"] * (1 - 1e-12))
+    _corridor_claims.require_corridor(changed)
+
+
 @pytest.mark.parametrize(("named", "forge"), FORGED.values(), ids=list(FORGED))
 def test_a_corridor_whose_parts_do_not_go_together_is_refused(named, forge):
     changed = copy.deepcopy(corridor())

@@ -8,7 +8,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from sfkd_jax.certification._core import Matrix, Vector, check_metric, check_vertices, check_witness, norm_upper
+from sfkd_jax.certification._core import Matrix, Vector, check_metric, check_witness, norm_upper
 from sfkd_jax.certification._environments import Box, Cover, cover
 from sfkd_jax.certification._exported import Exported
 from sfkd_jax.certification._proposals import proved
@@ -60,10 +60,10 @@ def claims_hold(claims: Claims, weights: Exported, box: Box) -> None:
         joint = claims.alpha_joint is None or joint_cover(weights, box, seen["joint"][0]).upper <= claims.alpha_joint
     elif metric is None:
         scope = hull(weights)
-        vertices = list(operators.vertices)
-        checks["rho"] = check_vertices((), [()] * len(vertices), claims.rho, vertices)
-        joint = claims.alpha_joint is None or check_vertices(
-            weights.residual, seen["joint"], claims.alpha_joint, vertices
+        checks["rho"] = all(check_witness((), (), claims.rho, vertex) for vertex in operators.vertices)
+        joint = claims.alpha_joint is None or all(
+            check_witness(weights.residual, part, claims.alpha_joint, vertex)
+            for part, vertex in zip(seen["joint"], operators.vertices, strict=True)
         )
     else:
         scope = hull(weights)
