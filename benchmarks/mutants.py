@@ -107,6 +107,7 @@ NAMED = {
         ('expected = bounds["nominal"] + bounds', "expected = bounds"),
         ('{"corridor": corridor, **corridor["by_scenario"]}', '{"corridor": corridor}'),
         (" and supports(drives, level)", ""),
+        ('    require_fixed_points(corridor["fixed_points"], output, bounds["for_ever_position"])\n', ""),
         ("for name in JOINT], axis=0)\n    factor", "for name in JOINT[:1]], axis=0)\n    factor"),
     ],
 }

@@ -9,7 +9,17 @@ from functools import cache
 import numpy as np
 import pytest
 
-from sfkd_jax.certification import OUTPUTS, DriveScores, OutputMetric, _corridor_claims, calibrate, covered, radii
+from sfkd_jax.certification import (
+    OUTPUTS,
+    DriveScores,
+    FixedPoints,
+    OutputMetric,
+    _corridor_claims,
+    calibrate,
+    covered,
+    fixed_point_corridor,
+    radii,
+)
 from sfkd_jax.certification._calibration import interval
 from sfkd_jax.certification._claims import Refuted
 from sfkd_jax.certification._corridor_claims import drive_scores
@@ -30,6 +40,10 @@ def test_bounds_hold_together_as_often_as_they_say():
     assert 0.895 <= np.mean(shares) <= 0.93
 
 
+PROVED = {"alpha": 0.8, "lipschitz": 0.02}
+"""Of e_y."""
+
+
 @cache
 def corridor():
     bounds = calibrate(scores(60, 0), scores(60, 1), level=0.9)
@@ -42,6 +56,12 @@ def corridor():
         **part,
         "by_scenario": {"s3": part},
         "attack": {"over_tube": 0.7, "over_corridor": 0.5},
+        "fixed_points": fixed_point_corridor(
+            FixedPoints(0.01, 0.7, 0.9, 1.1, 500),
+            **PROVED,
+            for_ever=bounds["for_ever_position"],
+            steps_between_switches=30,
+        ),
     }
 
 
@@ -77,19 +97,39 @@ FORGED = {
     "another scenario": ("s3: coverage", lambda c: c["by_scenario"]["s3"].update(coverage=0.5)),
     "an attack just beyond the tube": ("attack", lambda c: c["attack"].update(over_tube=1.0 + 1e-12)),
     "an attack far beyond the tube": ("attack", lambda c: c["attack"].update(over_tube=1.9)),
+    "no fixed points": ("fixed_points", lambda c: c["fixed_points"].update(points=0)),
+    "a fixed point off by less": ("fixed_points", lambda c: c["fixed_points"].update(centre_m=0.0)),
+    "a smaller move of the road": ("fixed_points", lambda c: c["fixed_points"].update(road=0.6)),
+    "a smaller switch": ("fixed_points", lambda c: c["fixed_points"].update(switch=0.1)),
+    "a smaller push": ("fixed_points", lambda c: c["fixed_points"].update(push=1.0)),
+    "a push NaN": ("fixed_points", lambda c: c["fixed_points"].update(push=float("nan"))),
+    "a negative push": ("fixed_points", lambda c: c["fixed_points"].update(push=-1.0)),
+    "rarer switches": ("fixed_points", lambda c: c["fixed_points"].update(steps_between_switches=10**6)),
+    "switches at no step": ("fixed_points", lambda c: c["fixed_points"].update(steps_between_switches=0)),
+    "half a step": ("fixed_points", lambda c: c["fixed_points"].update(steps_between_switches=30.5)),
+    "a narrower corridor": ("fixed_points", lambda c: c["fixed_points"]["corridor_m"].update(law=0.1)),
+    "another corridor": ("fixed_points", lambda c: c["fixed_points"]["corridor_m"].update(more=0.1)),
+    "no switch in it": (
+        "fixed_points",
+        lambda c: c["fixed_points"].update(after_switch_m=c["fixed_points"]["corridor_m"]),
+    ),
+    "a larger tube": (
+        "fixed_points",
+        lambda c: c["bounds"].update(for_ever_position=2.0 * c["bounds"]["for_ever_position"]),
+    ),
     "an attack that is no number": ("attack", lambda c: c["attack"].update(over_tube=float("nan"))),
 }
 
 
 def test_an_honest_corridor_passes():
-    _corridor_claims.require_corridor(corridor())
+    _corridor_claims.require_corridor(corridor(), PROVED)
 
 
 def test_what_was_added_up_in_another_order_is_the_same():
     changed = copy.deepcopy(corridor())
     changed["corridor_m"] *= 1 + 1e-12
     counted(changed, coverage=changed["coverage"] * (1 - 1e-12))
-    _corridor_claims.require_corridor(changed)
+    _corridor_claims.require_corridor(changed, PROVED)
 
 
 @pytest.mark.parametrize(("named", "forge"), FORGED.values(), ids=list(FORGED))
@@ -97,7 +137,7 @@ def test_a_corridor_whose_parts_do_not_go_together_is_refused(named, forge):
     changed = copy.deepcopy(corridor())
     forge(changed)
     with pytest.raises(Refuted) as told:
-        _corridor_claims.require_corridor(changed)
+        _corridor_claims.require_corridor(changed, PROVED)
     assert named in str(told.value)
 
 
@@ -107,7 +147,7 @@ def test_every_share_of_all_drives_can_be_covered(share):
     counted(changed, coverage=share)
     counted(changed["by_scenario"]["s3"], coverage=share)
     changed["attack"]["over_tube"] = 1.0
-    _corridor_claims.require_corridor(changed)
+    _corridor_claims.require_corridor(changed, PROVED)
 
 
 def test_bounds_are_units_of_other_drives_times_a_quantile():
@@ -153,3 +193,9 @@ def test_scores_are_the_radii_of_every_output():
             np.testing.assert_array_equal(getattr(scored, f"followed_{name}"), expected.followed)
             np.testing.assert_array_equal(getattr(scored, f"for_ever_{name}"), expected.for_ever)
         np.testing.assert_array_equal(scored.nominal, nominal)
+
+
+@pytest.mark.parametrize("constant", ["alpha", "lipschitz"])
+def test_fixed_points_rest_on_what_is_proved(constant):
+    with pytest.raises(Refuted, match="fixed_points"):
+        _corridor_claims.require_corridor(corridor(), PROVED | {constant: 1.01 * PROVED[constant]})
