@@ -41,6 +41,8 @@ FILES = {
     "_certificate": ["test_forged_certificates.py"],
     "_calibration": ["test_calibration.py"],
     "_document": ["test_document_arithmetic.py"],
+    "_output_metrics": ["test_output_claims.py"],
+    "_corridor_claims": ["test_corridor_claims.py"],
 }
 SLOW = "thousands"
 """Tests of seconds come last: few mutants reach them."""
@@ -53,11 +55,13 @@ NAMED = {
         ("+ rounding\n    return bool(rest", "\n    return bool(rest"),
         ("rest * (1 + MARGIN) + error + lost < shift", "0.5 * rest + error + lost < shift"),
         ("return left @ right, error + left.size * right.shape[1] * TINY", "return left @ right, 0.0"),
-        ("return is_positive_definite(*witness_matrix(", "return is_positive_definite(witness_matrix("),
-        ("bound, linear, metric))\n", "bound, linear, metric)[0])\n"),
-        ("4 * UNIT * (frobenius(start) + frobenius(matrix))", "4 * UNIT * frobenius(matrix - matrix)"),
+        ("is_positive_definite(*witness_matrix(", "is_positive_definite(witness_matrix("),
+        ("bound, vertex, metric))\n", "bound, vertex, metric)[0])\n"),
+        ("4 * UNIT * (frobenius(squared) + frobenius(start) + frobenius(matrix))", "4 * UNIT * frobenius(squared)"),
         ("4 * UNIT * size * largest)", "0.0)"),
-        ("for operator in operators)", "for operator in operators[:1])"),
+        ("[()] * len(operators), rate, operators, metric)", "[()], rate, operators[:1], metric)"),
+        ("in zip(witnesses, vertices, strict=True)", "in list(zip(witnesses, vertices, strict=True))[:1]"),
+        ("fits = len(witnesses) == len(vertices) and all(", "fits = all("),
         (" and not is_positive_definite(metric)", " and False"),
     ],
     "_claims": [
@@ -90,13 +94,30 @@ NAMED = {
         ('        _require_tubes(document["tube"], proof, document["d_bar"])\n', ""),
         ('{"d_bar": d_bar, **d_bar["by_scenario"]}', '{"d_bar": d_bar}'),
         (' or not supports(d_bar["trajectories"], level)', ""),
-        ("rtol=REPEATED, atol=0.0", "rtol=REPEATED"),
+        ("<= REPEATED * np.abs(expected)", "<= REPEATED + REPEATED * np.abs(expected)"),
+    ],
+    "_output_metrics": [
+        ("claim.joint, claim.alpha, list(vertices), claim.metric", "claim.joint, claim.alpha, list(vertices)"),
+        ("claim.joint, claim.alpha, list(vertices),", "claim.joint[:1], claim.alpha, list(vertices)[:1],"),
+        ("is_positive_definite(matrix, error)", "is_positive_definite(matrix)"),
+        ("error = rounding + ", "error = "),
+        ("name not in OUTPUTS or not may_have_metrics(weights)", "name not in OUTPUTS"),
+    ],
+    "_corridor_claims": [
+        ('expected = bounds["nominal"] + bounds', "expected = bounds"),
+        ('{"corridor": corridor, **corridor["by_scenario"]}', '{"corridor": corridor}'),
+        (" and supports(drives, level)", ""),
+        ('    require_fixed_points(corridor["fixed_points"], output, bounds["for_ever_position"])\n', ""),
+        ("for name in JOINT], axis=0)\n    factor", "for name in JOINT[:1]], axis=0)\n    factor"),
     ],
 }
 """Of each file: text and what replaces it."""
 ARGUED = {
     "what passes is refused by the comparison beside it, or by the core": (
-        *("<= error != np.inf", "< bound != np.inf", "<= condition != np.inf", "<= value != math.inf"),
+        *("<= error != np.inf", "< bound != np.inf", "<= condition != np.inf"),
+        *("<= value != math.inf", "< value != math.inf", "exact = -1 <= inside"),
+        *("largest <= np.inf and", "largest != np.inf and"),  # the rest contains the entry that is not finite
+        "zip(witnesses, vertices, strict=False)",
         *("claims.kappa != 1.0", "claims.kappa > 1.0", "claims.kappa >= 0.0"),  # with P the core proves no κ ≤ 1
         *("< level != 1", "< level <= 1", "< level < 2"),  # no number of trajectories supports such a level
     ),
@@ -105,7 +126,8 @@ ARGUED = {
         *("1e-140 == size", "size == 1e140", "1e-140 <= size", "size <= 1e140", "if 1.0 < size"),
     ),
     "the only entry of a list, one of several alike, or the first of two words": (
-        *('seen["joint"][ -1]', "weights.operators[ -1]", "witness[ -1]", "witness[0][ -1]", 'mode <= "joint"'),
+        *('seen["joint"][ -1]', "weights.operators[ -1]", "witness[ -1]", "witness[0][ -1]"),
+        *('mode <= "joint"', "if name <= JOINT[0]"),
     ),
     "nothing that is proved or measured depends on it": (
         *("np.nextafter(0.0, 2.0)", "initial= -1.0", "largest, physical, always = 1.0", "strict=False)])"),

@@ -82,8 +82,8 @@ WRITES = {f"os.environ.{verb}" for verb in ("update", "setdefault", "pop", "popi
 HOST = {"walk", "path_law", "corridor", "drive", "training", "certification", "exporting"}
 """Besides the doors and gymnasium's adapter, where code runs on the host and may compile."""
 FORBIDDEN = WRITES | {"os.putenv", "os.unsetenv", "jax.config"}
-GIVES_BACK = "exporting/_warm_up.py"
-"""The only library file that touches settings of jax: it sets a cache for one compilation, on request, and restores."""
+GIVES_BACK = "exporting/_jax_settings.py"
+"""The only library file that touches settings of jax: it sets them for one compilation or export, and restores."""
 
 
 def imports(name: str) -> Iterator[str]:

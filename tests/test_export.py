@@ -4,6 +4,7 @@ import hashlib
 import importlib.util
 import json
 import os
+import re
 import shutil
 import subprocess
 import sys
@@ -189,6 +190,18 @@ def test_the_manifest_says_what_the_programs_take_and_what_they_were_made_from(e
     assert tuple(control["high"] for control in manifest["controls"]) == plant.control_high
     assert manifest["environment"]["low"] == list(ENV_LOW)
     assert loaded.certificate["boxes"] == BOXES
+
+
+def test_nothing_in_an_export_tells_where_files_lay_when_it_was_made(exported):
+    """Nor in the programs, which jax annotates with source files; a jax setting that is made for it is given back."""
+    place = Path(exported[1]["blob"]).parent
+    folders = {str(Path(name).resolve().parent).encode() for name in (sfkd_jax.__file__, jax.__file__, __file__)}
+    programs = sorted(place.glob("*.stablehlo"))
+    assert len(programs) == 2
+    for content in (path.read_bytes() for path in programs):
+        assert not re.search(rb"[\w.-]\.py\b", content)
+        assert not [folder for folder in folders if folder in content]
+    assert jax.config.jax_traceback_in_locations_limit > 0
 
 
 def test_the_controller_of_the_command_is_what_is_exported(spoiled):

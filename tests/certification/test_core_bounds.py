@@ -188,7 +188,7 @@ def test_the_condition_of_a_metric_is_shown_with_its_rounding(coarse, monkeypatc
     asked = []
     monkeypatch.setattr(_core, "norm_upper", lambda matrix: 4.0)
     monkeypatch.setattr(_core, "is_positive_definite", lambda *given: bool(asked.append(given)) or True)
-    monkeypatch.setattr(_core, "check_witness", lambda *given, metric: True)
+    monkeypatch.setattr(_core, "check_vertices", lambda *given: True)
     metric = np.diag([4.0, 3.0, 2.0])
     assert _core.check_metric(metric, [np.eye(3)], 0.5, 2.5)
     ((shifted, error),) = asked
@@ -213,6 +213,41 @@ def test_every_operator_counts_in_a_metric():
     for operators in ([2 * short, short], [short, 2 * short], [short, 2 * short, short]):
         assert not _core.check_metric(metric, operators, 0.6, 5.0)
     assert not _core.check_metric(metric, [short], 0.6, 3.0)
+
+
+VERTICES = [0.5 * np.eye(2), np.diag([0.3, -0.4]), np.asarray([[0.0, 0.5], [0.0, 0.0]])]
+LAYERS = [0.2 * np.eye(2), 0.5 * np.eye(2)]
+
+
+def test_every_vertex_is_checked_with_its_own_multipliers():
+    """|A| + |W_2||W_1| = 0.6 at most; λ = 0.25 proves 0.8, and λ < |W_2|²/2 proves nothing."""
+    good, bad = [np.full(2, 0.25)], [np.full(2, 0.12)]
+    assert _core.check_vertices(LAYERS, [good] * 3, 0.8, VERTICES)
+    for k in range(3):
+        assert not _core.check_vertices(LAYERS, [*[good] * k, bad, *[good] * (2 - k)], 0.8, VERTICES)
+        longer = [vertex * (2 if j == k else 1) for j, vertex in enumerate(VERTICES)]
+        assert not _core.check_vertices(LAYERS, [good] * 3, 0.8, longer)
+    assert not _core.check_vertices(LAYERS, [good] * 3, 0.5, VERTICES)
+
+
+def test_there_are_as_many_witnesses_as_vertices_and_at_least_one():
+    good = [np.full(2, 0.25)]
+    assert not _core.check_vertices(LAYERS, [], 0.8, [])
+    for count in (0, 1, 2, 4):
+        assert not _core.check_vertices(LAYERS, [good] * count, 0.8, VERTICES)
+        assert not _core.check_vertices((), [()] * count, 0.8, VERTICES)
+    for few in ([], [*good, *good]):
+        for k in range(3):
+            assert not _core.check_vertices(LAYERS, [*[good] * k, few, *[good] * (2 - k)], 0.8, VERTICES)
+
+
+def test_a_metric_is_proved_once_for_all_vertices(monkeypatch):
+    asked, true = [], _core.is_positive_definite
+    monkeypatch.setattr(_core, "is_positive_definite", lambda *given: bool(asked.append(given)) or true(*given))
+    assert _core.check_vertices((), [()] * 3, 0.8, VERTICES, np.eye(2))
+    assert [len(given) for given in asked] == [1, 2, 2, 2]
+    for metric in (-np.eye(2), np.zeros((2, 2)), np.diag([1.0, np.nan])):
+        assert not _core.check_vertices((), [()] * 3, 0.8, [0 * vertex for vertex in VERTICES], metric)
 
 
 def test_bounds_are_positive_and_finite_and_multipliers_are_as_many_as_hidden_layers(monkeypatch):

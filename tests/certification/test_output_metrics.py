@@ -1,6 +1,5 @@
-"""Metrics of single outputs, the radii that follow from them, and the corridor's arithmetic."""
+"""Metrics of single outputs and the radii that follow from them, for the weights of a model as it runs."""
 
-import copy
 from functools import cache
 
 import jax
@@ -13,14 +12,8 @@ from jaxtyping import TypeCheckError
 from sfkd_jax import models
 from sfkd_jax.certification import (
     OUTPUTS,
-    DriveScores,
-    FixedPoints,
     OutputMetric,
-    _corridor_claims,
     _output_metrics,
-    calibrate,
-    covered,
-    fixed_point_corridor,
     radii,
     residuals,
 )
@@ -199,88 +192,3 @@ def test_radii_of_one_dimension_are_the_sums_that_they_are():
     assert bounds.largest == pytest.approx(1.0)
     later = radii(Residuals(steps, misses), "position", claim, np.asarray([8.0]))
     assert later.followed == pytest.approx(8.0 + 0.1)
-
-
-def scores(count, seed):
-    random = np.random.default_rng(seed)
-    return DriveScores._make(random.lognormal(size=(len(DriveScores._fields), count)))
-
-
-def test_bounds_hold_together_as_often_as_they_say():
-    """Exchangeable drives, 400 repetitions of 60 calibrating ones: coverage 0.9 within its error, 0.9 to 0.93."""
-    shares = []
-    for repetition in range(400):
-        bounds = calibrate(scores(60, 3 * repetition), scores(60, 3 * repetition + 1), level=0.9)
-        shares.append(covered(bounds, scores(200, 3 * repetition + 2))["coverage"])
-    assert 0.895 <= np.mean(shares) <= 0.93
-
-
-PROVED = {"alpha": 0.8, "lipschitz": 0.02}
-
-
-@cache
-def corridor():
-    bounds = calibrate(scores(60, 0), scores(60, 1), level=0.9)
-    part = covered(bounds, scores(200, 2))
-    return {
-        "bounds": bounds,
-        "corridor_m": bounds["nominal"] + bounds["followed_position"],
-        "level": 0.9,
-        "drives": 60,
-        **part,
-        "by_scenario": {"s3": part},
-        "attack": {"over_tube": 0.7, "over_corridor": 0.5},
-        "fixed_points": fixed_point_corridor(
-            FixedPoints(0.01, 0.7, 0.9, 1.1, 500),
-            **PROVED,
-            for_ever=bounds["for_ever_position"],
-            steps_between_switches=30,
-        ),
-    }
-
-
-FORGED = {
-    "the sum": lambda c: c.update(corridor_m=0.9 * c["corridor_m"]),
-    "a bound": lambda c: c["bounds"].update(followed_position=0.01),
-    "a bound NaN": lambda c: c["bounds"].update(nominal=float("nan")),
-    "a bound below 0": lambda c: c["bounds"].update(followed_yaw=-1.0),
-    "a bound that there is not": lambda c: c["bounds"].update(more=1.0),
-    "too few drives": lambda c: c.update(drives=3),
-    "a level that is none": lambda c: c.update(level=1.0),
-    "a coverage between two counts": lambda c: c.update(coverage=c["coverage"] - 0.001),
-    "an interval": lambda c: c.update(coverage_ci95=[0.99, 1.0]),
-    "another scenario": lambda c: c["by_scenario"]["s3"].update(coverage=2.0),
-    "an attack beyond the tube": lambda c: c["attack"].update(over_tube=1.1),
-    "no fixed points": lambda c: c.update(fixed_points=c["fixed_points"] | {"points": 0}),
-    "a fixed point off by less": lambda c: c["fixed_points"].update(centre_m=0.0),
-    "a smaller move of the road": lambda c: c["fixed_points"].update(road=0.6),
-    "a smaller switch": lambda c: c["fixed_points"].update(switch=0.1),
-    "a smaller push": lambda c: c["fixed_points"].update(push=1.0),
-    "a push NaN": lambda c: c["fixed_points"].update(push=float("nan")),
-    "a negative push": lambda c: c["fixed_points"].update(push=-1.0),
-    "rarer switches": lambda c: c["fixed_points"].update(steps_between_switches=10**6),
-    "switches at no step": lambda c: c["fixed_points"].update(steps_between_switches=0),
-    "half a step": lambda c: c["fixed_points"].update(steps_between_switches=30.5),
-    "a narrower corridor": lambda c: c["fixed_points"]["corridor_m"].update(law=0.1),
-    "another corridor": lambda c: c["fixed_points"]["corridor_m"].update(more=0.1),
-    "no switch in it": lambda c: c["fixed_points"].update(after_switch_m=c["fixed_points"]["corridor_m"]),
-    "a larger tube": lambda c: c["bounds"].update(for_ever_position=2.0 * c["bounds"]["for_ever_position"]),
-}
-
-
-def test_an_honest_corridor_passes():
-    _corridor_claims.require_corridor(corridor(), PROVED)
-
-
-@pytest.mark.parametrize("forge", FORGED.values(), ids=list(FORGED))
-def test_a_corridor_whose_parts_do_not_go_together_is_refused(forge):
-    changed = copy.deepcopy(corridor())
-    forge(changed)
-    with pytest.raises(Refuted):
-        _corridor_claims.require_corridor(changed, PROVED)
-
-
-@pytest.mark.parametrize("constant", ["alpha", "lipschitz"])
-def test_fixed_points_rest_on_what_is_proved(constant):
-    with pytest.raises(Refuted, match="fixed_points"):
-        _corridor_claims.require_corridor(corridor(), PROVED | {constant: 1.01 * PROVED[constant]})

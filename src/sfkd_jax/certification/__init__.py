@@ -20,6 +20,7 @@ from sfkd_jax.certification._certificate import certify as certify
 from sfkd_jax.certification._certificate import verify as verify
 from sfkd_jax.certification._conformal_tube import conformal_tube as conformal_tube
 from sfkd_jax.certification._core import check_metric as check_metric
+from sfkd_jax.certification._core import check_vertices as check_vertices
 from sfkd_jax.certification._core import check_witness as check_witness
 from sfkd_jax.certification._core import is_positive_definite as is_positive_definite
 from sfkd_jax.certification._core import norm_upper as norm_upper

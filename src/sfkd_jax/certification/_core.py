@@ -10,11 +10,12 @@ from jaxtyping import Float
 
 Matrix = Float[np.ndarray, "_ _"]
 Vector = Float[np.ndarray, " _"]
+Layers = Sequence[Matrix]
+Multipliers = Sequence[Vector]
+Vertices = Sequence[Matrix | None]
 UNIT, TINY = np.finfo(np.float64).eps / 2, np.finfo(np.float64).tiny
-SMALLEST = np.nextafter(0.0, 1.0)
-"""The smallest denormal number. Some libraries make the processor flush these to zero; nothing is proved then."""
-MARGIN = 1e-6
-"""Relative; far above what norms, sums and differences of fewer than 10^4 rows lose by rounding."""
+SMALLEST = np.nextafter(0.0, 1.0)  # denormal: where a library makes the processor flush it to zero nothing is proved
+MARGIN = 1e-6  # relative; far above what norms, sums and differences of fewer than 10^4 rows lose by rounding
 
 
 @np.errstate(over="ignore", invalid="ignore")  # NaN and infinity are refused by the comparisons
@@ -26,25 +27,27 @@ def is_positive_definite(matrix: Matrix, error: float = 0.0) -> bool:
     M is scaled by a power of two to entries below 1, so that nothing overflows and what underflows is at most `lost`.
     False when in doubt: every comparison with NaN is false.
     """
-    size = len(matrix)
-    if not (np.all(np.isfinite(matrix)) and np.array_equal(matrix, matrix.T) and 0 <= error < np.inf and SMALLEST > 0):
+    size, largest = len(matrix), np.max(np.abs(matrix), initial=0.0)
+    if not (largest < np.inf and np.array_equal(matrix, matrix.T) and 0 <= error < np.inf and SMALLEST > 0):
         return False
-    exponent = -int(np.frexp(np.max(np.abs(matrix), initial=0.0))[1])
-    scaled, error, identity = np.ldexp(matrix, exponent), float(np.ldexp(error, exponent)), np.eye(size)
+    exponent = -int(np.frexp(largest)[1])
+    scaled, error = np.ldexp(matrix, exponent), float(np.ldexp(error, exponent))
     lost = 4 * size**2 * TINY
     shift = 4 * (size + 2) * UNIT * float(np.trace(scaled)) + error * (1 + 4 * MARGIN) + 4 * lost
+    moved = shift * np.eye(size)
     try:
-        factor = np.linalg.cholesky(scaled - shift * identity)
+        factor = np.linalg.cholesky(scaled - moved)
     except np.linalg.LinAlgError:
         return False
     squared, rounding = product(factor, factor.T)
-    rest = frobenius(scaled - squared - shift * identity) + rounding
+    rest = frobenius(scaled - squared - moved) + rounding
     return bool(rest * (1 + MARGIN) + error + lost < shift * (1 - MARGIN))
 
 
 def frobenius(matrix: Matrix) -> float:
     """||M||_F, which is at least ||M||_2, without overflow or underflow of the squares."""
-    size = float(np.linalg.norm(matrix))
+    flat = matrix.ravel(order="K")
+    size = float(np.sqrt(flat.dot(flat)))
     if 1e-140 < size < 1e140:
         return size
     largest = float(np.max(np.abs(matrix), initial=0.0))
@@ -73,13 +76,8 @@ def norm_upper(matrix: Matrix) -> float:
     return float(np.sum(np.abs(matrix))) * (1 + MARGIN)
 
 
-@np.errstate(over="ignore", invalid="ignore")
 def check_witness(
-    weights: Sequence[Matrix],
-    multipliers: Sequence[Vector],
-    bound: float,
-    linear: Matrix | None = None,
-    metric: Matrix | None = None,
+    weights: Layers, multipliers: Multipliers, bound: float, linear: Matrix | None = None, metric: Matrix | None = None
 ) -> bool:
     """Whether the multipliers prove |f(z) − f(z')|_P ≤ b |z − z'|_P for f = A z + W_L σ(… σ(W_1 z + b_1) …) + b_L.
 
@@ -92,21 +90,26 @@ def check_witness(
     By Schur's complement this is linear in (A, Λ, b²): witnesses at the vertices of a polytope of A prove the largest
     of their bounds for every A in it. No weights: f = A z. No A: it is 0. No P: it is I, for z and f of any sizes.
     """
-    if len(multipliers) != max(len(weights) - 1, 0) or not 0 < bound < np.inf:
-        return False
-    if any(not np.all(np.asarray(part) > 0) for part in multipliers):
-        return False
+    return check_vertices(weights, [multipliers], bound, [linear], metric)
+
+
+@np.errstate(over="ignore", invalid="ignore")
+def check_vertices(
+    weights: Layers, witnesses: Sequence[Multipliers], bound: float, vertices: Vertices, metric: Matrix | None = None
+) -> bool:
+    """`check_witness` at every vertex A, each with multipliers of its own; P is one for all and proved once."""
     if metric is not None and not is_positive_definite(metric):
         return False
-    return is_positive_definite(*witness_matrix(weights, multipliers, bound, linear, metric))
+    fits = len(witnesses) == len(vertices) and all(len(part) == max(len(weights) - 1, 0) for part in witnesses)
+    positive = all(np.all(np.asarray(part) > 0) for multipliers in witnesses for part in multipliers)
+    return bool(witnesses and fits and positive and 0 < bound < np.inf) and all(
+        is_positive_definite(*witness_matrix(weights, multipliers, bound, vertex, metric))
+        for multipliers, vertex in zip(witnesses, vertices, strict=True)
+    )
 
 
 def witness_matrix(
-    weights: Sequence[Matrix],
-    multipliers: Sequence[Vector],
-    bound: float,
-    linear: Matrix | None = None,
-    metric: Matrix | None = None,
+    weights: Layers, multipliers: Multipliers, bound: float, linear: Matrix | None = None, metric: Matrix | None = None
 ) -> tuple[Matrix, float]:
     """The matrix above, and a bound on its rounding error (2-norm)."""
     first = np.asarray(weights[0] if weights else linear, dtype=np.float64)
@@ -115,8 +118,7 @@ def witness_matrix(
     blocks = [slice(a, b) for a, b in pairwise(edges)]
     matrix, error = np.zeros((edges[-1], edges[-1])), 0.0
     matrix[blocks[0], blocks[0]] = start
-    for k, multiplier in enumerate(multipliers):
-        multiplier = np.asarray(multiplier, dtype=np.float64)
+    for k, multiplier in enumerate(np.asarray(part, dtype=np.float64) for part in multipliers):
         coupling = multiplier[:, None] * np.asarray(weights[k], dtype=np.float64)
         matrix[blocks[k + 1], blocks[k]] = -coupling
         matrix[blocks[k], blocks[k + 1]] = -coupling.T
@@ -129,11 +131,9 @@ def witness_matrix(
         output[:, blocks[0]] += linear
     weighted, before = (output, 0.0) if metric is None else product(metric, output)
     squared, rounding = product(output.T, weighted)
-    error += (
-        frobenius(output) * (2 * before + 4 * UNIT * frobenius(weighted)) + 2 * rounding + 4 * UNIT * frobenius(squared)
-    )
+    error += frobenius(output) * (2 * before + 4 * UNIT * frobenius(weighted)) + 2 * rounding
     matrix -= 0.5 * (squared + squared.T)
-    error += 4 * UNIT * (frobenius(start) + frobenius(matrix)) + matrix.size * TINY
+    error += 4 * UNIT * (frobenius(squared) + frobenius(start) + frobenius(matrix)) + matrix.size * TINY
     return matrix, error
 
 
@@ -145,6 +145,6 @@ def check_metric(metric: Matrix, operators: Sequence[Matrix], rate: float, condi
     largest, size = norm_upper(metric), len(metric)
     if not (1 <= condition < np.inf and largest < np.inf):
         return False
-    smallest = largest / condition * (1 + 4 * UNIT)  # P is at least this, or κ is too small
-    proved = is_positive_definite(metric - smallest * np.eye(size), 4 * UNIT * size * largest)
-    return proved and all(check_witness((), (), rate, operator, metric=metric) for operator in operators)
+    least = largest / condition * (1 + 4 * UNIT)  # P is at least this, or κ is too small
+    proved = is_positive_definite(metric - least * np.eye(size), 4 * UNIT * size * largest)
+    return proved and check_vertices((), [()] * len(operators), rate, operators, metric)

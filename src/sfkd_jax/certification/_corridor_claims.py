@@ -94,14 +94,14 @@ def require_corridor(corridor: Mapping[str, Any], output: Mapping[str, Any]) -> 
         Refuted: naming what does not follow.
     """
     bounds = corridor["bounds"]
-    values = np.asarray([bounds[name] for name in MEASURED], dtype=np.float64)
+    values = np.asarray(list(bounds.values()), dtype=np.float64)
     if set(bounds) != set(MEASURED) or not (np.all(np.isfinite(values)) and np.all(values > 0)):
         raise Refuted("corridor.bounds must be positive numbers, one for each measured quantity")
     expected = bounds["nominal"] + bounds["followed_position"]
     if not np.isclose(corridor["corridor_m"], expected, rtol=1e-9, atol=0.0):
         raise Refuted("corridor.corridor_m is not nominal + followed_position")
     drives, level = corridor["drives"], corridor["level"]
-    if not (isinstance(drives, int) and drives > 0 and 0 < level < 1 and supports(drives, level)):
+    if not (isinstance(drives, int) and 0 < level < 1 and supports(drives, level)):
         raise Refuted(f"corridor.level = {level!r} cannot be had from {drives!r} drives")
     if not corridor["attack"]["over_tube"] <= 1.0:
         raise Refuted("corridor.attack is a car outside of its tube whose disturbances kept their bound")

@@ -137,5 +137,5 @@ def _require_equal(name: str, stated: Any, derived: Any) -> None:
     """Refuse what is not what it follows from."""
     expected = np.asarray(derived, dtype=np.float64)
     found = _numbers(name, stated)
-    if found.shape != expected.shape or not np.allclose(found, expected, rtol=REPEATED, atol=0.0):
+    if found.shape != expected.shape or not np.all(np.abs(found - expected) <= REPEATED * np.abs(expected)):
         raise Refuted(f"{name} does not follow from what it is computed from")

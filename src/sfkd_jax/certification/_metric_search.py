@@ -15,7 +15,7 @@ from scipy.linalg import cho_solve, eigh
 from scipy.optimize import minimize
 
 from sfkd_jax.certification._claims import SERVED, Refuted
-from sfkd_jax.certification._core import Matrix, Vector, check_witness, witness_matrix
+from sfkd_jax.certification._core import Matrix, Vector, check_vertices, witness_matrix
 from sfkd_jax.certification._exported import Exported
 from sfkd_jax.certification._output_metrics import OutputMetric, reads_within
 
@@ -75,12 +75,12 @@ def _accepted(weights: Exported, rows: Matrix, metric: Matrix, joint: list[list[
     Raises:
         Refuted: there are none.
     """
-    pairs = list(zip(joint, weights.operators.vertices, strict=True))
-    rate = max(_rate(weights.residual, part, vertex, metric) for part, vertex in pairs)
+    vertices = list(weights.operators.vertices)
+    rate = max(_rate(weights.residual, part, vertex, metric) for part, vertex in zip(joint, vertices, strict=True))
     reach = float(np.sqrt(np.max(np.linalg.eigvalsh(rows @ np.linalg.solve(metric, rows.T)))))
     for slack in SLACKS:
         alpha, lipschitz = float(SERVED * rate * (1 + slack)), float(SERVED * reach * (1 + slack))
-        proved = all(check_witness(weights.residual, part, alpha, vertex, metric) for part, vertex in pairs)
+        proved = check_vertices(weights.residual, joint, alpha, vertices, metric)
         if proved and alpha < 1.0 and reads_within(rows, lipschitz, metric):
             return OutputMetric(alpha, lipschitz, metric, joint)
     raise Refuted("no metric below 1 was found for this output")

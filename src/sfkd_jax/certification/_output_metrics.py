@@ -19,7 +19,7 @@ from sfkd_jax.certification._core import (
     UNIT,
     Matrix,
     Vector,
-    check_witness,
+    check_vertices,
     frobenius,
     is_positive_definite,
     product,
@@ -89,9 +89,8 @@ def require_output_metric(name: str, claim: OutputMetric, weights: Exported) -> 
     vertices = weights.operators.vertices
     if claim.metric.shape != vertices.shape[1:] or len(claim.joint) != len(vertices):
         raise Refuted(f"outputs.{name}.witness is of another size than the weights")
-    if not claim.alpha < 1.0 or not all(
-        check_witness(weights.residual, part, claim.alpha, vertex, claim.metric)
-        for part, vertex in zip(claim.joint, vertices, strict=True)
+    if not claim.alpha < 1.0 or not check_vertices(
+        weights.residual, claim.joint, claim.alpha, list(vertices), claim.metric
     ):
         raise Refuted(f"outputs.{name}.alpha does not follow from its witness")
     if not reads_within(readouts(weights)[name], claim.lipschitz, claim.metric):

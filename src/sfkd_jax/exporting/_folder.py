@@ -9,12 +9,11 @@ from pathlib import Path
 from typing import Any
 
 import jax
-import jax.export
 import numpy as np
 
 from sfkd_jax import artefacts, assembly, policy
 from sfkd_jax.exporting._iree import compile_iree
-from sfkd_jax.exporting._programs import Leaf, Program, flat_programs, specifications
+from sfkd_jax.exporting._programs import Leaf, flat_programs, lowered
 from sfkd_jax.types import Params
 
 FORMAT = 2
@@ -49,7 +48,7 @@ def write_controller(
     found = flat_programs(trained)
     programs = {name: getattr(found, name) for name in FILES}
     modules = {name: compile_iree(program, flags=iree_flags) for name, program in programs.items() if iree}
-    exported = {name: _lowered(program, platforms) for name, program in programs.items()}
+    exported = {name: lowered(program.function, program, platforms) for name, program in programs.items()}
     for stale in (MANIFEST, CERTIFICATE, *(f"{stem}.vmfb" for stem in FILES.values())):
         (folder / stale).unlink(missing_ok=True)
     stored = policy.save(folder / "policy.npz", trained.params, trained.settings, made_from=made_from)
@@ -79,11 +78,6 @@ def write_controller(
     manifest["sha256"] = artefacts.sha256(manifest)
     artefacts.write_json(folder / MANIFEST, manifest)
     return manifest
-
-
-def _lowered(program: Program, platforms: tuple[str, ...]) -> jax.export.Exported:
-    """A program as StableHLO; no argument is dropped, also if nothing depends on it."""
-    return jax.export.export(jax.jit(program.function, keep_unused=True), platforms=platforms)(*specifications(program))
 
 
 def _stored(path: Path, content: bytes) -> dict[str, Any]:

@@ -4,10 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
-import jax
-import jax.export
-
-from sfkd_jax.exporting._programs import Program, specifications
+from sfkd_jax.exporting._programs import Program, lowered
 from sfkd_jax.exporting._weights_first import weights_first
 
 
@@ -24,8 +21,7 @@ def compile_iree(program: Program, *, flags: Sequence[str] = ()) -> bytes:
         from iree import compiler  # pyright: ignore[reportMissingImports]
     except ImportError:
         raise ValueError("export.iree=true needs IREE: pip install 'sfkd-jax[cpp]'") from None
-    lowered = jax.export.export(jax.jit(weights_first(program), keep_unused=True), platforms=("cpu",))
-    text = lowered(*specifications(program)).mlir_module()
+    text = lowered(weights_first(program), program, ("cpu",)).mlir_module()
     try:
         return compiler.compile_str(text, input_type="stablehlo", target_backends=["llvm-cpu"], extra_args=list(flags))
     except compiler.CompilerToolError as error:

@@ -7,10 +7,12 @@ from functools import partial
 from typing import Any, NamedTuple
 
 import jax
+import jax.export
 import jax.numpy as jnp
 from jaxtyping import Array
 
 from sfkd_jax import assembly
+from sfkd_jax.exporting._jax_settings import jax_settings
 from sfkd_jax.policy import Policy
 
 
@@ -96,6 +98,17 @@ def flat_programs(policy: Policy) -> Programs:
 def specifications(program: Program) -> tuple[jax.ShapeDtypeStruct, ...]:
     """The shapes of a program's inputs as jax takes them."""
     return tuple(jax.ShapeDtypeStruct(leaf.shape, leaf.dtype) for leaf in program.inputs)
+
+
+def lowered(function: Callable[..., Any], program: Program, platforms: tuple[str, ...]) -> jax.export.Exported:
+    """A function of a program's inputs as StableHLO; no argument is dropped, also if nothing depends on it.
+
+    Without the places in source files that jax notes beside every operation: they tell where
+    this machine keeps its files, and make the same program another one elsewhere.
+    """
+    with jax_settings({"jax_traceback_in_locations_limit": 0}):
+        lower = jax.export.export(jax.jit(function, keep_unused=True), platforms=platforms)
+        return lower(*specifications(program))
 
 
 def _is_key(leaf: Any) -> bool:

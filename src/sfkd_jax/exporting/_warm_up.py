@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator
 from contextlib import contextmanager, nullcontext
 from pathlib import Path
 from typing import Any
@@ -10,6 +10,7 @@ from typing import Any
 import jax
 from jax.experimental.compilation_cache import compilation_cache
 
+from sfkd_jax.exporting._jax_settings import jax_settings
 from sfkd_jax.exporting._programs import example_inputs
 from sfkd_jax.policy import Policy
 
@@ -49,18 +50,10 @@ def warm_up(policy: Policy, *, cache: str | Path | None = None) -> jax.stages.Co
 
 @contextmanager
 def _persistent_cache(directory: Path) -> Iterator[None]:
-    """jax's compilation cache in `directory`, and afterwards as it was."""
-    asked = KEPT | {"jax_compilation_cache_dir": str(directory)}
-    before = {name: getattr(jax.config, name) for name in asked}
-    _set(asked)
+    """jax's compilation cache in `directory`, and afterwards as it was; an open one does not follow its settings."""
     try:
-        yield
+        with jax_settings(KEPT | {"jax_compilation_cache_dir": str(directory)}):
+            compilation_cache.reset_cache()
+            yield
     finally:
-        _set(before)
-
-
-def _set(values: Mapping[str, object]) -> None:
-    """Change settings; an open cache does not follow them and is opened anew."""
-    for name, value in values.items():
-        jax.config.update(name, value)
-    compilation_cache.reset_cache()
+        compilation_cache.reset_cache()
