@@ -1,4 +1,4 @@
-"""Print the tables of docs/plants.md from experiments/commonroad/results.json; with --write put them there.
+"""Print the tables of docs/plants.md from experiments/commonroad/*.json; with --write put them there.
 
 python benchmarks/commonroad_page.py [--write]
 --write draws the page's figure as well.
@@ -97,7 +97,55 @@ def export():
     return tables.table(["steps", "RMSE [mm]", "largest difference of a control"], [numbers])
 
 
-TABLES = {"deviations": deviations, "ratios": ratios, "handling": handling, "tuning": tuning, "export": export}
+def along_path():
+    """What is certified of the drift car along a path, and what the package's own car did."""
+    found = json.loads((ROOT / "experiments" / "commonroad" / "path.json").read_text())
+    certificate, package, step = found["certificate"], found["package"], found["step"]
+    output, corridor = certificate["outputs"]["position"], certificate["corridor"]
+    bounds, s3, tube = corridor["bounds"], corridor["by_scenario"]["s3"], output["tube"]
+    inside = {name: within(output["coverage"][name], output["coverage_drives"]) for name in tube}
+    apart = step["largest"]
+    lines = {
+        "α in the metric of e_y, proved; in the 2-norm": f"{output['alpha']:.3f}; {certificate['alpha']:.3f}",
+        "tube on 5 s drives like the data, `for_ever` [m]": f"{tube['for_ever']:.3f}",
+        "test drives inside": inside["for_ever"],
+        "the same, `followed` [m]": f"{tube['followed']:.3f}",
+        "test drives inside it": inside["followed"],
+        "corridor \\|e_y\\| on drives of the class [m]": f"{corridor['corridor_m']:.3f}",
+        "of it W; tube around the copy, `followed` [m]": f"{bounds['nominal']:.3f}; {bounds['followed_position']:.3f}",
+        "tube around the copy, `for_ever` [m]": f"{bounds['for_ever_position']:.3f}",
+        "fresh drives of the class inside": counted(corridor),
+        "S3 drives of 60 s inside, never calibrated on": counted(s3),
+        "drives of the class by the package's functions inside": counted(package),
+        "of these with \\|e_y\\| within the corridor": f"{package['inside_corridor']} of {package['coverage_drives']}",
+        "their largest \\|e_y\\|; \\|e_y − ê_y\\| [m]": f"{package['lateral_m']:.3f}; {package['distance_m']:.3f}",
+        f"one step beside the package's, largest of {step['steps']}: position [m]; v [m/s]": (
+            f"{max(apart['p_x'], apart['p_y']):.0e}; {apart['v']:.0e}"
+        ),
+        "certify everything [s]": f"{certificate['seconds']:.0f}",
+    }
+    return tables.table(["single-track drift, along a path", ""], list(map(list, lines.items())))
+
+
+def counted(found):
+    """Drives inside of how many, with the interval of the share."""
+    low, high = found["coverage_ci95"]
+    return f"{within(found['coverage'], found['coverage_drives'])} ({low:.3f} to {high:.3f})"
+
+
+def within(share, drives):
+    """A share as a count."""
+    return f"{round(share * drives)} of {drives}"
+
+
+TABLES = {
+    "deviations": deviations,
+    "ratios": ratios,
+    "handling": handling,
+    "tuning": tuning,
+    "export": export,
+    "along path": along_path,
+}
 
 
 def draw():
