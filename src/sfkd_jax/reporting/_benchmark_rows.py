@@ -14,9 +14,13 @@ VARIANTS = {"icode_mppi_one_step": "icode_mppi", "icode_mppi_reads_env": "icode_
 """Systems that the paper has under one name."""
 OFF_THE_ROAD_M = 1.0
 """A mean deviation beyond it is not driving: figures write it, so that the rows that drive share the axis."""
-SELF_EVIDENT = ("nominal", "oracle")
+SELF_EVIDENT = ("nominal", "oracle", "law")
 """Systems whose name says what they are told; so do those of SFKD and its parts."""
-_SAMPLINGS = {"feedback": "sampling around a feedback law", "plain": "plain sampling"}
+_SAMPLINGS = {
+    "feedback": "sampling around a feedback law",
+    "plain": "plain sampling",
+    "law": "path coordinates, sampling around their law",
+}
 _VEHICLES = ("kinematic", "dynamic")
 _LEVELS = ("seen", "interpolated", "extrapolated")
 
@@ -41,13 +45,18 @@ class Contest(NamedTuple):
 
 def name_of(row: Row) -> str:
     """What a reader sees for a row: its system, and what it is told of the environment where that is not plain."""
-    system, env = str(row.get("system")), str(row.get("env"))
+    system, env = _system(row), str(row.get("env"))
     shown = label(system)
     if env == "estimated":
         return f"{shown} (e estimated)"
     if system in SELF_EVIDENT or system.startswith("sfkd"):
         return shown
     return f"{shown} (e)" if env == "measured" else f"{shown} (no e)" if env == "none" else shown
+
+
+def _system(row: Row) -> str:
+    """The system of a row; in path coordinates, which a contest says, under the name that it has in others."""
+    return str(row.get("system")).removesuffix("_path")
 
 
 def search_words(row: Row) -> str:
@@ -76,7 +85,7 @@ def contests(rows: list[Row]) -> list[Contest]:
 def _lines(rows: list[Row]) -> list[Line]:
     lines: dict[tuple[str, str], Line] = {}
     for row in rows:
-        key = (str(row.get("system")), str(row.get("env")))
+        key = (_system(row), str(row.get("env")))
         lines.setdefault(key, Line(name_of(row), *key, {})).rows.setdefault(str(row.get("scenario")), row)
     return [lines[key] for key in sorted(lines, key=lambda key: (rank(key[0]), key[1]))]
 

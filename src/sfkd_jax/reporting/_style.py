@@ -29,6 +29,7 @@ SYSTEMS: dict[str, tuple[str, str, Any, float]] = {
     "r2dn": ("R2DN", "#999933", (0, (5, 1, 1, 1)), 1.3),
     "nominal": ("Nominal", "#e8a33d", "-", 1.4),
     "oracle": ("Oracle", "#3c3c3c", (0, (3, 1.2)), 1.4),
+    "law": ("Law alone", "#a0522d", (0, (1.5, 1)), 1.3),
 }
 """One colour and one dash per system, everywhere (after Okabe and Ito, and Tol: colour-blind safe)."""
 
