@@ -18,19 +18,20 @@ from sfkd_jax import assembly, config, walk
 from sfkd_jax.datasets import measure_space, random_windows, spread_windows
 from sfkd_jax.training import fit, multi_step_loss
 
-FREE = "training=standard"
 CHOICES = {
-    "neural_ode_path": [f"{FREE}", "training=state_model", "training=state_model training.learning_rate=0.001"],
+    "neural_ode_path": [
+        "training=standard",
+        "training=state_model",
+        "training=state_model training.learning_rate=0.001",
+    ],
     "r2dn_path": [
-        f"{FREE}",
-        f"{FREE} model.alpha=0.95",
+        "training=standard",
         "training=path model.alpha=0.95",
         "training=path model.alpha=0.9",
     ],
-    "sfkd_path_no_contraction": [f"{FREE}", "training=state_model"],
-    "sfkd_path": ["training=path"],
+    "sfkd_path_no_contraction": ["training=standard"],
 }
-"""Model -> overrides that are tried; the last line is no rival and says what the numbers are worth."""
+"""Model -> overrides that are tried. A tube is in the loss of models that have one."""
 
 
 def score(settings, steps):
