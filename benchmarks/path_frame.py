@@ -26,6 +26,8 @@ NAMES = {
     "law": "the law alone",
     "oracle": "oracle",
 }
+SHIPPED = [0.01]
+"""`training.loss.tube`."""
 LOOKS = {"dynamic": ("#0b57b0", "o"), "kinematic": ("#e8a33d", "s")}
 
 
@@ -111,28 +113,30 @@ def tubes(plant, system, weight=None):
     return ["–"] * (1 + len(TUBES))
 
 
-SHIPPED = [0.01]
-
-
 def weights():
     """What a larger weight of the tube buys and costs."""
     lines = []
-    for plant, weight, row in weighed():
-        ahead = f"{1e3 * row['open_loop_rmse_m']['20']:.2f}"
-        lines.append([plant, f"{weight:g}", ahead, *tubes(plant, row["system"], [weight] if weight else [])])
-        lines[-1].append(millimetres(row["rmse_m"]))
-    return tables.table(["", "weight", "e_y 20 ahead [mm]", "α", *TUBES, "S3 [mm]"], lines)
+    for plant, weight, rows in weighed():
+        ahead = f"{1e3 * rows['s3']['open_loop_rmse_m']['20']:.2f}"
+        certified = tubes(plant, "sfkd_path", [weight] if weight else [])
+        lines.append([plant, f"{weight:g}", ahead, *certified, *(millimetres(row["rmse_m"]) for row in rows.values())])
+    return tables.table(
+        ["", "weight", "e_y 20 ahead [mm]", "α", *TUBES, *(f"{name.upper()} [mm]" for name in rows)], lines
+    )
 
 
 def weighed():
-    """(plant, weight, row), the weights ascending."""
-    found = [(row["vehicle"], weight_of(row), row) for row in read(WEIGHTS, "results")["rows"]]
-    return sorted(found, key=lambda entry: (PLANTS.index(entry[0]), entry[1]))
+    """(plant, weight, scenario -> row), the weights ascending."""
+    found = {}
+    for row in read(WEIGHTS, "results")["rows"]:
+        found.setdefault((row["vehicle"], weight_of(row)), {})[row["scenario"]] = row
+    order = sorted(found, key=lambda entry: (PLANTS.index(entry[0]), entry[1]))
+    return [(*entry, dict(sorted(found[entry].items()))) for entry in order]
 
 
 def weight_of(row):
-    """The weight by the name of its variation."""
-    return float(row["variation"].split()[-1])
+    """The weight by the name of its variation; a row without one has what ships."""
+    return SHIPPED[0] if row["variation"] is None else float(row["variation"].split()[-1])
 
 
 def choices():
@@ -152,26 +156,26 @@ def draw():
     """Error of prediction and of driving over the certified tube, a line a plant, a point a weight."""
     from matplotlib.figure import Figure
 
-    figure = Figure(figsize=(6.9, 3.0), layout="constrained")
-    panels = figure.subplots(1, 2)
+    figure = Figure(figsize=(6.9, 2.9), layout="constrained")
+    panels = figure.subplots(1, 3)
     measures = {
-        "e_y 20 steps ahead, RMS [mm]": lambda row: 1e3 * row["open_loop_rmse_m"]["20"],
-        "S3, RMSE [mm]": lambda row: 1e3 * row["rmse_m"]["mean"],
+        "e_y 20 steps ahead, RMS [mm]": lambda rows: 1e3 * rows["s3"]["open_loop_rmse_m"]["20"],
+        "S2, RMSE [mm]": lambda rows: 1e3 * rows["s2"]["rmse_m"]["mean"],
+        "S3, RMSE [mm]": lambda rows: 1e3 * rows["s3"]["rmse_m"]["mean"],
     }
-    entries = {(one["vehicle"], one["system"], *one["weight"]): one for one in read(KEPT, "tubes")}
+    bounds = {(one["vehicle"], one["system"], *one["weight"]): one["bounds"] for one in read(KEPT, "tubes")}
     for axes, (head, measure) in zip(panels, measures.items(), strict=True):
         for plant, (colour, marker) in LOOKS.items():
             points = []
-            for _, weight, row in (entry for entry in weighed() if entry[0] == plant):
-                entry = entries.get((plant, row["system"], *([weight] if weight else [])))
-                if entry and entry["bounds"]:
-                    points.append((entry["bounds"]["followed_position"], measure(row), weight))
-            axes.plot(*zip(*(point[:2] for point in points), strict=True), color=colour, marker=marker, label=plant)
-            for x, y, weight in points:
-                axes.annotate(f"{weight:g}", (x, y), textcoords="offset points", xytext=(4, 4), fontsize=7.5)
-        axes.set(xlabel="certified tube of the class, followed [m]", ylabel=head, xscale="log")
+            for _, weight, rows in (entry for entry in weighed() if entry[0] == plant):
+                tube = bounds[plant, "sfkd_path", *([weight] if weight else [])]["followed_position"]
+                points.append((tube, measure(rows)))
+                axes.annotate(f"{weight:g}", points[-1], textcoords="offset points", xytext=(4, 4), fontsize=7.5)
+            axes.plot(*zip(*points, strict=True), color=colour, marker=marker, markersize=4, label=plant)
+        axes.set(ylabel=head, xscale="log")
         axes.set_ylim(bottom=0.0)
         axes.grid(visible=True, which="both", color="#e3e6ea", linewidth=0.6)
+    panels[1].set_xlabel("certified tube of the class, followed [m]")
     figure.legend(*panels[0].get_legend_handles_labels(), loc="outside upper center", ncols=2, frameon=False)
     figure.savefig(FIGURE, dpi=150, metadata={"Software": None})
 
