@@ -6,7 +6,7 @@ from typing import Any, NamedTuple, TypeAlias
 
 from sfkd_jax.artefacts import identity
 from sfkd_jax.reporting._numbers import dig, is_number
-from sfkd_jax.reporting._style import SYSTEMS, label, ordered
+from sfkd_jax.reporting._style import SYSTEMS, family, label, ordered
 
 Row: TypeAlias = dict[str, Any]
 
@@ -45,18 +45,13 @@ class Contest(NamedTuple):
 
 def name_of(row: Row) -> str:
     """What a reader sees for a row: its system, and what it is told of the environment where that is not plain."""
-    system, env = _system(row), str(row.get("env"))
+    system, env = family(str(row.get("system"))), str(row.get("env"))
     shown = label(system)
     if env == "estimated":
         return f"{shown} (e estimated)"
     if system in SELF_EVIDENT or system.startswith("sfkd"):
         return shown
     return f"{shown} (e)" if env == "measured" else f"{shown} (no e)" if env == "none" else shown
-
-
-def _system(row: Row) -> str:
-    """The system of a row; in path coordinates, which a contest says, under the name that it has in others."""
-    return str(row.get("system")).removesuffix("_path")
 
 
 def search_words(row: Row) -> str:
@@ -85,7 +80,7 @@ def contests(rows: list[Row]) -> list[Contest]:
 def _lines(rows: list[Row]) -> list[Line]:
     lines: dict[tuple[str, str], Line] = {}
     for row in rows:
-        key = (_system(row), str(row.get("env")))
+        key = (family(str(row.get("system"))), str(row.get("env")))
         lines.setdefault(key, Line(name_of(row), *key, {})).rows.setdefault(str(row.get("scenario")), row)
     return [lines[key] for key in sorted(lines, key=lambda key: (rank(key[0]), key[1]))]
 
