@@ -13,6 +13,7 @@ from pathlib import Path
 
 import jax
 from hydra import compose, initialize_config_dir
+from omegaconf import OmegaConf
 
 from sfkd_jax import assembly, config, walk
 from sfkd_jax.datasets import measure_space, random_windows, spread_windows
@@ -69,7 +70,8 @@ def main():
                 continue
             with initialize_config_dir(config.conf_path(), version_base="1.3"):
                 picked = ["dataset=path", f"model={model}", f"vehicle={asked.vehicle}", f"root={asked.root}"]
-                settings = config._settings(compose("config", overrides=[*picked, *overrides.split()]))
+                composed = compose("config", overrides=[*picked, *overrides.split()])
+            settings = OmegaConf.to_container(composed, resolve=True)
             kept[name] = score(settings, asked.steps)
             print(name, kept[name], flush=True)
             asked.out.write_text(json.dumps(kept, indent=1) + "\n")

@@ -6,6 +6,8 @@ python benchmarks/path_frame.py [--root runs]: with --root, first take what both
 import argparse
 import json
 import shutil
+from functools import reduce
+from operator import getitem
 from pathlib import Path
 
 import tables
@@ -28,7 +30,12 @@ NAMES = {
 }
 SHIPPED = [0.01]
 """`training.loss.tube`."""
-LOOKS = {"dynamic": ("#0b57b0", "o"), "kinematic": ("#e8a33d", "s")}
+MEASURES = {
+    "20 ahead [mm]": lambda rows: 1e3 * rows["s3"]["open_loop_rmse_m"]["20"],
+    "S2 [mm]": lambda rows: 1e3 * rows["s2"]["rmse_m"]["mean"],
+    "S3 [mm]": lambda rows: 1e3 * rows["s3"]["rmse_m"]["mean"],
+}
+"""What the figure has over the tube."""
 
 
 def read(place, name):
@@ -71,6 +78,25 @@ def difference(row):
     return f"{1e3 * found['mean']:+.2f} ({1e3 * low:+.2f} to {1e3 * high:+.2f}){mark}".replace("-", "−")
 
 
+def frames():
+    """RMSE over that of the oracle of the same frame, in the paper's table and here."""
+    paper = {
+        (row["vehicle"], row["system"], row["scenario"]): row["ratio_to_oracle"]
+        for row in read(HOME / "experiments" / "table1_closed_loop", "results")["rows"]
+        if row["sampling"] == "feedback" and row["env"] == "measured"
+    }
+    lines = []
+    for plant in PLANTS:
+        here = rows_of(plant)
+        for system, name in NAMES.items():
+            found = [paper.get((plant, system.removesuffix("_path"), scenario)) for scenario in SCENARIOS]
+            if system != "oracle" and None not in found:
+                found += [here[system, scenario]["ratio_to_oracle"] for scenario in SCENARIOS]
+                lines.append([f"{plant}, {name}", *(f"{value:.2f}" for value in found)])
+    heads = [f"{scenario.upper()}, {frame}" for frame in ("body", "path") for scenario in SCENARIOS]
+    return tables.table(["", *heads], lines)
+
+
 def claims():
     """Prediction without feedback, and what is certified, of every row that learns."""
     lines = []
@@ -94,23 +120,14 @@ TUBES = {
 """Head of a column -> where it lies in an entry of tubes.json."""
 
 
-def tubes(plant, system, weight=None):
+def tubes(plant, system, weight=SHIPPED):
     """α and the certified tubes of a policy, in the order of TUBES; dashes where nothing is certified."""
-    for entry in read(KEPT, "tubes"):
-        if (entry["vehicle"], entry["system"]) != (plant, system) or weight not in (None, entry["weight"]):
-            continue
-        if weight is None and entry["weight"] not in ([], SHIPPED):
-            continue
-        if entry["alpha"] is None:
-            break
-        found = [f"{entry['alpha']:.3f}"]
-        for path in TUBES.values():
-            value = entry
-            for part in path:
-                value = value and value[part]
-            found.append("–" if value is None else f"{value:.3f}")
-        return found
-    return ["–"] * (1 + len(TUBES))
+    made = (plant, system, weight)
+    found = [one for one in read(KEPT, "tubes") if (one["vehicle"], one["system"], one["weight"]) == made]
+    if not found or found[0]["alpha"] is None:
+        return ["–"] * (1 + len(TUBES))
+    lengths = [reduce(getitem, path, found[0]) for path in TUBES.values()]
+    return [f"{value:.3f}" for value in (found[0]["alpha"], *lengths)]
 
 
 def weights():
@@ -153,30 +170,27 @@ def choices():
 
 
 def draw():
-    """Error of prediction and of driving over the certified tube, a line a plant, a point a weight."""
+    """Error of prediction and of driving over the certified tube: a line of panels a plant, a point a weight."""
     from matplotlib.figure import Figure
 
-    figure = Figure(figsize=(6.9, 2.9), layout="constrained")
-    panels = figure.subplots(1, 3)
-    measures = {
-        "e_y 20 steps ahead, RMS [mm]": lambda rows: 1e3 * rows["s3"]["open_loop_rmse_m"]["20"],
-        "S2, RMSE [mm]": lambda rows: 1e3 * rows["s2"]["rmse_m"]["mean"],
-        "S3, RMSE [mm]": lambda rows: 1e3 * rows["s3"]["rmse_m"]["mean"],
-    }
+    figure = Figure(figsize=(6.9, 4.4), layout="constrained")
+    panels = figure.subplots(len(PLANTS), len(MEASURES), sharex="row")
     bounds = {(one["vehicle"], one["system"], *one["weight"]): one["bounds"] for one in read(KEPT, "tubes")}
-    for axes, (head, measure) in zip(panels, measures.items(), strict=True):
-        for plant, (colour, marker) in LOOKS.items():
-            points = []
-            for _, weight, rows in (entry for entry in weighed() if entry[0] == plant):
-                tube = bounds[plant, "sfkd_path", *([weight] if weight else [])]["followed_position"]
-                points.append((tube, measure(rows)))
-                axes.annotate(f"{weight:g}", points[-1], textcoords="offset points", xytext=(4, 4), fontsize=7.5)
-            axes.plot(*zip(*points, strict=True), color=colour, marker=marker, markersize=4, label=plant)
-        axes.set(ylabel=head, xscale="log")
-        axes.set_ylim(bottom=0.0)
-        axes.grid(visible=True, which="both", color="#e3e6ea", linewidth=0.6)
-    panels[1].set_xlabel("certified tube of the class, followed [m]")
-    figure.legend(*panels[0].get_legend_handles_labels(), loc="outside upper center", ncols=2, frameon=False)
+    for line, plant in zip(panels, PLANTS, strict=True):
+        found = [entry for entry in weighed() if entry[0] == plant]
+        keys = [(plant, "sfkd_path", *([weight] if weight else [])) for _, weight, _ in found]
+        wide = [bounds[key]["followed_position"] for key in keys]
+        for axes, (head, measure) in zip(line, MEASURES.items(), strict=True):
+            high = [measure(rows) for *_, rows in found]
+            axes.plot(wide, high, color="#0b57b0", marker="o", markersize=4)
+            for (_, weight, _), *point in zip(found, wide, high, strict=True):
+                offset = {"textcoords": "offset points", "xytext": (0, 6), "ha": "center", "fontsize": 7.5}
+                axes.annotate(f"{weight:g}", point, **offset)
+            axes.set(ylim=(0.0, 1.25 * max(high)), title=f"{plant}: {head}")
+            axes.title.set_fontsize(9)
+            axes.margins(x=0.15)
+            axes.grid(visible=True, color="#e3e6ea", linewidth=0.6)
+        line[1].set_xlabel("certified tube of the class, followed [m]")
     figure.savefig(FIGURE, dpi=150, metadata={"Software": None})
 
 
@@ -203,6 +217,7 @@ def take(root):
 TABLES = {
     "dynamic": lambda: driving("dynamic"),
     "kinematic": lambda: driving("kinematic"),
+    "frames": frames,
     "claims": claims,
     "choices": choices,
     "weights": weights,
