@@ -89,7 +89,7 @@ def frames():
     for plant in PLANTS:
         here = rows_of(plant)
         for system, name in NAMES.items():
-            found = [paper.get((plant, system.removesuffix("_path"), scenario)) for scenario in SCENARIOS]
+            found = [paper.get((plant, system.replace("_path", ""), scenario)) for scenario in SCENARIOS]
             if system != "oracle" and None not in found:
                 found += [here[system, scenario]["ratio_to_oracle"] for scenario in SCENARIOS]
                 lines.append([f"{plant}, {name}", *(f"{value:.2f}" for value in found)])

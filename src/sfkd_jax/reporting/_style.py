@@ -123,7 +123,7 @@ table{font-size:8.5pt}th,td{padding:.25rem .35rem}figure img{width:auto;max-widt
 
 def family(system: str) -> str:
     """A system in path coordinates looks like what it is in the others; where both are meant, the title says so."""
-    return system.removesuffix("_path")
+    return system.replace("_path", "")
 
 
 def ordered(systems: Iterable[str]) -> list[str]:
