@@ -10,6 +10,7 @@ from functools import reduce
 from operator import getitem
 from pathlib import Path
 
+import path_figure
 import tables
 from page import put
 
@@ -18,7 +19,6 @@ KEPT = HOME / "experiments" / "path_frame"
 WEIGHTS = HOME / "experiments" / "tube_weight"
 CHOICES = Path(__file__).with_name("path_choices.json")
 PAGE = HOME / "docs" / "path.md"
-FIGURE = HOME / "docs" / "path_tube.png"
 PLANTS, SCENARIOS = ("dynamic", "kinematic"), ("s1", "s2", "s3")
 NAMES = {
     "sfkd_path": "**SFKD**",
@@ -30,12 +30,6 @@ NAMES = {
 }
 SHIPPED = [0.01]
 """`training.loss.tube`."""
-MEASURES = {
-    "20 ahead [mm]": lambda rows: 1e3 * rows["s3"]["open_loop_rmse_m"]["20"],
-    "S2 [mm]": lambda rows: 1e3 * rows["s2"]["rmse_m"]["mean"],
-    "S3 [mm]": lambda rows: 1e3 * rows["s3"]["rmse_m"]["mean"],
-}
-"""What the figure has over the tube."""
 
 
 def read(place, name):
@@ -169,31 +163,6 @@ def choices():
     )
 
 
-def draw():
-    """Error of prediction and of driving over the certified tube: a line of panels a plant, a point a weight."""
-    from matplotlib.figure import Figure
-
-    figure = Figure(figsize=(6.9, 4.4), layout="constrained")
-    panels = figure.subplots(len(PLANTS), len(MEASURES), sharex="row")
-    bounds = {(one["vehicle"], one["system"], *one["weight"]): one["bounds"] for one in read(KEPT, "tubes")}
-    for line, plant in zip(panels, PLANTS, strict=True):
-        found = [entry for entry in weighed() if entry[0] == plant]
-        keys = [(plant, "sfkd_path", *([weight] if weight else [])) for _, weight, _ in found]
-        wide = [bounds[key]["followed_position"] for key in keys]
-        for axes, (head, measure) in zip(line, MEASURES.items(), strict=True):
-            high = [measure(rows) for *_, rows in found]
-            axes.plot(wide, high, color="#0b57b0", marker="o", markersize=4)
-            for (_, weight, _), *point in zip(found, wide, high, strict=True):
-                offset = {"textcoords": "offset points", "xytext": (0, 6), "ha": "center", "fontsize": 7.5}
-                axes.annotate(f"{weight:g}", point, **offset)
-            axes.set(ylim=(0.0, 1.25 * max(high)), title=f"{plant}: {head}")
-            axes.title.set_fontsize(9)
-            axes.margins(x=0.15)
-            axes.grid(visible=True, color="#e3e6ea", linewidth=0.6)
-        line[1].set_xlabel("certified tube of the class, followed [m]")
-    figure.savefig(FIGURE, dpi=150, metadata={"Software": None})
-
-
 def take(root):
     """Copy both results, and of every certificate what the tables show."""
     for kept in (KEPT, WEIGHTS):
@@ -232,7 +201,8 @@ def main():
     if root:
         take(root)
     put(PAGE, {name: build() for name, build in TABLES.items()})
-    draw()
+    bounds = {(one["vehicle"], one["system"], *one["weight"]): one["bounds"] for one in read(KEPT, "tubes")}
+    path_figure.draw(weighed(), bounds)
 
 
 if __name__ == "__main__":
