@@ -1,4 +1,4 @@
-"""The figure of docs/path.md, which path_frame.py draws: error over the certified tube, a point a weight of its loss."""
+"""The figure of docs/path.md, drawn by path_frame.py: error over the certified tube, a point a weight of its loss."""
 
 from pathlib import Path
 
