@@ -310,6 +310,14 @@ def test_the_tables_about_speed_are_those_of_their_run(monkeypatch):
             assert [min(values), max(values)] == ends
 
 
+def test_the_page_about_path_coordinates_says_what_the_results_say(monkeypatch):
+    """Its tables are what benchmarks/path_frame.py makes of the committed rows and tubes."""
+    monkeypatch.syspath_prepend(str(ROOT / "benchmarks"))
+    made = runpy.run_path(str(ROOT / "benchmarks" / "path_frame.py"))["TABLES"]
+    text = (DOCS / "path.md").read_text("utf-8")
+    assert [name for name, build in made.items() if f"<!-- {name} -->\n{build()}\n<!-- end -->" not in text] == []
+
+
 def test_the_table_of_the_long_drive_is_that_of_its_run(monkeypatch):
     """Every leg is there, and none failed at what is asked of all."""
     monkeypatch.syspath_prepend(str(ROOT / "benchmarks"))

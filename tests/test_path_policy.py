@@ -59,6 +59,13 @@ def test_path_coordinates_for_data_and_model_or_for_neither(overrides):
         rehearsal.check(asked, assembly.build_vehicle(asked["vehicle"]))
 
 
+def test_the_law_drives_as_a_row_along_a_path_alone():
+    asked = settings("evaluation.systems=[law]")
+    rehearsal.check(asked, assembly.build_vehicle(asked["vehicle"]))
+    with pytest.raises(ValueError, match=r"evaluation\.systems entry 'law'"):
+        rehearsal.check(settings("dataset=standard", "model=sfkd", "evaluation.systems=[law]"), vehicle.kinematic())
+
+
 @pytest.mark.parametrize("model", ["sfkd_path", "sfkd_path_no_contraction", "neural_ode_path", "r2dn_path"])
 def test_every_path_model_is_rehearsed_with_its_planner(model):
     asked = settings(f"model={model}", *(() if "sfkd" in model and "no" not in model else ("training.loss.tube=[]",)))

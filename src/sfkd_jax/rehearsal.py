@@ -25,13 +25,14 @@ def check(settings: dict[str, Any], plant: Vehicle) -> None:
     if window > data["steps"]:
         raise ValueError(f"training.window={window} does not fit segments of dataset.steps={data['steps']}")
     assembly.choose(dict.fromkeys(MODES), settings["certification"]["mode"], "certification.mode")
-    for name in settings["evaluation"]["systems"]:
-        assembly.choose({"self": None} | assembly.reference_systems(plant), name, "evaluation.systems entry")
     told = data["columns"]["environment"] if shelf.is_logged(settings) else ()
     along = shelf.is_along_path(settings)
     sizes = {"state": len(plant.state_names) - 3, "control": 2, "env": len(told) or 2}
     if along:
         sizes |= {"state": sizes["state"] + 2, "control": 4}
+    law = _any_law(sizes) if along else None
+    for name in settings["evaluation"]["systems"]:
+        assembly.choose({"self": None} | assembly.reference_systems(plant, law), name, "evaluation.systems entry")
     scales = (part(size) for size in (*sizes.values(), 3) for part in (jnp.zeros, jnp.ones))
     model = assembly.build_model(settings["model"], Space(*scales), plant)
     if model.along_path != along:
@@ -39,7 +40,7 @@ def check(settings: dict[str, Any], plant: Vehicle) -> None:
     if plant.control_low:
         boxes = {name: ((-1.0,) * size, (1.0,) * size) for name, size in sizes.items()}
         limits: dict[str, Any] = dict(zip(("env_low", "env_high"), boxes["env"], strict=True))
-        limits |= {"law": _any_law(sizes) if along else None}
+        limits |= {"law": law}
         limits |= {"certificate": {"boxes": boxes, "monitor": {"bounds": (1.0,) * 4}}, "env": settings["env"]}
         assembly.build_controller(settings["controller"], model, plant, **limits)
 

@@ -268,6 +268,13 @@ def test_comparisons_are_ratios_to_the_oracle_and_paired_differences_to_ours():
     assert compared["oracle"]["difference_to_sfkd"]["ci95"][1] < 0
 
 
+def test_along_a_path_ours_is_the_row_along_the_path():
+    scores = {"sfkd_path": scored(0.2), "r2dn_path": scored(0.5)}
+    ours, theirs = compare([row(value, about(name, sampling="law"), None, {}) for name, value in scores.items()])
+    assert ours["difference_to_sfkd"] is None
+    np.testing.assert_allclose(theirs["difference_to_sfkd"]["mean"], 0.3 * 1.15)
+
+
 def test_without_oracle_or_ours_nothing_is_compared():
     (only,) = compare([row(scored(0.5), about("nominal"), None, {})])
     assert only["ratio_to_oracle"] is None

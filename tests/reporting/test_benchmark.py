@@ -177,6 +177,18 @@ def test_a_quadratic_program_is_compared_with_the_sampling_it_was_compared_with(
     assert other == ["–"] * 4
 
 
+def test_rows_in_path_coordinates_have_the_names_of_their_systems_under_a_title_that_says_so():
+    ours = row("sfkd", "measured", sampling="law") | {"system": "sfkd_path"}
+    theirs = row("neural_ode", "measured", sampling="law") | {"system": "neural_ode_path"}
+    unbound = row("sfkd_no_contraction", "measured", sampling="law") | {"system": "sfkd_path_no_contraction"}
+    text = benchmark_markdown(document() | {"rows": [ours, unbound, theirs]})
+    found = tables_of(
+        text, "Against SFKD and the oracle: Kinematic vehicle, path coordinates, sampling around their law"
+    )
+    assert list(found) == ["Row", "SFKD", "SFKD − contraction", "Neural ODE (e)"]
+    assert found["Neural ODE (e)"][0].startswith("+")
+
+
 def test_claims_predictions_and_cost_are_there(whole):
     markdown = text_of(whole[0], "results.md")
     found = tables_of(markdown, f"Claims: {FEEDBACK}")

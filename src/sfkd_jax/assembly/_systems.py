@@ -46,7 +46,8 @@ def build_loop(plant: vehicle.Vehicle, law: control.PathLaw) -> vehicle.Vehicle:
 def reference_systems(plant: vehicle.Vehicle, law: control.PathLaw | None = None) -> dict[str, System]:
     """Rows that need no learning: the nominal bicycle, the true plant, and the true plant wrong about e.
 
-    With a law they are those of the loop around the plant, in path coordinates.
+    With a law they are those of the loop around the plant, in path coordinates, and "law" is beside them: the true
+    plant once more, for a planner that draws no samples (`num_samples=1`), so that the law drives alone.
     """
 
     def biased(entry: int, factor: float) -> Callable[[Environment], Environment]:
@@ -59,6 +60,8 @@ def reference_systems(plant: vehicle.Vehicle, law: control.PathLaw | None = None
         "nominal": System(models.physics(plant.nominal, along_path=along), {}, "none"),
         "oracle": System(oracle(), {}, "measured"),
     }
+    if along:
+        rows["law"] = rows["oracle"]
     distortions = {"friction_x0.7": (0, 0.7), "friction_x1.3": (0, 1.3), "wind_x0": (1, 0.0), "wind_x2": (1, 2.0)}
     for name, change in distortions.items():
         rows[f"oracle_{name}"] = System(oracle(distort=biased(*change)), {}, "measured")

@@ -60,9 +60,9 @@ def compare(rows: list[dict[str, Any]]) -> list[dict[str, Any]]:
     for entry in rows:
         same = [other for other in rows if _episodes(other) == _episodes(entry)]
         same.sort(key=lambda other, entry=entry: _search(other) != _search(entry))
-        for system, name, measure in _COMPARISONS:
-            other = next((other for other in same if other["system"] == system), None)
-            if other is None or (system == "sfkd" and other is entry):
+        for systems, name, measure in _COMPARISONS:
+            other = next((other for other in same if other["system"] in systems), None)
+            if other is None or (systems == _SFKD and other is entry):
                 continue
             entry[name] = measure(_by_seed(entry), _by_seed(other))
     return rows
@@ -88,7 +88,9 @@ def _ratio(values: np.ndarray, reference: np.ndarray) -> float:
     return float(np.mean(values) / np.mean(reference))
 
 
-_COMPARISONS = (("oracle", "ratio_to_oracle", _ratio), ("sfkd", "difference_to_sfkd", paired_difference))
+_SFKD = ("sfkd", "sfkd_path")
+"""In the frame of the body and along a path: rows of one sampling have one frame."""
+_COMPARISONS = ((("oracle",), "ratio_to_oracle", _ratio), (_SFKD, "difference_to_sfkd", paired_difference))
 
 
 def pool(rows: list[dict[str, Any]]) -> dict[str, Any]:

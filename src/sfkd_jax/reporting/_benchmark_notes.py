@@ -36,6 +36,7 @@ TITLES = {
     "estimated": "e inferred while driving",
     "seeds": "Trained from several seeds, row by row",
     "longer": "Twice the training, or a rate nearer to 1",
+    "path_frame": "In path coordinates around one law, row by row",
 }
 _INTRODUCED = {
     "figure2": "A force that nobody measures pushes the car from the side, as in the paper's Figure 2.",
@@ -50,6 +51,8 @@ _INTRODUCED = {
     "and which those of one training.",
     "longer": "Whether the rows with and without the bound differ because one of them is not yet trained to its end, "
     "or because the rate that the bound asks for is too far below 1.",
+    "path_frame": "Every row drives around the same law and, where it learns, has the same data in path coordinates: "
+    "what the bound costs, apart from what the coordinates do. Law alone: no planner, with the oracle's predictions.",
 }
 
 

@@ -6,7 +6,7 @@ from typing import Any, NamedTuple, TypeAlias
 
 from sfkd_jax.artefacts import identity
 from sfkd_jax.reporting._numbers import dig, is_number
-from sfkd_jax.reporting._style import SYSTEMS, label, ordered
+from sfkd_jax.reporting._style import SYSTEMS, family, label, ordered
 
 Row: TypeAlias = dict[str, Any]
 
@@ -14,9 +14,13 @@ VARIANTS = {"icode_mppi_one_step": "icode_mppi", "icode_mppi_reads_env": "icode_
 """Systems that the paper has under one name."""
 OFF_THE_ROAD_M = 1.0
 """A mean deviation beyond it is not driving: figures write it, so that the rows that drive share the axis."""
-SELF_EVIDENT = ("nominal", "oracle")
+SELF_EVIDENT = ("nominal", "oracle", "law")
 """Systems whose name says what they are told; so do those of SFKD and its parts."""
-_SAMPLINGS = {"feedback": "sampling around a feedback law", "plain": "plain sampling"}
+_SAMPLINGS = {
+    "feedback": "sampling around a feedback law",
+    "plain": "plain sampling",
+    "law": "path coordinates, sampling around their law",
+}
 _VEHICLES = ("kinematic", "dynamic")
 _LEVELS = ("seen", "interpolated", "extrapolated")
 
@@ -41,7 +45,7 @@ class Contest(NamedTuple):
 
 def name_of(row: Row) -> str:
     """What a reader sees for a row: its system, and what it is told of the environment where that is not plain."""
-    system, env = str(row.get("system")), str(row.get("env"))
+    system, env = family(str(row.get("system"))), str(row.get("env"))
     shown = label(system)
     if env == "estimated":
         return f"{shown} (e estimated)"
@@ -76,7 +80,7 @@ def contests(rows: list[Row]) -> list[Contest]:
 def _lines(rows: list[Row]) -> list[Line]:
     lines: dict[tuple[str, str], Line] = {}
     for row in rows:
-        key = (str(row.get("system")), str(row.get("env")))
+        key = (family(str(row.get("system"))), str(row.get("env")))
         lines.setdefault(key, Line(name_of(row), *key, {})).rows.setdefault(str(row.get("scenario")), row)
     return [lines[key] for key in sorted(lines, key=lambda key: (rank(key[0]), key[1]))]
 

@@ -29,6 +29,7 @@ SYSTEMS: dict[str, tuple[str, str, Any, float]] = {
     "r2dn": ("R2DN", "#999933", (0, (5, 1, 1, 1)), 1.3),
     "nominal": ("Nominal", "#e8a33d", "-", 1.4),
     "oracle": ("Oracle", "#3c3c3c", (0, (3, 1.2)), 1.4),
+    "law": ("Law alone", "#a0522d", (0, (1.5, 1)), 1.3),
 }
 """One colour and one dash per system, everywhere (after Okabe and Ito, and Tol: colour-blind safe)."""
 
@@ -122,7 +123,7 @@ table{font-size:8.5pt}th,td{padding:.25rem .35rem}figure img{width:auto;max-widt
 
 def family(system: str) -> str:
     """A system in path coordinates looks like what it is in the others; where both are meant, the title says so."""
-    return system.removesuffix("_path")
+    return system.replace("_path", "")
 
 
 def ordered(systems: Iterable[str]) -> list[str]:
