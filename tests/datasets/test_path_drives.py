@@ -86,13 +86,14 @@ def test_a_drive_in_the_world_is_told_along_its_path(known):
     env, speed = jnp.asarray([0.8, 1.0]), jnp.asarray(9.0)
     key = jax.random.key(0)
     added = jnp.asarray([0.01, 0.2]) * jax.random.normal(key, (80, 2))
-    world, states, controls = jnp.asarray([5.0, 0.1, 0.0, 9.0]), [], []
-    for nu in added:
+
+    def step(world, nu):
         one = to_path(Trajectory(jnp.stack([world, world]), jnp.zeros((1, 2)), env[None]), path, LAW, speed[None])
-        states.append(world)
-        controls.append(-one.controls[0, :2] + nu)
-        world = PLANT.step(world, controls[-1], env)
-    driven = Trajectory(jnp.stack([*states, world]), jnp.stack(controls), jnp.tile(env, (80, 1)))
+        control = nu - one.controls[0, :2]
+        return PLANT.step(world, control, env), (world, control)
+
+    last, (states, controls) = jax.jit(partial(jax.lax.scan, step))(jnp.asarray([5.0, 0.1, 0.0, 9.0]), added)
+    driven = Trajectory(jnp.concatenate([states, last[None]]), controls, jnp.tile(env, (80, 1)))
     along = jax.jit(lambda driven: to_path(driven, seen, LAW, jnp.full(80, 9.0)))(driven)
     np.testing.assert_allclose(along.controls[:, :2], added, atol=2e-3 if known else 6e-3)
     after = jax.vmap(LOOP.step)(along.states[:-1], along.controls, along.envs)
