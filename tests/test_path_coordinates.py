@@ -62,11 +62,16 @@ def test_the_loop_in_path_coordinates_drives_what_the_vehicle_drives_in_the_worl
     world = jnp.zeros(size).at[1].set(0.3).at[3].set(9.5)
     along = path_state(world[1:])
     place = jnp.zeros(())
-    for _ in range(40):
+
+    @jax.jit
+    def in_the_world(world, place):
         heading = world[2] - curvature * place
         xi = jnp.concatenate([jnp.stack([project(path, world[:2], place)[1], heading]), world[3:]])
         world = plant.step(world, law(xi, curvature, 9.0, env) + inputs[:2], env)
-        place, lateral = project(path, world[:2], place + 0.9)
+        return world, *project(path, world[:2], place + 0.9)
+
+    for _ in range(40):
+        world, place, lateral = in_the_world(world, place)
         along = step(along, inputs, env)
         np.testing.assert_allclose(along[BODY][0], lateral, atol=2e-4)
     np.testing.assert_allclose(along[BODY][2:], world[3:], atol=2e-4)
