@@ -19,7 +19,7 @@ import numpy as np
 from own_model import settings as composed
 
 import sfkd_jax
-from sfkd_jax import adapters, artefacts, assembly, evaluation, exporting, scenarios
+from sfkd_jax import adapters, artefacts, build, evaluation, exporting, scenarios
 from sfkd_jax.types import Controller
 
 FRICTIONS = (0.9, 0.6, 0.3)
@@ -40,7 +40,7 @@ class Driver(NamedTuple):
 
 def policy_driver(trained, system):
     """A policy, from where `sfkd_jax.load` found it."""
-    names = assembly.build_vehicle(trained.settings["vehicle"]).state_names
+    names = build.build_vehicle(trained.settings["vehicle"]).state_names
     about = {"system": system, "env": "measured", "alpha": trained.certificate and trained.certificate["alpha"]}
     params = jax.jit(trained.model.fold)(trained.params)
     return Driver(trained.controller, params, len(names), about | {"watched": trained.certificate is not None})
@@ -48,8 +48,8 @@ def policy_driver(trained, system):
 
 def nominal_driver(asked, plant, system, states):
     """MPPI on the textbook bicycle with the wheelbase of `plant`."""
-    found = assembly.reference_systems(plant)["nominal"]
-    controller = assembly.build_controller(asked["controller"], found.model, plant)
+    found = build.reference_systems(plant)["nominal"]
+    controller = build.build_controller(asked["controller"], found.model, plant)
     return Driver(
         controller, found.params, states, {"system": system, "env": found.env, "alpha": None, "watched": False}
     )
@@ -57,7 +57,7 @@ def nominal_driver(asked, plant, system, states):
 
 def lay(plant, paths, seconds, seed):
     """S1's paths at every friction, and the same keys for each: (friction x path, …)."""
-    family = assembly.build_scenario({"name": "s1"}, plant, duration=seconds)
+    family = build.build_scenario({"name": "s1"}, plant, duration=seconds)
     road_key, drive_key = jax.random.split(jax.random.key(seed))
     roads = jax.jit(jax.vmap(family))(jax.random.split(road_key, paths))
     tiled = jax.tree.map(lambda leaf: jnp.concatenate([leaf] * len(FRICTIONS)), roads)
@@ -72,7 +72,7 @@ def rows_of(plant, driver, track, asked, paths):
     controller = driver.controller
     if driver.states:
         controller = adapters.commonroad_controller(controller, states=driver.states)
-    options = {"dt": plant.dt, "horizon": assembly.controller_horizon(asked["controller"])}
+    options = {"dt": plant.dt, "horizon": build.controller_horizon(asked["controller"])}
     options["observation_noise"] = tuple(asked["evaluation"]["observation_noise"])
 
     def one(road, key):
@@ -142,7 +142,7 @@ def exported_alike(trained, plant, track, root):
         "as it is": (trained.controller.init(jax.random.key(0)), lambda *seen: act(trained.params, *seen)),
         "exported": (shipped.init(seed=0), shipped.act),
     }
-    horizon = assembly.controller_horizon(trained.settings["controller"])
+    horizon = build.controller_horizon(trained.settings["controller"])
     drives = {name: _host_drive(*driver, step, road, plant.dt, horizon) for name, driver in drivers.items()}
     (controls, lateral), (others, _) = drives["exported"], drives["as it is"]
     difference = float(np.abs(controls - others).max())
@@ -181,7 +181,7 @@ def main():
     for car, plant in plants.items():
         track = lay(plant, given.paths, given.seconds, asked["evaluation"]["seed"])
         place = given.root / "rows" / "-".join(map(str, (car, given.paths, given.seconds, *sizes.values())))
-        ours = assembly.build_vehicle(asked["vehicle"])
+        ours = build.build_vehicle(asked["vehicle"])
         drivers = [nominal_driver(asked, ours, "nominal", len(ours.state_names))]
         drivers += [nominal_driver(asked, plant, "nominal_this_car", None)]
         drivers += [policy_driver(policy, row) for row, policy in trained.items()]
@@ -194,7 +194,7 @@ def main():
     track = lay(plants["std"], given.paths, given.seconds, asked["evaluation"]["seed"])
     alike = exported_alike(before["sfkd"], plants["std"], track, given.root)
     kept = {"paths": given.paths, "seconds": given.seconds, **sizes}
-    turns = handling({name: assembly.PLANTS[name]() for name in POLICIES.values()} | plants)
+    turns = handling({name: build.PLANTS[name]() for name in POLICIES.values()} | plants)
     document = {"rows": compared(rows), "tuning": tuning, "handling": turns, "export": alike, "config": kept | asked}
     document["versions"] = artefacts.versions()
     artefacts.write_json(given.out / "results.json", document)

@@ -20,9 +20,9 @@ import numpy as np
 from sfkd_jax import adapters, artefacts, policy
 from sfkd_jax.certification import claims_of, covered
 from sfkd_jax.control import law_arrays
+from sfkd_jax.core.path_frame import CURVATURE, PATH_SPEED, PERTURBATION, REFERENCE_SPEED, beside
 from sfkd_jax.corridor._drives import closed, driving, measuring
 from sfkd_jax.datasets import drive_switching
-from sfkd_jax.path_frame import CURVATURE, PATH_SPEED, PERTURBATION, REFERENCE_SPEED, beside
 from sfkd_jax.types import BODY, Trajectory
 
 RUN = Path("commonroad_path", "sfkd_path", "seed=0")

@@ -9,7 +9,8 @@ import jax.numpy as jnp
 import numpy as np
 
 import sfkd_jax
-from sfkd_jax import adapters, artefacts, assembly, certification, datasets, evaluation, policy, shelf
+from sfkd_jax import adapters, artefacts, build, certification, datasets, evaluation, policy
+from sfkd_jax.pipeline import store
 from sfkd_jax.training import fit, multi_step_loss
 from sfkd_jax.types import Trajectory
 
@@ -26,7 +27,7 @@ def collect(plant, asked, segments, path):
     """Drives of 5 s as our own data sets have them: S1 and S2 with levels drawn per drive, both controls excited."""
     if not artefacts.exists(path):
         began = time.perf_counter()
-        drive = jax.jit(partial(datasets.generate, plant, assembly.build_driver(plant), segments=segments, steps=50))
+        drive = jax.jit(partial(datasets.generate, plant, build.build_driver(plant), segments=segments, steps=50))
         driven = jax.tree.map(np.asarray, drive(jax.random.key(SEED)))
         path.parent.mkdir(parents=True, exist_ok=True)
         artefacts.write_arrays(path, driven._asdict(), kind="drives", config={"segments": segments, "seed": SEED})
@@ -40,7 +41,7 @@ def collect(plant, asked, segments, path):
 
 def seen(data, states):
     """The same drives as a model of so many states is told of them."""
-    parts = {name: getattr(data, name) for name in shelf.PARTS}
+    parts = {name: getattr(data, name) for name in store.PARTS}
     parts = {
         name: part._replace(states=adapters.commonroad_observation(part.states, states=states))
         for name, part in parts.items()
@@ -51,7 +52,7 @@ def seen(data, states):
 def tune(trained, data, asked, place, steps):
     """Train on from the policy's own parameters, certify and store; how it went."""
     began, settings = time.process_time(), trained.settings
-    space = assembly.space_from_settings(settings["space"])
+    space = build.space_from_settings(settings["space"])
     loss = multi_step_loss(trained.model, space, **settings["training"]["loss"])
     draw = partial(datasets.random_windows, **WINDOWS)
     held_out = datasets.spread_windows(data.validation, length=WINDOWS["length"])
@@ -65,7 +66,7 @@ def tune(trained, data, asked, place, steps):
         params,
         **{name: getattr(data, name) for name in ("validation", "calibration")},
         held_out={"test": data.test},
-        boxes=shelf.boxes(data),
+        boxes=store.boxes(data),
         sensor_noise=tuple(asked["evaluation"]["observation_noise"]),
         level=LEVEL,
         monitor_level=LEVEL,
@@ -89,7 +90,7 @@ def tune_all(before, plant, asked, root, *, segments, steps):
         place = root / f"{row}-{segments}-{steps}"
         record = place / "record.json"
         if not record.exists():
-            states = len(assembly.build_vehicle(trained.settings["vehicle"]).state_names)
+            states = len(build.build_vehicle(trained.settings["vehicle"]).state_names)
             artefacts.write_json(record, tune(trained, seen(data, states), asked, place, steps))
         after[row], records[row] = sfkd_jax.load(place), artefacts.read_json(record)
     return after, records

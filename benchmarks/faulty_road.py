@@ -9,7 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 
 import sfkd_jax
-from sfkd_jax import assembly, control, scenarios
+from sfkd_jax import build, control, scenarios
 
 SHIPPED = Path(sfkd_jax.__file__).with_name("pretrained")
 HORIZON, ROAD, SAMPLES = 20, 1000, 64
@@ -96,7 +96,7 @@ def controlled(plant, env, delay, samples):
     if delay:
         controller = control.compensated(controller, policy.model, delay=delay)
     noise = policy.certificate["monitor"]["sensor_noise"]
-    return assembly.build_vehicle(settings["vehicle"]), policy.model.fold(policy.params), controller, noise
+    return build.build_vehicle(settings["vehicle"]), policy.model.fold(policy.params), controller, noise
 
 
 def track(plant, *, env="measured", delay=0, samples=SAMPLES, faulty=True, steps=ROAD):

@@ -14,7 +14,7 @@ import numpy as np
 
 import sfkd_jax
 from sfkd_jax import control, evaluation, scenarios
-from sfkd_jax.assembly import build_vehicle
+from sfkd_jax.build import build_vehicle
 
 SENSORS = (0.015, 0.015, 0.002, 0.03, 0.02, 0.002, 0.001)
 SPREAD = (0.02, 0.3)

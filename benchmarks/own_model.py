@@ -12,7 +12,7 @@ def settings(*overrides):
     import hydra
     from omegaconf import OmegaConf
 
-    from sfkd_jax import config
+    from sfkd_jax.cli import config
 
     config.register()
     with hydra.initialize_config_dir(config.conf_path(), version_base="1.3"):
@@ -41,11 +41,11 @@ def space(plant):
 
 def belief(*overrides):
     """Plant, model and settings under overrides of the configuration."""
-    from sfkd_jax import assembly
+    from sfkd_jax import build
 
     asked = settings(*overrides)
-    plant = assembly.build_vehicle(asked["vehicle"])
-    return plant, assembly.build_model(asked["model"], space(plant), plant), asked
+    plant = build.build_vehicle(asked["vehicle"])
+    return plant, build.build_model(asked["model"], space(plant), plant), asked
 
 
 def weights(model):
@@ -78,12 +78,12 @@ def problem(samples, horizon, seed=0, **options):
     """The configured `Controller` under further options of `mppi`, and what its `act` takes."""
     import jax
 
-    from sfkd_jax import assembly
+    from sfkd_jax import build
 
     plant, model, asked = belief()
     asked["controller"]["mppi"] |= {"num_samples": samples, "horizon": horizon, **options}
     limits = {name: asked["dataset"][name] for name in ("env_low", "env_high")}
-    controller = assembly.build_controller(asked["controller"], model, plant, **limits)
+    controller = build.build_controller(asked["controller"], model, plant, **limits)
     params, *rest = inputs(plant, model, horizon)
     params = jax.jit(model.fold)(params)
     return controller, (params, controller.init(jax.random.key(seed)), *rest)

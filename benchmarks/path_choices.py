@@ -15,8 +15,10 @@ import jax
 from hydra import compose, initialize_config_dir
 from omegaconf import OmegaConf
 
-from sfkd_jax import assembly, config, walk
+from sfkd_jax import build
+from sfkd_jax.cli import config
 from sfkd_jax.datasets import measure_space, random_windows, spread_windows
+from sfkd_jax.pipeline import stages
 from sfkd_jax.training import fit, multi_step_loss
 
 CHOICES = {
@@ -37,12 +39,12 @@ CHOICES = {
 
 def score(settings, steps):
     """Validation error after `steps` steps, and each of its two parts."""
-    dataset, _ = walk.ensure_dataset(settings)
+    dataset, _ = stages.ensure_dataset(settings)
     options = dict(settings["training"]) | {"steps": steps, "save_every": steps}
     del options["data_share"]
     length, space = options.pop("window"), measure_space(dataset)
-    model = assembly.build_model(settings["model"], space, assembly.build_vehicle(settings["vehicle"]))
-    loss = multi_step_loss(model, space, **assembly.without(options.pop("loss")))
+    model = build.build_model(settings["model"], space, build.build_vehicle(settings["vehicle"]))
+    loss = multi_step_loss(model, space, **build.without(options.pop("loss")))
     draw = partial(random_windows, batch=options.pop("batch"), length=length)
     held_out = spread_windows(dataset.validation, length=length)
     key = jax.random.fold_in(jax.random.key(settings["seed"]), 0)
@@ -56,7 +58,7 @@ def score(settings, steps):
 def main():
     """Train and write."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--vehicle", default="dynamic", choices=assembly.PLANTS)
+    parser.add_argument("--vehicle", default="dynamic", choices=build.PLANTS)
     parser.add_argument("--steps", type=int, default=1000)
     parser.add_argument("--root", default="runs")
     parser.add_argument("--out", type=Path, default=Path(__file__).with_suffix(".json"))

@@ -18,10 +18,10 @@ import timing
 from shield_table import ASKED, FLAGS, misses, table
 from soak import ENVIRONMENT, LANE
 
-from sfkd_jax import assembly, policy, scenarios
+from sfkd_jax import build, policy, scenarios
 from sfkd_jax.control import PathLaw, curvature_ahead, path_coordinates
+from sfkd_jax.core.path_frame import LATERAL
 from sfkd_jax.evaluation import first_reference
-from sfkd_jax.path_frame import LATERAL
 from sfkd_jax.types import Controller
 from sfkd_jax.vehicle import Vehicle
 
@@ -93,12 +93,12 @@ def planner(car, *, shield):
     """The policy's own planner."""
     box = {side: car.trained.settings["dataset"][side] for side in ("env_low", "env_high")}
     settings, about = car.settings | {"shield": shield}, {"certificate": car.certificate, "law": car.law}
-    return assembly.build_controller(settings, car.trained.model, car.plant, **box, **about)
+    return build.build_controller(settings, car.trained.model, car.plant, **box, **about)
 
 
 def shielded(car, controller):
     """The same controller in the certified corridor."""
-    return assembly.in_corridor(controller, car.trained.model, car.plant, car.law, car.certificate)
+    return build.in_corridor(controller, car.trained.model, car.plant, car.law, car.certificate)
 
 
 def drive(car, controller, road, key):
@@ -109,7 +109,7 @@ def drive(car, controller, road, key):
 def drive_states(car, controller, road, key):
     """States before every step and after the last one, (time + 1, state), and the rest as `drive` returns it."""
     planner_key, noise_key = jax.random.split(key)
-    horizon = assembly.controller_horizon(car.settings)
+    horizon = build.controller_horizon(car.settings)
 
     def step(carry, given):
         state, progress, memory = carry
@@ -200,7 +200,7 @@ def step_times(car, rounds):
     """A control step of the policy's own planner with the shield and without it [ms]."""
     roads, keys = episodes(car, 1, 5.0, 0)
     road = jax.tree.map(lambda leaf: leaf[0], roads)
-    window = first_reference(road, horizon=assembly.controller_horizon(car.settings), dt=car.plant.dt)
+    window = first_reference(road, horizon=build.controller_horizon(car.settings), dt=car.plant.dt)
 
     def job(shield):
         controller = planner(car, shield=shield)

@@ -15,10 +15,10 @@ from pathlib import Path
 import jax
 import numpy as np
 
-from sfkd_jax import artefacts, assembly, datasets, demo, evaluation, policy
+from sfkd_jax import artefacts, build, datasets, demo, evaluation, policy
 from sfkd_jax.certification import latent_tube
+from sfkd_jax.core.rollouts import step_disturbances
 from sfkd_jax.evaluation import predictions, theorem_reach, theorem_violations
-from sfkd_jax.rollouts import step_disturbances
 
 HORIZON, SEED = 20, 12345
 FORGED_ALPHA, FORGED_D_BAR = (0.98, 0.95, 0.9, 0.5), (0.5, 0.25)
@@ -31,9 +31,9 @@ SHORTER = (1.02, 1.1, 1.3)
 def driven(trained, segments):
     """Drives by scenario."""
     asked = trained.settings["dataset"] | {"segments": segments}
-    options = assembly.without(asked, "shares", "env_low", "env_high", "seed")
+    options = build.without(asked, "shares", "env_low", "env_high", "seed")
     steady, switching = jax.random.split(jax.random.key(SEED))
-    driver = assembly.build_driver(trained.vehicle)
+    driver = build.build_driver(trained.vehicle)
     switches = {name: value for name, value in options.items() if name != "fixed_levels"}
     return {
         "s1, s2": jax.jit(partial(datasets.generate, trained.vehicle, driver, **options))(steady),

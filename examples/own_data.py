@@ -74,7 +74,7 @@ def main(logs: str | None = None, drives: int = 400, steps: int = 500) -> dict[s
 
 def loss_of_position(model, params, window):
     """Distance between the last predicted position and the true one [m]."""
-    from sfkd_jax.rollouts import rollout
+    from sfkd_jax.core.rollouts import rollout
 
     predicted, _, _ = rollout(model, params, window)
     return jnp.linalg.norm(predicted[-1, :2] - window.states[-1, :2])

@@ -5,8 +5,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from sfkd_jax import cells
 from sfkd_jax.artefacts import write_json
+from sfkd_jax.pipeline import grid
 
 PLAN = {
     "vehicles": ["kinematic", "dynamic"],
@@ -21,34 +21,34 @@ PLAN = {
 
 
 def test_every_row_meets_every_scenario_under_every_controller_that_it_has():
-    found = cells.plan(PLAN)
+    found = grid.plan(PLAN)
     assert len(found) == len(set(found)) == 2 * 2 * 2 * (3 + 2)
     assert {cell.controller for cell in found if cell.label == "program"} == {"koopman_mpc"}
     assert {cell.scenario for cell in found if cell.controller == "mppi_plain"} == {"s1"}
 
 
 def test_rows_can_be_picked_and_an_unknown_one_is_named_with_the_choices():
-    assert {cell.label for cell in cells.plan(PLAN | {"only": ["program"]})} == {"program"}
+    assert {cell.label for cell in grid.plan(PLAN | {"only": ["program"]})} == {"program"}
     with pytest.raises(ValueError, match=r"unknown comparison\.only iocde; choose of ours, program"):
-        cells.plan(PLAN | {"only": ["iocde"]})
+        grid.plan(PLAN | {"only": ["iocde"]})
 
 
 def test_what_one_driver_does_lies_together():
-    groups = cells.drivers(cells.plan(PLAN))
-    assert [cell for group in groups for cell in group] == cells.plan(PLAN)
+    groups = grid.drivers(grid.plan(PLAN))
+    assert [cell for group in groups for cell in group] == grid.plan(PLAN)
     assert len(groups) == 2 * 2 * (2 + 1)
 
 
 def test_a_cell_composes_its_row_its_controller_and_its_variation():
-    cell = cells.Cell("dynamic", "program", 1, "koopman_mpc", "late", "s2")
+    cell = grid.Cell("dynamic", "program", 1, "koopman_mpc", "late", "s2")
     asked = ["vehicle=dynamic", "scenario=s2", "controller=koopman_mpc", "seed=1", "model=koopman_mpc"]
-    assert cells.overrides(cell, PLAN) == [*asked, "model.environment=false", "evaluation.told.delay_s=0.5"]
+    assert grid.overrides(cell, PLAN) == [*asked, "model.environment=false", "evaluation.told.delay_s=0.5"]
 
 
 def test_a_variation_that_retrains_has_a_policy_of_its_own():
-    cell = cells.Cell("dynamic", "ours", 1, "mppi", "10 % of the data", "s2")
-    assert cells.policy_name(cell, PLAN, retrained=False) == "table/dynamic/ours"
-    assert cells.policy_name(cell, PLAN, retrained=True) == "table/dynamic/ours/10_%_of_the_data"
+    cell = grid.Cell("dynamic", "ours", 1, "mppi", "10 % of the data", "s2")
+    assert grid.policy_name(cell, PLAN, retrained=False) == "table/dynamic/ours"
+    assert grid.policy_name(cell, PLAN, retrained=True) == "table/dynamic/ours/10_%_of_the_data"
 
 
 def settings(root, **changes):
@@ -62,16 +62,16 @@ def rows_file(path):
 
 
 def test_a_cell_is_done_only_with_its_own_settings_and_undamaged(tmp_path):
-    cell, asked = cells.plan(PLAN)[0], settings(tmp_path)
-    path = cells.place(cell, asked)
-    assert not cells.is_done(path, asked)
+    cell, asked = grid.plan(PLAN)[0], settings(tmp_path)
+    path = grid.place(cell, asked)
+    assert not grid.is_done(path, asked)
     path.parent.mkdir(parents=True)
-    write_json(rows_file(path), {"row": {}, "made_with": cells.made_with(asked)})
-    assert cells.is_done(path, asked)
-    assert not cells.is_done(path, settings(tmp_path, evaluation={"episodes": 8}))
-    assert not cells.is_done(path, settings(tmp_path, env="estimated"))
+    write_json(rows_file(path), {"row": {}, "made_with": grid.made_with(asked)})
+    assert grid.is_done(path, asked)
+    assert not grid.is_done(path, settings(tmp_path, evaluation={"episodes": 8}))
+    assert not grid.is_done(path, settings(tmp_path, env="estimated"))
     rows_file(path).write_bytes(rows_file(path).read_bytes()[:-5])
-    assert not cells.is_done(path, asked)
+    assert not grid.is_done(path, asked)
 
 
 def row(system, level, seed):
@@ -85,14 +85,14 @@ def row(system, level, seed):
 def test_collecting_pools_the_seeds_and_compares_what_is_there(tmp_path, seeds):
     plan = PLAN | {"rows": {"sfkd": "", "icode": "", "missing": ""}, "vehicles": ["kinematic"]}
     plan |= {"seeds": list(range(seeds)), "variations": {"as it is": None}, "controllers": {"mppi": ["s1"]}}
-    wanted = cells.plan(plan)
+    wanted = grid.plan(plan)
     for cell in wanted:
         if cell.label != "missing":
-            path = cells.place(cell, settings(tmp_path))
+            path = grid.place(cell, settings(tmp_path))
             path.parent.mkdir(parents=True, exist_ok=True)
             level = 1.0 if cell.label == "sfkd" else 3.0
             write_json(rows_file(path), {"row": row(cell.label, level, cell.seed), "made_with": cell.label})
-    found = {entry["system"]: entry for entry in cells.collect(wanted, settings(tmp_path), lambda cell: cell.label)}
+    found = {entry["system"]: entry for entry in grid.collect(wanted, settings(tmp_path), lambda cell: cell.label)}
     assert set(found) == {"sfkd", "icode"}
     assert found["icode"]["seeds"] == list(range(seeds))
     assert len(found["icode"]["rmse_episodes_m"]) == 2 * seeds
@@ -104,12 +104,12 @@ def test_collecting_pools_the_seeds_and_compares_what_is_there(tmp_path, seeds):
     [(False, {"sfkd"}, "left out; comparison.older=true takes them"), (True, {"sfkd", "icode"}, "taken all the same")],
 )
 def test_a_row_that_was_made_with_other_settings_enters_no_table_unseen(tmp_path, capsys, older, systems, says):
-    wanted = [cells.Cell("kinematic", label, 0, "mppi", "as it is", "s1") for label in ("sfkd", "icode")]
+    wanted = [grid.Cell("kinematic", label, 0, "mppi", "as it is", "s1") for label in ("sfkd", "icode")]
     for cell in wanted:
-        path = cells.place(cell, settings(tmp_path))
+        path = grid.place(cell, settings(tmp_path))
         path.parent.mkdir(parents=True, exist_ok=True)
         write_json(rows_file(path), {"row": row(cell.label, 1.0, 0), "made_with": cell.label})
-    found = cells.collect(wanted, settings(tmp_path), lambda cell: "sfkd", older=older)
+    found = grid.collect(wanted, settings(tmp_path), lambda cell: "sfkd", older=older)
     assert {entry["system"] for entry in found} == systems
     said = capsys.readouterr().err
     assert said.startswith("1 cells were made with other settings, such as")
@@ -119,11 +119,11 @@ def test_a_row_that_was_made_with_other_settings_enters_no_table_unseen(tmp_path
 
 def test_rows_are_dealt_to_processes_whole_and_each_to_one():
     """Two controllers of one row share its policy: no two processes may train it."""
-    groups = cells.drivers(cells.plan(PLAN))
-    parts = [cells.dealt(groups, [k, 3]) for k in range(3)]
+    groups = grid.drivers(grid.plan(PLAN))
+    parts = [grid.dealt(groups, [k, 3]) for k in range(3)]
     assert sorted(str(group) for part in parts for group in part) == sorted(map(str, groups))
     policies = [row for part in parts for row in {group[0][:3] for group in part}]
     assert len(policies) == len(set(policies))
-    assert cells.dealt(groups, None) == groups
+    assert grid.dealt(groups, None) == groups
     with pytest.raises(ValueError, match=r"comparison\.share"):
-        cells.dealt(groups, [3, 3])
+        grid.dealt(groups, [3, 3])

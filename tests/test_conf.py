@@ -9,7 +9,8 @@ from hydra.errors import HydraException
 from omegaconf import OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
-from sfkd_jax import assembly, config, models, vehicle
+from sfkd_jax import build, models, vehicle
+from sfkd_jax.cli import config
 
 CONF = Path(config.conf_path())
 GROUPS = sorted(folder.name for folder in CONF.iterdir() if folder.is_dir() and not folder.name.startswith("_"))
@@ -35,7 +36,7 @@ def test_every_option_composes_and_is_within_the_ranges(group, option):
 def test_every_model_option_builds_and_names_its_system(option):
     composed = settings(f"model={option}")
     assert composed["model"]["system"] == option
-    assembly.build_model(composed["model"], space(), vehicle.kinematic())
+    build.build_model(composed["model"], space(), vehicle.kinematic())
 
 
 @pytest.mark.parametrize("vehicle", [name for group, name in OPTIONS if group == "vehicle"])
@@ -43,13 +44,13 @@ def test_every_model_option_builds_and_names_its_system(option):
 def test_every_controller_builds_for_every_vehicle(vehicle, controller):
     limits = ("vehicle.control_low=[-0.4,-3.0]", "vehicle.control_high=[0.4,2.0]") if vehicle == "own" else ()
     composed = settings(f"vehicle={vehicle}", f"controller={controller}", *limits)
-    plant = assembly.build_vehicle(composed["vehicle"])
+    plant = build.build_vehicle(composed["vehicle"])
     law = any_law(len(plant.state_names) - 1) if composed["controller"]["sampling"] == "law" else None
-    model = assembly.reference_systems(plant, law)["oracle"].model
+    model = build.reference_systems(plant, law)["oracle"].model
     if composed["controller"]["planner"] == "koopman_mpc":  # the only planner that needs a linear predictor
         model = models.FACTORIES["koopman_mpc"](space(len(plant.state_names) - 3))
-    assembly.build_controller(composed["controller"], model, plant, law=law)
-    assembly.build_scenario(composed["scenario"], plant, duration=6.0)
+    build.build_controller(composed["controller"], model, plant, law=law)
+    build.build_scenario(composed["scenario"], plant, duration=6.0)
 
 
 def test_every_learned_model_has_an_option_file():

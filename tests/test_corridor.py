@@ -9,7 +9,7 @@ import pytest
 from helpers import any_law
 from test_path_policy import saved, settings
 
-from sfkd_jax import assembly, datasets, policy
+from sfkd_jax import build, datasets, policy
 from sfkd_jax.certification import CertificationRefused, claims_of, issue, verify_document
 from sfkd_jax.corridor import certify_corridor, corridor_by_speed, fastest
 from sfkd_jax.types import Trajectory
@@ -148,7 +148,7 @@ def test_a_controller_with_a_corridor_is_shielded_when_asked(document, trained, 
     for shield in (True, False):
         chosen = asked["controller"] | {"shield": shield}
         chosen["mppi"] = chosen["mppi"] | {"num_samples": 4}
-        built = assembly.build_controller(chosen, trained.model, plant, certificate=document, law=trained.law, **DRIVEN)
+        built = build.build_controller(chosen, trained.model, plant, certificate=document, law=trained.law, **DRIVEN)
         _, _, info = jax.jit(built.act)(
             trained.params, built.init(jax.random.key(0)), state, jnp.asarray([0.6, 0.0]), reference
         )

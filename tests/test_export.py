@@ -21,7 +21,9 @@ from hydra import compose, initialize_config_dir
 from omegaconf import OmegaConf
 
 import sfkd_jax
-from sfkd_jax import artefacts, assembly, certification, config, export, exporting, policy, shelf
+from sfkd_jax import artefacts, build, certification, export, exporting, policy
+from sfkd_jax.cli import config
+from sfkd_jax.pipeline import store
 from sfkd_jax.types import Controller
 
 HORIZON, STEPS = 5, 6
@@ -51,11 +53,11 @@ def settings(root, *overrides):
 def exported(tmp_path_factory):
     """A run with weights as they were drawn and a monitor, and what the door wrote and printed."""
     asked = settings(tmp_path_factory.mktemp("export") / "runs")
-    plant = assembly.build_vehicle(asked["vehicle"])
-    params = jit(assembly.build_model(asked["model"], space(), plant).init)(jax.random.key(0))
-    kept = asked | {"space": assembly.space_to_settings(space())}
-    shelf.claim(asked)
-    place = shelf.run_directory(asked)
+    plant = build.build_vehicle(asked["vehicle"])
+    params = jit(build.build_model(asked["model"], space(), plant).init)(jax.random.key(0))
+    kept = asked | {"space": build.space_to_settings(space())}
+    store.claim(asked)
+    place = store.run_directory(asked)
     policy.save(place / "policy.npz", params, kept, made_from={"dataset": "d" * 64})
     trained, data = policy.restore(place), dataset()
     splits = {"validation": data.validation, "calibration": data.calibration, "held_out": {"test": data.test}}
@@ -183,10 +185,10 @@ def test_the_manifest_says_what_the_programs_take_and_what_they_were_made_from(e
     states = [leaf for leaf in act["outputs"] if leaf["name"].startswith("state.")]
     assert states == act["inputs"][:-3] == manifest["programs"]["init"]["outputs"]
     assert {"name": "state.inner.key", "shape": [2], "dtype": "uint32"} in states
-    assert manifest["weights_sha256"] == policy.restore(shelf.run_directory(asked)).weights_sha256
+    assert manifest["weights_sha256"] == policy.restore(store.run_directory(asked)).weights_sha256
     assert manifest["certificate_sha256"] == hashlib.sha256((place / "certificate.json").read_bytes()).hexdigest()
     assert (manifest["sampling_period_s"], manifest["horizon"], manifest["iree"]) == (0.1, HORIZON, None)
-    plant = assembly.build_vehicle(asked["vehicle"])
+    plant = build.build_vehicle(asked["vehicle"])
     assert tuple(control["high"] for control in manifest["controls"]) == plant.control_high
     assert manifest["environment"]["low"] == list(ENV_LOW)
     assert loaded.certificate["boxes"] == BOXES
@@ -214,7 +216,7 @@ def test_the_controller_of_the_command_is_what_is_exported(spoiled):
 
 def test_a_refused_certificate_leaves_the_export_without_one(spoiled, capsys):
     asked = settings(spoiled)
-    place = shelf.run_directory(asked)
+    place = store.run_directory(asked)
     assert (place / "export" / "certificate.json").exists()
     artefacts.write_json(place / "certificate.json", {"valid": False, "reason": "alpha is not below 1"})
     printed = export.run(asked)
@@ -346,8 +348,8 @@ def flat_steps(run, first):
 
 
 def test_evaluating_the_weights_first_leaves_the_function_and_no_factorisation(loaded, in_process):
-    plant = assembly.build_vehicle(loaded.settings["vehicle"])
-    watched_by_nobody = assembly.build_controller(
+    plant = build.build_vehicle(loaded.settings["vehicle"])
+    watched_by_nobody = build.build_controller(
         loaded.settings["controller"], loaded.model, plant, env_low=ENV_LOW, env_high=ENV_HIGH
     )
     unfolded = loaded.model._replace(fold=lambda params: params)

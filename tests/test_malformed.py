@@ -17,7 +17,9 @@ import pytest
 from helpers import ENV_HIGH, ENV_LOW, SHARES, dataset, refusal_of
 from jaxtyping import TypeCheckError
 
-from sfkd_jax import artefacts, config, datasets, demo, evaluate, policy, report, shelf, training
+from sfkd_jax import artefacts, datasets, demo, evaluate, policy, report, training
+from sfkd_jax.cli import config
+from sfkd_jax.pipeline import store
 
 SHIPPED = demo.SHIPPED / "kinematic"
 WORSE = (None, "word", [], {}, -1, float("nan"), [[1, 2], 3], True, 10**400)
@@ -84,7 +86,7 @@ def read(run, name):
     if name == "results.json":
         evaluate._kept(run)
     elif name == "settings.json":
-        shelf.claim(settings_of(run))
+        store.claim(settings_of(run))
     else:
         read_policy(run)
 
@@ -151,11 +153,11 @@ def test_bytes_that_were_damaged_are_refused_or_say_the_same(run, name):
     draw, file, read_it = random.Random(2), run / name, read_policy
     if name == "dataset.npz":
         settings = settings_of(run)
-        shelf.write_dataset(settings, dataset(count=20, steps=8))
-        file = shelf.dataset_path(settings)
+        store.write_dataset(settings, dataset(count=20, steps=8))
+        file = store.dataset_path(settings)
 
         def read_it(_):
-            shelf.read_dataset(settings)
+            store.read_dataset(settings)
 
     lines = [survives(lambda: read_it(run), file, damaged(file.read_bytes(), draw)) for _ in range(BYTES[name])]
     refused = [line for line in lines if line]
@@ -227,7 +229,7 @@ def test_a_full_disk_is_one_line_keeps_what_was_there_and_the_same_call_continue
 
     def work():
         artefacts.write_json(run / "results.json", {"rows": [ROW, ROW]})
-        shelf.write_dataset(settings, drives)
+        store.write_dataset(settings, drives)
 
     before = snapshot(root)
     with monkeypatch.context() as disk:
@@ -236,7 +238,7 @@ def test_a_full_disk_is_one_line_keeps_what_was_there_and_the_same_call_continue
     assert snapshot(root) == before
     work()
     assert len(artefacts.read_json(run / "results.json")["rows"]) == 2
-    shelf.read_dataset(settings)
+    store.read_dataset(settings)
 
 
 def refuse(*_, **__):
@@ -249,10 +251,10 @@ def test_a_place_that_cannot_be_written_is_one_line_and_keeps_what_was_there(run
     before = snapshot(root)
     with monkeypatch.context() as read_only:
         read_only.setattr(Path, call, refuse)
-        assert "Read-only file system" in refusal_of(lambda: shelf.claim(settings))
+        assert "Read-only file system" in refusal_of(lambda: store.claim(settings))
         assert "Read-only file system" in refusal_of(lambda: artefacts.write_json(run / "results.json", {"rows": []}))
     assert {file: content for file, content in snapshot(root).items() if file in before} == before
-    shelf.claim(settings)
+    store.claim(settings)
 
 
 def test_segments_that_are_not_finite_are_no_data_set():

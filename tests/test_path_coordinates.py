@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 
 from sfkd_jax import vehicle
-from sfkd_jax.path_frame import closed_loop, is_valid, on_circle, path_state
+from sfkd_jax.core.path_frame import closed_loop, is_valid, on_circle, path_state
+from sfkd_jax.core.se2 import compose
 from sfkd_jax.scenarios import path_from_curvature, project
-from sfkd_jax.se2 import compose
 from sfkd_jax.types import BODY
 
 CURVATURES = (-0.08, -1e-6, 0.0, 1e-6, 0.02, 0.1)

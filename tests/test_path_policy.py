@@ -8,7 +8,9 @@ from helpers import TINY, any_law, path_space
 from hydra import compose, initialize_config_dir
 from omegaconf import OmegaConf
 
-from sfkd_jax import artefacts, assembly, config, policy, rehearsal, vehicle
+from sfkd_jax import artefacts, build, policy, vehicle
+from sfkd_jax.cli import config
+from sfkd_jax.pipeline import dry_run
 
 
 def settings(*overrides):
@@ -23,8 +25,8 @@ def saved(place, *, law, samples=4):
     asked["model"] |= {name: list(value) if isinstance(value, tuple) else value for name, value in TINY.items()}
     asked["model"] |= {"budget": "joint"}
     scales = path_space()
-    model = assembly.build_model(asked["model"], scales, vehicle.kinematic())
-    asked |= {"space": assembly.space_to_settings(scales)}
+    model = build.build_model(asked["model"], scales, vehicle.kinematic())
+    asked |= {"space": build.space_to_settings(scales)}
     return policy.save(place / "policy.npz", model.init(jax.random.key(0)), asked, made_from={}, law=law)
 
 
@@ -56,17 +58,17 @@ def test_a_policy_that_lost_its_law_is_refused(tmp_path):
 def test_path_coordinates_for_data_and_model_or_for_neither(overrides):
     asked = settings(*overrides)
     with pytest.raises(ValueError, match="go together"):
-        rehearsal.check(asked, assembly.build_vehicle(asked["vehicle"]))
+        dry_run.check(asked, build.build_vehicle(asked["vehicle"]))
 
 
 def test_the_law_drives_as_a_row_along_a_path_alone():
     asked = settings("evaluation.systems=[law]")
-    rehearsal.check(asked, assembly.build_vehicle(asked["vehicle"]))
+    dry_run.check(asked, build.build_vehicle(asked["vehicle"]))
     with pytest.raises(ValueError, match=r"evaluation\.systems entry 'law'"):
-        rehearsal.check(settings("dataset=standard", "model=sfkd", "evaluation.systems=[law]"), vehicle.kinematic())
+        dry_run.check(settings("dataset=standard", "model=sfkd", "evaluation.systems=[law]"), vehicle.kinematic())
 
 
 @pytest.mark.parametrize("model", ["sfkd_path", "sfkd_path_no_contraction", "neural_ode_path", "r2dn_path"])
 def test_every_path_model_is_rehearsed_with_its_planner(model):
     asked = settings(f"model={model}", *(() if "sfkd" in model and "no" not in model else ("training.loss.tube=[]",)))
-    rehearsal.check(asked, assembly.build_vehicle(asked["vehicle"]))
+    dry_run.check(asked, build.build_vehicle(asked["vehicle"]))

@@ -10,7 +10,9 @@ from hydra import compose, initialize_config_dir
 from omegaconf import OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
-from sfkd_jax import assembly, config, ranges, rehearsal
+from sfkd_jax import build
+from sfkd_jax.cli import config, ranges
+from sfkd_jax.pipeline import dry_run
 
 MODELS = ("sfkd", "koopman_mpc", "control_synth", "icode", "icode_mppi", "neural_ode", "r2dn")
 OPTIONS = (
@@ -81,9 +83,9 @@ def names(option):
 
 def use(settings):
     """What `train` does before anything is made."""
-    plant = assembly.build_vehicle(settings["vehicle"])
-    assembly.build_scenario(settings["scenario"], plant, duration=settings["evaluation"]["episode_s"])
-    rehearsal.check(settings, plant)
+    plant = build.build_vehicle(settings["vehicle"])
+    build.build_scenario(settings["scenario"], plant, duration=settings["evaluation"]["episode_s"])
+    dry_run.check(settings, plant)
 
 
 def refusal(option, name, value):

@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 from omegaconf import OmegaConf
 
-from sfkd_jax import queues, sweeps
+from sfkd_jax.cli import queues, sweeps
 
 SCRIPT = """
     import os

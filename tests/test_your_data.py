@@ -14,7 +14,9 @@ from hydra import compose, initialize_config_dir
 from omegaconf import OmegaConf
 
 import sfkd_jax
-from sfkd_jax import config, evaluate, shelf, walk
+from sfkd_jax import evaluate
+from sfkd_jax.cli import config
+from sfkd_jax.pipeline import stages, store
 
 sys.path.append(str(Path(__file__).parent / "datasets"))
 from recorded import drive, write_csv
@@ -81,13 +83,13 @@ def test_logs_become_a_certified_policy_of_a_robot_that_nothing_drives(logs):
 def test_logs_lie_on_the_shelf_with_their_coverage_and_test_drives_alone_are_held_out(logs, monkeypatch):
     monkeypatch.chdir(logs.parent)
     asked = settings(*SMALL)
-    dataset, _ = walk.ensure_dataset(asked)
+    dataset, _ = stages.ensure_dataset(asked)
     assert [part.states.shape[1:] for part in dataset[:4]] == [(11, 5)] * 4
     assert sum(len(part.states) for part in dataset[:4]) == 8 * 12
-    held_out = walk.held_out_drives(asked, dataset)
+    held_out = stages.held_out_drives(asked, dataset)
     assert set(held_out) == {"test"}
     assert held_out["test"] is dataset.test
-    covered = json.loads((shelf.dataset_path(asked).parent / "coverage.json").read_text())
+    covered = json.loads((store.dataset_path(asked).parent / "coverage.json").read_text())
     assert set(covered["state"]) == {"v", "yaw_rate"}
     assert 4.0 <= covered["state"]["v"]["low"] < covered["state"]["v"]["high"] <= 6.0
 
@@ -96,9 +98,9 @@ def test_what_logs_cannot_support_is_refused_before_a_run_is_begun(logs, monkeyp
     monkeypatch.chdir(logs.parent)
     asked = settings(*SMALL, "name=other", "certification.level=0.99")
     with pytest.raises(ValueError, match="12 calibration segments are too few for"):
-        walk.ensure_policy(asked)
+        stages.ensure_policy(asked)
     with pytest.raises(ValueError, match="no column friction for the environment; pass env=none"):
-        walk.ensure_policy(settings(*SMALL, "env=measured", "name=other"))
+        stages.ensure_policy(settings(*SMALL, "env=measured", "name=other"))
     with pytest.raises(ValueError, match="vehicle=own is known from logs alone, so nothing can drive it"):
         evaluate.run(settings(*SMALL, "name=other"))
     assert not (logs.parent / "runs" / "other").exists()
@@ -106,7 +108,7 @@ def test_what_logs_cannot_support_is_refused_before_a_run_is_begun(logs, monkeyp
 
 def test_logs_that_moved_are_the_same_data_set_and_changed_ones_are_not(logs, tmp_path):
     def identity(place):
-        return shelf.identity(settings(*SMALL, f"dataset.path={place}"))
+        return store.identity(settings(*SMALL, f"dataset.path={place}"))
 
     here = identity(logs)
     shutil.copytree(logs, tmp_path / "moved")

@@ -6,7 +6,7 @@ import time
 from pathlib import Path
 from typing import Any
 
-from sfkd_jax import artefacts, assembly, policy, shelf, walk
+from sfkd_jax import artefacts, build, policy
 from sfkd_jax.certification import (
     CertificateStale,
     CertificationRefused,
@@ -15,8 +15,9 @@ from sfkd_jax.certification import (
     claims_of,
     issue,
 )
-from sfkd_jax.config import door
+from sfkd_jax.cli.config import door
 from sfkd_jax.corridor import certify_corridor
+from sfkd_jax.pipeline import stages, store
 
 INCREMENTAL = "incremental.json"
 """A rate of a continuous flow lies apart: other doors take a certificate for one with tubes and bounds of a monitor."""
@@ -31,8 +32,8 @@ def document_in(place: Path) -> Path:
 def renew(settings: dict[str, Any]) -> dict[str, Any]:
     """Certify the policy of this run as it is now; a refusal is a document too."""
     began = time.perf_counter()
-    place = shelf.run_directory(settings)
-    trained = walk.ensure_policy(settings)
+    place = store.run_directory(settings)
+    trained = stages.ensure_policy(settings)
     flow = claims_a_rate(trained.model, trained.params)
     try:
         document = _rate(settings, trained) if flow else _tubes(settings, trained)
@@ -47,7 +48,7 @@ def renew(settings: dict[str, Any]) -> dict[str, Any]:
     verdict = f"alpha {document['alpha']:.6f}" if document["valid"] else f"refused: {document['reason']}"
     if "d_bar" in document:
         verdict += f"; d_bar {document['d_bar']['value']:.4g} holds for {document['d_bar']['holds_for']}"
-    shelf.say(f"certificate: {verdict}")
+    store.say(f"certificate: {verdict}")
     return document
 
 
@@ -58,34 +59,34 @@ def _rate(settings: dict[str, Any], trained: policy.Trained) -> dict[str, Any]:
 
 def _tubes(settings: dict[str, Any], trained: policy.Trained) -> dict[str, Any]:
     """What is proved of a model's steps, and what is measured on the data of the run."""
-    dataset, _ = walk.ensure_dataset(settings)
+    dataset, _ = stages.ensure_dataset(settings)
     options = {name: value for name, value in settings["certification"].items() if name not in ("renew", "corridor")}
-    boxes, noise = shelf.boxes(dataset), tuple(settings["evaluation"]["observation_noise"])
-    if shelf.is_logged(settings):  # the robot's own sensors are in its logs already
-        boxes, noise = boxes | {"names": shelf.channel_names(settings)}, ()
+    boxes, noise = store.boxes(dataset), tuple(settings["evaluation"]["observation_noise"])
+    if store.is_logged(settings):  # the robot's own sensors are in its logs already
+        boxes, noise = boxes | {"names": store.channel_names(settings)}, ()
     document = issue(
         trained.model,
         trained.params,
         validation=dataset.validation,
         calibration=dataset.calibration,
-        held_out=walk.held_out_drives(settings, dataset),
+        held_out=stages.held_out_drives(settings, dataset),
         boxes=boxes,
         drives=dataset.drives,
         sensor_noise=noise,
-        **assembly.without(options),
+        **build.without(options),
     )
-    if document["outputs"] and not shelf.is_logged(settings):
-        asked = assembly.without(settings["certification"]["corridor"])
+    if document["outputs"] and not store.is_logged(settings):
+        asked = build.without(settings["certification"]["corridor"])
         proved = claims_of(document["outputs"])
         document["corridor"] = certify_corridor(settings, trained, proved, **asked)
     return document
 
 
-@shelf.exclusive
+@store.exclusive
 def run(settings: dict[str, Any]) -> dict[str, Any]:
     """Certify, unless a certificate about other weights lies there (then `certification.renew=true`)."""
-    trained = walk.ensure_policy(settings)
-    place = shelf.run_directory(settings)
+    trained = stages.ensure_policy(settings)
+    place = store.run_directory(settings)
     path = document_in(place)
     if path.exists() and not settings["certification"]["renew"]:
         about = artefacts.read_json(path).get("policy_sha256")

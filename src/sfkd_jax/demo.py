@@ -6,8 +6,9 @@ import time
 from pathlib import Path
 from typing import Any
 
-from sfkd_jax import artefacts, assembly, cells, drive, evaluation, policy, shelf
-from sfkd_jax.config import door
+from sfkd_jax import artefacts, build, evaluation, policy
+from sfkd_jax.cli.config import door
+from sfkd_jax.pipeline import evaluate_system, grid, store
 from sfkd_jax.reporting import animate
 
 SHIPPED = Path(__file__).with_name("pretrained")
@@ -24,30 +25,30 @@ def run(settings: dict[str, Any]) -> dict[str, Any]:
     began = time.perf_counter()
     trained = _shipped(settings)
     settings = settings | {"name": "demo", "evaluation": settings["evaluation"] | settings["demo"]}
-    plant = assembly.build_vehicle(settings["vehicle"])
-    track = drive.lay(settings, plant)
-    own = assembly.System(trained.model, trained.params, settings["env"], trained.certificate, trained.law)
+    plant = build.build_vehicle(settings["vehicle"])
+    track = evaluate_system.lay(settings, plant)
+    own = build.System(trained.model, trained.params, settings["env"], trained.certificate, trained.law)
     systems = {trained.settings["model"]["system"]: own}
-    systems |= {name: assembly.reference_systems(plant, trained.law)[name] for name in ("nominal", "oracle")}
+    systems |= {name: build.reference_systems(plant, trained.law)[name] for name in ("nominal", "oracle")}
     place, rows = Path(settings["root"]) / settings["name"], []
     folder = place / f"{track.scenario}_{_name(settings)}"
     with artefacts.locked(folder):
         for name, system in systems.items():
-            shelf.say(f"driving {settings['demo']['episodes']} x {settings['demo']['episode_s']:.0f} s: {name}")
-            driven = drive.prepare(settings, plant, name, system, None)(track)
-            rows.append(cells.write(folder / name, settings, track, driven))
+            store.say(f"driving {settings['demo']['episodes']} x {settings['demo']['episode_s']:.0f} s: {name}")
+            driven = evaluate_system.prepare(settings, plant, name, system, None)(track)
+            rows.append(grid.write(folder / name, settings, track, driven))
         rows = evaluation.compare(rows)
         document = {"rows": rows, "config": settings, "versions": artefacts.versions()}
         artefacts.write_json(folder / "results.json", document)
         _print(rows)
         film = animate(place, rows, track.scenario, corridor=_corridor(trained))
-    shelf.say(f"animation: {film}; {time.perf_counter() - began:.0f} s in all")
+    store.say(f"animation: {film}; {time.perf_counter() - began:.0f} s in all")
     return {"animation": film and str(film), "rows": len(rows), "results": str(folder / "results.json")}
 
 
 def _name(settings: dict[str, Any]) -> str:
     """Of the policy that is asked for."""
-    return settings["vehicle"]["name"] + ALONG_PATH * shelf.is_along_path(settings)
+    return settings["vehicle"]["name"] + ALONG_PATH * store.is_along_path(settings)
 
 
 def _shipped(settings: dict[str, Any]) -> policy.Policy:
@@ -63,10 +64,10 @@ def _shipped(settings: dict[str, Any]) -> policy.Policy:
     if trained.certificate is None:
         raise artefacts.ArtefactError(f"{SHIPPED / name} was changed: its certificate is about other weights")
     alpha, seconds = trained.certificate["alpha"], time.perf_counter() - began
-    shelf.say(f"certificate: holds, alpha {alpha:.4f}; loaded and verified in {seconds:.1f} s")
+    store.say(f"certificate: holds, alpha {alpha:.4f}; loaded and verified in {seconds:.1f} s")
     if half := _corridor(trained):
         share = 100 * trained.certificate["corridor"]["level"]
-        shelf.say(f"corridor: {half:.2f} m to each side, on {share:.0f} % of the drives of its class")
+        store.say(f"corridor: {half:.2f} m to each side, on {share:.0f} % of the drives of its class")
     return trained
 
 
@@ -77,12 +78,12 @@ def _corridor(trained: policy.Policy) -> float | None:
 
 def _print(rows: list[dict[str, Any]]) -> None:
     """The table, for a person."""
-    shelf.say(f"{'':10}{'deviation [mm]':>16}{'largest [mm]':>14}{'steering [rad/s]':>18}{'outside the proof':>19}")
+    store.say(f"{'':10}{'deviation [mm]':>16}{'largest [mm]':>14}{'steering [rad/s]':>18}{'outside the proof':>19}")
     for row in rows:
         left, largest = 1e3 * row["rmse_m"]["mean"], 1e3 * row["max_deviation_m"]
         broken = row["violation"]["v0"]
         outside = "nothing proved" if broken is None else f"{100 * broken:.0f} %"
-        shelf.say(f"{row['system']:10}{left:16.1f}{largest:14.0f}{row['smoothness_rad_per_s']:18.3f}{outside:>19}")
+        store.say(f"{row['system']:10}{left:16.1f}{largest:14.0f}{row['smoothness_rad_per_s']:18.3f}{outside:>19}")
 
 
 if __name__ == "__main__":

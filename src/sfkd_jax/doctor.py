@@ -13,7 +13,7 @@ import jax
 import jax.numpy as jnp
 
 from sfkd_jax import artefacts
-from sfkd_jax.config import door
+from sfkd_jax.cli.config import door
 
 CORE = ("jax", "jaxlib", "flax", "optax", "orbax-checkpoint", "hydra-core", "numpy", "scipy", "matplotlib")
 EXTRAS = {

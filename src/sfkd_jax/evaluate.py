@@ -9,8 +9,9 @@ from typing import Any
 import numpy as np
 from hydra.core.hydra_config import HydraConfig
 
-from sfkd_jax import artefacts, assembly, drive, evaluation, rehearsal, shelf, walk
-from sfkd_jax.config import command, door
+from sfkd_jax import artefacts, build, evaluation
+from sfkd_jax.cli.config import command, door
+from sfkd_jax.pipeline import dry_run, evaluate_system, stages, store
 
 KIND = "episodes"
 
@@ -21,24 +22,26 @@ def run(settings: dict[str, Any], asked_by: str = "evaluate") -> dict[str, Any]:
     `asked_by` is the door that was opened; its command is kept with the results.
     """
     began = time.perf_counter()
-    place, protocol = shelf.run_directory(settings), settings["evaluation"]
-    plant = assembly.build_vehicle(settings["vehicle"])
-    track = drive.lay(settings, plant)  # first: a vehicle that nothing can drive is refused before anything is trained
-    rehearsal.check(settings, plant)
+    place, protocol = store.run_directory(settings), settings["evaluation"]
+    plant = build.build_vehicle(settings["vehicle"])
+    track = evaluate_system.lay(
+        settings, plant
+    )  # first: a vehicle that nothing can drive is refused before anything is trained
+    dry_run.check(settings, plant)
     _kept(place)  # first: nobody drives for an hour to hear that the earlier rows are damaged
-    systems = walk.systems(settings, plant)
-    dataset, _ = walk.ensure_dataset(settings)
+    systems = stages.systems(settings, plant)
+    dataset, _ = stages.ensure_dataset(settings)
     rows: list[dict[str, Any]] = []
     roads = dict(zip(artefacts.ROAD, (track.roads.envs, track.roads.path.points), strict=True))
     arrays: dict[str, Any] = {}
     for name, system in systems.items():
         length = f"{protocol['episodes']} episodes of {protocol['episode_s']:.0f} s"
-        shelf.say(f"driving {length}: {name} on {track.scenario}")
-        driven = drive.prepare(settings, plant, name, system, dataset)(track)
+        store.say(f"driving {length}: {name} on {track.scenario}")
+        driven = evaluate_system.prepare(settings, plant, name, system, dataset)(track)
         rows.append(driven.row)
         drive_name = artefacts.drive_name(driven.row)
         arrays |= {f"{drive_name}/{part}": array for part, array in (driven.arrays | roads).items()}
-        shelf.say(f"  rmse {driven.row['rmse_m']['mean']:.4f} m, worst {driven.row['max_deviation_m']:.3f} m")
+        store.say(f"  rmse {driven.row['rmse_m']['mean']:.4f} m, worst {driven.row['max_deviation_m']:.3f} m")
     arrays["dt"] = np.asarray(plant.dt)
     made_by = settings | ({"command": command(asked_by)} if HydraConfig.initialized() else {})
     _write(place, made_by, evaluation.compare(rows), arrays, time.perf_counter() - began)

@@ -4,9 +4,10 @@ from __future__ import annotations
 
 from typing import Any
 
-from sfkd_jax import artefacts, assembly, policy, shelf
-from sfkd_jax.config import door
+from sfkd_jax import artefacts, build, policy
+from sfkd_jax.cli.config import door
 from sfkd_jax.exporting import write_controller
+from sfkd_jax.pipeline import store
 
 FOLDER = "export"
 
@@ -17,24 +18,24 @@ def run(settings: dict[str, Any]) -> dict[str, Any]:
     Raises:
         ArtefactError: no policy was trained there, it is damaged, or it was trained with other settings.
     """
-    place = shelf.run_directory(settings)
+    place = store.run_directory(settings)
     if not artefacts.exists(place / "policy.npz"):
         raise artefacts.ArtefactError(f"{place} holds no trained controller; run train with the same options first")
     return _write(settings)
 
 
-@shelf.exclusive
+@store.exclusive
 def _write(settings: dict[str, Any]) -> dict[str, Any]:
     """Export the policy that lies there."""
-    place = shelf.run_directory(settings)
-    shelf.claim(settings)
+    place = store.run_directory(settings)
+    store.claim(settings)
     _, manifest = artefacts.read_arrays(place / "policy.npz", kind=policy.KIND)
     trained = policy.load(place, controller=settings["controller"], env=settings["env"])
     if trained.certificate is None:
-        shelf.say("exported without a certificate and without a monitor")
+        store.say("exported without a certificate and without a monitor")
     folder = place / FOLDER
-    write_controller(trained, folder, made_from=manifest["made_from"], **assembly.without(settings["export"]))
-    shelf.say(f"exported: {folder}; python {folder / 'run_controller.py'} runs it without sfkd_jax")
+    write_controller(trained, folder, made_from=manifest["made_from"], **build.without(settings["export"]))
+    store.say(f"exported: {folder}; python {folder / 'run_controller.py'} runs it without sfkd_jax")
     files = {"blob": "controller.stablehlo", "manifest": "controller.json", "npz": "policy.npz"}
     return {key: str(folder / name) for key, name in files.items()}
 

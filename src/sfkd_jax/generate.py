@@ -5,17 +5,17 @@ from __future__ import annotations
 import time
 from typing import Any
 
-from sfkd_jax import shelf, walk
-from sfkd_jax.config import door
+from sfkd_jax.cli.config import door
+from sfkd_jax.pipeline import stages, store
 
 
 def run(settings: dict[str, Any]) -> dict[str, Any]:
     """Generate the data set, unless it lies on the shelf already."""
     began = time.perf_counter()
-    dataset, _ = walk.ensure_dataset(settings)
+    dataset, _ = stages.ensure_dataset(settings)
     return {
-        "dataset": str(shelf.dataset_path(settings)),
-        "segments": sum(getattr(dataset, part).controls.shape[0] for part in shelf.PARTS),
+        "dataset": str(store.dataset_path(settings)),
+        "segments": sum(getattr(dataset, part).controls.shape[0] for part in store.PARTS),
         "seconds": time.perf_counter() - began,
     }
 

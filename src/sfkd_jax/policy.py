@@ -13,7 +13,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from sfkd_jax import artefacts, assembly
+from sfkd_jax import artefacts, build
 from sfkd_jax.control import PathLaw, law_arrays, law_from_arrays
 from sfkd_jax.types import Controller, Model, Params
 from sfkd_jax.vehicle import Vehicle
@@ -122,7 +122,7 @@ def load(path: str | Path, *, controller: Mapping[str, Any] | None = None, env: 
         fallback = asked.get("monitor", {}).get("fallback", "none")
         limits = {"env_low": box["env_low"], "env_high": box["env_high"], "env": env, "certificate": certificate}
         limits["law"] = trained.law
-        planner = assembly.build_controller(asked, trained.model, trained.vehicle, **limits)
+        planner = build.build_controller(asked, trained.model, trained.vehicle, **limits)
     if certificate is None and fallback != "none":
         raise artefacts.ArtefactError(f"{file}: controller.monitor.fallback={fallback} needs a certificate; {reason}")
     if certificate is None:
@@ -162,8 +162,8 @@ def read_certificate(path: str | Path, trained: Trained) -> tuple[dict[str, Any]
 def _built(settings: str) -> tuple[Vehicle, Model]:
     """The vehicle and the model of settings as JSON; the same objects again, so that nothing is compiled twice."""
     asked = json.loads(settings)
-    plant = assembly.build_vehicle(asked["vehicle"])
-    return plant, assembly.build_model(asked["model"], assembly.space_from_settings(asked["space"]), plant)
+    plant = build.build_vehicle(asked["vehicle"])
+    return plant, build.build_model(asked["model"], build.space_from_settings(asked["space"]), plant)
 
 
 def _file(path: str | Path) -> Path:

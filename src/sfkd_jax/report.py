@@ -6,19 +6,20 @@ from contextlib import nullcontext
 from pathlib import Path
 from typing import Any
 
-from sfkd_jax import artefacts, shelf
-from sfkd_jax.config import door
+from sfkd_jax import artefacts
+from sfkd_jax.cli.config import door
+from sfkd_jax.pipeline import store
 from sfkd_jax.reporting import write_comparison, write_report
 
 
 def run(settings: dict[str, Any]) -> dict[str, Any]:
     """Draw; nothing is recomputed."""
     pattern = settings["report"]["compare"]
-    place = Path(settings["root"]) if pattern else shelf.run_directory(settings)
+    place = Path(settings["root"]) if pattern else store.run_directory(settings)
     alone = artefacts.locked(place) if place.exists() else nullcontext()  # or it makes what it then finds empty
     with alone, artefacts.understood(place):
         pages = write_comparison(place, pattern, settings["name"]) if pattern else write_report(place)
-    shelf.say(f"report: {pages['report']}")
+    store.say(f"report: {pages['report']}")
     return pages
 
 

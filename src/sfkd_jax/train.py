@@ -6,32 +6,33 @@ import time
 from pathlib import Path
 from typing import Any
 
-from sfkd_jax import artefacts, assembly, certify, evaluate, rehearsal, report, shelf, walk
-from sfkd_jax.config import door
+from sfkd_jax import artefacts, build, certify, evaluate, report
+from sfkd_jax.cli.config import door
+from sfkd_jax.pipeline import dry_run, stages, store
 from sfkd_jax.vehicle import check_step
 
 
 def run(settings: dict[str, Any]) -> dict[str, Any]:
     """Walk: data, weights, certificate, closed loop if there is a step to drive with, report."""
     began = time.perf_counter()
-    plant = assembly.build_vehicle(settings["vehicle"])
+    plant = build.build_vehicle(settings["vehicle"])
     if plant.simulated:
         check_step(plant)
-    rehearsal.check(settings, plant)
+    dry_run.check(settings, plant)
     return _walk(settings) | {"seconds": time.perf_counter() - began}
 
 
-@shelf.exclusive
+@store.exclusive
 def _walk(settings: dict[str, Any]) -> dict[str, Any]:
     """All steps in the run directory."""
-    walk.ensure_policy(settings)
-    place = shelf.run_directory(settings)
+    stages.ensure_policy(settings)
+    place = store.run_directory(settings)
     certificate = certify.renew(settings)
-    if assembly.build_vehicle(settings["vehicle"]).simulated:
+    if build.build_vehicle(settings["vehicle"]).simulated:
         results = evaluate.run(settings, asked_by="train")
     else:
         results = {"results": None}
-        shelf.say("not driven: vehicle=own is known from logs alone; vehicle.step=package.module:function drives it")
+        store.say("not driven: vehicle=own is known from logs alone; vehicle.step=package.module:function drives it")
     pages = report.run(settings)
     return {
         "run": str(place),

@@ -11,7 +11,8 @@ from brax import envs
 from brax.envs.wrappers.training import EvalWrapper, wrap
 from helpers import at, jit
 
-from sfkd_jax import adapters, assembly, control, evaluation, se2, vehicle
+from sfkd_jax import adapters, build, control, evaluation, vehicle
+from sfkd_jax.core import se2
 from sfkd_jax.types import Controller
 
 STEPS = 25
@@ -69,7 +70,7 @@ def test_it_steps_the_plant_and_nothing_else(name):
 
 def test_a_controller_drives_it_as_the_test_track_has_it_driven():
     """The controls of a simulated episode, as actions: the same motion, and the same questions to the controller."""
-    plant, law = vehicle.kinematic(), assembly.build_driver(vehicle.kinematic())
+    plant, law = vehicle.kinematic(), build.build_driver(vehicle.kinematic())
 
     def act(params, state, observation, env, reference):
         info = {"predicted_states": observation[None], "effective_samples": jnp.ones(()), "healthy": jnp.asarray(True)}
@@ -253,7 +254,7 @@ def test_a_wrapped_car_drives_as_the_bare_one():
 )
 def test_bad_settings_are_refused_in_one_line(settings, message):
     if settings.get("scenario") == "family":
-        settings = settings | {"scenario": assembly.build_scenario({"name": "s1"}, vehicle.kinematic(), duration=2.0)}
+        settings = settings | {"scenario": build.build_scenario({"name": "s1"}, vehicle.kinematic(), duration=2.0)}
     with pytest.raises(ValueError, match=message) as refusal:
         envs.get_environment("sfkd_vehicle", **settings)
     assert "\n" not in str(refusal.value)
@@ -261,7 +262,7 @@ def test_bad_settings_are_refused_in_one_line(settings, message):
 
 def test_a_plant_and_a_family_of_ones_own():
     plant = vehicle.with_speed_loop(vehicle.dynamic(dt=0.05))
-    family = assembly.build_scenario({"name": "seen"}, plant, duration=1.0)
+    family = build.build_scenario({"name": "seen"}, plant, duration=1.0)
     task = adapters.BraxVehicle(vehicle=plant, scenario=family).task
     assert (task.plant.dt, task.steps, task.observation_size) == (0.05, 20, 50)
     control = jnp.asarray([0.1, 12.0])

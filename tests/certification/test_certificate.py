@@ -10,7 +10,7 @@ import pytest
 from helpers import ENV_HIGH, ENV_LOW, HARD, certified, explicit, jit, model_and_params, steepest_pattern, tiny
 
 from sfkd_jax.certification import Certificate, CertificateStale, CertificationRefused, certify, verify
-from sfkd_jax.se2 import between
+from sfkd_jax.core.se2 import between
 from sfkd_jax.types import POSE
 
 RHO, BETA = 0.895, 0.1

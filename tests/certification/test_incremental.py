@@ -13,7 +13,7 @@ from helpers import ENV_HIGH, ENV_LOW, jit, model_and_params, space
 from hydra import compose, initialize_config_dir
 from omegaconf import OmegaConf
 
-from sfkd_jax import artefacts, assembly, certification, certify, config, models, policy, shelf
+from sfkd_jax import artefacts, build, certification, certify, models, policy
 from sfkd_jax.certification import (
     CertificateStale,
     CertificationRefused,
@@ -24,6 +24,8 @@ from sfkd_jax.certification import (
     incremental_rate,
     progress,
 )
+from sfkd_jax.cli import config
+from sfkd_jax.pipeline import store
 from sfkd_jax.types import Declared, Incremental
 
 
@@ -188,11 +190,11 @@ def untrained(name="control_synth"):
     with initialize_config_dir(config.conf_path(), version_base="1.3"):
         composed = compose("config", overrides=["+experiment=smoke", f"model={name}"])
     settings = OmegaConf.to_container(composed, resolve=True)
-    plant = assembly.build_vehicle(settings["vehicle"])
-    params = jit(assembly.build_model(settings["model"], space(), plant).init)(jax.random.key(0))
-    kept = settings | {"space": assembly.space_to_settings(space())}
-    shelf.claim(settings)
-    policy.save(shelf.run_directory(settings) / "policy.npz", params, kept, made_from={})
+    plant = build.build_vehicle(settings["vehicle"])
+    params = jit(build.build_model(settings["model"], space(), plant).init)(jax.random.key(0))
+    kept = settings | {"space": build.space_to_settings(space())}
+    store.claim(settings)
+    policy.save(store.run_directory(settings) / "policy.npz", params, kept, made_from={})
     return settings
 
 

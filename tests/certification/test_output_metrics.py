@@ -10,18 +10,12 @@ from helpers import ENV_HIGH, ENV_LOW, TINY, path_space
 from jaxtyping import TypeCheckError
 
 from sfkd_jax import models
-from sfkd_jax.certification import (
-    OUTPUTS,
-    OutputMetric,
-    _output_metrics,
-    radii,
-    residuals,
-)
+from sfkd_jax.certification import OUTPUTS, OutputMetric, _output_metrics, radii, residuals
 from sfkd_jax.certification._claims import Refuted, readouts
 from sfkd_jax.certification._exported import exported
 from sfkd_jax.certification._metric_search import propose_metric
 from sfkd_jax.certification._radii import Residuals, worst_gaps
-from sfkd_jax.rollouts import rollout
+from sfkd_jax.core.rollouts import rollout
 from sfkd_jax.types import Trajectory
 
 OPTIONS = TINY | {"frame": "path", "transport": False, "budget": "joint", "forcing_hidden": 4, "rho": 0.85}

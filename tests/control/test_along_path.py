@@ -8,10 +8,10 @@ import numpy as np
 import pytest
 from helpers import any_law, tiny
 
-from sfkd_jax import assembly, control, vehicle
+from sfkd_jax import build, control, vehicle
 from sfkd_jax.control import at_turn, curvature_ahead, path_coordinates
+from sfkd_jax.core.se2 import compose
 from sfkd_jax.scenarios import path_from_curvature, reference_window
-from sfkd_jax.se2 import compose
 
 PLANT = vehicle.kinematic()
 LAW = any_law()
@@ -26,7 +26,7 @@ def bend(slope=1e-4):
 
 
 def planner(samples, **options):
-    model = assembly.reference_systems(PLANT, LAW)["oracle"].model
+    model = build.reference_systems(PLANT, LAW)["oracle"].model
     task = control.following_law(model, control.tracking_cost(dt=0.1), LAW, **LIMITS)
     return control.mppi(task, num_samples=samples, noise_std=(0.01, 0.2), **options)
 

@@ -7,7 +7,7 @@ import pytest
 from helpers import jit
 
 from sfkd_jax import control
-from sfkd_jax.control._curvature import FLATTEST, curvature_factor, shaped
+from sfkd_jax.control.laws._curvature import FLATTEST, curvature_factor, shaped
 
 HORIZON = 8
 A, B = np.float32([[1.0, 0.1], [0.0, 0.9]]), np.float32([[0.0, 0.02], [0.1, 0.0]])

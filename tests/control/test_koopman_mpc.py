@@ -10,7 +10,8 @@ import pytest
 from helpers import ENV_HIGH, ENV_LOW, dataset, jit, model_and_params, same, straight
 
 from sfkd_jax import control, datasets, evaluation, models, scenarios, vehicle
-from sfkd_jax.control import Stage, _koopman_mpc
+from sfkd_jax.control import Stage
+from sfkd_jax.control.planners import _koopman_mpc
 
 PLANT = vehicle.kinematic()
 LIMITS = {"dt": PLANT.dt, "control_low": PLANT.control_low, "control_high": PLANT.control_high}

@@ -10,7 +10,7 @@ import scipy.linalg
 from helpers import jit, model_and_params, straight
 
 from sfkd_jax import control, models, vehicle
-from sfkd_jax.control._model_law import _along_circle, solve
+from sfkd_jax.control.laws._model_law import _along_circle, solve
 
 LAW = control.ModelLaw(dt=0.1)
 PLANTS = {"kinematic": vehicle.kinematic(), "dynamic": vehicle.dynamic()}

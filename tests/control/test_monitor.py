@@ -9,7 +9,7 @@ import pytest
 from helpers import ENV_HIGH, ENV_LOW, at, driven, jit, model_and_params, same, straight
 
 from sfkd_jax import certification, control, evaluation, models, scenarios, vehicle
-from sfkd_jax.rollouts import fibers_along, step_disturbances
+from sfkd_jax.core.rollouts import fibers_along, step_disturbances
 from sfkd_jax.types import Controller, Trajectory
 
 PLANT = vehicle.kinematic()

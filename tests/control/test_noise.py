@@ -74,7 +74,7 @@ def test_the_spectrum_of_coloured_noise_falls_as_asked(exponent):
 @pytest.mark.parametrize("knots", [2, 3, 4, 7])
 def test_a_spline_through_knots_is_exact_for_the_polynomials_it_can_hold(knots):
     """Row by row the weights of the knots sum to one before scaling: a cubic is reproduced."""
-    from sfkd_jax.control._noise import _spline
+    from sfkd_jax.control.planners._noise import _spline
 
     spacing = (HORIZON - 1) / (knots - 1)
     places, steps = spacing * np.arange(knots), np.arange(HORIZON)

@@ -9,7 +9,7 @@ import pytest
 
 from sfkd_jax import artefacts, vehicle
 from sfkd_jax.control import derive_path_law, law_arrays, law_from_arrays
-from sfkd_jax.path_frame import path_state, path_step
+from sfkd_jax.core.path_frame import path_state, path_step
 from sfkd_jax.types import BODY
 
 BOX = {"env_low": (0.3, -8.0), "env_high": (0.9, 8.0)}

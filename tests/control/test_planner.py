@@ -266,7 +266,7 @@ def test_the_worst_case_is_cheaper_for_a_plan_that_was_made_for_it():
 
 
 def test_a_plan_is_shifted_by_the_time_that_has_passed():
-    from sfkd_jax.control._plans import shift
+    from sfkd_jax.control.planners._plans import shift
 
     plan = jnp.asarray([[0.0], [2.0], [4.0], [8.0]])
     for elapsed, expected in ((0.0, [0, 2, 4, 8]), (1.0, [2, 4, 8, 8]), (0.5, [1, 3, 6, 8]), (9.0, [8, 8, 8, 8])):

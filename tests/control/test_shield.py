@@ -8,9 +8,9 @@ import numpy as np
 import pytest
 from helpers import TINY, any_law, jit, path_space, same, tiny
 
-from sfkd_jax import assembly, control, models
+from sfkd_jax import build, control, models
 from sfkd_jax.control import admit, curvature_ahead, path_coordinates, shielded
-from sfkd_jax.path_frame import beside, path_state
+from sfkd_jax.core.path_frame import beside, path_state
 from sfkd_jax.types import BODY, Controller, Model
 from sfkd_jax.vehicle import kinematic
 
@@ -432,7 +432,7 @@ def test_the_box_of_a_certificate_holds_its_corridor(monkeypatch):
     boxes["control"] = [[-0.03, -1.0, -0.02, 8.0], [0.03, 1.0, 0.02, 10.0]]
     made = {}
     monkeypatch.setattr(control, "shielded", lambda inner, *_, **options: made.update(options) or inner)
-    assembly.in_corridor(scripted(), TOY, kinematic(), LAW, {"corridor": corridor, "boxes": boxes})
+    build.in_corridor(scripted(), TOY, kinematic(), LAW, {"corridor": corridor, "boxes": boxes})
     assert made["state_low"] == (pytest.approx(-0.17), -0.1, 7.0)
     assert made["state_high"] == (0.4, 0.1, 11.0)
     assert boxes["state"][0][0] == -0.05

@@ -9,6 +9,7 @@ import pytest
 from helpers import at, driven, jit, model_and_params
 
 from sfkd_jax import evaluation, models, scenarios, vehicle
+from sfkd_jax.core.rollouts import every_window, fibers_along, rollout, window_errors
 from sfkd_jax.evaluation import (
     Claims,
     Predictions,
@@ -19,7 +20,6 @@ from sfkd_jax.evaluation import (
     tube_violations,
     violations,
 )
-from sfkd_jax.rollouts import every_window, fibers_along, rollout, window_errors
 from sfkd_jax.types import Controller, Trajectory
 
 DT = 0.1

@@ -11,10 +11,10 @@ import scipy.special
 from helpers import at, driven, jit, same, space
 
 from sfkd_jax import models, vehicle
+from sfkd_jax.core.rollouts import rollout
+from sfkd_jax.core.se2 import compose
 from sfkd_jax.models._continuous import Conditioned, continuous
 from sfkd_jax.models._icode import affine_rates, softplus
-from sfkd_jax.rollouts import rollout
-from sfkd_jax.se2 import compose
 from sfkd_jax.types import BODY, POSE
 
 LEARNED = ("neural_ode", "icode", "icode_mppi")

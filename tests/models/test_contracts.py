@@ -9,8 +9,8 @@ import pytest
 from helpers import HARD, OTHERS, PHYSICS, TINY, VARIANTS, at, driven, jit, model_and_params, same, space, tiny
 
 from sfkd_jax import artefacts, models
-from sfkd_jax.rollouts import rollout
-from sfkd_jax.se2 import compose
+from sfkd_jax.core.rollouts import rollout
+from sfkd_jax.core.se2 import compose
 from sfkd_jax.types import POSE
 
 EVERY = (*VARIANTS, *OTHERS, *PHYSICS)

@@ -9,12 +9,13 @@ import numpy as np
 import pytest
 from helpers import driven, jit, space, tiny
 
-from sfkd_jax import models, walk
+from sfkd_jax import models
+from sfkd_jax.core.rollouts import defects
 from sfkd_jax.models._identification import bounded_ridge, ridge_regression
 from sfkd_jax.models.sfkd import bounded
 from sfkd_jax.models.sfkd._bounds import attainable, unbounded
 from sfkd_jax.models.sfkd._budget import budget_factors
-from sfkd_jax.rollouts import defects
+from sfkd_jax.pipeline import stages
 
 RIDGE, BOUND, RANK = 1e-3, 0.7, 4
 
@@ -123,8 +124,8 @@ def test_an_identified_start_predicts_better_than_a_drawn_one_within_its_bound_a
 def test_a_start_that_a_model_does_not_have_is_refused_by_name():
     blind, data, ours = models.FACTORIES["neural_ode"](space(), dt=0.1), driven(), tiny()
     with pytest.raises(ValueError, match=r"training\.start=identified needs a model=sfkd"):
-        walk._started(blind, "identified", data, 0)
+        stages._started(blind, "identified", data, 0)
     with pytest.raises(ValueError, match=r"training\.start must be one of random, identified, got 'identfied'"):
-        walk._started(ours, "identfied", data, 0)
-    assert walk._started(blind, "random", data, 0) is blind
-    assert walk._started(ours, "identified", data, 0).init is not ours.init
+        stages._started(ours, "identfied", data, 0)
+    assert stages._started(blind, "random", data, 0) is blind
+    assert stages._started(ours, "identified", data, 0).init is not ours.init

@@ -9,8 +9,8 @@ import pytest
 from helpers import TINY, any_law
 
 from sfkd_jax import models, vehicle
+from sfkd_jax.core.rollouts import defects
 from sfkd_jax.datasets import generate_along_path, measure_space, random_windows, split
-from sfkd_jax.rollouts import defects
 from sfkd_jax.training import multi_step_loss
 from sfkd_jax.training._losses import error_units, power_mean
 

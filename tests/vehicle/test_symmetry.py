@@ -5,7 +5,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from sfkd_jax.se2 import compose
+from sfkd_jax.core.se2 import compose
 from sfkd_jax.types import POSE
 from sfkd_jax.vehicle import with_speed_loop
 

@@ -5,7 +5,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from sfkd_jax.se2 import between
+from sfkd_jax.core.se2 import between
 
 GRAVITY = 9.81
 MASS, FRONT, REAR, LEVER = 1500.0, 1.2, 1.5, 0.4

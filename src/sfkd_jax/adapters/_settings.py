@@ -6,7 +6,7 @@ import math
 
 import jax
 
-from sfkd_jax import assembly
+from sfkd_jax import build
 from sfkd_jax.scenarios import Family
 from sfkd_jax.vehicle import Vehicle
 
@@ -15,14 +15,14 @@ def choose_plant(vehicle: str | Vehicle, inner_loop: str) -> Vehicle:
     """A plant by name, at the gain that its speed loop has by default."""
     if isinstance(vehicle, Vehicle):
         return vehicle
-    return assembly.build_vehicle({"name": vehicle, "inner_loop": inner_loop, "speed_gain": 1.0})
+    return build.build_vehicle({"name": vehicle, "inner_loop": inner_loop, "speed_gain": 1.0})
 
 
 def choose_family(scenario: str | Family, plant: Vehicle, duration: float) -> Family:
     """A scenario family by name, with the roads of the benchmark."""
     if not isinstance(scenario, str):
         return scenario
-    return assembly.build_scenario({"name": scenario}, plant, duration=duration)
+    return build.build_scenario({"name": scenario}, plant, duration=duration)
 
 
 def count_steps(family: Family, plant: Vehicle) -> int:

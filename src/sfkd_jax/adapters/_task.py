@@ -10,8 +10,8 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
 from sfkd_jax.adapters._settings import check_sizes, check_weights, choose_family, choose_plant, count_steps
+from sfkd_jax.core.se2 import between, wrap_angle
 from sfkd_jax.scenarios import Family, Scenario, point_at, project, reference_window
-from sfkd_jax.se2 import between, wrap_angle
 from sfkd_jax.types import BODY, POSE, Control, Environment, Key, Reference, Scalar, State
 from sfkd_jax.vehicle import Vehicle
 

@@ -26,15 +26,7 @@ from typing import Any
 import numpy as np
 
 from sfkd_jax.artefacts._content import differences, plain, sha256, versions
-from sfkd_jax.artefacts._files import (
-    ArtefactError,
-    encode,
-    failure,
-    open_regular,
-    read_json,
-    replacement,
-    synchronise,
-)
+from sfkd_jax.artefacts._files import ArtefactError, encode, failure, open_regular, read_json, replacement, synchronise
 from sfkd_jax.artefacts._npz import PORTABLE, check_archive, members, write_npz
 
 FORMAT = 1

@@ -25,8 +25,8 @@ from jaxtyping import Array, Float
 
 from sfkd_jax.certification._claims import Refuted
 from sfkd_jax.certification._output_metrics import OutputMetric
-from sfkd_jax.path_frame import LATERAL, PERTURBATION
-from sfkd_jax.rollouts import in_batches
+from sfkd_jax.core.path_frame import LATERAL, PERTURBATION
+from sfkd_jax.core.rollouts import in_batches
 from sfkd_jax.types import BODY, Environment, Model, Params, State
 
 BATCH = 500

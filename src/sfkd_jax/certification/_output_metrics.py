@@ -15,15 +15,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from sfkd_jax.certification._claims import Refuted, readouts
-from sfkd_jax.certification._core import (
-    UNIT,
-    Matrix,
-    Vector,
-    check_vertices,
-    frobenius,
-    is_positive_definite,
-    product,
-)
+from sfkd_jax.certification._core import UNIT, Matrix, Vector, check_vertices, frobenius, is_positive_definite, product
 from sfkd_jax.certification._exported import Exported
 from sfkd_jax.types import Polytope
 

@@ -12,8 +12,8 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from sfkd_jax.certification._output_metrics import OUTPUTS, OutputMetric
-from sfkd_jax.path_frame import HEADING, LATERAL
-from sfkd_jax.rollouts import defects, in_batches
+from sfkd_jax.core.path_frame import HEADING, LATERAL
+from sfkd_jax.core.rollouts import defects, in_batches
 from sfkd_jax.types import BODY, Model, Params, Trajectory
 
 BATCH = 50

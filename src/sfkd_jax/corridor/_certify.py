@@ -13,7 +13,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
 
-from sfkd_jax import assembly, policy
+from sfkd_jax import build, policy
 from sfkd_jax.certification import (
     CertificateContradicted,
     OutputMetric,
@@ -23,10 +23,10 @@ from sfkd_jax.certification import (
     fixed_points,
 )
 from sfkd_jax.control import admit
+from sfkd_jax.core.path_frame import PATH_SPEED, path_state
 from sfkd_jax.corridor._drives import EXCITATION, ROADS, Loop, closed, driving, measuring
 from sfkd_jax.datasets import drive_switching, generate_s3_along_path
 from sfkd_jax.evaluation import Outcome, Tube, attack_corridor, outcome_of
-from sfkd_jax.path_frame import PATH_SPEED, path_state
 from sfkd_jax.types import Control, Key
 
 STREAM = 4
@@ -59,8 +59,8 @@ def certify_corridor(
         ValueError: too few drives for the level, or a policy without a law.
     """
     began = time.perf_counter()
-    loop = closed(assembly.build_vehicle(settings["vehicle"]), trained, settings["evaluation"]["observation_noise"])
-    level, data = settings["certification"]["level"], assembly.without(settings["dataset"])
+    loop = closed(build.build_vehicle(settings["vehicle"]), trained, settings["evaluation"]["observation_noise"])
+    level, data = settings["certification"]["level"], build.without(settings["dataset"])
     roads = {name: data[name] for name in ROADS}
     box = {name: data[name] for name in ("env_low", "env_high")}
     asked = roads | {name: data[name] for name in EXCITATION}

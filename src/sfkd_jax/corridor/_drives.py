@@ -11,17 +11,11 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from sfkd_jax import assembly, policy
-from sfkd_jax.certification import (
-    OUTPUTS,
-    DriveScores,
-    OutputMetric,
-    drive_scores,
-    residuals,
-)
+from sfkd_jax import build, policy
+from sfkd_jax.certification import OUTPUTS, DriveScores, OutputMetric, drive_scores, residuals
 from sfkd_jax.control import PathLaw
-from sfkd_jax.path_frame import LATERAL, PERTURBATION
-from sfkd_jax.rollouts import in_batches, rollout
+from sfkd_jax.core.path_frame import LATERAL, PERTURBATION
+from sfkd_jax.core.rollouts import in_batches, rollout
 from sfkd_jax.types import BODY, Control, Environment, Key, Model, Params, State, Trajectory
 from sfkd_jax.vehicle import Vehicle
 
@@ -66,7 +60,7 @@ def closed(plant: Vehicle, trained: policy.Trained, noise: Sequence[float]) -> L
     if trained.law is None:
         raise ValueError("a corridor needs a policy in path coordinates, with its law: model.frame=path")
     params = jax.jit(trained.model.fold)(trained.params)
-    return Loop(assembly.build_loop(plant, trained.law), trained.law, trained.model, params, tuple(noise))
+    return Loop(build.build_loop(plant, trained.law), trained.law, trained.model, params, tuple(noise))
 
 
 def driving(loop: Loop, asked: Mapping[str, Any], duration: float) -> dict[str, Any]:

@@ -10,9 +10,9 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
+from sfkd_jax.core.path_frame import is_valid, path_state
+from sfkd_jax.core.rollouts import in_batches
 from sfkd_jax.datasets._path_excitation import perturbations, profile
-from sfkd_jax.path_frame import is_valid, path_state
-from sfkd_jax.rollouts import in_batches
 from sfkd_jax.scenarios import held_road, random_switching, switching_road, uniform_road, wet_road
 from sfkd_jax.types import BODY, Control, Environment, Key, Scalar, State, Trajectory
 from sfkd_jax.vehicle import Vehicle

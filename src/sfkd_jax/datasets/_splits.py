@@ -10,7 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int
 
-from sfkd_jax.se2 import between
+from sfkd_jax.core.se2 import between
 from sfkd_jax.types import BODY, POSE, Key, Space, Trajectory
 
 

@@ -6,9 +6,9 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from sfkd_jax.path_frame import PathFeedback, is_valid, path_state
+from sfkd_jax.core.path_frame import PathFeedback, is_valid, path_state
+from sfkd_jax.core.se2 import wrap_angle
 from sfkd_jax.scenarios import Path, path_through, point_at, project
-from sfkd_jax.se2 import wrap_angle
 from sfkd_jax.types import BODY, Scalar, State, Trajectory
 
 TIGHTEST = 0.2

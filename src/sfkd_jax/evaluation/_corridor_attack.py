@@ -10,7 +10,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from sfkd_jax.path_frame import LATERAL, path_state
+from sfkd_jax.core.path_frame import LATERAL, path_state
 from sfkd_jax.types import BODY, Environment, Key, Model, Params
 from sfkd_jax.vehicle import Vehicle
 

@@ -8,9 +8,9 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from sfkd_jax.path_frame import HEADING, LATERAL, PATH_SPEED
-from sfkd_jax.rollouts import every_window, in_batches, rollout
-from sfkd_jax.se2 import rotate, wrap_angle
+from sfkd_jax.core.path_frame import HEADING, LATERAL, PATH_SPEED
+from sfkd_jax.core.rollouts import every_window, in_batches, rollout
+from sfkd_jax.core.se2 import rotate, wrap_angle
 from sfkd_jax.types import BODY, Model, Params, Trajectory
 
 

@@ -11,7 +11,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from sfkd_jax.rollouts import defects, every_window, in_batches, prediction_errors, rollout
+from sfkd_jax.core.rollouts import defects, every_window, in_batches, prediction_errors, rollout
 from sfkd_jax.types import Model, Params, Trajectory
 
 STRIDE = 5

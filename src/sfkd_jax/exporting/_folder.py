@@ -11,7 +11,7 @@ from typing import Any
 import jax
 import numpy as np
 
-from sfkd_jax import artefacts, assembly, policy
+from sfkd_jax import artefacts, build, policy
 from sfkd_jax.exporting._iree import compile_iree
 from sfkd_jax.exporting._programs import Leaf, flat_programs, lowered
 from sfkd_jax.types import Params
@@ -103,13 +103,13 @@ def _certificate(trained: policy.Policy, folder: Path, policy_sha256: str) -> st
 
 def _vehicle(trained: policy.Policy) -> dict[str, Any]:
     """What the numbers mean: names, units and limits."""
-    plant, settings = assembly.build_vehicle(trained.settings["vehicle"]), trained.settings
+    plant, settings = build.build_vehicle(trained.settings["vehicle"]), trained.settings
     drive = "speed command [m/s]" if plant.speed_loop else "acceleration [m/s^2]"
     limits = zip(("steering [rad]", drive), plant.control_low, plant.control_high, strict=True)
     box = {side: list(settings["dataset"][f"env_{side}"]) for side in ("low", "high")}
     return {
         "sampling_period_s": plant.dt,
-        "horizon": assembly.controller_horizon(settings["controller"]),
+        "horizon": build.controller_horizon(settings["controller"]),
         "controls": [{"name": name, "low": low, "high": high} for name, low, high in limits],
         "observation": list(plant.state_names),
         "environment": {"names": ["friction [-]", "lateral wind [m/s]"], **box},

@@ -11,7 +11,7 @@ import jax.export
 import jax.numpy as jnp
 from jaxtyping import Array
 
-from sfkd_jax import assembly
+from sfkd_jax import build
 from sfkd_jax.exporting._jax_settings import jax_settings
 from sfkd_jax.policy import Policy
 
@@ -50,9 +50,9 @@ def example_inputs(policy: Policy) -> tuple[Any, ...]:
     """Shapes of (key, controller state, observation, env, reference) of a policy's controller."""
     key = jax.eval_shape(partial(jax.random.key, 0))
     settings = policy.settings
-    plant = assembly.build_vehicle(settings["vehicle"])
+    plant = build.build_vehicle(settings["vehicle"])
     sizes = (len(plant.state_names),), (len(settings["space"]["env_mean"]),)
-    shapes = *sizes, (assembly.controller_horizon(settings["controller"]), 4)
+    shapes = *sizes, (build.controller_horizon(settings["controller"]), 4)
     measured = (jax.ShapeDtypeStruct(shape, jnp.float32) for shape in shapes)
     return key, jax.eval_shape(policy.controller.init, key), *measured
 

@@ -9,7 +9,7 @@ import flax.linen as nn
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from sfkd_jax.se2 import rotate
+from sfkd_jax.core.se2 import rotate
 from sfkd_jax.types import BODY, Control, Environment, Explicit, Fiber, Key, Model, Params, Space, State
 
 SOLVERS = ("rk4", "euler")

@@ -18,15 +18,7 @@ from sfkd_jax.reporting._benchmark_rows import (
     side,
     title,
 )
-from sfkd_jax.reporting._benchmark_tables import (
-    STEPS,
-    Paper,
-    bounds,
-    certified,
-    conformal,
-    millimetres,
-    percent,
-)
+from sfkd_jax.reporting._benchmark_tables import STEPS, Paper, bounds, certified, conformal, millimetres, percent
 from sfkd_jax.reporting._blocks import Block, Heading, Table, Text
 from sfkd_jax.reporting._numbers import DASH, dig, is_number, number, short
 from sfkd_jax.reporting._style import label, scenario_label

@@ -9,9 +9,9 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from sfkd_jax.path_frame import HEADING, LATERAL
-from sfkd_jax.rollouts import defects, rollout
-from sfkd_jax.se2 import rotate, wrap_angle
+from sfkd_jax.core.path_frame import HEADING, LATERAL
+from sfkd_jax.core.rollouts import defects, rollout
+from sfkd_jax.core.se2 import rotate, wrap_angle
 from sfkd_jax.types import BODY, Explicit, Model, Params, Scalar, Space, Trajectory
 
 Loss: TypeAlias = Callable[[Params, Trajectory], tuple[Scalar, dict[str, Scalar]]]

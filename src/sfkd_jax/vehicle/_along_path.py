@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from sfkd_jax.path_frame import PathFeedback, closed_loop
+from sfkd_jax.core.path_frame import PathFeedback, closed_loop
 from sfkd_jax.types import Control, Environment, State
 from sfkd_jax.vehicle._vehicle import SPEED_RANGE, Vehicle
 

@@ -8,6 +8,7 @@ from typing import cast
 import jax
 import jax.numpy as jnp
 
+from sfkd_jax.core.se2 import between, compose
 from sfkd_jax.models._continuous import scaled_env
 from sfkd_jax.models.sfkd._networks import Encoder, Networks, PerEnvironment, Shared
 from sfkd_jax.models.sfkd._records import Mixture, SfkdFiber, SfkdLatent
@@ -15,7 +16,6 @@ from sfkd_jax.models.sfkd._sandwich import apply
 from sfkd_jax.models.sfkd._settings import check_settings
 from sfkd_jax.models.sfkd._start import identified
 from sfkd_jax.models.sfkd._transport import rotate_planes
-from sfkd_jax.se2 import between, compose
 from sfkd_jax.types import (
     BODY,
     POSE,

@@ -8,12 +8,12 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
+from sfkd_jax.core.rollouts import fibers_along
 from sfkd_jax.models._continuous import scaled_env
 from sfkd_jax.models._identification import bounded_ridge
 from sfkd_jax.models.sfkd._bounds import attainable, unbounded
 from sfkd_jax.models.sfkd._budget import budget_factors
 from sfkd_jax.models.sfkd._networks import Networks, PerEnvironment
-from sfkd_jax.rollouts import fibers_along
 from sfkd_jax.types import Key, Model, Params, Space, Trajectory
 
 

@@ -1,0 +1,1 @@
+"""Feedback laws along a path."""

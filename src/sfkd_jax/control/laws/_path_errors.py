@@ -1,0 +1,86 @@
+"""Errors of a state against a reference path, and the feedback law that the planner samples around."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import NamedTuple, TypeAlias
+
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+from sfkd_jax.core.se2 import wrap_angle
+from sfkd_jax.types import Control, Reference, Scalar, State
+
+
+class PathErrors(NamedTuple):
+    """Where a state stands against one reference point.
+
+    Attributes:
+        lateral: distance left of the path [m]. heading: yaw against the path [rad]. speed: too fast by [m/s].
+    """
+
+    lateral: Scalar
+    heading: Scalar
+    speed: Scalar
+
+
+Law: TypeAlias = Callable[[PathErrors, Scalar, Scalar], Control]
+
+
+def path_errors(state: State, point: Float[Array, " 4"], curvature: Scalar) -> PathErrors:
+    """Errors against the circle that touches the path at `point`, to second order in the distance along it.
+
+    Args:
+        state: p_x, p_y, yaw, v, ….
+        point: x, y, yaw, speed of the reference.
+        curvature: of the path there [1/m].
+    """
+    dx, dy = state[0] - point[0], state[1] - point[1]
+    c, s = jnp.cos(point[2]), jnp.sin(point[2])
+    along = c * dx + s * dy
+    lateral = c * dy - s * dx - 0.5 * curvature * along**2
+    heading = wrap_angle(state[2] - point[2] - curvature * along)
+    return PathErrors(lateral, heading, state[3] - point[3])
+
+
+def reference_curvature(reference: Reference) -> Float[Array, " horizon"]:
+    """κ_k from the turn between neighbouring reference points [1/m]; 0 where they coincide."""
+    steps = jnp.diff(reference, axis=0)
+    distance = jnp.hypot(steps[:, 0], steps[:, 1])
+    moved = distance > 1e-3
+    between = jnp.where(moved, wrap_angle(steps[:, 2]) / jnp.where(moved, distance, 1.0), 0.0)
+    ends = jnp.concatenate([between[:1], between, between[-1:]])
+    return 0.5 * (ends[1:] + ends[:-1])
+
+
+def path_feedback(
+    *,
+    wheelbase: float,
+    lateral_gain: float = 0.03,
+    heading_gain: float = 0.4,
+    speed_gain: float = 1.0,
+    speed_loop: bool = False,
+) -> Law:
+    """u = u_ff(κ) + K ξ: δ = atan(L κ) − k_y e_y − k_ψ e_ψ, a = −k_v e_v (or the speed command v_ref − k_v e_v).
+
+    Args:
+        wheelbase: L [m]. lateral_gain: [rad/m]. heading_gain: [-]. speed_gain: [1/s], or [-] with a speed loop.
+        speed_loop: whether the second control is a speed command.
+    """
+
+    def law(errors: PathErrors, curvature: Scalar, speed: Scalar) -> Control:
+        steering = jnp.arctan(wheelbase * curvature) - lateral_gain * errors.lateral - heading_gain * errors.heading
+        correction = -speed_gain * errors.speed
+        return jnp.stack([steering, correction + speed if speed_loop else correction])
+
+    return law
+
+
+def no_feedback(*, speed_loop: bool = False) -> Law:
+    """u = 0 (or the reference speed): plain sampling."""
+
+    def law(errors: PathErrors, curvature: Scalar, speed: Scalar) -> Control:
+        del errors, curvature
+        return jnp.stack([jnp.zeros_like(speed), speed if speed_loop else jnp.zeros_like(speed)])
+
+    return law

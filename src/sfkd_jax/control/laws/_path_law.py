@@ -1,0 +1,92 @@
+"""A path-following law as tables: steady turns of a vehicle's own step, and gains around them."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from itertools import product
+from math import prod
+from typing import Any, NamedTuple
+
+import jax.numpy as jnp
+from jaxtyping import Array, Float, Int
+
+from sfkd_jax.control.laws._model_law import SteadyTurn
+from sfkd_jax.core.path_frame import PATH_SPEED, PathState
+from sfkd_jax.types import Control, Environment, Scalar
+
+
+class PathLaw(NamedTuple):
+    """u = u*(a, v, e) − K(a, v, e) (ξ − ξ*(a, v, e)), a = v² κ, every table linear between its points.
+
+    Tables are over the lateral acceleration a that a turn asks for, not over κ: what the tyres hold is a box then.
+    A pytree of arrays: it is stored beside the weights that were learned around it.
+
+    Attributes:
+        low, high: ends of the axes (a [m/s²], v_ref [m/s], e_1, …), each divided evenly.
+        perturbation: largest |ν| that data and planners add to u [rad, control unit], (2,).
+        state: ξ* of the steady turns, (*axes, coordinate). control: u*, (*axes, 2).
+        gain: K, (*axes, 2, coordinate).
+    """
+
+    low: Float[Array, " axis"]
+    high: Float[Array, " axis"]
+    perturbation: Float[Array, " 2"]
+    state: Float[Array, "*axes coordinate"]
+    control: Float[Array, "*axes 2"]
+    gain: Float[Array, "*axes 2 coordinate"]
+
+    def turn(self, curvature: Scalar, speed: Scalar, env: Environment) -> SteadyTurn:
+        """How to drive along a circle; outside the axes, as at their ends.
+
+        The steady speed is the one that is asked for, whatever the tables hold.
+        """
+        at = jnp.concatenate([jnp.stack([curvature * speed**2, speed]), env])
+        counts = self.control.shape[:-1]
+        rows, weights = _corners(at, self.low, self.high, counts)
+
+        def between(table: Array) -> Array:
+            corners = table.reshape(-1, *table.shape[len(counts) :])[rows]
+            return jnp.tensordot(weights, corners, axes=1)
+
+        state, control, gain = (between(table) for table in (self.state, self.control, self.gain))
+        return SteadyTurn(state.at[PATH_SPEED].set(speed), control, gain)
+
+    def __call__(self, coordinates: PathState, curvature: Scalar, speed: Scalar, env: Environment) -> Control:
+        """u, not clipped to any limit."""
+        return at_turn(self.turn(curvature, speed, env), coordinates)
+
+
+def at_turn(turn: SteadyTurn, coordinates: PathState) -> Control:
+    """u* − K (ξ − ξ*)."""
+    return turn.control - turn.gain @ (coordinates - turn.state)
+
+
+def _corners(
+    at: Float[Array, " axis"],
+    low: Float[Array, " axis"],
+    high: Float[Array, " axis"],
+    counts: tuple[int, ...],
+) -> tuple[Int[Array, " corner"], Float[Array, " corner"]]:
+    """Flat indices and weights of the grid points around a point, for multilinear interpolation."""
+    last = jnp.asarray(counts) - 1
+    place = jnp.clip((at - low) / (high - low), 0.0, 1.0) * last
+    index = jnp.minimum(jnp.floor(place).astype(int), last - 1)
+    beyond = place - index
+    sides = jnp.asarray(list(product((0, 1), repeat=len(counts))))
+    strides = jnp.asarray([prod(counts[axis + 1 :]) for axis in range(len(counts))])
+    weights = jnp.prod(jnp.where(sides == 1, beyond, 1.0 - beyond), axis=1)
+    return (index + sides) @ strides, weights
+
+
+def law_arrays(law: PathLaw) -> dict[str, Array]:
+    """The law as a dictionary of arrays, to be stored."""
+    return law._asdict()
+
+
+def law_from_arrays(arrays: Mapping[str, Any]) -> PathLaw:
+    """The law that was stored.
+
+    Raises:
+        KeyError: an array is missing.
+    """
+    return PathLaw(**{name: jnp.asarray(arrays[name]) for name in PathLaw._fields})

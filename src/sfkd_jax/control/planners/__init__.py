@@ -1,0 +1,1 @@
+"""Sampling, gradient and quadratic-program planners."""

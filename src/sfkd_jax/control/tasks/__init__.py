@@ -1,0 +1,1 @@
+"""Tasks: dynamics, cost and limits that a planner plans for."""

@@ -1,0 +1,1 @@
+"""Core types: planar poses, path coordinates and what any model predicts."""

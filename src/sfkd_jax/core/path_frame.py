@@ -1,0 +1,96 @@
+"""Path coordinates: the car seen from the foot of the path beside it, and a step of the loop closed around it.
+
+A path state is a `State` whose pose is that of the foot point in its own frame, 0, and
+whose body is ξ = (e_y [m], e_ψ [rad], v [m/s], …): distance left of the path, yaw against
+it, and the vehicle's own body state. Its control is w = (ν, κ, v_ref): what is added to
+the law's control, the path's curvature [1/m] over the step, and the speed asked for [m/s].
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import TypeAlias
+
+import jax.numpy as jnp
+from jaxtyping import Array, Bool, Float
+
+from sfkd_jax.core.se2 import wrap_angle
+from sfkd_jax.types import BODY, POSE, Control, Environment, Pose, Scalar, State, Step
+
+PathState: TypeAlias = Float[Array, " coordinate"]
+"""ξ = (e_y, e_ψ, v, …): the body of a path state."""
+LATERAL, HEADING, PATH_SPEED = 0, 1, 2
+"""Where e_y, e_ψ and v stand in ξ."""
+PERTURBATION = slice(0, 2)
+"""Where ν stands in w."""
+CURVATURE, REFERENCE_SPEED = 2, 3
+"""Where κ and v_ref stand in w."""
+SMALLEST_SCALE = 0.2
+"""Of 1 − κ e_y: beyond, the car is so near to the path's centre of curvature that its foot says little."""
+
+PathFeedback: TypeAlias = Callable[[PathState, Scalar, Scalar, Environment], Control]
+"""(ξ, κ, v_ref, e) -> u, not yet clipped."""
+
+
+def on_circle(pose: Pose, curvature: Scalar) -> tuple[Scalar, Scalar]:
+    """e_y [m] and e_ψ [rad] of a pose against the circle of curvature κ through the origin.
+
+        q = κ (x² + y²) − 2 y,   e_y = −q / (1 + √(1 + κ q)),   e_ψ = yaw − atan2(κ x, 1 − κ y)
+
+    Exact, and without a singularity at κ = 0. √(1 + κ q) = 1 − κ e_y is held at
+    `SMALLEST_SCALE`, so that the result is finite wherever the car is; see `is_valid`.
+
+    Args:
+        pose: x [m], y [m], yaw [rad] in the frame that touches the circle at its origin.
+        curvature: κ [1/m], left positive.
+    """
+    x, y, yaw = pose[0], pose[1], pose[2]
+    q = curvature * (x**2 + y**2) - 2.0 * y
+    scale = jnp.sqrt(jnp.maximum(1.0 + curvature * q, SMALLEST_SCALE**2))
+    turned = jnp.arctan2(curvature * x, 1.0 - curvature * y)
+    return -q / (1.0 + scale), wrap_angle(yaw - turned)
+
+
+def is_valid(lateral: Float[Array, "*shape"], curvature: Float[Array, "*shape"]) -> Bool[Array, "*shape"]:
+    """Whether path coordinates mean something: 1 − κ e_y > 0.2; False for NaN."""
+    return 1.0 - curvature * lateral > SMALLEST_SCALE
+
+
+def path_state(coordinates: PathState) -> State:
+    """ξ as a `State`: the foot in its own frame, and ξ as the body."""
+    return jnp.concatenate([jnp.zeros(3), coordinates])
+
+
+def beside(coordinates: PathState) -> State:
+    """The vehicle's state in the frame of the foot: pose (0, e_y, e_ψ), body s."""
+    return jnp.concatenate([jnp.zeros(1), coordinates])
+
+
+def path_step(step: Step) -> Callable[[PathState, Control, Scalar, Environment], PathState]:
+    """(ξ, u, κ, e) -> ξ one period later, of a vehicle's step; exact on a circle of curvature κ."""
+
+    def along(coordinates: PathState, control: Control, curvature: Scalar, env: Environment) -> PathState:
+        after = step(beside(coordinates), control, env)
+        lateral, heading = on_circle(after[POSE], curvature)
+        return jnp.concatenate([jnp.stack([lateral, heading]), after[BODY]])
+
+    return along
+
+
+def closed_loop(step: Step, law: PathFeedback, low: tuple[float, ...], high: tuple[float, ...]) -> Step:
+    """(path state, w, e) -> path state: ξ⁺ = F(ξ, clip(law(ξ; κ, v_ref, e) + ν); κ, e).
+
+    Args:
+        step: of the vehicle, in the world. law: around which the loop is closed.
+        low, high: limits of the vehicle's controls.
+    """
+    along = path_step(step)
+    bottom, top = jnp.asarray(low), jnp.asarray(high)
+
+    def closed(state: State, inputs: Control, env: Environment) -> State:
+        curvature = inputs[CURVATURE]
+        wanted = law(state[BODY], curvature, inputs[REFERENCE_SPEED], env)
+        control = jnp.clip(wanted + inputs[PERTURBATION], bottom, top)
+        return path_state(along(state[BODY], control, curvature, env))
+
+    return closed
