@@ -1,8 +1,9 @@
 """Drive CommonRoad's cars on three frictions: shipped policies, the nominal bicycle, policies trained on such a car.
 
-python benchmarks/commonroad.py [--paths 3 --seconds 15 --segments 200 --steps 400 --out experiments/commonroad]
-Needs the extra `plants`. The tuned policies, their certificates, an export and finished rows go to --root; after an
-interruption the same command continues there.
+python benchmarks/commonroad.py [--paths 3 --seconds 15 --segments 200 --steps 400 --out
+experiments/commonroad] Needs the extra `plants`. The tuned policies, their
+certificates, an export and finished rows go to --root; after an interruption the same
+command continues there.
 """
 
 import argparse
@@ -30,7 +31,9 @@ POLICIES = {"sfkd": "dynamic", "sfkd_kinematic": "kinematic"}
 
 
 class Driver(NamedTuple):
-    """Who drives: `states` is what it knows of a car, None for everything; `about` goes into its row."""
+    """Who drives: `states` is what it knows of a car, None for everything; `about` goes
+    into its row.
+    """
 
     controller: Controller
     params: Any
@@ -41,9 +44,18 @@ class Driver(NamedTuple):
 def policy_driver(trained, system):
     """A policy, from where `sfkd_jax.load` found it."""
     names = build.build_vehicle(trained.settings["vehicle"]).state_names
-    about = {"system": system, "env": "measured", "alpha": trained.certificate and trained.certificate["alpha"]}
+    about = {
+        "system": system,
+        "env": "measured",
+        "alpha": trained.certificate and trained.certificate["alpha"],
+    }
     params = jax.jit(trained.model.fold)(trained.params)
-    return Driver(trained.controller, params, len(names), about | {"watched": trained.certificate is not None})
+    return Driver(
+        trained.controller,
+        params,
+        len(names),
+        about | {"watched": trained.certificate is not None},
+    )
 
 
 def nominal_driver(asked, plant, system, states):
@@ -51,7 +63,10 @@ def nominal_driver(asked, plant, system, states):
     found = build.reference_systems(plant)["nominal"]
     controller = build.build_controller(asked["controller"], found.model, plant)
     return Driver(
-        controller, found.params, states, {"system": system, "env": found.env, "alpha": None, "watched": False}
+        controller,
+        found.params,
+        states,
+        {"system": system, "env": found.env, "alpha": None, "watched": False},
     )
 
 
@@ -76,34 +91,62 @@ def rows_of(plant, driver, track, asked, paths):
     options["observation_noise"] = tuple(asked["evaluation"]["observation_noise"])
 
     def one(road, key):
-        return evaluation.simulate(plant.step, controller, driver.params, road, key, **options)
+        return evaluation.simulate(
+            plant.step, controller, driver.params, road, key, **options
+        )
 
     began = time.perf_counter()
     episodes = jax.block_until_ready(jax.jit(jax.vmap(one))(roads, keys))
-    print(f"{plant.name} {driver.about['system']}: {time.perf_counter() - began:.0f} s", file=sys.stderr, flush=True)
+    print(
+        f"{plant.name} {driver.about['system']}: {time.perf_counter() - began:.0f} s",
+        file=sys.stderr,
+        flush=True,
+    )
     nothing, rows = evaluation.violations(None, evaluation.Claims()), []
     for place, friction in enumerate(FRICTIONS):
         chosen = slice(place * paths, (place + 1) * paths)
-        part, envs = jax.tree.map(lambda leaf, chosen=chosen: leaf[chosen], (episodes, roads.envs))
+        part, envs = jax.tree.map(
+            lambda leaf, chosen=chosen: leaf[chosen], (episodes, roads.envs)
+        )
         scores = evaluation.score(part, np.asarray(envs), dt=plant.dt)
-        about = {name: value for name, value in driver.about.items() if name != "watched"}
-        about |= {"scenario": f"s1, friction {friction}", "friction": friction, "vehicle": plant.name}
+        about = {
+            name: value for name, value in driver.about.items() if name != "watched"
+        }
+        about |= {
+            "scenario": f"s1, friction {friction}",
+            "friction": friction,
+            "vehicle": plant.name,
+        }
         about |= {"sampling": asked["controller"]["sampling"], "variation": None}
-        rows.append(evaluation.row(scores, about, None, nothing, watched=driver.about["watched"]))
+        rows.append(
+            evaluation.row(
+                scores, about, None, nothing, watched=driver.about["watched"]
+            )
+        )
     return rows
 
 
 def compared(rows):
-    """RMSE over that of the nominal bicycle by path, and of a tuned policy over the policy before; None if it spun."""
-    found = {(row["vehicle"], row["friction"], row["system"]): _by_path(row) for row in rows}
+    """RMSE over that of the nominal bicycle by path, and of a tuned policy over the
+    policy before; None if it spun.
+    """
+    found = {
+        (row["vehicle"], row["friction"], row["system"]): _by_path(row) for row in rows
+    }
     for row in rows:
         where, mine = (row["vehicle"], row["friction"]), _by_path(row)
         for name in ("nominal", "nominal_this_car"):
             other = found[*where, name]
             row[f"ratio_to_{name}"] = float(mine.mean() / other.mean())
             row[f"worst_ratio_to_{name}"] = float(np.max(mine / other))
-        before = found.get((*where, row["system"].removesuffix("_tuned"))) if row["system"].endswith("_tuned") else None
-        row["ratio_to_untuned"] = None if before is None else float(mine.mean() / before.mean())
+        before = (
+            found.get((*where, row["system"].removesuffix("_tuned")))
+            if row["system"].endswith("_tuned")
+            else None
+        )
+        row["ratio_to_untuned"] = (
+            None if before is None else float(mine.mean() / before.mean())
+        )
     return rows
 
 
@@ -113,7 +156,9 @@ def _by_path(row):
 
 
 def handling(plants, steering=0.04, seconds=3.0):
-    """Curvature ω / v of a steady turn at about 10 m/s over that of the bicycle with our car's wheelbase."""
+    """Curvature ω / v of a steady turn at about 10 m/s over that of the bicycle with
+    our car's wheelbase.
+    """
     nominal = np.tan(steering) / plants["dynamic"].wheelbase
     return {
         name: [_steady(plant, steering, each, seconds) / nominal for each in FRICTIONS]
@@ -126,33 +171,62 @@ def _steady(plant, steering, friction, seconds):
     step, before = jax.jit(plant.step), None
     state = jnp.zeros(len(plant.state_names)).at[3].set(10.0)
     for _ in range(round(seconds / plant.dt)):
-        before, state = state, step(state, jnp.asarray([steering, 0.0]), jnp.asarray([friction, 0.0]))
+        before, state = (
+            state,
+            step(state, jnp.asarray([steering, 0.0]), jnp.asarray([friction, 0.0])),
+        )
     return float((state[2] - before[2]) / jnp.linalg.norm(state[:2] - before[:2]))
 
 
 def exported_alike(trained, plant, track, root):
-    """Drive one road with the controller as it is and as exported: RMSE, and the largest difference of a control."""
-    exporting.write_controller(trained, root / "export", made_from={}, platforms=("cpu",))
+    """Drive one road with the controller as it is and as exported: RMSE, and the
+    largest difference of a control.
+    """
+    exporting.write_controller(
+        trained, root / "export", made_from={}, platforms=("cpu",)
+    )
     sys.path.insert(0, str(root / "export"))
     from run_controller import ExportedController
 
-    shipped, act, step = ExportedController(root / "export"), jax.jit(trained.controller.act), jax.jit(plant.step)
+    shipped, act, step = (
+        ExportedController(root / "export"),
+        jax.jit(trained.controller.act),
+        jax.jit(plant.step),
+    )
     road = jax.tree.map(lambda leaf: leaf[0], track[0])
     drivers = {
-        "as it is": (trained.controller.init(jax.random.key(0)), lambda *seen: act(trained.params, *seen)),
+        "as it is": (
+            trained.controller.init(jax.random.key(0)),
+            lambda *seen: act(trained.params, *seen),
+        ),
         "exported": (shipped.init(seed=0), shipped.act),
     }
     horizon = build.controller_horizon(trained.settings["controller"])
-    drives = {name: _host_drive(*driver, step, road, plant.dt, horizon) for name, driver in drivers.items()}
+    drives = {
+        name: _host_drive(*driver, step, road, plant.dt, horizon)
+        for name, driver in drivers.items()
+    }
     (controls, lateral), (others, _) = drives["exported"], drives["as it is"]
     difference = float(np.abs(controls - others).max())
-    return {"steps": len(controls), "rmse_m": float(np.sqrt(np.mean(lateral**2))), "largest_difference": difference}
+    return {
+        "steps": len(controls),
+        "rmse_m": float(np.sqrt(np.mean(lateral**2))),
+        "largest_difference": difference,
+    }
 
 
 def _host_drive(memory, act, step, road, dt, horizon):
-    """The closed loop without noise, one step after the other: controls, lateral deviations."""
-    window = jax.jit(lambda s: scenarios.reference_window(road.path, s, road.speed, dt=dt, horizon=horizon))
-    locate = jax.jit(lambda state, s: scenarios.project(road.path, state[:2], s + road.speed * dt))
+    """The closed loop without noise, one step after the other: controls, lateral
+    deviations.
+    """
+    window = jax.jit(
+        lambda s: scenarios.reference_window(
+            road.path, s, road.speed, dt=dt, horizon=horizon
+        )
+    )
+    locate = jax.jit(
+        lambda state, s: scenarios.project(road.path, state[:2], s + road.speed * dt)
+    )
     state, progress, controls, lateral = road.initial_state, jnp.zeros(()), [], []
     for env in road.envs:
         seen = adapters.commonroad_observation(state)
@@ -166,7 +240,9 @@ def _host_drive(memory, act, step, road, dt, horizon):
 
 def main():
     """Parse, tune, drive, compare, write."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
     for name, value in (("paths", 3), ("segments", 200), ("steps", 400)):
         parser.add_argument(f"--{name}", type=int, default=value)
     parser.add_argument("--seconds", type=float, default=15.0)
@@ -176,11 +252,20 @@ def main():
     plants = {name: adapters.commonroad_vehicle(model=name) for name in CARS}
     before = {row: sfkd_jax.load(SHIPPED / ours) for row, ours in POLICIES.items()}
     sizes = {"segments": given.segments, "steps": given.steps}
-    after, tuning = commonroad_tuning.tune_all(before, plants["std"], asked, given.root, **sizes)
-    rows, trained = [], before | {f"{row}_tuned": policy for row, policy in after.items()}
+    after, tuning = commonroad_tuning.tune_all(
+        before, plants["std"], asked, given.root, **sizes
+    )
+    rows, trained = (
+        [],
+        before | {f"{row}_tuned": policy for row, policy in after.items()},
+    )
     for car, plant in plants.items():
         track = lay(plant, given.paths, given.seconds, asked["evaluation"]["seed"])
-        place = given.root / "rows" / "-".join(map(str, (car, given.paths, given.seconds, *sizes.values())))
+        place = (
+            given.root
+            / "rows"
+            / "-".join(map(str, (car, given.paths, given.seconds, *sizes.values())))
+        )
         ours = build.build_vehicle(asked["vehicle"])
         drivers = [nominal_driver(asked, ours, "nominal", len(ours.state_names))]
         drivers += [nominal_driver(asked, plant, "nominal_this_car", None)]
@@ -189,19 +274,40 @@ def main():
             path = place / f"{driver.about['system']}.json"
             if not path.exists():
                 path.parent.mkdir(parents=True, exist_ok=True)
-                artefacts.write_json(path, {"rows": rows_of(plant, driver, track, asked, given.paths)})
+                artefacts.write_json(
+                    path, {"rows": rows_of(plant, driver, track, asked, given.paths)}
+                )
             rows += artefacts.read_json(path)["rows"]
     track = lay(plants["std"], given.paths, given.seconds, asked["evaluation"]["seed"])
     alike = exported_alike(before["sfkd"], plants["std"], track, given.root)
     kept = {"paths": given.paths, "seconds": given.seconds, **sizes}
-    turns = handling({name: build.PLANTS[name]() for name in POLICIES.values()} | plants)
-    document = {"rows": compared(rows), "tuning": tuning, "handling": turns, "export": alike, "config": kept | asked}
+    turns = handling(
+        {name: build.PLANTS[name]() for name in POLICIES.values()} | plants
+    )
+    document = {
+        "rows": compared(rows),
+        "tuning": tuning,
+        "handling": turns,
+        "export": alike,
+        "config": kept | asked,
+    }
     document["versions"] = artefacts.versions()
     artefacts.write_json(given.out / "results.json", document)
     document = artefacts.read_json(given.out / "results.json")
     for row in document["rows"]:
-        mean = "spun" if row["rmse_m"]["mean"] is None else f"{1e3 * row['rmse_m']['mean']:.1f} mm"
-        print(row["vehicle"], row["friction"], row["system"], mean, f"{row['departures']} departures", sep="  ")
+        mean = (
+            "spun"
+            if row["rmse_m"]["mean"] is None
+            else f"{1e3 * row['rmse_m']['mean']:.1f} mm"
+        )
+        print(
+            row["vehicle"],
+            row["friction"],
+            row["system"],
+            mean,
+            f"{row['departures']} departures",
+            sep="  ",
+        )
     print(json.dumps({"results": str(given.out / "results.json"), "rows": len(rows)}))
 
 

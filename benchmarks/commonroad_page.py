@@ -28,39 +28,69 @@ CARS = {"commonroad_std": "single-track drift", "commonroad_mb": "multi-body"}
 
 def results():
     """The document of the last run."""
-    return json.loads((ROOT / "experiments" / "commonroad" / "results.json").read_text())
+    return json.loads(
+        (ROOT / "experiments" / "commonroad" / "results.json").read_text()
+    )
 
 
 def deviations():
-    """Lateral RMSE by car, friction and system [mm], and how many episodes left the lane."""
+    """Lateral RMSE by car, friction and system [mm], and how many episodes left the
+    lane.
+    """
     rows, lines = results()["rows"], []
     for name, (label, *_) in SYSTEMS.items():
         mine = [row for row in rows if row["system"] == name]
-        lines.append([label, *map(deviation, mine), sum(row["departures"] for row in mine)])
+        lines.append(
+            [label, *map(deviation, mine), sum(row["departures"] for row in mine)]
+        )
     first = [row for row in rows if row["system"] == "nominal"]
-    return tables.table(["", *(f"{CARS[row['vehicle']]}, {row['friction']}" for row in first), "left the lane"], lines)
+    return tables.table(
+        [
+            "",
+            *(f"{CARS[row['vehicle']]}, {row['friction']}" for row in first),
+            "left the lane",
+        ],
+        lines,
+    )
 
 
 def deviation(row):
     """In millimetres, with the departures."""
     mean, left = row["rmse_m"]["mean"], row["departures"]
-    return ("spun" if mean is None else f"{1e3 * mean:.1f}") + (f" ({left} left)" if left else "")
+    return ("spun" if mean is None else f"{1e3 * mean:.1f}") + (
+        f" ({left} left)" if left else ""
+    )
 
 
 def ratios():
-    """Every SFKD row over the nominal bicycle (all paths, worst path), over itself before, and the monitor's flags."""
+    """Every SFKD row over the nominal bicycle (all paths, worst path), over itself
+    before, and the monitor's flags.
+    """
     lines = []
     for name, (label, *_) in SYSTEMS.items():
         for car, words in CARS.items():
-            mine = [row for row in results()["rows"] if (row["system"], row["vehicle"]) == (name, car)]
+            mine = [
+                row
+                for row in results()["rows"]
+                if (row["system"], row["vehicle"]) == (name, car)
+            ]
             if name.startswith("nominal"):
                 continue
-            entries = [f"{times(row['ratio_to_nominal'])} ({times(row['worst_ratio_to_nominal'])})" for row in mine]
-            untuned = " / ".join(times(row["ratio_to_untuned"]) for row in mine) if name.endswith("_tuned") else ""
+            entries = [
+                f"{times(row['ratio_to_nominal'])} ({times(row['worst_ratio_to_nominal'])})"
+                for row in mine
+            ]
+            untuned = (
+                " / ".join(times(row["ratio_to_untuned"]) for row in mine)
+                if name.endswith("_tuned")
+                else ""
+            )
             flags = " / ".join(f"{100 * row['breach_steps']:.0f}" for row in mine)
             lines.append([f"{label}, {words}", *entries, untuned, flags])
     heads = [f"over nominal, {friction} (worst path)" for friction in FRICTIONS]
-    return tables.table(["RMSE", *heads, "over the same untuned", "steps flagged [%]"], lines)
+    return tables.table(
+        ["RMSE", *heads, "over the same untuned", "steps flagged [%]"], lines
+    )
 
 
 def times(ratio):
@@ -76,9 +106,29 @@ def tuning():
         if name == "drives":
             continue
         error = row["position_rmse_2s_m"]
-        numbers = [f"{error['before']:.3f}", f"{error['after']:.3f}", f"{row['alpha']:.4f}", f"{row['d_bar']:.3f}"]
-        lines.append([SYSTEMS[name][0], *numbers, f"{100 * row['coverage']:.0f} %", f"{row['cpu_seconds']:.0f}"])
-    heads = ["", "2 s ahead, before [m]", "after [m]", "α, certified", "d̄", "held-out drives inside d̄", "CPU [s]"]
+        numbers = [
+            f"{error['before']:.3f}",
+            f"{error['after']:.3f}",
+            f"{row['alpha']:.4f}",
+            f"{row['d_bar']:.3f}",
+        ]
+        lines.append(
+            [
+                SYSTEMS[name][0],
+                *numbers,
+                f"{100 * row['coverage']:.0f} %",
+                f"{row['cpu_seconds']:.0f}",
+            ]
+        )
+    heads = [
+        "",
+        "2 s ahead, before [m]",
+        "after [m]",
+        "α, certified",
+        "d̄",
+        "held-out drives inside d̄",
+        "CPU [s]",
+    ]
     return tables.table(heads, lines)
 
 
@@ -86,24 +136,41 @@ def handling():
     """Curvature in a steady turn over that of the textbook bicycle."""
     names = {"kinematic": "our kinematic plant", "dynamic": "our dynamic plant"}
     names |= {"std": CARS["commonroad_std"], "mb": CARS["commonroad_mb"]}
-    lines = [[names[name], *(f"{value:.3f}" for value in row)] for name, row in results()["handling"].items()]
-    return tables.table(["curvature over the bicycle's", *(f"friction {each}" for each in FRICTIONS)], lines)
+    lines = [
+        [names[name], *(f"{value:.3f}" for value in row)]
+        for name, row in results()["handling"].items()
+    ]
+    return tables.table(
+        ["curvature over the bicycle's", *(f"friction {each}" for each in FRICTIONS)],
+        lines,
+    )
 
 
 def export():
     """The exported controller beside the one in Python."""
     found = results()["export"]
-    numbers = [found["steps"], f"{1e3 * found['rmse_m']:.1f}", f"{found['largest_difference']:g}"]
-    return tables.table(["steps", "RMSE [mm]", "largest difference of a control"], [numbers])
+    numbers = [
+        found["steps"],
+        f"{1e3 * found['rmse_m']:.1f}",
+        f"{found['largest_difference']:g}",
+    ]
+    return tables.table(
+        ["steps", "RMSE [mm]", "largest difference of a control"], [numbers]
+    )
 
 
 def along_path():
-    """What is certified of the drift car along a path, and what the package's own car did."""
+    """What is certified of the drift car along a path, and what the package's own car
+    did.
+    """
     found = json.loads((ROOT / "experiments" / "commonroad" / "path.json").read_text())
     certificate, package, step = found["certificate"], found["package"], found["step"]
     output, corridor = certificate["outputs"]["position"], certificate["corridor"]
     bounds, s3, tube = corridor["bounds"], corridor["by_scenario"]["s3"], output["tube"]
-    inside = {name: within(output["coverage"][name], output["coverage_drives"]) for name in tube}
+    inside = {
+        name: within(output["coverage"][name], output["coverage_drives"])
+        for name in tube
+    }
     apart = step["largest"]
     lines = {
         "α in the metric of e_y, proved; in the 2-norm": f"{output['alpha']:.3f}; {certificate['alpha']:.3f}",
@@ -124,7 +191,9 @@ def along_path():
         ),
         "certify everything [s]": f"{certificate['seconds']:.0f}",
     }
-    return tables.table(["single-track drift, along a path", ""], list(map(list, lines.items())))
+    return tables.table(
+        ["single-track drift, along a path", ""], list(map(list, lines.items()))
+    )
 
 
 def counted(found):
@@ -149,24 +218,44 @@ TABLES = {
 
 
 def draw():
-    """Lateral RMSE over friction, one panel a car, where all paths were driven in the lane."""
+    """Lateral RMSE over friction, one panel a car, where all paths were driven in the
+    lane.
+    """
     from matplotlib.figure import Figure
 
     figure = Figure(figsize=(6.9, 3.4), layout="constrained")
     panels = figure.subplots(1, len(CARS), sharey=True)
     for axes, (car, words) in zip(panels, CARS.items(), strict=True):
         for name, (label, colour, line) in SYSTEMS.items():
-            mine = [row for row in results()["rows"] if (row["system"], row["vehicle"]) == (name, car)]
+            mine = [
+                row
+                for row in results()["rows"]
+                if (row["system"], row["vehicle"]) == (name, car)
+            ]
             sound = [row for row in mine if not row["departures"]]
-            points = [row["friction"] for row in sound], [1e3 * row["rmse_m"]["mean"] for row in sound]
+            points = (
+                [row["friction"] for row in sound],
+                [1e3 * row["rmse_m"]["mean"] for row in sound],
+            )
             if not sound:
                 continue
-            axes.plot(*points, color=colour, linestyle=line, marker="o", markersize=4, label=label)
+            axes.plot(
+                *points,
+                color=colour,
+                linestyle=line,
+                marker="o",
+                markersize=4,
+                label=label,
+            )
         axes.set(title=words, xlabel="friction", xticks=(0.3, 0.6, 0.9), yscale="log")
         axes.grid(visible=True, which="both", color="#e3e6ea", linewidth=0.6)
     panels[0].set_ylabel("lateral RMSE [mm]")
     figure.legend(
-        *panels[0].get_legend_handles_labels(), loc="outside upper center", ncols=3, fontsize=8, frameon=False
+        *panels[0].get_legend_handles_labels(),
+        loc="outside upper center",
+        ncols=3,
+        fontsize=8,
+        frameon=False,
     )
     FIGURE.parent.mkdir(exist_ok=True)
     figure.savefig(FIGURE, dpi=150, metadata={"Software": None})
@@ -174,8 +263,14 @@ def draw():
 
 def main():
     """Parse, print or write."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--write", action="store_true", help="put the tables into docs/plants.md and draw its figure")
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument(
+        "--write",
+        action="store_true",
+        help="put the tables into docs/plants.md and draw its figure",
+    )
     made = {name: build() for name, build in TABLES.items()}
     if not parser.parse_args().write:
         print("\n\n".join(made.values()))

@@ -9,14 +9,24 @@ import jax.numpy as jnp
 import numpy as np
 
 import sfkd_jax
-from sfkd_jax import adapters, artefacts, build, certification, datasets, evaluation, policy
+from sfkd_jax import (
+    adapters,
+    artefacts,
+    build,
+    certification,
+    datasets,
+    evaluation,
+    policy,
+)
 from sfkd_jax.pipeline import store
 from sfkd_jax.training import fit, multi_step_loss
 from sfkd_jax.types import Trajectory
 
 SHARES = (0.6, 0.1, 0.2, 0.1)
 LEVEL = 0.95
-"""Of the conformal bounds and of the monitor: 40 calibration drives carry no higher one."""
+"""Of the conformal bounds and of the monitor: 40 calibration drives carry no higher
+one.
+"""
 FIT = {"learning_rate": 3e-4, "log_every": 50, "save_every": 50}
 WINDOWS = {"batch": 128, "length": 20}
 SEED = 7
@@ -24,26 +34,52 @@ SEED = 7
 
 
 def collect(plant, asked, segments, path):
-    """Drives of 5 s as our own data sets have them: S1 and S2 with levels drawn per drive, both controls excited."""
+    """Drives of 5 s as our own data sets have them: S1 and S2 with levels drawn per
+    drive, both controls excited.
+    """
     if not artefacts.exists(path):
         began = time.perf_counter()
-        drive = jax.jit(partial(datasets.generate, plant, build.build_driver(plant), segments=segments, steps=50))
+        drive = jax.jit(
+            partial(
+                datasets.generate,
+                plant,
+                build.build_driver(plant),
+                segments=segments,
+                steps=50,
+            )
+        )
         driven = jax.tree.map(np.asarray, drive(jax.random.key(SEED)))
         path.parent.mkdir(parents=True, exist_ok=True)
-        artefacts.write_arrays(path, driven._asdict(), kind="drives", config={"segments": segments, "seed": SEED})
-        print(f"collected {segments} drives in {time.perf_counter() - began:.0f} s", file=sys.stderr, flush=True)
+        artefacts.write_arrays(
+            path,
+            driven._asdict(),
+            kind="drives",
+            config={"segments": segments, "seed": SEED},
+        )
+        print(
+            f"collected {segments} drives in {time.perf_counter() - began:.0f} s",
+            file=sys.stderr,
+            flush=True,
+        )
     driven = Trajectory(**artefacts.read_arrays(path, kind="drives")[0])
     whole = np.isfinite(driven.states).all(axis=(1, 2))
-    box = {f"env_{side}": jnp.asarray(asked["dataset"][f"env_{side}"]) for side in ("low", "high")}
+    box = {
+        f"env_{side}": jnp.asarray(asked["dataset"][f"env_{side}"])
+        for side in ("low", "high")
+    }
     kept = jax.tree.map(lambda leaf: jnp.asarray(leaf[whole]), driven)
-    return datasets.split(kept, jax.random.key(SEED + 1), shares=SHARES, **box), int(whole.sum())
+    return datasets.split(kept, jax.random.key(SEED + 1), shares=SHARES, **box), int(
+        whole.sum()
+    )
 
 
 def seen(data, states):
     """The same drives as a model of so many states is told of them."""
     parts = {name: getattr(data, name) for name in store.PARTS}
     parts = {
-        name: part._replace(states=adapters.commonroad_observation(part.states, states=states))
+        name: part._replace(
+            states=adapters.commonroad_observation(part.states, states=states)
+        )
         for name, part in parts.items()
     }
     return data._replace(**parts)
@@ -58,7 +94,9 @@ def tune(trained, data, asked, place, steps):
     held_out = datasets.spread_windows(data.validation, length=WINDOWS["length"])
     start = trained.model._replace(init=lambda key: trained.params)
     key = jax.random.key(SEED + 2)
-    params, best = fit(start, loss, draw, data.train, held_out, key, place, steps=steps, **FIT)
+    params, best = fit(
+        start, loss, draw, data.train, held_out, key, place, steps=steps, **FIT
+    )
     place.mkdir(parents=True, exist_ok=True)
     spent = time.process_time() - began
     proof = certification.issue(
@@ -71,19 +109,39 @@ def tune(trained, data, asked, place, steps):
         level=LEVEL,
         monitor_level=LEVEL,
     )
-    manifest = policy.save(place / "policy.npz", params, settings | {"best_step": best}, made_from={})
-    about = {"weights_sha256": manifest["sha256"], "policy_sha256": policy.policy_hash(manifest)}
+    manifest = policy.save(
+        place / "policy.npz", params, settings | {"best_step": best}, made_from={}
+    )
+    about = {
+        "weights_sha256": manifest["sha256"],
+        "policy_sha256": policy.policy_hash(manifest),
+    }
     artefacts.write_json(place / "certificate.json", proof | about)
     errors = {"before": trained.params, "after": params}
-    predict = jax.jit(partial(evaluation.open_loop, trained.model, horizon=WINDOWS["length"]))
-    found = {name: jnp.hypot(*predict(weights, data.test).T[:2])[-1].item() for name, weights in errors.items()}
-    print(f"tuned to step {best} in {spent:.0f} s: {found}", file=sys.stderr, flush=True)
+    predict = jax.jit(
+        partial(evaluation.open_loop, trained.model, horizon=WINDOWS["length"])
+    )
+    found = {
+        name: jnp.hypot(*predict(weights, data.test).T[:2])[-1].item()
+        for name, weights in errors.items()
+    }
+    print(
+        f"tuned to step {best} in {spent:.0f} s: {found}", file=sys.stderr, flush=True
+    )
     d_bar = {"d_bar": proof["d_bar"]["value"], "coverage": proof["d_bar"]["coverage"]}
-    return {"best_step": best, "cpu_seconds": spent, "alpha": proof["alpha"], **d_bar, "position_rmse_2s_m": found}
+    return {
+        "best_step": best,
+        "cpu_seconds": spent,
+        "alpha": proof["alpha"],
+        **d_bar,
+        "position_rmse_2s_m": found,
+    }
 
 
 def tune_all(before, plant, asked, root, *, segments, steps):
-    """Every policy on the same drives of one car; what an earlier run of the same sizes finished is read."""
+    """Every policy on the same drives of one car; what an earlier run of the same sizes
+    finished is read.
+    """
     data, whole = collect(plant, asked, segments, root / f"drives-{segments}.npz")
     after, records = {}, {"drives": whole}
     for row, trained in before.items():
@@ -91,6 +149,8 @@ def tune_all(before, plant, asked, root, *, segments, steps):
         record = place / "record.json"
         if not record.exists():
             states = len(build.build_vehicle(trained.settings["vehicle"]).state_names)
-            artefacts.write_json(record, tune(trained, seen(data, states), asked, place, steps))
+            artefacts.write_json(
+                record, tune(trained, seen(data, states), asked, place, steps)
+            )
         after[row], records[row] = sfkd_jax.load(place), artefacts.read_json(record)
     return after, records

@@ -1,6 +1,7 @@
 """What compiling `act` costs in a fresh process, without and with jax's persistent compilation cache; prints JSON.
 
-python benchmarks/compiling.py [--rounds 3]; problems: the shared one, and the project's own model (own_model.py).
+python benchmarks/compiling.py [--rounds 3]; problems: the shared one, and the project's
+own model (own_model.py).
 """
 
 import argparse
@@ -36,7 +37,11 @@ def measure(name):
     ready = time.perf_counter()
     jax.block_until_ready(compiled(*given))
     done = time.perf_counter()
-    return {"trace_s": traced - began, "compile_s": ready - traced, "first_step_s": done - ready}
+    return {
+        "trace_s": traced - began,
+        "compile_s": ready - traced,
+        "first_step_s": done - ready,
+    }
 
 
 def kept_in(directory):
@@ -50,21 +55,34 @@ def rounds(name, count):
     """Medians without a cache and with a full one."""
     with tempfile.TemporaryDirectory() as directory:
         cached = kept_in(directory)
-        ask = lambda environment: timing.in_own_process("compiling.py", "--measure", name, environment=environment)  # noqa: E731
+        ask = lambda environment: timing.in_own_process(
+            "compiling.py", "--measure", name, environment=environment
+        )
         ask(cached)
         both = [(ask({}), ask(cached)) for _ in range(count)]
-    middle = lambda runs: {key: statistics.median(run[key] for run in runs) for key in runs[0]}  # noqa: E731
-    return {"cold": middle([cold for cold, _ in both]), "warm": middle([warm for _, warm in both])}
+    middle = lambda runs: {
+        key: statistics.median(run[key] for run in runs) for key in runs[0]
+    }
+    return {
+        "cold": middle([cold for cold, _ in both]),
+        "warm": middle([warm for _, warm in both]),
+    }
 
 
 def main():
     """Parse, run, print."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
     parser.add_argument("--rounds", type=int, default=3)
     names = ("shared problem", "own model")
     parser.add_argument("--measure", choices=names, help=argparse.SUPPRESS)
     asked = parser.parse_args()
-    found = measure(asked.measure) if asked.measure else {name: rounds(name, asked.rounds) for name in names}
+    found = (
+        measure(asked.measure)
+        if asked.measure
+        else {name: rounds(name, asked.rounds) for name in names}
+    )
     print(json.dumps(found))
 
 

@@ -1,4 +1,6 @@
-"""The contenders by name: (samples, horizon, seed) -> `step(z, target) -> u`, built in a process of their own."""
+"""The contenders by name: (samples, horizon, seed) -> `step(z, target) -> u`, built in
+a process of their own.
+"""
 
 from functools import partial
 
@@ -30,5 +32,7 @@ def same_place(name, samples, horizon):
 
 
 def environment(name):
-    """Environment variables that a contender wants to have set before its process starts."""
+    """Environment variables that a contender wants to have set before its process
+    starts.
+    """
     return getattr(CONTENDERS[name], "environment", {})

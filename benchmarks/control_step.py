@@ -1,7 +1,8 @@
 """One control step of every contender, round-robin, each in its own process; prints a table and writes JSON.
 
-python benchmarks/control_step.py [--samples 1500 --horizon 20 --rounds 4 --steps 40 --only NAME ... --out FILE]
-Other libraries are used if they import; a contender that does not is named and left out. See docs/performance.md.
+python benchmarks/control_step.py [--samples 1500 --horizon 20 --rounds 4 --steps 40
+--only NAME ... --out FILE] Other libraries are used if they import; a contender that
+does not is named and left out. See docs/performance.md.
 """
 
 import argparse
@@ -14,22 +15,41 @@ from contenders import CONTENDERS, environment, same_place
 
 
 def rounds_of(jobs, count, steps):
-    """`count` rounds over all jobs (label -> name, samples, horizon), each time in a new process: label -> rounds."""
+    """`count` rounds over all jobs (label -> name, samples, horizon), each time in a
+    new process: label -> rounds.
+    """
     found = {label: [] for label in jobs}
     for _ in range(count):
         for label, (name, samples, horizon) in jobs.items():
-            words = ("--measure", name, "--samples", samples, "--horizon", horizon, "--steps", steps)
-            found[label].append(timing.in_own_process("control_step.py", *words, environment=environment(name)))
+            words = (
+                "--measure",
+                name,
+                "--samples",
+                samples,
+                "--horizon",
+                horizon,
+                "--steps",
+                steps,
+            )
+            found[label].append(
+                timing.in_own_process(
+                    "control_step.py", *words, environment=environment(name)
+                )
+            )
     return found
 
 
 def summary(rounds):
-    """Best and median of the rounds' medians, 99 % quantile over all steps, and the rest as medians."""
+    """Best and median of the rounds' medians, 99 % quantile over all steps, and the
+    rest as medians.
+    """
     medians = [statistics.median(one["wall_ms"]) for one in rounds]
     return {
         "best_ms": min(medians),
         "median_ms": statistics.median(medians),
-        "p99_ms": timing.quantile([step for one in rounds for step in one["wall_ms"]], 0.99),
+        "p99_ms": timing.quantile(
+            [step for one in rounds for step in one["wall_ms"]], 0.99
+        ),
         "cpu_ms": statistics.median(statistics.median(one["cpu_ms"]) for one in rounds),
         "first_s": statistics.median(one["first_s"] for one in rounds),
         "memory_mb": max(one["memory_mb"] for one in rounds),
@@ -38,16 +58,34 @@ def summary(rounds):
 
 def table_of(found):
     """Rounds -> summaries, and the reasons of those that did not run."""
-    missing = {label: one["error"] for label, rounds in found.items() for one in rounds if "error" in one}
-    return {label: summary(rounds) for label, rounds in found.items() if label not in missing}, missing
+    missing = {
+        label: one["error"]
+        for label, rounds in found.items()
+        for one in rounds
+        if "error" in one
+    }
+    return {
+        label: summary(rounds)
+        for label, rounds in found.items()
+        if label not in missing
+    }, missing
 
 
 def arguments():
     """The command line."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    for name, value in (("samples", 1500), ("horizon", 20), ("rounds", 4), ("steps", 40)):
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    for name, value in (
+        ("samples", 1500),
+        ("horizon", 20),
+        ("rounds", 4),
+        ("steps", 40),
+    ):
         parser.add_argument(f"--{name}", type=int, default=value)
-    parser.add_argument("--only", nargs="*", default=list(CONTENDERS), choices=list(CONTENDERS))
+    parser.add_argument(
+        "--only", nargs="*", default=list(CONTENDERS), choices=list(CONTENDERS)
+    )
     parser.add_argument("--out")
     parser.add_argument("--measure", choices=list(CONTENDERS), help=argparse.SUPPRESS)
     return parser.parse_args()
@@ -63,11 +101,20 @@ def main():
     jobs = {name: (name, asked.samples, asked.horizon) for name in asked.only}
     table, missing = table_of(rounds_of(jobs, asked.rounds, asked.steps))
     for name, row in table.items():
-        print(f"{name:24}", "  ".join(f"{key} {value:8.2f}" for key, value in row.items()))
+        print(
+            f"{name:24}", "  ".join(f"{key} {value:8.2f}" for key, value in row.items())
+        )
     for name, reason in missing.items():
         print(f"{name:24} not run: {reason}")
-    settings = {key: getattr(asked, key) for key in ("samples", "horizon", "rounds", "steps")}
-    document = {"contenders": table, "not_run": missing, "settings": settings, "machine": timing.machine()}
+    settings = {
+        key: getattr(asked, key) for key in ("samples", "horizon", "rounds", "steps")
+    }
+    document = {
+        "contenders": table,
+        "not_run": missing,
+        "settings": settings,
+        "machine": timing.machine(),
+    }
     timing.write(asked.out, document)
 
 

@@ -1,7 +1,8 @@
 """Write the table of docs/corridor.md.
 
-python benchmarks/corridor.py [--root runs]: from the certificates that ship and from experiments/corridor/; with --root
-both are taken first from where experiments/corridor/run.sh left them.
+python benchmarks/corridor.py [--root runs]: from the certificates that ship and from
+experiments/corridor/; with --root both are taken first from where
+experiments/corridor/run.sh left them.
 """
 
 import argparse
@@ -21,17 +22,30 @@ def table() -> str:
     """What is claimed of both policies and what they drove, as markdown."""
     found = [_facts(plant) for plant in PLANTS]
     lines = [f"| | {' | '.join(PLANTS)} |", f"|---|{'---|' * len(PLANTS)}"]
-    lines += [f"| {name} | {' | '.join(facts[name] for facts in found)} |" for name in found[0]]
+    lines += [
+        f"| {name} | {' | '.join(facts[name] for facts in found)} |"
+        for name in found[0]
+    ]
     return "\n".join(lines) + "\n"
 
 
 def _facts(plant: str) -> dict[str, str]:
     """One column."""
-    certificate = json.loads((SHIPPED / f"{plant}_path" / "certificate.json").read_text())
-    rows = {row["system"]: row for row in json.loads(RESULTS.read_text())["rows"] if row["vehicle"] == plant}
+    certificate = json.loads(
+        (SHIPPED / f"{plant}_path" / "certificate.json").read_text()
+    )
+    rows = {
+        row["system"]: row
+        for row in json.loads(RESULTS.read_text())["rows"]
+        if row["vehicle"] == plant
+    }
     own, oracle = rows["sfkd_path"], rows["oracle"]
     output, corridor = certificate["outputs"]["position"], certificate["corridor"]
-    bounds, attack, s3 = corridor["bounds"], corridor["attack"], corridor["by_scenario"]["s3"]
+    bounds, attack, s3 = (
+        corridor["bounds"],
+        corridor["attack"],
+        corridor["by_scenario"]["s3"],
+    )
     rest = [corridor["fixed_points"][name] for name in ("corridor_m", "after_switch_m")]
     low, high = corridor["coverage_ci95"]
     return {
@@ -44,7 +58,9 @@ def _facts(plant: str) -> dict[str, str]:
         "largest \\|e_y − ê_y\\| of those fresh drives [m]": f"{corridor['seen']['distance_m']:.3f}",
         "tube on 5 s drives like the data, `for_ever` [m]": f"{output['tube']['for_ever']:.3f}",
         "tube on 5 s drives like the data, `followed` [m]": f"{output['tube']['followed']:.3f}",
-        "without a copy: the law alone [m]; right after a switch": "; ".join(f"{part['law']:.3f}" for part in rest),
+        "without a copy: the law alone [m]; right after a switch": "; ".join(
+            f"{part['law']:.3f}" for part in rest
+        ),
         "without a copy: any ν in its limits [m]; right after a switch": "; ".join(
             f"{part['planner']:.3f}" for part in rest
         ),
@@ -67,7 +83,9 @@ def page(text: str) -> str:
 
 
 def take(root: Path) -> None:
-    """Copy what run.sh left: policies with their certificates, and the rows that they drove."""
+    """Copy what run.sh left: policies with their certificates, and the rows that they
+    drove.
+    """
     rows = []
     for plant in PLANTS:
         made = root / f"corridor_{plant}" / "sfkd_path" / "seed=0"
@@ -79,7 +97,9 @@ def take(root: Path) -> None:
 
 if __name__ == "__main__":
     parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--root", type=Path, default=None, help="where run.sh left its runs")
+    parser.add_argument(
+        "--root", type=Path, default=None, help="where run.sh left its runs"
+    )
     root = parser.parse_args().root
     if root:
         take(root)

@@ -16,7 +16,9 @@ import timing
 
 
 def episode_of(controller, w, targets, env, steps):
-    """(state, z) -> the same after `steps` steps of controller and plant, which is the model itself."""
+    """(state, z) -> the same after `steps` steps of controller and plant, which is the
+    model itself.
+    """
 
     def body(carry, _):
         state, z = carry
@@ -28,13 +30,23 @@ def episode_of(controller, w, targets, env, steps):
 
 def main():
     """Parse, time both in turn, print."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    for name, value in (("samples", 1500), ("horizon", 20), ("steps", 200), ("rounds", 6)):
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    for name, value in (
+        ("samples", 1500),
+        ("horizon", 20),
+        ("steps", 200),
+        ("rounds", 6),
+    ):
         parser.add_argument(f"--{name}", type=int, default=value)
     asked = parser.parse_args()
     controller, w = ours.planner(asked.samples, asked.horizon)
     w, state, z, env, targets = ours.arguments(controller, w, asked.horizon)
-    run, act = episode_of(controller, w, targets, env, asked.steps), jax.jit(controller.act)
+    run, act = (
+        episode_of(controller, w, targets, env, asked.steps),
+        jax.jit(controller.act),
+    )
     jax.block_until_ready(run(state, z))
     step = lambda: jax.block_until_ready(act(w, state, z, env, targets))  # noqa: E731
     timing.timed(step, timing.WARM_UP)
@@ -48,9 +60,15 @@ def main():
     pairs = zip(episodes, singles, strict=True)
     ratios = {
         "ratio": whole / (asked.steps * single),
-        "median_ratio": statistics.median(episode / (asked.steps * step) for episode, step in pairs),
+        "median_ratio": statistics.median(
+            episode / (asked.steps * step) for episode, step in pairs
+        ),
     }
-    print(json.dumps({"steps": asked.steps, "step_ms": single, "episode_ms": whole} | ratios))
+    print(
+        json.dumps(
+            {"steps": asked.steps, "step_ms": single, "episode_ms": whole} | ratios
+        )
+    )
 
 
 if __name__ == "__main__":

@@ -1,14 +1,25 @@
 """Faults of what a controller is given, drawn ahead of a drive: when, for how long, and what the readings become.
 
-A fault is a lag and an offset: a reading becomes what it was `lag` steps before, plus `offset`, which may be NaN,
-infinite or huge. A frozen reading is one whose lag grows by one at every step.
+A fault is a lag and an offset: a reading becomes what it was `lag` steps before, plus
+`offset`, which may be NaN, infinite or huge. A frozen reading is one whose lag grows by
+one at every step.
 """
 
 from typing import NamedTuple
 
 import numpy as np
 
-KINDS = ("nan", "infinite", "huge", "frozen", "jump", "delayed", "outside", "alternating", "clock")
+KINDS = (
+    "nan",
+    "infinite",
+    "huge",
+    "frozen",
+    "jump",
+    "delayed",
+    "outside",
+    "alternating",
+    "clock",
+)
 CHANNELS = ("observation", "env", "reference")
 DURATION = (1, 30)
 """Steps that a fault lasts, drawn evenly."""
@@ -49,7 +60,9 @@ class Faults(NamedTuple):
 
 
 def draw(random, steps, sizes):
-    """Faults with pauses between them, for readings of `sizes` entries, by channel; none at all without `random`."""
+    """Faults with pauses between them, for readings of `sizes` entries, by channel;
+    none at all without `random`.
+    """
     kind, elapsed = np.full(steps, -1, np.int32), np.ones(steps, np.float32)
     lag = np.zeros((steps, len(sizes)), np.int32)
     offset = tuple(np.zeros((steps, size), np.float32) for size in sizes)
@@ -65,14 +78,18 @@ def draw(random, steps, sizes):
             everything = random.random() < 0.25
             chosen = range(len(sizes)) if everything else [random.integers(len(sizes))]
             for channel in chosen:
-                fault = _fault(random, name, end - start, CHANNELS[channel], sizes[channel])
+                fault = _fault(
+                    random, name, end - start, CHANNELS[channel], sizes[channel]
+                )
                 lag[during, channel], offset[channel][during] = fault
         start = end + random.integers(*PAUSE, endpoint=True)
     return Faults(kind, lag, offset, elapsed)
 
 
 def _fault(random, name, steps, channel, size):
-    """Lag (steps,) and offset (steps, size) of one fault of one channel; it hits at least one entry."""
+    """Lag (steps,) and offset (steps, size) of one fault of one channel; it hits at
+    least one entry.
+    """
     hit = random.random(size) < 0.5
     hit[random.integers(size)] = True
     sign = random.choice((-1.0, 1.0), size)

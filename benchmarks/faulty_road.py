@@ -1,4 +1,6 @@
-"""The closed loop of a shipped policy and its plant while faults come between them, as pure functions."""
+"""The closed loop of a shipped policy and its plant while faults come between them, as
+pure functions.
+"""
 
 from pathlib import Path
 from typing import NamedTuple
@@ -30,7 +32,9 @@ class World(NamedTuple):
     """The truth, and what could be read of it.
 
     Attributes:
-        step: of the road. state, progress: of the car. sent: controls on their way, oldest first.
+        step: of the road.
+        state, progress: of the car.
+        sent: controls on their way, oldest first.
         read: by channel, readings without a fault of the last steps, newest first.
     """
 
@@ -54,9 +58,13 @@ class Track(NamedTuple):
     """The closed loop around a controller, as pure functions.
 
     Attributes:
-        params: of the model. init, act: of the controller; act takes `Told`.
-        road: (key, random) -> `Road`. enter: road -> `World`. sense: (road, world) -> (world, told).
-        advance: (road, world, control) -> (world, distance from the path, whether it was lost).
+        params: of the model.
+        init, act: of the controller; act takes `Told`.
+        road: (key, random) -> `Road`.
+        enter: road -> `World`.
+        sense: (road, world) -> (world, told).
+        advance: (road, world, control) -> (world, distance from the path, whether it
+            was lost).
         low, high: of the controls.
     """
 
@@ -72,7 +80,9 @@ class Track(NamedTuple):
 
 
 def with_elapsed(state, elapsed):
-    """The state of a controller whose planner, under its wrappers, is told the time since the last call."""
+    """The state of a controller whose planner, under its wrappers, is told the time
+    since the last call.
+    """
     if hasattr(state, "inner"):
         return state._replace(inner=with_elapsed(state.inner, elapsed))
     return state._replace(tuning=state.tuning._replace(elapsed=elapsed))
@@ -80,7 +90,11 @@ def with_elapsed(state, elapsed):
 
 def not_finite(state):
     """Entries of a controller's state that are not finite."""
-    leaves = [leaf for leaf in jax.tree.leaves(state) if jnp.issubdtype(leaf.dtype, jnp.floating)]
+    leaves = [
+        leaf
+        for leaf in jax.tree.leaves(state)
+        if jnp.issubdtype(leaf.dtype, jnp.floating)
+    ]
     return sum(jnp.sum(~jnp.isfinite(leaf)) for leaf in leaves)
 
 
@@ -96,7 +110,12 @@ def controlled(plant, env, delay, samples):
     if delay:
         controller = control.compensated(controller, policy.model, delay=delay)
     noise = policy.certificate["monitor"]["sensor_noise"]
-    return build.build_vehicle(settings["vehicle"]), policy.model.fold(policy.params), controller, noise
+    return (
+        build.build_vehicle(settings["vehicle"]),
+        policy.model.fold(policy.params),
+        controller,
+        noise,
+    )
 
 
 def track(plant, *, env="measured", delay=0, samples=SAMPLES, faulty=True, steps=ROAD):
@@ -104,7 +123,9 @@ def track(plant, *, env="measured", delay=0, samples=SAMPLES, faulty=True, steps
     car, params, controller, noise = controlled(plant, env, delay, samples)
     size = len(car.state_names)
     spread = jnp.asarray(noise[:size])
-    family = scenarios.scenario(name="s3", duration=steps * car.dt, state_size=size, dt=car.dt)
+    family = scenarios.scenario(
+        name="s3", duration=steps * car.dt, state_size=size, dt=car.dt
+    )
     deepest = faults.DURATION[1] + 1
 
     def road(key, random):
@@ -115,13 +136,27 @@ def track(plant, *, env="measured", delay=0, samples=SAMPLES, faulty=True, steps
 
     def readings(road, world):
         ahead = world.progress + delay * car.dt * road.scenario.speed
-        window = scenarios.reference_window(road.scenario.path, ahead, road.scenario.speed, dt=car.dt, horizon=HORIZON)
-        return world.state + road.noise[world.step], road.scenario.envs[world.step], window
+        window = scenarios.reference_window(
+            road.scenario.path, ahead, road.scenario.speed, dt=car.dt, horizon=HORIZON
+        )
+        return (
+            world.state + road.noise[world.step],
+            road.scenario.envs[world.step],
+            window,
+        )
 
     def enter(road):
         sent = jnp.zeros((delay, len(car.control_low)))
-        world = World(jnp.zeros((), jnp.int32), road.scenario.initial_state, jnp.zeros(()), sent, ())
-        return world._replace(read=tuple(jnp.stack([value] * deepest) for value in readings(road, world)))
+        world = World(
+            jnp.zeros((), jnp.int32),
+            road.scenario.initial_state,
+            jnp.zeros(()),
+            sent,
+            (),
+        )
+        return world._replace(
+            read=tuple(jnp.stack([value] * deepest) for value in readings(road, world))
+        )
 
     def sense(road, world):
         now = zip(readings(road, world), world.read, strict=True)
@@ -139,7 +174,11 @@ def track(plant, *, env="measured", delay=0, samples=SAMPLES, faulty=True, steps
         point = scenarios.point_at(road.scenario.path, guess)
         back = road.scenario.initial_state.at[:3].set(point[:3])
         state, progress = jnp.where(lost, back, state), jnp.where(lost, guess, progress)
-        return World(world.step + 1, state, progress, sent[1:], world.read), lateral, lost
+        return (
+            World(world.step + 1, state, progress, sent[1:], world.read),
+            lateral,
+            lost,
+        )
 
     def act(params, state, told):
         state = with_elapsed(state, told.elapsed)

@@ -1,4 +1,6 @@
-"""Contenders in jax that are not ours; each builds `step(z, target) -> u` on numpy arrays."""
+"""Contenders in jax that are not ours; each builds `step(z, target) -> u` on numpy
+arrays.
+"""
 
 from functools import partial
 
@@ -6,7 +8,9 @@ import problem
 
 
 def plain_jax(samples, horizon, seed=0, temperature=problem.TEMPERATURE):
-    """What a user would write by hand: one scan over the horizon, softmax, shift; no limits kept but the box."""
+    """What a user would write by hand: one scan over the horizon, softmax, shift; no
+    limits kept but the box.
+    """
     import jax
     import jax.numpy as jnp
 
@@ -15,32 +19,48 @@ def plain_jax(samples, horizon, seed=0, temperature=problem.TEMPERATURE):
     def act(memory, z, target):
         key, plan = memory
         key, draw = jax.random.split(key)
-        noise = problem.NOISE * jax.random.normal(draw, (horizon, samples, problem.CONTROLS))
+        noise = problem.NOISE * jax.random.normal(
+            draw, (horizon, samples, problem.CONTROLS)
+        )
         plans = jnp.clip(plan[:, None] + noise, problem.LOW, problem.HIGH)
 
         def body(carry, controls):
             costs, states = carry
             states = jax.vmap(partial(problem.advance, jnp, w))(states, controls)
-            charges = jax.vmap(partial(problem.charge, jnp, w), in_axes=(0, 0, None))(states, controls, target)
+            charges = jax.vmap(partial(problem.charge, jnp, w), in_axes=(0, 0, None))(
+                states, controls, target
+            )
             return (costs + charges, states), None
 
-        (costs, _), _ = jax.lax.scan(body, (jnp.zeros(samples), jnp.tile(z, (samples, 1))), plans)
+        (costs, _), _ = jax.lax.scan(
+            body, (jnp.zeros(samples), jnp.tile(z, (samples, 1))), plans
+        )
         plan = jnp.einsum("m,tmc->tc", jax.nn.softmax(-costs / temperature), plans)
         return plan[0], (key, jnp.concatenate([plan[1:], plan[-1:]]))
 
-    return _stepping(act, (jax.random.key(seed), jnp.zeros((horizon, problem.CONTROLS))))
+    return _stepping(
+        act, (jax.random.key(seed), jnp.zeros((horizon, problem.CONTROLS)))
+    )
 
 
 def jax_mppi(samples, horizon, seed=0, temperature=problem.TEMPERATURE):
-    """jax_mppi, `mppi.command` inside one jit; it charges z_t where the others charge z_{t+1}: as much work."""
+    """jax_mppi, `mppi.command` inside one jit; it charges z_t where the others charge
+    z_{t+1}: as much work.
+    """
     import jax
     import jax.numpy as jnp
     from jax_mppi import mppi
 
     w, ones = _weights(), jnp.ones(problem.CONTROLS)
-    box = {"u_min": problem.LOW * ones, "u_max": problem.HIGH * ones, "key": jax.random.PRNGKey(seed)}
+    box = {
+        "u_min": problem.LOW * ones,
+        "u_max": problem.HIGH * ones,
+        "key": jax.random.PRNGKey(seed),
+    }
     size = {"num_samples": samples, "horizon": horizon, "lambda_": temperature}
-    config, first = mppi.create(problem.RANK, problem.CONTROLS, problem.NOISE**2 * jnp.diag(ones), **size, **box)
+    config, first = mppi.create(
+        problem.RANK, problem.CONTROLS, problem.NOISE**2 * jnp.diag(ones), **size, **box
+    )
 
     def act(memory, z, target):
         cost = lambda z, u: problem.charge(jnp, w, z, u, target)  # noqa: E731

@@ -46,40 +46,75 @@ FILES = {
 }
 SLOW = "thousands"
 """Tests of seconds come last: few mutants reach them."""
-ARITHMETIC = {"Add": "Sub", "Sub": "Add", "Mul": "Div", "Div": "Mul", "FloorDiv": "Mul", "Mod": "Add", "Pow": "Mul"}
+ARITHMETIC = {
+    "Add": "Sub",
+    "Sub": "Add",
+    "Mul": "Div",
+    "Div": "Mul",
+    "FloorDiv": "Mul",
+    "Mod": "Add",
+    "Pow": "Mul",
+}
 UNARGUED = "not argued"
 SECONDS = 60
 """Of processor time; a mutant that takes longer counts as noticed."""
 NAMED = {
     "_core": [
         ("+ rounding\n    return bool(rest", "\n    return bool(rest"),
-        ("rest * (1 + MARGIN) + error + lost < shift", "0.5 * rest + error + lost < shift"),
-        ("return left @ right, error + left.size * right.shape[1] * TINY", "return left @ right, 0.0"),
-        ("is_positive_definite(*witness_matrix(", "is_positive_definite(witness_matrix("),
+        (
+            "rest * (1 + MARGIN) + error + lost < shift",
+            "0.5 * rest + error + lost < shift",
+        ),
+        (
+            "return left @ right, error + left.size * right.shape[1] * TINY",
+            "return left @ right, 0.0",
+        ),
+        (
+            "is_positive_definite(*witness_matrix(",
+            "is_positive_definite(witness_matrix(",
+        ),
         ("bound, vertex, metric))\n", "bound, vertex, metric)[0])\n"),
-        ("4 * UNIT * (frobenius(squared) + frobenius(start) + frobenius(matrix))", "4 * UNIT * frobenius(squared)"),
+        (
+            "4 * UNIT * (frobenius(squared) + frobenius(start) + frobenius(matrix))",
+            "4 * UNIT * frobenius(squared)",
+        ),
         ("4 * UNIT * size * largest)", "0.0)"),
-        ("[()] * len(operators), rate, operators, metric)", "[()], rate, operators[:1], metric)"),
-        ("in zip(witnesses, vertices, strict=True)", "in list(zip(witnesses, vertices, strict=True))[:1]"),
+        (
+            "[()] * len(operators), rate, operators, metric)",
+            "[()], rate, operators[:1], metric)",
+        ),
+        (
+            "in zip(witnesses, vertices, strict=True)",
+            "in list(zip(witnesses, vertices, strict=True))[:1]",
+        ),
         ("fits = len(witnesses) == len(vertices) and all(", "fits = all("),
         (" and not is_positive_definite(metric)", " and False"),
     ],
     "_claims": [
         ("for vertex in operators.vertices)", "for vertex in operators.vertices[:1])"),
-        ('zip(seen["joint"], operators.vertices, strict=True)', 'zip(seen["joint"][:1], operators.vertices[:1])'),
+        (
+            'zip(seen["joint"], operators.vertices, strict=True)',
+            'zip(seen["joint"][:1], operators.vertices[:1])',
+        ),
         (
             'for part, vertex in zip(seen["joint"], operators.vertices, strict=True)',
             'for part, vertex in zip(seen["joint"], operators.vertices)',
         ),
         (' and weights.declared.transport == "identity"', ""),
         ('checks["scope"] = claims.scope == scope', 'checks["scope"] = True'),
-        ('checks["kappa"] = claims.kappa == 1.0 if metric is None else claims.kappa >= 1.0', ""),
+        (
+            'checks["kappa"] = claims.kappa == 1.0 if metric is None else claims.kappa >= 1.0',
+            "",
+        ),
         ("claims.beta * claims.kappa**0.5", "claims.beta"),
     ],
     "_certificate": [
         ("not claims.alpha < 1.0 or ", ""),
         (" or certificate.transport_lipschitz != 1.0", ""),
-        ("    _require_consistent(certificate, claims, weights)\n    except", "    pass\n    except"),
+        (
+            "    _require_consistent(certificate, claims, weights)\n    except",
+            "    pass\n    except",
+        ),
         ("claims_hold(claims, weights, certificate.env_box)", "pass"),
     ],
     "_calibration": [
@@ -97,8 +132,14 @@ NAMED = {
         ("<= REPEATED * np.abs(expected)", "<= REPEATED + REPEATED * np.abs(expected)"),
     ],
     "_output_metrics": [
-        ("claim.joint, claim.alpha, list(vertices), claim.metric", "claim.joint, claim.alpha, list(vertices)"),
-        ("claim.joint, claim.alpha, list(vertices),", "claim.joint[:1], claim.alpha, list(vertices)[:1],"),
+        (
+            "claim.joint, claim.alpha, list(vertices), claim.metric",
+            "claim.joint, claim.alpha, list(vertices)",
+        ),
+        (
+            "claim.joint, claim.alpha, list(vertices),",
+            "claim.joint[:1], claim.alpha, list(vertices)[:1],",
+        ),
         ("is_positive_definite(matrix, error)", "is_positive_definite(matrix)"),
         ("error = rounding + ", "error = "),
         ("name not in OUTPUTS or not may_have_metrics(weights)", "name not in OUTPUTS"),
@@ -107,8 +148,14 @@ NAMED = {
         ('expected = bounds["nominal"] + bounds', "expected = bounds"),
         ('{"corridor": corridor, **corridor["by_scenario"]}', '{"corridor": corridor}'),
         (" and supports(drives, level)", ""),
-        ('    require_fixed_points(corridor["fixed_points"], output, bounds["for_ever_position"])\n', ""),
-        ("for name in JOINT], axis=0)\n    factor", "for name in JOINT[:1]], axis=0)\n    factor"),
+        (
+            '    require_fixed_points(corridor["fixed_points"], output, bounds["for_ever_position"])\n',
+            "",
+        ),
+        (
+            "for name in JOINT], axis=0)\n    factor",
+            "for name in JOINT[:1]], axis=0)\n    factor",
+        ),
     ],
 }
 """Of each file: text and what replaces it."""
@@ -116,21 +163,52 @@ ARGUED = {
     "what passes is refused by the comparison beside it, or by the core": (
         *("<= error != np.inf", "< bound != np.inf", "<= condition != np.inf"),
         *("<= value != math.inf", "< value != math.inf", "exact = -1 <= inside"),
-        *("largest <= np.inf and", "largest != np.inf and"),  # the rest contains the entry that is not finite
+        *(
+            "largest <= np.inf and",
+            "largest != np.inf and",
+        ),  # the rest contains the entry that is not finite
         "zip(witnesses, vertices, strict=False)",
-        *("claims.kappa != 1.0", "claims.kappa > 1.0", "claims.kappa >= 0.0"),  # with P the core proves no κ ≤ 1
-        *("< level != 1", "< level <= 1", "< level < 2"),  # no number of trajectories supports such a level
+        *(
+            "claims.kappa != 1.0",
+            "claims.kappa > 1.0",
+            "claims.kappa >= 0.0",
+        ),  # with P the core proves no κ ≤ 1
+        *(
+            "< level != 1",
+            "< level <= 1",
+            "< level < 2",
+        ),  # no number of trajectories supports such a level
     ),
-    "norms and scores are never negative: ≠ 0 is > 0": ("SMALLEST != 0", "largest != 0", "found != 0"),
+    "norms and scores are never negative: ≠ 0 is > 0": (
+        "SMALLEST != 0",
+        "largest != 0",
+        "found != 0",
+    ),
     "the same norm by the other of two formulas": (
-        *("1e-140 == size", "size == 1e140", "1e-140 <= size", "size <= 1e140", "if 1.0 < size"),
+        *(
+            "1e-140 == size",
+            "size == 1e140",
+            "1e-140 <= size",
+            "size <= 1e140",
+            "if 1.0 < size",
+        ),
     ),
     "the only entry of a list, one of several alike, or the first of two words": (
-        *('seen["joint"][ -1]', "weights.operators[ -1]", "witness[ -1]", "witness[0][ -1]"),
+        *(
+            'seen["joint"][ -1]',
+            "weights.operators[ -1]",
+            "witness[ -1]",
+            "witness[0][ -1]",
+        ),
         *('mode <= "joint"', "if name <= JOINT[0]"),
     ),
     "nothing that is proved or measured depends on it": (
-        *("np.nextafter(0.0, 2.0)", "initial= -1.0", "largest, physical, always = 1.0", "strict=False)])"),
+        *(
+            "np.nextafter(0.0, 2.0)",
+            "initial= -1.0",
+            "largest, physical, always = 1.0",
+            "strict=False)])",
+        ),
         *(
             "CHUNK = ",
             "-(-count * CHUNK) * CHUNK",
@@ -138,23 +216,36 @@ ARGUED = {
         ),  # sizes of batches, compilation
     ),
 }
-"""Why a change that is not noticed accepts nothing more: reason -> what such changes look like."""
+"""Why a change that is not noticed accepts nothing more: reason -> what such changes
+look like.
+"""
 
 
 def mutants_of(name):
-    """What was changed, and the changed source, of each mutant that computes something else."""
+    """What was changed, and the changed source, of each mutant that computes something
+    else.
+    """
     source = (SOURCES / f"{name}.py").read_text("utf-8")
     seen, found, provider = {_computes(source)}, [], OperatorProvider()
     for old, new in NAMED.get(name, []):
-        assert source.count(old) == 1, f"{name}: {old!r} is there {source.count(old)} times"
+        assert source.count(old) == 1, (
+            f"{name}: {old!r} is there {source.count(old)} times"
+        )
         found.append((f"named: {old.strip()}", source.replace(old, new)))
     for operator in provider:
         first, second = [*operator.split("_"), "", ""][1:3]
         skip = operator.startswith("Variable") or second in ("Invert", "Not")
         skip |= operator.startswith("ReplaceBinary") and ARITHMETIC.get(first) != second
-        skip |= operator.startswith("ReplaceComparison") and second.startswith("Is") and not first.startswith("Is")
+        skip |= (
+            operator.startswith("ReplaceComparison")
+            and second.startswith("Is")
+            and not first.startswith("Is")
+        )
         count = 0
-        while not skip and (mutant := mutate_code(source, provider[operator](), count)) is not None:
+        while (
+            not skip
+            and (mutant := mutate_code(source, provider[operator](), count)) is not None
+        ):
             found.append((f"{operator}: {_difference(source, mutant)}", mutant))
             count += 1
     fresh = []
@@ -170,7 +261,9 @@ def mutants_of(name):
 
 
 def _computes(source):
-    """The tree of what runs: without annotations, and without what may be handed over by name only."""
+    """The tree of what runs: without annotations, and without what may be handed over
+    by name only.
+    """
     tree = ast.parse(source)
     for node in ast.walk(tree):
         if isinstance(node, ast.AnnAssign):
@@ -179,9 +272,14 @@ def _computes(source):
             node.annotation = None
         if isinstance(node, ast.FunctionDef):
             node.returns = None
-        if isinstance(node, ast.arguments):  # the `*` between them is taken for a product
+        if isinstance(
+            node, ast.arguments
+        ):  # the `*` between them is taken for a product
             node.args = [*node.posonlyargs, *node.args, *node.kwonlyargs]
-            node.defaults = [*node.defaults, *(value for value in node.kw_defaults if value)]
+            node.defaults = [
+                *node.defaults,
+                *(value for value in node.kw_defaults if value),
+            ]
             node.posonlyargs, node.kwonlyargs, node.kw_defaults = [], [], []
     return ast.dump(tree)
 
@@ -189,11 +287,16 @@ def _computes(source):
 def _difference(source, mutant):
     """The first line that changed, as it is now."""
     lines = zip(source.splitlines(), mutant.splitlines(), strict=False)
-    return next((f"{k}: {new.strip()}" for k, (old, new) in enumerate(lines, 1) if old != new), "a line less")
+    return next(
+        (f"{k}: {new.strip()}" for k, (old, new) in enumerate(lines, 1) if old != new),
+        "a line less",
+    )
 
 
 def mutate(name, mutant):
-    """Run the changed source in place of the module, and hand the new functions to whoever took the old ones."""
+    """Run the changed source in place of the module, and hand the new functions to
+    whoever took the old ones.
+    """
     module = importlib.import_module(f"sfkd_jax.certification.{name}")
     before = dict(vars(module))
     source = (SOURCES / f"{name}.py").read_text("utf-8")
@@ -210,12 +313,18 @@ def mutate(name, mutant):
 
 def _class_of(source, name):
     """A class in a source, as a tree."""
-    found = [node for node in ast.parse(source).body if isinstance(node, ast.ClassDef) and node.name == name]
+    found = [
+        node
+        for node in ast.parse(source).body
+        if isinstance(node, ast.ClassDef) and node.name == name
+    ]
     return ast.dump(found[0]) if found else ""
 
 
 def notices(items, name, mutant):
-    """Start a fork in which one module is mutated and the tests run up to the first that fails: its process id."""
+    """Start a fork in which one module is mutated and the tests run up to the first
+    that fails: its process id.
+    """
     if child := os.fork():
         return child
     status = 1
@@ -227,7 +336,10 @@ def notices(items, name, mutant):
         resource.setrlimit(resource.RLIMIT_CORE, (0, 0))
         mutate(name, mutant)
         for item, following in zip_longest(items, items[1:]):
-            if any(report.failed for report in runtestprotocol(item, nextitem=following, log=False)):
+            if any(
+                report.failed
+                for report in runtestprotocol(item, nextitem=following, log=False)
+            ):
                 break
         else:
             status = 0
@@ -243,11 +355,15 @@ class Mutate:
         self.jobs, self.files, self.only, self.found = jobs, files, only, {}
 
     def pytest_runtestloop(self, session):
-        """Nothing is run in this process, so that no thread of an accelerator's library is there to be forked."""
+        """Nothing is run in this process, so that no thread of an accelerator's library
+        is there to be forked.
+        """
         for name, files in FILES.items():
             if name in self.files:
                 items = [item for item in session.items if item.path.name in files]
-                items.sort(key=lambda item: (SLOW in item.name, files.index(item.path.name)))
+                items.sort(
+                    key=lambda item: (SLOW in item.name, files.index(item.path.name))
+                )
                 self.found[name] = self.count(name, items)
         return True
 
@@ -256,7 +372,11 @@ class Mutate:
         source = (SOURCES / f"{name}.py").read_text("utf-8")
         if os.waitpid(notices(items, name, source), 0)[1]:
             raise SystemExit(f"the tests of {name} fail on the file as it is")
-        waiting, running, survivors = [row for row in mutants_of(name) if self.only in row[0]], {}, []
+        waiting, running, survivors = (
+            [row for row in mutants_of(name) if self.only in row[0]],
+            {},
+            [],
+        )
         total = len(waiting)
         waiting.reverse()
         while waiting or running:
@@ -268,35 +388,72 @@ class Mutate:
             if status == 0:
                 survivors.append(what)
                 print(f"{name} survives: {what}", flush=True)
-        counts = {"total": total, "killed": total - len(survivors), "named": len(NAMED[name]), "survived": {}}
+        counts = {
+            "total": total,
+            "killed": total - len(survivors),
+            "named": len(NAMED[name]),
+            "survived": {},
+        }
         for what in sorted(survivors):
-            reasons = [reason for reason, texts in ARGUED.items() if any(text in what for text in texts)]
+            reasons = [
+                reason
+                for reason, texts in ARGUED.items()
+                if any(text in what for text in texts)
+            ]
             counts["survived"][what] = reasons[0] if reasons else UNARGUED
         return counts | {"sha256": hashlib.sha256(source.encode()).hexdigest()}
 
 
 def main():
     """Count and write."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
     parser.add_argument("--files", nargs="+", choices=FILES, default=list(FILES))
     parser.add_argument("--jobs", type=int, default=os.cpu_count())
-    parser.add_argument("--only", default="", help="of those whose description holds this")
+    parser.add_argument(
+        "--only", default="", help="of those whose description holds this"
+    )
     parser.add_argument("--out", type=Path)
     asked = parser.parse_args()
     began, plugin = time.perf_counter(), Mutate(asked.jobs, asked.files, asked.only)
     tests = sorted({str(TESTS / test) for name in asked.files for test in FILES[name]})
-    # Without the types that other test runs check: a mutant must be noticed by what it computes.
-    status = pytest.main(["-q", "-p", "no:cacheprovider", "-o", "addopts=", "--rootdir", str(ROOT), *tests], [plugin])
+    # Without the types that other test runs check: a mutant must be noticed by what it
+    # computes.
+    status = pytest.main(
+        [
+            "-q",
+            "-p",
+            "no:cacheprovider",
+            "-o",
+            "addopts=",
+            "--rootdir",
+            str(ROOT),
+            *tests,
+        ],
+        [plugin],
+    )
     if status or set(plugin.found) != set(asked.files):
         sys.exit(f"pytest ended with {status}")
-    counts = {name: {key: row[key] for key in ("total", "killed")} for name, row in plugin.found.items()}
+    counts = {
+        name: {key: row[key] for key in ("total", "killed")}
+        for name, row in plugin.found.items()
+    }
     print(json.dumps({**counts, "seconds": round(time.perf_counter() - began)}))
-    reasons = Counter(reason for row in plugin.found.values() for reason in row["survived"].values())
+    reasons = Counter(
+        reason for row in plugin.found.values() for reason in row["survived"].values()
+    )
     print(json.dumps(reasons, indent=1))
     if asked.out:
         known = artefacts.read_json(asked.out)["files"] if asked.out.exists() else {}
-        rows = {name: (known | plugin.found)[name] for name in FILES if name in known | plugin.found}
-        artefacts.write_json(asked.out, {"files": rows, "versions": artefacts.versions()})
+        rows = {
+            name: (known | plugin.found)[name]
+            for name in FILES
+            if name in known | plugin.found
+        }
+        artefacts.write_json(
+            asked.out, {"files": rows, "versions": artefacts.versions()}
+        )
     sys.exit(1 if reasons[UNARGUED] else 0)
 
 

@@ -9,7 +9,9 @@ import problem
 ONE_THREAD = {"OMP_NUM_THREADS": "1"}
 
 
-def pytorch_mppi(samples, horizon, seed=0, temperature=problem.TEMPERATURE, kind="MPPI", **options):
+def pytorch_mppi(
+    samples, horizon, seed=0, temperature=problem.TEMPERATURE, kind="MPPI", **options
+):
     """pytorch-mppi, MPPI, eager, float32."""
     import pytorch_mppi as library
     import torch
@@ -18,11 +20,17 @@ def pytorch_mppi(samples, horizon, seed=0, temperature=problem.TEMPERATURE, kind
     w, aim = _weights(torch), [None]
     cost = lambda z, u: problem.charge(torch, w, z, u, aim[0])  # noqa: E731
     ones = torch.ones(problem.CONTROLS)
-    box = {"u_min": problem.LOW * ones, "u_max": problem.HIGH * ones, "U_init": torch.zeros(horizon, problem.CONTROLS)}
+    box = {
+        "u_min": problem.LOW * ones,
+        "u_max": problem.HIGH * ones,
+        "U_init": torch.zeros(horizon, problem.CONTROLS),
+    }
     size = {"num_samples": samples, "horizon": horizon, "lambda_": temperature}
     sigma = problem.NOISE**2 * torch.diag(ones)
     model = partial(problem.advance, torch, w)
-    planner = getattr(library, kind)(model, cost, problem.RANK, noise_sigma=sigma, **size, **box, **options)
+    planner = getattr(library, kind)(
+        model, cost, problem.RANK, noise_sigma=sigma, **size, **box, **options
+    )
 
     def step(z, target):
         aim[0] = torch.as_tensor(target)
@@ -32,7 +40,9 @@ def pytorch_mppi(samples, horizon, seed=0, temperature=problem.TEMPERATURE, kind
 
 
 def pytorch_mppi_one_thread(samples, horizon, seed=0):
-    """The same on one thread: no barrier between threads that another process can hold up."""
+    """The same on one thread: no barrier between threads that another process can hold
+    up.
+    """
     return pytorch_mppi(samples, horizon, seed)
 
 
@@ -41,11 +51,15 @@ pytorch_mppi_one_thread.environment = ONE_THREAD
 
 def pytorch_kmppi(samples, horizon, seed=0, temperature=problem.TEMPERATURE):
     """pytorch-mppi, KMPPI: five support points over the horizon."""
-    return pytorch_mppi(samples, horizon, seed, temperature, kind="KMPPI", num_support_pts=5)
+    return pytorch_mppi(
+        samples, horizon, seed, temperature, kind="KMPPI", num_support_pts=5
+    )
 
 
 def torchrl_mppi(samples, horizon, seed=0):
-    """torchrl's MPPIPlanner, one iteration, all samples kept (top_k); it starts anew, with unit noise, every step."""
+    """torchrl's MPPIPlanner, one iteration, all samples kept (top_k); it starts anew,
+    with unit noise, every step.
+    """
     import torch
     from tensordict import TensorDict
     from torchrl.modules import MPPIPlanner
@@ -59,13 +73,22 @@ def torchrl_mppi(samples, horizon, seed=0):
             total = found["next", "reward"].sum(-2, keepdim=True)
             return found.set("advantage", total.expand(found["next", "reward"].shape))
 
-    size = {"planning_horizon": horizon, "optim_steps": 1, "num_candidates": samples, "top_k": samples}
-    planner = MPPIPlanner(environment, Total(), temperature=1.0 / problem.TEMPERATURE, **size)
+    size = {
+        "planning_horizon": horizon,
+        "optim_steps": 1,
+        "num_candidates": samples,
+        "top_k": samples,
+    }
+    planner = MPPIPlanner(
+        environment, Total(), temperature=1.0 / problem.TEMPERATURE, **size
+    )
 
     def step(z, target):
         aim[0] = torch.as_tensor(target)
         with torch.no_grad():
-            return planner(TensorDict({"hidden": torch.as_tensor(z)}, []))["action"].numpy()
+            return planner(TensorDict({"hidden": torch.as_tensor(z)}, []))[
+                "action"
+            ].numpy()
 
     return step
 
@@ -97,9 +120,16 @@ def _torchrl_environment(aim):
 
         def _step(self, tensordict):
             z = problem.advance(torch, w, tensordict["hidden"], tensordict["action"])
-            reward = -problem.charge(torch, w, z, tensordict["action"], aim[0])[..., None]
+            reward = -problem.charge(torch, w, z, tensordict["action"], aim[0])[
+                ..., None
+            ]
             done = torch.zeros(*z.shape[:-1], 1, dtype=torch.bool)
-            found = {"hidden": z, "reward": reward, "done": done, "terminated": done.clone()}
+            found = {
+                "hidden": z,
+                "reward": reward,
+                "done": done,
+                "terminated": done.clone(),
+            }
             return TensorDict(found, tensordict.batch_size)
 
     return Latent()
@@ -124,11 +154,21 @@ def tau_ctrl(samples, horizon, seed=0, temperature=problem.TEMPERATURE):
             controls = controls.astype(np.float32)
             self.z = problem.advance(np, w, self.z, controls)
             never = np.zeros(samples, dtype=bool)
-            return self.z, -problem.charge(np, w, self.z, controls, self.target), never, never, {}
+            return (
+                self.z,
+                -problem.charge(np, w, self.z, controls, self.target),
+                never,
+                never,
+                {},
+            )
 
     class One(gymnasium.Env):
-        observation_space = gymnasium.spaces.Box(-np.inf, np.inf, (problem.RANK,), np.float32)
-        action_space = gymnasium.spaces.Box(problem.LOW, problem.HIGH, (problem.CONTROLS,), np.float32)
+        observation_space = gymnasium.spaces.Box(
+            -np.inf, np.inf, (problem.RANK,), np.float32
+        )
+        action_space = gymnasium.spaces.Box(
+            problem.LOW, problem.HIGH, (problem.CONTROLS,), np.float32
+        )
         state = (problem.start(), problem.TARGET)
 
         def get_state(self):
@@ -138,8 +178,15 @@ def tau_ctrl(samples, horizon, seed=0, temperature=problem.TEMPERATURE):
             self.state = state
 
     one = One()
-    size = {"horizon": horizon, "n_samples": samples, "noise_sigma": problem.NOISE, "temperature": temperature}
-    planner = library.make("mppi", one, vector_env_fn=lambda count: Samples(), seed=seed, **size)
+    size = {
+        "horizon": horizon,
+        "n_samples": samples,
+        "noise_sigma": problem.NOISE,
+        "temperature": temperature,
+    }
+    planner = library.make(
+        "mppi", one, vector_env_fn=lambda count: Samples(), seed=seed, **size
+    )
 
     def step(z, target):
         one.state = (z, target)

@@ -1,11 +1,15 @@
-"""This library among the contenders; each builds `step(z, target) -> u` on numpy arrays."""
+"""This library among the contenders; each builds `step(z, target) -> u` on numpy
+arrays.
+"""
 
 import problem
 import timing
 
 
 def planner(samples, horizon, **settings):
-    """A `Controller` for the problem, and its weights: noise, all rollouts, weights, the plan rolled out once more."""
+    """A `Controller` for the problem, and its weights: noise, all rollouts, weights,
+    the plan rolled out once more.
+    """
     import jax.numpy as jnp
 
     from sfkd_jax import control
@@ -18,11 +22,16 @@ def planner(samples, horizon, **settings):
     def stage(weights, z, u, before, target):
         return problem.charge(jnp, w, z, u, target)
 
-    limits = {"control_low": (problem.LOW,) * problem.CONTROLS, "control_high": (problem.HIGH,) * problem.CONTROLS}
+    limits = {
+        "control_low": (problem.LOW,) * problem.CONTROLS,
+        "control_high": (problem.HIGH,) * problem.CONTROLS,
+    }
     task = control.free_task(dynamics, stage, **limits)
     settings = {"noise": "white", "temperature": problem.TEMPERATURE, **settings}
     noise = (problem.NOISE,) * problem.CONTROLS
-    return control.mppi(task, num_samples=samples, horizon=horizon, noise_std=noise, **settings), w
+    return control.mppi(
+        task, num_samples=samples, horizon=horizon, noise_std=noise, **settings
+    ), w
 
 
 def arguments(controller, w, horizon, seed=0):
@@ -31,7 +40,13 @@ def arguments(controller, w, horizon, seed=0):
     import jax.numpy as jnp
 
     targets = jnp.tile(jnp.asarray(problem.TARGET), (horizon, 1))
-    return w, controller.init(jax.random.key(seed)), jnp.asarray(problem.start()), jnp.zeros(0), targets
+    return (
+        w,
+        controller.init(jax.random.key(seed)),
+        jnp.asarray(problem.start()),
+        jnp.zeros(0),
+        targets,
+    )
 
 
 def sfkd_jax(samples, horizon, seed=0, **settings):
@@ -57,7 +72,9 @@ def sfkd_jax_ess(samples, horizon, seed=0):
 
 def sfkd_jax_knots(samples, horizon, seed=0):
     """The same with noise of five bumps over the horizon."""
-    return sfkd_jax(samples, horizon, seed, effective_samples=30.0, noise="rbf", noise_knots=5)
+    return sfkd_jax(
+        samples, horizon, seed, effective_samples=30.0, noise="rbf", noise_knots=5
+    )
 
 
 def sfkd_jax_sharded(samples, horizon, seed=0, **settings):
@@ -71,7 +88,9 @@ def spread():
     import numpy as np
 
     mesh = jax.sharding.Mesh(np.array(jax.devices()), ("sample",))
-    return jax.sharding.NamedSharding(mesh, jax.sharding.PartitionSpec(None, "sample", None))
+    return jax.sharding.NamedSharding(
+        mesh, jax.sharding.PartitionSpec(None, "sample", None)
+    )
 
 
 sfkd_jax_sharded.environment = timing.HOST_DEVICES

@@ -1,4 +1,6 @@
-"""The project's own model and task: SFKD in the size of conf/model/sfkd.yaml, random weights, a bend to follow."""
+"""The project's own model and task: SFKD in the size of conf/model/sfkd.yaml, random
+weights, a bend to follow.
+"""
 
 import ours
 import timing
@@ -16,7 +18,9 @@ def settings(*overrides):
 
     config.register()
     with hydra.initialize_config_dir(config.conf_path(), version_base="1.3"):
-        return OmegaConf.to_container(hydra.compose("config", [PLANT, *overrides]), resolve=True)
+        return OmegaConf.to_container(
+            hydra.compose("config", [PLANT, *overrides]), resolve=True
+        )
 
 
 def space(plant):
@@ -58,7 +62,9 @@ def weights(model):
 
     def drawn(leaf):
         spread = leaf.shape[-2] ** -0.5 if len(leaf.shape) > 1 else 0.3
-        return jnp.asarray(spread * random.standard_normal(leaf.shape), dtype=leaf.dtype)
+        return jnp.asarray(
+            spread * random.standard_normal(leaf.shape), dtype=leaf.dtype
+        )
 
     return jax.tree.map(drawn, jax.eval_shape(model.init, jax.random.key(0)))
 
@@ -69,19 +75,27 @@ def inputs(plant, model, horizon):
 
     angle = plant.dt * SPEED / RADIUS * jnp.arange(1, horizon + 1)
     speed = jnp.full(horizon, SPEED)
-    reference = jnp.stack([RADIUS * jnp.sin(angle), RADIUS * (1 - jnp.cos(angle)), angle, speed], axis=1)
+    reference = jnp.stack(
+        [RADIUS * jnp.sin(angle), RADIUS * (1 - jnp.cos(angle)), angle, speed], axis=1
+    )
     observation = jnp.zeros(len(plant.state_names)).at[3].set(SPEED)
     return weights(model), observation, jnp.asarray([0.6, 2.0]), reference
 
 
 def problem(samples, horizon, seed=0, **options):
-    """The configured `Controller` under further options of `mppi`, and what its `act` takes."""
+    """The configured `Controller` under further options of `mppi`, and what its `act`
+    takes.
+    """
     import jax
 
     from sfkd_jax import build
 
     plant, model, asked = belief()
-    asked["controller"]["mppi"] |= {"num_samples": samples, "horizon": horizon, **options}
+    asked["controller"]["mppi"] |= {
+        "num_samples": samples,
+        "horizon": horizon,
+        **options,
+    }
     limits = {name: asked["dataset"][name] for name in ("env_low", "env_high")}
     controller = build.build_controller(asked["controller"], model, plant, **limits)
     params, *rest = inputs(plant, model, horizon)
@@ -90,7 +104,9 @@ def problem(samples, horizon, seed=0, **options):
 
 
 def own_model(samples, horizon, seed=0, **options):
-    """A contender by itself, with a problem of its own: state and target that it is given are not looked at."""
+    """A contender by itself, with a problem of its own: state and target that it is
+    given are not looked at.
+    """
     import jax
     import numpy as np
 

@@ -1,6 +1,7 @@
 """Where the control step with the project's own model spends its time: parts alone, and the rollouts less a part.
 
-python benchmarks/own_profile.py [--samples 1500 --horizon 20 --rounds 15 --out benchmarks/own_profile.json]
+python benchmarks/own_profile.py [--samples 1500 --horizon 20 --rounds 15 --out
+benchmarks/own_profile.json]
 """
 
 import argparse
@@ -40,7 +41,9 @@ def rollouts_of(task, horizon):
 
     def roll(began, plans):
         count = plans.shape[1]
-        batch = jax.tree.map(lambda leaf: jnp.broadcast_to(leaf, (count, *leaf.shape)), began.start)
+        batch = jax.tree.map(
+            lambda leaf: jnp.broadcast_to(leaf, (count, *leaf.shape)), began.start
+        )
 
         def body(carry, given):
             costs, samples = carry
@@ -48,7 +51,9 @@ def rollouts_of(task, horizon):
             after = step(task.weights, began.context, samples, *given)
             return (costs + after.cost, after.sample), after.perturbation
 
-        (costs, samples), effective = jax.lax.scan(body, (jnp.zeros(count), batch), (plans, began.targets, last))
+        (costs, samples), effective = jax.lax.scan(
+            body, (jnp.zeros(count), batch), (plans, began.targets, last)
+        )
         return costs, effective, samples.latent
 
     return jax.jit(roll)
@@ -80,19 +85,27 @@ def parts(samples, horizon):
     bare = {"law": control.no_feedback(), "cost": free}
     return {
         "whole step": whole(samples, horizon),
-        "whole step, 30 effective samples": whole(samples, horizon, effective_samples=30.0),
+        "whole step, 30 effective samples": whole(
+            samples, horizon, effective_samples=30.0
+        ),
         "whole step, one sample": whole(1, horizon),
         "fibre, encoder, curvature": _call(begin_of(task_of(plant, model)), *given),
         "noise": _call(noise, jax.random.key(3)),
         "rollouts": rollouts(samples, horizon),
         "rollouts, one sample": rollouts(1, horizon),
         "rollouts less the residual": rollouts(samples, horizon, "model.residual=none"),
-        "rollouts, decoder of width 2": rollouts(samples, horizon, f"model.decoder_hidden={SMALL}"),
+        "rollouts, decoder of width 2": rollouts(
+            samples, horizon, f"model.decoder_hidden={SMALL}"
+        ),
         "rollouts less the cost": rollouts(samples, horizon, cost=free),
         "rollouts less the law": rollouts(samples, horizon, law=control.no_feedback()),
         "rollouts less law and cost": rollouts(samples, horizon, **bare),
         "rollouts less all of these": rollouts(
-            samples, horizon, "model.residual=none", f"model.decoder_hidden={SMALL}", **bare
+            samples,
+            horizon,
+            "model.residual=none",
+            f"model.decoder_hidden={SMALL}",
+            **bare,
         ),
     }
 
@@ -104,16 +117,23 @@ def _call(run, *given):
 
 def main():
     """Parse, time, print, write."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
     for name, value in (("samples", 1500), ("horizon", 20), ("rounds", 15)):
         parser.add_argument(f"--{name}", type=int, default=value)
     parser.add_argument("--out")
     asked = parser.parse_args()
     found = timing.in_turn(parts(asked.samples, asked.horizon), asked.rounds)
     for label, row in found.items():
-        print(f"{label:36}", "  ".join(f"{key} {value:7.3f}" for key, value in row.items()))
+        print(
+            f"{label:36}",
+            "  ".join(f"{key} {value:7.3f}" for key, value in row.items()),
+        )
     settings = {key: getattr(asked, key) for key in ("samples", "horizon", "rounds")}
-    timing.write(asked.out, {"parts": found, "settings": settings, "machine": timing.machine()})
+    timing.write(
+        asked.out, {"parts": found, "settings": settings, "machine": timing.machine()}
+    )
     print(json.dumps(found["whole step"]))
 
 

@@ -1,7 +1,7 @@
 """Print the tables of docs/performance.md from the JSON files beside this script; with --write put them into the page.
 
-python benchmarks/page.py [--write]
-A table stands in the page between <!-- NAME --> and <!-- end -->; the words around it are written by hand.
+python benchmarks/page.py [--write] A table stands in the page between <!-- NAME --> and
+<!-- end -->; the words around it are written by hand.
 """
 
 import argparse
@@ -41,19 +41,32 @@ def put(path, made):
     page = path.read_text()
     for name, text in made.items():
         pattern = re.compile(rf"<!-- {name} -->\n.*?<!-- end -->", re.DOTALL)
-        page, count = pattern.subn(lambda _, text=text, name=name: f"<!-- {name} -->\n{text}\n<!-- end -->", page)
+        page, count = pattern.subn(
+            lambda _, text=text, name=name: f"<!-- {name} -->\n{text}\n<!-- end -->",
+            page,
+        )
         if count != 1:
-            raise SystemExit(f"{path.name} has {count} places for the table {name!r}, not 1")
+            raise SystemExit(
+                f"{path.name} has {count} places for the table {name!r}, not 1"
+            )
     path.write_text(page)
 
 
 def main():
     """Parse, print or write."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--write", action="store_true", help="put the tables into docs/performance.md")
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument(
+        "--write", action="store_true", help="put the tables into docs/performance.md"
+    )
     made = {name: built(build) for name, build in TABLES.items()}
     if not parser.parse_args().write:
-        print("\n\n".join(f"<!-- {name} -->\n{text}\n<!-- end -->" for name, text in made.items()))
+        print(
+            "\n\n".join(
+                f"<!-- {name} -->\n{text}\n<!-- end -->" for name, text in made.items()
+            )
+        )
         return
     put(PAGE, made)
 

@@ -1,8 +1,9 @@
 """Settings of the rivals in path coordinates, chosen by their error on validation windows after a short training.
 
-python benchmarks/path_choices.py [--vehicle dynamic --steps 1000 --root runs --out benchmarks/path_choices.json]
-Every choice is trained by its own loss and scored by the same: the free-running and the one-step prediction of the
-loss with its default weights. What is in the JSON already is not trained again.
+python benchmarks/path_choices.py [--vehicle dynamic --steps 1000 --root runs --out
+benchmarks/path_choices.json] Every choice is trained by its own loss and scored by the
+same: the free-running and the one-step prediction of the loss with its default weights.
+What is in the JSON already is not trained again.
 """
 
 import argparse
@@ -43,13 +44,17 @@ def score(settings, steps):
     options = dict(settings["training"]) | {"steps": steps, "save_every": steps}
     del options["data_share"]
     length, space = options.pop("window"), measure_space(dataset)
-    model = build.build_model(settings["model"], space, build.build_vehicle(settings["vehicle"]))
+    model = build.build_model(
+        settings["model"], space, build.build_vehicle(settings["vehicle"])
+    )
     loss = multi_step_loss(model, space, **build.without(options.pop("loss")))
     draw = partial(random_windows, batch=options.pop("batch"), length=length)
     held_out = spread_windows(dataset.validation, length=length)
     key = jax.random.fold_in(jax.random.key(settings["seed"]), 0)
     with tempfile.TemporaryDirectory() as place:
-        params, _ = fit(model, loss, draw, dataset.train, held_out, key, Path(place), **options)
+        params, _ = fit(
+            model, loss, draw, dataset.train, held_out, key, Path(place), **options
+        )
     parts = jax.jit(multi_step_loss(model, space))(params, held_out)[1]
     found = {name: float(parts[name]) for name in ("prediction", "one_step")}
     return {"error": sum(found.values())} | found
@@ -57,7 +62,9 @@ def score(settings, steps):
 
 def main():
     """Train and write."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
     parser.add_argument("--vehicle", default="dynamic", choices=build.PLANTS)
     parser.add_argument("--steps", type=int, default=1000)
     parser.add_argument("--root", default="runs")
@@ -71,7 +78,12 @@ def main():
             if name in kept:
                 continue
             with initialize_config_dir(config.conf_path(), version_base="1.3"):
-                picked = ["dataset=path", f"model={model}", f"vehicle={asked.vehicle}", f"root={asked.root}"]
+                picked = [
+                    "dataset=path",
+                    f"model={model}",
+                    f"vehicle={asked.vehicle}",
+                    f"root={asked.root}",
+                ]
                 composed = compose("config", overrides=[*picked, *overrides.split()])
             settings = OmegaConf.to_container(composed, resolve=True)
             kept[name] = score(settings, asked.steps)

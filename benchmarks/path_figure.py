@@ -1,4 +1,6 @@
-"""The figure of docs/path.md, drawn by path_frame.py: error over the certified tube, a point a weight of its loss."""
+"""The figure of docs/path.md, drawn by path_frame.py: error over the certified tube, a
+point a weight of its loss.
+"""
 
 from pathlib import Path
 
@@ -16,7 +18,8 @@ def draw(weighed, bounds):
 
     Args:
         weighed: (plant, weight, scenario -> row), the weights of a plant ascending.
-        bounds: (plant, system, weight) -> bounds of the corridor; without a weight for 0.
+        bounds: (plant, system, weight) -> bounds of the corridor; without a weight for
+            0.
     """
     from matplotlib.figure import Figure
 
@@ -25,13 +28,21 @@ def draw(weighed, bounds):
     panels = figure.subplots(len(plants), len(MEASURES), sharex="row")
     for line, plant in zip(panels, plants, strict=True):
         found = [entry for entry in weighed if entry[0] == plant]
-        keys = [(plant, "sfkd_path", *([weight] if weight else [])) for _, weight, _ in found]
+        keys = [
+            (plant, "sfkd_path", *([weight] if weight else []))
+            for _, weight, _ in found
+        ]
         wide = [bounds[key]["followed_position"] for key in keys]
         for axes, (head, measure) in zip(line, MEASURES.items(), strict=True):
             high = [measure(rows) for *_, rows in found]
             axes.plot(wide, high, color="#0b57b0", marker="o", markersize=4)
             for (_, weight, _), *point in zip(found, wide, high, strict=True):
-                offset = {"textcoords": "offset points", "xytext": (0, 6), "ha": "center", "fontsize": 7.5}
+                offset = {
+                    "textcoords": "offset points",
+                    "xytext": (0, 6),
+                    "ha": "center",
+                    "fontsize": 7.5,
+                }
                 axes.annotate(f"{weight:g}", point, **offset)
             axes.set(ylim=(0.0, 1.25 * max(high)), title=f"{plant}: {head}")
             axes.title.set_fontsize(9)

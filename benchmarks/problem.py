@@ -16,7 +16,9 @@ def weights():
     random = np.random.default_rng(0)
 
     def layer(out, size, scale=1.0):
-        return (scale * random.normal(size=(out, size)) / np.sqrt(size)).astype(np.float32)
+        return (scale * random.normal(size=(out, size)) / np.sqrt(size)).astype(
+            np.float32
+        )
 
     rotation, _ = np.linalg.qr(random.normal(size=(RANK, RANK)))
     return {
@@ -34,9 +36,13 @@ def weights():
 
 
 def advance(xp, w, z, u):
-    """z⁺ of one sample, or of samples as rows; `xp` is numpy, jax.numpy or torch, and w its arrays."""
+    """z⁺ of one sample, or of samples as rows; `xp` is numpy, jax.numpy or torch, and w
+    its arrays.
+    """
     hidden = xp.tanh(xp.concatenate((z, u), -1) @ w["W1"].T + w["b1"])
-    return z @ w["A"].T + u @ w["B"].T + xp.tanh(hidden @ w["W2"].T + w["b2"]) @ w["W3"].T
+    return (
+        z @ w["A"].T + u @ w["B"].T + xp.tanh(hidden @ w["W2"].T + w["b2"]) @ w["W3"].T
+    )
 
 
 def output(xp, w, z):

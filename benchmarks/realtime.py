@@ -1,6 +1,7 @@
 """Thousands of control steps at full speed, alone and beside a process that keeps one core busy; tails and misses.
 
-python benchmarks/realtime.py [--steps 10000 --beside 2000 --slow 2000 --only NAME ... --out benchmarks/realtime.json]
+python benchmarks/realtime.py [--steps 10000 --beside 2000 --slow 2000 --only NAME ...
+--out benchmarks/realtime.json]
 """
 
 import argparse
@@ -33,22 +34,38 @@ def competing():
 def tail(times):
     """Quantiles, the worst step, and how many missed the period."""
     found = {name: timing.quantile(times, share) for name, share in SHARES.items()}
-    return found | {"max_ms": max(times), "missed": sum(time > PERIOD_MS for time in times), "steps": len(times)}
+    return found | {
+        "max_ms": max(times),
+        "missed": sum(time > PERIOD_MS for time in times),
+        "steps": len(times),
+    }
 
 
 def drive(name, steps, beside):
     """One contender in a process of its own."""
     words = ("--measure", name, "--steps", steps)
     with competing() if beside else nullcontext():
-        return timing.in_own_process("realtime.py", *words, environment=environment(name))
+        return timing.in_own_process(
+            "realtime.py", *words, environment=environment(name)
+        )
 
 
 def main():
     """Parse, run, print, write."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    for name, value in (("samples", 1500), ("horizon", 20), ("steps", 10000), ("beside", 2000), ("slow", 2000)):
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    for name, value in (
+        ("samples", 1500),
+        ("horizon", 20),
+        ("steps", 10000),
+        ("beside", 2000),
+        ("slow", 2000),
+    ):
         parser.add_argument(f"--{name}", type=int, default=value)
-    parser.add_argument("--only", nargs="*", default=[*OURS, *PEERS], choices=list(CONTENDERS))
+    parser.add_argument(
+        "--only", nargs="*", default=[*OURS, *PEERS], choices=list(CONTENDERS)
+    )
     parser.add_argument("--out")
     parser.add_argument("--measure", choices=list(CONTENDERS), help=argparse.SUPPRESS)
     asked = parser.parse_args()
@@ -59,11 +76,22 @@ def main():
     found = {}
     for name in asked.only:
         steps = asked.steps if name in OURS else asked.slow
-        both = {"alone": drive(name, steps, False), "beside": drive(name, min(steps, asked.beside), True)}
+        both = {
+            "alone": drive(name, steps, False),
+            "beside": drive(name, min(steps, asked.beside), True),
+        }
         found[name] = both
         print(name, json.dumps(both))
-    settings = {key: getattr(asked, key) for key in ("samples", "horizon", "steps", "beside", "slow")}
-    document = {"contenders": found, "period_ms": PERIOD_MS, "settings": settings, "machine": timing.machine()}
+    settings = {
+        key: getattr(asked, key)
+        for key in ("samples", "horizon", "steps", "beside", "slow")
+    }
+    document = {
+        "contenders": found,
+        "period_ms": PERIOD_MS,
+        "settings": settings,
+        "machine": timing.machine(),
+    }
     timing.write(asked.out, document)
 
 

@@ -1,7 +1,8 @@
 """Write a page of results: python benchmarks/result_pages.py levels writes docs/levels.md and experiments/levels/.
 
-It takes what `python -m sfkd_jax.compare +experiment=NAME` left under --root. Where nothing lies there, the page is
-written anew from the results in experiments/; figures that need driven episodes then stay as they are.
+It takes what `python -m sfkd_jax.compare +experiment=NAME` left under --root. Where
+nothing lies there, the page is written anew from the results in experiments/; figures
+that need driven episodes then stay as they are.
 """
 
 from __future__ import annotations
@@ -38,13 +39,20 @@ def main() -> None:
     """Copy the results, draw them, write the page."""
     parser = argparse.ArgumentParser(description="Write a page of results in docs/.")
     parser.add_argument("name", choices=PAGES)
-    parser.add_argument("--root", type=Path, default=Path("runs"), help="of the artefacts")
+    parser.add_argument(
+        "--root", type=Path, default=Path("runs"), help="of the artefacts"
+    )
     asked = parser.parse_args()
     folder, page = PAGES[asked.name]
-    kept, files = HOME / "experiments" / folder / "results.json", HOME / "docs" / f"{page}_files"
+    kept, files = (
+        HOME / "experiments" / folder / "results.json",
+        HOME / "docs" / f"{page}_files",
+    )
     source = asked.root / asked.name / "results.json"
     if not source.exists() and not kept.exists():
-        parser.error(f"{source} is missing: python -m sfkd_jax.compare +experiment={asked.name} makes it")
+        parser.error(
+            f"{source} is missing: python -m sfkd_jax.compare +experiment={asked.name} makes it"
+        )
     if source.exists():
         kept.parent.mkdir(exist_ok=True)
         shutil.copyfile(source, kept)
@@ -52,14 +60,25 @@ def main() -> None:
     with tempfile.TemporaryDirectory() as scratch:
         if not source.exists():
             shutil.copyfile(kept, Path(scratch, "results.json"))
-        figures = benchmark_report(source.parent if source.exists() else Path(scratch))["figures"]
+        figures = benchmark_report(source.parent if source.exists() else Path(scratch))[
+            "figures"
+        ]
         text = page_of(json.loads(kept.read_text("utf-8")), page)
-        there, driven = set(files.iterdir()), [file for kind in DRIVEN for file in files.glob(kind)]
-        stays = set() if source.exists() else {file for file in driven if file.suffix == ".gif" or file.name in text}
+        there, driven = (
+            set(files.iterdir()),
+            [file for kind in DRIVEN for file in files.glob(kind)],
+        )
+        stays = (
+            set()
+            if source.exists()
+            else {file for file in driven if file.suffix == ".gif" or file.name in text}
+        )
         for old in there - stays:
             old.unlink()
         for figure in map(Path, figures):
-            place = files / figure.name  # films are not linked; other pages show one that lies there
+            place = (
+                files / figure.name
+            )  # films are not linked; other pages show one that lies there
             if place not in stays and (figure.name in text or place in there):
                 shutil.copyfile(figure, place)
     (HOME / "docs" / f"{page}.md").write_text(text, encoding="utf-8")

@@ -1,6 +1,7 @@
 """How the control step grows with samples and horizon, what compiling costs, episodes against steps, and the floor.
 
-python benchmarks/scaling.py [--rounds 3 --steps 30 --episode 200 --out benchmarks/scaling.json]
+python benchmarks/scaling.py [--rounds 3 --steps 30 --episode 200 --out
+benchmarks/scaling.json]
 """
 
 import argparse
@@ -26,28 +27,60 @@ def exponent(sizes, times):
 
 
 def sweep(names, samples, rounds, steps):
-    """Every contender at every size, round-robin: name -> rows of (samples, horizon, summary)."""
-    sizes = [(count, USUAL[1]) for count in samples] + [(USUAL[0], horizon) for horizon in HORIZONS]
+    """Every contender at every size, round-robin: name -> rows of (samples, horizon,
+    summary).
+    """
+    sizes = [(count, USUAL[1]) for count in samples] + [
+        (USUAL[0], horizon) for horizon in HORIZONS
+    ]
     sizes = list(dict.fromkeys(sizes))
-    jobs = {f"{name} {m} {t}": (name, m, t) for name, (m, t) in itertools.product(names, sizes)}
+    jobs = {
+        f"{name} {m} {t}": (name, m, t)
+        for name, (m, t) in itertools.product(names, sizes)
+    }
     table, missing = table_of(rounds_of(jobs, rounds, steps))
-    rows = [dict(zip(("name", "samples", "horizon"), jobs[label], strict=True)) | row for label, row in table.items()]
+    rows = [
+        dict(zip(("name", "samples", "horizon"), jobs[label], strict=True)) | row
+        for label, row in table.items()
+    ]
     return rows, missing
 
 
 def growth(rows, name, samples):
-    """Exponents of the best round's time, over all numbers of samples and over the large ones."""
-    times = {row["samples"]: row["best_ms"] for row in rows if row["name"] == name and row["horizon"] == USUAL[1]}
-    ranges = {"all": list(samples), "from_1500": [count for count in samples if count >= USUAL[0]]}
-    return {part: exponent(sizes, [times[m] for m in sizes]) for part, sizes in ranges.items() if len(sizes) > 1}
+    """Exponents of the best round's time, over all numbers of samples and over the
+    large ones.
+    """
+    times = {
+        row["samples"]: row["best_ms"]
+        for row in rows
+        if row["name"] == name and row["horizon"] == USUAL[1]
+    }
+    ranges = {
+        "all": list(samples),
+        "from_1500": [count for count in samples if count >= USUAL[0]],
+    }
+    return {
+        part: exponent(sizes, [times[m] for m in sizes])
+        for part, sizes in ranges.items()
+        if len(sizes) > 1
+    }
 
 
 def main():
     """Parse, run, print, write."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    for name, value in (("rounds", 3), ("steps", 30), ("episode", 200), ("compilations", 3)):
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    for name, value in (
+        ("rounds", 3),
+        ("steps", 30),
+        ("episode", 200),
+        ("compilations", 3),
+    ):
         parser.add_argument(f"--{name}", type=int, default=value)
-    parser.add_argument("--only", nargs="*", default=list(SHOWN), choices=list(CONTENDERS))
+    parser.add_argument(
+        "--only", nargs="*", default=list(SHOWN), choices=list(CONTENDERS)
+    )
     parser.add_argument("--samples", nargs="*", type=int, default=list(SAMPLES))
     parser.add_argument("--out")
     asked = parser.parse_args()
@@ -57,14 +90,23 @@ def main():
         "sweep": rows,
         "not_run": missing,
         "exponents": {name: growth(rows, name, asked.samples) for name in ran},
-        "episode": timing.in_own_process("episode.py", "--steps", asked.episode, "--rounds", 2 * asked.rounds),
-        "compile": timing.in_own_process("compiling.py", "--rounds", asked.compilations),
+        "episode": timing.in_own_process(
+            "episode.py", "--steps", asked.episode, "--rounds", 2 * asked.rounds
+        ),
+        "compile": timing.in_own_process(
+            "compiling.py", "--rounds", asked.compilations
+        ),
         "floor": timing.in_own_process("floor.py", "--rounds", 5 * asked.rounds),
-        "settings": {key: getattr(asked, key) for key in ("rounds", "steps", "episode", "compilations")},
+        "settings": {
+            key: getattr(asked, key)
+            for key in ("rounds", "steps", "episode", "compilations")
+        },
         "machine": timing.machine(),
     }
     for row in rows:
-        print(f"{row['name']:24} {row['samples']:6} x {row['horizon']:3}  best {row['best_ms']:8.2f} ms")
+        print(
+            f"{row['name']:24} {row['samples']:6} x {row['horizon']:3}  best {row['best_ms']:8.2f} ms"
+        )
     for part in ("not_run", "exponents", "episode", "compile", "floor"):
         print(part, document[part])
     timing.write(asked.out, document)

@@ -1,7 +1,7 @@
 """A Slurm cluster of one node on the loopback address, for as long as a drill takes: munge, slurmctld and slurmd.
 
-Needs root and the Debian packages munge, slurmctld, slurmd and slurm-client. Everything lies in one folder; nothing of
-/etc/slurm is read.
+Needs root and the Debian packages munge, slurmctld, slurmd and slurm-client. Everything
+lies in one folder; nothing of /etc/slurm is read.
 """
 
 import os
@@ -43,7 +43,9 @@ PartitionName=main Nodes=ALL Default=YES MaxTime=60 State=UP
 
 
 class Cluster:
-    """Two CPUs and 8 GB, without accounting; `with Cluster(folder) as cluster:` starts and stops it."""
+    """Two CPUs and 8 GB, without accounting; `with Cluster(folder) as cluster:` starts
+    and stops it.
+    """
 
     def __init__(self, place):
         """Write its configuration below `place`."""
@@ -59,22 +61,30 @@ class Cluster:
             first = min(free.getsockname()[1], 65000)
         ports = (first, first + 1, first + 2, first + 99)
         self._config = place / "slurm.conf"
-        self._config.write_text(CONFIG.format(place=place, host=socket.gethostname(), ports=ports))
+        self._config.write_text(
+            CONFIG.format(place=place, host=socket.gethostname(), ports=ports)
+        )
         self.env = os.environ | {"SLURM_CONF": str(self._config)}
 
     def __enter__(self):
         """Start the daemons, and wait until the node is idle."""
         munge = self.place / "munge"
-        files = [f"--{name}-file={munge / name}" for name in ("key", "log", "pid", "seed")]
+        files = [
+            f"--{name}-file={munge / name}" for name in ("key", "log", "pid", "seed")
+        ]
         self._start("munged", "--foreground", f"--socket={munge / 'socket'}", *files)
         self._until(lambda: (munge / "socket").exists(), "munged")
         self._start("slurmctld", "-D", "-f", str(self._config))
         self._start("slurmd", "-D", "-f", str(self._config))
-        self._until(lambda: "idle" in self.ask("sinfo", "--noheader", "--format=%T"), "slurmd")
+        self._until(
+            lambda: "idle" in self.ask("sinfo", "--noheader", "--format=%T"), "slurmd"
+        )
         return self
 
     def __exit__(self, *_):
-        """Stop who waits for jobs, cancel what runs, and stop the daemons in the reverse order."""
+        """Stop who waits for jobs, cancel what runs, and stop the daemons in the
+        reverse order.
+        """
         for client in self.clients:
             if client.poll() is None:
                 client.kill()
@@ -87,21 +97,31 @@ class Cluster:
 
     def ask(self, *command):
         """What a command of Slurm says."""
-        done = subprocess.run(command, env=self.env, capture_output=True, text=True, check=False)
+        done = subprocess.run(
+            command, env=self.env, capture_output=True, text=True, check=False
+        )
         return done.stdout + done.stderr
 
     def jobs(self):
         """State by job id, of those that Slurm remembers."""
-        said = self.ask("squeue", "--me", "--array", "--states=all", "--noheader", "--format=%i %T")
+        said = self.ask(
+            "squeue", "--me", "--array", "--states=all", "--noheader", "--format=%i %T"
+        )
         return dict(line.split() for line in said.splitlines())
 
     def _start(self, *command):
         log = (self.place / f"{command[0]}.out").open("w")
-        self._daemons.append(subprocess.Popen(command, env=self.env, stdout=log, stderr=log, start_new_session=True))
+        self._daemons.append(
+            subprocess.Popen(
+                command, env=self.env, stdout=log, stderr=log, start_new_session=True
+            )
+        )
 
     def _until(self, done, name, seconds=60):
         began = time.monotonic()
         while not done():
             if time.monotonic() - began > seconds:
-                raise SystemExit(f"{name} did not start: {(self.place / f'{name}.out').read_text()[-500:]}")
+                raise SystemExit(
+                    f"{name} did not start: {(self.place / f'{name}.out').read_text()[-500:]}"
+                )
             time.sleep(0.5)

@@ -1,8 +1,9 @@
 """How fast may the car go? The corridor of certified policies for every friction and speed of their box.
 
 python benchmarks/speed.py DIR ... [--room 0.5 --drives 150 --out benchmarks/speed.json]
-DIR: with policy.npz and a certificate.json that has a corridor. Every cell is calibrated by itself, on drives that have
-its friction and its speed. --room: what the lane leaves on either side of the car [m].
+DIR: with policy.npz and a certificate.json that has a corridor. Every cell is
+calibrated by itself, on drives that have its friction and its speed. --room: what the
+lane leaves on either side of the car [m].
 """
 
 import argparse
@@ -24,15 +25,23 @@ def cells(run, drives):
     car = shield.load(run)
     about = car.certificate["corridor"]["class"]
     low, high = (corner[0] for corner in about["env_box"])
-    frictions, speeds = np.linspace(low, high, FRICTIONS), np.linspace(*about["speed"], SPEEDS)
-    grid = {"frictions": frictions.round(6).tolist(), "speeds": speeds.round(6).tolist()}
+    frictions, speeds = (
+        np.linspace(low, high, FRICTIONS),
+        np.linspace(*about["speed"], SPEEDS),
+    )
+    grid = {
+        "frictions": frictions.round(6).tolist(),
+        "speeds": speeds.round(6).tolist(),
+    }
     found = corridor_by_speed(car.trained, car.certificate, **grid, drives=drives)
     return {"policy_sha256": car.certificate["policy_sha256"]} | found
 
 
 def main():
     """Parse, drive, print, write."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
     parser.add_argument("runs", nargs="+", metavar="DIR")
     parser.add_argument("--room", type=float, default=0.5)
     parser.add_argument("--drives", type=int, default=150)
@@ -45,7 +54,9 @@ def main():
         document["cars"][name] = found
         print(table(name, found), answer(found, asked.room), sep="\n", flush=True)
         if asked.out:
-            artefacts.write_json(asked.out, document | {"versions": artefacts.versions()})
+            artefacts.write_json(
+                asked.out, document | {"versions": artefacts.versions()}
+            )
 
 
 if __name__ == "__main__":

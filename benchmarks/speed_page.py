@@ -20,9 +20,19 @@ ROOMS = (0.1, 0.15, 0.2, 0.3)
 def table(name, found):
     """The corridor of every cell, as Markdown: a row for each speed."""
     cells = found["cells"]
-    frictions, speeds = (sorted({cell[key] for cell in cells}) for key in ("friction", "speed"))
+    frictions, speeds = (
+        sorted({cell[key] for cell in cells}) for key in ("friction", "speed")
+    )
     known = {(cell["friction"], cell["speed"]): cell for cell in cells}
-    lines = [_row([f"{name}: speed [m/s]", "tightest bend [1/m]", *(f"friction {value:g}" for value in frictions)])]
+    lines = [
+        _row(
+            [
+                f"{name}: speed [m/s]",
+                "tightest bend [1/m]",
+                *(f"friction {value:g}" for value in frictions),
+            ]
+        )
+    ]
     lines.append(_row(["---"] * (2 + len(frictions))))
     for speed in speeds:
         row = [known[friction, speed] for friction in frictions]
@@ -39,8 +49,16 @@ def answer(found, room):
         return f"With {room:g} m of room: up to {ends:g} m/s at every friction; the box ends first."
     if not any(speeds.values()):
         return f"With {room:g} m of room: at no speed of the box."
-    words = [f"friction {friction:g} {_speed(speed)}" for friction, speed in speeds.items() if speed != ends]
-    words += [f"up to {ends:g} m/s elsewhere, where the box ends first"] if ends in speeds.values() else []
+    words = [
+        f"friction {friction:g} {_speed(speed)}"
+        for friction, speed in speeds.items()
+        if speed != ends
+    ]
+    words += (
+        [f"up to {ends:g} m/s elsewhere, where the box ends first"]
+        if ends in speeds.values()
+        else []
+    )
     return f"With {room:g} m of room: {', '.join(words)}."
 
 
@@ -48,10 +66,16 @@ def tables(document):
     """All of them, with what was counted."""
     lines = []
     for name, found in document["cars"].items():
-        shares = [found["coverage"], *found["coverage_ci95"], *_ends(cell["coverage"] for cell in found["cells"])]
+        shares = [
+            found["coverage"],
+            *found["coverage_ci95"],
+            *_ends(cell["coverage"] for cell in found["cells"]),
+        ]
         inside = "{:.1f} % of all test drives are inside ({:.1f} to {:.1f} %), {:.1f} to {:.1f} % by cell"
         lines += [table(name, found)]
-        lines += [f"- {answer(found, room)}" for room in sorted({*ROOMS, document["room_m"]})]
+        lines += [
+            f"- {answer(found, room)}" for room in sorted({*ROOMS, document["room_m"]})
+        ]
         lines += [
             f"- {found['drives']} drives of {found['duration_s']:g} s fix the units of a cell, as many calibrate and "
             f"as many test at level {100 * found['level']:g} %: {inside.format(*(100 * share for share in shares))}.",

@@ -1,4 +1,6 @@
-"""What the benchmarks share: steps timed one by one, processes of their own, quantiles, the machine, JSON."""
+"""What the benchmarks share: steps timed one by one, processes of their own, quantiles,
+the machine, JSON.
+"""
 
 import json
 import os
@@ -14,8 +16,12 @@ from pathlib import Path
 HERE = Path(__file__).parent
 WARM_UP = 9
 LOAD = os.getloadavg()[0]
-"""How many processes wanted a core in the minute before: another job beside a benchmark makes its times void."""
-HOST_DEVICES = {"XLA_FLAGS": f"--xla_force_host_platform_device_count={len(os.sched_getaffinity(0))}"}
+"""How many processes wanted a core in the minute before: another job beside a benchmark
+makes its times void.
+"""
+HOST_DEVICES = {
+    "XLA_FLAGS": f"--xla_force_host_platform_device_count={len(os.sched_getaffinity(0))}"
+}
 PACKAGES = ("jax", "torch", "pytorch_mppi", "jax_mppi", "evosax", "torchrl", "tau_ctrl")
 
 
@@ -31,7 +37,9 @@ def timed(step, count):
 
 
 def first_and_then(build, count):
-    """Build a step and take it: seconds to the first answer, times of `count` warm steps [ms], peak memory [MB]."""
+    """Build a step and take it: seconds to the first answer, times of `count` warm
+    steps [ms], peak memory [MB].
+    """
     began = time.perf_counter()
     step = build()
     step()
@@ -43,25 +51,41 @@ def first_and_then(build, count):
 
 
 def quantile(values, share):
-    """The smallest value with at least that share of all at or below it, less one: no interpolation."""
+    """The smallest value with at least that share of all at or below it, less one: no
+    interpolation.
+    """
     ordered = sorted(values)
     return ordered[min(len(ordered) - 1, int(share * len(ordered)))]
 
 
 def in_own_process(script, *words, environment=None):
-    """Run a script of this folder; the JSON of its last line, or {"error": the last line of what went wrong}."""
+    """Run a script of this folder; the JSON of its last line, or {"error": the last
+    line of what went wrong}.
+    """
     command = [sys.executable, str(HERE / script), *map(str, words)]
     asked = os.environ | (environment or {})
-    done = subprocess.run(command, env=asked, capture_output=True, text=True, check=False)
+    done = subprocess.run(
+        command, env=asked, capture_output=True, text=True, check=False
+    )
     if done.returncode:
-        return {"error": (done.stderr.strip().splitlines() or [f"exit status {done.returncode}"])[-1]}
+        return {
+            "error": (
+                done.stderr.strip().splitlines() or [f"exit status {done.returncode}"]
+            )[-1]
+        }
     return json.loads(done.stdout.splitlines()[-1])
 
 
 def machine():
     """Where this was measured, with what."""
     cores, python = len(os.sched_getaffinity(0)), platform.python_version()
-    return {"cores": cores, "processor": platform.machine(), "python": python, "load": LOAD, "versions": _versions()}
+    return {
+        "cores": cores,
+        "processor": platform.machine(),
+        "python": python,
+        "load": LOAD,
+        "versions": _versions(),
+    }
 
 
 def _versions():
@@ -82,7 +106,9 @@ def write(path, document):
 
 
 def in_turn(jobs, rounds, steps=3):
-    """Jobs of no arguments in this process, round-robin: label -> best, median and CPU time of a call [ms]."""
+    """Jobs of no arguments in this process, round-robin: label -> best, median and CPU
+    time of a call [ms].
+    """
     for job in jobs.values():
         timed(job, 2)
     wall, cpu = {label: [] for label in jobs}, {label: [] for label in jobs}
@@ -92,6 +118,10 @@ def in_turn(jobs, rounds, steps=3):
                 kept[label] += new
     middle = statistics.median
     return {
-        label: {"best_ms": min(wall[label]), "median_ms": middle(wall[label]), "cpu_ms": middle(cpu[label])}
+        label: {
+            "best_ms": min(wall[label]),
+            "median_ms": middle(wall[label]),
+            "cpu_ms": middle(cpu[label]),
+        }
         for label in jobs
     }

@@ -39,7 +39,9 @@ def one_a_line(text: str, known: set[str]) -> str:
 def _split(line: str, known: set[str]) -> list[str]:
     """The items of one line, each on its own; what comes before the first of them continues the item above."""
     body, indent = line.strip(), line[: len(line) - len(line.lstrip())]
-    starts = [match for match in ITEM.finditer(body) if set(match[1].split(", ")) <= known]
+    starts = [
+        match for match in ITEM.finditer(body) if set(match[1].split(", ")) <= known
+    ]
     before = body[: starts[0].start()] if starts else body
     parts = [indent + before.strip()] if before.strip() else []
     for place, match in enumerate(starts):
@@ -52,7 +54,12 @@ def _split(line: str, known: set[str]) -> list[str]:
 def linked(text: str, places: dict[str, str]) -> str:
     """Turn `name` into a link where a name is public, and keep Markdown away from units in brackets and from u*(κ)."""
     text = STAR.sub(r"\\*", text.replace("] [", f"]{ZERO_WIDTH_SPACE} ["))
-    return NAME.sub(lambda match: f"[{match[0]}][{places[match[1]]}]" if match[1] in places else match[0], text)
+    return NAME.sub(
+        lambda match: (
+            f"[{match[0]}][{places[match[1]]}]" if match[1] in places else match[0]
+        ),
+        text,
+    )
 
 
 def _has_an_entry(seen: Any) -> bool:
@@ -74,7 +81,11 @@ class Docstrings(griffe.Extension):
         for room in pkg.members.values():
             if room.is_alias or not room.is_module:
                 continue
-            places = {name: f"{room.path}.{name}" for name, seen in room.members.items() if _has_an_entry(seen)}
+            places = {
+                name: f"{room.path}.{name}"
+                for name, seen in room.members.items()
+                if _has_an_entry(seen)
+            }
             self._walk(room, places)
 
     def _walk(self, place: Any, places: dict[str, str]) -> None:
@@ -89,6 +100,10 @@ class Docstrings(griffe.Extension):
         if seen.docstring is None:
             return
         known = set(seen.members)
-        known |= {parameter.name for parameter in seen.parameters} if seen.is_function else set()
+        known |= (
+            {parameter.name for parameter in seen.parameters}
+            if seen.is_function
+            else set()
+        )
         known |= set(re.findall(r"\b[A-Z]\w+(?=: )", seen.docstring.value))  # errors
         seen.docstring.value = linked(one_a_line(seen.docstring.value, known), places)

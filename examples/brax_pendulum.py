@@ -1,8 +1,9 @@
 """SFKD on brax's inverted pendulum, gravity is e: collect, train, certify, and let MPPI move the cart along a target.
 
-A contracting latent cannot hold a pendulum that falls, so what is learned and planned for is the plant under a fixed
-gain: u = clip(v - K s), K from a Riccati recursion at the upright state, v what the planner chooses. The last row
-plans u itself, with the true dynamics and without the gain. `--help` lists the sizes.
+A contracting latent cannot hold a pendulum that falls, so what is learned and planned
+for is the plant under a fixed gain: u = clip(v - K s), K from a Riccati recursion at
+the upright state, v what the planner chooses. The last row plans u itself, with the
+true dynamics and without the gain. `--help` lists the sizes.
 """
 
 import argparse
@@ -15,33 +16,54 @@ import jax.numpy as jnp
 from brax import envs
 
 from sfkd_jax import adapters, certification, control, models
-from sfkd_jax.datasets import Dataset, measure_space, random_windows, split, spread_windows
+from sfkd_jax.datasets import (
+    Dataset,
+    measure_space,
+    random_windows,
+    split,
+    spread_windows,
+)
 from sfkd_jax.training import fit, multi_step_loss
 from sfkd_jax.types import BODY, Controller
 
 LOW, HIGH = (0.6,), (1.4,)  # e: gravity, as a share of the Earth's
 LEVELS, HOLD = (1.0, 0.6, 1.4), 3.0  # e while driving, switched every 3 s
-AMPLITUDE, PERIOD = 0.35, 5.0  # the target swings between 0 and twice the amplitude [m], [s]; the rail ends at 1 m
+AMPLITUDE, PERIOD = (
+    0.35,
+    5.0,
+)  # the target swings between 0 and twice the amplitude [m], [s]; the rail ends at 1 m
 FALLEN = 0.2  # angle [rad] at which the environment ends an episode
 
 
 def upright_gain(plant):
-    """K of the linear quadratic regulator for the plant as it is (e = 1), linearised where the pole stands upright."""
-    A, B = jax.jit(jax.jacfwd(plant.step, argnums=(0, 1)))(jnp.zeros(7), jnp.zeros(1), jnp.ones(1))
+    """K of the linear quadratic regulator for the plant as it is (e = 1), linearised
+    where the pole stands upright.
+    """
+    A, B = jax.jit(jax.jacfwd(plant.step, argnums=(0, 1)))(
+        jnp.zeros(7), jnp.zeros(1), jnp.ones(1)
+    )
     A, B = A[BODY, BODY], B[BODY]
     Q, R = jnp.diag(jnp.asarray([20.0, 20.0, 10.0, 1.0])), jnp.eye(1)
 
     def best(value):
         return jnp.linalg.solve(R + B.T @ value @ B, B.T @ value @ A)
 
-    return best(jax.lax.fori_loop(0, 500, lambda _, value: Q + A.T @ value @ (A - B @ best(value)), Q))
+    return best(
+        jax.lax.fori_loop(
+            0, 500, lambda _, value: Q + A.T @ value @ (A - B @ best(value)), Q
+        )
+    )
 
 
 def under_gain(plant):
-    """(K, x, v, e) -> x one step later under u = clip(v - K s); K = 0 is the environment as it is."""
+    """(K, x, v, e) -> x one step later under u = clip(v - K s); K = 0 is the
+    environment as it is.
+    """
 
     def step(gain, state, v, env):
-        force = jnp.clip(v - gain @ state[BODY], plant.control_low[0], plant.control_high[0])
+        force = jnp.clip(
+            v - gain @ state[BODY], plant.control_low[0], plant.control_high[0]
+        )
         return plant.step(state, force, env)
 
     return step
@@ -49,47 +71,90 @@ def under_gain(plant):
 
 def collect(plant, step, gain, drives: int) -> Dataset:
     """Drives under random v, each with its own gravity."""
-    held, box = plant._replace(step=partial(step, gain)), {"env_low": LOW, "env_high": HIGH}
+    held, box = (
+        plant._replace(step=partial(step, gain)),
+        {"env_low": LOW, "env_high": HIGH},
+    )
     options = {"trajectories": drives, "steps": 75, "excitation": 0.22, "memory": 0.97}
-    driven = jax.jit(partial(adapters.collect, held, **options, **box))(jax.random.key(0))
+    driven = jax.jit(partial(adapters.collect, held, **options, **box))(
+        jax.random.key(0)
+    )
     corners = {"env_low": jnp.asarray(LOW), "env_high": jnp.asarray(HIGH)}
     return split(driven, jax.random.key(1), shares=(0.6, 0.1, 0.2, 0.1), **corners)
 
 
 def learn(data: Dataset, steps: int, horizon: int):
     """The model, its weights, and its certificate, checked again from its witnesses."""
-    space = measure_space(data)._replace(increment_scale=jnp.full(3, 1e-6))  # no pose moves: none is to be learned
-    model = models.sfkd(space, rank=8, vertices=4, residual_hidden=(16,), decoder_hidden=(4,))
-    loss, draw = multi_step_loss(model, space, consistency=1.0), partial(random_windows, batch=64, length=16)
+    space = measure_space(data)._replace(
+        increment_scale=jnp.full(3, 1e-6)
+    )  # no pose moves: none is to be learned
+    model = models.sfkd(
+        space, rank=8, vertices=4, residual_hidden=(16,), decoder_hidden=(4,)
+    )
+    loss, draw = (
+        multi_step_loss(model, space, consistency=1.0),
+        partial(random_windows, batch=64, length=16),
+    )
     held_out, key = spread_windows(data.validation, length=16), jax.random.key(2)
     with tempfile.TemporaryDirectory() as run:
-        params, _ = fit(model, loss, draw, data.train, held_out, key, Path(run), steps=steps, learning_rate=0.01)
-    splits = {"validation": data.validation, "calibration": data.calibration, "held_out": {"test": data.test}}
-    options = {"boxes": {"env": (LOW, HIGH)}, "horizon": horizon, "level": 0.9, "monitor_level": 0.9}
+        params, _ = fit(
+            model,
+            loss,
+            draw,
+            data.train,
+            held_out,
+            key,
+            Path(run),
+            steps=steps,
+            learning_rate=0.01,
+        )
+    splits = {
+        "validation": data.validation,
+        "calibration": data.calibration,
+        "held_out": {"test": data.test},
+    }
+    options = {
+        "boxes": {"env": (LOW, HIGH)},
+        "horizon": horizon,
+        "level": 0.9,
+        "monitor_level": 0.9,
+    }
     proof = certification.issue(model, params, **splits, **options, attack_starts=0)
-    certification.verify(certification.Certificate.from_document(proof), params, model=model)
+    certification.verify(
+        certification.Certificate.from_document(proof), params, model=model
+    )
     return model, params, proof
 
 
 def stage(weights, state, v, v_before, target):
-    """Cart error, and what keeps the controls smooth and the pole well inside its limit."""
+    """Cart error, and what keeps the controls smooth and the pole well inside its
+    limit.
+    """
     beyond = jnp.maximum(jnp.abs(state[4]) - 0.75 * FALLEN, 0.0)
-    return 100.0 * (state[3] - target) ** 2 + 1e4 * beyond**2 + (v[0] - v_before[0]) ** 2
+    return (
+        100.0 * (state[3] - target) ** 2 + 1e4 * beyond**2 + (v[0] - v_before[0]) ** 2
+    )
 
 
 def learned_task(model, plant) -> control.Task:
-    """The model's latent along the horizon, from what is observed; everything that depends on e is computed once."""
+    """The model's latent along the horizon, from what is observed; everything that
+    depends on e is computed once.
+    """
     low, high = jnp.asarray(plant.control_low), jnp.asarray(plant.control_high)
 
     def begin(params, observation, env, reference, applied):
         fiber = model.fiber(params, env)
-        return control.Began(fiber, (model.encode(fiber, observation), applied.control), reference)
+        return control.Began(
+            fiber, (model.encode(fiber, observation), applied.control), reference
+        )
 
     def advance(weights, fiber, before, wanted, target, last):
         v = jnp.clip(wanted, low, high)
         latent = model.step(fiber, before[0], v)
         state = model.decode(fiber, latent)
-        return control.Advanced((latent, v), stage(weights, state, v, before[1], target), v, v, state)
+        return control.Advanced(
+            (latent, v), stage(weights, state, v, before[1], target), v, v, state
+        )
 
     return control.Task(low, high, (), begin, advance, lambda *_: None)
 
@@ -98,46 +163,94 @@ def gain_alone(dt: float) -> Controller:
     """v = K s_ref, s_ref the target's position and speed: u = -K (s - s_ref)."""
 
     def act(gain, memory, state, env, targets):
-        return gain @ jnp.stack([targets[0], 0.0, (targets[1] - targets[0]) / dt, 0.0]), memory, {}
+        return (
+            gain @ jnp.stack([targets[0], 0.0, (targets[1] - targets[0]) / dt, 0.0]),
+            memory,
+            {},
+        )
 
     return Controller(lambda key: (), act)
 
 
-def drive(controller, params, physics, state, *, dt: float, horizon: int, seconds: float):
-    """Follow the target in the environment's physics while gravity switches; did the pole fall?"""
+def drive(
+    controller, params, physics, state, *, dt: float, horizon: int, seconds: float
+):
+    """Follow the target in the environment's physics while gravity switches; did the
+    pole fall?
+    """
     memory, errors, angles = controller.init(jax.random.key(4)), [], []
     for k in range(round(seconds / dt)):
         env = jnp.asarray([LEVELS[int((k + 0.5) * dt / HOLD) % len(LEVELS)]])
-        targets = AMPLITUDE * (1.0 - jnp.cos(2.0 * jnp.pi / PERIOD * dt * (k + 1 + jnp.arange(horizon))))
+        targets = AMPLITUDE * (
+            1.0 - jnp.cos(2.0 * jnp.pi / PERIOD * dt * (k + 1 + jnp.arange(horizon)))
+        )
         v, memory, _ = controller.act(params, memory, state, env, targets)
         state = physics(state, v, env)
         errors.append(float(state[3] - targets[0]))
         angles.append(abs(float(state[4])))
     rms = (sum(error**2 for error in errors) / len(errors)) ** 0.5
-    return {"rms_m": rms, "angle_rad": max(angles), "fallen": not all(angle <= FALLEN for angle in angles)}
+    return {
+        "rms_m": rms,
+        "angle_rad": max(angles),
+        "fallen": not all(angle <= FALLEN for angle in angles),
+    }
 
 
-def main(*, drives: int = 600, steps: int = 1500, samples: int = 256, horizon: int = 25, seconds: float = 12.0):
+def main(
+    *,
+    drives: int = 600,
+    steps: int = 1500,
+    samples: int = 256,
+    horizon: int = 25,
+    seconds: float = 12.0,
+):
     """Train, certify, drive: the certificate, and one row for each way of driving."""
-    plant = adapters.brax_plant(envs.get_environment("inverted_pendulum", backend="generalized"))
+    plant = adapters.brax_plant(
+        envs.get_environment("inverted_pendulum", backend="generalized")
+    )
     gain, step = upright_gain(plant), under_gain(plant)
     model, params, proof = learn(collect(plant, step, gain, drives), steps, horizon)
     params = jax.jit(model.fold)(params)  # once, not at every step
     tube = proof["tube"]["physical"]["body"]
-    print(f"certified: alpha {proof['alpha']:.4f}; at least {proof['attacks']['step_slopes']:.4f} by an attack")
-    print(f"tube of the body state: {tube[0]:.3f} after one step, {tube[-1]:.3f} after {horizon}")
+    print(
+        f"certified: alpha {proof['alpha']:.4f}; at least {proof['attacks']['step_slopes']:.4f} by an attack"
+    )
+    print(
+        f"tube of the body state: {tube[0]:.3f} after one step, {tube[-1]:.3f} after {horizon}"
+    )
 
     limits = {"control_low": plant.control_low, "control_high": plant.control_high}
-    options = {"horizon": horizon, "num_samples": samples, "effective_samples": 10.0, "noise_std": (0.4,)}
-    tasks = learned_task(model, plant), control.free_task(step, stage, dt=plant.dt, **limits)
+    options = {
+        "horizon": horizon,
+        "num_samples": samples,
+        "effective_samples": 10.0,
+        "noise_std": (0.4,),
+    }
+    tasks = (
+        learned_task(model, plant),
+        control.free_task(step, stage, dt=plant.dt, **limits),
+    )
     sfkd, true = (control.mppi(task, **options) for task in tasks)
-    sfkd, true, alone = (each._replace(act=jax.jit(each.act)) for each in (sfkd, true, gain_alone(plant.dt)))
+    sfkd, true, alone = (
+        each._replace(act=jax.jit(each.act))
+        for each in (sfkd, true, gain_alone(plant.dt))
+    )
 
-    def calm(key):  # without the gain the pole forgives little; the noise is data, nothing is compiled again
+    def calm(
+        key,
+        # Without the gain the pole forgives little; the noise is data, nothing is
+        # compiled again.
+    ):
         memory = true.init(key)
-        return memory._replace(tuning=memory.tuning._replace(noise_std=jnp.asarray([0.06])))
+        return memory._replace(
+            tuning=memory.tuning._replace(noise_std=jnp.asarray([0.06]))
+        )
 
-    told_one = sfkd._replace(act=lambda p, memory, x, e, targets: sfkd.act(p, memory, x, jnp.ones(1), targets))
+    told_one = sfkd._replace(
+        act=lambda p, memory, x, e, targets: sfkd.act(
+            p, memory, x, jnp.ones(1), targets
+        )
+    )
     ways = {
         "SFKD": (sfkd, params, gain),
         "SFKD, told e = 1": (told_one, params, gain),
@@ -148,7 +261,9 @@ def main(*, drives: int = 600, steps: int = 1500, samples: int = 256, horizon: i
     physics, start, rows = jax.jit(step), jax.jit(plant.start)(jax.random.key(3)), {}
     sizes = {"dt": plant.dt, "horizon": horizon, "seconds": seconds}
     for way, (controller, knows, under) in ways.items():
-        row = rows[way] = drive(controller, knows, partial(physics, under), start, **sizes)
+        row = rows[way] = drive(
+            controller, knows, partial(physics, under), start, **sizes
+        )
         fate = f"angle up to {row['angle_rad']:.3f} rad, {'fallen' if row['fallen'] else 'upright'}"
         print(f"{way:24} RMS cart error {row['rms_m']:.3f} m, {fate}", flush=True)
     return {"certificate": proof, "rows": rows}

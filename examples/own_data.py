@@ -1,7 +1,8 @@
 """SFKD on data of your own: read logged drives, train, certify, and plan with the result.
 
-python examples/own_data.py LOGS.npz with arrays x (drive, time + 1, state), u (drive, time, control) and
-e (drive, time, environment); the state begins with position [m] and yaw [rad]. Without an argument it logs some first.
+python examples/own_data.py LOGS.npz with arrays x (drive, time + 1, state), u (drive,
+time, control) and e (drive, time, environment); the state begins with position [m] and
+yaw [rad]. Without an argument it logs some first.
 """
 
 import sys
@@ -14,7 +15,13 @@ import jax.numpy as jnp
 import numpy as np
 
 from sfkd_jax import certification, control, models
-from sfkd_jax.datasets import Dataset, measure_space, random_windows, split, spread_windows
+from sfkd_jax.datasets import (
+    Dataset,
+    measure_space,
+    random_windows,
+    split,
+    spread_windows,
+)
 from sfkd_jax.training import fit, multi_step_loss
 from sfkd_jax.types import Trajectory
 
@@ -29,7 +36,9 @@ def log_some_drives(path: Path, drives: int) -> None:
     x = np.zeros((drives, 51, 5), np.float32)
     x[:, 0, 3] = random.uniform(1.0, 5.0, drives)
     u = np.zeros((drives, 50, 2), np.float32)
-    e = np.tile(random.uniform([0.3, -5.0], [0.9, 5.0], (drives, 1, 2)), (1, 50, 1)).astype(np.float32)
+    e = np.tile(
+        random.uniform([0.3, -5.0], [0.9, 5.0], (drives, 1, 2)), (1, 50, 1)
+    ).astype(np.float32)
     move = jax.jit(jax.vmap(step))
     for k in range(50):
         noise = 0.8 * noise + random.normal(0, [0.2, 0.6], (drives, 2))
@@ -39,14 +48,23 @@ def log_some_drives(path: Path, drives: int) -> None:
 
 
 def read(path: Path) -> Dataset:
-    """Logged drives, dealt by whole drives to training, validation, calibration and test."""
+    """Logged drives, dealt by whole drives to training, validation, calibration and
+    test.
+    """
     with np.load(path) as logs:
-        drives = Trajectory(*(jnp.asarray(logs[name], dtype=jnp.float32) for name in "xue"))
-    box = {"env_low": drives.envs.min(axis=(0, 1)), "env_high": drives.envs.max(axis=(0, 1))}
+        drives = Trajectory(
+            *(jnp.asarray(logs[name], dtype=jnp.float32) for name in "xue")
+        )
+    box = {
+        "env_low": drives.envs.min(axis=(0, 1)),
+        "env_high": drives.envs.max(axis=(0, 1)),
+    }
     return split(drives, jax.random.key(0), shares=(0.6, 0.1, 0.2, 0.1), **box)
 
 
-def main(logs: str | None = None, drives: int = 400, steps: int = 500) -> dict[str, float]:
+def main(
+    logs: str | None = None, drives: int = 400, steps: int = 500
+) -> dict[str, float]:
     """Prediction error on held-out drives, the certified rate, and a first control."""
     with tempfile.TemporaryDirectory() as scratch:
         path = Path(logs or Path(scratch) / "logs.npz")
@@ -57,19 +75,43 @@ def main(logs: str | None = None, drives: int = 400, steps: int = 500) -> dict[s
         loss = multi_step_loss(model, measure_space(data))
         draw = partial(random_windows, batch=64, length=20)
         held_out = spread_windows(data.validation, length=20)
-        params, _ = fit(model, loss, draw, data.train, held_out, jax.random.key(1), Path(scratch) / "run", steps=steps)
-    proof = certification.certify(model, params, (data.env_low, data.env_high), attack_starts=0)
+        params, _ = fit(
+            model,
+            loss,
+            draw,
+            data.train,
+            held_out,
+            jax.random.key(1),
+            Path(scratch) / "run",
+            steps=steps,
+        )
+    proof = certification.certify(
+        model, params, (data.env_low, data.env_high), attack_starts=0
+    )
 
-    low, high = (tuple(bound.tolist()) for bound in (data.train.controls.min((0, 1)), data.train.controls.max((0, 1))))
+    low, high = (
+        tuple(bound.tolist())
+        for bound in (data.train.controls.min((0, 1)), data.train.controls.max((0, 1)))
+    )
     cost, law = control.tracking_cost(dt=DT), control.no_feedback()
-    task = control.path_tracking(model, cost, law, dt=DT, control_low=low, control_high=high)
+    task = control.path_tracking(
+        model, cost, law, dt=DT, control_low=low, control_high=high
+    )
     planner = control.mppi(task, num_samples=256, horizon=20, noise_std=(0.1, 0.3))
     ahead = jnp.arange(1, 21) * DT * 3.0
     reference = jnp.stack([ahead, 0 * ahead, 0 * ahead, 0 * ahead + 3.0], axis=1)
     state, env = jnp.asarray([0.0, 0.2, 0.0, 3.0, 0.0]), data.train.envs[0, 0]
-    first, _, _ = jax.jit(planner.act)(params, planner.init(jax.random.key(2)), state, env, reference)
-    error = float(jnp.mean(jax.vmap(partial(loss_of_position, model, params))(held_out)))
-    return {"alpha": proof.alpha, "position_error_m": error, "first_control": float(first[0])}
+    first, _, _ = jax.jit(planner.act)(
+        params, planner.init(jax.random.key(2)), state, env, reference
+    )
+    error = float(
+        jnp.mean(jax.vmap(partial(loss_of_position, model, params))(held_out))
+    )
+    return {
+        "alpha": proof.alpha,
+        "position_error_m": error,
+        "first_control": float(first[0]),
+    }
 
 
 def loss_of_position(model, params, window):

@@ -1,4 +1,6 @@
-"""Your own vehicle as the rollout model: a delivery robot with two driven wheels follows an S3 path."""
+"""Your own vehicle as the rollout model: a delivery robot with two driven wheels
+follows an S3 path.
+"""
 
 import jax
 import jax.numpy as jnp
@@ -9,7 +11,9 @@ DT, TRACK = 0.1, 0.6  # [s], between the wheels [m]
 
 
 def step(state, action, env):
-    """x = (p_x, p_y, yaw, v, yaw rate); action = (speed difference of the wheels, acceleration); env = (grip, wind)."""
+    """x = (p_x, p_y, yaw, v, yaw rate); action = (speed difference of the wheels,
+    acceleration); env = (grip, wind).
+    """
     x, y, yaw, v, rate = state
     grip, wind = env
     v = v + DT * grip * action[1]
@@ -38,7 +42,9 @@ def main(samples: int = 256, seconds: float = 15.0) -> float:
     @jax.jit
     def drive(road_key, drive_key):
         road = family(road_key)
-        return evaluation.simulate(step, planner, {}, road, drive_key, dt=DT, horizon=15).lateral
+        return evaluation.simulate(
+            step, planner, {}, road, drive_key, dt=DT, horizon=15
+        ).lateral
 
     lateral = drive(*jax.random.split(jax.random.key(0)))
     return float(jnp.sqrt(jnp.mean(lateral**2)))

@@ -1,4 +1,6 @@
-"""Matrices chosen to fool a Cholesky factorisation, and their definiteness in exact integer arithmetic."""
+"""Matrices chosen to fool a Cholesky factorisation, and their definiteness in exact
+integer arithmetic.
+"""
 
 import itertools
 import math
@@ -11,13 +13,21 @@ EXTREMES = (1e-320, 1e-308, 1e-200, 1e-150, 1e-16, 1.0, 1e16, 1e150, 1e200, 1e30
 
 def integers(rows):
     """Rational rows times one positive number that makes them integers."""
-    exact = [[Fraction(float(entry)) if not isinstance(entry, Fraction) else entry for entry in row] for row in rows]
+    exact = [
+        [
+            Fraction(float(entry)) if not isinstance(entry, Fraction) else entry
+            for entry in row
+        ]
+        for row in rows
+    ]
     common = math.lcm(*(entry.denominator for row in exact for entry in row))
     return [[int(entry * common) for entry in row] for row in exact]
 
 
 def is_definite(rows):
-    """Whether a symmetric matrix of floats or fractions is positive definite: Sylvester's criterion by Bareiss."""
+    """Whether a symmetric matrix of floats or fractions is positive definite:
+    Sylvester's criterion by Bareiss.
+    """
     matrix, before = integers(rows), 1
     size = len(matrix)
     for k in range(size):
@@ -26,7 +36,9 @@ def is_definite(rows):
             return False
         for i in range(k + 1, size):
             for j in range(k + 1, size):
-                matrix[i][j] = (matrix[i][j] * pivot - matrix[i][k] * matrix[k][j]) // before
+                matrix[i][j] = (
+                    matrix[i][j] * pivot - matrix[i][k] * matrix[k][j]
+                ) // before
         before = pivot
     return True
 
@@ -38,9 +50,13 @@ def symmetric(matrix):
 
 @np.errstate(over="ignore", invalid="ignore")
 def hostile_matrix(random):
-    """A small symmetric matrix near the edge of the cone, and an error that is claimed to be tolerated."""
+    """A small symmetric matrix near the edge of the cone, and an error that is claimed
+    to be tolerated.
+    """
     size = int(random.integers(1, 6))
-    half = random.integers(-4, 5, (size, size)) * np.exp2(random.integers(-30, 30, (size, 1)) * random.integers(0, 2))
+    half = random.integers(-4, 5, (size, size)) * np.exp2(
+        random.integers(-30, 30, (size, 1)) * random.integers(0, 2)
+    )
     kind = random.integers(9)
     if kind == 0:  # singular, every product exact
         half = half[: size - 1]
@@ -55,29 +71,42 @@ def hostile_matrix(random):
     if kind == 4:  # of one extreme scale
         matrix = matrix * random.choice(EXTREMES)
     if kind == 5:  # a tiny step across the edge
-        matrix = matrix - np.exp2(-int(random.integers(0, 70))) * np.trace(matrix) * np.eye(size)
+        matrix = matrix - np.exp2(-int(random.integers(0, 70))) * np.trace(
+            matrix
+        ) * np.eye(size)
     if kind == 6:  # an entry moved by units in the last place
         i, j = random.integers(size, size=2)
         matrix[max(i, j), min(i, j)] *= 1 + np.exp2(-52) * random.integers(-4, 5)
     if kind == 7:  # an entry that is no number, or hardly one
         i, j = random.integers(size, size=2)
-        matrix[max(i, j), min(i, j)] = random.choice([np.nan, np.inf, -np.inf, 5e-324, -5e-324, 1e308, 0.0])
+        matrix[max(i, j), min(i, j)] = random.choice(
+            [np.nan, np.inf, -np.inf, 5e-324, -5e-324, 1e308, 0.0]
+        )
     if kind == 8:  # a pivot that nearly vanishes after a large coupling
         matrix = np.diag(np.exp2(random.integers(-40, 40, size).astype(float)))
-        matrix[-1, 0] = np.sqrt(matrix[0, 0] * matrix[-1, -1]) * (1 + np.exp2(-50) * random.integers(-3, 4))
+        matrix[-1, 0] = np.sqrt(matrix[0, 0] * matrix[-1, -1]) * (
+            1 + np.exp2(-50) * random.integers(-3, 4)
+        )
     error = random.choice([0.0, 0.0, 5e-324, 1e-300, np.exp2(-40.0), 0.5, 1e300])
     return symmetric(matrix), float(error)
 
 
 def hostile_network(random):
-    """Weights, multipliers, a bound, A and P near the edge of what a witness proves; or spoiled."""
+    """Weights, multipliers, a bound, A and P near the edge of what a witness proves; or
+    spoiled.
+    """
     inputs, hidden, outputs = (int(n) for n in random.integers(1, 4, 3))
     linear = random.choice([0, 1]) * random.integers(-3, 4, (outputs, inputs)) / 4 * 1.0
     layers = int(random.integers(0, 4))
     widths = [inputs, *[hidden] * max(layers - 1, 0), outputs]
-    weights = [random.integers(-3, 4, (b, a)) / 4 * 1.0 for a, b in itertools.pairwise(widths)][:layers]
+    weights = [
+        random.integers(-3, 4, (b, a)) / 4 * 1.0 for a, b in itertools.pairwise(widths)
+    ][:layers]
     scale = random.choice([1.0, 1.0, 1.0, 1e-7, 1e7, 1e-150, 1e150])
-    multipliers = [random.choice([1e-7, 0.5, 0.51, 1.0, 2.5], len(part)) * scale for part in weights[:-1]]
+    multipliers = [
+        random.choice([1e-7, 0.5, 0.51, 1.0, 2.5], len(part)) * scale
+        for part in weights[:-1]
+    ]
     bound = float(random.choice([0.3, 0.5, 0.999, 1.0, 1.5, 4.0, 40.0, 1e-160, 1e150]))
     metric = None
     if inputs == outputs and random.integers(2):
@@ -85,7 +114,13 @@ def hostile_network(random):
         metric = half.T @ half * random.choice([1.0, 1.0, 1e-12, 1e12, -1.0])
     if not random.integers(12) and multipliers:
         multipliers[0][0] = random.choice([np.nan, np.inf, 0.0, -1.0, 5e-324])
-    return weights, multipliers, bound, linear if layers == 0 or random.integers(2) else None, metric
+    return (
+        weights,
+        multipliers,
+        bound,
+        linear if layers == 0 or random.integers(2) else None,
+        metric,
+    )
 
 
 def exact_witness(weights, multipliers, bound, linear, metric):
@@ -113,18 +148,27 @@ def exact_witness(weights, multipliers, bound, linear, metric):
 
 
 def search(cases, seed):
-    """Counts of what the core was asked and accepted; raises at the first falsehood that it accepts."""
+    """Counts of what the core was asked and accepted; raises at the first falsehood
+    that it accepts.
+    """
     from sfkd_jax.certification import check_witness, is_positive_definite
 
-    random, counts = np.random.default_rng(seed), {"matrices": 0, "witnesses": 0, "true": 0, "accepted": 0}
+    random, counts = (
+        np.random.default_rng(seed),
+        {"matrices": 0, "witnesses": 0, "true": 0, "accepted": 0},
+    )
     for number in range(cases):
         if number % 2:
             weights, multipliers, bound, linear, metric = hostile_network(random)
             accepted = check_witness(weights, multipliers, bound, linear, metric)
-            numbers = all(np.all(np.isfinite(part)) and np.all(part > 0) for part in multipliers)
+            numbers = all(
+                np.all(np.isfinite(part)) and np.all(part > 0) for part in multipliers
+            )
             true = False
             if numbers:
-                matrix, norm = exact_witness(weights, multipliers, bound, linear, metric)
+                matrix, norm = exact_witness(
+                    weights, multipliers, bound, linear, metric
+                )
                 true = is_definite(matrix) and is_definite(norm)
             shown = (weights, multipliers, bound, linear, metric)
         else:
@@ -141,16 +185,25 @@ def search(cases, seed):
         counts["accepted"] += accepted
         counts["true"] += true
         if accepted and not true:
-            raise AssertionError(f"case {number} of seed {seed} is accepted and false: {shown}")
+            raise AssertionError(
+                f"case {number} of seed {seed} is accepted and false: {shown}"
+            )
     return counts
 
 
 def forged_witness():
-    """A network of gain 52 and multipliers whose factorisation grows until a pivot is NaN; the bound claimed is 0.5."""
+    """A network of gain 52 and multipliers whose factorisation grows until a pivot is
+    NaN; the bound claimed is 0.5.
+    """
     small, chain = 3.2e-4, 62
     first, last = np.zeros((76, 64), np.float32), np.zeros((64, 76), np.float32)
     growing = np.arange(chain - 3)
     last[growing, growing] = last[growing + 1, growing] = last[0, chain] = small
     first[chain + 1 :, 0] = last[63, chain + 1 :] = 2.0
-    multipliers = [1.0240223779264118e-07, 0.5242630550075378, *57 * [0.513300755193718], 0.49994975228662497]
+    multipliers = [
+        1.0240223779264118e-07,
+        0.5242630550075378,
+        *57 * [0.513300755193718],
+        0.49994975228662497,
+    ]
     return [first, last], [np.asarray([*multipliers, *3 * [0.5], *13 * [2.5]])], 0.5

@@ -2,10 +2,11 @@
 
     python tests/fuzzing.py --cases 10000 --seed 0
 
-Each case changes one file of a sound folder, reads the folder as the package does, and asks for one of two outcomes:
-what was read means what is in the file, or a refusal in one line that names the file. A case that takes longer than
-SECONDS, allocates more than 1 GiB or raises anything else is a fault. The case is a function of (seed, reader, number)
-and can be run alone:  --only read_json --case 17
+Each case changes one file of a sound folder, reads the folder as the package does, and
+asks for one of two outcomes: what was read means what is in the file, or a refusal in
+one line that names the file. A case that takes longer than SECONDS, allocates more than
+1 GiB or raises anything else is a fault. The case is a function of (seed, reader,
+number) and can be run alone:  --only read_json --case 17
 """
 
 import argparse
@@ -26,13 +27,21 @@ import fuzzing_readers as readers
 from fuzzing_mutations import place_special
 
 MEMORY_DISK = Path("/dev/shm")
-"""Where the folders lie if it is there: on a disk, writing them takes longer than reading."""
+"""Where the folders lie if it is there: on a disk, writing them takes longer than
+reading.
+"""
 SECONDS = 30
-"""That one case may take; the slowest honest one takes 0.3 s, on a machine that has nothing else to do."""
+"""That one case may take; the slowest honest one takes 0.3 s, on a machine that has
+nothing else to do.
+"""
 MEMORY = 1 << 30
-"""Bytes of address space that a case may ask for beyond what the process has when it starts."""
+"""Bytes of address space that a case may ask for beyond what the process has when it
+starts.
+"""
 SPECIAL = 0.02
-"""Share of cases in which a pipe, a device, a folder, a socket or a link stands in place of the file."""
+"""Share of cases in which a pipe, a device, a folder, a socket or a link stands in
+place of the file.
+"""
 SHARES = {
     "read_json": 25,
     "read_jsonl": 12,
@@ -55,8 +64,12 @@ class Hang(BaseException):
     """A case that took too long."""
 
 
-def fault_of(reader: readers.Reader, folder: Path, changed: str) -> tuple[str, str | None]:
-    """The outcome of reading a folder in which one file was changed, and what is wrong with it."""
+def fault_of(
+    reader: readers.Reader, folder: Path, changed: str
+) -> tuple[str, str | None]:
+    """The outcome of reading a folder in which one file was changed, and what is wrong
+    with it.
+    """
     signal.setitimer(signal.ITIMER_REAL, SECONDS)
     try:
         found = reader.read(folder)
@@ -69,8 +82,13 @@ def fault_of(reader: readers.Reader, folder: Path, changed: str) -> tuple[str, s
             return "leaked", f"{type(reason).__name__}: {line[:200]}"
         if len(line.splitlines()) != 1 or len(line) > 2000 or not line.isprintable():
             return "leaked", f"not one line: {line[:200]!r}"
-        named = any(file.stem in line for file in folder.rglob("*")) or Path(changed).stem in line
-        return ("refused", None) if named else ("leaked", f"names no file: {line[:200]}")
+        named = (
+            any(file.stem in line for file in folder.rglob("*"))
+            or Path(changed).stem in line
+        )
+        return (
+            ("refused", None) if named else ("leaked", f"names no file: {line[:200]}")
+        )
     except Hang:
         return "hung", f"more than {SECONDS} s"
     except BaseException as reason:
@@ -95,15 +113,25 @@ def restore(folder: Path, sound: dict[str, bytes]) -> None:
             (folder / name).write_bytes(content)
 
 
-def fuzz(name: str, numbers: range, seed: int) -> tuple[Counter, list[dict[str, Any]], float]:
+def fuzz(
+    name: str, numbers: range, seed: int
+) -> tuple[Counter, list[dict[str, Any]], float]:
     """Cases of one reader: outcomes, faults, seconds of the slowest."""
     reader, outcomes, faults, slowest = readers.READERS[name], Counter(), [], 0.0
-    with tempfile.TemporaryDirectory(dir=MEMORY_DISK if MEMORY_DISK.is_dir() else None) as place:
+    with tempfile.TemporaryDirectory(
+        dir=MEMORY_DISK if MEMORY_DISK.is_dir() else None
+    ) as place:
         folder = Path(place)
         reader.make(folder)
-        sound = {file.relative_to(folder).as_posix(): file.read_bytes() for file in folder.rglob("*") if file.is_file()}
+        sound = {
+            file.relative_to(folder).as_posix(): file.read_bytes()
+            for file in folder.rglob("*")
+            if file.is_file()
+        }
         reader.read(folder)  # what is imported and compiled once has no limit of time
-        assert fault_of(reader, folder, "nothing") == ("accepted", None), f"{name} refuses what is sound"
+        assert fault_of(reader, folder, "nothing") == ("accepted", None), (
+            f"{name} refuses what is sound"
+        )
         for number in numbers:
             restore(folder, sound)
             draw = random.Random(f"{seed}/{name}/{number}")
@@ -117,13 +145,23 @@ def fuzz(name: str, numbers: range, seed: int) -> tuple[Counter, list[dict[str, 
             slowest = max(slowest, time.monotonic() - began)
             outcomes[outcome] += 1
             if fault:
-                faults.append({"reader": name, "case": number, "file": file, "fault": fault.replace(place, "")})
+                faults.append(
+                    {
+                        "reader": name,
+                        "case": number,
+                        "file": file,
+                        "fault": fault.replace(place, ""),
+                    }
+                )
     return outcomes, faults, slowest
 
 
 def shares(cases: int, chosen: dict[str, int]) -> dict[str, int]:
     """How many cases each reader gets."""
-    return {name: max(1, cases * share // sum(chosen.values())) for name, share in chosen.items()}
+    return {
+        name: max(1, cases * share // sum(chosen.values()))
+        for name, share in chosen.items()
+    }
 
 
 def bound_memory() -> None:
@@ -148,23 +186,42 @@ def main() -> None:
 
     signal.signal(signal.SIGALRM, expire)
     counts = {asked.only: asked.cases} if asked.only else shares(asked.cases, SHARES)
-    for name in counts:  # what is imported, compiled or cached once is no allocation of a case
+    for (
+        name
+    ) in counts:  # what is imported, compiled or cached once is no allocation of a case
         fuzz(name, range(-1, 0), asked.seed)
     bound_memory()
     before, began = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss, time.monotonic()
     found: dict[str, Any] = {"readers": {}, "faults": []}
     for name, count in counts.items():
         started = time.monotonic()
-        numbers = range(count) if asked.case is None else range(asked.case, asked.case + 1)
+        numbers = (
+            range(count) if asked.case is None else range(asked.case, asked.case + 1)
+        )
         outcomes, faults, slowest = fuzz(name, numbers, asked.seed)
-        seconds = {"slowest_s": round(slowest, 3), "seconds": round(time.monotonic() - started, 1)}
+        seconds = {
+            "slowest_s": round(slowest, 3),
+            "seconds": round(time.monotonic() - started, 1),
+        }
         found["readers"][name] = {"cases": len(numbers), **outcomes, **seconds}
         found["faults"] += faults
         print(name, found["readers"][name], file=sys.stderr, flush=True)
     peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
-    found |= {"cases": sum(entry["cases"] for entry in found["readers"].values()), "seed": asked.seed}
-    found |= {"memory_MiB": {"before": before >> 10, "grown_by": (peak - before) >> 10, "bound": MEMORY >> 20}}
-    found |= {"seconds": round(time.monotonic() - began, 1), "processor_s": round(time.process_time(), 1)}
+    found |= {
+        "cases": sum(entry["cases"] for entry in found["readers"].values()),
+        "seed": asked.seed,
+    }
+    found |= {
+        "memory_MiB": {
+            "before": before >> 10,
+            "grown_by": (peak - before) >> 10,
+            "bound": MEMORY >> 20,
+        }
+    }
+    found |= {
+        "seconds": round(time.monotonic() - began, 1),
+        "processor_s": round(time.process_time(), 1),
+    }
     print(json.dumps(found), flush=True)
     sys.exit(1 if found["faults"] else 0)
 

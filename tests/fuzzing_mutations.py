@@ -1,4 +1,6 @@
-"""How the fuzzer changes a file: documents by structure and by text, archives by their members, headers and bytes."""
+"""How the fuzzer changes a file: documents by structure and by text, archives by their
+members, headers and bytes.
+"""
 
 import io
 import json
@@ -14,18 +16,93 @@ from pathlib import Path
 from typing import Any
 
 LITERALS = (
-    *("NaN", "Infinity", "-Infinity", "1e999", "-1e999", "1e308", "1e-320", "-0.0", "0.1e1"),
-    *("9" * 5000, "9" * 4000, "-" + "9" * 400, "9223372036854775808", "18446744073709551616", "1" + "0" * 300),
-    *(r'"\ud800"', r'"a\udfff"', r'"\u0000"', r'"\u001b[31m"', r'"\n\n"', '"\u2028"', "'a'", "01", "+1", "0x10", ""),
+    *(
+        "NaN",
+        "Infinity",
+        "-Infinity",
+        "1e999",
+        "-1e999",
+        "1e308",
+        "1e-320",
+        "-0.0",
+        "0.1e1",
+    ),
+    *(
+        "9" * 5000,
+        "9" * 4000,
+        "-" + "9" * 400,
+        "9223372036854775808",
+        "18446744073709551616",
+        "1" + "0" * 300,
+    ),
+    *(
+        r'"\ud800"',
+        r'"a\udfff"',
+        r'"\u0000"',
+        r'"\u001b[31m"',
+        r'"\n\n"',
+        '"\u2028"',
+        "'a'",
+        "01",
+        "+1",
+        "0x10",
+        "",
+    ),
     *("[" * depth + "]" * depth for depth in (5, 70, 500, 990, 3000, 100_000)),
     *('{"a":' * depth + "1" + "}" * depth for depth in (70, 900, 20_000)),
     '{"a": 1, "a": 2}',
 )
 """What may stand in a document as text, though no value of Python is written so."""
 VALUES = (
-    *(None, True, False, 0, 1, -1, 2, 2**31, 2**53 + 1, 2**63 - 1, 1e308, -1e-308, 0.5, "", "word", "x" * 300, "../x"),
-    *("/etc/passwd", "a\0b", "a/b", "nan", "1", [], {}, [None], [[]], [1, 2, 3], [[1, 2], 3], {"a": 1}, {"mean": "x"}),
-    *(["a"] * 100, "\n", "\u00e4", "$", "%", "\\", "<b>", "s3", "oracle", [{}], [[[[1]]]], {"": ""}, "0" * 64),
+    *(
+        None,
+        True,
+        False,
+        0,
+        1,
+        -1,
+        2,
+        2**31,
+        2**53 + 1,
+        2**63 - 1,
+        1e308,
+        -1e-308,
+        0.5,
+        "",
+        "word",
+        "x" * 300,
+        "../x",
+    ),
+    *(
+        "/etc/passwd",
+        "a\0b",
+        "a/b",
+        "nan",
+        "1",
+        [],
+        {},
+        [None],
+        [[]],
+        [1, 2, 3],
+        [[1, 2], 3],
+        {"a": 1},
+        {"mean": "x"},
+    ),
+    *(
+        ["a"] * 100,
+        "\n",
+        "\u00e4",
+        "$",
+        "%",
+        "\\",
+        "<b>",
+        "s3",
+        "oracle",
+        [{}],
+        [[[[1]]]],
+        {"": ""},
+        "0" * 64,
+    ),
 )
 FOREIGN = (
     b"",
@@ -48,11 +125,33 @@ HEADERS = (
         "'shape': (1e3,)",
         "'shape': 3",
     ),
-    *("'shape': (True,)", "'shape': (3)", "'shape': (3L,)", "'shape': ()", "'shape': (0, 999999999999999999)"),
-    *("'shape': (" + "9" * 5000 + ",)", "'shape': (" + "1," * 40 + ")", "'shape': [3]", "'shape': (2, 2"),
+    *(
+        "'shape': (True,)",
+        "'shape': (3)",
+        "'shape': (3L,)",
+        "'shape': ()",
+        "'shape': (0, 999999999999999999)",
+    ),
+    *(
+        "'shape': (" + "9" * 5000 + ",)",
+        "'shape': (" + "1," * 40 + ")",
+        "'shape': [3]",
+        "'shape': (2, 2",
+    ),
     *(
         f"'descr': '{kind}'"
-        for kind in ("|O", "<U999999999", "|V8", "<f3", "<f8", "<i4", "<M8", "<M8[s]", "|S0", "|b1")
+        for kind in (
+            "|O",
+            "<U999999999",
+            "|V8",
+            "<f3",
+            "<f8",
+            "<i4",
+            "<M8",
+            "<M8[s]",
+            "|S0",
+            "|b1",
+        )
     ),
     *(
         "'descr': [('a', '<f4')]",
@@ -111,21 +210,35 @@ def value_change(draw: random.Random, document: Any) -> Any:
     elif kind == 2 and isinstance(inner, dict):
         inner[draw.choice(("x", "", "a\0", "kind", "..", "é"))] = inner.pop(key)
     elif kind == 3:
-        inner[key] = draw.choice(([value], {"a": value}, str(value), [value, deepcopy(value)]))
+        inner[key] = draw.choice(
+            ([value], {"a": value}, str(value), [value, deepcopy(value)])
+        )
     elif kind == 4 and isinstance(value, (int, float)):
-        inner[key] = draw.choice((-value, value * 1e30, value + 1, float(value), str(value)))
+        inner[key] = draw.choice(
+            (-value, value * 1e30, value + 1, float(value), str(value))
+        )
     elif kind == 5:
         other, place = draw.choice(places)
         inner[key] = json.loads(json.dumps(other[place]))
     elif kind == 6 and isinstance(value, list):
-        inner[key] = draw.choice((value[:1], value[1:], deepcopy(value) + value, value[::-1], [*value, None]))
+        inner[key] = draw.choice(
+            (value[:1], value[1:], deepcopy(value) + value, value[::-1], [*value, None])
+        )
     else:
-        inner[key] = deepcopy(draw.choice(VALUES))  # of which later changes would else change all
+        inner[key] = deepcopy(
+            draw.choice(VALUES)
+        )  # of which later changes would else change all
     return document
 
 
 def _places(value: Any) -> Any:
-    entries = value.items() if isinstance(value, dict) else enumerate(value) if isinstance(value, list) else ()
+    entries = (
+        value.items()
+        if isinstance(value, dict)
+        else enumerate(value)
+        if isinstance(value, list)
+        else ()
+    )
     for key, entry in entries:
         yield value, key
         yield from _places(entry)
@@ -138,10 +251,17 @@ def text_change(draw: random.Random, content: bytes) -> bytes:
     return draw.choice(
         (
             lambda: b"\xef\xbb\xbf" + content,
-            lambda: text.encode(draw.choice(("utf-16", "utf-16-le", "utf-32", "utf-7", "cp500"))),
-            lambda: (text[:at] + draw.choice(LITERALS) + text[at:]).encode("utf-8", "surrogatepass"),
+            lambda: text.encode(
+                draw.choice(("utf-16", "utf-16-le", "utf-32", "utf-7", "cp500"))
+            ),
+            lambda: (text[:at] + draw.choice(LITERALS) + text[at:]).encode(
+                "utf-8", "surrogatepass"
+            ),
             lambda: (text[:at] + "\ud83d" + text[at:]).encode("utf-8", "surrogatepass"),
-            lambda: content + draw.choice((content, b"}", b"\n\n", b"\0", b"// x", b" " * 100_000)),
+            lambda: (
+                content
+                + draw.choice((content, b"}", b"\n\n", b"\0", b"// x", b" " * 100_000))
+            ),
             lambda: byte_change(draw, content),
         )
     )()
@@ -160,12 +280,19 @@ def byte_change(draw: random.Random, content: bytes) -> bytes:
     if kind == 3:
         return content[:to] + content[at:]
     if kind == 4:
-        foreign = (*FOREIGN, pickle.dumps({"a": 1}), draw.randbytes(500), b"PK\x03\x04" + draw.randbytes(200))
+        foreign = (
+            *FOREIGN,
+            pickle.dumps({"a": 1}),
+            draw.randbytes(500),
+            b"PK\x03\x04" + draw.randbytes(200),
+        )
         return draw.choice(foreign)
     changed = bytearray(content)
     for _ in range(draw.choice((1, 1, 2, 8)) if changed else 0):
         at = draw.randrange(len(changed))
-        changed[at] = draw.choice((changed[at] ^ (1 << draw.randrange(8)), 0, 255, draw.randrange(256)))
+        changed[at] = draw.choice(
+            (changed[at] ^ (1 << draw.randrange(8)), 0, 255, draw.randrange(256))
+        )
     return bytes(changed)
 
 
@@ -196,14 +323,46 @@ def csv_change(draw: random.Random, content: bytes) -> bytes:
         if kind == 0:
             rows[row] = rows[row][: draw.randrange(len(rows[row]) + 1)]
         elif kind == 1:
-            rows[row : row + 1] = draw.choice(([], [rows[row]] * 2, [rows[row - 1]], [["#", "a"]], [[""]]))
+            rows[row : row + 1] = draw.choice(
+                ([], [rows[row]] * 2, [rows[row - 1]], [["#", "a"]], [[""]])
+            )
         elif kind == 2:
-            rows[0][draw.randrange(len(rows[0]))] = draw.choice(("", "t", "1.0", "x" * 5000, "\0", '"', "é"))
+            rows[0][draw.randrange(len(rows[0]))] = draw.choice(
+                ("", "t", "1.0", "x" * 5000, "\0", '"', "é")
+            )
         elif rows[row]:
-            cells = ("", "nan", "inf", "-inf", "1e400", "1e308", "0x1", "1_0", "١", "text", '"', '"a\nb"', "\0", " 1 ")
-            cells += ("9" * 5000, "x" * 200_000, "1e-400", "-1e30", "True", "1,5", "1 2", "\r", "=1+1", "#")
+            cells = (
+                "",
+                "nan",
+                "inf",
+                "-inf",
+                "1e400",
+                "1e308",
+                "0x1",
+                "1_0",
+                "١",
+                "text",
+                '"',
+                '"a\nb"',
+                "\0",
+                " 1 ",
+            )
+            cells += (
+                "9" * 5000,
+                "x" * 200_000,
+                "1e-400",
+                "-1e30",
+                "True",
+                "1,5",
+                "1 2",
+                "\r",
+                "=1+1",
+                "#",
+            )
             rows[row][draw.randrange(len(rows[row]))] = draw.choice(cells)
-    text = "\n".join(draw.choice((",", ",", ",", ";", "\t", " ")).join(row) for row in rows)
+    text = "\n".join(
+        draw.choice((",", ",", ",", ";", "\t", " ")).join(row) for row in rows
+    )
     return text.encode()
 
 
@@ -227,14 +386,31 @@ def npz_change(draw: random.Random, content: bytes) -> bytes:
             (
                 [],
                 [(name, member)] * 2,
-                [(draw.choice(("a", "../x.npy", "\u2028.npy", "x.npy.npy", ".npy", "a\n.npy", "x" * 3000)), member)],
+                [
+                    (
+                        draw.choice(
+                            (
+                                "a",
+                                "../x.npy",
+                                "\u2028.npy",
+                                "x.npy.npy",
+                                ".npy",
+                                "a\n.npy",
+                                "x" * 3000,
+                            )
+                        ),
+                        member,
+                    )
+                ],
                 [(name, byte_change(draw, member))],
                 [(name, pickle.dumps(entries))],
                 [(name, member + b"\0" * 8)],
                 [(f"{k}.npy", member) for k in range(300)],
             )
         )
-    method = draw.choice((zipfile.ZIP_STORED, zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED, zipfile.ZIP_LZMA))
+    method = draw.choice(
+        (zipfile.ZIP_STORED, zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED, zipfile.ZIP_LZMA)
+    )
     packed = io.BytesIO()
     with zipfile.ZipFile(packed, "w", zipfile.ZIP_STORED) as archive:
         for name, member in entries:
@@ -247,16 +423,26 @@ def npz_change(draw: random.Random, content: bytes) -> bytes:
 def _header(draw: random.Random, member: bytes) -> bytes:
     """A .npy file with another header before the same data."""
     length = struct.unpack("<H", member[8:10])[0]
-    text, data, new = member[10 : 10 + length].decode("latin1"), member[10 + length :], draw.choice(HEADERS)
+    text, data, new = (
+        member[10 : 10 + length].decode("latin1"),
+        member[10 + length :],
+        draw.choice(HEADERS),
+    )
     key = new.partition(":")[0]
     start = text.find(key) if ":" in new else -1
     if start >= 0 and draw.random() < 0.8:
-        end = text.find(", '", start) if not key.startswith("'shape") else text.find("), ", start) + 1
+        end = (
+            text.find(", '", start)
+            if not key.startswith("'shape")
+            else text.find("), ", start) + 1
+        )
         text = text[:start] + new + text[end:]
     else:
         at = draw.randrange(len(text))
         text = text[:at] + new + text[at:]
-    version, width = draw.choice(((1, "<H"),) * 8 + ((2, "<I"), (3, "<I"), (0, "<H"), (9, "<H")))
+    version, width = draw.choice(
+        ((1, "<H"),) * 8 + ((2, "<I"), (3, "<I"), (0, "<H"), (9, "<H"))
+    )
     declared = draw.choice((len(text),) * 6 + (0, 1, 65535, len(text) + 7))
     if width == "<I":
         declared = draw.choice((declared, declared, 2**32 - 1))
@@ -269,16 +455,36 @@ def _header(draw: random.Random, member: bytes) -> bytes:
 
 
 def _fields(draw: random.Random, content: bytes) -> bytes:
-    """An archive with a field of a local header, of the directory or of its end set to an extreme."""
+    """An archive with a field of a local header, of the directory or of its end set to
+    an extreme.
+    """
     changed = bytearray(content)
     marks = [(b"PK\x01\x02", 46), (b"PK\x03\x04", 30), (b"PK\x05\x06", 22)]
     for _ in range(draw.choice((1, 1, 2, 3))):
         mark, size = draw.choice(marks)
-        places = [at for at in range(len(content) - size) if content[at : at + 4] == mark]
+        places = [
+            at for at in range(len(content) - size) if content[at : at + 4] == mark
+        ]
         places = places or [content.rfind(b"PK\x05\x06")]
-        at, width = draw.choice(places) + draw.randrange(4, size - 3), draw.choice((1, 2, 4))
+        at, width = (
+            draw.choice(places) + draw.randrange(4, size - 3),
+            draw.choice((1, 2, 4)),
+        )
         value = draw.choice(
-            (0, 1, 8, 12, 14, 99, 2**15, 2**31 - 1, 2**31, 2**32 - 1, len(content), draw.randrange(2**32))
+            (
+                0,
+                1,
+                8,
+                12,
+                14,
+                99,
+                2**15,
+                2**31 - 1,
+                2**31,
+                2**32 - 1,
+                len(content),
+                draw.randrange(2**32),
+            )
         )
         changed[at : at + width] = (value % 256**width).to_bytes(width, "little")
     return bytes(changed)
@@ -286,8 +492,13 @@ def _fields(draw: random.Random, content: bytes) -> bytes:
 
 @cache
 def bomb(size: int) -> bytes:
-    """An archive with one array of so many MiB of zeros, of which it holds a thousandth."""
-    packed, header = io.BytesIO(), b"{'descr': '|u1', 'fortran_order': False, 'shape': (%d,), }\n" % (size << 20)
+    """An archive with one array of so many MiB of zeros, of which it holds a
+    thousandth.
+    """
+    packed, header = (
+        io.BytesIO(),
+        b"{'descr': '|u1', 'fortran_order': False, 'shape': (%d,), }\n" % (size << 20),
+    )
     archive = zipfile.ZipFile(packed, "w", zipfile.ZIP_DEFLATED, compresslevel=1)
     with archive, archive.open("t.npy", "w") as entry:
         entry.write(b"\x93NUMPY\x01\0" + struct.pack("<H", len(header)) + header)

@@ -1,4 +1,6 @@
-"""What the fuzzer reads: how a sound folder is made, how a file of it is changed, and what reading it must give."""
+"""What the fuzzer reads: how a sound folder is made, how a file of it is changed, and
+what reading it must give.
+"""
 
 import contextlib
 import hashlib
@@ -30,8 +32,10 @@ class Reader(NamedTuple):
     """One way of reading.
 
     Attributes:
-        make: writes a sound folder. files: file -> how it is changed.
-        read: reads the folder. holds: whether what was read means what lies in the folder.
+        make: writes a sound folder.
+        files: file -> how it is changed.
+        read: reads the folder.
+        holds: whether what was read means what lies in the folder.
         refusals: types of a refusal.
     """
 
@@ -69,12 +73,17 @@ def read_document(folder: Path) -> Any:
 
 
 def document_holds(found: Any, folder: Path) -> bool:
-    return equal(found, plain_json((folder / "a.json").read_bytes())) and equal(artefacts.sha256(found)[:0], "")
+    return equal(found, plain_json((folder / "a.json").read_bytes())) and equal(
+        artefacts.sha256(found)[:0], ""
+    )
 
 
 def make_lines(folder: Path) -> None:
     for step in range(12):
-        artefacts.append_jsonl(folder / "a.jsonl", {"step": step, "loss": 0.5**step, "parts": {"x": [step]}, "w": "é"})
+        artefacts.append_jsonl(
+            folder / "a.jsonl",
+            {"step": step, "loss": 0.5**step, "parts": {"x": [step]}, "w": "é"},
+        )
 
 
 def read_lines(folder: Path) -> Any:
@@ -102,33 +111,50 @@ ARRAYS = {
 
 
 def make_arrays(folder: Path) -> None:
-    artefacts.write_arrays(folder / "a.npz", ARRAYS, kind="fuzzed", config={"seed": 0, "model": {"rank": 3}})
+    artefacts.write_arrays(
+        folder / "a.npz",
+        ARRAYS,
+        kind="fuzzed",
+        config={"seed": 0, "model": {"rank": 3}},
+    )
     manifest = artefacts.read_json(folder / "a.json")
-    manifest.pop("file_sha256", None)  # as an earlier version, or somebody who wants to be read, writes it
+    manifest.pop(
+        "file_sha256", None
+    )  # as an earlier version, or somebody who wants to be read, writes it
     shutil.copy(folder / "a.npz", folder / "b.npz")
     artefacts.write_json(folder / "b.json", manifest)
 
 
 def read_arrays(folder: Path) -> Any:
-    return [artefacts.read_arrays(folder / f"{name}.npz", kind="fuzzed") for name in "ab"]
+    return [
+        artefacts.read_arrays(folder / f"{name}.npz", kind="fuzzed") for name in "ab"
+    ]
 
 
 def arrays_hold(found: Any, folder: Path) -> bool:
     return all(
-        same_arrays(arrays, ARRAYS) and equal(manifest, plain_json((folder / f"{name}.json").read_bytes()))
+        same_arrays(arrays, ARRAYS)
+        and equal(manifest, plain_json((folder / f"{name}.json").read_bytes()))
         for name, (arrays, manifest) in zip("ab", found, strict=True)
     )
 
 
 def same_arrays(a: dict[str, np.ndarray], b: dict[str, np.ndarray]) -> bool:
     """Whether names, dtypes, shapes and every bit agree."""
-    agree = (a[n].dtype == b[n].dtype and a[n].shape == b[n].shape and a[n].tobytes() == b[n].tobytes() for n in a)
+    agree = (
+        a[n].dtype == b[n].dtype
+        and a[n].shape == b[n].shape
+        and a[n].tobytes() == b[n].tobytes()
+        for n in a
+    )
     return a.keys() == b.keys() and all(agree)
 
 
 def make_npz(folder: Path) -> None:
     with (folder / "a.npz").open("wb") as file:
-        np.savez(file, **{name.replace("/", "_"): array for name, array in ARRAYS.items()})
+        np.savez(
+            file, **{name.replace("/", "_"): array for name, array in ARRAYS.items()}
+        )
 
 
 def read_npz(folder: Path) -> Any:
@@ -137,7 +163,9 @@ def read_npz(folder: Path) -> Any:
 
 def npz_holds(found: Any, folder: Path) -> bool:
     with np.load(folder / "a.npz", allow_pickle=False) as archive:
-        return same_arrays(found, {name: np.asarray(archive[name]) for name in archive.files})
+        return same_arrays(
+            found, {name: np.asarray(archive[name]) for name in archive.files}
+        )
 
 
 # ---- logs
@@ -173,15 +201,29 @@ def log_reader(name: str, make: Callable[[Path], None], change: Change) -> Reade
 
     def read(folder: Path) -> Any:
         file = str(folder / name)
-        return datasets.from_logs(file, datasets.Columns(), dt=0.1, wheelbase=2.7, steps=5, say=lambda line: None)
+        return datasets.from_logs(
+            file,
+            datasets.Columns(),
+            dt=0.1,
+            wheelbase=2.7,
+            steps=5,
+            say=lambda line: None,
+        )
 
-    return Reader(make, {name: change}, read, log_holds, (artefacts.ArtefactError, ValueError))
+    return Reader(
+        make, {name: change}, read, log_holds, (artefacts.ArtefactError, ValueError)
+    )
 
 
 def log_holds(found: Any, folder: Path) -> bool:
     """Whether a data set is of finite numbers."""
-    parts = [getattr(found.dataset, part) for part in ("train", "validation", "calibration", "test")]
-    return all(bool(np.isfinite(np.asarray(leaf)).all()) for part in parts for leaf in part)
+    parts = [
+        getattr(found.dataset, part)
+        for part in ("train", "validation", "calibration", "test")
+    ]
+    return all(
+        bool(np.isfinite(np.asarray(leaf)).all()) for part in parts for leaf in part
+    )
 
 
 # ---- runs
@@ -189,9 +231,16 @@ def log_holds(found: Any, folder: Path) -> bool:
 
 @cache
 def results() -> dict[str, Any]:
-    """Two rows of a committed result, without the side forces that a figure would be drawn of."""
-    document = json.loads((ROOT / "experiments" / "violations" / "results.json").read_bytes())
-    rows = [{name: value for name, value in row.items() if name != "disturbed"} for row in document["rows"][:2]]
+    """Two rows of a committed result, without the side forces that a figure would be
+    drawn of.
+    """
+    document = json.loads(
+        (ROOT / "experiments" / "violations" / "results.json").read_bytes()
+    )
+    rows = [
+        {name: value for name, value in row.items() if name != "disturbed"}
+        for row in document["rows"][:2]
+    ]
     return document | {"rows": rows}
 
 
@@ -208,7 +257,9 @@ def read_rows(folder: Path) -> Any:
 
 
 def rows_hold(found: Any, folder: Path) -> bool:
-    return equal(found, list(plain_json((folder / "results.json").read_bytes())["rows"]))
+    return equal(
+        found, list(plain_json((folder / "results.json").read_bytes())["rows"])
+    )
 
 
 def read_report(folder: Path) -> Any:
@@ -231,7 +282,8 @@ def make_runs(folder: Path) -> None:
         run = folder / "runs" / f"seed={seed}"
         make_run(run) if run.mkdir(parents=True) is None else None
         artefacts.write_json(
-            run / "settings.json", {"seed": seed, "model": {"system": "sfkd", "rho": 0.9, "beta": 0.1}}
+            run / "settings.json",
+            {"seed": seed, "model": {"system": "sfkd", "rho": 0.9, "beta": 0.1}},
         )
 
 
@@ -249,11 +301,22 @@ def make_policy(folder: Path) -> None:
 
 
 def policy_holds(found: Any, folder: Path) -> bool:
-    """Whether a certified policy is the one that ships; one without says so itself, and is what its files hold."""
-    shipped, settings = shipped_policy(), plain_json((folder / "policy.json").read_bytes())["config"]
+    """Whether a certified policy is the one that ships; one without says so itself, and
+    is what its files hold.
+    """
+    shipped, settings = (
+        shipped_policy(),
+        plain_json((folder / "policy.json").read_bytes())["config"],
+    )
     pairs = zip(*map(jax.tree.leaves, (found.params, shipped.params)), strict=True)
-    expected = shipped.settings if found.certificate is not None else settings | {"env": "measured"}
-    return all(np.array_equal(a, b) for a, b in pairs) and equal(found.settings, expected)
+    expected = (
+        shipped.settings
+        if found.certificate is not None
+        else settings | {"env": "measured"}
+    )
+    return all(np.array_equal(a, b) for a, b in pairs) and equal(
+        found.settings, expected
+    )
 
 
 @cache
@@ -270,17 +333,26 @@ def make_export(folder: Path) -> None:
     def init(key: jax.Array) -> tuple[jax.Array]:
         return (key,)
 
-    def act(key: jax.Array, observation: jax.Array, env: jax.Array, reference: jax.Array) -> tuple[jax.Array, ...]:
+    def act(
+        key: jax.Array, observation: jax.Array, env: jax.Array, reference: jax.Array
+    ) -> tuple[jax.Array, ...]:
         return observation[:2] + env + reference[0, :2], key, observation.sum()
 
-    key, leaves = jax.ShapeDtypeStruct((2,), "uint32"), {"observation": (4,), "env": (2,), "reference": (3, 4)}
-    taken = {name: jax.ShapeDtypeStruct(shape, "float32") for name, shape in leaves.items()}
+    key, leaves = (
+        jax.ShapeDtypeStruct((2,), "uint32"),
+        {"observation": (4,), "env": (2,), "reference": (3, 4)},
+    )
+    taken = {
+        name: jax.ShapeDtypeStruct(shape, "float32") for name, shape in leaves.items()
+    }
     programs = {}
     for name, function, inputs, outputs in (
         ("init", init, {"key": key}, ["state.key"]),
         ("act", act, {"state.key": key} | taken, ["control", "state.key", "info.cost"]),
     ):
-        exported = jax.export.export(jax.jit(function), platforms=("cpu",))(*inputs.values())
+        exported = jax.export.export(jax.jit(function), platforms=("cpu",))(
+            *inputs.values()
+        )
         content = bytes(exported.serialize())
         artefacts.write_bytes(folder / f"{name}.stablehlo", content)
         programs[name] = {
@@ -290,22 +362,36 @@ def make_export(folder: Path) -> None:
             "inputs": described(inputs, exported.in_avals),
             "outputs": described(outputs, exported.out_avals),
         }
-    manifest = {"kind": "controller", "format": loader.FORMAT, "jax": jax.__version__, "programs": programs}
-    manifest |= {"key_implementation": "threefry2x32", "sampling_period_s": 0.1, "controls": [{"name": "a"}]}
+    manifest = {
+        "kind": "controller",
+        "format": loader.FORMAT,
+        "jax": jax.__version__,
+        "programs": programs,
+    }
+    manifest |= {
+        "key_implementation": "threefry2x32",
+        "sampling_period_s": 0.1,
+        "controls": [{"name": "a"}],
+    }
     manifest |= {"environment": {"low": [0.3, -8.0], "high": [0.9, 8.0]}, "horizon": 3}
     (folder / "controller.json").write_bytes(sealed(manifest))
 
 
 def described(names: Any, values: Any) -> list[dict[str, Any]]:
     pairs = zip(names, values, strict=True)
-    return [{"name": name, "shape": list(value.shape), "dtype": str(value.dtype)} for name, value in pairs]
+    return [
+        {"name": name, "shape": list(value.shape), "dtype": str(value.dtype)}
+        for name, value in pairs
+    ]
 
 
 def sealed(manifest: dict[str, Any]) -> bytes:
     """A manifest with the hash that belongs to it."""
     said = {name: value for name, value in manifest.items() if name != "sha256"}
     with contextlib.suppress(RecursionError, ValueError):
-        said["sha256"] = hashlib.sha256(json.dumps(said, sort_keys=True).encode()).hexdigest()
+        said["sha256"] = hashlib.sha256(
+            json.dumps(said, sort_keys=True).encode()
+        ).hexdigest()
     return json.dumps(said).encode()
 
 
@@ -321,7 +407,10 @@ def manifest_change(draw: random.Random, content: bytes) -> bytes:
 def read_export(folder: Path) -> Any:
     controller = loader.ExportedController(folder)
     state = controller.init(3)
-    measured = {leaf["name"]: jnp.ones(leaf["shape"]) for leaf in controller.manifest["programs"]["act"]["inputs"][1:]}
+    measured = {
+        leaf["name"]: jnp.ones(leaf["shape"])
+        for leaf in controller.manifest["programs"]["act"]["inputs"][1:]
+    }
     with contextlib.redirect_stdout(io.StringIO()):
         return controller.manifest, [state, measured]
 
@@ -331,12 +420,18 @@ def export_holds(found: Any, folder: Path) -> bool:
 
 
 READERS = {
-    "read_json": Reader(make_document, {"a.json": mutations.json_change}, read_document, document_holds),
-    "read_jsonl": Reader(make_lines, {"a.jsonl": mutations.lines_change}, read_lines, lines_hold),
+    "read_json": Reader(
+        make_document, {"a.json": mutations.json_change}, read_document, document_holds
+    ),
+    "read_jsonl": Reader(
+        make_lines, {"a.jsonl": mutations.lines_change}, read_lines, lines_hold
+    ),
     "read_arrays": Reader(
         make_arrays,
         {
-            name: mutations.json_change if name.endswith("json") else mutations.npz_change
+            name: mutations.json_change
+            if name.endswith("json")
+            else mutations.npz_change
             for name in ("a.json", "b.json")
         }
         | {"a.npz": mutations.npz_change, "b.npz": mutations.npz_change},
@@ -347,16 +442,27 @@ READERS = {
     "log_csv": log_reader("a.csv", make_csv, mutations.csv_change),
     "log_npz": log_reader("a.npz", make_log_npz, mutations.npz_change),
     "log_parquet": log_reader("a.parquet", make_parquet, mutations.byte_change),
-    "merge": Reader(make_run, {"results.json": mutations.json_change}, read_rows, rows_hold),
+    "merge": Reader(
+        make_run, {"results.json": mutations.json_change}, read_rows, rows_hold
+    ),
     "report": Reader(
-        make_run, dict.fromkeys(("results.json", "policy.json"), mutations.json_change), read_report, page_holds
+        make_run,
+        dict.fromkeys(("results.json", "policy.json"), mutations.json_change),
+        read_report,
+        page_holds,
     ),
     "benchmark": Reader(
-        make_run, {"results.json": mutations.json_change}, read_benchmark, lambda found, _: bool(found)
+        make_run,
+        {"results.json": mutations.json_change},
+        read_benchmark,
+        lambda found, _: bool(found),
     ),
     "comparison": Reader(
         make_runs,
-        dict.fromkeys(("runs/seed=0/settings.json", "runs/seed=0/results.json"), mutations.json_change),
+        dict.fromkeys(
+            ("runs/seed=0/settings.json", "runs/seed=0/results.json"),
+            mutations.json_change,
+        ),
         read_comparison,
         page_holds,
     ),

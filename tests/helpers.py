@@ -42,14 +42,18 @@ VARIANTS = {
     "path": {"frame": "path"},
 }
 HARD = ("sfkd", "no_fiber", "no_transport", "segment")
-"""Variants whose operator and residual are each bounded by construction (and are there)."""
+"""Variants whose operator and residual are each bounded by construction (and are
+there).
+"""
 PHYSICS = ("oracle", "nominal")
 OTHERS = tuple(name for name in models.FACTORIES if name != "sfkd")
 """Learned models that are not ours: with their default settings."""
 
 
 def space(body=1):
-    """Scales about those of the kinematic plant (body = 1) or the dynamic one (body = 4)."""
+    """Scales about those of the kinematic plant (body = 1) or the dynamic one (body =
+    4).
+    """
     return Space(
         body_mean=jnp.zeros(body).at[0].set(10.0),
         body_scale=jnp.full(body, 0.5).at[0].set(4.0),
@@ -64,17 +68,38 @@ def space(body=1):
 
 def path_space():
     """Scales about those of the kinematic plant along a path."""
-    controls = {"control_mean": jnp.asarray([0.0, 0.0, 0.0, 9.0]), "control_scale": jnp.asarray([0.03, 1.0, 0.02, 1.5])}
+    controls = {
+        "control_mean": jnp.asarray([0.0, 0.0, 0.0, 9.0]),
+        "control_scale": jnp.asarray([0.03, 1.0, 0.02, 1.5]),
+    }
     return space(3)._replace(**controls)
 
 
 def any_law(coordinates=3):
     """A law that follows a path slowly, the same in every environment."""
     corners = (2, 2, 2, 2)
-    gain = jnp.zeros((*corners, 2, coordinates)).at[..., 0, 0].set(0.05).at[..., 0, 1].set(0.5).at[..., 1, 2].set(1.0)
-    control_table = jnp.zeros((*corners, 2)).at[..., 0].add(jnp.asarray([-0.06, 0.06])[:, None, None, None])
+    gain = (
+        jnp.zeros((*corners, 2, coordinates))
+        .at[..., 0, 0]
+        .set(0.05)
+        .at[..., 0, 1]
+        .set(0.5)
+        .at[..., 1, 2]
+        .set(1.0)
+    )
+    control_table = (
+        jnp.zeros((*corners, 2))
+        .at[..., 0]
+        .add(jnp.asarray([-0.06, 0.06])[:, None, None, None])
+    )
     ends = (jnp.asarray([-2.0, 8.0, 0.3, -8.0]), jnp.asarray([2.0, 10.5, 0.9, 8.0]))
-    return control.PathLaw(*ends, jnp.asarray([0.03, 1.0]), jnp.zeros((*corners, coordinates)), control_table, gain)
+    return control.PathLaw(
+        *ends,
+        jnp.asarray([0.03, 1.0]),
+        jnp.zeros((*corners, coordinates)),
+        control_table,
+        gain,
+    )
 
 
 def tiny(name="sfkd", **changes):
@@ -85,7 +110,9 @@ def tiny(name="sfkd", **changes):
 
 @cache
 def model_and_params(name="sfkd", scale=1.0):
-    """A model by the name of a variant or of a physics row, and generic parameters, multiplied by `scale`."""
+    """A model by the name of a variant or of a physics row, and generic parameters,
+    multiplied by `scale`.
+    """
     plant = vehicle.kinematic()
     if name in PHYSICS:
         return models.physics(plant.step if name == "oracle" else plant.nominal), {}
@@ -99,17 +126,28 @@ def _model(name):
         return tiny(name)
     factory = models.FACTORIES[name]
     known = {"nominal": vehicle.kinematic().nominal_derivative}
-    return factory(space(), **{key: known[key] for key in known if key in inspect.signature(factory).parameters})
+    return factory(
+        space(),
+        **{
+            key: known[key]
+            for key in known
+            if key in inspect.signature(factory).parameters
+        },
+    )
 
 
 @cache
 def generic(name):
-    """Parameters in the shape of the model's own initial ones, none of them 0: weights of unit gain, small offsets."""
+    """Parameters in the shape of the model's own initial ones, none of them 0: weights
+    of unit gain, small offsets.
+    """
     random = np.random.default_rng(1)
 
     def drawn(leaf):
         spread = leaf.shape[-2] ** -0.5 if len(leaf.shape) > 1 else 0.3
-        return jnp.asarray(spread * random.standard_normal(leaf.shape), dtype=leaf.dtype)
+        return jnp.asarray(
+            spread * random.standard_normal(leaf.shape), dtype=leaf.dtype
+        )
 
     return jax.tree.map(drawn, jax.eval_shape(_model(name).init, jax.random.key(0)))
 
@@ -117,20 +155,31 @@ def generic(name):
 def explicit(name="sfkd", scale=1.0):
     """What a certificate speaks about, in float64."""
     model, params = model_and_params(name, scale)
-    return jax.tree.map(lambda leaf: np.asarray(leaf, dtype=np.float64), jax.jit(model.explicit)(params))
+    return jax.tree.map(
+        lambda leaf: np.asarray(leaf, dtype=np.float64), jax.jit(model.explicit)(params)
+    )
 
 
 @cache
 def certified(name="sfkd", scale=1.0):
     """A certificate of such a model, nothing attacked."""
-    return certification.certify(*model_and_params(name, scale), (ENV_LOW, ENV_HIGH), attack_starts=0)
+    return certification.certify(
+        *model_and_params(name, scale), (ENV_LOW, ENV_HIGH), attack_starts=0
+    )
 
 
 def steepest_pattern(weights, starts=6):
-    """Largest ||W_L D … D W_1||_2 found by flipping slopes between 0 and 1: a lower bound of the Lipschitz constant."""
+    """Largest ||W_L D … D W_1||_2 found by flipping slopes between 0 and 1: a lower
+    bound of the Lipschitz constant.
+    """
     random, best = np.random.default_rng(0), 0.0
     for start in range(starts):
-        slopes = [np.ones(len(w)) if start == 0 else random.integers(0, 2, len(w)).astype(float) for w in weights[:-1]]
+        slopes = [
+            np.ones(len(w))
+            if start == 0
+            else random.integers(0, 2, len(w)).astype(float)
+            for w in weights[:-1]
+        ]
 
         def gain(slopes):
             chained = weights[0]
@@ -165,12 +214,18 @@ def drive(plant, initial, controls, envs):
 
 @cache
 def driven(count=3, steps=12):
-    """A few trajectories of the kinematic plant with bold controls and an environment that switches at every step."""
+    """A few trajectories of the kinematic plant with bold controls and an environment
+    that switches at every step.
+    """
     plant = vehicle.kinematic()
     start_key, control_key, env_key = jax.random.split(jax.random.key(5), 3)
     spread = jnp.asarray([3.0, 3.0, 4.0, 2.0])
-    initial = jnp.asarray([0.0, 0.0, 0.0, 10.0]) + spread * jax.random.uniform(start_key, (count, 4), minval=-1.0)
-    controls = jnp.asarray([0.1, 1.0]) * jax.random.uniform(control_key, (count, steps, 2), minval=-1.0)
+    initial = jnp.asarray([0.0, 0.0, 0.0, 10.0]) + spread * jax.random.uniform(
+        start_key, (count, 4), minval=-1.0
+    )
+    controls = jnp.asarray([0.1, 1.0]) * jax.random.uniform(
+        control_key, (count, steps, 2), minval=-1.0
+    )
     low, high = jnp.asarray(ENV_LOW), jnp.asarray(ENV_HIGH)
     envs = low + (high - low) * jax.random.uniform(env_key, (count, steps, 2))
     return jit(jax.vmap(partial(drive, plant)))(initial, controls, envs)
@@ -182,7 +237,11 @@ def driver(plant):
 
     def follow(state, reference):
         curvature = control.reference_curvature(reference)[0]
-        return law(control.path_errors(state, reference[0], curvature), curvature, reference[0, 3])
+        return law(
+            control.path_errors(state, reference[0], curvature),
+            curvature,
+            reference[0, 3],
+        )
 
     return follow
 
@@ -191,7 +250,9 @@ def driver(plant):
 def generator(count=120, steps=25):
     """key -> training segments of the kinematic plant, compiled once."""
     plant = vehicle.kinematic()
-    return jit(partial(datasets.generate, plant, driver(plant), segments=count, steps=steps))
+    return jit(
+        partial(datasets.generate, plant, driver(plant), segments=count, steps=steps)
+    )
 
 
 @cache
@@ -204,7 +265,13 @@ def segments(count=120, steps=25, seed=0):
 def dataset(count=120, steps=25):
     """The same, dealt to the four splits."""
     low, high = jnp.asarray(ENV_LOW), jnp.asarray(ENV_HIGH)
-    return datasets.split(segments(count, steps), jax.random.key(1), shares=SHARES, env_low=low, env_high=high)
+    return datasets.split(
+        segments(count, steps),
+        jax.random.key(1),
+        shares=SHARES,
+        env_low=low,
+        env_high=high,
+    )
 
 
 def straight(horizon, speed=10.0, dt=0.1):
@@ -220,16 +287,25 @@ def at(tree, index):
 
 
 def same(left, right, **tolerance):
-    """Whether two pytrees have the same structure and (nearly) the same leaves; NaN equals NaN, keys count."""
+    """Whether two pytrees have the same structure and (nearly) the same leaves; NaN
+    equals NaN, keys count.
+    """
     if jax.tree.structure(left) != jax.tree.structure(right):
         return False
     pairs = zip(jax.tree.leaves(left), jax.tree.leaves(right), strict=True)
-    return all(jnp.allclose(_plain(a), _plain(b), equal_nan=True, **tolerance) for a, b in pairs)
+    return all(
+        jnp.allclose(_plain(a), _plain(b), equal_nan=True, **tolerance)
+        for a, b in pairs
+    )
 
 
 def _plain(leaf):
     """Keys as the numbers behind them."""
-    return jax.random.key_data(leaf) if jnp.issubdtype(leaf.dtype, jax.dtypes.prng_key) else leaf
+    return (
+        jax.random.key_data(leaf)
+        if jnp.issubdtype(leaf.dtype, jax.dtypes.prng_key)
+        else leaf
+    )
 
 
 def door(name, *arguments, cwd, code=0):
@@ -247,7 +323,9 @@ def last_line(done):
 
 @contextmanager
 def largest_file(size):
-    """The kernel stops every write beyond `size` bytes, in the middle of a write if need be."""
+    """The kernel stops every write beyond `size` bytes, in the middle of a write if
+    need be.
+    """
     soft, hard = resource.getrlimit(resource.RLIMIT_FSIZE)
     resource.setrlimit(resource.RLIMIT_FSIZE, (size, hard))
     try:
@@ -257,7 +335,9 @@ def largest_file(size):
 
 
 def refusal_of(action):
-    """The one line with which an action fails as a door says it; None if it does not fail."""
+    """The one line with which an action fails as a door says it; None if it does not
+    fail.
+    """
     try:
         action()
     except (artefacts.ArtefactError, ValueError, OSError) as reason:

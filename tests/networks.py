@@ -14,7 +14,9 @@ def rotation(size, seed):
 
 ROOT = np.diag([1.0, 2.0, 3.0])
 FIRST, LAST = 0.3 * rotation(4, 3)[:, :3], 0.4 * rotation(4, 4)[:3]
-POLYTOPE = Polytope(np.stack([0.3 * rotation(3, 1), 0.5 * rotation(3, 2), 0.4 * rotation(3, 5)]))
+POLYTOPE = Polytope(
+    np.stack([0.3 * rotation(3, 1), 0.5 * rotation(3, 2), 0.4 * rotation(3, 5)])
+)
 NETWORK = Explicit(
     operators=POLYTOPE,
     residual=(FIRST, LAST),
@@ -24,19 +26,45 @@ NETWORK = Explicit(
     readout=np.asarray([[0.7, 0.1, 0.0]]),
     declared=Declared("tanh", "rotation", 2),
 )
-TURNED = Polytope(np.stack([np.linalg.solve(ROOT, r * rotation(3, k) @ ROOT) for k, r in enumerate((0.3, 0.5))]))
+TURNED = Polytope(
+    np.stack(
+        [
+            np.linalg.solve(ROOT, r * rotation(3, k) @ ROOT)
+            for k, r in enumerate((0.3, 0.5))
+        ]
+    )
+)
 HYPERNETWORK = Hypernetwork(
-    (0.5 * rotation(3, 6)[:, :2], 0.1 * rotation(9, 7)[:, :3]), (np.zeros(3), 0.3 * rotation(3, 8).ravel())
+    (0.5 * rotation(3, 6)[:, :2], 0.1 * rotation(9, 7)[:, :3]),
+    (np.zeros(3), 0.3 * rotation(3, 8).ravel()),
 )
 KINDS = {
     "joint": (NETWORK, True, None),
     "separate": (NETWORK, False, None),
-    "bare": (NETWORK._replace(residual=(), residual_multipliers=(), decoder=(), decoder_multipliers=()), True, None),
-    "linear": (NETWORK._replace(residual=(FIRST.T @ FIRST,), residual_multipliers=()), True, None),
+    "bare": (
+        NETWORK._replace(
+            residual=(), residual_multipliers=(), decoder=(), decoder_multipliers=()
+        ),
+        True,
+        None,
+    ),
+    "linear": (
+        NETWORK._replace(residual=(FIRST.T @ FIRST,), residual_multipliers=()),
+        True,
+        None,
+    ),
     "silent": (NETWORK._replace(residual=(FIRST, 0 * LAST)), False, None),
-    "metric": (NETWORK._replace(operators=TURNED, declared=Declared("tanh", "identity", 2)), False, ROOT @ ROOT),
+    "metric": (
+        NETWORK._replace(operators=TURNED, declared=Declared("tanh", "identity", 2)),
+        False,
+        ROOT @ ROOT,
+    ),
     "hypernetwork": (NETWORK._replace(operators=HYPERNETWORK), True, None),
-    "bare hypernetwork": (NETWORK._replace(operators=HYPERNETWORK, residual=(), residual_multipliers=()), True, None),
+    "bare hypernetwork": (
+        NETWORK._replace(operators=HYPERNETWORK, residual=(), residual_multipliers=()),
+        True,
+        None,
+    ),
 }
 
 
@@ -47,7 +75,10 @@ def proved_once(weights, box, *, joint, metric=None):
     """What the search finds, which takes most of the time."""
     key = id(weights), str(box), joint, metric is None or metric.tobytes()
     if key not in PROVED:
-        PROVED[key] = weights, _proofs.prove(weights, box, joint=joint, metric=metric)  # so that no other has the id
+        PROVED[key] = (
+            weights,
+            _proofs.prove(weights, box, joint=joint, metric=metric),
+        )  # so that no other has the id
     return PROVED[key][1]
 
 
@@ -59,5 +90,7 @@ def honest(kind):
 def consistent(claims):
     """With everything that is computed from other constants computed again."""
     separate = claims.rho + claims.beta * claims.kappa**0.5
-    alpha = min([separate] + ([] if claims.alpha_joint is None else [claims.alpha_joint]))
+    alpha = min(
+        [separate] + ([] if claims.alpha_joint is None else [claims.alpha_joint])
+    )
     return claims._replace(alpha_separate=separate, alpha=alpha)

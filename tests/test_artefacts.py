@@ -1,4 +1,6 @@
-"""Files: what goes in comes out, whatever is wrong is told in one line, and a kill or a full disk loses nothing."""
+"""Files: what goes in comes out, whatever is wrong is told in one line, and a kill or a
+full disk loses nothing.
+"""
 
 import json
 import os
@@ -19,7 +21,11 @@ from helpers import largest_file
 from sfkd_jax import artefacts
 from sfkd_jax.artefacts import ArtefactError
 
-CONFIG = {"model": {"rank": 16, "layers": [32, 32]}, "training": {"steps": 4000, "rate": 1e-3}, "seed": 0}
+CONFIG = {
+    "model": {"rank": 16, "layers": [32, 32]},
+    "training": {"steps": 4000, "rate": 1e-3},
+    "seed": 0,
+}
 ARRAYS = {
     "params/A": np.arange(12, dtype=np.float32).reshape(3, 4),
     "params/allow_pickle": np.asfortranarray(np.arange(6.0).reshape(2, 3)),
@@ -36,7 +42,9 @@ OLD = {"x": np.arange(4.0)}
 
 
 def write(path, arrays=ARRAYS, **changes):
-    return artefacts.write_arrays(path, arrays, **{"kind": "policy", "config": CONFIG, **changes})
+    return artefacts.write_arrays(
+        path, arrays, **{"kind": "policy", "config": CONFIG, **changes}
+    )
 
 
 def read(path, **changes):
@@ -71,19 +79,36 @@ def path(tmp_path) -> Path:
 
 
 def test_trees_come_back_from_flat_names():
-    tree = {"params": {"dense": {"kernel": jnp.ones((2, 3)), "bias": np.zeros(3)}, "none": {}}, "step": 3, "scale": 0.5}
+    tree = {
+        "params": {
+            "dense": {"kernel": jnp.ones((2, 3)), "bias": np.zeros(3)},
+            "none": {},
+        },
+        "step": 3,
+        "scale": 0.5,
+    }
     flat = artefacts.flatten(tree)
-    assert list(flat) == ["params/dense/kernel", "params/dense/bias", "params/none/", "step", "scale"]
+    assert list(flat) == [
+        "params/dense/kernel",
+        "params/dense/bias",
+        "params/none/",
+        "step",
+        "scale",
+    ]
     assert all(isinstance(leaf, np.ndarray) for leaf in flat.values())
     back = artefacts.unflatten(flat)
     assert back["params"]["none"] == {}
     assert back["step"].shape == ()
-    np.testing.assert_array_equal(back["params"]["dense"]["kernel"], np.ones((2, 3), np.float32), strict=True)
+    np.testing.assert_array_equal(
+        back["params"]["dense"]["kernel"], np.ones((2, 3), np.float32), strict=True
+    )
     assert artefacts.flatten(back).keys() == flat.keys()
     assert artefacts.unflatten(artefacts.flatten({})) == {}
 
 
-@pytest.mark.parametrize("tree", [{"a/b": 1.0}, {"": 1.0}, {"a": [1.0, 2.0]}, {"a": None}])
+@pytest.mark.parametrize(
+    "tree", [{"a/b": 1.0}, {"": 1.0}, {"a": [1.0, 2.0]}, {"a": None}]
+)
 def test_trees_without_a_flat_form_are_refused(tree):
     with pytest.raises(ValueError, match="cannot flatten"):
         artefacts.flatten(tree)
@@ -98,15 +123,28 @@ def test_a_leaf_is_not_a_dict(flat_names):
 def test_hash_sees_content_and_nothing_else():
     digest = artefacts.sha256(ARRAYS)
     assert digest == artefacts.sha256(dict(reversed(ARRAYS.items())))
-    assert digest == artefacts.sha256({name: np.array(array, order="F") for name, array in ARRAYS.items()})
+    assert digest == artefacts.sha256(
+        {name: np.array(array, order="F") for name, array in ARRAYS.items()}
+    )
     strided = np.zeros((6, 8), np.float32)[::2, ::2]
     strided[:] = ARRAYS["params/A"]
     assert digest == artefacts.sha256(ARRAYS | {"params/A": strided})
     a = ARRAYS["params/A"]
     assert artefacts.sha256({"a": jnp.asarray(a)}) == artefacts.sha256({"a": a})
-    others = [{"b": a}, {"a": a.T}, {"a": a.ravel()}, {"a": a.astype(float)}, {"a": a + 1}, {"a": a, "b": a}, {}]
+    others = [
+        {"b": a},
+        {"a": a.T},
+        {"a": a.ravel()},
+        {"a": a.astype(float)},
+        {"a": a + 1},
+        {"a": a, "b": a},
+        {},
+    ]
     others += [{"a": a.astype(">f4")}, {"a": a.view(np.int32)}, {"a": a.tolist()}]
-    assert len({artefacts.sha256(other) for other in [{"a": a}, *others]}) == len(others) + 1
+    assert (
+        len({artefacts.sha256(other) for other in [{"a": a}, *others]})
+        == len(others) + 1
+    )
 
 
 def test_hash_of_json_sees_content_and_nothing_else():
@@ -115,11 +153,17 @@ def test_hash_of_json_sees_content_and_nothing_else():
     assert digest == artefacts.sha256(json.loads(json.dumps(CONFIG)))
     assert digest == artefacts.sha256(CONFIG | {"seed": np.int64(0)})
     assert digest != artefacts.sha256(CONFIG | {"seed": 1})
-    assert artefacts.sha256([1, 2]) == artefacts.sha256((1, 2)) != artefacts.sha256([2, 1])
+    assert (
+        artefacts.sha256([1, 2]) == artefacts.sha256((1, 2)) != artefacts.sha256([2, 1])
+    )
 
 
 def test_differences_are_told_by_dotted_key():
-    asked = {"model": {"rank": 16.0, "layers": (32, 64)}, "training": {"steps": 100, "rate": 1e-3}, "name": "a" * 99}
+    asked = {
+        "model": {"rank": 16.0, "layers": (32, 64)},
+        "training": {"steps": 100, "rate": 1e-3},
+        "name": "a" * 99,
+    }
     assert artefacts.differences(CONFIG, asked) == [
         "model.layers was [32, 32], asked [32, 64]",
         "training.steps was 4000, asked 100",
@@ -127,18 +171,30 @@ def test_differences_are_told_by_dotted_key():
         f"name was absent, asked {'a' * 57}...",
     ]
     assert artefacts.differences(CONFIG, json.loads(json.dumps(CONFIG))) == []
-    assert artefacts.differences({"a": {"b": 1}}, {"a": 1}) == ["a was {'b': 1}, asked 1"]
-    assert artefacts.differences({"a": True, "b": None}, {"a": 1, "b": float("nan")}) == ["a was True, asked 1"]
+    assert artefacts.differences({"a": {"b": 1}}, {"a": 1}) == [
+        "a was {'b': 1}, asked 1"
+    ]
+    assert artefacts.differences(
+        {"a": True, "b": None}, {"a": 1, "b": float("nan")}
+    ) == ["a was True, asked 1"]
 
 
 # ---- JSON
 
 
 def test_json_comes_back_with_arrays_as_lists_and_nan_as_null(path):
-    numbers = {"a": np.float32(0.5), "b": jnp.arange(3), "c": np.nan, "d": [np.inf, np.bool_(True)], "e": np.eye(2)}
+    numbers = {
+        "a": np.float32(0.5),
+        "b": jnp.arange(3),
+        "c": np.nan,
+        "d": [np.inf, np.bool_(True)],
+        "e": np.eye(2),
+    }
     document = path.with_suffix(".json")
     artefacts.write_json(
-        document, numbers | {"at": Path("runs"), "none": None, "deep": {"f": np.array([1.0, -np.inf])}}
+        document,
+        numbers
+        | {"at": Path("runs"), "none": None, "deep": {"f": np.array([1.0, -np.inf])}},
     )
     assert artefacts.read_json(document, keys=("a", "at")) == {
         "a": 0.5,
@@ -157,13 +213,23 @@ def test_json_that_cannot_be_read_is_refused(tmp_path):
     document = tmp_path / "a.json"
     assert refusal(artefacts.read_json, document) == f"{document}: missing"
     whole = json.dumps(CONFIG).encode()
-    for text in (b"", whole[:-1], whole[:10], b"\xff\xfe\x00", pickle.dumps(CONFIG), b"[" * 100_000):
+    for text in (
+        b"",
+        whole[:-1],
+        whole[:10],
+        b"\xff\xfe\x00",
+        pickle.dumps(CONFIG),
+        b"[" * 100_000,
+    ):
         document.write_bytes(text)
         assert "truncated or not JSON" in refusal(artefacts.read_json, document)
     document.write_bytes(b"[1]")
     assert refusal(artefacts.read_json, document) == f"{document}: not a JSON object"
     document.write_bytes(whole)
-    assert refusal(artefacts.read_json, document, keys=("seed", "rows", "b")) == f"{document}: lacks rows, b"
+    assert (
+        refusal(artefacts.read_json, document, keys=("seed", "rows", "b"))
+        == f"{document}: lacks rows, b"
+    )
     assert refusal(artefacts.read_json, tmp_path) == f"{tmp_path}: Is a directory"
 
 
@@ -200,14 +266,21 @@ def test_no_arrays_and_random_arrays_come_back(path):
     rng = np.random.default_rng(0)
     for dtype in ("f2", "f4", "f8", "i1", "i8", "u4", "c16", "?", "<M8[s]", "S3"):
         shapes = [tuple(rng.integers(0, 4, size=rank)) for rank in range(4)]
-        arrays = {f"{n}": rng.integers(0, 99, size=shape).astype(dtype) for n, shape in enumerate(shapes)}
+        arrays = {
+            f"{n}": rng.integers(0, 99, size=shape).astype(dtype)
+            for n, shape in enumerate(shapes)
+        }
         write(path, arrays)
         same(read(path)[0], arrays)
 
 
 def test_arrays_without_a_portable_form_are_refused(path):
     write(path)
-    for odd in (np.array([{}]), np.asarray(jnp.ones(2, jnp.bfloat16)), np.zeros(2, [("a", "f4")])):
+    for odd in (
+        np.array([{}]),
+        np.asarray(jnp.ones(2, jnp.bfloat16)),
+        np.zeros(2, [("a", "f4")]),
+    ):
         assert "x is of dtype" in refusal(write, path, {"x": odd})
     assert "must end in .npz" in refusal(write, path.with_suffix(".json"))
     assert "not written" in refusal(write, path, config={"a": object()})
@@ -217,9 +290,14 @@ def test_arrays_without_a_portable_form_are_refused(path):
 def test_other_settings_kinds_and_formats_are_refused(path):
     write(path)
     asked = CONFIG | {"training": {"steps": 100, "rate": 1e-3}}
-    assert refusal(read, path, config=asked) == f"{path}: made with other settings: training.steps was 4000, asked 100"
+    assert (
+        refusal(read, path, config=asked)
+        == f"{path}: made with other settings: training.steps was 4000, asked 100"
+    )
     assert refusal(read, path, config={"a": 1, "b": 2}).endswith("and 2 more")
-    assert refusal(read, path, kind="dataset") == f"{path}: is of kind policy, not dataset"
+    assert (
+        refusal(read, path, kind="dataset") == f"{path}: is of kind policy, not dataset"
+    )
     manifest = artefacts.read_json(path.with_suffix(".json"))
     artefacts.write_json(path.with_suffix(".json"), manifest | {"format": 2})
     assert refusal(read, path) == f"{path}: is of format 2, this version reads 1"
@@ -230,7 +308,10 @@ def test_half_of_a_pair_is_refused(path):
     write(path)
     path.with_suffix(".json").unlink()
     assert not artefacts.exists(path)
-    assert refusal(read, path) == f"{path}: incomplete, its manifest policy.json is missing"
+    assert (
+        refusal(read, path)
+        == f"{path}: incomplete, its manifest policy.json is missing"
+    )
     write(path)
     path.unlink()
     assert not artefacts.exists(path)
@@ -240,12 +321,19 @@ def test_half_of_a_pair_is_refused(path):
 def test_a_damaged_manifest_is_refused_and_can_be_written_over(path):
     good = write(path)
     manifest = path.with_suffix(".json")
-    for changes in ({"config": 1}, {"sha256": "../../x"}, {"sha256": None}, {"sha256": "ab"}):
+    for changes in (
+        {"config": 1},
+        {"sha256": "../../x"},
+        {"sha256": None},
+        {"sha256": "ab"},
+    ):
         artefacts.write_json(manifest, good | changes)
         assert "not a manifest" in refusal(read, path)
         write(path)
         same(read(path)[0], ARRAYS)
-    artefacts.write_json(manifest, {key: value for key, value in good.items() if key != "sha256"})
+    artefacts.write_json(
+        manifest, {key: value for key, value in good.items() if key != "sha256"}
+    )
     assert refusal(read, path) == f"{manifest}: lacks sha256"
     manifest.write_bytes(b'{"kind": "pol')
     assert "truncated or not JSON" in refusal(read, path)
@@ -255,7 +343,12 @@ def test_foreign_files_are_refused_each_in_its_own_words(path, tmp_path):
     write(path)
     np.save(tmp_path / "a.npy", np.zeros(3))
     random_bytes = np.random.default_rng(1).bytes(1000)
-    for content in (random_bytes, pickle.dumps(ARRAYS), (tmp_path / "a.npy").read_bytes(), b"PX"):
+    for content in (
+        random_bytes,
+        pickle.dumps(ARRAYS),
+        (tmp_path / "a.npy").read_bytes(),
+        b"PX",
+    ):
         path.write_bytes(content)
         assert refusal(read, path) == f"{path}: foreign, not an archive of arrays"
     np.savez(path, a=np.zeros(3))
@@ -294,9 +387,19 @@ def test_truncated_arrays_are_refused(path):
     write(path)
     whole = path.read_bytes()
     rng = random.Random(0)
-    for size in {0, 1, 2, 4, len(whole) - 1, *(rng.randrange(len(whole)) for _ in range(60))}:
+    for size in {
+        0,
+        1,
+        2,
+        4,
+        len(whole) - 1,
+        *(rng.randrange(len(whole)) for _ in range(60)),
+    }:
         path.write_bytes(whole[:size])
-        assert refusal(read, path) == f"{path}: truncated, the end of the archive is missing"
+        assert (
+            refusal(read, path)
+            == f"{path}: truncated, the end of the archive is missing"
+        )
 
 
 @pytest.mark.parametrize("compressed", [False, True])
@@ -337,11 +440,15 @@ def full(*_):
     raise OSError(28, "No space left on device")
 
 
-@pytest.mark.parametrize(("call", "working"), [("fsync", 0), ("fsync", 1), ("replace", 1), ("replace", 2)])
+@pytest.mark.parametrize(
+    ("call", "working"), [("fsync", 0), ("fsync", 1), ("replace", 1), ("replace", 2)]
+)
 def test_a_full_disk_leaves_the_earlier_pair(path, monkeypatch, call, working):
     write(path, OLD)
     steps = [getattr(os, call)] * working
-    monkeypatch.setattr(os, call, lambda *arguments: (steps.pop() if steps else full)(*arguments))
+    monkeypatch.setattr(
+        os, call, lambda *arguments: (steps.pop() if steps else full)(*arguments)
+    )
     assert "No space left on device" in refusal(write, path)
     monkeypatch.undo()
     same(read(path)[0], OLD)
@@ -355,7 +462,9 @@ def test_a_write_that_ends_in_the_middle_leaves_the_earlier_files(path, size):
     artefacts.write_json(document, CONFIG)
     with largest_file(size):
         assert "File too large" in refusal(write, path, {"x": np.zeros(1_000_000)})
-        assert "File too large" in refusal(artefacts.write_json, document, {"x": "0" * 1_000_000})
+        assert "File too large" in refusal(
+            artefacts.write_json, document, {"x": "0" * 1_000_000}
+        )
     same(read(path)[0], OLD)
     assert artefacts.read_json(document) == CONFIG
     assert names(path.parent) == ["policy.json", "policy.npz", "results.json"]
@@ -366,9 +475,15 @@ def test_a_place_that_cannot_be_written_is_told_in_one_line(tmp_path):
     below = tmp_path / "file" / "policy.npz"
     assert str(below) in refusal(write, below).replace(".json", ".npz")
     for writer in (artefacts.write_json, artefacts.append_jsonl):
-        assert refusal(writer, below, CONFIG) in (f"{below}: Not a directory", f"{below}: File exists")
+        assert refusal(writer, below, CONFIG) in (
+            f"{below}: Not a directory",
+            f"{below}: File exists",
+        )
     (tmp_path / "policy.json").mkdir()
-    assert refusal(write, tmp_path / "policy.npz") == f"{tmp_path / 'policy.npz'}: Is a directory"
+    assert (
+        refusal(write, tmp_path / "policy.npz")
+        == f"{tmp_path / 'policy.npz'}: Is a directory"
+    )
     assert names(tmp_path) == ["file", "policy.json"]
 
 
@@ -393,7 +508,9 @@ def write(n):
 def child(path, code):
     source = CHILD + textwrap.dedent(code)
     package = Path(artefacts.__file__).parents[1]
-    return subprocess.Popen([sys.executable, "-c", source, package, path], stdout=subprocess.PIPE)
+    return subprocess.Popen(
+        [sys.executable, "-c", source, package, path], stdout=subprocess.PIPE
+    )
 
 
 def version(path) -> int:
@@ -415,7 +532,9 @@ def version(path) -> int:
         ("replace", 4, 2, 2),
     ],
 )
-def test_a_kill_at_each_step_of_a_write_leaves_one_of_the_two_pairs(path, call, nth, second, left):
+def test_a_kill_at_each_step_of_a_write_leaves_one_of_the_two_pairs(
+    path, call, nth, second, left
+):
     code = f"""
     write(1)
     steps = [kill] + [os.{call}] * {nth - 1}
@@ -426,7 +545,9 @@ def test_a_kill_at_each_step_of_a_write_leaves_one_of_the_two_pairs(path, call, 
         assert process.wait(20) == -signal.SIGKILL
     assert version(path) == left
     assert len(names(path.parent)) > 2
-    artefacts.write_arrays(path, {"x": np.full(650_000, 3.0)}, kind="policy", config={"n": 3})
+    artefacts.write_arrays(
+        path, {"x": np.full(650_000, 3.0)}, kind="policy", config={"n": 3}
+    )
     assert version(path) == 3
     assert names(path.parent) == ["policy.json", "policy.npz"]
 
@@ -471,7 +592,9 @@ def test_logs_grow_line_by_line_and_are_cut_for_a_resumed_run(tmp_path):
     artefacts.truncate_jsonl(log, lambda record: True)
     assert refusal(artefacts.read_jsonl, log) == f"{log}: missing"
     for step in range(5):
-        artefacts.append_jsonl(log, {"step": step, "loss": np.float32(0.5), "gap": float("nan")})
+        artefacts.append_jsonl(
+            log, {"step": step, "loss": np.float32(0.5), "gap": float("nan")}
+        )
     records = [{"step": step, "loss": 0.5, "gap": None} for step in range(5)]
     assert artefacts.read_jsonl(log) == records
     artefacts.truncate_jsonl(log, lambda record: record["step"] < 3)
@@ -485,7 +608,9 @@ def test_a_last_line_cut_short_is_dropped_and_not_built_on(tmp_path):
     lines = b'{"step": 0}\n{"step": 1}\n{"step": 2}\n'
     for size in range(len(lines) + 1):
         log.write_bytes(lines[:size])
-        whole = [{"step": step} for step in range((size + 1) // 12)]  # complete, with or without its end of line
+        whole = [
+            {"step": step} for step in range((size + 1) // 12)
+        ]  # complete, with or without its end of line
         assert artefacts.read_jsonl(log) == whole
         artefacts.append_jsonl(log, {"step": 9})
         assert artefacts.read_jsonl(log) == [*whole, {"step": 9}]
@@ -503,10 +628,16 @@ def test_a_log_on_a_full_disk_keeps_its_lines(tmp_path, monkeypatch):
     log = tmp_path / "metrics.jsonl"
     artefacts.append_jsonl(log, {"step": 0})
     with largest_file(log.stat().st_size + 5):
-        assert refusal(artefacts.append_jsonl, log, {"step": 1}) == f"{log}: No space left on device"
+        assert (
+            refusal(artefacts.append_jsonl, log, {"step": 1})
+            == f"{log}: No space left on device"
+        )
     assert log.read_bytes() == b'{"step": 0}\n'
     with largest_file(4):
-        assert refusal(artefacts.truncate_jsonl, log, lambda record: True) == f"{log}: File too large"
+        assert (
+            refusal(artefacts.truncate_jsonl, log, lambda record: True)
+            == f"{log}: File too large"
+        )
     assert artefacts.read_jsonl(log) == [{"step": 0}]
     assert names(tmp_path) == ["metrics.jsonl"]
     artefacts.append_jsonl(log, {"step": 1})

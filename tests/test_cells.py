@@ -1,4 +1,6 @@
-"""The plan of a comparison: which cells there are, what is composed for them, and when one is done."""
+"""The plan of a comparison: which cells there are, what is composed for them, and when
+one is done.
+"""
 
 from pathlib import Path
 
@@ -13,7 +15,10 @@ PLAN = {
     "seeds": [0, 1],
     "controllers": {"mppi": ["s1", "s2"], "mppi_plain": ["s1"]},
     "own_controllers": {"program": {"mppi": "koopman_mpc", "mppi_plain": None}},
-    "rows": {"ours": "model=sfkd", "program": "model=koopman_mpc model.environment=false"},
+    "rows": {
+        "ours": "model=sfkd",
+        "program": "model=koopman_mpc model.environment=false",
+    },
     "variations": {"as it is": None, "late": "evaluation.told.delay_s=0.5"},
     "policies": "table",
     "only": [],
@@ -23,13 +28,21 @@ PLAN = {
 def test_every_row_meets_every_scenario_under_every_controller_that_it_has():
     found = grid.plan(PLAN)
     assert len(found) == len(set(found)) == 2 * 2 * 2 * (3 + 2)
-    assert {cell.controller for cell in found if cell.label == "program"} == {"koopman_mpc"}
-    assert {cell.scenario for cell in found if cell.controller == "mppi_plain"} == {"s1"}
+    assert {cell.controller for cell in found if cell.label == "program"} == {
+        "koopman_mpc"
+    }
+    assert {cell.scenario for cell in found if cell.controller == "mppi_plain"} == {
+        "s1"
+    }
 
 
 def test_rows_can_be_picked_and_an_unknown_one_is_named_with_the_choices():
-    assert {cell.label for cell in grid.plan(PLAN | {"only": ["program"]})} == {"program"}
-    with pytest.raises(ValueError, match=r"unknown comparison\.only iocde; choose of ours, program"):
+    assert {cell.label for cell in grid.plan(PLAN | {"only": ["program"]})} == {
+        "program"
+    }
+    with pytest.raises(
+        ValueError, match=r"unknown comparison\.only iocde; choose of ours, program"
+    ):
         grid.plan(PLAN | {"only": ["iocde"]})
 
 
@@ -41,19 +54,43 @@ def test_what_one_driver_does_lies_together():
 
 def test_a_cell_composes_its_row_its_controller_and_its_variation():
     cell = grid.Cell("dynamic", "program", 1, "koopman_mpc", "late", "s2")
-    asked = ["vehicle=dynamic", "scenario=s2", "controller=koopman_mpc", "seed=1", "model=koopman_mpc"]
-    assert grid.overrides(cell, PLAN) == [*asked, "model.environment=false", "evaluation.told.delay_s=0.5"]
+    asked = [
+        "vehicle=dynamic",
+        "scenario=s2",
+        "controller=koopman_mpc",
+        "seed=1",
+        "model=koopman_mpc",
+    ]
+    assert grid.overrides(cell, PLAN) == [
+        *asked,
+        "model.environment=false",
+        "evaluation.told.delay_s=0.5",
+    ]
 
 
 def test_a_variation_that_retrains_has_a_policy_of_its_own():
     cell = grid.Cell("dynamic", "ours", 1, "mppi", "10 % of the data", "s2")
     assert grid.policy_name(cell, PLAN, retrained=False) == "table/dynamic/ours"
-    assert grid.policy_name(cell, PLAN, retrained=True) == "table/dynamic/ours/10_%_of_the_data"
+    assert (
+        grid.policy_name(cell, PLAN, retrained=True)
+        == "table/dynamic/ours/10_%_of_the_data"
+    )
 
 
 def settings(root, **changes):
-    names = ("dataset", "model", "training", "seed", "controller", "scenario", "certification")
-    asked = {name: {"name": name} for name in names} | {"vehicle": {"dt": 0.1}, "evaluation": {"episodes": 4}}
+    names = (
+        "dataset",
+        "model",
+        "training",
+        "seed",
+        "controller",
+        "scenario",
+        "certification",
+    )
+    asked = {name: {"name": name} for name in names} | {
+        "vehicle": {"dt": 0.1},
+        "evaluation": {"episodes": 4},
+    }
     return asked | {"env": "measured", "root": str(root), "name": "table"} | changes
 
 
@@ -75,24 +112,56 @@ def test_a_cell_is_done_only_with_its_own_settings_and_undamaged(tmp_path):
 
 
 def row(system, level, seed):
-    about = {"system": system, "scenario": "s1", "vehicle": "kinematic", "sampling": "feedback", "variation": None}
-    measures = {"max_deviation_m": level, "departures": 0, "ratio_to_oracle": None, "difference_to_sfkd": None}
+    about = {
+        "system": system,
+        "scenario": "s1",
+        "vehicle": "kinematic",
+        "sampling": "feedback",
+        "variation": None,
+    }
+    measures = {
+        "max_deviation_m": level,
+        "departures": 0,
+        "ratio_to_oracle": None,
+        "difference_to_sfkd": None,
+    }
     episodes = [level, 2 * level]
-    return about | measures | {"seeds": [seed], "rmse_episodes_m": episodes, "rmse_m": {"mean": np.mean(episodes)}}
+    return (
+        about
+        | measures
+        | {
+            "seeds": [seed],
+            "rmse_episodes_m": episodes,
+            "rmse_m": {"mean": np.mean(episodes)},
+        }
+    )
 
 
 @pytest.mark.parametrize("seeds", [1, 2])
 def test_collecting_pools_the_seeds_and_compares_what_is_there(tmp_path, seeds):
-    plan = PLAN | {"rows": {"sfkd": "", "icode": "", "missing": ""}, "vehicles": ["kinematic"]}
-    plan |= {"seeds": list(range(seeds)), "variations": {"as it is": None}, "controllers": {"mppi": ["s1"]}}
+    plan = PLAN | {
+        "rows": {"sfkd": "", "icode": "", "missing": ""},
+        "vehicles": ["kinematic"],
+    }
+    plan |= {
+        "seeds": list(range(seeds)),
+        "variations": {"as it is": None},
+        "controllers": {"mppi": ["s1"]},
+    }
     wanted = grid.plan(plan)
     for cell in wanted:
         if cell.label != "missing":
             path = grid.place(cell, settings(tmp_path))
             path.parent.mkdir(parents=True, exist_ok=True)
             level = 1.0 if cell.label == "sfkd" else 3.0
-            write_json(rows_file(path), {"row": row(cell.label, level, cell.seed), "made_with": cell.label})
-    found = {entry["system"]: entry for entry in grid.collect(wanted, settings(tmp_path), lambda cell: cell.label)}
+            write_json(
+                rows_file(path),
+                {"row": row(cell.label, level, cell.seed), "made_with": cell.label},
+            )
+    found = {
+        entry["system"]: entry
+        for entry in grid.collect(wanted, settings(tmp_path), lambda cell: cell.label)
+    }
     assert set(found) == {"sfkd", "icode"}
     assert found["icode"]["seeds"] == list(range(seeds))
     assert len(found["icode"]["rmse_episodes_m"]) == 2 * seeds
@@ -101,14 +170,24 @@ def test_collecting_pools_the_seeds_and_compares_what_is_there(tmp_path, seeds):
 
 @pytest.mark.parametrize(
     ("older", "systems", "says"),
-    [(False, {"sfkd"}, "left out; comparison.older=true takes them"), (True, {"sfkd", "icode"}, "taken all the same")],
+    [
+        (False, {"sfkd"}, "left out; comparison.older=true takes them"),
+        (True, {"sfkd", "icode"}, "taken all the same"),
+    ],
 )
-def test_a_row_that_was_made_with_other_settings_enters_no_table_unseen(tmp_path, capsys, older, systems, says):
-    wanted = [grid.Cell("kinematic", label, 0, "mppi", "as it is", "s1") for label in ("sfkd", "icode")]
+def test_a_row_that_was_made_with_other_settings_enters_no_table_unseen(
+    tmp_path, capsys, older, systems, says
+):
+    wanted = [
+        grid.Cell("kinematic", label, 0, "mppi", "as it is", "s1")
+        for label in ("sfkd", "icode")
+    ]
     for cell in wanted:
         path = grid.place(cell, settings(tmp_path))
         path.parent.mkdir(parents=True, exist_ok=True)
-        write_json(rows_file(path), {"row": row(cell.label, 1.0, 0), "made_with": cell.label})
+        write_json(
+            rows_file(path), {"row": row(cell.label, 1.0, 0), "made_with": cell.label}
+        )
     found = grid.collect(wanted, settings(tmp_path), lambda cell: "sfkd", older=older)
     assert {entry["system"] for entry in found} == systems
     said = capsys.readouterr().err
@@ -121,7 +200,9 @@ def test_rows_are_dealt_to_processes_whole_and_each_to_one():
     """Two controllers of one row share its policy: no two processes may train it."""
     groups = grid.drivers(grid.plan(PLAN))
     parts = [grid.dealt(groups, [k, 3]) for k in range(3)]
-    assert sorted(str(group) for part in parts for group in part) == sorted(map(str, groups))
+    assert sorted(str(group) for part in parts for group in part) == sorted(
+        map(str, groups)
+    )
     policies = [row for part in parts for row in {group[0][:3] for group in part}]
     assert len(policies) == len(set(policies))
     assert grid.dealt(groups, None) == groups

@@ -7,7 +7,13 @@ from helpers import door, last_line
 from sfkd_jax import compare, vehicle
 
 SMALL = ("training.steps=75", "training.save_every=75", "dataset.segments=200")
-COMPARED = ("+experiment=smoke", "comparison=tiny", "evaluation.systems=[self]", "name=table", *SMALL)
+COMPARED = (
+    "+experiment=smoke",
+    "comparison=tiny",
+    "evaluation.systems=[self]",
+    "name=table",
+    *SMALL,
+)
 
 
 def test_compare_drives_every_row_and_continues_where_it_was_stopped(tmp_path):
@@ -45,10 +51,26 @@ def test_a_row_that_could_not_be_certified_is_refused_before_it_is_trained(tmp_p
 
 def test_roads_are_laid_once_for_all_rows_and_anew_for_another_protocol():
     told = {"delay_s": 0.0, "noise": [0.0, 0.0], "bias": [0.0, 0.0]}
-    protocol = {"episodes": 2, "episode_s": 2.0, "seed": 1, "told": told, "variation": None}
-    asked = {"vehicle": {"name": "kinematic"}, "scenario": {"name": "s1"}, "evaluation": protocol}
+    protocol = {
+        "episodes": 2,
+        "episode_s": 2.0,
+        "seed": 1,
+        "told": told,
+        "variation": None,
+    }
+    asked = {
+        "vehicle": {"name": "kinematic"},
+        "scenario": {"name": "s1"},
+        "evaluation": protocol,
+    }
     lay, plant = compare._surveyor(), vehicle.kinematic()
-    first, second = (lay(asked | {"model": {"name": model}}, plant) for model in ("sfkd", "icode"))
+    first, second = (
+        lay(asked | {"model": {"name": model}}, plant) for model in ("sfkd", "icode")
+    )
     assert second is first
-    others = [{"evaluation": protocol | {"seed": 2}}, {"scenario": {"name": "s3"}}, {"vehicle": {"name": "other"}}]
+    others = [
+        {"evaluation": protocol | {"seed": 2}},
+        {"scenario": {"name": "s3"}},
+        {"vehicle": {"name": "other"}},
+    ]
     assert len({id(lay(asked | other, plant)) for other in others} | {id(first)}) == 4

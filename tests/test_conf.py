@@ -13,15 +13,25 @@ from sfkd_jax import build, models, vehicle
 from sfkd_jax.cli import config
 
 CONF = Path(config.conf_path())
-GROUPS = sorted(folder.name for folder in CONF.iterdir() if folder.is_dir() and not folder.name.startswith("_"))
-OPTIONS = [(group, file.stem) for group in GROUPS for file in sorted((CONF / group).glob("*.yaml"))]
+GROUPS = sorted(
+    folder.name
+    for folder in CONF.iterdir()
+    if folder.is_dir() and not folder.name.startswith("_")
+)
+OPTIONS = [
+    (group, file.stem)
+    for group in GROUPS
+    for file in sorted((CONF / group).glob("*.yaml"))
+]
 MODELS = [name for group, name in OPTIONS if group == "model"]
 
 
 def settings(*overrides: str) -> dict:
     config.register()
     with initialize_config_dir(str(CONF), version_base="1.3"):
-        return OmegaConf.to_container(compose("config", overrides=list(overrides)), resolve=True)
+        return OmegaConf.to_container(
+            compose("config", overrides=list(overrides)), resolve=True
+        )
 
 
 @pytest.mark.parametrize(("group", "option"), OPTIONS)
@@ -39,15 +49,29 @@ def test_every_model_option_builds_and_names_its_system(option):
     build.build_model(composed["model"], space(), vehicle.kinematic())
 
 
-@pytest.mark.parametrize("vehicle", [name for group, name in OPTIONS if group == "vehicle"])
-@pytest.mark.parametrize("controller", [name for group, name in OPTIONS if group == "controller"])
+@pytest.mark.parametrize(
+    "vehicle", [name for group, name in OPTIONS if group == "vehicle"]
+)
+@pytest.mark.parametrize(
+    "controller", [name for group, name in OPTIONS if group == "controller"]
+)
 def test_every_controller_builds_for_every_vehicle(vehicle, controller):
-    limits = ("vehicle.control_low=[-0.4,-3.0]", "vehicle.control_high=[0.4,2.0]") if vehicle == "own" else ()
+    limits = (
+        ("vehicle.control_low=[-0.4,-3.0]", "vehicle.control_high=[0.4,2.0]")
+        if vehicle == "own"
+        else ()
+    )
     composed = settings(f"vehicle={vehicle}", f"controller={controller}", *limits)
     plant = build.build_vehicle(composed["vehicle"])
-    law = any_law(len(plant.state_names) - 1) if composed["controller"]["sampling"] == "law" else None
+    law = (
+        any_law(len(plant.state_names) - 1)
+        if composed["controller"]["sampling"] == "law"
+        else None
+    )
     model = build.reference_systems(plant, law)["oracle"].model
-    if composed["controller"]["planner"] == "koopman_mpc":  # the only planner that needs a linear predictor
+    if (
+        composed["controller"]["planner"] == "koopman_mpc"
+    ):  # the only planner that needs a linear predictor
         model = models.FACTORIES["koopman_mpc"](space(len(plant.state_names) - 3))
     build.build_controller(composed["controller"], model, plant, law=law)
     build.build_scenario(composed["scenario"], plant, duration=6.0)
@@ -58,7 +82,10 @@ def test_every_learned_model_has_an_option_file():
 
 
 def test_option_files_stay_short():
-    assert all(len((CONF / group / f"{name}.yaml").read_text().splitlines()) <= 15 for group, name in OPTIONS)
+    assert all(
+        len((CONF / group / f"{name}.yaml").read_text().splitlines()) <= 15
+        for group, name in OPTIONS
+    )
 
 
 @pytest.mark.parametrize(
@@ -91,11 +118,19 @@ def test_an_environment_that_nobody_can_learn_of_is_refused(overrides, says):
 
 def test_without_an_environment_no_model_reads_one():
     assert config._settings(OmegaConf.create(settings()))["model"]["environment"]
-    assert not config._settings(OmegaConf.create(settings("env=none")))["model"]["environment"]
+    assert not config._settings(OmegaConf.create(settings("env=none")))["model"][
+        "environment"
+    ]
 
 
 def test_logs_are_of_a_robot_of_ones_own_unless_a_plant_is_named():
     columns = "dataset.columns.state=[x,y,heading,speed,rate]"
-    assert settings("dataset=files", columns)["vehicle"]["state_names"] == ["x", "y", "heading", "speed", "rate"]
+    assert settings("dataset=files", columns)["vehicle"]["state_names"] == [
+        "x",
+        "y",
+        "heading",
+        "speed",
+        "rate",
+    ]
     assert settings("dataset=files")["vehicle"]["name"] == "own"
     assert settings("dataset=files", "vehicle=dynamic")["vehicle"]["name"] == "dynamic"

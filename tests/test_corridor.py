@@ -1,4 +1,6 @@
-"""The corridor of a policy, end to end: an untrained one, for what is claimed does not depend on training."""
+"""The corridor of a policy, end to end: an untrained one, for what is claimed does not
+depend on training.
+"""
 
 import copy
 
@@ -10,7 +12,12 @@ from helpers import any_law
 from test_path_policy import saved, settings
 
 from sfkd_jax import build, datasets, policy
-from sfkd_jax.certification import CertificationRefused, claims_of, issue, verify_document
+from sfkd_jax.certification import (
+    CertificationRefused,
+    claims_of,
+    issue,
+    verify_document,
+)
 from sfkd_jax.corridor import certify_corridor, corridor_by_speed, fastest
 from sfkd_jax.types import Trajectory
 from sfkd_jax.vehicle import along_path, kinematic
@@ -35,7 +42,11 @@ def asked():
 def document(trained, asked):
     """As `certify` makes it, with fewer and shorter drives."""
     loop = along_path(kinematic(), trained.law)
-    make = jax.jit(lambda key: datasets.generate_along_path(loop, key, segments=120, steps=20, **DRIVEN))
+    make = jax.jit(
+        lambda key: datasets.generate_along_path(
+            loop, key, segments=120, steps=20, **DRIVEN
+        )
+    )
     driven = make(jax.random.key(1))
     parts = {
         name: jax.tree.map(lambda leaf, k=k: leaf[k::3], driven)
@@ -43,16 +54,30 @@ def document(trained, asked):
     }
     held_out = {"test": parts.pop("test")}
     body = np.asarray(driven.states)[..., 3:].reshape(-1, 3)
-    boxes = {"state": [body.min(0).tolist(), body.max(0).tolist()], "env": [list(side) for side in DRIVEN.values()]}
+    boxes = {
+        "state": [body.min(0).tolist(), body.max(0).tolist()],
+        "env": [list(side) for side in DRIVEN.values()],
+    }
     boxes["control"] = [[-0.03, -1.0, -0.02, 8.0], [0.03, 1.0, 0.02, 10.5]]
     options = {"level": 0.9, "monitor_level": 0.9, "attack_starts": 0}
-    found = issue(trained.model, trained.params, **parts, held_out=held_out, boxes=boxes, **options)
-    found["corridor"] = certify_corridor(asked, trained, claims_of(found["outputs"]), **SMALL)
+    found = issue(
+        trained.model,
+        trained.params,
+        **parts,
+        held_out=held_out,
+        boxes=boxes,
+        **options,
+    )
+    found["corridor"] = certify_corridor(
+        asked, trained, claims_of(found["outputs"]), **SMALL
+    )
     return found | {"policy_sha256": trained.sha256}
 
 
 def check(document, trained):
-    verify_document(document, trained.params, model=trained.model, policy_sha256=trained.sha256)
+    verify_document(
+        document, trained.params, model=trained.model, policy_sha256=trained.sha256
+    )
 
 
 def test_the_document_verifies_and_a_changed_one_does_not(document, trained):
@@ -60,7 +85,11 @@ def test_the_document_verifies_and_a_changed_one_does_not(document, trained):
     for part, name, value in (
         ("corridor", "corridor_m", 0.01),
         ("corridor", "coverage", 1.5),
-        ("corridor", "fixed_points", document["corridor"]["fixed_points"] | {"push": 0.0}),
+        (
+            "corridor",
+            "fixed_points",
+            document["corridor"]["fixed_points"] | {"push": 0.0},
+        ),
         ("outputs", "position", document["outputs"]["yaw"]),
     ):
         changed = copy.deepcopy(document)
@@ -75,18 +104,29 @@ def test_the_document_verifies_and_a_changed_one_does_not(document, trained):
 
 def test_what_is_claimed_is_one_sum_of_what_is_calibrated(document):
     found = document["corridor"]
-    assert found["corridor_m"] == pytest.approx(found["bounds"]["nominal"] + found["bounds"]["followed_position"])
+    assert found["corridor_m"] == pytest.approx(
+        found["bounds"]["nominal"] + found["bounds"]["followed_position"]
+    )
     assert found["bounds"]["followed_position"] <= found["bounds"]["for_ever_position"]
     assert 0.6 <= found["coverage"] <= 1.0
     assert found["drives"] == SMALL["drives"]
     assert found["attack"]["over_tube"] <= 1.0
 
 
-def test_without_a_copy_the_corridor_is_wider_and_no_drive_of_the_class_leaves_it(document):
+def test_without_a_copy_the_corridor_is_wider_and_no_drive_of_the_class_leaves_it(
+    document,
+):
     found, part = document["corridor"], document["corridor"]["fixed_points"]
     between, after = part["corridor_m"], part["after_switch_m"]
-    assert found["bounds"]["for_ever_position"] < between["law"] < between["planner"] < after["planner"]
-    assert after["law"] - between["law"] == pytest.approx(after["planner"] - between["planner"])
+    assert (
+        found["bounds"]["for_ever_position"]
+        < between["law"]
+        < between["planner"]
+        < after["planner"]
+    )
+    assert after["law"] - between["law"] == pytest.approx(
+        after["planner"] - between["planner"]
+    )
     assert found["seen"]["lateral_m"] < part["after_switch_m"]["planner"]
     assert part["steps_between_switches"] == 30
     assert part["points"] == 3 * 3 * SMALL["drives"] * 2 * 25
@@ -94,18 +134,28 @@ def test_without_a_copy_the_corridor_is_wider_and_no_drive_of_the_class_leaves_i
 
 def test_every_friction_and_speed_gets_a_corridor_of_its_own(document, trained):
     frictions, speeds = [0.3, 0.9], [8.0, 10.5]
-    found = corridor_by_speed(trained, document, frictions=frictions, speeds=speeds, drives=24)
+    found = corridor_by_speed(
+        trained, document, frictions=frictions, speeds=speeds, drives=24
+    )
     cells = found["cells"]
-    assert [(cell["friction"], cell["speed"]) for cell in cells] == [(f, v) for f in frictions for v in speeds]
-    assert [cell["curvature"] for cell in cells] == pytest.approx([0.02, 2.0 / 10.5**2] * 2)
+    assert [(cell["friction"], cell["speed"]) for cell in cells] == [
+        (f, v) for f in frictions for v in speeds
+    ]
+    assert [cell["curvature"] for cell in cells] == pytest.approx(
+        [0.02, 2.0 / 10.5**2] * 2
+    )
     for cell in cells:
         assert cell["corridor_m"] == pytest.approx(cell["nominal_m"] + cell["tube_m"])
         assert cell["lateral_m"] > 0.0
         assert cell["coverage_drives"] == 24
     assert len({cell["corridor_m"] for cell in cells}) == 4
-    assert found["coverage"] == pytest.approx(np.mean([cell["coverage"] for cell in cells]))
+    assert found["coverage"] == pytest.approx(
+        np.mean([cell["coverage"] for cell in cells])
+    )
     assert found["coverage_ci95"][1] - found["coverage_ci95"][0] < 0.25
-    alone = corridor_by_speed(trained, document, frictions=frictions[:1], speeds=speeds[:1], drives=24)
+    alone = corridor_by_speed(
+        trained, document, frictions=frictions[:1], speeds=speeds[:1], drives=24
+    )
     assert alone["cells"] == cells[:1]
 
 
@@ -114,13 +164,20 @@ def test_nothing_is_said_of_speeds_and_frictions_outside_the_box(document, train
         ("friction", {"frictions": [0.2], "speeds": [9.0]}),
         ("speed", {"frictions": [0.3], "speeds": [11.0]}),
     ):
-        with pytest.raises(ValueError, match=f"{name} .* lies outside what is certified"):
+        with pytest.raises(
+            ValueError, match=f"{name} .* lies outside what is certified"
+        ):
             corridor_by_speed(trained, document, **values)
 
 
 def test_the_fastest_speed_is_one_below_which_every_corridor_fits():
     """Also where a faster one fits again by chance, and where none does."""
-    widths = {0.3: (0.6, 0.4, 0.4), 0.6: (0.4, 0.6, 0.4), 0.9: (0.5, 0.4, 0.5), 0.75: (0.4, 0.4, float("nan"))}
+    widths = {
+        0.3: (0.6, 0.4, 0.4),
+        0.6: (0.4, 0.6, 0.4),
+        0.9: (0.5, 0.4, 0.5),
+        0.75: (0.4, 0.4, float("nan")),
+    }
     cells = [
         {"friction": friction, "speed": speed, "corridor_m": width}
         for friction, row in widths.items()
@@ -137,38 +194,69 @@ def test_the_same_seed_gives_the_same_corridor(document, trained, asked):
 
 def test_a_policy_without_a_law_has_no_corridor(trained, asked, document):
     with pytest.raises(ValueError, match="with its law"):
-        certify_corridor(asked, trained._replace(law=None), claims_of(document["outputs"]), **SMALL)
+        certify_corridor(
+            asked, trained._replace(law=None), claims_of(document["outputs"]), **SMALL
+        )
 
 
 def test_a_controller_with_a_corridor_is_shielded_when_asked(document, trained, asked):
-    """And then a request beyond its limits is cut, the copy reported, and both are off without `shield`."""
+    """And then a request beyond its limits is cut, the copy reported, and both are off
+    without `shield`.
+    """
     plant = kinematic()
-    reference = jnp.column_stack([jnp.arange(1, 21.0), jnp.zeros(20), jnp.zeros(20), jnp.full(20, 9.0)])
+    reference = jnp.column_stack(
+        [jnp.arange(1, 21.0), jnp.zeros(20), jnp.zeros(20), jnp.full(20, 9.0)]
+    )
     state = jnp.asarray([0.0, 0.0, 0.0, 9.0])
     for shield in (True, False):
         chosen = asked["controller"] | {"shield": shield}
         chosen["mppi"] = chosen["mppi"] | {"num_samples": 4}
-        built = build.build_controller(chosen, trained.model, plant, certificate=document, law=trained.law, **DRIVEN)
+        built = build.build_controller(
+            chosen,
+            trained.model,
+            plant,
+            certificate=document,
+            law=trained.law,
+            **DRIVEN,
+        )
         _, _, info = jax.jit(built.act)(
-            trained.params, built.init(jax.random.key(0)), state, jnp.asarray([0.6, 0.0]), reference
+            trained.params,
+            built.init(jax.random.key(0)),
+            state,
+            jnp.asarray([0.6, 0.0]),
+            reference,
         )
         assert ("corridor" in info) == shield
         if shield:
-            assert info["corridor"] == pytest.approx(document["corridor"]["corridor_m"], rel=1e-5)
+            assert info["corridor"] == pytest.approx(
+                document["corridor"]["corridor_m"], rel=1e-5
+            )
             assert not info["void"]
 
 
 def test_what_sensors_add_is_no_part_of_the_recorded_perturbation(trained):
-    """A class drive with sensors records the ν that was asked for; the car moves otherwise."""
+    """A class drive with sensors records the ν that was asked for; the car moves
+    otherwise.
+    """
     loop = along_path(kinematic(), trained.law)
-    asked = {"drives": 2, "steps": 30, "offset": (0.0, 0.0, 0.0), "burn_in": 0, **DRIVEN}
+    asked = {
+        "drives": 2,
+        "steps": 30,
+        "offset": (0.0, 0.0, 0.0),
+        "burn_in": 0,
+        **DRIVEN,
+    }
 
     def noisy(key, state, inputs, env):
         del state, inputs, env
         return jnp.asarray([0.01, 0.0]) * jax.random.normal(key, (2,))
 
     plain, seen = (
-        jax.jit(lambda key, hook=hook: datasets.drive_switching(loop, key, sensors=hook, **asked))(jax.random.key(4))
+        jax.jit(
+            lambda key, hook=hook: datasets.drive_switching(
+                loop, key, sensors=hook, **asked
+            )
+        )(jax.random.key(4))
         for hook in (None, noisy)
     )
     assert isinstance(plain, Trajectory)
@@ -186,9 +274,15 @@ def test_a_filter_of_a_drive_sees_it_whole_and_its_answer_is_what_is_driven(trai
         return inputs.at[:, :2].multiply(0.5)
 
     plain, cut = (
-        jax.jit(lambda key, hook=hook: datasets.drive_switching(loop, key, admit=hook, **asked))(jax.random.key(5))
+        jax.jit(
+            lambda key, hook=hook: datasets.drive_switching(
+                loop, key, admit=hook, **asked
+            )
+        )(jax.random.key(5))
         for hook in (None, halve)
     )
-    np.testing.assert_allclose(cut.controls[..., :2], 0.5 * plain.controls[..., :2], rtol=1e-6)
+    np.testing.assert_allclose(
+        cut.controls[..., :2], 0.5 * plain.controls[..., :2], rtol=1e-6
+    )
     again = jax.vmap(jax.vmap(loop.step))(cut.states[:, :-1], cut.controls, cut.envs)
     np.testing.assert_allclose(again, cut.states[:, 1:], atol=1e-5)

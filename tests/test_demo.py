@@ -1,4 +1,6 @@
-"""The demo: what ships with the package drives, its certificate holds, and it beats what knows nothing of e."""
+"""The demo: what ships with the package drives, its certificate holds, and it beats
+what knows nothing of e.
+"""
 
 import json
 
@@ -19,7 +21,10 @@ def test_the_demo_drives_without_training_and_draws_an_animation(tmp_path):
     found = last_line(done)
     assert set(found) == {"animation", "rows", "results"}
     assert (tmp_path / found["animation"]).read_bytes()[:6] == b"GIF89a"
-    rows = {row["system"]: row for row in json.loads((tmp_path / found["results"]).read_text())["rows"]}
+    rows = {
+        row["system"]: row
+        for row in json.loads((tmp_path / found["results"]).read_text())["rows"]
+    }
     assert set(rows) == {"sfkd", "nominal", "oracle"}
     assert rows["sfkd"]["rmse_m"]["mean"] < 0.5 * rows["nominal"]["rmse_m"]["mean"]
     assert rows["sfkd"]["violation"]["v0"] == 0.0
@@ -28,17 +33,31 @@ def test_the_demo_drives_without_training_and_draws_an_animation(tmp_path):
 
 
 def test_along_a_path_the_demo_drives_in_the_corridor_of_its_policy(tmp_path):
-    done = door("demo", "+experiment=s3", "demo.episode_s=9.0", "controller.mppi.num_samples=30", cwd=tmp_path)
+    done = door(
+        "demo",
+        "+experiment=s3",
+        "demo.episode_s=9.0",
+        "controller.mppi.num_samples=30",
+        cwd=tmp_path,
+    )
     found = last_line(done)
     assert (tmp_path / found["animation"]).read_bytes()[:6] == b"GIF89a"
-    rows = {row["system"]: row for row in json.loads((tmp_path / found["results"]).read_text())["rows"]}
+    rows = {
+        row["system"]: row
+        for row in json.loads((tmp_path / found["results"]).read_text())["rows"]
+    }
     assert set(rows) == {"sfkd_path", "nominal", "oracle"}
-    certificate = json.loads((demo.SHIPPED / "kinematic_path" / "certificate.json").read_text())
+    certificate = json.loads(
+        (demo.SHIPPED / "kinematic_path" / "certificate.json").read_text()
+    )
     assert rows["sfkd_path"]["max_deviation_m"] <= certificate["corridor"]["corridor_m"]
     assert "corridor: 0.38 m to each side" in done.stderr
 
 
-@pytest.mark.parametrize("other", ["vehicle=kinematic_speed", "vehicle.mass=900.0", "vehicle.name=hovercraft"])
+@pytest.mark.parametrize(
+    "other",
+    ["vehicle=kinematic_speed", "vehicle.mass=900.0", "vehicle.name=hovercraft"],
+)
 def test_a_vehicle_for_which_nothing_ships_is_refused_before_it_drives(tmp_path, other):
     done = door("demo", other, cwd=tmp_path, code=1)
     assert done.stderr.startswith("sfkd_jax: controllers ship for ")
@@ -60,23 +79,44 @@ def test_what_ships_loads_and_its_certificate_follows_from_its_witnesses(vehicle
     ("change", "says"),
     [
         (lambda controller: controller.pop("task"), "'task'"),
-        (lambda controller: controller["mppi"].update(latent_weight=0.0), "latent_weight"),
+        (
+            lambda controller: controller["mppi"].update(latent_weight=0.0),
+            "latent_weight",
+        ),
     ],
 )
-def test_a_policy_with_settings_of_another_version_is_named_in_one_line(tmp_path, change, says):
-    arrays, manifest = artefacts.read_arrays(demo.SHIPPED / "kinematic" / "policy.npz", kind=policy.KIND)
+def test_a_policy_with_settings_of_another_version_is_named_in_one_line(
+    tmp_path, change, says
+):
+    arrays, manifest = artefacts.read_arrays(
+        demo.SHIPPED / "kinematic" / "policy.npz", kind=policy.KIND
+    )
     change(manifest["config"]["controller"])
-    artefacts.write_arrays(tmp_path / "policy.npz", arrays, kind=policy.KIND, config=manifest["config"])
-    with pytest.raises(artefacts.ArtefactError, match=rf"policy\.json.*{says}.*saved by sfkd_jax .*: train again"):
+    artefacts.write_arrays(
+        tmp_path / "policy.npz", arrays, kind=policy.KIND, config=manifest["config"]
+    )
+    with pytest.raises(
+        artefacts.ArtefactError,
+        match=rf"policy\.json.*{says}.*saved by sfkd_jax .*: train again",
+    ):
         policy.load(tmp_path)
 
 
 def test_what_ships_also_drives_where_the_environment_is_not_measured():
     trained = policy.load(demo.SHIPPED / "kinematic", env="estimated")
-    act, state = jax.jit(trained.controller.act), trained.controller.init(jax.random.key(0))
+    act, state = (
+        jax.jit(trained.controller.act),
+        trained.controller.init(jax.random.key(0)),
+    )
     observation, reference = jnp.asarray([0.0, 0.3, 0.0, 10.0]), straight(20)
-    control, _, info = act(trained.params, state, observation, jnp.full(2, jnp.nan), reference)
-    other, _, _ = act(trained.params, state, observation, jnp.asarray([0.3, 8.0]), reference)
+    control, _, info = act(
+        trained.params, state, observation, jnp.full(2, jnp.nan), reference
+    )
+    other, _, _ = act(
+        trained.params, state, observation, jnp.asarray([0.3, 8.0]), reference
+    )
     np.testing.assert_array_equal(control, other)
-    np.testing.assert_allclose(info["env_estimate"], [0.6, 0.0], atol=1e-4)  # nothing has moved yet
+    np.testing.assert_allclose(
+        info["env_estimate"], [0.6, 0.0], atol=1e-4
+    )  # nothing has moved yet
     assert not info["box_exit"]

@@ -1,4 +1,6 @@
-"""What the pages name exists: links, anchors, files, commands, options, functions, numbers; and all are on the site."""
+"""What the pages name exists: links, anchors, files, commands, options, functions,
+numbers; and all are on the site.
+"""
 
 import ast
 import json
@@ -13,12 +15,30 @@ import yaml
 
 ROOT = Path(__file__).parents[1]
 DOCS, PACKAGE = ROOT / "docs", ROOT / "src" / "sfkd_jax"
-PAGES = [ROOT / f"{name}.md" for name in ("README", "CONTRIBUTING", "ARCHITECTURE")] + sorted(DOCS.rglob("*.md"))
+PAGES = [
+    ROOT / f"{name}.md" for name in ("README", "CONTRIBUTING", "ARCHITECTURE")
+] + sorted(DOCS.rglob("*.md"))
 FENCED = re.compile(r"^```.*?^```", re.DOTALL | re.MULTILINE)
-ROOMS = {folder.name for folder in PACKAGE.iterdir() if (folder / "__init__.py").exists()}
-PLACES = {"examples", "conf", "benchmarks", "docs", "experiments", "tests", "src", ".ci", *ROOMS}
-DOORS = {file.stem for file in PACKAGE.glob("*.py") if "__main__" in file.read_text("utf-8")}
-every_page = pytest.mark.parametrize("page", PAGES, ids=lambda page: str(page.relative_to(ROOT)))
+PACKAGES = {
+    folder.name for folder in PACKAGE.iterdir() if (folder / "__init__.py").exists()
+}
+PLACES = {
+    "examples",
+    "conf",
+    "benchmarks",
+    "docs",
+    "experiments",
+    "tests",
+    "src",
+    ".ci",
+    *PACKAGES,
+}
+COMMANDS = {
+    file.stem for file in PACKAGE.glob("*.py") if "__main__" in file.read_text("utf-8")
+}
+every_page = pytest.mark.parametrize(
+    "page", PAGES, ids=lambda page: str(page.relative_to(ROOT))
+)
 
 
 @cache
@@ -29,22 +49,33 @@ def text_of(page):
         name, _, section = match[1].partition(":")
         text = (ROOT / name).read_text("utf-8")
         if section:
-            text = text.split(f"[start:{section}] -->\n")[1].split(f"<!-- --8<-- [end:{section}]")[0]
+            text = text.split(f"[start:{section}] -->\n")[1].split(
+                f"<!-- --8<-- [end:{section}]"
+            )[0]
         return text
 
-    return re.sub(r'^--8<-- "([^"]+)"$', included, page.read_text("utf-8"), flags=re.MULTILINE)
+    return re.sub(
+        r'^--8<-- "([^"]+)"$', included, page.read_text("utf-8"), flags=re.MULTILINE
+    )
 
 
 @cache
 def anchors_of(page):
     """Headings as GitHub and the site name them."""
     titles = re.findall(r"^#+ (.+)$", FENCED.sub("", text_of(page)), re.MULTILINE)
-    return {re.sub(r"[^\w\- ]", "", title.lower()).strip().replace(" ", "-") for title in titles}
+    return {
+        re.sub(r"[^\w\- ]", "", title.lower()).strip().replace(" ", "-")
+        for title in titles
+    }
 
 
 def spans_of(page):
     """Words in backticks."""
-    return [word for span in re.findall(r"`([^`\n]+)`", FENCED.sub("", text_of(page))) for word in span.split()]
+    return [
+        word
+        for span in re.findall(r"`([^`\n]+)`", FENCED.sub("", text_of(page)))
+        for word in span.split()
+    ]
 
 
 @cache
@@ -66,7 +97,9 @@ def names_in(*parts):
 
 @every_page
 def test_every_relative_link_and_image_leads_somewhere(page):
-    targets = re.findall(r"\]\(([^)\s]+)\)", re.sub(r"`[^`\n]*`", "", FENCED.sub("", text_of(page))))
+    targets = re.findall(
+        r"\]\(([^)\s]+)\)", re.sub(r"`[^`\n]*`", "", FENCED.sub("", text_of(page)))
+    )
     for target in targets:
         if re.match(r"\w+:", target):
             continue
@@ -80,35 +113,63 @@ def test_every_relative_link_and_image_leads_somewhere(page):
 def test_every_file_named_in_backticks_exists(page):
     words = [word.rstrip(",;:") for word in spans_of(page)]
     paths = [word for word in words if re.fullmatch(r"[\w.-]+(/[\w.-]+)*/?", word)]
-    named = [path for path in paths if ("/" in path and path.split("/")[0] in PLACES) or path.endswith(".md")]
+    named = [
+        path
+        for path in paths
+        if ("/" in path and path.split("/")[0] in PLACES) or path.endswith(".md")
+    ]
     named += re.findall(r"python ((?:examples|benchmarks)/[\w./-]+)", text_of(page))
-    assert [name for name in named if not any((base / name).exists() for base in (ROOT, DOCS, PACKAGE))] == []
+    assert [
+        name
+        for name in named
+        if not any((base / name).exists() for base in (ROOT, DOCS, PACKAGE))
+    ] == []
 
 
 @every_page
 def test_every_command_is_a_door_and_every_option_is_in_the_vocabulary(page):
     text = text_of(page)
-    assert set(re.findall(r"python -m sfkd_jax\.(\w+)", text)) <= DOORS
-    commands = [word for line in re.findall(r"^python -m .*$", text, re.MULTILINE) for word in line.split()]
-    groups = "|".join(folder.name for folder in (ROOT / "conf").iterdir() if folder.is_dir())
+    assert set(re.findall(r"python -m sfkd_jax\.(\w+)", text)) <= COMMANDS
+    commands = [
+        word
+        for line in re.findall(r"^python -m .*$", text, re.MULTILINE)
+        for word in line.split()
+    ]
+    groups = "|".join(
+        folder.name for folder in (ROOT / "conf").iterdir() if folder.is_dir()
+    )
     for word in commands + spans_of(page):
-        if option := re.fullmatch(rf"\+?({groups})=([a-z0-9_]+(?:,[a-z0-9_]+)*)[,;:]?", word):
+        if option := re.fullmatch(
+            rf"\+?({groups})=([a-z0-9_]+(?:,[a-z0-9_]+)*)[,;:]?", word
+        ):
             for name in option[2].split(","):
                 assert (ROOT / "conf" / option[1] / f"{name}.yaml").exists(), word
 
 
 @every_page
 def test_every_program_names_what_the_package_has(page):
-    for block in re.findall(r"^```py(?:thon)?\n(.*?)^```", text_of(page), re.DOTALL | re.MULTILINE):
+    for block in re.findall(
+        r"^```py(?:thon)?\n(.*?)^```", text_of(page), re.DOTALL | re.MULTILINE
+    ):
         tree = ast.parse(block)
         rooms = {"sfkd_jax": ()}
         for node in ast.walk(tree):
             package, *place = (getattr(node, "module", None) or "").split(".")
             if isinstance(node, ast.ImportFrom) and package == "sfkd_jax":
-                assert {alias.name for alias in node.names} <= names_in(*place), node.module
-                rooms |= {alias.asname or alias.name: (alias.name,) for alias in node.names if alias.name in ROOMS}
+                assert {alias.name for alias in node.names} <= names_in(*place), (
+                    node.module
+                )
+                rooms |= {
+                    alias.asname or alias.name: (alias.name,)
+                    for alias in node.names
+                    if alias.name in PACKAGES
+                }
         for node in ast.walk(tree):
-            if isinstance(node, ast.Attribute) and isinstance(node.value, ast.Name) and node.value.id in rooms:
+            if (
+                isinstance(node, ast.Attribute)
+                and isinstance(node.value, ast.Name)
+                and node.value.id in rooms
+            ):
                 assert node.attr in names_in(*rooms[node.value.id]), ast.unparse(node)
 
 
@@ -116,85 +177,155 @@ def test_every_page_is_in_the_navigation_and_nothing_else_is():
     def pages(entry):
         if isinstance(entry, str):
             return [entry]
-        return [page for part in (entry.values() if isinstance(entry, dict) else entry) for page in pages(part)]
+        return [
+            page
+            for part in (entry.values() if isinstance(entry, dict) else entry)
+            for page in pages(part)
+        ]
 
-    nav = pages(yaml.load((ROOT / "mkdocs.yml").read_text("utf-8"), yaml.BaseLoader)["nav"])
-    assert sorted(nav) == sorted(str(page.relative_to(DOCS)) for page in DOCS.rglob("*.md"))
+    nav = pages(
+        yaml.load((ROOT / "mkdocs.yml").read_text("utf-8"), yaml.BaseLoader)["nav"]
+    )
+    assert sorted(nav) == sorted(
+        str(page.relative_to(DOCS)) for page in DOCS.rglob("*.md")
+    )
 
 
 def test_every_public_room_has_a_page_of_the_reference():
     pages = "".join(page.read_text("utf-8") for page in (DOCS / "api").glob("*.md"))
     private = {"artefacts", "assembly", "reporting"}
-    assert {room for room in ROOMS - private if f"::: sfkd_jax.{room}\n" not in pages} == set()
+    assert {
+        room for room in PACKAGES - private if f"::: sfkd_jax.{room}\n" not in pages
+    } == set()
 
 
 def test_every_result_on_the_tuning_page_is_in_the_file_it_cites():
-    """All numbers with a decimal, but for names in backticks: results, or settings that are in use."""
-    text = re.sub(r"`[^`\n]*`", "", FENCED.sub("", (DOCS / "tuning.md").read_text("utf-8")))
+    """All numbers with a decimal, but for names in backticks: results, or settings that
+    are in use.
+    """
+    text = re.sub(
+        r"`[^`\n]*`", "", FENCED.sub("", (DOCS / "tuning.md").read_text("utf-8"))
+    )
     laws = json.loads((ROOT / "benchmarks" / "laws.json").read_text())["rows"]
-    table = json.loads((ROOT / "experiments" / "table1_closed_loop" / "results.json").read_text())["rows"]
+    table = json.loads(
+        (ROOT / "experiments" / "table1_closed_loop" / "results.json").read_text()
+    )["rows"]
     known = {f"{sum(row['rmse_mm']) / len(row['rmse_mm']):.1f}" for row in laws}
     known |= {f"{1e3 * row['rmse_m']['mean']:.1f}" for row in table}
     known |= {f"{row['max_deviation_m']:.2f}" for row in table}
     known |= {f"{rate:.3f}" for rate in [row["steering_rate"] for row in laws]}
     known |= {f"{row['smoothness_rad_per_s']:.3f}" for row in table}
-    settings = {"0.02", "0.3", "0.06", "0.6", "0.8", "0.5"}  # noise of both kinds, its correlation, a cost, a delay [s]
+    settings = {
+        "0.02",
+        "0.3",
+        "0.06",
+        "0.6",
+        "0.8",
+        "0.5",
+    }  # noise of both kinds, its correlation, a cost, a delay [s]
     assert set(re.findall(r"\d+\.\d+", text)) - known - settings == set()
 
 
 def test_the_tables_of_the_certificates_page_are_those_of_their_files():
-    """Every line below a comment that names the file; and the size of the core, and what was searched."""
-    page, readme = (file.read_text("utf-8") for file in (DOCS / "certificate.md", ROOT / "README.md"))
+    """Every line below a comment that names the file; and the size of the core, and
+    what was searched.
+    """
+    page, readme = (
+        file.read_text("utf-8")
+        for file in (DOCS / "certificate.md", ROOT / "README.md")
+    )
     found = json.loads((ROOT / "benchmarks" / "theorem_power.json").read_text())["rows"]
-    rows = [row for row in found if (row["vehicle"], row["scenario"]) == ("kinematic", "s1, s2")]
+    rows = [
+        row
+        for row in found
+        if (row["vehicle"], row["scenario"]) == ("kinematic", "s1, s2")
+    ]
     shown = [
         [cell.strip() for cell in line.strip("|").split("|")]
-        for table in re.findall(r"<!-- from benchmarks/theorem_power.json -->\n\|.*\n\|[-|]*\n((?:\|.*\n)*)", page)
+        for table in re.findall(
+            r"<!-- from benchmarks/theorem_power.json -->\n\|.*\n\|[-|]*\n((?:\|.*\n)*)",
+            page,
+        )
         for line in table.splitlines()
     ]
     reach = ("reach", "reach_1", "reach_5", "reach_20")
     expected = {
-        row["claim"]: [str(row["broken"]), str(row["applied"]), *(f"{row[name]:.2f}" for name in reach)]
+        row["claim"]: [
+            str(row["broken"]),
+            str(row["applied"]),
+            *(f"{row[name]:.2f}" for name in reach),
+        ]
         for row in rows
         if row.get("reach") is not None
     }
     expected |= {
-        str(row["force_n"]): [f"{100 * row['left'][kind]:.1f} %" for kind in ("latent", "position", "yaw", "body")]
+        str(row["force_n"]): [
+            f"{100 * row['left'][kind]:.1f} %"
+            for kind in ("latent", "position", "yaw", "body")
+        ]
         for row in rows
         if "force_n" in row
     }
     assert len(shown) == 12
     assert [cells for cells in shown if expected[cells[0]] != cells[1:]] == []
-    lines = len((ROOT / "src/sfkd_jax/certification/_core.py").read_text("utf-8").splitlines())
+    lines = len(
+        (ROOT / "src/sfkd_jax/certification/_core.py").read_text("utf-8").splitlines()
+    )
     assert lines <= 150
     assert f"`certification/_core.py`, {lines} lines" in page
     assert f"a core of {lines} lines" in readme
     searched = json.loads((ROOT / "benchmarks" / "trusted_core.json").read_text())
     assert searched["false_and_accepted"] == 0
     assert f"{searched['cases']:_}".replace("_", " ") + " hostile" in page
-    assert f"{100 * searched['accepted'] / searched['true']:.0f} % of those that hold" in " ".join(page.split())
+    assert (
+        f"{100 * searched['accepted'] / searched['true']:.0f} % of those that hold"
+        in " ".join(page.split())
+    )
 
 
 def rows_between(page, mark):
     """Cells of the lines below the head of a table between two marks."""
     table = page.split(f"<!-- {mark} -->\n")[1].split(f"<!-- end of {mark} -->")[0]
-    return [[cell.strip() for cell in line.strip("|").split("|")] for line in table.splitlines()[2:]]
+    return [
+        [cell.strip() for cell in line.strip("|").split("|")]
+        for line in table.splitlines()[2:]
+    ]
 
 
 def test_what_the_tests_of_a_certificate_notice_is_what_was_counted():
     """Changes by file, and by reason those that none notices, each of which is argued."""
     files = json.loads((ROOT / "benchmarks" / "mutants.json").read_text())["files"]
     page = (DOCS / "certificate.md").read_text("utf-8")
-    total, killed = (sum(row[key] for row in files.values()) for key in ("total", "killed"))
-    counted = [[f"`{name}`", str(row["total"]), str(row["killed"])] for name, row in files.items()]
-    assert rows_between(page, "mutants") == [*counted, ["all", str(total), f"{killed} ({100 * killed / total:.1f} %)"]]
-    reasons = Counter(reason for row in files.values() for reason in row["survived"].values())
-    assert {reason: int(count) for reason, count in rows_between(page, "survivors")} == reasons
+    total, killed = (
+        sum(row[key] for row in files.values()) for key in ("total", "killed")
+    )
+    counted = [
+        [f"`{name}`", str(row["total"]), str(row["killed"])]
+        for name, row in files.items()
+    ]
+    assert rows_between(page, "mutants") == [
+        *counted,
+        ["all", str(total), f"{killed} ({100 * killed / total:.1f} %)"],
+    ]
+    reasons = Counter(
+        reason for row in files.values() for reason in row["survived"].values()
+    )
+    assert {
+        reason: int(count) for reason, count in rows_between(page, "survivors")
+    } == reasons
     assert "not argued" not in reasons
     assert killed + reasons.total() == total
     assert killed >= 0.95 * total
-    assert f"by hand {sum(row['named'] for row in files.values())} mistakes" in " ".join(page.split())
-    assert not [what for row in files.values() for what in row["survived"] if what.startswith("named")]
+    assert (
+        f"by hand {sum(row['named'] for row in files.values())} mistakes"
+        in " ".join(page.split())
+    )
+    assert not [
+        what
+        for row in files.values()
+        for what in row["survived"]
+        if what.startswith("named")
+    ]
 
 
 def test_the_page_about_an_estimated_environment_says_what_the_results_say():
@@ -203,14 +334,19 @@ def test_the_page_about_an_estimated_environment_says_what_the_results_say():
         json.loads((ROOT / "experiments" / name / "results.json").read_text())["rows"]
         for name in ("estimated", "table1_closed_loop")
     )
-    drives = [(vehicle, scenario) for vehicle in ("kinematic", "dynamic") for scenario in ("s2", "s3")]
+    drives = [
+        (vehicle, scenario)
+        for vehicle in ("kinematic", "dynamic")
+        for scenario in ("s2", "s3")
+    ]
 
     def driven(variation):
         return [
             next(
                 1e3 * row["rmse_m"]["mean"]
                 for row in found
-                if (row["vehicle"], row["scenario"], row["variation"], row["system"]) == (*drive, variation, "sfkd")
+                if (row["vehicle"], row["scenario"], row["variation"], row["system"])
+                == (*drive, variation, "sfkd")
             )
             for drive in drives
         ]
@@ -229,9 +365,15 @@ def test_the_page_about_an_estimated_environment_says_what_the_results_say():
     sharp = driven("environment estimated by sensors ten times as good")
     ratios = [one / other for one, other in zip(estimated, measured, strict=True)]
     rows = {"e measured": measured, "e estimated": estimated, "over measured": ratios}
-    rows |= {"e estimated, sensors ten times as good": sharp, "not told e, best row": untold}
+    rows |= {
+        "e estimated, sensors ten times as good": sharp,
+        "not told e, best row": untold,
+    }
     page = (DOCS / "estimation.md").read_text("utf-8")
-    lines = [[cell.strip("* ") for cell in line.strip("|").split("|")] for line in re.findall(r"^\|.*\|$", page, re.M)]
+    lines = [
+        [cell.strip("* ") for cell in line.strip("|").split("|")]
+        for line in re.findall(r"^\|.*\|$", page, re.M)
+    ]
     shown = {name: cells for name, *cells in lines}
     for name, values in rows.items():
         digits = 2 if name == "over measured" else 1
@@ -242,14 +384,19 @@ def test_the_page_about_an_estimated_environment_says_what_the_results_say():
     assert f"the estimate costs {estimated[3] - measured[3]:.1f} mm on S3" in text
     assert f"the best by {gaps[3]:.1f} mm worse" in text
     assert f"{-gaps[2]:.1f} mm better" in text
-    assert f"{gaps[0]:.0f} and {gaps[1]:.0f} mm below every row that is not told e" in text
+    assert (
+        f"{gaps[0]:.0f} and {gaps[1]:.0f} mm below every row that is not told e" in text
+    )
 
 
 def test_what_the_fuzzer_found_is_what_the_page_says():
     """Every file was accepted or refused."""
     found = json.loads((ROOT / "benchmarks/fuzz.json").read_text())
     page = " ".join((DOCS / "failures.md").read_text("utf-8").split())
-    accepted, refused = (sum(row.get(key, 0) for row in found["readers"].values()) for key in ("accepted", "refused"))
+    accepted, refused = (
+        sum(row.get(key, 0) for row in found["readers"].values())
+        for key in ("accepted", "refused")
+    )
     told = f"accepted {accepted:_} files, refused {refused:_}, and found {len(found['faults'])} faults".replace(
         "_", " "
     )
@@ -262,7 +409,12 @@ def test_the_table_of_drills_is_that_of_the_run():
     """And nothing was damaged, failed or ended differently."""
     drills = json.loads((ROOT / "benchmarks/drills.json").read_text())
     table = runpy.run_path(str(ROOT / "benchmarks/drills.py"))["table"](drills)
-    shown = (DOCS / "failures.md").read_text("utf-8").split("<!-- drills -->")[1].split("<!-- end of drills -->")[0]
+    shown = (
+        (DOCS / "failures.md")
+        .read_text("utf-8")
+        .split("<!-- drills -->")[1]
+        .split("<!-- end of drills -->")[0]
+    )
     assert shown.strip() == table
     assert table.endswith("| 0 | 0 | 0 |")
     asked = {name: kills for name, (kills, *_) in drills["settings"]["jobs"].items()}
@@ -271,24 +423,34 @@ def test_the_table_of_drills_is_that_of_the_run():
 
 
 def test_the_readme_says_of_the_corridor_what_its_page_says():
-    """Every row of its table is one of that table, and the first sentence has both corridors, rounded."""
-    page, readme = (file.read_text("utf-8") for file in (DOCS / "corridor.md", ROOT / "README.md"))
-    rows = [text.split("<!-- corridor -->")[1].split("<!-- /corridor -->")[0].splitlines() for text in (readme, page)]
+    """Every row of its table is one of that table, and the first sentence has both
+    corridors, rounded.
+    """
+    page, readme = (
+        file.read_text("utf-8") for file in (DOCS / "corridor.md", ROOT / "README.md")
+    )
+    rows = [
+        text.split("<!-- corridor -->")[1].split("<!-- /corridor -->")[0].splitlines()
+        for text in (readme, page)
+    ]
     assert len(rows[0]) > 8
     assert set(rows[0]) <= set(rows[1])
     half = [
-        json.loads((PACKAGE / "pretrained" / f"{plant}_path" / "certificate.json").read_text())["corridor"][
-            "corridor_m"
-        ]
+        json.loads(
+            (PACKAGE / "pretrained" / f"{plant}_path" / "certificate.json").read_text()
+        )["corridor"]["corridor_m"]
         for plant in ("dynamic", "kinematic")
     ]
-    assert f"±{half[0]:.2f} m (dynamic single track) and ±{half[1]:.2f} m (kinematic) on 95 %" in " ".join(
-        readme.split()
+    assert (
+        f"±{half[0]:.2f} m (dynamic single track) and ±{half[1]:.2f} m (kinematic) on 95 %"
+        in " ".join(readme.split())
     )
 
 
 def test_the_page_about_the_corridor_says_what_the_certificates_say():
-    """Its table is what benchmarks/corridor.py makes of the shipped certificates and the committed rows."""
+    """Its table is what benchmarks/corridor.py makes of the shipped certificates and
+    the committed rows.
+    """
     made = runpy.run_path(str(ROOT / "benchmarks" / "corridor.py"))
     text = (DOCS / "corridor.md").read_text("utf-8")
     assert made["table"]() in text
@@ -296,26 +458,42 @@ def test_the_page_about_the_corridor_says_what_the_certificates_say():
 
 
 def test_the_tables_about_speed_are_those_of_their_run(monkeypatch):
-    """Of the policies that ship, over the whole of their box; and it is the box that ends where the page says so."""
+    """Of the policies that ship, over the whole of their box; and it is the box that
+    ends where the page says so.
+    """
     monkeypatch.syspath_prepend(str(ROOT / "benchmarks"))
     measured = json.loads((ROOT / "benchmarks/speed.json").read_text())
     text = (DOCS / "corridor.md").read_text("utf-8")
-    assert runpy.run_path(str(ROOT / "benchmarks/speed_page.py"))["page"](text, measured) == text
+    assert (
+        runpy.run_path(str(ROOT / "benchmarks/speed_page.py"))["page"](text, measured)
+        == text
+    )
     for name, found in measured["cars"].items():
-        certificate = json.loads((PACKAGE / "pretrained" / f"{name}_path" / "certificate.json").read_text())
+        certificate = json.loads(
+            (PACKAGE / "pretrained" / f"{name}_path" / "certificate.json").read_text()
+        )
         assert found["policy_sha256"] == certificate["policy_sha256"]
         about = certificate["corridor"]["class"]
-        for key, ends in (("speed", about["speed"]), ("friction", [side[0] for side in about["env_box"]])):
+        for key, ends in (
+            ("speed", about["speed"]),
+            ("friction", [side[0] for side in about["env_box"]]),
+        ):
             values = {cell[key] for cell in found["cells"]}
             assert [min(values), max(values)] == ends
 
 
 def test_the_page_about_path_coordinates_says_what_the_results_say(monkeypatch):
-    """Its tables are what benchmarks/path_frame.py makes of the committed rows and tubes."""
+    """Its tables are what benchmarks/path_frame.py makes of the committed rows and
+    tubes.
+    """
     monkeypatch.syspath_prepend(str(ROOT / "benchmarks"))
     made = runpy.run_path(str(ROOT / "benchmarks" / "path_frame.py"))["TABLES"]
     text = (DOCS / "path.md").read_text("utf-8")
-    assert [name for name, build in made.items() if f"<!-- {name} -->\n{build()}\n<!-- end -->" not in text] == []
+    assert [
+        name
+        for name, build in made.items()
+        if f"<!-- {name} -->\n{build()}\n<!-- end -->" not in text
+    ] == []
 
 
 def test_the_table_of_the_long_drive_is_that_of_its_run(monkeypatch):
@@ -323,25 +501,50 @@ def test_the_table_of_the_long_drive_is_that_of_its_run(monkeypatch):
     monkeypatch.syspath_prepend(str(ROOT / "benchmarks"))
     found = json.loads((ROOT / "benchmarks/soak.json").read_text())
     soak = runpy.run_path(str(ROOT / "benchmarks/soak.py"))
-    shown = (DOCS / "failures.md").read_text("utf-8").split("<!-- soak -->")[1].split("<!-- end of soak -->")[0]
+    shown = (
+        (DOCS / "failures.md")
+        .read_text("utf-8")
+        .split("<!-- soak -->")[1]
+        .split("<!-- end of soak -->")[0]
+    )
     assert shown.strip() == soak["table"](found)
     assert found["legs"].keys() == soak["LEGS"].keys()
     for leg in found["legs"].values():
-        assert leg["outside_limits"] == leg["not_finite"] == leg["compiled_later"] == leg["state_not_finite_after"] == 0
+        assert (
+            leg["outside_limits"]
+            == leg["not_finite"]
+            == leg["compiled_later"]
+            == leg["state_not_finite_after"]
+            == 0
+        )
         assert leg["compilations"] == 1
         assert leg["arrays"]["start"] == leg["arrays"]["end"]
-        assert all(fault["until_healthy"]["never"] == 0 for fault in leg["faults"].values())
+        assert all(
+            fault["until_healthy"]["never"] == 0 for fault in leg["faults"].values()
+        )
 
 
 def test_the_tables_of_the_shield_are_those_of_the_run():
     """And no car left its lane behind the shield."""
     measured = json.loads((ROOT / "benchmarks/shield.json").read_text())
     table = runpy.run_path(str(ROOT / "benchmarks/shield_table.py"))["table"](measured)
-    shown = (DOCS / "corridor.md").read_text("utf-8").split("<!-- shield -->")[1].split("<!-- end of shield -->")[0]
+    shown = (
+        (DOCS / "corridor.md")
+        .read_text("utf-8")
+        .split("<!-- shield -->")[1]
+        .split("<!-- end of shield -->")[0]
+    )
     assert shown.strip() == table.strip()
-    rows = [row for car in measured["cars"].values() for row in (*car["scripts"].values(), car["planner"])]
+    rows = [
+        row
+        for car in measured["cars"].values()
+        for row in (*car["scripts"].values(), car["planner"])
+    ]
     assert not any(row["with"]["departures"] for row in rows)
-    policies = {name: PACKAGE / "pretrained" / f"{name}_path" / "certificate.json" for name in measured["cars"]}
+    policies = {
+        name: PACKAGE / "pretrained" / f"{name}_path" / "certificate.json"
+        for name in measured["cars"]
+    }
     for name, place in policies.items():
         certificate = json.loads(place.read_text())
         assert measured["cars"][name]["policy_sha256"] == certificate["policy_sha256"]

@@ -1,4 +1,6 @@
-"""The doctor: what works is said to work, what does not is named with its reason, and nothing is written."""
+"""The doctor: what works is said to work, what does not is named with its reason, and
+nothing is written.
+"""
 
 import tomllib
 from pathlib import Path
@@ -19,12 +21,19 @@ def test_it_says_what_is_there_and_writes_nothing(tmp_path):
     assert list(tmp_path.iterdir()) == []
 
 
-def test_an_extra_that_is_missing_or_broken_is_named_with_its_reason(monkeypatch, tmp_path):
-    (tmp_path / "brokenextra.py").write_text("raise RuntimeError('its library is of another version\\nand more')")
+def test_an_extra_that_is_missing_or_broken_is_named_with_its_reason(
+    monkeypatch, tmp_path
+):
+    (tmp_path / "brokenextra.py").write_text(
+        "raise RuntimeError('its library is of another version\\nand more')"
+    )
     monkeypatch.syspath_prepend(tmp_path)
     assert doctor._extra(("json",)) is None
     assert doctor._extra(("json", "no_such_module")) == "not installed (no_such_module)"
-    assert doctor._extra(("brokenextra",)) == "brokenextra does not load: its library is of another version"
+    assert (
+        doctor._extra(("brokenextra",))
+        == "brokenextra does not load: its library is of another version"
+    )
 
 
 def test_a_backend_that_computes_wrongly_is_refused(monkeypatch):
@@ -46,9 +55,14 @@ def test_advice_is_given_where_something_is_in_the_way(monkeypatch, tmp_path):
     assert "accelerator" in unseen
     assert doctor._advice(tmp_path, ["cuda: H200"])[2:] == []
     monkeypatch.delenv("JAX_COMPILATION_CACHE_DIR")
-    assert any("JAX_COMPILATION_CACHE_DIR" in line for line in doctor._advice(tmp_path, ["cpu: cpu"]))
+    assert any(
+        "JAX_COMPILATION_CACHE_DIR" in line
+        for line in doctor._advice(tmp_path, ["cpu: cpu"])
+    )
 
 
 def test_the_extras_are_those_of_the_package():
-    project = tomllib.loads((Path(__file__).parents[1] / "pyproject.toml").read_text())["project"]
+    project = tomllib.loads((Path(__file__).parents[1] / "pyproject.toml").read_text())[
+        "project"
+    ]
     assert set(doctor.EXTRAS) == set(project["optional-dependencies"]) - {"dev"}

@@ -1,4 +1,6 @@
-"""The doors in a row, as a user opens them: last line JSON, one-line errors, artefacts intact."""
+"""The doors in a row, as a user opens them: last line JSON, one-line errors, artefacts
+intact.
+"""
 
 import json
 import shutil
@@ -29,7 +31,16 @@ def spoiled(walked, tmp_path):
 
 def test_train_walks_from_nothing_to_a_report(walked):
     place, document = walked
-    keys = {"run", "checkpoint", "certificate", "results", "report", "open_loop_rmse_m", "alpha", "seconds"}
+    keys = {
+        "run",
+        "checkpoint",
+        "certificate",
+        "results",
+        "report",
+        "open_loop_rmse_m",
+        "alpha",
+        "seconds",
+    }
     assert set(document) == keys | {"objective"}
     assert 0 < document["objective"] < np.inf
     for name in ("run", "checkpoint", "certificate", "results", "report"):
@@ -53,8 +64,24 @@ def test_results_have_the_rows_and_keys_that_others_rely_on(walked):
         "ess",
         "act_ms",
     }
-    about = {"system", "model", "controller", "sampling", "env", "scenario", "vehicle", "seeds", "episodes", "params"}
-    assert measures | about | {"episode_s", "departures", "ratio_to_oracle", "difference_to_sfkd"} <= set(rows["sfkd"])
+    about = {
+        "system",
+        "model",
+        "controller",
+        "sampling",
+        "env",
+        "scenario",
+        "vehicle",
+        "seeds",
+        "episodes",
+        "params",
+    }
+    assert measures | about | {
+        "episode_s",
+        "departures",
+        "ratio_to_oracle",
+        "difference_to_sfkd",
+    } <= set(rows["sfkd"])
     assert rows["oracle"]["ratio_to_oracle"] == 1.0
     assert rows["nominal"]["rmse_m"]["mean"] > rows["oracle"]["rmse_m"]["mean"]
 
@@ -62,7 +89,9 @@ def test_results_have_the_rows_and_keys_that_others_rely_on(walked):
 def test_the_certificate_speaks_about_the_saved_weights(walked):
     place, document = walked
     certificate = json.loads((place / document["certificate"]).read_text())
-    _, manifest = artefacts.read_arrays(place / document["run"] / "policy.npz", kind="policy")
+    _, manifest = artefacts.read_arrays(
+        place / document["run"] / "policy.npz", kind="policy"
+    )
     assert certificate["valid"]
     assert certificate["weights_sha256"] == manifest["sha256"]
     assert len(certificate["tube"]["latent"]) == 20
@@ -72,16 +101,25 @@ def test_the_certificate_speaks_about_the_saved_weights(walked):
 
 def test_training_logs_what_can_be_certified_at_every_checkpoint(walked):
     place, document = walked
-    lines = [json.loads(line) for line in (place / document["run"] / "metrics.jsonl").read_text().splitlines()]
+    lines = [
+        json.loads(line)
+        for line in (place / document["run"] / "metrics.jsonl").read_text().splitlines()
+    ]
     saved = [line for line in lines if "validation_loss" in line]
     assert saved
-    assert all(0.5 < line["alpha"] < min(line["alpha_separate"] * (1 + 1e-6), 1) for line in saved)
+    assert all(
+        0.5 < line["alpha"] < min(line["alpha_separate"] * (1 + 1e-6), 1)
+        for line in saved
+    )
     assert all(1.0 - 1e-9 <= line["tightness"] <= 1.1 for line in saved)
 
 
 def test_rows_count_violations_and_the_theorem_is_never_one(walked):
     place, document = walked
-    rows = {row["system"]: row for row in json.loads((place / document["results"]).read_text())["rows"]}
+    rows = {
+        row["system"]: row
+        for row in json.loads((place / document["results"]).read_text())["rows"]
+    }
     assert rows["sfkd"]["violation"]["v0"] == 0.0
     assert rows["sfkd"]["violation"]["v1_tube"] == "certified"
     assert rows["nominal"]["violation"]["v0"] is None
@@ -99,7 +137,9 @@ def test_the_same_command_again_trains_nothing_and_ends_the_same(walked):
 
 
 def test_other_settings_in_the_same_place_are_refused(walked):
-    done = door("train", "+experiment=smoke", "training.steps=100", cwd=walked[0], code=1)
+    done = door(
+        "train", "+experiment=smoke", "training.steps=100", cwd=walked[0], code=1
+    )
     assert "training.steps was 150, asked 100" in done.stderr
     assert len(done.stderr.strip().splitlines()) == 1
 
@@ -124,7 +164,12 @@ def test_load_gives_a_policy_without_heavy_imports(walked):
         verify(Certificate.from_document(policy.certificate), policy.params, model=policy.model)
         assert "cvxpy" not in sys.modules
     """
-    done = subprocess.run([sys.executable, "-c", textwrap.dedent(program)], cwd=place, capture_output=True, text=True)
+    done = subprocess.run(
+        [sys.executable, "-c", textwrap.dedent(program)],
+        cwd=place,
+        capture_output=True,
+        text=True,
+    )
     assert done.returncode == 0, done.stderr
 
 
@@ -132,16 +177,34 @@ def test_certify_exits_0_then_3_when_weights_changed_then_0_when_renewed(spoiled
     assert last_line(door("certify", "+experiment=smoke", cwd=spoiled))["valid"]
     file = spoiled / "runs/smoke/sfkd/seed=0/policy.npz"
     arrays, manifest = artefacts.read_arrays(file, kind="policy")
-    changed = {name: np.asarray(array) * np.float32(1.01) for name, array in arrays.items()}
-    artefacts.write_arrays(file, changed, kind="policy", config=manifest["config"], made_from=manifest["made_from"])
-    assert "other weights" in door("certify", "+experiment=smoke", cwd=spoiled, code=3).stderr
-    renewed = last_line(door("certify", "+experiment=smoke", "certification.renew=true", cwd=spoiled))
+    changed = {
+        name: np.asarray(array) * np.float32(1.01) for name, array in arrays.items()
+    }
+    artefacts.write_arrays(
+        file,
+        changed,
+        kind="policy",
+        config=manifest["config"],
+        made_from=manifest["made_from"],
+    )
+    assert (
+        "other weights"
+        in door("certify", "+experiment=smoke", cwd=spoiled, code=3).stderr
+    )
+    renewed = last_line(
+        door("certify", "+experiment=smoke", "certification.renew=true", cwd=spoiled)
+    )
     assert renewed["alpha"] < 1.0
 
 
 def test_a_model_without_a_bound_is_driven_but_refused_a_certificate(walked):
     place = walked[0]
-    small = ("model=sfkd_no_contraction", "training.steps=25", "training.save_every=25", "evaluation.systems=[self]")
+    small = (
+        "model=sfkd_no_contraction",
+        "training.steps=25",
+        "training.save_every=25",
+        "evaluation.systems=[self]",
+    )
     walk = last_line(door("train", "+experiment=smoke", *small, cwd=place))
     assert walk["alpha"] is None
     done = door("certify", "+experiment=smoke", *small, cwd=place, code=2)
@@ -175,9 +238,13 @@ def test_a_policy_without_its_manifest_is_finished_again_from_the_checkpoint(spo
 
 def test_a_scenario_of_choice_adds_rows_and_keeps_the_others(spoiled):
     door("evaluate", "+experiment=smoke", "scenario=s1", cwd=spoiled)
-    rows = json.loads((spoiled / "runs/smoke/sfkd/seed=0/results.json").read_text())["rows"]
+    rows = json.loads((spoiled / "runs/smoke/sfkd/seed=0/results.json").read_text())[
+        "rows"
+    ]
     assert {(row["system"], row["scenario"]) for row in rows} == {
-        (system, scenario) for system in ("sfkd", "nominal", "oracle") for scenario in ("s1", "s3")
+        (system, scenario)
+        for system in ("sfkd", "nominal", "oracle")
+        for scenario in ("s1", "s3")
     }
     report = last_line(door("report", "+experiment=smoke", cwd=spoiled))
     assert all((spoiled / figure).exists() for figure in report["figures"])
@@ -192,7 +259,10 @@ def test_a_scenario_of_choice_adds_rows_and_keeps_the_others(spoiled):
         (("+experiment=smoke", "model.frame=boddy", "name=bad"), "segment"),
         (("+experiment=smoke", "training.window=80", "name=bad"), "80"),
         (("+experiment=smoke", "dataset.shares=[0.5,0.5,0.5,0.5]"), "shares"),
-        (("+experiment=smoke", "training.batch=0"), "training.batch must be in [1, inf), got 0"),
+        (
+            ("+experiment=smoke", "training.batch=0"),
+            "training.batch must be in [1, inf), got 0",
+        ),
     ],
 )
 def test_bad_input_is_answered_with_the_choices(walked, arguments, says):
@@ -204,9 +274,13 @@ def test_bad_input_is_answered_with_the_choices(walked, arguments, says):
 
 def test_the_example_in_the_readme_runs_with_a_policy_of_its_first_command():
     root = Path(__file__).parents[1]
-    program = (root / "README.md").read_text("utf-8").split("```python\n")[1].split("```")[0]
+    program = (
+        (root / "README.md").read_text("utf-8").split("```python\n")[1].split("```")[0]
+    )
     shipped = root / "src/sfkd_jax/pretrained/kinematic_path"
     program = program.replace('"runs/s3/sfkd_path/seed=0"', repr(str(shipped)))
     assert str(shipped) in program
-    done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True)
+    done = subprocess.run(
+        [sys.executable, "-c", program], capture_output=True, text=True
+    )
     assert done.returncode == 0, done.stderr

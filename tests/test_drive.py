@@ -29,16 +29,22 @@ PROGRAM = """
 
 @functools.cache
 def driven(devices):
-    flags = {"XLA_FLAGS": f"{os.environ['XLA_FLAGS']} --xla_force_host_platform_device_count={devices}"}
+    flags = {
+        "XLA_FLAGS": f"{os.environ['XLA_FLAGS']} --xla_force_host_platform_device_count={devices}"
+    }
     command = [sys.executable, "-c", textwrap.dedent(PROGRAM)]
-    done = subprocess.run(command, env=os.environ | flags, capture_output=True, text=True, timeout=300)
+    done = subprocess.run(
+        command, env=os.environ | flags, capture_output=True, text=True, timeout=300
+    )
     assert done.returncode == 0, done.stderr[-2000:]
     used, *lateral = done.stdout.split()
     return int(used), [float(value) for value in lateral]
 
 
 @pytest.mark.parametrize(("devices", "used"), [(2, 2), (3, 1)])
-def test_episodes_are_dealt_to_all_devices_where_they_can_be_and_come_out_the_same(devices, used):
+def test_episodes_are_dealt_to_all_devices_where_they_can_be_and_come_out_the_same(
+    devices, used
+):
     alone, alike = driven(1), driven(devices)
     assert alone[0] == 1
     assert alike[0] == used

@@ -23,9 +23,15 @@ def test_the_pendulum_ends_upright(monkeypatch):
 
 
 def test_the_pendulum_example_is_short():
-    """Twenty lines of code, as promised: no docstrings, imports or the lines that print."""
+    """Twenty lines of code, as promised: no docstrings, imports or the lines that
+    print.
+    """
     text = (EXAMPLES / "mppi_own_dynamics.py").read_text().split("if __name__")[0]
-    lines = [line for line in text.splitlines()[2:] if line.strip() and "import" not in line and '"""' not in line]
+    lines = [
+        line
+        for line in text.splitlines()[2:]
+        if line.strip() and "import" not in line and '"""' not in line
+    ]
     assert len(lines) <= 30
 
 
@@ -50,7 +56,9 @@ def test_logged_drives_are_read_from_a_file_of_ones_own(monkeypatch, tmp_path):
 
 
 def test_the_brax_pendulum_is_learned_certified_and_driven(monkeypatch, capsys):
-    """In two seconds a pole left alone lies. So short a training gives a certificate, not yet a good driver."""
+    """In two seconds a pole left alone lies. So short a training gives a certificate,
+    not yet a good driver.
+    """
     sizes = {"drives": 50, "steps": 50, "samples": 64, "horizon": 20, "seconds": 2.0}
     found = example("brax_pendulum", monkeypatch)["main"](**sizes)
     proof, rows = found["certificate"], found["rows"]
@@ -58,8 +66,13 @@ def test_the_brax_pendulum_is_learned_certified_and_driven(monkeypatch, capsys):
     assert proof["attacks"]["step_slopes"] <= proof["alpha"] < 1.0
     assert len(proof["tube"]["latent"]) == 20
     assert np.isfinite(rows["SFKD"]["rms_m"])
-    assert rows["SFKD"] == rows["SFKD, told e = 1"]  # e is 1 for the first three seconds
-    assert not any(rows[way]["fallen"] for way in ("true dynamics", "true dynamics, no gain", "gain alone"))
+    assert (
+        rows["SFKD"] == rows["SFKD, told e = 1"]
+    )  # e is 1 for the first three seconds
+    assert not any(
+        rows[way]["fallen"]
+        for way in ("true dynamics", "true dynamics, no gain", "gain alone")
+    )
     assert rows["true dynamics"]["rms_m"] < rows["gain alone"]["rms_m"]
     printed = capsys.readouterr().out
     assert all(f"{way} " in printed for way in rows)
@@ -91,7 +104,9 @@ class StubNode:
         self.timers.append((period, callback))
 
     def get_clock(self):
-        return types.SimpleNamespace(now=lambda: types.SimpleNamespace(to_msg=lambda: 0))
+        return types.SimpleNamespace(
+            now=lambda: types.SimpleNamespace(to_msg=lambda: 0)
+        )
 
 
 class Message(types.SimpleNamespace):
@@ -124,27 +139,51 @@ def node(monkeypatch):
     law, limits = control.path_feedback(wheelbase=plant.wheelbase), {}
     limits = {"control_low": plant.control_low, "control_high": plant.control_high}
     model = models.physics(plant.nominal)
-    task = control.path_tracking(model, control.tracking_cost(dt=0.1), law, dt=0.1, **limits)
+    task = control.path_tracking(
+        model, control.tracking_cost(dt=0.1), law, dt=0.1, **limits
+    )
     controller = control.mppi(task, horizon=6, num_samples=16)
-    settings = {"vehicle": {"dt": 0.1}, "controller": {"mppi": {"horizon": 6}}, "space": {"body_mean": [0.0]}}
+    settings = {
+        "vehicle": {"dt": 0.1},
+        "controller": {"mppi": {"horizon": 6}},
+        "space": {"body_mean": [0.0]},
+    }
     policy = Policy(model, {}, controller, None, settings)
     monkeypatch.setattr(sfkd_jax, "load", lambda path: policy)
-    monkeypatch.setattr(sfkd_jax, "warm_up", lambda policy: jax.jit(policy.controller.act))
-    return runpy.run_path(str(EXAMPLES / "ros2" / "controller_node.py"))["ControllerNode"]()
+    monkeypatch.setattr(
+        sfkd_jax, "warm_up", lambda policy: jax.jit(policy.controller.act)
+    )
+    return runpy.run_path(str(EXAMPLES / "ros2" / "controller_node.py"))[
+        "ControllerNode"
+    ]()
 
 
 def odometry(y=0.3):
     return Message(
-        pose=Message(pose=Message(position=Message(x=0.0, y=y), orientation=Message(w=1.0, x=0.0, y=0.0, z=0.0))),
-        twist=Message(twist=Message(linear=Message(x=10.0, y=0.0), angular=Message(z=0.0))),
+        pose=Message(
+            pose=Message(
+                position=Message(x=0.0, y=y),
+                orientation=Message(w=1.0, x=0.0, y=0.0, z=0.0),
+            )
+        ),
+        twist=Message(
+            twist=Message(linear=Message(x=10.0, y=0.0), angular=Message(z=0.0))
+        ),
     )
 
 
 def straight_path():
-    return Message(poses=[Message(pose=Message(position=Message(x=float(k), y=0.0))) for k in range(60)])
+    return Message(
+        poses=[
+            Message(pose=Message(position=Message(x=float(k), y=0.0)))
+            for k in range(60)
+        ]
+    )
 
 
-def test_the_ros_node_waits_until_it_has_heard_everything_and_then_steers_to_the_path(node):
+def test_the_ros_node_waits_until_it_has_heard_everything_and_then_steers_to_the_path(
+    node,
+):
     ((period, tick),) = node.timers
     assert period == 0.1
     tick()

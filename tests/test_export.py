@@ -1,4 +1,6 @@
-"""What is exported runs without this package, to the last bit, and a damaged file is named in one line."""
+"""What is exported runs without this package, to the last bit, and a damaged file is
+named in one line.
+"""
 
 import hashlib
 import importlib.util
@@ -38,8 +40,21 @@ SMALL = (
     "controller.mppi.num_samples=16",
     f"controller.mppi.horizon={HORIZON}",
 )
-BOXES = {"state": [[0.0], [20.0]], "control": [[-0.5, -5.0], [0.5, 5.0]], "env": [list(ENV_LOW), list(ENV_HIGH)]}
-HEAVY = {"sfkd_jax", "flax", "hydra", "orbax", "optax", "jaxtyping", "matplotlib", "iree"}
+BOXES = {
+    "state": [[0.0], [20.0]],
+    "control": [[-0.5, -5.0], [0.5, 5.0]],
+    "env": [list(ENV_LOW), list(ENV_HIGH)],
+}
+HEAVY = {
+    "sfkd_jax",
+    "flax",
+    "hydra",
+    "orbax",
+    "optax",
+    "jaxtyping",
+    "matplotlib",
+    "iree",
+}
 
 
 def settings(root, *overrides):
@@ -51,19 +66,31 @@ def settings(root, *overrides):
 
 @pytest.fixture(scope="module")
 def exported(tmp_path_factory):
-    """A run with weights as they were drawn and a monitor, and what the door wrote and printed."""
+    """A run with weights as they were drawn and a monitor, and what the door wrote and
+    printed.
+    """
     asked = settings(tmp_path_factory.mktemp("export") / "runs")
     plant = build.build_vehicle(asked["vehicle"])
-    params = jit(build.build_model(asked["model"], space(), plant).init)(jax.random.key(0))
+    params = jit(build.build_model(asked["model"], space(), plant).init)(
+        jax.random.key(0)
+    )
     kept = asked | {"space": build.space_to_settings(space())}
     store.claim(asked)
     place = store.run_directory(asked)
     policy.save(place / "policy.npz", params, kept, made_from={"dataset": "d" * 64})
     trained, data = policy.restore(place), dataset()
-    splits = {"validation": data.validation, "calibration": data.calibration, "held_out": {"test": data.test}}
+    splits = {
+        "validation": data.validation,
+        "calibration": data.calibration,
+        "held_out": {"test": data.test},
+    }
     options = {"level": 0.9, "monitor_level": 0.9, "attack_starts": 0}
-    certificate = certification.issue(trained.model, trained.params, **splits, boxes=BOXES, **options)
-    artefacts.write_json(place / "certificate.json", certificate | {"policy_sha256": trained.sha256})
+    certificate = certification.issue(
+        trained.model, trained.params, **splits, boxes=BOXES, **options
+    )
+    artefacts.write_json(
+        place / "certificate.json", certificate | {"policy_sha256": trained.sha256}
+    )
     return asked, export.run(asked)
 
 
@@ -86,37 +113,62 @@ def folder(exported, tmp_path):
 
 def shipped(folder):
     """The script of an export folder as a module."""
-    found = importlib.util.spec_from_file_location("run_controller", folder / "run_controller.py")
+    found = importlib.util.spec_from_file_location(
+        "run_controller", folder / "run_controller.py"
+    )
     module = importlib.util.module_from_spec(found)
     found.loader.exec_module(module)
     return module
 
 
 def drive():
-    """Measurements of a few steps; one of them is not finite, and friction and wind switch."""
+    """Measurements of a few steps; one of them is not finite, and friction and wind
+    switch.
+    """
     random = np.random.default_rng(3)
-    observations = np.asarray([0.0, 0.2, 0.0, 9.0]) + 0.3 * random.standard_normal((STEPS, 4))
+    observations = np.asarray([0.0, 0.2, 0.0, 9.0]) + 0.3 * random.standard_normal(
+        (STEPS, 4)
+    )
     observations[3, 2] = np.nan
     envs = np.where(np.arange(STEPS)[:, None] < 2, [0.9, 0.0], [0.4, 6.0])
-    return observations.astype(np.float32), envs.astype(np.float32), np.asarray(straight(HORIZON))
+    return (
+        observations.astype(np.float32),
+        envs.astype(np.float32),
+        np.asarray(straight(HORIZON)),
+    )
 
 
 def plain(tree):
     """Leaves as numpy arrays, keys as their data."""
     leaves = jax.tree.leaves(tree)
-    opened = (jax.random.key_data(x) if jnp.issubdtype(x.dtype, jax.dtypes.prng_key) else x for x in leaves)
+    opened = (
+        jax.random.key_data(x) if jnp.issubdtype(x.dtype, jax.dtypes.prng_key) else x
+        for x in leaves
+    )
     return [np.asarray(leaf) for leaf in opened]
 
 
-fused = {"xla_cpu_use_fusion_emitters": True} if "fusion_emitters" in os.environ["XLA_FLAGS"] else {}
-optimised = partial(jax.jit, compiler_options={"xla_backend_optimization_level": 3, **fused})
-"""jax.jit as it is where conftest.py does not speed compiling up: to the last bit, programs agree only like this."""
+fused = (
+    {"xla_cpu_use_fusion_emitters": True}
+    if "fusion_emitters" in os.environ["XLA_FLAGS"]
+    else {}
+)
+optimised = partial(
+    jax.jit, compiler_options={"xla_backend_optimization_level": 3, **fused}
+)
+"""jax.jit as it is where conftest.py does not speed compiling up: to the last bit,
+programs agree only like this.
+"""
 
 
 @pytest.fixture(scope="module")
 def in_process(loaded):
     """Every leaf of every step of the policy's own controller, jitted here."""
-    act, state, steps = optimised(loaded.controller.act), loaded.controller.init(jax.random.key(7)), []
+    act, state, steps = (
+        optimised(loaded.controller.act),
+        loaded.controller.init(jax.random.key(7)),
+        [],
+    )
     folded = jax.jit(loaded.model.fold)(loaded.params)
     observations, envs, reference = drive()
     for observation, env in zip(observations, envs, strict=True):
@@ -125,11 +177,23 @@ def in_process(loaded):
     return steps
 
 
-@pytest.mark.parametrize(("platforms", "exact"), [(("cpu",), ("",)), (("cpu", "cuda"), ("control", "state."))])
-def test_a_process_without_this_package_repeats_every_bit(loaded, in_process, tmp_path, platforms, exact):
-    """With several platforms a product of matrices is a choice, and XLA may round otherwise what is only reported."""
-    manifest = exporting.write_controller(loaded, tmp_path, made_from={}, platforms=platforms)
-    np.savez(tmp_path / "drive.npz", **dict(zip(("observations", "envs", "reference"), drive(), strict=True)))
+@pytest.mark.parametrize(
+    ("platforms", "exact"),
+    [(("cpu",), ("",)), (("cpu", "cuda"), ("control", "state."))],
+)
+def test_a_process_without_this_package_repeats_every_bit(
+    loaded, in_process, tmp_path, platforms, exact
+):
+    """With several platforms a product of matrices is a choice, and XLA may round
+    otherwise what is only reported.
+    """
+    manifest = exporting.write_controller(
+        loaded, tmp_path, made_from={}, platforms=platforms
+    )
+    np.savez(
+        tmp_path / "drive.npz",
+        **dict(zip(("observations", "envs", "reference"), drive(), strict=True)),
+    )
     program = f"""
         import sys
         for name in {HEAVY!r}:
@@ -149,22 +213,44 @@ def test_a_process_without_this_package_repeats_every_bit(loaded, in_process, tm
         assert "flatbuffers" in packages
     """
     command = [sys.executable, "-c", textwrap.dedent(program)]
-    done = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, env=os.environ | {"XLA_FLAGS": ""})
+    done = subprocess.run(
+        command,
+        cwd=tmp_path,
+        capture_output=True,
+        text=True,
+        env=os.environ | {"XLA_FLAGS": ""},
+    )
     assert done.returncode == 0, done.stderr
     with np.load(tmp_path / "found.npz") as found:
-        steps = [[found[f"{k}/{i}"] for i in range(len(leaves))] for k, leaves in enumerate(in_process)]
+        steps = [
+            [found[f"{k}/{i}"] for i in range(len(leaves))]
+            for k, leaves in enumerate(in_process)
+        ]
         assert len(found.files) == sum(map(len, in_process))
     names = [leaf["name"] for leaf in manifest["programs"]["act"]["outputs"]]
     for k, (ours, theirs) in enumerate(zip(in_process, steps, strict=True)):
-        different = [n for n, a, b in zip(names, ours, theirs, strict=True) if a.tobytes() != b.tobytes()]
+        different = [
+            n
+            for n, a, b in zip(names, ours, theirs, strict=True)
+            if a.tobytes() != b.tobytes()
+        ]
         assert [name for name in different if name.startswith(exact)] == [], f"step {k}"
         for mine, found_there in zip(ours, theirs, strict=True):
             np.testing.assert_allclose(mine, found_there, rtol=1e-5, atol=1e-5)
     healthy = names.index("info.healthy")
-    assert [bool(leaves[healthy]) for leaves in steps] == [True, True, True, False, True, True]
+    assert [bool(leaves[healthy]) for leaves in steps] == [
+        True,
+        True,
+        True,
+        False,
+        True,
+        True,
+    ]
 
 
-def test_the_manifest_says_what_the_programs_take_and_what_they_were_made_from(exported, loaded):
+def test_the_manifest_says_what_the_programs_take_and_what_they_were_made_from(
+    exported, loaded
+):
     asked, printed = exported
     manifest = json.loads(Path(printed["manifest"]).read_text())
     place = Path(printed["blob"]).parent
@@ -175,29 +261,53 @@ def test_the_manifest_says_what_the_programs_take_and_what_they_were_made_from(e
         read = jax.export.deserialize(bytearray(content))
         assert read.platforms == ("cpu", "cuda") == tuple(manifest["platforms"])
         assert read.calling_convention_version == manifest["calling_convention_version"]
-        for avals, leaves in ((read.in_avals, program["inputs"]), (read.out_avals, program["outputs"])):
+        for avals, leaves in (
+            (read.in_avals, program["inputs"]),
+            (read.out_avals, program["outputs"]),
+        ):
             assert [(aval.shape, str(aval.dtype)) for aval in avals] == [
                 (tuple(x["shape"]), x["dtype"]) for x in leaves
             ]
     act = manifest["programs"]["act"]
-    assert [leaf["name"] for leaf in act["inputs"][-3:]] == ["observation", "env", "reference"]
+    assert [leaf["name"] for leaf in act["inputs"][-3:]] == [
+        "observation",
+        "env",
+        "reference",
+    ]
     assert act["outputs"][0]["name"] == "control"
     states = [leaf for leaf in act["outputs"] if leaf["name"].startswith("state.")]
     assert states == act["inputs"][:-3] == manifest["programs"]["init"]["outputs"]
     assert {"name": "state.inner.key", "shape": [2], "dtype": "uint32"} in states
-    assert manifest["weights_sha256"] == policy.restore(store.run_directory(asked)).weights_sha256
-    assert manifest["certificate_sha256"] == hashlib.sha256((place / "certificate.json").read_bytes()).hexdigest()
-    assert (manifest["sampling_period_s"], manifest["horizon"], manifest["iree"]) == (0.1, HORIZON, None)
+    assert (
+        manifest["weights_sha256"]
+        == policy.restore(store.run_directory(asked)).weights_sha256
+    )
+    assert (
+        manifest["certificate_sha256"]
+        == hashlib.sha256((place / "certificate.json").read_bytes()).hexdigest()
+    )
+    assert (manifest["sampling_period_s"], manifest["horizon"], manifest["iree"]) == (
+        0.1,
+        HORIZON,
+        None,
+    )
     plant = build.build_vehicle(asked["vehicle"])
-    assert tuple(control["high"] for control in manifest["controls"]) == plant.control_high
+    assert (
+        tuple(control["high"] for control in manifest["controls"]) == plant.control_high
+    )
     assert manifest["environment"]["low"] == list(ENV_LOW)
     assert loaded.certificate["boxes"] == BOXES
 
 
 def test_nothing_in_an_export_tells_where_files_lay_when_it_was_made(exported):
-    """Nor in the programs, which jax annotates with source files; a jax setting that is made for it is given back."""
+    """Nor in the programs, which jax annotates with source files; a jax setting that is
+    made for it is given back.
+    """
     place = Path(exported[1]["blob"]).parent
-    folders = {str(Path(name).resolve().parent).encode() for name in (sfkd_jax.__file__, jax.__file__, __file__)}
+    folders = {
+        str(Path(name).resolve().parent).encode()
+        for name in (sfkd_jax.__file__, jax.__file__, __file__)
+    }
     programs = sorted(place.glob("*.stablehlo"))
     assert len(programs) == 2
     for content in (path.read_bytes() for path in programs):
@@ -207,24 +317,33 @@ def test_nothing_in_an_export_tells_where_files_lay_when_it_was_made(exported):
 
 
 def test_the_controller_of_the_command_is_what_is_exported(spoiled):
-    printed = export.run(settings(spoiled, "controller.mppi.horizon=4", "export.platforms=[cpu]"))
+    printed = export.run(
+        settings(spoiled, "controller.mppi.horizon=4", "export.platforms=[cpu]")
+    )
     assert json.loads(Path(printed["manifest"]).read_text())["horizon"] == 4
     folder = Path(printed["npz"]).parent
     assert sfkd_jax.load(folder).settings["controller"]["mppi"]["horizon"] == 4
-    assert sfkd_jax.load(folder.parent).settings["controller"]["mppi"]["horizon"] == HORIZON
+    assert (
+        sfkd_jax.load(folder.parent).settings["controller"]["mppi"]["horizon"]
+        == HORIZON
+    )
 
 
 def test_a_refused_certificate_leaves_the_export_without_one(spoiled, capsys):
     asked = settings(spoiled)
     place = store.run_directory(asked)
     assert (place / "export" / "certificate.json").exists()
-    artefacts.write_json(place / "certificate.json", {"valid": False, "reason": "alpha is not below 1"})
+    artefacts.write_json(
+        place / "certificate.json", {"valid": False, "reason": "alpha is not below 1"}
+    )
     printed = export.run(asked)
     assert "refused" in capsys.readouterr().err
     manifest = json.loads(Path(printed["manifest"]).read_text())
     assert manifest["certificate_sha256"] is None
     assert not Path(printed["blob"]).with_name("certificate.json").exists()
-    assert "info.breach" not in {leaf["name"] for leaf in manifest["programs"]["act"]["outputs"]}
+    assert "info.breach" not in {
+        leaf["name"] for leaf in manifest["programs"]["act"]["outputs"]
+    }
 
 
 def sealed(path, manifest):
@@ -237,13 +356,25 @@ def sealed(path, manifest):
     ("file", "damage", "says"),
     [
         ("controller.stablehlo", lambda content: content[:-1], "truncated"),
-        ("controller.stablehlo", lambda content: content[:-1] + bytes([content[-1] ^ 1]), "changed, sha256"),
+        (
+            "controller.stablehlo",
+            lambda content: content[:-1] + bytes([content[-1] ^ 1]),
+            "changed, sha256",
+        ),
         ("initial_state.stablehlo", lambda content: content[::-1], "changed, sha256"),
         ("initial_state.stablehlo", None, "No such file"),
         ("controller.json", lambda content: content[:50], "truncated or not JSON"),
         ("controller.json", lambda content: b'{"kind": "policy"}', "not the manifest"),
-        ("controller.json", lambda content: content.replace(b'"format": 2', b'"format": 1'), "format 1"),
-        ("controller.json", lambda content: content.replace(b'"horizon": 5', b'"horizon": 6'), "changed, its sha256"),
+        (
+            "controller.json",
+            lambda content: content.replace(b'"format": 2', b'"format": 1'),
+            "format 1",
+        ),
+        (
+            "controller.json",
+            lambda content: content.replace(b'"horizon": 5', b'"horizon": 6'),
+            "changed, its sha256",
+        ),
     ],
 )
 def test_a_damaged_export_is_named_in_one_line(folder, file, damage, says):
@@ -273,26 +404,36 @@ def test_arguments_of_the_wrong_shape_are_named(exported):
     controller = shipped(Path(exported[1]["blob"]).parent).ExportedController()
     observations, envs, reference = drive()
     state = controller.init()
-    with pytest.raises(ValueError, match=r"observation must have shape \(4,\), got \(3,\)"):
+    with pytest.raises(
+        ValueError, match=r"observation must have shape \(4,\), got \(3,\)"
+    ):
         controller.act(state, observations[0, :3], envs[0], reference)
     with pytest.raises(ValueError, match=r"reference must have shape \(5, 4\)"):
         controller.act(state, observations[0], envs[0], reference[:-1])
     with pytest.raises(ValueError, match="state must be"):
-        controller.act(dict(list(state.items())[1:]), observations[0], envs[0], reference)
+        controller.act(
+            dict(list(state.items())[1:]), observations[0], envs[0], reference
+        )
 
 
 def test_the_script_steps_a_controller_by_itself(exported):
     script = Path(exported[1]["blob"]).with_name("run_controller.py")
-    done = subprocess.run([sys.executable, script, "--steps", "2"], capture_output=True, text=True)
+    done = subprocess.run(
+        [sys.executable, script, "--steps", "2"], capture_output=True, text=True
+    )
     assert done.returncode == 0, done.stderr
     assert len(json.loads(done.stdout)["controls"]) == 2
-    done = subprocess.run([sys.executable, script, script.parent.parent], capture_output=True, text=True)
+    done = subprocess.run(
+        [sys.executable, script, script.parent.parent], capture_output=True, text=True
+    )
     assert done.returncode == 1
     assert done.stderr.strip().endswith("controller.json: No such file or directory")
 
 
 def test_a_run_without_a_policy_is_sent_to_train(tmp_path):
-    with pytest.raises(artefacts.ArtefactError, match="run train with the same options"):
+    with pytest.raises(
+        artefacts.ArtefactError, match="run train with the same options"
+    ):
         export.run(settings(tmp_path))
     assert list(tmp_path.iterdir()) == []
 
@@ -310,26 +451,50 @@ def test_what_cannot_be_exported_is_refused(loaded, tmp_path):
         exporting.flat_programs(growing)
 
 
-def test_warm_up_gives_the_same_bits_and_keeps_the_machine_code_in_a_cache(loaded, tmp_path):
+def test_warm_up_gives_the_same_bits_and_keeps_the_machine_code_in_a_cache(
+    loaded, tmp_path
+):
     def act(params, key, observation, env, reference):
         key, noise = jax.random.split(key)
-        return jnp.tanh(env * observation[1]) + jax.random.normal(noise, (2,)), key, {"speed": reference[0, 3]}
+        return (
+            jnp.tanh(env * observation[1]) + jax.random.normal(noise, (2,)),
+            key,
+            {"speed": reference[0, 3]},
+        )
 
     def kept():
-        return {file.name for file in (tmp_path / "cache").iterdir() if file.name.endswith("-cache")}
+        return {
+            file.name
+            for file in (tmp_path / "cache").iterdir()
+            if file.name.endswith("-cache")
+        }
 
     simple = loaded._replace(controller=Controller(lambda key: key, act))
     observations, envs, reference = drive()
-    measured = jnp.asarray(observations[0]), jnp.asarray(envs[0]), jnp.asarray(reference)
+    measured = (
+        jnp.asarray(observations[0]),
+        jnp.asarray(envs[0]),
+        jnp.asarray(reference),
+    )
     expected = plain(jax.jit(act)(simple.params, jax.random.key(7), *measured))
-    before = jax.config.jax_compilation_cache_dir, jax.config.jax_persistent_cache_min_compile_time_secs
+    before = (
+        jax.config.jax_compilation_cache_dir,
+        jax.config.jax_persistent_cache_min_compile_time_secs,
+    )
     sfkd_jax.warm_up(simple, cache=tmp_path / "cache")
     first = kept()
     assert len(first) == 1
     compiled = sfkd_jax.warm_up(simple, cache=tmp_path / "cache")
-    sfkd_jax.warm_up(loaded._replace(controller=Controller(lambda key: key, lambda *given: act(*given))))
+    sfkd_jax.warm_up(
+        loaded._replace(
+            controller=Controller(lambda key: key, lambda *given: act(*given))
+        )
+    )
     assert kept() == first
-    assert (jax.config.jax_compilation_cache_dir, jax.config.jax_persistent_cache_min_compile_time_secs) == before
+    assert (
+        jax.config.jax_compilation_cache_dir,
+        jax.config.jax_persistent_cache_min_compile_time_secs,
+    ) == before
     found = plain(compiled(simple.params, jax.random.key(7), *measured))
     assert [leaf.tobytes() for leaf in found] == [leaf.tobytes() for leaf in expected]
     with pytest.raises(TypeError):
@@ -347,16 +512,26 @@ def flat_steps(run, first):
     return np.stack(controls)
 
 
-def test_evaluating_the_weights_first_leaves_the_function_and_no_factorisation(loaded, in_process):
+def test_evaluating_the_weights_first_leaves_the_function_and_no_factorisation(
+    loaded, in_process
+):
     plant = build.build_vehicle(loaded.settings["vehicle"])
     watched_by_nobody = build.build_controller(
-        loaded.settings["controller"], loaded.model, plant, env_low=ENV_LOW, env_high=ENV_HIGH
+        loaded.settings["controller"],
+        loaded.model,
+        plant,
+        env_low=ENV_LOW,
+        env_high=ENV_HIGH,
     )
     unfolded = loaded.model._replace(fold=lambda params: params)
-    programs = exporting.flat_programs(loaded._replace(controller=watched_by_nobody, model=unfolded))
+    programs = exporting.flat_programs(
+        loaded._replace(controller=watched_by_nobody, model=unfolded)
+    )
     first = programs.init.function(jax.random.key_data(jax.random.key(7)))
     ahead = exporting.weights_first(programs.act)
-    shapes = [jax.ShapeDtypeStruct(leaf.shape, leaf.dtype) for leaf in programs.act.inputs]
+    shapes = [
+        jax.ShapeDtypeStruct(leaf.shape, leaf.dtype) for leaf in programs.act.inputs
+    ]
     assert "lapack" in jax.jit(programs.act.function).lower(*shapes).as_text()
     assert "custom_call" not in jax.jit(ahead).lower(*shapes).as_text()
     expected = np.stack([leaves[0] for leaves in in_process])
@@ -367,7 +542,9 @@ def test_iree_runs_the_controller_without_jax(loaded, in_process, tmp_path):
     pytest.importorskip("iree.compiler")
     runtime = pytest.importorskip("iree.runtime")
     with pytest.raises(ValueError, match="nonsense"):
-        exporting.write_controller(loaded, tmp_path, made_from={}, iree=True, iree_flags=("--nonsense",))
+        exporting.write_controller(
+            loaded, tmp_path, made_from={}, iree=True, iree_flags=("--nonsense",)
+        )
     assert list(tmp_path.iterdir()) == []
     manifest = exporting.write_controller(loaded, tmp_path, made_from={}, iree=True)
     modules = {}
@@ -377,11 +554,17 @@ def test_iree_runs_the_controller_without_jax(loaded, in_process, tmp_path):
         modules[name] = runtime.load_vm_flatbuffer(content, driver="local-sync")["main"]
     key = np.asarray(jax.random.key_data(jax.random.key(7)))
     first = [np.asarray(leaf) for leaf in modules["init"](key)]
-    found = flat_steps(lambda *leaves: [np.asarray(leaf) for leaf in modules["act"](*leaves)], first)
-    np.testing.assert_allclose(found, np.stack([leaves[0] for leaves in in_process]), atol=1e-5)
+    found = flat_steps(
+        lambda *leaves: [np.asarray(leaf) for leaf in modules["act"](*leaves)], first
+    )
+    np.testing.assert_allclose(
+        found, np.stack([leaves[0] for leaves in in_process]), atol=1e-5
+    )
 
 
-@pytest.mark.skipif(importlib.util.find_spec("iree") is not None, reason="IREE is installed")
+@pytest.mark.skipif(
+    importlib.util.find_spec("iree") is not None, reason="IREE is installed"
+)
 def test_iree_that_is_not_installed_is_named_with_its_extra(loaded, tmp_path):
     with pytest.raises(ValueError, match=r"sfkd-jax\[cpp\]"):
         exporting.write_controller(loaded, tmp_path, made_from={}, iree=True)

@@ -1,4 +1,6 @@
-"""10^4 changed files: what is read means what is in the file, or is refused in one line that names it."""
+"""10^4 changed files: what is read means what is in the file, or is refused in one line
+that names it.
+"""
 
 import json
 import subprocess

@@ -1,4 +1,6 @@
-"""Files made to make a reader hang, allocate, evaluate or believe: each is one line that names it, at once."""
+"""Files made to make a reader hang, allocate, evaluate or believe: each is one line
+that names it, at once.
+"""
 
 import json
 import os
@@ -87,7 +89,11 @@ def test_what_is_no_regular_file_is_refused_at_once(tmp_path, monkeypatch, name,
     policy.load(run)  # what is compiled once is not what is timed
     (run / name).unlink(missing_ok=True)
     SPECIAL[kind](run / name, monkeypatch)
-    if kind == "link to itself" and name not in ("policy.npz", "policy.json", "metrics.jsonl"):
+    if kind == "link to itself" and name not in (
+        "policy.npz",
+        "policy.json",
+        "metrics.jsonl",
+    ):
         pytest.skip("to a reader of what may be missing, such a link is missing")
     assert name.split(".")[0] in refusal(FILES[name], run)
 
@@ -97,17 +103,28 @@ def test_what_is_no_regular_file_is_refused_at_once(tmp_path, monkeypatch, name,
 def test_a_pipe_among_logs_is_refused_at_once(tmp_path, name, whole):
     os.mkfifo(tmp_path / name)
     path = str(tmp_path if whole else tmp_path / name)
-    with bounded(), pytest.raises((ArtefactError, ValueError), match=f"{name}: (not a regular|no such)"):
-        datasets.from_logs(path, datasets.Columns(), dt=0.1, wheelbase=2.7, say=lambda line: None)
+    with (
+        bounded(),
+        pytest.raises(
+            (ArtefactError, ValueError), match=f"{name}: (not a regular|no such)"
+        ),
+    ):
+        datasets.from_logs(
+            path, datasets.Columns(), dt=0.1, wheelbase=2.7, say=lambda line: None
+        )
 
 
 @pytest.mark.parametrize("name", ["controller.json", "act.stablehlo"])
 @pytest.mark.parametrize("kind", SPECIAL)
-def test_an_export_of_what_is_no_regular_file_is_refused_at_once(tmp_path, monkeypatch, name, kind):
+def test_an_export_of_what_is_no_regular_file_is_refused_at_once(
+    tmp_path, monkeypatch, name, kind
+):
     fuzzing_readers.make_export(tmp_path)
     (tmp_path / name).unlink()
     SPECIAL[kind](tmp_path / name, monkeypatch)
-    assert name in refusal(loader.ExportedController, tmp_path, error=loader.ExportError)
+    assert name in refusal(
+        loader.ExportedController, tmp_path, error=loader.ExportError
+    )
 
 
 # ---- documents
@@ -116,23 +133,42 @@ def test_an_export_of_what_is_no_regular_file_is_refused_at_once(tmp_path, monke
 @pytest.mark.parametrize(
     "text",
     [
-        *('{"a": NaN}', '{"a": -Infinity}', '{"a": 1e999}', '{"a": 1, "a": 2}', '{"b": {"a": 1, "a": 2}}'),
-        *('{"a": 1' + "0" * 5000 + "}", '{"a": 18446744073709551616}', r'{"a": "\ud800"}', r'{"\udfff": 1}'),
+        *(
+            '{"a": NaN}',
+            '{"a": -Infinity}',
+            '{"a": 1e999}',
+            '{"a": 1, "a": 2}',
+            '{"b": {"a": 1, "a": 2}}',
+        ),
+        *(
+            '{"a": 1' + "0" * 5000 + "}",
+            '{"a": 18446744073709551616}',
+            r'{"a": "\ud800"}',
+            r'{"\udfff": 1}',
+        ),
         *('{"a": ' + "[" * n + "]" * n + "}" for n in (65, 900, 3000, 100_000)),
     ],
 )
-def test_documents_that_readers_would_understand_differently_are_refused(tmp_path, text):
+def test_documents_that_readers_would_understand_differently_are_refused(
+    tmp_path, text
+):
     path = tmp_path / "a.json"
     path.write_text(text)
-    assert refusal(artefacts.read_json, path).startswith(f"{path}: truncated or not JSON (")
+    assert refusal(artefacts.read_json, path).startswith(
+        f"{path}: truncated or not JSON ("
+    )
     path = tmp_path / "a.jsonl"
     path.write_text(f"{text}\n")
-    assert refusal(artefacts.read_jsonl, path).startswith(f"{path}: line 1 truncated or not JSON (")
+    assert refusal(artefacts.read_jsonl, path).startswith(
+        f"{path}: line 1 truncated or not JSON ("
+    )
 
 
 def test_a_mark_of_byte_order_and_whole_surrogate_pairs_are_read(tmp_path):
     path = tmp_path / "a.json"
-    path.write_bytes(b"\xef\xbb\xbf" + rb'{"a": "\ud83d\ude00", "b": 18446744073709551615}')
+    path.write_bytes(
+        b"\xef\xbb\xbf" + rb'{"a": "\ud83d\ude00", "b": 18446744073709551615}'
+    )
     assert artefacts.read_json(path) == {"a": "\U0001f600", "b": 2**64 - 1}
 
 
@@ -149,13 +185,18 @@ def test_a_manifest_whose_parts_are_no_dictionaries_is_refused(tmp_path, name, v
     shutil.copytree(SHIPPED, tmp_path, dirs_exist_ok=True)
     manifest = json.loads((tmp_path / "policy.json").read_bytes())
     (tmp_path / "policy.json").write_text(json.dumps(manifest | {name: value}))
-    assert refusal(policy.load, tmp_path) == f"{tmp_path / 'policy.json'}: not a manifest, {name} is malformed"
+    assert (
+        refusal(policy.load, tmp_path)
+        == f"{tmp_path / 'policy.json'}: not a manifest, {name} is malformed"
+    )
 
 
 def test_a_long_value_is_not_repeated_in_the_line(tmp_path):
     shutil.copytree(SHIPPED, tmp_path, dirs_exist_ok=True)
     manifest = json.loads((tmp_path / "policy.json").read_bytes())
-    (tmp_path / "policy.json").write_text(json.dumps(manifest | {"kind": "\x1b[31m\n" + "x" * 100_000}))
+    (tmp_path / "policy.json").write_text(
+        json.dumps(manifest | {"kind": "\x1b[31m\n" + "x" * 100_000})
+    )
     line = refusal(policy.load, tmp_path)
     assert "is of kind \\x1b[31m xxx" in line
 
@@ -173,13 +214,18 @@ def archive(path, header, data=b"\0" * 24, *, declared=None):
 
 
 def header(descr="'<f8'", order="False", shape="(3,)"):
-    return f"{{'descr': {descr}, 'fortran_order': {order}, 'shape': {shape}, }}\n".encode()
+    return (
+        f"{{'descr': {descr}, 'fortran_order': {order}, 'shape': {shape}, }}\n".encode()
+    )
 
 
 @pytest.mark.parametrize(
     ("text", "says"),
     [
-        (header(shape="(1000000000000,)"), "x.npy declares 8000000000000 bytes and holds 24"),
+        (
+            header(shape="(1000000000000,)"),
+            "x.npy declares 8000000000000 bytes and holds 24",
+        ),
         (header(shape="(99999, 99999, 99999)"), "and holds 24"),
         (header(shape="(2,)"), "x.npy declares 16 bytes and holds 24"),
         (header(descr="'<U999999999'"), "damaged"),
@@ -200,13 +246,17 @@ def test_headers_are_compared_with_the_bytes_and_not_evaluated(tmp_path, text, s
     assert line.startswith(f"{path}: ")
     assert says in line
     with bounded(), pytest.raises(ValueError, match=r"x\.npz"):
-        datasets.from_logs(str(path), datasets.Columns(), dt=0.1, wheelbase=2.7, say=lambda line: None)
+        datasets.from_logs(
+            str(path), datasets.Columns(), dt=0.1, wheelbase=2.7, say=lambda line: None
+        )
 
 
 def test_an_archive_of_another_compression_is_refused(tmp_path):
     with zipfile.ZipFile(tmp_path / "x.npz", "w", zipfile.ZIP_LZMA) as packed:
         packed.writestr("x.npy", b"\x93NUMPY")
-    assert "another method than deflate" in refusal(artefacts.read_npz, tmp_path / "x.npz")
+    assert "another method than deflate" in refusal(
+        artefacts.read_npz, tmp_path / "x.npz"
+    )
 
 
 def test_compressed_members_are_bounded_before_they_are_inflated(tmp_path):
@@ -215,16 +265,22 @@ def test_compressed_members_are_bounded_before_they_are_inflated(tmp_path):
     assert "inflates to 600 MiB, more than 512" in refusal(artefacts.read_npz, path)
     whole = bytearray(bomb(8))
     at = whole.rfind(b"PK\x01\x02") + 24
-    whole[at : at + 4] = struct.pack("<I", 1 << 28)  # declared larger than its 8 KiB can be
+    whole[at : at + 4] = struct.pack(
+        "<I", 1 << 28
+    )  # declared larger than its 8 KiB can be
     path.write_bytes(whole)
     assert "larger than it can inflate to" in refusal(artefacts.read_npz, path)
 
 
 def test_nothing_is_inflated_that_is_not_what_the_manifest_records(tmp_path):
     path = tmp_path / "x.npz"
-    artefacts.write_arrays(path, {"x": np.zeros(3)}, kind="k", config={}, compressed=True)
+    artefacts.write_arrays(
+        path, {"x": np.zeros(3)}, kind="k", config={}, compressed=True
+    )
     path.write_bytes(bomb(400))
-    assert "does not match its manifest: sha256" in refusal(artefacts.read_arrays, path, kind="k")
+    assert "does not match its manifest: sha256" in refusal(
+        artefacts.read_arrays, path, kind="k"
+    )
 
 
 def test_manifests_without_a_hash_of_the_file_stay_readable(tmp_path):
@@ -232,19 +288,30 @@ def test_manifests_without_a_hash_of_the_file_stay_readable(tmp_path):
     manifest = artefacts.write_arrays(path, {"x": np.arange(3)}, kind="k", config={})
     del manifest["file_sha256"]
     artefacts.write_json(path.with_suffix(".json"), manifest)
-    np.testing.assert_array_equal(artefacts.read_arrays(path, kind="k")[0]["x"], np.arange(3))
-    artefacts.write_json(path.with_suffix(".json"), manifest | {"file_sha256": "no hash"})
+    np.testing.assert_array_equal(
+        artefacts.read_arrays(path, kind="k")[0]["x"], np.arange(3)
+    )
+    artefacts.write_json(
+        path.with_suffix(".json"), manifest | {"file_sha256": "no hash"}
+    )
     assert "file_sha256 is malformed" in refusal(artefacts.read_arrays, path, kind="k")
 
 
 def test_the_same_arrays_make_the_same_file(tmp_path):
-    made = [artefacts.write_arrays(tmp_path / f"{name}.npz", {"x": np.eye(3)}, kind="k", config={}) for name in "ab"]
+    made = [
+        artefacts.write_arrays(
+            tmp_path / f"{name}.npz", {"x": np.eye(3)}, kind="k", config={}
+        )
+        for name in "ab"
+    ]
     assert (tmp_path / "a.npz").read_bytes() == (tmp_path / "b.npz").read_bytes()
     assert made[0]["file_sha256"] == made[1]["file_sha256"]
 
 
 @pytest.mark.parametrize("compressed", [False, True])
-def test_other_bytes_of_the_same_content_that_wait_do_not_hide_those_recorded(tmp_path, monkeypatch, compressed):
+def test_other_bytes_of_the_same_content_that_wait_do_not_hide_those_recorded(
+    tmp_path, monkeypatch, compressed
+):
     path, replace = tmp_path / "x.npz", os.replace
     artefacts.write_arrays(path, {"x": np.zeros(99)}, kind="k", config={})
 
@@ -255,9 +322,13 @@ def test_other_bytes_of_the_same_content_that_wait_do_not_hide_those_recorded(tm
 
     monkeypatch.setattr(os, "replace", killed)
     with pytest.raises(KeyboardInterrupt):
-        artefacts.write_arrays(path, {"x": np.zeros(99)}, kind="k", config={}, compressed=compressed)
+        artefacts.write_arrays(
+            path, {"x": np.zeros(99)}, kind="k", config={}, compressed=compressed
+        )
     monkeypatch.undo()
-    np.testing.assert_array_equal(artefacts.read_arrays(path, kind="k")[0]["x"], np.zeros(99))
+    np.testing.assert_array_equal(
+        artefacts.read_arrays(path, kind="k")[0]["x"], np.zeros(99)
+    )
 
 
 def test_a_cell_of_a_csv_file_does_not_make_all_others_as_wide(tmp_path):
@@ -265,8 +336,17 @@ def test_a_cell_of_a_csv_file_does_not_make_all_others_as_wide(tmp_path):
     rows += [f"{0.1 * k:.1f},{0.5 * k:.1f},0,0,5,0,0,0.9,0,a" for k in range(20_000)]
     rows[7] = rows[7][:-1] + "x" * 100_000
     (tmp_path / "a.csv").write_text("\n".join(rows))
-    with bounded(seconds=60, mebibytes=200), pytest.raises(ValueError, match="steering is always 0"):
-        datasets.from_logs(str(tmp_path), datasets.Columns(), dt=0.1, wheelbase=2.7, say=lambda line: None)
+    with (
+        bounded(seconds=60, mebibytes=200),
+        pytest.raises(ValueError, match="steering is always 0"),
+    ):
+        datasets.from_logs(
+            str(tmp_path),
+            datasets.Columns(),
+            dt=0.1,
+            wheelbase=2.7,
+            say=lambda line: None,
+        )
 
 
 # ---- exported controllers
@@ -304,21 +384,33 @@ def test_an_export_that_contradicts_itself_is_refused(tmp_path, change):
     fuzzing_readers.make_export(tmp_path)
     loader.ExportedController(tmp_path)
     forged(tmp_path, change)
-    assert str(tmp_path) in refusal(loader.ExportedController, tmp_path, error=loader.ExportError)
+    assert str(tmp_path) in refusal(
+        loader.ExportedController, tmp_path, error=loader.ExportError
+    )
 
 
-@pytest.mark.parametrize("text", ["[" * 100_000, '{"a":' * 5000 + "1" + "}" * 5000, "NaN", "\ufeff{}", "[]"])
+@pytest.mark.parametrize(
+    "text", ["[" * 100_000, '{"a":' * 5000 + "1" + "}" * 5000, "NaN", "\ufeff{}", "[]"]
+)
 def test_a_manifest_of_an_export_that_is_none_is_refused(tmp_path, text):
     fuzzing_readers.make_export(tmp_path)
     (tmp_path / "controller.json").write_text(text)
-    assert "controller.json: " in refusal(loader.ExportedController, tmp_path, error=loader.ExportError)
+    assert "controller.json: " in refusal(
+        loader.ExportedController, tmp_path, error=loader.ExportError
+    )
 
 
 def test_an_export_changed_in_a_number_that_no_program_holds_is_refused(tmp_path):
     fuzzing_readers.make_export(tmp_path)
     path = tmp_path / "controller.json"
-    path.write_bytes(path.read_bytes().replace(b'"sampling_period_s": 0.1', b'"sampling_period_s": 0.2'))
-    assert "changed, its sha256" in refusal(loader.ExportedController, tmp_path, error=loader.ExportError)
+    path.write_bytes(
+        path.read_bytes().replace(
+            b'"sampling_period_s": 0.1', b'"sampling_period_s": 0.2'
+        )
+    )
+    assert "changed, its sha256" in refusal(
+        loader.ExportedController, tmp_path, error=loader.ExportError
+    )
 
 
 # ---- pages
@@ -341,7 +433,11 @@ def test_a_report_of_rows_that_are_none_names_the_file(tmp_path):
 
 
 def test_a_row_cannot_name_arrays_outside_its_folder(tmp_path):
-    document = json.loads((Path(__file__).parents[1] / "experiments/table1_closed_loop/results.json").read_bytes())
+    document = json.loads(
+        (
+            Path(__file__).parents[1] / "experiments/table1_closed_loop/results.json"
+        ).read_bytes()
+    )
     rows = [row | {"arrays": "../../outside.npz"} for row in document["rows"][:3]]
     artefacts.write_json(tmp_path / "results.json", document | {"rows": rows})
     with pytest.raises(ArtefactError, match="outside this folder"):

@@ -1,4 +1,6 @@
-"""Files that are damaged, foreign or of another kind: each is one line that names it, and no other file is lost."""
+"""Files that are damaged, foreign or of another kind: each is one line that names it,
+and no other file is lost.
+"""
 
 import copy
 import json
@@ -24,12 +26,20 @@ from sfkd_jax.pipeline import store
 SHIPPED = demo.SHIPPED / "kinematic"
 WORSE = (None, "word", [], {}, -1, float("nan"), [[1, 2], 3], True, 10**400)
 """What a value of a document is replaced by."""
-DOCUMENTS = {"policy.json": 60, "certificate.json": 60, "results.json": 20, "settings.json": 10}
+DOCUMENTS = {
+    "policy.json": 60,
+    "certificate.json": 60,
+    "results.json": 20,
+    "settings.json": 10,
+}
 """Document -> how many times it is spoiled."""
 BYTES = {"policy.npz": 12, "policy.json": 8, "certificate.json": 8, "dataset.npz": 12}
 ROW = {"system": "sfkd", "scenario": "s3", "vehicle": "kinematic", "env": "measured"}
 SETTINGS = {
-    **{name: {"name": "kinematic"} for name in ("vehicle", "model", "controller", "training")},
+    **{
+        name: {"name": "kinematic"}
+        for name in ("vehicle", "model", "controller", "training")
+    },
     "dataset": {"env_low": [0.3, -8.0], "env_high": [0.9, 8.0]},
     "seed": 0,
 }
@@ -44,11 +54,16 @@ class Bomb:
 
 @pytest.fixture
 def run(tmp_path):
-    """A run directory as `train` leaves it, as far as readers of documents are concerned."""
+    """A run directory as `train` leaves it, as far as readers of documents are
+    concerned.
+    """
     place = tmp_path / "runs" / "smoke" / "sfkd" / "seed=0"
     shutil.copytree(SHIPPED, place)
     artefacts.write_json(place / "results.json", {"rows": [ROW]})
-    artefacts.write_json(place / "settings.json", {"seed": 0, "model": {"rank": 32}, "training": {"steps": 100}})
+    artefacts.write_json(
+        place / "settings.json",
+        {"seed": 0, "model": {"rank": 32}, "training": {"steps": 100}},
+    )
     return place
 
 
@@ -75,7 +90,9 @@ def read_policy(run):
         warnings.simplefilter("always")
         try:
             found = policy.load(run)
-        except TypeCheckError:  # under test, types are checked before anything is verified
+        except (
+            TypeCheckError
+        ):  # under test, types are checked before anything is verified
             raise ValueError("certificate: of other types") from None
     if found.certificate is None:
         raise ValueError(str(told[-1].message))
@@ -93,7 +110,13 @@ def read(run, name):
 
 def places(value, at=()):
     """Where values lie in a document."""
-    entries = value.items() if isinstance(value, dict) else enumerate(value[:2]) if isinstance(value, list) else ()
+    entries = (
+        value.items()
+        if isinstance(value, dict)
+        else enumerate(value[:2])
+        if isinstance(value, list)
+        else ()
+    )
     for key, entry in entries:
         yield (*at, key)
         yield from places(entry, (*at, key))
@@ -101,7 +124,10 @@ def places(value, at=()):
 
 def spoiled(document, draw):
     """The document with one value gone or replaced."""
-    changed, (*above, last) = copy.deepcopy(document), draw.choice(list(places(document)))
+    changed, (*above, last) = (
+        copy.deepcopy(document),
+        draw.choice(list(places(document))),
+    )
     inner = changed
     for key in above:
         inner = inner[key]
@@ -116,17 +142,32 @@ def damaged(content, draw):
     """Bytes that were cut, changed, doubled, or that never were of this kind."""
     at = draw.randrange(len(content))
     flipped = bytes([content[at] ^ (1 << draw.randrange(8))])
-    foreign = (b"", pickle.dumps(Bomb()), draw.randbytes(500), b"PK\x03\x04" + draw.randbytes(200), b"\xff\xfe\x00")
-    changes = (content[:at], content[:at] + flipped + content[at + 1 :], content[at:] + content, draw.choice(foreign))
+    foreign = (
+        b"",
+        pickle.dumps(Bomb()),
+        draw.randbytes(500),
+        b"PK\x03\x04" + draw.randbytes(200),
+        b"\xff\xfe\x00",
+    )
+    changes = (
+        content[:at],
+        content[:at] + flipped + content[at + 1 :],
+        content[at:] + content,
+        draw.choice(foreign),
+    )
     return draw.choice(changes)
 
 
 def snapshot(folder):
-    return {file: file.read_bytes() for file in sorted(folder.rglob("*")) if file.is_file()}
+    return {
+        file: file.read_bytes() for file in sorted(folder.rglob("*")) if file.is_file()
+    }
 
 
 def survives(action, file, content):
-    """Write what is wrong, read it, put back what was there: the line of the refusal; nothing else has changed."""
+    """Write what is wrong, read it, put back what was there: the line of the refusal;
+    nothing else has changed.
+    """
     folder, before = file.parent, file.read_bytes()
     file.write_bytes(content)
     held = snapshot(folder)
@@ -137,14 +178,22 @@ def survives(action, file, content):
 
 
 @pytest.mark.parametrize("name", DOCUMENTS)
-def test_a_document_with_a_value_gone_or_of_another_kind_is_refused_in_one_line_or_does_as_well(run, name):
+def test_a_document_with_a_value_gone_or_of_another_kind_is_refused_in_one_line_or_does_as_well(
+    run, name
+):
     draw, good, lines = random.Random(1), json.loads((run / name).read_text()), []
     for _ in range(DOCUMENTS[name]):
         text = json.dumps(spoiled(good, draw)).encode()
         lines.append(survives(lambda: read(run, name), run / name, text))
     refused = [line for line in lines if line]
-    assert len(refused) >= len(lines) // 5  # most values of a certificate are told and not used
-    assert [line for line in refused if not any(word in line for word in (name, "certificate", run.name))] == []
+    assert (
+        len(refused) >= len(lines) // 5
+    )  # most values of a certificate are told and not used
+    assert [
+        line
+        for line in refused
+        if not any(word in line for word in (name, "certificate", run.name))
+    ] == []
     assert refusal_of(lambda: read(run, "policy.json")) is None
 
 
@@ -159,7 +208,10 @@ def test_bytes_that_were_damaged_are_refused_or_say_the_same(run, name):
         def read_it(_):
             store.read_dataset(settings)
 
-    lines = [survives(lambda: read_it(run), file, damaged(file.read_bytes(), draw)) for _ in range(BYTES[name])]
+    lines = [
+        survives(lambda: read_it(run), file, damaged(file.read_bytes(), draw))
+        for _ in range(BYTES[name])
+    ]
     refused = [line for line in lines if line]
     assert len(refused) >= 0.7 * len(lines)
     assert [line for line in refused if file.stem not in line] == []
@@ -167,10 +219,23 @@ def test_bytes_that_were_damaged_are_refused_or_say_the_same(run, name):
 
 
 @pytest.mark.parametrize(
-    "name", ["results.json", "open_loop.json", "certificate.json", "metrics.jsonl", "episodes.npz"]
+    "name",
+    [
+        "results.json",
+        "open_loop.json",
+        "certificate.json",
+        "metrics.jsonl",
+        "episodes.npz",
+    ],
 )
 def test_a_report_names_the_file_that_it_cannot_draw(run, name):
-    for text in (b'{"rows": [', b"\xff\xfe", b"[1, 2]", b"7\n7\n", b"PK\x03\x04 not an archive"):
+    for text in (
+        b'{"rows": [',
+        b"\xff\xfe",
+        b"[1, 2]",
+        b"7\n7\n",
+        b"PK\x03\x04 not an archive",
+    ):
         (run / name).write_bytes(text)
         line = refusal_of(lambda: report.run(settings_of(run)))
         assert line is None or name in line
@@ -212,8 +277,12 @@ def opened(run_door, monkeypatch, capsys, *arguments):
         ("dataset.seed=null", "dataset.seed"),
     ],
 )
-def test_what_cannot_be_composed_is_one_line_of_a_door(monkeypatch, capsys, argument, says):
-    status, lines = opened(lambda settings: pytest.fail("a door was opened"), monkeypatch, capsys, argument)
+def test_what_cannot_be_composed_is_one_line_of_a_door(
+    monkeypatch, capsys, argument, says
+):
+    status, lines = opened(
+        lambda settings: pytest.fail("a door was opened"), monkeypatch, capsys, argument
+    )
     assert status == 1
     assert len(lines) == 1
     assert says in lines[0]
@@ -224,8 +293,14 @@ def full(*_):
 
 
 @pytest.mark.parametrize("call", ["fsync", "replace"])
-def test_a_full_disk_is_one_line_keeps_what_was_there_and_the_same_call_continues(run, monkeypatch, call):
-    settings, root, drives = settings_of(run), run.parents[2], dataset(count=20, steps=8)
+def test_a_full_disk_is_one_line_keeps_what_was_there_and_the_same_call_continues(
+    run, monkeypatch, call
+):
+    settings, root, drives = (
+        settings_of(run),
+        run.parents[2],
+        dataset(count=20, steps=8),
+    )
 
     def work():
         artefacts.write_json(run / "results.json", {"rows": [ROW, ROW]})
@@ -246,14 +321,20 @@ def refuse(*_, **__):
 
 
 @pytest.mark.parametrize("call", ["mkdir", "open"])
-def test_a_place_that_cannot_be_written_is_one_line_and_keeps_what_was_there(run, monkeypatch, call):
+def test_a_place_that_cannot_be_written_is_one_line_and_keeps_what_was_there(
+    run, monkeypatch, call
+):
     settings, root = settings_of(run) | {"name": "another"}, run.parents[2]
     before = snapshot(root)
     with monkeypatch.context() as read_only:
         read_only.setattr(Path, call, refuse)
         assert "Read-only file system" in refusal_of(lambda: store.claim(settings))
-        assert "Read-only file system" in refusal_of(lambda: artefacts.write_json(run / "results.json", {"rows": []}))
-    assert {file: content for file, content in snapshot(root).items() if file in before} == before
+        assert "Read-only file system" in refusal_of(
+            lambda: artefacts.write_json(run / "results.json", {"rows": []})
+        )
+    assert {
+        file: content for file, content in snapshot(root).items() if file in before
+    } == before
     store.claim(settings)
 
 
@@ -262,5 +343,9 @@ def test_segments_that_are_not_finite_are_no_data_set():
     for value in (np.nan, np.inf):
         bad = good._replace(states=good.states.at[0, 3, 3].set(value))
         low, high = jnp.asarray(ENV_LOW), jnp.asarray(ENV_HIGH)
-        with pytest.raises(ValueError, match="states of the trajectories are not finite"):
-            datasets.split(bad, jax.random.key(0), shares=SHARES, env_low=low, env_high=high)
+        with pytest.raises(
+            ValueError, match="states of the trajectories are not finite"
+        ):
+            datasets.split(
+                bad, jax.random.key(0), shares=SHARES, env_low=low, env_high=high
+            )

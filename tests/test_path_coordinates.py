@@ -1,4 +1,6 @@
-"""Path coordinates against their geometry, and a closed loop against the same drive in the world."""
+"""Path coordinates against their geometry, and a closed loop against the same drive in
+the world.
+"""
 
 import jax
 import jax.numpy as jnp
@@ -26,13 +28,17 @@ def foot(curvature: float, progress: float) -> jax.Array:
 def test_a_pose_beside_a_circle_is_found_again(curvature, progress):
     for lateral, heading in ((0.0, 0.0), (0.7, -0.2), (-1.5, 0.4)):
         pose = compose(foot(curvature, progress), jnp.asarray([0.0, lateral, heading]))
-        np.testing.assert_allclose(on_circle(pose, jnp.asarray(curvature)), (lateral, heading), atol=2e-5)
+        np.testing.assert_allclose(
+            on_circle(pose, jnp.asarray(curvature)), (lateral, heading), atol=2e-5
+        )
 
 
 @pytest.mark.parametrize("curvature", CURVATURES)
 def test_derivatives_exist_also_without_curvature_and_beyond_the_centre(curvature):
     for y in (0.0, 0.3, 1e3, -1e3):
-        rates = jax.jacfwd(on_circle, argnums=(0, 1))(jnp.asarray([1.0, y, 0.1]), jnp.asarray(curvature))
+        rates = jax.jacfwd(on_circle, argnums=(0, 1))(
+            jnp.asarray([1.0, y, 0.1]), jnp.asarray(curvature)
+        )
         assert all(bool(jnp.all(jnp.isfinite(leaf))) for leaf in jax.tree.leaves(rates))
 
 
@@ -45,10 +51,16 @@ def test_a_car_near_the_centre_of_curvature_is_told_and_stays_finite():
     assert not bool(is_valid(lateral, jnp.asarray(0.1)))
 
 
-@pytest.mark.parametrize("plant", [vehicle.kinematic(), vehicle.dynamic()], ids=lambda plant: plant.name)
+@pytest.mark.parametrize(
+    "plant", [vehicle.kinematic(), vehicle.dynamic()], ids=lambda plant: plant.name
+)
 @pytest.mark.parametrize("curvature", [-0.02, 0.0, 0.015])
-def test_the_loop_in_path_coordinates_drives_what_the_vehicle_drives_in_the_world(plant, curvature):
-    """The same feedback, once on ξ and once on the projection onto a path of constant curvature."""
+def test_the_loop_in_path_coordinates_drives_what_the_vehicle_drives_in_the_world(
+    plant, curvature
+):
+    """The same feedback, once on ξ and once on the projection onto a path of constant
+    curvature.
+    """
 
     def law(xi, kappa, speed, env):
         del env
@@ -66,7 +78,9 @@ def test_the_loop_in_path_coordinates_drives_what_the_vehicle_drives_in_the_worl
     @jax.jit
     def in_the_world(world, place):
         heading = world[2] - curvature * place
-        xi = jnp.concatenate([jnp.stack([project(path, world[:2], place)[1], heading]), world[3:]])
+        xi = jnp.concatenate(
+            [jnp.stack([project(path, world[:2], place)[1], heading]), world[3:]]
+        )
         world = plant.step(world, law(xi, curvature, 9.0, env) + inputs[:2], env)
         return world, *project(path, world[:2], place + 0.9)
 

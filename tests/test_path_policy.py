@@ -1,4 +1,6 @@
-"""A policy in path coordinates on its way through the store: law and weights are one artefact."""
+"""A policy in path coordinates on its way through the store: law and weights are one
+artefact.
+"""
 
 import jax
 import jax.numpy as jnp
@@ -17,17 +19,34 @@ def settings(*overrides):
     config.register()
     with initialize_config_dir(config.conf_path(), version_base="1.3"):
         composed = compose("config", overrides=["+experiment=s3", *overrides])
-    return {name: value for name, value in OmegaConf.to_container(composed, resolve=True).items() if name != "hydra"}
+    return {
+        name: value
+        for name, value in OmegaConf.to_container(composed, resolve=True).items()
+        if name != "hydra"
+    }
 
 
 def saved(place, *, law, samples=4):
-    asked = settings("controller=mppi_tiny", "controller.sampling=law", f"controller.mppi.num_samples={samples}")
-    asked["model"] |= {name: list(value) if isinstance(value, tuple) else value for name, value in TINY.items()}
+    asked = settings(
+        "controller=mppi_tiny",
+        "controller.sampling=law",
+        f"controller.mppi.num_samples={samples}",
+    )
+    asked["model"] |= {
+        name: list(value) if isinstance(value, tuple) else value
+        for name, value in TINY.items()
+    }
     asked["model"] |= {"budget": "joint"}
     scales = path_space()
     model = build.build_model(asked["model"], scales, vehicle.kinematic())
     asked |= {"space": build.space_to_settings(scales)}
-    return policy.save(place / "policy.npz", model.init(jax.random.key(0)), asked, made_from={}, law=law)
+    return policy.save(
+        place / "policy.npz",
+        model.init(jax.random.key(0)),
+        asked,
+        made_from={},
+        law=law,
+    )
 
 
 def test_the_law_is_stored_hashed_and_loaded_with_the_weights(tmp_path):
@@ -40,10 +59,18 @@ def test_the_law_is_stored_hashed_and_loaded_with_the_weights(tmp_path):
     assert loaded.model.along_path
     for name, leaf in any_law()._asdict().items():
         np.testing.assert_array_equal(getattr(loaded.law, name), leaf)
-    reference = jnp.stack([0.9 * jnp.arange(1, 21), *(jnp.zeros((2, 20))), jnp.full(20, 9.0)], axis=1)
+    reference = jnp.stack(
+        [0.9 * jnp.arange(1, 21), *(jnp.zeros((2, 20))), jnp.full(20, 9.0)], axis=1
+    )
     act = jax.jit(loaded.controller.act)
     memory = loaded.controller.init(jax.random.key(1))
-    control, _, info = act(loaded.params, memory, jnp.asarray([0.0, 0.2, 0.0, 9.0]), jnp.asarray([0.6, 0.0]), reference)
+    control, _, info = act(
+        loaded.params,
+        memory,
+        jnp.asarray([0.0, 0.2, 0.0, 9.0]),
+        jnp.asarray([0.6, 0.0]),
+        reference,
+    )
     assert np.all(np.isfinite(control))
     assert bool(info["healthy"])
 
@@ -54,7 +81,9 @@ def test_a_policy_that_lost_its_law_is_refused(tmp_path):
         policy.load(tmp_path)
 
 
-@pytest.mark.parametrize("overrides", [("dataset=standard",), ("model=sfkd", "controller=mppi")])
+@pytest.mark.parametrize(
+    "overrides", [("dataset=standard",), ("model=sfkd", "controller=mppi")]
+)
 def test_path_coordinates_for_data_and_model_or_for_neither(overrides):
     asked = settings(*overrides)
     with pytest.raises(ValueError, match="go together"):
@@ -65,10 +94,18 @@ def test_the_law_drives_as_a_row_along_a_path_alone():
     asked = settings("evaluation.systems=[law]")
     dry_run.check(asked, build.build_vehicle(asked["vehicle"]))
     with pytest.raises(ValueError, match=r"evaluation\.systems entry 'law'"):
-        dry_run.check(settings("dataset=standard", "model=sfkd", "evaluation.systems=[law]"), vehicle.kinematic())
+        dry_run.check(
+            settings("dataset=standard", "model=sfkd", "evaluation.systems=[law]"),
+            vehicle.kinematic(),
+        )
 
 
-@pytest.mark.parametrize("model", ["sfkd_path", "sfkd_path_no_contraction", "neural_ode_path", "r2dn_path"])
+@pytest.mark.parametrize(
+    "model", ["sfkd_path", "sfkd_path_no_contraction", "neural_ode_path", "r2dn_path"]
+)
 def test_every_path_model_is_rehearsed_with_its_planner(model):
-    asked = settings(f"model={model}", *(() if "sfkd" in model and "no" not in model else ("training.loss.tube=[]",)))
+    asked = settings(
+        f"model={model}",
+        *(() if "sfkd" in model and "no" not in model else ("training.loss.tube=[]",)),
+    )
     dry_run.check(asked, build.build_vehicle(asked["vehicle"]))

@@ -1,4 +1,6 @@
-"""What a setting may be: what cannot be meant is one line that names it, whichever setting of whichever option."""
+"""What a setting may be: what cannot be meant is one line that names it, whichever
+setting of whichever option.
+"""
 
 import math
 import random
@@ -14,7 +16,15 @@ from sfkd_jax import build
 from sfkd_jax.cli import config, ranges
 from sfkd_jax.pipeline import dry_run
 
-MODELS = ("sfkd", "koopman_mpc", "control_synth", "icode", "icode_mppi", "neural_ode", "r2dn")
+MODELS = (
+    "sfkd",
+    "koopman_mpc",
+    "control_synth",
+    "icode",
+    "icode_mppi",
+    "neural_ode",
+    "r2dn",
+)
 OPTIONS = (
     *(f"model={name}" for name in MODELS),
     "vehicle=dynamic",
@@ -23,7 +33,13 @@ OPTIONS = (
     "dataset=path",
     "comparison=paper",
 )
-SIGNED = {"vehicle.wind_lever", "vehicle.control_low", "vehicle.control_high", "dataset.env_low", "dataset.env_high"}
+SIGNED = {
+    "vehicle.wind_lever",
+    "vehicle.control_low",
+    "vehicle.control_high",
+    "dataset.env_low",
+    "dataset.env_high",
+}
 SIGNED |= {"evaluation.told.bias"}
 """Settings whose numbers may be negative."""
 FREE = {"evaluation.variation", "comparison.paper", "comparison.controllers", "hydra"}
@@ -84,12 +100,16 @@ def names(option):
 def use(settings):
     """What `train` does before anything is made."""
     plant = build.build_vehicle(settings["vehicle"])
-    build.build_scenario(settings["scenario"], plant, duration=settings["evaluation"]["episode_s"])
+    build.build_scenario(
+        settings["scenario"], plant, duration=settings["evaluation"]["episode_s"]
+    )
     dry_run.check(settings, plant)
 
 
 def refusal(option, name, value):
-    """The line with which a setting is refused, by its type or by what it says; None if it is not."""
+    """The line with which a setting is refused, by its type or by what it says; None if
+    it is not.
+    """
     settings = composed(option)
     before = OmegaConf.select(settings, name)
     before = OmegaConf.to_container(before) if OmegaConf.is_config(before) else before
@@ -107,7 +127,9 @@ def refusal(option, name, value):
 
 
 def impossible(name, value):
-    """Values that a setting cannot have, whatever the tables say: of another type, not finite, or below 0."""
+    """Values that a setting cannot have, whatever the tables say: of another type, not
+    finite, or below 0.
+    """
     sample = value[0] if isinstance(value, list) and value else value
     if value == []:
         return ["word", [math.nan], [{"a": 1}]]
@@ -118,17 +140,30 @@ def impossible(name, value):
     numbers = ["many", math.nan, math.inf, -math.inf, 1e39, {"a": 1}]
     numbers += [] if name in SIGNED else [-1]
     numbers += [2.5, 10**12] if isinstance(sample, int) else []
-    return [[number] * len(value) for number in numbers] + [7, "word"] if isinstance(value, list) else [*numbers, []]
+    return (
+        [[number] * len(value) for number in numbers] + [7, "word"]
+        if isinstance(value, list)
+        else [*numbers, []]
+    )
 
 
 def wrong():
-    """Name and value of every wrong setting of every option, each name once, then a sample of them."""
+    """Name and value of every wrong setting of every option, each name once, then a
+    sample of them.
+    """
     found = {}
     for option in OPTIONS:
         for name, value in names(option).items():
-            if name.partition(".")[0] in ("comparison", "report") or value in (None, "???") or name in FREE:
+            if (
+                name.partition(".")[0] in ("comparison", "report")
+                or value in (None, "???")
+                or name in FREE
+            ):
                 continue
-            found |= {(name, repr(one)): (option, name, one) for one in impossible(name, value)}
+            found |= {
+                (name, repr(one)): (option, name, one)
+                for one in impossible(name, value)
+            }
     return random.Random(0).sample(list(found.values()), SAMPLE)
 
 
@@ -137,7 +172,11 @@ def test_settings_of_the_wrong_type_or_size_are_refused_in_one_line_that_names_t
     for option, name, value in wrong():
         line = refusal(option, name, value)
         accepted += [(name, value)] if line is None else []
-        odd += [(name, value, line)] if line and ("\n" in line or name.split(".")[-1] not in line) else []
+        odd += (
+            [(name, value, line)]
+            if line and ("\n" in line or name.split(".")[-1] not in line)
+            else []
+        )
     assert accepted == []
     assert odd == []
 
@@ -157,7 +196,9 @@ def test_settings_that_do_not_go_together_are_refused_before_anything_is_made(na
     line = refusal(planner, name, TOGETHER[name])
     assert line
     assert "\n" not in line
-    assert re.search(name.split(".")[-1].replace("env_low", "env_low|environments"), line)
+    assert re.search(
+        name.split(".")[-1].replace("env_low", "env_low|environments"), line
+    )
 
 
 @pytest.mark.parametrize(
@@ -166,20 +207,44 @@ def test_settings_that_do_not_go_together_are_refused_before_anything_is_made(na
         ("training.batch", 0, "training.batch must be in [1, inf), got 0"),
         ("dataset.segments", -5, "dataset.segments must be in [4, inf), got -5"),
         ("certification.level", 1.5, "certification.level must be in (0, 1), got 1.5"),
-        ("controller.mppi.num_samples", 0, "controller.mppi.num_samples must be in [1, inf), got 0"),
+        (
+            "controller.mppi.num_samples",
+            0,
+            "controller.mppi.num_samples must be in [1, inf), got 0",
+        ),
         ("evaluation.episodes", 0, "evaluation.episodes must be in [1, inf), got 0"),
         ("scenario.speed", math.nan, "scenario.speed must be in (0, inf), got nan"),
-        ("scenario.wavelengths", [50.0], "scenario.wavelengths must be 2 entries, got [50.0]"),
-        ("scenario.wavelengths", [160.0, 50.0], "scenario.wavelengths must be in rising order, got [160.0, 50.0]"),
-        ("model.residual_hidden", [], "model.residual_hidden must be at least one entry, got []"),
+        (
+            "scenario.wavelengths",
+            [50.0],
+            "scenario.wavelengths must be 2 entries, got [50.0]",
+        ),
+        (
+            "scenario.wavelengths",
+            [160.0, 50.0],
+            "scenario.wavelengths must be in rising order, got [160.0, 50.0]",
+        ),
+        (
+            "model.residual_hidden",
+            [],
+            "model.residual_hidden must be at least one entry, got []",
+        ),
         ("seed", "abc", "seed must be a whole number, got 'abc'"),
         ("seed", True, "seed must be a whole number, got True"),
         ("name", 5, "name must be words, got 5"),
         ("name", " ", "name must be words, not nothing, got ' '"),
         ("root", None, "root must be set, got None"),
         ("demo", 5, "demo.episodes must be set, got None"),
-        ("evaluation.episode_s", 1.0, "evaluation.episode_s must be in (2, inf), got 1.0"),
-        ("comparison.seeds", [-1], "comparison.seeds must be in [0, inf) each, got [-1]"),
+        (
+            "evaluation.episode_s",
+            1.0,
+            "evaluation.episode_s must be in (2, inf), got 1.0",
+        ),
+        (
+            "comparison.seeds",
+            [-1],
+            "comparison.seeds must be in [0, inf) each, got [-1]",
+        ),
         ("comparison.share", 5, "comparison.share must be 2 entries, got 5"),
         ("comparison.rows.sfkd", 5, "comparison.rows.sfkd must be words, got 5"),
     ],
@@ -190,23 +255,40 @@ def test_the_line_says_what_a_setting_must_be_and_what_it_is(name, value, says):
 
 def test_every_name_in_the_tables_is_a_setting():
     known = {name for option in OPTIONS for name in names(option)}
-    assert [one for one in ranges.patterns() if not any(ranges.fits(name, one) for name in known)] == []
+    assert [
+        one
+        for one in ranges.patterns()
+        if not any(ranges.fits(name, one) for name in known)
+    ] == []
 
 
-@pytest.mark.parametrize("name", ["../../x", "a/../b", "/tmp/x", "a//b", "a/", "./a", "a\\b", "a\0b", "a\nb", ".."])
+@pytest.mark.parametrize(
+    "name",
+    ["../../x", "a/../b", "/tmp/x", "a//b", "a/", "./a", "a\\b", "a\0b", "a\nb", ".."],
+)
 @pytest.mark.parametrize("setting", ["name", "model.system", "comparison.policies"])
 def test_a_run_stays_below_the_root(setting, name):
     asked = container("model=sfkd")
     *above, last = setting.split(".")
     inner = asked[above[0]] if above else asked
     inner[last] = name
-    with pytest.raises(ValueError, match=rf"^{re.escape(setting)} must be a path below root") as refused:
+    with pytest.raises(
+        ValueError, match=rf"^{re.escape(setting)} must be a path below root"
+    ) as refused:
         ranges.check(asked)
     assert "\n" not in str(refused.value)
 
 
 @pytest.mark.parametrize(
-    "name", ["smoke", "a/b", "tune/learning_rate=0.003,consistency=0.001", "Läufe 2", "a..b", ".a"]
+    "name",
+    [
+        "smoke",
+        "a/b",
+        "tune/learning_rate=0.003,consistency=0.001",
+        "Läufe 2",
+        "a..b",
+        ".a",
+    ],
 )
 def test_names_with_folders_and_settings_in_them_are_names(name):
     ranges.check(container("model=sfkd") | {"name": name})
@@ -217,5 +299,7 @@ def test_the_keys_of_a_comparison_are_names_of_files():
     asked["comparison"]["rows"] = {"noise 0.1 and 2 m/s": "model=sfkd"}
     ranges.check(asked)
     asked["comparison"]["rows"] = {" ../../x": "model=sfkd"}
-    with pytest.raises(ValueError, match=r"comparison\.rows must have keys that are names of files"):
+    with pytest.raises(
+        ValueError, match=r"comparison\.rows must have keys that are names of files"
+    ):
         ranges.check(asked)

@@ -15,11 +15,15 @@ from sfkd_jax.reporting import benchmark_markdown
 ROOT = Path(__file__).parents[1]
 PAGES = runpy.run_path(str(ROOT / "benchmarks" / "result_pages.py"))["PAGES"]
 README = (ROOT / "README.md").read_text("utf-8")
-EXPERIMENTS = sorted(folder for folder in (ROOT / "experiments").iterdir() if folder.is_dir())
+EXPERIMENTS = sorted(
+    folder for folder in (ROOT / "experiments").iterdir() if folder.is_dir()
+)
 
 
 def within(value, bounds):
-    return (bounds[0] is None or value >= bounds[0]) and (bounds[1] is None or value <= bounds[1])
+    return (bounds[0] is None or value >= bounds[0]) and (
+        bounds[1] is None or value <= bounds[1]
+    )
 
 
 def test_the_first_screen_holds_the_two_commands():
@@ -38,11 +42,20 @@ def test_an_experiment_is_a_script_an_expectation_and_a_result_that_meets_it(fol
     expected = json.loads((folder / "expected.json").read_text())
     rows = json.loads((folder / "results.json").read_text())["rows"]
     for claim in expected.get("claims", []):
-        about = [row for row in rows if all(row[name] in wanted for name, wanted in claim["where"].items())]
+        about = [
+            row
+            for row in rows
+            if all(row[name] in wanted for name, wanted in claim["where"].items())
+        ]
         assert about, claim
         for row in about:
             for name, limits in claim["bounds"].items():
-                assert within(named(row, name), limits), (row["system"], row["scenario"], row["vehicle"], name)
+                assert within(named(row, name), limits), (
+                    row["system"],
+                    row["scenario"],
+                    row["vehicle"],
+                    name,
+                )
     found = {(row.get("scenario"), row["system"]): row for row in rows}
     for scenario, systems in expected.get("rows", {}).items():
         for system, bounds in systems.items():
@@ -53,14 +66,23 @@ def test_an_experiment_is_a_script_an_expectation_and_a_result_that_meets_it(fol
 
 @pytest.mark.parametrize(
     ("folder", "page"),
-    [found for found in PAGES.values() if (ROOT / "experiments" / found[0] / "results.json").exists()],
+    [
+        found
+        for found in PAGES.values()
+        if (ROOT / "experiments" / found[0] / "results.json").exists()
+    ],
 )
 def test_a_page_of_results_says_what_the_results_say(folder, page):
     results = json.loads((ROOT / "experiments" / folder / "results.json").read_text())
     shown = benchmark_markdown(results).replace("results_files/", f"{page}_files/")
     assert (ROOT / "docs" / f"{page}.md").read_text("utf-8") == shown
-    linked = {(ROOT / "docs" / figure).name for figure in re.findall(r"\]\((\S+\.png)\)", shown)}
-    assert {file.name for file in (ROOT / "docs" / f"{page}_files").glob("*.png")} == linked
+    linked = {
+        (ROOT / "docs" / figure).name
+        for figure in re.findall(r"\]\((\S+\.png)\)", shown)
+    }
+    assert {
+        file.name for file in (ROOT / "docs" / f"{page}_files").glob("*.png")
+    } == linked
 
 
 def test_the_page_about_foreign_plants_says_what_the_results_say():
@@ -81,17 +103,28 @@ def named(row, name):
 
 
 def test_a_low_certified_rate_costs_little_under_the_speed_loop():
-    """The curve of experiments/contraction: the lowest rate against the highest, and every certificate tight."""
+    """The curve of experiments/contraction: the lowest rate against the highest, and
+    every certificate tight.
+    """
     folder = ROOT / "experiments" / "contraction"
     expected = json.loads((folder / "expected.json").read_text())["speed"]
     rows = json.loads((folder / "results.json").read_text())["rows"]
-    curve = [row for row in rows if row["inner_loop"] == "speed" and row["beta"] == expected["beta"]]
+    curve = [
+        row
+        for row in rows
+        if row["inner_loop"] == "speed" and row["beta"] == expected["beta"]
+    ]
     highest = max(curve, key=lambda row: row["rho"])
     low = [row for row in curve if row["alpha"] <= expected["alpha"]]
     assert low
     for row in low:
-        predicted = row["open_loop"]["position_rmse_m"] / highest["open_loop"]["position_rmse_m"]
-        driven = named(row["closed_loop"]["s3"], "rmse_m") / named(highest["closed_loop"]["s3"], "rmse_m")
+        predicted = (
+            row["open_loop"]["position_rmse_m"]
+            / highest["open_loop"]["position_rmse_m"]
+        )
+        driven = named(row["closed_loop"]["s3"], "rmse_m") / named(
+            highest["closed_loop"]["s3"], "rmse_m"
+        )
         assert within(predicted, expected["prediction_ratio"]), row["run"]
         assert within(driven, expected["rmse_ratio"]), row["run"]
     assert all(1.0 <= row["tightness"] <= expected["tightness"] for row in rows)

@@ -1,4 +1,6 @@
-"""What a model does along a trajectory, where the answer is known: the true plant as a model."""
+"""What a model does along a trajectory, where the answer is known: the true plant as a
+model.
+"""
 
 import jax
 import jax.numpy as jnp
@@ -39,7 +41,9 @@ def test_a_wrong_model_has_defects_and_its_errors_grow(one):
 
 
 def test_fibres_are_those_of_each_step_and_of_the_one_after(one):
-    now, later = run(fibers_along, "oracle", one)  # the fibre of a physics model is e itself
+    now, later = run(
+        fibers_along, "oracle", one
+    )  # the fibre of a physics model is e itself
     np.testing.assert_array_equal(now, one.envs)
     np.testing.assert_array_equal(later[:-1], one.envs[1:])
     np.testing.assert_array_equal(later[-1], one.envs[-1])
@@ -53,16 +57,26 @@ def test_the_first_prediction_is_the_one_step_prediction(one, name):
 
 
 @pytest.mark.parametrize("name", ["sfkd", "segment"])
-def test_a_trajectory_that_the_model_made_itself_has_no_defect_where_the_encoder_inverts_the_decoder(one, name):
-    """d_k compares latents: with the rollout's own latents put in place of the encoder's, nothing is left."""
+def test_a_trajectory_that_the_model_made_itself_has_no_defect_where_the_encoder_inverts_the_decoder(
+    one, name
+):
+    """d_k compares latents: with the rollout's own latents put in place of the
+    encoder's, nothing is left.
+    """
     model, params = model_and_params(name)
 
     @jit
     def gap(params, data):
         _, latents, (fibers, later) = rollout(model, params, data)
         start = model.encode(at(fibers, 0), data.states[0])
-        before = jax.tree.map(lambda first, rest: jnp.concatenate([first[None], rest[:-1]]), start, latents)
-        after = jax.vmap(model.transport)(fibers, later, jax.vmap(model.step)(fibers, before, data.controls))
+        before = jax.tree.map(
+            lambda first, rest: jnp.concatenate([first[None], rest[:-1]]),
+            start,
+            latents,
+        )
+        after = jax.vmap(model.transport)(
+            fibers, later, jax.vmap(model.step)(fibers, before, data.controls)
+        )
         return model.vector(jax.tree.map(jnp.subtract, after, latents))
 
     assert float(jnp.max(jnp.abs(gap(params, one)))) < 1e-6
@@ -70,18 +84,24 @@ def test_a_trajectory_that_the_model_made_itself_has_no_defect_where_the_encoder
 
 @pytest.mark.parametrize("name", ["sfkd", "no_transport"])
 def test_a_defect_is_what_its_definition_says_on_every_switch(one, name):
-    """d_k = Φ(x_{k+1}, e_{k+1}) − T(e_k → e_{k+1}) F(Φ(x_k, e_k), u_k, e_k), step by step."""
+    """d_k = Φ(x_{k+1}, e_{k+1}) − T(e_k → e_{k+1}) F(Φ(x_k, e_k), u_k, e_k), step by
+    step.
+    """
     model, params = model_and_params(name)
 
     @jit
     def by_hand(params, here, there, state, after, control):
         fiber, fiber_next = model.fiber(params, here), model.fiber(params, there)
-        expected = model.transport(fiber, fiber_next, model.step(fiber, model.encode(fiber, state), control))
+        expected = model.transport(
+            fiber, fiber_next, model.step(fiber, model.encode(fiber, state), control)
+        )
         return model.encode(fiber_next, after).z - expected.z
 
     gaps, _ = run(defects, name, one)
     for k in (0, 4, len(one.envs) - 2):
-        gap = by_hand(params, *one.envs[k : k + 2], *one.states[k : k + 2], one.controls[k])
+        gap = by_hand(
+            params, *one.envs[k : k + 2], *one.states[k : k + 2], one.controls[k]
+        )
         np.testing.assert_allclose(gaps[k], gap, atol=3e-6)
     assert float(jnp.max(jnp.abs(gaps))) > 1e-4
 

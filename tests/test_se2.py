@@ -17,17 +17,23 @@ COMPOSE, BETWEEN = (jit(jax.vmap(law)) for law in (compose, between))
 def matrix(pose):
     """The homogeneous matrix of a pose, written down independently."""
     x, y, yaw = np.asarray(pose, dtype=np.float64)
-    return np.array([[np.cos(yaw), -np.sin(yaw), x], [np.sin(yaw), np.cos(yaw), y], [0.0, 0.0, 1.0]])
+    return np.array(
+        [[np.cos(yaw), -np.sin(yaw), x], [np.sin(yaw), np.cos(yaw), y], [0.0, 0.0, 1.0]]
+    )
 
 
 def test_composition_is_the_product_of_homogeneous_matrices():
     for pose, step, moved in zip(POSES, STEPS, COMPOSE(POSES, STEPS), strict=True):
-        np.testing.assert_allclose(matrix(moved), matrix(pose) @ matrix(step), atol=2e-5)
+        np.testing.assert_allclose(
+            matrix(moved), matrix(pose) @ matrix(step), atol=2e-5
+        )
 
 
 def test_between_is_the_product_with_the_inverse_matrix():
     for pose, other, step in zip(POSES, STEPS, BETWEEN(POSES, STEPS), strict=True):
-        np.testing.assert_allclose(matrix(step), np.linalg.inv(matrix(pose)) @ matrix(other), atol=2e-5)
+        np.testing.assert_allclose(
+            matrix(step), np.linalg.inv(matrix(pose)) @ matrix(other), atol=2e-5
+        )
 
 
 def test_between_undoes_composition():
@@ -48,7 +54,9 @@ def test_between_does_not_depend_on_the_frame_of_the_world():
 
 
 def test_composition_keeps_counting_turns_and_between_does_not():
-    start, step, end = (np.float32([[0.0, 0.0, yaw]]) for yaw in (3.0, 1.0, 3.0 + 4 * np.pi + 0.25))
+    start, step, end = (
+        np.float32([[0.0, 0.0, yaw]]) for yaw in (3.0, 1.0, 3.0 + 4 * np.pi + 0.25)
+    )
     np.testing.assert_array_equal(COMPOSE(start, step), [[0.0, 0.0, 4.0]])
     np.testing.assert_allclose(BETWEEN(start, end), [[0.0, 0.0, 0.25]], atol=2e-6)
 
@@ -56,7 +64,9 @@ def test_composition_keeps_counting_turns_and_between_does_not():
 @pytest.mark.parametrize("turns", [-3, -1, 0, 1, 3])
 def test_wrapping_removes_whole_turns_and_nothing_else(turns):
     angles = jnp.linspace(-3.1, 3.1, 63)
-    np.testing.assert_allclose(wrap_angle(angles + 2 * jnp.pi * turns), angles, atol=3e-6)
+    np.testing.assert_allclose(
+        wrap_angle(angles + 2 * jnp.pi * turns), angles, atol=3e-6
+    )
 
 
 def test_wrapped_angles_lie_within_half_a_turn():
@@ -70,5 +80,11 @@ def test_the_gradient_of_wrapping_is_one():
 
 
 def test_rotation_keeps_length_and_turns_by_the_angle():
-    np.testing.assert_allclose(rotate(jnp.asarray(jnp.pi / 2), jnp.asarray([1.0, 0.0])), [0.0, 1.0], atol=1e-6)
-    np.testing.assert_allclose(jnp.linalg.norm(rotate(jnp.asarray(0.7), jnp.asarray([3.0, 4.0]))), 5.0, rtol=1e-6)
+    np.testing.assert_allclose(
+        rotate(jnp.asarray(jnp.pi / 2), jnp.asarray([1.0, 0.0])), [0.0, 1.0], atol=1e-6
+    )
+    np.testing.assert_allclose(
+        jnp.linalg.norm(rotate(jnp.asarray(0.7), jnp.asarray([3.0, 4.0]))),
+        5.0,
+        rtol=1e-6,
+    )

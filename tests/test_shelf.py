@@ -1,4 +1,6 @@
-"""Where runs lie: a place from which nothing could be read back is refused before anything is trained."""
+"""Where runs lie: a place from which nothing could be read back is refused before
+anything is trained.
+"""
 
 from pathlib import Path
 
@@ -6,7 +8,11 @@ import pytest
 
 from sfkd_jax.pipeline import store
 
-SETTINGS = {name: {} for name in store.IDENTITY} | {"model": {"system": "sfkd"}, "seed": 0, "name": "trial"}
+SETTINGS = {name: {} for name in store.IDENTITY} | {
+    "model": {"system": "sfkd"},
+    "seed": 0,
+    "name": "trial",
+}
 
 
 @pytest.mark.parametrize("name", ["[a]", "trial=[1,2]"])

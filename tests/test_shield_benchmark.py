@@ -1,4 +1,6 @@
-"""The tables of the shield's benchmark: they hold its numbers, and what was missed is named."""
+"""The tables of the shield's benchmark: they hold its numbers, and what was missed is
+named.
+"""
 
 import runpy
 from pathlib import Path
@@ -10,19 +12,51 @@ MADE = runpy.run_path(str(BENCHMARKS / "shield_table.py"))
 
 
 def summary(departures=0, largest=0.0981, **shares):
-    kept = {"copy_m": 0.0774, "distance_m": 0.0412, "inside": 1.0, "intervened": 0.0, "infeasible": 0.0}
-    return {"drives": 200, "departures": departures, "largest_m": largest, "void": 0.0, "broken": 0.0} | kept | shares
+    kept = {
+        "copy_m": 0.0774,
+        "distance_m": 0.0412,
+        "inside": 1.0,
+        "intervened": 0.0,
+        "infeasible": 0.0,
+    }
+    return (
+        {
+            "drives": 200,
+            "departures": departures,
+            "largest_m": largest,
+            "void": 0.0,
+            "broken": 0.0,
+        }
+        | kept
+        | shares
+    )
 
 
 def document(**changes):
     scripts = {
-        "full lock": {"with": summary(intervened=0.98765), "without": summary(200, 84.0)},
+        "full lock": {
+            "with": summary(intervened=0.98765),
+            "without": summary(200, 84.0),
+        },
         "NaN": {"with": summary(void=1e-5), "without": summary(200, None)},
     }
-    planner = {"with": summary(intervened=0.0004) | {"rmse_m": 0.0093}, "without": summary() | {"rmse_m": 0.0092}}
+    planner = {
+        "with": summary(intervened=0.0004) | {"rmse_m": 0.0093},
+        "without": summary() | {"rmse_m": 0.0092},
+    }
     step = {"with": {"median_ms": 4.5}, "without": {"median_ms": 4.0}, "added_ms": 0.5}
-    car = {"bounds": {"nominal": 0.0781, "followed_position": 0.064}, "scripts": scripts, "step": step}
-    return {"cars": {"dynamic": car | {"planner": planner | {"rmse_ratio": 0.0093 / 0.0092}} | changes}}
+    car = {
+        "bounds": {"nominal": 0.0781, "followed_position": 0.064},
+        "scripts": scripts,
+        "step": step,
+    }
+    return {
+        "cars": {
+            "dynamic": car
+            | {"planner": planner | {"rmse_ratio": 0.0093 / 0.0092}}
+            | changes
+        }
+    }
 
 
 def test_the_tables_hold_every_planner_and_what_it_came_to():

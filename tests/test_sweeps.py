@@ -1,4 +1,6 @@
-"""Sweeps: every job has a run of its own, a job that fails is told and leaves the others alone, a study goes on."""
+"""Sweeps: every job has a run of its own, a job that fails is told and leaves the
+others alone, a study goes on.
+"""
 
 import json
 import subprocess
@@ -15,7 +17,7 @@ SCRIPT = """
     import os
 
     from sfkd_jax import shelf
-    from sfkd_jax.config import command, door
+    from sfkd_jax.cli.config import command, door
 
     def run(settings):
         if settings["seed"] == 1:
@@ -39,7 +41,9 @@ def sweep(tmp_path):
 
     def start(*arguments):
         command = [sys.executable, "toy.py", *arguments]
-        return subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, timeout=300)
+        return subprocess.run(
+            command, cwd=tmp_path, capture_output=True, text=True, timeout=300
+        )
 
     return start
 
@@ -55,36 +59,65 @@ def printed(done, word="{"):
 
 
 def test_every_job_has_a_run_that_its_settings_name_and_one_line_if_it_fails(sweep):
-    done = sweep("-m", "+experiment=smoke", RATES, "model.residual_hidden=[8,8],[16]", "seed=0,1,2")
+    done = sweep(
+        "-m",
+        "+experiment=smoke",
+        RATES,
+        "model.residual_hidden=[8,8],[16]",
+        "seed=0,1,2",
+    )
     assert done.returncode == 1
     runs = [json.loads(line)["run"] for line in printed(done)]
     assert len(set(runs)) == 4
     assert {Path(run).parts[-2:] for run in runs} == {("sfkd", "seed=0")}
     assert not any(character in run for run in runs for character in "[]'\"")
     names = {Path(run).parts[2] for run in runs}
-    assert {name.split(",")[1] for name in names} == {"training.learning_rate=0.001", "training.learning_rate=0.003"}
+    assert {name.split(",")[1] for name in names} == {
+        "training.learning_rate=0.001",
+        "training.learning_rate=0.003",
+    }
     jobs, total = told(done)
-    assert total == "sfkd_jax: 8 of 12 jobs failed; the same sweep again skips what is finished"
+    assert (
+        total
+        == "sfkd_jax: 8 of 12 jobs failed; the same sweep again skips what is finished"
+    )
     words = "training.learning_rate=0.001 model.residual_hidden=[8,8] seed=1"
     assert jobs[0] == f"sfkd_jax: job 1 ({words}) failed: a job that cannot be done"
-    assert sum(line.endswith("failed: TypeError: a job with a bug") for line in jobs) == 4
+    assert (
+        sum(line.endswith("failed: TypeError: a job with a bug") for line in jobs) == 4
+    )
 
 
 def test_what_a_job_typed_names_its_run_in_a_shell_as_well(sweep):
     """Of a sweep over more, and outside one."""
     done = sweep("-m", "+experiment=smoke", RATES, "seed=0")
     command = printed(done, "typed")[0].split(" ", 4)[-1]
-    again = sweep(*subprocess.check_output(["sh", "-c", f"printf '%s\\n' {command}"], text=True).split())
+    again = sweep(
+        *subprocess.check_output(
+            ["sh", "-c", f"printf '%s\\n' {command}"], text=True
+        ).split()
+    )
     assert (again.returncode, again.stderr) == (0, "")
     assert printed(again) == printed(done)[:1]
 
 
-def test_what_a_run_directory_names_already_or_what_decides_no_weights_is_not_named(sweep):
+def test_what_a_run_directory_names_already_or_what_decides_no_weights_is_not_named(
+    sweep,
+):
     done = sweep(
-        "-m", "+experiment=s1,s2", "model=sfkd_path,r2dn_path", "seed=0", "training.steps=50", "evaluation=tiny,quick"
+        "-m",
+        "+experiment=s1,s2",
+        "model=sfkd_path,r2dn_path",
+        "seed=0",
+        "training.steps=50",
+        "evaluation=tiny,quick",
     )
     runs = [json.loads(line)["run"] for line in printed(done)]
-    places = [f"runs/{name}/{model}/seed=0" for name in ("s1", "s2") for model in ("sfkd_path", "r2dn_path")]
+    places = [
+        f"runs/{name}/{model}/seed=0"
+        for name in ("s1", "s2")
+        for model in ("sfkd_path", "r2dn_path")
+    ]
     assert runs == [place for place in places for _ in range(2)]
     assert done.returncode == 0
 
@@ -120,18 +153,36 @@ def test_a_sweep_that_cannot_be_launched_is_one_line(sweep, monkeypatch):
 
 def test_outside_a_sweep_the_same_failure_is_an_exit_status(sweep):
     done = sweep("seed=1")
-    assert (done.returncode, done.stderr.strip()) == (1, "sfkd_jax: a job that cannot be done")
+    assert (done.returncode, done.stderr.strip()) == (
+        1,
+        "sfkd_jax: a job that cannot be done",
+    )
 
 
 def test_a_study_minimises_survives_a_failure_and_continues(sweep, tmp_path):
-    options = ("-m", "hydra/sweeper=optuna", "hydra.sweeper.n_jobs=1", "hydra.sweeper.direction=minimize")
-    options += ("hydra.sweeper.study_name=toy", "hydra.sweeper.storage=sqlite:///toy.db")
+    options = (
+        "-m",
+        "hydra/sweeper=optuna",
+        "hydra.sweeper.n_jobs=1",
+        "hydra.sweeper.direction=minimize",
+    )
+    options += (
+        "hydra.sweeper.study_name=toy",
+        "hydra.sweeper.storage=sqlite:///toy.db",
+    )
     grid = ("hydra/sweeper/sampler=grid", "seed=choice(0,1,3,5)")
     found = []
     for trials in (2, 4):
-        done = sweep(*options, *grid, f"hydra.sweeper.n_trials={trials}", f"hydra.sweep.dir=sweep{trials}")
+        done = sweep(
+            *options,
+            *grid,
+            f"hydra.sweeper.n_trials={trials}",
+            f"hydra.sweep.dir=sweep{trials}",
+        )
         assert done.returncode == 0, done.stderr[-2000:]
-        found.append(OmegaConf.load(tmp_path / f"sweep{trials}" / "optimization_results.yaml"))
+        found.append(
+            OmegaConf.load(tmp_path / f"sweep{trials}" / "optimization_results.yaml")
+        )
     assert found[-1].best_value == 0.0
     assert found[-1].best_params == {"seed": 3}
 
@@ -145,7 +196,11 @@ def test_a_study_fails_if_every_trial_did():
 
 
 def composed(**values):
-    config = {"training": {"a": 1.0, "b": "x"}, "model": {"sizes": [8, 8]}, "hydra": {"runtime": {"choices": {}}}}
+    config = {
+        "training": {"a": 1.0, "b": "x"},
+        "model": {"sizes": [8, 8]},
+        "hydra": {"runtime": {"choices": {}}},
+    }
     return OmegaConf.merge(config, OmegaConf.create(values))
 
 
@@ -178,14 +233,27 @@ def test_policies_of_a_comparison_lie_apart_as_its_results_do():
     assert sweeps.with_name(asked, OmegaConf.create(known), "") == asked
     found = sweeps.with_name(asked, OmegaConf.create(known), "training.a=1")
     assert found == [*asked[:2], r"name=table1/training.a\=1"]
-    found = sweeps.with_name(asked, OmegaConf.create(known | {"name": "seeds"}), "training.a=1")
-    assert found[2:] == [r"name=seeds/training.a\=1", r"comparison.policies=table1/training.a\=1"]
+    found = sweeps.with_name(
+        asked, OmegaConf.create(known | {"name": "seeds"}), "training.a=1"
+    )
+    assert found[2:] == [
+        r"name=seeds/training.a\=1",
+        r"comparison.policies=table1/training.a\=1",
+    ]
 
 
 def test_directories_differ_where_settings_do_and_not_with_their_order():
-    sizes = [composed(model={"sizes": sizes}) for sizes in ([8, 8], [88], [8, [8]], ["8", 8], "8-8")]
-    assert len({sweeps.directory(config, {"model.sizes"}) for config in sizes}) == len(sizes)
-    assert sweeps.directory(composed(), {"training.b", "training.a"}) == "training.a=1.0,training.b=x"
+    sizes = [
+        composed(model={"sizes": sizes})
+        for sizes in ([8, 8], [88], [8, [8]], ["8", 8], "8-8")
+    ]
+    assert len({sweeps.directory(config, {"model.sizes"}) for config in sizes}) == len(
+        sizes
+    )
+    assert (
+        sweeps.directory(composed(), {"training.b", "training.a"})
+        == "training.a=1.0,training.b=x"
+    )
     many = composed(training={f"setting{number}": number for number in range(40)})
     name = sweeps.directory(many, {f"training.setting{number}" for number in range(40)})
     assert len(name) <= sweeps.LONGEST_NAME
@@ -224,13 +292,20 @@ def test_what_can_never_start_is_not_waited_for(queue):
     lines = ("7_0|PENDING|PartitionTimeLimit", "7_1|PENDING|Priority")
     assert queue(*lines) == [False, False]
     assert queue(*lines, seconds=queues.HOPELESS_S) == [True, False]
-    assert "never start (Slurm says PartitionTimeLimit)" in queues._said(queue.watcher.get_info("7_0", mode="cache"))
-    assert queue("7_0|PENDING|Priority", "7_1|PENDING|Priority", seconds=queues.HOPELESS_S) == [False, False]
+    assert "never start (Slurm says PartitionTimeLimit)" in queues._said(
+        queue.watcher.get_info("7_0", mode="cache")
+    )
+    assert queue(
+        "7_0|PENDING|Priority", "7_1|PENDING|Priority", seconds=queues.HOPELESS_S
+    ) == [False, False]
     assert queue(*lines) == [False, False]
 
 
 def test_what_was_raised_becomes_one_line():
-    assert queues.one_line(RuntimeError("sbatch: error:\n  no such partition")) == "sbatch: error: no such partition"
+    assert (
+        queues.one_line(RuntimeError("sbatch: error:\n  no such partition"))
+        == "sbatch: error: no such partition"
+    )
     assert queues.one_line(KeyError("a")) == "KeyError: 'a'"
     assert queues.one_line(ValueError()) == "ValueError"
     assert len(queues.one_line(OSError("x" * 5000))) == 400

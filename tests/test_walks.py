@@ -1,4 +1,6 @@
-"""Doors opened from nothing: what is missing is made, for a vehicle of one's own and every job of a sweep."""
+"""Doors opened from nothing: what is missing is made, for a vehicle of one's own and
+every job of a sweep.
+"""
 
 import json
 
@@ -7,7 +9,14 @@ from helpers import door, last_line
 
 
 def test_a_sweep_runs_every_job_and_ends_with_json(tmp_path):
-    done = door("generate", "-m", "+experiment=smoke", "dataset.segments=40", "dataset.seed=0,1", cwd=tmp_path)
+    done = door(
+        "generate",
+        "-m",
+        "+experiment=smoke",
+        "dataset.segments=40",
+        "dataset.seed=0,1",
+        cwd=tmp_path,
+    )
     assert last_line(done)["segments"] == 40
     assert len(list((tmp_path / "runs/datasets").iterdir())) == 2
 
@@ -26,12 +35,32 @@ def step(x, u, e):
 
 
 def test_the_walk_works_for_a_step_function_of_ones_own_under_a_speed_loop(tmp_path):
-    """From a file in the current directory to data, weights, a certificate, driven episodes and a report."""
+    """From a file in the current directory to data, weights, a certificate, driven
+    episodes and a report.
+    """
     (tmp_path / "my_robot.py").write_text(ROBOT)
-    own = ("vehicle=own", "vehicle.step=my_robot:step", "vehicle.state_names=[p_x,p_y,yaw,v,yaw_rate]")
-    own += ("vehicle.control_low=[-0.4,-3.0]", "vehicle.control_high=[0.4,2.0]", "vehicle.wheelbase=1.0")
-    small = ("training.steps=25", "training.save_every=25", "dataset.segments=160", "evaluation.episode_s=4.0")
-    small += ("model.rank=8", "model.vertices=3", "model.residual_hidden=[8,8]", "model.decoder_hidden=[8]")
+    own = (
+        "vehicle=own",
+        "vehicle.step=my_robot:step",
+        "vehicle.state_names=[p_x,p_y,yaw,v,yaw_rate]",
+    )
+    own += (
+        "vehicle.control_low=[-0.4,-3.0]",
+        "vehicle.control_high=[0.4,2.0]",
+        "vehicle.wheelbase=1.0",
+    )
+    small = (
+        "training.steps=25",
+        "training.save_every=25",
+        "dataset.segments=160",
+        "evaluation.episode_s=4.0",
+    )
+    small += (
+        "model.rank=8",
+        "model.vertices=3",
+        "model.residual_hidden=[8,8]",
+        "model.decoder_hidden=[8]",
+    )
     small += ("evaluation.systems=[self]", "vehicle.inner_loop=speed", "name=robot")
     walk = last_line(door("train", "+experiment=smoke", *own, *small, cwd=tmp_path))
     assert (tmp_path / walk["report"]).exists()

@@ -1,4 +1,6 @@
-"""Several processes at one directory: nothing is lost, and whoever finds it taken is told by whom."""
+"""Several processes at one directory: nothing is lost, and whoever finds it taken is
+told by whom.
+"""
 
 import json
 import re
@@ -36,20 +38,33 @@ HOLD = """
 def started(program, *arguments):
     """A process that runs a program; its first line of output says that it is ready."""
     command = [sys.executable, "-c", textwrap.dedent(program), *map(str, arguments)]
-    process = subprocess.Popen(command, stdout=subprocess.PIPE, stdin=subprocess.PIPE, text=True)
+    process = subprocess.Popen(
+        command, stdout=subprocess.PIPE, stdin=subprocess.PIPE, text=True
+    )
     assert process.stdout.readline().strip()
     return process
 
 
 def driven(row, value=0.0, episodes=2, steps=40):
     """Arrays of a row as `evaluate` stores them, filled with a value."""
-    shapes = {"lateral": (steps,), "states": (steps + 1, 4), "controls": (steps, 2), "envs": (steps, 2), "path": (9, 4)}
+    shapes = {
+        "lateral": (steps,),
+        "states": (steps + 1, 4),
+        "controls": (steps, 2),
+        "envs": (steps, 2),
+        "path": (9, 4),
+    }
     name = artefacts.drive_name(row)
-    return {f"{name}/{part}": np.full((episodes, *shape), float(value)) for part, shape in shapes.items()}
+    return {
+        f"{name}/{part}": np.full((episodes, *shape), float(value))
+        for part, shape in shapes.items()
+    }
 
 
 def store(place, row, value=0.0):
-    evaluate._write(place, SETTINGS, [row], driven(row, value) | {"dt": np.asarray(0.1)}, 0.0)
+    evaluate._write(
+        place, SETTINGS, [row], driven(row, value) | {"dt": np.asarray(0.1)}, 0.0
+    )
 
 
 def stored(place):
@@ -72,7 +87,10 @@ def test_a_taken_directory_is_refused_at_once_in_a_line_that_says_by_whom(tmp_pa
     line = str(told.value)
     assert "\n" not in line
     assert line.startswith(f"{tmp_path}: process {holder.pid} on ")
-    assert re.search(r"\(python -c .*since \d{4}-\d\d-\d\d \d\d:\d\d:\d\d\+00:00\) is writing there", line)
+    assert re.search(
+        r"\(python -c .*since \d{4}-\d\d-\d\d \d\d:\d\d:\d\d\+00:00\) is writing there",
+        line,
+    )
 
 
 def test_kill_9_frees_a_directory(tmp_path):
@@ -97,14 +115,18 @@ def test_a_process_enters_what_it_holds_again_and_leaves_it_once(tmp_path):
         with locked(tmp_path / "." / ""):
             pass
         process = subprocess.run(
-            [sys.executable, "-c", textwrap.dedent(HOLD), str(tmp_path), "0"], capture_output=True, text=True
+            [sys.executable, "-c", textwrap.dedent(HOLD), str(tmp_path), "0"],
+            capture_output=True,
+            text=True,
         )
         assert "is writing there" in process.stderr
     assert started(HOLD, tmp_path, 0).wait() == 0
 
 
 @pytest.mark.parametrize("errno", [38, 95, 37])
-def test_a_file_system_without_locks_gets_a_file_with_the_process_in_it(tmp_path, monkeypatch, errno):
+def test_a_file_system_without_locks_gets_a_file_with_the_process_in_it(
+    tmp_path, monkeypatch, errno
+):
     """Such a file outlives its process, so another one must see that it is of nobody."""
 
     def absent(descriptor):
@@ -160,7 +182,10 @@ def test_two_processes_20_ms_apart_lose_no_row_and_no_episode(tmp_path):
 
 
 def test_three_planners_in_one_directory_keep_three_rows_with_their_episodes(tmp_path):
-    rows = [ROW | {"controller": name, "planner": name} for name in ("mppi", "cem", "gradient")]
+    rows = [
+        ROW | {"controller": name, "planner": name}
+        for name in ("mppi", "cem", "gradient")
+    ]
     for value, row in enumerate(rows, 1):
         store(tmp_path, row, value)
     kept, arrays = stored(tmp_path)
@@ -169,7 +194,11 @@ def test_three_planners_in_one_directory_keep_three_rows_with_their_episodes(tmp
         for part in ("lateral", "states", "controls", "envs", "path"):
             assert np.all(arrays[f"{artefacts.drive_name(row)}/{part}"] == value)
     scenes = scenes_of(tmp_path)
-    assert {scene.lateral["sfkd"][0, 0]: "cem" in scene.label for scene in scenes} == {1: False, 2: True, 3: False}
+    assert {scene.lateral["sfkd"][0, 0]: "cem" in scene.label for scene in scenes} == {
+        1: False,
+        2: True,
+        3: False,
+    }
     assert len({scene.stem for scene in scenes}) == 3
     blocks = blocks_of(kept)
     assert [len(block) for block in blocks] == [1, 1, 1]
@@ -186,16 +215,32 @@ def test_rows_that_differ_in_one_part_of_their_identity_are_two(name):
     assert artefacts.merge([ROW], [other]) == [ROW, other]
     assert artefacts.merge([ROW], [dict(ROW)]) == [ROW]
     assert artefacts.drive_name(ROW) != artefacts.drive_name(other)
-    known = {key: value for key, value in artefacts.identity(other).items() if value is not None}
+    known = {
+        key: value
+        for key, value in artefacts.identity(other).items()
+        if value is not None
+    }
     assert artefacts.drive_of(artefacts.drive_name(other)) == known
 
 
 def test_rows_and_episodes_of_an_earlier_version_are_read_and_replaced(tmp_path):
     """It had no planner in its rows, and named arrays by system and scenario alone."""
-    old = {name: value for name, value in ROW.items() if name not in ("planner", "inner_loop")}
-    arrays = {f"sfkd/s3/{name.rpartition('/')[2]}": array for name, array in driven(ROW, 1.0).items()}
+    old = {
+        name: value
+        for name, value in ROW.items()
+        if name not in ("planner", "inner_loop")
+    }
+    arrays = {
+        f"sfkd/s3/{name.rpartition('/')[2]}": array
+        for name, array in driven(ROW, 1.0).items()
+    }
     arrays |= {f"s3/{part}": arrays.pop(f"sfkd/s3/{part}") for part in artefacts.ROAD}
-    artefacts.write_arrays(tmp_path / "episodes.npz", arrays | {"dt": np.asarray(0.1)}, kind="episodes", config={})
+    artefacts.write_arrays(
+        tmp_path / "episodes.npz",
+        arrays | {"dt": np.asarray(0.1)},
+        kind="episodes",
+        config={},
+    )
     artefacts.write_json(tmp_path / "results.json", {"rows": [old]})
     (scene,) = scenes_of(tmp_path)
     assert (scene.label, scene.stem, list(scene.lateral)) == ("S3", "s3", ["sfkd"])
@@ -205,7 +250,10 @@ def test_rows_and_episodes_of_an_earlier_version_are_read_and_replaced(tmp_path)
     for part in ("lateral", *artefacts.ROAD):
         assert np.all(kept[f"{artefacts.drive_name(ROW)}/{part}"] == 1.0)
     store(tmp_path, ROW, 3.0)
-    assert json.loads((tmp_path / "results.json").read_text())["rows"] == [ROW | {"planner": "cem"}, ROW]
+    assert json.loads((tmp_path / "results.json").read_text())["rows"] == [
+        ROW | {"planner": "cem"},
+        ROW,
+    ]
     assert len(scenes_of(tmp_path)) == 2
 
 
@@ -214,4 +262,7 @@ def test_drives_on_other_roads_are_other_scenes(tmp_path):
     store(tmp_path, ROW | {"system": "nominal", "env": "none"}, 1.0)
     store(tmp_path, ROW | {"system": "oracle"}, 1.0)
     store(tmp_path, ROW, 2.0)
-    assert sorted(sorted(scene.lateral) for scene in scenes_of(tmp_path)) == [["nominal", "oracle"], ["sfkd"]]
+    assert sorted(sorted(scene.lateral) for scene in scenes_of(tmp_path)) == [
+        ["nominal", "oracle"],
+        ["sfkd"],
+    ]

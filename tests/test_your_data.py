@@ -22,7 +22,14 @@ sys.path.append(str(Path(__file__).parent / "datasets"))
 from recorded import drive, write_csv
 
 STATE = "dataset.columns.state=[p_x,p_y,yaw,v,yaw_rate]"
-SMALL = ("+experiment=smoke", "dataset=files", "dataset.path=logs", "dataset.steps=10", STATE, "env=none")
+SMALL = (
+    "+experiment=smoke",
+    "dataset=files",
+    "dataset.path=logs",
+    "dataset.steps=10",
+    STATE,
+    "env=none",
+)
 TINY = (
     "model.rank=8",
     "model.vertices=3",
@@ -42,7 +49,9 @@ FAST = (
 def settings(*overrides):
     config.register()
     with initialize_config_dir(config.conf_path(), version_base="1.3"):
-        return OmegaConf.to_container(compose("config", overrides=list(overrides)), resolve=True)
+        return OmegaConf.to_container(
+            compose("config", overrides=list(overrides)), resolve=True
+        )
 
 
 @pytest.fixture(scope="module")
@@ -53,13 +62,24 @@ def logs(tmp_path_factory):
     for k in range(8):
         columns = drive(seconds=12.0, phase=0.8 * k)
         columns["yaw_rate"] = np.gradient(columns["yaw"], columns["t"])
-        write_csv(place / f"{k}.csv", {name: columns[name] for name in columns if name not in ("friction", "wind")})
+        write_csv(
+            place / f"{k}.csv",
+            {
+                name: columns[name]
+                for name in columns
+                if name not in ("friction", "wind")
+            },
+        )
     return place
 
 
 @pytest.mark.slow
 def test_logs_become_a_certified_policy_of_a_robot_that_nothing_drives(logs):
-    walked = last_line(done := door("train", *SMALL, *TINY, *FAST, "model.environment=false", cwd=logs.parent))
+    walked = last_line(
+        done := door(
+            "train", *SMALL, *TINY, *FAST, "model.environment=false", cwd=logs.parent
+        )
+    )
     assert walked["results"] is None
     assert "not driven" in done.stderr
     certificate = json.loads((logs.parent / walked["certificate"]).read_text())
@@ -77,10 +97,14 @@ def test_logs_become_a_certified_policy_of_a_robot_that_nothing_drives(logs):
     assert not {"path"} & set(policy.settings["dataset"])
     init = jax.eval_shape(policy.controller.init, jax.random.key(0))
     shapes = (jnp.zeros(5), jnp.zeros(2), jnp.zeros((20, 4)))
-    assert jax.eval_shape(policy.controller.act, policy.params, init, *shapes)[0].shape == (2,)
+    assert jax.eval_shape(policy.controller.act, policy.params, init, *shapes)[
+        0
+    ].shape == (2,)
 
 
-def test_logs_lie_on_the_shelf_with_their_coverage_and_test_drives_alone_are_held_out(logs, monkeypatch):
+def test_logs_lie_on_the_shelf_with_their_coverage_and_test_drives_alone_are_held_out(
+    logs, monkeypatch
+):
     monkeypatch.chdir(logs.parent)
     asked = settings(*SMALL)
     dataset, _ = stages.ensure_dataset(asked)
@@ -89,7 +113,9 @@ def test_logs_lie_on_the_shelf_with_their_coverage_and_test_drives_alone_are_hel
     held_out = stages.held_out_drives(asked, dataset)
     assert set(held_out) == {"test"}
     assert held_out["test"] is dataset.test
-    covered = json.loads((store.dataset_path(asked).parent / "coverage.json").read_text())
+    covered = json.loads(
+        (store.dataset_path(asked).parent / "coverage.json").read_text()
+    )
     assert set(covered["state"]) == {"v", "yaw_rate"}
     assert 4.0 <= covered["state"]["v"]["low"] < covered["state"]["v"]["high"] <= 6.0
 
@@ -99,9 +125,14 @@ def test_what_logs_cannot_support_is_refused_before_a_run_is_begun(logs, monkeyp
     asked = settings(*SMALL, "name=other", "certification.level=0.99")
     with pytest.raises(ValueError, match="12 calibration segments are too few for"):
         stages.ensure_policy(asked)
-    with pytest.raises(ValueError, match="no column friction for the environment; pass env=none"):
+    with pytest.raises(
+        ValueError, match="no column friction for the environment; pass env=none"
+    ):
         stages.ensure_policy(settings(*SMALL, "env=measured", "name=other"))
-    with pytest.raises(ValueError, match="vehicle=own is known from logs alone, so nothing can drive it"):
+    with pytest.raises(
+        ValueError,
+        match="vehicle=own is known from logs alone, so nothing can drive it",
+    ):
         evaluate.run(settings(*SMALL, "name=other"))
     assert not (logs.parent / "runs" / "other").exists()
 

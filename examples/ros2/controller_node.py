@@ -1,7 +1,8 @@
 """A ROS 2 node around a trained controller: odometry, path and road condition in, drive commands out, at 10 Hz.
 
 ros2 run, or python controller_node.py --ros-args -p policy:=runs/s3/sfkd_path/seed=0
-Needs rclpy, nav_msgs, std_msgs and ackermann_msgs of a ROS 2 installation beside this package.
+Needs rclpy, nav_msgs, std_msgs and ackermann_msgs of a ROS 2 installation beside this
+package.
 """
 
 import math
@@ -22,17 +23,26 @@ from sfkd_jax.scenarios import path_through, project, reference_window
 class ControllerNode(Node):
     """Holds the last messages; a timer plans from them.
 
-    A message that is missing or older than `timeout` becomes an observation of NaN: the controller then continues its
-    last plan and says so, and this node stops the car when that has lasted for `patience` steps.
+    A message that is missing or older than `timeout` becomes an observation of NaN: the
+    controller then continues its last plan and says so, and this node stops the car
+    when that has lasted for `patience` steps.
     """
 
     def __init__(self) -> None:
         super().__init__("sfkd_controller")
-        defaults = {"policy": "runs/s3/sfkd_path/seed=0", "speed": 10.0, "timeout": 0.3, "patience": 5, "seed": 0}
+        defaults = {
+            "policy": "runs/s3/sfkd_path/seed=0",
+            "speed": 10.0,
+            "timeout": 0.3,
+            "patience": 5,
+            "seed": 0,
+        }
         for name, value in defaults.items():
             self.declare_parameter(name, value)
         policy = sfkd_jax.load(self.setting("policy"))
-        self.policy = policy._replace(params=jax.jit(policy.model.fold)(policy.params))  # once, not at every step
+        self.policy = policy._replace(
+            params=jax.jit(policy.model.fold)(policy.params)
+        )  # once, not at every step
         self.dt = self.policy.settings["vehicle"]["dt"]
         self.horizon = self.policy.settings["controller"]["mppi"]["horizon"]
         self.act = sfkd_jax.warm_up(self.policy)
@@ -50,17 +60,29 @@ class ControllerNode(Node):
         return self.get_parameter(name).value
 
     def on_odometry(self, message: Odometry) -> None:
-        """Position, yaw and forward speed; a dynamic model's further states follow in its own order."""
+        """Position, yaw and forward speed; a dynamic model's further states follow in
+        its own order.
+        """
         pose, twist = message.pose.pose, message.twist.twist
         q = pose.orientation
         yaw = math.atan2(2 * (q.w * q.z + q.x * q.y), 1 - 2 * (q.y**2 + q.z**2))
-        state = [pose.position.x, pose.position.y, yaw, twist.linear.x, twist.linear.y, twist.angular.z, 0.0]
+        state = [
+            pose.position.x,
+            pose.position.y,
+            yaw,
+            twist.linear.x,
+            twist.linear.y,
+            twist.angular.z,
+            0.0,
+        ]
         size = 3 + len(self.policy.settings["space"]["body_mean"])
         self.odometry, self.seen = jnp.asarray(state[:size]), time.monotonic()
 
     def on_path(self, message: Path) -> None:
         """A new path starts at its first point."""
-        points = jnp.asarray([[p.pose.position.x, p.pose.position.y] for p in message.poses])
+        points = jnp.asarray(
+            [[p.pose.position.x, p.pose.position.y] for p in message.poses]
+        )
         self.path, self.progress = path_through(points), jnp.zeros(())
 
     def on_road(self, message: Float32MultiArray) -> None:
@@ -74,18 +96,31 @@ class ControllerNode(Node):
         fresh = time.monotonic() - self.seen < self.setting("timeout")
         observation = self.odometry if fresh else jnp.full_like(self.odometry, jnp.nan)
         guess = self.progress + self.setting("speed") * self.dt
-        self.progress = project(self.path, observation[:2], guess)[0] if fresh else guess
+        self.progress = (
+            project(self.path, observation[:2], guess)[0] if fresh else guess
+        )
         speed = jnp.asarray(self.setting("speed"))
-        reference = reference_window(self.path, self.progress, speed, dt=self.dt, horizon=self.horizon)
-        control, self.memory, info = self.act(self.policy.params, self.memory, observation, self.env, reference)
+        reference = reference_window(
+            self.path, self.progress, speed, dt=self.dt, horizon=self.horizon
+        )
+        control, self.memory, info = self.act(
+            self.policy.params, self.memory, observation, self.env, reference
+        )
         self.blind = 0 if bool(info["healthy"]) else self.blind + 1
-        self.publish(control if self.blind <= self.setting("patience") else jnp.asarray([control[0], -3.0]))
+        self.publish(
+            control
+            if self.blind <= self.setting("patience")
+            else jnp.asarray([control[0], -3.0])
+        )
 
     def publish(self, control) -> None:
         """Steering angle and acceleration."""
         message = AckermannDriveStamped()
         message.header.stamp = self.get_clock().now().to_msg()
-        message.drive.steering_angle, message.drive.acceleration = float(control[0]), float(control[1])
+        message.drive.steering_angle, message.drive.acceleration = (
+            float(control[0]),
+            float(control[1]),
+        )
         self.commands.publish(message)
 
 

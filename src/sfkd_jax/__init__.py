@@ -11,7 +11,12 @@ if TYPE_CHECKING:
 
 __version__ = "0.1.0"
 
-_LAZY = {"load": "policy", "Policy": "policy", "warm_up": "exporting", "ArtefactError": "artefacts"}
+_LAZY = {
+    "load": "policy",
+    "Policy": "policy",
+    "warm_up": "exporting",
+    "ArtefactError": "artefacts",
+}
 
 
 def __getattr__(name: str) -> Any:

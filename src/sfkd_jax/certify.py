@@ -20,7 +20,9 @@ from sfkd_jax.corridor import certify_corridor
 from sfkd_jax.pipeline import stages, store
 
 INCREMENTAL = "incremental.json"
-"""A rate of a continuous flow lies apart: other doors take a certificate for one with tubes and bounds of a monitor."""
+"""A rate of a continuous flow lies apart: other doors take a certificate for one with
+tubes and bounds of a monitor.
+"""
 
 
 def document_in(place: Path) -> Path:
@@ -40,12 +42,22 @@ def renew(settings: dict[str, Any]) -> dict[str, Any]:
     except CertificationRefused as reason:
         document = {"valid": False, "reason": str(reason)}
     versions = artefacts.versions() | document.get("versions", {})
-    document |= {"weights_sha256": trained.weights_sha256, "policy_sha256": trained.sha256, "versions": versions}
+    document |= {
+        "weights_sha256": trained.weights_sha256,
+        "policy_sha256": trained.sha256,
+        "versions": versions,
+    }
     document["seconds"] = time.perf_counter() - began
-    kept, other = (INCREMENTAL, policy.CERTIFICATE) if flow else (policy.CERTIFICATE, INCREMENTAL)
+    kept, other = (
+        (INCREMENTAL, policy.CERTIFICATE) if flow else (policy.CERTIFICATE, INCREMENTAL)
+    )
     (place / other).unlink(missing_ok=True)
     artefacts.write_json(place / kept, document)
-    verdict = f"alpha {document['alpha']:.6f}" if document["valid"] else f"refused: {document['reason']}"
+    verdict = (
+        f"alpha {document['alpha']:.6f}"
+        if document["valid"]
+        else f"refused: {document['reason']}"
+    )
     if "d_bar" in document:
         verdict += f"; d_bar {document['d_bar']['value']:.4g} holds for {document['d_bar']['holds_for']}"
     store.say(f"certificate: {verdict}")
@@ -54,14 +66,23 @@ def renew(settings: dict[str, Any]) -> dict[str, Any]:
 
 def _rate(settings: dict[str, Any], trained: policy.Trained) -> dict[str, Any]:
     """What is proved of a continuous flow: how fast it contracts, and no tube."""
-    return certify_incremental(trained.model, trained.params, dt=settings["vehicle"]["dt"])
+    return certify_incremental(
+        trained.model, trained.params, dt=settings["vehicle"]["dt"]
+    )
 
 
 def _tubes(settings: dict[str, Any], trained: policy.Trained) -> dict[str, Any]:
     """What is proved of a model's steps, and what is measured on the data of the run."""
     dataset, _ = stages.ensure_dataset(settings)
-    options = {name: value for name, value in settings["certification"].items() if name not in ("renew", "corridor")}
-    boxes, noise = store.boxes(dataset), tuple(settings["evaluation"]["observation_noise"])
+    options = {
+        name: value
+        for name, value in settings["certification"].items()
+        if name not in ("renew", "corridor")
+    }
+    boxes, noise = (
+        store.boxes(dataset),
+        tuple(settings["evaluation"]["observation_noise"]),
+    )
     if store.is_logged(settings):  # the robot's own sensors are in its logs already
         boxes, noise = boxes | {"names": store.channel_names(settings)}, ()
     document = issue(
@@ -91,13 +112,19 @@ def run(settings: dict[str, Any]) -> dict[str, Any]:
     if path.exists() and not settings["certification"]["renew"]:
         about = artefacts.read_json(path).get("policy_sha256")
         if about != trained.sha256:
-            raise CertificateStale(f"{path} is about other weights or settings; certification.renew=true replaces it")
+            raise CertificateStale(
+                f"{path} is about other weights or settings; certification.renew=true replaces it"
+            )
     document = renew(settings)
     if not document["valid"]:
         raise CertificationRefused(document["reason"])
     keys = ("valid", "alpha", "alpha_separate", "rho", "beta", "tightness", "seconds")
     bound = document.get("d_bar", {"value": None})
-    short = {"certificate": str(document_in(place)), "reason": None, "d_bar": bound["value"]}
+    short = {
+        "certificate": str(document_in(place)),
+        "reason": None,
+        "d_bar": bound["value"],
+    }
     return short | {key: document.get(key) for key in keys}
 
 

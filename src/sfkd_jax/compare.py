@@ -25,9 +25,16 @@ def run(settings: dict[str, Any]) -> dict[str, Any]:
     """Whatever is missing is made; then all rows are collected, compared and drawn."""
     began, comparison = time.perf_counter(), settings["comparison"]
     wanted = grid.plan(comparison)
-    groups = grid.dealt(grid.drivers(wanted), comparison["share"]) if comparison["drive"] else []
+    groups = (
+        grid.dealt(grid.drivers(wanted), comparison["share"])
+        if comparison["drive"]
+        else []
+    )
     driven, failed = 0, {}
-    composed, lay = functools.cache(functools.partial(_compose, comparison=comparison)), _surveyor()
+    composed, lay = (
+        functools.cache(functools.partial(_compose, comparison=comparison)),
+        _surveyor(),
+    )
     for number, group in enumerate(groups):
         try:
             driven += _drive(group, comparison, composed, lay)
@@ -36,11 +43,19 @@ def run(settings: dict[str, Any]) -> dict[str, Any]:
             store.say(f"failed: {reason}")
         if driven:
             _estimate(number + 1, len(groups), time.perf_counter() - began)
-    if comparison["share"] is not None:  # others drive the rest: whoever comes last collects
+    if (
+        comparison["share"] is not None
+    ):  # others drive the rest: whoever comes last collects
         return {"results": None, "rows": driven, "failed": len(failed)}
     place = Path(settings["root"]) / settings["name"]
     with artefacts.locked(place, wait=True):
-        return _collect(wanted, settings, composed, failed, time.perf_counter() - began if driven else None)
+        return _collect(
+            wanted,
+            settings,
+            composed,
+            failed,
+            time.perf_counter() - began if driven else None,
+        )
 
 
 def _collect(
@@ -51,35 +66,64 @@ def _collect(
     seconds: float | None,
 ) -> dict[str, Any]:
     """Write the results of all cells that are done, and what is drawn of them."""
-    comparison, place = settings["comparison"], Path(settings["root"]) / settings["name"]
+    comparison, place = (
+        settings["comparison"],
+        Path(settings["root"]) / settings["name"],
+    )
     with artefacts.understood(place / "cells"):
-        rows = grid.collect(wanted, settings, lambda cell: grid.made_with(composed(cell)), older=comparison["older"])
+        rows = grid.collect(
+            wanted,
+            settings,
+            lambda cell: grid.made_with(composed(cell)),
+            older=comparison["older"],
+        )
     if not rows:
-        raise ValueError(f"nothing to compare: no row came out ({'; '.join(failed.values()) or 'none was asked for'})")
+        raise ValueError(
+            f"nothing to compare: no row came out ({'; '.join(failed.values()) or 'none was asked for'})"
+        )
     made_by = settings | {"command": command("compare")}
-    document = {"rows": rows, "config": made_by, "versions": artefacts.versions(), "failed": failed}
+    document = {
+        "rows": rows,
+        "config": made_by,
+        "versions": artefacts.versions(),
+        "failed": failed,
+    }
     artefacts.write_json(place / "results.json", document | {"seconds": seconds})
     with artefacts.understood(place):
         pages = benchmark_report(place)
-    return {"results": str(place / "results.json"), "rows": len(rows), "failed": len(failed), **pages}
+    return {
+        "results": str(place / "results.json"),
+        "rows": len(rows),
+        "failed": len(failed),
+        **pages,
+    }
 
 
-def _drive(group: list[grid.Cell], comparison: dict[str, Any], composed: _Composed, lay: _Lay) -> int:
+def _drive(
+    group: list[grid.Cell], comparison: dict[str, Any], composed: _Composed, lay: _Lay
+) -> int:
     """Drive what is missing of one row under one controller; returns how many cells that were."""
     drivers: dict[str, evaluate_system.TestDriver] = {}
     done = 0
     for cell in group:
         settings = composed(cell)
-        path, of_policy = grid.place(cell, settings), _of_policy(cell, comparison, composed)
+        path, of_policy = (
+            grid.place(cell, settings),
+            _of_policy(cell, comparison, composed),
+        )
         if grid.is_done(path, settings):
             continue
         plant, key = build.build_vehicle(settings["vehicle"]), grid.driver_of(of_policy)
-        track = lay(settings, plant)  # first: a road that there is not is refused before anything is trained
+        track = lay(
+            settings, plant
+        )  # first: a road that there is not is refused before anything is trained
         if key not in drivers:
             drivers[key] = _driver(of_policy, plant)
         found = drivers[key](track)
         grid.write(path, settings, track, found)
-        store.say(f"{' '.join(map(str, cell))}: {1e3 * found.row['rmse_m']['mean']:.1f} mm")
+        store.say(
+            f"{' '.join(map(str, cell))}: {1e3 * found.row['rmse_m']['mean']:.1f} mm"
+        )
         done += 1
     return done
 
@@ -89,7 +133,9 @@ def _surveyor() -> _Lay:
     known: dict[str, evaluate_system.Track] = {}
 
     def lay(settings: dict[str, Any], plant: Vehicle) -> evaluate_system.Track:
-        place = artefacts.sha256({name: settings[name] for name in ("vehicle", "scenario", "evaluation")})
+        place = artefacts.sha256(
+            {name: settings[name] for name in ("vehicle", "scenario", "evaluation")}
+        )
         if place not in known:
             known[place] = evaluate_system.lay(settings, plant)
         return known[place]
@@ -103,7 +149,9 @@ def _driver(settings: dict[str, Any], plant: Vehicle) -> evaluate_system.TestDri
         dry_run.check(settings, plant)
         _certified(settings)
     ((name, system),) = stages.systems(settings, plant).items()
-    return evaluate_system.prepare(settings, plant, name, system, stages.ensure_dataset(settings)[0])
+    return evaluate_system.prepare(
+        settings, plant, name, system, stages.ensure_dataset(settings)[0]
+    )
 
 
 def _certified(settings: dict[str, Any]) -> None:
@@ -112,7 +160,9 @@ def _certified(settings: dict[str, Any]) -> None:
     if artefacts.exists(place / "policy.npz") and certify.document_in(place).exists():
         stages.ensure_policy(settings)
         return
-    with artefacts.locked(place, wait=True):  # a process with another share may train it for us
+    with artefacts.locked(
+        place, wait=True
+    ):  # a process with another share may train it for us
         stages.ensure_policy(settings)
         if not certify.document_in(place).exists():
             certify.renew(settings)
@@ -121,13 +171,20 @@ def _certified(settings: dict[str, Any]) -> None:
 def _compose(cell: grid.Cell, comparison: dict[str, Any]) -> dict[str, Any]:
     """The settings of a cell, under the name of the comparison."""
     asked = compose(*grid.overrides(cell, comparison))
-    asked["evaluation"]["variation"] = None if not comparison["variations"][cell.variation] else cell.variation
+    asked["evaluation"]["variation"] = (
+        None if not comparison["variations"][cell.variation] else cell.variation
+    )
     return asked
 
 
-def _of_policy(cell: grid.Cell, comparison: dict[str, Any], composed: _Composed) -> dict[str, Any]:
+def _of_policy(
+    cell: grid.Cell, comparison: dict[str, Any], composed: _Composed
+) -> dict[str, Any]:
     """The settings of a cell, under the name of its policy's run."""
-    asked, usual = composed(cell), cell._replace(variation=next(iter(comparison["variations"])))
+    asked, usual = (
+        composed(cell),
+        cell._replace(variation=next(iter(comparison["variations"]))),
+    )
     retrained = store.identity(asked) != store.identity(composed(usual))
     return asked | {"name": grid.policy_name(cell, comparison, retrained=retrained)}
 
@@ -135,7 +192,9 @@ def _of_policy(cell: grid.Cell, comparison: dict[str, Any], composed: _Composed)
 def _estimate(done: int, total: int, seconds: float) -> None:
     """How far it is and how long it may take."""
     left = seconds / done * (total - done)
-    store.say(f"[{done}/{total}] {seconds / 60:.0f} min so far, about {left / 60:.0f} min left")
+    store.say(
+        f"[{done}/{total}] {seconds / 60:.0f} min so far, about {left / 60:.0f} min left"
+    )
 
 
 if __name__ == "__main__":

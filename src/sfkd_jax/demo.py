@@ -12,7 +12,9 @@ from sfkd_jax.pipeline import evaluate_system, grid, store
 from sfkd_jax.reporting import animate
 
 SHIPPED = Path(__file__).with_name("pretrained")
-"""vehicle, or vehicle_path in path coordinates -> policy.npz, its manifest and certificate, as `train` left them."""
+"""vehicle, or vehicle_path in path coordinates -> policy.npz, its manifest and
+certificate, as `train` left them.
+"""
 ALONG_PATH = "_path"
 
 
@@ -20,21 +22,32 @@ def run(settings: dict[str, Any]) -> dict[str, Any]:
     """Check the certificate, drive, print a table, draw an animation.
 
     Raises:
-        ArtefactError: what ships was changed. ValueError: a vehicle for which nothing ships, also by its settings.
+        ArtefactError: what ships was changed.
+        ValueError: a vehicle for which nothing ships, also by its settings.
     """
     began = time.perf_counter()
     trained = _shipped(settings)
-    settings = settings | {"name": "demo", "evaluation": settings["evaluation"] | settings["demo"]}
+    settings = settings | {
+        "name": "demo",
+        "evaluation": settings["evaluation"] | settings["demo"],
+    }
     plant = build.build_vehicle(settings["vehicle"])
     track = evaluate_system.lay(settings, plant)
-    own = build.System(trained.model, trained.params, settings["env"], trained.certificate, trained.law)
+    own = build.System(
+        trained.model, trained.params, settings["env"], trained.certificate, trained.law
+    )
     systems = {trained.settings["model"]["system"]: own}
-    systems |= {name: build.reference_systems(plant, trained.law)[name] for name in ("nominal", "oracle")}
+    systems |= {
+        name: build.reference_systems(plant, trained.law)[name]
+        for name in ("nominal", "oracle")
+    }
     place, rows = Path(settings["root"]) / settings["name"], []
     folder = place / f"{track.scenario}_{_name(settings)}"
     with artefacts.locked(folder):
         for name, system in systems.items():
-            store.say(f"driving {settings['demo']['episodes']} x {settings['demo']['episode_s']:.0f} s: {name}")
+            store.say(
+                f"driving {settings['demo']['episodes']} x {settings['demo']['episode_s']:.0f} s: {name}"
+            )
             driven = evaluate_system.prepare(settings, plant, name, system, None)(track)
             rows.append(grid.write(folder / name, settings, track, driven))
         rows = evaluation.compare(rows)
@@ -43,7 +56,11 @@ def run(settings: dict[str, Any]) -> dict[str, Any]:
         _print(rows)
         film = animate(place, rows, track.scenario, corridor=_corridor(trained))
     store.say(f"animation: {film}; {time.perf_counter() - began:.0f} s in all")
-    return {"animation": film and str(film), "rows": len(rows), "results": str(folder / "results.json")}
+    return {
+        "animation": film and str(film),
+        "rows": len(rows),
+        "results": str(folder / "results.json"),
+    }
 
 
 def _name(settings: dict[str, Any]) -> str:
@@ -54,20 +71,39 @@ def _name(settings: dict[str, Any]) -> str:
 def _shipped(settings: dict[str, Any]) -> policy.Policy:
     """The policy for a vehicle, with a certificate that holds."""
     if settings["env"] == "none":
-        raise ValueError("the controllers that ship read the environment; choose env=measured or env=estimated")
-    name, places = _name(settings), sorted(place.name for place in SHIPPED.iterdir() if place.is_dir())
+        raise ValueError(
+            "the controllers that ship read the environment; choose env=measured or env=estimated"
+        )
+    name, places = (
+        _name(settings),
+        sorted(place.name for place in SHIPPED.iterdir() if place.is_dir()),
+    )
     began = time.perf_counter()
-    trained = policy.load(SHIPPED / name, controller=settings["controller"]) if name in places else None
+    trained = (
+        policy.load(SHIPPED / name, controller=settings["controller"])
+        if name in places
+        else None
+    )
     if trained is None or trained.settings["vehicle"] != settings["vehicle"]:
-        known = " and ".join(place for place in places if not place.endswith(ALONG_PATH))
-        raise ValueError(f"controllers ship for {known} as they are; for another vehicle run train")
+        known = " and ".join(
+            place for place in places if not place.endswith(ALONG_PATH)
+        )
+        raise ValueError(
+            f"controllers ship for {known} as they are; for another vehicle run train"
+        )
     if trained.certificate is None:
-        raise artefacts.ArtefactError(f"{SHIPPED / name} was changed: its certificate is about other weights")
+        raise artefacts.ArtefactError(
+            f"{SHIPPED / name} was changed: its certificate is about other weights"
+        )
     alpha, seconds = trained.certificate["alpha"], time.perf_counter() - began
-    store.say(f"certificate: holds, alpha {alpha:.4f}; loaded and verified in {seconds:.1f} s")
+    store.say(
+        f"certificate: holds, alpha {alpha:.4f}; loaded and verified in {seconds:.1f} s"
+    )
     if half := _corridor(trained):
         share = 100 * trained.certificate["corridor"]["level"]
-        store.say(f"corridor: {half:.2f} m to each side, on {share:.0f} % of the drives of its class")
+        store.say(
+            f"corridor: {half:.2f} m to each side, on {share:.0f} % of the drives of its class"
+        )
     return trained
 
 
@@ -78,12 +114,16 @@ def _corridor(trained: policy.Policy) -> float | None:
 
 def _print(rows: list[dict[str, Any]]) -> None:
     """The table, for a person."""
-    store.say(f"{'':10}{'deviation [mm]':>16}{'largest [mm]':>14}{'steering [rad/s]':>18}{'outside the proof':>19}")
+    store.say(
+        f"{'':10}{'deviation [mm]':>16}{'largest [mm]':>14}{'steering [rad/s]':>18}{'outside the proof':>19}"
+    )
     for row in rows:
         left, largest = 1e3 * row["rmse_m"]["mean"], 1e3 * row["max_deviation_m"]
         broken = row["violation"]["v0"]
         outside = "nothing proved" if broken is None else f"{100 * broken:.0f} %"
-        store.say(f"{row['system']:10}{left:16.1f}{largest:14.0f}{row['smoothness_rad_per_s']:18.3f}{outside:>19}")
+        store.say(
+            f"{row['system']:10}{left:16.1f}{largest:14.0f}{row['smoothness_rad_per_s']:18.3f}{outside:>19}"
+        )
 
 
 if __name__ == "__main__":

@@ -15,7 +15,17 @@ import jax.numpy as jnp
 from sfkd_jax import artefacts
 from sfkd_jax.cli.config import door
 
-CORE = ("jax", "jaxlib", "flax", "optax", "orbax-checkpoint", "hydra-core", "numpy", "scipy", "matplotlib")
+CORE = (
+    "jax",
+    "jaxlib",
+    "flax",
+    "optax",
+    "orbax-checkpoint",
+    "hydra-core",
+    "numpy",
+    "scipy",
+    "matplotlib",
+)
 EXTRAS = {
     "certify": ("cvxpy", "clarabel"),
     "brax": ("brax",),
@@ -24,7 +34,11 @@ EXTRAS = {
     "docs": ("mkdocs", "material", "mkdocstrings"),
     "plants": ("vehiclemodels",),
     "cpp": ("iree.compiler", "iree.runtime"),
-    "sweeps": ("hydra_plugins.hydra_joblib_launcher", "hydra_plugins.hydra_optuna_sweeper", "submitit"),
+    "sweeps": (
+        "hydra_plugins.hydra_joblib_launcher",
+        "hydra_plugins.hydra_optuna_sweeper",
+        "submitit",
+    ),
 }
 """Extra -> the modules that it must bring."""
 ROOM_MB = 500
@@ -45,16 +59,29 @@ def run(settings: dict[str, Any]) -> dict[str, Any]:
     print(f"compiles and computes: yes, in {seconds:.1f} s")
     extras = {name: _extra(modules) for name, modules in EXTRAS.items()}
     for name, reason in extras.items():
-        print(f"extra {name}: {reason or 'works'}" + (f'; pip install "sfkd-jax[{name}]"' if reason else ""))
+        print(
+            f"extra {name}: {reason or 'works'}"
+            + (f'; pip install "sfkd-jax[{name}]"' if reason else "")
+        )
     advice = _advice(Path(settings["root"]), devices)
     for line in advice:
         print(f"advice: {line}")
     working = [name for name, reason in extras.items() if reason is None]
-    return {"versions": found, "devices": devices, "extras": working, "advice": advice, "seconds": seconds}
+    return {
+        "versions": found,
+        "devices": devices,
+        "extras": working,
+        "advice": advice,
+        "seconds": seconds,
+    }
 
 
 def _cores() -> int | None:
-    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count()
+    return (
+        len(os.sched_getaffinity(0))
+        if hasattr(os, "sched_getaffinity")
+        else os.cpu_count()
+    )
 
 
 def _version(name: str) -> str:
@@ -87,13 +114,17 @@ def _computes() -> float:
 
     @jax.jit
     def around(start: jax.Array) -> jax.Array:
-        return jax.lax.scan(lambda state, _: (turn @ state, None), start, None, length=size)[0]
+        return jax.lax.scan(
+            lambda state, _: (turn @ state, None), start, None, length=size
+        )[0]
 
     start = jnp.arange(size, dtype=jnp.float32)
     try:
         right = bool(jnp.all(around(start) == start))
     except Exception as failure:
-        raise ValueError(f"jax cannot compute on {jax.default_backend()}: {failure}") from failure
+        raise ValueError(
+            f"jax cannot compute on {jax.default_backend()}: {failure}"
+        ) from failure
     if not right:
         raise ValueError(
             f"jax computes wrongly on {jax.default_backend()}: a full turn of a permutation is not the identity"
@@ -110,11 +141,19 @@ def _advice(root: Path, devices: list[str]) -> list[str]:
         lines.append(f"{place} cannot be written; choose another place with root=DIR")
     free = shutil.disk_usage(place).free // 2**20
     if free < ROOM_MB:
-        lines.append(f"{free} MB are free below {place}; an experiment needs up to {ROOM_MB}")
+        lines.append(
+            f"{free} MB are free below {place}; an experiment needs up to {ROOM_MB}"
+        )
     if "JAX_COMPILATION_CACHE_DIR" not in os.environ:
-        lines.append("set JAX_COMPILATION_CACHE_DIR to a directory, and later runs compile nothing twice")
-    if all(device.startswith("cpu") for device in devices) and shutil.which("nvidia-smi"):
-        lines.append('there is an accelerator that jax does not see; pip install "jax[cuda12]"')
+        lines.append(
+            "set JAX_COMPILATION_CACHE_DIR to a directory, and later runs compile nothing twice"
+        )
+    if all(device.startswith("cpu") for device in devices) and shutil.which(
+        "nvidia-smi"
+    ):
+        lines.append(
+            'there is an accelerator that jax does not see; pip install "jax[cuda12]"'
+        )
     return lines
 
 

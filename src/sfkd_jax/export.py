@@ -16,11 +16,14 @@ def run(settings: dict[str, Any]) -> dict[str, Any]:
     """Write what lies there; nothing is trained or certified now.
 
     Raises:
-        ArtefactError: no policy was trained there, it is damaged, or it was trained with other settings.
+        ArtefactError: no policy was trained there, it is damaged, or it was trained
+            with other settings.
     """
     place = store.run_directory(settings)
     if not artefacts.exists(place / "policy.npz"):
-        raise artefacts.ArtefactError(f"{place} holds no trained controller; run train with the same options first")
+        raise artefacts.ArtefactError(
+            f"{place} holds no trained controller; run train with the same options first"
+        )
     return _write(settings)
 
 
@@ -34,9 +37,20 @@ def _write(settings: dict[str, Any]) -> dict[str, Any]:
     if trained.certificate is None:
         store.say("exported without a certificate and without a monitor")
     folder = place / FOLDER
-    write_controller(trained, folder, made_from=manifest["made_from"], **build.without(settings["export"]))
-    store.say(f"exported: {folder}; python {folder / 'run_controller.py'} runs it without sfkd_jax")
-    files = {"blob": "controller.stablehlo", "manifest": "controller.json", "npz": "policy.npz"}
+    write_controller(
+        trained,
+        folder,
+        made_from=manifest["made_from"],
+        **build.without(settings["export"]),
+    )
+    store.say(
+        f"exported: {folder}; python {folder / 'run_controller.py'} runs it without sfkd_jax"
+    )
+    files = {
+        "blob": "controller.stablehlo",
+        "manifest": "controller.json",
+        "npz": "policy.npz",
+    }
     return {key: str(folder / name) for key, name in files.items()}
 
 

@@ -15,7 +15,9 @@ def run(settings: dict[str, Any]) -> dict[str, Any]:
     dataset, _ = stages.ensure_dataset(settings)
     return {
         "dataset": str(store.dataset_path(settings)),
-        "segments": sum(getattr(dataset, part).controls.shape[0] for part in store.PARTS),
+        "segments": sum(
+            getattr(dataset, part).controls.shape[0] for part in store.PARTS
+        ),
         "seconds": time.perf_counter() - began,
     }
 

@@ -16,9 +16,15 @@ def run(settings: dict[str, Any]) -> dict[str, Any]:
     """Draw; nothing is recomputed."""
     pattern = settings["report"]["compare"]
     place = Path(settings["root"]) if pattern else store.run_directory(settings)
-    alone = artefacts.locked(place) if place.exists() else nullcontext()  # or it makes what it then finds empty
+    alone = (
+        artefacts.locked(place) if place.exists() else nullcontext()
+    )  # or it makes what it then finds empty
     with alone, artefacts.understood(place):
-        pages = write_comparison(place, pattern, settings["name"]) if pattern else write_report(place)
+        pages = (
+            write_comparison(place, pattern, settings["name"])
+            if pattern
+            else write_report(place)
+        )
     store.say(f"report: {pages['report']}")
     return pages
 

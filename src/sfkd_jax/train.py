@@ -32,7 +32,9 @@ def _walk(settings: dict[str, Any]) -> dict[str, Any]:
         results = evaluate.run(settings, asked_by="train")
     else:
         results = {"results": None}
-        store.say("not driven: vehicle=own is known from logs alone; vehicle.step=package.module:function drives it")
+        store.say(
+            "not driven: vehicle=own is known from logs alone; vehicle.step=package.module:function drives it"
+        )
     pages = report.run(settings)
     return {
         "run": str(place),
@@ -48,14 +50,19 @@ def _walk(settings: dict[str, Any]) -> dict[str, Any]:
 
 def _errors(place: Path) -> list[float]:
     """Error of free-running predictions by steps ahead [m]."""
-    return artefacts.read_json(place / "open_loop.json", keys=("position_rmse_m",))["position_rmse_m"]
+    return artefacts.read_json(place / "open_loop.json", keys=("position_rmse_m",))[
+        "position_rmse_m"
+    ]
 
 
 def _objective(place: Path) -> float | None:
     """What a sweep minimises: the least validation loss; None for a model that is identified at once."""
     log = place / "metrics.jsonl"
     lines = artefacts.read_jsonl(log, damaged=artefacts.tell) if log.exists() else []
-    return min((line["validation_loss"] for line in lines if "validation_loss" in line), default=None)
+    return min(
+        (line["validation_loss"] for line in lines if "validation_loss" in line),
+        default=None,
+    )
 
 
 if __name__ == "__main__":

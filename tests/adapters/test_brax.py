@@ -1,4 +1,6 @@
-"""The vehicles as a brax environment: its own physics, brax's wrappers, the end of episodes, and refusals."""
+"""The vehicles as a brax environment: its own physics, brax's wrappers, the end of
+episodes, and refusals.
+"""
 
 import inspect
 from functools import cache, partial
@@ -24,7 +26,9 @@ adapters.register_brax()
 @cache
 def env(name="kinematic"):
     """The kinematic car on steady roads of 25 steps, and the dynamic one in gusts."""
-    return envs.get_environment("sfkd_vehicle", **{"kinematic": SEEN, "dynamic": GUSTS}[name])
+    return envs.get_environment(
+        "sfkd_vehicle", **{"kinematic": SEEN, "dynamic": GUSTS}[name]
+    )
 
 
 @cache
@@ -51,7 +55,9 @@ def driven(actions, name="kinematic"):
 def gentle(steps=STEPS, seed=3):
     """Random actions about going on straight at the same speed."""
     spread = jnp.asarray([0.1, 0.3])
-    return jnp.asarray([0.0, 0.34]) + spread * jax.random.uniform(jax.random.key(seed), (steps, 2), minval=-1.0)
+    return jnp.asarray([0.0, 0.34]) + spread * jax.random.uniform(
+        jax.random.key(seed), (steps, 2), minval=-1.0
+    )
 
 
 @pytest.mark.parametrize("name", ["kinematic", "dynamic"])
@@ -61,27 +67,43 @@ def test_it_steps_the_plant_and_nothing_else(name):
     moments, road = after.pipeline_state, start.info["road"]
     states = jnp.concatenate([start.pipeline_state.state[None], moments.state])
     low, high = np.asarray(plant.control_low), np.asarray(plant.control_high)
-    np.testing.assert_allclose(moments.control, low + (high - low) * (np.asarray(gentle()) + 1) / 2, atol=1e-6)
-    expected = jit(jax.vmap(plant.step))(states[:-1], moments.control, road.envs[:STEPS])
+    np.testing.assert_allclose(
+        moments.control, low + (high - low) * (np.asarray(gentle()) + 1) / 2, atol=1e-6
+    )
+    expected = jit(jax.vmap(plant.step))(
+        states[:-1], moments.control, road.envs[:STEPS]
+    )
     np.testing.assert_allclose(states[1:], expected, atol=2e-5)
     assert start.obs.shape == (env(name).observation_size,)
     assert env(name).action_size == 2
 
 
 def test_a_controller_drives_it_as_the_test_track_has_it_driven():
-    """The controls of a simulated episode, as actions: the same motion, and the same questions to the controller."""
+    """The controls of a simulated episode, as actions: the same motion, and the same
+    questions to the controller.
+    """
     plant, law = vehicle.kinematic(), build.build_driver(vehicle.kinematic())
 
     def act(params, state, observation, env, reference):
-        info = {"predicted_states": observation[None], "effective_samples": jnp.ones(()), "healthy": jnp.asarray(True)}
+        info = {
+            "predicted_states": observation[None],
+            "effective_samples": jnp.ones(()),
+            "healthy": jnp.asarray(True),
+        }
         return law(observation, reference), state, info
 
     start = compiled()[0](jax.random.key(0))
     controller = Controller(lambda key: (), act)
-    drive = jit(partial(evaluation.simulate, plant.step, controller, {}, dt=plant.dt, horizon=10))
+    drive = jit(
+        partial(
+            evaluation.simulate, plant.step, controller, {}, dt=plant.dt, horizon=10
+        )
+    )
     episode = drive(start.info["road"], jax.random.key(0))
     _, after = driven(jax.vmap(env().action)(episode.controls))
-    np.testing.assert_allclose(after.pipeline_state.state, episode.states[1:], atol=2e-4)
+    np.testing.assert_allclose(
+        after.pipeline_state.state, episode.states[1:], atol=2e-4
+    )
     np.testing.assert_allclose(after.pipeline_state.lateral, episode.lateral, atol=2e-4)
     asked = jit(jax.vmap(lambda state: law(*env().situation(state)[::2])))(after)
     np.testing.assert_allclose(asked[:-1], episode.controls[1:], atol=1e-4)
@@ -116,8 +138,12 @@ def test_the_observation_does_not_depend_on_where_the_road_lies():
     @jit
     def both(road, moment):
         moved = jax.vmap(se2.compose, in_axes=(None, 0))(place, road.path.points[:, :3])
-        elsewhere = road._replace(path=road.path._replace(points=road.path.points.at[:, :3].set(moved)))
-        there = moment._replace(state=moment.state.at[:3].set(se2.compose(place, moment.state[:3])))
+        elsewhere = road._replace(
+            path=road.path._replace(points=road.path.points.at[:, :3].set(moved))
+        )
+        there = moment._replace(
+            state=moment.state.at[:3].set(se2.compose(place, moment.state[:3]))
+        )
         return env().task.observe(elsewhere, there), env().task.observe(road, moment)
 
     there, here = both(start.info["road"], at(after, -1).pipeline_state)
@@ -127,25 +153,41 @@ def test_the_observation_does_not_depend_on_where_the_road_lies():
 def test_the_reward_is_minus_the_cost_of_lateral_speed_and_steering_rate_as_the_planner_weighs_them():
     start, after = driven(gentle())
     moments = jax.tree.map(np.asarray, after.pipeline_state)
-    steering = np.concatenate([start.pipeline_state.control[None, :1], moments.control[:, :1]])[:, 0]
+    steering = np.concatenate(
+        [start.pipeline_state.control[None, :1], moments.control[:, :1]]
+    )[:, 0]
     parts = (moments.lateral, moments.state[:, 3] - 10.0, np.diff(steering) / env().dt)
     names = ("lateral", "speed", "steering_rate")
-    planner, task = (inspect.signature(f).parameters for f in (control.tracking_cost, adapters.tracking_task))
+    planner, task = (
+        inspect.signature(f).parameters
+        for f in (control.tracking_cost, adapters.tracking_task)
+    )
     weights = [planner[name].default for name in names]
     assert weights == [task[name].default for name in names]
     cost = sum(weight * part**2 for weight, part in zip(weights, parts, strict=True))
     np.testing.assert_allclose(after.reward, -cost, rtol=1e-4)
-    for name, part in zip(("lateral", "speed_error", "steering_rate"), parts, strict=True):
+    for name, part in zip(
+        ("lateral", "speed_error", "steering_rate"), parts, strict=True
+    ):
         np.testing.assert_allclose(after.metrics[name], np.abs(part), atol=1e-4)
 
 
 def test_every_key_is_another_episode_and_a_raw_key_is_the_typed_one():
     reset = compiled()[0]
-    first, again, other = reset(jax.random.key(1)), reset(jax.random.PRNGKey(1)), reset(jax.random.key(2))
+    first, again, other = (
+        reset(jax.random.key(1)),
+        reset(jax.random.PRNGKey(1)),
+        reset(jax.random.key(2)),
+    )
     for leaf, same in zip(jax.tree.leaves(first), jax.tree.leaves(again), strict=True):
         np.testing.assert_array_equal(leaf, same)
-    assert np.abs(first.info["road"].path.points - other.info["road"].path.points).max() > 1.0
-    assert np.any(np.asarray(first.info["road"].envs) != np.asarray(other.info["road"].envs))
+    assert (
+        np.abs(first.info["road"].path.points - other.info["road"].path.points).max()
+        > 1.0
+    )
+    assert np.any(
+        np.asarray(first.info["road"].envs) != np.asarray(other.info["road"].envs)
+    )
 
 
 def test_leaving_the_lane_ends_an_episode_and_costs_what_it_says():
@@ -165,13 +207,20 @@ def test_what_is_not_finite_ends_an_episode_and_does_not_get_out():
     actions = gentle().at[3].set(jnp.nan)
     _, after = driven(actions)
     assert after.done[:4].tolist() == [0.0, 0.0, 0.0, 1.0]
-    assert all(np.all(np.isfinite(leaf)) for leaf in jax.tree.leaves((after.obs, after.reward, after.pipeline_state)))
+    assert all(
+        np.all(np.isfinite(leaf))
+        for leaf in jax.tree.leaves((after.obs, after.reward, after.pipeline_state))
+    )
 
 
 def test_the_end_of_the_road_is_a_time_out_and_no_failure():
     _, after = driven(gentle())
     assert env().task.steps == STEPS
-    assert after.done.tolist() == after.info["time_out"].tolist() == [0.0] * (STEPS - 1) + [1.0]
+    assert (
+        after.done.tolist()
+        == after.info["time_out"].tolist()
+        == [0.0] * (STEPS - 1) + [1.0]
+    )
     assert np.all(np.asarray(after.reward) > -2e4)
 
 
@@ -182,7 +231,12 @@ def test_driving_beyond_the_path_is_a_time_out_and_facing_backwards_is_not():
     length = float((path.points.shape[0] - 1) * path.spacing)
     near = path.points[-11]
     placed = moment.state.at[:3].set(near[:3])
-    after = drive(start.replace(pipeline_state=moment._replace(state=placed, progress=length - 5.0)), gentle())
+    after = drive(
+        start.replace(
+            pipeline_state=moment._replace(state=placed, progress=length - 5.0)
+        ),
+        gentle(),
+    )
     first = int(np.argmax(after.done))
     assert 3 <= first <= 7
     assert after.info["time_out"][first] == 1.0
@@ -194,9 +248,14 @@ def test_driving_beyond_the_path_is_a_time_out_and_facing_backwards_is_not():
 
 @cache
 def wrapped(kind):
-    """A batch of three, episodes of 10 steps, 24 steps driven by brax's wrappers; typed keys where these allow it."""
+    """A batch of three, episodes of 10 steps, 24 steps driven by brax's wrappers; typed
+    keys where these allow it.
+    """
     if kind == "create":
-        outer, keys = envs.create("sfkd_vehicle", episode_length=10, batch_size=3, **SEEN), jax.random.key(0)
+        outer, keys = (
+            envs.create("sfkd_vehicle", episode_length=10, batch_size=3, **SEEN),
+            jax.random.key(0),
+        )
     else:
         outer = EvalWrapper(wrap(env(), episode_length=10, action_repeat=2))
         keys = jax.random.split(jax.random.PRNGKey(0), 3)
@@ -225,7 +284,9 @@ def test_under_brax_wrappers_episodes_end_in_time_and_begin_again(kind, repeat):
     np.testing.assert_array_equal(after.pipeline_state.count[ends[0]], np.zeros(3))
     assert np.all(np.asarray(after.pipeline_state.count[ends[0] + 1]) == repeat)
     paths = np.asarray(start.info["road"].path.points)
-    assert min(np.abs(paths[0] - paths[1]).max(), np.abs(paths[1] - paths[2]).max()) > 1.0
+    assert (
+        min(np.abs(paths[0] - paths[1]).max(), np.abs(paths[1] - paths[2]).max()) > 1.0
+    )
 
 
 def test_a_wrapped_car_drives_as_the_bare_one():
@@ -234,14 +295,23 @@ def test_a_wrapped_car_drives_as_the_bare_one():
     _, after = wrapped("create")
     for car, key in enumerate(jax.random.split(jax.random.key(0), 3)):
         alone = drive(reset(key), gentle())
-        np.testing.assert_allclose(after.pipeline_state.state[:9, car], alone.pipeline_state.state[:9], atol=1e-4)
-        np.testing.assert_allclose(after.reward[:9, car], alone.reward[:9], rtol=1e-3, atol=1e-3)
+        np.testing.assert_allclose(
+            after.pipeline_state.state[:9, car],
+            alone.pipeline_state.state[:9],
+            atol=1e-4,
+        )
+        np.testing.assert_allclose(
+            after.reward[:9, car], alone.reward[:9], rtol=1e-3, atol=1e-3
+        )
 
 
 @pytest.mark.parametrize(
     ("settings", "message"),
     [
-        ({"vehicle": "boat"}, "unknown vehicle 'boat'; choose one of dynamic, kinematic"),
+        (
+            {"vehicle": "boat"},
+            "unknown vehicle 'boat'; choose one of dynamic, kinematic",
+        ),
         ({"scenario": "s9"}, "unknown scenario 's9'"),
         ({"inner_loop": "steering"}, "unknown vehicle.inner_loop 'steering'"),
         ({"duration": 0.05}, "duration must be finite and at least one step"),
@@ -249,12 +319,19 @@ def test_a_wrapped_car_drives_as_the_bare_one():
         ({"lane": 0.0}, "lane must be positive"),
         ({"lateral": -1.0}, "lateral must be finite and at least 0"),
         ({"leaving": float("nan")}, "leaving must be finite and at least 0"),
-        ({"vehicle": "dynamic", "scenario": "family"}, r"the scenario starts in a state of shape \(4,\), 'dynamic'"),
+        (
+            {"vehicle": "dynamic", "scenario": "family"},
+            r"the scenario starts in a state of shape \(4,\), 'dynamic'",
+        ),
     ],
 )
 def test_bad_settings_are_refused_in_one_line(settings, message):
     if settings.get("scenario") == "family":
-        settings = settings | {"scenario": build.build_scenario({"name": "s1"}, vehicle.kinematic(), duration=2.0)}
+        settings = settings | {
+            "scenario": build.build_scenario(
+                {"name": "s1"}, vehicle.kinematic(), duration=2.0
+            )
+        }
     with pytest.raises(ValueError, match=message) as refusal:
         envs.get_environment("sfkd_vehicle", **settings)
     assert "\n" not in str(refusal.value)

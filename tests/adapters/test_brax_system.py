@@ -1,4 +1,6 @@
-"""A brax system as a plant: brax's own motion where nothing is changed, known motions where something is."""
+"""A brax system as a plant: brax's own motion where nothing is changed, known motions
+where something is.
+"""
 
 from functools import cache, partial
 
@@ -34,12 +36,19 @@ def stepper():
 def step(body, control, env):
     """(cart [m], pole [rad], their rates) one sampling period later."""
     state = jnp.concatenate([jnp.zeros(3), jnp.asarray(body, dtype=float)])
-    return stepper()(state, jnp.asarray([control], dtype=float), jnp.asarray(env, dtype=float))[BODY]
+    return stepper()(
+        state, jnp.asarray([control], dtype=float), jnp.asarray(env, dtype=float)
+    )[BODY]
 
 
 @cache
 def collected():
-    options = {"trajectories": 10, "steps": 12, "env_low": (0.5, 0.5, 0.5), "env_high": (1.5, 1.5, 1.5)}
+    options = {
+        "trajectories": 10,
+        "steps": 12,
+        "env_low": (0.5, 0.5, 0.5),
+        "env_high": (1.5, 1.5, 1.5),
+    }
     return jit(partial(adapters.collect, plant(), **options))(jax.random.key(0))
 
 
@@ -70,7 +79,9 @@ def test_without_gravity_a_pole_at_rest_rests_and_with_more_it_falls_faster():
 
 
 def test_without_friction_a_cart_with_an_upright_pole_keeps_its_speed():
-    """The pole's centre of mass stands half a millimetre beside its joint, so upright is not quite angle 0."""
+    """The pole's centre of mass stands half a millimetre beside its joint, so upright
+    is not quite angle 0.
+    """
     gliding = (0.0, 0.0, 0.4, 0.0)
     after = step(gliding, 0.0, (0.0, 0.0, 1.0))
     np.testing.assert_allclose(after, [0.4 * plant().dt, 0.0, 0.4, 0.0], atol=1e-5)
@@ -79,7 +90,10 @@ def test_without_friction_a_cart_with_an_upright_pole_keeps_its_speed():
 
 def test_a_motor_of_twice_the_force_is_twice_the_control():
     body = (0.1, -0.05, 0.2, 0.3)
-    doubled, unchanged = step(body, 0.4, (1.0, 1.0, 2.0)), step(body, 0.8, (1.0, 1.0, 1.0))
+    doubled, unchanged = (
+        step(body, 0.4, (1.0, 1.0, 2.0)),
+        step(body, 0.8, (1.0, 1.0, 1.0)),
+    )
     np.testing.assert_allclose(doubled, unchanged, atol=1e-5)
     assert np.abs(doubled - step(body, 0.4, (1.0, 1.0, 1.0))).max() > 1e-2
 
@@ -90,7 +104,9 @@ def test_collected_trajectories_are_the_plants_and_a_data_set_of_this_project():
     assert driven.controls.shape == (10, 12, 1)
     assert np.all(np.asarray(driven.states)[..., POSE] == 0.0)
     one = at(driven, 0)
-    for before, after, control, env in zip(one.states, one.states[1:], one.controls, one.envs, strict=False):
+    for before, after, control, env in zip(
+        one.states, one.states[1:], one.controls, one.envs, strict=False
+    ):
         np.testing.assert_allclose(after, stepper()(before, control, env), atol=1e-4)
     assert np.all(np.asarray(driven.envs) == np.asarray(driven.envs)[:, :1])
     assert np.std(np.asarray(driven.envs)[:, 0], axis=0).min() > 0.05
@@ -104,13 +120,19 @@ def test_collected_trajectories_are_the_plants_and_a_data_set_of_this_project():
 @pytest.mark.parametrize(
     ("environment", "parameters", "message"),
     [
-        ("pendulum", ("colour",), "parameters must be different ones of gravity, damping, motor"),
+        (
+            "pendulum",
+            ("colour",),
+            "parameters must be different ones of gravity, damping, motor",
+        ),
         ("pendulum", ("gravity", "gravity"), "parameters must be different ones of"),
         ("spring", ("gravity",), 'backend must be "generalized"'),
         ("vehicle", ("gravity",), "BraxVehicle has no brax system to step"),
     ],
 )
-def test_what_is_no_such_system_is_refused_in_one_line(environment, parameters, message):
+def test_what_is_no_such_system_is_refused_in_one_line(
+    environment, parameters, message
+):
     given = {
         "pendulum": pendulum,
         "spring": lambda: envs.get_environment("inverted_pendulum", backend="spring"),
@@ -122,5 +144,15 @@ def test_what_is_no_such_system_is_refused_in_one_line(environment, parameters, 
 
 
 def test_a_box_of_another_length_is_refused():
-    with pytest.raises(ValueError, match="env_low must have an entry for each of gravity, damping, motor"):
-        adapters.collect(plant(), jax.random.key(0), trajectories=1, steps=2, env_low=(0.5,), env_high=(1.0, 1.0, 1.0))
+    with pytest.raises(
+        ValueError,
+        match="env_low must have an entry for each of gravity, damping, motor",
+    ):
+        adapters.collect(
+            plant(),
+            jax.random.key(0),
+            trajectories=1,
+            steps=2,
+            env_low=(0.5,),
+            env_high=(1.0, 1.0, 1.0),
+        )

@@ -1,4 +1,6 @@
-"""CommonRoad's cars as plants: their own equations, grip, mirrors, frames, the servo, and a drive on a road."""
+"""CommonRoad's cars as plants: their own equations, grip, mirrors, frames, the servo,
+and a drive on a road.
+"""
 
 import re
 from functools import cache
@@ -10,9 +12,18 @@ import numpy as np
 import pytest
 from helpers import driver, jit
 
-pytest.importorskip("vehiclemodels", reason='CommonRoad\'s cars need the extra: pip install "sfkd-jax[plants]"')
+pytest.importorskip(
+    "vehiclemodels",
+    reason='CommonRoad\'s cars need the extra: pip install "sfkd-jax[plants]"',
+)
 
-from vehiclemodels import init_mb, init_std, vehicle_dynamics_mb, vehicle_dynamics_std, vehicle_parameters
+from vehiclemodels import (
+    init_mb,
+    init_std,
+    vehicle_dynamics_mb,
+    vehicle_dynamics_std,
+    vehicle_parameters,
+)
 
 from sfkd_jax import adapters, evaluation, scenarios
 from sfkd_jax.types import Controller
@@ -33,7 +44,9 @@ STEP_STEER = {
     ("mb", 0.6): (11.6292, 1.9522, 0.3867, 11.6696, 0.0611, 0.5120, 0.1799),
     ("mb", 0.3): (11.8816, 0.9757, 0.1767, 11.8430, 0.0532, 0.2064, 0.1799),
 }
-"""(p_x, p_y [m], yaw [rad], v, v_y [m/s], yaw rate [rad/s], δ [rad]) at the end of a step steer."""
+"""(p_x, p_y [m], yaw [rad], v, v_y [m/s], yaw rate [rad/s], δ [rad]) at the end of a
+step steer.
+"""
 
 
 @cache
@@ -64,51 +77,80 @@ def held(model, control, env, seconds, start=None):
     """x_0 … x_T under a control and an environment that are held."""
     states = [moving(model) if start is None else start]
     for _ in range(round(seconds / plant(model).dt)):
-        states.append(stepper(model)(states[-1], jnp.asarray(control, dtype=float), jnp.asarray(env, dtype=float)))
+        states.append(
+            stepper(model)(
+                states[-1],
+                jnp.asarray(control, dtype=float),
+                jnp.asarray(env, dtype=float),
+            )
+        )
     return np.asarray(states, dtype=np.float64)
 
 
 def by_runge_kutta(model, control, friction, seconds, steps):
-    """The same on the package's functions alone, fixed steps: (p_x, p_y, yaw, v_x, v_y, yaw rate, δ)."""
+    """The same on the package's functions alone, fixed steps: (p_x, p_y, yaw, v_x, v_y,
+    yaw rate, δ).
+    """
     derivative, initial = PACKAGE[model]
     car = vehicle_parameters.setup_vehicle_parameters(2)
     car.tire.p_dx1 *= friction / car.tire.p_dy1
     car.tire.p_dy1 = friction
-    x, h = np.asarray(initial([0.0, 0.0, 0.0, 12.0, 0.0, 0.0, 0.0], car), dtype=float), seconds / steps
+    x, h = (
+        np.asarray(initial([0.0, 0.0, 0.0, 12.0, 0.0, 0.0, 0.0], car), dtype=float),
+        seconds / steps,
+    )
 
     def flow(x):
-        return np.asarray(derivative(x.tolist(), [(control[0] - x[2]) / 0.1, control[1]], car))
+        return np.asarray(
+            derivative(x.tolist(), [(control[0] - x[2]) / 0.1, control[1]], car)
+        )
 
     for _ in range(steps):
         k1 = flow(x)
         k2 = flow(x + 0.5 * h * k1)
         k3 = flow(x + 0.5 * h * k2)
         x = x + h / 6.0 * (k1 + 2.0 * k2 + 2.0 * k3 + flow(x + h * k3))
-    speed, side = (x[3] * np.cos(x[6]), x[3] * np.sin(x[6])) if model == "std" else (x[3], x[10])
+    speed, side = (
+        (x[3] * np.cos(x[6]), x[3] * np.sin(x[6])) if model == "std" else (x[3], x[10])
+    )
     return np.asarray([x[0], x[1], x[4], speed, side, x[5], x[2]])
 
 
 @pytest.mark.parametrize("friction", FRICTIONS)
 @pytest.mark.parametrize("model", MODELS)
-def test_a_step_steer_is_what_it_was_and_what_the_packages_own_equations_give(model, friction):
+def test_a_step_steer_is_what_it_was_and_what_the_packages_own_equations_give(
+    model, friction
+):
     """0.18 rad at 12 m/s for 1 s, BMW 320i, commonroad-vehicle-models 3.0.2; recorded from `by_runge_kutta` with
     5000 steps and rounded. The package's own stored reference of this model does not hold for its own version.
     """
     found = held(model, (0.18, 0.0), (friction, 0.0), 1.0)[-1, :7]
     np.testing.assert_allclose(found, STEP_STEER[model, friction], atol=2e-4)
-    np.testing.assert_allclose(found, by_runge_kutta(model, (0.18, 0.0), friction, 1.0, 500), atol=1e-4)
+    np.testing.assert_allclose(
+        found, by_runge_kutta(model, (0.18, 0.0), friction, 1.0, 500), atol=1e-4
+    )
 
 
 @pytest.mark.parametrize("model", MODELS)
 def test_positions_move_with_the_velocity_rotated_by_yaw(model):
-    """By the derivative, and by differences of steps: from a start that slides, turns and rolls."""
-    start = np.asarray(moving(model, yaw=0.7, v_y=-0.8, yaw_rate=0.3, steering=0.05), dtype=np.float64)
+    """By the derivative, and by differences of steps: from a start that slides, turns
+    and rolls.
+    """
+    start = np.asarray(
+        moving(model, yaw=0.7, v_y=-0.8, yaw_rate=0.3, steering=0.05), dtype=np.float64
+    )
     start[7:] += 0.01 * np.random.default_rng(0).normal(size=len(start) - 7)
     short = adapters.commonroad_vehicle(model=model, dt=1e-4)
     with jax.enable_x64(True):
         asked = (jnp.asarray(start), jnp.asarray([0.05, 0.5]), jnp.asarray([0.8, 0.0]))
-        rate, quotient = np.asarray(short.derivative(*asked)), np.asarray((short.step(*asked) - asked[0]) / 1e-4)
-    turned = np.asarray([[np.cos(0.7), -np.sin(0.7)], [np.sin(0.7), np.cos(0.7)]]) @ start[3:5]
+        rate, quotient = (
+            np.asarray(short.derivative(*asked)),
+            np.asarray((short.step(*asked) - asked[0]) / 1e-4),
+        )
+    turned = (
+        np.asarray([[np.cos(0.7), -np.sin(0.7)], [np.sin(0.7), np.cos(0.7)]])
+        @ start[3:5]
+    )
     np.testing.assert_allclose(rate[:3], [*turned, 0.3], atol=1e-6)
     np.testing.assert_allclose(quotient[:3], rate[:3], atol=2e-3)
     np.testing.assert_allclose(quotient[3:7], rate[3:7], rtol=0.02, atol=0.05)
@@ -116,8 +158,12 @@ def test_positions_move_with_the_velocity_rotated_by_yaw(model):
 
 @pytest.mark.parametrize("model", MODELS)
 def test_a_settled_start_rolls_straight_on(model):
-    """But for 0.2 m/s² of the drift car at once: its tyre's force is not quite 0 at no slip (p_hx1)."""
-    rate = np.asarray(rates(model)(moving(model), jnp.zeros(2), jnp.asarray([0.9, 0.0])))
+    """But for 0.2 m/s² of the drift car at once: its tyre's force is not quite 0 at no
+    slip (p_hx1).
+    """
+    rate = np.asarray(
+        rates(model)(moving(model), jnp.zeros(2), jnp.asarray([0.9, 0.0]))
+    )
     assert rate[0] == pytest.approx(12.0, rel=1e-6)
     np.testing.assert_allclose(rate[[1, 2, 4, 5, 6]], np.zeros(5), atol=1e-3)
     assert abs(rate[3]) < 0.25
@@ -125,8 +171,12 @@ def test_a_settled_start_rolls_straight_on(model):
 
 
 @pytest.mark.parametrize("model", MODELS)
-def test_grip_is_at_most_friction_times_gravity_and_half_the_friction_is_less_grip(model):
-    """Centripetal acceleration v ω over the last second of a turn too tight for the tyres, at nearly steady speed."""
+def test_grip_is_at_most_friction_times_gravity_and_half_the_friction_is_less_grip(
+    model,
+):
+    """Centripetal acceleration v ω over the last second of a turn too tight for the
+    tyres, at nearly steady speed.
+    """
     grips = []
     for friction in (0.8, 0.4):
         states = held(model, (0.25, 1.0), (friction, 0.0), 3.0)[-10:]
@@ -138,8 +188,12 @@ def test_grip_is_at_most_friction_times_gravity_and_half_the_friction_is_less_gr
 
 @pytest.mark.parametrize("model", MODELS)
 def test_the_mirrored_turn_is_nearly_the_mirror_of_the_turn(model):
-    """CommonRoad's tyre is not quite symmetric: rolling forces depend on the sign of slip (r_hx1, r_by3, r_vy1)."""
-    left, right = (held(model, (side * 0.1, 0.0), (0.7, 0.0), 2.0)[-1, :7] for side in (1.0, -1.0))
+    """CommonRoad's tyre is not quite symmetric: rolling forces depend on the sign of
+    slip (r_hx1, r_by3, r_vy1).
+    """
+    left, right = (
+        held(model, (side * 0.1, 0.0), (0.7, 0.0), 2.0)[-1, :7] for side in (1.0, -1.0)
+    )
     flip = np.asarray([1.0, -1.0, -1.0, 1.0, -1.0, -1.0, -1.0])
     np.testing.assert_allclose(right, flip * left, rtol=0.01, atol=0.02)
     assert left[1] > 3.0
@@ -157,7 +211,10 @@ def test_the_servo_follows_the_command_and_keeps_its_rate():
 @pytest.mark.parametrize("model", MODELS)
 def test_wind_pushes_sideways_ahead_of_the_centre_of_mass(model):
     mass = BMW.m if model == "std" else BMW.m_s
-    calm, windy = (rates(model)(moving(model), jnp.zeros(2), jnp.asarray([0.9, wind])) for wind in (0.0, -4.0))
+    calm, windy = (
+        rates(model)(moving(model), jnp.zeros(2), jnp.asarray([0.9, wind]))
+        for wind in (0.0, -4.0)
+    )
     change = np.asarray(windy - calm)
     assert change[4] == pytest.approx(-160.0 / mass, abs=1e-3)
     assert change[5] == pytest.approx(-160.0 * 0.4 / BMW.I_z, abs=1e-3)
@@ -179,8 +236,12 @@ def test_a_wheel_that_locks_under_the_brakes_turns_again_without_them(model):
     braked = held(model, (0.0, -6.0), (0.3, 0.0), 0.5)[-1]
     radius, speed = BMW.R_w, braked[3]
     np.testing.assert_allclose(speed / radius + braked[wheels], 0.0, atol=1e-3)
-    released = held(model, (0.0, 0.0), (0.3, 0.0), 0.5, start=jnp.asarray(braked, dtype=jnp.float32))[-1]
-    assert released[3] > speed - 0.8  # a car that slides on loses 0.3 g for 0.5 s, 1.5 m/s
+    released = held(
+        model, (0.0, 0.0), (0.3, 0.0), 0.5, start=jnp.asarray(braked, dtype=jnp.float32)
+    )[-1]
+    assert (
+        released[3] > speed - 0.8
+    )  # a car that slides on loses 0.3 g for 0.5 s, 1.5 m/s
     assert np.abs(released[wheels]).max() < 0.05 * speed / radius
 
 
@@ -191,34 +252,59 @@ def test_a_spin_that_turns_a_wheel_backwards_ends_the_multi_body_car():
 
 def test_a_batch_is_driven_as_its_members_are():
     starts = jnp.stack([moving("std", speed) for speed in (8.0, 12.0)])
-    controls, envs = jnp.asarray([[0.1, 1.0], [-0.05, -2.0]]), jnp.asarray([[0.4, 5.0], [0.9, 0.0]])
-    one_by_one = [stepper("std")(*row) for row in zip(starts, controls, envs, strict=True)]
-    np.testing.assert_array_equal(jit(jax.vmap(plant("std").step))(starts, controls, envs), jnp.stack(one_by_one))
+    controls, envs = (
+        jnp.asarray([[0.1, 1.0], [-0.05, -2.0]]),
+        jnp.asarray([[0.4, 5.0], [0.9, 0.0]]),
+    )
+    one_by_one = [
+        stepper("std")(*row) for row in zip(starts, controls, envs, strict=True)
+    ]
+    np.testing.assert_array_equal(
+        jit(jax.vmap(plant("std").step))(starts, controls, envs), jnp.stack(one_by_one)
+    )
 
 
 def test_an_observation_is_that_of_the_plants_of_this_project():
     state = moving("mb", speed=4.0, v_y=3.0, yaw=0.2)
-    np.testing.assert_allclose(adapters.commonroad_observation(state), [0, 0, 0.2, 4, 3, 0, 0], atol=1e-6)
-    np.testing.assert_allclose(adapters.commonroad_observation(state, states=4), [0, 0, 0.2, 5], atol=1e-6)
+    np.testing.assert_allclose(
+        adapters.commonroad_observation(state), [0, 0, 0.2, 4, 3, 0, 0], atol=1e-6
+    )
+    np.testing.assert_allclose(
+        adapters.commonroad_observation(state, states=4), [0, 0, 0.2, 5], atol=1e-6
+    )
 
 
 @pytest.mark.parametrize("model", MODELS)
 def test_a_controller_for_our_plant_keeps_such_a_car_in_its_lane(model):
-    """The law that plans are sampled around, over 5 s of a path of the benchmark, on a wet road."""
+    """The law that plans are sampled around, over 5 s of a path of the benchmark, on a
+    wet road.
+    """
     follow, car = driver(plant(model)), plant(model)
 
     def act(params, memory, observation, env, reference):
-        info = {"predicted_states": observation[None], "effective_samples": jnp.ones(()), "healthy": jnp.asarray(True)}
+        info = {
+            "predicted_states": observation[None],
+            "effective_samples": jnp.ones(()),
+            "healthy": jnp.asarray(True),
+        }
         return follow(observation, reference), memory, info
 
     controller = adapters.commonroad_controller(Controller(lambda key: (), act))
-    family = scenarios.scenario(name="s1", duration=5.0, state_size=len(car.state_names), dt=car.dt)
+    family = scenarios.scenario(
+        name="s1", duration=5.0, state_size=len(car.state_names), dt=car.dt
+    )
     road = jit(family)(jax.random.key(3))
     road = road._replace(envs=road.envs.at[:, 0].set(0.6))
-    drive = jit(lambda key: evaluation.simulate(car.step, controller, {}, road, key, dt=car.dt, horizon=2))
+    drive = jit(
+        lambda key: evaluation.simulate(
+            car.step, controller, {}, road, key, dt=car.dt, horizon=2
+        )
+    )
     episode = drive(jax.random.key(0))
     batch = jax.tree.map(lambda leaf: leaf[None], episode)
-    assert not evaluation.score(batch, np.asarray(road.envs)[None], dt=car.dt).departed.any()
+    assert not evaluation.score(
+        batch, np.asarray(road.envs)[None], dt=car.dt
+    ).departed.any()
     assert float(episode.progress[-1]) > 45.0
     assert np.abs(episode.states[:, 2]).max() > 0.05
 
@@ -238,7 +324,9 @@ def test_what_is_no_such_car_is_refused_in_one_line(asked, message):
 
 
 def test_an_observation_of_another_size_is_refused():
-    with pytest.raises(ValueError, match="states must be 7, as of the dynamic vehicle, or 4"):
+    with pytest.raises(
+        ValueError, match="states must be 7, as of the dynamic vehicle, or 4"
+    ):
         adapters.commonroad_observation(jnp.zeros(9), states=5)
 
 

@@ -1,4 +1,6 @@
-"""The drift car that jax traces (benchmarks/commonroad_traced.py) beside the package's own function."""
+"""The drift car that jax traces (benchmarks/commonroad_traced.py) beside the package's
+own function.
+"""
 
 from importlib import import_module
 from pathlib import Path
@@ -6,7 +8,10 @@ from pathlib import Path
 import jax.numpy as jnp
 import pytest
 
-pytest.importorskip("vehiclemodels", reason='CommonRoad\'s cars need the extra: pip install "sfkd-jax[plants]"')
+pytest.importorskip(
+    "vehiclemodels",
+    reason='CommonRoad\'s cars need the extra: pip install "sfkd-jax[plants]"',
+)
 
 BENCHMARKS = Path(__file__).parents[2] / "benchmarks"
 CLOSE = 1e-5
@@ -16,7 +21,9 @@ WHEELS = 2e-3
 
 
 def test_one_step_is_that_of_the_package(monkeypatch):
-    """Braking and driving, both sides, wind, and sliding at friction 0.3; no wheel locks."""
+    """Braking and driving, both sides, wind, and sliding at friction 0.3; no wheel
+    locks.
+    """
     monkeypatch.syspath_prepend(str(BENCHMARKS))
     states = [
         [0.0, 0.0, 0.0, 10.0, 0.0, 0.0, 0.0, 0.0, 0.0],
@@ -26,7 +33,13 @@ def test_one_step_is_that_of_the_package(monkeypatch):
     ]
     controls = [[0.05, 1.0], [-0.2, -1.0], [0.12, 2.5], [0.15, -0.5]]
     envs = [[0.9, 0.0], [0.3, 8.0], [0.6, -5.0], [0.3, -8.0]]
-    found = import_module("commonroad_traced").disagreement(*map(jnp.asarray, (states, controls, envs)))
+    found = import_module("commonroad_traced").disagreement(
+        *map(jnp.asarray, (states, controls, envs))
+    )
     wheels = {name: value for name, value in found.items() if name.startswith("hidden")}
-    assert {name: value for name, value in found.items() if value > (WHEELS if name in wheels else CLOSE)} == {}
+    assert {
+        name: value
+        for name, value in found.items()
+        if value > (WHEELS if name in wheels else CLOSE)
+    } == {}
     assert len(wheels) == 2

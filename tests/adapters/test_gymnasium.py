@@ -1,4 +1,6 @@
-"""The vehicles as a gymnasium environment: the checker, seeds, the same episode as in brax, and refusals."""
+"""The vehicles as a gymnasium environment: the checker, seeds, the same episode as in
+brax, and refusals.
+"""
 
 import gymnasium
 import jax
@@ -45,7 +47,10 @@ def test_the_same_seed_is_the_same_episode_and_another_is_not(made):
 
 
 def test_episodes_after_a_seed_differ_and_repeat(made):
-    roads = [[made.reset(seed=3)[0], episode(made, None, 5)[0], episode(made, None, 5)[0]] for _ in range(2)]
+    roads = [
+        [made.reset(seed=3)[0], episode(made, None, 5)[0], episode(made, None, 5)[0]]
+        for _ in range(2)
+    ]
     for once, again in zip(*roads, strict=True):
         np.testing.assert_array_equal(once, again)
     assert np.abs(roads[0][1] - roads[0][2]).max() > 1e-4
@@ -56,13 +61,22 @@ def test_it_drives_what_the_task_says(made):
     task = adapters.tracking_task(**SETTINGS)
     key = jax.random.key(int(gymnasium.utils.seeding.np_random(11)[0].integers(2**31)))
     road, moment = jit(task.reset)(key)
-    step = jit(lambda moment: (task.step(road, moment, jnp.asarray(ACTION)), task.observe(road, moment)))
-    for seen, (_, reward, terminated, truncated, info) in zip(observations, taken, strict=False):
+    step = jit(
+        lambda moment: (
+            task.step(road, moment, jnp.asarray(ACTION)),
+            task.observe(road, moment),
+        )
+    )
+    for seen, (_, reward, terminated, truncated, info) in zip(
+        observations, taken, strict=False
+    ):
         (moment, outcome), expected = step(moment)
         np.testing.assert_allclose(seen, expected, atol=1e-4)
         np.testing.assert_allclose(reward, outcome.reward, rtol=1e-3, atol=1e-3)
         assert (terminated, truncated) == (bool(outcome.left), bool(outcome.over))
-        assert info == pytest.approx({name: float(value) for name, value in outcome.measures.items()}, abs=1e-3)
+        assert info == pytest.approx(
+            {name: float(value) for name, value in outcome.measures.items()}, abs=1e-3
+        )
 
 
 def test_the_end_of_the_road_truncates_and_leaving_the_lane_terminates(made):
@@ -70,7 +84,9 @@ def test_the_end_of_the_road_truncates_and_leaving_the_lane_terminates(made):
     assert [step[2:4] for step in taken] == [(False, False)] * 29 + [(False, True)]
     made.reset(seed=0)
     for _ in range(30):
-        _, reward, terminated, truncated, info = made.step(np.asarray([-1.0, 0.34], dtype=np.float32))
+        _, reward, terminated, truncated, info = made.step(
+            np.asarray([-1.0, 0.34], dtype=np.float32)
+        )
         if terminated:
             break
     assert terminated
@@ -80,7 +96,9 @@ def test_the_end_of_the_road_truncates_and_leaving_the_lane_terminates(made):
 
 
 def test_a_vector_of_them_steps():
-    envs = gymnasium.make_vec("sfkd_jax/Vehicle-v0", num_envs=2, vectorization_mode="sync", **SETTINGS)
+    envs = gymnasium.make_vec(
+        "sfkd_jax/Vehicle-v0", num_envs=2, vectorization_mode="sync", **SETTINGS
+    )
     observations, _ = envs.reset(seed=1)
     after, rewards, *_ = envs.step(np.stack([ACTION, ACTION]))
     assert observations.shape == after.shape
@@ -89,7 +107,9 @@ def test_a_vector_of_them_steps():
 
 
 def test_it_refuses_bad_settings_and_a_step_before_the_reset():
-    with pytest.raises(ValueError, match="unknown scenario 's9'; choose one of") as refusal:
+    with pytest.raises(
+        ValueError, match="unknown scenario 's9'; choose one of"
+    ) as refusal:
         gymnasium.make("sfkd_jax/Vehicle-v0", scenario="s9")
     assert "\n" not in str(refusal.value)
     with pytest.raises(gymnasium.error.ResetNeeded):

@@ -37,13 +37,17 @@ from sfkd_jax.types import Trajectory
     ],
 )
 def test_the_interval_of_a_proportion_is_the_exact_one(successes, trials, lower, upper):
-    np.testing.assert_allclose(clopper_pearson(successes, trials), (lower, upper), atol=1e-4)
+    np.testing.assert_allclose(
+        clopper_pearson(successes, trials), (lower, upper), atol=1e-4
+    )
 
 
 def test_the_interval_of_a_proportion_knows_its_mirror_image():
     for successes in range(0, 31, 5):
         low, high = clopper_pearson(successes, 30)
-        np.testing.assert_allclose(clopper_pearson(30 - successes, 30), (1 - high, 1 - low), atol=1e-9)
+        np.testing.assert_allclose(
+            clopper_pearson(30 - successes, 30), (1 - high, 1 - low), atol=1e-9
+        )
 
 
 def test_a_higher_level_makes_a_wider_interval():
@@ -64,15 +68,22 @@ def test_the_interval_covers_the_truth_at_least_as_often_as_it_says():
 def scores(random, count):
     """Exchangeable, correlated between kinds, heavy-tailed, in four different units."""
     common = random.standard_exponential((count, 1))
-    return Disturbance((common + random.standard_exponential((count, 4)) ** 2) * np.asarray([1.0, 1e-3, 50.0, 7.0]))
+    return Disturbance(
+        (common + random.standard_exponential((count, 4)) ** 2)
+        * np.asarray([1.0, 1e-3, 50.0, 7.0])
+    )
 
 
 @pytest.mark.parametrize(("level", "count"), [(0.9, 39), (0.95, 59), (0.8, 24)])
 def test_conformal_bounds_cover_a_new_trajectory_as_often_as_they_say(level, count):
-    """Split conformal, exactly: P(covered) = ⌈(n+1) level⌉/(n+1), here level to 1/(n+1), for all four kinds at once."""
+    """Split conformal, exactly: P(covered) = ⌈(n+1) level⌉/(n+1), here level to
+    1/(n+1), for all four kinds at once.
+    """
     random, shares = np.random.default_rng(0), []
     for _ in range(250):
-        units = (even_units, partial(tube_units, level=level))[len(shares) % 2](scores(random, 50))
+        units = (even_units, partial(tube_units, level=level))[len(shares) % 2](
+            scores(random, 50)
+        )
         bounds = conformal_bounds(units, scores(random, count), level=level)
         shares.append(coverage(bounds, scores(random, 100)))
     exact = np.ceil((count + 1) * level) / (count + 1)
@@ -95,35 +106,54 @@ def test_bounds_do_not_depend_on_the_units_of_a_kind():
     reference, calibration = scores(random, 50), scores(random, 40)
     scale = np.asarray([1e3, 1e-3, 1.0, 5.0])
     bounds = conformal_bounds(even_units(reference), calibration, level=0.9)
-    moved = Disturbance(scale * reference.scores), Disturbance(scale * calibration.scores)
+    moved = (
+        Disturbance(scale * reference.scores),
+        Disturbance(scale * calibration.scores),
+    )
     scaled = conformal_bounds(even_units(moved[0]), moved[1], level=0.9)
     np.testing.assert_allclose(scaled, scale * bounds)
 
 
 def test_a_kind_that_never_errs_needs_no_unit():
-    silent = Disturbance(scores(np.random.default_rng(3), 40).scores * np.asarray([1.0, 0.0, 1.0, 1.0]))
+    silent = Disturbance(
+        scores(np.random.default_rng(3), 40).scores * np.asarray([1.0, 0.0, 1.0, 1.0])
+    )
     assert even_units(silent)[1] == 1.0
-    assert np.all(even_units(silent)[[0, 2, 3]] == even_units(scores(np.random.default_rng(3), 40))[[0, 2, 3]])
+    assert np.all(
+        even_units(silent)[[0, 2, 3]]
+        == even_units(scores(np.random.default_rng(3), 40))[[0, 2, 3]]
+    )
     assert np.all(np.isfinite(conformal_bounds(even_units(silent), silent, level=0.9)))
 
 
 @pytest.mark.parametrize(("count", "level"), [(18, 0.95), (8, 0.9), (98, 0.99)])
 def test_too_few_trajectories_for_the_level_are_refused(count, level):
     random = np.random.default_rng(0)
-    with pytest.raises(ValueError, match=f"{count} calibration trajectories are too few for level {level}"):
-        conformal_bounds(even_units(scores(random, 50)), scores(random, count), level=level)
-    bounds = conformal_bounds(even_units(scores(random, 50)), scores(random, count + 1), level=level)
+    with pytest.raises(
+        ValueError,
+        match=f"{count} calibration trajectories are too few for level {level}",
+    ):
+        conformal_bounds(
+            even_units(scores(random, 50)), scores(random, count), level=level
+        )
+    bounds = conformal_bounds(
+        even_units(scores(random, 50)), scores(random, count + 1), level=level
+    )
     assert np.all(np.isfinite(bounds))
 
 
 def test_in_the_units_of_a_tube_the_latent_kind_decides():
-    """The other kinds hardly ever do, and the bound is hardly above the one of the latent kind alone."""
+    """The other kinds hardly ever do, and the bound is hardly above the one of the
+    latent kind alone.
+    """
     random, ratios = np.random.default_rng(4), []
     for _ in range(40):
         reference, calibration = scores(random, 200), scores(random, 199)
         alone = np.sort(calibration.scores[:, 0])[int(np.ceil(200 * 0.95)) - 1]
         even = conformal_bounds(even_units(reference), calibration, level=0.95)
-        ours = conformal_bounds(tube_units(reference, level=0.95), calibration, level=0.95)
+        ours = conformal_bounds(
+            tube_units(reference, level=0.95), calibration, level=0.95
+        )
         ratios.append((even[0] / alone, ours[0] / alone))
     inflated, tight = np.mean(ratios, axis=0)
     assert 1.0 <= tight < 1.25 < 1.6 < inflated
@@ -161,7 +191,9 @@ def test_reference_scores_that_are_not_numbers_are_refused():
 
 
 def test_coverage_counts_trajectories_inside_all_bounds():
-    held_out = Disturbance(np.asarray([[1.0, 1, 1, 1], [2, 1, 1, 1], [1, 1, 1, 1.0001], [0, 0, 0, 0]]))
+    held_out = Disturbance(
+        np.asarray([[1.0, 1, 1, 1], [2, 1, 1, 1], [1, 1, 1, 1.0001], [0, 0, 0, 0]])
+    )
     assert coverage(np.ones(4), held_out) == 0.5
 
 
@@ -176,23 +208,37 @@ def test_a_split_of_any_length_is_measured_in_batches_of_one_size(monkeypatch, c
 
     monkeypatch.setattr(_calibration, "_largest", largest)
     each = np.arange(count, dtype=np.float32)[:, None, None]
-    data = Trajectory(*(jnp.asarray(each + np.zeros(shape)) for shape in ((4, 5), (3, 2), (3, 2))))
+    data = Trajectory(
+        *(jnp.asarray(each + np.zeros(shape)) for shape in ((4, 5), (3, 2), (3, 2)))
+    )
     found = inspect.unwrap(disturbances)(None, None, data)
     np.testing.assert_array_equal(found.scores, each[:, :, 0] * np.ones(4))
     assert len(batches) == -(-count // _calibration.CHUNK)
     assert {len(leaf) for part in batches for leaf in part} == {_calibration.CHUNK}
 
 
-def test_every_step_is_measured_in_the_frame_of_the_first_state_and_environment(monkeypatch):
+def test_every_step_is_measured_in_the_frame_of_the_first_state_and_environment(
+    monkeypatch,
+):
     """What each step is given, as the largest entries of a trajectory that only grows."""
     model = SimpleNamespace(encode=lambda fiber, state: 1000 * fiber + state[0])
-    monkeypatch.setattr(_calibration, "fibers_along", lambda model, params, trajectory: 2 * (trajectory.envs[:, 0],))
-    given = lambda model, fiber, later, origin, *step: jnp.stack([origin, *(part[0] for part in step)])  # noqa: E731
+    monkeypatch.setattr(
+        _calibration,
+        "fibers_along",
+        lambda model, params, trajectory: 2 * (trajectory.envs[:, 0],),
+    )
+    given = lambda model, fiber, later, origin, *step: jnp.stack(
+        [origin, *(part[0] for part in step)]
+    )
     monkeypatch.setattr(_calibration, "step_disturbances", given)
     states = np.arange(10, dtype=np.float32).reshape(2, 5, 1)
-    data = Trajectory(*map(jnp.asarray, (states, 100 + states[:, :-1], 7 + states[:, :-1])))
+    data = Trajectory(
+        *map(jnp.asarray, (states, 100 + states[:, :-1], 7 + states[:, :-1]))
+    )
     found = inspect.unwrap(_calibration._largest)(model, {}, data)
-    np.testing.assert_array_equal(found, [[7000.0, 3.0, 103.0, 4.0], [12005.0, 8.0, 108.0, 9.0]])
+    np.testing.assert_array_equal(
+        found, [[7000.0, 3.0, 103.0, 4.0], [12005.0, 8.0, 108.0, 9.0]]
+    )
 
 
 def test_the_true_plant_has_no_disturbance():
@@ -207,12 +253,18 @@ def test_a_disturbance_is_the_largest_along_the_trajectory():
     kinds = disturbances(model, params, data).scores
     yaw = np.asarray(data.states)[1, 5:, 2]
     states = np.array(data.states)
-    states[1, 5:, 3] += 0.25  # from step 5 on; steps 6, 7, … then differ because the plant depends on v
-    pushed = disturbances(model, params, data._replace(states=jnp.asarray(states))).scores
+    states[1, 5:, 3] += (
+        0.25  # from step 5 on; steps 6, 7, … then differ because the plant depends on v
+    )
+    pushed = disturbances(
+        model, params, data._replace(states=jnp.asarray(states))
+    ).scores
     assert yaw.size
     np.testing.assert_allclose(pushed[[0, 2]], kinds[[0, 2]], atol=1e-7)
     assert pushed[1, 3] >= 0.25 - 1e-5
-    assert pushed[1, 0] == pytest.approx(pushed[1, 3], rel=1e-4)  # the latent of a physics model is the body state
+    assert pushed[1, 0] == pytest.approx(
+        pushed[1, 3], rel=1e-4
+    )  # the latent of a physics model is the body state
 
 
 def test_position_and_yaw_disturbances_are_those_of_the_pose_increment():
@@ -221,8 +273,12 @@ def test_position_and_yaw_disturbances_are_those_of_the_pose_increment():
     states = np.array(data.states)
     states[2, 4:, 0] += 0.3
     states[2, 4:, 1] += 0.4
-    moved = disturbances(model, params, data._replace(states=jnp.asarray(states))).scores
+    moved = disturbances(
+        model, params, data._replace(states=jnp.asarray(states))
+    ).scores
     np.testing.assert_allclose(moved[2], [0.0, 0.5, 0.0, 0.0], atol=1e-5)
     states[2, 4:, 2] += 0.1
-    turned = disturbances(model, params, data._replace(states=jnp.asarray(states))).scores
+    turned = disturbances(
+        model, params, data._replace(states=jnp.asarray(states))
+    ).scores
     np.testing.assert_allclose(turned[2], [0.0, 0.5, 0.1, 0.0], atol=1e-5)

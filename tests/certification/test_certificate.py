@@ -1,4 +1,6 @@
-"""Certificates of real weights: the constants are theirs, attacks stay below, other weights are not covered."""
+"""Certificates of real weights: the constants are theirs, attacks stay below, other
+weights are not covered.
+"""
 
 import dataclasses
 import json
@@ -7,9 +9,25 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from helpers import ENV_HIGH, ENV_LOW, HARD, certified, explicit, jit, model_and_params, steepest_pattern, tiny
+from helpers import (
+    ENV_HIGH,
+    ENV_LOW,
+    HARD,
+    certified,
+    explicit,
+    jit,
+    model_and_params,
+    steepest_pattern,
+    tiny,
+)
 
-from sfkd_jax.certification import Certificate, CertificateStale, CertificationRefused, certify, verify
+from sfkd_jax.certification import (
+    Certificate,
+    CertificateStale,
+    CertificationRefused,
+    certify,
+    verify,
+)
 from sfkd_jax.core.se2 import between
 from sfkd_jax.types import POSE
 
@@ -54,7 +72,11 @@ def test_the_constants_are_those_of_the_exported_weights():
 @pytest.mark.parametrize("scale", [1.0, 3.0])
 def test_the_decoders_constants_bound_it_under_attack(name, scale):
     weights, proved = explicit(name, scale), certified(name, scale).lipschitz
-    for part, rows in (("position", slice(0, 2)), ("yaw", slice(2, 3)), ("decoder", slice(0, 3))):
+    for part, rows in (
+        ("position", slice(0, 2)),
+        ("yaw", slice(2, 3)),
+        ("decoder", slice(0, 3)),
+    ):
         attack = steepest_pattern((*weights.decoder[:-1], weights.decoder[-1][rows]))
         assert attack <= proved[part] * (1 + 1e-12)
         assert proved[part] < 1.25 * attack
@@ -63,7 +85,9 @@ def test_the_decoders_constants_bound_it_under_attack(name, scale):
 
 
 def test_the_decoders_constants_bound_what_a_step_emits():
-    """Pairs of latents under the same u and e: pose increments in metres and radians, body state in m/s."""
+    """Pairs of latents under the same u and e: pose increments in metres and radians,
+    body state in m/s.
+    """
     model, params = model_and_params("sfkd")
     proved = certified("sfkd").lipschitz
     random = np.random.default_rng(0)
@@ -75,13 +99,21 @@ def test_the_decoders_constants_bound_what_a_step_emits():
         fiber = model.fiber(params, env)
         latent = model.encode(fiber, jnp.asarray([0.0, 0.0, 0.0, 10.0]))._replace(z=z)
         after = model.step(fiber, latent, control)
-        return between(latent.pose, model.decode(fiber, after)[POSE]), model.decode(fiber, latent)[3:]
+        return between(latent.pose, model.decode(fiber, after)[POSE]), model.decode(
+            fiber, latent
+        )[3:]
 
-    both = [jit(jax.vmap(emitted))(side.astype(np.float32), envs, controls) for side in z]
-    motion, body = (np.asarray(a, np.float64) - np.asarray(b) for a, b in zip(*both, strict=True))
+    both = [
+        jit(jax.vmap(emitted))(side.astype(np.float32), envs, controls) for side in z
+    ]
+    motion, body = (
+        np.asarray(a, np.float64) - np.asarray(b) for a, b in zip(*both, strict=True)
+    )
     apart = np.linalg.norm(z[0] - z[1], axis=1)
     rounding = 3e-6 * (1 + np.linalg.norm(z, axis=2).max(axis=0))
-    assert np.all(np.linalg.norm(motion[:, :2], axis=1) <= proved["position"] * apart + rounding)
+    assert np.all(
+        np.linalg.norm(motion[:, :2], axis=1) <= proved["position"] * apart + rounding
+    )
     assert np.all(np.abs(motion[:, 2]) <= proved["yaw"] * apart + rounding)
     assert np.all(np.linalg.norm(body, axis=1) <= proved["body"] * apart + rounding)
 
@@ -102,7 +134,9 @@ def test_a_free_residual_that_happens_to_be_small_is_certified_after_the_fact():
     model, params = model_and_params("no_contraction")
     network = params["networks"]["residual_weights"]
     small = network | {"kernel_2": 0.01 * network["kernel_2"]}
-    proved = certify(model, with_networks(params, residual_weights=small), BOX, attack_starts=0)
+    proved = certify(
+        model, with_networks(params, residual_weights=small), BOX, attack_starts=0
+    )
     found = steepest_pattern(jax.tree.leaves(small))
     assert found <= proved.beta <= 1.15 * found
 
@@ -139,15 +173,24 @@ def test_a_decoder_that_emits_a_constant_has_constant_zero():
     model, params = model_and_params("sfkd")
     network = params["networks"]["decoder_weights"]
     silent = network | {"tall_1": np.zeros_like(network["tall_1"])}
-    proved = certify(model, with_networks(params, decoder_weights=silent), BOX, attack_starts=0)
-    assert proved.lipschitz["position"] == proved.lipschitz["yaw"] == proved.lipschitz["decoder"] == 0.0
+    proved = certify(
+        model, with_networks(params, decoder_weights=silent), BOX, attack_starts=0
+    )
+    assert (
+        proved.lipschitz["position"]
+        == proved.lipschitz["yaw"]
+        == proved.lipschitz["decoder"]
+        == 0.0
+    )
     verify(proved, with_networks(params, decoder_weights=silent), model=model)
 
 
 @pytest.mark.parametrize("name", [*HARD, "no_residual"])
 def test_a_certificate_passes_its_own_check_also_after_a_walk_through_json(name):
     model, params = model_and_params(name)
-    walked = Certificate.from_document(json.loads(json.dumps(certified(name).document())))
+    walked = Certificate.from_document(
+        json.loads(json.dumps(certified(name).document()))
+    )
     assert walked == Certificate.from_document(certified(name).document())
     verify(walked, params, model=model)
 
@@ -158,7 +201,9 @@ CLAIMS = ("alpha", "alpha_separate", "alpha_joint", "rho", "beta", "kappa")
 @pytest.mark.parametrize("claim", CLAIMS)
 def test_no_claim_can_be_made_smaller_by_hand(claim):
     model, params = model_and_params("sfkd")
-    forged = dataclasses.replace(certified("sfkd"), **{claim: 0.99 * getattr(certified("sfkd"), claim)})
+    forged = dataclasses.replace(
+        certified("sfkd"), **{claim: 0.99 * getattr(certified("sfkd"), claim)}
+    )
     with pytest.raises(CertificationRefused, match="does not follow"):
         verify(forged, params, model=model)
 
@@ -167,7 +212,9 @@ def test_no_claim_can_be_made_smaller_by_hand(claim):
 def test_no_constant_of_the_decoder_can_be_made_smaller_by_hand(part):
     model, params = model_and_params("sfkd")
     constants = certified("sfkd").lipschitz
-    forged = dataclasses.replace(certified("sfkd"), lipschitz=constants | {part: 0.9 * constants[part]})
+    forged = dataclasses.replace(
+        certified("sfkd"), lipschitz=constants | {part: 0.9 * constants[part]}
+    )
     with pytest.raises(CertificationRefused, match=f"{part} does not follow"):
         verify(forged, params, model=model)
 
@@ -176,8 +223,12 @@ def test_no_constant_of_the_decoder_can_be_made_smaller_by_hand(part):
 @pytest.mark.parametrize("factor", [0.5, -1.0, float("nan")])
 def test_a_spoiled_witness_is_no_witness(witness, factor):
     model, params = model_and_params("sfkd")
-    spoiled = jax.tree.map(lambda entry: factor * entry, certified("sfkd").witnesses[witness])
-    forged = dataclasses.replace(certified("sfkd"), witnesses=certified("sfkd").witnesses | {witness: spoiled})
+    spoiled = jax.tree.map(
+        lambda entry: factor * entry, certified("sfkd").witnesses[witness]
+    )
+    forged = dataclasses.replace(
+        certified("sfkd"), witnesses=certified("sfkd").witnesses | {witness: spoiled}
+    )
     with pytest.raises(CertificationRefused, match="does not follow"):
         verify(forged, params, model=model)
 
@@ -194,7 +245,9 @@ def test_a_certificate_with_all_its_claims_scaled_together_is_no_certificate():
 def test_a_certificate_does_not_cover_other_weights():
     model, params = model_and_params("sfkd")
     for leaf in ("operators", "centre"):
-        changed = with_networks(params, **{leaf: params["networks"][leaf].at[..., 0].add(1e-7)})
+        changed = with_networks(
+            params, **{leaf: params["networks"][leaf].at[..., 0].add(1e-7)}
+        )
         with pytest.raises(CertificateStale):
             verify(certified("sfkd"), changed, model=model)
 
@@ -212,10 +265,19 @@ def test_a_mode_that_does_not_exist_is_an_error(settings):
 
 @pytest.mark.parametrize(
     "changes",
-    [{"joint": [[]]}, {"joint": None}, {"residual": "none"}, {"residual": [[1.0]]}, {"metric": [[1.0]]}, {"yaw": None}],
+    [
+        {"joint": [[]]},
+        {"joint": None},
+        {"residual": "none"},
+        {"residual": [[1.0]]},
+        {"metric": [[1.0]]},
+        {"yaw": None},
+    ],
 )
 def test_witnesses_of_another_shape_are_refused(changes):
     model, params = model_and_params("sfkd")
-    forged = dataclasses.replace(certified("sfkd"), witnesses=certified("sfkd").witnesses | changes)
+    forged = dataclasses.replace(
+        certified("sfkd"), witnesses=certified("sfkd").witnesses | changes
+    )
     with pytest.raises(CertificationRefused, match=r"malformed|does not follow"):
         verify(forged, params, model=model)

@@ -6,7 +6,13 @@ import numpy as np
 import pytest
 from exact import exact_witness, forged_witness, is_definite, search
 
-from sfkd_jax.certification import _core, check_metric, check_witness, is_positive_definite, norm_upper
+from sfkd_jax.certification import (
+    _core,
+    check_metric,
+    check_witness,
+    is_positive_definite,
+    norm_upper,
+)
 
 
 def rotation(size, seed=0):
@@ -24,7 +30,9 @@ def with_eigenvalues(values, seed=0):
 @pytest.mark.parametrize("smallest", [-1.0, -1e-6, -1e-11])
 def test_an_indefinite_matrix_is_never_accepted(size, smallest):
     for seed in range(10):
-        values = np.concatenate([[smallest], np.random.default_rng(seed).uniform(0.1, 1.0, size - 1)])
+        values = np.concatenate(
+            [[smallest], np.random.default_rng(seed).uniform(0.1, 1.0, size - 1)]
+        )
         assert not is_positive_definite(with_eigenvalues(values, seed))
 
 
@@ -32,14 +40,18 @@ def test_an_indefinite_matrix_is_never_accepted(size, smallest):
 def test_an_exactly_singular_matrix_of_integers_is_never_accepted(size):
     """B'B with fewer rows than columns: every product and sum is exact in float64."""
     for seed in range(50):
-        half = np.random.default_rng(seed).integers(-9, 10, (size - 1, size)).astype(float)
+        half = (
+            np.random.default_rng(seed).integers(-9, 10, (size - 1, size)).astype(float)
+        )
         assert not is_positive_definite(half.T @ half)
 
 
 @pytest.mark.parametrize("size", [1, 2, 5, 20, 60])
 def test_a_positive_definite_matrix_with_a_small_margin_is_accepted(size):
     for seed in range(10):
-        values = np.concatenate([[1e-10], np.random.default_rng(seed).uniform(0.1, 1.0, size - 1)])
+        values = np.concatenate(
+            [[1e-10], np.random.default_rng(seed).uniform(0.1, 1.0, size - 1)]
+        )
         assert is_positive_definite(with_eigenvalues(values, seed))
 
 
@@ -106,9 +118,13 @@ def test_the_norm_bound_is_never_below_what_a_vector_shows():
     random = np.random.default_rng(1)
     for size in (2, 8, 24):
         for _ in range(20):
-            matrix = random.standard_normal((size, size)) * 10.0 ** random.integers(-6, 6, (size, 1))
+            matrix = random.standard_normal((size, size)) * 10.0 ** random.integers(
+                -6, 6, (size, 1)
+            )
             _, values, right = np.linalg.svd(matrix)
-            shown = np.linalg.norm(matrix.astype(np.longdouble) @ right[0].astype(np.longdouble))
+            shown = np.linalg.norm(
+                matrix.astype(np.longdouble) @ right[0].astype(np.longdouble)
+            )
             shown /= np.linalg.norm(right[0].astype(np.longdouble))
             assert shown <= norm_upper(matrix) <= values[0] * (1 + 1e-9)
 
@@ -122,7 +138,10 @@ def test_the_norm_bound_of_nothing_is_nothing_and_of_nonsense_is_infinite():
 def test_the_norm_bound_of_a_float32_matrix_is_not_below_its_norm():
     random = np.random.default_rng(0)
     matrices = [random.standard_normal((16, 16)).astype(np.float32) for _ in range(100)]
-    assert all(norm_upper(matrix) >= np.linalg.norm(matrix.astype(np.float64), 2) for matrix in matrices)
+    assert all(
+        norm_upper(matrix) >= np.linalg.norm(matrix.astype(np.float64), 2)
+        for matrix in matrices
+    )
 
 
 WEIGHTS = [2.0 * rotation(6, 1), 0.5 * rotation(6, 2), 3.0 * rotation(6, 3)]
@@ -190,7 +209,11 @@ def test_layers_of_different_widths_fit_together():
     norms = [np.linalg.norm(matrix, 2) for matrix in weights]
     multipliers = [np.full(5, (norms[2] * norms[1]) ** 2), np.full(7, norms[2] ** 2)]
     assert check_witness(weights, multipliers, np.prod(norms) * (1 + 1e-9))
-    assert not check_witness(weights, multipliers, 0.99 * np.linalg.norm(weights[2] @ weights[1] @ weights[0], 2))
+    assert not check_witness(
+        weights,
+        multipliers,
+        0.99 * np.linalg.norm(weights[2] @ weights[1] @ weights[0], 2),
+    )
 
 
 # --- nothing that LAPACK, the processor or an enemy does is believed --------------------------------------------------
@@ -218,12 +241,18 @@ INDEFINITE = {
 LIES = {
     "nothing": lambda matrix: np.zeros_like(matrix),
     "no number": lambda matrix: np.full_like(matrix, np.nan),
-    "one pivot that is no number": lambda matrix: np.diag([*np.sqrt(np.abs(np.diag(matrix)))[:-1], np.nan]),
+    "one pivot that is no number": lambda matrix: np.diag(
+        [*np.sqrt(np.abs(np.diag(matrix)))[:-1], np.nan]
+    ),
     "infinity": lambda matrix: np.tril(np.full_like(matrix, np.inf)),
     "overflow": lambda matrix: np.tril(np.full_like(matrix, 1e200)),
-    "the root of the diagonal": lambda matrix: np.diag(np.sqrt(np.abs(np.diag(matrix)))),
+    "the root of the diagonal": lambda matrix: np.diag(
+        np.sqrt(np.abs(np.diag(matrix)))
+    ),
     "the root of the positive part": lambda matrix: positive_root(matrix),
-    "a random factor": lambda matrix: np.tril(np.random.default_rng(0).standard_normal(matrix.shape)),
+    "a random factor": lambda matrix: np.tril(
+        np.random.default_rng(0).standard_normal(matrix.shape)
+    ),
     "the matrix itself": lambda matrix: matrix,
 }
 
@@ -235,7 +264,9 @@ def positive_root(matrix):
 
 @pytest.mark.parametrize("lie", LIES)
 @pytest.mark.parametrize("matrix", INDEFINITE)
-def test_whatever_a_factorisation_returns_an_indefinite_matrix_is_refused(matrix, lie, monkeypatch):
+def test_whatever_a_factorisation_returns_an_indefinite_matrix_is_refused(
+    matrix, lie, monkeypatch
+):
     monkeypatch.setattr(np.linalg, "cholesky", LIES[lie])
     assert not is_positive_definite(INDEFINITE[matrix])
 
@@ -244,7 +275,11 @@ def test_a_factor_that_is_a_little_wrong_proves_nothing(monkeypatch):
     """By more than the shift allows, which is about 1e-14 of the trace."""
     matrix, true = with_eigenvalues([0.3, 0.7, 1.0]), np.linalg.cholesky
     for wrong, accepted in ((1e-16, True), (1e-12, False), (1e-6, False)):
-        monkeypatch.setattr(np.linalg, "cholesky", lambda shifted, wrong=wrong: true(shifted) * (1 + wrong))
+        monkeypatch.setattr(
+            np.linalg,
+            "cholesky",
+            lambda shifted, wrong=wrong: true(shifted) * (1 + wrong),
+        )
         assert is_positive_definite(matrix) == accepted
 
 
@@ -274,7 +309,11 @@ def squared_distance(exact, rounded):
 
 def exact_product(left, right):
     return [
-        [sum(a * b for a, b in zip(row, column, strict=True)) for column in zip(*right, strict=True)] for row in left
+        [
+            sum(a * b for a, b in zip(row, column, strict=True))
+            for column in zip(*right, strict=True)
+        ]
+        for row in left
     ]
 
 
@@ -287,10 +326,20 @@ def test_the_error_of_a_product_is_at_most_what_is_said_of_it(scale, shape):
     random = np.random.default_rng(0)
     rows, inner, columns = shape
     for _ in range(20):
-        left, right = scale * random.standard_normal((rows, inner)), random.standard_normal((inner, columns)) / 3
+        left, right = (
+            scale * random.standard_normal((rows, inner)),
+            random.standard_normal((inner, columns)) / 3,
+        )
         rounded, error = _core.product(left, right)
-        assert squared_distance(exact_product(exactly(left), exactly(right)), rounded) <= Fraction(error) ** 2
-        assert error <= 1e-12 * np.linalg.norm(np.abs(left) @ np.abs(right) / scale) * scale + 1e-300
+        assert (
+            squared_distance(exact_product(exactly(left), exactly(right)), rounded)
+            <= Fraction(error) ** 2
+        )
+        assert (
+            error
+            <= 1e-12 * np.linalg.norm(np.abs(left) @ np.abs(right) / scale) * scale
+            + 1e-300
+        )
 
 
 @pytest.mark.parametrize("scale", SCALES)
@@ -307,14 +356,24 @@ def test_the_error_of_a_witness_matrix_is_at_most_what_is_said_of_it(kind, metri
     random = np.random.default_rng(0)
     for case in range(25):
         grading = 10.0 ** random.integers(-8, 9, 3) if case % 2 else np.ones(3)
-        weights = [grading[:, None] * random.standard_normal((3, 3)) / 3, random.standard_normal((3, 3)) / 7]
-        weights = {"network": weights, "linear": [], "both": weights, "one layer": weights[:1]}[kind]
+        weights = [
+            grading[:, None] * random.standard_normal((3, 3)) / 3,
+            random.standard_normal((3, 3)) / 7,
+        ]
+        weights = {
+            "network": weights,
+            "linear": [],
+            "both": weights,
+            "one layer": weights[:1],
+        }[kind]
         linear = None if kind == "network" else random.standard_normal((3, 3)) / 3
         multipliers = [random.uniform(0.1, 3.0, 3) / grading for _ in weights[1:]]
         norm = None if metric is None else with_eigenvalues([0.1, 0.5, 3.0], case)
         given = weights, multipliers, float(random.uniform(0.1, 2.0)), linear, norm
         matrix, error = _core.witness_matrix(*given)
-        assert squared_distance(exact_witness(*given)[0], matrix) <= Fraction(error) ** 2
+        assert (
+            squared_distance(exact_witness(*given)[0], matrix) <= Fraction(error) ** 2
+        )
         assert error <= 1e-12 * (np.linalg.norm(matrix) + 100)
 
 
@@ -350,7 +409,12 @@ def test_a_metric_of_another_condition_is_refused():
         (-4.1, False),
     ):
         assert check_metric(metric, [0.5 * np.eye(2)], 0.6, condition) == holds
-    for rate, holds in ((0.50001, True), (0.49999, False), (-0.6, False), (np.nan, False)):
+    for rate, holds in (
+        (0.50001, True),
+        (0.49999, False),
+        (-0.6, False),
+        (np.nan, False),
+    ):
         assert check_metric(metric, [0.5 * np.eye(2)], rate, 5.0) == holds
 
 

@@ -1,4 +1,6 @@
-"""A certificate that was forged, or that lies beside other settings, is refused in one line; an honest one verifies."""
+"""A certificate that was forged, or that lies beside other settings, is refused in one
+line; an honest one verifies.
+"""
 
 import copy
 import json
@@ -15,7 +17,11 @@ from helpers import entry_at, put, refusal_of
 from jaxtyping import TypeCheckError
 
 from sfkd_jax import artefacts, demo, policy
-from sfkd_jax.certification import CertificateStale, CertificationRefused, verify_document
+from sfkd_jax.certification import (
+    CertificateStale,
+    CertificationRefused,
+    verify_document,
+)
 
 PLANTS = ("kinematic", "dynamic")
 
@@ -33,8 +39,12 @@ def honest(plant="kinematic"):
 def check(document, plant="kinematic"):
     trained = shipped(plant)
     try:
-        verify_document(document, trained.params, model=trained.model, policy_sha256=trained.sha256)
-    except TypeCheckError as reason:  # under test, types are checked before anything is verified
+        verify_document(
+            document, trained.params, model=trained.model, policy_sha256=trained.sha256
+        )
+    except (
+        TypeCheckError
+    ) as reason:  # under test, types are checked before anything is verified
         raise CertificationRefused("of another type") from reason
 
 
@@ -56,7 +66,9 @@ PROVED = (
 NONSENSE = (math.nan, math.inf, -math.inf, -4.1, 0.0, None, "0.5", [0.5], 1e400)
 
 
-@pytest.mark.parametrize("claim", [*PROVED, "lipschitz.decoder", "kappa", "transport_lipschitz"])
+@pytest.mark.parametrize(
+    "claim", [*PROVED, "lipschitz.decoder", "kappa", "transport_lipschitz"]
+)
 def test_no_proved_constant_can_be_replaced_by_nonsense(claim):
     for value in NONSENSE:
         with pytest.raises(CertificationRefused):
@@ -71,7 +83,9 @@ def test_no_proved_constant_can_be_made_smaller(claim):
 
 
 @pytest.mark.parametrize("claim", ["beta", "rho", "lipschitz.position"])
-def test_a_constant_that_is_larger_than_proved_does_not_go_unnoticed_where_others_follow_from_it(claim):
+def test_a_constant_that_is_larger_than_proved_does_not_go_unnoticed_where_others_follow_from_it(
+    claim,
+):
     with pytest.raises(CertificationRefused):
         check(put(honest(), claim, 1.01 * entry_at(honest(), claim)))
 
@@ -87,16 +101,45 @@ def test_constants_of_networks_that_there_are_not_are_refused():
 
 
 DERIVED = (
-    *("tube.latent.0", "tube.latent.19", "tube.ultimate", "tube.physical.position_m.19", "tube.physical.yaw_rad.3"),
-    *("tube.physical.body.7", "tube.largest_increment_m", "d_bar.value", "d_bar.one_step.latent", "d_bar.one_step.yaw"),
-    *("d_bar.coverage", "d_bar.coverage_ci95.0", "d_bar.by_scenario.s3.coverage", "decoder_lipschitz"),
-    *("d_bar.by_scenario.s3.coverage_ci95.1", "boxes.env.0.0", "env_box.1.1", "tightness", "attack", "attacks.step"),
+    *(
+        "tube.latent.0",
+        "tube.latent.19",
+        "tube.ultimate",
+        "tube.physical.position_m.19",
+        "tube.physical.yaw_rad.3",
+    ),
+    *(
+        "tube.physical.body.7",
+        "tube.largest_increment_m",
+        "d_bar.value",
+        "d_bar.one_step.latent",
+        "d_bar.one_step.yaw",
+    ),
+    *(
+        "d_bar.coverage",
+        "d_bar.coverage_ci95.0",
+        "d_bar.by_scenario.s3.coverage",
+        "decoder_lipschitz",
+    ),
+    *(
+        "d_bar.by_scenario.s3.coverage_ci95.1",
+        "boxes.env.0.0",
+        "env_box.1.1",
+        "tightness",
+        "attack",
+        "attacks.step",
+    ),
 )
 
 
 @pytest.mark.parametrize("number", DERIVED)
 def test_what_is_arithmetic_is_computed_again(number):
-    for value in (0.9 * entry_at(honest(), number), 1.001 * entry_at(honest(), number), math.nan, "many"):
+    for value in (
+        0.9 * entry_at(honest(), number),
+        1.001 * entry_at(honest(), number),
+        math.nan,
+        "many",
+    ):
         with pytest.raises(CertificationRefused):
             check(put(honest(), number, value))
 
@@ -140,7 +183,12 @@ def test_what_does_not_go_together_is_refused(path, value):
 
 
 def test_a_document_that_lacks_anything_is_refused():
-    spare = {"seconds", "seconds_proof", "versions", "weights_sha256"}  # needed by readers of the page
+    spare = {
+        "seconds",
+        "seconds_proof",
+        "versions",
+        "weights_sha256",
+    }  # needed by readers of the page
     for key in honest():
         lacking = {name: value for name, value in honest().items() if name != key}
         if key in spare:
@@ -155,7 +203,9 @@ def test_a_document_that_lacks_anything_is_refused():
 def leaves(value, path=()):
     """Where the numbers, words and switches of nested settings lie."""
     if isinstance(value, dict | list):
-        for key, entry in value.items() if isinstance(value, dict) else enumerate(value):
+        for key, entry in (
+            value.items() if isinstance(value, dict) else enumerate(value)
+        ):
             yield from leaves(entry, (*path, str(key)))
     else:
         yield ".".join(path), value
@@ -178,13 +228,18 @@ def test_the_hash_changes_with_every_single_setting():
     manifest = artefacts.read_json(demo.SHIPPED / "kinematic" / "policy.json")
     settings = dict(leaves(manifest["config"]))
     changed = {
-        policy.policy_hash(manifest | {"config": put(manifest["config"], path, another(value))})
+        policy.policy_hash(
+            manifest | {"config": put(manifest["config"], path, another(value))}
+        )
         for path, value in settings.items()
     }
     assert len(settings) > 120
     assert len(changed) == len(settings)
     assert shipped().sha256 == policy.policy_hash(manifest) not in changed
-    assert policy.policy_hash(manifest | {"sha256": "0" * 64}) not in {*changed, shipped().sha256}
+    assert policy.policy_hash(manifest | {"sha256": "0" * 64}) not in {
+        *changed,
+        shipped().sha256,
+    }
 
 
 @pytest.mark.parametrize(
@@ -198,10 +253,18 @@ def test_the_hash_changes_with_every_single_setting():
         ("dataset.env_low.0", 0.1),
     ],
 )
-def test_a_setting_that_changed_leaves_nothing_certified_and_says_so(copied, path, value):
+def test_a_setting_that_changed_leaves_nothing_certified_and_says_so(
+    copied, path, value
+):
     manifest = artefacts.read_json(copied / "policy.json")
-    artefacts.write_json(copied / "policy.json", manifest | {"config": put(manifest["config"], path, value)})
-    with pytest.warns(UserWarning, match="nothing is certified and nothing is monitored; .* other weights or settings"):
+    artefacts.write_json(
+        copied / "policy.json",
+        manifest | {"config": put(manifest["config"], path, value)},
+    )
+    with pytest.warns(
+        UserWarning,
+        match="nothing is certified and nothing is monitored; .* other weights or settings",
+    ):
         found = policy.load(copied)
     assert found.certificate is None
 
@@ -219,7 +282,10 @@ def test_a_fallback_needs_a_certificate(copied, fallback):
     policy.load(copied, controller=asked)
     (copied / "certificate.json").unlink()
     line = refusal_of(lambda: policy.load(copied, controller=asked))
-    assert f"controller.monitor.fallback={fallback} needs a certificate; certificate.json is missing" in line
+    assert (
+        f"controller.monitor.fallback={fallback} needs a certificate; certificate.json is missing"
+        in line
+    )
     with pytest.warns(UserWarning, match=r"certificate.json is missing"):
         assert policy.load(copied).certificate is None
 
@@ -231,7 +297,10 @@ def test_a_forged_certificate_is_an_error_that_names_the_file(copied):
 
 
 def test_a_refusal_is_told_with_its_reason(copied):
-    artefacts.write_json(copied / "certificate.json", {"valid": False, "reason": "alpha = 2.0 is not below 1"})
+    artefacts.write_json(
+        copied / "certificate.json",
+        {"valid": False, "reason": "alpha = 2.0 is not below 1"},
+    )
     with pytest.warns(UserWarning, match="refused: alpha = 2.0 is not below 1"):
         policy.load(copied)
 
@@ -251,9 +320,13 @@ def test_a_refusal_is_told_with_its_reason(copied):
 def test_weights_that_do_not_fit_the_model_are_refused_in_one_line(copied, spoil, told):
     arrays, manifest = artefacts.read_arrays(copied / "policy.npz", kind=policy.KIND)
     changed = spoil("networks/operators", arrays["networks/operators"])
-    arrays = {name: leaf for name, leaf in arrays.items() if name != "networks/operators"}
+    arrays = {
+        name: leaf for name, leaf in arrays.items() if name != "networks/operators"
+    }
     arrays |= {} if changed is None else {"networks/operators": changed}
-    artefacts.write_arrays(copied / "policy.npz", arrays, kind=policy.KIND, config=manifest["config"])
+    artefacts.write_arrays(
+        copied / "policy.npz", arrays, kind=policy.KIND, config=manifest["config"]
+    )
     line = refusal_of(lambda: policy.load(copied))
     assert told in line
     assert "policy.npz" in line
@@ -262,7 +335,9 @@ def test_weights_that_do_not_fit_the_model_are_refused_in_one_line(copied, spoil
 def test_weights_that_the_model_does_not_have_are_refused(copied):
     arrays, manifest = artefacts.read_arrays(copied / "policy.npz", kind=policy.KIND)
     arrays["networks/extra"] = np.zeros(3, np.float32)
-    artefacts.write_arrays(copied / "policy.npz", arrays, kind=policy.KIND, config=manifest["config"])
+    artefacts.write_arrays(
+        copied / "policy.npz", arrays, kind=policy.KIND, config=manifest["config"]
+    )
     assert "holds weights networks/extra" in refusal_of(lambda: policy.load(copied))
 
 
@@ -282,7 +357,11 @@ def test_one_weight_that_moved_by_the_smallest_step_is_noticed():
     trained = shipped()
     leaf = trained.params["networks"]["operators"]
     nudged = leaf.at[0, 0, 0].set(jnp.nextafter(leaf[0, 0, 0], jnp.inf))
-    params = trained.params | {"networks": trained.params["networks"] | {"operators": nudged}}
+    params = trained.params | {
+        "networks": trained.params["networks"] | {"operators": nudged}
+    }
     assert jax.tree.structure(params) == jax.tree.structure(trained.params)
     with pytest.raises(CertificateStale):
-        verify_document(honest(), params, model=trained.model, policy_sha256=trained.sha256)
+        verify_document(
+            honest(), params, model=trained.model, policy_sha256=trained.sha256
+        )

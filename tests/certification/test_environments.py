@@ -1,4 +1,6 @@
-"""All environments instead of some: branch and bound against dense grids, a planted spike, and exact cases."""
+"""All environments instead of some: branch and bound against dense grids, a planted
+spike, and exact cases.
+"""
 
 import numpy as np
 import pytest
@@ -13,12 +15,19 @@ BOX = ([-1.0, -1.0], [1.0, 1.0])
 def random_hypernetwork(seed, size=4, width=12, gain=0.7):
     random = np.random.default_rng(seed)
     shapes = ((width, 2), (width, width), (size * size, width))
-    weights = [gain * random.standard_normal(shape) / shape[1] ** 0.5 for shape in shapes]
-    return Hypernetwork(tuple(weights), tuple(0.3 * random.standard_normal(len(weight)) for weight in weights))
+    weights = [
+        gain * random.standard_normal(shape) / shape[1] ** 0.5 for shape in shapes
+    ]
+    return Hypernetwork(
+        tuple(weights),
+        tuple(0.3 * random.standard_normal(len(weight)) for weight in weights),
+    )
 
 
 def spike(height=2.0, place=(0.29, -0.271), width=0.01):
-    """‖A(e)‖ = 0.5 but on a ridge of this width, where two steep units disagree: tanh(x + w) − tanh(x − w)."""
+    """‖A(e)‖ = 0.5 but on a ridge of this width, where two steep units disagree: tanh(x
+    + w) − tanh(x − w).
+    """
     steep = 3.0 / width
     first = np.asarray([[steep, 0.0], [steep, 0.0]])
     shift = np.asarray([-steep * place[0] + 3.0, -steep * place[0] - 3.0])
@@ -29,7 +38,11 @@ def spike(height=2.0, place=(0.29, -0.271), width=0.01):
 
 def dense_maximum(network, count):
     axis = np.linspace(-1, 1, count)
-    return max(np.linalg.norm(operator_at(network, np.asarray([x, y])), 2) for x in axis for y in axis)
+    return max(
+        np.linalg.norm(operator_at(network, np.asarray([x, y])), 2)
+        for x in axis
+        for y in axis
+    )
 
 
 @pytest.mark.parametrize("seed", range(4))
@@ -65,10 +78,14 @@ def test_an_operator_that_does_not_depend_on_the_environment_takes_one_cell():
     network = network._replace(weights=(0.0 * network.weights[0], *network.weights[1:]))
     found = cover(network, BOX, norm_upper)
     assert found.cells == 1
-    assert found.upper == pytest.approx(np.linalg.norm(operator_at(network, np.zeros(2)), 2), rel=1e-9)
+    assert found.upper == pytest.approx(
+        np.linalg.norm(operator_at(network, np.zeros(2)), 2), rel=1e-9
+    )
 
 
 def test_a_box_of_one_point_has_the_value_there():
     network, point = random_hypernetwork(2), [0.3, -0.4]
     found = cover(network, (point, point), norm_upper)
-    assert found.upper == pytest.approx(np.linalg.norm(operator_at(network, np.asarray(point)), 2), rel=1e-9)
+    assert found.upper == pytest.approx(
+        np.linalg.norm(operator_at(network, np.asarray(point)), 2), rel=1e-9
+    )

@@ -1,14 +1,23 @@
-"""The corridor that needs no copy: of a linear loop, whose fixed points are known, and which attains the bound."""
+"""The corridor that needs no copy: of a linear loop, whose fixed points are known, and
+which attains the bound.
+"""
 
 import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from sfkd_jax.certification import FixedPoints, OutputMetric, fixed_point_corridor, fixed_points
+from sfkd_jax.certification import (
+    FixedPoints,
+    OutputMetric,
+    fixed_point_corridor,
+    fixed_points,
+)
 from sfkd_jax.types import Model
 
 RATES = np.diag([0.8, 0.7, 0.6])
-CONTROL = np.asarray([[2.0, 0.1, 30.0, 0.01], [0.5, 0.3, -4.0, 0.0], [0.0, 0.2, 1.0, 0.02]])
+CONTROL = np.asarray(
+    [[2.0, 0.1, 30.0, 0.01], [0.5, 0.3, -4.0, 0.0], [0.0, 0.2, 1.0, 0.02]]
+)
 ENVIRONMENT = np.asarray([[0.1, 0.02], [0.05, -0.01], [0.0, 0.03]])
 METRIC = np.diag([4.0, 1.0, 9.0])
 CLAIM = OutputMetric(0.8, 0.5, METRIC, [])
@@ -35,8 +44,12 @@ def linear(rates=RATES, control=CONTROL, environment=ENVIRONMENT):
 def roads(count=40, seed=0):
     """Steps of roads, (κ, v) before and after."""
     random = np.random.default_rng(seed)
-    before = np.stack([random.uniform(-0.02, 0.02, count), random.uniform(8.0, 10.5, count)], axis=1)
-    return np.stack([before, before + random.uniform(-1.0, 1.0, (count, 2)) * [0.004, 0.1]], axis=1)
+    before = np.stack(
+        [random.uniform(-0.02, 0.02, count), random.uniform(8.0, 10.5, count)], axis=1
+    )
+    return np.stack(
+        [before, before + random.uniform(-1.0, 1.0, (count, 2)) * [0.004, 0.1]], axis=1
+    )
 
 
 def length(gaps):
@@ -55,11 +68,15 @@ def test_the_fixed_points_of_a_linear_loop_are_found():
         perturbation=jnp.asarray(LIMIT, dtype=float),
     )
     settled = np.linalg.inv(np.eye(3) - RATES)
-    corners = np.asarray([[friction, wind] for friction in (0.3, 0.9) for wind in (-8.0, 8.0)])
+    corners = np.asarray(
+        [[friction, wind] for friction in (0.3, 0.9) for wind in (-8.0, 8.0)]
+    )
     roads_only = steps @ (settled @ CONTROL[:, 2:]).T
     rests = roads_only[:, :, None] + corners @ (settled @ ENVIRONMENT).T
     assert found.centre_m == pytest.approx(np.max(np.abs(rests[..., 0])), rel=1e-4)
-    assert found.road == pytest.approx(np.max(length(roads_only[:, 1] - roads_only[:, 0])), rel=1e-4)
+    assert found.road == pytest.approx(
+        np.max(length(roads_only[:, 1] - roads_only[:, 0])), rel=1e-4
+    )
     far = settled @ ENVIRONMENT @ (corners[None] - corners[:, None])[..., None]
     assert found.switch == pytest.approx(np.max(length(far[..., 0])), rel=1e-4)
     nus = LIMIT * np.asarray([[1, 1], [1, -1]])
@@ -68,7 +85,9 @@ def test_the_fixed_points_of_a_linear_loop_are_found():
 
 
 def worst_drive(alpha, scale, road, switch, push, disturbance, every, steps=2000):
-    """e_y against c'z* of z⁺ = α z + (1 − α) z* + ν + d on a line: everything drives it the same way."""
+    """e_y against c'z* of z⁺ = α z + (1 − α) z* + ν + d on a line: everything drives it
+    the same way.
+    """
     rest, latent, apart = 0.0, 0.0, []
     for step in range(steps):
         latent = alpha * latent + (1.0 - alpha) * rest + (push + disturbance) / scale
@@ -80,17 +99,31 @@ def worst_drive(alpha, scale, road, switch, push, disturbance, every, steps=2000
 @pytest.mark.parametrize("every", [1, 4, 30])
 @pytest.mark.parametrize("alpha", [0.5, 0.93])
 def test_the_bound_is_attained_by_a_loop_on_a_line(alpha, every):
-    """|z|_P = scale |z|, so L = 1 / scale; each of the four terms is needed in full, also right after a switch."""
+    """|z|_P = scale |z|, so L = 1 / scale; each of the four terms is needed in full,
+    also right after a switch.
+    """
     scale, sizes = 3.0, {"road": 0.2, "switch": 0.7, "push": 0.3}
     disturbance = 0.1
     apart = worst_drive(alpha, scale, **sizes, disturbance=disturbance, every=every)
     for_ever = (alpha * disturbance / (1.0 - alpha) + disturbance) / scale
     found = FixedPoints(centre_m=0.05, **sizes, points=1)
     claimed = fixed_point_corridor(
-        found, alpha=alpha, lipschitz=1.0 / scale, for_ever=for_ever, steps_between_switches=every
+        found,
+        alpha=alpha,
+        lipschitz=1.0 / scale,
+        for_ever=for_ever,
+        steps_between_switches=every,
     )
-    assert np.max(apart) + 0.05 == pytest.approx(claimed["after_switch_m"]["planner"], rel=1e-6)
-    quiet = worst_drive(alpha, scale, **(sizes | {"push": 0.0, "switch": 0.0}), disturbance=disturbance, every=every)
+    assert np.max(apart) + 0.05 == pytest.approx(
+        claimed["after_switch_m"]["planner"], rel=1e-6
+    )
+    quiet = worst_drive(
+        alpha,
+        scale,
+        **(sizes | {"push": 0.0, "switch": 0.0}),
+        disturbance=disturbance,
+        every=every,
+    )
     assert np.max(quiet) + 0.05 == pytest.approx(claimed["corridor_m"]["law"], rel=1e-6)
 
 
@@ -105,5 +138,7 @@ def test_a_loop_that_rests_on_its_path_whatever_happens_needs_its_tube_alone():
         env_box=ENV_BOX,
         perturbation=jnp.asarray(LIMIT, dtype=float),
     )
-    claimed = fixed_point_corridor(found, alpha=0.8, lipschitz=0.5, for_ever=0.2, steps_between_switches=30)
+    claimed = fixed_point_corridor(
+        found, alpha=0.8, lipschitz=0.5, for_ever=0.2, steps_between_switches=30
+    )
     assert claimed["after_switch_m"]["planner"] == pytest.approx(0.2, abs=1e-5)

@@ -10,13 +10,27 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
-from networks import BOX, FIRST, KINDS, LAST, NETWORK, POLYTOPE, consistent, honest, proved_once
+from networks import (
+    BOX,
+    FIRST,
+    KINDS,
+    LAST,
+    NETWORK,
+    POLYTOPE,
+    consistent,
+    honest,
+    proved_once,
+)
 
 from sfkd_jax.certification import _certificate, _proofs
 from sfkd_jax.certification._attack_all import FLOAT32
 from sfkd_jax.certification._certificate import Certificate, CertificateStale
 from sfkd_jax.certification._claims import Claims
-from sfkd_jax.certification._exported import CertificationRefused, fingerprint, one_thread
+from sfkd_jax.certification._exported import (
+    CertificationRefused,
+    fingerprint,
+    one_thread,
+)
 from sfkd_jax.types import Polytope
 
 
@@ -34,15 +48,22 @@ MODEL = SimpleNamespace()
 def kind(monkeypatch):
     """Which network the model serves, and what attacks on it find."""
     monkeypatch.setattr(_certificate, "prove", proved_once)
-    chosen = SimpleNamespace(name="joint", weights=None, attacks={"step": 0.2, "transport": 1.0})
-    served = lambda model, params: KINDS[chosen.name][0] if chosen.weights is None else chosen.weights  # noqa: E731
+    chosen = SimpleNamespace(
+        name="joint", weights=None, attacks={"step": 0.2, "transport": 1.0}
+    )
+    served = lambda model, params: (
+        KINDS[chosen.name][0] if chosen.weights is None else chosen.weights
+    )
     monkeypatch.setattr(_certificate, "exported", served)
     monkeypatch.setattr(_certificate, "attack_all", lambda *args: dict(chosen.attacks))
     return chosen
 
 
 def certified(name="joint", **settings):
-    given = {"mode": "joint" if KINDS[name][1] else "separate", "metric": KINDS[name][2]} | settings
+    given = {
+        "mode": "joint" if KINDS[name][1] else "separate",
+        "metric": KINDS[name][2],
+    } | settings
     return bare(_certificate.certify)(MODEL, PARAMS, BOX, **given)
 
 
@@ -62,7 +83,9 @@ def test_a_certificate_is_frozen(kind):
 
 def test_the_attack_is_told_what_was_asked_for(kind, monkeypatch):
     told = []
-    monkeypatch.setattr(_certificate, "attack_all", lambda *args: told.append(args) or {})
+    monkeypatch.setattr(
+        _certificate, "attack_all", lambda *args: told.append(args) or {}
+    )
     proof = certified()
     certified(attack_starts=3, seed=5)
     assert [args[-2:] for args in told] == [(6, 0), (3, 5)]
@@ -71,7 +94,10 @@ def test_the_attack_is_told_what_was_asked_for(kind, monkeypatch):
 
 
 def test_the_default_is_a_joint_proof(kind):
-    assert bare(_certificate.certify)(MODEL, PARAMS, BOX).alpha_joint == honest("joint").alpha_joint
+    assert (
+        bare(_certificate.certify)(MODEL, PARAMS, BOX).alpha_joint
+        == honest("joint").alpha_joint
+    )
 
 
 def test_a_margin_decides_how_close_to_one_is_certified(kind):
@@ -83,8 +109,14 @@ def test_a_margin_decides_how_close_to_one_is_certified(kind):
     exact = 1.0 - (1.0 - alpha)
     if exact >= alpha:
         certified(margin=1.0 - alpha)
-    for margin, length, holds in ((None, 0.99985, True), (None, 0.99995, False), (0.0, 1.1, False)):
-        kind.weights = KINDS["bare"][0]._replace(operators=Polytope(length * POLYTOPE.vertices[1:2] / 0.5))
+    for margin, length, holds in (
+        (None, 0.99985, True),
+        (None, 0.99995, False),
+        (0.0, 1.1, False),
+    ):
+        kind.weights = KINDS["bare"][0]._replace(
+            operators=Polytope(length * POLYTOPE.vertices[1:2] / 0.5)
+        )
         settings = {} if margin is None else {"margin": margin}
         if holds:
             certified(**settings)
@@ -94,7 +126,11 @@ def test_a_margin_decides_how_close_to_one_is_certified(kind):
 
 
 def test_a_rate_that_is_no_number_is_refused(kind, monkeypatch):
-    monkeypatch.setattr(_certificate, "prove", lambda *args, **kwargs: honest("joint")._replace(alpha=float("nan")))
+    monkeypatch.setattr(
+        _certificate,
+        "prove",
+        lambda *args, **kwargs: honest("joint")._replace(alpha=float("nan")),
+    )
     with pytest.raises(CertificationRefused, match="alpha = nan"):
         certified()
 
@@ -117,12 +153,19 @@ def test_certify_takes_no_box_that_is_none(kind, box):
 
 
 def test_certify_takes_a_box_of_a_point(kind):
-    assert bare(_certificate.certify)(MODEL, PARAMS, ((0.1,), (0.1,))).env_box == [[0.1], [0.1]]
+    assert bare(_certificate.certify)(MODEL, PARAMS, ((0.1,), (0.1,))).env_box == [
+        [0.1],
+        [0.1],
+    ]
 
 
-@pytest.mark.parametrize(("mode", "metric"), [("grid", None), ("joint", np.eye(3)), ("grid", np.eye(3))])
+@pytest.mark.parametrize(
+    ("mode", "metric"), [("grid", None), ("joint", np.eye(3)), ("grid", np.eye(3))]
+)
 def test_a_mode_that_there_is_not_is_an_error(kind, mode, metric):
-    with pytest.raises(ValueError, match=f"mode must be one of joint, separate, .*; got '{mode}'"):
+    with pytest.raises(
+        ValueError, match=f"mode must be one of joint, separate, .*; got '{mode}'"
+    ):
         certified(mode=mode, metric=metric)
 
 
@@ -135,15 +178,22 @@ def test_a_document_that_lacks_a_key_is_none(kind):
     document = certified().document()
     for name in document:
         lacking = {key: value for key, value in document.items() if key != name}
-        with pytest.raises(CertificationRefused, match=f"not a certificate: {name} missing"):
+        with pytest.raises(
+            CertificationRefused, match=f"not a certificate: {name} missing"
+        ):
             Certificate.from_document(lacking)
-    with pytest.raises(CertificationRefused, match="not a certificate: mode, scope, alpha missing"):
+    with pytest.raises(
+        CertificationRefused, match="not a certificate: mode, scope, alpha missing"
+    ):
         Certificate.from_document({})
 
 
 def test_other_weights_are_not_covered(kind):
     proof = certified()
-    for other in ({"networks": {"w": np.ones(3)}}, {"networks": {"w": np.full(3, 1.0000001, np.float32)}}):
+    for other in (
+        {"networks": {"w": np.ones(3)}},
+        {"networks": {"w": np.full(3, 1.0000001, np.float32)}},
+    ):
         with pytest.raises(CertificateStale, match="about other weights"):
             verified(proof, other)
     with pytest.raises(CertificateStale):
@@ -161,7 +211,9 @@ def test_a_model_that_serves_something_else_is_noticed(kind):
 
 def test_weights_that_are_at_hand_are_not_served_again(kind, monkeypatch):
     proof = certified()
-    monkeypatch.setattr(_certificate, "exported", lambda model, params: pytest.fail("served again"))
+    monkeypatch.setattr(
+        _certificate, "exported", lambda model, params: pytest.fail("served again")
+    )
     bare(_certificate.verify)(proof, PARAMS, model=MODEL, weights=NETWORK)
     other = NETWORK._replace(residual=(FIRST, 2 * LAST))
     with pytest.raises(CertificationRefused, match="beta does not follow"):
@@ -178,12 +230,21 @@ def forged(told, name="joint", **changes):
 def test_a_proved_rate_that_does_not_contract_is_no_certificate(kind, length):
     """All of its claims hold."""
     proof = certified("bare")
-    kind.weights = KINDS["bare"][0]._replace(operators=Polytope(length * POLYTOPE.vertices[1:2] / 0.5))
+    kind.weights = KINDS["bare"][0]._replace(
+        operators=Polytope(length * POLYTOPE.vertices[1:2] / 0.5)
+    )
     claims = _proofs.prove(kind.weights, BOX, joint=False)
-    claims = consistent(claims._replace(rho=max(length, claims.rho) if length > 1 else claims.rho))
-    with pytest.raises(CertificationRefused, match="is not below 1, or the transport is not nonexpansive"):
+    claims = consistent(
+        claims._replace(rho=max(length, claims.rho) if length > 1 else claims.rho)
+    )
+    with pytest.raises(
+        CertificationRefused,
+        match="is not below 1, or the transport is not nonexpansive",
+    ):
         verified(dataclasses.replace(proof, mode="separate", **claims._asdict()))
-    kind.weights = KINDS["bare"][0]._replace(operators=Polytope((1 - 1e-9) * POLYTOPE.vertices[1:2]))
+    kind.weights = KINDS["bare"][0]._replace(
+        operators=Polytope((1 - 1e-9) * POLYTOPE.vertices[1:2])
+    )
     claims = consistent(_proofs.prove(kind.weights, BOX, joint=False)._replace(rho=1.0))
     with pytest.raises(CertificationRefused, match=r"alpha = 1\.0 is not below 1"):
         verified(dataclasses.replace(proof, mode="separate", **claims._asdict()))
@@ -210,7 +271,16 @@ def test_what_precision_is_covered_cannot_be_reworded(kind):
 
 
 @pytest.mark.parametrize(
-    "name", ["residual_slopes", "transport", "body", "position", "yaw_slopes", "step", "step_slopes"]
+    "name",
+    [
+        "residual_slopes",
+        "transport",
+        "body",
+        "position",
+        "yaw_slopes",
+        "step",
+        "step_slopes",
+    ],
 )
 def test_an_attack_may_reach_its_bound_and_no_more(kind, name):
     honest_proof = certified()
@@ -231,16 +301,23 @@ def test_an_attack_may_reach_its_bound_and_no_more(kind, name):
         attacks = {"step": 0.2} | {name: value}
         step = attacks["step"]
         tightness = honest_proof.alpha / step if step else None
-        proof = dataclasses.replace(honest_proof, attacks=attacks, attack=step, tightness=tightness)
+        proof = dataclasses.replace(
+            honest_proof, attacks=attacks, attack=step, tightness=tightness
+        )
         if holds or (name == "step" and value == 0.0):
             verified(proof)
             continue
-        with pytest.raises(CertificationRefused, match=f"the attack {name} = .* contradicts the bound"):
+        with pytest.raises(
+            CertificationRefused, match=f"the attack {name} = .* contradicts the bound"
+        ):
             verified(proof)
 
 
 def test_an_attack_on_nothing_is_refused(kind):
-    forged("the attack flattery = 0.0 contradicts the bound None", attacks={"flattery": 0.0})
+    forged(
+        "the attack flattery = 0.0 contradicts the bound None",
+        attacks={"flattery": 0.0},
+    )
 
 
 def test_attack_and_tightness_are_of_the_attacks(kind):
@@ -264,19 +341,28 @@ def test_attack_and_tightness_are_of_the_attacks(kind):
     ],
 )
 def test_what_is_malformed_is_refused_in_one_line(kind, changes):
-    with pytest.raises(CertificationRefused, match=r"^the certificate is malformed: \S[^\n]*$"):
+    with pytest.raises(
+        CertificationRefused, match=r"^the certificate is malformed: \S[^\n]*$"
+    ):
         verified(dataclasses.replace(certified(), **changes))
 
 
 def test_a_certificate_of_each_kind_verifies_and_survives_json(kind):
     for kind.name in KINDS:
-        kind.attacks = {"transport": 1.0} | ({} if kind.name == "metric" else {"step": 0.2})
+        kind.attacks = {"transport": 1.0} | (
+            {} if kind.name == "metric" else {"step": 0.2}
+        )
         proof = certified(kind.name)
-        again = Certificate.from_document(json.loads(json.dumps(proof.document())) | {"other": 1})
+        again = Certificate.from_document(
+            json.loads(json.dumps(proof.document())) | {"other": 1}
+        )
         assert again == proof
         verified(again)
         assert proof.mode == ("joint" if KINDS[kind.name][1] else "separate")
-        assert (proof.alpha, proof.scope) == (honest(kind.name).alpha, honest(kind.name).scope)
+        assert (proof.alpha, proof.scope) == (
+            honest(kind.name).alpha,
+            honest(kind.name).scope,
+        )
         assert proof.transport_lipschitz == 1.0
         assert proof.env_box == BOX
         assert proof.params_sha256 == fingerprint(PARAMS)
@@ -284,4 +370,6 @@ def test_a_certificate_of_each_kind_verifies_and_survives_json(kind):
         assert (proof.attack, proof.tightness) == found
         assert 0 <= proof.seconds < 100
         assert set(proof.versions) == {"jax", "numpy", "scipy"}
-        assert proof.precision.startswith("bounds on the float32 weights as real numbers")
+        assert proof.precision.startswith(
+            "bounds on the float32 weights as real numbers"
+        )

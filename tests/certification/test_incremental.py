@@ -1,4 +1,6 @@
-"""The rate of a continuous flow: exact where it is known, never above what an attack finds, and mutants are caught."""
+"""The rate of a continuous flow: exact where it is known, never above what an attack
+finds, and mutants are caught.
+"""
 
 import dataclasses
 import json
@@ -33,7 +35,10 @@ def flow(linear, outer, inner, multipliers, metric=None):
     """Weights by hand."""
     linear = np.asarray(linear, dtype=np.float64)
     metric = np.eye(len(linear)) if metric is None else metric
-    parts = [np.asarray(part, dtype=np.float64) for part in (outer, inner, metric, multipliers)]
+    parts = [
+        np.asarray(part, dtype=np.float64)
+        for part in (outer, inner, metric, multipliers)
+    ]
     return Incremental(linear, *parts, Declared("tanh", "identity", 2))
 
 
@@ -43,15 +48,25 @@ def generic(body=4, scale=0.5, seed=0):
     model = models.control_synth(space(body), width=8, input_hidden=(4,))
     random = np.random.default_rng(seed)
     shapes = jax.eval_shape(model.init, jax.random.key(0))
-    params = jax.tree.map(lambda leaf: (scale * random.standard_normal(leaf.shape)).astype(np.float32), shapes)
-    return jax.tree.map(lambda leaf: np.asarray(leaf, dtype=np.float64), jit(model.explicit)(params))
+    params = jax.tree.map(
+        lambda leaf: (scale * random.standard_normal(leaf.shape)).astype(np.float32),
+        shapes,
+    )
+    return jax.tree.map(
+        lambda leaf: np.asarray(leaf, dtype=np.float64), jit(model.explicit)(params)
+    )
 
 
 def random_flow(seed, body, hidden):
     """Weights with no structure, most of which contract."""
     random = np.random.default_rng(seed)
-    outer, inner = random.standard_normal((body, hidden)), random.standard_normal((hidden, body))
-    linear = random.standard_normal((body, body)) - 2.0 * random.uniform(0.5, 3.0) * hidden * np.eye(body)
+    outer, inner = (
+        random.standard_normal((body, hidden)),
+        random.standard_normal((hidden, body)),
+    )
+    linear = random.standard_normal((body, body)) - 2.0 * random.uniform(
+        0.5, 3.0
+    ) * hidden * np.eye(body)
     root = np.eye(body) + 0.3 * random.standard_normal((body, body))
     multipliers = np.linalg.norm(outer, axis=0) / np.linalg.norm(inner, axis=1)
     return flow(linear, outer, inner, multipliers, root.T @ root)
@@ -78,7 +93,9 @@ def test_a_gradient_flow_pays_nothing_for_its_networks():
     assert attack_growth(weights) == pytest.approx(-0.3)
 
 
-@hypothesis.given(seed=st.integers(0, 10**6), body=st.integers(1, 5), hidden=st.integers(1, 12))
+@hypothesis.given(
+    seed=st.integers(0, 10**6), body=st.integers(1, 5), hidden=st.integers(1, 12)
+)
 @hypothesis.settings(max_examples=25, deadline=None)
 def test_the_proved_rate_holds_for_every_pattern_of_slopes(seed, body, hidden):
     weights = random_flow(seed, body, hidden)
@@ -91,30 +108,57 @@ def test_the_proved_rate_holds_for_every_pattern_of_slopes(seed, body, hidden):
     random = np.random.default_rng(seed)
     for _ in range(20):
         slopes = random.uniform(size=hidden) ** random.uniform(0.2, 5.0)
-        moving = weights.metric @ (weights.linear + weights.outer @ (slopes[:, None] * weights.inner))
-        top = np.linalg.eigvals(np.linalg.solve(weights.metric, moving + moving.T)).real.max() / 2
+        moving = weights.metric @ (
+            weights.linear + weights.outer @ (slopes[:, None] * weights.inner)
+        )
+        top = (
+            np.linalg.eigvals(
+                np.linalg.solve(weights.metric, moving + moving.T)
+            ).real.max()
+            / 2
+        )
         assert top <= -attack + 1e-9 * abs(attack)
         assert top <= -rate + 1e-9 or rate == 0.0
 
 
 MUTANTS = {
-    "linear part pushed by 2γ": lambda w, rate: w._replace(linear=w.linear + 2 * rate * np.eye(4)),
-    "linear part pushed a little": lambda w, rate: w._replace(linear=w.linear + 1e-4 * rate * np.eye(4)),
-    "one multiplier negative": lambda w, _: w._replace(multipliers=w.multipliers * np.r_[-1.0, np.ones(15)]),
+    "linear part pushed by 2γ": lambda w, rate: w._replace(
+        linear=w.linear + 2 * rate * np.eye(4)
+    ),
+    "linear part pushed a little": lambda w, rate: w._replace(
+        linear=w.linear + 1e-4 * rate * np.eye(4)
+    ),
+    "one multiplier negative": lambda w, _: w._replace(
+        multipliers=w.multipliers * np.r_[-1.0, np.ones(15)]
+    ),
     "all multipliers negative": lambda w, _: w._replace(multipliers=-w.multipliers),
-    "one multiplier 0": lambda w, _: w._replace(multipliers=w.multipliers * np.r_[0.0, np.ones(15)]),
-    "multipliers far too large": lambda w, _: w._replace(multipliers=1e4 * w.multipliers),
-    "rows of W in another order": lambda w, _: w._replace(inner=np.roll(w.inner, 1, axis=0)),
+    "one multiplier 0": lambda w, _: w._replace(
+        multipliers=w.multipliers * np.r_[0.0, np.ones(15)]
+    ),
+    "multipliers far too large": lambda w, _: w._replace(
+        multipliers=1e4 * w.multipliers
+    ),
+    "rows of W in another order": lambda w, _: w._replace(
+        inner=np.roll(w.inner, 1, axis=0)
+    ),
     "sign of A": lambda w, _: w._replace(outer=-w.outer),
     "A ten times too large": lambda w, _: w._replace(outer=10 * w.outer),
     "the metric forgotten": lambda w, _: w._replace(metric=np.eye(4)),
     "the metric negative": lambda w, _: w._replace(metric=-w.metric),
-    "the metric singular": lambda w, _: w._replace(metric=np.diag([1.0, 1.0, 1.0, 0.0])),
+    "the metric singular": lambda w, _: w._replace(
+        metric=np.diag([1.0, 1.0, 1.0, 0.0])
+    ),
     "transposed linear part": lambda w, _: w._replace(linear=w.linear.T),
-    "NaN in A": lambda w, _: w._replace(outer=np.where(np.arange(16) == 3, np.nan, w.outer)),
-    "NaN in W": lambda w, _: w._replace(inner=np.where(np.arange(4) == 3, np.nan, w.inner)),
+    "NaN in A": lambda w, _: w._replace(
+        outer=np.where(np.arange(16) == 3, np.nan, w.outer)
+    ),
+    "NaN in W": lambda w, _: w._replace(
+        inner=np.where(np.arange(4) == 3, np.nan, w.inner)
+    ),
     "NaN in the metric": lambda w, _: w._replace(metric=np.full((4, 4), np.nan)),
-    "an infinite multiplier": lambda w, _: w._replace(multipliers=w.multipliers * np.r_[np.inf, np.ones(15)]),
+    "an infinite multiplier": lambda w, _: w._replace(
+        multipliers=w.multipliers * np.r_[np.inf, np.ones(15)]
+    ),
     "infinity in the linear part": lambda w, _: w._replace(linear=w.linear - np.inf),
 }
 
@@ -136,7 +180,10 @@ def test_a_rate_that_is_none_is_never_proved(rate):
     ("change", "reason"),
     [
         ({"outer": np.full((4, 16), np.nan)}, "not finite"),
-        ({"declared": Declared("gelu", "identity", 2)}, "slopes of the activation 'gelu'"),
+        (
+            {"declared": Declared("gelu", "identity", 2)},
+            "slopes of the activation 'gelu'",
+        ),
         ({"declared": Declared("tanh", "rotation", 2)}, "transport 'rotation'"),
         ({"multipliers": -np.ones(16)}, "multipliers are not positive"),
         ({"metric": np.diag([1.0, 1.0, 1.0, -1.0])}, "metric is not positive definite"),
@@ -167,7 +214,9 @@ def test_a_false_declaration_is_refused_at_the_door_of_the_model():
 
     def explicit(params):
         found = model.explicit(params)
-        return found._replace(declared=dataclasses.replace(found.declared, activation="sin"))
+        return found._replace(
+            declared=dataclasses.replace(found.declared, activation="sin")
+        )
 
     with pytest.raises(CertificationRefused, match="sin"):
         certify_incremental(model._replace(explicit=explicit), params, dt=0.1)
@@ -191,25 +240,37 @@ def untrained(name="control_synth"):
         composed = compose("config", overrides=["+experiment=smoke", f"model={name}"])
     settings = OmegaConf.to_container(composed, resolve=True)
     plant = build.build_vehicle(settings["vehicle"])
-    params = jit(build.build_model(settings["model"], space(), plant).init)(jax.random.key(0))
+    params = jit(build.build_model(settings["model"], space(), plant).init)(
+        jax.random.key(0)
+    )
     kept = settings | {"space": build.space_to_settings(space())}
     store.claim(settings)
-    policy.save(store.run_directory(settings) / "policy.npz", params, kept, made_from={})
+    policy.save(
+        store.run_directory(settings) / "policy.npz", params, kept, made_from={}
+    )
     return settings
 
 
-def test_the_door_writes_the_rate_apart_from_certificates_of_steps(tmp_path, monkeypatch):
+def test_the_door_writes_the_rate_apart_from_certificates_of_steps(
+    tmp_path, monkeypatch
+):
     monkeypatch.chdir(tmp_path)
     settings = untrained()
     printed = certify.run(settings)
     file = tmp_path / printed["certificate"]
     document = json.loads(file.read_text())
     assert printed["valid"]
-    assert printed["alpha"] == document["alpha"] == np.exp(-0.1 * document["rate_per_s"])
-    assert [printed[name] for name in ("alpha_separate", "rho", "beta", "d_bar", "reason")] == [None] * 5
+    assert (
+        printed["alpha"] == document["alpha"] == np.exp(-0.1 * document["rate_per_s"])
+    )
+    assert [
+        printed[name] for name in ("alpha_separate", "rho", "beta", "d_bar", "reason")
+    ] == [None] * 5
     assert file.name == "incremental.json"
     assert not (file.parent / "certificate.json").exists()
-    assert policy.load(file.parent).certificate is None  # nothing that a monitor could take for its bounds
+    assert (
+        policy.load(file.parent).certificate is None
+    )  # nothing that a monitor could take for its bounds
     assert document["weights_sha256"] == policy.restore(file.parent).weights_sha256
     artefacts.write_json(file, document | {"policy_sha256": "others"})
     with pytest.raises(CertificateStale, match="other weights"):

@@ -1,4 +1,6 @@
-"""The document beside the weights: what it states, proved and measured, and that a refusal says why."""
+"""The document beside the weights: what it states, proved and measured, and that a
+refusal says why.
+"""
 
 import numpy as np
 import pytest
@@ -6,7 +8,11 @@ from helpers import SHARES, VARIANTS, certified, dataset, model_and_params
 
 from sfkd_jax.certification import CertificationRefused, issue
 
-BOXES = {"state": [[4.0], [16.0]], "control": [[-0.5, -6.0], [0.5, 3.0]], "env": [[0.3, -8.0], [0.9, 8.0]]}
+BOXES = {
+    "state": [[4.0], [16.0]],
+    "control": [[-0.5, -6.0], [0.5, 3.0]],
+    "env": [[0.3, -8.0], [0.9, 8.0]],
+}
 
 
 @pytest.fixture(scope="module")
@@ -30,10 +36,34 @@ def made(name, **settings):
 
 def test_a_certificate_has_the_documented_keys(certificate):
     assert set(certificate) >= {
-        *("valid", "mode", "scope", "alpha", "alpha_separate", "rho", "beta", "kappa", "decoder_lipschitz"),
-        *("transport_lipschitz", "d_bar", "tube", "boxes", "attack", "tightness", "seconds"),
+        *(
+            "valid",
+            "mode",
+            "scope",
+            "alpha",
+            "alpha_separate",
+            "rho",
+            "beta",
+            "kappa",
+            "decoder_lipschitz",
+        ),
+        *(
+            "transport_lipschitz",
+            "d_bar",
+            "tube",
+            "boxes",
+            "attack",
+            "tightness",
+            "seconds",
+        ),
     }
-    assert set(certificate["d_bar"]) >= {"value", "level", "trajectories", "coverage", "coverage_ci95"}
+    assert set(certificate["d_bar"]) >= {
+        "value",
+        "level",
+        "trajectories",
+        "coverage",
+        "coverage_ci95",
+    }
     assert set(certificate["tube"]) >= {"latent", "physical", "ultimate"}
     assert set(certificate["boxes"]) == {"state", "control", "env"}
     assert certificate["valid"] is True
@@ -71,12 +101,17 @@ def test_a_higher_level_gives_a_wider_tube(certificate):
 
 
 def test_too_few_calibration_trajectories_are_refused():
-    with pytest.raises(CertificationRefused, match=r"24 calibration trajectories are too few for level 0\.99"):
+    with pytest.raises(
+        CertificationRefused,
+        match=r"24 calibration trajectories are too few for level 0\.99",
+    ):
         made("sfkd", level=0.99)
 
 
 def test_a_rate_within_the_margin_of_one_is_refused():
-    with pytest.raises(CertificationRefused, match=r"is not below 1 by the margin 0\.2"):
+    with pytest.raises(
+        CertificationRefused, match=r"is not below 1 by the margin 0\.2"
+    ):
         made("sfkd", margin=0.2)
 
 

@@ -1,4 +1,6 @@
-"""The whole step as one map: exact cases, the hull of vertices, the semidefinite optimum, and mutants of the check."""
+"""The whole step as one map: exact cases, the hull of vertices, the semidefinite
+optimum, and mutants of the check.
+"""
 
 import numpy as np
 import pytest
@@ -31,7 +33,9 @@ def random_network(seed, shapes=((8, 6), (7, 8), (6, 7))):
 
 def positive(seed, shapes=((8, 6), (7, 8), (6, 7))):
     random = np.random.default_rng(seed)
-    return [random.uniform(0.05, 0.5, shape) for shape in shapes], random.uniform(0.05, 0.5, (6, 6))
+    return [random.uniform(0.05, 0.5, shape) for shape in shapes], random.uniform(
+        0.05, 0.5, (6, 6)
+    )
 
 
 def best(weights, linear=None):
@@ -39,7 +43,9 @@ def best(weights, linear=None):
 
 
 def aligned(share):
-    """A and the residual stretch the same direction: no joint certificate can be better than the sum of norms."""
+    """A and the residual stretch the same direction: no joint certificate can be better
+    than the sum of norms.
+    """
     turn = rotation(3)
     return [share * turn, rotation(4), rotation(4).T], 0.8 * turn, 0.8 + share
 
@@ -50,9 +56,15 @@ JOINT = {
     "aligned": aligned(0.15),
     "aligned, A = I": ([0.3 * np.eye(SIZE), np.eye(SIZE)], 0.6 * np.eye(SIZE), 0.9),
     "cancelling": ([0.3 * np.eye(SIZE), -np.eye(SIZE)], 0.9 * np.eye(SIZE), 0.9),
-    "diagonal": ([np.diag(np.linspace(0.1, 0.6, SIZE)), np.eye(SIZE)], np.diag(np.linspace(0.9, 0.2, SIZE)), 1.0),
+    "diagonal": (
+        [np.diag(np.linspace(0.1, 0.6, SIZE)), np.eye(SIZE)],
+        np.diag(np.linspace(0.9, 0.2, SIZE)),
+        1.0,
+    ),
 }
-"""W, A, and the exact constant where it is known by heart (else that of all slopes at 1: positive matrices)."""
+"""W, A, and the exact constant where it is known by heart (else that of all slopes at
+1: positive matrices).
+"""
 
 
 def exact(weights, linear, known):
@@ -73,7 +85,9 @@ def test_the_joint_bound_of_a_map_with_a_known_constant_is_tight_from_above(name
 @pytest.mark.parametrize("name", JOINT)
 def test_the_slope_attack_reaches_the_known_constant_and_no_more(name):
     weights, linear, known = JOINT[name]
-    assert attack_slopes(weights, linear) == pytest.approx(exact(weights, linear, known), rel=1e-9)
+    assert attack_slopes(weights, linear) == pytest.approx(
+        exact(weights, linear, known), rel=1e-9
+    )
 
 
 @pytest.mark.parametrize("seed", range(6))
@@ -105,11 +119,19 @@ def test_witnesses_at_the_vertices_prove_the_bound_everywhere_in_their_hull():
     weights = random_network(1)
     vertices = [0.8 * rotation(seed) for seed in range(4)]
     found = [propose_multipliers(weights, (), vertex) for vertex in vertices]
-    bound = max(lipschitz_upper(weights, part, vertex) for part, vertex in zip(found, vertices, strict=True))
+    bound = max(
+        lipschitz_upper(weights, part, vertex)
+        for part, vertex in zip(found, vertices, strict=True)
+    )
     for _ in range(50):
         shares = RANDOM.dirichlet(np.full(4, 0.5))
-        inside = sum(share * vertex for share, vertex in zip(shares, vertices, strict=True))
-        mixed = [sum(share * part[k] for share, part in zip(shares, found, strict=True)) for k in range(2)]
+        inside = sum(
+            share * vertex for share, vertex in zip(shares, vertices, strict=True)
+        )
+        mixed = [
+            sum(share * part[k] for share, part in zip(shares, found, strict=True))
+            for k in range(2)
+        ]
         assert attack_slopes(weights, inside, starts=3) <= bound
         assert lipschitz_upper(weights, mixed, inside) <= bound * (1 + 1e-3)
 
@@ -119,7 +141,10 @@ def test_slopes_anywhere_in_the_hull_of_a_model_stay_below_its_joint_alpha(name)
     weights, proved = explicit(name), certified(name)
     for vertex in weights.operators.vertices:
         assert attack_slopes(weights.residual, vertex) <= proved.alpha_joint
-    assert attack_slopes(weights.residual, weights.operators.vertices.mean(axis=0)) <= proved.alpha_joint
+    assert (
+        attack_slopes(weights.residual, weights.operators.vertices.mean(axis=0))
+        <= proved.alpha_joint
+    )
     assert proved.alpha_joint <= proved.alpha_separate * (1 + 1e-6)
 
 
@@ -134,11 +159,15 @@ def test_slopes_anywhere_in_the_hull_of_a_model_stay_below_its_joint_alpha(name)
         lambda parts: [-part for part in parts],
         lambda parts: parts[:1],
         lambda parts: [],
-        lambda parts: [part * np.exp(RANDOM.normal(0, 0.3, len(part))) for part in parts],
+        lambda parts: [
+            part * np.exp(RANDOM.normal(0, 0.3, len(part))) for part in parts
+        ],
     ],
 )
 def test_what_a_solver_returns_never_makes_a_bound_smaller(garbage):
-    """Whatever it calls its status: the bound is recomputed from the multipliers, or there is none."""
+    """Whatever it calls its status: the bound is recomputed from the multipliers, or
+    there is none.
+    """
     weights, linear, known = JOINT["aligned"]
     constant = exact(weights, linear, known)
     proposed = garbage(propose_multipliers(weights, (), linear))
@@ -149,8 +178,14 @@ def test_what_a_solver_returns_never_makes_a_bound_smaller(garbage):
 
 
 def skewed(seed=0, rate=0.8, condition=20.0):
-    """Operators that contract at `rate` in the norm of a P of this condition, but not in the 2-norm."""
-    root = rotation(seed) @ np.diag(np.sqrt(np.geomspace(1.0, condition, SIZE))) @ rotation(seed + 1)
+    """Operators that contract at `rate` in the norm of a P of this condition, but not
+    in the 2-norm.
+    """
+    root = (
+        rotation(seed)
+        @ np.diag(np.sqrt(np.geomspace(1.0, condition, SIZE)))
+        @ rotation(seed + 1)
+    )
     operators = [np.linalg.solve(root, rate * rotation(k) @ root) for k in range(2, 6)]
     return operators, root.T @ root
 
@@ -162,7 +197,12 @@ def test_a_common_lyapunov_matrix_is_accepted_at_its_rate_and_condition_and_not_
     assert check_metric(metric, operators, 0.8 * (1 + 1e-6), condition * (1 + 1e-6))
     assert not check_metric(metric, operators, 0.8 * (1 - 1e-6), condition * (1 + 1e-6))
     assert not check_metric(metric, operators, 0.8 * (1 + 1e-6), condition * (1 - 1e-6))
-    for spoiled in (-metric, np.zeros_like(metric), np.full_like(metric, np.nan), metric + 1e-12 * np.eye(6, k=1)):
+    for spoiled in (
+        -metric,
+        np.zeros_like(metric),
+        np.full_like(metric, np.nan),
+        metric + 1e-12 * np.eye(6, k=1),
+    ):
         assert not check_metric(spoiled, operators, 0.9, 1e6)
 
 
@@ -177,11 +217,16 @@ def test_scaling_a_lyapunov_matrix_changes_nothing(scale):
 def test_the_solver_finds_a_lyapunov_matrix_that_the_core_accepts():
     operators, metric = skewed(condition=5.0)
     found = solve_metric(operators, 0.85)
-    assert check_metric(found, operators, 0.85 * (1 + 1e-6), np.linalg.cond(metric) * 1.01)
+    assert check_metric(
+        found, operators, 0.85 * (1 + 1e-6), np.linalg.cond(metric) * 1.01
+    )
 
 
 def test_two_operators_that_are_stable_one_by_one_have_no_common_lyapunov_matrix():
-    switched = [np.asarray([[0.0, 2.0], [0.0, 0.0]]), np.asarray([[0.0, 0.0], [2.0, 0.0]])]
+    switched = [
+        np.asarray([[0.0, 2.0], [0.0, 0.0]]),
+        np.asarray([[0.0, 0.0], [2.0, 0.0]]),
+    ]
     found = solve_metric(switched, 0.99)
     assert found is None or not check_metric(found, switched, 1.0, 1e9)
 
@@ -193,7 +238,10 @@ def check_with(matrix_of, weights, multipliers, bound, linear):
     matrix = matrix_of(weights, multipliers, linear)
     inputs = linear.shape[1]
     matrix[:inputs, :inputs] += bound**2 * np.eye(inputs)
-    return np.all(np.isfinite(matrix)) and np.linalg.eigvalsh(0.5 * (matrix + matrix.T))[0] > 0
+    return (
+        np.all(np.isfinite(matrix))
+        and np.linalg.eigvalsh(0.5 * (matrix + matrix.T))[0] > 0
+    )
 
 
 def without_coupling(weights, multipliers, linear):
@@ -212,15 +260,24 @@ def wrong_vertex(weights, multipliers, linear):
     return witness_matrix(weights, multipliers, 0.0, 0.5 * linear)[0]
 
 
-MUTANTS = {"without coupling": without_coupling, "without A": without_linear, "half of A": wrong_vertex}
+MUTANTS = {
+    "without coupling": without_coupling,
+    "without A": without_linear,
+    "half of A": wrong_vertex,
+}
 
 
 @pytest.mark.parametrize("mutant", MUTANTS)
 def test_mutants_of_the_joint_check_accept_a_bound_that_is_false(mutant):
-    """So the exact cases above would catch them: each accepts less than the known constant of some map."""
+    """So the exact cases above would catch them: each accepts less than the known
+    constant of some map.
+    """
     fooled = []
     for weights, linear, known in JOINT.values():
-        false, found = 0.98 * exact(weights, linear, known), propose_multipliers(weights, (), linear)
+        false, found = (
+            0.98 * exact(weights, linear, known),
+            propose_multipliers(weights, (), linear),
+        )
         for scale in np.geomspace(0.01, 100, 60):
             proposed = [scale * part for part in found]
             assert not check_witness(weights, proposed, false, linear)

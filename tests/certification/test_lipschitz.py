@@ -1,4 +1,6 @@
-"""Lipschitz bounds on networks whose constant is known exactly, and mutants of the certifier that these must catch."""
+"""Lipschitz bounds on networks whose constant is known exactly, and mutants of the
+certifier that these must catch.
+"""
 
 import numpy as np
 import pytest
@@ -14,9 +16,10 @@ def rotation(seed, size=SIZE):
 
 
 def perron(weights):
-    """For positive weights every slope is 1 at worst: the constant is ||W_L … W_1||_2, and with x its top singular
-    vector, h_k = W_k … W_1 x, the multipliers Λ_k h_k = W_{k+1}' Λ_{k+1} h_{k+1} prove it (an M-matrix, positive null
-    vector)."""
+    """For positive weights every slope is 1 at worst: the constant is ||W_L … W_1||_2,
+    and with x its top singular vector, h_k = W_k … W_1 x, the multipliers Λ_k h_k =
+    W_{k+1}' Λ_{k+1} h_{k+1} prove it (an M-matrix, positive null vector).
+    """
     product = np.linalg.multi_dot(weights[::-1]) if len(weights) > 1 else weights[0]
     x = np.abs(np.linalg.svd(product)[2][0])
     hidden = [x]
@@ -31,17 +34,24 @@ def perron(weights):
 
 def diagonal(seed):
     """Every coordinate is a scalar chain of its own: max_i Π |d_i|, λ_k = Π_{j>k} d_j²."""
-    entries = np.random.default_rng(seed).uniform(0.2, 2.0, (3, SIZE)) * np.random.default_rng(seed).choice(
-        [-1, 1], (3, SIZE)
-    )
+    entries = np.random.default_rng(seed).uniform(
+        0.2, 2.0, (3, SIZE)
+    ) * np.random.default_rng(seed).choice([-1, 1], (3, SIZE))
     multipliers = [entries[1] ** 2 * entries[2] ** 2, entries[2] ** 2]
-    return [np.diag(row) for row in entries], multipliers, np.max(np.abs(np.prod(entries, axis=0)))
+    return (
+        [np.diag(row) for row in entries],
+        multipliers,
+        np.max(np.abs(np.prod(entries, axis=0))),
+    )
 
 
 def orthogonal(scales=(2.0, 0.5, 3.0)):
     """Aligned orthogonal factors: the product of the scales, λ_k = Π_{j>k} s_j²."""
     weights = [scale * rotation(seed) for seed, scale in enumerate(scales)]
-    multipliers = [np.full(SIZE, np.prod(np.square(scales[k + 1 :]))) for k in range(len(scales) - 1)]
+    multipliers = [
+        np.full(SIZE, np.prod(np.square(scales[k + 1 :])))
+        for k in range(len(scales) - 1)
+    ]
     return weights, multipliers, float(np.prod(scales))
 
 
@@ -75,7 +85,11 @@ EXACT = {
 @pytest.mark.parametrize("name", EXACT)
 def test_the_bound_of_a_network_with_a_known_constant_is_tight_from_above(name):
     weights, multipliers, exact = EXACT[name]
-    assert exact * (1 - 1e-14) <= lipschitz_upper(weights, multipliers) <= exact * (1 + 1e-3)
+    assert (
+        exact * (1 - 1e-14)
+        <= lipschitz_upper(weights, multipliers)
+        <= exact * (1 + 1e-3)
+    )
 
 
 @pytest.mark.parametrize("name", EXACT)
@@ -96,14 +110,18 @@ def test_no_multipliers_however_chosen_prove_less_than_the_constant(name):
     weights, multipliers, exact = EXACT[name]
     random = np.random.default_rng(0)
     for _ in range(10):
-        guessed = [part * np.exp(random.normal(0.0, 0.3, len(part))) for part in multipliers]
+        guessed = [
+            part * np.exp(random.normal(0.0, 0.3, len(part))) for part in multipliers
+        ]
         assert lipschitz_upper(weights, guessed) >= exact * (1 - 1e-14)
 
 
 def test_useless_multipliers_prove_nothing():
     weights, multipliers, _ = EXACT["orthogonal"]
     for spoil in (np.nan, -1.0, 0.0, np.inf):
-        assert lipschitz_upper(weights, [spoil * part for part in multipliers]) == np.inf
+        assert (
+            lipschitz_upper(weights, [spoil * part for part in multipliers]) == np.inf
+        )
     assert lipschitz_upper(weights, multipliers[:1]) == np.inf
     assert lipschitz_upper(weights, []) == np.inf
 
@@ -119,7 +137,9 @@ def test_weights_that_are_not_numbers_have_no_bound(layer):
 def test_the_multipliers_that_a_sandwich_carries_prove_its_own_bound(scale):
     weights = explicit("sfkd", scale)
     claimed = 0.1
-    assert check_witness(weights.residual, weights.residual_multipliers, claimed * (1 + 1e-6))
+    assert check_witness(
+        weights.residual, weights.residual_multipliers, claimed * (1 + 1e-6)
+    )
     true = steepest_pattern(weights.residual)
     assert not check_witness(weights.residual, weights.residual_multipliers, 0.9 * true)
     for spoil in (np.nan, -1.0):
@@ -143,7 +163,9 @@ def power_iteration(matrix, steps=5):
 
 def sampled_norm(matrix, count=200):
     vectors = np.random.default_rng(0).standard_normal((matrix.shape[1], count))
-    return np.max(np.linalg.norm(matrix @ vectors, axis=0) / np.linalg.norm(vectors, axis=0))
+    return np.max(
+        np.linalg.norm(matrix @ vectors, axis=0) / np.linalg.norm(vectors, axis=0)
+    )
 
 
 def square(matrix):
@@ -154,7 +176,9 @@ NORMS = {
     "reference": norm_upper,
     "power iteration, 1 step": lambda matrix: power_iteration(matrix, 1),
     "power iteration, 5 steps": power_iteration,
-    "Frobenius / sqrt(rank)": lambda matrix: np.linalg.norm(matrix) / np.sqrt(np.linalg.matrix_rank(matrix)),
+    "Frobenius / sqrt(rank)": lambda matrix: (
+        np.linalg.norm(matrix) / np.sqrt(np.linalg.matrix_rank(matrix))
+    ),
     "spectral radius": lambda matrix: np.max(np.abs(np.linalg.eigvals(square(matrix)))),
     "0.999 of the norm": lambda matrix: 0.999 * norm_upper(matrix),
     "sampled": sampled_norm,
@@ -165,7 +189,10 @@ NORMS = {
 MATRICES = {
     "orthogonal": (rotation(0), 1.0),
     "close eigenvalues": (np.diag(np.linspace(0.9, 1.0, SIZE)), 1.0),
-    "hidden direction": (0.5 * np.eye(SIZE) + 0.6 * np.outer(rotation(1)[0], rotation(1)[0]), 1.1),
+    "hidden direction": (
+        0.5 * np.eye(SIZE) + 0.6 * np.outer(rotation(1)[0], rotation(1)[0]),
+        1.1,
+    ),
     "nilpotent": (np.diag([2.0] * (SIZE - 1), 1), 2.0),
     "rank 1": (
         np.outer(np.ones(SIZE), np.arange(1.0, SIZE + 1)),
@@ -176,7 +203,9 @@ MATRICES = {
 
 
 def passed(bound_of, cases):
-    """Which soundness checks a certifier passes: a bound not below the constant; an error is a refusal."""
+    """Which soundness checks a certifier passes: a bound not below the constant; an
+    error is a refusal.
+    """
     verdicts = {}
     for name, (*inputs, exact) in cases.items():
         try:
@@ -195,18 +224,29 @@ def test_every_mutant_of_the_norm_bound_is_caught_and_the_reference_is_not(certi
 
 
 def product_of(norm):
-    return lambda weights, multipliers: float(np.prod([norm(matrix) for matrix in weights]))
+    return lambda weights, multipliers: float(
+        np.prod([norm(matrix) for matrix in weights])
+    )
 
 
 def jacobians(weights, count):
-    """Largest Jacobian of a tanh network over random inputs: the paper's L_contr, used as a certificate."""
+    """Largest Jacobian of a tanh network over random inputs: the paper's L_contr, used
+    as a certificate.
+    """
     random = np.random.default_rng(0)
     best = 0.0
     for _ in range(count):
-        z, chained = random.standard_normal(weights[0].shape[1]), np.eye(weights[0].shape[1])
+        z, chained = (
+            random.standard_normal(weights[0].shape[1]),
+            np.eye(weights[0].shape[1]),
+        )
         for k, matrix in enumerate(weights):
             before = matrix @ z
-            slope = np.ones_like(before) if k == len(weights) - 1 else 1 - np.tanh(before) ** 2
+            slope = (
+                np.ones_like(before)
+                if k == len(weights) - 1
+                else 1 - np.tanh(before) ** 2
+            )
             chained, z = slope[:, None] * (matrix @ chained), np.tanh(before)
         best = max(best, np.linalg.norm(chained, 2))
     return best
@@ -220,14 +260,18 @@ def random_pairs(weights, count):
         apart, values = np.linalg.norm(pair[0] - pair[1]), pair
         for matrix in weights[:-1]:
             values = np.tanh(values @ matrix.T)
-        best = max(best, np.linalg.norm((values[0] - values[1]) @ weights[-1].T) / apart)
+        best = max(
+            best, np.linalg.norm((values[0] - values[1]) @ weights[-1].T) / apart
+        )
     return best
 
 
 def unchecked(weights, multipliers, checker):
     """The smallest bound on a grid that some checker accepts."""
     grid = np.geomspace(1e-3, 1e3, 2000)
-    return next((bound for bound in grid if checker(weights, multipliers, bound)), np.inf)
+    return next(
+        (bound for bound in grid if checker(weights, multipliers, bound)), np.inf
+    )
 
 
 def witness(weights, multipliers, bound, *, last=1.0, diagonal=2.0, tolerance=0.0):
@@ -252,29 +296,55 @@ LIPSCHITZ = {
     "power iteration per layer": product_of(power_iteration),
     "Frobenius / sqrt(rank) per layer": product_of(NORMS["Frobenius / sqrt(rank)"]),
     "spectral radius per layer": product_of(NORMS["spectral radius"]),
-    "forgets the last layer": lambda weights, multipliers: product_of(norm_upper)(weights[:-1], multipliers),
-    "0.999 of the bound": lambda weights, multipliers: 0.999 * lipschitz_upper(weights, multipliers),
+    "forgets the last layer": lambda weights, multipliers: product_of(norm_upper)(
+        weights[:-1], multipliers
+    ),
+    "0.999 of the bound": lambda weights, multipliers: (
+        0.999 * lipschitz_upper(weights, multipliers)
+    ),
     "sampled Jacobian": lambda weights, multipliers: jacobians(weights, 300),
-    "1.05 sampled Jacobian": lambda weights, multipliers: 1.05 * jacobians(weights, 300),
+    "1.05 sampled Jacobian": lambda weights, multipliers: (
+        1.05 * jacobians(weights, 300)
+    ),
     "random pairs": lambda weights, multipliers: random_pairs(weights, 300),
-    "no last layer in the witness": lambda *network: unchecked(*network, lambda *a: witness(*a, last=0.0)),
-    "3 Λ in the witness": lambda *network: unchecked(*network, lambda *a: witness(*a, diagonal=3.0)),
-    "loose eigenvalues in the witness": lambda *network: unchecked(*network, lambda *a: witness(*a, tolerance=1e-2)),
-    "any multipliers": lambda weights, multipliers: unchecked(weights, multipliers, lambda *a: True),
-    "NaN passes": lambda weights, multipliers: lipschitz_upper([np.nan_to_num(w) for w in weights], multipliers),
+    "no last layer in the witness": lambda *network: unchecked(
+        *network, lambda *a: witness(*a, last=0.0)
+    ),
+    "3 Λ in the witness": lambda *network: unchecked(
+        *network, lambda *a: witness(*a, diagonal=3.0)
+    ),
+    "loose eigenvalues in the witness": lambda *network: unchecked(
+        *network, lambda *a: witness(*a, tolerance=1e-2)
+    ),
+    "any multipliers": lambda weights, multipliers: unchecked(
+        weights, multipliers, lambda *a: True
+    ),
+    "NaN passes": lambda weights, multipliers: lipschitz_upper(
+        [np.nan_to_num(w) for w in weights], multipliers
+    ),
 }
 
-NETWORKS = EXACT | {"NaN": ([np.diag([np.nan] + [1.0] * (SIZE - 1)), np.eye(SIZE)], [np.ones(SIZE)], np.inf)}
+NETWORKS = EXACT | {
+    "NaN": (
+        [np.diag([np.nan] + [1.0] * (SIZE - 1)), np.eye(SIZE)],
+        [np.ones(SIZE)],
+        np.inf,
+    )
+}
 
 
 @pytest.mark.filterwarnings("ignore::RuntimeWarning")
 @pytest.mark.parametrize("certifier", LIPSCHITZ)
-def test_every_mutant_of_the_lipschitz_bound_is_caught_and_the_reference_is_not(certifier):
+def test_every_mutant_of_the_lipschitz_bound_is_caught_and_the_reference_is_not(
+    certifier,
+):
     verdicts = passed(LIPSCHITZ[certifier], NETWORKS)
     assert all(verdicts.values()) == (certifier == "reference"), verdicts
 
 
 def test_the_checks_do_not_condemn_another_sound_certifier():
-    """A plain eigenvalue check on a safe grid is sound here too: the suite tests soundness, not one way to it."""
+    """A plain eigenvalue check on a safe grid is sound here too: the suite tests
+    soundness, not one way to it.
+    """
     verdicts = passed(lambda *network: 1.01 * unchecked(*network, witness), NETWORKS)
     assert all(verdicts.values()), verdicts

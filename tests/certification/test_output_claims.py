@@ -14,7 +14,12 @@ from sfkd_jax.certification._claims import Refuted, readouts
 from sfkd_jax.certification._metric_search import _accepted
 from sfkd_jax.types import Declared, Polytope
 
-VERTICES = np.stack([np.linalg.solve(ROOT, rate * rotation(3, k) @ ROOT) for k, rate in enumerate((0.3, 0.5, 0.4))])
+VERTICES = np.stack(
+    [
+        np.linalg.solve(ROOT, rate * rotation(3, k) @ ROOT)
+        for k, rate in enumerate((0.3, 0.5, 0.4))
+    ]
+)
 WEIGHTS = NETWORK._replace(
     operators=Polytope(VERTICES),
     decoder=(),
@@ -23,8 +28,13 @@ WEIGHTS = NETWORK._replace(
     declared=Declared("tanh", "identity", 2),
 )
 JOINT = [[np.full(4, 1.2 + 0.1 * k)] for k in range(3)]
-HONEST = {name: _accepted(WEIGHTS, readouts(WEIGHTS)[name], ROOT @ ROOT, JOINT) for name in _output_metrics.OUTPUTS}
-"""Found before anything is changed, so that a changed check cannot agree with a changed search."""
+HONEST = {
+    name: _accepted(WEIGHTS, readouts(WEIGHTS)[name], ROOT @ ROOT, JOINT)
+    for name in _output_metrics.OUTPUTS
+}
+"""Found before anything is changed, so that a changed check cannot agree with a changed
+search.
+"""
 every_output = pytest.mark.parametrize("name", HONEST)
 
 
@@ -52,21 +62,37 @@ def test_what_was_found_is_proved_also_from_json(name):
 
 @every_output
 def test_the_constants_are_those_of_the_matrices(name):
-    """|c|_{P⁻¹} of the row, and a rate above the longest vertex in the metric and below the sum with the residual."""
+    """|c|_{P⁻¹} of the row, and a rate above the longest vertex in the metric and below
+    the sum with the residual.
+    """
     claim, row = HONEST[name], readouts(WEIGHTS)[name][0]
-    assert claim.lipschitz == pytest.approx(np.sqrt(row @ np.linalg.solve(ROOT @ ROOT, row)), rel=1e-5)
+    assert claim.lipschitz == pytest.approx(
+        np.sqrt(row @ np.linalg.solve(ROOT @ ROOT, row)), rel=1e-5
+    )
     require(name, claim._replace(lipschitz=1.001 * claim.lipschitz))
     require(name, claim._replace(alpha=1.001 * claim.alpha))
     for share in (0.5, 0.99, 1 - 4e-6):
-        refuted(name, claim._replace(lipschitz=share * claim.lipschitz), ".lipschitz does not follow")
-        refuted(name, claim._replace(alpha=share * claim.alpha), ".alpha does not follow")
+        refuted(
+            name,
+            claim._replace(lipschitz=share * claim.lipschitz),
+            ".lipschitz does not follow",
+        )
+        refuted(
+            name, claim._replace(alpha=share * claim.alpha), ".alpha does not follow"
+        )
 
 
 @every_output
 @pytest.mark.parametrize("constant", ["alpha", "lipschitz"])
-@pytest.mark.parametrize("value", [0.0, -0.5, -5e-324, np.inf, np.nan, 1, "0.5", None, True])
+@pytest.mark.parametrize(
+    "value", [0.0, -0.5, -5e-324, np.inf, np.nan, 1, "0.5", None, True]
+)
 def test_what_is_no_bound_is_none(name, constant, value):
-    refuted(name, HONEST[name]._replace(**{constant: value}), f".{constant} is no bound: {value!r}")
+    refuted(
+        name,
+        HONEST[name]._replace(**{constant: value}),
+        f".{constant} is no bound: {value!r}",
+    )
 
 
 @every_output
@@ -79,46 +105,90 @@ def test_a_rate_that_is_proved_and_no_contraction_is_refused(name, alpha):
 def test_every_vertex_counts(vertex):
     claim, longer = HONEST["position"], np.array(VERTICES)
     longer[vertex] *= 0.9 / (0.3, 0.5, 0.4)[vertex]
-    refuted("position", claim, ".alpha does not follow", WEIGHTS._replace(operators=Polytope(longer)))
+    refuted(
+        "position",
+        claim,
+        ".alpha does not follow",
+        WEIGHTS._replace(operators=Polytope(longer)),
+    )
     for factor in (0.0, -1.0, 0.01, np.nan):
-        joint = [[factor * part for part in each] if k == vertex else each for k, each in enumerate(claim.joint)]
+        joint = [
+            [factor * part for part in each] if k == vertex else each
+            for k, each in enumerate(claim.joint)
+        ]
         refuted("position", claim._replace(joint=joint), ".alpha does not follow")
 
 
 def test_a_rate_in_one_metric_is_none_in_another():
     claim = HONEST["position"]
     refuted("position", claim._replace(metric=np.eye(3)), ".alpha does not follow")
-    for metric in (-claim.metric, 0 * claim.metric, np.diag([1.0, 4.0, np.nan]), claim.metric + np.triu(ROOT + 1, 1)):
+    for metric in (
+        -claim.metric,
+        0 * claim.metric,
+        np.diag([1.0, 4.0, np.nan]),
+        claim.metric + np.triu(ROOT + 1, 1),
+    ):
         refuted("position", claim._replace(metric=metric), ".alpha does not follow")
 
 
 @pytest.mark.parametrize("size", [2, 4])
 def test_a_witness_of_another_size_is_named(size):
     claim = HONEST["position"]
-    refuted("position", claim._replace(metric=np.eye(size)), ".witness is of another size")
-    refuted("position", claim._replace(joint=(2 * claim.joint)[:size]), ".witness is of another size")
+    refuted(
+        "position", claim._replace(metric=np.eye(size)), ".witness is of another size"
+    )
+    refuted(
+        "position",
+        claim._replace(joint=(2 * claim.joint)[:size]),
+        ".witness is of another size",
+    )
 
 
 def test_what_may_have_a_metric_is_a_polytope_without_transport_and_decoder():
     claim = HONEST["position"]
     for transport in ("rotation", "identical", "", "identity "):
-        refuted("position", claim, ": this model has no", WEIGHTS._replace(declared=Declared("tanh", transport, 2)))
-    refuted("position", claim, ": this model has no", WEIGHTS._replace(operators=HYPERNETWORK))
-    refuted("position", claim, ": this model has no", WEIGHTS._replace(decoder=NETWORK.decoder))
+        refuted(
+            "position",
+            claim,
+            ": this model has no",
+            WEIGHTS._replace(declared=Declared("tanh", transport, 2)),
+        )
+    refuted(
+        "position",
+        claim,
+        ": this model has no",
+        WEIGHTS._replace(operators=HYPERNETWORK),
+    )
+    refuted(
+        "position",
+        claim,
+        ": this model has no",
+        WEIGHTS._replace(decoder=NETWORK.decoder),
+    )
     refuted("body", claim, ": this model has no")
 
 
 def test_what_is_read_is_bounded_with_its_rounding(monkeypatch):
     """b² P − C'C to the bit of its symmetry, and every term of what it loses."""
     asked = []
-    monkeypatch.setattr(_output_metrics, "is_positive_definite", lambda *given: bool(asked.append(given)) or True)
+    monkeypatch.setattr(
+        _output_metrics,
+        "is_positive_definite",
+        lambda *given: bool(asked.append(given)) or True,
+    )
     rows, metric, bound = rotation(3, 4)[:2] / 3, ROOT @ ROOT, 0.7
     assert _output_metrics.reads_within(rows, bound, metric)
     ((matrix, error),) = asked
-    np.testing.assert_allclose(matrix, 0.49 * metric - rows.T @ rows, rtol=1e-14, atol=1e-15)
+    np.testing.assert_allclose(
+        matrix, 0.49 * metric - rows.T @ rows, rtol=1e-14, atol=1e-15
+    )
     np.testing.assert_array_equal(matrix, matrix.T)
-    lost = 4 * _core.UNIT * (np.linalg.norm(0.49 * metric) + np.linalg.norm(rows.T @ rows))
-    assert error == pytest.approx(lost + _core.product(rows.T, rows)[1], rel=1e-12, abs=0.0)
+    lost = (
+        4 * _core.UNIT * (np.linalg.norm(0.49 * metric) + np.linalg.norm(rows.T @ rows))
+    )
+    assert error == pytest.approx(
+        lost + _core.product(rows.T, rows)[1], rel=1e-12, abs=0.0
+    )
 
 
 def test_nothing_is_warned_of(recwarn):

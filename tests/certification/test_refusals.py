@@ -1,4 +1,6 @@
-"""What must not be certified is not, and the reason is named; what is declared falsely is contradicted by an attack."""
+"""What must not be certified is not, and the reason is named; what is declared falsely
+is contradicted by an attack.
+"""
 
 import dataclasses
 
@@ -29,9 +31,17 @@ def declaring(model, **changes):
 
     def explicit(params):
         found = model.explicit(params)
-        declared = {name: value for name, value in changes.items() if name in ("activation", "transport")}
-        others = {name: value for name, value in changes.items() if name not in declared}
-        return found._replace(declared=dataclasses.replace(found.declared, **declared), **others)
+        declared = {
+            name: value
+            for name, value in changes.items()
+            if name in ("activation", "transport")
+        }
+        others = {
+            name: value for name, value in changes.items() if name not in declared
+        }
+        return found._replace(
+            declared=dataclasses.replace(found.declared, **declared), **others
+        )
 
     return model._replace(explicit=explicit)
 
@@ -46,13 +56,17 @@ def test_an_activation_whose_slopes_are_not_known_is_refused(activation):
 def test_evidence_on_a_grid_is_refused_by_name():
     model, params = model_and_params("sfkd")
     operators = Samples(jnp.tile(0.5 * jnp.eye(8), (49, 1, 1)))
-    with pytest.raises(CertificationRefused, match="grid-only evidence: 49 sampled environments"):
+    with pytest.raises(
+        CertificationRefused, match="grid-only evidence: 49 sampled environments"
+    ):
         certify(declaring(model, operators=operators), params, BOX)
 
 
 def test_a_transport_of_unknown_kind_is_refused():
     model, params = model_and_params("sfkd")
-    with pytest.raises(CertificationRefused, match="transport 'learned matrix' is not known"):
+    with pytest.raises(
+        CertificationRefused, match="transport 'learned matrix' is not known"
+    ):
         certify(declaring(model, transport="learned matrix"), params, BOX)
 
 
@@ -63,15 +77,22 @@ def test_a_transport_that_stretches_is_found_out():
         moved = model.transport(fiber, fiber_next, latent)
         return moved._replace(z=1.001 * moved.z)
 
-    with pytest.raises(CertificateContradicted, match=r"INTERNAL ERROR: the attack on the transport reaches 1\.001"):
+    with pytest.raises(
+        CertificateContradicted,
+        match=r"INTERNAL ERROR: the attack on the transport reaches 1\.001",
+    ):
         certify(model._replace(transport=stretched), params, BOX, attack_starts=1)
 
 
 def at_the_limit(name):
-    """Equal vertices, multiples of the identity: every environment and direction uses the whole of ρ."""
+    """Equal vertices, multiples of the identity: every environment and direction uses
+    the whole of ρ.
+    """
     model, params = model_and_params(name)
     limit = 10.0 * np.tile(np.eye(8, dtype=np.float32), (3, 1, 1))
-    return model, params | {"networks": params["networks"] | {"operators": jnp.asarray(limit)}}
+    return model, params | {
+        "networks": params["networks"] | {"operators": jnp.asarray(limit)}
+    }
 
 
 def skipping(model):
@@ -85,7 +106,9 @@ def skipping(model):
 
 
 def modulated(model):
-    """FiLM: the environment scales what the residual and the operator emit, which no bias does."""
+    """FiLM: the environment scales what the residual and the operator emit, which no
+    bias does.
+    """
 
     def step(fiber, latent, control):
         after = model.step(fiber, latent, control)
@@ -102,7 +125,9 @@ def test_a_step_that_is_not_what_it_declares_is_contradicted_by_the_attack(liar)
 
 
 def test_operators_by_power_iteration_are_refused_or_counted_as_long_as_they_are():
-    """A shortened norm bound inside the model shows up in ρ: the certificate recomputes it from the weights."""
+    """A shortened norm bound inside the model shows up in ρ: the certificate recomputes
+    it from the weights.
+    """
     model, params = model_and_params("sfkd")
     longer = Polytope(1.15 * model.explicit(params).operators.vertices)
     with pytest.raises(CertificationRefused, match="is not below 1"):
@@ -118,22 +143,45 @@ def pair_stable_one_by_one(size=8):
 def test_operators_that_are_stable_for_every_environment_and_not_under_switching_are_refused():
     model, params = model_and_params("no_residual")
     operators = pair_stable_one_by_one()
-    assert max(abs(np.linalg.eigvals(np.asarray(vertex))).max() for vertex in operators.vertices) < 1e-6
+    assert (
+        max(
+            abs(np.linalg.eigvals(np.asarray(vertex))).max()
+            for vertex in operators.vertices
+        )
+        < 1e-6
+    )
     for settings in ({}, {"mode": "separate"}):
         with pytest.raises(CertificationRefused, match=r"alpha = 2\.0"):
-            certify(declaring(model, operators=operators), params, BOX, attack_starts=0, **settings)
+            certify(
+                declaring(model, operators=operators),
+                params,
+                BOX,
+                attack_starts=0,
+                **settings,
+            )
 
 
 def test_a_metric_certifies_what_the_identity_cannot_and_only_without_transport():
     root = np.diag(np.geomspace(1.0, 4.0, 8))
     turn = np.linalg.qr(np.random.default_rng(0).standard_normal((8, 8)))[0]
-    operators = Polytope(jnp.asarray(np.stack([np.linalg.solve(root, 0.7 * q @ root) for q in (turn, turn.T)])))
+    operators = Polytope(
+        jnp.asarray(
+            np.stack([np.linalg.solve(root, 0.7 * q @ root) for q in (turn, turn.T)])
+        )
+    )
     _, params = model_and_params("sfkd")
-    still, turning = (declaring(tiny(name, beta=0.02), operators=operators) for name in ("no_transport", "sfkd"))
-    metric = solve_metric([np.asarray(vertex, dtype=np.float64) for vertex in operators.vertices], 0.75)
+    still, turning = (
+        declaring(tiny(name, beta=0.02), operators=operators)
+        for name in ("no_transport", "sfkd")
+    )
+    metric = solve_metric(
+        [np.asarray(vertex, dtype=np.float64) for vertex in operators.vertices], 0.75
+    )
     with pytest.raises(CertificationRefused, match="is not below 1"):
         certify(still, params, BOX, mode="separate", attack_starts=0)
-    proved = certify(still, params, BOX, mode="separate", metric=metric, attack_starts=0)
+    proved = certify(
+        still, params, BOX, mode="separate", metric=metric, attack_starts=0
+    )
     assert 0.7 <= proved.rho <= 0.7501
     assert proved.kappa <= 16.2
     assert proved.alpha == proved.rho + proved.beta * proved.kappa**0.5 < 1
@@ -142,7 +190,9 @@ def test_a_metric_certifies_what_the_identity_cannot_and_only_without_transport(
         certify(turning, params, BOX, mode="separate", metric=metric)
     for spoiled in (-metric, np.nan * metric, np.eye(8), metric[:4, :4]):
         with pytest.raises(CertificationRefused):
-            certify(still, params, BOX, mode="separate", metric=spoiled, attack_starts=0)
+            certify(
+                still, params, BOX, mode="separate", metric=spoiled, attack_starts=0
+            )
 
 
 def hypernetwork(gain):
@@ -151,23 +201,31 @@ def hypernetwork(gain):
     first = random.standard_normal((6, 2)) * np.asarray([3.0, 0.12])
     last = gain * random.standard_normal((64, 6)) / 10
     return Hypernetwork(
-        (jnp.asarray(first), jnp.asarray(last)), (jnp.asarray([-1.8] * 6), jnp.asarray(0.3 * np.eye(8).ravel()))
+        (jnp.asarray(first), jnp.asarray(last)),
+        (jnp.asarray([-1.8] * 6), jnp.asarray(0.3 * np.eye(8).ravel())),
     )
 
 
 def test_a_hypernetwork_is_certified_by_branch_and_bound_and_refused_when_it_is_too_long():
     model, params = model_and_params("sfkd")
-    proved = certify(declaring(model, operators=hypernetwork(0.3)), params, BOX, attack_starts=0)
+    proved = certify(
+        declaring(model, operators=hypernetwork(0.3)), params, BOX, attack_starts=0
+    )
     assert "branch and bound" in proved.scope
     assert 0.3 < proved.rho < 0.9
-    # Cells widen the joint inequality and the sum of norms by different amounts: neither need be the smaller here.
+    # Cells widen the joint inequality and the sum of norms by different amounts:
+    # neither need be the smaller here.
     assert proved.alpha == min(proved.alpha_joint, proved.alpha_separate)
     verify(proved, params, model=declaring(model, operators=hypernetwork(0.3)))
     with pytest.raises(CertificationRefused, match="is not below 1"):
-        certify(declaring(model, operators=hypernetwork(3.0)), params, BOX, attack_starts=0)
+        certify(
+            declaring(model, operators=hypernetwork(3.0)), params, BOX, attack_starts=0
+        )
 
 
-@pytest.mark.parametrize("box", [(ENV_HIGH, ENV_LOW), (ENV_LOW,), (0.3, 0.9), ((np.nan, -8.0), ENV_HIGH)])
+@pytest.mark.parametrize(
+    "box", [(ENV_HIGH, ENV_LOW), (ENV_LOW,), (0.3, 0.9), ((np.nan, -8.0), ENV_HIGH)]
+)
 def test_a_box_that_is_none_is_an_error(box):
     with pytest.raises(ValueError, match="env_box must be a lower and an upper corner"):
         certify(*model_and_params("sfkd"), box)
@@ -194,7 +252,9 @@ def test_the_served_transport_is_an_isometry():
 
 
 @hypothesis.settings(max_examples=40, deadline=None, derandomize=True)
-@hypothesis.given(seed=st.integers(0, 2**31 - 1), scale=st.floats(-2, 2), apart=st.floats(-4, 1))
+@hypothesis.given(
+    seed=st.integers(0, 2**31 - 1), scale=st.floats(-2, 2), apart=st.floats(-4, 1)
+)
 def test_no_pair_of_latents_ever_moves_apart_faster_than_certified(seed, scale, apart):
     before, after, nearby = _pairs(seed, 10.0**scale, 10.0**apart)
     start = np.linalg.norm(np.asarray(before) - np.asarray(nearby), axis=1)
@@ -203,7 +263,9 @@ def test_no_pair_of_latents_ever_moves_apart_faster_than_certified(seed, scale, 
 
 
 def _pairs(seed, scale, apart):
-    """32 pairs of latents under shared controls and environments, and their distances after step and transport."""
+    """32 pairs of latents under shared controls and environments, and their distances
+    after step and transport.
+    """
     random = np.random.default_rng(seed)
     z = scale * random.standard_normal((32, 8))
     other = z + apart * random.standard_normal((32, 8))
@@ -220,10 +282,14 @@ def _distance(z, other, controls, envs, later):
     def moved(z, control, env, env_next):
         fiber, fiber_next = model.fiber(params, env), model.fiber(params, env_next)
         latent = model.encode(fiber, jnp.asarray([0.0, 0.0, 0.0, 10.0]))._replace(z=z)
-        return model.vector(model.transport(fiber, fiber_next, model.step(fiber, latent, control)))
+        return model.vector(
+            model.transport(fiber, fiber_next, model.step(fiber, latent, control))
+        )
 
     each = jax.vmap(moved)
-    return jnp.linalg.norm(each(z, controls, envs, later) - each(other, controls, envs, later), axis=1)
+    return jnp.linalg.norm(
+        each(z, controls, envs, later) - each(other, controls, envs, later), axis=1
+    )
 
 
 @pytest.mark.parametrize("entries", [1, 3])
@@ -231,4 +297,6 @@ def test_attacks_take_environments_of_any_size(entries):
     sizes = {"env_mean": jnp.zeros(entries), "env_scale": jnp.ones(entries)}
     model = models.sfkd(space()._replace(**sizes), **TINY)
     params, box = model.init(jax.random.key(0)), ((-1.0,) * entries, (1.0,) * entries)
-    assert attack_transport(model, params, box, jax.random.key(1)) == pytest.approx(1.0, abs=1e-5)
+    assert attack_transport(model, params, box, jax.random.key(1)) == pytest.approx(
+        1.0, abs=1e-5
+    )

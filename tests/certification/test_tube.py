@@ -1,4 +1,6 @@
-"""Tubes that follow from α and d̄: the formula, the paper's erratum, and zero violations in simulation."""
+"""Tubes that follow from α and d̄: the formula, the paper's erratum, and zero
+violations in simulation.
+"""
 
 import jax
 import jax.numpy as jnp
@@ -12,12 +14,15 @@ from sfkd_jax.core.se2 import wrap_angle
 
 
 @pytest.mark.parametrize(
-    ("alpha", "d_bar", "initial"), [(0.9, 0.3, 0.0), (0.5, 1.0, 2.0), (0.0, 0.7, 1.0), (0.995, 1e-3, 0.1)]
+    ("alpha", "d_bar", "initial"),
+    [(0.9, 0.3, 0.0), (0.5, 1.0, 2.0), (0.0, 0.7, 1.0), (0.995, 1e-3, 0.1)],
 )
 def test_the_latent_tube_is_the_closed_formula(alpha, d_bar, initial):
     k = np.arange(1, 41)
     exact = alpha**k * initial + d_bar * (1 - alpha**k) / (1 - alpha)
-    np.testing.assert_allclose(latent_tube(alpha, d_bar, 40, initial=initial), exact, rtol=1e-12)
+    np.testing.assert_allclose(
+        latent_tube(alpha, d_bar, 40, initial=initial), exact, rtol=1e-12
+    )
 
 
 def test_the_latent_tube_grows_to_its_ultimate_bound_and_never_beyond():
@@ -36,15 +41,19 @@ def test_from_a_large_initial_error_the_tube_shrinks_to_the_same_bound():
 def test_the_bound_is_reached_by_a_scalar_system_so_nothing_smaller_holds():
     error, errors = 0.0, []
     for _ in range(30):
-        error = 0.6 * error + 0.3 * error + 0.2  # A = ρ = 0.6, r = β z with β = 0.3, d = d̄
+        error = (
+            0.6 * error + 0.3 * error + 0.2
+        )  # A = ρ = 0.6, r = β z with β = 0.3, d = d̄
         errors.append(error)
     np.testing.assert_allclose(errors, latent_tube(0.9, 0.2, 30), rtol=1e-12)
 
 
 @pytest.mark.parametrize("scale", [1.0, 100.0, 1e6])
 def test_the_papers_second_constant_is_void_and_the_corrected_tube_is_not(scale):
-    """A = 0.5, P = t I satisfies A'PA − P ≤ −(1 − α²) I for every t ≥ 1, so the printed bound d̄ / (√λ_min(P) (1 − α))
-    falls below any number as t grows, while the error of the scalar system goes to 2 d̄."""
+    """A = 0.5, P = t I satisfies A'PA − P ≤ −(1 − α²) I for every t ≥ 1, so the printed
+    bound d̄ / (√λ_min(P) (1 − α)) falls below any number as t grows, while the error of
+    the scalar system goes to 2 d̄.
+    """
     a, alpha, d_bar = 0.5, 0.5, 1.0
     assert a * scale * a - scale <= -(1 - alpha**2) + 1e-12
     error, worst = 0.0, 0.0
@@ -57,7 +66,9 @@ def test_the_papers_second_constant_is_void_and_the_corrected_tube_is_not(scale)
 
 
 def scaled_to_the_limit(params):
-    """Operators that are multiples of the identity: ρ acts in every direction, so the tube is nearly reached."""
+    """Operators that are multiples of the identity: ρ acts in every direction, so the
+    tube is nearly reached.
+    """
     limit = 10.0 * np.tile(np.eye(8, dtype=np.float32), (3, 1, 1))
     return params | {"networks": params["networks"] | {"operators": limit}}
 
@@ -65,14 +76,23 @@ def scaled_to_the_limit(params):
 @pytest.mark.parametrize("aligned", [False, True])
 @pytest.mark.parametrize("limit", [False, True])
 def test_with_bounded_disturbances_the_tube_is_violated_exactly_never(aligned, limit):
-    """Latents under the same u, switching e and transport; one of them is pushed by |d| ≤ d̄ at every step."""
+    """Latents under the same u, switching e and transport; one of them is pushed by |d|
+    ≤ d̄ at every step.
+    """
     model, params = model_and_params("sfkd")
     params = scaled_to_the_limit(params) if limit else params
-    alpha, d_bar, steps, episodes = certify(model, params, (ENV_LOW, ENV_HIGH), attack_starts=0).alpha, 0.05, 120, 16
+    alpha, d_bar, steps, episodes = (
+        certify(model, params, (ENV_LOW, ENV_HIGH), attack_starts=0).alpha,
+        0.05,
+        120,
+        16,
+    )
 
     def episode(params, key):
         start_key, push_key, env_key, control_key = jax.random.split(key, 4)
-        envs = jnp.asarray([0.6, 0.0]) + jnp.asarray([0.3, 8.0]) * jax.random.uniform(env_key, (steps, 2), minval=-1.0)
+        envs = jnp.asarray([0.6, 0.0]) + jnp.asarray([0.3, 8.0]) * jax.random.uniform(
+            env_key, (steps, 2), minval=-1.0
+        )
         controls = jnp.asarray([0.3, 3.0]) * jax.random.normal(control_key, (steps, 2))
         fibers = jax.vmap(model.fiber, in_axes=(None, 0))(params, envs)
         later = jax.tree.map(lambda leaf: jnp.roll(leaf, -1, axis=0), fibers)
@@ -81,18 +101,25 @@ def test_with_bounded_disturbances_the_tube_is_violated_exactly_never(aligned, l
 
         def step(pair, inputs):
             here, there, control, push = inputs
-            truth, model_latent = (model.transport(here, there, model.step(here, latent, control)) for latent in pair)
+            truth, model_latent = (
+                model.transport(here, there, model.step(here, latent, control))
+                for latent in pair
+            )
             gap = truth.z - model_latent.z
             direction = gap + 1e-6 * push if aligned else push
             # |d| stays below d̄ by 1e-4 of it, more than float32 rounds in adding it
-            truth = truth._replace(z=truth.z + d_bar * (1 - 1e-4) * direction / jnp.linalg.norm(direction))
+            truth = truth._replace(
+                z=truth.z + d_bar * (1 - 1e-4) * direction / jnp.linalg.norm(direction)
+            )
             return (truth, model_latent), jnp.linalg.norm(truth.z - model_latent.z)
 
         pushes = jax.random.normal(push_key, (steps, 8))
         return jax.lax.scan(step, (start, start), (fibers, later, controls, pushes))[1]
 
     keys = jax.random.split(jax.random.key(4), episodes)
-    errors = np.asarray(jit(jax.vmap(episode, in_axes=(None, 0)))(params, keys), dtype=np.float64)
+    errors = np.asarray(
+        jit(jax.vmap(episode, in_axes=(None, 0)))(params, keys), dtype=np.float64
+    )
     tube = latent_tube(alpha, d_bar, steps)
     assert int(np.sum(errors > tube)) == 0
     if aligned and limit:
@@ -111,19 +138,34 @@ def test_the_physical_tube_is_its_finite_sums():
     )
     yaw = [0.01, 0.01 + 0.51, 0.01 + 0.51 + 1.01]
     np.testing.assert_allclose(tube["yaw_rad"], yaw)
-    np.testing.assert_allclose(tube["position_m"], [0.1, 0.2 + 2.0 + 10 * yaw[0], 0.3 + 6.0 + 10 * (yaw[0] + yaw[1])])
-    np.testing.assert_allclose(tube["body"], [0.2, 0.2 + 3.0 * 0.5 * 1.0, 0.2 + 3.0 * 0.5 * 2.0])
+    np.testing.assert_allclose(
+        tube["position_m"],
+        [0.1, 0.2 + 2.0 + 10 * yaw[0], 0.3 + 6.0 + 10 * (yaw[0] + yaw[1])],
+    )
+    np.testing.assert_allclose(
+        tube["body"], [0.2, 0.2 + 3.0 * 0.5 * 1.0, 0.2 + 3.0 * 0.5 * 2.0]
+    )
 
 
 @pytest.mark.parametrize("name", ["sfkd", "segment"])
 def test_free_running_predictions_stay_inside_the_physical_tube(name):
-    """Trajectories whose one-step disturbances are bounded as measured: position, yaw and body state for 12 steps, with
-    a switch of the environment at every one of them. The theorem leaves no exception."""
+    """Trajectories whose one-step disturbances are bounded as measured: position, yaw
+    and body state for 12 steps, with a switch of the environment at every one of them.
+    The theorem leaves no exception.
+    """
     model, params = model_and_params(name)
     data = driven(24)
     proved = certified(name)
-    found = dict(zip(("latent", "position", "yaw", "body"), disturbances(model, params, data).scores.T, strict=True))
-    predicted = np.asarray(jit(jax.vmap(lambda one: rollout(model, params, one)[0]))(data))
+    found = dict(
+        zip(
+            ("latent", "position", "yaw", "body"),
+            disturbances(model, params, data).scores.T,
+            strict=True,
+        )
+    )
+    predicted = np.asarray(
+        jit(jax.vmap(lambda one: rollout(model, params, one)[0]))(data)
+    )
     true = np.asarray(data.states)[:, 1:]
     position = np.linalg.norm(predicted[..., :2] - true[..., :2], axis=-1)
     yaw = np.abs(wrap_angle(jnp.asarray(predicted[..., 2] - true[..., 2])))
@@ -138,6 +180,8 @@ def test_free_running_predictions_stay_inside_the_physical_tube(name):
             largest_increment=float(moves[k].max()),
         )
         for radii, error in zip(
-            (tube["position_m"], tube["yaw_rad"], tube["body"]), (position, yaw, body), strict=True
+            (tube["position_m"], tube["yaw_rad"], tube["body"]),
+            (position, yaw, body),
+            strict=True,
         ):
             assert np.all(error[k] <= np.asarray(radii) + 2e-5)

@@ -1,4 +1,6 @@
-"""Planning in path coordinates: what is projected, previewed, added to the law, and never left."""
+"""Planning in path coordinates: what is projected, previewed, added to the law, and
+never left.
+"""
 
 from functools import partial
 
@@ -16,13 +18,19 @@ from sfkd_jax.scenarios import path_from_curvature, reference_window
 PLANT = vehicle.kinematic()
 LAW = any_law()
 ENV = jnp.asarray([0.6, 2.0])
-LIMITS = {"dt": PLANT.dt, "control_low": PLANT.control_low, "control_high": PLANT.control_high}
+LIMITS = {
+    "dt": PLANT.dt,
+    "control_low": PLANT.control_low,
+    "control_high": PLANT.control_high,
+}
 
 
 def bend(slope=1e-4):
     """A reference window from 30 m along a clothoid, and the curvature where it begins."""
     path = path_from_curvature(slope * 0.5 * jnp.arange(400), spacing=0.5)
-    return reference_window(path, jnp.asarray(30.0), jnp.asarray(9.0), dt=0.1, horizon=20), path
+    return reference_window(
+        path, jnp.asarray(30.0), jnp.asarray(9.0), dt=0.1, horizon=20
+    ), path
 
 
 def planner(samples, **options):
@@ -52,10 +60,14 @@ def test_without_samples_the_law_alone_drives():
     reference, _ = bend()
     controller = planner(1)
     state = jnp.asarray([30.0, 0.4, 0.1, 8.0])
-    action, _, info = jax.jit(controller.act)({}, controller.init(jax.random.key(0)), state, ENV, reference)
+    action, _, info = jax.jit(controller.act)(
+        {}, controller.init(jax.random.key(0)), state, ENV, reference
+    )
     curvature = curvature_ahead(reference)[0]
     xi = path_coordinates(state, reference[0], curvature)
-    np.testing.assert_allclose(action, at_turn(LAW.turn(curvature, jnp.asarray(9.0), ENV), xi), atol=1e-6)
+    np.testing.assert_allclose(
+        action, at_turn(LAW.turn(curvature, jnp.asarray(9.0), ENV), xi), atol=1e-6
+    )
     assert bool(info["healthy"])
 
 
@@ -64,7 +76,9 @@ def test_what_is_added_to_the_law_stays_within_its_bounds():
     reference, _ = bend()
     controller = planner(64, temperature=0.1)
     loud = controller.init(jax.random.key(0))
-    loud = loud._replace(tuning=loud.tuning._replace(noise_std=jnp.asarray([1.0, 10.0])))
+    loud = loud._replace(
+        tuning=loud.tuning._replace(noise_std=jnp.asarray([1.0, 10.0]))
+    )
     state = jnp.asarray([30.0, 2.5, 0.3, 6.0])
     action, after, _ = jax.jit(controller.act)({}, loud, state, ENV, reference)
     curvature = curvature_ahead(reference)[0]
@@ -75,10 +89,19 @@ def test_what_is_added_to_the_law_stays_within_its_bounds():
 
 
 def test_predicted_states_lie_where_the_car_then_is():
-    """On a bend, with the true plant as the model: within a centimetre across, and the speed's error along."""
+    """On a bend, with the true plant as the model: within a centimetre across, and the
+    speed's error along.
+    """
     reference, path = bend()
     controller = planner(1)
-    point = jnp.asarray([reference[0, 0] - 0.9 * jnp.cos(reference[0, 2]), reference[0, 1], reference[0, 2], 9.0])
+    point = jnp.asarray(
+        [
+            reference[0, 0] - 0.9 * jnp.cos(reference[0, 2]),
+            reference[0, 1],
+            reference[0, 2],
+            9.0,
+        ]
+    )
     memory = controller.init(jax.random.key(0))
     act = jax.jit(controller.act)
     action, _, info = act({}, memory, point, ENV, reference)
@@ -100,6 +123,8 @@ def test_what_is_not_finite_never_reaches_the_car():
 
 
 def test_a_model_of_the_world_is_refused():
-    build = partial(control.following_law, law=LAW, cost=control.tracking_cost(dt=0.1), **LIMITS)
+    make = partial(
+        control.following_law, law=LAW, cost=control.tracking_cost(dt=0.1), **LIMITS
+    )
     with pytest.raises(ValueError, match=r"model\.frame=path"):
-        build(tiny())
+        make(tiny())

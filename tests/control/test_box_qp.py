@@ -15,12 +15,16 @@ SIZE = 24
 
 
 def problem(seed, condition=1e3):
-    """A random strictly convex cost whose free minimum lies outside the box in about half of its entries."""
+    """A random strictly convex cost whose free minimum lies outside the box in about
+    half of its entries.
+    """
     random = np.random.default_rng(seed)
     axes, _ = np.linalg.qr(random.standard_normal((SIZE, SIZE)))
     H = (axes * np.geomspace(1.0, condition, SIZE)) @ axes.T
     low, high = -random.uniform(0.1, 1.0, SIZE), random.uniform(0.1, 1.0, SIZE)
-    return tuple(np.float32(part) for part in (H, -H @ random.standard_normal(SIZE), low, high))
+    return tuple(
+        np.float32(part) for part in (H, -H @ random.standard_normal(SIZE), low, high)
+    )
 
 
 def cost(H, f, x):
@@ -33,7 +37,9 @@ def by_clarabel(H, f, low, high):
     x = cvxpy.Variable(len(f))
     H = np.asarray(H, np.float64)
     objective = 0.5 * cvxpy.quad_form(x, cvxpy.psd_wrap(0.5 * (H + H.T))) + f @ x
-    cvxpy.Problem(cvxpy.Minimize(objective), [x >= low, x <= high]).solve(solver=cvxpy.CLARABEL)
+    cvxpy.Problem(cvxpy.Minimize(objective), [x >= low, x <= high]).solve(
+        solver=cvxpy.CLARABEL
+    )
     return x.value
 
 
@@ -53,7 +59,13 @@ def test_the_cost_is_that_of_a_convex_solver(seed, condition):
 
 def test_independent_entries_are_clipped():
     diagonal, f = np.float32([1.0, 4.0, 100.0]), np.float32([-0.5, 8.0, -300.0])
-    found = SOLVERS[1](np.diag(diagonal), f, -np.ones(3, np.float32), np.ones(3, np.float32), np.zeros(3, np.float32))
+    found = SOLVERS[1](
+        np.diag(diagonal),
+        f,
+        -np.ones(3, np.float32),
+        np.ones(3, np.float32),
+        np.zeros(3, np.float32),
+    )
     np.testing.assert_allclose(found.primal, np.clip(-f / diagonal, -1, 1), atol=1e-6)
     assert float(found.residual) < 1e-6
 
@@ -62,7 +74,9 @@ def test_without_active_bounds_one_iteration_solves():
     H, f, _, _ = problem(0)
     wide = np.full(SIZE, 1e3, np.float32)
     found = SOLVERS[1](H, f, -wide, wide, np.zeros(SIZE, np.float32))
-    np.testing.assert_allclose(found.primal, -np.linalg.solve(np.float64(H), f), atol=1e-4)
+    np.testing.assert_allclose(
+        found.primal, -np.linalg.solve(np.float64(H), f), atol=1e-4
+    )
 
 
 def iterations_needed(data, start):
@@ -73,8 +87,12 @@ def iterations_needed(data, start):
 def test_a_warm_start_needs_fewer_iterations(seed):
     data = problem(seed)
     H, f, low, high = data
-    near = SOLVERS[12](H, np.float32(1.02 * f), low, high, np.zeros(SIZE, np.float32)).primal
-    cold, warm = (iterations_needed(data, start) for start in (np.zeros(SIZE, np.float32), near))
+    near = SOLVERS[12](
+        H, np.float32(1.02 * f), low, high, np.zeros(SIZE, np.float32)
+    ).primal
+    cold, warm = (
+        iterations_needed(data, start) for start in (np.zeros(SIZE, np.float32), near)
+    )
     assert warm < cold
     assert iterations_needed(data, SOLVERS[12](H, f, low, high, near).primal) == 0
 
@@ -99,12 +117,18 @@ def test_what_is_not_finite_leaves_the_start(part):
 
 
 def test_a_cost_that_is_not_convex_still_ends_inside_the_box():
-    found = SOLVERS[12](-np.eye(3, dtype=np.float32), *np.float32([[0.1] * 3, [-1] * 3, [1] * 3, [0] * 3]))
+    found = SOLVERS[12](
+        -np.eye(3, dtype=np.float32),
+        *np.float32([[0.1] * 3, [-1] * 3, [1] * 3, [0] * 3]),
+    )
     assert np.all(np.abs(found.primal) <= 1)
 
 
 def test_a_batch_is_a_loop():
-    batch = [np.stack(parts) for parts in zip(*(problem(seed) for seed in range(3)), strict=True)]
+    batch = [
+        np.stack(parts)
+        for parts in zip(*(problem(seed) for seed in range(3)), strict=True)
+    ]
     start = jnp.zeros((3, SIZE))
     together = jit(jax.vmap(partial(box_qp, iterations=8)))(*batch, start)
     for k in range(3):

@@ -1,4 +1,6 @@
-"""What every controller promises, whatever it plans with; `test_mppi.py` asserts the rest for `mppi` alone."""
+"""What every controller promises, whatever it plans with; `test_mppi.py` asserts the
+rest for `mppi` alone.
+"""
 
 from functools import cache, partial
 
@@ -6,7 +8,17 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from helpers import ENV_HIGH, ENV_LOW, TINY, any_law, jit, model_and_params, path_space, same, straight
+from helpers import (
+    ENV_HIGH,
+    ENV_LOW,
+    TINY,
+    any_law,
+    jit,
+    model_and_params,
+    path_space,
+    same,
+    straight,
+)
 
 from sfkd_jax import control, evaluation, models, scenarios, vehicle
 
@@ -25,13 +37,17 @@ def along_path(law, **settings):
     """The task of following a path with the textbook bicycle, and its parameters."""
     model, params = model_and_params("nominal")
     cost = control.tracking_cost(dt=PLANT.dt)
-    return control.path_tracking(model, cost, law, dt=PLANT.dt, **LIMITS, **settings), params
+    return control.path_tracking(
+        model, cost, law, dt=PLANT.dt, **LIMITS, **settings
+    ), params
 
 
 def mppi(law, **settings):
     """A tiny planner, and its parameters."""
     task, params = along_path(law)
-    return control.mppi(task, num_samples=16, horizon=HORIZON, **BOX, **settings), params
+    return control.mppi(
+        task, num_samples=16, horizon=HORIZON, **BOX, **settings
+    ), params
 
 
 def searched(search, **settings):
@@ -43,7 +59,9 @@ def searched(search, **settings):
 def compensated():
     """For actuators two steps late."""
     controller, params = mppi(FEEDBACK)
-    return control.compensated(controller, model_and_params("nominal")[0], delay=2), params
+    return control.compensated(
+        controller, model_and_params("nominal")[0], delay=2
+    ), params
 
 
 def monitored():
@@ -51,25 +69,40 @@ def monitored():
     controller, params = mppi(FEEDBACK)
     boxes = {"state_low": (0.0,), "state_high": (30.0,)} | LIMITS | BOX
     watched = control.monitored(
-        controller, model_and_params("nominal")[0], bounds=(1e-4,) * 4, fallback="slow", release=2, **boxes
+        controller,
+        model_and_params("nominal")[0],
+        bounds=(1e-4,) * 4,
+        fallback="slow",
+        release=2,
+        **boxes,
     )
     return watched, params
 
 
 def shielded():
-    """A planner in path coordinates, filtered; with a tiny model as it is drawn, folded."""
+    """A planner in path coordinates, filtered; with a tiny model as it is drawn,
+    folded.
+    """
     law, limits = any_law(), LIMITS | BOX
     model = models.sfkd(path_space(), **TINY | {"budget": "joint"}, frame="path")
-    task = control.following_law(model, control.tracking_cost(dt=PLANT.dt), law, dt=PLANT.dt, **LIMITS)
-    planner = control.mppi(task, num_samples=16, horizon=HORIZON, noise_std=(0.01, 0.3), **BOX)
-    filtered = control.shielded(planner, model, law, width=0.5, tube=0.2, horizon=8, **limits)
+    task = control.following_law(
+        model, control.tracking_cost(dt=PLANT.dt), law, dt=PLANT.dt, **LIMITS
+    )
+    planner = control.mppi(
+        task, num_samples=16, horizon=HORIZON, noise_std=(0.01, 0.3), **BOX
+    )
+    filtered = control.shielded(
+        planner, model, law, width=0.5, tube=0.2, horizon=8, **limits
+    )
     return filtered, jit(model.fold)(jit(model.init)(jax.random.key(0)))
 
 
 def koopman_mpc():
     """Over a linear predictor with generic parameters."""
     model, params = model_and_params("koopman_mpc")
-    return control.koopman_mpc(model, dt=PLANT.dt, horizon=HORIZON, **LIMITS, **BOX), params
+    return control.koopman_mpc(
+        model, dt=PLANT.dt, horizon=HORIZON, **LIMITS, **BOX
+    ), params
 
 
 FEEDBACK = control.path_feedback(wheelbase=PLANT.wheelbase)
@@ -77,7 +110,9 @@ BUILDERS = {
     "mppi": partial(mppi, FEEDBACK),
     "mppi_plain": partial(mppi, control.no_feedback(), noise_std=(0.06, 0.6)),
     "mppi_smoothed": partial(mppi, FEEDBACK, smoothing_window=5),
-    "mppi_knots": partial(mppi, FEEDBACK, noise="rbf", noise_knots=3, effective_samples=4.0, iterations=2),
+    "mppi_knots": partial(
+        mppi, FEEDBACK, noise="rbf", noise_knots=3, effective_samples=4.0, iterations=2
+    ),
     "cem": partial(searched, control.cem, num_samples=16, elites=4, iterations=2),
     "gradient": partial(searched, control.gradient_planner, iterations=2, steps=4),
     "compensated": compensated,
@@ -85,18 +120,34 @@ BUILDERS = {
     "shielded": shielded,
     "koopman_mpc": koopman_mpc,
 }
-"""Name -> () -> (controller, params), for `HORIZON` steps of the kinematic plant within `LIMITS`."""
-SAMPLING = ("mppi", "mppi_plain", "mppi_smoothed", "mppi_knots", "cem", "compensated", "monitored")
+"""Name -> () -> (controller, params), for `HORIZON` steps of the kinematic plant within
+`LIMITS`.
+"""
+SAMPLING = (
+    "mppi",
+    "mppi_plain",
+    "mppi_smoothed",
+    "mppi_knots",
+    "cem",
+    "compensated",
+    "monitored",
+)
 """Those whose plan depends on the key."""
 
 every = pytest.mark.parametrize("name", BUILDERS)
-every_other = pytest.mark.parametrize("name", [name for name in BUILDERS if name != "mppi"])
-every_other_sampling = pytest.mark.parametrize("name", [name for name in SAMPLING if name != "mppi"])
+every_other = pytest.mark.parametrize(
+    "name", [name for name in BUILDERS if name != "mppi"]
+)
+every_other_sampling = pytest.mark.parametrize(
+    "name", [name for name in SAMPLING if name != "mppi"]
+)
 
 
 @cache
 def compiled(name):
-    """A controller by name, its parameters, its compiled act, and a list with an entry for every trace of it."""
+    """A controller by name, its parameters, its compiled act, and a list with an entry
+    for every trace of it.
+    """
     controller, params = BUILDERS[name]()
     traces = []
 
@@ -114,7 +165,9 @@ def act_once(name, seed=0):
 
 @cache
 def drive(name):
-    """Controls and infos of eight steps in one scan, with blackouts and a car far off the road at the end."""
+    """Controls and infos of eight steps in one scan, with blackouts and a car far off
+    the road at the end.
+    """
     controller, params = BUILDERS[name]()
     observations, envs = np.tile(OFFSET, (8, 1)), np.tile(ENV, (8, 1))
     observations[:, 1] -= 0.05 * np.arange(8)
@@ -138,10 +191,16 @@ def drive(name):
 def test_the_state_keeps_its_structure_shapes_and_types(name):
     controller, params = BUILDERS[name]()
     before = jax.eval_shape(controller.init, jax.random.key(0))
-    action, after, _ = jax.eval_shape(controller.act, params, before, OFFSET, ENV, REFERENCE)
+    action, after, _ = jax.eval_shape(
+        controller.act, params, before, OFFSET, ENV, REFERENCE
+    )
     assert jax.tree.structure(before) == jax.tree.structure(after)
     pairs = zip(jax.tree.leaves(before), jax.tree.leaves(after), strict=True)
-    assert [(a, b) for a, b in pairs if (a.shape, a.dtype, a.weak_type) != (b.shape, b.dtype, b.weak_type)] == []
+    assert [
+        (a, b)
+        for a, b in pairs
+        if (a.shape, a.dtype, a.weak_type) != (b.shape, b.dtype, b.weak_type)
+    ] == []
     assert (action.shape, action.dtype) == ((2,), jnp.float32)
 
 
@@ -155,12 +214,28 @@ def test_an_episode_finds_in_info_what_it_records(name):
         scenarios.path_from_curvature(jnp.zeros(40), spacing=0.5),
         jnp.asarray(10.0),
     )
-    simulate = partial(evaluation.simulate, PLANT.step, controller, params, dt=PLANT.dt, horizon=HORIZON)
+    simulate = partial(
+        evaluation.simulate,
+        PLANT.step,
+        controller,
+        params,
+        dt=PLANT.dt,
+        horizon=HORIZON,
+    )
     episode = jax.eval_shape(simulate, road, jax.random.key(0))
     assert episode.controls.shape == (7, 2)
-    for field in ("effective_samples", "healthy", "prediction_error", "breach", "box_exit"):
+    for field in (
+        "effective_samples",
+        "healthy",
+        "prediction_error",
+        "breach",
+        "box_exit",
+    ):
         assert getattr(episode, field).shape == (7,)
-    assert all(getattr(episode, flag).dtype == bool for flag in ("healthy", "breach", "box_exit"))
+    assert all(
+        getattr(episode, flag).dtype == bool
+        for flag in ("healthy", "breach", "box_exit")
+    )
 
 
 @every
@@ -183,7 +258,11 @@ def test_what_cannot_be_read_is_reported_and_the_next_clean_step_recovers(name):
 @every_other
 def test_compiling_does_not_change_the_action(name):
     controller, params, _, _ = compiled(name)
-    alone = controller.act(params, controller.init(jax.random.key(0)), *map(jnp.asarray, (OFFSET, ENV, REFERENCE)))
+    alone = controller.act(
+        params,
+        controller.init(jax.random.key(0)),
+        *map(jnp.asarray, (OFFSET, ENV, REFERENCE)),
+    )
     assert same(act_once(name), alone, rtol=1e-4, atol=1e-5)
 
 
@@ -191,23 +270,41 @@ def test_compiling_does_not_change_the_action(name):
 def test_a_batch_of_controllers_acts_as_each_one_alone(name):
     controller, params, act, _ = compiled(name)
     inputs = [
-        (controller.init(jax.random.key(k)), OFFSET + np.float32(0.1 * k), ENV - np.float32(0.1 * k)) for k in range(3)
+        (
+            controller.init(jax.random.key(k)),
+            OFFSET + np.float32(0.1 * k),
+            ENV - np.float32(0.1 * k),
+        )
+        for k in range(3)
     ]
     stack = partial(jax.tree.map, lambda *leaves: jnp.stack(leaves))
     together = jit(jax.vmap(controller.act, in_axes=(None, 0, 0, 0, None)))
     batch = together(params, *stack(*inputs), REFERENCE)
-    assert same(batch, stack(*[act(params, *each, REFERENCE) for each in inputs]), rtol=1e-4, atol=1e-5)
+    assert same(
+        batch,
+        stack(*[act(params, *each, REFERENCE) for each in inputs]),
+        rtol=1e-4,
+        atol=1e-5,
+    )
     assert len(np.unique(np.asarray(batch[0]), axis=0)) == 3
 
 
 @every_other
-def test_it_is_traced_once_while_state_observation_environment_reference_and_key_change(name):
+def test_it_is_traced_once_while_state_observation_environment_reference_and_key_change(
+    name,
+):
     controller, params, act, traces = compiled(name)
     for seed in range(2):
         state = controller.init(jax.random.key(seed))
         for k in range(3):
             reference = straight(HORIZON, speed=8.0 + k)
-            _, state, _ = act(params, state, OFFSET + np.float32(k), ENV + np.float32(9 * k), reference)
+            _, state, _ = act(
+                params,
+                state,
+                OFFSET + np.float32(k),
+                ENV + np.float32(9 * k),
+                reference,
+            )
     assert len(traces) == 1
 
 

@@ -1,4 +1,6 @@
-"""Noise shaped by the curvature of the cost: against its closed form, and what it is worth where cost is stretched."""
+"""Noise shaped by the curvature of the cost: against its closed form, and what it is
+worth where cost is stretched.
+"""
 
 import jax
 import jax.numpy as jnp
@@ -20,10 +22,15 @@ def dynamics(params, state, action, env):
 
 
 def stage(weights, state, action, before, goal):
-    return state @ jnp.asarray(Q, dtype=float) @ state + action @ jnp.asarray(R, dtype=float) @ action
+    return (
+        state @ jnp.asarray(Q, dtype=float) @ state
+        + action @ jnp.asarray(R, dtype=float) @ action
+    )
 
 
-TASK = control.free_task(dynamics, stage, control_low=(-50.0, -50.0), control_high=(50.0, 50.0))
+TASK = control.free_task(
+    dynamics, stage, control_low=(-50.0, -50.0), control_high=(50.0, 50.0)
+)
 
 
 def cost(plan):
@@ -37,7 +44,9 @@ def cost(plan):
 
 
 def closed_form():
-    """∇²J = 2 (G'QG + R), G the response of the states to the controls, in double precision."""
+    """∇²J = 2 (G'QG + R), G the response of the states to the controls, in double
+    precision.
+    """
     a, b = A.astype(float), B.astype(float)
     response = np.zeros((2 * HORIZON, 2 * HORIZON))
     for after in range(HORIZON):
@@ -49,25 +58,35 @@ def closed_form():
 
 
 def test_the_covariance_of_a_linear_model_is_its_closed_form():
-    factor = np.asarray(curvature_factor(cost, jnp.ones((HORIZON, 2)), STD), dtype=float).reshape(16, 16)
+    factor = np.asarray(
+        curvature_factor(cost, jnp.ones((HORIZON, 2)), STD), dtype=float
+    ).reshape(16, 16)
     scale = np.diag(np.tile(np.asarray(STD, dtype=float), HORIZON))
     values, vectors = np.linalg.eigh(scale @ closed_form() @ scale)
     assert values[0] / values[-1] > FLATTEST, "the floor must not hide the formula"
     widths = (values / np.exp(np.log(values).mean())) ** -0.5
     expected = scale @ vectors @ np.diag(widths) @ vectors.T @ scale
-    np.testing.assert_allclose(factor @ factor.T, expected, rtol=1e-3, atol=1e-3 * np.abs(expected).max())
+    np.testing.assert_allclose(
+        factor @ factor.T, expected, rtol=1e-3, atol=1e-3 * np.abs(expected).max()
+    )
 
 
 def test_the_volume_of_the_noise_is_that_of_independent_noise():
-    factor = np.asarray(curvature_factor(cost, jnp.zeros((HORIZON, 2)), STD), dtype=float).reshape(16, 16)
+    factor = np.asarray(
+        curvature_factor(cost, jnp.zeros((HORIZON, 2)), STD), dtype=float
+    ).reshape(16, 16)
     expected = HORIZON * np.log(np.asarray(STD, dtype=float)).sum()
     assert np.linalg.slogdet(factor)[1] == pytest.approx(expected, abs=1e-3)
 
 
-@pytest.mark.parametrize("bad", [lambda plan: jnp.sum(plan) * jnp.nan, lambda plan: jnp.zeros(())])
+@pytest.mark.parametrize(
+    "bad", [lambda plan: jnp.sum(plan) * jnp.nan, lambda plan: jnp.zeros(())]
+)
 def test_without_a_curvature_noise_is_independent(bad):
     factor = curvature_factor(bad, jnp.zeros((3, 2)), STD)
-    np.testing.assert_allclose(factor.reshape(6, 6), np.diag(np.tile(STD, 3)), rtol=1e-6)
+    np.testing.assert_allclose(
+        factor.reshape(6, 6), np.diag(np.tile(STD, 3)), rtol=1e-6
+    )
     noise = jax.random.normal(jax.random.key(0), (3, 5, 2))
     np.testing.assert_allclose(shaped(factor, noise), noise * STD, rtol=1e-6)
 
@@ -76,15 +95,21 @@ def test_where_the_cost_bends_down_noise_is_as_wide_as_where_it_is_flat():
     def saddle(plan):
         return plan[0, 0] ** 2 - plan[0, 1] ** 2
 
-    factor = np.asarray(curvature_factor(saddle, jnp.zeros((1, 2)), jnp.ones(2))).reshape(2, 2)
+    factor = np.asarray(
+        curvature_factor(saddle, jnp.zeros((1, 2)), jnp.ones(2))
+    ).reshape(2, 2)
     ratio = factor[1, 1] / factor[0, 0]
     assert ratio == pytest.approx(FLATTEST**-0.25, rel=1e-4)
     assert factor[0, 1] == pytest.approx(0.0, abs=1e-6)
 
 
 def regret(**settings):
-    """Cost above the optimum of the mean plan after some steps from one state, as a share of it."""
-    planner = control.mppi(TASK, horizon=HORIZON, noise="white", noise_std=(0.5, 2.0), **settings)
+    """Cost above the optimum of the mean plan after some steps from one state, as a
+    share of it.
+    """
+    planner = control.mppi(
+        TASK, horizon=HORIZON, noise="white", noise_std=(0.5, 2.0), **settings
+    )
     start = jnp.asarray([1.0, -0.5])
 
     @jit
@@ -98,7 +123,9 @@ def regret(**settings):
 
     found = np.mean([run(jax.random.key(seed)) for seed in range(3)])
     gradient = np.asarray(jax.grad(cost)(jnp.zeros((HORIZON, 2))), dtype=float).ravel()
-    least = float(cost(jnp.zeros((HORIZON, 2)))) - 0.5 * gradient @ np.linalg.solve(closed_form(), gradient)
+    least = float(cost(jnp.zeros((HORIZON, 2)))) - 0.5 * gradient @ np.linalg.solve(
+        closed_form(), gradient
+    )
     return found / least - 1
 
 

@@ -18,7 +18,9 @@ MODEL = models.physics(PLANT.step)
 def planner():
     limits = {"control_low": PLANT.control_low, "control_high": PLANT.control_high}
     law = control.path_feedback(wheelbase=PLANT.wheelbase)
-    task = control.path_tracking(MODEL, control.tracking_cost(dt=0.1), law, dt=0.1, **limits)
+    task = control.path_tracking(
+        MODEL, control.tracking_cost(dt=0.1), law, dt=0.1, **limits
+    )
     return control.mppi(task, num_samples=64, horizon=HORIZON)
 
 
@@ -30,7 +32,9 @@ def drive(controller, steps=12):
     def run(key):
         def step(carry, _):
             state, pipe, inner = carry
-            action, inner, info = controller.act({}, inner, state, ENV, reference.at[:, 0].add(state[0]))
+            action, inner, info = controller.act(
+                {}, inner, state, ENV, reference.at[:, 0].add(state[0])
+            )
             pipe = jnp.concatenate([pipe, action[None]])
             state = PLANT.step(state, pipe[0], ENV)
             return (state, pipe[1:], inner), (state, action, info)
@@ -44,14 +48,20 @@ def drive(controller, steps=12):
 def test_the_state_it_plans_from_is_the_one_that_comes():
     states, _, info = drive(control.compensated(planner(), MODEL, delay=DELAY))
     # At step k it foresees the state in which the control of step k begins to act.
-    np.testing.assert_allclose(info["arrival_state"][:-DELAY], states[DELAY - 1 : -1], atol=1e-4)
+    np.testing.assert_allclose(
+        info["arrival_state"][:-DELAY], states[DELAY - 1 : -1], atol=1e-4
+    )
 
 
 def test_it_acts_as_the_planner_alone_would_from_that_state():
-    _, actions, info = drive(control.compensated(planner(), MODEL, delay=DELAY), steps=1)
+    _, actions, info = drive(
+        control.compensated(planner(), MODEL, delay=DELAY), steps=1
+    )
     alone = planner()
     reference = straight(HORIZON).at[:, 0].add(START[0])
-    expected, _, _ = jit(alone.act)({}, alone.init(jax.random.key(0)), info["arrival_state"][0], ENV, reference)
+    expected, _, _ = jit(alone.act)(
+        {}, alone.init(jax.random.key(0)), info["arrival_state"][0], ENV, reference
+    )
     np.testing.assert_allclose(actions[0], expected, atol=1e-6)
 
 

@@ -1,4 +1,6 @@
-"""The environment inferred while driving: against what truly held, and what must not change it."""
+"""The environment inferred while driving: against what truly held, and what must not
+change it.
+"""
 
 from functools import cache
 
@@ -14,10 +16,15 @@ from sfkd_jax.types import Controller, Model
 PLANT = vehicle.kinematic()
 BOX = {"env_low": ENV_LOW, "env_high": ENV_HIGH, "states": 4}
 NOISE = (0.015, 0.015, 0.002, 0.03)
-EXACT = {"sensor_noise": (1e-4, 1e-4, 1e-5, 1e-4), "model_error": (1e-4, 1e-4, 1e-5, 1e-4)}
+EXACT = {
+    "sensor_noise": (1e-4, 1e-4, 1e-5, 1e-4),
+    "model_error": (1e-4, 1e-4, 1e-5, 1e-4),
+}
 STEPS = 60
 TIME = np.arange(STEPS)
-CONTROLS = np.stack([0.04 * np.sin(0.7 * TIME), 1.5 * np.cos(0.5 * TIME)], axis=1).astype(np.float32)
+CONTROLS = np.stack(
+    [0.04 * np.sin(0.7 * TIME), 1.5 * np.cos(0.5 * TIME)], axis=1
+).astype(np.float32)
 CALM, STORM = (0.9, 0.0), (0.3, 8.0)
 SWITCHED = np.where(TIME[:, None] < 30, CALM, STORM)
 
@@ -26,7 +33,11 @@ def scripted(controls=CONTROLS):
     """Plays recorded controls and shows in its info what it was told."""
 
     def act(params, count, observation, env, reference):
-        return jnp.asarray(controls)[count], count + 1, {"told": env, "seen": observation}
+        return (
+            jnp.asarray(controls)[count],
+            count + 1,
+            {"told": env, "seen": observation},
+        )
 
     return Controller(lambda key: jnp.zeros((), dtype=int), act)
 
@@ -45,19 +56,28 @@ def driven(envs, noise=(0.0,) * 4, start=(0.0, 0.0, 0.0, 10.0), seed=0):
     _, states = jit(lambda start, inputs: jax.lax.scan(step, start, inputs))(
         jnp.asarray(start), (jnp.asarray(CONTROLS), jnp.asarray(envs, dtype=float))
     )
-    return np.asarray(states) + np.random.default_rng(seed).normal(size=states.shape) * noise
+    return (
+        np.asarray(states)
+        + np.random.default_rng(seed).normal(size=states.shape) * noise
+    )
 
 
 @cache
 def follower(**settings):
-    """observations -> infos and states of the estimator, in one scan; the environment it is given is NaN."""
+    """observations -> infos and states of the estimator, in one scan; the environment
+    it is given is NaN.
+    """
     planner = estimator(**settings)
 
     def step(state, observation):
-        _, state, info = planner.act({}, state, observation, jnp.full(2, jnp.nan), jnp.zeros((1, 4)))
+        _, state, info = planner.act(
+            {}, state, observation, jnp.full(2, jnp.nan), jnp.zeros((1, 4))
+        )
         return state, (info, state)
 
-    return jit(lambda seen: jax.lax.scan(step, planner.init(jax.random.key(0)), seen)[1])
+    return jit(
+        lambda seen: jax.lax.scan(step, planner.init(jax.random.key(0)), seen)[1]
+    )
 
 
 def follow(observations, **settings):
@@ -67,7 +87,9 @@ def follow(observations, **settings):
 
 @pytest.mark.parametrize("env", [CALM, STORM, (0.6, -4.0)])
 def test_without_noise_an_environment_of_the_grid_is_found_exactly(env):
-    info, _ = follow(driven(np.tile(env, (STEPS, 1))), dwell=1e6, drift=(0.0, 0.0), **EXACT)
+    info, _ = follow(
+        driven(np.tile(env, (STEPS, 1))), dwell=1e6, drift=(0.0, 0.0), **EXACT
+    )
     np.testing.assert_allclose(info["env_estimate"][-1], env, atol=1e-3)
     np.testing.assert_allclose(info["env_spread"][-1], 0.0, atol=1e-2)
 
@@ -79,33 +101,53 @@ def test_between_hypotheses_the_estimate_lies_within_a_cell_of_the_truth():
 
 
 def test_a_switch_is_seen_within_a_few_noisy_steps():
-    """A storm of 8 m/s is known to a quarter after six of them, but for a false alarm now and then."""
-    winds = np.stack([follow(driven(SWITCHED, NOISE, seed=seed))[0]["env_estimate"][:, 1] for seed in range(4)])
+    """A storm of 8 m/s is known to a quarter after six of them, but for a false alarm
+    now and then.
+    """
+    winds = np.stack(
+        [
+            follow(driven(SWITCHED, NOISE, seed=seed))[0]["env_estimate"][:, 1]
+            for seed in range(4)
+        ]
+    )
     assert np.mean(np.abs(winds[:, 15:30]) < 2.0) > 0.9
     assert np.mean(np.abs(winds[:, 36:] - 8.0) < 2.0) > 0.9
     assert np.mean(np.abs(winds[:, 30] - 8.0) < 2.0) == 0.0  # nothing has moved yet
 
 
 def test_the_true_environment_lies_inside_the_reported_spread():
-    """At least nine steps of ten within two standard deviations, at environments off the grid, with noise."""
+    """At least nine steps of ten within two standard deviations, at environments off
+    the grid, with noise.
+    """
     inside = []
     for seed in range(4):
         env = np.random.default_rng(seed).uniform([0.35, -7.0], [0.85, 7.0])
         info, _ = follow(driven(np.tile(env, (STEPS, 1)), NOISE, seed=seed))
-        inside.append(np.abs(info["env_estimate"] - env)[10:] <= 2.0 * info["env_spread"][10:] + 0.02)
+        inside.append(
+            np.abs(info["env_estimate"] - env)[10:]
+            <= 2.0 * info["env_spread"][10:] + 0.02
+        )
     assert np.mean(inside) > 0.9
 
 
 def test_what_the_motion_does_not_show_stays_unknown():
-    """A model whose motion ignores both entries: mean and deviation of an even grid, for ever."""
+    """A model whose motion ignores both entries: mean and deviation of an even grid,
+    for ever.
+    """
     blind = models.physics(PLANT.nominal)
     planner = control.estimated(scripted(), blind, points=(3, 5), **BOX)
     state = planner.init(jax.random.key(0))
     act = jit(planner.act)
     for observation in driven(SWITCHED, NOISE)[:5]:
-        _, state, info = act({}, state, jnp.asarray(observation), jnp.zeros(2), jnp.zeros((1, 4)))
+        _, state, info = act(
+            {}, state, jnp.asarray(observation), jnp.zeros(2), jnp.zeros((1, 4))
+        )
     np.testing.assert_allclose(info["env_estimate"], [0.6, 0.0], atol=1e-5)
-    np.testing.assert_allclose(info["env_spread"], [np.std([0.3, 0.6, 0.9]), np.std([-8, -4, 0, 4, 8])], rtol=1e-5)
+    np.testing.assert_allclose(
+        info["env_spread"],
+        [np.std([0.3, 0.6, 0.9]), np.std([-8, -4, 0, 4, 8])],
+        rtol=1e-5,
+    )
 
 
 def test_where_the_drive_starts_and_heads_does_not_matter():
@@ -129,7 +171,9 @@ def test_a_lost_observation_changes_no_belief_but_by_the_chain_and_is_passed_on(
     seen = driven(SWITCHED, NOISE)
     seen[40] = np.nan
     info, state = follow(seen, dwell=1e6, drift=(0.0, 0.0))
-    np.testing.assert_allclose(state.probabilities[40], state.probabilities[39], atol=1e-5)
+    np.testing.assert_allclose(
+        state.probabilities[40], state.probabilities[39], atol=1e-5
+    )
     assert np.isnan(info["seen"][40]).all()
     assert np.isfinite(info["env_estimate"]).all()
     assert np.isfinite(info["seen"][41:]).all()
@@ -139,7 +183,9 @@ def test_nothing_is_learnt_before_the_first_observation():
     seen = driven(SWITCHED, NOISE)
     seen[:3] = np.nan
     info, _ = follow(seen)
-    np.testing.assert_allclose(info["env_estimate"][:4], np.tile([0.6, 0.0], (4, 1)), atol=1e-4)
+    np.testing.assert_allclose(
+        info["env_estimate"][:4], np.tile([0.6, 0.0], (4, 1)), atol=1e-4
+    )
     assert np.abs(info["env_estimate"][25] - CALM)[1] < 2.0
 
 
@@ -147,7 +193,9 @@ def test_a_jump_that_nothing_explains_moves_the_states_and_not_the_belief():
     seen = driven(np.tile(STORM, (STEPS, 1)), NOISE)
     seen[30:, :2] += 50.0
     info, _ = follow(seen)
-    assert abs(info["env_estimate"][30, 1] - info["env_estimate"][29, 1]) < 0.6  # what the chain alone does
+    assert (
+        abs(info["env_estimate"][30, 1] - info["env_estimate"][29, 1]) < 0.6
+    )  # what the chain alone does
     np.testing.assert_allclose(info["seen"][30], seen[30], atol=1e-4)
 
 
@@ -158,14 +206,22 @@ def test_hypotheses_whose_model_breaks_are_left_out_and_poison_nothing():
     planner = control.estimated(scripted(), models.physics(breaks), **BOX)
     state, act = planner.init(jax.random.key(0)), jit(planner.act)
     for observation in driven(np.tile([0.7, -6.0], (STEPS, 1)), NOISE)[:25]:
-        _, state, info = act({}, state, jnp.asarray(observation), jnp.zeros(2), jnp.zeros((1, 4)))
+        _, state, info = act(
+            {}, state, jnp.asarray(observation), jnp.zeros(2), jnp.zeros((1, 4))
+        )
     assert abs(info["env_estimate"][1] + 6.0) < 2.0
     assert info["env_estimate"][0] > 0.5
-    assert all(bool(jnp.isfinite(leaf).all()) for leaf in (state.states, state.covariance, state.probabilities))
+    assert all(
+        bool(jnp.isfinite(leaf).all())
+        for leaf in (state.states, state.covariance, state.probabilities)
+    )
 
 
 def test_the_state_that_is_planned_from_is_nearer_to_the_truth_than_the_sensors():
-    truth, seen = driven(np.tile(STORM, (STEPS, 1))), driven(np.tile(STORM, (STEPS, 1)), NOISE)
+    truth, seen = (
+        driven(np.tile(STORM, (STEPS, 1))),
+        driven(np.tile(STORM, (STEPS, 1)), NOISE),
+    )
     smooth, _ = follow(seen)
     raw, _ = follow(seen, smooth=False)
     np.testing.assert_allclose(raw["seen"], seen, rtol=1e-6)
@@ -178,7 +234,11 @@ def test_the_state_keeps_its_types_so_that_act_is_compiled_once():
     inputs = jnp.zeros(4), jnp.zeros(2), jnp.zeros((1, 4))
     _, after, _ = jax.eval_shape(estimator().act, {}, before, *inputs)
     pairs = zip(jax.tree.leaves(before), jax.tree.leaves(after), strict=True)
-    assert [(a, b) for a, b in pairs if (a.shape, a.dtype, a.weak_type) != (b.shape, b.dtype, b.weak_type)] == []
+    assert [
+        (a, b)
+        for a, b in pairs
+        if (a.shape, a.dtype, a.weak_type) != (b.shape, b.dtype, b.weak_type)
+    ] == []
 
 
 def test_it_drives_as_any_controller_under_jit_and_vmap():

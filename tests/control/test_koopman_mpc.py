@@ -1,4 +1,6 @@
-"""MPC in a lift: what it minimises, that it does, how it drives, and what it never does."""
+"""MPC in a lift: what it minimises, that it does, how it drives, and what it never
+does.
+"""
 
 from functools import cache, partial
 
@@ -14,7 +16,11 @@ from sfkd_jax.control import Stage
 from sfkd_jax.control.planners import _koopman_mpc
 
 PLANT = vehicle.kinematic()
-LIMITS = {"dt": PLANT.dt, "control_low": PLANT.control_low, "control_high": PLANT.control_high}
+LIMITS = {
+    "dt": PLANT.dt,
+    "control_low": PLANT.control_low,
+    "control_high": PLANT.control_high,
+}
 HORIZON = 15
 ENV = jnp.asarray([0.8, 0.0])
 OFFSET = jnp.asarray([0.0, 0.3, 0.05, 9.5])
@@ -24,20 +30,31 @@ LOW, HIGH = np.float32(PLANT.control_low), np.float32(PLANT.control_high)
 @cache
 def koopman():
     """A predictor of the kinematic car from a few segments of driving."""
-    model = models.koopman(datasets.measure_space(dataset()), functions=20, environment_degree=1)
-    return model, jit(model.identify)(dataset().train, dataset().validation, jax.random.key(3))
+    model = models.koopman(
+        datasets.measure_space(dataset()), functions=20, environment_degree=1
+    )
+    return model, jit(model.identify)(
+        dataset().train, dataset().validation, jax.random.key(3)
+    )
 
 
 @cache
 def compiled(**settings):
-    controller = control.koopman_mpc(koopman()[0], horizon=HORIZON, **LIMITS, **settings)
+    controller = control.koopman_mpc(
+        koopman()[0], horizon=HORIZON, **LIMITS, **settings
+    )
     return controller, jit(controller.act)
 
 
 def on_arc(curvature, speed=10.0):
     """A reference along a circle that leaves the origin along x."""
     turn = curvature * speed * 0.1 * np.arange(1, HORIZON + 1)
-    points = [np.sin(turn) / curvature, (1 - np.cos(turn)) / curvature, turn, np.full(HORIZON, speed)]
+    points = [
+        np.sin(turn) / curvature,
+        (1 - np.cos(turn)) / curvature,
+        turn,
+        np.full(HORIZON, speed),
+    ]
     return jnp.asarray(np.stack(points, axis=1), jnp.float32)
 
 
@@ -57,14 +74,22 @@ def whole(action, state):
 
 @cache
 def quadratic_programs():
-    """(H, f, low, high, start) of three steps in a row, the first far off the path, as they reach the solver."""
+    """(H, f, low, high, start) of three steps in a row, the first far off the path, as
+    they reach the solver.
+    """
     model, params = koopman()
     controller = control.koopman_mpc(model, horizon=HORIZON, **LIMITS)
     kept, solve = [], _koopman_mpc.box_qp
     state = controller.init(jax.random.key(0))
     try:
-        _koopman_mpc.box_qp = lambda *data, **options: kept.append(data) or solve(*data, **options)
-        for observation in (jnp.asarray([0.0, 6.0, 0.0, 4.0]), OFFSET, OFFSET.at[1].add(-0.02)):
+        _koopman_mpc.box_qp = lambda *data, **options: (
+            kept.append(data) or solve(*data, **options)
+        )
+        for observation in (
+            jnp.asarray([0.0, 6.0, 0.0, 4.0]),
+            OFFSET,
+            OFFSET.at[1].add(-0.02),
+        ):
             _, state, _ = controller.act(params, state, observation, ENV, BEND)
     finally:
         _koopman_mpc.box_qp = solve
@@ -76,24 +101,41 @@ def test_the_condensed_problem_is_solved_as_by_a_convex_solver(step):
     H, f, low, high, start = quadratic_programs()[step]
     x = cvxpy.Variable(len(f))
     bounds = [x >= low, x <= high]
-    cvxpy.Problem(cvxpy.Minimize(0.5 * cvxpy.quad_form(x, cvxpy.psd_wrap(H)) + f @ x), bounds).solve(cvxpy.CLARABEL)
-    found = control.box_qp(*(jnp.asarray(part, jnp.float32) for part in (H, f, low, high, start)))
-    costs = [0.5 * u @ H @ u + f @ u for u in (np.asarray(found.primal, np.float64), x.value)]
+    cvxpy.Problem(
+        cvxpy.Minimize(0.5 * cvxpy.quad_form(x, cvxpy.psd_wrap(H)) + f @ x), bounds
+    ).solve(cvxpy.CLARABEL)
+    found = control.box_qp(
+        *(jnp.asarray(part, jnp.float32) for part in (H, f, low, high, start))
+    )
+    costs = [
+        0.5 * u @ H @ u + f @ u for u in (np.asarray(found.primal, np.float64), x.value)
+    ]
     assert abs(costs[0] - costs[1]) <= 1e-4 * abs(costs[1])
     assert float(found.residual) < 1e-3
-    assert step > 0 or np.any(np.asarray(found.primal) == np.float32(high))  # bounds matter
+    assert step > 0 or np.any(
+        np.asarray(found.primal) == np.float32(high)
+    )  # bounds matter
 
 
 def test_the_plan_before_is_a_start_that_saves_iterations():
-    H, f, low, high, warm = (jnp.asarray(part, jnp.float32) for part in quadratic_programs()[0])
-    again = control.box_qp(H, f, low, high, control.box_qp(H, f, low, high, warm).primal, iterations=0)
-    left = [float(control.box_qp(H, f, low, high, warm, iterations=n).residual) for n in range(3)]
+    H, f, low, high, warm = (
+        jnp.asarray(part, jnp.float32) for part in quadratic_programs()[0]
+    )
+    again = control.box_qp(
+        H, f, low, high, control.box_qp(H, f, low, high, warm).primal, iterations=0
+    )
+    left = [
+        float(control.box_qp(H, f, low, high, warm, iterations=n).residual)
+        for n in range(3)
+    ]
     assert float(again.residual) < 1e-3 < min(left)
 
 
 @pytest.mark.parametrize("speed_loop", [False, True])
 def test_the_cost_is_the_tracking_cost_of_what_is_predicted(speed_loop):
-    """Step by step along the linear predictor, with the cost function of the sampling planner."""
+    """Step by step along the linear predictor, with the cost function of the sampling
+    planner.
+    """
     model, params = koopman()
     first, state, _ = act(speed_loop=speed_loop)
     moved = jnp.asarray([1.0, 0.25, 0.04, 9.6])
@@ -108,14 +150,18 @@ def test_the_cost_is_the_tracking_cost_of_what_is_predicted(speed_loop):
         z = linear.A @ z + linear.B @ now + linear.d * curvature[k] + linear.c
         x = linear.C @ z + linear.o
         later = control.PathErrors(x[1], x[2], x[3] - BEND[k, 3])
-        cost = tracking.stage(tracking.weights, Stage(later, errors, now, before, BEND[k, 3]))
+        cost = tracking.stage(
+            tracking.weights, Stage(later, errors, now, before, BEND[k, 3])
+        )
         total, errors, before = total + (1 + (k == HORIZON - 1)) * cost, later, now
     np.testing.assert_allclose(info["cost"], total, rtol=2e-3)
     assert np.isnan(info["effective_samples"])
 
 
 def test_no_other_plan_inside_the_box_is_cheaper():
-    """By that cost: the gradient of the quadratic vanishes at the plan, or pushes against a bound."""
+    """By that cost: the gradient of the quadratic vanishes at the plan, or pushes
+    against a bound.
+    """
     action, state, info = act(jnp.asarray([0.0, 6.0, 0.0, 4.0]))
     H, f, low, high, _ = quadratic_programs()[0]
     plan = whole(action, state).ravel().astype(np.float64)
@@ -131,7 +177,9 @@ def drive(curvature, offset, seconds=5.0, env=(0.8, 0.0)):
     start = jnp.asarray([0.0, offset, 0.0, 10.0])
     envs = jnp.tile(jnp.asarray(env), (round(seconds / 0.1), 1))
     road = scenarios.Scenario(start, envs, path, jnp.asarray(10.0))
-    run = partial(evaluation.simulate, PLANT.step, compiled()[0], dt=0.1, horizon=HORIZON)
+    run = partial(
+        evaluation.simulate, PLANT.step, compiled()[0], dt=0.1, horizon=HORIZON
+    )
     return jit(run)(koopman()[1], road, jax.random.key(0))
 
 
@@ -177,13 +225,17 @@ def test_controls_stay_in_their_box_however_far_the_car_is_off(scale):
 def test_compiling_changes_nothing():
     model, params = koopman()
     controller = control.koopman_mpc(model, horizon=HORIZON, **LIMITS)
-    plain = controller.act(params, controller.init(jax.random.key(0)), OFFSET, ENV, BEND)
+    plain = controller.act(
+        params, controller.init(jax.random.key(0)), OFFSET, ENV, BEND
+    )
     assert same(plain, act(), rtol=1e-3, atol=1e-3)
 
 
 @pytest.mark.parametrize("broken", ["observation", "env", "reference"])
 @pytest.mark.parametrize("value", [np.nan, np.inf])
-def test_what_cannot_be_read_continues_the_plan_and_the_next_clean_step_recovers(broken, value):
+def test_what_cannot_be_read_continues_the_plan_and_the_next_clean_step_recovers(
+    broken, value
+):
     _, clean, _ = act()
     inputs = {"observation": OFFSET, "env": ENV, "reference": BEND}
     inputs[broken] = inputs[broken].at[..., -1].set(value)
@@ -193,7 +245,10 @@ def test_what_cannot_be_read_continues_the_plan_and_the_next_clean_step_recovers
     np.testing.assert_array_equal(held.plan[:-1], clean.plan[1:])
     np.testing.assert_array_equal(held.previous, clean.plan[0])
     assert same(
-        act(state=held)[0], act(state=clean._replace(plan=held.plan, previous=held.previous))[0], rtol=0, atol=0
+        act(state=held)[0],
+        act(state=clean._replace(plan=held.plan, previous=held.previous))[0],
+        rtol=0,
+        atol=0,
     )
     assert bool(act(state=held)[2]["healthy"])
 
@@ -210,7 +265,10 @@ def test_the_first_steering_rate_counts_from_the_control_applied_last_if_there_w
     fresh = compiled()[0].init(jax.random.key(0))
     turned = fresh._replace(previous=jnp.asarray([0.2, 0.0]))
     assert same(act(on_path, state=turned), act(on_path, state=fresh), rtol=0, atol=0)
-    started = [act(on_path, state=s._replace(started=jnp.asarray(True))) for s in (fresh, turned)]
+    started = [
+        act(on_path, state=s._replace(started=jnp.asarray(True)))
+        for s in (fresh, turned)
+    ]
     assert started[1][0][0] > started[0][0][0] + 0.02
 
 
@@ -227,7 +285,9 @@ def test_a_predictor_that_knows_nothing_keeps_a_finite_plan():
     model = models.koopman(datasets.measure_space(dataset()), functions=4)
     controller = control.koopman_mpc(model, horizon=HORIZON, speed_loop=True, **LIMITS)
     params = model.init(jax.random.key(0))
-    action, _, info = jit(controller.act)(params, controller.init(jax.random.key(0)), OFFSET, ENV, straight(HORIZON))
+    action, _, info = jit(controller.act)(
+        params, controller.init(jax.random.key(0)), OFFSET, ENV, straight(HORIZON)
+    )
     np.testing.assert_allclose(action, 0.0, atol=1e-6)
     assert bool(info["healthy"])
 

@@ -1,4 +1,6 @@
-"""The law that comes out of a model: steady turns that are steady, and gains that solve the Riccati equation."""
+"""The law that comes out of a model: steady turns that are steady, and gains that solve
+the Riccati equation.
+"""
 
 from functools import cache
 
@@ -20,7 +22,9 @@ CURVATURE = jnp.asarray([0.0, 0.01, -0.02])
 
 @cache
 def turns(name, bend=1.0):
-    """Steady turns of a plant for three curvatures, and the step in path coordinates that they belong to."""
+    """Steady turns of a plant for three curvatures, and the step in path coordinates
+    that they belong to.
+    """
     plant = PLANTS[name]
     model, size = models.physics(plant.step), len(plant.state_names)
 
@@ -29,7 +33,9 @@ def turns(name, bend=1.0):
         fiber = model.fiber({}, env)
         return LAW.prepare(model, fiber, jnp.zeros(size), straight(3), curvature)
 
-    step = jit(lambda *inputs: _along_circle(model, model.fiber({}, ENV), size, 0.1)(*inputs))
+    step = jit(
+        lambda *inputs: _along_circle(model, model.fiber({}, ENV), size, 0.1)(*inputs)
+    )
     return prepared(ENV, bend * CURVATURE), step
 
 
@@ -39,25 +45,35 @@ def test_a_steady_turn_stays_what_it_is_on_the_path_at_the_speed_asked_for(name)
     for k, kappa in enumerate(CURVATURE):
         after = step(found.state[k], found.control[k], kappa, jnp.asarray(10.0))
         np.testing.assert_allclose(after, found.state[k], atol=2e-3)
-        np.testing.assert_allclose(np.asarray(found.state[k])[[0, 2]], [0.0, 10.0], atol=1e-6)
-    assert abs(float(found.control[0, 0])) > 1e-3  # side wind: even straight on, it steers against it
+        np.testing.assert_allclose(
+            np.asarray(found.state[k])[[0, 2]], [0.0, 10.0], atol=1e-6
+        )
+    assert (
+        abs(float(found.control[0, 0])) > 1e-3
+    )  # side wind: even straight on, it steers against it
 
 
 def test_the_textbook_bicycle_turns_as_its_geometry_says():
     plant = PLANTS["kinematic"]
     model = models.physics(plant.nominal)
-    found = LAW.prepare(model, model.fiber({}, ENV), jnp.zeros(4), straight(3), CURVATURE)
+    found = LAW.prepare(
+        model, model.fiber({}, ENV), jnp.zeros(4), straight(3), CURVATURE
+    )
     _, _, speed = found.state[1]
     np.testing.assert_allclose(speed, 10.0)
     np.testing.assert_allclose(found.control[:, 1], 0.0, atol=1e-5)
-    np.testing.assert_allclose(np.tan(found.control[:, 0]), plant.wheelbase * CURVATURE, rtol=2e-2, atol=1e-5)
+    np.testing.assert_allclose(
+        np.tan(found.control[:, 0]), plant.wheelbase * CURVATURE, rtol=2e-2, atol=1e-5
+    )
 
 
 @pytest.mark.parametrize("name", PLANTS)
 def test_the_gain_is_that_of_the_riccati_equation_and_stabilises(name):
     found, step = turns(name)
     at = (found.state[0], found.control[0], CURVATURE[0], jnp.asarray(10.0))
-    A, B = (np.asarray(part, dtype=float) for part in jax.jacfwd(step, argnums=(0, 1))(*at))
+    A, B = (
+        np.asarray(part, dtype=float) for part in jax.jacfwd(step, argnums=(0, 1))(*at)
+    )
     Q = np.zeros((len(A), len(A)))
     Q[:3, :3] = np.diag([LAW.lateral, LAW.heading, LAW.speed])
     R = np.diag([LAW.steering, LAW.drive])
@@ -76,12 +92,19 @@ def test_a_turn_that_no_tyre_can_hold_falls_back_to_driving_straight():
 
 
 def test_a_planner_around_it_needs_no_samples_to_stay_near_the_path_in_side_wind():
-    """The plan of zeros, the law alone, against the hand-made law: a steady crosswind on a straight road."""
+    """The plan of zeros, the law alone, against the hand-made law: a steady crosswind
+    on a straight road.
+    """
     plant, model = PLANTS["kinematic"], models.physics(PLANTS["kinematic"].step)
     limits = {"control_low": plant.control_low, "control_high": plant.control_high}
     aside = {}
-    for name, law in (("model", LAW), ("textbook", control.path_feedback(wheelbase=plant.wheelbase))):
-        task = control.path_tracking(model, control.tracking_cost(dt=0.1), law, dt=0.1, **limits)
+    for name, law in (
+        ("model", LAW),
+        ("textbook", control.path_feedback(wheelbase=plant.wheelbase)),
+    ):
+        task = control.path_tracking(
+            model, control.tracking_cost(dt=0.1), law, dt=0.1, **limits
+        )
         planner = control.mppi(task, num_samples=1, horizon=5, noise_std=(1e-6, 1e-6))
 
         @jit
@@ -103,7 +126,9 @@ def test_a_planner_around_it_needs_no_samples_to_stay_near_the_path_in_side_wind
 @pytest.mark.parametrize("name", ["sfkd", "nominal"])
 def test_a_learned_model_has_a_law_too(name):
     model, params = model_and_params(name)
-    found = LAW.prepare(model, model.fiber(params, ENV), jnp.zeros(4), straight(3), CURVATURE)
+    found = LAW.prepare(
+        model, model.fiber(params, ENV), jnp.zeros(4), straight(3), CURVATURE
+    )
     assert found.gain.shape == (3, 2, 3)
     assert all(np.all(np.isfinite(part)) for part in found)
 
@@ -113,25 +138,47 @@ def test_elimination_solves_what_needs_pivots(size):
     random = np.random.default_rng(size)
     matrix, right = random.normal(size=(size, size)), random.normal(size=(size, 2))
     matrix[0, 0] = 0.0 if size > 1 else matrix[0, 0]
-    found = jit(solve)(jnp.asarray(matrix, dtype=jnp.float32), jnp.asarray(right, dtype=jnp.float32))
+    found = jit(solve)(
+        jnp.asarray(matrix, dtype=jnp.float32), jnp.asarray(right, dtype=jnp.float32)
+    )
     np.testing.assert_allclose(matrix @ np.asarray(found), right, atol=2e-4)
 
 
 def test_as_an_ancillary_it_is_one_more_sample_of_a_planner_around_another_law():
-    """The cheapest of two plans: the hand-made law's, which is the plan of zeros, and the model's own."""
+    """The cheapest of two plans: the hand-made law's, which is the plan of zeros, and
+    the model's own.
+    """
     plant, model = PLANTS["kinematic"], models.physics(PLANTS["kinematic"].step)
     limits = {"control_low": plant.control_low, "control_high": plant.control_high}
-    textbook, state = control.path_feedback(wheelbase=plant.wheelbase), jnp.asarray([0.0, 0.3, 0.05, 10.0])
+    textbook, state = (
+        control.path_feedback(wheelbase=plant.wheelbase),
+        jnp.asarray([0.0, 0.3, 0.05, 10.0]),
+    )
 
     def cheapest(law, ancillary=None):
-        task = control.path_tracking(model, control.tracking_cost(dt=0.1), law, dt=0.1, ancillary=ancillary, **limits)
-        planner = control.mppi(task, num_samples=1, temperature=1e-3, horizon=8, noise_std=(1e-6, 1e-6))
-        start = planner.init(jax.random.key(0))._replace(previous=jnp.zeros(2), started=jnp.asarray(True))
+        task = control.path_tracking(
+            model,
+            control.tracking_cost(dt=0.1),
+            law,
+            dt=0.1,
+            ancillary=ancillary,
+            **limits,
+        )
+        planner = control.mppi(
+            task, num_samples=1, temperature=1e-3, horizon=8, noise_std=(1e-6, 1e-6)
+        )
+        start = planner.init(jax.random.key(0))._replace(
+            previous=jnp.zeros(2), started=jnp.asarray(True)
+        )
         action, after, info = jit(planner.act)({}, start, state, ENV, straight(8))
         assert jax.tree.map(jnp.shape, after) == jax.tree.map(jnp.shape, start)
         return float(info["cost"]), np.asarray(action)
 
-    (ours, steered), (theirs, _), (both, chosen) = cheapest(LAW), cheapest(textbook), cheapest(textbook, LAW)
+    (ours, steered), (theirs, _), (both, chosen) = (
+        cheapest(LAW),
+        cheapest(textbook),
+        cheapest(textbook, LAW),
+    )
     assert ours < theirs
     assert both == pytest.approx(ours, rel=1e-4)
     np.testing.assert_allclose(chosen, steered, atol=1e-3)
@@ -140,9 +187,16 @@ def test_as_an_ancillary_it_is_one_more_sample_of_a_planner_around_another_law()
 def test_over_several_environments_the_ancillary_plan_is_that_of_the_first():
     plant, model = PLANTS["kinematic"], models.physics(PLANTS["kinematic"].step)
     limits = {"control_low": plant.control_low, "control_high": plant.control_high}
-    law, state = control.path_feedback(wheelbase=plant.wheelbase), jnp.asarray([0.0, 0.3, 0.05, 10.0])
-    task = control.path_tracking(model, control.tracking_cost(dt=0.1), law, dt=0.1, ancillary=LAW, **limits)
-    planner = control.mppi(task, num_samples=1, temperature=1e-3, horizon=8, noise_std=(1e-6, 1e-6))
+    law, state = (
+        control.path_feedback(wheelbase=plant.wheelbase),
+        jnp.asarray([0.0, 0.3, 0.05, 10.0]),
+    )
+    task = control.path_tracking(
+        model, control.tracking_cost(dt=0.1), law, dt=0.1, ancillary=LAW, **limits
+    )
+    planner = control.mppi(
+        task, num_samples=1, temperature=1e-3, horizon=8, noise_std=(1e-6, 1e-6)
+    )
     start, act = planner.init(jax.random.key(0)), jit(planner.act)
     alone, _, _ = act({}, start, state, ENV, straight(8))
     twice, _, _ = act({}, start, state, jnp.stack([ENV, ENV]), straight(8))

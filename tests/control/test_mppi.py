@@ -1,4 +1,6 @@
-"""The planner: what it converges to, what it never does, and what a compiler sees of it."""
+"""The planner: what it converges to, what it never does, and what a compiler sees of
+it.
+"""
 
 from functools import cache, partial
 
@@ -20,13 +22,26 @@ HORIZON = 8
 OFFSET = np.float32([0.0, 0.3, 0.0, 10.0])
 ENV = np.float32([0.7, 3.0])
 REFERENCE = np.asarray(straight(HORIZON))
-FORBIDDEN = ("cholesky", "triangular_solve", "lu", "svd", "custom_linear_solve", "eigh", "qr", "geqrf")
+FORBIDDEN = (
+    "cholesky",
+    "triangular_solve",
+    "lu",
+    "svd",
+    "custom_linear_solve",
+    "eigh",
+    "qr",
+    "geqrf",
+)
 
 
 def planner(model, law=FEEDBACK, limits="actuators", latent_weight=0.0, **settings):
     limits = {"actuators": LIMITS, "wide": WIDE}[limits]
-    task = control.path_tracking(model, COST, law, dt=0.1, latent_weight=latent_weight, **limits)
-    return control.mppi(task, **{"num_samples": 64, "horizon": HORIZON, **BOX, **settings})
+    task = control.path_tracking(
+        model, COST, law, dt=0.1, latent_weight=latent_weight, **limits
+    )
+    return control.mppi(
+        task, **{"num_samples": 64, "horizon": HORIZON, **BOX, **settings}
+    )
 
 
 @cache
@@ -37,14 +52,18 @@ def compiled(name="oracle", **settings):
     return controller, params, jit(controller.act)
 
 
-def act_once(name="oracle", seed=0, observation=OFFSET, env=ENV, state=None, **settings):
+def act_once(
+    name="oracle", seed=0, observation=OFFSET, env=ENV, state=None, **settings
+):
     controller, params, act = compiled(name, **settings)
     state = controller.init(jax.random.key(seed)) if state is None else state
     return act(params, state, observation, env, REFERENCE)
 
 
 def finite(tree):
-    return all(np.all(np.isfinite(leaf)) for leaf in jax.tree.leaves(tree._replace(key=())))
+    return all(
+        np.all(np.isfinite(leaf)) for leaf in jax.tree.leaves(tree._replace(key=()))
+    )
 
 
 def with_entry(values, entry, value):
@@ -55,7 +74,14 @@ def with_entry(values, entry, value):
 
 def test_info_has_the_documented_keys_and_shapes():
     action, state, info = act_once()
-    keys = {"cost", "mean_cost", "effective_samples", "healthy", "env_inside", "predicted_states"}
+    keys = {
+        "cost",
+        "mean_cost",
+        "effective_samples",
+        "healthy",
+        "env_inside",
+        "predicted_states",
+    }
     assert set(info) >= keys
     assert info["predicted_states"].shape == (HORIZON, 4)
     assert all(info[key].shape == () for key in keys - {"predicted_states"})
@@ -66,11 +92,17 @@ def test_info_has_the_documented_keys_and_shapes():
 
 
 def test_as_the_temperature_falls_the_plan_becomes_the_best_samples():
-    """Every sample is rolled out again by hand; the planner must have chosen the cheapest."""
-    _, state, info = act_once(law=control.no_feedback(), temperature=1e-4, limits="wide")
+    """Every sample is rolled out again by hand; the planner must have chosen the
+    cheapest.
+    """
+    _, state, info = act_once(
+        law=control.no_feedback(), temperature=1e-4, limits="wide"
+    )
     noise_key, _ = jax.random.split(jax.random.key(0))
     std = jnp.asarray([0.02, 0.3])
-    noise = control.correlated_noise(noise_key, num_samples=64, horizon=HORIZON, std=std, correlation=0.8)
+    noise = control.correlated_noise(
+        noise_key, num_samples=64, horizon=HORIZON, std=std, correlation=0.8
+    )
     plans = np.array(noise)
     plans[:, 0] = 0.0
     step = jit(jax.vmap(PLANT.step, in_axes=(0, 0, None)))
@@ -80,7 +112,12 @@ def test_as_the_temperature_falls_the_plan_becomes_the_best_samples():
         states = np.asarray(step(states, controls, ENV))
         course = (states[:, 1] - y) / (10.0 * 0.1 + 1e-3)
         rate = (controls[:, 0] - before) / 0.1
-        stage = 200 * states[:, 1] ** 2 + 20 * course**2 + (states[:, 3] - 10.0) ** 2 + 5 * rate**2
+        stage = (
+            200 * states[:, 1] ** 2
+            + 20 * course**2
+            + (states[:, 3] - 10.0) ** 2
+            + 5 * rate**2
+        )
         costs += (1 + (k == HORIZON - 1)) * (stage + 0.02 * controls[:, 1] ** 2)
         y, before = states[:, 1], controls[:, 0]
     best = int(np.argmin(costs))
@@ -93,9 +130,13 @@ def test_as_the_temperature_falls_the_plan_becomes_the_best_samples():
 
 
 def test_the_shifted_plan_is_one_of_the_samples():
-    """On the path nothing is to be done: only the plan of zeros costs next to nothing, whatever the others do."""
+    """On the path nothing is to be done: only the plan of zeros costs next to nothing,
+    whatever the others do.
+    """
     on_path = np.float32([0.0, 0.0, 0.0, 10.0])
-    _, _, info = act_once("nominal", observation=on_path, noise_std=(0.3, 1.0), temperature=1e-4)
+    _, _, info = act_once(
+        "nominal", observation=on_path, noise_std=(0.3, 1.0), temperature=1e-4
+    )
     assert float(info["cost"]) < 1e-6
     assert float(info["mean_cost"]) < 1e-6
 
@@ -105,9 +146,13 @@ def test_the_first_steering_rate_counts_from_the_control_that_was_applied_last()
     quiet = {"observation": on_path, "noise_std": (1e-9, 1e-9)}
     _, state, _ = act_once("nominal", **quiet)
     turned = state._replace(previous=jnp.asarray([0.1, 0.0]))
-    np.testing.assert_allclose(act_once("nominal", state=state, **quiet)[2]["mean_cost"], 0.0, atol=1e-6)
     np.testing.assert_allclose(
-        act_once("nominal", state=turned, **quiet)[2]["mean_cost"], 5 * (0.1 / 0.1) ** 2, rtol=1e-4
+        act_once("nominal", state=state, **quiet)[2]["mean_cost"], 0.0, atol=1e-6
+    )
+    np.testing.assert_allclose(
+        act_once("nominal", state=turned, **quiet)[2]["mean_cost"],
+        5 * (0.1 / 0.1) ** 2,
+        rtol=1e-4,
     )
 
 
@@ -126,13 +171,19 @@ def test_the_plan_carried_over_is_shifted_by_one_step():
     np.testing.assert_allclose(info["predicted_states"][1], then, atol=1e-5)
 
 
-@pytest.mark.parametrize(("std", "law"), [(1e3, FEEDBACK), (1e30, control.no_feedback())])
+@pytest.mark.parametrize(
+    ("std", "law"), [(1e3, FEEDBACK), (1e30, control.no_feedback())]
+)
 def test_controls_stay_inside_their_bounds_however_large_the_noise(std, law):
-    """And perturbations are stored as they were effective after clipping: no larger than the actuator box is wide."""
+    """And perturbations are stored as they were effective after clipping: no larger
+    than the actuator box is wide.
+    """
     low, high = np.float32(PLANT.control_low), np.float32(PLANT.control_high)
     state = None
     for _ in range(3):
-        action, state, info = act_once(noise_std=(std, std), law=law, temperature=1e9, state=state)
+        action, state, info = act_once(
+            noise_std=(std, std), law=law, temperature=1e9, state=state
+        )
         assert np.all((low <= action) & (action <= high))
         assert np.all((low <= state.controls) & (state.controls <= high))
         assert np.all(np.abs(state.plan) <= 2 * (high - low))
@@ -142,7 +193,11 @@ def test_controls_stay_inside_their_bounds_however_large_the_noise(std, law):
 
 def test_compiling_does_not_change_the_action():
     controller, params, act = compiled(num_samples=16)
-    inputs = (params, controller.init(jax.random.key(0)), *map(jnp.asarray, (OFFSET, ENV, REFERENCE)))
+    inputs = (
+        params,
+        controller.init(jax.random.key(0)),
+        *map(jnp.asarray, (OFFSET, ENV, REFERENCE)),
+    )
     assert same(act(*inputs), controller.act(*inputs), rtol=1e-4, atol=1e-5)
 
 
@@ -153,8 +208,13 @@ def test_a_batch_of_controllers_acts_as_each_one_alone():
     envs = [ENV - 0.1 * k for k in range(3)]
     stack = partial(jax.tree.map, lambda *leaves: jnp.stack(leaves))
     together = jit(jax.vmap(controller.act, in_axes=(None, 0, 0, 0, None)))
-    batch = together(params, stack(*states), stack(*observations), stack(*envs), REFERENCE)
-    alone = [act(params, *inputs, REFERENCE) for inputs in zip(states, observations, envs, strict=True)]
+    batch = together(
+        params, stack(*states), stack(*observations), stack(*envs), REFERENCE
+    )
+    alone = [
+        act(params, *inputs, REFERENCE)
+        for inputs in zip(states, observations, envs, strict=True)
+    ]
     assert same(batch, stack(*alone), rtol=1e-4, atol=1e-5)
 
 
@@ -168,7 +228,9 @@ def test_it_is_traced_once_while_state_environment_and_reference_change():
     controller = planner(model._replace(fiber=counting))
     act, state = jit(controller.act), controller.init(jax.random.key(0))
     for k in range(4):
-        _, state, _ = act({}, state, OFFSET + k, ENV + 9 * k, straight(HORIZON, speed=8.0 + k))
+        _, state, _ = act(
+            {}, state, OFFSET + k, ENV + 9 * k, straight(HORIZON, speed=8.0 + k)
+        )
     assert len(traces) == 1
 
 
@@ -182,14 +244,20 @@ def test_the_same_key_makes_the_same_plan_and_another_key_another():
 def test_successive_steps_draw_fresh_noise():
     _, state, _ = act_once()
     rewound = state._replace(key=jax.random.key(0))
-    assert not np.array_equal(act_once(state=state)[1].plan, act_once(state=rewound)[1].plan)
+    assert not np.array_equal(
+        act_once(state=state)[1].plan, act_once(state=rewound)[1].plan
+    )
 
 
 @pytest.mark.parametrize("entry", range(4))
 @pytest.mark.parametrize("value", [np.nan, np.inf])
-def test_a_broken_observation_continues_the_last_clean_plan_and_the_next_clean_step_recovers(entry, value):
+def test_a_broken_observation_continues_the_last_clean_plan_and_the_next_clean_step_recovers(
+    entry, value
+):
     _, clean, _ = act_once()
-    action, held, info = act_once(state=clean, observation=with_entry(OFFSET, entry, value))
+    action, held, info = act_once(
+        state=clean, observation=with_entry(OFFSET, entry, value)
+    )
     assert not bool(info["healthy"])
     np.testing.assert_array_equal(action, clean.controls[0])
     np.testing.assert_array_equal(held.plan[:-1], clean.plan[1:])
@@ -214,11 +282,15 @@ def test_a_broken_environment_does_the_same(entry):
 
 @pytest.mark.parametrize("broken", ["observation", "env", "reference"])
 def test_what_is_not_finite_is_noticed_even_where_the_model_does_not_look(broken):
-    """The nominal bicycle does not read e; the last entry of the reference is read by the cost alone."""
+    """The nominal bicycle does not read e; the last entry of the reference is read by
+    the cost alone.
+    """
     inputs = {"observation": OFFSET, "env": ENV, "reference": REFERENCE}
     inputs[broken] = with_entry(inputs[broken], -1, np.nan)
     controller, params, act = compiled("nominal")
-    action, state, info = act(params, controller.init(jax.random.key(0)), *inputs.values())
+    action, state, info = act(
+        params, controller.init(jax.random.key(0)), *inputs.values()
+    )
     assert not bool(info["healthy"])
     assert np.all(np.isfinite(action))
     assert finite(state)
@@ -234,12 +306,16 @@ def test_a_broken_first_observation_gives_a_finite_control_inside_the_bounds():
 
 @pytest.mark.parametrize("law", [FEEDBACK, control.ModelLaw(dt=0.1)])
 def test_a_reading_far_off_leaves_no_more_in_the_plan_than_the_actuators_can_do(law):
-    """The law then asks for thousands of radians in vain; a perturbation that made up for them would outlast them."""
+    """The law then asks for thousands of radians in vain; a perturbation that made up
+    for them would outlast them.
+    """
     controller, params, act = compiled(law=law)
     span = np.subtract(PLANT.control_high, PLANT.control_low)
     for entry, value in ((0, 1e5), (1, -1e5), (3, 1e6)):
         state = controller.init(jax.random.key(0))
-        _, state, info = act(params, state, with_entry(OFFSET, entry, value), ENV, REFERENCE)
+        _, state, info = act(
+            params, state, with_entry(OFFSET, entry, value), ENV, REFERENCE
+        )
         assert bool(info["healthy"])
         assert np.all(np.abs(state.plan) <= span * (1 + 1e-6))
 
@@ -248,7 +324,9 @@ def test_a_long_blackout_ends_with_the_last_control_held():
     _, state, _ = act_once()
     last = state.controls[-1]
     for _ in range(HORIZON + 2):
-        action, state, _ = act_once(state=state, observation=np.full(4, np.nan, np.float32))
+        action, state, _ = act_once(
+            state=state, observation=np.full(4, np.nan, np.float32)
+        )
     np.testing.assert_array_equal(action, last)
 
 
@@ -263,14 +341,20 @@ def breaks_where(condition):
 
 @pytest.mark.parametrize("law", [FEEDBACK, control.no_feedback()])
 def test_a_model_that_breaks_for_half_of_the_samples_still_gives_a_finite_plan(law):
-    """Noise with correlation 1 keeps its sign: half of the samples steer left somewhere, and break."""
+    """Noise with correlation 1 keeps its sign: half of the samples steer left
+    somewhere, and break.
+    """
     on_path = jnp.asarray([0.0, 0.0, 0.0, 10.0])
     model = breaks_where(lambda action: action[0] > 0)
     settings = {"law": law, "noise_correlation": 1.0, "temperature": 1e9}
     controller = planner(model, **settings)
-    action, state, info = jit(controller.act)({}, controller.init(jax.random.key(0)), on_path, ENV, REFERENCE)
+    action, state, info = jit(controller.act)(
+        {}, controller.init(jax.random.key(0)), on_path, ENV, REFERENCE
+    )
     assert bool(info["healthy"])
-    assert 20 < float(info["effective_samples"]) < 44  # of 64: equal weights on the rest
+    assert (
+        20 < float(info["effective_samples"]) < 44
+    )  # of 64: equal weights on the rest
     assert finite(state)
     assert float(action[0]) < 0
     assert np.all(np.isfinite(info["predicted_states"]))
@@ -278,7 +362,9 @@ def test_a_model_that_breaks_for_half_of_the_samples_still_gives_a_finite_plan(l
 
 def test_a_model_that_always_breaks_is_reported_and_the_control_stays_finite():
     controller = planner(breaks_where(lambda action: True))
-    action, state, info = jit(controller.act)({}, controller.init(jax.random.key(0)), OFFSET, ENV, REFERENCE)
+    action, state, info = jit(controller.act)(
+        {}, controller.init(jax.random.key(0)), OFFSET, ENV, REFERENCE
+    )
     assert not bool(info["healthy"])
     assert np.all(np.isfinite(action))
     assert finite(state)
@@ -325,7 +411,9 @@ def scan_bodies(jaxpr):
 
 
 def square_products(jaxpr):
-    """Products of two square matrices of one size, as a Gram iteration is made of, at any depth."""
+    """Products of two square matrices of one size, as a Gram iteration is made of, at
+    any depth.
+    """
     here = [eqn for eqn in jaxpr.eqns if eqn.primitive.name == "dot_general"]
     shapes = [[operand.aval.shape[-2:] for operand in eqn.invars] for eqn in here]
     found = sum(a == b and len(a) == 2 and a[0] == a[1] > 1 for a, b in shapes)
@@ -346,9 +434,13 @@ def test_what_depends_on_the_environment_alone_is_hoisted_out_of_the_horizon(nam
     rolling = [body for body in bodies if {"dot_general", "tanh", "cos"} <= body]
     assert len(rolling) == 2  # all samples, then the plan that was chosen
     assert not [name for body in bodies for name in body if name in FORBIDDEN]
-    assert [name for name in primitives(jaxpr) if name in FORBIDDEN]  # the factorisation is there, outside
+    assert [
+        name for name in primitives(jaxpr) if name in FORBIDDEN
+    ]  # the factorisation is there, outside
     assert square_products(jaxpr) > 0
-    assert sum(square_products(body) for body in scan_bodies(jaxpr)) == 0  # and so is the Gram iteration
+    assert (
+        sum(square_products(body) for body in scan_bodies(jaxpr)) == 0
+    )  # and so is the Gram iteration
 
 
 @pytest.mark.parametrize("law", ["feedback", "plain"])
@@ -362,14 +454,18 @@ def test_a_nominal_model_of_a_nominal_plant_converges_to_the_path(law):
         scenarios.path_from_curvature(jnp.zeros(300), spacing=0.5),
         jnp.asarray(10.0),
     )
-    drive = partial(evaluation.simulate, PLANT.nominal, controller, {}, dt=0.1, horizon=HORIZON)
+    drive = partial(
+        evaluation.simulate, PLANT.nominal, controller, {}, dt=0.1, horizon=HORIZON
+    )
     episode = jit(drive)(road, jax.random.key(0))
     lateral = np.abs(np.asarray(episode.lateral))
     assert lateral[0] > 0.2
     assert np.all(lateral[-20:] < (0.03 if law == "feedback" else 0.05))
     assert np.all(lateral < 0.32)
     assert np.all(np.abs(np.asarray(episode.states)[-20:, 3] - 10.0) < 0.3)
-    np.testing.assert_allclose(episode.prediction_error, np.zeros(60), atol=1e-4)  # the model is the plant
+    np.testing.assert_allclose(
+        episode.prediction_error, np.zeros(60), atol=1e-4
+    )  # the model is the plant
     assert np.all(episode.healthy)
 
 
@@ -377,7 +473,9 @@ def test_no_key_is_used_twice():
     controller = planner(models.physics(PLANT.nominal), num_samples=4)
 
     def start(key):
-        return controller.act({}, controller.init(key), *map(jnp.asarray, (OFFSET, ENV, REFERENCE)))
+        return controller.act(
+            {}, controller.init(key), *map(jnp.asarray, (OFFSET, ENV, REFERENCE))
+        )
 
     with jax.debug_key_reuse(True):
         jax.jit(start)(jax.random.key(0))

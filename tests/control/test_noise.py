@@ -1,4 +1,6 @@
-"""Perturbations: what their course over the horizon has to be, and that every step has the same spread."""
+"""Perturbations: what their course over the horizon has to be, and that every step has
+the same spread.
+"""
 
 import jax
 import jax.numpy as jnp
@@ -55,16 +57,22 @@ def test_white_noise_has_no_memory():
 
 
 def test_autoregressive_noise_from_independent_and_from_halton_numbers_has_one_law():
-    np.testing.assert_allclose(correlations(drawn("ar1", halton=True)), correlations(drawn("ar1")), atol=0.1)
+    np.testing.assert_allclose(
+        correlations(drawn("ar1", halton=True)), correlations(drawn("ar1")), atol=0.1
+    )
 
 
 @pytest.mark.parametrize("exponent", [0.0, 1.0, 2.0])
 def test_the_spectrum_of_coloured_noise_falls_as_asked(exponent):
-    """Slope of the log spectrum of tapered windows, between the ends that a window of 20 steps resolves."""
+    """Slope of the log spectrum of tapered windows, between the ends that a window of
+    20 steps resolves.
+    """
     horizon = 64
     draw = control.sampler("coloured", horizon=horizon, exponent=exponent)
     noise = np.asarray(draw(jax.random.key(0), 2000, STD))[:, :, 0]
-    power = np.mean(np.abs(np.fft.rfft(noise * np.hanning(horizon)[:, None], axis=0)) ** 2, axis=1)
+    power = np.mean(
+        np.abs(np.fft.rfft(noise * np.hanning(horizon)[:, None], axis=0)) ** 2, axis=1
+    )
     inside = slice(3, 24)
     frequency = np.arange(len(power))[inside]
     slope = np.polyfit(np.log(frequency), np.log(power[inside]), 1)[0]
@@ -73,24 +81,33 @@ def test_the_spectrum_of_coloured_noise_falls_as_asked(exponent):
 
 @pytest.mark.parametrize("knots", [2, 3, 4, 7])
 def test_a_spline_through_knots_is_exact_for_the_polynomials_it_can_hold(knots):
-    """Row by row the weights of the knots sum to one before scaling: a cubic is reproduced."""
+    """Row by row the weights of the knots sum to one before scaling: a cubic is
+    reproduced.
+    """
     from sfkd_jax.control.planners._noise import _spline
 
     spacing = (HORIZON - 1) / (knots - 1)
     places, steps = spacing * np.arange(knots), np.arange(HORIZON)
     weights = np.asarray(_spline(jnp.asarray(steps / spacing), knots), dtype=float)
     for order in range(min(4, knots)):
-        np.testing.assert_allclose(weights @ (places / 10) ** order, (steps / 10) ** order, atol=2e-5)
+        np.testing.assert_allclose(
+            weights @ (places / 10) ** order, (steps / 10) ** order, atol=2e-5
+        )
 
 
 def test_halton_points_fill_their_space_more_evenly_than_independent_ones():
-    """The mean of a smooth function of four numbers: quasi-random points miss it by far less."""
+    """The mean of a smooth function of four numbers: quasi-random points miss it by far
+    less.
+    """
     misses = {halton: [] for halton in (True, False)}
     for halton, found in misses.items():
         draw = control.sampler("spline", horizon=HORIZON, knots=2, halton=halton)
         for seed in range(12):
             noise = np.asarray(draw(jax.random.key(seed), 512, jnp.ones(2)))
-            found.append(np.mean(np.cos(noise[0]).prod(axis=1) * np.cos(noise[-1]).prod(axis=1)) - np.exp(-2.0))
+            found.append(
+                np.mean(np.cos(noise[0]).prod(axis=1) * np.cos(noise[-1]).prod(axis=1))
+                - np.exp(-2.0)
+            )
     assert np.std(misses[True]) < 0.4 * np.std(misses[False])
 
 
@@ -106,7 +123,9 @@ def test_another_key_makes_other_noise_and_the_same_the_same(kind):
 @pytest.mark.parametrize("scale", [1e-3, 1.0, 1e3])
 @pytest.mark.parametrize("wanted", [2.0, 30.0, 400.0])
 @pytest.mark.parametrize("law", ["uniform", "exponential", "one far off"])
-def test_as_many_samples_count_as_are_wanted_whatever_the_scale_of_the_cost(scale, wanted, law):
+def test_as_many_samples_count_as_are_wanted_whatever_the_scale_of_the_cost(
+    scale, wanted, law
+):
     costs = {
         "uniform": jax.random.uniform(jax.random.key(0), (1500,)),
         "exponential": jax.random.exponential(jax.random.key(1), (1500,)),
@@ -120,11 +139,15 @@ def test_as_many_samples_count_as_are_wanted_whatever_the_scale_of_the_cost(scal
 
 def test_more_than_there_are_gives_all_and_bad_ones_never_count():
     costs = jnp.asarray([1.0, 2.0, jnp.nan, jnp.inf, 3.0])
-    weights, _ = control.softmin(costs, control.temperature_for(costs, jnp.asarray(5.0)))
+    weights, _ = control.softmin(
+        costs, control.temperature_for(costs, jnp.asarray(5.0))
+    )
     np.testing.assert_allclose(weights, [1 / 3, 1 / 3, 0.0, 0.0, 1 / 3], atol=1e-4)
 
 
-@pytest.mark.parametrize("costs", [[2.0, 2.0, 2.0], [jnp.nan] * 3, [1.0, jnp.inf, jnp.inf]])
+@pytest.mark.parametrize(
+    "costs", [[2.0, 2.0, 2.0], [jnp.nan] * 3, [1.0, jnp.inf, jnp.inf]]
+)
 def test_costs_without_a_spread_give_a_finite_temperature(costs):
     temperature = control.temperature_for(jnp.asarray(costs), jnp.asarray(2.0))
     assert bool(jnp.isfinite(temperature))

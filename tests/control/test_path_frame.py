@@ -14,20 +14,34 @@ RADIUS = 40.0
 
 
 def on_circle(along, offset=0.0):
-    """Poses that drive a left-hand circle through the origin, `along` [m] from there, `offset` to its left."""
+    """Poses that drive a left-hand circle through the origin, `along` [m] from there,
+    `offset` to its left.
+    """
     yaw = along / RADIUS
     radius = RADIUS - offset
-    return np.stack([radius * np.sin(yaw), RADIUS - radius * np.cos(yaw), yaw, np.full_like(yaw, 9.0)], axis=1)
+    return np.stack(
+        [
+            radius * np.sin(yaw),
+            RADIUS - radius * np.cos(yaw),
+            yaw,
+            np.full_like(yaw, 9.0),
+        ],
+        axis=1,
+    )
 
 
 def errors_at(states, point=(0.0, 0.0, 0.0, 9.0), curvature=1 / RADIUS):
     count = len(states)
     points = np.broadcast_to(np.float32(point), (count, 4))
-    return ERRORS(states.astype(np.float32), points, np.full(count, curvature, np.float32))
+    return ERRORS(
+        states.astype(np.float32), points, np.full(count, curvature, np.float32)
+    )
 
 
 def test_path_errors_vanish_on_the_circle_that_the_reference_describes():
-    """To second order in the distance s along it: what is left of the lateral error is below s⁴/(8 R³)."""
+    """To second order in the distance s along it: what is left of the lateral error is
+    below s⁴/(8 R³).
+    """
     along = np.linspace(-4.0, 4.0, 17)
     errors = errors_at(on_circle(along))
     assert np.all(np.abs(errors.lateral) <= along**4 / (8 * RADIUS**3) + 1e-5)
@@ -50,7 +64,9 @@ def test_path_errors_do_not_depend_on_where_the_world_puts_its_origin():
     turn = np.asarray([[np.cos(yaw), -np.sin(yaw)], [np.sin(yaw), np.cos(yaw)]])
 
     def moved(poses):
-        return np.column_stack([poses[:, :2] @ turn.T + shift, poses[:, 2] + yaw, poses[:, 3]]).astype(np.float32)
+        return np.column_stack(
+            [poses[:, :2] @ turn.T + shift, poses[:, 2] + yaw, poses[:, 3]]
+        ).astype(np.float32)
 
     curvature = np.full(20, 0.02, np.float32)
     here = ERRORS(states.astype(np.float32), points.astype(np.float32), curvature)
@@ -83,25 +99,43 @@ def scalar(value):
 def test_without_errors_the_law_is_the_feedforward_of_the_curve():
     law = control.path_feedback(wheelbase=2.7)
     none = PathErrors(scalar(0.0), scalar(0.0), scalar(0.0))
-    np.testing.assert_allclose(law(none, scalar(0.02), scalar(9.0)), [np.arctan(2.7 * 0.02), 0.0], rtol=1e-6)
+    np.testing.assert_allclose(
+        law(none, scalar(0.02), scalar(9.0)), [np.arctan(2.7 * 0.02), 0.0], rtol=1e-6
+    )
 
 
 def test_the_law_steers_and_brakes_against_its_errors():
-    law = control.path_feedback(wheelbase=2.7, lateral_gain=0.03, heading_gain=0.4, speed_gain=2.0)
+    law = control.path_feedback(
+        wheelbase=2.7, lateral_gain=0.03, heading_gain=0.4, speed_gain=2.0
+    )
     off = PathErrors(scalar(1.0), scalar(0.1), scalar(0.5))
-    np.testing.assert_allclose(law(off, scalar(0.0), scalar(9.0)), [-0.03 - 0.04, -1.0], rtol=1e-5)
+    np.testing.assert_allclose(
+        law(off, scalar(0.0), scalar(9.0)), [-0.03 - 0.04, -1.0], rtol=1e-5
+    )
     commanded = control.path_feedback(wheelbase=2.7, speed_gain=2.0, speed_loop=True)
-    np.testing.assert_allclose(commanded(off, scalar(0.0), scalar(9.0))[1], 8.0, rtol=1e-6)
+    np.testing.assert_allclose(
+        commanded(off, scalar(0.0), scalar(9.0))[1], 8.0, rtol=1e-6
+    )
 
 
 def test_no_feedback_ignores_every_error():
     off = PathErrors(scalar(1.0), scalar(0.1), scalar(0.5))
-    np.testing.assert_array_equal(control.no_feedback()(off, scalar(0.1), scalar(9.0)), [0.0, 0.0])
+    np.testing.assert_array_equal(
+        control.no_feedback()(off, scalar(0.1), scalar(9.0)), [0.0, 0.0]
+    )
     commanded = control.no_feedback(speed_loop=True)(off, scalar(0.1), scalar(9.0))
     np.testing.assert_array_equal(commanded, [0.0, 9.0])
 
 
-def stage(lateral=0.0, before=0.0, heading=0.0, fast=0.0, steering=0.0, steering_before=0.0, acceleration=0.0):
+def stage(
+    lateral=0.0,
+    before=0.0,
+    heading=0.0,
+    fast=0.0,
+    steering=0.0,
+    steering_before=0.0,
+    acceleration=0.0,
+):
     now = PathErrors(scalar(lateral), scalar(heading), scalar(fast))
     then = PathErrors(scalar(before), scalar(heading), scalar(fast))
     used = jnp.asarray([steering, acceleration]), jnp.asarray([steering_before, 0.0])
@@ -138,11 +172,17 @@ def test_a_speed_command_costs_no_effort():
 
 
 @pytest.mark.parametrize("correlation", [0.0, 0.8])
-def test_correlated_noise_has_the_stated_spread_at_every_step_and_the_stated_correlation(correlation):
+def test_correlated_noise_has_the_stated_spread_at_every_step_and_the_stated_correlation(
+    correlation,
+):
     count, std = 4000, np.asarray([0.02, 0.3])
     noise = np.asarray(
         control.correlated_noise(
-            jax.random.key(0), num_samples=count, horizon=15, std=jnp.asarray(std), correlation=correlation
+            jax.random.key(0),
+            num_samples=count,
+            horizon=15,
+            std=jnp.asarray(std),
+            correlation=correlation,
         )
     )
     assert noise.shape == (15, count, 2)

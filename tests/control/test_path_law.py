@@ -1,4 +1,6 @@
-"""A law derived from a plant's own step: it holds the car, everywhere in the box, and is stored as arrays."""
+"""A law derived from a plant's own step: it holds the car, everywhere in the box, and
+is stored as arrays.
+"""
 
 from functools import partial
 
@@ -19,7 +21,9 @@ PLANTS = {"kinematic": vehicle.kinematic(), "dynamic": vehicle.dynamic()}
 @pytest.fixture(scope="module", params=PLANTS)
 def derived(request):
     plant = PLANTS[request.param]
-    derive = partial(derive_path_law, plant.step, coordinates=len(plant.state_names) - 1, **BOX)
+    derive = partial(
+        derive_path_law, plant.step, coordinates=len(plant.state_names) - 1, **BOX
+    )
     return plant, jax.jit(partial(derive, points=(7, 2, 4)))()
 
 
@@ -37,56 +41,89 @@ def test_a_turn_at_a_point_of_the_tables_is_steady(derived):
 
 @pytest.mark.parametrize("env", [(0.3, 8.0), (0.3, -8.0), (0.9, 0.0), (0.55, 5.0)])
 def test_the_law_alone_keeps_the_car_on_its_path(derived, env):
-    """10 m/s, lateral acceleration 1.6 m/s², from 0.4 m beside the path: then within 7 cm, tables coarse."""
+    """10 m/s, lateral acceleration 1.6 m/s², from 0.4 m beside the path: then within 7
+    cm, tables coarse.
+    """
     plant, law = derived
     loop = vehicle.along_path(plant, law)
     inputs = jnp.asarray([0.0, 0.0, 0.016, 10.0])
-    start = path_state(jnp.zeros(len(plant.state_names) - 1).at[0].set(0.4).at[2].set(9.0))
-    drive = jax.jit(lambda x: jax.lax.scan(lambda x, _: (loop.step(x, inputs, jnp.asarray(env)), x), x, length=80))
+    start = path_state(
+        jnp.zeros(len(plant.state_names) - 1).at[0].set(0.4).at[2].set(9.0)
+    )
+    drive = jax.jit(
+        lambda x: jax.lax.scan(
+            lambda x, _: (loop.step(x, inputs, jnp.asarray(env)), x), x, length=80
+        )
+    )
     last, _ = drive(start)
     assert abs(float(last[BODY][0])) < 0.07
     assert abs(float(last[BODY][2]) - 10.0) < 0.1
 
 
 def test_the_loop_contracts_alike_where_tyres_give_little(derived):
-    """Steering is charged by the curvature it makes: the slowest mode on ice with wind is not slower than 0.92."""
+    """Steering is charged by the curvature it makes: the slowest mode on ice with wind
+    is not slower than 0.92.
+    """
     plant, law = derived
     loop = vehicle.along_path(plant, law)
     for env in ((0.3, 8.0), (0.9, 0.0)):
         turn = law.turn(jnp.asarray(0.02), jnp.asarray(10.0), jnp.asarray(env))
         inputs = jnp.asarray([0.0, 0.0, 0.02, 10.0])
-        slope = jax.jacfwd(lambda xi, w, e: loop.step(path_state(xi), w, e)[BODY])(turn.state, inputs, jnp.asarray(env))
+        slope = jax.jacfwd(lambda xi, w, e: loop.step(path_state(xi), w, e)[BODY])(
+            turn.state, inputs, jnp.asarray(env)
+        )
         assert np.max(np.abs(np.linalg.eigvals(np.asarray(slope, np.float64)))) < 0.92
 
 
 def test_a_law_survives_being_stored(derived):
     law = derived[1]
-    flat = {name: np.asarray(leaf) for name, leaf in artefacts.flatten({"law": law_arrays(law)}).items()}
+    flat = {
+        name: np.asarray(leaf)
+        for name, leaf in artefacts.flatten({"law": law_arrays(law)}).items()
+    }
     again = law_from_arrays(artefacts.unflatten(flat)["law"])
-    given = jnp.full(law.state.shape[-1], 0.1), jnp.asarray(0.01), jnp.asarray(9.0), jnp.asarray([0.42, -3.0])
+    given = (
+        jnp.full(law.state.shape[-1], 0.1),
+        jnp.asarray(0.01),
+        jnp.asarray(9.0),
+        jnp.asarray([0.42, -3.0]),
+    )
     np.testing.assert_array_equal(again(*given), law(*given))
 
 
 def test_a_step_without_a_derivative_will_do():
-    """A plant on the host, as CommonRoad's cars are: the textbook bicycle by Euler's method, in numpy."""
+    """A plant on the host, as CommonRoad's cars are: the textbook bicycle by Euler's
+    method, in numpy.
+    """
 
     def euler(x, u, e):
         del e
-        return np.stack([x[3] * np.cos(x[2]), x[3] * np.sin(x[2]), x[3] * np.tan(u[0]) / 2.7, u[1]]).astype(x.dtype)
+        return np.stack(
+            [x[3] * np.cos(x[2]), x[3] * np.sin(x[2]), x[3] * np.tan(u[0]) / 2.7, u[1]]
+        ).astype(x.dtype)
 
     def on_host(state, action, env):
         shape = jax.ShapeDtypeStruct(state.shape, state.dtype)
         rates = jax.pure_callback(
-            lambda *now: euler(*map(np.asarray, now)), shape, state, action, env, vmap_method="sequential"
+            lambda *now: euler(*map(np.asarray, now)),
+            shape,
+            state,
+            action,
+            env,
+            vmap_method="sequential",
         )
         return state + 0.1 * rates
 
     law = derive_path_law(on_host, coordinates=3, points=(3, 2, 2), **BOX)
     turn = law.turn(jnp.asarray(2.2 / 64), jnp.asarray(8.0), jnp.asarray([0.3, 8.0]))
-    np.testing.assert_allclose(turn.control, (np.arctan(2.7 * 2.2 / 64), 0.0), atol=1e-3)
+    np.testing.assert_allclose(
+        turn.control, (np.arctan(2.7 * 2.2 / 64), 0.0), atol=1e-3
+    )
     assert np.all(np.asarray(turn.gain[0, :2]) > 0.05)
 
 
 def test_axes_that_cannot_be_meant_are_refused():
     with pytest.raises(ValueError, match="odd number of accelerations"):
-        derive_path_law(PLANTS["kinematic"].step, coordinates=3, points=(4, 2, 2), **BOX)
+        derive_path_law(
+            PLANTS["kinematic"].step, coordinates=3, points=(4, 2, 2), **BOX
+        )

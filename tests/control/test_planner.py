@@ -1,4 +1,6 @@
-"""What planners do beyond the path: any task, any temperature, any limits, several environments, any devices."""
+"""What planners do beyond the path: any task, any temperature, any limits, several
+environments, any devices.
+"""
 
 import os
 import subprocess
@@ -29,7 +31,9 @@ def dynamics(params, state, action, env):
 
 
 def stage(weights, state, action, before, goal):
-    return weights["state"] * jnp.sum(jnp.asarray(Q) * state**2) + weights["effort"] * R * jnp.sum(action**2)
+    return weights["state"] * jnp.sum(jnp.asarray(Q) * state**2) + weights[
+        "effort"
+    ] * R * jnp.sum(action**2)
 
 
 def double_integrator(**settings):
@@ -38,15 +42,26 @@ def double_integrator(**settings):
 
 
 SEARCHES = {
-    "mppi": partial(control.mppi, num_samples=400, effective_samples=20.0, noise="white", adapt=0.5, iterations=2),
-    "cem": partial(control.cem, num_samples=400, elites=40, iterations=3, noise="white"),
+    "mppi": partial(
+        control.mppi,
+        num_samples=400,
+        effective_samples=20.0,
+        noise="white",
+        adapt=0.5,
+        iterations=2,
+    ),
+    "cem": partial(
+        control.cem, num_samples=400, elites=40, iterations=3, noise="white"
+    ),
     "gradient": control.gradient_planner,
 }
 every = pytest.mark.parametrize("search", SEARCHES)
 
 
 def plan_for(search, task=None, steps=12, start=START, env=NOTHING, **settings):
-    """Plan again and again from the same state, without moving on: what the search converges to."""
+    """Plan again and again from the same state, without moving on: what the search
+    converges to.
+    """
     task = task or double_integrator()
     controller = SEARCHES[search](task, horizon=HORIZON, noise_std=(2.0,), **settings)
 
@@ -57,14 +72,18 @@ def plan_for(search, task=None, steps=12, start=START, env=NOTHING, **settings):
             action, state, info = controller.act({}, held, start, env, ())
             return state, (action, info)
 
-        state, (actions, info) = jax.lax.scan(again, controller.init(key), None, length=steps)
+        state, (actions, info) = jax.lax.scan(
+            again, controller.init(key), None, length=steps
+        )
         return state, actions[-1], jax.tree.map(lambda leaf: leaf[-1], info)
 
     return run(jax.random.key(0))
 
 
 def optimal():
-    """Least cost of the linear-quadratic problem, and its controls: the Riccati recursion in double precision."""
+    """Least cost of the linear-quadratic problem, and its controls: the Riccati
+    recursion in double precision.
+    """
     a, b, q = A.astype(float), B.astype(float), np.diag(Q).astype(float)
     value, gains = np.zeros((2, 2)), []
     for _ in range(HORIZON):
@@ -82,7 +101,9 @@ def optimal():
 
 
 @every
-def test_on_a_linear_quadratic_problem_the_cost_is_within_two_percent_of_the_optimum(search):
+def test_on_a_linear_quadratic_problem_the_cost_is_within_two_percent_of_the_optimum(
+    search,
+):
     least, _ = optimal()
     _, _, info = plan_for(search)
     assert least <= float(info["mean_cost"]) * (1 + 1e-5)
@@ -90,7 +111,10 @@ def test_on_a_linear_quadratic_problem_the_cost_is_within_two_percent_of_the_opt
 
 
 def test_the_gradient_planner_never_goes_up_and_ends_at_the_optimal_plan():
-    costs = [float(plan_for("gradient", steps=steps, iterations=1)[2]["mean_cost"]) for steps in (1, 2, 4, 8, 16)]
+    costs = [
+        float(plan_for("gradient", steps=steps, iterations=1)[2]["mean_cost"])
+        for steps in (1, 2, 4, 8, 16)
+    ]
     assert all(after <= before * (1 + 1e-6) for before, after in pairwise(costs))
     state, _, _ = plan_for("gradient", steps=60)
     np.testing.assert_allclose(state.plan, optimal()[1], atol=0.05)
@@ -98,28 +122,43 @@ def test_the_gradient_planner_never_goes_up_and_ends_at_the_optimal_plan():
 
 @every
 @pytest.mark.parametrize("elapsed", [0.5, 1.0, 2.0, 2.75])
-def test_a_call_that_comes_late_continues_the_plan_from_where_it_would_be_by_then(search, elapsed):
-    """Nothing can be read at that call, so what it does is the plan alone; a plan is kept as of one period later."""
-    controller = SEARCHES[search](double_integrator(), horizon=HORIZON, noise_std=(2.0,))
-    plan, state = 0.1 * jnp.arange(HORIZON, dtype=float)[:, None], controller.init(jax.random.key(0))
+def test_a_call_that_comes_late_continues_the_plan_from_where_it_would_be_by_then(
+    search, elapsed
+):
+    """Nothing can be read at that call, so what it does is the plan alone; a plan is
+    kept as of one period later.
+    """
+    controller = SEARCHES[search](
+        double_integrator(), horizon=HORIZON, noise_std=(2.0,)
+    )
+    plan, state = (
+        0.1 * jnp.arange(HORIZON, dtype=float)[:, None],
+        controller.init(jax.random.key(0)),
+    )
     tuning = state.tuning._replace(elapsed=jnp.asarray(elapsed))
     state = state._replace(plan=plan, controls=plan, tuning=tuning)
     action, after, info = jit(controller.act)({}, state, START * jnp.nan, NOTHING, ())
     assert not bool(info["healthy"])
     late = max(elapsed - 1.0, 0.0)
     np.testing.assert_allclose(action, 0.1 * late, atol=1e-6)
-    np.testing.assert_allclose(after.controls[0], 0.1 * (late + min(elapsed, 1.0)), atol=1e-6)
+    np.testing.assert_allclose(
+        after.controls[0], 0.1 * (late + min(elapsed, 1.0)), atol=1e-6
+    )
 
 
 @every
 def test_a_clock_that_tells_no_number_counts_as_a_call_in_time(search):
     """Else the plan would be NaN from then on, and with it every control."""
-    controller = SEARCHES[search](double_integrator(), horizon=HORIZON, noise_std=(2.0,))
+    controller = SEARCHES[search](
+        double_integrator(), horizon=HORIZON, noise_std=(2.0,)
+    )
     act, seen = jit(controller.act), []
     for elapsed in (jnp.nan, 1.0):
         state = controller.init(jax.random.key(0))
         for told in (1.0, elapsed, 1.0):
-            state = state._replace(tuning=state.tuning._replace(elapsed=jnp.asarray(told)))
+            state = state._replace(
+                tuning=state.tuning._replace(elapsed=jnp.asarray(told))
+            )
             action, state, info = act({}, state, START, NOTHING, ())
             assert bool(info["healthy"])
         seen.append((action, state.plan))
@@ -134,8 +173,12 @@ def test_everything_a_driver_may_turn_is_data_and_compiles_nothing(search):
         traces.append(1)
         return dynamics(params, state, action, env)
 
-    task = control.free_task(counted, stage, dt=DT, weights={"state": 1.0, "effort": 1.0}, **BOUNDS)
-    controller = SEARCHES[search](task, horizon=HORIZON, noise_std=(2.0,), num_proposals=1)
+    task = control.free_task(
+        counted, stage, dt=DT, weights={"state": 1.0, "effort": 1.0}, **BOUNDS
+    )
+    controller = SEARCHES[search](
+        task, horizon=HORIZON, noise_std=(2.0,), num_proposals=1
+    )
     act, state = jit(controller.act), controller.init(jax.random.key(0))
     plans, seen = [], None
     for k in range(1, 4):
@@ -146,7 +189,9 @@ def test_everything_a_driver_may_turn_is_data_and_compiles_nothing(search):
             elapsed=jnp.asarray(0.5 * k),
             cost={"state": jnp.asarray(1.0 * k), "effort": jnp.asarray(1.0 / k)},
         )
-        state = state._replace(tuning=tuning, proposals=jnp.full((1, HORIZON, 1), -1.0 * k))
+        state = state._replace(
+            tuning=tuning, proposals=jnp.full((1, HORIZON, 1), -1.0 * k)
+        )
         _, state, _ = act({}, state, START * k, NOTHING, ())
         plans.append(np.asarray(state.plan))
         seen = seen or len(traces)
@@ -166,11 +211,15 @@ def test_a_dearer_control_is_used_less(search):
 @every
 def test_a_proposal_that_is_best_is_found_at_once(search):
     _, plan = optimal()
-    controller = SEARCHES[search](double_integrator(), horizon=HORIZON, noise_std=(1e-6,), num_proposals=1)
+    controller = SEARCHES[search](
+        double_integrator(), horizon=HORIZON, noise_std=(1e-6,), num_proposals=1
+    )
     state = controller.init(jax.random.key(0))
     proposed = state._replace(proposals=jnp.asarray(plan[None], dtype=jnp.float32))
     if search != "gradient":  # plans are averaged: let the best one alone count
-        proposed = proposed._replace(tuning=proposed.tuning._replace(effective_samples=jnp.ones(())))
+        proposed = proposed._replace(
+            tuning=proposed.tuning._replace(effective_samples=jnp.ones(()))
+        )
     _, _, info = jit(controller.act)({}, proposed, START, NOTHING, ())
     least, _ = optimal()
     np.testing.assert_allclose(info["cost"], least, rtol=1e-4)
@@ -184,24 +233,44 @@ def test_limits_hold_exactly_from_the_measured_actuator_on(search, window):
     limits = {"control_low": low, "control_high": high, "control_rate": rate}
     task = double_integrator(**limits, actuator=lambda state: 0.1 * state[1:])
     start = jnp.asarray([4.0, 5.0])  # the actuator stands at 0.5
-    state, action, _ = plan_for(search, task, steps=2, start=start, smoothing_window=window)
-    controls = np.concatenate([[[0.5]], np.asarray(action)[None], np.asarray(state.controls)[1:]])
+    state, action, _ = plan_for(
+        search, task, steps=2, start=start, smoothing_window=window
+    )
+    controls = np.concatenate(
+        [[[0.5]], np.asarray(action)[None], np.asarray(state.controls)[1:]]
+    )
     assert np.all((np.float32(low) <= controls) & (controls <= np.float32(high)))
     assert np.all(np.abs(np.diff(controls, axis=0)) <= np.float32(rate[0] * DT) + 1e-6)
     if search == "gradient":  # the others are averages
-        np.testing.assert_allclose(action, 0.5 - 0.3, atol=1e-6)  # as fast as it may: the state is far off
+        np.testing.assert_allclose(
+            action, 0.5 - 0.3, atol=1e-6
+        )  # as fast as it may: the state is far off
 
 
 @every
-def test_all_bad_rollouts_but_one_still_give_a_finite_plan_and_none_keeps_the_last(search):
+def test_all_bad_rollouts_but_one_still_give_a_finite_plan_and_none_keeps_the_last(
+    search,
+):
     def breaking(params, state, action, env):
-        return jnp.where(env[0] + action[0] ** 2 > 1e-8, jnp.nan, dynamics(params, state, action, jnp.zeros(2)))
+        return jnp.where(
+            env[0] + action[0] ** 2 > 1e-8,
+            jnp.nan,
+            dynamics(params, state, action, jnp.zeros(2)),
+        )
 
-    task = control.free_task(breaking, stage, dt=DT, weights={"state": 1.0, "effort": 1.0}, **BOUNDS)
-    settings = {} if search == "gradient" else {"num_samples": 64} | ({"elites": 8} if search == "cem" else {})
+    task = control.free_task(
+        breaking, stage, dt=DT, weights={"state": 1.0, "effort": 1.0}, **BOUNDS
+    )
+    settings = (
+        {}
+        if search == "gradient"
+        else {"num_samples": 64} | ({"elites": 8} if search == "cem" else {})
+    )
     controller = SEARCHES[search](task, horizon=HORIZON, noise_std=(2.0,), **settings)
     act, state = jit(controller.act), controller.init(jax.random.key(0))
-    action, state, info = act({}, state, START, NOTHING, ())  # only the plan of zeros survives
+    action, state, info = act(
+        {}, state, START, NOTHING, ()
+    )  # only the plan of zeros survives
     assert bool(info["healthy"])
     np.testing.assert_array_equal(action, 0.0)
     action, state, info = act({}, state, START, jnp.ones(1), ())  # and now nothing does
@@ -224,7 +293,9 @@ def test_the_control_cost_pulls_the_plan_to_nothing():
 
 
 def test_adapted_noise_finds_the_optimum_more_closely():
-    fixed, adapted = (plan_for("mppi", steps=20, adapt=adapt)[2]["mean_cost"] for adapt in (0.0, 1.0))
+    fixed, adapted = (
+        plan_for("mppi", steps=20, adapt=adapt)[2]["mean_cost"] for adapt in (0.0, 1.0)
+    )
     least, _ = optimal()
     assert float(adapted) - least < 0.7 * (float(fixed) - least)
 
@@ -237,8 +308,14 @@ def test_risk_is_of_whole_trajectories():
     np.testing.assert_allclose(control.risk_measure("mean", 1.0)(costs), [3.0, 2.0])
     np.testing.assert_allclose(control.risk_measure("worst", 1.0)(costs), [6.0, 4.0])
     np.testing.assert_allclose(control.risk_measure("cvar", 0.5)(costs), [4.0, 3.0])
-    np.testing.assert_allclose(control.risk_measure("cvar", 1.0)(costs), control.risk_measure("mean", 1.0)(costs))
-    np.testing.assert_allclose(control.risk_measure("cvar", 0.01)(costs), control.risk_measure("worst", 1.0)(costs))
+    np.testing.assert_allclose(
+        control.risk_measure("cvar", 1.0)(costs),
+        control.risk_measure("mean", 1.0)(costs),
+    )
+    np.testing.assert_allclose(
+        control.risk_measure("cvar", 0.01)(costs),
+        control.risk_measure("worst", 1.0)(costs),
+    )
 
 
 @pytest.mark.parametrize("risk", ["mean", "worst", "cvar"])
@@ -256,7 +333,13 @@ def test_the_worst_case_is_cheaper_for_a_plan_that_was_made_for_it():
     costs = {}
     for risk in ("mean", "worst"):
         state, _, _ = plan_for("gradient", steps=40, env=envs, risk=risk)
-        judge = control.mppi(double_integrator(), horizon=HORIZON, num_samples=1, noise_std=(1.0,), risk="worst")
+        judge = control.mppi(
+            double_integrator(),
+            horizon=HORIZON,
+            num_samples=1,
+            noise_std=(1.0,),
+            risk="worst",
+        )
         held = judge.init(jax.random.key(0))._replace(plan=state.plan)
         costs[risk] = float(jit(judge.act)({}, held, START, envs, ())[2]["mean_cost"])
     assert costs["worst"] < 0.97 * costs["mean"]
@@ -269,9 +352,16 @@ def test_a_plan_is_shifted_by_the_time_that_has_passed():
     from sfkd_jax.control.planners._plans import shift
 
     plan = jnp.asarray([[0.0], [2.0], [4.0], [8.0]])
-    for elapsed, expected in ((0.0, [0, 2, 4, 8]), (1.0, [2, 4, 8, 8]), (0.5, [1, 3, 6, 8]), (9.0, [8, 8, 8, 8])):
+    for elapsed, expected in (
+        (0.0, [0, 2, 4, 8]),
+        (1.0, [2, 4, 8, 8]),
+        (0.5, [1, 3, 6, 8]),
+        (9.0, [8, 8, 8, 8]),
+    ):
         np.testing.assert_array_equal(shift(plan, jnp.asarray(elapsed))[:, 0], expected)
-    np.testing.assert_array_equal(shift(jnp.asarray([[3.0]]), jnp.asarray(1.0)), [[3.0]])
+    np.testing.assert_array_equal(
+        shift(jnp.asarray([[3.0]]), jnp.asarray(1.0)), [[3.0]]
+    )
 
 
 # ---- devices -------------------------------------------------------------------------------------------------------
@@ -297,9 +387,13 @@ PROGRAM = """
 
 
 def planned_on(devices):
-    flags = {"XLA_FLAGS": f"{os.environ['XLA_FLAGS']} --xla_force_host_platform_device_count={devices}"}
+    flags = {
+        "XLA_FLAGS": f"{os.environ['XLA_FLAGS']} --xla_force_host_platform_device_count={devices}"
+    }
     command = [sys.executable, "-c", textwrap.dedent(PROGRAM)]
-    done = subprocess.run(command, env=os.environ | flags, capture_output=True, text=True, check=False)
+    done = subprocess.run(
+        command, env=os.environ | flags, capture_output=True, text=True, check=False
+    )
     assert done.returncode == 0, done.stderr
     count, *plan = done.stdout.split()
     assert int(count) == devices
@@ -332,7 +426,9 @@ def test_the_same_plan_comes_out_on_one_two_and_eight_devices():
 )
 def test_settings_that_cannot_be_meant_are_refused_by_name(search, settings, words):
     with pytest.raises(ValueError, match=words):
-        SEARCHES[search](double_integrator(), horizon=HORIZON, **{"noise_std": (1.0,), **settings})
+        SEARCHES[search](
+            double_integrator(), horizon=HORIZON, **{"noise_std": (1.0,), **settings}
+        )
 
 
 @pytest.mark.parametrize(
@@ -349,6 +445,10 @@ def test_limits_that_cannot_be_meant_are_refused_by_name(limits, words):
 
 
 def test_a_reference_of_another_length_is_refused():
-    controller = control.mppi(double_integrator(), horizon=HORIZON, num_samples=4, noise_std=(1.0,))
+    controller = control.mppi(
+        double_integrator(), horizon=HORIZON, num_samples=4, noise_std=(1.0,)
+    )
     with pytest.raises(ValueError, match="12 steps"):
-        controller.act({}, controller.init(jax.random.key(0)), START, NOTHING, jnp.zeros((5, 2)))
+        controller.act(
+            {}, controller.init(jax.random.key(0)), START, NOTHING, jnp.zeros((5, 2))
+        )

@@ -1,4 +1,6 @@
-"""The safety filter: what it lets through, what it holds whatever is planned, and what it reports."""
+"""The safety filter: what it lets through, what it holds whatever is planned, and what
+it reports.
+"""
 
 from functools import cache, partial
 
@@ -26,12 +28,18 @@ B = np.asarray([[0.0, 0.0], [0.36, 0.0], [0.0, 0.1]])
 
 
 def toy():
-    """xi+ = A xi + B nu + (0, wind and curvature, v_ref / 10), in a latent whose unit depends on friction."""
+    """xi+ = A xi + B nu + (0, wind and curvature, v_ref / 10), in a latent whose unit
+    depends on friction.
+    """
 
     def step(env, latent, inputs):
-        push = jnp.stack([jnp.zeros(()), 2e-4 * env[1] + 0.3 * inputs[2], 0.1 * inputs[3]])
+        push = jnp.stack(
+            [jnp.zeros(()), 2e-4 * env[1] + 0.3 * inputs[2], 0.1 * inputs[3]]
+        )
         unit = 1.0 + env[0]
-        return unit * (jnp.asarray(A) @ (latent / unit) + jnp.asarray(B) @ inputs[:2] + push)
+        return unit * (
+            jnp.asarray(A) @ (latent / unit) + jnp.asarray(B) @ inputs[:2] + push
+        )
 
     return Model(
         init=lambda key: {},
@@ -49,7 +57,9 @@ def toy():
 TOY = toy()
 POWERS = [np.linalg.matrix_power(A, k)[0] for k in range(STEPS)]
 TUBE = 1.001 * float(sum(np.abs(row) @ DISTURBANCE for row in POWERS))
-"""The exact largest |e_y - copy's e_y| after `STEPS` disturbances within their bounds, and room for rounding."""
+"""The exact largest |e_y - copy's e_y| after `STEPS` disturbances within their bounds,
+and room for rounding.
+"""
 WORST = np.asarray([np.sign(row) * DISTURBANCE for row in reversed(POWERS)])
 """The disturbances that reach it at the last step."""
 
@@ -59,17 +69,31 @@ def circle(curvature=0.0, horizon=HORIZON, speed=SPEED):
     ahead = speed * 0.1 * jnp.arange(1, horizon + 1)
     half = 0.5 * curvature * ahead
     chord = ahead * jnp.sinc(half / jnp.pi)
-    return jnp.stack([chord * jnp.cos(half), chord * jnp.sin(half), 2 * half, jnp.full(horizon, speed)], axis=1)
+    return jnp.stack(
+        [
+            chord * jnp.cos(half),
+            chord * jnp.sin(half),
+            2 * half,
+            jnp.full(horizon, speed),
+        ],
+        axis=1,
+    )
 
 
 def scripted():
-    """A planner that adds params[k] to the law at step k, whatever that leads to; or params["script"][k]."""
+    """A planner that adds params[k] to the law at step k, whatever that leads to; or
+    params["script"][k].
+    """
 
     def act(params, k, observation, env, reference):
         script = params["script"] if isinstance(params, dict) else params
         curvature = curvature_ahead(reference)[0]
         xi = path_coordinates(observation, reference[0], curvature)
-        return LAW(xi, curvature, reference[0, 3], env) + script[k], k + 1, {"cost": jnp.zeros(())}
+        return (
+            LAW(xi, curvature, reference[0, 3], env) + script[k],
+            k + 1,
+            {"cost": jnp.zeros(())},
+        )
 
     return Controller(lambda key: jnp.zeros((), jnp.int32), act)
 
@@ -79,8 +103,18 @@ def filtered(**changes):
     return shielded(scripted(), TOY, LAW, **options | changes)
 
 
-def drive(controller, script, disturbances, start=(0.0, 0.0, SPEED), curvature=0.0, seen=None, envs=None):
-    """xi of the car before every step, controls and info; the plant is the toy, disturbed; `seen` is 1 or NaN."""
+def drive(
+    controller,
+    script,
+    disturbances,
+    start=(0.0, 0.0, SPEED),
+    curvature=0.0,
+    seen=None,
+    envs=None,
+):
+    """xi of the car before every step, controls and info; the plant is the toy,
+    disturbed; `seen` is 1 or NaN.
+    """
     reference = circle(curvature)
     count = len(disturbances)
     seen = jnp.ones(count) if seen is None else seen
@@ -89,14 +123,25 @@ def drive(controller, script, disturbances, start=(0.0, 0.0, SPEED), curvature=0
     def step(carry, inputs):
         xi, memory = carry
         disturbance, mask, env = inputs
-        action, memory, info = controller.act(script, memory, beside(xi) * mask, env, reference)
+        action, memory, info = controller.act(
+            script, memory, beside(xi) * mask, env, reference
+        )
         nu = action - LAW(xi, jnp.asarray(curvature), jnp.asarray(SPEED), env)
-        inputs = jnp.concatenate([nu, jnp.stack([jnp.asarray(curvature), jnp.asarray(SPEED)])])
-        after = TOY.decode(env, TOY.step(env, TOY.encode(env, path_state(xi)), inputs))[BODY] + disturbance
+        inputs = jnp.concatenate(
+            [nu, jnp.stack([jnp.asarray(curvature), jnp.asarray(SPEED)])]
+        )
+        after = (
+            TOY.decode(env, TOY.step(env, TOY.encode(env, path_state(xi)), inputs))[
+                BODY
+            ]
+            + disturbance
+        )
         return (after, memory), (xi, action, info)
 
     carry = (jnp.asarray(start), controller.init(jax.random.key(0)))
-    return jax.lax.scan(step, carry, (jnp.asarray(disturbances, dtype=float), seen, envs))[1]
+    return jax.lax.scan(
+        step, carry, (jnp.asarray(disturbances, dtype=float), seen, envs)
+    )[1]
 
 
 def scripts():
@@ -110,7 +155,9 @@ def scripts():
         "huge": np.tile([-1e6, 1e6], (STEPS, 1)),
         "random": noise.uniform(-3, 3, (STEPS, 2)) * LIMIT,
         "nan": np.full((STEPS, 2), np.nan),
-        "sometimes infinite": np.where(noise.random((STEPS, 1)) < 0.3, np.inf, resonant),
+        "sometimes infinite": np.where(
+            noise.random((STEPS, 1)) < 0.3, np.inf, resonant
+        ),
     }
 
 
@@ -120,7 +167,10 @@ def attacked():
     named = scripts()
     together = jnp.asarray(np.stack(list(named.values())), dtype=float)
     tracks = jit(jax.vmap(lambda script: drive(filtered(), script, WORST)))(together)
-    return {name: jax.tree.map(lambda leaf, k=k: np.asarray(leaf[k]), tracks) for k, name in enumerate(named)}
+    return {
+        name: jax.tree.map(lambda leaf, k=k: np.asarray(leaf[k]), tracks)
+        for k, name in enumerate(named)
+    }
 
 
 @pytest.mark.parametrize("name", scripts())
@@ -137,7 +187,9 @@ def test_car_and_copy_stay_in_their_corridors_whatever_is_planned(name):
 
 @pytest.mark.parametrize("name", scripts())
 def test_once_feasible_it_stays_feasible(name):
-    """The preview is constant, so that what the law does next has been looked at already."""
+    """The preview is constant, so that what the law does next has been looked at
+    already.
+    """
     _, _, info = attacked()[name]
     assert np.all(info["feasible"])
     assert np.all(info["margin"] >= 0.0)
@@ -162,8 +214,12 @@ def test_the_worst_disturbance_reaches_the_tube():
 def test_who_asks_for_nothing_or_for_little_is_left_alone(added):
     """The control is the planner's own to the last bit."""
     script, reference = jnp.tile(added * jnp.asarray(LIMIT), (40, 1)), circle()
-    xi, controls, info = jit(partial(drive, filtered()))(script, jnp.zeros((40, 3)), (0.05, 0.0, 8.0))
-    planned = jit(jax.vmap(lambda xi: scripted().act(script, 0, beside(xi), ENV, reference)[0]))(xi)
+    xi, controls, info = jit(partial(drive, filtered()))(
+        script, jnp.zeros((40, 3)), (0.05, 0.0, 8.0)
+    )
+    planned = jit(
+        jax.vmap(lambda xi: scripted().act(script, 0, beside(xi), ENV, reference)[0])
+    )(xi)
     np.testing.assert_array_equal(controls, planned)
     np.testing.assert_allclose(info["perturbation"], script, atol=1e-6)
     assert not np.any(info["intervention"])
@@ -181,21 +237,31 @@ def margin_of(xi, nu, road):
 
 
 ROAD = np.asarray([0.002, SPEED])
-admitted = jit(partial(admit, TOY, ENV, ahead=jnp.tile(jnp.asarray(ROAD), (HORIZON, 1)), width=WIDTH))
+admitted = jit(
+    partial(
+        admit, TOY, ENV, ahead=jnp.tile(jnp.asarray(ROAD), (HORIZON, 1)), width=WIDTH
+    )
+)
 
 
 def asked(xi, nu, limit=LIMIT):
     latent = 1.6 * jnp.asarray(xi, dtype=float)
-    return admitted(latent, jnp.asarray(nu, dtype=float), limit=jnp.asarray(limit, dtype=float))
+    return admitted(
+        latent, jnp.asarray(nu, dtype=float), limit=jnp.asarray(limit, dtype=float)
+    )
 
 
 def test_the_largest_share_that_keeps_the_copy_inside_is_admitted():
     random = np.random.default_rng(1)
     found = []
     for _ in range(100):
-        xi = np.asarray([random.uniform(0.6, 1.0) * WIDTH, random.uniform(-0.02, 0.02), SPEED])
+        xi = np.asarray(
+            [random.uniform(0.6, 1.0) * WIDTH, random.uniform(-0.02, 0.02), SPEED]
+        )
         nu = random.uniform(-1, 1, 2) * LIMIT
-        margins = np.asarray([margin_of(xi, share * nu, ROAD) for share in control.SHARES])
+        margins = np.asarray(
+            [margin_of(xi, share * nu, ROAD) for share in control.SHARES]
+        )
         if np.min(np.abs(margins)) < 1e-5 or np.max(margins) < 0:
             continue
         result = asked(xi, nu)
@@ -203,7 +269,9 @@ def test_the_largest_share_that_keeps_the_copy_inside_is_admitted():
         found.append(share)
         assert float(result.share) == share
         np.testing.assert_allclose(result.nu, share * nu, rtol=1e-6)
-        np.testing.assert_allclose(result.margin, margin_of(xi, share * nu, ROAD), atol=1e-6)
+        np.testing.assert_allclose(
+            result.margin, margin_of(xi, share * nu, ROAD), atol=1e-6
+        )
         assert bool(result.feasible)
     assert 1.0 in found
     assert 0.0 in found
@@ -213,13 +281,19 @@ def test_the_largest_share_that_keeps_the_copy_inside_is_admitted():
 def test_a_share_of_one_is_the_request_to_the_last_bit():
     nu = jnp.asarray([0.0123, -0.456])
     np.testing.assert_array_equal(asked([0.0, 0.0, SPEED], nu).nu, nu)
-    np.testing.assert_array_equal(asked([0.0, 0.0, SPEED], 100 * nu).nu, LIMIT * (1, -1))
+    np.testing.assert_array_equal(
+        asked([0.0, 0.0, SPEED], 100 * nu).nu, LIMIT * (1, -1)
+    )
 
 
 @pytest.mark.parametrize("side", [-1.0, 1.0])
 @pytest.mark.parametrize(("lateral", "enough"), [(0.15, True), (0.17, False)])
-def test_where_the_law_alone_leaves_the_corridor_the_copy_is_steered_back(lateral, enough, side):
-    """Turned outward near the edge: one step of the largest steering makes it good, or makes it better."""
+def test_where_the_law_alone_leaves_the_corridor_the_copy_is_steered_back(
+    lateral, enough, side
+):
+    """Turned outward near the edge: one step of the largest steering makes it good, or
+    makes it better.
+    """
     xi = np.asarray([side * lateral, side * 0.03, SPEED])
     alone, back = margin_of(xi, np.zeros(2), ROAD), -side * LIMIT * (1, 0)
     result = asked(xi, LIMIT * (side, 1.0))
@@ -244,7 +318,9 @@ def test_what_is_not_finite_is_never_applied():
 def test_the_corridor_is_reached_from_outside():
     """Infeasible at first and told so; the copy comes back and stays."""
     pushed = jnp.tile(jnp.asarray(LIMIT), (120, 1))
-    _, _, info = jit(partial(drive, filtered()))(pushed, jnp.zeros((120, 3)), (1.0, 0.0, SPEED))
+    _, _, info = jit(partial(drive, filtered()))(
+        pushed, jnp.zeros((120, 3)), (1.0, 0.0, SPEED)
+    )
     assert not bool(info["feasible"][0])
     assert not bool(info["shield_healthy"][0])
     assert np.all(info["feasible"][60:])
@@ -255,9 +331,13 @@ def test_a_second_without_observations_is_driven_by_the_copy():
     seen = jnp.ones(60).at[20:30].set(jnp.nan)
     disturbances = DISTURBANCE * np.random.default_rng(2).choice([-1.0, 1.0], (60, 3))
     resonant = jnp.asarray(scripts()["resonant"][:60], dtype=float)
-    xi, controls, info = jit(partial(drive, filtered()))(resonant, disturbances, seen=seen)
+    xi, controls, info = jit(partial(drive, filtered()))(
+        resonant, disturbances, seen=seen
+    )
     assert list(np.flatnonzero(info["dead_reckoning"])) == list(range(20, 30))
-    assert np.all(np.isnan(info["copy_distance"]) == ((np.arange(60) == 0) | ~np.isfinite(seen)))
+    assert np.all(
+        np.isnan(info["copy_distance"]) == ((np.arange(60) == 0) | ~np.isfinite(seen))
+    )
     assert not np.any(info["shield_healthy"][20:30])
     assert np.all(np.isfinite(controls))
     assert np.all(np.abs(info["copy"][:, 0]) <= WIDTH + 1e-6)
@@ -266,7 +346,9 @@ def test_a_second_without_observations_is_driven_by_the_copy():
 
 
 def test_a_switch_of_the_environment_moves_copy_and_car_alike():
-    """The latent is carried into the new fibre: its unit changes, its meaning does not. Gaps in e are bridged."""
+    """The latent is carried into the new fibre: its unit changes, its meaning does not.
+    Gaps in e are bridged.
+    """
     envs = jnp.tile(ENV, (40, 1)).at[10:].set(jnp.asarray([0.3, -6.0]))
     told = envs.at[20:25, 1].set(jnp.nan)
     controller = filtered()
@@ -280,13 +362,17 @@ def test_a_switch_of_the_environment_moves_copy_and_car_alike():
         distances.append(float(jnp.abs(xi - info["copy"])[0]))
         inside.append(bool(info["env_inside"]))
         inputs = jnp.concatenate([info["perturbation"], jnp.asarray([0.0, SPEED])])
-        xi = TOY.decode(envs[k], TOY.step(envs[k], TOY.encode(envs[k], path_state(xi)), inputs))[BODY]
+        xi = TOY.decode(
+            envs[k], TOY.step(envs[k], TOY.encode(envs[k], path_state(xi)), inputs)
+        )[BODY]
     assert max(distances) < 1e-6
     assert list(np.flatnonzero(~np.asarray(inside))) == list(range(20, 25))
 
 
 def test_a_car_that_the_bound_does_not_hold_for_is_told_and_followed():
-    """Pushed aside by 0.5 m: one breach, then the copy is where the car is; or without end if it is not moved."""
+    """Pushed aside by 0.5 m: one breach, then the copy is where the car is; or without
+    end if it is not moved.
+    """
     kick = np.zeros((20, 3))
     kick[9, 0] = 0.5
     for reanchor in (True, False):
@@ -321,7 +407,9 @@ def test_outside_a_box_the_law_drives_alone(box, value):
         _, _, info = act(wanted, memory, beside(jnp.asarray(start)), ENV, circle(0.002))
         assert bool(info["void"]) == bool(options)
         assert bool(info["shield_healthy"]) != bool(options)
-        np.testing.assert_allclose(info["perturbation"], 0 * LIMIT if options else wanted[0], atol=1e-6)
+        np.testing.assert_allclose(
+            info["perturbation"], 0 * LIMIT if options else wanted[0], atol=1e-6
+        )
         assert float(info["intervention"]) == float(bool(options))
         assert bool(info["env_inside"]) == (box != "env_high" or not options)
 
@@ -331,12 +419,35 @@ def test_before_anything_is_seen_the_planner_passes_within_the_limits():
     act, memory = jit(controller.act), controller.init(jax.random.key(0))
     xi, reference = beside(jnp.asarray([0.1, 0.0, SPEED])), circle()
     silent = Controller(lambda key: (), lambda params, *rest: (params, (), {}))
-    blind = shielded(silent, TOY, LAW, width=1.0, tube=1.0, control_low=(-0.4, 0.5), control_high=HIGH)
-    for seen in ((xi * jnp.nan, ENV, reference), (xi, ENV * jnp.nan, reference), (xi, ENV, reference * jnp.nan)):
-        for planned, passed in (([0.1, 0.7], [0.1, 0.7]), ([9.0, 0.7], [0.4, 0.7]), ([np.nan, 1.0], [0.0, 0.5])):
-            action, after, info = jit(blind.act)(jnp.asarray(planned), blind.init(jax.random.key(0)), *seen)
+    blind = shielded(
+        silent,
+        TOY,
+        LAW,
+        width=1.0,
+        tube=1.0,
+        control_low=(-0.4, 0.5),
+        control_high=HIGH,
+    )
+    for seen in (
+        (xi * jnp.nan, ENV, reference),
+        (xi, ENV * jnp.nan, reference),
+        (xi, ENV, reference * jnp.nan),
+    ):
+        for planned, passed in (
+            ([0.1, 0.7], [0.1, 0.7]),
+            ([9.0, 0.7], [0.4, 0.7]),
+            ([np.nan, 1.0], [0.0, 0.5]),
+        ):
+            action, after, info = jit(blind.act)(
+                jnp.asarray(planned), blind.init(jax.random.key(0)), *seen
+            )
             np.testing.assert_allclose(action, passed)
-            assert not bool(after.copy.started | info["feasible"] | info["void"] | info["shield_healthy"])
+            assert not bool(
+                after.copy.started
+                | info["feasible"]
+                | info["void"]
+                | info["shield_healthy"]
+            )
             assert np.isnan(float(info["margin"]))
         _, memory, _ = act(jnp.zeros((9, 2)), memory, *seen)
     _, memory, info = act(jnp.zeros((9, 2)), memory, xi, ENV, reference)
@@ -352,24 +463,34 @@ def test_without_a_reference_the_last_preview_is_driven_on():
     ahead = memory.copy.ahead
     action, memory, info = act(jnp.zeros((9, 2)), memory, xi, ENV, reference * jnp.nan)
     np.testing.assert_allclose(memory.copy.ahead, ahead, atol=1e-5)
-    np.testing.assert_allclose(action, LAW(info["copy"], jnp.asarray(0.01), jnp.asarray(SPEED), ENV), atol=1e-5)
+    np.testing.assert_allclose(
+        action, LAW(info["copy"], jnp.asarray(0.01), jnp.asarray(SPEED), ENV), atol=1e-5
+    )
     assert bool(info["dead_reckoning"])
 
 
 def test_where_law_and_planner_are_at_the_same_limit_nothing_was_asked_for():
-    """A law beyond its limit gives the limit; the copy, whose law is as strong, must not be told a perturbation."""
+    """A law beyond its limit gives the limit; the copy, whose law is as strong, must
+    not be told a perturbation.
+    """
     controller = filtered(control_high=(0.05, 5.0), width=5.0)
     start = beside(jnp.asarray([-3.0, -0.2, SPEED]))
-    _, _, info = jit(controller.act)(jnp.zeros((9, 2)), controller.init(jax.random.key(0)), start, ENV, circle())
+    _, _, info = jit(controller.act)(
+        jnp.zeros((9, 2)), controller.init(jax.random.key(0)), start, ENV, circle()
+    )
     np.testing.assert_array_equal(info["perturbation"][0], 0.0)
     assert float(info["intervention"]) == 0.0
 
 
 def test_it_is_exported_in_a_scan_and_does_as_call_by_call():
-    """A tiny SFKD as it is drawn, a switch of e and one that cannot be read; jit and vmap are in the contracts."""
+    """A tiny SFKD as it is drawn, a switch of e and one that cannot be read; jit and
+    vmap are in the contracts.
+    """
     model = models.sfkd(path_space(), **TINY | {"budget": "joint"}, frame="path")
     params = jit(lambda key: model.fold(model.init(key)))(jax.random.key(0))
-    controller = shielded(scripted(), model, LAW, width=0.5, tube=0.3, control_low=LOW, control_high=HIGH)
+    controller = shielded(
+        scripted(), model, LAW, width=0.5, tube=0.3, control_low=LOW, control_high=HIGH
+    )
     envs = jnp.asarray([[0.6, 2.0], [0.6, 2.0], [0.4, -5.0], [jnp.nan, 0.0]])
     xi, reference = beside(jnp.asarray([0.2, 0.01, SPEED])), circle(0.003, horizon=6)
     asked = jnp.asarray(scripts()["random"][:4], dtype=float)
@@ -388,7 +509,12 @@ def test_it_is_exported_in_a_scan_and_does_as_call_by_call():
     for env in envs:
         memory, out = call(memory, env)
         called.append(out)
-    assert same(scanned, jax.tree.map(lambda *leaves: jnp.stack(leaves), *called), rtol=1e-4, atol=1e-4)
+    assert same(
+        scanned,
+        jax.tree.map(lambda *leaves: jnp.stack(leaves), *called),
+        rtol=1e-4,
+        atol=1e-4,
+    )
     assert np.all(np.isfinite(scanned[1]["margin"]))
     assert call._cache_size() == 1
 
@@ -403,9 +529,15 @@ def test_it_is_exported_in_a_scan_and_does_as_call_by_call():
         ({"horizon": 0}, "horizon must be at least 1"),
         ({"noise_allowance": -0.1}, "noise_allowance must be finite and not negative"),
         ({"control_low": (0.5, -5.0)}, "control_low must lie below control_high"),
-        ({"env_low": (0.9, 0.0), "env_high": (0.3, 1.0)}, "env_low must lie below env_high"),
+        (
+            {"env_low": (0.9, 0.0), "env_high": (0.3, 1.0)},
+            "env_low must lie below env_high",
+        ),
         ({"state_low": (0.0,)}, "state_low must lie below state_high, 3 entries each"),
-        ({"preview_high": (float("nan"), 1.0)}, "preview_low must lie below preview_high"),
+        (
+            {"preview_high": (float("nan"), 1.0)},
+            "preview_low must lie below preview_high",
+        ),
         ({"limit": (-0.03, 1.0)}, "limit_low must lie below limit_high"),
     ],
 )
@@ -417,23 +549,51 @@ def test_settings_that_cannot_be_meant_are_refused_in_one_line(changes, line):
 
 def test_a_model_of_the_world_and_an_environment_of_another_size_are_refused():
     with pytest.raises(ValueError, match=r"model\.frame=path"):
-        shielded(scripted(), tiny(), LAW, width=1.0, tube=1.0, control_low=LOW, control_high=HIGH)
+        shielded(
+            scripted(),
+            tiny(),
+            LAW,
+            width=1.0,
+            tube=1.0,
+            control_low=LOW,
+            control_high=HIGH,
+        )
     controller = filtered()
-    memory, xi = controller.init(jax.random.key(0)), beside(jnp.asarray([0.0, 0.0, SPEED]))
+    memory, xi = (
+        controller.init(jax.random.key(0)),
+        beside(jnp.asarray([0.0, 0.0, SPEED])),
+    )
     with pytest.raises(ValueError, match=r"env must have shape \(2,\), got \(3,\)"):
         controller.act(jnp.zeros((9, 2)), memory, xi, jnp.zeros(3), circle())
 
 
 def test_the_box_of_a_certificate_holds_its_corridor(monkeypatch):
-    """A data set that strayed to one side only must not make the other side of the corridor void."""
-    corridor = {"bounds": {"nominal": 0.08, "followed_position": 0.06}, "corridor_m": 0.14, "shield_horizon": 20}
+    """A data set that strayed to one side only must not make the other side of the
+    corridor void.
+    """
+    corridor = {
+        "bounds": {"nominal": 0.08, "followed_position": 0.06},
+        "corridor_m": 0.14,
+        "shield_horizon": 20,
+    }
     corridor["class"] = {"sensor_noise": [0.01, 0.01, 0.002]}
-    boxes = {"state": [[-0.05, -0.1, 7.0], [0.4, 0.1, 11.0]], "env": [[0.3, -8.0], [0.9, 8.0]]}
+    boxes = {
+        "state": [[-0.05, -0.1, 7.0], [0.4, 0.1, 11.0]],
+        "env": [[0.3, -8.0], [0.9, 8.0]],
+    }
     boxes["control"] = [[-0.03, -1.0, -0.02, 8.0], [0.03, 1.0, 0.02, 10.0]]
     made = {}
-    monkeypatch.setattr(control, "shielded", lambda inner, *_, **options: made.update(options) or inner)
-    build.in_corridor(scripted(), TOY, kinematic(), LAW, {"corridor": corridor, "boxes": boxes})
+    monkeypatch.setattr(
+        control, "shielded", lambda inner, *_, **options: made.update(options) or inner
+    )
+    build.in_corridor(
+        scripted(), TOY, kinematic(), LAW, {"corridor": corridor, "boxes": boxes}
+    )
     assert made["state_low"] == (pytest.approx(-0.17), -0.1, 7.0)
     assert made["state_high"] == (0.4, 0.1, 11.0)
     assert boxes["state"][0][0] == -0.05
-    assert (made["width"], made["tube"], made["noise_allowance"]) == (0.08, 0.06, pytest.approx(0.03))
+    assert (made["width"], made["tube"], made["noise_allowance"]) == (
+        0.08,
+        0.06,
+        pytest.approx(0.03),
+    )

@@ -1,4 +1,6 @@
-"""Savitzky-Golay smoothing: the filter from its definition, and what the planner does with it."""
+"""Savitzky-Golay smoothing: the filter from its definition, and what the planner does
+with it.
+"""
 
 from fractions import Fraction
 from functools import cache, partial
@@ -20,7 +22,10 @@ OFFSET = np.float32([0.0, 0.3, 0.0, 10.0])
 ENV = np.float32([0.7, 3.0])
 REFERENCE = straight(HORIZON)
 WINDOWS = [(5, 2), (5, 0), (7, 3), (3, 1), (9, 4)]
-LAWS = {"feedback": control.path_feedback(wheelbase=PLANT.wheelbase), "plain": control.no_feedback()}
+LAWS = {
+    "feedback": control.path_feedback(wheelbase=PLANT.wheelbase),
+    "plain": control.no_feedback(),
+}
 
 
 # ---- the filter --------------------------------------------------------------------------------------------------
@@ -36,14 +41,18 @@ LAWS = {"feedback": control.path_feedback(wheelbase=PLANT.wheelbase), "plain": c
         (3, 1, [1, 1, 1], 3),
     ],
 )
-def test_the_filter_has_the_published_coefficients_exactly(window, order, numerators, denominator):
+def test_the_filter_has_the_published_coefficients_exactly(
+    window, order, numerators, denominator
+):
     centre = control.savitzky_golay_weights(window=window, order=order)[window // 2]
     assert centre == [Fraction(numerator, denominator) for numerator in numerators]
 
 
 @pytest.mark.parametrize(("window", "order"), WINDOWS)
 def test_the_fit_is_the_orthogonal_projection_onto_polynomials(window, order):
-    """H = Hᵀ = H² with trace order + 1, and every power up to the order is left as it is; in exact arithmetic."""
+    """H = Hᵀ = H² with trace order + 1, and every power up to the order is left as it
+    is; in exact arithmetic.
+    """
     fit = np.array(control.savitzky_golay_weights(window=window, order=order))
     points = np.array([Fraction(i - window // 2) for i in range(window)])
     assert np.all(fit == fit.T)
@@ -60,22 +69,33 @@ def test_a_plan_is_smoothed_as_the_record_that_it_continues(window, order):
     record = np.random.default_rng(0).standard_normal((half + 12, 2))
     smooth = control.plan_smoother(horizon=12, window=window, order=order)
     expected = savgol_filter(record, window, order, axis=0, mode="interp")[half:]
-    np.testing.assert_allclose(smooth(jnp.asarray(record[:half]), jnp.asarray(record[half:])), expected, atol=2e-6)
+    np.testing.assert_allclose(
+        smooth(jnp.asarray(record[:half]), jnp.asarray(record[half:])),
+        expected,
+        atol=2e-6,
+    )
 
 
 @pytest.mark.parametrize(("window", "horizon"), [(5, 3), (5, 6), (9, 5), (9, 20)])
 @pytest.mark.parametrize("order", [0, 1, 2])
 def test_a_polynomial_that_continues_the_past_stays_what_it_is(window, horizon, order):
-    """Also for the shortest horizon of a window. One order more is bent, and so is the same plan after another past."""
+    """Also for the shortest horizon of a window. One order more is bent, and so is the
+    same plan after another past.
+    """
     half = window // 2
     smooth = control.plan_smoother(horizon=horizon, window=window, order=order)
     times = np.linspace(-1.0, 1.0, half + horizon)[:, None]
 
     def change(record, past=None):
-        smoothed = smooth(jnp.asarray(record[:half] if past is None else past), jnp.asarray(record[half:]))
+        smoothed = smooth(
+            jnp.asarray(record[:half] if past is None else past),
+            jnp.asarray(record[half:]),
+        )
         return np.max(np.abs(smoothed - record[half:]))
 
-    kept = np.sum([(k + 1) * np.hstack([times, -times]) ** k for k in range(order + 1)], axis=0)
+    kept = np.sum(
+        [(k + 1) * np.hstack([times, -times]) ** k for k in range(order + 1)], axis=0
+    )
     assert change(kept) < 1e-5
     assert change(kept + times ** (order + 1)) > 1e-3
     assert change(kept, np.zeros((half, 2))) > 1e-2
@@ -92,7 +112,10 @@ def test_a_plan_without_a_filter_is_the_same_array():
         ({"smoothing_window": 4}, "odd"),
         ({"smoothing_window": 1}, "at least 3"),
         ({"smoothing_window": -5}, "at least 3"),
-        ({"smoothing_window": 5, "smoothing_order": 4}, r"smoothing_order must lie in \[0, 3\]"),
+        (
+            {"smoothing_window": 5, "smoothing_order": 4},
+            r"smoothing_order must lie in \[0, 3\]",
+        ),
         ({"smoothing_window": 5, "smoothing_order": -1}, "smoothing_order"),
         ({"smoothing_window": 13}, "horizon of at least 7"),
     ],
@@ -106,11 +129,18 @@ def test_filters_that_cannot_be_meant_are_refused(settings, words):
 
 
 def planner(law, **settings):
-    settings = {"num_samples": 16, "horizon": HORIZON, "smoothing_window": 5, **settings}
+    settings = {
+        "num_samples": 16,
+        "horizon": HORIZON,
+        "smoothing_window": 5,
+        **settings,
+    }
     box = {"env_low": ENV_LOW, "env_high": ENV_HIGH}
     cost = control.tracking_cost(dt=0.1)
     limits = {name: settings.pop(name, LIMITS[name]) for name in LIMITS}
-    task = control.path_tracking(models.physics(PLANT.nominal), cost, LAWS[law], dt=0.1, **limits)
+    task = control.path_tracking(
+        models.physics(PLANT.nominal), cost, LAWS[law], dt=0.1, **limits
+    )
     return control.mppi(task, **settings, **box)
 
 
@@ -129,33 +159,53 @@ def started(law="plain", **settings):
 
 
 def test_the_chosen_plan_is_the_weighted_one_smoothed_after_what_was_applied():
-    """The planner without a filter, given the same state, tells what was to be smoothed; no limit is in the way."""
+    """The planner without a filter, given the same state, tells what was to be
+    smoothed; no limit is in the way.
+    """
     _, state, _ = act(started(**WIDE), **WIDE)
     _, state, _ = act(state, **WIDE)
     _, smoothed, _ = act(state, **WIDE)
-    _, rough, _ = act(state._replace(past=jnp.zeros((0, 2))), smoothing_window=0, **WIDE)
-    chosen, raw = (np.concatenate([after.previous[None], after.plan[:-1]]) for after in (smoothed, rough))
+    _, rough, _ = act(
+        state._replace(past=jnp.zeros((0, 2))), smoothing_window=0, **WIDE
+    )
+    chosen, raw = (
+        np.concatenate([after.previous[None], after.plan[:-1]])
+        for after in (smoothed, rough)
+    )
     record = np.concatenate([state.past, raw])
-    np.testing.assert_allclose(chosen, savgol_filter(record, 5, 2, axis=0, mode="interp")[2:], atol=1e-5)
+    np.testing.assert_allclose(
+        chosen, savgol_filter(record, 5, 2, axis=0, mode="interp")[2:], atol=1e-5
+    )
     assert np.max(np.abs(chosen - raw)) > 1e-2
 
 
-@pytest.mark.parametrize(("offset", "noise_std"), [(0.3, (0.06, 0.6)), (5.0, (1e3, 1e3))])
-def test_the_past_is_what_was_applied_within_the_limits_and_through_a_blackout(offset, noise_std):
+@pytest.mark.parametrize(
+    ("offset", "noise_std"), [(0.3, (0.06, 0.6)), (5.0, (1e3, 1e3))]
+)
+def test_the_past_is_what_was_applied_within_the_limits_and_through_a_blackout(
+    offset, noise_std
+):
     """Around nothing, perturbations are controls. Before the first step there was none.
 
-    From 5 m off the path the best plan is at its limits, and the filter overshoots where it begins.
+    From 5 m off the path the best plan is at its limits, and the filter overshoots
+    where it begins.
     """
     low, high = np.float32(PLANT.control_low), np.float32(PLANT.control_high)
     state, applied = started(noise_std=noise_std), [np.zeros(2), np.zeros(2)]
     for step in range(7):
         np.testing.assert_array_equal(state.past, applied[-2:])
-        seen = np.full(4, np.nan, np.float32) if step in (3, 4) else np.float32([0, offset, 0, 10])
+        seen = (
+            np.full(4, np.nan, np.float32)
+            if step in (3, 4)
+            else np.float32([0, offset, 0, 10])
+        )
         action, state, info = act(state, observation=seen, noise_std=noise_std)
         assert bool(info["healthy"]) == (step not in (3, 4))
         assert np.all((low <= action) & (action <= high))
         assert np.all((low <= state.controls) & (state.controls <= high))
-        np.testing.assert_array_equal(state.plan, state.controls)  # clipped, so that no plan leaves the limits
+        np.testing.assert_array_equal(
+            state.plan, state.controls
+        )  # clipped, so that no plan leaves the limits
         applied.append(action)
     assert bool(np.any(np.array(applied) == low)) == (offset == 5.0)
     assert np.all(np.array(applied)[2:] != 0)
@@ -164,10 +214,18 @@ def test_the_past_is_what_was_applied_within_the_limits_and_through_a_blackout(o
 def test_around_a_feedback_law_the_past_is_what_was_added_to_it():
     curvature = control.reference_curvature(REFERENCE)[0]
     state = started("feedback")
-    for offset in (0.3, -0.2, 5.0):  # the last one is beyond what the actuators can do about it
+    for offset in (
+        0.3,
+        -0.2,
+        5.0,
+    ):  # the last one is beyond what the actuators can do about it
         seen = jnp.asarray([0.0, offset, 0.1, 9.0])
         action, state, _ = act(state, "feedback", seen)
-        lawful = LAWS["feedback"](control.path_errors(seen, REFERENCE[0], curvature), curvature, REFERENCE[0, 3])
+        lawful = LAWS["feedback"](
+            control.path_errors(seen, REFERENCE[0], curvature),
+            curvature,
+            REFERENCE[0, 3],
+        )
         np.testing.assert_allclose(state.past[-1], action - lawful, atol=1e-6)
 
 
@@ -175,7 +233,9 @@ def test_what_is_predicted_is_the_drive_of_the_smoothed_plan():
     _, state, info = act(started())
     _, state, info = act(state)
     reached, step = OFFSET, jit(PLANT.nominal)
-    for action, predicted in zip([state.previous, *state.controls[:-1]], info["predicted_states"], strict=True):
+    for action, predicted in zip(
+        [state.previous, *state.controls[:-1]], info["predicted_states"], strict=True
+    ):
         reached = step(reached, action, ENV)
         np.testing.assert_allclose(predicted, reached, atol=1e-5)
 
@@ -195,10 +255,18 @@ def test_a_smoothed_plan_steers_more_calmly_and_still_reaches_the_path():
     )
     keys, rates = jax.random.split(jax.random.key(0), 4), {}
     for window in (0, 5):
-        controller = planner("plain", num_samples=64, noise_std=(0.06, 0.6), smoothing_window=window)
-        drive = partial(evaluation.simulate, PLANT.nominal, controller, {}, dt=0.1, horizon=HORIZON)
-        episodes = jax.tree.map(np.asarray, jit(jax.vmap(drive, in_axes=(None, 0)))(road, keys))
+        controller = planner(
+            "plain", num_samples=64, noise_std=(0.06, 0.6), smoothing_window=window
+        )
+        drive = partial(
+            evaluation.simulate, PLANT.nominal, controller, {}, dt=0.1, horizon=HORIZON
+        )
+        episodes = jax.tree.map(
+            np.asarray, jit(jax.vmap(drive, in_axes=(None, 0)))(road, keys)
+        )
         assert np.all(np.abs(episodes.lateral[:, -20:]) < 0.1)
         assert np.all(episodes.healthy)
-        rates[window] = np.mean(np.abs(np.diff(episodes.controls[:, :, 0], axis=1)), axis=1)
+        rates[window] = np.mean(
+            np.abs(np.diff(episodes.controls[:, :, 0], axis=1)), axis=1
+        )
     assert np.all(rates[5] < 0.8 * rates[0])

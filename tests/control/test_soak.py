@@ -19,13 +19,17 @@ RELEASE = 10
 
 @cache
 def driven():
-    """The loop, which fault there is at each step, and (controls, distance, lost, healthy, entries not finite)."""
+    """The loop, which fault there is at each step, and (controls, distance, lost,
+    healthy, entries not finite).
+    """
     with pytest.MonkeyPatch.context() as patch:
         patch.syspath_prepend(str(Path(__file__).parents[2] / "benchmarks"))
         faults, faulty_road = import_module("faults"), import_module("faulty_road")
         patch.setattr(faults, "PAUSE", (2 * RELEASE + 2, 40))
         loop = faulty_road.track("kinematic", samples=8, steps=STEPS)
-        road = jit(lambda key: loop.road(key, np.random.default_rng(1)))(jax.random.key(0))
+        road = jit(lambda key: loop.road(key, np.random.default_rng(1)))(
+            jax.random.key(0)
+        )
 
     @jit
     def run(key):
@@ -33,7 +37,13 @@ def driven():
             world, told, state = carry
             control, state, info = loop.act(loop.params, state, told)
             world, lateral, lost = loop.advance(road, world, control)
-            record = control, lateral, lost, info["healthy"], faulty_road.not_finite(state)
+            record = (
+                control,
+                lateral,
+                lost,
+                info["healthy"],
+                faulty_road.not_finite(state),
+            )
             return (*loop.sense(road, world), state), record
 
         start = (*loop.sense(road, loop.enter(road)), loop.init(key))

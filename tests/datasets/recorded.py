@@ -8,14 +8,18 @@ WHEELBASE = 2.7
 
 
 def drive(seconds=30.0, period=0.1, phase=0.0):
-    """Columns of a drive along v = 5 + sin 0.7 t, yaw = 0.9 sin 0.4 t; positions by fine quadrature."""
+    """Columns of a drive along v = 5 + sin 0.7 t, yaw = 0.9 sin 0.4 t; positions by
+    fine quadrature.
+    """
     fine = 20
     t = np.arange(round(seconds / period) * fine + 1) * (period / fine)
     speed, yaw = 5 + np.sin(0.7 * t + phase), 0.9 * np.sin(0.4 * t + phase)
     rate = 0.36 * np.cos(0.4 * t + phase)
 
     def integral(values):
-        return np.concatenate([[0.0], np.cumsum(0.5 * (values[1:] + values[:-1]) * (period / fine))])
+        return np.concatenate(
+            [[0.0], np.cumsum(0.5 * (values[1:] + values[:-1]) * (period / fine))]
+        )
 
     columns = {
         "t": t,
@@ -24,8 +28,14 @@ def drive(seconds=30.0, period=0.1, phase=0.0):
         "yaw": yaw,
         "v": speed,
     }
-    columns |= {"steering": np.arctan(WHEELBASE * rate / speed), "acceleration": 0.7 * np.cos(0.7 * t + phase)}
-    columns |= {"friction": 0.6 + 0.2 * np.sin(0.1 * t), "wind": 4.0 * np.sin(0.5 * t + phase)}
+    columns |= {
+        "steering": np.arctan(WHEELBASE * rate / speed),
+        "acceleration": 0.7 * np.cos(0.7 * t + phase),
+    }
+    columns |= {
+        "friction": 0.6 + 0.2 * np.sin(0.1 * t),
+        "wind": 4.0 * np.sin(0.5 * t + phase),
+    }
     return {name: values[::fine] for name, values in columns.items()}
 
 

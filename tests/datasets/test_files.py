@@ -1,4 +1,6 @@
-"""Logs of one's own: what is read comes out as it was, and what cannot be right is told in one line with its row."""
+"""Logs of one's own: what is read comes out as it was, and what cannot be right is told
+in one line with its row.
+"""
 
 import re
 import sys
@@ -32,17 +34,22 @@ def together(dataset):
     """Every segment of a data set, whatever part it went to."""
     parts = (dataset.train, dataset.validation, dataset.calibration, dataset.test)
     return [
-        np.concatenate([np.asarray(getattr(part, name)) for part in parts]) for name in ("states", "controls", "envs")
+        np.concatenate([np.asarray(getattr(part, name)) for part in parts])
+        for name in ("states", "controls", "envs")
     ]
 
 
 def expected(columns, steps=STEPS):
     """The same drive cut by hand: positions from the segment's first."""
     rows = [slice(k, k + steps + 1) for k in range(0, len(columns["t"]) - steps, steps)]
-    states = np.stack([np.column_stack([columns[name] for name in STATE])[row] for row in rows])
+    states = np.stack(
+        [np.column_stack([columns[name] for name in STATE])[row] for row in rows]
+    )
     states[..., :2] -= states[:, :1, :2]
     cut = [
-        np.stack([np.column_stack([columns[n] for n in names])[row][:-1] for row in rows])
+        np.stack(
+            [np.column_stack([columns[n] for n in names])[row][:-1] for row in rows]
+        )
         for names in (NAMES[5:7], NAMES[7:])
     ]
     return [part.astype(np.float32) for part in (states, *cut)]
@@ -50,8 +57,13 @@ def expected(columns, steps=STEPS):
 
 def same_segments(found, wanted):
     """Whether two sets of segments are the same in some order, to the last bit."""
-    order = [np.lexsort(part[0].reshape(len(part[0]), -1).T) for part in (found, wanted)]
-    return all(np.array_equal(a[order[0]], b[order[1]]) for a, b in zip(found, wanted, strict=True))
+    order = [
+        np.lexsort(part[0].reshape(len(part[0]), -1).T) for part in (found, wanted)
+    ]
+    return all(
+        np.array_equal(a[order[0]], b[order[1]])
+        for a, b in zip(found, wanted, strict=True)
+    )
 
 
 @pytest.mark.parametrize("separator", [",", ";", "\t", " "])
@@ -64,17 +76,23 @@ def test_a_drive_comes_back_from_csv_to_the_last_bit(tmp_path, separator):
 def test_a_drive_comes_back_from_npz_to_the_last_bit(tmp_path):
     columns = drive()
     write_npz(tmp_path / "a.npz", columns | {"camera": np.zeros((3, 4))})
-    assert same_segments(together(read(tmp_path / "a.npz")[0].dataset), expected(columns))
+    assert same_segments(
+        together(read(tmp_path / "a.npz")[0].dataset), expected(columns)
+    )
 
 
 def test_whole_drives_as_x_u_e_come_back_to_the_last_bit(tmp_path):
     drives = [drive(seconds=1.0, phase=0.3 * k) for k in range(12)]
     x, u, e = (
-        np.stack([np.column_stack([one[name] for name in names])[:end] for one in drives])
+        np.stack(
+            [np.column_stack([one[name] for name in names])[:end] for one in drives]
+        )
         for names, end in ((STATE, None), (NAMES[5:7], -1), (NAMES[7:], -1))
     )
     np.savez(tmp_path / "a.npz", x=x, u=u, e=e)
-    wanted = [np.concatenate(parts) for parts in zip(*map(expected, drives), strict=True)]
+    wanted = [
+        np.concatenate(parts) for parts in zip(*map(expected, drives), strict=True)
+    ]
     logged, said = read(tmp_path / "a.npz")
     assert same_segments(together(logged.dataset), wanted)
     assert not [line for line in said if "too few drives" in line]
@@ -91,16 +109,39 @@ def test_a_drive_comes_back_from_parquet_to_the_last_bit(tmp_path):
 def test_parquet_without_its_package_names_the_extra(tmp_path, monkeypatch):
     monkeypatch.setitem(sys.modules, "pyarrow", None)
     (tmp_path / "a.parquet").write_bytes(b"PAR1")
-    assert refusal(tmp_path).endswith('a.parquet: parquet files need pyarrow: pip install "sfkd-jax[parquet]"')
+    assert refusal(tmp_path).endswith(
+        'a.parquet: parquet files need pyarrow: pip install "sfkd-jax[parquet]"'
+    )
 
 
 def test_other_names_are_mapped(tmp_path):
     columns = drive()
     names = dict(
-        zip(NAMES, ("time", "x", "y", "heading", "speed", "delta", "throttle", "mu", "side wind"), strict=True)
+        zip(
+            NAMES,
+            (
+                "time",
+                "x",
+                "y",
+                "heading",
+                "speed",
+                "delta",
+                "throttle",
+                "mu",
+                "side wind",
+            ),
+            strict=True,
+        )
     )
-    write_csv(tmp_path / "a.csv", {names[name]: values for name, values in columns.items()})
-    mapped = Columns("time", ("x", "y", "heading", "speed"), ("delta", "throttle"), ("mu", "side wind"))
+    write_csv(
+        tmp_path / "a.csv", {names[name]: values for name, values in columns.items()}
+    )
+    mapped = Columns(
+        "time",
+        ("x", "y", "heading", "speed"),
+        ("delta", "throttle"),
+        ("mu", "side wind"),
+    )
     assert same_segments(together(read(tmp_path, mapped)[0].dataset), expected(columns))
 
 
@@ -109,27 +150,40 @@ def test_a_column_tells_drives_in_one_file_apart(tmp_path):
     joined = {name: np.concatenate([one[name] for one in drives]) for name in NAMES}
     labels = np.repeat(np.arange(8), 51)
     write_csv(tmp_path / "a.csv", joined | {"run": labels})
-    wanted = [np.concatenate(parts) for parts in zip(*map(expected, drives), strict=True)]
-    assert same_segments(together(read(tmp_path, Columns(drive="run"))[0].dataset), wanted)
+    wanted = [
+        np.concatenate(parts) for parts in zip(*map(expected, drives), strict=True)
+    ]
+    assert same_segments(
+        together(read(tmp_path, Columns(drive="run"))[0].dataset), wanted
+    )
 
 
 def test_an_unknown_environment_becomes_a_constant(tmp_path):
-    columns = {name: values for name, values in drive().items() if name not in NAMES[7:]}
+    columns = {
+        name: values for name, values in drive().items() if name not in NAMES[7:]
+    }
     write_csv(tmp_path / "a.csv", columns)
     logged, _ = read(tmp_path, told=False)
     assert together(logged.dataset)[2].shape == (30, STEPS, 2)
     assert not together(logged.dataset)[2].any()
     assert logged.coverage["environment"] == {}
-    assert np.all(np.asarray(logged.dataset.env_high) >= 1e6)  # nothing that is told can be outside
+    assert np.all(
+        np.asarray(logged.dataset.env_high) >= 1e6
+    )  # nothing that is told can be outside
 
 
 @pytest.mark.parametrize("period", [0.01, 0.03, 0.04])
 def test_resampling_interpolates_states_and_holds_controls(tmp_path, period):
     recorded = drive(period=period)
-    recorded["yaw"] = np.mod(recorded["yaw"] + 3.0 + np.pi, 2 * np.pi) - np.pi  # wraps around at ±π
+    recorded["yaw"] = (
+        np.mod(recorded["yaw"] + 3.0 + np.pi, 2 * np.pi) - np.pi
+    )  # wraps around at ±π
     turned = np.cos(3.0), np.sin(3.0)
     x, y = recorded["p_x"], recorded["p_y"]
-    recorded |= {"p_x": turned[0] * x - turned[1] * y, "p_y": turned[1] * x + turned[0] * y}
+    recorded |= {
+        "p_x": turned[0] * x - turned[1] * y,
+        "p_y": turned[1] * x + turned[0] * y,
+    }
     write_csv(tmp_path / "a.csv", recorded)
     states, controls, _ = together(read(tmp_path)[0].dataset)
     t = recorded["t"]
@@ -137,26 +191,40 @@ def test_resampling_interpolates_states_and_holds_controls(tmp_path, period):
     speed = np.sort(np.interp(moments, t, recorded["v"]).astype(np.float32))
     np.testing.assert_allclose(np.sort(states[:, :-1, 3].ravel()), speed, rtol=1e-6)
     held = recorded["steering"][np.searchsorted(t, moments + 1e-9, side="right") - 1]
-    np.testing.assert_array_equal(np.sort(controls[..., 0].ravel()), np.sort(held.astype(np.float32)))
+    np.testing.assert_array_equal(
+        np.sort(controls[..., 0].ravel()), np.sort(held.astype(np.float32))
+    )
     steps = np.diff(states[..., 2], axis=1)
-    assert np.abs(steps).max() < 0.37 * DT  # |d yaw / dt| ≤ 0.36: no turn by 2π between two moments
+    assert (
+        np.abs(steps).max() < 0.37 * DT
+    )  # |d yaw / dt| ≤ 0.36: no turn by 2π between two moments
 
 
 def test_a_gap_splits_a_drive_and_nothing_is_invented_in_it(tmp_path):
     columns = drive()
     kept = (columns["t"] <= 10.0 + 1e-9) | (columns["t"] >= 20.0 - 1e-9)
-    path = write_csv(tmp_path / "a.csv", {name: values[kept] for name, values in columns.items()})
+    path = write_csv(
+        tmp_path / "a.csv", {name: values[kept] for name, values in columns.items()}
+    )
     logged, said = read(path)
-    assert f"warning: {path}, line 103: 10 s without rows; drives are split there" in said
+    assert (
+        f"warning: {path}, line 103: 10 s without rows; drives are split there" in said
+    )
     states = together(logged.dataset)[0]
     assert len(states) == 20
-    assert np.linalg.norm(np.diff(states[..., :2], axis=1), axis=-1).max() < 0.61  # v ≤ 6 m/s
+    assert (
+        np.linalg.norm(np.diff(states[..., :2], axis=1), axis=-1).max() < 0.61
+    )  # v ≤ 6 m/s
 
 
 def test_moments_of_a_clock_and_places_on_earth_lose_no_digits(tmp_path):
     columns = drive()
     here = expected(columns)
-    moved = columns | {"t": columns["t"] + 1.7e9, "p_x": columns["p_x"] + 4.5e5, "p_y": columns["p_y"] + 5.3e6}
+    moved = columns | {
+        "t": columns["t"] + 1.7e9,
+        "p_x": columns["p_x"] + 4.5e5,
+        "p_y": columns["p_y"] + 5.3e6,
+    }
     write_csv(tmp_path / "a.csv", moved)
     there = together(read(tmp_path)[0].dataset)
     order = [np.lexsort(part[1].reshape(len(part[1]), -1).T) for part in (here, there)]
@@ -190,7 +258,10 @@ def stale(columns):
 
 WRONG = {
     "nan": (change("yaw", 7, np.nan), ", line 9: yaw is nan"),
-    "many nan": (change("v", slice(3, 6), np.nan), ", line 5: v is nan (3 rows like this)"),
+    "many nan": (
+        change("v", slice(3, 6), np.nan),
+        ", line 5: v is nan (3 rows like this)",
+    ),
     "infinite": (change("steering", 100, np.inf), ", line 102: steering is inf"),
     "nan in e": (change("wind", 0, np.nan), ", line 2: wind is nan"),
     "nan in t": (change("t", 4, np.nan), ", line 6: t is nan"),
@@ -204,30 +275,60 @@ WRONG = {
         ", lines 2 to 302: yaw and the direction of travel differ; yaw is probably in degrees",
     ),
     "clockwise": (scale("yaw", np.negative), "yaw probably counts clockwise"),
-    "compass": (scale("yaw", lambda yaw: np.pi / 2 - yaw), "yaw is probably a compass heading (from north, clockwise)"),
-    "reversed": (scale("yaw", lambda yaw: yaw + np.pi), "v is probably of the wrong sign"),
-    "km/h": (scale("v", lambda v: 3.6 * v), "0.278 times as fast as v says; the speed is probably in km/h"),
+    "compass": (
+        scale("yaw", lambda yaw: np.pi / 2 - yaw),
+        "yaw is probably a compass heading (from north, clockwise)",
+    ),
+    "reversed": (
+        scale("yaw", lambda yaw: yaw + np.pi),
+        "v is probably of the wrong sign",
+    ),
+    "km/h": (
+        scale("v", lambda v: 3.6 * v),
+        "0.278 times as fast as v says; the speed is probably in km/h",
+    ),
     "milliseconds": (scale("t", lambda t: 1e3 * t), "time is probably in ms"),
-    "centimetres": (lambda c: c.update(p_x=100 * c["p_x"], p_y=100 * c["p_y"]), "positions are probably in cm"),
-    "yaw and v": (swap("yaw", "v"), "yaw fits as the speed: have columns changed places?"),
+    "centimetres": (
+        lambda c: c.update(p_x=100 * c["p_x"], p_y=100 * c["p_y"]),
+        "positions are probably in cm",
+    ),
+    "yaw and v": (
+        swap("yaw", "v"),
+        "yaw fits as the speed: have columns changed places?",
+    ),
     "p_x and p_y": (swap("p_x", "p_y"), "or p_x and p_y changed places"),
     "p_x and v": (swap("p_x", "v"), "wrong units, or columns changed places?"),
     "standing": (scale("v", np.zeros_like), "v stands still while the position moves"),
     "position jumps": (jump, ", line 103: p_x, p_y jump 3.46 m at 5.66 m/s"),
     "yaw jumps": (change("yaw", 100, 3.5), ", line 102: yaw jumps by"),
-    "stale": (stale, ", line 3: the position of the row before at 5.07 m/s (270 rows like this)"),
-    "no excitation": (scale("steering", np.zeros_like), ", lines 2 to 302: steering is always 0; without excitation"),
-    "slow": (lambda c: c.update({n: c[n][::3] for n in NAMES}), "recorded every 0.3 s, slower than vehicle.dt=0.1"),
+    "stale": (
+        stale,
+        ", line 3: the position of the row before at 5.07 m/s (270 rows like this)",
+    ),
+    "no excitation": (
+        scale("steering", np.zeros_like),
+        ", lines 2 to 302: steering is always 0; without excitation",
+    ),
+    "slow": (
+        lambda c: c.update({n: c[n][::3] for n in NAMES}),
+        "recorded every 0.3 s, slower than vehicle.dt=0.1",
+    ),
     "short": (
         lambda c: c.update({n: c[n][:8] for n in NAMES}),
         "the longest drive without a gap has 7 steps, a segment 10",
     ),
-    "few": (lambda c: c.update({n: c[n][:21] for n in NAMES}), "2 segments are too few for dataset.shares="),
+    "few": (
+        lambda c: c.update({n: c[n][:21] for n in NAMES}),
+        "2 segments are too few for dataset.shares=",
+    ),
     "missing": (
         lambda c: c.pop("yaw"),
         "no column yaw among t, p_x, p_y, v, steering, acceleration, friction, wind; map it",
     ),
-    "missing e": (lambda c: c.pop("wind"), "no column wind for the environment; pass env=none, or map"),
+    "missing e": (
+        lambda c: c.pop("wind"),
+        "no column wind for the environment; pass env=none, or map",
+    ),
 }
 
 
@@ -245,12 +346,27 @@ def test_what_cannot_be_right_is_one_line_with_its_place(tmp_path, kind):
 TEXTS = {
     "empty": ("", ": the file is empty"),
     "header only": (",".join(NAMES) + "\n", ": no rows below the header"),
-    "no header": ("0,1,2\n1,2,3\n", ", line 1: numbers where the names of the columns should be"),
+    "no header": (
+        "0,1,2\n1,2,3\n",
+        ", line 1: numbers where the names of the columns should be",
+    ),
     "twice": ("t,t\n0,1\n", ", line 1: the column t stands there twice"),
-    "ragged": (",".join(NAMES) + "\n" + "0," * 8 + "0\n0,1,2\n", ", line 3: 3 cells below a header of 9"),
-    "empty cell": (",".join(NAMES) + "\n" + "0," * 8 + "0\n1,,0,0,0,0,0,0,0\n", ", line 3: p_x is empty, not a number"),
-    "word": (",".join(NAMES) + "\n" + "0," * 8 + "off\n", ", line 2: wind is 'off', not a number"),
-    "decimal comma": (";".join(NAMES) + "\n" + "0,5;" * 8 + "0\n", ", line 2: t is '0,5', not a number"),
+    "ragged": (
+        ",".join(NAMES) + "\n" + "0," * 8 + "0\n0,1,2\n",
+        ", line 3: 3 cells below a header of 9",
+    ),
+    "empty cell": (
+        ",".join(NAMES) + "\n" + "0," * 8 + "0\n1,,0,0,0,0,0,0,0\n",
+        ", line 3: p_x is empty, not a number",
+    ),
+    "word": (
+        ",".join(NAMES) + "\n" + "0," * 8 + "off\n",
+        ", line 2: wind is 'off', not a number",
+    ),
+    "decimal comma": (
+        ";".join(NAMES) + "\n" + "0,5;" * 8 + "0\n",
+        ", line 2: t is '0,5', not a number",
+    ),
 }
 
 
@@ -272,7 +388,10 @@ ARRAYS = {
         {"x": np.zeros((2, 5, 3)), "u": np.zeros((2, 4, 2)), "e": np.zeros((2, 4, 2))},
         "x has shape (2, 5, 3), expected (2, 5, 4)",
     ),
-    "no e": ({"x": np.zeros((2, 5, 4)), "u": np.zeros((2, 4, 2))}, "no column e for the environment; pass env=none"),
+    "no e": (
+        {"x": np.zeros((2, 5, 4)), "u": np.zeros((2, 4, 2))},
+        "no column e for the environment; pass env=none",
+    ),
 }
 
 
@@ -321,7 +440,9 @@ def test_contents_decide_which_data_set_it_is(tmp_path):
         (tmp_path / place).mkdir()
     write_csv(tmp_path / "here" / "a.csv", drive())
     write_csv(tmp_path / "there" / "renamed.csv", drive())
-    first, moved = (datasets.fingerprint(str(tmp_path / place)) for place in ("here", "there"))
+    first, moved = (
+        datasets.fingerprint(str(tmp_path / place)) for place in ("here", "there")
+    )
     write_csv(tmp_path / "here" / "a.csv", drive(phase=0.1))
     assert first == moved != datasets.fingerprint(str(tmp_path / "here"))
 
@@ -333,7 +454,10 @@ def test_contents_decide_which_data_set_it_is(tmp_path):
             Columns(state=("p_x", "p_y", "yaw")),
             "dataset.columns.state must name position, position, yaw and speed first",
         ),
-        (Columns(control=("steering",)), "dataset.columns.control must name two columns, got 1"),
+        (
+            Columns(control=("steering",)),
+            "dataset.columns.control must name two columns, got 1",
+        ),
         (Columns(environment=("friction", "v")), "dataset.columns names v twice"),
         (Columns(environment=()), "pass env=none"),
     ],
@@ -348,15 +472,25 @@ def test_columns_that_cannot_be_meant_are_refused(tmp_path, columns, says):
         (scale("steering", np.negative), {}, "the robot turns against steering"),
         (scale("steering", np.sign), {}, "steering takes only 2 values"),
         (scale("yaw", lambda yaw: yaw + 1.0), {}, "differ by -1.00 rad throughout"),
-        (scale("t", lambda t: t), {"wheelbase": 0.3}, "suggest a wheelbase of 2.7 m, vehicle.wheelbase is 0.3"),
-        (scale("t", lambda t: t), {"limits": ((-0.1, -1.0), (0.1, 1.0))}, "outside -0.1 to 0.1 of vehicle.control_low"),
+        (
+            scale("t", lambda t: t),
+            {"wheelbase": 0.3},
+            "suggest a wheelbase of 2.7 m, vehicle.wheelbase is 0.3",
+        ),
+        (
+            scale("t", lambda t: t),
+            {"limits": ((-0.1, -1.0), (0.1, 1.0))},
+            "outside -0.1 to 0.1 of vehicle.control_low",
+        ),
     ],
 )
 def test_what_is_merely_odd_is_warned_of(tmp_path, spoil, options, says):
     columns = drive()
     spoil(columns)
     _, said = read(write_csv(tmp_path / "a.csv", columns), **options)
-    assert any(line.startswith(f"warning: {tmp_path}") and says in line for line in said)
+    assert any(
+        line.startswith(f"warning: {tmp_path}") and says in line for line in said
+    )
 
 
 def test_the_box_of_environments_is_what_logs_reach_or_what_is_asked(tmp_path):
@@ -395,7 +529,9 @@ def test_too_few_drives_are_cut_in_time(sizes):
     assert not dealt.whole
     first = dealt.parts[: sizes[0]]
     assert np.all(np.diff(first) >= 0)
-    np.testing.assert_allclose(np.bincount(first) / sizes[0], [0.6, 0.1, 0.2, 0.1], atol=1.0 / sizes[0])
+    np.testing.assert_allclose(
+        np.bincount(first) / sizes[0], [0.6, 0.1, 0.2, 0.1], atol=1.0 / sizes[0]
+    )
 
 
 def test_coverage_counts_the_tenths_that_were_visited():

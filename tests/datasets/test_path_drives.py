@@ -1,4 +1,6 @@
-"""Drives in path coordinates: within what was asked for, everywhere in E, and the same as logs of the world."""
+"""Drives in path coordinates: within what was asked for, everywhere in E, and the same
+as logs of the world.
+"""
 
 from functools import partial
 
@@ -29,11 +31,17 @@ BOX = {"env_low": ENV_LOW, "env_high": ENV_HIGH}
 
 @pytest.fixture(scope="module")
 def drives():
-    return jax.jit(partial(generate_along_path, LOOP, segments=64, steps=30, **BOX))(jax.random.key(3))
+    return jax.jit(partial(generate_along_path, LOOP, segments=64, steps=30, **BOX))(
+        jax.random.key(3)
+    )
 
 
 def test_roads_speeds_and_perturbations_are_as_asked(drives):
-    nu, curvature, speed = drives.controls[..., :2], drives.controls[..., 2], drives.controls[..., 3]
+    nu, curvature, speed = (
+        drives.controls[..., :2],
+        drives.controls[..., 2],
+        drives.controls[..., 3],
+    )
     assert drives.states.shape == (64, 31, 6)
     assert drives.controls.shape == (64, 30, 4)
     assert not np.any(np.asarray(drives.states[..., POSE]))
@@ -44,7 +52,9 @@ def test_roads_speeds_and_perturbations_are_as_asked(drives):
     assert np.ptp(speed, axis=1).max() > 0.2
 
 
-def test_a_quarter_of_the_environments_is_held_another_switches_and_both_reach_the_corners(drives):
+def test_a_quarter_of_the_environments_is_held_another_switches_and_both_reach_the_corners(
+    drives,
+):
     held = drives.envs[32:]
     assert np.all(held[:16] == held[:16, :1])
     jumps = np.any(np.diff(held[16:], axis=1) != 0, axis=2)
@@ -61,13 +71,19 @@ def test_every_step_is_one_of_the_loop(drives):
 
 
 def test_switching_drives_dwell_and_s3_keeps_its_levels():
-    switching = jax.jit(partial(drive_switching, LOOP, drives=4, steps=100, **BOX))(jax.random.key(0))
+    switching = jax.jit(partial(drive_switching, LOOP, drives=4, steps=100, **BOX))(
+        jax.random.key(0)
+    )
     jumps = np.any(np.diff(switching.envs, axis=1) != 0, axis=2)
     for drive in jumps:
         assert np.all(np.diff(np.flatnonzero(drive)) >= 29)
     assert jumps.any()
-    s3 = jax.jit(partial(generate_s3_along_path, LOOP, segments=4, steps=40))(jax.random.key(0))
-    assert np.all(np.min(np.abs(np.asarray(s3.envs)[..., :1] - [0.3, 0.6, 0.9]), axis=-1) < 1e-6)
+    s3 = jax.jit(partial(generate_s3_along_path, LOOP, segments=4, steps=40))(
+        jax.random.key(0)
+    )
+    assert np.all(
+        np.min(np.abs(np.asarray(s3.envs)[..., :1] - [0.3, 0.6, 0.9]), axis=-1) < 1e-6
+    )
 
 
 def test_drives_that_left_their_path_are_refused(drives):
@@ -80,7 +96,9 @@ def test_drives_that_left_their_path_are_refused(drives):
 
 @pytest.mark.parametrize("known", [True, False])
 def test_a_drive_in_the_world_is_told_along_its_path(known):
-    """Driven by law + ν on its own projection: ν comes out again, and a loop step explains every step."""
+    """Driven by law + ν on its own projection: ν comes out again, and a loop step
+    explains every step.
+    """
     path = path_from_curvature(0.015 * jnp.sin(0.5 * jnp.arange(300) / 25), spacing=0.5)
     seen = path if known else logged_path(path.points[:, :2])
     env, speed = jnp.asarray([0.8, 1.0]), jnp.asarray(9.0)
@@ -88,16 +106,31 @@ def test_a_drive_in_the_world_is_told_along_its_path(known):
     added = jnp.asarray([0.01, 0.2]) * jax.random.normal(key, (80, 2))
 
     def step(world, nu):
-        one = to_path(Trajectory(jnp.stack([world, world]), jnp.zeros((1, 2)), env[None]), path, LAW, speed[None])
+        one = to_path(
+            Trajectory(jnp.stack([world, world]), jnp.zeros((1, 2)), env[None]),
+            path,
+            LAW,
+            speed[None],
+        )
         control = nu - one.controls[0, :2]
         return PLANT.step(world, control, env), (world, control)
 
-    last, (states, controls) = jax.jit(partial(jax.lax.scan, step))(jnp.asarray([5.0, 0.1, 0.0, 9.0]), added)
-    driven = Trajectory(jnp.concatenate([states, last[None]]), controls, jnp.tile(env, (80, 1)))
-    along = jax.jit(lambda driven: to_path(driven, seen, LAW, jnp.full(80, 9.0)))(driven)
-    np.testing.assert_allclose(along.controls[:, :2], added, atol=2e-3 if known else 6e-3)
+    last, (states, controls) = jax.jit(partial(jax.lax.scan, step))(
+        jnp.asarray([5.0, 0.1, 0.0, 9.0]), added
+    )
+    driven = Trajectory(
+        jnp.concatenate([states, last[None]]), controls, jnp.tile(env, (80, 1))
+    )
+    along = jax.jit(lambda driven: to_path(driven, seen, LAW, jnp.full(80, 9.0)))(
+        driven
+    )
+    np.testing.assert_allclose(
+        along.controls[:, :2], added, atol=2e-3 if known else 6e-3
+    )
     after = jax.vmap(LOOP.step)(along.states[:-1], along.controls, along.envs)
-    np.testing.assert_allclose(after[:, 3:], along.states[1:, 3:], atol=2e-3 if known else 1e-2)
+    np.testing.assert_allclose(
+        after[:, 3:], along.states[1:, 3:], atol=2e-3 if known else 1e-2
+    )
     check_logged(jax.tree.map(lambda leaf: leaf[None], along), ("drive 1",))
 
 
@@ -105,6 +138,10 @@ def test_a_log_that_is_not_of_its_path_is_refused_by_name():
     rough = jnp.column_stack([jnp.arange(50.0), jnp.tile(jnp.asarray([0.0, 1.0]), 25)])
     with pytest.raises(ValueError, match="positions are"):
         logged_path(rough)
-    lost = Trajectory(jnp.zeros((1, 3, 6)).at[0, 1, 3].set(45.0), jnp.full((1, 2, 4), 0.02), jnp.zeros((1, 2, 2)))
+    lost = Trajectory(
+        jnp.zeros((1, 3, 6)).at[0, 1, 3].set(45.0),
+        jnp.full((1, 2, 4), 0.02),
+        jnp.zeros((1, 2, 2)),
+    )
     with pytest.raises(ValueError, match="night drive"):
         check_logged(lost, ("night drive",))

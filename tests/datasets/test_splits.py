@@ -17,25 +17,36 @@ LOW, HIGH = jnp.asarray(ENV_LOW), jnp.asarray(ENV_HIGH)
 def numbered(count, steps=6):
     """Trajectories that carry their own number and time."""
     number, time = np.arange(count)[:, None, None], np.arange(steps + 1)[None, :, None]
-    states = np.broadcast_to(100.0 * number + time, (count, steps + 1, 4)).astype(np.float32)
+    states = np.broadcast_to(100.0 * number + time, (count, steps + 1, 4)).astype(
+        np.float32
+    )
     middle = np.broadcast_to(np.float32([0.6, 0.0]), (count, steps, 2))
-    return Trajectory(jnp.asarray(states), jnp.asarray(states[:, :-1, :2]), jnp.asarray(middle))
+    return Trajectory(
+        jnp.asarray(states), jnp.asarray(states[:, :-1, :2]), jnp.asarray(middle)
+    )
 
 
 def deal(trajectories, seed=0, shares=SHARES, low=LOW, high=HIGH):
-    return datasets.split(trajectories, jax.random.key(seed), shares=shares, env_low=low, env_high=high)
+    return datasets.split(
+        trajectories, jax.random.key(seed), shares=shares, env_low=low, env_high=high
+    )
 
 
 def members(part):
     return (np.asarray(part.states)[:, 0, 0] / 100).astype(int).tolist()
 
 
-@pytest.mark.parametrize("shares", [SHARES, (0.7, 0.1, 0.1, 0.1), (0.25, 0.25, 0.25, 0.25)])
+@pytest.mark.parametrize(
+    "shares", [SHARES, (0.7, 0.1, 0.1, 0.1), (0.25, 0.25, 0.25, 0.25)]
+)
 def test_every_trajectory_is_dealt_exactly_once(shares):
     dealt = deal(numbered(43), shares=shares)
     parts = [members(part) for part in dealt[:4]]
     assert sorted(chain(*parts)) == list(range(43))
-    assert all(abs(len(part) - share * 43) <= 1 for part, share in zip(parts, shares, strict=True))
+    assert all(
+        abs(len(part) - share * 43) <= 1
+        for part, share in zip(parts, shares, strict=True)
+    )
 
 
 def test_states_controls_and_environments_stay_together():
@@ -50,7 +61,13 @@ def test_the_deal_is_shuffled_by_its_key():
 
 
 @pytest.mark.parametrize(
-    "shares", [(0.5, 0.5, 0.1, -0.1), (0.5, 0.3, 0.2, 0.0), (0.5, 0.2, 0.2, 0.2), (0.1, 0.1, 0.1, 0.1)]
+    "shares",
+    [
+        (0.5, 0.5, 0.1, -0.1),
+        (0.5, 0.3, 0.2, 0.0),
+        (0.5, 0.2, 0.2, 0.2),
+        (0.1, 0.1, 0.1, 0.1),
+    ],
 )
 def test_bad_shares_are_refused_by_name(shares):
     with pytest.raises(ValueError, match=r"shares.*positive numbers of sum 1"):
@@ -62,7 +79,9 @@ def test_too_few_trajectories_are_refused_with_their_number():
         deal(numbered(3))
 
 
-@pytest.mark.parametrize(("channel", "value"), [(0, 0.2), (0, 0.95), (1, 9.0), (1, -8.5)])
+@pytest.mark.parametrize(
+    ("channel", "value"), [(0, 0.2), (0, 0.95), (1, 9.0), (1, -8.5)]
+)
 def test_an_environment_outside_its_box_is_refused(channel, value):
     data = numbered(43)
     strayed = data._replace(envs=data.envs.at[7, 3, channel].set(value))
@@ -81,15 +100,25 @@ def test_windows_are_slices():
     rows, starts = np.asarray([5, 0, 119]), np.asarray([0, 7, 17])
     cut = datasets.windows(data, jnp.asarray(rows), jnp.asarray(starts), length=8)
     for k, (row, start) in enumerate(zip(rows, starts, strict=True)):
-        np.testing.assert_array_equal(cut.states[k], np.asarray(data.states)[row, start : start + 9])
-        np.testing.assert_array_equal(cut.controls[k], np.asarray(data.controls)[row, start : start + 8])
-        np.testing.assert_array_equal(cut.envs[k], np.asarray(data.envs)[row, start : start + 8])
+        np.testing.assert_array_equal(
+            cut.states[k], np.asarray(data.states)[row, start : start + 9]
+        )
+        np.testing.assert_array_equal(
+            cut.controls[k], np.asarray(data.controls)[row, start : start + 8]
+        )
+        np.testing.assert_array_equal(
+            cut.envs[k], np.asarray(data.envs)[row, start : start + 8]
+        )
 
 
 def test_random_windows_reach_every_trajectory_and_every_start_evenly():
-    drawn = datasets.random_windows(numbered(4), jax.random.key(0), batch=4000, length=4)
+    drawn = datasets.random_windows(
+        numbered(4), jax.random.key(0), batch=4000, length=4
+    )
     first = np.asarray(drawn.states)[:, 0, 0].astype(int)
-    assert sorted(set(first)) == [100 * row + start for row in range(4) for start in range(3)]
+    assert sorted(set(first)) == [
+        100 * row + start for row in range(4) for start in range(3)
+    ]
     counts = np.unique(first, return_counts=True)[1]
     assert np.all(np.abs(counts - 4000 / 12) < 5 * np.sqrt(4000 / 12))
 
@@ -97,7 +126,9 @@ def test_random_windows_reach_every_trajectory_and_every_start_evenly():
 def test_a_window_may_be_as_long_as_the_trajectory_and_no_longer():
     drawn = datasets.random_windows(numbered(3), jax.random.key(0), batch=5, length=6)
     assert np.all(np.asarray(drawn.states)[:, 0, 0] % 100 == 0)
-    with pytest.raises(ValueError, match="windows of 7 steps do not fit trajectories of 6 steps"):
+    with pytest.raises(
+        ValueError, match="windows of 7 steps do not fit trajectories of 6 steps"
+    ):
         datasets.random_windows(numbered(3), jax.random.key(0), batch=5, length=7)
 
 

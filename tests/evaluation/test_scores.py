@@ -3,7 +3,16 @@
 import numpy as np
 import pytest
 
-from sfkd_jax.evaluation import Episode, bootstrap_mean, compare, paired_difference, pool, row, score, summary
+from sfkd_jax.evaluation import (
+    Episode,
+    bootstrap_mean,
+    compare,
+    paired_difference,
+    pool,
+    row,
+    score,
+    summary,
+)
 
 DT, STEPS = 0.1, 200
 TIME = np.arange(1, STEPS + 1) * DT
@@ -20,11 +29,17 @@ def episode(lateral, steering=None, states=None, ess=None, healthy=None, breach=
         controls=controls,
         lateral=np.asarray(lateral, dtype=float)[None],
         progress=np.zeros((1, steps)),
-        effective_samples=np.ones((1, steps)) if ess is None else np.asarray(ess, dtype=float)[None],
-        healthy=np.ones((1, steps), bool) if healthy is None else np.asarray(healthy)[None],
+        effective_samples=np.ones((1, steps))
+        if ess is None
+        else np.asarray(ess, dtype=float)[None],
+        healthy=np.ones((1, steps), bool)
+        if healthy is None
+        else np.asarray(healthy)[None],
         prediction_error=np.zeros((1, steps)),
         believed=np.zeros((1, steps, 2)),
-        breach=np.zeros((1, steps), bool) if breach is None else np.asarray(breach)[None],
+        breach=np.zeros((1, steps), bool)
+        if breach is None
+        else np.asarray(breach)[None],
         box_exit=np.zeros((1, steps), bool),
     )
 
@@ -60,19 +75,30 @@ def switching(steps=STEPS, when=100, channel=0, to=0.3):
 
 
 def test_exactly_the_three_seconds_after_a_switch_are_scored_apart():
-    """e_100 is the first after the switch; what it does is seen in the deviation of x_101, which is lateral[100]."""
+    """e_100 is the first after the switch; what it does is seen in the deviation of
+    x_101, which is lateral[100].
+    """
     lateral = np.zeros(STEPS)
     lateral[100:130] = 0.2
     scores = score(episode(lateral), switching(), dt=DT)
     np.testing.assert_allclose(scores.rmse_after_switch, [0.2], rtol=1e-12)
     lateral[99] = lateral[130] = 7.0
-    np.testing.assert_allclose(score(episode(lateral), switching(), dt=DT).rmse_after_switch, [0.2], rtol=1e-12)
+    np.testing.assert_allclose(
+        score(episode(lateral), switching(), dt=DT).rmse_after_switch, [0.2], rtol=1e-12
+    )
     lateral[129] = 0.0
     assert score(episode(lateral), switching(), dt=DT).rmse_after_switch[0] < 0.2
 
 
 @pytest.mark.parametrize(
-    ("channel", "to", "counts"), [(0, 0.3, True), (0, 0.88, False), (1, 8.0, True), (1, -8.0, True), (1, 5.0, False)]
+    ("channel", "to", "counts"),
+    [
+        (0, 0.3, True),
+        (0, 0.88, False),
+        (1, 8.0, True),
+        (1, -8.0, True),
+        (1, 5.0, False),
+    ],
 )
 def test_a_switch_is_a_jump_of_friction_or_wind(channel, to, counts):
     scores = score(episode(np.ones(STEPS)), switching(channel=channel, to=to), dt=DT)
@@ -81,31 +107,45 @@ def test_a_switch_is_a_jump_of_friction_or_wind(channel, to, counts):
 
 def test_a_switch_during_settling_is_scored_from_the_end_of_settling_on():
     lateral = np.where(TIME <= 2.0 + 1e-9, 9.0, 0.5)
-    np.testing.assert_allclose(score(episode(lateral), switching(when=10), dt=DT).rmse_after_switch, [0.5])
+    np.testing.assert_allclose(
+        score(episode(lateral), switching(when=10), dt=DT).rmse_after_switch, [0.5]
+    )
 
 
 def test_a_switch_near_the_end_is_scored_until_the_end():
     lateral = np.where(np.arange(STEPS) >= 190, 0.4, 0.0)
-    np.testing.assert_allclose(score(episode(lateral), switching(when=190), dt=DT).rmse_after_switch, [0.4])
+    np.testing.assert_allclose(
+        score(episode(lateral), switching(when=190), dt=DT).rmse_after_switch, [0.4]
+    )
 
 
 def test_a_smooth_gust_is_not_a_switch():
     """The ramp of `scenarios.gusts`: 1 − cos over 0.5 s, here from 0 to 8 m/s."""
     envs = np.array(CALM)
-    envs[0, 100:, 1] = 4.0 - 4.0 * np.cos(np.pi * np.clip(np.arange(100) * DT / 0.5, 0.0, 1.0))
+    envs[0, 100:, 1] = 4.0 - 4.0 * np.cos(
+        np.pi * np.clip(np.arange(100) * DT / 0.5, 0.0, 1.0)
+    )
     assert np.isnan(score(episode(np.ones(STEPS)), envs, dt=DT).rmse_after_switch[0])
 
 
 def test_smoothness_is_the_mean_steering_rate():
     ramp = score(episode(np.zeros(STEPS), steering=0.05 * TIME), CALM, dt=DT)
     np.testing.assert_allclose(ramp.smoothness, [0.05], rtol=1e-9)
-    zigzag = score(episode(np.zeros(STEPS), steering=0.01 * (np.arange(STEPS) % 2)), CALM, dt=DT)
+    zigzag = score(
+        episode(np.zeros(STEPS), steering=0.01 * (np.arange(STEPS) % 2)), CALM, dt=DT
+    )
     np.testing.assert_allclose(zigzag.smoothness, [0.01 / DT], rtol=1e-9)
-    assert score(episode(np.zeros(STEPS), steering=np.full(STEPS, 0.3)), CALM, dt=DT).smoothness[0] == 0.0
+    assert (
+        score(
+            episode(np.zeros(STEPS), steering=np.full(STEPS, 0.3)), CALM, dt=DT
+        ).smoothness[0]
+        == 0.0
+    )
 
 
 @pytest.mark.parametrize(
-    ("deviation", "departed"), [(0.84, False), (-0.84, False), (0.86, True), (-3.0, True), (np.nan, True)]
+    ("deviation", "departed"),
+    [(0.84, False), (-0.84, False), (0.86, True), (-3.0, True), (np.nan, True)],
 )
 def test_a_car_departs_when_its_side_leaves_the_lane(deviation, departed):
     """A lane of 3.5 m and a car of 1.8 m leave 0.85 m to either side."""
@@ -124,25 +164,34 @@ def test_a_state_that_is_not_finite_is_a_departure_whenever_it_happens(when):
 def test_sample_sizes_and_held_plans_are_summed_up():
     ess = np.where(np.arange(STEPS) < 150, 10.0, 1000.0)
     healthy = np.arange(STEPS) >= 20
-    scores = score(episode(np.zeros(STEPS), ess=ess, healthy=healthy, breach=~healthy), CALM, dt=DT)
+    scores = score(
+        episode(np.zeros(STEPS), ess=ess, healthy=healthy, breach=~healthy), CALM, dt=DT
+    )
     assert scores.ess[0] == 10.0
     np.testing.assert_allclose(scores.unhealthy, [0.1])
     np.testing.assert_allclose([*scores.breach, *scores.box_exit], [0.1, 0.0])
 
 
 def test_episodes_are_scored_one_by_one():
-    parts = [episode(np.full(STEPS, level), steering=level * TIME) for level in (0.1, 0.2, 2.0)]
+    parts = [
+        episode(np.full(STEPS, level), steering=level * TIME)
+        for level in (0.1, 0.2, 2.0)
+    ]
     batch = Episode(*(np.concatenate(leaves) for leaves in zip(*parts, strict=True)))
     envs = np.concatenate([switching(), switching(when=50), CALM])
     together = score(batch, envs, dt=DT)
     for k, part in enumerate(parts):
-        for ours, alone in zip(together, score(part, envs[k : k + 1], dt=DT), strict=True):
+        for ours, alone in zip(
+            together, score(part, envs[k : k + 1], dt=DT), strict=True
+        ):
             np.testing.assert_array_equal(ours[k], alone[0])
 
 
 def test_an_episode_shorter_than_three_seconds_is_scored():
     scores = score(episode(np.full(25, 0.2)), switching(steps=25, when=15), dt=DT)
-    np.testing.assert_allclose([scores.rmse[0], scores.rmse_after_switch[0]], [0.2, 0.2])
+    np.testing.assert_allclose(
+        [scores.rmse[0], scores.rmse_after_switch[0]], [0.2, 0.2]
+    )
 
 
 # --- statistics ------------------------------------------------------------------------------------------------------
@@ -150,7 +199,13 @@ def test_an_episode_shorter_than_three_seconds_is_scored():
 
 def test_the_interval_of_a_constant_is_that_constant():
     found = summary(np.full(7, 0.25))
-    assert found == {"mean": 0.25, "std": 0.0, "ci95": [0.25, 0.25], "median": 0.25, "p95": 0.25}
+    assert found == {
+        "mean": 0.25,
+        "std": 0.0,
+        "ci95": [0.25, 0.25],
+        "median": 0.25,
+        "p95": 0.25,
+    }
 
 
 def test_a_single_episode_has_no_spread():
@@ -162,9 +217,13 @@ def test_a_summary_holds_what_it_says():
     found = summary(values)
     np.testing.assert_allclose(found["mean"], values.mean())
     np.testing.assert_allclose(found["std"], values.std(ddof=1))
-    np.testing.assert_allclose([found["median"], found["p95"]], np.quantile(values, [0.5, 0.95]))
+    np.testing.assert_allclose(
+        [found["median"], found["p95"]], np.quantile(values, [0.5, 0.95])
+    )
     half = 1.96 * values.std() / np.sqrt(400)
-    np.testing.assert_allclose(found["ci95"], [values.mean() - half, values.mean() + half], atol=0.1 * half)
+    np.testing.assert_allclose(
+        found["ci95"], [values.mean() - half, values.mean() + half], atol=0.1 * half
+    )
 
 
 def test_bootstrap_intervals_cover_the_mean_about_as_often_as_they_say():
@@ -176,13 +235,20 @@ def test_bootstrap_intervals_cover_the_mean_about_as_often_as_they_say():
 
 
 def test_trainings_count_once_however_many_episodes_they_drive():
-    """Each of 5 trainings is good or bad on all of its 20 episodes: that many episodes are not that many trials."""
+    """Each of 5 trainings is good or bad on all of its 20 episodes: that many episodes
+    are not that many trials.
+    """
     random = np.random.default_rng(6)
-    drawn = random.standard_normal((80, 5, 1)) + 0.3 * random.standard_normal((80, 1, 20))
-    joined, crossed = (
-        np.asarray([bootstrap_mean(values)[1] for values in shaped]) for shaped in (drawn.reshape(80, -1), drawn)
+    drawn = random.standard_normal((80, 5, 1)) + 0.3 * random.standard_normal(
+        (80, 1, 20)
     )
-    covers = [np.mean((ends[:, 0] <= 0.0) & (ends[:, 1] >= 0.0)) for ends in (joined, crossed)]
+    joined, crossed = (
+        np.asarray([bootstrap_mean(values)[1] for values in shaped])
+        for shaped in (drawn.reshape(80, -1), drawn)
+    )
+    covers = [
+        np.mean((ends[:, 0] <= 0.0) & (ends[:, 1] >= 0.0)) for ends in (joined, crossed)
+    ]
     assert covers[0] < 0.6 < 0.75 < covers[1]
 
 
@@ -211,7 +277,9 @@ def test_pairing_sees_a_small_difference_that_separate_intervals_hide():
 
 def test_a_constant_gain_is_certain_when_paired():
     values = np.random.default_rng(4).standard_exponential(20)
-    np.testing.assert_allclose(paired_difference(values + 0.125, values)["ci95"], [0.125, 0.125], atol=1e-12)
+    np.testing.assert_allclose(
+        paired_difference(values + 0.125, values)["ci95"], [0.125, 0.125], atol=1e-12
+    )
 
 
 # --- rows ------------------------------------------------------------------------------------------------------------
@@ -247,7 +315,9 @@ def test_a_row_holds_every_measure_and_null_for_what_does_not_apply():
         "departures",
         "ess",
     }
-    assert keys | {"act_ms", "ratio_to_oracle", "difference_to_sfkd"} | set(about("")) <= set(made)
+    assert keys | {"act_ms", "ratio_to_oracle", "difference_to_sfkd"} | set(
+        about("")
+    ) <= set(made)
     np.testing.assert_allclose(made["rmse_m"]["mean"], 0.115)
     np.testing.assert_allclose(made["max_deviation_m"], 0.13)
     assert made["rmse_after_switch_m"] is None
@@ -262,15 +332,24 @@ def test_comparisons_are_ratios_to_the_oracle_and_paired_differences_to_ours():
     scores = {"oracle": scored(0.1), "sfkd": scored(0.2), "nominal": scored(0.5)}
     rows = {name: row(value, about(name), None, {}) for name, value in scores.items()}
     compared = {entry["system"]: entry for entry in compare(list(rows.values()))}
-    np.testing.assert_allclose([compared[name]["ratio_to_oracle"] for name in scores], [1.0, 2.0, 5.0])
+    np.testing.assert_allclose(
+        [compared[name]["ratio_to_oracle"] for name in scores], [1.0, 2.0, 5.0]
+    )
     assert compared["sfkd"]["difference_to_sfkd"] is None
-    np.testing.assert_allclose(compared["nominal"]["difference_to_sfkd"]["mean"], 0.3 * 1.15)
+    np.testing.assert_allclose(
+        compared["nominal"]["difference_to_sfkd"]["mean"], 0.3 * 1.15
+    )
     assert compared["oracle"]["difference_to_sfkd"]["ci95"][1] < 0
 
 
 def test_along_a_path_ours_is_the_row_along_the_path():
     scores = {"sfkd_path": scored(0.2), "r2dn_path": scored(0.5)}
-    ours, theirs = compare([row(value, about(name, sampling="law"), None, {}) for name, value in scores.items()])
+    ours, theirs = compare(
+        [
+            row(value, about(name, sampling="law"), None, {})
+            for name, value in scores.items()
+        ]
+    )
     assert ours["difference_to_sfkd"] is None
     np.testing.assert_allclose(theirs["difference_to_sfkd"]["mean"], 0.3 * 1.15)
 
@@ -282,7 +361,13 @@ def test_without_oracle_or_ours_nothing_is_compared():
 
 
 @pytest.mark.parametrize(
-    "change", [{"scenario": "s1"}, {"vehicle": "dynamic"}, {"variation": "late"}, {"sampling": "plain"}]
+    "change",
+    [
+        {"scenario": "s1"},
+        {"vehicle": "dynamic"},
+        {"variation": "late"},
+        {"sampling": "plain"},
+    ],
 )
 def test_rows_that_drove_other_episodes_or_sampled_otherwise_are_not_paired(change):
     ours = row(scored(0.2), about("sfkd"), None, {})
@@ -291,8 +376,18 @@ def test_rows_that_drove_other_episodes_or_sampled_otherwise_are_not_paired(chan
 
 
 def test_two_trainings_of_three_episodes_are_not_paired_with_three_of_two():
-    ours = pool([row(scored(0.2, count=3), about("sfkd", seeds=[k]), None, {}) for k in range(2)])
-    theirs = pool([row(scored(0.5, count=2), about("icode", seeds=[k]), None, {}) for k in range(3)])
+    ours = pool(
+        [
+            row(scored(0.2, count=3), about("sfkd", seeds=[k]), None, {})
+            for k in range(2)
+        ]
+    )
+    theirs = pool(
+        [
+            row(scored(0.5, count=2), about("icode", seeds=[k]), None, {})
+            for k in range(3)
+        ]
+    )
     assert compare([ours, theirs])[1]["difference_to_sfkd"] is None
 
 
@@ -301,16 +396,24 @@ def test_a_quadratic_program_is_paired_with_what_samples_around_feedback():
         row(scored(level), about("sfkd", sampling=name), None, {})
         for name, level in (("plain", 0.1), ("feedback", 0.2))
     ]
-    compared = compare([*rows, row(scored(0.5), about("koopman_mpc", sampling=None), None, {})])
+    compared = compare(
+        [*rows, row(scored(0.5), about("koopman_mpc", sampling=None), None, {})]
+    )
     np.testing.assert_allclose(compared[-1]["difference_to_sfkd"]["mean"], 0.3 * 1.15)
 
 
 def test_pooling_joins_the_episodes_of_all_seeds_and_averages_the_rest():
     levels = (0.1, 0.3)
-    made = [row(scored(level), about("sfkd", seeds=[k]), None, {"v0": level}) for k, level in enumerate(levels)]
+    made = [
+        row(scored(level), about("sfkd", seeds=[k]), None, {"v0": level})
+        for k, level in enumerate(levels)
+    ]
     pooled = pool(made)
     assert pooled["seeds"] == [0, 1]
-    assert pooled["rmse_episodes_m"] == made[0]["rmse_episodes_m"] + made[1]["rmse_episodes_m"]
+    assert (
+        pooled["rmse_episodes_m"]
+        == made[0]["rmse_episodes_m"] + made[1]["rmse_episodes_m"]
+    )
     np.testing.assert_allclose(pooled["rmse_m"]["mean"], 0.2 * 1.15)
     np.testing.assert_allclose(pooled["rmse_trainings_m"], [0.1 * 1.15, 0.3 * 1.15])
     np.testing.assert_allclose(pooled["violation"]["v0"], 0.2)

@@ -1,4 +1,6 @@
-"""Whole episodes: repeatable, paired, and ordered as they must be; open-loop errors of known models."""
+"""Whole episodes: repeatable, paired, and ordered as they must be; open-loop errors of
+known models.
+"""
 
 from functools import cache, partial
 
@@ -34,7 +36,15 @@ def driving(step, noise=SENSORS):
         control_high=PLANT.control_high,
     )
     controller = control.mppi(task, num_samples=96, horizon=HORIZON)
-    drive = partial(evaluation.simulate, PLANT.step, controller, {}, dt=0.1, horizon=HORIZON, observation_noise=noise)
+    drive = partial(
+        evaluation.simulate,
+        PLANT.step,
+        controller,
+        {},
+        dt=0.1,
+        horizon=HORIZON,
+        observation_noise=noise,
+    )
     return jit(jax.vmap(drive))
 
 
@@ -47,19 +57,25 @@ def test_an_episode_has_the_documented_shapes():
     assert one.states.shape == (STEPS + 1, 4)
     assert one.controls.shape == (STEPS, 2)
     assert one.believed.shape == (STEPS, 2)
-    assert all(leaf.shape == (STEPS,) for leaf in one._replace(believed=one.lateral)[2:])
+    assert all(
+        leaf.shape == (STEPS,) for leaf in one._replace(believed=one.lateral)[2:]
+    )
 
 
 def test_the_states_of_an_episode_are_the_plants():
     driven_episodes = episodes(PLANT.step)
     step = jit(jax.vmap(jax.vmap(PLANT.step)))
-    expected = step(driven_episodes.states[:, :-1], driven_episodes.controls, roads().envs)
+    expected = step(
+        driven_episodes.states[:, :-1], driven_episodes.controls, roads().envs
+    )
     np.testing.assert_allclose(driven_episodes.states[:, 1:], expected, atol=2e-5)
 
 
 def test_lateral_deviation_and_progress_are_those_of_the_path():
     one, road = at(episodes(PLANT.step), 0), at(roads(), 0)
-    points = np.asarray(jit(jax.vmap(scenarios.point_at, in_axes=(None, 0)))(road.path, one.progress))
+    points = np.asarray(
+        jit(jax.vmap(scenarios.point_at, in_axes=(None, 0)))(road.path, one.progress)
+    )
     normals = np.stack([-np.sin(points[:, 2]), np.cos(points[:, 2])], axis=1)
     placed = points[:, :2] + np.asarray(one.lateral)[:, None] * normals
     np.testing.assert_allclose(placed, np.asarray(one.states)[1:, :2], atol=2e-3)
@@ -68,7 +84,8 @@ def test_lateral_deviation_and_progress_are_those_of_the_path():
 
 def test_the_oracle_drives_better_than_the_nominal_model():
     scores = [
-        evaluation.score(episodes(step), np.asarray(roads().envs), dt=0.1) for step in (PLANT.step, PLANT.nominal)
+        evaluation.score(episodes(step), np.asarray(roads().envs), dt=0.1)
+        for step in (PLANT.step, PLANT.nominal)
     ]
     assert np.all(scores[0].rmse < scores[1].rmse)
     assert np.all(scores[0].rmse < 0.1)
@@ -89,7 +106,9 @@ def test_the_same_key_makes_the_same_episode_and_another_key_another():
 
 
 def recorder(gain, planner_draws):
-    """A controller that answers with gain times what it observes, and keeps a random stream of its own."""
+    """A controller that answers with gain times what it observes, and keeps a random
+    stream of its own.
+    """
 
     def act(params, state, observation, env, reference):
         info = {"effective_samples": jnp.ones(()), "healthy": jnp.asarray(True)}
@@ -107,8 +126,17 @@ def test_two_systems_meet_the_same_sensor_noise_whatever_they_do_with_their_own_
 
     def observed(gain, draws):
         controller = recorder(gain, draws)
-        still = partial(evaluation.simulate, lambda state, action, env: state, controller, {}, dt=0.1, horizon=3)
-        episode = jit(partial(still, observation_noise=SENSORS))(road, jax.random.key(5))
+        still = partial(
+            evaluation.simulate,
+            lambda state, action, env: state,
+            controller,
+            {},
+            dt=0.1,
+            horizon=3,
+        )
+        episode = jit(partial(still, observation_noise=SENSORS))(
+            road, jax.random.key(5)
+        )
         return np.asarray(episode.controls) / gain
 
     first, second = observed(1.0, 0), observed(2.0, 3)
@@ -120,17 +148,35 @@ def test_two_systems_meet_the_same_sensor_noise_whatever_they_do_with_their_own_
 
 def test_the_noise_reaches_the_controller_and_not_the_truth():
     road = at(roads(), 0)
-    still = partial(evaluation.simulate, lambda state, action, env: state, recorder(1.0, 0), {}, dt=0.1, horizon=3)
+    still = partial(
+        evaluation.simulate,
+        lambda state, action, env: state,
+        recorder(1.0, 0),
+        {},
+        dt=0.1,
+        horizon=3,
+    )
     episode = jit(partial(still, observation_noise=SENSORS))(road, jax.random.key(5))
-    np.testing.assert_array_equal(episode.states, np.broadcast_to(road.initial_state, (STEPS + 1, 4)))
+    np.testing.assert_array_equal(
+        episode.states, np.broadcast_to(road.initial_state, (STEPS + 1, 4))
+    )
     quiet = jit(still)(road, jax.random.key(5))
     np.testing.assert_array_equal(quiet.controls, np.zeros((STEPS, 2)))
 
 
 def test_no_key_is_used_twice():
-    still = partial(evaluation.simulate, lambda state, action, env: state, recorder(1.0, 1), {}, dt=0.1, horizon=3)
+    still = partial(
+        evaluation.simulate,
+        lambda state, action, env: state,
+        recorder(1.0, 1),
+        {},
+        dt=0.1,
+        horizon=3,
+    )
     with jax.debug_key_reuse(True):
-        jax.jit(partial(still, observation_noise=SENSORS))(at(roads(), 0), jax.random.key(0))
+        jax.jit(partial(still, observation_noise=SENSORS))(
+            at(roads(), 0), jax.random.key(0)
+        )
 
 
 def test_the_first_reference_starts_one_step_ahead():
@@ -143,11 +189,15 @@ def test_the_first_reference_starts_one_step_ahead():
 
 def errors(name, data, horizon):
     model, params = model_and_params(name)
-    return np.asarray(jit(partial(evaluation.open_loop, model, horizon=horizon))(params, data))
+    return np.asarray(
+        jit(partial(evaluation.open_loop, model, horizon=horizon))(params, data)
+    )
 
 
 def test_the_true_plant_predicts_without_error():
-    np.testing.assert_allclose(errors("oracle", driven(), 12), np.zeros((12, 4)), atol=2e-5)
+    np.testing.assert_allclose(
+        errors("oracle", driven(), 12), np.zeros((12, 4)), atol=2e-5
+    )
 
 
 def test_a_wrong_model_errs_and_more_so_the_further_it_looks():
@@ -160,9 +210,16 @@ def test_a_wrong_model_errs_and_more_so_the_further_it_looks():
 def test_errors_along_and_across_mean_the_same_on_every_heading():
     data = driven()
     turn = jnp.asarray([[0.0, -1.0], [1.0, 0.0]])
-    states = data.states.at[..., :2].set(data.states[..., :2] @ turn.T).at[..., 2].add(jnp.pi / 2)
+    states = (
+        data.states.at[..., :2]
+        .set(data.states[..., :2] @ turn.T)
+        .at[..., 2]
+        .add(jnp.pi / 2)
+    )
     np.testing.assert_allclose(
-        errors("nominal", data._replace(states=states), 6), errors("nominal", data, 6), atol=1e-4
+        errors("nominal", data._replace(states=states), 6),
+        errors("nominal", data, 6),
+        atol=1e-4,
     )
 
 
@@ -178,5 +235,7 @@ def test_a_constant_offset_in_speed_is_the_error_of_its_column():
 
 def test_a_horizon_longer_than_the_trajectories_is_refused():
     model, params = model_and_params("oracle")
-    with pytest.raises(ValueError, match="a horizon of 13 steps does not fit trajectories of 12 steps"):
+    with pytest.raises(
+        ValueError, match="a horizon of 13 steps does not fit trajectories of 12 steps"
+    ):
         evaluation.open_loop(model, params, driven(), horizon=13)

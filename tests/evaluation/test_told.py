@@ -25,7 +25,9 @@ def test_late_is_the_truth_shifted_and_the_first_value_before_it(key, steps):
 
 
 def test_a_bias_is_added_and_friction_stays_positive(key):
-    np.testing.assert_allclose(HEAR(key, bias=(0.1, -2.0)), ENVS + jnp.asarray([0.1, -2.0]), rtol=1e-6)
+    np.testing.assert_allclose(
+        HEAR(key, bias=(0.1, -2.0)), ENVS + jnp.asarray([0.1, -2.0]), rtol=1e-6
+    )
     assert float(HEAR(key, bias=(-0.9, 0.0))[:, 0].min()) == pytest.approx(0.05)
 
 

@@ -1,4 +1,6 @@
-"""Violations counted where the count is known, the theorem under attack, and forces that nobody measures."""
+"""Violations counted where the count is known, the theorem under attack, and forces
+that nobody measures.
+"""
 
 from functools import cache, partial
 
@@ -28,7 +30,11 @@ PLANTS = {"kinematic": vehicle.kinematic(), "dynamic": vehicle.dynamic()}
 
 def still(count=2, steps=12):
     """Cars that stand at the origin whatever they are told."""
-    return Trajectory(jnp.zeros((count, steps + 1, 4)), jnp.zeros((count, steps, 2)), jnp.ones((count, steps, 2)))
+    return Trajectory(
+        jnp.zeros((count, steps + 1, 4)),
+        jnp.zeros((count, steps, 2)),
+        jnp.ones((count, steps, 2)),
+    )
 
 
 def drifting(*each):
@@ -37,7 +43,11 @@ def drifting(*each):
 
 
 def tube(position, yaw=9.0, body=9.0, horizon=4):
-    return {"position_m": [position] * horizon, "yaw_rad": [yaw] * horizon, "body": [body] * horizon}
+    return {
+        "position_m": [position] * horizon,
+        "yaw_rad": [yaw] * horizon,
+        "body": [body] * horizon,
+    }
 
 
 def predicted(model, params, data, **lengths):
@@ -51,19 +61,29 @@ def predicted(model, params, data, **lengths):
 def test_windows_are_the_stretches_that_start_at_every_stride():
     one = at(driven(), 0)
     cut = every_window(one, horizon=5, stride=3)
-    assert cut.states.shape[0] == 3  # from 0, 3, 6; the one from 9 does not fit into 12 steps
+    assert (
+        cut.states.shape[0] == 3
+    )  # from 0, 3, 6; the one from 9 does not fit into 12 steps
     for index, start in enumerate((0, 3, 6)):
         np.testing.assert_array_equal(cut.states[index], one.states[start : start + 6])
-        np.testing.assert_array_equal(cut.controls[index], one.controls[start : start + 5])
+        np.testing.assert_array_equal(
+            cut.controls[index], one.controls[start : start + 5]
+        )
         np.testing.assert_array_equal(cut.envs[index], one.envs[start : start + 5])
-    with pytest.raises(ValueError, match="a horizon of 13 steps does not fit trajectories of 12 steps"):
+    with pytest.raises(
+        ValueError, match="a horizon of 13 steps does not fit trajectories of 12 steps"
+    ):
         every_window(one, horizon=13, stride=1)
 
 
 def test_errors_of_a_constant_drift_are_its_multiples_and_yaw_is_wrapped():
-    errors = window_errors(drifting(0.3, 0.4, 1.0, 0.5), {}, at(still(), 0), horizon=4, stride=4)
+    errors = window_errors(
+        drifting(0.3, 0.4, 1.0, 0.5), {}, at(still(), 0), horizon=4, stride=4
+    )
     steps = np.arange(1.0, 5.0)
-    expected = np.stack([0.5 * steps, np.minimum(steps, 2 * np.pi - steps), 0.5 * steps], axis=1)
+    expected = np.stack(
+        [0.5 * steps, np.minimum(steps, 2 * np.pi - steps), 0.5 * steps], axis=1
+    )
     np.testing.assert_allclose(errors, np.broadcast_to(expected, (3, 4, 3)), rtol=1e-5)
 
 
@@ -73,13 +93,22 @@ def test_the_errors_of_a_window_are_those_of_the_rollout_from_its_true_state():
     errors = jit(partial(window_errors, model, params, horizon=6, stride=3))(one)
     part = Trajectory(one.states[3:10], one.controls[3:9], one.envs[3:9])
     gap = jit(lambda part: rollout(model, params, part)[0])(part) - part.states[1:]
-    np.testing.assert_allclose(errors[1, :, 0], jnp.hypot(gap[:, 0], gap[:, 1]), rtol=1e-4)
+    np.testing.assert_allclose(
+        errors[1, :, 0], jnp.hypot(gap[:, 0], gap[:, 1]), rtol=1e-4
+    )
     np.testing.assert_allclose(errors[1, :, 2], jnp.abs(gap[:, 3]), atol=1e-5)
 
 
 def test_drives_are_cut_into_segments_and_the_rest_is_left_out():
-    found = predicted(drifting(0.1, 0, 0, 0), {}, still(count=3, steps=23), length=10, horizon=4)
-    assert found.errors.shape == (6, 2, 4, 3)  # 3 drives of 2 segments, windows from 0 and 5
+    found = predicted(
+        drifting(0.1, 0, 0, 0), {}, still(count=3, steps=23), length=10, horizon=4
+    )
+    assert found.errors.shape == (
+        6,
+        2,
+        4,
+        3,
+    )  # 3 drives of 2 segments, windows from 0 and 5
     assert found.latent_errors.shape == found.defects.shape == (6, 2, 4)
 
 
@@ -95,12 +124,16 @@ def test_a_segment_leaves_its_tube_if_any_window_step_or_kind_does():
 
 
 def test_a_drift_of_known_size_leaves_tubes_below_it_and_no_others():
-    found = predicted(drifting(0.0, 0.25, 0, 0), {}, still(steps=20), length=10, horizon=4)
+    found = predicted(
+        drifting(0.0, 0.25, 0, 0), {}, still(steps=20), length=10, horizon=4
+    )
     assert tube_violations(found.errors, tube(1.001)) == (0, 4)
     assert tube_violations(found.errors, tube(0.999)) == (4, 4)
     growing = tube(0.0) | {"position_m": [0.2501, 0.5001, 0.7501, 1.0001]}
     assert tube_violations(found.errors, growing) == (0, 4)
-    assert tube_violations(found.errors, growing | {"position_m": [0.2499, 9.0, 9.0, 9.0]}) == (4, 4)
+    assert tube_violations(
+        found.errors, growing | {"position_m": [0.2499, 9.0, 9.0, 9.0]}
+    ) == (4, 4)
 
 
 def test_windows_beyond_the_common_threshold_are_counted_by_window():
@@ -118,7 +151,9 @@ def test_the_theorem_is_only_asked_about_steps_up_to_the_first_large_defect():
     errors = np.asarray([[[0.5, 0.0, 0.5, 0.5]]])
     assert theorem_violations(errors, defects, np.full(4, 0.4), 0.2) == (1, 2)
     assert theorem_violations(errors, defects, np.full(4, 0.6), 0.2) == (0, 2)
-    assert theorem_violations(np.full((1, 1, 4), np.nan), defects, np.full(4, 0.6), 0.2) == (2, 2)
+    assert theorem_violations(
+        np.full((1, 1, 4), np.nan), defects, np.full(4, 0.6), 0.2
+    ) == (2, 2)
 
 
 def radii(alpha, d_bar, horizon):
@@ -126,8 +161,12 @@ def radii(alpha, d_bar, horizon):
 
 
 @pytest.mark.parametrize("alpha", [0.5, 0.93])
-def test_a_linear_model_whose_defects_all_point_one_way_fills_the_tube_and_no_more(alpha):
-    """s⁺ = α s beside the truth s⁺ = α s + d̄: |e_k| = R_k, so any smaller radius is left at every step."""
+def test_a_linear_model_whose_defects_all_point_one_way_fills_the_tube_and_no_more(
+    alpha,
+):
+    """s⁺ = α s beside the truth s⁺ = α s + d̄: |e_k| = R_k, so any smaller radius is
+    left at every step.
+    """
     d_bar, horizon = 0.2, 10
     model = models.physics(lambda state, action, env: state.at[3].multiply(alpha))
     speeds = [1.0]
@@ -136,16 +175,24 @@ def test_a_linear_model_whose_defects_all_point_one_way_fills_the_tube_and_no_mo
     data = still(count=1, steps=20)
     data = data._replace(states=data.states.at[0, :, 3].set(jnp.asarray(speeds)))
     found = predicted(model, {}, data, length=20, horizon=horizon)
-    np.testing.assert_allclose(found.latent_errors[0, 0], radii(alpha, d_bar, horizon), rtol=1e-5)
-    count, total = theorem_violations(found.latent_errors, found.defects, radii(alpha, d_bar, horizon), d_bar + 1e-6)
+    np.testing.assert_allclose(
+        found.latent_errors[0, 0], radii(alpha, d_bar, horizon), rtol=1e-5
+    )
+    count, total = theorem_violations(
+        found.latent_errors, found.defects, radii(alpha, d_bar, horizon), d_bar + 1e-6
+    )
     assert (count, total) == (0, 3 * horizon)
     tighter = radii(alpha, d_bar, horizon) * (1 - 1e-3)
-    assert theorem_violations(found.latent_errors, found.defects, tighter, d_bar + 1e-6) == (total, total)
+    assert theorem_violations(
+        found.latent_errors, found.defects, tighter, d_bar + 1e-6
+    ) == (total, total)
 
 
 @cache
 def attacked(name, d_bar, horizon=12):
-    """Predictions of a tiny SFKD beside a truth that leaves it by d̄ at every step, always away from the prediction."""
+    """Predictions of a tiny SFKD beside a truth that leaves it by d̄ at every step,
+    always away from the prediction.
+    """
     original, params = model_and_params(name)
 
     def read(fiber, state):
@@ -163,7 +210,10 @@ def attacked(name, d_bar, horizon=12):
 
         def step(pair, inputs):
             fiber, after, control = inputs
-            true, guess = (model.transport(fiber, after, model.step(fiber, z, control)) for z in pair)
+            true, guess = (
+                model.transport(fiber, after, model.step(fiber, z, control))
+                for z in pair
+            )
             apart = true.z - guess.z + 1e-6 * start
             push = 0.9999 * d_bar * apart / jnp.linalg.norm(apart)
             true = true._replace(z=true.z + push)
@@ -182,16 +232,22 @@ def attacked(name, d_bar, horizon=12):
 
 @pytest.mark.parametrize("name", ["sfkd", "no_transport", "no_fiber"])
 def test_no_defect_within_the_bound_takes_the_latent_out_of_its_tube(name):
-    """Real weights, environments that switch at every step, defects of full size in the worst direction."""
+    """Real weights, environments that switch at every step, defects of full size in the
+    worst direction.
+    """
     found, d_bar, alpha = attacked(name, 0.1), 0.1, 0.995
-    count, total = theorem_violations(found.latent_errors, found.defects, radii(alpha, d_bar, 12), d_bar)
+    count, total = theorem_violations(
+        found.latent_errors, found.defects, radii(alpha, d_bar, 12), d_bar
+    )
     assert (count, total) == (0, 3 * 12)
 
 
 @pytest.mark.parametrize("name", ["sfkd", "no_transport", "no_fiber"])
 def test_the_check_notices_a_rate_that_is_wrong(name):
     found, d_bar, alpha = attacked(name, 0.1), 0.1, 0.995 / 4
-    count, total = theorem_violations(found.latent_errors, found.defects, radii(alpha, d_bar, 12), d_bar)
+    count, total = theorem_violations(
+        found.latent_errors, found.defects, radii(alpha, d_bar, 12), d_bar
+    )
     assert total == 3 * 12
     assert count > total / 2
 
@@ -201,15 +257,25 @@ def test_the_latent_errors_of_the_true_plant_are_nothing_and_those_of_its_segmen
     assert float(np.max(found.latent_errors)) < 1e-5
     assert float(np.max(found.defects)) < 1e-5
     wrong = predicted(*model_and_params("nominal"), driven(), length=12, horizon=6)
-    np.testing.assert_allclose(wrong.latent_errors, wrong.errors[..., 2], atol=1e-6)  # the latent is the body state
+    np.testing.assert_allclose(
+        wrong.latent_errors, wrong.errors[..., 2], atol=1e-6
+    )  # the latent is the body state
 
 
 def test_the_reach_is_the_largest_error_in_units_of_its_bound_where_the_hypothesis_holds():
     errors = np.asarray([[[0.1, 0.9, 9.0], [0.2, 0.3, 0.4]]])
     defects = np.asarray([[[0.1, 0.1, 0.5], [0.1, 0.1, 0.1]]])
-    assert theorem_reach(errors, defects, np.asarray([0.2, 0.3, 0.4]), 0.2) == pytest.approx([1.0, 3.0, 1.0])
-    assert theorem_reach(errors, defects, np.asarray([0.1, 0.15, 0.2]), 0.2) == pytest.approx([2.0, 6.0, 2.0])
-    assert theorem_reach(errors, defects, np.asarray([0.2, 0.3, 0.4]), 0.05) == [None, None, None]
+    assert theorem_reach(
+        errors, defects, np.asarray([0.2, 0.3, 0.4]), 0.2
+    ) == pytest.approx([1.0, 3.0, 1.0])
+    assert theorem_reach(
+        errors, defects, np.asarray([0.1, 0.15, 0.2]), 0.2
+    ) == pytest.approx([2.0, 6.0, 2.0])
+    assert theorem_reach(errors, defects, np.asarray([0.2, 0.3, 0.4]), 0.05) == [
+        None,
+        None,
+        None,
+    ]
 
 
 # --- the record ------------------------------------------------------------------------------------------------------
@@ -219,7 +285,9 @@ def test_the_record_names_the_tube_it_speaks_of_and_is_null_where_nothing_is_cla
     errors = np.zeros((4, 1, 4, 3))
     errors[0, 0, 3, 0] = 1.5
     found = Predictions(errors, np.full((4, 1, 4), 0.3), np.full((4, 1, 4), 0.1))
-    everything = Claims(tube(2.0), tube(1.0), 0.95, np.asarray([0.2, 0.4, 0.4, 0.4]), 0.1, 1.4)
+    everything = Claims(
+        tube(2.0), tube(1.0), 0.95, np.asarray([0.2, 0.4, 0.4, 0.4]), 0.1, 1.4
+    )
     assert violations(found, everything) == {
         "v0": 0.25, "v0_reach": pytest.approx([1.5, 0.75, 0.75, 0.75]),
         "v1": 0.0, "v1_tube": "certified", "v1_radius_m": 2.0, "v1_conformal": 0.25,
@@ -227,11 +295,22 @@ def test_the_record_names_the_tube_it_speaks_of_and_is_null_where_nothing_is_cla
         "window_error_m": {"median": 0.0, "p95": pytest.approx(0.85 * 1.5)},
     }  # fmt: skip
     measured = violations(found, Claims(conformal=tube(1.0), level=0.95))
-    assert (measured["v0"], measured["v1"], measured["v1_tube"], measured["v2"]) == (None, 0.25, "conformal", None)
+    assert (measured["v0"], measured["v1"], measured["v1_tube"], measured["v2"]) == (
+        None,
+        0.25,
+        "conformal",
+        None,
+    )
     nothing = violations(found, Claims())
-    assert {name for name, value in nothing.items() if value is not None} == {"segments", "window_error_m"}
+    assert {name for name, value in nothing.items() if value is not None} == {
+        "segments",
+        "window_error_m",
+    }
     unmeasured = violations(None, everything)
-    assert all(unmeasured[name] is None for name in ("v0", "v1", "v1_conformal", "v2", "segments", "window_error_m"))
+    assert all(
+        unmeasured[name] is None
+        for name in ("v0", "v1", "v1_conformal", "v2", "segments", "window_error_m")
+    )
     assert unmeasured["v1_radius_m"] == 2.0
 
 
@@ -239,30 +318,52 @@ def test_the_record_names_the_tube_it_speaks_of_and_is_null_where_nothing_is_cla
 
 
 @pytest.mark.parametrize("name", PLANTS)
-@pytest.mark.parametrize(("wind", "force"), [(0.0, 250.0), (5.0, -250.0), (-8.0, 1000.0), (3.0, -900.0)])
+@pytest.mark.parametrize(
+    ("wind", "force"), [(0.0, 250.0), (5.0, -250.0), (-8.0, 1000.0), (3.0, -900.0)]
+)
 def test_a_push_is_the_wind_that_pushes_as_hard(name, wind, force):
     plant = PLANTS[name]
-    felt = vehicle.equivalent_wind(jnp.asarray(wind), jnp.asarray(force), wind_force=plant.wind_force)
+    felt = vehicle.equivalent_wind(
+        jnp.asarray(wind), jnp.asarray(force), wind_force=plant.wind_force
+    )
     expected = plant.wind_force * wind * abs(wind) + force
-    np.testing.assert_allclose(plant.wind_force * felt * abs(felt), expected, rtol=1e-5, atol=1e-3)
+    np.testing.assert_allclose(
+        plant.wind_force * felt * abs(felt), expected, rtol=1e-5, atol=1e-3
+    )
 
 
 def test_a_push_accelerates_the_dynamic_plant_by_force_over_mass_and_turns_it_by_its_lever():
     plant, force = PLANTS["dynamic"], 600.0
-    state, control = jnp.asarray([0.0, 0.0, 0.3, 10.0, 0.1, 0.05, 0.02]), jnp.asarray([0.03, 0.5])
-    felt = vehicle.equivalent_wind(jnp.asarray(4.0), jnp.asarray(force), wind_force=plant.wind_force)
-    rates = [plant.derivative(state, control, jnp.stack([jnp.asarray(0.5), wind])) for wind in (felt, jnp.asarray(4.0))]
-    np.testing.assert_allclose(rates[0] - rates[1], [0, 0, 0, 0, force / 1500, 0.4 * force / 2500, 0], atol=2e-5)
+    state, control = (
+        jnp.asarray([0.0, 0.0, 0.3, 10.0, 0.1, 0.05, 0.02]),
+        jnp.asarray([0.03, 0.5]),
+    )
+    felt = vehicle.equivalent_wind(
+        jnp.asarray(4.0), jnp.asarray(force), wind_force=plant.wind_force
+    )
+    rates = [
+        plant.derivative(state, control, jnp.stack([jnp.asarray(0.5), wind]))
+        for wind in (felt, jnp.asarray(4.0))
+    ]
+    np.testing.assert_allclose(
+        rates[0] - rates[1],
+        [0, 0, 0, 0, force / 1500, 0.4 * force / 2500, 0],
+        atol=2e-5,
+    )
 
 
 def test_a_pushed_episode_is_the_one_under_the_wind_that_pushes_as_hard():
-    """5 m/s of wind against 250 N, F = c_w w|w| with c_w = 10: the same numbers, and so the same drive."""
+    """5 m/s of wind against 250 N, F = c_w w|w| with c_w = 10: the same numbers, and so
+    the same drive.
+    """
     road, plant = at(roads(), 0), PLANTS["kinematic"]
     calm, windy = road.envs.at[:, 1].set(0.0), road.envs.at[:, 1].set(5.0)
     felt = jax.vmap(partial(vehicle.equivalent_wind, wind_force=plant.wind_force))(
         calm[:, 1], jnp.full(len(calm), 250.0)
     )
-    drive = jit(partial(evaluation.simulate, plant.step, follower(), {}, dt=DT, horizon=3))
+    drive = jit(
+        partial(evaluation.simulate, plant.step, follower(), {}, dt=DT, horizon=3)
+    )
     told = road._replace(envs=calm)
     pushed = drive(told, jax.random.key(0), met=calm.at[:, 1].set(felt))
     blown = drive(told, jax.random.key(0), met=windy)
@@ -277,13 +378,17 @@ def roads():
 
 
 def follower():
-    """Steers by the first reference point and a random stream, and writes down the wind it is told of."""
+    """Steers by the first reference point and a random stream, and writes down the wind
+    it is told of.
+    """
 
     def act(params, state, observation, env, reference):
         state, draw = jax.random.split(state)
         info = {"effective_samples": env[1], "healthy": jnp.asarray(True)}
         info["predicted_states"] = jnp.tile(observation, (reference.shape[0], 1))
-        steering = 0.3 * (reference[0, 2] - observation[2]) + 0.01 * jax.random.normal(draw)
+        steering = 0.3 * (reference[0, 2] - observation[2]) + 0.01 * jax.random.normal(
+            draw
+        )
         return jnp.stack([steering, jnp.zeros(())]), state, info
 
     return Controller(lambda key: key, act)
@@ -292,8 +397,20 @@ def follower():
 @cache
 def episode(largest):
     plant, road, key = PLANTS["kinematic"], at(roads(), 0), jax.random.key(3)
-    met = None if largest is None else evaluation.pushed(plant, road.envs, key, largest=largest)
-    drive = partial(evaluation.simulate, plant.step, follower(), {}, dt=DT, horizon=3, observation_noise=(0.02, 0.02))
+    met = (
+        None
+        if largest is None
+        else evaluation.pushed(plant, road.envs, key, largest=largest)
+    )
+    drive = partial(
+        evaluation.simulate,
+        plant.step,
+        follower(),
+        {},
+        dt=DT,
+        horizon=3,
+        observation_noise=(0.02, 0.02),
+    )
     return jit(drive)(road, key, met=met)
 
 
@@ -303,8 +420,12 @@ def test_a_force_of_zero_leaves_every_bit_of_an_episode_as_it_was():
 
 
 def test_a_pushed_car_is_told_the_weather_and_not_the_push():
-    np.testing.assert_array_equal(episode(800.0).effective_samples, at(roads(), 0).envs[:, 1])
-    assert float(jnp.max(jnp.abs(episode(800.0).lateral - episode(None).lateral))) > 0.02
+    np.testing.assert_array_equal(
+        episode(800.0).effective_samples, at(roads(), 0).envs[:, 1]
+    )
+    assert (
+        float(jnp.max(jnp.abs(episode(800.0).lateral - episode(None).lateral))) > 0.02
+    )
 
 
 def test_pushes_are_redrawn_every_second_evenly_within_their_bound_and_grow_with_it():
@@ -315,17 +436,35 @@ def test_pushes_are_redrawn_every_second_evenly_within_their_bound_and_grow_with
     assert np.all(levels == levels[:, :1])
     assert len(np.unique(levels[:, 0])) == 2000
     assert np.max(np.abs(force)) <= 300.0
-    np.testing.assert_allclose(np.quantile(force, [0.1, 0.5, 0.9]), [-240.0, 0.0, 240.0], atol=20.0)
-    np.testing.assert_allclose(scenarios.side_pushes(key, steps=20005, dt=DT, largest=600.0), 2 * force, rtol=1e-6)
+    np.testing.assert_allclose(
+        np.quantile(force, [0.1, 0.5, 0.9]), [-240.0, 0.0, 240.0], atol=20.0
+    )
+    np.testing.assert_allclose(
+        scenarios.side_pushes(key, steps=20005, dt=DT, largest=600.0),
+        2 * force,
+        rtol=1e-6,
+    )
 
 
 def test_pushes_do_not_share_a_stream_with_the_planner_or_the_sensors():
     key = jax.random.key(4)
-    streams = [jax.random.fold_in(key, evaluation._closed_loop.PUSHES), *jax.random.split(key)]
-    assert len({tuple(np.asarray(jax.random.key_data(stream))) for stream in streams}) == 3
+    streams = [
+        jax.random.fold_in(key, evaluation._closed_loop.PUSHES),
+        *jax.random.split(key),
+    ]
+    assert (
+        len({tuple(np.asarray(jax.random.key_data(stream))) for stream in streams}) == 3
+    )
     with jax.debug_key_reuse(True):
         road = at(roads(), 0)
         met = evaluation.pushed(PLANTS["kinematic"], road.envs, key, largest=100.0)
-        jax.jit(partial(evaluation.simulate, PLANTS["kinematic"].step, follower(), {}, dt=DT, horizon=3))(
-            road, key, met=met
-        )
+        jax.jit(
+            partial(
+                evaluation.simulate,
+                PLANTS["kinematic"].step,
+                follower(),
+                {},
+                dt=DT,
+                horizon=3,
+            )
+        )(road, key, met=met)

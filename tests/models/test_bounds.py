@@ -1,10 +1,21 @@
-"""Hard bounds of SFKD: they hold for every weight, environment, control and latent, also under attack."""
+"""Hard bounds of SFKD: they hold for every weight, environment, control and latent,
+also under attack.
+"""
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from helpers import HARD, at, driven, explicit, jit, model_and_params, space, steepest_pattern
+from helpers import (
+    HARD,
+    at,
+    driven,
+    explicit,
+    jit,
+    model_and_params,
+    space,
+    steepest_pattern,
+)
 
 from sfkd_jax import models
 from sfkd_jax.certification import lipschitz_upper
@@ -26,31 +37,45 @@ def family(kind, count=1500, size=8):
     if kind == "random":
         return free
     if kind == "rank 1":
-        return random.standard_normal((count, size, 1)) @ random.standard_normal((count, 1, size))
+        return random.standard_normal((count, size, 1)) @ random.standard_normal(
+            (count, 1, size)
+        )
     if kind == "orthogonal":
         return np.linalg.qr(free)[0]
     if kind == "nearly rank 1":
         return free[:, :, :1] @ free[:, :1] + 1e-4 * free
     if kind == "permutation":
-        return np.eye(size)[random.permuted(np.tile(np.arange(size), (count, 1)), axis=1)]
+        return np.eye(size)[
+            random.permuted(np.tile(np.arange(size), (count, 1)), axis=1)
+        ]
     return np.broadcast_to(np.diag(np.geomspace(1.0, 1e-6, size)), (count, size, size))
 
 
-@pytest.mark.parametrize("kind", ["random", "rank 1", "nearly rank 1", "orthogonal", "permutation", "geometric"])
+@pytest.mark.parametrize(
+    "kind",
+    ["random", "rank 1", "nearly rank 1", "orthogonal", "permutation", "geometric"],
+)
 @pytest.mark.parametrize("scale", [1e-18, 1e-6, 1.0, 1e6, 1e15])
-def test_the_gram_bound_is_never_below_the_norm_and_bounded_never_above_the_bound(kind, scale):
+def test_the_gram_bound_is_never_below_the_norm_and_bounded_never_above_the_bound(
+    kind, scale
+):
     matrices = (scale * family(kind)).astype(np.float32)
     norms = spectral(matrices)
     upper = np.asarray(GRAM(matrices), dtype=np.float64) * (1 + MARGIN)
     assert np.all(upper >= norms)
-    assert np.all(upper <= norms * 8 ** (1 / 2**7) * (1 + 3 * MARGIN))  # r^(1/2^(k+1)), k = 6
+    assert np.all(
+        upper <= norms * 8 ** (1 / 2**7) * (1 + 3 * MARGIN)
+    )  # r^(1/2^(k+1)), k = 6
     assert np.all(spectral(BOUNDED(matrices)) <= 0.9)
 
 
 @pytest.mark.parametrize("scale", [0.0, 1e-38, 1e-30, 1e25, 3e37])
 def test_beyond_the_range_of_float32_squares_the_bounds_stay_sound(scale):
     matrices = (scale * family("orthogonal", 50)).astype(np.float32)
-    assert np.all(np.asarray(GRAM(matrices), dtype=np.float64) * (1 + MARGIN) >= spectral(matrices))
+    assert np.all(
+        np.asarray(GRAM(matrices), dtype=np.float64) * (1 + MARGIN)
+        >= spectral(matrices)
+    )
     assert np.all(spectral(BOUNDED(matrices)) <= 0.9)
 
 
@@ -64,15 +89,26 @@ def test_a_matrix_outside_the_bound_keeps_its_direction_and_comes_close_to_the_b
     shrunk = np.asarray(BOUNDED(matrices))
     ratio = shrunk / matrices
     assert np.all(ratio > 0)
-    np.testing.assert_allclose(ratio, np.broadcast_to(ratio[:, :1, :1], ratio.shape), rtol=1e-5)
+    np.testing.assert_allclose(
+        ratio, np.broadcast_to(ratio[:, :1, :1], ratio.shape), rtol=1e-5
+    )
     assert np.all(spectral(shrunk) > 0.9 / 8 ** (1 / 2**7) * 0.999)
 
 
 @pytest.mark.parametrize("scale", [0.0, 1e-20, 1e-6, 1.0, 3.0, 1e6])
 def test_gradients_are_finite_where_singular_values_coincide(scale):
-    corners = np.stack([np.eye(6), np.outer(np.eye(6)[0], np.eye(6)[1]), np.ones((6, 6)), np.eye(6)[::-1]])
+    corners = np.stack(
+        [
+            np.eye(6),
+            np.outer(np.eye(6)[0], np.eye(6)[1]),
+            np.ones((6, 6)),
+            np.eye(6)[::-1],
+        ]
+    )
     for function in (gram_bound, lambda matrix: jnp.sum(bounded(matrix, 0.9) ** 2)):
-        gradients = jit(jax.vmap(jax.grad(function)))((scale * corners).astype(np.float32))
+        gradients = jit(jax.vmap(jax.grad(function)))(
+            (scale * corners).astype(np.float32)
+        )
         assert np.all(np.isfinite(gradients))
 
 
@@ -80,18 +116,22 @@ def environments(count=200):
     """Inside the box, far outside it, and at the ends of the earth."""
     random = np.random.default_rng(0)
     near = random.uniform([0.3, -8.0], [0.9, 8.0], (count, 2))
-    return np.concatenate([near, 100.0 * random.standard_normal((count, 2)), [[1e6, -1e6], [0.0, 0.0]]]).astype(
-        np.float32
-    )
+    return np.concatenate(
+        [near, 100.0 * random.standard_normal((count, 2)), [[1e6, -1e6], [0.0, 0.0]]]
+    ).astype(np.float32)
 
 
 @pytest.mark.parametrize("scale", [1.0, 100.0])
 @pytest.mark.parametrize("name", ["sfkd", "no_residual", "segment"])
 def test_the_operator_is_bounded_for_every_environment_and_every_weight(name, scale):
     model, params = model_and_params(name, scale)
-    operators = jit(jax.vmap(lambda env: model.fiber(model.fold(params), env).A))(environments())
+    operators = jit(jax.vmap(lambda env: model.fiber(model.fold(params), env).A))(
+        environments()
+    )
     assert np.all(spectral(operators) <= RHO)
-    assert np.all(spectral(explicit(name, scale).operators.vertices) > 0.97 * RHO)  # and the bound is used, not wasted
+    assert np.all(
+        spectral(explicit(name, scale).operators.vertices) > 0.97 * RHO
+    )  # and the bound is used, not wasted
 
 
 @pytest.mark.parametrize("seed", range(3))
@@ -99,8 +139,15 @@ def test_opposed_operators_mix_within_the_bound(seed):
     """The hull of A and −A holds 0: the norm of a mixture is smaller, never larger."""
     model, params = model_and_params("sfkd")
     free = np.random.default_rng(seed).standard_normal((3, 8, 8)).astype(np.float32)
-    params = params | {"networks": params["networks"] | {"operators": 50.0 * np.stack([free[0], -free[0], free[1]])}}
-    norms = spectral(jit(jax.vmap(lambda env: model.fiber(model.fold(params), env).A))(environments(50)))
+    params = params | {
+        "networks": params["networks"]
+        | {"operators": 50.0 * np.stack([free[0], -free[0], free[1]])}
+    }
+    norms = spectral(
+        jit(jax.vmap(lambda env: model.fiber(model.fold(params), env).A))(
+            environments(50)
+        )
+    )
     assert np.all(norms <= RHO)
     assert norms.min() < 0.9 * RHO
 
@@ -127,20 +174,33 @@ def attack(name, scale):
     def gain(point):
         z, control, env, direction = point
         unit = direction / jnp.linalg.norm(direction)
-        return jnp.sqrt(jnp.sum(jax.jvp(lambda z: value(z, control, env), (z,), (unit,))[1] ** 2) + 1e-20)
+        return jnp.sqrt(
+            jnp.sum(jax.jvp(lambda z: value(z, control, env), (z,), (unit,))[1] ** 2)
+            + 1e-20
+        )
 
     def climb(key):
         keys = jax.random.split(key, 4)
-        start = [jax.random.normal(key, (size,)) for key, size in zip(keys, (8, 2, 2, 8), strict=True)]
+        start = [
+            jax.random.normal(key, (size,))
+            for key, size in zip(keys, (8, 2, 2, 8), strict=True)
+        ]
 
         def step(point, _):
             now, slope = jax.value_and_grad(gain)(point)
-            moved = [x + 0.1 * g / (jnp.linalg.norm(g) + 1e-6) for x, g in zip(point, slope, strict=True)]
+            moved = [
+                x + 0.1 * g / (jnp.linalg.norm(g) + 1e-6)
+                for x, g in zip(point, slope, strict=True)
+            ]
             return moved, now
 
         return jnp.max(jax.lax.scan(step, start, length=ATTACK_STEPS)[1])
 
-    return float(jnp.max(jit(jax.vmap(climb))(jax.random.split(jax.random.key(3), ATTACK_STARTS))))
+    return float(
+        jnp.max(
+            jit(jax.vmap(climb))(jax.random.split(jax.random.key(3), ATTACK_STARTS))
+        )
+    )
 
 
 @pytest.mark.parametrize("scale", [1.0, 3.0, 30.0])
@@ -150,7 +210,9 @@ def test_the_residual_keeps_its_lipschitz_bound_under_attack(scale):
 
 @pytest.mark.parametrize("scale", [1.0, 3.0, 30.0])
 @pytest.mark.parametrize("name", ["sfkd", "segment"])
-def test_no_pattern_of_slopes_breaks_the_residual_and_its_multipliers_prove_it(name, scale):
+def test_no_pattern_of_slopes_breaks_the_residual_and_its_multipliers_prove_it(
+    name, scale
+):
     weights = explicit(name, scale)
     upper = lipschitz_upper(weights.residual, weights.residual_multipliers)
     lower = steepest_pattern(weights.residual)
@@ -168,10 +230,15 @@ def test_no_two_latents_are_driven_apart_by_the_residual():
     value = residual("sfkd", 3.0)
     random = np.random.default_rng(0)
     z = random.standard_normal((500, 8)) * 10.0 ** random.uniform(-1, 2, (500, 1))
-    other = z + random.standard_normal((500, 8)) * 10.0 ** random.uniform(-2, 2, (500, 1))
+    other = z + random.standard_normal((500, 8)) * 10.0 ** random.uniform(
+        -2, 2, (500, 1)
+    )
     inputs = [random.standard_normal((500, 2)).astype(np.float32) for _ in range(2)]
     both = [jit(jax.vmap(value))(x.astype(np.float32), *inputs) for x in (z, other)]
-    gap, apart = np.linalg.norm(np.subtract(*both), axis=1), np.linalg.norm(z - other, axis=1)
+    gap, apart = (
+        np.linalg.norm(np.subtract(*both), axis=1),
+        np.linalg.norm(z - other, axis=1),
+    )
     rounding = 1e-6 * (np.linalg.norm(z, axis=1) + 10.0)
     assert np.all(gap <= BETA * apart + rounding)
 
@@ -184,10 +251,14 @@ def test_the_rows_of_a_cayley_block_are_orthonormal(out, inputs, scale):
     tall = scale / np.sqrt(inputs) * random.standard_normal((20, inputs, out))
     A, B = (
         np.asarray(part, np.float64)
-        for part in jit(jax.vmap(cayley))(square.astype(np.float32), tall.astype(np.float32))
+        for part in jit(jax.vmap(cayley))(
+            square.astype(np.float32), tall.astype(np.float32)
+        )
     )
     gram = A @ A.swapaxes(1, 2) + B @ B.swapaxes(1, 2)
-    np.testing.assert_allclose(gram, np.broadcast_to(np.eye(out), gram.shape), atol=MARGIN)
+    np.testing.assert_allclose(
+        gram, np.broadcast_to(np.eye(out), gram.shape), atol=MARGIN
+    )
 
 
 def test_the_sandwich_bound_survives_ill_conditioned_weights():
@@ -199,9 +270,18 @@ def test_the_sandwich_bound_survives_ill_conditioned_weights():
     for _ in range(40):
         turns = [np.linalg.qr(random.standard_normal((8, 8)))[0] for _ in range(2)]
         tall = turns[0] @ np.diag([2000.0] + 7 * [1.0]) @ turns[1]
-        params = {"square_0": np.zeros((8, 8)), "square_1": np.zeros((8, 8)), "tall_0": tall, "tall_1": np.eye(8)}
-        params = {name: value.astype(np.float32) for name, value in params.items()} | {"psi_0": np.zeros(8, np.float32)}
-        made = [np.asarray(matrix, dtype=np.float64) for matrix in weights(params).matrices]
+        params = {
+            "square_0": np.zeros((8, 8)),
+            "square_1": np.zeros((8, 8)),
+            "tall_0": tall,
+            "tall_1": np.eye(8),
+        }
+        params = {name: value.astype(np.float32) for name, value in params.items()} | {
+            "psi_0": np.zeros(8, np.float32)
+        }
+        made = [
+            np.asarray(matrix, dtype=np.float64) for matrix in weights(params).matrices
+        ]
         worst = max(worst, steepest_pattern(made, starts=2))
     assert worst <= BETA
 
@@ -213,7 +293,9 @@ def test_the_body_read_out_is_short_in_scaled_units():
 
 @pytest.mark.parametrize("name", HARD)
 @pytest.mark.parametrize("scale", [1.0, 100.0])
-def test_two_latents_under_the_same_inputs_approach_at_least_as_fast_as_alpha(name, scale):
+def test_two_latents_under_the_same_inputs_approach_at_least_as_fast_as_alpha(
+    name, scale
+):
     """Switches of the environment at every step, transport included; α = ρ + β."""
     model, params = model_and_params(name, scale)
     data = at(driven(), 0)
@@ -223,18 +305,26 @@ def test_two_latents_under_the_same_inputs_approach_at_least_as_fast_as_alpha(na
         fibers = jax.vmap(model.fiber, in_axes=(None, 0))(params, data.envs)
         later = jax.tree.map(lambda leaf: jnp.roll(leaf, -1, axis=0), fibers)
         start = model.encode(at(fibers, 0), data.states[0])
-        pair = [start._replace(z=jax.random.normal(key, (8,))) for key in jax.random.split(jax.random.key(8))]
+        pair = [
+            start._replace(z=jax.random.normal(key, (8,)))
+            for key in jax.random.split(jax.random.key(8))
+        ]
 
         def step(pair, inputs):
             here, there, control = inputs
-            pair = [model.transport(here, there, model.step(here, latent, control)) for latent in pair]
+            pair = [
+                model.transport(here, there, model.step(here, latent, control))
+                for latent in pair
+            ]
             return pair, jnp.linalg.norm(pair[0].z - pair[1].z)
 
         first = jnp.linalg.norm(pair[0].z - pair[1].z)
         return first, jax.lax.scan(step, pair, (fibers, later, data.controls))[1]
 
     first, rest = distances(params)
-    scale_of_z = 1e-6 * (1 + scale)  # float32 rounding of latents that grow with the input gain
+    scale_of_z = 1e-6 * (
+        1 + scale
+    )  # float32 rounding of latents that grow with the input gain
     allowed = float(first) * (RHO + BETA) ** np.arange(1, len(rest) + 1)
     assert np.all(np.asarray(rest) <= allowed + scale_of_z)
     assert float(rest[0]) > 0.05 * float(first)
@@ -242,10 +332,16 @@ def test_two_latents_under_the_same_inputs_approach_at_least_as_fast_as_alpha(na
 
 def test_the_budget_is_the_callers():
     budget = {"rho": 0.5, "beta": 0.3, "budget": "sum"}
-    model = models.sfkd(space(), rank=8, vertices=2, residual_hidden=(4,), decoder_hidden=(4,), **budget)
+    model = models.sfkd(
+        space(), rank=8, vertices=2, residual_hidden=(4,), decoder_hidden=(4,), **budget
+    )
     shapes = jax.eval_shape(model.init, jax.random.key(0))
     random = np.random.default_rng(0)
-    params = jax.tree.map(lambda leaf: 3.0 * random.standard_normal(leaf.shape).astype(np.float32), shapes)
-    weights = jax.tree.map(lambda leaf: np.asarray(leaf, dtype=np.float64), jit(model.explicit)(params))
+    params = jax.tree.map(
+        lambda leaf: 3.0 * random.standard_normal(leaf.shape).astype(np.float32), shapes
+    )
+    weights = jax.tree.map(
+        lambda leaf: np.asarray(leaf, dtype=np.float64), jit(model.explicit)(params)
+    )
     assert np.all(spectral(weights.operators.vertices) <= 0.5)
     assert lipschitz_upper(weights.residual, weights.residual_multipliers) <= 0.3

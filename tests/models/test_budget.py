@@ -1,4 +1,6 @@
-"""The joint budget: operator and residual as one map are α-Lipschitz, though their norms may sum to more."""
+"""The joint budget: operator and residual as one map are α-Lipschitz, though their
+norms may sum to more.
+"""
 
 import jax.numpy as jnp
 import numpy as np
@@ -14,7 +16,9 @@ IDENTITY = Weights((jnp.eye(RANK), jnp.eye(RANK)), (jnp.ones(RANK),))
 
 
 def shared(operator_scale, coupling_scale, seed=0):
-    """A_j, G and H in float64, G and H read off a residual whose network is the identity."""
+    """A_j, G and H in float64, G and H read off a residual whose network is the
+    identity.
+    """
     random = np.random.default_rng(seed)
     operators = operator_scale * random.standard_normal((3, RANK, RANK))
     couplings = coupling_scale * random.standard_normal((2, RANK, RANK))
@@ -26,33 +30,46 @@ def shared(operator_scale, coupling_scale, seed=0):
 
 @pytest.mark.parametrize("operator_scale", [1e-3, 0.3, 3.0, 1e4])
 @pytest.mark.parametrize("coupling_scale", [1e-3, 0.1, 1.0, 1e4])
-def test_the_block_matrix_of_every_vertex_has_norm_at_most_one(operator_scale, coupling_scale):
+def test_the_block_matrix_of_every_vertex_has_norm_at_most_one(
+    operator_scale, coupling_scale
+):
     vertices, out, into = shared(operator_scale, coupling_scale)
     for vertex in vertices:
-        block = np.block([[vertex / ALPHA, out], [into / ALPHA, np.zeros((RANK, RANK))]])
+        block = np.block(
+            [[vertex / ALPHA, out], [into / ALPHA, np.zeros((RANK, RANK))]]
+        )
         assert np.linalg.norm(block, 2) <= 1.0 + 1e-6
 
 
 def test_a_residual_that_is_used_nowhere_leaves_the_operator_all_of_it():
     vertices, out, into = shared(1e4, 0.0)
-    np.testing.assert_allclose(np.linalg.norm(vertices, 2, axis=(1, 2)), ALPHA, rtol=0.03)
+    np.testing.assert_allclose(
+        np.linalg.norm(vertices, 2, axis=(1, 2)), ALPHA, rtol=0.03
+    )
     assert not out.any()
     assert not into.any()
 
 
 def test_where_the_residual_takes_a_direction_the_operator_has_none_of_it_and_keeps_the_others():
-    """G = H = e_1 e_1' (nearly): the first direction may have gain α through φ, or through A, never both."""
+    """G = H = e_1 e_1' (nearly): the first direction may have gain α through φ, or
+    through A, never both.
+    """
     projector = np.zeros((RANK, RANK))
     projector[0, 0] = 1e3
     couplings = jnp.asarray(np.stack([projector, projector]), dtype=jnp.float32)
-    vertices, residual = share_budget(jnp.eye(RANK)[None] * 1e3, couplings, IDENTITY, ALPHA)
+    vertices, residual = share_budget(
+        jnp.eye(RANK)[None] * 1e3, couplings, IDENTITY, ALPHA
+    )
     vertex = np.asarray(vertices[0])
     gain = np.asarray(residual.matrices[1] @ residual.matrices[0])[0, 0]
     assert gain > 0.99 * ALPHA
     assert abs(vertex[0, 0]) < 0.01
     np.testing.assert_allclose(np.diag(vertex)[1:], ALPHA, rtol=0.03)
     assert np.linalg.norm(vertex, 2) + gain > 1.7
-    assert np.linalg.norm(vertex + gain * np.diag([1.0] + [0.0] * (RANK - 1)), 2) <= ALPHA * 1.001
+    assert (
+        np.linalg.norm(vertex + gain * np.diag([1.0] + [0.0] * (RANK - 1)), 2)
+        <= ALPHA * 1.001
+    )
 
 
 @pytest.mark.parametrize("scale", [0.3, 1.0, 3.0, 10.0])
@@ -70,5 +87,7 @@ def test_the_budget_changes_weights_and_not_shapes(budget):
 
 
 def test_an_unknown_budget_is_named_with_the_choices():
-    with pytest.raises(ValueError, match=r"model\.budget must be one of joint, sum, got 'both'"):
+    with pytest.raises(
+        ValueError, match=r"model\.budget must be one of joint, sum, got 'both'"
+    ):
         models.sfkd(space(), budget="both")

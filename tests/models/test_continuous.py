@@ -1,4 +1,6 @@
-"""Models in continuous time: the order of the solver, symmetry, what is affine in what, and who sees e."""
+"""Models in continuous time: the order of the solver, symmetry, what is affine in what,
+and who sees e.
+"""
 
 from functools import cache, partial
 
@@ -18,9 +20,16 @@ from sfkd_jax.models._icode import affine_rates, softplus
 from sfkd_jax.types import BODY, POSE
 
 LEARNED = ("neural_ode", "icode", "icode_mppi")
-SIZES = {"neural_ode": {"hidden": (8, 8)}, "icode": {"width": 8}, "icode_mppi": {"hidden": (8, 8)}}
+SIZES = {
+    "neural_ode": {"hidden": (8, 8)},
+    "icode": {"width": 8},
+    "icode_mppi": {"hidden": (8, 8)},
+}
 PLANTS = {1: vehicle.kinematic, 4: vehicle.dynamic}
-STATES = {1: jnp.asarray([5.0, -2.0, 0.7, 11.0]), 4: jnp.asarray([5.0, -2.0, 0.7, 11.0, -0.3, 0.2, 0.1])}
+STATES = {
+    1: jnp.asarray([5.0, -2.0, 0.7, 11.0]),
+    4: jnp.asarray([5.0, -2.0, 0.7, 11.0, -0.3, 0.2, 0.1]),
+}
 CONTROL, ENV = jnp.asarray([0.12, -1.0]), jnp.asarray([0.5, 6.0])
 
 
@@ -32,7 +41,9 @@ def x64():
 
 def small(name, body=1, scales=None, **changes):
     """A small one of some size of body."""
-    known = {"nominal": PLANTS[body]().nominal_derivative} if name == "icode_mppi" else {}
+    known = (
+        {"nominal": PLANTS[body]().nominal_derivative} if name == "icode_mppi" else {}
+    )
     return getattr(models, name)(scales or space(body), **SIZES[name] | known | changes)
 
 
@@ -41,7 +52,9 @@ def drawn(name, body=1):
     """Generic parameters of unit gain, none of them 0."""
     random = np.random.default_rng(3)
     leaves = jax.eval_shape(small(name, body).init, jax.random.key(0))
-    return jax.tree.map(lambda leaf: leaf.shape[0] ** -0.5 * random.standard_normal(leaf.shape), leaves)
+    return jax.tree.map(
+        lambda leaf: leaf.shape[0] ** -0.5 * random.standard_normal(leaf.shape), leaves
+    )
 
 
 @partial(jit, static_argnums=0)
@@ -51,17 +64,30 @@ def stepped(model, params, state, control=CONTROL, env=ENV):
 
 @pytest.mark.usefixtures("x64")
 def test_the_step_is_the_exact_flow_of_a_linear_model_to_the_fourth_order():
-    """Each halving of dt divides the error over one second by 16; pose included, since it turns at a constant rate."""
+    """Each halving of dt divides the error over one second by 16; pose included, since
+    it turns at a constant rate.
+    """
     random = np.random.default_rng(0)
     linear, turning = random.standard_normal((3, 3)), np.array([1.3, -0.4, 0.8])
     scales = space(3)._replace(increment_mean=jnp.zeros(3), increment_scale=jnp.ones(3))
-    start, control = jnp.asarray([3.0, -1.0, 0.4, 12.0, 0.2, -0.3]), jnp.asarray([0.3, 1.2])
+    start, control = (
+        jnp.asarray([3.0, -1.0, 0.4, 12.0, 0.2, -0.3]),
+        jnp.asarray([0.3, 1.2]),
+    )
     offset = np.array([0.5, 0.5, 0.0])
 
     def errors(steps):
         dt = 1.0 / steps
-        rates = lambda fiber, s, u: jnp.concatenate([turning * dt, linear @ s + fiber * u[0] * offset])  # noqa: E731
-        model = continuous(scales, dt=dt, init=lambda key: {}, fiber=lambda params, env: env[1], rates=rates)
+        rates = lambda fiber, s, u: jnp.concatenate(
+            [turning * dt, linear @ s + fiber * u[0] * offset]
+        )
+        model = continuous(
+            scales,
+            dt=dt,
+            init=lambda key: {},
+            fiber=lambda params, env: env[1],
+            rates=rates,
+        )
         state = start
         for _ in range(steps):
             state = stepped(model, {}, state, control)
@@ -69,11 +95,21 @@ def test_the_step_is_the_exact_flow_of_a_linear_model_to_the_fourth_order():
         constant = float((ENV[1] / 8.0) * (control[0] / 0.2)) * offset
         system = np.block([[linear, constant[:, None]], [np.zeros((1, 4))]])
         body = (scipy.linalg.expm(system) @ np.append(scaled, 1.0))[:3]
-        back_and_forth = np.array([[0.0, -turning[2], turning[0]], [turning[2], 0.0, turning[1]], [0.0, 0.0, 0.0]])
+        back_and_forth = np.array(
+            [
+                [0.0, -turning[2], turning[0]],
+                [turning[2], 0.0, turning[1]],
+                [0.0, 0.0, 0.0],
+            ]
+        )
         motion = scipy.linalg.expm(back_and_forth)[:2, 2]
         pose = compose(start[POSE], jnp.asarray([*motion, turning[2]]))
         found = (state[BODY] - scales.body_mean) / scales.body_scale
-        return np.linalg.norm(found - body), np.linalg.norm(state[:2] - pose[:2]), abs(state[2] - pose[2])
+        return (
+            np.linalg.norm(found - body),
+            np.linalg.norm(state[:2] - pose[:2]),
+            abs(state[2] - pose[2]),
+        )
 
     coarse, fine = np.array(errors(10)), np.array(errors(20))
     assert np.all(coarse[:2] > 1e-8)
@@ -84,9 +120,13 @@ def test_the_step_is_the_exact_flow_of_a_linear_model_to_the_fourth_order():
 def test_the_rates_are_increments_over_a_period_in_units_of_the_data():
     scales = space()
     rates = lambda fiber, s, u: jnp.asarray([0.5, -1.0, 0.0, 2.0])  # noqa: E731
-    model = continuous(scales, dt=0.2, init=lambda key: {}, fiber=Conditioned, rates=rates)
+    model = continuous(
+        scales, dt=0.2, init=lambda key: {}, fiber=Conditioned, rates=rates
+    )
     moved = stepped(model, {}, jnp.asarray([0.0, 0.0, np.pi / 2, 10.0]))
-    np.testing.assert_allclose(moved, [0.05, 1.15, np.pi / 2, 10.0 + 0.2 * 2.0 * 4.0], atol=1e-5)
+    np.testing.assert_allclose(
+        moved, [0.05, 1.15, np.pi / 2, 10.0 + 0.2 * 2.0 * 4.0], atol=1e-5
+    )
     np.testing.assert_allclose(model.vector(jnp.asarray([1.0, 2.0, 3.0, 18.0])), [2.0])
 
 
@@ -111,23 +151,37 @@ def test_sizes_follow_the_space_and_wrong_ones_are_refused(name, body):
     assert state.shape == (3 + body,)
     assert model.vector(state).shape == (body,)
     assert np.all(np.isfinite(state))
-    with pytest.raises(ValueError, match=rf"state must have shape \({3 + body},\), got \(9,\)"):
+    with pytest.raises(
+        ValueError, match=rf"state must have shape \({3 + body},\), got \(9,\)"
+    ):
         model.encode(model.fiber(params, ENV), jnp.zeros(9))
 
 
 @pytest.mark.usefixtures("x64")
 @pytest.mark.parametrize("name", LEARNED)
-def test_only_the_input_affine_models_are_affine_in_control_and_environment_together(name):
-    """By the limit dt -> 0 of their steps: second differences of the rates along a line in [u; e]."""
+def test_only_the_input_affine_models_are_affine_in_control_and_environment_together(
+    name,
+):
+    """By the limit dt -> 0 of their steps: second differences of the rates along a line
+    in [u; e].
+    """
     dt, scales = 1e-6, space()
-    motion = {"increment_mean": dt * scales.increment_mean, "increment_scale": dt * scales.increment_scale}
+    motion = {
+        "increment_mean": dt * scales.increment_mean,
+        "increment_scale": dt * scales.increment_scale,
+    }
     model, params = small(name, dt=dt, scales=scales._replace(**motion)), drawn(name)
     control_way, env_way = jnp.asarray([0.0, 0.9]), jnp.asarray([0.2, -3.0])
 
     def rates(t):
-        """Of the pose and the body; the nominal bicycle is affine in the acceleration, which is what varies."""
+        """Of the pose and the body; the nominal bicycle is affine in the acceleration,
+        which is what varies.
+        """
         state = STATES[1].astype(jnp.float64).at[POSE].set(0.0)
-        return (stepped(model, params, state, CONTROL + t * control_way, ENV + t * env_way) - state) / dt
+        return (
+            stepped(model, params, state, CONTROL + t * control_way, ENV + t * env_way)
+            - state
+        ) / dt
 
     second = np.abs(rates(1.0) - 2.0 * rates(0.0) + rates(-1.0)).max()
     assert np.abs(rates(1.0) - rates(0.0)).max() > 0.1
@@ -136,38 +190,66 @@ def test_only_the_input_affine_models_are_affine_in_control_and_environment_toge
 
 @pytest.mark.usefixtures("x64")
 def test_the_learned_rates_are_exactly_affine_in_all_inputs():
-    _, rates = affine_rates(space(), (8, 8, 8), (jnp.tanh, jax.nn.softplus, jax.nn.softplus), last=1.0)
+    _, rates = affine_rates(
+        space(), (8, 8, 8), (jnp.tanh, jax.nn.softplus, jax.nn.softplus), last=1.0
+    )
     params = drawn("icode")
-    body, way = jnp.asarray([0.3]), jnp.asarray(np.random.default_rng(0).standard_normal(4))
+    body, way = (
+        jnp.asarray([0.3]),
+        jnp.asarray(np.random.default_rng(0).standard_normal(4)),
+    )
 
     def along(t):
         return rates(Conditioned(params, t * way[2:]), body, t * way[:2])
 
-    np.testing.assert_allclose(along(3.0) - along(0.0), 3.0 * (along(1.0) - along(0.0)), rtol=1e-12, atol=1e-14)
-    gain = jax.jacobian(lambda inputs: rates(Conditioned(params, inputs[2:]), body, inputs[:2]))(jnp.zeros(4))
-    np.testing.assert_allclose(along(1.0) - along(0.0), gain @ way, rtol=1e-12, atol=1e-14)
+    np.testing.assert_allclose(
+        along(3.0) - along(0.0), 3.0 * (along(1.0) - along(0.0)), rtol=1e-12, atol=1e-14
+    )
+    gain = jax.jacobian(
+        lambda inputs: rates(Conditioned(params, inputs[2:]), body, inputs[:2])
+    )(jnp.zeros(4))
+    np.testing.assert_allclose(
+        along(1.0) - along(0.0), gain @ way, rtol=1e-12, atol=1e-14
+    )
     assert np.linalg.matrix_rank(gain) == 4
 
 
 def test_the_quick_softplus_is_as_exact_as_float32_and_rises_by_the_sigmoid():
-    x = np.concatenate([np.linspace(-80.0, 80.0, 20_001), [0.0, -1e-30, 1e4]]).astype(np.float32)
+    x = np.concatenate([np.linspace(-80.0, 80.0, 20_001), [0.0, -1e-30, 1e4]]).astype(
+        np.float32
+    )
     exact = np.logaddexp(0.0, x.astype(np.float64))
     np.testing.assert_allclose(softplus(jnp.asarray(x)), exact, rtol=4e-7)
-    np.testing.assert_allclose(jax.vmap(jax.grad(softplus))(jnp.asarray(x)), scipy.special.expit(x), rtol=4e-7)
+    np.testing.assert_allclose(
+        jax.vmap(jax.grad(softplus))(jnp.asarray(x)), scipy.special.expit(x), rtol=4e-7
+    )
     assert np.isnan(softplus(jnp.asarray(jnp.nan)))
 
 
 @pytest.mark.parametrize("reads_env", [False, True])
-def test_the_gain_of_the_steering_depends_on_the_environment_only_where_it_is_read(reads_env):
-    init, rates = affine_rates(space(), (8,), (jnp.tanh,), last=1.0, reads_env=reads_env)
-    params, body, way = init(jax.random.key(0)), jnp.asarray([0.3]), jnp.asarray([0.7, -0.4])
+def test_the_gain_of_the_steering_depends_on_the_environment_only_where_it_is_read(
+    reads_env,
+):
+    init, rates = affine_rates(
+        space(), (8,), (jnp.tanh,), last=1.0, reads_env=reads_env
+    )
+    params, body, way = (
+        init(jax.random.key(0)),
+        jnp.asarray([0.3]),
+        jnp.asarray([0.7, -0.4]),
+    )
 
     def change(env, t):
         fiber = Conditioned(params, jnp.asarray(env))
         return rates(fiber, body, t * way) - rates(fiber, body, 0.0 * way)
 
-    np.testing.assert_allclose(change([0.5, 0.5], 3.0), 3.0 * change([0.5, 0.5], 1.0), rtol=1e-5)
-    assert np.allclose(change([0.5, 0.5], 1.0), change([-0.5, 0.9], 1.0), rtol=1e-5) != reads_env
+    np.testing.assert_allclose(
+        change([0.5, 0.5], 3.0), 3.0 * change([0.5, 0.5], 1.0), rtol=1e-5
+    )
+    assert (
+        np.allclose(change([0.5, 0.5], 1.0), change([-0.5, 0.9], 1.0), rtol=1e-5)
+        != reads_env
+    )
 
 
 @pytest.mark.parametrize("name", LEARNED)
@@ -175,14 +257,20 @@ def test_a_blind_model_ignores_the_environment_exactly_and_any_other_does_not(na
     other = jnp.asarray([0.8, -5.0])
     for environment in (True, False):
         model = small(name, environment=environment)
-        here, there = (stepped(model, drawn(name), STATES[1], env=env) for env in (ENV, other))
+        here, there = (
+            stepped(model, drawn(name), STATES[1], env=env) for env in (ENV, other)
+        )
         assert bool(jnp.all(here == there)) != environment
     centre = stepped(small(name), drawn(name), STATES[1], env=space().env_mean)
     assert same(centre, here, rtol=0, atol=0)
 
 
 @pytest.mark.usefixtures("x64")
-@pytest.mark.parametrize("loop", [lambda plant: plant, vehicle.with_speed_loop], ids=["acceleration", "speed"])
+@pytest.mark.parametrize(
+    "loop",
+    [lambda plant: plant, vehicle.with_speed_loop],
+    ids=["acceleration", "speed"],
+)
 @pytest.mark.parametrize("body", PLANTS)
 def test_without_a_residual_the_known_dynamics_are_all_that_moves(body, loop):
     plant = loop(PLANTS[body]())
@@ -195,7 +283,10 @@ def test_without_a_residual_the_known_dynamics_are_all_that_moves(body, loop):
 
 
 def test_the_initial_residual_is_too_small_to_matter():
-    plant, model = vehicle.kinematic(), models.icode_mppi(space(), nominal=vehicle.kinematic().nominal_derivative)
+    plant, model = (
+        vehicle.kinematic(),
+        models.icode_mppi(space(), nominal=vehicle.kinematic().nominal_derivative),
+    )
     moved = stepped(model, model.init(jax.random.key(0)), STATES[1])
     np.testing.assert_allclose(moved, plant.nominal(STATES[1], CONTROL, ENV), atol=2e-2)
 
@@ -203,16 +294,31 @@ def test_the_initial_residual_is_too_small_to_matter():
 @pytest.mark.parametrize("name", LEARNED)
 def test_gradients_of_a_rollout_reach_every_parameter(name):
     model, one = small(name), at(driven(), 0)
-    error = jit(jax.grad(lambda params: jnp.sum((rollout(model, params, one)[0] - one.states[1:]) ** 2)))
+    error = jit(
+        jax.grad(
+            lambda params: jnp.sum(
+                (rollout(model, params, one)[0] - one.states[1:]) ** 2
+            )
+        )
+    )
     gradients = error(drawn(name))
-    assert all(np.all(np.isfinite(leaf)) and np.any(leaf != 0.0) for leaf in jax.tree.leaves(gradients))
+    assert all(
+        np.all(np.isfinite(leaf)) and np.any(leaf != 0.0)
+        for leaf in jax.tree.leaves(gradients)
+    )
 
 
 @pytest.mark.parametrize("name", LEARNED)
 def test_no_model_is_much_larger_or_smaller_than_the_others(name):
-    known = {"nominal": vehicle.kinematic().nominal_derivative} if name == "icode_mppi" else {}
+    known = (
+        {"nominal": vehicle.kinematic().nominal_derivative}
+        if name == "icode_mppi"
+        else {}
+    )
     for body in PLANTS:
-        params = jax.eval_shape(getattr(models, name)(space(body), **known).init, jax.random.key(0))
+        params = jax.eval_shape(
+            getattr(models, name)(space(body), **known).init, jax.random.key(0)
+        )
         assert 9_000 < sum(leaf.size for leaf in jax.tree.leaves(params)) < 18_000
 
 

@@ -1,4 +1,6 @@
-"""What every model must keep: the contract of `Model`, over all variants and the physics rows."""
+"""What every model must keep: the contract of `Model`, over all variants and the
+physics rows.
+"""
 
 from functools import cache, partial
 
@@ -6,7 +8,20 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from helpers import HARD, OTHERS, PHYSICS, TINY, VARIANTS, at, driven, jit, model_and_params, same, space, tiny
+from helpers import (
+    HARD,
+    OTHERS,
+    PHYSICS,
+    TINY,
+    VARIANTS,
+    at,
+    driven,
+    jit,
+    model_and_params,
+    same,
+    space,
+    tiny,
+)
 
 from sfkd_jax import artefacts, models
 from sfkd_jax.core.rollouts import rollout
@@ -19,10 +34,14 @@ LEARNED = tuple(VARIANTS)
 
 def chain(model, params, trajectory):
     """Everything a model does, in a row: two steps with a switch between them."""
-    here, there = (model.fiber(params, env) for env in (trajectory.envs[0], trajectory.envs[1]))
+    here, there = (
+        model.fiber(params, env) for env in (trajectory.envs[0], trajectory.envs[1])
+    )
     start = model.encode(here, trajectory.states[0])
     stepped = model.step(here, start, trajectory.controls[0])
-    moved = model.step(there, model.transport(here, there, stepped), trajectory.controls[1])
+    moved = model.step(
+        there, model.transport(here, there, stepped), trajectory.controls[1]
+    )
     seen = model.observe(there, start, trajectory.states[2])
     again = model.observe(here, start, trajectory.states[0])
     return {
@@ -85,7 +104,11 @@ def test_sizes_follow_the_space(body):
         params = model.init(key)
         fiber = model.fiber(params, env)
         latent = model.step(fiber, model.encode(fiber, state), control)
-        return model.vector(latent), model.decode(fiber, latent), model.explicit(params).readout
+        return (
+            model.vector(latent),
+            model.decode(fiber, latent),
+            model.explicit(params).readout,
+        )
 
     two = jax.ShapeDtypeStruct((2,), jnp.float32)
     state = jax.ShapeDtypeStruct((3 + body,), jnp.float32)
@@ -97,7 +120,10 @@ def test_sizes_follow_the_space(body):
 def test_parameters_are_nested_dicts_of_float32_arrays_that_survive_the_shelf(name):
     _, params = model_and_params(name)
     flat = artefacts.flatten(params)
-    assert all(array.dtype == np.float32 and np.all(np.isfinite(array)) for array in flat.values())
+    assert all(
+        array.dtype == np.float32 and np.all(np.isfinite(array))
+        for array in flat.values()
+    )
     assert same(artefacts.unflatten(flat), params, rtol=0, atol=0)
 
 
@@ -106,7 +132,9 @@ def test_initial_parameters_depend_on_the_key_alone():
     first, again, other = (init(jax.random.key(seed)) for seed in (1, 1, 2))
     assert same(first, again, rtol=0, atol=0)
     assert all(np.all(np.isfinite(leaf)) for leaf in jax.tree.leaves(first))
-    assert not np.array_equal(first["networks"]["operators"], other["networks"]["operators"])
+    assert not np.array_equal(
+        first["networks"]["operators"], other["networks"]["operators"]
+    )
 
 
 @pytest.mark.parametrize("name", LEARNED)
@@ -118,7 +146,9 @@ def test_gradients_of_a_rollout_are_finite_and_reach_every_parameter_in_use(name
         total = jnp.sum((predicted - one.states[1:]) ** 2)
         if model.penalty is not None:
             fiber = model.fiber(params, one.envs[0])
-            total += model.penalty(fiber, model.encode(fiber, one.states[0]), one.controls[0])
+            total += model.penalty(
+                fiber, model.encode(fiber, one.states[0]), one.controls[0]
+            )
         return total
 
     flat = artefacts.flatten(jit(jax.grad(loss))(params))
@@ -129,16 +159,24 @@ def test_gradients_of_a_rollout_are_finite_and_reach_every_parameter_in_use(name
         "no_residual": ("residual",),
         "no_fiber": ("psi/layers_0/kernel",),  # which reads e
     }
-    assert not {path for path in unused if not any(part in path for part in allowed.get(name, ()))}
+    assert not {
+        path
+        for path in unused
+        if not any(part in path for part in allowed.get(name, ()))
+    }
     if name == "no_residual":
         assert unused
 
 
 @pytest.mark.parametrize("name", EVERY)
 def test_predictions_move_with_the_frame_of_the_world(name, one):
-    """SE(2): start elsewhere, facing elsewhere, and every predicted pose is moved along; body states stay."""
+    """SE(2): start elsewhere, facing elsewhere, and every predicted pose is moved
+    along; body states stay.
+    """
     world = jnp.asarray([30.0, -20.0, 1.1])
-    states = jax.vmap(lambda state: state.at[POSE].set(compose(world, state[POSE])))(one.states)
+    states = jax.vmap(lambda state: state.at[POSE].set(compose(world, state[POSE])))(
+        one.states
+    )
     here, there = run(name, one), run(name, one._replace(states=states))
     for part in ("start", "stepped", "moved"):
         expected = here[part].at[POSE].set(compose(world, here[part][POSE]))
@@ -162,22 +200,39 @@ def test_observing_the_state_that_was_encoded_gives_its_latent(name, one):
 @pytest.mark.parametrize("name", LEARNED)
 def test_what_is_certified_is_what_is_multiplied_by(name, one):
     model, params = model_and_params(name)
-    explicit, fiber = jit(lambda params: (model.explicit(params), model.fiber(model.fold(params), one.envs[0])))(params)
+    explicit, fiber = jit(
+        lambda params: (
+            model.explicit(params),
+            model.fiber(model.fold(params), one.envs[0]),
+        )
+    )(params)
     assert explicit.operators.vertices.shape == (TINY["vertices"], 8, 8)
     if name != "no_residual":
         assert same(explicit.residual, fiber.residual, rtol=0, atol=0)
     assert same(explicit.decoder[:-1], fiber.decoder[:-1], rtol=0, atol=0)
     assert bool(explicit.decoder) == (not model.along_path)
     if explicit.decoder:
-        scale = np.asarray(space().increment_scale) * (20.0 if name == "segment" else 1.0)
-        np.testing.assert_allclose(explicit.decoder[-1], scale[:, None] * np.asarray(fiber.decoder[-1]), rtol=1e-6)
+        scale = np.asarray(space().increment_scale) * (
+            20.0 if name == "segment" else 1.0
+        )
+        np.testing.assert_allclose(
+            explicit.decoder[-1],
+            scale[:, None] * np.asarray(fiber.decoder[-1]),
+            rtol=1e-6,
+        )
     mixture, *_ = np.linalg.lstsq(
-        np.asarray(explicit.operators.vertices).reshape(3, -1).T, np.ravel(fiber.A), rcond=None
+        np.asarray(explicit.operators.vertices).reshape(3, -1).T,
+        np.ravel(fiber.A),
+        rcond=None,
     )
-    np.testing.assert_allclose(np.tensordot(mixture, explicit.operators.vertices, axes=1), fiber.A, atol=1e-5)
+    np.testing.assert_allclose(
+        np.tensordot(mixture, explicit.operators.vertices, axes=1), fiber.A, atol=1e-5
+    )
     assert np.all(mixture > 0)
     np.testing.assert_allclose(mixture.sum(), 1.0, atol=1e-5)
-    assert len(explicit.residual_multipliers) == (2 if name in (*HARD, "joint", "path") else 0)
+    assert len(explicit.residual_multipliers) == (
+        2 if name in (*HARD, "joint", "path") else 0
+    )
 
 
 @pytest.mark.parametrize(
@@ -206,14 +261,18 @@ def test_an_unknown_frame_or_residual_lists_the_choices():
 
 
 def test_only_the_soft_variant_has_a_penalty_and_it_is_the_hinge_on_the_jacobian(one):
-    assert [name for name in LEARNED if model_and_params(name)[0].penalty is not None] == ["soft"]
+    assert [
+        name for name in LEARNED if model_and_params(name)[0].penalty is not None
+    ] == ["soft"]
     model, params = model_and_params("soft")
 
     @jit
     def parts(params):
         fiber = model.fiber(params, one.envs[0])
         latent = model.encode(fiber, one.states[0])
-        slope = jax.jacobian(lambda z: model.step(fiber, latent._replace(z=z), one.controls[0]).z)(latent.z)
+        slope = jax.jacobian(
+            lambda z: model.step(fiber, latent._replace(z=z), one.controls[0]).z
+        )(latent.z)
         slope = slope - fiber.A.summed()
         return model.penalty(fiber, latent, one.controls[0]), slope
 
@@ -236,11 +295,18 @@ def test_folded_parameters_are_the_same_model_and_the_same_claim(name, one):
 
     assert same(driven(folded), driven(params), rtol=1e-5, atol=1e-5)
     if model.explicit is not None:
-        assert same(jit(model.explicit)(folded), jit(model.explicit)(params), rtol=1e-6, atol=1e-6)
+        assert same(
+            jit(model.explicit)(folded),
+            jit(model.explicit)(params),
+            rtol=1e-6,
+            atol=1e-6,
+        )
 
 
 def test_no_gradient_of_training_passes_through_a_matrix_for_every_environment():
-    """One copy of such a gradient took half of a training step; folded parameters, made for driving, have it."""
+    """One copy of such a gradient took half of a training step; folded parameters, made
+    for driving, have it.
+    """
     model, params = model_and_params("sfkd")
     data = driven()
     count, steps = data.controls.shape[:2]
@@ -249,7 +315,10 @@ def test_no_gradient_of_training_passes_through_a_matrix_for_every_environment()
         predicted = jax.vmap(lambda one: rollout(model, given, one)[0])(data)
         return jnp.sum((predicted - data.states[:, 1:]) ** 2)
 
-    program = [str(jax.make_jaxpr(jax.grad(miss))(given)) for given in (params, jit(model.fold)(params))]
+    program = [
+        str(jax.make_jaxpr(jax.grad(miss))(given))
+        for given in (params, jit(model.fold)(params))
+    ]
     raw, folded = (f"f32[{count},{steps},8,8]" in text for text in program)
     assert folded
     assert not raw
@@ -257,10 +326,18 @@ def test_no_gradient_of_training_passes_through_a_matrix_for_every_environment()
 
 @pytest.mark.parametrize("name", ["sfkd", "r2dn"])
 def test_nothing_is_factorised_in_a_control_step_with_folded_parameters(name, one):
-    """A linear algebra library's own threads wait in circles on a busy host: one inverse may cost a sampling period."""
+    """A linear algebra library's own threads wait in circles on a busy host: one
+    inverse may cost a sampling period.
+    """
     model, params = model_and_params(name)
-    program = [jax.jit(model.fiber).lower(given, one.envs[0]).as_text() for given in (params, jit(model.fold)(params))]
-    raw, folded = ("lapack" in text or "linalg" in text or "triangular_solve" in text for text in program)
+    program = [
+        jax.jit(model.fiber).lower(given, one.envs[0]).as_text()
+        for given in (params, jit(model.fold)(params))
+    ]
+    raw, folded = (
+        "lapack" in text or "linalg" in text or "triangular_solve" in text
+        for text in program
+    )
     assert raw
     assert not folded
 
@@ -270,5 +347,12 @@ def test_a_claim_about_folded_parameters_is_about_the_matrices_that_run(name):
     """Spoiled after folding, they must not be certified as what they were folded from."""
     model, params = model_and_params(name)
     folded = jit(model.fold)(params)
-    spoiled = folded | {"shared": jax.tree.map(lambda leaf: 2.0 * leaf, folded["shared"])}
-    assert same(model.explicit(spoiled).readout, 2.0 * model.explicit(params).readout, rtol=1e-6, atol=1e-6)
+    spoiled = folded | {
+        "shared": jax.tree.map(lambda leaf: 2.0 * leaf, folded["shared"])
+    }
+    assert same(
+        model.explicit(spoiled).readout,
+        2.0 * model.explicit(params).readout,
+        rtol=1e-6,
+        atol=1e-6,
+    )

@@ -1,4 +1,6 @@
-"""ControlSynth: its flow contracts at the asked rate for all weights and inputs; inputs are only added."""
+"""ControlSynth: its flow contracts at the asked rate for all weights and inputs; inputs
+are only added.
+"""
 
 from functools import cache
 
@@ -17,7 +19,9 @@ RATE = 0.05
 @cache
 def parts(body, rate=RATE, dt=0.1):
     """A model with its `explicit`, compiled once."""
-    model = models.control_synth(space(body), rate=rate, dt=dt, width=24, input_hidden=(16,))
+    model = models.control_synth(
+        space(body), rate=rate, dt=dt, width=24, input_hidden=(16,)
+    )
     return model, jit(model.explicit)
 
 
@@ -25,11 +29,16 @@ def drawn(body, scale, seed=0):
     """Weights of `scale` from a bell curve, none of them 0."""
     random = np.random.default_rng(seed)
     shapes = jax.eval_shape(parts(body)[0].init, jax.random.key(0))
-    return jax.tree.map(lambda leaf: (scale * random.standard_normal(leaf.shape)).astype(np.float32), shapes)
+    return jax.tree.map(
+        lambda leaf: (scale * random.standard_normal(leaf.shape)).astype(np.float32),
+        shapes,
+    )
 
 
 def exported(body, params, rate=RATE):
-    return jax.tree.map(lambda leaf: np.asarray(leaf, dtype=np.float64), parts(body, rate)[1](params))
+    return jax.tree.map(
+        lambda leaf: np.asarray(leaf, dtype=np.float64), parts(body, rate)[1](params)
+    )
 
 
 @pytest.mark.parametrize("body", [1, 4])
@@ -53,7 +62,9 @@ def test_what_is_proved_is_the_asked_rate_and_little_more(body, rate):
 
 
 def test_the_matrices_reach_beyond_the_decay_they_prove():
-    """With slopes of 1 the state may run back much faster than γ: the bound is on the slowest direction only."""
+    """With slopes of 1 the state may run back much faster than γ: the bound is on the
+    slowest direction only.
+    """
     weights = exported(4, drawn(4, 1.0))
     assert np.linalg.norm(weights.linear) > 20 * RATE
     assert np.linalg.norm(weights.outer @ weights.inner) > RATE
@@ -62,20 +73,28 @@ def test_the_matrices_reach_beyond_the_decay_they_prove():
 @pytest.mark.parametrize("body", [1, 4])
 @pytest.mark.parametrize("scale", [0.1, 1.0])
 def test_two_solutions_under_the_same_inputs_approach_at_least_at_the_rate(body, scale):
-    """Small Runge-Kutta steps stand for the flow; inputs and environments jump; |·|_P in scaled units."""
+    """Small Runge-Kutta steps stand for the flow; inputs and environments jump; |·|_P
+    in scaled units.
+    """
     dt, steps = 0.01, 200
     model, _ = parts(body, RATE, dt)
     params, weights = drawn(body, scale), exported(body, drawn(body, scale))
     rate = incremental_rate(weights)
     keys = jax.random.split(jax.random.key(1), 3)
     controls = jnp.asarray([0.2, 2.0]) * jax.random.normal(keys[0], (steps, 2))
-    envs = jnp.asarray([0.6, 0.0]) + jnp.asarray([0.3, 8.0]) * jax.random.normal(keys[1], (steps, 2))
-    starts = space(body).body_mean + 3.0 * space(body).body_scale * jax.random.normal(keys[2], (2, 16, body))
+    envs = jnp.asarray([0.6, 0.0]) + jnp.asarray([0.3, 8.0]) * jax.random.normal(
+        keys[1], (steps, 2)
+    )
+    starts = space(body).body_mean + 3.0 * space(body).body_scale * jax.random.normal(
+        keys[2], (2, 16, body)
+    )
     states = jnp.concatenate([jnp.zeros((2, 16, 3)), starts], axis=-1)
 
     @jit
     def apart(params, states):
-        step = jax.vmap(jax.vmap(model.step, in_axes=(None, 0, None)), in_axes=(None, 0, None))
+        step = jax.vmap(
+            jax.vmap(model.step, in_axes=(None, 0, None)), in_axes=(None, 0, None)
+        )
 
         def along(states, inputs):
             control, env = inputs
@@ -86,8 +105,12 @@ def test_two_solutions_under_the_same_inputs_approach_at_least_at_the_rate(body,
         first = jax.vmap(jax.vmap(model.vector))(states)
         return first[0] - first[1], jax.lax.scan(along, states, (controls, envs))[1]
 
-    first, later = (np.asarray(part, dtype=np.float64) for part in apart(params, states))
-    length = lambda gap: np.sqrt(np.einsum("...i,ij,...j->...", gap, weights.metric, gap))  # noqa: E731
+    first, later = (
+        np.asarray(part, dtype=np.float64) for part in apart(params, states)
+    )
+    length = lambda gap: np.sqrt(
+        np.einsum("...i,ij,...j->...", gap, weights.metric, gap)
+    )
     shrunk = length(later) / length(first)
     allowed = np.exp(-rate * dt * np.arange(1, steps + 1))
     assert np.all(shrunk <= allowed[:, None] * (1 + 1e-5) + 1e-5)
@@ -106,10 +129,16 @@ def test_the_effect_of_the_input_does_not_depend_on_the_state(body):
     @jit
     def effect(params, state):
         fiber = model.fiber(params, env)
-        return (model.step(fiber, state, first) - model.step(fiber, state, second))[2:]  # positions turn with yaw
+        return (model.step(fiber, state, first) - model.step(fiber, state, second))[
+            2:
+        ]  # positions turn with yaw
 
-    slow = jnp.concatenate([jnp.zeros(3), space(body).body_mean - space(body).body_scale])
-    fast = jnp.concatenate([jnp.zeros(3), space(body).body_mean + space(body).body_scale])
+    slow = jnp.concatenate(
+        [jnp.zeros(3), space(body).body_mean - space(body).body_scale]
+    )
+    fast = jnp.concatenate(
+        [jnp.zeros(3), space(body).body_mean + space(body).body_scale]
+    )
     there, here = effect(params, fast), effect(params, slow)
     assert np.max(np.abs(here)) > 1e-3
     np.testing.assert_allclose(there, here, rtol=0.02, atol=2e-5)
@@ -118,7 +147,9 @@ def test_the_effect_of_the_input_does_not_depend_on_the_state(body):
 @pytest.mark.parametrize("body", [1, 4])
 def test_gradients_reach_every_part_and_are_finite(body):
     model, _ = parts(body)
-    state = jnp.concatenate([jnp.zeros(3), space(body).body_mean + 0.3 * space(body).body_scale])
+    state = jnp.concatenate(
+        [jnp.zeros(3), space(body).body_mean + 0.3 * space(body).body_scale]
+    )
 
     def loss(params):
         fiber = model.fiber(params, jnp.asarray([0.5, 4.0]))
@@ -134,11 +165,15 @@ def test_gradients_reach_every_part_and_are_finite(body):
 
 def test_about_ten_thousand_parameters():
     for body in (1, 4):
-        shapes = jax.eval_shape(models.control_synth(space(body)).init, jax.random.key(0))
+        shapes = jax.eval_shape(
+            models.control_synth(space(body)).init, jax.random.key(0)
+        )
         assert 10_000 <= sum(leaf.size for leaf in jax.tree.leaves(shapes)) <= 13_000
 
 
-@pytest.mark.parametrize("setting", [{"rate": 0.0}, {"rate": float("nan")}, {"networks": 0}, {"width": 0}])
+@pytest.mark.parametrize(
+    "setting", [{"rate": 0.0}, {"rate": float("nan")}, {"networks": 0}, {"width": 0}]
+)
 def test_settings_that_no_model_can_have_are_refused_by_name(setting):
     with pytest.raises(ValueError, match=rf"model\..*{next(iter(setting))}"):
         models.control_synth(space(), **setting)

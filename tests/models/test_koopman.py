@@ -1,4 +1,6 @@
-"""EDMD: the circles it looks from, the regression, and plants that it must recover exactly."""
+"""EDMD: the circles it looks from, the regression, and plants that it must recover
+exactly.
+"""
 
 from functools import cache, partial
 
@@ -23,14 +25,20 @@ KEY = jax.random.key(3)
 
 
 def two_body_space():
-    return space(4)._replace(body_mean=jnp.asarray([1.0, 0.0]), body_scale=jnp.asarray([2.0, 1.0]))
+    return space(4)._replace(
+        body_mean=jnp.asarray([1.0, 0.0]), body_scale=jnp.asarray([2.0, 1.0])
+    )
 
 
 def parked(change, count=60, steps=12):
-    """Trajectories of a plant that stands somewhere while its body state, of two entries, changes."""
+    """Trajectories of a plant that stands somewhere while its body state, of two
+    entries, changes.
+    """
     keys = jax.random.split(jax.random.key(8), 3)
     controls = jax.random.uniform(keys[0], (count, steps, 2), minval=-0.4, maxval=0.4)
-    envs = jnp.asarray([0.6, 0.0]) + jnp.asarray([0.3, 8.0]) * jax.random.uniform(keys[1], (count, steps, 2), minval=-1)
+    envs = jnp.asarray([0.6, 0.0]) + jnp.asarray([0.3, 8.0]) * jax.random.uniform(
+        keys[1], (count, steps, 2), minval=-1
+    )
     start = jax.random.uniform(keys[2], (count, 5), minval=-1.0)
 
     def step(state, inputs):
@@ -55,43 +63,71 @@ def switching_change(body, control, env):
 def identified(model, trajectories):
     half = len(trajectories.states) // 2
     train, validation = (
-        jax.tree.map(lambda leaf, s=part: leaf[s], trajectories) for part in (np.s_[:half], np.s_[half:])
+        jax.tree.map(lambda leaf, s=part: leaf[s], trajectories)
+        for part in (np.s_[:half], np.s_[half:])
     )
     return jit(model.identify)(train, validation, KEY)
 
 
 def physical(model, params, env):
-    """x⁺ = A x + B u + d κ + c in physical units, for a lift that holds the state alone."""
+    """x⁺ = A x + B u + d κ + c in physical units, for a lift that holds the state
+    alone.
+    """
     linear = model.linear(model.fiber(params, jnp.asarray(env)))
     A = linear.C @ linear.A @ jnp.linalg.inv(linear.C)
-    return A, linear.C @ linear.B, linear.C @ linear.d, linear.C @ linear.c + linear.o - A @ linear.o
+    return (
+        A,
+        linear.C @ linear.B,
+        linear.C @ linear.d,
+        linear.C @ linear.c + linear.o - A @ linear.o,
+    )
 
 
 @pytest.mark.parametrize("curvature", [-0.03, 0.0, 1e-4, 0.02])
 def test_states_along_a_circle_lie_where_they_were_put(curvature):
-    """Built in the world from progress, offset and heading, and read back: one frame, any radius."""
-    progress, left, heading = np.float32([[0.0, 1.0, 12.0], [0.5, -0.8, 2.0], [0.1, 0.0, -0.3]])
+    """Built in the world from progress, offset and heading, and read back: one frame,
+    any radius.
+    """
+    progress, left, heading = np.float32(
+        [[0.0, 1.0, 12.0], [0.5, -0.8, 2.0], [0.1, 0.0, -0.3]]
+    )
     origin = jnp.asarray([12.0, -7.0, 2.5])
 
     def place(s, y, psi):
         turn = curvature * s
-        foot = jnp.stack([s * jnp.sinc(turn / jnp.pi), s * jnp.sinc(turn / 2 / jnp.pi) * jnp.sin(turn / 2), turn])
-        return jnp.append(compose(compose(origin, foot), jnp.stack([jnp.zeros(()), y, psi])), 9.0)
+        foot = jnp.stack(
+            [
+                s * jnp.sinc(turn / jnp.pi),
+                s * jnp.sinc(turn / 2 / jnp.pi) * jnp.sin(turn / 2),
+                turn,
+            ]
+        )
+        return jnp.append(
+            compose(compose(origin, foot), jnp.stack([jnp.zeros(()), y, psi])), 9.0
+        )
 
     states = jax.vmap(place)(progress, left, heading)
-    seen = along_circle(states, jnp.asarray([left[0], heading[0]]), jnp.asarray(curvature))
-    np.testing.assert_allclose(seen, np.stack([progress, left, heading, np.full(3, 9.0)], axis=1), atol=2e-5)
+    seen = along_circle(
+        states, jnp.asarray([left[0], heading[0]]), jnp.asarray(curvature)
+    )
+    np.testing.assert_allclose(
+        seen, np.stack([progress, left, heading, np.full(3, 9.0)], axis=1), atol=2e-5
+    )
 
 
 def test_thin_plate_is_r_squared_log_r():
     centres = np.float32([[0.0, 0.0], [3.0, 4.0], [0.0, 1.0]])
     found = thin_plate(jnp.zeros(2), jnp.asarray(centres))
     np.testing.assert_allclose(found, [0.0, 25 * np.log(5.0), 0.0], atol=1e-5)
-    assert np.all(np.isfinite(jax.jacobian(thin_plate)(jnp.zeros(2), jnp.asarray(centres))))
+    assert np.all(
+        np.isfinite(jax.jacobian(thin_plate)(jnp.zeros(2), jnp.asarray(centres)))
+    )
 
 
 def test_a_linear_plant_is_recovered():
-    model = models.koopman(two_body_space(), functions=0, environment=False, ridges=(1e-10,))
+    model = models.koopman(
+        two_body_space(), functions=0, environment=False, ridges=(1e-10,)
+    )
     A, B, d, c = physical(model, identified(model, parked(linear_change)), [0.5, 2.0])
     expected = np.eye(5)
     expected[3:, 3:] = F
@@ -103,30 +139,47 @@ def test_a_linear_plant_is_recovered():
 
 
 @pytest.mark.parametrize("friction", [0.3, 0.8])
-def test_a_plant_that_varies_with_the_environment_is_recovered_at_every_environment(friction):
+def test_a_plant_that_varies_with_the_environment_is_recovered_at_every_environment(
+    friction,
+):
     model = models.koopman(two_body_space(), functions=0, ridges=(1e-10,))
-    A, B, _, c = physical(model, identified(model, parked(switching_change)), [friction, -3.0])
-    np.testing.assert_allclose(A[3:, 3:], F + (friction - 0.5) * np.eye(2)[::-1], atol=2e-4)
+    A, B, _, c = physical(
+        model, identified(model, parked(switching_change)), [friction, -3.0]
+    )
+    np.testing.assert_allclose(
+        A[3:, 3:], F + (friction - 0.5) * np.eye(2)[::-1], atol=2e-4
+    )
     np.testing.assert_allclose(B[3:], (friction - 0.5) * G, atol=2e-4)
     np.testing.assert_allclose(c[3:], friction * BIAS, atol=2e-4)
 
 
 def test_a_plant_that_is_linear_in_the_lift_is_predicted_exactly():
-    """The lift of fresh states, environments and curvatures one step later, thin-plate functions included."""
-    lift = Lift(space(), 20, 2, lateral_range=4.0, heading_range=0.5, curvature_range=0.03)
+    """The lift of fresh states, environments and curvatures one step later, thin-plate
+    functions included.
+    """
+    lift = Lift(
+        space(), 20, 2, lateral_range=4.0, heading_range=0.5, curvature_range=0.03
+    )
     random = np.random.default_rng(2)
     centres, weights = (
-        jnp.asarray(random.uniform(-1, 1, shape), jnp.float32) for shape in ((20, 3), (20 + 6 * 7, lift.rank))
+        jnp.asarray(random.uniform(-1, 1, shape), jnp.float32)
+        for shape in ((20, 3), (20 + 6 * 7, lift.rank))
     )
 
     @jit
     @jax.vmap
     def draw(key):
         x, u, e, kappa = (
-            jax.random.uniform(k, (n,), minval=-1) for k, n in zip(jax.random.split(key, 4), (4, 2, 2, 1), strict=True)
+            jax.random.uniform(k, (n,), minval=-1)
+            for k, n in zip(jax.random.split(key, 4), (4, 2, 2, 1), strict=True)
         )
         z = lift(centres, lift.centre + lift.scale * x)
-        return lift.regressors(z, 0.2 * u, jnp.asarray([0.6, 0.0]) + jnp.asarray([0.3, 8.0]) * e, 0.03 * kappa[0])
+        return lift.regressors(
+            z,
+            0.2 * u,
+            jnp.asarray([0.6, 0.0]) + jnp.asarray([0.3, 8.0]) * e,
+            0.03 * kappa[0],
+        )
 
     seen, fresh = (draw(jax.random.split(key, 600)) for key in jax.random.split(KEY))
     found = ridge_regression(seen, seen @ weights, jnp.asarray([1e-10]))[0]
@@ -137,23 +190,40 @@ def test_a_plant_that_is_linear_in_the_lift_is_predicted_exactly():
 @cache
 def driving(environment=True):
     """A model of the kinematic car and its parameters, from a few segments of driving."""
-    model = models.koopman(datasets.measure_space(dataset()), functions=30, environment=environment)
+    model = models.koopman(
+        datasets.measure_space(dataset()), functions=30, environment=environment
+    )
     return model, jit(model.identify)(dataset().train, dataset().validation, KEY)
 
 
 @pytest.mark.parametrize("environment", [True, False])
 def test_driving_is_predicted_far_better_than_by_no_change(environment):
-    """Initial parameters predict that nothing changes; drives that neither fit nor selection saw."""
+    """Initial parameters predict that nothing changes; drives that neither fit nor
+    selection saw.
+    """
     model, params = driving(environment)
-    miss = jit(jax.vmap(lambda params, drive: defects(model, params, drive)[0], in_axes=(None, 0)))
-    found, zero = (np.sqrt(np.mean(np.square(miss(p, dataset().test)), axis=(0, 1))) for p in (params, model.init(KEY)))
+    miss = jit(
+        jax.vmap(
+            lambda params, drive: defects(model, params, drive)[0], in_axes=(None, 0)
+        )
+    )
+    found, zero = (
+        np.sqrt(np.mean(np.square(miss(p, dataset().test)), axis=(0, 1)))
+        for p in (params, model.init(KEY))
+    )
     assert np.all(found < 0.25 * zero)  # e_y, e_ψ, v
 
 
 def test_seeing_the_environment_helps():
     aware, blind = (
         np.sqrt(
-            np.mean(np.square(jit(jax.vmap(partial(rollout_gap, model), in_axes=(None, 0)))(params, dataset().test)))
+            np.mean(
+                np.square(
+                    jit(jax.vmap(partial(rollout_gap, model), in_axes=(None, 0)))(
+                        params, dataset().test
+                    )
+                )
+            )
         )
         for model, params in (driving(True), driving(False))
     )
@@ -165,14 +235,16 @@ def rollout_gap(model, params, drive):
     window = Trajectory(drive.states[:11], drive.controls[:10], drive.envs[:10])
     predicted, _, _ = rollout(model, params, window)
     origin = window.states[0, POSE]
-    return jax.vmap(lambda a, b: between(origin, a[POSE])[1] - between(origin, b[POSE])[1])(
-        predicted, window.states[1:]
-    )
+    return jax.vmap(
+        lambda a, b: between(origin, a[POSE])[1] - between(origin, b[POSE])[1]
+    )(predicted, window.states[1:])
 
 
 def test_a_model_that_does_not_see_the_environment_is_the_pooled_original():
     model, params = driving(False)
-    here, there = (model.fiber(params, jnp.asarray(env)) for env in ([0.3, 8.0], [0.9, -2.0]))
+    here, there = (
+        model.fiber(params, jnp.asarray(env)) for env in ([0.3, 8.0], [0.9, -2.0])
+    )
     assert same(here, there, rtol=0, atol=0)
     assert params["weights"].shape == (30 + 3 + 2 + 2, 4 + 30)
 
@@ -181,7 +253,11 @@ def test_the_ridge_that_predicts_best_is_chosen():
     """One of the two is absurd; its place in the list does not matter."""
     for ridges in ((1e-5, 1e3), (1e3, 1e-5)):
         model = models.koopman(two_body_space(), functions=4, ridges=ridges)
-        linear = model.linear(model.fiber(identified(model, parked(linear_change)), jnp.asarray([0.6, 0.0])))
+        linear = model.linear(
+            model.fiber(
+                identified(model, parked(linear_change)), jnp.asarray([0.6, 0.0])
+            )
+        )
         np.testing.assert_allclose((linear.C @ linear.B)[3:], G, atol=0.02)
 
 
@@ -192,10 +268,15 @@ def test_the_model_and_its_linear_predictor_are_one_on_a_straight_path():
     @jit
     def both(params, state, control, env):
         fiber = model.fiber(params, env)
-        linear, latent = model.linear(fiber), model.step(fiber, model.encode(fiber, state), control)
+        linear, latent = (
+            model.linear(fiber),
+            model.step(fiber, model.encode(fiber, state), control),
+        )
         start = linear.lift(state.at[POSE].set(0.0))
         path = linear.C @ (linear.A @ start + linear.B @ control + linear.c) + linear.o
-        return model.decode(fiber, latent), path.at[POSE].set(compose(state[POSE], path[POSE]))
+        return model.decode(fiber, latent), path.at[POSE].set(
+            compose(state[POSE], path[POSE])
+        )
 
     one, other = both(params, drive.states[5], drive.controls[5], drive.envs[5])
     np.testing.assert_allclose(one, other, atol=1e-5)

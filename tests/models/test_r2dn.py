@@ -1,4 +1,6 @@
-"""R2DN: a hard contraction factor for the whole interconnection, under attack, and exact where it is known."""
+"""R2DN: a hard contraction factor for the whole interconnection, under attack, and
+exact where it is known.
+"""
 
 import jax
 import jax.numpy as jnp
@@ -10,7 +12,13 @@ from sfkd_jax import certification, models
 from sfkd_jax.models._r2dn_weights import contracting
 
 ALPHA, RANK = 0.97, 6
-SETTINGS = {"rank": RANK, "hidden": (RANK,), "decoder_hidden": (8,), "encoder_hidden": 8, "alpha": ALPHA}
+SETTINGS = {
+    "rank": RANK,
+    "hidden": (RANK,),
+    "decoder_hidden": (8,),
+    "encoder_hidden": 8,
+    "alpha": ALPHA,
+}
 BOX = (ENV_LOW, ENV_HIGH)
 FLOAT32 = 1e-5
 MODEL = models.r2dn(space(), **SETTINGS)
@@ -22,27 +30,48 @@ CONTRACTING = jit(jax.vmap(lambda A, B1, C1: contracting(A, B1, C1, ALPHA)))
 def drawn(scale, seed=0):
     """Random parameters in the shape of the model's own, but for the decoder's bound."""
     random = np.random.default_rng(seed)
-    params = jax.tree.map(lambda leaf: jnp.asarray(scale * random.standard_normal(leaf.shape), jnp.float32), INIT)
-    return params | {"weights": params["weights"] | {"log_decoder_bound": INIT["weights"]["log_decoder_bound"]}}
+    params = jax.tree.map(
+        lambda leaf: jnp.asarray(
+            scale * random.standard_normal(leaf.shape), jnp.float32
+        ),
+        INIT,
+    )
+    return params | {
+        "weights": params["weights"]
+        | {"log_decoder_bound": INIT["weights"]["log_decoder_bound"]}
+    }
 
 
 def steepest():
     """Parameters whose loop spends all that the constraint allows along the first axis: the step is α z₁ near 0.
 
-    There A = α/2, B₁ = C₁/α = 1/√2 and φ'(0) = 1: X = 0, Y = √2 − 1 make the Cayley block A = −B = 1/√2, and Y = 1
-    makes it A = 0, B = −1, so that V₂ V₁ = 2 B₂ A₁' B₁ = 1. The block [1/2 1/√2; 1/√2 0] has the norm 1.
+    There A = α/2, B₁ = C₁/α = 1/√2 and φ'(0) = 1: X = 0, Y = √2 − 1 make the Cayley
+    block A = −B = 1/√2, and Y = 1 makes it A = 0, B = −1, so that V₂ V₁ = 2 B₂ A₁' B₁ =
+    1. The block [1/2 1/√2; 1/√2 0] has the norm 1.
     """
-    zeros, axis = jax.tree.map(jnp.zeros_like, INIT["weights"]), jnp.diag(jnp.eye(RANK)[0])
-    phi = zeros["phi"] | {"tall_0": (2.0**0.5 - 1.0) * jnp.eye(RANK), "tall_1": jnp.eye(RANK)}
+    zeros, axis = (
+        jax.tree.map(jnp.zeros_like, INIT["weights"]),
+        jnp.diag(jnp.eye(RANK)[0]),
+    )
+    phi = zeros["phi"] | {
+        "tall_0": (2.0**0.5 - 1.0) * jnp.eye(RANK),
+        "tall_1": jnp.eye(RANK),
+    }
     blocks = {"A": 0.5 * axis, "B1": 0.5**0.5 * axis, "C1": 0.5**0.5 * axis, "phi": phi}
-    return INIT | {"weights": INIT["weights"] | {"feedback_gain": zeros["feedback_gain"]} | blocks}
+    return INIT | {
+        "weights": INIT["weights"] | {"feedback_gain": zeros["feedback_gain"]} | blocks
+    }
 
 
 def mutant(layer):
-    """The model with C₁ (layer 0) or B₁ (layer −1) half as long again after the bound, in all that it exposes."""
+    """The model with C₁ (layer 0) or B₁ (layer −1) half as long again after the bound,
+    in all that it exposes.
+    """
 
     def lengthened(matrices):
-        return tuple(1.5 * m if k == layer % len(matrices) else m for k, m in enumerate(matrices))
+        return tuple(
+            1.5 * m if k == layer % len(matrices) else m for k, m in enumerate(matrices)
+        )
 
     def fiber(params, env):
         found = MODEL.fiber(params, env)
@@ -61,8 +90,12 @@ def certified(model, params):
 
 def proved_by_construction(model, params):
     """The factor that the model's own multipliers prove, with no search."""
-    weights = jax.tree.map(lambda leaf: np.asarray(leaf, np.float64), jit(model.explicit)(params))
-    return certification.lipschitz_upper(weights.residual, weights.residual_multipliers, weights.operators.vertices[0])
+    weights = jax.tree.map(
+        lambda leaf: np.asarray(leaf, np.float64), jit(model.explicit)(params)
+    )
+    return certification.lipschitz_upper(
+        weights.residual, weights.residual_multipliers, weights.operators.vertices[0]
+    )
 
 
 def slope_at_rest(model, params):
@@ -73,24 +106,35 @@ def slope_at_rest(model, params):
         latent = model.encode(fiber, jnp.zeros(4))._replace(z=z)
         return model.vector(model.step(fiber, latent, space().control_mean))
 
-    return np.linalg.norm(np.asarray(jit(jax.jacobian(step))(jnp.zeros(RANK)), np.float64), 2)
+    return np.linalg.norm(
+        np.asarray(jit(jax.jacobian(step))(jnp.zeros(RANK)), np.float64), 2
+    )
 
 
 @pytest.mark.parametrize("scale", [0.0, 1e-6, 0.03, 0.3, 1.0, 30.0, 1e6])
 def test_the_constraint_holds_in_float64_and_its_bound_wastes_little(scale):
     random = np.random.default_rng(0)
-    free = [(scale * random.standard_normal((200, *size))).astype(np.float32) for size in ((6, 6), (6, 5), (4, 6))]
+    free = [
+        (scale * random.standard_normal((200, *size))).astype(np.float32)
+        for size in ((6, 6), (6, 5), (4, 6))
+    ]
     A, B1, C1 = (np.asarray(part, np.float64) for part in CONTRACTING(*free))
     increments = np.block([[A / ALPHA, B1], [C1 / ALPHA, np.zeros((200, 4, 5))]])
     norms = np.linalg.norm(increments, 2, axis=(1, 2))
     assert np.all(norms <= 1.0)
-    given = np.linalg.norm(np.block([[free[0], free[1]], [free[2], np.zeros((200, 4, 5))]]), 2, axis=(1, 2))
-    assert np.all(norms >= 0.96 * np.minimum(given, 1.0))  # and what is short stays as it is
+    given = np.linalg.norm(
+        np.block([[free[0], free[1]], [free[2], np.zeros((200, 4, 5))]]), 2, axis=(1, 2)
+    )
+    assert np.all(
+        norms >= 0.96 * np.minimum(given, 1.0)
+    )  # and what is short stays as it is
 
 
 @pytest.mark.parametrize("scale", [0.1, 1.0, 10.0])
 def test_the_step_in_float32_keeps_its_factor_under_attack(scale):
-    attacked = certification.attack_step(MODEL, drawn(scale), BOX, jax.random.key(1), starts=2, iterations=60)
+    attacked = certification.attack_step(
+        MODEL, drawn(scale), BOX, jax.random.key(1), starts=2, iterations=60
+    )
     assert attacked <= ALPHA * (1 + FLOAT32)
 
 
@@ -113,10 +157,14 @@ def test_where_the_factor_is_known_the_certificate_finds_it():
 
 
 @pytest.mark.parametrize("layer", [0, -1])
-def test_a_longer_loop_than_the_constraint_allows_has_no_certificate_and_no_contraction(layer):
+def test_a_longer_loop_than_the_constraint_allows_has_no_certificate_and_no_contraction(
+    layer,
+):
     """α/2 + 1.5 α/2 = 1.25 α at rest."""
     params = steepest()
-    np.testing.assert_allclose(slope_at_rest(mutant(layer), params), 1.25 * ALPHA, rtol=1e-4)
+    np.testing.assert_allclose(
+        slope_at_rest(mutant(layer), params), 1.25 * ALPHA, rtol=1e-4
+    )
     with pytest.raises(certification.CertificationRefused, match=r"alpha = 1\.212"):
         certified(mutant(layer), params)
 
@@ -124,11 +172,15 @@ def test_a_longer_loop_than_the_constraint_allows_has_no_certificate_and_no_cont
 @pytest.mark.parametrize("layer", [0, -1])
 def test_a_longer_loop_raises_the_certified_factor_of_any_parameters(layer):
     params = drawn(1.0)
-    assert certified(mutant(layer), params).alpha > 1.02 * certified(MODEL, params).alpha
+    assert (
+        certified(mutant(layer), params).alpha > 1.02 * certified(MODEL, params).alpha
+    )
 
 
 def test_two_trajectories_under_the_same_inputs_come_together_at_the_rate():
-    """The claim itself, over many steps, with an environment that switches at every one."""
+    """The claim itself, over many steps, with an environment that switches at every
+    one.
+    """
     params, drive = drawn(1.0), at(driven(), 0)
 
     def along(z):
@@ -140,10 +192,17 @@ def test_two_trajectories_under_the_same_inputs_come_together_at_the_rate():
         start = MODEL.encode(MODEL.fiber(params, drive.envs[0]), drive.states[0])
         return jax.lax.scan(step, start._replace(z=z), (drive.controls, drive.envs))[1]
 
-    first, second = 3.0 * np.random.default_rng(0).standard_normal((2, 20, RANK)).astype(np.float32)
-    paths = [np.asarray(jit(jax.vmap(along))(starts), np.float64) for starts in (first, second)]
+    first, second = 3.0 * np.random.default_rng(0).standard_normal(
+        (2, 20, RANK)
+    ).astype(np.float32)
+    paths = [
+        np.asarray(jit(jax.vmap(along))(starts), np.float64)
+        for starts in (first, second)
+    ]
     gaps = np.linalg.norm(paths[0] - paths[1], axis=-1)
-    allowed = np.linalg.norm(first - second, axis=-1)[:, None] * ALPHA ** np.arange(1, gaps.shape[1] + 1)
+    allowed = np.linalg.norm(first - second, axis=-1)[:, None] * ALPHA ** np.arange(
+        1, gaps.shape[1] + 1
+    )
     assert np.all(gaps <= allowed + 1e-5)
 
 
@@ -152,21 +211,37 @@ def test_the_blind_variant_ignores_e_exactly_and_the_other_does_not():
 
     def stepped(model, env):
         fiber = model.fiber(params, env)
-        return model.decode(fiber, model.step(fiber, model.encode(fiber, one.states[0]), one.controls[0]))
+        return model.decode(
+            fiber,
+            model.step(fiber, model.encode(fiber, one.states[0]), one.controls[0]),
+        )
 
-    seen = jit(lambda envs: [[stepped(model, env) for env in envs] for model in (MODEL, BLIND)])(one.envs[:2])
+    seen = jit(
+        lambda envs: [[stepped(model, env) for env in envs] for model in (MODEL, BLIND)]
+    )(one.envs[:2])
     assert not same(*seen[0], rtol=1e-3)
     assert same(*seen[1], rtol=0, atol=0)
 
 
 def test_what_is_certified_is_what_is_multiplied_by():
     params = drawn(1.0)
-    explicit, fiber = jit(lambda params: (MODEL.explicit(params), MODEL.fiber(params, jnp.asarray([0.5, 1.0]))))(params)
+    explicit, fiber = jit(
+        lambda params: (
+            MODEL.explicit(params),
+            MODEL.fiber(params, jnp.asarray([0.5, 1.0])),
+        )
+    )(params)
     assert same(explicit.operators.vertices[0], fiber.A, rtol=0, atol=0)
     assert same(explicit.residual, fiber.feedback, rtol=0, atol=0)
     assert same(explicit.decoder[:-1], fiber.decoder[:-1], rtol=0, atol=0)
-    np.testing.assert_allclose(explicit.decoder[-1], space().increment_scale[:, None] * fiber.decoder[-1], rtol=1e-6)
-    np.testing.assert_allclose(explicit.readout, space().body_scale[:, None] * fiber.readout, rtol=1e-6)
+    np.testing.assert_allclose(
+        explicit.decoder[-1],
+        space().increment_scale[:, None] * fiber.decoder[-1],
+        rtol=1e-6,
+    )
+    np.testing.assert_allclose(
+        explicit.readout, space().body_scale[:, None] * fiber.readout, rtol=1e-6
+    )
 
 
 def test_gradients_are_finite_and_reach_every_parameter():
@@ -175,15 +250,28 @@ def test_gradients_are_finite_and_reach_every_parameter():
     def loss(params):
         fiber = MODEL.fiber(params, one.envs[0])
         latent = MODEL.step(fiber, MODEL.encode(fiber, one.states[0]), one.controls[0])
-        return jnp.sum(MODEL.vector(latent) ** 2) + jnp.sum((MODEL.decode(fiber, latent) - one.states[1]) ** 2)
+        return jnp.sum(MODEL.vector(latent) ** 2) + jnp.sum(
+            (MODEL.decode(fiber, latent) - one.states[1]) ** 2
+        )
 
     gradients = jax.tree_util.tree_leaves_with_path(jit(jax.grad(loss))(params))
     assert all(np.all(np.isfinite(gradient)) for _, gradient in gradients)
-    assert [jax.tree_util.keystr(path) for path, gradient in gradients if not np.any(gradient)] == []
+    assert [
+        jax.tree_util.keystr(path)
+        for path, gradient in gradients
+        if not np.any(gradient)
+    ] == []
 
 
 @pytest.mark.parametrize(
-    ("setting", "value"), [("rank", 0), ("alpha", 1.0), ("alpha", 0.0), ("hidden", ()), ("decoder_hidden", ())]
+    ("setting", "value"),
+    [
+        ("rank", 0),
+        ("alpha", 1.0),
+        ("alpha", 0.0),
+        ("hidden", ()),
+        ("decoder_hidden", ()),
+    ],
 )
 def test_settings_that_no_model_can_have_are_refused_by_name(setting, value):
     with pytest.raises(ValueError, match=rf"model\.{setting}"):

@@ -14,7 +14,9 @@ LATENTS = (5.0 * RANDOM.standard_normal((60, 8))).astype(np.float32)
 
 
 def transported(name, scale=1.0):
-    """T(e1 → e2), T(e2 → e3) T(e1 → e2), T(e1 → e3), there and back, and T(e1 → e1), all applied to z."""
+    """T(e1 → e2), T(e2 → e3) T(e1 → e2), T(e1 → e3), there and back, and T(e1 → e1),
+    all applied to z.
+    """
     model, params = model_and_params(name, scale)
 
     def one(envs, z):
@@ -40,7 +42,11 @@ def transported(name, scale=1.0):
 def test_transport_is_an_isometry_with_inverse_and_a_cocycle(name, scale):
     found = transported(name, scale)
     close = {"rtol": 0, "atol": 2e-5}
-    np.testing.assert_allclose(np.linalg.norm(found["there"], axis=1), np.linalg.norm(LATENTS, axis=1), rtol=1e-6)
+    np.testing.assert_allclose(
+        np.linalg.norm(found["there"], axis=1),
+        np.linalg.norm(LATENTS, axis=1),
+        rtol=1e-6,
+    )
     np.testing.assert_allclose(found["home"], LATENTS, **close)
     np.testing.assert_allclose(found["back"], LATENTS, **close)
     np.testing.assert_allclose(found["on"], found["direct"], **close)
@@ -55,8 +61,12 @@ def test_without_transport_a_switch_leaves_the_latent_alone(name):
 def test_a_plane_turns_by_twice_the_arctangent():
     angles = np.linspace(-3.0, 3.0, 7)
     tangents = np.tan(angles / 2).astype(np.float32)
-    turned = jit(rotate_planes)(tangents, np.concatenate([np.ones(7), np.zeros(7)]).astype(np.float32))
-    np.testing.assert_allclose(turned, np.concatenate([np.cos(angles), np.sin(angles)]), atol=1e-5)
+    turned = jit(rotate_planes)(
+        tangents, np.concatenate([np.ones(7), np.zeros(7)]).astype(np.float32)
+    )
+    np.testing.assert_allclose(
+        turned, np.concatenate([np.cos(angles), np.sin(angles)]), atol=1e-5
+    )
 
 
 def test_rotation_is_the_cayley_transform_of_a_skew_matrix():

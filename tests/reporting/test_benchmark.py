@@ -17,7 +17,12 @@ from sfkd_jax.reporting._benchmark_words import beaten
 from sfkd_jax.reporting._blocks import Table
 from sfkd_jax.reporting._forces import forces_figure, forces_tables, pushed
 from sfkd_jax.reporting._latex import latex
-from sfkd_jax.reporting._robustness import columns, robustness, robustness_table, studies
+from sfkd_jax.reporting._robustness import (
+    columns,
+    robustness,
+    robustness_table,
+    studies,
+)
 
 ORACLE, SFKD = 0.016, 0.020
 LEVELS = ((0.9, 0.0), (0.6, -4.0), (0.3, 8.0), (0.6, 4.0))
@@ -28,15 +33,34 @@ SYSTEMS = {  # (system, env): RMSE on S3 [m]
     ("icode_mppi_one_step", "measured"): 0.040, ("nominal", "none"): 0.120, ("oracle", "measured"): ORACLE,
 }  # fmt: skip
 PAPER = {
-    "columns": ["rmse_s2_m", "rmse_s2_std", "rmse_s3_m", "rmse_s3_std", "smoothness_rad_per_s", "violation_rate"],
+    "columns": [
+        "rmse_s2_m",
+        "rmse_s2_std",
+        "rmse_s3_m",
+        "rmse_s3_std",
+        "smoothness_rad_per_s",
+        "violation_rate",
+    ],
     "icode_mppi": [0.127, 0.019, 0.174, 0.025, 0.134, 0.29],
     "sfkd": [0.098, 0.014, 0.120, 0.018, 0.101, 0.03],
 }
 
 
-def row(system, env, scenario="s3", vehicle="kinematic", sampling="feedback", factor=1.0, **more):
+def row(
+    system,
+    env,
+    scenario="s3",
+    vehicle="kinematic",
+    sampling="feedback",
+    factor=1.0,
+    **more,
+):
     sampling = None if system == "koopman_mpc" else sampling
-    scale = factor * {"s1": 0.5, "s2": 0.8, "s3": 1.0}[scenario] * (3 if sampling == "plain" else 1)
+    scale = (
+        factor
+        * {"s1": 0.5, "s2": 0.8, "s3": 1.0}[scenario]
+        * (3 if sampling == "plain" else 1)
+    )
     mean = SYSTEMS[system, env] * scale
     gap = mean - SFKD * scale
     own = system == "sfkd"
@@ -60,7 +84,10 @@ def row(system, env, scenario="s3", vehicle="kinematic", sampling="feedback", fa
 
 
 def driven_under_forces(system, env):
-    runs = [{"force_n": force, "v0": 0.0, "v1": 0.1, "v1_conformal": force / 1e3, "v2": 0.0} for force in (0.0, 500.0)]
+    runs = [
+        {"force_n": force, "v0": 0.0, "v1": 0.1, "v1_conformal": force / 1e3, "v2": 0.0}
+        for force in (0.0, 500.0)
+    ]
     runs[0] |= {"rmse_m": {"mean": SYSTEMS[system, env]}, "departures": 2}
     runs[1] |= {"departures": 0}
     return row(system, env, disturbed=runs)
@@ -74,42 +101,86 @@ def document(vehicles=("kinematic",), samplings=("feedback", "plain")):
                 rows.append(row(system, env, scenario, vehicle, sampling))
     for place, entry in enumerate(rows):
         if (entry["scenario"], entry["sampling"]) == ("s3", "feedback"):
-            rows[place] = entry | {"disturbed": driven_under_forces(entry["system"], entry["env"])["disturbed"]}
+            rows[place] = entry | {
+                "disturbed": driven_under_forces(entry["system"], entry["env"])[
+                    "disturbed"
+                ]
+            }
     for variation, factor in {
         "environment 0.5 s late": 1.5,
         "environment 1 s late": 2.5,
         "sensor noise x 2": 1.25,
     }.items():
         left = 2 if factor == 1.25 else 0
-        rows += [row(*one, factor=factor, variation=variation, departures=left) for one in SYSTEMS]
-    config = {"name": "table1", "comparison": {"paper": PAPER, "seeds": [0, 1]}, "evaluation": {"episodes": 8}}
-    return {"rows": rows, "config": config, "versions": {"jax": "0.10.2"}, "seconds": 90.0, "failed": {}}
+        rows += [
+            row(*one, factor=factor, variation=variation, departures=left)
+            for one in SYSTEMS
+        ]
+    config = {
+        "name": "table1",
+        "comparison": {"paper": PAPER, "seeds": [0, 1]},
+        "evaluation": {"episodes": 8},
+    }
+    return {
+        "rows": rows,
+        "config": config,
+        "versions": {"jax": "0.10.2"},
+        "seconds": 90.0,
+        "failed": {},
+    }
 
 
 def road(length):
     s = 0.5 * np.arange(2 * length + 400)
     curvature = 0.02 * np.sin(2 * np.pi * s / 90)
     yaw = np.cumsum(curvature) * 0.5
-    return np.stack([np.cumsum(np.cos(yaw)) * 0.5, np.cumsum(np.sin(yaw)) * 0.5, yaw, curvature], axis=1)
+    return np.stack(
+        [np.cumsum(np.cos(yaw)) * 0.5, np.cumsum(np.sin(yaw)) * 0.5, yaw, curvature],
+        axis=1,
+    )
 
 
-def cell(directory, system, env, sampling="feedback", steps=40, vehicle="kinematic", **changes):
+def cell(
+    directory,
+    system,
+    env,
+    sampling="feedback",
+    steps=40,
+    vehicle="kinematic",
+    **changes,
+):
     """A cell whose deviation follows the wind, as far as the system is wrong."""
     path, levels = road(steps), np.array(LEVELS)[np.arange(steps) // 30 % len(LEVELS)]
     time = 0.1 * np.arange(1, steps + 1)
     gain = 2 * SYSTEMS[system, env]
-    lateral = gain * (levels[:, 1] / 8 * (1 - np.exp(-3 * (time % 3))) + 0.3 * np.sin(1.7 * time + 40 * gain))
+    lateral = gain * (
+        levels[:, 1] / 8 * (1 - np.exp(-3 * (time % 3)))
+        + 0.3 * np.sin(1.7 * time + 40 * gain)
+    )
     here = path[2 * np.arange(steps + 1)]
     offset = np.concatenate([[0.0], lateral])
-    states = np.stack([here[:, 0] - offset * np.sin(here[:, 2]), here[:, 1] + offset * np.cos(here[:, 2])], axis=1)
-    states = np.concatenate([states, here[:, 2:3], np.full((steps + 1, 1), 10.0)], axis=1)
+    states = np.stack(
+        [
+            here[:, 0] - offset * np.sin(here[:, 2]),
+            here[:, 1] + offset * np.cos(here[:, 2]),
+        ],
+        axis=1,
+    )
+    states = np.concatenate(
+        [states, here[:, 2:3], np.full((steps + 1, 1), 10.0)], axis=1
+    )
     arrays = {"lateral": lateral, "states": states, "envs": levels, "path": path}
-    arrays = {name: np.stack([values] * 2).astype(np.float32) for name, values in arrays.items()}
+    arrays = {
+        name: np.stack([values] * 2).astype(np.float32)
+        for name, values in arrays.items()
+    }
     kind = "qp" if system == "koopman_mpc" else sampling
     place = directory / "cells" / vehicle / "s3" / kind
     place.mkdir(parents=True, exist_ok=True)
     arrays = {
-        name: values for name, values in (arrays | {"dt": np.float64(0.1)} | changes).items() if values is not None
+        name: values
+        for name, values in (arrays | {"dt": np.float64(0.1)} | changes).items()
+        if values is not None
     }
     write_arrays(place / f"{system}-{env}.npz", arrays, kind="cell", config={})
 
@@ -133,7 +204,10 @@ def whole(tmp_path_factory):
 def table(tmp_path_factory):
     """The table alone."""
     results = document()
-    rows = [{name: value for name, value in one.items() if name != "disturbed"} for one in results["rows"]]
+    rows = [
+        {name: value for name, value in one.items() if name != "disturbed"}
+        for one in results["rows"]
+    ]
     results["rows"] = [one for one in rows if one["variation"] is None]
     return reported(tmp_path_factory.mktemp("table"), results)
 
@@ -145,8 +219,14 @@ def text_of(directory, name):
 def tables_of(markdown, heading):
     """The cells of the first table under a heading, by row."""
     part = markdown.split(f"# {heading}")[1].split("\n#")[0]
-    lines = [line.strip("| ").split(" | ") for line in part.splitlines() if line.startswith("|")]
-    lines = [[re.sub(r"^\*\*(.*)\*\*$", r"\1", cell) for cell in line] for line in lines]
+    lines = [
+        line.strip("| ").split(" | ")
+        for line in part.splitlines()
+        if line.startswith("|")
+    ]
+    lines = [
+        [re.sub(r"^\*\*(.*)\*\*$", r"\1", cell) for cell in line] for line in lines
+    ]
     return {name: cells for name, *cells in (lines[0], *lines[2:])}
 
 
@@ -155,14 +235,22 @@ FEEDBACK = "Kinematic vehicle, sampling around a feedback law"
 
 def test_tracking_stands_beside_the_paper_with_intervals_in_millimetres(whole):
     found = tables_of(text_of(whole[0], "results.md"), f"Tracking: {FEEDBACK}")
-    assert found["SFKD"] == ["10.0 (9.0–11.0)", "16.0 (14.4–17.6)", "98 ± 14", "20.0 (18.0–22.0)", "120 ± 18"]
+    assert found["SFKD"] == [
+        "10.0 (9.0–11.0)",
+        "16.0 (14.4–17.6)",
+        "98 ± 14",
+        "20.0 (18.0–22.0)",
+        "120 ± 18",
+    ]
     assert found["ICODE-MPPI (e)"][-1] == found["ICODE-MPPI (no e)"][-1] == "174 ± 25"
     assert found["ICODE-MPPI, one step (e)"][-2:] == ["40.0 (36.0–44.0)", "174 ± 25"]
     assert found["Oracle"][-1] == "–"
 
 
 def test_differences_are_marked_where_the_interval_leaves_zero_on_either_side(whole):
-    found = tables_of(text_of(whole[0], "results.md"), f"Against SFKD and the oracle: {FEEDBACK}")
+    found = tables_of(
+        text_of(whole[0], "results.md"), f"Against SFKD and the oracle: {FEEDBACK}"
+    )
     assert found["ICODE-MPPI (e)"][2] == r"+5.0 (4.0–6.0) \*"
     assert found["SFKD − contraction"][2] == "−2.0 (−3.0 to −1.0) †"
     assert found["SFKD"] == ["–", "–", "–", "1.25 / 1.25 / 1.25"]
@@ -170,8 +258,12 @@ def test_differences_are_marked_where_the_interval_leaves_zero_on_either_side(wh
 
 def test_a_quadratic_program_is_compared_with_the_sampling_it_was_compared_with(whole):
     markdown = text_of(whole[0], "results.md")
-    own = tables_of(markdown, f"Against SFKD and the oracle: {FEEDBACK}")["Koopman MPC (e)"]
-    other = tables_of(markdown, "Against SFKD and the oracle: Kinematic vehicle, plain sampling")["Koopman MPC (e)"]
+    own = tables_of(markdown, f"Against SFKD and the oracle: {FEEDBACK}")[
+        "Koopman MPC (e)"
+    ]
+    other = tables_of(
+        markdown, "Against SFKD and the oracle: Kinematic vehicle, plain sampling"
+    )["Koopman MPC (e)"]
     assert own[2].startswith("+70.0")
     assert own[3] == "5.62 / 5.62 / 5.62"
     assert other == ["–"] * 4
@@ -179,11 +271,16 @@ def test_a_quadratic_program_is_compared_with_the_sampling_it_was_compared_with(
 
 def test_rows_in_path_coordinates_have_the_names_of_their_systems_under_a_title_that_says_so():
     ours = row("sfkd", "measured", sampling="law") | {"system": "sfkd_path"}
-    theirs = row("neural_ode", "measured", sampling="law") | {"system": "neural_ode_path"}
-    unbound = row("sfkd_no_contraction", "measured", sampling="law") | {"system": "sfkd_path_no_contraction"}
+    theirs = row("neural_ode", "measured", sampling="law") | {
+        "system": "neural_ode_path"
+    }
+    unbound = row("sfkd_no_contraction", "measured", sampling="law") | {
+        "system": "sfkd_path_no_contraction"
+    }
     text = benchmark_markdown(document() | {"rows": [ours, unbound, theirs]})
     found = tables_of(
-        text, "Against SFKD and the oracle: Kinematic vehicle, path coordinates, sampling around their law"
+        text,
+        "Against SFKD and the oracle: Kinematic vehicle, path coordinates, sampling around their law",
     )
     assert list(found) == ["Row", "SFKD", "SFKD − contraction", "Neural ODE (e)"]
     assert found["Neural ODE (e)"][0].startswith("+")
@@ -197,20 +294,43 @@ def test_claims_predictions_and_cost_are_there(whole):
     found = tables_of(markdown, f"Threshold and planner: {FEEDBACK}")
     assert found["SFKD"] == ["0.1 / 0.2 / 0.2", "3.0", "0 / 0 / 0", "–", "–"]
     assert found["Oracle"][:2] == ["0.1 / 0.1 / 0.2", "–"]
-    assert tables_of(markdown, "Prediction without feedback, position error")["SFKD"] == ["0.2", "2.0", "20.0", "100.0"]
-    assert tables_of(markdown, "Cost and certificate")["SFKD"] == ["9.25", "20.50", "9.25", "20.50", "12345", "0.9322"]
+    assert tables_of(markdown, "Prediction without feedback, position error")[
+        "SFKD"
+    ] == ["0.2", "2.0", "20.0", "100.0"]
+    assert tables_of(markdown, "Cost and certificate")["SFKD"] == [
+        "9.25",
+        "20.50",
+        "9.25",
+        "20.50",
+        "12345",
+        "0.9322",
+    ]
 
 
 def test_the_papers_claim_is_said_beside_ours_with_its_paired_interval(whole):
     markdown = text_of(whole[0], "results.md")
     assert "31 % lower than ICODE-MPPI on S3 (120 against 174 mm)" in markdown
-    for name, share, mean, gap in ((" (e)", 20, 25, 5), (" (no e)", 75, 80, 60), (", one step (e)", 50, 40, 20)):
-        interval = f"{gap}.0 mm, 95 % interval {gap - 1}.0 to {gap + 1}.0, so SFKD is better."
-        text = f"20.0 against {mean}.0 mm, {share} % lower; paired difference {interval}"
+    for name, share, mean, gap in (
+        (" (e)", 20, 25, 5),
+        (" (no e)", 75, 80, 60),
+        (", one step (e)", 50, 40, 20),
+    ):
+        interval = (
+            f"{gap}.0 mm, 95 % interval {gap - 1}.0 to {gap + 1}.0, so SFKD is better."
+        )
+        text = (
+            f"20.0 against {mean}.0 mm, {share} % lower; paired difference {interval}"
+        )
         assert markdown.count(f"**SFKD against ICODE-MPPI{name}.** On S3 {text}") == 1
     text = "20.0 against 18.0 mm, 11 % higher; paired difference −2.0 mm, 95 % interval −3.0 to −1.0"
-    assert f"**SFKD against SFKD − contraction.** On S3 {text}, so SFKD − contraction is better." in markdown
-    assert "1.25 on S1, 1.25 on S2, 1.25 on S3 times that of a planner with the true vehicle" in markdown
+    assert (
+        f"**SFKD against SFKD − contraction.** On S3 {text}, so SFKD − contraction is better."
+        in markdown
+    )
+    assert (
+        "1.25 on S1, 1.25 on S2, 1.25 on S3 times that of a planner with the true vehicle"
+        in markdown
+    )
 
 
 def test_rows_that_beat_sfkd_are_named_and_no_others():
@@ -221,10 +341,19 @@ def test_rows_that_beat_sfkd_are_named_and_no_others():
     assert found["prediction, 20 ahead [mm]: 100.0"] == "SFKD − contraction 90.0"
     assert "S3 steering rate [rad/s]: 0.054" in rest.text
     assert not any(name.startswith("S3 steering rate") for name in found)
-    worst = [row(*one) for one in SYSTEMS if one != ("sfkd", "measured")] + [row("sfkd", "measured", factor=20)]
+    worst = [row(*one) for one in SYSTEMS if one != ("sfkd", "measured")] + [
+        row("sfkd", "measured", factor=20)
+    ]
     others = beaten(contests(worst)[0])[0].rows[0][1]
-    assert all(line.name in others for line in contests(worst)[0].lines if line.system != "sfkd")
-    assert not any(isinstance(block, Table) for block in beaten(contests([row("sfkd", "measured")])[0]))
+    assert all(
+        line.name in others
+        for line in contests(worst)[0].lines
+        if line.system != "sfkd"
+    )
+    assert not any(
+        isinstance(block, Table)
+        for block in beaten(contests([row("sfkd", "measured")])[0])
+    )
 
 
 def test_latex_is_balanced_and_bold_marks_the_best_learned_row(whole):
@@ -234,16 +363,32 @@ def test_latex_is_balanced_and_bold_marks_the_best_learned_row(whole):
     assert depths.min() == 0
     assert depths[-1] == 0
     assert r"\usepackage{booktabs,graphicx}" in text.splitlines()[0]
-    assert text.count(r"\begin{table}") == text.count(r"\resizebox") == text.count(r"\end{table}") == 2
+    assert (
+        text.count(r"\begin{table}")
+        == text.count(r"\resizebox")
+        == text.count(r"\end{table}")
+        == 2
+    )
     assert len(set(re.findall(r"\\label\{[^}]*\}", text))) == 2
-    assert text.count(r"\begin{tabular}") == text.count(r"\end{tabular}") == text.count(r"\bottomrule") == 2
+    assert (
+        text.count(r"\begin{tabular}")
+        == text.count(r"\end{tabular}")
+        == text.count(r"\bottomrule")
+        == 2
+    )
     assert body.isascii()
     for tabular in text.split(r"\begin{tabular}")[1:]:
         width = len(re.match(r"\{l(r+)\}", tabular)[1])
-        lines = [line for line in tabular.splitlines() if line.startswith(("SFKD", "ICODE", "Oracle", "Koopman"))]
+        lines = [
+            line
+            for line in tabular.splitlines()
+            if line.startswith(("SFKD", "ICODE", "Oracle", "Koopman"))
+        ]
         assert {line.count("&") for line in lines} == {width}
     feedback = text.split(r"\end{tabular}")[0]
-    bold = {line.split(" &")[0] for line in feedback.splitlines() if r"\textbf{18.0" in line}
+    bold = {
+        line.split(" &")[0] for line in feedback.splitlines() if r"\textbf{18.0" in line
+    }
     assert bold == {"SFKD $-$ contraction"}
     assert not re.search(r"(?m)^(Oracle|Nominal).*textbf", text)
 
@@ -258,33 +403,58 @@ def test_the_page_is_one_file_that_asks_for_nothing(table):
     assert all(link.startswith("data:image/") for link in links)
     assert re.search(r"https?://|url\(|@import|<script", page) is None
     assert len(page.encode()) < 5e6
-    assert re.search(r"\b(nan|None|null)\b", re.sub(r"<style>.*?</style>|base64,[^\"]*", "", page, flags=re.S)) is None
+    assert (
+        re.search(
+            r"\b(nan|None|null)\b",
+            re.sub(r"<style>.*?</style>|base64,[^\"]*", "", page, flags=re.S),
+        )
+        is None
+    )
 
 
 def test_markdown_depends_on_the_results_alone_and_links_what_is_drawn(whole):
     directory, made = whole
     markdown = text_of(directory, "results.md")
-    assert markdown == benchmark_markdown(json.loads((directory / "results.json").read_text()))
+    assert markdown == benchmark_markdown(
+        json.loads((directory / "results.json").read_text())
+    )
     links = re.findall(r"\]\(([^)]*)\)", markdown)
-    assert {f"results_files/{Path(figure).name}" for figure in made["figures"] if figure.endswith("png")} == set(links)
+    assert {
+        f"results_files/{Path(figure).name}"
+        for figure in made["figures"]
+        if figure.endswith("png")
+    } == set(links)
     assert all((directory / "report" / link).exists() for link in links)
     assert "data:" not in markdown
-    widths = [{line.count(" | ") for line in table.splitlines()} for table in re.findall(r"(?m)(?:^\|.*\n)+", markdown)]
+    widths = [
+        {line.count(" | ") for line in table.splitlines()}
+        for table in re.findall(r"(?m)(?:^\|.*\n)+", markdown)
+    ]
     assert all(len(width) == 1 for width in widths)
 
 
-def test_every_figure_is_drawn_once_and_those_of_the_table_not_again_in_its_studies(whole, table):
-    of_studies, of_table = ([Path(figure).name for figure in made["figures"]] for _, made in (whole, table))
+def test_every_figure_is_drawn_once_and_those_of_the_table_not_again_in_its_studies(
+    whole, table
+):
+    of_studies, of_table = (
+        [Path(figure).name for figure in made["figures"]] for _, made in (whole, table)
+    )
     assert of_studies == [
         "variations_kinematic_feedback_s3.png",
         "figure2_kinematic_feedback.png",
         "rmse_kinematic.png",
     ]
-    assert of_table == ["rmse_kinematic.png", "figure1_kinematic.png", "s3_kinematic.gif"]
+    assert of_table == [
+        "rmse_kinematic.png",
+        "figure1_kinematic.png",
+        "s3_kinematic.gif",
+    ]
 
 
 def test_the_film_is_small_and_moves(table):
-    file = Path(next(figure for figure in table[1]["figures"] if figure.endswith(".gif")))
+    file = Path(
+        next(figure for figure in table[1]["figures"] if figure.endswith(".gif"))
+    )
     assert file.stat().st_size <= MOST_BYTES
     with Image.open(file) as image:
         assert image.n_frames == 40
@@ -299,11 +469,23 @@ def test_figure_1_draws_what_lies_there_and_names_what_does_not(whole):
     (contest, _) = contests(document()["rows"])
     figure = through_switches(whole[0], contest)
     drawn = {str(line.get_label()) for axes in figure.axes for line in axes.get_lines()}
-    assert {"SFKD", "Oracle", "Nominal", "ICODE-MPPI (e)", "ICODE-MPPI, one step (e)", "Koopman MPC (no e)"} <= drawn
+    assert {
+        "SFKD",
+        "Oracle",
+        "Nominal",
+        "ICODE-MPPI (e)",
+        "ICODE-MPPI, one step (e)",
+        "Koopman MPC (no e)",
+    } <= drawn
     assert not any("Neural ODE" in name for name in drawn)
-    assert figure._supxlabel.get_text() == "No driven episode of: Neural ODE (e), Neural ODE (no e)."
+    assert (
+        figure._supxlabel.get_text()
+        == "No driven episode of: Neural ODE (e), Neural ODE (no e)."
+    )
     assert any(text.get_text() == "μ 0.6\nw −4 m/s" for text in figure.axes[0].texts)
-    curve = next(line for line in figure.axes[0].get_lines() if line.get_label() == "SFKD")
+    curve = next(
+        line for line in figure.axes[0].get_lines() if line.get_label() == "SFKD"
+    )
     assert len(curve.get_xdata()) == 40
     assert figure.axes[0].get_ylim()[1] > np.max(np.abs(curve.get_ydata()))
     assert len(through_switches(None, contest).axes) == 1
@@ -312,13 +494,17 @@ def test_figure_1_draws_what_lies_there_and_names_what_does_not(whole):
 def test_a_row_that_says_where_its_arrays_lie_is_believed(tmp_path):
     cell(tmp_path, "sfkd", "measured")
     for end in ("npz", "json"):
-        (tmp_path / f"cells/kinematic/s3/feedback/sfkd-measured.{end}").rename(tmp_path / f"elsewhere.{end}")
+        (tmp_path / f"cells/kinematic/s3/feedback/sfkd-measured.{end}").rename(
+            tmp_path / f"elsewhere.{end}"
+        )
     (contest,) = contests([row("sfkd", "measured")])
     assert film(tmp_path, contest, tmp_path / "s3.gif", seconds=0.5) is None
     (contest,) = contests([row("sfkd", "measured", arrays="elsewhere.npz")])
     place, names = film(tmp_path, contest, tmp_path / "s3.gif", seconds=0.5)
     assert names == ["SFKD"]
-    within, _ = film(tmp_path, contest, tmp_path / "corridor.gif", seconds=0.5, corridor=0.1)
+    within, _ = film(
+        tmp_path, contest, tmp_path / "corridor.gif", seconds=0.5, corridor=0.1
+    )
     assert within.read_bytes() != place.read_bytes()
 
 
@@ -326,16 +512,34 @@ def test_a_study_sets_every_row_beside_itself_as_it_is(whole):
     rows = document()["rows"]
     (contest, plain) = contests(rows)
     (study,) = studies(rows, contest)
-    assert columns(study) == ["as it is", "environment 0.5 s late", "environment 1 s late", "sensor noise x 2"]
+    assert columns(study) == [
+        "as it is",
+        "environment 0.5 s late",
+        "environment 1 s late",
+        "sensor noise x 2",
+    ]
     assert studies(rows, plain) == []
-    found = tables_of(text_of(whole[0], "results.md"), f"What changes cost, S3: {FEEDBACK}")
+    found = tables_of(
+        text_of(whole[0], "results.md"), f"What changes cost, S3: {FEEDBACK}"
+    )
     assert found["Row"][1] == "environment 0.5 s late \\[mm\\]"
-    assert found["Nominal"] == ["120.0", "180.0 (1.50)", "300.0 (2.50)", "150.0 (1.25), 2 left"]
+    assert found["Nominal"] == [
+        "120.0",
+        "180.0 (1.50)",
+        "300.0 (2.50)",
+        "150.0 (1.25), 2 left",
+    ]
     assert set(found) == {"Row", *(line.name for line in contest.lines)}
     figure = robustness(study)
-    assert [axes.get_title(loc="left").replace("\n", " ") for axes in figure.axes][2] == "sensor noise ×\u00a02"
+    assert [axes.get_title(loc="left").replace("\n", " ") for axes in figure.axes][
+        2
+    ] == "sensor noise ×\u00a02"
     for axes, factor in zip(figure.axes, (1.5, 2.5, 1.25), strict=True):
-        ends = [line.get_xdata() for line in axes.get_lines() if line.get_gid() and len(line.get_xdata()) == 2]
+        ends = [
+            line.get_xdata()
+            for line in axes.get_lines()
+            if line.get_gid() and len(line.get_xdata()) == 2
+        ]
         assert len(ends) == len(SYSTEMS)
         np.testing.assert_allclose([after / before for before, after in ends], factor)
     assert len({axes.get_xlim() for axes in figure.axes}) == 1
@@ -344,12 +548,17 @@ def test_a_study_sets_every_row_beside_itself_as_it_is(whole):
 def test_shares_of_the_data_rise_to_the_whole_of_it():
     rows = [row(*one) for one in SYSTEMS]
     for share, factor in (("10", 1.5), ("1", 3.0)):
-        rows += [row(*one, factor=factor, variation=f"data share {share} %") for one in SYSTEMS]
+        rows += [
+            row(*one, factor=factor, variation=f"data share {share} %")
+            for one in SYSTEMS
+        ]
     results = {"rows": rows, "config": {"name": "small_data"}}
     (study,) = studies(rows, contests(rows)[0])
     assert columns(study) == ["data share 1 %", "data share 10 %", "data share 100 %"]
     markdown = benchmark_markdown(results)
-    assert markdown.startswith("# Less training data, row by row\n\nThe policies are trained anew on a share of")
+    assert markdown.startswith(
+        "# Less training data, row by row\n\nThe policies are trained anew on a share of"
+    )
     found = tables_of(markdown, f"Share of the training data, S3: {FEEDBACK}")
     assert found["SFKD"] == ["60.0 (3.00)", "30.0 (1.50)", "20.0"]
     assert markdown.index("Share of the training data") < markdown.index("Tracking: ")
@@ -357,28 +566,50 @@ def test_shares_of_the_data_rise_to_the_whole_of_it():
 
 def test_every_training_of_a_row_is_drawn_and_told_apart():
     trained = {"sfkd": [0.018, 0.022], "oracle": [0.016, 0.016]}
-    rows = [row(name, "measured", rmse_trainings_m=values) for name, values in trained.items()]
+    rows = [
+        row(name, "measured", rmse_trainings_m=values)
+        for name, values in trained.items()
+    ]
     markdown = benchmark_markdown({"rows": rows, "config": {"name": "seeds"}})
     found = tables_of(markdown, f"Trainings apart: {FEEDBACK}")
-    assert found == {"Row": ["S3 \\[mm\\], seed 0, 1"], "SFKD": ["18.0, 22.0 ± 2.8"], "Oracle": ["16.0"]}
+    assert found == {
+        "Row": ["S3 \\[mm\\], seed 0, 1"],
+        "SFKD": ["18.0, 22.0 ± 2.8"],
+        "Oracle": ["16.0"],
+    }
     assert "interval over trainings and episodes" in markdown
-    strokes = [one for one in overview(contests(rows), {}).axes[0].get_lines() if one.get_marker() == "|"]
+    strokes = [
+        one
+        for one in overview(contests(rows), {}).axes[0].get_lines()
+        if one.get_marker() == "|"
+    ]
     np.testing.assert_allclose([one.get_xdata() for one in strokes], [[18.0, 22.0]])
     alone = [row(name, "measured") for name in trained]
     assert "Trainings apart" not in benchmark_markdown({"rows": alone})
 
 
 def test_a_row_that_leaves_the_road_is_written_and_the_others_keep_the_axis():
-    rows = [row("sfkd", "measured"), row("oracle", "measured"), row("nominal", "none", factor=60.0)]
+    rows = [
+        row("sfkd", "measured"),
+        row("oracle", "measured"),
+        row("nominal", "none", factor=60.0),
+    ]
     (axes,) = overview(contests(rows), {}).axes
     assert [text.get_text() for text in axes.texts] == ["7.2 m →"]
     assert axes.get_xlim()[1] < 30.0  # SFKD's 20 mm and their interval, not 7200
-    assert "means beyond 1 m are written at the edge" in benchmark_markdown({"rows": rows, "config": {}})
-    assert "written at the edge" not in benchmark_markdown({"rows": rows[:2], "config": {}})
+    assert "means beyond 1 m are written at the edge" in benchmark_markdown(
+        {"rows": rows, "config": {}}
+    )
+    assert "written at the edge" not in benchmark_markdown(
+        {"rows": rows[:2], "config": {}}
+    )
 
 
 def test_a_row_that_estimates_e_stands_beside_itself_with_e_measured():
-    estimated = row("sfkd", "measured", factor=2.0) | {"env": "estimated", "variation": "environment estimated"}
+    estimated = row("sfkd", "measured", factor=2.0) | {
+        "env": "estimated",
+        "variation": "environment estimated",
+    }
     rows = [row("sfkd", "measured"), row("oracle", "measured"), estimated]
     (study,) = studies(rows, contests(rows)[0])
     assert {name: cells for name, *cells in robustness_table(study).rows} == {
@@ -389,8 +620,15 @@ def test_a_row_that_estimates_e_stands_beside_itself_with_e_measured():
 
 def test_steady_levels_come_from_seen_to_extrapolated_and_are_not_held_against_the_paper():
     names = {"s1": "seen", "s2": "interpolated", "s3": "extrapolated"}
-    rows = [row(*one, scenario) | {"scenario": names[scenario]} for scenario in names for one in SYSTEMS]
-    results = {"rows": rows, "config": {"name": "levels", "comparison": {"paper": PAPER}}}
+    rows = [
+        row(*one, scenario) | {"scenario": names[scenario]}
+        for scenario in names
+        for one in SYSTEMS
+    ]
+    results = {
+        "rows": rows,
+        "config": {"name": "levels", "comparison": {"paper": PAPER}},
+    }
     markdown = benchmark_markdown(results)
     found = tables_of(markdown, f"Tracking: {FEEDBACK}")
     assert found["Row"] == [rf"{name} RMSE \[mm\] (95 %)" for name in names.values()]
@@ -404,7 +642,11 @@ def test_steady_levels_come_from_seen_to_extrapolated_and_are_not_held_against_t
 
 
 def test_a_row_that_only_another_contest_drove_adds_no_scenario():
-    rows = [row("koopman_mpc", "measured", "s1"), row("sfkd", "measured", "s1"), row("sfkd", "measured", "s3")]
+    rows = [
+        row("koopman_mpc", "measured", "s1"),
+        row("sfkd", "measured", "s1"),
+        row("sfkd", "measured", "s3"),
+    ]
     rows.append(row("sfkd", "measured", "s3", sampling="plain"))
     assert [scenarios(contest) for contest in contests(rows)] == [["s1", "s3"], ["s3"]]
 
@@ -425,7 +667,9 @@ def test_rows_stand_by_what_they_are_told_and_then_by_what_they_reach(whole):
     ]
     places = [text.get_position()[1] for text in figure.axes[0].get_yticklabels()]
     assert places == sorted(places)
-    own = next(text for text in figure.axes[0].get_yticklabels() if text.get_text() == "SFKD")
+    own = next(
+        text for text in figure.axes[0].get_yticklabels() if text.get_text() == "SFKD"
+    )
     assert own.get_fontweight() == "bold"
 
 
@@ -437,11 +681,16 @@ def test_side_forces_are_in_a_table_and_in_a_figure_that_hold_the_same(whole):
     claimed = {name: cells for name, *cells in forces_tables(scenario, lines)[1].rows}
     assert claimed["SFKD"] == ["0 / 0", "10.0 / 10.0", "0 / 50.0", "0 / 0"]
     assert claimed["Nominal"] == ["–", "–", "0 / 50.0", "0 / 0"]
-    assert (scenario, len(lines)) == ("s3", len(SYSTEMS) - 2)  # the quadratic programs were not pushed
+    assert (scenario, len(lines)) == (
+        "s3",
+        len(SYSTEMS) - 2,
+    )  # the quadratic programs were not pushed
     panels = forces_figure(scenario, lines).axes
     shares = [line.get_xdata() for line in panels[1].get_lines() if line.get_gid()]
     np.testing.assert_allclose(shares, [[0.0, 50.0]] * len(lines))
-    radii = sorted(float(line.get_xdata()[0]) for line in panels[3].get_lines() if line.get_gid())
+    radii = sorted(
+        float(line.get_xdata()[0]) for line in panels[3].get_lines() if line.get_gid()
+    )
     np.testing.assert_allclose(radii, [0.2] * len(lines) + [2.0])
     assert pushed(contests(document()["rows"])[1]) is None
 
@@ -452,16 +701,29 @@ def emptied(value, hole):
         return {key: emptied(entry, hole) for key, entry in value.items()}
     if isinstance(value, list):
         return [emptied(entry, hole) for entry in value]
-    return hole if isinstance(value, int | float) and not isinstance(value, bool) else value
+    return (
+        hole
+        if isinstance(value, int | float) and not isinstance(value, bool)
+        else value
+    )
 
 
 @pytest.mark.parametrize("hole", [None, math.nan, math.inf])
 def test_what_was_not_measured_is_a_dash_and_never_a_zero(tmp_path, hole):
     results = document(samplings=("feedback",))
-    results["rows"] = [emptied(entry | {"rmse_trainings_m": [0.1, 0.2]}, hole) for entry in results["rows"]]
+    results["rows"] = [
+        emptied(entry | {"rmse_trainings_m": [0.1, 0.2]}, hole)
+        for entry in results["rows"]
+    ]
     markdown = benchmark_markdown(results)
     found = tables_of(markdown, f"Tracking: {FEEDBACK}")
-    assert {cell for name, cells in found.items() if name != "Row" for cell in cells if "±" not in cell} == {"–"}
+    assert {
+        cell
+        for name, cells in found.items()
+        if name != "Row"
+        for cell in cells
+        if "±" not in cell
+    } == {"–"}
     assert set(tables_of(markdown, "Cost and certificate")["SFKD"]) == {"–"}
     assert re.search(r"\b(nan|inf|None|null)\b", markdown) is None
     text = latex(contests(results["rows"]), paper_of(results))
@@ -473,7 +735,13 @@ def test_what_was_not_measured_is_a_dash_and_never_a_zero(tmp_path, hole):
 
 
 def test_rows_with_next_to_nothing_still_make_a_page(tmp_path):
-    bare = {"system": "sfkd", "env": "measured", "scenario": "s3", "vehicle": "kinematic", "sampling": None}
+    bare = {
+        "system": "sfkd",
+        "env": "measured",
+        "scenario": "s3",
+        "vehicle": "kinematic",
+        "sampling": None,
+    }
     (tmp_path / "results.json").write_text(json.dumps({"rows": [bare]}))
     made = benchmark_report(tmp_path)
     assert "–" in Path(made["report"]).read_text("utf-8")
@@ -483,8 +751,12 @@ def test_rows_with_next_to_nothing_still_make_a_page(tmp_path):
 
 
 def test_failed_rows_are_told(tmp_path):
-    markdown = benchmark_markdown(document() | {"failed": {"dynamic/r2dn": "loss is not finite"}})
-    assert tables_of(markdown, "Asked for, but not driven")["dynamic/r2dn"] == ["loss is not finite"]
+    markdown = benchmark_markdown(
+        document() | {"failed": {"dynamic/r2dn": "loss is not finite"}}
+    )
+    assert tables_of(markdown, "Asked for, but not driven")["dynamic/r2dn"] == [
+        "loss is not finite"
+    ]
     with pytest.raises(ArtefactError, match=r"results\.json: missing"):
         benchmark_report(tmp_path)
 
@@ -503,7 +775,9 @@ def test_the_same_results_give_the_same_bytes_and_no_stale_figure(whole):
     (directory / "report" / "results_files" / "old.png").write_bytes(b"")
     assert benchmark_report(directory) == made
     assert text_of(directory, "index.html") == before
-    assert sorted(map(str, (directory / "report" / "results_files").iterdir())) == sorted(made["figures"])
+    assert sorted(
+        map(str, (directory / "report" / "results_files").iterdir())
+    ) == sorted(made["figures"])
 
 
 def test_sfkd_is_the_line_that_sees_the_environment():

@@ -1,4 +1,6 @@
-"""The corridor in a report and as a figure: its numbers are the document's, and what is not there is not claimed."""
+"""The corridor in a report and as a figure: its numbers are the document's, and what is
+not there is not claimed.
+"""
 
 import numpy as np
 import pytest
@@ -82,7 +84,9 @@ def test_bounds_are_rounded_up_and_what_is_measured_is_not_called_proved(page):
     section = page[0].split(HEADING)[1].split("What is certified")[0]
     proved = section.split("Proved.")[1].split("Measured, not proved.")[0]
     assert "0.8439" in proved
-    assert not any(number in proved for number in ("0.2132", "0.1112", "0.1021", "95 %"))
+    assert not any(
+        number in proved for number in ("0.2132", "0.1112", "0.1021", "95 %")
+    )
     assert "0.2131 m" not in section
 
 
@@ -93,17 +97,33 @@ def test_the_corridor_is_drawn_around_the_drives_of_the_page(page):
 
 def test_no_corridor_no_section(tmp_path):
     for number, document in enumerate(
-        (documents()["certificate.json"], certificate() | {"valid": False}, certificate(corridor_m=None))
+        (
+            documents()["certificate.json"],
+            certificate() | {"valid": False},
+            certificate(corridor_m=None),
+        )
     ):
-        found = text_of(report_of(write_run(tmp_path / str(number), certificate=document, episodes=None))[0])
+        found = text_of(
+            report_of(
+                write_run(tmp_path / str(number), certificate=document, episodes=None)
+            )[0]
+        )
         assert HEADING not in found
         assert "Certified corridor" not in found
 
 
 def test_missing_entries_read_as_an_en_dash(tmp_path):
-    bare = certificate() | {"corridor": nulled(certificate()["corridor"]) | {"corridor_m": 0.21311}}
-    for number, document in enumerate((bare, certificate() | {"corridor": {"corridor_m": 0.21311}})):
-        found = text_of(report_of(write_run(tmp_path / str(number), certificate=document, episodes=None))[0])
+    bare = certificate() | {
+        "corridor": nulled(certificate()["corridor"]) | {"corridor_m": 0.21311}
+    }
+    for number, document in enumerate(
+        (bare, certificate() | {"corridor": {"corridor_m": 0.21311}})
+    ):
+        found = text_of(
+            report_of(
+                write_run(tmp_path / str(number), certificate=document, episodes=None)
+            )[0]
+        )
         assert "within 0.2132 m" in found
         assert "at – to – m/s" in found
         assert "None" not in found
@@ -114,21 +134,43 @@ def hostile_drives():
     free = np.zeros((2, steps))
     free[0, 10:], free[1, 20:] = np.linspace(0.0, 9.0, steps - 10), np.nan
     envs = np.repeat([[0.9, 0.0], [0.3, 8.0]], steps // 2, axis=0)
-    kept = {name: 0.05 * random.standard_normal((2, steps)) for name in ("worst", "random")}
-    about = {"dt": 0.1, "envs": envs, "lane": 0.85, "onset": np.array([10, 20]), "name": "full lock"}
+    kept = {
+        name: 0.05 * random.standard_normal((2, steps)) for name in ("worst", "random")
+    }
+    about = {
+        "dt": 0.1,
+        "envs": envs,
+        "lane": 0.85,
+        "onset": np.array([10, 20]),
+        "name": "full lock",
+    }
     return about | {"kept": kept, "held": np.zeros((2, steps)), "free": free}
 
 
-def test_hostile_planners_are_drawn_until_they_leave_and_the_corridor_is_to_scale(tmp_path):
+def test_hostile_planners_are_drawn_until_they_leave_and_the_corridor_is_to_scale(
+    tmp_path,
+):
     drives = hostile_drives()
     figure = hostile(Hostile(corridor=Corridor(0.1, 0.05), **drives))
     inside, lost = figure.axes[:2]
-    edges = {round(float(line.get_ydata()[0]), 6) for line in inside.get_lines() if len(set(line.get_ydata())) == 1}
+    edges = {
+        round(float(line.get_ydata()[0]), 6)
+        for line in inside.get_lines()
+        if len(set(line.get_ydata())) == 1
+    }
     assert {-0.15, 0.15} <= edges
-    left, broken = (line for line in lost.get_lines() if line.get_label().lstrip("_") == "without the shield")
+    left, broken = (
+        line
+        for line in lost.get_lines()
+        if line.get_label().lstrip("_") == "without the shield"
+    )
     assert np.max(left.get_ydata()) < 3.0
     assert len(broken.get_ydata()) == 1
-    switched = {float(line.get_xdata()[0]) for line in lost.get_lines() if len(set(line.get_xdata())) == 1}
+    switched = {
+        float(line.get_xdata()[0])
+        for line in lost.get_lines()
+        if len(set(line.get_xdata())) == 1
+    }
     assert 3.0 in switched
     place = draw_hostile(tmp_path / "figure.png", width=0.1, tube=0.05, **drives)
     with Image.open(place) as image:
@@ -143,9 +185,18 @@ def test_the_figure_about_speed_draws_every_cell_and_the_room():
     ]
     figure = against_speed({"one": cells, "other": cells[:2]}, 0.25)
     one, other = figure.axes
-    drawn = {line.get_label(): (list(line.get_xdata()), list(line.get_ydata())) for line in one.get_lines()}
-    assert drawn["friction 0.3"] == ([8.0, 10.0], pytest.approx([0.08 / 0.3, 0.1 / 0.3]))
-    assert drawn["friction 0.9"] == ([8.0, 10.0], pytest.approx([0.08 / 0.9, 0.1 / 0.9]))
+    drawn = {
+        line.get_label(): (list(line.get_xdata()), list(line.get_ydata()))
+        for line in one.get_lines()
+    }
+    assert drawn["friction 0.3"] == (
+        [8.0, 10.0],
+        pytest.approx([0.08 / 0.3, 0.1 / 0.3]),
+    )
+    assert drawn["friction 0.9"] == (
+        [8.0, 10.0],
+        pytest.approx([0.08 / 0.9, 0.1 / 0.9]),
+    )
     for axes, count in ((one, 2), (other, 1)):
         lines = axes.get_lines()
         assert len(lines) == count + 1

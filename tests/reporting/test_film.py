@@ -18,7 +18,9 @@ SWITCHED = 6
 def driven(lateral):
     """Deviation and states at 10 m/s along x."""
     offset = np.concatenate([[0.0], lateral])
-    states = np.stack([np.arange(STEPS + 1.0), offset, 0.0 * offset, np.full(STEPS + 1, 10.0)], axis=1)
+    states = np.stack(
+        [np.arange(STEPS + 1.0), offset, 0.0 * offset, np.full(STEPS + 1, 10.0)], axis=1
+    )
     return lateral, states
 
 
@@ -27,7 +29,14 @@ def drives(lost):
     points[:, 0] = 0.5 * np.arange(len(points))
     envs = np.repeat([[0.9, 0.0], [0.3, 8.0]], SWITCHED, axis=0)
     cars = {"kept": driven(np.full(STEPS, 0.1)), "lost": driven(lost)}
-    return {"title": "S3", "dt": DT, "points": points, "envs": envs, "corridor": CORRIDOR, "cars": cars}
+    return {
+        "title": "S3",
+        "dt": DT,
+        "points": points,
+        "envs": envs,
+        "corridor": CORRIDOR,
+        "cars": cars,
+    }
 
 
 def departing():
@@ -38,7 +47,14 @@ def departing():
 
 
 def shown(about):
-    return Film(**about | {"cars": [Car(name, "#0b57b0", *drive) for name, drive in about["cars"].items()]})
+    return Film(
+        **about
+        | {
+            "cars": [
+                Car(name, "#0b57b0", *drive) for name, drive in about["cars"].items()
+            ]
+        }
+    )
 
 
 def test_a_car_is_drawn_until_it_leaves_and_its_lane_is_said_to_be_left():
@@ -60,11 +76,19 @@ def test_a_car_is_drawn_until_it_leaves_and_its_lane_is_said_to_be_left():
 def test_the_corridor_is_to_the_scale_of_the_deviations():
     (above, below), film = Figure().subplots(2), shown(drives(departing()))
     road(above, film, STEPS)(3)
-    bands = [patch for patch in above.patches if isinstance(patch, Polygon) and len(patch.get_xy()) > 6]
+    bands = [
+        patch
+        for patch in above.patches
+        if isinstance(patch, Polygon) and len(patch.get_xy()) > 6
+    ]
     heights = sorted(tuple(sorted(set(band.get_xy()[:, 1].round(6)))) for band in bands)
     assert np.ptp(heights, axis=1) == pytest.approx(2 * 10 * CORRIDOR)
     strip(below, film, STEPS)(STEPS - 1)
-    level = {float(line.get_ydata()[0]) for line in below.get_lines() if len(set(line.get_ydata())) == 1}
+    level = {
+        float(line.get_ydata()[0])
+        for line in below.get_lines()
+        if len(set(line.get_ydata())) == 1
+    }
     assert {-CORRIDOR, CORRIDOR} <= level
     assert CORRIDOR < below.get_ylim()[1] < 2 * CORRIDOR
 
@@ -73,7 +97,9 @@ def test_the_scale_keeps_a_wide_corridor_and_every_car_that_stays_in_its_lane():
     stays = np.linspace(0.0, 0.65, STEPS)
     assert widening(shown(drives(stays)), STEPS) == 5
     assert widening(shown(drives(stays) | {"corridor": 0.85}), STEPS) == 4
-    assert widening(shown(drives(np.full(STEPS, 1e3)) | {"corridor": None}), STEPS) == 10
+    assert (
+        widening(shown(drives(np.full(STEPS, 1e3)) | {"corridor": None}), STEPS) == 10
+    )
 
 
 def test_the_film_of_a_car_that_is_lost_is_small_and_moves(tmp_path):

@@ -20,32 +20,54 @@ from sfkd_jax.reporting._violations import violations
 
 STEPS, DT, EPISODES, SPEED = 600, 0.1, 4, 10.0
 LEVELS = ((0.9, 0.0), (0.6, 4.0), (0.3, 8.0), (0.6, -4.0))
-SYSTEMS = {"sfkd": 0.09, "oracle": 0.04, "nominal": 0.33}  # how far a gust pushes each, in metres
+SYSTEMS = {
+    "sfkd": 0.09,
+    "oracle": 0.04,
+    "nominal": 0.33,
+}  # how far a gust pushes each, in metres
 
 
 def road():
     s = np.arange(1400) * 0.5
     blend = np.clip(s / 20, 0, 1) ** 2
-    curvature = blend * (0.012 * np.sin(2 * np.pi * s / 90) + 0.01 * np.sin(2 * np.pi * s / 151 + 1.0))
+    curvature = blend * (
+        0.012 * np.sin(2 * np.pi * s / 90) + 0.01 * np.sin(2 * np.pi * s / 151 + 1.0)
+    )
     yaw = np.cumsum(curvature) * 0.5
     x, y = np.cumsum(np.cos(yaw)) * 0.5, np.cumsum(np.sin(yaw)) * 0.5
     return np.stack([x, y, yaw, curvature], axis=1)
 
 
 def drive(rng, path, envs, gain):
-    """A damped response of the lateral deviation to curvature and wind, and the state that belongs to it."""
+    """A damped response of the lateral deviation to curvature and wind, and the state
+    that belongs to it.
+    """
     lateral, rate, rows, steer = 0.0, 0.0, [], []
     for step in range(STEPS):
         friction, wind = envs[step]
-        push = gain * (wind / 8 + 0.3 * (0.9 - friction) * np.sign(path[20 * (step // 10) % 1300, 3]))
-        rate += DT * (6.0 * (push - lateral) - 3.5 * rate) + gain * 0.02 * rng.standard_normal()
+        push = gain * (
+            wind / 8
+            + 0.3 * (0.9 - friction) * np.sign(path[20 * (step // 10) % 1300, 3])
+        )
+        rate += (
+            DT * (6.0 * (push - lateral) - 3.5 * rate)
+            + gain * 0.02 * rng.standard_normal()
+        )
         lateral += DT * rate
         rows.append(lateral)
-        steer.append(2.7 * path[2 * step + 8, 3] - 0.12 * lateral - 0.05 * rate + 0.004 * rng.standard_normal())
+        steer.append(
+            2.7 * path[2 * step + 8, 3]
+            - 0.12 * lateral
+            - 0.05 * rate
+            + 0.004 * rng.standard_normal()
+        )
     lateral = np.array(rows)
     here = path[2 * np.arange(STEPS + 1)]
     offset = np.concatenate([[0.0], lateral])
-    x, y = here[:, 0] - offset * np.sin(here[:, 2]), here[:, 1] + offset * np.cos(here[:, 2])
+    x, y = (
+        here[:, 0] - offset * np.sin(here[:, 2]),
+        here[:, 1] + offset * np.cos(here[:, 2]),
+    )
     states = np.stack([x, y, here[:, 2], np.full(STEPS + 1, SPEED)], axis=1)
     controls = np.stack([steer, 0.2 * rng.standard_normal(STEPS)], axis=1)
     return lateral, states, controls
@@ -64,7 +86,9 @@ def episodes():
     arrays = {"dt": np.float64(DT), "s3/envs": np.array(envs), "s3/path": roads}
     for name, gain in SYSTEMS.items():
         driven = [drive(rng, roads[i], envs[i], gain) for i in range(EPISODES)]
-        for kind, values in zip(("lateral", "states", "controls"), zip(*driven, strict=True), strict=True):
+        for kind, values in zip(
+            ("lateral", "states", "controls"), zip(*driven, strict=True), strict=True
+        ):
             arrays[f"{name}/s3/{kind}"] = np.array(values, dtype=np.float32)
     return arrays
 
@@ -91,9 +115,21 @@ def score(system, scenario, mean, std, ratio, **more):
 
 def documents():
     rows = [
-        *(score(*row) for row in (("oracle", "s3", 0.0163, 0.002, 1.0), ("nominal", "s3", 0.12, 0.021, 7.36))),
+        *(
+            score(*row)
+            for row in (
+                ("oracle", "s3", 0.0163, 0.002, 1.0),
+                ("nominal", "s3", 0.12, 0.021, 7.36),
+            )
+        ),
         score("sfkd", "s3", 0.0342, 0.006, 2.1),
-        *(score(*row) for row in (("sfkd", "s1", 0.014, 0.001, 1.0), ("oracle", "s1", 0.014, 0.001, 1.0))),
+        *(
+            score(*row)
+            for row in (
+                ("sfkd", "s1", 0.014, 0.001, 1.0),
+                ("oracle", "s1", 0.014, 0.001, 1.0),
+            )
+        ),
     ]
     ahead = list(range(1, 21))
     radii = [0.0123 * (1 - 0.9321**k) / (1 - 0.9321) for k in ahead]
@@ -104,7 +140,11 @@ def documents():
         "coverage": 0.957,
         "coverage_ci95": [0.93, 0.98],
     }
-    boxes = {"state": [[0.0], [15.0]], "control": [[-0.4, 0.0], [0.45, 14.0]], "env": [[0.3, -8], [0.9, 8]]}
+    boxes = {
+        "state": [[0.0], [15.0]],
+        "control": [[-0.4, 0.0], [0.45, 14.0]],
+        "env": [[0.3, -8], [0.9, 8]],
+    }
     certificate = {
         "valid": True, "reason": None, "mode": "joint", "scope": "construction", "alpha": 0.93207,
         "alpha_separate": 0.95, "rho": 0.9, "beta": 0.05, "kappa": 1.0, "decoder_lipschitz": 2.5,
@@ -125,7 +165,10 @@ def documents():
         "speed_rmse_m_per_s": [0.004 * k for k in ahead],
     }  # fmt: skip
     return {
-        "policy.json": {"settings": settings, "versions": {"python": "3.11.9", "jax": "0.10.2"}},
+        "policy.json": {
+            "settings": settings,
+            "versions": {"python": "3.11.9", "jax": "0.10.2"},
+        },
         "open_loop.json": errors,
         "certificate.json": certificate,
         "results.json": {"rows": rows, "config": {}, "versions": {}, "seconds": 60.0},
@@ -136,7 +179,13 @@ def metrics():
     rng = np.random.default_rng(1)
     for step in range(50, 4001, 50):
         loss = 0.02 + 3.0 * np.exp(-step / 500) * np.exp(0.15 * rng.standard_normal())
-        line = {"step": step, "seconds": step * 0.05, "loss": loss, "learning_rate": 3e-3, "alpha": 0.93}
+        line = {
+            "step": step,
+            "seconds": step * 0.05,
+            "loss": loss,
+            "learning_rate": 3e-3,
+            "alpha": 0.93,
+        }
         yield line | ({"validation_loss": 1.1 * loss} if step % 500 == 0 else {})
 
 
@@ -148,7 +197,9 @@ def write_run(run, **changes):
         if document is not None:
             (run / name).write_text(json.dumps(document))
     if "metrics" not in changes:
-        (run / "metrics.jsonl").write_text("".join(json.dumps(line) + "\n" for line in metrics()))
+        (run / "metrics.jsonl").write_text(
+            "".join(json.dumps(line) + "\n" for line in metrics())
+        )
     if "episodes" not in changes:
         np.savez(run / "episodes.npz", **episodes())
     return run
@@ -156,7 +207,11 @@ def write_run(run, **changes):
 
 def text_of(page):
     """What a reader sees of a page, spaces made plain."""
-    return " ".join(html.unescape(re.sub(r"<style>.*?</style>|<[^>]+>", " ", page, flags=re.S)).split())
+    return " ".join(
+        html.unescape(
+            re.sub(r"<style>.*?</style>|<[^>]+>", " ", page, flags=re.S)
+        ).split()
+    )
 
 
 def report_of(run):
@@ -170,7 +225,9 @@ def whole(tmp_path_factory):
 
 
 class Balanced(HTMLParser):
-    """Checks that every element is closed in order, and collects what could make a request."""
+    """Checks that every element is closed in order, and collects what could make a
+    request.
+    """
 
     VOID: ClassVar = {"meta", "img", "br"}
 
@@ -180,7 +237,11 @@ class Balanced(HTMLParser):
 
     def handle_starttag(self, tag, attrs):
         self.tags.add(tag)
-        self.links += [value for name, value in attrs if name in ("src", "href", "srcset", "action", "data")]
+        self.links += [
+            value
+            for name, value in attrs
+            if name in ("src", "href", "srcset", "action", "data")
+        ]
         if tag not in self.VOID:
             self.open.append(tag)
 
@@ -221,9 +282,17 @@ def test_markdown_says_the_same(whole):
     text = Path(whole[1]["report"]).with_name("report.md").read_text("utf-8")
     assert "| **SFKD** | **0.034 ± 0.006** |" in text
     for target in re.findall(r"\]\((figures/[^)]+)\)", text):
-        assert Path(whole[1]["report"]).with_name("figures").joinpath(Path(target).name).exists()
+        assert (
+            Path(whole[1]["report"])
+            .with_name("figures")
+            .joinpath(Path(target).name)
+            .exists()
+        )
     assert "    python -m sfkd_jax.train +experiment=s3 seed=0" in text
-    widths = [{line.count(" | ") for line in table.splitlines()} for table in re.findall(r"(?m)(?:^\|.*\n)+", text)]
+    widths = [
+        {line.count(" | ") for line in table.splitlines()}
+        for table in re.findall(r"(?m)(?:^\|.*\n)+", text)
+    ]
     assert widths
     assert all(len(width) == 1 for width in widths)
 
@@ -254,7 +323,9 @@ def test_figures_are_pictures(whole):
             pixels = np.asarray(image.convert("RGB"))
         assert pixels.shape[0] > 300, figure
         assert pixels.shape[1] > 900, figure
-        assert len({tuple(pixel) for pixel in pixels[::7, ::5].reshape(-1, 3)}) > 20, figure
+        assert len({tuple(pixel) for pixel in pixels[::7, ::5].reshape(-1, 3)}) > 20, (
+            figure
+        )
 
 
 def test_the_same_run_gives_the_same_bytes_and_no_stale_figure(tmp_path):
@@ -284,9 +355,14 @@ def test_a_missing_input_is_named_with_the_command_that_makes_it(tmp_path, name,
 def test_a_policy_alone_is_enough_and_no_policy_is_refused(tmp_path):
     with pytest.raises(ArtefactError, match=r"sfkd_jax\.train"):
         write_report(tmp_path)
-    settings = documents()["policy.json"]["settings"] | {"experiment": "default", "seed": 3}
+    settings = documents()["policy.json"]["settings"] | {
+        "experiment": "default",
+        "seed": 3,
+    }
     settings["model"] = {"name": "sfkd", "system": "sfkd_soft"}
-    (tmp_path / "policy.json").write_text(json.dumps({"config": settings}))  # as a manifest holds them
+    (tmp_path / "policy.json").write_text(
+        json.dumps({"config": settings})
+    )  # as a manifest holds them
     page, made = report_of(tmp_path)
     assert made["figures"] == []
     assert text_of(page).count(" is missing from this run") == 5
@@ -296,7 +372,10 @@ def test_a_policy_alone_is_enough_and_no_policy_is_refused(tmp_path):
 def nulled(value):
     """The same document with every number null, as what is not finite is written."""
     if isinstance(value, dict):
-        return {key: entry if key in ("episodes", "steps") else nulled(entry) for key, entry in value.items()}
+        return {
+            key: entry if key in ("episodes", "steps") else nulled(entry)
+            for key, entry in value.items()
+        }
     if isinstance(value, list):
         return [nulled(entry) for entry in value]
     return value if isinstance(value, str | bool) else None
@@ -315,10 +394,22 @@ def test_absent_keys_and_empty_lists_do_not_stop_a_report(tmp_path):
         {"system": "sfkd", "scenario": "s3"},
         {"system": "koopman_mpc", "scenario": "s3", "sampling": None},
     ]
-    certificate = {"valid": False, "reason": "alpha = 1.02 is not below 1", "alpha": 1.02}
-    run = write_run(tmp_path, results={"rows": rows}, certificate=certificate, open_loop={"steps": []})
+    certificate = {
+        "valid": False,
+        "reason": "alpha = 1.02 is not below 1",
+        "alpha": 1.02,
+    }
+    run = write_run(
+        tmp_path,
+        results={"rows": rows},
+        certificate=certificate,
+        open_loop={"steps": []},
+    )
     page = text_of(report_of(run)[0])
-    assert "Nothing is proved. No contraction is certified for these weights: alpha = 1.02 is not below 1." in page
+    assert (
+        "Nothing is proved. No contraction is certified for these weights: alpha = 1.02 is not below 1."
+        in page
+    )
     assert "It carries no valid certificate." in page
     assert "Certified α" not in page
     assert "Koopman MPC" in page
@@ -329,7 +420,11 @@ def test_a_certificate_of_other_weights_is_not_believed(tmp_path):
     mine = documents()["policy.json"] | {"sha256": "ab" * 32}
     page = text_of(report_of(write_run(tmp_path, episodes=None, policy=mine))[0])
     assert "Certified α 0.9321" in page
-    page = text_of(report_of(write_run(tmp_path, episodes=None, policy=mine | {"sha256": "cd" * 32}))[0])
+    page = text_of(
+        report_of(
+            write_run(tmp_path, episodes=None, policy=mine | {"sha256": "cd" * 32})
+        )[0]
+    )
     assert "Nothing is proved." in page
     assert "about other weights" in page
     assert "0.9321" not in page
@@ -342,9 +437,16 @@ def test_text_of_others_is_escaped(tmp_path):
     policy["settings"] |= {"experiment": hostile, "note": hostile, hostile: 1}
     policy["settings"]["vehicle"]["name"] = hostile
     policy["versions"][hostile] = hostile
-    rows = [score(hostile, hostile, 0.1, 0.01, 1.0, vehicle=hostile), *documents_["results.json"]["rows"]]
+    rows = [
+        score(hostile, hostile, 0.1, 0.01, 1.0, vehicle=hostile),
+        *documents_["results.json"]["rows"],
+    ]
     certificate = documents_["certificate.json"] | {"mode": hostile, "scope": hostile}
-    page, made = report_of(write_run(tmp_path, policy=policy, results={"rows": rows}, certificate=certificate))
+    page, made = report_of(
+        write_run(
+            tmp_path, policy=policy, results={"rows": rows}, certificate=certificate
+        )
+    )
     assert "<script" not in page
     assert hostile in html.unescape(page)
     parser = Balanced()
@@ -360,7 +462,10 @@ def test_text_of_others_is_escaped(tmp_path):
 def test_names_are_not_formulas(tmp_path):
     run, name = write_run(tmp_path), "$\\frac{"
     arrays = dict(episodes())
-    arrays |= {f"{name}/s3/{part}": arrays[f"oracle/s3/{part}"] for part in ("lateral", "states", "controls")}
+    arrays |= {
+        f"{name}/s3/{part}": arrays[f"oracle/s3/{part}"]
+        for part in ("lateral", "states", "controls")
+    }
     arrays |= {f"a$x_$b/{name}/lateral": arrays["oracle/s3/lateral"][:, :50]}
     np.savez(run / "episodes.npz", **arrays)
     assert len(report_of(run)[1]["figures"]) == 9
@@ -371,11 +476,17 @@ def test_a_cut_off_log_a_lost_vehicle_and_one_short_episode(tmp_path):
     with (run / "metrics.jsonl").open("a") as log:
         log.write('{"step": 4050, "lo')
     with np.load(run / "episodes.npz") as archive:
-        arrays = {name: values[:1] if values.ndim else values for name, values in archive.items()}
+        arrays = {
+            name: values[:1] if values.ndim else values
+            for name, values in archive.items()
+        }
     for part in ("lateral", "states", "controls"):
         arrays[f"nominal/s3/{part}"] = arrays[f"nominal/s3/{part}"].copy()
         arrays[f"nominal/s3/{part}"][:, 90:] = np.nan
-    arrays |= {"icode/s1/lateral": arrays["sfkd/s3/lateral"][:, :40], "someone/s1/lateral": np.zeros((0, 40))}
+    arrays |= {
+        "icode/s1/lateral": arrays["sfkd/s3/lateral"][:, :40],
+        "someone/s1/lateral": np.zeros((0, 40)),
+    }
     np.savez(run / "episodes.npz", **arrays)
     page, made = report_of(run)
     assert "4000 steps" in text_of(page)
@@ -383,15 +494,26 @@ def test_a_cut_off_log_a_lost_vehicle_and_one_short_episode(tmp_path):
 
 
 def test_a_baseline_that_wins_is_named(tmp_path):
-    rows = [*documents()["results.json"]["rows"], score("icode", "s3", 0.021, 0.001, 1.3)]
-    page = text_of(report_of(write_run(tmp_path, episodes=None, results={"rows": rows}))[0])
+    rows = [
+        *documents()["results.json"]["rows"],
+        score("icode", "s3", 0.021, 0.001, 1.3),
+    ]
+    page = text_of(
+        report_of(write_run(tmp_path, episodes=None, results={"rows": rows}))[0]
+    )
     assert "ICODE does better here, with 0.021 m." in page
 
 
 def test_feedback_and_plain_sampling_are_not_mixed(tmp_path):
     rows = documents()["results.json"]["rows"]
-    rows += [row | {"sampling": "plain", "rmse_m": {"mean": 0.068}} for row in rows if row["system"] == "sfkd"]
-    page = text_of(report_of(write_run(tmp_path, episodes=None, results={"rows": rows}))[0])
+    rows += [
+        row | {"sampling": "plain", "rmse_m": {"mean": 0.068}}
+        for row in rows
+        if row["system"] == "sfkd"
+    ]
+    page = text_of(
+        report_of(write_run(tmp_path, episodes=None, results={"rows": rows}))[0]
+    )
     assert "plain sampling" in page
     assert "to a lateral RMSE of 0.034 m" in page
 
@@ -403,7 +525,11 @@ def test_the_tube_is_drawn_about_the_states_that_follow_one_that_was_driven(tmp_
     above, below = tube_on_drive(scene, "sfkd", radii, [0.01, None, 0.02]).axes
     discs = {disc.radius: np.array(disc.center) for disc in above.patches}
     assert sorted(discs) == radii
-    (way,) = [line.get_xydata() for line in above.get_lines() if len(line.get_xydata()) == 1 + len(radii)]
+    (way,) = [
+        line.get_xydata()
+        for line in above.get_lines()
+        if len(line.get_xydata()) == 1 + len(radii)
+    ]
     np.testing.assert_allclose([discs[radius] for radius in radii], way[1:])
     np.testing.assert_allclose(way[0], 0.0, atol=1e-9)
     np.testing.assert_allclose(way[-1, 1], 0.0, atol=1e-6)
@@ -418,13 +544,25 @@ def test_the_tube_is_drawn_about_the_states_that_follow_one_that_was_driven(tmp_
 def test_the_command_is_the_one_that_was_typed_where_it_was_kept(tmp_path):
     rows = documents()["results.json"]["rows"]
     typed = "python -m sfkd_jax.train +experiment=s3 evaluation.episodes=4"
-    for command, shown in ((typed, 1), (typed.replace("train", "evaluate"), 2), (None, 1)):
+    for command, shown in (
+        (typed, 1),
+        (typed.replace("train", "evaluate"), 2),
+        (None, 1),
+    ):
         results = {"rows": rows, "config": {"command": command}}
         page, _ = report_of(write_run(tmp_path, episodes=None, results=results))
-        code = [html.unescape(text) for text in re.findall(r"<pre><code>(.*?)</code>", page)]
-        walked = [text for text in code if ".train" in text or ".evaluate +experiment=s3 evaluation" in text]
+        code = [
+            html.unescape(text) for text in re.findall(r"<pre><code>(.*?)</code>", page)
+        ]
+        walked = [
+            text
+            for text in code
+            if ".train" in text or ".evaluate +experiment=s3 evaluation" in text
+        ]
         assert len(walked) == shown
-        assert walked[-1] == (command or "python -m sfkd_jax.train +experiment=s3 seed=0")
+        assert walked[-1] == (
+            command or "python -m sfkd_jax.train +experiment=s3 seed=0"
+        )
 
 
 def test_two_rows_of_a_system_are_told_apart(tmp_path):
@@ -437,7 +575,9 @@ def test_two_rows_of_a_system_are_told_apart(tmp_path):
 
 
 def violated(row, certified, radius, shares):
-    """The row as it is after drives under side forces: share of V1 (conformal) by force."""
+    """The row as it is after drives under side forces: share of V1 (conformal) by
+    force.
+    """
     kind = "certified" if certified else "conformal"
     violation = {
         "v0": 0.0 if certified else None, "v1": 0.021 if certified else shares[0], "v1_tube": kind,
@@ -453,7 +593,11 @@ def violated(row, certified, radius, shares):
 
 
 def pushed_rows():
-    rows = {row["system"]: row for row in documents()["results.json"]["rows"] if row["scenario"] == "s3"}
+    rows = {
+        row["system"]: row
+        for row in documents()["results.json"]["rows"]
+        if row["scenario"] == "s3"
+    }
     return [
         violated(rows["sfkd"], True, 0.137, (0.0625, 0.4, 0.98, 1.0)),
         violated(rows["nominal"], False, 7.91, (0.0, 0.0, 0.01, 0.02)),
@@ -465,7 +609,14 @@ def test_violations_under_side_forces_are_drawn_and_written(tmp_path):
     page, made = report_of(write_run(tmp_path, results={"rows": pushed_rows()}))
     text = text_of(page)
     assert "figure2.png" in {Path(figure).name for figure in made["figures"]}
-    for words in ("Violations: Scenario S3", "certified tube", "conformal tube", "6.83 m", "96 segments", "0.95"):
+    for words in (
+        "Violations: Scenario S3",
+        "certified tube",
+        "conformal tube",
+        "6.83 m",
+        "96 segments",
+        "0.95",
+    ):
         assert words in text, words
     assert re.search(r"SFKD 0 2\.1 1\.945 6\.2 0\.137 0\.3", text)
     assert re.search(r"Oracle – – – 0 0\.001 0\.3", text)
@@ -476,16 +627,29 @@ def test_figure_2_holds_what_the_rows_hold():
     tubes, common, widths = violations(rows).axes
     lines = {line.get_label(): line.get_xydata() for line in tubes.get_lines()}
     forces = [0.0, 250.0, 500.0, 1000.0]
-    for label, key in (("SFKD", "v1_conformal"), ("_SFKD, certified tube", "v1"), ("_SFKD, theorem (V0)", "v0")):
-        expected = [[force, run[key]] for force, run in zip(forces, rows[0]["disturbed"], strict=True)]
+    for label, key in (
+        ("SFKD", "v1_conformal"),
+        ("_SFKD, certified tube", "v1"),
+        ("_SFKD, theorem (V0)", "v0"),
+    ):
+        expected = [
+            [force, run[key]]
+            for force, run in zip(forces, rows[0]["disturbed"], strict=True)
+        ]
         np.testing.assert_array_equal(lines[label], expected)
     assert {"Nominal", "Oracle"} <= set(lines)
     assert not {"_Oracle, certified tube", "_Nominal, theorem (V0)"} & set(lines)
     assert any(np.allclose(line.get_ydata(), 0.05) for line in tubes.get_lines())
-    np.testing.assert_array_equal(common.get_lines()[2].get_ydata(), [0.0, 0.1, 0.1, 0.1])
+    np.testing.assert_array_equal(
+        common.get_lines()[2].get_ydata(), [0.0, 0.1, 0.1, 0.1]
+    )
     shown = sorted(float(line.get_xdata()[0]) for line in widths.get_lines())
     np.testing.assert_allclose(shown, [0.001, 0.137, 14.2 * 0.137, 7.91])
-    assert [tick.get_text() for tick in widths.get_yticklabels()] == ["SFKD", "Nominal", "Oracle"]
+    assert [tick.get_text() for tick in widths.get_yticklabels()] == [
+        "SFKD",
+        "Nominal",
+        "Oracle",
+    ]
 
 
 def test_figure_2_survives_nulls_and_rows_that_were_not_pushed(tmp_path):
@@ -497,12 +661,18 @@ def test_figure_2_survives_nulls_and_rows_that_were_not_pushed(tmp_path):
         violated(score("r2dn", "s1", 0.1, 0.01, 2.0), False, 0.1, (0.0,) * 4),
     ]
     page, made = report_of(write_run(tmp_path, episodes=None, results={"rows": rows}))
-    assert [Path(figure).name for figure in made["figures"]][:2] == ["figure2.png", "figure2_2.png"]
+    assert [Path(figure).name for figure in made["figures"]][:2] == [
+        "figure2.png",
+        "figure2_2.png",
+    ]
     assert re.search(r"\b(nan|inf|None|null)\b", text_of(page)) is None
 
 
 def test_drawing_leaves_matplotlib_as_it_was(tmp_path):
-    before, backend = dict(matplotlib.rcParams), matplotlib.rcParams._get_backend_or_none()
+    before, backend = (
+        dict(matplotlib.rcParams),
+        matplotlib.rcParams._get_backend_or_none(),
+    )
     write_report(write_run(tmp_path))
     assert matplotlib.rcParams._get_backend_or_none() == backend
     assert dict(matplotlib.rcParams) == before

@@ -7,7 +7,14 @@ import numpy as np
 import pytest
 from helpers import jit
 
-from sfkd_jax.scenarios import gusts, scenario, steady_road, switching_road, uniform_road, wet_road
+from sfkd_jax.scenarios import (
+    gusts,
+    scenario,
+    steady_road,
+    switching_road,
+    uniform_road,
+    wet_road,
+)
 
 STEPS, DT = 600, 0.1
 KEYS = jax.random.split(jax.random.key(7), 64)
@@ -29,11 +36,18 @@ def s2():
 
 def test_s1_is_constant_and_calm():
     envs = many(uniform_road, steps=20)
-    np.testing.assert_array_equal(envs, np.broadcast_to(np.float32([0.9, 0.0]), envs.shape))
+    np.testing.assert_array_equal(
+        envs, np.broadcast_to(np.float32([0.9, 0.0]), envs.shape)
+    )
 
 
 def test_s1_with_a_range_draws_one_level_an_episode_evenly():
-    envs = many(uniform_road, steps=5, friction=(0.3, 0.9), keys=jax.random.split(jax.random.key(1), 2000))
+    envs = many(
+        uniform_road,
+        steps=5,
+        friction=(0.3, 0.9),
+        keys=jax.random.split(jax.random.key(1), 2000),
+    )
     assert np.all(envs == envs[:, :1])
     assert kolmogorov_distance(envs[:, 0, 0], 0.3, 0.9) < 1.63 / np.sqrt(2000)
 
@@ -61,14 +75,23 @@ def test_the_drop_falls_on_the_same_second_whatever_the_sampling(dt):
 
 def test_s2_with_ranges_stays_in_them_and_drops_at_every_time():
     settings = {"before": (0.55, 0.9), "after": (0.3, 0.5), "drop_time": (0.0, 5.0)}
-    friction = many(wet_road, steps=50, dt=DT, keys=jax.random.split(jax.random.key(2), 500), **settings)[..., 0]
+    friction = many(
+        wet_road,
+        steps=50,
+        dt=DT,
+        keys=jax.random.split(jax.random.key(2), 500),
+        **settings,
+    )[..., 0]
     high, low = friction > 0.52, friction < 0.52
     assert friction[high].min() >= 0.55 - 1e-6
     assert friction[high].max() <= 0.9
     assert friction[low].min() >= 0.3
     assert friction[low].max() <= 0.5
     assert np.all(np.diff(low.astype(int), axis=1) >= 0)  # never back up
-    assert kolmogorov_distance(high.sum(axis=1) * DT, 0.0, 5.0) < 1.63 / np.sqrt(500) + DT / 5.0
+    assert (
+        kolmogorov_distance(high.sum(axis=1) * DT, 0.0, 5.0)
+        < 1.63 / np.sqrt(500) + DT / 5.0
+    )
 
 
 def test_gusts_never_exceed_their_peak():
@@ -76,7 +99,9 @@ def test_gusts_never_exceed_their_peak():
 
 
 def test_gusts_cover_the_whole_range_evenly():
-    """Levels are held for 2 s on average and joined by ramps of 0.5 s; one level is independent of the next."""
+    """Levels are held for 2 s on average and joined by ramps of 0.5 s; one level is
+    independent of the next.
+    """
     keys = jax.random.split(jax.random.key(11), 3000)
     wind = many(gusts, keys=keys, steps=60, dt=DT, peak=8.0)
     # At the start every value is a level: a true Kolmogorov-Smirnov test at 1 %.
@@ -101,7 +126,9 @@ def test_s3_visits_a_b_c_b_a_for_exactly_three_seconds_each(s3):
     friction = np.float32([0.9, 0.6, 0.3, 0.6])[visit % 4]
     wind = np.float32([0.0, 4.0, 8.0, 4.0])[visit % 4]
     np.testing.assert_array_equal(s3[..., 0], np.broadcast_to(friction, s3.shape[:2]))
-    np.testing.assert_array_equal(np.abs(s3[..., 1]), np.broadcast_to(wind, s3.shape[:2]))
+    np.testing.assert_array_equal(
+        np.abs(s3[..., 1]), np.broadcast_to(wind, s3.shape[:2])
+    )
 
 
 @pytest.mark.parametrize(("dt", "steps"), [(0.02, 3000), (0.05, 1200), (0.1, 3000)])
@@ -142,7 +169,9 @@ def test_a_batch_of_episodes_is_one_pytree_of_different_roads(name):
     single = jit(make(name))(KEYS[2])
     assert batch.envs.shape == (4, 60, 2)
     assert batch.initial_state.shape == (4, 4)
-    for many_leaf, leaf in zip(jax.tree.leaves(batch), jax.tree.leaves(single), strict=True):
+    for many_leaf, leaf in zip(
+        jax.tree.leaves(batch), jax.tree.leaves(single), strict=True
+    ):
         np.testing.assert_allclose(many_leaf[2], leaf, atol=1e-4)
     ends = np.asarray(batch.path.points)[:, -1, 1]
     assert len(np.unique(ends.round(3))) == 4
@@ -158,7 +187,9 @@ def test_an_episode_starts_on_the_path_at_its_speed_and_the_path_outlasts_it():
     episode = jit(make("s2", duration=20.0, speed=12.0))(KEYS[0])
     np.testing.assert_array_equal(episode.initial_state, [0.0, 0.0, 0.0, 12.0])
     np.testing.assert_array_equal(np.asarray(episode.path.points)[0, :3], np.zeros(3))
-    assert (len(episode.path.points) - 1) * float(episode.path.spacing) >= 12.0 * 20.0 + 12.0 * 2.0
+    assert (len(episode.path.points) - 1) * float(
+        episode.path.spacing
+    ) >= 12.0 * 20.0 + 12.0 * 2.0
     assert float(episode.speed) == 12.0
 
 

@@ -9,7 +9,13 @@ import pytest
 from helpers import jit
 
 from sfkd_jax import scenarios
-from sfkd_jax.scenarios import path_from_curvature, point_at, project, reference_window, smooth_path
+from sfkd_jax.scenarios import (
+    path_from_curvature,
+    point_at,
+    project,
+    reference_window,
+    smooth_path,
+)
 
 RADIUS = 50.0
 POINTS = jit(jax.vmap(point_at, in_axes=(None, 0)))
@@ -24,13 +30,17 @@ def circle():
 
 @pytest.fixture(scope="module")
 def road():
-    return jit(partial(smooth_path, length=300.0, peak_curvature=0.03))(jax.random.key(3))
+    return jit(partial(smooth_path, length=300.0, peak_curvature=0.03))(
+        jax.random.key(3)
+    )
 
 
 def beside(path, s, offset):
     """The positions `offset` [m] to the left of the path at s."""
     points = np.asarray(POINTS(path, s))
-    return points[:, :2] + offset[:, None] * np.stack([-np.sin(points[:, 2]), np.cos(points[:, 2])], axis=1)
+    return points[:, :2] + offset[:, None] * np.stack(
+        [-np.sin(points[:, 2]), np.cos(points[:, 2])], axis=1
+    )
 
 
 @pytest.mark.parametrize("side", [1.0, -1.0])
@@ -39,8 +49,12 @@ def test_constant_curvature_makes_a_circle_of_exactly_that_radius(side):
     s = np.linspace(0.0, 349.0, 2001, dtype=np.float32)
     centre = np.asarray([0.0, side * RADIUS])
     samples, between = np.asarray(path.points), np.asarray(POINTS(path, s))
-    np.testing.assert_allclose(np.linalg.norm(samples[:, :2] - centre, axis=1), RADIUS, rtol=1e-5)
-    np.testing.assert_allclose(np.linalg.norm(between[:, :2] - centre, axis=1), RADIUS, rtol=2e-5)
+    np.testing.assert_allclose(
+        np.linalg.norm(samples[:, :2] - centre, axis=1), RADIUS, rtol=1e-5
+    )
+    np.testing.assert_allclose(
+        np.linalg.norm(between[:, :2] - centre, axis=1), RADIUS, rtol=2e-5
+    )
     np.testing.assert_allclose(between[:, 3], side / RADIUS, rtol=1e-6)
     np.testing.assert_allclose(between[:, 2], side * s / RADIUS, atol=1e-4)
 
@@ -58,8 +72,12 @@ def test_a_path_starts_at_the_origin_along_x_and_without_curvature(road):
 
 def test_points_between_samples_join_the_samples_without_a_jump(road):
     s = 0.5 * np.arange(1, 500, dtype=np.float32)
-    before, at, after = (np.asarray(POINTS(road, s + shift)) for shift in np.float32([-1e-3, 0.0, 1e-3]))
-    np.testing.assert_allclose(after[:, :2], before[:, :2], atol=2.5e-3)  # 2 mm of travel and float32 at 300 m
+    before, at, after = (
+        np.asarray(POINTS(road, s + shift)) for shift in np.float32([-1e-3, 0.0, 1e-3])
+    )
+    np.testing.assert_allclose(
+        after[:, :2], before[:, :2], atol=2.5e-3
+    )  # 2 mm of travel and float32 at 300 m
     np.testing.assert_allclose(after[:, 2:], before[:, 2:], atol=2e-4)
     np.testing.assert_allclose(at[:, :2], np.asarray(road.points)[1:500, :2], atol=1e-3)
 
@@ -85,9 +103,14 @@ def test_arc_length_is_clamped_to_the_path(circle):
     np.testing.assert_allclose(ends, np.asarray(circle.points)[[0, -1]], atol=1e-4)
 
 
-def test_projection_returns_the_distance_and_the_arc_length_that_a_point_was_placed_at(road):
+def test_projection_returns_the_distance_and_the_arc_length_that_a_point_was_placed_at(
+    road,
+):
     random = np.random.default_rng(0)
-    s, offset = (random.uniform(*edges, 300).astype(np.float32) for edges in ((5.0, 290.0), (-4.0, 4.0)))
+    s, offset = (
+        random.uniform(*edges, 300).astype(np.float32)
+        for edges in ((5.0, 290.0), (-4.0, 4.0))
+    )
     guess = s + random.uniform(-2.0, 2.0, 300).astype(np.float32)
     found, lateral = PROJECT(road, beside(road, s, offset), guess)
     np.testing.assert_allclose(lateral, offset, atol=2e-3)
@@ -95,12 +118,16 @@ def test_projection_returns_the_distance_and_the_arc_length_that_a_point_was_pla
 
 
 def test_left_of_the_path_is_positive(circle):
-    found, lateral = PROJECT(circle, np.float32([[0.0, 1.0], [0.0, -2.0]]), np.zeros(2, np.float32))
+    found, lateral = PROJECT(
+        circle, np.float32([[0.0, 1.0], [0.0, -2.0]]), np.zeros(2, np.float32)
+    )
     np.testing.assert_allclose(lateral, [1.0, -2.0], atol=1e-5)
     np.testing.assert_allclose(found, [0.0, 0.0], atol=1e-5)
 
 
-def test_projection_stays_finite_far_from_the_path_and_at_the_centre_of_a_circle(circle):
+def test_projection_stays_finite_far_from_the_path_and_at_the_centre_of_a_circle(
+    circle,
+):
     positions = np.float32([[0.0, RADIUS], [500.0, 500.0], [-1e4, 0.0]])
     found, lateral = PROJECT(circle, positions, np.float32([10.0, 50.0, 0.0]))
     assert np.all(np.isfinite(found))
@@ -111,18 +138,24 @@ def test_projection_stays_finite_far_from_the_path_and_at_the_centre_of_a_circle
 def test_the_peak_curvature_is_reached_and_not_exceeded(peak):
     make = jit(jax.vmap(partial(smooth_path, length=200.0, peak_curvature=peak)))
     roads = make(jax.random.split(jax.random.key(1), 20))
-    np.testing.assert_allclose(np.max(np.abs(roads.points)[..., 3], axis=1), peak, rtol=1e-5)
+    np.testing.assert_allclose(
+        np.max(np.abs(roads.points)[..., 3], axis=1), peak, rtol=1e-5
+    )
 
 
 def test_the_curvature_is_smooth_at_the_shortest_wavelength(road):
-    """|κ'| ≤ 2π Σ|aᵢ| / λ_min, and three amplitudes add up to three peaks at most; the blend adds little."""
+    """|κ'| ≤ 2π Σ|aᵢ| / λ_min, and three amplitudes add up to three peaks at most; the
+    blend adds little.
+    """
     slope = np.abs(np.diff(np.asarray(road.points)[:, 3])) / 0.5
     assert slope.max() < 3 * 0.03 * 2 * np.pi / 50.0 + 1.5 * 0.03 / 20.0
 
 
 def test_a_path_is_at_least_as_long_as_asked():
     for length in (10.0, 99.9, 100.0):
-        path = jax.eval_shape(partial(smooth_path, length=length, spacing=0.5), jax.random.key(0))
+        path = jax.eval_shape(
+            partial(smooth_path, length=length, spacing=0.5), jax.random.key(0)
+        )
         assert (path.points.shape[0] - 1) * 0.5 >= length
 
 
@@ -137,7 +170,9 @@ def test_different_keys_make_different_roads_and_the_same_key_the_same_road():
 
 
 def test_the_reference_window_holds_the_next_points_at_the_given_speed(circle):
-    window = jit(partial(reference_window, dt=0.1, horizon=5))(circle, jnp.asarray(3.0), jnp.asarray(8.0))
+    window = jit(partial(reference_window, dt=0.1, horizon=5))(
+        circle, jnp.asarray(3.0), jnp.asarray(8.0)
+    )
     expected = np.asarray(POINTS(circle, np.float32(3.0 + 0.8 * np.arange(1, 6))))
     np.testing.assert_allclose(np.asarray(window)[:, :3], expected[:, :3], atol=1e-6)
     np.testing.assert_array_equal(np.asarray(window)[:, 3], np.full(5, 8.0))
@@ -149,15 +184,25 @@ def test_a_path_through_positions_on_a_circle_has_its_curvature_and_runs_through
     path = scenarios.path_through(jnp.asarray(points, dtype=jnp.float32))
     inside = np.asarray(path.points)[3:-3]
     np.testing.assert_allclose(inside[:, 3], 1 / radius, rtol=0.02)
-    np.testing.assert_allclose(np.hypot(inside[:, 0], inside[:, 1] - radius), radius, atol=1e-3)
+    np.testing.assert_allclose(
+        np.hypot(inside[:, 0], inside[:, 1] - radius), radius, atol=1e-3
+    )
     for s in (3.0, 17.3, 41.9):
-        expected = [radius * np.sin(s / radius), radius * (1 - np.cos(s / radius)), s / radius]
-        np.testing.assert_allclose(scenarios.point_at(path, jnp.asarray(s))[:3], expected, atol=5e-3)
+        expected = [
+            radius * np.sin(s / radius),
+            radius * (1 - np.cos(s / radius)),
+            s / radius,
+        ]
+        np.testing.assert_allclose(
+            scenarios.point_at(path, jnp.asarray(s))[:3], expected, atol=5e-3
+        )
 
 
 def test_a_path_keeps_turning_beyond_half_a_turn():
     angle = np.linspace(0.0, 6.0, 600)
-    points = jnp.asarray(np.column_stack([10 * np.cos(angle), 10 * np.sin(angle)]), dtype=jnp.float32)
+    points = jnp.asarray(
+        np.column_stack([10 * np.cos(angle), 10 * np.sin(angle)]), dtype=jnp.float32
+    )
     yaw = np.asarray(scenarios.path_through(points).points)[:, 2]
     assert np.all(np.abs(np.diff(yaw)) < 0.1)
     assert abs((yaw[-1] - yaw[0]) - 6.0) < 0.1

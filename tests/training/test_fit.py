@@ -34,19 +34,35 @@ def task():
 def train(task, place, seed=3, **changes):
     model, loss, data = task
     held_out = spread_windows(data.validation, length=8)
-    return fit(model, loss, DRAW, data.train, held_out, jax.random.key(seed), place, **(OPTIONS | changes))
+    return fit(
+        model,
+        loss,
+        DRAW,
+        data.train,
+        held_out,
+        jax.random.key(seed),
+        place,
+        **(OPTIONS | changes),
+    )
 
 
 def same(a, b):
-    return all(np.array_equal(x, y) for x, y in zip(jax.tree.leaves(a), jax.tree.leaves(b), strict=True))
+    return all(
+        np.array_equal(x, y)
+        for x, y in zip(jax.tree.leaves(a), jax.tree.leaves(b), strict=True)
+    )
 
 
 def lines(place):
-    return [json.loads(line) for line in (place / "metrics.jsonl").read_text().splitlines()]
+    return [
+        json.loads(line) for line in (place / "metrics.jsonl").read_text().splitlines()
+    ]
 
 
 def test_training_goes_on_from_parameters_that_init_returns(task, tmp_path):
-    """A parabola in place of a model's loss: ten small steps move towards its minimum, from where `init` stands."""
+    """A parabola in place of a model's loss: ten small steps move towards its minimum,
+    from where `init` stands.
+    """
     model, _, data = task
 
     def parabola(params, batch):
@@ -74,7 +90,9 @@ def test_the_same_key_gives_the_same_weights_and_another_key_others(task, tmp_pa
     assert not same(first, other)
 
 
-def test_an_interrupted_run_ends_bit_identical_to_an_unbroken_one(task, tmp_path, monkeypatch):
+def test_an_interrupted_run_ends_bit_identical_to_an_unbroken_one(
+    task, tmp_path, monkeypatch
+):
     unbroken, best = train(task, tmp_path / "unbroken")
     saves = []
     save = Checkpoints.save
@@ -108,11 +126,18 @@ def test_latest_and_best_are_both_kept(tmp_path):
 
 
 @pytest.mark.parametrize("size", [0, 1000])
-def test_a_checkpoint_on_a_full_disk_is_one_line_and_leaves_the_one_before(tmp_path, capfd, size):
+def test_a_checkpoint_on_a_full_disk_is_one_line_and_leaves_the_one_before(
+    tmp_path, capfd, size
+):
     state = {"w": jax.random.normal(jax.random.key(0), (60, 60))}
     shelf = Checkpoints(tmp_path)
     shelf.save(1, state, validation_loss=2.0)
-    with largest_file(size), pytest.raises(OSError, match=r"step 2 was not saved.*File too large.*goes on") as told:
+    with (
+        largest_file(size),
+        pytest.raises(
+            OSError, match=r"step 2 was not saved.*File too large.*goes on"
+        ) as told,
+    ):
         shelf.save(2, state, validation_loss=1.0)
     assert "\n" not in str(told.value)
     assert "Traceback" not in capfd.readouterr().err
@@ -130,7 +155,10 @@ def test_a_log_on_a_full_disk_is_one_line_and_keeps_its_lines(tmp_path):
         log.write({"loss": 1.0, "step": 10})
         with (
             largest_file(30),
-            pytest.raises(OSError, match=r"step 20 was not logged .File too large.; the same command"),
+            pytest.raises(
+                OSError,
+                match=r"step 20 was not logged .File too large.; the same command",
+            ),
         ):
             log.write({"loss": 1.0, "step": 20})
     with TrainingLog(tmp_path, steps=20, resumed_at=10) as log:
@@ -140,7 +168,9 @@ def test_a_log_on_a_full_disk_is_one_line_and_keeps_its_lines(tmp_path):
 
 def test_a_loss_that_is_not_finite_stops_with_the_last_good_checkpoint(task, tmp_path):
     model, loss, data = task
-    poisoned = data._replace(train=data.train._replace(states=data.train.states.at[..., 3].set(jnp.nan)))
+    poisoned = data._replace(
+        train=data.train._replace(states=data.train.states.at[..., 3].set(jnp.nan))
+    )
     train(task, tmp_path, steps=20)
     with pytest.raises(TrainingStopped, match="last good checkpoint is step 20"):
         train((model, loss, poisoned), tmp_path)
@@ -149,7 +179,10 @@ def test_a_loss_that_is_not_finite_stops_with_the_last_good_checkpoint(task, tmp
     kept.close()
 
 
-@pytest.mark.parametrize(("changes", "says"), [({"steps": 45}, "multiples"), ({"save_every": 15}, "multiples")])
+@pytest.mark.parametrize(
+    ("changes", "says"),
+    [({"steps": 45}, "multiples"), ({"save_every": 15}, "multiples")],
+)
 def test_settings_that_cannot_work_are_refused(task, tmp_path, changes, says):
     with pytest.raises(ValueError, match=says):
         train(task, tmp_path, **changes)
@@ -180,9 +213,15 @@ def test_kill_9_at_random_moments_loses_nothing(task, tmp_path):
     unbroken, _ = train(task, tmp_path / "unbroken", save_every=10)
     random, place = np.random.default_rng(0), tmp_path / "killed"
     for _ in range(4):
-        worker = subprocess.Popen([sys.executable, "-c", WORKER, str(place), str(Path(__file__).parents[1])])
+        worker = subprocess.Popen(
+            [sys.executable, "-c", WORKER, str(place), str(Path(__file__).parents[1])]
+        )
         patience = time.monotonic() + 60
-        while not (place / "checkpoints").exists() and worker.poll() is None and time.monotonic() < patience:
+        while (
+            not (place / "checkpoints").exists()
+            and worker.poll() is None
+            and time.monotonic() < patience
+        ):
             time.sleep(0.05)
         time.sleep(random.uniform(0.0, 3.0))
         worker.send_signal(signal.SIGKILL)

@@ -1,4 +1,6 @@
-"""SIGINT and SIGTERM during training: a checkpoint at once, and an end as if nothing had been."""
+"""SIGINT and SIGTERM during training: a checkpoint at once, and an end as if nothing
+had been.
+"""
 
 import json
 import os
@@ -41,19 +43,37 @@ def train(place):
     model, draw = sfkd(space, **TINY), partial(random_windows, batch=16, length=8)
     held_out = spread_windows(data.validation, length=8)
     options = {"steps": 80, "log_every": 5, "save_every": 40}
-    return fit(model, multi_step_loss(model, space), draw, data.train, held_out, jax.random.key(3), place, **options)
+    return fit(
+        model,
+        multi_step_loss(model, space),
+        draw,
+        data.train,
+        held_out,
+        jax.random.key(3),
+        place,
+        **options,
+    )
 
 
 def lines(place):
     """What the log says of every step, less its times."""
-    return [{name: line.get(name) for name in EXACT} for line in artefacts.read_jsonl(place / "metrics.jsonl")]
+    return [
+        {name: line.get(name) for name in EXACT}
+        for line in artefacts.read_jsonl(place / "metrics.jsonl")
+    ]
 
 
 def stopped(place, number, step):
-    """Send a signal to a training that has logged a step: how long it takes to leave [s], and its status."""
-    process = subprocess.Popen([sys.executable, "-c", WORKER, str(place), str(Path(__file__).parents[1])])
+    """Send a signal to a training that has logged a step: how long it takes to leave
+    [s], and its status.
+    """
+    process = subprocess.Popen(
+        [sys.executable, "-c", WORKER, str(place), str(Path(__file__).parents[1])]
+    )
     log, patience = place / "metrics.jsonl", time.monotonic() + 120
-    while not (log.exists() and any(line["step"] >= step for line in artefacts.read_jsonl(log))):
+    while not (
+        log.exists() and any(line["step"] >= step for line in artefacts.read_jsonl(log))
+    ):
         assert process.poll() is None
         assert time.monotonic() < patience
         time.sleep(0.005)
@@ -62,7 +82,9 @@ def stopped(place, number, step):
     return process.wait(60), time.monotonic() - sent
 
 
-def test_signals_save_a_checkpoint_within_5_s_and_the_end_is_that_of_an_unbroken_run(tmp_path):
+def test_signals_save_a_checkpoint_within_5_s_and_the_end_is_that_of_an_unbroken_run(
+    tmp_path,
+):
     unbroken, best = train(tmp_path / "unbroken")
     place = tmp_path / "broken"
     for number, step in ((signal.SIGINT, 10), (signal.SIGTERM, 50)):
@@ -82,7 +104,7 @@ def test_signals_save_a_checkpoint_within_5_s_and_the_end_is_that_of_an_unbroken
 
 DOOR = """
 import os, signal, time
-from sfkd_jax.config import door
+from sfkd_jax.cli.config import door
 
 def run(settings):
     os.kill(os.getpid(), signal.SIGINT)
@@ -93,13 +115,21 @@ door(run)()
 
 
 def test_a_door_that_is_interrupted_says_so_in_one_line_and_exits_130(tmp_path):
-    done = subprocess.run([sys.executable, "-c", DOOR], cwd=tmp_path, capture_output=True, text=True, timeout=120)
+    done = subprocess.run(
+        [sys.executable, "-c", DOOR],
+        cwd=tmp_path,
+        capture_output=True,
+        text=True,
+        timeout=120,
+    )
     assert done.returncode == 130
     assert done.stderr == "sfkd_jax: interrupted; the same command continues\n"
 
 
 DAMAGE = {
-    "a flipped bit that makes a byte undecodable": lambda line: line[:8] + bytes([line[8] | 0x80]) + line[9:],
+    "a flipped bit that makes a byte undecodable": lambda line: (
+        line[:8] + bytes([line[8] | 0x80]) + line[9:]
+    ),
     "a broken line": lambda line: line[: len(line) // 2] + b"\n",
     "a name that changed": lambda line: line.replace(b"step", b"stfp"),
     "no object": lambda line: b"7\n",
@@ -107,9 +137,14 @@ DAMAGE = {
 
 
 @pytest.mark.parametrize("damage", list(DAMAGE))
-def test_a_damaged_line_is_told_with_its_number_and_the_others_stay(tmp_path, capfd, damage):
+def test_a_damaged_line_is_told_with_its_number_and_the_others_stay(
+    tmp_path, capfd, damage
+):
     log = tmp_path / "metrics.jsonl"
-    whole = [json.dumps({"loss": 1.0, "step": step}).encode() + b"\n" for step in (10, 20, 30, 40)]
+    whole = [
+        json.dumps({"loss": 1.0, "step": step}).encode() + b"\n"
+        for step in (10, 20, 30, 40)
+    ]
     log.write_bytes(whole[0] + DAMAGE[damage](whole[1]) + whole[2] + whole[3])
     with TrainingLog(tmp_path, steps=40, resumed_at=30):
         pass
@@ -123,7 +158,10 @@ def test_a_log_that_cannot_be_rewritten_stays_and_is_one_line(tmp_path):
     log = tmp_path / "metrics.jsonl"
     text = json.dumps({"loss": 1.0, "step": 10}) + "\n"
     log.write_text(text)
-    with largest_file(5), pytest.raises(artefacts.ArtefactError, match="File too large"):
+    with (
+        largest_file(5),
+        pytest.raises(artefacts.ArtefactError, match="File too large"),
+    ):
         TrainingLog(tmp_path, steps=40, resumed_at=30)
     assert log.read_text() == text
     assert os.listdir(tmp_path) == ["metrics.jsonl"]

@@ -1,4 +1,6 @@
-"""The certified tube in the loss: it is what it says, in metres, and training can lower it."""
+"""The certified tube in the loss: it is what it says, in metres, and training can lower
+it.
+"""
 
 from functools import partial
 
@@ -20,24 +22,38 @@ LOW, HIGH = (0.3, -8.0), (0.9, 8.0)
 @pytest.fixture(scope="module")
 def learned():
     loop = vehicle.along_path(vehicle.kinematic(), any_law())
-    drives = jax.jit(partial(generate_along_path, loop, segments=32, steps=12, env_low=LOW, env_high=HIGH))
+    drives = jax.jit(
+        partial(
+            generate_along_path, loop, segments=32, steps=12, env_low=LOW, env_high=HIGH
+        )
+    )
     box = {"env_low": jnp.asarray(LOW), "env_high": jnp.asarray(HIGH)}
-    data = split(drives(jax.random.key(0)), jax.random.key(1), shares=(0.7, 0.1, 0.1, 0.1), **box)
+    data = split(
+        drives(jax.random.key(0)), jax.random.key(1), shares=(0.7, 0.1, 0.1, 0.1), **box
+    )
     space = measure_space(data)
-    model = models.sfkd(space, **TINY | {"frame": "path", "budget": "joint", "learn_alpha": True})
+    model = models.sfkd(
+        space, **TINY | {"frame": "path", "budget": "joint", "learn_alpha": True}
+    )
     batch = random_windows(data.train, jax.random.key(2), batch=8, length=5)
     return model, space, model.init(jax.random.key(3)), batch
 
 
-def test_the_tube_in_the_loss_is_the_read_out_times_the_defect_over_what_contracts(learned):
+def test_the_tube_in_the_loss_is_the_read_out_times_the_defect_over_what_contracts(
+    learned,
+):
     model, space, params, batch = learned
     total, parts = multi_step_loss(model, space, tube=(0.5,))(params, batch)
     gaps = jax.vmap(lambda drive: defects(model, params, drive)[0])(batch)
     largest = float(power_mean(jnp.linalg.norm(gaps, axis=-1)))
     row = float(jnp.linalg.norm(model.explicit(params).readout[0]))
-    np.testing.assert_allclose(parts["tube"], row * largest / (1.0 - float(model.rate(params))), rtol=1e-4)
+    np.testing.assert_allclose(
+        parts["tube"], row * largest / (1.0 - float(model.rate(params))), rtol=1e-4
+    )
     without, _ = multi_step_loss(model, space)(params, batch)
-    np.testing.assert_allclose(total - without, 0.5 * (float(parts["tube"]) / 0.01) ** 2, rtol=1e-3)
+    np.testing.assert_allclose(
+        total - without, 0.5 * (float(parts["tube"]) / 0.01) ** 2, rtol=1e-3
+    )
 
 
 def test_lateral_error_and_heading_count_as_position_and_yaw(learned):
@@ -51,21 +67,34 @@ def test_alpha_follows_the_loss_and_stays_below_its_largest(learned):
     """A heavy tube alone drives α down; the weights hold whatever α says."""
     model, space, params, batch = learned
     loss = multi_step_loss(
-        model, space, prediction=0.0, one_step=0.0, consistency=0.0, reconstruction=0.0, transport=0.0, tube=(1.0,)
+        model,
+        space,
+        prediction=0.0,
+        one_step=0.0,
+        consistency=0.0,
+        reconstruction=0.0,
+        transport=0.0,
+        tube=(1.0,),
     )
     slope = jax.jit(jax.grad(lambda params: loss(params, batch)[0]))(params)
     assert float(slope["networks"]["alpha_logit"]) > 0
     assert 0.5 < float(model.rate(params)) < 0.995
     for logit in (-5.0, 5.0):
-        moved = params | {"networks": params["networks"] | {"alpha_logit": jnp.asarray(logit)}}
-        norms = jnp.linalg.norm(model.explicit(moved).operators.vertices, ord=2, axis=(1, 2))
+        moved = params | {
+            "networks": params["networks"] | {"alpha_logit": jnp.asarray(logit)}
+        }
+        norms = jnp.linalg.norm(
+            model.explicit(moved).operators.vertices, ord=2, axis=(1, 2)
+        )
         assert np.all(norms <= float(model.rate(moved)) + 1e-5)
 
 
 def test_a_power_mean_holds_tiny_and_huge_numbers():
     for scale in (1e-12, 1.0, 1e12):
         np.testing.assert_allclose(
-            power_mean(scale * jnp.asarray([1.0, 2.0, 2.0])), 2 * scale * (2 / 3) ** 0.125, rtol=2e-3
+            power_mean(scale * jnp.asarray([1.0, 2.0, 2.0])),
+            2 * scale * (2 / 3) ** 0.125,
+            rtol=2e-3,
         )
 
 

@@ -11,9 +11,20 @@ import pytest
 
 from sfkd_jax.vehicle import dynamic, kinematic
 
-PLANTS = {"kinematic": cache(kinematic), "dynamic": cache(dynamic)}  # one object a setting, so one compilation
+PLANTS = {
+    "kinematic": cache(kinematic),
+    "dynamic": cache(dynamic),
+}  # one object a setting, so one compilation
 LONGEST = 300
-STATE_LIMITS = [(-50, 50), (-50, 50), (-3, 3), (0, 25), (-4, 4), (-1.5, 1.5), (-0.5, 0.5)]
+STATE_LIMITS = [
+    (-50, 50),
+    (-50, 50),
+    (-3, 3),
+    (0, 25),
+    (-4, 4),
+    (-1.5, 1.5),
+    (-0.5, 0.5),
+]
 ENV_LIMITS = [(0.3, 0.9), (-8, 8)]
 
 
@@ -29,7 +40,9 @@ def vehicle(factory):
 
 @pytest.fixture
 def coasting(factory):
-    """The same plant without drag and rolling resistance: what accelerates it are its tyres and the wind."""
+    """The same plant without drag and rolling resistance: what accelerates it are its
+    tyres and the wind.
+    """
     return factory(drag=0.0, rolling=0.0)
 
 
@@ -45,7 +58,9 @@ def _hold(step, state, control, env):
         x = step(x, control, env)
         return x, x
 
-    return jnp.concatenate([state[None], jax.lax.scan(move, state, None, length=LONGEST)[1]])
+    return jnp.concatenate(
+        [state[None], jax.lax.scan(move, state, None, length=LONGEST)[1]]
+    )
 
 
 @cache
@@ -66,21 +81,27 @@ def dynamic_plant() -> Callable:
 
 @pytest.fixture
 def hold() -> Callable:
-    """(vehicle, speed or state, control, env, seconds) -> states x_0 … x_T under a control that is held."""
+    """(vehicle, speed or state, control, env, seconds) -> states x_0 … x_T under a
+    control that is held.
+    """
 
     def drive(vehicle, start, control, env, seconds):
         steps = round(seconds / vehicle.dt)
         assert steps <= LONGEST
         size = len(vehicle.state_names)
         state = jnp.zeros(size).at[3].set(start) if jnp.ndim(start) == 0 else start
-        return _hold(vehicle.step, state, jnp.array(control), jnp.array(env))[: steps + 1]
+        return _hold(vehicle.step, state, jnp.array(control), jnp.array(env))[
+            : steps + 1
+        ]
 
     return drive
 
 
 @pytest.fixture
 def sweep() -> Callable:
-    """(vehicle, count, overdrive) -> random states, controls and envs; every second row sits on the bounds."""
+    """(vehicle, count, overdrive) -> random states, controls and envs; every second row
+    sits on the bounds.
+    """
 
     def draw(vehicle, count, overdrive=1.0):
         random, size = np.random.default_rng(0), len(vehicle.state_names)
@@ -89,6 +110,10 @@ def sweep() -> Callable:
         share = random.uniform(size=(count, low.size))
         share[1::2] = np.round(2 * share[1::2]) / 2
         rows = jnp.asarray(low + (high - low) * share)
-        return SimpleNamespace(states=rows[:, :size], controls=rows[:, size : size + 2], envs=rows[:, size + 2 :])
+        return SimpleNamespace(
+            states=rows[:, :size],
+            controls=rows[:, size : size + 2],
+            envs=rows[:, size + 2 :],
+        )
 
     return draw

@@ -12,7 +12,9 @@ def test_one_step_of_a_linear_system_is_the_taylor_polynomial_of_degree_four():
     step = rk4(lambda x, u, e: e[0] * x + u, dt=0.5)
     after = step(jnp.array([2.0]), jnp.array([0.0]), jnp.array([-1.6]))
     z = -0.8
-    np.testing.assert_allclose(after, [2.0 * (1 + z + z**2 / 2 + z**3 / 6 + z**4 / 24)], rtol=1e-14)
+    np.testing.assert_allclose(
+        after, [2.0 * (1 + z + z**2 / 2 + z**3 / 6 + z**4 / 24)], rtol=1e-14
+    )
 
 
 def test_substeps_are_shorter_steps_under_the_same_control(vehicle):
@@ -34,7 +36,9 @@ def test_the_error_falls_with_the_fourth_power_of_the_step(vehicle):
         step = rk4(lambda x, u, e: vehicle.derivative(x, u, e) / steps, dt=1.0)
         return jax.lax.fori_loop(0, steps, lambda _, x: step(x, control, env), state)
 
-    steps = np.array([4, 6, 9, 14, 20]) * (10 if vehicle.name == "dynamic" else 1)  # tyres are stiffer than a path
+    steps = np.array([4, 6, 9, 14, 20]) * (
+        10 if vehicle.name == "dynamic" else 1
+    )  # tyres are stiffer than a path
     exact = end(3000)
     errors = [float(jnp.linalg.norm(end(n) - exact)) for n in steps]
     order = -np.polyfit(np.log(steps), np.log(errors), 1)[0]

@@ -1,4 +1,6 @@
-"""What only the kinematic plant promises: quasi-steady slip, and a state that hides nothing."""
+"""What only the kinematic plant promises: quasi-steady slip, and a state that hides
+nothing.
+"""
 
 import jax
 import jax.numpy as jnp
@@ -13,16 +15,25 @@ LENGTH = FRONT + REAR
 pytestmark = pytest.mark.usefixtures("x64")
 
 
-@pytest.mark.parametrize(("friction", "wind", "speed"), [(0.9, 0.0, 5.0), (0.5, 4.0, 12.0), (0.3, -8.0, 20.0)])
+@pytest.mark.parametrize(
+    ("friction", "wind", "speed"),
+    [(0.9, 0.0, 5.0), (0.5, 4.0, 12.0), (0.3, -8.0, 20.0)],
+)
 def test_slip_balances_force_and_moment_at_both_axles(friction, wind, speed):
-    """Whatever the curvature the circle leaves, the course is the one at which the rear tyres carry their share."""
+    """Whatever the curvature the circle leaves, the course is the one at which the rear
+    tyres carry their share.
+    """
     env = jnp.array([friction, wind])
-    rate = kinematic().derivative(jnp.array([0.0, 0.0, 0.0, speed]), jnp.array([0.05, 0.0]), env)
+    rate = kinematic().derivative(
+        jnp.array([0.0, 0.0, 0.0, speed]), jnp.array([0.05, 0.0]), env
+    )
     slip, curvature = np.arctan2(rate[1], rate[0]), rate[2] / speed
     force, lateral = 10.0 * wind * abs(wind), MASS * speed**2 * curvature
     rear = -7.0e4 * friction * (slip - REAR * curvature)
     front = lateral - force - rear
-    assert float(FRONT * front - REAR * rear + LEVER * force) == pytest.approx(0.0, abs=1e-6)
+    assert float(FRONT * front - REAR * rear + LEVER * force) == pytest.approx(
+        0.0, abs=1e-6
+    )
 
 
 @pytest.mark.parametrize(("friction", "wind"), [(0.9, 0.0), (0.3, 2.0)])
@@ -43,11 +54,15 @@ def test_below_the_limit_the_front_tyre_meets_the_linear_law(friction, wind):
 def test_the_demand_is_scaled_onto_the_circle_and_keeps_its_direction():
     vehicle, state = kinematic(drag=0.0, rolling=0.0), jnp.array([0.0, 0.0, 0.0, 20.0])
     env = jnp.array([0.4, 0.0])
-    rates = [vehicle.derivative(state, jnp.array(u), env) for u in ((1e-6, 0.0), (0.3, -5.0))]
+    rates = [
+        vehicle.derivative(state, jnp.array(u), env) for u in ((1e-6, 0.0), (0.3, -5.0))
+    ]
     lateral = float(rates[0][2]) / 1e-6 * np.tan(0.3) * 20.0
     wanted = np.array([-5.0, lateral])
     given = np.array([rates[1][3], 20.0 * rates[1][2]])
-    np.testing.assert_allclose(given / np.linalg.norm(given), wanted / np.linalg.norm(wanted), rtol=1e-6)
+    np.testing.assert_allclose(
+        given / np.linalg.norm(given), wanted / np.linalg.norm(wanted), rtol=1e-6
+    )
     size = np.linalg.norm(wanted) / (0.4 * 9.81)
     assert np.linalg.norm(given) == pytest.approx(0.4 * 9.81 * np.tanh(size), rel=1e-6)
 
@@ -55,7 +70,9 @@ def test_the_demand_is_scaled_onto_the_circle_and_keeps_its_direction():
 def test_a_storm_that_no_tyre_holds_stays_finite_and_turns_less_than_the_circle_allows():
     env = jnp.stack([jnp.full(50, 0.3), jnp.linspace(-40.0, 40.0, 50)], axis=1)
     state, control = jnp.array([0.0, 0.0, 0.0, 15.0]), jnp.array([0.3, 1.0])
-    rate = jax.vmap(kinematic().derivative, in_axes=(None, None, 0))(state, control, env)
+    rate = jax.vmap(kinematic().derivative, in_axes=(None, None, 0))(
+        state, control, env
+    )
     assert jnp.isfinite(rate).all()
     assert jnp.abs(15.0 * rate[:, 2]).max() <= 0.3 * 9.81
 
@@ -63,7 +80,10 @@ def test_a_storm_that_no_tyre_holds_stays_finite_and_turns_less_than_the_circle_
 def test_the_nominal_bicycle_drives_its_circle_whatever_road_and_weather(hold):
     vehicle = kinematic()
     nominal = vehicle._replace(step=vehicle.nominal)
-    ends = [hold(nominal, 10.0, (0.2, 0.0), env, 2.0)[-1] for env in ((0.9, 0.0), (0.3, 8.0))]
+    ends = [
+        hold(nominal, 10.0, (0.2, 0.0), env, 2.0)[-1]
+        for env in ((0.9, 0.0), (0.3, 8.0))
+    ]
     np.testing.assert_array_equal(*ends)
     curvature = np.tan(0.2) / LENGTH
     assert float(ends[0][2]) == pytest.approx(20.0 * curvature, rel=1e-10)

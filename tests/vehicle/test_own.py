@@ -10,7 +10,12 @@ from sfkd_jax import build, evaluation, vehicle
 
 NAMES = ("p_x", "p_y", "yaw", "v", "yaw_rate")
 LIMITS = {"control_low": (-1.0, -2.0), "control_high": (1.0, 2.0)}
-SETTINGS = {"name": "own", "inner_loop": "none", "speed_gain": 1.0, "state_names": list(NAMES)}
+SETTINGS = {
+    "name": "own",
+    "inner_loop": "none",
+    "speed_gain": 1.0,
+    "state_names": list(NAMES),
+}
 SETTINGS |= {name: list(values) for name, values in LIMITS.items()}
 EXAMPLES = Path(__file__).parents[2] / "examples"
 
@@ -21,8 +26,14 @@ def test_a_step_is_named_in_the_settings_and_is_the_function_itself(monkeypatch)
     vehicle.check_step(plant)
     from own_vehicle import step
 
-    state, control, env = jnp.asarray([1.0, 2.0, 0.3, 4.0, 0.1]), jnp.asarray([0.2, 0.5]), jnp.asarray([0.7, 3.0])
-    np.testing.assert_array_equal(plant.step(state, control, env), step(state, control, env))
+    state, control, env = (
+        jnp.asarray([1.0, 2.0, 0.3, 4.0, 0.1]),
+        jnp.asarray([0.2, 0.5]),
+        jnp.asarray([0.7, 3.0]),
+    )
+    np.testing.assert_array_equal(
+        plant.step(state, control, env), step(state, control, env)
+    )
     assert plant.simulated
     assert (plant.control_low, plant.control_high) == ((-1.0, -2.0), (1.0, 2.0))
 
@@ -30,12 +41,20 @@ def test_a_step_is_named_in_the_settings_and_is_the_function_itself(monkeypatch)
 @pytest.mark.parametrize(
     ("step", "says"),
     [
-        ("nowhere.at_all:step", "vehicle.step=nowhere.at_all:step: No module named 'nowhere'; name it as"),
-        ("own_vehicle:leap", "vehicle.step=own_vehicle:leap: module 'own_vehicle' has no attribute 'leap'; name it as"),
+        (
+            "nowhere.at_all:step",
+            "vehicle.step=nowhere.at_all:step: No module named 'nowhere'; name it as",
+        ),
+        (
+            "own_vehicle:leap",
+            "vehicle.step=own_vehicle:leap: module 'own_vehicle' has no attribute 'leap'; name it as",
+        ),
         ("own_vehicle", "name it as package.module:function"),
     ],
 )
-def test_a_step_that_is_not_there_is_told_when_it_is_needed_and_not_before(monkeypatch, step, says):
+def test_a_step_that_is_not_there_is_told_when_it_is_needed_and_not_before(
+    monkeypatch, step, says
+):
     monkeypatch.syspath_prepend(EXAMPLES)
     plant = build.build_vehicle(SETTINGS | {"step": step})
     with pytest.raises(ValueError, match=r"vehicle\.step") as caught:
@@ -45,8 +64,13 @@ def test_a_step_that_is_not_there_is_told_when_it_is_needed_and_not_before(monke
 
 def test_a_step_of_another_size_is_refused_by_its_shapes():
     names = ("p_x", "p_y", "yaw", "v")
-    plant = vehicle.own(state_names=names, step=lambda x, u, e: jnp.append(x, u[0]), **LIMITS)
-    with pytest.raises(ValueError, match=r"the step of vehicle own returns \(5,\), vehicle.state_names has 4 names"):
+    plant = vehicle.own(
+        state_names=names, step=lambda x, u, e: jnp.append(x, u[0]), **LIMITS
+    )
+    with pytest.raises(
+        ValueError,
+        match=r"the step of vehicle own returns \(5,\), vehicle.state_names has 4 names",
+    ):
         vehicle.check_step(plant)
 
 
@@ -56,21 +80,29 @@ def test_a_step_that_takes_other_sizes_is_told_which_it_is_given():
         return jnp.stack([p_x, p_y, yaw, v, rate])
 
     plant = vehicle.own(step=step, **LIMITS)
-    with pytest.raises(ValueError, match=r"fails on 4 states \(vehicle.state_names\), .*: not enough values to unpack"):
+    with pytest.raises(
+        ValueError,
+        match=r"fails on 4 states \(vehicle.state_names\), .*: not enough values to unpack",
+    ):
         vehicle.check_step(plant)
 
 
 def test_a_robot_known_from_logs_alone_is_not_driven():
     plant = vehicle.own(state_names=NAMES)
     assert not plant.simulated
-    with pytest.raises(ValueError, match="known from logs alone, so nothing can drive it"):
+    with pytest.raises(
+        ValueError, match="known from logs alone, so nothing can drive it"
+    ):
         vehicle.check_step(plant)
 
 
 @pytest.mark.parametrize(
     ("settings", "says"),
     [
-        ({"state_names": ("p_x", "p_y", "yaw")}, "state_names must be p_x, p_y, yaw, v"),
+        (
+            {"state_names": ("p_x", "p_y", "yaw")},
+            "state_names must be p_x, p_y, yaw, v",
+        ),
         ({"control_low": (-1.0,), "control_high": (1.0,)}, "two numbers each"),
         ({"control_low": (-1.0, -2.0)}, "two numbers each"),
         ({"step": lambda x, u, e: x}, "two numbers each"),
@@ -83,7 +115,9 @@ def test_settings_that_cannot_be_meant_are_refused(settings, says):
 
 def test_a_speed_loop_needs_limits_and_an_acceleration():
     for plant in (vehicle.own(), vehicle.own(speed_loop=True, **LIMITS)):
-        with pytest.raises(ValueError, match="inner_loop=speed needs limits of the acceleration"):
+        with pytest.raises(
+            ValueError, match="inner_loop=speed needs limits of the acceleration"
+        ):
             vehicle.with_speed_loop(plant)
 
 
@@ -98,5 +132,8 @@ def test_its_nominal_model_is_the_bicycle_and_leaves_further_states_alone():
 
 
 def test_a_plant_that_wind_does_not_push_cannot_be_pushed_through_it(key):
-    with pytest.raises(ValueError, match=r"side_forces push through the wind, and vehicle\.wind_force is 0"):
+    with pytest.raises(
+        ValueError,
+        match=r"side_forces push through the wind, and vehicle\.wind_force is 0",
+    ):
         evaluation.pushed(vehicle.own(), jnp.zeros((3, 2)), key, largest=10.0)

@@ -9,9 +9,19 @@ from sfkd_jax.types import POSE
 
 @pytest.mark.parametrize("which", ["step", "nominal"])
 def test_a_standing_car_with_its_brakes_on_stands(vehicle, which, hold):
-    start = jnp.zeros(len(vehicle.state_names)).at[POSE].set(jnp.array([3.0, -2.0, 0.7]))
-    states = hold(vehicle._replace(step=getattr(vehicle, which)), start, (0.3, -6.0), (0.5, 8.0), 3.0)
-    np.testing.assert_array_equal(states[:, :4], jnp.broadcast_to(start[:4], states[:, :4].shape))
+    start = (
+        jnp.zeros(len(vehicle.state_names)).at[POSE].set(jnp.array([3.0, -2.0, 0.7]))
+    )
+    states = hold(
+        vehicle._replace(step=getattr(vehicle, which)),
+        start,
+        (0.3, -6.0),
+        (0.5, 8.0),
+        3.0,
+    )
+    np.testing.assert_array_equal(
+        states[:, :4], jnp.broadcast_to(start[:4], states[:, :4].shape)
+    )
     assert (states[:, 4:6] == 0).all()
 
 
@@ -34,8 +44,13 @@ def test_a_car_launches_from_rest_along_the_kinematic_curve(vehicle, hold):
     assert jnp.isfinite(states).all()
     assert (jnp.diff(states[:, 3]) > 0).all()
     late = states[10:]
-    turned, gone = jnp.diff(late[:, 2]), jnp.linalg.norm(jnp.diff(late[:, :2], axis=0), axis=1)
-    np.testing.assert_allclose(turned / gone, np.tan(steering) / vehicle.wheelbase, rtol=0.06)
+    turned, gone = (
+        jnp.diff(late[:, 2]),
+        jnp.linalg.norm(jnp.diff(late[:, :2], axis=0), axis=1),
+    )
+    np.testing.assert_allclose(
+        turned / gone, np.tan(steering) / vehicle.wheelbase, rtol=0.06
+    )
 
 
 def test_wheels_turned_at_rest_move_nothing(vehicle, hold):

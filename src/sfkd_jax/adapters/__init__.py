@@ -1,6 +1,7 @@
 """Foreign interfaces: our vehicles as brax and gymnasium environments, brax systems and CommonRoad's cars as plants.
 
-Nothing here is loaded before it is asked for by name, and another project's package only by what needs it.
+Nothing here is loaded before it is asked for by name, and another project's package
+only by what needs it.
 """
 
 from importlib import import_module
@@ -17,8 +18,12 @@ if TYPE_CHECKING:
     from sfkd_jax.adapters._brax_system import BraxPlant as BraxPlant
     from sfkd_jax.adapters._brax_system import brax_plant as brax_plant
     from sfkd_jax.adapters._brax_system import collect as collect
-    from sfkd_jax.adapters._commonroad import commonroad_controller as commonroad_controller
-    from sfkd_jax.adapters._commonroad import commonroad_observation as commonroad_observation
+    from sfkd_jax.adapters._commonroad import (
+        commonroad_controller as commonroad_controller,
+    )
+    from sfkd_jax.adapters._commonroad import (
+        commonroad_observation as commonroad_observation,
+    )
     from sfkd_jax.adapters._commonroad import commonroad_vehicle as commonroad_vehicle
     from sfkd_jax.adapters._gymnasium import GymnasiumVehicle as GymnasiumVehicle
     from sfkd_jax.adapters._gymnasium import register_gymnasium as register_gymnasium
@@ -48,5 +53,7 @@ def __getattr__(name: str) -> Any:
     except ModuleNotFoundError as missing:
         package = str(missing.name).partition(".")[0]
         command = f'pip install "sfkd-jax[{extra}]"'
-        raise ImportError(f"sfkd_jax.adapters.{name} needs {package}: {command}") from missing
+        raise ImportError(
+            f"sfkd_jax.adapters.{name} needs {package}: {command}"
+        ) from missing
     return getattr(module, name)

@@ -24,9 +24,11 @@ def register_brax(name: str = NAME) -> None:
 class BraxVehicle(Env):
     """Following a path, as `brax.envs.Env`; settings, observation, action and reward are those of `tracking_task`.
 
-    A new road comes with every `reset`. It lies in `info["road"]`, so that the automatic reset of brax, which goes
-    back to the state an episode began with, drives the same road once more. `done` is 1 where the car left the lane
-    or the road ended; `info["time_out"]` is 1 for the latter only, as PPO's `bootstrap_on_timeout` expects.
+    A new road comes with every `reset`. It lies in `info["road"]`, so that the
+    automatic reset of brax, which goes back to the state an episode began with, drives
+    the same road once more. `done` is 1 where the car left the lane or the road ended;
+    `info["time_out"]` is 1 for the latter only, as PPO's `bootstrap_on_timeout`
+    expects.
 
     Raises:
         ValueError: as `tracking_task`.
@@ -42,13 +44,18 @@ class BraxVehicle(Env):
         zero = jnp.zeros(())
         metrics = dict.fromkeys(MEASURES, zero)
         info = {"road": road, "time_out": zero}
-        return State(moment, self._task.observe(road, moment), zero, zero, metrics, info)  # pyright: ignore
+        return State(
+            moment, self._task.observe(road, moment), zero, zero, metrics, info
+        )  # pyright: ignore
 
     def step(self, state: State, action: jax.Array) -> State:
         """One sampling period; entries that wrappers put into `metrics` and `info` are kept."""
         road = state.info["road"]
         moment, outcome = self._task.step(road, state.pipeline_state, action)  # pyright: ignore
-        done, time_out = (outcome.left | outcome.over).astype(float), outcome.over.astype(float)
+        done, time_out = (
+            (outcome.left | outcome.over).astype(float),
+            outcome.over.astype(float),
+        )
         return state.replace(  # pyright: ignore[reportAttributeAccessIssue]
             pipeline_state=moment,
             obs=self._task.observe(road, moment),

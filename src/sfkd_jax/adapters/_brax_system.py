@@ -19,16 +19,21 @@ SCALED = {
     "damping": ("dof.damping",),
     "motor": ("actuator.gear",),
 }
-"""What an entry of e may scale (viscous friction is that of all joints), and where it stands in a system."""
+"""What an entry of e may scale (viscous friction is that of all joints), and where it
+stands in a system.
+"""
 
 
 class BraxPlant(NamedTuple):
     """A brax system whose physical parameters are the environment e; x = (0, 0, 0, q, q̇).
 
-    The system has no pose in the plane, so the pose that leads every state of this project is 0 and stays 0.
+    The system has no pose in the plane, so the pose that leads every state of this
+    project is 0 and stays 0.
 
     Attributes:
-        dt: sampling period [s]. state_names: pose first. control_low, control_high: limits of the motors.
+        dt: sampling period [s].
+        state_names: pose first.
+        control_low, control_high: limits of the motors.
         parameters: what the entries of e scale; 1 is the system as it is.
         step: (x, u, e) -> x one sampling period later, u in the units of the motors.
         start: key -> x at the start of an episode of the environment.
@@ -47,12 +52,14 @@ def brax_plant(env: Env, *, parameters: tuple[str, ...] = ("gravity",)) -> BraxP
     """x⁺ = (0, q⁺, q̇⁺), (q⁺, q̇⁺) what the environment's own physics makes of (q, q̇, u) with parameters scaled by e.
 
     Args:
-        env: from `brax.envs.get_environment(name, backend="generalized")`; wrappers are taken off.
+        env: from `brax.envs.get_environment(name, backend="generalized")`; wrappers are
+            taken off.
         parameters: what the entries of e scale, of "gravity", "damping", "motor".
 
     Raises:
-        ValueError: an unknown or repeated parameter, an environment without a brax system, or a backend other than
-            "generalized": only there is (q, q̇) the whole state.
+        ValueError: an unknown or repeated parameter, an environment without a brax
+            system, or a backend other than "generalized": only there is (q, q̇) the
+            whole state.
     """
     inner = env.unwrapped
     _check(inner, parameters)
@@ -61,8 +68,14 @@ def brax_plant(env: Env, *, parameters: tuple[str, ...] = ("gravity",)) -> BraxP
     frames = round(float(inner.dt) / float(system.opt.timestep))
 
     def step(state: State, control: Control, env: Environment) -> State:
-        places = [(place, factor) for name, factor in zip(parameters, env, strict=True) for place in SCALED[name]]
-        changed: Any = system.tree_replace({place: factor * attrgetter(place)(system) for place, factor in places})
+        places = [
+            (place, factor)
+            for name, factor in zip(parameters, env, strict=True)
+            for place in SCALED[name]
+        ]
+        changed: Any = system.tree_replace(
+            {place: factor * attrgetter(place)(system) for place, factor in places}
+        )
         body = state[BODY]
         moment = pipeline.init(changed, body[:coordinates], body[coordinates:])
 
@@ -76,7 +89,9 @@ def brax_plant(env: Env, *, parameters: tuple[str, ...] = ("gravity",)) -> BraxP
         return _state(inner.reset(key).pipeline_state)
 
     limits = jnp.asarray(system.actuator.ctrl_range).T.tolist()
-    names = [f"q_{k}" for k in range(coordinates)] + [f"qd_{k}" for k in range(system.qd_size())]
+    names = [f"q_{k}" for k in range(coordinates)] + [
+        f"qd_{k}" for k in range(system.qd_size())
+    ]
     return BraxPlant(
         dt=float(inner.dt),
         state_names=("p_x", "p_y", "yaw", *names),
@@ -101,13 +116,16 @@ def collect(
 ) -> Trajectory:
     """Trajectories under random controls, each with its own e, drawn evenly from a box.
 
-    u_k = clip(centre + half range · n_k), n_{k+1} = ϱ n_k + √(1 − ϱ²) σ w_k, w white and n_0 = σ w.
+    u_k = clip(centre + half range · n_k), n_{k+1} = ϱ n_k + √(1 − ϱ²) σ w_k, w white
+    and n_0 = σ w.
 
     Args:
-        plant: whose. key: consumed.
+        plant: whose.
+        key: consumed.
         trajectories, steps: how many, how long.
         env_low, env_high: box of e, one entry a parameter.
-        excitation: σ, spread of the controls in shares of half their range. memory: ϱ.
+        excitation: σ, spread of the controls in shares of half their range.
+        memory: ϱ.
 
     Returns:
         A batch of trajectories, states (trajectory, steps + 1, state).
@@ -117,23 +135,43 @@ def collect(
     """
     for name, corner in (("env_low", env_low), ("env_high", env_high)):
         if len(corner) != len(plant.parameters):
-            raise ValueError(f"{name} must have an entry for each of {', '.join(plant.parameters)}, got {corner}")
+            raise ValueError(
+                f"{name} must have an entry for each of {', '.join(plant.parameters)}, got {corner}"
+            )
     low, high = jnp.asarray(plant.control_low), jnp.asarray(plant.control_high)
 
     def one(key: Key) -> Trajectory:
         start_key, env_key, noise_key = jax.random.split(key, 3)
-        env = jax.random.uniform(env_key, (len(env_low),), minval=jnp.asarray(env_low), maxval=jnp.asarray(env_high))
+        env = jax.random.uniform(
+            env_key,
+            (len(env_low),),
+            minval=jnp.asarray(env_low),
+            maxval=jnp.asarray(env_high),
+        )
         fresh = excitation * jax.random.normal(noise_key, (steps, low.shape[0]))
 
-        def advance(carry: tuple[State, Array], white: Float[Array, " control"]) -> tuple[Any, Any]:
+        def advance(
+            carry: tuple[State, Array], white: Float[Array, " control"]
+        ) -> tuple[Any, Any]:
             state, noise = carry
-            control = jnp.clip(0.5 * (low + high) + 0.5 * (high - low) * noise, low, high)
+            control = jnp.clip(
+                0.5 * (low + high) + 0.5 * (high - low) * noise, low, high
+            )
             after = plant.step(state, control, env)
-            return (after, memory * noise + jnp.sqrt(1.0 - memory**2) * white), (after, control)
+            return (after, memory * noise + jnp.sqrt(1.0 - memory**2) * white), (
+                after,
+                control,
+            )
 
         initial = plant.start(start_key)
-        _, (states, controls) = jax.lax.scan(advance, (initial, fresh[0]), jnp.roll(fresh, -1, axis=0))
-        return Trajectory(jnp.concatenate([initial[None], states]), controls, jnp.tile(env, (steps, 1)))
+        _, (states, controls) = jax.lax.scan(
+            advance, (initial, fresh[0]), jnp.roll(fresh, -1, axis=0)
+        )
+        return Trajectory(
+            jnp.concatenate([initial[None], states]),
+            controls,
+            jnp.tile(env, (steps, 1)),
+        )
 
     return jax.vmap(one)(jax.random.split(key, trajectories))
 
@@ -148,7 +186,11 @@ def _check(env: Env, parameters: tuple[str, ...]) -> None:
     if not isinstance(env, PipelineEnv):
         raise ValueError(f"{type(env).__name__} has no brax system to step")
     if env.backend != "generalized":
-        raise ValueError(f'backend must be "generalized", where (q, q̇) is the whole state, got {env.backend!r}')
+        raise ValueError(
+            f'backend must be "generalized", where (q, q̇) is the whole state, got {env.backend!r}'
+        )
     unknown = [name for name in parameters if name not in SCALED]
     if unknown or len(set(parameters)) != len(parameters):
-        raise ValueError(f"parameters must be different ones of {', '.join(SCALED)}, got {parameters}")
+        raise ValueError(
+            f"parameters must be different ones of {', '.join(SCALED)}, got {parameters}"
+        )

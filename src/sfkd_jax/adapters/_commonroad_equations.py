@@ -28,10 +28,13 @@ class Equations(NamedTuple):
 
     Attributes:
         rates: (x, (steering rate, acceleration), car) -> dx/dt.
-        settled: ((p_x, p_y, δ, |v|, yaw, yaw rate, slip angle), car) -> x with rolling wheels, springs at rest.
-        seven: x -> the states of `vehicle.dynamic`. rest: the entries of x that these do not hold.
+        settled: ((p_x, p_y, δ, |v|, yaw, yaw rate, slip angle), car) -> x with rolling
+            wheels, springs at rest.
+        seven: x -> the states of `vehicle.dynamic`.
+        rest: the entries of x that these do not hold.
         wheels: the entries that are speeds of wheels.
-        pushed: (x, side force [N], car) -> by index, what the force adds to dx/dt at the centre of mass.
+        pushed: (x, side force [N], car) -> by index, what the force adds to dx/dt at
+            the centre of mass.
     """
 
     rates: Callable[[list[float], list[float], Car], list[float]]
@@ -48,7 +51,10 @@ def _drift_seven(x: Numbers) -> list[float]:
 
 def _drift_pushed(x: Numbers, force: float, car: Car) -> dict[int, float]:
     """m d|v|/dt has F sin β, m |v| dβ/dt has F cos β."""
-    return {3: force / car.m * math.sin(x[6]), 6: force / (car.m * x[3]) * math.cos(x[6])}
+    return {
+        3: force / car.m * math.sin(x[6]),
+        6: force / (car.m * x[3]) * math.cos(x[6]),
+    }
 
 
 def _body_seven(x: Numbers) -> list[float]:
@@ -62,9 +68,16 @@ def _body_pushed(x: Numbers, force: float, car: Car) -> dict[int, float]:
 
 
 MODELS = {
-    "std": Equations(vehicle_dynamics_std, init_std, _drift_seven, (7, 8), (7, 8), _drift_pushed),
+    "std": Equations(
+        vehicle_dynamics_std, init_std, _drift_seven, (7, 8), (7, 8), _drift_pushed
+    ),
     "mb": Equations(
-        vehicle_dynamics_mb, init_mb, _body_seven, (*range(6, 10), *range(11, 29)), (23, 24, 25, 26), _body_pushed
+        vehicle_dynamics_mb,
+        init_mb,
+        _body_seven,
+        (*range(6, 10), *range(11, 29)),
+        (23, 24, 25, 26),
+        _body_pushed,
     ),
 }
 
@@ -77,10 +90,21 @@ def car_numbered(number: int) -> Car:
 def with_friction(car: Car, friction: float) -> Car:
     """The same car on tyres whose lateral force peaks at `friction` times the load; their stiffness stays."""
     tire = car.tire
-    return replace(car, tire=replace(tire, p_dy1=friction, p_dx1=tire.p_dx1 * friction / tire.p_dy1))
+    return replace(
+        car,
+        tire=replace(tire, p_dy1=friction, p_dx1=tire.p_dx1 * friction / tire.p_dy1),
+    )
 
 
-def rates(equations: Equations, x: Numbers, control: Numbers, car: Car, *, force: float, lever: float) -> list[float]:
+def rates(
+    equations: Equations,
+    x: Numbers,
+    control: Numbers,
+    car: Car,
+    *,
+    force: float,
+    lever: float,
+) -> list[float]:
     """dx/dt under (steering rate, acceleration) and a side force [N], `lever` [m] ahead of the centre of mass."""
     found = equations.rates(list(x), list(control), car)
     for index, change in equations.pushed(x, force, car).items():
@@ -92,7 +116,8 @@ def rates(equations: Equations, x: Numbers, control: Numbers, car: Car, *, force
 def to_commonroad(equations: Equations, state: Numbers, car: Car) -> list[float]:
     """CommonRoad's x of a state: what is hidden in the state is added to the settled x.
 
-    A locked wheel is left with a speed of just below 0, from which CommonRoad never lets it turn again; here it may.
+    A locked wheel is left with a speed of just below 0, from which CommonRoad never
+    lets it turn again; here it may.
     """
     x = equations.settled(_core(state), car)
     for index, hidden in zip(equations.rest, state[OBSERVED:], strict=True):
@@ -112,4 +137,12 @@ def from_commonroad(equations: Equations, x: Numbers, car: Car) -> list[float]:
 def _core(state: Numbers) -> list[float]:
     """(p_x, p_y, δ, |v|, yaw, yaw rate, slip angle)."""
     x, y, yaw, along, across, yaw_rate, steering = state[:OBSERVED]
-    return [x, y, steering, math.hypot(along, across), yaw, yaw_rate, math.atan2(across, along)]
+    return [
+        x,
+        y,
+        steering,
+        math.hypot(along, across),
+        yaw,
+        yaw_rate,
+        math.atan2(across, along),
+    ]

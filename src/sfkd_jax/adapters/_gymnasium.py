@@ -25,8 +25,9 @@ def register_gymnasium() -> None:
 class GymnasiumVehicle(gymnasium.Env):
     """Following a path, as `gymnasium.Env`; settings, observation, action and reward are those of `tracking_task`.
 
-    Terminated where the car left the lane, truncated where the road ended. The same seed gives the same road,
-    friction and wind; `reset` without a seed gives the next of the stream that the last seed began.
+    Terminated where the car left the lane, truncated where the road ended. The same
+    seed gives the same road, friction and wind; `reset` without a seed gives the next
+    of the stream that the last seed began.
 
     Raises:
         ValueError: as `tracking_task`.
@@ -36,8 +37,12 @@ class GymnasiumVehicle(gymnasium.Env):
 
     def __init__(self, **settings: Any) -> None:
         task = tracking_task(**settings)
-        self.observation_space = gymnasium.spaces.Box(-np.inf, np.inf, (task.observation_size,), np.float32)
-        self.action_space = gymnasium.spaces.Box(-1.0, 1.0, (task.action_size,), np.float32)
+        self.observation_space = gymnasium.spaces.Box(
+            -np.inf, np.inf, (task.observation_size,), np.float32
+        )
+        self.action_space = gymnasium.spaces.Box(
+            -1.0, 1.0, (task.action_size,), np.float32
+        )
         self._now: tuple[Scenario, Moment] | None = None
 
         def start(key: Key) -> tuple[Scenario, Moment, Float[Array, " observation"]]:
@@ -57,11 +62,15 @@ class GymnasiumVehicle(gymnasium.Env):
     ) -> tuple[np.ndarray, dict[str, Any]]:
         """The start of an episode on a new road; there are no options."""
         super().reset(seed=seed, options=options)
-        road, moment, observation = self._start(jax.random.key(int(self.np_random.integers(2**31))))
+        road, moment, observation = self._start(
+            jax.random.key(int(self.np_random.integers(2**31)))
+        )
         self._now = road, moment
         return np.array(observation), {}
 
-    def step(self, action: np.ndarray) -> tuple[np.ndarray, float, bool, bool, dict[str, Any]]:
+    def step(
+        self, action: np.ndarray
+    ) -> tuple[np.ndarray, float, bool, bool, dict[str, Any]]:
         """One sampling period.
 
         Raises:
@@ -70,7 +79,15 @@ class GymnasiumVehicle(gymnasium.Env):
         if self._now is None:
             raise gymnasium.error.ResetNeeded("call reset before step")
         road, moment = self._now
-        moment, outcome, observation = self._advance(road, moment, np.asarray(action, dtype=np.float32))
+        moment, outcome, observation = self._advance(
+            road, moment, np.asarray(action, dtype=np.float32)
+        )
         self._now = road, moment
         info = {name: float(value) for name, value in outcome.measures.items()}
-        return np.array(observation), float(outcome.reward), bool(outcome.left), bool(outcome.over), info
+        return (
+            np.array(observation),
+            float(outcome.reward),
+            bool(outcome.left),
+            bool(outcome.over),
+            info,
+        )

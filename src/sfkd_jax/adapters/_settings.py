@@ -15,7 +15,9 @@ def choose_plant(vehicle: str | Vehicle, inner_loop: str) -> Vehicle:
     """A plant by name, at the gain that its speed loop has by default."""
     if isinstance(vehicle, Vehicle):
         return vehicle
-    return build.build_vehicle({"name": vehicle, "inner_loop": inner_loop, "speed_gain": 1.0})
+    return build.build_vehicle(
+        {"name": vehicle, "inner_loop": inner_loop, "speed_gain": 1.0}
+    )
 
 
 def choose_family(scenario: str | Family, plant: Vehicle, duration: float) -> Family:
@@ -34,14 +36,18 @@ def count_steps(family: Family, plant: Vehicle) -> int:
     road = jax.eval_shape(family, jax.random.key(0))
     given, wanted = road.initial_state.shape, (len(plant.state_names),)
     if given != wanted:
-        raise ValueError(f"the scenario starts in a state of shape {given}, {plant.name!r} has {wanted}")
+        raise ValueError(
+            f"the scenario starts in a state of shape {given}, {plant.name!r} has {wanted}"
+        )
     return road.envs.shape[0]
 
 
 def check_sizes(dt: float, *, duration: float, preview: int, lane: float) -> None:
     """Refuse what leaves no step, no point ahead, or no lane."""
     if not (math.isfinite(duration) and duration >= dt):
-        raise ValueError(f"duration must be finite and at least one step of {dt} s, got {duration}")
+        raise ValueError(
+            f"duration must be finite and at least one step of {dt} s, got {duration}"
+        )
     if preview < 1 or preview != int(preview):
         raise ValueError(f"preview must be a whole number of at least 1, got {preview}")
     if not lane > 0:

@@ -1,14 +1,18 @@
 """An artefact: arrays in `name.npz` and their manifest in `name.json`.
 
-A writer that is killed, whenever that is, leaves the old pair or the new one readable. Both files are completed under
-hidden names; the arrays then wait under a name made of their hash, replacing the manifest commits, and only then do the
-arrays take their place. A manifest whose arrays still wait is read from there, and the next writer moves them.
+A writer that is killed, whenever that is, leaves the old pair or the new one readable.
+Both files are completed under hidden names; the arrays then wait under a name made of
+their hash, replacing the manifest commits, and only then do the arrays take their
+place. A manifest whose arrays still wait is read from there, and the next writer moves
+them.
 
-A manifest records two hashes. `sha256` names the content, whatever its order and layout, and is what other documents
-speak about; it can be computed of arrays alone, and so only after compressed members were inflated. `file_sha256` is
-of the file, byte by byte: it is compared before the archive is opened, so that nothing is parsed or inflated that the
-writer did not write. Manifests of earlier versions have no `file_sha256`; for them, and for whoever strikes it out, the
-bounds of `_npz` hold, as they do for files without a manifest.
+A manifest records two hashes. `sha256` names the content, whatever its order and
+layout, and is what other documents speak about; it can be computed of arrays alone, and
+so only after compressed members were inflated. `file_sha256` is of the file, byte by
+byte: it is compared before the archive is opened, so that nothing is parsed or inflated
+that the writer did not write. Manifests of earlier versions have no `file_sha256`; for
+them, and for whoever strikes it out, the bounds of `_npz` hold, as they do for files
+without a manifest.
 """
 
 from __future__ import annotations
@@ -26,7 +30,15 @@ from typing import Any
 import numpy as np
 
 from sfkd_jax.artefacts._content import differences, plain, sha256, versions
-from sfkd_jax.artefacts._files import ArtefactError, encode, failure, open_regular, read_json, replacement, synchronise
+from sfkd_jax.artefacts._files import (
+    ArtefactError,
+    encode,
+    failure,
+    open_regular,
+    read_json,
+    replacement,
+    synchronise,
+)
 from sfkd_jax.artefacts._npz import PORTABLE, check_archive, members, write_npz
 
 FORMAT = 1
@@ -45,20 +57,34 @@ def write_arrays(
     """Write `path` and its manifest, which is returned; `made_from` holds the hashes of what the arrays were made from.
 
     Raises:
-        ArtefactError: the disk is full or not writable (an earlier pair stays as it was), `path` does not end in .npz,
-            a dtype has no portable form (objects, bfloat16), or `config` is not JSON.
+        ArtefactError: the disk is full or not writable (an earlier pair stays as it
+            was), `path` does not end in .npz, a dtype has no portable form (objects,
+            bfloat16), or `config` is not JSON.
     """
     if path.suffix != ".npz":
         raise failure(path, "not written, the name must end in .npz")
     arrays = {name: np.asarray(array) for name, array in arrays.items()}
-    if odd := [name for name, array in arrays.items() if array.dtype.kind not in PORTABLE]:
-        raise failure(path, f"not written, {odd[0]} is of dtype {arrays[odd[0]].dtype}, which is not portable")
+    if odd := [
+        name for name, array in arrays.items() if array.dtype.kind not in PORTABLE
+    ]:
+        raise failure(
+            path,
+            f"not written, {odd[0]} is of dtype {arrays[odd[0]].dtype}, which is not portable",
+        )
     manifest_path = path.with_suffix(".json")
-    manifest = {"kind": kind, "format": FORMAT, "sha256": sha256(arrays), "config": config}
+    manifest = {
+        "kind": kind,
+        "format": FORMAT,
+        "sha256": sha256(arrays),
+        "config": config,
+    }
     manifest |= {"made_from": made_from or {}, "versions": versions()}
     manifest["created"] = datetime.now(UTC).isoformat(timespec="seconds")
     _complete(path)
-    with replacement(manifest_path) as (manifest_file, manifest_part), replacement(path) as (file, part):
+    with (
+        replacement(manifest_path) as (manifest_file, manifest_part),
+        replacement(path) as (file, part),
+    ):
         write_npz(file, arrays, compressed=compressed)
         synchronise(file)
         manifest["file_sha256"] = _digest(part)
@@ -83,8 +109,9 @@ def read_arrays(
     """The arrays of `path` and their manifest; nothing pickled is ever loaded.
 
     Raises:
-        ArtefactError: either file is missing, truncated, damaged or foreign; the artefact is of another kind or format,
-            was made with other settings than `config`, or its arrays are not those that the manifest is about.
+        ArtefactError: either file is missing, truncated, damaged or foreign; the
+            artefact is of another kind or format, was made with other settings than
+            `config`, or its arrays are not those that the manifest is about.
     """
     manifest = _manifest(path, kind)
     if config is not None and (found := differences(manifest["config"], plain(config))):
@@ -95,7 +122,9 @@ def read_arrays(
     except ArtefactError:
         if _manifest(path, kind) == manifest:
             raise
-    return read_arrays(path, kind=kind, config=config)  # rewritten while it was being read
+    return read_arrays(
+        path, kind=kind, config=config
+    )  # rewritten while it was being read
 
 
 def exists(path: Path) -> bool:
@@ -111,7 +140,9 @@ def _waiting(path: Path, manifest: Mapping[str, Any]) -> Path:
 
 def _complete(path: Path) -> None:
     """Move the arrays that a writer killed after its commit left waiting."""
-    with suppress(ArtefactError, OSError, TypeError, ValueError):  # a damaged manifest commits nothing
+    with suppress(
+        ArtefactError, OSError, TypeError, ValueError
+    ):  # a damaged manifest commits nothing
         manifest = read_json(path.with_suffix(".json"), keys=("sha256",))
         os.replace(_waiting(path, manifest), path)
 
@@ -120,18 +151,33 @@ def _manifest(path: Path, kind: str) -> dict[str, Any]:
     """The manifest of `path`, checked as far as it can be without the arrays."""
     manifest_path = path.with_suffix(".json")
     if not manifest_path.exists():
-        reason = f"incomplete, its manifest {manifest_path.name} is missing" if path.exists() else "missing"
+        reason = (
+            f"incomplete, its manifest {manifest_path.name} is missing"
+            if path.exists()
+            else "missing"
+        )
         raise failure(path, reason)
     manifest = read_json(manifest_path, keys=("kind", "format", "sha256", "config"))
     if manifest["kind"] != kind:
         raise failure(path, f"is of kind {manifest['kind']}, not {kind}")
     if manifest["format"] != FORMAT or isinstance(manifest["format"], bool):
-        raise failure(path, f"is of format {manifest['format']}, this version reads {FORMAT}")
+        raise failure(
+            path, f"is of format {manifest['format']}, this version reads {FORMAT}"
+        )
     hashes = (manifest["sha256"], manifest.get("file_sha256", manifest["sha256"]))
-    if odd := [name for name in ("config", "made_from", "versions") if not isinstance(manifest.get(name, {}), dict)]:
+    if odd := [
+        name
+        for name in ("config", "made_from", "versions")
+        if not isinstance(manifest.get(name, {}), dict)
+    ]:
         raise failure(manifest_path, f"not a manifest, {odd[0]} is malformed")
-    if not all(isinstance(digest, str) and re.fullmatch("[0-9a-f]{64}", digest) for digest in hashes):
-        raise failure(manifest_path, "not a manifest, sha256 or file_sha256 is malformed")
+    if not all(
+        isinstance(digest, str) and re.fullmatch("[0-9a-f]{64}", digest)
+        for digest in hashes
+    ):
+        raise failure(
+            manifest_path, "not a manifest, sha256 or file_sha256 is malformed"
+        )
     return manifest
 
 
@@ -155,7 +201,10 @@ def _load(path: Path, manifest: Mapping[str, Any]) -> dict[str, np.ndarray]:
             actual, recorded = sha256(arrays), manifest["sha256"]
             if actual == recorded:
                 return arrays
-    raise failure(path, f"does not match its manifest: sha256 {actual[:12]}, recorded {recorded[:12]}")
+    raise failure(
+        path,
+        f"does not match its manifest: sha256 {actual[:12]}, recorded {recorded[:12]}",
+    )
 
 
 def _digest(path: Path) -> str:

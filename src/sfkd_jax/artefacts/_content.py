@@ -18,7 +18,8 @@ def flatten(tree: Mapping[str, Any]) -> dict[str, np.ndarray]:
     """The leaves of nested dicts under "a/b/c"; an empty inner dict is kept as "a/b/".
 
     Raises:
-        ValueError: a key is not a string, is empty or holds "/"; a leaf is neither array nor number.
+        ValueError: a key is not a string, is empty or holds "/"; a leaf is neither
+            array nor number.
     """
     flat: dict[str, np.ndarray] = {}
     for key, value in tree.items():
@@ -27,10 +28,14 @@ def flatten(tree: Mapping[str, Any]) -> dict[str, np.ndarray]:
         if isinstance(value, Mapping):
             inner = flatten(value) or {"": np.zeros(0, np.float32)}
             flat |= {f"{key}/{name}": leaf for name, leaf in inner.items()}
-        elif hasattr(value, "__array__") or isinstance(value, bool | int | float | complex):
+        elif hasattr(value, "__array__") or isinstance(
+            value, bool | int | float | complex
+        ):
             flat[key] = np.asarray(value)
         else:
-            raise ValueError(f"cannot flatten {key!r}: a {type(value).__name__} is neither dict nor array")
+            raise ValueError(
+                f"cannot flatten {key!r}: a {type(value).__name__} is neither dict nor array"
+            )
     return flat
 
 
@@ -56,10 +61,17 @@ def unflatten(flat: Mapping[str, Any]) -> dict[str, Any]:
 def sha256(data: Mapping[str, Any] | Sequence[Any]) -> str:
     """Hash of the content, whatever its order and memory layout.
 
-    A flat dict of arrays counts by names, dtypes, shapes and values; anything else as the JSON that it would become.
+    A flat dict of arrays counts by names, dtypes, shapes and values; anything else as
+    the JSON that it would become.
     """
-    if not (isinstance(data, Mapping) and data and all(_is_array(value) for value in data.values())):
-        return hashlib.sha256(json.dumps(plain(data), sort_keys=True).encode()).hexdigest()
+    if not (
+        isinstance(data, Mapping)
+        and data
+        and all(_is_array(value) for value in data.values())
+    ):
+        return hashlib.sha256(
+            json.dumps(plain(data), sort_keys=True).encode()
+        ).hexdigest()
     digest = hashlib.sha256()
     for name in sorted(data):
         array = np.asarray(data[name])

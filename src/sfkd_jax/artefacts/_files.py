@@ -18,7 +18,9 @@ from sfkd_jax.artefacts._content import plain
 from sfkd_jax.artefacts._json import parse
 
 LARGEST = 1 << 24
-"""Bytes of a document; the largest of this package has 0.6 MB, and what JSON becomes takes up to 35 times as much."""
+"""Bytes of a document; the largest of this package has 0.6 MB, and what JSON becomes
+takes up to 35 times as much.
+"""
 LONGEST_LINE = 400
 """Letters of a reason; one may quote the file that it is about."""
 
@@ -31,7 +33,8 @@ def write_json(path: Path, document: Mapping[str, Any]) -> None:
     """Replace `path` in one step; arrays become lists, NaN and infinities null.
 
     Raises:
-        ArtefactError: the disk is full or not writable (an earlier file stays as it was), or a value is not JSON.
+        ArtefactError: the disk is full or not writable (an earlier file stays as it
+            was), or a value is not JSON.
     """
     write_bytes(path, encode(path, document, indent=2))
 
@@ -40,8 +43,9 @@ def read_json(path: Path, *, keys: Sequence[str] = ()) -> dict[str, Any]:
     """The object in `path`.
 
     Raises:
-        ArtefactError: the file is missing, no regular file, larger than LARGEST, truncated, not strictly JSON (see
-            `parse`), not an object, or lacks one of `keys`.
+        ArtefactError: the file is missing, no regular file, larger than LARGEST,
+            truncated, not strictly JSON (see `parse`), not an object, or lacks one of
+            `keys`.
     """
     document = decode(path, read_bytes(path))
     if absent := [key for key in keys if key not in document]:
@@ -58,7 +62,9 @@ def failure(path: Path, reason: object) -> ArtefactError:
 def one_line(text: object) -> str:
     """A reason as a terminal shows it: nothing that breaks or colours the line, and not all that a file holds."""
     line = " ".join(str(text)[: 4 * LONGEST_LINE].split())
-    line = "".join(letter if letter.isprintable() else ascii(letter)[1:-1] for letter in line)
+    line = "".join(
+        letter if letter.isprintable() else ascii(letter)[1:-1] for letter in line
+    )
     return line if len(line) <= LONGEST_LINE else f"{line[:LONGEST_LINE]}..."
 
 
@@ -68,7 +74,9 @@ def writing(path: Path) -> Iterator[None]:
     try:
         yield
     except OSError as reason:
-        raise failure(Path(os.fsdecode(reason.filename)) if reason.filename else path, reason) from reason
+        raise failure(
+            Path(os.fsdecode(reason.filename)) if reason.filename else path, reason
+        ) from reason
 
 
 @contextmanager
@@ -76,17 +84,27 @@ def understood(path: Path, *also: type[Exception], advice: str = "") -> Iterator
     """What is missing or of another kind inside a file that could be read becomes an ArtefactError about it.
 
     Args:
-        path: of the file. also: further exceptions that nothing else than the file can be the reason of.
+        path: of the file.
+        also: further exceptions that nothing else than the file can be the reason of.
         advice: what the line ends with.
     """
     try:
         yield
-    except (KeyError, TypeError, IndexError, AttributeError, OverflowError, *also) as reason:
+    except (
+        KeyError,
+        TypeError,
+        IndexError,
+        AttributeError,
+        OverflowError,
+        *also,
+    ) as reason:
         said = f"malformed, {type(reason).__name__}: {reason}"
         raise failure(path, f"{said}; {advice}" if advice else said) from reason
 
 
-def encode(path: Path, document: Mapping[str, Any], *, indent: int | None = None) -> bytes:
+def encode(
+    path: Path, document: Mapping[str, Any], *, indent: int | None = None
+) -> bytes:
     """JSON text of `document`, or an ArtefactError about `path`."""
     try:
         return json.dumps(plain(document), indent=indent, allow_nan=False).encode()
@@ -120,13 +138,18 @@ def open_regular(path: Path) -> io.FileIO:
         number = os.open(path, os.O_RDONLY | os.O_NONBLOCK | os.O_NOCTTY | os.O_CLOEXEC)
     except FileNotFoundError:
         raise failure(path, "missing") from None
-    except (OSError, ValueError) as error:  # a ValueError: of a name that no file can have
+    except (
+        OSError,
+        ValueError,
+    ) as error:  # a ValueError: of a name that no file can have
         raise failure(path, error) from error
     mode = os.fstat(number).st_mode
     if stat.S_ISREG(mode):
         return io.FileIO(number)
     os.close(number)
-    raise failure(path, "Is a directory" if stat.S_ISDIR(mode) else "not a regular file")
+    raise failure(
+        path, "Is a directory" if stat.S_ISDIR(mode) else "not a regular file"
+    )
 
 
 def _up_to(path: Path, file: io.FileIO, most: int) -> bytes:
@@ -142,7 +165,8 @@ def write_bytes(path: Path, content: bytes) -> None:
     """Replace `path` in one step.
 
     Raises:
-        ArtefactError: the disk is full or not writable; an earlier file stays as it was.
+        ArtefactError: the disk is full or not writable; an earlier file stays as it
+            was.
     """
     with replacement(path) as (file, part):
         file.write(content)
@@ -160,7 +184,8 @@ def synchronise(file: BinaryIO) -> None:
 def replacement(path: Path) -> Iterator[tuple[BinaryIO, Path]]:
     """A hidden file to fill and to move over `path`; it is removed if it was not moved.
 
-    A killed writer cannot remove its own: the next one does, and knows it by the lock that died with its owner.
+    A killed writer cannot remove its own: the next one does, and knows it by the lock
+    that died with its owner.
     """
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
@@ -190,6 +215,8 @@ def _claim(path: Path) -> tuple[BinaryIO, Path]:
         file = part.open("xb")
         with suppress(OSError):
             fcntl.flock(file, fcntl.LOCK_EX)
-        if part.exists():  # else another writer took it for left over before it was locked
+        if (
+            part.exists()
+        ):  # else another writer took it for left over before it was locked
             return file, part
         file.close()

@@ -9,7 +9,9 @@ from collections.abc import Iterable
 from typing import Any, NoReturn
 
 DEEPEST = 64
-"""Levels of a document; those of this package have at most 7, and whatever walks a document may recurse."""
+"""Levels of a document; those of this package have at most 7, and whatever walks a
+document may recurse.
+"""
 SMALLEST_INT, LARGEST_INT = -(2**63), 2**64 - 1
 _SURROGATE = re.compile(rb"\\u[dD][89a-fA-F]")
 
@@ -18,12 +20,14 @@ def parse(text: bytes) -> Any:
     """The value in `text`, UTF-8 with or without a byte order mark.
 
     Raises:
-        ValueError: no JSON; NaN or an infinity, also as a number that overflows;
-            an integer beyond 64 bits; a key that stands twice in one object; half of
-            a surrogate pair; or more levels than DEEPEST.
+        ValueError: no JSON; NaN or an infinity, also as a number that overflows; an
+            integer beyond 64 bits; a key that stands twice in one object; half of a
+            surrogate pair; or more levels than DEEPEST.
     """
     try:
-        document = json.loads(text.decode("utf-8-sig"), parse_constant=_refuse, object_pairs_hook=_object)
+        document = json.loads(
+            text.decode("utf-8-sig"), parse_constant=_refuse, object_pairs_hook=_object
+        )
     except RecursionError:
         raise ValueError(f"more than {DEEPEST} levels") from None
     _check(document)

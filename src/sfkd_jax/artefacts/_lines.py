@@ -10,14 +10,23 @@ from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from sfkd_jax.artefacts._files import ArtefactError, decode, encode, failure, open_regular, read_bytes, write_bytes
+from sfkd_jax.artefacts._files import (
+    ArtefactError,
+    decode,
+    encode,
+    failure,
+    open_regular,
+    read_bytes,
+    write_bytes,
+)
 
 
 def append_jsonl(path: Path, record: Mapping[str, Any]) -> None:
     """Add a line; a last line cut short by a kill is dropped first.
 
     Raises:
-        ArtefactError: the disk is full or not writable (the earlier lines stay as they were), or a value is not JSON.
+        ArtefactError: the disk is full or not writable (the earlier lines stay as they
+            were), or a value is not JSON.
     """
     line = encode(path, record) + b"\n"
     try:
@@ -37,23 +46,33 @@ def append_jsonl(path: Path, record: Mapping[str, Any]) -> None:
 
 
 def read_jsonl(
-    path: Path, *, keys: Sequence[str] = (), damaged: Callable[[str], None] | None = None
+    path: Path,
+    *,
+    keys: Sequence[str] = (),
+    damaged: Callable[[str], None] | None = None,
 ) -> list[dict[str, Any]]:
     """The records of `path`, without a last line that was cut short.
 
     Args:
-        path: of the file. keys: what every record must have.
-        damaged: told of every other line that is no such record, which is then left out; `tell`, for example.
+        path: of the file.
+        keys: what every record must have.
+        damaged: told of every other line that is no such record, which is then left
+            out; `tell`, for example.
 
     Raises:
-        ArtefactError: the file is missing; or a line before the last is no such record, and `damaged` is None.
+        ArtefactError: the file is missing; or a line before the last is no such record,
+            and `damaged` is None.
     """
     records = []
     for number, line in enumerate(io.BytesIO(read_bytes(path)), 1):
         whole = line.endswith(b"\n")
         try:
-            record = decode(path, line, where=f"line {number} ") if line.strip() else None
-            if record is not None and (absent := [key for key in keys if key not in record]):
+            record = (
+                decode(path, line, where=f"line {number} ") if line.strip() else None
+            )
+            if record is not None and (
+                absent := [key for key in keys if key not in record]
+            ):
                 raise failure(path, f"line {number} lacks {', '.join(absent)}")
             records += [record] if record is not None else []
         except ArtefactError as reason:
@@ -82,7 +101,11 @@ def truncate_jsonl(
         ArtefactError: see `read_jsonl` and `write_json`.
     """
     if path.exists():
-        kept = [record for record in read_jsonl(path, keys=keys, damaged=damaged) if keep(record)]
+        kept = [
+            record
+            for record in read_jsonl(path, keys=keys, damaged=damaged)
+            if keep(record)
+        ]
         write_bytes(path, b"".join(encode(path, record) + b"\n" for record in kept))
 
 

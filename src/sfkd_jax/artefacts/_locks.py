@@ -21,7 +21,9 @@ LOCK, HOLDER = ".lock", ".lock.json"
 GRACE_S = 2.0
 """How long everybody waits for a writer that is about to finish [s]."""
 _WITHOUT_LOCKS = (errno.ENOLCK, errno.EOPNOTSUPP, errno.ENOSYS)
-"""How a file system says that it has no locks: there a file with host and process id stands for one."""
+"""How a file system says that it has no locks: there a file with host and process id
+stands for one.
+"""
 
 
 class DirectoryTaken(ArtefactError):
@@ -32,12 +34,14 @@ class DirectoryTaken(ArtefactError):
 def locked(directory: Path, *, wait: bool = False) -> Iterator[None]:
     """Be the only process that writes into `directory`, made if missing; what holds it already may enter again.
 
-    The lock is freed by the system when its process ends, however it ends. It is taken with flock(2), which Linux
-    passes on to the server of a shared directory, so it holds between hosts as well.
+    The lock is freed by the system when its process ends, however it ends. It is taken
+    with flock(2), which Linux passes on to the server of a shared directory, so it
+    holds between hosts as well.
 
     Args:
         directory: of a run, a data set or a comparison.
-        wait: until it is free, as whoever holds finished work should; this is told on stderr.
+        wait: until it is free, as whoever holds finished work should; this is told on
+            stderr.
 
     Raises:
         DirectoryTaken: it is not free after a moment, and `wait` is false.
@@ -64,7 +68,9 @@ def _acquired(directory: Path, wait: bool) -> BaseFileLock:
     """The lock of `directory`, held by this process."""
     path = directory.resolve() / LOCK
     try:
-        return _held(FileLock(path, is_singleton=True, fallback_to_soft=False), directory, wait)
+        return _held(
+            FileLock(path, is_singleton=True, fallback_to_soft=False), directory, wait
+        )
     except OSError as reason:
         if reason.errno not in _WITHOUT_LOCKS:
             raise
@@ -76,7 +82,11 @@ def _held(lock: BaseFileLock, directory: Path, wait: bool) -> BaseFileLock:
     try:
         lock.acquire(timeout=GRACE_S)
     except Timeout:
-        soft = f" (if it is gone, remove {lock.lock_file})" if isinstance(lock, SoftFileLock) else ""
+        soft = (
+            f" (if it is gone, remove {lock.lock_file})"
+            if isinstance(lock, SoftFileLock)
+            else ""
+        )
         taken = f"{directory}: {_who(directory)} is writing there{soft}"
         if not wait:
             raise DirectoryTaken(f"{taken}; try again when it has ended") from None

@@ -1,9 +1,11 @@
 """Arrays of an .npz archive, read so that a file decides neither how much is allocated nor what is evaluated.
 
-All that a directory and a header declare is compared with the bytes that are there before an array is allocated. A
-stored member takes as many bytes as the file has for it. A compressed one is inflated to its declared size and never
-beyond; that size must be one that deflate can reach, and all of them together at most INFLATED. Headers are matched
-against the one form that they have and not evaluated, and objects, which would be unpickled, are refused.
+All that a directory and a header declare is compared with the bytes that are there
+before an array is allocated. A stored member takes as many bytes as the file has for
+it. A compressed one is inflated to its declared size and never beyond; that size must
+be one that deflate can reach, and all of them together at most INFLATED. Headers are
+matched against the one form that they have and not evaluated, and objects, which would
+be unpickled, are refused.
 """
 
 from __future__ import annotations
@@ -23,14 +25,18 @@ from sfkd_jax.artefacts._files import ArtefactError, failure, open_regular
 PORTABLE = "biufcSUmM"
 """Kinds of dtype that an .npz file gives back as they were."""
 INFLATED = 1 << 29
-"""Bytes that the compressed members of one file may inflate to together; stored ones are bounded by the file."""
+"""Bytes that the compressed members of one file may inflate to together; stored ones
+are bounded by the file.
+"""
 DEFLATE_RATIO = 1032
 """No stream of deflate inflates by more."""
 LONGEST_HEADER = 2048
 """Bytes; numpy itself writes 118 for most arrays."""
 CHUNK = 1 << 20
 DIRECTORY = 1 << 22
-"""Bytes of a zip directory, about 40000 arrays: the zip library holds twenty times as much for it."""
+"""Bytes of a zip directory, about 40000 arrays: the zip library holds twenty times as
+much for it.
+"""
 _DATE = (1980, 1, 1, 0, 0, 0)
 _ENTRY = (
     r"'descr':\s*'(?P<order>[<>|=]?)(?P<kind>[A-Za-z?])(?P<size>\d*(?:\[\w+\])?)'",
@@ -44,15 +50,17 @@ class _Reader(io.BufferedReader):
     """A file of which no call reads, and so allocates, more than DIRECTORY bytes, whatever a directory declares."""
 
     def read(self, size: int | None = -1, /) -> bytes:
-        return super().read(DIRECTORY if size is None or size < 0 else min(size, DIRECTORY))
+        return super().read(
+            DIRECTORY if size is None or size < 0 else min(size, DIRECTORY)
+        )
 
 
 def read_npz(path: Path) -> dict[str, np.ndarray]:
     """The arrays of a file that has no manifest; nothing pickled is ever loaded.
 
     Raises:
-        ArtefactError: missing, no regular file, truncated, damaged or foreign; objects; or more than INFLATED bytes
-            of compressed arrays.
+        ArtefactError: missing, no regular file, truncated, damaged or foreign; objects;
+            or more than INFLATED bytes of compressed arrays.
     """
     with open_regular(path) as file:
         check_archive(path, file)
@@ -74,19 +82,26 @@ def members(path: Path, file: io.FileIO) -> dict[str, np.ndarray]:
         with _Reader(file) as bounded, zipfile.ZipFile(bounded) as archive:
             listed = archive.infolist()
             _check_directory(path, listed, size)
-            return {info.filename.removesuffix(".npy"): _array(path, archive, info) for info in listed}
+            return {
+                info.filename.removesuffix(".npy"): _array(path, archive, info)
+                for info in listed
+            }
     except ArtefactError:
         raise
     except Exception as error:  # a damaged archive raises nearly anything
         raise failure(path, f"damaged ({error or type(error).__name__})") from error
 
 
-def write_npz(file: BinaryIO, arrays: Mapping[str, np.ndarray], *, compressed: bool) -> None:
+def write_npz(
+    file: BinaryIO, arrays: Mapping[str, np.ndarray], *, compressed: bool
+) -> None:
     """As np.savez, for any names and without pickles; the same arrays give the same bytes."""
     with zipfile.ZipFile(file, "w") as archive:
         for name, array in arrays.items():
             info = zipfile.ZipInfo(f"{name}.npy", _DATE)
-            info.compress_type = zipfile.ZIP_DEFLATED if compressed else zipfile.ZIP_STORED
+            info.compress_type = (
+                zipfile.ZIP_DEFLATED if compressed else zipfile.ZIP_STORED
+            )
             with archive.open(info, "w", force_zip64=True) as entry:
                 np.lib.format.write_array(entry, array, allow_pickle=False)
 
@@ -102,12 +117,22 @@ def _check_directory(path: Path, listed: list[zipfile.ZipInfo], size: int) -> No
     stored = [info for info in listed if info.compress_type == zipfile.ZIP_STORED]
     if len(packed) + len(stored) < len(listed):
         raise failure(path, "is compressed by another method than deflate")
-    if sum(info.file_size for info in stored) > size or sum(info.compress_size for info in packed) > size:
-        raise failure(path, f"damaged (its arrays are declared larger than its {size} bytes)")
+    if (
+        sum(info.file_size for info in stored) > size
+        or sum(info.compress_size for info in packed) > size
+    ):
+        raise failure(
+            path, f"damaged (its arrays are declared larger than its {size} bytes)"
+        )
     if any(info.file_size > DEFLATE_RATIO * info.compress_size for info in packed):
-        raise failure(path, "damaged (a member is declared larger than it can inflate to)")
+        raise failure(
+            path, "damaged (a member is declared larger than it can inflate to)"
+        )
     if (inflated := sum(info.file_size for info in packed)) > INFLATED:
-        raise failure(path, f"inflates to {inflated >> 20} MiB, more than {INFLATED >> 20}; store it uncompressed")
+        raise failure(
+            path,
+            f"inflates to {inflated >> 20} MiB, more than {INFLATED >> 20}; store it uncompressed",
+        )
 
 
 def _array(path: Path, archive: zipfile.ZipFile, info: zipfile.ZipInfo) -> np.ndarray:
@@ -116,7 +141,9 @@ def _array(path: Path, archive: zipfile.ZipFile, info: zipfile.ZipInfo) -> np.nd
         kind, shape, order, begins = _header(path, entry)
         size = math.prod(shape) * kind.itemsize
         if begins + size != info.file_size:
-            raise ValueError(f"{info.filename} declares {size} bytes and holds {info.file_size - begins}")
+            raise ValueError(
+                f"{info.filename} declares {size} bytes and holds {info.file_size - begins}"
+            )
         content = np.empty(size, np.uint8)
         for start in range(0, size, CHUNK):
             part = content[start : start + CHUNK]
@@ -127,7 +154,9 @@ def _array(path: Path, archive: zipfile.ZipFile, info: zipfile.ZipInfo) -> np.nd
     return array
 
 
-def _header(path: Path, entry: Any) -> tuple[np.dtype, tuple[int, ...], Literal["C", "F"], int]:
+def _header(
+    path: Path, entry: Any
+) -> tuple[np.dtype, tuple[int, ...], Literal["C", "F"], int]:
     """Dtype, shape and order of a .npy file, and where its data begin."""
     magic = _exactly(entry, 8)
     if magic[:6] != b"\x93NUMPY" or magic[6] not in (1, 2, 3) or magic[7]:
@@ -143,10 +172,17 @@ def _header(path: Path, entry: Any) -> tuple[np.dtype, tuple[int, ...], Literal[
         raise failure(path, "holds pickled objects, refused")
     if found["kind"] not in PORTABLE:
         raise ValueError(f"{entry.name} is of a dtype that is not portable")
-    kind, listed = np.dtype("".join(found.group("order", "kind", "size"))), found["shape"].strip()
+    kind, listed = (
+        np.dtype("".join(found.group("order", "kind", "size"))),
+        found["shape"].strip(),
+    )
     if not kind.itemsize or (listed and "," not in listed):
         raise ValueError(f"{entry.name} has no shape or no size")
-    shape = tuple(int(length.strip().removesuffix("L")) for length in listed.rstrip(",").split(",") if listed)
+    shape = tuple(
+        int(length.strip().removesuffix("L"))
+        for length in listed.rstrip(",").split(",")
+        if listed
+    )
     return kind, shape, "F" if found["fortran"] == "True" else "C", 8 + width + length
 
 
@@ -159,4 +195,6 @@ def _exactly(entry: Any, count: int) -> bytes:
 
 def _is_text(letters: np.ndarray) -> bool:
     """Whether all are code points, none of them half of a surrogate pair."""
-    return not np.any((letters > 0x10FFFF) | ((letters >= 0xD800) & (letters <= 0xDFFF)))
+    return not np.any(
+        (letters > 0x10FFFF) | ((letters >= 0xD800) & (letters <= 0xDFFF))
+    )

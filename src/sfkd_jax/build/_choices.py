@@ -11,14 +11,19 @@ Settings = Mapping[str, Any]
 def choose(table: Mapping[str, Any], name: str, what: str) -> Any:
     """`table[name]`, or an error that lists the choices."""
     if name not in table:
-        raise ValueError(f"unknown {what} {name!r}; choose one of {', '.join(sorted(table))}")
+        raise ValueError(
+            f"unknown {what} {name!r}; choose one of {', '.join(sorted(table))}"
+        )
     return table[name]
 
 
 def without(settings: Settings, *names: str) -> dict[str, Any]:
     """Settings of a factory, sequences as tuples: the rest after the names that choose it."""
     rest = {name: value for name, value in settings.items() if name not in names}
-    return {name: tuple(value) if isinstance(value, list) else value for name, value in rest.items()}
+    return {
+        name: tuple(value) if isinstance(value, list) else value
+        for name, value in rest.items()
+    }
 
 
 def floats(values: Any) -> tuple[float, ...] | None:

@@ -28,13 +28,16 @@ def build_law(settings: Settings, plant: vehicle.Vehicle) -> control.PathLaw | N
     """The law of a data set in path coordinates, derived from the vehicle's own step; None for other data sets.
 
     Args:
-        settings: of the data set. plant: any vehicle with limits of its controls.
+        settings: of the data set.
+        plant: any vehicle with limits of its controls.
     """
     if "law" not in settings:
         return None
     box = {name: floats(settings[name]) for name in ("env_low", "env_high")}
     size = len(plant.state_names) - 1
-    return control.derive_path_law(plant.step, coordinates=size, **box, **without(settings["law"]))
+    return control.derive_path_law(
+        plant.step, coordinates=size, **box, **without(settings["law"])
+    )
 
 
 def build_loop(plant: vehicle.Vehicle, law: control.PathLaw) -> vehicle.Vehicle:
@@ -43,11 +46,14 @@ def build_loop(plant: vehicle.Vehicle, law: control.PathLaw) -> vehicle.Vehicle:
     return vehicle.along_path(plant, law, perturbation=(steering, drive))
 
 
-def reference_systems(plant: vehicle.Vehicle, law: control.PathLaw | None = None) -> dict[str, System]:
+def reference_systems(
+    plant: vehicle.Vehicle, law: control.PathLaw | None = None
+) -> dict[str, System]:
     """Rows that need no learning: the nominal bicycle, the true plant, and the true plant wrong about e.
 
-    With a law they are those of the loop around the plant, in path coordinates, and "law" is beside them: the true
-    plant once more, for a planner that draws no samples (`num_samples=1`), so that the law drives alone.
+    With a law they are those of the loop around the plant, in path coordinates, and
+    "law" is beside them: the true plant once more, for a planner that draws no samples
+    (`num_samples=1`), so that the law drives alone.
     """
 
     def biased(entry: int, factor: float) -> Callable[[Environment], Environment]:
@@ -62,7 +68,12 @@ def reference_systems(plant: vehicle.Vehicle, law: control.PathLaw | None = None
     }
     if along:
         rows["law"] = rows["oracle"]
-    distortions = {"friction_x0.7": (0, 0.7), "friction_x1.3": (0, 1.3), "wind_x0": (1, 0.0), "wind_x2": (1, 2.0)}
+    distortions = {
+        "friction_x0.7": (0, 0.7),
+        "friction_x1.3": (0, 1.3),
+        "wind_x0": (1, 0.0),
+        "wind_x2": (1, 2.0),
+    }
     for name, change in distortions.items():
         rows[f"oracle_{name}"] = System(oracle(distort=biased(*change)), {}, "measured")
     return {name: row._replace(law=law) for name, row in rows.items()}

@@ -4,7 +4,9 @@ from sfkd_jax.certification._attack import attack_decoder as attack_decoder
 from sfkd_jax.certification._attack import attack_slopes as attack_slopes
 from sfkd_jax.certification._attack import attack_step as attack_step
 from sfkd_jax.certification._attack import attack_transport as attack_transport
-from sfkd_jax.certification._attack_all import CertificateContradicted as CertificateContradicted
+from sfkd_jax.certification._attack_all import (
+    CertificateContradicted as CertificateContradicted,
+)
 from sfkd_jax.certification._calibration import Disturbance as Disturbance
 from sfkd_jax.certification._calibration import clopper_pearson as clopper_pearson
 from sfkd_jax.certification._calibration import conformal_bounds as conformal_bounds
@@ -30,12 +32,18 @@ from sfkd_jax.certification._corridor_claims import covered as covered
 from sfkd_jax.certification._corridor_claims import drive_scores as drive_scores
 from sfkd_jax.certification._document import verify_document as verify_document
 from sfkd_jax.certification._environments import cover as cover
-from sfkd_jax.certification._exported import CertificationRefused as CertificationRefused
+from sfkd_jax.certification._exported import (
+    CertificationRefused as CertificationRefused,
+)
 from sfkd_jax.certification._fixed_points import FixedPoints as FixedPoints
-from sfkd_jax.certification._fixed_points import fixed_point_corridor as fixed_point_corridor
+from sfkd_jax.certification._fixed_points import (
+    fixed_point_corridor as fixed_point_corridor,
+)
 from sfkd_jax.certification._fixed_points import fixed_points as fixed_points
 from sfkd_jax.certification._incremental import attack_growth as attack_growth
-from sfkd_jax.certification._incremental import certify_incremental as certify_incremental
+from sfkd_jax.certification._incremental import (
+    certify_incremental as certify_incremental,
+)
 from sfkd_jax.certification._incremental import check_incremental as check_incremental
 from sfkd_jax.certification._incremental import claims_a_rate as claims_a_rate
 from sfkd_jax.certification._incremental import incremental_rate as incremental_rate

@@ -6,13 +6,20 @@ from typing import Any
 
 import jax
 
-from sfkd_jax.certification._attack import attack_decoder, attack_slopes, attack_step, attack_transport
+from sfkd_jax.certification._attack import (
+    attack_decoder,
+    attack_slopes,
+    attack_step,
+    attack_transport,
+)
 from sfkd_jax.certification._claims import Claims, decoders
 from sfkd_jax.certification._exported import CertificationRefused, Exported, one_thread
 from sfkd_jax.types import Model, Params, Polytope
 
 FLOAT32 = 1e-5
-"""An attack runs on the model in float32; a bound is contradicted when it is exceeded by more than this, relatively."""
+"""An attack runs on the model in float32; a bound is contradicted when it is exceeded
+by more than this, relatively.
+"""
 
 
 class CertificateContradicted(CertificationRefused):
@@ -20,16 +27,28 @@ class CertificateContradicted(CertificationRefused):
 
 
 def attack_all(
-    model: Model, params: Params, weights: Exported, claims: Claims, box: Any, starts: int, seed: int
+    model: Model,
+    params: Params,
+    weights: Exported,
+    claims: Claims,
+    box: Any,
+    starts: int,
+    seed: int,
 ) -> dict[str, float]:
     """Lower bounds by name, none of which may exceed what was proved."""
     limits, found = limits_of(claims, weights), {}
     with one_thread():
-        for name, network in {"residual": weights.residual, **decoders(weights)}.items():
+        for name, network in {
+            "residual": weights.residual,
+            **decoders(weights),
+        }.items():
             if network:
                 found[f"{name}_slopes"] = attack_slopes(network, seed=seed)
         if "step_slopes" in limits:
-            slopes = [attack_slopes(weights.residual, vertex, starts=8) for vertex in weights.operators.vertices]
+            slopes = [
+                attack_slopes(weights.residual, vertex, starts=8)
+                for vertex in weights.operators.vertices
+            ]
             found["step_slopes"] = max(slopes)
     if starts:
         step_key, transport_key, decoder_key = jax.random.split(jax.random.key(seed), 3)

@@ -15,7 +15,9 @@ from sfkd_jax.types import Model, Params, Trajectory
 
 KINDS = ("position_m", "yaw_rad", "body")
 RESOLUTION = np.asarray([1e-3, 1e-4, 1e-3])
-"""No radius is smaller [m, rad, body]: 600 m from the origin float32 positions lie 6e-5 m apart, and steps add up."""
+"""No radius is smaller [m, rad, body]: 600 m from the origin float32 positions lie 6e-5
+m apart, and steps add up.
+"""
 
 
 def conformal_tube(
@@ -32,21 +34,28 @@ def conformal_tube(
 
         r_jk = unit_jk q,   q the ⌈(n+1) level⌉-th smallest of the scores max over windows, j, k of error_jk / unit_jk
 
-    with unit_jk the 95 % quantile of the validation errors of kind k after j steps. A trajectory is one draw: its
-    windows overlap and are not independent.
+    with unit_jk the 95 % quantile of the validation errors of kind k after j steps. A
+    trajectory is one draw: its windows overlap and are not independent.
 
     Args:
-        model, params: any model. validation: fixes the units. calibration: sets q. Both batches of trajectories.
-        level: 1 − δ. horizon, stride: steps, as in `window_errors`.
+        model, params: any model.
+        validation: fixes the units.
+        calibration: sets q. Both batches of trajectories.
+        level: 1 − δ.
+        horizon, stride: steps, as in `window_errors`.
 
     Returns:
-        "position_m" [m], "yaw_rad" [rad] and "body" (2-norm in its own units), each of length `horizon`.
+        "position_m" [m], "yaw_rad" [rad] and "body" (2-norm in its own units), each of
+        length `horizon`.
 
     Raises:
-        ValueError: too few trajectories for the level, errors that are not finite, a horizon that does not fit.
+        ValueError: too few trajectories for the level, errors that are not finite, a
+            horizon that does not fit.
     """
 
-    def along(params: Params, data: Trajectory) -> Float[Array, "trajectory window horizon 3"]:
+    def along(
+        params: Params, data: Trajectory
+    ) -> Float[Array, "trajectory window horizon 3"]:
         one = partial(window_errors, model, params, horizon=horizon, stride=stride)
         return in_batches(one, data, size=64)
 

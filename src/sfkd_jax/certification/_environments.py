@@ -13,7 +13,9 @@ from sfkd_jax.certification._core import Matrix, Vector
 from sfkd_jax.types import Hypernetwork
 
 WIDENED = 1 + 1e-9
-"""Intervals are computed in float64 without directed rounding; this is far more than it can lose here."""
+"""Intervals are computed in float64 without directed rounding; this is far more than it
+can lose here.
+"""
 
 
 Box: TypeAlias = Sequence[Any]
@@ -24,7 +26,9 @@ class Cover(NamedTuple):
     """A bound for every environment of a box, and how it was found.
 
     Attributes:
-        upper: holds everywhere. lower: reached at the centre of some cell. cells: how many were opened.
+        upper: holds everywhere.
+        lower: reached at the centre of some cell.
+        cells: how many were opened.
     """
 
     upper: float
@@ -42,16 +46,21 @@ def cover(
 ) -> Cover:
     """An upper bound of b(A(e)) over all e in the box, for any b with |b(A) − b(A')| ≤ ||A − A'||_2.
 
-    On a cell with centre c and half widths h, by the mean value theorem with an interval Jacobian M_k ± R_k,
+    On a cell with centre c and half widths h, by the mean value theorem with an
+    interval Jacobian M_k ± R_k,
 
         b(A(e)) ≤ b(A(c)) + Σ_k h_k (||M_k||_2 + ||R_k||_F).
 
-    The cell with the largest bound is cut across the axis that costs most, until that bound is within `tolerance` of
-    a value that is reached. If the cells run out first, what is returned still holds and is just not as tight.
+    The cell with the largest bound is cut across the axis that costs most, until that
+    bound is within `tolerance` of a value that is reached. If the cells run out first,
+    what is returned still holds and is just not as tight.
 
     Args:
-        network: of A(e). box: lower and upper corner. bound_at: b, for example `norm_upper`.
-        tolerance: relative. most_cells: when to stop.
+        network: of A(e).
+        box: lower and upper corner.
+        bound_at: b, for example `norm_upper`.
+        tolerance: relative.
+        most_cells: when to stop.
     """
     low, high = (np.asarray(side, dtype=np.float64) for side in box)
     first = _cell(network, 0.5 * (low + high), 0.5 * (high - low), bound_at)
@@ -78,7 +87,10 @@ def operator_at(network: Hypernetwork, env: Vector) -> Matrix:
 
 
 def _cell(
-    network: Hypernetwork, centre: Vector, half: Vector, bound_at: Callable[[Matrix], float]
+    network: Hypernetwork,
+    centre: Vector,
+    half: Vector,
+    bound_at: Callable[[Matrix], float],
 ) -> tuple[float, float, Vector, Vector, Float[np.ndarray, " axis"]]:
     """Upper bound on a cell, value at its centre, the cell, and what each axis adds."""
     middle, radius = _interval_jacobian(network, centre, half)
@@ -91,18 +103,28 @@ def _cell(
     return value + WIDENED * sum(costs), value, centre, half, np.asarray(costs)
 
 
-def _interval_jacobian(network: Hypernetwork, centre: Vector, half: Vector) -> tuple[Matrix, Matrix]:
+def _interval_jacobian(
+    network: Hypernetwork, centre: Vector, half: Vector
+) -> tuple[Matrix, Matrix]:
     """Middle and radius of the Jacobian of vec A over a cell, interval arithmetic through every tanh."""
     low, high = centre - half, centre + half
     middle, radius = np.eye(len(centre)), np.zeros((len(centre), len(centre)))
     for weight, bias in zip(network.weights[:-1], network.biases[:-1], strict=True):
-        point, spread = weight @ (0.5 * (low + high)) + bias, np.abs(weight) @ (0.5 * (high - low)) * WIDENED
+        point, spread = (
+            weight @ (0.5 * (low + high)) + bias,
+            np.abs(weight) @ (0.5 * (high - low)) * WIDENED,
+        )
         low, high = np.tanh(point - spread), np.tanh(point + spread)
         far = np.maximum(np.abs(low), np.abs(high))
         near = np.where(low * high <= 0, 0.0, np.minimum(np.abs(low), np.abs(high)))
-        slope, half_slope = 1.0 - 0.5 * (near**2 + far**2), 0.5 * (far**2 - near**2) * WIDENED + 1e-15
+        slope, half_slope = (
+            1.0 - 0.5 * (near**2 + far**2),
+            0.5 * (far**2 - near**2) * WIDENED + 1e-15,
+        )
         middle, radius = weight @ middle, np.abs(weight) @ radius
-        radius = (slope + half_slope)[:, None] * radius + half_slope[:, None] * np.abs(middle)
+        radius = (slope + half_slope)[:, None] * radius + half_slope[:, None] * np.abs(
+            middle
+        )
         middle = slope[:, None] * middle
     last = np.asarray(network.weights[-1])
     return last @ middle, np.abs(last) @ radius * WIDENED

@@ -51,37 +51,63 @@ def issue(
 
     Args:
         model, params: what is certified, with the weights as exported.
-        validation: fixes the units of the scores. calibration: sets d̄. Both by trajectory.
-        held_out: batches of trajectories by name, to count coverage on; "test" is exchangeable with `calibration`.
-        boxes: the domain of s, u and e that the measurements come from; outside it nothing is claimed.
-        drives: how many independent drives the trajectories of "calibration" and "test" were cut from; where it is not
-            said, every trajectory is one. Guarantees are about new drives only if there are enough of them.
-        sensor_noise: standard deviation per state, for the bounds of the run-time monitor; entries beyond the state
-            are not used.
+        validation: fixes the units of the scores.
+        calibration: sets d̄. Both by trajectory.
+        held_out: batches of trajectories by name, to count coverage on; "test" is
+            exchangeable with `calibration`.
+        boxes: the domain of s, u and e that the measurements come from; outside it
+            nothing is claimed.
+        drives: how many independent drives the trajectories of "calibration" and "test"
+            were cut from; where it is not said, every trajectory is one. Guarantees are
+            about new drives only if there are enough of them.
+        sensor_noise: standard deviation per state, for the bounds of the run-time
+            monitor; entries beyond the state are not used.
         mode, margin, attack_starts: of `certify`.
-        horizon: of the tubes. level: 1 − δ of the conformal bound.
+        horizon: of the tubes.
+        level: 1 − δ of the conformal bound.
         monitor_level: the share of calibration trajectories without a false alarm.
 
     Raises:
         CertificationRefused: with the reason.
     """
     began = time.perf_counter()
-    certificate = certify(model, params, boxes["env"], mode=mode, margin=margin, attack_starts=attack_starts)
+    certificate = certify(
+        model,
+        params,
+        boxes["env"],
+        mode=mode,
+        margin=margin,
+        attack_starts=attack_starts,
+    )
     driving = jax.jit(model.fold)(params)
     try:
-        found = _measure(model, driving, validation, calibration, held_out, level, drives or {})
-        outputs = _outputs(model, params, driving, (validation, calibration, held_out["test"]), level)
-        alarms = _alarms(model, driving, (validation, calibration), sensor_noise, monitor_level)
+        found = _measure(
+            model, driving, validation, calibration, held_out, level, drives or {}
+        )
+        outputs = _outputs(
+            model, params, driving, (validation, calibration, held_out["test"]), level
+        )
+        alarms = _alarms(
+            model, driving, (validation, calibration), sensor_noise, monitor_level
+        )
     except ValueError as reason:
         raise CertificationRefused(str(reason)) from None
     one_step = found["one_step"]
     latent = latent_tube(certificate.alpha, one_step["latent"], horizon)
     positions = np.asarray(calibration.states, dtype=np.float64)[..., :2]
     largest = float(np.max(np.linalg.norm(np.diff(positions, axis=-2), axis=-1)))
-    known = {"alpha": certificate.alpha, "lipschitz": certificate.lipschitz, "residual": one_step}
+    known = {
+        "alpha": certificate.alpha,
+        "lipschitz": certificate.lipschitz,
+        "residual": one_step,
+    }
     ultimate = one_step["latent"] / (1 - certificate.alpha)
     along_path = model.along_path
-    tube = path_tube(latent, **known) if along_path else physical_tube(latent, **known, largest_increment=largest)
+    tube = (
+        path_tube(latent, **known)
+        if along_path
+        else physical_tube(latent, **known, largest_increment=largest)
+    )
     measured = {
         "decoder_lipschitz": certificate.lipschitz.get("decoder"),
         "d_bar": {"value": one_step["latent"], **found},
@@ -113,11 +139,20 @@ def progress(model: Model, params: Params) -> dict[str, float]:
     if not isinstance(weights.operators, Polytope):
         return {}
     with one_thread():
-        rho = max(float(np.linalg.norm(vertex, 2)) for vertex in weights.operators.vertices)
+        rho = max(
+            float(np.linalg.norm(vertex, 2)) for vertex in weights.operators.vertices
+        )
         separate = rho + residual_bound(weights)
         joint = joint_bound(weights, iterations=15)
-        slopes = max(attack_slopes(weights.residual, vertex, starts=4) for vertex in weights.operators.vertices)
-    found = {"alpha": min(joint, separate), "alpha_separate": separate, "tightness": min(joint, separate) / slopes}
+        slopes = max(
+            attack_slopes(weights.residual, vertex, starts=4)
+            for vertex in weights.operators.vertices
+        )
+    found = {
+        "alpha": min(joint, separate),
+        "alpha_separate": separate,
+        "tightness": min(joint, separate) / slopes,
+    }
     return {name: value for name, value in found.items() if np.isfinite(value)}
 
 
@@ -131,10 +166,13 @@ def _measure(
     drives: Mapping[str, int],
 ) -> dict[str, Any]:
     """One-step bounds at `level` for whole trajectories, and how often they hold where nobody looked before."""
-    reference, scores = (disturbances(model, params, part) for part in (validation, calibration))
+    reference, scores = (
+        disturbances(model, params, part) for part in (validation, calibration)
+    )
     bounds = conformal_bounds(tube_units(reference, level=level), scores, level=level)
     shares = {
-        name: _coverage(bounds, disturbances(model, params, part), drives.get(name)) for name, part in held_out.items()
+        name: _coverage(bounds, disturbances(model, params, part), drives.get(name))
+        for name, part in held_out.items()
     }
     independent = drives.get("calibration", len(scores.scores))
     same = f"further segments of the same {independent} drives"
@@ -144,14 +182,20 @@ def _measure(
         "drives": independent,
         "holds_for": "new drives like these" if supports(independent, level) else same,
         **shares["test"],
-        "by_scenario": {name: share for name, share in shares.items() if name != "test"},
+        "by_scenario": {
+            name: share for name, share in shares.items() if name != "test"
+        },
         "one_step": dict(zip(KINDS, bounds.tolist(), strict=True)),
         "validation": float(np.quantile(reference.scores[:, 0], level)),
     }
 
 
 def _outputs(
-    model: Model, params: Params, driving: Params, splits: tuple[Trajectory, ...], level: float
+    model: Model,
+    params: Params,
+    driving: Params,
+    splits: tuple[Trajectory, ...],
+    level: float,
 ) -> dict[str, Any]:
     """Tubes in metrics of their own; only along a path is the pose an output."""
     if not model.along_path:
@@ -178,11 +222,21 @@ def _alarms(
 ) -> dict[str, Any]:
     """One-step bounds as a monitor needs them: both states of a pair are seen through the sensors."""
     size = splits[0].states.shape[-1]
-    spread = jnp.zeros(size).at[: min(size, len(sensor_noise))].set(jnp.asarray(sensor_noise[:size]))
+    spread = (
+        jnp.zeros(size)
+        .at[: min(size, len(sensor_noise))]
+        .set(jnp.asarray(sensor_noise[:size]))
+    )
     noisy = [
-        part._replace(states=part.states + spread * jax.random.normal(key, part.states.shape))
+        part._replace(
+            states=part.states + spread * jax.random.normal(key, part.states.shape)
+        )
         for key, part in zip(jax.random.split(jax.random.key(0)), splits, strict=True)
     ]
     reference, scores = (disturbances(model, params, part) for part in noisy)
     bounds = conformal_bounds(even_units(reference), scores, level=level)
-    return {"bounds": bounds.tolist(), "level": level, "sensor_noise": list(sensor_noise)}
+    return {
+        "bounds": bounds.tolist(),
+        "level": level,
+        "sensor_noise": list(sensor_noise),
+    }

@@ -1,9 +1,10 @@
 """A metric for one output: how fast the step contracts in it, and how far that output moves per unit of it.
 
-The 2-norm weighs every direction of the latent alike, an output only sees some. With
-P = L L' chosen for the read-out row c, a tube |c z| ≤ |c|_{P⁻¹} R of the same weights is
+The 2-norm weighs every direction of the latent alike, an output only sees some. With P
+= L L' chosen for the read-out row c, a tube |c z| ≤ |c|_{P⁻¹} R of the same weights is
 several times tighter (closed-loop tube of Singh et al. 2017, for one output at a time).
-P and the multipliers are proposed by a search, see `_metric_search`; here they are checked.
+P and the multipliers are proposed by a search, see `_metric_search`; here they are
+checked.
 """
 
 from __future__ import annotations
@@ -15,7 +16,15 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from sfkd_jax.certification._claims import Refuted, readouts
-from sfkd_jax.certification._core import UNIT, Matrix, Vector, check_vertices, frobenius, is_positive_definite, product
+from sfkd_jax.certification._core import (
+    UNIT,
+    Matrix,
+    Vector,
+    check_vertices,
+    frobenius,
+    is_positive_definite,
+    product,
+)
 from sfkd_jax.certification._exported import Exported
 from sfkd_jax.types import Polytope
 
@@ -55,7 +64,10 @@ class OutputMetric(NamedTuple):
             KeyError, TypeError, ValueError: it is not one.
         """
         witness = document["witness"]
-        joint = [[np.asarray(part, dtype=np.float64) for part in vertex] for vertex in witness["joint"]]
+        joint = [
+            [np.asarray(part, dtype=np.float64) for part in vertex]
+            for vertex in witness["joint"]
+        ]
         metric = np.asarray(witness["metric"], dtype=np.float64)
         return cls(document["alpha"], document["lipschitz"], metric, joint)
 
@@ -89,7 +101,9 @@ def require_output_metric(name: str, claim: OutputMetric, weights: Exported) -> 
         raise Refuted(f"outputs.{name}.lipschitz does not follow from its witness")
 
 
-@np.errstate(over="ignore", invalid="ignore")  # NaN and infinity are refused by the core
+@np.errstate(
+    over="ignore", invalid="ignore"
+)  # NaN and infinity are refused by the core
 def reads_within(rows: Matrix, bound: float, metric: Matrix) -> bool:
     """Whether |C z| < b |z|_P for every z, which is b² P − C'C > 0."""
     squared, rounding = product(rows.T, rows)

@@ -9,32 +9,51 @@ import numpy as np
 from scipy.linalg import cho_solve
 from scipy.optimize import minimize
 
-from sfkd_jax.certification._core import Matrix, Vector, check_witness, norm_upper, witness_matrix
+from sfkd_jax.certification._core import (
+    Matrix,
+    Vector,
+    check_witness,
+    norm_upper,
+    witness_matrix,
+)
 
 SCALES = np.geomspace(0.25, 4.0, 33)
 SLACKS = (1e-9, 1e-7, 1e-5, 1e-3)
 SHARPNESS = (8, 64, 512)
-"""Exponents of the p-norm that stands in for the largest eigenvalue, one L-BFGS run each."""
+"""Exponents of the p-norm that stands in for the largest eigenvalue, one L-BFGS run
+each.
+"""
 INFEASIBLE = 1e3
 """Value of the objective, a logarithm, where the multipliers prove nothing."""
 
 
-def lipschitz_upper(weights: Sequence[Matrix], multipliers: Sequence[Vector], linear: Matrix | None = None) -> float:
+def lipschitz_upper(
+    weights: Sequence[Matrix],
+    multipliers: Sequence[Vector],
+    linear: Matrix | None = None,
+) -> float:
     """The smallest Lipschitz bound that the multipliers, scaled as a whole, prove; infinity if they prove none.
 
     Args:
-        weights: W_1 … W_L of a network with slopes in [0, 1]. multipliers: λ_1 … λ_{L-1}, as proposed.
+        weights: W_1 … W_L of a network with slopes in [0, 1].
+        multipliers: λ_1 … λ_{L-1}, as proposed.
         linear: A, for the bound of A z + network(z).
     """
     return rescaled(weights, multipliers, linear)[0]
 
 
 def rescaled(
-    weights: Sequence[Matrix], multipliers: Sequence[Vector], linear: Matrix | None = None
+    weights: Sequence[Matrix],
+    multipliers: Sequence[Vector],
+    linear: Matrix | None = None,
 ) -> tuple[float, list[Vector]]:
     """The same bound, with the scaled multipliers that prove it."""
     if not multipliers and len(weights) <= 1:
-        parts = [np.asarray(part, dtype=np.float64) for part in (*weights, linear) if part is not None]
+        parts = [
+            np.asarray(part, dtype=np.float64)
+            for part in (*weights, linear)
+            if part is not None
+        ]
         return norm_upper(sum(parts[1:], parts[0])) * (1 + (len(parts) - 1) * 1e-12), []
     if len(multipliers) != len(weights) - 1:
         return float("inf"), []
@@ -48,7 +67,11 @@ def rescaled(
 
 
 def proved(
-    weights: Sequence[Matrix], multipliers: Sequence[Vector], linear: Matrix | None = None, *, below: float = np.inf
+    weights: Sequence[Matrix],
+    multipliers: Sequence[Vector],
+    linear: Matrix | None = None,
+    *,
+    below: float = np.inf,
 ) -> float:
     """The smallest bound that the core accepts from just these multipliers, if it is under `below`; else infinity."""
     eigenvalues, *_ = _reduced(weights, multipliers, linear)
@@ -63,15 +86,23 @@ def proved(
 
 
 def propose_multipliers(
-    weights: Sequence[Matrix], start: Sequence[Vector] = (), linear: Matrix | None = None, *, iterations: int = 150
+    weights: Sequence[Matrix],
+    start: Sequence[Vector] = (),
+    linear: Matrix | None = None,
+    *,
+    iterations: int = 150,
 ) -> list[Vector]:
     """Multipliers near the LipSDP optimum, by L-BFGS over their logarithms from `start` (or the product of norms).
 
-    For fixed multipliers the best bound is the root of the largest eigenvalue of the Schur complement
-    C'S⁻¹C − K; its gradient is closed: with a top vector v and hidden y = −S⁻¹Cv, dλ_k ↦ −2 y_k ∘ (y_k − W_k y_{k−1}).
+    For fixed multipliers the best bound is the root of the largest eigenvalue of the
+    Schur complement C'S⁻¹C − K; its gradient is closed: with a top vector v and hidden
+    y = −S⁻¹Cv, dλ_k ↦ −2 y_k ∘ (y_k − W_k y_{k−1}).
 
     Args:
-        weights: W_1 … W_L. start: λ to begin with. linear: A of a joint bound. iterations: per sharpness.
+        weights: W_1 … W_L.
+        start: λ to begin with.
+        linear: A of a joint bound.
+        iterations: per sharpness.
     """
     weights = [np.asarray(weight, dtype=np.float64) for weight in weights]
     if len(weights) < 2 or not all(np.all(np.isfinite(part)) for part in weights):
@@ -93,23 +124,39 @@ def propose_multipliers(
         for k, (before, here) in enumerate(pairwise([vectors, *hidden])):
             each = -2.0 * here * (here - weights[k] @ before)
             gradient.append(multipliers[k] * (each @ powers) / (largest * total))
-        return 0.5 * (np.log(largest) + np.log(total) / sharpness), 0.5 * np.concatenate(gradient)
+        return 0.5 * (
+            np.log(largest) + np.log(total) / sharpness
+        ), 0.5 * np.concatenate(gradient)
 
     for sharpness in SHARPNESS:
         found = minimize(
-            objective, logs, (sharpness,), "L-BFGS-B", jac=True, options={"maxiter": iterations, "maxcor": 30}
+            objective,
+            logs,
+            (sharpness,),
+            "L-BFGS-B",
+            jac=True,
+            options={"maxiter": iterations, "maxcor": 30},
         )
         logs = found.x
     return np.split(np.exp(logs), widths)
 
 
-def _starting_point(weights: list[Matrix], start: Sequence[Vector], linear: Matrix | None) -> list[Vector]:
+def _starting_point(
+    weights: list[Matrix], start: Sequence[Vector], linear: Matrix | None
+) -> list[Vector]:
     """The start if it proves anything, else λ_k = Π_{j>k} ||W_j||²: the product of norms as a witness."""
     begin = [np.asarray(part, dtype=np.float64) for part in start]
-    if begin and all(np.all(part > 0) for part in begin) and np.isfinite(rescaled(weights, begin, linear)[0]):
+    if (
+        begin
+        and all(np.all(part > 0) for part in begin)
+        and np.isfinite(rescaled(weights, begin, linear)[0])
+    ):
         return begin
     squares = [np.linalg.norm(weight, 2) ** 2 + 1e-12 for weight in weights]
-    return [np.full(len(weights[k]), 1.001 * np.prod(squares[k + 1 :])) for k in range(len(weights) - 1)]
+    return [
+        np.full(len(weights[k]), 1.001 * np.prod(squares[k + 1 :]))
+        for k in range(len(weights) - 1)
+    ]
 
 
 def _reduced(

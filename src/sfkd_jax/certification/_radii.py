@@ -24,7 +24,8 @@ class Residuals(NamedTuple):
     """What every step of a drive differed from the model, (drive, time, …).
 
     Attributes:
-        gaps: d_k, in coordinates of the latent. outputs: |y_{k+1} − C F(z_k)| of e_y [m] and e_ψ [rad].
+        gaps: d_k, in coordinates of the latent.
+        outputs: |y_{k+1} − C F(z_k)| of e_y [m] and e_ψ [rad].
     """
 
     gaps: Float[np.ndarray, "drive time rank"]
@@ -35,8 +36,10 @@ class Radii(NamedTuple):
     """Bounds on |y_k − ŷ_k| over a whole drive, for any copy that starts where the car does, (drive,).
 
     Attributes:
-        for_ever: L α max|d|_P / (1 − α) + max ε: what follows from the largest disturbance alone.
-        followed: max_k (L α R_{k−1} + ε_k), R_k = α R_{k−1} + |d_k|_P: what follows from all of them in turn.
+        for_ever: L α max|d|_P / (1 − α) + max ε: what follows from the largest
+            disturbance alone.
+        followed: max_k (L α R_{k−1} + ε_k), R_k = α R_{k−1} + |d_k|_P: what follows
+            from all of them in turn.
         largest: max |d|_P.
     """
 
@@ -49,10 +52,14 @@ def residuals(model: Model, params: Params, drives: Trajectory) -> Residuals:
     """Of every step from its true state, switches included.
 
     Args:
-        model: along a path. params: folded. drives: a batch of trajectories.
+        model: along a path.
+        params: folded.
+        drives: a batch of trajectories.
     """
     gaps, outputs = _residuals(model, params, drives)
-    return Residuals(np.asarray(gaps, dtype=np.float64), np.asarray(outputs, dtype=np.float64))
+    return Residuals(
+        np.asarray(gaps, dtype=np.float64), np.asarray(outputs, dtype=np.float64)
+    )
 
 
 @partial(jax.jit, static_argnums=0)
@@ -66,21 +73,29 @@ def _residuals(model: Model, params: Params, drives: Trajectory) -> tuple[Array,
 
 
 def radii(
-    found: Residuals, name: str, claim: OutputMetric, initial: Float[np.ndarray, " drive"] | float = 0.0
+    found: Residuals,
+    name: str,
+    claim: OutputMetric,
+    initial: Float[np.ndarray, " drive"] | float = 0.0,
 ) -> Radii:
     """Both bounds for one output, by drive.
 
         |z_k − ẑ_k|_P ≤ R_k,  so  |y_k − ŷ_k| ≤ |C (F(z_{k−1}) − F(ẑ_{k−1}))| + ε_k ≤ L α R_{k−1} + ε_k
 
     Args:
-        found: of the drives. name: of `OUTPUTS`. claim: proved of it. initial: |z_0 − ẑ_0|_P.
+        found: of the drives.
+        name: of `OUTPUTS`.
+        claim: proved of it.
+        initial: |z_0 − ẑ_0|_P.
     """
     sizes = np.linalg.norm(found.gaps @ np.linalg.cholesky(claim.metric), axis=-1)
     misses = found.outputs[..., OUTPUTS.index(name)]
     radius = np.broadcast_to(np.asarray(initial, dtype=np.float64), sizes.shape[:1])
     followed = np.zeros(len(sizes))
     for step in range(sizes.shape[1]):
-        followed = np.maximum(followed, claim.lipschitz * claim.alpha * radius + misses[:, step])
+        followed = np.maximum(
+            followed, claim.lipschitz * claim.alpha * radius + misses[:, step]
+        )
         radius = claim.alpha * radius + sizes[:, step]
     largest = np.max(sizes, axis=1)
     ultimate = np.maximum(initial, largest / (1.0 - claim.alpha))
@@ -95,6 +110,8 @@ def worst_gaps(found: Residuals, count: int) -> Float[np.ndarray, "drive worst r
     return np.take_along_axis(found.gaps, order[..., None], axis=1)
 
 
-def metrics_document(claims: Mapping[str, OutputMetric]) -> dict[str, dict[str, object]]:
+def metrics_document(
+    claims: Mapping[str, OutputMetric],
+) -> dict[str, dict[str, object]]:
     """As JSON has them."""
     return {name: claim.document() for name, claim in claims.items()}

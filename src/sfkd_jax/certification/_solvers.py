@@ -10,7 +10,9 @@ import numpy as np
 from sfkd_jax.certification._core import Matrix
 
 MARGIN = 1e-6
-"""Relative tightening of what a solver is asked for: it returns solutions slightly outside of what it was given."""
+"""Relative tightening of what a solver is asked for: it returns solutions slightly
+outside of what it was given.
+"""
 
 
 def solve_multipliers(
@@ -18,13 +20,17 @@ def solve_multipliers(
 ) -> list[Any]:
     """Multipliers of the LipSDP optimum (diagonal, per neuron) of f = A z + W_L σ(… W_1 z …), by cvxpy.
 
-    min b²  over λ ≥ 0  such that the matrix of `check_witness` is positive semidefinite.
+    min b²  over λ ≥ 0  such that the matrix of `check_witness` is positive
+    semidefinite.
 
     Args:
-        weights: W_1 … W_L. linear: A, or None. solver: any conic solver that cvxpy knows.
+        weights: W_1 … W_L.
+        linear: A, or None.
+        solver: any conic solver that cvxpy knows.
 
     Returns:
-        λ_1 … λ_{L-1}, or an empty list if the solver returns nothing; its status is not consulted.
+        λ_1 … λ_{L-1}, or an empty list if the solver returns nothing; its status is not
+        consulted.
     """
     import cvxpy as cp  # part of an extra; nothing else in this room needs it
 
@@ -49,26 +55,39 @@ def solve_multipliers(
     blocks[0][-1] = blocks[0][-1] - last.T @ weights[-1]
     blocks[-1][0] = blocks[0][-1].T
     matrix = cp.bmat(blocks)
-    _solve(cp, cp.Problem(cp.Minimize(square), [0.5 * (matrix + matrix.T) >> 0]), solver)
+    _solve(
+        cp, cp.Problem(cp.Minimize(square), [0.5 * (matrix + matrix.T) >> 0]), solver
+    )
     found = [multiplier.value for multiplier in multipliers]
-    return [] if any(value is None for value in found) else [np.asarray(value, dtype=np.float64) for value in found]
+    return (
+        []
+        if any(value is None for value in found)
+        else [np.asarray(value, dtype=np.float64) for value in found]
+    )
 
 
-def solve_metric(operators: Sequence[Matrix], rate: float, *, solver: str = "CLARABEL") -> Matrix | None:
+def solve_metric(
+    operators: Sequence[Matrix], rate: float, *, solver: str = "CLARABEL"
+) -> Matrix | None:
     """A common Lyapunov matrix of least condition: min κ over I ⪯ P ⪯ κ I such that A' P A ⪯ ρ² P for every A.
 
     Args:
-        operators: the vertices. rate: ρ. solver: any conic solver that cvxpy knows.
+        operators: the vertices.
+        rate: ρ.
+        solver: any conic solver that cvxpy knows.
 
     Returns:
-        P, symmetric, or None if the solver returns nothing; `certify` recomputes ρ and κ from it.
+        P, symmetric, or None if the solver returns nothing; `certify` recomputes ρ and
+        κ from it.
     """
     import cvxpy as cp  # as above
 
     size = operators[0].shape[0]
     metric, condition = cp.Variable((size, size), symmetric=True), cp.Variable()
     bounds: list[Any] = [metric >> np.eye(size), condition * np.eye(size) - metric >> 0]
-    decreases = [(rate * (1 - MARGIN)) ** 2 * metric - a.T @ metric @ a >> 0 for a in operators]
+    decreases = [
+        (rate * (1 - MARGIN)) ** 2 * metric - a.T @ metric @ a >> 0 for a in operators
+    ]
     _solve(cp, cp.Problem(cp.Minimize(condition), bounds + decreases), solver)
     if metric.value is None:
         return None

@@ -37,7 +37,9 @@ def conf_path() -> str:
     """The folder of options: the repository's in a checkout, the package's in an installed wheel."""
     here = Path(__file__).resolve().parents[1]
     checkout = here.parents[1]
-    inside = (checkout / "conf" / "config.yaml").exists() and (checkout / "pyproject.toml").exists()
+    inside = (checkout / "conf" / "config.yaml").exists() and (
+        checkout / "pyproject.toml"
+    ).exists()
     return str(checkout / "conf" if inside else here / "conf")
 
 
@@ -49,16 +51,21 @@ def compose(*overrides: str) -> dict[str, Any]:
 
 def command(name: str) -> str:
     """The command that is running, less where its artefacts go, as it is typed in a shell."""
-    asked = [word for word in HydraConfig.get().overrides.task if not word.startswith("root=")]
+    asked = [
+        word
+        for word in HydraConfig.get().overrides.task
+        if not word.startswith("root=")
+    ]
     return " ".join(["python -m", f"sfkd_jax.{name}", shlex.join(asked)]).strip()
 
 
 def door(run: Callable[[dict[str, Any]], dict[str, Any]]) -> Callable[[], None]:
     """Make `run(settings) -> document` a command: compose, work, print one JSON object as the last line of stdout.
 
-    What can be expected to go wrong becomes one line on stderr and an exit code: 1 failed, 2 refused, 3 stale. A job
-    of a sweep returns the document's "objective" to the sweeper, and infinity where it failed: the others go on, and
-    the sweep ends with a line for each that failed and status 1 (`sweeps.Sweep.status`).
+    What can be expected to go wrong becomes one line on stderr and an exit code: 1
+    failed, 2 refused, 3 stale. A job of a sweep returns the document's "objective" to
+    the sweeper, and infinity where it failed: the others go on, and the sweep ends with
+    a line for each that failed and status 1 (`sweeps.Sweep.status`).
     """
     register()
 
@@ -68,8 +75,16 @@ def door(run: Callable[[dict[str, Any]], dict[str, Any]]) -> Callable[[], None]:
         try:
             document = run(_settings(config))
         except KeyboardInterrupt:
-            print("sfkd_jax: interrupted; the same command continues", file=sys.stderr, flush=True)
-            os._exit(INTERRUPTED)  # the interpreter would first wait for compiled code that nobody needs any more
+            print(
+                "sfkd_jax: interrupted; the same command continues",
+                file=sys.stderr,
+                flush=True,
+            )
+            os._exit(
+                INTERRUPTED
+                # The interpreter would first wait for compiled code that nobody needs any
+                # more.
+            )
         except CertificationRefused as reason:
             return fail(f"refused: {reason}", REFUSED)
         except CertificateStale as reason:
@@ -77,7 +92,9 @@ def door(run: Callable[[dict[str, Any]], dict[str, Any]]) -> Callable[[], None]:
         except (HydraException, OmegaConfBaseException) as reason:
             return fail(_one_line(reason), 1)
         except (ArtefactError, ValueError, training.TrainingStopped, OSError) as reason:
-            return fail(str(reason).splitlines()[0] if str(reason) else type(reason).__name__, 1)
+            return fail(
+                str(reason).splitlines()[0] if str(reason) else type(reason).__name__, 1
+            )
         except Exception as reason:
             if not sweeping:
                 raise
@@ -86,14 +103,18 @@ def door(run: Callable[[dict[str, Any]], dict[str, Any]]) -> Callable[[], None]:
         print(json.dumps(document), flush=True)
         return sweeps.Outcome(document.get("objective")) if sweeping else None
 
-    opened = hydra.main(config_path=conf_path(), config_name="config", version_base="1.3")(main)
+    opened = hydra.main(
+        config_path=conf_path(), config_name="config", version_base="1.3"
+    )(main)
     return functools.partial(_open, opened)
 
 
 def _open(opened: Callable[[], None]) -> None:
     """Open a door; what cannot be composed or launched is one line, unless HYDRA_FULL_ERROR asks for all of it."""
     loud = "HYDRA_FULL_ERROR" in os.environ
-    os.environ["HYDRA_FULL_ERROR"] = "1"  # else Hydra prints what is wrong in its own words and exits
+    os.environ["HYDRA_FULL_ERROR"] = (
+        "1"  # else Hydra prints what is wrong in its own words and exits
+    )
     try:
         with sweeps.watched() as sweep:
             opened()
@@ -113,19 +134,25 @@ def _open(opened: Callable[[], None]) -> None:
 
 def _one_line(reason: BaseException) -> str:
     """Hydra's reason and OmegaConf's behind it, without search paths and what types they have inside."""
-    behind = reason.__cause__ if isinstance(reason.__cause__, OmegaConfBaseException) else None
+    behind = (
+        reason.__cause__
+        if isinstance(reason.__cause__, OmegaConfBaseException)
+        else None
+    )
     asked = f"{reason.override}: " if isinstance(reason, OverrideParseException) else ""
     text = f"{asked}{reason}" + (f": {behind}" if behind else "")
     words = re.split(r"Config search path|\n\s*full_key:|\nSee https", text)[0].split()
-    return " ".join(word for word in words if not word.endswith("schema"))  # options for other options alone
+    return " ".join(
+        word for word in words if not word.endswith("schema")
+    )  # options for other options alone
 
 
 def _settings(config: DictConfig) -> dict[str, Any]:
     """Plain settings; a model that is told nothing of the environment has no use for it.
 
     Raises:
-        ValueError: a setting that cannot be meant, an `env` that there is not, or an estimate of what the model does
-            not read.
+        ValueError: a setting that cannot be meant, an `env` that there is not, or an
+            estimate of what the model does not read.
     """
     settings = typing.cast(dict[str, Any], OmegaConf.to_container(config, resolve=True))
     ranges.check(settings)
@@ -133,7 +160,9 @@ def _settings(config: DictConfig) -> dict[str, Any]:
     if env not in build.ENVS:
         raise ValueError(f"unknown env {env!r}; choose one of {', '.join(build.ENVS)}")
     if env == "estimated" and not model["environment"]:
-        raise ValueError("env=estimated needs a model that reads the environment; drop model.environment=false")
+        raise ValueError(
+            "env=estimated needs a model that reads the environment; drop model.environment=false"
+        )
     model["environment"] &= env != "none"
     return settings
 

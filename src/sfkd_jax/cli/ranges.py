@@ -67,7 +67,10 @@ _EMPTY = {
     "comparison.seeds",
     "comparison.only",
 }
-_PAIRS = (("dataset.env_low", "dataset.env_high"), ("vehicle.control_low", "vehicle.control_high"))
+_PAIRS = (
+    ("dataset.env_low", "dataset.env_high"),
+    ("vehicle.control_low", "vehicle.control_high"),
+)
 _BOXES = {name for pair in _PAIRS for name in pair}
 _FOLDERS = ("name", "model.system", "comparison.policies")
 """Settings that become folders below `root`."""
@@ -85,7 +88,15 @@ _NULL = (
     "controller.task.control_rate dataset.env_low dataset.env_high comparison.rows.* comparison.variations.* "
     "comparison.own_controllers.*"
 )
-_REQUIRED = ("seed", "name", "root", "env", "demo.episodes", "demo.episode_s", "demo.timed_steps")
+_REQUIRED = (
+    "seed",
+    "name",
+    "root",
+    "env",
+    "demo.episodes",
+    "demo.episode_s",
+    "demo.timed_steps",
+)
 _WORDS = {int: "a whole number", float: "a number", str: "words"}
 
 
@@ -93,7 +104,8 @@ class Rule(NamedTuple):
     """What one setting may be.
 
     Attributes:
-        interval: of its numbers, as it is said. entries: how many if it is a list, None for at least one.
+        interval: of its numbers, as it is said.
+        entries: how many if it is a list, None for at least one.
         kind: of it or its entries; None where a schema has checked that.
     """
 
@@ -105,8 +117,8 @@ class Rule(NamedTuple):
 def check(settings: Mapping[str, Any]) -> None:
     """Refuse the first setting that cannot be meant.
 
-    A whole number is at least 1, another number finite and at least 0, a list or a word not empty, unless the tables
-    of this file say otherwise.
+    A whole number is at least 1, another number finite and at least 0, a list or a word
+    not empty, unless the tables of this file say otherwise.
 
     Args:
         settings: composed, nested, plain.
@@ -121,15 +133,27 @@ def check(settings: Mapping[str, Any]) -> None:
             raise ValueError(f"{name} must be {said}, got {value!r}")
     for name in _FOLDERS:
         if isinstance(flat.get(name), str) and not is_below(flat[name]):
-            raise ValueError(f"{name} must be a path below root without '..', empty parts or \\, got {flat[name]!r}")
+            raise ValueError(
+                f"{name} must be a path below root without '..', empty parts or \\, got {flat[name]!r}"
+            )
     for name in _LABELS:
-        for label in (settings.get("comparison") or {}).get(name.removeprefix("comparison."), ()):
-            if not is_below("_".join(str(label).split())):  # as the folder of a cell is called
-                raise ValueError(f"{name} must have keys that are names of files, got {label!r}")
+        for label in (settings.get("comparison") or {}).get(
+            name.removeprefix("comparison."), ()
+        ):
+            if not is_below(
+                "_".join(str(label).split())
+            ):  # as the folder of a cell is called
+                raise ValueError(
+                    f"{name} must have keys that are names of files, got {label!r}"
+                )
     for low, high in _PAIRS:
         below, above = flat.get(low) or (), flat.get(high) or ()
-        if len(below) != len(above) or not all(a <= b for a, b in zip(below, above, strict=True)):
-            raise ValueError(f"{low} must not lie above {high}, entry by entry, got {below} and {above}")
+        if len(below) != len(above) or not all(
+            a <= b for a, b in zip(below, above, strict=True)
+        ):
+            raise ValueError(
+                f"{low} must not lie above {high}, entry by entry, got {below} and {above}"
+            )
 
 
 def is_below(path: str) -> bool:
@@ -147,18 +171,33 @@ def rule_of(name: str) -> Rule:
 def patterns() -> set[str]:
     """Every name in the tables, `*` for any."""
     listed = [*_INTERVALS.values(), *_ENTRIES.values(), *_KINDS.values()]
-    return {*_RISING, *_EMPTY, *_NULL.split(), *(name for names in listed for name in names.split()), *_BOXES}
+    return {
+        *_RISING,
+        *_EMPTY,
+        *_NULL.split(),
+        *(name for names in listed for name in names.split()),
+        *_BOXES,
+    }
 
 
 def fits(name: str, pattern: str) -> bool:
     """Whether a dotted name is one that a pattern with at most one `*` means."""
     before, star, after = pattern.partition("*")
-    return name == pattern or bool(star and name.startswith(before) and name.endswith(after))
+    return name == pattern or bool(
+        star and name.startswith(before) and name.endswith(after)
+    )
 
 
 def _find(table: Mapping[Any, str], name: str) -> Any:
     """The key under which a table lists a name, or None."""
-    return next((key for key, names in table.items() if any(fits(name, one) for one in names.split())), None)
+    return next(
+        (
+            key
+            for key, names in table.items()
+            if any(fits(name, one) for one in names.split())
+        ),
+        None,
+    )
 
 
 def _leaves(settings: Mapping[str, Any], above: str = "") -> Iterator[tuple[str, Any]]:
@@ -180,7 +219,9 @@ def _wrong(name: str, value: Any, rule: Rule) -> str | None:
     if any(entry is None or isinstance(entry, (dict, list)) for entry in entries):
         return "a list of numbers or words"
     size = f"{rule.entries} entries" if rule.entries else "at least one entry"
-    if not (entries or name in _EMPTY) or (rule.entries and (not listed or len(value) != rule.entries)):
+    if not (entries or name in _EMPTY) or (
+        rule.entries and (not listed or len(value) != rule.entries)
+    ):
         return size
     if listed != (rule.entries is not None or name in _BOXES) and rule.kind:
         return "a list" if name in _BOXES else _WORDS[rule.kind]
@@ -194,7 +235,9 @@ def _wrong(name: str, value: Any, rule: Rule) -> str | None:
 
 def _is(value: Any, kind: type) -> bool:
     """Whether a value is of a kind; a whole number is a number, true and false are none."""
-    return isinstance(value, (int, float) if kind is float else kind) and not isinstance(value, bool)
+    return isinstance(
+        value, (int, float) if kind is float else kind
+    ) and not isinstance(value, bool)
 
 
 def _outside(value: Any, interval: str | None) -> str | None:

@@ -63,8 +63,16 @@ class Sweep:
         """One line for each job that failed, and how many did, on stderr."""
         if self.failures:
             count = f"{len(self.failures)} of {self.jobs} jobs failed"
-            lines = [*self.failures, f"{count}; the same sweep again skips what is finished"]
-            print(*(f"sfkd_jax: {line}" for line in lines), sep="\n", file=sys.stderr, flush=True)
+            lines = [
+                *self.failures,
+                f"{count}; the same sweep again skips what is finished",
+            ]
+            print(
+                *(f"sfkd_jax: {line}" for line in lines),
+                sep="\n",
+                file=sys.stderr,
+                flush=True,
+            )
 
 
 class _NamedJobs(Launcher):
@@ -76,7 +84,9 @@ class _NamedJobs(Launcher):
     def setup(self, **_: Any) -> None:
         """Nothing to do: the inner launcher is set up."""
 
-    def launch(self, job_overrides: Sequence[Sequence[str]], initial_job_idx: int) -> Sequence[JobReturn]:
+    def launch(
+        self, job_overrides: Sequence[Sequence[str]], initial_job_idx: int
+    ) -> Sequence[JobReturn]:
         """Launch, and wait for all.
 
         Raises:
@@ -84,19 +94,29 @@ class _NamedJobs(Launcher):
         """
         inner: Any = self._inner
         swept = swept_settings(inner.config)
-        named = {key for key in swept if key.split(".")[0] in (*store.IDENTITY, "env")} - NAMED
+        named = {
+            key for key in swept if key.split(".")[0] in (*store.IDENTITY, "env")
+        } - NAMED
         load = inner.hydra_context.config_loader.load_sweep_config
         jobs = []
         for overrides in job_overrides:
             composed = load(inner.config, list(overrides))
-            jobs.append(with_name(list(overrides), composed, directory(composed, named)))
+            jobs.append(
+                with_name(list(overrides), composed, directory(composed, named))
+            )
         try:
             with queues.patient(inner) as logs:
                 returned = inner.launch(jobs, initial_job_idx=initial_job_idx)
         except Exception as reason:  # each launcher raises what its own libraries raise
-            raise SweepError(f"the sweep stopped: {queues.one_line(reason)}") from reason
+            raise SweepError(
+                f"the sweep stopped: {queues.one_line(reason)}"
+            ) from reason
         for number, (job, log) in enumerate(zip_longest(returned, logs)):
-            varied = (word for word in job_overrides[number] if word.lstrip("+").split("=")[0] in swept)
+            varied = (
+                word
+                for word in job_overrides[number]
+                if word.lstrip("+").split("=")[0] in swept
+            )
             self._note(job, f"job {initial_job_idx + number} ({' '.join(varied)})", log)
         return returned
 
@@ -117,7 +137,9 @@ def watched() -> Iterator[Sweep]:
     """While it lasts, jobs that Hydra launches are named and counted, whatever launches them."""
     sweep, instantiate = Sweep(), Plugins.instantiate_launcher
 
-    def watching(plugins: Plugins, *args: Any, config: DictConfig, **options: Any) -> Launcher:
+    def watching(
+        plugins: Plugins, *args: Any, config: DictConfig, **options: Any
+    ) -> Launcher:
         sweep.is_study = config.hydra.runtime.choices["hydra/sweeper"] != "basic"
         return _NamedJobs(instantiate(plugins, *args, config=config, **options), sweep)
 
@@ -131,7 +153,9 @@ def watched() -> Iterator[Sweep]:
 def swept_settings(config: DictConfig) -> set[str]:
     """The settings that a sweep varies, of its composed `config`."""
     params = (config.hydra.sweeper or {}).get("params") or {}
-    asked = chain(config.hydra.overrides.task, (f"{key}={value}" for key, value in params.items()))
+    asked = chain(
+        config.hydra.overrides.task, (f"{key}={value}" for key, value in params.items())
+    )
     parsed = OverridesParser.create().parse_overrides(list(asked))
     return {found.key_or_group for found in parsed if found.is_sweep_override()}
 
@@ -139,7 +163,8 @@ def swept_settings(config: DictConfig) -> set[str]:
 def directory(config: DictConfig, swept: set[str]) -> str:
     """What tells a job's run from the others: key=value,... in the order of keys; "" if nothing does.
 
-    The value is that of the composed settings, so that 1e-3 and 0.001 are one, or the option of a group.
+    The value is that of the composed settings, so that 1e-3 and 0.001 are one, or the
+    option of a group.
     """
     choices = config.hydra.runtime.choices
     parts = []
@@ -156,8 +181,13 @@ def with_name(overrides: list[str], config: DictConfig, added: str) -> list[str]
     for key, name in names.items() if added else ():
         if key != "name" and name == config.name:
             continue  # it follows
-        escaped = re.sub(r"([\\()\[\]{}:=, \t])", r"\\\1", f"{name}/{added}")  # what Hydra reads as its own grammar
-        overrides = [*(word for word in overrides if not word.startswith(f"{key}=")), f"{key}={escaped}"]
+        escaped = re.sub(
+            r"([\\()\[\]{}:=, \t])", r"\\\1", f"{name}/{added}"
+        )  # what Hydra reads as its own grammar
+        overrides = [
+            *(word for word in overrides if not word.startswith(f"{key}=")),
+            f"{key}={escaped}",
+        ]
     return overrides
 
 
@@ -167,7 +197,11 @@ def _spelled(value: Any) -> str:
         value = OmegaConf.to_container(value, resolve=True)
     text = value if isinstance(value, str) else json.dumps(value)
     plain = "-".join(re.findall(r"[\w.+-]+", text, re.ASCII))
-    return text if text == plain and len(text) <= LONGEST else f"{plain[:LONGEST]}-{_hash(text)}"
+    return (
+        text
+        if text == plain and len(text) <= LONGEST
+        else f"{plain[:LONGEST]}-{_hash(text)}"
+    )
 
 
 def _hash(text: str) -> str:

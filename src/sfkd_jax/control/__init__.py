@@ -8,7 +8,9 @@ from sfkd_jax.control.laws._path_errors import PathErrors as PathErrors
 from sfkd_jax.control.laws._path_errors import no_feedback as no_feedback
 from sfkd_jax.control.laws._path_errors import path_errors as path_errors
 from sfkd_jax.control.laws._path_errors import path_feedback as path_feedback
-from sfkd_jax.control.laws._path_errors import reference_curvature as reference_curvature
+from sfkd_jax.control.laws._path_errors import (
+    reference_curvature as reference_curvature,
+)
 from sfkd_jax.control.laws._path_law import PathLaw as PathLaw
 from sfkd_jax.control.laws._path_law import at_turn as at_turn
 from sfkd_jax.control.laws._path_law import law_arrays as law_arrays
@@ -30,7 +32,9 @@ from sfkd_jax.control.planners._plans import Search as Search
 from sfkd_jax.control.planners._plans import Tuning as Tuning
 from sfkd_jax.control.planners._risk import risk_measure as risk_measure
 from sfkd_jax.control.planners._smoothing import plan_smoother as plan_smoother
-from sfkd_jax.control.planners._smoothing import savitzky_golay_weights as savitzky_golay_weights
+from sfkd_jax.control.planners._smoothing import (
+    savitzky_golay_weights as savitzky_golay_weights,
+)
 from sfkd_jax.control.planners._weights import count_effective as count_effective
 from sfkd_jax.control.planners._weights import softmin as softmin
 from sfkd_jax.control.planners._weights import temperature_for as temperature_for

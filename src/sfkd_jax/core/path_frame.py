@@ -1,9 +1,10 @@
 """Path coordinates: the car seen from the foot of the path beside it, and a step of the loop closed around it.
 
 A path state is a `State` whose pose is that of the foot point in its own frame, 0, and
-whose body is ξ = (e_y [m], e_ψ [rad], v [m/s], …): distance left of the path, yaw against
-it, and the vehicle's own body state. Its control is w = (ν, κ, v_ref): what is added to
-the law's control, the path's curvature [1/m] over the step, and the speed asked for [m/s].
+whose body is ξ = (e_y [m], e_ψ [rad], v [m/s], …): distance left of the path, yaw
+against it, and the vehicle's own body state. Its control is w = (ν, κ, v_ref): what is
+added to the law's control, the path's curvature [1/m] over the step, and the speed
+asked for [m/s].
 """
 
 from __future__ import annotations
@@ -26,7 +27,9 @@ PERTURBATION = slice(0, 2)
 CURVATURE, REFERENCE_SPEED = 2, 3
 """Where κ and v_ref stand in w."""
 SMALLEST_SCALE = 0.2
-"""Of 1 − κ e_y: beyond, the car is so near to the path's centre of curvature that its foot says little."""
+"""Of 1 − κ e_y: beyond, the car is so near to the path's centre of curvature that its
+foot says little.
+"""
 
 PathFeedback: TypeAlias = Callable[[PathState, Scalar, Scalar, Environment], Control]
 """(ξ, κ, v_ref, e) -> u, not yet clipped."""
@@ -41,7 +44,8 @@ def on_circle(pose: Pose, curvature: Scalar) -> tuple[Scalar, Scalar]:
     `SMALLEST_SCALE`, so that the result is finite wherever the car is; see `is_valid`.
 
     Args:
-        pose: x [m], y [m], yaw [rad] in the frame that touches the circle at its origin.
+        pose: x [m], y [m], yaw [rad] in the frame that touches the circle at its
+            origin.
         curvature: κ [1/m], left positive.
     """
     x, y, yaw = pose[0], pose[1], pose[2]
@@ -51,7 +55,9 @@ def on_circle(pose: Pose, curvature: Scalar) -> tuple[Scalar, Scalar]:
     return -q / (1.0 + scale), wrap_angle(yaw - turned)
 
 
-def is_valid(lateral: Float[Array, "*shape"], curvature: Float[Array, "*shape"]) -> Bool[Array, "*shape"]:
+def is_valid(
+    lateral: Float[Array, "*shape"], curvature: Float[Array, "*shape"]
+) -> Bool[Array, "*shape"]:
     """Whether path coordinates mean something: 1 − κ e_y > 0.2; False for NaN."""
     return 1.0 - curvature * lateral > SMALLEST_SCALE
 
@@ -66,10 +72,14 @@ def beside(coordinates: PathState) -> State:
     return jnp.concatenate([jnp.zeros(1), coordinates])
 
 
-def path_step(step: Step) -> Callable[[PathState, Control, Scalar, Environment], PathState]:
+def path_step(
+    step: Step,
+) -> Callable[[PathState, Control, Scalar, Environment], PathState]:
     """(ξ, u, κ, e) -> ξ one period later, of a vehicle's step; exact on a circle of curvature κ."""
 
-    def along(coordinates: PathState, control: Control, curvature: Scalar, env: Environment) -> PathState:
+    def along(
+        coordinates: PathState, control: Control, curvature: Scalar, env: Environment
+    ) -> PathState:
         after = step(beside(coordinates), control, env)
         lateral, heading = on_circle(after[POSE], curvature)
         return jnp.concatenate([jnp.stack([lateral, heading]), after[BODY]])
@@ -77,11 +87,14 @@ def path_step(step: Step) -> Callable[[PathState, Control, Scalar, Environment],
     return along
 
 
-def closed_loop(step: Step, law: PathFeedback, low: tuple[float, ...], high: tuple[float, ...]) -> Step:
+def closed_loop(
+    step: Step, law: PathFeedback, low: tuple[float, ...], high: tuple[float, ...]
+) -> Step:
     """(path state, w, e) -> path state: ξ⁺ = F(ξ, clip(law(ξ; κ, v_ref, e) + ν); κ, e).
 
     Args:
-        step: of the vehicle, in the world. law: around which the loop is closed.
+        step: of the vehicle, in the world.
+        law: around which the loop is closed.
         low, high: limits of the vehicle's controls.
     """
     along = path_step(step)

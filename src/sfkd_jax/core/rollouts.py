@@ -11,10 +11,22 @@ from jaxtyping import Array, Float
 
 from sfkd_jax.core.path_frame import HEADING, LATERAL, PATH_SPEED
 from sfkd_jax.core.se2 import between, wrap_angle
-from sfkd_jax.types import BODY, POSE, Control, Fiber, Latent, Model, Params, State, Trajectory
+from sfkd_jax.types import (
+    BODY,
+    POSE,
+    Control,
+    Fiber,
+    Latent,
+    Model,
+    Params,
+    State,
+    Trajectory,
+)
 
 
-def fibers_along(model: Model, params: Params, trajectory: Trajectory) -> tuple[Fiber, Fiber]:
+def fibers_along(
+    model: Model, params: Params, trajectory: Trajectory
+) -> tuple[Fiber, Fiber]:
     """Fibres of e_0 … e_{T-1} and of the environment one step later (the last is held)."""
     fibers = jax.vmap(model.fiber, in_axes=(None, 0))(params, trajectory.envs)
     later = jax.tree.map(lambda leaf: jnp.concatenate([leaf[1:], leaf[-1:]]), fibers)
@@ -45,7 +57,9 @@ def every_window(trajectory: Trajectory, *, horizon: int, stride: int) -> Trajec
     """
     steps = trajectory.controls.shape[0]
     if horizon > steps:
-        raise ValueError(f"a horizon of {horizon} steps does not fit trajectories of {steps} steps")
+        raise ValueError(
+            f"a horizon of {horizon} steps does not fit trajectories of {steps} steps"
+        )
     starts = jnp.arange(0, steps - horizon + 1, stride)
     states = trajectory.states[starts[:, None] + jnp.arange(horizon + 1)]
     inside = starts[:, None] + jnp.arange(horizon)
@@ -58,29 +72,42 @@ def window_errors(
     """`prediction_errors` 1 … horizon steps ahead, from every `stride`-th true state.
 
     Args:
-        model, params: any model. trajectory: one, states (T + 1, state). horizon, stride: steps.
+        model, params: any model.
+        trajectory: one, states (T + 1, state).
+        horizon, stride: steps.
 
     Raises:
         ValueError: the horizon does not fit the trajectory.
     """
 
     def one(window: Trajectory) -> Float[Array, "horizon 3"]:
-        return prediction_errors(rollout(model, params, window)[0], window, along_path=model.along_path)
+        return prediction_errors(
+            rollout(model, params, window)[0], window, along_path=model.along_path
+        )
 
     return jax.vmap(one)(every_window(trajectory, horizon=horizon, stride=stride))
 
 
 def prediction_errors(
-    predicted: Float[Array, "horizon state"], window: Trajectory, *, along_path: bool = False
+    predicted: Float[Array, "horizon state"],
+    window: Trajectory,
+    *,
+    along_path: bool = False,
 ) -> Float[Array, "horizon 3"]:
     """Distance between positions [m], |yaw| [rad] (wrapped), 2-norm of the body state in its own units.
 
     Along a path: |e_y| [m], |e_ψ| [rad], 2-norm of the vehicle's own body state.
     """
     gap = predicted - window.states[1:]
-    kinds = _kinds_along_path(gap) if along_path else (gap[:, :2], gap[:, 2:3], gap[:, BODY])
+    kinds = (
+        _kinds_along_path(gap)
+        if along_path
+        else (gap[:, :2], gap[:, 2:3], gap[:, BODY])
+    )
     position, yaw, body = kinds
-    return jnp.column_stack([jnp.linalg.norm(kind, axis=1) for kind in (position, wrap_angle(yaw), body)])
+    return jnp.column_stack(
+        [jnp.linalg.norm(kind, axis=1) for kind in (position, wrap_angle(yaw), body)]
+    )
 
 
 def _kinds_along_path(gap: Float[Array, "*batch state"]) -> tuple[Array, Array, Array]:
@@ -92,17 +119,26 @@ def _kinds_along_path(gap: Float[Array, "*batch state"]) -> tuple[Array, Array, 
 def in_batches(function: Callable[[Any], Any], items: Any, *, size: int) -> Any:
     """`function` of every item along the leading axis, `size` of them at a time.
 
-    The last batch is filled up and what fills it is dropped: `jax.lax.map` would compile a second program for the rest.
+    The last batch is filled up and what fills it is dropped: `jax.lax.map` would
+    compile a second program for the rest.
     """
     count = jax.tree.leaves(items)[0].shape[0]
     size = min(size, count)
     rows = (jnp.arange(-(-count // size) * size) % count).reshape(-1, size)
-    found = jax.lax.map(lambda chosen: jax.vmap(function)(jax.tree.map(lambda leaf: leaf[chosen], items)), rows)
+    found = jax.lax.map(
+        lambda chosen: jax.vmap(function)(
+            jax.tree.map(lambda leaf: leaf[chosen], items)
+        ),
+        rows,
+    )
     return jax.tree.map(lambda leaf: leaf.reshape(-1, *leaf.shape[2:])[:count], found)
 
 
 def defects(
-    model: Model, params: Params, trajectory: Trajectory, along: tuple[Fiber, Fiber] | None = None
+    model: Model,
+    params: Params,
+    trajectory: Trajectory,
+    along: tuple[Fiber, Fiber] | None = None,
 ) -> tuple[Float[Array, "time rank"], Float[Array, "time state"]]:
     """One-step disturbances d_k, and beside them the states that each single step predicts.
 
@@ -125,7 +161,13 @@ def defects(
 
 
 def step_disturbances(
-    model: Model, fiber: Fiber, fiber_next: Fiber, origin: Latent, before: State, control: Control, after: State
+    model: Model,
+    fiber: Fiber,
+    fiber_next: Fiber,
+    origin: Latent,
+    before: State,
+    control: Control,
+    after: State,
 ) -> Float[Array, " 4"]:
     """How far one step fell from its prediction, of each kind: latent, position [m], yaw [rad], body state.
 
@@ -134,14 +176,18 @@ def step_disturbances(
         |z' − ẑ'|, |p(g⁻¹ g') − p(g⁻¹ ĝ')|, |yaw(g⁻¹ g') − yaw(g⁻¹ ĝ')|, |s' − ŝ'|,   ẑ' = T(e → e') F(z, u, e)
 
     Args:
-        model: any model. fiber, fiber_next: of e and e'.
-        origin: a latent whose frame z and z' share; `model.encode(fiber, before)` starts a new one at x.
+        model: any model.
+        fiber, fiber_next: of e and e'.
+        origin: a latent whose frame z and z' share; `model.encode(fiber, before)`
+            starts a new one at x.
         before, control, after: x, u, x'.
     """
     now = model.observe(fiber, origin, before)
     expected = model.transport(fiber, fiber_next, model.step(fiber, now, control))
     predicted = model.decode(fiber_next, expected)
-    gap = model.vector(model.observe(fiber_next, origin, after)) - model.vector(expected)
+    gap = model.vector(model.observe(fiber_next, origin, after)) - model.vector(
+        expected
+    )
     motion = between(before[POSE], predicted[POSE]) - between(before[POSE], after[POSE])
     kinds = (motion[:2], motion[2:], predicted[BODY] - after[BODY])
     if model.along_path:

@@ -17,13 +17,17 @@ def rotate(angle: Float[Array, ""], vector: Float[Array, " 2"]) -> Float[Array, 
     return jnp.stack([c * vector[0] - s * vector[1], s * vector[0] + c * vector[1]])
 
 
-def compose(pose: Float[Array, " 3"], increment: Float[Array, " 3"]) -> Float[Array, " 3"]:
+def compose(
+    pose: Float[Array, " 3"], increment: Float[Array, " 3"]
+) -> Float[Array, " 3"]:
     """g ∘ Δ: the pose reached from `pose` by a motion `increment` given in its own frame (yaw not wrapped)."""
     position = pose[:2] + rotate(pose[2], increment[:2])
     return jnp.concatenate([position, pose[2:] + increment[2:]])
 
 
-def between(pose: Float[Array, " 3"], pose_next: Float[Array, " 3"]) -> Float[Array, " 3"]:
+def between(
+    pose: Float[Array, " 3"], pose_next: Float[Array, " 3"]
+) -> Float[Array, " 3"]:
     """g⁻¹ ∘ g': the motion from `pose` to `pose_next` in the frame of `pose`, yaw wrapped."""
     position = rotate(-pose[2], pose_next[:2] - pose[:2])
     return jnp.concatenate([position, wrap_angle(pose_next[2:] - pose[2:])])

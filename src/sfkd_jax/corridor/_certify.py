@@ -24,7 +24,14 @@ from sfkd_jax.certification import (
 )
 from sfkd_jax.control import admit
 from sfkd_jax.core.path_frame import PATH_SPEED, path_state
-from sfkd_jax.corridor._drives import EXCITATION, ROADS, Loop, closed, driving, measuring
+from sfkd_jax.corridor._drives import (
+    EXCITATION,
+    ROADS,
+    Loop,
+    closed,
+    driving,
+    measuring,
+)
 from sfkd_jax.datasets import drive_switching, generate_s3_along_path
 from sfkd_jax.evaluation import Outcome, Tube, attack_corridor, outcome_of
 from sfkd_jax.types import Control, Key
@@ -46,39 +53,61 @@ def certify_corridor(
 ) -> dict[str, Any]:
     """The document's part about a corridor.
 
-    Its class: any switching in E that holds for at least the dwell time, roads and perturbations ν like those of the
-    data set, the law seeing the car through the sensors, drives of `duration`. Three times `drives` are made: one part
-    fixes the units, one calibrates, one tests. S3's own schedule is none of them and is tested on as well.
+    Its class: any switching in E that holds for at least the dwell time, roads and
+    perturbations ν like those of the data set, the law seeing the car through the
+    sensors, drives of `duration`. Three times `drives` are made: one part fixes the
+    units, one calibrates, one tests. S3's own schedule is none of them and is tested on
+    as well.
 
     Args:
-        settings: of the run. trained: its policy, with a law. outputs: proved metrics.
-        drives: of each part. duration: of a drive [s]. dwell: range of times between switches [s].
-        horizon: preview of the shield [steps]. attack_steps: of the search for drives that leave the corridor.
+        settings: of the run.
+        trained: its policy, with a law.
+        outputs: proved metrics.
+        drives: of each part.
+        duration: of a drive [s].
+        dwell: range of times between switches [s].
+        horizon: preview of the shield [steps].
+        attack_steps: of the search for drives that leave the corridor.
 
     Raises:
         ValueError: too few drives for the level, or a policy without a law.
     """
     began = time.perf_counter()
-    loop = closed(build.build_vehicle(settings["vehicle"]), trained, settings["evaluation"]["observation_noise"])
+    loop = closed(
+        build.build_vehicle(settings["vehicle"]),
+        trained,
+        settings["evaluation"]["observation_noise"],
+    )
     level, data = settings["certification"]["level"], build.without(settings["dataset"])
     roads = {name: data[name] for name in ROADS}
     box = {name: data[name] for name in ("env_low", "env_high")}
     asked = roads | {name: data[name] for name in EXCITATION}
-    *drive_keys, sensor_key, attack_key = jax.random.split(jax.random.fold_in(jax.random.key(data["seed"]), STREAM), 6)
+    *drive_keys, sensor_key, attack_key = jax.random.split(
+        jax.random.fold_in(jax.random.key(data["seed"]), STREAM), 6
+    )
     options = driving(loop, asked, duration)
-    switching = partial(drive_switching, loop.plant, drives=drives, dwell=dwell, **box, **options)
+    switching = partial(
+        drive_switching, loop.plant, drives=drives, dwell=dwell, **box, **options
+    )
     held_out = partial(generate_s3_along_path, loop.plant, segments=drives, **options)
     kinds = (switching, switching, switching, held_out)
     measure = measuring(loop, outputs)
     found = [
         measure(jax.jit(kind)(drive_key), key)
-        for kind, drive_key, key in zip(kinds, drive_keys, jax.random.split(sensor_key, len(kinds)), strict=True)
+        for kind, drive_key, key in zip(
+            kinds, drive_keys, jax.random.split(sensor_key, len(kinds)), strict=True
+        )
     ]
     units, known, fresh, s3 = (part.scores for part in found)
     bounds = calibrate(units, known, level=level)
     searching = box | roads | {"dwell": dwell[0], "steps": attack_steps}
     lateral, copied = found[2].lateral, found[2].copied
-    about = {"env_box": [*box.values()], "dwell_s": dwell, "duration_s": duration, "sensor_noise": loop.noise}
+    about = {
+        "env_box": [*box.values()],
+        "dwell_s": dwell,
+        "duration_s": duration,
+        "sensor_noise": loop.noise,
+    }
     return {
         "class": asked | about | {"perturbation": loop.law.perturbation.tolist()},
         "level": level,
@@ -91,8 +120,12 @@ def certify_corridor(
             "distance_m": float(np.max(np.abs(lateral - copied))),
             "lateral_m": float(np.max(np.abs(lateral))),
         },
-        "fixed_points": _at_rest(loop, outputs["position"], [part.roads for part in found[:3]], bounds, about),
-        "attack": _attack(loop, attack_key, outputs["position"], bounds, searching, horizon),
+        "fixed_points": _at_rest(
+            loop, outputs["position"], [part.roads for part in found[:3]], bounds, about
+        ),
+        "attack": _attack(
+            loop, attack_key, outputs["position"], bounds, searching, horizon
+        ),
         "shield_horizon": horizon,
         "seconds": time.perf_counter() - began,
     }
@@ -113,10 +146,19 @@ def _at_rest(
     steps = np.stack([driven[:, :-1], driven[:, 1:]], axis=2)
     changes = np.abs(steps[:, :, 1] - steps[:, :, 0])
     sharpness = np.abs(steps[:, :, 0, 0]) * steps[:, :, 0, 1] ** 2
-    chosen = [np.argmax(size, axis=1) for size in (changes[..., 0], changes[..., 1], sharpness)]
+    chosen = [
+        np.argmax(size, axis=1)
+        for size in (changes[..., 0], changes[..., 1], sharpness)
+    ]
     telling = np.concatenate([steps[np.arange(len(steps)), index] for index in chosen])
-    start = path_state(jnp.zeros(len(loop.plant.state_names) - 3).at[PATH_SPEED].set(telling[0, 0, 1]))
-    asked = {"env_box": about["env_box"], "perturbation": loop.law.perturbation, "start": start}
+    start = path_state(
+        jnp.zeros(len(loop.plant.state_names) - 3).at[PATH_SPEED].set(telling[0, 0, 1])
+    )
+    asked = {
+        "env_box": about["env_box"],
+        "perturbation": loop.law.perturbation,
+        "start": start,
+    }
     found = fixed_points(loop.model, loop.params, claim, jnp.asarray(telling), **asked)
     return fixed_point_corridor(
         found,
@@ -138,22 +180,31 @@ def _attack(
     """The worst drives that a search finds, without the shield and with it, against what is claimed.
 
     Raises:
-        CertificateContradicted: a car left its tube while the disturbances kept their bound, which is impossible.
+        CertificateContradicted: a car left its tube while the disturbances kept their
+            bound, which is impossible.
     """
     model, params, limit = loop.model, loop.params, loop.law.perturbation
     width, bound = bounds["nominal"], bounds["followed_position"]
     factor = jnp.asarray(np.linalg.cholesky(claim.metric), dtype=float)
     tube = Tube(claim.alpha, claim.lipschitz, factor, bound)
-    search = partial(attack_corridor, loop.plant, model, tube=tube, perturbation=limit, **options)
+    search = partial(
+        attack_corridor, loop.plant, model, tube=tube, perturbation=limit, **options
+    )
     found = jax.jit(search)(params, key)
 
     def shielded(drives: Any) -> Outcome:
         length = len(drives.inputs)
-        ahead = jnp.minimum(jnp.arange(length)[:, None] + jnp.arange(horizon), length - 1)
+        ahead = jnp.minimum(
+            jnp.arange(length)[:, None] + jnp.arange(horizon), length - 1
+        )
         roads = drives.inputs[ahead, 2:]
 
-        def let_through(fiber: Any, latent: Any, wanted: Control, index: Any) -> Control:
-            return admit(model, fiber, latent, wanted, roads[index], limit, width=width).nu
+        def let_through(
+            fiber: Any, latent: Any, wanted: Control, index: Any
+        ) -> Control:
+            return admit(
+                model, fiber, latent, wanted, roads[index], limit, width=width
+            ).nu
 
         return outcome_of(loop.plant, model, params, tube, drives, let_through)
 

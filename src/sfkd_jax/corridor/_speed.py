@@ -17,7 +17,9 @@ from sfkd_jax.datasets import drive_switching
 from sfkd_jax.types import Key, Scalar, Trajectory
 
 FRICTION = 0
-"""Of the entries of e, the one that is held in a cell; the others switch within their range."""
+"""Of the entries of e, the one that is held in a cell; the others switch within their
+range.
+"""
 PARTS = 3
 """Drives fix units, calibrate and test."""
 
@@ -33,20 +35,26 @@ def corridor_by_speed(
 ) -> dict[str, Any]:
     """A corridor for every friction and speed, each calibrated by itself, on the drives of the class that have both.
 
-    Roads, perturbations ν, sensors, duration and level are those of the certified class; wind switches as in it. The
-    road of a cell bends by at most `curvature`, which the class lets fall with speed once v² κ reaches its limit.
+    Roads, perturbations ν, sensors, duration and level are those of the certified
+    class; wind switches as in it. The road of a cell bends by at most `curvature`,
+    which the class lets fall with speed once v² κ reaches its limit.
 
     Args:
-        trained: with a law. certificate: verified, with a corridor.
-        frictions: [-]. speeds: asked for [m/s]. Both inside the certified box; nothing is extrapolated.
-        drives: of each of three parts in every cell: one fixes the units, one calibrates, one tests.
+        trained: with a law.
+        certificate: verified, with a corridor.
+        frictions: [-].
+        speeds: asked for [m/s]. Both inside the certified box; nothing is extrapolated.
+        drives: of each of three parts in every cell: one fixes the units, one
+            calibrates, one tests.
 
     Returns:
-        `cells`, in the order of frictions and then speeds: `corridor_m` = `nominal_m` + `tube_m`, each with its
-        coverage, and the largest |e_y| of its test drives, `lateral_m`; beside them the coverage of all cells together.
+        `cells`, in the order of frictions and then speeds: `corridor_m` = `nominal_m` +
+        `tube_m`, each with its coverage, and the largest |e_y| of its test drives,
+        `lateral_m`; beside them the coverage of all cells together.
 
     Raises:
-        ValueError: a friction or a speed outside the box, too few drives for the level, or a policy without a law.
+        ValueError: a friction or a speed outside the box, too few drives for the level,
+            or a policy without a law.
         KeyError: a certificate without a corridor.
     """
     began = time.perf_counter()
@@ -57,7 +65,10 @@ def corridor_by_speed(
     _require_inside("speed", speeds, about["speed"])
     loop = closed(trained.vehicle, trained, about["sensor_noise"])
     measure = measuring(loop, claims_of(certificate["outputs"]))
-    options = driving(loop, about, about["duration_s"]) | {"drives": drives, "dwell": about["dwell_s"]}
+    options = driving(loop, about, about["duration_s"]) | {
+        "drives": drives,
+        "dwell": about["dwell_s"],
+    }
 
     @jax.jit
     def drive(key: Key, friction: Scalar, speed: Scalar) -> Trajectory:
@@ -71,14 +82,21 @@ def corridor_by_speed(
     cells = []
     for friction in frictions:
         for speed in speeds:
-            keys = jax.random.split(jax.random.fold_in(jax.random.key(seed), len(cells)), (PARTS, 2))
-            parts = [measure(drive(drive_key, friction, speed), key) for drive_key, key in keys]
+            keys = jax.random.split(
+                jax.random.fold_in(jax.random.key(seed), len(cells)), (PARTS, 2)
+            )
+            parts = [
+                measure(drive(drive_key, friction, speed), key)
+                for drive_key, key in keys
+            ]
             units, scores, fresh = (part.scores for part in parts)
             bounds = calibrate(units, scores, level=level)
             cell = {
                 "friction": friction,
                 "speed": speed,
-                "curvature": min(about["peak_curvature"], about["lateral_acceleration"] / speed**2),
+                "curvature": min(
+                    about["peak_curvature"], about["lateral_acceleration"] / speed**2
+                ),
                 "corridor_m": bounds["nominal"] + bounds["followed_position"],
                 "nominal_m": bounds["nominal"],
                 "tube_m": bounds["followed_position"],
@@ -97,14 +115,18 @@ def corridor_by_speed(
     }
 
 
-def fastest(cells: Sequence[Mapping[str, Any]], room: float) -> dict[float, float | None]:
+def fastest(
+    cells: Sequence[Mapping[str, Any]], room: float
+) -> dict[float, float | None]:
     """The largest speed by friction at which the corridor, and that of every lower speed, fits into a lane.
 
     Args:
-        cells: of `corridor_by_speed`. room: what the lane leaves on either side of the car [m].
+        cells: of `corridor_by_speed`.
+        room: what the lane leaves on either side of the car [m].
 
     Returns:
-        Speeds [m/s] out of the cells; None where not even the lowest fits. Nothing is interpolated.
+        Speeds [m/s] out of the cells; None where not even the lowest fits. Nothing is
+        interpolated.
     """
     found: dict[float, float | None] = {}
     closed_off = set()
@@ -121,4 +143,6 @@ def fastest(cells: Sequence[Mapping[str, Any]], room: float) -> dict[float, floa
 def _require_inside(name: str, values: Sequence[float], box: Sequence[float]) -> None:
     """Refuse what lies outside the box that was certified."""
     if outside := [value for value in values if not box[0] <= value <= box[1]]:
-        raise ValueError(f"{name} {outside[0]:g} lies outside what is certified, {box[0]:g} to {box[1]:g}")
+        raise ValueError(
+            f"{name} {outside[0]:g} lies outside what is certified, {box[0]:g} to {box[1]:g}"
+        )

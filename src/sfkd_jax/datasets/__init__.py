@@ -13,7 +13,9 @@ from sfkd_jax.datasets._path_drives import check_on_path as check_on_path
 from sfkd_jax.datasets._path_drives import drive_along_path as drive_along_path
 from sfkd_jax.datasets._path_drives import drive_switching as drive_switching
 from sfkd_jax.datasets._path_drives import generate_along_path as generate_along_path
-from sfkd_jax.datasets._path_drives import generate_s3_along_path as generate_s3_along_path
+from sfkd_jax.datasets._path_drives import (
+    generate_s3_along_path as generate_s3_along_path,
+)
 from sfkd_jax.datasets._splits import Dataset as Dataset
 from sfkd_jax.datasets._splits import check_shares as check_shares
 from sfkd_jax.datasets._splits import first_share as first_share

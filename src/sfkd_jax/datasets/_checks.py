@@ -11,11 +11,15 @@ from jaxtyping import Bool, Float
 from sfkd_jax.datasets._logs import Columns, Log
 
 SLOWER = 1.2
-"""A log whose period is this many times the model's is refused: rows between its own would be invented."""
+"""A log whose period is this many times the model's is refused: rows between its own
+would be invented.
+"""
 LARGEST = 1e38
 """What float32, in which segments are held, holds of a difference of two."""
 STALE = 0.2
-"""Share of rows with the very position of the row before, though driving, from which positions count as stale."""
+"""Share of rows with the very position of the row before, though driving, from which
+positions count as stale.
+"""
 
 
 class Finding(NamedTuple):
@@ -27,11 +31,19 @@ class Finding(NamedTuple):
 
 def channels(log: Log, columns: Columns) -> dict[str, Float[np.ndarray, " time"]]:
     """Every column of a drive by its name; an environment that nobody measured has none."""
-    named = zip(("state", "control", "environment"), (log.states, log.controls, log.envs), strict=True)
+    named = zip(
+        ("state", "control", "environment"),
+        (log.states, log.controls, log.envs),
+        strict=True,
+    )
     found = {columns.time: log.time}
     for setting, values in named:
         names = getattr(columns, setting)
-        found |= {name: values[:, k] for k, name in enumerate(names) if len(names) == values.shape[1]}
+        found |= {
+            name: values[:, k]
+            for k, name in enumerate(names)
+            if len(names) == values.shape[1]
+        }
     return found
 
 
@@ -40,17 +52,25 @@ def check_rows(log: Log, columns: Columns) -> Iterator[Finding]:
     for name, values in channels(log, columns).items():
         bad = ~np.isfinite(values) | (np.abs(values) > LARGEST)
         if bad.any():
-            yield Finding(f"{_first(log, bad)}: {name} is {values[bad.argmax()]}{more(bad)}")
+            yield Finding(
+                f"{_first(log, bad)}: {name} is {values[bad.argmax()]}{more(bad)}"
+            )
     if np.isfinite(log.time).all() and (back := np.diff(log.time) <= 0).any():
         k = int(back.argmax())
         before, after = log.time[k], log.time[k + 1]
-        says = f"repeats {after:.12g}" if before == after else f"goes back from {before:.12g} to {after:.12g}"
+        says = (
+            f"repeats {after:.12g}"
+            if before == after
+            else f"goes back from {before:.12g} to {after:.12g}"
+        )
         yield Finding(
             f"{log.at(k + 1)}: {columns.time} {says}{more(back)}; two drives in one file? dataset.columns.drive"
         )
 
 
-def check_motion(log: Log, columns: Columns, *, dt: float, gap: float) -> Iterator[Finding]:
+def check_motion(
+    log: Log, columns: Columns, *, dt: float, gap: float
+) -> Iterator[Finding]:
     """Jumps of position and yaw, positions that are older than their rows, and sampling that is too slow or uneven."""
     waits = np.diff(log.time)
     period = float(np.median(waits))
@@ -62,7 +82,8 @@ def check_motion(log: Log, columns: Columns, *, dt: float, gap: float) -> Iterat
     if gaps.any():
         k = int(gaps.argmax())
         yield Finding(
-            f"{log.at(k + 1)}: {waits[k]:.4g} s without rows; drives are split there{more(gaps)}", refused=False
+            f"{log.at(k + 1)}: {waits[k]:.4g} s without rows; drives are split there{more(gaps)}",
+            refused=False,
         )
     uneven = (np.abs(waits - period) > 0.5 * period) & ~gaps
     if uneven.mean() > 0.1:
@@ -90,7 +111,9 @@ def check_motion(log: Log, columns: Columns, *, dt: float, gap: float) -> Iterat
     yield from _check_turns(log, columns, ~gaps)
 
 
-def _check_turns(log: Log, columns: Columns, near: Bool[np.ndarray, " step"]) -> Iterator[Finding]:
+def _check_turns(
+    log: Log, columns: Columns, near: Bool[np.ndarray, " step"]
+) -> Iterator[Finding]:
     """Yaw that is elsewhere at once, between rows that are near in time."""
     turned = np.abs(np.diff(np.unwrap(log.states[:, 2])))
     spins = near & (turned > max(1.0, 10.0 * float(np.median(turned))))

@@ -13,24 +13,38 @@ VISITED = 0.001
 """Share of all samples from which a bin counts as visited."""
 
 
-def coverage(values: Mapping[str, Float[np.ndarray, " sample"]]) -> dict[str, dict[str, float]]:
+def coverage(
+    values: Mapping[str, Float[np.ndarray, " sample"]],
+) -> dict[str, dict[str, float]]:
     """Per channel: range, middle 99.8 %, and the share of ten equal bins of the range that hold 0.1 % of the samples.
 
     Returns:
-        name -> {"low", "high", "low_998", "high_998", "bins_visited"}; a channel that never moves visits none.
+        name -> {"low", "high", "low_998", "high_998", "bins_visited"}; a channel that
+        never moves visits none.
     """
     found = {}
     for name, samples in values.items():
         low, high = float(samples.min()), float(samples.max())
         middle = np.quantile(samples, [0.001, 0.999])
-        counts = np.histogram(samples, BINS, (low, high))[0] if high > low else np.zeros(BINS)
+        counts = (
+            np.histogram(samples, BINS, (low, high))[0]
+            if high > low
+            else np.zeros(BINS)
+        )
         visited = float(np.mean(counts >= max(1.0, VISITED * len(samples))))
-        found[name] = {"low": low, "high": high, "low_998": float(middle[0]), "high_998": float(middle[1])}
+        found[name] = {
+            "low": low,
+            "high": high,
+            "low_998": float(middle[0]),
+            "high_998": float(middle[1]),
+        }
         found[name] |= {"bins_visited": visited}
     return found
 
 
-def coverage_lines(groups: Mapping[str, Mapping[str, Mapping[str, Any]]]) -> Iterator[str]:
+def coverage_lines(
+    groups: Mapping[str, Mapping[str, Mapping[str, Any]]],
+) -> Iterator[str]:
     """The same as a table for a person, one line a channel."""
     yield f"{'coverage':28}{'lowest':>11}{'highest':>11}{'middle 99.8 %':>24}{'tenths visited':>16}"
     for group, rows in groups.items():

@@ -22,33 +22,47 @@ class Deal(NamedTuple):
     whole: bool
 
 
-def deal(drives: Int[np.ndarray, " segment"], *, shares: tuple[float, ...], seed: int) -> Deal:
+def deal(
+    drives: Int[np.ndarray, " segment"], *, shares: tuple[float, ...], seed: int
+) -> Deal:
     """Deal whole drives, at random, if that comes near the shares; else cut each drive into four stretches of time.
 
-    Drives dealt whole leave nothing of a test or calibration drive in training. Where there are too few, the parts
-    are neighbours in time, and what is counted on them holds for more of the same drives, not for new ones.
+    Drives dealt whole leave nothing of a test or calibration drive in training. Where
+    there are too few, the parts are neighbours in time, and what is counted on them
+    holds for more of the same drives, not for new ones.
 
     Raises:
-        ValueError: shares that are not four positive numbers of sum 1, or too few segments for them.
+        ValueError: shares that are not four positive numbers of sum 1, or too few
+            segments for them.
     """
     check_shares(shares)
     names, sizes = np.unique(drives, return_counts=True)
     random = np.random.default_rng(seed)
     for _ in range(ATTEMPTS if len(names) >= len(shares) else 0):
         owner = _hand_out(sizes, np.asarray(shares), random.permutation(len(names)))
-        got = np.bincount(owner, weights=sizes, minlength=len(shares)) / len(drives) / shares
+        got = (
+            np.bincount(owner, weights=sizes, minlength=len(shares))
+            / len(drives)
+            / shares
+        )
         if got.min() >= 1 / TOLERANCE and got.max() <= TOLERANCE:
             return Deal(owner[np.searchsorted(names, drives)], whole=True)
     order = np.concatenate([(np.arange(size) + 0.5) / size for size in sizes])
     parts = np.empty(len(drives), dtype=int)
-    parts[np.argsort(drives, kind="stable")] = np.searchsorted(np.cumsum(shares)[:-1], order)
+    parts[np.argsort(drives, kind="stable")] = np.searchsorted(
+        np.cumsum(shares)[:-1], order
+    )
     if len(np.unique(parts)) < len(shares):
-        raise ValueError(f"{len(drives)} segments are too few for dataset.shares={list(shares)}; record more")
+        raise ValueError(
+            f"{len(drives)} segments are too few for dataset.shares={list(shares)}; record more"
+        )
     return Deal(parts, whole=False)
 
 
 def _hand_out(
-    sizes: Int[np.ndarray, " drive"], shares: np.ndarray, order: Int[np.ndarray, " drive"]
+    sizes: Int[np.ndarray, " drive"],
+    shares: np.ndarray,
+    order: Int[np.ndarray, " drive"],
 ) -> Int[np.ndarray, " drive"]:
     """Each drive in turn to the part that lacks most of its share."""
     lacking, owner = shares * sizes.sum(), np.empty(len(sizes), dtype=int)

@@ -16,19 +16,30 @@ def log_files(path: str) -> list[Path]:
     """The logs that a file, a folder or a glob means, sorted by name.
 
     Raises:
-        ValueError: there are none, some are of another kind, or two have the same contents.
+        ValueError: there are none, some are of another kind, or two have the same
+            contents.
         ArtefactError: one is a pipe, a device or a folder, or cannot be read.
     """
     if path in ("", "???"):
-        raise ValueError("dataset.path is not set: pass dataset.path=FILE, dataset.path=FOLDER or 'dataset.path=GLOB'")
+        raise ValueError(
+            "dataset.path is not set: pass dataset.path=FILE, dataset.path=FOLDER or 'dataset.path=GLOB'"
+        )
     place = Path(path).expanduser()
     known = ", ".join(SUFFIXES)
     if place.is_dir():
-        found = [file for file in sorted(place.iterdir()) if file.suffix.lower() in SUFFIXES and file.name[0] != "."]
+        found = [
+            file
+            for file in sorted(place.iterdir())
+            if file.suffix.lower() in SUFFIXES and file.name[0] != "."
+        ]
         if not found:
-            raise ValueError(f"{path}: no {known} in this folder; dataset.path takes globs such as logs/**/*.csv")
+            raise ValueError(
+                f"{path}: no {known} in this folder; dataset.path takes globs such as logs/**/*.csv"
+            )
     else:
-        matches = [str(place)] if place.is_file() else glob.glob(str(place), recursive=True)
+        matches = (
+            [str(place)] if place.is_file() else glob.glob(str(place), recursive=True)
+        )
         found = sorted(file for file in map(Path, matches) if file.is_file())
         if not found:
             raise ValueError(f"{path}: no such file or folder, and no file matches it")
@@ -37,7 +48,9 @@ def log_files(path: str) -> list[Path]:
     first: dict[str, Path] = {}
     for file in found:
         if (same := first.setdefault(digest(file), file)) != file:
-            raise ValueError(f"{file}: the same contents as {same}; remove one of them, or test drives are trained on")
+            raise ValueError(
+                f"{file}: the same contents as {same}; remove one of them, or test drives are trained on"
+            )
     return found
 
 
@@ -47,7 +60,9 @@ def fingerprint(path: str) -> str:
     Raises:
         ValueError: as for `log_files`.
     """
-    return hashlib.sha256("".join(sorted(map(digest, log_files(path)))).encode()).hexdigest()
+    return hashlib.sha256(
+        "".join(sorted(map(digest, log_files(path)))).encode()
+    ).hexdigest()
 
 
 def digest(file: Path) -> str:

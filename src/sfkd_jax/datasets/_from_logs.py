@@ -53,15 +53,22 @@ def from_logs(
     """Read drives, refuse what cannot be right, sample every dt, cut into segments, deal by whole drives.
 
     Args:
-        path: a file, a folder or a glob of .csv, .npz and .parquet. columns: how they name what they hold.
-        dt: of the model [s]. wheelbase: that steering is compared with [m]. limits: of the controls, low and high.
-        told: whether the environment must be in the logs. say: takes every line for a person.
-        steps: of a segment. gap: the longest wait between rows that is bridged, in periods.
-        shares: of training, validation, calibration and test. seed: of the deal.
+        path: a file, a folder or a glob of .csv, .npz and .parquet.
+        columns: how they name what they hold.
+        dt: of the model [s].
+        wheelbase: that steering is compared with [m].
+        limits: of the controls, low and high.
+        told: whether the environment must be in the logs.
+        say: takes every line for a person.
+        steps: of a segment.
+        gap: the longest wait between rows that is bridged, in periods.
+        shares: of training, validation, calibration and test.
+        seed: of the deal.
         env_low, env_high: the box E; None: as far as the logs reach.
 
     Raises:
-        ValueError: the first reason why the logs are refused; the others have been said.
+        ValueError: the first reason why the logs are refused; the others have been
+            said.
     """
     logs, unread = read_logs(path, columns, dt=dt, told=told)
     findings = [Finding(line) for line in unread]
@@ -69,7 +76,11 @@ def from_logs(
     for log in logs:
         found = list(_check(log, columns, dt, gap, steps))
         findings += found
-        sound += [] if any(finding.refused for finding in found) or len(log.time) < SHORTEST else [log]
+        sound += (
+            []
+            if any(finding.refused for finding in found) or len(log.time) < SHORTEST
+            else [log]
+        )
     if sound:
         findings += check_steering(sound, columns, wheelbase=wheelbase)
         findings += check_ranges(sound, columns, limits=limits, box=(env_low, env_high))
@@ -79,7 +90,9 @@ def from_logs(
     counts = np.bincount(dealt.parts, minlength=4).tolist()
     say(_summary(sound, cut, counts, dt))
     if not dealt.whole:
-        say("warning: too few drives to deal whole; each was cut in time, and coverage speaks of the same drives only")
+        say(
+            "warning: too few drives to deal whole; each was cut in time, and coverage speaks of the same drives only"
+        )
     dataset = _dataset(cut, dealt.parts, (env_low, env_high))
     covered = _covered(cut, columns)
     for line in coverage_lines(covered):
@@ -87,7 +100,9 @@ def from_logs(
     return Logged(dataset, covered)
 
 
-def _check(log: Log, columns: Columns, dt: float, gap: float, steps: int) -> Iterator[Finding]:
+def _check(
+    log: Log, columns: Columns, dt: float, gap: float, steps: int
+) -> Iterator[Finding]:
     """All that one drive can show; what depends on sound rows is looked at when they are."""
     found = list(check_rows(log, columns))
     yield from found
@@ -95,7 +110,10 @@ def _check(log: Log, columns: Columns, dt: float, gap: float, steps: int) -> Ite
         return
     length = log.time[-1] - log.time[0]
     if length < (steps - 1e-3) * dt:
-        yield Finding(f"{log.whole}: only {length:.4g} s, a segment is {steps * dt:.4g} s; not used", refused=False)
+        yield Finding(
+            f"{log.whole}: only {length:.4g} s, a segment is {steps * dt:.4g} s; not used",
+            refused=False,
+        )
     if len(log.time) < SHORTEST:
         return
     units = list(check_units(log, columns))
@@ -114,7 +132,10 @@ def _tell(findings: list[Finding], say: Callable[[str], None]) -> None:
         if len(lines) > MOST_SAID:
             say(f"and {len(lines) - MOST_SAID} lines more like these")
     if refused:
-        raise ValueError(refused[0] + (f" (the first of {len(refused)} findings)" if refused[1:] else ""))
+        raise ValueError(
+            refused[0]
+            + (f" (the first of {len(refused)} findings)" if refused[1:] else "")
+        )
 
 
 def _summary(logs: list[Log], cut: Segments, counts: list[int], dt: float) -> str:
@@ -122,7 +143,9 @@ def _summary(logs: list[Log], cut: Segments, counts: list[int], dt: float) -> st
     seconds = sum(log.time[-1] - log.time[0] for log in logs)
     steps = cut.controls.shape[1]
     rate = np.median(np.concatenate([np.diff(log.time) for log in logs]))
-    parts = ", ".join(f"{count} {name}" for count, name in zip(counts, Dataset._fields, strict=False))
+    parts = ", ".join(
+        f"{count} {name}" for count, name in zip(counts, Dataset._fields, strict=False)
+    )
     return (
         f"{len(logs)} drives, {seconds:.0f} s at {1 / rate:.4g} Hz; sampled every {dt:g} s (states linearly, yaw "
         f"unwrapped; controls and environment held); {len(cut.drives)} segments of {steps} steps, "
@@ -132,9 +155,17 @@ def _summary(logs: list[Log], cut: Segments, counts: list[int], dt: float) -> st
 
 def _dataset(cut: Segments, parts: Int[np.ndarray, " segment"], box: Ends) -> Dataset:
     """Arrays as models take them."""
-    drives = {name: len(np.unique(cut.drives[parts == k])) for k, name in enumerate(Dataset._fields[:4])}
+    drives = {
+        name: len(np.unique(cut.drives[parts == k]))
+        for k, name in enumerate(Dataset._fields[:4])
+    }
     dealt = [
-        Trajectory(*(jnp.asarray(part[parts == k], dtype=jnp.float32) for part in (cut.states, cut.controls, cut.envs)))
+        Trajectory(
+            *(
+                jnp.asarray(part[parts == k], dtype=jnp.float32)
+                for part in (cut.states, cut.controls, cut.envs)
+            )
+        )
         for k in range(4)
     ]
     low, high = environment_box(cut.envs, *box)
@@ -152,8 +183,14 @@ def environment_box(
     ends = (low, high)
     if low is None or high is None:
         anything = np.full(values.shape[1], ANYTHING)
-        ends = (values.min(axis=0), values.max(axis=0)) if values.any() else (-anything, anything)
-    return jnp.asarray(ends[0], dtype=jnp.float32), jnp.asarray(ends[1], dtype=jnp.float32)
+        ends = (
+            (values.min(axis=0), values.max(axis=0))
+            if values.any()
+            else (-anything, anything)
+        )
+    return jnp.asarray(ends[0], dtype=jnp.float32), jnp.asarray(
+        ends[1], dtype=jnp.float32
+    )
 
 
 def _covered(cut: Segments, columns: Columns) -> dict[str, dict[str, dict[str, float]]]:
@@ -164,6 +201,8 @@ def _covered(cut: Segments, columns: Columns) -> dict[str, dict[str, dict[str, f
         "environment": (columns.environment if cut.envs.any() else (), cut.envs),
     }
     return {
-        group: coverage(dict(zip(names, values.reshape(-1, values.shape[-1]).T, strict=False)))
+        group: coverage(
+            dict(zip(names, values.reshape(-1, values.shape[-1]).T, strict=False))
+        )
         for group, (names, values) in groups.items()
     }

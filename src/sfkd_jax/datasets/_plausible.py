@@ -36,7 +36,9 @@ class Stretches(NamedTuple):
     """A drive seen in stretches of about `LOOK`, those that moved.
 
     Attributes:
-        travelled: chord [m]. said: ∫ v dt [m]. course: direction of the chord, backwards where v < 0 [rad].
+        travelled: chord [m].
+        said: ∫ v dt [m].
+        course: direction of the chord, backwards where v < 0 [rad].
         middle: index of the row in the middle.
     """
 
@@ -51,11 +53,20 @@ def check_units(log: Log, columns: Columns) -> Iterator[Finding]:
     seen = _stretches(log, log.states[:, 3])
     moved, said = seen.travelled.sum(), np.abs(seen.said).sum()
     if moved == 0.0 and said == 0.0:
-        yield Finding(f"{log.whole}: neither position nor {columns.state[3]} ever moves", refused=False)
+        yield Finding(
+            f"{log.whole}: neither position nor {columns.state[3]} ever moves",
+            refused=False,
+        )
         return
     if moved == 0.0 or said == 0.0:
-        still, goes = ("the position", columns.state[3]) if moved == 0.0 else (columns.state[3], "the position")
-        yield Finding(f"{log.whole}: {still} stands still while {goes} moves; have columns changed places?")
+        still, goes = (
+            ("the position", columns.state[3])
+            if moved == 0.0
+            else (columns.state[3], "the position")
+        )
+        yield Finding(
+            f"{log.whole}: {still} stands still while {goes} moves; have columns changed places?"
+        )
         return
     ratio = moved / said
     if not AGREE[0] <= ratio <= AGREE[1]:
@@ -74,10 +85,18 @@ def _stretches(log: Log, speed: Float[np.ndarray, " time"]) -> Stretches:
     chord = log.states[reach:, :2] - log.states[:-reach, :2]
     travelled, said = np.linalg.norm(chord, axis=1), along[reach:] - along[:-reach]
     whole = log.time[reach:] - log.time[:-reach] < 1.5 * reach * period  # no gap inside
-    enough = [0.2 * np.max(np.abs(lengths), where=whole, initial=0.0) for lengths in (travelled, said)]
+    enough = [
+        0.2 * np.max(np.abs(lengths), where=whole, initial=0.0)
+        for lengths in (travelled, said)
+    ]
     moving = whole & ((travelled > enough[0]) | (np.abs(said) > enough[1]))
     course = np.arctan2(chord[:, 1], chord[:, 0]) + np.pi * (said < 0)
-    return Stretches(travelled[moving], said[moving], course[moving], np.flatnonzero(moving) + reach // 2)
+    return Stretches(
+        travelled[moving],
+        said[moving],
+        course[moving],
+        np.flatnonzero(moving) + reach // 2,
+    )
 
 
 def _cause(log: Log, columns: Columns, ratio: float) -> str:
@@ -89,7 +108,10 @@ def _cause(log: Log, columns: Columns, ratio: float) -> str:
     for name, values in channels(log, columns).items():
         seen = _stretches(log, values)
         said = np.abs(seen.said).sum()
-        if name not in (columns.time, *columns.state[:2]) and 0.9 * said <= seen.travelled.sum() <= 1.1 * said:
+        if (
+            name not in (columns.time, *columns.state[:2])
+            and 0.9 * said <= seen.travelled.sum() <= 1.1 * said
+        ):
             return f"{name} fits as the speed: have columns changed places?"
     return "wrong units, or columns changed places?"
 
@@ -102,9 +124,11 @@ def _check_heading(log: Log, columns: Columns, seen: Stretches) -> Iterator[Find
         f"{name} probably counts clockwise": -yaw,
         f"{name} is probably a compass heading (from north, clockwise), or {columns.state[0]} and {columns.state[1]} "
         "changed places": 0.5 * np.pi - yaw,
-        f"{name} is probably a compass heading in degrees": 0.5 * np.pi - np.deg2rad(yaw),
+        f"{name} is probably a compass heading in degrees": 0.5 * np.pi
+        - np.deg2rad(yaw),
         f"{name} probably counts from the y axis": yaw + 0.5 * np.pi,
-        f"{columns.state[3]} is probably of the wrong sign, or the robot drives backwards": yaw + np.pi,
+        f"{columns.state[3]} is probably of the wrong sign, or the robot drives backwards": yaw
+        + np.pi,
     }
     agreed = _agreement(seen.course - yaw)
     if abs(agreed) > 0.7 and abs(np.angle(agreed)) < 0.5:
@@ -115,11 +139,13 @@ def _check_heading(log: Log, columns: Columns, seen: Stretches) -> Iterator[Find
         yield Finding(f"{log.whole}: {off}; {best}")
     elif abs(agreed) > 0.7:
         yield Finding(
-            f"{log.whole}: {off} by {np.angle(agreed):.2f} rad throughout; is the sensor mounted askew?", False
+            f"{log.whole}: {off} by {np.angle(agreed):.2f} rad throughout; is the sensor mounted askew?",
+            False,
         )
     else:
         yield Finding(
-            f"{log.whole}: {off} at random; a robot that drives sideways, or columns that changed places?", False
+            f"{log.whole}: {off} at random; a robot that drives sideways, or columns that changed places?",
+            False,
         )
 
 
@@ -128,16 +154,23 @@ def _agreement(angles: Float[np.ndarray, " stretch"]) -> complex:
     return complex(np.mean(np.exp(1j * angles)))
 
 
-def check_steering(logs: list[Log], columns: Columns, *, wheelbase: float) -> Iterator[Finding]:
+def check_steering(
+    logs: list[Log], columns: Columns, *, wheelbase: float
+) -> Iterator[Finding]:
     """Whether yaw turns as a bicycle's would, ω = v tan δ / L: warns of its sign, its unit and the wheelbase."""
-    asked, turned = (np.concatenate(parts) for parts in zip(*map(_turns, logs), strict=True))
+    asked, turned = (
+        np.concatenate(parts) for parts in zip(*map(_turns, logs), strict=True)
+    )
     power = float(np.sqrt(np.mean(asked**2) * np.mean(turned**2)))
     if power == 0.0 or abs(alike := float(np.mean(asked * turned)) / power) < 0.6:
         return  # no angle of steering, or too little of it
     fits, name = float(np.mean(asked**2) / np.mean(asked * turned)), columns.control[0]
     where = span(logs)
     if alike < 0:
-        yield Finding(f"{where}: the robot turns against {name}; a positive one should turn it left", refused=False)
+        yield Finding(
+            f"{where}: the robot turns against {name}; a positive one should turn it left",
+            refused=False,
+        )
     elif not 0.6 < fits / wheelbase < 1.7:
         unit = f" or {name} is not in rad" if fits > 10 * wheelbase else ""
         says = f"{name} and yaw suggest a wheelbase of {fits:.3g} m, vehicle.wheelbase is {wheelbase:g}{unit}"
@@ -148,4 +181,6 @@ def _turns(log: Log) -> tuple[Float[np.ndarray, " step"], Float[np.ndarray, " st
     """v tan δ and the yaw rate, row by row; an angle that is none is left as it is."""
     steering = log.controls[:-1, 0]
     angle = np.tan(steering) if np.abs(log.controls[:, 0]).max() < 1.4 else steering
-    return log.states[:-1, 3] * angle, np.diff(np.unwrap(log.states[:, 2])) / np.diff(log.time)
+    return log.states[:-1, 3] * angle, np.diff(np.unwrap(log.states[:, 2])) / np.diff(
+        log.time
+    )

@@ -17,38 +17,66 @@ ROUNDED = 1e-5
 """How far outside its range a channel may be: float32 rounds."""
 
 
-def check_ranges(logs: list[Log], columns: Columns, *, limits: Ends, box: Ends) -> Iterator[Finding]:
+def check_ranges(
+    logs: list[Log], columns: Columns, *, limits: Ends, box: Ends
+) -> Iterator[Finding]:
     """Refuses controls that never move and environments outside E; warns of poor excitation and limits that are left.
 
     Args:
-        logs: all drives. columns: their names. limits: of the controls. box: E.
+        logs: all drives.
+        columns: their names.
+        limits: of the controls.
+        box: E.
     """
     where = span(logs)
     for k, name in enumerate(columns.control):
         held = np.concatenate([log.controls[:, k] for log in logs])
         kinds = len(np.unique(held))
         if np.ptp(held) <= 1e-9 * max(1.0, float(np.abs(held).max())):
-            yield Finding(f"{where}: {name} is always {held[0]:.4g}; without excitation nothing can be learned of it")
+            yield Finding(
+                f"{where}: {name} is always {held[0]:.4g}; without excitation nothing can be learned of it"
+            )
         elif kinds < 5:
-            yield Finding(f"{where}: {name} takes only {kinds} values; richer excitation teaches more", refused=False)
+            yield Finding(
+                f"{where}: {name} takes only {kinds} values; richer excitation teaches more",
+                refused=False,
+            )
     if limits[0] and limits[1]:
-        yield from _outside(logs, columns.control, "controls", (limits[0], limits[1]), "vehicle.control", refused=False)
+        yield from _outside(
+            logs,
+            columns.control,
+            "controls",
+            (limits[0], limits[1]),
+            "vehicle.control",
+            refused=False,
+        )
     low, high = box
     if low is None and high is None:
         return
     size = logs[0].envs.shape[1]
-    if low is None or high is None or {len(low), len(high)} != {size} or np.any(np.greater(low, high)):
+    if (
+        low is None
+        or high is None
+        or {len(low), len(high)} != {size}
+        or np.any(np.greater(low, high))
+    ):
         yield Finding(
             f"dataset.env_low and dataset.env_high must be {size} numbers each, the low ones not above the high"
         )
         return
-    names = columns.environment if len(columns.environment) == size else ("environment",) * size
+    names = (
+        columns.environment
+        if len(columns.environment) == size
+        else ("environment",) * size
+    )
     yield from _outside(logs, names, "envs", (low, high), "dataset.env", refused=True)
 
 
 def span(logs: list[Log]) -> str:
     """Where several drives stand, for a person."""
-    return logs[0].whole + (f" and {len(logs) - 1} drives more" if len(logs) > 1 else "")
+    return logs[0].whole + (
+        f" and {len(logs) - 1} drives more" if len(logs) > 1 else ""
+    )
 
 
 def _outside(

@@ -10,7 +10,9 @@ from jaxtyping import Float, Int
 from sfkd_jax.datasets._logs import Log
 
 SAME_MOMENT = 1e-5
-"""Moments this share of a period apart are one: what was recorded there is taken as it is."""
+"""Moments this share of a period apart are one: what was recorded there is taken as it
+is.
+"""
 
 
 class Piece(NamedTuple):
@@ -24,8 +26,8 @@ class Piece(NamedTuple):
 class Segments(NamedTuple):
     """Pieces cut to one length, (segment, …); `drives` says which drive each is from, in the order of time.
 
-    A position is counted from the segment's first, and yaw begins in (−π, π]: float32 has no digits to spare for
-    where on Earth a robot drove.
+    A position is counted from the segment's first, and yaw begins in (−π, π]: float32
+    has no digits to spare for where on Earth a robot drove.
     """
 
     states: Float[np.ndarray, "segment steps_plus_1 state"]
@@ -37,17 +39,29 @@ class Segments(NamedTuple):
 def pieces(log: Log, *, dt: float, gap: float) -> list[Piece]:
     """A drive split at its gaps and sampled every dt from each first moment on.
 
-    States are interpolated linearly, yaw after unwrapping; controls and environments are held from the row before
-    (zero order), so that a switch stays one.
+    States are interpolated linearly, yaw after unwrapping; controls and environments
+    are held from the row before (zero order), so that a switch stays one.
 
     Args:
-        log: rows that are finite, at increasing moments. dt: [s].
-        gap: the longest wait that is bridged, in periods: of the log or dt, whichever is longer.
+        log: rows that are finite, at increasing moments.
+        dt: [s].
+        gap: the longest wait that is bridged, in periods: of the log or dt, whichever
+            is longer.
     """
     waits = np.diff(log.time)
-    edges = np.flatnonzero(waits > gap * max(dt, float(np.median(waits)))) + 1 if len(waits) else []
+    edges = (
+        np.flatnonzero(waits > gap * max(dt, float(np.median(waits)))) + 1
+        if len(waits)
+        else []
+    )
     return [
-        _sampled(log.time[rows] - log.time[rows[0]], log.states[rows], log.controls[rows], log.envs[rows], dt)
+        _sampled(
+            log.time[rows] - log.time[rows[0]],
+            log.states[rows],
+            log.controls[rows],
+            log.envs[rows],
+            dt,
+        )
         for rows in np.split(np.arange(len(log.time)), edges)
     ]
 
@@ -62,10 +76,14 @@ def _sampled(
     """One stretch at the moments 0, dt, 2 dt, …; rows at these moments come out as they are."""
     moments = dt * np.arange(int(time[-1] / dt + SAME_MOMENT) + 1)
     nearest = np.searchsorted(0.5 * (time[1:] + time[:-1]), moments)
-    moments = np.where(np.abs(time[nearest] - moments) < SAME_MOMENT * dt, time[nearest], moments)
+    moments = np.where(
+        np.abs(time[nearest] - moments) < SAME_MOMENT * dt, time[nearest], moments
+    )
     smooth = np.column_stack([states[:, :2], np.unwrap(states[:, 2]), states[:, 3:]])
     held = np.searchsorted(time, moments, side="right")[:-1] - 1
-    sampled = np.column_stack([np.interp(moments, time, channel) for channel in smooth.T])
+    sampled = np.column_stack(
+        [np.interp(moments, time, channel) for channel in smooth.T]
+    )
     return Piece(sampled, controls[held], envs[held])
 
 
@@ -82,10 +100,23 @@ def segments(found: list[list[Piece]], *, steps: int) -> Segments:
                 stop = start + steps
                 states = part.states[start : stop + 1].copy()
                 states[:, :2] -= states[0, :2]
-                states[:, 2] -= 2.0 * np.pi * np.ceil((states[0, 2] - np.pi) / (2.0 * np.pi))
-                cut.append((Piece(states, part.controls[start:stop], part.envs[start:stop]), drive))
+                states[:, 2] -= (
+                    2.0 * np.pi * np.ceil((states[0, 2] - np.pi) / (2.0 * np.pi))
+                )
+                cut.append(
+                    (
+                        Piece(states, part.controls[start:stop], part.envs[start:stop]),
+                        drive,
+                    )
+                )
     if not cut:
-        longest = max((len(part.controls) for parts in found for part in parts), default=0)
-        raise ValueError(f"the longest drive without a gap has {longest} steps, a segment {steps}; pass dataset.steps")
-    states, controls, envs = (np.stack(arrays) for arrays in zip(*(piece for piece, _ in cut), strict=True))
+        longest = max(
+            (len(part.controls) for parts in found for part in parts), default=0
+        )
+        raise ValueError(
+            f"the longest drive without a gap has {longest} steps, a segment {steps}; pass dataset.steps"
+        )
+    states, controls, envs = (
+        np.stack(arrays) for arrays in zip(*(piece for piece, _ in cut), strict=True)
+    )
     return Segments(states, controls, envs, np.array([drive for _, drive in cut]))

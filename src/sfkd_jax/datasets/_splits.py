@@ -18,9 +18,13 @@ class Dataset(NamedTuple):
     """Four sets of trajectories, disjoint by trajectory, and the environment box E they were drawn from.
 
     Attributes:
-        train: fits weights. validation: selects. calibration: sets d_bar. test: reports, nothing else.
+        train: fits weights.
+        validation: selects.
+        calibration: sets d_bar.
+        test: reports, nothing else.
         env_low, env_high: E.
-        drives: how many independent drives each part was cut from, by its name; None where every trajectory is one.
+        drives: how many independent drives each part was cut from, by its name; None
+            where every trajectory is one.
     """
 
     train: Trajectory
@@ -39,7 +43,9 @@ def check_shares(shares: tuple[float, ...]) -> None:
         ValueError: shares that are not four, positive and of sum 1.
     """
     if len(shares) != 4 or not min(shares) > 0 or not abs(sum(shares) - 1.0) <= 1e-6:
-        raise ValueError(f"dataset.shares must be four positive numbers of sum 1, got {tuple(shares)}")
+        raise ValueError(
+            f"dataset.shares must be four positive numbers of sum 1, got {tuple(shares)}"
+        )
 
 
 def split(
@@ -53,8 +59,8 @@ def split(
     """Deal whole trajectories to train, validation, calibration and test.
 
     Raises:
-        ValueError: shares that are not four, positive and of sum 1, a set left empty, numbers that are not finite, an
-            environment outside E.
+        ValueError: shares that are not four, positive and of sum 1, a set left empty,
+            numbers that are not finite, an environment outside E.
     """
     check_shares(shares)
     count = trajectories.states.shape[0]
@@ -63,15 +69,26 @@ def split(
         raise ValueError(f"{count} trajectories are too few for shares {tuple(shares)}")
     finite = [jnp.all(jnp.isfinite(leaf)) for leaf in trajectories[:2]]
     if not all(map(bool, finite)):
-        names = " and ".join(name for name, good in zip(Trajectory._fields, finite, strict=False) if not good)
-        raise ValueError(f"{names} of the trajectories are not finite: check the vehicle that drove them")
+        names = " and ".join(
+            name
+            for name, good in zip(Trajectory._fields, finite, strict=False)
+            if not good
+        )
+        raise ValueError(
+            f"{names} of the trajectories are not finite: check the vehicle that drove them"
+        )
     envs = trajectories.envs.reshape(-1, trajectories.envs.shape[-1])
     if not envs.shape[-1:] == jnp.shape(env_low) == jnp.shape(env_high):
-        raise ValueError(f"dataset.env_low and env_high need {envs.shape[-1]} entries, got {env_low} and {env_high}")
+        raise ValueError(
+            f"dataset.env_low and env_high need {envs.shape[-1]} entries, got {env_low} and {env_high}"
+        )
     if not bool(jnp.all((envs >= env_low - 1e-5) & (envs <= env_high + 1e-5))):
         raise ValueError(f"environments leave the box [{env_low}, {env_high}]")
     order = jax.random.permutation(key, count)
-    parts = [jax.tree.map(lambda a, i=index: a[i], trajectories) for index in jnp.split(order, edges)]
+    parts = [
+        jax.tree.map(lambda a, i=index: a[i], trajectories)
+        for index in jnp.split(order, edges)
+    ]
     return Dataset(*parts, env_low=jnp.asarray(env_low), env_high=jnp.asarray(env_high))
 
 
@@ -90,18 +107,32 @@ def first_share(trajectories: Trajectory, share: float) -> Trajectory:
 def measure_space(dataset: Dataset) -> Space:
     """Centres and half widths of s and u over the training split, of e over its box, moments of the increments."""
     train = dataset.train
-    increments = jax.vmap(jax.vmap(between))(train.states[:, :-1, POSE], train.states[:, 1:, POSE])
+    increments = jax.vmap(jax.vmap(between))(
+        train.states[:, :-1, POSE], train.states[:, 1:, POSE]
+    )
     increments = increments.reshape(-1, 3)
     body = _range(train.states[..., BODY])
     control = _range(train.controls)
-    centre, half = 0.5 * (dataset.env_high + dataset.env_low), 0.5 * (dataset.env_high - dataset.env_low)
+    centre, half = (
+        0.5 * (dataset.env_high + dataset.env_low),
+        0.5 * (dataset.env_high - dataset.env_low),
+    )
     return Space(
-        *body, *control, centre, _away_from_zero(half), increments.mean(axis=0), _away_from_zero(increments.std(axis=0))
+        *body,
+        *control,
+        centre,
+        _away_from_zero(half),
+        increments.mean(axis=0),
+        _away_from_zero(increments.std(axis=0)),
     )
 
 
 def windows(
-    trajectories: Trajectory, rows: Int[Array, " batch"], starts: Int[Array, " batch"], *, length: int
+    trajectories: Trajectory,
+    rows: Int[Array, " batch"],
+    starts: Int[Array, " batch"],
+    *,
+    length: int,
 ) -> Trajectory:
     """Cut one window of `length` steps per row, from its start."""
 
@@ -118,7 +149,9 @@ def windows(
     return jax.vmap(cut)(rows, starts)
 
 
-def random_windows(trajectories: Trajectory, key: Key, *, batch: int, length: int) -> Trajectory:
+def random_windows(
+    trajectories: Trajectory, key: Key, *, batch: int, length: int
+) -> Trajectory:
     """`batch` windows drawn evenly over trajectories and start times.
 
     Raises:
@@ -148,10 +181,14 @@ def spread_windows(trajectories: Trajectory, *, length: int) -> Trajectory:
 def _check_length(length: int, steps: int) -> None:
     """Refuse windows that do not fit."""
     if length > steps:
-        raise ValueError(f"windows of {length} steps do not fit trajectories of {steps} steps")
+        raise ValueError(
+            f"windows of {length} steps do not fit trajectories of {steps} steps"
+        )
 
 
-def _range(values: Float[Array, "*batch n"]) -> tuple[Float[Array, " n"], Float[Array, " n"]]:
+def _range(
+    values: Float[Array, "*batch n"],
+) -> tuple[Float[Array, " n"], Float[Array, " n"]]:
     """Centre and half width of the middle 99.8 %, per channel."""
     flat = values.reshape(-1, values.shape[-1])
     low, high = jnp.quantile(flat, jnp.asarray([0.001, 0.999]), axis=0)

@@ -13,18 +13,24 @@ from jaxtyping import Float, Int, Shaped
 from sfkd_jax.artefacts import open_regular
 
 WIDEST = 64
-"""Letters of a cell up to which a column of a csv file is held as text of one width; numbers are shorter."""
+"""Letters of a cell up to which a column of a csv file is held as text of one width;
+numbers are shorter.
+"""
 DECODED = 1 << 29
-"""Bytes that a parquet file may become: it can repeat a value without end in a few bytes."""
+"""Bytes that a parquet file may become: it can repeat a value without end in a few
+bytes.
+"""
 
 
 class Table(NamedTuple):
     """Columns of equal length, as they stand in a file.
 
     Attributes:
-        source: the file. columns: by name; text where the file holds text.
-        rows: where each row stands in the file. counted: what `rows` counts: "line" (csv, the header is line 1) or
-            "row" (npz and parquet, from 0).
+        source: the file.
+        columns: by name; text where the file holds text.
+        rows: where each row stands in the file.
+        counted: what `rows` counts: "line" (csv, the header is line 1) or "row" (npz
+            and parquet, from 0).
     """
 
     source: str
@@ -55,7 +61,9 @@ class Table(NamedTuple):
                 float(value)
             except (TypeError, ValueError, OverflowError):
                 said = repr(str(value)[:WIDEST]) if str(value).strip() else "empty"
-                raise ValueError(f"{self.source}, {self.counted} {row}: {name} is {said}, not a number") from None
+                raise ValueError(
+                    f"{self.source}, {self.counted} {row}: {name} is {said}, not a number"
+                ) from None
         raise ValueError(f"{self.source}: {name} cannot be read as numbers")
 
 
@@ -63,16 +71,23 @@ def read_csv(file: Path) -> Table:
     """A csv file with one line of column names; comma, semicolon, tab or blank between cells, # before comments.
 
     Raises:
-        ValueError: not text, no header, no rows, or rows of another length than the header.
+        ValueError: not text, no header, no rows, or rows of another length than the
+            header.
     """
     try:
         with open_regular(file) as stream:
-            text = io.TextIOWrapper(io.BufferedReader(stream), encoding="utf-8-sig").read()
+            text = io.TextIOWrapper(
+                io.BufferedReader(stream), encoding="utf-8-sig"
+            ).read()
     except UnicodeDecodeError:
         raise ValueError(f"{file}: not a text file in UTF-8") from None
     head = text.split("\n", 1)[0]
     between = max(",;\t", key=head.count)
-    reader = csv.reader(io.StringIO(text), delimiter=between if between in head else " ", skipinitialspace=True)
+    reader = csv.reader(
+        io.StringIO(text),
+        delimiter=between if between in head else " ",
+        skipinitialspace=True,
+    )
     try:
         cells = [(reader.line_num, row) for row in reader if any(map(str.strip, row))]
     except csv.Error as reason:
@@ -87,10 +102,14 @@ def read_csv(file: Path) -> Table:
     rest = [(line, row) for line, row in rest if not row[0].startswith("#")]
     if odd := [(line, row) for line, row in rest if len(row) != len(names)]:
         line, row = odd[0]
-        raise ValueError(f"{file}, line {line}: {len(row)} cells below a header of {len(names)}")
+        raise ValueError(
+            f"{file}, line {line}: {len(row)} cells below a header of {len(names)}"
+        )
     if not rest:
         raise ValueError(f"{file}: no rows below the header")
-    columns = {name: _column([row[k] for _, row in rest]) for k, name in enumerate(names)}
+    columns = {
+        name: _column([row[k] for _, row in rest]) for k, name in enumerate(names)
+    }
     return Table(str(file), columns, np.array([number for number, _ in rest]), "line")
 
 
@@ -119,19 +138,27 @@ def read_parquet(file: Path) -> Table:
     """A parquet file.
 
     Raises:
-        ValueError: pyarrow is missing, the file is not what its name says, or it becomes more than DECODED bytes.
+        ValueError: pyarrow is missing, the file is not what its name says, or it
+            becomes more than DECODED bytes.
     """
     try:
         from pyarrow import parquet  # pyright: ignore[reportMissingImports]
     except ImportError:
-        raise ValueError(f'{file}: parquet files need pyarrow: pip install "sfkd-jax[parquet]"') from None
+        raise ValueError(
+            f'{file}: parquet files need pyarrow: pip install "sfkd-jax[parquet]"'
+        ) from None
     with open_regular(file) as stream:
         try:
             opened = parquet.ParquetFile(io.BufferedReader(stream))
             if (size := _decoded(opened.metadata)) > DECODED:
-                raise ValueError(f"{size >> 20} MiB once decoded, at most {DECODED >> 20} are read")
+                raise ValueError(
+                    f"{size >> 20} MiB once decoded, at most {DECODED >> 20} are read"
+                )
             held = opened.read()
-            columns = {name: held.column(k).to_numpy() for k, name in enumerate(held.column_names)}
+            columns = {
+                name: held.column(k).to_numpy()
+                for k, name in enumerate(held.column_names)
+            }
         except Exception as reason:  # a damaged file raises nearly anything
             said = (str(reason).splitlines() or [type(reason).__name__])[0]
             raise ValueError(f"{file}: not a readable parquet file ({said})") from None
@@ -149,4 +176,6 @@ def _decoded(about: Any) -> int:
     values = sum(max(column.num_values, 0) for column in columns)
     rows = sum(max(group.num_rows, 0) * group.num_columns for group in groups)
     pages = sum(max(column.total_uncompressed_size, 0) for column in columns)
-    return max(8 * values, 8 * rows, 8 * max(about.num_rows, 0) * about.num_columns, pages)
+    return max(
+        8 * values, 8 * rows, 8 * max(about.num_rows, 0) * about.num_columns, pages
+    )

@@ -18,7 +18,9 @@ BLOCK = 5
 """Steps for which the attack holds ν."""
 GENERATIONS = 10
 AIMS = ("lateral", "distance", "within")
-"""Far from the path; far from the copy; far from the copy while the tube's hypothesis holds."""
+"""Far from the path; far from the copy; far from the copy while the tube's hypothesis
+holds.
+"""
 ELITE = 0.1
 """Share of a generation that the next one is drawn around."""
 
@@ -34,7 +36,9 @@ class Tube(NamedTuple):
     """What is claimed of e_y: |e_y − ê_y| ≤ L α R + ε with R⁺ = α R + |d|_P, and that this radius stays below a bound.
 
     Attributes:
-        alpha, lipschitz: α and L. factor: of P = factor factor'. bound: of the radius [m].
+        alpha, lipschitz: α and L.
+        factor: of P = factor factor'.
+        bound: of the radius [m].
     """
 
     alpha: float
@@ -47,8 +51,10 @@ class Outcome(NamedTuple):
     """Largest values of a drive, (drive,).
 
     Attributes:
-        lateral: |e_y| [m]. distance: |e_y − ê_y| from a copy with the same inputs [m].
-        radius: what the tube says of that distance, from the disturbances that there were [m].
+        lateral: |e_y| [m].
+        distance: |e_y − ê_y| from a copy with the same inputs [m].
+        radius: what the tube says of that distance, from the disturbances that there
+            were [m].
     """
 
     lateral: Float[Array, " drive"]
@@ -84,42 +90,73 @@ def attack_corridor(
 ) -> Found:
     """Search by the cross-entropy method, a third of the steps for each of `AIMS`.
 
-    ν is held for `BLOCK` steps within ±`perturbation`, e for the dwell time anywhere in E, the road is a sinusoid of
-    any wavelength and phase of the class at a constant speed. What is found is a lower bound of what can happen.
+    ν is held for `BLOCK` steps within ±`perturbation`, e for the dwell time anywhere in
+    E, the road is a sinusoid of any wavelength and phase of the class at a constant
+    speed. What is found is a lower bound of what can happen.
 
     Args:
-        loop: the true plant along a path. model, params: of the copy, folded. key: consumed. tube: what is claimed.
-        env_low, env_high: E. perturbation: largest |ν|.
-        speed, peak_curvature, wavelengths, lateral_acceleration: of the roads, see `datasets.drive_along_path`.
-        dwell: least time between switches [s]. steps: in all. length: of a drive. keep: worst drives returned per aim.
+        loop: the true plant along a path.
+        model, params: of the copy, folded.
+        key: consumed.
+        tube: what is claimed.
+        env_low, env_high: E.
+        perturbation: largest |ν|.
+        speed, peak_curvature, wavelengths, lateral_acceleration: of the roads, see
+            `datasets.drive_along_path`.
+        dwell: least time between switches [s].
+        steps: in all.
+        length: of a drive.
+        keep: worst drives returned per aim.
     """
     population = max(keep, steps // (len(AIMS) * GENERATIONS * length))
     held = max(1, round(dwell / loop.dt))
-    shapes = {"nu": (-(-length // BLOCK), 2), "env": (-(-length // held), len(env_low)), "road": (4,)}
+    shapes = {
+        "nu": (-(-length // BLOCK), 2),
+        "env": (-(-length // held), len(env_low)),
+        "road": (4,),
+    }
     low, high = jnp.asarray(env_low), jnp.asarray(env_high)
 
     def drive(genes: dict[str, Array]) -> Drives:
-        nu = jnp.repeat(jnp.tanh(2.0 * genes["nu"]), BLOCK, axis=0)[:length] * perturbation
-        envs = low + (high - low) * jnp.repeat(_share(genes["env"]), held, axis=0)[:length]
+        nu = (
+            jnp.repeat(jnp.tanh(2.0 * genes["nu"]), BLOCK, axis=0)[:length]
+            * perturbation
+        )
+        envs = (
+            low + (high - low) * jnp.repeat(_share(genes["env"]), held, axis=0)[:length]
+        )
         fast, wave, phase, tight = _share(genes["road"])
         driven = speed[0] + (speed[1] - speed[0]) * fast
         wavelength = wavelengths[0] + (wavelengths[1] - wavelengths[0]) * wave
         peak = jnp.minimum(peak_curvature, lateral_acceleration / driven**2)
         along = jnp.arange(length) * driven * loop.dt
-        bend = jnp.clip((1.0 + tight) * jnp.sin(2 * jnp.pi * (along / wavelength + phase)), -1.0, 1.0)
-        return Drives(jnp.column_stack([nu, peak * bend, jnp.full(length, driven)]), envs)
+        bend = jnp.clip(
+            (1.0 + tight) * jnp.sin(2 * jnp.pi * (along / wavelength + phase)),
+            -1.0,
+            1.0,
+        )
+        return Drives(
+            jnp.column_stack([nu, peak * bend, jnp.full(length, driven)]), envs
+        )
 
     outcome = jax.vmap(partial(outcome_of, loop, model, params, tube))
 
-    def generation(aim: str, carry: Any, key: Key) -> tuple[Any, tuple[Drives, Outcome]]:
+    def generation(
+        aim: str, carry: Any, key: Key
+    ) -> tuple[Any, tuple[Drives, Outcome]]:
         mean, spread = carry
         drawn = {
-            name: mean[name] + spread[name] * jax.random.normal(part, (population, *shape))
-            for part, (name, shape) in zip(jax.random.split(key, len(shapes)), shapes.items(), strict=True)
+            name: mean[name]
+            + spread[name] * jax.random.normal(part, (population, *shape))
+            for part, (name, shape) in zip(
+                jax.random.split(key, len(shapes)), shapes.items(), strict=True
+            )
         }
         drives = jax.vmap(drive)(drawn)
         reached = outcome(drives)
-        best = jnp.argsort(-_score(aim, reached, tube))[: max(2, int(ELITE * population))]
+        best = jnp.argsort(-_score(aim, reached, tube))[
+            : max(2, int(ELITE * population))
+        ]
         elite = jax.tree.map(lambda leaf: leaf[best], drawn)
         mean = jax.tree.map(lambda leaf: jnp.mean(leaf, axis=0), elite)
         spread = jax.tree.map(lambda leaf: jnp.std(leaf, axis=0) + 0.1, elite)
@@ -130,7 +167,9 @@ def attack_corridor(
     for aim, aim_key in zip(AIMS, jax.random.split(key, len(AIMS)), strict=True):
         start = {name: jnp.zeros(shape) for name, shape in shapes.items()}
         begin = start, jax.tree.map(jnp.ones_like, start)
-        _, every = jax.lax.scan(partial(generation, aim), begin, jax.random.split(aim_key, GENERATIONS))
+        _, every = jax.lax.scan(
+            partial(generation, aim), begin, jax.random.split(aim_key, GENERATIONS)
+        )
         every = jax.tree.map(lambda leaf: leaf.reshape(-1, *leaf.shape[2:]), every)
         worst = jnp.argsort(-_score(aim, every[1], tube))[:keep]
         found.append(jax.tree.map(lambda leaf, worst=worst: leaf[worst], every))
@@ -140,7 +179,9 @@ def attack_corridor(
 def _score(aim: str, reached: Outcome, tube: Tube) -> Array:
     """What an aim makes large; drives that break the hypothesis come last where it has to hold."""
     if aim == "within":
-        return jnp.where(reached.radius <= tube.bound, reached.distance, -reached.radius)
+        return jnp.where(
+            reached.radius <= tube.bound, reached.distance, -reached.radius
+        )
     return getattr(reached, aim)
 
 
@@ -155,13 +196,20 @@ def outcome_of(
     """One drive of the plant and of the copy beside it, both from the path; of one drive, not of a batch.
 
     Args:
-        loop: the plant. model, params: of the copy, folded. tube: of e_y. drives: what is driven.
+        loop: the plant.
+        model, params: of the copy, folded.
+        tube: of e_y.
+        drives: what is driven.
         admit: (fiber, latent, ν, index) -> ν, a filter; nothing for none.
     """
-    start = path_state(jnp.zeros(len(loop.state_names) - 3).at[2].set(drives.inputs[0, 3]))
+    start = path_state(
+        jnp.zeros(len(loop.state_names) - 3).at[2].set(drives.inputs[0, 3])
+    )
     latent = model.encode(model.fiber(params, drives.envs[0]), start)
 
-    def step(carry: Any, given: tuple[Array, Environment, Array]) -> tuple[Any, Outcome]:
+    def step(
+        carry: Any, given: tuple[Array, Environment, Array]
+    ) -> tuple[Any, Outcome]:
         state, latent, error = carry
         wanted, env, index = given
         fiber = model.fiber(params, env)
@@ -170,12 +218,19 @@ def outcome_of(
         expected = model.step(fiber, model.encode(fiber, state), wanted)
         state, latent = loop.step(state, wanted, env), model.step(fiber, latent, wanted)
         here, there, near = (
-            at[BODY][LATERAL] for at in (state, model.decode(fiber, latent), model.decode(fiber, expected))
+            at[BODY][LATERAL]
+            for at in (
+                state,
+                model.decode(fiber, latent),
+                model.decode(fiber, expected),
+            )
         )
         radius = tube.lipschitz * tube.alpha * error + jnp.abs(here - near)
         gap = model.vector(model.encode(fiber, state)) - model.vector(expected)
         error = tube.alpha * error + jnp.linalg.norm(gap @ tube.factor)
-        return (state, latent, error), Outcome(jnp.abs(here), jnp.abs(here - there), radius)
+        return (state, latent, error), Outcome(
+            jnp.abs(here), jnp.abs(here - there), radius
+        )
 
     given = (drives.inputs, drives.envs, jnp.arange(len(drives.inputs)))
     _, reached = jax.lax.scan(step, (start, latent, jnp.zeros(())), given)

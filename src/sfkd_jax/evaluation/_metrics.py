@@ -14,16 +14,21 @@ AFTER_SWITCH = 3.0  # s
 LANE_HALF_WIDTH = 1.75  # m
 VEHICLE_HALF_WIDTH = 0.9  # m
 SWITCH = (0.05, 6.0)
-"""A step of friction [-] or wind [m/s] larger than this is a switch; the ramps of gusts reach 5 m/s a step."""
+"""A step of friction [-] or wind [m/s] larger than this is a switch; the ramps of gusts
+reach 5 m/s a step.
+"""
 
 
 class Scores(NamedTuple):
     """One number per episode, each (episode,).
 
     Attributes:
-        rmse: of the lateral deviation [m]. rmse_after_switch: within 3 s of a switch [m], NaN if there is none.
-        max_deviation: [m]. smoothness: mean |steering rate| of the applied control [rad/s].
-        departed: whether the car left its lane or a state is not finite. ess: median effective sample size.
+        rmse: of the lateral deviation [m].
+        rmse_after_switch: within 3 s of a switch [m], NaN if there is none.
+        max_deviation: [m].
+        smoothness: mean |steering rate| of the applied control [rad/s].
+        departed: whether the car left its lane or a state is not finite.
+        ess: median effective sample size.
         unhealthy: share of steps at which the planner held its last plan.
         breach, box_exit: share of steps that a monitor flagged.
     """
@@ -39,11 +44,15 @@ class Scores(NamedTuple):
     box_exit: Float[np.ndarray, " episode"]
 
 
-def score(episodes: Episode, envs: Float[np.ndarray, "episode time 2"], *, dt: float) -> Scores:
+def score(
+    episodes: Episode, envs: Float[np.ndarray, "episode time 2"], *, dt: float
+) -> Scores:
     """Score a batch of episodes, leading axis first.
 
     Args:
-        episodes: from `simulate`, batched. envs: the schedules they were driven under. dt: [s].
+        episodes: from `simulate`, batched.
+        envs: the schedules they were driven under.
+        dt: [s].
     """
     lateral = np.asarray(episodes.lateral, dtype=np.float64)
     skip = round(SETTLING / dt)
@@ -56,7 +65,9 @@ def score(episodes: Episode, envs: Float[np.ndarray, "episode time 2"], *, dt: f
     worst = np.max(np.abs(lateral[:, skip:]), axis=1)
     return Scores(
         rmse=np.sqrt(np.mean(lateral[:, skip:] ** 2, axis=1)),
-        rmse_after_switch=np.where(counts > 0, np.sqrt(squares / np.maximum(counts, 1)), np.nan),
+        rmse_after_switch=np.where(
+            counts > 0, np.sqrt(squares / np.maximum(counts, 1)), np.nan
+        ),
         max_deviation=worst,
         smoothness=np.mean(np.abs(np.diff(steering, axis=1)), axis=1) / dt,
         departed=~finite | ~(worst + VEHICLE_HALF_WIDTH <= LANE_HALF_WIDTH),

@@ -14,21 +14,27 @@ from sfkd_jax.core.se2 import rotate, wrap_angle
 from sfkd_jax.types import BODY, Model, Params, Trajectory
 
 
-def open_loop(model: Model, params: Params, trajectories: Trajectory, *, horizon: int) -> Float[Array, "horizon 4"]:
+def open_loop(
+    model: Model, params: Params, trajectories: Trajectory, *, horizon: int
+) -> Float[Array, "horizon 4"]:
     """RMSE of free-running predictions 1 … horizon steps ahead, from every `horizon`-th step of each trajectory.
 
-    Columns: along and across the true heading [m] (so that each axis means the same on every trajectory),
-    yaw [rad], speed [m/s]. In path coordinates: 0, e_y [m], e_ψ [rad], speed [m/s].
+    Columns: along and across the true heading [m] (so that each axis means the same on
+    every trajectory), yaw [rad], speed [m/s]. In path coordinates: 0, e_y [m], e_ψ
+    [rad], speed [m/s].
 
     Args:
-        model, params: what predicts. trajectories: never used for training.
+        model, params: what predicts.
+        trajectories: never used for training.
         horizon: steps.
 
     Raises:
         ValueError: the horizon does not fit the trajectories.
     """
     cut = jax.vmap(partial(every_window, horizon=horizon, stride=horizon))
-    pieces = jax.tree.map(lambda leaf: leaf.reshape(-1, *leaf.shape[2:]), cut(trajectories))
+    pieces = jax.tree.map(
+        lambda leaf: leaf.reshape(-1, *leaf.shape[2:]), cut(trajectories)
+    )
 
     def squares(piece: Trajectory) -> Float[Array, "horizon 4"]:
         predicted, _, _ = rollout(model, params, piece)
@@ -37,7 +43,12 @@ def open_loop(model: Model, params: Params, trajectories: Trajectory, *, horizon
             gap = (predicted - true)[:, BODY]
             return (
                 jnp.column_stack(
-                    [jnp.zeros(gap.shape[0]), gap[:, LATERAL], wrap_angle(gap[:, HEADING]), gap[:, PATH_SPEED]]
+                    [
+                        jnp.zeros(gap.shape[0]),
+                        gap[:, LATERAL],
+                        wrap_angle(gap[:, HEADING]),
+                        gap[:, PATH_SPEED],
+                    ]
                 )
                 ** 2
             )

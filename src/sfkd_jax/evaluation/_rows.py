@@ -21,8 +21,11 @@ def row(
     """One system on one scenario; what does not apply is None.
 
     Args:
-        scores: per episode. about: system, model, controller, sampling, env, scenario, vehicle, seeds, episodes,
-            episode_s, params. act_ms: median and 99 % quantile of one control step. violation: from `violations`.
+        scores: per episode.
+        about: system, model, controller, sampling, env, scenario, vehicle, seeds,
+            episodes, episode_s, params.
+        act_ms: median and 99 % quantile of one control step.
+        violation: from `violations`.
         watched: whether a monitor looked on.
     """
     after = scores.rmse_after_switch
@@ -30,7 +33,9 @@ def row(
         "rmse_m": summary(scores.rmse),
         "rmse_episodes_m": [float(value) for value in scores.rmse],
         "max_deviation_m": float(np.max(scores.max_deviation)),
-        "rmse_after_switch_m": None if np.all(np.isnan(after)) else float(np.nanmean(after)),
+        "rmse_after_switch_m": None
+        if np.all(np.isnan(after))
+        else float(np.nanmean(after)),
         "smoothness_rad_per_s": float(np.mean(scores.smoothness)),
         "violation": violation,
         "departures": int(np.sum(scores.departed)),
@@ -44,18 +49,26 @@ def row(
     }
 
 
-def disturbed(force: float, scores: Scores, violation: dict[str, Any]) -> dict[str, Any]:
+def disturbed(
+    force: float, scores: Scores, violation: dict[str, Any]
+) -> dict[str, Any]:
     """What becomes of a row when forces of up to ±`force` [N], which nobody measures, push the car sideways."""
     kept = {name: violation[name] for name in ("v0", "v1", "v1_conformal", "v2")}
     departures = int(np.sum(scores.departed))
-    return {"force_n": force, "rmse_m": summary(scores.rmse), **kept, "departures": departures}
+    return {
+        "force_n": force,
+        "rmse_m": summary(scores.rmse),
+        **kept,
+        "departures": departures,
+    }
 
 
 def compare(rows: list[dict[str, Any]]) -> list[dict[str, Any]]:
     """Rows with comparisons between systems that drove the same episodes with the same sampling.
 
-    A row without sampling (a quadratic program) is compared with those that sample around feedback. Of several rows
-    of a system, the one with the same controller and planner is taken.
+    A row without sampling (a quadratic program) is compared with those that sample
+    around feedback. Of several rows of a system, the one with the same controller and
+    planner is taken.
     """
     for entry in rows:
         same = [other for other in rows if _episodes(other) == _episodes(entry)]
@@ -71,7 +84,11 @@ def compare(rows: list[dict[str, Any]]) -> list[dict[str, Any]]:
 def _episodes(entry: dict[str, Any]) -> tuple[Any, ...]:
     """Which episodes a row drove: those of equal answers are paired."""
     names = ("scenario", "vehicle", "variation")
-    return *(entry[name] for name in names), entry["sampling"] or "feedback", _by_seed(entry).shape
+    return (
+        *(entry[name] for name in names),
+        entry["sampling"] or "feedback",
+        _by_seed(entry).shape,
+    )
 
 
 def _search(entry: dict[str, Any]) -> tuple[Any, ...]:
@@ -90,7 +107,10 @@ def _ratio(values: np.ndarray, reference: np.ndarray) -> float:
 
 _SFKD = ("sfkd", "sfkd_path")
 """In the frame of the body and along a path: rows of one sampling have one frame."""
-_COMPARISONS = ((("oracle",), "ratio_to_oracle", _ratio), (_SFKD, "difference_to_sfkd", paired_difference))
+_COMPARISONS = (
+    (("oracle",), "ratio_to_oracle", _ratio),
+    (_SFKD, "difference_to_sfkd", paired_difference),
+)
 
 
 def pool(rows: list[dict[str, Any]]) -> dict[str, Any]:
@@ -118,7 +138,9 @@ def _mean(values: list[Any]) -> Any:
     """The mean of equal structures, leaf by leaf; what is no number stays where all agree, and is None otherwise."""
     first = values[0]
     if isinstance(first, dict):
-        return {name: _mean([value.get(name) for value in values]) for name in first}  # older rows lack newer measures
+        return {
+            name: _mean([value.get(name) for value in values]) for name in first
+        }  # older rows lack newer measures
     if all(isinstance(value, float) for value in values):
         return float(np.mean(values))
     return first if all(value == first for value in values) else None

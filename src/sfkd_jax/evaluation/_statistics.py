@@ -8,11 +8,14 @@ from jaxtyping import Float
 RESAMPLES = 10_000
 
 
-def bootstrap_mean(values: Float[np.ndarray, "*seed episode"], *, seed: int = 0) -> tuple[float, list[float]]:
+def bootstrap_mean(
+    values: Float[np.ndarray, "*seed episode"], *, seed: int = 0
+) -> tuple[float, list[float]]:
     """Mean and its 95 % percentile-bootstrap interval.
 
-    With several training seeds, trainings and episodes are both drawn anew: all trainings drive the same episodes, so
-    a fortunate training is fortunate in each, and joining the episodes would count it as often as there are episodes.
+    With several training seeds, trainings and episodes are both drawn anew: all
+    trainings drive the same episodes, so a fortunate training is fortunate in each, and
+    joining the episodes would count it as often as there are episodes.
 
     Args:
         values: one per episode, or one per training seed and episode.
@@ -22,9 +25,13 @@ def bootstrap_mean(values: Float[np.ndarray, "*seed episode"], *, seed: int = 0)
     """
     table = np.atleast_2d(np.asarray(values, dtype=np.float64))
     rng = np.random.default_rng(seed)
-    episodes, trainings = (rng.integers(0, size, (RESAMPLES, size)) for size in reversed(table.shape))
+    episodes, trainings = (
+        rng.integers(0, size, (RESAMPLES, size)) for size in reversed(table.shape)
+    )
     draws = table[trainings[:, :, None], episodes[:, None, :]].reshape(RESAMPLES, -1)
-    return float(np.mean(table)), [float(edge) for edge in np.quantile(np.mean(draws, axis=1), [0.025, 0.975])]
+    return float(np.mean(table)), [
+        float(edge) for edge in np.quantile(np.mean(draws, axis=1), [0.025, 0.975])
+    ]
 
 
 def summary(values: Float[np.ndarray, "*seed episode"]) -> dict[str, object]:
@@ -40,7 +47,8 @@ def summary(values: Float[np.ndarray, "*seed episode"]) -> dict[str, object]:
 
 
 def paired_difference(
-    values: Float[np.ndarray, "*seed episode"], reference: Float[np.ndarray, "*seed episode"]
+    values: Float[np.ndarray, "*seed episode"],
+    reference: Float[np.ndarray, "*seed episode"],
 ) -> dict[str, object]:
     """Mean of values − reference over the same seeds and episodes, with its interval."""
     mean, interval = bootstrap_mean(np.asarray(values) - np.asarray(reference))

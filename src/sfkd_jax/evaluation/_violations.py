@@ -11,14 +11,22 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from sfkd_jax.core.rollouts import defects, every_window, in_batches, prediction_errors, rollout
+from sfkd_jax.core.rollouts import (
+    defects,
+    every_window,
+    in_batches,
+    prediction_errors,
+    rollout,
+)
 from sfkd_jax.types import Model, Params, Trajectory
 
 STRIDE = 5
 """Steps from the start of one window to that of the next."""
 KINDS = ("position_m", "yaw_rad", "body")
 ROUNDING = (1e-5, 1e-5)
-"""Relative and absolute, of latent errors: latents of size 10 are rounded to 1e-6 in float32, and 20 steps add up."""
+"""Relative and absolute, of latent errors: latents of size 10 are rounded to 1e-6 in
+float32, and 20 steps add up.
+"""
 
 Tube = Mapping[str, Sequence[float]]
 
@@ -27,7 +35,8 @@ class Predictions(NamedTuple):
     """Free-running predictions along segments of driving, from every `STRIDE`-th true state.
 
     Attributes:
-        errors: position [m], |yaw| [rad], body state (2-norm). latent_errors: |e_k|, k = 1 … horizon.
+        errors: position [m], |yaw| [rad], body state (2-norm).
+        latent_errors: |e_k|, k = 1 … horizon.
         defects: |d_j| of the step that leads to each of them.
     """
 
@@ -40,8 +49,10 @@ class Claims(NamedTuple):
     """What is claimed about the predictions of a model; None where nothing is.
 
     Attributes:
-        certified, conformal: tubes, radii by `KINDS`, each (horizon,). level: 1 − δ of both.
-        latent: R_1 … R_T of a certificate. d_bar: the one-step bound that it holds under.
+        certified, conformal: tubes, radii by `KINDS`, each (horizon,).
+        level: 1 − δ of both.
+        latent: R_1 … R_T of a certificate.
+        d_bar: the one-step bound that it holds under.
         threshold: δ*, one position error for all models [m].
     """
 
@@ -53,12 +64,16 @@ class Claims(NamedTuple):
     threshold: float | None = None
 
 
-def predictions(model: Model, params: Params, driven: Trajectory, *, length: int, horizon: int) -> Predictions:
+def predictions(
+    model: Model, params: Params, driven: Trajectory, *, length: int, horizon: int
+) -> Predictions:
     """Cut drives into segments of `length` steps and predict from their true states, controls and environments.
 
     Args:
-        model, params: any model. driven: a batch; the environments are those that the model is told.
-        length: of a calibration trajectory, so that a segment is to a tube what such a trajectory is.
+        model, params: any model.
+        driven: a batch; the environments are those that the model is told.
+        length: of a calibration trajectory, so that a segment is to a tube what such a
+            trajectory is.
         horizon: steps.
 
     Raises:
@@ -87,7 +102,9 @@ def _along_window(model: Model, params: Params, window: Trajectory) -> Predictio
     )
 
 
-def tube_violations(errors: Float[np.ndarray, "segment window horizon 3"], tube: Tube) -> tuple[int, int]:
+def tube_violations(
+    errors: Float[np.ndarray, "segment window horizon 3"], tube: Tube
+) -> tuple[int, int]:
     """V1: in how many segments any window, step or kind leaves the tube, and of how many; NaN has left it."""
     radii = np.stack([np.asarray(tube[kind]) for kind in KINDS], axis=1)
     inside = np.all(np.asarray(errors) <= radii, axis=(1, 2, 3))
@@ -103,7 +120,9 @@ def theorem_violations(
     """V0: at how many steps |e_k| > R_k though |d_1| … |d_k| ≤ d̄, and of how many; the theorem says at none."""
     applies = np.logical_and.accumulate(np.asarray(defects) <= d_bar, axis=2)
     relative, absolute = ROUNDING
-    beyond = ~(np.asarray(latent_errors) <= np.asarray(latent) * (1 + relative) + absolute)
+    beyond = ~(
+        np.asarray(latent_errors) <= np.asarray(latent) * (1 + relative) + absolute
+    )
     return int(np.sum(applies & beyond)), int(np.sum(applies))
 
 
@@ -115,15 +134,20 @@ def theorem_reach(
 ) -> list[float | None]:
     """The largest |e_k| / R_k for every k, where |d_1| … |d_k| ≤ d̄; None where that never holds.
 
-    At most 1 by the theorem. V0 counts what is above and is 0 for any bound that is loose enough; this says how near
-    to the bound the errors came, so it moves when α, d̄ or the model is not what is claimed.
+    At most 1 by the theorem. V0 counts what is above and is 0 for any bound that is
+    loose enough; this says how near to the bound the errors came, so it moves when α,
+    d̄ or the model is not what is claimed.
     """
     applies = np.logical_and.accumulate(np.asarray(defects) <= d_bar, axis=2)
-    shares = np.where(applies, np.asarray(latent_errors) / np.asarray(latent), -np.inf).max(axis=(0, 1))
+    shares = np.where(
+        applies, np.asarray(latent_errors) / np.asarray(latent), -np.inf
+    ).max(axis=(0, 1))
     return [float(share) if np.isfinite(share) else None for share in shares]
 
 
-def threshold_violations(errors: Float[np.ndarray, "segment window horizon 3"], threshold: float) -> tuple[int, int]:
+def threshold_violations(
+    errors: Float[np.ndarray, "segment window horizon 3"], threshold: float
+) -> tuple[int, int]:
     """V2: in how many windows the position error exceeds δ* at some step, and of how many."""
     inside = np.all(np.asarray(errors)[..., 0] <= threshold, axis=2)
     return int(np.sum(~inside)), inside.size
@@ -132,13 +156,25 @@ def threshold_violations(errors: Float[np.ndarray, "segment window horizon 3"], 
 def violations(found: Predictions | None, claims: Claims) -> dict[str, Any]:
     """The record of results.json: shares V0, V1, V2 and mean position radii of the tubes; null for no claim.
 
-    V1 speaks of the certified tube if there is one, else of the conformal one (`v1_tube` says which).
+    V1 speaks of the certified tube if there is one, else of the conformal one
+    (`v1_tube` says which).
     """
     tubes = {"certified": claims.certified, "conformal": claims.conformal}
-    shares = {name: _share(tube_violations, found and found.errors, tube) for name, tube in tubes.items()}
-    radii = {name: tube and float(np.mean(tube["position_m"])) for name, tube in tubes.items()}
+    shares = {
+        name: _share(tube_violations, found and found.errors, tube)
+        for name, tube in tubes.items()
+    }
+    radii = {
+        name: tube and float(np.mean(tube["position_m"]))
+        for name, tube in tubes.items()
+    }
     kind = next((name for name, tube in tubes.items() if tube), None)
-    claimed = (found and found.latent_errors, found and found.defects, claims.latent, claims.d_bar)
+    claimed = (
+        found and found.latent_errors,
+        found and found.defects,
+        claims.latent,
+        claims.d_bar,
+    )
     return {
         "v0": _share(theorem_violations, *claimed),
         "v0_reach": _unless_missing(theorem_reach, *claimed),

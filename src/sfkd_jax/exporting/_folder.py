@@ -17,10 +17,16 @@ from sfkd_jax.exporting._programs import Leaf, flat_programs, lowered
 from sfkd_jax.types import Params
 
 FORMAT = 2
-"""Version of the manifest and of the order of arguments; run_controller.py refuses every other one."""
+"""Version of the manifest and of the order of arguments; run_controller.py refuses
+every other one.
+"""
 PLATFORMS = ("cpu", "cuda", "rocm", "tpu")
 FILES = {"act": "controller", "init": "initial_state"}
-MANIFEST, CERTIFICATE, SCRIPT = "controller.json", "certificate.json", "run_controller.py"
+MANIFEST, CERTIFICATE, SCRIPT = (
+    "controller.json",
+    "certificate.json",
+    "run_controller.py",
+)
 
 
 def write_controller(
@@ -35,23 +41,38 @@ def write_controller(
     """Write a controller for processes without sfkd_jax; the manifest comes last and is returned.
 
     Args:
-        trained: what to write. folder: where; what an earlier export left there is replaced.
+        trained: what to write.
+        folder: where; what an earlier export left there is replaced.
         made_from: hashes of what the weights were made from.
-        platforms: where the programs are to run. iree: compile for C and C++ as well. iree_flags: for iree-compile.
+        platforms: where the programs are to run.
+        iree: compile for C and C++ as well.
+        iree_flags: for iree-compile.
 
     Raises:
-        ValueError: unknown platform, a controller that cannot be exported, or IREE missing or failing.
+        ValueError: unknown platform, a controller that cannot be exported, or IREE
+            missing or failing.
         ArtefactError: the folder is not writable.
     """
     if not platforms or not set(platforms) <= set(PLATFORMS):
-        raise ValueError(f"export.platforms must be some of {', '.join(PLATFORMS)}, got {list(platforms)}")
+        raise ValueError(
+            f"export.platforms must be some of {', '.join(PLATFORMS)}, got {list(platforms)}"
+        )
     found = flat_programs(trained)
     programs = {name: getattr(found, name) for name in FILES}
-    modules = {name: compile_iree(program, flags=iree_flags) for name, program in programs.items() if iree}
-    exported = {name: lowered(program.function, program, platforms) for name, program in programs.items()}
+    modules = {
+        name: compile_iree(program, flags=iree_flags)
+        for name, program in programs.items()
+        if iree
+    }
+    exported = {
+        name: lowered(program.function, program, platforms)
+        for name, program in programs.items()
+    }
     for stale in (MANIFEST, CERTIFICATE, *(f"{stem}.vmfb" for stem in FILES.values())):
         (folder / stale).unlink(missing_ok=True)
-    stored = policy.save(folder / "policy.npz", trained.params, trained.settings, made_from=made_from)
+    stored = policy.save(
+        folder / "policy.npz", trained.params, trained.settings, made_from=made_from
+    )
     manifest = {
         "kind": "controller",
         "format": FORMAT,
@@ -60,11 +81,17 @@ def write_controller(
         "platforms": list(platforms),
         "key_implementation": found.key_implementation,
         "programs": {
-            name: _stored(folder / f"{FILES[name]}.stablehlo", bytes(exported[name].serialize()))
+            name: _stored(
+                folder / f"{FILES[name]}.stablehlo", bytes(exported[name].serialize())
+            )
             | {"inputs": _listed(program.inputs), "outputs": _listed(program.outputs)}
             for name, program in programs.items()
         },
-        "iree": {name: _stored(folder / f"{FILES[name]}.vmfb", module) for name, module in modules.items()} or None,
+        "iree": {
+            name: _stored(folder / f"{FILES[name]}.vmfb", module)
+            for name, module in modules.items()
+        }
+        or None,
         "iree_flags": list(iree_flags) if iree else None,
         "weights_sha256": stored["sha256"],
         "certificate_sha256": _certificate(trained, folder, policy.policy_hash(stored)),
@@ -83,21 +110,30 @@ def write_controller(
 def _stored(path: Path, content: bytes) -> dict[str, Any]:
     """Write a file; what a reader needs to know that it is whole."""
     artefacts.write_bytes(path, content)
-    return {"file": path.name, "bytes": len(content), "sha256": hashlib.sha256(content).hexdigest()}
+    return {
+        "file": path.name,
+        "bytes": len(content),
+        "sha256": hashlib.sha256(content).hexdigest(),
+    }
 
 
 def _listed(leaves: tuple[Leaf, ...]) -> list[dict[str, Any]]:
     return [leaf._asdict() for leaf in leaves]
 
 
-def _certificate(trained: policy.Policy, folder: Path, policy_sha256: str) -> str | None:
+def _certificate(
+    trained: policy.Policy, folder: Path, policy_sha256: str
+) -> str | None:
     """Copy the certificate, which was verified when the policy was loaded, if there is one; returns the file's hash.
 
-    It is about the same model, and bound to the settings as they are exported: another controller, perhaps.
+    It is about the same model, and bound to the settings as they are exported: another
+    controller, perhaps.
     """
     if trained.certificate is None:
         return None
-    artefacts.write_json(folder / CERTIFICATE, trained.certificate | {"policy_sha256": policy_sha256})
+    artefacts.write_json(
+        folder / CERTIFICATE, trained.certificate | {"policy_sha256": policy_sha256}
+    )
     return hashlib.sha256((folder / CERTIFICATE).read_bytes()).hexdigest()
 
 
@@ -105,12 +141,16 @@ def _vehicle(trained: policy.Policy) -> dict[str, Any]:
     """What the numbers mean: names, units and limits."""
     plant, settings = build.build_vehicle(trained.settings["vehicle"]), trained.settings
     drive = "speed command [m/s]" if plant.speed_loop else "acceleration [m/s^2]"
-    limits = zip(("steering [rad]", drive), plant.control_low, plant.control_high, strict=True)
+    limits = zip(
+        ("steering [rad]", drive), plant.control_low, plant.control_high, strict=True
+    )
     box = {side: list(settings["dataset"][f"env_{side}"]) for side in ("low", "high")}
     return {
         "sampling_period_s": plant.dt,
         "horizon": build.controller_horizon(settings["controller"]),
-        "controls": [{"name": name, "low": low, "high": high} for name, low, high in limits],
+        "controls": [
+            {"name": name, "low": low, "high": high} for name, low, high in limits
+        ],
         "observation": list(plant.state_names),
         "environment": {"names": ["friction [-]", "lateral wind [m/s]"], **box},
         "reference": ["x [m]", "y [m]", "yaw [rad]", "speed [m/s]"],

@@ -37,7 +37,8 @@ class Programs(NamedTuple):
 
     Attributes:
         init: (key) -> state leaves.
-        act: (state leaves, observation, env, reference) -> (control, state leaves, info leaves).
+        act: (state leaves, observation, env, reference) -> (control, state leaves, info
+            leaves).
         key_implementation: how keys are drawn from; outside they are their uint32 data.
     """
 
@@ -60,10 +61,12 @@ def example_inputs(policy: Policy) -> tuple[Any, ...]:
 def flat_programs(policy: Policy) -> Programs:
     """The controller of a policy over flat arrays, its weights inside, folded.
 
-    Names are paths: `state.inner.plan`, `info.cost`. Typed keys do not cross a border, so their uint32 data do.
+    Names are paths: `state.inner.plan`, `info.cost`. Typed keys do not cross a border,
+    so their uint32 data do.
 
     Raises:
-        ValueError: the controller's state changes its structure, shapes or dtypes from step to step.
+        ValueError: the controller's state changes its structure, shapes or dtypes from
+            step to step.
     """
     key, state, *measured = example_inputs(policy)
     implementation = str(jax.random.key_impl(jax.random.key(0)))
@@ -75,39 +78,64 @@ def flat_programs(policy: Policy) -> Programs:
         return tuple(_opened(policy.controller.init(wrap(key_data))))
 
     def closed(leaves: Sequence[Array]) -> Any:
-        wrapped = [wrap(leaf) if _is_key(like) else leaf for like, leaf in zip(template, leaves, strict=True)]
+        wrapped = [
+            wrap(leaf) if _is_key(like) else leaf
+            for like, leaf in zip(template, leaves, strict=True)
+        ]
         return jax.tree.unflatten(structure, wrapped)
 
     def act(*leaves: Array) -> tuple[Array, ...]:
         *before, observation, env, reference = leaves
-        # Without the barrier XLA evaluates at compile time what depends on weights alone, and rounds otherwise.
+        # Without the barrier XLA evaluates at compile time what depends on weights
+        # alone, and rounds otherwise.
         params = jax.lax.optimization_barrier(folded)
-        control, after, info = policy.controller.act(params, closed(before), observation, env, reference)
+        control, after, info = policy.controller.act(
+            params, closed(before), observation, env, reference
+        )
         return control, *_opened(after), *jax.tree.leaves(info)
 
-    control, after, info = jax.eval_shape(policy.controller.act, folded, state, *measured)
-    if _named("state", after) != _named("state", state) or jax.tree.structure(after) != structure:
-        raise ValueError("cannot export a controller whose state changes its structure, shapes or dtypes")
+    control, after, info = jax.eval_shape(
+        policy.controller.act, folded, state, *measured
+    )
+    if (
+        _named("state", after) != _named("state", state)
+        or jax.tree.structure(after) != structure
+    ):
+        raise ValueError(
+            "cannot export a controller whose state changes its structure, shapes or dtypes"
+        )
     arguments = zip(("observation", "env", "reference"), measured, strict=True)
-    inputs = _named("state", state) + tuple(_leaf(name, value) for name, value in arguments)
-    outputs = (_leaf("control", control), *_named("state", after), *_named("info", info))
+    inputs = _named("state", state) + tuple(
+        _leaf(name, value) for name, value in arguments
+    )
+    outputs = (
+        _leaf("control", control),
+        *_named("state", after),
+        *_named("info", info),
+    )
     started = Program(init, (_leaf("key", key),), _named("state", state))
     return Programs(started, Program(act, inputs, outputs), implementation)
 
 
 def specifications(program: Program) -> tuple[jax.ShapeDtypeStruct, ...]:
     """The shapes of a program's inputs as jax takes them."""
-    return tuple(jax.ShapeDtypeStruct(leaf.shape, leaf.dtype) for leaf in program.inputs)
+    return tuple(
+        jax.ShapeDtypeStruct(leaf.shape, leaf.dtype) for leaf in program.inputs
+    )
 
 
-def lowered(function: Callable[..., Any], program: Program, platforms: tuple[str, ...]) -> jax.export.Exported:
+def lowered(
+    function: Callable[..., Any], program: Program, platforms: tuple[str, ...]
+) -> jax.export.Exported:
     """A function of a program's inputs as StableHLO; no argument is dropped, also if nothing depends on it.
 
-    Without the places in source files that jax notes beside every operation: they tell where
-    this machine keeps its files, and make the same program another one elsewhere.
+    Without the places in source files that jax notes beside every operation: they tell
+    where this machine keeps its files, and make the same program another one elsewhere.
     """
     with jax_settings({"jax_traceback_in_locations_limit": 0}):
-        lower = jax.export.export(jax.jit(function, keep_unused=True), platforms=platforms)
+        lower = jax.export.export(
+            jax.jit(function, keep_unused=True), platforms=platforms
+        )
         return lower(*specifications(program))
 
 
@@ -117,7 +145,10 @@ def _is_key(leaf: Any) -> bool:
 
 def _opened(tree: Any) -> list[Array]:
     """Leaves, keys as their data."""
-    return [jax.random.key_data(leaf) if _is_key(leaf) else leaf for leaf in jax.tree.leaves(tree)]
+    return [
+        jax.random.key_data(leaf) if _is_key(leaf) else leaf
+        for leaf in jax.tree.leaves(tree)
+    ]
 
 
 def _leaf(name: str, value: Any) -> Leaf:
@@ -129,5 +160,10 @@ def _leaf(name: str, value: Any) -> Leaf:
 def _named(root: str, tree: Any) -> tuple[Leaf, ...]:
     """The leaves of a tree under dotted paths."""
     paths = jax.tree_util.tree_leaves_with_path(tree)
-    names = (f"{root}.{jax.tree_util.keystr(path, simple=True, separator='.')}" for path, _ in paths)
-    return tuple(_leaf(name, leaf) for name, (_, leaf) in zip(names, paths, strict=True))
+    names = (
+        f"{root}.{jax.tree_util.keystr(path, simple=True, separator='.')}"
+        for path, _ in paths
+    )
+    return tuple(
+        _leaf(name, leaf) for name, (_, leaf) in zip(names, paths, strict=True)
+    )

@@ -10,8 +10,9 @@ checks the files and steps the controller on a straight road. In your own progra
     state = controller.init(seed=0)
     control, state, info = controller.act(state, observation, env, reference)
 
-Set JAX_COMPILATION_CACHE_DIR to a directory and JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS=0 before the start, and
-later starts read back what the first one compiled.
+Set JAX_COMPILATION_CACHE_DIR to a directory and
+JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS=0 before the start, and later starts read
+back what the first one compiled.
 """
 
 from __future__ import annotations
@@ -34,7 +35,15 @@ FORMAT = 2
 """Version of controller.json that this file reads."""
 LARGEST = 1 << 24
 """Bytes of controller.json; it has some 20 kB."""
-MALFORMED = (KeyError, TypeError, ValueError, IndexError, AttributeError, OverflowError, RecursionError)
+MALFORMED = (
+    KeyError,
+    TypeError,
+    ValueError,
+    IndexError,
+    AttributeError,
+    OverflowError,
+    RecursionError,
+)
 """What is raised about a manifest that says of itself what it is not."""
 
 
@@ -46,26 +55,35 @@ class ExportedController:
     """A controller as it was exported: checked, deserialised and compiled once, when it is made.
 
     Attributes:
-        manifest: what controller.json says: names, shapes, units, limits, hashes, settings.
+        manifest: what controller.json says: names, shapes, units, limits, hashes,
+            settings.
     """
 
     def __init__(self, folder: str | Path = Path(__file__).parent) -> None:
         """Read and compile.
 
         Raises:
-            ExportError: a file is missing, no regular file, truncated, changed, malformed, or made for another jax or
-                platform.
+            ExportError: a file is missing, no regular file, truncated, changed,
+                malformed, or made for another jax or platform.
         """
         path = Path(folder) / "controller.json"
         self.manifest = _manifest(path)
         try:
-            self._init, self._act = (_compiled(path.parent, self.manifest, name) for name in ("init", "act"))
+            self._init, self._act = (
+                _compiled(path.parent, self.manifest, name) for name in ("init", "act")
+            )
             key, first = self._key(0), self.manifest["programs"]["init"]["inputs"][0]
             known = isinstance(self.manifest["key_implementation"], str)
-            if not known or key.shape != tuple(first["shape"]) or str(key.dtype) != first["dtype"]:
+            if (
+                not known
+                or key.shape != tuple(first["shape"])
+                or str(key.dtype) != first["dtype"]
+            ):
                 raise ValueError("key_implementation")
         except MALFORMED as error:
-            raise ExportError(_line(f"{path}: malformed, {type(error).__name__}: {error}")) from None
+            raise ExportError(
+                _line(f"{path}: malformed, {type(error).__name__}: {error}")
+            ) from None
 
     def init(self, seed: int = 0) -> dict[str, jax.Array]:
         """The state before the first step; the seed fixes all samples that will be drawn."""
@@ -76,36 +94,57 @@ class ExportedController:
     ) -> tuple[jax.Array, dict[str, jax.Array], dict[str, jax.Array]]:
         """One control step: (control, next state, info).
 
-        Values that are not finite are passed on; the controller then continues its last plan and `info` says so.
+        Values that are not finite are passed on; the controller then continues its last
+        plan and `info` says so.
 
         Args:
-            state: from `init` or the step before. observation: (p_x [m], p_y [m], yaw [rad], v [m/s], …).
-            env: (friction [-], lateral wind [m/s]). reference: (horizon, 4): x, y, yaw, speed at the next steps.
+            state: from `init` or the step before.
+            observation: (p_x [m], p_y [m], yaw [rad], v [m/s], …).
+            env: (friction [-], lateral wind [m/s]).
+            reference: (horizon, 4): x, y, yaw, speed at the next steps.
 
         Raises:
-            ValueError: an argument of the wrong shape, or a state that is not of this controller.
+            ValueError: an argument of the wrong shape, or a state that is not of this
+                controller.
         """
         measured = {"observation": observation, "env": env, "reference": reference}
         given = {f"state.{name}": value for name, value in state.items()}
-        given |= {name: np.asarray(value, dtype=np.float32) for name, value in measured.items()}
+        given |= {
+            name: np.asarray(value, dtype=np.float32)
+            for name, value in measured.items()
+        }
         expected = self.manifest["programs"]["act"]["inputs"]
         if list(given) != [leaf["name"] for leaf in expected]:
-            raise ValueError("state must be what init or the last act of this controller returned")
+            raise ValueError(
+                "state must be what init or the last act of this controller returned"
+            )
         for leaf, value in zip(expected, given.values(), strict=True):
             if value.shape != tuple(leaf["shape"]):
-                raise ValueError(f"{leaf['name']} must have shape {tuple(leaf['shape'])}, got {value.shape}")
+                raise ValueError(
+                    f"{leaf['name']} must have shape {tuple(leaf['shape'])}, got {value.shape}"
+                )
         found = self._act(*given.values())
-        return found[0], self._named("act", "state", found), self._named("act", "info", found)
+        return (
+            found[0],
+            self._named("act", "state", found),
+            self._named("act", "info", found),
+        )
 
     def _key(self, seed: int) -> jax.Array:
         """A random key as the programs take it."""
-        return jax.random.key_data(jax.random.key(seed, impl=self.manifest["key_implementation"]))
+        return jax.random.key_data(
+            jax.random.key(seed, impl=self.manifest["key_implementation"])
+        )
 
     def _named(self, program: str, root: str, values: Any) -> dict[str, jax.Array]:
         """The results of a program whose names begin with `root`, without it."""
         names = [leaf["name"] for leaf in self.manifest["programs"][program]["outputs"]]
         pairs = zip(names, values, strict=True)
-        return {name.removeprefix(f"{root}."): value for name, value in pairs if name.startswith(f"{root}.")}
+        return {
+            name.removeprefix(f"{root}."): value
+            for name, value in pairs
+            if name.startswith(f"{root}.")
+        }
 
 
 def _manifest(path: Path) -> dict[str, Any]:
@@ -115,9 +154,15 @@ def _manifest(path: Path) -> dict[str, Any]:
         if not isinstance(manifest, dict) or manifest.get("kind") != "controller":
             raise ExportError(f"{path}: not the manifest of a controller")
         if manifest.get("format") != FORMAT:
-            raise ExportError(_line(f"{path}: is of format {manifest.get('format')}, this file reads {FORMAT}"))
+            raise ExportError(
+                _line(
+                    f"{path}: is of format {manifest.get('format')}, this file reads {FORMAT}"
+                )
+            )
         said = {name: value for name, value in manifest.items() if name != "sha256"}
-        digest = hashlib.sha256(json.dumps(said, sort_keys=True, allow_nan=False).encode()).hexdigest()
+        digest = hashlib.sha256(
+            json.dumps(said, sort_keys=True, allow_nan=False).encode()
+        ).hexdigest()
     except (ValueError, RecursionError):
         raise ExportError(f"{path}: truncated or not JSON") from None
     if digest != manifest.get("sha256"):
@@ -129,23 +174,38 @@ def _compiled(folder: Path, manifest: dict[str, Any], name: str) -> Any:
     """A program of the export, compiled for the device that jax uses by itself."""
     program = manifest["programs"][name]
     if Path(program["file"]).name != program["file"] or program["file"] in ("", ".."):
-        raise ValueError(f"{program['file']!r} is not the name of a file in this folder")
+        raise ValueError(
+            f"{program['file']!r} is not the name of a file in this folder"
+        )
     path = folder / program["file"]
     content = _content(path, int(program["bytes"]))
     if len(content) < program["bytes"]:
-        raise ExportError(f"{path}: truncated, {len(content)} of {program['bytes']} bytes")
+        raise ExportError(
+            f"{path}: truncated, {len(content)} of {program['bytes']} bytes"
+        )
     digest = hashlib.sha256(content).hexdigest()
     if digest != program["sha256"]:
-        raise ExportError(f"{path}: changed, sha256 {digest[:12]}, recorded {program['sha256'][:12]}")
+        raise ExportError(
+            f"{path}: changed, sha256 {digest[:12]}, recorded {program['sha256'][:12]}"
+        )
     try:
         exported = jax.export.deserialize(bytearray(content))
-        inputs = [jax.ShapeDtypeStruct(value.shape, value.dtype) for value in exported.in_avals]
+        inputs = [
+            jax.ShapeDtypeStruct(value.shape, value.dtype)
+            for value in exported.in_avals
+        ]
         compiled = jax.jit(exported.call).lower(*inputs).compile()
     except Exception as error:  # a blob of another version raises nearly anything
         reason = f"{path}: written by jax {manifest['jax']}, refused by {jax.__version__}: {error}"
         raise ExportError(_line(reason)) from None
-    for side, values in (("inputs", exported.in_avals), ("outputs", exported.out_avals)):
-        listed = [(type(leaf["name"]), tuple(leaf["shape"]), leaf["dtype"]) for leaf in program[side]]
+    for side, values in (
+        ("inputs", exported.in_avals),
+        ("outputs", exported.out_avals),
+    ):
+        listed = [
+            (type(leaf["name"]), tuple(leaf["shape"]), leaf["dtype"])
+            for leaf in program[side]
+        ]
         if listed != [(str, value.shape, str(value.dtype)) for value in values]:
             raise ExportError(f"{path}: has other {side} than its manifest says")
     return compiled
@@ -160,23 +220,34 @@ def _content(path: Path, most: int) -> bytes:
             if not stat.S_ISREG(status.st_mode):
                 raise ExportError(f"{path}: not a regular file")
             if status.st_size > most:
-                raise ExportError(f"{path}: {status.st_size} bytes, at most {most} belong to it")
+                raise ExportError(
+                    f"{path}: {status.st_size} bytes, at most {most} belong to it"
+                )
             with open(number, "rb", closefd=False) as file:
                 return file.read(most)
         finally:
             os.close(number)
-    except (OSError, ValueError) as error:  # a ValueError: of a name that no file can have
-        raise ExportError(_line(f"{path}: {getattr(error, 'strerror', None) or error}")) from None
+    except (
+        OSError,
+        ValueError,
+    ) as error:  # a ValueError: of a name that no file can have
+        raise ExportError(
+            _line(f"{path}: {getattr(error, 'strerror', None) or error}")
+        ) from None
 
 
 def _line(text: str) -> str:
     """What a terminal shows as one line, and not more than it should."""
-    return "".join(letter if letter.isprintable() else " " for letter in " ".join(text.split()))[:500]
+    return "".join(
+        letter if letter.isprintable() else " " for letter in " ".join(text.split())
+    )[:500]
 
 
 def main() -> None:
     """Step the controller as if it stood still beside a straight road, and print what it does."""
-    parser = argparse.ArgumentParser(description="Check an exported controller and step it on a straight road.")
+    parser = argparse.ArgumentParser(
+        description="Check an exported controller and step it on a straight road."
+    )
     parser.add_argument("folder", nargs="?", default=Path(__file__).parent, type=Path)
     parser.add_argument("--steps", default=10, type=int)
     parser.add_argument("--seed", default=0, type=int)
@@ -188,14 +259,22 @@ def main() -> None:
     except ExportError as reason:
         sys.exit(f"run_controller: {reason}")
     except MALFORMED as reason:
-        sys.exit(_line(f"run_controller: {asked.folder}: malformed, {type(reason).__name__}: {reason}"))
+        sys.exit(
+            _line(
+                f"run_controller: {asked.folder}: malformed, {type(reason).__name__}: {reason}"
+            )
+        )
     state, controls, times = controller.init(asked.seed), [], []
     for _ in range(asked.steps):
         began = time.perf_counter()
         control, state, _ = controller.act(state, observation, env, reference)
         controls.append(np.asarray(control).tolist())
         times.append(1e3 * (time.perf_counter() - began))
-    print(json.dumps({"names": names, "controls": controls, "median_ms": float(np.median(times))}))
+    print(
+        json.dumps(
+            {"names": names, "controls": controls, "median_ms": float(np.median(times))}
+        )
+    )
 
 
 def _straight(manifest: dict[str, Any]) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
@@ -204,9 +283,13 @@ def _straight(manifest: dict[str, Any]) -> tuple[np.ndarray, np.ndarray, np.ndar
     speed, observation = 10.0, np.zeros(observed["shape"])
     observation[1], observation[3] = 0.3, speed
     reference = np.zeros(ahead["shape"])
-    reference[:, 0] = speed * manifest["sampling_period_s"] * np.arange(1, len(reference) + 1)
+    reference[:, 0] = (
+        speed * manifest["sampling_period_s"] * np.arange(1, len(reference) + 1)
+    )
     reference[:, 3] = speed
-    env = np.mean([manifest["environment"]["low"], manifest["environment"]["high"]], axis=0)
+    env = np.mean(
+        [manifest["environment"]["low"], manifest["environment"]["high"]], axis=0
+    )
     return observation, env, reference
 
 

@@ -27,24 +27,35 @@ def warm_up(policy: Policy, *, cache: str | Path | None = None) -> jax.stages.Co
 
         act = warm_up(policy);   control, state, info = act(policy.params, state, observation, env, reference)
 
-    With `cache` the machine code is kept in jax's persistent compilation cache: a later process on the same kind of
-    machine, with the same jax and controller, reads it back. jax knows one cache for a whole process and offers no
-    narrower one, so the setting is made for this compilation alone and given back; other threads should not compile
-    meanwhile. To keep everything that a process compiles, set JAX_COMPILATION_CACHE_DIR for it instead.
+    With `cache` the machine code is kept in jax's persistent compilation cache: a later
+    process on the same kind of machine, with the same jax and controller, reads it
+    back. jax knows one cache for a whole process and offers no narrower one, so the
+    setting is made for this compilation alone and given back; other threads should not
+    compile meanwhile. To keep everything that a process compiles, set
+    JAX_COMPILATION_CACHE_DIR for it instead.
 
     Args:
-        policy: as `load` returns it. cache: a directory, made if missing; it holds machine code, so trust it as such.
+        policy: as `load` returns it.
+        cache: a directory, made if missing; it holds machine code, so trust it as such.
 
     Returns:
         The compiled function; it takes float32 arrays of these shapes and nothing else.
     """
     _, state, *measured = example_inputs(policy)
 
-    def act(*arguments: Any) -> Any:  # a new function: of one that has run, jax compiles and keeps nothing more
+    def act(
+        *arguments: Any,
+    ) -> (
+        Any
+    ):  # a new function: of one that has run, jax compiles and keeps nothing more
         return policy.controller.act(*arguments)
 
     lowered = jax.jit(act).lower(policy.params, state, *measured)
-    with nullcontext() if cache is None else _persistent_cache(Path(cache).expanduser().resolve()):
+    with (
+        nullcontext()
+        if cache is None
+        else _persistent_cache(Path(cache).expanduser().resolve())
+    ):
         return lowered.compile()
 
 

@@ -16,23 +16,37 @@ from sfkd_jax.exporting._programs import Program, specifications
 def weights_first(program: Program) -> Callable[..., list[Array]]:
     """The same function, with everything that no input enters evaluated now and kept as constants.
 
-    A compiler without LAPACK cannot take factorisations over. With folded parameters one model has any left that depend
-    on the weights alone, ControlSynth (the inverse of its metric's factor). Those of every control step stay: the
-    quadratic program of `koopman_mpc`, the eigenvectors of `curvature`. The rounding is not that of one program.
+    A compiler without LAPACK cannot take factorisations over. With folded parameters
+    one model has any left that depend on the weights alone, ControlSynth (the inverse
+    of its metric's factor). Those of every control step stay: the quadratic program of
+    `koopman_mpc`, the eigenvectors of `curvature`. The rounding is not that of one
+    program.
     """
     closed = jax.make_jaxpr(program.function)(*specifications(program))
     jaxpr = closed.jaxpr
     known, ahead, rest = set(jaxpr.constvars), [], []
     for equation in jaxpr.eqns:
-        constant = not equation.effects and all(_is_known(atom, known) for atom in equation.invars)
+        constant = not equation.effects and all(
+            _is_known(atom, known) for atom in equation.invars
+        )
         (ahead if constant else rest).append(equation)
         known |= set(equation.outvars) if constant else set()
-    wanted: list[Any] = [atom for equation in rest for atom in equation.invars] + list(jaxpr.outvars)
-    border = list(dict.fromkeys(atom for atom in wanted if isinstance(atom, Var) and atom in known))
+    wanted: list[Any] = [atom for equation in rest for atom in equation.invars] + list(
+        jaxpr.outvars
+    )
+    border = list(
+        dict.fromkeys(
+            atom for atom in wanted if isinstance(atom, Var) and atom in known
+        )
+    )
     names = jaxpr.debug_info.with_unknown_names()
     first = jaxpr.replace(invars=[], outvars=border, eqns=ahead, debug_info=names)
     values = jax.jit(jaxpr_as_fun(ClosedJaxpr(first, closed.consts)))()
-    remaining = jaxpr_as_fun(ClosedJaxpr(jaxpr.replace(constvars=border, eqns=rest, debug_info=names), values))
+    remaining = jaxpr_as_fun(
+        ClosedJaxpr(
+            jaxpr.replace(constvars=border, eqns=rest, debug_info=names), values
+        )
+    )
     return wraps(program.function)(lambda *leaves: remaining(*leaves))
 
 

@@ -10,7 +10,18 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from sfkd_jax.core.se2 import rotate
-from sfkd_jax.types import BODY, Control, Environment, Explicit, Fiber, Key, Model, Params, Space, State
+from sfkd_jax.types import (
+    BODY,
+    Control,
+    Environment,
+    Explicit,
+    Fiber,
+    Key,
+    Model,
+    Params,
+    Space,
+    State,
+)
 
 SOLVERS = ("rk4", "euler")
 FRAMES = ("body", "path")
@@ -20,7 +31,8 @@ class Conditioned(NamedTuple):
     """The fibre of a model that reads e as one more input: nothing is worth computing ahead.
 
     Attributes:
-        params: of the networks. env: scaled e.
+        params: of the networks.
+        env: scaled e.
     """
 
     params: Params
@@ -44,27 +56,33 @@ def continuous(
 
         ġ = R(yaw) (m_g + S_g r_g(s, u; e)) / dt,   ṡ = S_s r_s(s, u; e)
 
-    with s and u scaled, m_g, S_g centre and scale of the pose increment over dt, S_s the scale of s; u and e are held
-    over dt. R turns the velocity along and across the body into the world, so the step commutes with SE(2).
+    with s and u scaled, m_g, S_g centre and scale of the pose increment over dt, S_s
+    the scale of s; u and e are held over dt. R turns the velocity along and across the
+    body into the world, so the step commutes with SE(2).
 
     Args:
         space: measured scales; fixes all sizes.
         dt: sampling period [s].
         init: key -> params.
         fiber: (params, scaled e) -> all that depends on e alone.
-        rates: (fiber, scaled s, scaled u) -> (r_g, r_s), shape (3 + body,); r_s per second.
+        rates: (fiber, scaled s, scaled u) -> (r_g, r_s), shape (3 + body,); r_s per
+            second.
         environment: use e at all; if not, `fiber` is given zeros.
         solver: "rk4" or "euler", in training and in use.
-        known: (fiber, state, control) -> dx/dt known beforehand, in the world and in physical units, equivariant
-            under SE(2). The rates are then added to it, and m_g is left out.
+        known: (fiber, state, control) -> dx/dt known beforehand, in the world and in
+            physical units, equivariant under SE(2). The rates are then added to it, and
+            m_g is left out.
         explicit: as in `Model`.
-        frame: "body", or "path" for path coordinates: no pose, so r_g counts for nothing.
+        frame: "body", or "path" for path coordinates: no pose, so r_g counts for
+            nothing.
 
     Raises:
         ValueError: an unknown solver; a state of the wrong length, when it is encoded.
     """
     if solver not in SOLVERS:
-        raise ValueError(f"model.solver must be one of {', '.join(SOLVERS)}, got {solver!r}")
+        raise ValueError(
+            f"model.solver must be one of {', '.join(SOLVERS)}, got {solver!r}"
+        )
     size, pose = 3 + space.body_mean.shape[0], has_pose(frame)
     drift = jnp.asarray(space.increment_mean) if known is None else jnp.zeros(3)
 
@@ -77,7 +95,9 @@ def continuous(
         if not pose:
             return jnp.concatenate([jnp.zeros(3), space.body_scale * rate[3:]])
         twist = (drift + space.increment_scale * rate[:3]) / dt
-        change = jnp.concatenate([rotate(state[2], twist[:2]), twist[2:], space.body_scale * rate[3:]])
+        change = jnp.concatenate(
+            [rotate(state[2], twist[:2]), twist[2:], space.body_scale * rate[3:]]
+        )
         return change if known is None else change + known(at, state, control)
 
     def step(at: Fiber, state: State, control: Control) -> State:
@@ -119,7 +139,9 @@ def has_pose(frame: str) -> bool:
         ValueError: an unknown frame.
     """
     if frame not in FRAMES:
-        raise ValueError(f"model.frame must be one of {', '.join(FRAMES)}, got {frame!r}")
+        raise ValueError(
+            f"model.frame must be one of {', '.join(FRAMES)}, got {frame!r}"
+        )
     return frame == "body"
 
 
@@ -130,15 +152,25 @@ def scaled_env(space: Space, env: Environment, environment: bool) -> Environment
 
 
 def network(
-    hidden: Sequence[int], outputs: int, activations: Sequence[Callable[[Array], Array]], *, last: float
+    hidden: Sequence[int],
+    outputs: int,
+    activations: Sequence[Callable[[Array], Array]],
+    *,
+    last: float,
 ) -> nn.Sequential:
     """W_L σ_{L-1}(… σ_1(W_1 x + b_1) …) + b_L.
 
     Args:
-        hidden: widths, one a hidden layer. outputs: size of the result.
+        hidden: widths, one a hidden layer.
+        outputs: size of the result.
         activations: σ_1 … σ_{L-1}.
-        last: what the initial W_L is multiplied by; near 0, the model starts from no learned rates at all.
+        last: what the initial W_L is multiplied by; near 0, the model starts from no
+            learned rates at all.
     """
-    layers = [part for width, σ in zip(hidden, activations, strict=True) for part in (nn.Dense(width), σ)]
+    layers = [
+        part
+        for width, σ in zip(hidden, activations, strict=True)
+        for part in (nn.Dense(width), σ)
+    ]
     small = nn.initializers.variance_scaling(last**2, "fan_in", "truncated_normal")
     return nn.Sequential([*layers, nn.Dense(outputs, kernel_init=small)])

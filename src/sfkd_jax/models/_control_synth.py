@@ -10,19 +10,35 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from sfkd_jax.models._continuous import continuous, network
-from sfkd_jax.types import Control, Declared, Environment, Incremental, Key, Model, Params, Space
+from sfkd_jax.types import (
+    Control,
+    Declared,
+    Environment,
+    Incremental,
+    Key,
+    Model,
+    Params,
+    Space,
+)
 
 GAIN = 0.3
-"""Initial size of the networks in the state: their decay is GAIN² per second, slow against the sampling period."""
+"""Initial size of the networks in the state: their decay is GAIN² per second, slow
+against the sampling period.
+"""
 ROUNDING = 1e-5
-"""Of the size of the matrices, added to the rate: so that what is exact on paper still holds in float32."""
+"""Of the size of the matrices, added to the rate: so that what is exact on paper still
+holds in float32.
+"""
 
 
 class Synthesis(NamedTuple):
     """L s + Σ_j A_j tanh(W_j s + c_j), the M networks stacked.
 
     Attributes:
-        linear: L. outer: [A_1 … A_M]. inner: [W_1; …; W_M]. offsets: [c_1; …; c_M].
+        linear: L.
+        outer: [A_1 … A_M].
+        inner: [W_1; …; W_M].
+        offsets: [c_1; …; c_M].
     """
 
     linear: Float[Array, "out body"]
@@ -32,14 +48,19 @@ class Synthesis(NamedTuple):
 
     def __call__(self, body: Float[Array, " body"]) -> Float[Array, " out"]:
         """The value at one scaled body state."""
-        return self.linear @ body + self.outer @ jnp.tanh(self.inner @ body + self.offsets)
+        return self.linear @ body + self.outer @ jnp.tanh(
+            self.inner @ body + self.offsets
+        )
 
 
 class ControlSynthFiber(NamedTuple):
     """The matrices as they are multiplied by; e is one more input.
 
     Attributes:
-        change: of ds/dt. twist: of the output. inputs: parameters of the input network. env: scaled e.
+        change: of ds/dt.
+        twist: of the output.
+        inputs: parameters of the input network.
+        env: scaled e.
     """
 
     change: Synthesis
@@ -62,22 +83,26 @@ def control_synth(
 
         ds/dt = A_0 s + Σ_j A_j tanh(W_j s + c_j) + g(u, e),   twist = C_0 s + Σ_j C_j tanh(V_j s + d_j) + h(u, e)
 
-    By construction, for all weights, two solutions under the same inputs approach each other at γ = `rate`, in the
-    metric of a learned P = T'T: with A = [A_1 … A_M], W = [W_1; …; W_M] and a learned diagonal Λ > 0,
+    By construction, for all weights, two solutions under the same inputs approach each
+    other at γ = `rate`, in the metric of a learned P = T'T: with A = [A_1 … A_M], W =
+    [W_1; …; W_M] and a learned diagonal Λ > 0,
 
         [ A_0'P + P A_0 + 2γP   PA + W'Λ ]
         [          ·               −2Λ   ]  ≤  0,   as  T A_0 T⁻¹ = −γI − ¼ BB' − ½ XX' + (Y − Y'),
                                                         T A = (B − Ŵ') Λ^½,   W T⁻¹ = Λ^(−½) Ŵ
 
-    (Schur's complement of −2Λ leaves −XX'). B, X, Y, Ŵ and Λ are free, T is triangular and well conditioned. The
-    claim is about the continuous flow, not about its RK4 discretisation. Inputs are only added, as in the original:
-    that is a limit of the structure, and it is kept. There the input is a second state of an autonomous system, and
-    the published code has neither A_j nor a matrix inequality; the offsets c_j, d_j leave the proof as it is.
+    (Schur's complement of −2Λ leaves −XX'). B, X, Y, Ŵ and Λ are free, T is triangular
+    and well conditioned. The claim is about the continuous flow, not about its RK4
+    discretisation. Inputs are only added, as in the original: that is a limit of the
+    structure, and it is kept. There the input is a second state of an autonomous
+    system, and the published code has neither A_j nor a matrix inequality; the offsets
+    c_j, d_j leave the proof as it is.
 
     Args:
         space: measured scales; fixes all sizes.
         dt: sampling period [s], the solver's step in training and in use.
-        networks: M, of the state, and as many of the output. width: of each.
+        networks: M, of the state, and as many of the output.
+        width: of each.
         rate: γ [1/s].
         input_hidden: widths of the network that holds g and h.
         environment: use e at all.
@@ -88,7 +113,9 @@ def control_synth(
     Source: Mei, Zheng and Li, NeurIPS 2024, arXiv 2411.02292.
     """
     if networks < 1 or width < 1:
-        raise ValueError(f"model.networks and model.width must be at least 1, got {networks} and {width}")
+        raise ValueError(
+            f"model.networks and model.width must be at least 1, got {networks} and {width}"
+        )
     if not 0.0 < rate < float("inf"):
         raise ValueError(f"model.rate must be positive, got {rate}")
     body, hidden = space.body_mean.shape[0], networks * width
@@ -113,7 +140,9 @@ def control_synth(
                 "inner": jax.random.normal(keys[4], (hidden, body)),
                 "offsets": jnp.linspace(-1.0, 1.0, hidden),
             },
-            "inputs": inputs.init(keys[5], jnp.zeros(control + space.env_mean.shape[0]))["params"],
+            "inputs": inputs.init(
+                keys[5], jnp.zeros(control + space.env_mean.shape[0])
+            )["params"],
         }
 
     def explicit(params: Params) -> Incremental:
@@ -121,15 +150,23 @@ def control_synth(
 
     def fiber(params: Params, env: Environment) -> ControlSynthFiber:
         found = explicit(params)
-        change = Synthesis(found.linear, found.outer, found.inner, params["free"]["offsets"])
-        return ControlSynthFiber(change, Synthesis(**params["twist"]), params["inputs"], env)
+        change = Synthesis(
+            found.linear, found.outer, found.inner, params["free"]["offsets"]
+        )
+        return ControlSynthFiber(
+            change, Synthesis(**params["twist"]), params["inputs"], env
+        )
 
-    def rates(fiber: ControlSynthFiber, body: Float[Array, " body"], control: Control) -> Float[Array, " rates"]:
+    def rates(
+        fiber: ControlSynthFiber, body: Float[Array, " body"], control: Control
+    ) -> Float[Array, " rates"]:
         read = jnp.concatenate([control, fiber.env])
         added = cast(jax.Array, inputs.apply({"params": fiber.inputs}, read))
         return jnp.concatenate([fiber.twist(body), fiber.change(body)]) + added
 
-    model = continuous(space, dt=dt, init=init, fiber=fiber, rates=rates, environment=environment)
+    model = continuous(
+        space, dt=dt, init=init, fiber=fiber, rates=rates, environment=environment
+    )
     return model._replace(explicit=explicit)
 
 

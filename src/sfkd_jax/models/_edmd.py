@@ -13,11 +13,15 @@ STRAIGHT = 1e-12
 """Curvature [1/m] that stands for less, so that nothing divides by 0."""
 
 
-def thin_plate(point: Float[Array, " n"], centres: Float[Array, "function n"]) -> Float[Array, " function"]:
+def thin_plate(
+    point: Float[Array, " n"], centres: Float[Array, "function n"]
+) -> Float[Array, " function"]:
     """r² log r of the distances r to every centre; 0 at r = 0."""
     squares = jnp.sum((point - centres) ** 2, axis=1)
     apart = squares > 0
-    return jnp.where(apart, 0.5 * squares * jnp.log(jnp.where(apart, squares, 1.0)), 0.0)
+    return jnp.where(
+        apart, 0.5 * squares * jnp.log(jnp.where(apart, squares, 1.0)), 0.0
+    )
 
 
 def along_circle(
@@ -29,10 +33,13 @@ def along_circle(
     (X, Y, Θ) the pose in the frame of the circle's point next to the first state.
 
     Args:
-        states: x_0 … x_T. offset: e_y [m] and e_ψ [rad] of x_0. curvature: κ [1/m].
+        states: x_0 … x_T.
+        offset: e_y [m] and e_ψ [rad] of x_0.
+        curvature: κ [1/m].
 
     Returns:
-        (s, e_y, e_ψ, body state) at every time: exact, and finite up to the centre of the circle.
+        (s, e_y, e_ψ, body state) at every time: exact, and finite up to the centre of
+        the circle.
     """
     kappa = jnp.where(jnp.abs(curvature) < STRAIGHT, STRAIGHT, curvature)
     tangent = states[0, POSE].at[2].add(-offset[1])
@@ -43,6 +50,8 @@ def along_circle(
         across, along = 1.0 - kappa * y, kappa * x
         turned = jnp.arctan2(along, across)
         left = (2.0 * y - kappa * (x**2 + y**2)) / (1.0 + jnp.hypot(along, across))
-        return jnp.concatenate([jnp.stack([turned / kappa, left, wrap_angle(yaw - turned)]), state[BODY]])
+        return jnp.concatenate(
+            [jnp.stack([turned / kappa, left, wrap_angle(yaw - turned)]), state[BODY]]
+        )
 
     return jax.vmap(one)(states)

@@ -18,8 +18,8 @@ from sfkd_jax.types import Control, Key, Model, Params, Space
 def softplus(x: Float[Array, "*shape"]) -> Float[Array, "*shape"]:
     """log(1 + exp x), a quarter of the time of `log1p`: that branches per element, and rollouts spend most here.
 
-    With t = exp −|x| in (0, 1], log(1 + t) = 2 artanh(t / (2 + t)), whose argument is at most 1/3: seven terms of the
-    series leave 2e-8, less than float32 resolves.
+    With t = exp −|x| in (0, 1], log(1 + t) = 2 artanh(t / (2 + t)), whose argument is
+    at most 1/3: seven terms of the series leave 2e-8, less than float32 resolves.
     """
     t = jnp.exp(-jnp.abs(x))
     s = t / (2.0 + t)
@@ -50,7 +50,9 @@ def affine_rates(
         last: initial scale of both last layers.
         reads_env: f(s, e) + G(s, e) u instead: affine in the control alone.
     """
-    body, control, env = (part.shape[0] for part in (space.body_mean, space.control_mean, space.env_mean))
+    body, control, env = (
+        part.shape[0] for part in (space.body_mean, space.control_mean, space.env_mean)
+    )
     outputs, inputs = 3 + body, control + (0 if reads_env else env)
     start = jnp.zeros(body + (env if reads_env else 0))
     f = network(hidden, outputs, activations, last=last)
@@ -58,33 +60,48 @@ def affine_rates(
 
     def init(key: Key) -> Params:
         f_key, G_key = jax.random.split(key)
-        return {"f": f.init(f_key, start)["params"], "G": G.init(G_key, start)["params"]}
+        return {
+            "f": f.init(f_key, start)["params"],
+            "G": G.init(G_key, start)["params"],
+        }
 
-    def rates(fiber: Conditioned, body: Float[Array, " body"], control: Control) -> Float[Array, " rates"]:
+    def rates(
+        fiber: Conditioned, body: Float[Array, " body"], control: Control
+    ) -> Float[Array, " rates"]:
         read = jnp.concatenate([body, fiber.env]) if reads_env else body
         driven = control if reads_env else jnp.concatenate([control, fiber.env])
         free = cast(jax.Array, f.apply({"params": fiber.params["f"]}, read))
-        gain = cast(jax.Array, G.apply({"params": fiber.params["G"]}, read)).reshape(outputs, inputs)
+        gain = cast(jax.Array, G.apply({"params": fiber.params["G"]}, read)).reshape(
+            outputs, inputs
+        )
         return free + gain @ driven
 
     return init, rates
 
 
 def icode(
-    space: Space, *, dt: float = 0.1, width: int = 60, layers: int = 3, solver: str = "euler", environment: bool = True
+    space: Space,
+    *,
+    dt: float = 0.1,
+    width: int = 60,
+    layers: int = 3,
+    solver: str = "euler",
+    environment: bool = True,
 ) -> Model:
     """Rates that are affine in the control and in the environment.
 
         (ġ, ṡ) = f(s) + G(s) [u; e],   ġ in the frame of the body
 
-    f and G: a tanh layer, then softplus layers. Tyre forces at their limit are not affine in e: that is a limit of
-    the structure, and it is kept. The original solves by Euler on the grid of the data; since
-    the pose's rates are learned in the frame of the body, an Euler step composes learned increments and loses nothing.
+    f and G: a tanh layer, then softplus layers. Tyre forces at their limit are not
+    affine in e: that is a limit of the structure, and it is kept. The original solves
+    by Euler on the grid of the data; since the pose's rates are learned in the frame of
+    the body, an Euler step composes learned increments and loses nothing.
 
     Args:
         space: measured scales; fixes all sizes.
         dt: sampling period [s], the solver's step in training and in use.
-        width, layers: of the hidden layers of f and of G. solver: "euler" or "rk4".
+        width, layers: of the hidden layers of f and of G.
+        solver: "euler" or "rk4".
         environment: use e at all; if not, G(s) [u; 0].
 
     Raises:
@@ -96,4 +113,12 @@ def icode(
         raise ValueError(f"model.layers must be at least 1, got {layers}")
     activations = (nn.tanh, *(softplus,) * (layers - 1))
     init, rates = affine_rates(space, (width,) * layers, activations, last=0.1)
-    return continuous(space, dt=dt, init=init, fiber=Conditioned, rates=rates, environment=environment, solver=solver)
+    return continuous(
+        space,
+        dt=dt,
+        init=init,
+        fiber=Conditioned,
+        rates=rates,
+        environment=environment,
+        solver=solver,
+    )

@@ -20,24 +20,36 @@ def icode_mppi(
 
         ẋ = f_nom(x, u) + f(s) + G(s) [u; e],   the pose part of the residual in the frame of the body
 
-    f and G are softplus networks that start near 0: training starts from the known dynamics. The original's residual
-    is f(x) + G(x) u; e joins u.
+    f and G are softplus networks that start near 0: training starts from the known
+    dynamics. The original's residual is f(x) + G(x) u; e joins u.
 
     Args:
         space: measured scales; fixes all sizes.
-        nominal: (x, u, e) -> dx/dt of the known dynamics in physical units, passed in by the caller (models never
-            import the vehicle). A model that does not see e gives it the centre of the environment box.
+        nominal: (x, u, e) -> dx/dt of the known dynamics in physical units, passed in
+            by the caller (models never import the vehicle). A model that does not see e
+            gives it the centre of the environment box.
         dt: sampling period [s], the solver's step in training and in use.
         hidden: widths of f and of G.
         environment: use e at all; if not, G(s) [u; 0].
-        reads_env: f(s, e) + G(s, e) u instead, so that the gain of the steering may depend on friction: more than the
-            original has, and the most that a residual affine in the control can be given.
+        reads_env: f(s, e) + G(s, e) u instead, so that the gain of the steering may
+            depend on friction: more than the original has, and the most that a residual
+            affine in the control can be given.
 
     Source: Song et al., arXiv 2605.03260, eqs. 10 and 11.
     """
-    init, rates = affine_rates(space, hidden, (softplus,) * len(hidden), last=1e-3, reads_env=reads_env)
+    init, rates = affine_rates(
+        space, hidden, (softplus,) * len(hidden), last=1e-3, reads_env=reads_env
+    )
 
     def known(fiber: Conditioned, state: State, control: Control) -> State:
         return nominal(state, control, space.env_mean + space.env_scale * fiber.env)
 
-    return continuous(space, dt=dt, init=init, fiber=Conditioned, rates=rates, environment=environment, known=known)
+    return continuous(
+        space,
+        dt=dt,
+        init=init,
+        fiber=Conditioned,
+        rates=rates,
+        environment=environment,
+        known=known,
+    )

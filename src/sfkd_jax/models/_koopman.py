@@ -11,7 +11,17 @@ from jaxtyping import Array, Float
 from sfkd_jax.core.se2 import between, compose
 from sfkd_jax.models._koopman_fit import identify, random_centres
 from sfkd_jax.models._koopman_lift import KoopmanFiber, Lift
-from sfkd_jax.types import POSE, Control, Key, LinearPredictor, Model, Params, Pose, Space, State
+from sfkd_jax.types import (
+    POSE,
+    Control,
+    Key,
+    LinearPredictor,
+    Model,
+    Params,
+    Pose,
+    Space,
+    State,
+)
 
 
 class KoopmanLatent(NamedTuple):
@@ -39,9 +49,10 @@ def koopman(
         z = (x, |ξ − c_i|² log |ξ − c_i|),   ξ = (e_y, e_ψ, s) scaled to [-1, 1],   c_i uniform in the same box
         z⁺ = z + Wᵀ (rbf, m(e) ⊗ (ξ, u, κ, 1))   =   A(e) z + B(e) u + d(e) κ + c(e),   x = C z + o
 
-    m(e) are the monomials of the scaled environment up to a degree. At every e the predictor is linear in z, u and the
-    path's curvature κ; no products of state and control enter, as in the original. A model that does not see e has the
-    original's one (A, B) for all e; matrices that vary with e are an extension of it.
+    m(e) are the monomials of the scaled environment up to a degree. At every e the
+    predictor is linear in z, u and the path's curvature κ; no products of state and
+    control enter, as in the original. A model that does not see e has the original's
+    one (A, B) for all e; matrices that vary with e are an extension of it.
 
     `identify` regresses z⁺ − z on pairs of driven states, each seen from a circle of random curvature and offset (how
     a car moves does not depend on the path it is on), with the ridge that predicts validation drives best over a
@@ -51,11 +62,13 @@ def koopman(
     Args:
         space: measured scales; fixes all sizes.
         functions: how many thin-plate functions.
-        environment: use e at all. environment_degree: of m(e).
+        environment: use e at all.
+        environment_degree: of m(e).
         ridges: to choose from, for columns scaled to mean square 1, per sample.
-        lateral_range, heading_range, curvature_range: how far e_y [m], e_ψ [rad] and κ [1/m] of the pairs reach; also
-            their scales.
-        transitions: pairs in the regression, at most. horizon: of the predictions that choose the ridge, steps.
+        lateral_range, heading_range, curvature_range: how far e_y [m], e_ψ [rad] and κ
+            [1/m] of the pairs reach; also their scales.
+        transitions: pairs in the regression, at most.
+        horizon: of the predictions that choose the ridge, steps.
 
     Source: Korda and Mezić (2018), sections 4 to 6, and the authors' code.
     """
@@ -64,9 +77,14 @@ def koopman(
     regressors = functions + len(lift.monomials) * lift.columns
 
     def init(key: Key) -> Params:
-        return {"centres": random_centres(lift, key), "weights": jnp.zeros((regressors, lift.rank))}
+        return {
+            "centres": random_centres(lift, key),
+            "weights": jnp.zeros((regressors, lift.rank)),
+        }
 
-    def observe(fiber: KoopmanFiber, latent: KoopmanLatent, state: State) -> KoopmanLatent:
+    def observe(
+        fiber: KoopmanFiber, latent: KoopmanLatent, state: State
+    ) -> KoopmanLatent:
         path = state.at[POSE].set(between(latent.frame, state[POSE]))
         return latent._replace(z=lift(fiber.centres, path))
 
@@ -75,7 +93,9 @@ def koopman(
             raise ValueError(f"state must have shape ({lift.size},), got {state.shape}")
         return KoopmanLatent(state[POSE], lift(fiber.centres, state.at[POSE].set(0.0)))
 
-    def step(fiber: KoopmanFiber, latent: KoopmanLatent, control: Control) -> KoopmanLatent:
+    def step(
+        fiber: KoopmanFiber, latent: KoopmanLatent, control: Control
+    ) -> KoopmanLatent:
         return latent._replace(z=fiber.A @ latent.z + fiber.B @ control + fiber.c)
 
     def decode(fiber: KoopmanFiber, latent: KoopmanLatent) -> State:
@@ -85,7 +105,9 @@ def koopman(
     def linear(fiber: KoopmanFiber) -> LinearPredictor:
         readout = jnp.eye(lift.size, lift.rank) * lift.scale[:, None]
         up = partial(lift, fiber.centres)
-        return LinearPredictor(up, fiber.A, fiber.B, fiber.d, fiber.c, readout, lift.centre)
+        return LinearPredictor(
+            up, fiber.A, fiber.B, fiber.d, fiber.c, readout, lift.centre
+        )
 
     return Model(
         init=init,
@@ -96,6 +118,8 @@ def koopman(
         transport=lambda fiber, fiber_next, latent: latent,
         observe=observe,
         vector=lambda latent: latent.z[1 : lift.size],
-        identify=partial(identify, lift, ridges=ridges, transitions=transitions, horizon=horizon),
+        identify=partial(
+            identify, lift, ridges=ridges, transitions=transitions, horizon=horizon
+        ),
         linear=linear,
     )

@@ -13,7 +13,9 @@ from sfkd_jax.models._koopman_lift import Lift
 from sfkd_jax.types import POSE, Control, Environment, Key, Params, Scalar, Trajectory
 
 FOLLOWED = 0.1
-"""Share of the ranges that predictions are judged within: a controller keeps the car near its path."""
+"""Share of the ranges that predictions are judged within: a controller keeps the car
+near its path.
+"""
 
 
 def random_centres(lift: Lift, key: Key) -> Float[Array, "function coordinate"]:
@@ -34,43 +36,74 @@ def identify(
     """Random centres, weights by ridge regression on `transitions` pairs, and the ridge that predicts best."""
     centre_key, pair_key, circle_key = jax.random.split(key, 3)
     centres = random_centres(lift, centre_key)
-    fits = ridge_regression(*_pairs(lift, train, centres, pair_key, transitions), jnp.asarray(ridges))
+    fits = ridge_regression(
+        *_pairs(lift, train, centres, pair_key, transitions), jnp.asarray(ridges)
+    )
     count, steps = validation.controls.shape[:2]
     length = min(horizon, steps)
     states, *inputs = validation
-    windows = Trajectory(states[:, : length + 1], *(leaf[:, :length] for leaf in inputs))
-    drawn = jax.tree.map(lambda leaf: FOLLOWED * leaf, _circles(lift, circle_key, count))
+    windows = Trajectory(
+        states[:, : length + 1], *(leaf[:, :length] for leaf in inputs)
+    )
+    drawn = jax.tree.map(
+        lambda leaf: FOLLOWED * leaf, _circles(lift, circle_key, count)
+    )
 
     def error(weights: Float[Array, "regressor rank"]) -> Scalar:
         params = {"centres": centres, "weights": weights}
-        return jnp.mean(jax.vmap(lambda *each: _prediction_error(lift, params, *each))(windows, *drawn))
+        return jnp.mean(
+            jax.vmap(lambda *each: _prediction_error(lift, params, *each))(
+                windows, *drawn
+            )
+        )
 
     errors = jax.lax.map(error, fits)
-    return {"centres": centres, "weights": fits[jnp.argmin(jnp.where(jnp.isfinite(errors), errors, jnp.inf))]}
+    return {
+        "centres": centres,
+        "weights": fits[jnp.argmin(jnp.where(jnp.isfinite(errors), errors, jnp.inf))],
+    }
 
 
-def _circles(lift: Lift, key: Key, count: int) -> tuple[Float[Array, "sample 2"], Float[Array, " sample"]]:
+def _circles(
+    lift: Lift, key: Key, count: int
+) -> tuple[Float[Array, "sample 2"], Float[Array, " sample"]]:
     """Random offsets (e_y, e_ψ) from circles of random curvature, uniform over their ranges."""
     drawn = jax.random.uniform(key, (count, 3), minval=-1.0)
-    return drawn[:, :2] * jnp.asarray([lift.lateral_range, lift.heading_range]), lift.curvature_range * drawn[:, 2]
+    return drawn[:, :2] * jnp.asarray(
+        [lift.lateral_range, lift.heading_range]
+    ), lift.curvature_range * drawn[:, 2]
 
 
 def _pairs(
-    lift: Lift, train: Trajectory, centres: Float[Array, "function coordinate"], key: Key, most: int
+    lift: Lift,
+    train: Trajectory,
+    centres: Float[Array, "function coordinate"],
+    key: Key,
+    most: int,
 ) -> tuple[Float[Array, "sample regressor"], Float[Array, "sample rank"]]:
     """Regressors and increments of the lift, one row a transition."""
     choice_key, circle_key = jax.random.split(key)
-    ends = jnp.stack([train.states[:, :-1], train.states[:, 1:]], axis=2).reshape(-1, 2, lift.size)
+    ends = jnp.stack([train.states[:, :-1], train.states[:, 1:]], axis=2).reshape(
+        -1, 2, lift.size
+    )
     chosen = jax.random.permutation(choice_key, ends.shape[0])[:most]
-    controls, envs = (leaf.reshape(ends.shape[0], -1)[chosen] for leaf in (train.controls, train.envs))
+    controls, envs = (
+        leaf.reshape(ends.shape[0], -1)[chosen] for leaf in (train.controls, train.envs)
+    )
     offsets, curvatures = _circles(lift, circle_key, chosen.shape[0])
     paths = jax.vmap(along_circle)(ends[chosen], offsets, curvatures)
-    before, after = (jax.vmap(lift, in_axes=(None, 0))(centres, paths[:, k]) for k in (0, 1))
+    before, after = (
+        jax.vmap(lift, in_axes=(None, 0))(centres, paths[:, k]) for k in (0, 1)
+    )
     return jax.vmap(lift.regressors)(before, controls, envs, curvatures), after - before
 
 
 def _prediction_error(
-    lift: Lift, params: Params, window: Trajectory, offset: Float[Array, " 2"], change: Scalar
+    lift: Lift,
+    params: Params,
+    window: Trajectory,
+    offset: Float[Array, " 2"],
+    change: Scalar,
 ) -> Scalar:
     """Mean square of scaled errors of a free-running prediction, seen from a circle that about follows the window."""
     steps = jnp.hypot(*jnp.diff(window.states[:, :2], axis=0).T)
@@ -83,5 +116,7 @@ def _prediction_error(
         z = z + lift.regressors(z, *inputs, kappa) @ params["weights"]
         return z, z[1 : lift.size]
 
-    _, found = jax.lax.scan(advance, lift(params["centres"], paths[0]), (window.controls, window.envs))
+    _, found = jax.lax.scan(
+        advance, lift(params["centres"], paths[0]), (window.controls, window.envs)
+    )
     return jnp.mean((found - ((paths - lift.centre) / lift.scale)[1:, 1:]) ** 2)

@@ -28,8 +28,11 @@ class Lift:
     """z = (x, rbf(ξ)) and z⁺ − z = Wᵀ (rbf, m(e) ⊗ (ξ, u, κ, 1)), x = (progress, ξ) = (progress, e_y, e_ψ, s) scaled.
 
     Attributes:
-        space: measured scales. functions: how many. degree: of the monomials m(e).
-        lateral_range, heading_range, curvature_range: units of e_y [m], e_ψ [rad] and κ [1/m].
+        space: measured scales.
+        functions: how many.
+        degree: of the monomials m(e).
+        lateral_range, heading_range, curvature_range: units of e_y [m], e_ψ [rad] and κ
+            [1/m].
     """
 
     space: Space
@@ -42,7 +45,12 @@ class Lift:
     @property
     def scale(self) -> State:
         """Units of x."""
-        return jnp.concatenate([jnp.asarray([1.0, self.lateral_range, self.heading_range]), self.space.body_scale])
+        return jnp.concatenate(
+            [
+                jnp.asarray([1.0, self.lateral_range, self.heading_range]),
+                self.space.body_scale,
+            ]
+        )
 
     @property
     def centre(self) -> State:
@@ -68,9 +76,15 @@ class Lift:
     def monomials(self) -> list[tuple[int, ...]]:
         """Which entries of e each monomial multiplies; the first is the empty product, 1."""
         entries = range(self.space.env_mean.shape[0])
-        return [term for degree in range(self.degree + 1) for term in combinations_with_replacement(entries, degree)]
+        return [
+            term
+            for degree in range(self.degree + 1)
+            for term in combinations_with_replacement(entries, degree)
+        ]
 
-    def __call__(self, centres: Float[Array, "function coordinate"], path: State) -> Float[Array, " rank"]:
+    def __call__(
+        self, centres: Float[Array, "function coordinate"], path: State
+    ) -> Float[Array, " rank"]:
         """z of a state along the path, in physical units."""
         scaled = (path - self.centre) / self.scale
         return jnp.concatenate([scaled, thin_plate(scaled[1:], centres)])
@@ -78,24 +92,40 @@ class Lift:
     def features(self, env: Environment) -> Float[Array, " monomial"]:
         """m(e)."""
         scaled = (env - self.space.env_mean) / self.space.env_scale
-        return jnp.stack([jnp.prod(scaled[jnp.asarray(term, int)]) for term in self.monomials])
+        return jnp.stack(
+            [jnp.prod(scaled[jnp.asarray(term, int)]) for term in self.monomials]
+        )
 
     def regressors(
-        self, z: Float[Array, " rank"], control: Control, env: Environment, kappa: Scalar
+        self,
+        z: Float[Array, " rank"],
+        control: Control,
+        env: Environment,
+        kappa: Scalar,
     ) -> Float[Array, " regressor"]:
         """(rbf, m(e) ⊗ (ξ, u, κ, 1))."""
         inputs = (control - self.space.control_mean) / self.space.control_scale
         rest = jnp.stack([kappa / self.curvature_range, jnp.ones(())])
         linear = jnp.concatenate([z[1 : self.size], inputs, rest])
-        return jnp.concatenate([z[self.size :], jnp.outer(self.features(env), linear).ravel()])
+        return jnp.concatenate(
+            [z[self.size :], jnp.outer(self.features(env), linear).ravel()]
+        )
 
     def at(self, params: Params, env: Environment) -> KoopmanFiber:
         """The matrices at e."""
         of_functions, of_features = jnp.split(params["weights"], [self.functions])
         by_feature = of_features.reshape(-1, self.columns, self.rank)
         linear = jnp.tensordot(self.features(env), by_feature, axes=1).T
-        states, inputs, bend, rest = jnp.split(linear, (self.size - 1, self.columns - 2, self.columns - 1), axis=1)
+        states, inputs, bend, rest = jnp.split(
+            linear, (self.size - 1, self.columns - 2, self.columns - 1), axis=1
+        )
         A = jnp.concatenate([jnp.zeros((self.rank, 1)), states, of_functions.T], axis=1)
         B = inputs / self.space.control_scale
         c = rest[:, 0] - B @ self.space.control_mean
-        return KoopmanFiber(jnp.eye(self.rank) + A, B, bend[:, 0] / self.curvature_range, c, params["centres"])
+        return KoopmanFiber(
+            jnp.eye(self.rank) + A,
+            B,
+            bend[:, 0] / self.curvature_range,
+            c,
+            params["centres"],
+        )

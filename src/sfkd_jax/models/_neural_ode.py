@@ -31,7 +31,8 @@ def neural_ode(
         space: measured scales; fixes all sizes.
         dt: sampling period [s], the solver's step in training and in use.
         hidden: widths.
-        environment: use e at all. frame: "body", or "path" for path coordinates.
+        environment: use e at all.
+        frame: "body", or "path" for path coordinates.
 
     Source: Chen et al., NeurIPS 2018, arXiv 1806.07366.
     """
@@ -42,8 +43,18 @@ def neural_ode(
     def init(key: Key) -> Params:
         return net.init(key, jnp.zeros(inputs))["params"]
 
-    def rates(fiber: Conditioned, body: Float[Array, " body"], control: Control) -> Float[Array, " rates"]:
+    def rates(
+        fiber: Conditioned, body: Float[Array, " body"], control: Control
+    ) -> Float[Array, " rates"]:
         read = jnp.concatenate([body, control, fiber.env])
         return cast(jax.Array, net.apply({"params": fiber.params}, read))
 
-    return continuous(space, dt=dt, init=init, fiber=Conditioned, rates=rates, environment=environment, frame=frame)
+    return continuous(
+        space,
+        dt=dt,
+        init=init,
+        fiber=Conditioned,
+        rates=rates,
+        environment=environment,
+        frame=frame,
+    )

@@ -8,12 +8,16 @@ from sfkd_jax.types import BODY, Environment, Model, Step
 
 
 def physics(
-    step: Step, *, distort: Callable[[Environment], Environment] = lambda env: env, along_path: bool = False
+    step: Step,
+    *,
+    distort: Callable[[Environment], Environment] = lambda env: env,
+    along_path: bool = False,
 ) -> Model:
     """A one-step function as a `Model`: the latent is the state itself.
 
     Args:
-        step: (x, u, e) -> x one sampling period later, passed in by the caller (models never import the vehicle).
+        step: (x, u, e) -> x one sampling period later, passed in by the caller (models
+            never import the vehicle).
         distort: what the model believes e to be; a deliberately biased oracle has one.
         along_path: whether x and u are path states and w, see `path_frame`.
     """

@@ -59,38 +59,47 @@ def r2dn(
 
         z⁺ = A z + B₁ φ(C₁ z; u, e) + B₂ [u; e] + b,   g⁺ = g ∘ D(z; u, e),   s = C z + c
 
-    φ is a sandwich network; u and e (scaled) are biases of each of its layers, so D₁₂ [u; e] of the paper is part of
-    the first one. For two trajectories under the same u and e let Δz be their difference, Δv = C₁ Δz and Δw that of
-    φ. By construction, and checked in no search,
+    φ is a sandwich network; u and e (scaled) are biases of each of its layers, so D₁₂
+    [u; e] of the paper is part of the first one. For two trajectories under the same u
+    and e let Δz be their difference, Δv = C₁ Δz and Δw that of φ. By construction, and
+    checked in no search,
 
         |A Δz + B₁ Δw|² + |C₁ Δz|² ≤ α² |Δz|² + |Δw|²,   that is  ‖[A/α  B₁; C₁/α  0]‖₂ ≤ 1,
 
-    and |Δw| ≤ |Δv|. The sum of both is |Δz⁺| ≤ α |Δz|. The metric of the paper is P = I here: encoder, decoder and
-    read-out absorb P^(1/2), and B₁, C₁ the multiplier of φ's bound. A single bound for A and the feedback together
-    leaves more room than ρ + β.
-    Source: Barbara, Wang and Manchester, arXiv 2504.01250; its controls and observations are ours, as for SFKD.
+    and |Δw| ≤ |Δv|. The sum of both is |Δz⁺| ≤ α |Δz|. The metric of the paper is P = I
+    here: encoder, decoder and read-out absorb P^(1/2), and B₁, C₁ the multiplier of φ's
+    bound. A single bound for A and the feedback together leaves more room than ρ + β.
+    Source: Barbara, Wang and Manchester, arXiv 2504.01250; its controls and
+    observations are ours, as for SFKD.
 
     Args:
         space: measured scales; fixes all sizes.
-        rank: of z, and of what φ takes in and gives out. alpha: α, below 1 for a certificate.
+        rank: of z, and of what φ takes in and gives out.
+        alpha: α, below 1 for a certificate.
         hidden, decoder_hidden, encoder_hidden: hidden widths of φ, D and the encoder.
-        environment: use e at all. frame: "body", or "path" for path coordinates, which have no pose.
+        environment: use e at all.
+        frame: "body", or "path" for path coordinates, which have no pose.
 
     Raises:
-        ValueError: an unknown frame, rank below 1, α outside (0, 1), or no hidden layer in φ or D.
+        ValueError: an unknown frame, rank below 1, α outside (0, 1), or no hidden layer
+            in φ or D.
     """
     _check(rank, alpha, hidden, decoder_hidden)
     pose = has_pose(frame)
     body, control = space.body_mean.shape[0], space.control_mean.shape[0]
     inputs = control + space.env_mean.shape[0]
-    weights = Interconnection(rank, body, inputs, tuple(hidden), tuple(decoder_hidden), alpha, pose)
+    weights = Interconnection(
+        rank, body, inputs, tuple(hidden), tuple(decoder_hidden), alpha, pose
+    )
     encoder = Encoder(rank, encoder_hidden)
 
     def init(key: Key) -> Params:
         weights_key, encoder_key = jax.random.split(key)
         return {
             "weights": weights.init(weights_key)["params"],
-            "encoder": encoder.init(encoder_key, jnp.zeros(body), jnp.zeros(inputs - control))["params"],
+            "encoder": encoder.init(
+                encoder_key, jnp.zeros(body), jnp.zeros(inputs - control)
+            )["params"],
         }
 
     def explicit_weights(params: Params) -> Shared:
@@ -107,9 +116,13 @@ def r2dn(
         return R2dnFiber(
             A=shared.A,
             feedback=shared.feedback.matrices,
-            feedback_biases=_biases(shared.feedback_inputs, shared.feedback.matrices, scaled),
+            feedback_biases=_biases(
+                shared.feedback_inputs, shared.feedback.matrices, scaled
+            ),
             decoder=shared.decoder.matrices,
-            decoder_biases=_biases(shared.decoder_inputs, shared.decoder.matrices, scaled),
+            decoder_biases=_biases(
+                shared.decoder_inputs, shared.decoder.matrices, scaled
+            ),
             readout=shared.readout,
             centre=shared.centre,
             env=scaled,
@@ -120,25 +133,40 @@ def r2dn(
         if state.shape != (3 + body,):
             raise ValueError(f"state must have shape ({3 + body},), got {state.shape}")
         scaled = (state[BODY] - space.body_mean) / space.body_scale
-        return SfkdLatent(state[POSE], cast(jax.Array, encoder.apply({"params": fiber.encoder}, scaled, fiber.env)))
+        return SfkdLatent(
+            state[POSE],
+            cast(
+                jax.Array, encoder.apply({"params": fiber.encoder}, scaled, fiber.env)
+            ),
+        )
 
     def step(fiber: R2dnFiber, latent: SfkdLatent, control: Control) -> SfkdLatent:
         u = (control - space.control_mean) / space.control_scale
-        z = fiber.A @ latent.z + apply(fiber.feedback, fiber.feedback_biases.at(u), latent.z)
+        z = fiber.A @ latent.z + apply(
+            fiber.feedback, fiber.feedback_biases.at(u), latent.z
+        )
         if not pose:
             return SfkdLatent(latent.pose, z)
         motion = apply(fiber.decoder, fiber.decoder_biases.at(u), latent.z)
-        return SfkdLatent(compose(latent.pose, space.increment_mean + space.increment_scale * motion), z)
+        return SfkdLatent(
+            compose(latent.pose, space.increment_mean + space.increment_scale * motion),
+            z,
+        )
 
     def decode(fiber: R2dnFiber, latent: SfkdLatent) -> State:
         scaled = fiber.readout @ latent.z + fiber.centre
-        return jnp.concatenate([latent.pose, space.body_mean + space.body_scale * scaled])
+        return jnp.concatenate(
+            [latent.pose, space.body_mean + space.body_scale * scaled]
+        )
 
     def explicit(params: Params) -> Explicit:
         shared = explicit_weights(params)
         decoder = shared.decoder.matrices
         if pose:
-            decoder = (*decoder[:-1], jnp.asarray(space.increment_scale)[:, None] * decoder[-1])
+            decoder = (
+                *decoder[:-1],
+                jnp.asarray(space.increment_scale)[:, None] * decoder[-1],
+            )
         return Explicit(
             operators=Polytope(shared.A[None]),
             residual=shared.feedback.matrices,
@@ -165,7 +193,9 @@ def r2dn(
     )
 
 
-def _biases(inputs: Affine | None, matrices: tuple[Float[Array, "_ _"], ...], env: Environment) -> Biases:
+def _biases(
+    inputs: Affine | None, matrices: tuple[Float[Array, "_ _"], ...], env: Environment
+) -> Biases:
     """b_k(u, e) of every layer for one e: all of [u; e] enters linearly, so e only shifts the offsets."""
     if inputs is None:
         return Biases((), ())
@@ -177,11 +207,15 @@ def _biases(inputs: Affine | None, matrices: tuple[Float[Array, "_ _"], ...], en
     return Biases(tuple(gains), tuple(offsets))
 
 
-def _check(rank: int, alpha: float, hidden: tuple[int, ...], decoder_hidden: tuple[int, ...]) -> None:
+def _check(
+    rank: int, alpha: float, hidden: tuple[int, ...], decoder_hidden: tuple[int, ...]
+) -> None:
     """Refuse settings that no model can have."""
     if rank < 1:
         raise ValueError(f"model.rank must be at least 1, got {rank}")
     if not 0.0 < alpha < 1.0:
         raise ValueError(f"model.alpha must lie in (0, 1), got {alpha}")
     if not hidden or not decoder_hidden:
-        raise ValueError(f"model.hidden and model.decoder_hidden need a layer each, got {hidden} and {decoder_hidden}")
+        raise ValueError(
+            f"model.hidden and model.decoder_hidden need a layer each, got {hidden} and {decoder_hidden}"
+        )

@@ -27,9 +27,12 @@ class Shared(NamedTuple):
 
     Attributes:
         A: of z⁺ = A z + W_L tanh(… W_1 z …).
-        feedback: W_1 = V_1 C₁, …, W_L = B₁ V_L with V of φ, and φ's multipliers, which prove α for the whole step.
-        feedback_inputs, decoder_inputs: biases; the last of the feedback is B₂ [u; e] + b.
-        decoder: of the pose increment; without a pose it is empty and its inputs are None.
+        feedback: W_1 = V_1 C₁, …, W_L = B₁ V_L with V of φ, and φ's multipliers, which
+            prove α for the whole step.
+        feedback_inputs, decoder_inputs: biases; the last of the feedback is B₂ [u; e] +
+            b.
+        decoder: of the pose increment; without a pose it is empty and its inputs are
+            None.
         readout, centre: of the body state.
     """
 
@@ -46,8 +49,11 @@ class Interconnection(nn.Module):
     """Everything learned but the encoder.
 
     Attributes:
-        rank, body: sizes of z and s. inputs: size of [u; e].
-        hidden, decoder_hidden: widths. alpha: α. pose: whether there is a decoder of the pose.
+        rank, body: sizes of z and s.
+        inputs: size of [u; e].
+        hidden, decoder_hidden: widths.
+        alpha: α.
+        pose: whether there is a decoder of the pose.
     """
 
     rank: int
@@ -70,34 +76,58 @@ class Interconnection(nn.Module):
         )
         phi = Sandwich(self.rank, self.hidden, self.rank, name="phi")(1.0)
         first, *middle, last = phi.matrices
-        decoder, decoder_inputs = self._decoder() if self.pose else (Weights((), ()), None)
+        decoder, decoder_inputs = (
+            self._decoder() if self.pose else (Weights((), ()), None)
+        )
         return Shared(
             A=A,
             feedback=Weights((first @ C1, *middle, B1 @ last), phi.multipliers),
-            feedback_inputs=self._affine("feedback", sum(self.hidden) + self.rank, SMALL),
+            feedback_inputs=self._affine(
+                "feedback", sum(self.hidden) + self.rank, SMALL
+            ),
             decoder=decoder,
             decoder_inputs=decoder_inputs,
-            readout=bounded(self.param("readout", nn.initializers.orthogonal(), (self.body, self.rank)), 1.0),
+            readout=bounded(
+                self.param(
+                    "readout", nn.initializers.orthogonal(), (self.body, self.rank)
+                ),
+                1.0,
+            ),
             centre=self.param("centre", nn.initializers.zeros, (self.body,)),
         )
 
     def _decoder(self) -> tuple[Weights, Affine]:
         """Of the pose increment, and its biases."""
-        bound = jnp.exp(self.param("log_decoder_bound", nn.initializers.constant(1.0), ()))
+        bound = jnp.exp(
+            self.param("log_decoder_bound", nn.initializers.constant(1.0), ())
+        )
         weights = Sandwich(self.rank, self.decoder_hidden, 3, name="decoder")(bound)
-        return weights, self._affine("decoder", sum(self.decoder_hidden) + 3, nn.initializers.lecun_normal())
+        return weights, self._affine(
+            "decoder", sum(self.decoder_hidden) + 3, nn.initializers.lecun_normal()
+        )
 
-    def _affine(self, name: str, size: int, spread: nn.initializers.Initializer) -> Affine:
+    def _affine(
+        self, name: str, size: int, spread: nn.initializers.Initializer
+    ) -> Affine:
         """Learned biases of one network."""
         gain = self.param(f"{name}_gain", spread, (self.inputs, size))
-        return Affine(gain, self.param(f"{name}_offset", nn.initializers.zeros, (size,)))
+        return Affine(
+            gain, self.param(f"{name}_offset", nn.initializers.zeros, (size,))
+        )
 
 
 def contracting(
-    A: Float[Array, "rank rank"], B1: Float[Array, "rank w"], C1: Float[Array, "v rank"], alpha: float
+    A: Float[Array, "rank rank"],
+    B1: Float[Array, "rank w"],
+    C1: Float[Array, "v rank"],
+    alpha: float,
 ) -> tuple[Float[Array, "rank rank"], Float[Array, "rank w"], Float[Array, "v rank"]]:
     """(α Ã, B̃₁, α C̃₁) from free matrices, [Ã B̃₁; C̃₁ 0] = [A B₁; C₁ 0] / max(1, its Gram bound): norm at most 1."""
     zeros = jnp.zeros((C1.shape[0], B1.shape[1]))
     block = bounded(jnp.block([[A, B1], [C1, zeros]]), 1.0)
     rows, columns = A.shape
-    return alpha * block[:rows, :columns], block[:rows, columns:], alpha * block[rows:, :columns]
+    return (
+        alpha * block[:rows, :columns],
+        block[:rows, columns:],
+        alpha * block[rows:, :columns],
+    )

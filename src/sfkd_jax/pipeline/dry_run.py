@@ -24,8 +24,12 @@ def check(settings: dict[str, Any], plant: Vehicle) -> None:
     data, window = settings["dataset"], settings["training"]["window"]
     check_shares(tuple(data["shares"]))
     if window > data["steps"]:
-        raise ValueError(f"training.window={window} does not fit segments of dataset.steps={data['steps']}")
-    build.choose(dict.fromkeys(MODES), settings["certification"]["mode"], "certification.mode")
+        raise ValueError(
+            f"training.window={window} does not fit segments of dataset.steps={data['steps']}"
+        )
+    build.choose(
+        dict.fromkeys(MODES), settings["certification"]["mode"], "certification.mode"
+    )
     told = data["columns"]["environment"] if store.is_logged(settings) else ()
     along = store.is_along_path(settings)
     sizes = {"state": len(plant.state_names) - 3, "control": 2, "env": len(told) or 2}
@@ -33,21 +37,37 @@ def check(settings: dict[str, Any], plant: Vehicle) -> None:
         sizes |= {"state": sizes["state"] + 2, "control": 4}
     law = _any_law(sizes) if along else None
     for name in settings["evaluation"]["systems"]:
-        build.choose({"self": None} | build.reference_systems(plant, law), name, "evaluation.systems entry")
-    scales = (part(size) for size in (*sizes.values(), 3) for part in (jnp.zeros, jnp.ones))
+        build.choose(
+            {"self": None} | build.reference_systems(plant, law),
+            name,
+            "evaluation.systems entry",
+        )
+    scales = (
+        part(size) for size in (*sizes.values(), 3) for part in (jnp.zeros, jnp.ones)
+    )
     model = build.build_model(settings["model"], Space(*scales), plant)
     if model.along_path != along:
-        raise ValueError("model.frame=path and dataset=path go together: path coordinates for both or for neither")
+        raise ValueError(
+            "model.frame=path and dataset=path go together: path coordinates for both or for neither"
+        )
     if plant.control_low:
         boxes = {name: ((-1.0,) * size, (1.0,) * size) for name, size in sizes.items()}
-        limits: dict[str, Any] = dict(zip(("env_low", "env_high"), boxes["env"], strict=True))
+        limits: dict[str, Any] = dict(
+            zip(("env_low", "env_high"), boxes["env"], strict=True)
+        )
         limits |= {"law": law}
-        limits |= {"certificate": {"boxes": boxes, "monitor": {"bounds": (1.0,) * 4}}, "env": settings["env"]}
+        limits |= {
+            "certificate": {"boxes": boxes, "monitor": {"bounds": (1.0,) * 4}},
+            "env": settings["env"],
+        }
         build.build_controller(settings["controller"], model, plant, **limits)
 
 
 def _any_law(sizes: dict[str, int]) -> PathLaw:
     """A law that asks for nothing."""
     axes, corners = 2 + sizes["env"], (2,) * (2 + sizes["env"])
-    tables = (jnp.zeros((*corners, *shape)) for shape in ((sizes["state"],), (2,), (2, sizes["state"])))
+    tables = (
+        jnp.zeros((*corners, *shape))
+        for shape in ((sizes["state"],), (2,), (2, sizes["state"]))
+    )
     return PathLaw(jnp.zeros(axes), jnp.ones(axes), jnp.ones(2), *tables)

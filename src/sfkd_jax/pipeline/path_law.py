@@ -10,7 +10,12 @@ import jax
 
 from sfkd_jax import artefacts, build
 from sfkd_jax.control import PathLaw, law_arrays, law_from_arrays
-from sfkd_jax.datasets import generate, generate_along_path, generate_s3_along_path, generate_switching
+from sfkd_jax.datasets import (
+    generate,
+    generate_along_path,
+    generate_s3_along_path,
+    generate_switching,
+)
 from sfkd_jax.pipeline import store
 from sfkd_jax.types import Key, Trajectory
 from sfkd_jax.vehicle import Vehicle
@@ -46,12 +51,18 @@ def drives(
     """key -> the drives of a data set, or as many under S3's switching.
 
     Args:
-        settings: of the run. options: of the generator, less the environment box.
+        settings: of the run.
+        options: of the generator, less the environment box.
         switching: whether the schedule is S3's.
     """
     if not store.is_along_path(settings):
         plant = build.build_vehicle(settings["vehicle"])
-        return partial(generate_switching if switching else generate, plant, build.build_driver(plant), **options)
+        return partial(
+            generate_switching if switching else generate,
+            plant,
+            build.build_driver(plant),
+            **options,
+        )
     if switching:
         return partial(generate_s3_along_path, loop(settings), **options)
     box = {name: tuple(settings["dataset"][name]) for name in ("env_low", "env_high")}

@@ -41,9 +41,15 @@ def ensure_dataset(settings: dict[str, Any]) -> tuple[Dataset, str]:
     """The data set and its hash, read from logs or driven now if it does not lie on the shelf."""
     path = store.dataset_path(settings)
     if not artefacts.exists(path):
-        with artefacts.locked(path.parent, wait=True):  # whoever makes it now makes it for all
+        with artefacts.locked(
+            path.parent, wait=True
+        ):  # whoever makes it now makes it for all
             if not artefacts.exists(path):
-                dataset = _from_logs(settings) if store.is_logged(settings) else _driven(settings)
+                dataset = (
+                    _from_logs(settings)
+                    if store.is_logged(settings)
+                    else _driven(settings)
+                )
                 store.write_dataset(settings, dataset)
     return store.read_dataset(settings)
 
@@ -59,7 +65,13 @@ def _driven(settings: dict[str, Any]) -> Dataset:
     if store.is_along_path(settings):
         check_on_path(trajectories)
     low, high = jnp.asarray(asked["env_low"]), jnp.asarray(asked["env_high"])
-    return split(trajectories, split_key, shares=tuple(asked["shares"]), env_low=low, env_high=high)
+    return split(
+        trajectories,
+        split_key,
+        shares=tuple(asked["shares"]),
+        env_low=low,
+        env_high=high,
+    )
 
 
 def _from_logs(settings: dict[str, Any]) -> Dataset:
@@ -72,10 +84,22 @@ def _from_logs(settings: dict[str, Any]) -> Dataset:
             f"dataset.columns.state names {len(columns.state)} columns, {named}; name as many, in this order"
         )
     store.say(f"reading {asked['path']}")
-    known = {"dt": plant.dt, "wheelbase": plant.wheelbase, "told": store.is_told(settings)}
+    known = {
+        "dt": plant.dt,
+        "wheelbase": plant.wheelbase,
+        "told": store.is_told(settings),
+    }
     known["limits"] = (plant.control_low or None, plant.control_high or None)
-    logged = from_logs(asked["path"], columns, say=store.say, **known, **build.without(asked, "path", "columns"))
-    artefacts.write_json(store.dataset_path(settings).with_name("coverage.json"), logged.coverage)
+    logged = from_logs(
+        asked["path"],
+        columns,
+        say=store.say,
+        **known,
+        **build.without(asked, "path", "columns"),
+    )
+    artefacts.write_json(
+        store.dataset_path(settings).with_name("coverage.json"), logged.coverage
+    )
     return logged.dataset
 
 
@@ -86,17 +110,29 @@ def _check_enough(settings: dict[str, Any]) -> None:
         ValueError: naming the settings and the levels that can be asked for.
     """
     count = ensure_dataset(settings)[0].calibration.controls.shape[0]
-    asked = {name: settings["certification"][name] for name in ("level", "monitor_level")}
-    if most := [name for name, level in asked.items() if math.ceil((count + 1) * level) > count]:
+    asked = {
+        name: settings["certification"][name] for name in ("level", "monitor_level")
+    }
+    if most := [
+        name for name, level in asked.items() if math.ceil((count + 1) * level) > count
+    ]:
         wanted = " ".join(f"certification.{name}={asked[name]:g}" for name in most)
-        possible = " ".join(f"certification.{name}={math.floor(100 * count / (count + 1)) / 100:g}" for name in most)
-        raise ValueError(f"{count} calibration segments are too few for {wanted}: record more, or pass {possible}")
+        possible = " ".join(
+            f"certification.{name}={math.floor(100 * count / (count + 1)) / 100:g}"
+            for name in most
+        )
+        raise ValueError(
+            f"{count} calibration segments are too few for {wanted}: record more, or pass {possible}"
+        )
 
 
-def held_out_drives(settings: dict[str, Any], dataset: Dataset) -> dict[str, Trajectory]:
+def held_out_drives(
+    settings: dict[str, Any], dataset: Dataset
+) -> dict[str, Trajectory]:
     """What coverage is counted on: the test split, its S1 and S2 parts, and as many drives under S3's switching.
 
-    Of logged drives the test split alone: where they were driven has no name, and nothing drives them elsewhere.
+    Of logged drives the test split alone: where they were driven has no name, and
+    nothing drives them elsewhere.
     """
     if store.is_logged(settings):
         return {"test": dataset.test}
@@ -106,7 +142,9 @@ def held_out_drives(settings: dict[str, Any], dataset: Dataset) -> dict[str, Tra
     parts = {"test": dataset.test, "s3": _switching(json.dumps(asked))}
     for name, chosen in (("s1", constant), ("s2", ~constant)):
         if chosen.any():
-            parts[name] = jax.tree.map(lambda leaf, chosen=chosen: leaf[chosen], dataset.test)
+            parts[name] = jax.tree.map(
+                lambda leaf, chosen=chosen: leaf[chosen], dataset.test
+            )
     return parts
 
 
@@ -124,7 +162,8 @@ def ensure_policy(settings: dict[str, Any]) -> policy.Trained:
     """The policy of this run: from the shelf, or trained now, continuing what was begun.
 
     Raises:
-        ArtefactError: what lies there was made with other settings, is damaged, or is being trained by another process.
+        ArtefactError: what lies there was made with other settings, is damaged, or is
+            being trained by another process.
     """
     place = store.run_directory(settings)
     if not artefacts.exists(place / "policy.npz"):
@@ -145,7 +184,9 @@ def systems(settings: dict[str, Any], plant: Vehicle) -> dict[str, build.System]
         if name == "self":
             found[settings["model"]["system"]] = own_system(settings)
         else:
-            found[name] = build.choose(references | {"self": None}, name, "evaluation.systems entry")
+            found[name] = build.choose(
+                references | {"self": None}, name, "evaluation.systems entry"
+            )
     return found
 
 
@@ -155,12 +196,19 @@ def own_system(settings: dict[str, Any]) -> build.System:
     Raises:
         ValueError: there is none, and the monitor's fallback asks for one.
     """
-    trained, fallback = ensure_policy(settings), settings["controller"].get("monitor", {}).get("fallback", "none")
-    certificate, reason = policy.read_certificate(store.run_directory(settings), trained)
+    trained, fallback = (
+        ensure_policy(settings),
+        settings["controller"].get("monitor", {}).get("fallback", "none"),
+    )
+    certificate, reason = policy.read_certificate(
+        store.run_directory(settings), trained
+    )
     if certificate is None:
         store.say(f"nothing is certified and nothing is monitored: {reason}")
         if fallback != "none":
-            raise ValueError(f"controller.monitor.fallback={fallback} needs a certificate; {reason}")
+            raise ValueError(
+                f"controller.monitor.fallback={fallback} needs a certificate; {reason}"
+            )
     told = settings["env"] if trained.settings["model"]["environment"] else "none"
     return build.System(trained.model, trained.params, told, certificate, trained.law)
 
@@ -170,9 +218,13 @@ def _train(settings: dict[str, Any]) -> None:
     place, options = store.run_directory(settings), dict(settings["training"])
     dataset, data_hash = ensure_dataset(settings)
     kept = store.policy_settings(settings, dataset)
-    dataset = dataset._replace(train=first_share(dataset.train, options.pop("data_share")))
+    dataset = dataset._replace(
+        train=first_share(dataset.train, options.pop("data_share"))
+    )
     space = measure_space(dataset)
-    model = build.build_model(settings["model"], space, build.build_vehicle(settings["vehicle"]))
+    model = build.build_model(
+        settings["model"], space, build.build_vehicle(settings["vehicle"])
+    )
     horizon, start = options.pop("window"), options.pop("start", "random")
     key = jax.random.fold_in(jax.random.key(settings["seed"]), 0)
     if model.identify is not None:
@@ -182,17 +234,29 @@ def _train(settings: dict[str, Any]) -> None:
         loss = multi_step_loss(model, space, **options.pop("loss"))
         draw = partial(random_windows, batch=options.pop("batch"), length=horizon)
         held_out = spread_windows(dataset.validation, length=horizon)
-        store.say(f"training {settings['model']['system']}, {options['steps']} steps, in {place}")
+        store.say(
+            f"training {settings['model']['system']}, {options['steps']} steps, in {place}"
+        )
         options["inspect"] = partial(progress, model)
         begun = _started(model, start, dataset.train, settings["seed"])
-        params, best = fit(begun, loss, draw, dataset.train, held_out, key, place, **options)
-    predict = jax.jit(lambda params, data: open_loop(model, model.fold(params), data, horizon=horizon))
+        params, best = fit(
+            begun, loss, draw, dataset.train, held_out, key, place, **options
+        )
+    predict = jax.jit(
+        lambda params, data: open_loop(model, model.fold(params), data, horizon=horizon)
+    )
     errors = predict(params, dataset.test)
     document = store.open_loop_document(errors, dataset.test, settings["vehicle"]["dt"])
     artefacts.write_json(place / "open_loop.json", document)
     kept |= {"controller": settings["controller"], "experiment": settings["name"]}
     kept |= {"space": build.space_to_settings(space), "best_step": best}
-    policy.save(place / "policy.npz", params, kept, made_from={"dataset": data_hash}, law=path_law.ensure(settings))
+    policy.save(
+        place / "policy.npz",
+        params,
+        kept,
+        made_from={"dataset": data_hash},
+        law=path_law.ensure(settings),
+    )
 
 
 def _started(model: Model, start: str, train: Trajectory, seed: int) -> Model:
@@ -202,10 +266,14 @@ def _started(model: Model, start: str, train: Trajectory, seed: int) -> Model:
         ValueError: a start that there is not, or that this model does not have.
     """
     if start not in STARTS:
-        raise ValueError(f"training.start must be one of {', '.join(STARTS)}, got {start!r}")
+        raise ValueError(
+            f"training.start must be one of {', '.join(STARTS)}, got {start!r}"
+        )
     if start == "random":
         return model
     if model.start is None:
-        raise ValueError("training.start=identified needs a model=sfkd…, whose linear part can be identified")
+        raise ValueError(
+            "training.start=identified needs a model=sfkd…, whose linear part can be identified"
+        )
     start_from, key = model.start, jax.random.fold_in(jax.random.key(seed), START)
     return model._replace(init=lambda drawn: start_from(model.init(drawn), train, key))

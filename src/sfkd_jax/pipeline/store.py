@@ -22,12 +22,19 @@ PARTS = ("train", "validation", "calibration", "test")
 IDENTITY = ("vehicle", "dataset", "model", "training", "seed")
 """Settings that decide the weights; a run made with others is another run."""
 UNREADABLE = frozenset("[]")
-"""Characters that the checkpoint library takes for a pattern when it reads, though not when it writes."""
+"""Characters that the checkpoint library takes for a pattern when it reads, though not
+when it writes.
+"""
 
 
 def run_directory(settings: dict[str, Any]) -> Path:
     """root/name/system/seed=N."""
-    return Path(settings["root"]) / settings["name"] / settings["model"]["system"] / f"seed={settings['seed']}"
+    return (
+        Path(settings["root"])
+        / settings["name"]
+        / settings["model"]["system"]
+        / f"seed={settings['seed']}"
+    )
 
 
 def exclusive(run: Callable[[dict[str, Any]], Any]) -> Callable[[dict[str, Any]], Any]:
@@ -51,7 +58,10 @@ def dataset_config(settings: dict[str, Any]) -> dict[str, Any]:
     """What a data set was made with: of logs their contents, not where they lie."""
     asked = dict(settings["dataset"])
     if is_logged(settings):
-        asked |= {"contents": fingerprint(asked.pop("path")), "environment_known": is_told(settings)}
+        asked |= {
+            "contents": fingerprint(asked.pop("path")),
+            "environment_known": is_told(settings),
+        }
     return {"vehicle": settings["vehicle"], "dataset": asked}
 
 
@@ -73,26 +83,43 @@ def identity(settings: dict[str, Any]) -> dict[str, Any]:
 def write_dataset(settings: dict[str, Any], dataset: Dataset) -> dict[str, Any]:
     """Store the four splits; returns the manifest."""
     arrays = {
-        f"{part}/{name}": np.asarray(leaf) for part in PARTS for name, leaf in getattr(dataset, part)._asdict().items()
+        f"{part}/{name}": np.asarray(leaf)
+        for part in PARTS
+        for name, leaf in getattr(dataset, part)._asdict().items()
     }
     if dataset.drives is not None:
         arrays["drives"] = np.asarray([dataset.drives[part] for part in PARTS])
     path = dataset_path(settings)
     path.parent.mkdir(parents=True, exist_ok=True)
-    return artefacts.write_arrays(path, arrays, kind=DATASET, config=dataset_config(settings))
+    return artefacts.write_arrays(
+        path, arrays, kind=DATASET, config=dataset_config(settings)
+    )
 
 
 def read_dataset(settings: dict[str, Any]) -> tuple[Dataset, str]:
     """The four splits and their hash."""
-    arrays, manifest = artefacts.read_arrays(dataset_path(settings), kind=DATASET, config=dataset_config(settings))
+    arrays, manifest = artefacts.read_arrays(
+        dataset_path(settings), kind=DATASET, config=dataset_config(settings)
+    )
     with artefacts.understood(dataset_path(settings)):
-        parts = [Trajectory(*(jnp.asarray(arrays[f"{part}/{name}"]) for name in Trajectory._fields)) for part in PARTS]
+        parts = [
+            Trajectory(
+                *(jnp.asarray(arrays[f"{part}/{name}"]) for name in Trajectory._fields)
+            )
+            for part in PARTS
+        ]
     asked = settings["dataset"]
     envs = np.concatenate([np.asarray(part.envs) for part in parts])
     low, high = environment_box(envs, asked["env_low"], asked["env_high"])
     counts = arrays.get("drives")
-    drives = None if counts is None else {part: int(count) for part, count in zip(PARTS, counts, strict=True)}
-    return Dataset(*parts, env_low=low, env_high=high, drives=drives), manifest["sha256"]
+    drives = (
+        None
+        if counts is None
+        else {part: int(count) for part, count in zip(PARTS, counts, strict=True)}
+    )
+    return Dataset(*parts, env_low=low, env_high=high, drives=drives), manifest[
+        "sha256"
+    ]
 
 
 def write_law(settings: dict[str, Any], arrays: dict[str, Any]) -> None:
@@ -105,7 +132,9 @@ def write_law(settings: dict[str, Any], arrays: dict[str, Any]) -> None:
 
 def read_law(settings: dict[str, Any]) -> dict[str, np.ndarray]:
     """The arrays of that law."""
-    return artefacts.read_arrays(law_path(settings), kind=LAW, config=dataset_config(settings))[0]
+    return artefacts.read_arrays(
+        law_path(settings), kind=LAW, config=dataset_config(settings)
+    )[0]
 
 
 def law_path(settings: dict[str, Any]) -> Path:
@@ -122,12 +151,15 @@ def claim(settings: dict[str, Any]) -> None:
     """Mark the run directory as made with these settings, or refuse if it was begun with others.
 
     Raises:
-        ArtefactError: naming what differs. ValueError: a path from which orbax cannot read.
+        ArtefactError: naming what differs.
+        ValueError: a path from which orbax cannot read.
     """
     path = run_directory(settings) / "settings.json"
     unreadable = UNREADABLE & set(str(path.resolve()))
     if unreadable:
-        raise ValueError(f"checkpoints cannot be read back from a path with {' '.join(sorted(unreadable))}: {path}")
+        raise ValueError(
+            f"checkpoints cannot be read back from a path with {' '.join(sorted(unreadable))}: {path}"
+        )
     if path.exists():
         found = artefacts.differences(artefacts.read_json(path), identity(settings))
         if found:
@@ -144,14 +176,19 @@ def boxes(dataset: Dataset) -> dict[str, Any]:
     """The domain that measurements come from: hulls of body state and control over training and calibration, and E."""
 
     def hull(pick: Callable[[Trajectory], jax.Array]) -> list[list[float]]:
-        values = np.concatenate([np.asarray(pick(part)) for part in (dataset.train, dataset.calibration)])
+        values = np.concatenate(
+            [np.asarray(pick(part)) for part in (dataset.train, dataset.calibration)]
+        )
         flat = values.reshape(-1, values.shape[-1])
         return [flat.min(axis=0).tolist(), flat.max(axis=0).tolist()]
 
     return {
         "state": hull(lambda part: part.states[..., BODY]),
         "control": hull(lambda part: part.controls),
-        "env": [np.asarray(dataset.env_low).tolist(), np.asarray(dataset.env_high).tolist()],
+        "env": [
+            np.asarray(dataset.env_low).tolist(),
+            np.asarray(dataset.env_high).tolist(),
+        ],
     }
 
 
@@ -163,7 +200,9 @@ def policy_settings(settings: dict[str, Any], dataset: Dataset) -> dict[str, Any
     box = {"env_low": dataset.env_low.tolist(), "env_high": dataset.env_high.tolist()}
     if kept["vehicle"]["name"] == "own" and not kept["vehicle"]["control_low"]:
         low, high = boxes(dataset)["control"]
-        kept |= {"vehicle": kept["vehicle"] | {"control_low": low, "control_high": high}}
+        kept |= {
+            "vehicle": kept["vehicle"] | {"control_low": low, "control_high": high}
+        }
     return kept | {"dataset": kept["dataset"] | box}
 
 
@@ -177,7 +216,9 @@ def channel_names(settings: dict[str, Any]) -> dict[str, list[str]]:
     }
 
 
-def open_loop_document(errors: jax.Array, trajectories: Trajectory, dt: float) -> dict[str, Any]:
+def open_loop_document(
+    errors: jax.Array, trajectories: Trajectory, dt: float
+) -> dict[str, Any]:
     """Prediction error by horizon, as the report reads it."""
     columns = np.asarray(errors, dtype=np.float64).T
     return {

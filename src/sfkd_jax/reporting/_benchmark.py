@@ -27,11 +27,25 @@ from sfkd_jax.reporting._benchmark_rows import (
 from sfkd_jax.reporting._benchmark_seeds import apart
 from sfkd_jax.reporting._benchmark_tables import slashed
 from sfkd_jax.reporting._benchmark_words import beaten, words
-from sfkd_jax.reporting._blocks import Block, Heading, Picture, Text, to_html, to_markdown
+from sfkd_jax.reporting._blocks import (
+    Block,
+    Heading,
+    Picture,
+    Text,
+    to_html,
+    to_markdown,
+)
 from sfkd_jax.reporting._forces import forces_figure, forces_of, forces_tables, pushed
 from sfkd_jax.reporting._latex import latex
 from sfkd_jax.reporting._numbers import plain
-from sfkd_jax.reporting._robustness import caption, heading, note, robustness, robustness_table, studies
+from sfkd_jax.reporting._robustness import (
+    caption,
+    heading,
+    note,
+    robustness,
+    robustness_table,
+    studies,
+)
 from sfkd_jax.reporting._style import save, scenario_label
 
 _Ink: TypeAlias = Callable[..., Picture]
@@ -45,20 +59,25 @@ MOST_BYTES = 5_000_000
 def benchmark_report(directory: Path) -> dict[str, Any]:
     """Write `directory/report/`: index.html (one self-contained page), results.md, table1.tex and results_files/.
 
-    Reads results.json and the arrays of the rows' cells. The only arithmetic is on printed means: RMSE relative to
-    another row's in percent, over the same row's without a variation, and the spread of trainings.
+    Reads results.json and the arrays of the rows' cells. The only arithmetic is on
+    printed means: RMSE relative to another row's in percent, over the same row's
+    without a variation, and the spread of trainings.
 
     Args:
         directory: of a comparison. Of its files only results.json must be there.
 
     Returns:
-        `report`: path of the page. `figures`: paths of the figures and films, in the order of the page.
+        `report`: path of the page. `figures`: paths of the figures and films, in the
+        order of the page.
 
     Raises:
-        ArtefactError: results.json is missing, not JSON or without rows that a page can be made of; a cell's arrays
-            are damaged; or the disk refuses the page.
+        ArtefactError: results.json is missing, not JSON or without rows that a page can
+            be made of; a cell's arrays are damaged; or the disk refuses the page.
     """
-    with writing(directory / "report"), understood(directory / "results.json", ValueError):
+    with (
+        writing(directory / "report"),
+        understood(directory / "results.json", ValueError),
+    ):
         return _write(directory)
 
 
@@ -70,7 +89,9 @@ def _write(directory: Path) -> dict[str, Any]:
     for stale in (*place.glob("*.png"), *place.glob("*.gif")):
         stale.unlink()
 
-    def drawn(name: str, says: str, draw: Callable[..., Figure], *inputs: Any) -> Picture:
+    def drawn(
+        name: str, says: str, draw: Callable[..., Figure], *inputs: Any
+    ) -> Picture:
         return Picture(save(place / f"{name}.png", draw, *inputs), says)
 
     page = _page(results, drawn, directory)
@@ -79,7 +100,10 @@ def _write(directory: Path) -> dict[str, Any]:
     write_bytes(report.with_name("results.md"), benchmark_markdown(results).encode())
     table = latex(contests(results["rows"]), paper_of(results))
     write_bytes(report.with_name("table1.tex"), table.encode())
-    return {"report": str(report), "figures": [str(block.path) for block in page if isinstance(block, Picture)]}
+    return {
+        "report": str(report),
+        "figures": [str(block.path) for block in page if isinstance(block, Picture)],
+    }
 
 
 def benchmark_markdown(results: dict[str, Any]) -> str:
@@ -94,7 +118,10 @@ def benchmark_markdown(results: dict[str, Any]) -> str:
 def _html(page: list[Block]) -> str:
     """The page; its films, from the last one on, as names where it would become too heavy."""
     name = next((block.text for block in page if isinstance(block, Heading)), "")
-    text, films = to_html(name, page), [block for block in page if isinstance(block, Picture) and _moves(block)]
+    text, films = (
+        to_html(name, page),
+        [block for block in page if isinstance(block, Picture) and _moves(block)],
+    )
     while len(text.encode()) > MOST_BYTES and films:
         heavy = films.pop()
         page = [_named(heavy) if block is heavy else block for block in page]
@@ -107,13 +134,18 @@ def _moves(picture: Picture) -> bool:
 
 
 def _named(picture: Picture) -> Text:
-    return Text(f"{picture.caption} It lies in {FILES}/{picture.path.name}.", kind="note")
+    return Text(
+        f"{picture.caption} It lies in {FILES}/{picture.path.name}.", kind="note"
+    )
 
 
 def _page(results: dict[str, Any], ink: _Ink, directory: Path | None) -> list[Block]:
     rows: list[Row] = results["rows"]
     found, paper = contests(rows), paper_of(results)
-    page: list[Block] = [Heading(1, notes.heading(results)), Text(notes.lead(results, found), kind="lead")]
+    page: list[Block] = [
+        Heading(1, notes.heading(results)),
+        Text(notes.lead(results, found), kind="lead"),
+    ]
     page += notes.failures(results)
     claims = words(found, paper)
     varied = any(pushed(contest) or studies(rows, contest) for contest in found)
@@ -127,12 +159,29 @@ def _page(results: dict[str, Any], ink: _Ink, directory: Path | None) -> list[Bl
         for contest in group:
             page += [*_robust(rows, contest, ink), *_forces(contest, ink)]
         page += [Heading(3, "Every row")] if studied else []
-        page.append(ink(f"rmse_{stem(group[0])}", notes.overview(group, paper), overview, group, paper))
-        page += [] if varied else _driven(group[0], ink, directory)  # the rows as they are have theirs in the table
+        page.append(
+            ink(
+                f"rmse_{stem(group[0])}",
+                notes.overview(group, paper),
+                overview,
+                group,
+                paper,
+            )
+        )
+        page += (
+            [] if varied else _driven(group[0], ink, directory)
+        )  # the rows as they are have theirs in the table
         for contest in group:
             page += _contest(contest, paper, ink)
-        page += [Heading(3, "Prediction without feedback, position error"), tables.prediction(together(group))]
-        page += [Heading(3, "Cost and certificate"), tables.cost(group), Text(notes.COST, kind="note")]
+        page += [
+            Heading(3, "Prediction without feedback, position error"),
+            tables.prediction(together(group)),
+        ]
+        page += [
+            Heading(3, "Cost and certificate"),
+            tables.cost(group),
+            Text(notes.COST, kind="note"),
+        ]
     return [*page, *(claims if studied else []), *notes.provenance(results)]
 
 
@@ -142,10 +191,21 @@ def _driven(contest: Contest, ink: _Ink, directory: Path | None) -> list[Block]:
         return []
     name = f"{FIGURED}_{stem(contest)}"
     said = f"{title(contest)}: {notes.FIGURE_1}"
-    blocks: list[Block] = [ink(f"figure1_{stem(contest)}", said, through_switches, directory, contest)]
-    made = film(directory, contest, directory / "report" / FILES / f"{name}.gif") if directory else None
+    blocks: list[Block] = [
+        ink(f"figure1_{stem(contest)}", said, through_switches, directory, contest)
+    ]
+    made = (
+        film(directory, contest, directory / "report" / FILES / f"{name}.gif")
+        if directory
+        else None
+    )
     if made:
-        blocks.append(Picture(made[0], f"{scenario_label(FIGURED)} in real time: {', '.join(made[1])}."))
+        blocks.append(
+            Picture(
+                made[0],
+                f"{scenario_label(FIGURED)} in real time: {', '.join(made[1])}.",
+            )
+        )
     return blocks
 
 
@@ -186,7 +246,10 @@ def _forces(contest: Contest, ink: _Ink) -> list[Block]:
         tracked,
         Heading(3, f"Claims under side forces: {title(contest)}"),
         claimed,
-        Text(f"{notes.FORCES}: {slashed([plain(force) for force in forces_of(*found)])} N.", kind="note"),
+        Text(
+            f"{notes.FORCES}: {slashed([plain(force) for force in forces_of(*found)])} N.",
+            kind="note",
+        ),
     ]
 
 

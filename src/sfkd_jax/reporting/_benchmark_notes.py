@@ -5,7 +5,15 @@ from __future__ import annotations
 import shlex
 from typing import Any
 
-from sfkd_jax.reporting._benchmark_rows import OFF_THE_ROAD_M, Contest, Row, contests, is_quoted, measure, scenarios
+from sfkd_jax.reporting._benchmark_rows import (
+    OFF_THE_ROAD_M,
+    Contest,
+    Row,
+    contests,
+    is_quoted,
+    measure,
+    scenarios,
+)
 from sfkd_jax.reporting._benchmark_seeds import has_trainings
 from sfkd_jax.reporting._blocks import Block, Code, Heading, Table
 from sfkd_jax.reporting._numbers import DASH, dig, is_number, number, plain
@@ -93,7 +101,12 @@ def overview(group: list[Contest], paper: dict[str, Any]) -> str:
     marks = "; strokes: single trainings" if has_trainings(group) else ""
     if is_quoted(group, paper):
         marks += "; crosses: what the paper prints for the row's system, measured in another simulator"
-    means = [measure(line, name, "rmse_m", "mean") for one in group for line in one.lines for name in line.rows]
+    means = [
+        measure(line, name, "rmse_m", "mean")
+        for one in group
+        for line in one.lines
+        for name in line.rows
+    ]
     if any(mean is not None and mean > OFF_THE_ROAD_M for mean in means):
         marks += f"; means beyond {OFF_THE_ROAD_M:g} m are written at the edge"
     return (
@@ -109,7 +122,9 @@ def tracking(contest: Contest, paper: dict[str, Any]) -> str:
 
 def lead(results: dict[str, Any], found: list[Contest]) -> str:
     """How much was driven."""
-    rows: list[Row] = [row for contest in found for line in contest.lines for row in line.rows.values()]
+    rows: list[Row] = [
+        row for contest in found for line in contest.lines for row in line.rows.values()
+    ]
     lines = {line.name for contest in found for line in contest.lines}
     vehicles = dict.fromkeys(contest.vehicle for contest in found)
     said = [
@@ -118,7 +133,11 @@ def lead(results: dict[str, Any], found: list[Contest]) -> str:
         f"training seeds: {_seeds(rows)}",
     ]
     seconds: Any = results.get("seconds")
-    lasted = f" The last run of the command took {number(seconds / 60, 1)} minutes." if is_number(seconds) else ""
+    lasted = (
+        f" The last run of the command took {number(seconds / 60, 1)} minutes."
+        if is_number(seconds)
+        else ""
+    )
     begin = _INTRODUCED.get(str(dig(results, "config", "name")))
     return " ".join(filter(None, [begin, f"{'; '.join(said)}.{lasted}"]))
 
@@ -136,7 +155,10 @@ def failures(results: dict[str, Any]) -> list[Block]:
     if not isinstance(failed, dict) or not failed:
         return []
     rows = [[str(name), plain(reason)] for name, reason in failed.items()]
-    return [Heading(2, "Asked for, but not driven"), Table(["Row", "Reason"], rows, prose=True)]
+    return [
+        Heading(2, "Asked for, but not driven"),
+        Table(["Row", "Reason"], rows, prose=True),
+    ]
 
 
 def provenance(results: dict[str, Any]) -> list[Block]:
@@ -144,7 +166,11 @@ def provenance(results: dict[str, Any]) -> list[Block]:
     config = results.get("config") or {}
     versions = results.get("versions") or {}
     counts = [
-        [f"{contest.vehicle}, {contest.sampling or 'no sampling'}", name, *_counted(contest, name)]
+        [
+            f"{contest.vehicle}, {contest.sampling or 'no sampling'}",
+            name,
+            *_counted(contest, name),
+        ]
         for contest in contests(results["rows"])
         for name in scenarios(contest)
     ]
@@ -152,11 +178,19 @@ def provenance(results: dict[str, Any]) -> list[Block]:
         Heading(2, "How to make it again"),
         Code(_command(config)),
         Heading(3, "What was driven"),
-        Table(["Contest", "Scenario", "Episodes", "Seconds each", "Seeds"], counts, prose=True),
+        Table(
+            ["Contest", "Scenario", "Episodes", "Seconds each", "Seeds"],
+            counts,
+            prose=True,
+        ),
         Heading(3, "Settings"),
         settings_table(_without_print(config)),
         Heading(3, "Versions"),
-        Table(["Package", "Version"], [[str(name), plain(one)] for name, one in versions.items()], prose=True),
+        Table(
+            ["Package", "Version"],
+            [[str(name), plain(one)] for name, one in versions.items()],
+            prose=True,
+        ),
     ]
 
 
@@ -183,5 +217,9 @@ def _command(config: dict[str, Any]) -> str:
 def _without_print(config: dict[str, Any]) -> dict[str, Any]:
     """Settings without the paper's numbers, which stand in the tables."""
     comparison = config.get("comparison")
-    kept = {key: value for key, value in comparison.items() if key != "paper"} if isinstance(comparison, dict) else None
+    kept = (
+        {key: value for key, value in comparison.items() if key != "paper"}
+        if isinstance(comparison, dict)
+        else None
+    )
     return config if kept is None else config | {"comparison": kept}

@@ -25,7 +25,9 @@ def trainings(row: Row | None) -> list[float]:
 
 def has_trainings(group: list[Contest]) -> bool:
     """Whether a row of these contests was trained from several seeds."""
-    rows = (row for contest in group for line in contest.lines for row in line.rows.values())
+    rows = (
+        row for contest in group for line in contest.lines for row in line.rows.values()
+    )
     return any(len(trainings(row)) > 1 for row in rows)
 
 
@@ -33,11 +35,23 @@ def apart(contest: Contest) -> list[Block]:
     """A table of the trainings, where rows have several."""
     if not has_trainings([contest]):
         return []
-    rows, names = [row for line in contest.lines for row in line.rows.values()], scenarios(contest)
-    seeds = sorted({seed for row in rows for seed in row.get("seeds") or [] if is_number(seed)})
-    head = [f"{scenario_label(name)} [mm],\nseed {', '.join(map(plain, seeds))}" for name in names]
-    lines = [[line.name, *(_shown(line, name) for name in names)] for line in contest.lines]
-    strong = tuple(place for place, line in enumerate(contest.lines) if line.system == "sfkd")
+    rows, names = (
+        [row for line in contest.lines for row in line.rows.values()],
+        scenarios(contest),
+    )
+    seeds = sorted(
+        {seed for row in rows for seed in row.get("seeds") or [] if is_number(seed)}
+    )
+    head = [
+        f"{scenario_label(name)} [mm],\nseed {', '.join(map(plain, seeds))}"
+        for name in names
+    ]
+    lines = [
+        [line.name, *(_shown(line, name) for name in names)] for line in contest.lines
+    ]
+    strong = tuple(
+        place for place, line in enumerate(contest.lines) if line.system == "sfkd"
+    )
     return [
         Heading(3, f"Trainings apart: {title(contest)}"),
         Table(["Row", *head], lines, strong),

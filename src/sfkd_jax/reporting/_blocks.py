@@ -67,7 +67,9 @@ class Missing(NamedTuple):
     command: str
 
 
-def picture(place: Path, name: str, caption: str, draw: Callable[..., Figure], *inputs: Any) -> Picture:
+def picture(
+    place: Path, name: str, caption: str, draw: Callable[..., Figure], *inputs: Any
+) -> Picture:
     """Draw a figure into a folder."""
     return Picture(save(place / f"{name}.png", draw, *inputs), caption)
 
@@ -102,14 +104,18 @@ def _html(block: Block) -> str:
             start = f"<strong>{escape(lead)}</strong> " if lead else ""
             return f"<p{f' class={kind}' if kind else ''}>{start}{_bound(escape(text))}</p>"
         case Tiles(items):
-            tiles = "".join(f"<div><dt>{escape(k)}</dt><dd>{escape(v)}</dd></div>" for k, v in items)
+            tiles = "".join(
+                f"<div><dt>{escape(k)}</dt><dd>{escape(v)}</dd></div>" for k, v in items
+            )
             return f'<dl class="tiles">{tiles}</dl>'
         case Table():
             return _html_table(block)
         case Picture(path, caption):
             data = base64.b64encode(path.read_bytes()).decode("ascii")
             kind = path.suffix.removeprefix(".")
-            image = f'<img alt="{escape(caption)}" src="data:image/{kind};base64,{data}">'
+            image = (
+                f'<img alt="{escape(caption)}" src="data:image/{kind};base64,{data}">'
+            )
             return f"<figure>{image}<figcaption>{_bound(escape(caption))}</figcaption></figure>"
         case Code(text):
             return f"<pre><code>{escape(text)}</code></pre>"
@@ -139,9 +145,14 @@ def _markdown(block: Block) -> str:
         case Text(text, lead, _):
             return f"**{_plain(lead)}** {_plain(text)}" if lead else _plain(text)
         case Tiles(items):
-            return "\n".join(f"- {_plain(name)}: {_plain(value)}" for name, value in items)
+            return "\n".join(
+                f"- {_plain(name)}: {_plain(value)}" for name, value in items
+            )
         case Table(header, rows, strong, prose):
-            stress = [[f"**{_plain(c)}**" if i in strong else _plain(c) for c in row] for i, row in enumerate(rows)]
+            stress = [
+                [f"**{_plain(c)}**" if i in strong else _plain(c) for c in row]
+                for i, row in enumerate(rows)
+            ]
             rule = [":--"] + [":--" if prose else "--:"] * (len(header) - 1)
             lines = [[_plain(cell) for cell in header], rule, *stress]
             return "\n".join(f"| {' | '.join(line)} |" for line in lines)

@@ -20,35 +20,59 @@ def records_of(root: Path, pattern: str) -> list[Record]:
     """One record per run, ordered by system, vehicle, inner loop, ρ + β, β and place.
 
     Args:
-        root: that the pattern starts from. pattern: of run directories; those without settings.json are no runs.
+        root: that the pattern starts from.
+        pattern: of run directories; those without settings.json are no runs.
 
     Raises:
         ValueError: no run matches, or a file of a run is not JSON.
     """
-    places = [place for place in sorted(glob.glob(pattern, root_dir=root)) if (root / place / "settings.json").exists()]
+    places = [
+        place
+        for place in sorted(glob.glob(pattern, root_dir=root))
+        if (root / place / "settings.json").exists()
+    ]
     if not places:
         raise ValueError(f"no run under {root} matches {pattern!r}")
     records = [_record(root / place, place) for place in places]
     records.sort(
-        key=lambda record: (*_convention(record), *map(_last, (_asked(record), record["beta"])), record["run"])
+        key=lambda record: (
+            *_convention(record),
+            *map(_last, (_asked(record), record["beta"])),
+            record["run"],
+        )
     )
     for record in records:
-        record["smallest_of_its_betas"] = record is _best([r for r in records if _rivals(r, record)])
+        record["smallest_of_its_betas"] = record is _best(
+            [r for r in records if _rivals(r, record)]
+        )
     return records
 
 
 def curves(records: list[Record]) -> list[list[Record]]:
     """The certified runs at the most common β: one list per system, vehicle and inner loop, by rising α."""
     certified = [record for record in records if is_number(record["alpha"])]
-    betas = Counter(sorted(record["beta"] for record in certified if is_number(record["beta"])))
-    main = [record for record in certified if record["beta"] == (betas.most_common(1) or [(None, 0)])[0][0]]
-    lines = [[record for record in main if _convention(record) == one] for one in dict.fromkeys(map(_convention, main))]
+    betas = Counter(
+        sorted(record["beta"] for record in certified if is_number(record["beta"]))
+    )
+    main = [
+        record
+        for record in certified
+        if record["beta"] == (betas.most_common(1) or [(None, 0)])[0][0]
+    ]
+    lines = [
+        [record for record in main if _convention(record) == one]
+        for one in dict.fromkeys(map(_convention, main))
+    ]
     return [sorted(line, key=lambda record: record["alpha"]) for line in lines]
 
 
 def scenario_of(records: list[Record]) -> str | None:
     """The scenario that most runs were driven on; of several, the last by name."""
-    names = Counter(sorted((name for record in records for name in record["closed_loop"]), reverse=True))
+    names = Counter(
+        sorted(
+            (name for record in records for name in record["closed_loop"]), reverse=True
+        )
+    )
     return names.most_common(1)[0][0] if names else None
 
 
@@ -64,8 +88,15 @@ def _record(run: Path, place: str) -> Record:
     rows = (read(run / "results.json") or {}).get("rows") or []
     with understood(run / "settings.json", ValueError):
         model, system = settings.get("model"), model_of(settings)
-        asked = {"rho": dig(model, "rho"), "beta": dig(model, "beta"), "seed": settings.get("seed")}
-        vehicle = {"vehicle": dig(settings, "vehicle", "name"), "inner_loop": dig(settings, "vehicle", "inner_loop")}
+        asked = {
+            "rho": dig(model, "rho"),
+            "beta": dig(model, "beta"),
+            "seed": settings.get("seed"),
+        }
+        vehicle = {
+            "vehicle": dig(settings, "vehicle", "name"),
+            "inner_loop": dig(settings, "vehicle", "inner_loop"),
+        }
     with understood(run / "certificate.json", ValueError):
         certified = _certified(certificate)
     with understood(run / "open_loop.json", ValueError):
@@ -86,7 +117,10 @@ def _certified(certificate: dict[str, Any] | None) -> Record:
     proof = {} if reason or certificate is None else certificate
     alpha, separate = proof.get("alpha"), proof.get("alpha_separate")
     bound, tube = dig(proof, "d_bar") or {}, dig(proof, "tube") or {}
-    radii, position = tube.get("latent") or [], dig(tube, "physical", "position_m") or []
+    radii, position = (
+        tube.get("latent") or [],
+        dig(tube, "physical", "position_m") or [],
+    )
     drives = bound.get("by_scenario") or {}
     on_validation = _ultimate(bound.get("validation"), alpha)
     return {
@@ -98,18 +132,30 @@ def _certified(certificate: dict[str, Any] | None) -> Record:
         "tightness": proof.get("tightness"),
         "d_bar": bound.get("value"),
         "d_bar_validation": bound.get("validation"),
-        "tube": {"steps": len(radii), "latent": _end(radii), "position_m": _end(position)},
+        "tube": {
+            "steps": len(radii),
+            "latent": _end(radii),
+            "position_m": _end(position),
+        },
         "ultimate": tube.get("ultimate"),
         "ultimate_separate": _ultimate(bound.get("value"), separate),
         "ultimate_validation": on_validation,
-        "ultimate_body_validation": _times(dig(proof, "lipschitz", "body"), on_validation),
-        "coverage": {name: dig(drive, "coverage") for name, drive in sorted(drives.items())},
+        "ultimate_body_validation": _times(
+            dig(proof, "lipschitz", "body"), on_validation
+        ),
+        "coverage": {
+            name: dig(drive, "coverage") for name, drive in sorted(drives.items())
+        },
     }
 
 
 def _ultimate(d_bar: Any, alpha: Any) -> float | None:
     """d̄ / (1 − α), which no α of one or more has."""
-    return d_bar / (1 - alpha) if is_number(d_bar) and is_number(alpha) and alpha < 1 else None
+    return (
+        d_bar / (1 - alpha)
+        if is_number(d_bar) and is_number(alpha) and alpha < 1
+        else None
+    )
 
 
 def _times(left: Any, right: Any) -> float | None:
@@ -119,7 +165,9 @@ def _times(left: Any, right: Any) -> float | None:
 def _predicting(errors: dict[str, Any] | None) -> Record:
     """Errors at the last step ahead."""
     keys = ("position_rmse_m", "longitudinal_rmse_m", "lateral_rmse_m")
-    return {"steps": _end(dig(errors, "steps") or [])} | {key: _end(dig(errors, key) or []) for key in keys}
+    return {"steps": _end(dig(errors, "steps") or [])} | {
+        key: _end(dig(errors, key) or []) for key in keys
+    }
 
 
 def _driving(rows: list[dict[str, Any]], system: str) -> dict[str, Record]:
@@ -151,9 +199,15 @@ def _best(records: list[Record]) -> Record | None:
 
     In units of the body state: the latent's own unit differs from run to run.
     """
-    known = [record for record in records if is_number(record["ultimate_body_validation"])]
+    known = [
+        record for record in records if is_number(record["ultimate_body_validation"])
+    ]
     several = len({record["beta"] for record in known}) > 1
-    return min(known, key=lambda record: record["ultimate_body_validation"]) if several else None
+    return (
+        min(known, key=lambda record: record["ultimate_body_validation"])
+        if several
+        else None
+    )
 
 
 def _rivals(one: Record, other: Record) -> bool:

@@ -8,8 +8,23 @@ from typing import Any
 
 from sfkd_jax.artefacts import write_bytes, write_json, writing
 from sfkd_jax.reporting._benchmark_tables import percent
-from sfkd_jax.reporting._blocks import Block, Code, Heading, Picture, Table, Text, to_html, to_markdown
-from sfkd_jax.reporting._compared import Record, curves, records_of, scenario_of, steps_of
+from sfkd_jax.reporting._blocks import (
+    Block,
+    Code,
+    Heading,
+    Picture,
+    Table,
+    Text,
+    to_html,
+    to_markdown,
+)
+from sfkd_jax.reporting._compared import (
+    Record,
+    curves,
+    records_of,
+    scenario_of,
+    steps_of,
+)
 from sfkd_jax.reporting._comparison_words import paragraph
 from sfkd_jax.reporting._numbers import dig, mean_std, number, plain, short, upper
 from sfkd_jax.reporting._style import save, scenario_label
@@ -19,18 +34,22 @@ from sfkd_jax.reporting._tradeoff import tradeoff
 def write_comparison(root: Path, pattern: str, name: str) -> dict[str, Any]:
     """Write `root/name/comparison/`: `index.html`, `report.md`, `comparison.json` and `figures/<name>.png`.
 
-    Reads settings.json, policy.json, open_loop.json, certificate.json and results.json of every run. All but
-    settings.json may be missing: what they would say is null. The only arithmetic is d̄ / (1 − α), for the separate
-    α and for d̄ on validation drives.
+    Reads settings.json, policy.json, open_loop.json, certificate.json and results.json
+    of every run. All but settings.json may be missing: what they would say is null. The
+    only arithmetic is d̄ / (1 − α), for the separate α and for d̄ on validation drives.
 
     Args:
-        root: of all artefacts. pattern: of run directories below it, as `contraction/*/*/seed=*`. name: of the page.
+        root: of all artefacts.
+        pattern: of run directories below it, as `contraction/*/*/seed=*`.
+        name: of the page.
 
     Returns:
-        `report`, `comparison`: paths of the page and of the records. `figures`: paths of the figures.
+        `report`, `comparison`: paths of the page and of the records. `figures`: paths
+        of the figures.
 
     Raises:
-        ValueError: no run matches. ArtefactError: a file that is not JSON, or the disk refuses the page.
+        ValueError: no run matches.
+        ArtefactError: a file that is not JSON, or the disk refuses the page.
     """
     with writing(root / name / "comparison"):
         return _write(root, pattern, name)
@@ -63,11 +82,20 @@ def _write(root: Path, pattern: str, name: str) -> dict[str, Any]:
 def _command(root: Path, pattern: str, name: str) -> str:
     """The command line of this page, quoted twice: for the shell, and for Hydra, to which = and * mean something."""
     settings = {"report.compare": pattern, "name": name, "root": root}
-    return " ".join(["python -m sfkd_jax.report", *(f"\"{key}='{value}'\"" for key, value in settings.items())])
+    return " ".join(
+        [
+            "python -m sfkd_jax.report",
+            *(f"\"{key}='{value}'\"" for key, value in settings.items()),
+        ]
+    )
 
 
 def _caption(beta: str, scenario: str | None) -> str:
-    driven = f" Whiskers: 95 % interval of the mean over episodes of {scenario_label(scenario)}." if scenario else ""
+    driven = (
+        f" Whiskers: 95 % interval of the mean over episodes of {scenario_label(scenario)}."
+        if scenario
+        else ""
+    )
     return (
         f"Runs with β = {beta}, one point a run, against the contraction factor that is certified.{driven} Hollow: "
         "the same run, if only the separate bounds ρ and β were added. Latent units are those of each run."
@@ -93,7 +121,9 @@ _MEASURED: _Columns = {
     "d̄ on\nvalidation": lambda record: upper(record["d_bar_validation"]),
     "Tube at T,\nlatent": lambda record: upper(record["tube"]["latent"]),
     "Ultimate\nbound": lambda record: upper(record["ultimate"]),
-    "Ultimate on\nvalidation, body": lambda record: upper(record["ultimate_body_validation"]),
+    "Ultimate on\nvalidation, body": lambda record: upper(
+        record["ultimate_body_validation"]
+    ),
     "Tube at T,\nposition [m]": lambda record: upper(record["tube"]["position_m"]),
 }
 
@@ -118,7 +148,9 @@ _DRIVEN: _Columns = {
 def _tables(records: list[Record]) -> list[Block]:
     scenarios = sorted({name for record in records for name in record["closed_loop"]})
     covered = sorted({name for record in records for name in record["coverage"]})
-    coverage: _Columns = {f"Covered,\n{scenario_label(name)} [%]": _coverage(name) for name in covered}
+    coverage: _Columns = {
+        f"Covered,\n{scenario_label(name)} [%]": _coverage(name) for name in covered
+    }
     best = [record["smallest_of_its_betas"] for record in records]
     marked = f"{_MARKED} " if any(best) else ""
     blocks: list[Block] = [
@@ -126,14 +158,26 @@ def _tables(records: list[Record]) -> list[Block]:
         _table(records, _PROVED),
         *_reasons(records),
         Heading(2, "What the bounds come to"),
-        _table(records, _MEASURED | coverage, tuple(place for place, one in enumerate(best) if one)),
-        Text(f"{marked}T is {steps_of(records, 'tube')} steps. {_COVERED}", kind="note"),
-        Heading(2, f"Prediction without feedback, after {steps_of(records, 'open_loop')} steps"),
+        _table(
+            records,
+            _MEASURED | coverage,
+            tuple(place for place, one in enumerate(best) if one),
+        ),
+        Text(
+            f"{marked}T is {steps_of(records, 'tube')} steps. {_COVERED}", kind="note"
+        ),
+        Heading(
+            2,
+            f"Prediction without feedback, after {steps_of(records, 'open_loop')} steps",
+        ),
         _table(records, _PREDICTED),
     ]
     for name in scenarios:
         rows = {key: _of(name, cell) for key, cell in _DRIVEN.items()}
-        blocks += [Heading(2, f"Driven: scenario {scenario_label(name)}"), _table(records, rows)]
+        blocks += [
+            Heading(2, f"Driven: scenario {scenario_label(name)}"),
+            _table(records, rows),
+        ]
     return blocks
 
 
@@ -157,16 +201,29 @@ def _of(scenario: str, cell: Callable[[Record], str]) -> Callable[[Record], str]
     return lambda record: cell(dig(record, "closed_loop", scenario) or {})
 
 
-def _table(records: list[Record], columns: _Columns, strong: tuple[int, ...] = ()) -> Table:
+def _table(
+    records: list[Record], columns: _Columns, strong: tuple[int, ...] = ()
+) -> Table:
     names = _short([record["run"] for record in records])
-    rows = [[name, *(cell(record) for cell in columns.values())] for name, record in zip(names, records, strict=True)]
+    rows = [
+        [name, *(cell(record) for cell in columns.values())]
+        for name, record in zip(names, records, strict=True)
+    ]
     return Table(["Run", *columns], rows, strong)
 
 
 def _reasons(records: list[Record]) -> list[Block]:
     names = _short([record["run"] for record in records])
-    rows = [[name, plain(r["reason"])] for name, r in zip(names, records, strict=True) if r["reason"]]
-    return [Heading(3, "Not certified"), Table(["Run", "Reason"], rows, prose=True)] if rows else []
+    rows = [
+        [name, plain(r["reason"])]
+        for name, r in zip(names, records, strict=True)
+        if r["reason"]
+    ]
+    return (
+        [Heading(3, "Not certified"), Table(["Run", "Reason"], rows, prose=True)]
+        if rows
+        else []
+    )
 
 
 def _short(places: list[str]) -> list[str]:

@@ -6,7 +6,16 @@ from collections.abc import Callable
 from typing import Any
 
 from sfkd_jax.reporting._compared import Record, curves, scenario_of, steps_of
-from sfkd_jax.reporting._numbers import DASH, dig, interval, is_number, number, plain, short, upper
+from sfkd_jax.reporting._numbers import (
+    DASH,
+    dig,
+    interval,
+    is_number,
+    number,
+    plain,
+    short,
+    upper,
+)
 from sfkd_jax.reporting._style import scenario_label
 from sfkd_jax.reporting._tradeoff import title_of
 
@@ -19,7 +28,9 @@ def paragraph(records: list[Record]) -> str:
     sentences += [*_joint(records), *_chosen(records)]
     missing = sum(record["reason"] is not None for record in records)
     if missing:
-        sentences.append(f"Without a certificate: {_runs(missing)}, for reasons that are given below.")
+        sentences.append(
+            f"Without a certificate: {_runs(missing)}, for reasons that are given below."
+        )
     return " ".join(sentences)
 
 
@@ -29,9 +40,14 @@ def _along(line: list[Record], records: list[Record]) -> list[str]:
     ahead, horizon = steps_of(records, "open_loop"), steps_of(records, "tube")
     driven = _change(first, last, "closed_loop", scenario, "rmse_m", "mean", unit=" m")
     parts = {
-        f"the position error after {ahead} steps": _change(first, last, "open_loop", "position_rmse_m", unit=" m"),
-        f"the lateral RMSE on {scenario_label(scenario)}": driven and driven + _overlap(first, last, scenario),
-        f"the latent tube after {horizon} steps": _change(first, last, "tube", "latent", write=upper),
+        f"the position error after {ahead} steps": _change(
+            first, last, "open_loop", "position_rmse_m", unit=" m"
+        ),
+        f"the lateral RMSE on {scenario_label(scenario)}": driven
+        and driven + _overlap(first, last, scenario),
+        f"the latent tube after {horizon} steps": _change(
+            first, last, "tube", "latent", write=upper
+        ),
         "the ultimate bound": _change(first, last, "ultimate", write=upper),
     }
     known = [f"{name} {change}" for name, change in parts.items() if change]
@@ -40,10 +56,18 @@ def _along(line: list[Record], records: list[Record]) -> list[str]:
     where = f"{_capital(title_of(first, records))}, β = {plain(first['beta'])}"
     if first is last:
         return [f"{where}: at certified α = {upper(first['alpha'])}, {_listed(known)}."]
-    return [f"{where}: from certified α = {upper(first['alpha'])} to {upper(last['alpha'])}, {_listed(known)}."]
+    return [
+        f"{where}: from certified α = {upper(first['alpha'])} to {upper(last['alpha'])}, {_listed(known)}."
+    ]
 
 
-def _change(first: Record, last: Record, *keys: str, unit: str = "", write: Callable[[Any], str] = short) -> str:
+def _change(
+    first: Record,
+    last: Record,
+    *keys: str,
+    unit: str = "",
+    write: Callable[[Any], str] = short,
+) -> str:
     """One measure at both ends, or nothing if either is unknown."""
     ends = dig(first, *keys), dig(last, *keys)
     if not all(map(is_number, ends)):
@@ -54,7 +78,10 @@ def _change(first: Record, last: Record, *keys: str, unit: str = "", write: Call
 
 def _overlap(first: Record, last: Record, scenario: str) -> str:
     """Whether the intervals of both RMSEs share a value."""
-    pairs = [dig(record, "closed_loop", scenario, "rmse_m", "ci95") for record in (first, last)]
+    pairs = [
+        dig(record, "closed_loop", scenario, "rmse_m", "ci95")
+        for record in (first, last)
+    ]
     if first is last or any(interval(pair) == DASH for pair in pairs):
         return ""
     (low, high), (other_low, other_high) = pairs
@@ -65,13 +92,21 @@ def _overlap(first: Record, last: Record, scenario: str) -> str:
 def _joint(records: list[Record]) -> list[str]:
     """What is gained by bounding the step as one map."""
     pairs = [
-        (record["ultimate"], record["ultimate_separate"]) for record in records if is_number(record["alpha_joint"])
+        (record["ultimate"], record["ultimate_separate"])
+        for record in records
+        if is_number(record["alpha_joint"])
     ]
-    ratios = sorted(separate / ultimate for ultimate, separate in pairs if is_number(separate) and is_number(ultimate))
+    ratios = sorted(
+        separate / ultimate
+        for ultimate, separate in pairs
+        if is_number(separate) and is_number(ultimate)
+    )
     if not ratios:
         return []
     span = _span(ratios)
-    return [f"Bounding the whole step as one map divides the ultimate bound of ρ + β by {span} ({_runs(len(ratios))})."]
+    return [
+        f"Bounding the whole step as one map divides the ultimate bound of ρ + β by {span} ({_runs(len(ratios))})."
+    ]
 
 
 def _span(ratios: list[float]) -> str:
@@ -86,7 +121,11 @@ def _chosen(records: list[Record]) -> list[str]:
         f"β = {plain(record['beta'])} for ρ + β = {plain(record['rho'] + record['beta'])} ({title_of(record, records)})"
         for record in best
     ]
-    return [f"On validation drives the ultimate bound is smallest with {_listed(words)}."] if words else []
+    return (
+        [f"On validation drives the ultimate bound is smallest with {_listed(words)}."]
+        if words
+        else []
+    )
 
 
 def _runs(count: int) -> str:

@@ -7,23 +7,41 @@ from typing import Any
 
 from sfkd_jax.reporting._blocks import Block, Heading, Table, Text, picture
 from sfkd_jax.reporting._corridor import Corridor, around_drives
-from sfkd_jax.reporting._numbers import DASH, dig, interval, is_number, number, short, upper
+from sfkd_jax.reporting._numbers import (
+    DASH,
+    dig,
+    interval,
+    is_number,
+    number,
+    short,
+    upper,
+)
 from sfkd_jax.reporting._scene import scenes_of
 from sfkd_jax.reporting._words import holds, model_of
 
 
-def corridor(run: Path, record: dict[str, Any] | None, settings: dict[str, Any], place: Path) -> list[Block]:
+def corridor(
+    run: Path, record: dict[str, Any] | None, settings: dict[str, Any], place: Path
+) -> list[Block]:
     """The section of a certificate that holds and has a corridor; nothing for another."""
     found = dig(record, "corridor")
-    width, tube = (dig(found, "bounds", name) for name in ("nominal", "followed_position"))
+    width, tube = (
+        dig(found, "bounds", name) for name in ("nominal", "followed_position")
+    )
     if record is None or not holds(record) or not is_number(dig(found, "corridor_m")):
         return []
-    blocks: list[Block] = [Heading(2, "How far the car strays"), *corridor_words(record), corridor_table(found)]
+    blocks: list[Block] = [
+        Heading(2, "How far the car strays"),
+        *corridor_words(record),
+        corridor_table(found),
+    ]
     system = model_of(settings)
     scenes = [scene for scene in scenes_of(run) if system in scene.lateral]
     if scenes and is_number(width) and is_number(tube):
         half = Corridor(float(width), float(tube))
-        blocks.append(picture(place, "corridor", _CAPTION, around_drives, scenes[0], system, half))
+        blocks.append(
+            picture(place, "corridor", _CAPTION, around_drives, scenes[0], system, half)
+        )
     return blocks
 
 
@@ -61,7 +79,11 @@ def corridor_words(record: dict[str, Any]) -> list[Text]:
             if dig(found, "fixed_points", "corridor_m")
             else []
         ),
-        *([Text(_attacked(found), "Attacked.")] if isinstance(found.get("attack"), dict) else []),
+        *(
+            [Text(_attacked(found), "Attacked.")]
+            if isinstance(found.get("attack"), dict)
+            else []
+        ),
     ]
 
 
@@ -70,7 +92,9 @@ def _class(about: Any) -> str:
     low, high = (_entries(dig(about, "env_box"), side, 2) for side in (0, 1))
     speed, dwell = (_entries(about, name, 2) for name in ("speed", "dwell_s"))
     steering, drive = _entries(about, "perturbation", 2)
-    spread, push = (_entries(about, name, 2) for name in ("steering_excitation", "speed_excitation"))
+    spread, push = (
+        _entries(about, name, 2) for name in ("steering_excitation", "speed_excitation")
+    )
     return (
         f"it drives at {short(speed[0])} to {short(speed[1])} m/s on a road of a curvature of at most "
         f"{short(dig(about, 'peak_curvature'))} 1/m and a lateral acceleration of at most "
@@ -87,7 +111,9 @@ def _entries(record: Any, key: str | int, count: int) -> list[Any]:
     values = dig(record, key) if isinstance(key, str) else None
     if isinstance(key, int) and isinstance(record, list) and len(record) > key:
         values = record[key]
-    return values if isinstance(values, list) and len(values) == count else [None] * count
+    return (
+        values if isinstance(values, list) and len(values) == count else [None] * count
+    )
 
 
 def _measured(found: dict[str, Any]) -> str:
@@ -99,8 +125,12 @@ def _measured(found: dict[str, Any]) -> str:
     )
     if is_number(dig(s3, "coverage")):
         text += f", and on {_share(dig(s3, 'coverage'))} of {short(dig(s3, 'coverage_drives'))} drives of S3, "
-        text += f"whose schedule no calibration saw ({interval(dig(s3, 'coverage_ci95'))})"
-    lateral, distance = (dig(found, "seen", name) for name in ("lateral_m", "distance_m"))
+        text += (
+            f"whose schedule no calibration saw ({interval(dig(s3, 'coverage_ci95'))})"
+        )
+    lateral, distance = (
+        dig(found, "seen", name) for name in ("lateral_m", "distance_m")
+    )
     if is_number(lateral) and is_number(distance):
         text += f". The test drives came to {number(lateral)} m from the path and {number(distance)} m from their copy"
     return text + "."
@@ -108,7 +138,8 @@ def _measured(found: dict[str, Any]) -> str:
 
 def _at_rest(part: dict[str, Any]) -> str:
     between, after = (
-        [upper(dig(part, name, who)) for who in ("law", "planner")] for name in ("corridor_m", "after_switch_m")
+        [upper(dig(part, name, who)) for who in ("law", "planner")]
+        for name in ("corridor_m", "after_switch_m")
     )
     return (
         "On every road the model alone would come to rest at one point, and the car follows it at a distance that the "
@@ -127,7 +158,9 @@ def _attacked(found: dict[str, Any]) -> str:
         f"{number(attack.get('shielded_lateral_m'))} m with the shield. Such drives are not promised to keep the "
         "bounds on the disturbances"
     )
-    if is_number(attack.get("over_corridor")) and is_number(attack.get("kept_lateral_m")):
+    if is_number(attack.get("over_corridor")) and is_number(
+        attack.get("kept_lateral_m")
+    ):
         text += (
             f"; where they did keep them, the car came to {number(attack['kept_lateral_m'])} m, "
             f"{number(attack['over_corridor'], 2)} times the corridor"
@@ -143,14 +176,26 @@ def corridor_table(found: dict[str, Any]) -> Table:
         ("nominal", "W: nominal copy from the path [m]", together),
         ("followed_position", "Tube: car from its copy, across [m]", together),
         ("followed_yaw", "Tube: car from its copy, heading [rad]", together),
-        ("for_ever_position", "The same from the largest disturbance alone, across [m]", alone),
-        ("for_ever_yaw", "The same from the largest disturbance alone, heading [rad]", alone),
+        (
+            "for_ever_position",
+            "The same from the largest disturbance alone, across [m]",
+            alone,
+        ),
+        (
+            "for_ever_yaw",
+            "The same from the largest disturbance alone, heading [rad]",
+            alone,
+        ),
     )
     bounds = found.get("bounds")
     values = found | (bounds if isinstance(bounds, dict) else {})
     level = _share(found.get("level"))
-    rows = [[name, upper(values.get(key)), f"{level}, {kind}"] for key, name, kind in named]
-    return Table(["Bound", "At most", "Holds on a share of drives of"], rows, prose=True)
+    rows = [
+        [name, upper(values.get(key)), f"{level}, {kind}"] for key, name, kind in named
+    ]
+    return Table(
+        ["Bound", "At most", "Holds on a share of drives of"], rows, prose=True
+    )
 
 
 def _share(value: Any) -> str:

@@ -17,9 +17,21 @@ def learning(lines: list[dict[str, Any]]) -> Figure:
     rows = {key: _column(lines, key) for key in ("loss", "validation_loss", "alpha")}
     certified = rows["alpha"].shape[1] > 1
     figure = canvas(4.3 if certified else 3.3)
-    panels = figure.subplots(1 + certified, 1, sharex=True, squeeze=False, height_ratios=[3, 1][: 1 + certified])[:, 0]
+    panels = figure.subplots(
+        1 + certified,
+        1,
+        sharex=True,
+        squeeze=False,
+        height_ratios=[3, 1][: 1 + certified],
+    )[:, 0]
     panels[0].plot(*rows["loss"], color="#9dbbe3", linewidth=1.1, label="training")
-    panels[0].plot(*rows["validation_loss"], color=ACCENT, marker="o", markersize=3.5, label="validation")
+    panels[0].plot(
+        *rows["validation_loss"],
+        color=ACCENT,
+        marker="o",
+        markersize=3.5,
+        label="validation",
+    )
     panels[0].set(yscale="log", ylabel="loss [-]", title="Learning curves")
     panels[0].legend(loc="upper right", ncols=2)
     if certified:
@@ -33,7 +45,11 @@ def learning(lines: list[dict[str, Any]]) -> Figure:
 
 def _column(lines: list[dict[str, Any]], key: str) -> np.ndarray:
     """The steps and finite values of one logged quantity, (2, count)."""
-    pairs = [(row["step"], row[key]) for row in lines if isinstance(row.get(key), int | float) and "step" in row]
+    pairs = [
+        (row["step"], row[key])
+        for row in lines
+        if isinstance(row.get(key), int | float) and "step" in row
+    ]
     values = np.array(pairs, dtype=float).reshape(-1, 2).T
     return values[:, np.isfinite(values).all(axis=0)]
 
@@ -42,17 +58,30 @@ def open_loop(errors: dict[str, Any]) -> Figure:
     """Prediction error without feedback, by how far ahead the model looks."""
     figure = canvas(3.4)
     grid = figure.add_gridspec(2, 2, width_ratios=[1.45, 1])
-    panels = [figure.add_subplot(grid[:, 0]), figure.add_subplot(grid[0, 1]), figure.add_subplot(grid[1, 1])]
+    panels = [
+        figure.add_subplot(grid[:, 0]),
+        figure.add_subplot(grid[0, 1]),
+        figure.add_subplot(grid[1, 1]),
+    ]
     known = is_number(errors.get("dt"))
     ahead = np.asarray(errors["steps"], dtype=float) * (errors["dt"] if known else 1.0)
-    parts = (("position_rmse_m", "position", ACCENT), ("longitudinal_rmse_m", "along", SECOND))
+    parts = (
+        ("position_rmse_m", "position", ACCENT),
+        ("longitudinal_rmse_m", "along", SECOND),
+    )
     for key, name, colour in (*parts, ("lateral_rmse_m", "across", THIRD)):
-        panels[0].plot(ahead, numbers(errors.get(key), len(ahead)), color=colour, label=name)
+        panels[0].plot(
+            ahead, numbers(errors.get(key), len(ahead)), color=colour, label=name
+        )
     unit = "seconds ahead" if known else "steps ahead"
     panels[0].legend(loc="upper left")
     panels[1].plot(ahead, numbers(errors.get("yaw_rmse_rad"), len(ahead)), color=ACCENT)
-    panels[2].plot(ahead, numbers(errors.get("speed_rmse_m_per_s"), len(ahead)), color=ACCENT)
-    for axes, name in zip(panels, ("position RMSE [m]", "yaw [rad]", "speed [m/s]"), strict=True):
+    panels[2].plot(
+        ahead, numbers(errors.get("speed_rmse_m_per_s"), len(ahead)), color=ACCENT
+    )
+    for axes, name in zip(
+        panels, ("position RMSE [m]", "yaw [rad]", "speed [m/s]"), strict=True
+    ):
         axes.set(ylabel=name, xlim=(0, ahead[-1]))
         axes.set_ylim(bottom=0.0)
     panels[0].set(xlabel=unit, title="Prediction error without feedback")

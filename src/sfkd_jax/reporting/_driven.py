@@ -10,7 +10,16 @@ from matplotlib.figure import Figure
 
 from sfkd_jax.reporting._conditions import conditions, mark
 from sfkd_jax.reporting._scene import Scene, hardest_step, switches
-from sfkd_jax.reporting._style import MUTED, PLATE, canvas, legend, line, literal, ordered, principal
+from sfkd_jax.reporting._style import (
+    MUTED,
+    PLATE,
+    canvas,
+    legend,
+    line,
+    literal,
+    ordered,
+    principal,
+)
 
 
 def deviation(scene: Scene, seconds: float = 15.0) -> Figure:
@@ -48,7 +57,9 @@ def deviation(scene: Scene, seconds: float = 15.0) -> Figure:
     return figure
 
 
-def _label_conditions(axes: Any, envs: np.ndarray, changes: list[int], dt: float) -> None:
+def _label_conditions(
+    axes: Any, envs: np.ndarray, changes: list[int], dt: float
+) -> None:
     """Name (μ, w) above each stretch between two switches, as long as the names fit."""
     edges = [0, *changes, len(envs)]
     if len(edges) > 8:
@@ -71,20 +82,45 @@ def spread(scene: Scene) -> Figure:
     systems = ordered(scene.lateral)
     banded = principal(systems)
     for system in systems:
-        values = np.where(np.isfinite(scene.lateral[system]), np.abs(scene.lateral[system]), np.inf)
+        values = np.where(
+            np.isfinite(scene.lateral[system]), np.abs(scene.lateral[system]), np.inf
+        )
         time = scene.dt * np.arange(1, values.shape[1] + 1)
-        low, middle, high = np.quantile(values, [0.05, 0.5, 0.95], axis=0, method="nearest")
+        low, middle, high = np.quantile(
+            values, [0.05, 0.5, 0.95], axis=0, method="nearest"
+        )
         style = line(system)
         axes.plot(time, middle, **style | {"linewidth": 0.75 * style["linewidth"]})
         if system in banded:
-            axes.fill_between(time, low, np.minimum(high, 1e6), color=style["color"], alpha=0.2, linewidth=0)
+            axes.fill_between(
+                time,
+                low,
+                np.minimum(high, 1e6),
+                color=style["color"],
+                alpha=0.2,
+                linewidth=0,
+            )
     for step in switches(scene.envs):
-        axes.axvline(step * scene.dt, color=MUTED, linestyle=(0, (4, 3)), linewidth=0.5, alpha=0.5, zorder=1)
+        axes.axvline(
+            step * scene.dt,
+            color=MUTED,
+            linestyle=(0, (4, 3)),
+            linewidth=0.5,
+            alpha=0.5,
+            zorder=1,
+        )
     count = max(values.shape[0] for values in scene.lateral.values())
     title = f"{literal(scene.label)}: " + (
-        "the one episode" if count == 1 else f"median and 5–95 % band of {count} episodes"
+        "the one episode"
+        if count == 1
+        else f"median and 5–95 % band of {count} episodes"
     )
-    axes.set(xlabel="time [s]", ylabel="|lateral deviation| [m]", title=title, xlim=(0, time[-1]))
+    axes.set(
+        xlabel="time [s]",
+        ylabel="|lateral deviation| [m]",
+        title=title,
+        xlim=(0, time[-1]),
+    )
     axes.set_ylim(bottom=0.0)
     axes.grid(visible=False, axis="x")
     legend(figure, axes)
@@ -99,16 +135,33 @@ def steering(scene: Scene, seconds: float = 10.0) -> Figure:
     span = min(round(seconds / scene.dt), steps)
     start = int(np.clip(hardest_step(scene) - span // 2, 0, steps - span))
     start -= start % max(1, round(1.0 / scene.dt))
-    systems = ordered(scene.controls) if len(scene.controls) <= 4 else principal(scene.controls)
+    systems = (
+        ordered(scene.controls)
+        if len(scene.controls) <= 4
+        else principal(scene.controls)
+    )
     for system in systems:
         values = scene.controls[system][start : start + span, 0]
-        axes.plot(scene.dt * (start + np.arange(len(values))), values, drawstyle="steps-post", **line(system))
+        axes.plot(
+            scene.dt * (start + np.arange(len(values))),
+            values,
+            drawstyle="steps-post",
+            **line(system),
+        )
     for step in switches(scene.envs):
         if start < step < start + span:
-            axes.axvline(step * scene.dt, color=MUTED, linestyle=(0, (4, 3)), linewidth=0.9, zorder=1)
+            axes.axvline(
+                step * scene.dt,
+                color=MUTED,
+                linestyle=(0, (4, 3)),
+                linewidth=0.9,
+                zorder=1,
+            )
     limits = (start * scene.dt, (start + span) * scene.dt)
     axes.set(xlabel="time [s]", ylabel="steering command [rad]", xlim=limits)
-    axes.set_title(f"{literal(scene.label)}, first episode: steering around the hardest moment")
+    axes.set_title(
+        f"{literal(scene.label)}, first episode: steering around the hardest moment"
+    )
     axes.grid(visible=False, axis="x")
     legend(figure, axes)
     return figure

@@ -18,8 +18,11 @@ class Drive(NamedTuple):
     """The first episode of a line.
 
     Attributes:
-        line: who drove. dt: sampling period [s]. lateral: signed deviation of x_1 … x_T [m], left positive.
-        states: x_0 … x_T, beginning with x, y, yaw. envs: friction and wind [m/s] at every step.
+        line: who drove.
+        dt: sampling period [s].
+        lateral: signed deviation of x_1 … x_T [m], left positive.
+        states: x_0 … x_T, beginning with x, y, yaw.
+        envs: friction and wind [m/s] at every step.
         path: x, y, yaw, curvature of its points.
     """
 
@@ -31,30 +34,51 @@ class Drive(NamedTuple):
     path: Float[np.ndarray, "point column"] | None
 
 
-def drives(directory: Path, contest: Contest, scenario: str) -> tuple[list[Drive], list[str]]:
+def drives(
+    directory: Path, contest: Contest, scenario: str
+) -> tuple[list[Drive], list[str]]:
     """What was driven, and the names of those whose arrays are missing or hold no finite deviation."""
     lines = [line for line in contest.lines if scenario in line.rows]
     found = [_drive(directory, line, scenario) for line in lines]
-    return [one for one in found if one], [line.name for line, one in zip(lines, found, strict=True) if one is None]
+    return [one for one in found if one], [
+        line.name for line, one in zip(lines, found, strict=True) if one is None
+    ]
 
 
 def _drive(directory: Path, line: Line, scenario: str) -> Drive | None:
     file = _file(directory, line, scenario)
     arrays = read_arrays(file, kind=KIND)[0] if exists(file) else {}
-    first = {name: np.asarray(values[0], dtype=float) for name, values in arrays.items() if values.ndim and values.size}
+    first = {
+        name: np.asarray(values[0], dtype=float)
+        for name, values in arrays.items()
+        if values.ndim and values.size
+    }
     lateral = first.get("lateral")
     if lateral is None or not np.any(np.isfinite(lateral)):
         return None
     dt = float(arrays.get("dt", np.asarray(0.1)))
-    return Drive(line, dt, lateral, *(first.get(name) for name in ("states", "envs", "path")))
+    return Drive(
+        line, dt, lateral, *(first.get(name) for name in ("states", "envs", "path"))
+    )
 
 
 def _file(directory: Path, line: Line, scenario: str) -> Path:
     """Where a row says that its arrays lie, else where they lie by its identity."""
     row = line.rows[scenario]
     if isinstance(row.get("arrays"), str):
-        if PurePath(row["arrays"]).is_absolute() or ".." in PurePath(row["arrays"]).parts:
-            raise ArtefactError(f"{directory / 'results.json'}: arrays of a row lie outside this folder")
+        if (
+            PurePath(row["arrays"]).is_absolute()
+            or ".." in PurePath(row["arrays"]).parts
+        ):
+            raise ArtefactError(
+                f"{directory / 'results.json'}: arrays of a row lie outside this folder"
+            )
         return directory / row["arrays"]
-    place = directory / "cells" / str(row.get("vehicle")) / scenario / str(row.get("sampling") or "qp")
+    place = (
+        directory
+        / "cells"
+        / str(row.get("vehicle"))
+        / scenario
+        / str(row.get("sampling") or "qp")
+    )
     return place / f"{line.system}-{line.env}.npz"

@@ -9,18 +9,35 @@ from sfkd_jax.reporting._blocks import Block, Heading, Missing, Text, picture
 from sfkd_jax.reporting._driven import deviation, spread, steering
 from sfkd_jax.reporting._numbers import dig, is_number, short
 from sfkd_jax.reporting._scene import Scene, scenes_of
-from sfkd_jax.reporting._tables import block_title, closed_loop, closed_loop_more, planner_table, violation_table
+from sfkd_jax.reporting._tables import (
+    block_title,
+    closed_loop,
+    closed_loop_more,
+    planner_table,
+    violation_table,
+)
 from sfkd_jax.reporting._track import EXAGGERATION, track
 from sfkd_jax.reporting._violations import disturbed, violations
 from sfkd_jax.reporting._words import command, headline, paper_note, violation_words
 
 
-def driving(run: Path, rows: list[list[dict[str, Any]]], settings: dict[str, Any], place: Path) -> list[Block]:
+def driving(
+    run: Path, rows: list[list[dict[str, Any]]], settings: dict[str, Any], place: Path
+) -> list[Block]:
     """Closed loop: the table the summary speaks of, the pictures, then every other table."""
     blocks: list[Block] = [Heading(2, "How it drives")]
     head = headline(rows, settings)
-    if not head and dig(settings, "vehicle", "name") == "own" and not dig(settings, "vehicle", "step"):
-        return [*blocks, Text("Not driven: the robot is known from logs alone, so there is nothing here to drive.")]
+    if (
+        not head
+        and dig(settings, "vehicle", "name") == "own"
+        and not dig(settings, "vehicle", "step")
+    ):
+        return [
+            *blocks,
+            Text(
+                "Not driven: the robot is known from logs alone, so there is nothing here to drive."
+            ),
+        ]
     if head:
         blocks += [*_scores(head), Text(_EXPLAINED, kind="note")]
     else:
@@ -35,7 +52,11 @@ def driving(run: Path, rows: list[list[dict[str, Any]]], settings: dict[str, Any
     blocks += _planning(rows, settings)
     blocks += _violating(rows, place)
     more = [(block_title(block), closed_loop_more(block)) for block in rows]
-    shown = [[Text(title, kind="sub"), table] for title, table in more if len(table.header) > 1]
+    shown = [
+        [Text(title, kind="sub"), table]
+        for title, table in more
+        if len(table.header) > 1
+    ]
     return [
         *blocks,
         *([Heading(3, "More measures")] if shown else []),
@@ -65,10 +86,14 @@ def _scene_pictures(scene: Scene, place: Path, *, full: bool) -> list[Block]:
         "where friction and wind switch; below, what they are."
     )
     stem = scene.stem
-    blocks: list[Block] = [picture(place, f"deviation_{stem}", caption, deviation, scene)]
+    blocks: list[Block] = [
+        picture(place, f"deviation_{stem}", caption, deviation, scene)
+    ]
     if not full:
         return blocks
-    caption = f"{name}, all episodes: absolute lateral deviation over the whole duration."
+    caption = (
+        f"{name}, all episodes: absolute lateral deviation over the whole duration."
+    )
     blocks.append(picture(place, f"episodes_{stem}", caption, spread, scene))
     if scene.path is not None and scene.states:
         caption = (
@@ -82,13 +107,23 @@ def _scene_pictures(scene: Scene, place: Path, *, full: bool) -> list[Block]:
     return blocks
 
 
-def _planning(rows: list[list[dict[str, Any]]], settings: dict[str, Any]) -> list[Block]:
+def _planning(
+    rows: list[list[dict[str, Any]]], settings: dict[str, Any]
+) -> list[Block]:
     """Effective sample size and solve times, where any was measured."""
     tables = [(block_title(block), planner_table(block)) for block in rows]
-    shown = [[Text(title, kind="sub"), table] for title, table in tables if len(table.header) > 1]
+    shown = [
+        [Text(title, kind="sub"), table]
+        for title, table in tables
+        if len(table.header) > 1
+    ]
     said = [Text(_planner_words(settings), kind="note")] if shown else []
     return [
-        *([Heading(3, "Planner: effective sample size and solve time")] if shown else []),
+        *(
+            [Heading(3, "Planner: effective sample size and solve time")]
+            if shown
+            else []
+        ),
         *(piece for pair in shown for piece in pair),
         *said,
     ]
@@ -97,21 +132,41 @@ def _planning(rows: list[list[dict[str, Any]]], settings: dict[str, Any]) -> lis
 def _planner_words(settings: dict[str, Any]) -> str:
     """What the effective sample size and the solve times are of."""
     search = dig(settings, "controller", "planner") or "mppi"
-    drawn, ahead = (dig(settings, "controller", search, key) for key in ("num_samples", "horizon"))
+    drawn, ahead = (
+        dig(settings, "controller", search, key) for key in ("num_samples", "horizon")
+    )
     period = dig(settings, "vehicle", "dt")
     text = "Effective samples: 1 / Σ w² of the weights that the planner gives its samples, median over all steps"
-    text += f"; it draws {short(drawn)} over {short(ahead)} steps" if is_number(drawn) and is_number(ahead) else ""
+    text += (
+        f"; it draws {short(drawn)} over {short(ahead)} steps"
+        if is_number(drawn) and is_number(ahead)
+        else ""
+    )
     text += ". Control step: everything from observation to control for one car, compiled, on the machine that drove"
-    return text + (f"; a new control is due every {short(1e3 * period)} ms." if is_number(period) else ".")
+    return text + (
+        f"; a new control is due every {short(1e3 * period)} ms."
+        if is_number(period)
+        else "."
+    )
 
 
 def _violating(rows: list[list[dict[str, Any]]], place: Path) -> list[Block]:
     """How often predictions left what is claimed about them, and Figure 2 where side forces were injected."""
     blocks: list[Block] = []
-    measured = [block for block in rows if any(is_number(dig(row, "violation", "segments")) for row in block)]
-    figures = (f"figure2{suffix}" for suffix in ["", *(f"_{count}" for count in range(2, len(rows) + 1))])
+    measured = [
+        block
+        for block in rows
+        if any(is_number(dig(row, "violation", "segments")) for row in block)
+    ]
+    figures = (
+        f"figure2{suffix}"
+        for suffix in ["", *(f"_{count}" for count in range(2, len(rows) + 1))]
+    )
     for block in measured:
-        blocks += [Heading(3, f"Violations: {block_title(block)}"), violation_table(block)]
+        blocks += [
+            Heading(3, f"Violations: {block_title(block)}"),
+            violation_table(block),
+        ]
         pushed = disturbed(block)
         if pushed:
             blocks.append(picture(place, next(figures), _FIGURE2, violations, pushed))

@@ -13,9 +13,14 @@ def read(path: Path) -> dict[str, Any] | None:
     return read_json(path) if path.exists() else None
 
 
-def about(policy: dict[str, Any], certificate: dict[str, Any] | None) -> dict[str, Any] | None:
+def about(
+    policy: dict[str, Any], certificate: dict[str, Any] | None
+) -> dict[str, Any] | None:
     """The certificate, or a refusal if it names other weights than the policy's manifest."""
     mine, named = policy.get("sha256"), (certificate or {}).get("weights_sha256")
     if mine and named and mine != named:
-        return {"valid": False, "reason": "the certificate in this run is about other weights"}
+        return {
+            "valid": False,
+            "reason": "the certificate in this run is about other weights",
+        }
     return certificate

@@ -71,7 +71,10 @@ def reach(film: Film, last: int) -> float:
     """Largest deviation up to a step of the cars that stay in their lanes, and of the corridor [m]."""
     shown = [car.lateral[:last] for car in film.cars]
     stay = [values for values in shown if until(values, LANE) == len(values)]
-    known = [film.corridor or 0.0, *(float(np.max(np.abs(values), initial=0.0)) for values in stay)]
+    known = [
+        film.corridor or 0.0,
+        *(float(np.max(np.abs(values), initial=0.0)) for values in stay),
+    ]
     return max(known) or LANE
 
 
@@ -82,19 +85,36 @@ def widening(film: Film, last: int) -> int:
 
 def strip(axes: Any, film: Film, last: int) -> Move:
     """Draw the deviation over time."""
-    shown, top = [car.lateral[:last] for car in film.cars], 1.1 * max(1e-3, reach(film, last))
+    shown, top = (
+        [car.lateral[:last] for car in film.cars],
+        1.1 * max(1e-3, reach(film, last)),
+    )
     if film.envs is not None:
         edges = [0, *(step for step in switches(film.envs) if step < last), last]
         for start, stop in pairwise(edges):
-            axes.axvspan(start * film.dt, stop * film.dt, color=shade(film.envs[start, 0]), linewidth=0, zorder=0)
+            axes.axvspan(
+                start * film.dt,
+                stop * film.dt,
+                color=shade(film.envs[start, 0]),
+                linewidth=0,
+                zorder=0,
+            )
     if film.corridor:
         top *= 1.35
         axes.axhspan(-film.corridor, film.corridor, **BAND)
         for side in (-film.corridor, film.corridor):
             axes.axhline(side, **BAND_EDGE)
-        words: dict[str, Any] = {"fontsize": 8.5, "color": ACCENT, "va": "bottom", "ha": "right", "zorder": 6}
+        words: dict[str, Any] = {
+            "fontsize": 8.5,
+            "color": ACCENT,
+            "va": "bottom",
+            "ha": "right",
+            "zorder": 6,
+        }
         name = f"certified corridor ± {number(film.corridor)} m"
-        axes.text(0.99, film.corridor, name, transform=axes.get_yaxis_transform(), **words)
+        axes.text(
+            0.99, film.corridor, name, transform=axes.get_yaxis_transform(), **words
+        )
     axes.axhline(0.0, color="#9aa1ab", linewidth=0.8)
     lines = [axes.plot([], [], color=car.colour, linewidth=1.8)[0] for car in film.cars]
     now = axes.axvline(0.0, color="#57606a", linewidth=0.8)

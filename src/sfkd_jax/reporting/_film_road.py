@@ -9,7 +9,17 @@ import numpy as np
 from matplotlib.patches import Polygon
 
 from sfkd_jax.reporting._benchmark_figures import conditions, shade
-from sfkd_jax.reporting._film import BAND, BAND_EDGE, HALF_LANE, LANE, Car, Film, Move, until, widening
+from sfkd_jax.reporting._film import (
+    BAND,
+    BAND_EDGE,
+    HALF_LANE,
+    LANE,
+    Car,
+    Film,
+    Move,
+    until,
+    widening,
+)
 from sfkd_jax.reporting._style import PLATE, literal
 from sfkd_jax.reporting._track import _projected, _widened
 
@@ -18,7 +28,9 @@ _SPACING = 7.6  # between two copies of the road [m]
 _ROOM = 2.6  # below the last copy, where its car leaves it [m]
 _NAMED = 2.8  # how far from the middle of a copy a name goes with its car [m]
 _TRAIL = 20  # steps
-_CAR = np.array([[2.4, 0.0], [1.8, 0.85], [-2.2, 0.85], [-2.2, -0.85], [1.8, -0.85]]).T  # nose to tail [m]
+_CAR = np.array(
+    [[2.4, 0.0], [1.8, 0.85], [-2.2, 0.85], [-2.2, -0.85], [1.8, -0.85]]
+).T  # nose to tail [m]
 _EDGE: dict[str, Any] = {"color": "#aab1ba", "linewidth": 1.3, "zorder": 2}
 _MIDDLE = _EDGE | {"linewidth": 0.9, "linestyle": (0, (6, 5))}
 
@@ -33,7 +45,9 @@ class _View(NamedTuple):
 
     def of(self, points: np.ndarray, offset: np.ndarray, shift: float) -> np.ndarray:
         """Positions left of path points on a copy of the road, (2, point)."""
-        return self.turn @ (_widened(points, offset, 1) - self.origin) + np.array([[0.0], [shift]])
+        return self.turn @ (_widened(points, offset, 1) - self.origin) + np.array(
+            [[0.0], [shift]]
+        )
 
 
 _Part: TypeAlias = Callable[[int, _View], None]
@@ -50,15 +64,24 @@ def road(axes: Any, film: Film, last: int) -> Move:
     factor, path = widening(film, last), np.asarray(film.points)
     shifts = _SPACING * np.arange(len(film.cars) - 1, -1, -1.0)
     places = [_projected(np.asarray(car.states)[:, :2], path) for car in film.cars]
-    parts: list[_Part] = [_lanes(axes, path, factor * (film.corridor or 0.0), shift) for shift in shifts]
+    parts: list[_Part] = [
+        _lanes(axes, path, factor * (film.corridor or 0.0), shift) for shift in shifts
+    ]
     for car, (near, offset), shift in zip(film.cars, places, shifts, strict=True):
         left = until(offset, LANE)
         parting = left, f"left its lane ({LANE} m) at {left * film.dt:.1f} s"
         parts.append(_car(axes, car, (path[near], factor * offset), shift, parting))
     axes.set(xlim=(-_BEHIND, _AHEAD), ylim=extent(film), xticks=[], yticks=[])
     axes.set_aspect("equal")
-    axes.set_title(f"{literal(film.title)}, deviations × {factor}", fontsize=9.5, loc="right", pad=4)
-    parts += [_weather(axes, film.envs, 0.5 * shifts[0])] if film.envs is not None else []
+    axes.set_title(
+        f"{literal(film.title)}, deviations × {factor}",
+        fontsize=9.5,
+        loc="right",
+        pad=4,
+    )
+    parts += (
+        [_weather(axes, film.envs, 0.5 * shifts[0])] if film.envs is not None else []
+    )
 
     def move(step: int) -> None:
         centre = int(places[0][0][step + 1])
@@ -80,7 +103,9 @@ def _lanes(axes: Any, path: np.ndarray, half: float, shift: float) -> _Part:
 
     def move(_: int, view: _View) -> None:
         points = path[max(view.point - 120, 0) : view.point + 160]
-        drawn = {side: view.of(points, np.full(len(points), side), shift) for side in lines}
+        drawn = {
+            side: view.of(points, np.full(len(points), side), shift) for side in lines
+        }
         for side, line in lines.items():
             line.set_data(*drawn[side])
         if half:
@@ -89,7 +114,13 @@ def _lanes(axes: Any, path: np.ndarray, half: float, shift: float) -> _Part:
     return move
 
 
-def _car(axes: Any, car: Car, drawn: tuple[np.ndarray, np.ndarray], shift: float, parting: tuple[int, str]) -> _Part:
+def _car(
+    axes: Any,
+    car: Car,
+    drawn: tuple[np.ndarray, np.ndarray],
+    shift: float,
+    parting: tuple[int, str],
+) -> _Part:
     """A car, its trail and its name, until it is as far away as the next copy.
 
     Args:
@@ -98,10 +129,22 @@ def _car(axes: Any, car: Car, drawn: tuple[np.ndarray, np.ndarray], shift: float
         parting: from which step on it has left its lane, and the words that say so.
     """
     (points, offset), states = drawn, np.asarray(car.states)
-    shape = axes.add_patch(Polygon(_CAR.T, facecolor=car.colour, edgecolor="#30363d", linewidth=0.8, zorder=6))
+    shape = axes.add_patch(
+        Polygon(
+            _CAR.T, facecolor=car.colour, edgecolor="#30363d", linewidth=0.8, zorder=6
+        )
+    )
     trail = axes.plot([], [], color=car.colour, linewidth=1.8, zorder=4)[0]
-    words: dict[str, Any] = {"color": car.colour, "fontsize": 10, "fontweight": "bold", "va": "center", "zorder": 8}
-    name = axes.text(3.2, shift, literal(car.name), bbox=PLATE | {"alpha": 0.75}, **words)
+    words: dict[str, Any] = {
+        "color": car.colour,
+        "fontsize": 10,
+        "fontweight": "bold",
+        "va": "center",
+        "zorder": 8,
+    }
+    name = axes.text(
+        3.2, shift, literal(car.name), bbox=PLATE | {"alpha": 0.75}, **words
+    )
     seen = until(offset, _SPACING)
 
     def move(step: int, view: _View) -> None:
@@ -112,7 +155,9 @@ def _car(axes: Any, car: Car, drawn: tuple[np.ndarray, np.ndarray], shift: float
         if now < seen:
             place = view.of(points[now : now + 1], offset[now : now + 1], shift)
             yaw = states[now, 2] - view.yaw
-            rotation = np.array([[np.cos(yaw), -np.sin(yaw)], [np.sin(yaw), np.cos(yaw)]])
+            rotation = np.array(
+                [[np.cos(yaw), -np.sin(yaw)], [np.sin(yaw), np.cos(yaw)]]
+            )
             shape.set_xy((rotation @ _CAR + place).T)
             name.set_y(np.clip(place[1, 0], shift - _NAMED, shift + _NAMED))
         if now >= parting[0]:

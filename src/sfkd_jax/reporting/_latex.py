@@ -5,7 +5,14 @@ from __future__ import annotations
 from collections.abc import Callable
 from typing import Any, NamedTuple
 
-from sfkd_jax.reporting._benchmark_rows import SELF_EVIDENT, Contest, Line, scenarios, stem, title
+from sfkd_jax.reporting._benchmark_rows import (
+    SELF_EVIDENT,
+    Contest,
+    Line,
+    scenarios,
+    stem,
+    title,
+)
 from sfkd_jax.reporting._benchmark_tables import Paper, conformal, millimetres, percent
 from sfkd_jax.reporting._numbers import DASH, dig, is_number, number
 from sfkd_jax.reporting._style import scenario_label
@@ -63,11 +70,20 @@ def _tabular(contest: Contest, paper: Paper) -> str:
     columns = _columns(contest, paper)
     groups = list(dict.fromkeys(column.group for column in columns))
     spans = [sum(column.group == group for column in columns) for group in groups]
-    above = [rf"\multicolumn{{{span}}}{{c}}{{{_escaped(group)}}}" for group, span in zip(groups, spans, strict=True)]
+    above = [
+        rf"\multicolumn{{{span}}}{{c}}{{{_escaped(group)}}}"
+        for group, span in zip(groups, spans, strict=True)
+    ]
     edges = [2 + sum(spans[:place]) for place in range(len(spans))]
-    rules = [rf"\cmidrule(lr){{{edge}-{edge + span - 1}}}" for edge, span in zip(edges, spans, strict=True)]
+    rules = [
+        rf"\cmidrule(lr){{{edge}-{edge + span - 1}}}"
+        for edge, span in zip(edges, spans, strict=True)
+    ]
     shown = [_cells(contest, column) for column in columns]
-    body = [[_escaped(line.name), *cells] for line, *cells in zip(contest.lines, *shown, strict=True)]
+    body = [
+        [_escaped(line.name), *cells]
+        for line, *cells in zip(contest.lines, *shown, strict=True)
+    ]
     lines = [
         rf"\begin{{tabular}}{{l{'r' * len(columns)}}}",
         r"\toprule",
@@ -86,15 +102,30 @@ def _columns(contest: Contest, paper: Paper) -> list[_Column]:
     columns = []
     for name in scenarios(contest):
         group = f"{scenario_label(name)} RMSE [mm]"
-        columns.append(_Column(group, "ours", _spread(name), _of(name, "rmse_m", "mean")))
+        columns.append(
+            _Column(group, "ours", _spread(name), _of(name, "rmse_m", "mean"))
+        )
         if any(f"rmse_{name}_m" in row for row in paper.values()):
-            columns.append(_Column(group, "paper", _printed(paper, f"rmse_{name}_m", lambda x: millimetres(x, 0))))
+            columns.append(
+                _Column(
+                    group,
+                    "paper",
+                    _printed(paper, f"rmse_{name}_m", lambda x: millimetres(x, 0)),
+                )
+            )
     hardest = scenarios(contest)[-1]
     rate, violated = "smoothness_rad_per_s", _of(hardest, "violation", "v2")
     columns += [
-        _Column("Rate [rad/s]", "ours", lambda line: number(_of(hardest, rate)(line)), _of(hardest, rate)),
+        _Column(
+            "Rate [rad/s]",
+            "ours",
+            lambda line: number(_of(hardest, rate)(line)),
+            _of(hardest, rate),
+        ),
         _Column("Rate [rad/s]", "paper", _printed(paper, rate, number)),
-        _Column("Violations [%]", "V1", lambda line: percent(_conformal(line, hardest))),
+        _Column(
+            "Violations [%]", "V1", lambda line: percent(_conformal(line, hardest))
+        ),
         _Column("Violations [%]", "V2", lambda line: percent(violated(line)), violated),
         _Column("Violations [%]", "paper", _printed(paper, "violation_rate", percent)),
     ]
@@ -107,10 +138,20 @@ def _cells(contest: Contest, column: _Column) -> list[str]:
     if value is None:
         return [_escaped(text) for text in shown]
     pairs = list(zip(contest.lines, shown, strict=True))
-    learned = [(value(line), text) for line, text in pairs if _learned(line) and is_number(value(line))]
+    learned = [
+        (value(line), text)
+        for line, text in pairs
+        if _learned(line) and is_number(value(line))
+    ]
     best = min(learned, default=(None, DASH))[1].split(" ±")[0]
-    bold = [_learned(line) and text != DASH and text.split(" ±")[0] == best for line, text in pairs]
-    return [rf"\textbf{{{_escaped(text)}}}" if mark else _escaped(text) for text, mark in zip(shown, bold, strict=True)]
+    bold = [
+        _learned(line) and text != DASH and text.split(" ±")[0] == best
+        for line, text in pairs
+    ]
+    return [
+        rf"\textbf{{{_escaped(text)}}}" if mark else _escaped(text)
+        for text, mark in zip(shown, bold, strict=True)
+    ]
 
 
 def _learned(line: Line) -> bool:
@@ -128,12 +169,18 @@ def _conformal(line: Line, scenario: str) -> Any:
 def _spread(scenario: str) -> Callable[[Line], str]:
     def show(line: Line) -> str:
         mean, std = (_of(scenario, "rmse_m", key)(line) for key in ("mean", "std"))
-        return f"{millimetres(mean)} ± {millimetres(std)}" if is_number(mean) and is_number(std) else millimetres(mean)
+        return (
+            f"{millimetres(mean)} ± {millimetres(std)}"
+            if is_number(mean) and is_number(std)
+            else millimetres(mean)
+        )
 
     return show
 
 
-def _printed(paper: Paper, key: str, show: Callable[[Any], str]) -> Callable[[Line], str]:
+def _printed(
+    paper: Paper, key: str, show: Callable[[Any], str]
+) -> Callable[[Line], str]:
     return lambda line: show(dig(paper.get(line.system), key))
 
 

@@ -18,7 +18,11 @@ def dig(record: Any, *keys: str) -> Any:
 
 def is_number(value: Any) -> bool:
     """Whether a JSON value is a finite number."""
-    return isinstance(value, int | float) and not isinstance(value, bool) and math.isfinite(value)
+    return (
+        isinstance(value, int | float)
+        and not isinstance(value, bool)
+        and math.isfinite(value)
+    )
 
 
 def number(value: Any, digits: int = 3) -> str:
@@ -31,7 +35,9 @@ def short(value: Any, digits: int = 3) -> str:
     """A number to so many significant digits; whole numbers in full."""
     if not is_number(value):
         return DASH
-    return (str(value) if isinstance(value, int) else f"{value:.{digits}g}").replace("-", "−")
+    return (str(value) if isinstance(value, int) else f"{value:.{digits}g}").replace(
+        "-", "−"
+    )
 
 
 def upper(value: Any, digits: int = 4) -> str:
@@ -40,12 +46,20 @@ def upper(value: Any, digits: int = 4) -> str:
         return DASH
     exact = Decimal(repr(float(value)))
     rounded = Context(prec=digits, rounding=ROUND_CEILING).create_decimal(exact)
-    return upper(value, digits + 1) if exact < 1 <= rounded and digits < 15 else short(float(rounded), digits)
+    return (
+        upper(value, digits + 1)
+        if exact < 1 <= rounded and digits < 15
+        else short(float(rounded), digits)
+    )
 
 
 def interval(bounds: Any, digits: int = 3) -> str:
     """Two bounds as "low to high"."""
-    if not isinstance(bounds, list | tuple) or len(bounds) != 2 or not all(map(is_number, bounds)):
+    if (
+        not isinstance(bounds, list | tuple)
+        or len(bounds) != 2
+        or not all(map(is_number, bounds))
+    ):
         return DASH
     return f"{number(bounds[0], digits)} to {number(bounds[1], digits)}"
 
@@ -53,7 +67,11 @@ def interval(bounds: Any, digits: int = 3) -> str:
 def mean_std(measure: Any, digits: int = 3) -> str:
     """Mean ± standard deviation."""
     mean, std = dig(measure, "mean"), dig(measure, "std")
-    return f"{number(mean, digits)} ± {number(std, digits)}" if is_number(std) else number(mean, digits)
+    return (
+        f"{number(mean, digits)} ± {number(std, digits)}"
+        if is_number(std)
+        else number(mean, digits)
+    )
 
 
 def plain(value: Any) -> str:
@@ -66,7 +84,10 @@ def plain(value: Any) -> str:
         case int() | float():
             return short(value, 6)
         case dict():
-            parts = [f"{key} ({plain(v)})" if isinstance(v, dict) else f"{key} {plain(v)}" for key, v in value.items()]
+            parts = [
+                f"{key} ({plain(v)})" if isinstance(v, dict) else f"{key} {plain(v)}"
+                for key, v in value.items()
+            ]
             return "; ".join(parts) or DASH
         case list() | tuple():
             shown = ", ".join(plain(entry) for entry in value[:12])

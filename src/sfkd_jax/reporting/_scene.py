@@ -18,10 +18,14 @@ class Scene(NamedTuple):
     """One scenario as it was driven in one way; only the first episode's tracks are kept.
 
     Attributes:
-        name: of the scenario. dt: sampling period [s].
-        envs: friction, wind of the first episode, (time, 2). path: x, y, yaw, curvature of it, (point, 4).
-        lateral: by system, signed deviation of x_1 … x_T [m], left positive, (episode, time).
-        states: by system, (time + 1, state). controls: by system, (time, control).
+        name: of the scenario.
+        dt: sampling period [s].
+        envs: friction, wind of the first episode, (time, 2).
+        path: x, y, yaw, curvature of it, (point, 4).
+        lateral: by system, signed deviation of x_1 … x_T [m], left positive, (episode,
+            time).
+        states: by system, (time + 1, state).
+        controls: by system, (time, control).
     """
 
     name: str
@@ -60,7 +64,10 @@ def switches(envs: Float[np.ndarray, "time 2"] | None) -> list[int]:
 
 def hardest_step(scene: Scene) -> int:
     """The step of the first episode at which nominal (else whoever strays most) is furthest from its path."""
-    rows = {name: np.nan_to_num(np.abs(values[0]), nan=0.0) for name, values in scene.lateral.items()}
+    rows = {
+        name: np.nan_to_num(np.abs(values[0]), nan=0.0)
+        for name, values in scene.lateral.items()
+    }
     row = rows.get("nominal", max(rows.values(), key=np.max))
     return int(np.argmax(row))
 
@@ -87,8 +94,14 @@ def read_scenes(path: Path) -> list[Scene]:
     for name, mine in parts.items():
         about = drive_of(name)
         if mine.get("lateral", np.zeros(0)).size:
-            shared = parts.get(about.get("scenario", ""), {})  # an earlier version kept one road a scenario
-            road = {part: values[0] for part, values in (shared | mine).items() if part in ROAD and len(values)}
+            shared = parts.get(
+                about.get("scenario", ""), {}
+            )  # an earlier version kept one road a scenario
+            road = {
+                part: values[0]
+                for part, values in (shared | mine).items()
+                if part in ROAD and len(values)
+            }
             same_road = tuple((part, road[part].tobytes()) for part in sorted(road))
             way = tuple(about.get(key) for key in SHARED)
             together.setdefault((way, same_road), []).append(_Drive(about, mine, road))
@@ -97,7 +110,9 @@ def read_scenes(path: Path) -> list[Scene]:
     seen: Counter[str] = Counter()
     found = []
     usual = search_words({"sampling": "feedback"})
-    for scene in sorted(scenes, key=lambda scene: (scene.name, scene.way != usual, scene.way)):
+    for scene in sorted(
+        scenes, key=lambda scene: (scene.name, scene.way != usual, scene.way)
+    ):
         seen[scene.name] += 1
         way = scene.way if counts[scene.name] > 1 else ""
         found.append(scene._replace(way=way, number=seen[scene.name]))
@@ -117,11 +132,24 @@ def _scene(drives: list[_Drive], dt: float) -> Scene:
     drives = sorted(drives, key=lambda drive: drive.about.get("env") != "measured")
     lateral, states, controls = {}, {}, {}
     for about, parts, _ in drives:
-        system = about["system"] if about["system"] not in lateral else f"{about['system']} (e {about.get('env')})"
+        system = (
+            about["system"]
+            if about["system"] not in lateral
+            else f"{about['system']} (e {about.get('env')})"
+        )
         lateral[system] = parts["lateral"]
         for kind, kept in (("states", states), ("controls", controls)):
             if parts.get(kind, np.zeros(0)).size:
                 kept[system] = parts[kind][0]
     about, _, road = drives[0]
     way = search_words(about)
-    return Scene(about["scenario"], dt, road.get("envs"), road.get("path"), lateral, states, controls, way)
+    return Scene(
+        about["scenario"],
+        dt,
+        road.get("envs"),
+        road.get("path"),
+        lateral,
+        states,
+        controls,
+        way,
+    )

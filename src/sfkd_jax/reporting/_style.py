@@ -11,7 +11,8 @@ import matplotlib
 from matplotlib.figure import Figure
 
 SYSTEMS: dict[str, tuple[str, str, Any, float]] = {
-    # name in the artefacts: (label, colour, dash pattern, line width); the order is the order in every table
+    # name in the artefacts: (label, colour, dash pattern, line width); the order is the
+    # order in every table
     "sfkd": ("SFKD", "#0b57b0", "-", 2.0),
     "sfkd_no_fiber": ("SFKD − fiber", "#5b9bd5", (0, (4, 1.5)), 1.2),
     "sfkd_no_transport": ("SFKD − transport", "#7fb2a8", (0, (4, 1.5)), 1.2),
@@ -31,9 +32,17 @@ SYSTEMS: dict[str, tuple[str, str, Any, float]] = {
     "oracle": ("Oracle", "#3c3c3c", (0, (3, 1.2)), 1.4),
     "law": ("Law alone", "#a0522d", (0, (1.5, 1)), 1.3),
 }
-"""One colour and one dash per system, everywhere (after Okabe and Ito, and Tol: colour-blind safe)."""
+"""One colour and one dash per system, everywhere (after Okabe and Ito, and Tol:
+colour-blind safe).
+"""
 
-ACCENT, SECOND, THIRD, MUTED, GRID = "#0b57b0", "#e8a33d", "#009e73", "#6b7280", "#e3e6ea"
+ACCENT, SECOND, THIRD, MUTED, GRID = (
+    "#0b57b0",
+    "#e8a33d",
+    "#009e73",
+    "#6b7280",
+    "#e3e6ea",
+)
 LEAVES = "#c2410c"
 """Of a car that leaves its lane."""
 PLATE = {"facecolor": "white", "edgecolor": "none", "pad": 1.5}
@@ -149,9 +158,17 @@ def literal(text: str) -> str:
 
 def line(system: str) -> dict[str, Any]:
     """Keyword arguments of the line that stands for a system in every figure."""
-    name, colour, dashes, width = SYSTEMS.get(family(system), (system, MUTED, (0, (1, 1)), 1.2))
+    name, colour, dashes, width = SYSTEMS.get(
+        family(system), (system, MUTED, (0, (1, 1)), 1.2)
+    )
     top = {"sfkd": 5, "oracle": 4}.get(family(system), 3)
-    return {"label": literal(name), "color": colour, "linestyle": dashes, "linewidth": width, "zorder": top}
+    return {
+        "label": literal(name),
+        "color": colour,
+        "linestyle": dashes,
+        "linewidth": width,
+        "zorder": top,
+    }
 
 
 def canvas(height: float) -> Figure:
@@ -163,14 +180,23 @@ def legend(figure: Figure, axes: Any) -> None:
     """Put one legend for the whole figure above it, and make the figure higher by the rows that it takes."""
     handles, labels = axes.get_legend_handles_labels()
     columns, size = (max(1, len(labels)), 9.5) if len(labels) <= 5 else (4, 9.0)
-    figure.legend(handles, labels, loc="outside upper left", ncols=columns, columnspacing=1.4, fontsize=size)
+    figure.legend(
+        handles,
+        labels,
+        loc="outside upper left",
+        ncols=columns,
+        columnspacing=1.4,
+        fontsize=size,
+    )
     figure.set_figheight(figure.get_figheight() + 0.2 * ((len(labels) - 1) // columns))
 
 
 def principal(systems: Iterable[str]) -> list[str]:
     """The few systems to single out where all would be too many: SFKD, nominal and oracle, else the first."""
     names = ordered(systems)
-    return [name for name in names if name in ("sfkd", "nominal", "oracle")] or names[:3]
+    return [name for name in names if name in ("sfkd", "nominal", "oracle")] or names[
+        :3
+    ]
 
 
 def save(path: Path, draw: Callable[..., Figure], *inputs: Any) -> Path:

@@ -8,11 +8,23 @@ from typing import Any
 from sfkd_jax.reporting._benchmark_rows import name_of, search_words
 from sfkd_jax.reporting._benchmark_tables import certified, percent
 from sfkd_jax.reporting._blocks import Table
-from sfkd_jax.reporting._numbers import DASH, dig, interval, is_number, mean_std, number, plain, short, upper
+from sfkd_jax.reporting._numbers import (
+    DASH,
+    dig,
+    interval,
+    is_number,
+    mean_std,
+    number,
+    plain,
+    short,
+    upper,
+)
 from sfkd_jax.reporting._style import ordered, scenario_label
 
 PAPER_RMSE_M = {"s2": (0.098, 0.014), "s3": (0.120, 0.018)}
-"""Mean and standard deviation that the paper reports for SFKD, by scenario; its simulator is another one."""
+"""Mean and standard deviation that the paper reports for SFKD, by scenario; its
+simulator is another one.
+"""
 
 _SEES = {"measured": "measured", "estimated": "estimated", "none": "no"}
 
@@ -20,17 +32,32 @@ _SEES = {"measured": "measured", "estimated": "estimated", "none": "no"}
 def blocks_of(rows: list[dict[str, Any]]) -> list[list[dict[str, Any]]]:
     """Closed-loop rows that may be compared: one list per scenario, vehicle, sampling, controller and planner.
 
-    A row without sampling (its controller draws none) stands in every block of its scenario and vehicle.
+    A row without sampling (its controller draws none) stands in every block of its
+    scenario and vehicle.
     """
     where = ("scenario", "vehicle", "inner_loop")
     places = sorted({tuple(str(row.get(key)) for key in where) for row in rows})
     found = []
     for place in places:
-        here = [row for row in rows if tuple(str(row.get(key)) for key in where) == place]
-        kinds = {(row["sampling"], search_words(row)) for row in here if row.get("sampling")}
+        here = [
+            row for row in rows if tuple(str(row.get(key)) for key in where) == place
+        ]
+        kinds = {
+            (row["sampling"], search_words(row)) for row in here if row.get("sampling")
+        }
         for kind in sorted(kinds) or [None]:
-            block = [row for row in here if not row.get("sampling") or (row["sampling"], search_words(row)) == kind]
-            rank = {name: index for index, name in enumerate(ordered({str(r.get("system")) for r in block}))}
+            block = [
+                row
+                for row in here
+                if not row.get("sampling")
+                or (row["sampling"], search_words(row)) == kind
+            ]
+            rank = {
+                name: index
+                for index, name in enumerate(
+                    ordered({str(r.get("system")) for r in block})
+                )
+            }
             found.append(sorted(block, key=lambda row: rank[str(row.get("system"))]))
     return found
 
@@ -46,7 +73,11 @@ def block_title(block: list[dict[str, Any]]) -> str:
     if way:
         parts.append(way)
     if is_number(row.get("episodes")):
-        length = f" of {short(row['episode_s'])} s" if is_number(row.get("episode_s")) else ""
+        length = (
+            f" of {short(row['episode_s'])} s"
+            if is_number(row.get("episode_s"))
+            else ""
+        )
         parts.append(f"{short(row['episodes'])} episodes{length}")
     return ", ".join(parts)
 
@@ -66,8 +97,12 @@ _MORE: dict[str, Callable[[dict[str, Any]], str]] = {
     "Median\n[m]": lambda row: number(dig(row, "rmse_m", "median")),
     "95th perc.\n[m]": lambda row: number(dig(row, "rmse_m", "p95")),
     "After a\nswitch [m]": lambda row: number(row.get("rmse_after_switch_m")),
-    "RMSE minus\nSFKD [m]": lambda row: number(dig(row, "difference_to_sfkd", "mean"), 4),
-    "its 95 %\ninterval [m]": lambda row: interval(dig(row, "difference_to_sfkd", "ci95"), 4),
+    "RMSE minus\nSFKD [m]": lambda row: number(
+        dig(row, "difference_to_sfkd", "mean"), 4
+    ),
+    "its 95 %\ninterval [m]": lambda row: interval(
+        dig(row, "difference_to_sfkd", "ci95"), 4
+    ),
     "Left the\nlane": lambda row: short(row.get("departures")),
     "Parameters": lambda row: short(row.get("params")),
 }
@@ -96,10 +131,18 @@ def planner_table(block: list[dict[str, Any]]) -> Table:
     return _measured(_PLANNER, block)
 
 
-def _measured(columns: dict[str, Callable[[dict[str, Any]], str]], block: list[dict[str, Any]]) -> Table:
+def _measured(
+    columns: dict[str, Callable[[dict[str, Any]], str]], block: list[dict[str, Any]]
+) -> Table:
     """A table in which a measure that no row has gets no column."""
-    known = {name for name, cell in columns.items() if name == "System" or any(cell(row) != DASH for row in block)}
-    return _table({name: cell for name, cell in columns.items() if name in known}, block)
+    known = {
+        name
+        for name, cell in columns.items()
+        if name == "System" or any(cell(row) != DASH for row in block)
+    }
+    return _table(
+        {name: cell for name, cell in columns.items() if name in known}, block
+    )
 
 
 def violation_table(block: list[dict[str, Any]]) -> Table:
@@ -109,16 +152,26 @@ def violation_table(block: list[dict[str, Any]]) -> Table:
         "V0, theorem\n[%]": lambda row: percent(dig(row, "violation", "v0")),
         "V1, certified\ntube [%]": lambda row: percent(certified(row, "v1")),
         "its mean\nradius [m]": lambda row: number(certified(row, "v1_radius_m")),
-        "V1, conformal\ntube [%]": lambda row: percent(dig(row, "violation", "v1_conformal")),
-        "mean radius\nof that [m]": lambda row: number(dig(row, "violation", "v1_conformal_radius_m")),
+        "V1, conformal\ntube [%]": lambda row: percent(
+            dig(row, "violation", "v1_conformal")
+        ),
+        "mean radius\nof that [m]": lambda row: number(
+            dig(row, "violation", "v1_conformal_radius_m")
+        ),
         "V2, threshold\n[%]": lambda row: percent(dig(row, "violation", "v2")),
     }
     return _table(columns, block)
 
 
-def _table(columns: dict[str, Callable[[dict[str, Any]], str]], block: list[dict[str, Any]]) -> Table:
+def _table(
+    columns: dict[str, Callable[[dict[str, Any]], str]], block: list[dict[str, Any]]
+) -> Table:
     strong = tuple(place for place, row in enumerate(block) if name_of(row) == "SFKD")
-    return Table(list(columns), [[cell(row) for cell in columns.values()] for row in block], strong)
+    return Table(
+        list(columns),
+        [[cell(row) for cell in columns.values()] for row in block],
+        strong,
+    )
 
 
 def open_loop_table(errors: dict[str, Any]) -> Table:
@@ -137,8 +190,17 @@ def open_loop_table(errors: dict[str, Any]) -> Table:
             continue
         place = steps.index(step)
         columns = [errors.get(key) or [] for key in keys.values()]
-        cells = [number(values[place], 4) if place < len(values) else DASH for values in columns]
-        rows.append([str(step), number(step * errors["dt"] if is_number(errors.get("dt")) else None, 1), *cells])
+        cells = [
+            number(values[place], 4) if place < len(values) else DASH
+            for values in columns
+        ]
+        rows.append(
+            [
+                str(step),
+                number(step * errors["dt"] if is_number(errors.get("dt")) else None, 1),
+                *cells,
+            ]
+        )
     return Table(["Steps\nahead", "Seconds\nahead", *keys], rows)
 
 
@@ -173,9 +235,21 @@ _UNITS = {"position_m": "position [m]", "yaw_rad": "yaw [rad]", "body": "body st
 
 def _physical(tube: Any) -> str:
     """The last radius of each physical quantity."""
-    parts = {"": tube} if isinstance(tube, list) else tube if isinstance(tube, dict) else {}
-    last = [(name, radii[-1]) for name, radii in parts.items() if isinstance(radii, list) and radii]
-    return "; ".join(f"{_UNITS.get(name, name)} {_bound(radius)}".strip() for name, radius in last) or DASH
+    parts = (
+        {"": tube} if isinstance(tube, list) else tube if isinstance(tube, dict) else {}
+    )
+    last = [
+        (name, radii[-1])
+        for name, radii in parts.items()
+        if isinstance(radii, list) and radii
+    ]
+    return (
+        "; ".join(
+            f"{_UNITS.get(name, name)} {_bound(radius)}".strip()
+            for name, radius in last
+        )
+        or DASH
+    )
 
 
 def _bound(value: Any) -> str:

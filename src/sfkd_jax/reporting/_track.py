@@ -9,7 +9,16 @@ from matplotlib.figure import Figure
 from matplotlib.patches import Circle
 
 from sfkd_jax.reporting._scene import Scene, hardest_step, switches
-from sfkd_jax.reporting._style import MUTED, PLATE, WIDTH, canvas, legend, line, literal, ordered
+from sfkd_jax.reporting._style import (
+    MUTED,
+    PLATE,
+    WIDTH,
+    canvas,
+    legend,
+    line,
+    literal,
+    ordered,
+)
 
 EXAGGERATION = 10
 """How many times the overhead close-up widens a deviation."""
@@ -20,23 +29,43 @@ _RING = "#c2255c"
 def track(scene: Scene) -> Figure:
     """The road from above in true scale, and a close-up of the hardest stretch with deviations widened."""
     path = np.asarray(scene.path, dtype=float)
-    drawn = {name: _projected(scene.states[name][:, :2], path) for name in ordered(scene.states)}
+    drawn = {
+        name: _projected(scene.states[name][:, :2], path)
+        for name in ordered(scene.states)
+    }
     near = drawn.get("nominal", next(iter(drawn.values())))[0]
     centre = int(near[min(hardest_step(scene) + 1, len(near) - 1)])
     marks = [int(near[step]) for step in switches(scene.envs) if step < len(near)]
     used = path[: max(int(index.max()) for index, _ in drawn.values()) + 1]
     edges = np.stack([used[:, :2].min(axis=0) - 20.0, used[:, :2].max(axis=0) + 20.0])
     close = _close_up(path, centre, drawn)
-    limits = [_framed(*edges.T, most=0.55), _framed(np.array([-_CLOSE_UP, _CLOSE_UP]), close.reach, most=0.6)]
+    limits = [
+        _framed(*edges.T, most=0.55),
+        _framed(np.array([-_CLOSE_UP, _CLOSE_UP]), close.reach, most=0.6),
+    ]
     shapes = [np.ptp(y) / np.ptp(x) for x, y in limits]
     figure = canvas(0.87 * WIDTH * sum(shapes) + 1.95)
     figure.set_layout_engine("constrained", hspace=0.09)
     above, below = figure.subplots(2, 1, height_ratios=shapes)
-    above.plot(used[:, 0], used[:, 1], color="#d5dae1", linewidth=6, solid_capstyle="round", zorder=1)
+    above.plot(
+        used[:, 0],
+        used[:, 1],
+        color="#d5dae1",
+        linewidth=6,
+        solid_capstyle="round",
+        zorder=1,
+    )
     for name, (index, offset) in drawn.items():
         above.plot(*_widened(path[index], offset, 1), **line(name) | {"linewidth": 1.1})
     above.plot(*path[0, :2], marker="o", markersize=6, color="#30363d", zorder=6)
-    above.annotate("start", path[0, :2], xytext=(7, -12), textcoords="offset points", color="#57606a", fontsize=9)
+    above.annotate(
+        "start",
+        path[0, :2],
+        xytext=(7, -12),
+        textcoords="offset points",
+        color="#57606a",
+        fontsize=9,
+    )
     above.add_patch(
         Circle(
             (path[centre, 0], path[centre, 1]),
@@ -58,7 +87,11 @@ def track(scene: Scene) -> Figure:
     for mark in (close.turn @ (path[marks, :2] - path[centre, :2]).T)[0]:
         below.axvline(mark, color=MUTED, linestyle=(0, (4, 3)), linewidth=0.9, zorder=1)
     _scale_bar(below, limits[1][1][0] + 0.6)
-    below.set(xlabel="along the road [m]", yticks=[], title=f"Inside the ring, deviations drawn × {EXAGGERATION}")
+    below.set(
+        xlabel="along the road [m]",
+        yticks=[],
+        title=f"Inside the ring, deviations drawn × {EXAGGERATION}",
+    )
     for axes, (x, y) in zip((above, below), limits, strict=True):
         axes.set(xlim=x, ylim=y, aspect="equal")
     legend(figure, below)
@@ -74,7 +107,9 @@ class _CloseUp(NamedTuple):
     reach: np.ndarray
 
 
-def _close_up(path: np.ndarray, centre: int, drawn: dict[str, tuple[np.ndarray, np.ndarray]]) -> _CloseUp:
+def _close_up(
+    path: np.ndarray, centre: int, drawn: dict[str, tuple[np.ndarray, np.ndarray]]
+) -> _CloseUp:
     """The stretch around a path point with deviations × EXAGGERATION; `reach` is its extent across."""
     x, y, yaw = path[centre, :3]
     turn = np.array([[np.cos(yaw), np.sin(yaw)], [-np.sin(yaw), np.cos(yaw)]])
@@ -84,11 +119,18 @@ def _close_up(path: np.ndarray, centre: int, drawn: dict[str, tuple[np.ndarray, 
     tracks, heights = {}, [road[1, np.abs(road[0]) < _CLOSE_UP]]
     for name, (near, offset) in drawn.items():
         keep = inside[near]
-        tracks[name] = turn @ (_widened(path[near], offset, EXAGGERATION)[:, keep] - [[x], [y]])
+        tracks[name] = turn @ (
+            _widened(path[near], offset, EXAGGERATION)[:, keep] - [[x], [y]]
+        )
         heights.append(tracks[name][1, np.abs(tracks[name][0]) < _CLOSE_UP])
     across = np.concatenate(heights)
     across = across[np.abs(across) < 0.6 * _CLOSE_UP]
-    return _CloseUp(turn, road, tracks, np.array([across.min(initial=0.0) - 2.5, across.max(initial=0.0) + 1.0]))
+    return _CloseUp(
+        turn,
+        road,
+        tracks,
+        np.array([across.min(initial=0.0) - 2.5, across.max(initial=0.0) + 1.0]),
+    )
 
 
 def _framed(x: np.ndarray, y: np.ndarray, most: float) -> tuple[np.ndarray, np.ndarray]:
@@ -102,7 +144,14 @@ def _framed(x: np.ndarray, y: np.ndarray, most: float) -> tuple[np.ndarray, np.n
 def _scale_bar(axes: Any, foot: float) -> None:
     """A bar as long as 0.1 m of deviation is drawn."""
     height, left = 0.1 * EXAGGERATION, -0.96 * _CLOSE_UP
-    axes.plot([left, left], [foot, foot + height], color="#30363d", linewidth=2.5, solid_capstyle="butt", zorder=8)
+    axes.plot(
+        [left, left],
+        [foot, foot + height],
+        color="#30363d",
+        linewidth=2.5,
+        solid_capstyle="butt",
+        zorder=8,
+    )
     axes.text(
         left + 0.7,
         foot + height / 2,
@@ -114,13 +163,19 @@ def _scale_bar(axes: Any, foot: float) -> None:
     )
 
 
-def _projected(positions: np.ndarray, path: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def _projected(
+    positions: np.ndarray, path: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
     """The closest path point of each position, searched forward, and the offset to its left [m]."""
     near = np.zeros(len(positions), dtype=int)
     for step, position in enumerate(positions):
         start = max(int(near[step - 1]) - 5, 0) if step else 0
         gap = np.sum((path[start : start + 60, :2] - position) ** 2, axis=1)
-        near[step] = start + int(np.argmin(gap)) if np.all(np.isfinite(position)) else near[step - 1]
+        near[step] = (
+            start + int(np.argmin(gap))
+            if np.all(np.isfinite(position))
+            else near[step - 1]
+        )
     left = np.stack([-np.sin(path[near, 2]), np.cos(path[near, 2])], axis=1)
     return near, np.sum((positions - path[near, :2]) * left, axis=1)
 

@@ -12,7 +12,16 @@ from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter
 
 from sfkd_jax.reporting._compared import Record, curves, scenario_of, steps_of
 from sfkd_jax.reporting._numbers import DASH, dig, interval, is_number
-from sfkd_jax.reporting._style import ACCENT, MUTED, SECOND, THIRD, canvas, label, literal, scenario_label
+from sfkd_jax.reporting._style import (
+    ACCENT,
+    MUTED,
+    SECOND,
+    THIRD,
+    canvas,
+    label,
+    literal,
+    scenario_label,
+)
 
 _LOOKS = [("o", ACCENT), ("s", SECOND), ("D", THIRD), ("^", "#882255"), ("v", MUTED)]
 _LOOPS = {"none": "no inner loop", "speed": "speed loop"}
@@ -29,9 +38,15 @@ _SPREAD = 4.0
 
 def title_of(record: Record, records: list[Record]) -> str:
     """The control convention of a run, with its system and vehicle where runs differ in them."""
-    differing = [key for key in ("system", "vehicle") if len({other[key] for other in records}) > 1]
+    differing = [
+        key
+        for key in ("system", "vehicle")
+        if len({other[key] for other in records}) > 1
+    ]
     names = [label(str(record[key])) for key in differing]
-    return ", ".join([*names, _LOOPS.get(str(record["inner_loop"]), str(record["inner_loop"]))])
+    return ", ".join(
+        [*names, _LOOPS.get(str(record["inner_loop"]), str(record["inner_loop"]))]
+    )
 
 
 def tradeoff(records: list[Record]) -> Figure:
@@ -46,46 +61,89 @@ def tradeoff(records: list[Record]) -> Figure:
     ahead, horizon = steps_of(records, "open_loop"), steps_of(records, "tube")
     measures = {
         f"position error after\n{ahead} steps [m]": ("open_loop", "position_rmse_m"),
-        f"lateral RMSE driven,\n{literal(scenario_label(scenario))} [m]": ("closed_loop", scenario, "rmse_m", "mean"),
-        f"tube after {horizon} steps,\n$R_{{{horizon}}}$ [latent units]": ("tube", "latent"),
+        f"lateral RMSE driven,\n{literal(scenario_label(scenario))} [m]": (
+            "closed_loop",
+            scenario,
+            "rmse_m",
+            "mean",
+        ),
+        f"tube after {horizon} steps,\n$R_{{{horizon}}}$ [latent units]": (
+            "tube",
+            "latent",
+        ),
         "ultimate bound\n[latent units]": ("ultimate",),
     }
     for axes, (name, keys) in zip(panels.flat, measures.items(), strict=True):
         for line, (marker, colour) in zip(lines, cycle(_LOOKS), strict=False):
-            style: dict[str, Any] = {"color": colour, "marker": marker, "markersize": 5.5}
-            axes.plot(*_points(line, "alpha", keys), **style, label=literal(title_of(line[0], records)))
+            style: dict[str, Any] = {
+                "color": colour,
+                "marker": marker,
+                "markersize": 5.5,
+            }
+            axes.plot(
+                *_points(line, "alpha", keys),
+                **style,
+                label=literal(title_of(line[0], records)),
+            )
             if keys[0] == "closed_loop":
                 _whiskers(axes, line, keys[:-1], colour)
             if keys == ("ultimate",):
-                axes.plot(*_points(line, "alpha_separate", ("ultimate_separate",)), **style | _HOLLOW)
+                axes.plot(
+                    *_points(line, "alpha_separate", ("ultimate_separate",)),
+                    **style | _HOLLOW,
+                )
         _scale(axes)
         axes.set_ylabel(name)
     for axes in panels[1]:
         axes.set_xlabel("certified α [-]")
     figure.align_ylabels()
     drawn = panels[0, 0].get_legend_handles_labels()[0]
-    grey: dict[str, Any] = _HOLLOW | {"color": MUTED, "marker": "o", "label": "separate bounds, α = ρ + β"}
-    figure.legend(handles=[*drawn, Line2D([], [], **grey)], loc="outside upper left", ncols=3, columnspacing=1.4)
+    grey: dict[str, Any] = _HOLLOW | {
+        "color": MUTED,
+        "marker": "o",
+        "label": "separate bounds, α = ρ + β",
+    }
+    figure.legend(
+        handles=[*drawn, Line2D([], [], **grey)],
+        loc="outside upper left",
+        ncols=3,
+        columnspacing=1.4,
+    )
     return figure
 
 
 def _points(line: list[Record], abscissa: str, keys: tuple[str, ...]) -> np.ndarray:
     """The pairs of which both numbers are known, (2, count)."""
     pairs = [(record[abscissa], dig(record, *keys)) for record in line]
-    return np.array([pair for pair in pairs if all(map(is_number, pair))], dtype=float).reshape(-1, 2).T
+    return (
+        np.array([pair for pair in pairs if all(map(is_number, pair))], dtype=float)
+        .reshape(-1, 2)
+        .T
+    )
 
 
-def _whiskers(axes: Any, line: list[Record], keys: tuple[str, ...], colour: str) -> None:
+def _whiskers(
+    axes: Any, line: list[Record], keys: tuple[str, ...], colour: str
+) -> None:
     """The 95 % interval of each mean."""
     for record in line:
         bounds = dig(record, *keys, "ci95")
         if interval(bounds) != DASH:
-            axes.plot([record["alpha"]] * 2, bounds, color=colour, linewidth=1.0, marker="_", markersize=6)
+            axes.plot(
+                [record["alpha"]] * 2,
+                bounds,
+                color=colour,
+                linewidth=1.0,
+                marker="_",
+                markersize=6,
+            )
 
 
 def _scale(axes: Any) -> None:
     """From zero up, or logarithmic with plain numbers where values lie far apart."""
-    values = np.concatenate([line.get_ydata() for line in axes.get_lines()] or [np.zeros(0)])
+    values = np.concatenate(
+        [line.get_ydata() for line in axes.get_lines()] or [np.zeros(0)]
+    )
     if values.size == 0 or values.min() <= 0 or values.max() < _SPREAD * values.min():
         axes.set_ylim(bottom=0.0)
         return

@@ -12,14 +12,28 @@ from matplotlib.ticker import PercentFormatter
 from sfkd_jax.reporting._numbers import dig, is_number, short
 from sfkd_jax.reporting._style import MUTED, canvas, label, legend, line, literal
 
-_CERTIFIED: dict[str, Any] = {"linestyle": (0, (2, 1.5)), "marker": "s", "markersize": 5, "markerfacecolor": "white"}
-_THEOREM: dict[str, Any] = {"linestyle": (0, (1, 1.5)), "marker": "x", "markersize": 6, "linewidth": 1.2}
+_CERTIFIED: dict[str, Any] = {
+    "linestyle": (0, (2, 1.5)),
+    "marker": "s",
+    "markersize": 5,
+    "markerfacecolor": "white",
+}
+_THEOREM: dict[str, Any] = {
+    "linestyle": (0, (1, 1.5)),
+    "marker": "x",
+    "markersize": 6,
+    "linewidth": 1.2,
+}
 _CONFORMAL: dict[str, Any] = {"marker": "o", "markersize": 4}
 
 
 def disturbed(block: list[dict[str, Any]]) -> list[dict[str, Any]]:
     """The rows of a block that were also driven under side forces."""
-    return [row for row in block if isinstance(row.get("disturbed"), list) and row["disturbed"]]
+    return [
+        row
+        for row in block
+        if isinstance(row.get("disturbed"), list) and row["disturbed"]
+    ]
 
 
 def violations(rows: list[dict[str, Any]]) -> Figure:
@@ -37,14 +51,23 @@ def violations(rows: list[dict[str, Any]]) -> Figure:
         tubes.plot(*_against_force(row, "v1_conformal"), **style, **_CONFORMAL)
         common.plot(*_against_force(row, "v2"), **style, **_CONFORMAL)
         if _is_certified(row):
-            certified: dict[str, Any] = style | _CERTIFIED | {"label": f"_{name}, certified tube"}
-            theorem: dict[str, Any] = style | _THEOREM | {"label": f"_{name}, theorem (V0)"}
+            certified: dict[str, Any] = (
+                style | _CERTIFIED | {"label": f"_{name}, certified tube"}
+            )
+            theorem: dict[str, Any] = (
+                style | _THEOREM | {"label": f"_{name}, theorem (V0)"}
+            )
             tubes.plot(*_against_force(row, "v1"), **certified)
             tubes.plot(*_against_force(row, "v0"), **theorem)
     levels = [dig(row, "violation", "v1_level") for row in rows]
     for level in filter(is_number, levels[:1]):
-        tubes.axhline(1.0 - level, color=MUTED, linestyle=(0, (4, 3)), linewidth=0.9, zorder=1)
-    titles = {"V1: segments that leave their tube": tubes, "V2: beyond the common threshold": common}
+        tubes.axhline(
+            1.0 - level, color=MUTED, linestyle=(0, (4, 3)), linewidth=0.9, zorder=1
+        )
+    titles = {
+        "V1: segments that leave their tube": tubes,
+        "V2: beyond the common threshold": common,
+    }
     for title, axes in titles.items():
         axes.set(ylim=(-0.04, 1.04), title=title)
         axes.yaxis.set_major_formatter(PercentFormatter(xmax=1.0))
@@ -53,8 +76,16 @@ def violations(rows: list[dict[str, Any]]) -> Figure:
     _radii(figure.add_subplot(grid[:, 1]), rows)
     legend(figure, tubes)
     if any(map(_is_certified, rows)):
-        kinds = {"conformal tube": _CONFORMAL, "certified tube": _CERTIFIED, "theorem, V0": _THEOREM}
-        figure.legend(handles=[_mark(name, style) for name, style in kinds.items()], loc="outside lower left", ncols=3)
+        kinds = {
+            "conformal tube": _CONFORMAL,
+            "certified tube": _CERTIFIED,
+            "theorem, V0": _THEOREM,
+        }
+        figure.legend(
+            handles=[_mark(name, style) for name, style in kinds.items()],
+            loc="outside lower left",
+            ncols=3,
+        )
     return figure
 
 
@@ -66,8 +97,14 @@ def _mark(name: str, style: dict[str, Any]) -> Line2D:
 
 def _against_force(row: dict[str, Any], key: str) -> tuple[np.ndarray, np.ndarray]:
     """Forces [N] and a share at each of them, NaN for null."""
-    pairs = [(run.get("force_n"), run.get(key)) for run in row["disturbed"] if isinstance(run, dict)]
-    values = np.array([[x if is_number(x) else np.nan for x in pair] for pair in pairs], dtype=float).reshape(-1, 2)
+    pairs = [
+        (run.get("force_n"), run.get(key))
+        for run in row["disturbed"]
+        if isinstance(run, dict)
+    ]
+    values = np.array(
+        [[x if is_number(x) else np.nan for x in pair] for pair in pairs], dtype=float
+    ).reshape(-1, 2)
     return values[:, 0], values[:, 1]
 
 
@@ -80,16 +117,34 @@ def _radii(axes: Any, rows: list[dict[str, Any]]) -> None:
     places = range(len(rows) - 1, -1, -1)
     for place, row in zip(places, rows, strict=True):
         colour = line(str(row.get("system")))["color"]
-        shown = {"v1_conformal_radius_m": _CONFORMAL} | ({"v1_radius_m": _CERTIFIED} if _is_certified(row) else {})
+        shown = {"v1_conformal_radius_m": _CONFORMAL} | (
+            {"v1_radius_m": _CERTIFIED} if _is_certified(row) else {}
+        )
         for key, style in shown.items():
             radius = dig(row, "violation", key)
             if not is_number(radius) or radius <= 0:
                 continue
-            dot: dict[str, Any] = style | {"color": colour, "linestyle": "none", "markersize": 6}
+            dot: dict[str, Any] = style | {
+                "color": colour,
+                "linestyle": "none",
+                "markersize": 6,
+            }
             axes.plot(radius, place, **dot)
-            words = {"textcoords": "offset points", "ha": "center", "fontsize": 8.5, "color": "#57606a"}
+            words = {
+                "textcoords": "offset points",
+                "ha": "center",
+                "fontsize": 8.5,
+                "color": "#57606a",
+            }
             axes.annotate(short(radius, 2), (radius, place), (0, 6), **words)
-    axes.set_yticks(list(places), [literal(label(str(row.get("system")))) for row in rows])
-    axes.set(xscale="log", ylim=(-0.6, len(rows) - 0.4), xlabel="mean position radius [m]", title="Width of the tubes")
+    axes.set_yticks(
+        list(places), [literal(label(str(row.get("system")))) for row in rows]
+    )
+    axes.set(
+        xscale="log",
+        ylim=(-0.6, len(rows) - 0.4),
+        xlabel="mean position radius [m]",
+        title="Width of the tubes",
+    )
     axes.margins(x=0.18)
     axes.grid(visible=False, axis="y")

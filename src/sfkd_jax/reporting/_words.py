@@ -7,7 +7,17 @@ import shlex
 from typing import Any
 
 from sfkd_jax.artefacts import identity
-from sfkd_jax.reporting._numbers import DASH, dig, interval, is_number, mean_std, number, plain, short, upper
+from sfkd_jax.reporting._numbers import (
+    DASH,
+    dig,
+    interval,
+    is_number,
+    mean_std,
+    number,
+    plain,
+    short,
+    upper,
+)
 from sfkd_jax.reporting._style import label, scenario_label
 from sfkd_jax.reporting._tables import PAPER_RMSE_M
 
@@ -20,7 +30,11 @@ def command(door: str, settings: dict[str, Any]) -> str:
         parts += ["dataset=files", "dataset.path=LOGS"]
         parts += [f"name={name}"] if name not in (None, "", "default") else []
     else:
-        parts += _of_experiment(str(name), settings) if name not in (None, "", "default") else []
+        parts += (
+            _of_experiment(str(name), settings)
+            if name not in (None, "", "default")
+            else []
+        )
     parts += [f"model={model}"] if model != "sfkd" else []
     return shlex.join([*parts, f"seed={plain(settings.get('seed', 0))}"])
 
@@ -28,38 +42,75 @@ def command(door: str, settings: dict[str, Any]) -> str:
 def _of_experiment(name: str, settings: dict[str, Any]) -> list[str]:
     """An experiment; of a job of a sweep, called experiment/key=value,..., also its settings and its name."""
     words = []
-    for key, _, spelled in (word.partition("=") for word in name.partition("/")[2].split(",") if "=" in word):
-        words.append(f"{key}={value if isinstance(value := dig(settings, *key.split('.')), list) else spelled}")
+    for key, _, spelled in (
+        word.partition("=") for word in name.partition("/")[2].split(",") if "=" in word
+    ):
+        words.append(
+            f"{key}={value if isinstance(value := dig(settings, *key.split('.')), list) else spelled}"
+        )
     escaped = re.sub("([=,])", r"\\\1", name)  # = and , mean something to Hydra
-    return [f"+experiment={name.split('/')[0]}", *words, f"name={escaped}"] if words else [f"+experiment={name}"]
+    return (
+        [f"+experiment={name.split('/')[0]}", *words, f"name={escaped}"]
+        if words
+        else [f"+experiment={name}"]
+    )
 
 
 def model_of(settings: dict[str, Any]) -> str:
     """Name of the system a run trained, as in results.json."""
-    return str(dig(settings, "model", "system") or dig(settings, "model", "name") or "sfkd")
+    return str(
+        dig(settings, "model", "system") or dig(settings, "model", "name") or "sfkd"
+    )
 
 
-def headline(blocks: list[list[dict[str, Any]]], settings: dict[str, Any]) -> list[dict[str, Any]]:
+def headline(
+    blocks: list[list[dict[str, Any]]], settings: dict[str, Any]
+) -> list[dict[str, Any]]:
     """The block the summary speaks of: the run's own scenario, else the last; feedback, then its controller first."""
     experiment = str(settings.get("experiment"))
-    own = [block for block in blocks if experiment.startswith(str(block[0].get("scenario")))] or blocks
-    last = [block for block in own if block[0].get("scenario") == own[-1][0].get("scenario")] if own else []
-    feedback = [block for block in last if any(row.get("sampling") == "feedback" for row in block)]
-    same = [block for block in feedback or last if any(_own_controller(row, settings) for row in block)]
+    own = [
+        block
+        for block in blocks
+        if experiment.startswith(str(block[0].get("scenario")))
+    ] or blocks
+    last = (
+        [
+            block
+            for block in own
+            if block[0].get("scenario") == own[-1][0].get("scenario")
+        ]
+        if own
+        else []
+    )
+    feedback = [
+        block
+        for block in last
+        if any(row.get("sampling") == "feedback" for row in block)
+    ]
+    same = [
+        block
+        for block in feedback or last
+        if any(_own_controller(row, settings) for row in block)
+    ]
     return (same or feedback or last or [[]])[0]
 
 
 def _own_controller(row: dict[str, Any], settings: dict[str, Any]) -> bool:
     """Whether a row drove with the controller that the run was made with."""
     own = settings.get("controller") or {}
-    usual = identity({"controller": own.get("name")} | {key: own[key] for key in ("planner",) if key in own})
+    usual = identity(
+        {"controller": own.get("name")}
+        | {key: own[key] for key in ("planner",) if key in own}
+    )
     return all(identity(row)[key] == usual[key] for key in ("controller", "planner"))
 
 
 def row_of(block: list[dict[str, Any]], system: str) -> dict[str, Any]:
     """The row of a system in a block, preferring the one that sees e; empty if there is none."""
     rows = [row for row in block if row.get("system") == system]
-    return next((row for row in rows if row.get("env") == "measured"), rows[0] if rows else {})
+    return next(
+        (row for row in rows if row.get("env") == "measured"), rows[0] if rows else {}
+    )
 
 
 def summary(
@@ -74,7 +125,9 @@ def summary(
     plant = " from logged drives" if dig(settings, "dataset", "contents") else plant
     steps = dig(metrics[-1], "step") if metrics else None
     trained = f" for {short(steps, 9)} steps" if is_number(steps) else ""
-    sentences = [f"{label(model)} was trained{plant}{trained} (seed {plain(settings.get('seed'))})."]
+    sentences = [
+        f"{label(model)} was trained{plant}{trained} (seed {plain(settings.get('seed'))})."
+    ]
     if holds(certificate):
         alpha = upper(dig(certificate, "alpha"))
         sentences.append(
@@ -87,7 +140,9 @@ def summary(
 
 def _driving(model: str, block: list[dict[str, Any]]) -> list[str]:
     """How well the model's own row drives, beside oracle, nominal and whoever did better."""
-    own, oracle, nominal = (row_of(block, name) for name in (model, "oracle", "nominal"))
+    own, oracle, nominal = (
+        row_of(block, name) for name in (model, "oracle", "nominal")
+    )
     mean = dig(own, "rmse_m", "mean")
     if not is_number(mean):
         return []
@@ -95,19 +150,33 @@ def _driving(model: str, block: list[dict[str, Any]]) -> list[str]:
     within = f" (95 % interval {bounds})" if bounds != DASH else ""
     beside = []
     if is_number(dig(oracle, "rmse_m", "mean")):
-        beside.append(f"{number(oracle.get('rmse_m'))} m for the oracle, which plans with the true vehicle")
+        beside.append(
+            f"{number(oracle.get('rmse_m'))} m for the oracle, which plans with the true vehicle"
+        )
     if is_number(dig(nominal, "rmse_m", "mean")):
-        beside.append(f"{number(nominal.get('rmse_m'))} m for the nominal model, which knows neither friction nor wind")
+        beside.append(
+            f"{number(nominal.get('rmse_m'))} m for the nominal model, which knows neither friction nor wind"
+        )
     others = f", beside {', and '.join(beside)}" if beside else ""
     where = scenario_label(str(own.get("scenario")))
-    said = [f"In scenario {where} it follows the path to a lateral RMSE of {number(mean)} m{within}{others}."]
+    said = [
+        f"In scenario {where} it follows the path to a lateral RMSE of {number(mean)} m{within}{others}."
+    ]
     if is_number(own.get("ratio_to_oracle")):
-        said.append(f"Its RMSE is {number(own['ratio_to_oracle'], 2)} times the oracle's.")
+        said.append(
+            f"Its RMSE is {number(own['ratio_to_oracle'], 2)} times the oracle's."
+        )
     rivals = [row for row in block if row.get("system") not in (model, "oracle")]
-    better = [row for row in rivals if is_number(dig(row, "rmse_m", "mean")) and row["rmse_m"]["mean"] < mean]
+    better = [
+        row
+        for row in rivals
+        if is_number(dig(row, "rmse_m", "mean")) and row["rmse_m"]["mean"] < mean
+    ]
     if better:
         best = min(better, key=lambda row: row["rmse_m"]["mean"])
-        said.append(f"{label(str(best['system']))} does better here, with {number(best['rmse_m'])} m.")
+        said.append(
+            f"{label(str(best['system']))} does better here, with {number(best['rmse_m'])} m."
+        )
     return said
 
 

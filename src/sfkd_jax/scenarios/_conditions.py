@@ -26,12 +26,17 @@ def steady_road(key: Key, *, steps: int, friction: Range, wind: Range) -> Schedu
     """One friction level and one wind, its side drawn too, for a whole episode.
 
     Args:
-        key: consumed. steps: length. friction: range [-]. wind: range of its strength [m/s].
+        key: consumed.
+        steps: length.
+        friction: range [-].
+        wind: range of its strength [m/s].
     """
     friction_key, wind_key, side_key = jax.random.split(key, 3)
     level = jax.random.uniform(friction_key, (), minval=friction[0], maxval=friction[1])
     strength = jax.random.uniform(wind_key, (), minval=wind[0], maxval=wind[1])
-    pair = jnp.stack([level, strength * jax.random.rademacher(side_key, (), dtype=float)])
+    pair = jnp.stack(
+        [level, strength * jax.random.rademacher(side_key, (), dtype=float)]
+    )
     return jnp.tile(pair, (steps, 1))
 
 
@@ -50,7 +55,8 @@ def wet_road(
     Args:
         key: consumed.
         steps, dt: length and sampling period [s].
-        before, after: friction levels, drawn from a range. drop_time: when [s], drawn from a range.
+        before, after: friction levels, drawn from a range.
+        drop_time: when [s], drawn from a range.
         peak_wind: gusts cover [-peak, peak] [m/s] evenly.
     """
     before_key, after_key, time_key, gust_key = jax.random.split(key, 4)
@@ -58,7 +64,9 @@ def wet_road(
     low = jax.random.uniform(after_key, (), minval=after[0], maxval=after[1])
     when = jax.random.uniform(time_key, (), minval=drop_time[0], maxval=drop_time[1])
     friction = jnp.where(jnp.arange(steps) * dt < when - 1e-6, high, low)
-    return jnp.stack([friction, gusts(gust_key, steps=steps, dt=dt, peak=peak_wind)], axis=1)
+    return jnp.stack(
+        [friction, gusts(gust_key, steps=steps, dt=dt, peak=peak_wind)], axis=1
+    )
 
 
 def switching_road(key: Key, *, steps: int, dt: float, period: float = 3.0) -> Schedule:
@@ -77,9 +85,11 @@ def side_pushes(
     """Side forces that nobody measures: levels drawn evenly from [-F, F] every `hold` seconds [N].
 
     Args:
-        key: consumed; the same key gives the same pushes at every F, but for their size.
+        key: consumed; the same key gives the same pushes at every F, but for their
+            size.
         steps, dt: length and sampling period [s].
-        largest: F [N]. hold: how long a level lasts [s].
+        largest: F [N].
+        hold: how long a level lasts [s].
     """
     each = round(hold / dt)
     levels = jax.random.uniform(key, (-(-steps // each),), minval=-1.0)
@@ -87,19 +97,29 @@ def side_pushes(
 
 
 def gusts(
-    key: Key, *, steps: int, dt: float, peak: float, hold: Range = (1.0, 3.0), ramp: float = 0.5
+    key: Key,
+    *,
+    steps: int,
+    dt: float,
+    peak: float,
+    hold: Range = (1.0, 3.0),
+    ramp: float = 0.5,
 ) -> Float[Array, " time"]:
     """Wind levels drawn evenly from [-peak, peak], joined by 1 − cos ramps [m/s].
 
     Args:
         key: consumed.
         steps, dt: length and sampling period [s].
-        peak: [m/s]. hold: range of the time from one ramp to the next [s]. ramp: its duration [s].
+        peak: [m/s].
+        hold: range of the time from one ramp to the next [s].
+        ramp: its duration [s].
     """
     level_key, hold_key = jax.random.split(key)
     count = int(steps * dt / hold[0]) + 2
     levels = jax.random.uniform(level_key, (count + 1,), minval=-peak, maxval=peak)
-    starts = jnp.cumsum(jax.random.uniform(hold_key, (count,), minval=hold[0], maxval=hold[1]))
+    starts = jnp.cumsum(
+        jax.random.uniform(hold_key, (count,), minval=hold[0], maxval=hold[1])
+    )
     time = jnp.arange(steps) * dt
     gust = jnp.searchsorted(starts, time, side="right")
     since = time - jnp.where(gust > 0, starts[gust - 1], -ramp)
@@ -127,17 +147,25 @@ def random_switching(
     """Environments out of the box E, each as in `held_road`, held for a time drawn from `dwell` [s].
 
     Args:
-        key: consumed. steps, dt: length and sampling period [s]. low, high: E.
+        key: consumed.
+        steps, dt: length and sampling period [s].
+        low, high: E.
     """
     level_key, hold_key = jax.random.split(key)
     count = int(steps * dt / dwell[0]) + 2
-    levels = jax.vmap(lambda key: _anywhere(key, low, high))(jax.random.split(level_key, count))
-    ends = jnp.cumsum(jax.random.uniform(hold_key, (count,), minval=dwell[0], maxval=dwell[1]))
+    levels = jax.vmap(lambda key: _anywhere(key, low, high))(
+        jax.random.split(level_key, count)
+    )
+    ends = jnp.cumsum(
+        jax.random.uniform(hold_key, (count,), minval=dwell[0], maxval=dwell[1])
+    )
     return levels[jnp.searchsorted(ends, jnp.arange(steps) * dt, side="right")]
 
 
 def _anywhere(key: Key, low: Corner, high: Corner) -> Float[Array, " environment"]:
     """A point of a box; evenly inside, and a third of every entry at an end."""
-    share = jnp.clip(jax.random.uniform(key, (len(low),), minval=-0.25, maxval=1.25), 0.0, 1.0)
+    share = jnp.clip(
+        jax.random.uniform(key, (len(low),), minval=-0.25, maxval=1.25), 0.0, 1.0
+    )
     bottom, top = jnp.asarray(low), jnp.asarray(high)
     return bottom + share * (top - bottom)

@@ -15,7 +15,8 @@ class Path(NamedTuple):
     """A path sampled at equal arc length.
 
     Attributes:
-        points: x [m], y [m], yaw [rad], curvature [1/m] at s = 0, h, 2h, …, shape (point, 4).
+        points: x [m], y [m], yaw [rad], curvature [1/m] at s = 0, h, 2h, …, shape
+            (point, 4).
         spacing: h [m].
     """
 
@@ -38,13 +39,18 @@ def smooth_path(
 
     Args:
         key: consumed.
-        length: at least this long [m]. spacing: sampling [m].
-        peak_curvature: κ_max [1/m]. wavelengths: range of λᵢ [m]. run_up: length of the blend [m].
+        length: at least this long [m].
+        spacing: sampling [m].
+        peak_curvature: κ_max [1/m].
+        wavelengths: range of λᵢ [m].
+        run_up: length of the blend [m].
     """
     amplitude_key, wavelength_key, phase_key = jax.random.split(key, 3)
     s = jnp.arange(int(length / spacing) + 2) * spacing
     amplitudes = jax.random.uniform(amplitude_key, (3, 1), minval=0.3, maxval=1.0)
-    waves = jax.random.uniform(wavelength_key, (3, 1), minval=wavelengths[0], maxval=wavelengths[1])
+    waves = jax.random.uniform(
+        wavelength_key, (3, 1), minval=wavelengths[0], maxval=wavelengths[1]
+    )
     phases = jax.random.uniform(phase_key, (3, 1), maxval=2 * jnp.pi)
     curvature = jnp.sum(amplitudes * jnp.sin(2 * jnp.pi * s / waves + phases), axis=0)
     blend = jnp.clip(s / run_up, 0.0, 1.0)
@@ -66,11 +72,13 @@ def path_from_curvature(curvature: Float[Array, " point"], *, spacing: float) ->
 def path_through(points: Float[Array, "point 2"], *, spacing: float = 0.5) -> Path:
     """A path along given positions [m], sampled anew at equal distances; yaw and curvature by central differences.
 
-    Between the positions it runs straight, so they should lie closer than the path bends: a few to every `spacing`
-    on a sharp turn. Its length is a multiple of `spacing`.
+    Between the positions it runs straight, so they should lie closer than the path
+    bends: a few to every `spacing` on a sharp turn. Its length is a multiple of
+    `spacing`.
 
     Raises:
-        ValueError: a path too short for its spacing, positions that are not finite, or two in a row that coincide.
+        ValueError: a path too short for its spacing, positions that are not finite, or
+            two in a row that coincide.
     """
     steps = jnp.linalg.norm(jnp.diff(points, axis=0), axis=1)
     if not bool(jnp.all(jnp.isfinite(points)) & jnp.all(steps > 0)):
@@ -78,7 +86,9 @@ def path_through(points: Float[Array, "point 2"], *, spacing: float = 0.5) -> Pa
     along = jnp.concatenate([jnp.zeros(1), jnp.cumsum(steps)])
     count = int(along[-1] / spacing) + 1
     if count < 3:
-        raise ValueError(f"a path of {float(along[-1]):.3g} m has too few samples at a spacing of {spacing} m")
+        raise ValueError(
+            f"a path of {float(along[-1]):.3g} m has too few samples at a spacing of {spacing} m"
+        )
     s = jnp.arange(count) * spacing
     x, y = (jnp.interp(s, along, points[:, axis]) for axis in (0, 1))
     along_x, along_y = jnp.asarray(jnp.gradient(x)), jnp.asarray(jnp.gradient(y))
@@ -101,7 +111,9 @@ def point_at(path: Path, s: Scalar) -> Float[Array, " 4"]:
     return jnp.stack([x, y, yaw, start[3] + slope * ahead])
 
 
-def project(path: Path, position: Float[Array, " 2"], s_guess: Scalar) -> tuple[Scalar, Scalar]:
+def project(
+    path: Path, position: Float[Array, " 2"], s_guess: Scalar
+) -> tuple[Scalar, Scalar]:
     """Arc length of the closest point near `s_guess` and the signed distance to it (left positive), by Newton steps."""
     s = s_guess
     for _ in range(3):
@@ -111,14 +123,18 @@ def project(path: Path, position: Float[Array, " 2"], s_guess: Scalar) -> tuple[
     return s, _offsets(point_at(path, s), position)[1]
 
 
-def reference_window(path: Path, s: Scalar, speed: Scalar, *, dt: float, horizon: int) -> Reference:
+def reference_window(
+    path: Path, s: Scalar, speed: Scalar, *, dt: float, horizon: int
+) -> Reference:
     """The next `horizon` points at the given speed: x, y, yaw, speed, shape (horizon, 4)."""
     ahead = s + speed * dt * jnp.arange(1, horizon + 1)
     points = jax.vmap(point_at, in_axes=(None, 0))(path, ahead)
     return points.at[:, 3].set(speed)
 
 
-def _offsets(point: Float[Array, " 4"], position: Float[Array, " 2"]) -> tuple[Scalar, Scalar]:
+def _offsets(
+    point: Float[Array, " 4"], position: Float[Array, " 2"]
+) -> tuple[Scalar, Scalar]:
     """How far `position` lies ahead of and left of a point on the path [m]."""
     dx, dy = position[0] - point[0], position[1] - point[1]
     c, s = jnp.cos(point[2]), jnp.sin(point[2])

@@ -9,7 +9,13 @@ from typing import NamedTuple, TypeAlias
 import jax
 import jax.numpy as jnp
 
-from sfkd_jax.scenarios._conditions import Schedule, steady_road, switching_road, uniform_road, wet_road
+from sfkd_jax.scenarios._conditions import (
+    Schedule,
+    steady_road,
+    switching_road,
+    uniform_road,
+    wet_road,
+)
 from sfkd_jax.scenarios._paths import Path, smooth_path
 from sfkd_jax.types import Key, Scalar, State
 
@@ -18,7 +24,10 @@ class Scenario(NamedTuple):
     """One episode before anyone drives it; a batch of them is one pytree.
 
     Attributes:
-        initial_state: x_0. envs: e_0 … e_{T-1}, (time, 2). path: to follow. speed: at which [m/s].
+        initial_state: x_0.
+        envs: e_0 … e_{T-1}, (time, 2).
+        path: to follow.
+        speed: at which [m/s].
     """
 
     initial_state: State
@@ -43,13 +52,17 @@ def scenario(
 ) -> Family:
     """The family `name` of the benchmark: "s1" uniform road, "s2" wet road with gusts, "s3" switching road.
 
-    Three more hold one pair of friction and wind for an episode: "seen" as training drives have it, "interpolated"
-    between friction levels that they have under wind, "extrapolated" beyond the box that they cover.
+    Three more hold one pair of friction and wind for an episode: "seen" as training
+    drives have it, "interpolated" between friction levels that they have under wind,
+    "extrapolated" beyond the box that they cover.
 
     Args:
-        name: which. duration: of an episode [s]. speed: to hold [m/s].
+        name: which.
+        duration: of an episode [s].
+        speed: to hold [m/s].
         peak_curvature, wavelengths: of the random path, see `smooth_path`.
-        state_size: of the vehicle; the episode starts on the path at `speed`, other body states zero.
+        state_size: of the vehicle; the episode starts on the path at `speed`, other
+            body states zero.
         dt: sampling period [s].
 
     Raises:
@@ -60,9 +73,15 @@ def scenario(
         "s1": partial(uniform_road, steps=steps),
         "s2": partial(wet_road, steps=steps, dt=dt),
         "s3": partial(switching_road, steps=steps, dt=dt),
-        "seen": partial(steady_road, steps=steps, friction=(0.55, 0.9), wind=(0.0, 8.0)),
-        "interpolated": partial(steady_road, steps=steps, friction=(0.5, 0.55), wind=(4.0, 8.0)),
-        "extrapolated": partial(steady_road, steps=steps, friction=(0.27, 0.3), wind=(8.0, 9.0)),
+        "seen": partial(
+            steady_road, steps=steps, friction=(0.55, 0.9), wind=(0.0, 8.0)
+        ),
+        "interpolated": partial(
+            steady_road, steps=steps, friction=(0.5, 0.55), wind=(4.0, 8.0)
+        ),
+        "extrapolated": partial(
+            steady_road, steps=steps, friction=(0.27, 0.3), wind=(8.0, 9.0)
+        ),
     }
     if name not in table:
         raise ValueError(f"unknown scenario {name!r}; choose one of {', '.join(table)}")
@@ -89,7 +108,12 @@ def family(
 
     def sample(key: Key) -> Scenario:
         path_key, condition_key = jax.random.split(key)
-        path = smooth_path(path_key, length=length, peak_curvature=peak_curvature, wavelengths=wavelengths)
+        path = smooth_path(
+            path_key,
+            length=length,
+            peak_curvature=peak_curvature,
+            wavelengths=wavelengths,
+        )
         start = jnp.zeros(state_size).at[3].set(speed)
         return Scenario(start, conditions(condition_key), path, jnp.asarray(speed))
 

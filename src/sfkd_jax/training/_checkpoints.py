@@ -17,8 +17,8 @@ from sfkd_jax.training._log import GOES_ON
 class Checkpoints:
     """A directory that always holds the latest and the best state.
 
-    A save is atomic: a process killed in the middle leaves the states before it, and what is half written is
-    removed when the directory is opened again.
+    A save is atomic: a process killed in the middle leaves the states before it, and
+    what is half written is removed when the directory is opened again.
     """
 
     def __init__(self, directory: Path) -> None:
@@ -29,13 +29,17 @@ class Checkpoints:
 
         best = managers.BestN(get_metric_fn=metric, reverse=True, n=1)
         options = ocp.CheckpointManagerOptions(
-            preservation_policy=managers.AnyPreservationPolicy([managers.LatestN(1), best]),
+            preservation_policy=managers.AnyPreservationPolicy(
+                [managers.LatestN(1), best]
+            ),
             best_fn=metric,
             best_mode="min",
             cleanup_tmp_directories=True,
             enable_async_checkpointing=False,
         )
-        self._manager = ocp.CheckpointManager(Path(directory).resolve(), options=options)
+        self._manager = ocp.CheckpointManager(
+            Path(directory).resolve(), options=options
+        )
 
     def save(self, step: int, state: Any, *, validation_loss: float) -> None:
         """Write the state reached after `step` optimiser steps; a step already there is left alone.
@@ -45,14 +49,19 @@ class Checkpoints:
         """
         if step in self._manager.all_steps():
             return
-        metrics, logger = {"validation_loss": float(validation_loss)}, logging.getLogger("absl")
+        metrics, logger = (
+            {"validation_loss": float(validation_loss)},
+            logging.getLogger("absl"),
+        )
         level = logger.level
         logger.setLevel(logging.CRITICAL)  # orbax logs the trace of what it then raises
         try:
             self._manager.save(step, args=ocp.args.StandardSave(state), metrics=metrics)
         except Exception as reason:  # orbax raises whatever its storage raised
             line = " ".join(str(reason).split()).rsplit(": ", 1)[-1][:120]
-            raise OSError(f"{self._manager.directory}: step {step} was not saved ({line}); {GOES_ON}") from reason
+            raise OSError(
+                f"{self._manager.directory}: step {step} was not saved ({line}); {GOES_ON}"
+            ) from reason
         finally:
             logger.setLevel(level)
 
@@ -62,8 +71,12 @@ class Checkpoints:
 
     def best_step(self) -> int | None:
         """The step of the state with the lowest validation loss, or None."""
-        scores = {step: self._manager.metrics(step) for step in self._manager.all_steps()}
-        losses = {step: score["validation_loss"] for step, score in scores.items() if score}
+        scores = {
+            step: self._manager.metrics(step) for step in self._manager.all_steps()
+        }
+        losses = {
+            step: score["validation_loss"] for step, score in scores.items() if score
+        }
         return min(losses, key=lambda step: losses[step]) if losses else None
 
     def resume(self, like: Any) -> Any:
@@ -77,10 +90,19 @@ class Checkpoints:
             try:
                 return self.restore(step, like)
             except Exception as reason:  # orbax raises whatever its storage raised
-                line = str(reason).splitlines()[0] if str(reason) else type(reason).__name__
-                print(f"checkpoint {step} cannot be read ({line[:120]}); trying an older one", file=sys.stderr)
+                line = (
+                    str(reason).splitlines()[0]
+                    if str(reason)
+                    else type(reason).__name__
+                )
+                print(
+                    f"checkpoint {step} cannot be read ({line[:120]}); trying an older one",
+                    file=sys.stderr,
+                )
         if steps:
-            raise OSError(f"no checkpoint in {self._manager.directory} can be read; remove it to start again")
+            raise OSError(
+                f"no checkpoint in {self._manager.directory} can be read; remove it to start again"
+            )
         return like
 
     def restore(self, step: int, like: Any) -> Any:

@@ -21,8 +21,9 @@ class Interrupted(KeyboardInterrupt):
 class Interruption:
     """A context in which SIGINT and SIGTERM are kept until something is waited for, and then raise `Interrupted`.
 
-    Python runs no handler while it is inside a compiler or waits for a result, which may take minutes: so both are
-    waited for in small steps. A second signal, and signals that somebody else handles, do what they did before.
+    Python runs no handler while it is inside a compiler or waits for a result, which
+    may take minutes: so both are waited for in small steps. A second signal, and
+    signals that somebody else handles, do what they did before.
     """
 
     def __init__(self) -> None:
@@ -33,14 +34,20 @@ class Interruption:
     def __enter__(self) -> Interruption:
         """Take the signals over, where this thread may and nobody else did."""
         if threading.current_thread() is threading.main_thread():
-            usual = {signal.SIGINT: signal.default_int_handler, signal.SIGTERM: signal.SIG_DFL}
+            usual = {
+                signal.SIGINT: signal.default_int_handler,
+                signal.SIGTERM: signal.SIG_DFL,
+            }
             for number, handler in usual.items():
                 if signal.getsignal(number) == handler:
                     self._before[number] = signal.signal(number, self._ask)
         return self
 
     def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        trace: TracebackType | None,
     ) -> None:
         """Give the signals back; one that nothing has answered is answered now."""
         self._give_back()

@@ -12,7 +12,13 @@ from types import TracebackType
 from typing import Any
 
 from rich.console import Console
-from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
+from rich.progress import (
+    BarColumn,
+    MofNCompleteColumn,
+    Progress,
+    TextColumn,
+    TimeRemainingColumn,
+)
 from tensorboardX.event_file_writer import EventsWriter
 from tensorboardX.proto.event_pb2 import Event, SessionLog  # pyright: ignore[reportAttributeAccessIssue] made by protobuf
 from tensorboardX.summary import scalar
@@ -35,23 +41,42 @@ class TrainingLog:
         """Open the log of a run.
 
         Args:
-            directory: of the run. steps: how many there will be. resumed_at: lines after this step are dropped.
+            directory: of the run.
+            steps: how many there will be.
+            resumed_at: lines after this step are dropped.
         """
         self._steps = steps
         self._path = directory / "metrics.jsonl"
         self._path.parent.mkdir(parents=True, exist_ok=True)
         self._path.touch()
-        truncate_jsonl(self._path, lambda line: _step(line) <= resumed_at, keys=("step",), damaged=tell)
+        truncate_jsonl(
+            self._path,
+            lambda line: _step(line) <= resumed_at,
+            keys=("step",),
+            damaged=tell,
+        )
         board = directory / "tensorboard" / "events"
         board.parent.mkdir(exist_ok=True)
-        # Not SummaryWriter: of a full disk its thread would tell at the end of the process, with a trace.
+        # Not SummaryWriter: of a full disk its thread would tell at the end of the
+        # process, with a trace.
         self._board = EventsWriter(str(board), f".{resumed_at}")
         if resumed_at:
-            self._board.write_event(Event(step=resumed_at, session_log=SessionLog(status=SessionLog.START)))
-        columns = (TextColumn("training"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn())
+            self._board.write_event(
+                Event(step=resumed_at, session_log=SessionLog(status=SessionLog.START))
+            )
+        columns = (
+            TextColumn("training"),
+            BarColumn(),
+            MofNCompleteColumn(),
+            TimeRemainingColumn(),
+        )
         console = Console(stderr=True)
-        self._bar = Progress(*columns, TextColumn("{task.fields[note]}"), console=console)
-        self._task = self._bar.add_task("training", total=steps, completed=resumed_at, note="")
+        self._bar = Progress(
+            *columns, TextColumn("{task.fields[note]}"), console=console
+        )
+        self._task = self._bar.add_task(
+            "training", total=steps, completed=resumed_at, note=""
+        )
         self._shows_bar = console.is_terminal
 
     def __enter__(self) -> TrainingLog:
@@ -61,7 +86,10 @@ class TrainingLog:
         return self
 
     def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        trace: TracebackType | None,
     ) -> None:
         """Stop the bar, close the files."""
         if self._shows_bar:
@@ -78,12 +106,28 @@ class TrainingLog:
                 file.write(json.dumps(clean) + "\n")
             for name, value in clean.items():
                 if name != "step":
-                    self._board.write_event(Event(wall_time=time.time(), step=step, summary=scalar(name, value)))
+                    self._board.write_event(
+                        Event(
+                            wall_time=time.time(),
+                            step=step,
+                            summary=scalar(name, value),
+                        )
+                    )
             self._board.flush()
         except OSError as reason:
-            raise OSError(f"{self._path.parent}: step {step} was not logged ({reason.strerror}); {GOES_ON}") from reason
-        note = " ".join(f"{name} {clean[name]:.3g}" for name in ("loss", "validation_loss") if name in clean)
+            raise OSError(
+                f"{self._path.parent}: step {step} was not logged ({reason.strerror}); {GOES_ON}"
+            ) from reason
+        note = " ".join(
+            f"{name} {clean[name]:.3g}"
+            for name in ("loss", "validation_loss")
+            if name in clean
+        )
         if self._shows_bar:
             self._bar.update(self._task, completed=int(clean["step"]), note=note)
         elif "validation_loss" in clean:
-            print(f"training {clean['step']:.0f} / {self._steps}  {note}", file=sys.stderr, flush=True)
+            print(
+                f"training {clean['step']:.0f} / {self._steps}  {note}",
+                file=sys.stderr,
+                flush=True,
+            )

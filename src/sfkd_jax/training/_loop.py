@@ -52,38 +52,55 @@ def fit(
 ) -> tuple[Params, int]:
     """Train, or continue what `directory` holds, and return the parameters with the best validation loss.
 
-    Windows are drawn with a key folded with the step, so an interrupted run ends bit-identical to an unbroken one.
-    SIGINT or SIGTERM saves the state of the last log line before it raises.
+    Windows are drawn with a key folded with the step, so an interrupted run ends
+    bit-identical to an unbroken one. SIGINT or SIGTERM saves the state of the last log
+    line before it raises.
 
     Args:
-        model, loss: what is trained, and by which loss. To train on from parameters at hand, a model whose `init`
-            returns them: `model._replace(init=lambda key: params)`.
-        draw: (data, key) -> a batch of windows. data: what it draws from; held_out: windows that select.
+        model, loss: what is trained, and by which loss. To train on from parameters at
+            hand, a model whose `init` returns them: `model._replace(init=lambda key:
+            params)`.
+        draw: (data, key) -> a batch of windows.
+        data: what it draws from;
+        held_out: windows that select.
         key: for the initial parameters and the draws.
         directory: gets checkpoints/, metrics.jsonl, tensorboard/.
-        steps: optimiser steps. learning_rate, clip_norm: see `optimizer`.
-        log_every: steps per compiled chunk and per log line. save_every: a multiple of it.
-        inspect: more to log at every checkpoint, finite numbers by name (what can be certified, for example).
+        steps: optimiser steps.
+        learning_rate, clip_norm: see `optimizer`.
+        log_every: steps per compiled chunk and per log line.
+        save_every: a multiple of it.
+        inspect: more to log at every checkpoint, finite numbers by name (what can be
+            certified, for example).
 
     Returns:
         Best parameters, and the step they were reached at.
 
     Raises:
-        TrainingStopped: the loss or a gradient is not finite. KeyboardInterrupt: on SIGINT or SIGTERM.
+        TrainingStopped: the loss or a gradient is not finite.
+        KeyboardInterrupt: on SIGINT or SIGTERM.
         ValueError: steps or save_every are no multiples of log_every.
     """
     if save_every % log_every or steps % log_every:
-        raise ValueError(f"training.steps and save_every must be multiples of log_every = {log_every}")
+        raise ValueError(
+            f"training.steps and save_every must be multiples of log_every = {log_every}"
+        )
     init_key, data_key = jax.random.split(key)
-    transform, schedule = optimizer(steps=steps, learning_rate=learning_rate, clip_norm=clip_norm)
+    transform, schedule = optimizer(
+        steps=steps, learning_rate=learning_rate, clip_norm=clip_norm
+    )
     params = jax.jit(model.init)(init_key)
     state = TrainState(jnp.zeros((), jnp.int32), params, transform.init(params))
     checkpoints = Checkpoints(directory / "checkpoints")
     try:
         state = checkpoints.resume(state)
         start, logged = int(state.step), state
-        with TrainingLog(directory, steps=steps, resumed_at=start) as log, Interruption() as interruption:
-            advance = interruption.compiled(_chunk(loss, transform, draw, data_key, length=log_every), state, data)
+        with (
+            TrainingLog(directory, steps=steps, resumed_at=start) as log,
+            Interruption() as interruption,
+        ):
+            advance = interruption.compiled(
+                _chunk(loss, transform, draw, data_key, length=log_every), state, data
+            )
             validate = interruption.compiled(jax.jit(loss), params, held_out)
             began = time.perf_counter()
             for done in range(start + log_every, steps + 1, log_every):
@@ -97,19 +114,32 @@ def fit(
                 saves = done % save_every == 0 or done == steps
                 if saves:
                     total, parts = interruption.ready(validate(state.params, held_out))
-                    record |= {"validation_loss": float(total), "validation_prediction": float(parts["prediction"])}
+                    record |= {
+                        "validation_loss": float(total),
+                        "validation_prediction": float(parts["prediction"]),
+                    }
                     record |= inspect(state.params) if inspect else {}
                 if not all(math.isfinite(value) for value in record.values()):
                     kept = checkpoints.latest_step()
-                    raise TrainingStopped(f"non-finite loss near step {done}; the last good checkpoint is step {kept}")
-                log.write(record)  # before the checkpoint: a resumed run drops lines, it cannot invent them
+                    raise TrainingStopped(
+                        f"non-finite loss near step {done}; the last good checkpoint is step {kept}"
+                    )
+                log.write(
+                    record
+                    # Before the checkpoint: a resumed run drops lines, it cannot invent
+                    # them.
+                )
                 logged = state
                 if saves:
-                    checkpoints.save(done, state, validation_loss=record["validation_loss"])
+                    checkpoints.save(
+                        done, state, validation_loss=record["validation_loss"]
+                    )
         best = checkpoints.best_step() or steps
         return checkpoints.restore(best, state).params, best
     except Interrupted:
-        if int(logged.step) > start:  # never the best one: an unbroken run does not choose among these
+        if (
+            int(logged.step) > start
+        ):  # never the best one: an unbroken run does not choose among these
             checkpoints.save(int(logged.step), logged, validation_loss=math.inf)
         raise
     finally:
@@ -127,14 +157,23 @@ def _chunk(
     """`length` optimiser steps as one compiled call: state, data -> state, mean metrics."""
     gradient = jax.value_and_grad(loss, has_aux=True)
 
-    @jax.jit  # not donated: an interrupted run saves the state from which a chunk started
-    def chunk(state: TrainState, data: Trajectory) -> tuple[TrainState, dict[str, jax.Array]]:
+    # Not donated: an interrupted run saves the state from which a chunk started.
+    @jax.jit
+    def chunk(
+        state: TrainState, data: Trajectory
+    ) -> tuple[TrainState, dict[str, jax.Array]]:
         def step(state: TrainState, _: None) -> tuple[TrainState, dict[str, jax.Array]]:
             batch = draw(data, jax.random.fold_in(key, state.step))
             (total, parts), grads = gradient(state.params, batch)
             updates, memory = transform.update(grads, state.optimizer, state.params)
-            after = TrainState(state.step + 1, optax.apply_updates(state.params, updates), memory)
-            return after, {"loss": total, "gradient_norm": optax.tree.norm(grads), **parts}
+            after = TrainState(
+                state.step + 1, optax.apply_updates(state.params, updates), memory
+            )
+            return after, {
+                "loss": total,
+                "gradient_norm": optax.tree.norm(grads),
+                **parts,
+            }
 
         state, records = jax.lax.scan(step, state, length=length)
         return state, jax.tree.map(jnp.mean, records)

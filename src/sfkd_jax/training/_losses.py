@@ -17,7 +17,9 @@ from sfkd_jax.types import BODY, Explicit, Model, Params, Scalar, Space, Traject
 Loss: TypeAlias = Callable[[Params, Trajectory], tuple[Scalar, dict[str, Scalar]]]
 
 YAW_LENGTH = 5.0
-"""What 1 rad of yaw is worth in the loss [m]: its lever over half a second at the benchmark's speed."""
+"""What 1 rad of yaw is worth in the loss [m]: its lever over half a second at the
+benchmark's speed.
+"""
 
 
 def power_mean(values: Float[Array, "*shape"], power: int = 8) -> Scalar:
@@ -26,7 +28,9 @@ def power_mean(values: Float[Array, "*shape"], power: int = 8) -> Scalar:
     return largest * jnp.mean((values / largest) ** power) ** (1.0 / power)
 
 
-def state_errors(predicted: Float[Array, "time state"], true: Float[Array, "time state"]) -> Float[Array, "time state"]:
+def state_errors(
+    predicted: Float[Array, "time state"], true: Float[Array, "time state"]
+) -> Float[Array, "time state"]:
     """Predicted minus true: position along and across the true heading [m], yaw wrapped [rad], body state."""
     position = jax.vmap(rotate)(-true[:, 2], predicted[:, :2] - true[:, :2])
     yaw = wrap_angle(predicted[:, 2:3] - true[:, 2:3])
@@ -36,8 +40,9 @@ def state_errors(predicted: Float[Array, "time state"], true: Float[Array, "time
 def error_units(model: Model, space: Space) -> Float[Array, " state"]:
     """What multiplies each of `state_errors` to count as metres.
 
-    1 for the position, 5 m for a radian of yaw, 0.2 m for the half width of what else the body state holds. Along a
-    path, e_y and e_ψ are position and yaw, and the rest, which no longer moves the position, is worth 0.05 m.
+    1 for the position, 5 m for a radian of yaw, 0.2 m for the half width of what else
+    the body state holds. Along a path, e_y and e_ψ are position and yaw, and the rest,
+    which no longer moves the position, is worth 0.05 m.
     """
     others = (0.05 if model.along_path else 0.2) / jnp.asarray(space.body_scale)
     if model.along_path:
@@ -63,46 +68,62 @@ def multi_step_loss(
             + λ_c |d_k|² + λ_r |s − C Φ(x)|² + λ_t |Φ(x, e') − T(e → e') Φ(x, e)|²
             + Σ_i λ_i (|c_i| q(|d|) / (1 − α))²_W
 
-    W measures position in units of 0.01 m at the first step; a prediction's error grows about linearly with k, so
-    the division by its expected growth lets the near steps, which the planner leans on, count as much as the far ones.
-    The last sum is what a certificate will say: the tube of body coordinate i for ever, c_i its row of the read-out,
-    q the 8th power mean over the batch, in the place of the quantile that calibration takes.
-    The one-step term, in units of 0.001 m, sees what the sums over a window hide: slip, a lateral millimetre per step.
+    W measures position in units of 0.01 m at the first step; a prediction's error grows
+    about linearly with k, so the division by its expected growth lets the near steps,
+    which the planner leans on, count as much as the far ones. The last sum is what a
+    certificate will say: the tube of body coordinate i for ever, c_i its row of the
+    read-out, q the 8th power mean over the batch, in the place of the quantile that
+    calibration takes. The one-step term, in units of 0.001 m, sees what the sums over a
+    window hide: slip, a lateral millimetre per step.
 
     Args:
         model, space: what is trained and its scales.
         prediction: λ_p, on free-running predictions; 0 leaves the one-step loss alone.
         one_step: λ_1, on predictions from the true state one step before.
-        consistency: λ_c, on the one-step latent defect: larger gives a tighter tube and a less accurate model, see
-            `docs/certificate.md`. reconstruction: λ_r. transport: λ_t, on
-            Φ(x, e') − T(e → e') Φ(x, e) with e' another window's environment.
+        consistency: λ_c, on the one-step latent defect: larger gives a tighter tube and
+            a less accurate model, see `docs/certificate.md`.
+        reconstruction: λ_r.
+        transport: λ_t, on Φ(x, e') − T(e → e') Φ(x, e) with e' another window's
+            environment.
         growth: γ.
-        tube: λ_i of the first entries of the body state; () for none. For a model with a rate by construction.
+        tube: λ_i of the first entries of the body state; () for none. For a model with
+            a rate by construction.
 
     Returns:
-        (params, batch of windows) -> loss, parts; of a model with a tube in its loss also the first one's radius.
+        (params, batch of windows) -> loss, parts; of a model with a tube in its loss
+        also the first one's radius.
 
     Raises:
-        ValueError: a tube of a model that has none, or of more entries than the body state has.
+        ValueError: a tube of a model that has none, or of more entries than the body
+            state has.
     """
     if tube and (model.rate is None or model.explicit is None):
-        raise ValueError("training.loss.tube needs a model that contracts by construction: model=sfkd… or model=r2dn")
+        raise ValueError(
+            "training.loss.tube needs a model that contracts by construction: model=sfkd… or model=r2dn"
+        )
     if len(tube) > space.body_mean.shape[0]:
         raise ValueError(
             f"training.loss.tube has {len(tube)} weights, the body state {space.body_mean.shape[0]} entries"
         )
     units = error_units(model, space)
 
-    def window(params: Params, data: Trajectory, other: Float[Array, " environment"]) -> dict[str, Scalar]:
+    def window(
+        params: Params, data: Trajectory, other: Float[Array, " environment"]
+    ) -> dict[str, Scalar]:
         predicted, _, along = rollout(model, params, data)
         errors = state_errors(predicted, data.states[1:])
         steps = 1.0 + growth * jnp.arange(errors.shape[0])
         weighted = (errors * units / 0.01 / steps[:, None]) ** 2
         gap, single = defects(model, params, data, along)
         near = state_errors(single, data.states[1:]) * units / 0.001
-        fiber, there = jax.tree.map(lambda leaf: leaf[0], along[0]), model.fiber(params, other)
+        fiber, there = (
+            jax.tree.map(lambda leaf: leaf[0], along[0]),
+            model.fiber(params, other),
+        )
         here = model.encode(fiber, data.states[0])
-        moved = model.vector(model.transport(fiber, there, here)) - model.vector(model.encode(there, data.states[0]))
+        moved = model.vector(model.transport(fiber, there, here)) - model.vector(
+            model.encode(there, data.states[0])
+        )
         rebuilt = (model.decode(fiber, here) - data.states[0])[BODY] / space.body_scale
         parts = {
             "prediction": jnp.mean(jnp.sum(weighted, axis=1)),
@@ -125,7 +146,9 @@ def multi_step_loss(
         charged = jnp.zeros(())
         if gaps is not None:
             radii = tubes(params, gaps)
-            charged = jnp.sum(jnp.asarray(tube) * (radii * units[BODY][: len(tube)] / 0.01) ** 2)
+            charged = jnp.sum(
+                jnp.asarray(tube) * (radii * units[BODY][: len(tube)] / 0.01) ** 2
+            )
         weights = {
             "prediction": prediction,
             "one_step": one_step,
@@ -133,12 +156,18 @@ def multi_step_loss(
             "reconstruction": reconstruction,
             "transport": transport,
         }
-        total = sum((weights.get(name, 1.0) * part for name, part in parts.items()), charged)
+        total = sum(
+            (weights.get(name, 1.0) * part for name, part in parts.items()), charged
+        )
         return total, parts if gaps is None else parts | {"tube": radii[0]}
 
-    def tubes(params: Params, gaps: Float[Array, "window time"]) -> Float[Array, " weighted"]:
+    def tubes(
+        params: Params, gaps: Float[Array, "window time"]
+    ) -> Float[Array, " weighted"]:
         """|c_i| q(|d|) / (1 − α) of the weighted coordinates, in their own units."""
-        rows = cast(Explicit, cast(Callable, model.explicit)(params)).readout[: len(tube)]
+        rows = cast(Explicit, cast(Callable, model.explicit)(params)).readout[
+            : len(tube)
+        ]
         rate = cast(Callable, model.rate)(params)
         return jnp.linalg.norm(rows, axis=1) * power_mean(gaps) / (1.0 - rate)
 

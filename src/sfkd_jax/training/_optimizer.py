@@ -6,14 +6,26 @@ import optax
 
 
 def optimizer(
-    *, steps: int, learning_rate: float = 3e-3, warmup: int = 100, final: float = 0.01, clip_norm: float = 100.0
+    *,
+    steps: int,
+    learning_rate: float = 3e-3,
+    warmup: int = 100,
+    final: float = 0.01,
+    clip_norm: float = 100.0,
 ) -> tuple[optax.GradientTransformation, optax.Schedule]:
     """Adam whose step size rises linearly, then falls along a cosine to `final` times its peak.
 
     Args:
-        steps: of the whole run. learning_rate: peak. warmup: steps of the rise. final: relative to the peak.
+        steps: of the whole run.
+        learning_rate: peak.
+        warmup: steps of the rise.
+        final: relative to the peak.
         clip_norm: on the global gradient norm.
     """
     rise = min(warmup, max(steps // 10, 1))
-    schedule = optax.warmup_cosine_decay_schedule(0.0, learning_rate, rise, max(steps, rise + 1), learning_rate * final)
-    return optax.chain(optax.clip_by_global_norm(clip_norm), optax.adam(schedule)), schedule
+    schedule = optax.warmup_cosine_decay_schedule(
+        0.0, learning_rate, rise, max(steps, rise + 1), learning_rate * final
+    )
+    return optax.chain(
+        optax.clip_by_global_norm(clip_norm), optax.adam(schedule)
+    ), schedule

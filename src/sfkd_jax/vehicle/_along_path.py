@@ -10,22 +10,31 @@ STEEPEST = 0.2
 """Largest curvature of a path [1/m]: tighter than any car turns."""
 
 
-def along_path(vehicle: Vehicle, law: PathFeedback, *, perturbation: tuple[float, float] = (0.03, 1.0)) -> Vehicle:
+def along_path(
+    vehicle: Vehicle,
+    law: PathFeedback,
+    *,
+    perturbation: tuple[float, float] = (0.03, 1.0),
+) -> Vehicle:
     """The loop of a vehicle and a law as a plant: states (0, 0, 0, ξ), controls w = (ν, κ, v_ref).
 
-    See `sfkd_jax.path_frame`. One step is exact on a circle of curvature κ, whatever the
+    See `sfkd_jax.core.path_frame`. One step is exact on a circle of curvature κ, whatever the
     vehicle's own step is. Where 1 − κ e_y ≤ 0.2 it stays finite and means nothing;
     `path_frame.is_valid` tells.
 
     Args:
-        vehicle: any with limits of its controls. law: (ξ, κ, v_ref, e) -> u.
-        perturbation: largest |ν| [rad, control unit], the limits of w; no step enforces them.
+        vehicle: any with limits of its controls.
+        law: (ξ, κ, v_ref, e) -> u.
+        perturbation: largest |ν| [rad, control unit], the limits of w; no step enforces
+            them.
 
     Raises:
         ValueError: the vehicle has no limits.
     """
     if not vehicle.control_low:
-        raise ValueError("a path-following loop needs vehicle.control_low and vehicle.control_high")
+        raise ValueError(
+            "a path-following loop needs vehicle.control_low and vehicle.control_high"
+        )
     limits = (vehicle.control_low, vehicle.control_high)
     step = closed_loop(vehicle.step, law, *limits)
 
@@ -43,6 +52,10 @@ def along_path(vehicle: Vehicle, law: PathFeedback, *, perturbation: tuple[float
         derivative=derivative,
         nominal=nominal,
         nominal_derivative=nominal_derivative,
-        control_low=(*(-largest for largest in perturbation), -STEEPEST, SPEED_RANGE[0]),
+        control_low=(
+            *(-largest for largest in perturbation),
+            -STEEPEST,
+            SPEED_RANGE[0],
+        ),
         control_high=(*perturbation, STEEPEST, SPEED_RANGE[1]),
     )

@@ -51,10 +51,12 @@ def dynamic(
     on both axles in proportion to load, so both use the same share of their circle. The cornering stiffness does
     not depend on μ (only the limit does), unlike that of `kinematic`, which is linear in μ.
 
-    Below creep_speed slip is measured against a speed that stays above creep_speed / 2: the tyre is then a strong
-    damper of side slip, which is the kinematic bicycle, and the equations stay finite and non-stiff; the wind
-    fades out with v, because a tyre that does not roll holds the car. Needs dt / substeps ≤ 0.02 s with the given
-    stiffness, and μ > 0. A car that spins past 90° stops at v = 0 instead of rolling backwards.
+    Below creep_speed slip is measured against a speed that stays above creep_speed / 2:
+    the tyre is then a strong damper of side slip, which is the kinematic bicycle, and
+    the equations stay finite and non-stiff; the wind fades out with v, because a tyre
+    that does not roll holds the car. Needs dt / substeps ≤ 0.02 s with the given
+    stiffness, and μ > 0. A car that spins past 90° stops at v = 0 instead of rolling
+    backwards.
 
     Args:
         dt: sampling period [s].
@@ -78,18 +80,30 @@ def dynamic(
     bicycle = nominal_derivative(length, rear_length)
 
     def derivative(state: State, control: Control, env: Environment) -> State:
-        yaw, speed, side_speed, yaw_rate, steering = state[2], state[3], state[4], state[5], state[6]
+        yaw, speed, side_speed, yaw_rate, steering = (
+            state[2],
+            state[3],
+            state[4],
+            state[5],
+            state[6],
+        )
         grip = env[0] * GRAVITY
         cos, sin = jnp.cos(steering), jnp.sin(steering)
         drive = BRAKING_SHARE * grip * jnp.tanh(control[1] / (BRAKING_SHARE * grip))
-        drive = jnp.maximum(drive, 0.0) + jnp.minimum(drive, 0.0) * jnp.tanh(speed / 0.2)
+        drive = jnp.maximum(drive, 0.0) + jnp.minimum(drive, 0.0) * jnp.tanh(
+            speed / 0.2
+        )
         front_mass = mass * (rear_length - height * drive / GRAVITY) / length
         left_over = jnp.sqrt(grip**2 - drive**2)
         rolls = jnp.clip(jnp.abs(speed) / creep_speed, 0.0, 1.0)
-        wind = rolls**2 * (3.0 - 2.0 * rolls) * side_force(env[1], wind_force=wind_force)
+        wind = (
+            rolls**2 * (3.0 - 2.0 * rolls) * side_force(env[1], wind_force=wind_force)
+        )
 
         front_side = side_speed + front_length * yaw_rate
-        front_slip = _slip(speed * cos + front_side * sin, front_side * cos - speed * sin, creep_speed)
+        front_slip = _slip(
+            speed * cos + front_side * sin, front_side * cos - speed * sin, creep_speed
+        )
         rear_slip = _slip(speed, side_speed - rear_length * yaw_rate, creep_speed)
         front = _brush(front_slip, front_stiffness, front_mass * left_over)
         rear = _brush(rear_slip, rear_stiffness, (mass - front_mass) * left_over)
@@ -104,8 +118,10 @@ def dynamic(
                 yaw_rate,
                 forward / mass + side_speed * yaw_rate - slowed,
                 (sideways + rear + wind) / mass - speed * yaw_rate,
-                (front_length * sideways - rear_length * rear + wind_lever * wind) / yaw_inertia,
-                steering_rate * jnp.tanh((control[0] - steering) / (steering_lag * steering_rate)),
+                (front_length * sideways - rear_length * rear + wind_lever * wind)
+                / yaw_inertia,
+                steering_rate
+                * jnp.tanh((control[0] - steering) / (steering_lag * steering_rate)),
             ]
         )
 
@@ -124,14 +140,18 @@ def dynamic(
     )
 
 
-def _slip(along: Float[Array, ""], across: Float[Array, ""], creep_speed: float) -> Float[Array, ""]:
+def _slip(
+    along: Float[Array, ""], across: Float[Array, ""], creep_speed: float
+) -> Float[Array, ""]:
     """Tangent of the slip angle, v_across / |v_along|; below v_0, |v| becomes (v² + v_0²)/(2 v_0) ≥ v_0/2 (C¹)."""
     below = jnp.minimum(jnp.abs(along), creep_speed)
     beyond = jnp.maximum(jnp.abs(along), creep_speed) - creep_speed
     return across / ((below**2 + creep_speed**2) / (2.0 * creep_speed) + beyond)
 
 
-def _brush(slip: Float[Array, ""], stiffness: float, limit: Float[Array, ""]) -> Float[Array, ""]:
+def _brush(
+    slip: Float[Array, ""], stiffness: float, limit: Float[Array, ""]
+) -> Float[Array, ""]:
     """Side force of a brush (Fiala) tyre, −F_max (3θ − 3θ|θ| + θ³), θ = C t / (3 F_max) held in [-1, 1]."""
     bristle = jnp.clip(stiffness * slip / (3.0 * limit), -1.0, 1.0)
     return -limit * bristle * (3.0 - 3.0 * jnp.abs(bristle) + bristle**2)
@@ -143,7 +163,9 @@ def _quasi_steady(bicycle: Step, length: float, rear_length: float) -> Step:
     def step(state: State, control: Control, env: Environment) -> State:
         after = bicycle(state[:4], control, env)
         yaw_rate = after[3] * jnp.tan(control[0]) / length
-        return jnp.concatenate([after, jnp.stack([rear_length * yaw_rate, yaw_rate, control[0]])])
+        return jnp.concatenate(
+            [after, jnp.stack([rear_length * yaw_rate, yaw_rate, control[0]])]
+        )
 
     return step
 

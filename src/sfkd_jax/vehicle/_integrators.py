@@ -26,6 +26,8 @@ def rk4(derivative: Step, *, dt: float, substeps: int = 1) -> Step:
             k4 = derivative(x + h * k3, control, env)
             return x + h / 6.0 * (k1 + 2.0 * k2 + 2.0 * k3 + k4), None
 
-        return jax.lax.scan(substep, jnp.asarray(state), None, length=substeps, unroll=True)[0]
+        return jax.lax.scan(
+            substep, jnp.asarray(state), None, length=substeps, unroll=True
+        )[0]
 
     return step

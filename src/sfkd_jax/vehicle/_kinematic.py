@@ -56,9 +56,11 @@ def kinematic(
         mass: [kg].
         front_length: front axle to centre of mass [m].
         rear_length: rear axle to centre of mass [m].
-        front_stiffness: cornering stiffness of the front axle per unit friction [N/rad].
+        front_stiffness: cornering stiffness of the front axle per unit friction
+            [N/rad].
         rear_stiffness: cornering stiffness of the rear axle per unit friction [N/rad].
-        wind_force: side force per squared wind speed, c_w [N s²/m²] (an exposed, box-shaped body).
+        wind_force: side force per squared wind speed, c_w [N s²/m²] (an exposed,
+            box-shaped body).
         wind_lever: l_w, how far ahead of the centre of mass the side force acts [m].
         drag: ρ C_d A / 2 [N s²/m²].
         rolling: rolling resistance coefficient [-].
@@ -73,20 +75,28 @@ def kinematic(
         front, rear = front_stiffness * friction, rear_stiffness * friction
         force = side_force(wind, wind_force=wind_force)
         understeer = mass / length * (rear_length / front - front_length / rear)
-        push = ((rear_length + wind_lever) / front - (front_length - wind_lever) / rear) / length
+        push = (
+            (rear_length + wind_lever) / front - (front_length - wind_lever) / rear
+        ) / length
         demand = (jnp.tan(steering) + push * force) / (length + understeer * speed**2)
-        limit = jnp.maximum(friction * GRAVITY - jnp.abs(force) / mass, 0.05 * friction * GRAVITY)
+        limit = jnp.maximum(
+            friction * GRAVITY - jnp.abs(force) / mass, 0.05 * friction * GRAVITY
+        )
         norm = jnp.sqrt(acceleration**2 + (speed**2 * demand) ** 2 + 1e-12)
         scale = _tanhc(norm / limit)
         curvature = scale * demand
-        rear_force = (front_length * mass * speed**2 * curvature - (front_length - wind_lever) * force) / length
+        rear_force = (
+            front_length * mass * speed**2 * curvature
+            - (front_length - wind_lever) * force
+        ) / length
         slip = rear_length * curvature - rear_force / rear
         return jnp.stack(
             [
                 speed * jnp.cos(yaw + slip),
                 speed * jnp.sin(yaw + slip),
                 speed * curvature,
-                scale * acceleration - resistance(speed, mass=mass, drag=drag, rolling=rolling),
+                scale * acceleration
+                - resistance(speed, mass=mass, drag=drag, rolling=rolling),
             ]
         )
 

@@ -28,25 +28,34 @@ def own(
 ) -> Vehicle:
     """A plant from plain numbers and, if there is one, its step (x, u, e) -> x one sampling period later.
 
-    Without a step it may be learned and planned for, but nothing drives it here. Its nominal model is the textbook
-    kinematic bicycle on (p_x, p_y, yaw, v), centre of mass in the middle; further states are left as they are.
+    Without a step it may be learned and planned for, but nothing drives it here. Its
+    nominal model is the textbook kinematic bicycle on (p_x, p_y, yaw, v), centre of
+    mass in the middle; further states are left as they are.
 
     Args:
-        dt: sampling period [s]. state_names: pose first (p_x, p_y [m], yaw [rad]), then the speed [m/s].
-        control_low, control_high: limits of the actuators; may be empty without a step: logs then tell.
+        dt: sampling period [s].
+        state_names: pose first (p_x, p_y [m], yaw [rad]), then the speed [m/s].
+        control_low, control_high: limits of the actuators; may be empty without a step:
+            logs then tell.
         wheelbase: [m], for the nominal bicycle and the path-following law.
         wind_force: c_w of `side_force` [N s²/m²]; 0 if e_2 is no wind.
-        speed_loop: whether u_2 is a speed command [m/s] instead of an acceleration [m/s²].
+        speed_loop: whether u_2 is a speed command [m/s] instead of an acceleration
+            [m/s²].
         step: pure and traceable by jax.
 
     Raises:
-        ValueError: fewer than four states, or limits that are missing or not two numbers each.
+        ValueError: fewer than four states, or limits that are missing or not two
+            numbers each.
     """
     if len(state_names) < 4:
-        raise ValueError(f"vehicle.state_names must be p_x, p_y, yaw, v, …, got {', '.join(state_names) or 'none'}")
+        raise ValueError(
+            f"vehicle.state_names must be p_x, p_y, yaw, v, …, got {', '.join(state_names) or 'none'}"
+        )
     sizes = {len(control_low), len(control_high)}
     if sizes != {2} and (sizes != {0} or step is not None):
-        raise ValueError("vehicle.control_low and vehicle.control_high must be two numbers each, as in [-0.4,-3.0]")
+        raise ValueError(
+            "vehicle.control_low and vehicle.control_high must be two numbers each, as in [-0.4,-3.0]"
+        )
     bicycle = nominal_derivative(wheelbase, 0.5 * wheelbase)
     drives = _undriven if step is None else step
 
@@ -54,7 +63,9 @@ def own(
         return (drives(state, control, env) - state) / dt
 
     def unmoved(state: State, control: Control, env: Environment) -> State:
-        return jnp.concatenate([bicycle(state[:4], control, env), jnp.zeros(len(state_names) - 4)])
+        return jnp.concatenate(
+            [bicycle(state[:4], control, env), jnp.zeros(len(state_names) - 4)]
+        )
 
     return Vehicle(
         name="own",
@@ -75,15 +86,18 @@ def own(
 
 def _undriven(state: State, control: Control, env: Environment) -> State:
     """The step of a robot that is known from logs alone."""
-    raise _NoStep("vehicle=own is known from logs alone, so nothing can drive it: pass vehicle.step=module:function")
+    raise _NoStep(
+        "vehicle=own is known from logs alone, so nothing can drive it: pass vehicle.step=module:function"
+    )
 
 
 def step_named(name: str) -> Step:
     """The step "package.module:function", imported when it is first called: what never drives does without it.
 
     Args:
-        name: as in `vehicle.step`. What it names takes (x, u, e) and returns x one sampling period later; calling it
-            raises ValueError where there is no such function.
+        name: as in `vehicle.step`. What it names takes (x, u, e) and returns x one
+            sampling period later; calling it raises ValueError where there is no such
+            function.
     """
 
     def step(state: State, control: Control, env: Environment) -> State:
@@ -91,7 +105,9 @@ def step_named(name: str) -> Step:
         try:
             found = getattr(import_module(module), function)
         except (ImportError, AttributeError, ValueError) as reason:
-            raise _NoStep(f"vehicle.step={name}: {reason}; name it as package.module:function") from None
+            raise _NoStep(
+                f"vehicle.step={name}: {reason}; name it as package.module:function"
+            ) from None
         return found(state, control, env)
 
     return step
@@ -109,8 +125,14 @@ def check_step(plant: Vehicle) -> None:
     except _NoStep:
         raise
     except (TypeError, ValueError, IndexError) as reason:
-        given = f"{sizes[0]} states (vehicle.state_names), 2 controls and 2 environments"
-        raise ValueError(f"the step of vehicle {plant.name} fails on {given}: {reason}") from None
+        given = (
+            f"{sizes[0]} states (vehicle.state_names), 2 controls and 2 environments"
+        )
+        raise ValueError(
+            f"the step of vehicle {plant.name} fails on {given}: {reason}"
+        ) from None
     if getattr(after, "shape", None) != (sizes[0],):
         shape = getattr(after, "shape", type(after).__name__)
-        raise ValueError(f"the step of vehicle {plant.name} returns {shape}, vehicle.state_names has {sizes[0]} names")
+        raise ValueError(
+            f"the step of vehicle {plant.name} returns {shape}, vehicle.state_names has {sizes[0]} names"
+        )

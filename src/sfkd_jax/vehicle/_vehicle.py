@@ -20,16 +20,21 @@ class Vehicle(NamedTuple):
     """A plant sampled at dt.
 
     Attributes:
-        name: which plant. dt: sampling period [s]. wheelbase: [m].
+        name: which plant.
+        dt: sampling period [s].
+        wheelbase: [m].
         state_names: pose first, then the body state.
         step: (x, u, e) -> x one sampling period later.
         derivative: dx/dt of the plant before any wrapper.
-        nominal: the textbook kinematic bicycle without friction or wind, as a step on the same state.
+        nominal: the textbook kinematic bicycle without friction or wind, as a step on
+            the same state.
         nominal_derivative: dx/dt of that bicycle, for models that add to it.
         control_low, control_high: actuator limits.
         wind_force: c_w of `side_force` [N s²/m²].
-        speed_loop: whether u_2 is a speed command [m/s] instead of an acceleration [m/s²].
-        simulated: whether there is a step to drive with; False for a robot that is known from logs alone.
+        speed_loop: whether u_2 is a speed command [m/s] instead of an acceleration
+            [m/s²].
+        simulated: whether there is a step to drive with; False for a robot that is
+            known from logs alone.
     """
 
     name: str
@@ -52,13 +57,19 @@ def side_force(wind: Float[Array, ""], *, wind_force: float) -> Float[Array, ""]
     return wind_force * wind * jnp.abs(wind)
 
 
-def equivalent_wind(wind: Float[Array, ""], force: Float[Array, ""], *, wind_force: float) -> Float[Array, ""]:
+def equivalent_wind(
+    wind: Float[Array, ""], force: Float[Array, ""], *, wind_force: float
+) -> Float[Array, ""]:
     """The wind [m/s] whose side force is that of `wind` and `force` [N] together, c_w w'|w'| = c_w w|w| + F."""
     total = side_force(wind, wind_force=wind_force) + force
-    return jnp.where(force == 0.0, wind, jnp.sign(total) * jnp.sqrt(jnp.abs(total) / wind_force))
+    return jnp.where(
+        force == 0.0, wind, jnp.sign(total) * jnp.sqrt(jnp.abs(total) / wind_force)
+    )
 
 
-def resistance(speed: Float[Array, ""], *, mass: float, drag: float, rolling: float) -> Float[Array, ""]:
+def resistance(
+    speed: Float[Array, ""], *, mass: float, drag: float, rolling: float
+) -> Float[Array, ""]:
     """Deceleration by air drag and rolling, ρ C_d A v²/(2m) + c_rr g tanh(v / 0.2 m/s) [m/s²]; 0 at rest."""
     return drag * speed**2 / mass + rolling * GRAVITY * jnp.tanh(speed / 0.2)
 
@@ -71,7 +82,14 @@ def nominal_derivative(length: float, rear_length: float) -> Step:
         yaw, speed = state[2], state[3]
         curvature = jnp.tan(control[0]) / length
         course = yaw + rear_length * curvature
-        return jnp.stack([speed * jnp.cos(course), speed * jnp.sin(course), speed * curvature, control[1]])
+        return jnp.stack(
+            [
+                speed * jnp.cos(course),
+                speed * jnp.sin(course),
+                speed * curvature,
+                control[1],
+            ]
+        )
 
     return derivative
 
@@ -79,7 +97,8 @@ def nominal_derivative(length: float, rear_length: float) -> Step:
 def forward_rk4(derivative: Step, *, dt: float, substeps: int = 1) -> Step:
     """RK4 of a car whose brakes stop it and do not reverse it: f sees max(v, 0), and v ≥ 0 after every step.
 
-    Within a step v may pass below 0; the car then stands: neither its position nor its yaw moves backwards.
+    Within a step v may pass below 0; the car then stands: neither its position nor its
+    yaw moves backwards.
     """
 
     def forwards(state: State) -> State:

@@ -13,25 +13,33 @@ from sfkd_jax.control.planners._plans import Plan, Plans
 from sfkd_jax.types import Control, Scalar
 
 FLATTEST = 1e-4
-"""Smallest curvature against the largest: no direction is drawn more than ten times as wide as another."""
+"""Smallest curvature against the largest: no direction is drawn more than ten times as
+wide as another.
+"""
 
 Factor: TypeAlias = Float[Array, "horizon control horizon control"]
 
 
-def curvature_factor(cost: Callable[[Plan], Scalar], plan: Plan, std: Control) -> Factor:
+def curvature_factor(
+    cost: Callable[[Plan], Scalar], plan: Plan, std: Control
+) -> Factor:
     """F with F Fᵀ ∝ H^(−1/2), H the curvature of the cost of a plan in units of the standard deviations.
 
         H = S ∇²J(ν) S,  S = diag(std);   F = S V (D / D̄)^(−1/4) Vᵀ,  H = V D Vᵀ,  D̄ the geometric mean of D
 
-    So the volume of the noise stays what `std` makes it. For a linear model and a quadratic cost this is the closed
-    form G'QG + R of its matrices. Directions of negative curvature count as flat ones; where nothing is finite or
-    curved at all, F = S.
+    So the volume of the noise stays what `std` makes it. For a linear model and a
+    quadratic cost this is the closed form G'QG + R of its matrices. Directions of
+    negative curvature count as flat ones; where nothing is finite or curved at all, F =
+    S.
 
-    Source: Yi et al. (2024), CoVO-MPC: Theoretical Analysis of Sampling-based MPC and Optimal Covariance Design.
+    Source: Yi et al. (2024), CoVO-MPC: Theoretical Analysis of Sampling-based MPC and
+    Optimal Covariance Design.
     """
     size = plan.size
     scale = jnp.broadcast_to(std, plan.shape).ravel()
-    hessian = jax.hessian(lambda flat: cost(plan + flat.reshape(plan.shape)))(jnp.zeros(size))
+    hessian = jax.hessian(lambda flat: cost(plan + flat.reshape(plan.shape)))(
+        jnp.zeros(size)
+    )
     hessian = scale[:, None] * 0.5 * (hessian + hessian.T) * scale
     usable = jnp.all(jnp.isfinite(hessian)) & jnp.any(hessian != 0)
     values, vectors = jnp.linalg.eigh(jnp.where(usable, hessian, jnp.eye(size)))
@@ -43,4 +51,6 @@ def curvature_factor(cost: Callable[[Plan], Scalar], plan: Plan, std: Control) -
 
 def shaped(factor: Factor, noise: Plans) -> Plans:
     """F n for every sample."""
-    return jnp.einsum("tcsd,smd->tmc", factor, noise, precision=jax.lax.Precision.HIGHEST)
+    return jnp.einsum(
+        "tcsd,smd->tmc", factor, noise, precision=jax.lax.Precision.HIGHEST
+    )

@@ -20,7 +20,9 @@ NEWTON = 6
 NUDGE = 3e-3
 """Of every coordinate and control, for differences: a step need not be differentiable."""
 STEEPER = (0.5, 5.0)
-"""Limits of what more curvature costs in steering, against straight driving: near the tyres' limit it has none."""
+"""Limits of what more curvature costs in steering, against straight driving: near the
+tyres' limit it has none.
+"""
 
 Along: TypeAlias = Callable[[Array, Control, Scalar, Array], Array]
 
@@ -45,24 +47,33 @@ def derive_path_law(
 
         ξ* = F(ξ*, u*; κ, e),  e_y* = 0,  v* = v_ref;   K from Riccati's equation of F linearised there
 
-    F is the vehicle's step in path coordinates, see `path_frame.path_step`, and is differentiated by
-    differences, so it may be any function, a simulator on the host as well. Newton's method starts every
-    turn from that of the next smaller |κ|; where it finds none (a circle too fast for the friction), the
-    turn and gain of that smaller curvature stand.
+    F is the vehicle's step in path coordinates, see `path_frame.path_step`, and is
+    differentiated by differences, so it may be any function, a simulator on the host as
+    well. Newton's method starts every turn from that of the next smaller |κ|; where it
+    finds none (a circle too fast for the friction), the turn and gain of that smaller
+    curvature stand.
 
     Args:
-        step: (x, u, e) -> x. coordinates: size of ξ. env_low, env_high: ends of the axes of e.
-        lateral_acceleration: end of the axis of v_ref² κ, to both sides [m/s²]. speed: ends of the v_ref axis [m/s].
+        step: (x, u, e) -> x.
+        coordinates: size of ξ.
+        env_low, env_high: ends of the axes of e.
+        lateral_acceleration: end of the axis of v_ref² κ, to both sides [m/s²].
+        speed: ends of the v_ref axis [m/s].
         points: on the axes of v_ref² κ (odd), of v_ref, and of every entry of e.
         perturbation: largest |ν|, kept with the law.
-        lateral: [1/m²], heading: [1/rad²], velocity: [s²/m²], curvature: [m²], drive: per control unit²: weights
-            of Riccati's equation; those of other coordinates are zero. Steering is charged by the curvature that
-            it makes on the steady turns: where tyres give less, the wheel turns more, and the loop stays as fast.
+        lateral: [1/m²], heading: [1/rad²], velocity: [s²/m²], curvature: [m²], drive:
+            per control unit²: weights of Riccati's equation; those of other coordinates
+            are zero. Steering is charged by the curvature that it makes on the steady
+            turns: where tyres give less, the wheel turns more, and the loop stays as
+            fast.
 
     Raises:
         ValueError: axes that cannot be meant.
     """
-    low, high = (-lateral_acceleration, speed[0], *env_low), (lateral_acceleration, speed[1], *env_high)
+    low, high = (
+        (-lateral_acceleration, speed[0], *env_low),
+        (lateral_acceleration, speed[1], *env_high),
+    )
     counts = (*points[:2], *points[2:] * len(env_low))
     if (
         len(points) != 3
@@ -70,11 +81,17 @@ def derive_path_law(
         or min(counts) < 2
         or not all(a < b for a, b in zip(low, high, strict=True))
     ):
-        raise ValueError(f"a law needs rising axes and an odd number of accelerations, got {low}, {high}, {counts}")
+        raise ValueError(
+            f"a law needs rising axes and an odd number of accelerations, got {low}, {high}, {counts}"
+        )
     along = path_step(step)
     axes = [jnp.linspace(a, b, n) for a, b, n in zip(low, high, counts, strict=True)]
-    grid = jnp.stack(jnp.meshgrid(*axes[1:], indexing="ij"), axis=-1).reshape(-1, len(axes) - 1)
-    weights = jnp.diag(jnp.zeros(coordinates).at[:3].set(jnp.asarray([lateral, heading, velocity])))
+    grid = jnp.stack(jnp.meshgrid(*axes[1:], indexing="ij"), axis=-1).reshape(
+        -1, len(axes) - 1
+    )
+    weights = jnp.diag(
+        jnp.zeros(coordinates).at[:3].set(jnp.asarray([lateral, heading, velocity]))
+    )
 
     def row(place: Array) -> tuple[Array, Array, Array]:
         """Turns and gains over all curvatures, for one speed and environment."""
@@ -83,30 +100,53 @@ def derive_path_law(
         def outward(side: Scalar) -> Array:
             """Turns to one side, from straight driving on."""
             follow = partial(_next_turn, along, place)
-            return jax.lax.scan(follow, jnp.zeros(coordinates + 2), side * curvatures[middle:])[1]
+            return jax.lax.scan(
+                follow, jnp.zeros(coordinates + 2), side * curvatures[middle:]
+            )[1]
 
         left, right = jax.vmap(outward)(jnp.asarray([-1.0, 1.0]))
         turns = jnp.concatenate([left[:0:-1], right])
-        steering = jnp.asarray(jnp.gradient(turns[:, -2], curvatures[1] - curvatures[0]))
+        steering = jnp.asarray(
+            jnp.gradient(turns[:, -2], curvatures[1] - curvatures[0])
+        )
         steering = jnp.clip(steering, *(limit * steering[middle] for limit in STEEPER))
-        charges = jax.vmap(jnp.diag)(jnp.stack([curvature / steering**2, jnp.full(points[0], drive)], axis=1))
-        gains = jax.vmap(lambda kappa, turn, charge: _gain(along, turn, kappa, place, weights, charge))
+        charges = jax.vmap(jnp.diag)(
+            jnp.stack([curvature / steering**2, jnp.full(points[0], drive)], axis=1)
+        )
+        gains = jax.vmap(
+            lambda kappa, turn, charge: _gain(
+                along, turn, kappa, place, weights, charge
+            )
+        )
         return turns[:, :-2], turns[:, -2:], gains(curvatures, turns, charges)
 
     tables = jax.lax.map(row, grid, batch_size=64)
-    shaped = [jnp.moveaxis(table, 0, 1).reshape(*counts, *table.shape[2:]) for table in tables]
-    return PathLaw(jnp.asarray(low), jnp.asarray(high), jnp.asarray(perturbation), *shaped)
+    shaped = [
+        jnp.moveaxis(table, 0, 1).reshape(*counts, *table.shape[2:]) for table in tables
+    ]
+    return PathLaw(
+        jnp.asarray(low), jnp.asarray(high), jnp.asarray(perturbation), *shaped
+    )
 
 
-def _next_turn(along: Along, place: Array, known: Array, kappa: Scalar) -> tuple[Array, Array]:
+def _next_turn(
+    along: Along, place: Array, known: Array, kappa: Scalar
+) -> tuple[Array, Array]:
     """(ξ*, u*) at κ by Newton's method from a known turn; the known one where there is none.
 
     Args:
-        along: the step. place: v_ref and e. known: (ξ, u) of a smaller curvature. kappa: [1/m].
+        along: the step.
+        place: v_ref and e.
+        known: (ξ, u) of a smaller curvature.
+        kappa: [1/m].
     """
     size = known.shape[0] - 2
-    free = jnp.asarray([index for index in range(size + 2) if index not in (LATERAL, PATH_SPEED)])
-    start = known.at[jnp.asarray([LATERAL, PATH_SPEED])].set(jnp.stack([jnp.zeros(()), place[0]]))
+    free = jnp.asarray(
+        [index for index in range(size + 2) if index not in (LATERAL, PATH_SPEED)]
+    )
+    start = known.at[jnp.asarray([LATERAL, PATH_SPEED])].set(
+        jnp.stack([jnp.zeros(()), place[0]])
+    )
 
     def residual(unknown: Array) -> Array:
         turn = start.at[free].set(unknown)
@@ -124,11 +164,18 @@ def _next_turn(along: Along, place: Array, known: Array, kappa: Scalar) -> tuple
 
 
 def _gain(
-    along: Along, turn: Array, kappa: Scalar, place: Array, weights: Array, charges: Array
+    along: Along,
+    turn: Array,
+    kappa: Scalar,
+    place: Array,
+    weights: Array,
+    charges: Array,
 ) -> Float[Array, "2 coordinate"]:
     """K at a steady turn, by the Riccati recursion."""
     size = turn.shape[0] - 2
-    _, slopes = _value_and_jacobian(lambda both: along(both[:size], both[size:], kappa, place[1:]), turn)
+    _, slopes = _value_and_jacobian(
+        lambda both: along(both[:size], both[size:], kappa, place[1:]), turn
+    )
     A, B = slopes[:, :size], slopes[:, size:]
 
     def best(value: Array) -> Array:
@@ -141,9 +188,13 @@ def _gain(
     return jnp.where(jnp.isfinite(gain), gain, 0.0)
 
 
-def _value_and_jacobian(function: Callable[[Array], Array], at: Array) -> tuple[Array, Array]:
+def _value_and_jacobian(
+    function: Callable[[Array], Array], at: Array
+) -> tuple[Array, Array]:
     """f and its central differences, one column an entry; all of it one call, which compiles once."""
     nudges = NUDGE * jnp.eye(at.shape[0])
-    values = jax.vmap(function)(at + jnp.concatenate([jnp.zeros((1, at.shape[0])), nudges, -nudges]))
+    values = jax.vmap(function)(
+        at + jnp.concatenate([jnp.zeros((1, at.shape[0])), nudges, -nudges])
+    )
     above, below = jnp.split(values[1:], 2)
     return values[0], (above - below).T / (2.0 * NUDGE)

@@ -12,20 +12,29 @@ from sfkd_jax.control.laws._path_errors import path_errors
 from sfkd_jax.types import BODY, Control, Fiber, Model, Reference, Scalar, State
 
 NEWTON = 4
-"""Steps to the steady turn, from straight driving: float32 has no more to give then, for the benchmark's plants."""
+"""Steps to the steady turn, from straight driving: float32 has no more to give then,
+for the benchmark's plants.
+"""
 RICCATI_STEPS = 100
-"""Of the recursion, 10 s at 10 Hz: several times what a car needs to come back to its path."""
+"""Of the recursion, 10 s at 10 Hz: several times what a car needs to come back to its
+path.
+"""
 
 
 SOUND = 1e-2
-"""Largest entry of the residual of a steady turn that counts as found: mm, rad and m/s over one step."""
+"""Largest entry of the residual of a steady turn that counts as found: mm, rad and m/s
+over one step.
+"""
 
 
 class SteadyTurn(NamedTuple):
     """How to drive along a circle, and what to do about deviations; one for every step of a reference.
 
     Attributes:
-        state: path coordinates ξ* = (distance left of the path, yaw against it, body state). control: u*. gain: K.
+        state: path coordinates ξ* = (distance left of the path, yaw against it, body
+            state).
+        control: u*.
+        gain: K.
     """
 
     state: Float[Array, "*step coordinate"]
@@ -39,14 +48,17 @@ class ModelLaw(NamedTuple):
         ξ* = F(ξ*, u*; κ, e) with no distance from the path and the speed asked for;   K from the Riccati equation of
         F linearised there, with the weights below.
 
-    F is one step of the model in coordinates along a circle of curvature κ. On a road with side wind ξ* crabs, on a
-    slippery one u* steers more: what a model knows of e becomes feed-forward, and a planner need only sample the rest.
-    A steady turn that Newton's method does not find (a circle too fast for the friction) falls back to the law's
-    control of straight driving, its gain included.
+    F is one step of the model in coordinates along a circle of curvature κ. On a road
+    with side wind ξ* crabs, on a slippery one u* steers more: what a model knows of e
+    becomes feed-forward, and a planner need only sample the rest. A steady turn that
+    Newton's method does not find (a circle too fast for the friction) falls back to the
+    law's control of straight driving, its gain included.
 
     Attributes:
-        dt: [s]. lateral: [1/m²], heading: [1/rad²], speed: [s²/m²], steering: [1/rad²], drive: per control unit²: the
-            weights of the Riccati equation; those of other body entries are zero.
+        dt: [s].
+        lateral: [1/m²], heading: [1/rad²], speed: [s²/m²], steering: [1/rad²], drive:
+            per control unit²: the weights of the Riccati equation; those of other body
+            entries are zero.
     """
 
     dt: float
@@ -56,29 +68,55 @@ class ModelLaw(NamedTuple):
     steering: float = 20.0
     drive: float = 0.5
 
-    def prepare(self, model: Model, fiber: Fiber, like: State, reference: Reference, curvature: Array) -> SteadyTurn:
+    def prepare(
+        self,
+        model: Model,
+        fiber: Fiber,
+        like: State,
+        reference: Reference,
+        curvature: Array,
+    ) -> SteadyTurn:
         """Steady turns for every point of a reference.
 
         Args:
-            model, fiber: of the environment. like: a state, for its size. curvature: of the path at each point [1/m].
+            model, fiber: of the environment.
+            like: a state, for its size.
+            curvature: of the path at each point [1/m].
         """
         speeds = reference[:, 3]
         step = _along_circle(model, fiber, like.shape[0], self.dt)
-        turn = jax.vmap(lambda kappa, speed: _steady(step, like.shape[0] - 1, kappa, speed))
-        both = turn(jnp.stack([curvature, 0.0 * curvature]).ravel(), jnp.tile(speeds, 2))
+        turn = jax.vmap(
+            lambda kappa, speed: _steady(step, like.shape[0] - 1, kappa, speed)
+        )
+        both = turn(
+            jnp.stack([curvature, 0.0 * curvature]).ravel(), jnp.tile(speeds, 2)
+        )
         states, controls, left = (jnp.stack(jnp.split(part, 2)) for part in both)
-        finite = jnp.all(jnp.isfinite(jnp.concatenate([states[0], controls[0]], axis=1)), axis=1)
+        finite = jnp.all(
+            jnp.isfinite(jnp.concatenate([states[0], controls[0]], axis=1)), axis=1
+        )
         sound = finite & (left[0] < SOUND)
-        states, controls = (jnp.where(sound[:, None], part[0], part[1]) for part in (states, controls))
+        states, controls = (
+            jnp.where(sound[:, None], part[0], part[1]) for part in (states, controls)
+        )
         at = jnp.where(sound, curvature, 0.0)
-        # One gain, of the first step's turn: it varies little over a horizon, and the Riccati equation costs most.
+        # One gain, of the first step's turn: it varies little over a horizon, and the
+        # Riccati equation costs most.
         gain = self._gain(step, states[0], controls[0], at[0], speeds[0])
-        return SteadyTurn(states, controls, jnp.broadcast_to(gain, (*controls.shape, states.shape[1])))
+        return SteadyTurn(
+            states, controls, jnp.broadcast_to(gain, (*controls.shape, states.shape[1]))
+        )
 
-    def _gain(self, step: Any, state: Array, control: Control, kappa: Scalar, speed: Scalar) -> Array:
+    def _gain(
+        self, step: Any, state: Array, control: Control, kappa: Scalar, speed: Scalar
+    ) -> Array:
         """K, by the Riccati recursion."""
         A, B = jax.jacfwd(step, argnums=(0, 1))(state, control, kappa, speed)
-        Q = jnp.diag(jnp.zeros(state.shape[0]).at[:3].set(jnp.asarray([self.lateral, self.heading, self.speed])))
+        Q = jnp.diag(
+            jnp.zeros(state.shape[0])
+            .at[:3]
+            .set(jnp.asarray([self.lateral, self.heading, self.speed]))
+        )
         R = jnp.diag(jnp.asarray([self.steering, self.drive]))
 
         def best(value: Array) -> Array:
@@ -91,10 +129,18 @@ class ModelLaw(NamedTuple):
         gain = best(jax.lax.fori_loop(0, RICCATI_STEPS, before, Q))
         return jnp.where(jnp.isfinite(gain), gain, 0.0)
 
-    def control(self, turn: SteadyTurn, state: State, point: Float[Array, " 4"], curvature: Scalar) -> Control:
+    def control(
+        self,
+        turn: SteadyTurn,
+        state: State,
+        point: Float[Array, " 4"],
+        curvature: Scalar,
+    ) -> Control:
         """u at one step, for its steady turn."""
         errors = path_errors(state, point, curvature)
-        now = jnp.concatenate([jnp.stack([errors.lateral, errors.heading]), state[BODY]])
+        now = jnp.concatenate(
+            [jnp.stack([errors.lateral, errors.heading]), state[BODY]]
+        )
         return turn.control - turn.gain @ (now - turn.state)
 
 
@@ -102,24 +148,46 @@ def _along_circle(model: Model, fiber: Fiber, size: int, dt: float) -> Any:
     """(ξ, u, κ, speed) -> ξ one step later: the point on the path moves on by speed · dt."""
 
     def step(along: Array, control: Control, kappa: Scalar, speed: Scalar) -> Array:
-        state = jnp.zeros(size).at[1].set(along[0]).at[2].set(along[1]).at[BODY].set(along[2:])
-        after = model.decode(fiber, model.step(fiber, model.encode(fiber, state), control))
+        state = (
+            jnp.zeros(size)
+            .at[1]
+            .set(along[0])
+            .at[2]
+            .set(along[1])
+            .at[BODY]
+            .set(along[2:])
+        )
+        after = model.decode(
+            fiber, model.step(fiber, model.encode(fiber, state), control)
+        )
         turned = kappa * speed * dt
         half = 0.5 * turned
         # The chord of the arc; sin(h)/h by its series, so that κ = 0 is not special.
         chord = speed * dt * (1.0 - half**2 / 6.0 + half**4 / 120.0)
         point = jnp.stack([chord * jnp.cos(half), chord * jnp.sin(half), turned, speed])
         errors = path_errors(after, point, kappa)
-        return jnp.concatenate([jnp.stack([errors.lateral, errors.heading]), after[BODY]])
+        return jnp.concatenate(
+            [jnp.stack([errors.lateral, errors.heading]), after[BODY]]
+        )
 
     return step
 
 
-def _steady(step: Any, coordinates: int, kappa: Scalar, speed: Scalar) -> tuple[Array, Control, Scalar]:
+def _steady(
+    step: Any, coordinates: int, kappa: Scalar, speed: Scalar
+) -> tuple[Array, Control, Scalar]:
     """ξ* and u* by Newton's method, and what is left of the residual; unknown are the yaw, s without v, and u."""
 
     def unpack(unknown: Array) -> tuple[Array, Array]:
-        state = jnp.zeros(coordinates).at[1].set(unknown[0]).at[2].set(speed).at[3:].set(unknown[1:-2])
+        state = (
+            jnp.zeros(coordinates)
+            .at[1]
+            .set(unknown[0])
+            .at[2]
+            .set(speed)
+            .at[3:]
+            .set(unknown[1:-2])
+        )
         return state, unknown[-2:]
 
     def residual(unknown: Array) -> Array:
@@ -127,13 +195,18 @@ def _steady(step: Any, coordinates: int, kappa: Scalar, speed: Scalar) -> tuple[
         return step(state, control, kappa, speed) - state
 
     def newton(_: Any, unknown: Array) -> Array:
-        return unknown - solve(jax.jacfwd(residual)(unknown), residual(unknown)[:, None])[:, 0]
+        return (
+            unknown
+            - solve(jax.jacfwd(residual)(unknown), residual(unknown)[:, None])[:, 0]
+        )
 
     unknown = jax.lax.fori_loop(0, NEWTON, newton, jnp.zeros(coordinates))
     return *unpack(unknown), jnp.max(jnp.abs(residual(unknown)))
 
 
-def solve(matrix: Float[Array, "n n"], right: Float[Array, "n k"]) -> Float[Array, "n k"]:
+def solve(
+    matrix: Float[Array, "n n"], right: Float[Array, "n k"]
+) -> Float[Array, "n k"]:
     """matrix⁻¹ right by elimination with pivots; for a handful of unknowns.
 
     `jnp.linalg.solve` calls LAPACK; a program with several such calls inside maps takes XLA tens of seconds to compile.

@@ -16,7 +16,9 @@ class PathErrors(NamedTuple):
     """Where a state stands against one reference point.
 
     Attributes:
-        lateral: distance left of the path [m]. heading: yaw against the path [rad]. speed: too fast by [m/s].
+        lateral: distance left of the path [m].
+        heading: yaw against the path [rad].
+        speed: too fast by [m/s].
     """
 
     lateral: Scalar
@@ -27,7 +29,9 @@ class PathErrors(NamedTuple):
 Law: TypeAlias = Callable[[PathErrors, Scalar, Scalar], Control]
 
 
-def path_errors(state: State, point: Float[Array, " 4"], curvature: Scalar) -> PathErrors:
+def path_errors(
+    state: State, point: Float[Array, " 4"], curvature: Scalar
+) -> PathErrors:
     """Errors against the circle that touches the path at `point`, to second order in the distance along it.
 
     Args:
@@ -48,7 +52,9 @@ def reference_curvature(reference: Reference) -> Float[Array, " horizon"]:
     steps = jnp.diff(reference, axis=0)
     distance = jnp.hypot(steps[:, 0], steps[:, 1])
     moved = distance > 1e-3
-    between = jnp.where(moved, wrap_angle(steps[:, 2]) / jnp.where(moved, distance, 1.0), 0.0)
+    between = jnp.where(
+        moved, wrap_angle(steps[:, 2]) / jnp.where(moved, distance, 1.0), 0.0
+    )
     ends = jnp.concatenate([between[:1], between, between[-1:]])
     return 0.5 * (ends[1:] + ends[:-1])
 
@@ -64,12 +70,19 @@ def path_feedback(
     """u = u_ff(κ) + K ξ: δ = atan(L κ) − k_y e_y − k_ψ e_ψ, a = −k_v e_v (or the speed command v_ref − k_v e_v).
 
     Args:
-        wheelbase: L [m]. lateral_gain: [rad/m]. heading_gain: [-]. speed_gain: [1/s], or [-] with a speed loop.
+        wheelbase: L [m].
+        lateral_gain: [rad/m].
+        heading_gain: [-].
+        speed_gain: [1/s], or [-] with a speed loop.
         speed_loop: whether the second control is a speed command.
     """
 
     def law(errors: PathErrors, curvature: Scalar, speed: Scalar) -> Control:
-        steering = jnp.arctan(wheelbase * curvature) - lateral_gain * errors.lateral - heading_gain * errors.heading
+        steering = (
+            jnp.arctan(wheelbase * curvature)
+            - lateral_gain * errors.lateral
+            - heading_gain * errors.heading
+        )
         correction = -speed_gain * errors.speed
         return jnp.stack([steering, correction + speed if speed_loop else correction])
 
@@ -81,6 +94,8 @@ def no_feedback(*, speed_loop: bool = False) -> Law:
 
     def law(errors: PathErrors, curvature: Scalar, speed: Scalar) -> Control:
         del errors, curvature
-        return jnp.stack([jnp.zeros_like(speed), speed if speed_loop else jnp.zeros_like(speed)])
+        return jnp.stack(
+            [jnp.zeros_like(speed), speed if speed_loop else jnp.zeros_like(speed)]
+        )
 
     return law

@@ -18,13 +18,17 @@ from sfkd_jax.types import Control, Environment, Scalar
 class PathLaw(NamedTuple):
     """u = u*(a, v, e) − K(a, v, e) (ξ − ξ*(a, v, e)), a = v² κ, every table linear between its points.
 
-    Tables are over the lateral acceleration a that a turn asks for, not over κ: what the tyres hold is a box then.
-    A pytree of arrays: it is stored beside the weights that were learned around it.
+    Tables are over the lateral acceleration a that a turn asks for, not over κ: what
+    the tyres hold is a box then. A pytree of arrays: it is stored beside the weights
+    that were learned around it.
 
     Attributes:
-        low, high: ends of the axes (a [m/s²], v_ref [m/s], e_1, …), each divided evenly.
-        perturbation: largest |ν| that data and planners add to u [rad, control unit], (2,).
-        state: ξ* of the steady turns, (*axes, coordinate). control: u*, (*axes, 2).
+        low, high: ends of the axes (a [m/s²], v_ref [m/s], e_1, …), each divided
+            evenly.
+        perturbation: largest |ν| that data and planners add to u [rad, control unit],
+            (2,).
+        state: ξ* of the steady turns, (*axes, coordinate).
+        control: u*, (*axes, 2).
         gain: K, (*axes, 2, coordinate).
     """
 
@@ -48,10 +52,14 @@ class PathLaw(NamedTuple):
             corners = table.reshape(-1, *table.shape[len(counts) :])[rows]
             return jnp.tensordot(weights, corners, axes=1)
 
-        state, control, gain = (between(table) for table in (self.state, self.control, self.gain))
+        state, control, gain = (
+            between(table) for table in (self.state, self.control, self.gain)
+        )
         return SteadyTurn(state.at[PATH_SPEED].set(speed), control, gain)
 
-    def __call__(self, coordinates: PathState, curvature: Scalar, speed: Scalar, env: Environment) -> Control:
+    def __call__(
+        self, coordinates: PathState, curvature: Scalar, speed: Scalar, env: Environment
+    ) -> Control:
         """u, not clipped to any limit."""
         return at_turn(self.turn(curvature, speed, env), coordinates)
 

@@ -19,7 +19,8 @@ class BoxSolution(NamedTuple):
     """What was found.
 
     Attributes:
-        primal: x, inside the box. residual: max_i |x − clip(x − ∇/diag H)|_i, 0 at the optimum, in units of x.
+        primal: x, inside the box.
+        residual: max_i |x − clip(x − ∇/diag H)|_i, 0 at the optimum, in units of x.
     """
 
     primal: Float[Array, " n"]
@@ -37,13 +38,16 @@ def box_qp(
 ) -> BoxSolution:
     """min ½ xᵀ H x + fᵀ x subject to low ≤ x ≤ high, for H > 0.
 
-    Entries that sit at a bound and whose gradient pushes outward are held; the others take the Newton step of the
-    reduced problem, x ← clip(x − 2⁻ʲ H_ff⁻¹ ∇_f), with the j of the lowest cost. It is exact one step after the set of
-    held entries is right, so a warm start that guesses them is solved at once. The cost never rises, and a step that is
-    not finite is not taken.
+    Entries that sit at a bound and whose gradient pushes outward are held; the others
+    take the Newton step of the reduced problem, x ← clip(x − 2⁻ʲ H_ff⁻¹ ∇_f), with the
+    j of the lowest cost. It is exact one step after the set of held entries is right,
+    so a warm start that guesses them is solved at once. The cost never rises, and a
+    step that is not finite is not taken.
 
     Args:
-        H, f: the cost. low, high: the box, low ≤ high. start: where to begin, clipped into the box.
+        H, f: the cost.
+        low, high: the box, low ≤ high.
+        start: where to begin, clipped into the box.
         iterations: fixed; each is one Cholesky factorisation.
 
     Source: Bertsekas (1982); Tassa, Mansard and Todorov (2014), section III.
@@ -64,4 +68,6 @@ def box_qp(
         return jnp.where(change[best] < 0, candidates[best], x), None
 
     x, _ = jax.lax.scan(improve, jnp.clip(start, low, high), length=iterations)
-    return BoxSolution(x, jnp.max(jnp.abs(x - jnp.clip(x - (H @ x + f) / diagonal, low, high))))
+    return BoxSolution(
+        x, jnp.max(jnp.abs(x - jnp.clip(x - (H @ x + f) / diagonal, low, high)))
+    )

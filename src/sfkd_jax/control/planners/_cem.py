@@ -42,12 +42,19 @@ def cem(
 
         ν ← mean of the elites,   σ_k ← max(their standard deviation at step k, σ_min)
 
-    Sample 0 of each iteration is the present mean, so nothing found is lost; a bad rollout is no elite.
+    Sample 0 of each iteration is the present mean, so nothing found is lost; a bad
+    rollout is no elite.
 
     Args:
-        task: what is planned. horizon: T. num_samples: per iteration. elites: kept. iterations: per control step.
-        smallest_scale: σ_min, against noise_std; σ starts anew at noise_std at every control step.
-        noise, noise_correlation, noise_exponent, noise_knots, halton: course of the noise over time, see `sampler`.
+        task: what is planned.
+        horizon: T.
+        num_samples: per iteration.
+        elites: kept.
+        iterations: per control step.
+        smallest_scale: σ_min, against noise_std; σ starts anew at noise_std at every
+            control step.
+        noise, noise_correlation, noise_exponent, noise_knots, halton: course of the
+            noise over time, see `sampler`.
         options: of `planner`.
 
     Raises:
@@ -56,12 +63,21 @@ def cem(
     Source: Rubinstein (1999); correlated noise as in Pinneri et al. (2020), iCEM.
     """
     if not 1 <= elites <= num_samples or iterations < 1:
-        raise ValueError(f"elites must lie in [1, num_samples], got {elites} of {num_samples}, {iterations} iterations")
-    shape = {"correlation": noise_correlation, "exponent": noise_exponent, "knots": noise_knots, "halton": halton}
+        raise ValueError(
+            f"elites must lie in [1, num_samples], got {elites} of {num_samples}, {iterations} iterations"
+        )
+    shape = {
+        "correlation": noise_correlation,
+        "exponent": noise_exponent,
+        "knots": noise_knots,
+        "halton": halton,
+    }
     draw = sampler(noise, horizon=horizon, **shape)
 
     def search(key: Key, state: PlannerState, evaluate: Evaluate) -> Found:
-        def improve(carry: tuple[Array, Array], key: Key) -> tuple[tuple[Array, Array], Found]:
+        def improve(
+            carry: tuple[Array, Array], key: Key
+        ) -> tuple[tuple[Array, Array], Found]:
             plan, scale = carry
             noise = draw(key, num_samples, state.tuning.noise_std) * scale[:, None]
             costs, effective = evaluate(drawn_around(plan, noise, state))
@@ -70,7 +86,9 @@ def cem(
             weights = counts / jnp.maximum(jnp.sum(counts), 1.0)
             mean, spread = weighted(weights, finite_or_zero(effective)[:, chosen])
             scale = jnp.maximum(spread / state.tuning.noise_std, smallest_scale)
-            return (mean, scale), Found(mean, jnp.any(counts > 0), -lowest[0], jnp.sum(counts))
+            return (mean, scale), Found(
+                mean, jnp.any(counts > 0), -lowest[0], jnp.sum(counts)
+            )
 
         start = (state.plan, jnp.ones_like(state.plan))
         _, founds = jax.lax.scan(improve, start, jax.random.split(key, iterations))

@@ -29,14 +29,18 @@ from sfkd_jax.types import (
 )
 
 REGULARISATION = 1e-7
-"""Share of the largest diagonal entry that is added to H, so that it is positive definite in float32."""
+"""Share of the largest diagonal entry that is added to H, so that it is positive
+definite in float32.
+"""
 
 
 class KoopmanMpcState(NamedTuple):
     """What the controller carries from one control step to the next.
 
     Attributes:
-        plan: u_0 … u_{T-1}, shifted. previous: the control applied last. started: whether there was one.
+        plan: u_0 … u_{T-1}, shifted.
+        previous: the control applied last.
+        started: whether there was one.
     """
 
     plan: Float[Array, "horizon control"]
@@ -77,20 +81,26 @@ def koopman_mpc(
     The path enters through its curvature, previewed; e is held over the horizon. At most 2 T variables are left, and
     `box_qp` solves for them. The states are predictions alone and have no bounds, so every QP is feasible.
 
-    What is not finite never enters the plan: if the observation, environment, reference or solution is not, the plan
-    before it is continued and `info["healthy"]` is False.
+    What is not finite never enters the plan: if the observation, environment, reference
+    or solution is not, the plan before it is continued and `info["healthy"]` is False.
 
     Args:
-        model: with `linear`. dt: [s]. control_low, control_high: actuator limits, in control units.
-        speed_loop: whether the second control is a speed command; effort is then not charged.
-        horizon: T. iterations: of the QP.
+        model: with `linear`.
+        dt: [s].
+        control_low, control_high: actuator limits, in control units.
+        speed_loop: whether the second control is a speed command; effort is then not
+            charged.
+        horizon: T.
+        iterations: of the QP.
         lateral, course, speed, steering_rate, effort: weights as in `tracking_cost`.
         terminal_weight: of the last step, on top of its stage cost.
-        env_low, env_high: environment box; an environment outside is clamped and flagged.
+        env_low, env_high: environment box; an environment outside is clamped and
+            flagged.
 
     Returns:
-        A `Controller`; `info` has `cost` and `mean_cost` (both of the plan), `effective_samples` (NaN: none are
-        drawn), `healthy`, `env_inside`, `predicted_states` (horizon, state), and the QP's `residual`.
+        A `Controller`; `info` has `cost` and `mean_cost` (both of the plan),
+        `effective_samples` (NaN: none are drawn), `healthy`, `env_inside`,
+        `predicted_states` (horizon, state), and the QP's `residual`.
 
     Raises:
         ValueError: the model has no linear predictor.
@@ -99,16 +109,27 @@ def koopman_mpc(
     """
     linear = model.linear
     if linear is None:
-        raise ValueError("koopman_mpc needs a model that is linear in a lift (Model.linear)")
+        raise ValueError(
+            "koopman_mpc needs a model that is linear in a lift (Model.linear)"
+        )
     low, high = jnp.asarray(control_low), jnp.asarray(control_high)
-    weights = jnp.asarray([lateral, course, speed, steering_rate, 0.0 if speed_loop else effort])
+    weights = jnp.asarray(
+        [lateral, course, speed, steering_rate, 0.0 if speed_loop else effort]
+    )
     by_step = jnp.ones(horizon).at[-1].add(terminal_weight)
 
     def init(key: Key) -> KoopmanMpcState:
         del key  # nothing is drawn; every controller has this signature
-        return KoopmanMpcState(jnp.zeros((horizon, low.shape[0])), jnp.zeros_like(low), jnp.asarray(False))
+        return KoopmanMpcState(
+            jnp.zeros((horizon, low.shape[0])), jnp.zeros_like(low), jnp.asarray(False)
+        )
 
-    def charged(found: Condensed, start: State, state: KoopmanMpcState, speeds: Float[Array, " horizon"]) -> Any:
+    def charged(
+        found: Condensed,
+        start: State,
+        state: KoopmanMpcState,
+        speeds: Float[Array, " horizon"],
+    ) -> Any:
         """Rows (term, step) of what is squared, affine in u: gains, offsets, weights."""
         channels = jnp.eye(2 * horizon).reshape(horizon, 2, 2 * horizon)
         steering, drive = channels[:, 0], channels[:, 1]
@@ -132,15 +153,27 @@ def koopman_mpc(
         return jnp.concatenate(gains), jnp.concatenate(offsets), charges.ravel()
 
     def act(
-        params: Params, state: KoopmanMpcState, observation: State, env: Environment, reference: Reference
+        params: Params,
+        state: KoopmanMpcState,
+        observation: State,
+        env: Environment,
+        reference: Reference,
     ) -> tuple[Control, KoopmanMpcState, dict[str, Array]]:
         check_path(observation, env, reference, horizon)
         clean = all_finite((observation, env, reference))
-        inside = env if env_low is None or env_high is None else jnp.clip(env, jnp.array(env_low), jnp.array(env_high))
+        inside = (
+            env
+            if env_low is None or env_high is None
+            else jnp.clip(env, jnp.array(env_low), jnp.array(env_high))
+        )
         curvature = reference_curvature(reference)
         errors = path_errors(observation, reference[0], curvature[0])
-        start = observation.at[POSE].set(jnp.stack([jnp.zeros(()), errors.lateral, errors.heading]))
-        found = _condense(linear(model.fiber(params, inside)), start, _between_points(curvature))
+        start = observation.at[POSE].set(
+            jnp.stack([jnp.zeros(()), errors.lateral, errors.heading])
+        )
+        found = _condense(
+            linear(model.fiber(params, inside)), start, _between_points(curvature)
+        )
         gains, offsets, charges = charged(found, start, state, reference[:, 3])
         H = 2 * gains.T @ (charges[:, None] * gains)
         H = H + REGULARISATION * jnp.max(jnp.diagonal(H)) * jnp.eye(H.shape[0])
@@ -158,10 +191,21 @@ def koopman_mpc(
             "effective_samples": jnp.asarray(jnp.nan),
             "healthy": healthy,
             "env_inside": jnp.all(inside == env),
-            "predicted_states": _in_world(found.free + found.gain @ plan.ravel(), observation, reference, curvature),
+            "predicted_states": _in_world(
+                found.free + found.gain @ plan.ravel(),
+                observation,
+                reference,
+                curvature,
+            ),
             "residual": solution.residual,
         }
-        return control, KoopmanMpcState(shift(plan, jnp.ones(())), control, state.started | healthy), info
+        return (
+            control,
+            KoopmanMpcState(
+                shift(plan, jnp.ones(())), control, state.started | healthy
+            ),
+            info,
+        )
 
     return Controller(init, act)
 
@@ -171,19 +215,30 @@ def _between_points(curvature: Float[Array, " horizon"]) -> Float[Array, " horiz
     return jnp.concatenate([curvature[:1], 0.5 * (curvature[1:] + curvature[:-1])])
 
 
-def _condense(predictor: LinearPredictor, start: State, curvature: Float[Array, " horizon"]) -> Condensed:
+def _condense(
+    predictor: LinearPredictor, start: State, curvature: Float[Array, " horizon"]
+) -> Condensed:
     """Eliminate the lift: the free response and the Toeplitz matrix of the impulse responses C Aᵏ B."""
     horizon = curvature.shape[0]
 
-    def respond(carry: tuple[Array, Array], kappa: Scalar) -> tuple[tuple[Array, Array], tuple[Array, Array]]:
+    def respond(
+        carry: tuple[Array, Array], kappa: Scalar
+    ) -> tuple[tuple[Array, Array], tuple[Array, Array]]:
         z, impulse = carry
         z = predictor.A @ z + predictor.d * kappa + predictor.c
-        return (z, predictor.A @ impulse), (predictor.C @ z + predictor.o, predictor.C @ impulse)
+        return (z, predictor.A @ impulse), (
+            predictor.C @ z + predictor.o,
+            predictor.C @ impulse,
+        )
 
-    _, (free, impulses) = jax.lax.scan(respond, (predictor.lift(start), predictor.B), curvature)
+    _, (free, impulses) = jax.lax.scan(
+        respond, (predictor.lift(start), predictor.B), curvature
+    )
     lag = jnp.arange(horizon)[:, None] - jnp.arange(horizon)
     gain = jnp.where((lag >= 0)[:, :, None, None], impulses[jnp.maximum(lag, 0)], 0.0)
-    return Condensed(free, gain.transpose(0, 2, 1, 3).reshape(horizon, start.shape[0], -1))
+    return Condensed(
+        free, gain.transpose(0, 2, 1, 3).reshape(horizon, start.shape[0], -1)
+    )
 
 
 def _in_world(
@@ -197,7 +252,9 @@ def _in_world(
     steps = jnp.hypot(*jnp.diff(reference[:, :2], axis=0).T)
     passed = jnp.concatenate([jnp.zeros(1), jnp.cumsum(steps)])
 
-    def place(state: State, point: Float[Array, " 4"], kappa: Scalar, travelled: Scalar) -> State:
+    def place(
+        state: State, point: Float[Array, " 4"], kappa: Scalar, travelled: Scalar
+    ) -> State:
         ahead = behind + state[0] - travelled
         foot = jnp.stack([ahead, 0.5 * kappa * ahead**2, kappa * ahead])
         aside = jnp.stack([jnp.zeros(()), state[1], state[2]])

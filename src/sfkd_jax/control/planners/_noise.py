@@ -14,7 +14,9 @@ from sfkd_jax.types import Control, Key
 
 Noise: TypeAlias = Float[Array, "horizon sample control"]
 Sampler: TypeAlias = Callable[[Key, int, Control], Noise]
-"""(key, number of samples, standard deviation per control) -> perturbations, shape (horizon, sample, control)."""
+"""(key, number of samples, standard deviation per control) -> perturbations, shape
+(horizon, sample, control).
+"""
 
 KINDS = ("ar1", "white", "coloured", "rbf", "spline")
 
@@ -32,7 +34,8 @@ def correlated_noise(
     Args:
         key: consumed.
         num_samples, horizon: how many, how long.
-        std: per control channel, in control units. correlation: ρ in [0, 1).
+        std: per control channel, in control units.
+        correlation: ρ in [0, 1).
     """
     white = jax.random.normal(key, (horizon, num_samples, std.shape[0])) * std
     fresh = jnp.sqrt(1.0 - correlation**2)
@@ -63,9 +66,14 @@ def sampler(
         spline    cubic Lagrange interpolation between `knots` equidistant values
 
     Args:
-        kind: see above. horizon: T. correlation: ρ. exponent: ≥ 0; 0 is white, 1 pink, 2 brown.
-        knots: ≥ 2. halton: draw w from a Halton sequence, shifted at random each time, in place of independent
-            numbers; best with few knots, since its points fill a space of knots x controls dimensions.
+        kind: see above.
+        horizon: T.
+        correlation: ρ.
+        exponent: ≥ 0; 0 is white, 1 pink, 2 brown.
+        knots: ≥ 2.
+        halton: draw w from a Halton sequence, shifted at random each time, in place of
+            independent numbers; best with few knots, since its points fill a space of
+            knots x controls dimensions.
 
     Raises:
         ValueError: unknown kind, or settings that kind cannot have.
@@ -76,16 +84,28 @@ def sampler(
         if halton:
             w = _halton_normal(key, num_samples, (factor.shape[1], std.shape[0]))
         elif kind == "ar1":
-            return correlated_noise(key, num_samples=num_samples, horizon=horizon, std=std, correlation=correlation)
+            return correlated_noise(
+                key,
+                num_samples=num_samples,
+                horizon=horizon,
+                std=std,
+                correlation=correlation,
+            )
         else:
             w = jax.random.normal(key, (factor.shape[1], num_samples, std.shape[0]))
-        # Full precision: accelerators otherwise round the factors of float32 products to ten bits.
-        return jnp.einsum("tk,kmc->tmc", factor, w, precision=jax.lax.Precision.HIGHEST) * std
+        # Full precision: accelerators otherwise round the factors of float32 products
+        # to ten bits.
+        return (
+            jnp.einsum("tk,kmc->tmc", factor, w, precision=jax.lax.Precision.HIGHEST)
+            * std
+        )
 
     return draw
 
 
-def _factor(kind: str, horizon: int, correlation: float, exponent: float, knots: int) -> Float[Array, "horizon k"]:
+def _factor(
+    kind: str, horizon: int, correlation: float, exponent: float, knots: int
+) -> Float[Array, "horizon k"]:
     """L, see `sampler`."""
     if kind not in KINDS:
         raise ValueError(f"noise must be one of {', '.join(KINDS)}, got {kind!r}")
@@ -106,7 +126,9 @@ def _factor(kind: str, horizon: int, correlation: float, exponent: float, knots:
         return _coloured(horizon, exponent)
     places = jnp.linspace(0.0, horizon - 1.0, knots)
     if kind == "rbf":
-        factor = jnp.exp(-0.5 * ((steps[:, None] - places) / (places[1] - places[0])) ** 2)
+        factor = jnp.exp(
+            -0.5 * ((steps[:, None] - places) / (places[1] - places[0])) ** 2
+        )
     else:
         factor = _spline(steps / (places[1] - places[0]), knots)
     return factor / jnp.linalg.norm(factor, axis=1, keepdims=True)
@@ -115,19 +137,24 @@ def _factor(kind: str, horizon: int, correlation: float, exponent: float, knots:
 def _coloured(horizon: int, exponent: float) -> Float[Array, "horizon horizon"]:
     """Cholesky factor of the covariance whose spectrum is 1 / f^exponent down to a period of four horizons.
 
-    A window of a longer stationary process, not a period of its own: the end of a plan is not tied to its beginning.
+    A window of a longer stationary process, not a period of its own: the end of a plan
+    is not tied to its beginning.
     """
     period = 4 * horizon
     frequency = jnp.arange(1, period // 2 + 1) / period
     power = frequency**-exponent
     lags = jnp.arange(horizon)
-    covariance = jnp.cos(2 * jnp.pi * lags[:, None] * frequency) @ (power / jnp.sum(power))
+    covariance = jnp.cos(2 * jnp.pi * lags[:, None] * frequency) @ (
+        power / jnp.sum(power)
+    )
     table = covariance[jnp.abs(lags[:, None] - lags)]
     factor = jnp.linalg.cholesky(table + 1e-5 * jnp.eye(horizon))
     return factor / jnp.linalg.norm(factor, axis=1, keepdims=True)
 
 
-def _spline(times: Float[Array, " horizon"], knots: int) -> Float[Array, "horizon knots"]:
+def _spline(
+    times: Float[Array, " horizon"], knots: int
+) -> Float[Array, "horizon knots"]:
     """Weights of the cubic (or lower, with fewer knots) through the knots around each time, in knot distances."""
     order = min(4, knots)
     left = jnp.clip(jnp.floor(times).astype(int) - (order - 1) // 2, 0, knots - order)
@@ -137,29 +164,43 @@ def _spline(times: Float[Array, " horizon"], knots: int) -> Float[Array, "horizo
         weight = jnp.ones_like(times)
         for other in range(order):
             gap = jnp.where(place == other, 1.0, place - other)
-            weight = weight * jnp.where(place == other, 1.0, (times - left - other) / gap)
+            weight = weight * jnp.where(
+                place == other, 1.0, (times - left - other) / gap
+            )
         columns.append(jnp.where((place >= 0) & (place < order), weight, 0.0))
     return jnp.stack(columns, axis=1)
 
 
-def _halton_normal(key: Key, num_samples: int, shape: tuple[int, int]) -> Float[Array, "k sample control"]:
+def _halton_normal(
+    key: Key, num_samples: int, shape: tuple[int, int]
+) -> Float[Array, "k sample control"]:
     """Standard normal points of a Halton sequence, moved by one random shift around the unit cube.
 
     Source: Halton (1960); the shift is that of Cranley and Patterson (1976).
     """
     count = shape[0] * shape[1]
     index = jnp.arange(1, num_samples + 1)
-    points = jnp.stack([_radical_inverse(index, base, num_samples) for base in _primes(count)])
+    points = jnp.stack(
+        [_radical_inverse(index, base, num_samples) for base in _primes(count)]
+    )
     shifted = (points + jax.random.uniform(key, (count, 1))) % 1.0
     tiny = 1e-6
-    return jax.scipy.special.ndtri(jnp.clip(shifted, tiny, 1 - tiny)).reshape(*shape, num_samples).swapaxes(1, 2)
+    return (
+        jax.scipy.special.ndtri(jnp.clip(shifted, tiny, 1 - tiny))
+        .reshape(*shape, num_samples)
+        .swapaxes(1, 2)
+    )
 
 
 def _radical_inverse(index: Array, base: int, largest: int) -> Float[Array, " sample"]:
     """The digits of an index in a base, mirrored at the point: 6 = 110 in base 2 becomes 0.011."""
     total, scale = jnp.zeros(index.shape), 1.0 / base
     for _ in range(math.ceil(math.log(largest + 1, base))):
-        total, index, scale = total + scale * (index % base), index // base, scale / base
+        total, index, scale = (
+            total + scale * (index % base),
+            index // base,
+            scale / base,
+        )
     return total
 
 

@@ -19,10 +19,11 @@ class Tuning(NamedTuple):
     """Settings that a running planner carries as data: `state._replace(tuning=…)` changes them and compiles nothing.
 
     Attributes:
-        temperature: λ of MPPI, in units of cost. effective_samples: what λ is chosen for instead, if the planner was
-            built to. noise_std: per control channel, in control units.
-        elapsed: sampling periods since the last call; the plan is shifted by as many, also by fractions, and by one
-            where this is NaN.
+        temperature: λ of MPPI, in units of cost.
+        effective_samples: what λ is chosen for instead, if the planner was built to.
+        noise_std: per control channel, in control units.
+        elapsed: sampling periods since the last call; the plan is shifted by as many,
+            also by fractions, and by one where this is NaN.
         cost: weights of the task's cost.
     """
 
@@ -37,11 +38,16 @@ class PlannerState(NamedTuple):
     """What a planner carries from one control step to the next.
 
     Attributes:
-        plan: perturbations ν_0 … ν_{T-1} around the law. controls: what they amounted to at the last clean step.
-        previous: the control applied last. started: whether there was one. key: for the next samples.
-        past: perturbations applied before the plan, oldest first, as far back as smoothing looks; 0 before the start.
-        proposals: plans of the user's own, sampled beside the planner's, (proposal, horizon, control); they stay
-            until replaced. tuning: see `Tuning`.
+        plan: perturbations ν_0 … ν_{T-1} around the law.
+        controls: what they amounted to at the last clean step.
+        previous: the control applied last.
+        started: whether there was one.
+        key: for the next samples.
+        past: perturbations applied before the plan, oldest first, as far back as
+            smoothing looks; 0 before the start.
+        proposals: plans of the user's own, sampled beside the planner's, (proposal,
+            horizon, control); they stay until replaced.
+        tuning: see `Tuning`.
     """
 
     plan: Plan
@@ -58,7 +64,10 @@ class Found(NamedTuple):
     """What a search returns.
 
     Attributes:
-        plan: chosen. usable: whether any rollout was finite. cost: the best seen. effective_samples: of the weights.
+        plan: chosen.
+        usable: whether any rollout was finite.
+        cost: the best seen.
+        effective_samples: of the weights.
     """
 
     plan: Plan
@@ -72,15 +81,22 @@ Evaluate: TypeAlias = Callable[[Plans], tuple[Float[Array, " sample"], Plans]]
 Search: TypeAlias = Callable[[Key, PlannerState, Evaluate], Found]
 
 
-def drawn_around(plan: Plan, noise: Plans, state: PlannerState) -> Float[Array, "horizon candidate control"]:
+def drawn_around(
+    plan: Plan, noise: Plans, state: PlannerState
+) -> Float[Array, "horizon candidate control"]:
     """Candidates: the plan itself, the plan perturbed, and the proposals of the user."""
-    return jnp.concatenate([plan[:, None] + noise.at[:, 0].set(0.0), state.proposals.swapaxes(0, 1)], axis=1)
+    return jnp.concatenate(
+        [plan[:, None] + noise.at[:, 0].set(0.0), state.proposals.swapaxes(0, 1)],
+        axis=1,
+    )
 
 
 def weighted(weights: Float[Array, " sample"], plans: Plans) -> tuple[Plan, Plan]:
     """Mean and standard deviation of plans, step by step and control by control."""
     mean = jnp.einsum("m,tmc->tc", weights, plans)
-    return mean, jnp.sqrt(jnp.einsum("m,tmc->tc", weights, (plans - mean[:, None]) ** 2))
+    return mean, jnp.sqrt(
+        jnp.einsum("m,tmc->tc", weights, (plans - mean[:, None]) ** 2)
+    )
 
 
 def finite_or_dear(costs: Float[Array, " sample"]) -> Float[Array, " sample"]:
@@ -107,15 +123,23 @@ def by_chunks(roll: Callable[[Plans], Any], plans: Plans, chunk: int) -> Any:
     horizon, count, channels = plans.shape
     if not chunk or chunk >= count:
         return roll(plans)
-    parts = jnp.pad(plans, ((0, 0), (0, -count % chunk), (0, 0))).reshape(horizon, -1, chunk, channels).swapaxes(0, 1)
+    parts = (
+        jnp.pad(plans, ((0, 0), (0, -count % chunk), (0, 0)))
+        .reshape(horizon, -1, chunk, channels)
+        .swapaxes(0, 1)
+    )
     costs, tracks = jax.lax.map(roll, parts)
 
     def joined(leaf: Array) -> Array:
-        return jnp.moveaxis(leaf, 0, -3).reshape(*leaf.shape[1:-2], -1, leaf.shape[-1])[..., :count, :]
+        return jnp.moveaxis(leaf, 0, -3).reshape(*leaf.shape[1:-2], -1, leaf.shape[-1])[
+            ..., :count, :
+        ]
 
     return joined(costs[..., None])[..., 0], jax.tree.map(joined, tracks)
 
 
 def all_finite(tree: Any) -> Bool[Array, ""]:
     """Whether every entry of every leaf is finite."""
-    return jnp.all(jnp.stack([jnp.all(jnp.isfinite(leaf)) for leaf in jax.tree.leaves(tree)]))
+    return jnp.all(
+        jnp.stack([jnp.all(jnp.isfinite(leaf)) for leaf in jax.tree.leaves(tree)])
+    )

@@ -12,13 +12,16 @@ from jaxtyping import Array, Float
 RISKS = ("mean", "worst", "cvar")
 
 
-def risk_measure(name: str, level: float) -> Callable[[Float[Array, "particle sample"]], Float[Array, " sample"]]:
+def risk_measure(
+    name: str, level: float
+) -> Callable[[Float[Array, "particle sample"]], Float[Array, " sample"]]:
     """Costs of whole trajectories -> one number a plan; of trajectories, so that no worst case changes sides midway.
 
         mean_p J_p,   max_p J_p,   CVaR = mean of the ⌈level · P⌉ largest J_p
 
     Args:
-        name: "mean", "worst" or "cvar". level: share of the worst, in (0, 1].
+        name: "mean", "worst" or "cvar".
+        level: share of the worst, in (0, 1].
 
     Raises:
         ValueError: unknown name or level outside (0, 1].
@@ -32,6 +35,8 @@ def risk_measure(name: str, level: float) -> Callable[[Float[Array, "particle sa
         count = math.ceil(level * costs.shape[0])
         return jnp.mean(jax.lax.top_k(costs.T, count)[0], axis=1)
 
-    return {"mean": lambda costs: jnp.mean(costs, axis=0), "worst": lambda costs: jnp.max(costs, axis=0), "cvar": tail}[
-        name
-    ]
+    return {
+        "mean": lambda costs: jnp.mean(costs, axis=0),
+        "worst": lambda costs: jnp.max(costs, axis=0),
+        "cvar": tail,
+    }[name]

@@ -20,33 +20,47 @@ def savitzky_golay_weights(*, window: int, order: int) -> list[list[Fraction]]:
 
         H_ij = Σ_n q_n(i) q_n(j) / |q_n|²,   q_{n+1}(i) = i q_n(i) − (|q_n|² / |q_{n−1}|²) q_{n−1}(i),   q_0 = 1
 
-    q_n are the polynomials orthogonal over i = −h … h, h = (window − 1)/2; all of it in exact rationals.
+    q_n are the polynomials orthogonal over i = −h … h, h = (window − 1)/2; all of it in
+    exact rationals.
 
     Args:
-        window: odd, at least 3. order: of the polynomial.
+        window: odd, at least 3.
+        order: of the polynomial.
 
     Returns:
-        H, window x window; row h is the filter, the rows after it are the one-sided fits at the far end.
+        H, window x window; row h is the filter, the rows after it are the one-sided
+        fits at the far end.
 
     Raises:
-        ValueError: even or short window, negative order, or one so high that the fit smooths nothing.
+        ValueError: even or short window, negative order, or one so high that the fit
+            smooths nothing.
 
     Source: Savitzky and Golay (1964); the recurrence is Gram's.
     """
     if window < 3 or window % 2 == 0:
-        raise ValueError(f"smoothing_window must be 0 (off) or odd and at least 3, got {window}")
+        raise ValueError(
+            f"smoothing_window must be 0 (off) or odd and at least 3, got {window}"
+        )
     if not 0 <= order <= window - 2:
-        raise ValueError(f"smoothing_order must lie in [0, {window - 2}] for a window of {window}, got {order}")
+        raise ValueError(
+            f"smoothing_order must lie in [0, {window - 2}] for a window of {window}, got {order}"
+        )
     points = range(-(window // 2), window // 2 + 1)
     before, size_before = [Fraction(0)] * window, Fraction(1)
     now, basis = [Fraction(1)] * window, []
     for _ in range(order + 1):
         size = sum((value**2 for value in now), Fraction(0))
         basis.append((now, size))
-        after = [i * a - size / size_before * b for i, a, b in zip(points, now, before, strict=True)]
+        after = [
+            i * a - size / size_before * b
+            for i, a, b in zip(points, now, before, strict=True)
+        ]
         before, size_before, now = now, size, after
     places = range(window)
-    return [[sum((q[i] * q[j] / size for q, size in basis), Fraction(0)) for j in places] for i in places]
+    return [
+        [sum((q[i] * q[j] / size for q, size in basis), Fraction(0)) for j in places]
+        for i in places
+    ]
 
 
 def plan_smoother(*, horizon: int, window: int, order: int) -> Smoother:
@@ -56,28 +70,40 @@ def plan_smoother(*, horizon: int, window: int, order: int) -> Smoother:
     `order` that continues the past therefore stays what it is, to the end.
 
     Args:
-        horizon: T, more than h = (window − 1)/2. window: odd, or 0 for a plan that stays as it is. order: of the fit.
+        horizon: T, more than h = (window − 1)/2.
+        window: odd, or 0 for a plan that stays as it is.
+        order: of the fit.
 
     Raises:
         ValueError: as `savitzky_golay_weights`, or a horizon too short for the window.
 
-    Source: Williams et al. (2018), Information-Theoretic Model Predictive Control, T-RO 34(6).
+    Source: Williams et al. (2018), Information-Theoretic Model Predictive Control, T-RO
+    34(6).
     """
     if window == 0:
         return lambda past, plan: plan
     weights = savitzky_golay_weights(window=window, order=order)
     half = window // 2
     if horizon <= half:
-        raise ValueError(f"smoothing_window {window} needs a horizon of at least {half + 1}, got {horizon}")
+        raise ValueError(
+            f"smoothing_window {window} needs a horizon of at least {half + 1}, got {horizon}"
+        )
     rows = []
     for step in range(horizon):
         late = max(0, step + half - (horizon - 1))
         start = step - late
-        rows.append([0.0] * start + [float(w) for w in weights[half + late]] + [0.0] * (horizon - 1 - half - start))
+        rows.append(
+            [0.0] * start
+            + [float(w) for w in weights[half + late]]
+            + [0.0] * (horizon - 1 - half - start)
+        )
     matrix = jnp.asarray(rows)
 
     def smooth(past: Past, plan: Plan) -> Plan:
-        # Full precision: accelerators otherwise round the factors of float32 products to ten bits.
-        return jnp.matmul(matrix, jnp.concatenate([past, plan]), precision=jax.lax.Precision.HIGHEST)
+        # Full precision: accelerators otherwise round the factors of float32 products
+        # to ten bits.
+        return jnp.matmul(
+            matrix, jnp.concatenate([past, plan]), precision=jax.lax.Precision.HIGHEST
+        )
 
     return smooth

@@ -12,10 +12,14 @@ from sfkd_jax.types import Scalar
 
 BISECTIONS = 24
 DECADES = (-12.0, 4.0)
-"""Temperatures are looked for between 10^-12 and 10^4 times the spread of the costs: one far off stretches it."""
+"""Temperatures are looked for between 10^-12 and 10^4 times the spread of the costs:
+one far off stretches it.
+"""
 
 
-def softmin(costs: Float[Array, " sample"], temperature: Scalar) -> tuple[Float[Array, " sample"], Bool[Array, ""]]:
+def softmin(
+    costs: Float[Array, " sample"], temperature: Scalar
+) -> tuple[Float[Array, " sample"], Bool[Array, ""]]:
     """Weights ∝ exp(−J/λ) over the finite costs, and whether there is any."""
     finite = jnp.isfinite(costs)
     usable = jnp.any(finite)
@@ -32,18 +36,22 @@ def count_effective(weights: Float[Array, " sample"]) -> Scalar:
 def temperature_for(costs: Float[Array, " sample"], wanted: Scalar) -> Scalar:
     """λ at which `count_effective` is `wanted`, by bisection of log λ; it grows with λ.
 
-    The bracket scales with the spread of the finite costs, so the answer scales with the costs. More samples than
-    are finite, or fewer than share the lowest cost, cannot be had: the end of the bracket is then returned.
+    The bracket scales with the spread of the finite costs, so the answer scales with
+    the costs. More samples than are finite, or fewer than share the lowest cost, cannot
+    be had: the end of the bracket is then returned.
 
     Args:
-        costs: not all need be finite. wanted: in [1, sample].
+        costs: not all need be finite.
+        wanted: in [1, sample].
     """
     finite = jnp.isfinite(costs)
     lowest = jnp.min(jnp.where(finite, costs, jnp.inf))
     highest = jnp.max(jnp.where(finite, costs, -jnp.inf))
     spread = highest - lowest
     spread = jnp.where(jnp.isfinite(spread) & (spread > 0), spread, 1.0)
-    above = jnp.where(finite, (costs - lowest) / spread, jnp.inf)  # at scale 1, whatever the units of cost
+    above = jnp.where(
+        finite, (costs - lowest) / spread, jnp.inf
+    )  # at scale 1, whatever the units of cost
 
     def narrow(_: Any, bracket: tuple[Scalar, Scalar]) -> tuple[Scalar, Scalar]:
         low, high = bracket

@@ -11,7 +11,15 @@ from jaxtyping import Array, Float
 from sfkd_jax.control.laws._model_law import ModelLaw
 from sfkd_jax.control.laws._path_errors import Law, path_errors, reference_curvature
 from sfkd_jax.control.tasks._costs import Cost, Stage
-from sfkd_jax.control.tasks._task import Actuator, Advanced, Applied, Began, Environments, Task, actuator_limits
+from sfkd_jax.control.tasks._task import (
+    Actuator,
+    Advanced,
+    Applied,
+    Began,
+    Environments,
+    Task,
+    actuator_limits,
+)
 from sfkd_jax.types import Control, Environment, Model, Params, Reference, Scalar, State
 
 
@@ -42,18 +50,28 @@ def path_tracking(
         u_k = limit(clip(u_ff(κ_k) + K ξ_k) + ν_k),   J = Σ_k ℓ(x_k, u_k) + λ_z |z_k − z_k^ref|² + w_T ℓ(x_T, u_T)
 
     Args:
-        model: rolled out; `fiber` and `encode` are evaluated once a step, outside the scan.
-        cost: ℓ, see `tracking_cost`. law: u_ff + K ξ; see `path_feedback`, `ModelLaw`, `no_feedback`.
-        dt: [s]. control_low, control_high: actuator limits, in control units. control_rate: per second, or None.
-        terminal_weight: w_T, on top of the last step's ℓ. latent_weight: λ_z.
-        actuator: where the actuators stand, from the observation; else rates count from the control applied last.
-        ancillary: a second law; what it would do along the whole horizon is one more sample.
+        model: rolled out; `fiber` and `encode` are evaluated once a step, outside the
+            scan.
+        cost: ℓ, see `tracking_cost`.
+        law: u_ff + K ξ; see `path_feedback`, `ModelLaw`, `no_feedback`.
+        dt: [s].
+        control_low, control_high: actuator limits, in control units.
+        control_rate: per second, or None.
+        terminal_weight: w_T, on top of the last step's ℓ.
+        latent_weight: λ_z.
+        actuator: where the actuators stand, from the observation; else rates count from
+            the control applied last.
+        ancillary: a second law; what it would do along the whole horizon is one more
+            sample.
 
     Raises:
         ValueError: limits that cannot be meant.
     """
     limit = actuator_limits(control_low, control_high, control_rate, dt)
-    low, high = jnp.asarray(control_low, dtype=float), jnp.asarray(control_high, dtype=float)
+    low, high = (
+        jnp.asarray(control_low, dtype=float),
+        jnp.asarray(control_high, dtype=float),
+    )
 
     def asked(state: State, target: Any) -> Control:
         """What the law wants at a state, as far as the actuators can give it."""
@@ -62,14 +80,25 @@ def path_tracking(
             wanted = law.control(turn, state, point, curvature)
         else:
             wanted = law(path_errors(state, point, curvature), curvature, point[3])
-        # Else a perturbation would also make up for what the law asks in vain: of a reading far off, thousands of
-        # radians, which stay in the plan when the readings are right again.
+        # Else a perturbation would also make up for what the law asks in vain: of a
+        # reading far off, thousands of radians, which stay in the plan when the
+        # readings are right again.
         return jnp.clip(wanted, low, high)
 
-    def begin(params: Params, observation: State, env: Environment, reference: Reference, applied: Applied) -> Began:
-        fiber = model.fiber(model.fold(params), env)  # of many rollouts; nothing is left to fold if that was done ahead
+    def begin(
+        params: Params,
+        observation: State,
+        env: Environment,
+        reference: Reference,
+        applied: Applied,
+    ) -> Began:
+        fiber = model.fiber(
+            model.fold(params), env
+        )  # of many rollouts; nothing is left to fold if that was done ahead
         curvature = reference_curvature(reference)
-        goals = jax.vmap(lambda point: model.encode(fiber, _on_path(observation, point)))(reference)
+        goals = jax.vmap(
+            lambda point: model.encode(fiber, _on_path(observation, point))
+        )(reference)
         errors = path_errors(observation, reference[0], curvature[0])
         turns = None
         if isinstance(law, ModelLaw):
@@ -86,7 +115,9 @@ def path_tracking(
             proposals = followed(ancillary, turns, fiber, start, targets)
         return Began(fiber, start, targets, proposals)
 
-    def followed(other: ModelLaw, turns: Any, fiber: Any, start: PathSample, targets: Any) -> Array:
+    def followed(
+        other: ModelLaw, turns: Any, fiber: Any, start: PathSample, targets: Any
+    ) -> Array:
         """What another law does along the horizon, as a perturbation of the law: (1, horizon, control)."""
 
         def step(before: PathSample, inputs: Any) -> tuple[PathSample, Control]:
@@ -99,18 +130,35 @@ def path_tracking(
 
         return jax.lax.scan(step, start, (targets, turns))[1][None]
 
-    def advance(weights: Any, fiber: Any, before: PathSample, nu: Control, target: Any, last: Scalar) -> Advanced:
+    def advance(
+        weights: Any,
+        fiber: Any,
+        before: PathSample,
+        nu: Control,
+        target: Any,
+        last: Scalar,
+    ) -> Advanced:
         point, curvature, goal, _ = target
         lawful = asked(model.decode(fiber, before.latent), target)
         control = limit(lawful + nu, before.control)
         latent = model.step(fiber, before.latent, control)
         after = model.decode(fiber, latent)
         errors = path_errors(after, point, curvature)
-        charge = cost.stage(weights, Stage(errors, before.errors, control, before.control, point[3]))
+        charge = cost.stage(
+            weights, Stage(errors, before.errors, control, before.control, point[3])
+        )
         if latent_weight:
-            charge = charge + latent_weight * jnp.sum((model.vector(latent) - model.vector(goal)) ** 2)
+            charge = charge + latent_weight * jnp.sum(
+                (model.vector(latent) - model.vector(goal)) ** 2
+            )
         charge = charge * (1.0 + terminal_weight * last)
-        return Advanced(PathSample(latent, errors, control), charge, control, control - lawful, after)
+        return Advanced(
+            PathSample(latent, errors, control),
+            charge,
+            control,
+            control - lawful,
+            after,
+        )
 
     return Task(low, high, cost.weights, begin, advance, check_path)
 
@@ -120,11 +168,19 @@ def _on_path(state: State, point: Float[Array, " 4"]) -> State:
     return jnp.zeros_like(state).at[:4].set(point)
 
 
-def check_path(observation: State, env: Environments, reference: Any, horizon: int) -> None:
+def check_path(
+    observation: State, env: Environments, reference: Any, horizon: int
+) -> None:
     """Name the argument that has the wrong shape."""
     if observation.ndim != 1 or observation.shape[0] < 4:
-        raise ValueError(f"observation must be (p_x, p_y, yaw, v, …), shape (nx,), got {observation.shape}")
+        raise ValueError(
+            f"observation must be (p_x, p_y, yaw, v, …), shape (nx,), got {observation.shape}"
+        )
     if env.ndim not in (1, 2):
-        raise ValueError(f"env must have shape (ne,), or (particle, ne), got {env.shape}")
+        raise ValueError(
+            f"env must have shape (ne,), or (particle, ne), got {env.shape}"
+        )
     if reference.shape != (horizon, 4):
-        raise ValueError(f"reference must have shape ({horizon}, 4): x, y, yaw, speed; got {reference.shape}")
+        raise ValueError(
+            f"reference must have shape ({horizon}, 4): x, y, yaw, speed; got {reference.shape}"
+        )

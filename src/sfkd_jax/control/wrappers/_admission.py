@@ -50,9 +50,10 @@ def admit(
         margin(s) = width − max_k |ê_y,k|,   s = the largest of `SHARES` with margin(s) ≥ 0
 
     e is held. Both channels are scaled by one s: what is applied then lies between the
-    law, which is the backup, and the request, at the planner's ratio of steering to drive.
-    If no share passes, the law alone competes with the largest steering to either side and
-    the largest margin wins, so the predicted deviation never exceeds that of the law alone.
+    law, which is the backup, and the request, at the planner's ratio of steering to
+    drive. If no share passes, the law alone competes with the largest steering to
+    either side and the largest margin wins, so the predicted deviation never exceeds
+    that of the law alone.
 
     Args:
         model: of the closed loop along a path.
@@ -71,11 +72,15 @@ def admit(
     shares = jnp.asarray((*SHARES, 0.0, 0.0), dtype=float)
     tried = jnp.concatenate([shares[: len(SHARES), None] * asked, aside])
 
-    def advance(latent: Latent, nu: Control, road: Float[Array, " 2"]) -> tuple[Latent, Scalar]:
+    def advance(
+        latent: Latent, nu: Control, road: Float[Array, " 2"]
+    ) -> tuple[Latent, Scalar]:
         after = model.step(fiber, latent, jnp.concatenate([nu, road]))
         return after, model.decode(fiber, after)[BODY][LATERAL]
 
-    def alone(latents: Latent, road: Float[Array, " 2"]) -> tuple[Latent, Float[Array, " tried"]]:
+    def alone(
+        latents: Latent, road: Float[Array, " 2"]
+    ) -> tuple[Latent, Float[Array, " tried"]]:
         return jax.vmap(lambda latent: advance(latent, jnp.zeros(2), road))(latents)
 
     first, beside = jax.vmap(lambda nu: advance(latent, nu, ahead[0]))(tried)
@@ -84,7 +89,9 @@ def admit(
     margins = jnp.where(jnp.isfinite(deviations), width - deviations, -jnp.inf)
 
     passing = margins[: len(SHARES)] >= 0.0
-    backup = len(SHARES) - 1 + jnp.argmax(margins[len(SHARES) - 1 :])  # the law wins a tie
+    backup = (
+        len(SHARES) - 1 + jnp.argmax(margins[len(SHARES) - 1 :])
+    )  # the law wins a tie
     chosen = jnp.where(jnp.any(passing), jnp.argmax(passing), backup)
     return Admitted(
         nu=tried[chosen],

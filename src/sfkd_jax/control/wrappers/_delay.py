@@ -15,7 +15,8 @@ class DelayState(NamedTuple):
     """What delay compensation carries.
 
     Attributes:
-        inner: state of the controller. sent: controls on their way, oldest first.
+        inner: state of the controller.
+        sent: controls on their way, oldest first.
     """
 
     inner: Any
@@ -23,17 +24,24 @@ class DelayState(NamedTuple):
 
 
 def compensated(
-    controller: Controller, model: Model, *, delay: int, resting: tuple[float, ...] = (0.0, 0.0)
+    controller: Controller,
+    model: Model,
+    *,
+    delay: int,
+    resting: tuple[float, ...] = (0.0, 0.0),
 ) -> Controller:
     """The same controller for actuators that answer `delay` sampling periods late.
 
         x̂_{k+d} = F(… F(x_k, u_{k−d}, e_k) …, u_{k−1}, e_k),   u_k = act(x̂_{k+d}, e_k, reference)
 
-    The observation is carried forward by the model through the controls already sent, and the controller plans from
-    there. The reference must be that of the time at which the control arrives.
+    The observation is carried forward by the model through the controls already sent,
+    and the controller plans from there. The reference must be that of the time at which
+    the control arrives.
 
     Args:
-        controller: any. model: predicts; the one of the controller's own rollouts. delay: d, at least 1.
+        controller: any.
+        model: predicts; the one of the controller's own rollouts.
+        delay: d, at least 1.
         resting: what is in force before the first control arrives.
 
     Returns:
@@ -46,16 +54,25 @@ def compensated(
         raise ValueError(f"delay must be at least 1 sampling period, got {delay}")
 
     def init(key: Key) -> DelayState:
-        return DelayState(controller.init(key), jnp.tile(jnp.asarray(resting, dtype=float), (delay, 1)))
+        return DelayState(
+            controller.init(key),
+            jnp.tile(jnp.asarray(resting, dtype=float), (delay, 1)),
+        )
 
     def act(
-        params: Params, state: DelayState, observation: State, env: Environment, reference: Any
+        params: Params,
+        state: DelayState,
+        observation: State,
+        env: Environment,
+        reference: Any,
     ) -> tuple[Control, DelayState, dict[str, Array]]:
         fiber = model.fiber(params, env)
         advance = lambda latent, control: (model.step(fiber, latent, control), None)  # noqa: E731
         latent, _ = jax.lax.scan(advance, model.encode(fiber, observation), state.sent)
         arrival = model.decode(fiber, latent)
-        control, inner, info = controller.act(params, state.inner, arrival, env, reference)
+        control, inner, info = controller.act(
+            params, state.inner, arrival, env, reference
+        )
         sent = jnp.concatenate([state.sent[1:], control[None]])
         return control, DelayState(inner, sent), info | {"arrival_state": arrival}
 

@@ -14,7 +14,17 @@ from sfkd_jax.control.laws._path_law import PathLaw
 from sfkd_jax.control.planners._plans import all_finite
 from sfkd_jax.control.tasks._along_path import curvature_ahead, path_coordinates
 from sfkd_jax.core.path_frame import LATERAL, is_valid, path_state
-from sfkd_jax.types import BODY, Control, Environment, Key, Latent, Model, Params, Reference, State
+from sfkd_jax.types import (
+    BODY,
+    Control,
+    Environment,
+    Key,
+    Latent,
+    Model,
+    Params,
+    Reference,
+    State,
+)
 
 Limits: TypeAlias = tuple[float, ...]
 Box: TypeAlias = tuple[Float[Array, " entry"], Float[Array, " entry"]]
@@ -39,7 +49,9 @@ class CopyState(NamedTuple):
     def stepped(self, latent: Latent) -> CopyState:
         """With the latent one step later; a copy that is not finite has to start anew."""
         running = self.started & all_finite(latent)
-        return self._replace(latent=_where(running, latent, self.latent), started=running)
+        return self._replace(
+            latent=_where(running, latent, self.latent), started=running
+        )
 
 
 class Validity(NamedTuple):
@@ -101,14 +113,18 @@ def locate(
     told = jnp.where(all_finite(env), env, before.env)
     inside = jnp.clip(told, *valid.env)
     readable = all_finite(reference)
-    ahead = jnp.where(readable, _preview(reference, before.ahead.shape[0]), _later(before.ahead))
+    ahead = jnp.where(
+        readable, _preview(reference, before.ahead.shape[0]), _later(before.ahead)
+    )
     folded = model.fold(params)
     fiber = model.fiber(folded, inside)
 
     def switched() -> Latent:
         return model.transport(model.fiber(folded, before.env), fiber, before.latent)
 
-    latent = jax.lax.cond(jnp.all(inside == before.env), lambda: before.latent, switched)
+    latent = jax.lax.cond(
+        jnp.all(inside == before.env), lambda: before.latent, switched
+    )
     measured = path_coordinates(observation, reference[0], ahead[0, 0])
     anchor = model.encode(fiber, path_state(measured))
     clean = readable & all_finite((observation, measured, anchor))
@@ -116,7 +132,9 @@ def locate(
     compared = clean & before.started
     broken = compared & ~(distance <= valid.distance)
     started = before.started | clean
-    latent = _where(clean & (~before.started | (broken & valid.reanchor)), anchor, latent)
+    latent = _where(
+        clean & (~before.started | (broken & valid.reanchor)), anchor, latent
+    )
 
     copy = model.decode(fiber, latent)[BODY]
     xi = jnp.where(clean, measured, copy)
@@ -133,10 +151,14 @@ def locate(
         "dead_reckoning": started & ~clean,
         "env_inside": jnp.all(inside == env),
     }
-    return Located(CopyState(latent, started, inside, ahead), fiber, lawful, applicable, void), flags
+    return Located(
+        CopyState(latent, started, inside, ahead), fiber, lawful, applicable, void
+    ), flags
 
 
-def blank_copy(model: Model, environments: int, coordinates: int, horizon: int) -> Callable[[], CopyState]:
+def blank_copy(
+    model: Model, environments: int, coordinates: int, horizon: int
+) -> Callable[[], CopyState]:
     """() -> a copy that has not started; of the model only shapes are evaluated, once."""
 
     def encoded(key: Key) -> Latent:
@@ -166,7 +188,9 @@ def as_box(name: str, low: Limits | None, high: Limits | None, size: int) -> Box
     top = (math.inf,) * size if high is None else high
     sized = len(bottom) == len(top) == size
     if not sized or not all(a <= b for a, b in zip(bottom, top, strict=True)):
-        raise ValueError(f"{name}_low must lie below {name}_high, {size} entries each, got {low} and {high}")
+        raise ValueError(
+            f"{name}_low must lie below {name}_high, {size} entries each, got {low} and {high}"
+        )
     return jnp.asarray(bottom, dtype=float), jnp.asarray(top, dtype=float)
 
 

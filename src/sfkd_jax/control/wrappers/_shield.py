@@ -11,8 +11,24 @@ from jaxtyping import Array, Int
 from sfkd_jax.control.laws._path_law import PathLaw
 from sfkd_jax.control.planners._plans import all_finite
 from sfkd_jax.control.wrappers._admission import admit
-from sfkd_jax.control.wrappers._nominal_copy import CopyState, Limits, Validity, as_box, blank_copy, locate
-from sfkd_jax.types import Control, Controller, Environment, Key, Model, Params, Reference, State
+from sfkd_jax.control.wrappers._nominal_copy import (
+    CopyState,
+    Limits,
+    Validity,
+    as_box,
+    blank_copy,
+    locate,
+)
+from sfkd_jax.types import (
+    Control,
+    Controller,
+    Environment,
+    Key,
+    Model,
+    Params,
+    Reference,
+    State,
+)
 
 
 class ShieldState(NamedTuple):
@@ -56,10 +72,10 @@ def shielded(
         ν = u − law(ξ; κ_0, v_0, e),   ν' = admit(ν),   u' = clip(law(ξ; κ_0, v_0, e) + ν'),
         ẑ⁺ = F(ẑ; (ν', κ_0, v_0), e),   |ê_y| ≤ width,   |e_y| ≤ width + tube
 
-    The copy ẑ is the model driven with the car's own inputs and never corrected. `tube` is
-    a certified bound of |e_y − ê_y|; see `admit` for what is let through. A control whose
-    request passes whole is returned as it came. Slew limits of the actuators are not known
-    here. Source: Wabersich and Zeilinger, Automatica 129 (2021) 109597.
+    The copy ẑ is the model driven with the car's own inputs and never corrected. `tube`
+    is a certified bound of |e_y − ê_y|; see `admit` for what is let through. A control
+    whose request passes whole is returned as it came. Slew limits of the actuators are
+    not known here. Source: Wabersich and Zeilinger, Automatica 129 (2021) 109597.
 
     - Observation or reference not finite: ξ is that of the copy (`dead_reckoning`), and the
       certificate does not speak, since the law is not closed around the car; without a
@@ -76,9 +92,10 @@ def shielded(
         law: around which the model was learned.
         width: of the nominal corridor to each side [m].
         tube: bound of |e_y − ê_y| [m].
-        control_low: of u. control_high: of u.
-        horizon: steps that the law alone is followed ahead; beyond the reference its last
-            curvature and speed are held.
+        control_low: of u.
+        control_high: of u.
+        horizon: steps that the law alone is followed ahead; beyond the reference its
+            last curvature and speed are held.
         limit: largest |ν|; `law.perturbation` if None.
         noise_allowance: error of a measured e_y that is not held against the tube [m].
         reanchor: put the copy at the measurement when `broken`.
@@ -88,14 +105,16 @@ def shielded(
 
     Returns:
         A `Controller`; `info` gains `margin` [m], `intervention` (1 − s, of the request
-        clipped to `limit`; 0 if it passed, 1 if `void` or steered back),
-        `perturbation` ν', `copy` (its ξ), `copy_distance` |e_y − ê_y| [m] (NaN where there
-        is nothing to compare), `corridor` = width + tube [m], `feasible`, `broken`, `void`,
-        `dead_reckoning`, `request_finite`, `env_inside`, `interventions`, `broken_steps`,
-        and `shield_healthy`: feasible, and nothing at this step speaks against the corridor.
+        clipped to `limit`; 0 if it passed, 1 if `void` or steered back), `perturbation`
+        ν', `copy` (its ξ), `copy_distance` |e_y − ê_y| [m] (NaN where there is nothing
+        to compare), `corridor` = width + tube [m], `feasible`, `broken`, `void`,
+        `dead_reckoning`, `request_finite`, `env_inside`, `interventions`,
+        `broken_steps`, and `shield_healthy`: feasible, and nothing at this step speaks
+        against the corridor.
 
     Raises:
-        ValueError: a model of another frame, or settings or limits that cannot be meant.
+        ValueError: a model of another frame, or settings or limits that cannot be
+            meant.
     """
     _check(model, width, tube, horizon, noise_allowance)
     environments, coordinates = law.low.shape[0] - 2, law.gain.shape[-1]
@@ -126,7 +145,9 @@ def shielded(
     ) -> tuple[Control, ShieldState, dict[str, Array]]:
         if env.shape != (environments,):
             raise ValueError(f"env must have shape ({environments},), got {env.shape}")
-        planned, inner, info = controller.act(params, state.inner, observation, env, reference)
+        planned, inner, info = controller.act(
+            params, state.inner, observation, env, reference
+        )
         seen = (observation, env, reference)
         now, flags = locate(model, law, valid, params, state.copy, seen)
 
@@ -135,7 +156,9 @@ def shielded(
         request = jnp.where(finite, _request(planned, now.lawful, low, high), 0.0)
         bound = jnp.where(now.void, 0.0, largest)
         running = now.state
-        chosen = admit(model, now.fiber, running.latent, request, running.ahead, bound, width=width)
+        chosen = admit(
+            model, now.fiber, running.latent, request, running.ahead, bound, width=width
+        )
         untouched = finite & jnp.all(chosen.nu == request)
         filtered = jnp.clip(now.lawful + chosen.nu, low, high)
         control = jnp.where(now.applicable & ~untouched, filtered, planned)
@@ -149,7 +172,9 @@ def shielded(
             broken_steps=state.broken_steps + flags["broken"],
         )
         feasible = running.started & chosen.feasible
-        doubts = flags["broken"] | now.void | flags["dead_reckoning"] | ~flags["env_inside"]
+        doubts = (
+            flags["broken"] | now.void | flags["dead_reckoning"] | ~flags["env_inside"]
+        )
         report = {
             "margin": jnp.where(running.started, chosen.margin, jnp.nan),
             "intervention": cut,
@@ -173,7 +198,9 @@ def _request(planned: Control, lawful: Control, low: Control, high: Control) -> 
     return jnp.where(above | below, 0.0, planned - lawful)
 
 
-def _check(model: Model, width: float, tube: float, horizon: int, allowance: float) -> None:
+def _check(
+    model: Model, width: float, tube: float, horizon: int, allowance: float
+) -> None:
     """Refuse settings that cannot be meant, naming them."""
     if not model.along_path:
         raise ValueError("shielded needs a model in path coordinates: model.frame=path")
@@ -183,4 +210,6 @@ def _check(model: Model, width: float, tube: float, horizon: int, allowance: flo
     if horizon < 1:
         raise ValueError(f"horizon must be at least 1 step, got {horizon}")
     if not (math.isfinite(allowance) and allowance >= 0.0):
-        raise ValueError(f"noise_allowance must be finite and not negative [m], got {allowance}")
+        raise ValueError(
+            f"noise_allowance must be finite and not negative [m], got {allowance}"
+        )

@@ -8,21 +8,27 @@ from jaxtyping import Array, Float
 from sfkd_jax.types import Scalar
 
 FLOAT32_MARGIN = 1e-5
-"""Relative slack that float32 rounding inside the Gram iteration cannot use up (measured: 2.2e-6)."""
+"""Relative slack that float32 rounding inside the Gram iteration cannot use up
+(measured: 2.2e-6).
+"""
 
 
 GRAM_ITERATIONS = 6
 
 
-def gram_bound(matrix: Float[Array, "rows columns"], *, iterations: int = GRAM_ITERATIONS) -> Scalar:
+def gram_bound(
+    matrix: Float[Array, "rows columns"], *, iterations: int = GRAM_ITERATIONS
+) -> Scalar:
     """An upper bound on ||M||_2 by Gram iteration, at most r^(1/2^(k+1)) too large.
 
-    G_0 = M, G_{k+1} = G_k' G_k rescaled to unit Frobenius norm; ||M||_2 ≤ ||G_k||_F^(1/2^k), scales undone.
-    Nothing in it needs a singular vector, so the gradient is finite at repeated singular values.
-    Source: Delattre et al., arXiv 2305.16173.
+    G_0 = M, G_{k+1} = G_k' G_k rescaled to unit Frobenius norm; ||M||_2 ≤
+    ||G_k||_F^(1/2^k), scales undone. Nothing in it needs a singular vector, so the
+    gradient is finite at repeated singular values. Source: Delattre et al., arXiv
+    2305.16173.
 
     Args:
-        matrix: any shape. iterations: k.
+        matrix: any shape.
+        iterations: k.
     """
     scale = _frobenius(matrix)
     gram = matrix / scale
@@ -37,7 +43,9 @@ def gram_bound(matrix: Float[Array, "rows columns"], *, iterations: int = GRAM_I
     return jnp.exp(log_norm)
 
 
-def bounded(matrix: Float[Array, "rows columns"], bound: float) -> Float[Array, "rows columns"]:
+def bounded(
+    matrix: Float[Array, "rows columns"], bound: float
+) -> Float[Array, "rows columns"]:
     """M · ρ / max(ρ, gram(M)(1 + margin)): M itself while it is small enough, never longer than ρ."""
     norm = gram_bound(matrix) * (1.0 + FLOAT32_MARGIN)
     return matrix * (bound * (1.0 - FLOAT32_MARGIN) / jnp.maximum(bound, norm))
@@ -51,7 +59,8 @@ def unbounded(matrix: Float[Array, "rows columns"]) -> Float[Array, "rows column
 def attainable(bound: float, size: int) -> float:
     """The norm up to which `bounded` reaches every square matrix of this size; beyond, the Gram bound may exceed ρ.
 
-    All singular values alike are the worst case: the Gram bound is then size^(1/2^(k+1)) times the norm.
+    All singular values alike are the worst case: the Gram bound is then
+    size^(1/2^(k+1)) times the norm.
     """
     return bound * (1.0 - 3.0 * FLOAT32_MARGIN) / size ** (0.5 ** (GRAM_ITERATIONS + 1))
 

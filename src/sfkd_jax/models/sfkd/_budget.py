@@ -11,7 +11,9 @@ from sfkd_jax.models.sfkd._sandwich import Weights
 from sfkd_jax.types import Scalar
 
 LARGEST_COUPLING = 0.999
-"""Of ||G||_2 and ||H||_2: what they leave, I − G G' and I − H'H, must keep a Cholesky factor in float32."""
+"""Of ||G||_2 and ||H||_2: what they leave, I − G G' and I − H'H, must keep a Cholesky
+factor in float32.
+"""
 
 
 def share_budget(
@@ -30,16 +32,25 @@ def share_budget(
     same holds for every mixture of the A_j. The multipliers of φ are a witness of the joint bound.
 
     Args:
-        operators, couplings: free, the latter (G, H). network: φ, bounded by 1. alpha: α in (0, 1).
+        operators, couplings: free, the latter (G, H).
+        network: φ, bounded by 1.
+        alpha: α in (0, 1).
 
     Returns:
         A_j, and the residual with G and α H folded into its last and first weights.
     """
     out, into = (bounded(matrix, LARGEST_COUPLING) for matrix in couplings)
     left, right = _left_over(out, into)
-    vertices = alpha * left @ jax.vmap(lambda matrix: bounded(matrix, 1.0))(operators) @ right.T
+    vertices = (
+        alpha
+        * left
+        @ jax.vmap(lambda matrix: bounded(matrix, 1.0))(operators)
+        @ right.T
+    )
     first, *middle, last = network.matrices
-    return vertices, Weights((alpha * first @ into, *middle, out @ last), network.multipliers)
+    return vertices, Weights(
+        (alpha * first @ into, *middle, out @ last), network.multipliers
+    )
 
 
 def budget_factors(
@@ -55,4 +66,6 @@ def _left_over(
 ) -> tuple[Float[Array, "rank rank"], Float[Array, "rank rank"]]:
     """Cholesky factors of I − G G' and I − H'H."""
     identity = jnp.eye(out.shape[0])
-    return jnp.linalg.cholesky(identity - out @ out.T), jnp.linalg.cholesky(identity - into.T @ into)
+    return jnp.linalg.cholesky(identity - out @ out.T), jnp.linalg.cholesky(
+        identity - into.T @ into
+    )

@@ -63,25 +63,36 @@ def sfkd(
         z = Q(e) φ(s, ψ(e)),   z⁺ = A(e) z + B(e) u + r(z; u, e),   z ← T(e → e') z on a switch
         g⁺ = g ∘ D(z; u, e),   s = C z + c
 
-    For every e, by construction and in float32: A(e) = Σ_j w_j(e) A_j with w on the simplex, and z ↦ A_j z + r is
-    α-Lipschitz for every j, hence for every mixture, α = ρ + β; Q orthogonal; Lip_z D bounded; ||C||_2 ≤ 1 in scaled
-    units. With `budget="sum"` ||A_j||_2 ≤ ρ by the Gram bound and Lip_z r ≤ β (sandwich layers; u and e are biases);
-    with "joint" the two share α as one map (see `share_budget`), which holds all of those and more.
+    For every e, by construction and in float32: A(e) = Σ_j w_j(e) A_j with w on the
+    simplex, and z ↦ A_j z + r is α-Lipschitz for every j, hence for every mixture, α =
+    ρ + β; Q orthogonal; Lip_z D bounded; ||C||_2 ≤ 1 in scaled units. With
+    `budget="sum"` ||A_j||_2 ≤ ρ by the Gram bound and Lip_z r ≤ β (sandwich layers; u
+    and e are biases); with "joint" the two share α as one map (see `share_budget`),
+    which holds all of those and more.
 
     Args:
         space: measured scales; fixes all sizes.
-        rank: r, even. rho, beta: the hard bounds, ρ + β < 1 for a certificate; of a joint budget only the sum counts.
-        vertices: operators to mix. embedding: size of ψ(e).
-        residual_hidden, decoder_hidden, encoder_hidden: hidden widths. linear_lift: φ holds W_0 s, see `Encoder`.
-        frame: "body" composes the pose on SE(2) outside z; "segment" is the paper's reading, the pose relative to
-            the start of the window inside z; "path" has path coordinates as body (see `path_frame`) and no pose.
-        residual: "sandwich", "free" (no bound by construction; ||A_j|| ≤ ρ) or "none" (||A_j|| ≤ ρ).
+        rank: r, even.
+        rho, beta: the hard bounds, ρ + β < 1 for a certificate; of a joint budget only
+            the sum counts.
+        vertices: operators to mix.
+        embedding: size of ψ(e).
+        residual_hidden, decoder_hidden, encoder_hidden: hidden widths.
+        linear_lift: φ holds W_0 s, see `Encoder`.
+        frame: "body" composes the pose on SE(2) outside z; "segment" is the paper's
+            reading, the pose relative to the start of the window inside z; "path" has
+            path coordinates as body (see `path_frame`) and no pose.
+        residual: "sandwich", "free" (no bound by construction; ||A_j|| ≤ ρ) or "none"
+            (||A_j|| ≤ ρ).
         budget: "joint" or "sum", of a sandwich residual.
-        transport: learn Q(e), else the identity. environment: use e at all.
-        forcing_hidden: width of f(u, e) = V tanh(G(e) u + h(e)), added to B(e) u: no function of z, so every bound
-            stands as it is; 0 for none.
-        learn_alpha: let training choose α of a joint budget between `LOWEST_RATE` and ρ + β, from the latter on.
-        soft_penalty: weight of the paper's hinge max(0, ||∂r/∂z||_2 − β)² in the training loss (eq:contr_loss).
+        transport: learn Q(e), else the identity.
+        environment: use e at all.
+        forcing_hidden: width of f(u, e) = V tanh(G(e) u + h(e)), added to B(e) u: no
+            function of z, so every bound stands as it is; 0 for none.
+        learn_alpha: let training choose α of a joint budget between `LOWEST_RATE` and ρ
+            + β, from the latter on.
+        soft_penalty: weight of the paper's hinge max(0, ||∂r/∂z||_2 − β)² in the
+            training loss (eq:contr_loss).
 
     Raises:
         ValueError: unknown frame or residual, odd rank, or bounds outside (0, 1).
@@ -99,14 +110,20 @@ def sfkd(
         network_key, encoder_key = jax.random.split(key)
         inputs = jnp.zeros(body + 3 if segment else body)
         return {
-            "networks": networks.init(network_key, jnp.zeros(space.env_mean.shape[0]))["params"],
-            "encoder": encoder.init(encoder_key, inputs, jnp.zeros(embedding))["params"],
+            "networks": networks.init(network_key, jnp.zeros(space.env_mean.shape[0]))[
+                "params"
+            ],
+            "encoder": encoder.init(encoder_key, inputs, jnp.zeros(embedding))[
+                "params"
+            ],
         }
 
     def bounded_parts(params: Params) -> Shared:
         if "shared" in params:  # folded: what runs is then also what is certified
             return params["shared"]
-        return cast(Shared, networks.apply({"params": params["networks"]}, method="shared"))
+        return cast(
+            Shared, networks.apply({"params": params["networks"]}, method="shared")
+        )
 
     def fold(params: Params) -> Params:
         return params | {"shared": bounded_parts(params)}
@@ -114,12 +131,16 @@ def sfkd(
     def fiber(params: Params, env: Environment) -> SfkdFiber:
         shared = bounded_parts(params)
         found = networks.apply(
-            {"params": params["networks"]}, scaled_env(space, env, environment), method="per_environment"
+            {"params": params["networks"]},
+            scaled_env(space, env, environment),
+            method="per_environment",
         )
         local = cast(PerEnvironment, found)
         operator = Mixture(local.mixture, shared.vertices)
         return SfkdFiber(
-            A=operator.summed() if "shared" in params else operator,  # folded is what drives: many steps under one e
+            A=operator.summed()
+            if "shared" in params
+            else operator,  # folded is what drives: many steps under one e
             B=local.B,
             residual=shared.residual.matrices,
             residual_biases=local.residual,
@@ -135,7 +156,9 @@ def sfkd(
         )
 
     def rate(params: Params) -> Scalar:
-        return cast(Scalar, networks.apply({"params": params["networks"]}, method="rate"))
+        return cast(
+            Scalar, networks.apply({"params": params["networks"]}, method="rate")
+        )
 
     def lift(fiber: SfkdFiber, at: Pose, state: State) -> SfkdLatent:
         if state.shape != (3 + body,):
@@ -143,7 +166,9 @@ def sfkd(
         inputs = (state[BODY] - space.body_mean) / space.body_scale
         if segment:
             inputs = jnp.concatenate([between(at, state[POSE]) / pose_scale, inputs])
-        z = cast(jax.Array, encoder.apply({"params": fiber.encoder}, inputs, fiber.embedding))
+        z = cast(
+            jax.Array, encoder.apply({"params": fiber.encoder}, inputs, fiber.embedding)
+        )
         return SfkdLatent(at, rotate_planes(fiber.tangents, z))
 
     def encode(fiber: SfkdFiber, state: State) -> SfkdLatent:
@@ -165,7 +190,10 @@ def sfkd(
         if segment or not pose:
             return SfkdLatent(latent.pose, z)
         motion = apply(fiber.decoder, fiber.decoder_biases.at(u), latent.z)
-        return SfkdLatent(compose(latent.pose, space.increment_mean + space.increment_scale * motion), z)
+        return SfkdLatent(
+            compose(latent.pose, space.increment_mean + space.increment_scale * motion),
+            z,
+        )
 
     def decode(fiber: SfkdFiber, latent: SfkdLatent) -> State:
         reached = latent.pose
@@ -175,14 +203,20 @@ def sfkd(
         scaled = fiber.readout @ latent.z + fiber.centre
         return jnp.concatenate([reached, space.body_mean + space.body_scale * scaled])
 
-    def carry(fiber: SfkdFiber, fiber_next: SfkdFiber, latent: SfkdLatent) -> SfkdLatent:
+    def carry(
+        fiber: SfkdFiber, fiber_next: SfkdFiber, latent: SfkdLatent
+    ) -> SfkdLatent:
         home = rotate_planes(-fiber.tangents, latent.z)
         return latent._replace(z=rotate_planes(fiber_next.tangents, home))
 
     def explicit(params: Params) -> Explicit:
         shared = bounded_parts(params)
         scale = (pose_scale if segment else jnp.asarray(space.increment_scale))[:, None]
-        decoder = (*shared.decoder.matrices[:-1], scale * shared.decoder.matrices[-1]) if pose else ()
+        decoder = (
+            (*shared.decoder.matrices[:-1], scale * shared.decoder.matrices[-1])
+            if pose
+            else ()
+        )
         return Explicit(
             operators=Polytope(shared.vertices),
             residual=() if residual == "none" else shared.residual.matrices,
@@ -213,4 +247,6 @@ def sfkd(
         rate=rate if residual != "free" else None,
         along_path=not pose,
     )
-    return model._replace(start=partial(identified, model, networks, space, environment))
+    return model._replace(
+        start=partial(identified, model, networks, space, environment)
+    )

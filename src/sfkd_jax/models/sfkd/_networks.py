@@ -16,7 +16,9 @@ from sfkd_jax.models.sfkd._sandwich import Free, Sandwich, Weights
 from sfkd_jax.types import Scalar
 
 LOWEST_RATE = 0.5
-"""Of a learned α: no car comes back to its path faster than that in a tenth of a second."""
+"""Of a learned α: no car comes back to its path faster than that in a tenth of a
+second.
+"""
 ALPHA_START = 2.0
 """Logit of a learned α to begin with: 88 % of the way from the lowest to the largest."""
 
@@ -25,7 +27,8 @@ class Biases(NamedTuple):
     """b_k(u, e) = gain_k(e) u + offset_k(e) of every layer of a network, for one e.
 
     Attributes:
-        gains: (out, control) per layer. offsets: (out,) per layer.
+        gains: (out, control) per layer.
+        offsets: (out,) per layer.
     """
 
     gains: tuple[Float[Array, "_ control"], ...]
@@ -33,7 +36,10 @@ class Biases(NamedTuple):
 
     def at(self, control: Float[Array, " control"]) -> tuple[Float[Array, " _"], ...]:
         """The biases under one scaled control."""
-        return tuple(gain @ control + offset for gain, offset in zip(self.gains, self.offsets, strict=True))
+        return tuple(
+            gain @ control + offset
+            for gain, offset in zip(self.gains, self.offsets, strict=True)
+        )
 
 
 class Shared(NamedTuple):
@@ -63,11 +69,18 @@ class Networks(nn.Module):
     """Everything learned but the encoder: embedding ψ(e), operators, residual, decoder, transport.
 
     Attributes:
-        rank: r, even. body, control: sizes of s and u.
-        vertices: number of operator vertices. hidden: widths. embedding: size of ψ(e).
-        rho, beta: the two hard bounds. residual: "sandwich", "free" or "none". transport: whether Q(e) is learned.
-        budget: "sum" bounds A(e) by ρ and the residual by β; "joint" bounds their sum, as one map, by ρ + β.
-        pose: whether there is a decoder of the pose. learn_alpha: whether a joint budget may choose α below ρ + β.
+        rank: r, even.
+        body, control: sizes of s and u.
+        vertices: number of operator vertices.
+        hidden: widths.
+        embedding: size of ψ(e).
+        rho, beta: the two hard bounds.
+        residual: "sandwich", "free" or "none".
+        transport: whether Q(e) is learned.
+        budget: "sum" bounds A(e) by ρ and the residual by β; "joint" bounds their sum,
+            as one map, by ρ + β.
+        pose: whether there is a decoder of the pose.
+        learn_alpha: whether a joint budget may choose α below ρ + β.
         forcing_hidden: width of f(u, e), which is added to B(e) u; 0 for none.
     """
 
@@ -90,28 +103,53 @@ class Networks(nn.Module):
     def setup(self) -> None:
         """Declare the parts."""
         kinds = {"sandwich": Sandwich, "free": Free, "none": Free}
-        self.psi = nn.Sequential([nn.Dense(64), nn.tanh, nn.Dense(64), nn.tanh, nn.Dense(self.embedding), nn.tanh])
-        self.residual_weights = kinds[self.residual](self.rank, self.residual_hidden, self.rank)
+        self.psi = nn.Sequential(
+            [
+                nn.Dense(64),
+                nn.tanh,
+                nn.Dense(64),
+                nn.tanh,
+                nn.Dense(self.embedding),
+                nn.tanh,
+            ]
+        )
+        self.residual_weights = kinds[self.residual](
+            self.rank, self.residual_hidden, self.rank
+        )
         small = nn.initializers.variance_scaling(0.1, "fan_in", "truncated_normal")
         self.mixture_head = nn.Dense(self.vertices, kernel_init=small)
         self.input_head = nn.Dense(self.rank * self.control)
-        self.residual_head = nn.Dense(self._bias_size(self.residual_hidden, self.rank), kernel_init=small)
+        self.residual_head = nn.Dense(
+            self._bias_size(self.residual_hidden, self.rank), kernel_init=small
+        )
         if self.pose:
             self.decoder_weights = Sandwich(self.rank, self.decoder_hidden, 3)
             self.decoder_head = nn.Dense(self._bias_size(self.decoder_hidden, 3))
-            self.log_decoder_bound = self.param("log_decoder_bound", nn.initializers.constant(1.0), ())
+            self.log_decoder_bound = self.param(
+                "log_decoder_bound", nn.initializers.constant(1.0), ()
+            )
         if self.forcing_hidden:
             self.forcing_head = nn.Dense(self.forcing_hidden * (self.control + 1))
-            self.forcing_weights = self.param("forcing", nn.initializers.zeros, (self.rank, self.forcing_hidden))
-        self.tangent_head = nn.Dense(self.rank // 2, kernel_init=small, bias_init=nn.initializers.zeros)
+            self.forcing_weights = self.param(
+                "forcing", nn.initializers.zeros, (self.rank, self.forcing_hidden)
+            )
+        self.tangent_head = nn.Dense(
+            self.rank // 2, kernel_init=small, bias_init=nn.initializers.zeros
+        )
         shape = (self.vertices, self.rank, self.rank)
         self.operators = self.param("operators", _near_identity, shape)
-        self.readout = self.param("readout", nn.initializers.orthogonal(), (self.body, self.rank))
+        self.readout = self.param(
+            "readout", nn.initializers.orthogonal(), (self.body, self.rank)
+        )
         self.centre = self.param("centre", nn.initializers.zeros, (self.body,))
         if self._joint:
-            self.couplings = self.param("couplings", _couplings, (2, self.rank, self.rank))
+            self.couplings = self.param(
+                "couplings", _couplings, (2, self.rank, self.rank)
+            )
             if self.learn_alpha:
-                self.alpha_logit = self.param("alpha_logit", nn.initializers.constant(ALPHA_START), ())
+                self.alpha_logit = self.param(
+                    "alpha_logit", nn.initializers.constant(ALPHA_START), ()
+                )
 
     @property
     def _joint(self) -> bool:
@@ -131,24 +169,41 @@ class Networks(nn.Module):
     def shared(self) -> Shared:
         """What does not depend on e, with every bound in force."""
         vertices, residual = self._step()
-        decoder = self.decoder_weights(jnp.exp(self.log_decoder_bound)) if self.pose else Weights((), ())
+        decoder = (
+            self.decoder_weights(jnp.exp(self.log_decoder_bound))
+            if self.pose
+            else Weights((), ())
+        )
         forcing = (self.forcing_weights,) if self.forcing_hidden else ()
-        return Shared(vertices, residual, decoder, forcing, bounded(self.readout, 1.0), self.centre)
+        return Shared(
+            vertices,
+            residual,
+            decoder,
+            forcing,
+            bounded(self.readout, 1.0),
+            self.centre,
+        )
 
     def _step(self) -> tuple[Array, Weights]:
         """Vertices of A(e) and the residual, such that every step contracts."""
         if self._joint:
-            return share_budget(self.operators, self.couplings, self.residual_weights(1.0), self.rate())
+            return share_budget(
+                self.operators, self.couplings, self.residual_weights(1.0), self.rate()
+            )
         vertices = jax.vmap(lambda matrix: bounded(matrix, self.rho))(self.operators)
         residual = self.residual_weights(self.beta)
         if self.residual == "none":
-            residual = Weights(tuple(jnp.zeros_like(matrix) for matrix in residual.matrices), ())
+            residual = Weights(
+                tuple(jnp.zeros_like(matrix) for matrix in residual.matrices), ()
+            )
         return vertices, residual
 
     def per_environment(self, env: Float[Array, " environment"]) -> PerEnvironment:
         """What depends on e alone; `env` is scaled to about [-1, 1]."""
         embedding = self.psi(env)
-        residual = self._biases(self.residual_head(embedding), self.residual_hidden, self.rank)
+        residual = self._biases(
+            self.residual_head(embedding), self.residual_hidden, self.rank
+        )
         if self.residual == "none":
             residual = jax.tree.map(jnp.zeros_like, residual)
         tangents = self.tangent_head(embedding)
@@ -156,7 +211,9 @@ class Networks(nn.Module):
             mixture=nn.softmax(self.mixture_head(embedding)),
             B=self.input_head(embedding).reshape(self.rank, self.control),
             residual=residual,
-            decoder=self._biases(self.decoder_head(embedding), self.decoder_hidden, 3) if self.pose else Biases((), ()),
+            decoder=self._biases(self.decoder_head(embedding), self.decoder_hidden, 3)
+            if self.pose
+            else Biases((), ()),
             forcing=self._forcing(embedding),
             tangents=tangents if self.transport else jnp.zeros_like(tangents),
             embedding=embedding,
@@ -166,7 +223,9 @@ class Networks(nn.Module):
         """Biases of the hidden layer of f."""
         if not self.forcing_hidden:
             return Biases((), ())
-        table = self.forcing_head(embedding).reshape(self.forcing_hidden, self.control + 1)
+        table = self.forcing_head(embedding).reshape(
+            self.forcing_hidden, self.control + 1
+        )
         return Biases((table[:, :-1],), (table[:, -1],))
 
     def _bias_size(self, hidden: Sequence[int], outputs: int) -> int:
@@ -177,16 +236,21 @@ class Networks(nn.Module):
         table = flat.reshape(sum(hidden) + outputs, self.control + 1)
         edges = [sum(hidden[: k + 1]) for k in range(len(hidden))]
         parts = jnp.split(table, edges)
-        return Biases(tuple(part[:, :-1] for part in parts), tuple(part[:, -1] for part in parts))
+        return Biases(
+            tuple(part[:, :-1] for part in parts), tuple(part[:, -1] for part in parts)
+        )
 
 
 class Encoder(nn.Module):
     """φ(s, ψ(e)) = W_0 s + W_2 tanh(W_1 [s; ψ(e)] + b_1) + b_2, before it is turned into the fibre of e.
 
-    The read-out of s is linear in z: a lift that holds s itself, W_0 s, need not rebuild it from saturating functions.
+    The read-out of s is linear in z: a lift that holds s itself, W_0 s, need not
+    rebuild it from saturating functions.
 
     Attributes:
-        rank: r. hidden: width. linear: whether W_0 is there.
+        rank: r.
+        hidden: width.
+        linear: whether W_0 is there.
     """
 
     rank: int
@@ -194,19 +258,25 @@ class Encoder(nn.Module):
     linear: bool = True
 
     @nn.compact
-    def __call__(self, body: Float[Array, " inputs"], embedding: Float[Array, " embedding"]) -> Array:
+    def __call__(
+        self, body: Float[Array, " inputs"], embedding: Float[Array, " embedding"]
+    ) -> Array:
         """z before rotation, shape (rank,)."""
         hidden = nn.tanh(nn.Dense(self.hidden)(jnp.concatenate([body, embedding])))
         z = nn.Dense(self.rank)(hidden)
         return z + nn.Dense(self.rank, use_bias=False)(body) if self.linear else z
 
 
-def _couplings(key: Array, shape: tuple[int, ...], dtype: jnp.dtype = jnp.float32) -> Array:
+def _couplings(
+    key: Array, shape: tuple[int, ...], dtype: jnp.dtype = jnp.float32
+) -> Array:
     """Norms of about 0.3 each way, so that the residual begins with a gain of about 0.1."""
     return jax.random.normal(key, shape, dtype) * (0.15 / shape[-1] ** 0.5)
 
 
-def _near_identity(key: Array, shape: tuple[int, ...], dtype: jnp.dtype = jnp.float32) -> Array:
+def _near_identity(
+    key: Array, shape: tuple[int, ...], dtype: jnp.dtype = jnp.float32
+) -> Array:
     """Slow dynamics to start from: I plus a little noise."""
     noise = jax.random.normal(key, shape, dtype) * (0.1 / shape[-1] ** 0.5)
     return jnp.eye(shape[-1], dtype=dtype) + noise

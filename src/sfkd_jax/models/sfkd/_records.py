@@ -21,7 +21,8 @@ class SfkdLatent(NamedTuple):
 class Mixture(NamedTuple):
     """A(e) = Σ_j w_j A_j, not summed: the gradient by the A_j then needs no matrix of its own for every e.
 
-    That is what training differentiates, where every step of every window has its own e.
+    That is what training differentiates, where every step of every window has its own
+    e.
     """
 
     weights: Float[Array, " vertex"]

@@ -14,14 +14,17 @@ from sfkd_jax.models.sfkd._bounds import FLOAT32_MARGIN, bounded
 from sfkd_jax.types import Scalar
 
 CAYLEY_RANGE = 8.0
-"""Largest 2-norm of the free matrices: beyond it I + Z is so ill-conditioned that float32 loses orthogonality."""
+"""Largest 2-norm of the free matrices: beyond it I + Z is so ill-conditioned that
+float32 loses orthogonality.
+"""
 
 
 class Weights(NamedTuple):
     """A plain network W_L σ(… σ(W_1 z + b_1) …) + b_L and the multipliers that prove its bound.
 
     Attributes:
-        matrices: W_1 … W_L, each (out, in). multipliers: λ_1 … λ_{L-1}, one vector per hidden layer.
+        matrices: W_1 … W_L, each (out, in).
+        multipliers: λ_1 … λ_{L-1}, one vector per hidden layer.
     """
 
     matrices: tuple[Float[Array, "_ _"], ...]
@@ -52,13 +55,21 @@ class Sandwich(nn.Module):
         matrices, multipliers = [], []
         left = jnp.sqrt(gamma) * jnp.eye(self.inputs)
         for k, (before, after) in enumerate(pairwise(sizes)):
-            square = bounded(self.param(f"square_{k}", spread, (after, after)), CAYLEY_RANGE)
-            tall = bounded(self.param(f"tall_{k}", spread, (before, after)), CAYLEY_RANGE)
+            square = bounded(
+                self.param(f"square_{k}", spread, (after, after)), CAYLEY_RANGE
+            )
+            tall = bounded(
+                self.param(f"tall_{k}", spread, (before, after)), CAYLEY_RANGE
+            )
             A, B = cayley(square, tall)
             if k == len(self.hidden):
                 matrices.append(jnp.sqrt(gamma) * B @ left)
                 break
-            psi = jnp.exp(jnp.clip(self.param(f"psi_{k}", nn.initializers.zeros, (after,)), -5.0, 5.0))
+            psi = jnp.exp(
+                jnp.clip(
+                    self.param(f"psi_{k}", nn.initializers.zeros, (after,)), -5.0, 5.0
+                )
+            )
             matrices.append(jnp.sqrt(2.0) * (B @ left) / psi[:, None])
             multipliers.append(gamma * psi**2)
             left = jnp.sqrt(2.0) * A.T * psi
@@ -78,7 +89,10 @@ class Free(nn.Module):
         del bound
         sizes = (self.inputs, *self.hidden, self.outputs)
         pairs = enumerate(zip(sizes[1:], sizes[:-1], strict=True))
-        matrices = tuple(self.param(f"kernel_{k}", nn.initializers.lecun_normal(), size) for k, size in pairs)
+        matrices = tuple(
+            self.param(f"kernel_{k}", nn.initializers.lecun_normal(), size)
+            for k, size in pairs
+        )
         return Weights(matrices, ())
 
 
@@ -93,7 +107,9 @@ def cayley(
 
 
 def apply(
-    matrices: Sequence[Float[Array, "_ _"]], biases: Sequence[Float[Array, " _"]], z: Float[Array, " _"]
+    matrices: Sequence[Float[Array, "_ _"]],
+    biases: Sequence[Float[Array, " _"]],
+    z: Float[Array, " _"],
 ) -> Float[Array, " _"]:
     """W_L tanh(… tanh(W_1 z + b_1) …) + b_L."""
     for matrix, bias in zip(matrices[:-1], biases[:-1], strict=True):

@@ -21,8 +21,10 @@ class Pairs(NamedTuple):
     """Transitions as regression sees them.
 
     Attributes:
-        before, after: z_k, and z_{k+1} carried back into the fibre of e_k, less the residual at z_k.
-        mixtures: w(e_k). inputs: (ψ(e_k), 1) ⊗ u_k.
+        before, after: z_k, and z_{k+1} carried back into the fibre of e_k, less the
+            residual at z_k.
+        mixtures: w(e_k).
+        inputs: (ψ(e_k), 1) ⊗ u_k.
     """
 
     before: Float[Array, "*sample rank"]
@@ -54,18 +56,25 @@ def identified(
     32, and the raw parameters that the model bounds give them back exactly.
 
     Args:
-        model, networks: of `sfkd`. environment: whether e is used. driven: trajectories, of which the key draws some.
-        transitions: about how many, at most. ridge, iterations: of `bounded_ridge`.
+        model, networks: of `sfkd`.
+        environment: whether e is used.
+        driven: trajectories, of which the key draws some.
+        transitions: about how many, at most.
+        ridge, iterations: of `bounded_ridge`.
     """
     drawn = jax.random.permutation(key, driven.controls.shape[0])
     chosen = drawn[: max(transitions // driven.controls.shape[1], 1)]
     few = jax.tree.map(lambda leaf: leaf[chosen], driven)
-    found = jax.vmap(lambda one: _pairs(model, networks, space, environment, params, one))(few)
+    found = jax.vmap(
+        lambda one: _pairs(model, networks, space, environment, params, one)
+    )(few)
     pairs = jax.tree.map(lambda leaf: leaf.reshape(-1, leaf.shape[-1]), found)
     rank = networks.rank
     raw = params["networks"]
     joint = "couplings" in raw
-    left, right = budget_factors(raw["couplings"]) if joint else (jnp.eye(rank), jnp.eye(rank))
+    left, right = (
+        budget_factors(raw["couplings"]) if joint else (jnp.eye(rank), jnp.eye(rank))
+    )
     size, bound = (networks.rho + networks.beta, 1.0) if joint else (1.0, networks.rho)
     operators, gains = bounded_ridge(
         pairs.before @ right,
@@ -76,27 +85,46 @@ def identified(
         ridge=ridge,
         iterations=iterations,
     )
-    *kernel, bias = (size * left @ gains).reshape(rank, -1, networks.control).swapaxes(0, 1)
+    *kernel, bias = (
+        (size * left @ gains).reshape(rank, -1, networks.control).swapaxes(0, 1)
+    )
     head = {"kernel": jnp.stack(kernel).reshape(len(kernel), -1), "bias": bias.ravel()}
-    return params | {"networks": raw | {"operators": jax.vmap(unbounded)(operators), "input_head": head}}
+    return params | {
+        "networks": raw
+        | {"operators": jax.vmap(unbounded)(operators), "input_head": head}
+    }
 
 
 def _pairs(
-    model: Model, networks: Networks, space: Space, environment: bool, params: Params, driven: Trajectory
+    model: Model,
+    networks: Networks,
+    space: Space,
+    environment: bool,
+    params: Params,
+    driven: Trajectory,
 ) -> Pairs:
     """The transitions of one trajectory."""
     fibers, later = fibers_along(model, params, driven)
     origin = model.encode(_first(fibers), driven.states[0])
     seen = jax.vmap(model.observe, in_axes=(0, None, 0))
     before = seen(fibers, origin, driven.states[:-1])
-    after = jax.vmap(model.transport)(later, fibers, seen(later, origin, driven.states[1:]))
-    alone = fibers._replace(A=jax.tree.map(jnp.zeros_like, fibers.A), B=jnp.zeros_like(fibers.B))
+    after = jax.vmap(model.transport)(
+        later, fibers, seen(later, origin, driven.states[1:])
+    )
+    alone = fibers._replace(
+        A=jax.tree.map(jnp.zeros_like, fibers.A), B=jnp.zeros_like(fibers.B)
+    )
     residual = jax.vmap(model.step)(alone, before, driven.controls)
 
     def features(env: Array, control: Array) -> tuple[Array, Array]:
         scaled = scaled_env(space, env, environment)
-        local = networks.apply({"params": params["networks"]}, scaled, method="per_environment")
-        mixture, embedding = cast(PerEnvironment, local).mixture, cast(PerEnvironment, local).embedding
+        local = networks.apply(
+            {"params": params["networks"]}, scaled, method="per_environment"
+        )
+        mixture, embedding = (
+            cast(PerEnvironment, local).mixture,
+            cast(PerEnvironment, local).embedding,
+        )
         u = (control - space.control_mean) / space.control_scale
         return mixture, jnp.outer(jnp.append(embedding, 1.0), u).ravel()
 

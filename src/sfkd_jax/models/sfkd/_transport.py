@@ -6,19 +6,25 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 
-def rotate_planes(tangents: Float[Array, " plane"], z: Float[Array, " rank"]) -> Float[Array, " rank"]:
+def rotate_planes(
+    tangents: Float[Array, " plane"], z: Float[Array, " rank"]
+) -> Float[Array, " rank"]:
     """Q z for the Cayley transform Q = (I − S)⁻¹(I + S) of S = diag(t_i J), J = [[0, −1], [1, 0]], in closed form.
 
     Plane i = (z_i, z_{i + r/2}) turns by 2 arctan t_i; −t undoes t exactly.
 
-    Q loses nothing against a full orthogonal Q(e): in the coordinates Q(e)' z the transport is the identity and
-    A(e), B(e) and the networks are conjugated, which a model with free A(e), B(e) represents anyway. What matters
-    is that T is an isometry, T(e → e) = I, and a cocycle.
+    Q loses nothing against a full orthogonal Q(e): in the coordinates Q(e)' z the
+    transport is the identity and A(e), B(e) and the networks are conjugated, which a
+    model with free A(e), B(e) represents anyway. What matters is that T is an isometry,
+    T(e → e) = I, and a cocycle.
 
     Args:
-        tangents: t, one per plane. z: of even length.
+        tangents: t, one per plane.
+        z: of even length.
     """
     first, second = jnp.split(z, 2)
     scale = 1.0 / (1.0 + tangents**2)
     cosine, sine = (1.0 - tangents**2) * scale, 2.0 * tangents * scale
-    return jnp.concatenate([cosine * first - sine * second, sine * first + cosine * second])
+    return jnp.concatenate(
+        [cosine * first - sine * second, sine * first + cosine * second]
+    )
