@@ -10,5 +10,5 @@ python -m sfkd_jax.certify +experiment=s3 vehicle=own vehicle.step=commonroad_tr
   vehicle.wind_force=10.0 vehicle.control_low='[-0.5,-6.0]' vehicle.control_high='[0.5,3.0]' dataset.law.points='[9,3,5]' \
   dataset.law.lateral_acceleration=1.9 dataset.lateral_acceleration=1.7 dataset.segments=4000 training.steps=3000 training.batch=64 \
   certification.corridor.attack_steps=50000 root="${ROOT:-runs}" "$@"
-python benchmarks/commonroad_path.py --root "${ROOT:-runs}"
-python benchmarks/commonroad_page.py --write
+python -m experiments.commonroad.path --root "${ROOT:-runs}"
+python -m experiments.commonroad.page --write

@@ -3,5 +3,5 @@
 # policies after training on from 200 drives of the drift car; then docs/plants.md. Needs the extra `plants`.
 set -euo pipefail
 cd "$(dirname "${BASH_SOURCE[0]}")/../.."
-python benchmarks/commonroad.py "$@"
-python benchmarks/commonroad_page.py --write
+python -m experiments.commonroad.train "$@"
+python -m experiments.commonroad.page --write

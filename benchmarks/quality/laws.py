@@ -1,0 +1,158 @@
+"""Trained policies driven by MPPI around different laws, samplers and numbers of samples, on the same episodes.
+
+python -m benchmarks.quality.laws RUN ... [--scenarios s2 s3 --episodes 6 --seconds 15 --only
+LABEL ... --out FILE] RUN: directories with policy.npz in them. Differences are to the
+first contender, with a paired 95 % interval.
+"""
+
+import argparse
+import json
+import time
+from functools import partial
+
+import jax
+import numpy as np
+
+import sfkd_jax
+from sfkd_jax import control, evaluation, scenarios
+from sfkd_jax.build import build_vehicle
+
+SENSORS = (0.015, 0.015, 0.002, 0.03, 0.02, 0.002, 0.001)
+SPREAD = (0.02, 0.3)
+WHITE = {"noise": "white"}
+KNOTS = {"noise": "rbf", "noise_knots": 4, "effective_samples": 30.0}
+CURVED = WHITE | {"curvature": True, "effective_samples": 30.0}
+CONTENDERS = {
+    "feedback, 1500, white": ("feedback", 1500, WHITE),
+    "feedback, 1500": ("feedback", 1500, {}),
+    "feedback, 300, white": ("feedback", 300, WHITE),
+    "feedback, 300": ("feedback", 300, {}),
+    "feedback, 300, knots": ("feedback", 300, KNOTS),
+    "feedback, 300, curvature": ("feedback", 300, CURVED),
+    "feedback, 300, ancillary": ("ancillary", 300, {}),
+    "feedback, 300, curvature, ancillary": ("ancillary", 300, CURVED),
+    "model, 300": ("model", 300, {}),
+    "model, 300, curvature": ("model", 300, CURVED),
+    "model, 75, curvature": ("model", 75, CURVED | {"effective_samples": 10.0}),
+    "model, alone": ("model", 1, {"noise_std": (1e-6, 1e-6)}),
+}
+"""Label -> law, number of samples, options of the planner."""
+
+
+def planner_of(policy, plant, law, samples, options):
+    """One contender."""
+    model_law = control.ModelLaw(dt=plant.dt)
+    laws = {
+        "model": model_law,
+        "feedback": control.path_feedback(wheelbase=plant.wheelbase),
+    }
+    task = control.path_tracking(
+        policy.model,
+        control.tracking_cost(dt=plant.dt),
+        laws["model" if law == "model" else "feedback"],
+        dt=plant.dt,
+        control_low=plant.control_low,
+        control_high=plant.control_high,
+        ancillary=model_law if law == "ancillary" else None,
+    )
+    box = {
+        side: tuple(policy.settings["dataset"][side])
+        for side in ("env_low", "env_high")
+    }
+    return control.mppi(
+        task, num_samples=samples, **{"noise_std": SPREAD, **box, **options}
+    )
+
+
+def drive(policy, plant, planner, roads, keys):
+    """Lateral RMSE of every episode [mm], and the mean steering rate [rad/s]."""
+    run = partial(
+        evaluation.simulate, plant.step, planner, policy.params, dt=plant.dt, horizon=20
+    )
+    episodes = jax.jit(jax.vmap(partial(run, observation_noise=SENSORS)))(roads, keys)
+    rate = (
+        np.abs(np.diff(np.asarray(episodes.controls)[..., 0], axis=1)).mean() / plant.dt
+    )
+    return 1e3 * np.sqrt((np.asarray(episodes.lateral) ** 2).mean(axis=1)), float(rate)
+
+
+def compared(run, scenario, asked):
+    """Rows of one policy on one scenario; printed as they come."""
+    policy = sfkd_jax.load(run)
+    plant = build_vehicle(policy.settings["vehicle"])
+    sizes = {
+        "duration": asked.seconds,
+        "state_size": len(plant.state_names),
+        "dt": plant.dt,
+    }
+    road_key, drive_key = jax.random.split(jax.random.key(asked.seed))
+    family = scenarios.scenario(name=scenario, **sizes)
+    roads = jax.jit(jax.vmap(family))(jax.random.split(road_key, asked.episodes))
+    keys = jax.random.split(drive_key, asked.episodes)
+    first = None
+    for label in asked.only:
+        began = time.perf_counter()
+        found, rate = drive(
+            policy, plant, planner_of(policy, plant, *CONTENDERS[label]), roads, keys
+        )
+        assert np.all(np.isfinite(found))
+        first = found if first is None else first
+        row = {
+            "vehicle": plant.name,
+            "scenario": scenario,
+            "label": label,
+            "rmse_mm": [float(rmse) for rmse in found],
+        }
+        row |= {
+            "steering_rate": rate,
+            "difference_mm": evaluation.paired_difference(found, first),
+        }
+        low, high = row["difference_mm"]["ci95"]
+        print(
+            f"{plant.name:9} {scenario} {label:36} {found.mean():6.1f} mm  {found.mean() - first.mean():+6.1f}",
+            end=" ",
+        )
+        print(
+            f"({low:+.1f}, {high:+.1f})  {rate:.3f} rad/s  {time.perf_counter() - began:.0f} s",
+            flush=True,
+        )
+        yield row
+
+
+def main():
+    """Parse, drive, print, write."""
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument("runs", nargs="+", metavar="RUN")
+    parser.add_argument("--scenarios", nargs="+", default=["s2", "s3"])
+    parser.add_argument("--episodes", type=int, default=6)
+    parser.add_argument("--seconds", type=float, default=15.0)
+    parser.add_argument("--seed", type=int, default=2026)
+    parser.add_argument(
+        "--only",
+        nargs="+",
+        default=list(CONTENDERS),
+        choices=list(CONTENDERS),
+        metavar="LABEL",
+    )
+    parser.add_argument("--out")
+    asked = parser.parse_args()
+    rows = [
+        row
+        for run in asked.runs
+        for scenario in asked.scenarios
+        for row in compared(run, scenario, asked)
+    ]
+    if asked.out:
+        settings = {key: getattr(asked, key) for key in ("episodes", "seconds", "seed")}
+        with open(asked.out, "w") as file:
+            json.dump(
+                {"rows": rows, "settings": settings, "jax": jax.__version__},
+                file,
+                indent=1,
+            )
+
+
+if __name__ == "__main__":
+    main()

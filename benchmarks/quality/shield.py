@@ -1,0 +1,336 @@
+"""Planners that try to drive a car off its road, through the shield of a certified policy and without it.
+
+python -m benchmarks.quality.shield --runs DIR ... [--drives 200 --episodes 16 --seconds 60
+--out benchmarks/quality/shield.json] DIR: with policy.npz and a certificate.json that has a
+corridor. The true car on S3 roads, seen through its sensors. Asked for with the shield:
+no departure whatever is planned; for the policy's own planner at most 2 % more error on
+the same episodes, requests cut in at most 1 % of the steps, at most 1 ms more a step.
+"""
+
+import argparse
+import json
+from functools import partial
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from benchmarks import measure
+from benchmarks.quality.shield_table import ASKED, FLAGS, misses, table
+from benchmarks.robustness.soak import ENVIRONMENT, LANE
+
+from sfkd_jax import build, policy, scenarios
+from sfkd_jax.control import PathLaw, curvature_ahead, path_coordinates
+from sfkd_jax.core.path_frame import LATERAL
+from sfkd_jax.evaluation import first_reference
+from sfkd_jax.types import Controller
+from sfkd_jax.vehicle import Vehicle
+
+SCRIPTS = ("nothing", "worst", "bang-bang", "random", "constant", "NaN", "full lock")
+"""ν = 0; at its limit, outwards of the measured e_y; to and fro with a period of 1 to 8
+s; to either side, drawn every step; to one side for ever; not a number; u, not ν, at
+the actuators' limits.
+"""
+BATCH, SETTLED = 20, 2.0
+
+
+class Car(NamedTuple):
+    """A certified policy and the plant that it drives."""
+
+    plant: Vehicle
+    trained: policy.Trained
+    law: PathLaw
+    params: dict
+    certificate: dict
+
+    @property
+    def settings(self):
+        """Of the policy's own planner."""
+        return self.trained.settings["controller"]
+
+    @property
+    def sensors(self):
+        """Standard deviation of every entry of the state."""
+        noise = self.certificate["corridor"]["class"]["sensor_noise"]
+        return jnp.asarray(noise[: len(self.plant.state_names)])
+
+
+def load(run):
+    """The car of a run directory."""
+    trained = policy.restore(run)
+    certificate, reason = policy.read_certificate(run, trained)
+    if trained.law is None or not (certificate or {}).get("corridor"):
+        raise SystemExit(
+            f"{run}: no certified corridor; {reason or 'python -m sfkd_jax.certify makes one'}"
+        )
+    return Car(
+        trained.vehicle,
+        trained,
+        trained.law,
+        jax.jit(trained.model.fold)(trained.params),
+        certificate,
+    )
+
+
+def scripted(car, kind, onset=0):
+    """A planner of `SCRIPTS`, by its index, that may be traced; before step `onset` it
+    asks for nothing.
+    """
+    low, high = jnp.asarray(car.plant.control_low), jnp.asarray(car.plant.control_high)
+
+    def act(params, state, observation, env, reference):
+        key, step = state
+        side_key, period_key, now = (
+            jax.random.fold_in(key, stream) for stream in (0, 1, 2 + step)
+        )
+        curvature = curvature_ahead(reference)[0]
+        xi = path_coordinates(observation, reference[0], curvature)
+        side = jax.random.rademacher(side_key, (2,), float)
+        period = jax.random.uniform(period_key, minval=1.0, maxval=8.0)
+        swing = jnp.where(jnp.mod(step * car.plant.dt / period, 1.0) < 0.5, 1.0, -1.0)
+        shares = {
+            "nothing": jnp.zeros(2),
+            "worst": jnp.stack([jnp.where(xi[LATERAL] < 0.0, -1.0, 1.0), 1.0]),
+            "bang-bang": swing * side,
+            "random": jax.random.rademacher(now, (2,), float),
+            "constant": side,
+            "NaN": jnp.full(2, jnp.nan),
+        }
+        lawful = car.law(xi, curvature, reference[0, 3], env)
+        asked = [lawful + share * car.law.perturbation for share in shares.values()]
+        control = jnp.stack([*asked, jnp.where(side > 0.0, high, low)])[
+            jnp.where(step < onset, 0, kind)
+        ]
+        return jnp.clip(control, low, high), (key, step + 1), {}
+
+    return Controller(lambda key: (key, jnp.zeros((), jnp.int32)), act)
+
+
+def planner(car, *, shield):
+    """The policy's own planner."""
+    box = {
+        side: car.trained.settings["dataset"][side] for side in ("env_low", "env_high")
+    }
+    settings, about = (
+        car.settings | {"shield": shield},
+        {"certificate": car.certificate, "law": car.law},
+    )
+    return build.build_controller(
+        settings, car.trained.model, car.plant, **box, **about
+    )
+
+
+def shielded(car, controller):
+    """The same controller in the certified corridor."""
+    return build.in_corridor(
+        controller, car.trained.model, car.plant, car.law, car.certificate
+    )
+
+
+def drive(car, controller, road, key):
+    """e_y before every step and after the last one [m], (time + 1,), and what the
+    shield said at every step.
+    """
+    return drive_states(car, controller, road, key)[1:]
+
+
+def drive_states(car, controller, road, key):
+    """States before every step and after the last one, (time + 1, state), and the rest
+    as `drive` returns it.
+    """
+    planner_key, noise_key = jax.random.split(key)
+    horizon = build.controller_horizon(car.settings)
+
+    def step(carry, given):
+        state, progress, memory = carry
+        env, sensor_key = given
+        observation = state + car.sensors * jax.random.normal(sensor_key, state.shape)
+        window = scenarios.reference_window(
+            road.path, progress, road.speed, dt=car.plant.dt, horizon=horizon
+        )
+        control, memory, info = controller.act(
+            car.params, memory, observation, env, window
+        )
+        state = car.plant.step(state, control, env)
+        progress, lateral = scenarios.project(
+            road.path, state[:2], progress + road.speed * car.plant.dt
+        )
+        said = {}
+        if "copy" in info:
+            said = {name: info[name] for name in ("void", "broken")} | {
+                "infeasible": ~info["feasible"]
+            }
+            said |= {
+                "copy": info["copy"][LATERAL],
+                "intervened": info["intervention"] > 0.0,
+            }
+        return (state, progress, memory), (state, lateral, said)
+
+    start = road.initial_state, jnp.zeros(()), controller.init(planner_key)
+    given = road.envs, jax.random.split(noise_key, len(road.envs))
+    _, (states, lateral, said) = jax.lax.scan(step, start, given)
+    states = jnp.concatenate([road.initial_state[None], states])
+    return states, jnp.concatenate([jnp.zeros(1), lateral]), said
+
+
+def episodes(car, count, seconds, seed):
+    """Roads and keys of as many S3 episodes."""
+    sizes = {
+        "duration": seconds,
+        "state_size": len(car.plant.state_names),
+        "dt": car.plant.dt,
+    }
+    road_key, drive_key = jax.random.split(jax.random.key(seed))
+    roads = jax.jit(jax.vmap(scenarios.scenario(name="s3", **sizes)))(
+        jax.random.split(road_key, count)
+    )
+    return roads, jax.random.split(drive_key, count)
+
+
+def batches(driven, roads, keys):
+    """A vectorised function of (roads, keys), some at a time."""
+    parts = []
+    for begin in range(0, len(keys), BATCH):
+        some = jax.tree.map(
+            lambda leaf, begin=begin: leaf[begin : begin + BATCH], (roads, keys)
+        )
+        parts.append(jax.device_get(driven(*some)))
+    return jax.tree.map(lambda *leaves: np.concatenate(leaves), *parts)
+
+
+def summary(lateral, said, bounds):
+    """What some drives come to."""
+    worst = np.max(np.where(np.isfinite(lateral), np.abs(lateral), np.inf), axis=1)
+    largest = float(np.max(worst))
+    found = {"drives": len(worst), "departures": int(np.sum(~(worst <= LANE)))}
+    found |= {"largest_m": largest if np.isfinite(largest) else None}
+    if not said:
+        return found
+    apart = np.abs(lateral[:, :-1] - said["copy"])
+    width, tube = bounds["nominal"], bounds["followed_position"]
+    found |= {
+        "copy_m": float(np.max(np.abs(said["copy"]))),
+        "distance_m": float(np.max(apart)),
+    }
+    found |= {"inside": float(np.mean(worst <= width + tube))}
+    return found | {name: float(np.mean(said[name])) for name in ("intervened", *FLAGS)}
+
+
+def of_scripts(car, asked, show):
+    """Script -> summaries with the shield and without it."""
+    roads, keys = episodes(car, asked.drives, asked.seconds, asked.seed)
+    bounds, found = car.certificate["corridor"]["bounds"], {}
+
+    def filtered(kind, road, key):
+        return drive(car, shielded(car, scripted(car, kind)), road, key)
+
+    def free(kind, road, key):
+        return drive(car, scripted(car, kind), road, key)
+
+    ways = {
+        name: jax.jit(jax.vmap(way, (None, 0, 0)))
+        for name, way in (("with", filtered), ("without", free))
+    }
+    for kind in map(SCRIPTS.index, asked.scripts):
+        driven = {
+            name: batches(partial(way, kind), roads, keys) for name, way in ways.items()
+        }
+        found[SCRIPTS[kind]] = {
+            name: summary(*arrays, bounds) for name, arrays in driven.items()
+        }
+        show(SCRIPTS[kind], found[SCRIPTS[kind]])
+    return found
+
+
+def of_planner(car, asked):
+    """The policy's own planner with the shield and without it, on the same episodes."""
+    roads, keys = episodes(car, asked.episodes, asked.seconds, asked.seed + 1)
+    bounds, found, rmse = car.certificate["corridor"]["bounds"], {}, {}
+    for name, shield in (("with", True), ("without", False)):
+        run = jax.jit(jax.vmap(partial(drive, car, planner(car, shield=shield))))
+        lateral, said = batches(run, roads, keys)
+        settled = lateral[:, 1 + round(SETTLED / car.plant.dt) :]
+        rmse[name] = np.sqrt(np.mean(settled**2, axis=1))
+        found[name] = summary(lateral, said, bounds) | {
+            "rmse_m": float(np.mean(rmse[name]))
+        }
+    return found | {"rmse_ratio": found["with"]["rmse_m"] / found["without"]["rmse_m"]}
+
+
+def step_times(car, rounds):
+    """A control step of the policy's own planner with the shield and without it [ms]."""
+    roads, keys = episodes(car, 1, 5.0, 0)
+    road = jax.tree.map(lambda leaf: leaf[0], roads)
+    window = first_reference(
+        road, horizon=build.controller_horizon(car.settings), dt=car.plant.dt
+    )
+
+    def job(shield):
+        controller = planner(car, shield=shield)
+        act, state = jax.jit(controller.act), controller.init(keys[0])
+        given = road.initial_state, road.envs[0], window
+        _, state, _ = act(
+            car.params, state, *given
+        )  # the copy runs from the second step on
+        return lambda: jax.block_until_ready(act(car.params, state, *given))
+
+    times = measure.in_turn({"with": job(True), "without": job(False)}, rounds)
+    return times | {
+        "added_ms": times["with"]["median_ms"] - times["without"]["median_ms"]
+    }
+
+
+def main():
+    """Parse, drive, print, write."""
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument("--runs", nargs="+", required=True, metavar="DIR")
+    for name, value in (
+        ("drives", 200),
+        ("episodes", 16),
+        ("seed", 0),
+        ("rounds", 100),
+    ):
+        parser.add_argument(f"--{name}", type=int, default=value)
+    parser.add_argument("--seconds", type=float, default=60.0)
+    parser.add_argument(
+        "--scripts", nargs="*", default=SCRIPTS, choices=SCRIPTS, metavar="PLANNER"
+    )
+    parser.add_argument("--out")
+    parser.add_argument("--time", action="store_true", help=argparse.SUPPRESS)
+    asked = parser.parse_args()
+    if asked.time:
+        print(json.dumps(step_times(load(asked.runs[0]), asked.rounds)))
+        return
+    settings = {
+        key: getattr(asked, key) for key in ("drives", "episodes", "seconds", "seed")
+    }
+    document = {
+        "cars": {},
+        "settings": settings,
+        "asked": ASKED,
+        "machine": measure.machine(),
+    }
+    for run in asked.runs:
+        car, words = load(run), ("--runs", run, "--time", "--rounds", asked.rounds)
+        about = {key: car.certificate[key] for key in ("alpha", "policy_sha256")}
+        found = about | {"bounds": car.certificate["corridor"]["bounds"]}
+        show = lambda label, both: print(
+            car.plant.name, label, json.dumps(both), flush=True
+        )
+        found |= {
+            "scripts": of_scripts(car, asked, show),
+            "planner": of_planner(car, asked),
+        }
+        found |= {
+            "step": measure.in_own_process("benchmarks.quality.shield", *words, environment=ENVIRONMENT)
+        }
+        document["cars"][car.plant.name] = found
+        measure.write(asked.out, document)
+    print(table(document))
+    print("\n".join(misses(document)) or "all that was asked for")
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,279 @@
+"""Sweeps under a real Slurm: jobs that fail, that are requeued, cancelled, out of time, and too large for the node.
+
+python -m benchmarks.robustness.slurm_sweep [--only failures requeue limit large --out
+benchmarks/robustness/slurm_sweep.json] As root on Debian: apt-get install munge slurmctld slurmd
+slurm-client. The cluster (slurm_cluster.py) is one node with two CPUs on the loopback
+address and goes when the script ends. A job is the small walk of drills.py. What the
+file says of drills that are not asked for stays.
+"""
+
+import argparse
+import json
+import subprocess
+import sys
+import tempfile
+import time
+from pathlib import Path
+
+from benchmarks.robustness import drills
+from benchmarks import measure
+from benchmarks.robustness.slurm_cluster import Cluster
+
+LAUNCHER = (
+    "hydra/launcher=cluster",
+    "hydra.launcher.cpus_per_task=1",
+    "hydra.launcher.mem_gb=3",
+)
+SWEPT = "training.learning_rate"
+LONG = ("training.steps=2000", "training.log_every=25", "training.save_every=25")
+"""Training of some minutes, so that there is time to disturb it."""
+
+
+class Sweep:
+    """`train` swept over learning rates, in a folder of its own."""
+
+    def __init__(self, cluster, place, rates, *options, minutes=20):
+        """Start it."""
+        place.mkdir(exist_ok=True)
+        cache = str(cluster.place.parents[1] / "cache")
+        env = {
+            "JAX_COMPILATION_CACHE_DIR": cache,
+            "JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS": "0",
+        } | cluster.env
+        env |= {
+            "XLA_FLAGS": "--xla_backend_optimization_level=0",
+            "TF_CPP_MIN_LOG_LEVEL": "3",
+        }
+        asked = [
+            *drills.JOB,
+            *LAUNCHER,
+            f"hydra.launcher.timeout_min={minutes}",
+            f"{SWEPT}={rates}",
+            *options,
+            "--multirun",
+        ]
+        self.place, self.cluster, self.began = place, cluster, time.monotonic()
+        self._said = (place / f"said{len(list(place.glob('said*')))}.txt").open("w+")
+        command = [sys.executable, "-m", "sfkd_jax.train", *asked]
+        out = {"stdout": subprocess.DEVNULL, "stderr": self._said}
+        self.process = subprocess.Popen(
+            command, cwd=place, env=env, start_new_session=True, **out
+        )
+        cluster.clients.append(self.process)
+
+    def run(self, rate):
+        """The run directory of a job."""
+        return self.place / "runs/smoke" / f"{SWEPT}={rate}" / "sfkd/seed=0"
+
+    def step(self, rate):
+        """The newest checkpoint of a job."""
+        steps = [
+            int(file.name)
+            for file in (self.run(rate) / "checkpoints").glob("*")
+            if file.name.isdigit()
+        ]
+        return max(steps, default=0)
+
+    def until(self, reached, seconds=400):
+        """Wait for something to happen.
+
+        Raises:
+            SystemExit: it does not, or the sweep ended before.
+        """
+        while not reached():
+            if (
+                time.monotonic() - self.began > seconds
+                or self.process.poll() is not None
+            ):
+                raise SystemExit(f"it did not happen: {self.lines()[-5:]}")
+            time.sleep(0.2)
+
+    def lines(self):
+        """What was said of jobs and of the sweep."""
+        self._said.flush()
+        said = Path(self._said.name).read_text().replace(str(self.place), "")
+        return [
+            line
+            for line in said.splitlines()
+            if line.startswith("sfkd_jax: ") or "Traceback" in line
+        ]
+
+    def ended(self, seconds=900):
+        """Exit status, how long it took, and what it said."""
+        status = self.process.wait(timeout=seconds)
+        found = {
+            "status": status,
+            "seconds": round(time.monotonic() - self.began),
+            "said": self.lines(),
+        }
+        print(json.dumps(found, indent=1), flush=True)
+        return found
+
+    def left(self, rate):
+        """What a finished job left, less its times."""
+        return {name: drills.content(self.run(rate) / name) for name in drills.SAME}
+
+
+def failures(cluster, place):
+    """Two good jobs and two bad ones: one that is refused, one whose loss is not
+    finite; then the same sweep again.
+    """
+    rates = "0.001,0.003,-1,1e30"
+    first = Sweep(cluster, place, rates)
+    found = {"rates": rates, "first": first.ended()}
+    before = {
+        rate: (first.run(rate) / "policy.npz").stat().st_mtime_ns
+        for rate in (0.001, 0.003)
+    }
+    left = {rate: first.left(rate) for rate in before}
+    again = Sweep(cluster, place, rates)
+    found["again"] = again.ended()
+    kept = {
+        rate: (again.run(rate) / "policy.npz").stat().st_mtime_ns for rate in before
+    }
+    found["good_trained_again"] = kept != before
+    found["good_changed"] = [
+        name
+        for rate in left
+        for name in left[rate]
+        if again.left(rate)[name] != left[rate][name]
+    ]
+    found["directories"] = sorted(
+        path.name for path in (place / "runs/smoke").iterdir()
+    )
+    return found
+
+
+def requeue(cluster, place):
+    """Of four jobs on two CPUs one is requeued while it trains, a running and a pending
+    one are cancelled.
+    """
+    measure = _undisturbed(cluster, place.parent / "undisturbed")
+    sweep = Sweep(cluster, place / "disturbed", "0.001,0.002,0.003,0.004", *LONG)
+    sweep.until(lambda: sweep.step(0.001) >= 100 and sweep.step(0.002) >= 100)
+    array = next(
+        job.split("_")[0] for job, state in cluster.jobs().items() if state == "RUNNING"
+    )
+    at = sweep.step(0.001)
+    cluster.ask("scontrol", "requeue", f"{array}_0")
+    cluster.ask("scancel", f"{array}_3")
+    sweep.until(lambda: cluster.jobs()[f"{array}_2"] == "RUNNING")
+    cluster.ask("scancel", f"{array}_2")
+    found = {"requeued_at_step": at, "sweep": sweep.ended()}
+    found["different"] = _different(measure, sweep)
+    return found | {"resumed_at_steps": _resumed(sweep)}
+
+
+def limit(cluster, place):
+    """A time limit in mid-training: the job is queued again until it is done, or told
+    in a line if it must not be.
+    """
+    measure = _undisturbed(cluster, place.parent / "undisturbed")
+    short = (*LONG, "hydra.launcher.signal_delay_s=20")
+    sweep = Sweep(cluster, place / "limited", "0.001,0.002", *short, minutes=3)
+    found = {"minutes": [3, 1], "queued_again": sweep.ended(seconds=3000)}
+    found["different"] = _different(measure, sweep)
+    found["resumed_at_steps"] = _resumed(sweep)
+    once = Sweep(
+        cluster,
+        place / "once",
+        "0.001,0.002",
+        *short,
+        "hydra.launcher.max_num_timeout=0",
+        minutes=1,
+    )
+    return found | {"not_queued_again": once.ended()}
+
+
+def large(cluster, place):
+    """More than the node has: processors, memory, accelerators, time, nodes."""
+    asked = (
+        "cpus_per_task=64",
+        "mem_gb=4096",
+        "gpus_per_node=1",
+        "timeout_min=10000",
+        "nodes=3",
+    )
+    found = {}
+    for number, option in enumerate(asked):
+        found[option] = Sweep(
+            cluster, place / str(number), "0.001,0.002", f"hydra.launcher.{option}"
+        ).ended()
+    return found
+
+
+def _undisturbed(cluster, place):
+    """The measure of two drills: the good jobs, left alone.
+
+    Raises:
+        SystemExit: they fail.
+    """
+    sweep = Sweep(
+        cluster, place, "0.001,0.002", *LONG
+    )  # the second time there is nothing to do
+    if sweep.ended()["status"]:
+        raise SystemExit("undisturbed jobs failed")
+    return sweep
+
+
+def _different(one, other):
+    """What two sweeps left that is not the same, bit for bit less times."""
+    pairs = [(rate, one.left(rate), other.left(rate)) for rate in (0.001, 0.002)]
+    return [
+        f"{rate}: {name}" for rate, a, b in pairs for name in a if a[name] != b[name]
+    ]
+
+
+def _resumed(sweep):
+    """At which steps the training of each job began or went on, by the names of its
+    event files.
+    """
+    boards = {
+        rate: (sweep.run(rate) / "tensorboard").glob("*.*") for rate in (0.001, 0.002)
+    }
+    return {
+        rate: sorted(int(file.suffix[1:]) for file in files)
+        for rate, files in boards.items()
+    }
+
+
+DRILLS = {"failures": failures, "requeue": requeue, "limit": limit, "large": large}
+
+
+def main():
+    """Parse, drill, print, write."""
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument("--only", nargs="+", choices=DRILLS, default=list(DRILLS))
+    parser.add_argument("--out")
+    asked = parser.parse_args()
+    found = {}
+    with tempfile.TemporaryDirectory() as scratch:
+        Path(scratch).chmod(0o755)  # munge wants every user to reach its socket
+        for name in asked.only:
+            place = Path(scratch) / name
+            place.mkdir()
+            (place / "cluster").mkdir()
+            with Cluster(place / "cluster") as cluster:
+                found[name] = DRILLS[name](cluster, place)
+            print(json.dumps({name: found[name]}, indent=1), flush=True)
+    slurm = subprocess.run(
+        ["slurmctld", "-V"], capture_output=True, text=True, check=True
+    ).stdout.strip()
+    settings = {"job": drills.JOB, "launcher": LAUNCHER, "long": LONG}
+    kept = (
+        json.loads(Path(asked.out).read_text())
+        if asked.out and Path(asked.out).exists()
+        else {}
+    )
+    measure.write(
+        asked.out,
+        kept
+        | found
+        | {"settings": settings, "slurm": slurm, "machine": measure.machine()},
+    )
+
+
+if __name__ == "__main__":
+    main()

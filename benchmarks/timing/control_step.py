@@ -1,0 +1,121 @@
+"""One control step of every contender, round-robin, each in its own process; prints a table and writes JSON.
+
+python -m benchmarks.timing.control_step [--samples 1500 --horizon 20 --rounds 4 --steps 40
+--only NAME ... --out FILE] Other libraries are used if they import; a contender that
+does not is named and left out. See docs/performance.md.
+"""
+
+import argparse
+import json
+import statistics
+from functools import partial
+
+from benchmarks import measure
+from benchmarks.timing.contenders import CONTENDERS, environment, same_place
+
+
+def rounds_of(jobs, count, steps):
+    """`count` rounds over all jobs (label -> name, samples, horizon), each time in a
+    new process: label -> rounds.
+    """
+    found = {label: [] for label in jobs}
+    for _ in range(count):
+        for label, (name, samples, horizon) in jobs.items():
+            words = (
+                "--measure",
+                name,
+                "--samples",
+                samples,
+                "--horizon",
+                horizon,
+                "--steps",
+                steps,
+            )
+            found[label].append(
+                measure.in_own_process("benchmarks.timing.control_step", *words, environment=environment(name)
+                )
+            )
+    return found
+
+
+def summary(rounds):
+    """Best and median of the rounds' medians, 99 % quantile over all steps, and the
+    rest as medians.
+    """
+    medians = [statistics.median(one["wall_ms"]) for one in rounds]
+    return {
+        "best_ms": min(medians),
+        "median_ms": statistics.median(medians),
+        "p99_ms": measure.quantile(
+            [step for one in rounds for step in one["wall_ms"]], 0.99
+        ),
+        "cpu_ms": statistics.median(statistics.median(one["cpu_ms"]) for one in rounds),
+        "first_s": statistics.median(one["first_s"] for one in rounds),
+        "memory_mb": max(one["memory_mb"] for one in rounds),
+    }
+
+
+def table_of(found):
+    """Rounds -> summaries, and the reasons of those that did not run."""
+    missing = {
+        label: one["error"]
+        for label, rounds in found.items()
+        for one in rounds
+        if "error" in one
+    }
+    return {
+        label: summary(rounds)
+        for label, rounds in found.items()
+        if label not in missing
+    }, missing
+
+
+def arguments():
+    """The command line."""
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    for name, value in (
+        ("samples", 1500),
+        ("horizon", 20),
+        ("rounds", 4),
+        ("steps", 40),
+    ):
+        parser.add_argument(f"--{name}", type=int, default=value)
+    parser.add_argument(
+        "--only", nargs="*", default=list(CONTENDERS), choices=list(CONTENDERS)
+    )
+    parser.add_argument("--out")
+    parser.add_argument("--measure", choices=list(CONTENDERS), help=argparse.SUPPRESS)
+    return parser.parse_args()
+
+
+def main():
+    """Parse, run, print, write."""
+    asked = arguments()
+    if asked.measure:
+        build = partial(same_place, asked.measure, asked.samples, asked.horizon)
+        print(json.dumps(measure.first_and_then(build, asked.steps)))
+        return
+    jobs = {name: (name, asked.samples, asked.horizon) for name in asked.only}
+    table, missing = table_of(rounds_of(jobs, asked.rounds, asked.steps))
+    for name, row in table.items():
+        print(
+            f"{name:24}", "  ".join(f"{key} {value:8.2f}" for key, value in row.items())
+        )
+    for name, reason in missing.items():
+        print(f"{name:24} not run: {reason}")
+    settings = {
+        key: getattr(asked, key) for key in ("samples", "horizon", "rounds", "steps")
+    }
+    document = {
+        "contenders": table,
+        "not_run": missing,
+        "settings": settings,
+        "machine": measure.machine(),
+    }
+    measure.write(asked.out, document)
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,75 @@
+"""A whole episode as one scan of the controller and its plant, against as many single steps; prints JSON.
+
+python -m benchmarks.timing.episode [--samples 1500 --horizon 20 --steps 200 --rounds 3]
+"""
+
+import argparse
+import json
+import statistics
+import time
+
+import jax
+import jax.numpy as jnp
+from benchmarks.timing import ours
+from benchmarks.timing import problem
+from benchmarks import measure
+
+
+def episode_of(controller, w, targets, env, steps):
+    """(state, z) -> the same after `steps` steps of controller and plant, which is the
+    model itself.
+    """
+
+    def body(carry, _):
+        state, z = carry
+        u, state, _ = controller.act(w, state, z, env, targets)
+        return (state, problem.advance(jnp, w, z, u)), None
+
+    return jax.jit(lambda state, z: jax.lax.scan(body, (state, z), length=steps)[0])
+
+
+def main():
+    """Parse, time both in turn, print."""
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    for name, value in (
+        ("samples", 1500),
+        ("horizon", 20),
+        ("steps", 200),
+        ("rounds", 6),
+    ):
+        parser.add_argument(f"--{name}", type=int, default=value)
+    asked = parser.parse_args()
+    controller, w = ours.planner(asked.samples, asked.horizon)
+    w, state, z, env, targets = ours.arguments(controller, w, asked.horizon)
+    run, act = (
+        episode_of(controller, w, targets, env, asked.steps),
+        jax.jit(controller.act),
+    )
+    jax.block_until_ready(run(state, z))
+    step = lambda: jax.block_until_ready(act(w, state, z, env, targets))  # noqa: E731
+    measure.timed(step, measure.WARM_UP)
+    singles, episodes = [], []
+    for _ in range(asked.rounds):
+        singles.append(statistics.median(measure.timed(step, asked.steps)[0]))
+        began = time.perf_counter()
+        jax.block_until_ready(run(state, z))
+        episodes.append(1e3 * (time.perf_counter() - began))
+    single, whole = min(singles), min(episodes)
+    pairs = zip(episodes, singles, strict=True)
+    ratios = {
+        "ratio": whole / (asked.steps * single),
+        "median_ratio": statistics.median(
+            episode / (asked.steps * step) for episode, step in pairs
+        ),
+    }
+    print(
+        json.dumps(
+            {"steps": asked.steps, "step_ms": single, "episode_ms": whole} | ratios
+        )
+    )
+
+
+if __name__ == "__main__":
+    main()

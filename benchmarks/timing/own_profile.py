@@ -1,0 +1,141 @@
+"""Where the control step with the project's own model spends its time: parts alone, and the rollouts less a part.
+
+python -m benchmarks.timing.own_profile [--samples 1500 --horizon 20 --rounds 15 --out
+benchmarks/timing/own_profile.json]
+"""
+
+import argparse
+import json
+
+import jax
+import jax.numpy as jnp
+from benchmarks.timing import own_model
+from benchmarks import measure
+
+from sfkd_jax import control
+
+SMALL = "[2]"
+
+
+def task_of(plant, model, *, law=None, cost=None):
+    """The path task of the configuration, or with another law or cost."""
+    return control.path_tracking(
+        model,
+        cost or control.tracking_cost(dt=plant.dt),
+        law or control.path_feedback(wheelbase=plant.wheelbase),
+        dt=plant.dt,
+        control_low=plant.control_low,
+        control_high=plant.control_high,
+    )
+
+
+def begin_of(task):
+    """What is evaluated once a step: fibre, encoder, curvature."""
+    applied = control.Applied(jnp.zeros(2), jnp.asarray(False))
+    return jax.jit(lambda params, *measured: task.begin(params, *measured, applied))
+
+
+def rollouts_of(task, horizon):
+    """Costs of all plans, by the scan that the planner has."""
+    last = jnp.zeros(horizon).at[-1].set(1.0)
+
+    def roll(began, plans):
+        count = plans.shape[1]
+        batch = jax.tree.map(
+            lambda leaf: jnp.broadcast_to(leaf, (count, *leaf.shape)), began.start
+        )
+
+        def body(carry, given):
+            costs, samples = carry
+            step = jax.vmap(task.advance, in_axes=(None, None, 0, 0, None, None))
+            after = step(task.weights, began.context, samples, *given)
+            return (costs + after.cost, after.sample), after.perturbation
+
+        (costs, samples), effective = jax.lax.scan(
+            body, (jnp.zeros(count), batch), (plans, began.targets, last)
+        )
+        return costs, effective, samples.latent
+
+    return jax.jit(roll)
+
+
+def whole(samples, horizon, **options):
+    """The control step under further options of `mppi`."""
+    controller, given = own_model.problem(samples, horizon, **options)
+    return _call(jax.jit(controller.act), *given)
+
+
+def rollouts(samples, horizon, *overrides, **changes):
+    """Rollouts of a model and a task that are smaller than the real ones."""
+    plant, model, _ = own_model.belief(*overrides)
+    params, *measured = own_model.inputs(plant, model, horizon)
+    task = task_of(plant, model, **changes)
+    began = begin_of(task)(params, *measured)
+    plans = 0.02 * jax.random.normal(jax.random.key(2), (horizon, samples, 2))
+    return _call(rollouts_of(task, horizon), began, plans)
+
+
+def parts(samples, horizon):
+    """Label -> a function of no arguments."""
+    plant, model, _ = own_model.belief()
+    given = own_model.inputs(plant, model, horizon)
+    draw = control.sampler("ar1", horizon=horizon)
+    noise = jax.jit(lambda key: draw(key, samples, jnp.asarray([0.02, 0.3])))
+    free = control.Cost({}, lambda weights, seen: jnp.zeros(()))
+    bare = {"law": control.no_feedback(), "cost": free}
+    return {
+        "whole step": whole(samples, horizon),
+        "whole step, 30 effective samples": whole(
+            samples, horizon, effective_samples=30.0
+        ),
+        "whole step, one sample": whole(1, horizon),
+        "fibre, encoder, curvature": _call(begin_of(task_of(plant, model)), *given),
+        "noise": _call(noise, jax.random.key(3)),
+        "rollouts": rollouts(samples, horizon),
+        "rollouts, one sample": rollouts(1, horizon),
+        "rollouts less the residual": rollouts(samples, horizon, "model.residual=none"),
+        "rollouts, decoder of width 2": rollouts(
+            samples, horizon, f"model.decoder_hidden={SMALL}"
+        ),
+        "rollouts less the cost": rollouts(samples, horizon, cost=free),
+        "rollouts less the law": rollouts(samples, horizon, law=control.no_feedback()),
+        "rollouts less law and cost": rollouts(samples, horizon, **bare),
+        "rollouts less all of these": rollouts(
+            samples,
+            horizon,
+            "model.residual=none",
+            f"model.decoder_hidden={SMALL}",
+            **bare,
+        ),
+    }
+
+
+def _call(run, *given):
+    """Call and wait."""
+    return lambda: jax.block_until_ready(run(*given))
+
+
+def main():
+    """Parse, time, print, write."""
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    for name, value in (("samples", 1500), ("horizon", 20), ("rounds", 15)):
+        parser.add_argument(f"--{name}", type=int, default=value)
+    parser.add_argument("--out")
+    asked = parser.parse_args()
+    found = measure.in_turn(parts(asked.samples, asked.horizon), asked.rounds)
+    for label, row in found.items():
+        print(
+            f"{label:36}",
+            "  ".join(f"{key} {value:7.3f}" for key, value in row.items()),
+        )
+    settings = {key: getattr(asked, key) for key in ("samples", "horizon", "rounds")}
+    measure.write(
+        asked.out, {"parts": found, "settings": settings, "machine": measure.machine()}
+    )
+    print(json.dumps(found["whole step"]))
+
+
+if __name__ == "__main__":
+    main()

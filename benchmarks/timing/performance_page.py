@@ -1,0 +1,75 @@
+"""Print the tables of docs/performance.md from the JSON files beside this script; with --write put them into the page.
+
+python -m benchmarks.timing.performance_page [--write] A table stands in the page between <!-- NAME --> and
+<!-- end -->; the words around it are written by hand.
+"""
+
+import argparse
+import re
+
+from benchmarks.timing import tables
+from benchmarks.timing import targets
+from benchmarks import measure
+
+PAGE = measure.HERE.parent / "docs" / "performance.md"
+TABLES = {
+    "runs": tables.runs,
+    "targets": targets.targets,
+    "steps": lambda: tables.steps(False),
+    "ratios": tables.ratios,
+    "left out": tables.left_out,
+    "sweep": tables.sweep,
+    "compile": tables.compiling,
+    "floor": tables.floor,
+    "tails": tables.tails,
+    "closed loop": tables.closed_loop,
+    "own steps": lambda: tables.steps(True),
+    "profile": tables.profile,
+}
+
+
+def built(build):
+    """A table, or that there is nothing to make it from yet."""
+    try:
+        return build()
+    except FileNotFoundError as absent:
+        return f"Not measured yet: there is no {measure.HERE.name}/{absent.filename.rsplit('/', 1)[-1]}."
+
+
+def put(path, made):
+    """Tables into their places in a page."""
+    page = path.read_text()
+    for name, text in made.items():
+        pattern = re.compile(rf"<!-- {name} -->\n.*?<!-- end -->", re.DOTALL)
+        page, count = pattern.subn(
+            lambda _, text=text, name=name: f"<!-- {name} -->\n{text}\n<!-- end -->",
+            page,
+        )
+        if count != 1:
+            raise SystemExit(
+                f"{path.name} has {count} places for the table {name!r}, not 1"
+            )
+    path.write_text(page)
+
+
+def main():
+    """Parse, print or write."""
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument(
+        "--write", action="store_true", help="put the tables into docs/performance.md"
+    )
+    made = {name: built(build) for name, build in TABLES.items()}
+    if not parser.parse_args().write:
+        print(
+            "\n\n".join(
+                f"<!-- {name} -->\n{text}\n<!-- end -->" for name, text in made.items()
+            )
+        )
+        return
+    put(PAGE, made)
+
+
+if __name__ == "__main__":
+    main()
