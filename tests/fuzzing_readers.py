@@ -257,9 +257,7 @@ def read_rows(folder: Path) -> Any:
 
 
 def rows_hold(found: Any, folder: Path) -> bool:
-    return equal(
-        found, list(plain_json((folder / "results.json").read_bytes())["rows"])
-    )
+    return equal(found, list(plain_json((folder / "results.json").read_bytes())["rows"]))
 
 
 def read_report(folder: Path) -> Any:
@@ -312,7 +310,7 @@ def policy_holds(found: Any, folder: Path) -> bool:
     expected = (
         shipped.settings
         if found.certificate is not None
-        else settings | {"env": "measured"}
+        else settings | {"env_source": "measured"}
     )
     return all(np.array_equal(a, b) for a, b in pairs) and equal(
         found.settings, expected

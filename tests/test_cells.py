@@ -91,7 +91,7 @@ def settings(root, **changes):
         "vehicle": {"dt": 0.1},
         "evaluation": {"episodes": 4},
     }
-    return asked | {"env": "measured", "root": str(root), "name": "table"} | changes
+    return asked | {"env_source": "measured", "root": str(root), "name": "table"} | changes
 
 
 def rows_file(path):
@@ -106,7 +106,7 @@ def test_a_cell_is_done_only_with_its_own_settings_and_undamaged(tmp_path):
     write_json(rows_file(path), {"row": {}, "made_with": grid.made_with(asked)})
     assert grid.is_done(path, asked)
     assert not grid.is_done(path, settings(tmp_path, evaluation={"episodes": 8}))
-    assert not grid.is_done(path, settings(tmp_path, env="estimated"))
+    assert not grid.is_done(path, settings(tmp_path, env_source="estimated"))
     rows_file(path).write_bytes(rows_file(path).read_bytes()[:-5])
     assert not grid.is_done(path, asked)
 

@@ -107,8 +107,8 @@ def test_a_wrong_option_is_refused_by_name(override, says):
 @pytest.mark.parametrize(
     ("overrides", "says"),
     [
-        (["env=guessed"], "measured, estimated, none"),
-        (["env=estimated", "model=sfkd_no_fiber"], "reads the environment"),
+        (["env_source=guessed"], "measured, estimated, none"),
+        (["env_source=estimated", "model=sfkd_no_fiber"], "reads the environment"),
     ],
 )
 def test_an_environment_that_nobody_can_learn_of_is_refused(overrides, says):
@@ -118,7 +118,7 @@ def test_an_environment_that_nobody_can_learn_of_is_refused(overrides, says):
 
 def test_without_an_environment_no_model_reads_one():
     assert config._settings(OmegaConf.create(settings()))["model"]["environment"]
-    assert not config._settings(OmegaConf.create(settings("env=none")))["model"][
+    assert not config._settings(OmegaConf.create(settings("env_source=none")))["model"][
         "environment"
     ]
 

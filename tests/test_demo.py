@@ -103,7 +103,7 @@ def test_a_policy_with_settings_of_another_version_is_named_in_one_line(
 
 
 def test_what_ships_also_drives_where_the_environment_is_not_measured():
-    trained = policy.load(demo.SHIPPED / "kinematic", env="estimated")
+    trained = policy.load(demo.SHIPPED / "kinematic", env_source="estimated")
     act, state = (
         jax.jit(trained.controller.act),
         trained.controller.init(jax.random.key(0)),

@@ -59,7 +59,7 @@ UNKNOWN = {
     "controller.monitor.fallback": "stop",
     "certification.mode": "both",
     "evaluation.systems": ["self", "oracel"],
-    "env": "guessed",
+    "env_source": "guessed",
 }
 TOGETHER = {
     "dataset.shares": [0.5, 0.5, 0.5, 0.5],

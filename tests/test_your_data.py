@@ -28,7 +28,7 @@ SMALL = (
     "dataset.path=logs",
     "dataset.steps=10",
     STATE,
-    "env=none",
+    "env_source=none",
 )
 TINY = (
     "model.rank=8",
@@ -126,9 +126,9 @@ def test_what_logs_cannot_support_is_refused_before_a_run_is_begun(logs, monkeyp
     with pytest.raises(ValueError, match="12 calibration segments are too few for"):
         stages.ensure_policy(asked)
     with pytest.raises(
-        ValueError, match="no column friction for the environment; pass env=none"
+        ValueError, match="no column friction for the environment; pass env_source=none"
     ):
-        stages.ensure_policy(settings(*SMALL, "env=measured", "name=other"))
+        stages.ensure_policy(settings(*SMALL, "env_source=measured", "name=other"))
     with pytest.raises(
         ValueError,
         match="vehicle=own is known from logs alone, so nothing can drive it",

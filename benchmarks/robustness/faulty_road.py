@@ -5,12 +5,12 @@ pure functions.
 from pathlib import Path
 from typing import NamedTuple
 
-from benchmarks.robustness import faults
 import jax
 import jax.numpy as jnp
 import numpy as np
 
 import sfkd_jax
+from benchmarks.robustness import faults
 from sfkd_jax import build, control, scenarios
 
 SHIPPED = Path(sfkd_jax.__file__).with_name("pretrained")
@@ -105,7 +105,7 @@ def controlled(plant, env, delay, samples):
     changes = {"monitor": {"fallback": "hold"}, "mppi": {"num_samples": samples}}
     chosen = settings["controller"]
     chosen = chosen | {name: chosen[name] | change for name, change in changes.items()}
-    policy = sfkd_jax.load(place, controller=chosen, env=env)
+    policy = sfkd_jax.load(place, controller=chosen, env_source=env)
     controller = policy.controller
     if delay:
         controller = control.compensated(controller, policy.model, delay=delay)

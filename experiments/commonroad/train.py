@@ -13,13 +13,13 @@ import time
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from experiments.commonroad import tune
 import jax
 import jax.numpy as jnp
 import numpy as np
-from benchmarks.timing.own_model import settings as composed
 
 import sfkd_jax
+from benchmarks.timing.own_model import settings as composed
+from experiments.commonroad import tune
 from sfkd_jax import adapters, artefacts, build, evaluation, exporting, scenarios
 from sfkd_jax.types import Controller
 
@@ -66,7 +66,7 @@ def nominal_driver(asked, plant, system, states):
         controller,
         found.params,
         states,
-        {"system": system, "env": found.env, "alpha": None, "watched": False},
+        {"system": system, "env": found.env_source, "alpha": None, "watched": False},
     )
 
 
@@ -252,9 +252,7 @@ def main():
     plants = {name: adapters.commonroad_vehicle(model=name) for name in CARS}
     before = {row: sfkd_jax.load(SHIPPED / ours) for row, ours in POLICIES.items()}
     sizes = {"segments": given.segments, "steps": given.steps}
-    after, tuning = tune.tune_all(
-        before, plants["std"], asked, given.root, **sizes
-    )
+    after, tuning = tune.tune_all(before, plants["std"], asked, given.root, **sizes)
     rows, trained = (
         [],
         before | {f"{row}_tuned": policy for row, policy in after.items()},

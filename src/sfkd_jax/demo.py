@@ -34,7 +34,7 @@ def run(settings: dict[str, Any]) -> dict[str, Any]:
     plant = build.build_vehicle(settings["vehicle"])
     track = evaluate_system.lay(settings, plant)
     own = build.System(
-        trained.model, trained.params, settings["env"], trained.certificate, trained.law
+        trained.model, trained.params, settings["env_source"], trained.certificate, trained.law
     )
     systems = {trained.settings["model"]["system"]: own}
     systems |= {
@@ -70,9 +70,9 @@ def _name(settings: dict[str, Any]) -> str:
 
 def _shipped(settings: dict[str, Any]) -> policy.Policy:
     """The policy for a vehicle, with a certificate that holds."""
-    if settings["env"] == "none":
+    if settings["env_source"] == "none":
         raise ValueError(
-            "the controllers that ship read the environment; choose env=measured or env=estimated"
+            "the controllers that ship read the environment; choose env_source=measured or env_source=estimated"
         )
     name, places = (
         _name(settings),

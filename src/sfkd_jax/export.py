@@ -33,7 +33,7 @@ def _write(settings: dict[str, Any]) -> dict[str, Any]:
     place = store.run_directory(settings)
     store.claim(settings)
     _, manifest = artefacts.read_arrays(place / "policy.npz", kind=policy.KIND)
-    trained = policy.load(place, controller=settings["controller"], env=settings["env"])
+    trained = policy.load(place, controller=settings["controller"], env_source=settings["env_source"])
     if trained.certificate is None:
         store.say("exported without a certificate and without a monitor")
     folder = place / FOLDER

@@ -133,7 +133,7 @@ def load(
     path: str | Path,
     *,
     controller: Mapping[str, Any] | None = None,
-    env: str = "measured",
+    env_source: str = "measured",
 ) -> Policy:
     """The policy in a run directory (or a policy.npz with its manifest beside it), its certificate verified.
 
@@ -144,7 +144,7 @@ def load(
         path: where.
         controller: settings of a controller to build instead of the one it was saved
             with.
-        env: "estimated" for a controller that infers the environment and does not read
+        env_source: "estimated" for a controller that infers the environment and does not read
             the one it is given.
 
     Raises:
@@ -154,7 +154,7 @@ def load(
     trained = restore(path)
     file = _file(path)
     certificate, reason = read_certificate(path, trained)
-    settings: dict[str, Any] = trained.settings | {"env": env}
+    settings: dict[str, Any] = trained.settings | {"env_source": env_source}
     blamed: tuple[type[Exception], ...] = (ValueError,)
     if controller is not None:
         settings, blamed = settings | {"controller": dict(controller)}, ()
@@ -166,7 +166,7 @@ def load(
         limits = {
             "env_low": box["env_low"],
             "env_high": box["env_high"],
-            "env": env,
+            "env_source": env_source,
             "certificate": certificate,
         }
         limits["law"] = trained.law

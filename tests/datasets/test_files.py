@@ -327,7 +327,7 @@ WRONG = {
     ),
     "missing e": (
         lambda c: c.pop("wind"),
-        "no column wind for the environment; pass env=none, or map",
+        "no column wind for the environment; pass env_source=none, or map",
     ),
 }
 
@@ -390,7 +390,7 @@ ARRAYS = {
     ),
     "no e": (
         {"x": np.zeros((2, 5, 4)), "u": np.zeros((2, 4, 2))},
-        "no column e for the environment; pass env=none",
+        "no column e for the environment; pass env_source=none",
     ),
 }
 
@@ -459,7 +459,7 @@ def test_contents_decide_which_data_set_it_is(tmp_path):
             "dataset.columns.control must name two columns, got 1",
         ),
         (Columns(environment=("friction", "v")), "dataset.columns names v twice"),
-        (Columns(environment=()), "pass env=none"),
+        (Columns(environment=()), "pass env_source=none"),
     ],
 )
 def test_columns_that_cannot_be_meant_are_refused(tmp_path, columns, says):

@@ -16,7 +16,7 @@ little off.
 """
 ALLOWANCE = 3.0
 """Standard deviations of a measured position that are not held against the tube."""
-ENVS = ("measured", "estimated", "none")
+ENV_SOURCES = ("measured", "estimated", "none")
 """How a controller learns of the environment."""
 
 
@@ -28,10 +28,10 @@ def build_controller(
     env_low: Any = None,
     env_high: Any = None,
     certificate: Settings | None = None,
-    env: str = "measured",
+    env_source: str = "measured",
     law: control.PathLaw | None = None,
 ) -> Controller:
-    """The planner of the settings, watched by a monitor if there is a certificate, told an estimate if `env` asks.
+    """The planner of the settings, watched by a monitor if there is a certificate, told an estimate if `env_source` asks.
 
     Args:
         certificate: what watches the planner; with a corridor and `settings["shield"]`,
@@ -48,9 +48,9 @@ def build_controller(
         )
     build = choose(PLANNERS, settings.get("planner", "mppi"), "controller.planner")
     if model.along_path:
-        if settings["sampling"] != "law" or env == "estimated" or law is None:
+        if settings["sampling"] != "law" or env_source == "estimated" or law is None:
             raise ValueError(
-                "a model in path coordinates needs controller.sampling=law, its law, and env=measured or none"
+                "a model in path coordinates needs controller.sampling=law, its law, and env_source=measured or none"
             )
         planner = build(settings, model, plant, env_low, env_high, law)
         if certificate and certificate.get("corridor") and settings.get("shield"):
@@ -64,7 +64,7 @@ def build_controller(
     )
     return (
         _estimated(watched, settings, model, plant, env_low, env_high)
-        if env == "estimated"
+        if env_source == "estimated"
         else watched
     )
 

@@ -19,7 +19,7 @@ class System(NamedTuple):
 
     model: Model
     params: Any
-    env: str
+    env_source: str
     certificate: dict[str, Any] | None = None
     law: control.PathLaw | None = None
 

@@ -151,19 +151,22 @@ def _settings(config: DictConfig) -> dict[str, Any]:
     """Plain settings; a model that is told nothing of the environment has no use for it.
 
     Raises:
-        ValueError: a setting that cannot be meant, an `env` that there is not, or an
+        ValueError: a setting that cannot be meant, an `env_source` that there is not, or an
             estimate of what the model does not read.
     """
     settings = typing.cast(dict[str, Any], OmegaConf.to_container(config, resolve=True))
     ranges.check(settings)
-    env, model = settings["env"], settings["model"]
-    if env not in build.ENVS:
-        raise ValueError(f"unknown env {env!r}; choose one of {', '.join(build.ENVS)}")
-    if env == "estimated" and not model["environment"]:
+    env_source, model = settings["env_source"], settings["model"]
+    if env_source not in build.ENV_SOURCES:
         raise ValueError(
-            "env=estimated needs a model that reads the environment; drop model.environment=false"
+            f"unknown env_source {env_source!r}; "
+            f"choose one of {', '.join(build.ENV_SOURCES)}"
         )
-    model["environment"] &= env != "none"
+    if env_source == "estimated" and not model["environment"]:
+        raise ValueError(
+            "env_source=estimated needs a model that reads the environment; drop model.environment=false"
+        )
+    model["environment"] &= env_source != "none"
     return settings
 
 

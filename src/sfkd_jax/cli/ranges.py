@@ -79,7 +79,7 @@ _LABELS = ("comparison.rows", "comparison.variations", "comparison.own_controlle
 _KINDS = {
     int: "seed demo.episodes demo.timed_steps comparison.share",
     float: "demo.episode_s controller.task.control_rate dataset.env_low dataset.env_high",
-    str: "name root env report.compare vehicle.step controller.sampling evaluation.variation dataset.columns.drive "
+    str: "name root env_source report.compare vehicle.step controller.sampling evaluation.variation dataset.columns.drive "
     "comparison.rows.* comparison.variations.* comparison.own_controllers.*",
 }
 """Kinds of settings that no schema knows, or that may be null."""
@@ -92,7 +92,7 @@ _REQUIRED = (
     "seed",
     "name",
     "root",
-    "env",
+    "env_source",
     "demo.episodes",
     "demo.episode_s",
     "demo.timed_steps",

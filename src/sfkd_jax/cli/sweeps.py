@@ -95,7 +95,7 @@ class _NamedJobs(Launcher):
         inner: Any = self._inner
         swept = swept_settings(inner.config)
         named = {
-            key for key in swept if key.split(".")[0] in (*store.IDENTITY, "env")
+            key for key in swept if key.split(".")[0] in (*store.IDENTITY, "env_source")
         } - NAMED
         load = inner.hydra_context.config_loader.load_sweep_config
         jobs = []

@@ -111,7 +111,7 @@ def _check_columns(columns: Columns, told: bool) -> None:
         raise ValueError(f"dataset.columns names {twice[0]} twice")
     if told and not columns.environment:
         raise ValueError(
-            "dataset.columns.environment is empty: pass env=none, or name the columns that were measured"
+            "dataset.columns.environment is empty: pass env_source=none, or name the columns that were measured"
         )
 
 
@@ -212,7 +212,7 @@ def _environment(
     absent = [name for name in columns.environment if not held(name)]
     if not absent or (not told and len(absent) == len(columns.environment)):
         return () if absent else columns.environment
-    advice = "pass env=none, or map the columns with dataset.columns.environment"
+    advice = "pass env_source=none, or map the columns with dataset.columns.environment"
     raise ValueError(f"{source}: no column {absent[0]} for the environment; {advice}")
 
 

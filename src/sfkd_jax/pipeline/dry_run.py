@@ -58,7 +58,7 @@ def check(settings: dict[str, Any], plant: Vehicle) -> None:
         limits |= {"law": law}
         limits |= {
             "certificate": {"boxes": boxes, "monitor": {"bounds": (1.0,) * 4}},
-            "env": settings["env"],
+            "env_source": settings["env_source"],
         }
         build.build_controller(settings["controller"], model, plant, **limits)
 

@@ -96,7 +96,7 @@ def prepare(
         "env_high": box["env_high"],
         "certificate": system.certificate,
     }
-    limits |= {"env": system.env, "law": system.law}
+    limits |= {"env_source": system.env_source, "law": system.law}
     if dataset is not None:
         limits |= {
             "env_low": dataset.env_low.tolist(),
@@ -257,7 +257,7 @@ def _about(settings: dict[str, Any], name: str, system: build.System) -> dict[st
         "controller": settings["controller"]["name"],
         "planner": settings["controller"]["planner"],
         "sampling": settings["controller"]["sampling"],
-        "env": system.env,
+        "env": system.env_source,
         "vehicle": settings["vehicle"]["name"],
         "inner_loop": settings["vehicle"]["inner_loop"],
         "seeds": [settings["seed"]],

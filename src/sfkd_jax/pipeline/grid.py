@@ -142,8 +142,8 @@ def driver_of(settings: dict[str, Any]) -> str:
     }
     asked = {
         name: settings[name]
-        for name in (*store.IDENTITY, "env", "controller", "certification", "name")
-    }
+        for name in (*store.IDENTITY, "controller", "certification", "name")
+    } | {"env": settings["env_source"]}
     return artefacts.sha256(asked | {"evaluation": protocol})
 
 
@@ -151,8 +151,8 @@ def made_with(settings: dict[str, Any]) -> str:
     """The hash of the settings that a cell comes from; neither the code nor where the artefacts lie is in it."""
     asked = {
         name: settings[name]
-        for name in (*store.IDENTITY, "env", "controller", "scenario", "evaluation")
-    }
+        for name in (*store.IDENTITY, "controller", "scenario", "evaluation")
+    } | {"env": settings["env_source"]}
     return artefacts.sha256(asked | {"certification": settings["certification"]})
 
 

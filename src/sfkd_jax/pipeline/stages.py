@@ -209,7 +209,7 @@ def own_system(settings: dict[str, Any]) -> build.System:
             raise ValueError(
                 f"controller.monitor.fallback={fallback} needs a certificate; {reason}"
             )
-    told = settings["env"] if trained.settings["model"]["environment"] else "none"
+    told = settings["env_source"] if trained.settings["model"]["environment"] else "none"
     return build.System(trained.model, trained.params, told, certificate, trained.law)
 
 

@@ -72,7 +72,7 @@ def is_logged(settings: dict[str, Any]) -> bool:
 
 def is_told(settings: dict[str, Any]) -> bool:
     """Whether there is an environment that somebody measured or infers."""
-    return settings.get("env") != "none"
+    return settings.get("env_source") != "none"
 
 
 def identity(settings: dict[str, Any]) -> dict[str, Any]:
