@@ -11,9 +11,9 @@ from pathlib import Path
 import jax
 import jax.numpy as jnp
 import numpy as np
+
 from benchmarks.quality import shield
 from benchmarks.robustness.soak import LANE
-
 from sfkd_jax.reporting import draw_film, draw_hostile
 
 SHOWN = ("worst", "bang-bang", "random", "constant", "full lock")

@@ -15,10 +15,10 @@ from typing import NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
-from benchmarks import measure
+
+from benchmarks import harness
 from benchmarks.quality.shield_table import ASKED, FLAGS, misses, table
 from benchmarks.robustness.soak import ENVIRONMENT, LANE
-
 from sfkd_jax import build, policy, scenarios
 from sfkd_jax.control import PathLaw, curvature_ahead, path_coordinates
 from sfkd_jax.core.path_frame import LATERAL
@@ -274,7 +274,7 @@ def step_times(car, rounds):
         )  # the copy runs from the second step on
         return lambda: jax.block_until_ready(act(car.params, state, *given))
 
-    times = measure.in_turn({"with": job(True), "without": job(False)}, rounds)
+    times = harness.in_turn({"with": job(True), "without": job(False)}, rounds)
     return times | {
         "added_ms": times["with"]["median_ms"] - times["without"]["median_ms"]
     }
@@ -310,7 +310,7 @@ def main():
         "cars": {},
         "settings": settings,
         "asked": ASKED,
-        "machine": measure.machine(),
+        "machine": harness.machine(),
     }
     for run in asked.runs:
         car, words = load(run), ("--runs", run, "--time", "--rounds", asked.rounds)
@@ -324,10 +324,12 @@ def main():
             "planner": of_planner(car, asked),
         }
         found |= {
-            "step": measure.in_own_process("benchmarks.quality.shield", *words, environment=ENVIRONMENT)
+            "step": harness.in_own_process(
+                "benchmarks.quality.shield", *words, environment=ENVIRONMENT
+            )
         }
         document["cars"][car.plant.name] = found
-        measure.write(asked.out, document)
+        harness.write(asked.out, document)
     print(table(document))
     print("\n".join(misses(document)) or "all that was asked for")
 

@@ -10,9 +10,9 @@ import argparse
 from pathlib import Path
 
 import numpy as np
+
 from benchmarks.quality import shield
 from benchmarks.quality.speed_page import answer, table
-
 from sfkd_jax import artefacts
 from sfkd_jax.corridor import corridor_by_speed
 

@@ -426,7 +426,7 @@ def main():
         )
         for door in {commands[0][0] for _, commands, _ in DRILLS.values()}:
             importlib.import_module(f"sfkd_jax.{door}")
-        timing = importlib.import_module("timing")
+        timing = importlib.import_module("benchmarks.harness")
         settings = {"seed": asked.seed, "jobs": json.loads(json.dumps(DRILLS))}
         document = (
             json.loads(asked.out.read_text())

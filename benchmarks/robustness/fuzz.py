@@ -11,7 +11,7 @@ import subprocess
 import sys
 from pathlib import Path
 
-from benchmarks import measure
+from benchmarks import harness
 
 ENGINE = Path(__file__).parents[2] / "tests" / "fuzzing.py"
 
@@ -37,9 +37,9 @@ def main():
     if not done.stdout:
         sys.exit(f"the engine died with exit status {done.returncode}")
     command = f"python -m benchmarks.robustness.fuzz --cases {asked.cases} --seed {asked.seed} --out benchmarks/robustness/fuzz.json"
-    measure.write(
+    harness.write(
         asked.out,
-        json.loads(done.stdout) | {"command": command, "machine": measure.machine()},
+        json.loads(done.stdout) | {"command": command, "machine": harness.machine()},
     )
     sys.exit(done.returncode)
 

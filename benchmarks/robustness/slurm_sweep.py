@@ -15,8 +15,8 @@ import tempfile
 import time
 from pathlib import Path
 
+from benchmarks import harness
 from benchmarks.robustness import drills
-from benchmarks import measure
 from benchmarks.robustness.slurm_cluster import Cluster
 
 LAUNCHER = (
@@ -267,11 +267,11 @@ def main():
         if asked.out and Path(asked.out).exists()
         else {}
     )
-    measure.write(
+    harness.write(
         asked.out,
         kept
         | found
-        | {"settings": settings, "slurm": slurm, "machine": measure.machine()},
+        | {"settings": settings, "slurm": slurm, "machine": harness.machine()},
     )
 
 

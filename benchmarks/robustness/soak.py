@@ -16,11 +16,12 @@ import statistics
 import time
 from pathlib import Path
 
-from benchmarks.robustness import faults
 import jax
 import jax.numpy as jnp
 import numpy as np
-from benchmarks import measure
+
+from benchmarks import harness
+from benchmarks.robustness import faults
 from benchmarks.robustness.faulty_road import HORIZON, ROAD, SAMPLES, not_finite, track
 
 LANE = 0.85
@@ -275,12 +276,17 @@ def main():
         else {}
     )
     legs = known["legs"] if known.get("settings") == settings else {}
-    document = {"legs": legs, "settings": settings, "machine": measure.machine()}
+    document = {"legs": legs, "settings": settings, "machine": harness.machine()}
     for leg in asked.only:
-        document["legs"][leg] = measure.in_own_process("benchmarks.robustness.soak", "--measure", leg, *words, environment=ENVIRONMENT
+        document["legs"][leg] = harness.in_own_process(
+            "benchmarks.robustness.soak",
+            "--measure",
+            leg,
+            *words,
+            environment=ENVIRONMENT,
         )
         print(leg, json.dumps(document["legs"][leg]), flush=True)
-        measure.write(asked.out, document)
+        harness.write(asked.out, document)
     print(table(document), flush=True)
 
 

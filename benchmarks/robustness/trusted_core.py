@@ -13,7 +13,7 @@ import time
 from pathlib import Path
 
 HERE = Path(__file__).resolve().parent
-sys.path.append(str(HERE.parent / "tests"))
+sys.path.append(str(HERE.parents[1] / "tests"))
 
 from exact import search  # noqa: E402  beside the tests, which run the same search shorter
 

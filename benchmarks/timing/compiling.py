@@ -10,9 +10,8 @@ import statistics
 import tempfile
 import time
 
-from benchmarks.timing import ours
-from benchmarks.timing import own_model
-from benchmarks import measure
+from benchmarks import harness
+from benchmarks.timing import ours, own_model
 
 SAMPLES, HORIZON = 1500, 20
 
@@ -55,7 +54,8 @@ def rounds(name, count):
     """Medians without a cache and with a full one."""
     with tempfile.TemporaryDirectory() as directory:
         cached = kept_in(directory)
-        ask = lambda environment: measure.in_own_process("benchmarks.timing.compiling", "--measure", name, environment=environment
+        ask = lambda environment: harness.in_own_process(
+            "benchmarks.timing.compiling", "--measure", name, environment=environment
         )
         ask(cached)
         both = [(ask({}), ask(cached)) for _ in range(count)]

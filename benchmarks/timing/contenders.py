@@ -4,11 +4,7 @@ a process of their own.
 
 from functools import partial
 
-from benchmarks.timing import jax_peers
-from benchmarks.timing import other_peers
-from benchmarks.timing import ours
-from benchmarks.timing import own_model
-from benchmarks.timing import problem
+from benchmarks.timing import jax_peers, other_peers, ours, own_model, problem
 
 BUILDERS = (
     ours.sfkd_jax,

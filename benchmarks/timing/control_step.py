@@ -10,7 +10,7 @@ import json
 import statistics
 from functools import partial
 
-from benchmarks import measure
+from benchmarks import harness
 from benchmarks.timing.contenders import CONTENDERS, environment, same_place
 
 
@@ -32,7 +32,10 @@ def rounds_of(jobs, count, steps):
                 steps,
             )
             found[label].append(
-                measure.in_own_process("benchmarks.timing.control_step", *words, environment=environment(name)
+                harness.in_own_process(
+                    "benchmarks.timing.control_step",
+                    *words,
+                    environment=environment(name),
                 )
             )
     return found
@@ -46,7 +49,7 @@ def summary(rounds):
     return {
         "best_ms": min(medians),
         "median_ms": statistics.median(medians),
-        "p99_ms": measure.quantile(
+        "p99_ms": harness.quantile(
             [step for one in rounds for step in one["wall_ms"]], 0.99
         ),
         "cpu_ms": statistics.median(statistics.median(one["cpu_ms"]) for one in rounds),
@@ -95,7 +98,7 @@ def main():
     asked = arguments()
     if asked.measure:
         build = partial(same_place, asked.measure, asked.samples, asked.horizon)
-        print(json.dumps(measure.first_and_then(build, asked.steps)))
+        print(json.dumps(harness.first_and_then(build, asked.steps)))
         return
     jobs = {name: (name, asked.samples, asked.horizon) for name in asked.only}
     table, missing = table_of(rounds_of(jobs, asked.rounds, asked.steps))
@@ -112,9 +115,9 @@ def main():
         "contenders": table,
         "not_run": missing,
         "settings": settings,
-        "machine": measure.machine(),
+        "machine": harness.machine(),
     }
-    measure.write(asked.out, document)
+    harness.write(asked.out, document)
 
 
 if __name__ == "__main__":

@@ -10,9 +10,9 @@ import time
 
 import jax
 import jax.numpy as jnp
-from benchmarks.timing import ours
-from benchmarks.timing import problem
-from benchmarks import measure
+
+from benchmarks import harness
+from benchmarks.timing import ours, problem
 
 
 def episode_of(controller, w, targets, env, steps):
@@ -48,11 +48,11 @@ def main():
         jax.jit(controller.act),
     )
     jax.block_until_ready(run(state, z))
-    step = lambda: jax.block_until_ready(act(w, state, z, env, targets))  # noqa: E731
-    measure.timed(step, measure.WARM_UP)
+    step = lambda: jax.block_until_ready(act(w, state, z, env, targets))
+    harness.timed(step, harness.WARM_UP)
     singles, episodes = [], []
     for _ in range(asked.rounds):
-        singles.append(statistics.median(measure.timed(step, asked.steps)[0]))
+        singles.append(statistics.median(harness.timed(step, asked.steps)[0]))
         began = time.perf_counter()
         jax.block_until_ready(run(state, z))
         episodes.append(1e3 * (time.perf_counter() - began))

@@ -11,9 +11,9 @@ from functools import partial
 
 import jax
 import jax.numpy as jnp
-from benchmarks.timing import ours
-from benchmarks.timing import problem
-from benchmarks import measure
+
+from benchmarks import harness
+from benchmarks.timing import ours, problem
 
 PRODUCTS = ("A", "B", "W1", "W2", "W3", "D1", "D2", "D3")
 LARGE = 1024
@@ -47,7 +47,7 @@ def activation(times):
 def parts(samples, horizon):
     """Label -> a function of no arguments that does one part of one control step."""
     random = jax.random.normal
-    rows = lambda width: random(jax.random.key(0), (samples, width))  # noqa: E731
+    rows = lambda width: random(jax.random.key(0), (samples, width))
     found = {}
     for name in PRODUCTS:
         matrix = jnp.asarray(problem.weights()[name])
@@ -75,7 +75,7 @@ def summary(best, samples, horizon):
         * horizon
         * sum(problem.weights()[name].size for name in PRODUCTS)
     )
-    total = lambda names, kind: sum(best[name][kind] for name in names)  # noqa: E731
+    total = lambda names, kind: sum(best[name][kind] for name in names)
     products, step, large = (
         total(names, "best_ms") for names in (PRODUCTS, ("step",), ("large product",))
     )
@@ -102,7 +102,7 @@ def main():
     for name, value in (("samples", 1500), ("horizon", 20), ("rounds", 15)):
         parser.add_argument(f"--{name}", type=int, default=value)
     asked = parser.parse_args()
-    best = measure.in_turn(parts(asked.samples, asked.horizon), asked.rounds)
+    best = harness.in_turn(parts(asked.samples, asked.horizon), asked.rounds)
     print(json.dumps(summary(best, asked.samples, asked.horizon)))
 
 

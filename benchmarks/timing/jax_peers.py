@@ -63,7 +63,7 @@ def jax_mppi(samples, horizon, seed=0, temperature=problem.TEMPERATURE):
     )
 
     def act(memory, z, target):
-        cost = lambda z, u: problem.charge(jnp, w, z, u, target)  # noqa: E731
+        cost = lambda z, u: problem.charge(jnp, w, z, u, target)
         return mppi.command(config, memory, z, partial(problem.advance, jnp, w), cost)
 
     return _stepping(act, first)

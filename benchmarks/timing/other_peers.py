@@ -4,6 +4,7 @@ import os
 from functools import partial
 
 import numpy as np
+
 from benchmarks.timing import problem
 
 ONE_THREAD = {"OMP_NUM_THREADS": "1"}
@@ -18,7 +19,7 @@ def pytorch_mppi(
 
     torch.manual_seed(seed)
     w, aim = _weights(torch), [None]
-    cost = lambda z, u: problem.charge(torch, w, z, u, aim[0])  # noqa: E731
+    cost = lambda z, u: problem.charge(torch, w, z, u, aim[0])
     ones = torch.ones(problem.CONTROLS)
     box = {
         "u_min": problem.LOW * ones,

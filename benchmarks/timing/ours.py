@@ -2,8 +2,8 @@
 arrays.
 """
 
+from benchmarks import harness
 from benchmarks.timing import problem
-from benchmarks import measure
 
 
 def planner(samples, horizon, **settings):
@@ -93,4 +93,4 @@ def spread():
     )
 
 
-sfkd_jax_sharded.environment = measure.HOST_DEVICES
+sfkd_jax_sharded.environment = harness.HOST_DEVICES

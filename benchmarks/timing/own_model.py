@@ -2,8 +2,8 @@
 weights, a bend to follow.
 """
 
+from benchmarks import harness
 from benchmarks.timing import ours
-from benchmarks import measure
 
 SPEED, RADIUS = 10.0, 50.0
 PLANT = "vehicle=dynamic"
@@ -130,4 +130,4 @@ def own_model_sharded(samples, horizon, seed=0):
     return own_model(samples, horizon, seed, sharding=ours.spread())
 
 
-own_model_sharded.environment = measure.HOST_DEVICES
+own_model_sharded.environment = harness.HOST_DEVICES

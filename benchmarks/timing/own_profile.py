@@ -9,9 +9,9 @@ import json
 
 import jax
 import jax.numpy as jnp
-from benchmarks.timing import own_model
-from benchmarks import measure
 
+from benchmarks import harness
+from benchmarks.timing import own_model
 from sfkd_jax import control
 
 SMALL = "[2]"
@@ -124,15 +124,15 @@ def main():
         parser.add_argument(f"--{name}", type=int, default=value)
     parser.add_argument("--out")
     asked = parser.parse_args()
-    found = measure.in_turn(parts(asked.samples, asked.horizon), asked.rounds)
+    found = harness.in_turn(parts(asked.samples, asked.horizon), asked.rounds)
     for label, row in found.items():
         print(
             f"{label:36}",
             "  ".join(f"{key} {value:7.3f}" for key, value in row.items()),
         )
     settings = {key: getattr(asked, key) for key in ("samples", "horizon", "rounds")}
-    measure.write(
-        asked.out, {"parts": found, "settings": settings, "machine": measure.machine()}
+    harness.write(
+        asked.out, {"parts": found, "settings": settings, "machine": harness.machine()}
     )
     print(json.dumps(found["whole step"]))
 

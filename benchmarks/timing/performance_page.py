@@ -7,11 +7,10 @@ python -m benchmarks.timing.performance_page [--write] A table stands in the pag
 import argparse
 import re
 
-from benchmarks.timing import tables
-from benchmarks.timing import targets
-from benchmarks import measure
+from benchmarks import harness
+from benchmarks.timing import tables, targets
 
-PAGE = measure.HERE.parent / "docs" / "performance.md"
+PAGE = harness.ROOT / "docs" / "performance.md"
 TABLES = {
     "runs": tables.runs,
     "targets": targets.targets,
@@ -33,7 +32,7 @@ def built(build):
     try:
         return build()
     except FileNotFoundError as absent:
-        return f"Not measured yet: there is no {measure.HERE.name}/{absent.filename.rsplit('/', 1)[-1]}."
+        return f"Not measured yet: there is no benchmarks/timing/{absent.filename.rsplit('/', 1)[-1]}."
 
 
 def put(path, made):

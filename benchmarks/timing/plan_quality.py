@@ -12,10 +12,9 @@ import statistics
 from functools import partial
 
 import numpy as np
-from benchmarks.timing import other_peers
-from benchmarks.timing import ours
-from benchmarks.timing import problem
-from benchmarks import measure
+
+from benchmarks import harness
+from benchmarks.timing import other_peers, ours, problem
 from benchmarks.timing.contenders import CONTENDERS
 
 SAMPLES = (375, 750, 1500, 3000, 6000)
@@ -78,8 +77,8 @@ def fitting(name, rounds, steps):
     found = {}
     for samples in SAMPLES:
         ask = partial(
-            measure.in_own_process,
-            "quality.py",
+            harness.in_own_process,
+            "benchmarks.timing.plan_quality",
             "--time",
             name,
             "--samples",
@@ -111,7 +110,7 @@ def judged(name, times, budget, asked):
         "--steps",
         asked.steps,
     )
-    rows = measure.in_own_process("benchmarks.timing.plan_quality", *words)
+    rows = harness.in_own_process("benchmarks.timing.plan_quality", *words)
     best = min(rows, key=lambda row: statistics.mean(row["costs"]))
     spread = [statistics.mean(row["costs"]) for row in rows]
     costs = {
@@ -143,7 +142,7 @@ def main():
         build = lambda: partial(
             BUILD[asked.time](asked.samples, HORIZON), problem.start(), AIM
         )
-        print(json.dumps(measure.first_and_then(build, asked.steps)))
+        print(json.dumps(harness.first_and_then(build, asked.steps)))
     elif asked.drive:
         print(json.dumps(drive(asked.drive, asked.samples, asked.seeds, asked.steps)))
     else:
@@ -166,7 +165,7 @@ def main():
             "not_run": missing,
             "settings": settings,
         }
-        measure.write(asked.out, document | {"machine": measure.machine()})
+        harness.write(asked.out, document | {"machine": harness.machine()})
 
 
 if __name__ == "__main__":

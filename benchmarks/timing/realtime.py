@@ -11,7 +11,7 @@ import sys
 from contextlib import contextmanager, nullcontext
 from functools import partial
 
-from benchmarks import measure
+from benchmarks import harness
 from benchmarks.timing.contenders import CONTENDERS, environment, same_place
 
 PERIOD_MS = 100.0
@@ -33,7 +33,7 @@ def competing():
 
 def tail(times):
     """Quantiles, the worst step, and how many missed the period."""
-    found = {name: measure.quantile(times, share) for name, share in SHARES.items()}
+    found = {name: harness.quantile(times, share) for name, share in SHARES.items()}
     return found | {
         "max_ms": max(times),
         "missed": sum(time > PERIOD_MS for time in times),
@@ -45,7 +45,8 @@ def drive(name, steps, beside):
     """One contender in a process of its own."""
     words = ("--measure", name, "--steps", steps)
     with competing() if beside else nullcontext():
-        return measure.in_own_process("benchmarks.timing.realtime", *words, environment=environment(name)
+        return harness.in_own_process(
+            "benchmarks.timing.realtime", *words, environment=environment(name)
         )
 
 
@@ -70,7 +71,7 @@ def main():
     asked = parser.parse_args()
     if asked.measure:
         build = partial(same_place, asked.measure, asked.samples, asked.horizon)
-        print(json.dumps(tail(measure.first_and_then(build, asked.steps)["wall_ms"])))
+        print(json.dumps(tail(harness.first_and_then(build, asked.steps)["wall_ms"])))
         return
     found = {}
     for name in asked.only:
@@ -89,9 +90,9 @@ def main():
         "contenders": found,
         "period_ms": PERIOD_MS,
         "settings": settings,
-        "machine": measure.machine(),
+        "machine": harness.machine(),
     }
-    measure.write(asked.out, document)
+    harness.write(asked.out, document)
 
 
 if __name__ == "__main__":

@@ -8,7 +8,7 @@ import argparse
 import itertools
 import math
 
-from benchmarks import measure
+from benchmarks import harness
 from benchmarks.timing.contenders import CONTENDERS
 from benchmarks.timing.control_step import rounds_of, table_of
 
@@ -90,16 +90,24 @@ def main():
         "sweep": rows,
         "not_run": missing,
         "exponents": {name: growth(rows, name, asked.samples) for name in ran},
-        "episode": measure.in_own_process("benchmarks.timing.episode", "--steps", asked.episode, "--rounds", 2 * asked.rounds
+        "episode": harness.in_own_process(
+            "benchmarks.timing.episode",
+            "--steps",
+            asked.episode,
+            "--rounds",
+            2 * asked.rounds,
         ),
-        "compile": measure.in_own_process("benchmarks.timing.compiling", "--rounds", asked.compilations
+        "compile": harness.in_own_process(
+            "benchmarks.timing.compiling", "--rounds", asked.compilations
         ),
-        "floor": measure.in_own_process("benchmarks.timing.floor", "--rounds", 5 * asked.rounds),
+        "floor": harness.in_own_process(
+            "benchmarks.timing.floor", "--rounds", 5 * asked.rounds
+        ),
         "settings": {
             key: getattr(asked, key)
             for key in ("rounds", "steps", "episode", "compilations")
         },
-        "machine": measure.machine(),
+        "machine": harness.machine(),
     }
     for row in rows:
         print(
@@ -107,7 +115,7 @@ def main():
         )
     for part in ("not_run", "exponents", "episode", "compile", "floor"):
         print(part, document[part])
-    measure.write(asked.out, document)
+    harness.write(asked.out, document)
 
 
 if __name__ == "__main__":

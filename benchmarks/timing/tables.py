@@ -2,9 +2,7 @@
 
 import json
 
-from benchmarks import measure
-
-FILES = ("control_step", "scaling", "realtime", "quality", "own_profile")
+FILES = ("control_step", "scaling", "realtime", "plan_quality", "own_profile")
 OWN = ("own_model", "own_model_ess", "own_model_sharded")
 LABELS = {
     "sfkd_jax": "this library",
@@ -45,7 +43,7 @@ TAIL_HEADS = ("p50 [ms]", "p99 [ms]", "p99.9 [ms]", "max [ms]", "above 100 ms", 
 
 def read(name):
     """A document beside this script."""
-    return json.loads((measure.HERE / f"{name}.json").read_text())
+    return json.loads((HERE / f"{name}.json").read_text())
 
 
 def table(heads, rows):
@@ -193,7 +191,7 @@ def tails():
 def closed_loop():
     """Cost of the closed loop for what fits into a budget of time."""
     rows = []
-    for budget, found in read("quality")["budgets"].items():
+    for budget, found in read("plan_quality")["budgets"].items():
         for name, row in found.items():
             if not row["samples"]:
                 rows.append([budget, LABELS[name], 0, "", "", "", ""])
@@ -232,7 +230,7 @@ def runs():
     """Under which settings, and beside how much other work, the files were made."""
     rows = []
     for name in FILES:
-        if not (measure.HERE / f"{name}.json").exists():
+        if not (HERE / f"{name}.json").exists():
             continue
         found = read(name)
         asked = ", ".join(

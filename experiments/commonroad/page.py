@@ -7,11 +7,10 @@ python -m experiments.commonroad.page [--write]
 import argparse
 import json
 
+from benchmarks.harness import ROOT
 from benchmarks.timing import tables
 from benchmarks.timing.performance_page import put
-from benchmarks.measure import HERE
 
-ROOT = HERE.parent
 FIGURE = ROOT / "docs" / "plants_files" / "rmse.png"
 SYSTEMS = {
     # row: (label, colour, line)

@@ -13,11 +13,11 @@ import time
 from functools import partial
 from pathlib import Path
 
-from experiments.commonroad import traced_car
 import jax
 import jax.numpy as jnp
 import numpy as np
 
+from experiments.commonroad import traced_car
 from sfkd_jax import adapters, artefacts, policy
 from sfkd_jax.certification import claims_of, covered
 from sfkd_jax.control import law_arrays

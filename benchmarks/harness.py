@@ -13,7 +13,7 @@ import time
 from importlib import metadata
 from pathlib import Path
 
-HERE = Path(__file__).parent
+ROOT = Path(__file__).parents[1]
 WARM_UP = 9
 LOAD = os.getloadavg()[0]
 """How many processes wanted a core in the minute before: another job beside a benchmark
@@ -58,14 +58,12 @@ def quantile(values, share):
     return ordered[min(len(ordered) - 1, int(share * len(ordered)))]
 
 
-def in_own_process(script, *words, environment=None):
-    """Run a script of this folder; the JSON of its last line, or {"error": the last
-    line of what went wrong}.
-    """
-    command = [sys.executable, str(HERE / script), *map(str, words)]
-    asked = os.environ | (environment or {})
+def in_own_process(module, *words, environment=None):
+    """Run a module; return the JSON of its last line, or {"error": its last line}."""
+    command = [sys.executable, "-m", module, *map(str, words)]
+    variables = os.environ | (environment or {})
     done = subprocess.run(
-        command, env=asked, capture_output=True, text=True, check=False
+        command, cwd=ROOT, env=variables, capture_output=True, text=True, check=False
     )
     if done.returncode:
         return {

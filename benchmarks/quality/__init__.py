@@ -1,0 +1,1 @@
+"""How well plans, laws and corridors do."""

@@ -1,0 +1,1 @@
+"""Faults, kills, hostile files and mutants."""

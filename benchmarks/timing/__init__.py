@@ -1,0 +1,1 @@
+"""Times of control steps, episodes and compilations."""
