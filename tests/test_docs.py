@@ -5,13 +5,16 @@ numbers; and all are on the site.
 import ast
 import json
 import re
-import runpy
 from collections import Counter
 from functools import cache
 from pathlib import Path
 
 import pytest
 import yaml
+
+from benchmarks.quality import corridor_page, path_frame, shield_table, speed_page
+from benchmarks.robustness import drills as drills_benchmark
+from benchmarks.robustness import soak
 
 ROOT = Path(__file__).parents[1]
 DOCS, PACKAGE = ROOT / "docs", ROOT / "src" / "sfkd_jax"
@@ -206,7 +209,7 @@ def test_every_result_on_the_tuning_page_is_in_the_file_it_cites():
     text = re.sub(
         r"`[^`\n]*`", "", FENCED.sub("", (DOCS / "tuning.md").read_text("utf-8"))
     )
-    laws = json.loads((ROOT / "benchmarks" / "laws.json").read_text())["rows"]
+    laws = json.loads((ROOT / "benchmarks/quality/laws.json").read_text())["rows"]
     table = json.loads(
         (ROOT / "experiments" / "table1_closed_loop" / "results.json").read_text()
     )["rows"]
@@ -234,7 +237,9 @@ def test_the_tables_of_the_certificates_page_are_those_of_their_files():
         file.read_text("utf-8")
         for file in (DOCS / "certificate.md", ROOT / "README.md")
     )
-    found = json.loads((ROOT / "benchmarks" / "theorem_power.json").read_text())["rows"]
+    found = json.loads((ROOT / "benchmarks/quality/theorem_power.json").read_text())[
+        "rows"
+    ]
     rows = [
         row
         for row in found
@@ -243,7 +248,7 @@ def test_the_tables_of_the_certificates_page_are_those_of_their_files():
     shown = [
         [cell.strip() for cell in line.strip("|").split("|")]
         for table in re.findall(
-            r"<!-- from benchmarks/theorem_power.json -->\n\|.*\n\|[-|]*\n((?:\|.*\n)*)",
+            r"<!-- from benchmarks/quality/theorem_power.json -->\n\|.*\n\|[-|]*\n((?:\|.*\n)*)",
             page,
         )
         for line in table.splitlines()
@@ -274,7 +279,9 @@ def test_the_tables_of_the_certificates_page_are_those_of_their_files():
     assert lines <= 150
     assert f"`certification/_core.py`, {lines} lines" in page
     assert f"a core of {lines} lines" in readme
-    searched = json.loads((ROOT / "benchmarks" / "trusted_core.json").read_text())
+    searched = json.loads(
+        (ROOT / "benchmarks/robustness/trusted_core.json").read_text()
+    )
     assert searched["false_and_accepted"] == 0
     assert f"{searched['cases']:_}".replace("_", " ") + " hostile" in page
     assert (
@@ -294,7 +301,9 @@ def rows_between(page, mark):
 
 def test_what_the_tests_of_a_certificate_notice_is_what_was_counted():
     """Changes by file, and by reason those that none notices, each of which is argued."""
-    files = json.loads((ROOT / "benchmarks" / "mutants.json").read_text())["files"]
+    files = json.loads((ROOT / "benchmarks/robustness/mutants.json").read_text())[
+        "files"
+    ]
     page = (DOCS / "certificate.md").read_text("utf-8")
     total, killed = (
         sum(row[key] for row in files.values()) for key in ("total", "killed")
@@ -391,7 +400,7 @@ def test_the_page_about_an_estimated_environment_says_what_the_results_say():
 
 def test_what_the_fuzzer_found_is_what_the_page_says():
     """Every file was accepted or refused."""
-    found = json.loads((ROOT / "benchmarks/fuzz.json").read_text())
+    found = json.loads((ROOT / "benchmarks/robustness/fuzz.json").read_text())
     page = " ".join((DOCS / "failures.md").read_text("utf-8").split())
     accepted, refused = (
         sum(row.get(key, 0) for row in found["readers"].values())
@@ -407,8 +416,8 @@ def test_what_the_fuzzer_found_is_what_the_page_says():
 
 def test_the_table_of_drills_is_that_of_the_run():
     """And nothing was damaged, failed or ended differently."""
-    drills = json.loads((ROOT / "benchmarks/drills.json").read_text())
-    table = runpy.run_path(str(ROOT / "benchmarks/drills.py"))["table"](drills)
+    drills = json.loads((ROOT / "benchmarks/robustness/drills.json").read_text())
+    table = drills_benchmark.table(drills)
     shown = (
         (DOCS / "failures.md")
         .read_text("utf-8")
@@ -448,26 +457,21 @@ def test_the_readme_says_of_the_corridor_what_its_page_says():
 
 
 def test_the_page_about_the_corridor_says_what_the_certificates_say():
-    """Its table is what benchmarks/corridor.py makes of the shipped certificates and
+    """Its table is what benchmarks/quality/corridor_page.py makes of the shipped certificates and
     the committed rows.
     """
-    made = runpy.run_path(str(ROOT / "benchmarks" / "corridor.py"))
     text = (DOCS / "corridor.md").read_text("utf-8")
-    assert made["table"]() in text
-    assert made["page"](text) == text
+    assert corridor_page.table() in text
+    assert corridor_page.page(text) == text
 
 
-def test_the_tables_about_speed_are_those_of_their_run(monkeypatch):
+def test_the_tables_about_speed_are_those_of_their_run():
     """Of the policies that ship, over the whole of their box; and it is the box that
     ends where the page says so.
     """
-    monkeypatch.syspath_prepend(str(ROOT / "benchmarks"))
-    measured = json.loads((ROOT / "benchmarks/speed.json").read_text())
+    measured = json.loads((ROOT / "benchmarks/quality/speed.json").read_text())
     text = (DOCS / "corridor.md").read_text("utf-8")
-    assert (
-        runpy.run_path(str(ROOT / "benchmarks/speed_page.py"))["page"](text, measured)
-        == text
-    )
+    assert speed_page.page(text, measured) == text
     for name, found in measured["cars"].items():
         certificate = json.loads(
             (PACKAGE / "pretrained" / f"{name}_path" / "certificate.json").read_text()
@@ -482,33 +486,29 @@ def test_the_tables_about_speed_are_those_of_their_run(monkeypatch):
             assert [min(values), max(values)] == ends
 
 
-def test_the_page_about_path_coordinates_says_what_the_results_say(monkeypatch):
-    """Its tables are what benchmarks/path_frame.py makes of the committed rows and
+def test_the_page_about_path_coordinates_says_what_the_results_say():
+    """Its tables are what benchmarks/quality/path_frame.py makes of the committed rows and
     tubes.
     """
-    monkeypatch.syspath_prepend(str(ROOT / "benchmarks"))
-    made = runpy.run_path(str(ROOT / "benchmarks" / "path_frame.py"))["TABLES"]
-    text = (DOCS / "path.md").read_text("utf-8")
+    text = (DOCS / "results/path-frame.md").read_text("utf-8")
     assert [
         name
-        for name, build in made.items()
+        for name, build in path_frame.TABLES.items()
         if f"<!-- {name} -->\n{build()}\n<!-- end -->" not in text
     ] == []
 
 
-def test_the_table_of_the_long_drive_is_that_of_its_run(monkeypatch):
+def test_the_table_of_the_long_drive_is_that_of_its_run():
     """Every leg is there, and none failed at what is asked of all."""
-    monkeypatch.syspath_prepend(str(ROOT / "benchmarks"))
-    found = json.loads((ROOT / "benchmarks/soak.json").read_text())
-    soak = runpy.run_path(str(ROOT / "benchmarks/soak.py"))
+    found = json.loads((ROOT / "benchmarks/robustness/soak.json").read_text())
     shown = (
         (DOCS / "failures.md")
         .read_text("utf-8")
         .split("<!-- soak -->")[1]
         .split("<!-- end of soak -->")[0]
     )
-    assert shown.strip() == soak["table"](found)
-    assert found["legs"].keys() == soak["LEGS"].keys()
+    assert shown.strip() == soak.table(found)
+    assert found["legs"].keys() == soak.LEGS.keys()
     for leg in found["legs"].values():
         assert (
             leg["outside_limits"]
@@ -526,8 +526,8 @@ def test_the_table_of_the_long_drive_is_that_of_its_run(monkeypatch):
 
 def test_the_tables_of_the_shield_are_those_of_the_run():
     """And no car left its lane behind the shield."""
-    measured = json.loads((ROOT / "benchmarks/shield.json").read_text())
-    table = runpy.run_path(str(ROOT / "benchmarks/shield_table.py"))["table"](measured)
+    measured = json.loads((ROOT / "benchmarks/quality/shield.json").read_text())
+    table = shield_table.table(measured)
     shown = (
         (DOCS / "corridor.md")
         .read_text("utf-8")

@@ -3,20 +3,22 @@
 import json
 import os
 import re
-import runpy
 import subprocess
 import sys
 from pathlib import Path
 
 import pytest
 
-from sfkd_jax.reporting import benchmark_markdown
+from benchmarks.quality.result_pages import PAGES
+from sfkd_jax.paper import benchmark_markdown
 
 ROOT = Path(__file__).parents[1]
-PAGES = runpy.run_path(str(ROOT / "benchmarks" / "result_pages.py"))["PAGES"]
+RESULTS = ROOT / "docs" / "results"
 README = (ROOT / "README.md").read_text("utf-8")
 EXPERIMENTS = sorted(
-    folder for folder in (ROOT / "experiments").iterdir() if folder.is_dir()
+    folder
+    for folder in (ROOT / "experiments").iterdir()
+    if folder.is_dir() and folder.name != "__pycache__"
 )
 
 
@@ -75,20 +77,19 @@ def test_an_experiment_is_a_script_an_expectation_and_a_result_that_meets_it(fol
 def test_a_page_of_results_says_what_the_results_say(folder, page):
     results = json.loads((ROOT / "experiments" / folder / "results.json").read_text())
     shown = benchmark_markdown(results).replace("results_files/", f"{page}_files/")
-    assert (ROOT / "docs" / f"{page}.md").read_text("utf-8") == shown
+    assert (RESULTS / f"{page}.md").read_text("utf-8") == shown
     linked = {
-        (ROOT / "docs" / figure).name
-        for figure in re.findall(r"\]\((\S+\.png)\)", shown)
+        (RESULTS / figure).name for figure in re.findall(r"\]\((\S+\.png)\)", shown)
     }
-    assert {
-        file.name for file in (ROOT / "docs" / f"{page}_files").glob("*.png")
-    } == linked
+    assert {file.name for file in (RESULTS / f"{page}_files").glob("*.png")} == linked
 
 
 def test_the_page_about_foreign_plants_says_what_the_results_say():
-    command = [sys.executable, str(ROOT / "benchmarks" / "commonroad_page.py")]
-    printed = subprocess.run(command, capture_output=True, text=True, check=True).stdout
-    page = (ROOT / "docs" / "plants.md").read_text("utf-8")
+    command = [sys.executable, "-m", "experiments.commonroad.page"]
+    printed = subprocess.run(
+        command, cwd=ROOT, capture_output=True, text=True, check=True
+    ).stdout
+    page = (RESULTS / "other-cars.md").read_text("utf-8")
     tables = printed.strip().split("\n\n")
     assert len(tables) == 6
     assert [table for table in tables if table not in page] == []

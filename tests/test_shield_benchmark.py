@@ -2,13 +2,9 @@
 named.
 """
 
-import runpy
-from pathlib import Path
-
 import pytest
 
-BENCHMARKS = Path(__file__).parents[1] / "benchmarks"
-MADE = runpy.run_path(str(BENCHMARKS / "shield_table.py"))
+from benchmarks.quality import shield_table
 
 
 def summary(departures=0, largest=0.0981, **shares):
@@ -60,7 +56,7 @@ def document(**changes):
 
 
 def test_the_tables_hold_every_planner_and_what_it_came_to():
-    text = MADE["table"](document())
+    text = shield_table.table(document())
     assert "dynamic: W = 0.078 m, tube 0.064 m" in text
     assert (
         "| full lock | 200 of 200 → 0 of 200 | > 10 → 0.098 | 0.077 | 0.041 | 100 % | 98.77 % | 0 % | 0 % | 0 % |"
@@ -89,4 +85,4 @@ def test_the_tables_hold_every_planner_and_what_it_came_to():
     ],
 )  # fmt: skip
 def test_what_was_asked_for_and_missed_is_named(changes, named):
-    assert MADE["misses"](document(**changes)) == named
+    assert shield_table.misses(document(**changes)) == named

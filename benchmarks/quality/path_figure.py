@@ -1,10 +1,12 @@
-"""The figure of docs/path.md, drawn by path_frame.py: error over the certified tube, a
+"""The figure of docs/results/path-frame.md, drawn by path_frame.py: error over the certified tube, a
 point a weight of its loss.
 """
 
 from pathlib import Path
 
-FIGURE = Path(__file__).resolve().parents[2] / "docs" / "path_tube.png"
+FIGURE = (
+    Path(__file__).resolve().parents[2] / "docs" / "results" / "path-frame_tube.png"
+)
 MEASURES = {
     "20 ahead [mm]": lambda rows: 1e3 * rows["s3"]["open_loop_rmse_m"]["20"],
     "S2 [mm]": lambda rows: 1e3 * rows["s2"]["rmse_m"]["mean"],

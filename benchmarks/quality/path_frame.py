@@ -1,4 +1,4 @@
-"""Write the tables and the figure of docs/path.md from experiments/path_frame/ and experiments/tube_weight/.
+"""Write the tables and the figure of docs/results/path-frame.md from experiments/path_frame/ and experiments/tube_weight/.
 
 python -m benchmarks.quality.path_frame [--root runs]: with --root, first take what both run.sh
 left there.
@@ -19,7 +19,7 @@ HOME = Path(__file__).resolve().parents[2]
 KEPT = HOME / "experiments" / "path_frame"
 WEIGHTS = HOME / "experiments" / "tube_weight"
 CHOICES = Path(__file__).with_name("path_choices.json")
-PAGE = HOME / "docs" / "path.md"
+PAGE = HOME / "docs" / "results" / "path-frame.md"
 PLANTS, SCENARIOS = ("dynamic", "kinematic"), ("s1", "s2", "s3")
 NAMES = {
     "sfkd_path": "**SFKD**",

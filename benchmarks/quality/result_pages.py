@@ -1,5 +1,6 @@
-"""Write a page of results: python -m benchmarks.quality.result_pages levels writes docs/levels.md and experiments/levels/.
+"""Write a page of results, such as docs/results/levels.md and its figures.
 
+Run `python -m benchmarks.quality.result_pages levels`.
 It takes what `python -m sfkd_jax.compare +experiment=NAME` left under --root. Where
 nothing lies there, the page is written anew from the results in experiments/; figures
 that need driven episodes then stay as they are.
@@ -16,28 +17,31 @@ from pathlib import Path
 from sfkd_jax.reporting import benchmark_markdown, benchmark_report
 
 HOME = Path(__file__).parents[2]
+PAGES_DIR = HOME / "docs" / "results"
 PAGES = {
-    "table1": ("table1_closed_loop", "results"),
-    "figure2": ("figure2_disturbance", "disturbance"),
+    "table1": ("table1_closed_loop", "table"),
+    "figure2": ("figure2_disturbance", "side-forces"),
     "robustness": ("robustness", "robustness"),
     "levels": ("levels", "levels"),
     "small_data": ("small_data", "small-data"),
     "seeds": ("seeds", "seeds"),
     "longer": ("longer", "longer"),
 }
-"""Name of a comparison -> its folder in experiments/ and its page in docs/."""
+"""Name of a comparison -> its folder in experiments/ and its page in docs/results/."""
 DRIVEN = ("figure1_*", "*.gif")
 """Figures that need the arrays of driven episodes."""
 
 
 def page_of(results: dict, page: str) -> str:
-    """The page as it stands in docs/."""
+    """The page as it stands in docs/results/."""
     return benchmark_markdown(results).replace("results_files/", f"{page}_files/")
 
 
 def main() -> None:
     """Copy the results, draw them, write the page."""
-    parser = argparse.ArgumentParser(description="Write a page of results in docs/.")
+    parser = argparse.ArgumentParser(
+        description="Write a page of results in docs/results/."
+    )
     parser.add_argument("name", choices=PAGES)
     parser.add_argument(
         "--root", type=Path, default=Path("runs"), help="of the artefacts"
@@ -46,7 +50,7 @@ def main() -> None:
     folder, page = PAGES[asked.name]
     kept, files = (
         HOME / "experiments" / folder / "results.json",
-        HOME / "docs" / f"{page}_files",
+        PAGES_DIR / f"{page}_files",
     )
     source = asked.root / asked.name / "results.json"
     if not source.exists() and not kept.exists():
@@ -81,8 +85,8 @@ def main() -> None:
             )  # films are not linked; other pages show one that lies there
             if place not in stays and (figure.name in text or place in there):
                 shutil.copyfile(figure, place)
-    (HOME / "docs" / f"{page}.md").write_text(text, encoding="utf-8")
-    print(f"docs/{page}.md, {len(list(files.iterdir()))} figures")
+    (PAGES_DIR / f"{page}.md").write_text(text, encoding="utf-8")
+    print(f"docs/results/{page}.md, {len(list(files.iterdir()))} figures")
 
 
 if __name__ == "__main__":

@@ -2,7 +2,7 @@
 
 python -m benchmarks.timing.control_step [--samples 1500 --horizon 20 --rounds 4 --steps 40
 --only NAME ... --out FILE] Other libraries are used if they import; a contender that
-does not is named and left out. See docs/performance.md.
+does not is named and left out. See docs/results/performance.md.
 """
 
 import argparse

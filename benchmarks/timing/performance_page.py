@@ -1,4 +1,4 @@
-"""Print the tables of docs/performance.md from the JSON files beside this script; with --write put them into the page.
+"""Print the tables of docs/results/performance.md from the JSON files beside this script; with --write put them into the page.
 
 python -m benchmarks.timing.performance_page [--write] A table stands in the page between <!-- NAME --> and
 <!-- end -->; the words around it are written by hand.
@@ -10,7 +10,7 @@ import re
 from benchmarks import harness
 from benchmarks.timing import tables, targets
 
-PAGE = harness.ROOT / "docs" / "performance.md"
+PAGE = harness.ROOT / "docs" / "results" / "performance.md"
 TABLES = {
     "runs": tables.runs,
     "targets": targets.targets,
@@ -57,7 +57,9 @@ def main():
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
     parser.add_argument(
-        "--write", action="store_true", help="put the tables into docs/performance.md"
+        "--write",
+        action="store_true",
+        help="put the tables into docs/results/performance.md",
     )
     made = {name: built(build) for name, build in TABLES.items()}
     if not parser.parse_args().write:

@@ -1,4 +1,4 @@
-"""Print the tables of docs/plants.md from experiments/commonroad/*.json; with --write put them there.
+"""Print the tables of docs/results/other-cars.md from experiments/commonroad/*.json; with --write put them there.
 
 python -m experiments.commonroad.page [--write]
 --write draws the page's figure as well.
@@ -11,7 +11,7 @@ from benchmarks.harness import ROOT
 from benchmarks.timing import tables
 from benchmarks.timing.performance_page import put
 
-FIGURE = ROOT / "docs" / "plants_files" / "rmse.png"
+FIGURE = ROOT / "docs" / "results" / "other-cars_files" / "rmse.png"
 SYSTEMS = {
     # row: (label, colour, line)
     "sfkd": ("SFKD, dynamic", "#0b57b0", "-"),
@@ -268,13 +268,13 @@ def main():
     parser.add_argument(
         "--write",
         action="store_true",
-        help="put the tables into docs/plants.md and draw its figure",
+        help="put the tables into docs/results/other-cars.md and draw its figure",
     )
     made = {name: build() for name, build in TABLES.items()}
     if not parser.parse_args().write:
         print("\n\n".join(made.values()))
         return
-    put(ROOT / "docs" / "plants.md", made)
+    put(ROOT / "docs" / "results" / "other-cars.md", made)
     draw()
 
 

@@ -1,6 +1,6 @@
 #!/usr/bin/env bash
 # CommonRoad's drift car along a path: a law from its own step, its drives, a model of them, certified with its corridor; then
-# drives of the car by the package's own functions, and docs/plants.md. Needs the extra `plants`. Environment: ROOT, for the runs
+# drives of the car by the package's own functions, and docs/results/other-cars.md. Needs the extra `plants`. Environment: ROOT, for the runs
 # (default runs). Extra arguments are Hydra overrides.
 set -euo pipefail
 cd "$(dirname "${BASH_SOURCE[0]}")/../.."

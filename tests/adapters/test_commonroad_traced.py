@@ -1,9 +1,6 @@
-"""The drift car that jax traces (benchmarks/commonroad_traced.py) beside the package's
+"""The drift car that jax traces (experiments/commonroad/traced_car.py) beside the package's
 own function.
 """
-
-from importlib import import_module
-from pathlib import Path
 
 import jax.numpy as jnp
 import pytest
@@ -13,18 +10,18 @@ pytest.importorskip(
     reason='CommonRoad\'s cars need the extra: pip install "sfkd-jax[plants]"',
 )
 
-BENCHMARKS = Path(__file__).parents[2] / "benchmarks"
+from experiments.commonroad import traced_car
+
 CLOSE = 1e-5
 """Largest difference of one step [m, rad, s]."""
 WHEELS = 2e-3
 """Of wheel speeds [rad/s]: the package's solver steps at its stability limit there."""
 
 
-def test_one_step_is_that_of_the_package(monkeypatch):
+def test_one_step_is_that_of_the_package():
     """Braking and driving, both sides, wind, and sliding at friction 0.3; no wheel
     locks.
     """
-    monkeypatch.syspath_prepend(str(BENCHMARKS))
     states = [
         [0.0, 0.0, 0.0, 10.0, 0.0, 0.0, 0.0, 0.0, 0.0],
         [1.0, -2.0, 2.0, 8.0, 0.3, 0.4, 0.1, 0.2, -0.2],
@@ -33,9 +30,7 @@ def test_one_step_is_that_of_the_package(monkeypatch):
     ]
     controls = [[0.05, 1.0], [-0.2, -1.0], [0.12, 2.5], [0.15, -0.5]]
     envs = [[0.9, 0.0], [0.3, 8.0], [0.6, -5.0], [0.3, -8.0]]
-    found = import_module("commonroad_traced").disagreement(
-        *map(jnp.asarray, (states, controls, envs))
-    )
+    found = traced_car.disagreement(*map(jnp.asarray, (states, controls, envs)))
     wheels = {name: value for name, value in found.items() if name.startswith("hidden")}
     assert {
         name: value

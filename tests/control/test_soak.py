@@ -1,16 +1,16 @@
 """A thousand steps of a shipped policy while what it is told is wrong every few seconds.
 
-`benchmarks/soak.py` drives the same loop for 10^5 steps, one call of `act` each; here it is one scan.
+`benchmarks/robustness/soak.py` drives the same loop for 10^5 steps, one call of `act` each; here it is one scan.
 """
 
 from functools import cache
-from importlib import import_module
-from pathlib import Path
 
 import jax
 import numpy as np
 import pytest
 from helpers import jit
+
+from benchmarks.robustness import faults, faulty_road
 
 STEPS = 1000
 RELEASE = 10
@@ -23,8 +23,6 @@ def driven():
     healthy, entries not finite).
     """
     with pytest.MonkeyPatch.context() as patch:
-        patch.syspath_prepend(str(Path(__file__).parents[2] / "benchmarks"))
-        faults, faulty_road = import_module("faults"), import_module("faulty_road")
         patch.setattr(faults, "PAUSE", (2 * RELEASE + 2, 40))
         loop = faulty_road.track("kinematic", samples=8, steps=STEPS)
         road = jit(lambda key: loop.road(key, np.random.default_rng(1)))(
