@@ -252,7 +252,7 @@ def make_run(folder: Path) -> None:
 def read_rows(folder: Path) -> Any:
     path = folder / "results.json"
     rows = artefacts.read_json(path, keys=("rows",))["rows"]
-    with artefacts.understood(path):
+    with artefacts.as_artefact_error(path):
         return artefacts.merge([], rows)
 
 
@@ -271,7 +271,7 @@ def page_holds(found: Any, folder: Path) -> bool:
 def read_benchmark(folder: Path) -> Any:
     path = folder / "results.json"
     document = artefacts.read_json(path, keys=("rows",))
-    with artefacts.understood(path):
+    with artefacts.as_artefact_error(path):
         return reporting.benchmark_markdown(document)
 
 

@@ -19,7 +19,7 @@ PLAN = {
         "ours": "model=sfkd",
         "program": "model=koopman_mpc model.environment=false",
     },
-    "variations": {"as it is": None, "late": "evaluation.told.delay_s=0.5"},
+    "variations": {"as it is": None, "late": "evaluation.env_sensor.delay_s=0.5"},
     "policies": "table",
     "only": [],
 }
@@ -64,7 +64,7 @@ def test_a_cell_composes_its_row_its_controller_and_its_variation():
     assert grid.overrides(cell, PLAN) == [
         *asked,
         "model.environment=false",
-        "evaluation.told.delay_s=0.5",
+        "evaluation.env_sensor.delay_s=0.5",
     ]
 
 
@@ -103,7 +103,7 @@ def test_a_cell_is_done_only_with_its_own_settings_and_undamaged(tmp_path):
     path = grid.place(cell, asked)
     assert not grid.is_done(path, asked)
     path.parent.mkdir(parents=True)
-    write_json(rows_file(path), {"row": {}, "made_with": grid.made_with(asked)})
+    write_json(rows_file(path), {"row": {}, "made_with": grid.settings_hash(asked)})
     assert grid.is_done(path, asked)
     assert not grid.is_done(path, settings(tmp_path, evaluation={"episodes": 8}))
     assert not grid.is_done(path, settings(tmp_path, env_source="estimated"))
@@ -199,12 +199,12 @@ def test_a_row_that_was_made_with_other_settings_enters_no_table_unseen(
 def test_rows_are_dealt_to_processes_whole_and_each_to_one():
     """Two controllers of one row share its policy: no two processes may train it."""
     groups = grid.drivers(grid.plan(PLAN))
-    parts = [grid.dealt(groups, [k, 3]) for k in range(3)]
+    parts = [grid.take_share(groups, [k, 3]) for k in range(3)]
     assert sorted(str(group) for part in parts for group in part) == sorted(
         map(str, groups)
     )
     policies = [row for part in parts for row in {group[0][:3] for group in part}]
     assert len(policies) == len(set(policies))
-    assert grid.dealt(groups, None) == groups
+    assert grid.take_share(groups, None) == groups
     with pytest.raises(ValueError, match=r"comparison\.share"):
-        grid.dealt(groups, [3, 3])
+        grid.take_share(groups, [3, 3])

@@ -16,7 +16,7 @@ import pytest
 from helpers import refusal_of
 
 from sfkd_jax import artefacts, evaluate
-from sfkd_jax.artefacts import DirectoryTaken, locked
+from sfkd_jax.artefacts import DirectoryLocked, locked
 from sfkd_jax.reporting._scene import scenes_of
 from sfkd_jax.reporting._tables import block_title, blocks_of
 
@@ -79,7 +79,7 @@ def stored(place):
 def test_a_taken_directory_is_refused_at_once_in_a_line_that_says_by_whom(tmp_path):
     holder = started(HOLD, tmp_path, 60)
     began = time.monotonic()
-    with pytest.raises(DirectoryTaken) as told, locked(tmp_path):
+    with pytest.raises(DirectoryLocked) as told, locked(tmp_path):
         pass
     assert time.monotonic() - began < 5.0
     holder.kill()
@@ -220,7 +220,7 @@ def test_rows_that_differ_in_one_part_of_their_identity_are_two(name):
         for key, value in artefacts.identity(other).items()
         if value is not None
     }
-    assert artefacts.drive_of(artefacts.drive_name(other)) == known
+    assert artefacts.parse_drive_name(artefacts.drive_name(other)) == known
 
 
 def test_rows_and_episodes_of_an_earlier_version_are_read_and_replaced(tmp_path):

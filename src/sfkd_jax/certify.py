@@ -25,7 +25,7 @@ tubes and bounds of a monitor.
 """
 
 
-def document_in(place: Path) -> Path:
+def certificate_path(place: Path) -> Path:
     """Where what is proved of a run lies, or will lie."""
     flow = place / INCREMENTAL
     return flow if flow.exists() else place / policy.CERTIFICATE
@@ -60,18 +60,18 @@ def renew(settings: dict[str, Any]) -> dict[str, Any]:
     )
     if "d_bar" in document:
         verdict += f"; d_bar {document['d_bar']['value']:.4g} holds for {document['d_bar']['holds_for']}"
-    store.say(f"certificate: {verdict}")
+    artefacts.print_message(f"certificate: {verdict}")
     return document
 
 
-def _rate(settings: dict[str, Any], trained: policy.Trained) -> dict[str, Any]:
+def _rate(settings: dict[str, Any], trained: policy.TrainedModel) -> dict[str, Any]:
     """What is proved of a continuous flow: how fast it contracts, and no tube."""
     return certify_incremental(
         trained.model, trained.params, dt=settings["vehicle"]["dt"]
     )
 
 
-def _tubes(settings: dict[str, Any], trained: policy.Trained) -> dict[str, Any]:
+def _tubes(settings: dict[str, Any], trained: policy.TrainedModel) -> dict[str, Any]:
     """What is proved of a model's steps, and what is measured on the data of the run."""
     dataset, _ = stages.ensure_dataset(settings)
     options = {
@@ -90,14 +90,14 @@ def _tubes(settings: dict[str, Any], trained: policy.Trained) -> dict[str, Any]:
         trained.params,
         validation=dataset.validation,
         calibration=dataset.calibration,
-        held_out=stages.held_out_drives(settings, dataset),
+        held_out=stages.held_out_parts(settings, dataset),
         boxes=boxes,
         drives=dataset.drives,
         sensor_noise=noise,
-        **build.without(options),
+        **build.as_kwargs(options),
     )
     if document["outputs"] and not store.is_logged(settings):
-        asked = build.without(settings["certification"]["corridor"])
+        asked = build.as_kwargs(settings["certification"]["corridor"])
         proved = claims_of(document["outputs"])
         document["corridor"] = certify_corridor(settings, trained, proved, **asked)
     return document
@@ -108,7 +108,7 @@ def run(settings: dict[str, Any]) -> dict[str, Any]:
     """Certify, unless a certificate about other weights lies there (then `certification.renew=true`)."""
     trained = stages.ensure_policy(settings)
     place = store.run_directory(settings)
-    path = document_in(place)
+    path = certificate_path(place)
     if path.exists() and not settings["certification"]["renew"]:
         about = artefacts.read_json(path).get("policy_sha256")
         if about != trained.sha256:
@@ -121,7 +121,7 @@ def run(settings: dict[str, Any]) -> dict[str, Any]:
     keys = ("valid", "alpha", "alpha_separate", "rho", "beta", "tightness", "seconds")
     bound = document.get("d_bar", {"value": None})
     short = {
-        "certificate": str(document_in(place)),
+        "certificate": str(certificate_path(place)),
         "reason": None,
         "d_bar": bound["value"],
     }

@@ -17,7 +17,7 @@ from sfkd_jax.vehicle import Vehicle
 
 _Composed: TypeAlias = Callable[[grid.Cell], dict[str, Any]]
 """The settings of a cell, under the name of the comparison."""
-_Lay: TypeAlias = Callable[[dict[str, Any], Vehicle], evaluate_system.Track]
+_Lay: TypeAlias = Callable[[dict[str, Any], Vehicle], evaluate_system.EpisodeSet]
 """The episodes of a cell's settings."""
 
 
@@ -26,7 +26,7 @@ def run(settings: dict[str, Any]) -> dict[str, Any]:
     began, comparison = time.perf_counter(), settings["comparison"]
     wanted = grid.plan(comparison)
     groups = (
-        grid.dealt(grid.drivers(wanted), comparison["share"])
+        grid.take_share(grid.drivers(wanted), comparison["share"])
         if comparison["drive"]
         else []
     )
@@ -40,7 +40,7 @@ def run(settings: dict[str, Any]) -> dict[str, Any]:
             driven += _drive(group, comparison, composed, lay)
         except (TrainingStopped, ValueError, artefacts.ArtefactError) as reason:
             failed["/".join(map(str, group[0][:4]))] = str(reason)
-            store.say(f"failed: {reason}")
+            artefacts.print_message(f"failed: {reason}")
         if driven:
             _estimate(number + 1, len(groups), time.perf_counter() - began)
     if (
@@ -70,11 +70,11 @@ def _collect(
         settings["comparison"],
         Path(settings["root"]) / settings["name"],
     )
-    with artefacts.understood(place / "cells"):
+    with artefacts.as_artefact_error(place / "cells"):
         rows = grid.collect(
             wanted,
             settings,
-            lambda cell: grid.made_with(composed(cell)),
+            lambda cell: grid.settings_hash(composed(cell)),
             older=comparison["older"],
         )
     if not rows:
@@ -89,7 +89,7 @@ def _collect(
         "failed": failed,
     }
     artefacts.write_json(place / "results.json", document | {"seconds": seconds})
-    with artefacts.understood(place):
+    with artefacts.as_artefact_error(place):
         pages = benchmark_report(place)
     return {
         "results": str(place / "results.json"),
@@ -103,7 +103,7 @@ def _drive(
     group: list[grid.Cell], comparison: dict[str, Any], composed: _Composed, lay: _Lay
 ) -> int:
     """Drive what is missing of one row under one controller; returns how many cells that were."""
-    drivers: dict[str, evaluate_system.TestDriver] = {}
+    drivers: dict[str, evaluate_system.Evaluator] = {}
     done = 0
     for cell in group:
         settings = composed(cell)
@@ -113,7 +113,7 @@ def _drive(
         )
         if grid.is_done(path, settings):
             continue
-        plant, key = build.build_vehicle(settings["vehicle"]), grid.driver_of(of_policy)
+        plant, key = build.build_vehicle(settings["vehicle"]), grid.compilation_key(of_policy)
         track = lay(
             settings, plant
         )  # first: a road that there is not is refused before anything is trained
@@ -121,7 +121,7 @@ def _drive(
             drivers[key] = _driver(of_policy, plant)
         found = drivers[key](track)
         grid.write(path, settings, track, found)
-        store.say(
+        artefacts.print_message(
             f"{' '.join(map(str, cell))}: {1e3 * found.row['rmse_m']['mean']:.1f} mm"
         )
         done += 1
@@ -129,27 +129,27 @@ def _drive(
 
 
 def _surveyor() -> _Lay:
-    """`drive.lay` with a memory: rows that are compared meet the same roads."""
-    known: dict[str, evaluate_system.Track] = {}
+    """`evaluate_system.make_episodes` with a memory: rows that are compared meet the same roads."""
+    known: dict[str, evaluate_system.EpisodeSet] = {}
 
-    def lay(settings: dict[str, Any], plant: Vehicle) -> evaluate_system.Track:
+    def lay(settings: dict[str, Any], plant: Vehicle) -> evaluate_system.EpisodeSet:
         place = artefacts.sha256(
             {name: settings[name] for name in ("vehicle", "scenario", "evaluation")}
         )
         if place not in known:
-            known[place] = evaluate_system.lay(settings, plant)
+            known[place] = evaluate_system.make_episodes(settings, plant)
         return known[place]
 
     return lay
 
 
-def _driver(settings: dict[str, Any], plant: Vehicle) -> evaluate_system.TestDriver:
+def _driver(settings: dict[str, Any], plant: Vehicle) -> evaluate_system.Evaluator:
     """A row's only system, trained and certified if it learns."""
     if "self" in settings["evaluation"]["systems"]:
         dry_run.check(settings, plant)
         _certified(settings)
     ((name, system),) = stages.systems(settings, plant).items()
-    return evaluate_system.prepare(
+    return evaluate_system.compile_system(
         settings, plant, name, system, stages.ensure_dataset(settings)[0]
     )
 
@@ -157,14 +157,14 @@ def _driver(settings: dict[str, Any], plant: Vehicle) -> evaluate_system.TestDri
 def _certified(settings: dict[str, Any]) -> None:
     """A policy with what can be proved about it beside it."""
     place = store.run_directory(settings)
-    if artefacts.exists(place / "policy.npz") and certify.document_in(place).exists():
+    if artefacts.exists(place / "policy.npz") and certify.certificate_path(place).exists():
         stages.ensure_policy(settings)
         return
     with artefacts.locked(
         place, wait=True
     ):  # a process with another share may train it for us
         stages.ensure_policy(settings)
-        if not certify.document_in(place).exists():
+        if not certify.certificate_path(place).exists():
             certify.renew(settings)
 
 
@@ -192,7 +192,7 @@ def _of_policy(
 def _estimate(done: int, total: int, seconds: float) -> None:
     """How far it is and how long it may take."""
     left = seconds / done * (total - done)
-    store.say(
+    artefacts.print_message(
         f"[{done}/{total}] {seconds / 60:.0f} min so far, about {left / 60:.0f} min left"
     )
 

@@ -32,7 +32,7 @@ def run(settings: dict[str, Any]) -> dict[str, Any]:
         "evaluation": settings["evaluation"] | settings["demo"],
     }
     plant = build.build_vehicle(settings["vehicle"])
-    track = evaluate_system.lay(settings, plant)
+    track = evaluate_system.make_episodes(settings, plant)
     own = build.System(
         trained.model, trained.params, settings["env_source"], trained.certificate, trained.law
     )
@@ -42,20 +42,20 @@ def run(settings: dict[str, Any]) -> dict[str, Any]:
         for name in ("nominal", "oracle")
     }
     place, rows = Path(settings["root"]) / settings["name"], []
-    folder = place / f"{track.scenario}_{_name(settings)}"
+    folder = place / f"{track.name}_{_name(settings)}"
     with artefacts.locked(folder):
         for name, system in systems.items():
-            store.say(
+            artefacts.print_message(
                 f"driving {settings['demo']['episodes']} x {settings['demo']['episode_s']:.0f} s: {name}"
             )
-            driven = evaluate_system.prepare(settings, plant, name, system, None)(track)
+            driven = evaluate_system.compile_system(settings, plant, name, system, None)(track)
             rows.append(grid.write(folder / name, settings, track, driven))
         rows = evaluation.compare(rows)
         document = {"rows": rows, "config": settings, "versions": artefacts.versions()}
         artefacts.write_json(folder / "results.json", document)
         _print(rows)
-        film = animate(place, rows, track.scenario, corridor=_corridor(trained))
-    store.say(f"animation: {film}; {time.perf_counter() - began:.0f} s in all")
+        film = animate(place, rows, track.name, corridor=_corridor(trained))
+    artefacts.print_message(f"animation: {film}; {time.perf_counter() - began:.0f} s in all")
     return {
         "animation": film and str(film),
         "rows": len(rows),
@@ -96,12 +96,12 @@ def _shipped(settings: dict[str, Any]) -> policy.Policy:
             f"{SHIPPED / name} was changed: its certificate is about other weights"
         )
     alpha, seconds = trained.certificate["alpha"], time.perf_counter() - began
-    store.say(
+    artefacts.print_message(
         f"certificate: holds, alpha {alpha:.4f}; loaded and verified in {seconds:.1f} s"
     )
     if half := _corridor(trained):
         share = 100 * trained.certificate["corridor"]["level"]
-        store.say(
+        artefacts.print_message(
             f"corridor: {half:.2f} m to each side, on {share:.0f} % of the drives of its class"
         )
     return trained
@@ -114,14 +114,14 @@ def _corridor(trained: policy.Policy) -> float | None:
 
 def _print(rows: list[dict[str, Any]]) -> None:
     """The table, for a person."""
-    store.say(
+    artefacts.print_message(
         f"{'':10}{'deviation [mm]':>16}{'largest [mm]':>14}{'steering [rad/s]':>18}{'outside the proof':>19}"
     )
     for row in rows:
         left, largest = 1e3 * row["rmse_m"]["mean"], 1e3 * row["max_deviation_m"]
         broken = row["violation"]["v0"]
         outside = "nothing proved" if broken is None else f"{100 * broken:.0f} %"
-        store.say(
+        artefacts.print_message(
             f"{row['system']:10}{left:16.1f}{largest:14.0f}{row['smoothness_rad_per_s']:18.3f}{outside:>19}"
         )
 

@@ -24,7 +24,7 @@ def run(settings: dict[str, Any], asked_by: str = "evaluate") -> dict[str, Any]:
     began = time.perf_counter()
     place, protocol = store.run_directory(settings), settings["evaluation"]
     plant = build.build_vehicle(settings["vehicle"])
-    track = evaluate_system.lay(
+    track = evaluate_system.make_episodes(
         settings, plant
     )  # first: a vehicle that nothing can drive is refused before anything is trained
     dry_run.check(settings, plant)
@@ -35,20 +35,20 @@ def run(settings: dict[str, Any], asked_by: str = "evaluate") -> dict[str, Any]:
     dataset, _ = stages.ensure_dataset(settings)
     rows: list[dict[str, Any]] = []
     roads = dict(
-        zip(artefacts.ROAD, (track.roads.envs, track.roads.path.points), strict=True)
+        zip(artefacts.ROAD, (track.scenarios.envs, track.scenarios.path.points), strict=True)
     )
     arrays: dict[str, Any] = {}
     for name, system in systems.items():
         length = f"{protocol['episodes']} episodes of {protocol['episode_s']:.0f} s"
-        store.say(f"driving {length}: {name} on {track.scenario}")
-        driven = evaluate_system.prepare(settings, plant, name, system, dataset)(track)
+        artefacts.print_message(f"driving {length}: {name} on {track.name}")
+        driven = evaluate_system.compile_system(settings, plant, name, system, dataset)(track)
         rows.append(driven.row)
         drive_name = artefacts.drive_name(driven.row)
         arrays |= {
             f"{drive_name}/{part}": array
             for part, array in (driven.arrays | roads).items()
         }
-        store.say(
+        artefacts.print_message(
             f"  rmse {driven.row['rmse_m']['mean']:.4f} m, worst {driven.row['max_deviation_m']:.3f} m"
         )
     arrays["dt"] = np.asarray(plant.dt)
@@ -72,8 +72,8 @@ def _kept(place: Path) -> tuple[list[dict[str, Any]], dict[str, Any]]:
         if artefacts.exists(episodes)
         else {}
     )
-    with artefacts.understood(results):
-        return artefacts.merge([], rows), artefacts.renamed(arrays, rows)
+    with artefacts.as_artefact_error(results):
+        return artefacts.merge([], rows), artefacts.with_current_names(arrays, rows)
 
 
 def _write(

@@ -35,15 +35,15 @@ def _write(settings: dict[str, Any]) -> dict[str, Any]:
     _, manifest = artefacts.read_arrays(place / "policy.npz", kind=policy.KIND)
     trained = policy.load(place, controller=settings["controller"], env_source=settings["env_source"])
     if trained.certificate is None:
-        store.say("exported without a certificate and without a monitor")
+        artefacts.print_message("exported without a certificate and without a monitor")
     folder = place / FOLDER
     write_controller(
         trained,
         folder,
         made_from=manifest["made_from"],
-        **build.without(settings["export"]),
+        **build.as_kwargs(settings["export"]),
     )
-    store.say(
+    artefacts.print_message(
         f"exported: {folder}; python {folder / 'run_controller.py'} runs it without sfkd_jax"
     )
     files = {

@@ -14,7 +14,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from sfkd_jax import artefacts, build
-from sfkd_jax.control import PathLaw, law_arrays, law_from_arrays
+from sfkd_jax.control import PathLaw, law_to_arrays, law_from_arrays
 from sfkd_jax.types import Controller, Model, Params
 from sfkd_jax.vehicle import Vehicle
 
@@ -24,7 +24,7 @@ BOXES = {"state": "body", "control": "control", "env": "env"}
 """Box of a certificate -> scales of the model of the same size."""
 
 
-class Trained(NamedTuple):
+class TrainedModel(NamedTuple):
     """A model with its weights, as they lie in a run directory.
 
     Attributes:
@@ -76,7 +76,7 @@ def save(
     law: PathLaw | None = None,
 ) -> dict[str, Any]:
     """Write policy.npz and its manifest; returns the manifest, whose `sha256` names the weights and the law."""
-    tree = params if law is None else params | {LAW: law_arrays(law)}
+    tree = params if law is None else params | {LAW: law_to_arrays(law)}
     flat = {name: np.asarray(leaf) for name, leaf in artefacts.flatten(tree).items()}
     return artefacts.write_arrays(
         path, flat, kind=KIND, config=settings, made_from=made_from
@@ -90,7 +90,7 @@ def policy_hash(manifest: Mapping[str, Any]) -> str:
     )
 
 
-def restore(path: str | Path) -> Trained:
+def restore(path: str | Path) -> TrainedModel:
     """The model and weights in a run directory (or a policy.npz with its manifest beside it).
 
     Raises:
@@ -102,7 +102,7 @@ def restore(path: str | Path) -> Trained:
     arrays, manifest = artefacts.read_arrays(file, kind=KIND)
     settings = manifest["config"]
     version = _version(manifest)
-    with artefacts.understood(
+    with artefacts.as_artefact_error(
         file.with_suffix(".json"), ValueError, advice=_advice(version)
     ):
         plant, model = _built(
@@ -117,7 +117,7 @@ def restore(path: str | Path) -> Trained:
         else None
     )
     params = _weights(file, mine if model.along_path else arrays, model)
-    return Trained(
+    return TrainedModel(
         model,
         params,
         plant,
@@ -158,7 +158,7 @@ def load(
     blamed: tuple[type[Exception], ...] = (ValueError,)
     if controller is not None:
         settings, blamed = settings | {"controller": dict(controller)}, ()
-    with artefacts.understood(
+    with artefacts.as_artefact_error(
         file.with_suffix(".json"), *blamed, advice=_advice(trained.version)
     ):
         asked, box = settings["controller"], settings["dataset"]
@@ -188,7 +188,7 @@ def load(
 
 
 def read_certificate(
-    path: str | Path, trained: Trained
+    path: str | Path, trained: TrainedModel
 ) -> tuple[dict[str, Any] | None, str]:
     """The verified certificate beside a policy, or None and the reason why there is none.
 
@@ -206,7 +206,7 @@ def read_certificate(
     if document["valid"] is not True:
         return None, f"the certificate was refused: {document.get('reason')}"
     try:
-        with artefacts.understood(file):
+        with artefacts.as_artefact_error(file):
             bound = {"model": trained.model, "policy_sha256": trained.sha256}
             certification.verify_document(document, trained.params, **bound)
     except certification.CertificateStale as reason:
@@ -262,7 +262,7 @@ def _law(file: Path, arrays: Mapping[str, np.ndarray]) -> PathLaw:
     """
     if not all(np.all(np.isfinite(leaf)) for leaf in arrays.values()):
         raise artefacts.ArtefactError(f"{file}: the law's arrays are not finite")
-    with artefacts.understood(file, ValueError):
+    with artefacts.as_artefact_error(file, ValueError):
         return law_from_arrays(artefacts.unflatten(arrays)[LAW])
 
 
@@ -273,7 +273,7 @@ def _weights(file: Path, arrays: Mapping[str, np.ndarray], model: Model) -> Para
         ArtefactError: a name, shape or kind that the model does not have, or a number
             that is not finite.
     """
-    with artefacts.understood(file, ValueError):
+    with artefacts.as_artefact_error(file, ValueError):
         params = artefacts.unflatten(arrays)
         expected = _listed(
             jax.eval_shape(model.init, jax.random.key(0))

@@ -9,7 +9,8 @@ from typing import Any
 from sfkd_jax import artefacts
 from sfkd_jax.cli.config import door
 from sfkd_jax.pipeline import store
-from sfkd_jax.reporting import write_comparison, write_report
+from sfkd_jax.paper import write_comparison
+from sfkd_jax.reporting import write_report
 
 
 def run(settings: dict[str, Any]) -> dict[str, Any]:
@@ -19,13 +20,13 @@ def run(settings: dict[str, Any]) -> dict[str, Any]:
     alone = (
         artefacts.locked(place) if place.exists() else nullcontext()
     )  # or it makes what it then finds empty
-    with alone, artefacts.understood(place):
+    with alone, artefacts.as_artefact_error(place):
         pages = (
             write_comparison(place, pattern, settings["name"])
             if pattern
             else write_report(place)
         )
-    store.say(f"report: {pages['report']}")
+    artefacts.print_message(f"report: {pages['report']}")
     return pages
 
 

@@ -32,14 +32,14 @@ def _walk(settings: dict[str, Any]) -> dict[str, Any]:
         results = evaluate.run(settings, asked_by="train")
     else:
         results = {"results": None}
-        store.say(
+        artefacts.print_message(
             "not driven: vehicle=own is known from logs alone; vehicle.step=package.module:function drives it"
         )
     pages = report.run(settings)
     return {
         "run": str(place),
         "checkpoint": str(place / "checkpoints"),
-        "certificate": str(certify.document_in(place)),
+        "certificate": str(certify.certificate_path(place)),
         "results": results["results"],
         "report": pages["report"],
         "open_loop_rmse_m": _errors(place),
@@ -58,7 +58,7 @@ def _errors(place: Path) -> list[float]:
 def _objective(place: Path) -> float | None:
     """What a sweep minimises: the least validation loss; None for a model that is identified at once."""
     log = place / "metrics.jsonl"
-    lines = artefacts.read_jsonl(log, damaged=artefacts.tell) if log.exists() else []
+    lines = artefacts.read_jsonl(log, damaged=artefacts.print_message) if log.exists() else []
     return min(
         (line["validation_loss"] for line in lines if "validation_loss" in line),
         default=None,

@@ -56,7 +56,7 @@ def drive_name(row: Mapping[str, Any]) -> str:
     )
 
 
-def drive_of(name: str) -> dict[str, str]:
+def parse_drive_name(name: str) -> dict[str, str]:
     """The identity behind a name; an earlier version wrote system/scenario."""
     return (
         dict(parse_qsl(name))
@@ -65,7 +65,7 @@ def drive_of(name: str) -> dict[str, str]:
     )
 
 
-def renamed(
+def with_current_names(
     arrays: Mapping[str, Any], rows: Iterable[Mapping[str, Any]]
 ) -> dict[str, Any]:
     """The arrays of episodes.npz under the names of today.

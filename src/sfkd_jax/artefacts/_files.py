@@ -80,7 +80,7 @@ def writing(path: Path) -> Iterator[None]:
 
 
 @contextmanager
-def understood(path: Path, *also: type[Exception], advice: str = "") -> Iterator[None]:
+def as_artefact_error(path: Path, *also: type[Exception], advice: str = "") -> Iterator[None]:
     """What is missing or of another kind inside a file that could be read becomes an ArtefactError about it.
 
     Args:

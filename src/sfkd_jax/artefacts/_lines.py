@@ -83,7 +83,7 @@ def read_jsonl(
     return records
 
 
-def tell(line: str) -> None:
+def print_message(line: str) -> None:
     """Say something on stderr."""
     print(line, file=sys.stderr, flush=True)
 

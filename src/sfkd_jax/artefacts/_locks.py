@@ -15,7 +15,7 @@ from pathlib import Path
 from filelock import BaseFileLock, FileLock, SoftFileLock, Timeout
 
 from sfkd_jax.artefacts._files import ArtefactError, failure, read_json, write_json
-from sfkd_jax.artefacts._lines import tell
+from sfkd_jax.artefacts._lines import print_message
 
 LOCK, HOLDER = ".lock", ".lock.json"
 GRACE_S = 2.0
@@ -26,7 +26,7 @@ stands for one.
 """
 
 
-class DirectoryTaken(ArtefactError):
+class DirectoryLocked(ArtefactError):
     """Another process writes into a directory: which one, where and since when, in one line."""
 
 
@@ -89,8 +89,8 @@ def _held(lock: BaseFileLock, directory: Path, wait: bool) -> BaseFileLock:
         )
         taken = f"{directory}: {_who(directory)} is writing there{soft}"
         if not wait:
-            raise DirectoryTaken(f"{taken}; try again when it has ended") from None
-        tell(f"waiting: {taken}")
+            raise DirectoryLocked(f"{taken}; try again when it has ended") from None
+        print_message(f"waiting: {taken}")
         lock.acquire()
     return lock
 

@@ -1,9 +1,9 @@
-"""From plain settings (nested dicts) to vehicles, models, controllers and scenarios; knows no file and no Hydra."""
+"""Build vehicles, models, scenarios and controllers from plain settings."""
 
 from sfkd_jax.build._choices import Settings as Settings
+from sfkd_jax.build._choices import as_kwargs as as_kwargs
 from sfkd_jax.build._choices import choose as choose
-from sfkd_jax.build._choices import without as without
-from sfkd_jax.build._controllers import ENVS as ENVS
+from sfkd_jax.build._controllers import ENV_SOURCES as ENV_SOURCES
 from sfkd_jax.build._controllers import PLANNERS as PLANNERS
 from sfkd_jax.build._controllers import SEARCHES as SEARCHES
 from sfkd_jax.build._controllers import build_controller as build_controller

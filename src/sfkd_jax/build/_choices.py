@@ -1,4 +1,4 @@
-"""Names and settings, looked up and cut to what a factory takes."""
+"""Look up names in registries and turn settings into keyword arguments."""
 
 from __future__ import annotations
 
@@ -9,7 +9,16 @@ Settings = Mapping[str, Any]
 
 
 def choose(table: Mapping[str, Any], name: str, what: str) -> Any:
-    """`table[name]`, or an error that lists the choices."""
+    """Return `table[name]`.
+
+    Args:
+        table: choices by name.
+        name: of one of them.
+        what: the name stands for, for the message.
+
+    Raises:
+        ValueError: no such name; the message lists the choices.
+    """
     if name not in table:
         raise ValueError(
             f"unknown {what} {name!r}; choose one of {', '.join(sorted(table))}"
@@ -17,12 +26,17 @@ def choose(table: Mapping[str, Any], name: str, what: str) -> Any:
     return table[name]
 
 
-def without(settings: Settings, *names: str) -> dict[str, Any]:
-    """Settings of a factory, sequences as tuples: the rest after the names that choose it."""
-    rest = {name: value for name, value in settings.items() if name not in names}
+def as_kwargs(settings: Settings, *skip: str) -> dict[str, Any]:
+    """Return settings as keyword arguments of a factory, with lists as tuples.
+
+    Args:
+        settings: by the names of the factory's arguments.
+        skip: settings that are no arguments of it.
+    """
     return {
         name: tuple(value) if isinstance(value, list) else value
-        for name, value in rest.items()
+        for name, value in settings.items()
+        if name not in skip
     }
 
 

@@ -6,7 +6,7 @@ from functools import partial
 from typing import Any
 
 from sfkd_jax import control, vehicle
-from sfkd_jax.build._choices import Settings, choose, floats, without
+from sfkd_jax.build._choices import Settings, as_kwargs, choose, floats
 from sfkd_jax.core.path_frame import LATERAL
 from sfkd_jax.types import Controller, Model
 
@@ -129,7 +129,7 @@ def _monitored(
     }
     bounds = tuple(certificate["monitor"]["bounds"])
     return control.monitored(
-        planner, model, bounds=bounds, **boxes, **without(settings.get("monitor", {}))
+        planner, model, bounds=bounds, **boxes, **as_kwargs(settings.get("monitor", {}))
     )
 
 
@@ -144,7 +144,7 @@ def _estimated(
     box = {"env_low": floats(env_low), "env_high": floats(env_high)}
     sizes = {"states": len(plant.state_names), "controls": len(plant.control_low)}
     return control.estimated(
-        planner, model, **box, **sizes, **without(settings.get("estimator", {}))
+        planner, model, **box, **sizes, **as_kwargs(settings.get("estimator", {}))
     )
 
 
@@ -163,7 +163,7 @@ def _sampled(
     (`sampling: law`).
     """
     cost = control.tracking_cost(
-        dt=plant.dt, speed_loop=plant.speed_loop, **without(settings["cost"])
+        dt=plant.dt, speed_loop=plant.speed_loop, **as_kwargs(settings["cost"])
     )
     limits = {
         "dt": plant.dt,
@@ -172,7 +172,7 @@ def _sampled(
     }
     if law is not None:
         task = control.following_law(
-            model, cost, law, **limits, **without(settings["task"], "latent_weight")
+            model, cost, law, **limits, **as_kwargs(settings["task"], "latent_weight")
         )
     else:
         laws = {"feedback": _feedback, "model": _model_law, "plain": _no_feedback}
@@ -186,24 +186,24 @@ def _sampled(
             around,
             **limits,
             ancillary=ancillary,
-            **without(settings["task"]),
+            **as_kwargs(settings["task"]),
         )
     boxes = {"env_low": floats(env_low), "env_high": floats(env_high)}
-    return SEARCHES[search](task, **boxes, **without(settings[search]))
+    return SEARCHES[search](task, **boxes, **as_kwargs(settings[search]))
 
 
-def _feedback(settings: Settings, plant: vehicle.Vehicle) -> control.Law:
-    gains = without(settings["feedback"])
+def _feedback(settings: Settings, plant: vehicle.Vehicle) -> control.FeedbackLaw:
+    gains = as_kwargs(settings["feedback"])
     return control.path_feedback(
         wheelbase=plant.wheelbase, speed_loop=plant.speed_loop, **gains
     )
 
 
 def _model_law(settings: Settings, plant: vehicle.Vehicle) -> control.ModelLaw:
-    return control.ModelLaw(dt=plant.dt, **without(settings["model_law"]))
+    return control.ModelLaw(dt=plant.dt, **as_kwargs(settings["model_law"]))
 
 
-def _no_feedback(settings: Settings, plant: vehicle.Vehicle) -> control.Law:
+def _no_feedback(settings: Settings, plant: vehicle.Vehicle) -> control.FeedbackLaw:
     del settings
     return control.no_feedback(speed_loop=plant.speed_loop)
 
@@ -225,8 +225,8 @@ def _koopman_mpc(
         terminal_weight=settings["task"]["terminal_weight"],
         env_low=floats(env_low),
         env_high=floats(env_high),
-        **without(settings["cost"]),
-        **without(settings["koopman_mpc"]),
+        **as_kwargs(settings["cost"]),
+        **as_kwargs(settings["koopman_mpc"]),
     )
 
 

@@ -1,4 +1,4 @@
-"""Vehicles, models and scenarios out of plain settings."""
+"""Build vehicles, models, scenarios and drivers from plain settings."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ import inspect
 import jax.numpy as jnp
 
 from sfkd_jax import control, datasets, models, scenarios, vehicle
-from sfkd_jax.build._choices import Settings, choose, without
+from sfkd_jax.build._choices import Settings, as_kwargs, choose
 from sfkd_jax.types import Control, Model, Reference, Space, State
 
 PLANTS = {
@@ -19,14 +19,19 @@ INNER_LOOPS = ("none", "speed")
 
 
 def build_vehicle(settings: Settings) -> vehicle.Vehicle:
-    """A plant by name, wrapped in its inner loop."""
+    """Return the vehicle of the settings, with its inner loop.
+
+    Raises:
+        ValueError: an unknown vehicle or inner loop, or a step that does not exist.
+    """
     loop = settings["inner_loop"]
     if loop not in INNER_LOOPS:
         raise ValueError(
-            f"unknown vehicle.inner_loop {loop!r}; choose one of {', '.join(INNER_LOOPS)}"
+            f"unknown vehicle.inner_loop {loop!r}; "
+            f"choose one of {', '.join(INNER_LOOPS)}"
         )
     factory = choose(PLANTS, settings["name"], "vehicle")
-    options = without(settings, "name", "inner_loop", "speed_gain")
+    options = as_kwargs(settings, "name", "inner_loop", "speed_gain")
     if options.get("step") is not None:
         options["step"] = vehicle.step_named(options["step"])
     plant = factory(**options)
@@ -38,19 +43,31 @@ def build_vehicle(settings: Settings) -> vehicle.Vehicle:
 
 
 def build_model(settings: Settings, space: Space, plant: vehicle.Vehicle) -> Model:
-    """A learned model by the name of its factory; those that lean on textbook knowledge get it from the vehicle."""
+    """Return the model of the settings.
+
+    Models with prior knowledge take it from the vehicle: the sampling period and the
+    derivative of the nominal bicycle.
+
+    Args:
+        settings: the name of the factory and its arguments.
+        space: scales of states, controls and environments.
+        plant: the vehicle to be modelled.
+
+    Raises:
+        ValueError: an unknown model, or arguments that its factory refuses.
+    """
     factory = choose(models.FACTORIES, settings["name"], "model")
-    known = {"dt": plant.dt, "nominal": plant.nominal_derivative}
-    given = {
+    priors = {"dt": plant.dt, "nominal": plant.nominal_derivative}
+    prior = {
         name: value
-        for name, value in known.items()
+        for name, value in priors.items()
         if name in inspect.signature(factory).parameters
     }
-    return factory(space, **given, **without(settings, "name", "system"))
+    return factory(space, **prior, **as_kwargs(settings, "name", "system"))
 
 
 def space_to_settings(space: Space) -> dict[str, list[float]]:
-    """Scales as plain lists, to lie in a manifest."""
+    """Return scales as plain lists, for a manifest."""
     return {
         name: [float(entry) for entry in value]
         for name, value in space._asdict().items()
@@ -58,7 +75,7 @@ def space_to_settings(space: Space) -> dict[str, list[float]]:
 
 
 def space_from_settings(settings: Settings) -> Space:
-    """Scales from a manifest."""
+    """Return the scales that a manifest holds."""
     return Space(
         **{
             name: jnp.asarray(settings[name], dtype=jnp.float32)
@@ -70,9 +87,15 @@ def space_from_settings(settings: Settings) -> Space:
 def build_scenario(
     settings: Settings, plant: vehicle.Vehicle, *, duration: float
 ) -> scenarios.Family:
-    """The scenario family that a vehicle is to drive, episodes of `duration` [s]."""
+    """Return the scenario family of the settings.
+
+    Args:
+        settings: the name of the family and its arguments.
+        plant: the vehicle that will drive.
+        duration: of an episode [s].
+    """
     return scenarios.scenario(
-        **without(settings),
+        **as_kwargs(settings),
         duration=duration,
         state_size=len(plant.state_names),
         dt=plant.dt,
@@ -80,7 +103,7 @@ def build_scenario(
 
 
 def build_driver(plant: vehicle.Vehicle) -> datasets.Driver:
-    """The path-following law that keeps data collection on the road."""
+    """Return the path-following law that drives while data are collected."""
     law = control.path_feedback(wheelbase=plant.wheelbase, speed_loop=plant.speed_loop)
 
     def driver(state: State, reference: Reference) -> Control:

@@ -1,4 +1,4 @@
-"""Rows of a table: what is driven, by which model, told what; and the law of path coordinates."""
+"""Systems that an evaluation compares, and the law of path coordinates."""
 
 from __future__ import annotations
 
@@ -7,14 +7,19 @@ from functools import partial
 from typing import Any, NamedTuple
 
 from sfkd_jax import control, models, vehicle
-from sfkd_jax.build._choices import Settings, floats, without
+from sfkd_jax.build._choices import Settings, as_kwargs, floats
 from sfkd_jax.types import Environment, Model
 
 
 class System(NamedTuple):
-    """A row of a table: a model with its parameters, what it is told about the environment, and its certificate.
+    """A system that an evaluation drives: a row of its table.
 
-    Of a model in path coordinates also the law that it was learned around.
+    Attributes:
+        model: that the controller predicts with.
+        params: of the model.
+        env_source: where its environment comes from: "measured", "estimated" or "none".
+        certificate: verified, or None.
+        law: that a model in path coordinates was learned around, or None.
     """
 
     model: Model
@@ -25,23 +30,26 @@ class System(NamedTuple):
 
 
 def build_law(settings: Settings, plant: vehicle.Vehicle) -> control.PathLaw | None:
-    """The law of a data set in path coordinates, derived from the vehicle's own step; None for other data sets.
+    """Derive the law of a data set in path coordinates from the vehicle's step.
 
     Args:
         settings: of the data set.
         plant: any vehicle with limits of its controls.
+
+    Returns:
+        The law, or None if the data set is not in path coordinates.
     """
     if "law" not in settings:
         return None
     box = {name: floats(settings[name]) for name in ("env_low", "env_high")}
     size = len(plant.state_names) - 1
     return control.derive_path_law(
-        plant.step, coordinates=size, **box, **without(settings["law"])
+        plant.step, coordinates=size, **box, **as_kwargs(settings["law"])
     )
 
 
 def build_loop(plant: vehicle.Vehicle, law: control.PathLaw) -> vehicle.Vehicle:
-    """The plant with a law closed around it: states and controls of `path_frame`."""
+    """Return the closed loop of plant and law, in the coordinates of `path_frame`."""
     steering, drive = (float(largest) for largest in law.perturbation)
     return vehicle.along_path(plant, law, perturbation=(steering, drive))
 
@@ -49,11 +57,16 @@ def build_loop(plant: vehicle.Vehicle, law: control.PathLaw) -> vehicle.Vehicle:
 def reference_systems(
     plant: vehicle.Vehicle, law: control.PathLaw | None = None
 ) -> dict[str, System]:
-    """Rows that need no learning: the nominal bicycle, the true plant, and the true plant wrong about e.
+    """Return the systems that need no learning, by name.
 
-    With a law they are those of the loop around the plant, in path coordinates, and
-    "law" is beside them: the true plant once more, for a planner that draws no samples
-    (`num_samples=1`), so that the law drives alone.
+    "nominal" predicts with the bicycle, "oracle" with the true plant, and "oracle_…"
+    with the true plant under a wrong environment. With a law they describe its closed
+    loop, in path coordinates; "law" is then the oracle once more, for a planner without
+    samples (`num_samples=1`), so that the law drives alone.
+
+    Args:
+        plant: the true vehicle.
+        law: of path coordinates, or None.
     """
 
     def biased(entry: int, factor: float) -> Callable[[Environment], Environment]:

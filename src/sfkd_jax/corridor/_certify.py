@@ -22,7 +22,7 @@ from sfkd_jax.certification import (
     fixed_point_corridor,
     fixed_points,
 )
-from sfkd_jax.control import admit
+from sfkd_jax.control import safety_filter
 from sfkd_jax.core.path_frame import PATH_SPEED, path_state
 from sfkd_jax.corridor._drives import (
     EXCITATION,
@@ -42,7 +42,7 @@ STREAM = 4
 
 def certify_corridor(
     settings: Mapping[str, Any],
-    trained: policy.Trained,
+    trained: policy.TrainedModel,
     outputs: Mapping[str, OutputMetric],
     *,
     drives: int = 150,
@@ -78,7 +78,7 @@ def certify_corridor(
         trained,
         settings["evaluation"]["observation_noise"],
     )
-    level, data = settings["certification"]["level"], build.without(settings["dataset"])
+    level, data = settings["certification"]["level"], build.as_kwargs(settings["dataset"])
     roads = {name: data[name] for name in ROADS}
     box = {name: data[name] for name in ("env_low", "env_high")}
     asked = roads | {name: data[name] for name in EXCITATION}
@@ -202,7 +202,7 @@ def _attack(
         def let_through(
             fiber: Any, latent: Any, wanted: Control, index: Any
         ) -> Control:
-            return admit(
+            return safety_filter(
                 model, fiber, latent, wanted, roads[index], limit, width=width
             ).nu
 

@@ -65,7 +65,7 @@ class Measured(NamedTuple):
     roads: Float[np.ndarray, "drive time 2"]
 
 
-def closed(plant: Vehicle, trained: policy.Trained, noise: Sequence[float]) -> Loop:
+def closed(plant: Vehicle, trained: policy.TrainedModel, noise: Sequence[float]) -> Loop:
     """The loop of a policy, with the weights as they drive.
 
     Args:

@@ -25,7 +25,7 @@ PARTS = 3
 
 
 def corridor_by_speed(
-    trained: policy.Trained,
+    trained: policy.TrainedModel,
     certificate: Mapping[str, Any],
     *,
     frictions: Sequence[float],

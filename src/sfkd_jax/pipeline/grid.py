@@ -11,10 +11,10 @@ import numpy as np
 
 from sfkd_jax import artefacts, evaluation
 from sfkd_jax.pipeline import store
-from sfkd_jax.pipeline.evaluate_system import Drive, Track
+from sfkd_jax.pipeline.evaluate_system import EpisodeSet, SystemResult
 
 KIND = "cell"
-FIGURED = 2
+NUM_STORED_EPISODES = 2
 """Episodes of a cell whose arrays are kept for figures; the measures of all are in its
 row.
 """
@@ -74,7 +74,7 @@ def drivers(wanted: list[Cell]) -> list[list[Cell]]:
     ]
 
 
-def dealt(groups: list[list[Cell]], share: list[int] | None) -> list[list[Cell]]:
+def take_share(groups: list[list[Cell]], share: list[int] | None) -> list[list[Cell]]:
     """Those of every n-th row from the k-th on, share = [k, n]; all for None.
 
     All controllers and cells of a row lie in one share, for they share its policy.
@@ -133,12 +133,12 @@ def place(cell: Cell, settings: dict[str, Any]) -> Path:
     )
 
 
-def driver_of(settings: dict[str, Any]) -> str:
+def compilation_key(settings: dict[str, Any]) -> str:
     """The hash of what a driver is compiled from: cells that share it share the driver."""
     protocol = {
         name: value
         for name, value in settings["evaluation"].items()
-        if name not in ("told", "variation")
+        if name not in ("env_sensor", "variation")
     }
     asked = {
         name: settings[name]
@@ -147,12 +147,16 @@ def driver_of(settings: dict[str, Any]) -> str:
     return artefacts.sha256(asked | {"evaluation": protocol})
 
 
-def made_with(settings: dict[str, Any]) -> str:
+def settings_hash(settings: dict[str, Any]) -> str:
     """The hash of the settings that a cell comes from; neither the code nor where the artefacts lie is in it."""
     asked = {
         name: settings[name]
-        for name in (*store.IDENTITY, "controller", "scenario", "evaluation")
+        for name in (*store.IDENTITY, "controller", "scenario")
     } | {"env": settings["env_source"]}
+    asked["evaluation"] = {  # stored cells were hashed under an earlier key
+        "told" if name == "env_sensor" else name: value
+        for name, value in settings["evaluation"].items()
+    }
     return artefacts.sha256(asked | {"certification": settings["certification"]})
 
 
@@ -161,18 +165,18 @@ def is_done(path: Path, settings: dict[str, Any]) -> bool:
     try:
         return artefacts.read_json(_row_file(path), keys=("row",))[
             "made_with"
-        ] == made_with(settings)
+        ] == settings_hash(settings)
     except (artefacts.ArtefactError, OSError, KeyError):
         return False
 
 
 def write(
-    path: Path, settings: dict[str, Any], track: Track, driven: Drive
+    path: Path, settings: dict[str, Any], track: EpisodeSet, driven: SystemResult
 ) -> dict[str, Any]:
     """Store arrays of the first episodes, then the row, which is returned: a kill between leaves a cell not done."""
     path.parent.mkdir(parents=True, exist_ok=True)
-    arrays = driven.arrays | {"envs": track.roads.envs, "path": track.roads.path.points}
-    kept = {name: np.asarray(array)[:FIGURED] for name, array in arrays.items()}
+    arrays = driven.arrays | {"envs": track.scenarios.envs, "path": track.scenarios.path.points}
+    kept = {name: np.asarray(array)[:NUM_STORED_EPISODES] for name, array in arrays.items()}
     kept["dt"] = np.asarray(settings["vehicle"]["dt"])
     file = path.with_name(f"{path.name}.npz")
     artefacts.write_arrays(file, kept, kind=KIND, config=settings["scenario"])
@@ -180,7 +184,7 @@ def write(
         "arrays": str(file.relative_to(Path(settings["root"], settings["name"])))
     }
     artefacts.write_json(
-        _row_file(path), {"row": row, "made_with": made_with(settings)}
+        _row_file(path), {"row": row, "made_with": settings_hash(settings)}
     )
     return row
 
@@ -217,7 +221,7 @@ def collect(
             if older
             else "left out; comparison.older=true takes them"
         )
-        store.say(
+        artefacts.print_message(
             f"{len(others)} cells were made with other settings, such as {others[0]}: {done}"
         )
     return evaluation.compare([evaluation.pool(rows) for rows in found.values()])

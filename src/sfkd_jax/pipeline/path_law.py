@@ -9,7 +9,7 @@ from typing import Any
 import jax
 
 from sfkd_jax import artefacts, build
-from sfkd_jax.control import PathLaw, law_arrays, law_from_arrays
+from sfkd_jax.control import PathLaw, law_to_arrays, law_from_arrays
 from sfkd_jax.datasets import (
     generate,
     generate_along_path,
@@ -27,9 +27,9 @@ def ensure(settings: dict[str, Any]) -> PathLaw | None:
         return None
     if not artefacts.exists(store.law_path(settings)):
         plant = build.build_vehicle(settings["vehicle"])
-        store.say(f"deriving the law of vehicle {plant.name}")
+        artefacts.print_message(f"deriving the law of vehicle {plant.name}")
         law = jax.jit(partial(build.build_law, settings["dataset"], plant))()
-        store.write_law(settings, law_arrays(law))
+        store.write_law(settings, law_to_arrays(law))
     return law_from_arrays(store.read_law(settings))
 
 

@@ -58,9 +58,9 @@ def _driven(settings: dict[str, Any]) -> Dataset:
     """A data set that the vehicle's own step drives."""
     asked = settings["dataset"]
     drive_key, split_key = jax.random.split(jax.random.key(asked["seed"]))
-    options = build.without(asked, *SPLIT, "law")
+    options = build.as_kwargs(asked, *SPLIT, "law")
     drives = path_law.drives(settings, options)
-    store.say(f"generating {asked['segments']} segments")
+    artefacts.print_message(f"generating {asked['segments']} segments")
     trajectories = jax.jit(drives)(drive_key)
     if store.is_along_path(settings):
         check_on_path(trajectories)
@@ -77,25 +77,25 @@ def _driven(settings: dict[str, Any]) -> Dataset:
 def _from_logs(settings: dict[str, Any]) -> Dataset:
     """A data set from logs; what they cover is said, and kept beside it."""
     asked, plant = settings["dataset"], build.build_vehicle(settings["vehicle"])
-    columns = Columns(**build.without(asked["columns"]))
+    columns = Columns(**build.as_kwargs(asked["columns"]))
     if len(columns.state) != len(plant.state_names):
         named = f"vehicle {plant.name} has {', '.join(plant.state_names)}"
         raise ValueError(
             f"dataset.columns.state names {len(columns.state)} columns, {named}; name as many, in this order"
         )
-    store.say(f"reading {asked['path']}")
+    artefacts.print_message(f"reading {asked['path']}")
     known = {
         "dt": plant.dt,
         "wheelbase": plant.wheelbase,
-        "told": store.is_told(settings),
+        "told": store.has_environment(settings),
     }
     known["limits"] = (plant.control_low or None, plant.control_high or None)
     logged = from_logs(
         asked["path"],
         columns,
-        say=store.say,
+        say=artefacts.print_message,
         **known,
-        **build.without(asked, "path", "columns"),
+        **build.as_kwargs(asked, "path", "columns"),
     )
     artefacts.write_json(
         store.dataset_path(settings).with_name("coverage.json"), logged.coverage
@@ -126,7 +126,7 @@ def _check_enough(settings: dict[str, Any]) -> None:
         )
 
 
-def held_out_drives(
+def held_out_parts(
     settings: dict[str, Any], dataset: Dataset
 ) -> dict[str, Trajectory]:
     """What coverage is counted on: the test split, its S1 and S2 parts, and as many drives under S3's switching.
@@ -153,12 +153,12 @@ def _switching(asked: str) -> Trajectory:
     """Drives under S3's switching, of these settings as JSON; kept, for every row of a comparison asks for the same."""
     settings = json.loads(asked)
     data = settings["dataset"] | {"segments": settings["segments"]}
-    options = build.without(data, *SPLIT, "law", "fixed_levels")
+    options = build.as_kwargs(data, *SPLIT, "law", "fixed_levels")
     drive = jax.jit(path_law.drives(settings, options, switching=True))
     return drive(jax.random.fold_in(jax.random.key(data["seed"]), SWITCHING))
 
 
-def ensure_policy(settings: dict[str, Any]) -> policy.Trained:
+def ensure_policy(settings: dict[str, Any]) -> policy.TrainedModel:
     """The policy of this run: from the shelf, or trained now, continuing what was begun.
 
     Raises:
@@ -182,7 +182,7 @@ def systems(settings: dict[str, Any], plant: Vehicle) -> dict[str, build.System]
     references, found = build.reference_systems(plant, path_law.ensure(settings)), {}
     for name in settings["evaluation"]["systems"]:
         if name == "self":
-            found[settings["model"]["system"]] = own_system(settings)
+            found[settings["model"]["system"]] = policy_system(settings)
         else:
             found[name] = build.choose(
                 references | {"self": None}, name, "evaluation.systems entry"
@@ -190,7 +190,7 @@ def systems(settings: dict[str, Any], plant: Vehicle) -> dict[str, build.System]
     return found
 
 
-def own_system(settings: dict[str, Any]) -> build.System:
+def policy_system(settings: dict[str, Any]) -> build.System:
     """The policy of this run as a row of a table, with its certificate if there is one.
 
     Raises:
@@ -204,7 +204,7 @@ def own_system(settings: dict[str, Any]) -> build.System:
         store.run_directory(settings), trained
     )
     if certificate is None:
-        store.say(f"nothing is certified and nothing is monitored: {reason}")
+        artefacts.print_message(f"nothing is certified and nothing is monitored: {reason}")
         if fallback != "none":
             raise ValueError(
                 f"controller.monitor.fallback={fallback} needs a certificate; {reason}"
@@ -228,13 +228,13 @@ def _train(settings: dict[str, Any]) -> None:
     horizon, start = options.pop("window"), options.pop("start", "random")
     key = jax.random.fold_in(jax.random.key(settings["seed"]), 0)
     if model.identify is not None:
-        store.say(f"identifying {settings['model']['system']} in {place}")
+        artefacts.print_message(f"identifying {settings['model']['system']} in {place}")
         params, best = model.identify(dataset.train, dataset.validation, key), None
     else:
         loss = multi_step_loss(model, space, **options.pop("loss"))
         draw = partial(random_windows, batch=options.pop("batch"), length=horizon)
         held_out = spread_windows(dataset.validation, length=horizon)
-        store.say(
+        artefacts.print_message(
             f"training {settings['model']['system']}, {options['steps']} steps, in {place}"
         )
         options["inspect"] = partial(progress, model)

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import functools
-import sys
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -60,7 +59,7 @@ def dataset_config(settings: dict[str, Any]) -> dict[str, Any]:
     if is_logged(settings):
         asked |= {
             "contents": fingerprint(asked.pop("path")),
-            "environment_known": is_told(settings),
+            "environment_known": has_environment(settings),
         }
     return {"vehicle": settings["vehicle"], "dataset": asked}
 
@@ -70,7 +69,7 @@ def is_logged(settings: dict[str, Any]) -> bool:
     return "path" in settings["dataset"]
 
 
-def is_told(settings: dict[str, Any]) -> bool:
+def has_environment(settings: dict[str, Any]) -> bool:
     """Whether there is an environment that somebody measured or infers."""
     return settings.get("env_source") != "none"
 
@@ -101,7 +100,7 @@ def read_dataset(settings: dict[str, Any]) -> tuple[Dataset, str]:
     arrays, manifest = artefacts.read_arrays(
         dataset_path(settings), kind=DATASET, config=dataset_config(settings)
     )
-    with artefacts.understood(dataset_path(settings)):
+    with artefacts.as_artefact_error(dataset_path(settings)):
         parts = [
             Trajectory(
                 *(jnp.asarray(arrays[f"{part}/{name}"]) for name in Trajectory._fields)
@@ -212,7 +211,7 @@ def channel_names(settings: dict[str, Any]) -> dict[str, list[str]]:
     return {
         "state": columns["state"][BODY],
         "control": columns["control"],
-        "env": columns["environment"] if is_told(settings) else [],
+        "env": columns["environment"] if has_environment(settings) else [],
     }
 
 
@@ -231,8 +230,3 @@ def open_loop_document(
         "yaw_rmse_rad": columns[2].tolist(),
         "speed_rmse_m_per_s": columns[3].tolist(),
     }
-
-
-def say(text: str) -> None:
-    """Progress for a person; stdout's last line belongs to the JSON object."""
-    print(text, file=sys.stderr, flush=True)

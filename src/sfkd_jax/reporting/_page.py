@@ -8,8 +8,8 @@ from typing import Any
 from sfkd_jax.artefacts import (
     ArtefactError,
     read_jsonl,
-    tell,
-    understood,
+    print_message,
+    as_artefact_error,
     write_bytes,
     writing,
 )
@@ -67,10 +67,10 @@ def _write(run: Path) -> dict[str, Any]:
     for stale in place.glob("*.png"):
         stale.unlink()
     log, errors = run / "metrics.jsonl", read(run / "open_loop.json")
-    metrics = read_jsonl(log, damaged=tell) if log.exists() else []
+    metrics = read_jsonl(log, damaged=print_message) if log.exists() else []
     certificate = about(policy, read(run / "certificate.json"))
     results = read(run / "results.json") or {}
-    with understood(run / "policy.json", ValueError):
+    with as_artefact_error(run / "policy.json", ValueError):
         name, seed = (
             plain(settings.get("experiment") or "unnamed run"),
             plain(settings.get("seed")),
@@ -81,15 +81,15 @@ def _write(run: Path) -> dict[str, Any]:
             policy.get("versions") or results.get("versions"),
             dig(results, "config", "command"),
         )
-    with understood(run / "results.json", ValueError):
+    with as_artefact_error(run / "results.json", ValueError):
         rows = blocks_of(results.get("rows") or [])
         head = headline(rows, settings)
         driven = driving(run, rows, settings, place)
-    with understood(run / "open_loop.json", ValueError):
+    with as_artefact_error(run / "open_loop.json", ValueError):
         predicted = sections.predicting(errors, settings, place)
-    with understood(log, ValueError):
+    with as_artefact_error(log, ValueError):
         trained = sections.training(metrics, settings, place)
-    with understood(run / "certificate.json", ValueError):
+    with as_artefact_error(run / "certificate.json", ValueError):
         lead = Text(summary(settings, head, certificate, metrics), kind="lead")
         tiles = sections.tiles(settings, head, errors, certificate)
         certified = corridor(run, certificate, settings, place)
