@@ -294,7 +294,8 @@ def test_a_controller_for_our_plant_keeps_such_a_car_in_its_lane(model):
         name="s1", duration=5.0, state_size=len(car.state_names), dt=car.dt
     )
     road = jit(family)(jax.random.key(3))
-    road = road._replace(envs=road.envs.at[:, 0].set(0.6))
+    envs = road.envs.at[:, 0].set(0.6)
+    road = road._replace(envs=envs, observed_envs=envs)
     drive = jit(
         lambda key: evaluation.simulate(
             car.step, controller, {}, road, key, dt=car.dt, horizon=2
@@ -302,9 +303,8 @@ def test_a_controller_for_our_plant_keeps_such_a_car_in_its_lane(model):
     )
     episode = drive(jax.random.key(0))
     batch = jax.tree.map(lambda leaf: leaf[None], episode)
-    assert not evaluation.score(
-        batch, np.asarray(road.envs)[None], dt=car.dt
-    ).departed.any()
+    scores = evaluation.score(batch, np.asarray(road.envs)[None], dt=car.dt)
+    assert not scores["departures"].any()
     assert float(episode.progress[-1]) > 45.0
     assert np.abs(episode.states[:, 2]).max() > 0.05
 
@@ -333,5 +333,5 @@ def test_an_observation_of_another_size_is_refused():
 def test_the_snippet_of_the_page_runs_as_it_stands(capsys):
     page = (Path(__file__).parents[2] / "docs" / "plants.md").read_text("utf-8")
     (snippet,) = re.findall(r"```python\n(.*?)```", page, re.DOTALL)
-    exec(compile(snippet, "docs/plants.md", "exec"), {})
+    exec(compile(snippet, "docs/results/other-cars.md", "exec"), {})
     assert "(7,)" in capsys.readouterr().out

@@ -56,9 +56,9 @@ def test_an_episode_has_the_documented_shapes():
     one = at(episodes(PLANT.step), 0)
     assert one.states.shape == (STEPS + 1, 4)
     assert one.controls.shape == (STEPS, 2)
-    assert one.believed.shape == (STEPS, 2)
+    assert one.assumed_envs.shape == (STEPS, 2)
     assert all(
-        leaf.shape == (STEPS,) for leaf in one._replace(believed=one.lateral)[2:]
+        leaf.shape == (STEPS,) for leaf in one._replace(assumed_envs=one.lateral)[2:]
     )
 
 
@@ -87,8 +87,8 @@ def test_the_oracle_drives_better_than_the_nominal_model():
         evaluation.score(episodes(step), np.asarray(roads().envs), dt=0.1)
         for step in (PLANT.step, PLANT.nominal)
     ]
-    assert np.all(scores[0].rmse < scores[1].rmse)
-    assert np.all(scores[0].rmse < 0.1)
+    assert np.all(scores[0]["rmse_m"] < scores[1]["rmse_m"])
+    assert np.all(scores[0]["rmse_m"] < 0.1)
     assert not np.any(scores[0].departed)
 
 

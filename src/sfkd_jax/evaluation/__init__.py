@@ -1,25 +1,29 @@
-"""The test track: closed loop, open loop, metrics and their statistics."""
+"""Closed-loop and open-loop evaluation: episodes, scores and their statistics."""
 
 from sfkd_jax.evaluation._closed_loop import Episode as Episode
 from sfkd_jax.evaluation._closed_loop import first_reference as first_reference
-from sfkd_jax.evaluation._closed_loop import pushed as pushed
 from sfkd_jax.evaluation._closed_loop import simulate as simulate
 from sfkd_jax.evaluation._corridor_attack import AIMS as AIMS
 from sfkd_jax.evaluation._corridor_attack import Outcome as Outcome
 from sfkd_jax.evaluation._corridor_attack import Tube as Tube
 from sfkd_jax.evaluation._corridor_attack import attack_corridor as attack_corridor
 from sfkd_jax.evaluation._corridor_attack import outcome_of as outcome_of
-from sfkd_jax.evaluation._metrics import Scores as Scores
-from sfkd_jax.evaluation._metrics import score as score
+from sfkd_jax.evaluation._environment import (
+    disturbed_environment as disturbed_environment,
+)
+from sfkd_jax.evaluation._environment import (
+    observed_environment as observed_environment,
+)
 from sfkd_jax.evaluation._open_loop import open_loop as open_loop
+from sfkd_jax.evaluation._rows import Scores as Scores
 from sfkd_jax.evaluation._rows import compare as compare
 from sfkd_jax.evaluation._rows import disturbed as disturbed
 from sfkd_jax.evaluation._rows import pool as pool
 from sfkd_jax.evaluation._rows import row as row
+from sfkd_jax.evaluation._rows import score as score
 from sfkd_jax.evaluation._statistics import bootstrap_mean as bootstrap_mean
 from sfkd_jax.evaluation._statistics import paired_difference as paired_difference
 from sfkd_jax.evaluation._statistics import summary as summary
-from sfkd_jax.evaluation._told import told as told
 from sfkd_jax.evaluation._violations import STRIDE as STRIDE
 from sfkd_jax.evaluation._violations import Claims as Claims
 from sfkd_jax.evaluation._violations import Predictions as Predictions

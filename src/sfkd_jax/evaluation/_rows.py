@@ -1,13 +1,48 @@
-"""From scores to the rows of results.json."""
+"""Rows of results.json from simulated episodes."""
 
 from __future__ import annotations
 
-from typing import Any
+from typing import Any, TypeAlias
 
 import numpy as np
+from jaxtyping import Float
 
-from sfkd_jax.evaluation._metrics import Scores
-from sfkd_jax.evaluation._statistics import paired_difference, summary
+from sfkd_jax.evaluation._closed_loop import Episode
+from sfkd_jax.evaluation._statistics import paired_difference
+from sfkd_jax.evaluation.metrics import METRICS, PerEpisode, Recording, Row
+
+_ARRAYS = (
+    "states",
+    "controls",
+    "effective_samples",
+    "healthy",
+    "breach",
+    "box_exit",
+)
+"""Of an episode, as they are."""
+
+
+Scores: TypeAlias = dict[str, PerEpisode]
+"""Numbers per episode by the name of their metric."""
+
+
+def score(
+    episodes: Episode, envs: Float[np.ndarray, "episode time 2"], *, dt: float
+) -> Scores:
+    """Measure every metric on a batch of episodes, leading axis first.
+
+    Args:
+        episodes: from `simulate`, batched.
+        envs: the true environments.
+        dt: sampling period [s].
+    """
+    recording = Recording(
+        dt=dt,
+        envs=np.asarray(envs),
+        lateral=np.asarray(episodes.lateral, dtype=np.float64),
+        **{name: np.asarray(getattr(episodes, name)) for name in _ARRAYS},
+    )
+    return {one.name: one.measure(recording) for one in METRICS if one.measure}
 
 
 def row(
@@ -17,7 +52,7 @@ def row(
     violation: dict[str, Any],
     *,
     watched: bool = False,
-) -> dict[str, Any]:
+) -> Row:
     """One system on one scenario; what does not apply is None.
 
     Args:
@@ -26,47 +61,55 @@ def row(
             episodes, episode_s, params.
         act_ms: median and 99 % quantile of one control step.
         violation: from `violations`.
-        watched: whether a monitor looked on.
+        watched: whether a monitor was active.
     """
-    after = scores.rmse_after_switch
-    return about | {
-        "rmse_m": summary(scores.rmse),
-        "rmse_episodes_m": [float(value) for value in scores.rmse],
-        "max_deviation_m": float(np.max(scores.max_deviation)),
-        "rmse_after_switch_m": None
-        if np.all(np.isnan(after))
-        else float(np.nanmean(after)),
-        "smoothness_rad_per_s": float(np.mean(scores.smoothness)),
+    pooled = _pooled(scores, watched=watched)
+    given = {
         "violation": violation,
-        "departures": int(np.sum(scores.departed)),
-        "unhealthy_steps": float(np.mean(scores.unhealthy)),
-        "breach_steps": float(np.mean(scores.breach)) if watched else None,
-        "box_exit_steps": float(np.mean(scores.box_exit)) if watched else None,
-        "ess": None if np.any(np.isnan(scores.ess)) else float(np.median(scores.ess)),
         "act_ms": None if act_ms is None else {"p50": act_ms[0], "p99": act_ms[1]},
         "ratio_to_oracle": None,
         "difference_to_sfkd": None,
+    }
+    keys = dict.fromkeys(metric.name.split(".")[0] for metric in METRICS)
+    values = pooled | given
+    return about | {key: values[key] for key in keys if key in values}
+
+
+def _pooled(scores: Scores, *, watched: bool = False) -> Row:
+    """The values of all metrics that are measured on episodes."""
+    return {
+        metric.name: metric.pool(scores[metric.name])
+        if watched or not metric.monitored
+        else None
+        for metric in METRICS
+        if metric.pool
     }
 
 
 def disturbed(
     force: float, scores: Scores, violation: dict[str, Any]
 ) -> dict[str, Any]:
-    """What becomes of a row when forces of up to ±`force` [N], which nobody measures, push the car sideways."""
-    kept = {name: violation[name] for name in ("v0", "v1", "v1_conformal", "v2")}
-    departures = int(np.sum(scores.departed))
+    """The part of a row that is also measured under unmeasured side forces.
+
+    Args:
+        force: largest force to either side [N].
+        scores: per episode.
+        violation: from `violations`.
+    """
+    pooled = _pooled(scores)
+    claims = {name: violation[name] for name in ("v0", "v1", "v1_conformal", "v2")}
     return {
         "force_n": force,
-        "rmse_m": summary(scores.rmse),
-        **kept,
-        "departures": departures,
+        "rmse_m": pooled["rmse_m"],
+        **claims,
+        "departures": pooled["departures"],
     }
 
 
 def compare(rows: list[dict[str, Any]]) -> list[dict[str, Any]]:
-    """Rows with comparisons between systems that drove the same episodes with the same sampling.
+    """Add comparisons of systems that drove the same episodes with the same sampling.
 
-    A row without sampling (a quadratic program) is compared with those that sample
+    A row without sampling (a quadratic program) is compared with rows that sample
     around feedback. Of several rows of a system, the one with the same controller and
     planner is taken.
     """
@@ -82,7 +125,7 @@ def compare(rows: list[dict[str, Any]]) -> list[dict[str, Any]]:
 
 
 def _episodes(entry: dict[str, Any]) -> tuple[Any, ...]:
-    """Which episodes a row drove: those of equal answers are paired."""
+    """Key of the episodes of a row; rows with equal keys are paired."""
     names = ("scenario", "vehicle", "variation")
     return (
         *(entry[name] for name in names),
@@ -92,7 +135,7 @@ def _episodes(entry: dict[str, Any]) -> tuple[Any, ...]:
 
 
 def _search(entry: dict[str, Any]) -> tuple[Any, ...]:
-    """How the controls of a row were found."""
+    """Controller and planner of a row."""
     return entry.get("controller"), entry.get("planner")
 
 
@@ -106,41 +149,44 @@ def _ratio(values: np.ndarray, reference: np.ndarray) -> float:
 
 
 _SFKD = ("sfkd", "sfkd_path")
-"""In the frame of the body and along a path: rows of one sampling have one frame."""
+"""In the frame of the body and in that of a path; one sampling has one frame."""
 _COMPARISONS = (
     (("oracle",), "ratio_to_oracle", _ratio),
     (_SFKD, "difference_to_sfkd", paired_difference),
 )
 
 
-def pool(rows: list[dict[str, Any]]) -> dict[str, Any]:
-    """One row of several that differ in the training seed alone: episodes are joined, other measures averaged.
+def pool(rows: list[Row]) -> Row:
+    """Pool rows that differ in the training seed alone.
+
+    Metrics are pooled as their table says, by default averaged.
 
     Args:
-        rows: at least one, in the order of their seeds; all drove the same episodes.
+        rows: at least one, in the order of their seeds, of the same episodes.
     """
     first, *rest = rows
     if not rest:
         return first
-    driven = [entry["rmse_episodes_m"] for entry in rows]
+    pooled = {one.name: one.pool_seeds(rows) for one in METRICS if one.pool_seeds}
     return _mean(rows) | {
         "arrays": first.get("arrays"),
         "seeds": [seed for entry in rows for seed in entry["seeds"]],
-        "rmse_m": summary(np.asarray(driven)),
-        "rmse_episodes_m": [value for episodes in driven for value in episodes],
-        "rmse_trainings_m": [float(np.mean(episodes)) for episodes in driven],
-        "max_deviation_m": max(entry["max_deviation_m"] for entry in rows),
-        "departures": sum(entry["departures"] for entry in rows),
+        **pooled,
     }
 
 
 def _mean(values: list[Any]) -> Any:
-    """The mean of equal structures, leaf by leaf; what is no number stays where all agree, and is None otherwise."""
+    """The mean of equal structures, leaf by leaf.
+
+    A leaf that is not a number stays where all agree and is None otherwise.
+    """
     first = values[0]
     if isinstance(first, dict):
         return {
-            name: _mean([value.get(name) for value in values]) for name in first
-        }  # older rows lack newer measures
+            # Older rows lack newer metrics.
+            name: _mean([value.get(name) for value in values])
+            for name in first
+        }
     if all(isinstance(value, float) for value in values):
         return float(np.mean(values))
     return first if all(value == first for value in values) else None

@@ -1,0 +1,106 @@
+"""JSON values as text: numbers, bounds and records; an en dash for what is missing."""
+
+from __future__ import annotations
+
+import math
+from decimal import ROUND_CEILING, Context, Decimal
+from typing import Any
+
+DASH = "–"
+
+
+def dig(record: Any, *keys: str) -> Any:
+    """The entry under nested keys, or None where one of them is absent."""
+    for key in keys:
+        record = record.get(key) if isinstance(record, dict) else None
+    return record
+
+
+def is_number(value: Any) -> bool:
+    """Whether a JSON value is a finite number."""
+    real = isinstance(value, int | float) and not isinstance(value, bool)
+    return real and math.isfinite(value)
+
+
+def is_pair(value: Any) -> bool:
+    """Whether a JSON value is a list of two finite numbers."""
+    pair = isinstance(value, list | tuple) and len(value) == 2
+    return pair and all(map(is_number, value))
+
+
+def number(value: Any, digits: int = 3) -> str:
+    """A number, or the mean of a record, with fixed decimals."""
+    value = dig(value, "mean") if isinstance(value, dict) else value
+    return f"{value:.{digits}f}".replace("-", "−") if is_number(value) else DASH
+
+
+def short(value: Any, digits: int = 3) -> str:
+    """A number to so many significant digits, an integer in full."""
+    if not is_number(value):
+        return DASH
+    text = str(value) if isinstance(value, int) else f"{value:.{digits}g}"
+    return text.replace("-", "−")
+
+
+def upper(value: Any, digits: int = 4) -> str:
+    """An upper bound, rounded up, but never up to 1 from below."""
+    if not is_number(value):
+        return DASH
+    exact = Decimal(repr(float(value)))
+    rounded = Context(prec=digits, rounding=ROUND_CEILING).create_decimal(exact)
+    if exact < 1 <= rounded and digits < 15:
+        return upper(value, digits + 1)
+    return short(float(rounded), digits)
+
+
+def millimetres(value: Any, digits: int = 1) -> str:
+    """A length in m, or the mean of a record of lengths, as millimetres."""
+    value = dig(value, "mean") if isinstance(value, dict) else value
+    return number(1e3 * value, digits) if is_number(value) else DASH
+
+
+def percent(share: Any) -> str:
+    """A share in percent; one that is not zero is not shown as zero."""
+    if not is_number(share):
+        return DASH
+    if share == 0:
+        return "0"
+    return "< 0.1" if 0 < share < 5e-4 else number(100 * share, 1)
+
+
+def interval(bounds: Any, digits: int = 3) -> str:
+    """Two bounds as "low to high"."""
+    if not is_pair(bounds):
+        return DASH
+    return f"{number(bounds[0], digits)} to {number(bounds[1], digits)}"
+
+
+def mean_std(record: Any, digits: int = 3) -> str:
+    """Mean ± standard deviation of a record."""
+    mean, std = number(record, digits), dig(record, "std")
+    return f"{mean} ± {number(std, digits)}" if is_number(std) else mean
+
+
+def plain(value: Any) -> str:
+    """Any JSON value: a record as "key value; …", a list by its first 12 entries."""
+    match value:
+        case None:
+            return DASH
+        case bool():
+            return "yes" if value else "no"
+        case int() | float():
+            return short(value, 6)
+        case dict():
+            return "; ".join(_entry(*item) for item in value.items()) or DASH
+        case list() | tuple():
+            shown = ", ".join(plain(entry) for entry in value[:12])
+            return f"[{shown}{', …' if len(value) > 12 else ''}]"
+    return str(value)
+
+
+def _entry(key: Any, value: Any) -> str:
+    return (
+        f"{key} ({plain(value)})"
+        if isinstance(value, dict)
+        else (f"{key} {plain(value)}")
+    )

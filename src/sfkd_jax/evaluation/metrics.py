@@ -1,0 +1,276 @@
+"""The table of metrics: what each one measures, how it is pooled and shown."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from functools import partial
+from typing import Any, NamedTuple, TypeAlias
+
+import numpy as np
+from jaxtyping import Bool, Float
+
+from sfkd_jax.evaluation._statistics import summary
+from sfkd_jax.evaluation.formats import (
+    dig,
+    interval,
+    mean_std,
+    millimetres,
+    number,
+    percent,
+    short,
+    upper,
+)
+
+Row: TypeAlias = dict[str, Any]
+"""One system on one scenario, as in results.json."""
+PerEpisode: TypeAlias = Float[np.ndarray, " episode"] | Bool[np.ndarray, " episode"]
+
+SETTLING = 2.0
+"""Start of an episode, not scored because it is the same for every system [s]."""
+AFTER_SWITCH = 3.0
+"""Time after a switch of e that `rmse_after_switch_m` covers [s]."""
+LANE_HALF_WIDTH = 1.75
+"""[m]"""
+VEHICLE_HALF_WIDTH = 0.9
+"""[m]"""
+SWITCH = (0.05, 6.0)
+"""A larger step of friction [-] or wind [m/s] is a switch; the ramps of gusts reach
+5 m/s a step.
+"""
+
+
+class Recording(NamedTuple):
+    """Simulated episodes as arrays; the leading axis runs over episodes.
+
+    Attributes:
+        dt: sampling period [s].
+        envs: true friction and wind.
+        lateral: signed distance of x_1 … x_T from the path [m].
+        states: x_0 … x_T.
+        controls: applied.
+        effective_samples: of the planner.
+        healthy: whether the planner's plan was usable.
+        breach: whether a monitor reported a breach.
+        box_exit: whether a monitor saw its domain left.
+    """
+
+    dt: float
+    envs: Float[np.ndarray, "episode time environment"]
+    lateral: Float[np.ndarray, "episode time"]
+    states: Float[np.ndarray, "episode time_plus_1 state"]
+    controls: Float[np.ndarray, "episode time control"]
+    effective_samples: Float[np.ndarray, "episode time"]
+    healthy: Bool[np.ndarray, "episode time"]
+    breach: Bool[np.ndarray, "episode time"]
+    box_exit: Bool[np.ndarray, "episode time"]
+
+
+class Metric(NamedTuple):
+    """One metric of a row of results.json.
+
+    Attributes:
+        name: JSON key; `a.b` is the entry b of the record a.
+        label: what a reader sees.
+        unit: of the value as shown.
+        table: which table shows it: "tracking", "spread", "planner", "cost", "claims"
+            or "prediction"; "" for none.
+        write: formats a JSON value; an en dash for None and for what is not finite.
+        mm: decimals as millimetres; None for what is not a length.
+        measure: one number per episode; None if the value is not about one episode.
+        pool: the JSON value of a row from the numbers of its episodes.
+        pool_seeds: the JSON value of rows that differ in the training seed; None for
+            the mean of their numbers.
+        read: the JSON value of a row, where that is more than a look-up by name.
+        monitored: whether it is null for a system without a monitor.
+    """
+
+    name: str
+    label: str = ""
+    unit: str = ""
+    table: str = ""
+    write: Callable[[Any], str] = number
+    mm: int | None = None
+    measure: Callable[[Recording], PerEpisode] | None = None
+    pool: Callable[[PerEpisode], Any] | None = None
+    pool_seeds: Callable[[list[Row]], Any] | None = None
+    read: Callable[[Row], Any] | None = None
+    monitored: bool = False
+
+    def value(self, row: Row) -> Any:
+        """The JSON value in a row, or None."""
+        return self.read(row) if self.read else dig(row, *self.name.split("."))
+
+    def text(self, row: Row, *, mm: bool = False) -> str:
+        """The value of a row as text, lengths in millimetres with `mm`."""
+        value = self.value(row)
+        return (
+            millimetres(value, self.mm)
+            if mm and self.mm is not None
+            else (self.write(value))
+        )
+
+    def head(self, *, mm: bool = False) -> str:
+        """Label and unit, as the head of a column."""
+        unit = "mm" if mm and self.mm is not None else self.unit
+        return f"{self.label} [{unit}]" if unit else self.label
+
+
+def _scored(drive: Recording) -> np.ndarray:
+    """Lateral deviation after the start of the episode."""
+    return drive.lateral[:, round(SETTLING / drive.dt) :]
+
+
+def _rmse(drive: Recording) -> np.ndarray:
+    return np.sqrt(np.mean(_scored(drive) ** 2, axis=1))
+
+
+def _max_deviation(drive: Recording) -> np.ndarray:
+    return np.max(np.abs(_scored(drive)), axis=1)
+
+
+def _rmse_after_switch(drive: Recording) -> np.ndarray:
+    """RMSE within AFTER_SWITCH of a switch; NaN for an episode without a switch."""
+    after = _after_switch(drive.envs, round(AFTER_SWITCH / drive.dt))
+    after[:, : round(SETTLING / drive.dt)] = False
+    squares = np.where(after, drive.lateral**2, 0.0).sum(axis=1)
+    counts = after.sum(axis=1)
+    return np.where(counts > 0, np.sqrt(squares / np.maximum(counts, 1)), np.nan)
+
+
+def _after_switch(envs: np.ndarray, steps: int) -> np.ndarray:
+    """Which steps lie within `steps` of a switch of e, (episode, time)."""
+    jumps = np.any(np.abs(np.diff(envs, axis=1)) > np.asarray(SWITCH), axis=2)
+    jumps = np.concatenate([np.zeros((len(envs), 1), bool), jumps], axis=1)
+    mask = np.zeros_like(jumps)
+    for lag in range(min(steps, jumps.shape[1])):
+        mask[:, lag:] |= jumps[:, : jumps.shape[1] - lag]
+    return mask
+
+
+def _steering_rate(drive: Recording) -> np.ndarray:
+    """Mean |steering rate| of the applied controls."""
+    return np.mean(np.abs(np.diff(drive.controls[..., 0], axis=1)), axis=1) / drive.dt
+
+
+def _departed(drive: Recording) -> np.ndarray:
+    """Whether the car left its lane or a state is not finite."""
+    finite = np.all(np.isfinite(drive.states), axis=(1, 2))
+    stays = _max_deviation(drive) + VEHICLE_HALF_WIDTH <= LANE_HALF_WIDTH
+    return ~finite | ~stays
+
+
+def _mean(values: np.ndarray) -> float:
+    return float(np.mean(values))
+
+
+def _mean_known(values: np.ndarray) -> float | None:
+    """The mean of the episodes that have the measure."""
+    return None if np.all(np.isnan(values)) else float(np.nanmean(values))
+
+
+def _median(values: np.ndarray) -> float | None:
+    return None if np.any(np.isnan(values)) else float(np.median(values))
+
+
+def _each(values: np.ndarray) -> list[float]:
+    return [float(value) for value in values]
+
+
+def _of_trainings(rows: list[Row]) -> list[list[float]]:
+    """RMSE of every episode, one list per training."""
+    return [row["rmse_episodes_m"] for row in rows]
+
+
+def _certified(key: str) -> Callable[[Row], Any]:
+    """Read an entry about the tube in use, None unless that one is certified."""
+
+    def read(row: Row) -> Any:
+        record = dig(row, "violation")
+        return dig(record, key) if dig(record, "v1_tube") == "certified" else None
+
+    return read
+
+
+def _conformal(key: str, own: str) -> Callable[[Row], Any]:
+    """Read an entry about the conformal tube; older rows have it as the tube in use."""
+
+    def read(row: Row) -> Any:
+        record = dig(row, "violation")
+        value = dig(record, key)
+        in_use = value is None and dig(record, "v1_tube") == "conformal"
+        return dig(record, own) if in_use else value
+
+    return read
+
+
+def _ahead(steps: int) -> Metric:
+    """Position error of open-loop predictions."""
+    label = f"{steps} step{'s' * (steps > 1)} ahead"
+    return Metric(f"open_loop_rmse_m.{steps}", label, "m", "prediction", number, 1)
+
+
+# fmt: off
+METRICS: tuple[Metric, ...] = (
+    Metric("rmse_m", "RMSE, mean ± std", "m", "tracking", mean_std, 1, _rmse, summary,
+           lambda rows: summary(np.asarray(_of_trainings(rows)))),
+    Metric("rmse_m.ci95", "95 % interval", "m", "tracking", interval),
+    Metric("rmse_m.median", "Median", "m", "spread", number, 1),
+    Metric("rmse_m.p95", "95th percentile", "m", "spread", number, 1),
+    Metric("rmse_episodes_m", measure=_rmse, pool=_each,
+           pool_seeds=lambda rows: [x for one in _of_trainings(rows) for x in one]),
+    Metric("rmse_trainings_m",
+           pool_seeds=lambda rows: [float(np.mean(x)) for x in _of_trainings(rows)]),
+    Metric("max_deviation_m", "Largest deviation", "m", "tracking", number, 0,
+           _max_deviation, lambda values: float(np.max(values)),
+           lambda rows: max(row["max_deviation_m"] for row in rows)),
+    Metric("rmse_after_switch_m", "RMSE after a switch", "m", "spread", number, 1,
+           _rmse_after_switch, _mean_known),
+    Metric("smoothness_rad_per_s", "Steering rate", "rad/s", "tracking",
+           measure=_steering_rate, pool=_mean),
+    Metric("violation.v0", "V0, theorem", "%", "claims", percent),
+    Metric("violation.v1", "V1, certified tube", "%", "claims", percent,
+           read=_certified("v1")),
+    Metric("violation.v1_radius_m", "mean radius of the certified tube", "m", "claims",
+           read=_certified("v1_radius_m")),
+    Metric("violation.v1_conformal", "V1, conformal tube", "%", "claims", percent,
+           read=_conformal("v1_conformal", "v1")),
+    Metric("violation.v1_conformal_radius_m", "mean radius of the conformal tube", "m",
+           "claims", read=_conformal("v1_conformal_radius_m", "v1_radius_m")),
+    Metric("violation.v2", "V2, threshold", "%", "claims", percent),
+    Metric("departures", "Left the lane", "", "spread", short, None, _departed,
+           lambda values: int(np.sum(values)),
+           lambda rows: sum(row["departures"] for row in rows)),
+    Metric("unhealthy_steps", "Steps with the last plan held", "%", "planner", percent,
+           measure=lambda drive: 1.0 - np.mean(drive.healthy, axis=1), pool=_mean),
+    Metric("breach_steps", "Steps beyond the monitored bounds", "%", "claims", percent,
+           measure=lambda drive: np.mean(drive.breach, axis=1), pool=_mean,
+           monitored=True),
+    Metric("box_exit_steps", "Steps outside the monitored domain", "%", "claims",
+           percent, measure=lambda drive: np.mean(drive.box_exit, axis=1), pool=_mean,
+           monitored=True),
+    Metric("ess", "Effective samples", "", "planner", partial(number, digits=0), None,
+           lambda drive: np.median(drive.effective_samples, axis=1), _median),
+    Metric("act_ms.p50", "Control step, median", "ms", "cost",
+           partial(number, digits=2)),
+    Metric("act_ms.p99", "Control step, 99 %", "ms", "cost",
+           partial(number, digits=2)),
+    Metric("ratio_to_oracle", "RMSE over oracle", "", "tracking",
+           partial(number, digits=2)),
+    Metric("difference_to_sfkd.mean", "RMSE minus SFKD", "m", "spread",
+           partial(number, digits=4), 1),
+    Metric("difference_to_sfkd.ci95", "95 % interval of the difference", "m", "spread",
+           partial(interval, digits=4)),
+    Metric("params", "Parameters", "", "cost", short),
+    Metric("alpha", "Certified α", "", "cost", upper),
+    *map(_ahead, (1, 5, 10, 20)),
+)
+"""All metrics, in the order of the keys of a row and of the columns of tables."""
+# fmt: on
+
+BY_NAME: dict[str, Metric] = {metric.name: metric for metric in METRICS}
+"""The same by JSON key."""
+
+
+def in_table(table: str) -> list[Metric]:
+    """The metrics that a table shows."""
+    return [metric for metric in METRICS if metric.table == table]
