@@ -165,18 +165,18 @@ def test_differences_are_told_by_dotted_key():
         "name": "a" * 99,
     }
     assert artefacts.differences(CONFIG, asked) == [
-        "model.layers was [32, 32], asked [32, 64]",
-        "training.steps was 4000, asked 100",
-        "seed was 0, asked absent",
-        f"name was absent, asked {'a' * 57}...",
+        "model.layers was [32, 32], is now [32, 64]",
+        "training.steps was 4000, is now 100",
+        "seed was 0, is now absent",
+        f"name was absent, is now {'a' * 57}...",
     ]
     assert artefacts.differences(CONFIG, json.loads(json.dumps(CONFIG))) == []
     assert artefacts.differences({"a": {"b": 1}}, {"a": 1}) == [
-        "a was {'b': 1}, asked 1"
+        "a was {'b': 1}, is now 1"
     ]
     assert artefacts.differences(
         {"a": True, "b": None}, {"a": 1, "b": float("nan")}
-    ) == ["a was True, asked 1"]
+    ) == ["a was True, is now 1"]
 
 
 # ---- JSON
@@ -292,7 +292,7 @@ def test_other_settings_kinds_and_formats_are_refused(path):
     asked = CONFIG | {"training": {"steps": 100, "rate": 1e-3}}
     assert (
         refusal(read, path, config=asked)
-        == f"{path}: made with other settings: training.steps was 4000, asked 100"
+        == f"{path}: made with other settings: training.steps was 4000, is now 100"
     )
     assert refusal(read, path, config={"a": 1, "b": 2}).endswith("and 2 more")
     assert (

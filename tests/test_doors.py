@@ -140,7 +140,7 @@ def test_other_settings_in_the_same_place_are_refused(walked):
     done = door(
         "train", "+experiment=smoke", "training.steps=100", cwd=walked[0], code=1
     )
-    assert "training.steps was 150, asked 100" in done.stderr
+    assert "training.steps was 150, is now 100" in done.stderr
     assert len(done.stderr.strip().splitlines()) == 1
 
 

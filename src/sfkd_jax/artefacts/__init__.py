@@ -1,4 +1,4 @@
-"""Files: the only room that reads and writes arrays and JSON. Whatever is wrong with a file is told in one line."""
+"""Read and write arrays and JSON; every failure is one line that names the file."""
 
 from sfkd_jax.artefacts._arrays import exists as exists
 from sfkd_jax.artefacts._arrays import read_arrays as read_arrays
@@ -11,21 +11,21 @@ from sfkd_jax.artefacts._content import versions as versions
 from sfkd_jax.artefacts._drives import ROAD as ROAD
 from sfkd_jax.artefacts._drives import SHARED as SHARED
 from sfkd_jax.artefacts._drives import drive_name as drive_name
-from sfkd_jax.artefacts._drives import parse_drive_name as parse_drive_name
 from sfkd_jax.artefacts._drives import identity as identity
 from sfkd_jax.artefacts._drives import merge as merge
+from sfkd_jax.artefacts._drives import parse_drive_name as parse_drive_name
 from sfkd_jax.artefacts._drives import with_current_names as with_current_names
 from sfkd_jax.artefacts._files import ArtefactError as ArtefactError
+from sfkd_jax.artefacts._files import as_artefact_error as as_artefact_error
 from sfkd_jax.artefacts._files import one_line as one_line
 from sfkd_jax.artefacts._files import open_regular as open_regular
 from sfkd_jax.artefacts._files import read_json as read_json
-from sfkd_jax.artefacts._files import as_artefact_error as as_artefact_error
 from sfkd_jax.artefacts._files import write_bytes as write_bytes
 from sfkd_jax.artefacts._files import write_json as write_json
 from sfkd_jax.artefacts._files import writing as writing
 from sfkd_jax.artefacts._lines import append_jsonl as append_jsonl
-from sfkd_jax.artefacts._lines import read_jsonl as read_jsonl
 from sfkd_jax.artefacts._lines import print_message as print_message
+from sfkd_jax.artefacts._lines import read_jsonl as read_jsonl
 from sfkd_jax.artefacts._lines import truncate_jsonl as truncate_jsonl
 from sfkd_jax.artefacts._locks import DirectoryLocked as DirectoryLocked
 from sfkd_jax.artefacts._locks import locked as locked

@@ -1,18 +1,16 @@
-"""An artefact: arrays in `name.npz` and their manifest in `name.json`.
+"""Read and write artefacts: arrays in `name.npz` with a manifest in `name.json`.
 
-A writer that is killed, whenever that is, leaves the old pair or the new one readable.
-Both files are completed under hidden names; the arrays then wait under a name made of
-their hash, replacing the manifest commits, and only then do the arrays take their
-place. A manifest whose arrays still wait is read from there, and the next writer moves
-them.
+A writer that is killed at any time leaves the old pair or the new pair readable. It
+completes both files under hidden names, renames the arrays to a hidden name with their
+hash, commits by replacing the manifest, and then renames the arrays to `name.npz`. If a
+writer was killed before that last step, readers use the hidden file, and the next
+writer renames it.
 
-A manifest records two hashes. `sha256` names the content, whatever its order and
-layout, and is what other documents speak about; it can be computed of arrays alone, and
-so only after compressed members were inflated. `file_sha256` is of the file, byte by
-byte: it is compared before the archive is opened, so that nothing is parsed or inflated
-that the writer did not write. Manifests of earlier versions have no `file_sha256`; for
-them, and for whoever strikes it out, the bounds of `_npz` hold, as they do for files
-without a manifest.
+A manifest records two hashes. `sha256` identifies the content, independent of order and
+layout; other documents refer to it. `file_sha256` is the hash of the bytes of the file.
+It is compared before the archive is opened, so that only what the writer wrote is
+parsed and inflated. Manifests of earlier versions have no `file_sha256`; for these, and
+for files without a manifest, the limits of `_npz` apply.
 """
 
 from __future__ import annotations
@@ -54,7 +52,15 @@ def write_arrays(
     made_from: Mapping[str, str] | None = None,
     compressed: bool = False,
 ) -> dict[str, Any]:
-    """Write `path` and its manifest, which is returned; `made_from` holds the hashes of what the arrays were made from.
+    """Write `path` and its manifest, and return the manifest.
+
+    Args:
+        path: of the arrays, ending in .npz.
+        arrays: by name.
+        kind: of artefact, such as "policy".
+        config: settings that the arrays were made with.
+        made_from: hashes of the artefacts that they were made from.
+        compressed: compress with deflate.
 
     Raises:
         ArtefactError: the disk is full or not writable (an earlier pair stays as it
@@ -69,7 +75,8 @@ def write_arrays(
     ]:
         raise failure(
             path,
-            f"not written, {odd[0]} is of dtype {arrays[odd[0]].dtype}, which is not portable",
+            f"not written, {odd[0]} is of dtype {arrays[odd[0]].dtype}, "
+            "which is not portable",
         )
     manifest_path = path.with_suffix(".json")
     manifest = {
@@ -106,49 +113,55 @@ def write_arrays(
 def read_arrays(
     path: Path, *, kind: str, config: Mapping[str, Any] | None = None
 ) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
-    """The arrays of `path` and their manifest; nothing pickled is ever loaded.
+    """Return the arrays of `path` and their manifest; pickles are never loaded.
+
+    Args:
+        path: of the arrays.
+        kind: that the artefact must have.
+        config: settings that it must have been made with, or None for any.
 
     Raises:
         ArtefactError: either file is missing, truncated, damaged or foreign; the
             artefact is of another kind or format, was made with other settings than
-            `config`, or its arrays are not those that the manifest is about.
+            `config`, or its arrays do not match the manifest.
     """
     manifest = _manifest(path, kind)
-    if config is not None and (found := differences(manifest["config"], plain(config))):
-        more = f" and {len(found) - 3} more" if len(found) > 3 else ""
-        raise failure(path, f"made with other settings: {'; '.join(found[:3])}{more}")
+    if config is not None and (
+        changed := differences(manifest["config"], plain(config))
+    ):
+        more = f" and {len(changed) - 3} more" if len(changed) > 3 else ""
+        listed = "; ".join(changed[:3])
+        raise failure(path, f"made with other settings: {listed}{more}")
     try:
         return _load(path, manifest), manifest
     except ArtefactError:
         if _manifest(path, kind) == manifest:
             raise
-    return read_arrays(
-        path, kind=kind, config=config
-    )  # rewritten while it was being read
+    # The artefact was replaced while it was read.
+    return read_arrays(path, kind=kind, config=config)
 
 
 def exists(path: Path) -> bool:
-    """Whether both files of an artefact are there."""
+    """Whether both files of an artefact exist."""
     return path.is_file() and path.with_suffix(".json").is_file()
 
 
 def _waiting(path: Path, manifest: Mapping[str, Any]) -> Path:
-    """Where complete arrays wait for their manifest to be committed."""
+    """The hidden name of complete arrays before their manifest is committed."""
     digest = manifest.get("file_sha256", manifest["sha256"])
     return path.with_name(f".{path.name}.{digest[:16]}.part")
 
 
 def _complete(path: Path) -> None:
-    """Move the arrays that a writer killed after its commit left waiting."""
-    with suppress(
-        ArtefactError, OSError, TypeError, ValueError
-    ):  # a damaged manifest commits nothing
+    """Rename the arrays of a writer that was killed after its commit."""
+    # A damaged manifest commits nothing.
+    with suppress(ArtefactError, OSError, TypeError, ValueError):
         manifest = read_json(path.with_suffix(".json"), keys=("sha256",))
         os.replace(_waiting(path, manifest), path)
 
 
 def _manifest(path: Path, kind: str) -> dict[str, Any]:
-    """The manifest of `path`, checked as far as it can be without the arrays."""
+    """Return the manifest of `path`, checked without its arrays."""
     manifest_path = path.with_suffix(".json")
     if not manifest_path.exists():
         reason = (
@@ -182,10 +195,10 @@ def _manifest(path: Path, kind: str) -> dict[str, Any]:
 
 
 def _load(path: Path, manifest: Mapping[str, Any]) -> dict[str, np.ndarray]:
-    """The arrays that a manifest is about.
+    """Return the arrays of a manifest.
 
     Raises:
-        ArtefactError: other bytes or other arrays than the manifest speaks of.
+        ArtefactError: the bytes or the arrays do not match the manifest.
     """
     try:
         opened = open_regular(_waiting(path, manifest))
@@ -208,6 +221,6 @@ def _load(path: Path, manifest: Mapping[str, Any]) -> dict[str, np.ndarray]:
 
 
 def _digest(path: Path) -> str:
-    """Hash of a file, byte by byte."""
+    """Hash the bytes of a file."""
     with path.open("rb") as file:
         return hashlib.file_digest(file, "sha256").hexdigest()

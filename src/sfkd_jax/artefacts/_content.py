@@ -1,4 +1,4 @@
-"""What is in a file, apart from the file: trees and flat names, hashes, settings compared, versions."""
+"""Flatten trees, hash content, compare settings and list versions."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ import numpy as np
 
 
 def flatten(tree: Mapping[str, Any]) -> dict[str, np.ndarray]:
-    """The leaves of nested dicts under "a/b/c"; an empty inner dict is kept as "a/b/".
+    """Return the leaves of nested dicts as "a/b/c"; an empty inner dict becomes "a/b/".
 
     Raises:
         ValueError: a key is not a string, is empty or holds "/"; a leaf is neither
@@ -34,16 +34,17 @@ def flatten(tree: Mapping[str, Any]) -> dict[str, np.ndarray]:
             flat[key] = np.asarray(value)
         else:
             raise ValueError(
-                f"cannot flatten {key!r}: a {type(value).__name__} is neither dict nor array"
+                f"cannot flatten {key!r}: "
+                f"a {type(value).__name__} is neither dict nor array"
             )
     return flat
 
 
 def unflatten(flat: Mapping[str, Any]) -> dict[str, Any]:
-    """The nested dicts that `flatten` came from; leaves are passed on as they are.
+    """Return the nested dicts of flat names, the inverse of `flatten`.
 
     Raises:
-        ValueError: one name stands for both a leaf and a dict.
+        ValueError: one name is both a leaf and a dict.
     """
     tree: dict[str, Any] = {}
     for name, leaf in flat.items():
@@ -59,10 +60,10 @@ def unflatten(flat: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def sha256(data: Mapping[str, Any] | Sequence[Any]) -> str:
-    """Hash of the content, whatever its order and memory layout.
+    """Hash the content, independent of its order and memory layout.
 
-    A flat dict of arrays counts by names, dtypes, shapes and values; anything else as
-    the JSON that it would become.
+    The hash of a flat dict of arrays covers names, dtypes, shapes and values; that of
+    anything else covers the JSON that it would become.
     """
     if not (
         isinstance(data, Mapping)
@@ -80,31 +81,38 @@ def sha256(data: Mapping[str, Any] | Sequence[Any]) -> str:
     return digest.hexdigest()
 
 
-def differences(made: Mapping[str, Any], asked: Mapping[str, Any]) -> list[str]:
-    """Where settings differ, by dotted key: "training.steps was 4000, asked 100" (1 and 1.0 are the same)."""
-    found = []
-    for key in dict.fromkeys([*made, *asked]):
-        a, b = made.get(key, ...), asked.get(key, ...)
+def differences(old: Mapping[str, Any], new: Mapping[str, Any]) -> list[str]:
+    """List where settings differ, by dotted key; 1 and 1.0 are equal.
+
+    An entry reads "training.steps was 4000, is now 100".
+
+    Args:
+        old: recorded settings.
+        new: current settings.
+    """
+    lines = []
+    for key in dict.fromkeys([*old, *new]):
+        a, b = old.get(key, ...), new.get(key, ...)
         if isinstance(a, Mapping) and isinstance(b, Mapping):
-            found += [f"{key}.{line}" for line in differences(a, b)]
+            lines += [f"{key}.{line}" for line in differences(a, b)]
         elif isinstance(a, bool) != isinstance(b, bool) or plain(a) != plain(b):
-            found.append(f"{key} was {_shown(a)}, asked {_shown(b)}")
-    return found
+            lines.append(f"{key} was {_short(a)}, is now {_short(b)}")
+    return lines
 
 
 def versions() -> dict[str, str]:
-    """Versions of Python and of the packages that decide numbers."""
-    found = {"python": platform.python_version()}
+    """Return the versions of Python and of the packages that numbers depend on."""
+    installed = {"python": platform.python_version()}
     for name in ("numpy", "jax", "sfkd_jax"):
         try:
-            found[name] = metadata.version(name)
+            installed[name] = metadata.version(name)
         except metadata.PackageNotFoundError:
-            found[name] = import_module(name).__version__
-    return found
+            installed[name] = import_module(name).__version__
+    return installed
 
 
 def plain(value: Any) -> Any:
-    """`value` in the types of JSON where it has them: arrays become lists, NaN and infinities None."""
+    """Convert to JSON types; arrays become lists, NaN and infinities None."""
     if hasattr(value, "__array__"):
         value = np.asarray(value).tolist()
     if isinstance(value, Mapping):
@@ -120,6 +128,6 @@ def _is_array(value: Any) -> bool:
     return hasattr(value, "__array__") and not isinstance(value, np.generic)
 
 
-def _shown(value: Any) -> str:
+def _short(value: Any) -> str:
     text = "absent" if value is ... else str(plain(value))
     return text if len(text) <= 60 else f"{text[:57]}..."

@@ -1,4 +1,4 @@
-"""What tells two drives of a run apart: the one identity of their rows, their arrays and their figures."""
+"""Identify the drives of a run: their rows, arrays and figures."""
 
 from __future__ import annotations
 
@@ -17,47 +17,50 @@ IDENTITY = (
     "env",
     "variation",
 )
-"""Rows of results.json that agree in these are the same row, and the later one replaces
-the earlier.
+"""Columns that identify a row of results.json; a new row replaces the old row of the
+same identity.
 """
 ROAD = ("envs", "path")
-"""Arrays of the road that a drive met, beside what was driven on it."""
+"""Arrays that describe the environment and the path of a drive."""
 SHARED = tuple(name for name in IDENTITY if name not in ("system", "env"))
-"""What systems that may be compared have in common, besides their roads."""
+"""Columns that systems must share to be compared."""
 
 
 def identity(row: Mapping[str, Any]) -> dict[str, str | None]:
-    """What tells a row apart; a row of an earlier version has the search that its controller is named after."""
-    found = {name: row.get(name) for name in IDENTITY}
+    """Return the identity of a row.
+
+    Rows of earlier versions have no planner; their controller is named after it.
+    """
+    columns = {name: row.get(name) for name in IDENTITY}
     if "planner" not in row and row.get("controller"):
-        found["planner"] = (
+        columns["planner"] = (
             "mppi" if str(row["controller"]).startswith("mppi") else row["controller"]
         )
     if "inner_loop" not in row and "vehicle" in row:
-        found["inner_loop"] = "none"
+        columns["inner_loop"] = "none"
     return {
-        name: None if value is None else str(value) for name, value in found.items()
+        name: None if value is None else str(value) for name, value in columns.items()
     }
 
 
 def merge(
     old: Iterable[Mapping[str, Any]], new: Iterable[Mapping[str, Any]]
 ) -> list[Any]:
-    """New rows replace old ones with the same identity; the others stay."""
+    """Return old and new rows; a new row replaces the old row of the same identity."""
     fresh = list(new)
     replaced = [identity(row) for row in fresh]
     return [row for row in old if identity(row) not in replaced] + fresh
 
 
 def drive_name(row: Mapping[str, Any]) -> str:
-    """The name of a row's arrays in episodes.npz, as in "system=sfkd&scenario=s3/lateral" before the slash."""
+    """Return the prefix of a row's arrays, such as "system=sfkd&scenario=s3"."""
     return urlencode(
         {name: value for name, value in identity(row).items() if value is not None}
     )
 
 
 def parse_drive_name(name: str) -> dict[str, str]:
-    """The identity behind a name; an earlier version wrote system/scenario."""
+    """Return the identity in a name; earlier versions wrote system/scenario."""
     return (
         dict(parse_qsl(name))
         if "=" in name
@@ -68,23 +71,23 @@ def parse_drive_name(name: str) -> dict[str, str]:
 def with_current_names(
     arrays: Mapping[str, Any], rows: Iterable[Mapping[str, Any]]
 ) -> dict[str, Any]:
-    """The arrays of episodes.npz under the names of today.
+    """Return the arrays of episodes.npz under the names of this version.
 
-    An earlier version named them system/scenario/part and the roads scenario/part;
-    where several rows share a system and a scenario, the arrays were those of the last
-    one.
+    An earlier version named them system/scenario/part, and those of the path and the
+    environment scenario/part. Where several rows share system and scenario, the arrays
+    belong to the last one.
     """
-    today = {f"{row['system']}/{row['scenario']}": drive_name(row) for row in rows}
-    found = {}
+    current = {f"{row['system']}/{row['scenario']}": drive_name(row) for row in rows}
+    result = {}
     for name, values in arrays.items():
         drive, _, part = name.rpartition("/")
-        found[f"{today.get(drive, drive)}/{part}" if drive else part] = values
-        if drive in today:
+        result[f"{current.get(drive, drive)}/{part}" if drive else part] = values
+        if drive in current:
             scenario = drive.partition("/")[2]
             roads = {part: arrays.get(f"{scenario}/{part}") for part in ROAD}
-            found |= {
-                f"{today[drive]}/{part}": road
+            result |= {
+                f"{current[drive]}/{part}": road
                 for part, road in roads.items()
                 if road is not None
             }
-    return found
+    return result

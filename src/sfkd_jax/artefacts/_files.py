@@ -1,4 +1,4 @@
-"""How bytes reach the disk and come back: whole or not at all, and every failure as one line."""
+"""Read and replace files atomically; every failure is an error of one line."""
 
 from __future__ import annotations
 
@@ -17,12 +17,12 @@ from typing import Any, BinaryIO
 from sfkd_jax.artefacts._content import plain
 from sfkd_jax.artefacts._json import parse
 
-LARGEST = 1 << 24
-"""Bytes of a document; the largest of this package has 0.6 MB, and what JSON becomes
-takes up to 35 times as much.
+MAX_BYTES = 1 << 24
+"""Size of a document; the largest of this package has 0.6 MB. Parsed JSON takes up to
+35 times as much memory.
 """
-LONGEST_LINE = 400
-"""Letters of a reason; one may quote the file that it is about."""
+MAX_LINE = 400
+"""Characters of a message, which may quote the file that it is about."""
 
 
 class ArtefactError(Exception):
@@ -30,7 +30,7 @@ class ArtefactError(Exception):
 
 
 def write_json(path: Path, document: Mapping[str, Any]) -> None:
-    """Replace `path` in one step; arrays become lists, NaN and infinities null.
+    """Replace `path` atomically; arrays become lists, NaN and infinities null.
 
     Raises:
         ArtefactError: the disk is full or not writable (an earlier file stays as it
@@ -40,10 +40,10 @@ def write_json(path: Path, document: Mapping[str, Any]) -> None:
 
 
 def read_json(path: Path, *, keys: Sequence[str] = ()) -> dict[str, Any]:
-    """The object in `path`.
+    """Return the JSON object in `path`.
 
     Raises:
-        ArtefactError: the file is missing, no regular file, larger than LARGEST,
+        ArtefactError: the file is missing, no regular file, larger than MAX_BYTES,
             truncated, not strictly JSON (see `parse`), not an object, or lacks one of
             `keys`.
     """
@@ -54,23 +54,27 @@ def read_json(path: Path, *, keys: Sequence[str] = ()) -> dict[str, Any]:
 
 
 def failure(path: Path, reason: object) -> ArtefactError:
-    """The error to raise about `path`; `reason` may be an exception of any length."""
+    """Return the error to raise about `path`; `reason` may be an exception."""
     text = reason.strerror or reason if isinstance(reason, OSError) else reason
     return ArtefactError(f"{path}: {one_line(text)}")
 
 
 def one_line(text: object) -> str:
-    """A reason as a terminal shows it: nothing that breaks or colours the line, and not all that a file holds."""
-    line = " ".join(str(text)[: 4 * LONGEST_LINE].split())
+    """Shorten a reason to one printable line, without control characters."""
+    line = " ".join(str(text)[: 4 * MAX_LINE].split())
     line = "".join(
         letter if letter.isprintable() else ascii(letter)[1:-1] for letter in line
     )
-    return line if len(line) <= LONGEST_LINE else f"{line[:LONGEST_LINE]}..."
+    return line if len(line) <= MAX_LINE else f"{line[:MAX_LINE]}..."
 
 
 @contextmanager
 def writing(path: Path) -> Iterator[None]:
-    """What the disk refuses while several files are made becomes an ArtefactError about the file, or about `path`."""
+    """Turn an OSError while files are written into an ArtefactError.
+
+    Args:
+        path: to blame if the exception names no file.
+    """
     try:
         yield
     except OSError as reason:
@@ -80,13 +84,15 @@ def writing(path: Path) -> Iterator[None]:
 
 
 @contextmanager
-def as_artefact_error(path: Path, *also: type[Exception], advice: str = "") -> Iterator[None]:
-    """What is missing or of another kind inside a file that could be read becomes an ArtefactError about it.
+def as_artefact_error(
+    path: Path, *also: type[Exception], advice: str = ""
+) -> Iterator[None]:
+    """Turn exceptions about the content of a file into an ArtefactError.
 
     Args:
         path: of the file.
-        also: further exceptions that nothing else than the file can be the reason of.
-        advice: what the line ends with.
+        also: exceptions to convert besides those of missing keys and wrong types.
+        advice: appended to the message.
     """
     try:
         yield
@@ -98,14 +104,14 @@ def as_artefact_error(path: Path, *also: type[Exception], advice: str = "") -> I
         OverflowError,
         *also,
     ) as reason:
-        said = f"malformed, {type(reason).__name__}: {reason}"
-        raise failure(path, f"{said}; {advice}" if advice else said) from reason
+        message = f"malformed, {type(reason).__name__}: {reason}"
+        raise failure(path, f"{message}; {advice}" if advice else message) from reason
 
 
 def encode(
     path: Path, document: Mapping[str, Any], *, indent: int | None = None
 ) -> bytes:
-    """JSON text of `document`, or an ArtefactError about `path`."""
+    """Return `document` as JSON, or raise an ArtefactError about `path`."""
     try:
         return json.dumps(plain(document), indent=indent, allow_nan=False).encode()
     except (TypeError, ValueError, RecursionError) as error:
@@ -113,7 +119,7 @@ def encode(
 
 
 def decode(path: Path, text: bytes, *, where: str = "") -> dict[str, Any]:
-    """The JSON object in `text`, or an ArtefactError about `path`."""
+    """Return the JSON object in `text`, or raise an ArtefactError about `path`."""
     try:
         document = parse(text)
     except ValueError as error:
@@ -124,24 +130,24 @@ def decode(path: Path, text: bytes, *, where: str = "") -> dict[str, Any]:
 
 
 def read_bytes(path: Path) -> bytes:
-    """All of `path`, or an ArtefactError; more than LARGEST is not read."""
+    """Return the content of `path`, of at most MAX_BYTES, or raise an ArtefactError."""
     with open_regular(path) as file:
-        content = _up_to(path, file, LARGEST + 1)
-    if len(content) > LARGEST:
-        raise failure(path, f"larger than {LARGEST >> 20} MiB")
+        content = _up_to(path, file, MAX_BYTES + 1)
+    if len(content) > MAX_BYTES:
+        raise failure(path, f"larger than {MAX_BYTES >> 20} MiB")
     return content
 
 
 def open_regular(path: Path) -> io.FileIO:
-    """A regular file to read from, or an ArtefactError; a pipe, a socket or a device does not make the caller wait."""
+    """Open a regular file for reading, or raise an ArtefactError.
+
+    A pipe, a socket or a device is refused without waiting for it.
+    """
     try:
         number = os.open(path, os.O_RDONLY | os.O_NONBLOCK | os.O_NOCTTY | os.O_CLOEXEC)
     except FileNotFoundError:
         raise failure(path, "missing") from None
-    except (
-        OSError,
-        ValueError,
-    ) as error:  # a ValueError: of a name that no file can have
+    except (OSError, ValueError) as error:  # ValueError: an impossible file name
         raise failure(path, error) from error
     mode = os.fstat(number).st_mode
     if stat.S_ISREG(mode):
@@ -153,7 +159,7 @@ def open_regular(path: Path) -> io.FileIO:
 
 
 def _up_to(path: Path, file: io.FileIO, most: int) -> bytes:
-    """The first bytes of a file."""
+    """Return at most the first `most` bytes of a file."""
     try:
         with io.BufferedReader(file) as buffered:
             return buffered.read(min(most, os.fstat(file.fileno()).st_size + 1))
@@ -162,7 +168,7 @@ def _up_to(path: Path, file: io.FileIO, most: int) -> bytes:
 
 
 def write_bytes(path: Path, content: bytes) -> None:
-    """Replace `path` in one step.
+    """Replace `path` atomically.
 
     Raises:
         ArtefactError: the disk is full or not writable; an earlier file stays as it
@@ -175,17 +181,17 @@ def write_bytes(path: Path, content: bytes) -> None:
 
 
 def synchronise(file: BinaryIO) -> None:
-    """Wait until what was written to `file` is on the disk."""
+    """Flush `file` to the disk."""
     file.flush()
     os.fsync(file.fileno())
 
 
 @contextmanager
 def replacement(path: Path) -> Iterator[tuple[BinaryIO, Path]]:
-    """A hidden file to fill and to move over `path`; it is removed if it was not moved.
+    """Yield a hidden file to write and to move over `path`; remove it if it stays.
 
-    A killed writer cannot remove its own: the next one does, and knows it by the lock
-    that died with its owner.
+    The hidden file of a killed writer is removed by the next writer, which recognises
+    it because its lock is free.
     """
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
@@ -201,7 +207,7 @@ def replacement(path: Path) -> Iterator[tuple[BinaryIO, Path]]:
 
 
 def _sweep(path: Path) -> None:
-    """Remove the hidden files beside `path` that nobody holds."""
+    """Remove hidden files of `path` that no process holds."""
     for left in path.parent.glob(f".{glob.escape(path.name)}.*.part"):
         with suppress(OSError), left.open("r+b") as file:
             fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
@@ -209,14 +215,12 @@ def _sweep(path: Path) -> None:
 
 
 def _claim(path: Path) -> tuple[BinaryIO, Path]:
-    """A new hidden file beside `path`, locked where the file system has locks."""
+    """Create a hidden file beside `path`, locked if the file system has locks."""
     while True:
         part = path.with_name(f".{path.name}.{secrets.token_hex(4)}.part")
         file = part.open("xb")
         with suppress(OSError):
             fcntl.flock(file, fcntl.LOCK_EX)
-        if (
-            part.exists()
-        ):  # else another writer took it for left over before it was locked
+        if part.exists():  # else another writer removed it before it was locked
             return file, part
         file.close()

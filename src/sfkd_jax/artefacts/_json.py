@@ -1,4 +1,4 @@
-"""JSON as this package takes it: what several readers could understand differently is refused."""
+"""Parse JSON strictly; refuse documents that two parsers could read differently."""
 
 from __future__ import annotations
 
@@ -8,28 +8,28 @@ import re
 from collections.abc import Iterable
 from typing import Any, NoReturn
 
-DEEPEST = 64
-"""Levels of a document; those of this package have at most 7, and whatever walks a
-document may recurse.
+MAX_DEPTH = 64
+"""Levels of a document; documents of this package have at most 7. The limit lets code
+that reads a document recurse.
 """
 SMALLEST_INT, LARGEST_INT = -(2**63), 2**64 - 1
 _SURROGATE = re.compile(rb"\\u[dD][89a-fA-F]")
 
 
 def parse(text: bytes) -> Any:
-    """The value in `text`, UTF-8 with or without a byte order mark.
+    """Return the value in `text`, which is UTF-8 with or without a byte order mark.
 
     Raises:
         ValueError: no JSON; NaN or an infinity, also as a number that overflows; an
-            integer beyond 64 bits; a key that stands twice in one object; half of a
-            surrogate pair; or more levels than DEEPEST.
+            integer beyond 64 bits; a duplicate key in one object; half of a surrogate
+            pair; or more levels than MAX_DEPTH.
     """
     try:
         document = json.loads(
             text.decode("utf-8-sig"), parse_constant=_refuse, object_pairs_hook=_object
         )
     except RecursionError:
-        raise ValueError(f"more than {DEEPEST} levels") from None
+        raise ValueError(f"more than {MAX_DEPTH} levels") from None
     _check(document)
     if _SURROGATE.search(text):
         json.dumps(document, ensure_ascii=False).encode()
@@ -41,18 +41,18 @@ def _refuse(constant: str) -> NoReturn:
 
 
 def _object(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
-    found = dict(pairs)
-    if len(found) < len(pairs):
+    document = dict(pairs)
+    if len(document) < len(pairs):
         names = [name for name, _ in pairs]
         twice = next(name for name in names if names.count(name) > 1)
         raise ValueError(f"the key {twice[:60]!r} stands twice in one object")
-    return found
+    return document
 
 
 def _check(document: Any) -> None:
-    """Look at all values, level by level and without recursion."""
+    """Check all values, level by level and without recursion."""
     level: Iterable[Any] = [document]
-    for _ in range(DEEPEST + 1):
+    for _ in range(MAX_DEPTH + 1):
         inner: list[Any] = []
         for value in level:
             if isinstance(value, dict):
@@ -66,4 +66,4 @@ def _check(document: Any) -> None:
         if not inner:
             return
         level = inner
-    raise ValueError(f"more than {DEEPEST} levels")
+    raise ValueError(f"more than {MAX_DEPTH} levels")

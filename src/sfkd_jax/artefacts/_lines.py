@@ -1,4 +1,4 @@
-"""Logs that grow by one JSON object a line."""
+"""Append to and read logs of one JSON object a line, and print messages."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ from sfkd_jax.artefacts._files import (
 
 
 def append_jsonl(path: Path, record: Mapping[str, Any]) -> None:
-    """Add a line; a last line cut short by a kill is dropped first.
+    """Append one record, after removing an incomplete last line.
 
     Raises:
         ArtefactError: the disk is full or not writable (the earlier lines stay as they
@@ -51,17 +51,17 @@ def read_jsonl(
     keys: Sequence[str] = (),
     damaged: Callable[[str], None] | None = None,
 ) -> list[dict[str, Any]]:
-    """The records of `path`, without a last line that was cut short.
+    """Return the records of `path`, without an incomplete last line.
 
     Args:
         path: of the file.
-        keys: what every record must have.
-        damaged: told of every other line that is no such record, which is then left
-            out; `tell`, for example.
+        keys: that every record must have.
+        damaged: receives one message for each other line that is no such record; the
+            line is then skipped. `print_message`, for example.
 
     Raises:
-        ArtefactError: the file is missing; or a line before the last is no such record,
-            and `damaged` is None.
+        ArtefactError: the file is missing; or a complete line is no such record and
+            `damaged` is None.
     """
     records = []
     for number, line in enumerate(io.BytesIO(read_bytes(path)), 1):
@@ -83,9 +83,9 @@ def read_jsonl(
     return records
 
 
-def print_message(line: str) -> None:
-    """Say something on stderr."""
-    print(line, file=sys.stderr, flush=True)
+def print_message(message: str) -> None:
+    """Print a message for a person to stderr; stdout is for the result of a command."""
+    print(message, file=sys.stderr, flush=True)
 
 
 def truncate_jsonl(
@@ -95,7 +95,15 @@ def truncate_jsonl(
     keys: Sequence[str] = (),
     damaged: Callable[[str], None] | None = None,
 ) -> None:
-    """Rewrite `path` in one step with the records to keep, as a resumed run needs; where no file is, none is made.
+    """Replace `path` by the records to keep, as a resumed run needs.
+
+    A missing file stays missing.
+
+    Args:
+        path: of the file.
+        keep: whether to keep a record.
+        keys: see `read_jsonl`.
+        damaged: see `read_jsonl`.
 
     Raises:
         ArtefactError: see `read_jsonl` and `write_json`.
@@ -110,7 +118,7 @@ def truncate_jsonl(
 
 
 def _cut_short(path: Path) -> bool:
-    """Whether the last byte is not the end of a line."""
+    """Whether the last line is incomplete."""
     if not path.exists() or not path.stat().st_size:
         return False
     with open_regular(path) as file:

@@ -1,4 +1,4 @@
-"""One writer a directory: a lock that the system frees when its process ends, and a record of who holds it."""
+"""Lock a directory for one writer, and record which process holds it."""
 
 from __future__ import annotations
 
@@ -19,32 +19,31 @@ from sfkd_jax.artefacts._lines import print_message
 
 LOCK, HOLDER = ".lock", ".lock.json"
 GRACE_S = 2.0
-"""How long everybody waits for a writer that is about to finish [s]."""
+"""Time to wait for a writer that is about to finish [s]."""
 _WITHOUT_LOCKS = (errno.ENOLCK, errno.EOPNOTSUPP, errno.ENOSYS)
-"""How a file system says that it has no locks: there a file with host and process id
-stands for one.
+"""Errors of file systems without locks; there a file with host and process id replaces
+the lock.
 """
 
 
 class DirectoryLocked(ArtefactError):
-    """Another process writes into a directory: which one, where and since when, in one line."""
+    """Another process writes into a directory; the message names the process."""
 
 
 @contextmanager
 def locked(directory: Path, *, wait: bool = False) -> Iterator[None]:
-    """Be the only process that writes into `directory`, made if missing; what holds it already may enter again.
+    """Hold the lock of `directory`, which is created if it is missing.
 
-    The lock is freed by the system when its process ends, however it ends. It is taken
-    with flock(2), which Linux passes on to the server of a shared directory, so it
-    holds between hosts as well.
+    The lock is reentrant. The system frees it when the process ends, however it ends.
+    It uses flock(2), which Linux forwards to the server of a shared directory, so it
+    also holds between hosts.
 
     Args:
         directory: of a run, a data set or a comparison.
-        wait: until it is free, as whoever holds finished work should; this is told on
-            stderr.
+        wait: wait until the lock is free and print a message, instead of raising.
 
     Raises:
-        DirectoryTaken: it is not free after a moment, and `wait` is false.
+        DirectoryLocked: another process holds the lock, and `wait` is false.
         ArtefactError: the directory or its lock cannot be made.
     """
     holder = directory / HOLDER
@@ -65,7 +64,7 @@ def locked(directory: Path, *, wait: bool = False) -> Iterator[None]:
 
 
 def _acquired(directory: Path, wait: bool) -> BaseFileLock:
-    """The lock of `directory`, held by this process."""
+    """Return the lock of `directory`, acquired."""
     path = directory.resolve() / LOCK
     try:
         return _held(
@@ -78,7 +77,7 @@ def _acquired(directory: Path, wait: bool) -> BaseFileLock:
 
 
 def _held(lock: BaseFileLock, directory: Path, wait: bool) -> BaseFileLock:
-    """`lock`, once it is ours."""
+    """Acquire `lock` and return it."""
     try:
         lock.acquire(timeout=GRACE_S)
     except Timeout:
@@ -87,16 +86,16 @@ def _held(lock: BaseFileLock, directory: Path, wait: bool) -> BaseFileLock:
             if isinstance(lock, SoftFileLock)
             else ""
         )
-        taken = f"{directory}: {_who(directory)} is writing there{soft}"
+        message = f"{directory}: {_who(directory)} is writing there{soft}"
         if not wait:
-            raise DirectoryLocked(f"{taken}; try again when it has ended") from None
-        print_message(f"waiting: {taken}")
+            raise DirectoryLocked(f"{message}; try again when it has ended") from None
+        print_message(f"waiting: {message}")
         lock.acquire()
     return lock
 
 
 def _myself() -> dict[str, str | int]:
-    """This process, as another one may want to know it."""
+    """Describe this process for the record of the lock."""
     return {
         "pid": os.getpid(),
         "host": socket.gethostname(),
@@ -106,10 +105,11 @@ def _myself() -> dict[str, str | int]:
 
 
 def _who(directory: Path) -> str:
-    """Who holds a directory, as far as its record can be read."""
+    """Describe the process that holds a directory, if its record can be read."""
     try:
         record = read_json(directory / HOLDER, keys=("pid", "host", "command", "since"))
     except ArtefactError:
         return "another process"
     command = " ".join(str(record["command"]).split())[:200]
-    return f"process {record['pid']} on {record['host']} ({command}, since {record['since']})"
+    process = f"process {record['pid']} on {record['host']}"
+    return f"{process} ({command}, since {record['since']})"

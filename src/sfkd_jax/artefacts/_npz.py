@@ -1,11 +1,10 @@
-"""Arrays of an .npz archive, read so that a file decides neither how much is allocated nor what is evaluated.
+"""Read arrays of an .npz archive without trusting what the archive declares.
 
-All that a directory and a header declare is compared with the bytes that are there
-before an array is allocated. A stored member takes as many bytes as the file has for
-it. A compressed one is inflated to its declared size and never beyond; that size must
-be one that deflate can reach, and all of them together at most INFLATED. Headers are
-matched against the one form that they have and not evaluated, and objects, which would
-be unpickled, are refused.
+Declared sizes are compared with the size of the file before an array is allocated.
+Stored members cannot be larger than the file. Compressed members are inflated to their
+declared size and no further; deflate must be able to reach that size, and all of them
+together may have at most MAX_INFLATED bytes. Headers are matched against a regular
+expression and not evaluated. Objects, which would be unpickled, are refused.
 """
 
 from __future__ import annotations
@@ -23,19 +22,17 @@ import numpy as np
 from sfkd_jax.artefacts._files import ArtefactError, failure, open_regular
 
 PORTABLE = "biufcSUmM"
-"""Kinds of dtype that an .npz file gives back as they were."""
-INFLATED = 1 << 29
-"""Bytes that the compressed members of one file may inflate to together; stored ones
-are bounded by the file.
-"""
+"""Kinds of dtype that an .npz file preserves."""
+MAX_INFLATED = 1 << 29
+"""Total size of the compressed members of one file after inflation [bytes]."""
 DEFLATE_RATIO = 1032
-"""No stream of deflate inflates by more."""
-LONGEST_HEADER = 2048
-"""Bytes; numpy itself writes 118 for most arrays."""
+"""Largest ratio by which deflate can inflate."""
+MAX_HEADER = 2048
+"""Size of a header [bytes]; numpy writes 118 for most arrays."""
 CHUNK = 1 << 20
-DIRECTORY = 1 << 22
-"""Bytes of a zip directory, about 40000 arrays: the zip library holds twenty times as
-much for it.
+MAX_DIRECTORY = 1 << 22
+"""Size of a zip directory [bytes], enough for about 40000 arrays; the zip library
+allocates twenty times as much.
 """
 _DATE = (1980, 1, 1, 0, 0, 0)
 _ENTRY = (
@@ -47,20 +44,20 @@ _HEADER = re.compile(rf"\{{\s*(?:(?:{'|'.join(_ENTRY)})\s*(?:,\s*)?){{3}}\}}\s*"
 
 
 class _Reader(io.BufferedReader):
-    """A file of which no call reads, and so allocates, more than DIRECTORY bytes, whatever a directory declares."""
+    """A file whose reads are limited to MAX_DIRECTORY bytes each."""
 
     def read(self, size: int | None = -1, /) -> bytes:
         return super().read(
-            DIRECTORY if size is None or size < 0 else min(size, DIRECTORY)
+            MAX_DIRECTORY if size is None or size < 0 else min(size, MAX_DIRECTORY)
         )
 
 
 def read_npz(path: Path) -> dict[str, np.ndarray]:
-    """The arrays of a file that has no manifest; nothing pickled is ever loaded.
+    """Return the arrays of a file without a manifest; pickles are never loaded.
 
     Raises:
         ArtefactError: missing, no regular file, truncated, damaged or foreign; objects;
-            or more than INFLATED bytes of compressed arrays.
+            or more than MAX_INFLATED bytes of compressed arrays.
     """
     with open_regular(path) as file:
         check_archive(path, file)
@@ -68,7 +65,7 @@ def read_npz(path: Path) -> dict[str, np.ndarray]:
 
 
 def check_archive(path: Path, file: BinaryIO) -> None:
-    """Refuse, without reading more than both ends, what is no whole archive."""
+    """Refuse an incomplete archive after reading only its start and its end."""
     if not b"PK".startswith(file.read(2)):
         raise failure(path, "foreign, not an archive of arrays")
     if not zipfile.is_zipfile(file):
@@ -76,7 +73,7 @@ def check_archive(path: Path, file: BinaryIO) -> None:
 
 
 def members(path: Path, file: io.FileIO) -> dict[str, np.ndarray]:
-    """The arrays of an open archive; see `read_npz`. Closes the file."""
+    """Return the arrays of an open archive and close it; see `read_npz`."""
     size = file.seek(0, io.SEEK_END)
     try:
         with _Reader(file) as bounded, zipfile.ZipFile(bounded) as archive:
@@ -95,7 +92,7 @@ def members(path: Path, file: io.FileIO) -> dict[str, np.ndarray]:
 def write_npz(
     file: BinaryIO, arrays: Mapping[str, np.ndarray], *, compressed: bool
 ) -> None:
-    """As np.savez, for any names and without pickles; the same arrays give the same bytes."""
+    """Write as np.savez does, for any names, without pickles, byte-reproducible."""
     with zipfile.ZipFile(file, "w") as archive:
         for name, array in arrays.items():
             info = zipfile.ZipInfo(f"{name}.npy", _DATE)
@@ -107,7 +104,7 @@ def write_npz(
 
 
 def _check_directory(path: Path, listed: list[zipfile.ZipInfo], size: int) -> None:
-    """Refuse what the directory declares and the file cannot hold."""
+    """Refuse members that the directory declares and the file cannot hold."""
     names = [info.filename for info in listed]
     if odd := [name for name in names if not name.endswith(".npy")]:
         raise failure(path, f"holds {odd[0][:60]!r}, which is no array")
@@ -128,21 +125,23 @@ def _check_directory(path: Path, listed: list[zipfile.ZipInfo], size: int) -> No
         raise failure(
             path, "damaged (a member is declared larger than it can inflate to)"
         )
-    if (inflated := sum(info.file_size for info in packed)) > INFLATED:
+    if (inflated := sum(info.file_size for info in packed)) > MAX_INFLATED:
         raise failure(
             path,
-            f"inflates to {inflated >> 20} MiB, more than {INFLATED >> 20}; store it uncompressed",
+            f"inflates to {inflated >> 20} MiB, more than {MAX_INFLATED >> 20}; "
+            "store it uncompressed",
         )
 
 
 def _array(path: Path, archive: zipfile.ZipFile, info: zipfile.ZipInfo) -> np.ndarray:
-    """One member; its checksum is compared by the zip library with the last byte."""
+    """Read one member; the zip library compares its checksum at the last byte."""
     with archive.open(info) as entry:
         kind, shape, order, begins = _header(path, entry)
         size = math.prod(shape) * kind.itemsize
         if begins + size != info.file_size:
             raise ValueError(
-                f"{info.filename} declares {size} bytes and holds {info.file_size - begins}"
+                f"{info.filename} declares {size} bytes "
+                f"and holds {info.file_size - begins}"
             )
         content = np.empty(size, np.uint8)
         for start in range(0, size, CHUNK):
@@ -157,24 +156,24 @@ def _array(path: Path, archive: zipfile.ZipFile, info: zipfile.ZipInfo) -> np.nd
 def _header(
     path: Path, entry: Any
 ) -> tuple[np.dtype, tuple[int, ...], Literal["C", "F"], int]:
-    """Dtype, shape and order of a .npy file, and where its data begin."""
+    """Return dtype, shape, order and length of the header of a .npy file."""
     magic = _exactly(entry, 8)
     if magic[:6] != b"\x93NUMPY" or magic[6] not in (1, 2, 3) or magic[7]:
         raise ValueError(f"{entry.name} is no array of numpy")
     width = 2 if magic[6] == 1 else 4
     length = int.from_bytes(_exactly(entry, width), "little")
-    if length > LONGEST_HEADER:
+    if length > MAX_HEADER:
         raise ValueError(f"{entry.name} has a header of {length} bytes")
-    found = _HEADER.fullmatch(_exactly(entry, length).decode("latin1"))
-    if not found or None in found.group("kind", "fortran", "shape"):
+    header = _HEADER.fullmatch(_exactly(entry, length).decode("latin1"))
+    if not header or None in header.group("kind", "fortran", "shape"):
         raise ValueError(f"{entry.name} has no header of plain numbers")
-    if found["kind"] == "O":
+    if header["kind"] == "O":
         raise failure(path, "holds pickled objects, refused")
-    if found["kind"] not in PORTABLE:
+    if header["kind"] not in PORTABLE:
         raise ValueError(f"{entry.name} is of a dtype that is not portable")
     kind, listed = (
-        np.dtype("".join(found.group("order", "kind", "size"))),
-        found["shape"].strip(),
+        np.dtype("".join(header.group("order", "kind", "size"))),
+        header["shape"].strip(),
     )
     if not kind.itemsize or (listed and "," not in listed):
         raise ValueError(f"{entry.name} has no shape or no size")
@@ -183,7 +182,7 @@ def _header(
         for length in listed.rstrip(",").split(",")
         if listed
     )
-    return kind, shape, "F" if found["fortran"] == "True" else "C", 8 + width + length
+    return kind, shape, "F" if header["fortran"] == "True" else "C", 8 + width + length
 
 
 def _exactly(entry: Any, count: int) -> bytes:
@@ -194,7 +193,7 @@ def _exactly(entry: Any, count: int) -> bytes:
 
 
 def _is_text(letters: np.ndarray) -> bool:
-    """Whether all are code points, none of them half of a surrogate pair."""
+    """Whether all are code points and none is half of a surrogate pair."""
     return not np.any(
         (letters > 0x10FFFF) | ((letters >= 0xD800) & (letters <= 0xDFFF))
     )
