@@ -271,6 +271,7 @@ def dataset(count=120, steps=25):
         shares=SHARES,
         env_low=low,
         env_high=high,
+        scenarios=jnp.asarray(datasets.segment_scenarios(count)),
     )
 
 

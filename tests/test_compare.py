@@ -50,12 +50,12 @@ def test_a_row_that_could_not_be_certified_is_refused_before_it_is_trained(tmp_p
 
 
 def test_roads_are_laid_once_for_all_rows_and_anew_for_another_protocol():
-    told = {"delay_s": 0.0, "noise": [0.0, 0.0], "bias": [0.0, 0.0]}
+    env_sensor = {"delay_s": 0.0, "noise": [0.0, 0.0], "bias": [0.0, 0.0]}
     protocol = {
         "episodes": 2,
         "episode_s": 2.0,
         "seed": 1,
-        "told": told,
+        "env_sensor": env_sensor,
         "variation": None,
     }
     asked = {

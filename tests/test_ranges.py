@@ -40,7 +40,7 @@ SIGNED = {
     "dataset.env_low",
     "dataset.env_high",
 }
-SIGNED |= {"evaluation.told.bias"}
+SIGNED |= {"evaluation.env_sensor.bias"}
 """Settings whose numbers may be negative."""
 FREE = {"evaluation.variation", "comparison.paper", "comparison.controllers", "hydra"}
 SAMPLE = 160

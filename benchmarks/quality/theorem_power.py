@@ -32,7 +32,7 @@ SHORTER = (1.02, 1.1, 1.3)
 def driven(trained, segments):
     """Drives by scenario."""
     asked = trained.settings["dataset"] | {"segments": segments}
-    options = build.without(asked, "shares", "env_low", "env_high", "seed")
+    options = build.as_kwargs(asked, "shares", "env_low", "env_high", "seed")
     steady, switching = jax.random.split(jax.random.key(SEED))
     driver = build.build_driver(trained.vehicle)
     switches = {
@@ -79,7 +79,7 @@ def pushed(trained, params, drives, bounds, force):
 
     def one(key, before, control, env):
         met = (
-            evaluation.pushed(plant, env[None], key, largest=force)[0] if force else env
+            evaluation.disturbed_environment(plant, env[None], key, largest=force)[0] if force else env
         )
         fiber = model.fiber(params, env)
         origin = model.encode(fiber, before)

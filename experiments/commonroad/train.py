@@ -78,7 +78,8 @@ def lay(plant, paths, seconds, seed):
     tiled = jax.tree.map(lambda leaf: jnp.concatenate([leaf] * len(FRICTIONS)), roads)
     levels = jnp.repeat(jnp.asarray(FRICTIONS), paths)[:, None]
     keys = jnp.tile(jax.random.split(drive_key, paths), len(FRICTIONS))
-    return tiled._replace(envs=tiled.envs.at[..., 0].set(levels)), keys
+    envs = tiled.envs.at[..., 0].set(levels)
+    return tiled._replace(envs=envs, observed_envs=envs), keys
 
 
 def rows_of(plant, driver, track, asked, paths):

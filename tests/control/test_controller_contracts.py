@@ -56,10 +56,10 @@ def searched(search, **settings):
     return search(task, horizon=HORIZON, **BOX, **settings), params
 
 
-def compensated():
+def delay_compensated():
     """For actuators two steps late."""
     controller, params = mppi(FEEDBACK)
-    return control.compensated(
+    return control.delay_compensated(
         controller, model_and_params("nominal")[0], delay=2
     ), params
 
@@ -115,7 +115,7 @@ BUILDERS = {
     ),
     "cem": partial(searched, control.cem, num_samples=16, elites=4, iterations=2),
     "gradient": partial(searched, control.gradient_planner, iterations=2, steps=4),
-    "compensated": compensated,
+    "compensated": delay_compensated,
     "monitored": monitored,
     "shielded": shielded,
     "koopman_mpc": koopman_mpc,
@@ -210,7 +210,7 @@ def test_an_episode_finds_in_info_what_it_records(name):
     controller, params = BUILDERS[name]()
     road = scenarios.Scenario(
         jnp.asarray(OFFSET),
-        jnp.tile(jnp.asarray(ENV), (7, 1)),
+        *[jnp.tile(jnp.asarray(ENV), (7, 1))] * 2,
         scenarios.path_from_curvature(jnp.zeros(40), spacing=0.5),
         jnp.asarray(10.0),
     )

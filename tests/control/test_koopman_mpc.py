@@ -12,7 +12,7 @@ import pytest
 from helpers import ENV_HIGH, ENV_LOW, dataset, jit, model_and_params, same, straight
 
 from sfkd_jax import control, datasets, evaluation, models, scenarios, vehicle
-from sfkd_jax.control import Stage
+from sfkd_jax.control import StageInputs
 from sfkd_jax.control.planners import _koopman_mpc
 
 PLANT = vehicle.kinematic()
@@ -151,7 +151,7 @@ def test_the_cost_is_the_tracking_cost_of_what_is_predicted(speed_loop):
         x = linear.C @ z + linear.o
         later = control.PathErrors(x[1], x[2], x[3] - BEND[k, 3])
         cost = tracking.stage(
-            tracking.weights, Stage(later, errors, now, before, BEND[k, 3])
+            tracking.weights, StageInputs(later, errors, now, before, BEND[k, 3])
         )
         total, errors, before = total + (1 + (k == HORIZON - 1)) * cost, later, now
     np.testing.assert_allclose(info["cost"], total, rtol=2e-3)
@@ -176,7 +176,7 @@ def drive(curvature, offset, seconds=5.0, env=(0.8, 0.0)):
     path = scenarios.path_from_curvature(jnp.full(300, curvature), spacing=0.5)
     start = jnp.asarray([0.0, offset, 0.0, 10.0])
     envs = jnp.tile(jnp.asarray(env), (round(seconds / 0.1), 1))
-    road = scenarios.Scenario(start, envs, path, jnp.asarray(10.0))
+    road = scenarios.Scenario(start, envs, envs, path, jnp.asarray(10.0))
     run = partial(
         evaluation.simulate, PLANT.step, compiled()[0], dt=0.1, horizon=HORIZON
     )

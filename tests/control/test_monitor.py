@@ -533,7 +533,7 @@ def test_a_car_outside_its_box_slows_down_on_its_path_and_the_one_inside_does_no
     def episode(friction):
         road = scenarios.Scenario(
             jnp.asarray([0.0, 0.0, 0.0, 10.0]),
-            jnp.tile(jnp.stack([friction, 0.0]), (40, 1)),
+            *[jnp.tile(jnp.stack([friction, 0.0]), (40, 1))] * 2,
             scenarios.path_from_curvature(jnp.full(200, 0.01), spacing=0.5),
             jnp.asarray(10.0),
         )

@@ -450,7 +450,7 @@ def test_a_nominal_model_of_a_nominal_plant_converges_to_the_path(law):
     controller = planner(model, num_samples=128, **({} if law == "feedback" else plain))
     road = scenarios.Scenario(
         jnp.asarray(OFFSET),
-        jnp.tile(jnp.asarray([[0.9, 0.0]]), (60, 1)),
+        *[jnp.tile(jnp.asarray([[0.9, 0.0]]), (60, 1))] * 2,
         scenarios.path_from_curvature(jnp.zeros(300), spacing=0.5),
         jnp.asarray(10.0),
     )

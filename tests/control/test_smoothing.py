@@ -249,7 +249,7 @@ def test_without_a_filter_nothing_is_kept_of_the_past():
 def test_a_smoothed_plan_steers_more_calmly_and_still_reaches_the_path():
     road = scenarios.Scenario(
         jnp.asarray(OFFSET),
-        jnp.tile(jnp.asarray([[0.9, 0.0]]), (60, 1)),
+        *[jnp.tile(jnp.asarray([[0.9, 0.0]]), (60, 1))] * 2,
         scenarios.path_from_curvature(jnp.zeros(300), spacing=0.5),
         jnp.asarray(10.0),
     )

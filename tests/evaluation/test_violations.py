@@ -29,7 +29,7 @@ PLANTS = {"kinematic": vehicle.kinematic(), "dynamic": vehicle.dynamic()}
 
 
 def still(count=2, steps=12):
-    """Cars that stand at the origin whatever they are told."""
+    """Cars that stand at the origin whatever they observe."""
     return Trajectory(
         jnp.zeros((count, steps + 1, 4)),
         jnp.zeros((count, steps, 2)),
@@ -352,7 +352,7 @@ def test_a_push_accelerates_the_dynamic_plant_by_force_over_mass_and_turns_it_by
     )
 
 
-def test_a_pushed_episode_is_the_one_under_the_wind_that_pushes_as_hard():
+def test_a_side_force_is_the_wind_that_pushes_as_hard():
     """5 m/s of wind against 250 N, F = c_w w|w| with c_w = 10: the same numbers, and so
     the same drive.
     """
@@ -364,11 +364,12 @@ def test_a_pushed_episode_is_the_one_under_the_wind_that_pushes_as_hard():
     drive = jit(
         partial(evaluation.simulate, plant.step, follower(), {}, dt=DT, horizon=3)
     )
-    told = road._replace(envs=calm)
-    pushed = drive(told, jax.random.key(0), met=calm.at[:, 1].set(felt))
-    blown = drive(told, jax.random.key(0), met=windy)
-    np.testing.assert_array_equal(pushed.states, blown.states)
-    assert not np.array_equal(pushed.states, drive(told, jax.random.key(0)).states)
+    key = jax.random.key(0)
+    observed = road._replace(envs=calm, observed_envs=calm)
+    disturbed = drive(observed._replace(envs=calm.at[:, 1].set(felt)), key)
+    blown = drive(observed._replace(envs=windy), key)
+    np.testing.assert_array_equal(disturbed.states, blown.states)
+    assert not np.array_equal(disturbed.states, drive(observed, key).states)
 
 
 @cache
@@ -378,8 +379,8 @@ def roads():
 
 
 def follower():
-    """Steers by the first reference point and a random stream, and writes down the wind
-    it is told of.
+    """Steers by the first reference point and a random stream, and records the wind
+    that it observes.
     """
 
     def act(params, state, observation, env, reference):
@@ -397,11 +398,9 @@ def follower():
 @cache
 def episode(largest):
     plant, road, key = PLANTS["kinematic"], at(roads(), 0), jax.random.key(3)
-    met = (
-        None
-        if largest is None
-        else evaluation.pushed(plant, road.envs, key, largest=largest)
-    )
+    if largest is not None:
+        envs = evaluation.disturbed_environment(plant, road.envs, key, largest=largest)
+        road = road._replace(envs=envs)
     drive = partial(
         evaluation.simulate,
         plant.step,
@@ -411,7 +410,7 @@ def episode(largest):
         horizon=3,
         observation_noise=(0.02, 0.02),
     )
-    return jit(drive)(road, key, met=met)
+    return jit(drive)(road, key)
 
 
 def test_a_force_of_zero_leaves_every_bit_of_an_episode_as_it_was():
@@ -419,7 +418,7 @@ def test_a_force_of_zero_leaves_every_bit_of_an_episode_as_it_was():
         np.testing.assert_array_equal(before, after)
 
 
-def test_a_pushed_car_is_told_the_weather_and_not_the_push():
+def test_a_controller_observes_the_wind_but_not_the_side_force():
     np.testing.assert_array_equal(
         episode(800.0).effective_samples, at(roads(), 0).envs[:, 1]
     )
@@ -449,7 +448,7 @@ def test_pushes_are_redrawn_every_second_evenly_within_their_bound_and_grow_with
 def test_pushes_do_not_share_a_stream_with_the_planner_or_the_sensors():
     key = jax.random.key(4)
     streams = [
-        jax.random.fold_in(key, evaluation._closed_loop.PUSHES),
+        jax.random.fold_in(key, evaluation._environment.FORCE_STREAM),
         *jax.random.split(key),
     ]
     assert (
@@ -457,7 +456,9 @@ def test_pushes_do_not_share_a_stream_with_the_planner_or_the_sensors():
     )
     with jax.debug_key_reuse(True):
         road = at(roads(), 0)
-        met = evaluation.pushed(PLANTS["kinematic"], road.envs, key, largest=100.0)
+        envs = evaluation.disturbed_environment(
+            PLANTS["kinematic"], road.envs, key, largest=100.0
+        )
         jax.jit(
             partial(
                 evaluation.simulate,
@@ -467,4 +468,4 @@ def test_pushes_do_not_share_a_stream_with_the_planner_or_the_sensors():
                 dt=DT,
                 horizon=3,
             )
-        )(road, key, met=met)
+        )(road._replace(envs=envs), key)

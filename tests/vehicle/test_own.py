@@ -134,6 +134,6 @@ def test_its_nominal_model_is_the_bicycle_and_leaves_further_states_alone():
 def test_a_plant_that_wind_does_not_push_cannot_be_pushed_through_it(key):
     with pytest.raises(
         ValueError,
-        match=r"side_forces push through the wind, and vehicle\.wind_force is 0",
+        match=r"side_forces act through the wind, but vehicle\.wind_force is 0",
     ):
-        evaluation.pushed(vehicle.own(), jnp.zeros((3, 2)), key, largest=10.0)
+        evaluation.disturbed_environment(vehicle.own(), jnp.zeros((3, 2)), key, largest=10.0)

@@ -12,7 +12,7 @@ LARGEST_INT, LARGEST_FLOAT = 2**31 - 1, 3e38
 _PLANTS = "mass yaw_inertia front_length rear_length front_stiffness rear_stiffness steering_lag steering_rate"
 _INTERVALS = {
     "(-inf, inf)": "vehicle.wind_lever vehicle.control_low vehicle.control_high dataset.env_low dataset.env_high "
-    "evaluation.told.bias",
+    "evaluation.env_sensor.bias",
     "[0, inf)": "seed dataset.seed evaluation.seed comparison.seeds comparison.share evaluation.timed_steps "
     "demo.timed_steps certification.attack_starts model.environment_degree model.forcing_hidden "
     "*.num_proposals *.smoothing_window "
@@ -40,7 +40,7 @@ _INTERVALS = {
 }
 _ENTRIES = {
     2: "scenario.wavelengths dataset.speed dataset.steering_excitation dataset.speed_excitation *.noise_std "
-    "controller.task.control_rate evaluation.told.noise evaluation.told.bias comparison.share "
+    "controller.task.control_rate evaluation.env_sensor.noise evaluation.env_sensor.bias comparison.share "
     "dataset.law.speed dataset.law.perturbation dataset.wavelengths "
     "certification.corridor.dwell",
     3: "dataset.law.points",

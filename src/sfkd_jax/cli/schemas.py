@@ -187,7 +187,8 @@ def register() -> None:
         "threshold_m": _THRESHOLD,
         "variation": None,
     }
-    protocol |= {"told": schema("ToldConfig", evaluation.told, skip=("dt",))}
+    sensor = schema("EnvSensorConfig", evaluation.observed_environment, skip=("dt",))
+    protocol |= {"env_sensor": sensor}
     store.store(
         group="evaluation", name="schema", node=schema("EvaluationConfig", **protocol)
     )

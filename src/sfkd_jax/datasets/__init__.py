@@ -1,4 +1,4 @@
-"""The archive: driving data, its splits, windows and scales."""
+"""Driving data: generated or recorded, its parts, windows and scales."""
 
 from sfkd_jax.datasets._coverage import coverage as coverage
 from sfkd_jax.datasets._files import fingerprint as fingerprint
@@ -8,6 +8,7 @@ from sfkd_jax.datasets._from_logs import from_logs as from_logs
 from sfkd_jax.datasets._generation import Driver as Driver
 from sfkd_jax.datasets._generation import generate as generate
 from sfkd_jax.datasets._generation import generate_switching as generate_switching
+from sfkd_jax.datasets._generation import segment_scenarios as segment_scenarios
 from sfkd_jax.datasets._logs import Columns as Columns
 from sfkd_jax.datasets._path_drives import check_on_path as check_on_path
 from sfkd_jax.datasets._path_drives import drive_along_path as drive_along_path
@@ -16,6 +17,10 @@ from sfkd_jax.datasets._path_drives import generate_along_path as generate_along
 from sfkd_jax.datasets._path_drives import (
     generate_s3_along_path as generate_s3_along_path,
 )
+from sfkd_jax.datasets._path_drives import (
+    segment_scenarios_along_path as segment_scenarios_along_path,
+)
+from sfkd_jax.datasets._splits import SCENARIOS as SCENARIOS
 from sfkd_jax.datasets._splits import Dataset as Dataset
 from sfkd_jax.datasets._splits import check_shares as check_shares
 from sfkd_jax.datasets._splits import first_share as first_share

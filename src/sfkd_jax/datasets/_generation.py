@@ -1,4 +1,4 @@
-"""Segments of driving for training: scenarios S1 and S2 with levels drawn per segment, persistently excited."""
+"""Generate training segments of S1 and S2 with persistently excited controls."""
 
 from __future__ import annotations
 
@@ -8,8 +8,10 @@ from typing import Any, TypeAlias
 
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Float
+import numpy as np
+from jaxtyping import Array, Float, Int
 
+from sfkd_jax.datasets._splits import scenario_labels
 from sfkd_jax.scenarios import (
     Scenario,
     family,
@@ -27,12 +29,12 @@ Driver: TypeAlias = Callable[
 ]
 
 BURN_IN = 10
-"""Steps driven before a segment starts, so that hidden states (slip, yaw rate,
-steering) are on their manifold.
+"""Steps simulated before a segment starts, so that slip, yaw rate and steering have
+settled.
 """
 PATH = {"peak_curvature": 0.025, "wavelengths": (60.0, 240.0)}
-"""Training geometry: other wavelengths and a wider range of curvature than the
-benchmark's paths.
+"""Paths for training: other wavelengths and a wider range of curvature than those of
+the benchmark.
 """
 
 
@@ -48,34 +50,46 @@ def generate(
     speed_excitation: tuple[float, float] = (0.1, 1.5),
     fixed_levels: bool = False,
 ) -> Trajectory:
-    """Independent segments, half S1 (uniform road), half S2 (friction drop and gusts), every one its own trajectory.
+    """Generate independent segments: half S1 (uniform road), half S2 (drop and gusts).
 
     A path-following driver keeps the car on a random road while an AR(1) process
-    excites both controls; its spread is drawn per segment, log-uniformly, so that quiet
-    and violent driving both occur.
+    excites both controls. Its spread is drawn log-uniformly per segment, so that the
+    excitation ranges from weak to strong.
 
     Args:
         vehicle: the plant.
         driver: (state, next reference points) -> control before excitation.
         key: consumed.
-        segments, steps: how many, how long.
+        segments: their number.
+        steps: of a segment.
         speed: range of the target speed [m/s].
         steering_excitation: range of the spread [rad].
         speed_excitation: the same for the second control [m/s² or m/s].
-        fixed_levels: draw S1 and S2 at the benchmark's own levels only (the paper's
-            literal training set).
+        fixed_levels: use the benchmark's own levels of S1 and S2 only (the training
+            set as printed in the paper).
 
     Returns:
-        A batch of trajectories, states (segment, steps + 1, state).
+        A batch of trajectories, states (segment, steps + 1, state); their scenarios are
+        those of `segment_scenarios`.
     """
-    halves = []
-    for index, conditions in enumerate(_conditions(steps, vehicle.dt, fixed_levels)):
-        count = segments // 2 if index else segments - segments // 2
+    halves, counts = [], _counts(segments).values()
+    schedules = _conditions(steps, vehicle.dt, fixed_levels)
+    for index, (conditions, count) in enumerate(zip(schedules, counts, strict=True)):
         drive = partial(_segment, vehicle, driver, conditions, steps, speed)
         drive = partial(drive, jnp.asarray([steering_excitation, speed_excitation]))
         keys = jax.random.split(jax.random.fold_in(key, index), count)
         halves.append(jax.lax.map(drive, keys, batch_size=500))
     return jax.tree.map(lambda a, b: jnp.concatenate([a, b]), *halves)
+
+
+def segment_scenarios(segments: int) -> Int[np.ndarray, " segment"]:
+    """Return the scenario of every segment of `generate`, as index into `SCENARIOS`."""
+    return scenario_labels(_counts(segments))
+
+
+def _counts(segments: int) -> dict[str, int]:
+    """Number of segments by scenario, in the order in which they are generated."""
+    return {"s1": segments - segments // 2, "s2": segments // 2}
 
 
 def generate_switching(
@@ -89,11 +103,19 @@ def generate_switching(
     steering_excitation: tuple[float, float] = (0.005, 0.1),
     speed_excitation: tuple[float, float] = (0.1, 1.5),
 ) -> Trajectory:
-    """The same driving under S3's switching, from a random moment of its schedule: never for training.
+    """Generate segments of S3's switching, from a random time of its schedule.
+
+    They are for tests, never for training.
 
     Args:
-        vehicle, driver, key, segments, steps, speed, steering_excitation,
-            speed_excitation: as for `generate`.
+        vehicle: the plant.
+        driver: as for `generate`.
+        key: consumed.
+        segments: their number.
+        steps: of a segment.
+        speed: as for `generate`.
+        steering_excitation: as for `generate`.
+        speed_excitation: as for `generate`.
     """
 
     def conditions(key: Key) -> Float[Array, "time 2"]:
@@ -109,7 +131,7 @@ def generate_switching(
 
 
 def _conditions(steps: int, dt: float, fixed: bool) -> list[Callable[[Key], Array]]:
-    """Schedules of S1 and S2 for training; the friction drop falls anywhere in the segment."""
+    """Schedules of S1 and S2; friction drops at a random time of the segment."""
     during = (0.0, steps * dt)
     if fixed:
         return [
@@ -138,9 +160,9 @@ def _segment(
     excitation: Float[Array, "control 2"],
     key: Key,
 ) -> Trajectory:
-    """One segment; its first environment also holds during the burn-in."""
-    road_key, speed_key, spread_key, noise_key, start_key, place_key = jax.random.split(
-        key, 6
+    """One segment; its first environment also applies during the burn-in."""
+    road_key, speed_key, spread_key, noise_key, start_key, offset_key = (
+        jax.random.split(key, 6)
     )
     speed = jax.random.uniform(
         speed_key, (), minval=speed_range[0], maxval=speed_range[1]
@@ -181,7 +203,7 @@ def _segment(
 
     start = (
         initial,
-        jnp.full((), 20.0 * jax.random.uniform(place_key)),
+        jnp.full((), 20.0 * jax.random.uniform(offset_key)),
         spread * white[0],
     )
     start = (_on_path(scenario, start[1], initial), start[1], start[2])

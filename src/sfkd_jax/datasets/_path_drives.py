@@ -1,4 +1,4 @@
-"""Drives of a closed loop in path coordinates: roads, speeds, environments and what a planner may add."""
+"""Generate drives of a closed loop in path coordinates under perturbations ν."""
 
 from __future__ import annotations
 
@@ -8,11 +8,13 @@ from typing import Any, TypeAlias
 
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Float
+import numpy as np
+from jaxtyping import Array, Float, Int
 
 from sfkd_jax.core.path_frame import is_valid, path_state
 from sfkd_jax.core.rollouts import in_batches
 from sfkd_jax.datasets._path_excitation import perturbations, profile
+from sfkd_jax.datasets._splits import scenario_labels
 from sfkd_jax.scenarios import (
     held_road,
     random_switching,
@@ -24,26 +26,20 @@ from sfkd_jax.types import BODY, Control, Environment, Key, Scalar, State, Traje
 from sfkd_jax.vehicle import Vehicle
 
 Conditions: TypeAlias = Callable[[Key], Float[Array, "time environment"]]
-Admit: TypeAlias = Callable[
+SafetyFilter: TypeAlias = Callable[
     [State, Float[Array, "time 4"], Float[Array, "time environment"]],
     Float[Array, "time 4"],
 ]
-"""(first path state, w, e) -> w: what a filter lets through of the perturbations of a
-whole drive.
-"""
+"""(first path state, w, e) -> w of a whole drive, with ν replaced by admissible ν."""
 Sensors: TypeAlias = Callable[[Key, State, Control, Environment], Control]
-"""(key, path state, w, e) -> what the law adds to ν because it sees a measurement of
-the state.
-"""
+"""(key, path state, w, e) -> what the law adds to ν because its sensors are noisy."""
 
 SWITCHES = (1.5, 6.0)
 """Range of times between switches in the data [s]."""
 BURN_IN = 20
-"""Steps driven before a drive starts, so that the car is where the law brings it and
-not where it was put.
-"""
+"""Steps simulated before a drive starts, so that the start has no influence."""
 SENSORS = 3
-"""Folded into a drive's key, of which road, ν and start take a split each."""
+"""Folded into a drive's key, which is also split for road, ν and start."""
 BATCH = 500
 """Drives simulated at once."""
 
@@ -63,57 +59,39 @@ def generate_along_path(
     env_low: tuple[float, ...],
     env_high: tuple[float, ...],
 ) -> Trajectory:
-    """Independent drives under any ν: a quarter each on S1, on S2, with e held anywhere in E, and under any switching.
+    """Generate independent drives: a quarter each of S1, S2, held e and switching e.
 
-    Of the last two a third of every entry of e lies at an end of its range, so that the
-    corners of E are driven; switches are `SWITCHES` apart. Roads and ν are those of
-    `drive_along_path`.
+    In the last two quarters a third of every entry of e lies at an end of its range, so
+    that the corners of E are covered; switches are `SWITCHES` apart. Roads and ν are
+    those of `drive_along_path`.
 
     Args:
         loop: of `vehicle.along_path`.
         key: consumed.
-        segments, steps: how many, how long.
-        speed, peak_curvature, wavelengths, lateral_acceleration, steering_excitation,
-            speed_excitation: see `drive_along_path`.
-        env_low, env_high: E.
+        segments: their number.
+        steps: of a segment.
+        speed: see `drive_along_path`.
+        peak_curvature: see there.
+        wavelengths: see there.
+        lateral_acceleration: see there.
+        steering_excitation: see there.
+        speed_excitation: see there.
+        env_low: lower corner of E.
+        env_high: upper corner of E.
 
     Returns:
         A batch of trajectories, states (segment, steps + 1, 3 + coordinate), controls w
-        (segment, steps, 4).
+        (segment, steps, 4); their scenarios are those of
+        `segment_scenarios_along_path`.
     """
-    during = (0.0, steps * loop.dt)
-    kinds: list[tuple[Conditions, int]] = [
-        (partial(uniform_road, steps=steps, friction=(0.3, 0.9)), segments // 4),
-        (
-            partial(
-                wet_road,
-                steps=steps,
-                dt=loop.dt,
-                before=(0.55, 0.9),
-                after=(0.3, 0.5),
-                drop_time=during,
-            ),
-            segments // 4,
-        ),
-        (partial(held_road, steps=steps, low=env_low, high=env_high), segments // 4),
-        (
-            partial(
-                random_switching,
-                steps=steps,
-                dt=loop.dt,
-                low=env_low,
-                high=env_high,
-                dwell=SWITCHES,
-            ),
-            segments - 3 * (segments // 4),
-        ),
-    ]
+    schedules = _conditions(steps, loop.dt, (env_low, env_high))
+    counts = _counts(segments)
     env_key, drive_key = jax.random.split(key)
     envs = [
-        jax.vmap(conditions)(
+        jax.vmap(schedules[name])(
             jax.random.split(jax.random.fold_in(env_key, index), count)
         )
-        for index, (conditions, count) in enumerate(kinds)
+        for index, (name, count) in enumerate(counts.items())
     ]
     return drive_along_path(
         loop,
@@ -126,6 +104,44 @@ def generate_along_path(
         steering_excitation=steering_excitation,
         speed_excitation=speed_excitation,
     )
+
+
+def segment_scenarios_along_path(segments: int) -> Int[np.ndarray, " segment"]:
+    """Return the scenario of every segment of `generate_along_path`."""
+    return scenario_labels(_counts(segments))
+
+
+def _counts(segments: int) -> dict[str, int]:
+    """Number of segments by scenario, in the order in which they are generated."""
+    quarter = segments // 4
+    return {
+        "s1": quarter,
+        "s2": quarter,
+        "held": quarter,
+        "switching": segments - 3 * quarter,
+    }
+
+
+def _conditions(
+    steps: int, dt: float, box: tuple[tuple[float, ...], tuple[float, ...]]
+) -> dict[str, Conditions]:
+    """Schedules of e by scenario."""
+    low, high = box
+    return {
+        "s1": partial(uniform_road, steps=steps, friction=(0.3, 0.9)),
+        "s2": partial(
+            wet_road,
+            steps=steps,
+            dt=dt,
+            before=(0.55, 0.9),
+            after=(0.3, 0.5),
+            drop_time=(0.0, steps * dt),
+        ),
+        "held": partial(held_road, steps=steps, low=low, high=high),
+        "switching": partial(
+            random_switching, steps=steps, dt=dt, low=low, high=high, dwell=SWITCHES
+        ),
+    }
 
 
 def drive_along_path(
@@ -141,20 +157,19 @@ def drive_along_path(
     speed_excitation: tuple[float, float] = (0.05, 0.6),
     offset: tuple[float, float, float] = (0.1, 0.02, 0.5),
     burn_in: int = BURN_IN,
-    admit: Admit | None = None,
+    safety_filter: SafetyFilter | None = None,
     sensors: Sensors | None = None,
 ) -> Trajectory:
-    """Drives in environments of one's own, one schedule a drive.
+    """Generate drives in given environments, one schedule per drive.
 
-    Speed varies slowly within its range. A third of the roads is one circle, the others
-    bend as a sum of three sinusoids; none asks for more than `peak_curvature` or
-    `lateral_acceleration`. ν is, drive by drive, what a planner does (an AR(1) process)
-    or what nobody should (its sign alone, held for random times: bang-bang), the spread
-    drawn log-uniformly and ν held within the limits of the loop.
+    The speed varies slowly within its range. A third of the roads are circles, the
+    curvature of the others is a sum of three sinusoids; none exceeds `peak_curvature`
+    or `lateral_acceleration`. ν of a drive is an AR(1) process, as of a planner, or its
+    sign (bang-bang), with a log-uniform spread, clipped to the limits of the loop.
 
     Args:
         loop: of `vehicle.along_path`.
-        envs: what is met.
+        envs: of the plant.
         key: consumed.
         speed: range of v_ref [m/s].
         peak_curvature: [1/m].
@@ -163,10 +178,10 @@ def drive_along_path(
         steering_excitation: range of the spread of ν_1 [rad].
         speed_excitation: of ν_2 [m/s² or m/s].
         offset: largest e_y [m], e_ψ [rad] and v − v_ref [m/s] at the start.
-        burn_in: steps before a drive starts.
-        admit: a filter of ν that sees the drive's conditions and not the car; what it
-            lets through is w.
-        sensors: of the law; what they add to ν is not part of w.
+        burn_in: steps simulated before a drive starts.
+        safety_filter: replaces ν by admissible ν; sees the drive's conditions, not the
+            car.
+        sensors: noise of the law's sensors; it is not part of w.
     """
     limits = jnp.asarray([steering_excitation, speed_excitation])
     road = partial(
@@ -194,18 +209,15 @@ def drive_along_path(
         start = path_state(
             jnp.zeros(len(loop.state_names) - 3).at[:3].set(beside.at[2].add(speeds[0]))
         )
-        inputs = inputs if admit is None else admit(start, inputs, envs)
+        inputs = inputs if safety_filter is None else safety_filter(start, inputs, envs)
 
         def step(
             state: State, given: tuple[Control, Environment, Key]
         ) -> tuple[State, State]:
-            wanted, env, key = given
-            seen = (
-                wanted
-                if sensors is None
-                else wanted.at[:2].add(sensors(key, state, wanted, env))
-            )
-            after = loop.step(state, seen, env)
+            inputs, env, key = given
+            if sensors is not None:
+                inputs = inputs.at[:2].add(sensors(key, state, inputs, env))
+            after = loop.step(state, inputs, env)
             return after, after
 
         _, states = jax.lax.scan(step, start, (inputs, envs, sensor_keys))
@@ -219,10 +231,15 @@ def drive_along_path(
 def generate_s3_along_path(
     loop: Vehicle, key: Key, *, segments: int, steps: int = 50, **options: Any
 ) -> Trajectory:
-    """The same driving under S3's switching, from a random moment of its schedule: never for training.
+    """Generate drives of S3's switching, from a random time of its schedule.
+
+    They are for tests, never for training.
 
     Args:
-        loop, key, segments, steps: as for `generate_along_path`.
+        loop: of `vehicle.along_path`.
+        key: consumed.
+        segments: their number.
+        steps: of a segment.
         options: of `drive_along_path`.
     """
 
@@ -249,12 +266,16 @@ def drive_switching(
     dwell: tuple[float, float] = (3.0, 6.0),
     **options: Any,
 ) -> Trajectory:
-    """Drives under any switching in E: levels drawn anew, a third of every entry at an end, held for `dwell` [s].
+    """Generate drives with e switching anywhere in E, as `random_switching` draws it.
 
     Args:
-        loop, key: see `drive_along_path`.
-        drives, steps: how many, how long.
-        env_low, env_high: E.
+        loop: see `drive_along_path`.
+        key: consumed.
+        drives: their number.
+        steps: of a drive.
+        env_low: lower corner of E.
+        env_high: upper corner of E.
+        dwell: range of the times between switches [s].
         options: of `drive_along_path`.
     """
     env_key, drive_key = jax.random.split(key)
@@ -274,18 +295,19 @@ def check_on_path(trajectories: Trajectory) -> None:
     """Refuse drives that left their path.
 
     Raises:
-        ValueError: how many came nearer than a fifth of the radius to a centre of
-            curvature, or are not finite.
+        ValueError: the number of drives with 1 − κ e_y ≤ 0.2 or states that are not
+            finite.
     """
     lateral, curvature = (
         trajectories.states[..., :-1, BODY.start],
         trajectories.controls[..., 2],
     )
-    held = jnp.all(is_valid(lateral, curvature), axis=-1) & jnp.all(
+    valid = jnp.all(is_valid(lateral, curvature), axis=-1) & jnp.all(
         jnp.isfinite(trajectories.states), axis=(-2, -1)
     )
-    if not bool(jnp.all(held)):
-        lost, total = int(jnp.sum(~held)), held.size
+    if not bool(jnp.all(valid)):
+        lost, total = int(jnp.sum(~valid)), valid.size
         raise ValueError(
-            f"{lost} of {total} drives left their path (1 - kappa e_y <= 0.2): dataset.law does not hold the car"
+            f"{lost} of {total} drives left their path (1 - kappa e_y <= 0.2): "
+            "dataset.law does not stabilise the car"
         )

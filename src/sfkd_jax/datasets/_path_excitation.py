@@ -1,4 +1,4 @@
-"""What a drive along a path is given: curvature and speed along the road, and what is added to the law."""
+"""Draw the inputs of a drive along a path: curvature, speed and perturbation ν."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ def profile(
     wavelengths: tuple[float, float],
     most: float,
 ) -> tuple[Float[Array, " time"], Float[Array, " time"]]:
-    """v_ref [m/s] and κ [1/m] at every step."""
+    """Draw v_ref [m/s] and κ [1/m] at every step."""
     level_key, swing_key, wave_key, phase_key, size_key, kind_key, circle_key = (
         jax.random.split(key, 7)
     )
@@ -36,7 +36,7 @@ def profile(
     phases = jax.random.uniform(phase_key, (3, 1), maxval=2 * jnp.pi)
     along = jnp.cumsum(speeds) * dt
     bends = jnp.mean(jnp.sin(2 * jnp.pi * along / waves + phases), axis=0)
-    # Three sinusoids seldom peak together: twice their mean, clipped, holds the
+    # Three sinusoids seldom peak together: twice their mean, clipped, stays at the
     # extremes for a while as well.
     bends = jnp.sqrt(jax.random.uniform(size_key)) * jnp.clip(2.0 * bends, -1.0, 1.0)
     circle = jnp.clip(
@@ -50,7 +50,7 @@ def profile(
 def perturbations(
     key: Key, *, steps: int, spread: Float[Array, "2 2"]
 ) -> Float[Array, "time 2"]:
-    """ν: an AR(1) process, or its sign alone, of a spread drawn log-uniformly for each channel."""
+    """Draw ν: an AR(1) process or its sign, its spread log-uniform per channel."""
     spread_key, white_key, kind_key = jax.random.split(key, 3)
     logs = jnp.log(spread)
     size = jnp.exp(

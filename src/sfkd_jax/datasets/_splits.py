@@ -1,4 +1,4 @@
-"""Splits by trajectory, windows, and the scales measured on the training split."""
+"""Data sets split by trajectory, windows of them, and scales of the training part."""
 
 from __future__ import annotations
 
@@ -13,18 +13,26 @@ from jaxtyping import Array, Float, Int
 from sfkd_jax.core.se2 import between
 from sfkd_jax.types import BODY, POSE, Key, Space, Trajectory
 
+SCENARIOS = ("s1", "s2", "held", "switching")
+"""Scenarios of generated segments: uniform road, wet road with gusts, e held anywhere
+in E, and e switching anywhere in E.
+"""
+
 
 class Dataset(NamedTuple):
-    """Four sets of trajectories, disjoint by trajectory, and the environment box E they were drawn from.
+    """Four sets of trajectories, disjoint by trajectory, and the environment box E.
 
     Attributes:
-        train: fits weights.
-        validation: selects.
-        calibration: sets d_bar.
-        test: reports, nothing else.
-        env_low, env_high: E.
-        drives: how many independent drives each part was cut from, by its name; None
-            where every trajectory is one.
+        train: to fit weights.
+        validation: to select weights.
+        calibration: to measure d_bar.
+        test: for reported numbers only.
+        env_low: lower corner of E.
+        env_high: upper corner of E.
+        drives: number of independent drives that each part was cut from, by its name;
+            None where every trajectory is one.
+        scenarios: index into `SCENARIOS` of every trajectory of each part, by its name;
+            None for recorded drives.
     """
 
     train: Trajectory
@@ -34,17 +42,29 @@ class Dataset(NamedTuple):
     env_low: Float[Array, " environment"]
     env_high: Float[Array, " environment"]
     drives: Mapping[str, int] | None = None
+    scenarios: Mapping[str, Int[Array, " segment"]] | None = None
+
+
+PARTS = Dataset._fields[:4]
+"""Names of the parts of a data set."""
+
+
+def scenario_labels(counts: Mapping[str, int]) -> Int[np.ndarray, " segment"]:
+    """Return indices into `SCENARIOS` of segments that are ordered by scenario."""
+    codes = np.asarray([SCENARIOS.index(name) for name in counts], dtype=np.int32)
+    return np.repeat(codes, list(counts.values()))
 
 
 def check_shares(shares: tuple[float, ...]) -> None:
-    """Of training, validation, calibration and test.
+    """Check the shares of training, validation, calibration and test.
 
     Raises:
-        ValueError: shares that are not four, positive and of sum 1.
+        ValueError: shares that are not four positive numbers of sum 1.
     """
     if len(shares) != 4 or not min(shares) > 0 or not abs(sum(shares) - 1.0) <= 1e-6:
         raise ValueError(
-            f"dataset.shares must be four positive numbers of sum 1, got {tuple(shares)}"
+            "dataset.shares must be four positive numbers of sum 1, "
+            f"got {tuple(shares)}"
         )
 
 
@@ -55,18 +75,43 @@ def split(
     shares: tuple[float, float, float, float],
     env_low: Float[Array, " environment"],
     env_high: Float[Array, " environment"],
+    scenarios: Int[Array, " segment"] | None = None,
 ) -> Dataset:
-    """Deal whole trajectories to train, validation, calibration and test.
+    """Split trajectories at random into training, validation, calibration and test.
+
+    Args:
+        trajectories: a batch.
+        key: consumed.
+        shares: of the four parts.
+        env_low: lower corner of E.
+        env_high: upper corner of E.
+        scenarios: index into `SCENARIOS` of every trajectory, or None.
 
     Raises:
-        ValueError: shares that are not four, positive and of sum 1, a set left empty,
-            numbers that are not finite, an environment outside E.
+        ValueError: shares that are not four positive numbers of sum 1, an empty part,
+            numbers that are not finite, or an environment outside E.
     """
     check_shares(shares)
     count = trajectories.states.shape[0]
     edges = np.round(np.cumsum(shares)[:-1] * count).astype(int)
     if min(np.diff([0, *edges, count])) < 1:
         raise ValueError(f"{count} trajectories are too few for shares {tuple(shares)}")
+    _check_finite(trajectories)
+    _check_box(trajectories, env_low, env_high)
+    order = jax.random.permutation(key, count)
+    rows = jnp.split(order, edges)
+    parts = [jax.tree.map(lambda a, i=index: a[i], trajectories) for index in rows]
+    dataset = Dataset(
+        *parts, env_low=jnp.asarray(env_low), env_high=jnp.asarray(env_high)
+    )
+    if scenarios is None:
+        return dataset
+    labels = {name: scenarios[index] for name, index in zip(PARTS, rows, strict=True)}
+    return dataset._replace(scenarios=labels)
+
+
+def _check_finite(trajectories: Trajectory) -> None:
+    """Refuse states or controls that are not finite."""
     finite = [jnp.all(jnp.isfinite(leaf)) for leaf in trajectories[:2]]
     if not all(map(bool, finite)):
         names = " and ".join(
@@ -75,25 +120,29 @@ def split(
             if not good
         )
         raise ValueError(
-            f"{names} of the trajectories are not finite: check the vehicle that drove them"
+            f"{names} of the trajectories are not finite: "
+            "check the vehicle that drove them"
         )
+
+
+def _check_box(
+    trajectories: Trajectory,
+    env_low: Float[Array, " environment"],
+    env_high: Float[Array, " environment"],
+) -> None:
+    """Refuse environments outside E, or a box of another size."""
     envs = trajectories.envs.reshape(-1, trajectories.envs.shape[-1])
     if not envs.shape[-1:] == jnp.shape(env_low) == jnp.shape(env_high):
         raise ValueError(
-            f"dataset.env_low and env_high need {envs.shape[-1]} entries, got {env_low} and {env_high}"
+            f"dataset.env_low and env_high need {envs.shape[-1]} entries, "
+            f"got {env_low} and {env_high}"
         )
     if not bool(jnp.all((envs >= env_low - 1e-5) & (envs <= env_high + 1e-5))):
         raise ValueError(f"environments leave the box [{env_low}, {env_high}]")
-    order = jax.random.permutation(key, count)
-    parts = [
-        jax.tree.map(lambda a, i=index: a[i], trajectories)
-        for index in jnp.split(order, edges)
-    ]
-    return Dataset(*parts, env_low=jnp.asarray(env_low), env_high=jnp.asarray(env_high))
 
 
 def first_share(trajectories: Trajectory, share: float) -> Trajectory:
-    """The first of the trajectories, at least one: a smaller data set inside a larger one.
+    """Return the first share of the trajectories, at least one.
 
     Raises:
         ValueError: a share outside (0, 1].
@@ -105,7 +154,7 @@ def first_share(trajectories: Trajectory, share: float) -> Trajectory:
 
 
 def measure_space(dataset: Dataset) -> Space:
-    """Centres and half widths of s and u over the training split, of e over its box, moments of the increments."""
+    """Measure the scales of s and u over the training part, and those of e over E."""
     train = dataset.train
     increments = jax.vmap(jax.vmap(between))(
         train.states[:, :-1, POSE], train.states[:, 1:, POSE]
@@ -152,7 +201,7 @@ def windows(
 def random_windows(
     trajectories: Trajectory, key: Key, *, batch: int, length: int
 ) -> Trajectory:
-    """`batch` windows drawn evenly over trajectories and start times.
+    """Draw `batch` windows uniformly over trajectories and start times.
 
     Raises:
         ValueError: windows longer than the trajectories.
@@ -166,7 +215,7 @@ def random_windows(
 
 
 def spread_windows(trajectories: Trajectory, *, length: int) -> Trajectory:
-    """Every trajectory cut at three places: start, middle and end.
+    """Cut three windows of every trajectory: at its start, middle and end.
 
     Raises:
         ValueError: windows longer than the trajectories.

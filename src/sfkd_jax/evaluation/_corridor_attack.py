@@ -1,4 +1,4 @@
-"""An attack on a corridor: the ν, roads and switches that carry a car farthest from its path and from its copy."""
+"""Search for the worst drives along a corridor by the cross-entropy method."""
 
 from __future__ import annotations
 
@@ -26,17 +26,25 @@ ELITE = 0.1
 
 
 class Drives(NamedTuple):
-    """What an attack drives, without its outcome: w (drive, time, 4), e (drive, time, environment)."""
+    """Inputs of drives.
+
+    Attributes:
+        inputs: w, (drive, time, 4).
+        envs: e, (drive, time, environment).
+    """
 
     inputs: Float[Array, "drive time 4"]
     envs: Float[Array, "drive time environment"]
 
 
 class Tube(NamedTuple):
-    """What is claimed of e_y: |e_y − ê_y| ≤ L α R + ε with R⁺ = α R + |d|_P, and that this radius stays below a bound.
+    """The claimed tube |e_y − ê_y| ≤ L α R + ε with R⁺ = α R + |d|_P.
+
+    The radius, the right-hand side, is claimed to stay below a bound.
 
     Attributes:
-        alpha, lipschitz: α and L.
+        alpha: α.
+        lipschitz: L.
         factor: of P = factor factor'.
         bound: of the radius [m].
     """
@@ -53,8 +61,7 @@ class Outcome(NamedTuple):
     Attributes:
         lateral: |e_y| [m].
         distance: |e_y − ê_y| from a copy with the same inputs [m].
-        radius: what the tube says of that distance, from the disturbances that there
-            were [m].
+        radius: of the tube, from the disturbances of this drive [m].
     """
 
     lateral: Float[Array, " drive"]
@@ -62,11 +69,44 @@ class Outcome(NamedTuple):
     radius: Float[Array, " drive"]
 
 
-class Found(NamedTuple):
+class WorstDrives(NamedTuple):
     """The worst drives of each aim, (aim, drive, …), see `AIMS`."""
 
     drives: Drives
     outcome: Outcome
+
+
+class _Roads(NamedTuple):
+    """Ranges of roads and environments, as in `attack_corridor`."""
+
+    dt: float
+    env_low: Float[Array, " environment"]
+    env_high: Float[Array, " environment"]
+    perturbation: Float[Array, " 2"]
+    speed: tuple[float, float]
+    peak_curvature: float
+    wavelengths: tuple[float, float]
+    lateral_acceleration: float
+
+
+class _Search(NamedTuple):
+    """The settings of one search.
+
+    Attributes:
+        tube: that is attacked.
+        shapes: of the genes by name.
+        population: drives per generation.
+        keep: worst drives kept per generation.
+        drive: genes -> inputs of a drive.
+        outcome: a batch of drives -> their outcomes.
+    """
+
+    tube: Tube
+    shapes: dict[str, tuple[int, ...]]
+    population: int
+    keep: int
+    drive: Callable[[dict[str, Array]], Drives]
+    outcome: Callable[[Drives], Outcome]
 
 
 def attack_corridor(
@@ -87,102 +127,122 @@ def attack_corridor(
     steps: int = 1_000_000,
     length: int = 200,
     keep: int = 20,
-) -> Found:
-    """Search by the cross-entropy method, a third of the steps for each of `AIMS`.
+) -> WorstDrives:
+    """Search for the worst drives, with a third of the steps for each of `AIMS`.
 
     ν is held for `BLOCK` steps within ±`perturbation`, e for the dwell time anywhere in
     E, the road is a sinusoid of any wavelength and phase of the class at a constant
-    speed. What is found is a lower bound of what can happen.
+    speed. The result is a lower bound of the worst case.
 
     Args:
         loop: the true plant along a path.
-        model, params: of the copy, folded.
+        model: of the copy.
+        params: of the copy, folded.
         key: consumed.
-        tube: what is claimed.
-        env_low, env_high: E.
+        tube: that is claimed.
+        env_low: lower corner of E.
+        env_high: upper corner of E.
         perturbation: largest |ν|.
-        speed, peak_curvature, wavelengths, lateral_acceleration: of the roads, see
-            `datasets.drive_along_path`.
+        speed: range, see `datasets.drive_along_path`.
+        peak_curvature: of the roads.
+        wavelengths: of the roads.
+        lateral_acceleration: largest on the roads.
         dwell: least time between switches [s].
         steps: in all.
         length: of a drive.
         keep: worst drives returned per aim.
     """
-    population = max(keep, steps // (len(AIMS) * GENERATIONS * length))
     held = max(1, round(dwell / loop.dt))
-    shapes = {
-        "nu": (-(-length // BLOCK), 2),
-        "env": (-(-length // held), len(env_low)),
-        "road": (4,),
+    roads = _Roads(
+        dt=loop.dt,
+        env_low=jnp.asarray(env_low),
+        env_high=jnp.asarray(env_high),
+        perturbation=perturbation,
+        speed=speed,
+        peak_curvature=peak_curvature,
+        wavelengths=wavelengths,
+        lateral_acceleration=lateral_acceleration,
+    )
+    search = _Search(
+        tube=tube,
+        shapes={
+            "nu": (-(-length // BLOCK), 2),
+            "env": (-(-length // held), len(env_low)),
+            "road": (4,),
+        },
+        population=max(keep, steps // (len(AIMS) * GENERATIONS * length)),
+        keep=keep,
+        drive=partial(_drive, roads, length=length, held=held),
+        outcome=jax.vmap(partial(outcome_of, loop, model, params, tube)),
+    )
+    keys = jax.random.split(key, len(AIMS))
+    worst = [_attack(search, aim, k) for aim, k in zip(AIMS, keys, strict=True)]
+    return WorstDrives(*jax.tree.map(lambda *leaves: jnp.stack(leaves), *worst))
+
+
+def _drive(roads: _Roads, genes: dict[str, Array], *, length: int, held: int) -> Drives:
+    """Inputs of one drive from its genes."""
+    nu = (
+        jnp.repeat(jnp.tanh(2.0 * genes["nu"]), BLOCK, axis=0)[:length]
+        * roads.perturbation
+    )
+    low, high = roads.env_low, roads.env_high
+    envs = low + (high - low) * jnp.repeat(_share(genes["env"]), held, axis=0)[:length]
+    fast, wave, phase, tight = _share(genes["road"])
+    speed = roads.speed[0] + (roads.speed[1] - roads.speed[0]) * fast
+    shortest, longest = roads.wavelengths
+    wavelength = shortest + (longest - shortest) * wave
+    peak = jnp.minimum(roads.peak_curvature, roads.lateral_acceleration / speed**2)
+    along = jnp.arange(length) * speed * roads.dt
+    bend = jnp.clip(
+        (1.0 + tight) * jnp.sin(2 * jnp.pi * (along / wavelength + phase)), -1.0, 1.0
+    )
+    return Drives(jnp.column_stack([nu, peak * bend, jnp.full(length, speed)]), envs)
+
+
+def _attack(search: _Search, aim: str, key: Key) -> tuple[Drives, Outcome]:
+    """The worst drives of one aim over all generations."""
+    mean = {name: jnp.zeros(shape) for name, shape in search.shapes.items()}
+    start = mean, jax.tree.map(jnp.ones_like, mean)
+    keys = jax.random.split(key, GENERATIONS)
+    _, drives = jax.lax.scan(partial(_generation, search, aim), start, keys)
+    drives = jax.tree.map(lambda leaf: leaf.reshape(-1, *leaf.shape[2:]), drives)
+    worst = jnp.argsort(-_score(aim, drives[1], search.tube))[: search.keep]
+    return jax.tree.map(lambda leaf: leaf[worst], drives)
+
+
+def _generation(
+    search: _Search, aim: str, carry: Any, key: Key
+) -> tuple[Any, tuple[Drives, Outcome]]:
+    """Draw a generation and return the next distribution and the worst drives."""
+    mean, spread = carry
+    genes = {
+        name: mean[name]
+        + spread[name] * jax.random.normal(part, (search.population, *shape))
+        for part, (name, shape) in zip(
+            jax.random.split(key, len(search.shapes)),
+            search.shapes.items(),
+            strict=True,
+        )
     }
-    low, high = jnp.asarray(env_low), jnp.asarray(env_high)
-
-    def drive(genes: dict[str, Array]) -> Drives:
-        nu = (
-            jnp.repeat(jnp.tanh(2.0 * genes["nu"]), BLOCK, axis=0)[:length]
-            * perturbation
-        )
-        envs = (
-            low + (high - low) * jnp.repeat(_share(genes["env"]), held, axis=0)[:length]
-        )
-        fast, wave, phase, tight = _share(genes["road"])
-        driven = speed[0] + (speed[1] - speed[0]) * fast
-        wavelength = wavelengths[0] + (wavelengths[1] - wavelengths[0]) * wave
-        peak = jnp.minimum(peak_curvature, lateral_acceleration / driven**2)
-        along = jnp.arange(length) * driven * loop.dt
-        bend = jnp.clip(
-            (1.0 + tight) * jnp.sin(2 * jnp.pi * (along / wavelength + phase)),
-            -1.0,
-            1.0,
-        )
-        return Drives(
-            jnp.column_stack([nu, peak * bend, jnp.full(length, driven)]), envs
-        )
-
-    outcome = jax.vmap(partial(outcome_of, loop, model, params, tube))
-
-    def generation(
-        aim: str, carry: Any, key: Key
-    ) -> tuple[Any, tuple[Drives, Outcome]]:
-        mean, spread = carry
-        drawn = {
-            name: mean[name]
-            + spread[name] * jax.random.normal(part, (population, *shape))
-            for part, (name, shape) in zip(
-                jax.random.split(key, len(shapes)), shapes.items(), strict=True
-            )
-        }
-        drives = jax.vmap(drive)(drawn)
-        reached = outcome(drives)
-        best = jnp.argsort(-_score(aim, reached, tube))[
-            : max(2, int(ELITE * population))
-        ]
-        elite = jax.tree.map(lambda leaf: leaf[best], drawn)
-        mean = jax.tree.map(lambda leaf: jnp.mean(leaf, axis=0), elite)
-        spread = jax.tree.map(lambda leaf: jnp.std(leaf, axis=0) + 0.1, elite)
-        worst = best[:keep]
-        return (mean, spread), jax.tree.map(lambda leaf: leaf[worst], (drives, reached))
-
-    found = []
-    for aim, aim_key in zip(AIMS, jax.random.split(key, len(AIMS)), strict=True):
-        start = {name: jnp.zeros(shape) for name, shape in shapes.items()}
-        begin = start, jax.tree.map(jnp.ones_like, start)
-        _, every = jax.lax.scan(
-            partial(generation, aim), begin, jax.random.split(aim_key, GENERATIONS)
-        )
-        every = jax.tree.map(lambda leaf: leaf.reshape(-1, *leaf.shape[2:]), every)
-        worst = jnp.argsort(-_score(aim, every[1], tube))[:keep]
-        found.append(jax.tree.map(lambda leaf, worst=worst: leaf[worst], every))
-    return Found(*jax.tree.map(lambda *leaves: jnp.stack(leaves), *found))
+    drives = jax.vmap(search.drive)(genes)
+    outcome = search.outcome(drives)
+    order = jnp.argsort(-_score(aim, outcome, search.tube))
+    best = order[: max(2, int(ELITE * search.population))]
+    elite = jax.tree.map(lambda leaf: leaf[best], genes)
+    mean = jax.tree.map(lambda leaf: jnp.mean(leaf, axis=0), elite)
+    spread = jax.tree.map(lambda leaf: jnp.std(leaf, axis=0) + 0.1, elite)
+    worst = best[: search.keep]
+    return (mean, spread), jax.tree.map(lambda leaf: leaf[worst], (drives, outcome))
 
 
-def _score(aim: str, reached: Outcome, tube: Tube) -> Array:
-    """What an aim makes large; drives that break the hypothesis come last where it has to hold."""
+def _score(aim: str, outcome: Outcome, tube: Tube) -> Array:
+    """What an aim maximises; drives outside the hypothesis rank last for "within"."""
     if aim == "within":
         return jnp.where(
-            reached.radius <= tube.bound, reached.distance, -reached.radius
+            outcome.radius <= tube.bound, outcome.distance, -outcome.radius
         )
-    return getattr(reached, aim)
+    return getattr(outcome, aim)
 
 
 def outcome_of(
@@ -191,16 +251,19 @@ def outcome_of(
     params: Params,
     tube: Tube,
     drives: Drives,
-    admit: Callable[..., Any] | None = None,
+    safety_filter: Callable[..., Any] | None = None,
 ) -> Outcome:
-    """One drive of the plant and of the copy beside it, both from the path; of one drive, not of a batch.
+    """Return the outcome of one drive of the plant beside its copy; callers vmap.
+
+    Both start on the path.
 
     Args:
         loop: the plant.
-        model, params: of the copy, folded.
+        model: of the copy.
+        params: of the copy, folded.
         tube: of e_y.
-        drives: what is driven.
-        admit: (fiber, latent, ν, index) -> ν, a filter; nothing for none.
+        drives: inputs of one drive.
+        safety_filter: (fiber, latent, ν, index) -> ν, or None for none.
     """
     start = path_state(
         jnp.zeros(len(loop.state_names) - 3).at[2].set(drives.inputs[0, 3])
@@ -211,32 +274,26 @@ def outcome_of(
         carry: Any, given: tuple[Array, Environment, Array]
     ) -> tuple[Any, Outcome]:
         state, latent, error = carry
-        wanted, env, index = given
+        inputs, env, index = given
         fiber = model.fiber(params, env)
-        if admit is not None:
-            wanted = wanted.at[:2].set(admit(fiber, latent, wanted[:2], index))
-        expected = model.step(fiber, model.encode(fiber, state), wanted)
-        state, latent = loop.step(state, wanted, env), model.step(fiber, latent, wanted)
-        here, there, near = (
-            at[BODY][LATERAL]
-            for at in (
-                state,
-                model.decode(fiber, latent),
-                model.decode(fiber, expected),
-            )
-        )
-        radius = tube.lipschitz * tube.alpha * error + jnp.abs(here - near)
+        if safety_filter is not None:
+            inputs = inputs.at[:2].set(safety_filter(fiber, latent, inputs[:2], index))
+        expected = model.step(fiber, model.encode(fiber, state), inputs)
+        state, latent = loop.step(state, inputs, env), model.step(fiber, latent, inputs)
+        decoded = model.decode(fiber, latent), model.decode(fiber, expected)
+        true, copy, predicted = (x[BODY][LATERAL] for x in (state, *decoded))
+        radius = tube.lipschitz * tube.alpha * error + jnp.abs(true - predicted)
         gap = model.vector(model.encode(fiber, state)) - model.vector(expected)
         error = tube.alpha * error + jnp.linalg.norm(gap @ tube.factor)
         return (state, latent, error), Outcome(
-            jnp.abs(here), jnp.abs(here - there), radius
+            jnp.abs(true), jnp.abs(true - copy), radius
         )
 
     given = (drives.inputs, drives.envs, jnp.arange(len(drives.inputs)))
-    _, reached = jax.lax.scan(step, (start, latent, jnp.zeros(())), given)
-    return jax.tree.map(jnp.max, reached)
+    _, outcomes = jax.lax.scan(step, (start, latent, jnp.zeros(())), given)
+    return jax.tree.map(jnp.max, outcomes)
 
 
 def _share(gene: Array) -> Array:
-    """From the line to [0, 1]; both ends are reached."""
+    """Map a gene to [0, 1]; both ends are reached."""
     return jnp.clip(0.5 + 0.5 * gene, 0.0, 1.0)

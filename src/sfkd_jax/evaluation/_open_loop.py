@@ -1,4 +1,4 @@
-"""Prediction error by horizon on held-out trajectories."""
+"""Open-loop prediction errors by horizon on held-out trajectories."""
 
 from __future__ import annotations
 
@@ -17,15 +17,18 @@ from sfkd_jax.types import BODY, Model, Params, Trajectory
 def open_loop(
     model: Model, params: Params, trajectories: Trajectory, *, horizon: int
 ) -> Float[Array, "horizon 4"]:
-    """RMSE of free-running predictions 1 … horizon steps ahead, from every `horizon`-th step of each trajectory.
+    """Return the RMSE of free-running predictions 1 … horizon steps ahead.
+
+    Predictions start at every `horizon`-th step of each trajectory.
 
     Columns: along and across the true heading [m] (so that each axis means the same on
     every trajectory), yaw [rad], speed [m/s]. In path coordinates: 0, e_y [m], e_ψ
     [rad], speed [m/s].
 
     Args:
-        model, params: what predicts.
-        trajectories: never used for training.
+        model: that predicts.
+        params: of the model.
+        trajectories: held out from training.
         horizon: steps.
 
     Raises:

@@ -1,4 +1,4 @@
-"""Summaries with intervals: bootstrap over trainings and episodes, paired where two systems drove the same ones."""
+"""Summary statistics with bootstrap intervals over trainings and episodes."""
 
 from __future__ import annotations
 
@@ -11,11 +11,11 @@ RESAMPLES = 10_000
 def bootstrap_mean(
     values: Float[np.ndarray, "*seed episode"], *, seed: int = 0
 ) -> tuple[float, list[float]]:
-    """Mean and its 95 % percentile-bootstrap interval.
+    """Return the mean and its 95 % percentile-bootstrap interval.
 
-    With several training seeds, trainings and episodes are both drawn anew: all
-    trainings drive the same episodes, so a fortunate training is fortunate in each, and
-    joining the episodes would count it as often as there are episodes.
+    With several training seeds, both trainings and episodes are resampled: all
+    trainings drive the same episodes, so pooling them would count one good training as
+    often as there are episodes.
 
     Args:
         values: one per episode, or one per training seed and episode.
@@ -35,7 +35,7 @@ def bootstrap_mean(
 
 
 def summary(values: Float[np.ndarray, "*seed episode"]) -> dict[str, object]:
-    """mean, std, ci95, median, p95 of one number per episode, or per training seed and episode."""
+    """Return mean, std, ci95, median and p95 of one number per episode (and seed)."""
     mean, interval = bootstrap_mean(values)
     return {
         "mean": mean,
@@ -50,6 +50,6 @@ def paired_difference(
     values: Float[np.ndarray, "*seed episode"],
     reference: Float[np.ndarray, "*seed episode"],
 ) -> dict[str, object]:
-    """Mean of values − reference over the same seeds and episodes, with its interval."""
+    """Return the mean of values − reference over equal episodes, and its interval."""
     mean, interval = bootstrap_mean(np.asarray(values) - np.asarray(reference))
     return {"mean": mean, "ci95": interval}

@@ -1,4 +1,4 @@
-"""How often predictions leave what is claimed about them, on drives as they were driven."""
+"""Count how often predictions along closed-loop drives violate claimed bounds."""
 
 from __future__ import annotations
 
@@ -24,15 +24,15 @@ STRIDE = 5
 """Steps from the start of one window to that of the next."""
 KINDS = ("position_m", "yaw_rad", "body")
 ROUNDING = (1e-5, 1e-5)
-"""Relative and absolute, of latent errors: latents of size 10 are rounded to 1e-6 in
-float32, and 20 steps add up.
+"""Relative and absolute tolerance of latent errors: float32 rounds latents of size 10
+to 1e-6, and 20 steps add up.
 """
 
 Tube = Mapping[str, Sequence[float]]
 
 
 class Predictions(NamedTuple):
-    """Free-running predictions along segments of driving, from every `STRIDE`-th true state.
+    """Open-loop predictions along segments, from every `STRIDE`-th true state.
 
     Attributes:
         errors: position [m], |yaw| [rad], body state (2-norm).
@@ -46,13 +46,14 @@ class Predictions(NamedTuple):
 
 
 class Claims(NamedTuple):
-    """What is claimed about the predictions of a model; None where nothing is.
+    """Claims about the predictions of a model; None where there is no claim.
 
     Attributes:
-        certified, conformal: tubes, radii by `KINDS`, each (horizon,).
+        certified: tube of a certificate, radii by `KINDS`, each (horizon,).
+        conformal: tube of calibration drives, in the same form.
         level: 1 − δ of both.
         latent: R_1 … R_T of a certificate.
-        d_bar: the one-step bound that it holds under.
+        d_bar: the one-step bound that the certificate assumes.
         threshold: δ*, one position error for all models [m].
     """
 
@@ -67,13 +68,13 @@ class Claims(NamedTuple):
 def predictions(
     model: Model, params: Params, driven: Trajectory, *, length: int, horizon: int
 ) -> Predictions:
-    """Cut drives into segments of `length` steps and predict from their true states, controls and environments.
+    """Predict along drives, cut into segments as long as calibration trajectories.
 
     Args:
-        model, params: any model.
-        driven: a batch; the environments are those that the model is told.
-        length: of a calibration trajectory, so that a segment is to a tube what such a
-            trajectory is.
+        model: any model.
+        params: of the model.
+        driven: a batch; the environments are those that the model observes.
+        length: of a segment, that of a calibration trajectory.
         horizon: steps.
 
     Raises:
@@ -90,7 +91,7 @@ def predictions(
 
 
 def _along_window(model: Model, params: Params, window: Trajectory) -> Predictions:
-    """Predictions of one window; |e_k| = |z_k − ẑ_k| with z_k the latent of the true state."""
+    """Predictions of one window; |e_k| = |z_k − ẑ_k| against the true latent z_k."""
     predicted, latents, along = rollout(model, params, window)
     gaps, _ = defects(model, params, window, along)
     seen = jax.vmap(model.observe)(along[1], latents, window.states[1:])
@@ -105,7 +106,10 @@ def _along_window(model: Model, params: Params, window: Trajectory) -> Predictio
 def tube_violations(
     errors: Float[np.ndarray, "segment window horizon 3"], tube: Tube
 ) -> tuple[int, int]:
-    """V1: in how many segments any window, step or kind leaves the tube, and of how many; NaN has left it."""
+    """Return V1: the number of segments that leave the tube anywhere, and their total.
+
+    NaN counts as outside.
+    """
     radii = np.stack([np.asarray(tube[kind]) for kind in KINDS], axis=1)
     inside = np.all(np.asarray(errors) <= radii, axis=(1, 2, 3))
     return int(np.sum(~inside)), len(inside)
@@ -117,7 +121,10 @@ def theorem_violations(
     latent: Float[np.ndarray, " horizon"],
     d_bar: float,
 ) -> tuple[int, int]:
-    """V0: at how many steps |e_k| > R_k though |d_1| … |d_k| ≤ d̄, and of how many; the theorem says at none."""
+    """Return V0: steps with |e_k| > R_k though |d_1| … |d_k| ≤ d̄, and the total.
+
+    The theorem excludes such steps.
+    """
     applies = np.logical_and.accumulate(np.asarray(defects) <= d_bar, axis=2)
     relative, absolute = ROUNDING
     beyond = ~(
@@ -132,11 +139,11 @@ def theorem_reach(
     latent: Float[np.ndarray, " horizon"],
     d_bar: float,
 ) -> list[float | None]:
-    """The largest |e_k| / R_k for every k, where |d_1| … |d_k| ≤ d̄; None where that never holds.
+    """Return the largest |e_k| / R_k of every k where |d_1| … |d_k| ≤ d̄, else None.
 
-    At most 1 by the theorem. V0 counts what is above and is 0 for any bound that is
-    loose enough; this says how near to the bound the errors came, so it moves when α,
-    d̄ or the model is not what is claimed.
+    At most 1 by the theorem. V0 is 0 for any bound that is loose enough; this ratio
+    shows how tight the bound is, so it changes when α, d̄ or the model is not as
+    claimed.
     """
     applies = np.logical_and.accumulate(np.asarray(defects) <= d_bar, axis=2)
     shares = np.where(
@@ -148,20 +155,20 @@ def theorem_reach(
 def threshold_violations(
     errors: Float[np.ndarray, "segment window horizon 3"], threshold: float
 ) -> tuple[int, int]:
-    """V2: in how many windows the position error exceeds δ* at some step, and of how many."""
+    """Return V2: the number of windows with an error above δ*, and their total."""
     inside = np.all(np.asarray(errors)[..., 0] <= threshold, axis=2)
     return int(np.sum(~inside)), inside.size
 
 
-def violations(found: Predictions | None, claims: Claims) -> dict[str, Any]:
-    """The record of results.json: shares V0, V1, V2 and mean position radii of the tubes; null for no claim.
+def violations(predicted: Predictions | None, claims: Claims) -> dict[str, Any]:
+    """Return the violation rates V0, V1, V2 and tube radii as results.json has them.
 
-    V1 speaks of the certified tube if there is one, else of the conformal one
-    (`v1_tube` says which).
+    A rate without a claim is null. V1 is of the certified tube if there is one, else of
+    the conformal tube (`v1_tube` names it).
     """
     tubes = {"certified": claims.certified, "conformal": claims.conformal}
     shares = {
-        name: _share(tube_violations, found and found.errors, tube)
+        name: _share(tube_violations, predicted and predicted.errors, tube)
         for name, tube in tubes.items()
     }
     radii = {
@@ -170,8 +177,8 @@ def violations(found: Predictions | None, claims: Claims) -> dict[str, Any]:
     }
     kind = next((name for name, tube in tubes.items() if tube), None)
     claimed = (
-        found and found.latent_errors,
-        found and found.defects,
+        predicted and predicted.latent_errors,
+        predicted and predicted.defects,
         claims.latent,
         claims.d_bar,
     )
@@ -184,15 +191,18 @@ def violations(found: Predictions | None, claims: Claims) -> dict[str, Any]:
         "v1_conformal": shares["conformal"],
         "v1_conformal_radius_m": radii["conformal"],
         "v1_level": claims.level,
-        "v2": _share(threshold_violations, found and found.errors, claims.threshold),
+        "v2": _share(
+            threshold_violations, predicted and predicted.errors, claims.threshold
+        ),
         "v2_threshold_m": claims.threshold,
-        "window_error_m": found and _quantiles(np.max(found.errors[..., 0], axis=2)),
-        "segments": found and len(found.errors),
+        "window_error_m": predicted
+        and _quantiles(np.max(predicted.errors[..., 0], axis=2)),
+        "segments": predicted and len(predicted.errors),
     }
 
 
 def _share(count: Any, *inputs: Any) -> float | None:
-    """A count over its total, or None if any input is missing or nothing was counted."""
+    """A count over its total; None if an input is missing or the total is 0."""
     counted = _unless_missing(count, *inputs)
     return counted[0] / counted[1] if counted and counted[1] else None
 

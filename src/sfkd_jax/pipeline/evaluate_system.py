@@ -1,4 +1,4 @@
-"""A test drive: one system on paired episodes, its scores, and how often it left what is claimed about it."""
+"""Evaluate a system: simulate paired episodes, score them and count violations."""
 
 from __future__ import annotations
 
@@ -8,248 +8,220 @@ from functools import partial
 from typing import Any, NamedTuple, TypeAlias
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 
 from sfkd_jax import build, evaluation
-from sfkd_jax.certification import conformal_tube, latent_tube
-from sfkd_jax.datasets import Dataset, to_path
-from sfkd_jax.pipeline import store
+from sfkd_jax.datasets import Dataset
+from sfkd_jax.pipeline import scoring
 from sfkd_jax.scenarios import Scenario
-from sfkd_jax.types import Trajectory
+from sfkd_jax.types import Controller, Key, Params
 from sfkd_jax.vehicle import Vehicle, check_step
 
-OPEN_LOOP_STEPS = (1, 5, 10, 20)
+WARM_UP = 10
+"""Control steps before timing starts."""
 
 
-class Track(NamedTuple):
-    """Paired episodes before anybody drives them.
+class EpisodeSet(NamedTuple):
+    """Paired episodes that every system is evaluated on.
 
     Attributes:
-        scenario: its name.
-        variation: what is unusual about it, or None.
-        roads: with the environment that is met.
-        told: the environment that a driver is told.
+        name: of the scenario.
+        variation: of the protocol, or None.
+        scenarios: one per episode, leading axis first.
         keys: one per episode, for sensors and samplers.
     """
 
-    scenario: str
+    name: str
     variation: str | None
-    roads: Scenario
-    told: jax.Array
-    keys: jax.Array
+    scenarios: Scenario
+    keys: Key
 
 
-class Drive(NamedTuple):
+class SystemResult(NamedTuple):
     """A row of results.json before comparisons, and the arrays behind it."""
 
     row: dict[str, Any]
     arrays: dict[str, np.ndarray]
 
 
-TestDriver: TypeAlias = Callable[[Track], Drive]
+Evaluator: TypeAlias = Callable[[EpisodeSet], SystemResult]
 
 
-def lay(settings: dict[str, Any], plant: Vehicle) -> Track:
-    """The episodes of a scenario; on several devices they are spread over all of them.
+class _Compiled(NamedTuple):
+    """What the evaluation of one system needs.
+
+    Attributes:
+        plant: the truth.
+        controller: of the system.
+        params: of its model, folded.
+        options: of `evaluation.simulate`.
+        protocol: the settings under `evaluation`.
+        columns: of the row that do not depend on episodes.
+        simulate: (scenarios, keys) -> episodes.
+        score: (episodes, scenarios) -> scores and violations.
+        watched: whether a monitor runs beside the controller.
+        act_ms: empty, or the time of a control step once it was measured.
+    """
+
+    plant: Vehicle
+    controller: Controller
+    params: Params
+    options: dict[str, Any]
+    protocol: dict[str, Any]
+    columns: dict[str, Any]
+    simulate: Callable[[Scenario, Key], evaluation.Episode]
+    score: scoring.Scorer
+    watched: bool
+    act_ms: list[tuple[float, float] | None]
+
+
+def make_episodes(settings: dict[str, Any], plant: Vehicle) -> EpisodeSet:
+    """Draw the episodes of a scenario; several devices share them evenly.
 
     Raises:
-        ValueError: a vehicle that nothing can drive.
+        ValueError: a vehicle that cannot be simulated.
     """
     check_step(plant)
     protocol = settings["evaluation"]
     family = build.build_scenario(
         settings["scenario"], plant, duration=protocol["episode_s"]
     )
-    road_key, drive_key = jax.random.split(jax.random.key(protocol["seed"]))
-    roads = jax.jit(jax.vmap(family))(jax.random.split(road_key, protocol["episodes"]))
+    scenario_key, drive_key = jax.random.split(jax.random.key(protocol["seed"]))
+    keys = jax.random.split(scenario_key, protocol["episodes"])
+    scenarios = jax.jit(jax.vmap(family))(keys)
     keys = jax.random.split(drive_key, protocol["episodes"])
-    hear = partial(evaluation.told, dt=plant.dt, **build.without(protocol["told"]))
-    told = jax.jit(jax.vmap(hear))(roads.envs, keys)
-    return Track(
-        settings["scenario"]["name"],
-        protocol["variation"],
-        *_spread((roads, told, keys)),
-    )
+    sensor = build.as_kwargs(protocol["env_sensor"])
+    observe = partial(evaluation.observed_environment, dt=plant.dt, **sensor)
+    observed = jax.jit(jax.vmap(observe))(scenarios.envs, keys)
+    scenarios = scenarios._replace(observed_envs=observed)
+    name, variation = settings["scenario"]["name"], protocol["variation"]
+    return EpisodeSet(name, variation, *_shard((scenarios, keys)))
 
 
-def prepare(
+def compile_system(
     settings: dict[str, Any],
     plant: Vehicle,
     name: str,
     system: build.System,
     dataset: Dataset | None,
-) -> TestDriver:
-    """Compile a system for driving; the same driver serves every track of one length, with one compilation.
+) -> Evaluator:
+    """Compile a system once for all sets of episodes of one length.
 
     Args:
         settings: of the run.
         plant: the truth.
         name: of the system.
-        system: who drives.
-        dataset: whose calibration drives give the conformal tube, and whose test drives
-            the open-loop error; without it there is neither.
+        system: to evaluate.
+        dataset: its calibration part gives the conformal tube and its test part the
+            open-loop error; without it there is neither.
     """
-    protocol, box = settings["evaluation"], settings["dataset"]
-    limits = {
-        "env_low": box["env_low"],
-        "env_high": box["env_high"],
-        "certificate": system.certificate,
-    }
-    limits |= {"env_source": system.env_source, "law": system.law}
-    if dataset is not None:
-        limits |= {
-            "env_low": dataset.env_low.tolist(),
-            "env_high": dataset.env_high.tolist(),
-        }
-    controller = build.build_controller(
-        settings["controller"], system.model, plant, **limits
-    )
+    protocol = settings["evaluation"]
+    controller = _build_controller(settings, plant, system, dataset)
     options = {
         "horizon": build.controller_horizon(settings["controller"]),
         "dt": plant.dt,
+        "observation_noise": tuple(protocol["observation_noise"]),
     }
-    options["observation_noise"] = tuple(protocol["observation_noise"])
-    about = _about(settings, name, system)
-    system = system._replace(
-        params=jax.jit(system.model.fold)(system.params)
-    )  # or every step evaluates it anew
+    columns = _columns(settings, name, system)
+    # Folded once here; otherwise every control step would fold again.
+    system = system._replace(params=jax.jit(system.model.fold)(system.params))
 
-    def one(road: Scenario, key: Any, met: Any) -> evaluation.Episode:
+    def simulate(scenario: Scenario, key: Key) -> evaluation.Episode:
         return evaluation.simulate(
-            plant.step, controller, system.params, road, key, met=met, **options
+            plant.step, controller, system.params, scenario, key, **options
         )
 
-    compiled = jax.jit(jax.vmap(one))
-    assess = _assessor(settings, system, dataset, plant.dt)
-    about |= {"open_loop_rmse_m": _open_loop(settings, system, dataset)}
-    timing: list[Any] = []
-
-    def drive(track: Track) -> Drive:
-        episodes, scores, violation = pushed(track, 0.0)
-        if not timing:
-            timing.append(
-                _act_ms(
-                    controller, system.params, track, options, protocol["timed_steps"]
-                )
-            )
-        where = about | {"scenario": track.scenario, "variation": track.variation}
-        row = evaluation.row(
-            scores, where, timing[0], violation, watched=system.certificate is not None
-        )
-        if protocol["side_forces"]:
-            row["disturbed"] = [
-                evaluation.disturbed(
-                    force, *(pushed(track, force)[1:] if force else (scores, violation))
-                )
-                for force in protocol["side_forces"]
-            ]
-        arrays = {
-            part: np.asarray(getattr(episodes, part))
-            for part in ("lateral", "states", "controls")
-        }
-        return Drive(row, arrays)
-
-    def pushed(
-        track: Track, force: float
-    ) -> tuple[evaluation.Episode, evaluation.Scores, dict[str, Any]]:
-        push = jax.jit(jax.vmap(partial(evaluation.pushed, plant, largest=force)))
-        met = push(track.roads.envs, track.keys) if force else track.roads.envs
-        episodes = compiled(track.roads._replace(envs=track.told), track.keys, met)
-        return episodes, *assess(episodes, track)
-
-    return drive
-
-
-def _assessor(
-    settings: dict[str, Any], system: build.System, dataset: Dataset | None, dt: float
-) -> Callable[..., Any]:
-    """episodes, track -> how they were driven, and how often predictions along them left what is claimed."""
-    length, horizon = settings["dataset"]["steps"], settings["certification"]["horizon"]
-    predict = jax.jit(
-        partial(evaluation.predictions, system.model, length=length, horizon=horizon)
+    columns |= {"open_loop_rmse_m": scoring.open_loop(settings, system, dataset)}
+    compiled = _Compiled(
+        plant=plant,
+        controller=controller,
+        params=system.params,
+        options=options,
+        protocol=protocol,
+        columns=columns,
+        simulate=jax.jit(jax.vmap(simulate)),
+        score=scoring.scorer(settings, system, dataset, plant.dt),
+        watched=system.certificate is not None,
+        act_ms=[],
     )
-    claims = _claims(settings, system, dataset)
-
-    def seen(driven: Trajectory, road: Scenario) -> Trajectory:
-        """A drive as the model sees it."""
-        law = system.law
-        if law is None:
-            return driven
-        return to_path(
-            driven, road.path, law, jnp.full(driven.controls.shape[0], road.speed)
-        )
-
-    def assess(
-        episodes: evaluation.Episode, track: Track
-    ) -> tuple[evaluation.Scores, dict[str, Any]]:
-        driven = Trajectory(episodes.states, episodes.controls, episodes.believed)
-        driven = jax.jit(jax.vmap(seen))(driven, track.roads)
-        long_enough = driven.controls.shape[1] >= length
-        found = jax.device_get(predict(system.params, driven)) if long_enough else None
-        scores = evaluation.score(episodes, np.asarray(track.roads.envs), dt=dt)
-        return scores, evaluation.violations(found, claims)
-
-    return assess
+    return partial(_evaluate, compiled)
 
 
-def _claims(
-    settings: dict[str, Any], system: build.System, dataset: Dataset | None
-) -> evaluation.Claims:
-    """What is claimed about a system's predictions: by its certificate if it has one, and by calibration drives."""
-    level, horizon = (settings["certification"][name] for name in ("level", "horizon"))
-    claims = evaluation.Claims(
-        level=level, threshold=settings["evaluation"]["threshold_m"]
-    )
-    if dataset is not None:
-        try:
-            parts = {
-                "validation": dataset.validation,
-                "calibration": dataset.calibration,
-            }
-            options = {"level": level, "horizon": horizon, "stride": evaluation.STRIDE}
-            claims = claims._replace(
-                conformal=conformal_tube(
-                    system.model, system.params, **parts, **options
-                )
-            )
-        except ValueError as reason:
-            store.say(f"  no conformal tube: {reason}")
-    proof = system.certificate
-    if proof is None:
-        return claims
-    if (len(proof["tube"]["latent"]), proof["d_bar"]["level"]) != (horizon, level):
-        store.say(
-            "  the certificate is of another horizon or level and is not compared"
-        )
-        return claims
-    d_bar = proof["d_bar"]["value"]
-    latent = latent_tube(proof["alpha"], d_bar, horizon)
-    return claims._replace(
-        certified=proof["tube"]["physical"], latent=latent, d_bar=d_bar
-    )
-
-
-def _open_loop(
-    settings: dict[str, Any], system: build.System, dataset: Dataset | None
-) -> dict[str, float] | None:
-    """Position RMSE of free-running predictions on the test split, by steps ahead [m]."""
-    if dataset is None:
-        return None
-    horizon = settings["certification"]["horizon"]
-    errors = jax.jit(partial(evaluation.open_loop, system.model, horizon=horizon))(
-        system.params, dataset.test
-    )
-    distance = np.hypot(*np.asarray(errors, dtype=np.float64).T[:2])
-    return {
-        str(step): float(distance[step - 1])
-        for step in OPEN_LOOP_STEPS
-        if step <= horizon
+def _build_controller(
+    settings: dict[str, Any],
+    plant: Vehicle,
+    system: build.System,
+    dataset: Dataset | None,
+) -> Controller:
+    """The controller of a system, for the environments of its data set."""
+    box: dict[str, Any] = {
+        name: settings["dataset"][name] for name in ("env_low", "env_high")
     }
+    if dataset is not None:
+        box = {
+            "env_low": dataset.env_low.tolist(),
+            "env_high": dataset.env_high.tolist(),
+        }
+    return build.build_controller(
+        settings["controller"],
+        system.model,
+        plant,
+        **box,
+        certificate=system.certificate,
+        env_source=system.env_source,
+        law=system.law,
+    )
 
 
-def _about(settings: dict[str, Any], name: str, system: build.System) -> dict[str, Any]:
-    """The columns of a row that are known before anything is driven."""
+def _evaluate(compiled: _Compiled, episodes: EpisodeSet) -> SystemResult:
+    """Simulate and score one set of episodes, without and with side forces."""
+    driven, scores, violation = _simulate(compiled, episodes, 0.0)
+    if not compiled.act_ms:
+        compiled.act_ms.append(_act_ms(compiled, episodes))
+    row = evaluation.row(
+        scores,
+        compiled.columns | {"scenario": episodes.name, "variation": episodes.variation},
+        compiled.act_ms[0],
+        violation,
+        watched=compiled.watched,
+    )
+    if compiled.protocol["side_forces"]:
+        row["disturbed"] = [
+            evaluation.disturbed(
+                force,
+                *(
+                    _simulate(compiled, episodes, force)[1:]
+                    if force
+                    else (scores, violation)
+                ),
+            )
+            for force in compiled.protocol["side_forces"]
+        ]
+    parts = ("lateral", "states", "controls")
+    return SystemResult(
+        row, {part: np.asarray(getattr(driven, part)) for part in parts}
+    )
+
+
+def _simulate(
+    compiled: _Compiled, episodes: EpisodeSet, force: float
+) -> tuple[evaluation.Episode, evaluation.Scores, dict[str, Any]]:
+    """Episodes under unmeasured side forces up to `force` [N], and their scores."""
+    scenarios = episodes.scenarios
+    if force:
+        disturb = partial(
+            evaluation.disturbed_environment, compiled.plant, largest=force
+        )
+        envs = jax.jit(jax.vmap(disturb))(scenarios.envs, episodes.keys)
+        scenarios = scenarios._replace(envs=envs)
+    driven = compiled.simulate(scenarios, episodes.keys)
+    return driven, *compiled.score(driven, episodes.scenarios)
+
+
+def _columns(
+    settings: dict[str, Any], name: str, system: build.System
+) -> dict[str, Any]:
+    """The columns of a row that do not depend on episodes."""
     protocol, certificate = settings["evaluation"], system.certificate
     return {
         "system": name,
@@ -268,29 +240,29 @@ def _about(settings: dict[str, Any], name: str, system: build.System) -> dict[st
     }
 
 
-def _act_ms(
-    controller: Any, params: Any, track: Track, options: dict[str, Any], steps: int
-) -> tuple[float, float] | None:
-    """Median and 99 % quantile of `steps` compiled control steps after ten to warm up [ms]; None for no steps."""
+def _act_ms(compiled: _Compiled, episodes: EpisodeSet) -> tuple[float, float] | None:
+    """Median and 99 % quantile of a compiled control step [ms]; None if not timed."""
+    steps = compiled.protocol["timed_steps"]
     if not steps:
         return None
-    road = jax.tree.map(lambda leaf: leaf[0], track.roads)
+    scenario = jax.tree.map(lambda leaf: leaf[0], episodes.scenarios)
+    options = compiled.options
     reference = evaluation.first_reference(
-        road, horizon=options["horizon"], dt=options["dt"]
+        scenario, horizon=options["horizon"], dt=options["dt"]
     )
-    act, state = jax.jit(controller.act), controller.init(track.keys[0])
-    times = []
-    for _ in range(10 + steps):
+    observed = (scenario.initial_state, scenario.envs[0], reference)
+    act = jax.jit(compiled.controller.act)
+    state, times = compiled.controller.init(episodes.keys[0]), []
+    for _ in range(WARM_UP + steps):
         start = time.perf_counter()
-        _, state, _ = jax.block_until_ready(
-            act(params, state, road.initial_state, road.envs[0], reference)
-        )
+        _, state, _ = jax.block_until_ready(act(compiled.params, state, *observed))
         times.append(1e3 * (time.perf_counter() - start))
-    return float(np.median(times[10:])), float(np.quantile(times[10:], 0.99))
+    times = times[WARM_UP:]
+    return float(np.median(times)), float(np.quantile(times, 0.99))
 
 
-def _spread(batch: Any) -> Any:
-    """Episodes dealt evenly to all devices, where they can be."""
+def _shard(batch: Any) -> Any:
+    """Distribute episodes evenly over all devices, if their number allows it."""
     devices = jax.devices()
     if len(devices) == 1 or len(jax.tree.leaves(batch)[0]) % len(devices):
         return batch

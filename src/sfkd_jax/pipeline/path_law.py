@@ -7,6 +7,8 @@ from functools import partial
 from typing import Any
 
 import jax
+import numpy as np
+from jaxtyping import Int
 
 from sfkd_jax import artefacts, build
 from sfkd_jax.control import PathLaw, law_to_arrays, law_from_arrays
@@ -15,6 +17,8 @@ from sfkd_jax.datasets import (
     generate_along_path,
     generate_s3_along_path,
     generate_switching,
+    segment_scenarios,
+    segment_scenarios_along_path,
 )
 from sfkd_jax.pipeline import store
 from sfkd_jax.types import Key, Trajectory
@@ -43,6 +47,16 @@ def loop(settings: dict[str, Any]) -> Vehicle:
     if law is None:
         raise ValueError("a loop along a path needs dataset=path")
     return build.build_loop(build.build_vehicle(settings["vehicle"]), law)
+
+
+def scenarios(settings: dict[str, Any]) -> Int[np.ndarray, " segment"]:
+    """The scenario of every segment that `drives` generates for training."""
+    of_segments = (
+        segment_scenarios_along_path
+        if store.is_along_path(settings)
+        else segment_scenarios
+    )
+    return of_segments(settings["dataset"]["segments"])
 
 
 def drives(

@@ -88,6 +88,9 @@ def write_dataset(settings: dict[str, Any], dataset: Dataset) -> dict[str, Any]:
     }
     if dataset.drives is not None:
         arrays["drives"] = np.asarray([dataset.drives[part] for part in PARTS])
+    if dataset.scenarios is not None:
+        labels = dataset.scenarios
+        arrays |= {f"{part}/scenario": np.asarray(labels[part]) for part in PARTS}
     path = dataset_path(settings)
     path.parent.mkdir(parents=True, exist_ok=True)
     return artefacts.write_arrays(
@@ -107,6 +110,14 @@ def read_dataset(settings: dict[str, Any]) -> tuple[Dataset, str]:
             )
             for part in PARTS
         ]
+    scenarios = None
+    if not is_logged(settings):
+        if f"{PARTS[0]}/scenario" not in arrays:
+            raise artefacts.ArtefactError(
+                f"{dataset_path(settings)}: made by an earlier version, without the "
+                "scenario of each segment; delete it and generate it again"
+            )
+        scenarios = {part: jnp.asarray(arrays[f"{part}/scenario"]) for part in PARTS}
     asked = settings["dataset"]
     envs = np.concatenate([np.asarray(part.envs) for part in parts])
     low, high = environment_box(envs, asked["env_low"], asked["env_high"])
@@ -116,9 +127,10 @@ def read_dataset(settings: dict[str, Any]) -> tuple[Dataset, str]:
         if counts is None
         else {part: int(count) for part, count in zip(PARTS, counts, strict=True)}
     )
-    return Dataset(*parts, env_low=low, env_high=high, drives=drives), manifest[
-        "sha256"
-    ]
+    dataset = Dataset(
+        *parts, env_low=low, env_high=high, drives=drives, scenarios=scenarios
+    )
+    return dataset, manifest["sha256"]
 
 
 def write_law(settings: dict[str, Any], arrays: dict[str, Any]) -> None:

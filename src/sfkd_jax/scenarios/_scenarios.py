@@ -21,17 +21,19 @@ from sfkd_jax.types import Key, Scalar, State
 
 
 class Scenario(NamedTuple):
-    """One episode before anyone drives it; a batch of them is one pytree.
+    """The task of one episode: start, environment, path and speed.
 
     Attributes:
         initial_state: x_0.
-        envs: e_0 … e_{T-1}, (time, 2).
+        envs: e_0 … e_{T-1} that the plant is in, (time, 2).
+        observed_envs: the same as the controller observes it, (time, 2).
         path: to follow.
-        speed: at which [m/s].
+        speed: to hold [m/s].
     """
 
     initial_state: State
     envs: Schedule
+    observed_envs: Schedule
     path: Path
     speed: Scalar
 
@@ -115,6 +117,7 @@ def family(
             wavelengths=wavelengths,
         )
         start = jnp.zeros(state_size).at[3].set(speed)
-        return Scenario(start, conditions(condition_key), path, jnp.asarray(speed))
+        envs = conditions(condition_key)
+        return Scenario(start, envs, envs, path, jnp.asarray(speed))
 
     return sample

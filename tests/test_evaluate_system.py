@@ -1,4 +1,4 @@
-"""A test drive on several devices drives the same episodes as on one."""
+"""Several devices simulate the same episodes as one."""
 
 import functools
 import os
@@ -10,19 +10,26 @@ import pytest
 
 PROGRAM = """
     import jax, jax.numpy as jnp, numpy as np
-    from sfkd_jax import assembly, control, drive, evaluation, models, vehicle
+    from sfkd_jax import control, evaluation, models, vehicle
+    from sfkd_jax.pipeline import evaluate_system
     plant = vehicle.kinematic()
-    told = {"delay_s": 0.0, "noise": [0.0, 0.0], "bias": [0.0, 0.0]}
-    protocol = {"episodes": 4, "episode_s": 3.0, "seed": 1, "told": told, "variation": None}
-    track = drive.lay({"evaluation": protocol, "scenario": {"name": "s3"}}, plant)
+    sensor = {"delay_s": 0.0, "noise": [0.0, 0.0], "bias": [0.0, 0.0]}
+    protocol = {"episodes": 4, "episode_s": 3.0, "seed": 1, "variation": None}
+    settings = {
+        "evaluation": protocol | {"env_sensor": sensor},
+        "scenario": {"name": "s3"},
+    }
+    episodes = evaluate_system.make_episodes(settings, plant)
     law = control.path_feedback(wheelbase=plant.wheelbase)
     limits = {"control_low": plant.control_low, "control_high": plant.control_high}
     cost = control.tracking_cost(dt=plant.dt)
     task = control.path_tracking(models.physics(plant.nominal), cost, law, dt=plant.dt, **limits)
     planner = control.mppi(task, num_samples=16, horizon=5)
-    def one(road, key):
-        return evaluation.simulate(plant.step, planner, {}, road, key, dt=plant.dt, horizon=5).lateral
-    lateral = jax.jit(jax.vmap(one))(track.roads, track.keys)
+    def one(scenario, key):
+        return evaluation.simulate(
+            plant.step, planner, {}, scenario, key, dt=plant.dt, horizon=5
+        ).lateral
+    lateral = jax.jit(jax.vmap(one))(episodes.scenarios, episodes.keys)
     print(len(lateral.sharding.device_set), *np.asarray(lateral).ravel().tolist())
 """
 
@@ -42,9 +49,7 @@ def driven(devices):
 
 
 @pytest.mark.parametrize(("devices", "used"), [(2, 2), (3, 1)])
-def test_episodes_are_dealt_to_all_devices_where_they_can_be_and_come_out_the_same(
-    devices, used
-):
+def test_devices_share_the_episodes_evenly_and_return_the_same_drives(devices, used):
     alone, alike = driven(1), driven(devices)
     assert alone[0] == 1
     assert alike[0] == used
