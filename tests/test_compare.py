@@ -4,7 +4,8 @@ import json
 
 from helpers import door, last_line
 
-from sfkd_jax import compare, vehicle
+from sfkd_jax import vehicle
+from sfkd_jax.pipeline import comparison
 
 SMALL = ("training.steps=75", "training.save_every=75", "dataset.segments=200")
 COMPARED = (
@@ -63,7 +64,7 @@ def test_roads_are_laid_once_for_all_rows_and_anew_for_another_protocol():
         "scenario": {"name": "s1"},
         "evaluation": protocol,
     }
-    lay, plant = compare._surveyor(), vehicle.kinematic()
+    lay, plant = comparison.cached_episodes(), vehicle.kinematic()
     first, second = (
         lay(asked | {"model": {"name": model}}, plant) for model in ("sfkd", "icode")
     )

@@ -19,9 +19,9 @@ import pytest
 from helpers import ENV_HIGH, ENV_LOW, SHARES, dataset, refusal_of
 from jaxtyping import TypeCheckError
 
-from sfkd_jax import artefacts, datasets, demo, evaluate, policy, report, training
+from sfkd_jax import artefacts, datasets, demo, policy, report, training
 from sfkd_jax.cli import config
-from sfkd_jax.pipeline import store
+from sfkd_jax.pipeline import evaluate_run, store
 
 SHIPPED = demo.SHIPPED / "kinematic"
 WORSE = (None, "word", [], {}, -1, float("nan"), [[1, 2], 3], True, 10**400)
@@ -101,7 +101,7 @@ def read_policy(run):
 def read(run, name):
     """Read a file as the doors do."""
     if name == "results.json":
-        evaluate._kept(run)
+        evaluate_run.read_results(run)
     elif name == "settings.json":
         store.claim(settings_of(run))
     else:

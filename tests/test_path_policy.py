@@ -55,7 +55,7 @@ def test_the_law_is_stored_hashed_and_loaded_with_the_weights(tmp_path):
     faster = any_law()._replace(gain=1.1 * any_law().gain)
     assert saved(tmp_path / "other", law=faster)["sha256"] != first["sha256"]
     loaded = policy.load(tmp_path)
-    assert "law" not in loaded.params
+    assert "law" not in loaded.weights
     assert loaded.model.along_path
     for name, leaf in any_law()._asdict().items():
         np.testing.assert_array_equal(getattr(loaded.law, name), leaf)
@@ -87,14 +87,14 @@ def test_a_policy_that_lost_its_law_is_refused(tmp_path):
 def test_path_coordinates_for_data_and_model_or_for_neither(overrides):
     asked = settings(*overrides)
     with pytest.raises(ValueError, match="go together"):
-        dry_run.check(asked, build.build_vehicle(asked["vehicle"]))
+        dry_run.check_settings(asked, build.build_vehicle(asked["vehicle"]))
 
 
 def test_the_law_drives_as_a_row_along_a_path_alone():
     asked = settings("evaluation.systems=[law]")
-    dry_run.check(asked, build.build_vehicle(asked["vehicle"]))
+    dry_run.check_settings(asked, build.build_vehicle(asked["vehicle"]))
     with pytest.raises(ValueError, match=r"evaluation\.systems entry 'law'"):
-        dry_run.check(
+        dry_run.check_settings(
             settings("dataset=standard", "model=sfkd", "evaluation.systems=[law]"),
             vehicle.kinematic(),
         )
@@ -108,4 +108,4 @@ def test_every_path_model_is_rehearsed_with_its_planner(model):
         f"model={model}",
         *(() if "sfkd" in model and "no" not in model else ("training.loss.tube=[]",)),
     )
-    dry_run.check(asked, build.build_vehicle(asked["vehicle"]))
+    dry_run.check_settings(asked, build.build_vehicle(asked["vehicle"]))

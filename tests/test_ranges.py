@@ -103,7 +103,7 @@ def use(settings):
     build.build_scenario(
         settings["scenario"], plant, duration=settings["evaluation"]["episode_s"]
     )
-    dry_run.check(settings, plant)
+    dry_run.check_settings(settings, plant)
 
 
 def refusal(option, name, value):

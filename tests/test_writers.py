@@ -15,8 +15,9 @@ import numpy as np
 import pytest
 from helpers import refusal_of
 
-from sfkd_jax import artefacts, evaluate
+from sfkd_jax import artefacts
 from sfkd_jax.artefacts import DirectoryLocked, locked
+from sfkd_jax.pipeline import evaluate_run
 from sfkd_jax.reporting._scene import scenes_of
 from sfkd_jax.reporting._tables import block_title, blocks_of
 
@@ -62,7 +63,7 @@ def driven(row, value=0.0, episodes=2, steps=40):
 
 
 def store(place, row, value=0.0):
-    evaluate._write(
+    evaluate_run.write_results(
         place, SETTINGS, [row], driven(row, value) | {"dt": np.asarray(0.1)}, 0.0
     )
 

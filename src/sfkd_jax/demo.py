@@ -49,7 +49,7 @@ def run(settings: dict[str, Any]) -> dict[str, Any]:
                 f"driving {settings['demo']['episodes']} x {settings['demo']['episode_s']:.0f} s: {name}"
             )
             driven = evaluate_system.compile_system(settings, plant, name, system, None)(track)
-            rows.append(grid.write(folder / name, settings, track, driven))
+            rows.append(grid.write_cell(folder / name, settings, track, driven))
         rows = evaluation.compare(rows)
         document = {"rows": rows, "config": settings, "versions": artefacts.versions()}
         artefacts.write_json(folder / "results.json", document)

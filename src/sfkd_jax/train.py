@@ -1,4 +1,4 @@
-"""python -m sfkd_jax.train: the main job, from nothing to a certified controller, its score and a report."""
+"""python -m sfkd_jax.train: from nothing to a certified controller and its report."""
 
 from __future__ import annotations
 
@@ -6,63 +6,74 @@ import time
 from pathlib import Path
 from typing import Any
 
-from sfkd_jax import artefacts, build, certify, evaluate, report
-from sfkd_jax.cli.config import door
-from sfkd_jax.pipeline import dry_run, stages, store
+from hydra.core.hydra_config import HydraConfig
+
+from sfkd_jax import artefacts, build
+from sfkd_jax.cli.config import command, door
+from sfkd_jax.pipeline import certificates, dry_run, stages, store
+from sfkd_jax.pipeline.evaluate_run import evaluate_run
+from sfkd_jax.reporting import write_report
 from sfkd_jax.vehicle import check_step
 
 
 def run(settings: dict[str, Any]) -> dict[str, Any]:
-    """Walk: data, weights, certificate, closed loop if there is a step to drive with, report."""
+    """Make data, policy, certificate, closed-loop results and report of a run.
+
+    A vehicle without a step function is not evaluated in closed loop.
+    """
     began = time.perf_counter()
     plant = build.build_vehicle(settings["vehicle"])
     if plant.simulated:
         check_step(plant)
-    dry_run.check(settings, plant)
-    return _walk(settings) | {"seconds": time.perf_counter() - began}
+    dry_run.check_settings(settings, plant)
+    document = _run_stages(settings)
+    return document | {"seconds": time.perf_counter() - began}
 
 
 @store.exclusive
-def _walk(settings: dict[str, Any]) -> dict[str, Any]:
-    """All steps in the run directory."""
+def _run_stages(settings: dict[str, Any]) -> dict[str, Any]:
+    """Run all stages in the run directory."""
     stages.ensure_policy(settings)
-    place = store.run_directory(settings)
-    certificate = certify.renew(settings)
+    run_dir = store.run_directory(settings)
+    certificate = certificates.certify_policy(settings)
     if build.build_vehicle(settings["vehicle"]).simulated:
-        results = evaluate.run(settings, asked_by="train")
+        typed = command("train") if HydraConfig.initialized() else None
+        results = evaluate_run(settings, command=typed)["results"]
     else:
-        results = {"results": None}
+        results = None
         artefacts.print_message(
-            "not driven: vehicle=own is known from logs alone; vehicle.step=package.module:function drives it"
+            "not driven: vehicle=own is known from logs alone; "
+            "vehicle.step=package.module:function drives it"
         )
-    pages = report.run(settings)
+    with artefacts.as_artefact_error(run_dir):
+        pages = write_report(run_dir)
+    artefacts.print_message(f"report: {pages['report']}")
     return {
-        "run": str(place),
-        "checkpoint": str(place / "checkpoints"),
-        "certificate": str(certify.certificate_path(place)),
-        "results": results["results"],
+        "run": str(run_dir),
+        "checkpoint": str(run_dir / "checkpoints"),
+        "certificate": str(certificates.certificate_path(run_dir)),
+        "results": results,
         "report": pages["report"],
-        "open_loop_rmse_m": _errors(place),
+        "open_loop_rmse_m": _position_errors(run_dir),
         "alpha": certificate.get("alpha"),
-        "objective": _objective(place),
+        "objective": _objective(run_dir),
     }
 
 
-def _errors(place: Path) -> list[float]:
-    """Error of free-running predictions by steps ahead [m]."""
-    return artefacts.read_json(place / "open_loop.json", keys=("position_rmse_m",))[
-        "position_rmse_m"
-    ]
+def _position_errors(run_dir: Path) -> list[float]:
+    """Position errors of open-loop predictions by steps ahead [m]."""
+    key = "position_rmse_m"
+    return artefacts.read_json(run_dir / "open_loop.json", keys=(key,))[key]
 
 
-def _objective(place: Path) -> float | None:
-    """What a sweep minimises: the least validation loss; None for a model that is identified at once."""
-    log = place / "metrics.jsonl"
-    lines = artefacts.read_jsonl(log, damaged=artefacts.print_message) if log.exists() else []
-    return min(
-        (line["validation_loss"] for line in lines if "validation_loss" in line),
-        default=None,
-    )
+def _objective(run_dir: Path) -> float | None:
+    """The lowest validation loss, which a sweep minimises; None if none was logged."""
+    log = run_dir / "metrics.jsonl"
+    if not log.exists():
+        return None
+    lines = artefacts.read_jsonl(log, damaged=artefacts.print_message)
+    losses = [line["validation_loss"] for line in lines if "validation_loss" in line]
+    return min(losses, default=None)
 
 
 if __name__ == "__main__":

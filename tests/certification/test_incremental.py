@@ -1,6 +1,4 @@
-"""The rate of a continuous flow: exact where it is known, never above what an attack
-finds, and mutants are caught.
-"""
+"""The rate of a continuous flow: exact cases, attacks, and mutants of the check."""
 
 import dataclasses
 import json
@@ -22,13 +20,13 @@ from sfkd_jax.certification import (
     attack_growth,
     certify_incremental,
     check_incremental,
-    claims_a_rate,
+    contraction_metrics,
     incremental_rate,
-    progress,
+    is_incremental,
 )
 from sfkd_jax.cli import config
-from sfkd_jax.pipeline import store
-from sfkd_jax.types import Declared, Incremental
+from sfkd_jax.pipeline import certificates, store
+from sfkd_jax.types import Declared, Incremental, Structure
 
 
 def flow(linear, outer, inner, multipliers, metric=None):
@@ -53,7 +51,8 @@ def generic(body=4, scale=0.5, seed=0):
         shapes,
     )
     return jax.tree.map(
-        lambda leaf: np.asarray(leaf, dtype=np.float64), jit(model.explicit)(params)
+        lambda leaf: np.asarray(leaf, dtype=np.float64),
+        jit(model.structure.explicit)(params),
     )
 
 
@@ -122,10 +121,10 @@ def test_the_proved_rate_holds_for_every_pattern_of_slopes(seed, body, hidden):
 
 
 MUTANTS = {
-    "linear part pushed by 2γ": lambda w, rate: w._replace(
+    "linear part shifted by 2γ": lambda w, rate: w._replace(
         linear=w.linear + 2 * rate * np.eye(4)
     ),
-    "linear part pushed a little": lambda w, rate: w._replace(
+    "linear part shifted a little": lambda w, rate: w._replace(
         linear=w.linear + 1e-4 * rate * np.eye(4)
     ),
     "one multiplier negative": lambda w, _: w._replace(
@@ -213,28 +212,30 @@ def test_a_false_declaration_is_refused_at_the_door_of_the_model():
     model, params = model_and_params("control_synth")
 
     def explicit(params):
-        found = model.explicit(params)
-        return found._replace(
-            declared=dataclasses.replace(found.declared, activation="sin")
+        weights = model.structure.explicit(params)
+        return weights._replace(
+            declared=dataclasses.replace(weights.declared, activation="sin")
         )
 
     with pytest.raises(CertificationRefused, match="sin"):
-        certify_incremental(model._replace(explicit=explicit), params, dt=0.1)
+        certify_incremental(
+            model._replace(structure=Structure(explicit=explicit)), params, dt=0.1
+        )
 
 
 def test_no_certificate_of_steps_is_given_for_a_flow_and_none_of_a_flow_for_steps():
     model, params = model_and_params("control_synth")
-    assert claims_a_rate(model, params)
-    assert progress(model, params) == {}
+    assert is_incremental(model, params)
+    assert contraction_metrics(model, params) == {}
     with pytest.raises(CertificationRefused, match="continuous flow"):
         certification.certify(model, params, (ENV_LOW, ENV_HIGH))
     ours, ours_params = model_and_params("sfkd")
-    assert not claims_a_rate(ours, ours_params)
-    assert not claims_a_rate(*model_and_params("neural_ode"))
+    assert not is_incremental(ours, ours_params)
+    assert not is_incremental(*model_and_params("neural_ode"))
 
 
 def untrained(name="control_synth"):
-    """Settings of a run whose policy lies on the shelf as it was drawn."""
+    """Settings of a run with an untrained policy in its directory."""
     config.register()
     with initialize_config_dir(config.conf_path(), version_base="1.3"):
         composed = compose("config", overrides=["+experiment=smoke", f"model={name}"])
@@ -275,4 +276,4 @@ def test_the_door_writes_the_rate_apart_from_certificates_of_steps(
     artefacts.write_json(file, document | {"policy_sha256": "others"})
     with pytest.raises(CertificateStale, match="other weights"):
         certify.run(settings)
-    assert certify.renew(settings)["alpha"] == document["alpha"]
+    assert certificates.certify_policy(settings)["alpha"] == document["alpha"]

@@ -17,7 +17,7 @@ from sfkd_jax.models._identification import bounded_ridge, ridge_regression
 from sfkd_jax.models.sfkd import bounded
 from sfkd_jax.models.sfkd._bounds import attainable, unbounded
 from sfkd_jax.models.sfkd._budget import budget_factors
-from sfkd_jax.pipeline import stages
+from sfkd_jax.pipeline import train_policy
 
 RIDGE, BOUND, RANK = 1e-3, 0.7, 4
 
@@ -135,7 +135,7 @@ def test_raw_parameters_give_back_every_matrix_within_the_attainable_norm(size):
 def test_an_identified_start_predicts_better_than_a_drawn_one_within_its_bound_and_keeps_the_rest():
     model = tiny("joint")
     drawn = jit(model.init)(jax.random.key(0))
-    start = jit(model.start)(drawn, driven(), jax.random.key(1))
+    start = jit(model.fitting.start)(drawn, driven(), jax.random.key(1))
     miss = jit(
         jax.vmap(
             lambda params, drive: defects(model, params, drive)[0], in_axes=(None, 0)
@@ -151,7 +151,7 @@ def test_an_identified_start_predicts_better_than_a_drawn_one_within_its_bound_a
         0.995 * left @ np.float64(matrix) @ right.T for matrix in found["operators"]
     ]
     np.testing.assert_allclose(
-        model.explicit(start).operators.vertices, wanted, atol=1e-4
+        model.structure.explicit(start).operators.vertices, wanted, atol=1e-4
     )  # nothing was cut off
     for name, part in found.items():
         kept = all(
@@ -169,11 +169,11 @@ def test_a_start_that_a_model_does_not_have_is_refused_by_name():
     with pytest.raises(
         ValueError, match=r"training\.start=identified needs a model=sfkd"
     ):
-        stages._started(blind, "identified", data, 0)
+        train_policy.with_start(blind, "identified", data, 0)
     with pytest.raises(
         ValueError,
         match=r"training\.start must be one of random, identified, got 'identfied'",
     ):
-        stages._started(ours, "identfied", data, 0)
-    assert stages._started(blind, "random", data, 0) is blind
-    assert stages._started(ours, "identified", data, 0).init is not ours.init
+        train_policy.with_start(ours, "identfied", data, 0)
+    assert train_policy.with_start(blind, "random", data, 0) is blind
+    assert train_policy.with_start(ours, "identified", data, 0).init is not ours.init

@@ -53,7 +53,7 @@ def unflatten(flat: Mapping[str, Any]) -> dict[str, Any]:
         for branch in branches:
             node = node.setdefault(branch, {})
             if not isinstance(node, dict):
-                raise ValueError(f"{name!r} lies below a leaf")
+                raise ValueError(f"{name!r} is below a leaf")
         if last and node.setdefault(last, leaf) is not leaf:
             raise ValueError(f"{name!r} is both a leaf and a dict")
     return tree

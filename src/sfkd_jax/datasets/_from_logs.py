@@ -86,14 +86,14 @@ def from_logs(
         findings += check_ranges(sound, columns, limits=limits, box=(env_low, env_high))
     _tell(findings, say)
     cut = segments([pieces(log, dt=dt, gap=gap) for log in sound], steps=steps)
-    take_share = deal(cut.drives, shares=shares, seed=seed)
-    counts = np.bincount(take_share.parts, minlength=4).tolist()
+    dealt = deal(cut.drives, shares=shares, seed=seed)
+    counts = np.bincount(dealt.parts, minlength=4).tolist()
     say(_summary(sound, cut, counts, dt))
-    if not take_share.whole:
+    if not dealt.whole:
         say(
             "warning: too few drives to deal whole; each was cut in time, and coverage speaks of the same drives only"
         )
-    dataset = _dataset(cut, take_share.parts, (env_low, env_high))
+    dataset = _dataset(cut, dealt.parts, (env_low, env_high))
     covered = _covered(cut, columns)
     for line in coverage_lines(covered):
         say(line)
@@ -159,7 +159,7 @@ def _dataset(cut: Segments, parts: Int[np.ndarray, " segment"], box: Ends) -> Da
         name: len(np.unique(cut.drives[parts == k]))
         for k, name in enumerate(Dataset._fields[:4])
     }
-    take_share = [
+    dealt = [
         Trajectory(
             *(
                 jnp.asarray(part[parts == k], dtype=jnp.float32)
@@ -169,7 +169,7 @@ def _dataset(cut: Segments, parts: Int[np.ndarray, " segment"], box: Ends) -> Da
         for k in range(4)
     ]
     low, high = environment_box(cut.envs, *box)
-    return Dataset(*take_share, env_low=low, env_high=high, drives=drives)
+    return Dataset(*dealt, env_low=low, env_high=high, drives=drives)
 
 
 def environment_box(

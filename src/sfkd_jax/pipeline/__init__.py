@@ -1,1 +1,1 @@
-"""From settings to artefacts: the run store and the stages that commands share."""
+"""Stages from settings to artefacts, and the store of runs that commands share."""

@@ -11,6 +11,7 @@ import jax
 import numpy as np
 
 from sfkd_jax import build, evaluation
+from sfkd_jax.core.folding import fold, unfold
 from sfkd_jax.datasets import Dataset
 from sfkd_jax.pipeline import scoring
 from sfkd_jax.scenarios import Scenario
@@ -124,7 +125,7 @@ def compile_system(
     }
     columns = _columns(settings, name, system)
     # Folded once here; otherwise every control step would fold again.
-    system = system._replace(params=jax.jit(system.model.fold)(system.params))
+    system = system._replace(params=jax.jit(partial(fold, system.model))(system.params))
 
     def simulate(scenario: Scenario, key: Key) -> evaluation.Episode:
         return evaluation.simulate(
@@ -235,7 +236,8 @@ def _columns(
         "seeds": [settings["seed"]],
         "episodes": protocol["episodes"],
         "episode_s": protocol["episode_s"],
-        "params": sum(leaf.size for leaf in jax.tree.leaves(system.params)) or None,
+        "params": sum(leaf.size for leaf in jax.tree.leaves(unfold(system.params)))
+        or None,
         "alpha": certificate and certificate["alpha"],
     }
 

@@ -1,4 +1,4 @@
-"""The cells of a comparison: what is driven by whom, with which settings, and where each result is kept."""
+"""The cells of a comparison: which there are, their settings and stored results."""
 
 from __future__ import annotations
 
@@ -15,18 +15,19 @@ from sfkd_jax.pipeline.evaluate_system import EpisodeSet, SystemResult
 
 KIND = "cell"
 NUM_STORED_EPISODES = 2
-"""Episodes of a cell whose arrays are kept for figures; the measures of all are in its
-row.
-"""
+"""Episodes of a cell whose arrays are stored for figures; its row covers them all."""
 
 
 class Cell(NamedTuple):
-    """One row on one scenario.
+    """One row of the comparison on one scenario.
 
     Attributes:
-        vehicle, seed, controller, scenario: as in the settings.
+        vehicle: as in the settings.
         label: of the row.
+        seed: as in the settings.
+        controller: as in the settings.
         variation: of the protocol.
+        scenario: as in the settings.
     """
 
     vehicle: str
@@ -37,50 +38,50 @@ class Cell(NamedTuple):
     scenario: str
 
 
-def plan(comparison: dict[str, Any]) -> list[Cell]:
-    """All cells in the order in which they are driven: what one driver does lies together.
+def list_cells(comparison: dict[str, Any]) -> list[Cell]:
+    """Return all cells in the order of evaluation; those of one system are adjacent.
 
     Raises:
-        ValueError: `only` names a row that there is not.
+        ValueError: `only` names an unknown row.
     """
-    unknown = set(comparison["only"]) - set(comparison["rows"])
-    if unknown:
-        known = ", ".join(comparison["rows"])
+    rows, only = comparison["rows"], comparison["only"]
+    if unknown := set(only) - set(rows):
         raise ValueError(
-            f"unknown comparison.only {', '.join(sorted(unknown))}; choose of {known or 'none'}"
+            f"unknown comparison.only {', '.join(sorted(unknown))}; "
+            f"choose of {', '.join(rows) or 'none'}"
         )
-    labels = [
-        label
-        for label in comparison["rows"]
-        if label in (comparison["only"] or comparison["rows"])
-    ]
+    labels = [label for label in rows if label in (only or rows)]
     cells = []
     for vehicle, seed, label in itertools.product(
         comparison["vehicles"], comparison["seeds"], labels
     ):
         for common, scenarios in comparison["controllers"].items():
             own = comparison["own_controllers"].get(label, {}).get(common, common)
-            drives = itertools.product(
+            varied = itertools.product(
                 comparison["variations"], scenarios if own else ()
             )
-            cells += [Cell(vehicle, label, seed, own, *drive) for drive in drives]
+            cells += [Cell(vehicle, label, seed, own, *entry) for entry in varied]
     return cells
 
 
-def drivers(wanted: list[Cell]) -> list[list[Cell]]:
-    """Cells that differ in the road, or in what is told about it, alone."""
+def group_cells(cells: list[Cell]) -> list[list[Cell]]:
+    """Group cells that differ only in variation and scenario."""
     return [
-        list(group) for _, group in itertools.groupby(wanted, key=lambda cell: cell[:4])
+        list(group) for _, group in itertools.groupby(cells, key=lambda cell: cell[:4])
     ]
 
 
 def take_share(groups: list[list[Cell]], share: list[int] | None) -> list[list[Cell]]:
-    """Those of every n-th row from the k-th on, share = [k, n]; all for None.
+    """Return the groups of every n-th row from the k-th on, share = [k, n].
 
-    All controllers and cells of a row lie in one share, for they share its policy.
+    All groups of a row are in one share, because they use the same policy.
+
+    Args:
+        groups: of all cells.
+        share: [k, n], or None for all groups.
 
     Raises:
-        ValueError: a share that there is not.
+        ValueError: not 0 ≤ k < n.
     """
     if share is None:
         return groups
@@ -97,18 +98,13 @@ def take_share(groups: list[list[Cell]], share: list[int] | None) -> list[list[C
 
 
 def overrides(cell: Cell, comparison: dict[str, Any]) -> list[str]:
-    """What must be composed for a cell, beyond what the command asked for."""
-    row, variation = (
-        comparison["rows"][cell.label],
-        comparison["variations"][cell.variation],
-    )
-    chosen = [
+    """Return the overrides of a cell, beyond those of the command."""
+    row = comparison["rows"][cell.label]
+    variation = comparison["variations"][cell.variation]
+    return [
         f"vehicle={cell.vehicle}",
         f"scenario={cell.scenario}",
         f"controller={cell.controller}",
-    ]
-    return [
-        *chosen,
         f"seed={cell.seed}",
         *(row or "").split(),
         *(variation or "").split(),
@@ -116,13 +112,22 @@ def overrides(cell: Cell, comparison: dict[str, Any]) -> list[str]:
 
 
 def policy_name(cell: Cell, comparison: dict[str, Any], *, retrained: bool) -> str:
-    """The name of the run that holds a cell's policy; a variation that changes the training has its own."""
+    """Return the name of the run that trains the policy of a cell.
+
+    Args:
+        cell: of the comparison.
+        comparison: its settings.
+        retrained: whether the variation changes the training, and so needs its own run.
+    """
     parts = [comparison["policies"], cell.vehicle, cell.label]
     return "/".join([*parts, _slug(cell.variation)] if retrained else parts)
 
 
-def place(cell: Cell, settings: dict[str, Any]) -> Path:
-    """root/name/cells/vehicle/variation/scenario/controller/label-seed=N, without an ending."""
+def cell_path(cell: Cell, settings: dict[str, Any]) -> Path:
+    """Return the path of a cell's files, without their suffixes.
+
+    It is root/name/cells/vehicle/variation/scenario/controller/label-seed=N.
+    """
     folders = (cell.vehicle, _slug(cell.variation), cell.scenario, cell.controller)
     return Path(
         settings["root"],
@@ -134,53 +139,66 @@ def place(cell: Cell, settings: dict[str, Any]) -> Path:
 
 
 def compilation_key(settings: dict[str, Any]) -> str:
-    """The hash of what a driver is compiled from: cells that share it share the driver."""
+    """Hash the settings that a compiled evaluator depends on; equal keys share it."""
+    names = (*store.IDENTITY, "env_source", "controller", "certification", "name")
     protocol = {
         name: value
         for name, value in settings["evaluation"].items()
         if name not in ("env_sensor", "variation")
     }
-    asked = {
-        name: settings[name]
-        for name in (*store.IDENTITY, "controller", "certification", "name")
-    } | {"env": settings["env_source"]}
-    return artefacts.sha256(asked | {"evaluation": protocol})
+    return artefacts.sha256(
+        {name: settings[name] for name in names} | {"evaluation": protocol}
+    )
 
 
 def settings_hash(settings: dict[str, Any]) -> str:
-    """The hash of the settings that a cell comes from; neither the code nor where the artefacts lie is in it."""
-    asked = {
-        name: settings[name]
-        for name in (*store.IDENTITY, "controller", "scenario")
-    } | {"env": settings["env_source"]}
-    asked["evaluation"] = {  # stored cells were hashed under an earlier key
+    """Hash the settings that the result of a cell depends on.
+
+    Neither the code nor the location of the artefacts enters.
+    """
+    names = (*store.IDENTITY, "controller", "scenario", "certification")
+    hashed = {name: settings[name] for name in names}
+    # Two settings keep the keys under which stored cells were hashed.
+    hashed["env"] = settings["env_source"]
+    hashed["evaluation"] = {
         "told" if name == "env_sensor" else name: value
         for name, value in settings["evaluation"].items()
     }
-    return artefacts.sha256(asked | {"certification": settings["certification"]})
+    return artefacts.sha256(hashed)
 
 
 def is_done(path: Path, settings: dict[str, Any]) -> bool:
-    """Whether a cell was driven with exactly these settings; a damaged one was not."""
+    """Whether an undamaged cell with exactly these settings is stored."""
     try:
-        return artefacts.read_json(_row_file(path), keys=("row",))[
-            "made_with"
-        ] == settings_hash(settings)
+        document = artefacts.read_json(_row_file(path), keys=("row",))
+        return document["made_with"] == settings_hash(settings)
     except (artefacts.ArtefactError, OSError, KeyError):
         return False
 
 
-def write(
-    path: Path, settings: dict[str, Any], track: EpisodeSet, driven: SystemResult
+def write_cell(
+    path: Path, settings: dict[str, Any], episodes: EpisodeSet, result: SystemResult
 ) -> dict[str, Any]:
-    """Store arrays of the first episodes, then the row, which is returned: a kill between leaves a cell not done."""
+    """Write the arrays of the first episodes, then the row, and return the row.
+
+    A process that is killed in between leaves a cell that is not done.
+
+    Args:
+        path: of the cell, without suffix.
+        settings: of the cell.
+        episodes: that were simulated.
+        result: row and arrays.
+    """
     path.parent.mkdir(parents=True, exist_ok=True)
-    arrays = driven.arrays | {"envs": track.scenarios.envs, "path": track.scenarios.path.points}
-    kept = {name: np.asarray(array)[:NUM_STORED_EPISODES] for name, array in arrays.items()}
-    kept["dt"] = np.asarray(settings["vehicle"]["dt"])
+    scenarios = episodes.scenarios
+    arrays = result.arrays | {"envs": scenarios.envs, "path": scenarios.path.points}
+    stored = {
+        name: np.asarray(array)[:NUM_STORED_EPISODES] for name, array in arrays.items()
+    }
+    stored["dt"] = np.asarray(settings["vehicle"]["dt"])
     file = path.with_name(f"{path.name}.npz")
-    artefacts.write_arrays(file, kept, kind=KIND, config=settings["scenario"])
-    row = driven.row | {
+    artefacts.write_arrays(file, stored, kind=KIND, config=settings["scenario"])
+    row = result.row | {
         "arrays": str(file.relative_to(Path(settings["root"], settings["name"])))
     }
     artefacts.write_json(
@@ -189,42 +207,42 @@ def write(
     return row
 
 
-def collect(
+def collect_rows(
     cells: list[Cell],
     settings: dict[str, Any],
     expected: Callable[[Cell], str],
     *,
     older: bool = False,
 ) -> list[dict[str, Any]]:
-    """The rows of all cells that are done, seeds pooled, systems compared; how many were left out is said.
+    """Return the rows of all stored cells, with seeds pooled and systems compared.
+
+    Prints how many cells were made with other settings.
 
     Args:
-        cells: of the plan.
+        cells: of the comparison.
         settings: of the comparison.
-        expected: what `made_with` is for a cell.
-        older: take rows of cells made with other settings as well.
+        expected: cell -> the `settings_hash` of its settings.
+        older: also use cells that were made with other settings.
     """
-    found: dict[Cell, list[dict[str, Any]]] = {}
+    pooled: dict[Cell, list[dict[str, Any]]] = {}
     others = []
     for cell in cells:
-        path = _row_file(place(cell, settings))
+        path = _row_file(cell_path(cell, settings))
         if not path.exists():
             continue
-        kept = artefacts.read_json(path, keys=("row", "made_with"))
-        if kept["made_with"] != expected(cell):
+        document = artefacts.read_json(path, keys=("row", "made_with"))
+        is_current = document["made_with"] == expected(cell)
+        if not is_current:
             others.append(path)
-        if older or kept["made_with"] == expected(cell):
-            found.setdefault(cell._replace(seed=0), []).append(kept["row"])
+        if older or is_current:
+            pooled.setdefault(cell._replace(seed=0), []).append(document["row"])
     if others:
-        done = (
-            "taken all the same"
-            if older
-            else "left out; comparison.older=true takes them"
-        )
+        outcome = "used" if older else "left out; comparison.older=true uses them"
         artefacts.print_message(
-            f"{len(others)} cells were made with other settings, such as {others[0]}: {done}"
+            f"{len(others)} cells were made with other settings, "
+            f"such as {others[0]}: {outcome}"
         )
-    return evaluation.compare([evaluation.pool(rows) for rows in found.values()])
+    return evaluation.compare([evaluation.pool(rows) for rows in pooled.values()])
 
 
 def _row_file(path: Path) -> Path:
@@ -232,5 +250,5 @@ def _row_file(path: Path) -> Path:
 
 
 def _slug(words: str) -> str:
-    """Words as a name for a folder."""
+    """Words as the name of a folder."""
     return "_".join(words.split()) or "none"

@@ -1,4 +1,4 @@
-"""What drives a data set: the law of path coordinates, derived once and kept beside it, or the simple driver."""
+"""The law of a data set in path coordinates, and the generator of its drives."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ import numpy as np
 from jaxtyping import Int
 
 from sfkd_jax import artefacts, build
-from sfkd_jax.control import PathLaw, law_to_arrays, law_from_arrays
+from sfkd_jax.control import PathLaw, law_from_arrays, law_to_arrays
 from sfkd_jax.datasets import (
     generate,
     generate_along_path,
@@ -25,8 +25,12 @@ from sfkd_jax.types import Key, Trajectory
 from sfkd_jax.vehicle import Vehicle
 
 
-def ensure(settings: dict[str, Any]) -> PathLaw | None:
-    """The law, derived now if it does not lie on the shelf; None for data sets of other frames."""
+def ensure_law(settings: dict[str, Any]) -> PathLaw | None:
+    """Return the law of the data set; derive it if it is missing.
+
+    Returns:
+        The law, or None if the data set is not in path coordinates.
+    """
     if not store.is_along_path(settings):
         return None
     if not artefacts.exists(store.law_path(settings)):
@@ -37,37 +41,27 @@ def ensure(settings: dict[str, Any]) -> PathLaw | None:
     return law_from_arrays(store.read_law(settings))
 
 
-def loop(settings: dict[str, Any]) -> Vehicle:
-    """The vehicle with that law closed around it: states and controls of `path_frame`.
+def closed_loop(settings: dict[str, Any]) -> Vehicle:
+    """Return the closed loop of vehicle and law, in the coordinates of `path_frame`.
 
     Raises:
         ValueError: the data set is not in path coordinates.
     """
-    law = ensure(settings)
+    law = ensure_law(settings)
     if law is None:
         raise ValueError("a loop along a path needs dataset=path")
     return build.build_loop(build.build_vehicle(settings["vehicle"]), law)
 
 
-def scenarios(settings: dict[str, Any]) -> Int[np.ndarray, " segment"]:
-    """The scenario of every segment that `drives` generates for training."""
-    of_segments = (
-        segment_scenarios_along_path
-        if store.is_along_path(settings)
-        else segment_scenarios
-    )
-    return of_segments(settings["dataset"]["segments"])
-
-
-def drives(
+def generator(
     settings: dict[str, Any], options: dict[str, Any], *, switching: bool = False
 ) -> Callable[[Key], Trajectory]:
-    """key -> the drives of a data set, or as many under S3's switching.
+    """Return key -> the drives of a data set, or as many under the switching of S3.
 
     Args:
         settings: of the run.
-        options: of the generator, less the environment box.
-        switching: whether the schedule is S3's.
+        options: of the generator, without the environment box.
+        switching: whether the environment follows S3.
     """
     if not store.is_along_path(settings):
         plant = build.build_vehicle(settings["vehicle"])
@@ -78,6 +72,16 @@ def drives(
             **options,
         )
     if switching:
-        return partial(generate_s3_along_path, loop(settings), **options)
+        return partial(generate_s3_along_path, closed_loop(settings), **options)
     box = {name: tuple(settings["dataset"][name]) for name in ("env_low", "env_high")}
-    return partial(generate_along_path, loop(settings), **options, **box)
+    return partial(generate_along_path, closed_loop(settings), **options, **box)
+
+
+def generated_scenarios(settings: dict[str, Any]) -> Int[np.ndarray, " segment"]:
+    """Return the scenario of every segment of `generator`, as index into SCENARIOS."""
+    of_segments = (
+        segment_scenarios_along_path
+        if store.is_along_path(settings)
+        else segment_scenarios
+    )
+    return of_segments(settings["dataset"]["segments"])

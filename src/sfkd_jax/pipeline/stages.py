@@ -9,20 +9,30 @@ from typing import Any
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 
 from sfkd_jax import artefacts, build, policy
-from sfkd_jax.datasets import Columns, Dataset, check_on_path, from_logs, split
+from sfkd_jax.datasets import (
+    SCENARIOS,
+    Columns,
+    Dataset,
+    check_on_path,
+    from_logs,
+    split,
+)
 from sfkd_jax.pipeline import path_law, store
 from sfkd_jax.pipeline.train_policy import train_policy
 from sfkd_jax.types import Trajectory
 
 SPLIT = ("shares", "env_low", "env_high", "seed")
+CONSTANT = ("s1", "held")
+"""Scenarios of generated segments in which the environment is constant."""
 SWITCHING = 2
 """Stream folded into the data set's seed; simulation and split use streams 0 and 1."""
 
 
 def ensure_dataset(settings: dict[str, Any]) -> tuple[Dataset, str]:
-    """Return the data set and its hash; simulate it or read its logs if it is missing."""
+    """Return the data set and its hash; simulate or read it if it is missing."""
     path = store.dataset_path(settings)
     if not artefacts.exists(path):
         with artefacts.locked(path.parent, wait=True):  # other runs share the data set
@@ -48,6 +58,7 @@ def _simulate(settings: dict[str, Any]) -> Dataset:
         shares=tuple(options["shares"]),
         env_low=low,
         env_high=high,
+        scenarios=jnp.asarray(path_law.generated_scenarios(settings)),
     )
 
 
@@ -108,13 +119,19 @@ def _check_calibration_size(settings: dict[str, Any]) -> None:
 def held_out_parts(settings: dict[str, Any], dataset: Dataset) -> dict[str, Trajectory]:
     """Return the trajectories on which coverage is measured, by name.
 
-    These are the test part, its drives with constant (S1) and varying (S2) environment,
-    and as many new drives under the switching environment of S3. Logs have the test
-    part only: their scenario is unknown, and they cannot be driven again.
+    These are the test part, its segments with a constant environment ("s1") and with a
+    varying one ("s2"), by the scenarios that they were generated from, and as many new
+    segments under the switching of S3. Logs have the test part only: their scenario is
+    unknown, and they cannot be driven again.
+
+    Args:
+        settings: of the run.
+        dataset: its data set.
     """
-    if store.is_logged(settings):
+    if dataset.scenarios is None:
         return {"test": dataset.test}
-    constant = jnp.all(dataset.test.envs == dataset.test.envs[:, :1], axis=(1, 2))
+    scenarios = np.asarray(dataset.scenarios["test"])
+    constant = np.isin(scenarios, [SCENARIOS.index(name) for name in CONSTANT])
     options = {name: settings[name] for name in ("vehicle", "dataset", "root")}
     options |= {"segments": dataset.test.controls.shape[0]}
     parts = {"test": dataset.test, "s3": _switching(json.dumps(options))}

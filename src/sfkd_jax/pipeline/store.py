@@ -1,4 +1,4 @@
-"""Where artefacts lie and what they were made from: the same place for every door."""
+"""Run directories and data sets on disk, and the settings that identify them."""
 
 from __future__ import annotations
 
@@ -19,15 +19,13 @@ DATASET = "dataset"
 LAW = "law"
 PARTS = ("train", "validation", "calibration", "test")
 IDENTITY = ("vehicle", "dataset", "model", "training", "seed")
-"""Settings that decide the weights; a run made with others is another run."""
+"""Settings that determine the weights of a run."""
 UNREADABLE = frozenset("[]")
-"""Characters that the checkpoint library takes for a pattern when it reads, though not
-when it writes.
-"""
+"""Characters of a path that the checkpoint library writes, but reads as a pattern."""
 
 
 def run_directory(settings: dict[str, Any]) -> Path:
-    """root/name/system/seed=N."""
+    """Return the directory of a run, root/name/system/seed=N."""
     return (
         Path(settings["root"])
         / settings["name"]
@@ -37,50 +35,51 @@ def run_directory(settings: dict[str, Any]) -> Path:
 
 
 def exclusive(run: Callable[[dict[str, Any]], Any]) -> Callable[[dict[str, Any]], Any]:
-    """Make `run(settings)` the only one that writes into the run directory while it works."""
+    """Wrap `run(settings)` so that it holds the lock of the run directory."""
 
     @functools.wraps(run)
-    def alone(settings: dict[str, Any]) -> Any:
+    def locked(settings: dict[str, Any]) -> Any:
         with artefacts.locked(run_directory(settings)):
             return run(settings)
 
-    return alone
+    return locked
 
 
 def dataset_path(settings: dict[str, Any]) -> Path:
-    """Data sets are shared by all runs with the same vehicle and data settings."""
-    name = f"{settings['vehicle']['name']}-{artefacts.sha256(dataset_config(settings))[:8]}"
+    """Return the path of a data set, which runs of equal data settings share."""
+    digest = artefacts.sha256(dataset_config(settings))[:8]
+    name = f"{settings['vehicle']['name']}-{digest}"
     return Path(settings["root"]) / "datasets" / name / "dataset.npz"
 
 
 def dataset_config(settings: dict[str, Any]) -> dict[str, Any]:
-    """What a data set was made with: of logs their contents, not where they lie."""
-    asked = dict(settings["dataset"])
+    """Return the settings of a data set, with the contents of logs for their path."""
+    options = dict(settings["dataset"])
     if is_logged(settings):
-        asked |= {
-            "contents": fingerprint(asked.pop("path")),
+        options |= {
+            "contents": fingerprint(options.pop("path")),
             "environment_known": has_environment(settings),
         }
-    return {"vehicle": settings["vehicle"], "dataset": asked}
+    return {"vehicle": settings["vehicle"], "dataset": options}
 
 
 def is_logged(settings: dict[str, Any]) -> bool:
-    """Whether the data set is read from logs instead of driven."""
+    """Whether the data set is read from logs instead of simulated."""
     return "path" in settings["dataset"]
 
 
 def has_environment(settings: dict[str, Any]) -> bool:
-    """Whether there is an environment that somebody measured or infers."""
+    """Whether the environment is measured or estimated."""
     return settings.get("env_source") != "none"
 
 
 def identity(settings: dict[str, Any]) -> dict[str, Any]:
-    """What a policy was made with."""
+    """Return the settings that determine the weights of a run."""
     return {name: settings[name] for name in IDENTITY} | dataset_config(settings)
 
 
 def write_dataset(settings: dict[str, Any], dataset: Dataset) -> dict[str, Any]:
-    """Store the four splits; returns the manifest."""
+    """Write the four parts of a data set and return the manifest."""
     arrays = {
         f"{part}/{name}": np.asarray(leaf)
         for part in PARTS
@@ -99,7 +98,12 @@ def write_dataset(settings: dict[str, Any], dataset: Dataset) -> dict[str, Any]:
 
 
 def read_dataset(settings: dict[str, Any]) -> tuple[Dataset, str]:
-    """The four splits and their hash."""
+    """Return a data set and its hash.
+
+    Raises:
+        ArtefactError: missing, damaged, made with other settings, or by an earlier
+            version that did not store scenarios.
+    """
     arrays, manifest = artefacts.read_arrays(
         dataset_path(settings), kind=DATASET, config=dataset_config(settings)
     )
@@ -118,9 +122,9 @@ def read_dataset(settings: dict[str, Any]) -> tuple[Dataset, str]:
                 "scenario of each segment; delete it and generate it again"
             )
         scenarios = {part: jnp.asarray(arrays[f"{part}/scenario"]) for part in PARTS}
-    asked = settings["dataset"]
+    options = settings["dataset"]
     envs = np.concatenate([np.asarray(part.envs) for part in parts])
-    low, high = environment_box(envs, asked["env_low"], asked["env_high"])
+    low, high = environment_box(envs, options["env_low"], options["env_high"])
     counts = arrays.get("drives")
     drives = (
         None
@@ -134,7 +138,7 @@ def read_dataset(settings: dict[str, Any]) -> tuple[Dataset, str]:
 
 
 def write_law(settings: dict[str, Any], arrays: dict[str, Any]) -> None:
-    """Store the law of a data set in path coordinates beside it."""
+    """Write the law of a data set in path coordinates beside it."""
     path = law_path(settings)
     path.parent.mkdir(parents=True, exist_ok=True)
     plain = {name: np.asarray(array) for name, array in arrays.items()}
@@ -142,14 +146,14 @@ def write_law(settings: dict[str, Any], arrays: dict[str, Any]) -> None:
 
 
 def read_law(settings: dict[str, Any]) -> dict[str, np.ndarray]:
-    """The arrays of that law."""
+    """Return the arrays of the law."""
     return artefacts.read_arrays(
         law_path(settings), kind=LAW, config=dataset_config(settings)
     )[0]
 
 
 def law_path(settings: dict[str, Any]) -> Path:
-    """Where it lies."""
+    """Return the path of the law of a data set."""
     return dataset_path(settings).with_name("law.npz")
 
 
@@ -159,24 +163,25 @@ def is_along_path(settings: dict[str, Any]) -> bool:
 
 
 def claim(settings: dict[str, Any]) -> None:
-    """Mark the run directory as made with these settings, or refuse if it was begun with others.
+    """Record the settings of a run in its directory, or check the recorded ones.
 
     Raises:
-        ArtefactError: naming what differs.
+        ArtefactError: the run was made with other settings; names the differences.
         ValueError: a path from which orbax cannot read.
     """
     path = run_directory(settings) / "settings.json"
     unreadable = UNREADABLE & set(str(path.resolve()))
     if unreadable:
         raise ValueError(
-            f"checkpoints cannot be read back from a path with {' '.join(sorted(unreadable))}: {path}"
+            "checkpoints cannot be read back from a path "
+            f"with {' '.join(sorted(unreadable))}: {path}"
         )
     if path.exists():
-        found = artefacts.differences(artefacts.read_json(path), identity(settings))
-        if found:
-            hint = "pass name=… for another run"
+        changed = artefacts.differences(artefacts.read_json(path), identity(settings))
+        if changed:
             raise artefacts.ArtefactError(
-                f"{path.parent} was made with other settings ({'; '.join(found[:3])}); {hint}"
+                f"{path.parent} was made with other settings "
+                f"({'; '.join(changed[:3])}); pass name=… for another run"
             )
         return
     path.parent.mkdir(parents=True, exist_ok=True)
@@ -184,7 +189,11 @@ def claim(settings: dict[str, Any]) -> None:
 
 
 def boxes(dataset: Dataset) -> dict[str, Any]:
-    """The domain that measurements come from: hulls of body state and control over training and calibration, and E."""
+    """Return the box of the measurements, as lower and upper corners.
+
+    Those of body state and control are hulls over training and calibration parts; that
+    of the environment is E.
+    """
 
     def hull(pick: Callable[[Trajectory], jax.Array]) -> list[list[float]]:
         values = np.concatenate(
@@ -204,21 +213,28 @@ def boxes(dataset: Dataset) -> dict[str, Any]:
 
 
 def policy_settings(settings: dict[str, Any], dataset: Dataset) -> dict[str, Any]:
-    """What a policy was made with, and of logs what only they can say: the box E and how far controls went."""
-    kept = identity(settings)
+    """Return the settings to store with a policy.
+
+    Those of logged data include E, and the limits of controls unless they were given.
+
+    Args:
+        settings: of the run.
+        dataset: that the policy is trained on.
+    """
+    recorded = identity(settings)
     if not is_logged(settings):
-        return kept
+        return recorded
     box = {"env_low": dataset.env_low.tolist(), "env_high": dataset.env_high.tolist()}
-    if kept["vehicle"]["name"] == "own" and not kept["vehicle"]["control_low"]:
+    if recorded["vehicle"]["name"] == "own" and not recorded["vehicle"]["control_low"]:
         low, high = boxes(dataset)["control"]
-        kept |= {
-            "vehicle": kept["vehicle"] | {"control_low": low, "control_high": high}
+        recorded |= {
+            "vehicle": recorded["vehicle"] | {"control_low": low, "control_high": high}
         }
-    return kept | {"dataset": kept["dataset"] | box}
+    return recorded | {"dataset": recorded["dataset"] | box}
 
 
 def channel_names(settings: dict[str, Any]) -> dict[str, list[str]]:
-    """How logs name what the boxes bound; an environment that the model does not read has no name."""
+    """Return the columns of the logs by box; an unused environment has none."""
     columns = settings["dataset"]["columns"]
     return {
         "state": columns["state"][BODY],
@@ -230,7 +246,13 @@ def channel_names(settings: dict[str, Any]) -> dict[str, list[str]]:
 def open_loop_document(
     errors: jax.Array, trajectories: Trajectory, dt: float
 ) -> dict[str, Any]:
-    """Prediction error by horizon, as the report reads it."""
+    """Return the content of open_loop.json.
+
+    Args:
+        errors: RMSE by step and coordinate.
+        trajectories: that were predicted.
+        dt: sampling period [s].
+    """
     columns = np.asarray(errors, dtype=np.float64).T
     return {
         "steps": list(range(1, columns.shape[1] + 1)),

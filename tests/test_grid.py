@@ -26,7 +26,7 @@ PLAN = {
 
 
 def test_every_row_meets_every_scenario_under_every_controller_that_it_has():
-    found = grid.plan(PLAN)
+    found = grid.list_cells(PLAN)
     assert len(found) == len(set(found)) == 2 * 2 * 2 * (3 + 2)
     assert {cell.controller for cell in found if cell.label == "program"} == {
         "koopman_mpc"
@@ -37,18 +37,18 @@ def test_every_row_meets_every_scenario_under_every_controller_that_it_has():
 
 
 def test_rows_can_be_picked_and_an_unknown_one_is_named_with_the_choices():
-    assert {cell.label for cell in grid.plan(PLAN | {"only": ["program"]})} == {
+    assert {cell.label for cell in grid.list_cells(PLAN | {"only": ["program"]})} == {
         "program"
     }
     with pytest.raises(
         ValueError, match=r"unknown comparison\.only iocde; choose of ours, program"
     ):
-        grid.plan(PLAN | {"only": ["iocde"]})
+        grid.list_cells(PLAN | {"only": ["iocde"]})
 
 
 def test_what_one_driver_does_lies_together():
-    groups = grid.drivers(grid.plan(PLAN))
-    assert [cell for group in groups for cell in group] == grid.plan(PLAN)
+    groups = grid.group_cells(grid.list_cells(PLAN))
+    assert [cell for group in groups for cell in group] == grid.list_cells(PLAN)
     assert len(groups) == 2 * 2 * (2 + 1)
 
 
@@ -99,8 +99,8 @@ def rows_file(path):
 
 
 def test_a_cell_is_done_only_with_its_own_settings_and_undamaged(tmp_path):
-    cell, asked = grid.plan(PLAN)[0], settings(tmp_path)
-    path = grid.place(cell, asked)
+    cell, asked = grid.list_cells(PLAN)[0], settings(tmp_path)
+    path = grid.cell_path(cell, asked)
     assert not grid.is_done(path, asked)
     path.parent.mkdir(parents=True)
     write_json(rows_file(path), {"row": {}, "made_with": grid.settings_hash(asked)})
@@ -148,10 +148,10 @@ def test_collecting_pools_the_seeds_and_compares_what_is_there(tmp_path, seeds):
         "variations": {"as it is": None},
         "controllers": {"mppi": ["s1"]},
     }
-    wanted = grid.plan(plan)
+    wanted = grid.list_cells(plan)
     for cell in wanted:
         if cell.label != "missing":
-            path = grid.place(cell, settings(tmp_path))
+            path = grid.cell_path(cell, settings(tmp_path))
             path.parent.mkdir(parents=True, exist_ok=True)
             level = 1.0 if cell.label == "sfkd" else 3.0
             write_json(
@@ -160,7 +160,7 @@ def test_collecting_pools_the_seeds_and_compares_what_is_there(tmp_path, seeds):
             )
     found = {
         entry["system"]: entry
-        for entry in grid.collect(wanted, settings(tmp_path), lambda cell: cell.label)
+        for entry in grid.collect_rows(wanted, settings(tmp_path), lambda cell: cell.label)
     }
     assert set(found) == {"sfkd", "icode"}
     assert found["icode"]["seeds"] == list(range(seeds))
@@ -172,7 +172,7 @@ def test_collecting_pools_the_seeds_and_compares_what_is_there(tmp_path, seeds):
     ("older", "systems", "says"),
     [
         (False, {"sfkd"}, "left out; comparison.older=true takes them"),
-        (True, {"sfkd", "icode"}, "taken all the same"),
+        (True, {"sfkd", "icode"}, ": used"),
     ],
 )
 def test_a_row_that_was_made_with_other_settings_enters_no_table_unseen(
@@ -183,12 +183,12 @@ def test_a_row_that_was_made_with_other_settings_enters_no_table_unseen(
         for label in ("sfkd", "icode")
     ]
     for cell in wanted:
-        path = grid.place(cell, settings(tmp_path))
+        path = grid.cell_path(cell, settings(tmp_path))
         path.parent.mkdir(parents=True, exist_ok=True)
         write_json(
             rows_file(path), {"row": row(cell.label, 1.0, 0), "made_with": cell.label}
         )
-    found = grid.collect(wanted, settings(tmp_path), lambda cell: "sfkd", older=older)
+    found = grid.collect_rows(wanted, settings(tmp_path), lambda cell: "sfkd", older=older)
     assert {entry["system"] for entry in found} == systems
     said = capsys.readouterr().err
     assert said.startswith("1 cells were made with other settings, such as")
@@ -198,7 +198,7 @@ def test_a_row_that_was_made_with_other_settings_enters_no_table_unseen(
 
 def test_rows_are_dealt_to_processes_whole_and_each_to_one():
     """Two controllers of one row share its policy: no two processes may train it."""
-    groups = grid.drivers(grid.plan(PLAN))
+    groups = grid.group_cells(grid.list_cells(PLAN))
     parts = [grid.take_share(groups, [k, 3]) for k in range(3)]
     assert sorted(str(group) for part in parts for group in part) == sorted(
         map(str, groups)

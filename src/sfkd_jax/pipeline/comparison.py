@@ -1,0 +1,109 @@
+"""Evaluate the cells of a comparison; train and certify the policies they need."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any, TypeAlias
+
+from sfkd_jax import artefacts, build
+from sfkd_jax.pipeline import (
+    certificates,
+    dry_run,
+    evaluate_system,
+    grid,
+    stages,
+    store,
+    systems,
+)
+from sfkd_jax.vehicle import Vehicle
+
+ComposeCell: TypeAlias = Callable[[grid.Cell], dict[str, Any]]
+"""cell -> its settings, under the name of the comparison."""
+MakeEpisodes: TypeAlias = Callable[
+    [dict[str, Any], Vehicle], evaluate_system.EpisodeSet
+]
+"""(settings, vehicle) -> the episodes of a cell."""
+
+
+def cached_episodes() -> MakeEpisodes:
+    """Return `evaluate_system.make_episodes` with a cache, shared by compared rows."""
+    cache: dict[str, evaluate_system.EpisodeSet] = {}
+
+    def make_episodes(
+        settings: dict[str, Any], plant: Vehicle
+    ) -> evaluate_system.EpisodeSet:
+        key = artefacts.sha256(
+            {name: settings[name] for name in ("vehicle", "scenario", "evaluation")}
+        )
+        if key not in cache:
+            cache[key] = evaluate_system.make_episodes(settings, plant)
+        return cache[key]
+
+    return make_episodes
+
+
+def evaluate_group(
+    group: list[grid.Cell],
+    comparison: dict[str, Any],
+    compose_cell: ComposeCell,
+    make_episodes: MakeEpisodes,
+) -> int:
+    """Evaluate the cells of one row under one controller that are not done.
+
+    Args:
+        group: of `grid.group_cells`.
+        comparison: its settings.
+        compose_cell: for the settings of a cell.
+        make_episodes: of `cached_episodes`.
+
+    Returns:
+        How many cells were evaluated.
+
+    Raises:
+        ValueError: settings that cannot be built.
+        ArtefactError: damaged files, or a policy made with other settings.
+        TrainingStopped: the training of the policy diverged.
+    """
+    evaluators: dict[str, evaluate_system.Evaluator] = {}
+    done = 0
+    for cell in group:
+        settings = compose_cell(cell)
+        path = grid.cell_path(cell, settings)
+        run_settings = _run_settings(cell, comparison, compose_cell)
+        if grid.is_done(path, settings):
+            continue
+        plant = build.build_vehicle(settings["vehicle"])
+        # The scenario is checked before anything is trained.
+        episodes = make_episodes(settings, plant)
+        key = grid.compilation_key(run_settings)
+        if key not in evaluators:
+            evaluators[key] = _compile_evaluator(run_settings, plant)
+        result = evaluators[key](episodes)
+        grid.write_cell(path, settings, episodes, result)
+        error = 1e3 * result.row["rmse_m"]["mean"]
+        artefacts.print_message(f"{' '.join(map(str, cell))}: {error:.1f} mm")
+        done += 1
+    return done
+
+
+def _run_settings(
+    cell: grid.Cell, comparison: dict[str, Any], compose_cell: ComposeCell
+) -> dict[str, Any]:
+    """The settings of a cell, under the name of the run of its policy."""
+    settings = compose_cell(cell)
+    usual = cell._replace(variation=next(iter(comparison["variations"])))
+    retrained = store.identity(settings) != store.identity(compose_cell(usual))
+    return settings | {"name": grid.policy_name(cell, comparison, retrained=retrained)}
+
+
+def _compile_evaluator(
+    settings: dict[str, Any], plant: Vehicle
+) -> evaluate_system.Evaluator:
+    """Compile the only system of a row; train and certify it first if it learns."""
+    if "self" in settings["evaluation"]["systems"]:
+        dry_run.check_settings(settings, plant)
+        certificates.ensure_certificate(settings)
+    ((name, system),) = systems.load_systems(settings, plant).items()
+    return evaluate_system.compile_system(
+        settings, plant, name, system, stages.ensure_dataset(settings)[0]
+    )

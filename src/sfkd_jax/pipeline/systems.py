@@ -1,0 +1,59 @@
+"""The systems that an evaluation compares."""
+
+from __future__ import annotations
+
+from typing import Any
+
+from sfkd_jax import artefacts, build, policy
+from sfkd_jax.pipeline import path_law, stages, store
+from sfkd_jax.vehicle import Vehicle
+
+
+def load_systems(settings: dict[str, Any], plant: Vehicle) -> dict[str, build.System]:
+    """Return the systems of `evaluation.systems` by name.
+
+    "self" is the policy of the run, which is trained if it is missing.
+
+    Args:
+        settings: of the run.
+        plant: the true vehicle.
+
+    Raises:
+        ValueError: an unknown system.
+    """
+    references = build.reference_systems(plant, path_law.ensure_law(settings))
+    systems = {}
+    for name in settings["evaluation"]["systems"]:
+        if name == "self":
+            systems[settings["model"]["system"]] = policy_system(settings)
+        else:
+            systems[name] = build.choose(
+                references | {"self": None}, name, "evaluation.systems entry"
+            )
+    return systems
+
+
+def policy_system(settings: dict[str, Any]) -> build.System:
+    """Return the policy of the run as a system, with its certificate if there is one.
+
+    Raises:
+        ValueError: there is none, and the fallback of the monitor needs one.
+    """
+    trained = stages.ensure_policy(settings)
+    fallback = settings["controller"].get("monitor", {}).get("fallback", "none")
+    certificate, reason = policy.read_certificate(
+        store.run_directory(settings), trained
+    )
+    if certificate is None:
+        artefacts.print_message(
+            f"nothing is certified and nothing is monitored: {reason}"
+        )
+        if fallback != "none":
+            raise ValueError(
+                f"controller.monitor.fallback={fallback} needs a certificate; {reason}"
+            )
+    reads_env = trained.settings["model"]["environment"]
+    env_source = settings["env_source"] if reads_env else "none"
+    return build.System(
+        trained.model, trained.params, env_source, certificate, trained.law
+    )

@@ -1,0 +1,128 @@
+"""Train a model and write the policy of a run."""
+
+from __future__ import annotations
+
+from functools import partial
+from typing import Any
+
+import jax
+
+from sfkd_jax import artefacts, build, policy
+from sfkd_jax.certification import contraction_metrics
+from sfkd_jax.core.folding import fold
+from sfkd_jax.datasets import (
+    Dataset,
+    first_share,
+    measure_space,
+    random_windows,
+    spread_windows,
+)
+from sfkd_jax.evaluation import open_loop
+from sfkd_jax.pipeline import path_law, store
+from sfkd_jax.training import fit, multi_step_loss
+from sfkd_jax.types import Key, Model, Params, Space, Trajectory
+
+STARTS = ("random", "identified")
+START = 1
+"""Stream folded into the run's seed; initial weights and windows use stream 0."""
+
+
+def train_policy(settings: dict[str, Any], dataset: Dataset, data_hash: str) -> None:
+    """Train, then write the best weights and their prediction error on the test part.
+
+    Args:
+        settings: of the run.
+        dataset: all of its parts.
+        data_hash: of the data set.
+    """
+    run_dir, options = store.run_directory(settings), dict(settings["training"])
+    recorded = store.policy_settings(settings, dataset)
+    dataset = dataset._replace(
+        train=first_share(dataset.train, options.pop("data_share"))
+    )
+    space = measure_space(dataset)
+    model = build.build_model(
+        settings["model"], space, build.build_vehicle(settings["vehicle"])
+    )
+    horizon = options["window"]
+    key = jax.random.fold_in(jax.random.key(settings["seed"]), 0)
+    if model.fitting.identify is not None:
+        artefacts.print_message(
+            f"identifying {settings['model']['system']} in {run_dir}"
+        )
+        params, best = (
+            model.fitting.identify(dataset.train, dataset.validation, key),
+            None,
+        )
+    else:
+        params, best = _fit(settings, options, model, space, dataset, key)
+    predict = jax.jit(
+        lambda params, data: open_loop(
+            model, fold(model, params), data, horizon=horizon
+        )
+    )
+    errors = predict(params, dataset.test)
+    document = store.open_loop_document(errors, dataset.test, settings["vehicle"]["dt"])
+    artefacts.write_json(run_dir / "open_loop.json", document)
+    recorded |= {"controller": settings["controller"], "experiment": settings["name"]}
+    recorded |= {"space": build.space_to_settings(space), "best_step": best}
+    policy.save(
+        run_dir / "policy.npz",
+        params,
+        recorded,
+        made_from={"dataset": data_hash},
+        law=path_law.ensure_law(settings),
+    )
+
+
+def _fit(
+    settings: dict[str, Any],
+    options: dict[str, Any],
+    model: Model,
+    space: Space,
+    dataset: Dataset,
+    key: Key,
+) -> tuple[Params, int | None]:
+    """Fit a model by gradient descent; return the best weights and their step."""
+    run_dir, options = store.run_directory(settings), dict(options)
+    length, start = options.pop("window"), options.pop("start", "random")
+    loss = multi_step_loss(model, space, **options.pop("loss"))
+    draw = partial(random_windows, batch=options.pop("batch"), length=length)
+    held_out = spread_windows(dataset.validation, length=length)
+    artefacts.print_message(
+        f"training {settings['model']['system']}, {options['steps']} steps, "
+        f"in {run_dir}"
+    )
+    options["inspect"] = partial(contraction_metrics, model)
+    started = with_start(model, start, dataset.train, settings["seed"])
+    return fit(started, loss, draw, dataset.train, held_out, key, run_dir, **options)
+
+
+def with_start(model: Model, start: str, train: Trajectory, seed: int) -> Model:
+    """Return the model with the initial weights of `training.start`.
+
+    Args:
+        model: to train.
+        start: "random", or "identified" for a linear part found by regression.
+        train: data of the regression.
+        seed: of the run.
+
+    Raises:
+        ValueError: an unknown start, or one that this model does not have.
+    """
+    if start not in STARTS:
+        raise ValueError(
+            f"training.start must be one of {', '.join(STARTS)}, got {start!r}"
+        )
+    if start == "random":
+        return model
+    if model.fitting.start is None:
+        raise ValueError(
+            "training.start=identified needs a model=sfkd…, "
+            "whose linear part can be identified"
+        )
+    start_from, key = (
+        model.fitting.start,
+        jax.random.fold_in(jax.random.key(seed), START),
+    )
+    return model._replace(init=lambda drawn: start_from(model.init(drawn), train, key))
