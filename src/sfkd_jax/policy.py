@@ -14,7 +14,8 @@ import jax.numpy as jnp
 import numpy as np
 
 from sfkd_jax import artefacts, build
-from sfkd_jax.control import PathLaw, law_to_arrays, law_from_arrays
+from sfkd_jax.control import PathLaw, law_from_arrays, law_to_arrays
+from sfkd_jax.core.folding import fold, unfold
 from sfkd_jax.types import Controller, Model, Params
 from sfkd_jax.vehicle import Vehicle
 
@@ -65,6 +66,11 @@ class Policy(NamedTuple):
     certificate: dict[str, Any] | None
     settings: dict[str, Any]
     law: PathLaw | None = None
+
+    @property
+    def weights(self) -> Params:
+        """The learned parameters as they were saved, to train on or to save again."""
+        return unfold(self.params)
 
 
 def save(
@@ -182,9 +188,8 @@ def load(
             f"{file}: nothing is certified and nothing is monitored; {reason}",
             stacklevel=2,
         )
-    return Policy(
-        trained.model, trained.params, planner, certificate, settings, trained.law
-    )
+    params = jax.jit(fold, static_argnums=0)(trained.model, trained.params)
+    return Policy(trained.model, params, planner, certificate, settings, trained.law)
 
 
 def read_certificate(

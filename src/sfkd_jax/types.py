@@ -1,6 +1,6 @@
-"""The hallway: what vehicle (truth), models (belief) and control (decision) meet in.
+"""Shared types: what vehicles, models, controllers and certificates exchange.
 
-Symbols, used in every room: state x = (pose g in SE(2), body state s), control u,
+Symbols, used in every package: state x = (pose g in SE(2), body state s), control u,
 environment e, latent z. Every function named here works on one sample; callers vmap.
 """
 
@@ -8,10 +8,10 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any, NamedTuple, TypeAlias
+from typing import Any, NamedTuple, Required, TypeAlias, TypedDict
 
 import jax
-from jaxtyping import Array, Float, PRNGKeyArray
+from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray
 
 Key: TypeAlias = PRNGKeyArray
 State: TypeAlias = Float[Array, " state"]
@@ -26,23 +26,23 @@ Latent: TypeAlias = Any
 Step: TypeAlias = Callable[[State, Control, Environment], State]
 
 POSE = slice(0, 3)
-"""Where the pose (p_x [m], p_y [m], yaw [rad]) stands in a state."""
+"""Entries of the pose (p_x [m], p_y [m], yaw [rad]) in a state."""
 BODY = slice(3, None)
-"""Where the body state stands in a state: v [m/s], then (v_y [m/s], yaw rate [rad/s],
-steering [rad]).
-"""
+"""Entries of the body state: v [m/s], then (v_y [m/s], yaw rate [rad/s], steering)."""
 
 
 class Space(NamedTuple):
-    """Measured scales of a data set: they fix a model's dimensions and its units.
+    """Measured scales of a data set; they fix the sizes and the units of a model.
 
     Attributes:
-        body_mean, body_scale: centre and half width of the body state s, shape (nb,).
-        control_mean, control_scale: the same for u, shape (nu,).
-        env_mean, env_scale: centre and half width of the environment box E, shape
-            (ne,).
-        increment_mean, increment_scale: of the body-frame pose increment over one step,
-            shape (3,).
+        body_mean: centre of the body state s, shape (nb,).
+        body_scale: half width of s, shape (nb,).
+        control_mean: centre of the control u, shape (nu,).
+        control_scale: half width of u, shape (nu,).
+        env_mean: centre of the environment box E, shape (ne,).
+        env_scale: half width of E, shape (ne,).
+        increment_mean: centre of the body-frame pose increment of a step, shape (3,).
+        increment_scale: half width of that increment, shape (3,).
     """
 
     body_mean: Float[Array, " body"]
@@ -62,7 +62,9 @@ class Polytope(NamedTuple):
 
 
 class Hypernetwork(NamedTuple):
-    """A(e) is what a tanh network of e emits: vec A(e) = V_L tanh(… tanh(V_1 e + c_1) …) + c_L, row by row.
+    """A(e) is the output of a tanh network of e, row by row.
+
+        vec A(e) = V_L tanh(… tanh(V_1 e + c_1) …) + c_L
 
     Attributes:
         weights: V_1 … V_L, each (out, in).
@@ -74,7 +76,7 @@ class Hypernetwork(NamedTuple):
 
 
 class Samples(NamedTuple):
-    """A(e) at some environments, (sample, rank, rank), and nothing about those between: evidence, never a proof."""
+    """A(e) at sampled environments only, (sample, rank, rank): evidence, no proof."""
 
     operators: Float[Array, "sample rank rank"]
 
@@ -82,12 +84,12 @@ class Samples(NamedTuple):
 @jax.tree_util.register_static
 @dataclass(frozen=True)
 class Declared:
-    """What a model states about itself in words, for a certificate to accept or refuse.
+    """Properties that a model declares and a certificate accepts or refuses.
 
     Attributes:
         activation: σ of the residual and the decoder.
         transport: "identity" or "rotation" (of planes, an isometry).
-        controls: how many there are.
+        controls: number of controls.
     """
 
     activation: str
@@ -96,17 +98,15 @@ class Declared:
 
 
 class Explicit(NamedTuple):
-    """What a certificate speaks about: the weights a model multiplies by, and nothing hidden.
+    """The plain weights of a discrete-time model; a certificate is about these.
 
     z⁺ = A(e) z + B(e) u + W_L σ(… σ(W_1 z + b_1(u, e)) …) + b_L(u, e), σ with slopes in
     [0, 1].
 
     Attributes:
         operators: what is known of A(e) for all e.
-        residual: W_1 … W_L of the residual, each (out, in); empty for a model without
-            one.
-        residual_multipliers: λ_1 … λ_{L-1}, diagonal multipliers proposed as a
-            Lipschitz witness; () if none.
+        residual: W_1 … W_L of the residual, each (out, in); () without a residual.
+        residual_multipliers: λ_1 … λ_{L-1}, a proposed Lipschitz witness, or ().
         decoder: W_1 … W_L of the pose-increment decoder, in physical units over z.
         decoder_multipliers: as for the residual.
         readout: C of the body state, s = C z + c, in physical units, (body, rank).
@@ -123,7 +123,7 @@ class Explicit(NamedTuple):
 
 
 class Incremental(NamedTuple):
-    """A state equation in continuous time, and what is to prove that it contracts.
+    """The state equation of a continuous-time model and a witness that it contracts.
 
     ds/dt = A_0 s + A σ(W s + c) + g(u, e) in scaled units of s, per second; σ entry by
     entry with slopes in [0, 1].
@@ -146,10 +146,12 @@ class Incremental(NamedTuple):
 
 
 class LinearPredictor(NamedTuple):
-    """z⁺ = A z + B u + d κ + c, x = C z + o, z = lift(x): linear in a lift of the state along a path, for one e.
+    """A predictor of the state along a path that is linear in a lift, for one e.
+
+        z⁺ = A z + B u + d κ + c,   x = C z + o,   z = lift(x)
 
     x is a `State` whose pose is (progress [m], distance left of the path [m], yaw
-    against it [rad]); κ is the path's curvature [1/m].
+    relative to it [rad]); κ is the path's curvature [1/m].
     """
 
     lift: Callable[[State], Float[Array, " rank"]]
@@ -161,38 +163,56 @@ class LinearPredictor(NamedTuple):
     o: State
 
 
+class Fitting(NamedTuple):
+    """How the parameters of a model are fitted, besides gradient descent from `init`.
+
+    Attributes:
+        identify: (training, validation data, key) -> params by regression, or None.
+        start: (params, training data, key) -> params to train from, their linear part
+            by regression, or None.
+        penalty: (fiber, latent, control) -> extra term of the training loss, or None.
+    """
+
+    identify: Callable[[Trajectory, Trajectory, Key], Params] | None = None
+    start: Callable[[Params, Trajectory, Key], Params] | None = None
+    penalty: Callable[[Fiber, Latent, Control], Scalar] | None = None
+
+
+class Structure(NamedTuple):
+    """What is known of a model by construction; None where nothing is.
+
+    Attributes:
+        explicit: params -> `Explicit`, `Incremental` in continuous time, or None.
+        rate: params -> α, the contraction rate of `step`, or None if there is none.
+        linear: fiber -> `LinearPredictor`, or None.
+    """
+
+    explicit: Callable[[Params], Explicit | Incremental] | None = None
+    rate: Callable[[Params], Scalar] | None = None
+    linear: Callable[[Fiber], LinearPredictor] | None = None
+
+
 class Model(NamedTuple):
     """A rollout model as pure functions over pytrees.
 
+    A model whose latent is the physical state needs `init`, `fiber` and `step` only:
+    `models.state_model` fills in the rest.
+
     Attributes:
         init: key -> params.
-        fiber: (params, env) -> all that depends on e alone; once per control step,
-            outside every scan.
+        fiber: (params, env) -> all that depends on e, evaluated once per control step;
+            params may be `core.folding.Folded`.
         encode: (fiber, state) -> latent.
         step: (fiber, latent, control) -> latent one sampling period later.
         decode: (fiber, latent) -> state.
-        transport: (fiber, fiber_next, latent) -> latent, on a switch e -> e'.
-        observe: (fiber, latent, state) -> the latent a perfect model would hold at
-            `state`, in `latent`'s frame.
-        vector: latent -> z, the coordinates a contraction claim is about, shape
-            (rank,).
-        explicit: params -> `Explicit`, or `Incremental` for a model in continuous time
-            about whose rate alone something can be proved, or None for a model about
-            which nothing can be certified.
-        penalty: (fiber, latent, control) -> an extra term of the training loss, or
-            None.
-        identify: (training, validation trajectories, key) -> params, by regression at
-            once, or None.
-        start: (params, training trajectories, key) -> params to train from, linear part
-            by regression, or None.
-        linear: fiber -> `LinearPredictor`, or None for a model that is not linear in a
-            lift.
-        fold: params -> params that `fiber` takes as well, with all that depends on no
-            environment evaluated. To drive with: what it saves is what a control step
-            would do anew each time.
-        rate: params -> α that `step` contracts with by construction, or None.
-        along_path: whether states and controls are those of `path_frame`, which have no
-            pose to predict.
+        transport: (fiber, fiber_next, latent) -> latent, when e switches to e'.
+        observe: (fiber, latent, state) -> latent of `state`, in the frame of `latent`.
+        vector: latent -> z, the coordinates in which contraction is claimed, (rank,).
+        shared: params -> the part of every fiber that does not depend on e, computed
+            once before driving; None if there is no such part.
+        fitting: how the parameters are fitted.
+        structure: what is known by construction.
+        along_path: whether states and controls are those of `core.path_frame`.
     """
 
     init: Callable[[Key], Params]
@@ -203,18 +223,54 @@ class Model(NamedTuple):
     transport: Callable[[Fiber, Fiber, Latent], Latent]
     observe: Callable[[Fiber, Latent, State], Latent]
     vector: Callable[[Latent], Float[Array, " rank"]]
-    explicit: Callable[[Params], Explicit | Incremental] | None = None
-    penalty: Callable[[Fiber, Latent, Control], Scalar] | None = None
-    identify: Callable[[Trajectory, Trajectory, Key], Params] | None = None
-    start: Callable[[Params, Trajectory, Key], Params] | None = None
-    linear: Callable[[Fiber], LinearPredictor] | None = None
-    fold: Callable[[Params], Params] = lambda params: params
-    rate: Callable[[Params], Scalar] | None = None
+    shared: Callable[[Params], Any] | None = None
+    fitting: Fitting = Fitting()
+    structure: Structure = Structure()
     along_path: bool = False
 
 
+class ControllerInfo(TypedDict, total=False):
+    """Diagnostics of a control step: planners give the first six, wrappers add keys."""
+
+    cost: Required[Scalar]  # lowest cost of all samples
+    mean_cost: Required[Scalar]  # cost of the chosen plan
+    effective_samples: Required[Scalar]  # 1 / Σ w²; NaN if nothing is sampled
+    healthy: Required[Bool[Array, ""]]  # False: the last finite plan is continued
+    env_inside: Required[Bool[Array, ""]]  # whether e is in its box
+    predicted_states: Required[Float[Array, "horizon state"]]  # of the chosen plan
+    # koopman_mpc
+    residual: Scalar  # of the quadratic program, in control units
+    # monitored
+    breach: Bool[Array, ""]  # a disturbance exceeds its bound
+    box_exit: Bool[Array, ""]  # (s, u, e) is outside its box
+    breaches: Int[Array, ""]  # number of steps with a breach so far
+    box_exits: Int[Array, ""]  # number of steps with a box exit so far
+    disturbance: Float[Array, " 4"]  # latent [-], position [m], yaw [rad], body state
+    fallback_active: Bool[Array, ""]
+    # estimated
+    env_estimate: Environment  # mean over the hypotheses
+    env_spread: Environment  # standard deviation over the hypotheses
+    # delay_compensated
+    arrival_state: State  # predicted state at which the control arrives
+    # shielded
+    margin: Scalar  # distance of the nominal copy to the edge of its corridor [m]
+    intervention: Scalar  # share of the request that was removed, in [0, 1]
+    perturbation: Control  # ν applied on top of the law, in control units
+    copy: Float[Array, " coordinate"]  # path coordinates of the nominal copy
+    copy_distance: Scalar  # |e_y| between vehicle and copy [m]
+    corridor: Scalar  # certified half width [m]
+    feasible: Bool[Array, ""]  # margin is not negative
+    broken: Bool[Array, ""]  # copy_distance exceeds the certified bound
+    void: Bool[Array, ""]  # outside the boxes of the certificate
+    dead_reckoning: Bool[Array, ""]  # observation or reference is not finite
+    request_finite: Bool[Array, ""]  # the filtered controller gave a finite control
+    interventions: Int[Array, ""]  # number of steps with an intervention so far
+    broken_steps: Int[Array, ""]  # number of broken steps so far
+    shield_healthy: Bool[Array, ""]  # feasible, and the certificate applies
+
+
 class Controller(NamedTuple):
-    """A decision rule as two pure functions.
+    """A control law as two pure functions.
 
     Attributes:
         init: key -> controller state.
@@ -225,12 +281,12 @@ class Controller(NamedTuple):
     init: Callable[[Key], Any]
     act: Callable[
         [Params, Any, State, Environment, Reference],
-        tuple[Control, Any, dict[str, Array]],
+        tuple[Control, Any, ControllerInfo],
     ]
 
 
 class Trajectory(NamedTuple):
-    """What was driven.
+    """States, controls and environments of a drive.
 
     Attributes:
         states: x_0 … x_T, shape (*batch, time + 1, state).

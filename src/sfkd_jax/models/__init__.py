@@ -1,4 +1,4 @@
-"""Belief: every file one factory that returns a `Model`; `FACTORIES` is the registry by name."""
+"""Rollout models: one factory per file, listed by name in `FACTORIES`."""
 
 from sfkd_jax.models._control_synth import control_synth as control_synth
 from sfkd_jax.models._icode import icode as icode
@@ -7,6 +7,7 @@ from sfkd_jax.models._koopman import koopman as koopman
 from sfkd_jax.models._neural_ode import neural_ode as neural_ode
 from sfkd_jax.models._physics import physics as physics
 from sfkd_jax.models._r2dn import r2dn as r2dn
+from sfkd_jax.models._state_model import state_model as state_model
 from sfkd_jax.models.sfkd import sfkd as sfkd
 
 FACTORIES = {

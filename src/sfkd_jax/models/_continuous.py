@@ -1,4 +1,4 @@
-"""Models in continuous time: learned rates of the body state, integrated together with the pose."""
+"""Models in continuous time: learned rates, integrated together with the pose."""
 
 from __future__ import annotations
 
@@ -10,17 +10,18 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from sfkd_jax.core.se2 import rotate
+from sfkd_jax.models._state_model import NO_STRUCTURE, state_model
 from sfkd_jax.types import (
     BODY,
     Control,
     Environment,
-    Explicit,
     Fiber,
     Key,
     Model,
     Params,
     Space,
     State,
+    Structure,
 )
 
 SOLVERS = ("rk4", "euler")
@@ -28,7 +29,7 @@ FRAMES = ("body", "path")
 
 
 class Conditioned(NamedTuple):
-    """The fibre of a model that reads e as one more input: nothing is worth computing ahead.
+    """The fiber of a model that reads e as one more input: nothing is precomputed.
 
     Attributes:
         params: of the networks.
@@ -49,32 +50,33 @@ def continuous(
     environment: bool = True,
     solver: str = "rk4",
     known: Callable[[Fiber, State, Control], State] | None = None,
-    explicit: Callable[[Params], Explicit] | None = None,
+    structure: Structure = NO_STRUCTURE,
     frame: str = "body",
 ) -> Model:
-    """A model ds/dt = r_s(s, u; e) whose latent is the state itself, one step of a fixed-step solver per period.
+    """Return a model with learned rates and one solver step per sampling period.
 
         ġ = R(yaw) (m_g + S_g r_g(s, u; e)) / dt,   ṡ = S_s r_s(s, u; e)
 
-    with s and u scaled, m_g, S_g centre and scale of the pose increment over dt, S_s
-    the scale of s; u and e are held over dt. R turns the velocity along and across the
-    body into the world, so the step commutes with SE(2).
+    The latent is the state itself. s and u are scaled; m_g and S_g are centre and scale
+    of the pose increment over dt, S_s is the scale of s; u and e are held over dt. R
+    turns the velocity along and across the car into the world frame, so the model is
+    equivariant under SE(2).
 
     Args:
         space: measured scales; fixes all sizes.
-        dt: sampling period [s].
+        dt: sampling period [s], the solver's step in training and in use.
         init: key -> params.
         fiber: (params, scaled e) -> all that depends on e alone.
         rates: (fiber, scaled s, scaled u) -> (r_g, r_s), shape (3 + body,); r_s per
             second.
-        environment: use e at all; if not, `fiber` is given zeros.
+        environment: whether e is used; if not, `fiber` is given zeros.
         solver: "rk4" or "euler", in training and in use.
-        known: (fiber, state, control) -> dx/dt known beforehand, in the world and in
-            physical units, equivariant under SE(2). The rates are then added to it, and
-            m_g is left out.
-        explicit: as in `Model`.
-        frame: "body", or "path" for path coordinates: no pose, so r_g counts for
-            nothing.
+        known: (fiber, state, control) -> known dx/dt in the world frame and physical
+            units, equivariant under SE(2). The rates are added to it, and m_g is
+            omitted.
+        structure: as in `Model`.
+        frame: "body", or "path" for path coordinates, which have no pose: r_g is
+            ignored.
 
     Raises:
         ValueError: an unknown solver; a state of the wrong length, when it is encoded.
@@ -83,11 +85,14 @@ def continuous(
         raise ValueError(
             f"model.solver must be one of {', '.join(SOLVERS)}, got {solver!r}"
         )
-    size, pose = 3 + space.body_mean.shape[0], has_pose(frame)
+    pose = has_pose(frame)
     drift = jnp.asarray(space.increment_mean) if known is None else jnp.zeros(3)
 
     def scaled_fiber(params: Params, env: Environment) -> Fiber:
         return fiber(params, scaled_env(space, env, environment))
+
+    def scaled_body(state: State) -> Float[Array, " body"]:
+        return (state[BODY] - space.body_mean) / space.body_scale
 
     def derivative(at: Fiber, state: State, control: Control) -> State:
         scaled_control = (control - space.control_mean) / space.control_scale
@@ -101,39 +106,34 @@ def continuous(
         return change if known is None else change + known(at, state, control)
 
     def step(at: Fiber, state: State, control: Control) -> State:
-        k1 = derivative(at, state, control)
-        if solver == "euler":
-            return state + dt * k1
-        k2 = derivative(at, state + 0.5 * dt * k1, control)
-        k3 = derivative(at, state + 0.5 * dt * k2, control)
-        k4 = derivative(at, state + dt * k3, control)
-        return state + dt / 6.0 * (k1 + 2.0 * k2 + 2.0 * k3 + k4)
+        return _solver_step(lambda x: derivative(at, x, control), state, dt, solver)
 
-    def encode(at: Fiber, state: State) -> State:
-        del at
-        if state.shape != (size,):
-            raise ValueError(f"state must have shape ({size},), got {state.shape}")
-        return state
-
-    def scaled_body(state: State) -> Float[Array, " body"]:
-        return (state[BODY] - space.body_mean) / space.body_scale
-
-    return Model(
-        init=init,
-        fiber=scaled_fiber,
-        encode=encode,
-        step=step,
-        decode=lambda at, latent: latent,
-        transport=lambda at, after, latent: latent,
-        observe=lambda at, latent, state: encode(at, state),
+    return state_model(
+        init,
+        scaled_fiber,
+        step,
         vector=scaled_body,
-        explicit=explicit,
+        state_size=3 + space.body_mean.shape[0],
+        structure=structure,
         along_path=not pose,
     )
 
 
+def _solver_step(
+    derivative: Callable[[State], State], state: State, dt: float, solver: str
+) -> State:
+    """One step of RK4 or Euler, control and environment held."""
+    k1 = derivative(state)
+    if solver == "euler":
+        return state + dt * k1
+    k2 = derivative(state + 0.5 * dt * k1)
+    k3 = derivative(state + 0.5 * dt * k2)
+    k4 = derivative(state + dt * k3)
+    return state + dt / 6.0 * (k1 + 2.0 * k2 + 2.0 * k3 + k4)
+
+
 def has_pose(frame: str) -> bool:
-    """Whether a model predicts a pose: in the frame of the body; along a path there is none.
+    """Whether a model in this frame predicts a pose; path coordinates have none.
 
     Raises:
         ValueError: an unknown frame.
@@ -146,26 +146,28 @@ def has_pose(frame: str) -> bool:
 
 
 def scaled_env(space: Space, env: Environment, environment: bool) -> Environment:
-    """(e − centre) / half width, in [-1, 1] inside the box E; zeros for a model that does not see e."""
+    """Return (e − centre) / half width, or zeros for a model that ignores e.
+
+    Inside the box E every entry lies in [-1, 1].
+    """
     scaled = (env - space.env_mean) / space.env_scale
     return scaled if environment else jnp.zeros_like(scaled)
 
 
-def network(
+def mlp(
     hidden: Sequence[int],
     outputs: int,
     activations: Sequence[Callable[[Array], Array]],
     *,
     last: float,
 ) -> nn.Sequential:
-    """W_L σ_{L-1}(… σ_1(W_1 x + b_1) …) + b_L.
+    """Return the network W_L σ_{L-1}(… σ_1(W_1 x + b_1) …) + b_L.
 
     Args:
-        hidden: widths, one a hidden layer.
-        outputs: size of the result.
+        hidden: widths of the hidden layers.
+        outputs: number of outputs.
         activations: σ_1 … σ_{L-1}.
-        last: what the initial W_L is multiplied by; near 0, the model starts from no
-            learned rates at all.
+        last: factor of the initial W_L; near 0, the initial rates vanish.
     """
     layers = [
         part

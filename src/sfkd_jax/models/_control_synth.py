@@ -1,4 +1,4 @@
-"""ControlSynth neural ordinary differential equation: contracting by construction, inputs added from outside."""
+"""ControlSynth neural ODE: contracting by construction, with additive inputs."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from sfkd_jax.models._continuous import continuous, network
+from sfkd_jax.models._continuous import continuous, mlp
 from sfkd_jax.types import (
     Control,
     Declared,
@@ -19,15 +19,16 @@ from sfkd_jax.types import (
     Model,
     Params,
     Space,
+    Structure,
 )
 
 GAIN = 0.3
-"""Initial size of the networks in the state: their decay is GAIN² per second, slow
+"""Initial size of the networks of the state: their decay is GAIN² per second, slow
 against the sampling period.
 """
 ROUNDING = 1e-5
-"""Of the size of the matrices, added to the rate: so that what is exact on paper still
-holds in float32.
+"""Margin on the rate relative to the size of the matrices, so that the inequality
+also holds in float32.
 """
 
 
@@ -47,14 +48,14 @@ class Synthesis(NamedTuple):
     offsets: Float[Array, " hidden"]
 
     def __call__(self, body: Float[Array, " body"]) -> Float[Array, " out"]:
-        """The value at one scaled body state."""
+        """Evaluate at one scaled body state."""
         return self.linear @ body + self.outer @ jnp.tanh(
             self.inner @ body + self.offsets
         )
 
 
 class ControlSynthFiber(NamedTuple):
-    """The matrices as they are multiplied by; e is one more input.
+    """The explicit matrices; e is one more input.
 
     Attributes:
         change: of ds/dt.
@@ -79,33 +80,36 @@ def control_synth(
     input_hidden: tuple[int, ...] = (96, 96),
     environment: bool = True,
 ) -> Model:
-    """Networks of the state beside a network of the input, contracting at a hard rate, solved by RK4 at dt.
+    """Networks of the state beside a network of the input, contracting at a hard rate.
 
-        ds/dt = A_0 s + Σ_j A_j tanh(W_j s + c_j) + g(u, e),   twist = C_0 s + Σ_j C_j tanh(V_j s + d_j) + h(u, e)
+        ds/dt = A_0 s + Σ_j A_j tanh(W_j s + c_j) + g(u, e)
+        twist = C_0 s + Σ_j C_j tanh(V_j s + d_j) + h(u, e)
 
-    By construction, for all weights, two solutions under the same inputs approach each
-    other at γ = `rate`, in the metric of a learned P = T'T: with A = [A_1 … A_M], W =
-    [W_1; …; W_M] and a learned diagonal Λ > 0,
+    Solved by RK4 at dt. By construction, for all weights, two solutions under the same
+    inputs approach each other at γ = `rate`, in the metric of a learned P = T'T: with
+    A = [A_1 … A_M], W = [W_1; …; W_M] and a learned diagonal Λ > 0,
 
         [ A_0'P + P A_0 + 2γP   PA + W'Λ ]
-        [          ·               −2Λ   ]  ≤  0,   as  T A_0 T⁻¹ = −γI − ¼ BB' − ½ XX' + (Y − Y'),
-                                                        T A = (B − Ŵ') Λ^½,   W T⁻¹ = Λ^(−½) Ŵ
+        [          ·               −2Λ   ]  ≤  0,   since
+
+        T A_0 T⁻¹ = −γI − ¼ BB' − ½ XX' + (Y − Y'),
+        T A = (B − Ŵ') Λ^½,   W T⁻¹ = Λ^(−½) Ŵ
 
     (Schur's complement of −2Λ leaves −XX'). B, X, Y, Ŵ and Λ are free, T is triangular
     and well conditioned. The claim is about the continuous flow, not about its RK4
     discretisation. Inputs are only added, as in the original: that is a limit of the
-    structure, and it is kept. There the input is a second state of an autonomous
-    system, and the published code has neither A_j nor a matrix inequality; the offsets
-    c_j, d_j leave the proof as it is.
+    published structure, kept here. In the original the input is a second state of an
+    autonomous system, and the published code has neither A_j nor a matrix inequality.
+    The offsets c_j and d_j do not affect the proof.
 
     Args:
         space: measured scales; fixes all sizes.
         dt: sampling period [s], the solver's step in training and in use.
-        networks: M, of the state, and as many of the output.
-        width: of each.
+        networks: M, number of networks of the state and of the output.
+        width: of each network.
         rate: γ [1/s].
         input_hidden: widths of the network that holds g and h.
-        environment: use e at all.
+        environment: whether e is used.
 
     Raises:
         ValueError: no network, or a rate that is not positive.
@@ -114,44 +118,25 @@ def control_synth(
     """
     if networks < 1 or width < 1:
         raise ValueError(
-            f"model.networks and model.width must be at least 1, got {networks} and {width}"
+            "model.networks and model.width must be at least 1, "
+            f"got {networks} and {width}"
         )
     if not 0.0 < rate < float("inf"):
         raise ValueError(f"model.rate must be positive, got {rate}")
-    body, hidden = space.body_mean.shape[0], networks * width
-    control = space.control_mean.shape[0]
-    inputs = network(input_hidden, 3 + body, (nn.tanh,) * len(input_hidden), last=0.1)
+    body, control = space.body_mean.shape[0], space.control_mean.shape[0]
+    inputs = mlp(input_hidden, 3 + body, (nn.tanh,) * len(input_hidden), last=0.1)
 
     def init(key: Key) -> Params:
-        keys = jax.random.split(key, 6)
-        return {
-            "free": {
-                "B": 0.1 * jax.random.normal(keys[0], (body, hidden)),
-                "W": jax.random.normal(keys[1], (hidden, body)),
-                "X": 0.1 * jnp.eye(body),
-                "Y": jnp.zeros((body, body)),
-                "T": jnp.zeros((body, body)),
-                "log_multipliers": jnp.zeros(hidden),
-                "offsets": jax.random.uniform(keys[2], (hidden,), minval=-1.0),
-            },
-            "twist": {
-                "linear": jnp.zeros((3, body)),
-                "outer": 0.1 * hidden**-0.5 * jax.random.normal(keys[3], (3, hidden)),
-                "inner": jax.random.normal(keys[4], (hidden, body)),
-                "offsets": jnp.linspace(-1.0, 1.0, hidden),
-            },
-            "inputs": inputs.init(
-                keys[5], jnp.zeros(control + space.env_mean.shape[0])
-            )["params"],
-        }
+        read = jnp.zeros(control + space.env_mean.shape[0])
+        return _initial(key, body, networks * width, inputs, read)
 
     def explicit(params: Params) -> Incremental:
         return contracting(params["free"], rate, Declared("tanh", "identity", control))
 
     def fiber(params: Params, env: Environment) -> ControlSynthFiber:
-        found = explicit(params)
+        flow = explicit(params)
         change = Synthesis(
-            found.linear, found.outer, found.inner, params["free"]["offsets"]
+            flow.linear, flow.outer, flow.inner, params["free"]["offsets"]
         )
         return ControlSynthFiber(
             change, Synthesis(**params["twist"]), params["inputs"], env
@@ -164,14 +149,47 @@ def control_synth(
         added = cast(jax.Array, inputs.apply({"params": fiber.inputs}, read))
         return jnp.concatenate([fiber.twist(body), fiber.change(body)]) + added
 
-    model = continuous(
-        space, dt=dt, init=init, fiber=fiber, rates=rates, environment=environment
+    return continuous(
+        space,
+        dt=dt,
+        init=init,
+        fiber=fiber,
+        rates=rates,
+        environment=environment,
+        structure=Structure(explicit=explicit),
     )
-    return model._replace(explicit=explicit)
+
+
+def _initial(
+    key: Key, body: int, hidden: int, inputs: nn.Module, read: Float[Array, " inputs"]
+) -> Params:
+    """Random initial parameters."""
+    keys = jax.random.split(key, 6)
+    return {
+        "free": {
+            "B": 0.1 * jax.random.normal(keys[0], (body, hidden)),
+            "W": jax.random.normal(keys[1], (hidden, body)),
+            "X": 0.1 * jnp.eye(body),
+            "Y": jnp.zeros((body, body)),
+            "T": jnp.zeros((body, body)),
+            "log_multipliers": jnp.zeros(hidden),
+            "offsets": jax.random.uniform(keys[2], (hidden,), minval=-1.0),
+        },
+        "twist": {
+            "linear": jnp.zeros((3, body)),
+            "outer": 0.1 * hidden**-0.5 * jax.random.normal(keys[3], (3, hidden)),
+            "inner": jax.random.normal(keys[4], (hidden, body)),
+            "offsets": jnp.linspace(-1.0, 1.0, hidden),
+        },
+        "inputs": inputs.init(keys[5], read)["params"],
+    }
 
 
 def contracting(free: Params, rate: float, declared: Declared) -> Incremental:
-    """Free matrices made into those of a state equation that contracts at `rate` [1/s]: see `control_synth`."""
+    """Map free matrices to a state equation that contracts at `rate` [1/s].
+
+    See `control_synth` for the parametrisation.
+    """
     body, hidden = free["B"].shape
     entries = jnp.tanh(free["T"])  # so that the metric stays well conditioned
     T = jnp.tril(entries, -1) + jnp.diag(jnp.exp(jnp.diag(entries)))

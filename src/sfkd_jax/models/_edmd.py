@@ -1,4 +1,4 @@
-"""Extended dynamic mode decomposition: a lift by radial functions, and pairs along circles."""
+"""Extended dynamic mode decomposition: radial functions and pairs along circles."""
 
 from __future__ import annotations
 
@@ -10,27 +10,29 @@ from sfkd_jax.core.se2 import between, compose, wrap_angle
 from sfkd_jax.types import BODY, POSE, Scalar, State
 
 STRAIGHT = 1e-12
-"""Curvature [1/m] that stands for less, so that nothing divides by 0."""
+"""Smallest curvature [1/m], so that nothing divides by 0."""
 
 
 def thin_plate(
     point: Float[Array, " n"], centres: Float[Array, "function n"]
 ) -> Float[Array, " function"]:
-    """r² log r of the distances r to every centre; 0 at r = 0."""
+    """Return r² log r of the distances r to every centre; 0 at r = 0."""
     squares = jnp.sum((point - centres) ** 2, axis=1)
-    apart = squares > 0
+    positive = squares > 0
     return jnp.where(
-        apart, 0.5 * squares * jnp.log(jnp.where(apart, squares, 1.0)), 0.0
+        positive, 0.5 * squares * jnp.log(jnp.where(positive, squares, 1.0)), 0.0
     )
 
 
 def along_circle(
     states: Float[Array, "time state"], offset: Float[Array, " 2"], curvature: Scalar
 ) -> Float[Array, "time state"]:
-    """States as seen from a circle that is laid so that the first one has a given offset from it.
+    """Return states relative to a circle from which the first one has a given offset.
 
-        e_y = (2Y − κ (X² + Y²)) / (1 + D),   s = atan2(κX, 1 − κY) / κ,   e_ψ = Θ − κ s,   D = |(κX, 1 − κY)|,
-    (X, Y, Θ) the pose in the frame of the circle's point next to the first state.
+        e_y = (2Y − κ (X² + Y²)) / (1 + D),   s = atan2(κX, 1 − κY) / κ,
+        e_ψ = Θ − κ s,   D = |(κX, 1 − κY)|,
+
+    (X, Y, Θ) the pose in the frame of the circle's point closest to the first state.
 
     Args:
         states: x_0 … x_T.

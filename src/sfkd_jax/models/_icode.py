@@ -1,4 +1,4 @@
-"""Input concomitant neural ordinary differential equation: rates affine in control and environment."""
+"""ICODE: a neural ODE with rates affine in control and environment."""
 
 from __future__ import annotations
 
@@ -10,16 +10,17 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from sfkd_jax.models._continuous import Conditioned, continuous, network
+from sfkd_jax.models._continuous import Conditioned, continuous, mlp
 from sfkd_jax.types import Control, Key, Model, Params, Space
 
 
 @jax.custom_jvp
 def softplus(x: Float[Array, "*shape"]) -> Float[Array, "*shape"]:
-    """log(1 + exp x), a quarter of the time of `log1p`: that branches per element, and rollouts spend most here.
+    """Return log(1 + exp x), four times as fast as with `log1p`.
 
-    With t = exp −|x| in (0, 1], log(1 + t) = 2 artanh(t / (2 + t)), whose argument is
-    at most 1/3: seven terms of the series leave 2e-8, less than float32 resolves.
+    `log1p` branches for each element, and rollouts spend most of their time there. With
+    t = exp −|x| in (0, 1], log(1 + t) = 2 artanh(t / (2 + t)), whose argument is at
+    most 1/3: seven terms of the series leave 2e-8, less than float32 resolves.
     """
     t = jnp.exp(-jnp.abs(x))
     s = t / (2.0 + t)
@@ -42,21 +43,24 @@ def affine_rates(
     last: float,
     reads_env: bool = False,
 ) -> tuple[Callable[[Key], Params], Callable[[Conditioned, Array, Control], Array]]:
-    """`init` and `rates` of a model in continuous time with rates f(s) + G(s) [u; e], two networks of one shape.
+    """Return `init` and `rates` of a model with rates f(s) + G(s) [u; e].
+
+    f and G are two networks of the same hidden layers.
 
     Args:
         space: measured scales; fixes all sizes.
-        hidden, activations: widths of f and of G, and what follows each.
+        hidden: widths of the hidden layers of f and of G.
+        activations: the activation after each hidden layer.
         last: initial scale of both last layers.
-        reads_env: f(s, e) + G(s, e) u instead: affine in the control alone.
+        reads_env: f(s, e) + G(s, e) u instead, affine in the control alone.
     """
     body, control, env = (
         part.shape[0] for part in (space.body_mean, space.control_mean, space.env_mean)
     )
     outputs, inputs = 3 + body, control + (0 if reads_env else env)
     start = jnp.zeros(body + (env if reads_env else 0))
-    f = network(hidden, outputs, activations, last=last)
-    G = network(hidden, outputs * inputs, activations, last=last)
+    f = mlp(hidden, outputs, activations, last=last)
+    G = mlp(hidden, outputs * inputs, activations, last=last)
 
     def init(key: Key) -> Params:
         f_key, G_key = jax.random.split(key)
@@ -88,21 +92,22 @@ def icode(
     solver: str = "euler",
     environment: bool = True,
 ) -> Model:
-    """Rates that are affine in the control and in the environment.
+    """Input concomitant neural ODE: rates affine in control and environment.
 
-        (ġ, ṡ) = f(s) + G(s) [u; e],   ġ in the frame of the body
+        (ġ, ṡ) = f(s) + G(s) [u; e],   ġ in the body frame
 
-    f and G: a tanh layer, then softplus layers. Tyre forces at their limit are not
-    affine in e: that is a limit of the structure, and it is kept. The original solves
-    by Euler on the grid of the data; since the pose's rates are learned in the frame of
-    the body, an Euler step composes learned increments and loses nothing.
+    f and G have a tanh layer, then softplus layers. Tyre forces at their limit are not
+    affine in e: that is a limit of the published structure, kept here. The original
+    solves by Euler on the grid of the data; since the pose's rates are learned in the
+    body frame, an Euler step composes learned increments and loses nothing.
 
     Args:
         space: measured scales; fixes all sizes.
         dt: sampling period [s], the solver's step in training and in use.
-        width, layers: of the hidden layers of f and of G.
+        width: of the hidden layers of f and of G.
+        layers: number of hidden layers of f and of G.
         solver: "euler" or "rk4".
-        environment: use e at all; if not, G(s) [u; 0].
+        environment: whether e is used; if not, G(s) [u; 0].
 
     Raises:
         ValueError: no hidden layer.

@@ -1,4 +1,4 @@
-"""A textbook model with a learned residual that is affine in control and environment."""
+"""Known dynamics with a learned residual that is affine in control and environment."""
 
 from __future__ import annotations
 
@@ -18,22 +18,23 @@ def icode_mppi(
 ) -> Model:
     """Known dynamics plus a residual f(s) + G(s) [u; e], the sum solved by RK4 at dt.
 
-        ẋ = f_nom(x, u) + f(s) + G(s) [u; e],   the pose part of the residual in the frame of the body
+        ẋ = f_nom(x, u) + f(s) + G(s) [u; e]
 
-    f and G are softplus networks that start near 0: training starts from the known
-    dynamics. The original's residual is f(x) + G(x) u; e joins u.
+    The pose part of the residual is in the body frame. f and G are softplus networks
+    that start near 0, so that training starts from the known dynamics. The residual of
+    the original is f(x) + G(x) u; here e joins u.
 
     Args:
         space: measured scales; fixes all sizes.
         nominal: (x, u, e) -> dx/dt of the known dynamics in physical units, passed in
-            by the caller (models never import the vehicle). A model that does not see e
+            by the caller (models never import the vehicle). A model that ignores e
             gives it the centre of the environment box.
         dt: sampling period [s], the solver's step in training and in use.
         hidden: widths of f and of G.
-        environment: use e at all; if not, G(s) [u; 0].
+        environment: whether e is used; if not, G(s) [u; 0].
         reads_env: f(s, e) + G(s, e) u instead, so that the gain of the steering may
-            depend on friction: more than the original has, and the most that a residual
-            affine in the control can be given.
+            depend on friction. The original has less; a residual affine in the control
+            cannot have more.
 
     Source: Song et al., arXiv 2605.03260, eqs. 10 and 11.
     """

@@ -14,6 +14,7 @@ from sfkd_jax.models._koopman_lift import KoopmanFiber, Lift
 from sfkd_jax.types import (
     POSE,
     Control,
+    Fitting,
     Key,
     LinearPredictor,
     Model,
@@ -21,11 +22,12 @@ from sfkd_jax.types import (
     Pose,
     Space,
     State,
+    Structure,
 )
 
 
 class KoopmanLatent(NamedTuple):
-    """A lift, and the pose from which the straight path that it is measured along begins."""
+    """The lift of a state, and the start of the straight path it is measured along."""
 
     frame: Pose
     z: Float[Array, " rank"]
@@ -44,30 +46,33 @@ def koopman(
     transitions: int = 100_000,
     horizon: int = 20,
 ) -> Model:
-    """EDMD in path coordinates x = (progress, e_y, e_ψ, s): linear in a lift that holds the state itself.
+    """EDMD in path coordinates x = (progress, e_y, e_ψ, s), linear in a lift of x.
 
-        z = (x, |ξ − c_i|² log |ξ − c_i|),   ξ = (e_y, e_ψ, s) scaled to [-1, 1],   c_i uniform in the same box
-        z⁺ = z + Wᵀ (rbf, m(e) ⊗ (ξ, u, κ, 1))   =   A(e) z + B(e) u + d(e) κ + c(e),   x = C z + o
+        z = (x, |ξ − c_i|² log |ξ − c_i|),   ξ = (e_y, e_ψ, s) scaled to [-1, 1],
+        z⁺ = z + Wᵀ (rbf, m(e) ⊗ (ξ, u, κ, 1)) = A(e) z + B(e) u + d(e) κ + c(e),
+        x = C z + o,   c_i uniform in the box of ξ
 
-    m(e) are the monomials of the scaled environment up to a degree. At every e the
-    predictor is linear in z, u and the path's curvature κ; no products of state and
-    control enter, as in the original. A model that does not see e has the original's
-    one (A, B) for all e; matrices that vary with e are an extension of it.
+    The lift holds the state itself. m(e) are the monomials of the scaled environment up
+    to a degree. At every e the predictor is linear in z, u and the path's curvature κ;
+    no products of state and control enter, as in the original. A model that ignores e
+    has the original's one (A, B) for all e; matrices that vary with e are an extension.
 
-    `identify` regresses z⁺ − z on pairs of driven states, each seen from a circle of random curvature and offset (how
-    a car moves does not depend on the path it is on), with the ridge that predicts validation drives best over a
-    horizon; the original has no ridge. It is pure and may be compiled. As a `Model`, which is given no path, the path
-    is straight ahead from where the rollout starts.
+    `identify` regresses z⁺ − z on pairs of driven states, each relative to a circle of
+    random curvature and offset (how a car moves does not depend on the path it is on),
+    with the ridge that predicts validation drives best over a horizon; the original has
+    no ridge. It is pure and may be compiled. A `Model` is given no path, so its rollout
+    follows a straight path from its initial pose.
 
     Args:
         space: measured scales; fixes all sizes.
-        functions: how many thin-plate functions.
-        environment: use e at all.
+        functions: number of thin-plate functions.
+        environment: whether e is used.
         environment_degree: of m(e).
         ridges: to choose from, for columns scaled to mean square 1, per sample.
-        lateral_range, heading_range, curvature_range: how far e_y [m], e_ψ [rad] and κ
-            [1/m] of the pairs reach; also their scales.
-        transitions: pairs in the regression, at most.
+        lateral_range: largest |e_y| of the pairs [m]; also its scale.
+        heading_range: largest |e_ψ| of the pairs [rad]; also its scale.
+        curvature_range: largest |κ| of the pairs [1/m]; also its scale.
+        transitions: largest number of pairs in the regression.
         horizon: of the predictions that choose the ridge, steps.
 
     Source: Korda and Mezić (2018), sections 4 to 6, and the authors' code.
@@ -75,6 +80,8 @@ def koopman(
     degree = environment_degree if environment else 0
     lift = Lift(space, functions, degree, lateral_range, heading_range, curvature_range)
     regressors = functions + len(lift.monomials) * lift.columns
+
+    options = {"ridges": ridges, "transitions": transitions, "horizon": horizon}
 
     def init(key: Key) -> Params:
         return {
@@ -118,8 +125,6 @@ def koopman(
         transport=lambda fiber, fiber_next, latent: latent,
         observe=observe,
         vector=lambda latent: latent.z[1 : lift.size],
-        identify=partial(
-            identify, lift, ridges=ridges, transitions=transitions, horizon=horizon
-        ),
-        linear=linear,
+        fitting=Fitting(identify=partial(identify, lift, **options)),
+        structure=Structure(linear=linear),
     )

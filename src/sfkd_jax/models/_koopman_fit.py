@@ -12,14 +12,14 @@ from sfkd_jax.models._identification import ridge_regression
 from sfkd_jax.models._koopman_lift import Lift
 from sfkd_jax.types import POSE, Control, Environment, Key, Params, Scalar, Trajectory
 
-FOLLOWED = 0.1
-"""Share of the ranges that predictions are judged within: a controller keeps the car
+VALIDATION_SHARE = 0.1
+"""Share of the ranges that the validation predictions use: a controller keeps the car
 near its path.
 """
 
 
 def random_centres(lift: Lift, key: Key) -> Float[Array, "function coordinate"]:
-    """Uniform in the box [-1, 1] of ξ."""
+    """Draw centres uniformly from the box [-1, 1] of ξ."""
     return jax.random.uniform(key, (lift.functions, lift.size - 1), minval=-1.0)
 
 
@@ -33,7 +33,17 @@ def identify(
     transitions: int,
     horizon: int,
 ) -> Params:
-    """Random centres, weights by ridge regression on `transitions` pairs, and the ridge that predicts best."""
+    """Fit the weights by ridge regression, with the ridge that predicts best.
+
+    Args:
+        lift: with random centres, drawn here.
+        train: trajectories that the pairs come from.
+        validation: trajectories that choose the ridge.
+        key: consumed.
+        ridges: to choose from.
+        transitions: largest number of pairs.
+        horizon: of the validation predictions, steps.
+    """
     centre_key, pair_key, circle_key = jax.random.split(key, 3)
     centres = random_centres(lift, centre_key)
     fits = ridge_regression(
@@ -46,7 +56,7 @@ def identify(
         states[:, : length + 1], *(leaf[:, :length] for leaf in inputs)
     )
     drawn = jax.tree.map(
-        lambda leaf: FOLLOWED * leaf, _circles(lift, circle_key, count)
+        lambda leaf: VALIDATION_SHARE * leaf, _circles(lift, circle_key, count)
     )
 
     def error(weights: Float[Array, "regressor rank"]) -> Scalar:
@@ -67,7 +77,7 @@ def identify(
 def _circles(
     lift: Lift, key: Key, count: int
 ) -> tuple[Float[Array, "sample 2"], Float[Array, " sample"]]:
-    """Random offsets (e_y, e_ψ) from circles of random curvature, uniform over their ranges."""
+    """Draw offsets (e_y, e_ψ) from circles, and their curvatures, uniformly."""
     drawn = jax.random.uniform(key, (count, 3), minval=-1.0)
     return drawn[:, :2] * jnp.asarray(
         [lift.lateral_range, lift.heading_range]
@@ -81,7 +91,7 @@ def _pairs(
     key: Key,
     most: int,
 ) -> tuple[Float[Array, "sample regressor"], Float[Array, "sample rank"]]:
-    """Regressors and increments of the lift, one row a transition."""
+    """Regressors and increments of the lift, one row per transition."""
     choice_key, circle_key = jax.random.split(key)
     ends = jnp.stack([train.states[:, :-1], train.states[:, 1:]], axis=2).reshape(
         -1, 2, lift.size
@@ -105,7 +115,7 @@ def _prediction_error(
     offset: Float[Array, " 2"],
     change: Scalar,
 ) -> Scalar:
-    """Mean square of scaled errors of a free-running prediction, seen from a circle that about follows the window."""
+    """Mean square error of a prediction relative to a circle close to the window."""
     steps = jnp.hypot(*jnp.diff(window.states[:, :2], axis=0).T)
     turned = jax.vmap(between)(window.states[:-1, POSE], window.states[1:, POSE])[:, 2]
     bend = jnp.sum(turned) / jnp.maximum(jnp.sum(steps), 1.0)
@@ -116,7 +126,7 @@ def _prediction_error(
         z = z + lift.regressors(z, *inputs, kappa) @ params["weights"]
         return z, z[1 : lift.size]
 
-    _, found = jax.lax.scan(
+    _, predicted = jax.lax.scan(
         advance, lift(params["centres"], paths[0]), (window.controls, window.envs)
     )
-    return jnp.mean((found - ((paths - lift.centre) / lift.scale)[1:, 1:]) ** 2)
+    return jnp.mean((predicted - ((paths - lift.centre) / lift.scale)[1:, 1:]) ** 2)

@@ -1,4 +1,4 @@
-"""The lift of the Koopman baseline and its linear predictor, for every environment."""
+"""The lift of the Koopman baseline and its linear predictor for each environment."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from sfkd_jax.types import Control, Environment, Params, Scalar, Space, State
 
 
 class KoopmanFiber(NamedTuple):
-    """The predictor of one environment, in units of the lift: z⁺ = A z + B u + d κ + c, and the centres."""
+    """z⁺ = A z + B u + d κ + c for one environment, in units of the lift."""
 
     A: Float[Array, "rank rank"]
     B: Float[Array, "rank control"]
@@ -25,14 +25,19 @@ class KoopmanFiber(NamedTuple):
 
 @dataclass(frozen=True)
 class Lift:
-    """z = (x, rbf(ξ)) and z⁺ − z = Wᵀ (rbf, m(e) ⊗ (ξ, u, κ, 1)), x = (progress, ξ) = (progress, e_y, e_ψ, s) scaled.
+    """The lift z = (x, rbf(ξ)) and the regressors of its increment.
+
+        z⁺ − z = Wᵀ (rbf, m(e) ⊗ (ξ, u, κ, 1)),   x = (progress, ξ),   ξ = (e_y, e_ψ, s)
+
+    x and ξ are scaled.
 
     Attributes:
         space: measured scales.
-        functions: how many.
+        functions: number of radial functions.
         degree: of the monomials m(e).
-        lateral_range, heading_range, curvature_range: units of e_y [m], e_ψ [rad] and κ
-            [1/m].
+        lateral_range: unit of e_y [m].
+        heading_range: unit of e_ψ [rad].
+        curvature_range: unit of κ [1/m].
     """
 
     space: Space
@@ -44,7 +49,7 @@ class Lift:
 
     @property
     def scale(self) -> State:
-        """Units of x."""
+        """The units of x."""
         return jnp.concatenate(
             [
                 jnp.asarray([1.0, self.lateral_range, self.heading_range]),
@@ -54,27 +59,27 @@ class Lift:
 
     @property
     def centre(self) -> State:
-        """Where x is 0 in those units."""
+        """The value of x that is scaled to 0."""
         return jnp.concatenate([jnp.zeros(3), self.space.body_mean])
 
     @property
     def size(self) -> int:
-        """Entries of x."""
+        """Number of entries of x."""
         return 3 + self.space.body_mean.shape[0]
 
     @property
     def rank(self) -> int:
-        """Entries of z."""
+        """Number of entries of z."""
         return self.size + self.functions
 
     @property
     def columns(self) -> int:
-        """Entries of (ξ, u, κ, 1)."""
+        """Number of entries of (ξ, u, κ, 1)."""
         return self.size - 1 + self.space.control_mean.shape[0] + 2
 
     @property
     def monomials(self) -> list[tuple[int, ...]]:
-        """Which entries of e each monomial multiplies; the first is the empty product, 1."""
+        """The entries of e in each monomial; the first is the empty product, 1."""
         entries = range(self.space.env_mean.shape[0])
         return [
             term
@@ -85,12 +90,12 @@ class Lift:
     def __call__(
         self, centres: Float[Array, "function coordinate"], path: State
     ) -> Float[Array, " rank"]:
-        """z of a state along the path, in physical units."""
+        """Return z of a state along the path, which is in physical units."""
         scaled = (path - self.centre) / self.scale
         return jnp.concatenate([scaled, thin_plate(scaled[1:], centres)])
 
     def features(self, env: Environment) -> Float[Array, " monomial"]:
-        """m(e)."""
+        """Return the monomials m(e)."""
         scaled = (env - self.space.env_mean) / self.space.env_scale
         return jnp.stack(
             [jnp.prod(scaled[jnp.asarray(term, int)]) for term in self.monomials]
@@ -103,7 +108,7 @@ class Lift:
         env: Environment,
         kappa: Scalar,
     ) -> Float[Array, " regressor"]:
-        """(rbf, m(e) ⊗ (ξ, u, κ, 1))."""
+        """Return (rbf, m(e) ⊗ (ξ, u, κ, 1))."""
         inputs = (control - self.space.control_mean) / self.space.control_scale
         rest = jnp.stack([kappa / self.curvature_range, jnp.ones(())])
         linear = jnp.concatenate([z[1 : self.size], inputs, rest])
@@ -112,7 +117,7 @@ class Lift:
         )
 
     def at(self, params: Params, env: Environment) -> KoopmanFiber:
-        """The matrices at e."""
+        """Return the matrices at e."""
         of_functions, of_features = jnp.split(params["weights"], [self.functions])
         by_feature = of_features.reshape(-1, self.columns, self.rank)
         linear = jnp.tensordot(self.features(env), by_feature, axes=1).T

@@ -9,7 +9,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from sfkd_jax.models._continuous import Conditioned, continuous, network
+from sfkd_jax.models._continuous import Conditioned, continuous, mlp
 from sfkd_jax.types import Control, Key, Model, Params, Space
 
 
@@ -23,31 +23,31 @@ def neural_ode(
 ) -> Model:
     """Rates of the body state and the pose from one tanh network, solved by RK4 at dt.
 
-        (ġ, ṡ) = W_L tanh(… tanh(W_1 [s; u; e] + b_1) …) + b_L,   ġ in the frame of the body
+        (ġ, ṡ) = W_L tanh(… tanh(W_1 [s; u; e] + b_1) …) + b_L,   ġ in the body frame
 
-    The original has no inputs; u and e are held over dt and read like s.
+    The original has no inputs; here u and e are held over dt and are inputs like s.
 
     Args:
         space: measured scales; fixes all sizes.
         dt: sampling period [s], the solver's step in training and in use.
         hidden: widths.
-        environment: use e at all.
+        environment: whether e is used.
         frame: "body", or "path" for path coordinates.
 
     Source: Chen et al., NeurIPS 2018, arXiv 1806.07366.
     """
     body = space.body_mean.shape[0]
     inputs = body + space.control_mean.shape[0] + space.env_mean.shape[0]
-    net = network(hidden, 3 + body, (nn.tanh,) * len(hidden), last=0.1)
+    network = mlp(hidden, 3 + body, (nn.tanh,) * len(hidden), last=0.1)
 
     def init(key: Key) -> Params:
-        return net.init(key, jnp.zeros(inputs))["params"]
+        return network.init(key, jnp.zeros(inputs))["params"]
 
     def rates(
         fiber: Conditioned, body: Float[Array, " body"], control: Control
     ) -> Float[Array, " rates"]:
         read = jnp.concatenate([body, control, fiber.env])
-        return cast(jax.Array, net.apply({"params": fiber.params}, read))
+        return cast(jax.Array, network.apply({"params": fiber.params}, read))
 
     return continuous(
         space,

@@ -1,10 +1,11 @@
-"""Known dynamics as a rollout model: the nominal bicycle, the true plant (oracle), and a plant with a biased e."""
+"""Known dynamics as a rollout model: nominal bicycle, true plant, or a biased e."""
 
 from __future__ import annotations
 
 from collections.abc import Callable
 
-from sfkd_jax.types import BODY, Environment, Model, Step
+from sfkd_jax.models._state_model import state_model
+from sfkd_jax.types import Environment, Model, Step
 
 
 def physics(
@@ -13,22 +14,18 @@ def physics(
     distort: Callable[[Environment], Environment] = lambda env: env,
     along_path: bool = False,
 ) -> Model:
-    """A one-step function as a `Model`: the latent is the state itself.
+    """Return a one-step function as a `Model` without parameters.
 
     Args:
         step: (x, u, e) -> x one sampling period later, passed in by the caller (models
             never import the vehicle).
-        distort: what the model believes e to be; a deliberately biased oracle has one.
-        along_path: whether x and u are path states and w, see `path_frame`.
+        distort: the environment that the model assumes instead of e; the identity for
+            the true plant.
+        along_path: whether x and u are those of `core.path_frame`.
     """
-    return Model(
+    return state_model(
         init=lambda key: {},
         fiber=lambda params, env: distort(env),
-        encode=lambda fiber, state: state,
-        step=lambda fiber, latent, control: step(latent, control, fiber),
-        decode=lambda fiber, latent: latent,
-        transport=lambda fiber, fiber_next, latent: latent,
-        observe=lambda fiber, latent, state: state,
-        vector=lambda latent: latent[BODY],
+        step=lambda env, state, control: step(state, control, env),
         along_path=along_path,
     )

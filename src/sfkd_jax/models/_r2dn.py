@@ -1,13 +1,15 @@
-"""R2DN: a linear system in feedback with a 1-Lipschitz network, contracting by construction."""
+"""R2DN: a linear system in feedback with a 1-Lipschitz network."""
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from typing import Any, NamedTuple, cast
 
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
+from sfkd_jax.core.folding import Folded, unfold
 from sfkd_jax.core.se2 import compose
 from sfkd_jax.models._continuous import has_pose, scaled_env
 from sfkd_jax.models._r2dn_weights import Affine, Interconnection, Shared
@@ -25,13 +27,15 @@ from sfkd_jax.types import (
     Model,
     Params,
     Polytope,
+    Scalar,
     Space,
     State,
+    Structure,
 )
 
 
 class R2dnFiber(NamedTuple):
-    """All that does not change along a rollout; only the biases and `env` depend on e."""
+    """All that is constant along a rollout; only the biases and `env` depend on e."""
 
     A: Float[Array, "rank rank"]
     feedback: tuple[Float[Array, "_ _"], ...]
@@ -55,29 +59,34 @@ def r2dn(
     environment: bool = True,
     frame: str = "body",
 ) -> Model:
-    """Robust recurrent deep network: an LTI system in feedback with a 1-Lipschitz network, the pose on SE(2) outside.
+    """Robust recurrent deep network (R2DN), contracting by construction.
 
-        z⁺ = A z + B₁ φ(C₁ z; u, e) + B₂ [u; e] + b,   g⁺ = g ∘ D(z; u, e),   s = C z + c
+        z⁺ = A z + B₁ φ(C₁ z; u, e) + B₂ [u; e] + b
+        g⁺ = g ∘ D(z; u, e),   s = C z + c
 
-    φ is a sandwich network; u and e (scaled) are biases of each of its layers, so D₁₂
-    [u; e] of the paper is part of the first one. For two trajectories under the same u
-    and e let Δz be their difference, Δv = C₁ Δz and Δw that of φ. By construction, and
-    checked in no search,
+    An LTI system in feedback with a 1-Lipschitz network φ; the pose is composed on
+    SE(2) outside z. φ is a sandwich network; u and e (scaled) are biases of each of its
+    layers, so D₁₂ [u; e] of the paper is part of the first one. For two trajectories
+    under the same u and e let Δz be their difference, Δv = C₁ Δz and Δw that of φ. By
+    construction, without any search,
 
-        |A Δz + B₁ Δw|² + |C₁ Δz|² ≤ α² |Δz|² + |Δw|²,   that is  ‖[A/α  B₁; C₁/α  0]‖₂ ≤ 1,
+        |A Δz + B₁ Δw|² + |C₁ Δz|² ≤ α² |Δz|² + |Δw|²,
+        that is  ‖[A/α  B₁; C₁/α  0]‖₂ ≤ 1,
 
     and |Δw| ≤ |Δv|. The sum of both is |Δz⁺| ≤ α |Δz|. The metric of the paper is P = I
     here: encoder, decoder and read-out absorb P^(1/2), and B₁, C₁ the multiplier of φ's
-    bound. A single bound for A and the feedback together leaves more room than ρ + β.
-    Source: Barbara, Wang and Manchester, arXiv 2504.01250; its controls and
+    bound. A single bound for A and the feedback together is less conservative than
+    ρ + β. Source: Barbara, Wang and Manchester, arXiv 2504.01250; its controls and
     observations are ours, as for SFKD.
 
     Args:
         space: measured scales; fixes all sizes.
-        rank: of z, and of what φ takes in and gives out.
+        rank: of z, and number of inputs and outputs of φ.
         alpha: α, below 1 for a certificate.
-        hidden, decoder_hidden, encoder_hidden: hidden widths of φ, D and the encoder.
-        environment: use e at all.
+        hidden: hidden widths of φ.
+        decoder_hidden: hidden widths of D.
+        encoder_hidden: hidden width of the encoder.
+        environment: whether e is used.
         frame: "body", or "path" for path coordinates, which have no pose.
 
     Raises:
@@ -86,33 +95,65 @@ def r2dn(
     """
     _check(rank, alpha, hidden, decoder_hidden)
     pose = has_pose(frame)
-    body, control = space.body_mean.shape[0], space.control_mean.shape[0]
-    inputs = control + space.env_mean.shape[0]
+    body = space.body_mean.shape[0]
+    inputs = space.control_mean.shape[0] + space.env_mean.shape[0]
     weights = Interconnection(
         rank, body, inputs, tuple(hidden), tuple(decoder_hidden), alpha, pose
     )
-    encoder = Encoder(rank, encoder_hidden)
+    functions = _R2dn(space, weights, Encoder(rank, encoder_hidden), environment)
+    return Model(
+        init=functions.init,
+        fiber=functions.fiber,
+        encode=functions.encode,
+        step=functions.step,
+        decode=functions.decode,
+        transport=lambda fiber, fiber_next, latent: latent,
+        observe=lambda fiber, latent, state: functions.encode(fiber, state),
+        vector=lambda latent: latent.z,
+        shared=functions.shared,
+        structure=Structure(explicit=functions.explicit, rate=functions.rate),
+        along_path=not pose,
+    )
 
-    def init(key: Key) -> Params:
+
+@dataclass(frozen=True, eq=False)
+class _R2dn:
+    """The functions of the model.
+
+    Attributes:
+        space: measured scales.
+        weights: everything learned except the encoder.
+        encoder: of the body state.
+        environment: whether e is used.
+    """
+
+    space: Space
+    weights: Interconnection
+    encoder: Encoder
+    environment: bool
+
+    def init(self, key: Key) -> Params:
+        """Draw initial parameters."""
         weights_key, encoder_key = jax.random.split(key)
+        body, env = (
+            jnp.zeros(part.shape[0])
+            for part in (self.space.body_mean, self.space.env_mean)
+        )
         return {
-            "weights": weights.init(weights_key)["params"],
-            "encoder": encoder.init(
-                encoder_key, jnp.zeros(body), jnp.zeros(inputs - control)
-            )["params"],
+            "weights": self.weights.init(weights_key)["params"],
+            "encoder": self.encoder.init(encoder_key, body, env)["params"],
         }
 
-    def explicit_weights(params: Params) -> Shared:
-        if "shared" in params:  # folded: what runs is then also what is certified
-            return params["shared"]
-        return cast(Shared, weights.apply({"params": params["weights"]}))
+    def shared(self, params: Params) -> Shared:
+        """Return the explicit weights, as they are if folded."""
+        if isinstance(params, Folded):
+            return params.shared
+        return cast(Shared, self.weights.apply({"params": params["weights"]}))
 
-    def fold(params: Params) -> Params:
-        return params | {"shared": explicit_weights(params)}
-
-    def fiber(params: Params, env: Environment) -> R2dnFiber:
-        shared = explicit_weights(params)
-        scaled = scaled_env(space, env, environment)
+    def fiber(self, params: Params, env: Environment) -> R2dnFiber:
+        """Return the explicit weights with the biases of one environment."""
+        shared = self.shared(params)
+        scaled = scaled_env(self.space, env, self.environment)
         return R2dnFiber(
             A=shared.A,
             feedback=shared.feedback.matrices,
@@ -126,26 +167,29 @@ def r2dn(
             readout=shared.readout,
             centre=shared.centre,
             env=scaled,
-            encoder=params["encoder"],
+            encoder=unfold(params)["encoder"],
         )
 
-    def encode(fiber: R2dnFiber, state: State) -> SfkdLatent:
-        if state.shape != (3 + body,):
-            raise ValueError(f"state must have shape ({3 + body},), got {state.shape}")
+    def encode(self, fiber: R2dnFiber, state: State) -> SfkdLatent:
+        """Return the latent of a state."""
+        space, size = self.space, 3 + self.space.body_mean.shape[0]
+        if state.shape != (size,):
+            raise ValueError(f"state must have shape ({size},), got {state.shape}")
         scaled = (state[BODY] - space.body_mean) / space.body_scale
-        return SfkdLatent(
-            state[POSE],
-            cast(
-                jax.Array, encoder.apply({"params": fiber.encoder}, scaled, fiber.env)
-            ),
-        )
+        pose = state[POSE]
+        z = self.encoder.apply({"params": fiber.encoder}, scaled, fiber.env)
+        return SfkdLatent(pose, cast(jax.Array, z))
 
-    def step(fiber: R2dnFiber, latent: SfkdLatent, control: Control) -> SfkdLatent:
+    def step(
+        self, fiber: R2dnFiber, latent: SfkdLatent, control: Control
+    ) -> SfkdLatent:
+        """Advance z and the pose by one sampling period."""
+        space = self.space
         u = (control - space.control_mean) / space.control_scale
         z = fiber.A @ latent.z + apply(
             fiber.feedback, fiber.feedback_biases.at(u), latent.z
         )
-        if not pose:
+        if not self.weights.pose:
             return SfkdLatent(latent.pose, z)
         motion = apply(fiber.decoder, fiber.decoder_biases.at(u), latent.z)
         return SfkdLatent(
@@ -153,16 +197,23 @@ def r2dn(
             z,
         )
 
-    def decode(fiber: R2dnFiber, latent: SfkdLatent) -> State:
+    def decode(self, fiber: R2dnFiber, latent: SfkdLatent) -> State:
+        """Return the state of a latent."""
         scaled = fiber.readout @ latent.z + fiber.centre
         return jnp.concatenate(
-            [latent.pose, space.body_mean + space.body_scale * scaled]
+            [latent.pose, self.space.body_mean + self.space.body_scale * scaled]
         )
 
-    def explicit(params: Params) -> Explicit:
-        shared = explicit_weights(params)
+    def rate(self, params: Params) -> Scalar:
+        """Return α, the same for all parameters."""
+        del params
+        return jnp.asarray(self.weights.alpha)
+
+    def explicit(self, params: Params) -> Explicit:
+        """Return the weights that a certificate is about."""
+        shared, space = self.shared(params), self.space
         decoder = shared.decoder.matrices
-        if pose:
+        if self.weights.pose:
             decoder = (
                 *decoder[:-1],
                 jnp.asarray(space.increment_scale)[:, None] * decoder[-1],
@@ -174,29 +225,14 @@ def r2dn(
             decoder=decoder,
             decoder_multipliers=shared.decoder.multipliers,
             readout=jnp.asarray(space.body_scale)[:, None] * shared.readout,
-            declared=Declared("tanh", "identity", control),
+            declared=Declared("tanh", "identity", space.control_mean.shape[0]),
         )
-
-    return Model(
-        init=init,
-        fiber=fiber,
-        encode=encode,
-        step=step,
-        decode=decode,
-        transport=lambda fiber, fiber_next, latent: latent,
-        observe=lambda fiber, latent, state: encode(fiber, state),
-        vector=lambda latent: latent.z,
-        explicit=explicit,
-        fold=fold,
-        rate=lambda params: jnp.asarray(alpha),
-        along_path=not pose,
-    )
 
 
 def _biases(
     inputs: Affine | None, matrices: tuple[Float[Array, "_ _"], ...], env: Environment
 ) -> Biases:
-    """b_k(u, e) of every layer for one e: all of [u; e] enters linearly, so e only shifts the offsets."""
+    """b_k(u, e) of every layer; e enters linearly and shifts the offsets."""
     if inputs is None:
         return Biases((), ())
     widths = [matrix.shape[0] for matrix in matrices]
@@ -210,12 +246,13 @@ def _biases(
 def _check(
     rank: int, alpha: float, hidden: tuple[int, ...], decoder_hidden: tuple[int, ...]
 ) -> None:
-    """Refuse settings that no model can have."""
+    """Raise ValueError for invalid settings."""
     if rank < 1:
         raise ValueError(f"model.rank must be at least 1, got {rank}")
     if not 0.0 < alpha < 1.0:
         raise ValueError(f"model.alpha must lie in (0, 1), got {alpha}")
     if not hidden or not decoder_hidden:
         raise ValueError(
-            f"model.hidden and model.decoder_hidden need a layer each, got {hidden} and {decoder_hidden}"
+            "model.hidden and model.decoder_hidden need a layer each, "
+            f"got {hidden} and {decoder_hidden}"
         )

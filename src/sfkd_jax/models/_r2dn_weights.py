@@ -1,4 +1,4 @@
-"""The learned weights of R2DN in explicit form, with the contraction constraint in force."""
+"""Learned weights of R2DN in explicit form, with the contraction bound enforced."""
 
 from __future__ import annotations
 
@@ -16,24 +16,24 @@ SMALL = nn.initializers.variance_scaling(0.1, "fan_in", "truncated_normal")
 
 
 class Affine(NamedTuple):
-    """The biases of all layers of a network, one after the other, as [u; e] gain + offset."""
+    """The biases of all layers of a network, concatenated, as [u; e] gain + offset."""
 
     gain: Float[Array, "inputs all"]
     offset: Float[Array, " all"]
 
 
 class Shared(NamedTuple):
-    """Plain weights: nothing is left to bound.
+    """Plain weights, with all bounds enforced.
 
     Attributes:
         A: of z⁺ = A z + W_L tanh(… W_1 z …).
         feedback: W_1 = V_1 C₁, …, W_L = B₁ V_L with V of φ, and φ's multipliers, which
             prove α for the whole step.
-        feedback_inputs, decoder_inputs: biases; the last of the feedback is B₂ [u; e] +
-            b.
-        decoder: of the pose increment; without a pose it is empty and its inputs are
-            None.
-        readout, centre: of the body state.
+        feedback_inputs: biases of the feedback; the last one is B₂ [u; e] + b.
+        decoder: of the pose increment; empty without a pose.
+        decoder_inputs: biases of the decoder; None without a pose.
+        readout: C of the body state.
+        centre: c of the body state.
     """
 
     A: Float[Array, "rank rank"]
@@ -46,12 +46,14 @@ class Shared(NamedTuple):
 
 
 class Interconnection(nn.Module):
-    """Everything learned but the encoder.
+    """Everything learned except the encoder.
 
     Attributes:
-        rank, body: sizes of z and s.
+        rank: size of z.
+        body: size of s.
         inputs: size of [u; e].
-        hidden, decoder_hidden: widths.
+        hidden: hidden widths of φ.
+        decoder_hidden: hidden widths of the decoder.
         alpha: α.
         pose: whether there is a decoder of the pose.
     """
@@ -66,7 +68,7 @@ class Interconnection(nn.Module):
 
     @nn.compact
     def __call__(self) -> Shared:
-        """Explicit weights."""
+        """Return the explicit weights."""
         square = (self.rank, self.rank)
         A, B1, C1 = contracting(
             self.param("A", lambda key, shape: jnp.eye(*shape), square),
@@ -97,7 +99,7 @@ class Interconnection(nn.Module):
         )
 
     def _decoder(self) -> tuple[Weights, Affine]:
-        """Of the pose increment, and its biases."""
+        """Weights and biases of the decoder of the pose increment."""
         bound = jnp.exp(
             self.param("log_decoder_bound", nn.initializers.constant(1.0), ())
         )
@@ -109,7 +111,7 @@ class Interconnection(nn.Module):
     def _affine(
         self, name: str, size: int, spread: nn.initializers.Initializer
     ) -> Affine:
-        """Learned biases of one network."""
+        """The learned biases of one network."""
         gain = self.param(f"{name}_gain", spread, (self.inputs, size))
         return Affine(
             gain, self.param(f"{name}_offset", nn.initializers.zeros, (size,))
@@ -122,7 +124,10 @@ def contracting(
     C1: Float[Array, "v rank"],
     alpha: float,
 ) -> tuple[Float[Array, "rank rank"], Float[Array, "rank w"], Float[Array, "v rank"]]:
-    """(α Ã, B̃₁, α C̃₁) from free matrices, [Ã B̃₁; C̃₁ 0] = [A B₁; C₁ 0] / max(1, its Gram bound): norm at most 1."""
+    """Return (α Ã, B̃₁, α C̃₁) from free matrices, with ‖[Ã B̃₁; C̃₁ 0]‖₂ ≤ 1.
+
+    [Ã B̃₁; C̃₁ 0] = [A B₁; C₁ 0] / max(1, Gram bound of [A B₁; C₁ 0]).
+    """
     zeros = jnp.zeros((C1.shape[0], B1.shape[1]))
     block = bounded(jnp.block([[A, B1], [C1, zeros]]), 1.0)
     rows, columns = A.shape

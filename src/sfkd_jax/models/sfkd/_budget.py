@@ -1,4 +1,4 @@
-"""One contraction budget for the operator and the residual together."""
+"""One contraction bound that the operator and the residual share."""
 
 from __future__ import annotations
 
@@ -11,8 +11,8 @@ from sfkd_jax.models.sfkd._sandwich import Weights
 from sfkd_jax.types import Scalar
 
 LARGEST_COUPLING = 0.999
-"""Of ||G||_2 and ||H||_2: what they leave, I − G G' and I − H'H, must keep a Cholesky
-factor in float32.
+"""Bound of ||G||_2 and ||H||_2, so that I − G G' and I − H'H have a Cholesky factor in
+float32.
 """
 
 
@@ -22,17 +22,20 @@ def share_budget(
     network: Weights,
     alpha: float | Scalar,
 ) -> tuple[Float[Array, "vertex rank rank"], Weights]:
-    """Operators and a residual such that z ↦ A_j z + G φ(α H z) is α-Lipschitz for every j, φ 1-Lipschitz.
+    """Return operators and a residual such that A_j z + G φ(α H z) is α-Lipschitz.
 
-        A_j = α L M_j R',   L L' = I − G G',   R R' = I − H'H,   ||M_j||_2, ||G||_2, ||H||_2 ≤ 1
+        A_j = α L M_j R',   L L' = I − G G',   R R' = I − H'H,
+        ||M_j||_2, ||G||_2, ||H||_2 ≤ 1,   φ 1-Lipschitz
 
-    That is Parrott's parametrisation of all matrices [[A_j/α, G], [H, 0]] with norm at most 1; hence
-    |A dz + G dw|² + |α H dz|² ≤ α²|dz|² + |dw|², and |dw| ≤ |α H dz|. A direction that the residual does not use keeps
-    the whole of α for the operator: ||A|| + Lip r may exceed 1 where their sum as one map cannot. By convexity the
-    same holds for every mixture of the A_j. The multipliers of φ are a witness of the joint bound.
+    This is Parrott's parametrisation of all matrices [[A_j/α, G], [H, 0]] with norm at
+    most 1; hence |A dz + G dw|² + |α H dz|² ≤ α²|dz|² + |dw|², and |dw| ≤ |α H dz|.
+    Where the residual does not use a direction, the operator has the whole of α: ||A||
+    + Lip r may exceed 1, but their sum as one map cannot. By convexity the same holds
+    for every mixture of the A_j. The multipliers of φ are a witness of the joint bound.
 
     Args:
-        operators, couplings: free, the latter (G, H).
+        operators: M_j before bounding.
+        couplings: (G, H) before bounding.
         network: φ, bounded by 1.
         alpha: α in (0, 1).
 
@@ -40,7 +43,7 @@ def share_budget(
         A_j, and the residual with G and α H folded into its last and first weights.
     """
     out, into = (bounded(matrix, LARGEST_COUPLING) for matrix in couplings)
-    left, right = _left_over(out, into)
+    left, right = _factors(out, into)
     vertices = (
         alpha
         * left
@@ -56,12 +59,12 @@ def share_budget(
 def budget_factors(
     couplings: Float[Array, "2 rank rank"],
 ) -> tuple[Float[Array, "rank rank"], Float[Array, "rank rank"]]:
-    """L and R of `share_budget`: lower triangular, of what the residual leaves to the operators."""
+    """Return L and R of `share_budget`, lower triangular."""
     out, into = (bounded(matrix, LARGEST_COUPLING) for matrix in couplings)
-    return _left_over(out, into)
+    return _factors(out, into)
 
 
-def _left_over(
+def _factors(
     out: Float[Array, "rank rank"], into: Float[Array, "rank rank"]
 ) -> tuple[Float[Array, "rank rank"], Float[Array, "rank rank"]]:
     """Cholesky factors of I − G G' and I − H'H."""

@@ -1,4 +1,4 @@
-"""The parts of SFKD that are learned, as one flax module used through init and apply."""
+"""The learned parts of SFKD as flax modules, used through init and apply."""
 
 from __future__ import annotations
 
@@ -16,15 +16,13 @@ from sfkd_jax.models.sfkd._sandwich import Free, Sandwich, Weights
 from sfkd_jax.types import Scalar
 
 LOWEST_RATE = 0.5
-"""Of a learned α: no car comes back to its path faster than that in a tenth of a
-second.
-"""
+"""Smallest learned α: no car converges to its path faster than that in 0.1 s."""
 ALPHA_START = 2.0
-"""Logit of a learned α to begin with: 88 % of the way from the lowest to the largest."""
+"""Initial logit of a learned α: 88 % of the way from the smallest to the largest."""
 
 
 class Biases(NamedTuple):
-    """b_k(u, e) = gain_k(e) u + offset_k(e) of every layer of a network, for one e.
+    """b_k(u, e) = gain_k(e) u + offset_k(e) for every layer of a network and one e.
 
     Attributes:
         gains: (out, control) per layer.
@@ -35,7 +33,7 @@ class Biases(NamedTuple):
     offsets: tuple[Float[Array, " _"], ...]
 
     def at(self, control: Float[Array, " control"]) -> tuple[Float[Array, " _"], ...]:
-        """The biases under one scaled control."""
+        """Return the biases for one scaled control."""
         return tuple(
             gain @ control + offset
             for gain, offset in zip(self.gains, self.offsets, strict=True)
@@ -43,7 +41,7 @@ class Biases(NamedTuple):
 
 
 class Shared(NamedTuple):
-    """What does not depend on e: operator vertices, the two bounded networks, the read-out."""
+    """Weights that do not depend on e: vertices, the bounded networks, the read-out."""
 
     vertices: Float[Array, "vertex rank rank"]
     residual: Weights
@@ -54,7 +52,7 @@ class Shared(NamedTuple):
 
 
 class PerEnvironment(NamedTuple):
-    """What depends on e alone: mixture of the vertices, B(e), biases, rotation, embedding."""
+    """Functions of e: mixture of the vertices, B(e), biases, rotation, embedding."""
 
     mixture: Float[Array, " vertex"]
     B: Float[Array, "rank control"]
@@ -66,15 +64,18 @@ class PerEnvironment(NamedTuple):
 
 
 class Networks(nn.Module):
-    """Everything learned but the encoder: embedding ψ(e), operators, residual, decoder, transport.
+    """Embedding ψ(e), operators, residual, decoder and transport: all but the encoder.
 
     Attributes:
         rank: r, even.
-        body, control: sizes of s and u.
+        body: size of s.
+        control: size of u.
         vertices: number of operator vertices.
-        hidden: widths.
+        residual_hidden: hidden widths of the residual.
+        decoder_hidden: hidden widths of the decoder.
         embedding: size of ψ(e).
-        rho, beta: the two hard bounds.
+        rho: ρ.
+        beta: β.
         residual: "sandwich", "free" or "none".
         transport: whether Q(e) is learned.
         budget: "sum" bounds A(e) by ρ and the residual by β; "joint" bounds their sum,
@@ -101,7 +102,7 @@ class Networks(nn.Module):
     forcing_hidden: int = 0
 
     def setup(self) -> None:
-        """Declare the parts."""
+        """Declare submodules and parameters."""
         kinds = {"sandwich": Sandwich, "free": Free, "none": Free}
         self.psi = nn.Sequential(
             [
@@ -156,18 +157,18 @@ class Networks(nn.Module):
         return self.budget == "joint" and self.residual == "sandwich"
 
     def rate(self) -> Scalar:
-        """α, that a joint budget holds; ρ + β, or less if it is learned."""
+        """Return α = ρ + β, or less if it is learned."""
         most = jnp.asarray(self.rho + self.beta)
         if not (self._joint and self.learn_alpha):
             return most
         return LOWEST_RATE + (most - LOWEST_RATE) * nn.sigmoid(self.alpha_logit)
 
     def __call__(self, env: Array) -> tuple[Shared, PerEnvironment]:
-        """Touch every part once, so that init creates all parameters."""
+        """Evaluate every part once, so that init creates all parameters."""
         return self.shared(), self.per_environment(env)
 
     def shared(self) -> Shared:
-        """What does not depend on e, with every bound in force."""
+        """Return the weights that do not depend on e, with every bound enforced."""
         vertices, residual = self._step()
         decoder = (
             self.decoder_weights(jnp.exp(self.log_decoder_bound))
@@ -199,7 +200,7 @@ class Networks(nn.Module):
         return vertices, residual
 
     def per_environment(self, env: Float[Array, " environment"]) -> PerEnvironment:
-        """What depends on e alone; `env` is scaled to about [-1, 1]."""
+        """Return the functions of e; `env` is scaled to about [-1, 1]."""
         embedding = self.psi(env)
         residual = self._biases(
             self.residual_head(embedding), self.residual_hidden, self.rank
@@ -242,15 +243,15 @@ class Networks(nn.Module):
 
 
 class Encoder(nn.Module):
-    """φ(s, ψ(e)) = W_0 s + W_2 tanh(W_1 [s; ψ(e)] + b_1) + b_2, before it is turned into the fibre of e.
+    """φ(s, ψ(e)) = W_0 s + W_2 tanh(W_1 [s; ψ(e)] + b_1) + b_2.
 
-    The read-out of s is linear in z: a lift that holds s itself, W_0 s, need not
-    rebuild it from saturating functions.
+    The read-out of s is linear in z: a lift that contains s itself, W_0 s, need not
+    reconstruct it from saturating functions.
 
     Attributes:
         rank: r.
         hidden: width.
-        linear: whether W_0 is there.
+        linear: whether W_0 s is part of the lift.
     """
 
     rank: int
@@ -261,7 +262,7 @@ class Encoder(nn.Module):
     def __call__(
         self, body: Float[Array, " inputs"], embedding: Float[Array, " embedding"]
     ) -> Array:
-        """z before rotation, shape (rank,)."""
+        """Return z before rotation, shape (rank,)."""
         hidden = nn.tanh(nn.Dense(self.hidden)(jnp.concatenate([body, embedding])))
         z = nn.Dense(self.rank)(hidden)
         return z + nn.Dense(self.rank, use_bias=False)(body) if self.linear else z
@@ -270,13 +271,13 @@ class Encoder(nn.Module):
 def _couplings(
     key: Array, shape: tuple[int, ...], dtype: jnp.dtype = jnp.float32
 ) -> Array:
-    """Norms of about 0.3 each way, so that the residual begins with a gain of about 0.1."""
+    """Initial couplings of norm 0.3: the initial gain of the residual is about 0.1."""
     return jax.random.normal(key, shape, dtype) * (0.15 / shape[-1] ** 0.5)
 
 
 def _near_identity(
     key: Array, shape: tuple[int, ...], dtype: jnp.dtype = jnp.float32
 ) -> Array:
-    """Slow dynamics to start from: I plus a little noise."""
+    """Initial operators: I plus a little noise, which is slow dynamics."""
     noise = jax.random.normal(key, shape, dtype) * (0.1 / shape[-1] ** 0.5)
     return jnp.eye(shape[-1], dtype=dtype) + noise

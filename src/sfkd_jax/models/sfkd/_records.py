@@ -1,4 +1,4 @@
-"""What a rollout carries and what it is given: the latent and the fibre."""
+"""Latent and fiber of SFKD."""
 
 from __future__ import annotations
 
@@ -12,33 +12,33 @@ from sfkd_jax.types import Pose
 
 
 class SfkdLatent(NamedTuple):
-    """The rollout state: the pose (body frame) or the anchor of the segment (segment frame), and z."""
+    """State of a rollout: z and a pose, in the segment frame that of its start."""
 
     pose: Pose
     z: Float[Array, " rank"]
 
 
 class Mixture(NamedTuple):
-    """A(e) = Σ_j w_j A_j, not summed: the gradient by the A_j then needs no matrix of its own for every e.
+    """A(e) = Σ_j w_j A_j, not summed.
 
-    That is what training differentiates, where every step of every window has its own
-    e.
+    In training every step of every window has its own e. Without the sum, the gradient
+    with respect to the A_j needs no matrix for each e.
     """
 
     weights: Float[Array, " vertex"]
     vertices: Float[Array, "vertex rank rank"]
 
     def __matmul__(self, z: Float[Array, " rank"]) -> Float[Array, " rank"]:
-        """A(e) z."""
+        """Return A(e) z."""
         return self.weights @ (self.vertices @ z)
 
     def summed(self) -> Float[Array, "rank rank"]:
-        """A(e), for many steps under one e."""
+        """Return A(e), for many steps under one e."""
         return jnp.tensordot(self.weights, self.vertices, axes=1)
 
 
 class SfkdFiber(NamedTuple):
-    """All that depends on e alone, with explicit weights: nothing is left to normalise inside a rollout."""
+    """All that depends on e, with explicit weights that need no further bounding."""
 
     A: Mixture | Float[Array, "rank rank"]
     B: Float[Array, "rank control"]

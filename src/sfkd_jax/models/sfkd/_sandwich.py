@@ -1,4 +1,4 @@
-"""A network whose Lipschitz constant in z is bounded by construction; everything else enters as biases."""
+"""Networks with a Lipschitz bound in z; all other inputs enter as biases."""
 
 from __future__ import annotations
 
@@ -14,17 +14,17 @@ from sfkd_jax.models.sfkd._bounds import FLOAT32_MARGIN, bounded
 from sfkd_jax.types import Scalar
 
 CAYLEY_RANGE = 8.0
-"""Largest 2-norm of the free matrices: beyond it I + Z is so ill-conditioned that
-float32 loses orthogonality.
+"""Largest 2-norm of the free matrices; beyond it I + Z is too ill-conditioned for
+orthogonality in float32.
 """
 
 
 class Weights(NamedTuple):
-    """A plain network W_L σ(… σ(W_1 z + b_1) …) + b_L and the multipliers that prove its bound.
+    """Matrices of W_L σ(… σ(W_1 z + b_1) …) + b_L and the multipliers of its bound.
 
     Attributes:
         matrices: W_1 … W_L, each (out, in).
-        multipliers: λ_1 … λ_{L-1}, one vector per hidden layer.
+        multipliers: λ_1 … λ_{L-1}, one vector per hidden layer; () without a bound.
     """
 
     matrices: tuple[Float[Array, "_ _"], ...]
@@ -32,14 +32,21 @@ class Weights(NamedTuple):
 
 
 class Sandwich(nn.Module):
-    """Weights of a sandwich (LBDN) network, |f(z) − f(z')| ≤ γ |z − z'| for any biases and slopes in [0, 1].
+    """Weights of a sandwich (LBDN) network, |f(z) − f(z')| ≤ γ |z − z'|.
 
-    With [A_k B_k] the rows of an orthogonal Cayley block, A A' + B B' = I, and Ψ_k = diag(exp ψ_k),
-        W_1 = √(2γ) Ψ_1⁻¹ B_1,  W_k = 2 Ψ_k⁻¹ B_k A_{k-1}' Ψ_{k-1},  W_L = √(2γ) B_L A_{L-1}' Ψ_{L-1},
-    and Λ_k = γ Ψ_k² is the witness of the bound. Source: Wang and Manchester, arXiv 2301.11526.
+    The bound holds for any biases and slopes in [0, 1]. With [A_k B_k] the rows of an
+    orthogonal Cayley block, A A' + B B' = I, and Ψ_k = diag(exp ψ_k),
+
+        W_1 = √(2γ) Ψ_1⁻¹ B_1,   W_k = 2 Ψ_k⁻¹ B_k A_{k-1}' Ψ_{k-1},
+        W_L = √(2γ) B_L A_{L-1}' Ψ_{L-1},
+
+    and Λ_k = γ Ψ_k² is the witness of the bound. Source: Wang and Manchester, arXiv
+    2301.11526.
 
     Attributes:
-        inputs, hidden, outputs: layer widths; at least one hidden layer.
+        inputs: number of inputs.
+        hidden: widths of the hidden layers, at least one.
+        outputs: number of outputs.
     """
 
     inputs: int
@@ -48,7 +55,7 @@ class Sandwich(nn.Module):
 
     @nn.compact
     def __call__(self, bound: Scalar | float) -> Weights:
-        """Explicit weights for the Lipschitz bound γ."""
+        """Return explicit weights for the Lipschitz bound γ."""
         gamma = jnp.asarray(bound) * (1.0 - FLOAT32_MARGIN)
         sizes = (self.inputs, *self.hidden, self.outputs)
         spread = nn.initializers.lecun_normal()
@@ -77,7 +84,13 @@ class Sandwich(nn.Module):
 
 
 class Free(nn.Module):
-    """The same network with nothing bounded: an ablation, certified only if it happens to contract."""
+    """The same network without a bound, an ablation: certified only if it contracts.
+
+    Attributes:
+        inputs: number of inputs.
+        hidden: widths of the hidden layers.
+        outputs: number of outputs.
+    """
 
     inputs: int
     hidden: Sequence[int]
@@ -85,7 +98,7 @@ class Free(nn.Module):
 
     @nn.compact
     def __call__(self, bound: Scalar | float) -> Weights:
-        """Plain weights; the bound is ignored."""
+        """Return plain weights; the bound is ignored."""
         del bound
         sizes = (self.inputs, *self.hidden, self.outputs)
         pairs = enumerate(zip(sizes[1:], sizes[:-1], strict=True))
@@ -99,7 +112,10 @@ class Free(nn.Module):
 def cayley(
     square: Float[Array, "out out"], tall: Float[Array, "inputs out"]
 ) -> tuple[Float[Array, "out out"], Float[Array, "out inputs"]]:
-    """A, B with A A' + B B' = I from free X, Y: Z = X − X' + Y'Y, A' = (I − Z)(I + Z)⁻¹, B' = −2 Y (I + Z)⁻¹."""
+    """Return A, B with A A' + B B' = I from free matrices X (square) and Y (tall).
+
+    Z = X − X' + Y'Y,   A' = (I − Z)(I + Z)⁻¹,   B' = −2 Y (I + Z)⁻¹
+    """
     identity = jnp.eye(square.shape[0])
     Z = square - square.T + tall.T @ tall
     inverse = jnp.linalg.inv(identity + Z)
@@ -111,7 +127,7 @@ def apply(
     biases: Sequence[Float[Array, " _"]],
     z: Float[Array, " _"],
 ) -> Float[Array, " _"]:
-    """W_L tanh(… tanh(W_1 z + b_1) …) + b_L."""
+    """Return W_L tanh(… tanh(W_1 z + b_1) …) + b_L."""
     for matrix, bias in zip(matrices[:-1], biases[:-1], strict=True):
         z = jnp.tanh(matrix @ z + bias)
     return matrices[-1] @ z + biases[-1]

@@ -1,4 +1,4 @@
-"""Which settings of SFKD there are."""
+"""Checks of the settings of SFKD."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ def check_settings(
     budget: str,
     learn_alpha: bool,
 ) -> None:
-    """Refuse settings that no model can have, naming the choices."""
+    """Raise ValueError for invalid settings, listing the choices."""
     if frame not in FRAMES:
         raise ValueError(
             f"model.frame must be one of {', '.join(FRAMES)}, got {frame!r}"
@@ -43,5 +43,6 @@ def check_settings(
         )
     if learn_alpha and rho + beta <= LOWEST_RATE:
         raise ValueError(
-            f"model.learn_alpha needs model.rho + model.beta above {LOWEST_RATE}, got {rho + beta}"
+            "model.learn_alpha needs model.rho + model.beta above "
+            f"{LOWEST_RATE}, got {rho + beta}"
         )

@@ -1,28 +1,27 @@
-"""Where training may start from: operators and input map identified for the initial lift, the rest as drawn."""
+"""Initial parameters whose linear part is identified from data for the initial lift."""
 
 from __future__ import annotations
 
-from typing import Any, NamedTuple, cast
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from sfkd_jax.core.rollouts import fibers_along
-from sfkd_jax.models._continuous import scaled_env
 from sfkd_jax.models._identification import bounded_ridge
 from sfkd_jax.models.sfkd._bounds import attainable, unbounded
 from sfkd_jax.models.sfkd._budget import budget_factors
-from sfkd_jax.models.sfkd._networks import Networks, PerEnvironment
-from sfkd_jax.types import Key, Model, Params, Space, Trajectory
+from sfkd_jax.models.sfkd._dynamics import Dynamics
+from sfkd_jax.types import Key, Model, Params, Trajectory
 
 
 class Pairs(NamedTuple):
-    """Transitions as regression sees them.
+    """Transitions as regressors and targets.
 
     Attributes:
-        before, after: z_k, and z_{k+1} carried back into the fibre of e_k, less the
-            residual at z_k.
+        before: z_k.
+        after: z_{k+1} transported back to the fiber of e_k, minus the residual at z_k.
         mixtures: w(e_k).
         inputs: (ψ(e_k), 1) ⊗ u_k.
     """
@@ -33,42 +32,45 @@ class Pairs(NamedTuple):
     inputs: Float[Array, "*sample feature"]
 
 
-def identified(
+def identify_start(
     model: Model,
-    networks: Networks,
-    space: Space,
-    environment: bool,
+    dynamics: Dynamics,
     params: Params,
-    driven: Trajectory,
+    data: Trajectory,
     key: Key,
     *,
     transitions: int = 20000,
     ridge: float = 1e-4,
     iterations: int = 200,
 ) -> Params:
-    """Params whose A_j and B(e) solve (eq:koopid) for the lift, embedding, mixture and residual that they have.
+    """Return params whose A_j and B(e) solve (eq:koopid) for their other parts.
 
-        min Σ_k |T(e_{k+1} → e_k) z_{k+1} − r(z_k; u_k, e_k) − Σ_j w_j(e_k) A_j z_k − B(e_k) u_k|² + ridge
+        min Σ_k |T(e_{k+1} → e_k) z_{k+1} − r(z_k; u_k, e_k)
+                 − Σ_j w_j(e_k) A_j z_k − B(e_k) u_k|² + ridge
 
-    under the model's own bound, in the coordinates in which it has it: with a joint budget A_j = α L M_j R' that is
-    ||M_j|| ≤ 1 and the sum of squares is that of L⁻¹ times the errors. The Gram bound overestimates norms, so the
-    matrices that every choice of singular values can attain (`attainable`) are searched, up to 2.7 % shorter at rank
-    32, and the raw parameters that the model bounds give them back exactly.
+    Lift, embedding, mixture and residual are those of `params`. The bound is the
+    model's own, in the coordinates in which the model has it: with a joint budget A_j =
+    α L M_j R' that is ||M_j|| ≤ 1 and the sum of squares is that of L⁻¹ times the
+    errors. The Gram bound overestimates norms, so the search is over matrices that
+    every choice of singular values can attain (`attainable`), up to 2.7 % smaller at
+    rank 32, and `bounded` maps the raw parameters back to them exactly.
 
     Args:
-        model, networks: of `sfkd`.
-        environment: whether e is used.
-        driven: trajectories, of which the key draws some.
-        transitions: about how many, at most.
-        ridge, iterations: of `bounded_ridge`.
+        model: SFKD.
+        dynamics: of the same model.
+        params: of the model.
+        data: trajectories, a random part of which is used.
+        key: consumed.
+        transitions: largest number, approximately.
+        ridge: of `bounded_ridge`.
+        iterations: of `bounded_ridge`.
     """
-    drawn = jax.random.permutation(key, driven.controls.shape[0])
-    chosen = drawn[: max(transitions // driven.controls.shape[1], 1)]
-    few = jax.tree.map(lambda leaf: leaf[chosen], driven)
-    found = jax.vmap(
-        lambda one: _pairs(model, networks, space, environment, params, one)
-    )(few)
-    pairs = jax.tree.map(lambda leaf: leaf.reshape(-1, leaf.shape[-1]), found)
+    networks = dynamics.networks
+    order = jax.random.permutation(key, data.controls.shape[0])
+    chosen = order[: max(transitions // data.controls.shape[1], 1)]
+    subset = jax.tree.map(lambda leaf: leaf[chosen], data)
+    by_trajectory = jax.vmap(lambda one: _pairs(model, dynamics, params, one))(subset)
+    pairs = jax.tree.map(lambda leaf: leaf.reshape(-1, leaf.shape[-1]), by_trajectory)
     rank = networks.rank
     raw = params["networks"]
     joint = "couplings" in raw
@@ -89,48 +91,31 @@ def identified(
         (size * left @ gains).reshape(rank, -1, networks.control).swapaxes(0, 1)
     )
     head = {"kernel": jnp.stack(kernel).reshape(len(kernel), -1), "bias": bias.ravel()}
-    return params | {
-        "networks": raw
-        | {"operators": jax.vmap(unbounded)(operators), "input_head": head}
-    }
+    linear = {"operators": jax.vmap(unbounded)(operators), "input_head": head}
+    return params | {"networks": raw | linear}
 
 
-def _pairs(
-    model: Model,
-    networks: Networks,
-    space: Space,
-    environment: bool,
-    params: Params,
-    driven: Trajectory,
-) -> Pairs:
+def _pairs(model: Model, dynamics: Dynamics, params: Params, data: Trajectory) -> Pairs:
     """The transitions of one trajectory."""
-    fibers, later = fibers_along(model, params, driven)
-    origin = model.encode(_first(fibers), driven.states[0])
-    seen = jax.vmap(model.observe, in_axes=(0, None, 0))
-    before = seen(fibers, origin, driven.states[:-1])
+    fibers, later = fibers_along(model, params, data)
+    first = jax.tree.map(lambda leaf: leaf[0], fibers)
+    origin = model.encode(first, data.states[0])
+    observe = jax.vmap(model.observe, in_axes=(0, None, 0))
+    before = observe(fibers, origin, data.states[:-1])
     after = jax.vmap(model.transport)(
-        later, fibers, seen(later, origin, driven.states[1:])
+        later, fibers, observe(later, origin, data.states[1:])
     )
-    alone = fibers._replace(
+    without_linear = fibers._replace(
         A=jax.tree.map(jnp.zeros_like, fibers.A), B=jnp.zeros_like(fibers.B)
     )
-    residual = jax.vmap(model.step)(alone, before, driven.controls)
+    residual = jax.vmap(model.step)(without_linear, before, data.controls)
 
     def features(env: Array, control: Array) -> tuple[Array, Array]:
-        scaled = scaled_env(space, env, environment)
-        local = networks.apply(
-            {"params": params["networks"]}, scaled, method="per_environment"
-        )
-        mixture, embedding = (
-            cast(PerEnvironment, local).mixture,
-            cast(PerEnvironment, local).embedding,
-        )
+        local = dynamics.per_environment(params, env)
+        space = dynamics.space
         u = (control - space.control_mean) / space.control_scale
-        return mixture, jnp.outer(jnp.append(embedding, 1.0), u).ravel()
+        inputs = jnp.outer(jnp.append(local.embedding, 1.0), u).ravel()
+        return local.mixture, inputs
 
-    mixtures, inputs = jax.vmap(features)(driven.envs, driven.controls)
+    mixtures, inputs = jax.vmap(features)(data.envs, data.controls)
     return Pairs(before.z, after.z - residual.z, mixtures, inputs)
-
-
-def _first(tree: Any) -> Any:
-    return jax.tree.map(lambda leaf: leaf[0], tree)

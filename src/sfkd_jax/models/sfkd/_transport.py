@@ -1,4 +1,4 @@
-"""Isometric transport between fibres: T(e → e') = Q(e') Q(e)', Q(e) orthogonal."""
+"""Isometric transport between fibers: T(e → e') = Q(e') Q(e)', Q(e) orthogonal."""
 
 from __future__ import annotations
 
@@ -9,17 +9,18 @@ from jaxtyping import Array, Float
 def rotate_planes(
     tangents: Float[Array, " plane"], z: Float[Array, " rank"]
 ) -> Float[Array, " rank"]:
-    """Q z for the Cayley transform Q = (I − S)⁻¹(I + S) of S = diag(t_i J), J = [[0, −1], [1, 0]], in closed form.
+    """Return Q z, where Q rotates plane i = (z_i, z_{i + r/2}) by 2 arctan t_i.
 
-    Plane i = (z_i, z_{i + r/2}) turns by 2 arctan t_i; −t undoes t exactly.
+    Q = (I − S)⁻¹(I + S) is the Cayley transform of S = diag(t_i J), J = [[0, −1], [1,
+    0]], in closed form; −t inverts t exactly.
 
-    Q loses nothing against a full orthogonal Q(e): in the coordinates Q(e)' z the
+    This Q is as general as a full orthogonal Q(e): in the coordinates Q(e)' z the
     transport is the identity and A(e), B(e) and the networks are conjugated, which a
     model with free A(e), B(e) represents anyway. What matters is that T is an isometry,
     T(e → e) = I, and a cocycle.
 
     Args:
-        tangents: t, one per plane.
+        tangents: t, one entry per plane.
         z: of even length.
     """
     first, second = jnp.split(z, 2)
