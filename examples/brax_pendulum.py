@@ -16,6 +16,7 @@ import jax.numpy as jnp
 from brax import envs
 
 from sfkd_jax import adapters, certification, control, models
+from sfkd_jax.core.folding import fold
 from sfkd_jax.datasets import (
     Dataset,
     measure_space,
@@ -142,21 +143,21 @@ def learned_task(model, plant) -> control.Task:
     """
     low, high = jnp.asarray(plant.control_low), jnp.asarray(plant.control_high)
 
-    def begin(params, observation, env, reference, applied):
+    def prepare(params, observation, env, reference, applied):
         fiber = model.fiber(params, env)
-        return control.Began(
+        return control.RolloutSetup(
             fiber, (model.encode(fiber, observation), applied.control), reference
         )
 
-    def advance(weights, fiber, before, wanted, target, last):
+    def step(weights, fiber, before, wanted, target, last):
         v = jnp.clip(wanted, low, high)
         latent = model.step(fiber, before[0], v)
         state = model.decode(fiber, latent)
-        return control.Advanced(
+        return control.StepResult(
             (latent, v), stage(weights, state, v, before[1], target), v, v, state
         )
 
-    return control.Task(low, high, (), begin, advance, lambda *_: None)
+    return control.Task(low, high, (), prepare, step, lambda *_: None)
 
 
 def gain_alone(dt: float) -> Controller:
@@ -210,7 +211,7 @@ def main(
     )
     gain, step = upright_gain(plant), under_gain(plant)
     model, params, proof = learn(collect(plant, step, gain, drives), steps, horizon)
-    params = jax.jit(model.fold)(params)  # once, not at every step
+    params = jax.jit(partial(fold, model))(params)  # once, not at every step
     tube = proof["tube"]["physical"]["body"]
     print(
         f"certified: alpha {proof['alpha']:.4f}; at least {proof['attacks']['step_slopes']:.4f} by an attack"

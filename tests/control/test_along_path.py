@@ -11,7 +11,7 @@ import pytest
 from helpers import any_law, tiny
 
 from sfkd_jax import build, control, vehicle
-from sfkd_jax.control import at_turn, curvature_ahead, path_coordinates
+from sfkd_jax.control import curvature_ahead, path_coordinates, turn_control
 from sfkd_jax.core.se2 import compose
 from sfkd_jax.scenarios import path_from_curvature, reference_window
 
@@ -66,7 +66,7 @@ def test_without_samples_the_law_alone_drives():
     curvature = curvature_ahead(reference)[0]
     xi = path_coordinates(state, reference[0], curvature)
     np.testing.assert_allclose(
-        action, at_turn(LAW.turn(curvature, jnp.asarray(9.0), ENV), xi), atol=1e-6
+        action, turn_control(LAW.turn(curvature, jnp.asarray(9.0), ENV), xi), atol=1e-6
     )
     assert bool(info["healthy"])
 
@@ -83,7 +83,7 @@ def test_what_is_added_to_the_law_stays_within_its_bounds():
     action, after, _ = jax.jit(controller.act)({}, loud, state, ENV, reference)
     curvature = curvature_ahead(reference)[0]
     xi = path_coordinates(state, reference[0], curvature)
-    added = action - at_turn(LAW.turn(curvature, jnp.asarray(9.0), ENV), xi)
+    added = action - turn_control(LAW.turn(curvature, jnp.asarray(9.0), ENV), xi)
     assert np.all(np.abs(added) <= LAW.perturbation + 1e-6)
     assert np.all(np.abs(after.plan) <= LAW.perturbation + 1e-6)
 

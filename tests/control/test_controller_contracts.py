@@ -21,6 +21,7 @@ from helpers import (
 )
 
 from sfkd_jax import control, evaluation, models, scenarios, vehicle
+from sfkd_jax.core.folding import fold
 
 PLANT = vehicle.kinematic()
 LIMITS = {"control_low": PLANT.control_low, "control_high": PLANT.control_high}
@@ -94,7 +95,7 @@ def shielded():
     filtered = control.shielded(
         planner, model, law, width=0.5, tube=0.2, horizon=8, **limits
     )
-    return filtered, jit(model.fold)(jit(model.init)(jax.random.key(0)))
+    return filtered, jit(partial(fold, model))(jit(model.init)(jax.random.key(0)))
 
 
 def koopman_mpc():

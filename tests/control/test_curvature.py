@@ -9,7 +9,11 @@ import pytest
 from helpers import jit
 
 from sfkd_jax import control
-from sfkd_jax.control.laws._curvature import FLATTEST, curvature_factor, shaped
+from sfkd_jax.control.planners._shaped_noise import (
+    MIN_CURVATURE,
+    curvature_factor,
+    shape_noise,
+)
 
 HORIZON = 8
 A, B = np.float32([[1.0, 0.1], [0.0, 0.9]]), np.float32([[0.0, 0.02], [0.1, 0.0]])
@@ -63,7 +67,7 @@ def test_the_covariance_of_a_linear_model_is_its_closed_form():
     ).reshape(16, 16)
     scale = np.diag(np.tile(np.asarray(STD, dtype=float), HORIZON))
     values, vectors = np.linalg.eigh(scale @ closed_form() @ scale)
-    assert values[0] / values[-1] > FLATTEST, "the floor must not hide the formula"
+    assert values[0] / values[-1] > MIN_CURVATURE, "the floor must not hide the formula"
     widths = (values / np.exp(np.log(values).mean())) ** -0.5
     expected = scale @ vectors @ np.diag(widths) @ vectors.T @ scale
     np.testing.assert_allclose(
@@ -88,7 +92,7 @@ def test_without_a_curvature_noise_is_independent(bad):
         factor.reshape(6, 6), np.diag(np.tile(STD, 3)), rtol=1e-6
     )
     noise = jax.random.normal(jax.random.key(0), (3, 5, 2))
-    np.testing.assert_allclose(shaped(factor, noise), noise * STD, rtol=1e-6)
+    np.testing.assert_allclose(shape_noise(factor, noise), noise * STD, rtol=1e-6)
 
 
 def test_where_the_cost_bends_down_noise_is_as_wide_as_where_it_is_flat():
@@ -99,7 +103,7 @@ def test_where_the_cost_bends_down_noise_is_as_wide_as_where_it_is_flat():
         curvature_factor(saddle, jnp.zeros((1, 2)), jnp.ones(2))
     ).reshape(2, 2)
     ratio = factor[1, 1] / factor[0, 0]
-    assert ratio == pytest.approx(FLATTEST**-0.25, rel=1e-4)
+    assert ratio == pytest.approx(MIN_CURVATURE**-0.25, rel=1e-4)
     assert factor[0, 1] == pytest.approx(0.0, abs=1e-6)
 
 

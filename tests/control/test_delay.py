@@ -46,7 +46,7 @@ def drive(controller, steps=12):
 
 
 def test_the_state_it_plans_from_is_the_one_that_comes():
-    states, _, info = drive(control.compensated(planner(), MODEL, delay=DELAY))
+    states, _, info = drive(control.delay_compensated(planner(), MODEL, delay=DELAY))
     # At step k it foresees the state in which the control of step k begins to act.
     np.testing.assert_allclose(
         info["arrival_state"][:-DELAY], states[DELAY - 1 : -1], atol=1e-4
@@ -55,7 +55,7 @@ def test_the_state_it_plans_from_is_the_one_that_comes():
 
 def test_it_acts_as_the_planner_alone_would_from_that_state():
     _, actions, info = drive(
-        control.compensated(planner(), MODEL, delay=DELAY), steps=1
+        control.delay_compensated(planner(), MODEL, delay=DELAY), steps=1
     )
     alone = planner()
     reference = straight(HORIZON).at[:, 0].add(START[0])
@@ -66,7 +66,7 @@ def test_it_acts_as_the_planner_alone_would_from_that_state():
 
 
 def test_an_observation_that_cannot_be_read_is_reported_and_the_next_clean_one_recovers():
-    controller = control.compensated(planner(), MODEL, delay=DELAY)
+    controller = control.delay_compensated(planner(), MODEL, delay=DELAY)
     act, state = jit(controller.act), controller.init(jax.random.key(0))
     seen = []
     for observation in (START, START * jnp.nan, START):
@@ -78,4 +78,4 @@ def test_an_observation_that_cannot_be_read_is_reported_and_the_next_clean_one_r
 
 def test_a_delay_below_one_period_is_refused():
     with pytest.raises(ValueError, match="delay must be at least 1"):
-        control.compensated(planner(), MODEL, delay=0)
+        control.delay_compensated(planner(), MODEL, delay=0)

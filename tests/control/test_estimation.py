@@ -225,7 +225,7 @@ def test_the_state_that_is_planned_from_is_nearer_to_the_truth_than_the_sensors(
     smooth, _ = follow(seen)
     raw, _ = follow(seen, smooth=False)
     np.testing.assert_allclose(raw["seen"], seen, rtol=1e-6)
-    error = lambda states: np.sqrt(np.mean((states[15:] - truth[15:]) ** 2, axis=0))  # noqa: E731
+    error = lambda states: np.sqrt(np.mean((states[15:] - truth[15:]) ** 2, axis=0))
     assert np.all(error(smooth["seen"]) < 0.9 * error(seen))
 
 

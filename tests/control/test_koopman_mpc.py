@@ -33,7 +33,7 @@ def koopman():
     model = models.koopman(
         datasets.measure_space(dataset()), functions=20, environment_degree=1
     )
-    return model, jit(model.identify)(
+    return model, jit(model.fitting.identify)(
         dataset().train, dataset().validation, jax.random.key(3)
     )
 
@@ -140,7 +140,7 @@ def test_the_cost_is_the_tracking_cost_of_what_is_predicted(speed_loop):
     first, state, _ = act(speed_loop=speed_loop)
     moved = jnp.asarray([1.0, 0.25, 0.04, 9.6])
     action, after, info = act(moved, state=state, speed_loop=speed_loop)
-    linear = model.linear(model.fiber(params, ENV))
+    linear = model.structure.linear(model.fiber(params, ENV))
     tracking = control.tracking_cost(dt=0.1, speed_loop=speed_loop)
     curvature = control.reference_curvature(BEND)
     errors = control.path_errors(moved, BEND[0], curvature[0])

@@ -22,7 +22,7 @@ every = pytest.mark.parametrize("kind", KINDS)
 
 
 def drawn(kind, seed=0, samples=SAMPLES, **settings):
-    draw = control.sampler(kind, horizon=HORIZON, **{**KINDS[kind], **settings})
+    draw = control.noise_sampler(kind, horizon=HORIZON, **{**KINDS[kind], **settings})
     return np.asarray(draw(jax.random.key(seed), samples, STD))
 
 
@@ -68,7 +68,7 @@ def test_the_spectrum_of_coloured_noise_falls_as_asked(exponent):
     20 steps resolves.
     """
     horizon = 64
-    draw = control.sampler("coloured", horizon=horizon, exponent=exponent)
+    draw = control.noise_sampler("coloured", horizon=horizon, exponent=exponent)
     noise = np.asarray(draw(jax.random.key(0), 2000, STD))[:, :, 0]
     power = np.mean(
         np.abs(np.fft.rfft(noise * np.hanning(horizon)[:, None], axis=0)) ** 2, axis=1
@@ -101,7 +101,7 @@ def test_halton_points_fill_their_space_more_evenly_than_independent_ones():
     """
     misses = {halton: [] for halton in (True, False)}
     for halton, found in misses.items():
-        draw = control.sampler("spline", horizon=HORIZON, knots=2, halton=halton)
+        draw = control.noise_sampler("spline", horizon=HORIZON, knots=2, halton=halton)
         for seed in range(12):
             noise = np.asarray(draw(jax.random.key(seed), 512, jnp.ones(2)))
             found.append(
@@ -131,16 +131,16 @@ def test_as_many_samples_count_as_are_wanted_whatever_the_scale_of_the_cost(
         "exponential": jax.random.exponential(jax.random.key(1), (1500,)),
         "one far off": jax.random.uniform(jax.random.key(2), (1500,)).at[7].set(1e4),
     }[law]
-    temperature = control.temperature_for(scale * costs, jnp.asarray(wanted))
+    temperature = control.temperature_for_sample_size(scale * costs, jnp.asarray(wanted))
     weights, usable = control.softmin(scale * costs, temperature)
     assert bool(usable)
-    np.testing.assert_allclose(control.count_effective(weights), wanted, rtol=0.05)
+    np.testing.assert_allclose(control.effective_sample_size(weights), wanted, rtol=0.05)
 
 
 def test_more_than_there_are_gives_all_and_bad_ones_never_count():
     costs = jnp.asarray([1.0, 2.0, jnp.nan, jnp.inf, 3.0])
     weights, _ = control.softmin(
-        costs, control.temperature_for(costs, jnp.asarray(5.0))
+        costs, control.temperature_for_sample_size(costs, jnp.asarray(5.0))
     )
     np.testing.assert_allclose(weights, [1 / 3, 1 / 3, 0.0, 0.0, 1 / 3], atol=1e-4)
 
@@ -149,6 +149,6 @@ def test_more_than_there_are_gives_all_and_bad_ones_never_count():
     "costs", [[2.0, 2.0, 2.0], [jnp.nan] * 3, [1.0, jnp.inf, jnp.inf]]
 )
 def test_costs_without_a_spread_give_a_finite_temperature(costs):
-    temperature = control.temperature_for(jnp.asarray(costs), jnp.asarray(2.0))
+    temperature = control.temperature_for_sample_size(jnp.asarray(costs), jnp.asarray(2.0))
     assert bool(jnp.isfinite(temperature))
     assert float(temperature) > 0

@@ -7,7 +7,7 @@ import pytest
 from helpers import jit, straight
 
 from sfkd_jax import control
-from sfkd_jax.control import PathErrors, Stage
+from sfkd_jax.control import PathErrors, StageInputs
 
 ERRORS = jit(jax.vmap(control.path_errors))
 RADIUS = 40.0
@@ -139,7 +139,7 @@ def stage(
     now = PathErrors(scalar(lateral), scalar(heading), scalar(fast))
     then = PathErrors(scalar(before), scalar(heading), scalar(fast))
     used = jnp.asarray([steering, acceleration]), jnp.asarray([steering_before, 0.0])
-    return Stage(now, then, *used, scalar(10.0))
+    return StageInputs(now, then, *used, scalar(10.0))
 
 
 def charge(seen, **settings):

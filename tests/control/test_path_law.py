@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from sfkd_jax import artefacts, vehicle
-from sfkd_jax.control import derive_path_law, law_arrays, law_from_arrays
+from sfkd_jax.control import derive_path_law, law_from_arrays, law_to_arrays
 from sfkd_jax.core.path_frame import path_state, path_step
 from sfkd_jax.types import BODY
 
@@ -79,7 +79,7 @@ def test_a_law_survives_being_stored(derived):
     law = derived[1]
     flat = {
         name: np.asarray(leaf)
-        for name, leaf in artefacts.flatten({"law": law_arrays(law)}).items()
+        for name, leaf in artefacts.flatten({"law": law_to_arrays(law)}).items()
     }
     again = law_from_arrays(artefacts.unflatten(flat)["law"])
     given = (

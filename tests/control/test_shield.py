@@ -11,8 +11,9 @@ import pytest
 from helpers import TINY, any_law, jit, path_space, same, tiny
 
 from sfkd_jax import build, control, models
-from sfkd_jax.control import admit, curvature_ahead, path_coordinates, shielded
-from sfkd_jax.core.path_frame import beside, path_state
+from sfkd_jax.control import curvature_ahead, path_coordinates, safety_filter, shielded
+from sfkd_jax.core.folding import fold, unfold
+from sfkd_jax.core.path_frame import vehicle_state, path_state
 from sfkd_jax.types import BODY, Controller, Model
 from sfkd_jax.vehicle import kinematic
 
@@ -86,6 +87,7 @@ def scripted():
     """
 
     def act(params, k, observation, env, reference):
+        params = unfold(params)
         script = params["script"] if isinstance(params, dict) else params
         curvature = curvature_ahead(reference)[0]
         xi = path_coordinates(observation, reference[0], curvature)
@@ -124,7 +126,7 @@ def drive(
         xi, memory = carry
         disturbance, mask, env = inputs
         action, memory, info = controller.act(
-            script, memory, beside(xi) * mask, env, reference
+            script, memory, vehicle_state(xi) * mask, env, reference
         )
         nu = action - LAW(xi, jnp.asarray(curvature), jnp.asarray(SPEED), env)
         inputs = jnp.concatenate(
@@ -218,7 +220,7 @@ def test_who_asks_for_nothing_or_for_little_is_left_alone(added):
         script, jnp.zeros((40, 3)), (0.05, 0.0, 8.0)
     )
     planned = jit(
-        jax.vmap(lambda xi: scripted().act(script, 0, beside(xi), ENV, reference)[0])
+        jax.vmap(lambda xi: scripted().act(script, 0, vehicle_state(xi), ENV, reference)[0])
     )(xi)
     np.testing.assert_array_equal(controls, planned)
     np.testing.assert_allclose(info["perturbation"], script, atol=1e-6)
@@ -239,7 +241,11 @@ def margin_of(xi, nu, road):
 ROAD = np.asarray([0.002, SPEED])
 admitted = jit(
     partial(
-        admit, TOY, ENV, ahead=jnp.tile(jnp.asarray(ROAD), (HORIZON, 1)), width=WIDTH
+        safety_filter,
+        TOY,
+        ENV,
+        ahead=jnp.tile(jnp.asarray(ROAD), (HORIZON, 1)),
+        width=WIDTH,
     )
 )
 
@@ -260,12 +266,12 @@ def test_the_largest_share_that_keeps_the_copy_inside_is_admitted():
         )
         nu = random.uniform(-1, 1, 2) * LIMIT
         margins = np.asarray(
-            [margin_of(xi, share * nu, ROAD) for share in control.SHARES]
+            [margin_of(xi, share * nu, ROAD) for share in control.FILTER_SCALES]
         )
         if np.min(np.abs(margins)) < 1e-5 or np.max(margins) < 0:
             continue
         result = asked(xi, nu)
-        share = control.SHARES[np.argmax(margins >= 0)]
+        share = control.FILTER_SCALES[np.argmax(margins >= 0)]
         found.append(share)
         assert float(result.share) == share
         np.testing.assert_allclose(result.nu, share * nu, rtol=1e-6)
@@ -357,7 +363,7 @@ def test_a_switch_of_the_environment_moves_copy_and_car_alike():
     xi, memory = jnp.asarray([0.1, 0.0, SPEED]), controller.init(jax.random.key(0))
     act, distances, inside = jit(controller.act), [], []
     for k in range(40):
-        action, memory, info = act(quiet, memory, beside(xi), told[k], reference)
+        action, memory, info = act(quiet, memory, vehicle_state(xi), told[k], reference)
         assert np.all(np.isfinite(action))
         distances.append(float(jnp.abs(xi - info["copy"])[0]))
         inside.append(bool(info["env_inside"]))
@@ -404,7 +410,7 @@ def test_outside_a_box_the_law_drives_alone(box, value):
         controller = filtered(**options)
         act = jit(controller.act)
         memory = controller.init(jax.random.key(0))
-        _, _, info = act(wanted, memory, beside(jnp.asarray(start)), ENV, circle(0.002))
+        _, _, info = act(wanted, memory, vehicle_state(jnp.asarray(start)), ENV, circle(0.002))
         assert bool(info["void"]) == bool(options)
         assert bool(info["shield_healthy"]) != bool(options)
         np.testing.assert_allclose(
@@ -417,7 +423,7 @@ def test_outside_a_box_the_law_drives_alone(box, value):
 def test_before_anything_is_seen_the_planner_passes_within_the_limits():
     controller = filtered(control_low=(-0.4, 0.5))
     act, memory = jit(controller.act), controller.init(jax.random.key(0))
-    xi, reference = beside(jnp.asarray([0.1, 0.0, SPEED])), circle()
+    xi, reference = vehicle_state(jnp.asarray([0.1, 0.0, SPEED])), circle()
     silent = Controller(lambda key: (), lambda params, *rest: (params, (), {}))
     blind = shielded(
         silent,
@@ -458,7 +464,7 @@ def test_without_a_reference_the_last_preview_is_driven_on():
     """On a circle, where the curvature that was ahead is the one that comes."""
     controller = filtered()
     act, memory = jit(controller.act), controller.init(jax.random.key(0))
-    xi, reference = beside(jnp.asarray([0.1, 0.0, SPEED])), circle(0.01)
+    xi, reference = vehicle_state(jnp.asarray([0.1, 0.0, SPEED])), circle(0.01)
     _, memory, _ = act(jnp.zeros((9, 2)), memory, xi, ENV, reference)
     ahead = memory.copy.ahead
     action, memory, info = act(jnp.zeros((9, 2)), memory, xi, ENV, reference * jnp.nan)
@@ -474,7 +480,7 @@ def test_where_law_and_planner_are_at_the_same_limit_nothing_was_asked_for():
     not be told a perturbation.
     """
     controller = filtered(control_high=(0.05, 5.0), width=5.0)
-    start = beside(jnp.asarray([-3.0, -0.2, SPEED]))
+    start = vehicle_state(jnp.asarray([-3.0, -0.2, SPEED]))
     _, _, info = jit(controller.act)(
         jnp.zeros((9, 2)), controller.init(jax.random.key(0)), start, ENV, circle()
     )
@@ -487,16 +493,16 @@ def test_it_is_exported_in_a_scan_and_does_as_call_by_call():
     vmap are in the contracts.
     """
     model = models.sfkd(path_space(), **TINY | {"budget": "joint"}, frame="path")
-    params = jit(lambda key: model.fold(model.init(key)))(jax.random.key(0))
+    params = jit(lambda key: fold(model, model.init(key)))(jax.random.key(0))
     controller = shielded(
         scripted(), model, LAW, width=0.5, tube=0.3, control_low=LOW, control_high=HIGH
     )
     envs = jnp.asarray([[0.6, 2.0], [0.6, 2.0], [0.4, -5.0], [jnp.nan, 0.0]])
-    xi, reference = beside(jnp.asarray([0.2, 0.01, SPEED])), circle(0.003, horizon=6)
+    xi, reference = vehicle_state(jnp.asarray([0.2, 0.01, SPEED])), circle(0.003, horizon=6)
     asked = jnp.asarray(scripts()["random"][:4], dtype=float)
 
     def step(memory, env):
-        given = params | {"script": asked}
+        given = params._replace(weights=params.weights | {"script": asked})
         action, memory, info = controller.act(given, memory, xi, env, reference)
         return memory, (action, info)
 
@@ -561,7 +567,7 @@ def test_a_model_of_the_world_and_an_environment_of_another_size_are_refused():
     controller = filtered()
     memory, xi = (
         controller.init(jax.random.key(0)),
-        beside(jnp.asarray([0.0, 0.0, SPEED])),
+        vehicle_state(jnp.asarray([0.0, 0.0, SPEED])),
     )
     with pytest.raises(ValueError, match=r"env must have shape \(2,\), got \(3,\)"):
         controller.act(jnp.zeros((9, 2)), memory, xi, jnp.zeros(3), circle())

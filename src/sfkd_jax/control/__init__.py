@@ -3,7 +3,7 @@
 from sfkd_jax.control.laws._derived_law import derive_path_law as derive_path_law
 from sfkd_jax.control.laws._model_law import ModelLaw as ModelLaw
 from sfkd_jax.control.laws._model_law import SteadyTurn as SteadyTurn
-from sfkd_jax.control.laws._path_errors import Law as Law
+from sfkd_jax.control.laws._path_errors import FeedbackLaw as FeedbackLaw
 from sfkd_jax.control.laws._path_errors import PathErrors as PathErrors
 from sfkd_jax.control.laws._path_errors import no_feedback as no_feedback
 from sfkd_jax.control.laws._path_errors import path_errors as path_errors
@@ -12,9 +12,9 @@ from sfkd_jax.control.laws._path_errors import (
     reference_curvature as reference_curvature,
 )
 from sfkd_jax.control.laws._path_law import PathLaw as PathLaw
-from sfkd_jax.control.laws._path_law import at_turn as at_turn
-from sfkd_jax.control.laws._path_law import law_arrays as law_arrays
 from sfkd_jax.control.laws._path_law import law_from_arrays as law_from_arrays
+from sfkd_jax.control.laws._path_law import law_to_arrays as law_to_arrays
+from sfkd_jax.control.laws._path_law import turn_control as turn_control
 from sfkd_jax.control.planners._box_qp import BoxSolution as BoxSolution
 from sfkd_jax.control.planners._box_qp import box_qp as box_qp
 from sfkd_jax.control.planners._cem import cem as cem
@@ -22,43 +22,47 @@ from sfkd_jax.control.planners._gradient import gradient_planner as gradient_pla
 from sfkd_jax.control.planners._koopman_mpc import KoopmanMpcState as KoopmanMpcState
 from sfkd_jax.control.planners._koopman_mpc import koopman_mpc as koopman_mpc
 from sfkd_jax.control.planners._mppi import mppi as mppi
-from sfkd_jax.control.planners._noise import Sampler as Sampler
+from sfkd_jax.control.planners._noise import NoiseSampler as NoiseSampler
 from sfkd_jax.control.planners._noise import correlated_noise as correlated_noise
-from sfkd_jax.control.planners._noise import sampler as sampler
+from sfkd_jax.control.planners._noise import noise_sampler as noise_sampler
 from sfkd_jax.control.planners._planner import planner as planner
-from sfkd_jax.control.planners._plans import Found as Found
 from sfkd_jax.control.planners._plans import PlannerState as PlannerState
 from sfkd_jax.control.planners._plans import Search as Search
+from sfkd_jax.control.planners._plans import SearchResult as SearchResult
 from sfkd_jax.control.planners._plans import Tuning as Tuning
 from sfkd_jax.control.planners._risk import risk_measure as risk_measure
 from sfkd_jax.control.planners._smoothing import plan_smoother as plan_smoother
 from sfkd_jax.control.planners._smoothing import (
     savitzky_golay_weights as savitzky_golay_weights,
 )
-from sfkd_jax.control.planners._weights import count_effective as count_effective
+from sfkd_jax.control.planners._weights import (
+    effective_sample_size as effective_sample_size,
+)
 from sfkd_jax.control.planners._weights import softmin as softmin
-from sfkd_jax.control.planners._weights import temperature_for as temperature_for
+from sfkd_jax.control.planners._weights import (
+    temperature_for_sample_size as temperature_for_sample_size,
+)
 from sfkd_jax.control.tasks._along_path import curvature_ahead as curvature_ahead
 from sfkd_jax.control.tasks._along_path import following_law as following_law
 from sfkd_jax.control.tasks._along_path import path_coordinates as path_coordinates
 from sfkd_jax.control.tasks._costs import Cost as Cost
-from sfkd_jax.control.tasks._costs import Stage as Stage
+from sfkd_jax.control.tasks._costs import StageInputs as StageInputs
 from sfkd_jax.control.tasks._costs import tracking_cost as tracking_cost
 from sfkd_jax.control.tasks._path_tracking import path_tracking as path_tracking
-from sfkd_jax.control.tasks._task import Advanced as Advanced
-from sfkd_jax.control.tasks._task import Applied as Applied
-from sfkd_jax.control.tasks._task import Began as Began
+from sfkd_jax.control.tasks._task import PreviousControl as PreviousControl
+from sfkd_jax.control.tasks._task import RolloutSetup as RolloutSetup
+from sfkd_jax.control.tasks._task import StepResult as StepResult
 from sfkd_jax.control.tasks._task import Task as Task
 from sfkd_jax.control.tasks._task import actuator_limits as actuator_limits
 from sfkd_jax.control.tasks._task import free_task as free_task
-from sfkd_jax.control.wrappers._admission import SHARES as SHARES
-from sfkd_jax.control.wrappers._admission import Admitted as Admitted
-from sfkd_jax.control.wrappers._admission import admit as admit
 from sfkd_jax.control.wrappers._delay import DelayState as DelayState
-from sfkd_jax.control.wrappers._delay import compensated as compensated
+from sfkd_jax.control.wrappers._delay import delay_compensated as delay_compensated
 from sfkd_jax.control.wrappers._estimation import EstimatorState as EstimatorState
 from sfkd_jax.control.wrappers._estimation import estimated as estimated
 from sfkd_jax.control.wrappers._monitor import MonitorState as MonitorState
 from sfkd_jax.control.wrappers._monitor import monitored as monitored
+from sfkd_jax.control.wrappers._safety_filter import FILTER_SCALES as FILTER_SCALES
+from sfkd_jax.control.wrappers._safety_filter import FilterResult as FilterResult
+from sfkd_jax.control.wrappers._safety_filter import safety_filter as safety_filter
 from sfkd_jax.control.wrappers._shield import ShieldState as ShieldState
 from sfkd_jax.control.wrappers._shield import shielded as shielded

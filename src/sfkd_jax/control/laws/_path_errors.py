@@ -26,7 +26,7 @@ class PathErrors(NamedTuple):
     speed: Scalar
 
 
-Law: TypeAlias = Callable[[PathErrors, Scalar, Scalar], Control]
+FeedbackLaw: TypeAlias = Callable[[PathErrors, Scalar, Scalar], Control]
 
 
 def path_errors(
@@ -66,7 +66,7 @@ def path_feedback(
     heading_gain: float = 0.4,
     speed_gain: float = 1.0,
     speed_loop: bool = False,
-) -> Law:
+) -> FeedbackLaw:
     """u = u_ff(κ) + K ξ: δ = atan(L κ) − k_y e_y − k_ψ e_ψ, a = −k_v e_v (or the speed command v_ref − k_v e_v).
 
     Args:
@@ -89,7 +89,7 @@ def path_feedback(
     return law
 
 
-def no_feedback(*, speed_loop: bool = False) -> Law:
+def no_feedback(*, speed_loop: bool = False) -> FeedbackLaw:
     """u = 0 (or the reference speed): plain sampling."""
 
     def law(errors: PathErrors, curvature: Scalar, speed: Scalar) -> Control:

@@ -61,10 +61,10 @@ class PathLaw(NamedTuple):
         self, coordinates: PathState, curvature: Scalar, speed: Scalar, env: Environment
     ) -> Control:
         """u, not clipped to any limit."""
-        return at_turn(self.turn(curvature, speed, env), coordinates)
+        return turn_control(self.turn(curvature, speed, env), coordinates)
 
 
-def at_turn(turn: SteadyTurn, coordinates: PathState) -> Control:
+def turn_control(turn: SteadyTurn, coordinates: PathState) -> Control:
     """u* − K (ξ − ξ*)."""
     return turn.control - turn.gain @ (coordinates - turn.state)
 
@@ -86,7 +86,7 @@ def _corners(
     return (index + sides) @ strides, weights
 
 
-def law_arrays(law: PathLaw) -> dict[str, Array]:
+def law_to_arrays(law: PathLaw) -> dict[str, Array]:
     """The law as a dictionary of arrays, to be stored."""
     return law._asdict()
 

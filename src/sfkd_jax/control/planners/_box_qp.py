@@ -1,4 +1,4 @@
-"""Quadratic programs under box constraints, by projected Newton steps."""
+"""Box-constrained quadratic programs by the projected Newton method."""
 
 from __future__ import annotations
 
@@ -12,15 +12,15 @@ from jaxtyping import Array, Float
 from sfkd_jax.types import Scalar
 
 HALVINGS = 12
-"""Step lengths 1, 1/2, … tried along the projected Newton direction."""
+"""Number of step lengths 1, 1/2, … tried along the projected Newton direction."""
 
 
 class BoxSolution(NamedTuple):
-    """What was found.
+    """The solution of a box-constrained quadratic program.
 
     Attributes:
         primal: x, inside the box.
-        residual: max_i |x − clip(x − ∇/diag H)|_i, 0 at the optimum, in units of x.
+        residual: max_i |x − clip(x − ∇ / diag H)|_i in units of x; 0 at the optimum.
     """
 
     primal: Float[Array, " n"]
@@ -36,19 +36,23 @@ def box_qp(
     *,
     iterations: int = 12,
 ) -> BoxSolution:
-    """min ½ xᵀ H x + fᵀ x subject to low ≤ x ≤ high, for H > 0.
+    """Minimise ½ xᵀ H x + fᵀ x subject to low ≤ x ≤ high, for H > 0.
 
-    Entries that sit at a bound and whose gradient pushes outward are held; the others
-    take the Newton step of the reduced problem, x ← clip(x − 2⁻ʲ H_ff⁻¹ ∇_f), with the
-    j of the lowest cost. It is exact one step after the set of held entries is right,
-    so a warm start that guesses them is solved at once. The cost never rises, and a
-    step that is not finite is not taken.
+        x_f ← clip(x_f − 2⁻ʲ H_ff⁻¹ ∇_f)
+
+    The active set holds the entries at a bound where descent points outward; the free
+    entries f take a Newton step of the reduced problem, with the j of the lowest cost.
+    The solution is exact one step after the active set is right, so a good warm start
+    needs one iteration. The cost never increases, and a step that is not finite is not
+    taken.
 
     Args:
-        H, f: the cost.
-        low, high: the box, low ≤ high.
-        start: where to begin, clipped into the box.
-        iterations: fixed; each is one Cholesky factorisation.
+        H: Hessian of the cost, positive definite.
+        f: linear term of the cost.
+        low: lower bounds.
+        high: upper bounds, high ≥ low.
+        start: initial guess, clipped to the box.
+        iterations: fixed number; each is one Cholesky factorisation.
 
     Source: Bertsekas (1982); Tassa, Mansard and Todorov (2014), section III.
     """
@@ -57,9 +61,9 @@ def box_qp(
 
     def improve(x: Float[Array, " n"], _: None) -> tuple[Float[Array, " n"], None]:
         slope = H @ x + f
-        held = ((x <= low) & (slope > 0)) | ((x >= high) & (slope < 0))
-        reduced = jnp.where(held[:, None] | held, jnp.diag(diagonal), H)
-        newton = -cho_solve(cho_factor(reduced), jnp.where(held, 0.0, slope))
+        active = ((x <= low) & (slope > 0)) | ((x >= high) & (slope < 0))
+        reduced = jnp.where(active[:, None] | active, jnp.diag(diagonal), H)
+        newton = -cho_solve(cho_factor(reduced), jnp.where(active, 0.0, slope))
         candidates = jnp.clip(x + lengths * newton, low, high)
         moves = candidates - x
         change = moves @ slope + 0.5 * jnp.sum((moves @ H) * moves, axis=1)

@@ -1,4 +1,4 @@
-"""The cross-entropy method over any task."""
+"""The cross-entropy method for any task."""
 
 from __future__ import annotations
 
@@ -6,18 +6,17 @@ from typing import Any
 
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array
 
-from sfkd_jax.control.planners._noise import sampler
+from sfkd_jax.control.planners._noise import noise_sampler
 from sfkd_jax.control.planners._planner import planner
 from sfkd_jax.control.planners._plans import (
     Evaluate,
-    Found,
+    Plan,
     PlannerState,
-    drawn_around,
-    finite_or_dear,
-    finite_or_zero,
-    weighted,
+    SearchResult,
+    candidate_plans,
+    replace_nonfinite,
+    weighted_mean_and_std,
 )
 from sfkd_jax.control.tasks._task import Task
 from sfkd_jax.types import Controller, Key
@@ -38,60 +37,70 @@ def cem(
     halton: bool = False,
     **options: Any,
 ) -> Controller:
-    """Draw plans, keep the elites, fit mean and spread to them, draw again.
+    """Return the cross-entropy controller of a task.
 
         ν ← mean of the elites,   σ_k ← max(their standard deviation at step k, σ_min)
 
-    Sample 0 of each iteration is the present mean, so nothing found is lost; a bad
-    rollout is no elite.
+    Each iteration samples plans, keeps the elites and fits mean and standard deviation
+    to them. Sample 0 is the current mean, so the best cost never increases between
+    iterations. A rollout that is not finite is never an elite.
 
     Args:
-        task: what is planned.
-        horizon: T.
+        task: the planning problem.
+        horizon: T, number of steps.
         num_samples: per iteration.
-        elites: kept.
+        elites: number of samples kept.
         iterations: per control step.
-        smallest_scale: σ_min, against noise_std; σ starts anew at noise_std at every
+        smallest_scale: σ_min relative to noise_std; σ is reset to noise_std at every
             control step.
-        noise, noise_correlation, noise_exponent, noise_knots, halton: course of the
-            noise over time, see `sampler`.
+        noise: kind of noise, see `noise_sampler`.
+        noise_correlation: see `noise_sampler`.
+        noise_exponent: see `noise_sampler`.
+        noise_knots: see `noise_sampler`.
+        halton: see `noise_sampler`.
         options: of `planner`.
 
     Raises:
-        ValueError: settings that cannot be meant.
+        ValueError: a setting is out of its range.
 
     Source: Rubinstein (1999); correlated noise as in Pinneri et al. (2020), iCEM.
     """
     if not 1 <= elites <= num_samples or iterations < 1:
         raise ValueError(
-            f"elites must lie in [1, num_samples], got {elites} of {num_samples}, {iterations} iterations"
+            "elites must lie in [1, num_samples], "
+            f"got {elites} of {num_samples}, {iterations} iterations"
         )
-    shape = {
-        "correlation": noise_correlation,
-        "exponent": noise_exponent,
-        "knots": noise_knots,
-        "halton": halton,
-    }
-    draw = sampler(noise, horizon=horizon, **shape)
+    draw = noise_sampler(
+        noise,
+        horizon=horizon,
+        correlation=noise_correlation,
+        exponent=noise_exponent,
+        knots=noise_knots,
+        halton=halton,
+    )
 
-    def search(key: Key, state: PlannerState, evaluate: Evaluate) -> Found:
+    def search(key: Key, state: PlannerState, evaluate: Evaluate) -> SearchResult:
+        std = state.tuning.noise_std
+
         def improve(
-            carry: tuple[Array, Array], key: Key
-        ) -> tuple[tuple[Array, Array], Found]:
+            carry: tuple[Plan, Plan], key: Key
+        ) -> tuple[tuple[Plan, Plan], SearchResult]:
             plan, scale = carry
-            noise = draw(key, num_samples, state.tuning.noise_std) * scale[:, None]
-            costs, effective = evaluate(drawn_around(plan, noise, state))
-            lowest, chosen = jax.lax.top_k(-finite_or_dear(costs), elites)
-            counts = jnp.isfinite(lowest).astype(float)
+            noise = draw(key, num_samples, std) * scale[:, None]
+            costs, effective = evaluate(candidate_plans(plan, noise, state))
+            costs = replace_nonfinite(costs, jnp.inf)
+            negated, chosen = jax.lax.top_k(-costs, elites)
+            counts = jnp.isfinite(negated).astype(float)
             weights = counts / jnp.maximum(jnp.sum(counts), 1.0)
-            mean, spread = weighted(weights, finite_or_zero(effective)[:, chosen])
-            scale = jnp.maximum(spread / state.tuning.noise_std, smallest_scale)
-            return (mean, scale), Found(
-                mean, jnp.any(counts > 0), -lowest[0], jnp.sum(counts)
+            mean, spread = weighted_mean_and_std(
+                weights, replace_nonfinite(effective, 0.0)[:, chosen]
             )
+            scale = jnp.maximum(spread / std, smallest_scale)
+            usable, size = jnp.any(counts > 0), jnp.sum(counts)
+            return (mean, scale), SearchResult(mean, usable, -negated[0], size)
 
         start = (state.plan, jnp.ones_like(state.plan))
-        _, founds = jax.lax.scan(improve, start, jax.random.split(key, iterations))
-        return jax.tree.map(lambda leaf: leaf[-1], founds)
+        _, results = jax.lax.scan(improve, start, jax.random.split(key, iterations))
+        return jax.tree.map(lambda leaf: leaf[-1], results)
 
     return planner(task, search, horizon=horizon, **options)

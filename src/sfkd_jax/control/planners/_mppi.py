@@ -1,4 +1,4 @@
-"""Model predictive path integral control over any task."""
+"""Model predictive path integral control of any task."""
 
 from __future__ import annotations
 
@@ -9,26 +9,29 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from sfkd_jax.control.laws._curvature import curvature_factor, shaped
-from sfkd_jax.control.planners._noise import sampler
+from sfkd_jax.control.planners._noise import noise_sampler
 from sfkd_jax.control.planners._planner import planner
 from sfkd_jax.control.planners._plans import (
     Evaluate,
-    Found,
     Plan,
     PlannerState,
     Plans,
-    drawn_around,
-    finite_or_dear,
-    finite_or_zero,
-    weighted,
+    SearchResult,
+    candidate_plans,
+    replace_nonfinite,
+    weighted_mean_and_std,
 )
-from sfkd_jax.control.planners._weights import count_effective, softmin, temperature_for
+from sfkd_jax.control.planners._shaped_noise import curvature_factor, shape_noise
+from sfkd_jax.control.planners._weights import (
+    effective_sample_size,
+    softmin,
+    temperature_for_sample_size,
+)
 from sfkd_jax.control.tasks._task import Task
 from sfkd_jax.types import Controller, Key
 
-SMALLEST_SCALE = 0.05
-"""Of adapted noise, against what it starts as: a spread of zero would never grow again."""
+MIN_NOISE_SCALE = 0.05
+"""Floor of adapted noise, relative to its initial spread: zero could never grow."""
 
 
 def mppi(
@@ -48,35 +51,38 @@ def mppi(
     control_cost: float = 0.0,
     **options: Any,
 ) -> Controller:
-    """Information-theoretic MPPI; each iteration draws M plans around the present one and rolls all out in one scan.
+    """Return the information-theoretic MPPI controller of a task.
 
         ν ← Σ_m w_m ν^m,   w_m ∝ exp(−(J^m + γ Σ_k ν_k' Σ⁻¹ (ν_k^m − ν_k)) / λ)
 
-    ν^m is the perturbation that was effective after clipping. Sample 0 is the shifted
-    plan itself; proposals in the planner's state come beside the drawn ones. A bad
-    rollout gets weight zero.
+    Each iteration samples M plans around the current one and rolls all of them out in
+    one scan. ν^m is the perturbation that the limits allowed. Sample 0 is the shifted
+    plan itself; proposals in the planner's state are added to the samples. A rollout
+    that is not finite has weight zero.
 
     Args:
-        task: what is planned.
-        horizon: T.
+        task: the planning problem.
+        horizon: T, number of steps.
         num_samples: M.
-        iterations: of drawing and weighing, per control step.
-        effective_samples: choose λ anew each time so that 1 / Σ w² is this; 0 keeps λ
-            at `temperature`. The number and λ itself are data of the state, see
-            `Tuning`.
-        noise, noise_correlation, noise_exponent, noise_knots, halton: see `sampler`.
-        curvature: shape the noise by the second derivative of the plan's own cost, see
-            `curvature_factor`; the task must be differentiable, and white noise is the
-            natural choice then.
-        adapt: share in [0, 1] by which the noise's spread, per step and control, moves
-            to that of the weighted samples after each iteration; it starts anew at
-            every control step.
+        iterations: of sampling and weighting per control step.
+        effective_samples: if not 0, λ is chosen at every iteration such that 1 / Σ w²
+            has this value; 0 keeps λ at `temperature`. Both are data, see `Tuning`.
+        noise: kind of noise, see `noise_sampler`.
+        noise_correlation: see `noise_sampler`.
+        noise_exponent: see `noise_sampler`.
+        noise_knots: see `noise_sampler`.
+        halton: see `noise_sampler`.
+        curvature: shape the noise by the Hessian of the plan's own cost, see
+            `curvature_factor`. The task must be differentiable; best with white noise.
+        adapt: fraction in [0, 1] by which the standard deviation of the noise, per step
+            and control, moves to that of the weighted samples after each iteration. It
+            is reset at every control step.
         control_cost: γ, in units of cost; Williams et al. have λ (1 − α).
         options: of `planner`: temperature, noise_std, smoothing, risk, chunk, sharding,
             environment box.
 
     Raises:
-        ValueError: settings that cannot be meant.
+        ValueError: a setting is out of its range, or two settings exclude each other.
 
     Source: Williams et al. (2018), Information-Theoretic Model Predictive Control, T-RO
     34(6).
@@ -84,68 +90,70 @@ def mppi(
     _check(num_samples, iterations, effective_samples, adapt)
     if curvature and control_cost:
         raise ValueError(
-            "curvature and control_cost exclude each other: the latter wants independent noise"
+            "curvature and control_cost exclude each other: "
+            "the latter needs independent noise"
         )
-    shape = {
-        "correlation": noise_correlation,
-        "exponent": noise_exponent,
-        "knots": noise_knots,
-        "halton": halton,
-    }
-    draw = sampler(noise, horizon=horizon, **shape)
+    draw = noise_sampler(
+        noise,
+        horizon=horizon,
+        correlation=noise_correlation,
+        exponent=noise_exponent,
+        knots=noise_knots,
+        halton=halton,
+    )
 
-    def around(state: PlannerState, evaluate: Evaluate) -> Callable[[Key], Plans]:
-        """The noise of this control step."""
+    def noise_around(state: PlannerState, evaluate: Evaluate) -> Callable[[Key], Plans]:
+        """The sampler of this control step."""
         std = state.tuning.noise_std
         if not curvature:
             return lambda key: draw(key, num_samples, std)
         factor = curvature_factor(
             lambda plan: evaluate(plan[:, None])[0][0], state.plan, std
         )
-        return lambda key: shaped(factor, draw(key, num_samples, jnp.ones_like(std)))
+        return lambda key: shape_noise(
+            factor, draw(key, num_samples, jnp.ones_like(std))
+        )
 
-    def search(key: Key, state: PlannerState, evaluate: Evaluate) -> Found:
+    def search(key: Key, state: PlannerState, evaluate: Evaluate) -> SearchResult:
         std = state.tuning.noise_std
-        noise_of = around(state, evaluate)
+        sample = noise_around(state, evaluate)
 
         def improve(
             carry: tuple[Plan, Plan], key: Key
-        ) -> tuple[tuple[Plan, Plan], Found]:
+        ) -> tuple[tuple[Plan, Plan], SearchResult]:
             plan, scale = carry
-            plans = drawn_around(plan, noise_of(key) * scale[:, None], state)
+            plans = candidate_plans(plan, sample(key) * scale[:, None], state)
             costs, effective = evaluate(plans)
-            charged = costs
+            total = costs
             if control_cost:
-                charged = costs + control_cost * _work(plan, plans, std)
-            wanted = state.tuning.effective_samples
-            temperature = (
-                temperature_for(charged, wanted)
-                if effective_samples
-                else state.tuning.temperature
+                total = costs + control_cost * _control_cost(plan, plans, std)
+            temperature = state.tuning.temperature
+            if effective_samples:
+                wanted = state.tuning.effective_samples
+                temperature = temperature_for_sample_size(total, wanted)
+            weights, usable = softmin(total, temperature)
+            mean, spread = weighted_mean_and_std(
+                weights, replace_nonfinite(effective, 0.0)
             )
-            weights, usable = softmin(charged, temperature)
-            better, spread = weighted(weights, finite_or_zero(effective))
             if adapt:
-                scale = jnp.maximum(
-                    (1 - adapt) * scale + adapt * spread / std, SMALLEST_SCALE
-                )
-            best = jnp.min(finite_or_dear(costs))
-            return (better, scale), Found(
-                better, usable, best, count_effective(weights)
-            )
+                scale = (1 - adapt) * scale + adapt * spread / std
+                scale = jnp.maximum(scale, MIN_NOISE_SCALE)
+            lowest = jnp.min(replace_nonfinite(costs, jnp.inf))
+            size = effective_sample_size(weights)
+            return (mean, scale), SearchResult(mean, usable, lowest, size)
 
         start = (state.plan, jnp.ones_like(state.plan))
         if iterations == 1:
             return improve(start, key)[1]
-        _, founds = jax.lax.scan(improve, start, jax.random.split(key, iterations))
-        return jax.tree.map(lambda leaf: leaf[-1], founds)
+        _, results = jax.lax.scan(improve, start, jax.random.split(key, iterations))
+        return jax.tree.map(lambda leaf: leaf[-1], results)
 
     return planner(
         task, search, horizon=horizon, effective_samples=effective_samples, **options
     )
 
 
-def _work(plan: Array, plans: Plans, std: Array) -> Float[Array, " sample"]:
+def _control_cost(plan: Array, plans: Plans, std: Array) -> Float[Array, " sample"]:
     """Σ_k ν_k' Σ⁻¹ (ν_k^m − ν_k)."""
     return jnp.einsum("tc,tmc->m", plan / std**2, plans - plan[:, None])
 
@@ -153,14 +161,16 @@ def _work(plan: Array, plans: Plans, std: Array) -> Float[Array, " sample"]:
 def _check(
     num_samples: int, iterations: int, effective_samples: float, adapt: float
 ) -> None:
-    """Refuse settings that cannot be meant, naming them."""
+    """Raise a ValueError that names a setting out of its range."""
     if num_samples < 1 or iterations < 1:
         raise ValueError(
-            f"num_samples and iterations must be at least 1, got {num_samples} and {iterations}"
+            "num_samples and iterations must be at least 1, "
+            f"got {num_samples} and {iterations}"
         )
     if effective_samples and not 1 <= effective_samples <= num_samples:
         raise ValueError(
-            f"effective_samples must be 0 or lie in [1, {num_samples}], got {effective_samples}"
+            f"effective_samples must be 0 or lie in [1, {num_samples}], "
+            f"got {effective_samples}"
         )
     if not 0 <= adapt <= 1:
         raise ValueError(f"adapt must lie in [0, 1], got {adapt}")

@@ -1,4 +1,4 @@
-"""Perturbations for sampling planners: unit variance at every step, whatever their course over the horizon."""
+"""Noise for sampling planners, with the same variance at every step."""
 
 from __future__ import annotations
 
@@ -13,10 +13,8 @@ from jaxtyping import Array, Float
 from sfkd_jax.types import Control, Key
 
 Noise: TypeAlias = Float[Array, "horizon sample control"]
-Sampler: TypeAlias = Callable[[Key, int, Control], Noise]
-"""(key, number of samples, standard deviation per control) -> perturbations, shape
-(horizon, sample, control).
-"""
+NoiseSampler: TypeAlias = Callable[[Key, int, Control], Noise]
+"""(key, number of samples, standard deviation per control) -> perturbations."""
 
 KINDS = ("ar1", "white", "coloured", "rbf", "spline")
 
@@ -29,12 +27,15 @@ def correlated_noise(
     std: Float[Array, " control"],
     correlation: float,
 ) -> Noise:
-    """Stationary AR(1) noise, ε_{k+1} = ρ ε_k + √(1 − ρ²) w_k, so that every step has the same spread.
+    """Return stationary AR(1) noise, which has the same variance at every step.
+
+        ε_{k+1} = ρ ε_k + √(1 − ρ²) w_k
 
     Args:
         key: consumed.
-        num_samples, horizon: how many, how long.
-        std: per control channel, in control units.
+        num_samples: number of samples.
+        horizon: number of steps.
+        std: standard deviation per control, in control units.
         correlation: ρ in [0, 1).
     """
     white = jax.random.normal(key, (horizon, num_samples, std.shape[0])) * std
@@ -48,7 +49,7 @@ def correlated_noise(
     return jnp.concatenate([white[:1], rest])
 
 
-def sampler(
+def noise_sampler(
     kind: str = "ar1",
     *,
     horizon: int,
@@ -56,27 +57,27 @@ def sampler(
     exponent: float = 2.0,
     knots: int = 5,
     halton: bool = False,
-) -> Sampler:
-    """ε = L w, w independent and standard normal, every row of L of unit length.
+) -> NoiseSampler:
+    """Return a sampler of ε = L w, w standard normal, every row of L of unit length.
 
         ar1       ε_{k+1} = ρ ε_k + √(1 − ρ²) w_k
         white     L = I
         coloured  power ∝ 1 / f^exponent; L a Cholesky factor of its Toeplitz covariance
-        rbf       bumps at `knots` places over the horizon, each as wide as their distance
+        rbf       Gaussian bumps at `knots` times, each as wide as their distance
         spline    cubic Lagrange interpolation between `knots` equidistant values
 
     Args:
         kind: see above.
-        horizon: T.
+        horizon: number of steps.
         correlation: ρ.
         exponent: ≥ 0; 0 is white, 1 pink, 2 brown.
         knots: ≥ 2.
-        halton: draw w from a Halton sequence, shifted at random each time, in place of
-            independent numbers; best with few knots, since its points fill a space of
-            knots x controls dimensions.
+        halton: draw w from a randomly shifted Halton sequence instead of independent
+            numbers. Best with few knots, since the sequence fills a space of knots x
+            controls dimensions.
 
     Raises:
-        ValueError: unknown kind, or settings that kind cannot have.
+        ValueError: the kind is unknown, or a setting is out of its range.
     """
     factor = _factor(kind, horizon, correlation, exponent, knots)
 
@@ -93,8 +94,7 @@ def sampler(
             )
         else:
             w = jax.random.normal(key, (factor.shape[1], num_samples, std.shape[0]))
-        # Full precision: accelerators otherwise round the factors of float32 products
-        # to ten bits.
+        # Full precision: accelerators otherwise round float32 factors to ten bits.
         return (
             jnp.einsum("tk,kmc->tmc", factor, w, precision=jax.lax.Precision.HIGHEST)
             * std
@@ -106,7 +106,7 @@ def sampler(
 def _factor(
     kind: str, horizon: int, correlation: float, exponent: float, knots: int
 ) -> Float[Array, "horizon k"]:
-    """L, see `sampler`."""
+    """L of `noise_sampler`."""
     if kind not in KINDS:
         raise ValueError(f"noise must be one of {', '.join(KINDS)}, got {kind!r}")
     if not 0 <= correlation <= 1:
@@ -124,21 +124,20 @@ def _factor(
         return jnp.where(lag >= 0, correlation ** jnp.maximum(lag, 0), 0.0) * fresh
     if kind == "coloured":
         return _coloured(horizon, exponent)
-    places = jnp.linspace(0.0, horizon - 1.0, knots)
+    centres = jnp.linspace(0.0, horizon - 1.0, knots)
+    width = centres[1] - centres[0]
     if kind == "rbf":
-        factor = jnp.exp(
-            -0.5 * ((steps[:, None] - places) / (places[1] - places[0])) ** 2
-        )
+        factor = jnp.exp(-0.5 * ((steps[:, None] - centres) / width) ** 2)
     else:
-        factor = _spline(steps / (places[1] - places[0]), knots)
+        factor = _spline(steps / width, knots)
     return factor / jnp.linalg.norm(factor, axis=1, keepdims=True)
 
 
 def _coloured(horizon: int, exponent: float) -> Float[Array, "horizon horizon"]:
-    """Cholesky factor of the covariance whose spectrum is 1 / f^exponent down to a period of four horizons.
+    """Cholesky factor of the covariance with spectrum 1 / f^exponent.
 
-    A window of a longer stationary process, not a period of its own: the end of a plan
-    is not tied to its beginning.
+    The longest period is four horizons: a plan is a window of a longer stationary
+    process, so its end is not correlated with its beginning as in a periodic one.
     """
     period = 4 * horizon
     frequency = jnp.arange(1, period // 2 + 1) / period
@@ -155,26 +154,29 @@ def _coloured(horizon: int, exponent: float) -> Float[Array, "horizon horizon"]:
 def _spline(
     times: Float[Array, " horizon"], knots: int
 ) -> Float[Array, "horizon knots"]:
-    """Weights of the cubic (or lower, with fewer knots) through the knots around each time, in knot distances."""
+    """Weights of cubic interpolation at each time, in units of the knot distance.
+
+    With fewer than four knots, the order is lower.
+    """
     order = min(4, knots)
     left = jnp.clip(jnp.floor(times).astype(int) - (order - 1) // 2, 0, knots - order)
     columns = []
     for knot in range(knots):
-        place = knot - left
+        offset = knot - left
         weight = jnp.ones_like(times)
         for other in range(order):
-            gap = jnp.where(place == other, 1.0, place - other)
+            gap = jnp.where(offset == other, 1.0, offset - other)
             weight = weight * jnp.where(
-                place == other, 1.0, (times - left - other) / gap
+                offset == other, 1.0, (times - left - other) / gap
             )
-        columns.append(jnp.where((place >= 0) & (place < order), weight, 0.0))
+        columns.append(jnp.where((offset >= 0) & (offset < order), weight, 0.0))
     return jnp.stack(columns, axis=1)
 
 
 def _halton_normal(
     key: Key, num_samples: int, shape: tuple[int, int]
 ) -> Float[Array, "k sample control"]:
-    """Standard normal points of a Halton sequence, moved by one random shift around the unit cube.
+    """Standard normal points of a Halton sequence with one random shift modulo 1.
 
     Source: Halton (1960); the shift is that of Cranley and Patterson (1976).
     """
@@ -193,7 +195,7 @@ def _halton_normal(
 
 
 def _radical_inverse(index: Array, base: int, largest: int) -> Float[Array, " sample"]:
-    """The digits of an index in a base, mirrored at the point: 6 = 110 in base 2 becomes 0.011."""
+    """Mirror the digits of an index at the point: 6 = 110 in base 2 becomes 0.011."""
     total, scale = jnp.zeros(index.shape), 1.0 / base
     for _ in range(math.ceil(math.log(largest + 1, base))):
         total, index, scale = (
@@ -206,10 +208,10 @@ def _radical_inverse(index: Array, base: int, largest: int) -> Float[Array, " sa
 
 def _primes(count: int) -> list[int]:
     """The first primes."""
-    found: list[int] = []
+    primes: list[int] = []
     candidate = 2
-    while len(found) < count:
-        if all(candidate % prime for prime in found):
-            found.append(candidate)
+    while len(primes) < count:
+        if all(candidate % prime for prime in primes):
+            primes.append(candidate)
         candidate += 1
-    return found
+    return primes

@@ -1,4 +1,4 @@
-"""What planners carry, search and return, and what is done to plans."""
+"""The state and the search interface of planners, and operations on plans."""
 
 from __future__ import annotations
 
@@ -16,14 +16,17 @@ Plans: TypeAlias = Float[Array, "horizon sample control"]
 
 
 class Tuning(NamedTuple):
-    """Settings that a running planner carries as data: `state._replace(tuning=…)` changes them and compiles nothing.
+    """Settings that are data of a running planner: changing them recompiles nothing.
+
+    Set them with `state._replace(tuning=state.tuning._replace(…))`.
 
     Attributes:
         temperature: λ of MPPI, in units of cost.
-        effective_samples: what λ is chosen for instead, if the planner was built to.
+        effective_samples: target of 1 / Σ w² from which λ follows, for planners built
+            with one.
         noise_std: per control channel, in control units.
-        elapsed: sampling periods since the last call; the plan is shifted by as many,
-            also by fractions, and by one where this is NaN.
+        elapsed: sampling periods since the last call. The plan is shifted by as many,
+            fractions included; NaN counts as one.
         cost: weights of the task's cost.
     """
 
@@ -38,15 +41,15 @@ class PlannerState(NamedTuple):
     """What a planner carries from one control step to the next.
 
     Attributes:
-        plan: perturbations ν_0 … ν_{T-1} around the law.
-        controls: what they amounted to at the last clean step.
+        plan: perturbations ν_0 … ν_{T-1} of the law.
+        controls: the controls of the last healthy rollout of that plan.
         previous: the control applied last.
-        started: whether there was one.
-        key: for the next samples.
-        past: perturbations applied before the plan, oldest first, as far back as
-            smoothing looks; 0 before the start.
-        proposals: plans of the user's own, sampled beside the planner's, (proposal,
-            horizon, control); they stay until replaced.
+        started: whether a control was planned before.
+        key: random key of the next samples.
+        past: perturbations applied before the plan, oldest first, as many as smoothing
+            needs; zero before the start.
+        proposals: the user's own plans, evaluated beside the sampled ones at every
+            step, (proposal, horizon, control).
         tuning: see `Tuning`.
     """
 
@@ -60,14 +63,14 @@ class PlannerState(NamedTuple):
     tuning: Tuning
 
 
-class Found(NamedTuple):
-    """What a search returns.
+class SearchResult(NamedTuple):
+    """The outcome of a search.
 
     Attributes:
-        plan: chosen.
-        usable: whether any rollout was finite.
-        cost: the best seen.
-        effective_samples: of the weights.
+        plan: the chosen plan.
+        usable: whether any rollout had a finite cost.
+        cost: the lowest cost of all samples.
+        effective_samples: 1 / Σ w² of the sample weights.
     """
 
     plan: Plan
@@ -77,35 +80,39 @@ class Found(NamedTuple):
 
 
 Evaluate: TypeAlias = Callable[[Plans], tuple[Float[Array, " sample"], Plans]]
-"""Plans -> costs, and the perturbations that were effective within the limits."""
-Search: TypeAlias = Callable[[Key, PlannerState, Evaluate], Found]
+"""Plans -> their costs, and the perturbations that the limits allowed."""
+Search: TypeAlias = Callable[[Key, PlannerState, Evaluate], SearchResult]
 
 
-def drawn_around(
+def candidate_plans(
     plan: Plan, noise: Plans, state: PlannerState
 ) -> Float[Array, "horizon candidate control"]:
-    """Candidates: the plan itself, the plan perturbed, and the proposals of the user."""
+    """Return the plan itself, its perturbed copies, and the user's proposals."""
     return jnp.concatenate(
         [plan[:, None] + noise.at[:, 0].set(0.0), state.proposals.swapaxes(0, 1)],
         axis=1,
     )
 
 
-def weighted(weights: Float[Array, " sample"], plans: Plans) -> tuple[Plan, Plan]:
-    """Mean and standard deviation of plans, step by step and control by control."""
+def weighted_mean_and_std(
+    weights: Float[Array, " sample"], plans: Plans
+) -> tuple[Plan, Plan]:
+    """Return mean and standard deviation over the samples, step by step."""
     mean = jnp.einsum("m,tmc->tc", weights, plans)
     return mean, jnp.sqrt(
         jnp.einsum("m,tmc->tc", weights, (plans - mean[:, None]) ** 2)
     )
 
 
-def finite_or_dear(costs: Float[Array, " sample"]) -> Float[Array, " sample"]:
-    """Infinity in place of what is not finite: a bad rollout is never the cheapest."""
-    return jnp.where(jnp.isfinite(costs), costs, jnp.inf)
+def replace_nonfinite(
+    values: Float[Array, "*shape"], fill: float
+) -> Float[Array, "*shape"]:
+    """Replace NaN and infinity by `fill`."""
+    return jnp.where(jnp.isfinite(values), values, fill)
 
 
 def shift(plan: Plan, elapsed: Scalar) -> Plan:
-    """The plan as it stands `elapsed` sampling periods later: linear between its steps, its last step held."""
+    """Shift a plan by `elapsed` periods: linear in between, the last step held."""
     last = plan.shape[0] - 1
     times = jnp.clip(jnp.arange(plan.shape[0]) + elapsed, 0, last)
     index = jnp.floor(times).astype(int)
@@ -113,33 +120,19 @@ def shift(plan: Plan, elapsed: Scalar) -> Plan:
     return plan[index] + (times - index)[:, None] * (after - plan[index])
 
 
-def finite_or_zero(values: Float[Array, "*shape"]) -> Float[Array, "*shape"]:
-    """Zero in place of what is not finite."""
-    return jnp.where(jnp.isfinite(values), values, 0.0)
-
-
-def by_chunks(roll: Callable[[Plans], Any], plans: Plans, chunk: int) -> Any:
-    """Roll out all plans, `chunk` at a time; the sample axis of every result is its last, or second to last."""
-    horizon, count, channels = plans.shape
-    if not chunk or chunk >= count:
-        return roll(plans)
-    parts = (
-        jnp.pad(plans, ((0, 0), (0, -count % chunk), (0, 0)))
-        .reshape(horizon, -1, chunk, channels)
-        .swapaxes(0, 1)
-    )
-    costs, tracks = jax.lax.map(roll, parts)
-
-    def joined(leaf: Array) -> Array:
-        return jnp.moveaxis(leaf, 0, -3).reshape(*leaf.shape[1:-2], -1, leaf.shape[-1])[
-            ..., :count, :
-        ]
-
-    return joined(costs[..., None])[..., 0], jax.tree.map(joined, tracks)
-
-
 def all_finite(tree: Any) -> Bool[Array, ""]:
     """Whether every entry of every leaf is finite."""
     return jnp.all(
         jnp.stack([jnp.all(jnp.isfinite(leaf)) for leaf in jax.tree.leaves(tree)])
     )
+
+
+def clip_environment(
+    env: Float[Array, "*particle environment"],
+    low: tuple[float, ...] | None,
+    high: tuple[float, ...] | None,
+) -> Float[Array, "*particle environment"]:
+    """Clip an environment to its box, if there is one."""
+    if low is None or high is None:
+        return env
+    return jnp.clip(env, jnp.array(low), jnp.array(high))

@@ -1,4 +1,4 @@
-"""Savitzky-Golay smoothing of a plan that continues what was done before it."""
+"""Savitzky-Golay smoothing of a plan together with the controls applied before it."""
 
 from __future__ import annotations
 
@@ -16,12 +16,13 @@ Smoother: TypeAlias = Callable[[Past, Plan], Plan]
 
 
 def savitzky_golay_weights(*, window: int, order: int) -> list[list[Fraction]]:
-    """Weights of the least-squares polynomial through the values in a window, evaluated at each of its points.
+    """Return the weights of the least-squares polynomial at each point of a window.
 
-        H_ij = Σ_n q_n(i) q_n(j) / |q_n|²,   q_{n+1}(i) = i q_n(i) − (|q_n|² / |q_{n−1}|²) q_{n−1}(i),   q_0 = 1
+        H_ij = Σ_n q_n(i) q_n(j) / |q_n|²
+        q_{n+1}(i) = i q_n(i) − (|q_n|² / |q_{n−1}|²) q_{n−1}(i),   q_0 = 1
 
-    q_n are the polynomials orthogonal over i = −h … h, h = (window − 1)/2; all of it in
-    exact rationals.
+    The q_n are the polynomials orthogonal over i = −h … h, h = (window − 1)/2. They are
+    computed in exact rationals.
 
     Args:
         window: odd, at least 3.
@@ -29,11 +30,11 @@ def savitzky_golay_weights(*, window: int, order: int) -> list[list[Fraction]]:
 
     Returns:
         H, window x window; row h is the filter, the rows after it are the one-sided
-        fits at the far end.
+        fits at the end of the window.
 
     Raises:
-        ValueError: even or short window, negative order, or one so high that the fit
-            smooths nothing.
+        ValueError: the window is even or too short, or the order is negative or so
+            high that the fit smooths nothing.
 
     Source: Savitzky and Golay (1964); the recurrence is Gram's.
     """
@@ -43,7 +44,8 @@ def savitzky_golay_weights(*, window: int, order: int) -> list[list[Fraction]]:
         )
     if not 0 <= order <= window - 2:
         raise ValueError(
-            f"smoothing_order must lie in [0, {window - 2}] for a window of {window}, got {order}"
+            f"smoothing_order must lie in [0, {window - 2}] for a window of {window}, "
+            f"got {order}"
         )
     points = range(-(window // 2), window // 2 + 1)
     before, size_before = [Fraction(0)] * window, Fraction(1)
@@ -56,26 +58,28 @@ def savitzky_golay_weights(*, window: int, order: int) -> list[list[Fraction]]:
             for i, a, b in zip(points, now, before, strict=True)
         ]
         before, size_before, now = now, size, after
-    places = range(window)
+    entries = range(window)
     return [
-        [sum((q[i] * q[j] / size for q, size in basis), Fraction(0)) for j in places]
-        for i in places
+        [sum((q[i] * q[j] / size for q, size in basis), Fraction(0)) for j in entries]
+        for i in entries
     ]
 
 
 def plan_smoother(*, horizon: int, window: int, order: int) -> Smoother:
-    """(past, plan) -> the plan smoothed, ν̄_t = Σ_i H_hi ν_{t+i}, with ν_{−h} … ν_{−1} what was done before it.
+    """Return the function (past, plan) -> smoothed plan, ν̄_t = Σ_i H_hi ν_{t+i}.
 
-    The last h steps, which have no h steps after them, get the polynomial fitted to the last window. A polynomial of
-    `order` that continues the past therefore stays what it is, to the end.
+    The past holds ν_{−h} … ν_{−1}. The last h steps, which have fewer than h steps
+    after them, are those of the polynomial fitted to the last window. A plan that
+    continues the past as a polynomial of degree `order` is therefore not changed.
 
     Args:
         horizon: T, more than h = (window − 1)/2.
-        window: odd, or 0 for a plan that stays as it is.
-        order: of the fit.
+        window: odd, or 0 to return plans unchanged.
+        order: of the polynomial.
 
     Raises:
-        ValueError: as `savitzky_golay_weights`, or a horizon too short for the window.
+        ValueError: as `savitzky_golay_weights`, or the horizon is too short for the
+            window.
 
     Source: Williams et al. (2018), Information-Theoretic Model Predictive Control, T-RO
     34(6).
@@ -86,7 +90,8 @@ def plan_smoother(*, horizon: int, window: int, order: int) -> Smoother:
     half = window // 2
     if horizon <= half:
         raise ValueError(
-            f"smoothing_window {window} needs a horizon of at least {half + 1}, got {horizon}"
+            f"smoothing_window {window} needs a horizon of at least {half + 1}, "
+            f"got {horizon}"
         )
     rows = []
     for step in range(horizon):
@@ -100,8 +105,7 @@ def plan_smoother(*, horizon: int, window: int, order: int) -> Smoother:
     matrix = jnp.asarray(rows)
 
     def smooth(past: Past, plan: Plan) -> Plan:
-        # Full precision: accelerators otherwise round the factors of float32 products
-        # to ten bits.
+        # Full precision: accelerators otherwise round float32 factors to ten bits.
         return jnp.matmul(
             matrix, jnp.concatenate([past, plan]), precision=jax.lax.Precision.HIGHEST
         )

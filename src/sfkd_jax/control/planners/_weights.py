@@ -1,4 +1,4 @@
-"""From costs to weights, and the temperature at which as many samples count as are wanted."""
+"""Sample weights of MPPI, and the temperature for a given effective sample size."""
 
 from __future__ import annotations
 
@@ -12,15 +12,15 @@ from sfkd_jax.types import Scalar
 
 BISECTIONS = 24
 DECADES = (-12.0, 4.0)
-"""Temperatures are looked for between 10^-12 and 10^4 times the spread of the costs:
-one far off stretches it.
+"""The temperature is searched between 10^-12 and 10^4 times the range of the costs. The
+lower end is that small because a single outlier widens the range.
 """
 
 
 def softmin(
     costs: Float[Array, " sample"], temperature: Scalar
 ) -> tuple[Float[Array, " sample"], Bool[Array, ""]]:
-    """Weights ∝ exp(−J/λ) over the finite costs, and whether there is any."""
+    """Return weights ∝ exp(−J/λ) over the finite costs, and whether any is finite."""
     finite = jnp.isfinite(costs)
     usable = jnp.any(finite)
     scores = jnp.where(finite, -costs / temperature, -jnp.inf)
@@ -28,35 +28,36 @@ def softmin(
     return weights, usable
 
 
-def count_effective(weights: Float[Array, " sample"]) -> Scalar:
-    """1 / Σ w²: M for equal weights, 1 for a single one (Kish)."""
+def effective_sample_size(weights: Float[Array, " sample"]) -> Scalar:
+    """Return Kish's 1 / Σ w²: M for M equal weights, 1 if one sample has all weight."""
     return 1.0 / jnp.sum(weights**2)
 
 
-def temperature_for(costs: Float[Array, " sample"], wanted: Scalar) -> Scalar:
-    """λ at which `count_effective` is `wanted`, by bisection of log λ; it grows with λ.
+def temperature_for_sample_size(
+    costs: Float[Array, " sample"], wanted: Scalar
+) -> Scalar:
+    """Return λ at which `effective_sample_size` is `wanted`, by bisection of log λ.
 
-    The bracket scales with the spread of the finite costs, so the answer scales with
-    the costs. More samples than are finite, or fewer than share the lowest cost, cannot
-    be had: the end of the bracket is then returned.
+    The bracket scales with the range of the finite costs, so λ scales with the costs.
+    If `wanted` exceeds the number of finite costs, or is less than the number of
+    samples that share the lowest cost, the result is an end of the bracket.
 
     Args:
-        costs: not all need be finite.
-        wanted: in [1, sample].
+        costs: may contain values that are not finite.
+        wanted: in [1, number of samples]; the effective sample size grows with λ.
     """
     finite = jnp.isfinite(costs)
     lowest = jnp.min(jnp.where(finite, costs, jnp.inf))
     highest = jnp.max(jnp.where(finite, costs, -jnp.inf))
     spread = highest - lowest
     spread = jnp.where(jnp.isfinite(spread) & (spread > 0), spread, 1.0)
-    above = jnp.where(
-        finite, (costs - lowest) / spread, jnp.inf
-    )  # at scale 1, whatever the units of cost
+    # In [0, 1], whatever the units of cost.
+    scaled = jnp.where(finite, (costs - lowest) / spread, jnp.inf)
 
     def narrow(_: Any, bracket: tuple[Scalar, Scalar]) -> tuple[Scalar, Scalar]:
         low, high = bracket
         middle = 0.5 * (low + high)
-        few = count_effective(softmin(above, jnp.exp(middle))[0]) < wanted
+        few = effective_sample_size(softmin(scaled, jnp.exp(middle))[0]) < wanted
         return jnp.where(few, middle, low), jnp.where(few, high, middle)
 
     ends = jnp.log(10.0) * jnp.asarray(DECADES)

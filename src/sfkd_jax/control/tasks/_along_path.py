@@ -1,24 +1,34 @@
-"""The task of following a path in path coordinates: the law inside, the curvature previewed, no pose."""
+"""The task of following a path in path coordinates, with curvature preview."""
 
 from __future__ import annotations
 
+from functools import partial
 from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
+from sfkd_jax.control.laws._model_law import SteadyTurn
 from sfkd_jax.control.laws._path_errors import PathErrors
-from sfkd_jax.control.laws._path_law import PathLaw, at_turn
-from sfkd_jax.control.tasks._costs import Cost, Stage
+from sfkd_jax.control.laws._path_law import PathLaw, turn_control
+from sfkd_jax.control.tasks._costs import Cost, StageInputs
 from sfkd_jax.control.tasks._path_tracking import check_path
-from sfkd_jax.control.tasks._task import Advanced, Applied, Began, Task, actuator_limits
+from sfkd_jax.control.tasks._task import (
+    Limiter,
+    PreviousControl,
+    RolloutSetup,
+    StepResult,
+    Task,
+    actuator_limits,
+)
+from sfkd_jax.core.folding import fold
 from sfkd_jax.core.path_frame import (
     HEADING,
     LATERAL,
     PATH_SPEED,
     PathState,
-    on_circle,
+    circle_errors,
     path_state,
 )
 from sfkd_jax.core.se2 import between, wrap_angle
@@ -36,19 +46,47 @@ from sfkd_jax.types import (
 
 
 class AlongSample(NamedTuple):
-    """A sample on its way: latent, path coordinates, last control."""
+    """State of one rollout: latent, path coordinates, last control."""
 
     latent: Any
     coordinates: PathState
     control: Control
 
 
-def curvature_ahead(reference: Reference) -> Float[Array, " horizon"]:
-    """κ over each step that leads to a reference point [1/m]; 0 where points coincide.
+class AlongTarget(NamedTuple):
+    """The reference of one step.
 
-    Between points it is the turn over the distance. The step to the first point begins
-    where the car is, for which there is no point: its curvature continues the next two
-    as a straight line.
+    Attributes:
+        point: x, y, yaw, speed.
+        normal: unit vector to the left of the path.
+        curvature: of the path over the step [1/m].
+        turn: steady turn of the law.
+    """
+
+    point: Float[Array, "*horizon 4"]
+    normal: Float[Array, "*horizon 2"]
+    curvature: Float[Array, "*horizon"]
+    turn: SteadyTurn
+
+
+class _Problem(NamedTuple):
+    """Settings of `following_law` as its functions need them."""
+
+    model: Model
+    cost: Cost
+    law: PathLaw
+    limit: Limiter
+    low: Control
+    high: Control
+    terminal_weight: float
+
+
+def curvature_ahead(reference: Reference) -> Float[Array, " horizon"]:
+    """Return κ [1/m] over the step to each reference point; 0 where points coincide.
+
+    Between points it is the change of yaw over the distance. The first step begins at
+    the vehicle, where there is no reference point: its curvature is extrapolated
+    linearly from the next two.
     """
     steps = jnp.diff(reference, axis=0)
     distance = jnp.hypot(steps[:, 0], steps[:, 1])
@@ -63,8 +101,14 @@ def curvature_ahead(reference: Reference) -> Float[Array, " horizon"]:
 def path_coordinates(
     state: State, point: Float[Array, " 4"], curvature: Scalar
 ) -> PathState:
-    """ξ of a state in the world, against the circle of curvature κ through a reference point (x, y, yaw, …)."""
-    lateral, heading = on_circle(between(point[POSE], state[POSE]), curvature)
+    """Return ξ of a world state, relative to the circle through a reference point.
+
+    Args:
+        state: pose and body state.
+        point: x, y, yaw, speed of the reference.
+        curvature: of the circle [1/m].
+    """
+    lateral, heading = circle_errors(between(point[POSE], state[POSE]), curvature)
     return jnp.concatenate([jnp.stack([lateral, heading]), state[BODY]])
 
 
@@ -79,100 +123,102 @@ def following_law(
     control_rate: tuple[float, ...] | None = None,
     terminal_weight: float = 1.0,
 ) -> Task:
-    """Follow a path with a model of the closed loop; a plan is what is added to the law.
+    """Return the task of following a path with a model of the closed loop.
 
-        ξ_{k+1} = F(ξ_k, (ν_k, κ_k, v_k); e),   u_k = limit(law(ξ_k; κ_k, v_k, e) + ν_k),
+        ξ_{k+1} = F(ξ_k, (ν_k, κ_k, v_k); e),   u_k = limit(law(ξ_k; κ_k, v_k, e) + ν_k)
         J = Σ_k ℓ(ξ_{k+1}, u_k) + w_T ℓ(ξ_T, u_{T-1})
 
-    The observation and the reference are those of any other controller, poses in the
-    world. They are projected once a step; rollouts know ξ and the curvature ahead, and
-    predicted states are put beside the reference points at the end. |ν| stays within
-    `law.perturbation`, as it did in the data.
+    A plan is the perturbation ν of the law. Observation and reference are poses in the
+    world, as for every controller, and are projected once per control step. Rollouts
+    use ξ and the previewed curvature only; predicted states are mapped back to the
+    world beside the reference points. |ν| stays within `law.perturbation`, as it did
+    in the training data.
 
     Args:
-        model: of path states, `along_path`.
+        model: of the closed loop, with `along_path`.
         cost: ℓ, see `tracking_cost`.
         law: the one that the model was learned around.
-        dt: [s].
-        control_low, control_high: actuator limits.
-        control_rate: per second, or None.
-        terminal_weight: w_T, on top of the last step's ℓ.
+        dt: sampling period [s].
+        control_low: lower control limits.
+        control_high: upper control limits.
+        control_rate: largest change of a control per second, or None.
+        terminal_weight: w_T, added to the weight of the last step.
 
     Raises:
-        ValueError: a model of another frame, or limits that cannot be meant.
+        ValueError: the model is not in path coordinates, or the limits are
+            inconsistent, see `actuator_limits`.
     """
     if not model.along_path:
         raise ValueError(
-            "controller.sampling=law needs a model in path coordinates: model.frame=path"
+            "controller.sampling=law needs a model in path coordinates: "
+            "model.frame=path"
         )
     limit = actuator_limits(control_low, control_high, control_rate, dt)
     low, high = (
         jnp.asarray(control_low, dtype=float),
         jnp.asarray(control_high, dtype=float),
     )
+    problem = _Problem(model, cost, law, limit, low, high, terminal_weight)
+    prepare, step = partial(_prepare, problem), partial(_step, problem)
+    return Task(low, high, cost.weights, prepare, step, check_path)
 
-    def begin(
-        params: Params,
-        observation: State,
-        env: Environment,
-        reference: Reference,
-        applied: Applied,
-    ) -> Began:
-        fiber = model.fiber(model.fold(params), env)  # of many rollouts
-        curvatures = curvature_ahead(reference)
-        coordinates = path_coordinates(observation, reference[0], curvatures[0])
-        turns = jax.vmap(law.turn, in_axes=(0, 0, None))(
-            curvatures, reference[:, 3], env
-        )
-        lawful = jnp.clip(
-            at_turn(jax.tree.map(lambda leaf: leaf[0], turns), coordinates), low, high
-        )
-        before = jnp.where(applied.known, applied.control, lawful)
-        start = AlongSample(
-            model.encode(fiber, path_state(coordinates)), coordinates, before
-        )
-        sideways = jnp.stack(
-            [-jnp.sin(reference[:, 2]), jnp.cos(reference[:, 2])], axis=1
-        )
-        return Began(fiber, start, (reference, sideways, curvatures, turns))
 
-    def advance(
-        weights: Any,
-        fiber: Any,
-        before: AlongSample,
-        nu: Control,
-        target: Any,
-        last: Scalar,
-    ) -> Advanced:
-        point, sideways, curvature, turn = target
-        lawful = at_turn(turn, before.coordinates)
-        control = limit(
-            lawful + jnp.clip(nu, -law.perturbation, law.perturbation), before.control
-        )
-        effective = control - lawful
-        inputs = jnp.concatenate([effective, jnp.stack([curvature, point[3]])])
-        latent = model.step(fiber, before.latent, inputs)
-        coordinates = model.decode(fiber, latent)[BODY]
-        here, there = (
-            _errors(coordinates, point[3]),
-            _errors(before.coordinates, point[3]),
-        )
-        charge = cost.stage(
-            weights, Stage(here, there, control, before.control, point[3])
-        )
-        charge = charge * (1.0 + terminal_weight * last)
-        position = point[:2] + coordinates[LATERAL] * sideways
-        yaw = point[2] + coordinates[HEADING]
-        state = jnp.concatenate([position, yaw[None], coordinates[PATH_SPEED:]])
-        return Advanced(
-            AlongSample(latent, coordinates, control), charge, control, effective, state
-        )
+def _prepare(
+    problem: _Problem,
+    params: Params,
+    observation: State,
+    env: Environment,
+    reference: Reference,
+    previous: PreviousControl,
+) -> RolloutSetup:
+    """Project the observation and evaluate fibre and law once per control step."""
+    model, law = problem.model, problem.law
+    fiber = model.fiber(fold(model, params), env)
+    curvatures = curvature_ahead(reference)
+    coordinates = path_coordinates(observation, reference[0], curvatures[0])
+    turns = jax.vmap(law.turn, in_axes=(0, 0, None))(curvatures, reference[:, 3], env)
+    first = jax.tree.map(lambda leaf: leaf[0], turns)
+    law_control = jnp.clip(turn_control(first, coordinates), problem.low, problem.high)
+    before = jnp.where(previous.known, previous.control, law_control)
+    latent = model.encode(fiber, path_state(coordinates))
+    start = AlongSample(latent, coordinates, before)
+    yaw = reference[:, 2]
+    normal = jnp.stack([-jnp.sin(yaw), jnp.cos(yaw)], axis=1)
+    return RolloutSetup(fiber, start, AlongTarget(reference, normal, curvatures, turns))
 
-    return Task(low, high, cost.weights, begin, advance, check_path)
+
+def _step(
+    problem: _Problem,
+    weights: Any,
+    fiber: Any,
+    before: AlongSample,
+    nu: Control,
+    target: AlongTarget,
+    last: Scalar,
+) -> StepResult:
+    """One step of one rollout: law plus perturbation, limits, model, cost."""
+    point, law = target.point, problem.law
+    law_control = turn_control(target.turn, before.coordinates)
+    nu = jnp.clip(nu, -law.perturbation, law.perturbation)
+    control = problem.limit(law_control + nu, before.control)
+    effective = control - law_control
+    inputs = jnp.concatenate([effective, jnp.stack([target.curvature, point[3]])])
+    latent = problem.model.step(fiber, before.latent, inputs)
+    coordinates = problem.model.decode(fiber, latent)[BODY]
+    errors = _errors(coordinates, point[3])
+    errors_before = _errors(before.coordinates, point[3])
+    stage = StageInputs(errors, errors_before, control, before.control, point[3])
+    cost = problem.cost.stage(weights, stage)
+    cost = cost * (1.0 + problem.terminal_weight * last)
+    position = point[:2] + coordinates[LATERAL] * target.normal
+    yaw = point[2] + coordinates[HEADING]
+    state = jnp.concatenate([position, yaw[None], coordinates[PATH_SPEED:]])
+    sample = AlongSample(latent, coordinates, control)
+    return StepResult(sample, cost, control, effective, state)
 
 
 def _errors(coordinates: PathState, speed: Scalar) -> PathErrors:
-    """As a stage cost wants them."""
+    """Path coordinates as the errors that a stage cost takes."""
     return PathErrors(
         coordinates[LATERAL], coordinates[HEADING], coordinates[PATH_SPEED] - speed
     )

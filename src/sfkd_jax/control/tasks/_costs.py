@@ -9,8 +9,16 @@ from sfkd_jax.control.laws._path_errors import PathErrors
 from sfkd_jax.types import Control, Scalar
 
 
-class Stage(NamedTuple):
-    """What a stage cost sees: errors now and one step ago, controls now and one step ago, dt [s], speed [m/s]."""
+class StageInputs(NamedTuple):
+    """Arguments of a stage cost at one step of one rollout.
+
+    Attributes:
+        errors: path errors after the step.
+        errors_before: path errors before the step.
+        control: applied in the step.
+        control_before: applied in the step before.
+        speed: of the reference [m/s].
+    """
 
     errors: PathErrors
     errors_before: PathErrors
@@ -20,15 +28,15 @@ class Stage(NamedTuple):
 
 
 class Cost(NamedTuple):
-    """A stage cost whose weights are data: they may change from step to step without a compilation.
+    """A stage cost whose weights are data: changing them does not recompile anything.
 
     Attributes:
         weights: a pytree of numbers.
-        stage: (weights, `Stage`) -> cost of one step.
+        stage: (weights, `StageInputs`) -> cost of one step.
     """
 
     weights: Any
-    stage: Callable[[Any, Stage], Scalar]
+    stage: Callable[[Any, StageInputs], Scalar]
 
 
 def tracking_cost(
@@ -41,19 +49,21 @@ def tracking_cost(
     effort: float = 0.02,
     speed_loop: bool = False,
 ) -> Cost:
-    """ℓ = q_y e_y² + q_c (Δe_y / v dt)² + q_v e_v² + q_δ̇ (Δδ / dt)² + q_a a²; its weights by the names below.
+    """Return the quadratic path-tracking cost, its weights under the argument names.
 
-    Course, Δe_y / (v dt), is the direction of travel against the path: a car that crabs
-    against the wind or through a bend keeps its course, not its body heading, along the
-    path.
+        ℓ = q_y e_y² + q_c (Δe_y / v dt)² + q_v e_v² + q_δ̇ (Δδ / dt)² + q_a a²
+
+    The course error Δe_y / (v dt) is the direction of travel relative to the path. A
+    vehicle that crabs in a side wind or through a bend then aligns its direction of
+    travel with the path, not its body heading.
 
     Args:
-        dt: [s].
-        lateral: [1/m²].
-        course: [1/rad²].
-        speed: [s²/m²].
-        steering_rate: [s²/rad²].
-        effort: on the acceleration [s⁴/m²]; not charged under a speed loop.
+        dt: sampling period [s].
+        lateral: q_y [1/m²].
+        course: q_c [1/rad²].
+        speed: q_v [s²/m²].
+        steering_rate: q_δ̇ [s²/rad²].
+        effort: q_a, on the acceleration [s⁴/m²]; ignored with a speed loop.
         speed_loop: whether the second control is a speed command.
     """
     weights = {
@@ -64,18 +74,16 @@ def tracking_cost(
         "effort": effort,
     }
 
-    def stage(weights: Mapping[str, Any], seen: Stage) -> Scalar:
-        travelled = seen.speed * dt + 1e-3
-        angle = (seen.errors.lateral - seen.errors_before.lateral) / travelled
-        rate = (seen.control[0] - seen.control_before[0]) / dt
-        total = (
-            weights["lateral"] * seen.errors.lateral**2 + weights["course"] * angle**2
+    def stage(weights: Mapping[str, Any], inputs: StageInputs) -> Scalar:
+        errors, before = inputs.errors, inputs.errors_before
+        travelled = inputs.speed * dt + 1e-3
+        angle = (errors.lateral - before.lateral) / travelled
+        rate = (inputs.control[0] - inputs.control_before[0]) / dt
+        total = weights["lateral"] * errors.lateral**2 + weights["course"] * angle**2
+        total = total + weights["speed"] * errors.speed**2
+        total = total + weights["steering_rate"] * rate**2
+        return (
+            total if speed_loop else total + weights["effort"] * inputs.control[1] ** 2
         )
-        total = (
-            total
-            + weights["speed"] * seen.errors.speed**2
-            + weights["steering_rate"] * rate**2
-        )
-        return total if speed_loop else total + weights["effort"] * seen.control[1] ** 2
 
     return Cost(weights, stage)

@@ -1,4 +1,4 @@
-"""What a planner plans: a rollout with a cost, stated one sample at a time."""
+"""Planning problems as pure functions: one rollout step, its cost and its limits."""
 
 from __future__ import annotations
 
@@ -14,26 +14,31 @@ from sfkd_jax.types import Control, Environment, Params, Scalar, State
 Environments: TypeAlias = Float[Array, "*particle environment"]
 """One environment, or several that are equally likely."""
 Actuator: TypeAlias = Callable[[State], Control]
-"""Where the actuators stand, read off an observation."""
+"""Reads the actuator positions from an observation."""
+Limiter: TypeAlias = Callable[[Control, Control], Control]
+"""(wanted control, control before) -> the nearest control that the actuators allow."""
 
 
-class Applied(NamedTuple):
-    """The control in force when planning starts, and whether there is one."""
+class PreviousControl(NamedTuple):
+    """The control in force when planning starts.
+
+    Attributes:
+        control: applied at the previous control step.
+        known: False at the first step, where no control was applied before.
+    """
 
     control: Control
     known: Bool[Array, ""]
 
 
-class Began(NamedTuple):
-    """What a task evaluates once per control step, before anything is rolled out.
+class RolloutSetup(NamedTuple):
+    """Everything that a task evaluates once per control step, before the rollouts.
 
     Attributes:
         context: shared by all samples and steps.
-        start: a sample before its first step.
-        targets: what differs from step to step; every leaf has the horizon as leading
-            axis.
-        proposals: plans that the task itself suggests, sampled beside the planner's, if
-            it has any.
+        start: state of one rollout before its first step.
+        targets: data of each step; every leaf has the horizon as its leading axis.
+        proposals: plans suggested by the task, evaluated beside the sampled ones.
     """
 
     context: Any
@@ -42,16 +47,15 @@ class Began(NamedTuple):
     proposals: Float[Array, "*particle proposal horizon control"] | None = None
 
 
-class Advanced(NamedTuple):
-    """One step of one sample.
+class StepResult(NamedTuple):
+    """One step of one rollout.
 
     Attributes:
-        sample: after the step.
+        sample: state of the rollout after the step.
         cost: of the step.
-        control: applied in it.
-        perturbation: the part of the one asked for that was effective within the
-            limits.
-        state: where it led.
+        control: applied in the step.
+        perturbation: the part of the requested perturbation that the limits allowed.
+        state: predicted state after the step.
     """
 
     sample: Any
@@ -62,24 +66,25 @@ class Advanced(NamedTuple):
 
 
 class Task(NamedTuple):
-    """A planning problem as pure functions.
+    """A planning problem as pure functions of one sample; planners vmap them.
 
     Attributes:
-        low, high: the box of the controls.
-        weights: of the cost, a pytree of numbers; planners carry them as data, so they
-            change without a compilation.
-        begin: (params, observation, env, reference, applied) -> `Began`.
-        advance: (weights, context, sample, perturbation, target, last) -> `Advanced`;
-            last is 1 at the final step.
-        check: (observation, env, reference, horizon) -> None, or ValueError that names
-            the argument of a wrong shape.
+        low: lower control limits.
+        high: upper control limits.
+        weights: of the cost, a pytree of numbers. Planners carry them in their state,
+            so changing them does not recompile anything.
+        prepare: (params, observation, env, reference, previous) -> `RolloutSetup`.
+        step: (weights, context, sample, perturbation, target, last) -> `StepResult`;
+            `last` is 1 at the final step of the horizon and 0 before it.
+        check: (observation, env, reference, horizon) -> None; raises a ValueError that
+            names an argument of the wrong shape.
     """
 
     low: Control
     high: Control
     weights: Any
-    begin: Callable[[Params, State, Environment, Any, Applied], Began]
-    advance: Callable[[Any, Any, Any, Control, Any, Scalar], Advanced]
+    prepare: Callable[[Params, State, Environment, Any, PreviousControl], RolloutSetup]
+    step: Callable[[Any, Any, Any, Control, Any, Scalar], StepResult]
     check: Callable[[State, Environments, Any, int], None]
 
 
@@ -88,16 +93,22 @@ def actuator_limits(
     high: tuple[float, ...],
     rate: tuple[float, ...] | None,
     dt: float,
-) -> Callable[[Control, Control], Control]:
-    """(wanted, before) -> the nearest control inside the box and within rate · dt of the one before.
+) -> Limiter:
+    """Return the projection of a control onto its box and its slew limits.
+
+    Args:
+        low: lower control limits.
+        high: upper control limits.
+        rate: largest change per second, or None for no slew limit.
+        dt: sampling period [s].
 
     Raises:
-        ValueError: a box that is empty or of another size, or rates that are not
-            positive.
+        ValueError: the box is empty, the sizes differ, or a rate is not positive.
     """
     if len(low) != len(high) or not all(a < b for a, b in zip(low, high, strict=True)):
         raise ValueError(
-            f"control_low must lie below control_high, entry by entry, got {low} and {high}"
+            "control_low must lie below control_high, entry by entry, "
+            f"got {low} and {high}"
         )
     if rate is None:
         return lambda wanted, before: jnp.clip(
@@ -108,9 +119,8 @@ def actuator_limits(
     bottom, top, reach = jnp.asarray(low), jnp.asarray(high), dt * jnp.asarray(rate)
 
     def limit(wanted: Control, before: Control) -> Control:
-        before = jnp.clip(
-            before, bottom, top
-        )  # an actuator outside its box comes back as fast as the box asks
+        # An actuator outside its box returns to it at once, whatever its slew limit.
+        before = jnp.clip(before, bottom, top)
         return jnp.clip(
             wanted,
             jnp.maximum(bottom, before - reach),
@@ -121,18 +131,19 @@ def actuator_limits(
 
 
 class FreeSample(NamedTuple):
-    """A sample of a plain state equation: state and last control."""
+    """State of one rollout of a plain state equation: state and last control."""
 
     state: State
     control: Control
 
 
-StageLoss: TypeAlias = Callable[[Any, State, Control, Control, Any], Scalar]
+StageCost: TypeAlias = Callable[[Any, State, Control, Control, Any], Scalar]
+"""(weights, state, control, control before, reference) -> cost of one step."""
 
 
 def free_task(
     dynamics: Callable[[Params, State, Control, Environment], State],
-    stage: StageLoss,
+    stage: StageCost,
     *,
     dt: float = 1.0,
     control_low: tuple[float, ...],
@@ -142,71 +153,77 @@ def free_task(
     weights: Any = (),
     actuator: Actuator | None = None,
 ) -> Task:
-    """Any state equation and any cost: x⁺ = f(params, x, u, e), J = Σ_k ℓ(weights, x_{k+1}, u_k, u_{k−1}, ref_k) + φ.
+    """Return the task of minimising any cost under any state equation.
+
+        x⁺ = f(params, x, u, e),   J = Σ_k ℓ(weights, x_{k+1}, u_k, u_{k−1}, ref_k) + φ
 
     Args:
         dynamics: f.
-        stage: ℓ, of the state that the control leads to.
+        stage: ℓ, evaluated at the state after the control.
+        dt: sampling period [s], used by `control_rate` alone.
+        control_low: lower control limits.
+        control_high: upper control limits.
+        control_rate: largest change of a control per second, or None.
         terminal: φ(weights, x_T, ref_T).
-        dt: [s], for rates.
-        control_low, control_high, control_rate: limits; the last per second, or None.
-        weights: a pytree of numbers that both costs read, changed at run time through
-            the planner's state.
-        actuator: see `path_tracking`.
+        weights: a pytree of numbers that both costs read; it can be changed at run
+            time through the planner's state.
+        actuator: reads the actuator positions from the observation; without it, slew
+            limits count from the control applied last.
 
     Returns:
-        A `Task` whose reference is any array or pytree with the horizon as leading
-        axis; () if there is none.
+        A `Task` whose reference is any array or pytree with the horizon as its leading
+        axis, or () if there is none.
 
     Raises:
-        ValueError: limits that cannot be meant.
+        ValueError: the limits are inconsistent, see `actuator_limits`.
     """
     limit = actuator_limits(control_low, control_high, control_rate, dt)
     low, high = (
         jnp.asarray(control_low, dtype=float),
         jnp.asarray(control_high, dtype=float),
     )
-    nothing = jnp.clip(jnp.zeros_like(low), low, high)
+    initial = jnp.clip(jnp.zeros_like(low), low, high)
 
-    def begin(
+    def prepare(
         params: Params,
         observation: State,
         env: Environment,
         reference: Any,
-        applied: Applied,
-    ) -> Began:
-        before = jnp.where(applied.known, applied.control, nothing)
+        previous: PreviousControl,
+    ) -> RolloutSetup:
+        before = jnp.where(previous.known, previous.control, initial)
         if actuator is not None:
             before = actuator(observation)
-        return Began((params, env), FreeSample(observation, before), reference)
+        return RolloutSetup((params, env), FreeSample(observation, before), reference)
 
-    def advance(
+    def step(
         weights: Any,
         context: Any,
         before: FreeSample,
         nu: Control,
         goal: Any,
         last: Scalar,
-    ) -> Advanced:
+    ) -> StepResult:
         params, env = context
         control = limit(nu, before.control)
         state = dynamics(params, before.state, control, env)
-        charge = stage(weights, state, control, before.control, goal)
+        cost = stage(weights, state, control, before.control, goal)
         if terminal is not None:
-            charge = charge + last * terminal(weights, state, goal)
-        return Advanced(FreeSample(state, control), charge, control, control, state)
+            cost = cost + last * terminal(weights, state, goal)
+        return StepResult(FreeSample(state, control), cost, control, control, state)
 
-    return Task(low, high, weights, begin, advance, _check_nothing)
+    return Task(low, high, weights, prepare, step, _check_shapes)
 
 
-def _check_nothing(
+def _check_shapes(
     observation: State, env: Environments, reference: Any, horizon: int
 ) -> None:
-    """Of a free task, name the argument that has the wrong shape."""
+    """Raise a ValueError that names an argument of the wrong shape."""
     if observation.ndim != 1:
         raise ValueError(f"observation must have shape (nx,), got {observation.shape}")
     for leaf in jax.tree.leaves(reference):
         if leaf.shape[:1] != (horizon,):
             raise ValueError(
-                f"reference must have {horizon} steps as its leading axis, got shape {leaf.shape}"
+                f"reference must have {horizon} steps as its leading axis, "
+                f"got shape {leaf.shape}"
             )

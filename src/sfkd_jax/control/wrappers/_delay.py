@@ -23,12 +23,12 @@ class DelayState(NamedTuple):
     sent: Float[Array, "delay control"]
 
 
-def compensated(
+def delay_compensated(
     controller: Controller,
     model: Model,
     *,
     delay: int,
-    resting: tuple[float, ...] = (0.0, 0.0),
+    initial_control: tuple[float, ...] = (0.0, 0.0),
 ) -> Controller:
     """The same controller for actuators that answer `delay` sampling periods late.
 
@@ -56,7 +56,7 @@ def compensated(
     def init(key: Key) -> DelayState:
         return DelayState(
             controller.init(key),
-            jnp.tile(jnp.asarray(resting, dtype=float), (delay, 1)),
+            jnp.tile(jnp.asarray(initial_control, dtype=float), (delay, 1)),
         )
 
     def act(

@@ -13,6 +13,7 @@ from jaxtyping import Array, Bool, Float
 from sfkd_jax.control.laws._path_law import PathLaw
 from sfkd_jax.control.planners._plans import all_finite
 from sfkd_jax.control.tasks._along_path import curvature_ahead, path_coordinates
+from sfkd_jax.core.folding import fold
 from sfkd_jax.core.path_frame import LATERAL, is_valid, path_state
 from sfkd_jax.types import (
     BODY,
@@ -116,7 +117,7 @@ def locate(
     ahead = jnp.where(
         readable, _preview(reference, before.ahead.shape[0]), _later(before.ahead)
     )
-    folded = model.fold(params)
+    folded = fold(model, params)
     fiber = model.fiber(folded, inside)
 
     def switched() -> Latent:
@@ -162,7 +163,7 @@ def blank_copy(
     """() -> a copy that has not started; of the model only shapes are evaluated, once."""
 
     def encoded(key: Key) -> Latent:
-        fiber = model.fiber(model.fold(model.init(key)), jnp.zeros(environments))
+        fiber = model.fiber(fold(model, model.init(key)), jnp.zeros(environments))
         return model.encode(fiber, path_state(jnp.zeros(coordinates)))
 
     shapes = jax.eval_shape(encoded, jax.random.key(0))

@@ -10,7 +10,6 @@ from jaxtyping import Array, Int
 
 from sfkd_jax.control.laws._path_law import PathLaw
 from sfkd_jax.control.planners._plans import all_finite
-from sfkd_jax.control.wrappers._admission import admit
 from sfkd_jax.control.wrappers._nominal_copy import (
     CopyState,
     Limits,
@@ -19,6 +18,7 @@ from sfkd_jax.control.wrappers._nominal_copy import (
     blank_copy,
     locate,
 )
+from sfkd_jax.control.wrappers._safety_filter import safety_filter
 from sfkd_jax.types import (
     Control,
     Controller,
@@ -156,7 +156,7 @@ def shielded(
         request = jnp.where(finite, _request(planned, now.lawful, low, high), 0.0)
         bound = jnp.where(now.void, 0.0, largest)
         running = now.state
-        chosen = admit(
+        chosen = safety_filter(
             model, now.fiber, running.latent, request, running.ahead, bound, width=width
         )
         untouched = finite & jnp.all(chosen.nu == request)

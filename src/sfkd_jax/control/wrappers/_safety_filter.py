@@ -12,11 +12,11 @@ from sfkd_jax.control.planners._plans import all_finite
 from sfkd_jax.core.path_frame import LATERAL
 from sfkd_jax.types import BODY, Control, Latent, Model, Scalar
 
-SHARES = (1.0, 0.875, 0.75, 0.625, 0.5, 0.375, 0.25, 0.125, 0.0)
+FILTER_SCALES = (1.0, 0.875, 0.75, 0.625, 0.5, 0.375, 0.25, 0.125, 0.0)
 """Shares of a request that are tried, largest first; the last one is the law alone."""
 
 
-class Admitted(NamedTuple):
+class FilterResult(NamedTuple):
     """What is let through of a request.
 
     Attributes:
@@ -34,7 +34,7 @@ class Admitted(NamedTuple):
     feasible: Bool[Array, ""]
 
 
-def admit(
+def safety_filter(
     model: Model,
     fiber: Any,
     latent: Latent,
@@ -43,7 +43,7 @@ def admit(
     limit: Control,
     *,
     width: float,
-) -> Admitted:
+) -> FilterResult:
     """The largest share of a request after which the law alone keeps the copy in its corridor.
 
         ẑ_1 = F(ẑ_0; (s ν, κ_0, v_0), e),   ẑ_{k+1} = F(ẑ_k; (0, κ_k, v_k), e),
@@ -69,8 +69,8 @@ def admit(
     """
     asked = jnp.clip(jnp.where(all_finite(wanted), wanted, 0.0), -limit, limit)
     aside = limit * jnp.asarray([[1.0, 0.0], [-1.0, 0.0]])
-    shares = jnp.asarray((*SHARES, 0.0, 0.0), dtype=float)
-    tried = jnp.concatenate([shares[: len(SHARES), None] * asked, aside])
+    shares = jnp.asarray((*FILTER_SCALES, 0.0, 0.0), dtype=float)
+    tried = jnp.concatenate([shares[: len(FILTER_SCALES), None] * asked, aside])
 
     def advance(
         latent: Latent, nu: Control, road: Float[Array, " 2"]
@@ -88,12 +88,12 @@ def admit(
     deviations = jnp.max(jnp.abs(jnp.concatenate([beside[None], later])), axis=0)
     margins = jnp.where(jnp.isfinite(deviations), width - deviations, -jnp.inf)
 
-    passing = margins[: len(SHARES)] >= 0.0
+    passing = margins[: len(FILTER_SCALES)] >= 0.0
     backup = (
-        len(SHARES) - 1 + jnp.argmax(margins[len(SHARES) - 1 :])
+        len(FILTER_SCALES) - 1 + jnp.argmax(margins[len(FILTER_SCALES) - 1 :])
     )  # the law wins a tie
     chosen = jnp.where(jnp.any(passing), jnp.argmax(passing), backup)
-    return Admitted(
+    return FilterResult(
         nu=tried[chosen],
         latent=jax.tree.map(lambda leaf: leaf[chosen], first),
         share=shares[chosen],

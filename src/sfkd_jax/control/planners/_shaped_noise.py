@@ -1,4 +1,4 @@
-"""Noise shaped by the problem: wide where the cost of a plan is flat, narrow where it is steep."""
+"""Sampling noise shaped by the cost: wide where it is flat, narrow where steep."""
 
 from __future__ import annotations
 
@@ -12,9 +12,9 @@ from jaxtyping import Array, Float
 from sfkd_jax.control.planners._plans import Plan, Plans
 from sfkd_jax.types import Control, Scalar
 
-FLATTEST = 1e-4
-"""Smallest curvature against the largest: no direction is drawn more than ten times as
-wide as another.
+MIN_CURVATURE = 1e-4
+"""Floor of the curvature relative to the largest: the widths of two directions differ
+by at most a factor of ten.
 """
 
 Factor: TypeAlias = Float[Array, "horizon control horizon control"]
@@ -23,14 +23,19 @@ Factor: TypeAlias = Float[Array, "horizon control horizon control"]
 def curvature_factor(
     cost: Callable[[Plan], Scalar], plan: Plan, std: Control
 ) -> Factor:
-    """F with F Fᵀ ∝ H^(−1/2), H the curvature of the cost of a plan in units of the standard deviations.
+    """Return F with F Fᵀ ∝ H^(−1/2), H the scaled Hessian of the cost of a plan.
 
-        H = S ∇²J(ν) S,  S = diag(std);   F = S V (D / D̄)^(−1/4) Vᵀ,  H = V D Vᵀ,  D̄ the geometric mean of D
+        H = S ∇²J(ν) S,   S = diag(std)
+        F = S V (D / D̄)^(−1/4) Vᵀ,   H = V D Vᵀ,   D̄ the geometric mean of D
 
-    So the volume of the noise stays what `std` makes it. For a linear model and a
-    quadratic cost this is the closed form G'QG + R of its matrices. Directions of
-    negative curvature count as flat ones; where nothing is finite or curved at all, F =
-    S.
+    The volume of the noise is therefore that of `std`. For a linear model and a
+    quadratic cost, H is the closed form G'QG + R. Directions of negative curvature
+    count as flat. If the Hessian is not finite or zero, F = S.
+
+    Args:
+        cost: of a plan; twice differentiable.
+        plan: ν.
+        std: standard deviation per control.
 
     Source: Yi et al. (2024), CoVO-MPC: Theoretical Analysis of Sampling-based MPC and
     Optimal Covariance Design.
@@ -43,14 +48,14 @@ def curvature_factor(
     hessian = scale[:, None] * 0.5 * (hessian + hessian.T) * scale
     usable = jnp.all(jnp.isfinite(hessian)) & jnp.any(hessian != 0)
     values, vectors = jnp.linalg.eigh(jnp.where(usable, hessian, jnp.eye(size)))
-    values = jnp.maximum(values / jnp.max(jnp.abs(values)), FLATTEST)
+    values = jnp.maximum(values / jnp.max(jnp.abs(values)), MIN_CURVATURE)
     widths = jnp.exp(-0.25 * (jnp.log(values) - jnp.mean(jnp.log(values))))
     factor = scale[:, None] * (vectors * widths) @ vectors.T
     return factor.reshape(*plan.shape, *plan.shape)
 
 
-def shaped(factor: Factor, noise: Plans) -> Plans:
-    """F n for every sample."""
+def shape_noise(factor: Factor, noise: Plans) -> Plans:
+    """Return F n for every sample n."""
     return jnp.einsum(
         "tcsd,smd->tmc", factor, noise, precision=jax.lax.Precision.HIGHEST
     )
