@@ -1,4 +1,4 @@
-"""What is measured: intervals of proportions, conformal bounds, disturbances."""
+"""Measured bounds: intervals of shares, conformal bounds, disturbances."""
 
 import inspect
 from functools import partial
@@ -14,9 +14,9 @@ from sfkd_jax.certification import (
     clopper_pearson,
     conformal_bounds,
     coverage,
+    coverage_interval,
     disturbances,
-    even_units,
-    interval,
+    monitor_units,
     tube_units,
 )
 from sfkd_jax.certification._calibration import Disturbance
@@ -81,7 +81,7 @@ def test_conformal_bounds_cover_a_new_trajectory_as_often_as_they_say(level, cou
     """
     random, shares = np.random.default_rng(0), []
     for _ in range(250):
-        units = (even_units, partial(tube_units, level=level))[len(shares) % 2](
+        units = (monitor_units, partial(tube_units, level=level))[len(shares) % 2](
             scores(random, 50)
         )
         bounds = conformal_bounds(units, scores(random, count), level=level)
@@ -94,7 +94,7 @@ def test_conformal_bounds_cover_a_new_trajectory_as_often_as_they_say(level, cou
 def test_conformal_bounds_are_a_calibration_score_in_the_units_of_the_reference():
     random = np.random.default_rng(1)
     reference, calibration = scores(random, 50), scores(random, 40)
-    bounds = conformal_bounds(even_units(reference), calibration, level=0.9)
+    bounds = conformal_bounds(monitor_units(reference), calibration, level=0.9)
     units = np.quantile(reference.scores, 0.95, axis=0)
     np.testing.assert_allclose(bounds / units, np.full(4, bounds[0] / units[0]))
     inside = np.sum(np.all(calibration.scores <= bounds * (1 + 1e-12), axis=1))
@@ -105,12 +105,12 @@ def test_bounds_do_not_depend_on_the_units_of_a_kind():
     random = np.random.default_rng(2)
     reference, calibration = scores(random, 50), scores(random, 40)
     scale = np.asarray([1e3, 1e-3, 1.0, 5.0])
-    bounds = conformal_bounds(even_units(reference), calibration, level=0.9)
+    bounds = conformal_bounds(monitor_units(reference), calibration, level=0.9)
     moved = (
         Disturbance(scale * reference.scores),
         Disturbance(scale * calibration.scores),
     )
-    scaled = conformal_bounds(even_units(moved[0]), moved[1], level=0.9)
+    scaled = conformal_bounds(monitor_units(moved[0]), moved[1], level=0.9)
     np.testing.assert_allclose(scaled, scale * bounds)
 
 
@@ -118,12 +118,14 @@ def test_a_kind_that_never_errs_needs_no_unit():
     silent = Disturbance(
         scores(np.random.default_rng(3), 40).scores * np.asarray([1.0, 0.0, 1.0, 1.0])
     )
-    assert even_units(silent)[1] == 1.0
+    assert monitor_units(silent)[1] == 1.0
     assert np.all(
-        even_units(silent)[[0, 2, 3]]
-        == even_units(scores(np.random.default_rng(3), 40))[[0, 2, 3]]
+        monitor_units(silent)[[0, 2, 3]]
+        == monitor_units(scores(np.random.default_rng(3), 40))[[0, 2, 3]]
     )
-    assert np.all(np.isfinite(conformal_bounds(even_units(silent), silent, level=0.9)))
+    assert np.all(
+        np.isfinite(conformal_bounds(monitor_units(silent), silent, level=0.9))
+    )
 
 
 @pytest.mark.parametrize(("count", "level"), [(18, 0.95), (8, 0.9), (98, 0.99)])
@@ -134,10 +136,10 @@ def test_too_few_trajectories_for_the_level_are_refused(count, level):
         match=f"{count} calibration trajectories are too few for level {level}",
     ):
         conformal_bounds(
-            even_units(scores(random, 50)), scores(random, count), level=level
+            monitor_units(scores(random, 50)), scores(random, count), level=level
         )
     bounds = conformal_bounds(
-        even_units(scores(random, 50)), scores(random, count + 1), level=level
+        monitor_units(scores(random, 50)), scores(random, count + 1), level=level
     )
     assert np.all(np.isfinite(bounds))
 
@@ -150,7 +152,7 @@ def test_in_the_units_of_a_tube_the_latent_kind_decides():
     for _ in range(40):
         reference, calibration = scores(random, 200), scores(random, 199)
         alone = np.sort(calibration.scores[:, 0])[int(np.ceil(200 * 0.95)) - 1]
-        even = conformal_bounds(even_units(reference), calibration, level=0.95)
+        even = conformal_bounds(monitor_units(reference), calibration, level=0.95)
         ours = conformal_bounds(
             tube_units(reference, level=0.95), calibration, level=0.95
         )
@@ -166,10 +168,13 @@ def test_a_level_that_is_none_is_refused(level):
 
 
 def test_segments_of_few_drives_give_the_interval_of_few_trials():
-    assert interval(0.9, 60) == list(clopper_pearson(54, 60))
-    assert interval(0.9, 2) == [clopper_pearson(1, 2)[0], clopper_pearson(2, 2)[1]]
-    assert interval(1.0, 1) == list(clopper_pearson(1, 1))
-    narrow, wide = interval(0.95, 600), interval(0.95, 4)
+    assert coverage_interval(0.9, 60) == list(clopper_pearson(54, 60))
+    assert coverage_interval(0.9, 2) == [
+        clopper_pearson(1, 2)[0],
+        clopper_pearson(2, 2)[1],
+    ]
+    assert coverage_interval(1.0, 1) == list(clopper_pearson(1, 1))
+    narrow, wide = coverage_interval(0.95, 600), coverage_interval(0.95, 4)
     assert wide[0] < narrow[0] < 0.95 < narrow[1] < wide[1]
 
 
@@ -187,7 +192,7 @@ def test_calibration_scores_that_are_not_finite_are_refused(value):
 
 def test_reference_scores_that_are_not_numbers_are_refused():
     with pytest.raises(ValueError, match="not finite"):
-        even_units(spoiled(np.nan))
+        monitor_units(spoiled(np.nan))
 
 
 def test_coverage_counts_trajectories_inside_all_bounds():
@@ -211,8 +216,8 @@ def test_a_split_of_any_length_is_measured_in_batches_of_one_size(monkeypatch, c
     data = Trajectory(
         *(jnp.asarray(each + np.zeros(shape)) for shape in ((4, 5), (3, 2), (3, 2)))
     )
-    found = inspect.unwrap(disturbances)(None, None, data)
-    np.testing.assert_array_equal(found.scores, each[:, :, 0] * np.ones(4))
+    actual = inspect.unwrap(disturbances)(None, None, data)
+    np.testing.assert_array_equal(actual.scores, each[:, :, 0] * np.ones(4))
     assert len(batches) == -(-count // _calibration.CHUNK)
     assert {len(leaf) for part in batches for leaf in part} == {_calibration.CHUNK}
 
@@ -235,9 +240,9 @@ def test_every_step_is_measured_in_the_frame_of_the_first_state_and_environment(
     data = Trajectory(
         *map(jnp.asarray, (states, 100 + states[:, :-1], 7 + states[:, :-1]))
     )
-    found = inspect.unwrap(_calibration._largest)(model, {}, data)
+    actual = inspect.unwrap(_calibration._largest)(model, {}, data)
     np.testing.assert_array_equal(
-        found, [[7000.0, 3.0, 103.0, 4.0], [12005.0, 8.0, 108.0, 9.0]]
+        actual, [[7000.0, 3.0, 103.0, 4.0], [12005.0, 8.0, 108.0, 9.0]]
     )
 
 
@@ -247,7 +252,7 @@ def test_the_true_plant_has_no_disturbance():
 
 
 def test_a_disturbance_is_the_largest_along_the_trajectory():
-    """A plant that is pushed sideways once, by a known amount, is seen as exactly that."""
+    """A known sideways disturbance of one step is measured exactly."""
     model, params = model_and_params("oracle")
     data = driven()
     kinds = disturbances(model, params, data).scores
@@ -256,14 +261,14 @@ def test_a_disturbance_is_the_largest_along_the_trajectory():
     states[1, 5:, 3] += (
         0.25  # from step 5 on; steps 6, 7, … then differ because the plant depends on v
     )
-    pushed = disturbances(
+    disturbed = disturbances(
         model, params, data._replace(states=jnp.asarray(states))
     ).scores
     assert yaw.size
-    np.testing.assert_allclose(pushed[[0, 2]], kinds[[0, 2]], atol=1e-7)
-    assert pushed[1, 3] >= 0.25 - 1e-5
-    assert pushed[1, 0] == pytest.approx(
-        pushed[1, 3], rel=1e-4
+    np.testing.assert_allclose(disturbed[[0, 2]], kinds[[0, 2]], atol=1e-7)
+    assert disturbed[1, 3] >= 0.25 - 1e-5
+    assert disturbed[1, 0] == pytest.approx(
+        disturbed[1, 3], rel=1e-4
     )  # the latent of a physics model is the body state
 
 

@@ -1,6 +1,4 @@
-"""Certificates of real weights: the constants are theirs, attacks stay below, other
-weights are not covered.
-"""
+"""Certificates of real weights: their constants, attacks and verification."""
 
 import dataclasses
 import json
@@ -109,13 +107,13 @@ def test_the_decoders_constants_bound_what_a_step_emits():
     motion, body = (
         np.asarray(a, np.float64) - np.asarray(b) for a, b in zip(*both, strict=True)
     )
-    apart = np.linalg.norm(z[0] - z[1], axis=1)
+    gap = np.linalg.norm(z[0] - z[1], axis=1)
     rounding = 3e-6 * (1 + np.linalg.norm(z, axis=2).max(axis=0))
     assert np.all(
-        np.linalg.norm(motion[:, :2], axis=1) <= proved["position"] * apart + rounding
+        np.linalg.norm(motion[:, :2], axis=1) <= proved["position"] * gap + rounding
     )
-    assert np.all(np.abs(motion[:, 2]) <= proved["yaw"] * apart + rounding)
-    assert np.all(np.linalg.norm(body, axis=1) <= proved["body"] * apart + rounding)
+    assert np.all(np.abs(motion[:, 2]) <= proved["yaw"] * gap + rounding)
+    assert np.all(np.linalg.norm(body, axis=1) <= proved["body"] * gap + rounding)
 
 
 def test_models_without_explicit_weights_are_refused():
@@ -137,8 +135,8 @@ def test_a_free_residual_that_happens_to_be_small_is_certified_after_the_fact():
     proved = certify(
         model, with_networks(params, residual_weights=small), BOX, attack_starts=0
     )
-    found = steepest_pattern(jax.tree.leaves(small))
-    assert found <= proved.beta <= 1.15 * found
+    reached = steepest_pattern(jax.tree.leaves(small))
+    assert reached <= proved.beta <= 1.15 * reached
 
 
 @pytest.mark.parametrize("leaf", ["operators", "readout", "log_decoder_bound"])

@@ -1,6 +1,4 @@
-"""Tubes of measured errors: exact where the errors are known, and as good as their word
-on exchangeable drives.
-"""
+"""Tubes of measured errors: exact cases, and coverage on exchangeable drives."""
 
 from functools import partial
 
@@ -22,8 +20,8 @@ STAYS = models.physics(lambda state, action, env: state)
 
 
 def random_walks(count, seed, steps=8):
-    """States that wander from where they were, each walk with a spread of its own:
-    heavy tails, equal law.
+    """Random walks of the state, each with its own spread: heavy tails, one
+    distribution.
     """
     random = np.random.default_rng(seed)
     spread = random.standard_exponential((count, 1, 1)) * np.asarray(
@@ -62,9 +60,9 @@ def test_a_model_that_always_errs_alike_gets_its_error_as_radius():
     still = Trajectory(
         jnp.zeros((20, 9, 4)), jnp.zeros((20, 8, 2)), jnp.zeros((20, 8, 2))
     )
-    found = as_array(tube_of(model, still, still))
+    radii = as_array(tube_of(model, still, still))
     np.testing.assert_allclose(
-        found, np.arange(1, 5)[:, None] * np.asarray([0.5, 0.1, 2.0]), rtol=1e-5
+        radii, np.arange(1, 5)[:, None] * np.asarray([0.5, 0.1, 2.0]), rtol=1e-5
     )
 
 

@@ -1,4 +1,4 @@
-"""The trusted core: it may refuse what is true, and never accepts what is false."""
+"""The trusted core may refuse a true claim, but never accepts a false one."""
 
 from fractions import Fraction
 
@@ -216,7 +216,7 @@ def test_layers_of_different_widths_fit_together():
     )
 
 
-# --- nothing that LAPACK, the processor or an enemy does is believed --------------------------------------------------
+# --- nothing that LAPACK, the processor or an enemy does is believed ------------------
 
 
 def test_a_witness_whose_factorisation_meets_a_pivot_that_is_no_number_proves_nothing():
@@ -226,7 +226,7 @@ def test_a_witness_whose_factorisation_meets_a_pivot_that_is_no_number_proves_no
 
 
 def test_thousands_of_hostile_matrices_and_witnesses_against_exact_arithmetic():
-    """`benchmarks/trusted_core.py` is the same search with more cases."""
+    """`benchmarks/robustness/trusted_core.py` is the same search with more cases."""
     counts = search(4000, seed=0)
     assert counts["accepted"] > 0.8 * counts["true"] > 0
 

@@ -1,7 +1,7 @@
-"""Every term of the core's rounding bounds, with units of rounding large enough to be seen one by one.
+"""Every term of the core's rounding bounds, made visible by large rounding units.
 
-`benchmarks/mutants.py` runs these against each change of `_core`; whether the bounds suffice, `test_core.py` asks exact
-arithmetic.
+`benchmarks/robustness/mutants.py` runs these tests against mutants of `_core`.
+`test_core.py` checks with exact arithmetic that the bounds suffice.
 """
 
 import numpy as np
@@ -41,10 +41,10 @@ def test_a_factor_may_be_wrong_by_as_much_as_the_shift_covers(
     """
     lost = 4 * size**2 * TINY
     shift = 4 * (size + 2) * UNIT * size * entry + error * (1 + 4 * MARGIN) + 4 * lost
-    asked = []
+    calls = []
 
     def factor(shifted, wrong):
-        asked.append(shifted)
+        calls.append(shifted)
         return np.sqrt(entry - shift + wrong) * np.eye(size)
 
     def rest(wrong):
@@ -77,7 +77,7 @@ def test_a_factor_may_be_wrong_by_as_much_as_the_shift_covers(
                 == holds
             )
             np.testing.assert_allclose(
-                asked[-1], (entry - shift) * np.eye(size), rtol=1e-12
+                calls[-1], (entry - shift) * np.eye(size), rtol=1e-12
             )
 
 
@@ -175,7 +175,7 @@ def test_a_witness_matrix_is_what_it_should_be_and_loses_so_much(coarse, kind, m
     multipliers = [random.uniform(0.5, 2.0, shape[0]) for shape in shapes[:-1]]
     half = random.standard_normal((inputs, inputs))
     form = half.T @ half if metric else None
-    found, error = _core.witness_matrix(weights, multipliers, 1.7, given, form)
+    actual, error = _core.witness_matrix(weights, multipliers, 1.7, given, form)
     start = 1.7**2 * (np.eye(inputs) if form is None else form)
     edges = np.cumsum([0, inputs, *(len(part) for part in multipliers)])
     expected, output = np.zeros((edges[-1], edges[-1])), np.zeros((outputs, edges[-1]))
@@ -194,8 +194,8 @@ def test_a_witness_matrix_is_what_it_should_be_and_loses_so_much(coarse, kind, m
     weighted, before = (output, 0.0) if form is None else _core.product(form, output)
     squared, rounding = _core.product(output.T, weighted)
     expected -= 0.5 * (squared + squared.T)
-    np.testing.assert_allclose(found, expected, rtol=1e-12, atol=1e-12)
-    np.testing.assert_array_equal(found, found.T)
+    np.testing.assert_allclose(actual, expected, rtol=1e-12, atol=1e-12)
+    np.testing.assert_array_equal(actual, actual.T)
     lost += (
         norm(output) * 2 * before
         + norm(output) * 4 * UNIT * norm(weighted)
@@ -245,15 +245,15 @@ def test_the_error_of_a_witness_matrix_counts(monkeypatch):
 
 
 def test_the_condition_of_a_metric_is_shown_with_its_rounding(coarse, monkeypatch):
-    asked = []
+    calls = []
     monkeypatch.setattr(_core, "norm_upper", lambda matrix: 4.0)
     monkeypatch.setattr(
-        _core, "is_positive_definite", lambda *given: bool(asked.append(given)) or True
+        _core, "is_positive_definite", lambda *given: bool(calls.append(given)) or True
     )
     monkeypatch.setattr(_core, "check_vertices", lambda *given: True)
     metric = np.diag([4.0, 3.0, 2.0])
     assert _core.check_metric(metric, [np.eye(3)], 0.5, 2.5)
-    ((shifted, error),) = asked
+    ((shifted, error),) = calls
     np.testing.assert_allclose(
         shifted, metric - 4.0 / 2.5 * (1 + 4 * UNIT) * np.eye(3), rtol=1e-13
     )
@@ -318,14 +318,14 @@ def test_there_are_as_many_witnesses_as_vertices_and_at_least_one():
 
 
 def test_a_metric_is_proved_once_for_all_vertices(monkeypatch):
-    asked, true = [], _core.is_positive_definite
+    calls, true = [], _core.is_positive_definite
     monkeypatch.setattr(
         _core,
         "is_positive_definite",
-        lambda *given: bool(asked.append(given)) or true(*given),
+        lambda *given: bool(calls.append(given)) or true(*given),
     )
     assert _core.check_vertices((), [()] * 3, 0.8, VERTICES, np.eye(2))
-    assert [len(given) for given in asked] == [1, 2, 2, 2]
+    assert [len(given) for given in calls] == [1, 2, 2, 2]
     for metric in (-np.eye(2), np.zeros((2, 2)), np.diag([1.0, np.nan])):
         assert not _core.check_vertices(
             (), [()] * 3, 0.8, [0 * vertex for vertex in VERTICES], metric

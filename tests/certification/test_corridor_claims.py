@@ -1,6 +1,7 @@
-"""The corridor's arithmetic: bounds that hold together, counts that fit, and forgeries that are refused.
+"""The corridor: joint bounds, consistent counts, and forgeries that are refused.
 
-`benchmarks/mutants.py` runs these against each change of `_corridor_claims`.
+`benchmarks/robustness/mutants.py` runs these tests against mutants of
+`_corridor_claims`.
 """
 
 import copy
@@ -15,12 +16,12 @@ from sfkd_jax.certification import (
     FixedPoints,
     OutputMetric,
     _corridor_claims,
-    calibrate,
-    covered,
+    calibrate_corridor,
+    corridor_coverage,
     fixed_point_corridor,
     radii,
 )
-from sfkd_jax.certification._calibration import interval
+from sfkd_jax.certification._calibration import coverage_interval
 from sfkd_jax.certification._claims import Refuted
 from sfkd_jax.certification._corridor_claims import drive_scores
 from sfkd_jax.certification._radii import Residuals
@@ -37,10 +38,12 @@ def test_bounds_hold_together_as_often_as_they_say():
     """
     shares = []
     for repetition in range(400):
-        bounds = calibrate(
+        bounds = calibrate_corridor(
             scores(60, 3 * repetition), scores(60, 3 * repetition + 1), level=0.9
         )
-        shares.append(covered(bounds, scores(200, 3 * repetition + 2))["coverage"])
+        shares.append(
+            corridor_coverage(bounds, scores(200, 3 * repetition + 2))["coverage"]
+        )
     assert 0.895 <= np.mean(shares) <= 0.93
 
 
@@ -50,8 +53,8 @@ PROVED = {"alpha": 0.8, "lipschitz": 0.02}
 
 @cache
 def corridor():
-    bounds = calibrate(scores(60, 0), scores(60, 1), level=0.9)
-    part = covered(bounds, scores(200, 2))
+    bounds = calibrate_corridor(scores(60, 0), scores(60, 1), level=0.9)
+    part = corridor_coverage(bounds, scores(200, 2))
     return {
         "bounds": bounds,
         "corridor_m": bounds["nominal"] + bounds["followed_position"],
@@ -72,7 +75,7 @@ def corridor():
 def counted(corridor, **changes):
     """With the interval that a share and a number of drives have."""
     corridor.update(changes)
-    corridor["coverage_ci95"] = interval(
+    corridor["coverage_ci95"] = coverage_interval(
         corridor["coverage"], corridor["coverage_drives"]
     )
 
@@ -209,9 +212,9 @@ def test_what_was_added_up_in_another_order_is_the_same():
 def test_a_corridor_whose_parts_do_not_go_together_is_refused(named, forge):
     changed = copy.deepcopy(corridor())
     forge(changed)
-    with pytest.raises(Refuted) as told:
+    with pytest.raises(Refuted) as reason:
         _corridor_claims.require_corridor(changed, PROVED)
-    assert named in str(told.value)
+    assert named in str(reason.value)
 
 
 @pytest.mark.parametrize("share", [0.0, 0.005, 1.0])
@@ -237,7 +240,7 @@ def test_bounds_are_units_of_other_drives_times_a_quantile():
         for_ever_yaw=np.asarray([0.3, 0.2, 0.4]),
         nominal=np.asarray([19.0, 20.0, 190.0]),
     )
-    bounds = calibrate(reference, new, level=0.5)
+    bounds = calibrate_corridor(reference, new, level=0.5)
     units = {"followed_position": 1.0, "followed_yaw": 19.0, "nominal": 190.0}
     assert sorted(bounds) == sorted(_corridor_claims.MEASURED)
     assert {name: bounds[name] for name in units} == pytest.approx(
@@ -256,10 +259,10 @@ def test_a_drive_on_its_bound_is_covered_and_one_that_leaves_any_bound_is_not():
     )
     for k, name in enumerate(_corridor_claims.JOINT):
         getattr(inside, name)[k] *= 1 + 1e-9
-    found = covered(bounds, inside)
-    assert found == {
+    actual = corridor_coverage(bounds, inside)
+    assert actual == {
         "coverage": 0.4,
-        "coverage_ci95": interval(0.4, 5),
+        "coverage_ci95": coverage_interval(0.4, 5),
         "coverage_trajectories": 5,
         "coverage_drives": 5,
     }
@@ -267,7 +270,7 @@ def test_a_drive_on_its_bound_is_covered_and_one_that_leaves_any_bound_is_not():
 
 def test_scores_are_the_radii_of_every_output():
     random = np.random.default_rng(0)
-    found = Residuals(
+    measured = Residuals(
         random.standard_normal((4, 7, 2)), np.abs(random.standard_normal((4, 7, 2)))
     )
     claims = {
@@ -279,10 +282,10 @@ def test_scores_are_the_radii_of_every_output():
         {name: np.full(4, 20.0 + k) for k, name in enumerate(OUTPUTS)},
     )
     for initial in (None, beside):
-        scored = drive_scores(found, claims, nominal, initial)
+        scored = drive_scores(measured, claims, nominal, initial)
         for name in OUTPUTS:
             expected = radii(
-                found, name, claims[name], 0.0 if initial is None else initial[name]
+                measured, name, claims[name], 0.0 if initial is None else initial[name]
             )
             np.testing.assert_array_equal(
                 getattr(scored, f"followed_{name}"), expected.followed

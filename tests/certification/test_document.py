@@ -1,6 +1,4 @@
-"""A certificate that was forged, or that lies beside other settings, is refused in one
-line; an honest one verifies.
-"""
+"""Forged or stale certificates of a policy are refused in one line."""
 
 import copy
 import json
@@ -197,7 +195,7 @@ def test_a_document_that_lacks_anything_is_refused():
             check(lacking)
 
 
-# --- bound to everything that model and controller compute with -----------------------------------------------------
+# --- bound to everything that model and controller compute with -----------------------
 
 
 def leaves(value, path=()):
@@ -265,8 +263,8 @@ def test_a_setting_that_changed_leaves_nothing_certified_and_says_so(
         UserWarning,
         match="nothing is certified and nothing is monitored; .* other weights or settings",
     ):
-        found = policy.load(copied)
-    assert found.certificate is None
+        loaded = policy.load(copied)
+    assert loaded.certificate is None
 
 
 def test_a_certificate_is_loaded_without_a_word_and_its_monitor_with_it(copied):
@@ -277,11 +275,13 @@ def test_a_certificate_is_loaded_without_a_word_and_its_monitor_with_it(copied):
 
 @pytest.mark.parametrize("fallback", ["hold", "slow"])
 def test_a_fallback_needs_a_certificate(copied, fallback):
-    asked = shipped().settings["controller"]
-    asked = asked | {"monitor": asked["monitor"] | {"fallback": fallback}}
-    policy.load(copied, controller=asked)
+    controller = shipped().settings["controller"]
+    controller = controller | {
+        "monitor": controller["monitor"] | {"fallback": fallback}
+    }
+    policy.load(copied, controller=controller)
     (copied / "certificate.json").unlink()
-    line = refusal_of(lambda: policy.load(copied, controller=asked))
+    line = refusal_of(lambda: policy.load(copied, controller=controller))
     assert (
         f"controller.monitor.fallback={fallback} needs a certificate; certificate.json is missing"
         in line
@@ -305,11 +305,11 @@ def test_a_refusal_is_told_with_its_reason(copied):
         policy.load(copied)
 
 
-# --- weights ---------------------------------------------------------------------------------------------------------
+# --- weights --------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize(
-    ("spoil", "told"),
+    ("spoil", "message"),
     [
         (lambda name, leaf: leaf.astype(np.float64), "are float64"),
         (lambda name, leaf: leaf[..., :-1], "weights networks/operators are"),
@@ -317,7 +317,9 @@ def test_a_refusal_is_told_with_its_reason(copied):
         (lambda name, leaf: None, "lacks weights networks/operators"),
     ],
 )
-def test_weights_that_do_not_fit_the_model_are_refused_in_one_line(copied, spoil, told):
+def test_weights_that_do_not_fit_the_model_are_refused_in_one_line(
+    copied, spoil, message
+):
     arrays, manifest = artefacts.read_arrays(copied / "policy.npz", kind=policy.KIND)
     changed = spoil("networks/operators", arrays["networks/operators"])
     arrays = {
@@ -328,7 +330,7 @@ def test_weights_that_do_not_fit_the_model_are_refused_in_one_line(copied, spoil
         copied / "policy.npz", arrays, kind=policy.KIND, config=manifest["config"]
     )
     line = refusal_of(lambda: policy.load(copied))
-    assert told in line
+    assert message in line
     assert "policy.npz" in line
 
 

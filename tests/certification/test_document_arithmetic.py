@@ -1,6 +1,7 @@
-"""What a document must repeat: boxes, statistics and tubes, with its proof taken for verified.
+"""The arithmetic of a document: boxes, statistics and tubes, with a verified proof.
 
-`benchmarks/mutants.py` runs these against each change of `_document`; `test_document.py` asks the whole chain.
+`benchmarks/robustness/mutants.py` runs these tests against mutants of `_document`;
+`test_document.py` tests the whole chain.
 """
 
 import copy
@@ -18,9 +19,14 @@ from sfkd_jax.certification import (
     CertificateStale,
     CertificationRefused,
     _document,
-    interval,
+    coverage_interval,
 )
-from sfkd_jax.certification._tube import for_ever, latent_tube, path_tube, physical_tube
+from sfkd_jax.certification._tube import (
+    latent_tube,
+    path_tube,
+    physical_tube,
+    ultimate_tube,
+)
 from sfkd_jax.types import Model
 
 KINDS = ("kinematic", "dynamic", "path")
@@ -30,13 +36,13 @@ every_kind = pytest.mark.parametrize("kind", KINDS)
 
 @pytest.fixture(autouse=True)
 def proof_is_verified(monkeypatch):
-    """All but what `verify` asks; the weights are a word."""
-    asked = []
+    """`verify_document` without `verify` and without weights."""
+    calls = []
     monkeypatch.setattr(_document, "exported", lambda model, params: "weights")
     monkeypatch.setattr(
-        _document, "verify", lambda *given, **named: asked.append((given, named))
+        _document, "verify", lambda *given, **named: calls.append((given, named))
     )
-    return asked
+    return calls
 
 
 @cache
@@ -57,7 +63,7 @@ def honest(kind="kinematic"):
         "residual": d_bar["one_step"],
     }
     tube["physical"] = path_tube(latent_tube(alpha, d_bar["value"], 20), **known)
-    tube["for_ever"] = for_ever(d_bar["value"] / (1 - alpha), **known)
+    tube["for_ever"] = ultimate_tube(d_bar["value"] / (1 - alpha), **known)
     return document | {
         "tube": tube | {"largest_increment_m": None},
         "decoder_lipschitz": None,
@@ -71,10 +77,10 @@ def check(document, sha=None):
     )
 
 
-def refused(document, told):
+def refused(document, message):
     with pytest.raises(CertificationRefused) as reason:
         check(document)
-    assert told in str(reason.value)
+    assert message in str(reason.value)
     assert "\n" not in str(reason.value)
 
 
@@ -104,17 +110,17 @@ def test_boxes_are_a_lower_and_an_upper_corner(name):
     for corners in (swapped, [low], [low, high, high], [0.0, 1.0], [[low], [high]]):
         refused(
             put(honest(), f"boxes.{name}", corners),
-            f"boxes.{name} is no lower and upper corner",
+            f"boxes.{name} is not a lower and an upper corner",
         )
     for value in (math.nan, math.inf, "0.5", None, 1j):
         corners = [[value] * len(low), high]
         refused(
             put(honest(), f"boxes.{name}", corners),
-            f"boxes.{name} holds what is no number",
+            f"boxes.{name} must be finite numbers",
         )
     refused(
         put(honest(), f"boxes.{name}", [[False], [True]]),
-        f"boxes.{name} holds what is no number",
+        f"boxes.{name} must be finite numbers",
     )
 
 
@@ -158,7 +164,7 @@ def test_a_measured_error_may_be_zero_and_not_less():
     )
     refused(
         put(honest(), "d_bar.one_step.yaw", math.nan),
-        "d_bar.one_step holds what is no number",
+        "d_bar.one_step must be finite numbers",
     )
     check(put(honest(), "monitor.bounds", [1, 5e-324, 1, 2]))
 
@@ -166,16 +172,16 @@ def test_a_measured_error_may_be_zero_and_not_less():
 @pytest.mark.parametrize("part", ["d_bar", "monitor"])
 def test_a_level_is_one_that_so_many_trajectories_support(part):
     for level in (0.0, 1.0, -0.5, 1.5, 0.999, math.nan):
-        told = f"{part}.level = {level!r} cannot be had from 600 trajectories"
-        refused(put(honest(), f"{part}.level", level), told)
+        message = f"{part}.level = {level!r} is not possible with 600 trajectories"
+        refused(put(honest(), f"{part}.level", level), message)
     for level in (0.001, 0.5, 0.998):
         check(put(honest(), f"{part}.level", level))
 
 
 def test_there_are_at_least_as_many_trajectories_as_drives():
     for drives in (0, -1, 601):
-        told = f"d_bar.drives = {drives} does not fit 600 trajectories"
-        refused(put(honest(), "d_bar.drives", drives), told)
+        message = f"d_bar.drives = {drives} does not fit 600 trajectories"
+        refused(put(honest(), "d_bar.drives", drives), message)
     for drives in (1, 599, 600):
         check(put(honest(), "d_bar.drives", drives))
 
@@ -197,7 +203,9 @@ def covered(path, inside, count, drives):
         "coverage_drives": drives,
     }
     document = honest()
-    for name, value in (parts | {"coverage_ci95": interval(share, drives)}).items():
+    for name, value in (
+        parts | {"coverage_ci95": coverage_interval(share, drives)}
+    ).items():
         document = put(document, f"{path}.{name}", value)
     return document
 
@@ -210,10 +218,10 @@ def test_a_coverage_is_a_share_of_trajectories_with_the_interval_of_its_drives(p
     for inside, drives in ((-1, 40), (41, 40), (20, 41)):
         refused(
             covered(path, inside, 40, drives),
-            f"{name}: a coverage of {inside / 40!r} of 40 trajectories is none",
+            f"{name}: a coverage of {inside / 40!r} is not possible with 40 trajectories",
         )
     drives = put(covered(path, 20, 40, 40), f"{path}.coverage_drives", 0)
-    refused(drives, f"{name}: a coverage of 0.5 of 40 trajectories is none")
+    refused(drives, f"{name}: a coverage of 0.5 is not possible with 40 trajectories")
     document = covered(path, 20, 40, 20)
     refused(
         put(document, f"{path}.coverage", 0.5 + 1e-8),
@@ -243,12 +251,12 @@ def test_every_radius_is_computed_again(kind):
     if kind == "path":
         radii += [f"tube.for_ever.{name}" for name in ("position_m", "yaw_rad", "body")]
     for path in radii:
-        value, told = (
+        value, message = (
             entry_at(honest(kind), path),
             path.rstrip("0123456789").rstrip("."),
         )
         for factor in (0.5, 1 - 2e-9, 1 + 2e-9, math.nan):
-            refused(put(honest(kind), path, factor * value), told)
+            refused(put(honest(kind), path, factor * value), message)
         for factor in (1 - 0.5e-9, 1 + 0.5e-9):
             check(put(honest(kind), path, factor * value))
 
@@ -274,7 +282,7 @@ def test_every_radius_follows_from_alpha_d_bar_and_the_constants(kind):
         for path in (f"lipschitz.{name}", f"d_bar.one_step.{name}"):
             refused(
                 put(document, path, 1.001 * entry_at(document, path)),
-                "does not follow from what it is computed from",
+                "does not agree with the value derived from the document",
             )
         shorter = put(
             document,
@@ -290,16 +298,16 @@ def test_every_radius_follows_from_alpha_d_bar_and_the_constants(kind):
 
 
 def test_a_tube_has_the_parts_of_its_kind():
-    told = "tube is not of position, yaw and body state"
+    message = "tube is not of position, yaw and body state"
     for kind in KINDS:
-        refused(put(honest(kind), "tube.physical.height", [0.0] * 20), told)
+        refused(put(honest(kind), "tube.physical.height", [0.0] * 20), message)
         less = copy.deepcopy(honest(kind))
         del less["tube"]["physical"]["yaw_rad"]
-        refused(less, told)
-    refused(put(honest(), "tube.for_ever", {}), told)
-    refused(put(honest("path"), "tube.for_ever", None), told)
+        refused(less, message)
+    refused(put(honest(), "tube.for_ever", {}), message)
+    refused(put(honest("path"), "tube.for_ever", None), message)
     length = honest()["tube"]["largest_increment_m"]
-    refused(put(honest(), "tube.largest_increment_m", -length), told)
+    refused(put(honest(), "tube.largest_increment_m", -length), message)
     alpha, d_bar = honest()["alpha"], honest()["d_bar"]
     known = {
         "alpha": alpha,
@@ -312,7 +320,7 @@ def test_a_tube_has_the_parts_of_its_kind():
     check(put(put(honest(), "tube.physical", shorter), "tube.largest_increment_m", 0.1))
     refused(
         put(put(honest(), "tube.physical", shorter), "tube.largest_increment_m", -0.1),
-        told,
+        message,
     )
     for other in (0.0, 1.001 * length):
         refused(
@@ -321,7 +329,7 @@ def test_a_tube_has_the_parts_of_its_kind():
         )
     refused(
         put(honest(), "tube.largest_increment_m", None),
-        "tube.largest_increment_m holds what is no number",
+        "tube.largest_increment_m must be finite numbers",
     )
 
 
@@ -329,7 +337,7 @@ FORMS = ("for_ever", "followed")
 
 
 def output(alpha, coverages=(0.95, 0.9), drives=60):
-    """What a document says of one output in a metric of its own."""
+    """The document's part about one output."""
     shares = dict(zip(FORMS, coverages, strict=True))
     return {
         "alpha": alpha,
@@ -338,7 +346,7 @@ def output(alpha, coverages=(0.95, 0.9), drives=60):
         "tube": {"for_ever": 0.3, "followed": 0.2},
         "coverage": shares,
         "coverage_ci95": {
-            form: interval(share, drives) for form, share in shares.items()
+            form: coverage_interval(share, drives) for form, share in shares.items()
         },
         "coverage_drives": drives,
     }
@@ -346,54 +354,54 @@ def output(alpha, coverages=(0.95, 0.9), drives=60):
 
 @pytest.fixture
 def outputs(monkeypatch):
-    """A document with both outputs, and what is asked of their proofs."""
-    asked = {"metric": [], "corridor": []}
+    """A document with both outputs, and the recorded checks of their proofs."""
+    calls = {"metric": [], "corridor": []}
     monkeypatch.setattr(
-        _document, "require_output_metric", lambda *given: asked["metric"].append(given)
+        _document, "require_output_metric", lambda *given: calls["metric"].append(given)
     )
     monkeypatch.setattr(
-        _document, "require_corridor", lambda *given: asked["corridor"].append(given)
+        _document, "require_corridor", lambda *given: calls["corridor"].append(given)
     )
     return honest("path") | {
         "outputs": {"position": output(0.8), "yaw": output(0.7)}
-    }, asked
+    }, calls
 
 
 def test_every_output_is_proved_in_its_metric(outputs):
-    document, asked = outputs
+    document, calls = outputs
     check(document)
-    assert asked["corridor"] == []
+    assert calls["corridor"] == []
     assert [
         (name, claim.alpha, claim.lipschitz, weights)
-        for name, claim, weights in asked["metric"]
+        for name, claim, weights in calls["metric"]
     ] == [
         ("position", 0.8, 2.0, "weights"),
         ("yaw", 0.7, 2.0, "weights"),
     ]
-    for _, claim, _ in asked["metric"]:
+    for _, claim, _ in calls["metric"]:
         np.testing.assert_array_equal(claim.metric, [[4.0]])
         np.testing.assert_array_equal(claim.joint, [[[1.0, 2.0]]])
 
 
 def test_without_outputs_none_is_proved(outputs):
-    asked = outputs[1]
+    calls = outputs[1]
     for parts in ({}, {"outputs": {}}, {"outputs": {}, "corridor": None}):
         check(honest("path") | parts)
-    assert asked == {"metric": [], "corridor": []}
+    assert calls == {"metric": [], "corridor": []}
 
 
 def test_a_corridor_needs_both_outputs(outputs, monkeypatch):
-    document, asked = outputs
+    document, calls = outputs
     check(document | {"corridor": {"bounds": 1}})
-    assert asked["corridor"] == [({"bounds": 1}, document["outputs"]["position"])]
+    assert calls["corridor"] == [({"bounds": 1}, document["outputs"]["position"])]
     for nothing in ({"outputs": {}}, {}):
         refused(
             honest("path") | nothing | {"corridor": {}},
             "a corridor needs a metric of every output",
         )
     for names in ("position", "yaw"):
-        told = f"outputs must be position and yaw, got {names}"
-        refused(document | {"outputs": {names: output(0.8)}}, told)
+        message = f"outputs must be position and yaw, got {names}"
+        refused(document | {"outputs": {names: output(0.8)}}, message)
     monkeypatch.setattr(
         _document,
         "require_corridor",
@@ -419,12 +427,12 @@ def test_the_tube_of_an_output_is_above_zero_and_its_coverage_one_of_drives(
     for radius in (0.0, -0.1):
         refused(
             put(document, f"{part}.tube.{form}", radius),
-            f"{part}.tube.{form} is no radius",
+            f"{part}.tube.{form} is not a radius",
         )
     for radius in (math.nan, math.inf, None, "0.3"):
         refused(
             put(document, f"{part}.tube.{form}", radius),
-            f"{part}.tube holds what is no number",
+            f"{part}.tube must be finite numbers",
         )
     check(put(document, f"{part}.tube.{form}", 5e-324))
     share = entry_at(document, f"{part}.coverage.{form}")
@@ -443,12 +451,12 @@ def test_the_tube_of_an_output_is_above_zero_and_its_coverage_one_of_drives(
             put(document, path, entry_at(document, path) + 1e-8),
             f"{part}: coverage_ci95 does not follow",
         )
-    for drives, told in (
+    for drives, message in (
         (0, "malformed"),
         (120, "coverage_ci95 does not follow"),
         (61, "coverage does not follow"),
     ):
-        refused(put(document, f"{part}.coverage_drives", drives), told)
+        refused(put(document, f"{part}.coverage_drives", drives), message)
 
 
 @every_kind

@@ -1,6 +1,4 @@
-"""The corridor that needs no copy: of a linear loop, whose fixed points are known, and
-which attains the bound.
-"""
+"""The corridor from fixed points: linear loops with known ones, and forgeries."""
 
 import jax.numpy as jnp
 import numpy as np
@@ -58,7 +56,7 @@ def length(gaps):
 
 def test_the_fixed_points_of_a_linear_loop_are_found():
     steps = roads()
-    found = fixed_points(
+    measured = fixed_points(
         linear(),
         {},
         CLAIM,
@@ -73,27 +71,29 @@ def test_the_fixed_points_of_a_linear_loop_are_found():
     )
     roads_only = steps @ (settled @ CONTROL[:, 2:]).T
     rests = roads_only[:, :, None] + corners @ (settled @ ENVIRONMENT).T
-    assert found.centre_m == pytest.approx(np.max(np.abs(rests[..., 0])), rel=1e-4)
-    assert found.road == pytest.approx(
+    assert measured.centre_m == pytest.approx(np.max(np.abs(rests[..., 0])), rel=1e-4)
+    assert measured.road == pytest.approx(
         np.max(length(roads_only[:, 1] - roads_only[:, 0])), rel=1e-4
     )
     far = settled @ ENVIRONMENT @ (corners[None] - corners[:, None])[..., None]
-    assert found.switch == pytest.approx(np.max(length(far[..., 0])), rel=1e-4)
+    assert measured.switch == pytest.approx(np.max(length(far[..., 0])), rel=1e-4)
     nus = LIMIT * np.asarray([[1, 1], [1, -1]])
-    assert found.push == pytest.approx(np.max(length(nus @ CONTROL[:, :2].T)), rel=1e-4)
-    assert found.points == len(steps) * 2 * 25
+    assert measured.push == pytest.approx(
+        np.max(length(nus @ CONTROL[:, :2].T)), rel=1e-4
+    )
+    assert measured.points == len(steps) * 2 * 25
 
 
 def worst_drive(alpha, scale, road, switch, push, disturbance, every, steps=2000):
     """e_y against c'z* of z⁺ = α z + (1 − α) z* + ν + d on a line: everything drives it
     the same way.
     """
-    rest, latent, apart = 0.0, 0.0, []
+    rest, latent, errors = 0.0, 0.0, []
     for step in range(steps):
         latent = alpha * latent + (1.0 - alpha) * rest + (push + disturbance) / scale
-        apart.append(latent - rest)
+        errors.append(latent - rest)
         rest -= (road + (switch if step % every == 0 else 0.0)) / scale
-    return np.asarray(apart[steps // 2 :])
+    return np.asarray(errors[steps // 2 :])
 
 
 @pytest.mark.parametrize("every", [1, 4, 30])
@@ -104,17 +104,17 @@ def test_the_bound_is_attained_by_a_loop_on_a_line(alpha, every):
     """
     scale, sizes = 3.0, {"road": 0.2, "switch": 0.7, "push": 0.3}
     disturbance = 0.1
-    apart = worst_drive(alpha, scale, **sizes, disturbance=disturbance, every=every)
+    errors = worst_drive(alpha, scale, **sizes, disturbance=disturbance, every=every)
     for_ever = (alpha * disturbance / (1.0 - alpha) + disturbance) / scale
-    found = FixedPoints(centre_m=0.05, **sizes, points=1)
+    measured = FixedPoints(centre_m=0.05, **sizes, points=1)
     claimed = fixed_point_corridor(
-        found,
+        measured,
         alpha=alpha,
         lipschitz=1.0 / scale,
         for_ever=for_ever,
         steps_between_switches=every,
     )
-    assert np.max(apart) + 0.05 == pytest.approx(
+    assert np.max(errors) + 0.05 == pytest.approx(
         claimed["after_switch_m"]["planner"], rel=1e-6
     )
     quiet = worst_drive(
@@ -129,7 +129,7 @@ def test_the_bound_is_attained_by_a_loop_on_a_line(alpha, every):
 
 def test_a_loop_that_rests_on_its_path_whatever_happens_needs_its_tube_alone():
     still = linear(control=np.zeros((3, 4)), environment=np.zeros((3, 2)))
-    found = fixed_points(
+    measured = fixed_points(
         still,
         {},
         CLAIM,
@@ -139,6 +139,6 @@ def test_a_loop_that_rests_on_its_path_whatever_happens_needs_its_tube_alone():
         perturbation=jnp.asarray(LIMIT, dtype=float),
     )
     claimed = fixed_point_corridor(
-        found, alpha=0.8, lipschitz=0.5, for_ever=0.2, steps_between_switches=30
+        measured, alpha=0.8, lipschitz=0.5, for_ever=0.2, steps_between_switches=30
     )
     assert claimed["after_switch_m"]["planner"] == pytest.approx(0.2, abs=1e-5)

@@ -1,6 +1,6 @@
-"""Certificates of networks small enough for numpy alone: honest ones verify, and every forgery is refused, and why.
+"""Certificates of tiny networks: honest ones verify, forged ones are refused.
 
-`benchmarks/mutants.py` runs these against each change of `_certificate`.
+`benchmarks/robustness/mutants.py` runs these tests against mutants of `_certificate`.
 """
 
 import dataclasses
@@ -82,13 +82,13 @@ def test_a_certificate_is_frozen(kind):
 
 
 def test_the_attack_is_told_what_was_asked_for(kind, monkeypatch):
-    told = []
+    calls = []
     monkeypatch.setattr(
-        _certificate, "attack_all", lambda *args: told.append(args) or {}
+        _certificate, "attack_all", lambda *args: calls.append(args) or {}
     )
     proof = certified()
     certified(attack_starts=3, seed=5)
-    assert [args[-2:] for args in told] == [(6, 0), (3, 5)]
+    assert [args[-2:] for args in calls] == [(6, 0), (3, 5)]
     assert (proof.attack, proof.tightness) == (None, None)
     verified(proof)
 
@@ -220,9 +220,9 @@ def test_weights_that_are_at_hand_are_not_served_again(kind, monkeypatch):
         bare(_certificate.verify)(proof, PARAMS, model=MODEL, weights=other)
 
 
-def forged(told, name="joint", **changes):
+def forged(message, name="joint", **changes):
     """A certificate with some parts replaced is refused, and why."""
-    with pytest.raises(CertificationRefused, match=told):
+    with pytest.raises(CertificationRefused, match=message):
         verified(dataclasses.replace(certified(name), **changes))
 
 
@@ -322,14 +322,14 @@ def test_an_attack_on_nothing_is_refused(kind):
 
 def test_attack_and_tightness_are_of_the_attacks(kind):
     alpha = certified().alpha
-    told = "attack or tightness is not what the attacks found"
+    message = "attack or tightness is not what the attacks found"
     for attack in (0.3, 0.5, None, np.nan):
-        forged(told, attack=attack)
+        forged(message, attack=attack)
     for tightness in (alpha / 0.21, alpha / 0.19, None, 1.0, np.nan):
-        forged(told, tightness=tightness)
-    forged(told, attacks={"step": 0.3})
-    forged(told, attacks={})
-    forged(told, attacks={}, attack=None)
+        forged(message, tightness=tightness)
+    forged(message, attacks={"step": 0.3})
+    forged(message, attacks={})
+    forged(message, attacks={}, attack=None)
     verified(dataclasses.replace(certified(), attacks={}, attack=None, tightness=None))
 
 
@@ -366,8 +366,8 @@ def test_a_certificate_of_each_kind_verifies_and_survives_json(kind):
         assert proof.transport_lipschitz == 1.0
         assert proof.env_box == BOX
         assert proof.params_sha256 == fingerprint(PARAMS)
-        found = (None, None) if kind.name == "metric" else (0.2, proof.alpha / 0.2)
-        assert (proof.attack, proof.tightness) == found
+        expected = (None, None) if kind.name == "metric" else (0.2, proof.alpha / 0.2)
+        assert (proof.attack, proof.tightness) == expected
         assert 0 <= proof.seconds < 100
         assert set(proof.versions) == {"jax", "numpy", "scipy"}
         assert proof.precision.startswith(

@@ -1,6 +1,6 @@
-"""Claims of networks small enough for numpy alone: honest ones hold, and every forgery is refused by its name.
+"""Claims of tiny networks: honest ones hold, forged ones are refused by name.
 
-`benchmarks/mutants.py` runs these against each change of `_claims`.
+`benchmarks/robustness/mutants.py` runs these tests against mutants of `_claims`.
 """
 
 import json
@@ -22,7 +22,7 @@ from networks import (
 )
 
 from sfkd_jax.certification import _claims, _proofs
-from sfkd_jax.certification._claims import Refuted, claims_hold
+from sfkd_jax.certification._claims import Refuted, require_claims
 from sfkd_jax.certification._exported import one_thread
 from sfkd_jax.types import Declared, Polytope
 
@@ -36,9 +36,9 @@ def on_one_thread():
 
 
 def refuted(claims, weights, named, box=BOX):
-    with pytest.raises(Refuted) as told:
-        claims_hold(claims, weights, box)
-    assert named in str(told.value)
+    with pytest.raises(Refuted) as reason:
+        require_claims(claims, weights, box)
+    assert named in str(reason.value)
 
 
 def witness(claims, **changes):
@@ -47,19 +47,19 @@ def witness(claims, **changes):
 
 @every_kind
 def test_what_was_proved_holds(kind):
-    claims_hold(honest(kind), KINDS[kind][0], BOX)
+    require_claims(honest(kind), KINDS[kind][0], BOX)
     assert json.loads(json.dumps(honest(kind).witnesses)) == honest(kind).witnesses
 
 
 def test_the_constants_are_those_of_the_matrices():
-    found = honest("joint")
-    assert found.rho == pytest.approx(0.5, rel=2e-6)
-    assert 0.06 < found.beta <= 0.12 * (1 + 2e-6)
-    assert found.alpha_separate == found.rho + found.beta
-    assert 0.5 < found.alpha_joint <= found.alpha_separate * (1 + 1e-6)
-    assert found.kappa == 1.0
-    assert found.lipschitz["body"] == pytest.approx(np.hypot(0.7, 0.1), rel=2e-6)
-    assert set(found.lipschitz) == {"body", "position", "yaw", "decoder"}
+    claims = honest("joint")
+    assert claims.rho == pytest.approx(0.5, rel=2e-6)
+    assert 0.06 < claims.beta <= 0.12 * (1 + 2e-6)
+    assert claims.alpha_separate == claims.rho + claims.beta
+    assert 0.5 < claims.alpha_joint <= claims.alpha_separate * (1 + 1e-6)
+    assert claims.kappa == 1.0
+    assert claims.lipschitz["body"] == pytest.approx(np.hypot(0.7, 0.1), rel=2e-6)
+    assert set(claims.lipschitz) == {"body", "position", "yaw", "decoder"}
     turned = honest("metric")
     assert turned.rho == pytest.approx(0.5, rel=1e-5)
     assert turned.kappa == pytest.approx(9.0, rel=1e-5)
@@ -73,7 +73,7 @@ def test_the_constants_are_those_of_the_matrices():
         np.linalg.norm(FIRST.T @ FIRST, 2), rel=2e-6
     )
     assert honest("silent").beta == 0.0
-    assert "hull of 3 vertices; all u, all z" in found.scope
+    assert "hull of 3 vertices; all u, all z" in claims.scope
     assert "branch and bound over" in honest("hypernetwork").scope
 
 
@@ -106,16 +106,16 @@ def test_operators_are_served_with_a_margin():
     assert norm * (1 + 0.9e-6) < rho < norm * (1 + 1.1e-6)
     assert (
         scope
-        == _claims.hull(NETWORK)
+        == _claims.hull_scope(NETWORK)
         == "all e: A(e) lies in the hull of 3 vertices; all u, all z"
     )
-    found = _claims.cover(HYPERNETWORK, BOX, _claims.norm_upper)
+    actual = _claims.bound_over_box(HYPERNETWORK, BOX, _claims.norm_upper)
     rho, scope = _claims.operator_norms(KINDS["hypernetwork"][0], BOX)
-    assert rho == _claims.SERVED * found.upper
-    assert 1 + 0.9e-6 < _claims.SERVED < 1 + 1.1e-6
+    assert rho == _claims.COMPILATION_SLACK * actual.upper
+    assert 1 + 0.9e-6 < _claims.COMPILATION_SLACK < 1 + 1.1e-6
     assert (
         scope
-        == f"all e in the box, branch and bound over {found.cells} cells; all u, all z"
+        == f"all e in the box, branch and bound over {actual.cells} cells; all u, all z"
     )
 
 
@@ -134,7 +134,7 @@ def test_what_is_no_bound_is_none(name, value):
     refuted(
         replaced(honest("joint"), name, value),
         NETWORK,
-        f"{name} is no bound: {value!r}",
+        f"{name} is not a bound: {value!r}",
     )
 
 
@@ -145,13 +145,13 @@ def test_what_is_no_number_is_no_bound(value):
         lipschitz=honest("joint").lipschitz | {"body": value}
     )
     assert ("body", value) in _claims._constants(claims)
-    with pytest.raises(Refuted, match="body is no bound"):
-        getattr(claims_hold, "__wrapped__", claims_hold)(claims, NETWORK, BOX)
+    with pytest.raises(Refuted, match="body is not a bound"):
+        getattr(require_claims, "__wrapped__", require_claims)(claims, NETWORK, BOX)
 
 
 def test_zero_is_a_bound_of_what_does_not_move():
     still = KINDS["bare"][0]._replace(readout=np.zeros((1, 3)))
-    claims_hold(replaced(honest("bare"), "position", 0.0), still, BOX)
+    require_claims(replaced(honest("bare"), "position", 0.0), still, BOX)
     refuted(
         replaced(honest("bare"), "position", 0.0),
         KINDS["bare"][0],
@@ -193,7 +193,7 @@ def test_a_smaller_constant_does_not_follow_and_a_larger_one_does(kind, name):
             weights,
             f"{named} does not follow",
         )
-    claims_hold(consistent(replaced(claims, name, 1.001 * value)), weights, BOX)
+    require_claims(consistent(replaced(claims, name, 1.001 * value)), weights, BOX)
 
 
 @pytest.mark.parametrize("name", ["alpha", "alpha_separate"])
@@ -221,7 +221,7 @@ def test_alpha_is_the_smaller_of_both():
     loose = claims._replace(alpha_joint=2.0)
     refuted(loose._replace(alpha=2.0), NETWORK, "alpha does not follow")
     refuted(loose, NETWORK, "alpha does not follow")
-    claims_hold(consistent(loose), NETWORK, BOX)
+    require_claims(consistent(loose), NETWORK, BOX)
 
 
 @pytest.mark.parametrize("vertex", range(3))
@@ -253,7 +253,7 @@ def test_a_witness_is_needed_for_every_vertex():
     for count in (0, 1, 2, 4):
         joint = (2 * claims.witnesses["joint"])[:count]
         with pytest.raises((Refuted, ValueError, IndexError)):
-            claims_hold(witness(claims, joint=joint), NETWORK, BOX)
+            require_claims(witness(claims, joint=joint), NETWORK, BOX)
 
 
 @pytest.mark.parametrize("name", ["residual", "position", "yaw", "decoder", "joint"])
@@ -291,14 +291,16 @@ def test_a_network_whose_last_layer_moved_is_another_one():
 
 def test_constants_must_be_of_the_parts_that_there_are():
     claims, parts = honest("joint"), honest("joint").lipschitz
-    told = "lipschitz must be of body, position, yaw, decoder, got "
+    message = "lipschitz must be of body, position, yaw, decoder, got "
     refuted(
         claims._replace(lipschitz=parts | {"height": 7.0}),
         NETWORK,
-        f"{told}body, position, yaw, decoder, height",
+        f"{message}body, position, yaw, decoder, height",
     )
     less = {name: value for name, value in parts.items() if name != "yaw"}
-    refuted(claims._replace(lipschitz=less), NETWORK, f"{told}body, position, decoder")
+    refuted(
+        claims._replace(lipschitz=less), NETWORK, f"{message}body, position, decoder"
+    )
 
 
 def test_what_all_environments_rests_on_is_part_of_the_claim():
@@ -333,8 +335,8 @@ def test_kappa_is_one_without_a_metric_and_proved_with_one():
 def test_a_metric_of_condition_one_is_one():
     weights = KINDS["metric"][0]._replace(operators=POLYTOPE)
     claims = _proofs.prove(weights, BOX, joint=False, metric=np.eye(3))
-    claims_hold(claims, weights, BOX)
-    claims_hold(consistent(claims._replace(kappa=1.5)), weights, BOX)
+    require_claims(claims, weights, BOX)
+    require_claims(consistent(claims._replace(kappa=1.5)), weights, BOX)
 
 
 def test_a_metric_holds_only_without_transport_and_without_a_joint_claim():
@@ -377,21 +379,21 @@ def test_a_box_that_is_none_is_refused(kind, box):
 
 
 def test_a_box_of_a_point_is_one_and_a_box_of_other_environments_is_none():
-    claims_hold(honest("joint"), NETWORK, [[0.1, 0.1], [0.1, 0.1]])
-    claims_hold(
+    require_claims(honest("joint"), NETWORK, [[0.1, 0.1], [0.1, 0.1]])
+    require_claims(
         honest("joint"), NETWORK, [[0.1], [0.2]]
     )  # the hull of vertices holds for any environment
     for box in ([[0.1], [0.2]], [[0.1] * 3, [0.2] * 3]):
-        told = f"env_box has {len(box[0])} entries, the operators take 2"
-        refuted(honest("hypernetwork"), KINDS["hypernetwork"][0], told, box)
+        message = f"env_box has {len(box[0])} entries, the operators take 2"
+        refuted(honest("hypernetwork"), KINDS["hypernetwork"][0], message, box)
 
 
 @pytest.mark.parametrize("kind", ["hypernetwork", "bare hypernetwork"])
 def test_the_joint_bound_of_a_box_can_be_claimed_to_the_last_bit(kind):
     weights, claims = KINDS[kind][0], honest(kind)
     multipliers = _claims._arrays(claims.witnesses["joint"])[0]
-    upper = _claims.joint_cover(weights, BOX, multipliers).upper
-    claims_hold(consistent(claims._replace(alpha_joint=upper)), weights, BOX)
+    upper = _claims.joint_bound_over_box(weights, BOX, multipliers).upper
+    require_claims(consistent(claims._replace(alpha_joint=upper)), weights, BOX)
     smaller = float(np.nextafter(upper, 0.0))
     refuted(
         consistent(claims._replace(alpha_joint=smaller)),

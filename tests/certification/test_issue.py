@@ -1,6 +1,4 @@
-"""The document beside the weights: what it states, proved and measured, and that a
-refusal says why.
-"""
+"""The certificate document of a policy, and the reasons of refusals."""
 
 import numpy as np
 import pytest

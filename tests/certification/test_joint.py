@@ -1,6 +1,4 @@
-"""The whole step as one map: exact cases, the hull of vertices, the semidefinite
-optimum, and mutants of the check.
-"""
+"""The joint bound: exact cases, hulls, the semidefinite optimum, and mutants."""
 
 import numpy as np
 import pytest
@@ -118,10 +116,10 @@ def test_proposals_from_gradients_match_the_semidefinite_optimum(seed):
 def test_witnesses_at_the_vertices_prove_the_bound_everywhere_in_their_hull():
     weights = random_network(1)
     vertices = [0.8 * rotation(seed) for seed in range(4)]
-    found = [propose_multipliers(weights, (), vertex) for vertex in vertices]
+    proposed = [propose_multipliers(weights, (), vertex) for vertex in vertices]
     bound = max(
         lipschitz_upper(weights, part, vertex)
-        for part, vertex in zip(found, vertices, strict=True)
+        for part, vertex in zip(proposed, vertices, strict=True)
     )
     for _ in range(50):
         shares = RANDOM.dirichlet(np.full(4, 0.5))
@@ -129,7 +127,7 @@ def test_witnesses_at_the_vertices_prove_the_bound_everywhere_in_their_hull():
             share * vertex for share, vertex in zip(shares, vertices, strict=True)
         )
         mixed = [
-            sum(share * part[k] for share, part in zip(shares, found, strict=True))
+            sum(share * part[k] for share, part in zip(shares, proposed, strict=True))
             for k in range(2)
         ]
         assert attack_slopes(weights, inside, starts=3) <= bound
@@ -148,7 +146,7 @@ def test_slopes_anywhere_in_the_hull_of_a_model_stay_below_its_joint_alpha(name)
     assert proved.alpha_joint <= proved.alpha_separate * (1 + 1e-6)
 
 
-# --- solvers that lie ------------------------------------------------------------------------------------------------
+# --- solvers that lie -----------------------------------------------------------------
 
 
 @pytest.mark.parametrize(
@@ -174,7 +172,7 @@ def test_what_a_solver_returns_never_makes_a_bound_smaller(garbage):
     assert lipschitz_upper(weights, proposed, linear) >= constant * (1 - 1e-12)
 
 
-# --- common Lyapunov matrices ----------------------------------------------------------------------------------------
+# --- common Lyapunov matrices ---------------------------------------------------------
 
 
 def skewed(seed=0, rate=0.8, condition=20.0):
@@ -216,9 +214,9 @@ def test_scaling_a_lyapunov_matrix_changes_nothing(scale):
 
 def test_the_solver_finds_a_lyapunov_matrix_that_the_core_accepts():
     operators, metric = skewed(condition=5.0)
-    found = solve_metric(operators, 0.85)
+    solution = solve_metric(operators, 0.85)
     assert check_metric(
-        found, operators, 0.85 * (1 + 1e-6), np.linalg.cond(metric) * 1.01
+        solution, operators, 0.85 * (1 + 1e-6), np.linalg.cond(metric) * 1.01
     )
 
 
@@ -227,11 +225,11 @@ def test_two_operators_that_are_stable_one_by_one_have_no_common_lyapunov_matrix
         np.asarray([[0.0, 2.0], [0.0, 0.0]]),
         np.asarray([[0.0, 0.0], [2.0, 0.0]]),
     ]
-    found = solve_metric(switched, 0.99)
-    assert found is None or not check_metric(found, switched, 1.0, 1e9)
+    solution = solve_metric(switched, 0.99)
+    assert solution is None or not check_metric(solution, switched, 1.0, 1e9)
 
 
-# --- mutants of the joint check --------------------------------------------------------------------------------------
+# --- mutants of the joint check -------------------------------------------------------
 
 
 def check_with(matrix_of, weights, multipliers, bound, linear):
@@ -274,12 +272,12 @@ def test_mutants_of_the_joint_check_accept_a_bound_that_is_false(mutant):
     """
     fooled = []
     for weights, linear, known in JOINT.values():
-        false, found = (
+        false, start = (
             0.98 * exact(weights, linear, known),
             propose_multipliers(weights, (), linear),
         )
         for scale in np.geomspace(0.01, 100, 60):
-            proposed = [scale * part for part in found]
+            proposed = [scale * part for part in start]
             assert not check_witness(weights, proposed, false, linear)
             fooled.append(check_with(MUTANTS[mutant], weights, proposed, false, linear))
     assert any(fooled)

@@ -1,6 +1,4 @@
-"""Lipschitz bounds on networks whose constant is known exactly, and mutants of the
-certifier that these must catch.
-"""
+"""Lipschitz bounds of networks with known constants, and faulty certifiers."""
 
 import numpy as np
 import pytest
@@ -150,7 +148,7 @@ def test_the_multipliers_that_a_sandwich_carries_prove_its_own_bound(scale):
         assert not check_witness(weights.residual, halved, claimed * (1 + 1e-6))
 
 
-# --- mutants: certifiers with a known fault, each of which a soundness check must catch -----------------------------
+# --- mutants: certifiers with a known fault, each of which a soundness check must catch 
 
 
 def power_iteration(matrix, steps=5):
@@ -257,11 +255,11 @@ def random_pairs(weights, count):
     best = 0.0
     for _ in range(count):
         pair = random.standard_normal((2, weights[0].shape[1]))
-        apart, values = np.linalg.norm(pair[0] - pair[1]), pair
+        distance, values = np.linalg.norm(pair[0] - pair[1]), pair
         for matrix in weights[:-1]:
             values = np.tanh(values @ matrix.T)
         best = max(
-            best, np.linalg.norm((values[0] - values[1]) @ weights[-1].T) / apart
+            best, np.linalg.norm((values[0] - values[1]) @ weights[-1].T) / distance
         )
     return best
 

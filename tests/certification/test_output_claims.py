@@ -1,6 +1,7 @@
-"""Metrics of single outputs for networks small enough for numpy alone: what is proved holds, forgeries are refused.
+"""Metrics of outputs of tiny networks: honest ones hold, forged ones are refused.
 
-`benchmarks/mutants.py` runs these against each change of `_output_metrics`.
+`benchmarks/robustness/mutants.py` runs these tests against mutants of
+`_output_metrics`.
 """
 
 import json
@@ -44,10 +45,10 @@ def require(name, claim, weights=WEIGHTS):
     getattr(check, "__wrapped__", check)(name, claim, weights)
 
 
-def refuted(name, claim, told, weights=WEIGHTS):
+def refuted(name, claim, message, weights=WEIGHTS):
     with pytest.raises(Refuted) as reason:
         require(name, claim, weights)
-    assert str(reason.value).startswith(f"outputs.{name}{told}")
+    assert str(reason.value).startswith(f"outputs.{name}{message}")
 
 
 @every_output
@@ -91,7 +92,7 @@ def test_what_is_no_bound_is_none(name, constant, value):
     refuted(
         name,
         HONEST[name]._replace(**{constant: value}),
-        f".{constant} is no bound: {value!r}",
+        f".{constant} is not a bound: {value!r}",
     )
 
 
@@ -170,15 +171,15 @@ def test_what_may_have_a_metric_is_a_polytope_without_transport_and_decoder():
 
 def test_what_is_read_is_bounded_with_its_rounding(monkeypatch):
     """b² P − C'C to the bit of its symmetry, and every term of what it loses."""
-    asked = []
+    calls = []
     monkeypatch.setattr(
         _output_metrics,
         "is_positive_definite",
-        lambda *given: bool(asked.append(given)) or True,
+        lambda *given: bool(calls.append(given)) or True,
     )
     rows, metric, bound = rotation(3, 4)[:2] / 3, ROOT @ ROOT, 0.7
     assert _output_metrics.reads_within(rows, bound, metric)
-    ((matrix, error),) = asked
+    ((matrix, error),) = calls
     np.testing.assert_allclose(
         matrix, 0.49 * metric - rows.T @ rows, rtol=1e-14, atol=1e-15
     )

@@ -1,8 +1,6 @@
-"""Metrics of single outputs and the radii that follow from them, for the weights of a
-model as it runs.
-"""
+"""Metrics of single outputs of a trained model, and the radii from them."""
 
-from functools import cache
+from functools import cache, partial
 
 import jax
 import jax.numpy as jnp
@@ -23,6 +21,7 @@ from sfkd_jax.certification._claims import Refuted, readouts
 from sfkd_jax.certification._exported import exported
 from sfkd_jax.certification._metric_search import propose_metric
 from sfkd_jax.certification._radii import Residuals, worst_gaps
+from sfkd_jax.core.folding import fold
 from sfkd_jax.core.rollouts import rollout
 from sfkd_jax.types import Trajectory
 
@@ -78,15 +77,15 @@ def drives(count=6, steps=40, seed=2):
 
 
 @cache
-def found():
-    return residuals(model(), jax.jit(model().fold)(params()), drives())
+def measured():
+    return residuals(model(), jax.jit(partial(fold, model()))(params()), drives())
 
 
 @cache
 def proposed(name="position"):
     start = weights().residual_multipliers
     return propose_metric(
-        weights(), readouts(weights())[name], worst_gaps(found(), 5), start
+        weights(), readouts(weights())[name], worst_gaps(measured(), 5), start
     )
 
 
@@ -111,7 +110,7 @@ def test_what_is_proposed_is_proved_and_survives_json(name):
 
 def test_the_tube_of_an_output_is_tighter_than_by_the_norm():
     claim, rank = proposed(), weights().readout.shape[1]
-    rate = float(model().rate(params()))
+    rate = float(model().structure.rate(params()))
     plain = OutputMetric(
         rate,
         float(np.linalg.norm(readouts(weights())["position"], 2)),
@@ -119,7 +118,7 @@ def test_the_tube_of_an_output_is_tighter_than_by_the_norm():
         [],
     )
     sizes = [
-        np.max(radii(found(), "position", each).for_ever) for each in (claim, plain)
+        np.max(radii(measured(), "position", each).for_ever) for each in (claim, plain)
     ]
     assert sizes[0] < 0.95 * sizes[1]
 
@@ -128,12 +127,12 @@ def test_no_pair_of_latents_contradicts_the_metric():
     """The running step, float32, at scales from 1e-2 to 1e2 and where the residual is
     steepest.
     """
-    claim, folded = proposed(), jax.jit(model().fold)(params())
+    claim, folded = proposed(), jax.jit(partial(fold, model()))(params())
     factor = np.linalg.cholesky(claim.metric)
 
     @jax.jit
     @jax.vmap
-    def apart(z, direction, control, env):
+    def distance(z, direction, control, env):
         fiber = model().fiber(folded, env)
         latent = model().encode(fiber, drives().states[0, 0])
         moved = [
@@ -154,7 +153,7 @@ def test_no_pair_of_latents_contradicts_the_metric():
     ]
     envs = random.uniform(ENV_LOW, ENV_HIGH, (count, 2))
     after = np.asarray(
-        apart(*map(jnp.float32, (z, direction, controls, envs))), dtype=np.float64
+        distance(*map(jnp.float32, (z, direction, controls, envs))), dtype=np.float64
     )
     ratios = np.linalg.norm(after @ factor, axis=1) / np.linalg.norm(
         direction @ factor, axis=1
@@ -230,16 +229,16 @@ def test_every_distance_to_a_copy_lies_within_the_radius_of_its_drive():
     """For any inputs, the copy started where the car is or beside it; each form bounds
     the next.
     """
-    folded = jax.jit(model().fold)(params())
+    folded = jax.jit(partial(fold, model()))(params())
     predicted = jax.vmap(lambda drive: rollout(model(), folded, drive)[0])(drives())
     for index, name in enumerate(OUTPUTS):
         distance = np.abs(np.asarray(predicted - drives().states[:, 1:]))[
             ..., 3 + index
         ].max(axis=1)
-        bounds = radii(found(), name, proposed(name))
+        bounds = radii(measured(), name, proposed(name))
         assert np.all(distance <= bounds.followed * (1 + 1e-4))
         assert np.all(bounds.followed <= bounds.for_ever * (1 + 1e-12))
-        beside = radii(found(), name, proposed(name), np.full(len(distance), 0.3))
+        beside = radii(measured(), name, proposed(name), np.full(len(distance), 0.3))
         assert np.all(beside.followed >= bounds.followed)
         assert np.all(beside.for_ever >= bounds.for_ever)
 

@@ -1,6 +1,4 @@
-"""What docs/paper-errata.md says is wrong with the paper, each as a computation; the
-last test binds the two.
-"""
+"""The errata in docs/paper-errata.md as computations; the last test compares both."""
 
 import re
 from pathlib import Path
@@ -29,7 +27,7 @@ def norm_in_p(matrix, root=ROOT):
 
 
 def printed_condition(matrix, p, alpha):
-    """A'PA - P <= -(1 - alpha^2) I, strictly; it is all that thm:ISS asks of P."""
+    """A'PA - P <= -(1 - alpha^2) I, strictly; thm:ISS needs no more of P."""
     gap = p - matrix.T @ p @ matrix - (1 - alpha**2) * np.eye(len(p))
     return is_positive_definite(0.5 * (gap + gap.T))
 

@@ -1,6 +1,4 @@
-"""What must not be certified is not, and the reason is named; what is declared falsely
-is contradicted by an attack.
-"""
+"""Models that must not be certified are refused, with the reason."""
 
 import dataclasses
 
@@ -27,10 +25,10 @@ BOX = (ENV_LOW, ENV_HIGH)
 
 
 def declaring(model, **changes):
-    """The same model, which says something else about itself."""
+    """The same model with another declaration."""
 
     def explicit(params):
-        found = model.explicit(params)
+        weights = model.structure.explicit(params)
         declared = {
             name: value
             for name, value in changes.items()
@@ -39,11 +37,11 @@ def declaring(model, **changes):
         others = {
             name: value for name, value in changes.items() if name not in declared
         }
-        return found._replace(
-            declared=dataclasses.replace(found.declared, **declared), **others
+        return weights._replace(
+            declared=dataclasses.replace(weights.declared, **declared), **others
         )
 
-    return model._replace(explicit=explicit)
+    return model._replace(structure=model.structure._replace(explicit=explicit))
 
 
 @pytest.mark.parametrize("activation", ["gelu", "silu", "leaky gelu", "sin", ""])
@@ -129,7 +127,7 @@ def test_operators_by_power_iteration_are_refused_or_counted_as_long_as_they_are
     it from the weights.
     """
     model, params = model_and_params("sfkd")
-    longer = Polytope(1.15 * model.explicit(params).operators.vertices)
+    longer = Polytope(1.15 * model.structure.explicit(params).operators.vertices)
     with pytest.raises(CertificationRefused, match="is not below 1"):
         certify(declaring(model, operators=longer), params, BOX, attack_starts=0)
 
@@ -231,7 +229,7 @@ def test_a_box_that_is_none_is_an_error(box):
         certify(*model_and_params("sfkd"), box)
 
 
-# --- attacks ---------------------------------------------------------------------------------------------------------
+# --- attacks --------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("name", ["sfkd", "segment"])
@@ -247,28 +245,30 @@ def test_the_attack_reaches_the_factor_of_a_linear_map():
 
 
 def test_the_served_transport_is_an_isometry():
-    found = attack_transport(*model_and_params("sfkd"), BOX, jax.random.key(0))
-    assert found == pytest.approx(1.0, abs=1e-6)
+    reached = attack_transport(*model_and_params("sfkd"), BOX, jax.random.key(0))
+    assert reached == pytest.approx(1.0, abs=1e-6)
 
 
 @hypothesis.settings(max_examples=40, deadline=None, derandomize=True)
 @hypothesis.given(
-    seed=st.integers(0, 2**31 - 1), scale=st.floats(-2, 2), apart=st.floats(-4, 1)
+    seed=st.integers(0, 2**31 - 1), scale=st.floats(-2, 2), distance=st.floats(-4, 1)
 )
-def test_no_pair_of_latents_ever_moves_apart_faster_than_certified(seed, scale, apart):
-    before, after, nearby = _pairs(seed, 10.0**scale, 10.0**apart)
+def test_no_pair_of_latents_ever_moves_apart_faster_than_certified(
+    seed, scale, distance
+):
+    before, after, nearby = _pairs(seed, 10.0**scale, 10.0**distance)
     start = np.linalg.norm(np.asarray(before) - np.asarray(nearby), axis=1)
     rounding = 2e-6 * (1 + np.abs(np.asarray(before)).max())
     assert np.all(after <= certified("sfkd").alpha * start + rounding)
 
 
-def _pairs(seed, scale, apart):
+def _pairs(seed, scale, distance):
     """32 pairs of latents under shared controls and environments, and their distances
     after step and transport.
     """
     random = np.random.default_rng(seed)
     z = scale * random.standard_normal((32, 8))
-    other = z + apart * random.standard_normal((32, 8))
+    other = z + distance * random.standard_normal((32, 8))
     controls = 10.0 ** random.uniform(-1, 2) * random.standard_normal((32, 2))
     envs = random.uniform(ENV_LOW, ENV_HIGH, (2, 32, 2))
     args = [np.asarray(part, dtype=np.float32) for part in (z, other, controls, *envs)]

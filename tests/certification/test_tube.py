@@ -1,6 +1,4 @@
-"""Tubes that follow from α and d̄: the formula, the paper's erratum, and zero
-violations in simulation.
-"""
+"""Tubes from α and d̄: the formula, the paper's erratum, and simulations."""
 
 import jax
 import jax.numpy as jnp
@@ -76,8 +74,8 @@ def scaled_to_the_limit(params):
 @pytest.mark.parametrize("aligned", [False, True])
 @pytest.mark.parametrize("limit", [False, True])
 def test_with_bounded_disturbances_the_tube_is_violated_exactly_never(aligned, limit):
-    """Latents under the same u, switching e and transport; one of them is pushed by |d|
-    ≤ d̄ at every step.
+    """Latents under the same u, switching e and transport; one of them is disturbed
+    by |d| ≤ d̄ at every step.
     """
     model, params = model_and_params("sfkd")
     params = scaled_to_the_limit(params) if limit else params
@@ -156,7 +154,7 @@ def test_free_running_predictions_stay_inside_the_physical_tube(name):
     model, params = model_and_params(name)
     data = driven(24)
     proved = certified(name)
-    found = dict(
+    residuals = dict(
         zip(
             ("latent", "position", "yaw", "body"),
             disturbances(model, params, data).scores.T,
@@ -173,10 +171,10 @@ def test_free_running_predictions_stay_inside_the_physical_tube(name):
     moves = np.linalg.norm(np.diff(np.asarray(data.states)[..., :2], axis=1), axis=-1)
     for k in range(len(predicted)):
         tube = physical_tube(
-            latent_tube(proved.alpha, found["latent"][k], 12),
+            latent_tube(proved.alpha, residuals["latent"][k], 12),
             alpha=proved.alpha,
             lipschitz=proved.lipschitz,
-            residual={kind: found[kind][k] for kind in ("position", "yaw", "body")},
+            residual={kind: residuals[kind][k] for kind in ("position", "yaw", "body")},
             largest_increment=float(moves[k].max()),
         )
         for radii, error in zip(

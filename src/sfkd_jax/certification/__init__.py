@@ -1,4 +1,4 @@
-"""The notary: what is claimed for all states, controls and environments, and what is only measured."""
+"""Certificates: bounds proved for all inputs, and measured disturbance bounds."""
 
 from sfkd_jax.certification._attack import attack_decoder as attack_decoder
 from sfkd_jax.certification._attack import attack_slopes as attack_slopes
@@ -11,9 +11,9 @@ from sfkd_jax.certification._calibration import Disturbance as Disturbance
 from sfkd_jax.certification._calibration import clopper_pearson as clopper_pearson
 from sfkd_jax.certification._calibration import conformal_bounds as conformal_bounds
 from sfkd_jax.certification._calibration import coverage as coverage
+from sfkd_jax.certification._calibration import coverage_interval as coverage_interval
 from sfkd_jax.certification._calibration import disturbances as disturbances
-from sfkd_jax.certification._calibration import even_units as even_units
-from sfkd_jax.certification._calibration import interval as interval
+from sfkd_jax.certification._calibration import monitor_units as monitor_units
 from sfkd_jax.certification._calibration import tube_units as tube_units
 from sfkd_jax.certification._certificate import MODES as MODES
 from sfkd_jax.certification._certificate import Certificate as Certificate
@@ -27,11 +27,15 @@ from sfkd_jax.certification._core import check_witness as check_witness
 from sfkd_jax.certification._core import is_positive_definite as is_positive_definite
 from sfkd_jax.certification._core import norm_upper as norm_upper
 from sfkd_jax.certification._corridor_claims import DriveScores as DriveScores
-from sfkd_jax.certification._corridor_claims import calibrate as calibrate
-from sfkd_jax.certification._corridor_claims import covered as covered
+from sfkd_jax.certification._corridor_claims import (
+    calibrate_corridor as calibrate_corridor,
+)
+from sfkd_jax.certification._corridor_claims import (
+    corridor_coverage as corridor_coverage,
+)
 from sfkd_jax.certification._corridor_claims import drive_scores as drive_scores
 from sfkd_jax.certification._document import verify_document as verify_document
-from sfkd_jax.certification._environments import cover as cover
+from sfkd_jax.certification._environments import bound_over_box as bound_over_box
 from sfkd_jax.certification._exported import (
     CertificationRefused as CertificationRefused,
 )
@@ -45,13 +49,15 @@ from sfkd_jax.certification._incremental import (
     certify_incremental as certify_incremental,
 )
 from sfkd_jax.certification._incremental import check_incremental as check_incremental
-from sfkd_jax.certification._incremental import claims_a_rate as claims_a_rate
 from sfkd_jax.certification._incremental import incremental_rate as incremental_rate
+from sfkd_jax.certification._incremental import is_incremental as is_incremental
+from sfkd_jax.certification._issue import contraction_metrics as contraction_metrics
 from sfkd_jax.certification._issue import issue as issue
-from sfkd_jax.certification._issue import progress as progress
 from sfkd_jax.certification._output_metrics import OUTPUTS as OUTPUTS
 from sfkd_jax.certification._output_metrics import OutputMetric as OutputMetric
-from sfkd_jax.certification._output_tubes import claims_of as claims_of
+from sfkd_jax.certification._output_tubes import (
+    output_metrics_from as output_metrics_from,
+)
 from sfkd_jax.certification._proposals import lipschitz_upper as lipschitz_upper
 from sfkd_jax.certification._proposals import propose_multipliers as propose_multipliers
 from sfkd_jax.certification._radii import radii as radii

@@ -1,4 +1,4 @@
-"""Attacks: they search for the largest contraction factor that a map really has, a lower bound for any certificate."""
+"""Attacks: searches for the largest slope of a map, a lower bound on any proof."""
 
 from __future__ import annotations
 
@@ -23,17 +23,17 @@ def attack_slopes(
     starts: int = 24,
     seed: int = 0,
 ) -> float:
-    """Largest ||A + W_L D_{L-1} W_{L-1} … D_1 W_1||_2 found over slopes D_k in [0, 1].
+    """Maximise ||A + W_L D_{L-1} W_{L-1} … D_1 W_1||_2 over slopes D_k in [0, 1].
 
-    The norm is convex in each D_k, so its maximum is at 0 or 1: with the top singular
-    pair fixed, each layer's slopes are chosen by the sign of their effect, in turn,
-    until nothing grows.
+    The norm is convex in each D_k, so the maximum is at slopes 0 or 1. With the top
+    singular pair fixed, the slopes of one layer after another are set by the sign of
+    their effect, until the norm stops growing.
 
     Args:
-        weights: W_1 … W_L, or nothing.
+        weights: W_1 … W_L, or an empty list.
         linear: A.
-        starts: random beginnings, the first all ones.
-        seed: of these.
+        starts: number of starting points; the first has all slopes 1.
+        seed: of the random starting points.
     """
     random, best = np.random.default_rng(seed), 0.0
     if not weights:
@@ -70,19 +70,19 @@ def attack_step(
     starts: int = 12,
     iterations: int = 120,
 ) -> float:
-    """Largest ||∂(T(e → e') F(z, u, e))/∂z||_2 of the model as it runs in float32, by ascent over z, u, e, e'.
+    """Maximise ||∂(T(e → e') F(z, u, e))/∂z||_2 of the float32 model by ascent.
 
-    F is `model.step` followed by `model.transport`. e and e' stay in the box; z and u
-    are free, as the certificate claims. The ascent follows |J v|²/|v|² over the
-    direction v as well; the value returned is the full norm.
+    F is `model.step`, T is `model.transport`. e and e' stay in the box; z and u are
+    free, as in the certificate. The ascent maximises |J v|²/|v|² over z, u, e, e' and
+    the direction v; the value returned is the 2-norm of J.
 
     Args:
-        model: with `explicit`.
+        model: a model with `explicit`.
         params: its weights.
         box: lower and upper corner of E.
-        key: for the beginnings.
-        starts: how many.
-        iterations: of L-BFGS-B, each.
+        key: for the starting points.
+        starts: number of starting points.
+        iterations: L-BFGS-B iterations from each of them.
     """
     inject, *_ = _coordinates(model, params, len(box[0]))
 
@@ -92,10 +92,9 @@ def attack_step(
             model.transport(fiber, fiber_next, model.step(fiber, inject(z), control))
         )
 
-    found = _steepest(
-        step, model, params, box, key, starts=starts, iterations=iterations
-    )
-    return max(float(np.linalg.norm(jacobian, 2)) for jacobian in found)
+    options = {"starts": starts, "iterations": iterations}
+    jacobians = _steepest(step, model, params, box, key, **options)
+    return max(float(np.linalg.norm(jacobian, 2)) for jacobian in jacobians)
 
 
 def attack_decoder(
@@ -107,44 +106,47 @@ def attack_decoder(
     starts: int = 12,
     iterations: int = 60,
 ) -> dict[str, float]:
-    """Largest ||∂/∂z|| of what the model emits as it runs: "position" [m], "yaw" [rad], "decoder" (both), "body".
+    """Maximise ||∂/∂z||_2 of each output of the float32 model, as `attack_step`.
 
-    The pose increment is that of a step and, where the pose lies in the latent, that of
-    reading it; see `attack_step`.
+    Outputs are the pose increment of a step and, if the pose is part of the latent, of
+    decoding: "position" [m], "yaw" [rad] and "decoder" (both); and the body state,
+    "body".
+
+    Args:
+        model: a model with `explicit`.
+        params: its weights.
+        box: lower and upper corner of E.
+        key: for the starting points.
+        starts: number of starting points.
+        iterations: L-BFGS-B iterations from each of them.
     """
     inject, *_ = _coordinates(model, params, len(box[0]))
 
-    def emitted(params: Params, z: Any, control: Any, env: Any, later: Any) -> Any:
+    def outputs(params: Params, z: Any, control: Any, env: Any, later: Any) -> Any:
         del later
-        fiber, latent = (
-            model.fiber(params, env),
-            inject(z),
-        )  # at the origin, so that an increment is a pose
-        after, read = (
-            model.decode(fiber, model.step(fiber, latent, control)),
-            model.decode(fiber, latent),
-        )
-        return jnp.concatenate([after[POSE], read])
+        fiber = model.fiber(params, env)
+        latent = inject(z)  # at the origin, so that an increment is a pose
+        after = model.decode(fiber, model.step(fiber, latent, control))
+        return jnp.concatenate([after[POSE], model.decode(fiber, latent)])
 
-    found = _steepest(
-        emitted, model, params, box, key, starts=starts, iterations=iterations
-    )
-    if (
-        model.along_path
-    ):  # the pose is read from z with the body state: e_y, e_ψ, then the rest
+    options = {"starts": starts, "iterations": iterations}
+    jacobians = _steepest(outputs, model, params, box, key, **options)
+    if model.along_path:  # decoded from z: e_y, e_ψ, then the vehicle's own state
         parts = {"position": slice(6, 7), "yaw": slice(7, 8), "body": slice(8, None)}
-        return {
-            name: max(float(np.linalg.norm(part[row], 2)) for part in found)
-            for name, row in parts.items()
-        }
-    rows = {"position": slice(0, 2), "yaw": slice(2, 3), "decoder": slice(0, 3)}
-    poses = [part for jacobian in found for part in (jacobian[:3], jacobian[3:6])]
-    steepest = {
-        name: max(float(np.linalg.norm(part[row], 2)) for part in poses)
-        for name, row in rows.items()
-    }
-    return steepest | {
-        "body": max(float(np.linalg.norm(jacobian[6:], 2)) for jacobian in found)
+        return _largest_norms(jacobians, parts)
+    poses = [part for jacobian in jacobians for part in (jacobian[:3], jacobian[3:6])]
+    parts = {"position": slice(0, 2), "yaw": slice(2, 3), "decoder": slice(0, 3)}
+    body = _largest_norms(jacobians, {"body": slice(6, None)})
+    return _largest_norms(poses, parts) | body
+
+
+def _largest_norms(
+    jacobians: Sequence[Matrix], parts: dict[str, slice]
+) -> dict[str, float]:
+    """Largest 2-norm of some rows, by name of these rows."""
+    return {
+        name: max(float(np.linalg.norm(jacobian[rows], 2)) for jacobian in jacobians)
+        for name, rows in parts.items()
     }
 
 
@@ -158,7 +160,7 @@ def _steepest(
     starts: int,
     iterations: int,
 ) -> list[Matrix]:
-    """Jacobians by z of `function(params, z, u, e, e')`, each where an ascent over all four ended."""
+    """∂/∂z of `function(params, z, u, e, e')` at the end of each ascent."""
     _, rank, controls = _coordinates(model, params, len(box[0]))
     low, high = (np.asarray(side, dtype=np.float64) for side in box)
     inputs = rank + controls + 2 * len(low)
@@ -182,42 +184,37 @@ def _steepest(
     )
     limits = [(None, None)] * (inputs + rank)
     limits[envs] = 2 * list(zip(low, high, strict=True))
-    found = []
+    search = {
+        "method": "L-BFGS-B",
+        "jac": True,
+        "bounds": limits,
+        "options": {"maxiter": iterations},
+    }
+    jacobians = []
     for number, start_key in enumerate(jax.random.split(key, starts)):
-        start = np.asarray(
-            jax.random.normal(start_key, (inputs + rank,)), dtype=np.float64
-        )
-        start[: rank + controls] *= 10.0 ** (
-            number % 4 - 2
-        )  # small latents see steep slopes, large saturated ones
-        start[envs] = np.tile(low, 2) + (
-            np.arctan(start[envs]) / np.pi + 0.5
-        ) * np.tile(high - low, 2)
-        search = {
-            "method": "L-BFGS-B",
-            "jac": True,
-            "bounds": limits,
-            "options": {"maxiter": iterations},
-        }
-        ended = minimize(_float64(partial(objective, params)), start, **search)
-        found.append(
-            np.asarray(
-                jacobian(params, jnp.asarray(ended.x, jnp.float32)), dtype=np.float64
-            )
-        )
-    return found
+        draw = jax.random.normal(start_key, (inputs + rank,))
+        start = np.asarray(draw, dtype=np.float64)
+        # slopes are steep at small latents and saturated at large ones
+        start[: rank + controls] *= 10.0 ** (number % 4 - 2)
+        share = np.arctan(start[envs]) / np.pi + 0.5
+        start[envs] = np.tile(low, 2) + share * np.tile(high - low, 2)
+        solution = minimize(_float64(partial(objective, params)), start, **search)
+        steepest = jacobian(params, jnp.asarray(solution.x, jnp.float32))
+        jacobians.append(np.asarray(steepest, dtype=np.float64))
+    return jacobians
 
 
 def attack_transport(
     model: Model, params: Params, box: Box, key: Key, *, samples: int = 256
 ) -> float:
-    """Largest ||∂T(e → e') z/∂z||_2 at random pairs of environments in the box; T is linear in z.
+    """Largest ||∂T(e → e') z/∂z||_2 over random pairs (e, e'); T is linear in z.
 
     Args:
-        model, params: as in `attack_step`.
-        box: of E.
+        model: a model with `explicit`.
+        params: its weights.
+        box: lower and upper corner of E.
         key: for the pairs.
-        samples: how many.
+        samples: number of pairs.
     """
     inject, rank, _ = _coordinates(model, params, len(box[0]))
     low, high = (jnp.asarray(side, dtype=jnp.float32) for side in box)
@@ -229,14 +226,13 @@ def attack_transport(
             lambda z: model.vector(model.transport(before, after, inject(z)))
         )(jnp.zeros(rank))
 
-    found = np.asarray(
-        jax.jit(jax.vmap(matrix, in_axes=(None, 0)))(params, draws), dtype=np.float64
-    )
-    return float(np.max(np.linalg.norm(found, 2, axis=(1, 2))))
+    matrices = jax.jit(jax.vmap(matrix, in_axes=(None, 0)))(params, draws)
+    norms = np.linalg.norm(np.asarray(matrices, dtype=np.float64), 2, axis=(1, 2))
+    return float(np.max(norms))
 
 
 def _chain(weights: Sequence[Matrix], slopes: Sequence[Vector]) -> Matrix:
-    """W_L D_{L-1} … D_1 W_1."""
+    """Return W_L D_{L-1} … D_1 W_1."""
     chained = np.asarray(weights[0])
     for slope, weight in zip(slopes, weights[1:], strict=True):
         chained = weight @ (slope[:, None] * chained)
@@ -246,7 +242,7 @@ def _chain(weights: Sequence[Matrix], slopes: Sequence[Vector]) -> Matrix:
 def _best_layer(
     weights: Sequence[Matrix], slopes: Sequence[Vector], base: Matrix, layer: int
 ) -> Vector:
-    """The slopes of one layer that raise u'(A + …)v most, (u, v) the top singular pair now."""
+    """Slopes of one layer that maximise u'(A + …)v for the current top pair (u, v)."""
     left, _, right = np.linalg.svd(base + _chain(weights, slopes))
     before = _chain(weights[: layer + 1], slopes[:layer]) @ right[0]
     after = left[:, 0] @ _chain(
@@ -259,14 +255,17 @@ def _best_layer(
 def _coordinates(
     model: Model, params: Params, entries: int
 ) -> tuple[Callable[[Any], Any], int, int]:
-    """z -> a latent that holds it (`vector` picks z out, its transpose puts z back), and the sizes of z and u.
+    """Return the map from z to a latent, the size of z and that of u.
+
+    `model.vector` reads z from a latent; its transpose writes z into one.
 
     Args:
-        model, params: of a claim.
-        entries: of e.
+        model: a model with `explicit`.
+        params: its weights.
+        entries: size of e.
     """
-    assert model.explicit is not None
-    weights = jax.eval_shape(model.explicit, params)
+    assert model.structure.explicit is not None
+    weights = jax.eval_shape(model.structure.explicit, params)
     state = jax.ShapeDtypeStruct((3 + weights.readout.shape[0],), jnp.float32)
     env = jax.ShapeDtypeStruct((entries,), jnp.float32)
     shapes = jax.eval_shape(
@@ -284,7 +283,7 @@ def _coordinates(
 def _float64(
     objective: Callable[[Any], tuple[Any, Any]],
 ) -> Callable[[Vector], tuple[float, Vector]]:
-    """A jitted float32 objective as scipy calls it."""
+    """Wrap a jitted float32 objective for scipy."""
 
     def call(flat: Vector) -> tuple[float, Vector]:
         value, gradient = objective(jnp.asarray(flat, jnp.float32))

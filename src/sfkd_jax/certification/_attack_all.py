@@ -1,7 +1,8 @@
-"""Every attack beside a proof, and what each may reach at most."""
+"""All attacks on a certificate, and the bound that each of them tests."""
 
 from __future__ import annotations
 
+from functools import partial
 from typing import Any
 
 import jax
@@ -14,16 +15,18 @@ from sfkd_jax.certification._attack import (
 )
 from sfkd_jax.certification._claims import Claims, decoders
 from sfkd_jax.certification._exported import CertificationRefused, Exported, one_thread
+from sfkd_jax.core.folding import fold
 from sfkd_jax.types import Model, Params, Polytope
 
 FLOAT32 = 1e-5
-"""An attack runs on the model in float32; a bound is contradicted when it is exceeded
-by more than this, relatively.
-"""
+"""Relative excess over a bound that float32 rounding of the attacked model explains."""
 
 
 class CertificateContradicted(CertificationRefused):
-    """An attack exceeds a proved bound: a fault in this code or in what the model says about itself, never data."""
+    """An attack exceeds a proved bound, which is a fault of the code, never of data.
+
+    Either this package is wrong or what the model declares about itself.
+    """
 
 
 def attack_all(
@@ -35,39 +38,45 @@ def attack_all(
     starts: int,
     seed: int,
 ) -> dict[str, float]:
-    """Lower bounds by name, none of which may exceed what was proved."""
-    limits, found = limits_of(claims, weights), {}
+    """Run all attacks and return the lower bounds that they reach, by name.
+
+    Raises:
+        CertificateContradicted: a lower bound exceeds the proved bound.
+    """
+    limits, reached = limits_of(claims, weights), {}
+    networks = {"residual": weights.residual, **decoders(weights)}
     with one_thread():
-        for name, network in {
-            "residual": weights.residual,
-            **decoders(weights),
-        }.items():
+        for name, network in networks.items():
             if network:
-                found[f"{name}_slopes"] = attack_slopes(network, seed=seed)
+                reached[f"{name}_slopes"] = attack_slopes(network, seed=seed)
         if "step_slopes" in limits:
             slopes = [
                 attack_slopes(weights.residual, vertex, starts=8)
                 for vertex in weights.operators.vertices
             ]
-            found["step_slopes"] = max(slopes)
+            reached["step_slopes"] = max(slopes)
     if starts:
         step_key, transport_key, decoder_key = jax.random.split(jax.random.key(seed), 3)
-        driving = jax.jit(model.fold)(params)
-        found["transport"] = attack_transport(model, driving, box, transport_key)
-        emitted = attack_decoder(model, driving, box, decoder_key, starts=starts)
-        found |= {name: value for name, value in emitted.items() if name in limits}
+        folded = jax.jit(partial(fold, model))(params)
+        reached["transport"] = attack_transport(model, folded, box, transport_key)
+        outputs = attack_decoder(model, folded, box, decoder_key, starts=starts)
+        reached |= {name: value for name, value in outputs.items() if name in limits}
         if claims.kappa == 1.0:
-            found["step"] = attack_step(model, driving, box, step_key, starts=starts)
-    for name, value in found.items():
+            reached["step"] = attack_step(model, folded, box, step_key, starts=starts)
+    for name, value in reached.items():
         if not value <= limits[name] * (1 + FLOAT32):
             raise CertificateContradicted(
-                f"INTERNAL ERROR: the attack on the {name} reaches {value:.6f}, above the bound {limits[name]:.6f}"
+                f"INTERNAL ERROR: the attack on the {name} reaches {value:.6f}, "
+                f"above the bound {limits[name]:.6f}"
             )
-    return found
+    return reached
 
 
 def limits_of(claims: Claims, weights: Exported) -> dict[str, float]:
-    """What an attack may reach at most, by its name; in another metric than I the step is not attacked."""
+    """Return the proved bound behind each attack, by name of the attack.
+
+    The step is attacked in the 2-norm only.
+    """
     limits = {"residual_slopes": claims.beta, "transport": 1.0, **claims.lipschitz}
     limits |= {f"{name}_slopes": claims.lipschitz[name] for name in decoders(weights)}
     if claims.kappa == 1.0:

@@ -1,4 +1,4 @@
-"""What is measured, not proved: one-step disturbances on trajectories that no weight has seen."""
+"""Measured one-step disturbances and their split-conformal bounds."""
 
 from __future__ import annotations
 
@@ -17,10 +17,11 @@ from sfkd_jax.types import Model, Params, Trajectory
 
 
 class Disturbance(NamedTuple):
-    """Per trajectory, the largest one-step disturbance of each kind, (trajectory, kind).
+    """Largest one-step disturbances of trajectories.
 
-    Kinds: latent |d_k|, position of the pose increment [m], its yaw [rad], body state
-    (2-norm in its own units).
+    Attributes:
+        scores: by trajectory and kind: latent |d_k|, position of the pose increment
+            [m], its yaw [rad], body state (2-norm in its own units).
     """
 
     scores: Float[np.ndarray, "trajectory 4"]
@@ -28,13 +29,16 @@ class Disturbance(NamedTuple):
 
 KINDS = ("latent", "position", "yaw", "body")
 ROUNDING = 1e-9
-"""Far above what share times count loses to rounding."""
+"""Far above the rounding error of a share times a count."""
 CHUNK = 50
-"""Trajectories in one batch."""
+"""Trajectories in a batch."""
 
 
 def disturbances(model: Model, params: Params, trajectories: Trajectory) -> Disturbance:
-    """One-step residuals from true states, transport defect and switch steps included; maximum over each trajectory."""
+    """Return the largest one-step disturbances of each trajectory.
+
+    Every step starts at the true state. Transport defects and switches of e count.
+    """
     count = trajectories.controls.shape[0]
     filled = jax.tree.map(
         lambda leaf: leaf[jnp.arange(-(-count // CHUNK) * CHUNK) % count], trajectories
@@ -53,7 +57,7 @@ def disturbances(model: Model, params: Params, trajectories: Trajectory) -> Dist
 def _largest(
     model: Model, params: Params, trajectories: Trajectory
 ) -> Float[Array, "trajectory 4"]:
-    """The same for a batch of one fixed size, so that splits of any length share a compilation."""
+    """`disturbances` of one batch of fixed size, so that it is compiled once."""
 
     def one(trajectory: Trajectory) -> Float[Array, " 4"]:
         fibers, later = fibers_along(model, params, trajectory)
@@ -63,7 +67,7 @@ def _largest(
         each = jax.vmap(
             partial(step_disturbances, model), in_axes=(0, 0, None, 0, 0, 0)
         )
-        found = each(
+        kinds = each(
             fibers,
             later,
             origin,
@@ -71,16 +75,18 @@ def _largest(
             trajectory.controls,
             trajectory.states[1:],
         )
-        return jnp.max(found, axis=0)
+        return jnp.max(kinds, axis=0)
 
     return jax.vmap(one)(trajectories)
 
 
 def conformal_quantile(scores: Float[np.ndarray, " trajectory"], level: float) -> float:
-    """The ⌈(n+1) level⌉-th smallest of n scores: a new, exchangeable score exceeds it with probability ≤ 1 − level.
+    """Return the ⌈(n+1) level⌉-th smallest of n scores.
+
+    A new, exchangeable score exceeds it with probability at most 1 − level.
 
     Raises:
-        ValueError: too few scores for the level, a level that is none, or scores that
+        ValueError: too few scores for the level, a level outside (0, 1), or scores that
             are not finite.
     """
     if not 0 < level < 1:
@@ -95,20 +101,29 @@ def conformal_quantile(scores: Float[np.ndarray, " trajectory"], level: float) -
 
 
 def supports(count: int, level: float) -> bool:
-    """Whether ⌈(n+1) level⌉ ≤ n: of fewer scores none is high enough for the level."""
+    """Whether `count` scores suffice for a conformal quantile: ⌈(n+1) level⌉ ≤ n."""
     return math.ceil((count + 1) * level) <= count
 
 
-def even_units(reference: Disturbance) -> Float[np.ndarray, " 4"]:
-    """Units in which all kinds are alike: the 95 % quantiles of another split than the one that is calibrated on."""
+def monitor_units(reference: Disturbance) -> Float[np.ndarray, " 4"]:
+    """Return the 95 % quantile of each kind as its unit.
+
+    Args:
+        reference: disturbances of a split other than the one for calibration.
+    """
     return _quantiles(reference, np.full(len(KINDS), 0.95))
 
 
 def tube_units(reference: Disturbance, *, level: float) -> Float[np.ndarray, " 4"]:
-    """Units in which the latent kind decides: its quantile at `level`; the others' one is missed a tenth as often.
+    """Return units in which the latent kind decides the conformal score.
 
-    Every tube multiplies the latent bound by up to 1/(1 − α) and adds the others once:
-    what makes the others wider and the latent one tighter makes the tube tighter.
+    The latent unit is its quantile at `level`; the other kinds exceed their units a
+    tenth as often. A tube multiplies the latent bound by up to 1/(1 − α) and adds the
+    others once, so these units make it tighter than equal quantiles do.
+
+    Args:
+        reference: disturbances of a split other than the one for calibration.
+        level: of the conformal bounds.
     """
     return _quantiles(
         reference,
@@ -119,30 +134,30 @@ def tube_units(reference: Disturbance, *, level: float) -> Float[np.ndarray, " 4
 def _quantiles(
     reference: Disturbance, shares: Float[np.ndarray, " 4"]
 ) -> Float[np.ndarray, " 4"]:
-    """A quantile of each kind; 1 of a kind that is always 0.
+    """Return a quantile of each kind, or 1 for a kind that is always 0.
 
     Raises:
         ValueError: scores that are not finite.
     """
     if not np.all(np.isfinite(reference.scores)):
         raise ValueError("residuals are not finite")
-    found = np.asarray(
-        [
-            np.quantile(kind, share)
-            for kind, share in zip(reference.scores.T, shares, strict=True)
-        ]
-    )
-    return np.where(found > 0, found, 1.0)
+    kinds = zip(reference.scores.T, shares, strict=True)
+    quantiles = np.asarray([np.quantile(kind, share) for kind, share in kinds])
+    return np.where(quantiles > 0, quantiles, 1.0)
 
 
 def conformal_bounds(
     units: Float[np.ndarray, " 4"], calibration: Disturbance, *, level: float
 ) -> Float[np.ndarray, " 4"]:
-    """Bounds on all four kinds at once, valid for a whole new trajectory with probability ≥ level.
+    """Return joint bounds on all kinds over a whole new trajectory (split-conformal).
 
-    Split-conformal: the score of a trajectory is its largest kind in `units`, which
-    another split fixed beforehand; the bound is the ⌈(n+1) level⌉-th smallest
-    calibration score.
+    They hold with probability at least `level`. The score of a trajectory is its
+    largest kind in `units`; the bound is the ⌈(n+1) level⌉-th smallest score.
+
+    Args:
+        units: of each kind, from a split other than `calibration`.
+        calibration: disturbances of the calibration split.
+        level: 1 − δ.
 
     Raises:
         ValueError: too few trajectories for the level, or scores that are not finite.
@@ -151,15 +166,18 @@ def conformal_bounds(
 
 
 def coverage(bounds: Float[np.ndarray, " 4"], held_out: Disturbance) -> float:
-    """Share of held-out trajectories inside all four bounds."""
+    """Return the share of held-out trajectories within all four bounds."""
     return float(np.mean(np.all(held_out.scores <= bounds, axis=1)))
 
 
-def interval(share: float, drives: int) -> list[float]:
-    """95 % interval of a share counted on trajectories that were cut from so many independent drives.
+def coverage_interval(share: float, drives: int) -> list[float]:
+    """Return the 95 % Clopper-Pearson interval of a coverage.
 
-    Clopper-Pearson of `drives` trials; where the share falls between two counts, from
-    the lower one to the upper one.
+    If the share lies between two counts, the interval covers those of both.
+
+    Args:
+        share: of trajectories that were covered.
+        drives: number of independent drives that the trajectories were cut from.
     """
     counts = math.floor(share * drives + ROUNDING), math.ceil(share * drives - ROUNDING)
     return [clopper_pearson(count, drives)[side] for side, count in enumerate(counts)]
@@ -168,7 +186,7 @@ def interval(share: float, drives: int) -> list[float]:
 def clopper_pearson(
     successes: int, trials: int, *, level: float = 0.95
 ) -> tuple[float, float]:
-    """The exact interval of a binomial proportion (Clopper and Pearson, 1934)."""
+    """Return the exact interval of a binomial share (Clopper and Pearson, 1934)."""
     tail, failures = 0.5 * (1.0 - level), trials - successes
     low = betaincinv(successes, failures + 1, tail) if successes else 0.0
     high = betaincinv(successes + 1, failures, 1.0 - tail) if failures else 1.0

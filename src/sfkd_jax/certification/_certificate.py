@@ -1,4 +1,4 @@
-"""The certificate: what is proved about the exported weights for all z, u and e, or a refusal with the reason."""
+"""Certificates of contraction for all z, u and e: proof and verification."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 
 from sfkd_jax.certification._attack_all import FLOAT32, attack_all, limits_of
-from sfkd_jax.certification._claims import Claims, Refuted, claims_hold
+from sfkd_jax.certification._claims import Claims, Refuted, require_claims
 from sfkd_jax.certification._core import Matrix
 from sfkd_jax.certification._environments import Box
 from sfkd_jax.certification._exported import (
@@ -32,10 +32,11 @@ MALFORMED = (
     AttributeError,
     RecursionError,
 )
-"""What Python raises about a document whose parts are of other kinds than they should
-be.
-"""
-PRECISION = "bounds on the float32 weights as real numbers, checked in float64; float32 rounding of a step counts as d"
+"""Errors that Python raises on a document with values of unexpected types."""
+PRECISION = (
+    "bounds on the float32 weights as real numbers, checked in float64; "
+    "float32 rounding of a step counts as d"
+)
 
 
 class CertificateStale(Exception):
@@ -44,29 +45,30 @@ class CertificateStale(Exception):
 
 @dataclasses.dataclass(frozen=True)
 class Certificate:
-    """What is proved. Frozen; `document` and `from_document` carry it through JSON unchanged.
+    """Proved constants with their witnesses.
 
     Attributes:
         mode: "joint" or "separate".
-        scope: how all environments are covered.
+        scope: the environments, and how all of them are covered.
         alpha: contraction factor of a step, |F(z) − F(z')|_P ≤ α |z − z'|_P for all z,
             z', u and all e of the scope.
         alpha_separate: ρ + β √κ.
         alpha_joint: of z ↦ A(e) z + r(z; u, e) as one map, or None.
         rho: sup_e ||A(e)||_P.
         beta: Lipschitz constant of r in z.
-        kappa: condition of P, 1 for P = I.
-        lipschitz: of the decoder's parts "position" [m], "yaw" [rad], both ("decoder")
-            and of "body".
-        transport_lipschitz: of T(e → e').
+        kappa: condition number of P, 1 for P = I.
+        lipschitz: Lipschitz constants of the decoder's outputs "position" [m], "yaw"
+            [rad], both ("decoder") and of "body".
+        transport_lipschitz: Lipschitz constant of T(e → e').
         env_box: [low, high].
-        witnesses: multipliers (and P) that prove all of it; `verify` needs no search.
-        params_sha256: of the weights.
-        precision: what float arithmetic is covered how.
-        attack: largest contraction factor that an attack on the running model found.
+        witnesses: multipliers (and P) of all proofs; `verify` needs no search.
+        params_sha256: hash of the weights.
+        precision: how float arithmetic is accounted for.
+        attack: largest contraction factor reached by an attack on the float32 model.
         tightness: α / attack.
         attacks: all lower bounds by name.
-        versions, seconds: of how it was made.
+        versions: of the libraries that computed it.
+        seconds: duration of the proof and the attacks.
     """
 
     mode: str
@@ -90,12 +92,12 @@ class Certificate:
     seconds: float
 
     def document(self) -> dict[str, Any]:
-        """As JSON has it."""
+        """Return the certificate as JSON values."""
         return dataclasses.asdict(self)
 
     @classmethod
     def from_document(cls, document: dict[str, Any]) -> Certificate:
-        """Back from JSON; keys that are not the certificate's own are left out.
+        """Read a certificate from JSON values; other keys are ignored.
 
         Raises:
             CertificationRefused: a key is missing.
@@ -120,23 +122,24 @@ def certify(
     attack_starts: int = 6,
     seed: int = 0,
 ) -> Certificate:
-    """Prove a contraction factor for all z, all u and all e, and attack what was proved.
+    """Prove a contraction factor for all z, u and e, and attack all proved bounds.
 
     Args:
-        model, params: with `explicit`; the weights as exported.
+        model: a model with `explicit`.
+        params: its weights as exported.
         env_box: lower and upper corner of E.
         mode: "joint" bounds A(e) z + r(z; u, e) as one map; "separate" only ρ + β.
-        margin: how far below 1 α must lie.
-        metric: P of a common Lyapunov function, proposed by anyone; ρ and κ are
-            recomputed (separate mode).
-        attack_starts: of the ascent on the running model; 0 leaves it out and tightness
-            None.
+        margin: α must be at most 1 − margin.
+        metric: P of a proposed common Lyapunov function for the separate mode; ρ and κ
+            are recomputed.
+        attack_starts: starting points of the ascent on the float32 model; with 0 there
+            is no ascent and tightness is None.
         seed: of the attacks.
 
     Raises:
-        CertificationRefused: with the reason. CertificateContradicted: an attack beat
-            the bound.
-        ValueError: unknown mode, a metric in joint mode, or a box that is none.
+        CertificationRefused: the model cannot be certified; gives the reason.
+        CertificateContradicted: an attack exceeds a proved bound.
+        ValueError: unknown mode, a metric in joint mode, or an invalid box.
     """
     began = time.perf_counter()
     corners = np.asarray(env_box, dtype=np.float64)
@@ -144,7 +147,8 @@ def certify(
         raise ValueError(f"env_box must be a lower and an upper corner, got {env_box}")
     if mode not in MODES or (metric is not None and mode == "joint"):
         raise ValueError(
-            f"mode must be one of {', '.join(MODES)}, and separate with a metric; got {mode!r}"
+            f"mode must be one of {', '.join(MODES)}, and separate with a metric; "
+            f"got {mode!r}"
         )
     weights = exported(model, params)
     try:
@@ -152,9 +156,12 @@ def certify(
             claims = prove(weights, env_box, joint=mode == "joint", metric=metric)
     except Refuted as reason:
         raise CertificationRefused(str(reason)) from None
-    if not claims.alpha <= 1.0 - margin:  # so that NaN is refused as well
-        shown = f"alpha = {claims.alpha:.6f} (rho {claims.rho:.6f}, beta {claims.beta:.6f}, kappa {claims.kappa:.3g})"
-        raise CertificationRefused(f"{shown} is not below 1 by the margin {margin:g}")
+    if not claims.alpha <= 1.0 - margin:  # refuses NaN as well
+        raise CertificationRefused(
+            f"alpha = {claims.alpha:.6f} (rho {claims.rho:.6f}, "
+            f"beta {claims.beta:.6f}, kappa {claims.kappa:.3g}) "
+            f"is not below 1 by the margin {margin:g}"
+        )
     attacks = attack_all(model, params, weights, claims, env_box, attack_starts, seed)
     attack = attacks.get("step")
     return Certificate(
@@ -179,13 +186,15 @@ def verify(
     model: Model,
     weights: Exported | None = None,
 ) -> None:
-    """Check a certificate against weights, without any search: milliseconds, once `model.explicit` is compiled.
+    """Check a certificate against weights without any search.
+
+    Takes milliseconds once `model.explicit` is compiled.
 
     Args:
-        certificate: of unknown origin.
-        params: weights.
-        model: what turns them into explicit ones.
-        weights: the explicit ones, where they are at hand.
+        certificate: from an untrusted source.
+        params: the weights.
+        model: provides `explicit`.
+        weights: explicit weights of `params`, if already computed.
 
     Raises:
         CertificateStale: it is about other weights.
@@ -197,7 +206,7 @@ def verify(
     claims = Claims(**{name: getattr(certificate, name) for name in Claims._fields})
     try:
         with one_thread():
-            claims_hold(claims, weights, certificate.env_box)
+            require_claims(claims, weights, certificate.env_box)
         _require_consistent(certificate, claims, weights)
     except Refuted as reason:
         raise CertificationRefused(str(reason)) from None
@@ -210,18 +219,18 @@ def verify(
 def _require_consistent(
     certificate: Certificate, claims: Claims, weights: Exported
 ) -> None:
-    """Refuse a certificate whose parts contradict each other.
+    """Check that the parts of a certificate agree with each other.
 
     Raises:
-        Refuted: naming the first part.
+        Refuted: names the first part that does not.
     """
     if not claims.alpha < 1.0 or certificate.transport_lipschitz != 1.0:
         raise Refuted(
-            f"alpha = {claims.alpha} is not below 1, or the transport is not nonexpansive"
+            f"alpha = {claims.alpha} is not below 1, "
+            "or the transport is not nonexpansive"
         )
-    if certificate.mode not in MODES or (certificate.mode == "joint") != (
-        claims.alpha_joint is not None
-    ):
+    joint = certificate.mode == "joint"
+    if certificate.mode not in MODES or joint != (claims.alpha_joint is not None):
         raise Refuted(
             f"mode {certificate.mode!r} does not fit alpha_joint = {claims.alpha_joint}"
         )
@@ -231,10 +240,10 @@ def _require_consistent(
     for name, value in certificate.attacks.items():
         if name not in limits or not 0 <= value <= limits[name] * (1 + FLOAT32):
             raise Refuted(
-                f"the attack {name} = {value!r} contradicts the bound {limits.get(name)}"
+                f"the attack {name} = {value!r} "
+                f"contradicts the bound {limits.get(name)}"
             )
     step = certificate.attacks.get("step")
-    if certificate.attack != step or certificate.tightness != (
-        claims.alpha / step if step else None
-    ):
+    tightness = claims.alpha / step if step else None
+    if certificate.attack != step or certificate.tightness != tightness:
         raise Refuted("attack or tightness is not what the attacks found")

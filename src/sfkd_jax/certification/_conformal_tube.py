@@ -1,4 +1,4 @@
-"""The tube that any model gets: measured prediction errors and nothing proved."""
+"""Conformal tube of any model from measured prediction errors, without a proof."""
 
 from __future__ import annotations
 
@@ -15,8 +15,8 @@ from sfkd_jax.types import Model, Params, Trajectory
 
 KINDS = ("position_m", "yaw_rad", "body")
 RESOLUTION = np.asarray([1e-3, 1e-4, 1e-3])
-"""No radius is smaller [m, rad, body]: 600 m from the origin float32 positions lie 6e-5
-m apart, and steps add up.
+"""Smallest radii [m, rad, body], above the accumulated rounding of float32 positions
+(6e-5 m at 600 m from the origin).
 """
 
 
@@ -30,27 +30,33 @@ def conformal_tube(
     horizon: int,
     stride: int,
 ) -> dict[str, list[float]]:
-    """Radii that all windows of a new trajectory respect together with probability ≥ level (split-conformal).
+    """Return split-conformal radii of the prediction error up to a horizon.
 
-        r_jk = unit_jk q,   q the ⌈(n+1) level⌉-th smallest of the scores max over windows, j, k of error_jk / unit_jk
+    With probability at least `level`, all windows of a new trajectory respect all radii
 
-    with unit_jk the 95 % quantile of the validation errors of kind k after j steps. A
-    trajectory is one draw: its windows overlap and are not independent.
+        r_jk = unit_jk q,
+
+    where unit_jk is the 95 % quantile of the validation errors of kind k after j steps,
+    q is the ⌈(n+1) level⌉-th smallest score, and the score of a trajectory is the
+    maximum of error_jk / unit_jk over its windows, j and k. A trajectory is one sample,
+    because its windows overlap and are not independent.
 
     Args:
-        model, params: any model.
-        validation: fixes the units.
-        calibration: sets q. Both batches of trajectories.
+        model: any model.
+        params: its weights.
+        validation: trajectories that fix the units.
+        calibration: trajectories that set q.
         level: 1 − δ.
-        horizon, stride: steps, as in `window_errors`.
+        horizon: number of steps predicted.
+        stride: steps between the starts of windows.
 
     Returns:
         "position_m" [m], "yaw_rad" [rad] and "body" (2-norm in its own units), each of
         length `horizon`.
 
     Raises:
-        ValueError: too few trajectories for the level, errors that are not finite, a
-            horizon that does not fit.
+        ValueError: too few trajectories for the level, errors that are not finite, or a
+            horizon longer than a trajectory.
     """
 
     def along(
@@ -60,11 +66,11 @@ def conformal_tube(
         return in_batches(one, data, size=64)
 
     both = jax.tree.map(lambda *parts: jnp.concatenate(parts), validation, calibration)
-    found = np.asarray(jax.jit(along)(params, both), dtype=np.float64)
-    seen, errors = np.split(found, [validation.controls.shape[0]])
-    if not np.all(np.isfinite(seen)):
+    errors = np.asarray(jax.jit(along)(params, both), dtype=np.float64)
+    reference, errors = np.split(errors, [validation.controls.shape[0]])
+    if not np.all(np.isfinite(reference)):
         raise ValueError("prediction errors are not finite")
-    units = np.maximum(np.quantile(seen, 0.95, axis=(0, 1)), RESOLUTION)
+    units = np.maximum(np.quantile(reference, 0.95, axis=(0, 1)), RESOLUTION)
     factor = conformal_quantile(np.max(errors / units, axis=(1, 2, 3)), level)
     radii = np.maximum(units * factor, RESOLUTION)
     return dict(zip(KINDS, radii.T.tolist(), strict=True))

@@ -1,4 +1,4 @@
-"""The corridor: a nominal part that a shield keeps, and the tube of the car around it; measured, not proved."""
+"""Calibrated corridor of the closed loop: the nominal copy and the tube around it."""
 
 from __future__ import annotations
 
@@ -8,7 +8,11 @@ from typing import Any, NamedTuple
 import numpy as np
 from jaxtyping import Float
 
-from sfkd_jax.certification._calibration import conformal_quantile, interval, supports
+from sfkd_jax.certification._calibration import (
+    conformal_quantile,
+    coverage_interval,
+    supports,
+)
 from sfkd_jax.certification._claims import Refuted
 from sfkd_jax.certification._fixed_points import require_fixed_points
 from sfkd_jax.certification._output_metrics import OUTPUTS, OutputMetric
@@ -18,15 +22,15 @@ MEASURED = (
     *(f"{form}_{name}" for form in ("followed", "for_ever") for name in OUTPUTS),
     "nominal",
 )
-"""What is calibrated of whole drives: both bounds on |y − ŷ| of every output, and the
-largest |ê_y| of the copy.
+"""Quantities calibrated on whole drives: two bounds on |y − ŷ| of every output, and the
+largest |ê_y| of the nominal copy.
 """
 JOINT = (*(f"followed_{name}" for name in OUTPUTS), "nominal")
-"""Those that hold together with the level; each of the others has the level for itself."""
+"""Quantities whose bounds hold jointly at the level; the others hold one by one."""
 
 
 class DriveScores(NamedTuple):
-    """Of whole drives, (drive,); names as in `MEASURED`."""
+    """Scores of whole drives, (drive,), for each quantity in `MEASURED`."""
 
     followed_position: Float[np.ndarray, " drive"]
     followed_yaw: Float[np.ndarray, " drive"]
@@ -36,23 +40,23 @@ class DriveScores(NamedTuple):
 
 
 def drive_scores(
-    found: Residuals,
+    measured: Residuals,
     claims: Mapping[str, OutputMetric],
     nominal: Float[np.ndarray, " drive"],
     initial: Mapping[str, Float[np.ndarray, " drive"]] | None = None,
 ) -> DriveScores:
-    """What a claim of a corridor would have had to be, drive by drive.
+    """Return the smallest bounds that would have held on each drive.
 
     Args:
-        found: of the drives.
-        claims: proved, of every output.
-        nominal: largest |ê_y| of a copy run along [m].
-        initial: |z_0 − ẑ_0|_P of every output's metric; nothing if the copy starts
-            where the car does.
+        measured: residuals of the drives.
+        claims: proved metric of every output.
+        nominal: largest |ê_y| of the nominal copy [m].
+        initial: |z_0 − ẑ_0|_P in the metric of every output; None if the copy starts at
+            the state of the car.
     """
+    starts = dict.fromkeys(OUTPUTS, 0.0) if initial is None else initial
     position, yaw = (
-        radii(found, name, claims[name], 0.0 if initial is None else initial[name])
-        for name in OUTPUTS
+        radii(measured, name, claims[name], starts[name]) for name in OUTPUTS
     )
     return DriveScores(
         followed_position=position.followed,
@@ -63,24 +67,25 @@ def drive_scores(
     )
 
 
-def calibrate(
+def calibrate_corridor(
     reference: DriveScores, scores: DriveScores, *, level: float
 ) -> dict[str, float]:
-    """Bounds by name: those of `JOINT` hold together for a new drive with probability ≥ level, the others alone.
+    """Return split-conformal bounds for a new drive, by name.
 
-    Split conformal: units are fixed by other drives. The lateral tube decides: heading
-    and nominal corridor count in units that are missed a tenth as often.
+    The bounds in `JOINT` hold together with probability at least `level`, the others
+    one by one. The units make the lateral tube decide the joint score: heading and
+    nominal corridor exceed their units a tenth as often.
 
     Args:
-        reference: of drives that fix the units.
-        scores: of those that calibrate.
+        reference: scores of the drives that fix the units.
+        scores: scores of the calibration drives.
+        level: 1 − δ.
 
     Raises:
         ValueError: too few drives for the level, or scores that are not finite.
     """
-    shares = {
-        name: level if name == JOINT[0] else 1.0 - 0.1 * (1.0 - level) for name in JOINT
-    }
+    rarely = 1.0 - 0.1 * (1.0 - level)
+    shares = {name: level if name == JOINT[0] else rarely for name in JOINT}
     units = {
         name: float(np.quantile(getattr(reference, name), share))
         for name, share in shares.items()
@@ -95,33 +100,39 @@ def calibrate(
     return {name: units[name] * factor for name in JOINT} | alone
 
 
-def covered(bounds: Mapping[str, float], scores: DriveScores) -> dict[str, Any]:
-    """On how many drives all bounds of `JOINT` held, with its interval; every drive is an independent one."""
+def corridor_coverage(
+    bounds: Mapping[str, float], scores: DriveScores
+) -> dict[str, Any]:
+    """Return the share of drives on which all bounds in `JOINT` held.
+
+    Args:
+        bounds: from `calibrate_corridor`.
+        scores: scores of independent drives.
+    """
     inside = np.all([getattr(scores, name) <= bounds[name] for name in JOINT], axis=0)
     count, share = len(inside), float(np.mean(inside))
     return {
         "coverage": share,
-        "coverage_ci95": interval(share, count),
+        "coverage_ci95": coverage_interval(share, count),
         "coverage_trajectories": count,
         "coverage_drives": count,
     }
 
 
 def require_corridor(corridor: Mapping[str, Any], output: Mapping[str, Any]) -> None:
-    """Check what is arithmetic in the document's part: sums, levels and counts that go together.
+    """Check sums, levels and counts of the document's corridor.
 
     Args:
-        corridor: the part.
-        output: the document's part about e_y, its constants proved.
+        corridor: that part of the document.
+        output: the part about e_y, whose constants have been checked.
 
     Raises:
-        Refuted: naming what does not follow.
+        Refuted: names the first value that does not follow.
     """
     bounds = corridor["bounds"]
     values = np.asarray(list(bounds.values()), dtype=np.float64)
-    if set(bounds) != set(MEASURED) or not (
-        np.all(np.isfinite(values)) and np.all(values > 0)
-    ):
+    positive = np.all(np.isfinite(values)) and np.all(values > 0)
+    if set(bounds) != set(MEASURED) or not positive:
         raise Refuted(
             "corridor.bounds must be positive numbers, one for each measured quantity"
         )
@@ -131,20 +142,19 @@ def require_corridor(corridor: Mapping[str, Any], output: Mapping[str, Any]) -> 
     drives, level = corridor["drives"], corridor["level"]
     if not (isinstance(drives, int) and 0 < level < 1 and supports(drives, level)):
         raise Refuted(
-            f"corridor.level = {level!r} cannot be had from {drives!r} drives"
+            f"corridor.level = {level!r} is not possible with {drives!r} drives"
         )
     if not corridor["attack"]["over_tube"] <= 1.0:
         raise Refuted(
-            "corridor.attack is a car outside of its tube whose disturbances kept their bound"
+            "corridor.attack left the tube with disturbances within their bound"
         )
     for name, part in {"corridor": corridor, **corridor["by_scenario"]}.items():
-        count = part["coverage_trajectories"]
-        inside = round(part["coverage"] * count)
-        exact = 0 <= inside <= count and np.isclose(
-            part["coverage"], inside / count, rtol=1e-9
+        count, share = part["coverage_trajectories"], part["coverage"]
+        inside = round(share * count)
+        exact = 0 <= inside <= count and np.isclose(share, inside / count, rtol=1e-9)
+        fits = exact and np.allclose(
+            part["coverage_ci95"], coverage_interval(share, part["coverage_drives"])
         )
-        if not exact or not np.allclose(
-            part["coverage_ci95"], interval(part["coverage"], part["coverage_drives"])
-        ):
+        if not fits:
             raise Refuted(f"{name}: coverage does not fit {count!r} drives")
     require_fixed_points(corridor["fixed_points"], output, bounds["for_ever_position"])

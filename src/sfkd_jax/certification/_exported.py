@@ -1,4 +1,4 @@
-"""What a certificate is about: the weights as a model serves them, or the reason why nothing can be said about them."""
+"""The explicit weights of a model in float64, or the reason for refusing them."""
 
 from __future__ import annotations
 
@@ -11,81 +11,84 @@ import jax
 import numpy as np
 from threadpoolctl import ThreadpoolController
 
+from sfkd_jax.core.folding import unfold
 from sfkd_jax.types import Incremental, Model, Params, Samples
 
 ACTIVATIONS = ("tanh", "relu", "sigmoid", "softplus", "elu")
-"""Those whose slopes lie in [0, 1] everywhere; gelu and silu leave it."""
+"""Activations with slopes in [0, 1] everywhere, which excludes gelu and silu."""
 TRANSPORTS = ("identity", "rotation")
-ONCE = {"xla_backend_optimization_level": 1}
-"""Of what is compiled to run a few times: full optimisation takes longer than it saves,
-none costs milliseconds.
-"""
+COMPILER_OPTIONS = {"xla_backend_optimization_level": 1}
+"""Less optimisation, since full optimisation compiles longer than it saves here."""
 Exported: TypeAlias = Any
 """An `Explicit` (or an `Incremental`) whose leaves are float64 numpy arrays."""
 
 
 class CertificationRefused(Exception):
-    """No certificate; the message is the reason."""
+    """A certificate is refused; the message gives the reason."""
 
 
 def exported(model: Model, params: Params) -> Exported:
-    """The explicit weights in float64, as the model serves them.
+    """Return the explicit weights in float64, checked to be certifiable.
 
     Raises:
-        CertificationRefused: none, not finite, sampled operators only, an unknown
-            activation or transport, or weights of a flow in continuous time.
+        CertificationRefused: no explicit weights, weights that are not finite, sampled
+            operators only, an unknown activation or transport, or a continuous flow.
     """
-    weights = served(model, params)
+    weights = explicit_weights(model, params)
     if isinstance(weights, Incremental):
         raise CertificationRefused(
-            "what is proved of a continuous flow is its rate; no tube of its steps follows"
+            "only the rate of a continuous flow can be proved; "
+            "no tube of its steps follows"
         )
     require_finite(weights)
     if isinstance(weights.operators, Samples):
         count = len(weights.operators.operators)
         raise CertificationRefused(
-            f"grid-only evidence: {count} sampled environments say nothing about those between"
+            f"grid-only evidence: {count} sampled environments "
+            "prove nothing about those in between"
         )
     require_slopes(weights)
     if weights.declared.transport not in TRANSPORTS:
         raise CertificationRefused(
-            f"the transport {weights.declared.transport!r} is not known to be nonexpansive"
+            f"the transport {weights.declared.transport!r} "
+            "is not known to be nonexpansive"
         )
     return weights
 
 
-def served(model: Model, params: Params) -> Exported:
-    """What the model serves, in float64, unchecked.
+def explicit_weights(model: Model, params: Params) -> Exported:
+    """Return the explicit weights in float64, unchecked.
 
     Raises:
-        CertificationRefused: nothing.
+        CertificationRefused: the model has none.
     """
-    if model.explicit is None:
+    if model.structure.explicit is None:
         raise CertificationRefused("this model exposes no explicit weights to certify")
-    evaluate = jax.jit(model.explicit, compiler_options=ONCE)
+    evaluate = jax.jit(model.structure.explicit, compiler_options=COMPILER_OPTIONS)
     return jax.tree.map(
-        lambda leaf: np.asarray(leaf, dtype=np.float64), evaluate(params)
+        lambda leaf: np.asarray(leaf, dtype=np.float64), evaluate(unfold(params))
     )
 
 
 def require_finite(weights: Exported) -> None:
-    """Refuse weights that are not numbers."""
+    """Refuse weights that are not finite."""
     if not all(np.all(np.isfinite(leaf)) for leaf in jax.tree.leaves(weights)):
         raise CertificationRefused("the weights are not finite")
 
 
 def require_slopes(weights: Exported) -> None:
-    """Refuse an activation that may leave the sector that every claim assumes."""
+    """Refuse an activation whose slopes may lie outside [0, 1]."""
     if weights.declared.activation not in ACTIVATIONS:
         raise CertificationRefused(
-            f"slopes of the activation {weights.declared.activation!r} are not known in [0, 1]"
+            f"slopes of the activation {weights.declared.activation!r} "
+            "are not known in [0, 1]"
         )
 
 
 def fingerprint(params: Params) -> str:
-    """SHA-256 of all weights with their names, types and shapes."""
+    """Return the SHA-256 of all weights with their names, types and shapes."""
     digest = hashlib.sha256()
-    for path, leaf in jax.tree_util.tree_flatten_with_path(params)[0]:
+    for path, leaf in jax.tree_util.tree_flatten_with_path(unfold(params))[0]:
         array = np.asarray(leaf)
         digest.update(
             f"{jax.tree_util.keystr(path)} {array.dtype} {array.shape} ".encode()
@@ -95,11 +98,14 @@ def fingerprint(params: Params) -> str:
 
 
 def one_thread() -> AbstractContextManager[object]:
-    """BLAS on one thread: matrices of this size lose on two, and lose a hundredfold on busy cores."""
+    """Limit BLAS to one thread, which is faster for matrices of this size.
+
+    On busy cores two threads are a hundred times slower.
+    """
     return _threads().limit(limits=1, user_api="blas")
 
 
 @cache
 def _threads() -> ThreadpoolController:
-    """The libraries of this process; finding them takes milliseconds."""
+    """Return the controller of the loaded BLAS libraries; finding them takes time."""
     return ThreadpoolController()

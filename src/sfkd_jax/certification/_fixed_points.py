@@ -1,15 +1,15 @@
-"""A corridor without a copy of the car: how far it is from where the model alone would come to rest.
+"""Corridor of the car from the fixed points of the model, without simulating a copy.
 
-For constant w = (0, κ, v) and e the step contracts to one fixed point z*(κ, v, e).
-Along a drive V_k = |z_k − z*_k|_P obeys, with Δ the move of z* over a step of the road,
-J that at a switch of e, U the largest |F(z*; ν) − z*|_P, and N the least steps between
-two switches,
+For constant w = (0, κ, v) and e, the step contracts to one fixed point z*(κ, v, e). Let
+V_k = |z_k − z*_k|_P along a drive, Δ the distance that z* moves over a step of the
+road, J that at a switch of e, U the largest |F(z*; ν) − z*|_P, and N the smallest
+number of steps between two switches. Then
 
     V_{k+1} ≤ α V_k + |d_{k+1}|_P + Δ + U (+ J at a switch),
     |e_y,k+1| ≤ |c'z*_k + o| + L (α V_k + U) + ε_{k+1}.
 
-α, L and P are proved. Δ, J, U and the first term are measured, on a grid of e and on
-steps of roads.
+α, L and P are proved. Δ, J, U and |c'z* + o| are measured on a grid of e and on steps
+of roads.
 """
 
 from __future__ import annotations
@@ -29,28 +29,28 @@ from sfkd_jax.certification._claims import Refuted
 from sfkd_jax.certification._output_metrics import OutputMetric
 from sfkd_jax.core.path_frame import LATERAL, PERTURBATION
 from sfkd_jax.core.rollouts import in_batches
-from sfkd_jax.types import BODY, Environment, Model, Params, State
+from sfkd_jax.types import BODY, Environment, Latent, Model, Params, State
 
 BATCH = 500
-"""Steps of roads at once."""
+"""Steps of roads in a batch."""
 LEVELS = 5
-"""Of every entry of e, its ends among them."""
+"""Grid points for each entry of e, including both ends."""
 ACCURACY = 1e-7
-"""To which part of its first distance from the fixed point an iterate comes."""
+"""Final distance of the iteration from its fixed point, relative to the initial one."""
 REPEATED = 1e-9
-"""Relative, of what is computed again from the same numbers."""
+"""Relative tolerance of recomputed values."""
 SIZES = ("centre_m", "road", "switch", "push")
 
 
 class FixedPoints(NamedTuple):
-    """Largest values over a class of roads and a grid of e.
+    """Largest values over steps of roads and a grid of e.
 
     Attributes:
         centre_m: |c'z* + o| [m].
-        road: Δ.
-        switch: J.
-        push: U; all three in the metric P.
-        points: how many fixed points were looked at.
+        road: Δ, in the metric P.
+        switch: J, in the metric P.
+        push: U, in the metric P.
+        points: number of fixed points.
     """
 
     centre_m: float
@@ -70,12 +70,12 @@ def fixed_points(
     env_box: Sequence[Sequence[float]],
     perturbation: Float[Array, " 2"],
 ) -> FixedPoints:
-    """Where the model comes to rest on every road and in every environment, and how far that moves.
+    """Measure the fixed points z* on all roads and in all environments.
 
     Args:
-        model: along a path.
-        params: folded.
-        claim: proved of e_y.
+        model: a model along a path.
+        params: folded parameters.
+        claim: proved metric of e_y.
         steps: (κ [1/m], v_ref [m/s]) before and after a step of a road.
         start: any path state.
         env_box: lower and upper corner of E.
@@ -86,28 +86,27 @@ def fixed_points(
     ]
     envs = jnp.asarray([*product(*levels)], dtype=float)
     iterations = math.ceil(math.log(ACCURACY) / math.log(claim.alpha))
-    latents, lateral, pushed = _rests(
+    latents, lateral, moves = _fixed_points_on_grid(
         model, params, steps, envs, start, perturbation, iterations
     )
     factor = np.linalg.cholesky(claim.metric)
 
-    def size(gaps: Any) -> float:
-        return float(
-            np.max(np.linalg.norm(np.asarray(gaps, dtype=np.float64) @ factor, axis=-1))
-        )
+    def largest(differences: Any) -> float:
+        scaled = np.asarray(differences, dtype=np.float64) @ factor
+        return float(np.max(np.linalg.norm(scaled, axis=-1)))
 
     before, after = latents[:, 0], latents[:, 1]
     return FixedPoints(
         centre_m=float(np.max(np.abs(lateral))),
-        road=size(after - before),
-        switch=max(size(before - before[:, index, None]) for index in range(len(envs))),
-        push=size(pushed),
+        road=largest(after - before),
+        switch=max(largest(before - before[:, k, None]) for k in range(len(envs))),
+        push=largest(moves),
         points=lateral.size,
     )
 
 
 @partial(jax.jit, static_argnums=(0, 6))
-def _rests(
+def _fixed_points_on_grid(
     model: Model,
     params: Params,
     steps: Float[Array, "step 2 2"],
@@ -120,49 +119,63 @@ def _rests(
     Float[Array, "step 2 grid"],
     Float[Array, "step 2 grid corner rank"],
 ]:
-    """z* and its e_y, and F(z*; ν) − z* for ν at the corners of its box."""
+    """Return z*, its e_y, and F(z*; ν) − z* for ν at the corners of its box."""
     corners = perturbation * jnp.asarray([*product((-1.0, 1.0), repeat=2)])
 
-    def rest(road: Float[Array, " 2"], env: Environment) -> tuple[Array, Array, Array]:
+    def converge(
+        road: Float[Array, " 2"], env: Environment
+    ) -> tuple[Array, Array, Array]:
         fiber = model.fiber(params, env)
-        alone = jnp.concatenate([jnp.zeros(2), road])
+        constant = jnp.concatenate([jnp.zeros(2), road])
+
+        def step(latent: Latent, inputs: Array) -> Latent:
+            return model.step(fiber, latent, inputs)
+
         latent = jax.lax.fori_loop(
             0,
             iterations,
-            lambda _, latent: model.step(fiber, latent, alone),
+            lambda _, latent: step(latent, constant),
             model.encode(fiber, start),
         )
-        known = model.vector(latent)
-        pushed = [
-            model.vector(model.step(fiber, latent, alone.at[PERTURBATION].set(nu)))
-            - known
+        fixed = model.vector(latent)
+        moves = [
+            model.vector(step(latent, constant.at[PERTURBATION].set(nu))) - fixed
             for nu in corners
         ]
-        return known, model.decode(fiber, latent)[BODY][LATERAL], jnp.stack(pushed)
+        return fixed, model.decode(fiber, latent)[BODY][LATERAL], jnp.stack(moves)
 
-    each = jax.vmap(jax.vmap(rest, (None, 0)), (0, None))
+    each = jax.vmap(jax.vmap(converge, (None, 0)), (0, None))
     return in_batches(lambda step: each(step, envs), steps, size=BATCH)
 
 
 def fixed_point_corridor(
-    found: FixedPoints,
+    measured: FixedPoints,
     *,
     alpha: float,
     lipschitz: float,
     for_ever: float,
     steps_between_switches: int,
 ) -> dict[str, Any]:
-    """The document's part: what was measured, and the corridors that follow from it [m].
+    """Return the corridors that follow from the fixed points, for the document.
 
     Args:
-        alpha, lipschitz: proved of e_y.
-        for_ever: L α d̄/(1 − α) + ε̄ of it [m].
+        measured: from `fixed_points`.
+        alpha: proved contraction factor in the metric of e_y.
+        lipschitz: proved Lipschitz constant of e_y in that metric.
+        for_ever: L α d̄/(1 − α) + ε̄ of e_y [m].
+        steps_between_switches: smallest number N of steps between two switches of e.
+
+    Returns:
+        The measured values; `corridor_m` [m] with the law alone and with a planner; and
+        `after_switch_m` [m], the same with switches of e.
     """
-    law = found.centre_m + for_ever + lipschitz * alpha * found.road / (1.0 - alpha)
-    planner = law + lipschitz * found.push / (1.0 - alpha)
-    switch = lipschitz * alpha * found.switch / (1.0 - alpha**steps_between_switches)
+    law = measured.centre_m + for_ever
+    law = law + lipschitz * alpha * measured.road / (1.0 - alpha)
+    planner = law + lipschitz * measured.push / (1.0 - alpha)
+    jump = lipschitz * alpha * measured.switch
+    switch = jump / (1.0 - alpha**steps_between_switches)
     return {
-        **found._asdict(),
+        **measured._asdict(),
         "steps_between_switches": steps_between_switches,
         "corridor_m": {"law": law, "planner": planner},
         "after_switch_m": {"law": law + switch, "planner": planner + switch},
@@ -172,23 +185,23 @@ def fixed_point_corridor(
 def require_fixed_points(
     part: Mapping[str, Any], output: Mapping[str, Any], for_ever: float
 ) -> None:
-    """Check that both corridors follow from what was measured.
+    """Check that all corridors follow from the measured fixed points.
 
     Args:
-        part: of the document.
-        output: e_y's constants, proved.
-        for_ever: its calibrated tube [m].
+        part: that part of the document.
+        output: the part about e_y, whose constants have been checked.
+        for_ever: calibrated tube of e_y [m].
 
     Raises:
-        Refuted: naming what does not follow.
+        Refuted: names the first value that does not follow.
     """
     sizes = {name: part[name] for name in SIZES}
     count, points = part["steps_between_switches"], part["points"]
-    whole = all(type(number) is int and number > 0 for number in (count, points))
-    if not whole or not all(
+    counted = all(type(number) is int and number > 0 for number in (count, points))
+    if not counted or not all(
         isinstance(size, float) and 0 <= size < math.inf for size in sizes.values()
     ):
-        raise Refuted("corridor.fixed_points holds what is no size or no count")
+        raise Refuted("corridor.fixed_points must hold sizes and positive counts")
     constants = {name: output[name] for name in ("alpha", "lipschitz")}
     expected = fixed_point_corridor(
         FixedPoints(**sizes, points=points),
@@ -203,5 +216,5 @@ def require_fixed_points(
             for key, value in expected[name].items()
         ):
             raise Refuted(
-                f"corridor.fixed_points.{name} does not follow from what was measured"
+                f"corridor.fixed_points.{name} does not follow from the fixed points"
             )

@@ -1,4 +1,4 @@
-"""The rate at which the flow of a model in continuous time contracts, proved by one linear matrix inequality."""
+"""Contraction rate of a continuous-time model, proved by a linear matrix inequality."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ import jax
 import numpy as np
 
 from sfkd_jax.certification._attack_all import CertificateContradicted
-from sfkd_jax.certification._claims import SERVED
+from sfkd_jax.certification._claims import COMPILATION_SLACK
 from sfkd_jax.certification._core import (
     TINY,
     UNIT,
@@ -23,49 +23,51 @@ from sfkd_jax.certification._core import (
 from sfkd_jax.certification._exported import (
     CertificationRefused,
     Exported,
+    explicit_weights,
     fingerprint,
     one_thread,
     require_finite,
     require_slopes,
-    served,
 )
 from sfkd_jax.types import Incremental, Model, Params
 
 HALVINGS = 40
+"""Bisection steps of the search for the rate."""
 
 
-def claims_a_rate(model: Model, params: Params) -> bool:
-    """Whether what can be proved about a model is the rate of its continuous flow."""
-    return model.explicit is not None and isinstance(
-        jax.eval_shape(model.explicit, params), Incremental
+def is_incremental(model: Model, params: Params) -> bool:
+    """Return whether only the rate of the continuous flow can be certified."""
+    return model.structure.explicit is not None and isinstance(
+        jax.eval_shape(model.structure.explicit, params), Incremental
     )
 
 
 def certify_incremental(
     model: Model, params: Params, *, dt: float, seed: int = 0
 ) -> dict[str, Any]:
-    """Prove how fast solutions of the state equation approach each other under the same inputs, and attack it.
+    """Prove and attack the contraction rate γ of the continuous flow.
 
-        |s(t) − s'(t)|_P ≤ exp(−γ t) |s(0) − s'(0)|_P   for all inputs, s in scaled units
+        |s(t) − s'(t)|_P ≤ exp(−γ t) |s(0) − s'(0)|_P   for all inputs
 
-    It is about the continuous flow: not about its discretisation, and no tube is
-    derived from it.
+    with s in scaled units. This says nothing about the discretisation of the flow, and
+    no tube follows from it.
 
     Args:
-        model, params: with `explicit` an `Incremental`; the weights as exported.
+        model: a model whose `explicit` is an `Incremental`.
+        params: its weights as exported.
         dt: sampling period [s].
         seed: of the attack.
 
     Returns:
-        A document: rate_per_s is γ, alpha exp(−γ dt), attack the rate [1/s] that some
-        slopes do not exceed, tightness attack over rate, at least 1.
+        A document: rate_per_s is γ, alpha is exp(−γ dt), attack is the smallest rate
+        [1/s] that the attack reached, and tightness is attack / rate, at least 1.
 
     Raises:
-        CertificationRefused: with the reason. CertificateContradicted: the attack is
-            slower than the proved rate.
+        CertificationRefused: no rate above 0 is proved; gives the reason.
+        CertificateContradicted: the attack reached a rate below the proved one.
     """
     began = time.perf_counter()
-    weights = served(model, params)
+    weights = explicit_weights(model, params)
     with one_thread():
         rate = incremental_rate(weights)
         attack = -attack_growth(weights, seed=seed)
@@ -77,7 +79,8 @@ def certify_incremental(
         "valid": True,
         "reason": None,
         "mode": "incremental",
-        "scope": "the continuous flow, not its discretisation; all states and inputs; no tube is derived from it",
+        "scope": "the continuous flow, not its discretisation; all states and inputs; "
+        "no tube is derived from it",
         "alpha": math.exp(-rate * dt),
         "rate_per_s": rate,
         "attack": attack,
@@ -89,13 +92,13 @@ def certify_incremental(
 
 
 def incremental_rate(weights: Exported) -> float:
-    """The largest rate [1/s] that the model's own metric and multipliers prove, found by halving.
+    """Return the largest rate [1/s] that the model's metric and multipliers prove.
 
     Args:
         weights: an `Incremental` in float64.
 
     Raises:
-        CertificationRefused: not even a rate next to 0 is proved; the reason is named.
+        CertificationRefused: no rate above 0 is proved; gives the reason.
     """
     require_finite(weights)
     require_slopes(weights)
@@ -110,9 +113,8 @@ def incremental_rate(weights: Exported) -> float:
     low, high = 0.0, max(-_growth(weights, np.zeros(len(weights.multipliers)))[0], 0.0)
     for _ in range(HALVINGS):
         middle = 0.5 * (low + high)
-        low, high = (
-            (middle, high) if check_incremental(weights, middle) else (low, middle)
-        )
+        proved = check_incremental(weights, middle)
+        low, high = (middle, high) if proved else (low, middle)
     if not low > 0.0:
         raise CertificationRefused(
             "the matrix inequality of the incremental rate holds at no rate above 0"
@@ -121,17 +123,17 @@ def incremental_rate(weights: Exported) -> float:
 
 
 def check_incremental(weights: Exported, rate: float) -> bool:
-    """Whether the metric P and the multipliers Λ prove that the flow contracts at `rate` [1/s]; rounding included.
+    """Check that the metric P and multipliers Λ prove the contraction rate γ.
 
-    For all inputs and every σ applied entry by entry with slopes in [0, 1] it suffices
-    that P > 0, Λ > 0 and
+    For all inputs and every σ that acts entry by entry with slopes in [0, 1] it
+    suffices that P > 0, Λ > 0 and
 
         [ −A_0'P − P A_0 − 2γP   −PA − W'Λ ]
         [           ·                2Λ    ]  >  0
 
-    (add 2 δσ'Λ(W δs − δσ) ≥ 0 to the derivative of δs'P δs). It is checked between
-    powers of 2 that balance Λ, and with room for the controller's own compilation,
-    which may round the same weights differently. False when in doubt.
+    (add 2 δσ'Λ(W δs − δσ) ≥ 0 to the derivative of δs'P δs). The matrix is balanced by
+    powers of 2. Its error bound includes rounding, and the differences between weights
+    from different compilations of the model. Returns False if in doubt.
 
     Args:
         weights: an `Incremental` in float64.
@@ -139,52 +141,47 @@ def check_incremental(weights: Exported, rate: float) -> bool:
     """
     P, multipliers = _symmetric(weights.metric), weights.multipliers
     finite = all(np.all(np.isfinite(leaf)) for leaf in jax.tree.leaves(weights))
-    if not (
-        finite
-        and 0 < rate < np.inf
-        and np.all(multipliers > 0)
-        and is_positive_definite(P)
-    ):
+    if not (finite and 0 < rate < np.inf and np.all(multipliers > 0)):
+        return False
+    if not is_positive_definite(P):
         return False
     balance = np.exp2(-np.round(0.5 * np.log2(multipliers)))
     drift, drift_error = product(P, weights.linear)
     forced, forced_error = product(P, weights.outer * balance)
     sensed = (multipliers * balance)[:, None] * weights.inner
     top, coupling = drift + drift.T + 2 * rate * P, forced.T + sensed
-    matrix = -np.block(
-        [[top, coupling.T], [coupling, -np.diag(2 * multipliers * balance**2)]]
+    hidden = -np.diag(2 * multipliers * balance**2)
+    matrix = -np.block([[top, coupling.T], [coupling, hidden]])
+    rounded = 2 * _size(P, weights.linear) + 2 * _size(P, weights.outer * balance)
+    rounded = rounded + 2 * frobenius(sensed)
+    summands = frobenius(matrix) + 2 * rate * frobenius(P) + rounded
+    summed = 8 * UNIT * summands + matrix.size * TINY
+    error = (
+        (COMPILATION_SLACK - 1.0) * rounded
+        + 2 * drift_error
+        + 2 * forced_error
+        + summed
     )
-    rounded = (
-        2 * _size(P, weights.linear)
-        + 2 * _size(P, weights.outer * balance)
-        + 2 * frobenius(sensed)
-    )
-    summed = (
-        8 * UNIT * (frobenius(matrix) + 2 * rate * frobenius(P) + rounded)
-        + matrix.size * TINY
-    )
-    error = (SERVED - 1.0) * rounded + 2 * drift_error + 2 * forced_error + summed
     return is_positive_definite(matrix, error)
 
 
 def attack_growth(weights: Exported, *, starts: int = 24, seed: int = 0) -> float:
-    """Largest growth rate [1/s] of |δs|_P found over slopes: λ_max of the symmetric part of A_0 + A D W in the metric.
+    """Maximise the growth rate [1/s] of |δs|_P over slopes D.
 
-    It is convex in D, so its maximum is at 0 or 1: with the top direction fixed, the
-    slopes are chosen by the sign of their effect, in turn, until nothing grows.
+    The rate is λ_max of the symmetric part of A_0 + A D W in coordinates of the metric.
+    It is convex in D, so the maximum is at slopes 0 or 1. With the top direction fixed,
+    the slopes are set by the sign of their effect, until the rate stops growing.
 
     Args:
         weights: an `Incremental` in float64.
-        starts: random beginnings, the first all ones.
-        seed: of these.
+        starts: number of starting points; the first has all slopes 1.
+        seed: of the random starting points.
     """
     random, best = np.random.default_rng(seed), -np.inf
     for start in range(starts):
         share = 1.0 if start == 0 else random.uniform()
-        slopes, value = (
-            (random.uniform(size=len(weights.multipliers)) < share).astype(float),
-            -np.inf,
-        )
+        draws = random.uniform(size=len(weights.multipliers))
+        slopes, value = (draws < share).astype(float), -np.inf
         after, slopes = _growth(weights, slopes)
         while after > value + 1e-12 * abs(after):
             value = after
@@ -194,23 +191,22 @@ def attack_growth(weights: Exported, *, starts: int = 24, seed: int = 0) -> floa
 
 
 def _growth(weights: Exported, slopes: Vector) -> tuple[float, Vector]:
-    """λ_max for these slopes, and the slopes that raise the growth most along its direction."""
+    """λ_max at some slopes, and the slopes that maximise growth along its direction."""
     root = np.linalg.cholesky(_symmetric(weights.metric)).T  # P = R'R
     back = np.linalg.inv(root)
     outer, inner = root @ weights.outer, weights.inner @ back
     moving = root @ weights.linear @ back + outer @ (slopes[:, None] * inner)
     values, directions = np.linalg.eigh(0.5 * (moving + moving.T))
     steepest = directions[:, -1]
-    return float(values[-1]), ((steepest @ outer) * (inner @ steepest) > 0).astype(
-        float
-    )
+    effects = (steepest @ outer) * (inner @ steepest)
+    return float(values[-1]), (effects > 0).astype(float)
 
 
 def _symmetric(matrix: Matrix) -> Matrix:
-    """What a quadratic form sees of a matrix."""
+    """Symmetric part of a matrix."""
     return 0.5 * (matrix + matrix.T)
 
 
 def _size(left: Matrix, right: Matrix) -> float:
-    """How large a product is if nothing cancels."""
+    """Frobenius norm of |X| |Y|."""
     return frobenius(np.abs(left) @ np.abs(right))

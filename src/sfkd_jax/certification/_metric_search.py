@@ -1,4 +1,4 @@
-"""The search for an output's metric: proposed in float64 by L-BFGS, believed by nobody."""
+"""Search for the metric of an output in float64 by L-BFGS, without a proof."""
 
 from __future__ import annotations
 
@@ -14,22 +14,18 @@ from jaxtyping import Array, Float
 from scipy.linalg import cho_solve, eigh
 from scipy.optimize import minimize
 
-from sfkd_jax.certification._claims import SERVED, Refuted
+from sfkd_jax.certification._claims import COMPILATION_SLACK, Refuted
 from sfkd_jax.certification._core import Matrix, Vector, check_vertices, witness_matrix
 from sfkd_jax.certification._exported import Exported
 from sfkd_jax.certification._output_metrics import OutputMetric, reads_within
 
 SHARPNESS = ((16, 40), (64, 60), (256, 100))
-"""Exponents of the p-norms that stand in for largest values, and L-BFGS iterations with
-each.
-"""
+"""Exponents of the p-norms that smooth a maximum, with L-BFGS iterations for each."""
 INFEASIBLE = 1e3
-"""Value of the objective, a logarithm, where nothing is proved."""
+"""Value of the logarithmic objective where nothing is proved."""
 SLACKS = (1e-9, 1e-7, 1e-5, 1e-3)
 DRIVES = 8
-"""Exponent of the mean over drives: near the quantile that calibration takes, and
-smooth.
-"""
+"""Exponent of the power mean over drives, a smooth stand-in for a high quantile."""
 
 
 def propose_metric(
@@ -38,50 +34,42 @@ def propose_metric(
     gaps: Float[np.ndarray, "drive worst rank"],
     start: Sequence[Vector],
 ) -> OutputMetric:
-    """The P for which |C|_{P⁻¹} q(|d|_P) / (1 − α_P) is small, with the constants that the core accepts.
+    """Minimise |C|_{P⁻¹} q(|d|_P) / (1 − α_P) over metrics P.
 
-    Over P = L L' and multipliers of every vertex at once. The step in coordinates L'z
-    has A' = L'A L'⁻¹, W_1' = W_1 L'⁻¹, W_L' = L'W_L; eliminating the hidden layers by
-    Schur gives α² as a largest eigenvalue, which is differentiable.
+    The variables are L with P = L L' and the multipliers of every vertex. In
+    coordinates L'z the step has A' = L'A L'⁻¹, W_1' = W_1 L'⁻¹ and W_L' = L'W_L. The
+    Schur complement of the hidden layers gives α² as a largest eigenvalue, which is
+    differentiable.
 
     Args:
-        weights: explicit, float64, of a polytope.
+        weights: explicit, float64, with a polytope of operators.
         rows: C, (output, rank).
-        gaps: d of the worst steps of every drive; not those that calibrate.
-        start: multipliers to begin with, of all vertices alike.
+        gaps: d of the worst steps of every drive, not of the calibration split.
+        start: initial multipliers, equal at all vertices.
+
+    Returns:
+        The metric with the smallest constants that the trusted core accepts.
 
     Raises:
-        Refuted: nothing below 1 was found.
+        Refuted: no α below 1 was found.
     """
     vertices, rank = weights.operators.vertices, weights.operators.vertices.shape[-1]
-    begin = (
-        np.concatenate([np.log(np.concatenate(start))] * len(vertices))
-        if start
-        else np.zeros(0)
-    )
+    logs = [np.log(np.concatenate(start))] * len(vertices) if start else [np.zeros(0)]
     lower = np.tril_indices(rank)
-    flat = np.concatenate([np.eye(rank)[lower], begin])
+    flat = np.concatenate([np.eye(rank)[lower], *logs])
     with jax.enable_x64(True):
         objective = _objective(weights, rows, gaps)
         for sharpness, iterations in SHARPNESS:
             options = {"maxiter": iterations, "maxcor": 20}
-            found = minimize(
-                partial(objective, sharpness),
-                flat,
-                jac=True,
-                method="L-BFGS-B",
-                options=options,
-            )
-            flat = found.x
+            search = {"jac": True, "method": "L-BFGS-B", "options": options}
+            flat = minimize(partial(objective, sharpness), flat, **search).x
     factor = np.zeros((rank, rank))
     factor[lower] = flat[: len(lower[0])]
     metric = factor @ factor.T
-    metric *= 2.0 / (np.trace(metric) / rank + np.max(np.abs(metric)))
+    scale = 2.0 / (np.trace(metric) / rank + np.max(np.abs(metric)))
+    metric *= scale
     widths = np.cumsum([len(part) for part in start])[:-1]
     logs = flat[len(lower[0]) :].reshape(len(vertices), -1)
-    scale = 2.0 / (
-        np.trace(factor @ factor.T) / rank + np.max(np.abs(factor @ factor.T))
-    )
     joint = [np.split(scale * np.exp(part), widths) if start else [] for part in logs]
     return _accepted(weights, rows, 0.5 * (metric + metric.T), joint)
 
@@ -89,7 +77,7 @@ def propose_metric(
 def _accepted(
     weights: Exported, rows: Matrix, metric: Matrix, joint: list[list[Vector]]
 ) -> OutputMetric:
-    """The smallest constants that the core accepts in this metric.
+    """Return the smallest constants that the core accepts in this metric.
 
     Raises:
         Refuted: there are none.
@@ -99,14 +87,11 @@ def _accepted(
         _rate(weights.residual, part, vertex, metric)
         for part, vertex in zip(joint, vertices, strict=True)
     )
-    reach = float(
-        np.sqrt(np.max(np.linalg.eigvalsh(rows @ np.linalg.solve(metric, rows.T))))
-    )
+    squared = rows @ np.linalg.solve(metric, rows.T)
+    gain = float(np.sqrt(np.max(np.linalg.eigvalsh(squared))))
     for slack in SLACKS:
-        alpha, lipschitz = (
-            float(SERVED * rate * (1 + slack)),
-            float(SERVED * reach * (1 + slack)),
-        )
+        alpha = float(COMPILATION_SLACK * rate * (1 + slack))
+        lipschitz = float(COMPILATION_SLACK * gain * (1 + slack))
         proved = check_vertices(weights.residual, joint, alpha, vertices, metric)
         if proved and alpha < 1.0 and reads_within(rows, lipschitz, metric):
             return OutputMetric(alpha, lipschitz, metric, joint)
@@ -116,15 +101,13 @@ def _accepted(
 def _rate(
     weights: Sequence[Matrix], joint: list[Vector], vertex: Matrix, metric: Matrix
 ) -> float:
-    """α in this metric by the same elimination, not rigorous; infinity if the multipliers prove nothing."""
+    """α in this metric, not rigorous; infinity if the multipliers prove nothing."""
     matrix, _ = witness_matrix(weights, joint, 0.0, vertex, metric)
     rank = len(metric)
     try:
         root = np.linalg.cholesky(matrix[rank:, rank:])
-        schur = (
-            matrix[rank:, :rank].T @ cho_solve((root, True), matrix[rank:, :rank])
-            - matrix[:rank, :rank]
-        )
+        hidden = cho_solve((root, True), matrix[rank:, :rank])
+        schur = matrix[rank:, :rank].T @ hidden - matrix[:rank, :rank]
         return float(np.sqrt(eigh(schur, metric, eigvals_only=True)[-1]))
     except (np.linalg.LinAlgError, ValueError):
         return float("inf")
@@ -133,34 +116,29 @@ def _rate(
 def _objective(
     weights: Exported, rows: Matrix, gaps: Any
 ) -> Callable[..., tuple[float, Vector]]:
-    """(sharpness, flat (L, log λ)) -> log of the radius and its gradient, as scipy calls it."""
+    """Return (sharpness, flat (L, log λ)) ↦ (log radius, gradient) for scipy."""
     operators = jnp.asarray(weights.operators.vertices)
     rank, hidden = operators.shape[-1], sum(len(part) for part in weights.residual[:-1])
     lower = jnp.tril_indices(rank)
-    read, driven = jnp.asarray(rows.T), jnp.asarray(gaps)
+    read, disturbed = jnp.asarray(rows.T), jnp.asarray(gaps)
 
     def value(flat: Array, sharpness: Array) -> Array:
         factor = jnp.zeros((rank, rank)).at[lower].set(flat[: len(lower[0])])
         logs = flat[len(lower[0]) :].reshape(len(operators), hidden)
-        found = jax.vmap(partial(_squares, weights.residual, factor))(
-            jnp.exp(logs), operators
-        )
-        alpha = jnp.sqrt(
-            _power_mean(jnp.maximum(found, 1e-12).reshape(-1), sharpness, mean=False)
-        )
-        reach = jnp.linalg.norm(
-            jax.scipy.linalg.solve_triangular(factor, read, lower=True)
-        )
-        sizes = jnp.linalg.norm(driven @ factor, axis=-1)
+        each = jax.vmap(partial(_squares, weights.residual, factor))
+        squares = jnp.maximum(each(jnp.exp(logs), operators), 1e-12).reshape(-1)
+        alpha = jnp.sqrt(_power_mean(squares, sharpness, mean=False))
+        solved = jax.scipy.linalg.solve_triangular(factor, read, lower=True)
+        gain = jnp.linalg.norm(solved)
+        sizes = jnp.linalg.norm(disturbed @ factor, axis=-1)
         worst = jax.vmap(lambda drive: _power_mean(drive, 32.0, mean=False))(sizes)
-        return jnp.log(reach * _power_mean(worst, DRIVES, mean=True)) - jnp.log(
-            1.0 - alpha
-        )
+        radius = jnp.log(gain * _power_mean(worst, DRIVES, mean=True))
+        return radius - jnp.log(1.0 - alpha)
 
-    derived = jax.jit(jax.value_and_grad(value))
+    with_gradient = jax.jit(jax.value_and_grad(value))
 
     def call(sharpness: int, flat: Vector) -> tuple[float, Vector]:
-        loss, gradient = derived(jnp.asarray(flat), jnp.asarray(float(sharpness)))
+        loss, gradient = with_gradient(jnp.asarray(flat), jnp.asarray(float(sharpness)))
         if not (np.isfinite(loss) and np.all(np.isfinite(gradient))):
             return INFEASIBLE, np.zeros_like(flat)
         return float(loss), np.asarray(gradient)
@@ -171,7 +149,7 @@ def _objective(
 def _squares(
     weights: Sequence[Matrix], factor: Array, multipliers: Array, operator: Array
 ) -> Array:
-    """Eigenvalues of A'A + X H⁻¹ X' in coordinates L'z; NaN where the multipliers prove nothing."""
+    """Eigenvalues of A'A + X H⁻¹ X' in coordinates L'z; NaN if nothing is proved."""
     inverse = jax.scipy.linalg.solve_triangular(
         factor, jnp.eye(len(factor)), lower=True
     )
@@ -180,11 +158,8 @@ def _squares(
         return jnp.linalg.eigvalsh(linear.T @ linear)
     edges = np.cumsum([0, *(len(part) for part in weights[:-1])])
     blocks = [slice(a, b) for a, b in pairwise(edges)]
-    output = (
-        jnp.zeros((len(factor), edges[-1]))
-        .at[:, blocks[-1]]
-        .set(factor.T @ weights[-1])
-    )
+    output = jnp.zeros((len(factor), edges[-1]))
+    output = output.at[:, blocks[-1]].set(factor.T @ weights[-1])
     inner = 2 * jnp.diag(multipliers) - output.T @ output
     for k, (before, here) in enumerate(pairwise(blocks)):
         coupling = multipliers[here, None] * weights[k + 1]
@@ -197,7 +172,7 @@ def _squares(
 
 
 def _power_mean(values: Array, power: Any, *, mean: bool) -> Array:
-    """(Σ x^p)^(1/p), or with the mean in the place of the sum; x > 0."""
+    """Return (Σ x^p)^(1/p) for x > 0, with `mean` that of the mean."""
     largest = jax.lax.stop_gradient(jnp.max(values))
     total = jnp.sum((values / largest) ** power)
     return largest * (total / len(values) if mean else total) ** (1.0 / power)

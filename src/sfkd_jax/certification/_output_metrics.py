@@ -1,9 +1,9 @@
-"""A metric for one output: how fast the step contracts in it, and how far that output moves per unit of it.
+"""Contraction of a step in the metric of one output, and the gain of that output.
 
-The 2-norm weighs every direction of the latent alike, an output only sees some. With P
-= L L' chosen for the read-out row c, a tube |c z| ≤ |c|_{P⁻¹} R of the same weights is
-several times tighter (closed-loop tube of Singh et al. 2017, for one output at a time).
-P and the multipliers are proposed by a search, see `_metric_search`; here they are
+The 2-norm weighs all directions of the latent alike, but an output depends on some of
+them only. With P = L L' chosen for the read-out row c, the tube |c z| ≤ |c|_{P⁻¹} R of
+the same weights is several times tighter (closed-loop tube of Singh et al. 2017, for
+one output at a time). `_metric_search` proposes P and the multipliers; here they are
 checked.
 """
 
@@ -29,17 +29,17 @@ from sfkd_jax.certification._exported import Exported
 from sfkd_jax.types import Polytope
 
 OUTPUTS = ("position", "yaw")
-"""Those that get a metric of their own: e_y [m] and e_ψ [rad]."""
+"""Outputs with a metric of their own: e_y [m] and e_ψ [rad]."""
 
 
 class OutputMetric(NamedTuple):
-    """What is proved in one metric.
+    """Constants proved in the metric of one output.
 
     Attributes:
         alpha: |F(z) − F(z')|_P ≤ α |z − z'|_P for all z, z', w and e.
-        lipschitz: |C z| ≤ L |z|_P of the output that P was chosen for [m or rad].
+        lipschitz: |C z| ≤ L |z|_P for the output C z [m or rad].
         metric: P, (rank, rank).
-        joint: multipliers of every vertex, that prove α.
+        joint: multipliers of every vertex that prove α.
     """
 
     alpha: float
@@ -48,7 +48,7 @@ class OutputMetric(NamedTuple):
     joint: list[list[Vector]]
 
     def document(self) -> dict[str, Any]:
-        """As JSON has it."""
+        """Return the claim as JSON values."""
         joint = [[part.tolist() for part in vertex] for vertex in self.joint]
         return {
             "alpha": self.alpha,
@@ -58,10 +58,12 @@ class OutputMetric(NamedTuple):
 
     @classmethod
     def from_document(cls, document: Mapping[str, Any]) -> OutputMetric:
-        """Back from JSON.
+        """Read a claim from JSON values.
 
         Raises:
-            KeyError, TypeError, ValueError: it is not one.
+            KeyError: a key is missing.
+            TypeError: a value is of another type.
+            ValueError: a value is not a number, or an array is ragged.
         """
         witness = document["witness"]
         joint = [
@@ -73,7 +75,10 @@ class OutputMetric(NamedTuple):
 
 
 def may_have_metrics(weights: Exported) -> bool:
-    """Whether a metric other than I can be proved: a polytope of operators, and no transport that might stretch it."""
+    """Return whether metrics other than I can be proved for a model.
+
+    They need a polytope of operators, no transport, and no decoder of the pose.
+    """
     polytope = isinstance(weights.operators, Polytope)
     return polytope and weights.declared.transport == "identity" and not weights.decoder
 
@@ -82,14 +87,14 @@ def require_output_metric(name: str, claim: OutputMetric, weights: Exported) -> 
     """Check both constants from P and the multipliers, without a search.
 
     Raises:
-        Refuted: naming the one that does not follow.
+        Refuted: names the constant that does not follow.
     """
     if name not in OUTPUTS or not may_have_metrics(weights):
         raise Refuted(f"outputs.{name}: this model has no metric of an output")
     for constant in ("alpha", "lipschitz"):
         value = getattr(claim, constant)
         if not (isinstance(value, float) and 0 < value < math.inf):
-            raise Refuted(f"outputs.{name}.{constant} is no bound: {value!r}")
+            raise Refuted(f"outputs.{name}.{constant} is not a bound: {value!r}")
     vertices = weights.operators.vertices
     if claim.metric.shape != vertices.shape[1:] or len(claim.joint) != len(vertices):
         raise Refuted(f"outputs.{name}.witness is of another size than the weights")
@@ -101,11 +106,9 @@ def require_output_metric(name: str, claim: OutputMetric, weights: Exported) -> 
         raise Refuted(f"outputs.{name}.lipschitz does not follow from its witness")
 
 
-@np.errstate(
-    over="ignore", invalid="ignore"
-)  # NaN and infinity are refused by the core
+@np.errstate(over="ignore", invalid="ignore")  # the core refuses NaN and infinity
 def reads_within(rows: Matrix, bound: float, metric: Matrix) -> bool:
-    """Whether |C z| < b |z|_P for every z, which is b² P − C'C > 0."""
+    """Check that |C z| < b |z|_P for every z ≠ 0, that is b² P − C'C > 0."""
     squared, rounding = product(rows.T, rows)
     scaled = np.square(bound) * metric
     matrix = scaled - 0.5 * (squared + squared.T)

@@ -1,4 +1,4 @@
-"""Tubes of single outputs on drives like the data, each in the metric that suits it."""
+"""Calibrated tubes of single outputs, each in its own metric."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from sfkd_jax.certification._calibration import conformal_quantile, interval
+from sfkd_jax.certification._calibration import conformal_quantile, coverage_interval
 from sfkd_jax.certification._claims import Refuted, readouts
 from sfkd_jax.certification._exported import Exported, one_thread
 from sfkd_jax.certification._metric_search import propose_metric
@@ -16,11 +16,11 @@ from sfkd_jax.certification._output_metrics import (
     OutputMetric,
     may_have_metrics,
 )
-from sfkd_jax.certification._radii import radii, residuals, worst_gaps
+from sfkd_jax.certification._radii import Radii, radii, residuals, worst_gaps
 from sfkd_jax.types import Model, Params, Trajectory
 
 WORST = 5
-"""Steps of every validation drive that a metric is chosen for."""
+"""Steps of every validation drive that the metric is optimised for."""
 FORMS = ("for_ever", "followed")
 
 
@@ -34,64 +34,58 @@ def output_tubes(
     test: Trajectory,
     level: float,
 ) -> dict[str, dict[str, Any]]:
-    """For each of `OUTPUTS` what is proved in its own metric, and a bound on |y − ŷ| calibrated with it.
+    """Prove a metric for each of `OUTPUTS` and calibrate a bound on |y − ŷ| with it.
 
     Args:
-        model: along a path.
-        params: folded.
-        weights: explicit, of the same.
-        validation: what the metric is chosen on.
-        calibration: sets the bounds.
-        test: counts coverage.
+        model: a model along a path.
+        params: folded parameters.
+        weights: explicit weights of the same model.
+        validation: drives that the metric is optimised for.
+        calibration: drives that set the bounds.
+        test: drives on which coverage is counted.
         level: of each bound, for a whole new drive.
 
     Returns:
-        By output α, L, their witness and `tube`; nothing for a model that can have no
-        metric but I.
+        α, L, their witness and the tube by output; empty if the model has no metrics.
     """
     if not may_have_metrics(weights):
         return {}
-    parts = {
-        name: residuals(model, params, part)
-        for name, part in {
-            "validation": validation,
-            "calibration": calibration,
-            "test": test,
-        }.items()
-    }
-    worst, documents = worst_gaps(parts["validation"], WORST), {}
+    reference, measured, unseen = (
+        residuals(model, params, part) for part in (validation, calibration, test)
+    )
+    worst, start = worst_gaps(reference, WORST), weights.residual_multipliers
+    documents = {}
     for name in OUTPUTS:
         try:
             with one_thread():
-                claim = propose_metric(
-                    weights,
-                    readouts(weights)[name],
-                    worst,
-                    weights.residual_multipliers,
-                )
+                claim = propose_metric(weights, readouts(weights)[name], worst, start)
         except Refuted:
             return {}
-        known, fresh = (
-            radii(parts[part], name, claim) for part in ("calibration", "test")
-        )
-        bounds = {
-            form: conformal_quantile(getattr(known, form), level) for form in FORMS
-        }
-        inside = {
-            form: float(np.mean(getattr(fresh, form) <= bounds[form])) for form in FORMS
-        }
-        count = len(fresh.largest)
-        documents[name] = claim.document() | {
-            "tube": bounds,
-            "coverage": inside,
-            "coverage_ci95": {
-                form: interval(share, count) for form, share in inside.items()
-            },
-            "coverage_drives": count,
-        }
+        calibrated = radii(measured, name, claim)
+        tube = _tube(calibrated, radii(unseen, name, claim), level)
+        documents[name] = claim.document() | tube
     return documents
 
 
-def claims_of(outputs: Mapping[str, Any]) -> dict[str, OutputMetric]:
-    """The proved part back from a document."""
+def _tube(calibration: Radii, test: Radii, level: float) -> dict[str, Any]:
+    """Conformal bounds on the radii of the calibration drives, and their coverage."""
+    bounds = {
+        form: conformal_quantile(getattr(calibration, form), level) for form in FORMS
+    }
+    shares = {
+        form: float(np.mean(getattr(test, form) <= bounds[form])) for form in FORMS
+    }
+    count = len(test.largest)
+    return {
+        "tube": bounds,
+        "coverage": shares,
+        "coverage_ci95": {
+            form: coverage_interval(shares[form], count) for form in FORMS
+        },
+        "coverage_drives": count,
+    }
+
+
+def output_metrics_from(outputs: Mapping[str, Any]) -> dict[str, OutputMetric]:
+    """Read the proved metric of every output from a document."""
     return {name: OutputMetric.from_document(part) for name, part in outputs.items()}

@@ -1,4 +1,4 @@
-"""Proposers: they look for the smallest bound that the trusted core will accept, and are never believed themselves."""
+"""Search for multipliers; only the trusted core decides which bound they prove."""
 
 from __future__ import annotations
 
@@ -20,11 +20,9 @@ from sfkd_jax.certification._core import (
 SCALES = np.geomspace(0.25, 4.0, 33)
 SLACKS = (1e-9, 1e-7, 1e-5, 1e-3)
 SHARPNESS = (8, 64, 512)
-"""Exponents of the p-norm that stands in for the largest eigenvalue, one L-BFGS run
-each.
-"""
+"""Exponents of the p-norm that smooths the largest eigenvalue, one L-BFGS run each."""
 INFEASIBLE = 1e3
-"""Value of the objective, a logarithm, where the multipliers prove nothing."""
+"""Value of the logarithmic objective where the multipliers prove nothing."""
 
 
 def lipschitz_upper(
@@ -32,12 +30,12 @@ def lipschitz_upper(
     multipliers: Sequence[Vector],
     linear: Matrix | None = None,
 ) -> float:
-    """The smallest Lipschitz bound that the multipliers, scaled as a whole, prove; infinity if they prove none.
+    """Return the smallest Lipschitz bound that scaled multipliers prove, or infinity.
 
     Args:
         weights: W_1 … W_L of a network with slopes in [0, 1].
-        multipliers: λ_1 … λ_{L-1}, as proposed.
-        linear: A, for the bound of A z + network(z).
+        multipliers: proposed λ_1 … λ_{L-1}, scaled by a common factor.
+        linear: A, for a bound on A z + network(z).
     """
     return rescaled(weights, multipliers, linear)[0]
 
@@ -47,7 +45,7 @@ def rescaled(
     multipliers: Sequence[Vector],
     linear: Matrix | None = None,
 ) -> tuple[float, list[Vector]]:
-    """The same bound, with the scaled multipliers that prove it."""
+    """Return the bound of `lipschitz_upper` and its scaled multipliers."""
     if not multipliers and len(weights) <= 1:
         parts = [
             np.asarray(part, dtype=np.float64)
@@ -60,20 +58,23 @@ def rescaled(
     best: tuple[float, list[Vector]] = (float("inf"), [])
     for scale in SCALES:
         scaled = [scale * np.asarray(part, dtype=np.float64) for part in multipliers]
-        bound = proved(weights, scaled, linear, below=best[0])
+        bound = smallest_bound(weights, scaled, linear, below=best[0])
         if bound < best[0]:
             best = bound, scaled
     return best
 
 
-def proved(
+def smallest_bound(
     weights: Sequence[Matrix],
     multipliers: Sequence[Vector],
     linear: Matrix | None = None,
     *,
     below: float = np.inf,
 ) -> float:
-    """The smallest bound that the core accepts from just these multipliers, if it is under `below`; else infinity."""
+    """Return the smallest bound that the core accepts from exactly these multipliers.
+
+    Returns infinity if there is none below `below`.
+    """
     eigenvalues, *_ = _reduced(weights, multipliers, linear)
     guess = float(np.sqrt(np.max(eigenvalues)))
     for slack in SLACKS:
@@ -92,17 +93,17 @@ def propose_multipliers(
     *,
     iterations: int = 150,
 ) -> list[Vector]:
-    """Multipliers near the LipSDP optimum, by L-BFGS over their logarithms from `start` (or the product of norms).
+    """Return multipliers near the LipSDP optimum, by L-BFGS over their logarithms.
 
     For fixed multipliers the best bound is the root of the largest eigenvalue of the
-    Schur complement C'S⁻¹C − K; its gradient is closed: with a top vector v and hidden
-    y = −S⁻¹Cv, dλ_k ↦ −2 y_k ∘ (y_k − W_k y_{k−1}).
+    Schur complement C'S⁻¹C − K. With a top eigenvector v and the hidden values
+    y = −S⁻¹Cv, its gradient is dλ_k ↦ −2 y_k ∘ (y_k − W_k y_{k−1}).
 
     Args:
         weights: W_1 … W_L.
-        start: λ to begin with.
+        start: initial λ; without it those that prove the product of norms.
         linear: A of a joint bound.
-        iterations: per sharpness.
+        iterations: L-BFGS iterations for each exponent in `SHARPNESS`.
     """
     weights = [np.asarray(weight, dtype=np.float64) for weight in weights]
     if len(weights) < 2 or not all(np.all(np.isfinite(part)) for part in weights):
@@ -124,33 +125,23 @@ def propose_multipliers(
         for k, (before, here) in enumerate(pairwise([vectors, *hidden])):
             each = -2.0 * here * (here - weights[k] @ before)
             gradient.append(multipliers[k] * (each @ powers) / (largest * total))
-        return 0.5 * (
-            np.log(largest) + np.log(total) / sharpness
-        ), 0.5 * np.concatenate(gradient)
+        value = 0.5 * (np.log(largest) + np.log(total) / sharpness)
+        return value, 0.5 * np.concatenate(gradient)
 
+    options = {"maxiter": iterations, "maxcor": 30}
     for sharpness in SHARPNESS:
-        found = minimize(
-            objective,
-            logs,
-            (sharpness,),
-            "L-BFGS-B",
-            jac=True,
-            options={"maxiter": iterations, "maxcor": 30},
-        )
-        logs = found.x
+        search = {"args": (sharpness,), "method": "L-BFGS-B", "options": options}
+        logs = minimize(objective, logs, jac=True, **search).x
     return np.split(np.exp(logs), widths)
 
 
 def _starting_point(
     weights: list[Matrix], start: Sequence[Vector], linear: Matrix | None
 ) -> list[Vector]:
-    """The start if it proves anything, else λ_k = Π_{j>k} ||W_j||²: the product of norms as a witness."""
+    """Return `start` if it proves anything, else λ_k = Π_{j>k} ||W_j||²."""
     begin = [np.asarray(part, dtype=np.float64) for part in start]
-    if (
-        begin
-        and all(np.all(part > 0) for part in begin)
-        and np.isfinite(rescaled(weights, begin, linear)[0])
-    ):
+    positive = begin and all(np.all(part > 0) for part in begin)
+    if positive and np.isfinite(rescaled(weights, begin, linear)[0]):
         return begin
     squares = [np.linalg.norm(weight, 2) ** 2 + 1e-12 for weight in weights]
     return [
@@ -162,7 +153,7 @@ def _starting_point(
 def _reduced(
     weights: Sequence[Matrix], multipliers: Sequence[Vector], linear: Matrix | None
 ) -> tuple[Vector, Matrix, list[Matrix]]:
-    """Eigenvalues (ascending) and vectors of C'S⁻¹C − K of the witness matrix, and the hidden y; not rigorous."""
+    """Eigenvalues (ascending) and vectors of C'S⁻¹C − K, and y; not rigorous."""
     matrix, _ = witness_matrix(weights, multipliers, 0.0, linear)
     widths = np.cumsum([len(part) for part in multipliers])
     inputs = len(matrix) - widths[-1]

@@ -1,8 +1,7 @@
-"""How far an output of the true state was from that of a nominal copy, at most: measured, drive by drive."""
+"""Measured bounds on the distance between outputs of the car and its nominal copy."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from functools import partial
 from typing import NamedTuple
 
@@ -17,14 +16,14 @@ from sfkd_jax.core.rollouts import defects, in_batches
 from sfkd_jax.types import BODY, Model, Params, Trajectory
 
 BATCH = 50
-"""Drives measured at once."""
+"""Drives in a batch."""
 
 
 class Residuals(NamedTuple):
-    """What every step of a drive differed from the model, (drive, time, …).
+    """One-step prediction errors of every step of a drive, (drive, time, …).
 
     Attributes:
-        gaps: d_k, in coordinates of the latent.
+        gaps: d_k in latent coordinates.
         outputs: |y_{k+1} − C F(z_k)| of e_y [m] and e_ψ [rad].
     """
 
@@ -33,13 +32,12 @@ class Residuals(NamedTuple):
 
 
 class Radii(NamedTuple):
-    """Bounds on |y_k − ŷ_k| over a whole drive, for any copy that starts where the car does, (drive,).
+    """Bounds on |y_k − ŷ_k| over a whole drive, (drive,).
 
     Attributes:
-        for_ever: L α max|d|_P / (1 − α) + max ε: what follows from the largest
-            disturbance alone.
-        followed: max_k (L α R_{k−1} + ε_k), R_k = α R_{k−1} + |d_k|_P: what follows
-            from all of them in turn.
+        for_ever: L α max|d|_P / (1 − α) + max ε, from the largest disturbance alone.
+        followed: max_k (L α R_{k−1} + ε_k) with R_k = α R_{k−1} + |d_k|_P, from the
+            sequence of all disturbances.
         largest: max |d|_P.
     """
 
@@ -49,11 +47,11 @@ class Radii(NamedTuple):
 
 
 def residuals(model: Model, params: Params, drives: Trajectory) -> Residuals:
-    """Of every step from its true state, switches included.
+    """Measure the error of every step from its true state, including switches of e.
 
     Args:
-        model: along a path.
-        params: folded.
+        model: a model along a path.
+        params: folded parameters.
         drives: a batch of trajectories.
     """
     gaps, outputs = _residuals(model, params, drives)
@@ -64,6 +62,8 @@ def residuals(model: Model, params: Params, drives: Trajectory) -> Residuals:
 
 @partial(jax.jit, static_argnums=0)
 def _residuals(model: Model, params: Params, drives: Trajectory) -> tuple[Array, Array]:
+    """`residuals` on the device."""
+
     def one(drive: Trajectory) -> tuple[Array, Array]:
         gap, predicted = defects(model, params, drive)
         miss = (predicted - drive.states[1:])[:, BODY]
@@ -73,29 +73,30 @@ def _residuals(model: Model, params: Params, drives: Trajectory) -> tuple[Array,
 
 
 def radii(
-    found: Residuals,
+    measured: Residuals,
     name: str,
     claim: OutputMetric,
     initial: Float[np.ndarray, " drive"] | float = 0.0,
 ) -> Radii:
-    """Both bounds for one output, by drive.
+    """Return the bounds of one output for each drive.
 
-        |z_k − ẑ_k|_P ≤ R_k,  so  |y_k − ŷ_k| ≤ |C (F(z_{k−1}) − F(ẑ_{k−1}))| + ε_k ≤ L α R_{k−1} + ε_k
+    With |z_k − ẑ_k|_P ≤ R_k,
+
+        |y_k − ŷ_k| ≤ |C (F(z_{k−1}) − F(ẑ_{k−1}))| + ε_k ≤ L α R_{k−1} + ε_k.
 
     Args:
-        found: of the drives.
-        name: of `OUTPUTS`.
-        claim: proved of it.
-        initial: |z_0 − ẑ_0|_P.
+        measured: residuals of the drives.
+        name: one of `OUTPUTS`.
+        claim: its proved metric.
+        initial: |z_0 − ẑ_0|_P; 0 if the copy starts at the state of the car.
     """
-    sizes = np.linalg.norm(found.gaps @ np.linalg.cholesky(claim.metric), axis=-1)
-    misses = found.outputs[..., OUTPUTS.index(name)]
+    sizes = np.linalg.norm(measured.gaps @ np.linalg.cholesky(claim.metric), axis=-1)
+    misses = measured.outputs[..., OUTPUTS.index(name)]
     radius = np.broadcast_to(np.asarray(initial, dtype=np.float64), sizes.shape[:1])
     followed = np.zeros(len(sizes))
     for step in range(sizes.shape[1]):
-        followed = np.maximum(
-            followed, claim.lipschitz * claim.alpha * radius + misses[:, step]
-        )
+        distance = claim.lipschitz * claim.alpha * radius + misses[:, step]
+        followed = np.maximum(followed, distance)
         radius = claim.alpha * radius + sizes[:, step]
     largest = np.max(sizes, axis=1)
     ultimate = np.maximum(initial, largest / (1.0 - claim.alpha))
@@ -103,15 +104,10 @@ def radii(
     return Radii(for_ever, followed, largest)
 
 
-def worst_gaps(found: Residuals, count: int) -> Float[np.ndarray, "drive worst rank"]:
-    """The steps of every drive with the largest |d|: what a metric is chosen for."""
-    sizes = np.linalg.norm(found.gaps, axis=-1)
+def worst_gaps(
+    measured: Residuals, count: int
+) -> Float[np.ndarray, "drive worst rank"]:
+    """Return d of the `count` steps of every drive with the largest |d|."""
+    sizes = np.linalg.norm(measured.gaps, axis=-1)
     order = np.argsort(sizes, axis=1)[:, -count:]
-    return np.take_along_axis(found.gaps, order[..., None], axis=1)
-
-
-def metrics_document(
-    claims: Mapping[str, OutputMetric],
-) -> dict[str, dict[str, object]]:
-    """As JSON has them."""
-    return {name: claim.document() for name, claim in claims.items()}
+    return np.take_along_axis(measured.gaps, order[..., None], axis=1)

@@ -1,4 +1,4 @@
-"""The same proposals from a semidefinite program: slow, for widths up to about 32, and believed no more."""
+"""Proposals from semidefinite programs, feasible for widths up to about 32."""
 
 from __future__ import annotations
 
@@ -10,29 +10,27 @@ import numpy as np
 from sfkd_jax.certification._core import Matrix
 
 MARGIN = 1e-6
-"""Relative tightening of what a solver is asked for: it returns solutions slightly
-outside of what it was given.
-"""
+"""Relative tightening of constraints, which solvers may violate slightly."""
 
 
 def solve_multipliers(
     weights: Sequence[Matrix], linear: Matrix | None = None, *, solver: str = "CLARABEL"
 ) -> list[Any]:
-    """Multipliers of the LipSDP optimum (diagonal, per neuron) of f = A z + W_L σ(… W_1 z …), by cvxpy.
+    """Return the diagonal multipliers of the LipSDP optimum by cvxpy.
 
-    min b²  over λ ≥ 0  such that the matrix of `check_witness` is positive
-    semidefinite.
+    For f = A z + W_L σ(… W_1 z …), minimise b² over λ ≥ 0 such that the matrix of
+    `check_witness` is positive semidefinite.
 
     Args:
         weights: W_1 … W_L.
         linear: A, or None.
-        solver: any conic solver that cvxpy knows.
+        solver: a conic solver of cvxpy.
 
     Returns:
-        λ_1 … λ_{L-1}, or an empty list if the solver returns nothing; its status is not
-        consulted.
+        λ_1 … λ_{L-1}, or an empty list if the solver returns no values. The status of
+        the solver is ignored.
     """
-    import cvxpy as cp  # part of an extra; nothing else in this room needs it
+    import cvxpy as cp  # an optional dependency
 
     widths = [weight.shape[0] for weight in weights[:-1]]
     inputs = weights[0].shape[1]
@@ -55,32 +53,31 @@ def solve_multipliers(
     blocks[0][-1] = blocks[0][-1] - last.T @ weights[-1]
     blocks[-1][0] = blocks[0][-1].T
     matrix = cp.bmat(blocks)
-    _solve(
-        cp, cp.Problem(cp.Minimize(square), [0.5 * (matrix + matrix.T) >> 0]), solver
-    )
-    found = [multiplier.value for multiplier in multipliers]
-    return (
-        []
-        if any(value is None for value in found)
-        else [np.asarray(value, dtype=np.float64) for value in found]
-    )
+    feasible = 0.5 * (matrix + matrix.T) >> 0
+    _solve(cp, cp.Problem(cp.Minimize(square), [feasible]), solver)
+    values = [multiplier.value for multiplier in multipliers]
+    if any(value is None for value in values):
+        return []
+    return [np.asarray(value, dtype=np.float64) for value in values]
 
 
 def solve_metric(
     operators: Sequence[Matrix], rate: float, *, solver: str = "CLARABEL"
 ) -> Matrix | None:
-    """A common Lyapunov matrix of least condition: min κ over I ⪯ P ⪯ κ I such that A' P A ⪯ ρ² P for every A.
+    """Return a common Lyapunov matrix of the smallest condition number by cvxpy.
+
+    Minimise κ over I ⪯ P ⪯ κ I such that A' P A ⪯ ρ² P for every operator A.
 
     Args:
         operators: the vertices.
         rate: ρ.
-        solver: any conic solver that cvxpy knows.
+        solver: a conic solver of cvxpy.
 
     Returns:
-        P, symmetric, or None if the solver returns nothing; `certify` recomputes ρ and
-        κ from it.
+        P, symmetric, or None if the solver returns no values; `certify` recomputes ρ
+        and κ from it.
     """
-    import cvxpy as cp  # as above
+    import cvxpy as cp  # an optional dependency
 
     size = operators[0].shape[0]
     metric, condition = cp.Variable((size, size), symmetric=True), cp.Variable()
@@ -91,12 +88,12 @@ def solve_metric(
     _solve(cp, cp.Problem(cp.Minimize(condition), bounds + decreases), solver)
     if metric.value is None:
         return None
-    found = np.asarray(metric.value, dtype=np.float64)
-    return 0.5 * (found + found.T)
+    solution = np.asarray(metric.value, dtype=np.float64)
+    return 0.5 * (solution + solution.T)
 
 
 def _solve(cp: Any, problem: Any, solver: str) -> None:
-    """Run the solver; a failure leaves the variables without values."""
+    """Run a solver; after a failure the variables have no values."""
     try:
         problem.solve(solver=solver)
     except (cp.SolverError, ValueError, ArithmeticError):

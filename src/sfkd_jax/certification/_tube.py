@@ -1,4 +1,4 @@
-"""Error tubes that follow from a contraction rate and a disturbance bound (thm:ISS, as corrected)."""
+"""Error tubes from a contraction factor and a disturbance bound (corrected thm:ISS)."""
 
 from __future__ import annotations
 
@@ -11,7 +11,16 @@ from jaxtyping import Float
 def latent_tube(
     alpha: float, d_bar: float, horizon: int, *, initial: float = 0.0
 ) -> Float[np.ndarray, " horizon"]:
-    """R_k = α^k |e_0| + d̄ (1 − α^k)/(1 − α), k = 1 … horizon: |z_k − ẑ_k| ≤ R_k whenever every |d_j| ≤ d̄."""
+    """Return R_1 … R_T with |z_k − ẑ_k| ≤ R_k as long as all |d_j| ≤ d̄.
+
+        R_k = α^k |e_0| + d̄ (1 − α^k)/(1 − α)
+
+    Args:
+        alpha: α.
+        d_bar: d̄.
+        horizon: T [steps].
+        initial: |e_0|.
+    """
     radii, radius = [], initial
     for _ in range(horizon):
         radius = alpha * radius + d_bar
@@ -26,13 +35,18 @@ def path_tube(
     lipschitz: Mapping[str, float],
     residual: Mapping[str, float],
 ) -> dict[str, list[float]]:
-    """Radii of e_y [m], e_ψ [rad] and the rest of the state along a path, for k = 1 … horizon, from z_0 known exactly.
+    """Return radii of e_y [m], e_ψ [rad] and body state along a path for an exact z_0.
 
-        |e_i,k| ≤ L_i α R_{k−1} + ε_i
+        |e_i,k| ≤ L_i α R_{k−1} + ε_i,   k = 1 … T
 
-    Position and heading are read from z like everything else, so nothing adds up over
-    the horizon: with the limit of R_k the radii hold for ever. Arguments as
-    `physical_tube`.
+    Position and heading are decoded from z, so no error accumulates over the horizon.
+
+    Args:
+        latent: R_1 … R_T.
+        alpha: contraction factor.
+        lipschitz: L of the outputs, by "position", "yaw", "body".
+        residual: ε, one-step errors of the outputs at the true latent, by the same
+            names.
     """
     before = np.concatenate([[0.0], latent[:-1]])
     kinds = {"position_m": "position", "yaw_rad": "yaw", "body": "body"}
@@ -42,20 +56,24 @@ def path_tube(
     }
 
 
-def for_ever(
+def ultimate_tube(
     ultimate: float,
     *,
     alpha: float,
     lipschitz: Mapping[str, float],
     residual: Mapping[str, float],
 ) -> dict[str, float]:
-    """`path_tube` at the limit d̄/(1 − α) of R_k: what holds at every step, however many there are."""
-    radii = path_tube(
-        np.asarray([ultimate, ultimate]),
-        alpha=alpha,
-        lipschitz=lipschitz,
-        residual=residual,
-    )
+    """Return the radii of `path_tube` for an infinite horizon.
+
+    Args:
+        ultimate: d̄/(1 − α), the limit of R_k.
+        alpha: contraction factor.
+        lipschitz: L of the outputs, by "position", "yaw", "body".
+        residual: ε, one-step errors of the outputs at the true latent, by the same
+            names.
+    """
+    limits = np.asarray([ultimate, ultimate])
+    radii = path_tube(limits, alpha=alpha, lipschitz=lipschitz, residual=residual)
     return {name: values[-1] for name, values in radii.items()}
 
 
@@ -67,28 +85,28 @@ def physical_tube(
     residual: Mapping[str, float],
     largest_increment: float,
 ) -> dict[str, list[float]]:
-    """Radii of position [m], yaw [rad] and body state for k = 1 … horizon, from z_0 known exactly.
+    """Return radii of position [m], yaw [rad] and body state for an exact z_0.
 
-    The pose is a sum of increments on SE(2), so its error is bounded by finite sums, not by a contraction:
-        |e_yaw,k| ≤ Σ_j (L_yaw R_j + ε_yaw),   |e_p,k| ≤ Σ_j (L_p R_j + ε_p + |dp| |e_yaw,j|),   j = 0 … k − 1
-        |e_s,k| ≤ L_s α R_{k−1} + ε_s
+    The pose is a sum of increments on SE(2), so its error is bounded by finite sums and
+    not by a contraction. For k = 1 … T and sums over j = 0 … k − 1,
+
+        |e_yaw,k| ≤ Σ_j (L_yaw R_j + ε_yaw)
+        |e_p,k|   ≤ Σ_j (L_p R_j + ε_p + |dp| |e_yaw,j|)
+        |e_s,k|   ≤ L_s α R_{k−1} + ε_s
 
     Args:
         latent: R_1 … R_T.
-        alpha: the contraction factor behind them.
-        lipschitz: L of the decoder's parts, by "position", "yaw", "body".
-        residual: ε, the decoder's one-step residuals at the true latent, by the same
+        alpha: contraction factor.
+        lipschitz: L of the decoder's outputs, by "position", "yaw", "body".
+        residual: ε, one-step errors of the decoder at the true latent, by the same
             names.
-        largest_increment: |dp|, the longest step driven [m].
+        largest_increment: |dp|, the longest step [m].
     """
     before = np.concatenate([[0.0], latent[:-1]])
     yaw = np.cumsum(lipschitz["yaw"] * before + residual["yaw"])
     turned = np.concatenate([[0.0], yaw[:-1]])
-    position = np.cumsum(
-        lipschitz["position"] * before
-        + residual["position"]
-        + largest_increment * turned
-    )
+    increments = lipschitz["position"] * before + residual["position"]
+    position = np.cumsum(increments + largest_increment * turned)
     body = lipschitz["body"] * alpha * before + residual["body"]
     return {
         "position_m": position.tolist(),
