@@ -14,11 +14,11 @@ from test_path_policy import saved, settings
 from sfkd_jax import build, datasets, policy
 from sfkd_jax.certification import (
     CertificationRefused,
-    claims_of,
     issue,
+    output_metrics_from,
     verify_document,
 )
-from sfkd_jax.corridor import certify_corridor, corridor_by_speed, fastest
+from sfkd_jax.corridor import certify_corridor, corridor_by_speed, fastest_speeds
 from sfkd_jax.types import Trajectory
 from sfkd_jax.vehicle import along_path, kinematic
 
@@ -69,7 +69,7 @@ def document(trained, asked):
         **options,
     )
     found["corridor"] = certify_corridor(
-        asked, trained, claims_of(found["outputs"]), **SMALL
+        asked, trained, output_metrics_from(found["outputs"]), **SMALL
     )
     return found | {"policy_sha256": trained.sha256}
 
@@ -165,7 +165,7 @@ def test_nothing_is_said_of_speeds_and_frictions_outside_the_box(document, train
         ("speed", {"frictions": [0.3], "speeds": [11.0]}),
     ):
         with pytest.raises(
-            ValueError, match=f"{name} .* lies outside what is certified"
+            ValueError, match=f"{name} .* is outside the certified range"
         ):
             corridor_by_speed(trained, document, **values)
 
@@ -183,19 +183,24 @@ def test_the_fastest_speed_is_one_below_which_every_corridor_fits():
         for friction, row in widths.items()
         for speed, width in zip((8.0, 9.0, 10.0), row, strict=True)
     ]
-    assert fastest(cells[::-1], 0.5) == {0.3: None, 0.6: 8.0, 0.75: 9.0, 0.9: 10.0}
-    assert fastest(cells, 0.1) == dict.fromkeys(widths)
+    assert fastest_speeds(cells[::-1], 0.5) == {0.3: None, 0.6: 8.0, 0.75: 9.0, 0.9: 10.0}
+    assert fastest_speeds(cells, 0.1) == dict.fromkeys(widths)
 
 
 def test_the_same_seed_gives_the_same_corridor(document, trained, asked):
-    again = certify_corridor(asked, trained, claims_of(document["outputs"]), **SMALL)
+    again = certify_corridor(
+        asked, trained, output_metrics_from(document["outputs"]), **SMALL
+    )
     assert {**again, "seconds": 0.0} == {**document["corridor"], "seconds": 0.0}
 
 
 def test_a_policy_without_a_law_has_no_corridor(trained, asked, document):
     with pytest.raises(ValueError, match="with its law"):
         certify_corridor(
-            asked, trained._replace(law=None), claims_of(document["outputs"]), **SMALL
+            asked,
+            trained._replace(law=None),
+            output_metrics_from(document["outputs"]),
+            **SMALL,
         )
 
 
@@ -276,7 +281,7 @@ def test_a_filter_of_a_drive_sees_it_whole_and_its_answer_is_what_is_driven(trai
     plain, cut = (
         jax.jit(
             lambda key, hook=hook: datasets.drive_switching(
-                loop, key, admit=hook, **asked
+                loop, key, safety_filter=hook, **asked
             )
         )(jax.random.key(5))
         for hook in (None, halve)

@@ -66,7 +66,7 @@ def settings(root, *overrides):
 
 @pytest.fixture(scope="module")
 def exported(tmp_path_factory):
-    """A run with weights as they were drawn and a monitor, and what the door wrote and
+    """A run with weights as they were drawn and a monitor, and what the command wrote and
     printed.
     """
     asked = settings(tmp_path_factory.mktemp("export") / "runs")
@@ -169,10 +169,9 @@ def in_process(loaded):
         loaded.controller.init(jax.random.key(7)),
         [],
     )
-    folded = jax.jit(loaded.model.fold)(loaded.params)
     observations, envs, reference = drive()
     for observation, env in zip(observations, envs, strict=True):
-        control, state, info = act(folded, state, observation, env, reference)
+        control, state, info = act(loaded.params, state, observation, env, reference)
         steps.append(plain((control, state, info)))
     return steps
 
@@ -523,12 +522,11 @@ def test_evaluating_the_weights_first_leaves_the_function_and_no_factorisation(
         env_low=ENV_LOW,
         env_high=ENV_HIGH,
     )
-    unfolded = loaded.model._replace(fold=lambda params: params)
     programs = exporting.flat_programs(
-        loaded._replace(controller=watched_by_nobody, model=unfolded)
+        loaded._replace(controller=watched_by_nobody, params=loaded.weights)
     )
     first = programs.init.function(jax.random.key_data(jax.random.key(7)))
-    ahead = exporting.weights_first(programs.act)
+    ahead = exporting.fold_constants(programs.act)
     shapes = [
         jax.ShapeDtypeStruct(leaf.shape, leaf.dtype) for leaf in programs.act.inputs
     ]

@@ -6,8 +6,8 @@ python -m benchmarks.quality.speed_page
 import json
 from pathlib import Path
 
-from sfkd_jax.corridor import fastest
-from sfkd_jax.reporting import draw_speed
+from sfkd_jax.corridor import fastest_speeds
+from sfkd_jax.paper import draw_speed
 
 HOME = Path(__file__).resolve().parents[2]
 MEASURED = HOME / "benchmarks" / "speed.json"
@@ -44,7 +44,7 @@ def table(name, found):
 def answer(found, room):
     """How fast the car may go, in one sentence."""
     ends = max(cell["speed"] for cell in found["cells"])
-    speeds = fastest(found["cells"], room)
+    speeds = fastest_speeds(found["cells"], room)
     if all(speed == ends for speed in speeds.values()):
         return f"With {room:g} m of room: up to {ends:g} m/s at every friction; the box ends first."
     if not any(speeds.values()):

@@ -19,16 +19,16 @@ import numpy as np
 
 from experiments.commonroad import traced_car
 from sfkd_jax import adapters, artefacts, policy
-from sfkd_jax.certification import claims_of, covered
-from sfkd_jax.control import law_arrays
+from sfkd_jax.certification import corridor_coverage, output_metrics_from
+from sfkd_jax.control import law_to_arrays
 from sfkd_jax.core.path_frame import (
     CURVATURE,
     PATH_SPEED,
     PERTURBATION,
     REFERENCE_SPEED,
-    beside,
+    vehicle_state,
 )
-from sfkd_jax.corridor._drives import closed, driving, measuring
+from sfkd_jax.corridor import drive_measurement, drive_options, policy_loop
 from sfkd_jax.datasets import drive_switching
 from sfkd_jax.types import BODY, Trajectory
 
@@ -43,7 +43,7 @@ def collect(loop, about, drives, place):
     """Drives of a class on a loop, in batches that are kept: after an interruption the
     same command continues.
     """
-    options = driving(loop, about, about["duration_s"]) | {
+    options = drive_options(loop, about, about["duration_s"]) | {
         "dwell": tuple(about["dwell_s"]),
         "drives": BATCH,
     }
@@ -54,7 +54,7 @@ def collect(loop, about, drives, place):
     law = artefacts.sha256(
         {
             name: np.asarray(table).tolist()
-            for name, table in law_arrays(loop.law).items()
+            for name, table in law_to_arrays(loop.law).items()
         }
     )
     parts = []
@@ -87,15 +87,15 @@ def driven(trained, certificate, drives, place):
     certified bounds.
     """
     about = certificate["corridor"]["class"]
-    loop = closed(
+    loop = policy_loop(
         adapters.commonroad_vehicle(model="std"), trained, about["sensor_noise"]
     )
     made = collect(loop, about, drives, place)
-    measured = measuring(loop, claims_of(certificate["outputs"]))(
+    measured = drive_measurement(loop, output_metrics_from(certificate["outputs"]))(
         made, jax.random.key(SEED + 1)
     )
     bounds, lateral = certificate["corridor"]["bounds"], np.abs(measured.lateral)
-    found = covered(bounds, measured.scores)
+    found = corridor_coverage(bounds, measured.scores)
     found |= {
         "lateral_m": float(lateral.max()),
         "distance_m": float(np.abs(measured.lateral - measured.copied).max()),
@@ -126,7 +126,7 @@ def compared(trained, made):
         for name in ("control_low", "control_high")
     )
     controls = jnp.clip(asked + inputs[:, PERTURBATION], low, high)
-    apart = traced_car.disagreement(jax.vmap(beside)(states), controls, envs)
+    apart = traced_car.disagreement(jax.vmap(vehicle_state)(states), controls, envs)
     return {"steps": STEPS_COMPARED, "largest": apart}
 
 

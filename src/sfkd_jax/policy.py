@@ -1,4 +1,4 @@
-"""A trained controller as other JAX projects import it: no Hydra, no orbax, no convex solver, no matplotlib."""
+"""Load trained controllers, without Hydra, orbax, convex solvers or matplotlib."""
 
 from __future__ import annotations
 
@@ -22,20 +22,21 @@ from sfkd_jax.vehicle import Vehicle
 KIND, LAW = "policy", "law"
 CERTIFICATE = "certificate.json"
 BOXES = {"state": "body", "control": "control", "env": "env"}
-"""Box of a certificate -> scales of the model of the same size."""
+"""Box of a certificate -> scales of the model that have the same size."""
 
 
 class TrainedModel(NamedTuple):
-    """A model with its weights, as they lie in a run directory.
+    """A model with its weights, as stored in a run directory.
 
     Attributes:
-        model, params: the learned rollout model.
+        model: the learned rollout model.
+        params: its weights.
         vehicle: that it was trained for.
-        settings: how all of it was made.
-        weights_sha256: of the weights alone.
-        sha256: of them and of every setting; a certificate is about this one.
+        settings: that it was made with.
+        weights_sha256: hash of the weights.
+        sha256: hash of weights and settings, to which certificates refer.
         version: of the package that saved it.
-        law: of a model in path coordinates, the one it was learned around.
+        law: that a model in path coordinates was learned around, or None.
     """
 
     model: Model
@@ -49,15 +50,16 @@ class TrainedModel(NamedTuple):
 
 
 class Policy(NamedTuple):
-    """What `load` returns.
+    """A trained controller, as `load` returns it.
 
     Attributes:
-        model, params: the learned rollout model.
-        controller: `Controller(init, act)`, pure; jit, vmap, scan it.
-        certificate: the document in certificate.json, verified, or None if it is
+        model: the learned rollout model.
+        params: its weights.
+        controller: `Controller(init, act)`, pure; jit, vmap or scan it.
+        certificate: the verified document of certificate.json, or None if it is
             missing, refused or stale.
-        settings: how all of it was made.
-        law: of a model in path coordinates, the one it was learned around.
+        settings: that it was made with.
+        law: that a model in path coordinates was learned around, or None.
     """
 
     model: Model
@@ -81,7 +83,18 @@ def save(
     made_from: Mapping[str, str],
     law: PathLaw | None = None,
 ) -> dict[str, Any]:
-    """Write policy.npz and its manifest; returns the manifest, whose `sha256` names the weights and the law."""
+    """Write policy.npz and its manifest, and return the manifest.
+
+    Args:
+        path: of policy.npz.
+        params: weights.
+        settings: that they were made with.
+        made_from: hashes of the artefacts that they were made from.
+        law: that a model in path coordinates was learned around, or None.
+
+    Returns:
+        The manifest; its `sha256` is the hash of weights and law.
+    """
     tree = params if law is None else params | {LAW: law_to_arrays(law)}
     flat = {name: np.asarray(leaf) for name, leaf in artefacts.flatten(tree).items()}
     return artefacts.write_arrays(
@@ -90,49 +103,39 @@ def save(
 
 
 def policy_hash(manifest: Mapping[str, Any]) -> str:
-    """The hash of all that a policy computes with: its weights, and every setting of vehicle, model and controller."""
+    """Return the hash of the weights and all settings of a policy."""
     return artefacts.sha256(
         {"weights": manifest["sha256"], "settings": manifest["config"]}
     )
 
 
 def restore(path: str | Path) -> TrainedModel:
-    """The model and weights in a run directory (or a policy.npz with its manifest beside it).
+    """Return the model and weights in a run directory.
+
+    Args:
+        path: of the directory, or of a policy.npz with its manifest beside it.
 
     Raises:
-        ArtefactError: nothing there, truncated, foreign, changed since it was written,
-            saved with settings that this version does not have, or weights that are not
+        ArtefactError: missing, truncated, foreign, changed since it was written, saved
+            with settings that this version does not have, or weights that are not
             finite or do not fit the model.
     """
     file = _file(path)
     arrays, manifest = artefacts.read_arrays(file, kind=KIND)
     settings = manifest["config"]
-    version = _version(manifest)
+    version = str(manifest.get("versions", {}).get("sfkd_jax", "unknown"))
     with artefacts.as_artefact_error(
         file.with_suffix(".json"), ValueError, advice=_advice(version)
     ):
-        plant, model = _built(
-            json.dumps({name: settings[name] for name in ("vehicle", "space", "model")})
-        )
-    mine = {
-        name: leaf for name, leaf in arrays.items() if not name.startswith(f"{LAW}/")
-    }
-    law = (
-        _law(file, {name: leaf for name, leaf in arrays.items() if name not in mine})
-        if model.along_path
-        else None
-    )
-    params = _weights(file, mine if model.along_path else arrays, model)
-    return TrainedModel(
-        model,
-        params,
-        plant,
-        settings,
-        manifest["sha256"],
-        policy_hash(manifest),
-        version,
-        law,
-    )
+        parts = {name: settings[name] for name in ("vehicle", "space", "model")}
+        plant, model = _build(json.dumps(parts))
+    law = None
+    if model.along_path:
+        names = [name for name in arrays if name.startswith(f"{LAW}/")]
+        law = _law(file, {name: arrays.pop(name) for name in names})
+    params = _weights(file, arrays, model)
+    hashes = manifest["sha256"], policy_hash(manifest)
+    return TrainedModel(model, params, plant, settings, *hashes, version, law)
 
 
 def load(
@@ -141,49 +144,49 @@ def load(
     controller: Mapping[str, Any] | None = None,
     env_source: str = "measured",
 ) -> Policy:
-    """The policy in a run directory (or a policy.npz with its manifest beside it), its certificate verified.
+    """Return the policy in a run directory, with its certificate verified.
 
-    Where nothing is certified, a warning says why; where `controller.monitor.fallback`
-    needs it, that is an error.
+    Without a certificate a warning says why.
 
     Args:
-        path: where.
-        controller: settings of a controller to build instead of the one it was saved
-            with.
-        env_source: "estimated" for a controller that infers the environment and does not read
-            the one it is given.
+        path: of the directory, or of a policy.npz with its manifest beside it.
+        controller: settings of a controller to build instead of the saved one.
+        env_source: "estimated" for a controller that estimates the environment and
+            ignores the one it is given.
 
     Raises:
-        ArtefactError: as `restore`; a certificate that does not hold; none where a
-            fallback asks for one.
+        ArtefactError: as `restore`; a certificate that does not hold; or none, and
+            `controller.monitor.fallback` needs one.
     """
     trained = restore(path)
     file = _file(path)
     certificate, reason = read_certificate(path, trained)
     settings: dict[str, Any] = trained.settings | {"env_source": env_source}
-    blamed: tuple[type[Exception], ...] = (ValueError,)
+    # A ValueError is about the file, unless the caller gave the controller.
+    errors: tuple[type[Exception], ...] = (ValueError,)
     if controller is not None:
-        settings, blamed = settings | {"controller": dict(controller)}, ()
+        settings, errors = settings | {"controller": dict(controller)}, ()
     with artefacts.as_artefact_error(
-        file.with_suffix(".json"), *blamed, advice=_advice(trained.version)
+        file.with_suffix(".json"), *errors, advice=_advice(trained.version)
     ):
-        asked, box = settings["controller"], settings["dataset"]
-        fallback = asked.get("monitor", {}).get("fallback", "none")
-        limits = {
-            "env_low": box["env_low"],
-            "env_high": box["env_high"],
-            "env_source": env_source,
-            "certificate": certificate,
-        }
-        limits["law"] = trained.law
+        options, box = settings["controller"], settings["dataset"]
+        fallback = options.get("monitor", {}).get("fallback", "none")
         planner = build.build_controller(
-            asked, trained.model, trained.vehicle, **limits
-        )
-    if certificate is None and fallback != "none":
-        raise artefacts.ArtefactError(
-            f"{file}: controller.monitor.fallback={fallback} needs a certificate; {reason}"
+            options,
+            trained.model,
+            trained.vehicle,
+            env_low=box["env_low"],
+            env_high=box["env_high"],
+            env_source=env_source,
+            certificate=certificate,
+            law=trained.law,
         )
     if certificate is None:
+        if fallback != "none":
+            raise artefacts.ArtefactError(
+                f"{file}: controller.monitor.fallback={fallback} "
+                f"needs a certificate; {reason}"
+            )
         warnings.warn(
             f"{file}: nothing is certified and nothing is monitored; {reason}",
             stacklevel=2,
@@ -195,14 +198,19 @@ def load(
 def read_certificate(
     path: str | Path, trained: TrainedModel
 ) -> tuple[dict[str, Any] | None, str]:
-    """The verified certificate beside a policy, or None and the reason why there is none.
+    """Verify the certificate beside a policy.
+
+    Args:
+        path: of the run directory, or of policy.npz.
+        trained: the policy.
+
+    Returns:
+        The certificate and "", or None and the reason why there is none.
 
     Raises:
         ArtefactError: it is damaged, or does not follow from its witnesses.
     """
-    from sfkd_jax import (
-        certification,
-    )  # what it needs is loaded only where something is to be verified
+    from sfkd_jax import certification  # loaded only if there is something to verify
 
     file = _file(path).with_name(CERTIFICATE)
     if not file.exists():
@@ -218,41 +226,28 @@ def read_certificate(
         return None, f"{reason}; certify again"
     except certification.CertificationRefused as reason:
         raise artefacts.ArtefactError(f"{file}: {reason}") from None
-    sizes = {
-        name: len(trained.settings["space"][f"{part}_mean"])
-        for name, part in BOXES.items()
-    }
-    if wrong := [
-        name for name, size in sizes.items() if len(document["boxes"][name][0]) != size
-    ]:
-        raise artefacts.ArtefactError(
-            f"{file}: boxes.{wrong[0]} is of another size than the model"
-        )
+    space, boxes = trained.settings["space"], document["boxes"]
+    for name, part in BOXES.items():
+        if len(boxes[name][0]) != len(space[f"{part}_mean"]):
+            raise artefacts.ArtefactError(
+                f"{file}: boxes.{name} is of another size than the model"
+            )
     return document, ""
 
 
 @lru_cache(maxsize=8)
-def _built(settings: str) -> tuple[Vehicle, Model]:
-    """The vehicle and the model of settings as JSON; the same objects again, so that nothing is compiled twice."""
-    asked = json.loads(settings)
-    plant = build.build_vehicle(asked["vehicle"])
+def _build(settings: str) -> tuple[Vehicle, Model]:
+    """Build vehicle and model; cached by settings as JSON to compile nothing twice."""
+    parts = json.loads(settings)
+    plant = build.build_vehicle(parts["vehicle"])
     return plant, build.build_model(
-        asked["model"], build.space_from_settings(asked["space"]), plant
+        parts["model"], build.space_from_settings(parts["space"]), plant
     )
 
 
 def _file(path: str | Path) -> Path:
-    """policy.npz of a run directory, or the file itself."""
+    """Return policy.npz of a run directory, or the file itself."""
     return Path(path) if Path(path).suffix == ".npz" else Path(path) / "policy.npz"
-
-
-def _version(manifest: Mapping[str, Any]) -> str:
-    versions = manifest.get("versions")
-    return (
-        str(versions.get("sfkd_jax", "unknown"))
-        if isinstance(versions, Mapping)
-        else "unknown"
-    )
 
 
 def _advice(version: str) -> str:
@@ -260,11 +255,7 @@ def _advice(version: str) -> str:
 
 
 def _law(file: Path, arrays: Mapping[str, np.ndarray]) -> PathLaw:
-    """Arrays as the law that a model in path coordinates was learned around.
-
-    Raises:
-        ArtefactError: some are missing, of another shape, or not finite.
-    """
+    """Return the law that arrays hold, or raise an ArtefactError."""
     if not all(np.all(np.isfinite(leaf)) for leaf in arrays.values()):
         raise artefacts.ArtefactError(f"{file}: the law's arrays are not finite")
     with artefacts.as_artefact_error(file, ValueError):
@@ -272,36 +263,31 @@ def _law(file: Path, arrays: Mapping[str, np.ndarray]) -> PathLaw:
 
 
 def _weights(file: Path, arrays: Mapping[str, np.ndarray], model: Model) -> Params:
-    """Arrays as the parameters of a model.
-
-    Raises:
-        ArtefactError: a name, shape or kind that the model does not have, or a number
-            that is not finite.
-    """
+    """Return arrays as the parameters of a model, or raise an ArtefactError."""
     with artefacts.as_artefact_error(file, ValueError):
         params = artefacts.unflatten(arrays)
-        expected = _listed(
-            jax.eval_shape(model.init, jax.random.key(0))
-        )  # settings of another kind fail only here
-    found = _listed(params)
-    if wrong := sorted(expected.keys() ^ found.keys()):
+        # Settings of a wrong type fail only here.
+        expected = _by_path(jax.eval_shape(model.init, jax.random.key(0)))
+    leaves = _by_path(params)
+    if wrong := sorted(expected.keys() ^ leaves.keys()):
         verb = "lacks" if wrong[0] in expected else "holds"
         raise artefacts.ArtefactError(
             f"{file}: {verb} weights {wrong[0]}, which does not fit the model"
         )
-    for name, leaf in found.items():
+    for name, leaf in leaves.items():
         if (leaf.shape, leaf.dtype) != (expected[name].shape, expected[name].dtype):
             wanted = f"{expected[name].dtype}{list(expected[name].shape)}"
             raise artefacts.ArtefactError(
-                f"{file}: weights {name} are {leaf.dtype}{list(leaf.shape)}, not {wanted}"
+                f"{file}: weights {name} are {leaf.dtype}{list(leaf.shape)}, "
+                f"not {wanted}"
             )
         if not np.all(np.isfinite(leaf)):
             raise artefacts.ArtefactError(f"{file}: weights {name} are not finite")
     return jax.tree.map(jnp.asarray, params)
 
 
-def _listed(tree: Any) -> dict[str, Any]:
-    """Leaves by their path."""
+def _by_path(tree: Any) -> dict[str, Any]:
+    """Return the leaves by path."""
     leaves = jax.tree_util.tree_flatten_with_path(tree)[0]
     return {
         "/".join(str(getattr(key, "key", key)) for key in path): leaf

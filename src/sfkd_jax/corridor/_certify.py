@@ -1,4 +1,4 @@
-"""The corridor in a certificate: drives of its class on the true plant, what they bound, and an attack."""
+"""Certify the corridor of a policy: calibrate it, test it and attack it."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ import math
 import time
 from collections.abc import Mapping, Sequence
 from functools import partial
-from typing import Any
+from typing import Annotated, Any
 
 import jax
 import jax.numpy as jnp
@@ -17,27 +17,28 @@ from sfkd_jax import build, policy
 from sfkd_jax.certification import (
     CertificateContradicted,
     OutputMetric,
-    calibrate,
-    covered,
+    calibrate_corridor,
+    corridor_coverage,
     fixed_point_corridor,
     fixed_points,
 )
 from sfkd_jax.control import safety_filter
 from sfkd_jax.core.path_frame import PATH_SPEED, path_state
+from sfkd_jax.core.ranges import Interval, Span
 from sfkd_jax.corridor._drives import (
     EXCITATION,
     ROADS,
     Loop,
-    closed,
-    driving,
-    measuring,
+    drive_measurement,
+    drive_options,
+    policy_loop,
 )
 from sfkd_jax.datasets import drive_switching, generate_s3_along_path
 from sfkd_jax.evaluation import Outcome, Tube, attack_corridor, outcome_of
 from sfkd_jax.types import Control, Key
 
 STREAM = 4
-"""Folded into the data set's seed; its drives take the streams 0 to 2."""
+"""Stream folded into the data set's seed; the data set uses streams 0 to 2."""
 
 
 def certify_corridor(
@@ -46,24 +47,24 @@ def certify_corridor(
     outputs: Mapping[str, OutputMetric],
     *,
     drives: int = 150,
-    duration: float = 60.0,
-    dwell: tuple[float, float] = (3.0, 6.0),
+    duration: Annotated[float, Interval("(2, inf)")] = 60.0,
+    dwell: Span = (3.0, 6.0),
     horizon: int = 20,
     attack_steps: int = 200_000,
 ) -> dict[str, Any]:
-    """The document's part about a corridor.
+    """Return the entry of the certificate about the corridor.
 
-    Its class: any switching in E that holds for at least the dwell time, roads and
-    perturbations ν like those of the data set, the law seeing the car through the
-    sensors, drives of `duration`. Three times `drives` are made: one part fixes the
-    units, one calibrates, one tests. S3's own schedule is none of them and is tested on
-    as well.
+    The class of drives: e switches in E with at least the dwell time, roads and
+    perturbations ν are those of the data set, the law reads the state through the
+    sensors, and a drive lasts `duration`. One part of `drives` fixes the units, one
+    calibrates and one tests. The drives of S3, which is not in the class, are tested
+    too.
 
     Args:
         settings: of the run.
         trained: its policy, with a law.
         outputs: proved metrics.
-        drives: of each part.
+        drives: number of drives of each part.
         duration: of a drive [s].
         dwell: range of times between switches [s].
         horizon: preview of the shield [steps].
@@ -73,55 +74,60 @@ def certify_corridor(
         ValueError: too few drives for the level, or a policy without a law.
     """
     began = time.perf_counter()
-    loop = closed(
+    loop = policy_loop(
         build.build_vehicle(settings["vehicle"]),
         trained,
         settings["evaluation"]["observation_noise"],
     )
-    level, data = settings["certification"]["level"], build.as_kwargs(settings["dataset"])
+    level = settings["certification"]["level"]
+    data = build.as_kwargs(settings["dataset"])
     roads = {name: data[name] for name in ROADS}
     box = {name: data[name] for name in ("env_low", "env_high")}
-    asked = roads | {name: data[name] for name in EXCITATION}
+    excited = roads | {name: data[name] for name in EXCITATION}
     *drive_keys, sensor_key, attack_key = jax.random.split(
         jax.random.fold_in(jax.random.key(data["seed"]), STREAM), 6
     )
-    options = driving(loop, asked, duration)
+    options = drive_options(loop, excited, duration)
     switching = partial(
         drive_switching, loop.plant, drives=drives, dwell=dwell, **box, **options
     )
     held_out = partial(generate_s3_along_path, loop.plant, segments=drives, **options)
     kinds = (switching, switching, switching, held_out)
-    measure = measuring(loop, outputs)
-    found = [
+    measure = drive_measurement(loop, outputs)
+    measured = [
         measure(jax.jit(kind)(drive_key), key)
         for kind, drive_key, key in zip(
             kinds, drive_keys, jax.random.split(sensor_key, len(kinds)), strict=True
         )
     ]
-    units, known, fresh, s3 = (part.scores for part in found)
-    bounds = calibrate(units, known, level=level)
+    units, calibration, test, s3 = (part.scores for part in measured)
+    bounds = calibrate_corridor(units, calibration, level=level)
     searching = box | roads | {"dwell": dwell[0], "steps": attack_steps}
-    lateral, copied = found[2].lateral, found[2].copied
-    about = {
+    lateral, copied = measured[2].lateral, measured[2].copied
+    protocol = {
         "env_box": [*box.values()],
         "dwell_s": dwell,
         "duration_s": duration,
         "sensor_noise": loop.noise,
     }
     return {
-        "class": asked | about | {"perturbation": loop.law.perturbation.tolist()},
+        "class": excited | protocol | {"perturbation": loop.law.perturbation.tolist()},
         "level": level,
         "drives": drives,
         "bounds": bounds,
         "corridor_m": bounds["nominal"] + bounds["followed_position"],
-        **covered(bounds, fresh),
-        "by_scenario": {"s3": covered(bounds, s3)},
+        **corridor_coverage(bounds, test),
+        "by_scenario": {"s3": corridor_coverage(bounds, s3)},
         "seen": {
             "distance_m": float(np.max(np.abs(lateral - copied))),
             "lateral_m": float(np.max(np.abs(lateral))),
         },
-        "fixed_points": _at_rest(
-            loop, outputs["position"], [part.roads for part in found[:3]], bounds, about
+        "fixed_points": _fixed_point_corridor(
+            loop,
+            outputs["position"],
+            [part.roads for part in measured[:3]],
+            bounds,
+            protocol,
         ),
         "attack": _attack(
             loop, attack_key, outputs["position"], bounds, searching, horizon
@@ -131,16 +137,17 @@ def certify_corridor(
     }
 
 
-def _at_rest(
+def _fixed_point_corridor(
     loop: Loop,
     claim: OutputMetric,
     roads: Sequence[Float[np.ndarray, "drive time 2"]],
     bounds: Mapping[str, float],
-    about: Mapping[str, Any],
+    protocol: Mapping[str, Any],
 ) -> dict[str, Any]:
-    """The corridor that needs no copy, from the steps of every road that tell most.
+    """The corridor around the fixed points, which needs no nominal copy.
 
-    Those at which curvature changes most, speed does, and v² κ is largest.
+    It is computed from the steps of every road with the largest change of curvature,
+    the largest change of speed, and the largest v² κ.
     """
     driven = np.concatenate(roads)
     steps = np.stack([driven[:, :-1], driven[:, 1:]], axis=2)
@@ -150,22 +157,26 @@ def _at_rest(
         np.argmax(size, axis=1)
         for size in (changes[..., 0], changes[..., 1], sharpness)
     ]
-    telling = np.concatenate([steps[np.arange(len(steps)), index] for index in chosen])
+    extreme = np.concatenate([steps[np.arange(len(steps)), index] for index in chosen])
     start = path_state(
-        jnp.zeros(len(loop.plant.state_names) - 3).at[PATH_SPEED].set(telling[0, 0, 1])
+        jnp.zeros(len(loop.plant.state_names) - 3).at[PATH_SPEED].set(extreme[0, 0, 1])
     )
-    asked = {
-        "env_box": about["env_box"],
+    options = {
+        "env_box": protocol["env_box"],
         "perturbation": loop.law.perturbation,
         "start": start,
     }
-    found = fixed_points(loop.model, loop.params, claim, jnp.asarray(telling), **asked)
+    points = fixed_points(
+        loop.model, loop.params, claim, jnp.asarray(extreme), **options
+    )
     return fixed_point_corridor(
-        found,
+        points,
         alpha=claim.alpha,
         lipschitz=claim.lipschitz,
         for_ever=bounds["for_ever_position"],
-        steps_between_switches=math.floor(about["dwell_s"][0] / loop.plant.dt + 1e-9),
+        steps_between_switches=math.floor(
+            protocol["dwell_s"][0] / loop.plant.dt + 1e-9
+        ),
     )
 
 
@@ -177,11 +188,11 @@ def _attack(
     options: dict[str, Any],
     horizon: int,
 ) -> dict[str, Any]:
-    """The worst drives that a search finds, without the shield and with it, against what is claimed.
+    """Search for the worst drives, without and with the shield.
 
     Raises:
-        CertificateContradicted: a car left its tube while the disturbances kept their
-            bound, which is impossible.
+        CertificateContradicted: a car left its tube while the disturbances stayed
+            within their bound, which is impossible.
     """
     model, params, limit = loop.model, loop.params, loop.law.perturbation
     width, bound = bounds["nominal"], bounds["followed_position"]
@@ -190,7 +201,7 @@ def _attack(
     search = partial(
         attack_corridor, loop.plant, model, tube=tube, perturbation=limit, **options
     )
-    found = jax.jit(search)(params, key)
+    worst_drives = jax.jit(search)(params, key)
 
     def shielded(drives: Any) -> Outcome:
         length = len(drives.inputs)
@@ -199,20 +210,20 @@ def _attack(
         )
         roads = drives.inputs[ahead, 2:]
 
-        def let_through(
+        def apply_filter(
             fiber: Any, latent: Any, wanted: Control, index: Any
         ) -> Control:
             return safety_filter(
                 model, fiber, latent, wanted, roads[index], limit, width=width
             ).nu
 
-        return outcome_of(loop.plant, model, params, tube, drives, let_through)
+        return outcome_of(loop.plant, model, params, tube, drives, apply_filter)
 
-    held = jax.jit(jax.vmap(jax.vmap(shielded)))(found.drives)
+    held = jax.jit(jax.vmap(jax.vmap(shielded)))(worst_drives.drives)
     kept = np.asarray(held.radius) <= bound
     worst = {
-        "lateral_m": np.max(found.outcome.lateral),
-        "distance_m": np.max(found.outcome.distance),
+        "lateral_m": np.max(worst_drives.outcome.lateral),
+        "distance_m": np.max(worst_drives.outcome.distance),
         "shielded_lateral_m": np.max(held.lateral),
         "kept_lateral_m": np.max(np.asarray(held.lateral), where=kept, initial=0.0),
         "kept_distance_m": np.max(np.asarray(held.distance), where=kept, initial=0.0),
@@ -224,6 +235,7 @@ def _attack(
     }
     if not shares["over_tube"] <= 1.0:
         raise CertificateContradicted(
-            f"INTERNAL ERROR: {worst['kept_distance_m']:.4f} m from the copy, and the tube is {bound:.4f} m"
+            f"INTERNAL ERROR: {worst['kept_distance_m']:.4f} m from the copy, "
+            f"and the tube is {bound:.4f} m"
         )
     return {"steps": options["steps"]} | worst | shares

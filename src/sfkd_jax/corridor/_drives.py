@@ -1,4 +1,4 @@
-"""A policy's loop on the true plant, and how far the car strays on every drive of it."""
+"""The closed loop of a policy on the true plant, and measurements of its drives."""
 
 from __future__ import annotations
 
@@ -20,6 +20,7 @@ from sfkd_jax.certification import (
     residuals,
 )
 from sfkd_jax.control import PathLaw
+from sfkd_jax.core.folding import fold
 from sfkd_jax.core.path_frame import LATERAL, PERTURBATION
 from sfkd_jax.core.rollouts import in_batches, rollout
 from sfkd_jax.types import (
@@ -40,7 +41,15 @@ BATCH = 20
 
 
 class Loop(NamedTuple):
-    """The true plant with the law of a policy around it, and that policy's model beside it, folded."""
+    """The closed loop of plant and law, and the model of the policy.
+
+    Attributes:
+        plant: the true plant with the law around it.
+        law: of the policy.
+        model: of the policy.
+        params: of the model, folded.
+        noise: standard deviations of the sensors.
+    """
 
     plant: Vehicle
     law: PathLaw
@@ -49,13 +58,13 @@ class Loop(NamedTuple):
     noise: tuple[float, ...]
 
 
-class Measured(NamedTuple):
-    """Of a batch of drives.
+class MeasuredDrives(NamedTuple):
+    """Measurements of a batch of drives.
 
     Attributes:
         lateral: e_y of the car [m].
-        copied: ê_y of its copy [m].
-        scores: what a corridor would have had to be.
+        copied: ê_y of the nominal copy [m].
+        scores: corridor bounds that each drive needs.
         roads: κ [1/m] and v_ref [m/s] at every step.
     """
 
@@ -65,12 +74,14 @@ class Measured(NamedTuple):
     roads: Float[np.ndarray, "drive time 2"]
 
 
-def closed(plant: Vehicle, trained: policy.TrainedModel, noise: Sequence[float]) -> Loop:
-    """The loop of a policy, with the weights as they drive.
+def policy_loop(
+    plant: Vehicle, trained: policy.TrainedModel, noise: Sequence[float]
+) -> Loop:
+    """Return the closed loop of a policy, with folded weights.
 
     Args:
-        plant: what is driven.
-        trained: with a law.
+        plant: to be driven.
+        trained: a policy with a law.
         noise: standard deviations of the sensors.
 
     Raises:
@@ -78,9 +89,10 @@ def closed(plant: Vehicle, trained: policy.TrainedModel, noise: Sequence[float])
     """
     if trained.law is None:
         raise ValueError(
-            "a corridor needs a policy in path coordinates, with its law: model.frame=path"
+            "a corridor needs a policy in path coordinates, with its law: "
+            "model.frame=path"
         )
-    params = jax.jit(trained.model.fold)(trained.params)
+    params = jax.jit(partial(fold, trained.model))(trained.params)
     return Loop(
         build.build_loop(plant, trained.law),
         trained.law,
@@ -90,38 +102,42 @@ def closed(plant: Vehicle, trained: policy.TrainedModel, noise: Sequence[float])
     )
 
 
-def driving(loop: Loop, asked: Mapping[str, Any], duration: float) -> dict[str, Any]:
-    """Options of `drive_along_path` for the drives of a class.
+def drive_options(
+    loop: Loop, settings: Mapping[str, Any], duration: float
+) -> dict[str, Any]:
+    """Return the options of `drive_along_path` for the drives of a class.
 
     Args:
-        loop: whose law sees the car through its sensors.
-        asked: entries of `ROADS` and `EXCITATION`.
+        loop: its law reads the state through the sensors.
+        settings: entries of `ROADS` and `EXCITATION`.
         duration: of a drive [s].
     """
-    options = {name: asked[name] for name in (*ROADS, *EXCITATION)}
+    options = {name: settings[name] for name in (*ROADS, *EXCITATION)}
     steps = round(duration / loop.plant.dt)
     return options | {
         "steps": steps,
-        "sensors": partial(_seen, loop),
+        "sensors": partial(_sensor_effect, loop),
         "offset": (0.0, 0.0, 0.0),
         "burn_in": 0,
     }
 
 
-def measuring(
+def drive_measurement(
     loop: Loop, outputs: Mapping[str, OutputMetric]
-) -> Callable[[Trajectory, Key], Measured]:
-    """A function of drives and a key for the sensors; compiled once for all batches of one size.
+) -> Callable[[Trajectory, Key], MeasuredDrives]:
+    """Return (drives, key for the sensors) -> measurements.
+
+    It is compiled once for all batches of one size.
 
     Args:
-        loop: that drove.
+        loop: that was driven.
         outputs: proved metrics.
     """
-    beside = jax.jit(partial(_beside, loop))
+    simulate_copy = jax.jit(partial(_simulate_copy, loop))
 
-    def measure(drives: Trajectory, key: Key) -> Measured:
+    def measure(drives: Trajectory, key: Key) -> MeasuredDrives:
         copied, gaps = (
-            np.asarray(part, dtype=np.float64) for part in beside(drives, key)
+            np.asarray(part, dtype=np.float64) for part in simulate_copy(drives, key)
         )
         initial = {
             name: np.linalg.norm(
@@ -129,10 +145,10 @@ def measuring(
             )
             for name in OUTPUTS
         }
-        found = residuals(loop.model, loop.params, drives)
-        scores = drive_scores(found, outputs, np.max(np.abs(copied), axis=1), initial)
+        errors = residuals(loop.model, loop.params, drives)
+        scores = drive_scores(errors, outputs, np.max(np.abs(copied), axis=1), initial)
         lateral = np.asarray(drives.states, dtype=np.float64)[:, 1:, BODY][..., LATERAL]
-        return Measured(
+        return MeasuredDrives(
             lateral,
             copied,
             scores,
@@ -142,31 +158,34 @@ def measuring(
     return measure
 
 
-def _beside(
+def _simulate_copy(
     loop: Loop, drives: Trajectory, key: Key
 ) -> tuple[Float[Array, "drive time"], Float[Array, "drive rank"]]:
-    """ê_y of a copy that starts where the car does, and z_0 − ẑ_0 of a real copy: that one starts from the sensors."""
+    """Return ê_y of a copy that starts at the true state, and z_0 − ẑ_0.
+
+    ẑ_0 is the latent state of a copy that starts at the measured state.
+    """
     model, spread = loop.model, _spread(loop.noise, drives.states.shape[-1])
 
     def copied(drive: Trajectory) -> jax.Array:
         return rollout(model, loop.params, drive)[0][:, BODY][:, LATERAL]
 
-    def apart(state: State, env: Environment, key: Key) -> jax.Array:
+    def gap(state: State, env: Environment, key: Key) -> jax.Array:
         fiber = model.fiber(loop.params, env)
-        seen = state + spread * jax.random.normal(key, state.shape)
-        return model.vector(model.encode(fiber, seen)) - model.vector(
+        measured = state + spread * jax.random.normal(key, state.shape)
+        return model.vector(model.encode(fiber, measured)) - model.vector(
             model.encode(fiber, state)
         )
 
     keys = jax.random.split(key, len(drives.states))
-    gaps = jax.vmap(apart)(drives.states[:, 0], drives.envs[:, 0], keys)
+    gaps = jax.vmap(gap)(drives.states[:, 0], drives.envs[:, 0], keys)
     return in_batches(copied, drives, size=BATCH), gaps
 
 
-def _seen(
+def _sensor_effect(
     loop: Loop, key: Key, state: State, inputs: Control, env: Environment
 ) -> jax.Array:
-    """What the law adds to ν because it sees ξ through the sensors."""
+    """Return the change of ν because the law reads ξ through the sensors."""
     coordinates, road = state[BODY], inputs[PERTURBATION.stop :]
     spread = _spread(loop.noise, state.shape[-1])[BODY]
     measured = coordinates + spread * jax.random.normal(key, coordinates.shape)
@@ -176,6 +195,9 @@ def _seen(
 
 
 def _spread(noise: tuple[float, ...], size: int) -> jax.Array:
-    """Standard deviations along a path state: e_y has that of a position, e_ψ that of yaw, the rest its own."""
+    """Standard deviations of a path state from those of the sensors.
+
+    e_y takes that of a position, e_ψ that of yaw, the other coordinates their own.
+    """
     known = noise[1 : size - 2]
     return jnp.zeros(size).at[3 : 3 + len(known)].set(jnp.asarray(known))

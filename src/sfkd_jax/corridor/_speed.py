@@ -1,4 +1,4 @@
-"""How the corridor of a policy depends on speed and friction, and how fast it may go where there is little room."""
+"""The corridor of a policy by speed and friction."""
 
 from __future__ import annotations
 
@@ -11,17 +11,20 @@ import jax.numpy as jnp
 import numpy as np
 
 from sfkd_jax import policy
-from sfkd_jax.certification import calibrate, claims_of, covered, interval
-from sfkd_jax.corridor._drives import closed, driving, measuring
+from sfkd_jax.certification import (
+    calibrate_corridor,
+    corridor_coverage,
+    coverage_interval,
+    output_metrics_from,
+)
+from sfkd_jax.corridor._drives import drive_measurement, drive_options, policy_loop
 from sfkd_jax.datasets import drive_switching
 from sfkd_jax.types import Key, Scalar, Trajectory
 
 FRICTION = 0
-"""Of the entries of e, the one that is held in a cell; the others switch within their
-range.
-"""
+"""Entry of e that is constant in a cell; the other entries switch in their range."""
 PARTS = 3
-"""Drives fix units, calibrate and test."""
+"""Drives that fix the units, that calibrate and that test."""
 
 
 def corridor_by_speed(
@@ -33,24 +36,25 @@ def corridor_by_speed(
     drives: int = 60,
     seed: int = 0,
 ) -> dict[str, Any]:
-    """A corridor for every friction and speed, each calibrated by itself, on the drives of the class that have both.
+    """Calibrate a corridor for every friction and speed.
 
-    Roads, perturbations ν, sensors, duration and level are those of the certified
-    class; wind switches as in it. The road of a cell bends by at most `curvature`,
-    which the class lets fall with speed once v² κ reaches its limit.
+    Roads, perturbations ν, sensors, duration, level and switching of the wind are those
+    of the certified class. The curvature of a cell's roads is at most `curvature`,
+    which decreases with speed where the class limits v² κ.
 
     Args:
         trained: with a law.
         certificate: verified, with a corridor.
-        frictions: [-].
-        speeds: asked for [m/s]. Both inside the certified box; nothing is extrapolated.
-        drives: of each of three parts in every cell: one fixes the units, one
-            calibrates, one tests.
+        frictions: inside the certified box [-].
+        speeds: v_ref, inside the certified box [m/s].
+        drives: number of drives of each of three parts in every cell: one fixes the
+            units, one calibrates, one tests.
+        seed: of the drives.
 
     Returns:
-        `cells`, in the order of frictions and then speeds: `corridor_m` = `nominal_m` +
-        `tube_m`, each with its coverage, and the largest |e_y| of its test drives,
-        `lateral_m`; beside them the coverage of all cells together.
+        `cells`, in the order of frictions and then speeds, each with `corridor_m` =
+        `nominal_m` + `tube_m`, its coverage and `lateral_m`, the largest |e_y| of its
+        test drives; and the `coverage` of all cells.
 
     Raises:
         ValueError: a friction or a speed outside the box, too few drives for the level,
@@ -58,26 +62,26 @@ def corridor_by_speed(
         KeyError: a certificate without a corridor.
     """
     began = time.perf_counter()
-    known = certificate["corridor"]
-    about, level = known["class"], known["level"]
+    corridor = certificate["corridor"]
+    about, level = corridor["class"], corridor["level"]
     low, high = (np.asarray(side) for side in about["env_box"])
     _require_inside("friction", frictions, (low[FRICTION], high[FRICTION]))
     _require_inside("speed", speeds, about["speed"])
-    loop = closed(trained.vehicle, trained, about["sensor_noise"])
-    measure = measuring(loop, claims_of(certificate["outputs"]))
-    options = driving(loop, about, about["duration_s"]) | {
+    loop = policy_loop(trained.vehicle, trained, about["sensor_noise"])
+    measure = drive_measurement(loop, output_metrics_from(certificate["outputs"]))
+    options = drive_options(loop, about, about["duration_s"]) | {
         "drives": drives,
         "dwell": about["dwell_s"],
     }
 
     @jax.jit
     def drive(key: Key, friction: Scalar, speed: Scalar) -> Trajectory:
-        held: dict[str, Any] = {
+        constant: dict[str, Any] = {
             side: jnp.asarray(corner).at[FRICTION].set(friction)
             for side, corner in (("env_low", low), ("env_high", high))
         }
-        asked: dict[str, Any] = options | held | {"speed": (speed, speed)}
-        return drive_switching(loop.plant, key, **asked)
+        kwargs: dict[str, Any] = options | constant | {"speed": (speed, speed)}
+        return drive_switching(loop.plant, key, **kwargs)
 
     cells = []
     for friction in frictions:
@@ -89,8 +93,8 @@ def corridor_by_speed(
                 measure(drive(drive_key, friction, speed), key)
                 for drive_key, key in keys
             ]
-            units, scores, fresh = (part.scores for part in parts)
-            bounds = calibrate(units, scores, level=level)
+            units, scores, test = (part.scores for part in parts)
+            bounds = calibrate_corridor(units, scores, level=level)
             cell = {
                 "friction": friction,
                 "speed": speed,
@@ -102,7 +106,7 @@ def corridor_by_speed(
                 "tube_m": bounds["followed_position"],
                 "lateral_m": float(np.max(np.abs(parts[-1].lateral))),
             }
-            cells.append(cell | covered(bounds, fresh))
+            cells.append(cell | corridor_coverage(bounds, test))
     share = float(np.mean([cell["coverage"] for cell in cells]))
     return {
         "level": level,
@@ -110,39 +114,39 @@ def corridor_by_speed(
         "duration_s": about["duration_s"],
         "cells": cells,
         "coverage": share,
-        "coverage_ci95": interval(share, drives * len(cells)),
+        "coverage_ci95": coverage_interval(share, drives * len(cells)),
         "seconds": time.perf_counter() - began,
     }
 
 
-def fastest(
-    cells: Sequence[Mapping[str, Any]], room: float
+def fastest_speeds(
+    cells: Sequence[Mapping[str, Any]], clearance: float
 ) -> dict[float, float | None]:
-    """The largest speed by friction at which the corridor, and that of every lower speed, fits into a lane.
+    """Return the largest speed by friction up to which all corridors fit into a lane.
 
     Args:
         cells: of `corridor_by_speed`.
-        room: what the lane leaves on either side of the car [m].
+        clearance: between the car and either edge of the lane [m].
 
     Returns:
-        Speeds [m/s] out of the cells; None where not even the lowest fits. Nothing is
-        interpolated.
+        Speeds of the cells, not interpolated [m/s]; None if not even the lowest fits.
     """
-    found: dict[float, float | None] = {}
-    closed_off = set()
+    speeds: dict[float, float | None] = {}
+    exceeded = set()
     for cell in sorted(cells, key=lambda cell: (cell["friction"], cell["speed"])):
         friction = cell["friction"]
-        found.setdefault(friction, None)
-        if not cell["corridor_m"] <= room:
-            closed_off.add(friction)
-        elif friction not in closed_off:
-            found[friction] = cell["speed"]
-    return found
+        speeds.setdefault(friction, None)
+        if not cell["corridor_m"] <= clearance:
+            exceeded.add(friction)
+        elif friction not in exceeded:
+            speeds[friction] = cell["speed"]
+    return speeds
 
 
 def _require_inside(name: str, values: Sequence[float], box: Sequence[float]) -> None:
-    """Refuse what lies outside the box that was certified."""
+    """Refuse values outside the certified box."""
     if outside := [value for value in values if not box[0] <= value <= box[1]]:
         raise ValueError(
-            f"{name} {outside[0]:g} lies outside what is certified, {box[0]:g} to {box[1]:g}"
+            f"{name} {outside[0]:g} is outside the certified range, "
+            f"{box[0]:g} to {box[1]:g}"
         )

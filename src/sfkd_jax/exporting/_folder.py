@@ -1,4 +1,4 @@
-"""The export folder: programs, their manifest, the weights for users of jax, and a script that runs it all."""
+"""Write the export folder: programs, manifest, weights and a script that runs them."""
 
 from __future__ import annotations
 
@@ -12,13 +12,14 @@ import jax
 import numpy as np
 
 from sfkd_jax import artefacts, build, policy
+from sfkd_jax.core.ranges import Names
 from sfkd_jax.exporting._iree import compile_iree
-from sfkd_jax.exporting._programs import Leaf, flat_programs, lowered
+from sfkd_jax.exporting._programs import Leaf, flat_programs, lower
 from sfkd_jax.types import Params
 
 FORMAT = 2
-"""Version of the manifest and of the order of arguments; run_controller.py refuses
-every other one.
+"""Version of the manifest and of the order of arguments; run_controller.py reads no
+other version.
 """
 PLATFORMS = ("cpu", "cuda", "rocm", "tpu")
 FILES = {"act": "controller", "init": "initial_state"}
@@ -36,16 +37,18 @@ def write_controller(
     made_from: Mapping[str, str],
     platforms: tuple[str, ...] = ("cpu", "cuda"),
     iree: bool = False,
-    iree_flags: tuple[str, ...] = ("--iree-llvmcpu-target-cpu=host",),
+    iree_flags: Names = ("--iree-llvmcpu-target-cpu=host",),
 ) -> dict[str, Any]:
-    """Write a controller for processes without sfkd_jax; the manifest comes last and is returned.
+    """Write a controller for processes without sfkd_jax, and return its manifest.
+
+    The manifest is written last.
 
     Args:
-        trained: what to write.
-        folder: where; what an earlier export left there is replaced.
-        made_from: hashes of what the weights were made from.
-        platforms: where the programs are to run.
-        iree: compile for C and C++ as well.
+        trained: the policy to export.
+        folder: to write; an earlier export in it is replaced.
+        made_from: hashes of the artefacts that the weights were made from.
+        platforms: that the programs are compiled for.
+        iree: whether to compile for C and C++ as well.
         iree_flags: for iree-compile.
 
     Raises:
@@ -55,23 +58,24 @@ def write_controller(
     """
     if not platforms or not set(platforms) <= set(PLATFORMS):
         raise ValueError(
-            f"export.platforms must be some of {', '.join(PLATFORMS)}, got {list(platforms)}"
+            f"export.platforms must be some of {', '.join(PLATFORMS)}, "
+            f"got {list(platforms)}"
         )
-    found = flat_programs(trained)
-    programs = {name: getattr(found, name) for name in FILES}
+    flat = flat_programs(trained)
+    programs = {name: getattr(flat, name) for name in FILES}
     modules = {
         name: compile_iree(program, flags=iree_flags)
         for name, program in programs.items()
         if iree
     }
     exported = {
-        name: lowered(program.function, program, platforms)
+        name: lower(program.function, program, platforms)
         for name, program in programs.items()
     }
     for stale in (MANIFEST, CERTIFICATE, *(f"{stem}.vmfb" for stem in FILES.values())):
         (folder / stale).unlink(missing_ok=True)
     stored = policy.save(
-        folder / "policy.npz", trained.params, trained.settings, made_from=made_from
+        folder / "policy.npz", trained.weights, trained.settings, made_from=made_from
     )
     manifest = {
         "kind": "controller",
@@ -79,16 +83,16 @@ def write_controller(
         "jax": jax.__version__,
         "calling_convention_version": exported["act"].calling_convention_version,
         "platforms": list(platforms),
-        "key_implementation": found.key_implementation,
+        "key_implementation": flat.key_implementation,
         "programs": {
-            name: _stored(
+            name: _write(
                 folder / f"{FILES[name]}.stablehlo", bytes(exported[name].serialize())
             )
             | {"inputs": _listed(program.inputs), "outputs": _listed(program.outputs)}
             for name, program in programs.items()
         },
         "iree": {
-            name: _stored(folder / f"{FILES[name]}.vmfb", module)
+            name: _write(folder / f"{FILES[name]}.vmfb", module)
             for name, module in modules.items()
         }
         or None,
@@ -96,7 +100,7 @@ def write_controller(
         "weights_sha256": stored["sha256"],
         "certificate_sha256": _certificate(trained, folder, policy.policy_hash(stored)),
         **_vehicle(trained),
-        "parameters": _count(trained.params),
+        "parameters": _count(trained.weights),
         "settings": trained.settings,
         "versions": artefacts.versions(),
     }
@@ -107,8 +111,8 @@ def write_controller(
     return manifest
 
 
-def _stored(path: Path, content: bytes) -> dict[str, Any]:
-    """Write a file; what a reader needs to know that it is whole."""
+def _write(path: Path, content: bytes) -> dict[str, Any]:
+    """Write a file and return its name, size and hash."""
     artefacts.write_bytes(path, content)
     return {
         "file": path.name,
@@ -124,10 +128,9 @@ def _listed(leaves: tuple[Leaf, ...]) -> list[dict[str, Any]]:
 def _certificate(
     trained: policy.Policy, folder: Path, policy_sha256: str
 ) -> str | None:
-    """Copy the certificate, which was verified when the policy was loaded, if there is one; returns the file's hash.
+    """Copy the verified certificate of a policy, if any, and return the file's hash.
 
-    It is about the same model, and bound to the settings as they are exported: another
-    controller, perhaps.
+    The copy refers to the settings as exported, perhaps with another controller.
     """
     if trained.certificate is None:
         return None
@@ -138,8 +141,9 @@ def _certificate(
 
 
 def _vehicle(trained: policy.Policy) -> dict[str, Any]:
-    """What the numbers mean: names, units and limits."""
-    plant, settings = build.build_vehicle(trained.settings["vehicle"]), trained.settings
+    """Names, units and limits of controls, observation, environment and reference."""
+    settings = trained.settings
+    plant = build.build_vehicle(settings["vehicle"])
     drive = "speed command [m/s]" if plant.speed_loop else "acceleration [m/s^2]"
     limits = zip(
         ("steering [rad]", drive), plant.control_low, plant.control_high, strict=True
@@ -158,5 +162,5 @@ def _vehicle(trained: policy.Policy) -> dict[str, Any]:
 
 
 def _count(params: Params) -> int:
-    """How many weights."""
+    """Return the number of weights."""
     return sum(int(np.size(leaf)) for leaf in jax.tree.leaves(params))

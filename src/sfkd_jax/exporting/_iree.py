@@ -1,23 +1,25 @@
-"""The route to C and C++: StableHLO compiled by IREE to a module that its runtime loads without Python."""
+"""Compile StableHLO with IREE to modules for C and C++."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 
-from sfkd_jax.exporting._programs import Program, lowered
-from sfkd_jax.exporting._weights_first import weights_first
+from sfkd_jax.exporting._constants import fold_constants
+from sfkd_jax.exporting._programs import Program, lower
 
 
 def compile_iree(program: Program, *, flags: Sequence[str] = ()) -> bytes:
-    """An IREE module (.vmfb) for processors, its function `main`; arguments and results as in the manifest.
+    """Return an IREE module (.vmfb) for CPUs, with the function `main`.
+
+    Arguments and results are those of the manifest.
 
     Args:
-        program: what to compile.
-        flags: for iree-compile, for example the processor or the target triple.
+        program: to compile.
+        flags: for iree-compile, such as the processor or the target triple.
 
     Raises:
         ValueError: IREE is not installed, or does not compile this program; with its
-            first complaint.
+            first error.
     """
     try:
         from iree import compiler  # pyright: ignore[reportMissingImports]
@@ -25,7 +27,7 @@ def compile_iree(program: Program, *, flags: Sequence[str] = ()) -> bytes:
         raise ValueError(
             "export.iree=true needs IREE: pip install 'sfkd-jax[cpp]'"
         ) from None
-    text = lowered(weights_first(program), program, ("cpu",)).mlir_module()
+    text = lower(fold_constants(program), program, ("cpu",)).mlir_module()
     try:
         return compiler.compile_str(
             text,
@@ -34,7 +36,7 @@ def compile_iree(program: Program, *, flags: Sequence[str] = ()) -> bytes:
             extra_args=list(flags),
         )
     except compiler.CompilerToolError as error:
-        complaint = str(error).partition("Diagnostics:\n")[2] or str(error)
+        message = str(error).partition("Diagnostics:\n")[2] or str(error)
         raise ValueError(
-            f"iree-compile failed: {complaint.splitlines()[0][:300]}"
+            f"iree-compile failed: {message.splitlines()[0][:300]}"
         ) from error

@@ -1,4 +1,4 @@
-"""Settings of jax that have no narrower scope than a process, made for one piece of work."""
+"""Change process-wide settings of jax for the duration of one task."""
 
 from __future__ import annotations
 
@@ -9,15 +9,17 @@ import jax
 
 
 @contextmanager
-def jax_settings(asked: Mapping[str, object]) -> Iterator[None]:
-    """Settings as asked, and afterwards as they were; other threads should not trace or compile meanwhile.
+def jax_settings(values: Mapping[str, object]) -> Iterator[None]:
+    """Set settings of jax and restore them afterwards.
+
+    Other threads should not trace or compile meanwhile.
 
     Args:
-        asked: by their names in `jax.config`.
+        values: by their names in `jax.config`.
     """
-    before = {name: getattr(jax.config, name) for name in asked}
+    before = {name: getattr(jax.config, name) for name in values}
     try:
-        _set(asked)
+        _set(values)
         yield
     finally:
         _set(before)

@@ -1,4 +1,4 @@
-"""A controller as two functions from flat arrays to flat arrays, every array with a name."""
+"""Controllers as functions from flat, named arrays to flat, named arrays."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from sfkd_jax.policy import Policy
 
 
 class Leaf(NamedTuple):
-    """One array that crosses the border."""
+    """Name, shape and dtype of an array that a program takes or returns."""
 
     name: str
     shape: tuple[int, ...]
@@ -25,7 +25,7 @@ class Leaf(NamedTuple):
 
 
 class Program(NamedTuple):
-    """A function of flat arrays, what it takes and what it returns, in order."""
+    """A function of flat arrays, with its inputs and outputs in order."""
 
     function: Callable[..., tuple[Array, ...]]
     inputs: tuple[Leaf, ...]
@@ -33,13 +33,13 @@ class Program(NamedTuple):
 
 
 class Programs(NamedTuple):
-    """A controller as others run it.
+    """The two programs of a controller.
 
     Attributes:
         init: (key) -> state leaves.
         act: (state leaves, observation, env, reference) -> (control, state leaves, info
             leaves).
-        key_implementation: how keys are drawn from; outside they are their uint32 data.
+        key_implementation: of random keys, which are passed as their uint32 data.
     """
 
     init: Program
@@ -48,7 +48,7 @@ class Programs(NamedTuple):
 
 
 def example_inputs(policy: Policy) -> tuple[Any, ...]:
-    """Shapes of (key, controller state, observation, env, reference) of a policy's controller."""
+    """Return the shapes of key, controller state, observation, env and reference."""
     key = jax.eval_shape(partial(jax.random.key, 0))
     settings = policy.settings
     plant = build.build_vehicle(settings["vehicle"])
@@ -59,10 +59,10 @@ def example_inputs(policy: Policy) -> tuple[Any, ...]:
 
 
 def flat_programs(policy: Policy) -> Programs:
-    """The controller of a policy over flat arrays, its weights inside, folded.
+    """Return the controller of a policy as programs, with folded weights inside.
 
-    Names are paths: `state.inner.plan`, `info.cost`. Typed keys do not cross a border,
-    so their uint32 data do.
+    Names are paths, such as `state.inner.plan` and `info.cost`. Keys are passed as
+    their uint32 data.
 
     Raises:
         ValueError: the controller's state changes its structure, shapes or dtypes from
@@ -72,12 +72,11 @@ def flat_programs(policy: Policy) -> Programs:
     implementation = str(jax.random.key_impl(jax.random.key(0)))
     wrap = partial(jax.random.wrap_key_data, impl=implementation)
     template, structure = jax.tree.flatten(state)
-    folded = jax.jit(policy.model.fold)(policy.params)
 
     def init(key_data: Array) -> tuple[Array, ...]:
-        return tuple(_opened(policy.controller.init(wrap(key_data))))
+        return tuple(_unpack(policy.controller.init(wrap(key_data))))
 
-    def closed(leaves: Sequence[Array]) -> Any:
+    def pack(leaves: Sequence[Array]) -> Any:
         wrapped = [
             wrap(leaf) if _is_key(like) else leaf
             for like, leaf in zip(template, leaves, strict=True)
@@ -86,23 +85,24 @@ def flat_programs(policy: Policy) -> Programs:
 
     def act(*leaves: Array) -> tuple[Array, ...]:
         *before, observation, env, reference = leaves
-        # Without the barrier XLA evaluates at compile time what depends on weights
-        # alone, and rounds otherwise.
-        params = jax.lax.optimization_barrier(folded)
+        # Without the barrier XLA evaluates functions of the weights at compile time and
+        # rounds differently.
+        params = jax.lax.optimization_barrier(policy.params)
         control, after, info = policy.controller.act(
-            params, closed(before), observation, env, reference
+            params, pack(before), observation, env, reference
         )
-        return control, *_opened(after), *jax.tree.leaves(info)
+        return control, *_unpack(after), *jax.tree.leaves(info)
 
     control, after, info = jax.eval_shape(
-        policy.controller.act, folded, state, *measured
+        policy.controller.act, policy.params, state, *measured
     )
     if (
         _named("state", after) != _named("state", state)
         or jax.tree.structure(after) != structure
     ):
         raise ValueError(
-            "cannot export a controller whose state changes its structure, shapes or dtypes"
+            "cannot export a controller whose state changes its structure, "
+            "shapes or dtypes"
         )
     arguments = zip(("observation", "env", "reference"), measured, strict=True)
     inputs = _named("state", state) + tuple(
@@ -113,38 +113,43 @@ def flat_programs(policy: Policy) -> Programs:
         *_named("state", after),
         *_named("info", info),
     )
-    started = Program(init, (_leaf("key", key),), _named("state", state))
-    return Programs(started, Program(act, inputs, outputs), implementation)
+    initial = Program(init, (_leaf("key", key),), _named("state", state))
+    return Programs(initial, Program(act, inputs, outputs), implementation)
 
 
-def specifications(program: Program) -> tuple[jax.ShapeDtypeStruct, ...]:
-    """The shapes of a program's inputs as jax takes them."""
+def input_shapes(program: Program) -> tuple[jax.ShapeDtypeStruct, ...]:
+    """Return the shapes of a program's inputs."""
     return tuple(
         jax.ShapeDtypeStruct(leaf.shape, leaf.dtype) for leaf in program.inputs
     )
 
 
-def lowered(
+def lower(
     function: Callable[..., Any], program: Program, platforms: tuple[str, ...]
 ) -> jax.export.Exported:
-    """A function of a program's inputs as StableHLO; no argument is dropped, also if nothing depends on it.
+    """Return a function of a program's inputs as StableHLO, with unused arguments kept.
 
-    Without the places in source files that jax notes beside every operation: they tell
-    where this machine keeps its files, and make the same program another one elsewhere.
+    Source locations are left out: they contain paths of this machine and would make the
+    result depend on it.
+
+    Args:
+        function: to lower.
+        program: for its inputs.
+        platforms: to lower for.
     """
     with jax_settings({"jax_traceback_in_locations_limit": 0}):
-        lower = jax.export.export(
+        export = jax.export.export(
             jax.jit(function, keep_unused=True), platforms=platforms
         )
-        return lower(*specifications(program))
+        return export(*input_shapes(program))
 
 
 def _is_key(leaf: Any) -> bool:
     return jnp.issubdtype(leaf.dtype, jax.dtypes.prng_key)
 
 
-def _opened(tree: Any) -> list[Array]:
-    """Leaves, keys as their data."""
+def _unpack(tree: Any) -> list[Array]:
+    """Return the leaves, with keys as their data."""
     return [
         jax.random.key_data(leaf) if _is_key(leaf) else leaf
         for leaf in jax.tree.leaves(tree)
@@ -152,13 +157,13 @@ def _opened(tree: Any) -> list[Array]:
 
 
 def _leaf(name: str, value: Any) -> Leaf:
-    """What is known of an array before it is there."""
+    """Name, shape and dtype of an array, or of the data of a key."""
     data = jax.eval_shape(jax.random.key_data, value) if _is_key(value) else value
     return Leaf(name, tuple(data.shape), str(data.dtype))
 
 
 def _named(root: str, tree: Any) -> tuple[Leaf, ...]:
-    """The leaves of a tree under dotted paths."""
+    """Return the leaves of a tree by dotted path."""
     paths = jax.tree_util.tree_leaves_with_path(tree)
     names = (
         f"{root}.{jax.tree_util.keystr(path, simple=True, separator='.')}"

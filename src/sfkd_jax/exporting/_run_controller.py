@@ -1,4 +1,4 @@
-"""Run the controller in this folder. Needs jax, numpy and flatbuffers; nothing else.
+"""Run the controller in this folder; requires jax, numpy and flatbuffers only.
 
     python run_controller.py --steps 20
 
@@ -11,8 +11,8 @@ checks the files and steps the controller on a straight road. In your own progra
     control, state, info = controller.act(state, observation, env, reference)
 
 Set JAX_COMPILATION_CACHE_DIR to a directory and
-JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS=0 before the start, and later starts read
-back what the first one compiled.
+JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS=0 before the start, and later starts load
+the compiled programs of the first one.
 """
 
 from __future__ import annotations
@@ -33,8 +33,8 @@ import numpy as np
 
 FORMAT = 2
 """Version of controller.json that this file reads."""
-LARGEST = 1 << 24
-"""Bytes of controller.json; it has some 20 kB."""
+MAX_BYTES = 1 << 24
+"""Size of controller.json, which has about 20 kB."""
 MALFORMED = (
     KeyError,
     TypeError,
@@ -44,23 +44,26 @@ MALFORMED = (
     OverflowError,
     RecursionError,
 )
-"""What is raised about a manifest that says of itself what it is not."""
+"""Exceptions that a manifest of wrong content can raise."""
 
 
 class ExportError(Exception):
-    """A file of the export that cannot be used: its name and the reason, in one line."""
+    """A file of the export cannot be used; one line with its name and the reason."""
 
 
 class ExportedController:
-    """A controller as it was exported: checked, deserialised and compiled once, when it is made.
+    """An exported controller, checked and compiled when it is constructed.
 
     Attributes:
-        manifest: what controller.json says: names, shapes, units, limits, hashes,
+        manifest: content of controller.json: names, shapes, units, limits, hashes and
             settings.
     """
 
     def __init__(self, folder: str | Path = Path(__file__).parent) -> None:
-        """Read and compile.
+        """Read and compile the programs.
+
+        Args:
+            folder: of the export.
 
         Raises:
             ExportError: a file is missing, no regular file, truncated, changed,
@@ -73,9 +76,8 @@ class ExportedController:
                 _compiled(path.parent, self.manifest, name) for name in ("init", "act")
             )
             key, first = self._key(0), self.manifest["programs"]["init"]["inputs"][0]
-            known = isinstance(self.manifest["key_implementation"], str)
             if (
-                not known
+                not isinstance(self.manifest["key_implementation"], str)
                 or key.shape != tuple(first["shape"])
                 or str(key.dtype) != first["dtype"]
             ):
@@ -86,25 +88,25 @@ class ExportedController:
             ) from None
 
     def init(self, seed: int = 0) -> dict[str, jax.Array]:
-        """The state before the first step; the seed fixes all samples that will be drawn."""
+        """Return the state before the first step; `seed` determines all samples."""
         return self._named("init", "state", self._init(self._key(seed)))
 
     def act(
         self, state: dict[str, jax.Array], observation: Any, env: Any, reference: Any
     ) -> tuple[jax.Array, dict[str, jax.Array], dict[str, jax.Array]]:
-        """One control step: (control, next state, info).
+        """Return (control, next state, info) of one control step.
 
         Values that are not finite are passed on; the controller then continues its last
-        plan and `info` says so.
+        plan, and `info` reports it.
 
         Args:
-            state: from `init` or the step before.
+            state: from `init` or the previous step.
             observation: (p_x [m], p_y [m], yaw [rad], v [m/s], …).
             env: (friction [-], lateral wind [m/s]).
             reference: (horizon, 4): x, y, yaw, speed at the next steps.
 
         Raises:
-            ValueError: an argument of the wrong shape, or a state that is not of this
+            ValueError: an argument of the wrong shape, or a state of another
                 controller.
         """
         measured = {"observation": observation, "env": env, "reference": reference}
@@ -121,23 +123,24 @@ class ExportedController:
         for leaf, value in zip(expected, given.values(), strict=True):
             if value.shape != tuple(leaf["shape"]):
                 raise ValueError(
-                    f"{leaf['name']} must have shape {tuple(leaf['shape'])}, got {value.shape}"
+                    f"{leaf['name']} must have shape {tuple(leaf['shape'])}, "
+                    f"got {value.shape}"
                 )
-        found = self._act(*given.values())
+        outputs = self._act(*given.values())
         return (
-            found[0],
-            self._named("act", "state", found),
-            self._named("act", "info", found),
+            outputs[0],
+            self._named("act", "state", outputs),
+            self._named("act", "info", outputs),
         )
 
     def _key(self, seed: int) -> jax.Array:
-        """A random key as the programs take it."""
+        """Return the data of a random key."""
         return jax.random.key_data(
             jax.random.key(seed, impl=self.manifest["key_implementation"])
         )
 
     def _named(self, program: str, root: str, values: Any) -> dict[str, jax.Array]:
-        """The results of a program whose names begin with `root`, without it."""
+        """Return the outputs below `root` by name, without the prefix."""
         names = [leaf["name"] for leaf in self.manifest["programs"][program]["outputs"]]
         pairs = zip(names, values, strict=True)
         return {
@@ -148,30 +151,31 @@ class ExportedController:
 
 
 def _manifest(path: Path) -> dict[str, Any]:
-    """What controller.json says, if it says what was written."""
+    """Return the content of controller.json, checked against its hash."""
     try:
-        manifest = json.loads(_content(path, LARGEST).decode())
+        manifest = json.loads(_content(path, MAX_BYTES).decode())
         if not isinstance(manifest, dict) or manifest.get("kind") != "controller":
             raise ExportError(f"{path}: not the manifest of a controller")
         if manifest.get("format") != FORMAT:
             raise ExportError(
                 _line(
-                    f"{path}: is of format {manifest.get('format')}, this file reads {FORMAT}"
+                    f"{path}: is of format {manifest.get('format')}, "
+                    f"this file reads {FORMAT}"
                 )
             )
-        said = {name: value for name, value in manifest.items() if name != "sha256"}
+        hashed = {name: value for name, value in manifest.items() if name != "sha256"}
         digest = hashlib.sha256(
-            json.dumps(said, sort_keys=True, allow_nan=False).encode()
+            json.dumps(hashed, sort_keys=True, allow_nan=False).encode()
         ).hexdigest()
     except (ValueError, RecursionError):
         raise ExportError(f"{path}: truncated or not JSON") from None
     if digest != manifest.get("sha256"):
-        raise ExportError(f"{path}: changed, its sha256 is not that of what it says")
+        raise ExportError(f"{path}: changed, its sha256 is not that of its content")
     return manifest
 
 
 def _compiled(folder: Path, manifest: dict[str, Any], name: str) -> Any:
-    """A program of the export, compiled for the device that jax uses by itself."""
+    """Return a program of the export, compiled for the default device."""
     program = manifest["programs"][name]
     if Path(program["file"]).name != program["file"] or program["file"] in ("", ".."):
         raise ValueError(
@@ -196,8 +200,8 @@ def _compiled(folder: Path, manifest: dict[str, Any], name: str) -> Any:
         ]
         compiled = jax.jit(exported.call).lower(*inputs).compile()
     except Exception as error:  # a blob of another version raises nearly anything
-        reason = f"{path}: written by jax {manifest['jax']}, refused by {jax.__version__}: {error}"
-        raise ExportError(_line(reason)) from None
+        written = f"written by jax {manifest['jax']}, refused by {jax.__version__}"
+        raise ExportError(_line(f"{path}: {written}: {error}")) from None
     for side, values in (
         ("inputs", exported.in_avals),
         ("outputs", exported.out_avals),
@@ -212,7 +216,7 @@ def _compiled(folder: Path, manifest: dict[str, Any], name: str) -> Any:
 
 
 def _content(path: Path, most: int) -> bytes:
-    """The bytes of a regular file that has at most so many; nothing else is waited for."""
+    """Return the content of a regular file of at most `most` bytes."""
     try:
         number = os.open(path, os.O_RDONLY | os.O_NONBLOCK | os.O_NOCTTY | os.O_CLOEXEC)
         try:
@@ -227,45 +231,39 @@ def _content(path: Path, most: int) -> bytes:
                 return file.read(most)
         finally:
             os.close(number)
-    except (
-        OSError,
-        ValueError,
-    ) as error:  # a ValueError: of a name that no file can have
+    except (OSError, ValueError) as error:  # ValueError: an impossible file name
         raise ExportError(
             _line(f"{path}: {getattr(error, 'strerror', None) or error}")
         ) from None
 
 
 def _line(text: str) -> str:
-    """What a terminal shows as one line, and not more than it should."""
+    """Shorten a message to one printable line."""
     return "".join(
         letter if letter.isprintable() else " " for letter in " ".join(text.split())
     )[:500]
 
 
 def main() -> None:
-    """Step the controller as if it stood still beside a straight road, and print what it does."""
+    """Step the controller at a fixed observation and print its controls."""
     parser = argparse.ArgumentParser(
         description="Check an exported controller and step it on a straight road."
     )
     parser.add_argument("folder", nargs="?", default=Path(__file__).parent, type=Path)
     parser.add_argument("--steps", default=10, type=int)
     parser.add_argument("--seed", default=0, type=int)
-    asked = parser.parse_args()
+    arguments = parser.parse_args()
     try:
-        controller = ExportedController(asked.folder)
+        controller = ExportedController(arguments.folder)
         observation, env, reference = _straight(controller.manifest)
         names = [entry["name"] for entry in controller.manifest["controls"]]
     except ExportError as reason:
         sys.exit(f"run_controller: {reason}")
     except MALFORMED as reason:
-        sys.exit(
-            _line(
-                f"run_controller: {asked.folder}: malformed, {type(reason).__name__}: {reason}"
-            )
-        )
-    state, controls, times = controller.init(asked.seed), [], []
-    for _ in range(asked.steps):
+        message = f"malformed, {type(reason).__name__}: {reason}"
+        sys.exit(_line(f"run_controller: {arguments.folder}: {message}"))
+    state, controls, times = controller.init(arguments.seed), [], []
+    for _ in range(arguments.steps):
         began = time.perf_counter()
         control, state, _ = controller.act(state, observation, env, reference)
         controls.append(np.asarray(control).tolist())
@@ -278,7 +276,7 @@ def main() -> None:
 
 
 def _straight(manifest: dict[str, Any]) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Observation, environment and reference of a car that stands 0.3 m beside a straight road."""
+    """Observation, environment and reference of a car 0.3 m beside a straight road."""
     *_, observed, _, ahead = manifest["programs"]["act"]["inputs"]
     speed, observation = 10.0, np.zeros(observed["shape"])
     observation[1], observation[3] = 0.3, speed

@@ -1,4 +1,4 @@
-"""Compiling a controller before the first step is due."""
+"""Compile a controller before its first step."""
 
 from __future__ import annotations
 
@@ -14,40 +14,38 @@ from sfkd_jax.exporting._jax_settings import jax_settings
 from sfkd_jax.exporting._programs import example_inputs
 from sfkd_jax.policy import Policy
 
-KEPT = {
+CACHE_SETTINGS = {
     "jax_enable_compilation_cache": True,
     "jax_persistent_cache_min_compile_time_secs": 0.0,
     "jax_persistent_cache_min_entry_size_bytes": -1,
 }
-"""Whatever was asked to be kept is kept, however small."""
+"""Cache every compilation, however short and small."""
 
 
 def warm_up(policy: Policy, *, cache: str | Path | None = None) -> jax.stages.Compiled:
-    """Compile `act` for the shapes of a policy, so that no control step waits for a compiler.
+    """Compile `act` for the shapes of a policy, so that no step waits for a compiler.
 
-        act = warm_up(policy);   control, state, info = act(policy.params, state, observation, env, reference)
+        act = warm_up(policy)
+        control, state, info = act(policy.params, state, observation, env, reference)
 
-    With `cache` the machine code is kept in jax's persistent compilation cache: a later
-    process on the same kind of machine, with the same jax and controller, reads it
-    back. jax knows one cache for a whole process and offers no narrower one, so the
-    setting is made for this compilation alone and given back; other threads should not
-    compile meanwhile. To keep everything that a process compiles, set
-    JAX_COMPILATION_CACHE_DIR for it instead.
+    With `cache` the machine code is stored in jax's persistent compilation cache, and
+    later processes with the same kind of machine, jax and controller load it. The cache
+    is a setting of the whole process: it is changed for this compilation and restored
+    afterwards, and other threads should not compile meanwhile. To cache everything that
+    a process compiles, set JAX_COMPILATION_CACHE_DIR instead.
 
     Args:
         policy: as `load` returns it.
-        cache: a directory, made if missing; it holds machine code, so trust it as such.
+        cache: a directory, created if it is missing. It holds machine code that will be
+            executed, so it must be trusted.
 
     Returns:
-        The compiled function; it takes float32 arrays of these shapes and nothing else.
+        The compiled function, for float32 arrays of the policy's shapes only.
     """
     _, state, *measured = example_inputs(policy)
 
-    def act(
-        *arguments: Any,
-    ) -> (
-        Any
-    ):  # a new function: of one that has run, jax compiles and keeps nothing more
+    # A new function: jax would not compile and cache one again that has run.
+    def act(*arguments: Any) -> Any:
         return policy.controller.act(*arguments)
 
     lowered = jax.jit(act).lower(policy.params, state, *measured)
@@ -61,9 +59,14 @@ def warm_up(policy: Policy, *, cache: str | Path | None = None) -> jax.stages.Co
 
 @contextmanager
 def _persistent_cache(directory: Path) -> Iterator[None]:
-    """jax's compilation cache in `directory`, and afterwards as it was; an open one does not follow its settings."""
+    """Use jax's compilation cache in `directory`, and restore the former one.
+
+    The cache is reset, since an open one ignores changed settings.
+    """
     try:
-        with jax_settings(KEPT | {"jax_compilation_cache_dir": str(directory)}):
+        with jax_settings(
+            CACHE_SETTINGS | {"jax_compilation_cache_dir": str(directory)}
+        ):
             compilation_cache.reset_cache()
             yield
     finally:

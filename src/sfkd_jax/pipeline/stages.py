@@ -80,10 +80,10 @@ def _read_logs(settings: dict[str, Any]) -> Dataset:
     logged = from_logs(
         options["path"],
         columns,
-        say=artefacts.print_message,
+        report=artefacts.print_message,
         dt=plant.dt,
         wheelbase=plant.wheelbase,
-        told=store.has_environment(settings),
+        needs_environment=store.has_environment(settings),
         limits=(plant.control_low or None, plant.control_high or None),
         **build.as_kwargs(options, "path", "columns"),
     )

@@ -1,4 +1,4 @@
-"""Evaluating ahead what depends on weights alone."""
+"""Evaluate ahead of time all operations that depend on weights only."""
 
 from __future__ import annotations
 
@@ -10,19 +10,19 @@ import jax
 from jax.extend.core import ClosedJaxpr, Literal, Var, jaxpr_as_fun
 from jaxtyping import Array
 
-from sfkd_jax.exporting._programs import Program, specifications
+from sfkd_jax.exporting._programs import Program, input_shapes
 
 
-def weights_first(program: Program) -> Callable[..., list[Array]]:
-    """The same function, with everything that no input enters evaluated now and kept as constants.
+def fold_constants(program: Program) -> Callable[..., list[Array]]:
+    """Return the same function with all operations on constants replaced by results.
 
-    A compiler without LAPACK cannot take factorisations over. With folded parameters
-    one model has any left that depend on the weights alone, ControlSynth (the inverse
-    of its metric's factor). Those of every control step stay: the quadratic program of
-    `koopman_mpc`, the eigenvectors of `curvature`. The rounding is not that of one
-    program.
+    IREE has no LAPACK and cannot compile factorisations. With folded parameters one
+    model still has factorisations of its weights: ControlSynth, for the inverse of its
+    metric's factor. Factorisations in every control step remain: those of the quadratic
+    program of `koopman_mpc` and the eigenvectors of `curvature`. The rounding differs
+    from that of a single program.
     """
-    closed = jax.make_jaxpr(program.function)(*specifications(program))
+    closed = jax.make_jaxpr(program.function)(*input_shapes(program))
     jaxpr = closed.jaxpr
     known, ahead, rest = set(jaxpr.constvars), [], []
     for equation in jaxpr.eqns:
