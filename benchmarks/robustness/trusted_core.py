@@ -1,9 +1,11 @@
-"""Search for a falsehood that the trusted core accepts: hostile matrices and witnesses against exact arithmetic.
+"""Search for a false claim that the trusted core accepts, with exact arithmetic.
 
-python -m benchmarks.robustness.trusted_core [--cases 200000 --seed 1 --out
-benchmarks/robustness/trusted_core.json] Every second case is a matrix with a tolerated error,
-every other one a network with multipliers, a bound, A and P. It stops at the first case
-that is accepted and false. `true` counts those that hold, `accepted` those that passed.
+    python -m benchmarks.robustness.trusted_core [--cases 200000 --seed 1]
+        [--out benchmarks/robustness/trusted_core.json]
+
+Half of the cases are hostile matrices with a tolerated error, half are networks with
+multipliers, a bound, A and P. The search stops at the first case that is accepted and
+false. `true` counts the cases that hold, `accepted` those that the core accepts.
 """
 
 import argparse
@@ -15,34 +17,32 @@ from pathlib import Path
 HERE = Path(__file__).resolve().parent
 sys.path.append(str(HERE.parents[1] / "tests"))
 
-from exact import search  # noqa: E402  beside the tests, which run the same search shorter
+from exact import search  # noqa: E402  the tests run the same search with fewer cases
 
 from sfkd_jax import artefacts  # noqa: E402
 
 
 def main():
-    """Search and write what was counted."""
+    """Search, and write the counts."""
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
     parser.add_argument("--cases", type=int, default=200_000)
     parser.add_argument("--seed", type=int, default=1)
     parser.add_argument("--out", type=Path)
-    asked = parser.parse_args()
+    options = parser.parse_args()
     began = time.perf_counter()
-    counts = search(asked.cases, asked.seed)
+    counts = search(options.cases, options.seed)
     document = {
-        "cases": asked.cases,
-        "seed": asked.seed,
+        "cases": options.cases,
+        "seed": options.seed,
         "false_and_accepted": 0,
         **counts,
-    }
-    document |= {
         "seconds": round(time.perf_counter() - began),
         "versions": artefacts.versions(),
     }
-    if asked.out:
-        artefacts.write_json(asked.out, document)
+    if options.out:
+        artefacts.write_json(options.out, document)
     print(json.dumps(document))
 
 

@@ -148,7 +148,7 @@ def test_the_multipliers_that_a_sandwich_carries_prove_its_own_bound(scale):
         assert not check_witness(weights.residual, halved, claimed * (1 + 1e-6))
 
 
-# --- mutants: certifiers with a known fault, each of which a soundness check must catch 
+# --- mutants: certifiers with a known fault, each of which a soundness check must catch
 
 
 def power_iteration(matrix, steps=5):
