@@ -1,12 +1,12 @@
-"""A seeded fuzzer of everything that this package reads: documents, arrays, logs, runs and exported controllers.
+"""A seeded fuzzer of all files that this package reads.
 
     python tests/fuzzing.py --cases 10000 --seed 0
 
-Each case changes one file of a sound folder, reads the folder as the package does, and
-asks for one of two outcomes: what was read means what is in the file, or a refusal in
-one line that names the file. A case that takes longer than SECONDS, allocates more than
-1 GiB or raises anything else is a fault. The case is a function of (seed, reader,
-number) and can be run alone:  --only read_json --case 17
+Each case changes one file of a valid folder and reads the folder as the package does.
+There are two valid outcomes: the content is read correctly, or the file is refused in
+one line that names it. A case that takes longer than SECONDS, allocates more than 1 GiB
+or raises anything else is a fault. A case is a function of (seed, reader, number) and
+can be run alone:  --only read_json --case 17
 """
 
 import argparse
@@ -24,23 +24,17 @@ from pathlib import Path
 from typing import Any
 
 import fuzzing_readers as readers
-from fuzzing_mutations import place_special
+from fuzzing_mutations import put_special_file
 
 MEMORY_DISK = Path("/dev/shm")
-"""Where the folders lie if it is there: on a disk, writing them takes longer than
-reading.
-"""
+"""Directory of the folders if it exists; writing to a disk takes longer than reading."""
 SECONDS = 30
-"""That one case may take; the slowest honest one takes 0.3 s, on a machine that has
-nothing else to do.
-"""
+"""Time limit of a case; the slowest valid one takes 0.3 s on an idle machine."""
 MEMORY = 1 << 30
-"""Bytes of address space that a case may ask for beyond what the process has when it
-starts.
-"""
+"""Address space that a case may allocate [bytes]."""
 SPECIAL = 0.02
-"""Share of cases in which a pipe, a device, a folder, a socket or a link stands in
-place of the file.
+"""Share of cases in which a pipe, a device, a folder, a socket or a link replaces the
+file.
 """
 SHARES = {
     "read_json": 25,
@@ -57,7 +51,7 @@ SHARES = {
     "exported": 1,
     "load": 1,
 }
-"""Of 100 cases; those that draw, compile or import a library get fewer."""
+"""Cases of 100; readers that draw, compile or import a library get fewer."""
 
 
 class Hang(BaseException):
@@ -72,9 +66,9 @@ def fault_of(
     """
     signal.setitimer(signal.ITIMER_REAL, SECONDS)
     try:
-        found = reader.read(folder)
+        result = reader.read(folder)
         signal.setitimer(signal.ITIMER_REAL, 0)
-        if not reader.holds(found, folder):
+        if not reader.holds(result, folder):
             return "changed", "accepted, but means something else"
     except reader.refusals as reason:
         line = str(reason)
@@ -106,7 +100,7 @@ def restore(folder: Path, sound: dict[str, bytes]) -> None:
             continue
         if path.is_symlink() or not path.is_dir():
             path.unlink()
-        elif not any(kept.startswith(f"{name}/") for kept in sound):
+        elif not any(stored.startswith(f"{name}/") for stored in sound):
             path.rmdir()
     for name, content in sound.items():
         if not (folder / name).exists() or (folder / name).read_bytes() != content:
@@ -120,8 +114,8 @@ def fuzz(
     reader, outcomes, faults, slowest = readers.READERS[name], Counter(), [], 0.0
     with tempfile.TemporaryDirectory(
         dir=MEMORY_DISK if MEMORY_DISK.is_dir() else None
-    ) as place:
-        folder = Path(place)
+    ) as run_dir:
+        folder = Path(run_dir)
         reader.make(folder)
         sound = {
             file.relative_to(folder).as_posix(): file.read_bytes()
@@ -137,7 +131,7 @@ def fuzz(
             draw = random.Random(f"{seed}/{name}/{number}")
             file = draw.choice(list(reader.files))
             if draw.random() < SPECIAL:
-                place_special(draw, folder / file)
+                put_special_file(draw, folder / file)
             else:
                 (folder / file).write_bytes(reader.files[file](draw, sound[file]))
             began = time.monotonic()
@@ -150,7 +144,7 @@ def fuzz(
                         "reader": name,
                         "case": number,
                         "file": file,
-                        "fault": fault.replace(place, ""),
+                        "fault": fault.replace(run_dir, ""),
                     }
                 )
     return outcomes, faults, slowest
@@ -177,7 +171,7 @@ def main() -> None:
     parser.add_argument("--seed", default=0, type=int)
     parser.add_argument("--only", choices=list(SHARES))
     parser.add_argument("--case", type=int)
-    asked = parser.parse_args()
+    options = parser.parse_args()
     warnings.simplefilter("ignore")
     os.environ["TF_CPP_MIN_LOG_LEVEL"] = "3"
 
@@ -185,45 +179,49 @@ def main() -> None:
         raise Hang
 
     signal.signal(signal.SIGALRM, expire)
-    counts = {asked.only: asked.cases} if asked.only else shares(asked.cases, SHARES)
+    counts = (
+        {options.only: options.cases} if options.only else shares(options.cases, SHARES)
+    )
     for (
         name
     ) in counts:  # what is imported, compiled or cached once is no allocation of a case
-        fuzz(name, range(-1, 0), asked.seed)
+        fuzz(name, range(-1, 0), options.seed)
     bound_memory()
     before, began = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss, time.monotonic()
-    found: dict[str, Any] = {"readers": {}, "faults": []}
+    result: dict[str, Any] = {"readers": {}, "faults": []}
     for name, count in counts.items():
         started = time.monotonic()
         numbers = (
-            range(count) if asked.case is None else range(asked.case, asked.case + 1)
+            range(count)
+            if options.case is None
+            else range(options.case, options.case + 1)
         )
-        outcomes, faults, slowest = fuzz(name, numbers, asked.seed)
+        outcomes, faults, slowest = fuzz(name, numbers, options.seed)
         seconds = {
             "slowest_s": round(slowest, 3),
             "seconds": round(time.monotonic() - started, 1),
         }
-        found["readers"][name] = {"cases": len(numbers), **outcomes, **seconds}
-        found["faults"] += faults
-        print(name, found["readers"][name], file=sys.stderr, flush=True)
+        result["readers"][name] = {"cases": len(numbers), **outcomes, **seconds}
+        result["faults"] += faults
+        print(name, result["readers"][name], file=sys.stderr, flush=True)
     peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
-    found |= {
-        "cases": sum(entry["cases"] for entry in found["readers"].values()),
-        "seed": asked.seed,
+    result |= {
+        "cases": sum(entry["cases"] for entry in result["readers"].values()),
+        "seed": options.seed,
     }
-    found |= {
+    result |= {
         "memory_MiB": {
             "before": before >> 10,
             "grown_by": (peak - before) >> 10,
             "bound": MEMORY >> 20,
         }
     }
-    found |= {
+    result |= {
         "seconds": round(time.monotonic() - began, 1),
         "processor_s": round(time.process_time(), 1),
     }
-    print(json.dumps(found), flush=True)
-    sys.exit(1 if found["faults"] else 0)
+    print(json.dumps(result), flush=True)
+    sys.exit(1 if result["faults"] else 0)
 
 
 if __name__ == "__main__":

@@ -1,6 +1,4 @@
-"""How the fuzzer changes a file: documents by structure and by text, archives by their
-members, headers and bytes.
-"""
+"""Changes for the fuzzer: of documents by structure and text, and of zip files."""
 
 import io
 import json
@@ -198,10 +196,10 @@ def json_change(draw: random.Random, content: bytes) -> bytes:
 
 def value_change(draw: random.Random, document: Any) -> Any:
     """One value gone, replaced, doubled, moved or made larger, anywhere in a document."""
-    places = list(_places(document))
-    if not places:
+    paths_in = list(_paths_in(document))
+    if not paths_in:
         return deepcopy(draw.choice(VALUES))
-    inner, key = draw.choice(places)
+    inner, key = draw.choice(paths_in)
     value, kind = inner[key], draw.randrange(8)
     if kind == 0:
         del inner[key]
@@ -218,8 +216,8 @@ def value_change(draw: random.Random, document: Any) -> Any:
             (-value, value * 1e30, value + 1, float(value), str(value))
         )
     elif kind == 5:
-        other, place = draw.choice(places)
-        inner[key] = json.loads(json.dumps(other[place]))
+        other, run_dir = draw.choice(paths_in)
+        inner[key] = json.loads(json.dumps(other[run_dir]))
     elif kind == 6 and isinstance(value, list):
         inner[key] = draw.choice(
             (value[:1], value[1:], deepcopy(value) + value, value[::-1], [*value, None])
@@ -231,7 +229,7 @@ def value_change(draw: random.Random, document: Any) -> Any:
     return document
 
 
-def _places(value: Any) -> Any:
+def _paths_in(value: Any) -> Any:
     entries = (
         value.items()
         if isinstance(value, dict)
@@ -241,7 +239,7 @@ def _places(value: Any) -> Any:
     )
     for key, entry in entries:
         yield value, key
-        yield from _places(entry)
+        yield from _paths_in(entry)
 
 
 def text_change(draw: random.Random, content: bytes) -> bytes:
@@ -367,7 +365,7 @@ def csv_change(draw: random.Random, content: bytes) -> bytes:
 
 
 def npz_change(draw: random.Random, content: bytes) -> bytes:
-    """An archive with headers, members, its directory or its bytes changed."""
+    """A zip file with headers, members, its directory or its bytes changed."""
     kind = draw.randrange(10)
     if draw.random() < 0.01:
         return bomb(draw.choice((8, 600)))
@@ -375,8 +373,8 @@ def npz_change(draw: random.Random, content: bytes) -> bytes:
         return byte_change(draw, content)
     if kind < 5:
         return _fields(draw, content)
-    with zipfile.ZipFile(io.BytesIO(content)) as archive:
-        entries = [(name, archive.read(name)) for name in archive.namelist()]
+    with zipfile.ZipFile(io.BytesIO(content)) as zip_file:
+        entries = [(name, zip_file.read(name)) for name in zip_file.namelist()]
     at = draw.randrange(len(entries))
     name, member = entries[at]
     if kind < 8:
@@ -412,11 +410,11 @@ def npz_change(draw: random.Random, content: bytes) -> bytes:
         (zipfile.ZIP_STORED, zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED, zipfile.ZIP_LZMA)
     )
     packed = io.BytesIO()
-    with zipfile.ZipFile(packed, "w", zipfile.ZIP_STORED) as archive:
+    with zipfile.ZipFile(packed, "w", zipfile.ZIP_STORED) as zip_file:
         for name, member in entries:
             info = zipfile.ZipInfo(name)
             info.compress_type = method
-            archive.writestr(info, member)
+            zip_file.writestr(info, member)
     return packed.getvalue()
 
 
@@ -455,19 +453,19 @@ def _header(draw: random.Random, member: bytes) -> bytes:
 
 
 def _fields(draw: random.Random, content: bytes) -> bytes:
-    """An archive with a field of a local header, of the directory or of its end set to
+    """A zip file with a field of a local header, of the directory or of its end set to
     an extreme.
     """
     changed = bytearray(content)
     marks = [(b"PK\x01\x02", 46), (b"PK\x03\x04", 30), (b"PK\x05\x06", 22)]
     for _ in range(draw.choice((1, 1, 2, 3))):
         mark, size = draw.choice(marks)
-        places = [
+        paths_in = [
             at for at in range(len(content) - size) if content[at : at + 4] == mark
         ]
-        places = places or [content.rfind(b"PK\x05\x06")]
+        paths_in = paths_in or [content.rfind(b"PK\x05\x06")]
         at, width = (
-            draw.choice(places) + draw.randrange(4, size - 3),
+            draw.choice(paths_in) + draw.randrange(4, size - 3),
             draw.choice((1, 2, 4)),
         )
         value = draw.choice(
@@ -492,23 +490,23 @@ def _fields(draw: random.Random, content: bytes) -> bytes:
 
 @cache
 def bomb(size: int) -> bytes:
-    """An archive with one array of so many MiB of zeros, of which it holds a
+    """A zip file with one array of so many MiB of zeros, of which it holds a
     thousandth.
     """
     packed, header = (
         io.BytesIO(),
         b"{'descr': '|u1', 'fortran_order': False, 'shape': (%d,), }\n" % (size << 20),
     )
-    archive = zipfile.ZipFile(packed, "w", zipfile.ZIP_DEFLATED, compresslevel=1)
-    with archive, archive.open("t.npy", "w") as entry:
+    zip_file = zipfile.ZipFile(packed, "w", zipfile.ZIP_DEFLATED, compresslevel=1)
+    with zip_file, zip_file.open("t.npy", "w") as entry:
         entry.write(b"\x93NUMPY\x01\0" + struct.pack("<H", len(header)) + header)
         for _ in range(size):
             entry.write(bytes(1 << 20))
     return packed.getvalue()
 
 
-def place_special(draw: random.Random, path: Path) -> None:
-    """Something in place of a file that is none."""
+def put_special_file(draw: random.Random, path: Path) -> None:
+    """Replace a file by something that is no regular file."""
     path.unlink()
     kind = draw.randrange(8)
     if kind == 0:
@@ -516,10 +514,10 @@ def place_special(draw: random.Random, path: Path) -> None:
     elif kind == 1:
         path.mkdir()
     elif kind == 2:
-        place = os.getcwd()
+        run_dir = os.getcwd()
         os.chdir(path.parent)  # the name of a socket has at most 107 bytes
         with socket.socket(socket.AF_UNIX) as server:
             server.bind(path.name)
-        os.chdir(place)
+        os.chdir(run_dir)
     elif kind < 7:
         path.symlink_to(("/dev/zero", "/dev/null", path.name, "nowhere")[kind - 3])

@@ -1,6 +1,4 @@
-"""What the fuzzer reads: how a sound folder is made, how a file of it is changed, and
-what reading it must give.
-"""
+"""Readers for the fuzzer: valid folders, changes of their files, expected results."""
 
 import contextlib
 import hashlib
@@ -20,7 +18,7 @@ import jax.export
 import jax.numpy as jnp
 import numpy as np
 
-from sfkd_jax import artefacts, datasets, policy, reporting
+from sfkd_jax import artefacts, datasets, paper, policy, reporting
 from sfkd_jax.exporting import _run_controller as loader
 
 ROOT = Path(__file__).parents[1]
@@ -32,10 +30,10 @@ class Reader(NamedTuple):
     """One way of reading.
 
     Attributes:
-        make: writes a sound folder.
-        files: file -> how it is changed.
+        make: writes a valid folder.
+        files: file -> function that changes it.
         read: reads the folder.
-        holds: whether what was read means what lies in the folder.
+        holds: whether the result agrees with the content of the folder.
         refusals: types of a refusal.
     """
 
@@ -50,7 +48,7 @@ class Reader(NamedTuple):
 
 
 def plain_json(content: bytes) -> Any:
-    """What Python's own reader makes of a document, which must say everything once."""
+    """Parse a document with Python's own reader; duplicate keys are refused."""
 
     def once(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
         assert len(dict(pairs)) == len(pairs)
@@ -60,7 +58,7 @@ def plain_json(content: bytes) -> Any:
 
 
 def equal(a: Any, b: Any) -> bool:
-    """Whether two documents are the same, with 1, 1.0 and true told apart."""
+    """Whether two documents are the same, where 1, 1.0 and true differ."""
     return repr(a) == repr(b)
 
 
@@ -72,9 +70,9 @@ def read_document(folder: Path) -> Any:
     return artefacts.read_json(folder / "a.json")
 
 
-def document_holds(found: Any, folder: Path) -> bool:
-    return equal(found, plain_json((folder / "a.json").read_bytes())) and equal(
-        artefacts.sha256(found)[:0], ""
+def document_holds(result: Any, folder: Path) -> bool:
+    return equal(result, plain_json((folder / "a.json").read_bytes())) and equal(
+        artefacts.sha256(result)[:0], ""
     )
 
 
@@ -90,10 +88,10 @@ def read_lines(folder: Path) -> Any:
     return artefacts.read_jsonl(folder / "a.jsonl")
 
 
-def lines_hold(found: Any, folder: Path) -> bool:
+def lines_hold(result: Any, folder: Path) -> bool:
     *lines, last = (folder / "a.jsonl").read_bytes().split(b"\n")
     expected = [plain_json(line) for line in lines if line.strip()]
-    return equal(found, expected) or equal(found, [*expected, plain_json(last)])
+    return equal(result, expected) or equal(result, [*expected, plain_json(last)])
 
 
 # ---- arrays
@@ -118,9 +116,7 @@ def make_arrays(folder: Path) -> None:
         config={"seed": 0, "model": {"rank": 3}},
     )
     manifest = artefacts.read_json(folder / "a.json")
-    manifest.pop(
-        "file_sha256", None
-    )  # as an earlier version, or somebody who wants to be read, writes it
+    manifest.pop("file_sha256", None)  # as an earlier version or an attacker writes it
     shutil.copy(folder / "a.npz", folder / "b.npz")
     artefacts.write_json(folder / "b.json", manifest)
 
@@ -131,11 +127,11 @@ def read_arrays(folder: Path) -> Any:
     ]
 
 
-def arrays_hold(found: Any, folder: Path) -> bool:
+def arrays_hold(result: Any, folder: Path) -> bool:
     return all(
         same_arrays(arrays, ARRAYS)
         and equal(manifest, plain_json((folder / f"{name}.json").read_bytes()))
-        for name, (arrays, manifest) in zip("ab", found, strict=True)
+        for name, (arrays, manifest) in zip("ab", result, strict=True)
     )
 
 
@@ -161,10 +157,10 @@ def read_npz(folder: Path) -> Any:
     return artefacts.read_npz(folder / "a.npz")
 
 
-def npz_holds(found: Any, folder: Path) -> bool:
-    with np.load(folder / "a.npz", allow_pickle=False) as archive:
+def npz_holds(result: Any, folder: Path) -> bool:
+    with np.load(folder / "a.npz", allow_pickle=False) as arrays_file:
         return same_arrays(
-            found, {name: np.asarray(archive[name]) for name in archive.files}
+            result, {name: np.asarray(arrays_file[name]) for name in arrays_file.files}
         )
 
 
@@ -207,7 +203,7 @@ def log_reader(name: str, make: Callable[[Path], None], change: Change) -> Reade
             dt=0.1,
             wheelbase=2.7,
             steps=5,
-            say=lambda line: None,
+            report=lambda line: None,
         )
 
     return Reader(
@@ -215,10 +211,10 @@ def log_reader(name: str, make: Callable[[Path], None], change: Change) -> Reade
     )
 
 
-def log_holds(found: Any, folder: Path) -> bool:
+def log_holds(result: Any, folder: Path) -> bool:
     """Whether a data set is of finite numbers."""
     parts = [
-        getattr(found.dataset, part)
+        getattr(result.dataset, part)
         for part in ("train", "validation", "calibration", "test")
     ]
     return all(
@@ -256,23 +252,25 @@ def read_rows(folder: Path) -> Any:
         return artefacts.merge([], rows)
 
 
-def rows_hold(found: Any, folder: Path) -> bool:
-    return equal(found, list(plain_json((folder / "results.json").read_bytes())["rows"]))
+def rows_hold(result: Any, folder: Path) -> bool:
+    return equal(
+        result, list(plain_json((folder / "results.json").read_bytes())["rows"])
+    )
 
 
 def read_report(folder: Path) -> Any:
     return reporting.write_report(folder)
 
 
-def page_holds(found: Any, folder: Path) -> bool:
-    return Path(found["report"]).read_text().endswith("</html>\n")
+def page_holds(result: Any, folder: Path) -> bool:
+    return Path(result["report"]).read_text().endswith("</html>\n")
 
 
 def read_benchmark(folder: Path) -> Any:
     path = folder / "results.json"
     document = artefacts.read_json(path, keys=("rows",))
     with artefacts.as_artefact_error(path):
-        return reporting.benchmark_markdown(document)
+        return paper.results_markdown(document)
 
 
 def make_runs(folder: Path) -> None:
@@ -286,7 +284,7 @@ def make_runs(folder: Path) -> None:
 
 
 def read_comparison(folder: Path) -> Any:
-    return reporting.write_comparison(folder, "runs/*", "page")
+    return paper.write_comparison(folder, "runs/*", "page")
 
 
 def load(folder: Path) -> Any:
@@ -298,22 +296,22 @@ def make_policy(folder: Path) -> None:
         shutil.copy(file, folder / file.name)
 
 
-def policy_holds(found: Any, folder: Path) -> bool:
-    """Whether a certified policy is the one that ships; one without says so itself, and
-    is what its files hold.
+def policy_holds(result: Any, folder: Path) -> bool:
+    """Whether a certified policy is the shipped one, and an uncertified one has the
+    settings of its file.
     """
     shipped, settings = (
         shipped_policy(),
         plain_json((folder / "policy.json").read_bytes())["config"],
     )
-    pairs = zip(*map(jax.tree.leaves, (found.params, shipped.params)), strict=True)
+    pairs = zip(*map(jax.tree.leaves, (result.params, shipped.params)), strict=True)
     expected = (
         shipped.settings
-        if found.certificate is not None
+        if result.certificate is not None
         else settings | {"env_source": "measured"}
     )
     return all(np.array_equal(a, b) for a, b in pairs) and equal(
-        found.settings, expected
+        result.settings, expected
     )
 
 
@@ -385,16 +383,16 @@ def described(names: Any, values: Any) -> list[dict[str, Any]]:
 
 def sealed(manifest: dict[str, Any]) -> bytes:
     """A manifest with the hash that belongs to it."""
-    said = {name: value for name, value in manifest.items() if name != "sha256"}
+    message = {name: value for name, value in manifest.items() if name != "sha256"}
     with contextlib.suppress(RecursionError, ValueError):
-        said["sha256"] = hashlib.sha256(
-            json.dumps(said, sort_keys=True).encode()
+        message["sha256"] = hashlib.sha256(
+            json.dumps(message, sort_keys=True).encode()
         ).hexdigest()
-    return json.dumps(said).encode()
+    return json.dumps(message).encode()
 
 
 def manifest_change(draw: random.Random, content: bytes) -> bytes:
-    """A manifest changed, every second time with a hash that says it was written so."""
+    """Change a manifest, every second time with a hash that matches the change."""
     changed = mutations.json_change(draw, content)
     if draw.random() < 0.5:
         with contextlib.suppress(ValueError, RecursionError, AttributeError):
@@ -413,8 +411,8 @@ def read_export(folder: Path) -> Any:
         return controller.manifest, [state, measured]
 
 
-def export_holds(found: Any, folder: Path) -> bool:
-    return equal(found[0], plain_json((folder / "controller.json").read_bytes()))
+def export_holds(result: Any, folder: Path) -> bool:
+    return equal(result[0], plain_json((folder / "controller.json").read_bytes()))
 
 
 READERS = {
@@ -453,7 +451,7 @@ READERS = {
         make_run,
         {"results.json": mutations.json_change},
         read_benchmark,
-        lambda found, _: bool(found),
+        lambda result, _: bool(result),
     ),
     "comparison": Reader(
         make_runs,

@@ -1,4 +1,4 @@
-"""Small builders that several test files share."""
+"""Builders that several test files share."""
 
 import copy
 import inspect
@@ -47,7 +47,7 @@ there).
 """
 PHYSICS = ("oracle", "nominal")
 OTHERS = tuple(name for name in models.FACTORIES if name != "sfkd")
-"""Learned models that are not ours: with their default settings."""
+"""Other learned models, with their default settings."""
 
 
 def space(body=1):
@@ -121,7 +121,7 @@ def model_and_params(name="sfkd", scale=1.0):
 
 @cache
 def _model(name):
-    """One object a variant, so that what is compiled for it is compiled once."""
+    """Return one object per variant, so that it is compiled once."""
     if name not in OTHERS:
         return tiny(name)
     factory = models.FACTORIES[name]
@@ -153,10 +153,11 @@ def generic(name):
 
 
 def explicit(name="sfkd", scale=1.0):
-    """What a certificate speaks about, in float64."""
+    """The explicit structure that a certificate is about, in float64."""
     model, params = model_and_params(name, scale)
     return jax.tree.map(
-        lambda leaf: np.asarray(leaf, dtype=np.float64), jax.jit(model.explicit)(params)
+        lambda leaf: np.asarray(leaf, dtype=np.float64),
+        jax.jit(model.structure.explicit)(params),
     )
 
 
@@ -169,7 +170,7 @@ def certified(name="sfkd", scale=1.0):
 
 
 def steepest_pattern(weights, starts=6):
-    """Largest ||W_L D … D W_1||_2 found by flipping slopes between 0 and 1: a lower
+    """Largest ||W_L D … D W_1||_2 reached by flipping slopes between 0 and 1: a lower
     bound of the Lipschitz constant.
     """
     random, best = np.random.default_rng(0), 0.0
@@ -232,7 +233,7 @@ def driven(count=3, steps=12):
 
 
 def driver(plant):
-    """The path-following law that keeps data collection on the road."""
+    """The path-following law that drives while data are collected."""
     law = control.path_feedback(wheelbase=plant.wheelbase, speed_loop=plant.speed_loop)
 
     def follow(state, reference):
@@ -263,7 +264,7 @@ def segments(count=120, steps=25, seed=0):
 
 @cache
 def dataset(count=120, steps=25):
-    """The same, dealt to the four splits."""
+    """The same, split into the four parts."""
     low, high = jnp.asarray(ENV_LOW), jnp.asarray(ENV_HIGH)
     return datasets.split(
         segments(count, steps),
@@ -309,8 +310,8 @@ def _plain(leaf):
     )
 
 
-def door(name, *arguments, cwd, code=0):
-    """Open a door in a process of its own, and expect this exit status."""
+def run_command(name, *arguments, cwd, code=0):
+    """Run a command in a process of its own, and expect this exit status."""
     command = [sys.executable, "-m", f"sfkd_jax.{name}", *arguments]
     done = subprocess.run(command, cwd=cwd, capture_output=True, text=True, timeout=600)
     assert done.returncode == code, done.stderr[-2000:]
@@ -318,7 +319,7 @@ def door(name, *arguments, cwd, code=0):
 
 
 def last_line(done):
-    """What a door prints for other programs."""
+    """Return the JSON document that a command prints last."""
     return json.loads(done.stdout.strip().splitlines()[-1])
 
 
@@ -336,7 +337,7 @@ def largest_file(size):
 
 
 def refusal_of(action):
-    """The one line with which an action fails as a door says it; None if it does not
+    """The one line with which an action fails as a command reports it; None if it does not
     fail.
     """
     try:

@@ -1,6 +1,4 @@
-"""Files: what goes in comes out, whatever is wrong is told in one line, and a kill or a
-full disk loses nothing.
-"""
+"""Files: round trips, errors of one line, and no loss by a kill or a full disk."""
 
 import json
 import os
@@ -158,13 +156,13 @@ def test_hash_of_json_sees_content_and_nothing_else():
     )
 
 
-def test_differences_are_told_by_dotted_key():
-    asked = {
+def test_differences_are_listed_by_dotted_key():
+    options = {
         "model": {"rank": 16.0, "layers": (32, 64)},
         "training": {"steps": 100, "rate": 1e-3},
         "name": "a" * 99,
     }
-    assert artefacts.differences(CONFIG, asked) == [
+    assert artefacts.differences(CONFIG, options) == [
         "model.layers was [32, 32], is now [32, 64]",
         "training.steps was 4000, is now 100",
         "seed was 0, is now absent",
@@ -289,9 +287,9 @@ def test_arrays_without_a_portable_form_are_refused(path):
 
 def test_other_settings_kinds_and_formats_are_refused(path):
     write(path)
-    asked = CONFIG | {"training": {"steps": 100, "rate": 1e-3}}
+    options = CONFIG | {"training": {"steps": 100, "rate": 1e-3}}
     assert (
-        refusal(read, path, config=asked)
+        refusal(read, path, config=options)
         == f"{path}: made with other settings: training.steps was 4000, is now 100"
     )
     assert refusal(read, path, config={"a": 1, "b": 2}).endswith("and 2 more")
@@ -350,7 +348,7 @@ def test_foreign_files_are_refused_each_in_its_own_words(path, tmp_path):
         b"PX",
     ):
         path.write_bytes(content)
-        assert refusal(read, path) == f"{path}: foreign, not an archive of arrays"
+        assert refusal(read, path) == f"{path}: foreign, not a zip file of arrays"
     np.savez(path, a=np.zeros(3))
     assert "does not match its manifest: sha256" in refusal(read, path)
     np.savez(path, a=np.array([Unpicklable()]))
@@ -398,7 +396,7 @@ def test_truncated_arrays_are_refused(path):
         path.write_bytes(whole[:size])
         assert (
             refusal(read, path)
-            == f"{path}: truncated, the end of the archive is missing"
+            == f"{path}: truncated, the end of the zip file is missing"
         )
 
 
@@ -413,7 +411,7 @@ def test_no_flipped_byte_changes_what_is_read(path, compressed):
         damaged[at] ^= 1 << rng.randrange(8)
         path.write_bytes(damaged)
         try:
-            same(read(path)[0], ARRAYS)  # a byte that nobody reads, such as a date
+            same(read(path)[0], ARRAYS)  # a byte that is not read, such as a date
         except ArtefactError as error:
             assert str(error).startswith(f"{path}: ") and "\n" not in str(error)  # noqa: PT017, PT018
             refused += 1
@@ -470,7 +468,7 @@ def test_a_write_that_ends_in_the_middle_leaves_the_earlier_files(path, size):
     assert names(path.parent) == ["policy.json", "policy.npz", "results.json"]
 
 
-def test_a_place_that_cannot_be_written_is_told_in_one_line(tmp_path):
+def test_a_directory_that_cannot_be_written_is_reported_in_one_line(tmp_path):
     (tmp_path / "file").touch()
     below = tmp_path / "file" / "policy.npz"
     assert str(below) in refusal(write, below).replace(".json", ".npz")
@@ -566,9 +564,9 @@ def test_kills_at_random_moments_leave_a_readable_pair(path):
             process.stdout.readline()
             time.sleep(rng.uniform(0.0, 0.15))
             process.kill()
-            told = [first, *map(int, process.stdout.read().split())][-1]
+            reported = [first, *map(int, process.stdout.read().split())][-1]
         seen = version(path)
-        assert seen in (told, told + 1)
+        assert seen in (reported, reported + 1)
     write(path)
     assert names(path.parent) == ["policy.json", "policy.npz"]
 

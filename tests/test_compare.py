@@ -2,7 +2,7 @@
 
 import json
 
-from helpers import door, last_line
+from helpers import last_line, run_command
 
 from sfkd_jax import vehicle
 from sfkd_jax.pipeline import comparison
@@ -18,7 +18,7 @@ COMPARED = (
 
 
 def test_compare_drives_every_row_and_continues_where_it_was_stopped(tmp_path):
-    first = last_line(door("compare", *COMPARED, cwd=tmp_path))
+    first = last_line(run_command("compare", *COMPARED, cwd=tmp_path))
     document = json.loads((tmp_path / first["results"]).read_text())
     rows = {row["system"]: row for row in document["rows"]}
     assert set(rows) == {"oracle", "sfkd"}
@@ -27,30 +27,30 @@ def test_compare_drives_every_row_and_continues_where_it_was_stopped(tmp_path):
     assert rows["oracle"]["difference_to_sfkd"]["mean"] < 0
     assert set(rows["sfkd"]["open_loop_rmse_m"]) == {"1", "5", "10", "20"}
     assert (tmp_path / first["report"]).exists()
-    kept = tmp_path / "runs/table/cells"
-    before = {file: file.read_bytes() for file in kept.rglob("*.row.json")}
+    stored = tmp_path / "runs/table/cells"
+    before = {file: file.read_bytes() for file in stored.rglob("*.row.json")}
     (victim,) = (file for file in before if "oracle" in file.name)
     victim.write_bytes(before[victim][:-9])
-    again = door("compare", *COMPARED, cwd=tmp_path)
+    again = run_command("compare", *COMPARED, cwd=tmp_path)
     assert "training" not in again.stderr
-    assert {file: file.read_bytes() for file in kept.rglob("*.row.json")} == before
+    assert {file: file.read_bytes() for file in stored.rglob("*.row.json")} == before
 
 
 def test_a_row_that_cannot_be_made_is_named_and_the_others_come_out(tmp_path):
-    done = door("compare", *COMPARED, "model.frame=boddy", cwd=tmp_path)
+    done = run_command("compare", *COMPARED, "model.frame=boddy", cwd=tmp_path)
     assert last_line(done)["rows"] == 1
     assert last_line(done)["failed"] == 1
     assert "segment" in done.stderr
 
 
 def test_a_row_that_could_not_be_certified_is_refused_before_it_is_trained(tmp_path):
-    done = door("compare", *COMPARED, "certification.mode=boxes", cwd=tmp_path)
+    done = run_command("compare", *COMPARED, "certification.mode=boxes", cwd=tmp_path)
     assert last_line(done)["failed"] == 1
     assert "certification.mode" in done.stderr
     assert "training" not in done.stderr.replace("training.", "")
 
 
-def test_roads_are_laid_once_for_all_rows_and_anew_for_another_protocol():
+def test_episodes_are_made_once_for_all_rows_and_again_for_another_protocol():
     env_sensor = {"delay_s": 0.0, "noise": [0.0, 0.0], "bias": [0.0, 0.0]}
     protocol = {
         "episodes": 2,
@@ -59,14 +59,15 @@ def test_roads_are_laid_once_for_all_rows_and_anew_for_another_protocol():
         "env_sensor": env_sensor,
         "variation": None,
     }
-    asked = {
+    options = {
         "vehicle": {"name": "kinematic"},
         "scenario": {"name": "s1"},
         "evaluation": protocol,
     }
-    lay, plant = comparison.cached_episodes(), vehicle.kinematic()
+    make_episodes, plant = comparison.cached_episodes(), vehicle.kinematic()
     first, second = (
-        lay(asked | {"model": {"name": model}}, plant) for model in ("sfkd", "icode")
+        make_episodes(options | {"model": {"name": model}}, plant)
+        for model in ("sfkd", "icode")
     )
     assert second is first
     others = [
@@ -74,4 +75,10 @@ def test_roads_are_laid_once_for_all_rows_and_anew_for_another_protocol():
         {"scenario": {"name": "s3"}},
         {"vehicle": {"name": "other"}},
     ]
-    assert len({id(lay(asked | other, plant)) for other in others} | {id(first)}) == 4
+    assert (
+        len(
+            {id(make_episodes(options | other, plant)) for other in others}
+            | {id(first)}
+        )
+        == 4
+    )

@@ -1,5 +1,6 @@
-"""The corridor of a policy, end to end: an untrained one, for what is claimed does not
-depend on training.
+"""The corridor of a policy, end to end.
+
+The policy is untrained, because the claims do not depend on training.
 """
 
 import copy
@@ -28,18 +29,18 @@ SMALL = {"drives": 24, "duration": 4.0, "attack_steps": 3000}
 
 @pytest.fixture(scope="module")
 def trained(tmp_path_factory):
-    place = tmp_path_factory.mktemp("policy")
-    saved(place, law=any_law())
-    return policy.restore(place)
+    run_dir = tmp_path_factory.mktemp("policy")
+    saved(run_dir, law=any_law())
+    return policy.restore(run_dir)
 
 
 @pytest.fixture(scope="module")
-def asked():
+def config():
     return settings("certification.level=0.9", "certification=tiny")
 
 
 @pytest.fixture(scope="module")
-def document(trained, asked):
+def document(trained, config):
     """As `certify` makes it, with fewer and shorter drives."""
     loop = along_path(kinematic(), trained.law)
     make = jax.jit(
@@ -60,7 +61,7 @@ def document(trained, asked):
     }
     boxes["control"] = [[-0.03, -1.0, -0.02, 8.0], [0.03, 1.0, 0.02, 10.5]]
     options = {"level": 0.9, "monitor_level": 0.9, "attack_starts": 0}
-    found = issue(
+    result = issue(
         trained.model,
         trained.params,
         **parts,
@@ -68,10 +69,10 @@ def document(trained, asked):
         boxes=boxes,
         **options,
     )
-    found["corridor"] = certify_corridor(
-        asked, trained, output_metrics_from(found["outputs"]), **SMALL
+    result["corridor"] = certify_corridor(
+        config, trained, output_metrics_from(result["outputs"]), **SMALL
     )
-    return found | {"policy_sha256": trained.sha256}
+    return result | {"policy_sha256": trained.sha256}
 
 
 def check(document, trained):
@@ -103,23 +104,25 @@ def test_the_document_verifies_and_a_changed_one_does_not(document, trained):
 
 
 def test_what_is_claimed_is_one_sum_of_what_is_calibrated(document):
-    found = document["corridor"]
-    assert found["corridor_m"] == pytest.approx(
-        found["bounds"]["nominal"] + found["bounds"]["followed_position"]
+    result = document["corridor"]
+    assert result["corridor_m"] == pytest.approx(
+        result["bounds"]["nominal"] + result["bounds"]["followed_position"]
     )
-    assert found["bounds"]["followed_position"] <= found["bounds"]["for_ever_position"]
-    assert 0.6 <= found["coverage"] <= 1.0
-    assert found["drives"] == SMALL["drives"]
-    assert found["attack"]["over_tube"] <= 1.0
+    assert (
+        result["bounds"]["followed_position"] <= result["bounds"]["for_ever_position"]
+    )
+    assert 0.6 <= result["coverage"] <= 1.0
+    assert result["drives"] == SMALL["drives"]
+    assert result["attack"]["over_tube"] <= 1.0
 
 
 def test_without_a_copy_the_corridor_is_wider_and_no_drive_of_the_class_leaves_it(
     document,
 ):
-    found, part = document["corridor"], document["corridor"]["fixed_points"]
+    result, part = document["corridor"], document["corridor"]["fixed_points"]
     between, after = part["corridor_m"], part["after_switch_m"]
     assert (
-        found["bounds"]["for_ever_position"]
+        result["bounds"]["for_ever_position"]
         < between["law"]
         < between["planner"]
         < after["planner"]
@@ -127,17 +130,17 @@ def test_without_a_copy_the_corridor_is_wider_and_no_drive_of_the_class_leaves_i
     assert after["law"] - between["law"] == pytest.approx(
         after["planner"] - between["planner"]
     )
-    assert found["seen"]["lateral_m"] < part["after_switch_m"]["planner"]
+    assert result["seen"]["lateral_m"] < part["after_switch_m"]["planner"]
     assert part["steps_between_switches"] == 30
     assert part["points"] == 3 * 3 * SMALL["drives"] * 2 * 25
 
 
 def test_every_friction_and_speed_gets_a_corridor_of_its_own(document, trained):
     frictions, speeds = [0.3, 0.9], [8.0, 10.5]
-    found = corridor_by_speed(
+    result = corridor_by_speed(
         trained, document, frictions=frictions, speeds=speeds, drives=24
     )
-    cells = found["cells"]
+    cells = result["cells"]
     assert [(cell["friction"], cell["speed"]) for cell in cells] == [
         (f, v) for f in frictions for v in speeds
     ]
@@ -149,17 +152,17 @@ def test_every_friction_and_speed_gets_a_corridor_of_its_own(document, trained):
         assert cell["lateral_m"] > 0.0
         assert cell["coverage_drives"] == 24
     assert len({cell["corridor_m"] for cell in cells}) == 4
-    assert found["coverage"] == pytest.approx(
+    assert result["coverage"] == pytest.approx(
         np.mean([cell["coverage"] for cell in cells])
     )
-    assert found["coverage_ci95"][1] - found["coverage_ci95"][0] < 0.25
+    assert result["coverage_ci95"][1] - result["coverage_ci95"][0] < 0.25
     alone = corridor_by_speed(
         trained, document, frictions=frictions[:1], speeds=speeds[:1], drives=24
     )
     assert alone["cells"] == cells[:1]
 
 
-def test_nothing_is_said_of_speeds_and_frictions_outside_the_box(document, trained):
+def test_speeds_and_frictions_outside_the_box_are_refused(document, trained):
     for name, values in (
         ("friction", {"frictions": [0.2], "speeds": [9.0]}),
         ("speed", {"frictions": [0.3], "speeds": [11.0]}),
@@ -183,28 +186,35 @@ def test_the_fastest_speed_is_one_below_which_every_corridor_fits():
         for friction, row in widths.items()
         for speed, width in zip((8.0, 9.0, 10.0), row, strict=True)
     ]
-    assert fastest_speeds(cells[::-1], 0.5) == {0.3: None, 0.6: 8.0, 0.75: 9.0, 0.9: 10.0}
+    assert fastest_speeds(cells[::-1], 0.5) == {
+        0.3: None,
+        0.6: 8.0,
+        0.75: 9.0,
+        0.9: 10.0,
+    }
     assert fastest_speeds(cells, 0.1) == dict.fromkeys(widths)
 
 
-def test_the_same_seed_gives_the_same_corridor(document, trained, asked):
+def test_the_same_seed_gives_the_same_corridor(document, trained, config):
     again = certify_corridor(
-        asked, trained, output_metrics_from(document["outputs"]), **SMALL
+        config, trained, output_metrics_from(document["outputs"]), **SMALL
     )
     assert {**again, "seconds": 0.0} == {**document["corridor"], "seconds": 0.0}
 
 
-def test_a_policy_without_a_law_has_no_corridor(trained, asked, document):
+def test_a_policy_without_a_law_has_no_corridor(trained, config, document):
     with pytest.raises(ValueError, match="with its law"):
         certify_corridor(
-            asked,
+            config,
             trained._replace(law=None),
             output_metrics_from(document["outputs"]),
             **SMALL,
         )
 
 
-def test_a_controller_with_a_corridor_is_shielded_when_asked(document, trained, asked):
+def test_a_controller_with_a_corridor_is_shielded_if_shield_is_set(
+    document, trained, config
+):
     """And then a request beyond its limits is cut, the copy reported, and both are off
     without `shield`.
     """
@@ -214,7 +224,7 @@ def test_a_controller_with_a_corridor_is_shielded_when_asked(document, trained, 
     )
     state = jnp.asarray([0.0, 0.0, 0.0, 9.0])
     for shield in (True, False):
-        chosen = asked["controller"] | {"shield": shield}
+        chosen = config["controller"] | {"shield": shield}
         chosen["mppi"] = chosen["mppi"] | {"num_samples": 4}
         built = build.build_controller(
             chosen,
@@ -240,11 +250,11 @@ def test_a_controller_with_a_corridor_is_shielded_when_asked(document, trained, 
 
 
 def test_what_sensors_add_is_no_part_of_the_recorded_perturbation(trained):
-    """A class drive with sensors records the ν that was asked for; the car moves
-    otherwise.
+    """The recorded ν of a drive with sensors is the requested one, though the car moves
+    differently.
     """
     loop = along_path(kinematic(), trained.law)
-    asked = {
+    config = {
         "drives": 2,
         "steps": 30,
         "offset": (0.0, 0.0, 0.0),
@@ -259,7 +269,7 @@ def test_what_sensors_add_is_no_part_of_the_recorded_perturbation(trained):
     plain, seen = (
         jax.jit(
             lambda key, hook=hook: datasets.drive_switching(
-                loop, key, sensors=hook, **asked
+                loop, key, sensors=hook, **config
             )
         )(jax.random.key(4))
         for hook in (None, noisy)
@@ -272,7 +282,7 @@ def test_what_sensors_add_is_no_part_of_the_recorded_perturbation(trained):
 
 def test_a_filter_of_a_drive_sees_it_whole_and_its_answer_is_what_is_driven(trained):
     loop = along_path(kinematic(), trained.law)
-    asked = {"drives": 2, "steps": 30, "burn_in": 0, **DRIVEN}
+    config = {"drives": 2, "steps": 30, "burn_in": 0, **DRIVEN}
 
     def halve(start, inputs, envs):
         assert (start.shape, inputs.shape, envs.shape) == ((6,), (30, 4), (30, 2))
@@ -281,7 +291,7 @@ def test_a_filter_of_a_drive_sees_it_whole_and_its_answer_is_what_is_driven(trai
     plain, cut = (
         jax.jit(
             lambda key, hook=hook: datasets.drive_switching(
-                loop, key, safety_filter=hook, **asked
+                loop, key, safety_filter=hook, **config
             )
         )(jax.random.key(5))
         for hook in (None, halve)

@@ -69,16 +69,16 @@ def exported(tmp_path_factory):
     """A run with weights as they were drawn and a monitor, and what the command wrote and
     printed.
     """
-    asked = settings(tmp_path_factory.mktemp("export") / "runs")
-    plant = build.build_vehicle(asked["vehicle"])
-    params = jit(build.build_model(asked["model"], space(), plant).init)(
+    requested = settings(tmp_path_factory.mktemp("export") / "runs")
+    plant = build.build_vehicle(requested["vehicle"])
+    params = jit(build.build_model(requested["model"], space(), plant).init)(
         jax.random.key(0)
     )
-    kept = asked | {"space": build.space_to_settings(space())}
-    store.claim(asked)
-    place = store.run_directory(asked)
-    policy.save(place / "policy.npz", params, kept, made_from={"dataset": "d" * 64})
-    trained, data = policy.restore(place), dataset()
+    stored = requested | {"space": build.space_to_settings(space())}
+    store.claim(requested)
+    run_dir = store.run_directory(requested)
+    policy.save(run_dir / "policy.npz", params, stored, made_from={"dataset": "d" * 64})
+    trained, data = policy.restore(run_dir), dataset()
     splits = {
         "validation": data.validation,
         "calibration": data.calibration,
@@ -89,9 +89,9 @@ def exported(tmp_path_factory):
         trained.model, trained.params, **splits, boxes=BOXES, **options
     )
     artefacts.write_json(
-        place / "certificate.json", certificate | {"policy_sha256": trained.sha256}
+        run_dir / "certificate.json", certificate | {"policy_sha256": trained.sha256}
     )
-    return asked, export.run(asked)
+    return requested, export.run(requested)
 
 
 @pytest.fixture(scope="module")
@@ -113,11 +113,11 @@ def folder(exported, tmp_path):
 
 def shipped(folder):
     """The script of an export folder as a module."""
-    found = importlib.util.spec_from_file_location(
+    spec = importlib.util.spec_from_file_location(
         "run_controller", folder / "run_controller.py"
     )
-    module = importlib.util.module_from_spec(found)
-    found.loader.exec_module(module)
+    module = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(module)
     return module
 
 
@@ -200,13 +200,13 @@ def test_a_process_without_this_package_repeats_every_bit(
         import numpy as np
         from run_controller import ExportedController
         controller = ExportedController()
-        state, found = controller.init(seed=7), {{}}
+        state, arrays = controller.init(seed=7), {{}}
         with np.load("drive.npz") as drive:
             for k, (observation, env) in enumerate(zip(drive["observations"], drive["envs"])):
                 control, state, info = controller.act(state, observation, env, drive["reference"])
                 leaves = [control, *state.values(), *info.values()]
-                found |= {{f"{{k}}/{{i}}": np.asarray(leaf) for i, leaf in enumerate(leaves)}}
-        np.savez("found.npz", **found)
+                arrays |= {{f"{{k}}/{{i}}": np.asarray(leaf) for i, leaf in enumerate(leaves)}}
+        np.savez("steps.npz", **arrays)
         packages = {{name.split(".")[0] for name, module in sys.modules.items() if module is not None}}
         assert not packages & {HEAVY!r}, packages
         assert "flatbuffers" in packages
@@ -220,12 +220,12 @@ def test_a_process_without_this_package_repeats_every_bit(
         env=os.environ | {"XLA_FLAGS": ""},
     )
     assert done.returncode == 0, done.stderr
-    with np.load(tmp_path / "found.npz") as found:
+    with np.load(tmp_path / "steps.npz") as result:
         steps = [
-            [found[f"{k}/{i}"] for i in range(len(leaves))]
+            [result[f"{k}/{i}"] for i in range(len(leaves))]
             for k, leaves in enumerate(in_process)
         ]
-        assert len(found.files) == sum(map(len, in_process))
+        assert len(result.files) == sum(map(len, in_process))
     names = [leaf["name"] for leaf in manifest["programs"]["act"]["outputs"]]
     for k, (ours, theirs) in enumerate(zip(in_process, steps, strict=True)):
         different = [
@@ -234,8 +234,8 @@ def test_a_process_without_this_package_repeats_every_bit(
             if a.tobytes() != b.tobytes()
         ]
         assert [name for name in different if name.startswith(exact)] == [], f"step {k}"
-        for mine, found_there in zip(ours, theirs, strict=True):
-            np.testing.assert_allclose(mine, found_there, rtol=1e-5, atol=1e-5)
+        for mine, theirs_leaf in zip(ours, theirs, strict=True):
+            np.testing.assert_allclose(mine, theirs_leaf, rtol=1e-5, atol=1e-5)
     healthy = names.index("info.healthy")
     assert [bool(leaves[healthy]) for leaves in steps] == [
         True,
@@ -247,15 +247,15 @@ def test_a_process_without_this_package_repeats_every_bit(
     ]
 
 
-def test_the_manifest_says_what_the_programs_take_and_what_they_were_made_from(
+def test_the_manifest_lists_the_inputs_of_programs_and_what_they_were_made_from(
     exported, loaded
 ):
-    asked, printed = exported
+    requested, printed = exported
     manifest = json.loads(Path(printed["manifest"]).read_text())
-    place = Path(printed["blob"]).parent
+    run_dir = Path(printed["blob"]).parent
     assert set(printed) == {"blob", "manifest", "npz"}
     for program in manifest["programs"].values():
-        content = (place / program["file"]).read_bytes()
+        content = (run_dir / program["file"]).read_bytes()
         assert program["sha256"] == hashlib.sha256(content).hexdigest()
         read = jax.export.deserialize(bytearray(content))
         assert read.platforms == ("cpu", "cuda") == tuple(manifest["platforms"])
@@ -279,18 +279,18 @@ def test_the_manifest_says_what_the_programs_take_and_what_they_were_made_from(
     assert {"name": "state.inner.key", "shape": [2], "dtype": "uint32"} in states
     assert (
         manifest["weights_sha256"]
-        == policy.restore(store.run_directory(asked)).weights_sha256
+        == policy.restore(store.run_directory(requested)).weights_sha256
     )
     assert (
         manifest["certificate_sha256"]
-        == hashlib.sha256((place / "certificate.json").read_bytes()).hexdigest()
+        == hashlib.sha256((run_dir / "certificate.json").read_bytes()).hexdigest()
     )
     assert (manifest["sampling_period_s"], manifest["horizon"], manifest["iree"]) == (
         0.1,
         HORIZON,
         None,
     )
-    plant = build.build_vehicle(asked["vehicle"])
+    plant = build.build_vehicle(requested["vehicle"])
     assert (
         tuple(control["high"] for control in manifest["controls"]) == plant.control_high
     )
@@ -298,16 +298,16 @@ def test_the_manifest_says_what_the_programs_take_and_what_they_were_made_from(
     assert loaded.certificate["boxes"] == BOXES
 
 
-def test_nothing_in_an_export_tells_where_files_lay_when_it_was_made(exported):
+def test_an_export_does_not_contain_paths_of_this_machine(exported):
     """Nor in the programs, which jax annotates with source files; a jax setting that is
     made for it is given back.
     """
-    place = Path(exported[1]["blob"]).parent
+    run_dir = Path(exported[1]["blob"]).parent
     folders = {
         str(Path(name).resolve().parent).encode()
         for name in (sfkd_jax.__file__, jax.__file__, __file__)
     }
-    programs = sorted(place.glob("*.stablehlo"))
+    programs = sorted(run_dir.glob("*.stablehlo"))
     assert len(programs) == 2
     for content in (path.read_bytes() for path in programs):
         assert not re.search(rb"[\w.-]\.py\b", content)
@@ -329,13 +329,13 @@ def test_the_controller_of_the_command_is_what_is_exported(spoiled):
 
 
 def test_a_refused_certificate_leaves_the_export_without_one(spoiled, capsys):
-    asked = settings(spoiled)
-    place = store.run_directory(asked)
-    assert (place / "export" / "certificate.json").exists()
+    requested = settings(spoiled)
+    run_dir = store.run_directory(requested)
+    assert (run_dir / "export" / "certificate.json").exists()
     artefacts.write_json(
-        place / "certificate.json", {"valid": False, "reason": "alpha is not below 1"}
+        run_dir / "certificate.json", {"valid": False, "reason": "alpha is not below 1"}
     )
-    printed = export.run(asked)
+    printed = export.run(requested)
     assert "refused" in capsys.readouterr().err
     manifest = json.loads(Path(printed["manifest"]).read_text())
     assert manifest["certificate_sha256"] is None
@@ -347,12 +347,12 @@ def test_a_refused_certificate_leaves_the_export_without_one(spoiled, capsys):
 
 def sealed(path, manifest):
     """A manifest with the hash that belongs to it."""
-    said = {name: value for name, value in manifest.items() if name != "sha256"}
-    path.write_text(json.dumps(said | {"sha256": artefacts.sha256(said)}))
+    output = {name: value for name, value in manifest.items() if name != "sha256"}
+    path.write_text(json.dumps(output | {"sha256": artefacts.sha256(output)}))
 
 
 @pytest.mark.parametrize(
-    ("file", "damage", "says"),
+    ("file", "damage", "message"),
     [
         ("controller.stablehlo", lambda content: content[:-1], "truncated"),
         (
@@ -376,13 +376,13 @@ def sealed(path, manifest):
         ),
     ],
 )
-def test_a_damaged_export_is_named_in_one_line(folder, file, damage, says):
+def test_a_damaged_export_is_named_in_one_line(folder, file, damage, message):
     if damage is None:
         (folder / file).unlink()
     else:
         (folder / file).write_bytes(damage((folder / file).read_bytes()))
     run_controller = shipped(folder)
-    with pytest.raises(run_controller.ExportError, match=says) as raised:
+    with pytest.raises(run_controller.ExportError, match=message) as raised:
         run_controller.ExportedController(folder)
     assert file in str(raised.value)
     assert "\n" not in str(raised.value)
@@ -461,7 +461,7 @@ def test_warm_up_gives_the_same_bits_and_keeps_the_machine_code_in_a_cache(
             {"speed": reference[0, 3]},
         )
 
-    def kept():
+    def stored():
         return {
             file.name
             for file in (tmp_path / "cache").iterdir()
@@ -481,7 +481,7 @@ def test_warm_up_gives_the_same_bits_and_keeps_the_machine_code_in_a_cache(
         jax.config.jax_persistent_cache_min_compile_time_secs,
     )
     sfkd_jax.warm_up(simple, cache=tmp_path / "cache")
-    first = kept()
+    first = stored()
     assert len(first) == 1
     compiled = sfkd_jax.warm_up(simple, cache=tmp_path / "cache")
     sfkd_jax.warm_up(
@@ -489,13 +489,13 @@ def test_warm_up_gives_the_same_bits_and_keeps_the_machine_code_in_a_cache(
             controller=Controller(lambda key: key, lambda *given: act(*given))
         )
     )
-    assert kept() == first
+    assert stored() == first
     assert (
         jax.config.jax_compilation_cache_dir,
         jax.config.jax_persistent_cache_min_compile_time_secs,
     ) == before
-    found = plain(compiled(simple.params, jax.random.key(7), *measured))
-    assert [leaf.tobytes() for leaf in found] == [leaf.tobytes() for leaf in expected]
+    result = plain(compiled(simple.params, jax.random.key(7), *measured))
+    assert [leaf.tobytes() for leaf in result] == [leaf.tobytes() for leaf in expected]
     with pytest.raises(TypeError):
         compiled(simple.params, jax.random.key(7), measured[0][:3], *measured[1:])
 
@@ -511,11 +511,9 @@ def flat_steps(run, first):
     return np.stack(controls)
 
 
-def test_evaluating_the_weights_first_leaves_the_function_and_no_factorisation(
-    loaded, in_process
-):
+def test_folding_constants_keeps_the_function_and_no_factorisation(loaded, in_process):
     plant = build.build_vehicle(loaded.settings["vehicle"])
-    watched_by_nobody = build.build_controller(
+    without_monitor = build.build_controller(
         loaded.settings["controller"],
         loaded.model,
         plant,
@@ -523,7 +521,7 @@ def test_evaluating_the_weights_first_leaves_the_function_and_no_factorisation(
         env_high=ENV_HIGH,
     )
     programs = exporting.flat_programs(
-        loaded._replace(controller=watched_by_nobody, params=loaded.weights)
+        loaded._replace(controller=without_monitor, params=loaded.weights)
     )
     first = programs.init.function(jax.random.key_data(jax.random.key(7)))
     ahead = exporting.fold_constants(programs.act)
@@ -552,11 +550,11 @@ def test_iree_runs_the_controller_without_jax(loaded, in_process, tmp_path):
         modules[name] = runtime.load_vm_flatbuffer(content, driver="local-sync")["main"]
     key = np.asarray(jax.random.key_data(jax.random.key(7)))
     first = [np.asarray(leaf) for leaf in modules["init"](key)]
-    found = flat_steps(
+    result = flat_steps(
         lambda *leaves: [np.asarray(leaf) for leaf in modules["act"](*leaves)], first
     )
     np.testing.assert_allclose(
-        found, np.stack([leaves[0] for leaves in in_process]), atol=1e-5
+        result, np.stack([leaves[0] for leaves in in_process]), atol=1e-5
     )
 
 

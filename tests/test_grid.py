@@ -1,6 +1,4 @@
-"""The plan of a comparison: which cells there are, what is composed for them, and when
-one is done.
-"""
+"""The cells of a comparison, their overrides, and when they are done."""
 
 from pathlib import Path
 
@@ -25,13 +23,13 @@ PLAN = {
 }
 
 
-def test_every_row_meets_every_scenario_under_every_controller_that_it_has():
-    found = grid.list_cells(PLAN)
-    assert len(found) == len(set(found)) == 2 * 2 * 2 * (3 + 2)
-    assert {cell.controller for cell in found if cell.label == "program"} == {
+def test_every_row_has_every_scenario_under_each_of_its_controllers():
+    result = grid.list_cells(PLAN)
+    assert len(result) == len(set(result)) == 2 * 2 * 2 * (3 + 2)
+    assert {cell.controller for cell in result if cell.label == "program"} == {
         "koopman_mpc"
     }
-    assert {cell.scenario for cell in found if cell.controller == "mppi_plain"} == {
+    assert {cell.scenario for cell in result if cell.controller == "mppi_plain"} == {
         "s1"
     }
 
@@ -46,7 +44,7 @@ def test_rows_can_be_picked_and_an_unknown_one_is_named_with_the_choices():
         grid.list_cells(PLAN | {"only": ["iocde"]})
 
 
-def test_what_one_driver_does_lies_together():
+def test_the_cells_of_one_system_are_adjacent():
     groups = grid.group_cells(grid.list_cells(PLAN))
     assert [cell for group in groups for cell in group] == grid.list_cells(PLAN)
     assert len(groups) == 2 * 2 * (2 + 1)
@@ -54,7 +52,7 @@ def test_what_one_driver_does_lies_together():
 
 def test_a_cell_composes_its_row_its_controller_and_its_variation():
     cell = grid.Cell("dynamic", "program", 1, "koopman_mpc", "late", "s2")
-    asked = [
+    options = [
         "vehicle=dynamic",
         "scenario=s2",
         "controller=koopman_mpc",
@@ -62,7 +60,7 @@ def test_a_cell_composes_its_row_its_controller_and_its_variation():
         "model=koopman_mpc",
     ]
     assert grid.overrides(cell, PLAN) == [
-        *asked,
+        *options,
         "model.environment=false",
         "evaluation.env_sensor.delay_s=0.5",
     ]
@@ -87,11 +85,15 @@ def settings(root, **changes):
         "scenario",
         "certification",
     )
-    asked = {name: {"name": name} for name in names} | {
+    options = {name: {"name": name} for name in names} | {
         "vehicle": {"dt": 0.1},
         "evaluation": {"episodes": 4},
     }
-    return asked | {"env_source": "measured", "root": str(root), "name": "table"} | changes
+    return (
+        options
+        | {"env_source": "measured", "root": str(root), "name": "table"}
+        | changes
+    )
 
 
 def rows_file(path):
@@ -99,16 +101,16 @@ def rows_file(path):
 
 
 def test_a_cell_is_done_only_with_its_own_settings_and_undamaged(tmp_path):
-    cell, asked = grid.list_cells(PLAN)[0], settings(tmp_path)
-    path = grid.cell_path(cell, asked)
-    assert not grid.is_done(path, asked)
+    cell, options = grid.list_cells(PLAN)[0], settings(tmp_path)
+    path = grid.cell_path(cell, options)
+    assert not grid.is_done(path, options)
     path.parent.mkdir(parents=True)
-    write_json(rows_file(path), {"row": {}, "made_with": grid.settings_hash(asked)})
-    assert grid.is_done(path, asked)
+    write_json(rows_file(path), {"row": {}, "made_with": grid.settings_hash(options)})
+    assert grid.is_done(path, options)
     assert not grid.is_done(path, settings(tmp_path, evaluation={"episodes": 8}))
     assert not grid.is_done(path, settings(tmp_path, env_source="estimated"))
     rows_file(path).write_bytes(rows_file(path).read_bytes()[:-5])
-    assert not grid.is_done(path, asked)
+    assert not grid.is_done(path, options)
 
 
 def row(system, level, seed):
@@ -158,25 +160,27 @@ def test_collecting_pools_the_seeds_and_compares_what_is_there(tmp_path, seeds):
                 rows_file(path),
                 {"row": row(cell.label, level, cell.seed), "made_with": cell.label},
             )
-    found = {
+    result = {
         entry["system"]: entry
-        for entry in grid.collect_rows(wanted, settings(tmp_path), lambda cell: cell.label)
+        for entry in grid.collect_rows(
+            wanted, settings(tmp_path), lambda cell: cell.label
+        )
     }
-    assert set(found) == {"sfkd", "icode"}
-    assert found["icode"]["seeds"] == list(range(seeds))
-    assert len(found["icode"]["rmse_episodes_m"]) == 2 * seeds
-    assert found["icode"]["difference_to_sfkd"]["mean"] == pytest.approx(3.0)
+    assert set(result) == {"sfkd", "icode"}
+    assert result["icode"]["seeds"] == list(range(seeds))
+    assert len(result["icode"]["rmse_episodes_m"]) == 2 * seeds
+    assert result["icode"]["difference_to_sfkd"]["mean"] == pytest.approx(3.0)
 
 
 @pytest.mark.parametrize(
-    ("older", "systems", "says"),
+    ("older", "systems", "message"),
     [
-        (False, {"sfkd"}, "left out; comparison.older=true takes them"),
+        (False, {"sfkd"}, "left out; comparison.older=true uses them"),
         (True, {"sfkd", "icode"}, ": used"),
     ],
 )
 def test_a_row_that_was_made_with_other_settings_enters_no_table_unseen(
-    tmp_path, capsys, older, systems, says
+    tmp_path, capsys, older, systems, message
 ):
     wanted = [
         grid.Cell("kinematic", label, 0, "mppi", "as it is", "s1")
@@ -188,15 +192,17 @@ def test_a_row_that_was_made_with_other_settings_enters_no_table_unseen(
         write_json(
             rows_file(path), {"row": row(cell.label, 1.0, 0), "made_with": cell.label}
         )
-    found = grid.collect_rows(wanted, settings(tmp_path), lambda cell: "sfkd", older=older)
-    assert {entry["system"] for entry in found} == systems
-    said = capsys.readouterr().err
-    assert said.startswith("1 cells were made with other settings, such as")
-    assert "icode-seed=0" in said
-    assert says in said
+    result = grid.collect_rows(
+        wanted, settings(tmp_path), lambda cell: "sfkd", older=older
+    )
+    assert {entry["system"] for entry in result} == systems
+    output = capsys.readouterr().err
+    assert output.startswith("1 cells were made with other settings, such as")
+    assert "icode-seed=0" in output
+    assert message in output
 
 
-def test_rows_are_dealt_to_processes_whole_and_each_to_one():
+def test_every_row_belongs_to_exactly_one_share():
     """Two controllers of one row share its policy: no two processes may train it."""
     groups = grid.group_cells(grid.list_cells(PLAN))
     parts = [grid.take_share(groups, [k, 3]) for k in range(3)]

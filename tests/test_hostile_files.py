@@ -18,7 +18,7 @@ import numpy as np
 import pytest
 from fuzzing_mutations import bomb
 
-from sfkd_jax import artefacts, datasets, demo, policy, reporting
+from sfkd_jax import artefacts, datasets, demo, paper, policy, reporting
 from sfkd_jax.artefacts import ArtefactError
 from sfkd_jax.exporting import _run_controller as loader
 
@@ -110,7 +110,7 @@ def test_a_pipe_among_logs_is_refused_at_once(tmp_path, name, whole):
         ),
     ):
         datasets.from_logs(
-            path, datasets.Columns(), dt=0.1, wheelbase=2.7, say=lambda line: None
+            path, datasets.Columns(), dt=0.1, wheelbase=2.7, report=lambda line: None
         )
 
 
@@ -204,7 +204,7 @@ def test_a_long_value_is_not_repeated_in_the_line(tmp_path):
 # ---- arrays
 
 
-def archive(path, header, data=b"\0" * 24, *, declared=None):
+def write_zip(path, header, data=b"\0" * 24, *, declared=None):
     """An npz file of one array with any header."""
     length = len(header) if declared is None else declared
     member = b"\x93NUMPY\x01\0" + struct.pack("<H", length) + header + data
@@ -220,7 +220,7 @@ def header(descr="'<f8'", order="False", shape="(3,)"):
 
 
 @pytest.mark.parametrize(
-    ("text", "says"),
+    ("text", "message"),
     [
         (
             header(shape="(1000000000000,)"),
@@ -240,18 +240,22 @@ def header(descr="'<f8'", order="False", shape="(3,)"):
         (header(descr="__import__('os').abort()"), "no header of plain numbers"),
     ],
 )
-def test_headers_are_compared_with_the_bytes_and_not_evaluated(tmp_path, text, says):
-    path = archive(tmp_path / "x.npz", text)
+def test_headers_are_compared_with_the_bytes_and_not_evaluated(tmp_path, text, message):
+    path = write_zip(tmp_path / "x.npz", text)
     line = refusal(artefacts.read_npz, path)
     assert line.startswith(f"{path}: ")
-    assert says in line
+    assert message in line
     with bounded(), pytest.raises(ValueError, match=r"x\.npz"):
         datasets.from_logs(
-            str(path), datasets.Columns(), dt=0.1, wheelbase=2.7, say=lambda line: None
+            str(path),
+            datasets.Columns(),
+            dt=0.1,
+            wheelbase=2.7,
+            report=lambda line: None,
         )
 
 
-def test_an_archive_of_another_compression_is_refused(tmp_path):
+def test_a_zip_file_of_another_compression_is_refused(tmp_path):
     with zipfile.ZipFile(tmp_path / "x.npz", "w", zipfile.ZIP_LZMA) as packed:
         packed.writestr("x.npy", b"\x93NUMPY")
     assert "another method than deflate" in refusal(
@@ -345,7 +349,7 @@ def test_a_cell_of_a_csv_file_does_not_make_all_others_as_wide(tmp_path):
             datasets.Columns(),
             dt=0.1,
             wheelbase=2.7,
-            say=lambda line: None,
+            report=lambda line: None,
         )
 
 
@@ -441,4 +445,4 @@ def test_a_row_cannot_name_arrays_outside_its_folder(tmp_path):
     rows = [row | {"arrays": "../../outside.npz"} for row in document["rows"][:3]]
     artefacts.write_json(tmp_path / "results.json", document | {"rows": rows})
     with pytest.raises(ArtefactError, match="outside this folder"):
-        reporting.benchmark_report(tmp_path)
+        paper.write_results_page(tmp_path)

@@ -1,6 +1,4 @@
-"""Files that are damaged, foreign or of another kind: each is one line that names it,
-and no other file is lost.
-"""
+"""Damaged and foreign files are refused in one line that names them."""
 
 import copy
 import json
@@ -20,7 +18,7 @@ from helpers import ENV_HIGH, ENV_LOW, SHARES, dataset, refusal_of
 from jaxtyping import TypeCheckError
 
 from sfkd_jax import artefacts, datasets, demo, policy, report, training
-from sfkd_jax.cli import config
+from sfkd_jax.cli import entry
 from sfkd_jax.pipeline import evaluate_run, store
 
 SHIPPED = demo.SHIPPED / "kinematic"
@@ -54,17 +52,15 @@ class Bomb:
 
 @pytest.fixture
 def run(tmp_path):
-    """A run directory as `train` leaves it, as far as readers of documents are
-    concerned.
-    """
-    place = tmp_path / "runs" / "smoke" / "sfkd" / "seed=0"
-    shutil.copytree(SHIPPED, place)
-    artefacts.write_json(place / "results.json", {"rows": [ROW]})
+    """A run directory with the documents that `train` writes."""
+    run_dir = tmp_path / "runs" / "smoke" / "sfkd" / "seed=0"
+    shutil.copytree(SHIPPED, run_dir)
+    artefacts.write_json(run_dir / "results.json", {"rows": [ROW]})
     artefacts.write_json(
-        place / "settings.json",
+        run_dir / "settings.json",
         {"seed": 0, "model": {"rank": 32}, "training": {"steps": 100}},
     )
-    return place
+    return run_dir
 
 
 def settings_of(run):
@@ -80,26 +76,24 @@ def settings_of(run):
 
 @cache
 def shipped():
-    """As it ships: one object, so that what is compiled for it is compiled once."""
+    """The shipped policy; one object, so that it is compiled once."""
     return policy.load(SHIPPED)
 
 
 def read_policy(run):
-    """A policy and its certificate; that nothing is certified counts as refused."""
-    with warnings.catch_warnings(record=True) as told:
+    """Read a policy and its certificate; one without a certificate counts as refused."""
+    with warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter("always")
         try:
-            found = policy.load(run)
-        except (
-            TypeCheckError
-        ):  # under test, types are checked before anything is verified
+            result = policy.load(run)
+        except TypeCheckError:  # tests check types before anything is verified
             raise ValueError("certificate: of other types") from None
-    if found.certificate is None:
-        raise ValueError(str(told[-1].message))
+    if result.certificate is None:
+        raise ValueError(str(caught[-1].message))
 
 
 def read(run, name):
-    """Read a file as the doors do."""
+    """Read a file as the commands do."""
     if name == "results.json":
         evaluate_run.read_results(run)
     elif name == "settings.json":
@@ -108,8 +102,8 @@ def read(run, name):
         read_policy(run)
 
 
-def places(value, at=()):
-    """Where values lie in a document."""
+def paths_in(value, at=()):
+    """The paths of all values in a document."""
     entries = (
         value.items()
         if isinstance(value, dict)
@@ -117,16 +111,16 @@ def places(value, at=()):
         if isinstance(value, list)
         else ()
     )
-    for key, entry in entries:
+    for key, inner in entries:
         yield (*at, key)
-        yield from places(entry, (*at, key))
+        yield from paths_in(inner, (*at, key))
 
 
 def spoiled(document, draw):
     """The document with one value gone or replaced."""
     changed, (*above, last) = (
         copy.deepcopy(document),
-        draw.choice(list(places(document))),
+        draw.choice(list(paths_in(document))),
     )
     inner = changed
     for key in above:
@@ -186,9 +180,8 @@ def test_a_document_with_a_value_gone_or_of_another_kind_is_refused_in_one_line_
         text = json.dumps(spoiled(good, draw)).encode()
         lines.append(survives(lambda: read(run, name), run / name, text))
     refused = [line for line in lines if line]
-    assert (
-        len(refused) >= len(lines) // 5
-    )  # most values of a certificate are told and not used
+    # Most values of a certificate are informative only.
+    assert len(refused) >= len(lines) // 5
     assert [
         line
         for line in refused
@@ -198,7 +191,7 @@ def test_a_document_with_a_value_gone_or_of_another_kind_is_refused_in_one_line_
 
 
 @pytest.mark.parametrize("name", BYTES)
-def test_bytes_that_were_damaged_are_refused_or_say_the_same(run, name):
+def test_damaged_bytes_are_refused_or_read_the_same(run, name):
     draw, file, read_it = random.Random(2), run / name, read_policy
     if name == "dataset.npz":
         settings = settings_of(run)
@@ -234,7 +227,7 @@ def test_a_report_names_the_file_that_it_cannot_draw(run, name):
         b"\xff\xfe",
         b"[1, 2]",
         b"7\n7\n",
-        b"PK\x03\x04 not an archive",
+        b"PK\x03\x04 not a zip file",
     ):
         (run / name).write_bytes(text)
         line = refusal_of(lambda: report.run(settings_of(run)))
@@ -250,14 +243,14 @@ def test_lines_of_a_training_log_that_are_none_are_dropped(tmp_path):
         assert artefacts.read_jsonl(tmp_path / "metrics.jsonl") == [json.loads(good)]
 
 
-# ---- a door with what cannot be composed; a full disk; a place that cannot be written
+# ---- a command with what cannot be composed; a full disk; a directory that cannot be written
 
 
-def opened(run_door, monkeypatch, capsys, *arguments):
-    """The exit status of a door in this process, and its lines on stderr."""
-    monkeypatch.setattr("sys.argv", ["door", *arguments])
+def opened(run, monkeypatch, capsys, *arguments):
+    """The exit status of a command in this process, and its lines on stderr."""
+    monkeypatch.setattr("sys.argv", ["command", *arguments])
     try:
-        config.door(run_door)()
+        entry.hydra_command(run)()
         status = 0
     except SystemExit as ended:
         status = ended.code
@@ -265,7 +258,7 @@ def opened(run_door, monkeypatch, capsys, *arguments):
 
 
 @pytest.mark.parametrize(
-    ("argument", "says"),
+    ("argument", "expected_text"),
     [
         ("model.rank=abc", "model.rank"),
         ("model=sfdk", "sfkd_no_fiber"),
@@ -277,15 +270,15 @@ def opened(run_door, monkeypatch, capsys, *arguments):
         ("dataset.seed=null", "dataset.seed"),
     ],
 )
-def test_what_cannot_be_composed_is_one_line_of_a_door(
-    monkeypatch, capsys, argument, says
+def test_what_cannot_be_composed_is_one_line_of_a_command(
+    monkeypatch, capsys, argument, expected_text
 ):
     status, lines = opened(
-        lambda settings: pytest.fail("a door was opened"), monkeypatch, capsys, argument
+        lambda settings: pytest.fail("a command ran"), monkeypatch, capsys, argument
     )
     assert status == 1
     assert len(lines) == 1
-    assert says in lines[0]
+    assert expected_text in lines[0]
 
 
 def full(*_):
@@ -321,9 +314,7 @@ def refuse(*_, **__):
 
 
 @pytest.mark.parametrize("call", ["mkdir", "open"])
-def test_a_place_that_cannot_be_written_is_one_line_and_keeps_what_was_there(
-    run, monkeypatch, call
-):
+def test_a_read_only_directory_is_one_line_and_keeps_its_files(run, monkeypatch, call):
     settings, root = settings_of(run) | {"name": "another"}, run.parents[2]
     before = snapshot(root)
     with monkeypatch.context() as read_only:

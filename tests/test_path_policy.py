@@ -1,6 +1,4 @@
-"""A policy in path coordinates on its way through the store: law and weights are one
-artefact.
-"""
+"""Policies in path coordinates: law and weights are one artefact."""
 
 import jax
 import jax.numpy as jnp
@@ -26,24 +24,24 @@ def settings(*overrides):
     }
 
 
-def saved(place, *, law, samples=4):
-    asked = settings(
+def saved(run_dir, *, law, samples=4):
+    options = settings(
         "controller=mppi_tiny",
         "controller.sampling=law",
         f"controller.mppi.num_samples={samples}",
     )
-    asked["model"] |= {
+    options["model"] |= {
         name: list(value) if isinstance(value, tuple) else value
         for name, value in TINY.items()
     }
-    asked["model"] |= {"budget": "joint"}
+    options["model"] |= {"budget": "joint"}
     scales = path_space()
-    model = build.build_model(asked["model"], scales, vehicle.kinematic())
-    asked |= {"space": build.space_to_settings(scales)}
+    model = build.build_model(options["model"], scales, vehicle.kinematic())
+    options |= {"space": build.space_to_settings(scales)}
     return policy.save(
-        place / "policy.npz",
+        run_dir / "policy.npz",
         model.init(jax.random.key(0)),
-        asked,
+        options,
         made_from={},
         law=law,
     )
@@ -85,14 +83,14 @@ def test_a_policy_that_lost_its_law_is_refused(tmp_path):
     "overrides", [("dataset=standard",), ("model=sfkd", "controller=mppi")]
 )
 def test_path_coordinates_for_data_and_model_or_for_neither(overrides):
-    asked = settings(*overrides)
+    options = settings(*overrides)
     with pytest.raises(ValueError, match="go together"):
-        dry_run.check_settings(asked, build.build_vehicle(asked["vehicle"]))
+        dry_run.check_settings(options, build.build_vehicle(options["vehicle"]))
 
 
-def test_the_law_drives_as_a_row_along_a_path_alone():
-    asked = settings("evaluation.systems=[law]")
-    dry_run.check_settings(asked, build.build_vehicle(asked["vehicle"]))
+def test_the_system_law_exists_in_path_coordinates_only():
+    options = settings("evaluation.systems=[law]")
+    dry_run.check_settings(options, build.build_vehicle(options["vehicle"]))
     with pytest.raises(ValueError, match=r"evaluation\.systems entry 'law'"):
         dry_run.check_settings(
             settings("dataset=standard", "model=sfkd", "evaluation.systems=[law]"),
@@ -103,9 +101,9 @@ def test_the_law_drives_as_a_row_along_a_path_alone():
 @pytest.mark.parametrize(
     "model", ["sfkd_path", "sfkd_path_no_contraction", "neural_ode_path", "r2dn_path"]
 )
-def test_every_path_model_is_rehearsed_with_its_planner(model):
-    asked = settings(
+def test_every_path_model_passes_the_dry_run_with_its_planner(model):
+    options = settings(
         f"model={model}",
         *(() if "sfkd" in model and "no" not in model else ("training.loss.tube=[]",)),
     )
-    dry_run.check_settings(asked, build.build_vehicle(asked["vehicle"]))
+    dry_run.check_settings(options, build.build_vehicle(options["vehicle"]))

@@ -1,15 +1,13 @@
-"""Doors opened from nothing: what is missing is made, for a vehicle of one's own and
-every job of a sweep.
-"""
+"""Commands that start from nothing make all artefacts that they need."""
 
 import json
 
 import numpy as np
-from helpers import door, last_line
+from helpers import last_line, run_command
 
 
 def test_a_sweep_runs_every_job_and_ends_with_json(tmp_path):
-    done = door(
+    done = run_command(
         "generate",
         "-m",
         "+experiment=smoke",
@@ -34,8 +32,8 @@ def step(x, u, e):
 """
 
 
-def test_the_walk_works_for_a_step_function_of_ones_own_under_a_speed_loop(tmp_path):
-    """From a file in the current directory to data, weights, a certificate, driven
+def test_all_stages_run_for_a_users_step_function_under_a_speed_loop(tmp_path):
+    """A step function in the current directory gives data, weights, a certificate,
     episodes and a report.
     """
     (tmp_path / "my_robot.py").write_text(ROBOT)
@@ -62,9 +60,11 @@ def test_the_walk_works_for_a_step_function_of_ones_own_under_a_speed_loop(tmp_p
         "model.decoder_hidden=[8]",
     )
     small += ("evaluation.systems=[self]", "vehicle.inner_loop=speed", "name=robot")
-    walk = last_line(door("train", "+experiment=smoke", *own, *small, cwd=tmp_path))
-    assert (tmp_path / walk["report"]).exists()
-    assert 0 < walk["alpha"] < 1
-    (row,) = json.loads((tmp_path / walk["results"]).read_text())["rows"]
+    summary = last_line(
+        run_command("train", "+experiment=smoke", *own, *small, cwd=tmp_path)
+    )
+    assert (tmp_path / summary["report"]).exists()
+    assert 0 < summary["alpha"] < 1
+    (row,) = json.loads((tmp_path / summary["results"]).read_text())["rows"]
     assert (row["system"], row["vehicle"], row["episodes"]) == ("sfkd", "own", 2)
     assert np.isfinite(row["rmse_m"]["mean"])

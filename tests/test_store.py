@@ -1,6 +1,4 @@
-"""Where runs lie: a place from which nothing could be read back is refused before
-anything is trained.
-"""
+"""Run directories from which checkpoints cannot be read are refused before training."""
 
 from pathlib import Path
 

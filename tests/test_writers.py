@@ -1,6 +1,4 @@
-"""Several processes at one directory: nothing is lost, and whoever finds it taken is
-told by whom.
-"""
+"""Several processes write into one directory: locks, and no lost rows or episodes."""
 
 import json
 import re
@@ -14,12 +12,12 @@ from pathlib import Path
 import numpy as np
 import pytest
 from helpers import refusal_of
+from sfkd_jax.reporting._scene import scenes_of
+from sfkd_jax.reporting._tables import block_title, blocks_of
 
 from sfkd_jax import artefacts
 from sfkd_jax.artefacts import DirectoryLocked, locked
 from sfkd_jax.pipeline import evaluate_run
-from sfkd_jax.reporting._scene import scenes_of
-from sfkd_jax.reporting._tables import block_title, blocks_of
 
 ROW = {
     "system": "sfkd", "scenario": "s3", "vehicle": "kinematic", "inner_loop": "none", "controller": "mppi",
@@ -37,7 +35,7 @@ HOLD = """
 
 
 def started(program, *arguments):
-    """A process that runs a program; its first line of output says that it is ready."""
+    """A process that runs a program; its first line of output means that it is ready."""
     command = [sys.executable, "-c", textwrap.dedent(program), *map(str, arguments)]
     process = subprocess.Popen(
         command, stdout=subprocess.PIPE, stdin=subprocess.PIPE, text=True
@@ -62,30 +60,32 @@ def driven(row, value=0.0, episodes=2, steps=40):
     }
 
 
-def store(place, row, value=0.0):
+def store(run_dir, row, value=0.0):
     evaluate_run.write_results(
-        place, SETTINGS, [row], driven(row, value) | {"dt": np.asarray(0.1)}, 0.0
+        run_dir, SETTINGS, [row], driven(row, value) | {"dt": np.asarray(0.1)}, 0.0
     )
 
 
-def stored(place):
+def stored(run_dir):
     """Rows, and the arrays by the name of their drive."""
-    rows = artefacts.read_json(place / "results.json")["rows"]
-    return rows, artefacts.read_arrays(place / "episodes.npz", kind="episodes")[0]
+    rows = artefacts.read_json(run_dir / "results.json")["rows"]
+    return rows, artefacts.read_arrays(run_dir / "episodes.npz", kind="episodes")[0]
 
 
 # ---- the lock
 
 
-def test_a_taken_directory_is_refused_at_once_in_a_line_that_says_by_whom(tmp_path):
+def test_a_locked_directory_is_refused_at_once_and_the_message_names_the_process(
+    tmp_path,
+):
     holder = started(HOLD, tmp_path, 60)
     began = time.monotonic()
-    with pytest.raises(DirectoryLocked) as told, locked(tmp_path):
+    with pytest.raises(DirectoryLocked) as caught, locked(tmp_path):
         pass
     assert time.monotonic() - began < 5.0
     holder.kill()
     holder.wait()
-    line = str(told.value)
+    line = str(caught.value)
     assert "\n" not in line
     assert line.startswith(f"{tmp_path}: process {holder.pid} on ")
     assert re.search(
@@ -103,7 +103,7 @@ def test_kill_9_frees_a_directory(tmp_path):
     assert not (tmp_path / ".lock.json").exists()
 
 
-def test_who_waits_is_told_and_gets_it(tmp_path, capfd):
+def test_a_waiting_process_prints_a_message_and_gets_the_lock(tmp_path, capfd):
     holder = started(HOLD, tmp_path, 3.5)
     with locked(tmp_path, wait=True):
         assert holder.wait(10) == 0
@@ -111,7 +111,7 @@ def test_who_waits_is_told_and_gets_it(tmp_path, capfd):
     assert line.startswith(f"waiting: {tmp_path}: process {holder.pid} on ")
 
 
-def test_a_process_enters_what_it_holds_again_and_leaves_it_once(tmp_path):
+def test_a_lock_is_reentrant_in_its_process(tmp_path):
     with locked(tmp_path):
         with locked(tmp_path / "." / ""):
             pass
@@ -128,7 +128,7 @@ def test_a_process_enters_what_it_holds_again_and_leaves_it_once(tmp_path):
 def test_a_file_system_without_locks_gets_a_file_with_the_process_in_it(
     tmp_path, monkeypatch, errno
 ):
-    """Such a file outlives its process, so another one must see that it is of nobody."""
+    """Such a file outlives its process, so it must record the process."""
 
     def absent(descriptor):
         raise OSError(errno, "no locks here")
@@ -157,16 +157,16 @@ WRITER = """
     sys.path.insert(0, sys.argv[3])
     from pathlib import Path
     from test_writers import ROW, store
-    place, me = Path(sys.argv[1]), int(sys.argv[2])
+    run_dir, me = Path(sys.argv[1]), int(sys.argv[2])
     print("ready", flush=True)
     begins = float(sys.stdin.readline())
     for number in range(10):
         time.sleep(max(0.0, begins + 0.3 * number + 0.02 * me - time.time()))
-        store(place, ROW | {"system": f"writer{me}", "scenario": f"road{number}"}, 10 * me + number)
+        store(run_dir, ROW | {"system": f"writer{me}", "scenario": f"road{number}"}, 10 * me + number)
 """
 
 
-def test_two_processes_20_ms_apart_lose_no_row_and_no_episode(tmp_path):
+def test_two_processes_20_ms_after_each_other_lose_no_row_and_no_episode(tmp_path):
     writers = [started(WRITER, tmp_path, me, Path(__file__).parent) for me in (0, 1)]
     begins = time.time() + 0.5
     for writer in writers:
@@ -189,9 +189,9 @@ def test_three_planners_in_one_directory_keep_three_rows_with_their_episodes(tmp
     ]
     for value, row in enumerate(rows, 1):
         store(tmp_path, row, value)
-    kept, arrays = stored(tmp_path)
-    assert [row["planner"] for row in kept] == ["mppi", "cem", "gradient"]
-    for value, row in enumerate(kept, 1):
+    retained, arrays = stored(tmp_path)
+    assert [row["planner"] for row in retained] == ["mppi", "cem", "gradient"]
+    for value, row in enumerate(retained, 1):
         for part in ("lateral", "states", "controls", "envs", "path"):
             assert np.all(arrays[f"{artefacts.drive_name(row)}/{part}"] == value)
     scenes = scenes_of(tmp_path)
@@ -201,12 +201,12 @@ def test_three_planners_in_one_directory_keep_three_rows_with_their_episodes(tmp
         3: False,
     }
     assert len({scene.stem for scene in scenes}) == 3
-    blocks = blocks_of(kept)
+    blocks = blocks_of(retained)
     assert [len(block) for block in blocks] == [1, 1, 1]
     assert len({block_title(block) for block in blocks}) == 3
     store(tmp_path, rows[1], 7.0)
-    kept, arrays = stored(tmp_path)
-    assert len(kept) == 3
+    retained, arrays = stored(tmp_path)
+    assert len(retained) == 3
     assert np.all(arrays[f"{artefacts.drive_name(rows[1])}/lateral"] == 7.0)
 
 
@@ -246,10 +246,10 @@ def test_rows_and_episodes_of_an_earlier_version_are_read_and_replaced(tmp_path)
     (scene,) = scenes_of(tmp_path)
     assert (scene.label, scene.stem, list(scene.lateral)) == ("S3", "s3", ["sfkd"])
     store(tmp_path, ROW | {"planner": "cem"}, 2.0)
-    rows, kept = stored(tmp_path)
+    rows, retained = stored(tmp_path)
     assert len(rows) == 2
     for part in ("lateral", *artefacts.ROAD):
-        assert np.all(kept[f"{artefacts.drive_name(ROW)}/{part}"] == 1.0)
+        assert np.all(retained[f"{artefacts.drive_name(ROW)}/{part}"] == 1.0)
     store(tmp_path, ROW, 3.0)
     assert json.loads((tmp_path / "results.json").read_text())["rows"] == [
         ROW | {"planner": "cem"},

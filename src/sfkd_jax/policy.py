@@ -146,7 +146,7 @@ def load(
 ) -> Policy:
     """Return the policy in a run directory, with its certificate verified.
 
-    Without a certificate a warning says why.
+    Without a certificate it warns and gives the reason.
 
     Args:
         path: of the directory, or of a policy.npz with its manifest beside it.

@@ -8,7 +8,7 @@ writer renames it.
 
 A manifest records two hashes. `sha256` identifies the content, independent of order and
 layout; other documents refer to it. `file_sha256` is the hash of the bytes of the file.
-It is compared before the archive is opened, so that only what the writer wrote is
+It is compared before the zip file is opened, so that only what the writer wrote is
 parsed and inflated. Manifests of earlier versions have no `file_sha256`; for these, and
 for files without a manifest, the limits of `_npz` apply.
 """
@@ -37,7 +37,7 @@ from sfkd_jax.artefacts._files import (
     replacement,
     synchronise,
 )
-from sfkd_jax.artefacts._npz import PORTABLE, check_archive, members, write_npz
+from sfkd_jax.artefacts._npz import PORTABLE, check_zip, members, write_npz
 
 FORMAT = 1
 """Version of the manifest; a reader refuses every other one."""
@@ -205,7 +205,7 @@ def _load(path: Path, manifest: Mapping[str, Any]) -> dict[str, np.ndarray]:
     except ArtefactError:
         opened = open_regular(path)
     with opened as file:
-        check_archive(path, file)
+        check_zip(path, file)
         file.seek(0)
         recorded = manifest.get("file_sha256", "")
         actual = hashlib.file_digest(file, "sha256").hexdigest() if recorded else ""

@@ -109,12 +109,12 @@ def truncate_jsonl(
         ArtefactError: see `read_jsonl` and `write_json`.
     """
     if path.exists():
-        kept = [
+        records = [
             record
             for record in read_jsonl(path, keys=keys, damaged=damaged)
             if keep(record)
         ]
-        write_bytes(path, b"".join(encode(path, record) + b"\n" for record in kept))
+        write_bytes(path, b"".join(encode(path, record) + b"\n" for record in records))
 
 
 def _cut_short(path: Path) -> bool:

@@ -1,4 +1,4 @@
-"""Read arrays of an .npz archive without trusting what the archive declares.
+"""Read the arrays of an .npz file without trusting the sizes that it declares.
 
 Declared sizes are compared with the size of the file before an array is allocated.
 Stored members cannot be larger than the file. Compressed members are inflated to their
@@ -60,32 +60,32 @@ def read_npz(path: Path) -> dict[str, np.ndarray]:
             or more than MAX_INFLATED bytes of compressed arrays.
     """
     with open_regular(path) as file:
-        check_archive(path, file)
+        check_zip(path, file)
         return members(path, file)
 
 
-def check_archive(path: Path, file: BinaryIO) -> None:
-    """Refuse an incomplete archive after reading only its start and its end."""
+def check_zip(path: Path, file: BinaryIO) -> None:
+    """Refuse an incomplete zip file after reading only its start and its end."""
     if not b"PK".startswith(file.read(2)):
-        raise failure(path, "foreign, not an archive of arrays")
+        raise failure(path, "foreign, not a zip file of arrays")
     if not zipfile.is_zipfile(file):
-        raise failure(path, "truncated, the end of the archive is missing")
+        raise failure(path, "truncated, the end of the zip file is missing")
 
 
 def members(path: Path, file: io.FileIO) -> dict[str, np.ndarray]:
-    """Return the arrays of an open archive and close it; see `read_npz`."""
+    """Return the arrays of an open zip file and close it; see `read_npz`."""
     size = file.seek(0, io.SEEK_END)
     try:
-        with _Reader(file) as bounded, zipfile.ZipFile(bounded) as archive:
-            listed = archive.infolist()
+        with _Reader(file) as bounded, zipfile.ZipFile(bounded) as zip_file:
+            listed = zip_file.infolist()
             _check_directory(path, listed, size)
             return {
-                info.filename.removesuffix(".npy"): _array(path, archive, info)
+                info.filename.removesuffix(".npy"): _array(path, zip_file, info)
                 for info in listed
             }
     except ArtefactError:
         raise
-    except Exception as error:  # a damaged archive raises nearly anything
+    except Exception as error:  # a damaged file raises nearly anything
         raise failure(path, f"damaged ({error or type(error).__name__})") from error
 
 
@@ -93,13 +93,13 @@ def write_npz(
     file: BinaryIO, arrays: Mapping[str, np.ndarray], *, compressed: bool
 ) -> None:
     """Write as np.savez does, for any names, without pickles, byte-reproducible."""
-    with zipfile.ZipFile(file, "w") as archive:
+    with zipfile.ZipFile(file, "w") as zip_file:
         for name, array in arrays.items():
             info = zipfile.ZipInfo(f"{name}.npy", _DATE)
             info.compress_type = (
                 zipfile.ZIP_DEFLATED if compressed else zipfile.ZIP_STORED
             )
-            with archive.open(info, "w", force_zip64=True) as entry:
+            with zip_file.open(info, "w", force_zip64=True) as entry:
                 np.lib.format.write_array(entry, array, allow_pickle=False)
 
 
@@ -133,9 +133,9 @@ def _check_directory(path: Path, listed: list[zipfile.ZipInfo], size: int) -> No
         )
 
 
-def _array(path: Path, archive: zipfile.ZipFile, info: zipfile.ZipInfo) -> np.ndarray:
+def _array(path: Path, zip_file: zipfile.ZipFile, info: zipfile.ZipInfo) -> np.ndarray:
     """Read one member; the zip library compares its checksum at the last byte."""
-    with archive.open(info) as entry:
+    with zip_file.open(info) as entry:
         kind, shape, order, begins = _header(path, entry)
         size = math.prod(shape) * kind.itemsize
         if begins + size != info.file_size:

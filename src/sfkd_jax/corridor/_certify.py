@@ -220,13 +220,13 @@ def _attack(
         return outcome_of(loop.plant, model, params, tube, drives, apply_filter)
 
     held = jax.jit(jax.vmap(jax.vmap(shielded)))(worst_drives.drives)
-    kept = np.asarray(held.radius) <= bound
+    within = np.asarray(held.radius) <= bound
     worst = {
         "lateral_m": np.max(worst_drives.outcome.lateral),
         "distance_m": np.max(worst_drives.outcome.distance),
         "shielded_lateral_m": np.max(held.lateral),
-        "kept_lateral_m": np.max(np.asarray(held.lateral), where=kept, initial=0.0),
-        "kept_distance_m": np.max(np.asarray(held.distance), where=kept, initial=0.0),
+        "kept_lateral_m": np.max(np.asarray(held.lateral), where=within, initial=0.0),
+        "kept_distance_m": np.max(np.asarray(held.distance), where=within, initial=0.0),
     }
     worst = {name: float(value) for name, value in worst.items()}
     shares = {

@@ -127,7 +127,7 @@ def input_shapes(program: Program) -> tuple[jax.ShapeDtypeStruct, ...]:
 def lower(
     function: Callable[..., Any], program: Program, platforms: tuple[str, ...]
 ) -> jax.export.Exported:
-    """Return a function of a program's inputs as StableHLO, with unused arguments kept.
+    """Return a function of a program's inputs as StableHLO, including unused arguments.
 
     Source locations are left out: they contain paths of this machine and would make the
     result depend on it.

@@ -211,7 +211,7 @@ def _compiled(folder: Path, manifest: dict[str, Any], name: str) -> Any:
             for leaf in program[side]
         ]
         if listed != [(str, value.shape, str(value.dtype)) for value in values]:
-            raise ExportError(f"{path}: has other {side} than its manifest says")
+            raise ExportError(f"{path}: has other {side} than its manifest")
     return compiled
 
 

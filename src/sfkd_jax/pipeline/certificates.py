@@ -30,7 +30,7 @@ def certificate_path(run_dir: Path) -> Path:
 def certify_policy(settings: dict[str, Any]) -> dict[str, Any]:
     """Certify the policy of the run, and write and return the document.
 
-    A refusal is a document too: `valid` is false, and `reason` says why.
+    A refusal is a document too: `valid` is false, and `reason` is given.
     """
     began = time.perf_counter()
     run_dir = store.run_directory(settings)

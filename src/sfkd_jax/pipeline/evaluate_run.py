@@ -23,7 +23,7 @@ def evaluate_run(
 
     Args:
         settings: of the run.
-        command: that was typed; it is kept with the results.
+        command: that was typed; it is stored with the results.
 
     Returns:
         `results`, the path of results.json, and the number of new `rows`.
