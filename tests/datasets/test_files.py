@@ -1,5 +1,5 @@
-"""Logs of one's own: what is read comes out as it was, and what cannot be right is told
-in one line with its row.
+"""Recorded drives are read without loss, and implausible ones are refused in one line
+with their row.
 """
 
 import re
@@ -10,16 +10,17 @@ import pytest
 from recorded import NAMES, STATE, drive, write_csv, write_npz
 
 from sfkd_jax import datasets
-from sfkd_jax.datasets import Columns, _dealing
+from sfkd_jax.datasets import Columns, _assignment
 
 DT, STEPS = 0.1, 10
 
 
 def read(path, columns=None, **options):
-    """The data set of some logs, and every line that was said."""
-    said = []
-    options = {"dt": DT, "wheelbase": 2.7, "steps": STEPS, "say": said.append} | options
-    return datasets.from_logs(str(path), columns or Columns(), **options), said
+    """The data set of some logs, and every line that was reported."""
+    lines = []
+    options = {"report": lines.append} | options
+    options = {"dt": DT, "wheelbase": 2.7, "steps": STEPS} | options
+    return datasets.from_logs(str(path), columns or Columns(), **options), lines
 
 
 def refusal(path, columns=None, **options):
@@ -93,9 +94,9 @@ def test_whole_drives_as_x_u_e_come_back_to_the_last_bit(tmp_path):
     wanted = [
         np.concatenate(parts) for parts in zip(*map(expected, drives), strict=True)
     ]
-    logged, said = read(tmp_path / "a.npz")
+    logged, lines = read(tmp_path / "a.npz")
     assert same_segments(together(logged.dataset), wanted)
-    assert not [line for line in said if "too few drives" in line]
+    assert not [line for line in lines if "too few drives" in line]
 
 
 def test_a_drive_comes_back_from_parquet_to_the_last_bit(tmp_path):
@@ -163,13 +164,11 @@ def test_an_unknown_environment_becomes_a_constant(tmp_path):
         name: values for name, values in drive().items() if name not in NAMES[7:]
     }
     write_csv(tmp_path / "a.csv", columns)
-    logged, _ = read(tmp_path, told=False)
+    logged, _ = read(tmp_path, needs_environment=False)
     assert together(logged.dataset)[2].shape == (30, STEPS, 2)
     assert not together(logged.dataset)[2].any()
     assert logged.coverage["environment"] == {}
-    assert np.all(
-        np.asarray(logged.dataset.env_high) >= 1e6
-    )  # nothing that is told can be outside
+    assert np.all(np.asarray(logged.dataset.env_high) >= 1e6)  # nothing can be outside
 
 
 @pytest.mark.parametrize("period", [0.01, 0.03, 0.04])
@@ -206,9 +205,9 @@ def test_a_gap_splits_a_drive_and_nothing_is_invented_in_it(tmp_path):
     path = write_csv(
         tmp_path / "a.csv", {name: values[kept] for name, values in columns.items()}
     )
-    logged, said = read(path)
+    logged, lines = read(path)
     assert (
-        f"warning: {path}, line 103: 10 s without rows; drives are split there" in said
+        f"warning: {path}, line 103: 10 s without rows; drives are split there" in lines
     )
     states = together(logged.dataset)[0]
     assert len(states) == 20
@@ -285,7 +284,7 @@ WRONG = {
     ),
     "km/h": (
         scale("v", lambda v: 3.6 * v),
-        "0.278 times as fast as v says; the speed is probably in km/h",
+        "0.278 times as fast as v; the speed is probably in km/h",
     ),
     "milliseconds": (scale("t", lambda t: 1e3 * t), "time is probably in ms"),
     "centimetres": (
@@ -350,7 +349,7 @@ TEXTS = {
         "0,1,2\n1,2,3\n",
         ", line 1: numbers where the names of the columns should be",
     ),
-    "twice": ("t,t\n0,1\n", ", line 1: the column t stands there twice"),
+    "twice": ("t,t\n0,1\n", ", line 1: the column t appears twice"),
     "ragged": (
         ",".join(NAMES) + "\n" + "0," * 8 + "0\n0,1,2\n",
         ", line 3: 3 cells below a header of 9",
@@ -401,16 +400,16 @@ def test_a_malformed_npz_is_one_line(tmp_path, kind):
     assert says in refusal(write_npz(tmp_path / "a.npz", arrays))
 
 
-def test_every_file_that_is_refused_is_told(tmp_path):
+def test_every_refused_file_is_reported(tmp_path):
     for name, row in (("a", 3), ("b", 8)):
         columns = drive(phase=row)
         change("yaw", row, np.nan)(columns)
         write_csv(tmp_path / f"{name}.csv", columns)
-    said = []
+    lines = []
     with pytest.raises(ValueError, match=r"yaw is nan \(the first of 2 findings\)"):
-        read(tmp_path, say=said.append)
-    assert len(said) == 1
-    assert re.search(r"[ab]\.csv, line (5|10): yaw is nan$", said[0])
+        read(tmp_path, report=lines.append)
+    assert len(lines) == 1
+    assert re.search(r"[ab]\.csv, line (5|10): yaw is nan$", lines[0])
 
 
 @pytest.mark.parametrize(
@@ -462,7 +461,7 @@ def test_contents_decide_which_data_set_it_is(tmp_path):
         (Columns(environment=()), "pass env_source=none"),
     ],
 )
-def test_columns_that_cannot_be_meant_are_refused(tmp_path, columns, says):
+def test_invalid_columns_are_refused(tmp_path, columns, says):
     assert says in refusal(write_csv(tmp_path / "a.csv", drive()), columns)
 
 
@@ -484,12 +483,12 @@ def test_columns_that_cannot_be_meant_are_refused(tmp_path, columns, says):
         ),
     ],
 )
-def test_what_is_merely_odd_is_warned_of(tmp_path, spoil, options, says):
+def test_oddities_are_warned_of(tmp_path, spoil, options, says):
     columns = drive()
     spoil(columns)
-    _, said = read(write_csv(tmp_path / "a.csv", columns), **options)
+    _, lines = read(write_csv(tmp_path / "a.csv", columns), **options)
     assert any(
-        line.startswith(f"warning: {tmp_path}") and says in line for line in said
+        line.startswith(f"warning: {tmp_path}") and says in line for line in lines
     )
 
 
@@ -509,25 +508,27 @@ def test_the_box_of_environments_is_what_logs_reach_or_what_is_asked(tmp_path):
     assert "must be 2 numbers each" in refusal(path, env_low=(0.3, -8.0))
 
 
-def deal(drives, shares=(0.6, 0.1, 0.2, 0.1), seed=0):
-    return _dealing.deal(np.asarray(drives), shares=shares, seed=seed)
+def assign(drives, shares=(0.6, 0.1, 0.2, 0.1), seed=0):
+    return _assignment.assign_parts(np.asarray(drives), shares=shares, seed=seed)
 
 
 @pytest.mark.parametrize("drives", [20, 50, 200])
-def test_drives_are_dealt_whole_where_there_are_enough(drives):
+def test_drives_are_assigned_whole_where_there_are_enough(drives):
     labels = np.repeat(np.arange(drives), 7)
-    dealt = deal(labels)
-    assert dealt.whole
-    assert all(len(set(dealt.parts[labels == drive])) == 1 for drive in range(drives))
-    shares = np.bincount(dealt.parts) / len(labels)
+    assigned = assign(labels)
+    assert assigned.whole
+    assert all(
+        len(set(assigned.parts[labels == drive])) == 1 for drive in range(drives)
+    )
+    shares = np.bincount(assigned.parts) / len(labels)
     assert np.all(np.abs(shares - [0.6, 0.1, 0.2, 0.1]) <= 1.0 / drives + 1e-9)
 
 
 @pytest.mark.parametrize("sizes", [(40,), (20, 20), (100, 1, 1, 1, 1, 1)])
 def test_too_few_drives_are_cut_in_time(sizes):
-    dealt = deal(np.repeat(np.arange(len(sizes)), sizes))
-    assert not dealt.whole
-    first = dealt.parts[: sizes[0]]
+    assigned = assign(np.repeat(np.arange(len(sizes)), sizes))
+    assert not assigned.whole
+    first = assigned.parts[: sizes[0]]
     assert np.all(np.diff(first) >= 0)
     np.testing.assert_allclose(
         np.bincount(first) / sizes[0], [0.6, 0.1, 0.2, 0.1], atol=1.0 / sizes[0]

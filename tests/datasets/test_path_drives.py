@@ -95,7 +95,7 @@ def test_drives_that_left_their_path_are_refused(drives):
 
 
 @pytest.mark.parametrize("known", [True, False])
-def test_a_drive_in_the_world_is_told_along_its_path(known):
+def test_a_drive_in_the_world_converts_to_path_coordinates(known):
     """Driven by law + ν on its own projection: ν comes out again, and a loop step
     explains every step.
     """

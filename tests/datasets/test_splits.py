@@ -26,7 +26,7 @@ def numbered(count, steps=6):
     )
 
 
-def deal(trajectories, seed=0, shares=SHARES, low=LOW, high=HIGH):
+def split(trajectories, seed=0, shares=SHARES, low=LOW, high=HIGH):
     return datasets.split(
         trajectories, jax.random.key(seed), shares=shares, env_low=low, env_high=high
     )
@@ -39,9 +39,9 @@ def members(part):
 @pytest.mark.parametrize(
     "shares", [SHARES, (0.7, 0.1, 0.1, 0.1), (0.25, 0.25, 0.25, 0.25)]
 )
-def test_every_trajectory_is_dealt_exactly_once(shares):
-    dealt = deal(numbered(43), shares=shares)
-    parts = [members(part) for part in dealt[:4]]
+def test_every_trajectory_is_assigned_exactly_once(shares):
+    parts_of = split(numbered(43), shares=shares)
+    parts = [members(part) for part in parts_of[:4]]
     assert sorted(chain(*parts)) == list(range(43))
     assert all(
         abs(len(part) - share * 43) <= 1
@@ -50,14 +50,14 @@ def test_every_trajectory_is_dealt_exactly_once(shares):
 
 
 def test_states_controls_and_environments_stay_together():
-    part = deal(numbered(43)).train
+    part = split(numbered(43)).train
     np.testing.assert_array_equal(np.asarray(part.states)[:, :-1, :2], part.controls)
 
 
-def test_the_deal_is_shuffled_by_its_key():
-    deals = [members(deal(numbered(43), seed).train) for seed in (0, 0, 1)]
-    assert deals[0] == deals[1] != deals[2]
-    assert deals[0] != sorted(deals[0])
+def test_the_split_is_shuffled_by_its_key():
+    orders = [members(split(numbered(43), seed).train) for seed in (0, 0, 1)]
+    assert orders[0] == orders[1] != orders[2]
+    assert orders[0] != sorted(orders[0])
 
 
 @pytest.mark.parametrize(
@@ -71,12 +71,12 @@ def test_the_deal_is_shuffled_by_its_key():
 )
 def test_bad_shares_are_refused_by_name(shares):
     with pytest.raises(ValueError, match=r"shares.*positive numbers of sum 1"):
-        deal(numbered(43), shares=shares)
+        split(numbered(43), shares=shares)
 
 
 def test_too_few_trajectories_are_refused_with_their_number():
     with pytest.raises(ValueError, match="3 trajectories are too few"):
-        deal(numbered(3))
+        split(numbered(3))
 
 
 @pytest.mark.parametrize(
@@ -86,13 +86,13 @@ def test_an_environment_outside_its_box_is_refused(channel, value):
     data = numbered(43)
     strayed = data._replace(envs=data.envs.at[7, 3, channel].set(value))
     with pytest.raises(ValueError, match="environments leave the box"):
-        deal(strayed)
+        split(strayed)
 
 
 def test_an_environment_that_is_not_a_number_is_refused():
     data = numbered(43)
     with pytest.raises(ValueError, match="environments leave the box"):
-        deal(data._replace(envs=data.envs.at[7, 3, 0].set(jnp.nan)))
+        split(data._replace(envs=data.envs.at[7, 3, 0].set(jnp.nan)))
 
 
 def test_windows_are_slices():
@@ -163,5 +163,24 @@ def test_scales_come_from_the_training_split_alone():
 def test_a_channel_that_never_moves_gets_scale_one():
     data = numbered(43)
     still = data._replace(controls=jnp.zeros_like(data.controls))
-    measured = datasets.measure_space(deal(still))
+    measured = datasets.measure_space(split(still))
     np.testing.assert_array_equal(measured.control_scale, np.ones(2))
+
+
+def test_scenarios_of_segments_stay_with_their_trajectories():
+    """Half of the segments of `generate` are S1, without wind; S2 has wind."""
+    data = dataset()
+    for part in datasets._splits.PARTS:
+        windy = np.abs(np.asarray(getattr(data, part).envs)[..., 1]).max(axis=1) > 0
+        names = np.asarray(datasets.SCENARIOS)[np.asarray(data.scenarios[part])]
+        np.testing.assert_array_equal(names, np.where(windy, "s2", "s1"))
+
+
+@pytest.mark.parametrize("segments", [4, 7, 101])
+def test_every_segment_has_a_scenario(segments):
+    for labels, names in (
+        (datasets.segment_scenarios(segments), {"s1", "s2"}),
+        (datasets.segment_scenarios_along_path(segments), set(datasets.SCENARIOS)),
+    ):
+        assert len(labels) == segments
+        assert {datasets.SCENARIOS[code] for code in labels} == names

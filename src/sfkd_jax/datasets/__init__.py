@@ -2,7 +2,7 @@
 
 from sfkd_jax.datasets._coverage import coverage as coverage
 from sfkd_jax.datasets._files import fingerprint as fingerprint
-from sfkd_jax.datasets._from_logs import Logged as Logged
+from sfkd_jax.datasets._from_logs import LoggedDataset as LoggedDataset
 from sfkd_jax.datasets._from_logs import environment_box as environment_box
 from sfkd_jax.datasets._from_logs import from_logs as from_logs
 from sfkd_jax.datasets._generation import Driver as Driver
@@ -12,12 +12,12 @@ from sfkd_jax.datasets._generation import segment_scenarios as segment_scenarios
 from sfkd_jax.datasets._logs import Columns as Columns
 from sfkd_jax.datasets._path_drives import check_on_path as check_on_path
 from sfkd_jax.datasets._path_drives import drive_along_path as drive_along_path
-from sfkd_jax.datasets._path_drives import drive_switching as drive_switching
-from sfkd_jax.datasets._path_drives import generate_along_path as generate_along_path
-from sfkd_jax.datasets._path_drives import (
+from sfkd_jax.datasets._path_segments import drive_switching as drive_switching
+from sfkd_jax.datasets._path_segments import generate_along_path as generate_along_path
+from sfkd_jax.datasets._path_segments import (
     generate_s3_along_path as generate_s3_along_path,
 )
-from sfkd_jax.datasets._path_drives import (
+from sfkd_jax.datasets._path_segments import (
     segment_scenarios_along_path as segment_scenarios_along_path,
 )
 from sfkd_jax.datasets._splits import SCENARIOS as SCENARIOS

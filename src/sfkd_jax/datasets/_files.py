@@ -1,4 +1,4 @@
-"""Which files a path means, and what they are known by: their contents, wherever they lie."""
+"""Find the log files of a path, and identify them by their contents."""
 
 from __future__ import annotations
 
@@ -13,49 +13,51 @@ SUFFIXES = (".csv", ".npz", ".parquet")
 
 
 def log_files(path: str) -> list[Path]:
-    """The logs that a file, a folder or a glob means, sorted by name.
+    """Return the log files of a file, a folder or a glob, sorted by name.
 
     Raises:
-        ValueError: there are none, some are of another kind, or two have the same
-            contents.
+        ValueError: none, files of another kind, or two with the same contents.
         ArtefactError: one is a pipe, a device or a folder, or cannot be read.
     """
     if path in ("", "???"):
         raise ValueError(
-            "dataset.path is not set: pass dataset.path=FILE, dataset.path=FOLDER or 'dataset.path=GLOB'"
+            "dataset.path is not set: pass dataset.path=FILE, dataset.path=FOLDER or "
+            "'dataset.path=GLOB'"
         )
-    place = Path(path).expanduser()
-    known = ", ".join(SUFFIXES)
-    if place.is_dir():
-        found = [
-            file
-            for file in sorted(place.iterdir())
-            if file.suffix.lower() in SUFFIXES and file.name[0] != "."
-        ]
-        if not found:
-            raise ValueError(
-                f"{path}: no {known} in this folder; dataset.path takes globs such as logs/**/*.csv"
-            )
-    else:
-        matches = (
-            [str(place)] if place.is_file() else glob.glob(str(place), recursive=True)
+    files, known = _files(Path(path).expanduser()), ", ".join(SUFFIXES)
+    if not files and Path(path).expanduser().is_dir():
+        raise ValueError(
+            f"{path}: no {known} in this folder; "
+            "dataset.path takes globs such as logs/**/*.csv"
         )
-        found = sorted(file for file in map(Path, matches) if file.is_file())
-        if not found:
-            raise ValueError(f"{path}: no such file or folder, and no file matches it")
-    if odd := [file for file in found if file.suffix.lower() not in SUFFIXES]:
+    if not files:
+        raise ValueError(f"{path}: no such file or folder, and no file matches it")
+    if odd := [file for file in files if file.suffix.lower() not in SUFFIXES]:
         raise ValueError(f"{odd[0]}: unknown kind of log; choose one of {known}")
     first: dict[str, Path] = {}
-    for file in found:
+    for file in files:
         if (same := first.setdefault(digest(file), file)) != file:
             raise ValueError(
-                f"{file}: the same contents as {same}; remove one of them, or test drives are trained on"
+                f"{file}: the same contents as {same}; remove one of them, "
+                "or test drives are trained on"
             )
-    return found
+    return files
+
+
+def _files(path: Path) -> list[Path]:
+    """The log files of a folder, or all files that a path or glob matches."""
+    if path.is_dir():
+        return [
+            file
+            for file in sorted(path.iterdir())
+            if file.suffix.lower() in SUFFIXES and file.name[0] != "."
+        ]
+    matches = [str(path)] if path.is_file() else glob.glob(str(path), recursive=True)
+    return sorted(file for file in map(Path, matches) if file.is_file())
 
 
 def fingerprint(path: str) -> str:
-    """Hash of the contents of all logs of a path: a changed file is another data set, a moved or renamed one is not.
+    """Return a hash of the contents of all logs of a path, whatever their names.
 
     Raises:
         ValueError: as for `log_files`.
@@ -66,13 +68,13 @@ def fingerprint(path: str) -> str:
 
 
 def digest(file: Path) -> str:
-    """Hash of a file's contents, computed again only when the file was written again."""
+    """Return the hash of a file's contents, cached until the file is written again."""
     status = file.stat()
     return _digest(file.resolve(), status.st_size, status.st_mtime_ns)
 
 
 @cache
 def _digest(file: Path, size: int, written: int) -> str:
-    del size, written  # they are the key of the cache
+    del size, written  # part of the key of the cache
     with open_regular(file) as stream:
         return hashlib.file_digest(stream, "sha256").hexdigest()

@@ -1,37 +1,55 @@
-"""A data set from logged drives: read, checked, resampled, cut, dealt; everything that is noticed is said."""
+"""Make a data set of recorded drives: read, check, resample, cut and assign them."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Sequence
 from typing import NamedTuple
 
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int
 
-from sfkd_jax.datasets._checks import Finding, check_motion, check_rows
+from sfkd_jax.core.ranges import Fraction, NonNegativeInt, Positive, Real
+from sfkd_jax.datasets._assignment import Assignment, assign_parts
+from sfkd_jax.datasets._checks import Finding, check_finite, check_motion, check_time
+from sfkd_jax.datasets._cleaning import cut_at_jumps, drop_slow_rows
 from sfkd_jax.datasets._coverage import coverage, coverage_lines
-from sfkd_jax.datasets._dealing import deal
-from sfkd_jax.datasets._logs import Columns, Log, read_logs
+from sfkd_jax.datasets._logs import Columns, Log
 from sfkd_jax.datasets._plausible import check_steering, check_units
-from sfkd_jax.datasets._ranges import Ends, check_ranges
+from sfkd_jax.datasets._ranges import Bounds, check_ranges
+from sfkd_jax.datasets._reading import read_logs
 from sfkd_jax.datasets._resampling import Segments, pieces, segments
-from sfkd_jax.datasets._splits import Dataset
+from sfkd_jax.datasets._splits import PARTS, Dataset
 from sfkd_jax.types import BODY, Trajectory
 
 SHORTEST = 3
-"""Rows without which a drive cannot even be looked at."""
-ANYTHING = 1e6
-"""How far an environment reaches that nobody measured and no model reads."""
-MOST_SAID = 20
-"""Lines that are said about logs; of more, only their number."""
+"""Rows that a drive needs to be checked at all."""
+UNBOUNDED = 1e6
+"""Half width of E where nobody measured the environment and no model reads it."""
+MOST_LINES = 20
+"""Warnings that are reported in full; of more, only their number."""
 
 
-class Logged(NamedTuple):
-    """A data set from logs, and what it covers: {"state", "control", "environment"} -> channel -> `coverage`."""
+class LoggedDataset(NamedTuple):
+    """A data set of recorded drives.
+
+    Attributes:
+        dataset: its four parts.
+        coverage: {"state", "control", "environment"} -> channel -> `coverage`.
+    """
 
     dataset: Dataset
     coverage: dict[str, dict[str, dict[str, float]]]
+
+
+class _Options(NamedTuple):
+    """How each drive is checked and cut, as in `from_logs`."""
+
+    dt: float
+    steps: int
+    gap: float
+    min_speed: float
+    split_at_jumps: bool
 
 
 def from_logs(
@@ -40,97 +58,119 @@ def from_logs(
     *,
     dt: float,
     wheelbase: float,
-    limits: Ends = (None, None),
-    told: bool = True,
-    say: Callable[[str], None] = print,
+    limits: Bounds = (None, None),
+    needs_environment: bool = True,
+    report: Callable[[str], None] = print,
     steps: int = 50,
-    gap: float = 2.5,
-    shares: tuple[float, float, float, float] = (0.6, 0.1, 0.2, 0.1),
-    seed: int = 0,
-    env_low: tuple[float, ...] | None = None,
-    env_high: tuple[float, ...] | None = None,
-) -> Logged:
-    """Read drives, refuse what cannot be right, sample every dt, cut into segments, deal by whole drives.
+    gap: Positive = 2.5,
+    min_speed: float = 0.0,
+    split_at_jumps: bool = False,
+    shares: tuple[Fraction, Fraction, Fraction, Fraction] = (0.6, 0.1, 0.2, 0.1),
+    seed: NonNegativeInt = 0,
+    env_low: tuple[Real, ...] | None = None,
+    env_high: tuple[Real, ...] | None = None,
+) -> LoggedDataset:
+    """Make a data set of recorded drives, or refuse them with the reason.
 
     Args:
         path: a file, a folder or a glob of .csv, .npz and .parquet.
-        columns: how they name what they hold.
+        columns: their names.
         dt: of the model [s].
         wheelbase: that steering is compared with [m].
         limits: of the controls, low and high.
-        told: whether the environment must be in the logs.
-        say: takes every line for a person.
+        needs_environment: whether the environment must be in the logs.
+        report: receives every line for the user.
         steps: of a segment.
         gap: the longest wait between rows that is bridged, in periods.
+        min_speed: slower rows are dropped, and the drive is cut there [m/s].
+        split_at_jumps: whether a drive is cut where time, position or yaw jump;
+            otherwise it is refused.
         shares: of training, validation, calibration and test.
-        seed: of the deal.
-        env_low, env_high: the box E; None: as far as the logs reach.
+        seed: of the random order of drives.
+        env_low: lower corner of E; None: as far as the logs reach.
+        env_high: upper corner of E.
 
     Raises:
-        ValueError: the first reason why the logs are refused; the others have been
-            said.
+        ValueError: the first reason why the logs are refused; the others are reported.
     """
-    logs, unread = read_logs(path, columns, dt=dt, told=told)
-    findings = [Finding(line) for line in unread]
+    files = read_logs(path, columns, dt=dt, needs_environment=needs_environment)
+    if files.conversions:
+        report(f"converted to SI units: {', '.join(files.conversions)}")
+    findings = [Finding(line) for line in files.errors]
+    options = _Options(dt, steps, gap, min_speed, split_at_jumps)
     sound: list[Log] = []
-    for log in logs:
-        found = list(_check(log, columns, dt, gap, steps))
-        findings += found
-        sound += (
-            []
-            if any(finding.refused for finding in found) or len(log.time) < SHORTEST
-            else [log]
-        )
+    for recorded in files.logs:
+        log, noticed = _check(recorded, columns, options)
+        findings += noticed
+        refused = any(finding.refused for finding in noticed)
+        if not refused and len(log.time) >= SHORTEST and log.joined.any():
+            sound.append(log)
     if sound:
         findings += check_steering(sound, columns, wheelbase=wheelbase)
         findings += check_ranges(sound, columns, limits=limits, box=(env_low, env_high))
-    _tell(findings, say)
+    _report_findings(findings, report)
     cut = segments([pieces(log, dt=dt, gap=gap) for log in sound], steps=steps)
-    dealt = deal(cut.drives, shares=shares, seed=seed)
-    counts = np.bincount(dealt.parts, minlength=4).tolist()
-    say(_summary(sound, cut, counts, dt))
-    if not dealt.whole:
-        say(
-            "warning: too few drives to deal whole; each was cut in time, and coverage speaks of the same drives only"
+    assignment = assign_parts(cut.drives, shares=shares, seed=seed)
+    report(_summary(sound, cut, assignment, dt))
+    if not assignment.whole:
+        report(
+            "warning: too few drives to assign them whole; each was cut in time, and "
+            "coverage is that of the same drives only"
         )
-    dataset = _dataset(cut, dealt.parts, (env_low, env_high))
-    covered = _covered(cut, columns)
+    dataset = _dataset(cut, assignment.parts, (env_low, env_high))
+    covered = _coverage(cut, columns)
     for line in coverage_lines(covered):
-        say(line)
-    return Logged(dataset, covered)
+        report(line)
+    return LoggedDataset(dataset, covered)
 
 
-def _check(
-    log: Log, columns: Columns, dt: float, gap: float, steps: int
-) -> Iterator[Finding]:
-    """All that one drive can show; what depends on sound rows is looked at when they are."""
-    found = list(check_rows(log, columns))
-    yield from found
-    if found:
-        return
-    length = log.time[-1] - log.time[0]
-    if length < (steps - 1e-3) * dt:
-        yield Finding(
-            f"{log.whole}: only {length:.4g} s, a segment is {steps * dt:.4g} s; not used",
-            refused=False,
+def _check(log: Log, columns: Columns, options: _Options) -> tuple[Log, list[Finding]]:
+    """A drive after cutting, and all findings about it alone."""
+    dt, gap = options.dt, options.gap
+    log, findings = drop_slow_rows(log, columns, min_speed=options.min_speed)
+    wrong = list(check_finite(log, columns))
+    if options.split_at_jumps and not wrong:
+        log, cuts = cut_at_jumps(log, columns, dt=dt, gap=gap)
+        findings += cuts
+    wrong += check_time(log, columns)
+    findings += wrong
+    if wrong or not len(log.time):
+        return log, findings
+    if (length := _longest(log)) < (options.steps - 1e-3) * dt:
+        findings.append(
+            Finding(
+                f"{log.whole}: only {length:.4g} s, a segment is "
+                f"{options.steps * dt:.4g} s; not used",
+                refused=False,
+            )
         )
-    if len(log.time) < SHORTEST:
-        return
+    if len(log.time) < SHORTEST or not log.joined.any():
+        return log, findings
     units = list(check_units(log, columns))
-    yield from units
+    findings += units
     if not any(finding.refused for finding in units):
-        yield from check_motion(log, columns, dt=dt, gap=gap)
+        findings += check_motion(log, columns, dt=dt, gap=gap)
+    return log, findings
 
 
-def _tell(findings: list[Finding], say: Callable[[str], None]) -> None:
-    """Say what was found; if something is refused, the first of it is the error."""
-    warned = [f"warning: {finding.line}" for finding in findings if not finding.refused]
+def _longest(log: Log) -> float:
+    """Duration of the longest stretch between cuts [s]."""
+    edges = np.flatnonzero(~log.joined) + 1
+    parts = np.split(log.time, edges)
+    return max(float(part[-1] - part[0]) for part in parts)
+
+
+def _report_findings(findings: list[Finding], report: Callable[[str], None]) -> None:
+    """Report all findings; the first of those that refuse the logs is the error."""
+    warnings = [
+        f"warning: {finding.line}" for finding in findings if not finding.refused
+    ]
     refused = [finding.line for finding in findings if finding.refused]
-    for lines in (warned, refused[1:]):
-        for line in lines[:MOST_SAID]:
-            say(line)
-        if len(lines) > MOST_SAID:
-            say(f"and {len(lines) - MOST_SAID} lines more like these")
+    for lines in (warnings, refused[1:]):
+        for line in lines[:MOST_LINES]:
+            report(line)
+        if len(lines) > MOST_LINES:
+            report(f"and {len(lines) - MOST_LINES} lines more like these")
     if refused:
         raise ValueError(
             refused[0]
@@ -138,38 +178,34 @@ def _tell(findings: list[Finding], say: Callable[[str], None]) -> None:
         )
 
 
-def _summary(logs: list[Log], cut: Segments, counts: list[int], dt: float) -> str:
-    """How much was read and what became of it."""
-    seconds = sum(log.time[-1] - log.time[0] for log in logs)
-    steps = cut.controls.shape[1]
-    rate = np.median(np.concatenate([np.diff(log.time) for log in logs]))
+def _summary(logs: list[Log], cut: Segments, assignment: Assignment, dt: float) -> str:
+    """How much was read, and how many segments came of it."""
+    waits = np.concatenate([np.diff(log.time)[log.joined] for log in logs])
+    seconds, steps = float(waits.sum()), cut.controls.shape[1]
+    counts = np.bincount(assignment.parts, minlength=len(PARTS)).tolist()
     parts = ", ".join(
-        f"{count} {name}" for count, name in zip(counts, Dataset._fields, strict=False)
+        f"{count} {name}" for count, name in zip(counts, PARTS, strict=True)
     )
     return (
-        f"{len(logs)} drives, {seconds:.0f} s at {1 / rate:.4g} Hz; sampled every {dt:g} s (states linearly, yaw "
-        f"unwrapped; controls and environment held); {len(cut.drives)} segments of {steps} steps, "
+        f"{len(logs)} drives, {seconds:.0f} s at {1 / np.median(waits):.4g} Hz; "
+        f"sampled every {dt:g} s (states linearly, yaw unwrapped; controls and "
+        f"environment held); {len(cut.drives)} segments of {steps} steps, "
         f"{100 * len(cut.drives) * steps * dt / seconds:.0f} % of the time: {parts}"
     )
 
 
-def _dataset(cut: Segments, parts: Int[np.ndarray, " segment"], box: Ends) -> Dataset:
-    """Arrays as models take them."""
+def _dataset(cut: Segments, parts: Int[np.ndarray, " segment"], box: Bounds) -> Dataset:
+    """Segments as arrays of a data set."""
     drives = {
-        name: len(np.unique(cut.drives[parts == k]))
-        for k, name in enumerate(Dataset._fields[:4])
+        name: len(np.unique(cut.drives[parts == k])) for k, name in enumerate(PARTS)
     }
-    dealt = [
-        Trajectory(
-            *(
-                jnp.asarray(part[parts == k], dtype=jnp.float32)
-                for part in (cut.states, cut.controls, cut.envs)
-            )
-        )
-        for k in range(4)
+    arrays = (cut.states, cut.controls, cut.envs)
+    trajectories = [
+        Trajectory(*(jnp.asarray(a[parts == k], dtype=jnp.float32) for a in arrays))
+        for k in range(len(PARTS))
     ]
     low, high = environment_box(cut.envs, *box)
-    return Dataset(*dealt, env_low=low, env_high=high, drives=drives)
+    return Dataset(*trajectories, env_low=low, env_high=high, drives=drives)
 
 
 def environment_box(
@@ -177,24 +213,32 @@ def environment_box(
     low: Sequence[float] | None = None,
     high: Sequence[float] | None = None,
 ) -> tuple[Float[Array, " environment"], Float[Array, " environment"]]:
-    """E: as asked, or as far as the environments of all segments reach; anything, if they stand for unknown ones."""
+    """Return the corners of E: as given, or as far as the environments reach.
+
+    Environments that are all zero are unknown; E is then wide.
+
+    Args:
+        envs: of all segments.
+        low: lower corner, or None.
+        high: upper corner, or None.
+    """
     values = np.asarray(envs)
     values = values.reshape(-1, values.shape[-1])
-    ends = (low, high)
+    corners = (low, high)
     if low is None or high is None:
-        anything = np.full(values.shape[1], ANYTHING)
-        ends = (
-            (values.min(axis=0), values.max(axis=0))
-            if values.any()
-            else (-anything, anything)
+        wide = np.full(values.shape[1], UNBOUNDED)
+        corners = (
+            (values.min(axis=0), values.max(axis=0)) if values.any() else (-wide, wide)
         )
-    return jnp.asarray(ends[0], dtype=jnp.float32), jnp.asarray(
-        ends[1], dtype=jnp.float32
+    return jnp.asarray(corners[0], dtype=jnp.float32), jnp.asarray(
+        corners[1], dtype=jnp.float32
     )
 
 
-def _covered(cut: Segments, columns: Columns) -> dict[str, dict[str, dict[str, float]]]:
-    """What body states, controls and environments reach; where they were not measured, there is nothing to say."""
+def _coverage(
+    cut: Segments, columns: Columns
+) -> dict[str, dict[str, dict[str, float]]]:
+    """Coverage of body states, controls and measured environments."""
     groups = {
         "state": (columns.state[BODY], cut.states[..., BODY]),
         "control": (columns.control, cut.controls),

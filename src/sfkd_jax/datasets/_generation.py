@@ -4,13 +4,14 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from functools import partial
-from typing import Any, TypeAlias
+from typing import Annotated, Any, TypeAlias
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int
 
+from sfkd_jax.core.ranges import Interval, Span
 from sfkd_jax.datasets._splits import scenario_labels
 from sfkd_jax.scenarios import (
     Scenario,
@@ -43,11 +44,11 @@ def generate(
     driver: Driver,
     key: Key,
     *,
-    segments: int = 8000,
+    segments: Annotated[int, Interval("[4, inf)")] = 8000,
     steps: int = 50,
-    speed: tuple[float, float] = (7.0, 13.0),
-    steering_excitation: tuple[float, float] = (0.005, 0.1),
-    speed_excitation: tuple[float, float] = (0.1, 1.5),
+    speed: Span = (7.0, 13.0),
+    steering_excitation: Span = (0.005, 0.1),
+    speed_excitation: Span = (0.1, 1.5),
     fixed_levels: bool = False,
 ) -> Trajectory:
     """Generate independent segments: half S1 (uniform road), half S2 (drop and gusts).

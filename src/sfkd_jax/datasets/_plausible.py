@@ -1,4 +1,4 @@
-"""Whether the columns of a drive mean what they are said to mean: units, axes, and columns that changed places."""
+"""Check units, axes and the order of columns against the motion of a drive."""
 
 from __future__ import annotations
 
@@ -7,14 +7,14 @@ from collections.abc import Iterator
 from typing import NamedTuple
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Float, Int
 
 from sfkd_jax.datasets._checks import Finding, channels
 from sfkd_jax.datasets._logs import Columns, Log
 from sfkd_jax.datasets._ranges import span
 
 LOOK = 0.5
-"""Length of the stretches over which motion is compared with what the columns say [s]."""
+"""Length of the chords over which motion is compared with the columns [s]."""
 AGREE = (0.8, 1.25)
 """Path length over integrated speed of a plausible log."""
 FACTORS = (
@@ -32,155 +32,176 @@ FACTORS = (
 )
 
 
-class Stretches(NamedTuple):
-    """A drive seen in stretches of about `LOOK`, those that moved.
+class Chords(NamedTuple):
+    """Chords of a drive over about `LOOK`, where it moves.
 
     Attributes:
-        travelled: chord [m].
-        said: ∫ v dt [m].
-        course: direction of the chord, backwards where v < 0 [rad].
+        length: of the chord [m].
+        integrated: ∫ v dt [m].
+        course: direction of the chord, reversed where v < 0 [rad].
         middle: index of the row in the middle.
     """
 
-    travelled: Float[np.ndarray, " stretch"]
-    said: Float[np.ndarray, " stretch"]
-    course: Float[np.ndarray, " stretch"]
-    middle: np.ndarray
+    length: Float[np.ndarray, " chord"]
+    integrated: Float[np.ndarray, " chord"]
+    course: Float[np.ndarray, " chord"]
+    middle: Int[np.ndarray, " chord"]
 
 
 def check_units(log: Log, columns: Columns) -> Iterator[Finding]:
-    """Speed against positions, then yaw against the direction of travel."""
-    seen = _stretches(log, log.states[:, 3])
-    moved, said = seen.travelled.sum(), np.abs(seen.said).sum()
-    if moved == 0.0 and said == 0.0:
+    """Check the speed against positions, then yaw against the direction of travel."""
+    chords = _chords(log, log.states[:, 3])
+    moved, integrated = chords.length.sum(), np.abs(chords.integrated).sum()
+    if moved == 0.0 and integrated == 0.0:
         yield Finding(
             f"{log.whole}: neither position nor {columns.state[3]} ever moves",
             refused=False,
         )
         return
-    if moved == 0.0 or said == 0.0:
+    if moved == 0.0 or integrated == 0.0:
         still, goes = (
             ("the position", columns.state[3])
             if moved == 0.0
             else (columns.state[3], "the position")
         )
         yield Finding(
-            f"{log.whole}: {still} stands still while {goes} moves; have columns changed places?"
+            f"{log.whole}: {still} stands still while {goes} moves; "
+            "have columns changed places?"
         )
         return
-    ratio = moved / said
+    ratio = moved / integrated
     if not AGREE[0] <= ratio <= AGREE[1]:
-        says = f"positions move {ratio:.3g} times as fast as {columns.state[3]} says"
-        yield Finding(f"{log.whole}: {says}; {_cause(log, columns, ratio)}")
+        yield Finding(
+            f"{log.whole}: positions move {ratio:.3g} times as fast as "
+            f"{columns.state[3]}; {_cause(log, columns, ratio)}"
+        )
         return
-    yield from _check_heading(log, columns, seen)
+    yield from _check_heading(log, columns, chords)
 
 
-def _stretches(log: Log, speed: Float[np.ndarray, " time"]) -> Stretches:
-    """The stretches of a drive that moved, by position or by what a speed says."""
+def _chords(log: Log, speed: Float[np.ndarray, " time"]) -> Chords:
+    """Chords of a drive that moved, by position or by a speed."""
     waits = np.diff(log.time)
-    period = float(np.median(waits))
+    period = float(np.median(waits[log.joined]))
     reach = min(max(1, round(LOOK / period)), len(log.time) - 1)
     along = np.concatenate([[0.0], np.cumsum(0.5 * (speed[1:] + speed[:-1]) * waits)])
     chord = log.states[reach:, :2] - log.states[:-reach, :2]
-    travelled, said = np.linalg.norm(chord, axis=1), along[reach:] - along[:-reach]
+    length, integrated = np.linalg.norm(chord, axis=1), along[reach:] - along[:-reach]
     whole = log.time[reach:] - log.time[:-reach] < 1.5 * reach * period  # no gap inside
+    whole &= log.stretch[reach:] == log.stretch[:-reach]
     enough = [
         0.2 * np.max(np.abs(lengths), where=whole, initial=0.0)
-        for lengths in (travelled, said)
+        for lengths in (length, integrated)
     ]
-    moving = whole & ((travelled > enough[0]) | (np.abs(said) > enough[1]))
-    course = np.arctan2(chord[:, 1], chord[:, 0]) + np.pi * (said < 0)
-    return Stretches(
-        travelled[moving],
-        said[moving],
+    moving = whole & ((length > enough[0]) | (np.abs(integrated) > enough[1]))
+    course = np.arctan2(chord[:, 1], chord[:, 0]) + np.pi * (integrated < 0)
+    return Chords(
+        length[moving],
+        integrated[moving],
         course[moving],
         np.flatnonzero(moving) + reach // 2,
     )
 
 
 def _cause(log: Log, columns: Columns, ratio: float) -> str:
-    """The unit that explains a factor, or the column that is the speed, or neither."""
+    """A unit that explains a factor, else a column that fits as the speed, if any."""
     nearest, text = min(FACTORS, key=lambda factor: abs(math.log(ratio / factor[0])))
     tolerance = 0.5 if nearest == 9e-6 else 0.1
     if abs(math.log(ratio / nearest)) < tolerance:
         return text
     for name, values in channels(log, columns).items():
-        seen = _stretches(log, values)
-        said = np.abs(seen.said).sum()
+        chords = _chords(log, values)
+        integrated = np.abs(chords.integrated).sum()
         if (
             name not in (columns.time, *columns.state[:2])
-            and 0.9 * said <= seen.travelled.sum() <= 1.1 * said
+            and 0.9 * integrated <= chords.length.sum() <= 1.1 * integrated
         ):
             return f"{name} fits as the speed: have columns changed places?"
     return "wrong units, or columns changed places?"
 
 
-def _check_heading(log: Log, columns: Columns, seen: Stretches) -> Iterator[Finding]:
-    """Yaw against the direction of travel; what would explain their difference is tried."""
-    name, yaw = columns.state[2], log.states[seen.middle, 2]
-    readings = {
-        f"{name} is probably in degrees": np.deg2rad(yaw),
-        f"{name} probably counts clockwise": -yaw,
-        f"{name} is probably a compass heading (from north, clockwise), or {columns.state[0]} and {columns.state[1]} "
-        "changed places": 0.5 * np.pi - yaw,
-        f"{name} is probably a compass heading in degrees": 0.5 * np.pi
-        - np.deg2rad(yaw),
-        f"{name} probably counts from the y axis": yaw + 0.5 * np.pi,
-        f"{columns.state[3]} is probably of the wrong sign, or the robot drives backwards": yaw
-        + np.pi,
-    }
-    agreed = _agreement(seen.course - yaw)
+def _check_heading(log: Log, columns: Columns, chords: Chords) -> Iterator[Finding]:
+    """Check yaw against the direction of travel; name a likely cause."""
+    name, yaw = columns.state[2], log.states[chords.middle, 2]
+    agreed = _agreement(chords.course - yaw)
     if abs(agreed) > 0.7 and abs(np.angle(agreed)) < 0.5:
         return
-    best = max(readings, key=lambda text: _agreement(seen.course - readings[text]).real)
-    off = f"{name} and the direction of travel differ"
-    if _agreement(seen.course - readings[best]).real > 0.9:
-        yield Finding(f"{log.whole}: {off}; {best}")
+    readings = _readings(columns, yaw)
+    best = max(
+        readings, key=lambda text: _agreement(chords.course - readings[text]).real
+    )
+    off = f"{log.whole}: {name} and the direction of travel differ"
+    if _agreement(chords.course - readings[best]).real > 0.9:
+        yield Finding(f"{off}; {best}")
     elif abs(agreed) > 0.7:
         yield Finding(
-            f"{log.whole}: {off} by {np.angle(agreed):.2f} rad throughout; is the sensor mounted askew?",
+            f"{off} by {np.angle(agreed):.2f} rad throughout; "
+            "is the sensor mounted askew?",
             False,
         )
     else:
         yield Finding(
-            f"{log.whole}: {off} at random; a robot that drives sideways, or columns that changed places?",
+            f"{off} at random; a robot that drives sideways, "
+            "or columns that changed places?",
             False,
         )
 
 
-def _agreement(angles: Float[np.ndarray, " stretch"]) -> complex:
-    """Mean of exp(i φ): its length says how well angles agree, its angle on what."""
+def _readings(
+    columns: Columns, yaw: Float[np.ndarray, " chord"]
+) -> dict[str, Float[np.ndarray, " chord"]]:
+    """What yaw may be instead, and the yaw that follows."""
+    x, y, name, speed = columns.state[:4]
+    return {
+        f"{name} is probably in degrees": np.deg2rad(yaw),
+        f"{name} probably counts clockwise": -yaw,
+        f"{name} is probably a compass heading (from north, clockwise), "
+        f"or {x} and {y} changed places": 0.5 * np.pi - yaw,
+        f"{name} is probably a compass heading in degrees": 0.5 * np.pi
+        - np.deg2rad(yaw),
+        f"{name} probably counts from the y axis": yaw + 0.5 * np.pi,
+        f"{speed} is probably of the wrong sign, or the robot drives backwards": yaw
+        + np.pi,
+    }
+
+
+def _agreement(angles: Float[np.ndarray, " chord"]) -> complex:
+    """Mean of exp(i φ): its length measures agreement, its angle is the mean angle."""
     return complex(np.mean(np.exp(1j * angles)))
 
 
 def check_steering(
     logs: list[Log], columns: Columns, *, wheelbase: float
 ) -> Iterator[Finding]:
-    """Whether yaw turns as a bicycle's would, ω = v tan δ / L: warns of its sign, its unit and the wheelbase."""
-    asked, turned = (
+    """Compare yaw rates with a bicycle's, ω = v tan δ / L; warn of sign, unit and L."""
+    expected, turned = (
         np.concatenate(parts) for parts in zip(*map(_turns, logs), strict=True)
     )
-    power = float(np.sqrt(np.mean(asked**2) * np.mean(turned**2)))
-    if power == 0.0 or abs(alike := float(np.mean(asked * turned)) / power) < 0.6:
-        return  # no angle of steering, or too little of it
-    fits, name = float(np.mean(asked**2) / np.mean(asked * turned)), columns.control[0]
-    where = span(logs)
+    power = float(np.sqrt(np.mean(expected**2) * np.mean(turned**2)))
+    alike = float(np.mean(expected * turned)) / power if power else 0.0
+    if abs(alike) < 0.6:
+        return  # not a steering angle, or too little steering
+    fits = float(np.mean(expected**2) / np.mean(expected * turned))
+    name, where = columns.control[0], span(logs)
     if alike < 0:
         yield Finding(
-            f"{where}: the robot turns against {name}; a positive one should turn it left",
+            f"{where}: the robot turns against {name}; "
+            "a positive one should turn it left",
             refused=False,
         )
     elif not 0.6 < fits / wheelbase < 1.7:
         unit = f" or {name} is not in rad" if fits > 10 * wheelbase else ""
-        says = f"{name} and yaw suggest a wheelbase of {fits:.3g} m, vehicle.wheelbase is {wheelbase:g}{unit}"
-        yield Finding(f"{where}: {says}", refused=False)
+        yield Finding(
+            f"{where}: {name} and yaw suggest a wheelbase of {fits:.3g} m, "
+            f"vehicle.wheelbase is {wheelbase:g}{unit}",
+            refused=False,
+        )
 
 
 def _turns(log: Log) -> tuple[Float[np.ndarray, " step"], Float[np.ndarray, " step"]]:
-    """v tan δ and the yaw rate, row by row; an angle that is none is left as it is."""
+    """v tan δ and the yaw rate of every step; large controls are taken as tan δ."""
     steering = log.controls[:-1, 0]
     angle = np.tan(steering) if np.abs(log.controls[:, 0]).max() < 1.4 else steering
-    return log.states[:-1, 3] * angle, np.diff(np.unwrap(log.states[:, 2])) / np.diff(
-        log.time
-    )
+    joined = log.joined
+    turned = np.diff(np.unwrap(log.states[:, 2]))[joined] / np.diff(log.time)[joined]
+    return (log.states[:-1, 3] * angle)[joined], turned

@@ -1,4 +1,4 @@
-"""Whether controls were excited, and whether controls and environments stay where they are said to stay."""
+"""Check the excitation of controls, and the ranges of controls and environments."""
 
 from __future__ import annotations
 
@@ -11,16 +11,18 @@ from jaxtyping import Float
 from sfkd_jax.datasets._checks import Finding, more
 from sfkd_jax.datasets._logs import Columns, Log
 
-Ends: TypeAlias = tuple[tuple[float, ...] | None, tuple[float, ...] | None]
-"""Lowest and highest of every channel, or None where nothing is asked."""
+Bounds: TypeAlias = tuple[tuple[float, ...] | None, tuple[float, ...] | None]
+"""Lowest and highest of every channel, or None where there is no bound."""
 ROUNDED = 1e-5
 """How far outside its range a channel may be: float32 rounds."""
 
 
 def check_ranges(
-    logs: list[Log], columns: Columns, *, limits: Ends, box: Ends
+    logs: list[Log], columns: Columns, *, limits: Bounds, box: Bounds
 ) -> Iterator[Finding]:
-    """Refuses controls that never move and environments outside E; warns of poor excitation and limits that are left.
+    """Refuse constant controls and environments outside E; warn of the rest.
+
+    Warnings are of poor excitation and of controls outside their limits.
 
     Args:
         logs: all drives.
@@ -30,15 +32,16 @@ def check_ranges(
     """
     where = span(logs)
     for k, name in enumerate(columns.control):
-        held = np.concatenate([log.controls[:, k] for log in logs])
-        kinds = len(np.unique(held))
-        if np.ptp(held) <= 1e-9 * max(1.0, float(np.abs(held).max())):
+        values = np.concatenate([log.controls[:, k] for log in logs])
+        kinds = len(np.unique(values))
+        if np.ptp(values) <= 1e-9 * max(1.0, float(np.abs(values).max())):
             yield Finding(
-                f"{where}: {name} is always {held[0]:.4g}; without excitation nothing can be learned of it"
+                f"{where}: {name} is always {values[0]:.4g}; "
+                "without excitation nothing can be learned of it"
             )
         elif kinds < 5:
             yield Finding(
-                f"{where}: {name} takes only {kinds} values; richer excitation teaches more",
+                f"{where}: {name} takes only {kinds} values; vary it more",
                 refused=False,
             )
     if limits[0] and limits[1]:
@@ -61,7 +64,8 @@ def check_ranges(
         or np.any(np.greater(low, high))
     ):
         yield Finding(
-            f"dataset.env_low and dataset.env_high must be {size} numbers each, the low ones not above the high"
+            f"dataset.env_low and dataset.env_high must be {size} numbers each, "
+            "the low ones not above the high"
         )
         return
     names = (
@@ -73,7 +77,7 @@ def check_ranges(
 
 
 def span(logs: list[Log]) -> str:
-    """Where several drives stand, for a person."""
+    """Return the position of several drives, for messages."""
     return logs[0].whole + (
         f" and {len(logs) - 1} drives more" if len(logs) > 1 else ""
     )
@@ -83,19 +87,23 @@ def _outside(
     logs: list[Log],
     names: tuple[str, ...],
     field: str,
-    ends: tuple[tuple[float, ...], tuple[float, ...]],
+    bounds: tuple[tuple[float, ...], tuple[float, ...]],
     setting: str,
     *,
     refused: bool,
 ) -> Iterator[Finding]:
-    """Per channel, the first row that leaves its range."""
-    for k, (name, low, high) in enumerate(zip(names, *ends, strict=True)):
+    """Report the first row of every channel that is outside its range."""
+    for k, (name, low, high) in enumerate(zip(names, *bounds, strict=True)):
         for log in logs:
             values: Float[np.ndarray, " time"] = getattr(log, field)[:, k]
             slack = ROUNDED * max(1.0, abs(low), abs(high))
-            left = (values < low - slack) | (values > high + slack)
-            if left.any():
-                first = int(left.argmax())
-                says = f"{name} is {values[first]:.4g}, outside {low:g} to {high:g} of {setting}_low and {setting}_high"
-                yield Finding(f"{log.at(first)}: {says}{more(left)}", refused)
+            outside = (values < low - slack) | (values > high + slack)
+            if outside.any():
+                first = int(outside.argmax())
+                yield Finding(
+                    f"{log.at(first)}: {name} is {values[first]:.4g}, outside "
+                    f"{low:g} to {high:g} of {setting}_low and {setting}_high"
+                    f"{more(outside)}",
+                    refused,
+                )
                 break

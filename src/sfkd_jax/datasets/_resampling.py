@@ -1,4 +1,4 @@
-"""From rows at the moments of a recorder to segments at the period of a model."""
+"""Resample recorded drives at the period of a model and cut them into segments."""
 
 from __future__ import annotations
 
@@ -10,13 +10,17 @@ from jaxtyping import Float, Int
 from sfkd_jax.datasets._logs import Log
 
 SAME_MOMENT = 1e-5
-"""Moments this share of a period apart are one: what was recorded there is taken as it
-is.
-"""
+"""Rows within this share of a period of a moment are taken without interpolation."""
 
 
 class Piece(NamedTuple):
-    """A stretch of a drive without a gap, sampled evenly: states at every moment, u and e up to the last but one."""
+    """A stretch of a drive without a gap, sampled evenly.
+
+    Attributes:
+        states: at every moment.
+        controls: at every moment but the last.
+        envs: at every moment but the last.
+    """
 
     states: Float[np.ndarray, "time_plus_1 state"]
     controls: Float[np.ndarray, "time control"]
@@ -24,10 +28,16 @@ class Piece(NamedTuple):
 
 
 class Segments(NamedTuple):
-    """Pieces cut to one length, (segment, …); `drives` says which drive each is from, in the order of time.
+    """Segments of one length, in the order of time.
 
-    A position is counted from the segment's first, and yaw begins in (−π, π]: float32
-    has no digits to spare for where on Earth a robot drove.
+    Positions are relative to the first of a segment, and its yaw begins in (−π, π]:
+    float32 cannot resolve positions on Earth.
+
+    Attributes:
+        states: (segment, steps + 1, state).
+        controls: (segment, steps, control).
+        envs: (segment, steps, environment).
+        drives: number of the drive that each segment is from.
     """
 
     states: Float[np.ndarray, "segment steps_plus_1 state"]
@@ -37,23 +47,20 @@ class Segments(NamedTuple):
 
 
 def pieces(log: Log, *, dt: float, gap: float) -> list[Piece]:
-    """A drive split at its gaps and sampled every dt from each first moment on.
+    """Split a drive at its gaps and cuts, and sample each piece every dt.
 
     States are interpolated linearly, yaw after unwrapping; controls and environments
-    are held from the row before (zero order), so that a switch stays one.
+    are held from the row before (zero order).
 
     Args:
-        log: rows that are finite, at increasing moments.
+        log: rows that are finite, at increasing moments between cuts.
         dt: [s].
         gap: the longest wait that is bridged, in periods: of the log or dt, whichever
             is longer.
     """
-    waits = np.diff(log.time)
-    edges = (
-        np.flatnonzero(waits > gap * max(dt, float(np.median(waits)))) + 1
-        if len(waits)
-        else []
-    )
+    waits, joined = np.diff(log.time), log.joined
+    period = float(np.median(waits[joined])) if joined.any() else 0.0
+    edges = np.flatnonzero((waits > gap * max(dt, period)) | ~joined) + 1
     return [
         _sampled(
             log.time[rows] - log.time[rows[0]],
@@ -73,7 +80,7 @@ def _sampled(
     envs: Float[np.ndarray, "time environment"],
     dt: float,
 ) -> Piece:
-    """One stretch at the moments 0, dt, 2 dt, …; rows at these moments come out as they are."""
+    """Sample one stretch at 0, dt, 2 dt, …; rows at these moments are kept exactly."""
     moments = dt * np.arange(int(time[-1] / dt + SAME_MOMENT) + 1)
     nearest = np.searchsorted(0.5 * (time[1:] + time[:-1]), moments)
     moments = np.where(
@@ -87,36 +94,37 @@ def _sampled(
     return Piece(sampled, controls[held], envs[held])
 
 
-def segments(found: list[list[Piece]], *, steps: int) -> Segments:
-    """Pieces of drives cut into segments of `steps` steps end to end; what is left of a piece is dropped.
+def segments(drives: list[list[Piece]], *, steps: int) -> Segments:
+    """Cut pieces into segments end to end; the rest of a piece is dropped.
+
+    Args:
+        drives: the pieces of every drive.
+        steps: of a segment.
 
     Raises:
         ValueError: no piece is as long as a segment.
     """
     cut: list[tuple[Piece, int]] = []
-    for drive, parts in enumerate(found):
-        for part in parts:
-            for start in range(0, len(part.controls) - steps + 1, steps):
-                stop = start + steps
-                states = part.states[start : stop + 1].copy()
-                states[:, :2] -= states[0, :2]
-                states[:, 2] -= (
-                    2.0 * np.pi * np.ceil((states[0, 2] - np.pi) / (2.0 * np.pi))
-                )
-                cut.append(
-                    (
-                        Piece(states, part.controls[start:stop], part.envs[start:stop]),
-                        drive,
-                    )
-                )
+    for drive, pieces_of_drive in enumerate(drives):
+        for piece in pieces_of_drive:
+            starts = range(0, len(piece.controls) - steps + 1, steps)
+            cut += [(_segment(piece, start, steps), drive) for start in starts]
     if not cut:
-        longest = max(
-            (len(part.controls) for parts in found for part in parts), default=0
-        )
+        lengths = (len(piece.controls) for parts in drives for piece in parts)
         raise ValueError(
-            f"the longest drive without a gap has {longest} steps, a segment {steps}; pass dataset.steps"
+            f"the longest drive without a gap has {max(lengths, default=0)} steps, "
+            f"a segment {steps}; pass dataset.steps"
         )
     states, controls, envs = (
         np.stack(arrays) for arrays in zip(*(piece for piece, _ in cut), strict=True)
     )
     return Segments(states, controls, envs, np.array([drive for _, drive in cut]))
+
+
+def _segment(piece: Piece, start: int, steps: int) -> Piece:
+    """`steps` steps of a piece, positions relative to the first, yaw in (−π, π]."""
+    stop = start + steps
+    states = piece.states[start : stop + 1].copy()
+    states[:, :2] -= states[0, :2]
+    states[:, 2] -= 2.0 * np.pi * np.ceil((states[0, 2] - np.pi) / (2.0 * np.pi))
+    return Piece(states, piece.controls[start:stop], piece.envs[start:stop])

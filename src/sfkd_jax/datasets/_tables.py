@@ -1,10 +1,12 @@
-"""Columns of numbers from csv and parquet; what cannot be read is told in one line with its place."""
+"""Tables from csv and parquet files; errors name the file and the line."""
 
 from __future__ import annotations
 
 import csv
 import io
+from collections.abc import Mapping
 from pathlib import Path
+from types import MappingProxyType
 from typing import Any, NamedTuple, NoReturn
 
 import numpy as np
@@ -13,12 +15,10 @@ from jaxtyping import Float, Int, Shaped
 from sfkd_jax.artefacts import open_regular
 
 WIDEST = 64
-"""Letters of a cell up to which a column of a csv file is held as text of one width;
-numbers are shorter.
-"""
+"""Characters of a cell up to which a csv column is stored as text of fixed width."""
 DECODED = 1 << 29
-"""Bytes that a parquet file may become: it can repeat a value without end in a few
-bytes.
+"""Largest decoded size of a parquet file [bytes]: few bytes may encode any number of
+equal values.
 """
 
 
@@ -28,47 +28,53 @@ class Table(NamedTuple):
     Attributes:
         source: the file.
         columns: by name; text where the file holds text.
-        rows: where each row stands in the file.
-        counted: what `rows` counts: "line" (csv, the header is line 1) or "row" (npz
+        rows: position of each row in the file.
+        row_name: what `rows` counts: "line" (csv, the header is line 1) or "row" (npz
             and parquet, from 0).
+        factors: to SI units, by column; 1 if a column is not listed.
     """
 
     source: str
     columns: dict[str, Shaped[np.ndarray, " time"]]
     rows: Int[np.ndarray, " time"]
-    counted: str
+    row_name: str
+    factors: Mapping[str, float] = MappingProxyType({})
 
     def numbers(self, name: str) -> Float[np.ndarray, " time"]:
-        """A column as float64; moments become seconds since the first.
+        """Return a column as float64 in SI units; dates become seconds since the first.
 
         Raises:
             ValueError: a cell that is not a number.
         """
-        values = self.columns[name]
+        values, factor = self.columns[name], self.factors.get(name, 1.0)
         try:
             if values.dtype.kind == "M":
                 return (values - values[0]) / np.timedelta64(1, "s")
             if values.dtype.kind in "biufSUO":
-                return values.astype(np.float64)
+                numbers = values.astype(np.float64)
+                return numbers if factor == 1.0 else factor * numbers
         except (TypeError, ValueError, OverflowError):
             pass
-        self._blame(name)
+        self._raise_at(name)
 
-    def _blame(self, name: str) -> NoReturn:
-        """Name the first cell of a column that is not a number."""
+    def _raise_at(self, name: str) -> NoReturn:
+        """Report the first cell of a column that is not a number."""
         for row, value in zip(self.rows, self.columns[name], strict=True):
             try:
                 float(value)
             except (TypeError, ValueError, OverflowError):
-                said = repr(str(value)[:WIDEST]) if str(value).strip() else "empty"
+                text = repr(str(value)[:WIDEST]) if str(value).strip() else "empty"
                 raise ValueError(
-                    f"{self.source}, {self.counted} {row}: {name} is {said}, not a number"
+                    f"{self.source}, {self.row_name} {row}: {name} is {text}, "
+                    "not a number"
                 ) from None
         raise ValueError(f"{self.source}: {name} cannot be read as numbers")
 
 
 def read_csv(file: Path) -> Table:
-    """A csv file with one line of column names; comma, semicolon, tab or blank between cells, # before comments.
+    """Read a csv file with one line of column names.
+
+    Cells are separated by commas, semicolons, tabs or blanks; # begins a comment.
 
     Raises:
         ValueError: not text, no header, no rows, or rows of another length than the
@@ -114,7 +120,7 @@ def read_csv(file: Path) -> Table:
 
 
 def _column(cells: list[str]) -> Shaped[np.ndarray, " time"]:
-    """Cells as an array; one long cell does not make all others as wide."""
+    """Cells as an array; a long cell does not widen all others."""
     return np.array(cells, dtype=object if max(map(len, cells)) > WIDEST else str)
 
 
@@ -123,7 +129,7 @@ def _check_header(where: str, names: list[str]) -> None:
     if all(map(_is_number, names)):
         raise ValueError(f"{where}: numbers where the names of the columns should be")
     if twice := [name for k, name in enumerate(names) if name in names[:k]]:
-        raise ValueError(f"{where}: the column {twice[0]} stands there twice")
+        raise ValueError(f"{where}: the column {twice[0]} appears twice")
 
 
 def _is_number(text: str) -> bool:
@@ -135,11 +141,11 @@ def _is_number(text: str) -> bool:
 
 
 def read_parquet(file: Path) -> Table:
-    """A parquet file.
+    """Read a parquet file.
 
     Raises:
-        ValueError: pyarrow is missing, the file is not what its name says, or it
-            becomes more than DECODED bytes.
+        ValueError: pyarrow is missing, the file is damaged or of another kind, or
+            larger than DECODED bytes once decoded.
     """
     try:
         from pyarrow import parquet  # pyright: ignore[reportMissingImports]
@@ -160,8 +166,8 @@ def read_parquet(file: Path) -> Table:
                 for k, name in enumerate(held.column_names)
             }
         except Exception as reason:  # a damaged file raises nearly anything
-            said = (str(reason).splitlines() or [type(reason).__name__])[0]
-            raise ValueError(f"{file}: not a readable parquet file ({said})") from None
+            first = (str(reason).splitlines() or [type(reason).__name__])[0]
+            raise ValueError(f"{file}: not a readable parquet file ({first})") from None
     if not held.num_rows:
         raise ValueError(f"{file}: no rows")
     if len(columns) < len(held.column_names):
@@ -170,7 +176,7 @@ def read_parquet(file: Path) -> Table:
 
 
 def _decoded(about: Any) -> int:
-    """At least how many bytes a parquet file says that it becomes: by its values, and by its pages."""
+    """Decoded size that a parquet file declares, by its values and pages [bytes]."""
     groups = [about.row_group(k) for k in range(about.num_row_groups)]
     columns = [group.column(k) for group in groups for k in range(group.num_columns)]
     values = sum(max(column.num_values, 0) for column in columns)
