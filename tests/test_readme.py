@@ -9,8 +9,7 @@ from pathlib import Path
 
 import pytest
 
-from benchmarks.quality.result_pages import PAGES
-from sfkd_jax.paper import benchmark_markdown
+from benchmarks.quality.result_pages import PAGES, page_of
 
 ROOT = Path(__file__).parents[1]
 RESULTS = ROOT / "docs" / "results"
@@ -76,7 +75,7 @@ def test_an_experiment_is_a_script_an_expectation_and_a_result_that_meets_it(fol
 )
 def test_a_page_of_results_says_what_the_results_say(folder, page):
     results = json.loads((ROOT / "experiments" / folder / "results.json").read_text())
-    shown = benchmark_markdown(results).replace("results_files/", f"{page}_files/")
+    shown = page_of(results, page)
     assert (RESULTS / f"{page}.md").read_text("utf-8") == shown
     linked = {
         (RESULTS / figure).name for figure in re.findall(r"\]\((\S+\.png)\)", shown)

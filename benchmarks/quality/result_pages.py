@@ -1,20 +1,26 @@
 """Write a page of results, such as docs/results/levels.md and its figures.
 
 Run `python -m benchmarks.quality.result_pages levels`.
-It takes what `python -m sfkd_jax.compare +experiment=NAME` left under --root. Where
-nothing lies there, the page is written anew from the results in experiments/; figures
-that need driven episodes then stay as they are.
+It takes the results of `python -m sfkd_jax.compare +experiment=NAME` below --root. If
+there are none, the page is written again from the results in experiments/; figures that
+need the arrays of episodes then stay as they are.
 """
 
 from __future__ import annotations
 
 import argparse
+import functools
 import json
 import shutil
 import tempfile
 from pathlib import Path
+from typing import Any
 
-from sfkd_jax.reporting import benchmark_markdown, benchmark_report
+from hydra import compose, initialize_config_dir
+from omegaconf import OmegaConf
+
+from sfkd_jax.cli.config import conf_path, register
+from sfkd_jax.paper import results_markdown, write_results_page
 
 HOME = Path(__file__).parents[2]
 PAGES_DIR = HOME / "docs" / "results"
@@ -28,63 +34,76 @@ PAGES = {
     "longer": ("longer", "longer"),
 }
 """Name of a comparison -> its folder in experiments/ and its page in docs/results/."""
-DRIVEN = ("figure1_*", "*.gif")
-"""Figures that need the arrays of driven episodes."""
+FROM_ARRAYS = ("figure1_*", "*.gif")
+"""Figures that need the arrays of episodes."""
 
 
-def page_of(results: dict, page: str) -> str:
-    """The page as it stands in docs/results/."""
-    return benchmark_markdown(results).replace("results_files/", f"{page}_files/")
+@functools.cache
+def page_texts(name: str) -> dict[str, Any]:
+    """`comparison.page` of an experiment, which results of older versions lack."""
+    register()
+    with initialize_config_dir(conf_path(), version_base="1.3"):
+        config = compose("config", [f"+experiment={name}"])
+    page: Any = OmegaConf.to_container(config.comparison.page)
+    return page
+
+
+def page_of(results: dict[str, Any], page: str) -> str:
+    """The page as it is in docs/results/."""
+    texts = page_texts(results["config"]["name"])
+    markdown = results_markdown(results, texts)
+    return markdown.replace("results_files/", f"{page}_files/")
+
+
+def update_figures(figures: list[Path], files: Path, text: str, *, final: bool) -> None:
+    """Replace the figures of a page.
+
+    Args:
+        figures: as drawn.
+        files: folder of the page.
+        text: of the page, which links figures. Films are not linked; they stay if they
+            are there, because other pages show them.
+        final: whether the arrays of episodes were available.
+    """
+    files.mkdir(exist_ok=True)
+    before = set(files.iterdir())
+    old = {path for pattern in FROM_ARRAYS for path in files.glob(pattern)}
+    keep = {one for one in old if one.suffix == ".gif" or one.name in text}
+    keep = set() if final else keep
+    for stale in before - keep:
+        stale.unlink()
+    for figure in figures:
+        path = files / figure.name
+        if path not in keep and (figure.name in text or path in before):
+            shutil.copyfile(figure, path)
 
 
 def main() -> None:
     """Copy the results, draw them, write the page."""
-    parser = argparse.ArgumentParser(
-        description="Write a page of results in docs/results/."
-    )
+    parser = argparse.ArgumentParser(description="Write a page of results.")
     parser.add_argument("name", choices=PAGES)
-    parser.add_argument(
-        "--root", type=Path, default=Path("runs"), help="of the artefacts"
-    )
-    asked = parser.parse_args()
-    folder, page = PAGES[asked.name]
-    kept, files = (
-        HOME / "experiments" / folder / "results.json",
-        PAGES_DIR / f"{page}_files",
-    )
-    source = asked.root / asked.name / "results.json"
-    if not source.exists() and not kept.exists():
-        parser.error(
-            f"{source} is missing: python -m sfkd_jax.compare +experiment={asked.name} makes it"
-        )
-    if source.exists():
-        kept.parent.mkdir(exist_ok=True)
-        shutil.copyfile(source, kept)
-    files.mkdir(exist_ok=True)
+    help_text = "root of the artefacts"
+    parser.add_argument("--root", type=Path, default=Path("runs"), help=help_text)
+    options = parser.parse_args()
+    folder, page = PAGES[options.name]
+    stored = HOME / "experiments" / folder / "results.json"
+    source = options.root / options.name / "results.json"
+    final = source.exists()
+    if not final and not stored.exists():
+        command = f"python -m sfkd_jax.compare +experiment={options.name}"
+        parser.error(f"{source} is missing: {command} writes it")
+    if final:
+        stored.parent.mkdir(exist_ok=True)
+        shutil.copyfile(source, stored)
+    text = page_of(json.loads(stored.read_text("utf-8")), page)
+    files = PAGES_DIR / f"{page}_files"
     with tempfile.TemporaryDirectory() as scratch:
-        if not source.exists():
-            shutil.copyfile(kept, Path(scratch, "results.json"))
-        figures = benchmark_report(source.parent if source.exists() else Path(scratch))[
-            "figures"
-        ]
-        text = page_of(json.loads(kept.read_text("utf-8")), page)
-        there, driven = (
-            set(files.iterdir()),
-            [file for kind in DRIVEN for file in files.glob(kind)],
-        )
-        stays = (
-            set()
-            if source.exists()
-            else {file for file in driven if file.suffix == ".gif" or file.name in text}
-        )
-        for old in there - stays:
-            old.unlink()
-        for figure in map(Path, figures):
-            place = (
-                files / figure.name
-            )  # films are not linked; other pages show one that lies there
-            if place not in stays and (figure.name in text or place in there):
-                shutil.copyfile(figure, place)
+        if not final:
+            shutil.copyfile(stored, Path(scratch, "results.json"))
+        directory = source.parent if final else Path(scratch)
+        written = write_results_page(directory, page_texts(options.name))
+        figures = [Path(figure) for figure in written["figures"]]
+        update_figures(figures, files, text, final=final)
     (PAGES_DIR / f"{page}.md").write_text(text, encoding="utf-8")
     print(f"docs/results/{page}.md, {len(list(files.iterdir()))} figures")
 

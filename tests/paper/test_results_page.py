@@ -8,21 +8,23 @@ import numpy as np
 import pytest
 from PIL import Image
 
+from benchmarks.quality.result_pages import page_texts
 from sfkd_jax.artefacts import ArtefactError, write_arrays
-from sfkd_jax.reporting import benchmark_markdown, benchmark_report
-from sfkd_jax.reporting._animation import MOST_BYTES, film
-from sfkd_jax.reporting._benchmark_figures import overview, through_switches
-from sfkd_jax.reporting._benchmark_rows import contests, line_of, paper_of, scenarios
-from sfkd_jax.reporting._benchmark_words import beaten
-from sfkd_jax.reporting._blocks import Table
-from sfkd_jax.reporting._forces import forces_figure, forces_tables, pushed
-from sfkd_jax.reporting._latex import latex
-from sfkd_jax.reporting._robustness import (
-    columns,
-    robustness,
-    robustness_table,
-    studies,
+from sfkd_jax.paper import results_markdown, write_results_page
+from sfkd_jax.paper._animation import film
+from sfkd_jax.paper._claims import better_rows
+from sfkd_jax.paper._figures import deviations, overview
+from sfkd_jax.paper._forces import forces_figure, forces_of, forces_tables
+from sfkd_jax.paper._latex import latex
+from sfkd_jax.paper._setups import setups
+from sfkd_jax.paper._study import Study, study_of
+from sfkd_jax.paper._variations import (
+    variations,
+    variations_figure,
+    variations_table,
 )
+from sfkd_jax.reporting.blocks import Table
+from sfkd_jax.reporting.film import MAX_BYTES
 
 ORACLE, SFKD = 0.016, 0.020
 LEVELS = ((0.9, 0.0), (0.6, -4.0), (0.3, 8.0), (0.6, 4.0))
@@ -118,7 +120,7 @@ def document(vehicles=("kinematic",), samplings=("feedback", "plain")):
         ]
     config = {
         "name": "table1",
-        "comparison": {"paper": PAPER, "seeds": [0, 1]},
+        "comparison": {"paper": PAPER, "seeds": [0, 1], "page": page_texts("table1")},
         "evaluation": {"episodes": 8},
     }
     return {
@@ -191,7 +193,7 @@ def reported(directory, results):
     for system, env in SYSTEMS:
         if system != "neural_ode":
             cell(directory, system, env)
-    return directory, benchmark_report(directory)
+    return directory, write_results_page(directory)
 
 
 @pytest.fixture(scope="module")
@@ -277,7 +279,7 @@ def test_rows_in_path_coordinates_have_the_names_of_their_systems_under_a_title_
     unbound = row("sfkd_no_contraction", "measured", sampling="law") | {
         "system": "sfkd_path_no_contraction"
     }
-    text = benchmark_markdown(document() | {"rows": [ours, unbound, theirs]})
+    text = results_markdown(document() | {"rows": [ours, unbound, theirs]})
     found = tables_of(
         text,
         "Against SFKD and the oracle: Kinematic vehicle, path coordinates, sampling around their law",
@@ -307,7 +309,7 @@ def test_claims_predictions_and_cost_are_there(whole):
     ]
 
 
-def test_the_papers_claim_is_said_beside_ours_with_its_paired_interval(whole):
+def test_the_papers_claim_is_beside_ours_with_its_paired_interval(whole):
     markdown = text_of(whole[0], "results.md")
     assert "31 % lower than ICODE-MPPI on S3 (120 against 174 mm)" in markdown
     for name, share, mean, gap in (
@@ -334,25 +336,25 @@ def test_the_papers_claim_is_said_beside_ours_with_its_paired_interval(whole):
 
 
 def test_rows_that_beat_sfkd_are_named_and_no_others():
-    (contest,) = contests([row(*one) for one in SYSTEMS])
-    table, rest = beaten(contest)
+    (setup,) = setups([row(*one) for one in SYSTEMS])
+    table, rest = better_rows(setup)
     found = dict(table.rows)
     assert found["S3 RMSE [mm]: 20.0"] == "SFKD − contraction 18.0 †; Oracle 16.0 †"
-    assert found["prediction, 20 ahead [mm]: 100.0"] == "SFKD − contraction 90.0"
+    assert found["prediction 20 steps ahead [mm]: 100.0"] == "SFKD − contraction 90.0"
     assert "S3 steering rate [rad/s]: 0.054" in rest.text
     assert not any(name.startswith("S3 steering rate") for name in found)
     worst = [row(*one) for one in SYSTEMS if one != ("sfkd", "measured")] + [
         row("sfkd", "measured", factor=20)
     ]
-    others = beaten(contests(worst)[0])[0].rows[0][1]
+    others = better_rows(setups(worst)[0])[0].rows[0][1]
     assert all(
         line.name in others
-        for line in contests(worst)[0].lines
+        for line in setups(worst)[0].entries
         if line.system != "sfkd"
     )
     assert not any(
         isinstance(block, Table)
-        for block in beaten(contests([row("sfkd", "measured")])[0])
+        for block in better_rows(setups([row("sfkd", "measured")])[0])
     )
 
 
@@ -415,7 +417,7 @@ def test_the_page_is_one_file_that_asks_for_nothing(table):
 def test_markdown_depends_on_the_results_alone_and_links_what_is_drawn(whole):
     directory, made = whole
     markdown = text_of(directory, "results.md")
-    assert markdown == benchmark_markdown(
+    assert markdown == results_markdown(
         json.loads((directory / "results.json").read_text())
     )
     links = re.findall(r"\]\(([^)]*)\)", markdown)
@@ -455,7 +457,7 @@ def test_the_film_is_small_and_moves(table):
     file = Path(
         next(figure for figure in table[1]["figures"] if figure.endswith(".gif"))
     )
-    assert file.stat().st_size <= MOST_BYTES
+    assert file.stat().st_size <= MAX_BYTES
     with Image.open(file) as image:
         assert image.n_frames == 40
         assert image.info["duration"] == 100
@@ -465,9 +467,9 @@ def test_the_film_is_small_and_moves(table):
     assert np.mean(np.abs(first - later).max(axis=2) > 30) > 0.01
 
 
-def test_figure_1_draws_what_lies_there_and_names_what_does_not(whole):
-    (contest, _) = contests(document()["rows"])
-    figure = through_switches(whole[0], contest)
+def test_figure_1_draws_stored_episodes_and_names_the_missing_ones(whole, tmp_path):
+    (setup, _) = setups(document()["rows"])
+    figure = deviations(whole[0], setup, "s3")
     drawn = {str(line.get_label()) for axes in figure.axes for line in axes.get_lines()}
     assert {
         "SFKD",
@@ -488,39 +490,40 @@ def test_figure_1_draws_what_lies_there_and_names_what_does_not(whole):
     )
     assert len(curve.get_xdata()) == 40
     assert figure.axes[0].get_ylim()[1] > np.max(np.abs(curve.get_ydata()))
-    assert len(through_switches(None, contest).axes) == 1
+    assert len(deviations(tmp_path, setup, "s3").axes) == 1
 
 
-def test_a_row_that_says_where_its_arrays_lie_is_believed(tmp_path):
+def test_the_arrays_of_a_row_are_where_the_row_says(tmp_path):
     cell(tmp_path, "sfkd", "measured")
     for end in ("npz", "json"):
         (tmp_path / f"cells/kinematic/s3/feedback/sfkd-measured.{end}").rename(
             tmp_path / f"elsewhere.{end}"
         )
-    (contest,) = contests([row("sfkd", "measured")])
-    assert film(tmp_path, contest, tmp_path / "s3.gif", seconds=0.5) is None
-    (contest,) = contests([row("sfkd", "measured", arrays="elsewhere.npz")])
-    place, names = film(tmp_path, contest, tmp_path / "s3.gif", seconds=0.5)
+    rows = [row("sfkd", "measured")]
+    assert film(tmp_path, rows, tmp_path / "s3.gif", seconds=0.5) is None
+    rows = [row("sfkd", "measured", arrays="elsewhere.npz")]
+    path, names = film(tmp_path, rows, tmp_path / "s3.gif", seconds=0.5)
     assert names == ["SFKD"]
     within, _ = film(
-        tmp_path, contest, tmp_path / "corridor.gif", seconds=0.5, corridor=0.1
+        tmp_path, rows, tmp_path / "corridor.gif", seconds=0.5, corridor=0.1
     )
-    assert within.read_bytes() != place.read_bytes()
+    assert within.read_bytes() != path.read_bytes()
 
 
-def test_a_study_sets_every_row_beside_itself_as_it_is(whole):
+def test_variations_show_every_row_beside_itself_without_one(whole):
     rows = document()["rows"]
-    (contest, plain) = contests(rows)
-    (study,) = studies(rows, contest)
-    assert columns(study) == [
+    study = study_of(document())
+    (setup, plain) = setups(rows)
+    (varied,) = variations(rows, setup, study)
+    assert varied.columns == [
         "as it is",
         "environment 0.5 s late",
         "environment 1 s late",
         "sensor noise x 2",
     ]
-    assert studies(rows, plain) == []
+    assert variations(rows, plain, study) == []
     found = tables_of(
-        text_of(whole[0], "results.md"), f"What changes cost, S3: {FEEDBACK}"
+        text_of(whole[0], "results.md"), f"Cost of a variation, S3: {FEEDBACK}"
     )
     assert found["Row"][1] == "environment 0.5 s late \\[mm\\]"
     assert found["Nominal"] == [
@@ -529,8 +532,8 @@ def test_a_study_sets_every_row_beside_itself_as_it_is(whole):
         "300.0 (2.50)",
         "150.0 (1.25), 2 left",
     ]
-    assert set(found) == {"Row", *(line.name for line in contest.lines)}
-    figure = robustness(study)
+    assert set(found) == {"Row", *(line.name for line in setup.entries)}
+    figure = variations_figure(varied)
     assert [axes.get_title(loc="left").replace("\n", " ") for axes in figure.axes][
         2
     ] == "sensor noise ×\u00a02"
@@ -552,26 +555,29 @@ def test_shares_of_the_data_rise_to_the_whole_of_it():
             row(*one, factor=factor, variation=f"data share {share} %")
             for one in SYSTEMS
         ]
-    results = {"rows": rows, "config": {"name": "small_data"}}
-    (study,) = studies(rows, contests(rows)[0])
-    assert columns(study) == ["data share 1 %", "data share 10 %", "data share 100 %"]
-    markdown = benchmark_markdown(results)
+    results = {
+        "rows": rows,
+        "config": {"comparison": {"page": page_texts("small_data")}},
+    }
+    (varied,) = variations(rows, setups(rows)[0], study_of(results))
+    assert varied.columns == ["data share 1 %", "data share 10 %", "data share 100 %"]
+    markdown = results_markdown(results)
     assert markdown.startswith(
-        "# Less training data, row by row\n\nThe policies are trained anew on a share of"
+        "# Less training data, row by row\n\nThe policies are trained from scratch on a share of"
     )
     found = tables_of(markdown, f"Share of the training data, S3: {FEEDBACK}")
     assert found["SFKD"] == ["60.0 (3.00)", "30.0 (1.50)", "20.0"]
     assert markdown.index("Share of the training data") < markdown.index("Tracking: ")
 
 
-def test_every_training_of_a_row_is_drawn_and_told_apart():
+def test_every_training_of_a_row_is_drawn_and_listed():
     trained = {"sfkd": [0.018, 0.022], "oracle": [0.016, 0.016]}
     rows = [
         row(name, "measured", rmse_trainings_m=values)
         for name, values in trained.items()
     ]
-    markdown = benchmark_markdown({"rows": rows, "config": {"name": "seeds"}})
-    found = tables_of(markdown, f"Trainings apart: {FEEDBACK}")
+    markdown = results_markdown({"rows": rows, "config": {"name": "seeds"}})
+    found = tables_of(markdown, f"Single trainings: {FEEDBACK}")
     assert found == {
         "Row": ["S3 \\[mm\\], seed 0, 1"],
         "SFKD": ["18.0, 22.0 ± 2.8"],
@@ -580,12 +586,12 @@ def test_every_training_of_a_row_is_drawn_and_told_apart():
     assert "interval over trainings and episodes" in markdown
     strokes = [
         one
-        for one in overview(contests(rows), {}).axes[0].get_lines()
+        for one in overview(setups(rows), Study()).axes[0].get_lines()
         if one.get_marker() == "|"
     ]
     np.testing.assert_allclose([one.get_xdata() for one in strokes], [[18.0, 22.0]])
     alone = [row(name, "measured") for name in trained]
-    assert "Trainings apart" not in benchmark_markdown({"rows": alone})
+    assert "Single trainings" not in results_markdown({"rows": alone})
 
 
 def test_a_row_that_leaves_the_road_is_written_and_the_others_keep_the_axis():
@@ -594,13 +600,13 @@ def test_a_row_that_leaves_the_road_is_written_and_the_others_keep_the_axis():
         row("oracle", "measured"),
         row("nominal", "none", factor=60.0),
     ]
-    (axes,) = overview(contests(rows), {}).axes
+    (axes,) = overview(setups(rows), Study()).axes
     assert [text.get_text() for text in axes.texts] == ["7.2 m →"]
     assert axes.get_xlim()[1] < 30.0  # SFKD's 20 mm and their interval, not 7200
-    assert "means beyond 1 m are written at the edge" in benchmark_markdown(
+    assert "means beyond 1 m are written at the edge" in results_markdown(
         {"rows": rows, "config": {}}
     )
-    assert "written at the edge" not in benchmark_markdown(
+    assert "written at the edge" not in results_markdown(
         {"rows": rows[:2], "config": {}}
     )
 
@@ -611,8 +617,8 @@ def test_a_row_that_estimates_e_stands_beside_itself_with_e_measured():
         "variation": "environment estimated",
     }
     rows = [row("sfkd", "measured"), row("oracle", "measured"), estimated]
-    (study,) = studies(rows, contests(rows)[0])
-    assert {name: cells for name, *cells in robustness_table(study).rows} == {
+    (varied,) = variations(rows, setups(rows)[0], Study())
+    assert {name: cells for name, *cells in variations_table(varied).rows} == {
         "SFKD": ["20.0", "40.0 (2.00)"],
         "Oracle": ["16.0", "–"],
     }
@@ -627,9 +633,12 @@ def test_steady_levels_come_from_seen_to_extrapolated_and_are_not_held_against_t
     ]
     results = {
         "rows": rows,
-        "config": {"name": "levels", "comparison": {"paper": PAPER}},
+        "config": {
+            "name": "levels",
+            "comparison": {"paper": PAPER, "page": page_texts("levels")},
+        },
     }
-    markdown = benchmark_markdown(results)
+    markdown = results_markdown(results)
     found = tables_of(markdown, f"Tracking: {FEEDBACK}")
     assert found["Row"] == [rf"{name} RMSE \[mm\] (95 %)" for name in names.values()]
     assert found["SFKD"] == ["10.0 (9.0–11.0)", "16.0 (14.4–17.6)", "20.0 (18.0–22.0)"]
@@ -637,7 +646,7 @@ def test_steady_levels_come_from_seen_to_extrapolated_and_are_not_held_against_t
     assert "On S3" not in markdown
     assert "crosses" not in markdown
     assert markdown.startswith("# Steady friction and wind")
-    figure = overview(contests(rows), paper_of(results))
+    figure = overview(setups(rows), study_of(results))
     assert [axes.get_title(loc="left") for axes in figure.axes] == list(names.values())
 
 
@@ -648,15 +657,15 @@ def test_a_row_that_only_another_contest_drove_adds_no_scenario():
         row("sfkd", "measured", "s3"),
     ]
     rows.append(row("sfkd", "measured", "s3", sampling="plain"))
-    assert [scenarios(contest) for contest in contests(rows)] == [["s1", "s3"], ["s3"]]
+    assert [setup.scenarios for setup in setups(rows)] == [["s1", "s3"], ["s3"]]
 
 
-def test_rows_stand_by_what_they_are_told_and_then_by_what_they_reach(whole):
-    (contest, _) = contests(document()["rows"])
-    figure = overview([contest], {})
+def test_rows_are_grouped_by_access_to_e_and_sorted_by_rmse(whole):
+    (setup, _) = setups(document()["rows"])
+    figure = overview([setup], Study())
     shown = [text.get_text() for text in figure.axes[0].get_yticklabels()]
-    split = shown.index("told neither")
-    assert shown[0] == "told friction and wind"
+    split = shown.index("observe neither")
+    assert shown[0] == "observe friction and wind"
     assert shown[1:4] == ["Oracle", "SFKD − contraction", "SFKD"]
     assert shown[split + 1 :] == [
         "SFKD − fiber",
@@ -677,22 +686,21 @@ def test_side_forces_are_in_a_table_and_in_a_figure_that_hold_the_same(whole):
     found = tables_of(text_of(whole[0], "results.md"), f"Side forces: {FEEDBACK}")
     assert found["Row"] == [r"RMSE \[mm\] 0 N", r"RMSE \[mm\] 500 N", "Left the lane"]
     assert found["SFKD"] == ["20.0", "–", "2 / 0"]
-    scenario, lines = pushed(contests(document()["rows"])[0])
-    claimed = {name: cells for name, *cells in forces_tables(scenario, lines)[1].rows}
+    forces = forces_of(setups(document()["rows"])[0])
+    claimed = {name: cells for name, *cells in forces_tables(forces)[1].rows}
     assert claimed["SFKD"] == ["0 / 0", "10.0 / 10.0", "0 / 50.0", "0 / 0"]
     assert claimed["Nominal"] == ["–", "–", "0 / 50.0", "0 / 0"]
-    assert (scenario, len(lines)) == (
-        "s3",
-        len(SYSTEMS) - 2,
-    )  # the quadratic programs were not pushed
-    panels = forces_figure(scenario, lines).axes
+    assert forces.scenario == "s3"
+    count = len(forces.entries)
+    assert count == len(SYSTEMS) - 2  # the quadratic programs had no side forces
+    panels = forces_figure(forces).axes
     shares = [line.get_xdata() for line in panels[1].get_lines() if line.get_gid()]
-    np.testing.assert_allclose(shares, [[0.0, 50.0]] * len(lines))
+    np.testing.assert_allclose(shares, [[0.0, 50.0]] * count)
     radii = sorted(
         float(line.get_xdata()[0]) for line in panels[3].get_lines() if line.get_gid()
     )
-    np.testing.assert_allclose(radii, [0.2] * len(lines) + [2.0])
-    assert pushed(contests(document()["rows"])[1]) is None
+    np.testing.assert_allclose(radii, [0.2] * count + [2.0])
+    assert forces_of(setups(document()["rows"])[1]) is None
 
 
 def emptied(value, hole):
@@ -715,7 +723,7 @@ def test_what_was_not_measured_is_a_dash_and_never_a_zero(tmp_path, hole):
         emptied(entry | {"rmse_trainings_m": [0.1, 0.2]}, hole)
         for entry in results["rows"]
     ]
-    markdown = benchmark_markdown(results)
+    markdown = results_markdown(results)
     found = tables_of(markdown, f"Tracking: {FEEDBACK}")
     assert {
         cell
@@ -726,12 +734,12 @@ def test_what_was_not_measured_is_a_dash_and_never_a_zero(tmp_path, hole):
     } == {"–"}
     assert set(tables_of(markdown, "Cost and certificate")["SFKD"]) == {"–"}
     assert re.search(r"\b(nan|inf|None|null)\b", markdown) is None
-    text = latex(contests(results["rows"]), paper_of(results))
+    text = latex(setups(results["rows"]), study_of(results))
     assert r"\textbf" not in text
-    overview(contests(results["rows"]), paper_of(results))
+    overview(setups(results["rows"]), study_of(results))
     if hole is None:
         (tmp_path / "results.json").write_text(json.dumps(results))
-        assert len(benchmark_report(tmp_path)["figures"]) == 3
+        assert len(write_results_page(tmp_path)["figures"]) == 3
 
 
 def test_rows_with_next_to_nothing_still_make_a_page(tmp_path):
@@ -743,25 +751,25 @@ def test_rows_with_next_to_nothing_still_make_a_page(tmp_path):
         "sampling": None,
     }
     (tmp_path / "results.json").write_text(json.dumps({"rows": [bare]}))
-    made = benchmark_report(tmp_path)
+    made = write_results_page(tmp_path)
     assert "–" in Path(made["report"]).read_text("utf-8")
     (tmp_path / "results.json").write_text(json.dumps({"rows": []}))
-    assert benchmark_report(tmp_path)["figures"] == []
+    assert write_results_page(tmp_path)["figures"] == []
     assert not list((tmp_path / "report" / "results_files").iterdir())
 
 
-def test_failed_rows_are_told(tmp_path):
-    markdown = benchmark_markdown(
+def test_failed_rows_are_listed_with_their_reasons(tmp_path):
+    markdown = results_markdown(
         document() | {"failed": {"dynamic/r2dn": "loss is not finite"}}
     )
-    assert tables_of(markdown, "Asked for, but not driven")["dynamic/r2dn"] == [
+    assert tables_of(markdown, "Rows that failed")["dynamic/r2dn"] == [
         "loss is not finite"
     ]
     with pytest.raises(ArtefactError, match=r"results\.json: missing"):
-        benchmark_report(tmp_path)
+        write_results_page(tmp_path)
 
 
-def test_the_way_back_is_told(whole):
+def test_the_page_says_how_to_reproduce_it(whole):
     markdown = text_of(whole[0], "results.md")
     assert "    python -m sfkd_jax.compare +experiment=table1\n" in markdown
     assert "| jax | 0.10.2 |" in markdown
@@ -773,7 +781,7 @@ def test_the_same_results_give_the_same_bytes_and_no_stale_figure(whole):
     directory, made = whole
     before = text_of(directory, "index.html")
     (directory / "report" / "results_files" / "old.png").write_bytes(b"")
-    assert benchmark_report(directory) == made
+    assert write_results_page(directory) == made
     assert text_of(directory, "index.html") == before
     assert sorted(
         map(str, (directory / "report" / "results_files").iterdir())
@@ -782,4 +790,4 @@ def test_the_same_results_give_the_same_bytes_and_no_stale_figure(whole):
 
 def test_sfkd_is_the_line_that_sees_the_environment():
     rows = [row("sfkd", "measured") | {"env": "none"}, row("sfkd", "measured")]
-    assert line_of(contests(rows)[0], "sfkd").env == "measured"
+    assert setups(rows)[0].entry("sfkd").env == "measured"
