@@ -1,1 +1,1 @@
-"""Core types: planar poses, path coordinates and what any model predicts."""
+"""Planar poses, path coordinates, folded parameters, and rollouts of any model."""

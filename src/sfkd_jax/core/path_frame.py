@@ -1,10 +1,10 @@
-"""Path coordinates: the car seen from the foot of the path beside it, and a step of the loop closed around it.
+"""Path coordinates: the vehicle relative to its path, and one closed-loop step.
 
 A path state is a `State` whose pose is that of the foot point in its own frame, 0, and
 whose body is ξ = (e_y [m], e_ψ [rad], v [m/s], …): distance left of the path, yaw
-against it, and the vehicle's own body state. Its control is w = (ν, κ, v_ref): what is
-added to the law's control, the path's curvature [1/m] over the step, and the speed
-asked for [m/s].
+relative to it, and the vehicle's own body state. Its control is w = (ν, κ, v_ref): a
+perturbation added to the law's control, the path's curvature [1/m] over the step, and
+the reference speed [m/s].
 """
 
 from __future__ import annotations
@@ -21,31 +21,32 @@ from sfkd_jax.types import BODY, POSE, Control, Environment, Pose, Scalar, State
 PathState: TypeAlias = Float[Array, " coordinate"]
 """ξ = (e_y, e_ψ, v, …): the body of a path state."""
 LATERAL, HEADING, PATH_SPEED = 0, 1, 2
-"""Where e_y, e_ψ and v stand in ξ."""
+"""Indices of e_y, e_ψ and v in ξ."""
 PERTURBATION = slice(0, 2)
-"""Where ν stands in w."""
+"""Entries of ν in w."""
 CURVATURE, REFERENCE_SPEED = 2, 3
-"""Where κ and v_ref stand in w."""
+"""Indices of κ and v_ref in w."""
 SMALLEST_SCALE = 0.2
-"""Of 1 − κ e_y: beyond, the car is so near to the path's centre of curvature that its
-foot says little.
+"""Lower limit of 1 − κ e_y: below it the car is too close to the path's centre of
+curvature for path coordinates to be meaningful.
 """
 
 PathFeedback: TypeAlias = Callable[[PathState, Scalar, Scalar, Environment], Control]
 """(ξ, κ, v_ref, e) -> u, not yet clipped."""
 
 
-def on_circle(pose: Pose, curvature: Scalar) -> tuple[Scalar, Scalar]:
-    """e_y [m] and e_ψ [rad] of a pose against the circle of curvature κ through the origin.
+def circle_errors(pose: Pose, curvature: Scalar) -> tuple[Scalar, Scalar]:
+    """Return e_y [m] and e_ψ [rad] of a pose relative to a circle through the origin.
 
-        q = κ (x² + y²) − 2 y,   e_y = −q / (1 + √(1 + κ q)),   e_ψ = yaw − atan2(κ x, 1 − κ y)
+        q = κ (x² + y²) − 2 y,   e_y = −q / (1 + √(1 + κ q)),
+        e_ψ = yaw − atan2(κ x, 1 − κ y)
 
-    Exact, and without a singularity at κ = 0. √(1 + κ q) = 1 − κ e_y is held at
-    `SMALLEST_SCALE`, so that the result is finite wherever the car is; see `is_valid`.
+    Exact, and without a singularity at κ = 0. √(1 + κ q) = 1 − κ e_y is limited from
+    below to `SMALLEST_SCALE`, so that the result is always finite; see `is_valid`.
 
     Args:
-        pose: x [m], y [m], yaw [rad] in the frame that touches the circle at its
-            origin.
+        pose: x [m], y [m], yaw [rad] in the frame whose x axis is tangent to the circle
+            at the origin.
         curvature: κ [1/m], left positive.
     """
     x, y, yaw = pose[0], pose[1], pose[2]
@@ -58,30 +59,34 @@ def on_circle(pose: Pose, curvature: Scalar) -> tuple[Scalar, Scalar]:
 def is_valid(
     lateral: Float[Array, "*shape"], curvature: Float[Array, "*shape"]
 ) -> Bool[Array, "*shape"]:
-    """Whether path coordinates mean something: 1 − κ e_y > 0.2; False for NaN."""
+    """Whether path coordinates are meaningful: 1 − κ e_y > 0.2; False for NaN."""
     return 1.0 - curvature * lateral > SMALLEST_SCALE
 
 
 def path_state(coordinates: PathState) -> State:
-    """ξ as a `State`: the foot in its own frame, and ξ as the body."""
+    """Return ξ as a `State`: the pose of the foot in its own frame, 0, and body ξ."""
     return jnp.concatenate([jnp.zeros(3), coordinates])
 
 
-def beside(coordinates: PathState) -> State:
-    """The vehicle's state in the frame of the foot: pose (0, e_y, e_ψ), body s."""
+def vehicle_state(coordinates: PathState) -> State:
+    """Return the vehicle's state in the foot frame: pose (0, e_y, e_ψ), body s."""
     return jnp.concatenate([jnp.zeros(1), coordinates])
 
 
 def path_step(
     step: Step,
 ) -> Callable[[PathState, Control, Scalar, Environment], PathState]:
-    """(ξ, u, κ, e) -> ξ one period later, of a vehicle's step; exact on a circle of curvature κ."""
+    """Return (ξ, u, κ, e) -> ξ one period later, exact on a circle of curvature κ.
+
+    Args:
+        step: of the vehicle, in the world frame.
+    """
 
     def along(
         coordinates: PathState, control: Control, curvature: Scalar, env: Environment
     ) -> PathState:
-        after = step(beside(coordinates), control, env)
-        lateral, heading = on_circle(after[POSE], curvature)
+        after = step(vehicle_state(coordinates), control, env)
+        lateral, heading = circle_errors(after[POSE], curvature)
         return jnp.concatenate([jnp.stack([lateral, heading]), after[BODY]])
 
     return along
@@ -90,12 +95,15 @@ def path_step(
 def closed_loop(
     step: Step, law: PathFeedback, low: tuple[float, ...], high: tuple[float, ...]
 ) -> Step:
-    """(path state, w, e) -> path state: ξ⁺ = F(ξ, clip(law(ξ; κ, v_ref, e) + ν); κ, e).
+    """Return (path state, w, e) -> path state, the vehicle in closed loop with a law.
+
+        ξ⁺ = F(ξ, clip(law(ξ; κ, v_ref, e) + ν); κ, e)
 
     Args:
-        step: of the vehicle, in the world.
-        law: around which the loop is closed.
-        low, high: limits of the vehicle's controls.
+        step: of the vehicle, in the world frame.
+        law: (ξ, κ, v_ref, e) -> u.
+        low: lower limits of the vehicle's controls.
+        high: upper limits of the vehicle's controls.
     """
     along = path_step(step)
     bottom, top = jnp.asarray(low), jnp.asarray(high)

@@ -1,4 +1,4 @@
-"""What any `Model` does along a trajectory: free-running predictions and one-step defects."""
+"""Predictions of any `Model` along a trajectory: rollouts and one-step defects."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ from sfkd_jax.types import (
 def fibers_along(
     model: Model, params: Params, trajectory: Trajectory
 ) -> tuple[Fiber, Fiber]:
-    """Fibres of e_0 … e_{T-1} and of the environment one step later (the last is held)."""
+    """Return the fibers of e_0 … e_{T-1} and of e_1 … e_{T-1}, e_{T-1}."""
     fibers = jax.vmap(model.fiber, in_axes=(None, 0))(params, trajectory.envs)
     later = jax.tree.map(lambda leaf: jnp.concatenate([leaf[1:], leaf[-1:]]), fibers)
     return fibers, later
@@ -36,7 +36,7 @@ def fibers_along(
 def rollout(
     model: Model, params: Params, trajectory: Trajectory
 ) -> tuple[Float[Array, "time state"], Latent, tuple[Fiber, Fiber]]:
-    """Predict x_1 … x_T from x_0, the controls and the environments; latents and fibres come along."""
+    """Predict x_1 … x_T from x_0, u and e; return the latents and fibers as well."""
     fibers, later = fibers_along(model, params, trajectory)
     start = model.encode(_at(fibers, 0), trajectory.states[0])
 
@@ -49,8 +49,13 @@ def rollout(
     return jax.vmap(model.decode)(later, latents), latents, (fibers, later)
 
 
-def every_window(trajectory: Trajectory, *, horizon: int, stride: int) -> Trajectory:
-    """The windows of `horizon` steps that start at every `stride`-th state of one trajectory, leading axis first.
+def sliding_windows(trajectory: Trajectory, *, horizon: int, stride: int) -> Trajectory:
+    """Return the windows of one trajectory along a new leading axis.
+
+    Args:
+        trajectory: one, states (T + 1, state).
+        horizon: steps of a window.
+        stride: steps between the starts of two windows.
 
     Raises:
         ValueError: the horizon does not fit the trajectory.
@@ -69,12 +74,14 @@ def every_window(trajectory: Trajectory, *, horizon: int, stride: int) -> Trajec
 def window_errors(
     model: Model, params: Params, trajectory: Trajectory, *, horizon: int, stride: int
 ) -> Float[Array, "window horizon 3"]:
-    """`prediction_errors` 1 … horizon steps ahead, from every `stride`-th true state.
+    """Return `prediction_errors` 1 … horizon steps ahead, for every window.
 
     Args:
-        model, params: any model.
+        model: any model.
+        params: of the model.
         trajectory: one, states (T + 1, state).
-        horizon, stride: steps.
+        horizon: steps of a window.
+        stride: steps between the starts of two windows.
 
     Raises:
         ValueError: the horizon does not fit the trajectory.
@@ -85,7 +92,7 @@ def window_errors(
             rollout(model, params, window)[0], window, along_path=model.along_path
         )
 
-    return jax.vmap(one)(every_window(trajectory, horizon=horizon, stride=stride))
+    return jax.vmap(one)(sliding_windows(trajectory, horizon=horizon, stride=stride))
 
 
 def prediction_errors(
@@ -94,7 +101,7 @@ def prediction_errors(
     *,
     along_path: bool = False,
 ) -> Float[Array, "horizon 3"]:
-    """Distance between positions [m], |yaw| [rad] (wrapped), 2-norm of the body state in its own units.
+    """Return the errors of position [m], yaw [rad] (wrapped) and body state, as norms.
 
     Along a path: |e_y| [m], |e_ψ| [rad], 2-norm of the vehicle's own body state.
     """
@@ -111,27 +118,27 @@ def prediction_errors(
 
 
 def _kinds_along_path(gap: Float[Array, "*batch state"]) -> tuple[Array, Array, Array]:
-    """Of path states, what stands for position, yaw and body state: e_y, e_ψ, and the rest."""
+    """Split path states into e_y, e_ψ (for position and yaw) and the vehicle's body."""
     xi = gap[..., BODY]
     return xi[..., LATERAL, None], xi[..., HEADING, None], xi[..., PATH_SPEED:]
 
 
 def in_batches(function: Callable[[Any], Any], items: Any, *, size: int) -> Any:
-    """`function` of every item along the leading axis, `size` of them at a time.
+    """Map a function over the leading axis, `size` items at a time.
 
-    The last batch is filled up and what fills it is dropped: `jax.lax.map` would
-    compile a second program for the rest.
+    The last batch is padded and the padding dropped: `jax.lax.map` would compile a
+    second program for the rest.
     """
     count = jax.tree.leaves(items)[0].shape[0]
     size = min(size, count)
     rows = (jnp.arange(-(-count // size) * size) % count).reshape(-1, size)
-    found = jax.lax.map(
+    results = jax.lax.map(
         lambda chosen: jax.vmap(function)(
             jax.tree.map(lambda leaf: leaf[chosen], items)
         ),
         rows,
     )
-    return jax.tree.map(lambda leaf: leaf.reshape(-1, *leaf.shape[2:])[:count], found)
+    return jax.tree.map(lambda leaf: leaf.reshape(-1, *leaf.shape[2:])[:count], results)
 
 
 def defects(
@@ -140,22 +147,25 @@ def defects(
     trajectory: Trajectory,
     along: tuple[Fiber, Fiber] | None = None,
 ) -> tuple[Float[Array, "time rank"], Float[Array, "time state"]]:
-    """One-step disturbances d_k, and beside them the states that each single step predicts.
+    """Return the one-step disturbances d_k and the one-step predictions of the states.
 
-        d_k = z_{k+1} − T(e_k → e_{k+1}) F(z_k, u_k, e_k),   z_k = Φ(x_k, e_k), F the latent step
+        d_k = z_{k+1} − T(e_k → e_{k+1}) F(z_k, u_k, e_k),   z_k = Φ(x_k, e_k)
+
+    F is the latent step.
 
     Args:
-        model, params: any model.
+        model: any model.
+        params: of the model.
         trajectory: one, states (T + 1, state).
-        along: fibres from `fibers_along`, if they are at hand.
+        along: the result of `fibers_along`, if it is available.
     """
     fibers, later = along or fibers_along(model, params, trajectory)
     origin = model.encode(_at(fibers, 0), trajectory.states[0])
-    seen = jax.vmap(model.observe, in_axes=(0, None, 0))
-    now = seen(fibers, origin, trajectory.states[:-1])
+    observe = jax.vmap(model.observe, in_axes=(0, None, 0))
+    now = observe(fibers, origin, trajectory.states[:-1])
     expected = jax.vmap(model.step)(fibers, now, trajectory.controls)
     expected = jax.vmap(model.transport)(fibers, later, expected)
-    after = seen(later, origin, trajectory.states[1:])
+    after = observe(later, origin, trajectory.states[1:])
     gap = jax.vmap(model.vector)(after) - jax.vmap(model.vector)(expected)
     return gap, jax.vmap(model.decode)(later, expected)
 
@@ -169,18 +179,22 @@ def step_disturbances(
     control: Control,
     after: State,
 ) -> Float[Array, " 4"]:
-    """How far one step fell from its prediction, of each kind: latent, position [m], yaw [rad], body state.
+    """Return the one-step residuals of latent, position [m], yaw [rad] and body state.
+
+        |z' − ẑ'|, |p(g⁻¹ g') − p(g⁻¹ ĝ')|, |yaw(g⁻¹ g') − yaw(g⁻¹ ĝ')|, |s' − ŝ'|,
+        ẑ' = T(e → e') F(z, u, e)
 
     Along a path the last three are e_y [m], e_ψ [rad] and the vehicle's own body state.
 
-        |z' − ẑ'|, |p(g⁻¹ g') − p(g⁻¹ ĝ')|, |yaw(g⁻¹ g') − yaw(g⁻¹ ĝ')|, |s' − ŝ'|,   ẑ' = T(e → e') F(z, u, e)
-
     Args:
         model: any model.
-        fiber, fiber_next: of e and e'.
-        origin: a latent whose frame z and z' share; `model.encode(fiber, before)`
-            starts a new one at x.
-        before, control, after: x, u, x'.
+        fiber: of e.
+        fiber_next: of e'.
+        origin: a latent in whose frame z and z' are expressed; `model.encode(fiber,
+            before)` gives a new frame at x.
+        before: x.
+        control: u.
+        after: x'.
     """
     now = model.observe(fiber, origin, before)
     expected = model.transport(fiber, fiber_next, model.step(fiber, now, control))
@@ -196,5 +210,5 @@ def step_disturbances(
 
 
 def _at(tree: Any, index: int) -> Any:
-    """One entry along the leading axis of every leaf."""
+    """Index the leading axis of every leaf."""
     return jax.tree.map(lambda leaf: leaf[index], tree)

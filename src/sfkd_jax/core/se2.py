@@ -1,4 +1,4 @@
-"""Poses in the plane, g = (p_x [m], p_y [m], yaw [rad]): composition, difference, angle wrapping."""
+"""Planar poses g = (p_x [m], p_y [m], yaw [rad]): composition, difference, wrapping."""
 
 from __future__ import annotations
 
@@ -7,12 +7,12 @@ from jaxtyping import Array, Float
 
 
 def wrap_angle(angle: Float[Array, "*shape"]) -> Float[Array, "*shape"]:
-    """The same angle in [-π, π], with gradient 1."""
+    """Return the same angle in [-π, π], with gradient 1."""
     return angle - 2 * jnp.pi * jnp.round(angle / (2 * jnp.pi))
 
 
 def rotate(angle: Float[Array, ""], vector: Float[Array, " 2"]) -> Float[Array, " 2"]:
-    """R(angle) vector."""
+    """Return R(angle) vector."""
     c, s = jnp.cos(angle), jnp.sin(angle)
     return jnp.stack([c * vector[0] - s * vector[1], s * vector[0] + c * vector[1]])
 
@@ -20,7 +20,7 @@ def rotate(angle: Float[Array, ""], vector: Float[Array, " 2"]) -> Float[Array, 
 def compose(
     pose: Float[Array, " 3"], increment: Float[Array, " 3"]
 ) -> Float[Array, " 3"]:
-    """g ∘ Δ: the pose reached from `pose` by a motion `increment` given in its own frame (yaw not wrapped)."""
+    """Return g ∘ Δ, the pose after a motion Δ in the frame of g; yaw is not wrapped."""
     position = pose[:2] + rotate(pose[2], increment[:2])
     return jnp.concatenate([position, pose[2:] + increment[2:]])
 
@@ -28,6 +28,6 @@ def compose(
 def between(
     pose: Float[Array, " 3"], pose_next: Float[Array, " 3"]
 ) -> Float[Array, " 3"]:
-    """g⁻¹ ∘ g': the motion from `pose` to `pose_next` in the frame of `pose`, yaw wrapped."""
+    """Return g⁻¹ ∘ g', the motion from g to g' in the frame of g, yaw wrapped."""
     position = rotate(-pose[2], pose_next[:2] - pose[:2])
     return jnp.concatenate([position, wrap_angle(pose_next[2:] - pose[2:])])

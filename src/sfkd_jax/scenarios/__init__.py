@@ -1,9 +1,9 @@
-"""The road: what happens to the truth. Paths, environment schedules, and the scenarios S1, S2, S3."""
+"""Driving scenarios: paths, environment schedules, and the families S1, S2, S3."""
 
 from sfkd_jax.scenarios._conditions import gusts as gusts
 from sfkd_jax.scenarios._conditions import held_road as held_road
+from sfkd_jax.scenarios._conditions import random_side_forces as random_side_forces
 from sfkd_jax.scenarios._conditions import random_switching as random_switching
-from sfkd_jax.scenarios._conditions import side_pushes as side_pushes
 from sfkd_jax.scenarios._conditions import steady_road as steady_road
 from sfkd_jax.scenarios._conditions import switching_road as switching_road
 from sfkd_jax.scenarios._conditions import uniform_road as uniform_road

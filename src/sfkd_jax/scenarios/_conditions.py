@@ -1,4 +1,4 @@
-"""What the road and the air do over time: schedules of e = (friction [-], side wind [m/s])."""
+"""Schedules of the environment e = (friction [-], side wind [m/s]) over time."""
 
 from __future__ import annotations
 
@@ -17,19 +17,25 @@ SWITCH_LEVELS = ((0.9, 0.0), (0.6, 4.0), (0.3, 8.0), (0.6, 4.0))
 
 
 def uniform_road(key: Key, *, steps: int, friction: Range = (0.9, 0.9)) -> Schedule:
-    """S1: one friction level drawn from a range, no wind."""
-    level = jax.random.uniform(key, (), minval=friction[0], maxval=friction[1])
-    return jnp.stack([jnp.full(steps, level), jnp.zeros(steps)], axis=1)
-
-
-def steady_road(key: Key, *, steps: int, friction: Range, wind: Range) -> Schedule:
-    """One friction level and one wind, its side drawn too, for a whole episode.
+    """S1: one friction level from a range, no wind.
 
     Args:
         key: consumed.
         steps: length.
         friction: range [-].
-        wind: range of its strength [m/s].
+    """
+    level = jax.random.uniform(key, (), minval=friction[0], maxval=friction[1])
+    return jnp.stack([jnp.full(steps, level), jnp.zeros(steps)], axis=1)
+
+
+def steady_road(key: Key, *, steps: int, friction: Range, wind: Range) -> Schedule:
+    """One friction level and one wind from a random side, for a whole episode.
+
+    Args:
+        key: consumed.
+        steps: length.
+        friction: range [-].
+        wind: range of the wind speed [m/s].
     """
     friction_key, wind_key, side_key = jax.random.split(key, 3)
     level = jax.random.uniform(friction_key, (), minval=friction[0], maxval=friction[1])
@@ -54,10 +60,12 @@ def wet_road(
 
     Args:
         key: consumed.
-        steps, dt: length and sampling period [s].
-        before, after: friction levels, drawn from a range.
-        drop_time: when [s], drawn from a range.
-        peak_wind: gusts cover [-peak, peak] [m/s] evenly.
+        steps: length.
+        dt: sampling period [s].
+        before: range of the friction before the drop [-].
+        after: range of the friction after it [-].
+        drop_time: range of its time [s].
+        peak_wind: gusts are uniform in [-peak, peak] [m/s].
     """
     before_key, after_key, time_key, gust_key = jax.random.split(key, 4)
     high = jax.random.uniform(before_key, (), minval=before[0], maxval=before[1])
@@ -70,7 +78,14 @@ def wet_road(
 
 
 def switching_road(key: Key, *, steps: int, dt: float, period: float = 3.0) -> Schedule:
-    """S3: every `period` seconds the next of A, B, C, B, A, …, each with a random side of the wind."""
+    """S3: the next of the levels A, B, C, B, A, … every period, wind side random.
+
+    Args:
+        key: consumed.
+        steps: length.
+        dt: sampling period [s].
+        period: between two switches [s].
+    """
     visits = int(steps * dt / period) + 1
     sides = jax.random.rademacher(key, (visits,), dtype=float)
     levels = jnp.asarray(SWITCH_LEVELS)[jnp.arange(visits) % len(SWITCH_LEVELS)]
@@ -79,17 +94,17 @@ def switching_road(key: Key, *, steps: int, dt: float, period: float = 3.0) -> S
     return levels[visit]
 
 
-def side_pushes(
+def random_side_forces(
     key: Key, *, steps: int, dt: float, largest: float | Scalar, hold: float = 1.0
 ) -> Float[Array, " time"]:
-    """Side forces that nobody measures: levels drawn evenly from [-F, F] every `hold` seconds [N].
+    """Draw unmeasured side forces, uniform in [-F, F] and constant for `hold` [N].
 
     Args:
-        key: consumed; the same key gives the same pushes at every F, but for their
-            size.
-        steps, dt: length and sampling period [s].
+        key: consumed; the same key gives the same forces at every F, up to the factor.
+        steps: length.
+        dt: sampling period [s].
         largest: F [N].
-        hold: how long a level lasts [s].
+        hold: duration of a level [s].
     """
     each = round(hold / dt)
     levels = jax.random.uniform(key, (-(-steps // each),), minval=-1.0)
@@ -105,14 +120,15 @@ def gusts(
     hold: Range = (1.0, 3.0),
     ramp: float = 0.5,
 ) -> Float[Array, " time"]:
-    """Wind levels drawn evenly from [-peak, peak], joined by 1 − cos ramps [m/s].
+    """Draw wind levels, uniform in [-peak, peak], joined by 1 − cos ramps [m/s].
 
     Args:
         key: consumed.
-        steps, dt: length and sampling period [s].
+        steps: length.
+        dt: sampling period [s].
         peak: [m/s].
         hold: range of the time from one ramp to the next [s].
-        ramp: its duration [s].
+        ramp: duration of a ramp [s].
     """
     level_key, hold_key = jax.random.split(key)
     count = int(steps * dt / hold[0]) + 2
@@ -131,8 +147,17 @@ def gusts(
 def held_road(
     key: Key, *, steps: int, low: tuple[float, ...], high: tuple[float, ...]
 ) -> Float[Array, "time environment"]:
-    """One environment out of the box E, held; a third of every entry lies at an end of its range."""
-    return jnp.tile(_anywhere(key, low, high), (steps, 1))
+    """One constant environment from the box E.
+
+    Each entry is uniform in its range or, with probability 1/3, at one of its ends.
+
+    Args:
+        key: consumed.
+        steps: length.
+        low: lower corner of E.
+        high: upper corner of E.
+    """
+    return jnp.tile(_from_box(key, low, high), (steps, 1))
 
 
 def random_switching(
@@ -144,16 +169,19 @@ def random_switching(
     high: Corner,
     dwell: Range = (3.0, 6.0),
 ) -> Float[Array, "time environment"]:
-    """Environments out of the box E, each as in `held_road`, held for a time drawn from `dwell` [s].
+    """Environments from the box E, as in `held_road`, each held for a random time.
 
     Args:
         key: consumed.
-        steps, dt: length and sampling period [s].
-        low, high: E.
+        steps: length.
+        dt: sampling period [s].
+        low: lower corner of E.
+        high: upper corner of E.
+        dwell: range of the time that each is held [s].
     """
     level_key, hold_key = jax.random.split(key)
     count = int(steps * dt / dwell[0]) + 2
-    levels = jax.vmap(lambda key: _anywhere(key, low, high))(
+    levels = jax.vmap(lambda key: _from_box(key, low, high))(
         jax.random.split(level_key, count)
     )
     ends = jnp.cumsum(
@@ -162,8 +190,8 @@ def random_switching(
     return levels[jnp.searchsorted(ends, jnp.arange(steps) * dt, side="right")]
 
 
-def _anywhere(key: Key, low: Corner, high: Corner) -> Float[Array, " environment"]:
-    """A point of a box; evenly inside, and a third of every entry at an end."""
+def _from_box(key: Key, low: Corner, high: Corner) -> Float[Array, " environment"]:
+    """A point of a box; each entry is at an end of its range with probability 1/3."""
     share = jnp.clip(
         jax.random.uniform(key, (len(low),), minval=-0.25, maxval=1.25), 0.0, 1.0
     )

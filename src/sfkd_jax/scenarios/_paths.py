@@ -1,4 +1,4 @@
-"""Reference paths by arc length: a random smooth family, points on it, and projection onto it."""
+"""Reference paths by arc length: random smooth paths, interpolation and projection."""
 
 from __future__ import annotations
 
@@ -33,14 +33,17 @@ def smooth_path(
     wavelengths: tuple[float, float] = (50.0, 160.0),
     run_up: float = 20.0,
 ) -> Path:
-    """A random path whose curvature is a sum of three sinusoids, κ(s) = Σᵢ aᵢ sin(2π s/λᵢ + φᵢ), max |κ| = κ_max.
+    """Draw a path whose curvature is a sum of three sinusoids.
 
-    The first metres are straight and blend in, so that an episode starts on the path.
+        κ(s) = Σᵢ aᵢ sin(2π s/λᵢ + φᵢ),   max |κ| = κ_max
+
+    The curvature is blended in over the first metres, so that an episode starts on the
+    path.
 
     Args:
         key: consumed.
-        length: at least this long [m].
-        spacing: sampling [m].
+        length: smallest length [m].
+        spacing: between samples [m].
         peak_curvature: κ_max [1/m].
         wavelengths: range of λᵢ [m].
         run_up: length of the blend [m].
@@ -60,7 +63,10 @@ def smooth_path(
 
 
 def path_from_curvature(curvature: Float[Array, " point"], *, spacing: float) -> Path:
-    """Integrate κ(s) to a path that starts at the origin, heading along x (trapezoid and midpoint rules)."""
+    """Integrate κ(s) to a path that starts at the origin along x.
+
+    Uses the trapezoid rule for yaw and the midpoint rule for positions.
+    """
     yaw_steps = 0.5 * (curvature[1:] + curvature[:-1]) * spacing
     yaw = jnp.concatenate([jnp.zeros(1), jnp.cumsum(yaw_steps)])
     middle = yaw[:-1] + 0.5 * yaw_steps
@@ -70,15 +76,19 @@ def path_from_curvature(curvature: Float[Array, " point"], *, spacing: float) ->
 
 
 def path_through(points: Float[Array, "point 2"], *, spacing: float = 0.5) -> Path:
-    """A path along given positions [m], sampled anew at equal distances; yaw and curvature by central differences.
+    """Return a path through positions, resampled at equal distances.
 
-    Between the positions it runs straight, so they should lie closer than the path
-    bends: a few to every `spacing` on a sharp turn. Its length is a multiple of
-    `spacing`.
+    Yaw and curvature are central differences. The path is straight between positions,
+    so these should be dense: several per `spacing` on a sharp turn. Its length is a
+    multiple of `spacing`.
+
+    Args:
+        points: positions [m].
+        spacing: between samples [m].
 
     Raises:
         ValueError: a path too short for its spacing, positions that are not finite, or
-            two in a row that coincide.
+            two consecutive positions that coincide.
     """
     steps = jnp.linalg.norm(jnp.diff(points, axis=0), axis=1)
     if not bool(jnp.all(jnp.isfinite(points)) & jnp.all(steps > 0)):
@@ -87,7 +97,8 @@ def path_through(points: Float[Array, "point 2"], *, spacing: float = 0.5) -> Pa
     count = int(along[-1] / spacing) + 1
     if count < 3:
         raise ValueError(
-            f"a path of {float(along[-1]):.3g} m has too few samples at a spacing of {spacing} m"
+            f"a path of {float(along[-1]):.3g} m has too few samples "
+            f"at a spacing of {spacing} m"
         )
     s = jnp.arange(count) * spacing
     x, y = (jnp.interp(s, along, points[:, axis]) for axis in (0, 1))
@@ -98,7 +109,10 @@ def path_through(points: Float[Array, "point 2"], *, spacing: float = 0.5) -> Pa
 
 
 def point_at(path: Path, s: Scalar) -> Float[Array, " 4"]:
-    """x, y, yaw, curvature at arc length s [m], along a clothoid from the sample before; s is clamped to the path."""
+    """Return x, y, yaw, curvature at arc length s [m], which is clamped to the path.
+
+    Between two samples the path is a clothoid.
+    """
     last = path.points.shape[0] - 2
     index = jnp.clip(jnp.floor(s / path.spacing).astype(int), 0, last)
     start, end = path.points[index], path.points[index + 1]
@@ -114,7 +128,10 @@ def point_at(path: Path, s: Scalar) -> Float[Array, " 4"]:
 def project(
     path: Path, position: Float[Array, " 2"], s_guess: Scalar
 ) -> tuple[Scalar, Scalar]:
-    """Arc length of the closest point near `s_guess` and the signed distance to it (left positive), by Newton steps."""
+    """Return the arc length of the closest point and the signed distance to it [m].
+
+    Newton steps from `s_guess`; left of the path the distance is positive.
+    """
     s = s_guess
     for _ in range(3):
         point = point_at(path, s)
@@ -126,7 +143,7 @@ def project(
 def reference_window(
     path: Path, s: Scalar, speed: Scalar, *, dt: float, horizon: int
 ) -> Reference:
-    """The next `horizon` points at the given speed: x, y, yaw, speed, shape (horizon, 4)."""
+    """Return the next points at the given speed: x, y, yaw, speed, (horizon, 4)."""
     ahead = s + speed * dt * jnp.arange(1, horizon + 1)
     points = jax.vmap(point_at, in_axes=(None, 0))(path, ahead)
     return points.at[:, 3].set(speed)
@@ -135,7 +152,7 @@ def reference_window(
 def _offsets(
     point: Float[Array, " 4"], position: Float[Array, " 2"]
 ) -> tuple[Scalar, Scalar]:
-    """How far `position` lies ahead of and left of a point on the path [m]."""
+    """Distance of a position ahead of and left of a point on the path [m]."""
     dx, dy = position[0] - point[0], position[1] - point[1]
     c, s = jnp.cos(point[2]), jnp.sin(point[2])
     return c * dx + s * dy, -s * dx + c * dy

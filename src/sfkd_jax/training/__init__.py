@@ -1,4 +1,4 @@
-"""The workshop: takes any `Model` and changes its params. The only room that knows optax and orbax."""
+"""Training of any `Model`: losses, the optimiser loop, logs and checkpoints."""
 
 from sfkd_jax.training._checkpoints import Checkpoints as Checkpoints
 from sfkd_jax.training._loop import TrainingStopped as TrainingStopped

@@ -11,18 +11,18 @@ import jax
 import orbax.checkpoint as ocp
 from orbax.checkpoint import checkpoint_managers as managers
 
-from sfkd_jax.training._log import GOES_ON
+from sfkd_jax.training._log import RESUME_HINT
 
 
 class Checkpoints:
-    """A directory that always holds the latest and the best state.
+    """A directory that holds the latest and the best training state.
 
-    A save is atomic: a process killed in the middle leaves the states before it, and
-    what is half written is removed when the directory is opened again.
+    A save is atomic: a process killed in the middle leaves the previous states, and an
+    incomplete one is removed when the directory is opened again.
     """
 
     def __init__(self, directory: Path) -> None:
-        """Open `directory`, created if need be."""
+        """Open a directory, which is created if it does not exist."""
 
         def metric(metrics: dict[str, float]) -> float:
             return metrics["validation_loss"]
@@ -42,10 +42,10 @@ class Checkpoints:
         )
 
     def save(self, step: int, state: Any, *, validation_loss: float) -> None:
-        """Write the state reached after `step` optimiser steps; a step already there is left alone.
+        """Write the state after `step` optimiser steps, unless it exists.
 
         Raises:
-            OSError: it cannot be written; the states before it stay.
+            OSError: it cannot be written; the previous states remain.
         """
         if step in self._manager.all_steps():
             return
@@ -54,23 +54,24 @@ class Checkpoints:
             logging.getLogger("absl"),
         )
         level = logger.level
-        logger.setLevel(logging.CRITICAL)  # orbax logs the trace of what it then raises
+        logger.setLevel(logging.CRITICAL)  # orbax logs a traceback and raises as well
         try:
             self._manager.save(step, args=ocp.args.StandardSave(state), metrics=metrics)
-        except Exception as reason:  # orbax raises whatever its storage raised
+        except Exception as reason:  # orbax raises any error of its storage
             line = " ".join(str(reason).split()).rsplit(": ", 1)[-1][:120]
             raise OSError(
-                f"{self._manager.directory}: step {step} was not saved ({line}); {GOES_ON}"
+                f"{self._manager.directory}: step {step} was not saved ({line}); "
+                f"{RESUME_HINT}"
             ) from reason
         finally:
             logger.setLevel(level)
 
     def latest_step(self) -> int | None:
-        """The step of the newest state, or None."""
+        """Return the step of the newest state, or None."""
         return self._manager.latest_step()
 
     def best_step(self) -> int | None:
-        """The step of the state with the lowest validation loss, or None."""
+        """Return the step with the lowest validation loss, or None."""
         scores = {
             step: self._manager.metrics(step) for step in self._manager.all_steps()
         }
@@ -80,7 +81,9 @@ class Checkpoints:
         return min(losses, key=lambda step: losses[step]) if losses else None
 
     def resume(self, like: Any) -> Any:
-        """The newest state that can be read, or `like` if there is none; a damaged one is told on stderr.
+        """Return the newest readable state, or `like` if there is no state.
+
+        A damaged state is reported on stderr.
 
         Raises:
             OSError: there are states, and none can be read.
@@ -89,24 +92,26 @@ class Checkpoints:
         for step in steps:
             try:
                 return self.restore(step, like)
-            except Exception as reason:  # orbax raises whatever its storage raised
+            except Exception as reason:  # orbax raises any error of its storage
                 line = (
                     str(reason).splitlines()[0]
                     if str(reason)
                     else type(reason).__name__
                 )
                 print(
-                    f"checkpoint {step} cannot be read ({line[:120]}); trying an older one",
+                    f"checkpoint {step} cannot be read ({line[:120]}); "
+                    "trying an older one",
                     file=sys.stderr,
                 )
         if steps:
             raise OSError(
-                f"no checkpoint in {self._manager.directory} can be read; remove it to start again"
+                f"no checkpoint in {self._manager.directory} can be read; "
+                "remove it to start again"
             )
         return like
 
     def restore(self, step: int, like: Any) -> Any:
-        """The state saved at `step`, with the structure and types of `like`."""
+        """Return the state saved at `step`, with the structure and types of `like`."""
         abstract = jax.tree.map(ocp.utils.to_shape_dtype_struct, like)
         return self._manager.restore(step, args=ocp.args.StandardRestore(abstract))
 

@@ -1,4 +1,4 @@
-"""Stopping on request: SIGINT and SIGTERM are answered within moments, also while compiled code runs."""
+"""SIGINT and SIGTERM stop training promptly, also while compiled code runs."""
 
 from __future__ import annotations
 
@@ -10,29 +10,29 @@ from typing import Any
 
 import jax
 
-_LOOK_S = 0.02
-"""How often a wait looks for a signal [s]."""
+_POLL_S = 0.02
+"""Interval at which a wait checks for a signal [s]."""
 
 
 class Interrupted(KeyboardInterrupt):
-    """A signal asked to stop; nothing was in the middle of being written."""
+    """A signal requested a stop; no file was being written."""
 
 
 class Interruption:
-    """A context in which SIGINT and SIGTERM are kept until something is waited for, and then raise `Interrupted`.
+    """A context that turns SIGINT and SIGTERM into `Interrupted` at the next wait.
 
-    Python runs no handler while it is inside a compiler or waits for a result, which
-    may take minutes: so both are waited for in small steps. A second signal, and
-    signals that somebody else handles, do what they did before.
+    Python runs no handler while it compiles or waits for a result, which may take
+    minutes; here both are waited for in small steps. A second signal has its previous
+    effect, and signals that have a handler already are left alone.
     """
 
     def __init__(self) -> None:
-        """Nothing is asked for yet."""
-        self._asked = False
-        self._before: dict[int, Any] = {}
+        """Start without a request."""
+        self._requested = False
+        self._previous: dict[int, Any] = {}
 
     def __enter__(self) -> Interruption:
-        """Take the signals over, where this thread may and nobody else did."""
+        """Install handlers, in the main thread and for signals with their default."""
         if threading.current_thread() is threading.main_thread():
             usual = {
                 signal.SIGINT: signal.default_int_handler,
@@ -40,7 +40,7 @@ class Interruption:
             }
             for number, handler in usual.items():
                 if signal.getsignal(number) == handler:
-                    self._before[number] = signal.signal(number, self._ask)
+                    self._previous[number] = signal.signal(number, self._request)
         return self
 
     def __exit__(
@@ -49,49 +49,50 @@ class Interruption:
         error: BaseException | None,
         trace: TracebackType | None,
     ) -> None:
-        """Give the signals back; one that nothing has answered is answered now."""
-        self._give_back()
+        """Restore the handlers; raise a pending request."""
+        self._restore()
         if kind is None:
-            self._answer()
+            self._raise_if_requested()
 
-    def _ask(self, number: int, frame: FrameType | None) -> None:
-        self._asked = True
-        self._give_back()
+    def _request(self, number: int, frame: FrameType | None) -> None:
+        self._requested = True
+        self._restore()
 
-    def _give_back(self) -> None:
-        while self._before:
-            signal.signal(*self._before.popitem())
+    def _restore(self) -> None:
+        while self._previous:
+            signal.signal(*self._previous.popitem())
 
-    def _answer(self) -> None:
-        if self._asked:
+    def _raise_if_requested(self) -> None:
+        if self._requested:
             raise Interrupted
 
     def ready(self, result: Any) -> Any:
-        """A pytree of arrays, once they are computed."""
+        """Wait until all arrays of a pytree are computed and return it."""
         for leaf in jax.tree.leaves(result):
             wait = 1e-4
             while not leaf.is_ready():
-                self._answer()
+                self._raise_if_requested()
                 time.sleep(wait)
-                wait = min(2 * wait, _LOOK_S)
-        self._answer()
+                wait = min(2 * wait, _POLL_S)
+        self._raise_if_requested()
         return result
 
     def compiled(self, function: Any, *arguments: Any) -> Any:
-        """A jitted function, compiled for these arguments."""
-        lowered, made, failed = function.lower(*arguments), [], []
+        """Compile a jitted function for these arguments and return it."""
+        lowered = function.lower(*arguments)
+        programs, errors = [], []
 
         def build() -> None:
             try:
-                made.append(lowered.compile())
-            except BaseException as reason:  # raised where it is waited for
-                failed.append(reason)
+                programs.append(lowered.compile())
+            except BaseException as reason:  # raised again in the waiting thread
+                errors.append(reason)
 
         builder = threading.Thread(target=build, daemon=True)
         builder.start()
         while builder.is_alive():
-            builder.join(_LOOK_S)
-            self._answer()
-        if failed:
-            raise failed[0]
-        return made[0]
+            builder.join(_POLL_S)
+            self._raise_if_requested()
+        if errors:
+            raise errors[0]
+        return programs[0]

@@ -1,4 +1,4 @@
-"""Where training metrics go: JSON lines and TensorBoard always, a progress bar on a terminal."""
+"""Logging of training metrics: JSON lines, TensorBoard, and a progress bar."""
 
 from __future__ import annotations
 
@@ -25,25 +25,25 @@ from tensorboardX.summary import scalar
 
 from sfkd_jax.artefacts import print_message, truncate_jsonl
 
-GOES_ON = "the same command goes on from the last checkpoint"
+RESUME_HINT = "the same command goes on from the last checkpoint"
 
 
 def _step(line: dict[str, Any]) -> int | float:
-    """The step of a line; what is no number belongs to no step that is kept."""
+    """The step of a line; a line without a number belongs to no step."""
     step = line["step"]
     return step if isinstance(step, int | float) else math.inf
 
 
 class TrainingLog:
-    """A context that records metrics of a run; a resumed run forgets the lines after the step it resumes from."""
+    """A context that records the metrics of a run, new or resumed."""
 
     def __init__(self, directory: Path, *, steps: int, resumed_at: int) -> None:
         """Open the log of a run.
 
         Args:
             directory: of the run.
-            steps: how many there will be.
-            resumed_at: lines after this step are dropped.
+            steps: of the whole run.
+            resumed_at: step at which the run is resumed; later lines are dropped.
         """
         self._steps = steps
         self._path = directory / "metrics.jsonl"
@@ -57,8 +57,8 @@ class TrainingLog:
         )
         board = directory / "tensorboard" / "events"
         board.parent.mkdir(exist_ok=True)
-        # Not SummaryWriter: of a full disk its thread would tell at the end of the
-        # process, with a trace.
+        # Not SummaryWriter: its thread reports a full disk only at the end of the
+        # process, with a traceback.
         self._board = EventsWriter(str(board), f".{resumed_at}")
         if resumed_at:
             self._board.write_event(
@@ -80,7 +80,7 @@ class TrainingLog:
         self._shows_bar = console.is_terminal
 
     def __enter__(self) -> TrainingLog:
-        """Start the bar, if there is a terminal to show it."""
+        """Start the progress bar, on a terminal only."""
         if self._shows_bar:
             self._bar.start()
         return self
@@ -91,14 +91,14 @@ class TrainingLog:
         error: BaseException | None,
         trace: TracebackType | None,
     ) -> None:
-        """Stop the bar, close the files."""
+        """Stop the bar and close the files."""
         if self._shows_bar:
             self._bar.stop()
-        with suppress(OSError):  # a full disk has been told of by then
+        with suppress(OSError):  # a full disk has been reported before
             self._board.close()
 
     def write(self, record: dict[str, float]) -> None:
-        """Append one record; it must have `step`. What is not finite is left out."""
+        """Append one record, which must have `step`; entries not finite are omitted."""
         clean = {name: value for name, value in record.items() if math.isfinite(value)}
         step = int(clean["step"])
         try:
@@ -116,7 +116,8 @@ class TrainingLog:
             self._board.flush()
         except OSError as reason:
             raise OSError(
-                f"{self._path.parent}: step {step} was not logged ({reason.strerror}); {GOES_ON}"
+                f"{self._path.parent}: step {step} was not logged "
+                f"({reason.strerror}); {RESUME_HINT}"
             ) from reason
         note = " ".join(
             f"{name} {clean[name]:.3g}"

@@ -1,4 +1,4 @@
-"""The training loop: deterministic, resumable after a kill at any moment, stopped by a non-finite loss."""
+"""The training loop: deterministic, resumable, stopped by a non-finite loss."""
 
 from __future__ import annotations
 
@@ -12,6 +12,7 @@ import jax
 import jax.numpy as jnp
 import optax
 
+from sfkd_jax.core.ranges import Positive
 from sfkd_jax.training._checkpoints import Checkpoints
 from sfkd_jax.training._interruption import Interrupted, Interruption
 from sfkd_jax.training._log import TrainingLog
@@ -23,11 +24,11 @@ Draw: TypeAlias = Callable[[Trajectory, Key], Trajectory]
 
 
 class TrainingStopped(RuntimeError):
-    """Training cannot go on; the message says why and what is left on disk."""
+    """Training cannot continue; the message names the last checkpoint."""
 
 
 class TrainState(NamedTuple):
-    """Everything that training carries; keys are derived from `step`, so nothing else decides what comes next."""
+    """The whole state of training; random keys are derived from `step`."""
 
     step: jax.Array
     params: Params
@@ -44,36 +45,37 @@ def fit(
     directory: Path,
     *,
     steps: int = 4000,
-    learning_rate: float = 3e-3,
-    clip_norm: float = 100.0,
+    learning_rate: Positive = 3e-3,
+    clip_norm: Positive = 100.0,
     log_every: int = 50,
     save_every: int = 500,
     inspect: Callable[[Params], dict[str, float]] | None = None,
 ) -> tuple[Params, int]:
-    """Train, or continue what `directory` holds, and return the parameters with the best validation loss.
+    """Train and return the parameters with the lowest validation loss.
 
-    Windows are drawn with a key folded with the step, so an interrupted run ends
-    bit-identical to an unbroken one. SIGINT or SIGTERM saves the state of the last log
-    line before it raises.
+    A run that `directory` contains is resumed. Batches depend on the key and the step
+    only, so an interrupted run ends bit-identical to an uninterrupted one. SIGINT or
+    SIGTERM saves the state of the last log line before it raises.
 
     Args:
-        model, loss: what is trained, and by which loss. To train on from parameters at
-            hand, a model whose `init` returns them: `model._replace(init=lambda key:
-            params)`.
+        model: to be trained. To train on from given parameters, a model whose `init`
+            returns them: `model._replace(init=lambda key: params)`.
+        loss: (params, batch of windows) -> loss, parts.
         draw: (data, key) -> a batch of windows.
-        data: what it draws from;
-        held_out: windows that select.
-        key: for the initial parameters and the draws.
-        directory: gets checkpoints/, metrics.jsonl, tensorboard/.
+        data: the training trajectories.
+        held_out: windows of the validation loss.
+        key: for the initial parameters and the batches.
+        directory: for checkpoints/, metrics.jsonl, tensorboard/.
         steps: optimiser steps.
-        learning_rate, clip_norm: see `optimizer`.
+        learning_rate: see `optimizer`.
+        clip_norm: see `optimizer`.
         log_every: steps per compiled chunk and per log line.
-        save_every: a multiple of it.
-        inspect: more to log at every checkpoint, finite numbers by name (what can be
-            certified, for example).
+        save_every: steps per checkpoint, a multiple of `log_every`.
+        inspect: params -> more finite numbers to log at every checkpoint, by name (what
+            can be certified, for example).
 
     Returns:
-        Best parameters, and the step they were reached at.
+        The best parameters, and the step at which they were reached.
 
     Raises:
         TrainingStopped: the loss or a gradient is not finite.
@@ -82,7 +84,8 @@ def fit(
     """
     if save_every % log_every or steps % log_every:
         raise ValueError(
-            f"training.steps and save_every must be multiples of log_every = {log_every}"
+            "training.steps and save_every must be multiples of "
+            f"log_every = {log_every}"
         )
     init_key, data_key = jax.random.split(key)
     transform, schedule = optimizer(
@@ -106,11 +109,7 @@ def fit(
             for done in range(start + log_every, steps + 1, log_every):
                 state, record = interruption.ready(advance(state, data))
                 record = {name: float(value) for name, value in record.items()}
-                record |= {
-                    "step": done,
-                    "learning_rate": float(jnp.asarray(schedule(done))),
-                    "seconds": time.perf_counter() - began,
-                }
+                record |= _progress(done, schedule, began)
                 saves = done % save_every == 0 or done == steps
                 if saves:
                     total, parts = interruption.ready(validate(state.params, held_out))
@@ -119,16 +118,9 @@ def fit(
                         "validation_prediction": float(parts["prediction"]),
                     }
                     record |= inspect(state.params) if inspect else {}
-                if not all(math.isfinite(value) for value in record.values()):
-                    kept = checkpoints.latest_step()
-                    raise TrainingStopped(
-                        f"non-finite loss near step {done}; the last good checkpoint is step {kept}"
-                    )
-                log.write(
-                    record
-                    # Before the checkpoint: a resumed run drops lines, it cannot invent
-                    # them.
-                )
+                _require_finite(record, done, checkpoints)
+                # Before the checkpoint: a resumed run can drop lines, but not add them.
+                log.write(record)
                 logged = state
                 if saves:
                     checkpoints.save(
@@ -137,13 +129,32 @@ def fit(
         best = checkpoints.best_step() or steps
         return checkpoints.restore(best, state).params, best
     except Interrupted:
-        if (
-            int(logged.step) > start
-        ):  # never the best one: an unbroken run does not choose among these
+        # Never selected as the best: an uninterrupted run does not have this state.
+        if int(logged.step) > start:
             checkpoints.save(int(logged.step), logged, validation_loss=math.inf)
         raise
     finally:
         checkpoints.close()
+
+
+def _progress(step: int, schedule: optax.Schedule, began: float) -> dict[str, float]:
+    """Step, learning rate and elapsed time for the log."""
+    return {
+        "step": step,
+        "learning_rate": float(jnp.asarray(schedule(step))),
+        "seconds": time.perf_counter() - began,
+    }
+
+
+def _require_finite(
+    record: dict[str, float], step: int, checkpoints: Checkpoints
+) -> None:
+    """Raise TrainingStopped if any entry of a record is not finite."""
+    if not all(math.isfinite(value) for value in record.values()):
+        raise TrainingStopped(
+            f"non-finite loss near step {step}; "
+            f"the last good checkpoint is step {checkpoints.latest_step()}"
+        )
 
 
 def _chunk(
@@ -154,7 +165,7 @@ def _chunk(
     *,
     length: int,
 ) -> Any:
-    """`length` optimiser steps as one compiled call: state, data -> state, mean metrics."""
+    """Compile `length` optimiser steps: (state, data) -> state, mean metrics."""
     gradient = jax.value_and_grad(loss, has_aux=True)
 
     # Not donated: an interrupted run saves the state from which a chunk started.

@@ -1,8 +1,9 @@
-"""The training loss: multi-step prediction in physical units, and what keeps the latent honest."""
+"""The training loss: multi-step prediction in physical units and latent consistency."""
 
 from __future__ import annotations
 
 from collections.abc import Callable
+from functools import partial
 from typing import TypeAlias, cast
 
 import jax
@@ -10,20 +11,30 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from sfkd_jax.core.path_frame import HEADING, LATERAL
+from sfkd_jax.core.ranges import Numbers
 from sfkd_jax.core.rollouts import defects, rollout
 from sfkd_jax.core.se2 import rotate, wrap_angle
-from sfkd_jax.types import BODY, Explicit, Model, Params, Scalar, Space, Trajectory
+from sfkd_jax.types import (
+    BODY,
+    Environment,
+    Explicit,
+    Model,
+    Params,
+    Scalar,
+    Space,
+    Trajectory,
+)
 
 Loss: TypeAlias = Callable[[Params, Trajectory], tuple[Scalar, dict[str, Scalar]]]
 
 YAW_LENGTH = 5.0
-"""What 1 rad of yaw is worth in the loss [m]: its lever over half a second at the
+"""Weight of 1 rad of yaw in the loss [m]: the distance driven in half a second at the
 benchmark's speed.
 """
 
 
 def power_mean(values: Float[Array, "*shape"], power: int = 8) -> Scalar:
-    """(mean |x|^p)^(1/p), scaled so that float32 holds the powers: near the maximum, and smooth."""
+    """Return (mean |x|^p)^(1/p), a smooth maximum that does not overflow in float32."""
     largest = jax.lax.stop_gradient(jnp.max(values))
     return largest * jnp.mean((values / largest) ** power) ** (1.0 / power)
 
@@ -31,18 +42,21 @@ def power_mean(values: Float[Array, "*shape"], power: int = 8) -> Scalar:
 def state_errors(
     predicted: Float[Array, "time state"], true: Float[Array, "time state"]
 ) -> Float[Array, "time state"]:
-    """Predicted minus true: position along and across the true heading [m], yaw wrapped [rad], body state."""
+    """Return predicted minus true states.
+
+    Position along and across the true heading [m], yaw wrapped [rad], body state.
+    """
     position = jax.vmap(rotate)(-true[:, 2], predicted[:, :2] - true[:, :2])
     yaw = wrap_angle(predicted[:, 2:3] - true[:, 2:3])
     return jnp.concatenate([position, yaw, predicted[:, BODY] - true[:, BODY]], axis=1)
 
 
 def error_units(model: Model, space: Space) -> Float[Array, " state"]:
-    """What multiplies each of `state_errors` to count as metres.
+    """Return factors that convert each of `state_errors` to metres.
 
-    1 for the position, 5 m for a radian of yaw, 0.2 m for the half width of what else
-    the body state holds. Along a path, e_y and e_ψ are position and yaw, and the rest,
-    which no longer moves the position, is worth 0.05 m.
+    1 for the position, 5 m for a radian of yaw, 0.2 m for the half width of any other
+    entry. Along a path, e_y and e_ψ are position and yaw; the other entries do not
+    affect the position directly and count 0.05 m.
     """
     others = (0.05 if model.along_path else 0.2) / jnp.asarray(space.body_scale)
     if model.along_path:
@@ -60,115 +74,128 @@ def multi_step_loss(
     reconstruction: float = 0.1,
     transport: float = 0.1,
     growth: float = 0.5,
-    tube: tuple[float, ...] = (),
+    tube: Numbers = (),
 ) -> Loss:
-    """Mean over windows and steps of the prediction error in physical units, with four terms beside it.
+    """Return the mean prediction error over windows and steps, plus four regularisers.
 
         λ_p |x_k − x̂_k|²_W / (1 + γ (k − 1))² + λ_1 |x_k − x̂_{k|k−1}|²_{W}·10²
             + λ_c |d_k|² + λ_r |s − C Φ(x)|² + λ_t |Φ(x, e') − T(e → e') Φ(x, e)|²
             + Σ_i λ_i (|c_i| q(|d|) / (1 − α))²_W
 
-    W measures position in units of 0.01 m at the first step; a prediction's error grows
-    about linearly with k, so the division by its expected growth lets the near steps,
-    which the planner leans on, count as much as the far ones. The last sum is what a
-    certificate will say: the tube of body coordinate i for ever, c_i its row of the
-    read-out, q the 8th power mean over the batch, in the place of the quantile that
-    calibration takes. The one-step term, in units of 0.001 m, sees what the sums over a
-    window hide: slip, a lateral millimetre per step.
+    W measures position in units of 0.01 m at the first step. The error of a prediction
+    grows about linearly with k; dividing by this growth gives the near steps, on which
+    the planner depends most, the same weight as the far ones. The last sum is the
+    infinite-horizon tube of a certificate: c_i is row i of the read-out, q the 8th
+    power mean over the batch instead of the quantile that calibration takes. The
+    one-step term, in units of 0.001 m, sees errors that the sums over a window hide:
+    slip, a lateral millimetre per step.
 
     Args:
-        model, space: what is trained and its scales.
-        prediction: λ_p, on free-running predictions; 0 leaves the one-step loss alone.
-        one_step: λ_1, on predictions from the true state one step before.
-        consistency: λ_c, on the one-step latent defect: larger gives a tighter tube and
+        model: to be trained.
+        space: its scales.
+        prediction: λ_p, of free-running predictions; 0 leaves the one-step loss alone.
+        one_step: λ_1, of predictions from the true state one step before.
+        consistency: λ_c, of the one-step latent defect: larger gives a tighter tube and
             a less accurate model, see `docs/certificate.md`.
         reconstruction: λ_r.
-        transport: λ_t, on Φ(x, e') − T(e → e') Φ(x, e) with e' another window's
-            environment.
+        transport: λ_t, of Φ(x, e') − T(e → e') Φ(x, e) with e' the environment of
+            another window.
         growth: γ.
         tube: λ_i of the first entries of the body state; () for none. For a model with
-            a rate by construction.
+            a contraction rate by construction.
 
     Returns:
-        (params, batch of windows) -> loss, parts; of a model with a tube in its loss
-        also the first one's radius.
+        (params, batch of windows) -> loss, its parts; with `tube` one part is the first
+        radius.
 
     Raises:
-        ValueError: a tube of a model that has none, or of more entries than the body
-            state has.
+        ValueError: a tube for a model without a rate, or with more entries than the
+            body state.
     """
-    if tube and (model.rate is None or model.explicit is None):
+    structure = model.structure
+    if tube and (structure.rate is None or structure.explicit is None):
         raise ValueError(
-            "training.loss.tube needs a model that contracts by construction: model=sfkd… or model=r2dn"
+            "training.loss.tube needs a model that contracts by construction: "
+            "model=sfkd… or model=r2dn"
         )
     if len(tube) > space.body_mean.shape[0]:
         raise ValueError(
-            f"training.loss.tube has {len(tube)} weights, the body state {space.body_mean.shape[0]} entries"
+            f"training.loss.tube has {len(tube)} weights, "
+            f"the body state {space.body_mean.shape[0]} entries"
         )
     units = error_units(model, space)
-
-    def window(
-        params: Params, data: Trajectory, other: Float[Array, " environment"]
-    ) -> dict[str, Scalar]:
-        predicted, _, along = rollout(model, params, data)
-        errors = state_errors(predicted, data.states[1:])
-        steps = 1.0 + growth * jnp.arange(errors.shape[0])
-        weighted = (errors * units / 0.01 / steps[:, None]) ** 2
-        gap, single = defects(model, params, data, along)
-        near = state_errors(single, data.states[1:]) * units / 0.001
-        fiber, there = (
-            jax.tree.map(lambda leaf: leaf[0], along[0]),
-            model.fiber(params, other),
-        )
-        here = model.encode(fiber, data.states[0])
-        moved = model.vector(model.transport(fiber, there, here)) - model.vector(
-            model.encode(there, data.states[0])
-        )
-        rebuilt = (model.decode(fiber, here) - data.states[0])[BODY] / space.body_scale
-        parts = {
-            "prediction": jnp.mean(jnp.sum(weighted, axis=1)),
-            "one_step": jnp.mean(jnp.sum(near**2, axis=1)),
-            "consistency": jnp.mean(jnp.sum(gap**2, axis=1)) / 1e-4,
-            "reconstruction": jnp.sum(rebuilt**2) / 1e-4,
-            "transport": jnp.sum(moved**2) / 1e-4,
-        }
-        if tube:
-            parts["gap"] = jnp.sqrt(jnp.sum(gap**2, axis=1) + 1e-16)
-        if model.penalty is not None:
-            parts["penalty"] = model.penalty(fiber, here, data.controls[0])
-        return parts
+    window = partial(_window_parts, model, space, units, growth, bool(tube))
+    weights = {
+        "prediction": prediction,
+        "one_step": one_step,
+        "consistency": consistency,
+        "reconstruction": reconstruction,
+        "transport": transport,
+    }
 
     def loss(params: Params, batch: Trajectory) -> tuple[Scalar, dict[str, Scalar]]:
         others = jnp.roll(batch.envs[:, -1], 1, axis=0)
         parts = jax.vmap(window, in_axes=(None, 0, 0))(params, batch, others)
         gaps = parts.pop("gap", None)
         parts = {name: jnp.mean(part) for name, part in parts.items()}
-        charged = jnp.zeros(())
+        start = jnp.zeros(())
         if gaps is not None:
-            radii = tubes(params, gaps)
-            charged = jnp.sum(
+            radii = _tube_radii(model, params, gaps, len(tube))
+            start = jnp.sum(
                 jnp.asarray(tube) * (radii * units[BODY][: len(tube)] / 0.01) ** 2
             )
-        weights = {
-            "prediction": prediction,
-            "one_step": one_step,
-            "consistency": consistency,
-            "reconstruction": reconstruction,
-            "transport": transport,
-        }
         total = sum(
-            (weights.get(name, 1.0) * part for name, part in parts.items()), charged
+            (weights.get(name, 1.0) * part for name, part in parts.items()), start
         )
         return total, parts if gaps is None else parts | {"tube": radii[0]}
 
-    def tubes(
-        params: Params, gaps: Float[Array, "window time"]
-    ) -> Float[Array, " weighted"]:
-        """|c_i| q(|d|) / (1 − α) of the weighted coordinates, in their own units."""
-        rows = cast(Explicit, cast(Callable, model.explicit)(params)).readout[
-            : len(tube)
-        ]
-        rate = cast(Callable, model.rate)(params)
-        return jnp.linalg.norm(rows, axis=1) * power_mean(gaps) / (1.0 - rate)
-
     return loss
+
+
+def _window_parts(
+    model: Model,
+    space: Space,
+    units: Float[Array, " state"],
+    growth: float,
+    with_gap: bool,
+    params: Params,
+    data: Trajectory,
+    other: Environment,
+) -> dict[str, Array]:
+    """The parts of the loss of one window; `other` is another window's environment."""
+    predicted, _, along = rollout(model, params, data)
+    errors = state_errors(predicted, data.states[1:])
+    steps = 1.0 + growth * jnp.arange(errors.shape[0])
+    weighted = (errors * units / 0.01 / steps[:, None]) ** 2
+    gap, single = defects(model, params, data, along)
+    near = state_errors(single, data.states[1:]) * units / 0.001
+    fiber = jax.tree.map(lambda leaf: leaf[0], along[0])
+    there = model.fiber(params, other)
+    here = model.encode(fiber, data.states[0])
+    moved = model.vector(model.transport(fiber, there, here)) - model.vector(
+        model.encode(there, data.states[0])
+    )
+    rebuilt = (model.decode(fiber, here) - data.states[0])[BODY] / space.body_scale
+    parts = {
+        "prediction": jnp.mean(jnp.sum(weighted, axis=1)),
+        "one_step": jnp.mean(jnp.sum(near**2, axis=1)),
+        "consistency": jnp.mean(jnp.sum(gap**2, axis=1)) / 1e-4,
+        "reconstruction": jnp.sum(rebuilt**2) / 1e-4,
+        "transport": jnp.sum(moved**2) / 1e-4,
+    }
+    if with_gap:
+        parts["gap"] = jnp.sqrt(jnp.sum(gap**2, axis=1) + 1e-16)
+    if model.fitting.penalty is not None:
+        parts["penalty"] = model.fitting.penalty(fiber, here, data.controls[0])
+    return parts
+
+
+def _tube_radii(
+    model: Model, params: Params, gaps: Float[Array, "window time"], count: int
+) -> Float[Array, " count"]:
+    """|c_i| q(|d|) / (1 − α) of the first entries of the body state, in their units."""
+    structure = model.structure
+    explicit = cast(Callable, structure.explicit)(params)
+    rows = cast(Explicit, explicit).readout[:count]
+    rate = cast(Callable, structure.rate)(params)
+    return jnp.linalg.norm(rows, axis=1) * power_mean(gaps) / (1.0 - rate)

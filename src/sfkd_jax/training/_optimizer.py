@@ -13,14 +13,14 @@ def optimizer(
     final: float = 0.01,
     clip_norm: float = 100.0,
 ) -> tuple[optax.GradientTransformation, optax.Schedule]:
-    """Adam whose step size rises linearly, then falls along a cosine to `final` times its peak.
+    """Return Adam with linear warm-up and cosine decay, and its learning rate schedule.
 
     Args:
         steps: of the whole run.
-        learning_rate: peak.
-        warmup: steps of the rise.
-        final: relative to the peak.
-        clip_norm: on the global gradient norm.
+        learning_rate: at the peak.
+        warmup: steps until the peak.
+        final: last learning rate, relative to the peak.
+        clip_norm: largest global gradient norm.
     """
     rise = min(warmup, max(steps // 10, 1))
     schedule = optax.warmup_cosine_decay_schedule(

@@ -1,4 +1,4 @@
-"""Truth: the plants, as pure steps. Nothing here is learned and nothing here decides."""
+"""Simulated vehicles as pure step functions."""
 
 from sfkd_jax.vehicle._along_path import along_path as along_path
 from sfkd_jax.vehicle._dynamic import dynamic as dynamic

@@ -1,4 +1,4 @@
-"""Any vehicle with a law closed around it, as a vehicle in path coordinates."""
+"""Any vehicle in closed loop with a law, as a vehicle in path coordinates."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from sfkd_jax.types import Control, Environment, State
 from sfkd_jax.vehicle._vehicle import SPEED_RANGE, Vehicle
 
 STEEPEST = 0.2
-"""Largest curvature of a path [1/m]: tighter than any car turns."""
+"""Largest curvature of a path [1/m]: more than any car can turn."""
 
 
 def along_path(
@@ -16,17 +16,17 @@ def along_path(
     *,
     perturbation: tuple[float, float] = (0.03, 1.0),
 ) -> Vehicle:
-    """The loop of a vehicle and a law as a plant: states (0, 0, 0, ξ), controls w = (ν, κ, v_ref).
+    """Return the closed loop as a plant with states (0, 0, 0, ξ) and controls w.
 
-    See `sfkd_jax.core.path_frame`. One step is exact on a circle of curvature κ, whatever the
-    vehicle's own step is. Where 1 − κ e_y ≤ 0.2 it stays finite and means nothing;
-    `path_frame.is_valid` tells.
+    w = (ν, κ, v_ref), see `sfkd_jax.core.path_frame`. One step is exact on a circle of
+    curvature κ for any step of the vehicle. Where 1 − κ e_y ≤ 0.2 the result is finite
+    but not meaningful; `path_frame.is_valid` tests for it.
 
     Args:
-        vehicle: any with limits of its controls.
+        vehicle: with limits of its controls.
         law: (ξ, κ, v_ref, e) -> u.
-        perturbation: largest |ν| [rad, control unit], the limits of w; no step enforces
-            them.
+        perturbation: largest |ν| [rad, control unit], the limits of w; steps do not
+            enforce them.
 
     Raises:
         ValueError: the vehicle has no limits.

@@ -1,4 +1,4 @@
-"""Fixed-step integrators: (derivative, dt, substeps) -> step, control and environment held over dt."""
+"""Fixed-step integrators with control and environment held over dt."""
 
 from __future__ import annotations
 
@@ -9,11 +9,11 @@ from sfkd_jax.types import Control, Environment, State, Step
 
 
 def rk4(derivative: Step, *, dt: float, substeps: int = 1) -> Step:
-    """Classical Runge-Kutta of order 4 with zero-order hold.
+    """Return a step by the classical Runge-Kutta method of order 4.
 
     Args:
         derivative: dx/dt = f(x, u, e).
-        dt: the sampling period [s].
+        dt: sampling period [s].
         substeps: integration steps per sampling period.
     """
     h = dt / substeps

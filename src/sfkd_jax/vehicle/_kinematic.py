@@ -1,10 +1,11 @@
-"""The paper's literal plant: a 4-state bicycle whose tyres saturate and whom wind pushes."""
+"""The paper's plant: a 4-state bicycle with tyre saturation and side wind."""
 
 from __future__ import annotations
 
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
+from sfkd_jax.core.ranges import Positive, Real
 from sfkd_jax.types import Control, Environment, State
 from sfkd_jax.vehicle._vehicle import (
     ACCELERATION_RANGE,
@@ -19,7 +20,7 @@ from sfkd_jax.vehicle._vehicle import (
 
 
 def _tanhc(x: Float[Array, ""]) -> Float[Array, ""]:
-    """tanh(x) / x for x ≥ 0, finite with its gradient at 0."""
+    """tanh(x) / x for x ≥ 0, finite at 0 with its gradient."""
     small = x < 1e-3
     safe = jnp.where(small, 1.0, x)
     return jnp.where(small, 1.0 - x**2 / 3.0, jnp.tanh(safe) / safe)
@@ -27,26 +28,31 @@ def _tanhc(x: Float[Array, ""]) -> Float[Array, ""]:
 
 def kinematic(
     *,
-    dt: float = 0.1,
+    dt: Positive = 0.1,
     substeps: int = 2,
-    mass: float = 1500.0,
-    front_length: float = 1.2,
-    rear_length: float = 1.5,
-    front_stiffness: float = 6.0e4,
-    rear_stiffness: float = 7.0e4,
+    mass: Positive = 1500.0,
+    front_length: Positive = 1.2,
+    rear_length: Positive = 1.5,
+    front_stiffness: Positive = 6.0e4,
+    rear_stiffness: Positive = 7.0e4,
     wind_force: float = 10.0,
-    wind_lever: float = 0.4,
+    wind_lever: Real = 0.4,
     drag: float = 0.4,
     rolling: float = 0.012,
 ) -> Vehicle:
-    """Bicycle with friction saturation and quasi-steady side wind; x = (p_x, p_y, yaw, v) of the centre of mass.
+    """Bicycle with friction saturation and quasi-steady side wind.
 
-    With F = c_w w|w| and axle stiffnesses C = c μ, the steady single track turns with curvature
+    x = (p_x, p_y, yaw, v), p the centre of mass. With F = c_w w|w| and axle stiffnesses
+    C = c μ, the steady single track turns with curvature
+
         κ° = (tan δ + γ F) / (L + K v²),   K = m (l_r/C_f − l_f/C_r) / L,
         γ  = ((l_r + l_w)/C_f − (l_f − l_w)/C_r) / L,
-    as long as the tyres hold. The friction circle scales the demand (a, v² κ°) onto the circle of radius
-    a_lim = μ g − |F|/m (what is left once the wind is held; at least 0.05 μ g, so that a storm which no tyre
-    holds stays finite):  s = tanh(d/a_lim)/(d/a_lim), d = |(a, v² κ°)|.
+
+    as long as the tyres do not saturate. The demand (a, v² κ°) is scaled into the
+    friction circle of radius a_lim = μ g − |F|/m, which is what the wind leaves, at
+    least 0.05 μ g, so that the equations stay finite in any wind:
+
+        s = tanh(d/a_lim)/(d/a_lim),   d = |(a, v² κ°)|,
         κ = s κ°,   β = l_r κ − (l_f m v² κ − (l_f − l_w) F)/(L C_r)
         ẋ = (v cos(yaw + β), v sin(yaw + β), v κ, s a − ρ v²/(2m)·C_d A − c_rr g)
 

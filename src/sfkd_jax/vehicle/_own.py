@@ -1,4 +1,4 @@
-"""A robot of one's own: known by a step function, or from logs alone."""
+"""A vehicle of the user's own, given by a step function or by logs alone."""
 
 from __future__ import annotations
 
@@ -7,41 +7,44 @@ from importlib import import_module
 import jax
 import jax.numpy as jnp
 
+from sfkd_jax.core.ranges import Bounds, Positive
 from sfkd_jax.types import Control, Environment, State, Step
 from sfkd_jax.vehicle._vehicle import Vehicle, forward_rk4, nominal_derivative
 
 
-class _NoStep(ValueError):
-    """There is no step to try; the message names the setting."""
+class _MissingStep(ValueError):
+    """There is no step to evaluate; the message names the setting."""
 
 
 def own(
     *,
-    dt: float = 0.1,
+    dt: Positive = 0.1,
     state_names: tuple[str, ...] = ("p_x", "p_y", "yaw", "v"),
-    control_low: tuple[float, ...] = (),
-    control_high: tuple[float, ...] = (),
-    wheelbase: float = 2.7,
+    control_low: Bounds = (),
+    control_high: Bounds = (),
+    wheelbase: Positive = 2.7,
     wind_force: float = 0.0,
     speed_loop: bool = False,
     step: Step | None = None,
 ) -> Vehicle:
-    """A plant from plain numbers and, if there is one, its step (x, u, e) -> x one sampling period later.
+    """Return a plant from plain numbers and, optionally, its step.
 
-    Without a step it may be learned and planned for, but nothing drives it here. Its
-    nominal model is the textbook kinematic bicycle on (p_x, p_y, yaw, v), centre of
-    mass in the middle; further states are left as they are.
+    Without a step a model of the vehicle can be learned and planned with, but the
+    vehicle cannot be simulated. Its nominal model is the textbook kinematic bicycle on
+    (p_x, p_y, yaw, v), with the centre of mass in the middle; further states are
+    constant.
 
     Args:
         dt: sampling period [s].
         state_names: pose first (p_x, p_y [m], yaw [rad]), then the speed [m/s].
-        control_low, control_high: limits of the actuators; may be empty without a step:
-            logs then tell.
+        control_low: lower limits of the actuators; () without a step, where the logs
+            give them.
+        control_high: upper limits of the actuators.
         wheelbase: [m], for the nominal bicycle and the path-following law.
         wind_force: c_w of `side_force` [N s²/m²]; 0 if e_2 is no wind.
         speed_loop: whether u_2 is a speed command [m/s] instead of an acceleration
             [m/s²].
-        step: pure and traceable by jax.
+        step: (x, u, e) -> x one sampling period later, pure and traceable by jax.
 
     Raises:
         ValueError: fewer than four states, or limits that are missing or not two
@@ -49,20 +52,22 @@ def own(
     """
     if len(state_names) < 4:
         raise ValueError(
-            f"vehicle.state_names must be p_x, p_y, yaw, v, …, got {', '.join(state_names) or 'none'}"
+            "vehicle.state_names must be p_x, p_y, yaw, v, …, "
+            f"got {', '.join(state_names) or 'none'}"
         )
     sizes = {len(control_low), len(control_high)}
     if sizes != {2} and (sizes != {0} or step is not None):
         raise ValueError(
-            "vehicle.control_low and vehicle.control_high must be two numbers each, as in [-0.4,-3.0]"
+            "vehicle.control_low and vehicle.control_high must be two numbers each, "
+            "as in [-0.4,-3.0]"
         )
     bicycle = nominal_derivative(wheelbase, 0.5 * wheelbase)
-    drives = _undriven if step is None else step
+    simulate = _no_step if step is None else step
 
     def derivative(state: State, control: Control, env: Environment) -> State:
-        return (drives(state, control, env) - state) / dt
+        return (simulate(state, control, env) - state) / dt
 
-    def unmoved(state: State, control: Control, env: Environment) -> State:
+    def padded(state: State, control: Control, env: Environment) -> State:
         return jnp.concatenate(
             [bicycle(state[:4], control, env), jnp.zeros(len(state_names) - 4)]
         )
@@ -72,10 +77,10 @@ def own(
         dt=dt,
         wheelbase=wheelbase,
         state_names=tuple(state_names),
-        step=drives,
+        step=simulate,
         derivative=derivative,
-        nominal=forward_rk4(unmoved, dt=dt),
-        nominal_derivative=unmoved,
+        nominal=forward_rk4(padded, dt=dt),
+        nominal_derivative=padded,
         control_low=tuple(control_low),
         control_high=tuple(control_high),
         wind_force=wind_force,
@@ -84,45 +89,45 @@ def own(
     )
 
 
-def _undriven(state: State, control: Control, env: Environment) -> State:
-    """The step of a robot that is known from logs alone."""
-    raise _NoStep(
-        "vehicle=own is known from logs alone, so nothing can drive it: pass vehicle.step=module:function"
+def _no_step(state: State, control: Control, env: Environment) -> State:
+    """The step of a vehicle that is known from logs alone."""
+    raise _MissingStep(
+        "vehicle=own is known from logs alone, so nothing can drive it: "
+        "pass vehicle.step=module:function"
     )
 
 
 def step_named(name: str) -> Step:
-    """The step "package.module:function", imported when it is first called: what never drives does without it.
+    """Return the step "package.module:function", imported at its first call.
 
     Args:
-        name: as in `vehicle.step`. What it names takes (x, u, e) and returns x one
-            sampling period later; calling it raises ValueError where there is no such
-            function.
+        name: of a function (x, u, e) -> x one sampling period later, as in
+            `vehicle.step`. If there is no such function, the call raises ValueError.
     """
 
     def step(state: State, control: Control, env: Environment) -> State:
         module, _, function = name.partition(":")
         try:
-            found = getattr(import_module(module), function)
+            imported = getattr(import_module(module), function)
         except (ImportError, AttributeError, ValueError) as reason:
-            raise _NoStep(
+            raise _MissingStep(
                 f"vehicle.step={name}: {reason}; name it as package.module:function"
             ) from None
-        return found(state, control, env)
+        return imported(state, control, env)
 
     return step
 
 
 def check_step(plant: Vehicle) -> None:
-    """Try a plant's step on shapes alone.
+    """Evaluate a plant's step on shapes only.
 
     Raises:
-        ValueError: there is no step, it fails, or what it returns is no state.
+        ValueError: there is no step, it fails, or it does not return a state.
     """
     sizes = (len(plant.state_names), 2, 2)
     try:
         after = jax.eval_shape(plant.step, *(jnp.zeros(size) for size in sizes))
-    except _NoStep:
+    except _MissingStep:
         raise
     except (TypeError, ValueError, IndexError) as reason:
         given = (
@@ -134,5 +139,6 @@ def check_step(plant: Vehicle) -> None:
     if getattr(after, "shape", None) != (sizes[0],):
         shape = getattr(after, "shape", type(after).__name__)
         raise ValueError(
-            f"the step of vehicle {plant.name} returns {shape}, vehicle.state_names has {sizes[0]} names"
+            f"the step of vehicle {plant.name} returns {shape}, "
+            f"vehicle.state_names has {sizes[0]} names"
         )

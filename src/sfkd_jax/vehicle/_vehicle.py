@@ -1,4 +1,4 @@
-"""What a plant is, what every plant is made of, and the inner speed loop that wraps any of them."""
+"""The `Vehicle` record, parts that all plants share, and the inner speed loop."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ class Vehicle(NamedTuple):
     """A plant sampled at dt.
 
     Attributes:
-        name: which plant.
+        name: of the plant.
         dt: sampling period [s].
         wheelbase: [m].
         state_names: pose first, then the body state.
@@ -29,12 +29,13 @@ class Vehicle(NamedTuple):
         nominal: the textbook kinematic bicycle without friction or wind, as a step on
             the same state.
         nominal_derivative: dx/dt of that bicycle, for models that add to it.
-        control_low, control_high: actuator limits.
+        control_low: lower actuator limits.
+        control_high: upper actuator limits.
         wind_force: c_w of `side_force` [N s²/m²].
         speed_loop: whether u_2 is a speed command [m/s] instead of an acceleration
             [m/s²].
-        simulated: whether there is a step to drive with; False for a robot that is
-            known from logs alone.
+        simulated: whether there is a step; False for a vehicle that is known from logs
+            alone.
     """
 
     name: str
@@ -53,14 +54,20 @@ class Vehicle(NamedTuple):
 
 
 def side_force(wind: Float[Array, ""], *, wind_force: float) -> Float[Array, ""]:
-    """Lateral force of a side wind on the body, F = c_w w|w| [N]."""
+    """Return the lateral force of a side wind on the body, F = c_w w|w| [N]."""
     return wind_force * wind * jnp.abs(wind)
 
 
 def equivalent_wind(
     wind: Float[Array, ""], force: Float[Array, ""], *, wind_force: float
 ) -> Float[Array, ""]:
-    """The wind [m/s] whose side force is that of `wind` and `force` [N] together, c_w w'|w'| = c_w w|w| + F."""
+    """Return the wind w' [m/s] with c_w w'|w'| = c_w w|w| + F.
+
+    Args:
+        wind: w [m/s].
+        force: F [N].
+        wind_force: c_w [N s²/m²].
+    """
     total = side_force(wind, wind_force=wind_force) + force
     return jnp.where(
         force == 0.0, wind, jnp.sign(total) * jnp.sqrt(jnp.abs(total) / wind_force)
@@ -70,12 +77,18 @@ def equivalent_wind(
 def resistance(
     speed: Float[Array, ""], *, mass: float, drag: float, rolling: float
 ) -> Float[Array, ""]:
-    """Deceleration by air drag and rolling, ρ C_d A v²/(2m) + c_rr g tanh(v / 0.2 m/s) [m/s²]; 0 at rest."""
+    """Return the deceleration by air drag and rolling [m/s²]; 0 at rest.
+
+    ρ C_d A v²/(2m) + c_rr g tanh(v / 0.2 m/s)
+    """
     return drag * speed**2 / mass + rolling * GRAVITY * jnp.tanh(speed / 0.2)
 
 
 def nominal_derivative(length: float, rear_length: float) -> Step:
-    """Textbook kinematic bicycle, no friction, no wind: κ = tan δ / L, β = l_r κ; x = (p_x, p_y, yaw, v)."""
+    """Return dx/dt of the kinematic bicycle without friction or wind.
+
+    κ = tan δ / L,   β = l_r κ,   x = (p_x, p_y, yaw, v)
+    """
 
     def derivative(state: State, control: Control, env: Environment) -> State:
         del env
@@ -95,10 +108,10 @@ def nominal_derivative(length: float, rear_length: float) -> Step:
 
 
 def forward_rk4(derivative: Step, *, dt: float, substeps: int = 1) -> Step:
-    """RK4 of a car whose brakes stop it and do not reverse it: f sees max(v, 0), and v ≥ 0 after every step.
+    """Return RK4 for a car that brakes cannot reverse: v ≥ 0 after every step.
 
-    Within a step v may pass below 0; the car then stands: neither its position nor its
-    yaw moves backwards.
+    The derivative is evaluated at max(v, 0), so that a car whose v falls below 0 within
+    a step stands: neither its position nor its yaw moves backwards.
     """
 
     def forwards(state: State) -> State:
@@ -116,7 +129,9 @@ def forward_rk4(derivative: Step, *, dt: float, substeps: int = 1) -> Step:
 
 
 def with_speed_loop(vehicle: Vehicle, *, gain: float = 1.0) -> Vehicle:
-    """The same vehicle under (steering, speed command): a = clip(k_v (v_cmd − v)), held over dt.
+    """Return the vehicle with a speed command instead of an acceleration.
+
+    a = clip(k_v (v_cmd − v)), held over dt.
 
     Args:
         vehicle: any plant whose second control is an acceleration.
@@ -127,7 +142,8 @@ def with_speed_loop(vehicle: Vehicle, *, gain: float = 1.0) -> Vehicle:
     """
     if vehicle.speed_loop or not vehicle.control_low:
         raise ValueError(
-            "vehicle.inner_loop=speed needs limits of the acceleration; of speed commands: speed_loop=true"
+            "vehicle.inner_loop=speed needs limits of the acceleration; "
+            "of speed commands: speed_loop=true"
         )
     low, high = vehicle.control_low[1], vehicle.control_high[1]
 
