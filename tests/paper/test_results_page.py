@@ -791,3 +791,29 @@ def test_the_same_results_give_the_same_bytes_and_no_stale_figure(whole):
 def test_sfkd_is_the_line_that_sees_the_environment():
     rows = [row("sfkd", "measured") | {"env": "none"}, row("sfkd", "measured")]
     assert setups(rows)[0].entry("sfkd").env == "measured"
+
+
+@pytest.mark.parametrize(
+    "name",
+    [
+        "table1",
+        "figure2",
+        "robustness",
+        "levels",
+        "small_data",
+        "estimated",
+        "seeds",
+        "longer",
+        "path_frame",
+        "tube_weight",
+    ],
+)
+def test_the_texts_of_every_comparison_are_those_of_a_page(name):
+    study = study_of({"rows": []}, page_texts(name))
+    assert study.title != Study().title
+    assert study.rivals[0] == "icode_mppi"
+
+
+def test_a_text_that_no_page_has_is_refused():
+    with pytest.raises(ValueError, match=r"unknown comparison\.page\.titel; choose of"):
+        study_of({}, {"titel": "A table"})

@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
+from types import MappingProxyType
 from typing import Any, NamedTuple
 
 from sfkd_jax.evaluation.formats import dig
 from sfkd_jax.paper._setups import Setup
 
-Printed = dict[str, dict[str, float]]
+Printed = Mapping[str, Mapping[str, float]]
 """Numbers that the paper prints: system -> column -> number."""
 
 
@@ -37,8 +39,8 @@ class Study(NamedTuple):
     unvaried: str = "as it is"
     unvaried_last: bool = False
     variations_note: str = ""
-    printed_as: dict[str, str] = {}  # noqa: RUF012
-    printed: Printed = {}  # noqa: RUF012
+    printed_as: Mapping[str, str] = MappingProxyType({})
+    printed: Printed = MappingProxyType({})
 
     def number(self, system: str, column: str) -> Any:
         """What the paper prints, or None."""
