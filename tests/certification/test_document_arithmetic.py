@@ -282,7 +282,7 @@ def test_every_radius_follows_from_alpha_d_bar_and_the_constants(kind):
         for path in (f"lipschitz.{name}", f"d_bar.one_step.{name}"):
             refused(
                 put(document, path, 1.001 * entry_at(document, path)),
-                "does not agree with the value derived from the document",
+                "does not follow from the rest of the document",
             )
         shorter = put(
             document,

@@ -54,10 +54,15 @@ def length(gaps):
     return np.sqrt(np.einsum("...i,ij,...j", gaps, METRIC, gaps))
 
 
-def test_the_fixed_points_of_a_linear_loop_are_found():
+@pytest.mark.parametrize("sign", [1.0, -1.0])
+def test_the_fixed_points_of_a_linear_loop_are_found(sign):
+    """The signs of two columns decide which corners of E and of the box of ν are the
+    farthest apart.
+    """
     steps = roads()
+    control, environment = CONTROL * [1, sign, 1, 1], ENVIRONMENT * [1, sign]
     measured = fixed_points(
-        linear(),
+        linear(control=control, environment=environment),
         {},
         CLAIM,
         jnp.asarray(steps, dtype=float),
@@ -69,17 +74,17 @@ def test_the_fixed_points_of_a_linear_loop_are_found():
     corners = np.asarray(
         [[friction, wind] for friction in (0.3, 0.9) for wind in (-8.0, 8.0)]
     )
-    roads_only = steps @ (settled @ CONTROL[:, 2:]).T
-    rests = roads_only[:, :, None] + corners @ (settled @ ENVIRONMENT).T
+    roads_only = steps @ (settled @ control[:, 2:]).T
+    rests = roads_only[:, :, None] + corners @ (settled @ environment).T
     assert measured.centre_m == pytest.approx(np.max(np.abs(rests[..., 0])), rel=1e-4)
     assert measured.road == pytest.approx(
         np.max(length(roads_only[:, 1] - roads_only[:, 0])), rel=1e-4
     )
-    far = settled @ ENVIRONMENT @ (corners[None] - corners[:, None])[..., None]
+    far = settled @ environment @ (corners[None] - corners[:, None])[..., None]
     assert measured.switch == pytest.approx(np.max(length(far[..., 0])), rel=1e-4)
     nus = LIMIT * np.asarray([[1, 1], [1, -1]])
     assert measured.push == pytest.approx(
-        np.max(length(nus @ CONTROL[:, :2].T)), rel=1e-4
+        np.max(length(nus @ control[:, :2].T)), rel=1e-4
     )
     assert measured.points == len(steps) * 2 * 25
 

@@ -139,7 +139,7 @@ def _require_box(weights: Exported, box: Box) -> None:
 def _bounded(
     weights: Sequence[Matrix], multipliers: Sequence[Vector], bound: float
 ) -> bool:
-    """Whether a network respects a Lipschitz bound; no network is a constant."""
+    """Return whether a network respects a bound; an absent one is constant."""
     return (
         not weights
         or not np.any(weights[-1])

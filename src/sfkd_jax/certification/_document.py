@@ -201,4 +201,4 @@ def _require_equal(name: str, stated: Any, derived: Any) -> None:
     if actual.shape != expected.shape or not np.all(
         np.abs(actual - expected) <= REPEATED * np.abs(expected)
     ):
-        raise Refuted(f"{name} does not agree with the value derived from the document")
+        raise Refuted(f"{name} does not follow from the rest of the document")

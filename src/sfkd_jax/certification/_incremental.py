@@ -156,12 +156,8 @@ def check_incremental(weights: Exported, rate: float) -> bool:
     rounded = rounded + 2 * frobenius(sensed)
     summands = frobenius(matrix) + 2 * rate * frobenius(P) + rounded
     summed = 8 * UNIT * summands + matrix.size * TINY
-    error = (
-        (COMPILATION_SLACK - 1.0) * rounded
-        + 2 * drift_error
-        + 2 * forced_error
-        + summed
-    )
+    compiled = (COMPILATION_SLACK - 1.0) * rounded
+    error = compiled + 2 * drift_error + 2 * forced_error + summed
     return is_positive_definite(matrix, error)
 
 

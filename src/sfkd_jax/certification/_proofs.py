@@ -99,9 +99,8 @@ def _joint(
         low, high = (np.asarray(corner) for corner in box)
         middle = operator_at(weights.operators, 0.5 * (low + high))
         multipliers = propose_multipliers(weights.residual, start, middle)
-        return COMPILATION_SLACK * joint_bound_over_box(
-            weights, box, multipliers
-        ).upper, [multipliers]
+        bound = joint_bound_over_box(weights, box, multipliers).upper
+        return COMPILATION_SLACK * bound, [multipliers]
     return _vertices(weights, start, iterations=150)
 
 
