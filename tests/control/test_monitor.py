@@ -308,7 +308,7 @@ def test_a_broken_measurement_is_a_box_exit_and_the_clean_pair_after_it_is_compa
     assert flagged(info["breach"]) == []
     assert flagged(np.isnan(info["disturbance"][:, 0])) == [0, 4, 5]
     np.testing.assert_allclose(info["disturbance"][6:], 0.0, atol=1e-5)
-    assert flagged(~states.primed) == [4]
+    assert flagged(~states.previous_clean) == [4]
     assert all(
         np.all(np.isfinite(leaf))
         for leaf in (states.observation, states.env, states.control)

@@ -244,7 +244,7 @@ admitted = jit(
         safety_filter,
         TOY,
         ENV,
-        ahead=jnp.tile(jnp.asarray(ROAD), (HORIZON, 1)),
+        preview=jnp.tile(jnp.asarray(ROAD), (HORIZON, 1)),
         width=WIDTH,
     )
 )
@@ -273,7 +273,7 @@ def test_the_largest_share_that_keeps_the_copy_inside_is_admitted():
         result = asked(xi, nu)
         share = control.FILTER_SCALES[np.argmax(margins >= 0)]
         found.append(share)
-        assert float(result.share) == share
+        assert float(result.scale) == share
         np.testing.assert_allclose(result.nu, share * nu, rtol=1e-6)
         np.testing.assert_allclose(
             result.margin, margin_of(xi, share * nu, ROAD), atol=1e-6
@@ -307,7 +307,7 @@ def test_where_the_law_alone_leaves_the_corridor_the_copy_is_steered_back(
     np.testing.assert_allclose(result.nu, back)
     np.testing.assert_allclose(result.margin, margin_of(xi, back, ROAD), atol=1e-6)
     assert bool(result.feasible) == enough
-    assert float(result.share) == 0.0
+    assert float(result.scale) == 0.0
 
 
 def test_what_is_not_finite_is_never_applied():
@@ -466,9 +466,9 @@ def test_without_a_reference_the_last_preview_is_driven_on():
     act, memory = jit(controller.act), controller.init(jax.random.key(0))
     xi, reference = vehicle_state(jnp.asarray([0.1, 0.0, SPEED])), circle(0.01)
     _, memory, _ = act(jnp.zeros((9, 2)), memory, xi, ENV, reference)
-    ahead = memory.copy.ahead
+    ahead = memory.copy.preview
     action, memory, info = act(jnp.zeros((9, 2)), memory, xi, ENV, reference * jnp.nan)
-    np.testing.assert_allclose(memory.copy.ahead, ahead, atol=1e-5)
+    np.testing.assert_allclose(memory.copy.preview, ahead, atol=1e-5)
     np.testing.assert_allclose(
         action, LAW(info["copy"], jnp.asarray(0.01), jnp.asarray(SPEED), ENV), atol=1e-5
     )

@@ -1,4 +1,4 @@
-"""Decision: planners over any rollout model. Imports jax only; takes models and costs as arguments."""
+"""Controllers: tasks, planners, feedback laws and wrappers, for any dynamics."""
 
 from sfkd_jax.control.laws._derived_law import derive_path_law as derive_path_law
 from sfkd_jax.control.laws._model_law import ModelLaw as ModelLaw

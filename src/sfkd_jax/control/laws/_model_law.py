@@ -1,4 +1,4 @@
-"""A path-following law out of the model itself: its own steady turn as feed-forward, its own Riccati gains."""
+"""A path-following law from a model: its steady turn and its Riccati gains."""
 
 from __future__ import annotations
 
@@ -9,30 +9,25 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from sfkd_jax.control.laws._path_errors import path_errors
+from sfkd_jax.core.ranges import Positive
 from sfkd_jax.types import BODY, Control, Fiber, Model, Reference, Scalar, State
 
 NEWTON = 4
-"""Steps to the steady turn, from straight driving: float32 has no more to give then,
-for the benchmark's plants.
+"""Newton steps to the steady turn from straight driving. For the benchmark's vehicles
+that reaches the accuracy of float32.
 """
 RICCATI_STEPS = 100
-"""Of the recursion, 10 s at 10 Hz: several times what a car needs to come back to its
-path.
-"""
-
-
-SOUND = 1e-2
-"""Largest entry of the residual of a steady turn that counts as found: mm, rad and m/s
-over one step.
-"""
+"""Steps of the Riccati recursion: 10 s at 10 Hz, several times the settling time."""
+RESIDUAL_TOLERANCE = 1e-2
+"""Largest residual of a valid steady turn: m, rad and m/s over one step."""
 
 
 class SteadyTurn(NamedTuple):
-    """How to drive along a circle, and what to do about deviations; one for every step of a reference.
+    """Steady driving along a circle, and the feedback gain around it.
 
     Attributes:
-        state: path coordinates ξ* = (distance left of the path, yaw against it, body
-            state).
+        state: path coordinates ξ* = (distance left of the path, yaw relative to it,
+            body state).
         control: u*.
         gain: K.
     """
@@ -43,30 +38,32 @@ class SteadyTurn(NamedTuple):
 
 
 class ModelLaw(NamedTuple):
-    """u = u*(κ, v, e) − K(e) (ξ − ξ*(κ, v, e)), all of it from the model.
+    """A feedback law around the steady turns of a model, with its Riccati gains.
 
-        ξ* = F(ξ*, u*; κ, e) with no distance from the path and the speed asked for;   K from the Riccati equation of
-        F linearised there, with the weights below.
+        u = u*(κ, v, e) − K(e) (ξ − ξ*(κ, v, e)),   ξ* = F(ξ*, u*; κ, e)
 
-    F is one step of the model in coordinates along a circle of curvature κ. On a road
-    with side wind ξ* crabs, on a slippery one u* steers more: what a model knows of e
-    becomes feed-forward, and a planner need only sample the rest. A steady turn that
-    Newton's method does not find (a circle too fast for the friction) falls back to the
-    law's control of straight driving, its gain included.
+    F is one step of the model in coordinates along a circle of curvature κ. ξ* has no
+    lateral error and the reference speed; K solves the Riccati equation of F linearised
+    there, with the weights below. In side wind ξ* crabs, on a slippery road u* steers
+    more: what the model knows of e becomes feed-forward, and a planner samples only the
+    rest. If Newton's method does not converge (the circle is too fast for the
+    friction), the law is that of straight driving, gain included.
 
     Attributes:
-        dt: [s].
-        lateral: [1/m²], heading: [1/rad²], speed: [s²/m²], steering: [1/rad²], drive:
-            per control unit²: the weights of the Riccati equation; those of other body
-            entries are zero.
+        dt: sampling period [s].
+        lateral: weight in the Riccati equation [1/m²].
+        heading: weight [1/rad²].
+        speed: weight [s²/m²]; the weights of further body states are zero.
+        steering: weight [1/rad²].
+        drive: weight, per control unit².
     """
 
     dt: float
     lateral: float = 1.0
     heading: float = 1.0
     speed: float = 1.0
-    steering: float = 20.0
-    drive: float = 0.5
+    steering: Positive = 20.0
+    drive: Positive = 0.5
 
     def prepare(
         self,
@@ -76,11 +73,13 @@ class ModelLaw(NamedTuple):
         reference: Reference,
         curvature: Array,
     ) -> SteadyTurn:
-        """Steady turns for every point of a reference.
+        """Return the steady turns at every point of a reference.
 
         Args:
-            model, fiber: of the environment.
+            model: any model of world states.
+            fiber: of the environment.
             like: a state, for its size.
+            reference: x, y, yaw, speed of each step.
             curvature: of the path at each point [1/m].
         """
         speeds = reference[:, 3]
@@ -91,17 +90,17 @@ class ModelLaw(NamedTuple):
         both = turn(
             jnp.stack([curvature, 0.0 * curvature]).ravel(), jnp.tile(speeds, 2)
         )
-        states, controls, left = (jnp.stack(jnp.split(part, 2)) for part in both)
+        states, controls, residuals = (jnp.stack(jnp.split(part, 2)) for part in both)
         finite = jnp.all(
             jnp.isfinite(jnp.concatenate([states[0], controls[0]], axis=1)), axis=1
         )
-        sound = finite & (left[0] < SOUND)
+        valid = finite & (residuals[0] < RESIDUAL_TOLERANCE)
         states, controls = (
-            jnp.where(sound[:, None], part[0], part[1]) for part in (states, controls)
+            jnp.where(valid[:, None], part[0], part[1]) for part in (states, controls)
         )
-        at = jnp.where(sound, curvature, 0.0)
-        # One gain, of the first step's turn: it varies little over a horizon, and the
-        # Riccati equation costs most.
+        at = jnp.where(valid, curvature, 0.0)
+        # One gain, of the first step: it varies little over a horizon, and the Riccati
+        # recursion is the most expensive part.
         gain = self._gain(step, states[0], controls[0], at[0], speeds[0])
         return SteadyTurn(
             states, controls, jnp.broadcast_to(gain, (*controls.shape, states.shape[1]))
@@ -110,7 +109,7 @@ class ModelLaw(NamedTuple):
     def _gain(
         self, step: Any, state: Array, control: Control, kappa: Scalar, speed: Scalar
     ) -> Array:
-        """K, by the Riccati recursion."""
+        """K by the Riccati recursion."""
         A, B = jax.jacfwd(step, argnums=(0, 1))(state, control, kappa, speed)
         Q = jnp.diag(
             jnp.zeros(state.shape[0])
@@ -136,7 +135,14 @@ class ModelLaw(NamedTuple):
         point: Float[Array, " 4"],
         curvature: Scalar,
     ) -> Control:
-        """u at one step, for its steady turn."""
+        """Return the control at one step of the reference.
+
+        Args:
+            turn: steady turn of the step.
+            state: in the world.
+            point: x, y, yaw, speed of the reference.
+            curvature: of the path at `point` [1/m].
+        """
         errors = path_errors(state, point, curvature)
         now = jnp.concatenate(
             [jnp.stack([errors.lateral, errors.heading]), state[BODY]]
@@ -145,7 +151,7 @@ class ModelLaw(NamedTuple):
 
 
 def _along_circle(model: Model, fiber: Fiber, size: int, dt: float) -> Any:
-    """(ξ, u, κ, speed) -> ξ one step later: the point on the path moves on by speed · dt."""
+    """(ξ, u, κ, speed) -> ξ one step later, relative to the point speed · dt ahead."""
 
     def step(along: Array, control: Control, kappa: Scalar, speed: Scalar) -> Array:
         state = (
@@ -176,7 +182,10 @@ def _along_circle(model: Model, fiber: Fiber, size: int, dt: float) -> Any:
 def _steady(
     step: Any, coordinates: int, kappa: Scalar, speed: Scalar
 ) -> tuple[Array, Control, Scalar]:
-    """ξ* and u* by Newton's method, and what is left of the residual; unknown are the yaw, s without v, and u."""
+    """ξ* and u* by Newton's method, and the residual.
+
+    The unknowns are the relative yaw, the body state without v, and u.
+    """
 
     def unpack(unknown: Array) -> tuple[Array, Array]:
         state = (
@@ -207,9 +216,10 @@ def _steady(
 def solve(
     matrix: Float[Array, "n n"], right: Float[Array, "n k"]
 ) -> Float[Array, "n k"]:
-    """matrix⁻¹ right by elimination with pivots; for a handful of unknowns.
+    """Return matrix⁻¹ right by Gaussian elimination with pivoting; for few unknowns.
 
-    `jnp.linalg.solve` calls LAPACK; a program with several such calls inside maps takes XLA tens of seconds to compile.
+    `jnp.linalg.solve` calls LAPACK, and XLA takes tens of seconds to compile a program
+    with several such calls inside maps.
     """
     size = matrix.shape[0]
     rows = jnp.concatenate([matrix, right], axis=1)

@@ -1,4 +1,4 @@
-"""Errors of a state against a reference path, and the feedback law that the planner samples around."""
+"""Errors of a state relative to a reference path, and a feedback law on them."""
 
 from __future__ import annotations
 
@@ -13,12 +13,12 @@ from sfkd_jax.types import Control, Reference, Scalar, State
 
 
 class PathErrors(NamedTuple):
-    """Where a state stands against one reference point.
+    """Errors of a state relative to one reference point.
 
     Attributes:
         lateral: distance left of the path [m].
-        heading: yaw against the path [rad].
-        speed: too fast by [m/s].
+        heading: yaw relative to the path [rad].
+        speed: relative to the reference [m/s].
     """
 
     lateral: Scalar
@@ -27,17 +27,20 @@ class PathErrors(NamedTuple):
 
 
 FeedbackLaw: TypeAlias = Callable[[PathErrors, Scalar, Scalar], Control]
+"""(path errors, curvature [1/m], reference speed [m/s]) -> control."""
 
 
 def path_errors(
     state: State, point: Float[Array, " 4"], curvature: Scalar
 ) -> PathErrors:
-    """Errors against the circle that touches the path at `point`, to second order in the distance along it.
+    """Return the errors relative to the circle that touches the path at `point`.
+
+    They are exact to second order in the distance along the circle.
 
     Args:
         state: p_x, p_y, yaw, v, ….
         point: x, y, yaw, speed of the reference.
-        curvature: of the path there [1/m].
+        curvature: of the path at `point` [1/m].
     """
     dx, dy = state[0] - point[0], state[1] - point[1]
     c, s = jnp.cos(point[2]), jnp.sin(point[2])
@@ -48,7 +51,11 @@ def path_errors(
 
 
 def reference_curvature(reference: Reference) -> Float[Array, " horizon"]:
-    """κ_k from the turn between neighbouring reference points [1/m]; 0 where they coincide."""
+    """Return κ [1/m] at each reference point, from its neighbours.
+
+    Between two points κ is the change of yaw over the distance, or 0 where they
+    coincide; at a point it is the mean of both sides.
+    """
     steps = jnp.diff(reference, axis=0)
     distance = jnp.hypot(steps[:, 0], steps[:, 1])
     moved = distance > 1e-3
@@ -67,13 +74,16 @@ def path_feedback(
     speed_gain: float = 1.0,
     speed_loop: bool = False,
 ) -> FeedbackLaw:
-    """u = u_ff(κ) + K ξ: δ = atan(L κ) − k_y e_y − k_ψ e_ψ, a = −k_v e_v (or the speed command v_ref − k_v e_v).
+    """Return the path-following law u = u_ff(κ) + K ξ.
+
+        δ = atan(L κ) − k_y e_y − k_ψ e_ψ
+        a = −k_v e_v,   or the speed command v_ref − k_v e_v
 
     Args:
         wheelbase: L [m].
-        lateral_gain: [rad/m].
-        heading_gain: [-].
-        speed_gain: [1/s], or [-] with a speed loop.
+        lateral_gain: k_y [rad/m].
+        heading_gain: k_ψ [-].
+        speed_gain: k_v [1/s], or [-] with a speed loop.
         speed_loop: whether the second control is a speed command.
     """
 
@@ -90,7 +100,7 @@ def path_feedback(
 
 
 def no_feedback(*, speed_loop: bool = False) -> FeedbackLaw:
-    """u = 0 (or the reference speed): plain sampling."""
+    """Return the law u = 0, or the reference speed: sampling without feedback."""
 
     def law(errors: PathErrors, curvature: Scalar, speed: Scalar) -> Control:
         del errors, curvature

@@ -1,4 +1,4 @@
-"""A path-following law as tables: steady turns of a vehicle's own step, and gains around them."""
+"""A path-following law as tables of steady turns and feedback gains."""
 
 from __future__ import annotations
 
@@ -16,15 +16,17 @@ from sfkd_jax.types import Control, Environment, Scalar
 
 
 class PathLaw(NamedTuple):
-    """u = u*(a, v, e) − K(a, v, e) (ξ − ξ*(a, v, e)), a = v² κ, every table linear between its points.
+    """Feedback around steady turns, tabulated over a = v² κ, v and e.
 
-    Tables are over the lateral acceleration a that a turn asks for, not over κ: what
-    the tyres hold is a box then. A pytree of arrays: it is stored beside the weights
-    that were learned around it.
+        u = u*(a, v, e) − K(a, v, e) (ξ − ξ*(a, v, e))
+
+    Interpolation is linear. The tables are over the lateral acceleration a of a turn,
+    not over κ, because the limit of the tyres is then a box. The law is a pytree of
+    arrays, so it can be stored beside the weights that were learned around it.
 
     Attributes:
-        low, high: ends of the axes (a [m/s²], v_ref [m/s], e_1, …), each divided
-            evenly.
+        low: lower ends of the axes (a [m/s²], v_ref [m/s], e_1, …).
+        high: upper ends of the axes; every axis is divided evenly.
         perturbation: largest |ν| that data and planners add to u [rad, control unit],
             (2,).
         state: ξ* of the steady turns, (*axes, coordinate).
@@ -40,32 +42,35 @@ class PathLaw(NamedTuple):
     gain: Float[Array, "*axes 2 coordinate"]
 
     def turn(self, curvature: Scalar, speed: Scalar, env: Environment) -> SteadyTurn:
-        """How to drive along a circle; outside the axes, as at their ends.
+        """Interpolate the steady turn; outside the axes, the value at their ends.
 
-        The steady speed is the one that is asked for, whatever the tables hold.
+        Args:
+            curvature: κ [1/m].
+            speed: reference speed [m/s]; it is also the speed of the steady turn.
+            env: e.
         """
         at = jnp.concatenate([jnp.stack([curvature * speed**2, speed]), env])
         counts = self.control.shape[:-1]
         rows, weights = _corners(at, self.low, self.high, counts)
 
-        def between(table: Array) -> Array:
+        def interpolate(table: Array) -> Array:
             corners = table.reshape(-1, *table.shape[len(counts) :])[rows]
             return jnp.tensordot(weights, corners, axes=1)
 
         state, control, gain = (
-            between(table) for table in (self.state, self.control, self.gain)
+            interpolate(table) for table in (self.state, self.control, self.gain)
         )
         return SteadyTurn(state.at[PATH_SPEED].set(speed), control, gain)
 
     def __call__(
         self, coordinates: PathState, curvature: Scalar, speed: Scalar, env: Environment
     ) -> Control:
-        """u, not clipped to any limit."""
+        """Return u, without any limit."""
         return turn_control(self.turn(curvature, speed, env), coordinates)
 
 
 def turn_control(turn: SteadyTurn, coordinates: PathState) -> Control:
-    """u* − K (ξ − ξ*)."""
+    """Return the control u* − K (ξ − ξ*)."""
     return turn.control - turn.gain @ (coordinates - turn.state)
 
 
@@ -75,11 +80,11 @@ def _corners(
     high: Float[Array, " axis"],
     counts: tuple[int, ...],
 ) -> tuple[Int[Array, " corner"], Float[Array, " corner"]]:
-    """Flat indices and weights of the grid points around a point, for multilinear interpolation."""
+    """Flat indices and weights of the grid points for multilinear interpolation."""
     last = jnp.asarray(counts) - 1
-    place = jnp.clip((at - low) / (high - low), 0.0, 1.0) * last
-    index = jnp.minimum(jnp.floor(place).astype(int), last - 1)
-    beyond = place - index
+    position = jnp.clip((at - low) / (high - low), 0.0, 1.0) * last
+    index = jnp.minimum(jnp.floor(position).astype(int), last - 1)
+    beyond = position - index
     sides = jnp.asarray(list(product((0, 1), repeat=len(counts))))
     strides = jnp.asarray([prod(counts[axis + 1 :]) for axis in range(len(counts))])
     weights = jnp.prod(jnp.where(sides == 1, beyond, 1.0 - beyond), axis=1)
@@ -87,12 +92,12 @@ def _corners(
 
 
 def law_to_arrays(law: PathLaw) -> dict[str, Array]:
-    """The law as a dictionary of arrays, to be stored."""
+    """Return the law as a dictionary of arrays, for storage."""
     return law._asdict()
 
 
 def law_from_arrays(arrays: Mapping[str, Any]) -> PathLaw:
-    """The law that was stored.
+    """Return the law from a dictionary of arrays.
 
     Raises:
         KeyError: an array is missing.

@@ -19,21 +19,22 @@ from sfkd_jax.control.planners._plans import (
     weighted_mean_and_std,
 )
 from sfkd_jax.control.tasks._task import Task
+from sfkd_jax.core.ranges import AtLeastTwo, UnitInterval
 from sfkd_jax.types import Controller, Key
 
 
 def cem(
     task: Task,
     *,
-    horizon: int = 20,
+    horizon: AtLeastTwo = 20,
     num_samples: int = 500,
     elites: int = 50,
     iterations: int = 3,
     smallest_scale: float = 0.05,
     noise: str = "ar1",
-    noise_correlation: float = 0.8,
+    noise_correlation: UnitInterval = 0.8,
     noise_exponent: float = 2.0,
-    noise_knots: int = 5,
+    noise_knots: AtLeastTwo = 5,
     halton: bool = False,
     **options: Any,
 ) -> Controller:

@@ -17,16 +17,17 @@ from sfkd_jax.control.planners._plans import (
     replace_nonfinite,
 )
 from sfkd_jax.control.tasks._task import Task
+from sfkd_jax.core.ranges import AtLeastTwo, Fraction
 from sfkd_jax.types import Controller, Key, Scalar
 
 
 def gradient_planner(
     task: Task,
     *,
-    horizon: int = 20,
+    horizon: AtLeastTwo = 20,
     iterations: int = 5,
-    steps: int = 8,
-    shrink: float = 0.4,
+    steps: AtLeastTwo = 8,
+    shrink: Fraction = 0.4,
     **options: Any,
 ) -> Controller:
     """Return the controller that descends the gradient of the rollout's cost.

@@ -15,6 +15,7 @@ from sfkd_jax.control.planners._condensed import condense, condensed_cost, to_wo
 from sfkd_jax.control.planners._plans import all_finite, clip_environment, shift
 from sfkd_jax.control.tasks._path_tracking import check_path
 from sfkd_jax.control.tasks._task import PreviousControl
+from sfkd_jax.core.ranges import AtLeastTwo
 from sfkd_jax.types import (
     POSE,
     Control,
@@ -73,7 +74,7 @@ def koopman_mpc(
     control_low: tuple[float, ...],
     control_high: tuple[float, ...],
     speed_loop: bool = False,
-    horizon: int = 20,
+    horizon: AtLeastTwo = 20,
     iterations: int = 12,
     lateral: float = 200.0,
     course: float = 20.0,

@@ -28,6 +28,7 @@ from sfkd_jax.control.planners._weights import (
     temperature_for_sample_size,
 )
 from sfkd_jax.control.tasks._task import Task
+from sfkd_jax.core.ranges import AtLeastTwo, UnitInterval
 from sfkd_jax.types import Controller, Key
 
 MIN_NOISE_SCALE = 0.05
@@ -37,17 +38,17 @@ MIN_NOISE_SCALE = 0.05
 def mppi(
     task: Task,
     *,
-    horizon: int = 20,
+    horizon: AtLeastTwo = 20,
     num_samples: int = 1500,
     iterations: int = 1,
     effective_samples: float = 0.0,
     noise: str = "ar1",
-    noise_correlation: float = 0.8,
+    noise_correlation: UnitInterval = 0.8,
     noise_exponent: float = 2.0,
-    noise_knots: int = 5,
+    noise_knots: AtLeastTwo = 5,
     halton: bool = False,
     curvature: bool = False,
-    adapt: float = 0.0,
+    adapt: UnitInterval = 0.0,
     control_cost: float = 0.0,
     **options: Any,
 ) -> Controller:
@@ -88,11 +89,7 @@ def mppi(
     34(6).
     """
     _check(num_samples, iterations, effective_samples, adapt)
-    if curvature and control_cost:
-        raise ValueError(
-            "curvature and control_cost exclude each other: "
-            "the latter needs independent noise"
-        )
+    _check_independent(curvature, control_cost)
     draw = noise_sampler(
         noise,
         horizon=horizon,
@@ -174,3 +171,12 @@ def _check(
         )
     if not 0 <= adapt <= 1:
         raise ValueError(f"adapt must lie in [0, 1], got {adapt}")
+
+
+def _check_independent(curvature: bool, control_cost: float) -> None:
+    """Raise a ValueError if the noise is not independent but has to be."""
+    if curvature and control_cost:
+        raise ValueError(
+            "curvature and control_cost exclude each other: "
+            "the latter needs independent noise"
+        )

@@ -28,6 +28,7 @@ from sfkd_jax.control.tasks._task import (
     actuator_limits,
 )
 from sfkd_jax.core.folding import fold
+from sfkd_jax.core.ranges import Positive
 from sfkd_jax.types import Control, Environment, Model, Params, Reference, Scalar, State
 
 
@@ -78,7 +79,7 @@ def path_tracking(
     dt: float,
     control_low: tuple[float, ...],
     control_high: tuple[float, ...],
-    control_rate: tuple[float, ...] | None = None,
+    control_rate: tuple[Positive, ...] | None = None,
     terminal_weight: float = 1.0,
     latent_weight: float = 0.0,
     actuator: Actuator | None = None,

@@ -1,4 +1,4 @@
-"""Planning for the state that the vehicle will be in once the control arrives."""
+"""Delay compensation: plan from the state in which a late control will arrive."""
 
 from __future__ import annotations
 
@@ -8,15 +8,24 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from sfkd_jax.types import Control, Controller, Environment, Key, Model, Params, State
+from sfkd_jax.types import (
+    Control,
+    Controller,
+    ControllerInfo,
+    Environment,
+    Key,
+    Model,
+    Params,
+    State,
+)
 
 
 class DelayState(NamedTuple):
-    """What delay compensation carries.
+    """What delay compensation carries from one control step to the next.
 
     Attributes:
-        inner: state of the controller.
-        sent: controls on their way, oldest first.
+        inner: state of the wrapped controller.
+        sent: controls that have not arrived yet, oldest first.
     """
 
     inner: Any
@@ -30,25 +39,26 @@ def delay_compensated(
     delay: int,
     initial_control: tuple[float, ...] = (0.0, 0.0),
 ) -> Controller:
-    """The same controller for actuators that answer `delay` sampling periods late.
+    """Wrap a controller for actuators that respond `delay` sampling periods late.
 
-        x̂_{k+d} = F(… F(x_k, u_{k−d}, e_k) …, u_{k−1}, e_k),   u_k = act(x̂_{k+d}, e_k, reference)
+        x̂_{k+d} = F(… F(x_k, u_{k−d}, e_k) …, u_{k−1}, e_k)
+        u_k = act(x̂_{k+d}, e_k, reference)
 
-    The observation is carried forward by the model through the controls already sent,
-    and the controller plans from there. The reference must be that of the time at which
+    The model predicts the observation through the controls already sent, and the
+    controller plans from the result. The reference must be that of the time at which
     the control arrives.
 
     Args:
-        controller: any.
-        model: predicts; the one of the controller's own rollouts.
+        controller: any controller.
+        model: used for the prediction; usually that of the controller's rollouts.
         delay: d, at least 1.
-        resting: what is in force before the first control arrives.
+        initial_control: in force before the first control arrives.
 
     Returns:
         A `Controller`; `info` gains `arrival_state`, x̂_{k+d}.
 
     Raises:
-        ValueError: a delay below 1.
+        ValueError: the delay is less than 1.
     """
     if delay < 1:
         raise ValueError(f"delay must be at least 1 sampling period, got {delay}")
@@ -65,10 +75,13 @@ def delay_compensated(
         observation: State,
         env: Environment,
         reference: Any,
-    ) -> tuple[Control, DelayState, dict[str, Array]]:
+    ) -> tuple[Control, DelayState, ControllerInfo]:
         fiber = model.fiber(params, env)
-        advance = lambda latent, control: (model.step(fiber, latent, control), None)  # noqa: E731
-        latent, _ = jax.lax.scan(advance, model.encode(fiber, observation), state.sent)
+
+        def predict(latent: Any, control: Control) -> tuple[Any, None]:
+            return model.step(fiber, latent, control), None
+
+        latent, _ = jax.lax.scan(predict, model.encode(fiber, observation), state.sent)
         arrival = model.decode(fiber, latent)
         control, inner, info = controller.act(
             params, state.inner, arrival, env, reference

@@ -1,4 +1,4 @@
-"""A nominal copy of the car: the model beside it, driven with its inputs, not corrected."""
+"""A nominal copy of the vehicle: the model driven with the vehicle's own inputs."""
 
 from __future__ import annotations
 
@@ -32,23 +32,23 @@ Box: TypeAlias = tuple[Float[Array, " entry"], Float[Array, " entry"]]
 
 
 class CopyState(NamedTuple):
-    """The copy between two control steps.
+    """The nominal copy between two control steps.
 
     Attributes:
         latent: in the fibre of `env`; 0 before the start.
-        started: whether the copy runs.
-        env: the last finite environment, within its box; NaN before the first one.
-        ahead: κ [1/m] and v_ref [m/s] over the next steps as of the last finite
+        started: whether the copy is running.
+        env: the last finite environment, clipped to its box; NaN before the first one.
+        preview: κ [1/m] and v_ref [m/s] over the next steps of the last finite
             reference; NaN before the first one.
     """
 
     latent: Latent
     started: Bool[Array, ""]
     env: Environment
-    ahead: Float[Array, "preview 2"]
+    preview: Float[Array, "preview 2"]
 
-    def stepped(self, latent: Latent) -> CopyState:
-        """With the latent one step later; a copy that is not finite has to start anew."""
+    def advanced(self, latent: Latent) -> CopyState:
+        """Return the copy one step later; it stops if its latent is not finite."""
         running = self.started & all_finite(latent)
         return self._replace(
             latent=_where(running, latent, self.latent), started=running
@@ -56,12 +56,14 @@ class CopyState(NamedTuple):
 
 
 class Validity(NamedTuple):
-    """Where a certificate speaks: boxes as (low, high), and the largest |e_y − ê_y| [m].
+    """Where a certificate applies; boxes are pairs (low, high).
 
     Attributes:
-        env, state, preview: boxes of e, ξ and (κ, v_ref).
-        distance: between car and copy.
-        reanchor: whether a copy beyond it is put at the measurement.
+        env: box of e.
+        state: box of ξ.
+        preview: box of (κ, v_ref).
+        distance: largest |e_y − ê_y| between vehicle and copy [m].
+        reanchor: whether a copy beyond that distance is moved to the measurement.
     """
 
     env: Box
@@ -71,51 +73,54 @@ class Validity(NamedTuple):
     reanchor: bool
 
 
-class Located(NamedTuple):
-    """Car and copy at one control step.
+class CopyUpdate(NamedTuple):
+    """Vehicle and copy at one control step.
 
     Attributes:
-        state: the copy, in the fibre of the environment now, anchored if need be.
+        state: the copy, in the fibre of the current environment, moved to the
+            measurement if necessary.
         fiber: of that environment.
-        lawful: what the law asks for, at the measurement or, without one, at the copy.
-        applicable: whether that is finite and the copy runs.
-        void: whether the copy runs and the certificate says nothing here.
+        law_control: control of the law at the measurement or, without one, at the copy.
+        applicable: whether that control is finite and the copy is running.
+        void: whether the copy is running and the certificate does not apply here.
     """
 
     state: CopyState
     fiber: Any
-    lawful: Control
+    law_control: Control
     applicable: Bool[Array, ""]
     void: Bool[Array, ""]
 
 
-def locate(
+def update_copy(
     model: Model,
     law: PathLaw,
     valid: Validity,
     params: Params,
     before: CopyState,
-    seen: tuple[State, Environment, Reference],
-) -> tuple[Located, dict[str, Array]]:
-    """Where car and copy are, what the law asks for, and what speaks against a certificate.
+    measured: tuple[State, Environment, Reference],
+) -> tuple[CopyUpdate, dict[str, Array]]:
+    """Compare the copy with a measurement, and evaluate the law and the certificate.
 
     Args:
-        model: of the closed loop, `along_path`.
+        model: of the closed loop, with `along_path`.
         law: around which it was learned.
-        valid: where its certificate speaks.
+        valid: where its certificate applies.
         params: folded or not.
-        before: the copy, as `CopyState.stepped` left it.
-        seen: observation and reference in the world, and e; each may be not finite.
+        before: the copy, as `CopyState.advanced` returned it.
+        measured: observation, e and reference in the world; each may be not finite.
 
     Returns:
-        `Located`, and entries for a controller's `info`, see `shielded`.
+        The update, and entries of the controller's `info`, see `shielded`.
     """
-    observation, env, reference = seen
-    told = jnp.where(all_finite(env), env, before.env)
-    inside = jnp.clip(told, *valid.env)
+    observation, env, reference = measured
+    last_env = jnp.where(all_finite(env), env, before.env)
+    inside = jnp.clip(last_env, *valid.env)
     readable = all_finite(reference)
-    ahead = jnp.where(
-        readable, _preview(reference, before.ahead.shape[0]), _later(before.ahead)
+    preview = jnp.where(
+        readable,
+        _preview(reference, before.preview.shape[0]),
+        _next_preview(before.preview),
     )
     folded = fold(model, params)
     fiber = model.fiber(folded, inside)
@@ -126,10 +131,10 @@ def locate(
     latent = jax.lax.cond(
         jnp.all(inside == before.env), lambda: before.latent, switched
     )
-    measured = path_coordinates(observation, reference[0], ahead[0, 0])
-    anchor = model.encode(fiber, path_state(measured))
-    clean = readable & all_finite((observation, measured, anchor))
-    distance = jnp.abs(measured - model.decode(fiber, latent)[BODY])[LATERAL]
+    vehicle = path_coordinates(observation, reference[0], preview[0, 0])
+    anchor = model.encode(fiber, path_state(vehicle))
+    clean = readable & all_finite((observation, vehicle, anchor))
+    distance = jnp.abs(vehicle - model.decode(fiber, latent)[BODY])[LATERAL]
     compared = clean & before.started
     broken = compared & ~(distance <= valid.distance)
     started = before.started | clean
@@ -138,11 +143,12 @@ def locate(
     )
 
     copy = model.decode(fiber, latent)[BODY]
-    xi = jnp.where(clean, measured, copy)
-    lawful = law(xi, ahead[0, 0], ahead[0, 1], inside)
-    applicable = started & all_finite(lawful)
-    covered = applicable & jnp.all(inside == told) & is_valid(xi[LATERAL], ahead[0, 0])
-    covered &= _within(xi, valid.state) & _within(ahead[0], valid.preview)
+    xi = jnp.where(clean, vehicle, copy)
+    law_control = law(xi, preview[0, 0], preview[0, 1], inside)
+    applicable = started & all_finite(law_control)
+    covered = applicable & jnp.all(inside == last_env)
+    covered &= is_valid(xi[LATERAL], preview[0, 0])
+    covered &= _within(xi, valid.state) & _within(preview[0], valid.preview)
     void = started & ~covered
     flags = {
         "copy": jnp.where(started, copy, jnp.nan),
@@ -152,45 +158,58 @@ def locate(
         "dead_reckoning": started & ~clean,
         "env_inside": jnp.all(inside == env),
     }
-    return Located(
-        CopyState(latent, started, inside, ahead), fiber, lawful, applicable, void
-    ), flags
+    state = CopyState(latent, started, inside, preview)
+    return CopyUpdate(state, fiber, law_control, applicable, void), flags
 
 
-def blank_copy(
+def initial_copy(
     model: Model, environments: int, coordinates: int, horizon: int
 ) -> Callable[[], CopyState]:
-    """() -> a copy that has not started; of the model only shapes are evaluated, once."""
+    """Return the function that makes a copy that has not started.
 
-    def encoded(key: Key) -> Latent:
+    Args:
+        model: of the closed loop; only shapes are evaluated, and only once.
+        environments: size of e.
+        coordinates: size of ξ.
+        horizon: number of previewed steps.
+    """
+
+    def encode(key: Key) -> Latent:
         fiber = model.fiber(fold(model, model.init(key)), jnp.zeros(environments))
         return model.encode(fiber, path_state(jnp.zeros(coordinates)))
 
-    shapes = jax.eval_shape(encoded, jax.random.key(0))
+    shapes = jax.eval_shape(encode, jax.random.key(0))
 
-    def blank() -> CopyState:
+    def initial() -> CopyState:
         return CopyState(
             latent=jax.tree.map(lambda leaf: jnp.zeros(leaf.shape, leaf.dtype), shapes),
             started=jnp.asarray(False),
             env=jnp.full(environments, jnp.nan, dtype=float),
-            ahead=jnp.full((horizon, 2), jnp.nan, dtype=float),
+            preview=jnp.full((horizon, 2), jnp.nan, dtype=float),
         )
 
-    return blank
+    return initial
 
 
 def as_box(name: str, low: Limits | None, high: Limits | None, size: int) -> Box:
-    """Limits as arrays, infinite where None.
+    """Return limits as arrays, infinite where None.
+
+    Args:
+        name: of the limits, for messages.
+        low: lower limits.
+        high: upper limits.
+        size: number of entries.
 
     Raises:
-        ValueError: of another size, or reversed.
+        ValueError: the size is wrong, or a lower limit exceeds the upper one.
     """
     bottom = (-math.inf,) * size if low is None else low
     top = (math.inf,) * size if high is None else high
     sized = len(bottom) == len(top) == size
     if not sized or not all(a <= b for a, b in zip(bottom, top, strict=True)):
         raise ValueError(
-            f"{name}_low must lie below {name}_high, {size} entries each, got {low} and {high}"
+            f"{name}_low must lie below {name}_high, {size} entries each, "
+            f"got {low} and {high}"
         )
     return jnp.asarray(bottom, dtype=float), jnp.asarray(top, dtype=float)
 
@@ -201,16 +220,16 @@ def _within(point: Float[Array, " entry"], box: Box) -> Bool[Array, ""]:
 
 
 def _preview(reference: Reference, horizon: int) -> Float[Array, "preview 2"]:
-    """κ and v_ref of the next steps; the last ones are held."""
+    """κ and v_ref of the next steps; beyond the reference, its last ones."""
     known = jnp.stack([curvature_ahead(reference), reference[:, 3]], axis=1)
     return known[jnp.minimum(jnp.arange(horizon), known.shape[0] - 1)]
 
 
-def _later(ahead: Float[Array, "preview 2"]) -> Float[Array, "preview 2"]:
+def _next_preview(preview: Float[Array, "preview 2"]) -> Float[Array, "preview 2"]:
     """The same preview one step later."""
-    return jnp.concatenate([ahead[1:], ahead[-1:]])
+    return jnp.concatenate([preview[1:], preview[-1:]])
 
 
-def _where(chosen: Bool[Array, ""], left: Latent, right: Latent) -> Latent:
+def _where(condition: Bool[Array, ""], left: Latent, right: Latent) -> Latent:
     """`jnp.where` for latents."""
-    return jax.tree.map(lambda a, b: jnp.where(chosen, a, b), left, right)
+    return jax.tree.map(lambda a, b: jnp.where(condition, a, b), left, right)
