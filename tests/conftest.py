@@ -53,7 +53,7 @@ def key() -> jax.Array:
 
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
-    """The doors first: some of their files take minutes, and a file that starts last
+    """The commands first: some of their files take minutes, and a file that starts last
     decides when the run ends.
     """
     items.sort(key=lambda item: len(item.path.parts))

@@ -6,7 +6,7 @@ import pytest
 from helpers import any_law, space
 from hydra import compose, initialize_config_dir
 from hydra.errors import HydraException
-from omegaconf import OmegaConf
+from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
 from sfkd_jax import build, models, vehicle
@@ -26,27 +26,28 @@ OPTIONS = [
 MODELS = [name for group, name in OPTIONS if group == "model"]
 
 
-def settings(*overrides: str) -> dict:
+def composed(*overrides: str) -> DictConfig:
     config.register()
     with initialize_config_dir(str(CONF), version_base="1.3"):
-        return OmegaConf.to_container(
-            compose("config", overrides=list(overrides)), resolve=True
-        )
+        return compose("config", overrides=list(overrides))
+
+
+def settings(*overrides: str) -> dict:
+    return OmegaConf.to_container(composed(*overrides), resolve=True)
 
 
 @pytest.mark.parametrize(("group", "option"), OPTIONS)
 def test_every_option_composes_and_is_within_the_ranges(group, option):
     prefix = "+" if group == "experiment" else ""
-    composed = settings(f"{prefix}{group}={option}")
-    assert composed["seed"] == 0
-    config._settings(OmegaConf.create(composed))
+    plain = config.plain_settings(composed(f"{prefix}{group}={option}"))
+    assert plain["seed"] == 0
 
 
 @pytest.mark.parametrize("option", MODELS)
 def test_every_model_option_builds_and_names_its_system(option):
-    composed = settings(f"model={option}")
-    assert composed["model"]["system"] == option
-    build.build_model(composed["model"], space(), vehicle.kinematic())
+    plain = settings(f"model={option}")
+    assert plain["model"]["system"] == option
+    build.build_model(plain["model"], space(), vehicle.kinematic())
 
 
 @pytest.mark.parametrize(
@@ -61,20 +62,20 @@ def test_every_controller_builds_for_every_vehicle(vehicle, controller):
         if vehicle == "own"
         else ()
     )
-    composed = settings(f"vehicle={vehicle}", f"controller={controller}", *limits)
-    plant = build.build_vehicle(composed["vehicle"])
+    plain = settings(f"vehicle={vehicle}", f"controller={controller}", *limits)
+    plant = build.build_vehicle(plain["vehicle"])
     law = (
         any_law(len(plant.state_names) - 1)
-        if composed["controller"]["sampling"] == "law"
+        if plain["controller"]["sampling"] == "law"
         else None
     )
     model = build.reference_systems(plant, law)["oracle"].model
     if (
-        composed["controller"]["planner"] == "koopman_mpc"
+        plain["controller"]["planner"] == "koopman_mpc"
     ):  # the only planner that needs a linear predictor
         model = models.FACTORIES["koopman_mpc"](space(len(plant.state_names) - 3))
-    build.build_controller(composed["controller"], model, plant, law=law)
-    build.build_scenario(composed["scenario"], plant, duration=6.0)
+    build.build_controller(plain["controller"], model, plant, law=law)
+    build.build_scenario(plain["scenario"], plant, duration=6.0)
 
 
 def test_every_learned_model_has_an_option_file():
@@ -113,12 +114,12 @@ def test_a_wrong_option_is_refused_by_name(override, says):
 )
 def test_an_environment_that_nobody_can_learn_of_is_refused(overrides, says):
     with pytest.raises(ValueError, match=says):
-        config._settings(OmegaConf.create(settings(*overrides)))
+        config.plain_settings(composed(*overrides))
 
 
 def test_without_an_environment_no_model_reads_one():
-    assert config._settings(OmegaConf.create(settings()))["model"]["environment"]
-    assert not config._settings(OmegaConf.create(settings("env_source=none")))["model"][
+    assert config.plain_settings(composed())["model"]["environment"]
+    assert not config.plain_settings(composed("env_source=none"))["model"][
         "environment"
     ]
 

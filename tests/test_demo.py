@@ -8,7 +8,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from helpers import door, last_line, straight
+from helpers import run_command, last_line, straight
 
 from sfkd_jax import artefacts, demo, policy
 from sfkd_jax.certification import Certificate, verify
@@ -17,7 +17,7 @@ VEHICLES = sorted(place.name for place in demo.SHIPPED.iterdir())
 
 
 def test_the_demo_drives_without_training_and_draws_an_animation(tmp_path):
-    done = door("demo", "controller=mppi_tiny", "demo.episode_s=9.0", cwd=tmp_path)
+    done = run_command("demo", "controller=mppi_tiny", "demo.episode_s=9.0", cwd=tmp_path)
     found = last_line(done)
     assert set(found) == {"animation", "rows", "results"}
     assert (tmp_path / found["animation"]).read_bytes()[:6] == b"GIF89a"
@@ -33,7 +33,7 @@ def test_the_demo_drives_without_training_and_draws_an_animation(tmp_path):
 
 
 def test_along_a_path_the_demo_drives_in_the_corridor_of_its_policy(tmp_path):
-    done = door(
+    done = run_command(
         "demo",
         "+experiment=s3",
         "demo.episode_s=9.0",
@@ -59,7 +59,7 @@ def test_along_a_path_the_demo_drives_in_the_corridor_of_its_policy(tmp_path):
     ["vehicle=kinematic_speed", "vehicle.mass=900.0", "vehicle.name=hovercraft"],
 )
 def test_a_vehicle_for_which_nothing_ships_is_refused_before_it_drives(tmp_path, other):
-    done = door("demo", other, cwd=tmp_path, code=1)
+    done = run_command("demo", other, cwd=tmp_path, code=1)
     assert done.stderr.startswith("sfkd_jax: controllers ship for ")
     assert len(done.stderr.strip().splitlines()) == 1
     assert list(tmp_path.iterdir()) == []

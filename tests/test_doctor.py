@@ -6,13 +6,13 @@ import tomllib
 from pathlib import Path
 
 import pytest
-from helpers import door, last_line
+from helpers import run_command, last_line
 
 from sfkd_jax import doctor
 
 
 def test_it_says_what_is_there_and_writes_nothing(tmp_path):
-    done = door("doctor", cwd=tmp_path)
+    done = run_command("doctor", cwd=tmp_path)
     found = last_line(done)
     assert set(found) == {"versions", "devices", "extras", "advice", "seconds"}
     assert {"python", "jax", "flax", "sfkd_jax"} <= set(found["versions"])

@@ -1,7 +1,7 @@
-"""What a setting may be: what cannot be meant is one line that names it, whichever
-setting of whichever option.
-"""
+"""Ranges: a wrong value of any setting of any option is refused in one line."""
 
+import copy
+import dataclasses
 import math
 import random
 import re
@@ -13,7 +13,8 @@ from omegaconf import OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
 from sfkd_jax import build
-from sfkd_jax.cli import config, ranges
+from sfkd_jax.cli import config, groups, messages, ranges
+from sfkd_jax.core.ranges import Interval
 from sfkd_jax.pipeline import dry_run
 
 MODELS = (
@@ -27,6 +28,9 @@ MODELS = (
 )
 OPTIONS = (
     *(f"model={name}" for name in MODELS),
+    "controller=cem",
+    "controller=gradient",
+    "controller=koopman_mpc",
     "vehicle=dynamic",
     "vehicle=own",
     "dataset=files",
@@ -97,6 +101,12 @@ def names(option):
     return dict(leaves(container(option)))
 
 
+def check(name, value):
+    settings = copy.deepcopy(composed("model=sfkd"))
+    OmegaConf.update(settings, name, value)
+    ranges.check(settings, groups.root_schema())
+
+
 def use(settings):
     """What `train` does before anything is made."""
     plant = build.build_vehicle(settings["vehicle"])
@@ -107,17 +117,17 @@ def use(settings):
 
 
 def refusal(option, name, value):
-    """The line with which a setting is refused, by its type or by what it says; None if
-    it is not.
+    """The line with which a setting is refused, by its type or its value; None if it
+    is accepted.
     """
     settings = composed(option)
     before = OmegaConf.select(settings, name)
     before = OmegaConf.to_container(before) if OmegaConf.is_config(before) else before
     try:
         OmegaConf.update(settings, name, value)
-        use(config._settings(settings))
+        use(config.plain_settings(settings))
     except OmegaConfBaseException as reason:
-        return f"{name}: {config._one_line(reason)}"
+        return f"{name}: {messages.one_line(reason)}"
     except ValueError as reason:
         return str(reason)
     else:
@@ -127,8 +137,8 @@ def refusal(option, name, value):
 
 
 def impossible(name, value):
-    """Values that a setting cannot have, whatever the tables say: of another type, not
-    finite, or below 0.
+    """Values that a setting cannot have, whatever its annotation states: of another
+    type, not finite, or below 0.
     """
     sample = value[0] if isinstance(value, list) and value else value
     if value == []:
@@ -253,12 +263,40 @@ def test_the_line_says_what_a_setting_must_be_and_what_it_is(name, value, says):
     assert refusal("comparison=paper", name, value) == says
 
 
-def test_every_name_in_the_tables_is_a_setting():
-    known = {name for option in OPTIONS for name in names(option)}
+def fields(schema, above):
+    for entry in dataclasses.fields(schema):
+        if dataclasses.is_dataclass(entry.type):
+            yield from fields(entry.type, f"{above}.{entry.name}")
+        else:
+            yield f"{above}.{entry.name}", entry.metadata["rule"]
+
+
+def rules():
+    listed = {
+        f"{group}/{name}": schema
+        for group, schemas in groups.schemas().items()
+        for name, schema in schemas.items()
+    }
+    return [
+        pair
+        for option, schema in (listed | {"": groups.root_schema()}).items()
+        for pair in fields(schema, option)
+    ]
+
+
+def test_every_setting_states_what_it_may_be():
+    free = [name for name, rule in rules() if rule.kind is None and rule.values is None]
+    assert free == []
+
+
+def test_every_interval_excludes_a_number_that_its_kind_would_allow_or_allows_more():
+    """An annotation that states the default would say nothing."""
+    stated = {rule.interval for _, rule in rules() if rule.interval}
+    assert {Interval("(0, inf)"), Interval("(0, 1)"), Interval("[2, inf)")} <= stated
     assert [
-        one
-        for one in ranges.patterns()
-        if not any(ranges.fits(name, one) for name in known)
+        name
+        for name, rule in rules()
+        if rule.interval and rule.interval == ranges.DEFAULT[rule.kind]
     ] == []
 
 
@@ -268,14 +306,10 @@ def test_every_name_in_the_tables_is_a_setting():
 )
 @pytest.mark.parametrize("setting", ["name", "model.system", "comparison.policies"])
 def test_a_run_stays_below_the_root(setting, name):
-    asked = container("model=sfkd")
-    *above, last = setting.split(".")
-    inner = asked[above[0]] if above else asked
-    inner[last] = name
     with pytest.raises(
         ValueError, match=rf"^{re.escape(setting)} must be a path below root"
     ) as refused:
-        ranges.check(asked)
+        check(setting, name)
     assert "\n" not in str(refused.value)
 
 
@@ -291,15 +325,12 @@ def test_a_run_stays_below_the_root(setting, name):
     ],
 )
 def test_names_with_folders_and_settings_in_them_are_names(name):
-    ranges.check(container("model=sfkd") | {"name": name})
+    check("name", name)
 
 
 def test_the_keys_of_a_comparison_are_names_of_files():
-    asked = container("model=sfkd")
-    asked["comparison"]["rows"] = {"noise 0.1 and 2 m/s": "model=sfkd"}
-    ranges.check(asked)
-    asked["comparison"]["rows"] = {" ../../x": "model=sfkd"}
+    check("comparison.rows", {"noise 0.1 and 2 m/s": "model=sfkd"})
     with pytest.raises(
         ValueError, match=r"comparison\.rows must have keys that are names of files"
     ):
-        ranges.check(asked)
+        check("comparison.rows", {" ../../x": "model=sfkd"})

@@ -16,8 +16,9 @@ from sfkd_jax.cli import queues, sweeps
 SCRIPT = """
     import os
 
-    from sfkd_jax import shelf
-    from sfkd_jax.cli.config import command, door
+    from sfkd_jax.pipeline import store
+    from sfkd_jax.cli.config import command_line
+    from sfkd_jax.cli.entry import hydra_command
 
     def run(settings):
         if settings["seed"] == 1:
@@ -26,11 +27,11 @@ SCRIPT = """
             raise TypeError("a job with a bug")
         if settings["seed"] == 4:
             os._exit(9)
-        print("typed", command("toy"))
-        return {"objective": (settings["seed"] - 3.0) ** 2, "run": str(shelf.run_directory(settings))}
+        print("typed", command_line("toy"))
+        return {"objective": (settings["seed"] - 3.0) ** 2, "run": str(store.run_directory(settings))}
 
     if __name__ == "__main__":
-        door(run)()
+        hydra_command(run)()
 """
 RATES = "training.learning_rate=1e-3,0.003"
 

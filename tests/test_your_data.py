@@ -1,4 +1,4 @@
-"""Logs of one's own through the door: from csv files to a certified policy that loads."""
+"""Logs of one's own through the command: from csv files to a certified policy that loads."""
 
 import json
 import shutil
@@ -9,7 +9,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from helpers import door, last_line
+from helpers import run_command, last_line
 from hydra import compose, initialize_config_dir
 from omegaconf import OmegaConf
 
@@ -76,7 +76,7 @@ def logs(tmp_path_factory):
 @pytest.mark.slow
 def test_logs_become_a_certified_policy_of_a_robot_that_nothing_drives(logs):
     walked = last_line(
-        done := door(
+        done := run_command(
             "train", *SMALL, *TINY, *FAST, "model.environment=false", cwd=logs.parent
         )
     )
@@ -110,7 +110,7 @@ def test_logs_lie_on_the_shelf_with_their_coverage_and_test_drives_alone_are_hel
     dataset, _ = stages.ensure_dataset(asked)
     assert [part.states.shape[1:] for part in dataset[:4]] == [(11, 5)] * 4
     assert sum(len(part.states) for part in dataset[:4]) == 8 * 12
-    held_out = stages.held_out_drives(asked, dataset)
+    held_out = stages.held_out_parts(asked, dataset)
     assert set(held_out) == {"test"}
     assert held_out["test"] is dataset.test
     covered = json.loads(

@@ -126,7 +126,7 @@ class Job:
             os.dup2(os.open(self.said, os.O_CREAT | os.O_TRUNC | os.O_WRONLY), 2)
             sys.argv = list(self.command)
             module = importlib.import_module(f"sfkd_jax.{self.command[0]}")
-            importlib.import_module("sfkd_jax.cli.config").door(module.run)()
+            importlib.import_module("sfkd_jax.cli.entry").hydra_command(module.run)()
             status = 0
         except SystemExit as left:
             status = left.code or 0
@@ -424,8 +424,8 @@ def main():
                 )
             }
         )
-        for door in {commands[0][0] for _, commands, _ in DRILLS.values()}:
-            importlib.import_module(f"sfkd_jax.{door}")
+        for command in {commands[0][0] for _, commands, _ in DRILLS.values()}:
+            importlib.import_module(f"sfkd_jax.{command}")
         timing = importlib.import_module("benchmarks.harness")
         settings = {"seed": asked.seed, "jobs": json.loads(json.dumps(DRILLS))}
         document = (

@@ -2,15 +2,18 @@
 weights, a bend to follow.
 """
 
+from functools import partial
+
 from benchmarks import harness
 from benchmarks.timing import ours
+from sfkd_jax.core.folding import fold
 
 SPEED, RADIUS = 10.0, 50.0
 PLANT = "vehicle=dynamic"
 
 
 def settings(*overrides):
-    """The composed configuration of the doors, as plain settings."""
+    """The composed configuration of the commands, as plain settings."""
     import hydra
     from omegaconf import OmegaConf
 
@@ -99,7 +102,7 @@ def problem(samples, horizon, seed=0, **options):
     limits = {name: asked["dataset"][name] for name in ("env_low", "env_high")}
     controller = build.build_controller(asked["controller"], model, plant, **limits)
     params, *rest = inputs(plant, model, horizon)
-    params = jax.jit(model.fold)(params)
+    params = jax.jit(partial(fold, model))(params)
     return controller, (params, controller.init(jax.random.key(seed)), *rest)
 
 

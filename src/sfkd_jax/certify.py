@@ -1,4 +1,7 @@
-"""python -m sfkd_jax.certify: certify the policy of a run. Exit 2 refused, 3 stale."""
+"""Certify the policy of a run.
+
+Exit codes: 0 certified, 2 refused, 3 stale.
+"""
 
 from __future__ import annotations
 
@@ -6,8 +9,13 @@ from typing import Any
 
 from sfkd_jax import artefacts
 from sfkd_jax.certification import CertificateStale, CertificationRefused
-from sfkd_jax.cli.config import door
+from sfkd_jax.cli.entry import hydra_command
 from sfkd_jax.pipeline import certificates, stages, store
+
+SECONDS = 2.3e-5
+"""Training time on two cores per step, segment of the batch and time step of the
+window, measured with +experiment=s3.
+"""
 
 
 @store.exclusive
@@ -19,6 +27,8 @@ def run(settings: dict[str, Any]) -> dict[str, Any]:
             `certification.renew` is false.
         CertificationRefused: nothing could be certified.
     """
+    if not artefacts.exists(store.run_directory(settings) / "policy.npz"):
+        artefacts.print_message(_announcement(settings))
     trained = stages.ensure_policy(settings)
     path = certificates.certificate_path(store.run_directory(settings))
     if path.exists() and not settings["certification"]["renew"]:
@@ -38,5 +48,17 @@ def run(settings: dict[str, Any]) -> dict[str, Any]:
     return summary | {key: document.get(key) for key in keys}
 
 
+def _announcement(settings: dict[str, Any]) -> str:
+    """Return what happens before the certification of a policy that is not trained."""
+    options = settings["training"]
+    steps = options["steps"]
+    seconds = SECONDS * steps * options["batch"] * options["window"]
+    return (
+        f"{store.run_directory(settings)} holds no trained policy: "
+        f"{settings['model']['system']} is trained first, at most {steps} steps, "
+        f"about {max(1, round(seconds / 60))} min on two cores; then it is certified"
+    )
+
+
 if __name__ == "__main__":
-    door(run)()
+    hydra_command(run)()

@@ -1,4 +1,4 @@
-"""python -m sfkd_jax.compare: evaluate every row of a table; run again to continue."""
+"""Evaluate every row of a table; the same command continues."""
 
 from __future__ import annotations
 
@@ -8,7 +8,8 @@ from pathlib import Path
 from typing import Any
 
 from sfkd_jax import artefacts
-from sfkd_jax.cli.config import command, compose, door
+from sfkd_jax.cli.config import command_line, compose
+from sfkd_jax.cli.entry import hydra_command
 from sfkd_jax.paper import write_results_page
 from sfkd_jax.pipeline import grid
 from sfkd_jax.pipeline.comparison import (
@@ -75,7 +76,7 @@ def _collect(
         raise ValueError(f"nothing to compare: no row came out ({reasons})")
     document = {
         "rows": rows,
-        "config": settings | {"command": command("compare")},
+        "config": settings | {"command": command_line("compare")},
         "versions": artefacts.versions(),
         "failed": failed,
         "seconds": seconds,
@@ -109,4 +110,4 @@ def _print_estimate(done: int, total: int, seconds: float) -> None:
 
 
 if __name__ == "__main__":
-    door(run)()
+    hydra_command(run)()

@@ -1,4 +1,4 @@
-"""python -m sfkd_jax.demo: a controller that ships with the package drives beside nominal and oracle; no training."""
+"""Drive a policy that ships with the package; nothing is trained."""
 
 from __future__ import annotations
 
@@ -7,9 +7,9 @@ from pathlib import Path
 from typing import Any
 
 from sfkd_jax import artefacts, build, evaluation, policy
-from sfkd_jax.cli.config import door
+from sfkd_jax.cli.entry import hydra_command
 from sfkd_jax.pipeline import evaluate_system, grid, store
-from sfkd_jax.reporting import animate
+from sfkd_jax.paper import animate
 
 SHIPPED = Path(__file__).with_name("pretrained")
 """vehicle, or vehicle_path in path coordinates -> policy.npz, its manifest and
@@ -34,7 +34,11 @@ def run(settings: dict[str, Any]) -> dict[str, Any]:
     plant = build.build_vehicle(settings["vehicle"])
     track = evaluate_system.make_episodes(settings, plant)
     own = build.System(
-        trained.model, trained.params, settings["env_source"], trained.certificate, trained.law
+        trained.model,
+        trained.params,
+        settings["env_source"],
+        trained.certificate,
+        trained.law,
     )
     systems = {trained.settings["model"]["system"]: own}
     systems |= {
@@ -48,14 +52,18 @@ def run(settings: dict[str, Any]) -> dict[str, Any]:
             artefacts.print_message(
                 f"driving {settings['demo']['episodes']} x {settings['demo']['episode_s']:.0f} s: {name}"
             )
-            driven = evaluate_system.compile_system(settings, plant, name, system, None)(track)
+            driven = evaluate_system.compile_system(
+                settings, plant, name, system, None
+            )(track)
             rows.append(grid.write_cell(folder / name, settings, track, driven))
         rows = evaluation.compare(rows)
         document = {"rows": rows, "config": settings, "versions": artefacts.versions()}
         artefacts.write_json(folder / "results.json", document)
         _print(rows)
         film = animate(place, rows, track.name, corridor=_corridor(trained))
-    artefacts.print_message(f"animation: {film}; {time.perf_counter() - began:.0f} s in all")
+    artefacts.print_message(
+        f"animation: {film}; {time.perf_counter() - began:.0f} s in all"
+    )
     return {
         "animation": film and str(film),
         "rows": len(rows),
@@ -127,4 +135,4 @@ def _print(rows: list[dict[str, Any]]) -> None:
 
 
 if __name__ == "__main__":
-    door(run)()
+    hydra_command(run)()

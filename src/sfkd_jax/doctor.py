@@ -1,4 +1,4 @@
-"""python -m sfkd_jax.doctor: versions, devices, optional extras that work or do not, and what to do about it."""
+"""Show versions, devices and extras, with advice on what is missing."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ import jax
 import jax.numpy as jnp
 
 from sfkd_jax import artefacts
-from sfkd_jax.cli.config import door
+from sfkd_jax.cli.entry import hydra_command
 
 CORE = (
     "jax",
@@ -158,4 +158,4 @@ def _advice(root: Path, devices: list[str]) -> list[str]:
 
 
 if __name__ == "__main__":
-    door(run)()
+    hydra_command(run)()

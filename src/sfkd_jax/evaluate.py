@@ -1,4 +1,4 @@
-"""python -m sfkd_jax.evaluate: simulate and score paired episodes of every system."""
+"""Simulate and score paired episodes of every system."""
 
 from __future__ import annotations
 
@@ -6,15 +6,16 @@ from typing import Any
 
 from hydra.core.hydra_config import HydraConfig
 
-from sfkd_jax.cli.config import command, door
+from sfkd_jax.cli.config import command_line
+from sfkd_jax.cli.entry import hydra_command
 from sfkd_jax.pipeline.evaluate_run import evaluate_run
 
 
 def run(settings: dict[str, Any]) -> dict[str, Any]:
     """Evaluate the systems of the run and add their rows to its results."""
-    typed = command("evaluate") if HydraConfig.initialized() else None
+    typed = command_line("evaluate") if HydraConfig.initialized() else None
     return evaluate_run(settings, command=typed)
 
 
 if __name__ == "__main__":
-    door(run)()
+    hydra_command(run)()

@@ -1,11 +1,11 @@
-"""python -m sfkd_jax.export: the controller of a run for processes without sfkd_jax, and for C and C++ through IREE."""
+"""Export a controller for programs without sfkd_jax, or for C and C++."""
 
 from __future__ import annotations
 
 from typing import Any
 
 from sfkd_jax import artefacts, build, policy
-from sfkd_jax.cli.config import door
+from sfkd_jax.cli.entry import hydra_command
 from sfkd_jax.exporting import write_controller
 from sfkd_jax.pipeline import store
 
@@ -33,7 +33,9 @@ def _write(settings: dict[str, Any]) -> dict[str, Any]:
     place = store.run_directory(settings)
     store.claim(settings)
     _, manifest = artefacts.read_arrays(place / "policy.npz", kind=policy.KIND)
-    trained = policy.load(place, controller=settings["controller"], env_source=settings["env_source"])
+    trained = policy.load(
+        place, controller=settings["controller"], env_source=settings["env_source"]
+    )
     if trained.certificate is None:
         artefacts.print_message("exported without a certificate and without a monitor")
     folder = place / FOLDER
@@ -55,4 +57,4 @@ def _write(settings: dict[str, Any]) -> dict[str, Any]:
 
 
 if __name__ == "__main__":
-    door(run)()
+    hydra_command(run)()

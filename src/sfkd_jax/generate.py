@@ -1,11 +1,11 @@
-"""python -m sfkd_jax.generate: drive the training vehicle and store the data set."""
+"""Make the training data: drive the vehicle, or read logs."""
 
 from __future__ import annotations
 
 import time
 from typing import Any
 
-from sfkd_jax.cli.config import door
+from sfkd_jax.cli.entry import hydra_command
 from sfkd_jax.pipeline import stages, store
 
 
@@ -23,4 +23,4 @@ def run(settings: dict[str, Any]) -> dict[str, Any]:
 
 
 if __name__ == "__main__":
-    door(run)()
+    hydra_command(run)()

@@ -1,4 +1,4 @@
-"""python -m sfkd_jax.report: a page, tables and figures from what lies in a run, or in many (`report.compare`)."""
+"""Write the page, tables and figures of a run, or of many runs."""
 
 from __future__ import annotations
 
@@ -7,9 +7,9 @@ from pathlib import Path
 from typing import Any
 
 from sfkd_jax import artefacts
-from sfkd_jax.cli.config import door
+from sfkd_jax.cli.entry import hydra_command
+from sfkd_jax.paper import beside_the_paper, write_comparison
 from sfkd_jax.pipeline import store
-from sfkd_jax.paper import write_comparison
 from sfkd_jax.reporting import write_report
 
 
@@ -24,11 +24,11 @@ def run(settings: dict[str, Any]) -> dict[str, Any]:
         pages = (
             write_comparison(place, pattern, settings["name"])
             if pattern
-            else write_report(place)
+            else write_report(place, studies=beside_the_paper)
         )
     artefacts.print_message(f"report: {pages['report']}")
     return pages
 
 
 if __name__ == "__main__":
-    door(run)()
+    hydra_command(run)()

@@ -1,4 +1,4 @@
-"""python -m sfkd_jax.train: from nothing to a certified controller and its report."""
+"""Train, certify and evaluate a policy, and write its report."""
 
 from __future__ import annotations
 
@@ -9,7 +9,9 @@ from typing import Any
 from hydra.core.hydra_config import HydraConfig
 
 from sfkd_jax import artefacts, build
-from sfkd_jax.cli.config import command, door
+from sfkd_jax.cli.config import command_line
+from sfkd_jax.cli.entry import hydra_command
+from sfkd_jax.paper import beside_the_paper
 from sfkd_jax.pipeline import certificates, dry_run, stages, store
 from sfkd_jax.pipeline.evaluate_run import evaluate_run
 from sfkd_jax.reporting import write_report
@@ -37,7 +39,7 @@ def _run_stages(settings: dict[str, Any]) -> dict[str, Any]:
     run_dir = store.run_directory(settings)
     certificate = certificates.certify_policy(settings)
     if build.build_vehicle(settings["vehicle"]).simulated:
-        typed = command("train") if HydraConfig.initialized() else None
+        typed = command_line("train") if HydraConfig.initialized() else None
         results = evaluate_run(settings, command=typed)["results"]
     else:
         results = None
@@ -46,7 +48,7 @@ def _run_stages(settings: dict[str, Any]) -> dict[str, Any]:
             "vehicle.step=package.module:function drives it"
         )
     with artefacts.as_artefact_error(run_dir):
-        pages = write_report(run_dir)
+        pages = write_report(run_dir, studies=beside_the_paper)
     artefacts.print_message(f"report: {pages['report']}")
     return {
         "run": str(run_dir),
@@ -77,4 +79,4 @@ def _objective(run_dir: Path) -> float | None:
 
 
 if __name__ == "__main__":
-    door(run)()
+    hydra_command(run)()

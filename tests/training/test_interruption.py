@@ -102,21 +102,21 @@ def test_signals_save_a_checkpoint_within_5_s_and_the_end_is_that_of_an_unbroken
     assert lines(place) == lines(tmp_path / "unbroken")
 
 
-DOOR = """
+COMMAND = """
 import os, signal, time
-from sfkd_jax.cli.config import door
+from sfkd_jax.cli.entry import hydra_command
 
 def run(settings):
     os.kill(os.getpid(), signal.SIGINT)
     time.sleep(60)
 
-door(run)()
+hydra_command(run)()
 """
 
 
-def test_a_door_that_is_interrupted_says_so_in_one_line_and_exits_130(tmp_path):
+def test_a_command_that_is_interrupted_says_so_in_one_line_and_exits_130(tmp_path):
     done = subprocess.run(
-        [sys.executable, "-c", DOOR],
+        [sys.executable, "-c", COMMAND],
         cwd=tmp_path,
         capture_output=True,
         text=True,

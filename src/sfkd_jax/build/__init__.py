@@ -5,7 +5,7 @@ from sfkd_jax.build._choices import as_kwargs as as_kwargs
 from sfkd_jax.build._choices import choose as choose
 from sfkd_jax.build._controllers import ENV_SOURCES as ENV_SOURCES
 from sfkd_jax.build._controllers import PLANNERS as PLANNERS
-from sfkd_jax.build._controllers import SEARCHES as SEARCHES
+from sfkd_jax.build._controllers import Planner as Planner
 from sfkd_jax.build._controllers import build_controller as build_controller
 from sfkd_jax.build._controllers import controller_horizon as controller_horizon
 from sfkd_jax.build._controllers import in_corridor as in_corridor

@@ -1,9 +1,10 @@
-"""Controllers out of plain settings."""
+"""Controllers from plain settings."""
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from functools import partial
-from typing import Any
+from typing import Any, NamedTuple
 
 from sfkd_jax import control, vehicle
 from sfkd_jax.build._choices import Settings, as_kwargs, choose, floats
@@ -11,13 +12,13 @@ from sfkd_jax.core.path_frame import LATERAL
 from sfkd_jax.types import Controller, Model
 
 ROAD_MARGIN = 0.05
-"""Relative, of the box of κ and v_ref: a reference of points has a curvature that is a
-little off.
+"""Relative enlargement of the box of κ and v_ref, since the curvature of a reference is
+computed from its points.
 """
 ALLOWANCE = 3.0
-"""Standard deviations of a measured position that are not held against the tube."""
+"""Standard deviations of a measured position by which the tube is enlarged."""
 ENV_SOURCES = ("measured", "estimated", "none")
-"""How a controller learns of the environment."""
+"""Where a controller takes the environment from."""
 
 
 def build_controller(
@@ -31,26 +32,34 @@ def build_controller(
     env_source: str = "measured",
     law: control.PathLaw | None = None,
 ) -> Controller:
-    """The planner of the settings, watched by a monitor if there is a certificate, told an estimate if `env_source` asks.
+    """Return the planner of the settings with its monitor, estimator or shield.
 
     Args:
-        certificate: what watches the planner; with a corridor and `settings["shield"]`,
-            what its shield keeps.
-        law: of a model in path coordinates, the one that it was learned around.
+        settings: of the controller.
+        model: the planner predicts with.
+        plant: vehicle, whose limits the controls keep.
+        env_low: lower ends of the environment box E.
+        env_high: upper ends of E.
+        certificate: bounds of a monitor around the planner; with a corridor and
+            `settings["shield"]`, of a shield.
+        env_source: one of `ENV_SOURCES`; "estimated" adds an estimator.
+        law: that a model in path coordinates was learned around.
 
     Raises:
         ValueError: an unknown planner, a vehicle without limits of its controls, or a
-            model and a planner of different frames.
+            model and a planner in different coordinates.
     """
     if not plant.control_low:
         raise ValueError(
-            "a controller needs vehicle.control_low and vehicle.control_high, as in [-0.4,-3.0]"
+            "a controller needs vehicle.control_low and vehicle.control_high, "
+            "as in [-0.4,-3.0]"
         )
-    build = choose(PLANNERS, settings.get("planner", "mppi"), "controller.planner")
+    build = _chosen(settings).build
     if model.along_path:
         if settings["sampling"] != "law" or env_source == "estimated" or law is None:
             raise ValueError(
-                "a model in path coordinates needs controller.sampling=law, its law, and env_source=measured or none"
+                "a model in path coordinates needs controller.sampling=law, its law, "
+                "and env_source=measured or none"
             )
         planner = build(settings, model, plant, env_low, env_high, law)
         if certificate and certificate.get("corridor") and settings.get("shield"):
@@ -69,6 +78,22 @@ def build_controller(
     )
 
 
+def _chosen(settings: Settings) -> Planner:
+    """Return the planner that the settings name.
+
+    Raises:
+        ValueError: it does not exist, or its own settings are missing.
+    """
+    name = settings.get("planner", "mppi")
+    planner = choose(PLANNERS, name, "controller.planner")
+    if name not in settings:
+        raise ValueError(
+            f"controller.planner={name} needs the settings controller.{name}; "
+            f"choose the option controller={name}"
+        )
+    return planner
+
+
 def in_corridor(
     planner: Controller,
     model: Model,
@@ -76,15 +101,15 @@ def in_corridor(
     law: control.PathLaw,
     certificate: Settings,
 ) -> Controller:
-    """The planner inside the corridor of a certificate; outside the boxes of ξ, e, κ and v_ref the law drives alone.
+    """Return the planner with a shield that keeps the corridor of a certificate.
 
-    The box of e_y is at least the corridor: whoever drives further out than the data
-    did is still where it is claimed.
+    Outside the boxes of ξ, e, κ and v_ref the law acts alone. The box of e_y contains
+    the corridor, since the claim holds there, whether or not the data reach that far.
 
     Args:
-        planner: any controller that needs no more than `Controller.act` is given.
-        model: along a path.
-        plant: whose limits of the controls hold.
+        planner: any controller that needs no other input than that of `Controller.act`.
+        model: in path coordinates.
+        plant: vehicle, whose limits the controls keep.
         law: around which the model was learned.
         certificate: with a corridor.
     """
@@ -149,7 +174,8 @@ def _estimated(
 
 
 def _sampled(
-    search: str,
+    name: str,
+    search: Callable[..., Controller],
     settings: Settings,
     model: Model,
     plant: vehicle.Vehicle,
@@ -157,10 +183,11 @@ def _sampled(
     env_high: Any,
     law: control.PathLaw | None = None,
 ) -> Controller:
-    """A planner that searches around a law: the path-following one (`sampling: feedback`), the model's own, none.
+    """Return a planner that searches around a feedback law.
 
-    In path coordinates it is the law of the policy, and the model already holds it
-    (`sampling: law`).
+    The law is the path-following one (`sampling: feedback`), that of the model
+    (`sampling: model`) or none (`sampling: plain`). In path coordinates it is the law
+    of the policy, which the model contains (`sampling: law`).
     """
     cost = control.tracking_cost(
         dt=plant.dt, speed_loop=plant.speed_loop, **as_kwargs(settings["cost"])
@@ -189,7 +216,7 @@ def _sampled(
             **as_kwargs(settings["task"]),
         )
     boxes = {"env_low": floats(env_low), "env_high": floats(env_high)}
-    return SEARCHES[search](task, **boxes, **as_kwargs(settings[search]))
+    return search(task, **boxes, **as_kwargs(settings[name]))
 
 
 def _feedback(settings: Settings, plant: vehicle.Vehicle) -> control.FeedbackLaw:
@@ -215,7 +242,7 @@ def _koopman_mpc(
     env_low: Any,
     env_high: Any,
 ) -> Controller:
-    """A quadratic program over a linear predictor, under the cost that the samplers have."""
+    """Return a quadratic program over a linear predictor, with the planners' cost."""
     return control.koopman_mpc(
         model,
         dt=plant.dt,
@@ -230,16 +257,51 @@ def _koopman_mpc(
     )
 
 
-SEARCHES = {
-    "mppi": control.mppi,
-    "cem": control.cem,
-    "gradient": control.gradient_planner,
+class Planner(NamedTuple):
+    """A planner: how it is built, and whose arguments are its settings.
+
+    Attributes:
+        build: (settings of the controller, model, plant, env_low, env_high) ->
+            controller; one that samples takes the law of a model in path coordinates.
+        factories: their keyword-only arguments are the settings `controller.NAME`.
+        given: of these arguments, those that are decided elsewhere.
+        samples: whether it searches around a law (`controller.sampling`).
+    """
+
+    build: Callable[..., Controller]
+    factories: tuple[Callable[..., Any], ...]
+    given: tuple[str, ...] = ()
+    samples: bool = True
+
+
+def _searching(name: str, search: Callable[..., Any], *given: str) -> Planner:
+    """Return a planner that searches around a law."""
+    build = partial(_sampled, name, search)
+    return Planner(build, (search, control.planner), given)
+
+
+_WEIGHTS = ("effective_samples", "temperature")
+"""Of the weighted mean, which only MPPI takes."""
+_COST = (
+    "lateral",
+    "course",
+    "speed",
+    "steering_rate",
+    "effort",
+    "terminal_weight",
+)
+"""Of the cost, which all planners share."""
+PLANNERS = {
+    "mppi": _searching("mppi", control.mppi),
+    "cem": _searching("cem", control.cem, *_WEIGHTS),
+    "gradient": _searching("gradient", control.gradient_planner, *_WEIGHTS),
+    "koopman_mpc": Planner(
+        _koopman_mpc, (control.koopman_mpc,), given=_COST, samples=False
+    ),
 }
-PLANNERS = {search: partial(_sampled, search) for search in SEARCHES} | {
-    "koopman_mpc": _koopman_mpc
-}
+"""Planners by the name under which a controller's settings hold their own."""
 
 
 def controller_horizon(settings: Settings) -> int:
-    """How many steps of the reference a controller wants to see."""
+    """Return how many steps of the reference a controller reads."""
     return settings[settings.get("planner", "mppi")]["horizon"]

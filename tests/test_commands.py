@@ -1,0 +1,286 @@
+"""The doors in a row, as a user opens them: last line JSON, one-line errors, artefacts
+intact.
+"""
+
+import json
+import shutil
+import subprocess
+import sys
+import textwrap
+from pathlib import Path
+
+import numpy as np
+import pytest
+from helpers import run_command, last_line
+
+from sfkd_jax import artefacts
+
+
+@pytest.fixture(scope="session")
+def walked(tmp_path_factory):
+    """One smoke walk from nothing; tests that spoil it copy it first."""
+    place = tmp_path_factory.mktemp("walk")
+    return place, last_line(run_command("train", "+experiment=smoke", cwd=place))
+
+
+@pytest.fixture
+def spoiled(walked, tmp_path):
+    shutil.copytree(walked[0] / "runs", tmp_path / "runs")
+    return tmp_path
+
+
+def test_train_walks_from_nothing_to_a_report(walked):
+    place, document = walked
+    keys = {
+        "run",
+        "checkpoint",
+        "certificate",
+        "results",
+        "report",
+        "open_loop_rmse_m",
+        "alpha",
+        "seconds",
+    }
+    assert set(document) == keys | {"objective"}
+    assert 0 < document["objective"] < np.inf
+    for name in ("run", "checkpoint", "certificate", "results", "report"):
+        assert (place / document[name]).exists()
+    assert len(document["open_loop_rmse_m"]) == 20
+    assert 0.9 < document["alpha"] < 0.996
+
+
+def test_results_have_the_rows_and_keys_that_others_rely_on(walked):
+    place, document = walked
+    results = json.loads((place / document["results"]).read_text())
+    assert results["config"]["command"] == "python -m sfkd_jax.train +experiment=smoke"
+    rows = {row["system"]: row for row in results["rows"]}
+    assert set(rows) == {"sfkd", "nominal", "oracle"}
+    measures = {
+        "rmse_m",
+        "max_deviation_m",
+        "rmse_after_switch_m",
+        "smoothness_rad_per_s",
+        "violation",
+        "ess",
+        "act_ms",
+    }
+    about = {
+        "system",
+        "model",
+        "controller",
+        "sampling",
+        "env",
+        "scenario",
+        "vehicle",
+        "seeds",
+        "episodes",
+        "params",
+    }
+    assert measures | about | {
+        "episode_s",
+        "departures",
+        "ratio_to_oracle",
+        "difference_to_sfkd",
+    } <= set(rows["sfkd"])
+    assert rows["oracle"]["ratio_to_oracle"] == 1.0
+    assert rows["nominal"]["rmse_m"]["mean"] > rows["oracle"]["rmse_m"]["mean"]
+
+
+def test_the_certificate_speaks_about_the_saved_weights(walked):
+    place, document = walked
+    certificate = json.loads((place / document["certificate"]).read_text())
+    _, manifest = artefacts.read_arrays(
+        place / document["run"] / "policy.npz", kind="policy"
+    )
+    assert certificate["valid"]
+    assert certificate["weights_sha256"] == manifest["sha256"]
+    assert len(certificate["tube"]["latent"]) == 20
+    assert set(certificate["d_bar"]["by_scenario"]) == {"s1", "s2", "s3"}
+    assert 1.0 <= certificate["tightness"] <= 1.1
+
+
+def test_training_logs_what_can_be_certified_at_every_checkpoint(walked):
+    place, document = walked
+    lines = [
+        json.loads(line)
+        for line in (place / document["run"] / "metrics.jsonl").read_text().splitlines()
+    ]
+    saved = [line for line in lines if "validation_loss" in line]
+    assert saved
+    assert all(
+        0.5 < line["alpha"] < min(line["alpha_separate"] * (1 + 1e-6), 1)
+        for line in saved
+    )
+    assert all(1.0 - 1e-9 <= line["tightness"] <= 1.1 for line in saved)
+
+
+def test_rows_count_violations_and_the_theorem_is_never_one(walked):
+    place, document = walked
+    rows = {
+        row["system"]: row
+        for row in json.loads((place / document["results"]).read_text())["rows"]
+    }
+    assert rows["sfkd"]["violation"]["v0"] == 0.0
+    assert rows["sfkd"]["violation"]["v1_tube"] == "certified"
+    assert rows["nominal"]["violation"]["v0"] is None
+    assert rows["nominal"]["violation"]["v1_tube"] == "conformal"
+    assert 0.0 <= rows["sfkd"]["breach_steps"] <= 1.0
+    assert rows["nominal"]["breach_steps"] is None
+
+
+def test_the_same_command_again_trains_nothing_and_ends_the_same(walked):
+    place, before = walked
+    weights = (place / before["run"] / "policy.npz").read_bytes()
+    again = last_line(run_command("train", "+experiment=smoke", cwd=place))
+    assert (place / again["run"] / "policy.npz").read_bytes() == weights
+    assert again["open_loop_rmse_m"] == before["open_loop_rmse_m"]
+
+
+def test_other_settings_in_the_same_place_are_refused(walked):
+    done = run_command(
+        "train", "+experiment=smoke", "training.steps=100", cwd=walked[0], code=1
+    )
+    assert "training.steps was 150, is now 100" in done.stderr
+    assert len(done.stderr.strip().splitlines()) == 1
+
+
+def test_load_gives_a_policy_without_heavy_imports(walked):
+    place, document = walked
+    program = f"""
+        import sys, jax, jax.numpy as jnp, sfkd_jax
+        policy = sfkd_jax.load({document["run"]!r})
+        assert not {{"hydra", "orbax", "cvxpy", "matplotlib", "optax"}} & set(sys.modules), "heavy import"
+        state = policy.controller.init(jax.random.key(0))
+        road = jnp.stack([jnp.arange(1.0, 21.0), jnp.zeros(20), jnp.zeros(20), jnp.full(20, 10.0)], axis=1)
+        env = jnp.array([0.9, 0.0])
+        act = jax.jit(policy.controller.act)
+        control, state, info = act(policy.params, state, jnp.array([0.0, 0.3, 0.0, 10.0]), env, road)
+        assert control.shape == (2,) and bool(info["healthy"]) and policy.certificate["valid"]
+        assert not bool(info["breach"]) and not bool(info["box_exit"])
+        far = jnp.array([0.0, 0.3, 0.0, 40.0])
+        _, state, info = act(policy.params, state, far, env, road)
+        assert bool(info["breach"]) and bool(info["box_exit"]) and int(info["breaches"]) == 1
+        from sfkd_jax.certification import Certificate, verify
+        verify(Certificate.from_document(policy.certificate), policy.params, model=policy.model)
+        assert "cvxpy" not in sys.modules
+    """
+    done = subprocess.run(
+        [sys.executable, "-c", textwrap.dedent(program)],
+        cwd=place,
+        capture_output=True,
+        text=True,
+    )
+    assert done.returncode == 0, done.stderr
+
+
+def test_certify_exits_0_then_3_when_weights_changed_then_0_when_renewed(spoiled):
+    assert last_line(run_command("certify", "+experiment=smoke", cwd=spoiled))["valid"]
+    file = spoiled / "runs/smoke/sfkd/seed=0/policy.npz"
+    arrays, manifest = artefacts.read_arrays(file, kind="policy")
+    changed = {
+        name: np.asarray(array) * np.float32(1.01) for name, array in arrays.items()
+    }
+    artefacts.write_arrays(
+        file,
+        changed,
+        kind="policy",
+        config=manifest["config"],
+        made_from=manifest["made_from"],
+    )
+    assert (
+        "other weights"
+        in run_command("certify", "+experiment=smoke", cwd=spoiled, code=3).stderr
+    )
+    renewed = last_line(
+        run_command("certify", "+experiment=smoke", "certification.renew=true", cwd=spoiled)
+    )
+    assert renewed["alpha"] < 1.0
+
+
+def test_a_model_without_a_bound_is_driven_but_refused_a_certificate(walked):
+    place = walked[0]
+    small = (
+        "model=sfkd_no_contraction",
+        "training.steps=25",
+        "training.save_every=25",
+        "evaluation.systems=[self]",
+    )
+    walk = last_line(run_command("train", "+experiment=smoke", *small, cwd=place))
+    assert walk["alpha"] is None
+    done = run_command("certify", "+experiment=smoke", *small, cwd=place, code=2)
+    assert done.stderr.strip().splitlines()[-1].startswith("sfkd_jax: refused:")
+
+
+@pytest.mark.parametrize("damage", ["truncate", "foreign", "flip"])
+def test_a_damaged_policy_is_named_in_one_line(spoiled, damage):
+    file = spoiled / "runs/smoke/sfkd/seed=0/policy.npz"
+    content = bytearray(file.read_bytes())
+    if damage == "truncate":
+        file.write_bytes(content[: len(content) // 2])
+    elif damage == "foreign":
+        file.write_bytes(b"not an archive")
+    else:
+        content[len(content) // 2] ^= 0xFF
+        file.write_bytes(content)
+    done = run_command("evaluate", "+experiment=smoke", cwd=spoiled, code=1)
+    assert "policy" in done.stderr
+    assert "Traceback" not in done.stderr
+    assert (spoiled / "runs/smoke/sfkd/seed=0/results.json").exists()
+
+
+def test_a_policy_without_its_manifest_is_finished_again_from_the_checkpoint(spoiled):
+    file = spoiled / "runs/smoke/sfkd/seed=0/policy.npz"
+    weights = artefacts.read_arrays(file, kind="policy")[1]["sha256"]
+    file.with_suffix(".json").unlink()
+    run_command("certify", "+experiment=smoke", cwd=spoiled)
+    assert artefacts.read_arrays(file, kind="policy")[1]["sha256"] == weights
+
+
+def test_a_scenario_of_choice_adds_rows_and_keeps_the_others(spoiled):
+    run_command("evaluate", "+experiment=smoke", "scenario=s1", cwd=spoiled)
+    rows = json.loads((spoiled / "runs/smoke/sfkd/seed=0/results.json").read_text())[
+        "rows"
+    ]
+    assert {(row["system"], row["scenario"]) for row in rows} == {
+        (system, scenario)
+        for system in ("sfkd", "nominal", "oracle")
+        for scenario in ("s1", "s3")
+    }
+    report = last_line(run_command("report", "+experiment=smoke", cwd=spoiled))
+    assert all((spoiled / figure).exists() for figure in report["figures"])
+
+
+@pytest.mark.parametrize(
+    ("arguments", "says"),
+    [
+        (("+experiment=s9",), "smoke"),
+        (("+experiment=smoke", "model=sfdk"), "sfkd_segment"),
+        (("+experiment=smoke", "evaluation.systems=[oracel]"), "oracle"),
+        (("+experiment=smoke", "model.frame=boddy", "name=bad"), "segment"),
+        (("+experiment=smoke", "training.window=80", "name=bad"), "80"),
+        (("+experiment=smoke", "dataset.shares=[0.5,0.5,0.5,0.5]"), "shares"),
+        (
+            ("+experiment=smoke", "training.batch=0"),
+            "training.batch must be in [1, inf), got 0",
+        ),
+    ],
+)
+def test_bad_input_is_answered_with_the_choices(walked, arguments, says):
+    name = "evaluate" if "systems" in arguments[-1] else "train"
+    done = run_command(name, *arguments, cwd=walked[0], code=1)
+    assert says in done.stderr
+    assert len(done.stderr.strip().splitlines()) == 1
+
+
+def test_the_example_in_the_readme_runs_with_a_policy_of_its_first_command():
+    root = Path(__file__).parents[1]
+    program = (
+        (root / "README.md").read_text("utf-8").split("```python\n")[1].split("```")[0]
+    )
+    shipped = root / "src/sfkd_jax/pretrained/kinematic_path"
+    program = program.replace('"runs/s3/sfkd_path/seed=0"', repr(str(shipped)))
+    assert str(shipped) in program
+    done = subprocess.run(
+        [sys.executable, "-c", program], capture_output=True, text=True
+    )
+    assert done.returncode == 0, done.stderr
