@@ -12,12 +12,12 @@ from pathlib import Path
 import numpy as np
 import pytest
 from helpers import refusal_of
-from sfkd_jax.reporting._scene import scenes_of
-from sfkd_jax.reporting._tables import block_title, blocks_of
 
 from sfkd_jax import artefacts
 from sfkd_jax.artefacts import DirectoryLocked, locked
 from sfkd_jax.pipeline import evaluate_run
+from sfkd_jax.reporting.rows import group_title, groups_of
+from sfkd_jax.reporting.scene import scenes_of
 
 ROW = {
     "system": "sfkd", "scenario": "s3", "vehicle": "kinematic", "inner_loop": "none", "controller": "mppi",
@@ -201,9 +201,9 @@ def test_three_planners_in_one_directory_keep_three_rows_with_their_episodes(tmp
         3: False,
     }
     assert len({scene.stem for scene in scenes}) == 3
-    blocks = blocks_of(retained)
+    blocks = groups_of(retained)
     assert [len(block) for block in blocks] == [1, 1, 1]
-    assert len({block_title(block) for block in blocks}) == 3
+    assert len({group_title(block) for block in blocks}) == 3
     store(tmp_path, rows[1], 7.0)
     retained, arrays = stored(tmp_path)
     assert len(retained) == 3

@@ -98,29 +98,31 @@ def not_finite(state):
     return sum(jnp.sum(~jnp.isfinite(leaf)) for leaf in leaves)
 
 
-def controlled(plant, env, delay, samples):
+def controlled(plant, env_source, delay, samples):
     """The shipped policy as a user has it: (vehicle, params, controller, sensor noise)."""
     place = SHIPPED / plant
     settings = sfkd_jax.load(place).settings
     changes = {"monitor": {"fallback": "hold"}, "mppi": {"num_samples": samples}}
     chosen = settings["controller"]
     chosen = chosen | {name: chosen[name] | change for name, change in changes.items()}
-    policy = sfkd_jax.load(place, controller=chosen, env_source=env)
+    policy = sfkd_jax.load(place, controller=chosen, env_source=env_source)
     controller = policy.controller
     if delay:
-        controller = control.compensated(controller, policy.model, delay=delay)
+        controller = control.delay_compensated(controller, policy.model, delay=delay)
     noise = policy.certificate["monitor"]["sensor_noise"]
     return (
         build.build_vehicle(settings["vehicle"]),
-        policy.model.fold(policy.params),
+        policy.params,
         controller,
         noise,
     )
 
 
-def track(plant, *, env="measured", delay=0, samples=SAMPLES, faulty=True, steps=ROAD):
+def track(
+    plant, *, env_source="measured", delay=0, samples=SAMPLES, faulty=True, steps=ROAD
+):
     """The closed loop over roads of `steps` steps."""
-    car, params, controller, noise = controlled(plant, env, delay, samples)
+    car, params, controller, noise = controlled(plant, env_source, delay, samples)
     size = len(car.state_names)
     spread = jnp.asarray(noise[:size])
     family = scenarios.scenario(
