@@ -28,8 +28,9 @@ def episode(env, seed, steps=30):
     return np.stack([first, *(step[0] for step in taken)]), taken
 
 
-def test_it_passes_the_checker(made):
-    check_env(made.unwrapped, skip_render_check=True)
+def test_it_passes_the_checker_also_where_it_draws():
+    env = gymnasium.make("sfkd_jax/Vehicle-v0", render_mode="rgb_array", **SETTINGS)
+    check_env(env.unwrapped)
 
 
 def test_registering_twice_changes_nothing():
@@ -106,6 +107,59 @@ def test_a_vector_of_them_steps():
     assert np.any(observations[0] != observations[1])
 
 
+def test_an_image_shows_the_car_and_changes_as_it_drives():
+    env = gymnasium.make("sfkd_jax/Vehicle-v0", render_mode="rgb_array", **SETTINGS)
+    with pytest.raises(gymnasium.error.ResetNeeded):
+        env.unwrapped.render()
+    images = []
+    env.reset(seed=0)
+    for _ in range(3):
+        images.append(env.render())
+        for _ in range(5):
+            env.step(ACTION)
+    assert {(image.shape, str(image.dtype)) for image in images} == {
+        ((480, 640, 3), "uint8")
+    }
+    assert all(len(np.unique(image.reshape(-1, 3), axis=0)) > 10 for image in images)
+    assert np.any(images[0] != images[1])
+    again = [env.reset(seed=0), env.render()][1]
+    np.testing.assert_array_equal(again, images[0])
+    env.close()
+
+
+def test_a_window_is_drawn_at_every_step():
+    """Without a screen the backend is Agg: frames are drawn and not shown."""
+    env = gymnasium.make("sfkd_jax/Vehicle-v0", render_mode="human", **SETTINGS)
+    env.reset(seed=0)
+    env.step(ACTION)
+    assert env.render() is None
+    before = env.unwrapped._view.image()
+    env.step(ACTION)
+    assert np.any(env.unwrapped._view.image() != before)
+    env.close()
+
+
+def test_observations_and_actions_have_limits_where_there_are_any(made):
+    space = made.observation_space
+    bounded = np.isfinite(space.high)
+    # Of e_y, e_ψ, v, two actions, friction, wind, then ten points (x, y, ψ, v).
+    expected = [False, True, False, True, True, False, False] + 10 * [
+        False,
+        False,
+        True,
+        False,
+    ]
+    np.testing.assert_array_equal(bounded, expected)
+    np.testing.assert_allclose(space.high[[1, 3, 4]], [np.pi, 1.0, 1.0], rtol=1e-6)
+    assert space.low[5] == 0.0
+    observations, _ = episode(made, 5)
+    assert all(space.contains(observation) for observation in observations)
+    for action in (made.action_space.high, made.action_space.low):
+        made.reset(seed=1)
+        observation, *_ = made.step(action)
+        assert space.contains(observation)
+
+
 def test_it_refuses_bad_settings_and_a_step_before_the_reset():
     with pytest.raises(
         ValueError, match="unknown scenario 's9'; choose one of"
@@ -114,3 +168,5 @@ def test_it_refuses_bad_settings_and_a_step_before_the_reset():
     assert "\n" not in str(refusal.value)
     with pytest.raises(gymnasium.error.ResetNeeded):
         adapters.GymnasiumVehicle().step(ACTION)
+    with pytest.raises(ValueError, match="render_mode must be one of human, rgb_array"):
+        adapters.GymnasiumVehicle(render_mode="ansi")

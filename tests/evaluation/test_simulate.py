@@ -89,7 +89,7 @@ def test_the_oracle_drives_better_than_the_nominal_model():
     ]
     assert np.all(scores[0]["rmse_m"] < scores[1]["rmse_m"])
     assert np.all(scores[0]["rmse_m"] < 0.1)
-    assert not np.any(scores[0].departed)
+    assert not np.any(scores[0]["departures"])
 
 
 def test_without_sensor_noise_the_oracle_predicts_its_next_position_exactly():

@@ -11,7 +11,7 @@ import pytest
 from helpers import at, driven, jit, model_and_params
 
 from sfkd_jax import evaluation, models, scenarios, vehicle
-from sfkd_jax.core.rollouts import every_window, fibers_along, rollout, window_errors
+from sfkd_jax.core.rollouts import fibers_along, rollout, sliding_windows, window_errors
 from sfkd_jax.evaluation import (
     Claims,
     Predictions,
@@ -60,7 +60,7 @@ def predicted(model, params, data, **lengths):
 
 def test_windows_are_the_stretches_that_start_at_every_stride():
     one = at(driven(), 0)
-    cut = every_window(one, horizon=5, stride=3)
+    cut = sliding_windows(one, horizon=5, stride=3)
     assert (
         cut.states.shape[0] == 3
     )  # from 0, 3, 6; the one from 9 does not fit into 12 steps
@@ -73,7 +73,7 @@ def test_windows_are_the_stretches_that_start_at_every_stride():
     with pytest.raises(
         ValueError, match="a horizon of 13 steps does not fit trajectories of 12 steps"
     ):
-        every_window(one, horizon=13, stride=1)
+        sliding_windows(one, horizon=13, stride=1)
 
 
 def test_errors_of_a_constant_drift_are_its_multiples_and_yaw_is_wrapped():
@@ -429,7 +429,7 @@ def test_a_controller_observes_the_wind_but_not_the_side_force():
 
 def test_pushes_are_redrawn_every_second_evenly_within_their_bound_and_grow_with_it():
     key = jax.random.key(1)
-    force = np.asarray(scenarios.side_pushes(key, steps=20005, dt=DT, largest=300.0))
+    force = np.asarray(scenarios.random_side_forces(key, steps=20005, dt=DT, largest=300.0))
     assert len(force) == 20005
     levels = force[:20000].reshape(-1, 10)
     assert np.all(levels == levels[:, :1])
@@ -439,7 +439,7 @@ def test_pushes_are_redrawn_every_second_evenly_within_their_bound_and_grow_with
         np.quantile(force, [0.1, 0.5, 0.9]), [-240.0, 0.0, 240.0], atol=20.0
     )
     np.testing.assert_allclose(
-        scenarios.side_pushes(key, steps=20005, dt=DT, largest=600.0),
+        scenarios.random_side_forces(key, steps=20005, dt=DT, largest=600.0),
         2 * force,
         rtol=1e-6,
     )

@@ -1,7 +1,8 @@
-"""The vehicles and scenarios as a gymnasium environment: numpy outside, compiled inside."""
+"""The vehicles and scenarios as a gymnasium environment."""
 
 from __future__ import annotations
 
+from functools import partial
 from typing import Any
 
 import gymnasium
@@ -9,69 +10,79 @@ import jax
 import numpy as np
 from jaxtyping import Array, Float
 
-from sfkd_jax.adapters._task import Moment, Outcome, tracking_task
-from sfkd_jax.scenarios import Scenario
+from sfkd_jax.adapters._drawing import RoadView
+from sfkd_jax.adapters._task import DrivingTask, Moment, Outcome, tracking_task
+from sfkd_jax.scenarios import Scenario, point_at
 from sfkd_jax.types import Control, Key
 
 NAME = "sfkd_jax/Vehicle-v0"
+MODES = ("human", "rgb_array")
 
 
 def register_gymnasium() -> None:
-    """Make `gymnasium.make("sfkd_jax/Vehicle-v0", …)` build a `GymnasiumVehicle`; a second call changes nothing."""
+    """Make `gymnasium.make("sfkd_jax/Vehicle-v0", …)` build a `GymnasiumVehicle`."""
     if NAME not in gymnasium.registry:
         gymnasium.register(id=NAME, entry_point="sfkd_jax.adapters:GymnasiumVehicle")
 
 
 class GymnasiumVehicle(gymnasium.Env):
-    """Following a path, as `gymnasium.Env`; settings, observation, action and reward are those of `tracking_task`.
+    """Path following as `gymnasium.Env`, with the settings of `tracking_task`.
 
-    Terminated where the car left the lane, truncated where the road ended. The same
+    Observation, action and reward are those of `tracking_task`. An episode is
+    terminated if the car leaves the lane and truncated at the end of the road. The same
     seed gives the same road, friction and wind; `reset` without a seed gives the next
     of the stream that the last seed began.
 
+    Args:
+        render_mode: "rgb_array" for images, "human" for a window, or None.
+        settings: of `tracking_task`.
+
     Raises:
-        ValueError: as `tracking_task`.
+        ValueError: an unknown render mode, or as `tracking_task`.
     """
 
-    metadata = {"render_modes": []}  # noqa: RUF012
+    metadata = {"render_modes": list(MODES), "render_fps": 10}  # noqa: RUF012
 
-    def __init__(self, **settings: Any) -> None:
-        task = tracking_task(**settings)
+    def __init__(self, *, render_mode: str | None = None, **settings: Any) -> None:
+        if render_mode not in (None, *MODES):
+            raise ValueError(
+                f"render_mode must be one of {', '.join(MODES)}, got {render_mode!r}"
+            )
+        task = self._task = tracking_task(**settings)
+        self.render_mode = render_mode
+        self.metadata = {**self.metadata, "render_fps": round(1 / task.plant.dt)}
         self.observation_space = gymnasium.spaces.Box(
-            -np.inf, np.inf, (task.observation_size,), np.float32
+            np.asarray(task.observation_low, dtype=np.float32),
+            np.asarray(task.observation_high, dtype=np.float32),
+            dtype=np.float32,
         )
         self.action_space = gymnasium.spaces.Box(
             -1.0, 1.0, (task.action_size,), np.float32
         )
         self._now: tuple[Scenario, Moment] | None = None
-
-        def start(key: Key) -> tuple[Scenario, Moment, Float[Array, " observation"]]:
-            road, moment = task.reset(key)
-            return road, moment, task.observe(road, moment)
-
-        def advance(
-            road: Scenario, moment: Moment, action: Control
-        ) -> tuple[Moment, Outcome, Float[Array, " observation"]]:
-            moment, outcome = task.step(road, moment, action)
-            return moment, outcome, task.observe(road, moment)
-
-        self._start, self._advance = jax.jit(start), jax.jit(advance)
+        self._view: RoadView | None = None
+        self._start = jax.jit(partial(_start, task))
+        self._advance = jax.jit(partial(_advance, task))
+        self._foot = jax.jit(_foot)
 
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
     ) -> tuple[np.ndarray, dict[str, Any]]:
-        """The start of an episode on a new road; there are no options."""
+        """Start an episode on a new road; there are no options."""
         super().reset(seed=seed, options=options)
         road, moment, observation = self._start(
             jax.random.key(int(self.np_random.integers(2**31)))
         )
         self._now = road, moment
-        return np.array(observation), {}
+        if self.render_mode is not None:
+            self._new_view().start(np.asarray(road.path.points))
+            self._follow()
+        return self._bounded(observation), {}
 
     def step(
         self, action: np.ndarray
     ) -> tuple[np.ndarray, float, bool, bool, dict[str, Any]]:
-        """One sampling period.
+        """Simulate one sampling period.
 
         Raises:
             gymnasium.error.ResetNeeded: before the first reset.
@@ -83,11 +94,93 @@ class GymnasiumVehicle(gymnasium.Env):
             road, moment, np.asarray(action, dtype=np.float32)
         )
         self._now = road, moment
+        if self.render_mode is not None:
+            self._follow()
         info = {name: float(value) for name, value in outcome.measures.items()}
         return (
-            np.array(observation),
+            self._bounded(observation),
             float(outcome.reward),
             bool(outcome.left),
             bool(outcome.over),
             info,
         )
+
+    def render(self) -> np.ndarray | None:  # pyright: ignore
+        """Return the image of the last step, uint8, if the mode is "rgb_array".
+
+        Raises:
+            gymnasium.error.ResetNeeded: before the first reset.
+        """
+        if self.render_mode is None:
+            gymnasium.logger.warn(
+                "render is called without a render_mode; pass render_mode to make"
+            )
+            return None
+        if self._view is None:
+            raise gymnasium.error.ResetNeeded("call reset before render")
+        if self.render_mode == "human":
+            return None
+        self._draw(self._view)
+        return self._view.image()
+
+    def close(self) -> None:
+        """Close the window, if there is one."""
+        if self._view is not None:
+            self._view.close()
+            self._view = None
+
+    def _bounded(self, observation: Float[Array, " observation"]) -> np.ndarray:
+        """An observation within its bounds, from which rounding may take it."""
+        space: Any = self.observation_space
+        return np.clip(np.array(observation), space.low, space.high)
+
+    def _new_view(self) -> RoadView:
+        """The view, made at the first reset."""
+        if self._view is None:
+            self._view = RoadView(
+                dt=self._task.plant.dt,
+                lane=self._task.lane,
+                human=self.render_mode == "human",
+            )
+        return self._view
+
+    def _follow(self) -> None:
+        """Extend the driven line; a window is drawn at once, an image on demand."""
+        assert self._now is not None
+        assert self._view is not None
+        self._view.follow(np.asarray(self._now[1].state))
+        if self.render_mode == "human":
+            self._draw(self._view)
+
+    def _draw(self, view: RoadView) -> None:
+        """Draw the car at its position."""
+        assert self._now is not None
+        road, moment = self._now
+        state = np.asarray(moment.state)
+        seconds = int(moment.count) * self._task.plant.dt
+        title = (
+            f"{seconds:.1f} s, {state[3]:.1f} m/s, "
+            f"deviation {float(moment.lateral):+.2f} m"
+        )
+        view.draw(state, np.asarray(self._foot(road, moment)), title)
+
+
+def _start(
+    task: DrivingTask, key: Key
+) -> tuple[Scenario, Moment, Float[Array, " observation"]]:
+    """A new episode and its first observation."""
+    road, moment = task.reset(key)
+    return road, moment, task.observe(road, moment)
+
+
+def _advance(
+    task: DrivingTask, road: Scenario, moment: Moment, action: Control
+) -> tuple[Moment, Outcome, Float[Array, " observation"]]:
+    """One step and its observation."""
+    moment, outcome = task.step(road, moment, action)
+    return moment, outcome, task.observe(road, moment)
+
+
+def _foot(road: Scenario, moment: Moment) -> Float[Array, " 2"]:
+    """The closest point of the path [m]."""
+    return point_at(road.path, moment.progress)[:2]

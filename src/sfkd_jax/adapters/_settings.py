@@ -1,4 +1,4 @@
-"""What a task is made of, chosen by name or given, and refused in one line."""
+"""Choose and check the settings of a task."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from sfkd_jax.vehicle import Vehicle
 
 
 def choose_plant(vehicle: str | Vehicle, inner_loop: str) -> Vehicle:
-    """A plant by name, at the gain that its speed loop has by default."""
+    """Return a plant, or build one by name with the default gain of its speed loop."""
     if isinstance(vehicle, Vehicle):
         return vehicle
     return build.build_vehicle(
@@ -21,14 +21,14 @@ def choose_plant(vehicle: str | Vehicle, inner_loop: str) -> Vehicle:
 
 
 def choose_family(scenario: str | Family, plant: Vehicle, duration: float) -> Family:
-    """A scenario family by name, with the roads of the benchmark."""
+    """Return a scenario family, or build one of the benchmark by name."""
     if not isinstance(scenario, str):
         return scenario
     return build.build_scenario({"name": scenario}, plant, duration=duration)
 
 
 def count_steps(family: Family, plant: Vehicle) -> int:
-    """Length of the family's episodes; nothing is computed.
+    """Return the length of the family's episodes, from shapes alone.
 
     Raises:
         ValueError: the family is for another plant.
@@ -37,13 +37,14 @@ def count_steps(family: Family, plant: Vehicle) -> int:
     given, wanted = road.initial_state.shape, (len(plant.state_names),)
     if given != wanted:
         raise ValueError(
-            f"the scenario starts in a state of shape {given}, {plant.name!r} has {wanted}"
+            f"the scenario starts in a state of shape {given}, "
+            f"{plant.name!r} has {wanted}"
         )
     return road.envs.shape[0]
 
 
 def check_sizes(dt: float, *, duration: float, preview: int, lane: float) -> None:
-    """Refuse what leaves no step, no point ahead, or no lane."""
+    """Check that there is a step, a point ahead, and a lane."""
     if not (math.isfinite(duration) and duration >= dt):
         raise ValueError(
             f"duration must be finite and at least one step of {dt} s, got {duration}"
@@ -55,7 +56,20 @@ def check_sizes(dt: float, *, duration: float, preview: int, lane: float) -> Non
 
 
 def check_weights(**weights: float) -> None:
-    """Refuse what is negative or not finite."""
+    """Check that weights are finite and not negative."""
     for name, weight in weights.items():
         if not (math.isfinite(weight) and weight >= 0):
             raise ValueError(f"{name} must be finite and at least 0, got {weight}")
+
+
+def observation_bounds(
+    plant: Vehicle, preview: int
+) -> tuple[tuple[float, ...], tuple[float, ...]]:
+    """Return the limits of observations: of angles, actions and friction, else ∞."""
+    inf, turn = float("inf"), math.pi
+    body, controls = len(plant.state_names) - 3, len(plant.control_low)
+    high = (inf, turn, *[inf] * body, *[1.0] * controls, inf, inf)
+    high = (*high, *(inf, inf, turn, inf) * preview)
+    low = [-value for value in high]
+    low[2 + body + controls] = 0.0  # friction
+    return tuple(low), high

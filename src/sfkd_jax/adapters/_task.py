@@ -1,8 +1,9 @@
-"""Following a path as a task: what the brax and the gymnasium environment have in common, as pure functions."""
+"""Path following as a task, shared by the brax and gymnasium adapters."""
 
 from __future__ import annotations
 
 from collections.abc import Callable
+from functools import partial
 from typing import NamedTuple
 
 import jax
@@ -15,6 +16,7 @@ from sfkd_jax.adapters._settings import (
     choose_family,
     choose_plant,
     count_steps,
+    observation_bounds,
 )
 from sfkd_jax.core.se2 import between, wrap_angle
 from sfkd_jax.scenarios import Family, Scenario, point_at, project, reference_window
@@ -34,7 +36,7 @@ MEASURES = ("lateral", "speed_error", "steering_rate")
 
 
 class Moment(NamedTuple):
-    """Where an episode stands.
+    """The state of an episode.
 
     Attributes:
         state: x.
@@ -52,12 +54,12 @@ class Moment(NamedTuple):
 
 
 class Outcome(NamedTuple):
-    """What one step was worth.
+    """The outcome of one step.
 
     Attributes:
         reward: −ℓ.
-        left: whether the car left the lane (or faces backwards, or its state is not
-            finite).
+        left: whether the car left the lane, faces backwards, or its state is not
+            finite.
         over: whether the road ended with the car on it.
         measures: by the names of `MEASURES`: |e_y| [m], |e_v| [m/s], |δ̇| [rad/s].
     """
@@ -69,15 +71,18 @@ class Outcome(NamedTuple):
 
 
 class DrivingTask(NamedTuple):
-    """Following a path, for one car; callers vmap.
+    """Path following for one car; callers vmap.
 
     Attributes:
-        plant: whose step is taken.
+        plant: that is simulated.
         steps: of an episode, at most.
-        observation_size, action_size: of the vectors.
+        lane: half width [m].
+        observation_low: smallest observation, −∞ where there is no limit.
+        observation_high: largest observation, ∞ where there is no limit.
+        action_size: entries of an action.
         reset: key -> (road, moment).
         step: (road, moment, action) -> (moment, outcome).
-        observe: (road, moment) -> what a learner sees.
+        observe: (road, moment) -> observation.
         situation: (road, moment) -> (state, environment, reference), what
             `Controller.act` takes.
         control: action in [-1, 1] -> control in physical units.
@@ -86,7 +91,9 @@ class DrivingTask(NamedTuple):
 
     plant: Vehicle
     steps: int
-    observation_size: int
+    lane: float
+    observation_low: tuple[float, ...]
+    observation_high: tuple[float, ...]
     action_size: int
     reset: Callable[[Key], tuple[Scenario, Moment]]
     step: Callable[[Scenario, Moment, Control], tuple[Moment, Outcome]]
@@ -94,6 +101,24 @@ class DrivingTask(NamedTuple):
     situation: Callable[[Scenario, Moment], tuple[State, Environment, Reference]]
     control: Callable[[Control], Control]
     action: Callable[[Control], Control]
+
+    @property
+    def observation_size(self) -> int:
+        """Entries of an observation."""
+        return len(self.observation_low)
+
+
+class _Task(NamedTuple):
+    """The settings of `tracking_task`."""
+
+    plant: Vehicle
+    family: Family
+    preview: int
+    lane: float
+    lateral: float
+    speed: float
+    steering_rate: float
+    leaving: float
 
 
 def tracking_task(
@@ -109,17 +134,18 @@ def tracking_task(
     steering_rate: float = 5.0,
     leaving: float = 2e4,
 ) -> DrivingTask:
-    """ℓ = q_y e_y² + q_v e_v² + q_δ̇ (Δδ / dt)², and once the cost of leaving.
+    """ℓ = q_y e_y² + q_v e_v² + q_δ̇ (Δδ / dt)², plus the cost of leaving, once.
 
-    Road, friction and wind are drawn anew by every `reset`. The observation is, in this
+    Every `reset` draws a new road, friction and wind. The observation is, in this
     order, n = state size:
 
-        e_y [m], e_ψ [rad]          distance left of the path, yaw against it              2
-        s                           body state, e.g. v [m/s]                               n − 3
-        a                           last action, in [-1, 1]                                2
-        e                           friction [-], side wind [m/s], measured without error  2
-        (x, y, ψ, v) × preview      the next points of the path in the car's frame, a row
-                                    per sampling period at the speed to hold               4 · preview
+        e_y [m], e_ψ [rad]        distance left of the path, yaw relative to it        2
+        s                         body state, e.g. v [m/s]                         n − 3
+        a                         last action, in [-1, 1]                              2
+        e                         observed friction [-] and side wind [m/s]            2
+        (x, y, ψ, v) × preview    the next points of the path in the car's
+                                  frame, one per sampling period at the speed
+                                  to hold                                    4 · preview
 
     An action lies in [-1, 1] and is clipped to it; u = u_low + (u_high − u_low)(a +
     1)/2.
@@ -129,16 +155,17 @@ def tracking_task(
         scenario: "s1", "s2", "s3", …, or a family for this plant.
         inner_loop: "none" or "speed", for a vehicle given by name.
         duration: of a road [s].
-        preview: points ahead that are seen.
-        lane: half width; further from the path the car has left it [m].
-        lateral, speed, steering_rate: q_y [1/m²], q_v [s²/m²], q_δ̇ [s²/rad²], as the
-            planner has them.
+        preview: number of points ahead.
+        lane: half width; farther from the path the car has left it [m].
+        lateral: q_y [1/m²], as the planner has it.
+        speed: q_v [s²/m²].
+        steering_rate: q_δ̇ [s²/rad²].
         leaving: charged once [-]; standing still costs half of it at 10 m/s and a
             discount of 0.99.
 
     Raises:
-        ValueError: an unknown name, or a size, width, duration or weight that is not
-            positive (0 is a weight too).
+        ValueError: an unknown name, a size, width or duration that is not positive, or
+            a negative weight.
     """
     check_weights(
         lateral=lateral, speed=speed, steering_rate=steering_rate, leaving=leaving
@@ -146,93 +173,124 @@ def tracking_task(
     plant = choose_plant(vehicle, inner_loop)
     check_sizes(plant.dt, duration=duration, preview=preview, lane=lane)
     family = choose_family(scenario, plant, duration)
-    steps = count_steps(family, plant)
-    low, high = jnp.asarray(plant.control_low), jnp.asarray(plant.control_high)
-
-    def control(action: Control) -> Control:
-        return low + (high - low) * 0.5 * (jnp.clip(action, -1.0, 1.0) + 1.0)
-
-    def action(control: Control) -> Control:
-        return 2.0 * (control - low) / (high - low) - 1.0
-
-    def reset(key: Key) -> tuple[Scenario, Moment]:
-        road = family(key)
-        progress, offset = project(road.path, road.initial_state[:2], jnp.zeros(()))
-        still = jnp.zeros(len(plant.control_low))
-        return road, Moment(
-            road.initial_state, progress, offset, still, jnp.zeros((), dtype=jnp.int32)
-        )
-
-    def step(road: Scenario, moment: Moment, action: Control) -> tuple[Moment, Outcome]:
-        applied = control(action)
-        after = plant.step(moment.state, applied, _now(road, moment))
-        progress, offset = project(
-            road.path, after[:2], moment.progress + after[3] * plant.dt
-        )
-        reached = Moment(after, progress, offset, applied, moment.count + 1)
-        sound = jnp.all(
-            jnp.isfinite(
-                jnp.concatenate([after, applied, jnp.stack([progress, offset])])
-            )
-        )
-        kept: Moment = jax.tree.map(
-            lambda new, old: jnp.where(sound, new, old), reached, moment
-        )
-        backwards = jnp.abs(_heading(road, kept)) > 0.5 * jnp.pi
-        left = ~sound | (jnp.abs(kept.lateral) > lane) | backwards
-        over = ~left & (
-            (kept.count >= road.envs.shape[0]) | (kept.progress >= _length(road))
-        )
-        missed, turned = (
-            kept.state[3] - road.speed,
-            (kept.control[0] - moment.control[0]) / plant.dt,
-        )
-        cost = lateral * kept.lateral**2 + speed * missed**2 + steering_rate * turned**2
-        values = (kept.lateral, missed, turned)
-        measures = {
-            name: jnp.abs(value) for name, value in zip(MEASURES, values, strict=True)
-        }
-        return kept, Outcome(-cost - leaving * left, left, over, measures)
-
-    def situation(
-        road: Scenario, moment: Moment
-    ) -> tuple[State, Environment, Reference]:
-        reference = reference_window(
-            road.path, moment.progress, road.speed, dt=plant.dt, horizon=preview
-        )
-        return moment.state, _now(road, moment), reference
-
-    def observe(road: Scenario, moment: Moment) -> Float[Array, " observation"]:
-        state, env, reference = situation(road, moment)
-        ahead = jax.vmap(between, in_axes=(None, 0))(state[POSE], reference[:, :3])
-        points = jnp.concatenate([ahead, reference[:, 3:]], axis=1).ravel()
-        errors = jnp.stack([moment.lateral, _heading(road, moment)])
-        return jnp.concatenate(
-            [errors, state[BODY], action(moment.control), env, points]
-        )
-
-    size = 2 + (len(plant.state_names) - 3) + len(plant.control_low) + 2 + 4 * preview
+    task = _Task(plant, family, preview, lane, lateral, speed, steering_rate, leaving)
+    low, high = observation_bounds(plant, preview)
     return DrivingTask(
-        plant,
-        steps,
-        size,
-        len(plant.control_low),
-        reset,
-        step,
-        observe,
-        situation,
-        control,
-        action,
+        plant=plant,
+        steps=count_steps(family, plant),
+        lane=lane,
+        observation_low=low,
+        observation_high=high,
+        action_size=len(plant.control_low),
+        reset=partial(_reset, task),
+        step=partial(_step, task),
+        observe=partial(_observe, task),
+        situation=partial(_situation, task),
+        control=partial(_control, plant),
+        action=partial(_action, plant),
     )
 
 
-def _now(road: Scenario, moment: Moment) -> Environment:
+def _control(plant: Vehicle, action: Control) -> Control:
+    """An action in physical units, clipped to the limits."""
+    low, high = jnp.asarray(plant.control_low), jnp.asarray(plant.control_high)
+    return low + (high - low) * 0.5 * (jnp.clip(action, -1.0, 1.0) + 1.0)
+
+
+def _action(plant: Vehicle, control: Control) -> Control:
+    """A control as an action in [-1, 1]."""
+    low, high = jnp.asarray(plant.control_low), jnp.asarray(plant.control_high)
+    return 2.0 * (control - low) / (high - low) - 1.0
+
+
+def _reset(task: _Task, key: Key) -> tuple[Scenario, Moment]:
+    """A new road, and the car at its start."""
+    road = task.family(key)
+    progress, offset = project(road.path, road.initial_state[:2], jnp.zeros(()))
+    still = jnp.zeros(len(task.plant.control_low))
+    return road, Moment(
+        road.initial_state, progress, offset, still, jnp.zeros((), dtype=jnp.int32)
+    )
+
+
+def _step(
+    task: _Task, road: Scenario, moment: Moment, action: Control
+) -> tuple[Moment, Outcome]:
+    """One sampling period; a state that is not finite is replaced by the last one."""
+    plant = task.plant
+    applied = _control(plant, action)
+    after = plant.step(moment.state, applied, _at(road.envs, moment))
+    progress, offset = project(
+        road.path, after[:2], moment.progress + after[3] * plant.dt
+    )
+    reached = Moment(after, progress, offset, applied, moment.count + 1)
+    sound = jnp.all(
+        jnp.isfinite(jnp.concatenate([after, applied, jnp.stack([progress, offset])]))
+    )
+    kept: Moment = jax.tree.map(
+        lambda new, old: jnp.where(sound, new, old), reached, moment
+    )
+    return kept, _outcome(task, road, moment, kept, sound)
+
+
+def _outcome(
+    task: _Task, road: Scenario, before: Moment, kept: Moment, sound: Bool[Array, ""]
+) -> Outcome:
+    """Reward, end and measures of a step."""
+    backwards = jnp.abs(_heading(road, kept)) > 0.5 * jnp.pi
+    left = ~sound | (jnp.abs(kept.lateral) > task.lane) | backwards
+    over = ~left & (
+        (kept.count >= road.envs.shape[0]) | (kept.progress >= _length(road))
+    )
+    missed, turned = (
+        kept.state[3] - road.speed,
+        (kept.control[0] - before.control[0]) / task.plant.dt,
+    )
+    cost = (
+        task.lateral * kept.lateral**2
+        + task.speed * missed**2
+        + task.steering_rate * turned**2
+    )
+    values = (kept.lateral, missed, turned)
+    measures = {
+        name: jnp.abs(value) for name, value in zip(MEASURES, values, strict=True)
+    }
+    return Outcome(-cost - task.leaving * left, left, over, measures)
+
+
+def _situation(
+    task: _Task, road: Scenario, moment: Moment
+) -> tuple[State, Environment, Reference]:
+    """What a controller is given."""
+    reference = reference_window(
+        road.path,
+        moment.progress,
+        road.speed,
+        dt=task.plant.dt,
+        horizon=task.preview,
+    )
+    return moment.state, _at(road.observed_envs, moment), reference
+
+
+def _observe(
+    task: _Task, road: Scenario, moment: Moment
+) -> Float[Array, " observation"]:
+    """The observation, as `tracking_task` describes it."""
+    state, env, reference = _situation(task, road, moment)
+    ahead = jax.vmap(between, in_axes=(None, 0))(state[POSE], reference[:, :3])
+    points = jnp.concatenate([ahead, reference[:, 3:]], axis=1).ravel()
+    errors = jnp.stack([moment.lateral, _heading(road, moment)])
+    action = _action(task.plant, moment.control)
+    return jnp.concatenate([errors, state[BODY], action, env, points])
+
+
+def _at(envs: Float[Array, "time environment"], moment: Moment) -> Environment:
     """e_k, the last one beyond the end of the schedule."""
-    return road.envs[jnp.minimum(moment.count, road.envs.shape[0] - 1)]
+    return envs[jnp.minimum(moment.count, envs.shape[0] - 1)]
 
 
 def _heading(road: Scenario, moment: Moment) -> Scalar:
-    """Yaw against the path [rad]."""
+    """Yaw relative to the path [rad]."""
     return wrap_angle(moment.state[2] - point_at(road.path, moment.progress)[2])
 
 

@@ -1,5 +1,8 @@
 """Closed-loop and open-loop evaluation: episodes, scores and their statistics."""
 
+from sfkd_jax.evaluation._baselines import baselines as baselines
+from sfkd_jax.evaluation._baselines import bicycle_step as bicycle_step
+from sfkd_jax.evaluation._baselines import fit_bicycle as fit_bicycle
 from sfkd_jax.evaluation._closed_loop import Episode as Episode
 from sfkd_jax.evaluation._closed_loop import first_reference as first_reference
 from sfkd_jax.evaluation._closed_loop import simulate as simulate

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from functools import partial
 
 import jax
@@ -9,7 +10,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from sfkd_jax.core.path_frame import HEADING, LATERAL, PATH_SPEED
-from sfkd_jax.core.rollouts import every_window, in_batches, rollout
+from sfkd_jax.core.rollouts import in_batches, rollout, sliding_windows
 from sfkd_jax.core.se2 import rotate, wrap_angle
 from sfkd_jax.types import BODY, Model, Params, Trajectory
 
@@ -34,29 +35,64 @@ def open_loop(
     Raises:
         ValueError: the horizon does not fit the trajectories.
     """
-    cut = jax.vmap(partial(every_window, horizon=horizon, stride=horizon))
+    return prediction_rmse(
+        lambda window: rollout(model, params, window)[0],
+        trajectories,
+        horizon=horizon,
+        along_path=model.along_path,
+    )
+
+
+def prediction_rmse(
+    predict: Callable[[Trajectory], Float[Array, "horizon state"]],
+    trajectories: Trajectory,
+    *,
+    horizon: int,
+    along_path: bool,
+) -> Float[Array, "horizon 4"]:
+    """Return the RMSE of any predictor, as `open_loop` does.
+
+    Args:
+        predict: window -> predicted x_1 … x_horizon; the window's first state, controls
+            and environments are known.
+        trajectories: held out from training.
+        horizon: steps.
+        along_path: whether states are those of `path_frame`.
+
+    Raises:
+        ValueError: the horizon does not fit the trajectories.
+    """
+    cut = jax.vmap(partial(sliding_windows, horizon=horizon, stride=horizon))
     pieces = jax.tree.map(
         lambda leaf: leaf.reshape(-1, *leaf.shape[2:]), cut(trajectories)
     )
+    gaps = _path_gaps if along_path else _world_gaps
 
     def squares(piece: Trajectory) -> Float[Array, "horizon 4"]:
-        predicted, _, _ = rollout(model, params, piece)
-        true = piece.states[1:]
-        if model.along_path:
-            gap = (predicted - true)[:, BODY]
-            return (
-                jnp.column_stack(
-                    [
-                        jnp.zeros(gap.shape[0]),
-                        gap[:, LATERAL],
-                        wrap_angle(gap[:, HEADING]),
-                        gap[:, PATH_SPEED],
-                    ]
-                )
-                ** 2
-            )
-        position = jax.vmap(rotate)(-true[:, 2], predicted[:, :2] - true[:, :2])
-        yaw = wrap_angle(predicted[:, 2] - true[:, 2])
-        return jnp.column_stack([position, yaw, predicted[:, 3] - true[:, 3]]) ** 2
+        return gaps(predict(piece), piece.states[1:]) ** 2
 
     return jnp.sqrt(jnp.mean(in_batches(squares, pieces, size=128), axis=0))
+
+
+def _path_gaps(
+    predicted: Float[Array, "horizon state"], true: Float[Array, "horizon state"]
+) -> Float[Array, "horizon 4"]:
+    """Errors in path coordinates: 0, e_y, e_ψ and speed."""
+    gap = (predicted - true)[:, BODY]
+    return jnp.column_stack(
+        [
+            jnp.zeros(gap.shape[0]),
+            gap[:, LATERAL],
+            wrap_angle(gap[:, HEADING]),
+            gap[:, PATH_SPEED],
+        ]
+    )
+
+
+def _world_gaps(
+    predicted: Float[Array, "horizon state"], true: Float[Array, "horizon state"]
+) -> Float[Array, "horizon 4"]:
+    """Errors along and across the true heading, of yaw and of speed."""
+    position = jax.vmap(rotate)(-true[:, 2], predicted[:, :2] - true[:, :2])
+    yaw = wrap_angle(predicted[:, 2] - true[:, 2])
+    return jnp.column_stack([position, yaw, predicted[:, 3] - true[:, 3]])

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import functools
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -244,7 +244,10 @@ def channel_names(settings: dict[str, Any]) -> dict[str, list[str]]:
 
 
 def open_loop_document(
-    errors: jax.Array, trajectories: Trajectory, dt: float
+    errors: jax.Array,
+    trajectories: Trajectory,
+    dt: float,
+    baselines: Mapping[str, jax.Array],
 ) -> dict[str, Any]:
     """Return the content of open_loop.json.
 
@@ -252,12 +255,23 @@ def open_loop_document(
         errors: RMSE by step and coordinate.
         trajectories: that were predicted.
         dt: sampling period [s].
+        baselines: the same errors of naive predictors, by name.
     """
-    columns = np.asarray(errors, dtype=np.float64).T
     return {
-        "steps": list(range(1, columns.shape[1] + 1)),
+        "steps": list(range(1, len(errors) + 1)),
         "dt": dt,
         "trajectories": trajectories.controls.shape[0],
+        **_error_columns(errors),
+        "baselines": {
+            name: _error_columns(values) for name, values in baselines.items()
+        },
+    }
+
+
+def _error_columns(errors: jax.Array) -> dict[str, list[float]]:
+    """Errors by coordinate as lists over the steps ahead."""
+    columns = np.asarray(errors, dtype=np.float64).T
+    return {
         "position_rmse_m": np.hypot(columns[0], columns[1]).tolist(),
         "longitudinal_rmse_m": columns[0].tolist(),
         "lateral_rmse_m": columns[1].tolist(),

@@ -17,7 +17,7 @@ from sfkd_jax.datasets import (
     random_windows,
     spread_windows,
 )
-from sfkd_jax.evaluation import open_loop
+from sfkd_jax.evaluation import baselines, open_loop
 from sfkd_jax.pipeline import path_law, store
 from sfkd_jax.training import fit, multi_step_loss
 from sfkd_jax.types import Key, Model, Params, Space, Trajectory
@@ -62,7 +62,12 @@ def train_policy(settings: dict[str, Any], dataset: Dataset, data_hash: str) -> 
         )
     )
     errors = predict(params, dataset.test)
-    document = store.open_loop_document(errors, dataset.test, settings["vehicle"]["dt"])
+    document = store.open_loop_document(
+        errors,
+        dataset.test,
+        settings["vehicle"]["dt"],
+        _baselines(settings, dataset, horizon),
+    )
     artefacts.write_json(run_dir / "open_loop.json", document)
     recorded |= {"controller": settings["controller"], "experiment": settings["name"]}
     recorded |= {"space": build.space_to_settings(space), "best_step": best}
@@ -72,6 +77,26 @@ def train_policy(settings: dict[str, Any], dataset: Dataset, data_hash: str) -> 
         recorded,
         made_from={"dataset": data_hash},
         law=path_law.ensure_law(settings),
+    )
+
+
+def _baselines(
+    settings: dict[str, Any], dataset: Dataset, horizon: int
+) -> dict[str, jax.Array]:
+    """Open-loop errors of naive predictors on the test part."""
+    along_path = store.is_along_path(settings)
+    plant = (
+        path_law.closed_loop(settings)
+        if along_path
+        else build.build_vehicle(settings["vehicle"])
+    )
+    return baselines(
+        dataset.train,
+        dataset.test,
+        nominal=plant.nominal,
+        dt=plant.dt,
+        horizon=horizon,
+        along_path=along_path,
     )
 
 
