@@ -10,6 +10,8 @@ from sfkd_jax.certification import (
     fixed_point_corridor,
     fixed_points,
 )
+from sfkd_jax.certification._claims import Refuted
+from sfkd_jax.certification._fixed_points import require_fixed_points
 from sfkd_jax.types import Model
 
 RATES = np.diag([0.8, 0.7, 0.6])
@@ -130,6 +132,12 @@ def test_the_bound_is_attained_by_a_loop_on_a_line(alpha, every):
         every=every,
     )
     assert np.max(quiet) + 0.05 == pytest.approx(claimed["corridor_m"]["law"], rel=1e-6)
+    alone = worst_drive(
+        alpha, scale, **(sizes | {"push": 0.0}), disturbance=disturbance, every=every
+    )
+    assert np.max(alone) + 0.05 == pytest.approx(
+        claimed["after_switch_m"]["law"], rel=1e-6
+    )
 
 
 def test_a_loop_that_rests_on_its_path_whatever_happens_needs_its_tube_alone():
@@ -147,3 +155,69 @@ def test_a_loop_that_rests_on_its_path_whatever_happens_needs_its_tube_alone():
         measured, alpha=0.8, lipschitz=0.5, for_ever=0.2, steps_between_switches=30
     )
     assert claimed["after_switch_m"]["planner"] == pytest.approx(0.2, abs=1e-5)
+
+
+def test_an_environment_box_of_unequal_corners_is_refused():
+    with pytest.raises(ValueError, match="shorter"):
+        fixed_points(
+            linear(),
+            {},
+            CLAIM,
+            jnp.asarray(roads(), dtype=float),
+            start=jnp.zeros(6),
+            env_box=[[0.3, -8.0], [0.9]],
+            perturbation=jnp.asarray(LIMIT, dtype=float),
+        )
+
+
+CONSTANTS = {"alpha": 0.8, "lipschitz": 0.5}
+SIZES = {"centre_m": 0.05, "road": 0.2, "switch": 0.7, "push": 0.3}
+
+
+def part(points=10, steps_between_switches=30, **sizes):
+    """A document's part whose corridors follow from its sizes and counts."""
+    return fixed_point_corridor(
+        FixedPoints(**(SIZES | sizes), points=points),
+        **CONSTANTS,
+        for_ever=0.2,
+        steps_between_switches=steps_between_switches,
+    )
+
+
+@pytest.mark.parametrize(
+    "changes",
+    [
+        {},
+        {"points": 1},
+        {"steps_between_switches": 1},
+        dict.fromkeys(SIZES, 0.0),
+    ],
+)
+def test_corridors_that_follow_are_accepted(changes):
+    require_fixed_points(part(**changes), CONSTANTS, 0.2)
+
+
+@pytest.mark.parametrize("name", SIZES)
+@pytest.mark.parametrize("size", [-0.5, -1.0, 1, np.inf, np.nan])
+def test_sizes_must_be_finite_and_not_negative_even_if_all_else_follows(name, size):
+    with pytest.raises(Refuted, match="sizes and positive counts"):
+        require_fixed_points(part(**{name: size}), CONSTANTS, 0.2)
+
+
+@pytest.mark.parametrize("name", ["points", "steps_between_switches"])
+@pytest.mark.parametrize("count", [-5, 2.0, True])
+def test_counts_must_be_positive_integers_even_if_all_else_follows(name, count):
+    with pytest.raises(Refuted, match="sizes and positive counts"):
+        require_fixed_points(part() | {name: count}, CONSTANTS, 0.2)
+
+
+@pytest.mark.parametrize("corridor", ["corridor_m", "after_switch_m"])
+@pytest.mark.parametrize("name", ["law", "planner"])
+def test_no_corridor_may_be_missing_or_smaller(corridor, name):
+    stated = part()[corridor]
+    for forged in (
+        {key: value for key, value in stated.items() if key != name},
+        stated | {name: stated[name] * (1 - 1e-8)},
+    ):
+        with pytest.raises(Refuted, match=f"fixed_points.{corridor} does not follow"):
+            require_fixed_points(part() | {corridor: forged}, CONSTANTS, 0.2)
