@@ -322,7 +322,7 @@ def test_an_attack_on_nothing_is_refused(kind):
 
 def test_attack_and_tightness_are_of_the_attacks(kind):
     alpha = certified().alpha
-    message = "attack or tightness is not what the attacks found"
+    message = "attack or tightness does not follow from the attacks"
     for attack in (0.3, 0.5, None, np.nan):
         forged(message, attack=attack)
     for tightness in (alpha / 0.21, alpha / 0.19, None, 1.0, np.nan):

@@ -188,7 +188,7 @@ def verify(
 ) -> None:
     """Check a certificate against weights without any search.
 
-    Takes milliseconds once `model.explicit` is compiled.
+    Takes milliseconds once `model.structure.explicit` is compiled.
 
     Args:
         certificate: from an untrusted source.
@@ -246,4 +246,4 @@ def _require_consistent(
     step = certificate.attacks.get("step")
     tightness = claims.alpha / step if step else None
     if certificate.attack != step or certificate.tightness != tightness:
-        raise Refuted("attack or tightness is not what the attacks found")
+        raise Refuted("attack or tightness does not follow from the attacks")

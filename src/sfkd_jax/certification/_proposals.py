@@ -158,13 +158,13 @@ def _reduced(
     widths = np.cumsum([len(part) for part in multipliers])
     inputs = len(matrix) - widths[-1]
     coupling, lower = matrix[inputs:, :inputs], matrix[inputs:, inputs:]
-    nothing = np.full(inputs, np.inf), np.eye(inputs), []
+    infeasible = np.full(inputs, np.inf), np.eye(inputs), []
     if not np.all(np.isfinite(matrix)):
-        return nothing
+        return infeasible
     try:
         hidden = cho_solve((np.linalg.cholesky(lower), True), coupling)
     except np.linalg.LinAlgError:
-        return nothing
+        return infeasible
     schur = coupling.T @ hidden - matrix[:inputs, :inputs]
     eigenvalues, vectors = np.linalg.eigh(0.5 * (schur + schur.T))
     return eigenvalues, vectors, np.split(-hidden @ vectors, widths[:-1])
