@@ -128,7 +128,7 @@ def with_start(model: Model, start: str, train: Trajectory, seed: int) -> Model:
 
     Args:
         model: to train.
-        start: "random", or "identified" for a linear part found by regression.
+        start: "random", or "identified" for a linear part obtained by regression.
         train: data of the regression.
         seed: of the run.
 
