@@ -88,13 +88,13 @@ def machine():
 
 def _versions():
     """Of the packages that are installed; one used from its source is not named."""
-    found = {}
+    result = {}
     for name in PACKAGES:
         try:
-            found[name] = metadata.version(name)
+            result[name] = metadata.version(name)
         except metadata.PackageNotFoundError:
             continue
-    return found
+    return result
 
 
 def write(path, document):
@@ -112,8 +112,8 @@ def in_turn(jobs, rounds, steps=3):
     wall, cpu = {label: [] for label in jobs}, {label: [] for label in jobs}
     for _ in range(rounds):
         for label, job in jobs.items():
-            for kept, new in zip((wall, cpu), timed(job, steps), strict=True):
-                kept[label] += new
+            for saved, new in zip((wall, cpu), timed(job, steps), strict=True):
+                saved[label] += new
     middle = statistics.median
     return {
         label: {

@@ -1,0 +1,1 @@
+"""Scripts of experiments that need more than a command."""

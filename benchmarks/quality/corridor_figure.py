@@ -14,7 +14,7 @@ import numpy as np
 
 from benchmarks.quality import shield
 from benchmarks.robustness.soak import LANE
-from sfkd_jax.reporting import draw_film, draw_hostile
+from sfkd_jax.paper import draw_film, draw_hostile
 
 SHOWN = ("worst", "bang-bang", "random", "constant", "full lock")
 LOCKED = 5
@@ -122,13 +122,11 @@ def main():
     parser.add_argument(
         "--film", type=Path, metavar="GIF", help="make this, and no figure"
     )
-    asked = parser.parse_args()
+    args = parser.parse_args()
     draw, path, shown = (
-        (draw_film, asked.film, film)
-        if asked.film
-        else (draw_hostile, asked.out, drives)
+        (draw_film, args.film, film) if args.film else (draw_hostile, args.out, drives)
     )
-    print(draw(path, **shown(shield.load(asked.run), asked.seconds, asked.seed)))
+    print(draw(path, **shown(shield.load(args.run), args.seconds, args.seed)))
 
 
 if __name__ == "__main__":

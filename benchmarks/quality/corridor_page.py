@@ -20,11 +20,11 @@ OPEN, CLOSE = "<!-- corridor -->\n", "<!-- /corridor -->"
 
 def table() -> str:
     """What is claimed of both policies and what they drove, as markdown."""
-    found = [_facts(plant) for plant in PLANTS]
+    result = [_facts(plant) for plant in PLANTS]
     lines = [f"| | {' | '.join(PLANTS)} |", f"|---|{'---|' * len(PLANTS)}"]
     lines += [
-        f"| {name} | {' | '.join(facts[name] for facts in found)} |"
-        for name in found[0]
+        f"| {name} | {' | '.join(facts[name] for facts in result)} |"
+        for name in result[0]
     ]
     return "\n".join(lines) + "\n"
 

@@ -76,40 +76,40 @@ def drive(policy, plant, planner, roads, keys):
     return 1e3 * np.sqrt((np.asarray(episodes.lateral) ** 2).mean(axis=1)), float(rate)
 
 
-def compared(run, scenario, asked):
+def compared(run, scenario, args):
     """Rows of one policy on one scenario; printed as they come."""
     policy = sfkd_jax.load(run)
     plant = build_vehicle(policy.settings["vehicle"])
     sizes = {
-        "duration": asked.seconds,
+        "duration": args.seconds,
         "state_size": len(plant.state_names),
         "dt": plant.dt,
     }
-    road_key, drive_key = jax.random.split(jax.random.key(asked.seed))
+    road_key, drive_key = jax.random.split(jax.random.key(args.seed))
     family = scenarios.scenario(name=scenario, **sizes)
-    roads = jax.jit(jax.vmap(family))(jax.random.split(road_key, asked.episodes))
-    keys = jax.random.split(drive_key, asked.episodes)
+    roads = jax.jit(jax.vmap(family))(jax.random.split(road_key, args.episodes))
+    keys = jax.random.split(drive_key, args.episodes)
     first = None
-    for label in asked.only:
+    for label in args.only:
         began = time.perf_counter()
-        found, rate = drive(
+        result, rate = drive(
             policy, plant, planner_of(policy, plant, *CONTENDERS[label]), roads, keys
         )
-        assert np.all(np.isfinite(found))
-        first = found if first is None else first
+        assert np.all(np.isfinite(result))
+        first = result if first is None else first
         row = {
             "vehicle": plant.name,
             "scenario": scenario,
             "label": label,
-            "rmse_mm": [float(rmse) for rmse in found],
+            "rmse_mm": [float(rmse) for rmse in result],
         }
         row |= {
             "steering_rate": rate,
-            "difference_mm": evaluation.paired_difference(found, first),
+            "difference_mm": evaluation.paired_difference(result, first),
         }
         low, high = row["difference_mm"]["ci95"]
         print(
-            f"{plant.name:9} {scenario} {label:36} {found.mean():6.1f} mm  {found.mean() - first.mean():+6.1f}",
+            f"{plant.name:9} {scenario} {label:36} {result.mean():6.1f} mm  {result.mean() - first.mean():+6.1f}",
             end=" ",
         )
         print(
@@ -137,16 +137,16 @@ def main():
         metavar="LABEL",
     )
     parser.add_argument("--out")
-    asked = parser.parse_args()
+    args = parser.parse_args()
     rows = [
         row
-        for run in asked.runs
-        for scenario in asked.scenarios
-        for row in compared(run, scenario, asked)
+        for run in args.runs
+        for scenario in args.scenarios
+        for row in compared(run, scenario, args)
     ]
-    if asked.out:
-        settings = {key: getattr(asked, key) for key in ("episodes", "seconds", "seed")}
-        with open(asked.out, "w") as file:
+    if args.out:
+        settings = {key: getattr(args, key) for key in ("episodes", "seconds", "seed")}
+        with open(args.out, "w") as file:
             json.dump(
                 {"rows": rows, "settings": settings, "jax": jax.__version__},
                 file,

@@ -47,17 +47,17 @@ def score(settings, steps):
     model = build.build_model(
         settings["model"], space, build.build_vehicle(settings["vehicle"])
     )
-    loss = multi_step_loss(model, space, **build.without(options.pop("loss")))
+    loss = multi_step_loss(model, space, **build.as_kwargs(options.pop("loss")))
     draw = partial(random_windows, batch=options.pop("batch"), length=length)
     held_out = spread_windows(dataset.validation, length=length)
     key = jax.random.fold_in(jax.random.key(settings["seed"]), 0)
-    with tempfile.TemporaryDirectory() as place:
+    with tempfile.TemporaryDirectory() as directory:
         params, _ = fit(
-            model, loss, draw, dataset.train, held_out, key, Path(place), **options
+            model, loss, draw, dataset.train, held_out, key, Path(directory), **options
         )
     parts = jax.jit(multi_step_loss(model, space))(params, held_out)[1]
-    found = {name: float(parts[name]) for name in ("prediction", "one_step")}
-    return {"error": sum(found.values())} | found
+    result = {name: float(parts[name]) for name in ("prediction", "one_step")}
+    return {"error": sum(result.values())} | result
 
 
 def main():
@@ -69,26 +69,26 @@ def main():
     parser.add_argument("--steps", type=int, default=1000)
     parser.add_argument("--root", default="runs")
     parser.add_argument("--out", type=Path, default=Path(__file__).with_suffix(".json"))
-    asked = parser.parse_args()
+    args = parser.parse_args()
     config.register()
-    kept = json.loads(asked.out.read_text()) if asked.out.exists() else {}
+    saved = json.loads(args.out.read_text()) if args.out.exists() else {}
     for model, tried in CHOICES.items():
         for overrides in tried:
-            name = f"{asked.vehicle} {asked.steps} {model} {overrides}"
-            if name in kept:
+            name = f"{args.vehicle} {args.steps} {model} {overrides}"
+            if name in saved:
                 continue
             with initialize_config_dir(config.conf_path(), version_base="1.3"):
                 picked = [
                     "dataset=path",
                     f"model={model}",
-                    f"vehicle={asked.vehicle}",
-                    f"root={asked.root}",
+                    f"vehicle={args.vehicle}",
+                    f"root={args.root}",
                 ]
                 composed = compose("config", overrides=[*picked, *overrides.split()])
             settings = OmegaConf.to_container(composed, resolve=True)
-            kept[name] = score(settings, asked.steps)
-            print(name, kept[name], flush=True)
-            asked.out.write_text(json.dumps(kept, indent=1) + "\n")
+            saved[name] = score(settings, args.steps)
+            print(name, saved[name], flush=True)
+            args.out.write_text(json.dumps(saved, indent=1) + "\n")
 
 
 if __name__ == "__main__":

@@ -29,16 +29,16 @@ def draw(weighed, bounds):
     figure = Figure(figsize=(6.9, 4.4), layout="constrained")
     panels = figure.subplots(len(plants), len(MEASURES), sharex="row")
     for line, plant in zip(panels, plants, strict=True):
-        found = [entry for entry in weighed if entry[0] == plant]
+        result = [entry for entry in weighed if entry[0] == plant]
         keys = [
             (plant, "sfkd_path", *([weight] if weight else []))
-            for _, weight, _ in found
+            for _, weight, _ in result
         ]
         wide = [bounds[key]["followed_position"] for key in keys]
         for axes, (head, measure) in zip(line, MEASURES.items(), strict=True):
-            high = [measure(rows) for *_, rows in found]
+            high = [measure(rows) for *_, rows in result]
             axes.plot(wide, high, color="#0b57b0", marker="o", markersize=4)
-            for (_, weight, _), *point in zip(found, wide, high, strict=True):
+            for (_, weight, _), *point in zip(result, wide, high, strict=True):
                 offset = {
                     "textcoords": "offset points",
                     "xytext": (0, 6),

@@ -33,22 +33,22 @@ SHIPPED = [0.01]
 """`training.loss.tube`."""
 
 
-def read(place, name):
+def read(directory, name):
     """A committed document."""
-    return json.loads((place / f"{name}.json").read_text("utf-8"))
+    return json.loads((directory / f"{name}.json").read_text("utf-8"))
 
 
 def rows_of(plant):
     """(system, scenario) -> row of the comparison on a plant."""
-    found = read(KEPT, "results")["rows"]
+    result = read(KEPT, "results")["rows"]
     return {
         (row["system"], row["scenario"]): row
-        for row in found
+        for row in result
         if row["vehicle"] == plant
     }
 
 
-def driving(plant):
+def drive_options(plant):
     """RMSE of every row with its interval, and its difference to SFKD on the same
     episodes.
     """
@@ -84,12 +84,12 @@ def difference(row):
     """The paired difference to SFKD; * where SFKD is better for sure, † where it is
     worse.
     """
-    found = row["difference_to_sfkd"]
-    if found is None:
+    result = row["difference_to_sfkd"]
+    if result is None:
         return "–"
-    low, high = found["ci95"]
+    low, high = result["ci95"]
     mark = " *" if low > 0 else " †" if high < 0 else ""
-    return f"{1e3 * found['mean']:+.2f} ({1e3 * low:+.2f} to {1e3 * high:+.2f}){mark}".replace(
+    return f"{1e3 * result['mean']:+.2f} ({1e3 * low:+.2f} to {1e3 * high:+.2f}){mark}".replace(
         "-", "−"
     )
 
@@ -105,15 +105,17 @@ def frames():
     for plant in PLANTS:
         here = rows_of(plant)
         for system, name in NAMES.items():
-            found = [
+            result = [
                 paper.get((plant, system.replace("_path", ""), scenario))
                 for scenario in SCENARIOS
             ]
-            if system != "oracle" and None not in found:
-                found += [
+            if system != "oracle" and None not in result:
+                result += [
                     here[system, scenario]["ratio_to_oracle"] for scenario in SCENARIOS
                 ]
-                lines.append([f"{plant}, {name}", *(f"{value:.2f}" for value in found)])
+                lines.append(
+                    [f"{plant}, {name}", *(f"{value:.2f}" for value in result)]
+                )
     heads = [
         f"{scenario.upper()}, {frame}"
         for frame in ("body", "path")
@@ -154,15 +156,15 @@ def tubes(plant, system, weight=SHIPPED):
     nothing is certified.
     """
     made = (plant, system, weight)
-    found = [
+    result = [
         one
         for one in read(KEPT, "tubes")
         if (one["vehicle"], one["system"], one["weight"]) == made
     ]
-    if not found or found[0]["alpha"] is None:
+    if not result or result[0]["alpha"] is None:
         return ["–"] * (1 + len(TUBES))
-    lengths = [reduce(getitem, path, found[0]) for path in TUBES.values()]
-    return [f"{value:.3f}" for value in (found[0]["alpha"], *lengths)]
+    lengths = [reduce(getitem, path, result[0]) for path in TUBES.values()]
+    return [f"{value:.3f}" for value in (result[0]["alpha"], *lengths)]
 
 
 def weights():
@@ -195,11 +197,11 @@ def weights():
 
 def weighed():
     """(plant, weight, scenario -> row), the weights ascending."""
-    found = {}
+    result = {}
     for row in read(WEIGHTS, "results")["rows"]:
-        found.setdefault((row["vehicle"], weight_of(row)), {})[row["scenario"]] = row
-    order = sorted(found, key=lambda entry: (PLANTS.index(entry[0]), entry[1]))
-    return [(*entry, dict(sorted(found[entry].items()))) for entry in order]
+        result.setdefault((row["vehicle"], weight_of(row)), {})[row["scenario"]] = row
+    order = sorted(result, key=lambda entry: (PLANTS.index(entry[0]), entry[1]))
+    return [(*entry, dict(sorted(result[entry].items()))) for entry in order]
 
 
 def weight_of(row):
@@ -211,9 +213,9 @@ def weight_of(row):
 
 def choices():
     """What the rivals were tried with."""
-    found = json.loads(CHOICES.read_text("utf-8"))
+    result = json.loads(CHOICES.read_text("utf-8"))
     lines = []
-    for name, entry in found.items():
+    for name, entry in result.items():
         plant, steps, model, *overrides = name.split()
         shown = [f"{entry[part]:.4f}" for part in ("error", "prediction", "one_step")]
         lines.append([model, f"`{' '.join(overrides)}`", *shown, f"{plant}, {steps}"])
@@ -232,9 +234,9 @@ def choices():
 
 def take(root):
     """Copy both results, and of every certificate what the tables show."""
-    for kept in (KEPT, WEIGHTS):
-        shutil.copyfile(root / kept.name / "results.json", kept / "results.json")
-    found = []
+    for saved in (KEPT, WEIGHTS):
+        shutil.copyfile(root / saved.name / "results.json", saved / "results.json")
+    result = []
     for settings in sorted((root / KEPT.name).glob("*/*/**/settings.json")):
         made, file = (
             json.loads(settings.read_text()),
@@ -256,19 +258,19 @@ def take(root):
         entry |= {"reason": certificate.get("reason"), "tube": None}
         if certificate.get("outputs"):
             entry["tube"] = certificate["outputs"]["position"]["tube"]
-        found.append(
+        result.append(
             entry
             | {
                 name: corridor.get(name)
                 for name in ("bounds", "corridor_m", "coverage")
             }
         )
-    (KEPT / "tubes.json").write_text(json.dumps(found, indent=1) + "\n", "utf-8")
+    (KEPT / "tubes.json").write_text(json.dumps(result, indent=1) + "\n", "utf-8")
 
 
 TABLES = {
-    "dynamic": lambda: driving("dynamic"),
-    "kinematic": lambda: driving("kinematic"),
+    "dynamic": lambda: drive_options("dynamic"),
+    "kinematic": lambda: drive_options("kinematic"),
     "frames": frames,
     "claims": claims,
     "choices": choices,

@@ -21,6 +21,7 @@ from benchmarks.quality.shield_table import ASKED, FLAGS, misses, table
 from benchmarks.robustness.soak import ENVIRONMENT, LANE
 from sfkd_jax import build, policy, scenarios
 from sfkd_jax.control import PathLaw, curvature_ahead, path_coordinates
+from sfkd_jax.core.folding import fold
 from sfkd_jax.core.path_frame import LATERAL
 from sfkd_jax.evaluation import first_reference
 from sfkd_jax.types import Controller
@@ -38,7 +39,7 @@ class Car(NamedTuple):
     """A certified policy and the plant that it drives."""
 
     plant: Vehicle
-    trained: policy.Trained
+    trained: policy.TrainedModel
     law: PathLaw
     params: dict
     certificate: dict
@@ -67,7 +68,7 @@ def load(run):
         trained.vehicle,
         trained,
         trained.law,
-        jax.jit(trained.model.fold)(trained.params),
+        jax.jit(partial(fold, trained.model))(trained.params),
         certificate,
     )
 
@@ -97,8 +98,8 @@ def scripted(car, kind, onset=0):
             "NaN": jnp.full(2, jnp.nan),
         }
         lawful = car.law(xi, curvature, reference[0, 3], env)
-        asked = [lawful + share * car.law.perturbation for share in shares.values()]
-        control = jnp.stack([*asked, jnp.where(side > 0.0, high, low)])[
+        args = [lawful + share * car.law.perturbation for share in shares.values()]
+        control = jnp.stack([*args, jnp.where(side > 0.0, high, low)])[
             jnp.where(step < onset, 0, kind)
         ]
         return jnp.clip(control, low, high), (key, step + 1), {}
@@ -155,22 +156,22 @@ def drive_states(car, controller, road, key):
         progress, lateral = scenarios.project(
             road.path, state[:2], progress + road.speed * car.plant.dt
         )
-        said = {}
+        message = {}
         if "copy" in info:
-            said = {name: info[name] for name in ("void", "broken")} | {
+            message = {name: info[name] for name in ("void", "broken")} | {
                 "infeasible": ~info["feasible"]
             }
-            said |= {
+            message |= {
                 "copy": info["copy"][LATERAL],
                 "intervened": info["intervention"] > 0.0,
             }
-        return (state, progress, memory), (state, lateral, said)
+        return (state, progress, memory), (state, lateral, message)
 
     start = road.initial_state, jnp.zeros(()), controller.init(planner_key)
     given = road.envs, jax.random.split(noise_key, len(road.envs))
-    _, (states, lateral, said) = jax.lax.scan(step, start, given)
+    _, (states, lateral, message) = jax.lax.scan(step, start, given)
     states = jnp.concatenate([road.initial_state[None], states])
-    return states, jnp.concatenate([jnp.zeros(1), lateral]), said
+    return states, jnp.concatenate([jnp.zeros(1), lateral]), message
 
 
 def episodes(car, count, seconds, seed):
@@ -198,28 +199,30 @@ def batches(driven, roads, keys):
     return jax.tree.map(lambda *leaves: np.concatenate(leaves), *parts)
 
 
-def summary(lateral, said, bounds):
+def summary(lateral, message, bounds):
     """What some drives come to."""
     worst = np.max(np.where(np.isfinite(lateral), np.abs(lateral), np.inf), axis=1)
     largest = float(np.max(worst))
-    found = {"drives": len(worst), "departures": int(np.sum(~(worst <= LANE)))}
-    found |= {"largest_m": largest if np.isfinite(largest) else None}
-    if not said:
-        return found
-    apart = np.abs(lateral[:, :-1] - said["copy"])
+    result = {"drives": len(worst), "departures": int(np.sum(~(worst <= LANE)))}
+    result |= {"largest_m": largest if np.isfinite(largest) else None}
+    if not message:
+        return result
+    separate = np.abs(lateral[:, :-1] - message["copy"])
     width, tube = bounds["nominal"], bounds["followed_position"]
-    found |= {
-        "copy_m": float(np.max(np.abs(said["copy"]))),
-        "distance_m": float(np.max(apart)),
+    result |= {
+        "copy_m": float(np.max(np.abs(message["copy"]))),
+        "distance_m": float(np.max(separate)),
     }
-    found |= {"inside": float(np.mean(worst <= width + tube))}
-    return found | {name: float(np.mean(said[name])) for name in ("intervened", *FLAGS)}
+    result |= {"inside": float(np.mean(worst <= width + tube))}
+    return result | {
+        name: float(np.mean(message[name])) for name in ("intervened", *FLAGS)
+    }
 
 
-def of_scripts(car, asked, show):
+def of_scripts(car, args, show):
     """Script -> summaries with the shield and without it."""
-    roads, keys = episodes(car, asked.drives, asked.seconds, asked.seed)
-    bounds, found = car.certificate["corridor"]["bounds"], {}
+    roads, keys = episodes(car, args.drives, args.seconds, args.seed)
+    bounds, result = car.certificate["corridor"]["bounds"], {}
 
     def filtered(kind, road, key):
         return drive(car, shielded(car, scripted(car, kind)), road, key)
@@ -231,30 +234,32 @@ def of_scripts(car, asked, show):
         name: jax.jit(jax.vmap(way, (None, 0, 0)))
         for name, way in (("with", filtered), ("without", free))
     }
-    for kind in map(SCRIPTS.index, asked.scripts):
+    for kind in map(SCRIPTS.index, args.scripts):
         driven = {
             name: batches(partial(way, kind), roads, keys) for name, way in ways.items()
         }
-        found[SCRIPTS[kind]] = {
+        result[SCRIPTS[kind]] = {
             name: summary(*arrays, bounds) for name, arrays in driven.items()
         }
-        show(SCRIPTS[kind], found[SCRIPTS[kind]])
-    return found
+        show(SCRIPTS[kind], result[SCRIPTS[kind]])
+    return result
 
 
-def of_planner(car, asked):
+def of_planner(car, args):
     """The policy's own planner with the shield and without it, on the same episodes."""
-    roads, keys = episodes(car, asked.episodes, asked.seconds, asked.seed + 1)
-    bounds, found, rmse = car.certificate["corridor"]["bounds"], {}, {}
+    roads, keys = episodes(car, args.episodes, args.seconds, args.seed + 1)
+    bounds, result, rmse = car.certificate["corridor"]["bounds"], {}, {}
     for name, shield in (("with", True), ("without", False)):
         run = jax.jit(jax.vmap(partial(drive, car, planner(car, shield=shield))))
-        lateral, said = batches(run, roads, keys)
+        lateral, message = batches(run, roads, keys)
         settled = lateral[:, 1 + round(SETTLED / car.plant.dt) :]
         rmse[name] = np.sqrt(np.mean(settled**2, axis=1))
-        found[name] = summary(lateral, said, bounds) | {
+        result[name] = summary(lateral, message, bounds) | {
             "rmse_m": float(np.mean(rmse[name]))
         }
-    return found | {"rmse_ratio": found["with"]["rmse_m"] / found["without"]["rmse_m"]}
+    return result | {
+        "rmse_ratio": result["with"]["rmse_m"] / result["without"]["rmse_m"]
+    }
 
 
 def step_times(car, rounds):
@@ -299,12 +304,12 @@ def main():
     )
     parser.add_argument("--out")
     parser.add_argument("--time", action="store_true", help=argparse.SUPPRESS)
-    asked = parser.parse_args()
-    if asked.time:
-        print(json.dumps(step_times(load(asked.runs[0]), asked.rounds)))
+    args = parser.parse_args()
+    if args.time:
+        print(json.dumps(step_times(load(args.runs[0]), args.rounds)))
         return
     settings = {
-        key: getattr(asked, key) for key in ("drives", "episodes", "seconds", "seed")
+        key: getattr(args, key) for key in ("drives", "episodes", "seconds", "seed")
     }
     document = {
         "cars": {},
@@ -312,24 +317,24 @@ def main():
         "asked": ASKED,
         "machine": harness.machine(),
     }
-    for run in asked.runs:
-        car, words = load(run), ("--runs", run, "--time", "--rounds", asked.rounds)
+    for run in args.runs:
+        car, words = load(run), ("--runs", run, "--time", "--rounds", args.rounds)
         about = {key: car.certificate[key] for key in ("alpha", "policy_sha256")}
-        found = about | {"bounds": car.certificate["corridor"]["bounds"]}
+        result = about | {"bounds": car.certificate["corridor"]["bounds"]}
         show = lambda label, both: print(
             car.plant.name, label, json.dumps(both), flush=True
         )
-        found |= {
-            "scripts": of_scripts(car, asked, show),
-            "planner": of_planner(car, asked),
+        result |= {
+            "scripts": of_scripts(car, args, show),
+            "planner": of_planner(car, args),
         }
-        found |= {
+        result |= {
             "step": harness.in_own_process(
                 "benchmarks.quality.shield", *words, environment=ENVIRONMENT
             )
         }
-        document["cars"][car.plant.name] = found
-        harness.write(asked.out, document)
+        document["cars"][car.plant.name] = result
+        harness.write(args.out, document)
     print(table(document))
     print("\n".join(misses(document)) or "all that was asked for")
 

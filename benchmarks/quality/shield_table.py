@@ -28,17 +28,17 @@ def table(document):
         ]
         lines += [_row(head), _row(["---"] * len(head))]
         for label, both in (*car["scripts"].items(), ("its own", car["planner"])):
-            kept, free = both["with"], both["without"]
+            saved, free = both["with"], both["without"]
             cells = [
                 label,
-                f"{_of(free)} → {_of(kept)}",
-                f"{_metres(free)} → {_metres(kept)}",
+                f"{_of(free)} → {_of(saved)}",
+                f"{_metres(free)} → {_metres(saved)}",
             ]
-            cells += [f"{kept[key]:.3f}" for key in ("copy_m", "distance_m")]
+            cells += [f"{saved[key]:.3f}" for key in ("copy_m", "distance_m")]
             lines.append(
                 _row(
                     cells
-                    + [_percent(kept[key]) for key in ("inside", "intervened", *FLAGS)]
+                    + [_percent(saved[key]) for key in ("inside", "intervened", *FLAGS)]
                 )
             )
         lines.append("")
@@ -52,17 +52,17 @@ def table(document):
     ]
     lines += [_row(head), _row(["---"] * len(head))]
     for name, car in document["cars"].items():
-        kept, free, times = (
+        saved, free, times = (
             car["planner"]["with"],
             car["planner"]["without"],
             car["step"],
         )
         cells = [
             name,
-            f"{1e3 * free['rmse_m']:.1f} → {1e3 * kept['rmse_m']:.1f}",
+            f"{1e3 * free['rmse_m']:.1f} → {1e3 * saved['rmse_m']:.1f}",
             f"{car['planner']['rmse_ratio']:.3f}",
         ]
-        cells += [_percent(kept["intervened"])]
+        cells += [_percent(saved["intervened"])]
         cells += [
             f"{times['without']['median_ms']:.2f} → {times['with']['median_ms']:.2f}",
             f"{times['added_ms']:.2f}",
@@ -99,7 +99,7 @@ def _percent(share):
 
 def misses(document):
     """What was asked for and is not so, in words."""
-    found = []
+    result = []
     for name, car in document["cars"].items():
         left = {
             script: both["with"]["departures"]
@@ -111,14 +111,14 @@ def misses(document):
             "intervened": car["planner"]["with"]["intervened"],
         }
         own |= {"added_ms": car["step"]["added_ms"]}
-        found += [
+        result += [
             f"{name}, {script}: {count} departures"
             for script, count in left.items()
             if count > ASKED["departures"]
         ]
-        found += [
+        result += [
             f"{name}: {key} = {value:.4g}, asked {ASKED[key]}"
             for key, value in own.items()
             if not value <= ASKED[key]
         ]
-    return found
+    return result

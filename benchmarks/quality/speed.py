@@ -33,8 +33,8 @@ def cells(run, drives):
         "frictions": frictions.round(6).tolist(),
         "speeds": speeds.round(6).tolist(),
     }
-    found = corridor_by_speed(car.trained, car.certificate, **grid, drives=drives)
-    return {"policy_sha256": car.certificate["policy_sha256"]} | found
+    result = corridor_by_speed(car.trained, car.certificate, **grid, drives=drives)
+    return {"policy_sha256": car.certificate["policy_sha256"]} | result
 
 
 def main():
@@ -46,16 +46,16 @@ def main():
     parser.add_argument("--room", type=float, default=0.5)
     parser.add_argument("--drives", type=int, default=150)
     parser.add_argument("--out", type=Path)
-    asked = parser.parse_args()
-    document = {"room_m": asked.room, "cars": {}}
-    for run in asked.runs:
-        found = cells(run, asked.drives)
+    args = parser.parse_args()
+    document = {"room_m": args.room, "cars": {}}
+    for run in args.runs:
+        result = cells(run, args.drives)
         name = shield.load(run).plant.name
-        document["cars"][name] = found
-        print(table(name, found), answer(found, asked.room), sep="\n", flush=True)
-        if asked.out:
+        document["cars"][name] = result
+        print(table(name, result), answer(result, args.room), sep="\n", flush=True)
+        if args.out:
             artefacts.write_json(
-                asked.out, document | {"versions": artefacts.versions()}
+                args.out, document | {"versions": artefacts.versions()}
             )
 
 

@@ -17,9 +17,9 @@ ROOMS = (0.1, 0.15, 0.2, 0.3)
 """Besides the one that was asked for [m]."""
 
 
-def table(name, found):
+def table(name, result):
     """The corridor of every cell, as Markdown: a row for each speed."""
-    cells = found["cells"]
+    cells = result["cells"]
     frictions, speeds = (
         sorted({cell[key] for cell in cells}) for key in ("friction", "speed")
     )
@@ -41,10 +41,10 @@ def table(name, found):
     return "\n".join(lines) + "\n"
 
 
-def answer(found, room):
+def answer(result, room):
     """How fast the car may go, in one sentence."""
-    ends = max(cell["speed"] for cell in found["cells"])
-    speeds = fastest_speeds(found["cells"], room)
+    ends = max(cell["speed"] for cell in result["cells"])
+    speeds = fastest_speeds(result["cells"], room)
     if all(speed == ends for speed in speeds.values()):
         return f"With {room:g} m of room: up to {ends:g} m/s at every friction; the box ends first."
     if not any(speeds.values()):
@@ -65,20 +65,20 @@ def answer(found, room):
 def tables(document):
     """All of them, with what was counted."""
     lines = []
-    for name, found in document["cars"].items():
+    for name, result in document["cars"].items():
         shares = [
-            found["coverage"],
-            *found["coverage_ci95"],
-            *_ends(cell["coverage"] for cell in found["cells"]),
+            result["coverage"],
+            *result["coverage_ci95"],
+            *_ends(cell["coverage"] for cell in result["cells"]),
         ]
         inside = "{:.1f} % of all test drives are inside ({:.1f} to {:.1f} %), {:.1f} to {:.1f} % by cell"
-        lines += [table(name, found)]
+        lines += [table(name, result)]
         lines += [
-            f"- {answer(found, room)}" for room in sorted({*ROOMS, document["room_m"]})
+            f"- {answer(result, room)}" for room in sorted({*ROOMS, document["room_m"]})
         ]
         lines += [
-            f"- {found['drives']} drives of {found['duration_s']:g} s fix the units of a cell, as many calibrate and "
-            f"as many test at level {100 * found['level']:g} %: {inside.format(*(100 * share for share in shares))}.",
+            f"- {result['drives']} drives of {result['duration_s']:g} s fix the units of a cell, as many calibrate and "
+            f"as many test at level {100 * result['level']:g} %: {inside.format(*(100 * share for share in shares))}.",
             "",
         ]
     return "\n".join(lines)
@@ -95,8 +95,8 @@ def _row(cells):
 
 
 def _ends(values):
-    found = sorted(values)
-    return found[0], found[-1]
+    result = sorted(values)
+    return result[0], result[-1]
 
 
 def _speed(speed):
@@ -106,5 +106,5 @@ def _speed(speed):
 if __name__ == "__main__":
     measured = json.loads(MEASURED.read_text("utf-8"))
     PAGE.write_text(page(PAGE.read_text("utf-8"), measured), "utf-8")
-    shown = {name: found["cells"] for name, found in measured["cars"].items()}
+    shown = {name: result["cells"] for name, result in measured["cars"].items()}
     print(draw_speed(FIGURE, shown, room=measured["room_m"]))

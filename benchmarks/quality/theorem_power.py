@@ -18,6 +18,7 @@ import numpy as np
 
 from sfkd_jax import artefacts, build, datasets, demo, evaluation, policy
 from sfkd_jax.certification import latent_tube
+from sfkd_jax.core.folding import fold
 from sfkd_jax.core.rollouts import step_disturbances
 from sfkd_jax.evaluation import predictions, theorem_reach, theorem_violations
 
@@ -31,8 +32,8 @@ SHORTER = (1.02, 1.1, 1.3)
 
 def driven(trained, segments):
     """Drives by scenario."""
-    asked = trained.settings["dataset"] | {"segments": segments}
-    options = build.as_kwargs(asked, "shares", "env_low", "env_high", "seed")
+    args = trained.settings["dataset"] | {"segments": segments}
+    options = build.as_kwargs(args, "shares", "env_low", "env_high", "seed")
     steady, switching = jax.random.split(jax.random.key(SEED))
     driver = build.build_driver(trained.vehicle)
     switches = {
@@ -48,15 +49,15 @@ def driven(trained, segments):
     }
 
 
-def measured(found, alpha, d_bar):
+def measured(result, alpha, d_bar):
     """V0 and reach under these claims."""
     tube = latent_tube(alpha, d_bar, HORIZON)
     broken, applied = theorem_violations(
-        found.latent_errors, found.defects, tube, d_bar
+        result.latent_errors, result.defects, tube, d_bar
     )
     reach = [
         share
-        for share in theorem_reach(found.latent_errors, found.defects, tube, d_bar)
+        for share in theorem_reach(result.latent_errors, result.defects, tube, d_bar)
         if share is not None
     ]
     where = {
@@ -71,15 +72,17 @@ def measured(found, alpha, d_bar):
     }
 
 
-def pushed(trained, params, drives, bounds, force):
+def disturbed(trained, params, drives, bounds, force):
     """Share of steps that leave the bound of each kind when the step itself is pushed
     sideways.
     """
     plant, model = trained.vehicle, trained.model
 
     def one(key, before, control, env):
-        met = (
-            evaluation.disturbed_environment(plant, env[None], key, largest=force)[0] if force else env
+        actual = (
+            evaluation.disturbed_environment(plant, env[None], key, largest=force)[0]
+            if force
+            else env
         )
         fiber = model.fiber(params, env)
         origin = model.encode(fiber, before)
@@ -90,24 +93,24 @@ def pushed(trained, params, drives, bounds, force):
             origin,
             before,
             control,
-            plant.step(before, control, met),
+            plant.step(before, control, actual),
         )
 
     steps = drives.controls.shape[1]
     keys = jax.random.split(jax.random.key(SEED + 1), (drives.controls.shape[0], steps))
-    found = jax.jit(jax.vmap(jax.vmap(one)))(
+    result = jax.jit(jax.vmap(jax.vmap(one)))(
         keys, drives.states[:, :-1], drives.controls, drives.envs
     )
     return {
-        kind: round(float(np.mean(np.asarray(found[..., k]) > bounds[kind])), 4)
+        kind: round(float(np.mean(np.asarray(result[..., k]) > bounds[kind])), 4)
         for k, kind in enumerate(KINDS)
     }
 
 
 def lengthened(params, factor):
     """Folded parameters with every A_j multiplied."""
-    shared = params["shared"]
-    return params | {"shared": shared._replace(vertices=factor * shared.vertices)}
+    shared = params.shared
+    return params._replace(shared=shared._replace(vertices=factor * shared.vertices))
 
 
 def rows(plant, segments):
@@ -115,14 +118,14 @@ def rows(plant, segments):
     trained = policy.restore(demo.SHIPPED / plant)
     certificate, _ = policy.read_certificate(demo.SHIPPED / plant, trained)
     alpha, d_bar = certificate["alpha"], certificate["d_bar"]["value"]
-    params = jax.jit(trained.model.fold)(trained.params)
+    params = jax.jit(partial(fold, trained.model))(trained.params)
     length = trained.settings["dataset"]["steps"]
     predict = jax.jit(
         partial(predictions, trained.model, length=length, horizon=HORIZON)
     )
     for scenario, drives in driven(trained, segments).items():
         for force in FORCES:
-            left = pushed(
+            left = disturbed(
                 trained, params, drives, certificate["d_bar"]["one_step"], force
             )
             yield {
@@ -131,18 +134,18 @@ def rows(plant, segments):
                 "force_n": force,
                 "left": left,
             }
-        found = jax.device_get(predict(params, drives))
+        result = jax.device_get(predict(params, drives))
         about = {"vehicle": plant, "scenario": scenario}
-        yield about | {"claim": "as certified", **measured(found, alpha, d_bar)}
+        yield about | {"claim": "as certified", **measured(result, alpha, d_bar)}
         for forged in FORGED_ALPHA:
             yield about | {
                 "claim": f"alpha {forged:g}",
-                **measured(found, forged, d_bar),
+                **measured(result, forged, d_bar),
             }
         for factor in FORGED_D_BAR:
             yield about | {
                 "claim": f"d_bar x {factor:g}",
-                **measured(found, alpha, factor * d_bar),
+                **measured(result, alpha, factor * d_bar),
             }
         for factor in SHORTER:
             other = jax.device_get(predict(lengthened(params, factor), drives))
@@ -159,17 +162,17 @@ def main():
     )
     parser.add_argument("--segments", type=int, default=400)
     parser.add_argument("--out", type=Path)
-    asked = parser.parse_args()
-    found = [
-        row for plant in ("kinematic", "dynamic") for row in rows(plant, asked.segments)
+    args = parser.parse_args()
+    result = [
+        row for plant in ("kinematic", "dynamic") for row in rows(plant, args.segments)
     ]
     document = {
-        "rows": found,
-        "segments": asked.segments,
+        "rows": result,
+        "segments": args.segments,
         "versions": artefacts.versions(),
     }
-    if asked.out:
-        artefacts.write_json(asked.out, document)
+    if args.out:
+        artefacts.write_json(args.out, document)
     print(json.dumps(document, indent=1))
 
 

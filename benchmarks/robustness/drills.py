@@ -103,27 +103,27 @@ there in this script.
 class Job:
     """A command in a process group of its own, in a folder."""
 
-    def __init__(self, place, command, said):
+    def __init__(self, directory, command, output):
         """Fork it; what it says goes into a file."""
-        self.command, self.said, self.began, self.status = (
+        self.command, self.output, self.began, self.status = (
             command,
-            place / said,
+            directory / output,
             time.monotonic(),
             None,
         )
         self.pid = os.fork()
         if not self.pid:
-            self._run(place)
+            self._run(directory)
 
-    def _run(self, place):
+    def _run(self, directory):
         """What the child does."""
         status = 1
         try:
             os.setsid()
-            os.chdir(place)
+            os.chdir(directory)
             os.dup2(os.open(os.devnull, os.O_RDWR), 0)
             os.dup2(0, 1)
-            os.dup2(os.open(self.said, os.O_CREAT | os.O_TRUNC | os.O_WRONLY), 2)
+            os.dup2(os.open(self.output, os.O_CREAT | os.O_TRUNC | os.O_WRONLY), 2)
             sys.argv = list(self.command)
             module = importlib.import_module(f"sfkd_jax.{self.command[0]}")
             importlib.import_module("sfkd_jax.cli.entry").hydra_command(module.run)()
@@ -147,7 +147,7 @@ class Job:
 
     def lines(self):
         """What it has said."""
-        return self.said.read_text().splitlines() if self.said.exists() else []
+        return self.output.read_text().splitlines() if self.output.exists() else []
 
     def taken(self):
         """Whether it was refused because another process is at work."""
@@ -236,13 +236,13 @@ def content(file):
     return hashlib.sha256(file.read_bytes()).hexdigest()
 
 
-def files(place):
+def files(directory):
     """What counts as written: not checkpoints (the next job tells), boards, pages with
     times in them, hidden files.
     """
     artefacts = importlib.import_module("sfkd_jax.artefacts")
-    for file in sorted((place / "runs").rglob("*")):
-        parts = file.relative_to(place).parts
+    for file in sorted((directory / "runs").rglob("*")):
+        parts = file.relative_to(directory).parts
         skipped = {"checkpoints", "tensorboard", "sweeps"} & set(parts) or any(
             part.startswith(".") for part in parts
         )
@@ -256,23 +256,25 @@ def files(place):
             yield file
 
 
-def damaged(place):
+def damaged(directory):
     """Files that count as written and cannot be read."""
-    found = []
-    for file in files(place):
+    result = []
+    for file in files(directory):
         try:
             content(file)
         except importlib.import_module("sfkd_jax.artefacts").ArtefactError as reason:
-            found.append(str(reason))
-    return found
+            result.append(str(reason))
+    return result
 
 
-def outcome(place):
+def outcome(directory):
     """What finished jobs left: file -> content."""
-    return {str(file.relative_to(place)): content(file) for file in files(place)}
+    return {
+        str(file.relative_to(directory)): content(file) for file in files(directory)
+    }
 
 
-def disturbed(place, commands, moments):
+def disturbed(directory, commands, moments):
     """Run commands at once; each is killed at its moments [s], one after the other, and given again until it is done.
 
     Yields:
@@ -280,7 +282,7 @@ def disturbed(place, commands, moments):
     """
     moments = iter(moments)
     jobs = {
-        number: (Job(place, command, f"said{number}"), next(moments, None))
+        number: (Job(directory, command, f"said{number}"), next(moments, None))
         for number, command in enumerate(commands)
     }
     while jobs:
@@ -290,24 +292,24 @@ def disturbed(place, commands, moments):
                 del jobs[number]
                 yield job
                 if job.taken():
-                    jobs[number] = Job(place, job.command, f"said{number}"), moment
+                    jobs[number] = Job(directory, job.command, f"said{number}"), moment
             elif moment is not None and time.monotonic() - job.began > moment:
                 job.kill()
                 yield job
                 jobs[number] = (
-                    Job(place, job.command, f"said{number}"),
+                    Job(directory, job.command, f"said{number}"),
                     next(moments, None),
                 )
 
 
 def fresh(scratch, name, template):
     """A new folder, with a trained run in it if there is a template."""
-    place = scratch / name.replace(" ", "_")
-    shutil.rmtree(place, ignore_errors=True)
-    place.mkdir()
+    directory = scratch / name.replace(" ", "_")
+    shutil.rmtree(directory, ignore_errors=True)
+    directory.mkdir()
     if template:
-        shutil.copytree(template / "runs", place / "runs")
-    return place
+        shutil.copytree(template / "runs", directory / "runs")
+    return directory
 
 
 def undisturbed(scratch, commands, template, known={}):  # noqa: B006, what is measured once serves every drill
@@ -316,74 +318,74 @@ def undisturbed(scratch, commands, template, known={}):  # noqa: B006, what is m
     Raises:
         SystemExit: one fails.
     """
-    asked = tuple(commands)
-    while asked not in known or len(known[asked]) < 2:  # the first ones compile
-        place, longest = (
+    args = tuple(commands)
+    while args not in known or len(known[args]) < 2:  # the first ones compile
+        directory, longest = (
             fresh(scratch, f"undisturbed{sum(map(len, known.values()))}", template),
             0.0,
         )
-        for command in asked:
-            for job in disturbed(place, [command], []):
+        for command in args:
+            for job in disturbed(directory, [command], []):
                 longest = max(longest, time.monotonic() - job.began)
-                if found := job.failures():
-                    raise SystemExit("\n".join(found))
+                if result := job.failures():
+                    raise SystemExit("\n".join(result))
         print(
-            f"{' and '.join(command[0] for command in asked)}: undisturbed {longest:.1f} s",
+            f"{' and '.join(command[0] for command in args)}: undisturbed {longest:.1f} s",
             flush=True,
         )
-        known.setdefault(asked, []).append((outcome(place), longest, place))
-    return known[asked][-1]
+        known.setdefault(args, []).append((outcome(directory), longest, directory))
+    return known[args][-1]
 
 
-def drill(name, found, scratch, seed, save):
+def drill(name, result, scratch, seed, save):
     """Rounds of jobs, killed until they are done, until the kills are spent; `found`
     grows, and is saved after each.
     """
     kills, commands, trained = DRILLS[name]
-    if found["kills"] >= kills:
+    if result["kills"] >= kills:
         return
     template = undisturbed(scratch, (TRAIN,), None)[2] if trained else None
     expected, longest, _ = undisturbed(scratch, dict.fromkeys(commands), template)
-    while found["kills"] < kills:
-        draw, place = (
-            random.Random(f"{seed} {name} {found['rounds']}"),
+    while result["kills"] < kills:
+        draw, directory = (
+            random.Random(f"{seed} {name} {result['rounds']}"),
             fresh(scratch, name, template),
         )
-        planned = min(kills - found["kills"], 3 * len(commands))
-        stages, hit = Counter(found["stages"]), 0
+        planned = min(kills - result["kills"], 3 * len(commands))
+        stages, hit = Counter(result["stages"]), 0
         for job in disturbed(
-            place, commands, [draw.uniform(0.0, longest) for _ in range(planned)]
+            directory, commands, [draw.uniform(0.0, longest) for _ in range(planned)]
         ):
             if job.status == -signal.SIGKILL:
                 stages[job.stage()] += 1
                 hit += 1
-                found["damaged"] += damaged(place)
-            found["refused"] += job.taken()
-            found["failed"] += [] if job.taken() else job.failures()
-        left = outcome(place)
-        found["different"] += [
+                result["damaged"] += damaged(directory)
+            result["refused"] += job.taken()
+            result["failed"] += [] if job.taken() else job.failures()
+        left = outcome(directory)
+        result["different"] += [
             file
             for file in expected.keys() | left.keys()
             if left.get(file) != expected.get(file)
         ]
-        found |= {
-            "kills": found["kills"] + hit,
+        result |= {
+            "kills": result["kills"] + hit,
             "stages": dict(stages),
             "undisturbed_s": longest,
         }
-        found["rounds"], found["resumed"] = (
-            found["rounds"] + 1,
-            found["resumed"] + (hit > 0),
+        result["rounds"], result["resumed"] = (
+            result["rounds"] + 1,
+            result["resumed"] + (hit > 0),
         )
-        print(json.dumps({name: found}), flush=True)
+        print(json.dumps({name: result}), flush=True)
         save()
 
 
 def table(document):
     """What was found, as docs/failures.md has it."""
     rows = {
-        name: found
-        for name, found in document.items()
+        name: result
+        for name, result in document.items()
         if name not in ("settings", "machine")
     }
     counted, listed = (
@@ -394,11 +396,11 @@ def table(document):
         "| job | kills | rounds | hit | refused | damaged | failed | different |",
         "|---|" + 7 * "---|",
     ]
-    for name, group in [(name, [found]) for name, found in rows.items()] + [
+    for name, group in [(name, [result]) for name, result in rows.items()] + [
         ("all", list(rows.values()))
     ]:
-        numbers = [sum(found[key] for found in group) for key in counted]
-        numbers += [sum(len(found[key]) for found in group) for key in listed]
+        numbers = [sum(result[key] for result in group) for key in counted]
+        numbers += [sum(len(result[key]) for result in group) for key in listed]
         lines.append(f"| {' | '.join(map(str, (name, *numbers)))} |")
     return "\n".join(lines)
 
@@ -413,7 +415,7 @@ def main():
         "--only", choices=DRILLS, action="append", help="of the drills; may be repeated"
     )
     parser.add_argument("--out", type=Path)
-    asked = parser.parse_args()
+    args = parser.parse_args()
     with tempfile.TemporaryDirectory() as temporary:
         scratch = Path(temporary)
         os.environ.update(
@@ -427,24 +429,22 @@ def main():
         for command in {commands[0][0] for _, commands, _ in DRILLS.values()}:
             importlib.import_module(f"sfkd_jax.{command}")
         timing = importlib.import_module("benchmarks.harness")
-        settings = {"seed": asked.seed, "jobs": json.loads(json.dumps(DRILLS))}
+        settings = {"seed": args.seed, "jobs": json.loads(json.dumps(DRILLS))}
         document = (
-            json.loads(asked.out.read_text())
-            if asked.out and asked.out.exists()
-            else {}
+            json.loads(args.out.read_text()) if args.out and args.out.exists() else {}
         )
         if document.get("settings") != settings:
             document = {"settings": settings}
         empty = {"kills": 0, "rounds": 0, "resumed": 0, "refused": 0, "stages": {}}
 
         def save():
-            timing.write(asked.out, document | {"machine": timing.machine()})
+            timing.write(args.out, document | {"machine": timing.machine()})
 
-        for name in asked.only or DRILLS:
-            found = document.setdefault(
+        for name in args.only or DRILLS:
+            result = document.setdefault(
                 name, empty | {key: [] for key in ("damaged", "failed", "different")}
             )
-            drill(name, found, scratch, asked.seed, save)
+            drill(name, result, scratch, args.seed, save)
         print(table(document), flush=True)
 
 

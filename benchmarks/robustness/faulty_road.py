@@ -100,12 +100,12 @@ def not_finite(state):
 
 def controlled(plant, env_source, delay, samples):
     """The shipped policy as a user has it: (vehicle, params, controller, sensor noise)."""
-    place = SHIPPED / plant
-    settings = sfkd_jax.load(place).settings
+    directory = SHIPPED / plant
+    settings = sfkd_jax.load(directory).settings
     changes = {"monitor": {"fallback": "hold"}, "mppi": {"num_samples": samples}}
     chosen = settings["controller"]
     chosen = chosen | {name: chosen[name] | change for name, change in changes.items()}
-    policy = sfkd_jax.load(place, controller=chosen, env_source=env_source)
+    policy = sfkd_jax.load(directory, controller=chosen, env_source=env_source)
     controller = policy.controller
     if delay:
         controller = control.delay_compensated(controller, policy.model, delay=delay)
@@ -164,8 +164,8 @@ def track(
         now = zip(readings(road, world), world.read, strict=True)
         read = tuple(jnp.concatenate([value[None], past[:-1]]) for value, past in now)
         fault = jax.tree.map(lambda leaf: leaf[world.step], road.faults)
-        told = [past[fault.lag[k]] + fault.offset[k] for k, past in enumerate(read)]
-        return world._replace(read=read), Told(*told, fault.elapsed)
+        observed = [past[fault.lag[k]] + fault.offset[k] for k, past in enumerate(read)]
+        return world._replace(read=read), Told(*observed, fault.elapsed)
 
     def advance(road, world, control):
         sent = jnp.concatenate([world.sent, control[None]])
@@ -182,9 +182,11 @@ def track(
             lost,
         )
 
-    def act(params, state, told):
-        state = with_elapsed(state, told.elapsed)
-        return controller.act(params, state, told.observation, told.env, told.reference)
+    def act(params, state, observed):
+        state = with_elapsed(state, observed.elapsed)
+        return controller.act(
+            params, state, observed.observation, observed.env, observed.reference
+        )
 
     limits = [np.float32(side) for side in (car.control_low, car.control_high)]
     return Track(params, controller.init, act, road, enter, sense, advance, *limits)

@@ -47,28 +47,28 @@ class Cluster:
     and stops it.
     """
 
-    def __init__(self, place):
+    def __init__(self, directory):
         """Write its configuration below `place`."""
-        self.place, self._daemons, self.clients = place, [], []
+        self.directory, self._daemons, self.clients = directory, [], []
         for name, mode in (("munge", 0o755), ("state", 0o700), ("spool", 0o755)):
-            (place / name).mkdir(mode=mode)
-        place.chmod(0o755)
-        key = place / "munge/key"
+            (directory / name).mkdir(mode=mode)
+        directory.chmod(0o755)
+        key = directory / "munge/key"
         key.write_bytes(secrets.token_bytes(128))
         key.chmod(0o400)
         with socket.socket() as free:
             free.bind(("127.0.0.1", 0))
             first = min(free.getsockname()[1], 65000)
         ports = (first, first + 1, first + 2, first + 99)
-        self._config = place / "slurm.conf"
+        self._config = directory / "slurm.conf"
         self._config.write_text(
-            CONFIG.format(place=place, host=socket.gethostname(), ports=ports)
+            CONFIG.format(directory=directory, host=socket.gethostname(), ports=ports)
         )
         self.env = os.environ | {"SLURM_CONF": str(self._config)}
 
     def __enter__(self):
         """Start the daemons, and wait until the node is idle."""
-        munge = self.place / "munge"
+        munge = self.directory / "munge"
         files = [
             f"--{name}-file={munge / name}" for name in ("key", "log", "pid", "seed")
         ]
@@ -104,13 +104,13 @@ class Cluster:
 
     def jobs(self):
         """State by job id, of those that Slurm remembers."""
-        said = self.ask(
+        message = self.ask(
             "squeue", "--me", "--array", "--states=all", "--noheader", "--format=%i %T"
         )
-        return dict(line.split() for line in said.splitlines())
+        return dict(line.split() for line in message.splitlines())
 
     def _start(self, *command):
-        log = (self.place / f"{command[0]}.out").open("w")
+        log = (self.directory / f"{command[0]}.out").open("w")
         self._daemons.append(
             subprocess.Popen(
                 command, env=self.env, stdout=log, stderr=log, start_new_session=True

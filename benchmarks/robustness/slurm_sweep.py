@@ -32,10 +32,10 @@ LONG = ("training.steps=2000", "training.log_every=25", "training.save_every=25"
 class Sweep:
     """`train` swept over learning rates, in a folder of its own."""
 
-    def __init__(self, cluster, place, rates, *options, minutes=20):
+    def __init__(self, cluster, directory, rates, *options, minutes=20):
         """Start it."""
-        place.mkdir(exist_ok=True)
-        cache = str(cluster.place.parents[1] / "cache")
+        directory.mkdir(exist_ok=True)
+        cache = str(cluster.directory.parents[1] / "cache")
         env = {
             "JAX_COMPILATION_CACHE_DIR": cache,
             "JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS": "0",
@@ -44,7 +44,7 @@ class Sweep:
             "XLA_FLAGS": "--xla_backend_optimization_level=0",
             "TF_CPP_MIN_LOG_LEVEL": "3",
         }
-        asked = [
+        args = [
             *drills.JOB,
             *LAUNCHER,
             f"hydra.launcher.timeout_min={minutes}",
@@ -52,18 +52,20 @@ class Sweep:
             *options,
             "--multirun",
         ]
-        self.place, self.cluster, self.began = place, cluster, time.monotonic()
-        self._said = (place / f"said{len(list(place.glob('said*')))}.txt").open("w+")
-        command = [sys.executable, "-m", "sfkd_jax.train", *asked]
+        self.directory, self.cluster, self.began = directory, cluster, time.monotonic()
+        self._said = (directory / f"said{len(list(place.glob('said*')))}.txt").open(
+            "w+"
+        )
+        command = [sys.executable, "-m", "sfkd_jax.train", *args]
         out = {"stdout": subprocess.DEVNULL, "stderr": self._said}
         self.process = subprocess.Popen(
-            command, cwd=place, env=env, start_new_session=True, **out
+            command, cwd=directory, env=env, start_new_session=True, **out
         )
         cluster.clients.append(self.process)
 
     def run(self, rate):
         """The run directory of a job."""
-        return self.place / "runs/smoke" / f"{SWEPT}={rate}" / "sfkd/seed=0"
+        return self.directory / "runs/smoke" / f"{SWEPT}={rate}" / "sfkd/seed=0"
 
     def step(self, rate):
         """The newest checkpoint of a job."""
@@ -91,65 +93,65 @@ class Sweep:
     def lines(self):
         """What was said of jobs and of the sweep."""
         self._said.flush()
-        said = Path(self._said.name).read_text().replace(str(self.place), "")
+        message = Path(self._said.name).read_text().replace(str(self.directory), "")
         return [
             line
-            for line in said.splitlines()
+            for line in message.splitlines()
             if line.startswith("sfkd_jax: ") or "Traceback" in line
         ]
 
     def ended(self, seconds=900):
         """Exit status, how long it took, and what it said."""
         status = self.process.wait(timeout=seconds)
-        found = {
+        result = {
             "status": status,
             "seconds": round(time.monotonic() - self.began),
             "said": self.lines(),
         }
-        print(json.dumps(found, indent=1), flush=True)
-        return found
+        print(json.dumps(result, indent=1), flush=True)
+        return result
 
     def left(self, rate):
         """What a finished job left, less its times."""
         return {name: drills.content(self.run(rate) / name) for name in drills.SAME}
 
 
-def failures(cluster, place):
+def failures(cluster, directory):
     """Two good jobs and two bad ones: one that is refused, one whose loss is not
     finite; then the same sweep again.
     """
     rates = "0.001,0.003,-1,1e30"
-    first = Sweep(cluster, place, rates)
-    found = {"rates": rates, "first": first.ended()}
+    first = Sweep(cluster, directory, rates)
+    result = {"rates": rates, "first": first.ended()}
     before = {
         rate: (first.run(rate) / "policy.npz").stat().st_mtime_ns
         for rate in (0.001, 0.003)
     }
     left = {rate: first.left(rate) for rate in before}
-    again = Sweep(cluster, place, rates)
-    found["again"] = again.ended()
-    kept = {
+    again = Sweep(cluster, directory, rates)
+    result["again"] = again.ended()
+    saved = {
         rate: (again.run(rate) / "policy.npz").stat().st_mtime_ns for rate in before
     }
-    found["good_trained_again"] = kept != before
-    found["good_changed"] = [
+    result["good_trained_again"] = saved != before
+    result["good_changed"] = [
         name
         for rate in left
         for name in left[rate]
         if again.left(rate)[name] != left[rate][name]
     ]
-    found["directories"] = sorted(
-        path.name for path in (place / "runs/smoke").iterdir()
+    result["directories"] = sorted(
+        path.name for path in (directory / "runs/smoke").iterdir()
     )
-    return found
+    return result
 
 
-def requeue(cluster, place):
+def requeue(cluster, directory):
     """Of four jobs on two CPUs one is requeued while it trains, a running and a pending
     one are cancelled.
     """
-    measure = _undisturbed(cluster, place.parent / "undisturbed")
-    sweep = Sweep(cluster, place / "disturbed", "0.001,0.002,0.003,0.004", *LONG)
+    measure = _undisturbed(cluster, directory.parent / "undisturbed")
+    sweep = Sweep(cluster, directory / "disturbed", "0.001,0.002,0.003,0.004", *LONG)
     sweep.until(lambda: sweep.step(0.001) >= 100 and sweep.step(0.002) >= 100)
     array = next(
         job.split("_")[0] for job, state in cluster.jobs().items() if state == "RUNNING"
@@ -159,57 +161,57 @@ def requeue(cluster, place):
     cluster.ask("scancel", f"{array}_3")
     sweep.until(lambda: cluster.jobs()[f"{array}_2"] == "RUNNING")
     cluster.ask("scancel", f"{array}_2")
-    found = {"requeued_at_step": at, "sweep": sweep.ended()}
-    found["different"] = _different(measure, sweep)
-    return found | {"resumed_at_steps": _resumed(sweep)}
+    result = {"requeued_at_step": at, "sweep": sweep.ended()}
+    result["different"] = _different(measure, sweep)
+    return result | {"resumed_at_steps": _resumed(sweep)}
 
 
-def limit(cluster, place):
+def limit(cluster, directory):
     """A time limit in mid-training: the job is queued again until it is done, or told
     in a line if it must not be.
     """
-    measure = _undisturbed(cluster, place.parent / "undisturbed")
+    measure = _undisturbed(cluster, directory.parent / "undisturbed")
     short = (*LONG, "hydra.launcher.signal_delay_s=20")
-    sweep = Sweep(cluster, place / "limited", "0.001,0.002", *short, minutes=3)
-    found = {"minutes": [3, 1], "queued_again": sweep.ended(seconds=3000)}
-    found["different"] = _different(measure, sweep)
-    found["resumed_at_steps"] = _resumed(sweep)
+    sweep = Sweep(cluster, directory / "limited", "0.001,0.002", *short, minutes=3)
+    result = {"minutes": [3, 1], "queued_again": sweep.ended(seconds=3000)}
+    result["different"] = _different(measure, sweep)
+    result["resumed_at_steps"] = _resumed(sweep)
     once = Sweep(
         cluster,
-        place / "once",
+        directory / "once",
         "0.001,0.002",
         *short,
         "hydra.launcher.max_num_timeout=0",
         minutes=1,
     )
-    return found | {"not_queued_again": once.ended()}
+    return result | {"not_queued_again": once.ended()}
 
 
-def large(cluster, place):
+def large(cluster, directory):
     """More than the node has: processors, memory, accelerators, time, nodes."""
-    asked = (
+    args = (
         "cpus_per_task=64",
         "mem_gb=4096",
         "gpus_per_node=1",
         "timeout_min=10000",
         "nodes=3",
     )
-    found = {}
-    for number, option in enumerate(asked):
-        found[option] = Sweep(
-            cluster, place / str(number), "0.001,0.002", f"hydra.launcher.{option}"
+    result = {}
+    for number, option in enumerate(args):
+        result[option] = Sweep(
+            cluster, directory / str(number), "0.001,0.002", f"hydra.launcher.{option}"
         ).ended()
-    return found
+    return result
 
 
-def _undisturbed(cluster, place):
+def _undisturbed(cluster, directory):
     """The measure of two drills: the good jobs, left alone.
 
     Raises:
         SystemExit: they fail.
     """
     sweep = Sweep(
-        cluster, place, "0.001,0.002", *LONG
+        cluster, directory, "0.001,0.002", *LONG
     )  # the second time there is nothing to do
     if sweep.ended()["status"]:
         raise SystemExit("undisturbed jobs failed")
@@ -247,30 +249,30 @@ def main():
     )
     parser.add_argument("--only", nargs="+", choices=DRILLS, default=list(DRILLS))
     parser.add_argument("--out")
-    asked = parser.parse_args()
-    found = {}
+    args = parser.parse_args()
+    result = {}
     with tempfile.TemporaryDirectory() as scratch:
         Path(scratch).chmod(0o755)  # munge wants every user to reach its socket
-        for name in asked.only:
-            place = Path(scratch) / name
-            place.mkdir()
-            (place / "cluster").mkdir()
-            with Cluster(place / "cluster") as cluster:
-                found[name] = DRILLS[name](cluster, place)
-            print(json.dumps({name: found[name]}, indent=1), flush=True)
+        for name in args.only:
+            directory = Path(scratch) / name
+            directory.mkdir()
+            (directory / "cluster").mkdir()
+            with Cluster(directory / "cluster") as cluster:
+                result[name] = DRILLS[name](cluster, directory)
+            print(json.dumps({name: result[name]}, indent=1), flush=True)
     slurm = subprocess.run(
         ["slurmctld", "-V"], capture_output=True, text=True, check=True
     ).stdout.strip()
     settings = {"job": drills.JOB, "launcher": LAUNCHER, "long": LONG}
-    kept = (
-        json.loads(Path(asked.out).read_text())
-        if asked.out and Path(asked.out).exists()
+    saved = (
+        json.loads(Path(args.out).read_text())
+        if args.out and Path(args.out).exists()
         else {}
     )
     harness.write(
-        asked.out,
-        kept
-        | found
+        args.out,
+        saved
+        | result
         | {"settings": settings, "slurm": slurm, "machine": harness.machine()},
     )
 

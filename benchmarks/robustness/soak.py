@@ -80,22 +80,24 @@ def drive(loop, steps, seed):
         np.full((steps, len(loop.low) + 4), np.nan, np.float32),
         np.full(steps, -1),
     )
-    kept = {"resident_kb": [], "arrays": [], "compiled": []}
+    saved = {"resident_kb": [], "arrays": [], "compiled": []}
     for begin in range(0, steps, ROAD):
         road = loop.road(jax.random.key(seed + begin), random)
         kinds[begin : begin + ROAD] = np.asarray(road.faults.kind)[: steps - begin]
-        world, told = enter(road)
+        world, observed = enter(road)
         for k in range(begin, min(begin + ROAD, steps)):
-            control, state, info = act(loop.params, state, told)
-            world, told, records[k] = move(road, world, control, state, info["healthy"])
-        del road, world, told, control, info
+            control, state, info = act(loop.params, state, observed)
+            world, observed, records[k] = move(
+                road, world, control, state, info["healthy"]
+            )
+        del road, world, observed, control, info
         now = resident_kb(), len(jax.live_arrays()), sum(compiled)
-        for name, value in zip(kept, now, strict=True):
-            kept[name].append(value)
-    return records, kinds, kept | {"act": act._cache_size()}
+        for name, value in zip(saved, now, strict=True):
+            saved[name].append(value)
+    return records, kinds, saved | {"act": act._cache_size()}
 
 
-def summary(records, kinds, kept, low, high):
+def summary(records, kinds, saved, low, high):
     """What a leg comes to."""
     controls, (lateral, lost, healthy, left) = (
         records[:, : len(low)],
@@ -113,10 +115,10 @@ def summary(records, kinds, kept, low, high):
         "steps": steps,
         "outside_limits": int(np.sum((controls < low) | (controls > high))),
         "not_finite": int(np.sum(~np.isfinite(controls))),
-        "compilations": kept["act"],
-        "compiled_later": kept["compiled"][-1] - kept["compiled"][0],
-        "memory": growth(np.asarray(kept["resident_kb"])),
-        "arrays": {"start": kept["arrays"][0], "end": kept["arrays"][-1]},
+        "compilations": saved["act"],
+        "compiled_later": saved["compiled"][-1] - saved["compiled"][0],
+        "memory": growth(np.asarray(saved["resident_kb"])),
+        "arrays": {"start": saved["arrays"][0], "end": saved["arrays"][-1]},
         "state_not_finite_after": int(np.max(left[kinds < 0])),
         "healthy": float(np.mean(healthy)),
         "rmse_settled_m": float(np.sqrt(np.mean(lateral[settled] ** 2))),
@@ -151,14 +153,14 @@ def recoveries(kinds, disturbed, healthy, away):
     """By kind of fault: how many, steps until the plan is trusted again, steps until
     the car stays in its lane.
     """
-    found = {
+    result = {
         name: {"count": 0, "until_healthy": [], "until_in_lane": []}
         for name in faults.KINDS
     }
     ends = np.flatnonzero((kinds[:-1] >= 0) & (kinds[1:] < 0)) + 1
     for end in ends:
         fault, later = (
-            found[faults.KINDS[kinds[end - 1]]],
+            result[faults.KINDS[kinds[end - 1]]],
             np.flatnonzero(disturbed[end:]),
         )
         after = slice(end, end + later[0] if len(later) else len(kinds))
@@ -170,7 +172,7 @@ def recoveries(kinds, disturbed, healthy, away):
         fault["until_in_lane"].append(int(off[-1]) + 1 if len(off) else 0)
     return {
         name: fault | {key: spread(fault[key]) for key in fault if key != "count"}
-        for name, fault in found.items()
+        for name, fault in result.items()
     }
 
 
@@ -255,11 +257,11 @@ def main():
     parser.add_argument("--only", nargs="*", default=list(LEGS), choices=list(LEGS))
     parser.add_argument("--out")
     parser.add_argument("--measure", choices=list(LEGS), help=argparse.SUPPRESS)
-    asked = parser.parse_args()
-    if asked.measure:
-        steps, settings = LEGS[asked.measure]
+    args = parser.parse_args()
+    if args.measure:
+        steps, settings = LEGS[args.measure]
         loop, began = track(**settings), time.perf_counter()
-        driven = drive(loop, getattr(asked, steps), asked.seed)
+        driven = drive(loop, getattr(args, steps), args.seed)
         print(
             json.dumps(
                 summary(*driven, loop.low, loop.high)
@@ -267,17 +269,17 @@ def main():
             )
         )
         return
-    settings = {key: getattr(asked, key) for key in ("steps", "short", "full", "seed")}
+    settings = {key: getattr(args, key) for key in ("steps", "short", "full", "seed")}
     words = [word for key, value in settings.items() for word in (f"--{key}", value)]
     settings |= {"samples": SAMPLES, "horizon": HORIZON}
     known = (
-        json.loads(Path(asked.out).read_text())
-        if asked.out and Path(asked.out).exists()
+        json.loads(Path(args.out).read_text())
+        if args.out and Path(args.out).exists()
         else {}
     )
     legs = known["legs"] if known.get("settings") == settings else {}
     document = {"legs": legs, "settings": settings, "machine": harness.machine()}
-    for leg in asked.only:
+    for leg in args.only:
         document["legs"][leg] = harness.in_own_process(
             "benchmarks.robustness.soak",
             "--measure",
@@ -286,7 +288,7 @@ def main():
             environment=ENVIRONMENT,
         )
         print(leg, json.dumps(document["legs"][leg]), flush=True)
-        harness.write(asked.out, document)
+        harness.write(args.out, document)
     print(table(document), flush=True)
 
 

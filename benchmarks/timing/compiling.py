@@ -76,13 +76,13 @@ def main():
     parser.add_argument("--rounds", type=int, default=3)
     names = ("shared problem", "own model")
     parser.add_argument("--measure", choices=names, help=argparse.SUPPRESS)
-    asked = parser.parse_args()
-    found = (
-        measure(asked.measure)
-        if asked.measure
-        else {name: rounds(name, asked.rounds) for name in names}
+    args = parser.parse_args()
+    result = (
+        measure(args.measure)
+        if args.measure
+        else {name: rounds(name, args.rounds) for name in names}
     )
-    print(json.dumps(found))
+    print(json.dumps(result))
 
 
 if __name__ == "__main__":

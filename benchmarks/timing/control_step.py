@@ -18,7 +18,7 @@ def rounds_of(jobs, count, steps):
     """`count` rounds over all jobs (label -> name, samples, horizon), each time in a
     new process: label -> rounds.
     """
-    found = {label: [] for label in jobs}
+    result = {label: [] for label in jobs}
     for _ in range(count):
         for label, (name, samples, horizon) in jobs.items():
             words = (
@@ -31,14 +31,14 @@ def rounds_of(jobs, count, steps):
                 "--steps",
                 steps,
             )
-            found[label].append(
+            result[label].append(
                 harness.in_own_process(
                     "benchmarks.timing.control_step",
                     *words,
                     environment=environment(name),
                 )
             )
-    return found
+    return result
 
 
 def summary(rounds):
@@ -58,17 +58,17 @@ def summary(rounds):
     }
 
 
-def table_of(found):
+def table_of(result):
     """Rounds -> summaries, and the reasons of those that did not run."""
     missing = {
         label: one["error"]
-        for label, rounds in found.items()
+        for label, rounds in result.items()
         for one in rounds
         if "error" in one
     }
     return {
         label: summary(rounds)
-        for label, rounds in found.items()
+        for label, rounds in result.items()
         if label not in missing
     }, missing
 
@@ -95,13 +95,13 @@ def arguments():
 
 def main():
     """Parse, run, print, write."""
-    asked = arguments()
-    if asked.measure:
-        build = partial(same_place, asked.measure, asked.samples, asked.horizon)
-        print(json.dumps(harness.first_and_then(build, asked.steps)))
+    args = arguments()
+    if args.measure:
+        build = partial(same_place, args.measure, args.samples, args.horizon)
+        print(json.dumps(harness.first_and_then(build, args.steps)))
         return
-    jobs = {name: (name, asked.samples, asked.horizon) for name in asked.only}
-    table, missing = table_of(rounds_of(jobs, asked.rounds, asked.steps))
+    jobs = {name: (name, args.samples, args.horizon) for name in args.only}
+    table, missing = table_of(rounds_of(jobs, args.rounds, args.steps))
     for name, row in table.items():
         print(
             f"{name:24}", "  ".join(f"{key} {value:8.2f}" for key, value in row.items())
@@ -109,7 +109,7 @@ def main():
     for name, reason in missing.items():
         print(f"{name:24} not run: {reason}")
     settings = {
-        key: getattr(asked, key) for key in ("samples", "horizon", "rounds", "steps")
+        key: getattr(args, key) for key in ("samples", "horizon", "rounds", "steps")
     }
     document = {
         "contenders": table,
@@ -117,7 +117,7 @@ def main():
         "settings": settings,
         "machine": harness.machine(),
     }
-    harness.write(asked.out, document)
+    harness.write(args.out, document)
 
 
 if __name__ == "__main__":

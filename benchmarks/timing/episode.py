@@ -40,33 +40,33 @@ def main():
         ("rounds", 6),
     ):
         parser.add_argument(f"--{name}", type=int, default=value)
-    asked = parser.parse_args()
-    controller, w = ours.planner(asked.samples, asked.horizon)
-    w, state, z, env, targets = ours.arguments(controller, w, asked.horizon)
+    args = parser.parse_args()
+    controller, w = ours.planner(args.samples, args.horizon)
+    w, state, z, env, targets = ours.arguments(controller, w, args.horizon)
     run, act = (
-        episode_of(controller, w, targets, env, asked.steps),
+        episode_of(controller, w, targets, env, args.steps),
         jax.jit(controller.act),
     )
     jax.block_until_ready(run(state, z))
     step = lambda: jax.block_until_ready(act(w, state, z, env, targets))
     harness.timed(step, harness.WARM_UP)
     singles, episodes = [], []
-    for _ in range(asked.rounds):
-        singles.append(statistics.median(harness.timed(step, asked.steps)[0]))
+    for _ in range(args.rounds):
+        singles.append(statistics.median(harness.timed(step, args.steps)[0]))
         began = time.perf_counter()
         jax.block_until_ready(run(state, z))
         episodes.append(1e3 * (time.perf_counter() - began))
     single, whole = min(singles), min(episodes)
     pairs = zip(episodes, singles, strict=True)
     ratios = {
-        "ratio": whole / (asked.steps * single),
+        "ratio": whole / (args.steps * single),
         "median_ratio": statistics.median(
-            episode / (asked.steps * step) for episode, step in pairs
+            episode / (args.steps * step) for episode, step in pairs
         ),
     }
     print(
         json.dumps(
-            {"steps": asked.steps, "step_ms": single, "episode_ms": whole} | ratios
+            {"steps": args.steps, "step_ms": single, "episode_ms": whole} | ratios
         )
     )
 

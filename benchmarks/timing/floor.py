@@ -48,18 +48,18 @@ def parts(samples, horizon):
     """Label -> a function of no arguments that does one part of one control step."""
     random = jax.random.normal
     rows = lambda width: random(jax.random.key(0), (samples, width))
-    found = {}
+    result = {}
     for name in PRODUCTS:
         matrix = jnp.asarray(problem.weights()[name])
-        found[name] = partial(product(matrix, samples, horizon), rows(matrix.shape[1]))
-    found["tanh"] = partial(activation(TANH * horizon), rows(problem.WIDTH))
+        result[name] = partial(product(matrix, samples, horizon), rows(matrix.shape[1]))
+    result["tanh"] = partial(activation(TANH * horizon), rows(problem.WIDTH))
     controller, w = ours.planner(samples, horizon)
-    found["step"] = partial(
+    result["step"] = partial(
         jax.jit(controller.act), *ours.arguments(controller, w, horizon)
     )
     large = random(jax.random.key(1), (LARGE, LARGE))
-    found["large product"] = partial(jax.jit(lambda a: a @ a), large)
-    return {name: partial(ready, run) for name, run in found.items()}
+    result["large product"] = partial(jax.jit(lambda a: a @ a), large)
+    return {name: partial(ready, run) for name, run in result.items()}
 
 
 def ready(run):
@@ -101,9 +101,9 @@ def main():
     )
     for name, value in (("samples", 1500), ("horizon", 20), ("rounds", 15)):
         parser.add_argument(f"--{name}", type=int, default=value)
-    asked = parser.parse_args()
-    best = harness.in_turn(parts(asked.samples, asked.horizon), asked.rounds)
-    print(json.dumps(summary(best, asked.samples, asked.horizon)))
+    args = parser.parse_args()
+    best = harness.in_turn(parts(args.samples, args.horizon), args.rounds)
+    print(json.dumps(summary(best, args.samples, args.horizon)))
 
 
 if __name__ == "__main__":

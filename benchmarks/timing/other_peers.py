@@ -70,9 +70,9 @@ def torchrl_mppi(samples, horizon, seed=0):
     environment = _torchrl_environment(aim)
 
     class Total(torch.nn.Module):
-        def forward(self, found):
-            total = found["next", "reward"].sum(-2, keepdim=True)
-            return found.set("advantage", total.expand(found["next", "reward"].shape))
+        def forward(self, result):
+            total = result["next", "reward"].sum(-2, keepdim=True)
+            return result.set("advantage", total.expand(result["next", "reward"].shape))
 
     size = {
         "planning_horizon": horizon,
@@ -125,13 +125,13 @@ def _torchrl_environment(aim):
                 ..., None
             ]
             done = torch.zeros(*z.shape[:-1], 1, dtype=torch.bool)
-            found = {
+            result = {
                 "hidden": z,
                 "reward": reward,
                 "done": done,
                 "terminated": done.clone(),
             }
-            return TensorDict(found, tensordict.batch_size)
+            return TensorDict(result, tensordict.batch_size)
 
     return Latent()
 

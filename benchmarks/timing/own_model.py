@@ -50,9 +50,9 @@ def belief(*overrides):
     """Plant, model and settings under overrides of the configuration."""
     from sfkd_jax import build
 
-    asked = settings(*overrides)
-    plant = build.build_vehicle(asked["vehicle"])
-    return plant, build.build_model(asked["model"], space(plant), plant), asked
+    args = settings(*overrides)
+    plant = build.build_vehicle(args["vehicle"])
+    return plant, build.build_model(args["model"], space(plant), plant), args
 
 
 def weights(model):
@@ -93,14 +93,14 @@ def problem(samples, horizon, seed=0, **options):
 
     from sfkd_jax import build
 
-    plant, model, asked = belief()
-    asked["controller"]["mppi"] |= {
+    plant, model, args = belief()
+    args["controller"]["mppi"] |= {
         "num_samples": samples,
         "horizon": horizon,
         **options,
     }
-    limits = {name: asked["dataset"][name] for name in ("env_low", "env_high")}
-    controller = build.build_controller(asked["controller"], model, plant, **limits)
+    limits = {name: args["dataset"][name] for name in ("env_low", "env_high")}
+    controller = build.build_controller(args["controller"], model, plant, **limits)
     params, *rest = inputs(plant, model, horizon)
     params = jax.jit(partial(fold, model))(params)
     return controller, (params, controller.init(jax.random.key(seed)), *rest)

@@ -31,8 +31,8 @@ def task_of(plant, model, *, law=None, cost=None):
 
 def begin_of(task):
     """What is evaluated once a step: fibre, encoder, curvature."""
-    applied = control.Applied(jnp.zeros(2), jnp.asarray(False))
-    return jax.jit(lambda params, *measured: task.begin(params, *measured, applied))
+    applied = control.PreviousControl(jnp.zeros(2), jnp.asarray(False))
+    return jax.jit(lambda params, *measured: task.prepare(params, *measured, applied))
 
 
 def rollouts_of(task, horizon):
@@ -47,7 +47,7 @@ def rollouts_of(task, horizon):
 
         def body(carry, given):
             costs, samples = carry
-            step = jax.vmap(task.advance, in_axes=(None, None, 0, 0, None, None))
+            step = jax.vmap(task.step, in_axes=(None, None, 0, 0, None, None))
             after = step(task.weights, began.context, samples, *given)
             return (costs + after.cost, after.sample), after.perturbation
 
@@ -79,7 +79,7 @@ def parts(samples, horizon):
     """Label -> a function of no arguments."""
     plant, model, _ = own_model.belief()
     given = own_model.inputs(plant, model, horizon)
-    draw = control.sampler("ar1", horizon=horizon)
+    draw = control.noise_sampler("ar1", horizon=horizon)
     noise = jax.jit(lambda key: draw(key, samples, jnp.asarray([0.02, 0.3])))
     free = control.Cost({}, lambda weights, seen: jnp.zeros(()))
     bare = {"law": control.no_feedback(), "cost": free}
@@ -123,18 +123,18 @@ def main():
     for name, value in (("samples", 1500), ("horizon", 20), ("rounds", 15)):
         parser.add_argument(f"--{name}", type=int, default=value)
     parser.add_argument("--out")
-    asked = parser.parse_args()
-    found = harness.in_turn(parts(asked.samples, asked.horizon), asked.rounds)
-    for label, row in found.items():
+    args = parser.parse_args()
+    result = harness.in_turn(parts(args.samples, args.horizon), args.rounds)
+    for label, row in result.items():
         print(
             f"{label:36}",
             "  ".join(f"{key} {value:7.3f}" for key, value in row.items()),
         )
-    settings = {key: getattr(asked, key) for key in ("samples", "horizon", "rounds")}
+    settings = {key: getattr(args, key) for key in ("samples", "horizon", "rounds")}
     harness.write(
-        asked.out, {"parts": found, "settings": settings, "machine": harness.machine()}
+        args.out, {"parts": result, "settings": settings, "machine": harness.machine()}
     )
-    print(json.dumps(found["whole step"]))
+    print(json.dumps(result["whole step"]))
 
 
 if __name__ == "__main__":

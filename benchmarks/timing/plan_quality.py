@@ -74,7 +74,7 @@ def drive(name, samples, seeds, steps):
 
 def fitting(name, rounds, steps):
     """Best time of a step for every number of samples [ms]."""
-    found = {}
+    result = {}
     for samples in SAMPLES:
         ask = partial(
             harness.in_own_process,
@@ -89,11 +89,11 @@ def fitting(name, rounds, steps):
         runs = [ask() for _ in range(rounds)]
         if "error" in runs[0]:
             return runs[0]
-        found[samples] = min(statistics.median(run["wall_ms"]) for run in runs)
-    return found
+        result[samples] = min(statistics.median(run["wall_ms"]) for run in runs)
+    return result
 
 
-def judged(name, times, budget, asked):
+def judged(name, times, budget, args):
     """The most samples within the budget, and the best temperature's closed loop with
     them.
     """
@@ -106,9 +106,9 @@ def judged(name, times, budget, asked):
         "--samples",
         max(fit),
         "--seeds",
-        asked.seeds,
+        args.seeds,
         "--steps",
-        asked.steps,
+        args.steps,
     )
     rows = harness.in_own_process("benchmarks.timing.plan_quality", *words)
     best = min(rows, key=lambda row: statistics.mean(row["costs"]))
@@ -137,35 +137,35 @@ def main():
     parser.add_argument("--out")
     for hidden in ("--time", "--drive"):
         parser.add_argument(hidden, choices=list(BUILD), help=argparse.SUPPRESS)
-    asked = parser.parse_args()
-    if asked.time:
+    args = parser.parse_args()
+    if args.time:
         build = lambda: partial(
-            BUILD[asked.time](asked.samples, HORIZON), problem.start(), AIM
+            BUILD[args.time](args.samples, HORIZON), problem.start(), AIM
         )
-        print(json.dumps(harness.first_and_then(build, asked.steps)))
-    elif asked.drive:
-        print(json.dumps(drive(asked.drive, asked.samples, asked.seeds, asked.steps)))
+        print(json.dumps(harness.first_and_then(build, args.steps)))
+    elif args.drive:
+        print(json.dumps(drive(args.drive, args.samples, args.seeds, args.steps)))
     else:
-        times = {name: fitting(name, asked.rounds, asked.steps) for name in asked.only}
+        times = {name: fitting(name, args.rounds, args.steps) for name in args.only}
         missing = {
-            name: found["error"] for name, found in times.items() if "error" in found
+            name: result["error"] for name, result in times.items() if "error" in result
         }
-        ran = [name for name in asked.only if name not in missing]
-        found = {
-            budget: {name: judged(name, times[name], budget, asked) for name in ran}
-            for budget in asked.budgets
+        ran = [name for name in args.only if name not in missing]
+        result = {
+            budget: {name: judged(name, times[name], budget, args) for name in ran}
+            for budget in args.budgets
         }
-        for budget, rows in found.items():
+        for budget, rows in result.items():
             for name, row in rows.items():
                 print(f"{budget:5} ms  {name:20}", json.dumps(row))
-        settings = {key: getattr(asked, key) for key in ("seeds", "steps", "budgets")}
+        settings = {key: getattr(args, key) for key in ("seeds", "steps", "budgets")}
         document = {
-            "budgets": found,
+            "budgets": result,
             "times_ms": times,
             "not_run": missing,
             "settings": settings,
         }
-        harness.write(asked.out, document | {"machine": harness.machine()})
+        harness.write(args.out, document | {"machine": harness.machine()})
 
 
 if __name__ == "__main__":

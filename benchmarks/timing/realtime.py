@@ -33,8 +33,8 @@ def competing():
 
 def tail(times):
     """Quantiles, the worst step, and how many missed the period."""
-    found = {name: harness.quantile(times, share) for name, share in SHARES.items()}
-    return found | {
+    result = {name: harness.quantile(times, share) for name, share in SHARES.items()}
+    return result | {
         "max_ms": max(times),
         "missed": sum(time > PERIOD_MS for time in times),
         "steps": len(times),
@@ -68,31 +68,31 @@ def main():
     )
     parser.add_argument("--out")
     parser.add_argument("--measure", choices=list(CONTENDERS), help=argparse.SUPPRESS)
-    asked = parser.parse_args()
-    if asked.measure:
-        build = partial(same_place, asked.measure, asked.samples, asked.horizon)
-        print(json.dumps(tail(harness.first_and_then(build, asked.steps)["wall_ms"])))
+    args = parser.parse_args()
+    if args.measure:
+        build = partial(same_place, args.measure, args.samples, args.horizon)
+        print(json.dumps(tail(harness.first_and_then(build, args.steps)["wall_ms"])))
         return
-    found = {}
-    for name in asked.only:
-        steps = asked.steps if name in OURS else asked.slow
+    result = {}
+    for name in args.only:
+        steps = args.steps if name in OURS else args.slow
         both = {
             "alone": drive(name, steps, False),
-            "beside": drive(name, min(steps, asked.beside), True),
+            "beside": drive(name, min(steps, args.beside), True),
         }
-        found[name] = both
+        result[name] = both
         print(name, json.dumps(both))
     settings = {
-        key: getattr(asked, key)
+        key: getattr(args, key)
         for key in ("samples", "horizon", "steps", "beside", "slow")
     }
     document = {
-        "contenders": found,
+        "contenders": result,
         "period_ms": PERIOD_MS,
         "settings": settings,
         "machine": harness.machine(),
     }
-    harness.write(asked.out, document)
+    harness.write(args.out, document)
 
 
 if __name__ == "__main__":

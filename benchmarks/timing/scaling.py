@@ -83,28 +83,28 @@ def main():
     )
     parser.add_argument("--samples", nargs="*", type=int, default=list(SAMPLES))
     parser.add_argument("--out")
-    asked = parser.parse_args()
-    rows, missing = sweep(asked.only, asked.samples, asked.rounds, asked.steps)
-    ran = [name for name in asked.only if any(row["name"] == name for row in rows)]
+    args = parser.parse_args()
+    rows, missing = sweep(args.only, args.samples, args.rounds, args.steps)
+    ran = [name for name in args.only if any(row["name"] == name for row in rows)]
     document = {
         "sweep": rows,
         "not_run": missing,
-        "exponents": {name: growth(rows, name, asked.samples) for name in ran},
+        "exponents": {name: growth(rows, name, args.samples) for name in ran},
         "episode": harness.in_own_process(
             "benchmarks.timing.episode",
             "--steps",
-            asked.episode,
+            args.episode,
             "--rounds",
-            2 * asked.rounds,
+            2 * args.rounds,
         ),
         "compile": harness.in_own_process(
-            "benchmarks.timing.compiling", "--rounds", asked.compilations
+            "benchmarks.timing.compiling", "--rounds", args.compilations
         ),
         "floor": harness.in_own_process(
-            "benchmarks.timing.floor", "--rounds", 5 * asked.rounds
+            "benchmarks.timing.floor", "--rounds", 5 * args.rounds
         ),
         "settings": {
-            key: getattr(asked, key)
+            key: getattr(args, key)
             for key in ("rounds", "steps", "episode", "compilations")
         },
         "machine": harness.machine(),
@@ -115,7 +115,7 @@ def main():
         )
     for part in ("not_run", "exponents", "episode", "compile", "floor"):
         print(part, document[part])
-    harness.write(asked.out, document)
+    harness.write(args.out, document)
 
 
 if __name__ == "__main__":

@@ -59,10 +59,10 @@ def numbers(row, digits):
 
 def steps(own):
     """One control step of the shared problem, or of the project's own model."""
-    found = read("control_step")["contenders"]
+    result = read("control_step")["contenders"]
     rows = [
         [LABELS[name], *numbers(row, STEP)]
-        for name, row in found.items()
+        for name, row in result.items()
         if (name in OWN) == own
     ]
     return table(["contender", *STEP_HEADS], rows)
@@ -70,7 +70,7 @@ def steps(own):
 
 def ratios():
     """Every other contender's time over ours, on one device and on two."""
-    found = read("control_step")["contenders"]
+    result = read("control_step")["contenders"]
     kinds = [
         (ours, kind)
         for ours in ("sfkd_jax", "sfkd_jax_sharded")
@@ -80,9 +80,11 @@ def ratios():
         "time over ours",
         *(f"{'two' if 'sh' in ours else 'one'}, {kind[:-3]}" for ours, kind in kinds),
     ]
-    others = [name for name in found if not name.startswith("sfkd") and name not in OWN]
+    others = [
+        name for name in result if not name.startswith("sfkd") and name not in OWN
+    ]
     divided = lambda name: [
-        f"{found[name][kind] / found[ours][kind]:.2f}" for ours, kind in kinds
+        f"{result[name][kind] / result[ours][kind]:.2f}" for ours, kind in kinds
     ]
     return table(heads, [[LABELS[name], *divided(name)] for name in others])
 
@@ -97,11 +99,11 @@ def left_out():
 
 def sweep():
     """Best round's times by number of samples and by horizon."""
-    found = read("scaling")
-    names = list(found["exponents"])
+    result = read("scaling")
+    names = list(result["exponents"])
     times = {
         (row["name"], row["samples"], row["horizon"]): row["best_ms"]
-        for row in found["sweep"]
+        for row in result["sweep"]
     }
     sizes = list(dict.fromkeys(key[1:] for key in times))
     entry = lambda name, size: (
@@ -119,7 +121,7 @@ def sweep():
             [
                 label,
                 *(
-                    f"{found['exponents'][name].get(part, float('nan')):.2f}"
+                    f"{result['exponents'][name].get(part, float('nan')):.2f}"
                     for name in names
                 ),
             ]
@@ -131,12 +133,12 @@ def sweep():
 
 def compiling():
     """Seconds in a fresh process."""
-    found = read("scaling")["compile"]
+    result = read("scaling")["compile"]
     digits = {"trace_s": 2, "compile_s": 2, "first_step_s": 3}
     rows = [
-        [f"{name}, {kind} cache", *numbers(found[name][kind], digits)]
-        for name in found
-        for kind in found[name]
+        [f"{name}, {kind} cache", *numbers(result[name][kind], digits)]
+        for name in result
+        for kind in result[name]
     ]
     return table(["", "trace [s]", "compile [s]", "first step [s]"], rows).replace(
         "cold cache", "no cache"
@@ -145,8 +147,8 @@ def compiling():
 
 def floor():
     """Episode against steps, and the roofline."""
-    found = read("scaling")
-    episode, under = found["episode"], found["floor"]
+    result = read("scaling")
+    episode, under = result["episode"], result["floor"]
     rates = [under[f"{name}_gflops"] for name in ("step", "products", "large_product")]
     rows = [
         ["products of matrices alone", f"{under['products_ms']:.2f} ms"],
@@ -172,10 +174,10 @@ def floor():
 
 def tails():
     """Thousands of steps, alone and beside a busy process."""
-    found = read("realtime")["contenders"]
+    result = read("realtime")["contenders"]
     kinds = {"alone": "alone", "beside": "beside a busy process"}
     rows = []
-    for name, both in found.items():
+    for name, both in result.items():
         for kind, words in kinds.items():
             ran = "error" not in both[kind]
             rows.append(
@@ -191,8 +193,8 @@ def tails():
 def closed_loop():
     """Cost of the closed loop for what fits into a budget of time."""
     rows = []
-    for budget, found in read("plan_quality")["budgets"].items():
-        for name, row in found.items():
+    for budget, result in read("plan_quality")["budgets"].items():
+        for name, row in result.items():
             if not row["samples"]:
                 rows.append([budget, LABELS[name], 0, "", "", "", ""])
                 continue
@@ -232,14 +234,14 @@ def runs():
     for name in FILES:
         if not (HERE / f"{name}.json").exists():
             continue
-        found = read(name)
-        asked = ", ".join(
-            f"{key} {value}" for key, value in found.get("settings", {}).items()
+        result = read(name)
+        args = ", ".join(
+            f"{key} {value}" for key, value in result.get("settings", {}).items()
         )
         versions = ", ".join(
-            f"{key} {value}" for key, value in found["machine"]["versions"].items()
+            f"{key} {value}" for key, value in result["machine"]["versions"].items()
         )
-        load = found["machine"].get("load", "not recorded")
+        load = result["machine"].get("load", "not recorded")
         load = load if isinstance(load, str) else f"{load:.1f}"
-        rows.append([f"{name}.json", asked, load, versions])
+        rows.append([f"{name}.json", args, load, versions])
     return table(["file", "settings", "load average before", "versions"], rows)

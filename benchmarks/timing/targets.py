@@ -33,9 +33,9 @@ def speeds():
 
 def tails():
     """In real time."""
-    found = read("realtime")["contenders"]
+    result = read("realtime")["contenders"]
     for name in ("sfkd_jax", "own_model"):
-        alone, beside = found[name]["alone"], found[name]["beside"]
+        alone, beside = result[name]["alone"], result[name]["beside"]
         yield (
             f"{LABELS[name]}: p99 beside a busy process [ms]",
             "<= 20",
@@ -51,11 +51,11 @@ def tails():
 def growth():
     """Temperature, samples, episodes, compiling."""
     parts, scale = read("own_profile")["parts"], read("scaling")
-    found = (
+    result = (
         parts["whole step, 30 effective samples"]["best_ms"]
         - parts["whole step"]["best_ms"]
     )
-    yield "finding the temperature [ms]", "<= 0.3", found
+    yield "finding the temperature [ms]", "<= 0.3", result
     yield (
         "exponent of the growth in samples, from 1500 on",
         "<= 1.05",
@@ -83,11 +83,11 @@ def targets():
             rows += part()
     return table(
         ["", "target", "found", "met"],
-        [[*row[:2], f"{row[2]:.2f}", met(*row[1:])] for row in rows],
+        [[*row[:2], f"{row[2]:.2f}", actual(*row[1:])] for row in rows],
     )
 
 
-def met(target, value):
+def actual(target, value):
     """yes or no."""
     sign, number = target.split()
     return (

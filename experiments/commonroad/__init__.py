@@ -1,0 +1,1 @@
+"""CommonRoad's cars: training, tuning, the page."""

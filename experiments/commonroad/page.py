@@ -99,9 +99,9 @@ def times(ratio):
 
 def tuning():
     """What training on did to prediction and certificate."""
-    found = results()["tuning"]
+    result = results()["tuning"]
     lines = []
-    for name, row in found.items():
+    for name, row in result.items():
         if name == "drives":
             continue
         error = row["position_rmse_2s_m"]
@@ -147,11 +147,11 @@ def handling():
 
 def export():
     """The exported controller beside the one in Python."""
-    found = results()["export"]
+    result = results()["export"]
     numbers = [
-        found["steps"],
-        f"{1e3 * found['rmse_m']:.1f}",
-        f"{found['largest_difference']:g}",
+        result["steps"],
+        f"{1e3 * result['rmse_m']:.1f}",
+        f"{result['largest_difference']:g}",
     ]
     return tables.table(
         ["steps", "RMSE [mm]", "largest difference of a control"], [numbers]
@@ -162,15 +162,19 @@ def along_path():
     """What is certified of the drift car along a path, and what the package's own car
     did.
     """
-    found = json.loads((ROOT / "experiments" / "commonroad" / "path.json").read_text())
-    certificate, package, step = found["certificate"], found["package"], found["step"]
+    result = json.loads((ROOT / "experiments" / "commonroad" / "path.json").read_text())
+    certificate, package, step = (
+        result["certificate"],
+        result["package"],
+        result["step"],
+    )
     output, corridor = certificate["outputs"]["position"], certificate["corridor"]
     bounds, s3, tube = corridor["bounds"], corridor["by_scenario"]["s3"], output["tube"]
     inside = {
         name: within(output["coverage"][name], output["coverage_drives"])
         for name in tube
     }
-    apart = step["largest"]
+    separate = step["largest"]
     lines = {
         "α in the metric of e_y, proved; in the 2-norm": f"{output['alpha']:.3f}; {certificate['alpha']:.3f}",
         "tube on 5 s drives like the data, `for_ever` [m]": f"{tube['for_ever']:.3f}",
@@ -186,7 +190,7 @@ def along_path():
         "of these with \\|e_y\\| within the corridor": f"{package['inside_corridor']} of {package['coverage_drives']}",
         "their largest \\|e_y\\|; \\|e_y − ê_y\\| [m]": f"{package['lateral_m']:.3f}; {package['distance_m']:.3f}",
         f"one step beside the package's, largest of {step['steps']}: position [m]; v [m/s]": (
-            f"{max(apart['p_x'], apart['p_y']):.0e}; {apart['v']:.0e}"
+            f"{max(separate['p_x'], separate['p_y']):.0e}; {separate['v']:.0e}"
         ),
         "certify everything [s]": f"{certificate['seconds']:.0f}",
     }
@@ -195,10 +199,10 @@ def along_path():
     )
 
 
-def counted(found):
+def counted(result):
     """Drives inside of how many, with the interval of the share."""
-    low, high = found["coverage_ci95"]
-    return f"{within(found['coverage'], found['coverage_drives'])} ({low:.3f} to {high:.3f})"
+    low, high = result["coverage_ci95"]
+    return f"{within(result['coverage'], result['coverage_drives'])} ({low:.3f} to {high:.3f})"
 
 
 def within(share, drives):

@@ -39,7 +39,7 @@ BATCH = 10
 STEPS_COMPARED = 300
 
 
-def collect(loop, about, drives, place):
+def collect(loop, about, drives, directory):
     """Drives of a class on a loop, in batches that are kept: after an interruption the
     same command continues.
     """
@@ -60,7 +60,7 @@ def collect(loop, about, drives, place):
     parts = []
     for index in range(drives // BATCH):
         path, config = (
-            place / f"{index}.npz",
+            directory / f"{index}.npz",
             {"class": about, "law": law, "index": index, "seed": SEED},
         )
         if not artefacts.exists(path):
@@ -75,14 +75,14 @@ def collect(loop, about, drives, place):
                 file=sys.stderr,
                 flush=True,
             )
-        kept = artefacts.read_arrays(path, kind="drives", config=config)[0]
+        saved = artefacts.read_arrays(path, kind="drives", config=config)[0]
         parts.append(
-            Trajectory(**{name: jnp.asarray(leaf) for name, leaf in kept.items()})
+            Trajectory(**{name: jnp.asarray(leaf) for name, leaf in saved.items()})
         )
     return jax.tree.map(lambda *leaves: jnp.concatenate(leaves), *parts)
 
 
-def driven(trained, certificate, drives, place):
+def driven(trained, certificate, drives, directory):
     """Drives of the certified class by the package's car; their scores under the
     certified bounds.
     """
@@ -90,13 +90,13 @@ def driven(trained, certificate, drives, place):
     loop = policy_loop(
         adapters.commonroad_vehicle(model="std"), trained, about["sensor_noise"]
     )
-    made = collect(loop, about, drives, place)
+    made = collect(loop, about, drives, directory)
     measured = drive_measurement(loop, output_metrics_from(certificate["outputs"]))(
         made, jax.random.key(SEED + 1)
     )
     bounds, lateral = certificate["corridor"]["bounds"], np.abs(measured.lateral)
-    found = corridor_coverage(bounds, measured.scores)
-    found |= {
+    result = corridor_coverage(bounds, measured.scores)
+    result |= {
         "lateral_m": float(lateral.max()),
         "distance_m": float(np.abs(measured.lateral - measured.copied).max()),
         "inside_corridor": int(
@@ -104,7 +104,7 @@ def driven(trained, certificate, drives, place):
         ),
         "slowest_m_per_s": float(made.states[..., BODY][..., PATH_SPEED].min()),
     }
-    return found, made
+    return result, made
 
 
 def compared(trained, made):
@@ -118,16 +118,16 @@ def compared(trained, made):
         jnp.asarray(np.asarray(leaf).reshape(-1, leaf.shape[-1])[chosen])
         for leaf in (made.states[:, :-1, BODY], made.controls, made.envs)
     )
-    asked = jax.vmap(trained.law)(
+    args = jax.vmap(trained.law)(
         states, inputs[:, CURVATURE], inputs[:, REFERENCE_SPEED], envs
     )
     low, high = (
         jnp.asarray(getattr(trained.vehicle, name))
         for name in ("control_low", "control_high")
     )
-    controls = jnp.clip(asked + inputs[:, PERTURBATION], low, high)
-    apart = traced_car.disagreement(jax.vmap(vehicle_state)(states), controls, envs)
-    return {"steps": STEPS_COMPARED, "largest": apart}
+    controls = jnp.clip(args + inputs[:, PERTURBATION], low, high)
+    separate = traced_car.disagreement(jax.vmap(vehicle_state)(states), controls, envs)
+    return {"steps": STEPS_COMPARED, "largest": separate}
 
 
 def main():
@@ -145,10 +145,10 @@ def main():
         raise SystemExit(
             f"{given.root / RUN}: {reason or 'no corridor in its certificate'}; run path.sh first"
         )
-    found, made = driven(
+    result, made = driven(
         trained, certificate, given.drives, given.root / RUN.parts[0] / "package"
     )
-    kept = {
+    saved = {
         name: certificate[name]
         for name in (
             "alpha",
@@ -159,14 +159,18 @@ def main():
             "policy_sha256",
         )
     }
-    kept["outputs"] = {
+    saved["outputs"] = {
         name: {key: value for key, value in claim.items() if key != "witness"}
-        for name, claim in kept["outputs"].items()
+        for name, claim in saved["outputs"].items()
     }
-    document = {"certificate": kept, "package": found, "step": compared(trained, made)}
+    document = {
+        "certificate": saved,
+        "package": result,
+        "step": compared(trained, made),
+    }
     document |= {"settings": trained.settings, "versions": artefacts.versions()}
     artefacts.write_json(given.out / "path.json", document)
-    print(json.dumps({"results": str(given.out / "path.json"), **found}))
+    print(json.dumps({"results": str(given.out / "path.json"), **result}))
 
 
 if __name__ == "__main__":

@@ -49,28 +49,27 @@ def policy_driver(trained, system):
         "env": "measured",
         "alpha": trained.certificate and trained.certificate["alpha"],
     }
-    params = jax.jit(trained.model.fold)(trained.params)
     return Driver(
         trained.controller,
-        params,
+        trained.params,
         len(names),
         about | {"watched": trained.certificate is not None},
     )
 
 
-def nominal_driver(asked, plant, system, states):
+def nominal_driver(args, plant, system, states):
     """MPPI on the textbook bicycle with the wheelbase of `plant`."""
-    found = build.reference_systems(plant)["nominal"]
-    controller = build.build_controller(asked["controller"], found.model, plant)
+    result = build.reference_systems(plant)["nominal"]
+    controller = build.build_controller(args["controller"], result.model, plant)
     return Driver(
         controller,
-        found.params,
+        result.params,
         states,
-        {"system": system, "env": found.env_source, "alpha": None, "watched": False},
+        {"system": system, "env": result.env_source, "alpha": None, "watched": False},
     )
 
 
-def lay(plant, paths, seconds, seed):
+def make_road(plant, paths, seconds, seed):
     """S1's paths at every friction, and the same keys for each: (friction x path, …)."""
     family = build.build_scenario({"name": "s1"}, plant, duration=seconds)
     road_key, drive_key = jax.random.split(jax.random.key(seed))
@@ -82,14 +81,14 @@ def lay(plant, paths, seconds, seed):
     return tiled._replace(envs=envs, observed_envs=envs), keys
 
 
-def rows_of(plant, driver, track, asked, paths):
+def rows_of(plant, driver, track, args, paths):
     """Drive every road of a track; one row a friction."""
     roads, keys = track
     controller = driver.controller
     if driver.states:
         controller = adapters.commonroad_controller(controller, states=driver.states)
-    options = {"dt": plant.dt, "horizon": build.controller_horizon(asked["controller"])}
-    options["observation_noise"] = tuple(asked["evaluation"]["observation_noise"])
+    options = {"dt": plant.dt, "horizon": build.controller_horizon(args["controller"])}
+    options["observation_noise"] = tuple(args["evaluation"]["observation_noise"])
 
     def one(road, key):
         return evaluation.simulate(
@@ -104,8 +103,8 @@ def rows_of(plant, driver, track, asked, paths):
         flush=True,
     )
     nothing, rows = evaluation.violations(None, evaluation.Claims()), []
-    for place, friction in enumerate(FRICTIONS):
-        chosen = slice(place * paths, (place + 1) * paths)
+    for directory, friction in enumerate(FRICTIONS):
+        chosen = slice(directory * paths, (directory + 1) * paths)
         part, envs = jax.tree.map(
             lambda leaf, chosen=chosen: leaf[chosen], (episodes, roads.envs)
         )
@@ -118,7 +117,7 @@ def rows_of(plant, driver, track, asked, paths):
             "friction": friction,
             "vehicle": plant.name,
         }
-        about |= {"sampling": asked["controller"]["sampling"], "variation": None}
+        about |= {"sampling": args["controller"]["sampling"], "variation": None}
         rows.append(
             evaluation.row(
                 scores, about, None, nothing, watched=driver.about["watched"]
@@ -131,17 +130,17 @@ def compared(rows):
     """RMSE over that of the nominal bicycle by path, and of a tuned policy over the
     policy before; None if it spun.
     """
-    found = {
+    result = {
         (row["vehicle"], row["friction"], row["system"]): _by_path(row) for row in rows
     }
     for row in rows:
         where, mine = (row["vehicle"], row["friction"]), _by_path(row)
         for name in ("nominal", "nominal_this_car"):
-            other = found[*where, name]
+            other = result[*where, name]
             row[f"ratio_to_{name}"] = float(mine.mean() / other.mean())
             row[f"worst_ratio_to_{name}"] = float(np.max(mine / other))
         before = (
-            found.get((*where, row["system"].removesuffix("_tuned")))
+            result.get((*where, row["system"].removesuffix("_tuned")))
             if row["system"].endswith("_tuned")
             else None
         )
@@ -249,37 +248,39 @@ def main():
     parser.add_argument("--seconds", type=float, default=15.0)
     parser.add_argument("--root", type=Path, default=Path("runs/commonroad"))
     parser.add_argument("--out", type=Path, default=Path("experiments/commonroad"))
-    given, asked = parser.parse_args(), composed()
+    given, args = parser.parse_args(), composed()
     plants = {name: adapters.commonroad_vehicle(model=name) for name in CARS}
     before = {row: sfkd_jax.load(SHIPPED / ours) for row, ours in POLICIES.items()}
     sizes = {"segments": given.segments, "steps": given.steps}
-    after, tuning = tune.tune_all(before, plants["std"], asked, given.root, **sizes)
+    after, tuning = tune.tune_all(before, plants["std"], args, given.root, **sizes)
     rows, trained = (
         [],
         before | {f"{row}_tuned": policy for row, policy in after.items()},
     )
     for car, plant in plants.items():
-        track = lay(plant, given.paths, given.seconds, asked["evaluation"]["seed"])
-        place = (
+        track = make_road(plant, given.paths, given.seconds, args["evaluation"]["seed"])
+        directory = (
             given.root
             / "rows"
             / "-".join(map(str, (car, given.paths, given.seconds, *sizes.values())))
         )
-        ours = build.build_vehicle(asked["vehicle"])
-        drivers = [nominal_driver(asked, ours, "nominal", len(ours.state_names))]
-        drivers += [nominal_driver(asked, plant, "nominal_this_car", None)]
+        ours = build.build_vehicle(args["vehicle"])
+        drivers = [nominal_driver(args, ours, "nominal", len(ours.state_names))]
+        drivers += [nominal_driver(args, plant, "nominal_this_car", None)]
         drivers += [policy_driver(policy, row) for row, policy in trained.items()]
         for driver in drivers:
-            path = place / f"{driver.about['system']}.json"
+            path = directory / f"{driver.about['system']}.json"
             if not path.exists():
                 path.parent.mkdir(parents=True, exist_ok=True)
                 artefacts.write_json(
-                    path, {"rows": rows_of(plant, driver, track, asked, given.paths)}
+                    path, {"rows": rows_of(plant, driver, track, args, given.paths)}
                 )
             rows += artefacts.read_json(path)["rows"]
-    track = lay(plants["std"], given.paths, given.seconds, asked["evaluation"]["seed"])
+    track = make_road(
+        plants["std"], given.paths, given.seconds, args["evaluation"]["seed"]
+    )
     alike = exported_alike(before["sfkd"], plants["std"], track, given.root)
-    kept = {"paths": given.paths, "seconds": given.seconds, **sizes}
+    saved = {"paths": given.paths, "seconds": given.seconds, **sizes}
     turns = handling(
         {name: build.PLANTS[name]() for name in POLICIES.values()} | plants
     )
@@ -288,7 +289,7 @@ def main():
         "tuning": tuning,
         "handling": turns,
         "export": alike,
-        "config": kept | asked,
+        "config": saved | args,
     }
     document["versions"] = artefacts.versions()
     artefacts.write_json(given.out / "results.json", document)

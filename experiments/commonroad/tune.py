@@ -33,7 +33,7 @@ SEED = 7
 """Of drives, splits and windows: another than that of the roads that are evaluated on."""
 
 
-def collect(plant, asked, segments, path):
+def collect(plant, args, segments, path):
     """Drives of 5 s as our own data sets have them: S1 and S2 with levels drawn per
     drive, both controls excited.
     """
@@ -64,11 +64,11 @@ def collect(plant, asked, segments, path):
     driven = Trajectory(**artefacts.read_arrays(path, kind="drives")[0])
     whole = np.isfinite(driven.states).all(axis=(1, 2))
     box = {
-        f"env_{side}": jnp.asarray(asked["dataset"][f"env_{side}"])
+        f"env_{side}": jnp.asarray(args["dataset"][f"env_{side}"])
         for side in ("low", "high")
     }
-    kept = jax.tree.map(lambda leaf: jnp.asarray(leaf[whole]), driven)
-    return datasets.split(kept, jax.random.key(SEED + 1), shares=SHARES, **box), int(
+    saved = jax.tree.map(lambda leaf: jnp.asarray(leaf[whole]), driven)
+    return datasets.split(saved, jax.random.key(SEED + 1), shares=SHARES, **box), int(
         whole.sum()
     )
 
@@ -85,19 +85,19 @@ def seen(data, states):
     return data._replace(**parts)
 
 
-def tune(trained, data, asked, place, steps):
+def tune(trained, data, args, directory, steps):
     """Train on from the policy's own parameters, certify and store; how it went."""
     began, settings = time.process_time(), trained.settings
     space = build.space_from_settings(settings["space"])
     loss = multi_step_loss(trained.model, space, **settings["training"]["loss"])
     draw = partial(datasets.random_windows, **WINDOWS)
     held_out = datasets.spread_windows(data.validation, length=WINDOWS["length"])
-    start = trained.model._replace(init=lambda key: trained.params)
+    start = trained.model._replace(init=lambda key: trained.weights)
     key = jax.random.key(SEED + 2)
     params, best = fit(
-        start, loss, draw, data.train, held_out, key, place, steps=steps, **FIT
+        start, loss, draw, data.train, held_out, key, directory, steps=steps, **FIT
     )
-    place.mkdir(parents=True, exist_ok=True)
+    directory.mkdir(parents=True, exist_ok=True)
     spent = time.process_time() - began
     proof = certification.issue(
         trained.model,
@@ -105,28 +105,28 @@ def tune(trained, data, asked, place, steps):
         **{name: getattr(data, name) for name in ("validation", "calibration")},
         held_out={"test": data.test},
         boxes=store.boxes(data),
-        sensor_noise=tuple(asked["evaluation"]["observation_noise"]),
+        sensor_noise=tuple(args["evaluation"]["observation_noise"]),
         level=LEVEL,
         monitor_level=LEVEL,
     )
     manifest = policy.save(
-        place / "policy.npz", params, settings | {"best_step": best}, made_from={}
+        directory / "policy.npz", params, settings | {"best_step": best}, made_from={}
     )
     about = {
         "weights_sha256": manifest["sha256"],
         "policy_sha256": policy.policy_hash(manifest),
     }
-    artefacts.write_json(place / "certificate.json", proof | about)
+    artefacts.write_json(directory / "certificate.json", proof | about)
     errors = {"before": trained.params, "after": params}
     predict = jax.jit(
         partial(evaluation.open_loop, trained.model, horizon=WINDOWS["length"])
     )
-    found = {
+    result = {
         name: jnp.hypot(*predict(weights, data.test).T[:2])[-1].item()
         for name, weights in errors.items()
     }
     print(
-        f"tuned to step {best} in {spent:.0f} s: {found}", file=sys.stderr, flush=True
+        f"tuned to step {best} in {spent:.0f} s: {result}", file=sys.stderr, flush=True
     )
     d_bar = {"d_bar": proof["d_bar"]["value"], "coverage": proof["d_bar"]["coverage"]}
     return {
@@ -134,23 +134,23 @@ def tune(trained, data, asked, place, steps):
         "cpu_seconds": spent,
         "alpha": proof["alpha"],
         **d_bar,
-        "position_rmse_2s_m": found,
+        "position_rmse_2s_m": result,
     }
 
 
-def tune_all(before, plant, asked, root, *, segments, steps):
+def tune_all(before, plant, args, root, *, segments, steps):
     """Every policy on the same drives of one car; what an earlier run of the same sizes
     finished is read.
     """
-    data, whole = collect(plant, asked, segments, root / f"drives-{segments}.npz")
+    data, whole = collect(plant, args, segments, root / f"drives-{segments}.npz")
     after, records = {}, {"drives": whole}
     for row, trained in before.items():
-        place = root / f"{row}-{segments}-{steps}"
-        record = place / "record.json"
+        directory = root / f"{row}-{segments}-{steps}"
+        record = directory / "record.json"
         if not record.exists():
             states = len(build.build_vehicle(trained.settings["vehicle"]).state_names)
             artefacts.write_json(
-                record, tune(trained, seen(data, states), asked, place, steps)
+                record, tune(trained, seen(data, states), args, directory, steps)
             )
-        after[row], records[row] = sfkd_jax.load(place), artefacts.read_json(record)
+        after[row], records[row] = sfkd_jax.load(directory), artefacts.read_json(record)
     return after, records
