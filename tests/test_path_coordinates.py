@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from sfkd_jax import vehicle
-from sfkd_jax.core.path_frame import closed_loop, is_valid, on_circle, path_state
+from sfkd_jax.core.path_frame import closed_loop, is_valid, circle_errors, path_state
 from sfkd_jax.core.se2 import compose
 from sfkd_jax.scenarios import path_from_curvature, project
 from sfkd_jax.types import BODY
@@ -29,14 +29,14 @@ def test_a_pose_beside_a_circle_is_found_again(curvature, progress):
     for lateral, heading in ((0.0, 0.0), (0.7, -0.2), (-1.5, 0.4)):
         pose = compose(foot(curvature, progress), jnp.asarray([0.0, lateral, heading]))
         np.testing.assert_allclose(
-            on_circle(pose, jnp.asarray(curvature)), (lateral, heading), atol=2e-5
+            circle_errors(pose, jnp.asarray(curvature)), (lateral, heading), atol=2e-5
         )
 
 
 @pytest.mark.parametrize("curvature", CURVATURES)
 def test_derivatives_exist_also_without_curvature_and_beyond_the_centre(curvature):
     for y in (0.0, 0.3, 1e3, -1e3):
-        rates = jax.jacfwd(on_circle, argnums=(0, 1))(
+        rates = jax.jacfwd(circle_errors, argnums=(0, 1))(
             jnp.asarray([1.0, y, 0.1]), jnp.asarray(curvature)
         )
         assert all(bool(jnp.all(jnp.isfinite(leaf))) for leaf in jax.tree.leaves(rates))
@@ -46,7 +46,7 @@ def test_a_car_near_the_centre_of_curvature_is_told_and_stays_finite():
     assert bool(is_valid(jnp.asarray(7.9), jnp.asarray(0.1)))
     assert not bool(is_valid(jnp.asarray(8.1), jnp.asarray(0.1)))
     assert not bool(is_valid(jnp.asarray(jnp.nan), jnp.asarray(0.1)))
-    lateral, heading = on_circle(jnp.asarray([0.5, 9.9, 0.0]), jnp.asarray(0.1))
+    lateral, heading = circle_errors(jnp.asarray([0.5, 9.9, 0.0]), jnp.asarray(0.1))
     assert np.all(np.isfinite([lateral, heading]))
     assert not bool(is_valid(lateral, jnp.asarray(0.1)))
 

@@ -40,10 +40,10 @@ def test_a_wrong_model_has_defects_and_its_errors_grow(one):
     assert float(errors[-1]) > 3 * float(errors[0]) > 0
 
 
-def test_fibres_are_those_of_each_step_and_of_the_one_after(one):
+def test_fibers_are_those_of_each_step_and_of_the_one_after(one):
     now, later = run(
         fibers_along, "oracle", one
-    )  # the fibre of a physics model is e itself
+    )  # the fiber of a physics model is e itself
     np.testing.assert_array_equal(now, one.envs)
     np.testing.assert_array_equal(later[:-1], one.envs[1:])
     np.testing.assert_array_equal(later[-1], one.envs[-1])
@@ -60,7 +60,7 @@ def test_the_first_prediction_is_the_one_step_prediction(one, name):
 def test_a_trajectory_that_the_model_made_itself_has_no_defect_where_the_encoder_inverts_the_decoder(
     one, name
 ):
-    """d_k compares latents: with the rollout's own latents put in place of the
+    """d_k compares latents: with the rollout's own latents instead of the
     encoder's, nothing is left.
     """
     model, params = model_and_params(name)
@@ -83,7 +83,7 @@ def test_a_trajectory_that_the_model_made_itself_has_no_defect_where_the_encoder
 
 
 @pytest.mark.parametrize("name", ["sfkd", "no_transport"])
-def test_a_defect_is_what_its_definition_says_on_every_switch(one, name):
+def test_a_defect_matches_its_definition_on_every_switch(one, name):
     """d_k = Φ(x_{k+1}, e_{k+1}) − T(e_k → e_{k+1}) F(Φ(x_k, e_k), u_k, e_k), step by
     step.
     """
@@ -114,7 +114,7 @@ def test_batches_of_any_size_leave_every_item_what_it_is_and_trace_one_program(s
         traced.append(item)
         return {"sum": item["a"].sum() + item["b"], "twice": 2.0 * item["a"]}
 
-    found = in_batches(function, items, size=size)
-    np.testing.assert_array_equal(found["sum"], items["a"].sum(axis=1) + items["b"])
-    np.testing.assert_array_equal(found["twice"], 2.0 * items["a"])
+    results = in_batches(function, items, size=size)
+    np.testing.assert_array_equal(results["sum"], items["a"].sum(axis=1) + items["b"])
+    np.testing.assert_array_equal(results["twice"], 2.0 * items["a"])
     assert len(traced) == 1

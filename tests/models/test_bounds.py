@@ -19,6 +19,7 @@ from helpers import (
 
 from sfkd_jax import models
 from sfkd_jax.certification import lipschitz_upper
+from sfkd_jax.core.folding import fold
 from sfkd_jax.models.sfkd import Sandwich, bounded, cayley, gram_bound
 
 RHO, BETA = 0.895, 0.1
@@ -125,7 +126,7 @@ def environments(count=200):
 @pytest.mark.parametrize("name", ["sfkd", "no_residual", "segment"])
 def test_the_operator_is_bounded_for_every_environment_and_every_weight(name, scale):
     model, params = model_and_params(name, scale)
-    operators = jit(jax.vmap(lambda env: model.fiber(model.fold(params), env).A))(
+    operators = jit(jax.vmap(lambda env: model.fiber(fold(model, params), env).A))(
         environments()
     )
     assert np.all(spectral(operators) <= RHO)
@@ -144,7 +145,7 @@ def test_opposed_operators_mix_within_the_bound(seed):
         | {"operators": 50.0 * np.stack([free[0], -free[0], free[1]])}
     }
     norms = spectral(
-        jit(jax.vmap(lambda env: model.fiber(model.fold(params), env).A))(
+        jit(jax.vmap(lambda env: model.fiber(fold(model, params), env).A))(
             environments(50)
         )
     )
@@ -168,7 +169,7 @@ ATTACK_STARTS, ATTACK_STEPS = 8, 40
 
 
 def attack(name, scale):
-    """Gradient ascent over z, u, e and a direction v on |∂r/∂z v|: the largest found."""
+    """Gradient ascent over z, u, e and a direction v on |∂r/∂z v|: the largest value."""
     value = residual(name, scale)
 
     def gain(point):
@@ -225,8 +226,8 @@ def test_the_free_residual_breaks_the_bound_by_far():
     assert attack("no_contraction", 3.0) > 2 * BETA
 
 
-def test_no_two_latents_are_driven_apart_by_the_residual():
-    """Random pairs, far apart and close, under random u and e."""
+def test_the_residual_increases_no_distance_between_latents_beyond_its_bound():
+    """Random pairs, distant and close, under random u and e."""
     value = residual("sfkd", 3.0)
     random = np.random.default_rng(0)
     z = random.standard_normal((500, 8)) * 10.0 ** random.uniform(-1, 2, (500, 1))
@@ -235,12 +236,12 @@ def test_no_two_latents_are_driven_apart_by_the_residual():
     )
     inputs = [random.standard_normal((500, 2)).astype(np.float32) for _ in range(2)]
     both = [jit(jax.vmap(value))(x.astype(np.float32), *inputs) for x in (z, other)]
-    gap, apart = (
+    gap, distance = (
         np.linalg.norm(np.subtract(*both), axis=1),
         np.linalg.norm(z - other, axis=1),
     )
     rounding = 1e-6 * (np.linalg.norm(z, axis=1) + 10.0)
-    assert np.all(gap <= BETA * apart + rounding)
+    assert np.all(gap <= BETA * distance + rounding)
 
 
 @pytest.mark.parametrize("scale", [0.1, 1.0, 5.0])
@@ -341,7 +342,8 @@ def test_the_budget_is_the_callers():
         lambda leaf: 3.0 * random.standard_normal(leaf.shape).astype(np.float32), shapes
     )
     weights = jax.tree.map(
-        lambda leaf: np.asarray(leaf, dtype=np.float64), jit(model.explicit)(params)
+        lambda leaf: np.asarray(leaf, dtype=np.float64),
+        jit(model.structure.explicit)(params),
     )
     assert np.all(spectral(weights.operators.vertices) <= 0.5)
     assert lipschitz_upper(weights.residual, weights.residual_multipliers) <= 0.3

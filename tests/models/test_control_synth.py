@@ -1,4 +1,4 @@
-"""ControlSynth: its flow contracts at the asked rate for all weights and inputs; inputs
+"""ControlSynth: its flow contracts at the given rate for all weights and inputs; inputs
 are only added.
 """
 
@@ -22,7 +22,7 @@ def parts(body, rate=RATE, dt=0.1):
     model = models.control_synth(
         space(body), rate=rate, dt=dt, width=24, input_hidden=(16,)
     )
-    return model, jit(model.explicit)
+    return model, jit(model.structure.explicit)
 
 
 def drawn(body, scale, seed=0):
@@ -43,14 +43,14 @@ def exported(body, params, rate=RATE):
 
 @pytest.mark.parametrize("body", [1, 4])
 @pytest.mark.parametrize("scale", [0.0, 0.03, 0.3, 1.0, 3.0, 10.0])
-def test_the_asked_rate_is_proved_for_all_weights(body, scale):
+def test_the_given_rate_is_proved_for_all_weights(body, scale):
     for seed in range(5):
         assert check_incremental(exported(body, drawn(body, scale, seed)), RATE)
 
 
 @pytest.mark.parametrize("body", [1, 4])
 @pytest.mark.parametrize("rate", [1e-3, 0.05, 1.0, 5.0])
-def test_what_is_proved_is_the_asked_rate_and_little_more(body, rate):
+def test_the_proved_rate_is_the_given_one_and_little_more(body, rate):
     """With B = 0 in one direction and X = 0 nothing damps it but the rate itself."""
     params = drawn(body, 0.1)
     params["free"]["X"][:] = 0.0
@@ -91,7 +91,7 @@ def test_two_solutions_under_the_same_inputs_approach_at_least_at_the_rate(body,
     states = jnp.concatenate([jnp.zeros((2, 16, 3)), starts], axis=-1)
 
     @jit
-    def apart(params, states):
+    def distances(params, states):
         step = jax.vmap(
             jax.vmap(model.step, in_axes=(None, 0, None)), in_axes=(None, 0, None)
         )
@@ -106,7 +106,7 @@ def test_two_solutions_under_the_same_inputs_approach_at_least_at_the_rate(body,
         return first[0] - first[1], jax.lax.scan(along, states, (controls, envs))[1]
 
     first, later = (
-        np.asarray(part, dtype=np.float64) for part in apart(params, states)
+        np.asarray(part, dtype=np.float64) for part in distances(params, states)
     )
     length = lambda gap: np.sqrt(
         np.einsum("...i,ij,...j->...", gap, weights.metric, gap)
@@ -174,6 +174,6 @@ def test_about_ten_thousand_parameters():
 @pytest.mark.parametrize(
     "setting", [{"rate": 0.0}, {"rate": float("nan")}, {"networks": 0}, {"width": 0}]
 )
-def test_settings_that_no_model_can_have_are_refused_by_name(setting):
+def test_invalid_settings_are_refused_by_name(setting):
     with pytest.raises(ValueError, match=rf"model\..*{next(iter(setting))}"):
         models.control_synth(space(), **setting)

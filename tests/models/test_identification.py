@@ -22,15 +22,15 @@ from sfkd_jax.pipeline import train_policy
 RIDGE, BOUND, RANK = 1e-3, 0.7, 4
 
 
-def test_ridge_regression_minimises_what_it_says():
+def test_ridge_regression_minimises_its_objective():
     random = np.random.default_rng(0)
     X = random.standard_normal((200, 6)) * np.float64([1, 10, 0.1, 1, 1, 0])
     Y, ridges = random.standard_normal((200, 3)), np.float32([1e-6, 0.1])
-    found = ridge_regression(
+    fits = ridge_regression(
         jnp.asarray(X, jnp.float32), jnp.asarray(Y, jnp.float32), jnp.asarray(ridges)
     )
     D = np.sqrt(np.mean(X**2, axis=0)) + np.float64([0, 0, 0, 0, 0, 1])
-    for ridge, W in zip(ridges, found, strict=True):
+    for ridge, W in zip(ridges, fits, strict=True):
         expected = np.linalg.solve(X.T @ X + ridge * 200 * np.diag(D**2), X.T @ Y)
         np.testing.assert_allclose(W, expected, rtol=1e-4, atol=1e-5)
 
@@ -40,10 +40,10 @@ def test_regression_survives_columns_that_normal_equations_do_not():
     random = np.random.default_rng(1)
     base = random.standard_normal(1000)
     X = np.stack([base, base + 3e-4 * random.standard_normal(1000)], axis=1)
-    found = ridge_regression(
+    fits = ridge_regression(
         *(jnp.asarray(part, jnp.float32) for part in (X, X @ np.ones((2, 1)), [1e-12]))
     )
-    np.testing.assert_allclose(found[0, :, 0], [1.0, 1.0], atol=1e-2)
+    np.testing.assert_allclose(fits[0, :, 0], [1.0, 1.0], atol=1e-2)
 
 
 @cache
@@ -64,13 +64,13 @@ def problem():
 
 
 @cache
-def found(bound, iterations=200):
+def solution(bound, iterations=200):
     given = [jnp.asarray(part, jnp.float32) for part in problem()]
     return bounded_ridge(*given, bound=bound, ridge=RIDGE, iterations=iterations)
 
 
 def loss(operators, gains, square=lambda part: np.sum(np.square(part))):
-    """What the docstring says is minimised, of arrays or of variables."""
+    """The objective in the docstring, of arrays or of variables."""
     states, mixtures, inputs, targets = problem()
     products = [mixtures[:, j, None] * states for j in range(2)]
     spread = [np.sqrt(np.mean(part**2, axis=0)) for part in (*products, inputs)]
@@ -99,18 +99,19 @@ def optimum(bound):
 
 
 def test_where_the_bound_is_slack_the_closed_form_solves_the_convex_program():
-    for exact, closed in zip(optimum(10.0), found(10.0, 0), strict=True):
+    for exact, closed in zip(optimum(10.0), solution(10.0, 0), strict=True):
         np.testing.assert_allclose(closed, exact, atol=2e-4)
-    for closed, steps in zip(found(10.0, 0), found(10.0), strict=True):
+    for closed, steps in zip(solution(10.0, 0), solution(10.0), strict=True):
         np.testing.assert_allclose(steps, closed, atol=1e-5)
 
 
 def test_where_it_binds_the_steps_reach_the_optimum_and_clipping_alone_does_not():
     best = loss(*optimum(BOUND))
     clipped, stepped = (
-        loss(*(np.float64(part) for part in found(BOUND, steps))) for steps in (0, 200)
+        loss(*(np.float64(part) for part in solution(BOUND, steps)))
+        for steps in (0, 200)
     )
-    for operators in (found(BOUND)[0], found(BOUND, 0)[0]):
+    for operators in (solution(BOUND)[0], solution(BOUND, 0)[0]):
         assert np.all(
             np.linalg.norm(np.float64(operators), 2, axis=(1, 2)) <= BOUND * (1 + 1e-6)
         )
@@ -145,19 +146,19 @@ def test_an_identified_start_predicts_better_than_a_drawn_one_within_its_bound_a
         np.mean(np.square(miss(params, driven()))) for params in (drawn, start)
     )
     assert after < 0.5 * before
-    raw, found = drawn["networks"], start["networks"]
+    raw, fitted = drawn["networks"], start["networks"]
     left, right = map(np.float64, budget_factors(raw["couplings"]))
     wanted = [
-        0.995 * left @ np.float64(matrix) @ right.T for matrix in found["operators"]
+        0.995 * left @ np.float64(matrix) @ right.T for matrix in fitted["operators"]
     ]
     np.testing.assert_allclose(
         model.structure.explicit(start).operators.vertices, wanted, atol=1e-4
     )  # nothing was cut off
-    for name, part in found.items():
-        kept = all(
+    for name, part in fitted.items():
+        unchanged = all(
             map(np.array_equal, jax.tree.leaves(part), jax.tree.leaves(raw[name]))
         )
-        assert kept == (name not in ("operators", "input_head"))
+        assert unchanged == (name not in ("operators", "input_head"))
 
 
 def test_a_start_that_a_model_does_not_have_is_refused_by_name():

@@ -66,14 +66,14 @@ def identified(model, trajectories):
         jax.tree.map(lambda leaf, s=part: leaf[s], trajectories)
         for part in (np.s_[:half], np.s_[half:])
     )
-    return jit(model.identify)(train, validation, KEY)
+    return jit(model.fitting.identify)(train, validation, KEY)
 
 
 def physical(model, params, env):
     """x⁺ = A x + B u + d κ + c in physical units, for a lift that holds the state
     alone.
     """
-    linear = model.linear(model.fiber(params, jnp.asarray(env)))
+    linear = model.structure.linear(model.fiber(params, jnp.asarray(env)))
     A = linear.C @ linear.A @ jnp.linalg.inv(linear.C)
     return (
         A,
@@ -84,7 +84,7 @@ def physical(model, params, env):
 
 
 @pytest.mark.parametrize("curvature", [-0.03, 0.0, 1e-4, 0.02])
-def test_states_along_a_circle_lie_where_they_were_put(curvature):
+def test_states_along_a_circle_have_the_coordinates_they_were_made_with(curvature):
     """Built in the world from progress, offset and heading, and read back: one frame,
     any radius.
     """
@@ -93,7 +93,7 @@ def test_states_along_a_circle_lie_where_they_were_put(curvature):
     )
     origin = jnp.asarray([12.0, -7.0, 2.5])
 
-    def place(s, y, psi):
+    def state_at(s, y, psi):
         turn = curvature * s
         foot = jnp.stack(
             [
@@ -106,7 +106,7 @@ def test_states_along_a_circle_lie_where_they_were_put(curvature):
             compose(compose(origin, foot), jnp.stack([jnp.zeros(()), y, psi])), 9.0
         )
 
-    states = jax.vmap(place)(progress, left, heading)
+    states = jax.vmap(state_at)(progress, left, heading)
     seen = along_circle(
         states, jnp.asarray([left[0], heading[0]]), jnp.asarray(curvature)
     )
@@ -117,8 +117,8 @@ def test_states_along_a_circle_lie_where_they_were_put(curvature):
 
 def test_thin_plate_is_r_squared_log_r():
     centres = np.float32([[0.0, 0.0], [3.0, 4.0], [0.0, 1.0]])
-    found = thin_plate(jnp.zeros(2), jnp.asarray(centres))
-    np.testing.assert_allclose(found, [0.0, 25 * np.log(5.0), 0.0], atol=1e-5)
+    values = thin_plate(jnp.zeros(2), jnp.asarray(centres))
+    np.testing.assert_allclose(values, [0.0, 25 * np.log(5.0), 0.0], atol=1e-5)
     assert np.all(
         np.isfinite(jax.jacobian(thin_plate)(jnp.zeros(2), jnp.asarray(centres)))
     )
@@ -182,8 +182,8 @@ def test_a_plant_that_is_linear_in_the_lift_is_predicted_exactly():
         )
 
     seen, fresh = (draw(jax.random.split(key, 600)) for key in jax.random.split(KEY))
-    found = ridge_regression(seen, seen @ weights, jnp.asarray([1e-10]))[0]
-    np.testing.assert_allclose(fresh @ found, fresh @ weights, atol=2e-3)
+    fitted = ridge_regression(seen, seen @ weights, jnp.asarray([1e-10]))[0]
+    np.testing.assert_allclose(fresh @ fitted, fresh @ weights, atol=2e-3)
     assert float(jnp.std(fresh @ weights)) > 1
 
 
@@ -193,7 +193,9 @@ def driving(environment=True):
     model = models.koopman(
         datasets.measure_space(dataset()), functions=30, environment=environment
     )
-    return model, jit(model.identify)(dataset().train, dataset().validation, KEY)
+    return model, jit(model.fitting.identify)(
+        dataset().train, dataset().validation, KEY
+    )
 
 
 @pytest.mark.parametrize("environment", [True, False])
@@ -207,11 +209,11 @@ def test_driving_is_predicted_far_better_than_by_no_change(environment):
             lambda params, drive: defects(model, params, drive)[0], in_axes=(None, 0)
         )
     )
-    found, zero = (
+    errors, zero = (
         np.sqrt(np.mean(np.square(miss(p, dataset().test)), axis=(0, 1)))
         for p in (params, model.init(KEY))
     )
-    assert np.all(found < 0.25 * zero)  # e_y, e_ψ, v
+    assert np.all(errors < 0.25 * zero)  # e_y, e_ψ, v
 
 
 def test_seeing_the_environment_helps():
@@ -250,10 +252,10 @@ def test_a_model_that_does_not_see_the_environment_is_the_pooled_original():
 
 
 def test_the_ridge_that_predicts_best_is_chosen():
-    """One of the two is absurd; its place in the list does not matter."""
+    """One of the two is absurd; their order does not matter."""
     for ridges in ((1e-5, 1e3), (1e3, 1e-5)):
         model = models.koopman(two_body_space(), functions=4, ridges=ridges)
-        linear = model.linear(
+        linear = model.structure.linear(
             model.fiber(
                 identified(model, parked(linear_change)), jnp.asarray([0.6, 0.0])
             )
@@ -269,7 +271,7 @@ def test_the_model_and_its_linear_predictor_are_one_on_a_straight_path():
     def both(params, state, control, env):
         fiber = model.fiber(params, env)
         linear, latent = (
-            model.linear(fiber),
+            model.structure.linear(fiber),
             model.step(fiber, model.encode(fiber, state), control),
         )
         start = linear.lift(state.at[POSE].set(0.0))
@@ -285,7 +287,7 @@ def test_the_model_and_its_linear_predictor_are_one_on_a_straight_path():
 def test_a_path_that_bends_left_turns_the_car_right_against_it():
     """Per step of a metre, the heading error falls by about the turn of the path."""
     model, params = driving()
-    linear = model.linear(model.fiber(params, jnp.asarray([0.7, 0.0])))
+    linear = model.structure.linear(model.fiber(params, jnp.asarray([0.7, 0.0])))
     np.testing.assert_allclose((linear.C @ linear.d)[2], -1.0, atol=0.1)
 
 

@@ -74,14 +74,16 @@ def mutant(layer):
         )
 
     def fiber(params, env):
-        found = MODEL.fiber(params, env)
-        return found._replace(feedback=lengthened(found.feedback))
+        fiber = MODEL.fiber(params, env)
+        return fiber._replace(feedback=lengthened(fiber.feedback))
 
     def explicit(params):
-        found = MODEL.explicit(params)
-        return found._replace(residual=lengthened(found.residual))
+        weights = MODEL.structure.explicit(params)
+        return weights._replace(residual=lengthened(weights.residual))
 
-    return MODEL._replace(fiber=fiber, explicit=explicit)
+    return MODEL._replace(
+        fiber=fiber, structure=MODEL.structure._replace(explicit=explicit)
+    )
 
 
 def certified(model, params):
@@ -91,7 +93,7 @@ def certified(model, params):
 def proved_by_construction(model, params):
     """The factor that the model's own multipliers prove, with no search."""
     weights = jax.tree.map(
-        lambda leaf: np.asarray(leaf, np.float64), jit(model.explicit)(params)
+        lambda leaf: np.asarray(leaf, np.float64), jit(model.structure.explicit)(params)
     )
     return certification.lipschitz_upper(
         weights.residual, weights.residual_multipliers, weights.operators.vertices[0]
@@ -227,7 +229,7 @@ def test_what_is_certified_is_what_is_multiplied_by():
     params = drawn(1.0)
     explicit, fiber = jit(
         lambda params: (
-            MODEL.explicit(params),
+            MODEL.structure.explicit(params),
             MODEL.fiber(params, jnp.asarray([0.5, 1.0])),
         )
     )(params)
@@ -273,6 +275,6 @@ def test_gradients_are_finite_and_reach_every_parameter():
         ("decoder_hidden", ()),
     ],
 )
-def test_settings_that_no_model_can_have_are_refused_by_name(setting, value):
+def test_invalid_settings_are_refused_by_name(setting, value):
     with pytest.raises(ValueError, match=rf"model\.{setting}"):
         models.r2dn(space(), **SETTINGS | {setting: value})

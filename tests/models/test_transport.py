@@ -1,4 +1,4 @@
-"""Transport between fibres: an isometry, the identity at home, and a cocycle."""
+"""Transport between fibers: an isometry, the identity at home, and a cocycle."""
 
 import jax
 import jax.numpy as jnp
@@ -33,24 +33,24 @@ def transported(name, scale=1.0):
         assert all(part.pose is latent.pose for part in outcome.values())
         return {way: part.z for way, part in outcome.items()}
 
-    found = jit(jax.vmap(one))(ENVS, LATENTS)
-    return {way: np.asarray(z, dtype=np.float64) for way, z in found.items()}
+    results = jit(jax.vmap(one))(ENVS, LATENTS)
+    return {way: np.asarray(z, dtype=np.float64) for way, z in results.items()}
 
 
 @pytest.mark.parametrize("scale", [1.0, 30.0])
 @pytest.mark.parametrize("name", ["sfkd", "segment"])
 def test_transport_is_an_isometry_with_inverse_and_a_cocycle(name, scale):
-    found = transported(name, scale)
+    results = transported(name, scale)
     close = {"rtol": 0, "atol": 2e-5}
     np.testing.assert_allclose(
-        np.linalg.norm(found["there"], axis=1),
+        np.linalg.norm(results["there"], axis=1),
         np.linalg.norm(LATENTS, axis=1),
         rtol=1e-6,
     )
-    np.testing.assert_allclose(found["home"], LATENTS, **close)
-    np.testing.assert_allclose(found["back"], LATENTS, **close)
-    np.testing.assert_allclose(found["on"], found["direct"], **close)
-    assert np.abs(found["there"] - LATENTS).max() > 1e-3  # and it does turn something
+    np.testing.assert_allclose(results["home"], LATENTS, **close)
+    np.testing.assert_allclose(results["back"], LATENTS, **close)
+    np.testing.assert_allclose(results["on"], results["direct"], **close)
+    assert np.abs(results["there"] - LATENTS).max() > 1e-3  # and it does turn something
 
 
 @pytest.mark.parametrize("name", ["no_transport", "no_fiber"])

@@ -35,7 +35,7 @@ def road():
     )
 
 
-def beside(path, s, offset):
+def left_of(path, s, offset):
     """The positions `offset` [m] to the left of the path at s."""
     points = np.asarray(POINTS(path, s))
     return points[:, :2] + offset[:, None] * np.stack(
@@ -103,7 +103,7 @@ def test_arc_length_is_clamped_to_the_path(circle):
     np.testing.assert_allclose(ends, np.asarray(circle.points)[[0, -1]], atol=1e-4)
 
 
-def test_projection_returns_the_distance_and_the_arc_length_that_a_point_was_placed_at(
+def test_projection_returns_the_distance_and_the_arc_length_of_a_point(
     road,
 ):
     random = np.random.default_rng(0)
@@ -112,25 +112,25 @@ def test_projection_returns_the_distance_and_the_arc_length_that_a_point_was_pla
         for edges in ((5.0, 290.0), (-4.0, 4.0))
     )
     guess = s + random.uniform(-2.0, 2.0, 300).astype(np.float32)
-    found, lateral = PROJECT(road, beside(road, s, offset), guess)
+    arc_length, lateral = PROJECT(road, left_of(road, s, offset), guess)
     np.testing.assert_allclose(lateral, offset, atol=2e-3)
-    np.testing.assert_allclose(found, s, atol=5e-3)
+    np.testing.assert_allclose(arc_length, s, atol=5e-3)
 
 
 def test_left_of_the_path_is_positive(circle):
-    found, lateral = PROJECT(
+    arc_length, lateral = PROJECT(
         circle, np.float32([[0.0, 1.0], [0.0, -2.0]]), np.zeros(2, np.float32)
     )
     np.testing.assert_allclose(lateral, [1.0, -2.0], atol=1e-5)
-    np.testing.assert_allclose(found, [0.0, 0.0], atol=1e-5)
+    np.testing.assert_allclose(arc_length, [0.0, 0.0], atol=1e-5)
 
 
 def test_projection_stays_finite_far_from_the_path_and_at_the_centre_of_a_circle(
     circle,
 ):
     positions = np.float32([[0.0, RADIUS], [500.0, 500.0], [-1e4, 0.0]])
-    found, lateral = PROJECT(circle, positions, np.float32([10.0, 50.0, 0.0]))
-    assert np.all(np.isfinite(found))
+    arc_length, lateral = PROJECT(circle, positions, np.float32([10.0, 50.0, 0.0]))
+    assert np.all(np.isfinite(arc_length))
     assert np.all(np.isfinite(lateral))
 
 
@@ -151,7 +151,7 @@ def test_the_curvature_is_smooth_at_the_shortest_wavelength(road):
     assert slope.max() < 3 * 0.03 * 2 * np.pi / 50.0 + 1.5 * 0.03 / 20.0
 
 
-def test_a_path_is_at_least_as_long_as_asked():
+def test_a_path_is_at_least_as_long_as_requested():
     for length in (10.0, 99.9, 100.0):
         path = jax.eval_shape(
             partial(smooth_path, length=length, spacing=0.5), jax.random.key(0)
@@ -165,8 +165,8 @@ def test_different_keys_make_different_roads_and_the_same_key_the_same_road():
     first, again = make(keys), make(keys)
     np.testing.assert_array_equal(first.points, again.points)
     ends = np.asarray(first.points)[:, -1, :2]
-    apart = np.linalg.norm(ends[:, None] - ends[None], axis=2) + np.eye(8)
-    assert apart.min() > 1e-3
+    distance = np.linalg.norm(ends[:, None] - ends[None], axis=2) + np.eye(8)
+    assert distance.min() > 1e-3
 
 
 def test_the_reference_window_holds_the_next_points_at_the_given_speed(circle):

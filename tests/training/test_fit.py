@@ -31,7 +31,7 @@ def task():
     return model, multi_step_loss(model, space), data
 
 
-def train(task, place, seed=3, **changes):
+def train(task, directory, seed=3, **changes):
     model, loss, data = task
     held_out = spread_windows(data.validation, length=8)
     return fit(
@@ -41,7 +41,7 @@ def train(task, place, seed=3, **changes):
         data.train,
         held_out,
         jax.random.key(seed),
-        place,
+        directory,
         **(OPTIONS | changes),
     )
 
@@ -53,14 +53,15 @@ def same(a, b):
     )
 
 
-def lines(place):
+def lines(directory):
     return [
-        json.loads(line) for line in (place / "metrics.jsonl").read_text().splitlines()
+        json.loads(line)
+        for line in (directory / "metrics.jsonl").read_text().splitlines()
     ]
 
 
 def test_training_goes_on_from_parameters_that_init_returns(task, tmp_path):
-    """A parabola in place of a model's loss: ten small steps move towards its minimum,
+    """A parabola instead of a model's loss: ten small steps move towards its minimum,
     from where `init` stands.
     """
     model, _, data = task
@@ -114,12 +115,12 @@ def test_an_interrupted_run_ends_bit_identical_to_an_unbroken_one(
 
 
 def test_latest_and_best_are_both_kept(tmp_path):
-    shelf = Checkpoints(tmp_path)
+    checkpoints = Checkpoints(tmp_path)
     for step, score in ((1, 3.0), (2, 1.0), (3, 2.0), (4, 5.0)):
-        shelf.save(step, {"w": jnp.full(3, float(step))}, validation_loss=score)
-    assert (shelf.latest_step(), shelf.best_step()) == (4, 2)
-    assert shelf.restore(2, {"w": jnp.zeros(3)})["w"][0] == 2.0
-    shelf.close()
+        checkpoints.save(step, {"w": jnp.full(3, float(step))}, validation_loss=score)
+    assert (checkpoints.latest_step(), checkpoints.best_step()) == (4, 2)
+    assert checkpoints.restore(2, {"w": jnp.zeros(3)})["w"][0] == 2.0
+    checkpoints.close()
     reopened = Checkpoints(tmp_path)
     assert (reopened.latest_step(), reopened.best_step()) == (4, 2)
     reopened.close()
@@ -130,18 +131,18 @@ def test_a_checkpoint_on_a_full_disk_is_one_line_and_leaves_the_one_before(
     tmp_path, capfd, size
 ):
     state = {"w": jax.random.normal(jax.random.key(0), (60, 60))}
-    shelf = Checkpoints(tmp_path)
-    shelf.save(1, state, validation_loss=2.0)
+    checkpoints = Checkpoints(tmp_path)
+    checkpoints.save(1, state, validation_loss=2.0)
     with (
         largest_file(size),
         pytest.raises(
             OSError, match=r"step 2 was not saved.*File too large.*goes on"
-        ) as told,
+        ) as caught,
     ):
-        shelf.save(2, state, validation_loss=1.0)
-    assert "\n" not in str(told.value)
+        checkpoints.save(2, state, validation_loss=1.0)
+    assert "\n" not in str(caught.value)
     assert "Traceback" not in capfd.readouterr().err
-    shelf.close()
+    checkpoints.close()
     reopened = Checkpoints(tmp_path)
     assert reopened.latest_step() == 1
     assert same(reopened.restore(1, state), state)
@@ -174,17 +175,17 @@ def test_a_loss_that_is_not_finite_stops_with_the_last_good_checkpoint(task, tmp
     train(task, tmp_path, steps=20)
     with pytest.raises(TrainingStopped, match="last good checkpoint is step 20"):
         train((model, loss, poisoned), tmp_path)
-    kept = Checkpoints(tmp_path / "checkpoints")
-    assert kept.latest_step() == 20
-    kept.close()
+    checkpoints = Checkpoints(tmp_path / "checkpoints")
+    assert checkpoints.latest_step() == 20
+    checkpoints.close()
 
 
 @pytest.mark.parametrize(
-    ("changes", "says"),
+    ("changes", "message"),
     [({"steps": 45}, "multiples"), ({"save_every": 15}, "multiples")],
 )
-def test_settings_that_cannot_work_are_refused(task, tmp_path, changes, says):
-    with pytest.raises(ValueError, match=says):
+def test_invalid_settings_are_refused(task, tmp_path, changes, message):
+    with pytest.raises(ValueError, match=message):
         train(task, tmp_path, **changes)
 
 
@@ -203,22 +204,28 @@ space = measure_space(data)
 model = sfkd(space, **TINY)
 draw = partial(random_windows, batch=16, length=8)
 held_out = spread_windows(data.validation, length=8)
-loss, key, place = multi_step_loss(model, space), jax.random.key(3), Path(sys.argv[1])
-fit(model, loss, draw, data.train, held_out, key, place, steps=40, log_every=10, save_every=10)
+loss, key, directory = multi_step_loss(model, space), jax.random.key(3), Path(sys.argv[1])
+fit(model, loss, draw, data.train, held_out, key, directory, steps=40, log_every=10, save_every=10)
 """
 
 
 @pytest.mark.slow
 def test_kill_9_at_random_moments_loses_nothing(task, tmp_path):
     unbroken, _ = train(task, tmp_path / "unbroken", save_every=10)
-    random, place = np.random.default_rng(0), tmp_path / "killed"
+    random, directory = np.random.default_rng(0), tmp_path / "killed"
     for _ in range(4):
         worker = subprocess.Popen(
-            [sys.executable, "-c", WORKER, str(place), str(Path(__file__).parents[1])]
+            [
+                sys.executable,
+                "-c",
+                WORKER,
+                str(directory),
+                str(Path(__file__).parents[1]),
+            ]
         )
         patience = time.monotonic() + 60
         while (
-            not (place / "checkpoints").exists()
+            not (directory / "checkpoints").exists()
             and worker.poll() is None
             and time.monotonic() < patience
         ):
@@ -226,6 +233,6 @@ def test_kill_9_at_random_moments_loses_nothing(task, tmp_path):
         time.sleep(random.uniform(0.0, 3.0))
         worker.send_signal(signal.SIGKILL)
         worker.wait()
-    resumed, _ = train(task, place, save_every=10)
+    resumed, _ = train(task, directory, save_every=10)
     assert same(unbroken, resumed)
-    assert [line["step"] for line in lines(place)] == [10, 20, 30, 40]
+    assert [line["step"] for line in lines(directory)] == [10, 20, 30, 40]

@@ -31,13 +31,13 @@ from training.test_interruption import train
 try:
     train(Path(sys.argv[1]))
 except KeyboardInterrupt:
-    os._exit(130)  # as doors do
+    os._exit(130)  # as commands do
 """
 EXACT = ("step", "loss", "validation_loss", "learning_rate", "gradient_norm")
 
 
-def train(place):
-    """Weights after 80 steps, and the best of them; checkpoints are far apart."""
+def train(directory):
+    """Weights after 80 steps, and the best of them; checkpoints are rare."""
     data = dataset()
     space = measure_space(data)
     model, draw = sfkd(space, **TINY), partial(random_windows, batch=16, length=8)
@@ -50,27 +50,27 @@ def train(place):
         data.train,
         held_out,
         jax.random.key(3),
-        place,
+        directory,
         **options,
     )
 
 
-def lines(place):
-    """What the log says of every step, less its times."""
+def lines(directory):
+    """The log of every step without its times."""
     return [
         {name: line.get(name) for name in EXACT}
-        for line in artefacts.read_jsonl(place / "metrics.jsonl")
+        for line in artefacts.read_jsonl(directory / "metrics.jsonl")
     ]
 
 
-def stopped(place, number, step):
+def stopped(directory, number, step):
     """Send a signal to a training that has logged a step: how long it takes to leave
     [s], and its status.
     """
     process = subprocess.Popen(
-        [sys.executable, "-c", WORKER, str(place), str(Path(__file__).parents[1])]
+        [sys.executable, "-c", WORKER, str(directory), str(Path(__file__).parents[1])]
     )
-    log, patience = place / "metrics.jsonl", time.monotonic() + 120
+    log, patience = directory / "metrics.jsonl", time.monotonic() + 120
     while not (
         log.exists() and any(line["step"] >= step for line in artefacts.read_jsonl(log))
     ):
@@ -86,20 +86,20 @@ def test_signals_save_a_checkpoint_within_5_s_and_the_end_is_that_of_an_unbroken
     tmp_path,
 ):
     unbroken, best = train(tmp_path / "unbroken")
-    place = tmp_path / "broken"
+    directory = tmp_path / "broken"
     for number, step in ((signal.SIGINT, 10), (signal.SIGTERM, 50)):
-        status, seconds = stopped(place, number, step)
+        status, seconds = stopped(directory, number, step)
         assert status == 130
         assert seconds < 5.0
-        saved = Checkpoints(place / "checkpoints")
+        saved = Checkpoints(directory / "checkpoints")
         latest = saved.latest_step()
         saved.close()
-        assert latest == lines(place)[-1]["step"]
+        assert latest == lines(directory)[-1]["step"]
         assert latest % 40
-    resumed, best_again = train(place)
+    resumed, best_again = train(directory)
     assert jax.tree.all(jax.tree.map(np.array_equal, unbroken, resumed))
     assert best == best_again
-    assert lines(place) == lines(tmp_path / "unbroken")
+    assert lines(directory) == lines(tmp_path / "unbroken")
 
 
 COMMAND = """
@@ -114,7 +114,7 @@ hydra_command(run)()
 """
 
 
-def test_a_command_that_is_interrupted_says_so_in_one_line_and_exits_130(tmp_path):
+def test_an_interrupted_command_prints_one_line_and_exits_130(tmp_path):
     done = subprocess.run(
         [sys.executable, "-c", COMMAND],
         cwd=tmp_path,
@@ -137,7 +137,7 @@ DAMAGE = {
 
 
 @pytest.mark.parametrize("damage", list(DAMAGE))
-def test_a_damaged_line_is_told_with_its_number_and_the_others_stay(
+def test_a_damaged_line_is_reported_with_its_number_and_the_others_stay(
     tmp_path, capfd, damage
 ):
     log = tmp_path / "metrics.jsonl"

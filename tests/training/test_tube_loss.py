@@ -1,4 +1,4 @@
-"""The certified tube in the loss: it is what it says, in metres, and training can lower
+"""The certified tube in the loss: it equals its formula, in metres, and training can lower
 it.
 """
 
@@ -46,9 +46,11 @@ def test_the_tube_in_the_loss_is_the_read_out_times_the_defect_over_what_contrac
     total, parts = multi_step_loss(model, space, tube=(0.5,))(params, batch)
     gaps = jax.vmap(lambda drive: defects(model, params, drive)[0])(batch)
     largest = float(power_mean(jnp.linalg.norm(gaps, axis=-1)))
-    row = float(jnp.linalg.norm(model.explicit(params).readout[0]))
+    row = float(jnp.linalg.norm(model.structure.explicit(params).readout[0]))
     np.testing.assert_allclose(
-        parts["tube"], row * largest / (1.0 - float(model.rate(params))), rtol=1e-4
+        parts["tube"],
+        row * largest / (1.0 - float(model.structure.rate(params))),
+        rtol=1e-4,
     )
     without, _ = multi_step_loss(model, space)(params, batch)
     np.testing.assert_allclose(
@@ -64,7 +66,7 @@ def test_lateral_error_and_heading_count_as_position_and_yaw(learned):
 
 
 def test_alpha_follows_the_loss_and_stays_below_its_largest(learned):
-    """A heavy tube alone drives α down; the weights hold whatever α says."""
+    """A heavy tube alone drives α down; the weights hold for any α."""
     model, space, params, batch = learned
     loss = multi_step_loss(
         model,
@@ -78,15 +80,15 @@ def test_alpha_follows_the_loss_and_stays_below_its_largest(learned):
     )
     slope = jax.jit(jax.grad(lambda params: loss(params, batch)[0]))(params)
     assert float(slope["networks"]["alpha_logit"]) > 0
-    assert 0.5 < float(model.rate(params)) < 0.995
+    assert 0.5 < float(model.structure.rate(params)) < 0.995
     for logit in (-5.0, 5.0):
         moved = params | {
             "networks": params["networks"] | {"alpha_logit": jnp.asarray(logit)}
         }
         norms = jnp.linalg.norm(
-            model.explicit(moved).operators.vertices, ord=2, axis=(1, 2)
+            model.structure.explicit(moved).operators.vertices, ord=2, axis=(1, 2)
         )
-        assert np.all(norms <= float(model.rate(moved)) + 1e-5)
+        assert np.all(norms <= float(model.structure.rate(moved)) + 1e-5)
 
 
 def test_a_power_mean_holds_tiny_and_huge_numbers():

@@ -76,7 +76,7 @@ def test_the_linearisation_in_straight_driving_is_the_linear_single_track(linear
     assert max(gap.min(axis=1).max(), gap.min(axis=2).max()) < 5e-3
 
 
-def test_the_body_forgets_its_slip_as_fast_as_the_design_notes_say(linearised):
+def test_slip_decays_as_fast_as_in_the_design_notes(linearised):
     blocks = linearised("step")[np.isin(SPEEDS, [10.0, 15.0, 20.0]), :2, :2]
     np.testing.assert_allclose(
         np.abs(np.linalg.eigvals(blocks)).max(axis=1), [0.25, 0.40, 0.50], atol=0.01

@@ -37,7 +37,7 @@ def test_slip_balances_force_and_moment_at_both_axles(friction, wind, speed):
 
 
 @pytest.mark.parametrize(("friction", "wind"), [(0.9, 0.0), (0.3, 2.0)])
-def test_below_the_limit_the_front_tyre_meets_the_linear_law(friction, wind):
+def test_below_the_limit_the_front_tyre_follows_the_linear_law(friction, wind):
     steering, speed = 1e-4, 3.0
     env = jnp.array([friction, wind * 1e-2])
     rate = kinematic(drag=0.0, rolling=0.0).derivative(

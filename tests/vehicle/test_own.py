@@ -39,7 +39,7 @@ def test_a_step_is_named_in_the_settings_and_is_the_function_itself(monkeypatch)
 
 
 @pytest.mark.parametrize(
-    ("step", "says"),
+    ("step", "message"),
     [
         (
             "nowhere.at_all:step",
@@ -52,14 +52,14 @@ def test_a_step_is_named_in_the_settings_and_is_the_function_itself(monkeypatch)
         ("own_vehicle", "name it as package.module:function"),
     ],
 )
-def test_a_step_that_is_not_there_is_told_when_it_is_needed_and_not_before(
-    monkeypatch, step, says
+def test_a_missing_step_is_reported_when_it_is_needed_and_not_before(
+    monkeypatch, step, message
 ):
     monkeypatch.syspath_prepend(EXAMPLES)
     plant = build.build_vehicle(SETTINGS | {"step": step})
     with pytest.raises(ValueError, match=r"vehicle\.step") as caught:
         vehicle.check_step(plant)
-    assert says in str(caught.value)
+    assert message in str(caught.value)
 
 
 def test_a_step_of_another_size_is_refused_by_its_shapes():
@@ -74,7 +74,7 @@ def test_a_step_of_another_size_is_refused_by_its_shapes():
         vehicle.check_step(plant)
 
 
-def test_a_step_that_takes_other_sizes_is_told_which_it_is_given():
+def test_a_step_that_fails_is_reported_with_the_sizes_it_was_given():
     def step(x, u, e):
         p_x, p_y, yaw, v, rate = x
         return jnp.stack([p_x, p_y, yaw, v, rate])
@@ -97,7 +97,7 @@ def test_a_robot_known_from_logs_alone_is_not_driven():
 
 
 @pytest.mark.parametrize(
-    ("settings", "says"),
+    ("settings", "message"),
     [
         (
             {"state_names": ("p_x", "p_y", "yaw")},
@@ -108,8 +108,8 @@ def test_a_robot_known_from_logs_alone_is_not_driven():
         ({"step": lambda x, u, e: x}, "two numbers each"),
     ],
 )
-def test_settings_that_cannot_be_meant_are_refused(settings, says):
-    with pytest.raises(ValueError, match=says):
+def test_invalid_settings_are_refused(settings, message):
+    with pytest.raises(ValueError, match=message):
         vehicle.own(**settings)
 
 
@@ -131,9 +131,11 @@ def test_its_nominal_model_is_the_bicycle_and_leaves_further_states_alone():
     assert after[4] == state[4]
 
 
-def test_a_plant_that_wind_does_not_push_cannot_be_pushed_through_it(key):
+def test_side_forces_need_a_plant_that_wind_acts_on(key):
     with pytest.raises(
         ValueError,
         match=r"side_forces act through the wind, but vehicle\.wind_force is 0",
     ):
-        evaluation.disturbed_environment(vehicle.own(), jnp.zeros((3, 2)), key, largest=10.0)
+        evaluation.disturbed_environment(
+            vehicle.own(), jnp.zeros((3, 2)), key, largest=10.0
+        )

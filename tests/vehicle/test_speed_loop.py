@@ -51,5 +51,5 @@ def test_the_wrapper_changes_the_meaning_of_one_control_and_nothing_else(vehicle
     assert closed.speed_loop
     assert not vehicle.speed_loop
     assert (closed.control_low, closed.control_high) == ((-0.5, 0.0), (0.5, 25.0))
-    kept = ("name", "dt", "wheelbase", "state_names", "derivative")
-    assert all(getattr(closed, name) is getattr(vehicle, name) for name in kept)
+    unchanged = ("name", "dt", "wheelbase", "state_names", "derivative")
+    assert all(getattr(closed, name) is getattr(vehicle, name) for name in unchanged)

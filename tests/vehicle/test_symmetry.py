@@ -29,7 +29,7 @@ def test_the_mirrored_drive_is_the_mirror_of_the_drive(vehicle, which, many, swe
 
 @pytest.mark.usefixtures("x64")
 @pytest.mark.parametrize("which", ["step", "nominal"])
-def test_the_drive_does_not_depend_on_the_frame_it_is_told_in(
+def test_the_drive_does_not_depend_on_the_frame_it_is_expressed_in(
     vehicle, which, many, sweep
 ):
     step = many(getattr(vehicle, which))

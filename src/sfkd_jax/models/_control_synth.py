@@ -9,6 +9,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
+from sfkd_jax.core.ranges import Positive
 from sfkd_jax.models._continuous import continuous, mlp
 from sfkd_jax.types import (
     Control,
@@ -76,7 +77,7 @@ def control_synth(
     dt: float = 0.1,
     networks: int = 2,
     width: int = 48,
-    rate: float = 0.05,
+    rate: Positive = 0.05,
     input_hidden: tuple[int, ...] = (96, 96),
     environment: bool = True,
 ) -> Model:

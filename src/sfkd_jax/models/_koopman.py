@@ -8,6 +8,7 @@ from typing import NamedTuple
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
+from sfkd_jax.core.ranges import AtLeastTwo, NonNegativeInt, Positive
 from sfkd_jax.core.se2 import between, compose
 from sfkd_jax.models._koopman_fit import identify, random_centres
 from sfkd_jax.models._koopman_lift import KoopmanFiber, Lift
@@ -38,13 +39,13 @@ def koopman(
     *,
     functions: int = 100,
     environment: bool = True,
-    environment_degree: int = 2,
-    ridges: tuple[float, ...] = (1e-6, 1e-5, 1e-4, 1e-3),
-    lateral_range: float = 4.0,
-    heading_range: float = 0.5,
-    curvature_range: float = 0.03,
+    environment_degree: NonNegativeInt = 2,
+    ridges: tuple[Positive, ...] = (1e-6, 1e-5, 1e-4, 1e-3),
+    lateral_range: Positive = 4.0,
+    heading_range: Positive = 0.5,
+    curvature_range: Positive = 0.03,
     transitions: int = 100_000,
-    horizon: int = 20,
+    horizon: AtLeastTwo = 20,
 ) -> Model:
     """EDMD in path coordinates x = (progress, e_y, e_ψ, s), linear in a lift of x.
 

@@ -10,6 +10,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from sfkd_jax.core.folding import Folded, unfold
+from sfkd_jax.core.ranges import Fraction
 from sfkd_jax.core.se2 import compose
 from sfkd_jax.models._continuous import has_pose, scaled_env
 from sfkd_jax.models._r2dn_weights import Affine, Interconnection, Shared
@@ -52,7 +53,7 @@ def r2dn(
     space: Space,
     *,
     rank: int = 32,
-    alpha: float = 0.995,
+    alpha: Fraction = 0.995,
     hidden: tuple[int, ...] = (32, 32),
     decoder_hidden: tuple[int, ...] = (64, 32),
     encoder_hidden: int = 32,

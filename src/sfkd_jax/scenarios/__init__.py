@@ -15,6 +15,7 @@ from sfkd_jax.scenarios._paths import point_at as point_at
 from sfkd_jax.scenarios._paths import project as project
 from sfkd_jax.scenarios._paths import reference_window as reference_window
 from sfkd_jax.scenarios._paths import smooth_path as smooth_path
+from sfkd_jax.scenarios._scenarios import FAMILIES as FAMILIES
 from sfkd_jax.scenarios._scenarios import Family as Family
 from sfkd_jax.scenarios._scenarios import Scenario as Scenario
 from sfkd_jax.scenarios._scenarios import family as family

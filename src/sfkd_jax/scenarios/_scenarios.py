@@ -1,14 +1,14 @@
-"""Scenario families: a key in, one episode's road, weather and start out, as arrays only."""
+"""Scenario families: key -> start, environment and path of one episode, as arrays."""
 
 from __future__ import annotations
 
 from collections.abc import Callable
-from functools import partial
 from typing import NamedTuple, TypeAlias
 
 import jax
 import jax.numpy as jnp
 
+from sfkd_jax.core.ranges import Positive, Span
 from sfkd_jax.scenarios._conditions import (
     Schedule,
     steady_road,
@@ -39,30 +39,47 @@ class Scenario(NamedTuple):
 
 
 Family: TypeAlias = Callable[[Key], Scenario]
-Conditions: TypeAlias = Callable[..., Schedule]
+
+FAMILIES: dict[str, Callable[[Key, int, float], Schedule]] = {
+    "s1": lambda key, steps, dt: uniform_road(key, steps=steps),
+    "s2": lambda key, steps, dt: wet_road(key, steps=steps, dt=dt),
+    "s3": lambda key, steps, dt: switching_road(key, steps=steps, dt=dt),
+    "seen": lambda key, steps, dt: steady_road(
+        key, steps=steps, friction=(0.55, 0.9), wind=(0.0, 8.0)
+    ),
+    "interpolated": lambda key, steps, dt: steady_road(
+        key, steps=steps, friction=(0.5, 0.55), wind=(4.0, 8.0)
+    ),
+    "extrapolated": lambda key, steps, dt: steady_road(
+        key, steps=steps, friction=(0.27, 0.3), wind=(8.0, 9.0)
+    ),
+}
+"""Environments of an episode: name -> (key, steps, sampling period [s]) -> schedule."""
 
 
 def scenario(
     *,
     name: str,
     duration: float,
-    speed: float = 10.0,
+    speed: Positive = 10.0,
     peak_curvature: float = 0.02,
-    wavelengths: tuple[float, float] = (50.0, 160.0),
+    wavelengths: Span = (50.0, 160.0),
     state_size: int,
     dt: float,
 ) -> Family:
-    """The family `name` of the benchmark: "s1" uniform road, "s2" wet road with gusts, "s3" switching road.
+    """Return a family of the benchmark by name.
 
-    Three more hold one pair of friction and wind for an episode: "seen" as training
-    drives have it, "interpolated" between friction levels that they have under wind,
-    "extrapolated" beyond the box that they cover.
+    "s1" is a uniform road, "s2" a wet road with gusts, "s3" a switching road. Three
+    more have one constant pair of friction and wind per episode: "seen" in the range of
+    the training drives, "interpolated" between friction levels that these have under
+    wind, "extrapolated" outside their box.
 
     Args:
-        name: which.
+        name: of the family.
         duration: of an episode [s].
         speed: to hold [m/s].
-        peak_curvature, wavelengths: of the random path, see `smooth_path`.
+        peak_curvature: of the random path, see `smooth_path`.
+        wavelengths: of the random path, see `smooth_path`.
         state_size: of the vehicle; the episode starts on the path at `speed`, other
             body states zero.
         dt: sampling period [s].
@@ -70,25 +87,13 @@ def scenario(
     Raises:
         ValueError: unknown name.
     """
-    steps = round(duration / dt)
-    table = {
-        "s1": partial(uniform_road, steps=steps),
-        "s2": partial(wet_road, steps=steps, dt=dt),
-        "s3": partial(switching_road, steps=steps, dt=dt),
-        "seen": partial(
-            steady_road, steps=steps, friction=(0.55, 0.9), wind=(0.0, 8.0)
-        ),
-        "interpolated": partial(
-            steady_road, steps=steps, friction=(0.5, 0.55), wind=(4.0, 8.0)
-        ),
-        "extrapolated": partial(
-            steady_road, steps=steps, friction=(0.27, 0.3), wind=(8.0, 9.0)
-        ),
-    }
-    if name not in table:
-        raise ValueError(f"unknown scenario {name!r}; choose one of {', '.join(table)}")
+    if name not in FAMILIES:
+        raise ValueError(
+            f"unknown scenario {name!r}; choose one of {', '.join(FAMILIES)}"
+        )
+    conditions, steps = FAMILIES[name], round(duration / dt)
     return family(
-        table[name],
+        lambda key: conditions(key, steps, dt),
         length=speed * duration * 1.1 + 50.0,
         speed=speed,
         peak_curvature=peak_curvature,
@@ -98,7 +103,7 @@ def scenario(
 
 
 def family(
-    conditions: Conditions,
+    conditions: Callable[[Key], Schedule],
     *,
     length: float,
     speed: float,
@@ -106,7 +111,16 @@ def family(
     wavelengths: tuple[float, float],
     state_size: int,
 ) -> Family:
-    """Join a schedule of conditions and a family of paths to a family of scenarios."""
+    """Combine a schedule of conditions and a family of paths.
+
+    Args:
+        conditions: key -> e_0 … e_{T-1}.
+        length: of the path [m].
+        speed: to hold [m/s].
+        peak_curvature: of the path, see `smooth_path`.
+        wavelengths: of the path, see `smooth_path`.
+        state_size: of the vehicle.
+    """
 
     def sample(key: Key) -> Scenario:
         path_key, condition_key = jax.random.split(key)

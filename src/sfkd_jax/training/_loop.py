@@ -137,7 +137,7 @@ def fit(
         checkpoints.close()
 
 
-def _progress(step: int, schedule: optax.Schedule, began: float) -> dict[str, float]:
+def _progress(step: int, schedule: optax.Schedule, began: float) -> dict[str, Any]:
     """Step, learning rate and elapsed time for the log."""
     return {
         "step": step,

@@ -6,6 +6,7 @@ from functools import partial
 
 import jax.numpy as jnp
 
+from sfkd_jax.core.ranges import Fraction, NonNegativeInt
 from sfkd_jax.models.sfkd._dynamics import Dynamics
 from sfkd_jax.models.sfkd._networks import Encoder, Networks
 from sfkd_jax.models.sfkd._settings import check_settings
@@ -20,8 +21,8 @@ def sfkd(
     space: Space,
     *,
     rank: int = 32,
-    rho: float = 0.895,
-    beta: float = 0.1,
+    rho: Fraction = 0.895,
+    beta: Fraction = 0.1,
     vertices: int = 8,
     residual_hidden: tuple[int, ...] = (32, 32),
     decoder_hidden: tuple[int, ...] = (64, 32),
@@ -35,7 +36,7 @@ def sfkd(
     environment: bool = True,
     soft_penalty: float = 0.0,
     learn_alpha: bool = False,
-    forcing_hidden: int = 0,
+    forcing_hidden: NonNegativeInt = 0,
 ) -> Model:
     """Stable Fiber-Koopman Residual Dynamics (eq:sfkd).
 

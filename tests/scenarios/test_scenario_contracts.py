@@ -1,0 +1,83 @@
+"""The contract of every scenario family: shapes, randomness, arrays, and the box of e."""
+
+from functools import cache
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from helpers import ENV_HIGH, ENV_LOW, at, jit, same
+
+from sfkd_jax import scenarios
+
+EVERY = tuple(scenarios.FAMILIES)
+KEYS = jax.random.split(jax.random.key(7), 32)
+STEPS, DT, STATES = 60, 0.1, 4
+
+
+def make(name):
+    return scenarios.scenario(
+        name=name, duration=STEPS * DT, state_size=STATES, dt=DT, speed=9.0
+    )
+
+
+@cache
+def sampled(name):
+    """One compilation of a family serves all tests."""
+    return jit(jax.vmap(make(name)))
+
+
+@cache
+def batch(name):
+    return sampled(name)(KEYS)
+
+
+@pytest.mark.parametrize("name", EVERY)
+def test_a_batch_of_episodes_is_one_pytree_of_finite_arrays(name):
+    episodes = batch(name)
+    leaves = jax.tree.leaves(episodes)
+    assert all(isinstance(leaf, jax.Array) for leaf in leaves)
+    assert all(leaf.dtype == jnp.float32 and leaf.shape[0] == 32 for leaf in leaves)
+    assert all(bool(jnp.all(jnp.isfinite(leaf))) for leaf in leaves)
+    assert episodes.envs.shape == episodes.observed_envs.shape == (32, STEPS, 2)
+    assert episodes.initial_state.shape == (32, STATES)
+    assert episodes.path.points.shape[2:] == (4,)
+
+
+@pytest.mark.parametrize("name", EVERY)
+def test_an_episode_follows_from_its_key_alone(name):
+    again = sampled(name)(KEYS[::-1])
+    assert same(at(again, slice(None, None, -1)), batch(name), rtol=0, atol=0)
+    assert sampled(name)._cache_size() == 1  # other keys, no other trace
+
+
+@pytest.mark.parametrize("name", EVERY)
+def test_different_keys_make_different_episodes(name):
+    points = np.asarray(batch(name).path.points)
+    assert len(np.unique(points[:, -1, 1].round(3))) == len(KEYS)
+    if name != "s1":  # whose friction is constant and whose air is calm
+        assert len(np.unique(np.asarray(batch(name).envs), axis=0)) > 1
+
+
+@pytest.mark.parametrize("name", EVERY)
+def test_an_episode_starts_on_its_path_at_its_speed_and_is_observed_as_it_is(name):
+    episodes = batch(name)
+    start = np.tile(np.float32([0.0, 0.0, 0.0, 9.0]), (32, 1))
+    np.testing.assert_array_equal(episodes.initial_state, start)
+    np.testing.assert_array_equal(episodes.path.points[:, 0], np.zeros((32, 4)))
+    np.testing.assert_array_equal(episodes.speed, np.full(32, np.float32(9.0)))
+    np.testing.assert_array_equal(episodes.observed_envs, episodes.envs)
+
+
+@pytest.mark.parametrize("name", EVERY)
+def test_friction_and_wind_lie_in_the_box_of_the_data_unless_extrapolated(name):
+    envs = np.asarray(batch(name).envs, dtype=np.float64)
+    low, high = np.asarray(ENV_LOW) - 1e-6, np.asarray(ENV_HIGH) + 1e-6
+    inside = np.all((envs >= low) & (envs <= high), axis=-1)
+    assert np.all(inside) if name != "extrapolated" else not np.any(inside)
+
+
+@pytest.mark.parametrize("name", EVERY)
+def test_no_key_is_used_twice(name):
+    with jax.debug_key_reuse(True):
+        jax.jit(make(name))(jax.random.key(0))
