@@ -99,7 +99,7 @@ HEAVY = {
 WRITES = {
     f"os.environ.{verb}" for verb in ("update", "setdefault", "pop", "popitem", "clear")
 }
-HOST = {"pipeline", "corridor", "training", "certification", "exporting"}
+HOST = {"policy", "pipeline", "corridor", "training", "certification", "exporting"}
 """Besides the commands and gymnasium's adapter, where code runs on the host and may
 compile.
 """

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from sfkd_jax import vehicle
-from sfkd_jax.core.path_frame import closed_loop, is_valid, circle_errors, path_state
+from sfkd_jax.core.path_frame import circle_errors, closed_loop, is_valid, path_state
 from sfkd_jax.core.se2 import compose
 from sfkd_jax.scenarios import path_from_curvature, project
 from sfkd_jax.types import BODY

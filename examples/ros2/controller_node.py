@@ -39,10 +39,7 @@ class ControllerNode(Node):
         }
         for name, value in defaults.items():
             self.declare_parameter(name, value)
-        policy = sfkd_jax.load(self.setting("policy"))
-        self.policy = policy._replace(
-            params=jax.jit(policy.model.fold)(policy.params)
-        )  # once, not at every step
+        self.policy = sfkd_jax.load(self.setting("policy"))
         self.dt = self.policy.settings["vehicle"]["dt"]
         self.horizon = self.policy.settings["controller"]["mppi"]["horizon"]
         self.act = sfkd_jax.warm_up(self.policy)
