@@ -14,17 +14,16 @@ from sfkd_jax.reporting import write_report
 
 
 def run(settings: dict[str, Any]) -> dict[str, Any]:
-    """Draw; nothing is recomputed."""
+    """Write the report of the run, or of all runs that `report.compare` matches."""
     pattern = settings["report"]["compare"]
-    place = Path(settings["root"]) if pattern else store.run_directory(settings)
-    alone = (
-        artefacts.locked(place) if place.exists() else nullcontext()
-    )  # or it makes what it then finds empty
-    with alone, artefacts.as_artefact_error(place):
+    directory = Path(settings["root"]) if pattern else store.run_directory(settings)
+    # A lock would make a directory that does not exist.
+    exclusive = artefacts.locked(directory) if directory.exists() else nullcontext()
+    with exclusive, artefacts.as_artefact_error(directory):
         pages = (
-            write_comparison(place, pattern, settings["name"])
+            write_comparison(directory, pattern, settings["name"])
             if pattern
-            else write_report(place, studies=beside_the_paper)
+            else write_report(directory, studies=beside_the_paper)
         )
     artefacts.print_message(f"report: {pages['report']}")
     return pages

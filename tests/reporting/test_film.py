@@ -6,10 +6,9 @@ from matplotlib.figure import Figure
 from matplotlib.patches import Polygon
 from PIL import Image
 
-from sfkd_jax.reporting import draw_film
-from sfkd_jax.reporting._animation import MOST_BYTES
-from sfkd_jax.reporting._film import Car, Film, strip, widening
-from sfkd_jax.reporting._film_road import road
+from sfkd_jax.paper import draw_film
+from sfkd_jax.reporting._film import draw_strip
+from sfkd_jax.reporting.film import MAX_BYTES, Car, Film, draw_road
 
 STEPS, DT, CORRIDOR = 12, 0.1, 0.2
 SWITCHED = 6
@@ -59,8 +58,8 @@ def shown(about):
 
 def test_a_car_is_drawn_until_it_leaves_and_its_lane_is_said_to_be_left():
     axes, film = Figure().subplots(), shown(drives(departing()))
-    assert widening(film, STEPS) == 10
-    move = road(axes, film, STEPS)
+    assert film.widening(STEPS) == 10
+    move = draw_road(axes, film, STEPS)
     kept, lost = (patch for patch in axes.patches if len(patch.get_xy()) == 6)
     *_, name = axes.texts[:2]
     visible = []
@@ -75,7 +74,7 @@ def test_a_car_is_drawn_until_it_leaves_and_its_lane_is_said_to_be_left():
 
 def test_the_corridor_is_to_the_scale_of_the_deviations():
     (above, below), film = Figure().subplots(2), shown(drives(departing()))
-    road(above, film, STEPS)(3)
+    draw_road(above, film, STEPS)(3)
     bands = [
         patch
         for patch in above.patches
@@ -83,7 +82,7 @@ def test_the_corridor_is_to_the_scale_of_the_deviations():
     ]
     heights = sorted(tuple(sorted(set(band.get_xy()[:, 1].round(6)))) for band in bands)
     assert np.ptp(heights, axis=1) == pytest.approx(2 * 10 * CORRIDOR)
-    strip(below, film, STEPS)(STEPS - 1)
+    draw_strip(below, film, STEPS)(STEPS - 1)
     level = {
         float(line.get_ydata()[0])
         for line in below.get_lines()
@@ -95,16 +94,14 @@ def test_the_corridor_is_to_the_scale_of_the_deviations():
 
 def test_the_scale_keeps_a_wide_corridor_and_every_car_that_stays_in_its_lane():
     stays = np.linspace(0.0, 0.65, STEPS)
-    assert widening(shown(drives(stays)), STEPS) == 5
-    assert widening(shown(drives(stays) | {"corridor": 0.85}), STEPS) == 4
-    assert (
-        widening(shown(drives(np.full(STEPS, 1e3)) | {"corridor": None}), STEPS) == 10
-    )
+    assert shown(drives(stays)).widening(STEPS) == 5
+    assert shown(drives(stays) | {"corridor": 0.85}).widening(STEPS) == 4
+    assert shown(drives(np.full(STEPS, 1e3)) | {"corridor": None}).widening(STEPS) == 10
 
 
 def test_the_film_of_a_car_that_is_lost_is_small_and_moves(tmp_path):
     place = draw_film(tmp_path / "film.gif", **drives(departing()))
-    assert place.stat().st_size <= MOST_BYTES
+    assert place.stat().st_size <= MAX_BYTES
     with Image.open(place) as image:
         assert image.n_frames == STEPS
         frames = []

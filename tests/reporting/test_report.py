@@ -12,11 +12,13 @@ import pytest
 from PIL import Image
 
 from sfkd_jax.artefacts import ArtefactError
+from sfkd_jax.evaluation.formats import upper
+from sfkd_jax.evaluation.metrics import METRICS, Metric
+from sfkd_jax.paper import beside_the_paper
+from sfkd_jax.paper._side_forces import violations
 from sfkd_jax.reporting import write_report
-from sfkd_jax.reporting._numbers import upper
-from sfkd_jax.reporting._scene import scenes_of
-from sfkd_jax.reporting._tube import tube_on_drive
-from sfkd_jax.reporting._violations import violations
+from sfkd_jax.reporting._certificate import tube_on_drive
+from sfkd_jax.reporting.scene import scenes_of
 
 STEPS, DT, EPISODES, SPEED = 600, 0.1, 4, 10.0
 LEVELS = ((0.9, 0.0), (0.6, 4.0), (0.3, 8.0), (0.6, -4.0))
@@ -215,7 +217,7 @@ def text_of(page):
 
 
 def report_of(run):
-    made = write_report(run)
+    made = write_report(run, studies=beside_the_paper)
     return Path(made["report"]).read_text("utf-8"), made
 
 
@@ -337,19 +339,21 @@ def test_the_same_run_gives_the_same_bytes_and_no_stale_figure(tmp_path):
 
 
 @pytest.mark.parametrize(
-    ("name", "door"),
+    ("name", "command"),
     [
         ("metrics.jsonl", "train"), ("open_loop.json", "train"), ("certificate.json", "certify"),
         ("results.json", "evaluate"), ("episodes.npz", "evaluate"),
     ],
 )  # fmt: skip
-def test_a_missing_input_is_named_with_the_command_that_makes_it(tmp_path, name, door):
+def test_a_missing_input_is_named_with_the_command_that_makes_it(
+    tmp_path, name, command
+):
     run = write_run(tmp_path)
     (run / name).unlink()
     page = text_of(report_of(run)[0])
     assert f"{name} is missing" in page
     assert page.count(" is missing from this run") == 1
-    assert f"that makes it: python -m sfkd_jax.{door} +experiment=s3 seed=0" in page
+    assert f"that makes it: python -m sfkd_jax.{command} +experiment=s3 seed=0" in page
 
 
 def test_a_policy_alone_is_enough_and_no_policy_is_refused(tmp_path):
@@ -410,7 +414,7 @@ def test_absent_keys_and_empty_lists_do_not_stop_a_report(tmp_path):
         "Nothing is proved. No contraction is certified for these weights: alpha = 1.02 is not below 1."
         in page
     )
-    assert "It carries no valid certificate." in page
+    assert "It has no valid certificate." in page
     assert "Certified α" not in page
     assert "Koopman MPC" in page
     assert "open_loop.json is missing" in page
@@ -469,6 +473,29 @@ def test_names_are_not_formulas(tmp_path):
     arrays |= {f"a$x_$b/{name}/lateral": arrays["oracle/s3/lateral"][:, :50]}
     np.savez(run / "episodes.npz", **arrays)
     assert len(report_of(run)[1]["figures"]) == 9
+
+
+def test_naive_baselines_stand_beside_the_model(tmp_path):
+    errors = documents()["open_loop.json"]
+    naive = {"position_rmse_m": [0.01 * k for k in errors["steps"]]}
+    errors |= {"baselines": {"constant_velocity": naive, "kinematic_bicycle": {}}}
+    made = report_of(write_run(tmp_path, episodes=None, open_loop=errors))[1]
+    text = Path(made["report"]).with_name("report.md").read_text("utf-8")
+    head = "| Steps ahead | Model | Constant velocity | Kinematic bicycle |"
+    assert head in text
+    assert "| 20 | 0.4400 | 0.2000 | – |" in text
+
+
+def test_a_metric_of_the_table_is_a_column_of_the_page(tmp_path, monkeypatch):
+    new = Metric("largest_steering_rad", "Largest steering", "rad", "tracking")
+    monkeypatch.setattr("sfkd_jax.evaluation.metrics.METRICS", (*METRICS, new))
+    rows = documents()["results.json"]["rows"]
+    for row in rows:
+        row["largest_steering_rad"] = 0.23456
+    made = report_of(write_run(tmp_path, episodes=None, results={"rows": rows}))[1]
+    text = Path(made["report"]).with_name("report.md").read_text("utf-8")
+    assert r"Largest steering \[rad\]" in text
+    assert "0.235" in text
 
 
 def test_a_cut_off_log_a_lost_vehicle_and_one_short_episode(tmp_path):

@@ -17,9 +17,16 @@ from sfkd_jax.paper._setups import OFF_THE_ROAD_M, Setup, by_hardness, merged
 from sfkd_jax.paper._study import Study
 from sfkd_jax.paper._tables import has_trainings, trainings
 from sfkd_jax.paper._texts import text
-from sfkd_jax.reporting.conditions import env_text, shade
 from sfkd_jax.reporting.scene import switches
-from sfkd_jax.reporting.style import MUTED, canvas, line, literal, scenario_label
+from sfkd_jax.reporting.style import (
+    MUTED,
+    canvas,
+    env_text,
+    line,
+    literal,
+    scenario_label,
+    shade,
+)
 
 _PRINTED: dict[str, Any] = {"marker": "x", "color": "#9aa1ab"}
 _ALWAYS = ("sfkd", "oracle")

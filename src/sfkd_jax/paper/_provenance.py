@@ -11,7 +11,7 @@ from sfkd_jax.paper._setups import Setup
 from sfkd_jax.paper._study import Study
 from sfkd_jax.paper._texts import text
 from sfkd_jax.reporting.blocks import Block, Code, Heading, Table
-from sfkd_jax.reporting.tables import settings_table
+from sfkd_jax.reporting.tables import named_values
 
 
 def lead(results: dict[str, Any], setups: list[Setup], study: Study) -> str:
@@ -61,7 +61,7 @@ def provenance(results: dict[str, Any], setups: list[Setup]) -> list[Block]:
         Heading(3, "Episodes"),
         Table(head, counts, prose=True),
         Heading(3, "Settings"),
-        settings_table(_without_page(config)),
+        named_values(("Group", "Settings"), _without_page(config)),
         Heading(3, "Versions"),
         Table(["Package", "Version"], packages, prose=True),
     ]

@@ -7,8 +7,8 @@ from typing import Any, NamedTuple
 
 from sfkd_jax.evaluation.formats import dig, is_number, is_pair
 from sfkd_jax.evaluation.metrics import Metric, Row
-from sfkd_jax.reporting.rows import SAMPLINGS, name_of, rank, vehicle_stem
-from sfkd_jax.reporting.style import family
+from sfkd_jax.reporting.rows import SAMPLINGS, name_of, vehicle_stem
+from sfkd_jax.reporting.style import family, rank
 
 OFF_THE_ROAD_M = 1.0
 """Mean deviation from which a figure writes a number instead of drawing a mark."""

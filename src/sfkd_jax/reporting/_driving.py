@@ -1,181 +1,200 @@
-"""The section on what was driven: scores, pictures, planner, violations, and the remaining measures."""
+"""The section on closed-loop episodes: scores, figures, planner and violations."""
 
 from __future__ import annotations
 
+from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
-from sfkd_jax.reporting._blocks import Block, Heading, Missing, Text, picture
-from sfkd_jax.reporting._driven import deviation, spread, steering
-from sfkd_jax.reporting._numbers import dig, is_number, short
-from sfkd_jax.reporting._scene import Scene, scenes_of
-from sfkd_jax.reporting._tables import (
-    block_title,
-    closed_loop,
-    closed_loop_more,
-    planner_table,
-    violation_table,
-)
+import numpy as np
+from matplotlib.figure import Figure
+
+from sfkd_jax.evaluation.formats import dig, is_number
+from sfkd_jax.evaluation.metrics import Row
+from sfkd_jax.reporting import style
+from sfkd_jax.reporting._summary import command
 from sfkd_jax.reporting._track import EXAGGERATION, track
-from sfkd_jax.reporting._violations import disturbed, violations
-from sfkd_jax.reporting._words import command, headline, paper_note, violation_words
+from sfkd_jax.reporting.blocks import Block, Heading, Text, missing, picture
+from sfkd_jax.reporting.rows import group_title
+from sfkd_jax.reporting.run import Run
+from sfkd_jax.reporting.scene import Scene, hardest_step, switches
+from sfkd_jax.reporting.tables import metric_table
+from sfkd_jax.reporting.texts import text
 
 
-def driving(
-    run: Path, rows: list[list[dict[str, Any]]], settings: dict[str, Any], place: Path
-) -> list[Block]:
-    """Closed loop: the table the summary speaks of, the pictures, then every other table."""
+def driving(run: Run) -> list[Block]:
+    """The table of the summary, the figures, then every other table."""
     blocks: list[Block] = [Heading(2, "How it drives")]
-    head = headline(rows, settings)
-    if (
-        not head
-        and dig(settings, "vehicle", "name") == "own"
-        and not dig(settings, "vehicle", "step")
-    ):
-        return [
-            *blocks,
-            Text(
-                "Not driven: the robot is known from logs alone, so there is nothing here to drive."
-            ),
-        ]
+    vehicle, head = run.settings.get("vehicle"), run.headline
+    if not head and dig(vehicle, "name") == "own" and not dig(vehicle, "step"):
+        return [*blocks, Text(text("driving.not_driven"))]
+    again = command("evaluate", run.settings)
     if head:
-        blocks += [*_scores(head), Text(_EXPLAINED, kind="note")]
+        blocks += [*_scores(head), Text(text("driving.scores"), kind="note")]
     else:
-        blocks.append(Missing("results.json", command("evaluate", settings)))
-    scenes = scenes_of(run)
-    if not scenes:
-        blocks.append(Missing("episodes.npz", command("evaluate", settings)))
-    for scene in scenes:
-        blocks += _scene_pictures(scene, place, full=scene is scenes[0])
-    for block in rows:
-        blocks += _scores(block) if block is not head else []
-    blocks += _planning(rows, settings)
-    blocks += _violating(rows, place)
-    more = [(block_title(block), closed_loop_more(block)) for block in rows]
-    shown = [
-        [Text(title, kind="sub"), table]
-        for title, table in more
-        if len(table.header) > 1
-    ]
-    return [
-        *blocks,
-        *([Heading(3, "More measures")] if shown else []),
-        *(piece for pair in shown for piece in pair),
-    ]
+        blocks += missing("results.json", again)
+    blocks += [] if run.scenes else missing("episodes.npz", again)
+    for scene in run.scenes:
+        blocks += _figures(scene, run.figures, full=scene is run.scenes[0])
+    for group in run.groups:
+        blocks += _scores(group) if group is not head else []
+    tables = _tables("Planner and cost", run.groups, "planner", "cost")
+    words = [Text(_planner_words(run.settings), kind="note")] if tables else []
+    blocks += [*tables, *words, *_violations(run.groups)]
+    return [*blocks, *_tables("More measures", run.groups, "spread")]
 
 
-_EXPLAINED = (
-    "RMSE is of the lateral deviation of the true state from the path, one number per episode. Mean, "
-    "standard deviation and 95 % interval are over the same episodes for every system. Steering rate is "
-    "the mean of its absolute value. The oracle plans with the true vehicle; the nominal model is told "
-    "neither friction nor wind."
-)
+def _scores(group: list[Row]) -> list[Block]:
+    table = metric_table(group, "tracking", observed=True)
+    return [Heading(3, group_title(group)), table]
 
 
-def _scores(block: list[dict[str, Any]]) -> list[Block]:
-    note = paper_note(block)
-    table = [Heading(3, block_title(block)), closed_loop(block)]
-    return [*table, Text(note, "Beside the paper.", "note")] if note else table
-
-
-def _scene_pictures(scene: Scene, place: Path, *, full: bool) -> list[Block]:
-    """Deviation of one scenario; with `full` also all episodes, the road from above and the steering."""
-    name = scene.label
-    caption = (
-        f"{name}, first episode: signed lateral deviation from the path, left positive. Dashed lines mark "
-        "where friction and wind switch; below, what they are."
-    )
-    stem = scene.stem
-    blocks: list[Block] = [
-        picture(place, f"deviation_{stem}", caption, deviation, scene)
-    ]
-    if not full:
-        return blocks
-    caption = (
-        f"{name}, all episodes: absolute lateral deviation over the whole duration."
-    )
-    blocks.append(picture(place, f"episodes_{stem}", caption, spread, scene))
-    if scene.path is not None and scene.states:
-        caption = (
-            f"{name}, first episode: the road in true scale, and the stretch in the ring, where "
-            f"deviations are largest, with deviations (not the road) drawn {EXAGGERATION} times as wide."
-        )
-        blocks.append(picture(place, f"track_{stem}", caption, track, scene))
-    if scene.controls:
-        caption = f"{name}, first episode: steering commands over ten seconds around that stretch."
-        blocks.append(picture(place, f"steering_{stem}", caption, steering, scene))
+def _figures(scene: Scene, folder: Path, *, full: bool) -> list[Block]:
+    """Deviation; with `full` also all episodes, the road and the steering."""
+    shown = {"deviation": deviation}
+    if full:
+        shown["episodes"] = spread
+        shown |= {"track": track} if scene.path is not None and scene.states else {}
+        shown |= {"steering": steering} if scene.controls else {}
+    blocks: list[Block] = []
+    for name, draw in shown.items():
+        caption = text(f"driving.{name}", scene=scene.label, factor=EXAGGERATION)
+        blocks.append(picture(folder, f"{name}_{scene.stem}", caption, draw, scene))
     return blocks
 
 
-def _planning(
-    rows: list[list[dict[str, Any]]], settings: dict[str, Any]
-) -> list[Block]:
-    """Effective sample size and solve times, where any was measured."""
-    tables = [(block_title(block), planner_table(block)) for block in rows]
-    shown = [
-        [Text(title, kind="sub"), table]
-        for title, table in tables
-        if len(table.header) > 1
-    ]
-    said = [Text(_planner_words(settings), kind="note")] if shown else []
-    return [
-        *(
-            [Heading(3, "Planner: effective sample size and solve time")]
-            if shown
-            else []
-        ),
-        *(piece for pair in shown for piece in pair),
-        *said,
-    ]
+def _tables(heading: str, groups: list[list[Row]], *tables: str) -> list[Block]:
+    """Further metrics of every group that has any of them."""
+    blocks: list[Block] = []
+    for group in groups:
+        table = metric_table(group, *tables)
+        if table.header[1:]:
+            blocks += [Text(group_title(group), kind="sub"), table]
+    return [Heading(3, heading), *blocks] if blocks else []
 
 
 def _planner_words(settings: dict[str, Any]) -> str:
-    """What the effective sample size and the solve times are of."""
-    search = dig(settings, "controller", "planner") or "mppi"
-    drawn, ahead = (
-        dig(settings, "controller", search, key) for key in ("num_samples", "horizon")
-    )
-    period = dig(settings, "vehicle", "dt")
-    text = "Effective samples: 1 / Σ w² of the weights that the planner gives its samples, median over all steps"
-    text += (
-        f"; it draws {short(drawn)} over {short(ahead)} steps"
-        if is_number(drawn) and is_number(ahead)
-        else ""
-    )
-    text += ". Control step: everything from observation to control for one car, compiled, on the machine that drove"
-    return text + (
-        f"; a new control is due every {short(1e3 * period)} ms."
-        if is_number(period)
-        else "."
-    )
+    """What the effective samples and the solve times are."""
+    planner = dig(settings, "controller", "planner") or "mppi"
+    options, dt = dig(settings, "controller", planner), dig(settings, "vehicle", "dt")
+    known = all(is_number(dig(options, key)) for key in ("num_samples", "horizon"))
+    due = text("driving.due", period_ms=1e3 * dt) if is_number(dt) else ""
+    drawn = text("driving.drawn", options) if known else ""
+    return text("driving.planner", drawn=drawn, due=due)
 
 
-def _violating(rows: list[list[dict[str, Any]]], place: Path) -> list[Block]:
-    """How often predictions left what is claimed about them, and Figure 2 where side forces were injected."""
+def _violations(groups: list[list[Row]]) -> list[Block]:
+    """How often predictions violate what is claimed, and what V0, V1 and V2 count."""
     blocks: list[Block] = []
-    measured = [
-        block
-        for block in rows
-        if any(is_number(dig(row, "violation", "segments")) for row in block)
-    ]
-    figures = (
-        f"figure2{suffix}"
-        for suffix in ["", *(f"_{count}" for count in range(2, len(rows) + 1))]
-    )
-    for block in measured:
-        blocks += [
-            Heading(3, f"Violations: {block_title(block)}"),
-            violation_table(block),
-        ]
-        pushed = disturbed(block)
-        if pushed:
-            blocks.append(picture(place, next(figures), _FIGURE2, violations, pushed))
-    return [*blocks, Text(violation_words(measured), kind="note")] if measured else []
+    records: list[Any] = []
+    for group in groups:
+        claims = [row.get("violation") for row in group]
+        if any(is_number(dig(claim, "segments")) for claim in claims):
+            heading = Heading(3, f"Violations: {group_title(group)}")
+            blocks += [heading, metric_table(group, "claims")]
+            records += claims
+    settings = {
+        key: next(filter(is_number, (dig(record, key) for record in records)), None)
+        for key in ("segments", "v1_level", "v2_threshold_m")
+    }
+    note = Text(text("driving.violations", settings), kind="note")
+    return [*blocks, note] if blocks else []
 
 
-_FIGURE2 = (
-    "Violations while a side force that nobody measures pushes the car: redrawn every second, evenly up to the value "
-    "on the axis to either side. Circles: conformal tubes, all at one level. Squares: the certified tube. Crosses: "
-    "steps at which the theorem fails. Dashed: the share that the level of the tubes allows. Right: the position "
-    "radius of each tube, mean over the horizon; a tube that is wide enough is never left."
-)
+def deviation(scene: Scene, seconds: float = 15.0) -> Figure:
+    """Lateral deviation in the first episode, above friction and wind."""
+    figure = style.canvas(5.2)
+    ratios = {"sharex": True, "height_ratios": [5, 1, 1]}
+    panels = top, friction, wind = figure.subplots(3, 1, **ratios)
+    length = max(values.shape[1] for values in scene.lateral.values())
+    end = min(seconds, length * scene.dt)
+    last = round(end / scene.dt)
+    top.axhline(0.0, color=style.AXIS, linewidth=0.8)
+    for system in style.ordered(scene.lateral):
+        values = scene.lateral[system][0, :last]
+        top.plot(scene.elapsed(values), values, **style.line(system))
+    top.set(ylabel="lateral deviation [m]", xlim=(0.0, end))
+    top.set_title(f"{scene.title}: deviation from the path")
+    low, high = top.get_ylim()
+    top.set_ylim(low, high + 0.2 * (high - low))
+    changes = [step for step in switches(scene.envs) if step < last]
+    for axes in panels:
+        style.mark(axes, changes, scene.dt)
+    if scene.envs is None:
+        friction.set_visible(False)
+        wind.set_visible(False)
+        top.set_xlabel("time [s]")
+        top.tick_params(labelbottom=True)
+    else:
+        _label_conditions(top, scene.envs[:last], changes, scene.dt)
+        style.conditions(friction, wind, scene.envs[:last], scene.dt)
+    wind.set(xlabel="time [s]")
+    figure.align_ylabels()
+    style.legend(figure, top)
+    return figure
+
+
+def _label_conditions(
+    axes: Any, envs: np.ndarray, changes: list[int], dt: float
+) -> None:
+    """Name friction and wind between two switches, if the names fit."""
+    edges = [0, *changes, len(envs)]
+    if len(edges) > 8:
+        return
+    look = {"ha": "center", "va": "top", "linespacing": 1.25}
+    for start, stop in pairwise(edges):
+        stretch = envs[start:stop]
+        gusts = np.ptp(stretch[:, 1]) >= 1e-3
+        friction, wind = style.env_text(*stretch[0]).split(", ")
+        words = f"{friction}\n{'gusts' if gusts else wind}"
+        look["transform"] = axes.get_xaxis_transform()
+        style.note(axes, (start + stop) / 2 * dt, 0.985, words, **look)
+
+
+def spread(scene: Scene) -> Figure:
+    """|deviation| over time: median, and 5–95 % band of the principal systems."""
+    figure = style.canvas(3.5)
+    axes = figure.subplots()
+    systems = style.ordered(scene.lateral)
+    banded = style.principal(systems)
+    for system in systems:
+        values = np.abs(scene.lateral[system])
+        values = np.where(np.isfinite(values), values, np.inf)
+        time = scene.elapsed(values[0])
+        levels = [0.05, 0.5, 0.95]
+        low, middle, high = np.quantile(values, levels, axis=0, method="nearest")
+        look = style.line(system)
+        axes.plot(time, middle, **look | {"linewidth": 0.75 * look["linewidth"]})
+        if system in banded:
+            fill = {"color": look["color"], "alpha": 0.2, "linewidth": 0}
+            axes.fill_between(time, low, np.minimum(high, 1e6), **fill)
+    style.mark(axes, switches(scene.envs), scene.dt, linewidth=0.5, alpha=0.5)
+    count = max(values.shape[0] for values in scene.lateral.values())
+    shown = "median and 5–95 % band of {} episodes" if count > 1 else "the one episode"
+    axes.set(xlabel="time [s]", ylabel="|lateral deviation| [m]", xlim=(0, time[-1]))
+    axes.set_title(f"{style.literal(scene.label)}: {shown.format(count)}")
+    axes.set_ylim(bottom=0.0)
+    style.legend(figure, axes)
+    return figure
+
+
+def steering(scene: Scene, seconds: float = 10.0) -> Figure:
+    """Steering commands around the hardest step, of at most four systems."""
+    figure = style.canvas(3.3)
+    axes = figure.subplots()
+    steps = max(len(values) for values in scene.controls.values())
+    span = min(round(seconds / scene.dt), steps)
+    start = int(np.clip(hardest_step(scene) - span // 2, 0, steps - span))
+    start -= start % max(1, round(1.0 / scene.dt))
+    chosen = style.ordered if len(scene.controls) <= 4 else style.principal
+    for system in chosen(scene.controls):
+        values = scene.controls[system][start : start + span, 0]
+        time = scene.dt * (start + np.arange(len(values)))
+        axes.plot(time, values, drawstyle="steps-post", **style.line(system))
+    inside = [step for step in switches(scene.envs) if start < step < start + span]
+    style.mark(axes, inside, scene.dt)
+    axes.set(xlabel="time [s]", ylabel="steering command [rad]")
+    axes.set_xlim(start * scene.dt, (start + span) * scene.dt)
+    axes.set_title(f"{scene.title}: steering around the hardest moment")
+    style.legend(figure, axes)
+    return figure

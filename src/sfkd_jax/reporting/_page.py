@@ -1,113 +1,86 @@
-"""The report of a run: reads what lies in its directory and writes page, Markdown and figures."""
+"""The page of a run: reads its directory and writes HTML, Markdown and figures."""
 
 from __future__ import annotations
 
+from collections.abc import Callable
+from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeAlias
 
-from sfkd_jax.artefacts import (
-    ArtefactError,
-    read_jsonl,
-    print_message,
-    as_artefact_error,
-    write_bytes,
-    writing,
-)
-from sfkd_jax.reporting import _sections as sections
-from sfkd_jax.reporting._blocks import (
-    Block,
-    Heading,
-    Picture,
-    Text,
-    to_html,
-    to_markdown,
-)
-from sfkd_jax.reporting._corridor_words import corridor
+from sfkd_jax.artefacts import ArtefactError, as_artefact_error, write_bytes, writing
+from sfkd_jax.evaluation.formats import plain
+from sfkd_jax.evaluation.metrics import Row
+from sfkd_jax.reporting._certificate import certified
 from sfkd_jax.reporting._driving import driving
-from sfkd_jax.reporting._files import about, read
-from sfkd_jax.reporting._numbers import dig, plain
-from sfkd_jax.reporting._style import label
-from sfkd_jax.reporting._tables import blocks_of
-from sfkd_jax.reporting._words import command, headline, model_of, summary
+from sfkd_jax.reporting._model import predicting, training
+from sfkd_jax.reporting._summary import command, provenance, summary
+from sfkd_jax.reporting.blocks import Block, Heading, Picture, to_html, to_markdown
+from sfkd_jax.reporting.corridor import corridor
+from sfkd_jax.reporting.run import Run, read_optional, read_run
+from sfkd_jax.reporting.style import label
+
+Studies: TypeAlias = Callable[[list[list[Row]], Path], list[Block]]
 
 
-def write_report(run: Path) -> dict[str, Any]:
-    """Write `run/report/`: `index.html` (one self-contained page), `report.md` and `figures/*.png`.
+def write_report(run_dir: Path, *, studies: Studies | None = None) -> dict[str, Any]:
+    """Write `run_dir/report/`: index.html, report.md and figures/*.png.
 
     Reads policy.json, metrics.jsonl, open_loop.json, certificate.json, results.json and
-    episodes.npz of `run` and recomputes none of their numbers; the same inputs give the
+    episodes.npz of a run and recomputes none of their numbers; the same inputs give the
     same bytes.
 
     Args:
-        run: directory of a run. All but policy.json may be missing; the page names the
+        run_dir: of a run. All but policy.json may be missing; the page names the
             command that makes it.
+        studies: adds what studies say about groups of comparable rows; gets the groups
+            and the folder of the figures.
 
     Returns:
         `report`: path of the page. `figures`: paths of the figures, in the order of the
         page.
 
     Raises:
-        ArtefactError: no policy.json; a file that is not JSON, or holds what no page
-            can be made of; or the disk refuses the page.
+        ArtefactError: no policy.json; a file that is not JSON, or whose content does
+            not fit on a page; or the disk refuses the page.
     """
-    with writing(run / "report"):
-        return _write(run)
+    with writing(run_dir / "report"):
+        return _write(run_dir, studies)
 
 
-def _write(run: Path) -> dict[str, Any]:
-    """`write_report`, errors as they come."""
-    policy = read(run / "policy.json")
+def _write(directory: Path, studies: Studies | None) -> dict[str, Any]:
+    """`write_report`, without conversion of errors of the disk."""
+    policy = read_optional(directory / "policy.json")
     if policy is None:
-        raise ArtefactError(
-            f"{run / 'policy.json'} is missing: {command('train', {})} makes a run"
-        )
-    settings = policy.get("settings") or policy.get("config") or {}
-    place = run / "report" / "figures"
-    place.mkdir(parents=True, exist_ok=True)
-    for stale in place.glob("*.png"):
+        makes = f"{command('train', {})} makes a run"
+        raise ArtefactError(f"{directory / 'policy.json'} is missing: {makes}")
+    run = read_run(directory, policy)
+    run.figures.mkdir(parents=True, exist_ok=True)
+    for stale in run.figures.glob("*.png"):
         stale.unlink()
-    log, errors = run / "metrics.jsonl", read(run / "open_loop.json")
-    metrics = read_jsonl(log, damaged=print_message) if log.exists() else []
-    certificate = about(policy, read(run / "certificate.json"))
-    results = read(run / "results.json") or {}
-    with as_artefact_error(run / "policy.json", ValueError):
-        name, seed = (
-            plain(settings.get("experiment") or "unnamed run"),
-            plain(settings.get("seed")),
-        )
-        title = f"{label(model_of(settings))} on {name}, seed {seed}"
-        made = sections.provenance(
-            settings,
-            policy.get("versions") or results.get("versions"),
-            dig(results, "config", "command"),
-        )
-    with as_artefact_error(run / "results.json", ValueError):
-        rows = blocks_of(results.get("rows") or [])
-        head = headline(rows, settings)
-        driven = driving(run, rows, settings, place)
-    with as_artefact_error(run / "open_loop.json", ValueError):
-        predicted = sections.predicting(errors, settings, place)
-    with as_artefact_error(log, ValueError):
-        trained = sections.training(metrics, settings, place)
-    with as_artefact_error(run / "certificate.json", ValueError):
-        lead = Text(summary(settings, head, certificate, metrics), kind="lead")
-        tiles = sections.tiles(settings, head, errors, certificate)
-        certified = corridor(run, certificate, settings, place)
-        certified += sections.certified(run, certificate, errors, settings, place)
-    page: list[Block] = [
-        Heading(1, title),
-        lead,
-        *tiles,
-        *driven,
-        *certified,
-        *predicted,
-        *trained,
-        *made,
-    ]
-    report = run / "report" / "index.html"
-    write_bytes(report, to_html(title, page).encode())
-    write_bytes(report.with_name("report.md"), to_markdown(page).encode())
-    return {
-        "report": str(report),
-        "figures": [str(block.path) for block in page if isinstance(block, Picture)],
-    }
+    with as_artefact_error(directory / "policy.json", ValueError):
+        experiment = plain(run.settings.get("experiment") or "unnamed run")
+        seed = plain(run.settings.get("seed"))
+        title = f"{label(run.system)} on {experiment}, seed {seed}"
+        foot = provenance(run)
+    body: list[Block] = []
+    for section, name in (
+        (driving, "results.json"),
+        (partial(_studied, studies), "results.json"),
+        (corridor, "certificate.json"),
+        (certified, "certificate.json"),
+        (predicting, "open_loop.json"),
+        (training, "metrics.jsonl"),
+    ):
+        with as_artefact_error(directory / name, ValueError):
+            body += section(run)
+    with as_artefact_error(directory / "certificate.json", ValueError):
+        page = [Heading(1, title), *summary(run), *body, *foot]
+    path = directory / "report" / "index.html"
+    write_bytes(path, to_html(title, page).encode())
+    write_bytes(path.with_name("report.md"), to_markdown(page).encode())
+    figures = [str(block.path) for block in page if isinstance(block, Picture)]
+    return {"report": str(path), "figures": figures}
+
+
+def _studied(studies: Studies | None, run: Run) -> list[Block]:
+    return studies(run.groups, run.figures) if studies else []

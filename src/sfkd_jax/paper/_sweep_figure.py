@@ -10,9 +10,9 @@ from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter
 
-from sfkd_jax.reporting._compared import Record, curves, scenario_of, steps_of
-from sfkd_jax.reporting._numbers import DASH, dig, interval, is_number
-from sfkd_jax.reporting._style import (
+from sfkd_jax.evaluation.formats import DASH, dig, interval, is_number
+from sfkd_jax.paper._sweep_records import Record, curves, scenario_of, steps_of
+from sfkd_jax.reporting.style import (
     ACCENT,
     MUTED,
     SECOND,

@@ -7,8 +7,25 @@ from pathlib import Path
 from typing import Any
 
 from sfkd_jax.artefacts import write_bytes, write_json, writing
-from sfkd_jax.reporting._benchmark_tables import percent
-from sfkd_jax.reporting._blocks import (
+from sfkd_jax.evaluation.formats import (
+    dig,
+    mean_std,
+    number,
+    percent,
+    plain,
+    short,
+    upper,
+)
+from sfkd_jax.paper._sweep_figure import tradeoff
+from sfkd_jax.paper._sweep_records import (
+    Record,
+    curves,
+    records_of,
+    scenario_of,
+    steps_of,
+)
+from sfkd_jax.paper._sweep_text import paragraph
+from sfkd_jax.reporting.blocks import (
     Block,
     Code,
     Heading,
@@ -18,17 +35,7 @@ from sfkd_jax.reporting._blocks import (
     to_html,
     to_markdown,
 )
-from sfkd_jax.reporting._compared import (
-    Record,
-    curves,
-    records_of,
-    scenario_of,
-    steps_of,
-)
-from sfkd_jax.reporting._comparison_words import paragraph
-from sfkd_jax.reporting._numbers import dig, mean_std, number, plain, short, upper
-from sfkd_jax.reporting._style import save, scenario_label
-from sfkd_jax.reporting._tradeoff import tradeoff
+from sfkd_jax.reporting.style import save, scenario_label
 
 
 def write_comparison(root: Path, pattern: str, name: str) -> dict[str, Any]:

@@ -7,11 +7,10 @@ from collections import Counter
 from pathlib import Path
 from typing import Any, TypeAlias
 
-from sfkd_jax.artefacts import understood
-from sfkd_jax.reporting._files import about, read
-from sfkd_jax.reporting._numbers import dig, is_number
-from sfkd_jax.reporting._tables import blocks_of
-from sfkd_jax.reporting._words import holds, model_of, row_of
+from sfkd_jax.artefacts import as_artefact_error
+from sfkd_jax.evaluation.formats import dig, is_number
+from sfkd_jax.reporting.rows import groups_of, model_of, row_of
+from sfkd_jax.reporting.run import holds, read_certificate, read_optional
 
 Record: TypeAlias = dict[str, Any]
 
@@ -83,10 +82,13 @@ def steps_of(records: list[Record], key: str) -> str:
 
 
 def _record(run: Path, place: str) -> Record:
-    settings, errors = read(run / "settings.json") or {}, read(run / "open_loop.json")
-    certificate = about(read(run / "policy.json") or {}, read(run / "certificate.json"))
-    rows = (read(run / "results.json") or {}).get("rows") or []
-    with understood(run / "settings.json", ValueError):
+    settings, errors = (
+        read_optional(run / "settings.json") or {},
+        read_optional(run / "open_loop.json"),
+    )
+    certificate = read_certificate(run, read_optional(run / "policy.json") or {})
+    rows = (read_optional(run / "results.json") or {}).get("rows") or []
+    with as_artefact_error(run / "settings.json", ValueError):
         model, system = settings.get("model"), model_of(settings)
         asked = {
             "rho": dig(model, "rho"),
@@ -97,11 +99,11 @@ def _record(run: Path, place: str) -> Record:
             "vehicle": dig(settings, "vehicle", "name"),
             "inner_loop": dig(settings, "vehicle", "inner_loop"),
         }
-    with understood(run / "certificate.json", ValueError):
+    with as_artefact_error(run / "certificate.json", ValueError):
         certified = _certified(certificate)
-    with understood(run / "open_loop.json", ValueError):
+    with as_artefact_error(run / "open_loop.json", ValueError):
         predicting = _predicting(errors)
-    with understood(run / "results.json", ValueError):
+    with as_artefact_error(run / "results.json", ValueError):
         driving = _driving(rows, system)
     found = {"run": place, "system": system, **vehicle, **asked, **certified}
     return found | {"open_loop": predicting, "closed_loop": driving}
@@ -173,7 +175,7 @@ def _predicting(errors: dict[str, Any] | None) -> Record:
 def _driving(rows: list[dict[str, Any]], system: str) -> dict[str, Record]:
     """The system's own row of each scenario; the one with feedback sampling where there are several."""
     found: dict[str, Record] = {}
-    for block in blocks_of(rows):
+    for block in groups_of(rows):
         own = row_of(block, system)
         if own:
             found.setdefault(str(own.get("scenario")), _driven(own))

@@ -9,16 +9,18 @@ import numpy as np
 from jaxtyping import Float
 
 from sfkd_jax.artefacts import ArtefactError, exists, read_arrays
-from sfkd_jax.reporting._benchmark_rows import Contest, Line
+from sfkd_jax.evaluation.metrics import Row
+from sfkd_jax.reporting.rows import name_of
+from sfkd_jax.reporting.style import family
 
 KIND = "cell"
 
 
 class Drive(NamedTuple):
-    """The first episode of a line.
+    """The first episode of a row.
 
     Attributes:
-        line: who drove.
+        row: of results.json.
         dt: sampling period [s].
         lateral: signed deviation of x_1 … x_T [m], left positive.
         states: x_0 … x_T, beginning with x, y, yaw.
@@ -26,27 +28,33 @@ class Drive(NamedTuple):
         path: x, y, yaw, curvature of its points.
     """
 
-    line: Line
+    row: Row
     dt: float
     lateral: Float[np.ndarray, " time"]
     states: Float[np.ndarray, "time_plus_1 state"] | None
     envs: Float[np.ndarray, "time 2"] | None
     path: Float[np.ndarray, "point column"] | None
 
+    @property
+    def name(self) -> str:
+        """Name of the row."""
+        return name_of(self.row)
 
-def drives(
-    directory: Path, contest: Contest, scenario: str
-) -> tuple[list[Drive], list[str]]:
-    """What was driven, and the names of those whose arrays are missing or hold no finite deviation."""
-    lines = [line for line in contest.lines if scenario in line.rows]
-    found = [_drive(directory, line, scenario) for line in lines]
-    return [one for one in found if one], [
-        line.name for line, one in zip(lines, found, strict=True) if one is None
-    ]
+    @property
+    def system(self) -> str:
+        """Name of the system, without its coordinates."""
+        return family(str(self.row.get("system")))
 
 
-def _drive(directory: Path, line: Line, scenario: str) -> Drive | None:
-    file = _file(directory, line, scenario)
+def drives(directory: Path, rows: list[Row]) -> tuple[list[Drive], list[str]]:
+    """Read the first episode of rows, and name the rows without a usable episode."""
+    read = [_drive(directory, row) for row in rows]
+    missing = [name_of(row) for row, one in zip(rows, read, strict=True) if one is None]
+    return [one for one in read if one], missing
+
+
+def _drive(directory: Path, row: Row) -> Drive | None:
+    file = _file(directory, row)
     arrays = read_arrays(file, kind=KIND)[0] if exists(file) else {}
     first = {
         name: np.asarray(values[0], dtype=float)
@@ -58,27 +66,19 @@ def _drive(directory: Path, line: Line, scenario: str) -> Drive | None:
         return None
     dt = float(arrays.get("dt", np.asarray(0.1)))
     return Drive(
-        line, dt, lateral, *(first.get(name) for name in ("states", "envs", "path"))
+        row, dt, lateral, *(first.get(name) for name in ("states", "envs", "path"))
     )
 
 
-def _file(directory: Path, line: Line, scenario: str) -> Path:
-    """Where a row says that its arrays lie, else where they lie by its identity."""
-    row = line.rows[scenario]
+def _file(directory: Path, row: Row) -> Path:
+    """The arrays of a row: as the row says, else by its identity."""
     if isinstance(row.get("arrays"), str):
-        if (
-            PurePath(row["arrays"]).is_absolute()
-            or ".." in PurePath(row["arrays"]).parts
-        ):
+        path = PurePath(row["arrays"])
+        if path.is_absolute() or ".." in path.parts:
             raise ArtefactError(
                 f"{directory / 'results.json'}: arrays of a row lie outside this folder"
             )
         return directory / row["arrays"]
-    place = (
-        directory
-        / "cells"
-        / str(row.get("vehicle"))
-        / scenario
-        / str(row.get("sampling") or "qp")
-    )
-    return place / f"{line.system}-{line.env}.npz"
+    sampling = str(row.get("sampling") or "qp")
+    cells = directory / "cells" / str(row.get("vehicle")) / str(row.get("scenario"))
+    return cells / sampling / f"{family(str(row.get('system')))}-{row.get('env')}.npz"

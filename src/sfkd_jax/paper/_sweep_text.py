@@ -5,8 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from typing import Any
 
-from sfkd_jax.reporting._compared import Record, curves, scenario_of, steps_of
-from sfkd_jax.reporting._numbers import (
+from sfkd_jax.evaluation.formats import (
     DASH,
     dig,
     interval,
@@ -16,8 +15,9 @@ from sfkd_jax.reporting._numbers import (
     short,
     upper,
 )
-from sfkd_jax.reporting._style import scenario_label
-from sfkd_jax.reporting._tradeoff import title_of
+from sfkd_jax.paper._sweep_figure import title_of
+from sfkd_jax.paper._sweep_records import Record, curves, scenario_of, steps_of
+from sfkd_jax.reporting.style import scenario_label
 
 
 def paragraph(records: list[Record]) -> str:

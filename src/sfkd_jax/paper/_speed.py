@@ -8,7 +8,7 @@ from typing import Any
 
 from matplotlib.figure import Figure
 
-from sfkd_jax.reporting._style import MUTED, PLATE, canvas, legend, literal, save
+from sfkd_jax.reporting.style import MUTED, PLATE, canvas, legend, literal, save
 
 _COLOURS = ("#c2410c", "#e8a33d", "#009e73", "#56b4e9", "#0b57b0")
 _MARKS = "osD^v"

@@ -1,4 +1,4 @@
-"""A certified corridor as ink: around drives of a page, and around hostile planners with their shield and without."""
+"""Figure of hostile planners in a certified corridor, with the shield and without it."""
 
 from __future__ import annotations
 
@@ -10,12 +10,18 @@ from jaxtyping import Float
 from matplotlib.figure import Figure
 from matplotlib.ticker import MultipleLocator
 
-from sfkd_jax.reporting._conditions import conditions, mark
-from sfkd_jax.reporting._numbers import number
-from sfkd_jax.reporting._scene import Scene, switches
-from sfkd_jax.reporting._style import ACCENT, LEAVES, PLATE, canvas, literal, save
+from sfkd_jax.reporting.corridor import band
+from sfkd_jax.reporting.scene import switches
+from sfkd_jax.reporting.style import (
+    ACCENT,
+    DEPARTED,
+    PLATE,
+    canvas,
+    conditions,
+    mark,
+    save,
+)
 
-_INNER, _OUTER = "#cfe0f5", "#e9f1fb"
 _LANE = "#30363d"
 _COLOURS = ("#0b57b0", "#009e73", "#8b5fbf", "#b8860b", "#56b4e9", "#6b7280")
 _VIEW = 2.2
@@ -24,20 +30,14 @@ reaches.
 """
 
 
-class Corridor(NamedTuple):
-    """Half widths [m]: kept by the shield, and the tube around the copy."""
-
-    width: float
-    tube: float
-
-
 class Hostile(NamedTuple):
     """Drives of one road.
 
     Attributes:
         dt: sampling period [s].
         envs: friction and wind at every step.
-        corridor: certified.
+        width: half of the corridor of the nominal copy [m].
+        tube: half width of the tube around that copy [m].
         lane: its half width, less the car's [m].
         kept: planner -> e_y with the shield [m], (drive, time).
         onset: step from which on each drive of the next two is hostile.
@@ -47,7 +47,8 @@ class Hostile(NamedTuple):
 
     dt: float
     envs: Float[np.ndarray, "time 2"]
-    corridor: Corridor
+    width: float
+    tube: float
     lane: float
     kept: dict[str, Float[np.ndarray, "drive time"]]
     onset: Float[np.ndarray, " drive"]
@@ -56,36 +57,9 @@ class Hostile(NamedTuple):
     name: str
 
 
-def band(axes: Any, corridor: Corridor, *, named: bool) -> None:
-    """Both parts of a corridor along the whole of an axis, and its edge."""
-    edge = corridor.width + corridor.tube
-    axes.axhspan(-edge, edge, color=_OUTER, linewidth=0, zorder=0.1)
-    axes.axhspan(-corridor.width, corridor.width, color=_INNER, linewidth=0, zorder=0.2)
-    for side in (-edge, edge):
-        axes.axhline(side, color=ACCENT, linewidth=1.2, zorder=2)
-    if named:
-        words = {
-            "fontsize": 8.5,
-            "color": ACCENT,
-            "va": "bottom",
-            "ha": "right",
-            "zorder": 6,
-            "bbox": PLATE,
-        }
-        for height, name in ((edge, "W + tube"), (corridor.width, "W")):
-            where = {"transform": axes.get_yaxis_transform()}
-            axes.text(
-                0.995,
-                height + 0.03 * edge,
-                f"{name} = {number(height)} m",
-                **where,
-                **words,
-            )
-
-
-def draw_hostile(path: Path, *, width: float, tube: float, **drives: Any) -> Path:
-    """Write the figure of hostile planners as a PNG; width, tube: of the corridor [m], the rest as in `Hostile`."""
-    return save(path, hostile, Hostile(corridor=Corridor(width, tube), **drives))
+def draw_hostile(path: Path, **drives: Any) -> Path:
+    """Write the figure of hostile planners as a PNG; `drives` are those of `Hostile`."""
+    return save(path, hostile, Hostile(**drives))
 
 
 def hostile(drives: Hostile) -> Figure:
@@ -94,24 +68,24 @@ def hostile(drives: Hostile) -> Figure:
     inside, lost, friction, wind = figure.subplots(
         4, 1, sharex=True, height_ratios=[5, 4.2, 1, 1]
     )
-    band(inside, drives.corridor, named=True)
+    band(inside, drives.width, drives.tube)
     colours = dict(zip(drives.kept, _COLOURS, strict=False))
     for name, lateral in drives.kept.items():
         for row, values in enumerate(lateral):
             label = f"_{name}" if row else name
             inside.plot(
-                _time(values, drives.dt),
+                _elapsed(values, drives.dt),
                 values,
                 color=colours[name],
                 linewidth=0.7,
                 label=label,
                 zorder=3,
             )
-    edge = drives.corridor.width + drives.corridor.tube
+    edge = drives.width + drives.tube
     count = sum(map(len, drives.kept.values()))
     inside.set(ylim=(-1.25 * edge, 1.25 * edge), ylabel="lateral deviation [m]")
     inside.set_title(f"{count} drives with the shield, all planners hostile", pad=20)
-    band(lost, drives.corridor, named=False)
+    band(lost, drives.width, drives.tube, named=False)
     reach = _VIEW * drives.lane
     for side in (-drives.lane, drives.lane):
         lost.axhline(side, color=_LANE, linewidth=1.2, linestyle=(0, (6, 2)), zorder=2)
@@ -134,11 +108,11 @@ def hostile(drives: Hostile) -> Figure:
     ):
         begin, outside = int(began), np.flatnonzero(~(np.abs(free) < 1.2 * reach))
         end = int(outside[0]) + 1 if len(outside) else len(free)
-        time, quiet = _time(free, drives.dt), "_" if row else ""
+        time, quiet = _elapsed(free, drives.dt), "_" if row else ""
         lost.plot(
             time[begin:end],
             free[begin:end],
-            color=LEAVES,
+            color=DEPARTED,
             linewidth=1.0,
             label=f"{quiet}without the shield",
         )
@@ -165,35 +139,6 @@ def hostile(drives: Hostile) -> Figure:
     return figure
 
 
-def around_drives(scene: Scene, system: str, corridor: Corridor) -> Figure:
-    """e_y of every episode of a system in its corridor."""
-    figure = canvas(3.4)
-    axes = figure.subplots()
-    band(axes, corridor, named=True)
-    for values in scene.lateral[system]:
-        axes.plot(_time(values, scene.dt), values, color=ACCENT, linewidth=0.6)
-    values = np.abs(scene.lateral[system])
-    farthest = float(np.max(values, where=np.isfinite(values), initial=0.0))
-    reach = 1.25 * max(corridor.width + corridor.tube, farthest)
-    axes.set(
-        xlabel="time [s]",
-        ylabel="lateral deviation [m]",
-        ylim=(-reach, reach),
-        xlim=(0.0, scene.dt * values.shape[1]),
-    )
-    count = "the one episode" if len(values) == 1 else f"{len(values)} episodes"
-    axes.set_title(
-        f"{literal(scene.label)}: {count}, at most {number(farthest)} m from the path"
-    )
-    mark(axes, switches(scene.envs) if len(values) == 1 else (), scene.dt)
-    return figure
-
-
-def _time(values: np.ndarray, dt: float) -> np.ndarray:
-    """Of e_y after every step."""
-    return dt * np.arange(1, len(values) + 1)
-
-
 def _named(axes: Any) -> None:
     """A legend of one row between a panel and its title."""
     lines, names = axes.get_legend_handles_labels()
@@ -214,3 +159,8 @@ def _named(axes: Any) -> None:
     )
     for handle in found.get_lines():
         handle.set_linewidth(1.8)
+
+
+def _elapsed(values: np.ndarray, dt: float) -> np.ndarray:
+    """Time of the states after every step [s]."""
+    return dt * np.arange(1, len(values) + 1)
