@@ -1,7 +1,7 @@
-"""Foreign interfaces: our vehicles as brax and gymnasium environments, brax systems and CommonRoad's cars as plants.
+"""Adapters to brax, gymnasium and CommonRoad.
 
-Nothing here is loaded before it is asked for by name, and another project's package
-only by what needs it.
+Our vehicles are environments of brax and gymnasium; brax systems and CommonRoad's cars
+are plants. Each adapter, and the package it needs, is imported on first use.
 """
 
 from importlib import import_module
@@ -44,7 +44,7 @@ _LAZY = {
 
 
 def __getattr__(name: str) -> Any:
-    """Load an adapter on first use, or say which extra it needs."""
+    """Import an adapter on first use; without its package, name the extra."""
     if name not in _LAZY:
         raise AttributeError(f"module 'sfkd_jax.adapters' has no attribute {name!r}")
     file, extra = _LAZY[name]

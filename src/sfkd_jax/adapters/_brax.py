@@ -17,18 +17,18 @@ NAME = "sfkd_vehicle"
 
 
 def register_brax(name: str = NAME) -> None:
-    """Make `brax.envs.get_environment(name, …)` and `brax.envs.create(name, …)` build a `BraxVehicle`."""
+    """Register `BraxVehicle` under a name that `brax.envs.create` knows."""
     envs.register_environment(name, BraxVehicle)
 
 
 class BraxVehicle(Env):
-    """Following a path, as `brax.envs.Env`; settings, observation, action and reward are those of `tracking_task`.
+    """Path following as `brax.envs.Env`, with the settings of `tracking_task`.
 
-    A new road comes with every `reset`. It lies in `info["road"]`, so that the
-    automatic reset of brax, which goes back to the state an episode began with, drives
-    the same road once more. `done` is 1 where the car left the lane or the road ended;
-    `info["time_out"]` is 1 for the latter only, as PPO's `bootstrap_on_timeout`
-    expects.
+    Observation, action and reward are those of `tracking_task`. Every `reset` draws a
+    new road and puts it into `info["road"]`; the automatic reset of brax, which
+    restores the first state of an episode, therefore repeats the road. `done` is 1 if
+    the car left the lane or the road ended; `info["time_out"]` is 1 in the second case
+    only, as PPO's `bootstrap_on_timeout` expects.
 
     Raises:
         ValueError: as `tracking_task`.
@@ -38,7 +38,7 @@ class BraxVehicle(Env):
         self._task = tracking_task(**settings)
 
     def reset(self, rng: jax.Array) -> State:
-        """The start of an episode on a new road; `rng` may be a typed key or, as brax has it, two integers."""
+        """Start an episode on a new road; `rng` is a typed key or two integers."""
         typed = jnp.issubdtype(rng.dtype, jax.dtypes.prng_key)
         road, moment = self._task.reset(rng if typed else jax.random.wrap_key_data(rng))
         zero = jnp.zeros(())
@@ -49,7 +49,7 @@ class BraxVehicle(Env):
         )  # pyright: ignore
 
     def step(self, state: State, action: jax.Array) -> State:
-        """One sampling period; entries that wrappers put into `metrics` and `info` are kept."""
+        """Simulate one sampling period; keep other entries of `metrics` and `info`."""
         road = state.info["road"]
         moment, outcome = self._task.step(road, state.pipeline_state, action)  # pyright: ignore
         done, time_out = (
@@ -66,11 +66,11 @@ class BraxVehicle(Env):
         )
 
     def situation(self, state: State) -> tuple[VehicleState, Environment, Reference]:
-        """State, environment and reference in the world's frame: what `Controller.act` takes."""
+        """Return state, environment and reference, as `Controller.act` takes them."""
         return self._task.situation(state.info["road"], state.pipeline_state)  # pyright: ignore
 
     def action(self, control: Control) -> Control:
-        """The action that a control in physical units is."""
+        """Return the action of a control in physical units."""
         return self._task.action(control)
 
     @property
@@ -95,5 +95,5 @@ class BraxVehicle(Env):
 
     @property
     def backend(self) -> str:
-        """Whose physics: not brax's."""
+        """Name of the physics, which is not brax's."""
         return "sfkd_jax"

@@ -1,4 +1,4 @@
-"""A brax system as a plant of this project: one step from (state, control, e), and trajectories of it."""
+"""A brax system as a plant, and trajectories of it."""
 
 from __future__ import annotations
 
@@ -19,22 +19,22 @@ SCALED = {
     "damping": ("dof.damping",),
     "motor": ("actuator.gear",),
 }
-"""What an entry of e may scale (viscous friction is that of all joints), and where it
-stands in a system.
+"""Parameters that entries of e may scale, and their fields in a system; damping is the
+viscous friction of all joints.
 """
 
 
 class BraxPlant(NamedTuple):
-    """A brax system whose physical parameters are the environment e; x = (0, 0, 0, q, q̇).
+    """A brax system with physical parameters scaled by e; x = (0, 0, 0, q, q̇).
 
-    The system has no pose in the plane, so the pose that leads every state of this
-    project is 0 and stays 0.
+    The system has no pose in the plane: the first three entries of its state are 0.
 
     Attributes:
         dt: sampling period [s].
         state_names: pose first.
-        control_low, control_high: limits of the motors.
-        parameters: what the entries of e scale; 1 is the system as it is.
+        control_low: lower limits of the motors.
+        control_high: upper limits of the motors.
+        parameters: that the entries of e scale; 1 leaves the system unchanged.
         step: (x, u, e) -> x one sampling period later, u in the units of the motors.
         start: key -> x at the start of an episode of the environment.
     """
@@ -49,17 +49,17 @@ class BraxPlant(NamedTuple):
 
 
 def brax_plant(env: Env, *, parameters: tuple[str, ...] = ("gravity",)) -> BraxPlant:
-    """x⁺ = (0, q⁺, q̇⁺), (q⁺, q̇⁺) what the environment's own physics makes of (q, q̇, u) with parameters scaled by e.
+    """Return x⁺ = (0, q⁺, q̇⁺) with (q⁺, q̇⁺) from brax's own physics scaled by e.
 
     Args:
         env: from `brax.envs.get_environment(name, backend="generalized")`; wrappers are
-            taken off.
-        parameters: what the entries of e scale, of "gravity", "damping", "motor".
+            removed.
+        parameters: that the entries of e scale, of "gravity", "damping", "motor".
 
     Raises:
         ValueError: an unknown or repeated parameter, an environment without a brax
-            system, or a backend other than "generalized": only there is (q, q̇) the
-            whole state.
+            system, or a backend other than "generalized", where (q, q̇) is the whole
+            state.
     """
     inner = env.unwrapped
     _check(inner, parameters)
@@ -68,13 +68,13 @@ def brax_plant(env: Env, *, parameters: tuple[str, ...] = ("gravity",)) -> BraxP
     frames = round(float(inner.dt) / float(system.opt.timestep))
 
     def step(state: State, control: Control, env: Environment) -> State:
-        places = [
-            (place, factor)
+        factors = {
+            field: factor
             for name, factor in zip(parameters, env, strict=True)
-            for place in SCALED[name]
-        ]
+            for field in SCALED[name]
+        }
         changed: Any = system.tree_replace(
-            {place: factor * attrgetter(place)(system) for place, factor in places}
+            {f: factor * attrgetter(f)(system) for f, factor in factors.items()}
         )
         body = state[BODY]
         moment = pipeline.init(changed, body[:coordinates], body[coordinates:])
@@ -114,29 +114,32 @@ def collect(
     excitation: float = 0.3,
     memory: float = 0.85,
 ) -> Trajectory:
-    """Trajectories under random controls, each with its own e, drawn evenly from a box.
+    """Collect trajectories under random controls, each with its own e from a box.
 
     u_k = clip(centre + half range · n_k), n_{k+1} = ϱ n_k + √(1 − ϱ²) σ w_k, w white
     and n_0 = σ w.
 
     Args:
-        plant: whose.
+        plant: to simulate.
         key: consumed.
-        trajectories, steps: how many, how long.
-        env_low, env_high: box of e, one entry a parameter.
-        excitation: σ, spread of the controls in shares of half their range.
+        trajectories: their number.
+        steps: of a trajectory.
+        env_low: lower corner of the box of e, one entry per parameter.
+        env_high: upper corner of the box.
+        excitation: σ, spread of the controls relative to half their range.
         memory: ϱ.
 
     Returns:
         A batch of trajectories, states (trajectory, steps + 1, state).
 
     Raises:
-        ValueError: a box whose corners do not have one entry a parameter.
+        ValueError: a box whose corners do not have one entry per parameter.
     """
     for name, corner in (("env_low", env_low), ("env_high", env_high)):
         if len(corner) != len(plant.parameters):
             raise ValueError(
-                f"{name} must have an entry for each of {', '.join(plant.parameters)}, got {corner}"
+                f"{name} must have an entry for each of "
+                f"{', '.join(plant.parameters)}, got {corner}"
             )
     low, high = jnp.asarray(plant.control_low), jnp.asarray(plant.control_high)
 
@@ -182,15 +185,17 @@ def _state(moment: Any) -> State:
 
 
 def _check(env: Env, parameters: tuple[str, ...]) -> None:
-    """Refuse what has no such step."""
+    """Check that an environment has such a step."""
     if not isinstance(env, PipelineEnv):
         raise ValueError(f"{type(env).__name__} has no brax system to step")
     if env.backend != "generalized":
         raise ValueError(
-            f'backend must be "generalized", where (q, q̇) is the whole state, got {env.backend!r}'
+            'backend must be "generalized", where (q, q̇) is the whole state, '
+            f"got {env.backend!r}"
         )
     unknown = [name for name in parameters if name not in SCALED]
     if unknown or len(set(parameters)) != len(parameters):
         raise ValueError(
-            f"parameters must be different ones of {', '.join(SCALED)}, got {parameters}"
+            f"parameters must be different ones of {', '.join(SCALED)}, "
+            f"got {parameters}"
         )

@@ -1,10 +1,10 @@
-"""CommonRoad's cars as plants of this project: their equations run on the host, in double precision."""
+"""CommonRoad's cars as plants; their equations run on the host in double precision."""
 
 from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from typing import Any, TypeAlias
+from typing import Any, NamedTuple, TypeAlias
 
 import jax
 import jax.numpy as jnp
@@ -16,6 +16,7 @@ from sfkd_jax.adapters._commonroad_equations import (
     CARS,
     MODELS,
     OBSERVED,
+    Equations,
     Numbers,
     car_numbered,
     from_commonroad,
@@ -28,11 +29,12 @@ from sfkd_jax.vehicle import Vehicle, dynamic
 
 SLOWEST = 0.5  # m/s; the multi-body car divides by the speed over ground at every wheel
 ACCURACY: dict[str, Any] = {"method": "RK23", "rtol": 1e-5, "atol": 1e-7}
-"""Explicit, though slip settles within I_w v / (R_w² K_x), 1 ms at 10 m/s: implicit
-steps fail at a locked wheel.
+"""An explicit method, although slip settles within I_w v / (R_w² K_x), 1 ms at 10 m/s:
+implicit steps fail at a locked wheel.
 """
 
 HostStep: TypeAlias = Callable[[Numbers, Numbers, Numbers], list[float]]
+Rates: TypeAlias = Callable[[list[float]], list[float]]
 
 
 def commonroad_vehicle(
@@ -44,21 +46,24 @@ def commonroad_vehicle(
     wind_force: float = 10.0,
     wind_lever: float = 0.4,
 ) -> Vehicle:
-    """A car of Althoff and Würsching, "CommonRoad: Vehicle Models", as a plant that this project drives.
+    """Return a car of CommonRoad as a plant.
 
     x = (p_x, p_y, yaw, v, v_y, yaw rate, δ | hidden), the first seven as in
-    `vehicle.dynamic`, p at the centre of mass. Hidden are wheel speeds, and of the
-    multi-body car also roll, pitch, heave and the axles. They are told relative to
-    freely rolling wheels and springs at rest, so a start with zeros there is settled.
+    `vehicle.dynamic`, p at the centre of mass. Hidden states are wheel speeds, and of
+    the multi-body car also roll, pitch, heave and the axles, relative to freely rolling
+    wheels and springs at rest: a start with zeros there is in equilibrium.
 
-        δ̇ = clip((δ_cmd − δ)/τ, ±δ̇_max), δ̇_max = 0.4 rad/s as CommonRoad has it; the acceleration goes through,
-        F = c_w w|w| at l_w ahead of the centre of mass, added here: CommonRoad has no wind.
-    The tyres' lateral force peaks at friction x load (1.0489 in CommonRoad's tyre), the longitudinal one in proportion.
+        δ̇ = clip((δ_cmd − δ)/τ, ±δ̇_max), δ̇_max = 0.4 rad/s as in CommonRoad,
+        F = c_w w|w| at l_w ahead of the centre of mass
+
+    The acceleration is applied directly. CommonRoad has no wind; F is added here. The
+    tyres' lateral force peaks at friction × load (1.0489 in CommonRoad's tyre), the
+    longitudinal one in proportion.
 
     A step is a host callback: it works under `jit`, `vmap` and `scan`, one car after
-    the other, without a gradient. Where the equations end, because the car's forward
-    speed falls below 0.5 m/s or a wheel of the multi-body car is turned backwards in a
-    spin, the state is NaN from then on.
+    the other, without a gradient. The equations are not valid below a forward speed of
+    0.5 m/s or when a wheel of the multi-body car turns backwards in a spin; from there
+    on the state is NaN.
 
     Args:
         model: "std", single track with drift (9 states), or "mb", multi-body (29
@@ -71,80 +76,104 @@ def commonroad_vehicle(
 
     Raises:
         ValueError: an unknown model or car, a period or lag that is not positive.
+
+    Source: Althoff and Würsching, CommonRoad: Vehicle Models.
     """
     _check(model, car, dt, steering_lag)
-    equations, dry = MODELS[model], car_numbered(car)
+    dry = car_numbered(car)
+    host = _HostCar(MODELS[model], dry, dt, steering_lag, wind_force, wind_lever)
     bicycle = dynamic(
         dt=dt, wind_force=wind_force, front_length=dry.a, rear_length=dry.b
     )
-
-    def flow(control: Numbers, env: Numbers) -> Callable[[list[float]], list[float]]:
-        met, push = (
-            with_friction(dry, env[0]),
-            {"force": wind_force * env[1] * abs(env[1]), "lever": wind_lever},
-        )
-        return lambda x: rates(
-            equations, x, [(control[0] - x[2]) / steering_lag, control[1]], met, **push
-        )
-
-    def ends(time: float, x: Any) -> float:
-        del time
-        return equations.seven(x.tolist())[3] - SLOWEST
-
-    ends.terminal = True  # type: ignore[attr-defined]
-
-    def advance(state: Numbers, control: Numbers, env: Numbers) -> list[float]:
-        lost = [math.nan] * len(state)
-        if not (all(map(math.isfinite, state)) and state[3] > SLOWEST):
-            return lost
-        moving, start = (
-            flow(control, env),
-            np.asarray(to_commonroad(equations, state, dry)),
-        )
-        try:
-            found = solve_ivp(
-                lambda time, x: moving(x.tolist()),
-                (0.0, dt),
-                start,
-                events=ends,
-                **ACCURACY,
-            )
-        # A wheel that rolls backwards: the multi-body car divides by its speed, held at
-        # 0.
-        except ArithmeticError:
-            return lost
-        return (
-            from_commonroad(equations, found.y[:, -1].tolist(), dry)
-            if found.status == 0
-            else lost
-        )
-
-    def derivative(state: Numbers, control: Numbers, env: Numbers) -> list[float]:
-        x = np.asarray(to_commonroad(equations, state, dry))
-        little = 1e-6 * np.asarray(flow(control, env)(x.tolist()))
-        ahead, behind = (
-            np.asarray(from_commonroad(equations, y.tolist(), dry))
-            for y in (x + little, x - little)
-        )
-        return ((ahead - behind) / 2e-6).tolist()
-
     return bicycle._replace(
         name=f"commonroad_{model}",
         state_names=(
             *bicycle.state_names,
-            *(f"hidden_{index}" for index in equations.rest),
+            *(f"hidden_{index}" for index in host.equations.rest),
         ),
-        step=_on_host(advance),
-        derivative=_on_host(derivative),
+        step=_on_host(host.step),
+        derivative=_on_host(host.derivative),
         nominal=_settled(bicycle.nominal),
         nominal_derivative=_settled(bicycle.nominal_derivative),
     )
 
 
+class _HostCar(NamedTuple):
+    """A car whose equations run on the host.
+
+    Attributes:
+        equations: of CommonRoad.
+        car: parameters on a dry road.
+        dt: sampling period [s].
+        steering_lag: [s].
+        wind_force: c_w [N s²/m²].
+        wind_lever: l_w [m].
+    """
+
+    equations: Equations
+    car: Any
+    dt: float
+    steering_lag: float
+    wind_force: float
+    wind_lever: float
+
+    def rates(self, control: Numbers, env: Numbers) -> Rates:
+        """Return x -> dx/dt in CommonRoad's coordinates."""
+        car = with_friction(self.car, env[0])
+        force = self.wind_force * env[1] * abs(env[1])
+        return lambda x: rates(
+            self.equations,
+            x,
+            [(control[0] - x[2]) / self.steering_lag, control[1]],
+            car,
+            force=force,
+            lever=self.wind_lever,
+        )
+
+    def step(self, state: Numbers, control: Numbers, env: Numbers) -> list[float]:
+        """Return the state one sampling period later, NaN where equations end."""
+        lost = [math.nan] * len(state)
+        if not (all(map(math.isfinite, state)) and state[3] > SLOWEST):
+            return lost
+        flow = self.rates(control, env)
+        start = np.asarray(to_commonroad(self.equations, state, self.car))
+
+        def too_slow(time: float, x: Any) -> float:
+            del time
+            return self.equations.seven(x.tolist())[3] - SLOWEST
+
+        too_slow.terminal = True  # type: ignore[attr-defined]
+        try:
+            solution = solve_ivp(
+                lambda time, x: flow(x.tolist()),
+                (0.0, self.dt),
+                start,
+                events=too_slow,
+                **ACCURACY,
+            )
+        # The multi-body car divides by the speed of a wheel, which is held at 0 when it
+        # rolls backwards.
+        except ArithmeticError:
+            return lost
+        if solution.status != 0:
+            return lost
+        return from_commonroad(self.equations, solution.y[:, -1].tolist(), self.car)
+
+    def derivative(self, state: Numbers, control: Numbers, env: Numbers) -> list[float]:
+        """Return dx/dt by a central difference along the flow."""
+        x = np.asarray(to_commonroad(self.equations, state, self.car))
+        little = 1e-6 * np.asarray(self.rates(control, env)(x.tolist()))
+        ahead, behind = (
+            np.asarray(from_commonroad(self.equations, y.tolist(), self.car))
+            for y in (x + little, x - little)
+        )
+        return ((ahead - behind) / 2e-6).tolist()
+
+
 def commonroad_observation(
     state: Float[Array, "*batch state"], *, states: int = OBSERVED
 ) -> Float[Array, "*batch observed"]:
-    """What a model of `vehicle.dynamic` (7 states) or of `vehicle.kinematic` (4 states) is to know of such a car.
+    """Return the states that a model of `dynamic` (7) or `kinematic` (4) has.
 
     The speed of `kinematic` is that along the course, √(v² + v_y²).
 
@@ -159,7 +188,8 @@ def commonroad_observation(
         return state[..., :OBSERVED]
     if states != 4:
         raise ValueError(
-            f"states must be 7, as of the dynamic vehicle, or 4, as of the kinematic one, got {states}"
+            "states must be 7, as of the dynamic vehicle, or 4, as of the kinematic "
+            f"one, got {states}"
         )
     return jnp.concatenate(
         [state[..., :3], jnp.linalg.norm(state[..., 3:5], axis=-1, keepdims=True)],
@@ -170,7 +200,7 @@ def commonroad_observation(
 def commonroad_controller(
     controller: Controller, *, states: int = OBSERVED
 ) -> Controller:
-    """A controller made for `vehicle.dynamic` (7 states) or `vehicle.kinematic` (4), at the wheel of such a car."""
+    """Return a controller of `dynamic` (7 states) or `kinematic` (4) for such a car."""
 
     def act(params: Any, memory: Any, state: State, *rest: Any) -> Any:
         return controller.act(
@@ -181,7 +211,7 @@ def commonroad_controller(
 
 
 def _check(model: str, car: int, dt: float, steering_lag: float) -> None:
-    """Refuse what names no car, or no time."""
+    """Check model, car and times."""
     if model not in MODELS:
         raise ValueError(f"unknown model {model!r}; choose one of {', '.join(MODELS)}")
     if car not in CARS:
@@ -211,7 +241,7 @@ def _on_host(function: HostStep) -> Step:
 
 
 def _settled(step: Step) -> Step:
-    """A step of seven states that leaves what is hidden at 0."""
+    """A step of the first seven states; hidden ones stay at 0."""
 
     def wider(state: State, control: Control, env: Environment) -> State:
         return (

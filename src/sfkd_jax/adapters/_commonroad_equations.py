@@ -1,4 +1,4 @@
-"""CommonRoad's single-track drift and multi-body cars, in the coordinates of this project's; lists of numbers."""
+"""CommonRoad's drift and multi-body cars in our coordinates, on lists of numbers."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from vehiclemodels.vehicle_parameters import setup_vehicle_parameters
 CARS = (1, 2, 3)
 """CommonRoad's numbers of the Ford Escort, the BMW 320i and the VW Vanagon."""
 OBSERVED = 7
-"""How many states lead a state here, in the order of `vehicle.dynamic`."""
+"""Number of leading states, in the order of `vehicle.dynamic`."""
 
 Numbers: TypeAlias = Sequence[float]
 Car: TypeAlias = Any
@@ -29,12 +29,12 @@ class Equations(NamedTuple):
     Attributes:
         rates: (x, (steering rate, acceleration), car) -> dx/dt.
         settled: ((p_x, p_y, δ, |v|, yaw, yaw rate, slip angle), car) -> x with rolling
-            wheels, springs at rest.
+            wheels and springs at rest.
         seven: x -> the states of `vehicle.dynamic`.
-        rest: the entries of x that these do not hold.
-        wheels: the entries that are speeds of wheels.
-        pushed: (x, side force [N], car) -> by index, what the force adds to dx/dt at
-            the centre of mass.
+        rest: indices of the other entries of x.
+        wheels: indices of wheel speeds.
+        force_rates: (x, side force [N], car) -> what a force at the centre of mass adds
+            to dx/dt, by index.
     """
 
     rates: Callable[[list[float], list[float], Car], list[float]]
@@ -42,14 +42,14 @@ class Equations(NamedTuple):
     seven: Callable[[Numbers], list[float]]
     rest: tuple[int, ...]
     wheels: tuple[int, ...]
-    pushed: Callable[[Numbers, float, Car], dict[int, float]]
+    force_rates: Callable[[Numbers, float, Car], dict[int, float]]
 
 
 def _drift_seven(x: Numbers) -> list[float]:
     return [x[0], x[1], x[4], x[3] * math.cos(x[6]), x[3] * math.sin(x[6]), x[5], x[2]]
 
 
-def _drift_pushed(x: Numbers, force: float, car: Car) -> dict[int, float]:
+def _drift_force_rates(x: Numbers, force: float, car: Car) -> dict[int, float]:
     """m d|v|/dt has F sin β, m |v| dβ/dt has F cos β."""
     return {
         3: force / car.m * math.sin(x[6]),
@@ -61,15 +61,15 @@ def _body_seven(x: Numbers) -> list[float]:
     return [x[index] for index in (0, 1, 4, 3, 10, 5, 2)]
 
 
-def _body_pushed(x: Numbers, force: float, car: Car) -> dict[int, float]:
-    """F pushes the sprung mass; the axles follow through their joints."""
+def _body_force_rates(x: Numbers, force: float, car: Car) -> dict[int, float]:
+    """F acts on the sprung mass; the axles follow through their joints."""
     del x
     return {10: force / car.m_s}
 
 
 MODELS = {
     "std": Equations(
-        vehicle_dynamics_std, init_std, _drift_seven, (7, 8), (7, 8), _drift_pushed
+        vehicle_dynamics_std, init_std, _drift_seven, (7, 8), (7, 8), _drift_force_rates
     ),
     "mb": Equations(
         vehicle_dynamics_mb,
@@ -77,7 +77,7 @@ MODELS = {
         _body_seven,
         (*range(6, 10), *range(11, 29)),
         (23, 24, 25, 26),
-        _body_pushed,
+        _body_force_rates,
     ),
 }
 
@@ -88,7 +88,7 @@ def car_numbered(number: int) -> Car:
 
 
 def with_friction(car: Car, friction: float) -> Car:
-    """The same car on tyres whose lateral force peaks at `friction` times the load; their stiffness stays."""
+    """Limit the lateral force of tyres to `friction` times the load, same stiffness."""
     tire = car.tire
     return replace(
         car,
@@ -105,19 +105,28 @@ def rates(
     force: float,
     lever: float,
 ) -> list[float]:
-    """dx/dt under (steering rate, acceleration) and a side force [N], `lever` [m] ahead of the centre of mass."""
-    found = equations.rates(list(x), list(control), car)
-    for index, change in equations.pushed(x, force, car).items():
-        found[index] += change
-    found[5] += lever * force / car.I_z
-    return [float(change) for change in found]
+    """Return dx/dt under controls and a side force.
+
+    Args:
+        equations: of the model.
+        x: in CommonRoad's coordinates.
+        control: steering rate [rad/s] and acceleration [m/s²].
+        car: its parameters.
+        force: to the side [N].
+        lever: of the force, ahead of the centre of mass [m].
+    """
+    result = equations.rates(list(x), list(control), car)
+    for index, change in equations.force_rates(x, force, car).items():
+        result[index] += change
+    result[5] += lever * force / car.I_z
+    return [float(change) for change in result]
 
 
 def to_commonroad(equations: Equations, state: Numbers, car: Car) -> list[float]:
-    """CommonRoad's x of a state: what is hidden in the state is added to the settled x.
+    """Return CommonRoad's x of a state; hidden states are added to the settled x.
 
-    A locked wheel is left with a speed of just below 0, from which CommonRoad never
-    lets it turn again; here it may.
+    CommonRoad leaves a locked wheel with a speed just below 0, from which it never
+    turns again; here the speed becomes 0.
     """
     x = equations.settled(_core(state), car)
     for index, hidden in zip(equations.rest, state[OBSERVED:], strict=True):
@@ -128,7 +137,7 @@ def to_commonroad(equations: Equations, state: Numbers, car: Car) -> list[float]
 
 
 def from_commonroad(equations: Equations, x: Numbers, car: Car) -> list[float]:
-    """The state of CommonRoad's x."""
+    """Return the state of CommonRoad's x."""
     seven = equations.seven(x)
     settled = equations.settled(_core(seven), car)
     return [*seven, *(x[index] - settled[index] for index in equations.rest)]

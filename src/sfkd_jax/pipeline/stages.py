@@ -23,6 +23,7 @@ from sfkd_jax.datasets import (
 from sfkd_jax.pipeline import path_law, store
 from sfkd_jax.pipeline.train_policy import train_policy
 from sfkd_jax.types import Trajectory
+from sfkd_jax.vehicle import check_step
 
 SPLIT = ("shares", "env_low", "env_high", "seed")
 CONSTANT = ("s1", "held")
@@ -43,7 +44,12 @@ def ensure_dataset(settings: dict[str, Any]) -> tuple[Dataset, str]:
 
 
 def _simulate(settings: dict[str, Any]) -> Dataset:
-    """Simulate a data set with the vehicle of the settings."""
+    """Simulate a data set with the vehicle of the settings.
+
+    Raises:
+        ValueError: the vehicle has no step, or one that does not return a state.
+    """
+    check_step(build.build_vehicle(settings["vehicle"]))
     options = settings["dataset"]
     drive_key, split_key = jax.random.split(jax.random.key(options["seed"]))
     generate = path_law.generator(settings, build.as_kwargs(options, *SPLIT, "law"))

@@ -129,12 +129,13 @@ def check_step(plant: Vehicle) -> None:
         after = jax.eval_shape(plant.step, *(jnp.zeros(size) for size in sizes))
     except _MissingStep:
         raise
-    except (TypeError, ValueError, IndexError) as reason:
+    except Exception as reason:  # a function of the user raises anything
         given = (
             f"{sizes[0]} states (vehicle.state_names), 2 controls and 2 environments"
         )
+        first = (str(reason).splitlines() or [type(reason).__name__])[0]
         raise ValueError(
-            f"the step of vehicle {plant.name} fails on {given}: {reason}"
+            f"the step of vehicle {plant.name} fails on {given}: {first}"
         ) from None
     if getattr(after, "shape", None) != (sizes[0],):
         shape = getattr(after, "shape", type(after).__name__)
