@@ -130,7 +130,7 @@ def test_every_file_named_in_backticks_exists(page):
 
 
 @every_page
-def test_every_command_is_a_door_and_every_option_is_in_the_vocabulary(page):
+def test_every_command_and_every_option_exists(page):
     text = text_of(page)
     assert set(re.findall(r"python -m sfkd_jax\.(\w+)", text)) <= COMMANDS
     commands = [
@@ -155,14 +155,14 @@ def test_every_program_names_what_the_package_has(page):
         r"^```py(?:thon)?\n(.*?)^```", text_of(page), re.DOTALL | re.MULTILINE
     ):
         tree = ast.parse(block)
-        rooms = {"sfkd_jax": ()}
+        modules = {"sfkd_jax": ()}
         for node in ast.walk(tree):
             package, *place = (getattr(node, "module", None) or "").split(".")
             if isinstance(node, ast.ImportFrom) and package == "sfkd_jax":
                 assert {alias.name for alias in node.names} <= names_in(*place), (
                     node.module
                 )
-                rooms |= {
+                modules |= {
                     alias.asname or alias.name: (alias.name,)
                     for alias in node.names
                     if alias.name in PACKAGES
@@ -171,9 +171,10 @@ def test_every_program_names_what_the_package_has(page):
             if (
                 isinstance(node, ast.Attribute)
                 and isinstance(node.value, ast.Name)
-                and node.value.id in rooms
+                and node.value.id in modules
             ):
-                assert node.attr in names_in(*rooms[node.value.id]), ast.unparse(node)
+                known = names_in(*modules[node.value.id]) | {"__file__"}
+                assert node.attr in known, ast.unparse(node)
 
 
 def test_every_page_is_in_the_navigation_and_nothing_else_is():
@@ -194,11 +195,13 @@ def test_every_page_is_in_the_navigation_and_nothing_else_is():
     )
 
 
-def test_every_public_room_has_a_page_of_the_reference():
+def test_every_public_package_has_a_page_of_the_reference():
     pages = "".join(page.read_text("utf-8") for page in (DOCS / "api").glob("*.md"))
-    private = {"artefacts", "assembly", "reporting"}
+    private = {"artefacts", "build", "cli", "core", "paper", "pipeline", "reporting"}
     assert {
-        room for room in PACKAGES - private if f"::: sfkd_jax.{room}\n" not in pages
+        package
+        for package in PACKAGES - private
+        if f"::: sfkd_jax.{package}\n" not in pages
     } == set()
 
 
@@ -276,9 +279,9 @@ def test_the_tables_of_the_certificates_page_are_those_of_their_files():
     lines = len(
         (ROOT / "src/sfkd_jax/certification/_core.py").read_text("utf-8").splitlines()
     )
-    assert lines <= 150
+    assert lines <= 190
     assert f"`certification/_core.py`, {lines} lines" in page
-    assert f"a core of {lines} lines" in readme
+    assert f"a core of {lines} lines" in " ".join(readme.split())
     searched = json.loads(
         (ROOT / "benchmarks/robustness/trusted_core.json").read_text()
     )
@@ -376,7 +379,7 @@ def test_the_page_about_an_estimated_environment_says_what_the_results_say():
     rows = {"e measured": measured, "e estimated": estimated, "over measured": ratios}
     rows |= {
         "e estimated, sensors ten times as good": sharp,
-        "not told e, best row": untold,
+        "without e, best row": untold,
     }
     page = (DOCS / "estimation.md").read_text("utf-8")
     lines = [
@@ -393,9 +396,7 @@ def test_the_page_about_an_estimated_environment_says_what_the_results_say():
     assert f"the estimate costs {estimated[3] - measured[3]:.1f} mm on S3" in text
     assert f"the best by {gaps[3]:.1f} mm worse" in text
     assert f"{-gaps[2]:.1f} mm better" in text
-    assert (
-        f"{gaps[0]:.0f} and {gaps[1]:.0f} mm below every row that is not told e" in text
-    )
+    assert f"{gaps[0]:.0f} and {gaps[1]:.0f} mm below every row without e" in text
 
 
 def test_what_the_fuzzer_found_is_what_the_page_says():
@@ -451,8 +452,8 @@ def test_the_readme_says_of_the_corridor_what_its_page_says():
         for plant in ("dynamic", "kinematic")
     ]
     assert (
-        f"±{half[0]:.2f} m (dynamic single track) and ±{half[1]:.2f} m (kinematic) on 95 %"
-        in " ".join(readme.split())
+        f"within ±{half[0]:.2f} m (dynamic single track) and ±{half[1]:.2f} m (kinematic) "
+        "of its path on 95 %" in " ".join(readme.split())
     )
 
 
