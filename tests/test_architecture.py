@@ -47,8 +47,8 @@ ARROWS = {
     "corridor": MODEL_AND_DATA | {"evaluation", "policy"},
     "pipeline": MODEL_AND_DATA
     | {"corridor", "evaluation", "policy", "scenarios", "training"},
-    "reporting": {"artefacts"},
-    "paper": {"artefacts", "reporting"},
+    "reporting": {"artefacts", "evaluation"},
+    "paper": {"artefacts", "evaluation", "reporting"},
     "__init__": {"artefacts", "exporting", "policy"},
 }
 LIBRARY = set(ARROWS)
@@ -68,7 +68,14 @@ THIRD_PARTY = {
     "reporting": {"numpy", "matplotlib"},
     "policy": {"numpy"},
     "corridor": {"numpy"},
-    "adapters": {"brax", "gymnasium", "numpy", "scipy", "vehiclemodels"},
+    "adapters": {
+        "brax",
+        "gymnasium",
+        "matplotlib",
+        "numpy",
+        "scipy",
+        "vehiclemodels",
+    },
     "exporting": {"numpy", "iree"},
     "pipeline": {"numpy"},
     "paper": {"numpy", "matplotlib"},

@@ -33,6 +33,34 @@ def test_the_first_screen_holds_the_two_commands():
     assert "pytest -q -n 2" in screen
 
 
+def test_the_readme_is_short():
+    assert len(README.encode()) <= 8 * 1024
+
+
+def test_the_ratios_to_the_oracle_are_those_of_the_table():
+    """Rounded, not cut: the README and the results in short say the same."""
+    rows = json.loads(
+        (ROOT / "experiments" / "table1_closed_loop" / "results.json").read_text()
+    )["rows"]
+
+    def ratio(vehicle, scenario):
+        kind = {"vehicle": vehicle, "scenario": scenario, "sampling": "feedback"}
+        chosen = [row for row in rows if kind.items() <= row.items()]
+        error = {row["system"]: row["rmse_m"]["mean"] for row in chosen}
+        return f"{error['sfkd'] / error['oracle']:.2f}"
+
+    kinematic, dynamic = (
+        [ratio(vehicle, scenario) for scenario in ("s1", "s2", "s3")]
+        for vehicle in ("kinematic", "dynamic")
+    )
+    first = " ".join(README.split())
+    assert f"at {kinematic[2]} times the oracle on the kinematic car" in first
+    assert f"at {dynamic[2]} times on the dynamic one" in first
+    short = " ".join((RESULTS / "index.md").read_text("utf-8").split())
+    for one, two, three in (kinematic, dynamic):
+        assert f"at {one}, {two} and {three} times the oracle" in short
+
+
 def test_ci_runs_the_test_command_of_the_readme():
     assert "pytest -q -n 2" in (ROOT / ".ci" / "run").read_text("utf-8")
 
