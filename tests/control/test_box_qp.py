@@ -50,32 +50,34 @@ SOLVERS = {n: jit(partial(box_qp, iterations=n)) for n in (*range(9), 12)}
 @pytest.mark.parametrize("condition", [10.0, 1e5])
 def test_the_cost_is_that_of_a_convex_solver(seed, condition):
     H, f, low, high = problem(seed, condition)
-    found = SOLVERS[12](H, f, low, high, np.zeros(SIZE, np.float32))
+    solution = SOLVERS[12](H, f, low, high, np.zeros(SIZE, np.float32))
     best = cost(H, f, by_clarabel(H, f, low, high))
-    assert 0 < np.sum((found.primal == low) | (found.primal == high)) < SIZE
-    assert abs(cost(H, f, found.primal) - best) <= 1e-4 * abs(best)
-    assert float(found.residual) < 1e-4
+    assert 0 < np.sum((solution.primal == low) | (solution.primal == high)) < SIZE
+    assert abs(cost(H, f, solution.primal) - best) <= 1e-4 * abs(best)
+    assert float(solution.residual) < 1e-4
 
 
 def test_independent_entries_are_clipped():
     diagonal, f = np.float32([1.0, 4.0, 100.0]), np.float32([-0.5, 8.0, -300.0])
-    found = SOLVERS[1](
+    solution = SOLVERS[1](
         np.diag(diagonal),
         f,
         -np.ones(3, np.float32),
         np.ones(3, np.float32),
         np.zeros(3, np.float32),
     )
-    np.testing.assert_allclose(found.primal, np.clip(-f / diagonal, -1, 1), atol=1e-6)
-    assert float(found.residual) < 1e-6
+    np.testing.assert_allclose(
+        solution.primal, np.clip(-f / diagonal, -1, 1), atol=1e-6
+    )
+    assert float(solution.residual) < 1e-6
 
 
 def test_without_active_bounds_one_iteration_solves():
     H, f, _, _ = problem(0)
     wide = np.full(SIZE, 1e3, np.float32)
-    found = SOLVERS[1](H, f, -wide, wide, np.zeros(SIZE, np.float32))
+    solution = SOLVERS[1](H, f, -wide, wide, np.zeros(SIZE, np.float32))
     np.testing.assert_allclose(
-        found.primal, -np.linalg.solve(np.float64(H), f), atol=1e-4
+        solution.primal, -np.linalg.solve(np.float64(H), f), atol=1e-4
     )
 
 
@@ -100,9 +102,9 @@ def test_a_warm_start_needs_fewer_iterations(seed):
 def test_the_cost_never_rises_and_the_box_is_never_left():
     H, f, low, high = problem(5, condition=1e5)
     start = np.full(SIZE, 7.0, np.float32)  # outside
-    found = [SOLVERS[n](H, f, low, high, start).primal for n in range(9)]
-    assert all(np.all((low <= x) & (x <= high)) for x in found)
-    costs = np.asarray([cost(H, f, x) for x in found])
+    solutions = [SOLVERS[n](H, f, low, high, start).primal for n in range(9)]
+    assert all(np.all((low <= x) & (x <= high)) for x in solutions)
+    costs = np.asarray([cost(H, f, x) for x in solutions])
     assert np.all(np.diff(costs) <= 1e-6 * np.abs(costs[:-1]))
 
 
@@ -111,17 +113,17 @@ def test_what_is_not_finite_leaves_the_start(part):
     data = [np.array(entry) for entry in problem(1)]
     start = 0.5 * data[3]
     data[part].flat[0] = np.nan
-    found = SOLVERS[12](*data, start)
-    np.testing.assert_array_equal(found.primal, start)
-    assert not float(found.residual) < 1e-4
+    solution = SOLVERS[12](*data, start)
+    np.testing.assert_array_equal(solution.primal, start)
+    assert not float(solution.residual) < 1e-4
 
 
 def test_a_cost_that_is_not_convex_still_ends_inside_the_box():
-    found = SOLVERS[12](
+    solution = SOLVERS[12](
         -np.eye(3, dtype=np.float32),
         *np.float32([[0.1] * 3, [-1] * 3, [1] * 3, [0] * 3]),
     )
-    assert np.all(np.abs(found.primal) <= 1)
+    assert np.all(np.abs(solution.primal) <= 1)
 
 
 def test_a_batch_is_a_loop():

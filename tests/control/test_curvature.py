@@ -125,12 +125,12 @@ def regret(**settings):
 
         return jax.lax.scan(again, planner.init(key), None, length=40)[1][-20:].mean()
 
-    found = np.mean([run(jax.random.key(seed)) for seed in range(3)])
+    reached = np.mean([run(jax.random.key(seed)) for seed in range(3)])
     gradient = np.asarray(jax.grad(cost)(jnp.zeros((HORIZON, 2))), dtype=float).ravel()
     least = float(cost(jnp.zeros((HORIZON, 2)))) - 0.5 * gradient @ np.linalg.solve(
         closed_form(), gradient
     )
-    return found / least - 1
+    return reached / least - 1
 
 
 def test_with_few_samples_shaped_noise_comes_closer_to_the_optimum():

@@ -30,13 +30,13 @@ SWITCHED = np.where(TIME[:, None] < 30, CALM, STORM)
 
 
 def scripted(controls=CONTROLS):
-    """Plays recorded controls and shows in its info what it was told."""
+    """Plays recorded controls and shows in its info what it was given."""
 
     def act(params, count, observation, env, reference):
         return (
             jnp.asarray(controls)[count],
             count + 1,
-            {"told": env, "seen": observation},
+            {"env": env, "seen": observation},
         )
 
     return Controller(lambda key: jnp.zeros((), dtype=int), act)
@@ -48,7 +48,7 @@ def estimator(**settings):
 
 
 def driven(envs, noise=(0.0,) * 4, start=(0.0, 0.0, 0.0, 10.0), seed=0):
-    """What sensors say of a drive: before every control, with noise."""
+    """Measurements of a drive before every control, with noise."""
 
     def step(state, inputs):
         return PLANT.step(state, *inputs), state
@@ -265,6 +265,6 @@ def test_it_drives_as_any_controller_under_jit_and_vmap():
         ({"env_low": (0.9, -8.0)}, "env_low"),
     ],
 )
-def test_settings_that_cannot_be_meant_are_refused_by_name(change, word):
+def test_invalid_settings_are_refused_by_name(change, word):
     with pytest.raises(ValueError, match=word):
         control.estimated(scripted(), Model(*[None] * 8), **BOX | change)

@@ -104,16 +104,17 @@ def test_the_condensed_problem_is_solved_as_by_a_convex_solver(step):
     cvxpy.Problem(
         cvxpy.Minimize(0.5 * cvxpy.quad_form(x, cvxpy.psd_wrap(H)) + f @ x), bounds
     ).solve(cvxpy.CLARABEL)
-    found = control.box_qp(
+    solution = control.box_qp(
         *(jnp.asarray(part, jnp.float32) for part in (H, f, low, high, start))
     )
     costs = [
-        0.5 * u @ H @ u + f @ u for u in (np.asarray(found.primal, np.float64), x.value)
+        0.5 * u @ H @ u + f @ u
+        for u in (np.asarray(solution.primal, np.float64), x.value)
     ]
     assert abs(costs[0] - costs[1]) <= 1e-4 * abs(costs[1])
-    assert float(found.residual) < 1e-3
+    assert float(solution.residual) < 1e-3
     assert step > 0 or np.any(
-        np.asarray(found.primal) == np.float32(high)
+        np.asarray(solution.primal) == np.float32(high)
     )  # bounds matter
 
 

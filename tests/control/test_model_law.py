@@ -40,37 +40,37 @@ def turns(name, bend=1.0):
 
 
 @pytest.mark.parametrize("name", PLANTS)
-def test_a_steady_turn_stays_what_it_is_on_the_path_at_the_speed_asked_for(name):
-    found, step = turns(name)
+def test_a_steady_turn_stays_what_it_is_on_the_path_at_the_reference_speed(name):
+    turn, step = turns(name)
     for k, kappa in enumerate(CURVATURE):
-        after = step(found.state[k], found.control[k], kappa, jnp.asarray(10.0))
-        np.testing.assert_allclose(after, found.state[k], atol=2e-3)
+        after = step(turn.state[k], turn.control[k], kappa, jnp.asarray(10.0))
+        np.testing.assert_allclose(after, turn.state[k], atol=2e-3)
         np.testing.assert_allclose(
-            np.asarray(found.state[k])[[0, 2]], [0.0, 10.0], atol=1e-6
+            np.asarray(turn.state[k])[[0, 2]], [0.0, 10.0], atol=1e-6
         )
     assert (
-        abs(float(found.control[0, 0])) > 1e-3
+        abs(float(turn.control[0, 0])) > 1e-3
     )  # side wind: even straight on, it steers against it
 
 
-def test_the_textbook_bicycle_turns_as_its_geometry_says():
+def test_the_textbook_bicycle_turns_as_its_geometry_requires():
     plant = PLANTS["kinematic"]
     model = models.physics(plant.nominal)
-    found = LAW.prepare(
+    turn = LAW.prepare(
         model, model.fiber({}, ENV), jnp.zeros(4), straight(3), CURVATURE
     )
-    _, _, speed = found.state[1]
+    _, _, speed = turn.state[1]
     np.testing.assert_allclose(speed, 10.0)
-    np.testing.assert_allclose(found.control[:, 1], 0.0, atol=1e-5)
+    np.testing.assert_allclose(turn.control[:, 1], 0.0, atol=1e-5)
     np.testing.assert_allclose(
-        np.tan(found.control[:, 0]), plant.wheelbase * CURVATURE, rtol=2e-2, atol=1e-5
+        np.tan(turn.control[:, 0]), plant.wheelbase * CURVATURE, rtol=2e-2, atol=1e-5
     )
 
 
 @pytest.mark.parametrize("name", PLANTS)
 def test_the_gain_is_that_of_the_riccati_equation_and_stabilises(name):
-    found, step = turns(name)
-    at = (found.state[0], found.control[0], CURVATURE[0], jnp.asarray(10.0))
+    turn, step = turns(name)
+    at = (turn.state[0], turn.control[0], CURVATURE[0], jnp.asarray(10.0))
     A, B = (
         np.asarray(part, dtype=float) for part in jax.jacfwd(step, argnums=(0, 1))(*at)
     )
@@ -79,8 +79,8 @@ def test_the_gain_is_that_of_the_riccati_equation_and_stabilises(name):
     R = np.diag([LAW.steering, LAW.drive])
     value = scipy.linalg.solve_discrete_are(A, B, Q + 1e-9 * np.eye(len(A)), R)
     gain = np.linalg.solve(R + B.T @ value @ B, B.T @ value @ A)
-    np.testing.assert_allclose(found.gain[0], gain, rtol=2e-2, atol=2e-3)
-    assert np.max(np.abs(np.linalg.eigvals(A - B @ np.asarray(found.gain[0])))) < 1.0
+    np.testing.assert_allclose(turn.gain[0], gain, rtol=2e-2, atol=2e-3)
+    assert np.max(np.abs(np.linalg.eigvals(A - B @ np.asarray(turn.gain[0])))) < 1.0
 
 
 def test_a_turn_that_no_tyre_can_hold_falls_back_to_driving_straight():
@@ -126,11 +126,11 @@ def test_a_planner_around_it_needs_no_samples_to_stay_near_the_path_in_side_wind
 @pytest.mark.parametrize("name", ["sfkd", "nominal"])
 def test_a_learned_model_has_a_law_too(name):
     model, params = model_and_params(name)
-    found = LAW.prepare(
+    turn = LAW.prepare(
         model, model.fiber(params, ENV), jnp.zeros(4), straight(3), CURVATURE
     )
-    assert found.gain.shape == (3, 2, 3)
-    assert all(np.all(np.isfinite(part)) for part in found)
+    assert turn.gain.shape == (3, 2, 3)
+    assert all(np.all(np.isfinite(part)) for part in turn)
 
 
 @pytest.mark.parametrize("size", [1, 3, 7])
@@ -138,10 +138,10 @@ def test_elimination_solves_what_needs_pivots(size):
     random = np.random.default_rng(size)
     matrix, right = random.normal(size=(size, size)), random.normal(size=(size, 2))
     matrix[0, 0] = 0.0 if size > 1 else matrix[0, 0]
-    found = jit(solve)(
+    solution = jit(solve)(
         jnp.asarray(matrix, dtype=jnp.float32), jnp.asarray(right, dtype=jnp.float32)
     )
-    np.testing.assert_allclose(matrix @ np.asarray(found), right, atol=2e-4)
+    np.testing.assert_allclose(matrix @ np.asarray(solution), right, atol=2e-4)
 
 
 def test_as_an_ancillary_it_is_one_more_sample_of_a_planner_around_another_law():

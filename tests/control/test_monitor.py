@@ -218,7 +218,7 @@ def test_on_a_switch_the_latent_is_transported(name):
         carried = model.transport(fiber, fiber_next, stepped).z
         return jnp.linalg.norm(after - carried), jnp.linalg.norm(after - stepped.z)
 
-    found = watched(CLEAN, name)["disturbance"][:, 0]
+    latent = watched(CLEAN, name)["disturbance"][:, 0]
     for k in (1, 4):
         with_transport, without = by_hand(
             params,
@@ -227,7 +227,7 @@ def test_on_a_switch_the_latent_is_transported(name):
             CLEAN.controls[k - 1],
             CLEAN.states[k],
         )
-        np.testing.assert_allclose(found[k], with_transport, rtol=2e-5)
+        np.testing.assert_allclose(latent[k], with_transport, rtol=2e-5)
         assert abs(float(with_transport) - float(without)) > 3e-4 * float(
             with_transport
         )
@@ -598,14 +598,14 @@ def test_it_is_traced_once_while_everything_changes():
 
 def scans(jaxpr):
     """How many loops a jaxpr holds, at any depth."""
-    found = 0
+    count = 0
     for equation in jaxpr.eqns:
-        found += equation.primitive.name in ("scan", "while")
+        count += equation.primitive.name in ("scan", "while")
         for value in equation.params.values():
             for part in value if isinstance(value, tuple | list) else (value,):
                 inner = getattr(part, "jaxpr", part)
-                found += scans(inner) if hasattr(inner, "eqns") else 0
-    return found
+                count += scans(inner) if hasattr(inner, "eqns") else 0
+    return count
 
 
 @pytest.mark.parametrize("fallback", ["none", "hold", "slow"])
@@ -648,6 +648,6 @@ def test_the_planner_is_run_once_whatever_the_fallback(fallback):
         ({"release": 0}, "release"),
     ],
 )
-def test_settings_that_cannot_be_meant_are_refused(settings, words):
+def test_invalid_settings_are_refused(settings, words):
     with pytest.raises(ValueError, match=words):
         guarded(**settings)

@@ -416,8 +416,8 @@ def square_products(jaxpr):
     """
     here = [eqn for eqn in jaxpr.eqns if eqn.primitive.name == "dot_general"]
     shapes = [[operand.aval.shape[-2:] for operand in eqn.invars] for eqn in here]
-    found = sum(a == b and len(a) == 2 and a[0] == a[1] > 1 for a, b in shapes)
-    return found + sum(square_products(inner) for _, inner in nested(jaxpr))
+    count = sum(a == b and len(a) == 2 and a[0] == a[1] > 1 for a, b in shapes)
+    return count + sum(square_products(inner) for _, inner in nested(jaxpr))
 
 
 def jaxpr_of_act(name):

@@ -100,11 +100,11 @@ def test_halton_points_fill_their_space_more_evenly_than_independent_ones():
     less.
     """
     misses = {halton: [] for halton in (True, False)}
-    for halton, found in misses.items():
+    for halton, errors in misses.items():
         draw = control.noise_sampler("spline", horizon=HORIZON, knots=2, halton=halton)
         for seed in range(12):
             noise = np.asarray(draw(jax.random.key(seed), 512, jnp.ones(2)))
-            found.append(
+            errors.append(
                 np.mean(np.cos(noise[0]).prod(axis=1) * np.cos(noise[-1]).prod(axis=1))
                 - np.exp(-2.0)
             )
@@ -131,10 +131,14 @@ def test_as_many_samples_count_as_are_wanted_whatever_the_scale_of_the_cost(
         "exponential": jax.random.exponential(jax.random.key(1), (1500,)),
         "one far off": jax.random.uniform(jax.random.key(2), (1500,)).at[7].set(1e4),
     }[law]
-    temperature = control.temperature_for_sample_size(scale * costs, jnp.asarray(wanted))
+    temperature = control.temperature_for_sample_size(
+        scale * costs, jnp.asarray(wanted)
+    )
     weights, usable = control.softmin(scale * costs, temperature)
     assert bool(usable)
-    np.testing.assert_allclose(control.effective_sample_size(weights), wanted, rtol=0.05)
+    np.testing.assert_allclose(
+        control.effective_sample_size(weights), wanted, rtol=0.05
+    )
 
 
 def test_more_than_there_are_gives_all_and_bad_ones_never_count():
@@ -149,6 +153,8 @@ def test_more_than_there_are_gives_all_and_bad_ones_never_count():
     "costs", [[2.0, 2.0, 2.0], [jnp.nan] * 3, [1.0, jnp.inf, jnp.inf]]
 )
 def test_costs_without_a_spread_give_a_finite_temperature(costs):
-    temperature = control.temperature_for_sample_size(jnp.asarray(costs), jnp.asarray(2.0))
+    temperature = control.temperature_for_sample_size(
+        jnp.asarray(costs), jnp.asarray(2.0)
+    )
     assert bool(jnp.isfinite(temperature))
     assert float(temperature) > 0

@@ -190,6 +190,6 @@ def test_correlated_noise_has_the_stated_spread_at_every_step_and_the_stated_cor
     assert np.all(np.abs(noise.std(axis=1) / std - 1) < tight)
     assert np.all(np.abs(noise.mean(axis=1) / std) < 4 / np.sqrt(count))
     for lag in (1, 3):
-        found = (noise[lag:] * noise[:-lag]).mean(axis=(0, 1)) / std**2
-        assert np.all(np.abs(found - correlation**lag) < 0.03)
+        relative = (noise[lag:] * noise[:-lag]).mean(axis=(0, 1)) / std**2
+        assert np.all(np.abs(relative - correlation**lag) < 0.03)
     assert abs((noise[..., 0] * noise[..., 1]).mean() / std.prod()) < 0.03

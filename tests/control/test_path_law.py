@@ -122,7 +122,7 @@ def test_a_step_without_a_derivative_will_do():
     assert np.all(np.asarray(turn.gain[0, :2]) > 0.05)
 
 
-def test_axes_that_cannot_be_meant_are_refused():
+def test_invalid_axes_are_refused():
     with pytest.raises(ValueError, match="odd number of accelerations"):
         derive_path_law(
             PLANTS["kinematic"].step, coordinates=3, points=(4, 2, 2), **BOX

@@ -155,9 +155,9 @@ def test_a_clock_that_tells_no_number_counts_as_a_call_in_time(search):
     act, seen = jit(controller.act), []
     for elapsed in (jnp.nan, 1.0):
         state = controller.init(jax.random.key(0))
-        for told in (1.0, elapsed, 1.0):
+        for clock in (1.0, elapsed, 1.0):
             state = state._replace(
-                tuning=state.tuning._replace(elapsed=jnp.asarray(told))
+                tuning=state.tuning._replace(elapsed=jnp.asarray(clock))
             )
             action, state, info = act({}, state, START, NOTHING, ())
             assert bool(info["healthy"])
@@ -424,7 +424,7 @@ def test_the_same_plan_comes_out_on_one_two_and_eight_devices():
         ("gradient", {"shrink": 1.0}, "shrink"),
     ],
 )
-def test_settings_that_cannot_be_meant_are_refused_by_name(search, settings, words):
+def test_invalid_settings_are_refused_by_name(search, settings, words):
     with pytest.raises(ValueError, match=words):
         SEARCHES[search](
             double_integrator(), horizon=HORIZON, **{"noise_std": (1.0,), **settings}
@@ -439,7 +439,7 @@ def test_settings_that_cannot_be_meant_are_refused_by_name(search, settings, wor
         ({"control_rate": (1.0, 1.0)}, "control_rate"),
     ],
 )
-def test_limits_that_cannot_be_meant_are_refused_by_name(limits, words):
+def test_invalid_limits_are_refused_by_name(limits, words):
     with pytest.raises(ValueError, match=words):
         double_integrator(**limits)
 

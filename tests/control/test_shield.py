@@ -13,7 +13,7 @@ from helpers import TINY, any_law, jit, path_space, same, tiny
 from sfkd_jax import build, control, models
 from sfkd_jax.control import curvature_ahead, path_coordinates, safety_filter, shielded
 from sfkd_jax.core.folding import fold, unfold
-from sfkd_jax.core.path_frame import vehicle_state, path_state
+from sfkd_jax.core.path_frame import path_state, vehicle_state
 from sfkd_jax.types import BODY, Controller, Model
 from sfkd_jax.vehicle import kinematic
 
@@ -59,7 +59,7 @@ TOY = toy()
 POWERS = [np.linalg.matrix_power(A, k)[0] for k in range(STEPS)]
 TUBE = 1.001 * float(sum(np.abs(row) @ DISTURBANCE for row in POWERS))
 """The exact largest |e_y - copy's e_y| after `STEPS` disturbances within their bounds,
-and room for rounding.
+and a margin for rounding.
 """
 WORST = np.asarray([np.sign(row) * DISTURBANCE for row in reversed(POWERS)])
 """The disturbances that reach it at the last step."""
@@ -220,7 +220,9 @@ def test_who_asks_for_nothing_or_for_little_is_left_alone(added):
         script, jnp.zeros((40, 3)), (0.05, 0.0, 8.0)
     )
     planned = jit(
-        jax.vmap(lambda xi: scripted().act(script, 0, vehicle_state(xi), ENV, reference)[0])
+        jax.vmap(
+            lambda xi: scripted().act(script, 0, vehicle_state(xi), ENV, reference)[0]
+        )
     )(xi)
     np.testing.assert_array_equal(controls, planned)
     np.testing.assert_allclose(info["perturbation"], script, atol=1e-6)
@@ -239,7 +241,7 @@ def margin_of(xi, nu, road):
 
 
 ROAD = np.asarray([0.002, SPEED])
-admitted = jit(
+filter_from = jit(
     partial(
         safety_filter,
         TOY,
@@ -250,16 +252,16 @@ admitted = jit(
 )
 
 
-def asked(xi, nu, limit=LIMIT):
+def apply_filter(xi, nu, limit=LIMIT):
     latent = 1.6 * jnp.asarray(xi, dtype=float)
-    return admitted(
+    return filter_from(
         latent, jnp.asarray(nu, dtype=float), limit=jnp.asarray(limit, dtype=float)
     )
 
 
-def test_the_largest_share_that_keeps_the_copy_inside_is_admitted():
+def test_the_largest_scale_that_keeps_the_copy_inside_is_chosen():
     random = np.random.default_rng(1)
-    found = []
+    scales = []
     for _ in range(100):
         xi = np.asarray(
             [random.uniform(0.6, 1.0) * WIDTH, random.uniform(-0.02, 0.02), SPEED]
@@ -270,25 +272,25 @@ def test_the_largest_share_that_keeps_the_copy_inside_is_admitted():
         )
         if np.min(np.abs(margins)) < 1e-5 or np.max(margins) < 0:
             continue
-        result = asked(xi, nu)
+        result = apply_filter(xi, nu)
         share = control.FILTER_SCALES[np.argmax(margins >= 0)]
-        found.append(share)
+        scales.append(share)
         assert float(result.scale) == share
         np.testing.assert_allclose(result.nu, share * nu, rtol=1e-6)
         np.testing.assert_allclose(
             result.margin, margin_of(xi, share * nu, ROAD), atol=1e-6
         )
         assert bool(result.feasible)
-    assert 1.0 in found
-    assert 0.0 in found
-    assert len(set(found)) > 4
+    assert 1.0 in scales
+    assert 0.0 in scales
+    assert len(set(scales)) > 4
 
 
 def test_a_share_of_one_is_the_request_to_the_last_bit():
     nu = jnp.asarray([0.0123, -0.456])
-    np.testing.assert_array_equal(asked([0.0, 0.0, SPEED], nu).nu, nu)
+    np.testing.assert_array_equal(apply_filter([0.0, 0.0, SPEED], nu).nu, nu)
     np.testing.assert_array_equal(
-        asked([0.0, 0.0, SPEED], 100 * nu).nu, LIMIT * (1, -1)
+        apply_filter([0.0, 0.0, SPEED], 100 * nu).nu, LIMIT * (1, -1)
     )
 
 
@@ -302,7 +304,7 @@ def test_where_the_law_alone_leaves_the_corridor_the_copy_is_steered_back(
     """
     xi = np.asarray([side * lateral, side * 0.03, SPEED])
     alone, back = margin_of(xi, np.zeros(2), ROAD), -side * LIMIT * (1, 0)
-    result = asked(xi, LIMIT * (side, 1.0))
+    result = apply_filter(xi, LIMIT * (side, 1.0))
     assert alone < min(0.0, margin_of(xi, back, ROAD))
     np.testing.assert_allclose(result.nu, back)
     np.testing.assert_allclose(result.margin, margin_of(xi, back, ROAD), atol=1e-6)
@@ -311,21 +313,21 @@ def test_where_the_law_alone_leaves_the_corridor_the_copy_is_steered_back(
 
 
 def test_what_is_not_finite_is_never_applied():
-    lost = asked([np.nan, 0.0, SPEED], LIMIT)
+    lost = apply_filter([np.nan, 0.0, SPEED], LIMIT)
     np.testing.assert_array_equal(lost.nu, np.zeros(2))
     assert float(lost.margin) == -np.inf
     assert not bool(lost.feasible)
     for nu in ([np.nan, 0.5], [0.01, np.inf]):
-        result = asked([0.0, 0.0, SPEED], nu)
+        result = apply_filter([0.0, 0.0, SPEED], nu)
         np.testing.assert_array_equal(result.nu, np.zeros(2))
         assert bool(result.feasible)
 
 
 def test_the_corridor_is_reached_from_outside():
-    """Infeasible at first and told so; the copy comes back and stays."""
-    pushed = jnp.tile(jnp.asarray(LIMIT), (120, 1))
+    """Infeasible at first, and reported as such; the copy comes back and stays."""
+    requests = jnp.tile(jnp.asarray(LIMIT), (120, 1))
     _, _, info = jit(partial(drive, filtered()))(
-        pushed, jnp.zeros((120, 3)), (1.0, 0.0, SPEED)
+        requests, jnp.zeros((120, 3)), (1.0, 0.0, SPEED)
     )
     assert not bool(info["feasible"][0])
     assert not bool(info["shield_healthy"][0])
@@ -356,14 +358,16 @@ def test_a_switch_of_the_environment_moves_copy_and_car_alike():
     Gaps in e are bridged.
     """
     envs = jnp.tile(ENV, (40, 1)).at[10:].set(jnp.asarray([0.3, -6.0]))
-    told = envs.at[20:25, 1].set(jnp.nan)
+    observed_envs = envs.at[20:25, 1].set(jnp.nan)
     controller = filtered()
     quiet = jnp.zeros((40, 2))
     reference = circle()
     xi, memory = jnp.asarray([0.1, 0.0, SPEED]), controller.init(jax.random.key(0))
     act, distances, inside = jit(controller.act), [], []
     for k in range(40):
-        action, memory, info = act(quiet, memory, vehicle_state(xi), told[k], reference)
+        action, memory, info = act(
+            quiet, memory, vehicle_state(xi), observed_envs[k], reference
+        )
         assert np.all(np.isfinite(action))
         distances.append(float(jnp.abs(xi - info["copy"])[0]))
         inside.append(bool(info["env_inside"]))
@@ -410,7 +414,9 @@ def test_outside_a_box_the_law_drives_alone(box, value):
         controller = filtered(**options)
         act = jit(controller.act)
         memory = controller.init(jax.random.key(0))
-        _, _, info = act(wanted, memory, vehicle_state(jnp.asarray(start)), ENV, circle(0.002))
+        _, _, info = act(
+            wanted, memory, vehicle_state(jnp.asarray(start)), ENV, circle(0.002)
+        )
         assert bool(info["void"]) == bool(options)
         assert bool(info["shield_healthy"]) != bool(options)
         np.testing.assert_allclose(
@@ -477,7 +483,7 @@ def test_without_a_reference_the_last_preview_is_driven_on():
 
 def test_where_law_and_planner_are_at_the_same_limit_nothing_was_asked_for():
     """A law beyond its limit gives the limit; the copy, whose law is as strong, must
-    not be told a perturbation.
+    not be given a perturbation.
     """
     controller = filtered(control_high=(0.05, 5.0), width=5.0)
     start = vehicle_state(jnp.asarray([-3.0, -0.2, SPEED]))
@@ -498,11 +504,14 @@ def test_it_is_exported_in_a_scan_and_does_as_call_by_call():
         scripted(), model, LAW, width=0.5, tube=0.3, control_low=LOW, control_high=HIGH
     )
     envs = jnp.asarray([[0.6, 2.0], [0.6, 2.0], [0.4, -5.0], [jnp.nan, 0.0]])
-    xi, reference = vehicle_state(jnp.asarray([0.2, 0.01, SPEED])), circle(0.003, horizon=6)
-    asked = jnp.asarray(scripts()["random"][:4], dtype=float)
+    xi, reference = (
+        vehicle_state(jnp.asarray([0.2, 0.01, SPEED])),
+        circle(0.003, horizon=6),
+    )
+    script = jnp.asarray(scripts()["random"][:4], dtype=float)
 
     def step(memory, env):
-        given = params._replace(weights=params.weights | {"script": asked})
+        given = params._replace(weights=params.weights | {"script": script})
         action, memory, info = controller.act(given, memory, xi, env, reference)
         return memory, (action, info)
 
@@ -547,7 +556,7 @@ def test_it_is_exported_in_a_scan_and_does_as_call_by_call():
         ({"limit": (-0.03, 1.0)}, "limit_low must lie below limit_high"),
     ],
 )
-def test_settings_that_cannot_be_meant_are_refused_in_one_line(changes, line):
+def test_invalid_settings_are_refused_in_one_line(changes, line):
     with pytest.raises(ValueError, match=line) as refusal:
         filtered(**changes)
     assert "\n" not in str(refusal.value)

@@ -120,7 +120,7 @@ def test_a_plan_without_a_filter_is_the_same_array():
         ({"smoothing_window": 13}, "horizon of at least 7"),
     ],
 )
-def test_filters_that_cannot_be_meant_are_refused(settings, words):
+def test_invalid_filters_are_refused(settings, words):
     with pytest.raises(ValueError, match=words):
         planner("plain", **settings)
 

@@ -1,4 +1,4 @@
-"""A thousand steps of a shipped policy while what it is told is wrong every few seconds.
+"""A thousand steps of a shipped policy while its inputs are wrong every few seconds.
 
 `benchmarks/robustness/soak.py` drives the same loop for 10^5 steps, one call of `act` each; here it is one scan.
 """
@@ -32,8 +32,8 @@ def driven():
     @jit
     def run(key):
         def step(carry, _):
-            world, told, state = carry
-            control, state, info = loop.act(loop.params, state, told)
+            world, observed, state = carry
+            control, state, info = loop.act(loop.params, state, observed)
             world, lateral, lost = loop.advance(road, world, control)
             record = (
                 control,

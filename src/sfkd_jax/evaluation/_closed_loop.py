@@ -9,7 +9,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from sfkd_jax.scenarios import Scenario, project, reference_window
-from sfkd_jax.types import Controller, Key, Params, Scalar, State, Step
+from sfkd_jax.types import Controller, ControllerInfo, Key, Params, Scalar, State, Step
 
 
 class Episode(NamedTuple):
@@ -111,7 +111,7 @@ def _noise_levels(observation_noise: tuple[float, ...], state: State) -> State:
 
 
 def _record(
-    info: dict[str, Any], state: State, observed_env: Array
+    info: ControllerInfo, state: State, observed_env: Array
 ) -> tuple[Array, ...]:
     """Fields of an `Episode` that the controller reports, from effective samples on."""
     miss = jnp.linalg.norm(info["predicted_states"][0, :2] - state[:2])

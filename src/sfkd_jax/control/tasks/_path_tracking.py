@@ -47,13 +47,13 @@ class PathTarget(NamedTuple):
         point: x, y, yaw, speed.
         curvature: of the path there [1/m].
         goal: latent of driving exactly along the path.
-        turn: steady turn of the law, if it is a `ModelLaw`.
+        turn: `SteadyTurn` of the law, or None if it is not a `ModelLaw`.
     """
 
     point: Float[Array, "*horizon 4"]
     curvature: Float[Array, "*horizon"]
     goal: Any
-    turn: SteadyTurn | None
+    turn: Any
 
 
 class _Problem(NamedTuple):

@@ -87,6 +87,6 @@ def delay_compensated(
             params, state.inner, arrival, env, reference
         )
         sent = jnp.concatenate([state.sent[1:], control[None]])
-        return control, DelayState(inner, sent), info | {"arrival_state": arrival}
+        return control, DelayState(inner, sent), {**info, "arrival_state": arrival}
 
     return Controller(init, act)

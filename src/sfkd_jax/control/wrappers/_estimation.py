@@ -180,7 +180,7 @@ def _act(
         params, state.inner, observation, estimate, reference
     )
     after = EstimatorState(inner, *hypotheses, control, state.started | clean)
-    return control, after, info | {"env_estimate": estimate, "env_spread": spread}
+    return control, after, {**info, "env_estimate": estimate, "env_spread": spread}
 
 
 def _check(*settings: Any) -> None:

@@ -213,7 +213,8 @@ def _act(
         remaining=remaining,
         held=jnp.where(remaining > 0, state.held + active, 0),
     )
-    report = {
+    report: ControllerInfo = {
+        **info,
         "breach": breach,
         "box_exit": box_exit,
         "disturbance": disturbance,
@@ -221,7 +222,7 @@ def _act(
         "breaches": after.breaches,
         "box_exits": after.box_exits,
     }
-    return control, after, info | report
+    return control, after, report
 
 
 def _disturbance(

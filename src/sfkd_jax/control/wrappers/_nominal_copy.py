@@ -14,7 +14,7 @@ from sfkd_jax.control.laws._path_law import PathLaw
 from sfkd_jax.control.planners._plans import all_finite
 from sfkd_jax.control.tasks._along_path import curvature_ahead, path_coordinates
 from sfkd_jax.core.folding import fold
-from sfkd_jax.core.path_frame import LATERAL, is_valid, path_state
+from sfkd_jax.core.path_frame import LATERAL, PathState, is_valid, path_state
 from sfkd_jax.types import (
     BODY,
     Control,
@@ -24,6 +24,7 @@ from sfkd_jax.types import (
     Model,
     Params,
     Reference,
+    Scalar,
     State,
 )
 
@@ -83,6 +84,11 @@ class CopyUpdate(NamedTuple):
         law_control: control of the law at the measurement or, without one, at the copy.
         applicable: whether that control is finite and the copy is running.
         void: whether the copy is running and the certificate does not apply here.
+        copy: ξ of the copy; NaN before the start.
+        copy_distance: |e_y − ê_y| [m]; NaN without comparison.
+        broken: whether that distance exceeds its bound.
+        dead_reckoning: whether the copy is running without a measurement.
+        env_inside: whether e is in its box.
     """
 
     state: CopyState
@@ -90,6 +96,11 @@ class CopyUpdate(NamedTuple):
     law_control: Control
     applicable: Bool[Array, ""]
     void: Bool[Array, ""]
+    copy: PathState
+    copy_distance: Scalar
+    broken: Bool[Array, ""]
+    dead_reckoning: Bool[Array, ""]
+    env_inside: Bool[Array, ""]
 
 
 def update_copy(
@@ -99,7 +110,7 @@ def update_copy(
     params: Params,
     before: CopyState,
     measured: tuple[State, Environment, Reference],
-) -> tuple[CopyUpdate, dict[str, Array]]:
+) -> CopyUpdate:
     """Compare the copy with a measurement, and evaluate the law and the certificate.
 
     Args:
@@ -109,9 +120,6 @@ def update_copy(
         params: folded or not.
         before: the copy, as `CopyState.advanced` returned it.
         measured: observation, e and reference in the world; each may be not finite.
-
-    Returns:
-        The update, and entries of the controller's `info`, see `shielded`.
     """
     observation, env, reference = measured
     last_env = jnp.where(all_finite(env), env, before.env)
@@ -150,16 +158,18 @@ def update_copy(
     covered &= is_valid(xi[LATERAL], preview[0, 0])
     covered &= _within(xi, valid.state) & _within(preview[0], valid.preview)
     void = started & ~covered
-    flags = {
-        "copy": jnp.where(started, copy, jnp.nan),
-        "copy_distance": jnp.where(compared, distance, jnp.nan),
-        "broken": broken,
-        "void": void,
-        "dead_reckoning": started & ~clean,
-        "env_inside": jnp.all(inside == env),
-    }
-    state = CopyState(latent, started, inside, preview)
-    return CopyUpdate(state, fiber, law_control, applicable, void), flags
+    return CopyUpdate(
+        state=CopyState(latent, started, inside, preview),
+        fiber=fiber,
+        law_control=law_control,
+        applicable=applicable,
+        void=void,
+        copy=jnp.where(started, copy, jnp.nan),
+        copy_distance=jnp.where(compared, distance, jnp.nan),
+        broken=broken,
+        dead_reckoning=started & ~clean,
+        env_inside=jnp.all(inside == env),
+    )
 
 
 def initial_copy(

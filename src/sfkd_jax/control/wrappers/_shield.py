@@ -194,9 +194,7 @@ def _act(
         params, state.inner, observation, env, reference
     )
     measured = (observation, env, reference)
-    now, flags = update_copy(
-        model, settings.law, settings.valid, params, state.copy, measured
-    )
+    now = update_copy(model, settings.law, settings.valid, params, state.copy, measured)
 
     finite = all_finite(planned)
     planned = jnp.clip(jnp.where(finite, planned, 0.0), low, high)
@@ -222,13 +220,18 @@ def _act(
         inner=inner,
         copy=copy.advanced(chosen.latent),
         interventions=state.interventions + (cut > 0.0),
-        broken_steps=state.broken_steps + flags["broken"],
+        broken_steps=state.broken_steps + now.broken,
     )
     feasible = copy.started & chosen.feasible
-    invalid = (
-        flags["broken"] | now.void | flags["dead_reckoning"] | ~flags["env_inside"]
-    )
-    report = {
+    invalid = now.broken | now.void | now.dead_reckoning | ~now.env_inside
+    report: ControllerInfo = {
+        **info,
+        "copy": now.copy,
+        "copy_distance": now.copy_distance,
+        "broken": now.broken,
+        "void": now.void,
+        "dead_reckoning": now.dead_reckoning,
+        "env_inside": now.env_inside,
         "margin": jnp.where(copy.started, chosen.margin, jnp.nan),
         "intervention": cut,
         "perturbation": chosen.nu,
@@ -239,7 +242,7 @@ def _act(
         "broken_steps": after.broken_steps,
         "shield_healthy": feasible & ~invalid,
     }
-    return control, after, info | flags | report
+    return control, after, report
 
 
 def _request(

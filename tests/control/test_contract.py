@@ -1,8 +1,10 @@
-"""What every controller promises, whatever it plans with; `test_mppi.py` asserts the
-rest for `mppi` alone.
+"""The contract of every controller: all registered planners, their variants, and all
+wrappers. `test_mppi.py` asserts more for `mppi` alone.
 """
 
 from functools import cache, partial
+from inspect import signature
+from typing import Required, get_origin, get_type_hints
 
 import jax
 import jax.numpy as jnp
@@ -19,9 +21,11 @@ from helpers import (
     same,
     straight,
 )
+from jaxtyping import jaxtyped
 
-from sfkd_jax import control, evaluation, models, scenarios, vehicle
+from sfkd_jax import build, control, evaluation, models, scenarios, vehicle
 from sfkd_jax.core.folding import fold
+from sfkd_jax.types import ControllerInfo
 
 PLANT = vehicle.kinematic()
 LIMITS = {"control_low": PLANT.control_low, "control_high": PLANT.control_high}
@@ -31,7 +35,15 @@ OFFSET = np.float32([0.0, 0.3, 0.0, 10.0])
 ENV = np.float32([0.7, 3.0])
 REFERENCE = straight(HORIZON)
 BLACKOUTS = {"observation": 1, "infinite": 3, "env": 5}
-"""Steps of the drive at which something cannot be read; the step after each is clean."""
+"""Steps of the drive with an input that is not finite; the step after each is clean."""
+SMALL = {
+    "horizon": HORIZON,
+    "num_samples": 16,
+    "elites": 4,
+    "iterations": 2,
+    "steps": 4,
+}
+"""Small values of settings, for the planners that have them."""
 
 
 def along_path(law, **settings):
@@ -51,10 +63,25 @@ def mppi(law, **settings):
     ), params
 
 
-def searched(search, **settings):
-    """The same by another search, and with slew limits."""
-    task, params = along_path(FEEDBACK, control_rate=(0.5, 20.0))
-    return search(task, horizon=HORIZON, **BOX, **settings), params
+def registered(name):
+    """A planner as it is registered, with small settings and slew limits."""
+    planner = build.PLANNERS[name]
+    known = {
+        argument
+        for factory in planner.factories
+        for argument in signature(factory).parameters
+    }
+    settings = {
+        "planner": name,
+        name: {key: value for key, value in SMALL.items() if key in known},
+        "sampling": "feedback",
+        "ancillary": False,
+        "feedback": {},
+        "cost": {},
+        "task": {"terminal_weight": 1.0, "control_rate": (0.5, 20.0)},
+    }
+    model, params = model_and_params("nominal" if planner.samples else "koopman_mpc")
+    return build.build_controller(settings, model, PLANT, **BOX), params
 
 
 def delay_compensated():
@@ -66,7 +93,7 @@ def delay_compensated():
 
 
 def monitored():
-    """The same, watched, with a fallback that keeps on planning."""
+    """With a monitor whose fallback keeps on planning."""
     controller, params = mppi(FEEDBACK)
     boxes = {"state_low": (0.0,), "state_high": (30.0,)} | LIMITS | BOX
     watched = control.monitored(
@@ -98,49 +125,43 @@ def shielded():
     return filtered, jit(partial(fold, model))(jit(model.init)(jax.random.key(0)))
 
 
-def koopman_mpc():
-    """Over a linear predictor with generic parameters."""
-    model, params = model_and_params("koopman_mpc")
-    return control.koopman_mpc(
-        model, dt=PLANT.dt, horizon=HORIZON, **LIMITS, **BOX
-    ), params
+def estimated():
+    """With an environment that is inferred from the motion, on a coarse grid."""
+    controller, params = mppi(FEEDBACK)
+    model = model_and_params("nominal")[0]
+    return control.estimated(controller, model, **BOX, states=4, points=(3, 4)), params
 
 
 FEEDBACK = control.path_feedback(wheelbase=PLANT.wheelbase)
-BUILDERS = {
-    "mppi": partial(mppi, FEEDBACK),
+PLANNERS = {name: partial(registered, name) for name in build.PLANNERS}
+VARIANTS = {
     "mppi_plain": partial(mppi, control.no_feedback(), noise_std=(0.06, 0.6)),
     "mppi_smoothed": partial(mppi, FEEDBACK, smoothing_window=5),
     "mppi_knots": partial(
         mppi, FEEDBACK, noise="rbf", noise_knots=3, effective_samples=4.0, iterations=2
     ),
-    "cem": partial(searched, control.cem, num_samples=16, elites=4, iterations=2),
-    "gradient": partial(searched, control.gradient_planner, iterations=2, steps=4),
-    "compensated": delay_compensated,
-    "monitored": monitored,
-    "shielded": shielded,
-    "koopman_mpc": koopman_mpc,
 }
+WRAPPERS = {
+    "delay_compensated": delay_compensated,
+    "monitored": monitored,
+    "estimated": estimated,
+    "shielded": shielded,
+}
+BUILDERS = PLANNERS | VARIANTS | WRAPPERS
 """Name -> () -> (controller, params), for `HORIZON` steps of the kinematic plant within
-`LIMITS`.
+`LIMITS`. A planner that is registered in `build.PLANNERS` is among them.
 """
-SAMPLING = (
-    "mppi",
-    "mppi_plain",
-    "mppi_smoothed",
-    "mppi_knots",
-    "cem",
-    "compensated",
-    "monitored",
-)
-"""Those whose plan depends on the key."""
+DETERMINISTIC = ("gradient", "koopman_mpc")
+"""Those whose plan does not depend on the key."""
+IGNORING_ENV = ("estimated",)
+"""Those that do not read the environment, so that NaN there does not matter."""
 
 every = pytest.mark.parametrize("name", BUILDERS)
-every_other = pytest.mark.parametrize(
+every_but_mppi = pytest.mark.parametrize(
     "name", [name for name in BUILDERS if name != "mppi"]
 )
-every_other_sampling = pytest.mark.parametrize(
-    "name", [name for name in SAMPLING if name != "mppi"]
+every_sampling = pytest.mark.parametrize(
+    "name", [name for name in BUILDERS if name not in DETERMINISTIC]
 )
 
 
@@ -249,14 +270,17 @@ def test_controls_are_finite_and_within_the_limits_whatever_is_seen(name):
 
 
 @every
-def test_what_cannot_be_read_is_reported_and_the_next_clean_step_recovers(name):
+def test_an_input_that_is_not_finite_is_reported_and_the_next_clean_step_recovers(name):
     _, info, _ = drive(name)
     healthy = np.asarray(info["healthy"])[:7]
-    assert list(np.flatnonzero(~healthy)) == list(BLACKOUTS.values())
+    broken = {BLACKOUTS[entry] for entry in BLACKOUTS if entry != "env"}
+    if name not in IGNORING_ENV:
+        broken.add(BLACKOUTS["env"])
+    assert set(np.flatnonzero(~healthy)) == broken
     assert np.all(np.isfinite(np.asarray(info["predicted_states"])[:7][healthy]))
 
 
-@every_other
+@every_but_mppi
 def test_compiling_does_not_change_the_action(name):
     controller, params, _, _ = compiled(name)
     alone = controller.act(
@@ -267,7 +291,7 @@ def test_compiling_does_not_change_the_action(name):
     assert same(act_once(name), alone, rtol=1e-4, atol=1e-5)
 
 
-@every_other
+@every_but_mppi
 def test_a_batch_of_controllers_acts_as_each_one_alone(name):
     controller, params, act, _ = compiled(name)
     inputs = [
@@ -290,7 +314,7 @@ def test_a_batch_of_controllers_acts_as_each_one_alone(name):
     assert len(np.unique(np.asarray(batch[0]), axis=0)) == 3
 
 
-@every_other
+@every
 def test_it_is_traced_once_while_state_observation_environment_reference_and_key_change(
     name,
 ):
@@ -309,10 +333,64 @@ def test_it_is_traced_once_while_state_observation_environment_reference_and_key
     assert len(traces) == 1
 
 
-@every_other_sampling
-def test_the_same_key_makes_the_same_plan_and_another_key_another(name):
-    first, again, other = (act_once(name, seed) for seed in (1, 1, 2))
-    assert same(first, again, rtol=0, atol=0)
+@every
+def test_the_same_key_makes_the_same_plan(name):
+    assert same(act_once(name, 1), act_once(name, 1), rtol=0, atol=0)
+
+
+@every_sampling
+def test_another_key_makes_another_plan(name):
+    first, other = (act_once(name, seed) for seed in (1, 2))
     for entry in ("cost", "predicted_states"):
         assert not np.array_equal(first[2][entry], other[2][entry])
-    assert not np.array_equal(first[0], other[0])
+    if name != "shielded":  # its control may be the law's, whatever the plan is
+        assert not np.array_equal(first[0], other[0])
+
+
+@every
+def test_the_state_is_a_pytree_of_arrays_that_can_be_taken_apart(name):
+    _, state, _ = act_once(name)
+    leaves, structure = jax.tree.flatten(state)
+    assert all(isinstance(leaf, jax.Array) for leaf in leaves)
+    again = jax.tree.unflatten(structure, [leaf.copy() for leaf in leaves])
+    assert type(again) is type(state)
+    _, params, act, _ = compiled(name)
+    steps = [act(params, each, OFFSET, ENV, REFERENCE) for each in (state, again)]
+    assert same(*steps, rtol=0, atol=0)
+
+
+DOCUMENTED = get_type_hints(ControllerInfo)
+REQUIRED = {
+    key
+    for key, hint in get_type_hints(ControllerInfo, include_extras=True).items()
+    if get_origin(hint) is Required
+}
+
+
+@jaxtyped(typechecker=None)
+def undocumented(info):
+    """Entries of an info that `ControllerInfo` does not document with their shape."""
+    return {
+        key: value.shape
+        for key, value in info.items()
+        if key not in DOCUMENTED or not isinstance(value, DOCUMENTED[key])
+    }
+
+
+@every
+def test_info_has_the_documented_entries_with_the_documented_shapes(name):
+    _, _, info = act_once(name)
+    assert undocumented(info) == {}
+    assert set(info) >= REQUIRED
+    assert info["predicted_states"].shape == (HORIZON, 4)
+
+
+def test_every_documented_entry_is_given_by_a_planner_or_a_wrapper():
+    given = [act_once(name)[2] for name in BUILDERS]
+    assert set().union(*given) == set(DOCUMENTED)
+
+
+def test_an_entry_of_another_shape_or_name_is_noticed():
+    _, _, info = act_once("mppi")
+    assert undocumented(info | {"cost": jnp.zeros(3)}) == {"cost": (3,)}
+    assert undocumented(info | {"price": jnp.zeros(())}) == {"price": ()}
