@@ -1,5 +1,5 @@
-"""The doors in a row, as a user opens them: last line JSON, one-line errors, artefacts
-intact.
+"""The commands in a row, as a user runs them: last line JSON, errors of one line,
+artefacts intact.
 """
 
 import json
@@ -11,26 +11,28 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from helpers import run_command, last_line
+from helpers import last_line, run_command
 
 from sfkd_jax import artefacts
 
 
 @pytest.fixture(scope="session")
-def walked(tmp_path_factory):
-    """One smoke walk from nothing; tests that spoil it copy it first."""
-    place = tmp_path_factory.mktemp("walk")
-    return place, last_line(run_command("train", "+experiment=smoke", cwd=place))
+def smoke(tmp_path_factory):
+    """One smoke run from nothing; tests that change it copy it first."""
+    directory = tmp_path_factory.mktemp("run")
+    return directory, last_line(
+        run_command("train", "+experiment=smoke", cwd=directory)
+    )
 
 
 @pytest.fixture
-def spoiled(walked, tmp_path):
-    shutil.copytree(walked[0] / "runs", tmp_path / "runs")
+def copied(smoke, tmp_path):
+    shutil.copytree(smoke[0] / "runs", tmp_path / "runs")
     return tmp_path
 
 
-def test_train_walks_from_nothing_to_a_report(walked):
-    place, document = walked
+def test_train_goes_from_nothing_to_a_report(smoke):
+    directory, document = smoke
     keys = {
         "run",
         "checkpoint",
@@ -44,14 +46,14 @@ def test_train_walks_from_nothing_to_a_report(walked):
     assert set(document) == keys | {"objective"}
     assert 0 < document["objective"] < np.inf
     for name in ("run", "checkpoint", "certificate", "results", "report"):
-        assert (place / document[name]).exists()
+        assert (directory / document[name]).exists()
     assert len(document["open_loop_rmse_m"]) == 20
     assert 0.9 < document["alpha"] < 0.996
 
 
-def test_results_have_the_rows_and_keys_that_others_rely_on(walked):
-    place, document = walked
-    results = json.loads((place / document["results"]).read_text())
+def test_results_have_the_rows_and_keys_that_other_programs_use(smoke):
+    directory, document = smoke
+    results = json.loads((directory / document["results"]).read_text())
     assert results["config"]["command"] == "python -m sfkd_jax.train +experiment=smoke"
     rows = {row["system"]: row for row in results["rows"]}
     assert set(rows) == {"sfkd", "nominal", "oracle"}
@@ -86,11 +88,11 @@ def test_results_have_the_rows_and_keys_that_others_rely_on(walked):
     assert rows["nominal"]["rmse_m"]["mean"] > rows["oracle"]["rmse_m"]["mean"]
 
 
-def test_the_certificate_speaks_about_the_saved_weights(walked):
-    place, document = walked
-    certificate = json.loads((place / document["certificate"]).read_text())
+def test_the_certificate_is_about_the_saved_weights(smoke):
+    directory, document = smoke
+    certificate = json.loads((directory / document["certificate"]).read_text())
     _, manifest = artefacts.read_arrays(
-        place / document["run"] / "policy.npz", kind="policy"
+        directory / document["run"] / "policy.npz", kind="policy"
     )
     assert certificate["valid"]
     assert certificate["weights_sha256"] == manifest["sha256"]
@@ -99,11 +101,13 @@ def test_the_certificate_speaks_about_the_saved_weights(walked):
     assert 1.0 <= certificate["tightness"] <= 1.1
 
 
-def test_training_logs_what_can_be_certified_at_every_checkpoint(walked):
-    place, document = walked
+def test_training_logs_what_can_be_certified_at_every_checkpoint(smoke):
+    directory, document = smoke
     lines = [
         json.loads(line)
-        for line in (place / document["run"] / "metrics.jsonl").read_text().splitlines()
+        for line in (directory / document["run"] / "metrics.jsonl")
+        .read_text()
+        .splitlines()
     ]
     saved = [line for line in lines if "validation_loss" in line]
     assert saved
@@ -114,11 +118,11 @@ def test_training_logs_what_can_be_certified_at_every_checkpoint(walked):
     assert all(1.0 - 1e-9 <= line["tightness"] <= 1.1 for line in saved)
 
 
-def test_rows_count_violations_and_the_theorem_is_never_one(walked):
-    place, document = walked
+def test_rows_count_violations_and_the_theorem_is_never_one(smoke):
+    directory, document = smoke
     rows = {
         row["system"]: row
-        for row in json.loads((place / document["results"]).read_text())["rows"]
+        for row in json.loads((directory / document["results"]).read_text())["rows"]
     }
     assert rows["sfkd"]["violation"]["v0"] == 0.0
     assert rows["sfkd"]["violation"]["v1_tube"] == "certified"
@@ -128,24 +132,24 @@ def test_rows_count_violations_and_the_theorem_is_never_one(walked):
     assert rows["nominal"]["breach_steps"] is None
 
 
-def test_the_same_command_again_trains_nothing_and_ends_the_same(walked):
-    place, before = walked
-    weights = (place / before["run"] / "policy.npz").read_bytes()
-    again = last_line(run_command("train", "+experiment=smoke", cwd=place))
-    assert (place / again["run"] / "policy.npz").read_bytes() == weights
+def test_the_same_command_again_trains_nothing_and_ends_the_same(smoke):
+    directory, before = smoke
+    weights = (directory / before["run"] / "policy.npz").read_bytes()
+    again = last_line(run_command("train", "+experiment=smoke", cwd=directory))
+    assert (directory / again["run"] / "policy.npz").read_bytes() == weights
     assert again["open_loop_rmse_m"] == before["open_loop_rmse_m"]
 
 
-def test_other_settings_in_the_same_place_are_refused(walked):
+def test_other_settings_in_the_same_run_directory_are_refused(smoke):
     done = run_command(
-        "train", "+experiment=smoke", "training.steps=100", cwd=walked[0], code=1
+        "train", "+experiment=smoke", "training.steps=100", cwd=smoke[0], code=1
     )
     assert "training.steps was 150, is now 100" in done.stderr
     assert len(done.stderr.strip().splitlines()) == 1
 
 
-def test_load_gives_a_policy_without_heavy_imports(walked):
-    place, document = walked
+def test_load_gives_a_policy_without_heavy_imports(smoke):
+    directory, document = smoke
     program = f"""
         import sys, jax, jax.numpy as jnp, sfkd_jax
         policy = sfkd_jax.load({document["run"]!r})
@@ -166,16 +170,16 @@ def test_load_gives_a_policy_without_heavy_imports(walked):
     """
     done = subprocess.run(
         [sys.executable, "-c", textwrap.dedent(program)],
-        cwd=place,
+        cwd=directory,
         capture_output=True,
         text=True,
     )
     assert done.returncode == 0, done.stderr
 
 
-def test_certify_exits_0_then_3_when_weights_changed_then_0_when_renewed(spoiled):
-    assert last_line(run_command("certify", "+experiment=smoke", cwd=spoiled))["valid"]
-    file = spoiled / "runs/smoke/sfkd/seed=0/policy.npz"
+def test_certify_exits_0_then_3_when_weights_changed_then_0_when_renewed(copied):
+    assert last_line(run_command("certify", "+experiment=smoke", cwd=copied))["valid"]
+    file = copied / "runs/smoke/sfkd/seed=0/policy.npz"
     arrays, manifest = artefacts.read_arrays(file, kind="policy")
     changed = {
         name: np.asarray(array) * np.float32(1.01) for name, array in arrays.items()
@@ -189,56 +193,60 @@ def test_certify_exits_0_then_3_when_weights_changed_then_0_when_renewed(spoiled
     )
     assert (
         "other weights"
-        in run_command("certify", "+experiment=smoke", cwd=spoiled, code=3).stderr
+        in run_command("certify", "+experiment=smoke", cwd=copied, code=3).stderr
     )
     renewed = last_line(
-        run_command("certify", "+experiment=smoke", "certification.renew=true", cwd=spoiled)
+        run_command(
+            "certify", "+experiment=smoke", "certification.renew=true", cwd=copied
+        )
     )
     assert renewed["alpha"] < 1.0
 
 
-def test_a_model_without_a_bound_is_driven_but_refused_a_certificate(walked):
-    place = walked[0]
+def test_a_model_without_a_bound_is_evaluated_but_not_certified(smoke):
+    directory = smoke[0]
     small = (
         "model=sfkd_no_contraction",
         "training.steps=25",
         "training.save_every=25",
         "evaluation.systems=[self]",
     )
-    walk = last_line(run_command("train", "+experiment=smoke", *small, cwd=place))
-    assert walk["alpha"] is None
-    done = run_command("certify", "+experiment=smoke", *small, cwd=place, code=2)
+    trained = last_line(
+        run_command("train", "+experiment=smoke", *small, cwd=directory)
+    )
+    assert trained["alpha"] is None
+    done = run_command("certify", "+experiment=smoke", *small, cwd=directory, code=2)
     assert done.stderr.strip().splitlines()[-1].startswith("sfkd_jax: refused:")
 
 
 @pytest.mark.parametrize("damage", ["truncate", "foreign", "flip"])
-def test_a_damaged_policy_is_named_in_one_line(spoiled, damage):
-    file = spoiled / "runs/smoke/sfkd/seed=0/policy.npz"
+def test_a_damaged_policy_is_named_in_one_line(copied, damage):
+    file = copied / "runs/smoke/sfkd/seed=0/policy.npz"
     content = bytearray(file.read_bytes())
     if damage == "truncate":
         file.write_bytes(content[: len(content) // 2])
     elif damage == "foreign":
-        file.write_bytes(b"not an archive")
+        file.write_bytes(b"not a zip file")
     else:
         content[len(content) // 2] ^= 0xFF
         file.write_bytes(content)
-    done = run_command("evaluate", "+experiment=smoke", cwd=spoiled, code=1)
+    done = run_command("evaluate", "+experiment=smoke", cwd=copied, code=1)
     assert "policy" in done.stderr
     assert "Traceback" not in done.stderr
-    assert (spoiled / "runs/smoke/sfkd/seed=0/results.json").exists()
+    assert (copied / "runs/smoke/sfkd/seed=0/results.json").exists()
 
 
-def test_a_policy_without_its_manifest_is_finished_again_from_the_checkpoint(spoiled):
-    file = spoiled / "runs/smoke/sfkd/seed=0/policy.npz"
+def test_a_policy_without_its_manifest_is_finished_again_from_the_checkpoint(copied):
+    file = copied / "runs/smoke/sfkd/seed=0/policy.npz"
     weights = artefacts.read_arrays(file, kind="policy")[1]["sha256"]
     file.with_suffix(".json").unlink()
-    run_command("certify", "+experiment=smoke", cwd=spoiled)
+    run_command("certify", "+experiment=smoke", cwd=copied)
     assert artefacts.read_arrays(file, kind="policy")[1]["sha256"] == weights
 
 
-def test_a_scenario_of_choice_adds_rows_and_keeps_the_others(spoiled):
-    run_command("evaluate", "+experiment=smoke", "scenario=s1", cwd=spoiled)
-    rows = json.loads((spoiled / "runs/smoke/sfkd/seed=0/results.json").read_text())[
+def test_a_scenario_of_choice_adds_rows_and_keeps_the_others(copied):
+    run_command("evaluate", "+experiment=smoke", "scenario=s1", cwd=copied)
+    rows = json.loads((copied / "runs/smoke/sfkd/seed=0/results.json").read_text())[
         "rows"
     ]
     assert {(row["system"], row["scenario"]) for row in rows} == {
@@ -246,8 +254,8 @@ def test_a_scenario_of_choice_adds_rows_and_keeps_the_others(spoiled):
         for system in ("sfkd", "nominal", "oracle")
         for scenario in ("s1", "s3")
     }
-    report = last_line(run_command("report", "+experiment=smoke", cwd=spoiled))
-    assert all((spoiled / figure).exists() for figure in report["figures"])
+    report = last_line(run_command("report", "+experiment=smoke", cwd=copied))
+    assert all((copied / figure).exists() for figure in report["figures"])
 
 
 @pytest.mark.parametrize(
@@ -265,9 +273,9 @@ def test_a_scenario_of_choice_adds_rows_and_keeps_the_others(spoiled):
         ),
     ],
 )
-def test_bad_input_is_answered_with_the_choices(walked, arguments, says):
+def test_bad_input_gives_one_line_with_the_choices(smoke, arguments, says):
     name = "evaluate" if "systems" in arguments[-1] else "train"
-    done = run_command(name, *arguments, cwd=walked[0], code=1)
+    done = run_command(name, *arguments, cwd=smoke[0], code=1)
     assert says in done.stderr
     assert len(done.stderr.strip().splitlines()) == 1
 

@@ -17,7 +17,7 @@ COMPARED = (
 )
 
 
-def test_compare_drives_every_row_and_continues_where_it_was_stopped(tmp_path):
+def test_compare_evaluates_every_row_and_continues_where_it_stopped(tmp_path):
     first = last_line(run_command("compare", *COMPARED, cwd=tmp_path))
     document = json.loads((tmp_path / first["results"]).read_text())
     rows = {row["system"]: row for row in document["rows"]}

@@ -1,5 +1,5 @@
-"""The demo: what ships with the package drives, its certificate holds, and it beats
-what knows nothing of e.
+"""The demo: shipped policies are evaluated, their certificates hold, and they beat the
+nominal model.
 """
 
 import json
@@ -8,22 +8,24 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from helpers import run_command, last_line, straight
+from helpers import last_line, run_command, straight
 
 from sfkd_jax import artefacts, demo, policy
 from sfkd_jax.certification import Certificate, verify
 
-VEHICLES = sorted(place.name for place in demo.SHIPPED.iterdir())
+VEHICLES = sorted(entry.name for entry in demo.SHIPPED.iterdir())
 
 
 def test_the_demo_drives_without_training_and_draws_an_animation(tmp_path):
-    done = run_command("demo", "controller=mppi_tiny", "demo.episode_s=9.0", cwd=tmp_path)
-    found = last_line(done)
-    assert set(found) == {"animation", "rows", "results"}
-    assert (tmp_path / found["animation"]).read_bytes()[:6] == b"GIF89a"
+    done = run_command(
+        "demo", "controller=mppi_tiny", "demo.episode_s=9.0", cwd=tmp_path
+    )
+    document = last_line(done)
+    assert set(document) == {"animation", "rows", "results"}
+    assert (tmp_path / document["animation"]).read_bytes()[:6] == b"GIF89a"
     rows = {
         row["system"]: row
-        for row in json.loads((tmp_path / found["results"]).read_text())["rows"]
+        for row in json.loads((tmp_path / document["results"]).read_text())["rows"]
     }
     assert set(rows) == {"sfkd", "nominal", "oracle"}
     assert rows["sfkd"]["rmse_m"]["mean"] < 0.5 * rows["nominal"]["rmse_m"]["mean"]
@@ -32,7 +34,7 @@ def test_the_demo_drives_without_training_and_draws_an_animation(tmp_path):
     assert "certificate: holds" in done.stderr
 
 
-def test_along_a_path_the_demo_drives_in_the_corridor_of_its_policy(tmp_path):
+def test_in_path_coordinates_the_demo_stays_in_the_corridor_of_its_policy(tmp_path):
     done = run_command(
         "demo",
         "+experiment=s3",
@@ -40,11 +42,11 @@ def test_along_a_path_the_demo_drives_in_the_corridor_of_its_policy(tmp_path):
         "controller.mppi.num_samples=30",
         cwd=tmp_path,
     )
-    found = last_line(done)
-    assert (tmp_path / found["animation"]).read_bytes()[:6] == b"GIF89a"
+    document = last_line(done)
+    assert (tmp_path / document["animation"]).read_bytes()[:6] == b"GIF89a"
     rows = {
         row["system"]: row
-        for row in json.loads((tmp_path / found["results"]).read_text())["rows"]
+        for row in json.loads((tmp_path / document["results"]).read_text())["rows"]
     }
     assert set(rows) == {"sfkd_path", "nominal", "oracle"}
     certificate = json.loads(
@@ -58,7 +60,7 @@ def test_along_a_path_the_demo_drives_in_the_corridor_of_its_policy(tmp_path):
     "other",
     ["vehicle=kinematic_speed", "vehicle.mass=900.0", "vehicle.name=hovercraft"],
 )
-def test_a_vehicle_for_which_nothing_ships_is_refused_before_it_drives(tmp_path, other):
+def test_a_vehicle_without_a_shipped_policy_is_refused_at_once(tmp_path, other):
     done = run_command("demo", other, cwd=tmp_path, code=1)
     assert done.stderr.startswith("sfkd_jax: controllers ship for ")
     assert len(done.stderr.strip().splitlines()) == 1
@@ -66,7 +68,7 @@ def test_a_vehicle_for_which_nothing_ships_is_refused_before_it_drives(tmp_path,
 
 
 @pytest.mark.parametrize("vehicle", VEHICLES)
-def test_what_ships_loads_and_its_certificate_follows_from_its_witnesses(vehicle):
+def test_shipped_policies_load_and_their_certificates_follow_from_witnesses(vehicle):
     trained = policy.load(demo.SHIPPED / vehicle)
     proof = Certificate.from_document(trained.certificate)
     verify(proof, trained.params, model=trained.model)
@@ -102,7 +104,7 @@ def test_a_policy_with_settings_of_another_version_is_named_in_one_line(
         policy.load(tmp_path)
 
 
-def test_what_ships_also_drives_where_the_environment_is_not_measured():
+def test_shipped_policies_also_work_with_an_estimated_environment():
     trained = policy.load(demo.SHIPPED / "kinematic", env_source="estimated")
     act, state = (
         jax.jit(trained.controller.act),

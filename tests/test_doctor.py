@@ -1,22 +1,20 @@
-"""The doctor: what works is said to work, what does not is named with its reason, and
-nothing is written.
-"""
+"""The doctor names what works and why something does not, and writes nothing."""
 
 import tomllib
 from pathlib import Path
 
 import pytest
-from helpers import run_command, last_line
+from helpers import last_line, run_command
 
 from sfkd_jax import doctor
 
 
-def test_it_says_what_is_there_and_writes_nothing(tmp_path):
+def test_it_reports_the_installation_and_writes_nothing(tmp_path):
     done = run_command("doctor", cwd=tmp_path)
-    found = last_line(done)
-    assert set(found) == {"versions", "devices", "extras", "advice", "seconds"}
-    assert {"python", "jax", "flax", "sfkd_jax"} <= set(found["versions"])
-    assert "certify" in found["extras"]
+    document = last_line(done)
+    assert set(document) == {"versions", "devices", "extras", "advice", "seconds"}
+    assert {"python", "jax", "flax", "sfkd_jax"} <= set(document["versions"])
+    assert "certify" in document["extras"]
     assert "extra certify: works" in done.stdout
     assert list(tmp_path.iterdir()) == []
 
@@ -39,7 +37,7 @@ def test_an_extra_that_is_missing_or_broken_is_named_with_its_reason(
 def test_a_backend_that_computes_wrongly_is_refused(monkeypatch):
     monkeypatch.setattr(doctor.jnp, "roll", lambda matrix, *_, **__: 2.0 * matrix)
     with pytest.raises(ValueError, match="computes wrongly"):
-        doctor._computes()
+        doctor._backend_seconds()
 
 
 def test_advice_is_given_where_something_is_in_the_way(monkeypatch, tmp_path):
@@ -47,7 +45,7 @@ def test_advice_is_given_where_something_is_in_the_way(monkeypatch, tmp_path):
     monkeypatch.setattr(doctor.shutil, "which", lambda name: None)
     assert doctor._advice(tmp_path / "not" / "made" / "yet", ["cpu: cpu"]) == []
     monkeypatch.setattr(doctor.os, "access", lambda *_: False)
-    monkeypatch.setattr(doctor, "ROOM_MB", 10**12)
+    monkeypatch.setattr(doctor, "NEEDED_MB", 10**12)
     monkeypatch.setattr(doctor.shutil, "which", lambda name: "/usr/bin/nvidia-smi")
     written, room, unseen = doctor._advice(tmp_path, ["cpu: cpu"])
     assert "root=DIR" in written

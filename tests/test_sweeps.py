@@ -1,5 +1,5 @@
-"""Sweeps: every job has a run of its own, a job that fails is told and leaves the
-others alone, a study goes on.
+"""Sweeps: every job has its own run, a failed job is reported and does not stop the
+others, a study continues.
 """
 
 import json
@@ -49,8 +49,8 @@ def sweep(tmp_path):
     return start
 
 
-def told(done):
-    """The lines that a sweep ends with: of jobs, and of all."""
+def failures(done):
+    """The last lines of a sweep: one for each failed job, and the total."""
     lines = [line for line in done.stderr.splitlines() if "failed" in line]
     return lines[:-1], lines[-1]
 
@@ -59,7 +59,7 @@ def printed(done, word="{"):
     return [line for line in done.stdout.splitlines() if line.startswith(word)]
 
 
-def test_every_job_has_a_run_that_its_settings_name_and_one_line_if_it_fails(sweep):
+def test_every_job_has_a_run_named_by_its_settings_and_one_line_if_it_fails(sweep):
     done = sweep(
         "-m",
         "+experiment=smoke",
@@ -77,7 +77,7 @@ def test_every_job_has_a_run_that_its_settings_name_and_one_line_if_it_fails(swe
         "training.learning_rate=0.001",
         "training.learning_rate=0.003",
     }
-    jobs, total = told(done)
+    jobs, total = failures(done)
     assert (
         total
         == "sfkd_jax: 8 of 12 jobs failed; the same sweep again skips what is finished"
@@ -89,8 +89,8 @@ def test_every_job_has_a_run_that_its_settings_name_and_one_line_if_it_fails(swe
     )
 
 
-def test_what_a_job_typed_names_its_run_in_a_shell_as_well(sweep):
-    """Of a sweep over more, and outside one."""
+def test_the_command_of_a_job_gives_the_same_run_in_a_shell(sweep):
+    """Within a sweep over more jobs, and outside a sweep."""
     done = sweep("-m", "+experiment=smoke", RATES, "seed=0")
     command = printed(done, "typed")[0].split(" ", 4)[-1]
     again = sweep(
@@ -102,7 +102,7 @@ def test_what_a_job_typed_names_its_run_in_a_shell_as_well(sweep):
     assert printed(again) == printed(done)[:1]
 
 
-def test_what_a_run_directory_names_already_or_what_decides_no_weights_is_not_named(
+def test_model_seed_and_settings_without_effect_on_weights_are_not_named_again(
     sweep,
 ):
     done = sweep(
@@ -114,27 +114,27 @@ def test_what_a_run_directory_names_already_or_what_decides_no_weights_is_not_na
         "evaluation=tiny,quick",
     )
     runs = [json.loads(line)["run"] for line in printed(done)]
-    places = [
+    run_dirs = [
         f"runs/{name}/{model}/seed=0"
         for name in ("s1", "s2")
         for model in ("sfkd_path", "r2dn_path")
     ]
-    assert runs == [place for place in places for _ in range(2)]
+    assert runs == [run_dir for run_dir in run_dirs for _ in range(2)]
     assert done.returncode == 0
 
 
-def test_what_workers_of_joblib_could_not_do_is_told(sweep):
+def test_failures_of_joblib_workers_are_reported(sweep):
     done = sweep("-m", "seed=0,1", "hydra/launcher=cores")
-    jobs, total = told(done)
+    jobs, total = failures(done)
     assert jobs == ["sfkd_jax: job 1 (seed=1) failed: a job that cannot be done"]
     assert total.startswith("sfkd_jax: 1 of 2 jobs failed")
     assert "Traceback" not in done.stderr
     assert done.returncode == 1
 
 
-def test_what_submitit_could_not_do_is_told_with_its_log_and_a_job_that_died_too(sweep):
+def test_failures_of_submitit_jobs_and_killed_jobs_are_reported_with_their_log(sweep):
     done = sweep("-m", "seed=1,4", "hydra/launcher=submitit_local")
-    jobs, total = told(done)
+    jobs, total = failures(done)
     assert ["a job that cannot be done" in job for job in jobs] == [True, False]
     assert "has not produced any output" in jobs[1]
     assert all("_log.err" in job for job in jobs)
@@ -172,7 +172,7 @@ def test_a_study_minimises_survives_a_failure_and_continues(sweep, tmp_path):
         "hydra.sweeper.storage=sqlite:///toy.db",
     )
     grid = ("hydra/sweeper/sampler=grid", "seed=choice(0,1,3,5)")
-    found = []
+    results = []
     for trials in (2, 4):
         done = sweep(
             *options,
@@ -181,11 +181,11 @@ def test_a_study_minimises_survives_a_failure_and_continues(sweep, tmp_path):
             f"hydra.sweep.dir=sweep{trials}",
         )
         assert done.returncode == 0, done.stderr[-2000:]
-        found.append(
+        results.append(
             OmegaConf.load(tmp_path / f"sweep{trials}" / "optimization_results.yaml")
         )
-    assert found[-1].best_value == 0.0
-    assert found[-1].best_params == {"seed": 3}
+    assert results[-1].best_value == 0.0
+    assert results[-1].best_params == {"seed": 3}
 
 
 def test_a_study_fails_if_every_trial_did():
@@ -222,22 +222,23 @@ def composed(**values):
 )
 def test_a_value_is_spelled_so_that_files_can_be_called_by_it(value, spelled):
     name = sweeps.directory(composed(training={"b": value}), {"training.b"})
-    key, found = name.split("=")
+    key, value_name = name.split("=")
     assert key == "training.b"
-    assert found == spelled if not spelled.endswith("-") else found.startswith(spelled)
-    assert len(found) == len(spelled) + (8 if spelled.endswith("-") else 0)
+    exact = not spelled.endswith("-")
+    assert value_name == spelled if exact else value_name.startswith(spelled)
+    assert len(value_name) == len(spelled) + (0 if exact else 8)
 
 
-def test_policies_of_a_comparison_lie_apart_as_its_results_do():
+def test_policies_of_a_comparison_are_as_separate_as_its_results():
     known = {"name": "table1", "comparison": {"policies": "table1"}}
-    asked = ["+experiment=table1", "training.a=1", "name=other"]
-    assert sweeps.with_name(asked, OmegaConf.create(known), "") == asked
-    found = sweeps.with_name(asked, OmegaConf.create(known), "training.a=1")
-    assert found == [*asked[:2], r"name=table1/training.a\=1"]
-    found = sweeps.with_name(
-        asked, OmegaConf.create(known | {"name": "seeds"}), "training.a=1"
+    typed = ["+experiment=table1", "training.a=1", "name=other"]
+    assert sweeps.with_name(typed, OmegaConf.create(known), "") == typed
+    named = sweeps.with_name(typed, OmegaConf.create(known), "training.a=1")
+    assert named == [*typed[:2], r"name=table1/training.a\=1"]
+    named = sweeps.with_name(
+        typed, OmegaConf.create(known | {"name": "seeds"}), "training.a=1"
     )
-    assert found[2:] == [
+    assert named[2:] == [
         r"name=seeds/training.a\=1",
         r"comparison.policies=table1/training.a\=1",
     ]
@@ -284,16 +285,16 @@ def test_a_job_is_waited_for_while_slurm_may_run_it_again(queue, capsys):
     assert queue("7_0|PENDING|BeginTime", "7_1|SUSPENDED|None") == [False, False]
     assert queue("7_0|RUNNING|None", "7_1|COMPLETING|None") == [False, False]
     assert queue("7_0|TIMEOUT|TimeLimit") == [True, True]
-    said = capsys.readouterr().err.splitlines()
-    assert said[0] == "sfkd_jax: Slurm: 1 pending (Resources), 1 running"
-    assert said[-1] == "sfkd_jax: Slurm: 1 gone, 1 timeout"
+    lines = capsys.readouterr().err.splitlines()
+    assert lines[0] == "sfkd_jax: Slurm: 1 pending (Resources), 1 running"
+    assert lines[-1] == "sfkd_jax: Slurm: 1 gone, 1 timeout"
 
 
 def test_what_can_never_start_is_not_waited_for(queue):
     lines = ("7_0|PENDING|PartitionTimeLimit", "7_1|PENDING|Priority")
     assert queue(*lines) == [False, False]
     assert queue(*lines, seconds=queues.HOPELESS_S) == [True, False]
-    assert "never start (Slurm says PartitionTimeLimit)" in queues._said(
+    assert "never start (Slurm says PartitionTimeLimit)" in queues._state_message(
         queue.watcher.get_info("7_0", mode="cache")
     )
     assert queue(

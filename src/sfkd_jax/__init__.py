@@ -1,4 +1,4 @@
-"""Learned dynamics with a stability certificate, driving sampling-based control, in JAX."""
+"""Learned dynamics with a stability certificate for sampling-based control, in JAX."""
 
 from importlib import import_module
 from typing import TYPE_CHECKING, Any
@@ -20,7 +20,7 @@ _LAZY = {
 
 
 def __getattr__(name: str) -> Any:
-    """Load on first use what not every importer of a room wants to pay for."""
+    """Import a public name on first use, so that `import sfkd_jax` stays quick."""
     if name not in _LAZY:
         raise AttributeError(f"module 'sfkd_jax' has no attribute {name!r}")
     return getattr(import_module(f"sfkd_jax.{_LAZY[name]}"), name)

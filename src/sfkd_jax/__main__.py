@@ -30,7 +30,7 @@ def main() -> None:
         entry.hydra_command(import_module(f"sfkd_jax.{command}").run)()
     else:
         hint = messages.did_you_mean(command, (*COMMANDS, COMPLETION))
-        sys.exit(f"sfkd_jax: unknown command {command}{hint}; sfkd lists them")
+        sys.exit(f"sfkd_jax: unknown command {command}{hint or ';'} sfkd lists them")
 
 
 def overview() -> str:

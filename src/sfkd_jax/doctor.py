@@ -40,22 +40,22 @@ EXTRAS = {
         "submitit",
     ),
 }
-"""Extra -> the modules that it must bring."""
-ROOM_MB = 500
-"""What data sets, checkpoints and reports of one experiment need at most."""
+"""Extra -> the modules that it installs."""
+NEEDED_MB = 500
+"""Size of the data set, checkpoints and reports of one experiment, at most."""
 
 
 def run(settings: dict[str, Any]) -> dict[str, Any]:
-    """Look, print what was found with advice, return it.
+    """Print and return the state of the installation, with advice.
 
     Raises:
         ValueError: jax cannot compute here.
     """
-    found = artefacts.versions() | {name: _version(name) for name in CORE}
-    print("  ".join(f"{name} {version}" for name, version in found.items()))
+    versions = artefacts.versions() | {name: _version(name) for name in CORE}
+    print("  ".join(f"{name} {version}" for name, version in versions.items()))
     devices = [f"{device.platform}: {device.device_kind}" for device in jax.devices()]
     print(f"devices: {', '.join(devices)}; {_cores()} processor cores for this process")
-    seconds = _computes()
+    seconds = _backend_seconds()
     print(f"compiles and computes: yes, in {seconds:.1f} s")
     extras = {name: _extra(modules) for name, modules in EXTRAS.items()}
     for name, reason in extras.items():
@@ -68,7 +68,7 @@ def run(settings: dict[str, Any]) -> dict[str, Any]:
         print(f"advice: {line}")
     working = [name for name, reason in extras.items() if reason is None]
     return {
-        "versions": found,
+        "versions": versions,
         "devices": devices,
         "extras": working,
         "advice": advice,
@@ -92,61 +92,67 @@ def _version(name: str) -> str:
 
 
 def _extra(modules: tuple[str, ...]) -> str | None:
-    """Why an extra does not work; None if it does. A package may be there and broken, so each is imported."""
+    """Return why an extra does not work; None if all its modules import."""
     for module in modules:
         try:
             import_module(module)
         except ModuleNotFoundError as absent:
             return f"not installed ({absent.name})"
         except Exception as broken:
-            return f"{module} does not load: {(str(broken) or type(broken).__name__).splitlines()[0]}"
+            reason = (str(broken) or type(broken).__name__).splitlines()[0]
+            return f"{module} does not load: {reason}"
     return None
 
 
-def _computes() -> float:
-    """Seconds that compiling and running a scan of products takes.
+def _backend_seconds() -> float:
+    """Return the seconds that it takes to compile and run a scan of products.
 
     Raises:
         ValueError: it fails, or its result is wrong.
     """
     began, size = time.perf_counter(), 32
-    turn = jnp.roll(jnp.eye(size), 1, axis=0)
+    permutation = jnp.roll(jnp.eye(size), 1, axis=0)
 
     @jax.jit
-    def around(start: jax.Array) -> jax.Array:
+    def rotate(start: jax.Array) -> jax.Array:
         return jax.lax.scan(
-            lambda state, _: (turn @ state, None), start, None, length=size
+            lambda state, _: (permutation @ state, None), start, None, length=size
         )[0]
 
     start = jnp.arange(size, dtype=jnp.float32)
     try:
-        right = bool(jnp.all(around(start) == start))
+        right = bool(jnp.all(rotate(start) == start))
     except Exception as failure:
         raise ValueError(
             f"jax cannot compute on {jax.default_backend()}: {failure}"
         ) from failure
     if not right:
         raise ValueError(
-            f"jax computes wrongly on {jax.default_backend()}: a full turn of a permutation is not the identity"
+            f"jax computes wrongly on {jax.default_backend()}: "
+            "the power of a cyclic permutation is not the identity"
         )
     return time.perf_counter() - began
 
 
 def _advice(root: Path, devices: list[str]) -> list[str]:
-    """What would make work here better, in order of weight."""
-    lines, place = [], root.resolve()
-    while not place.exists():
-        place = place.parent
-    if not os.access(place, os.W_OK):
-        lines.append(f"{place} cannot be written; choose another place with root=DIR")
-    free = shutil.disk_usage(place).free // 2**20
-    if free < ROOM_MB:
+    """Return what would improve the installation, the most important first."""
+    lines, directory = [], root.resolve()
+    while not directory.exists():
+        directory = directory.parent
+    if not os.access(directory, os.W_OK):
         lines.append(
-            f"{free} MB are free below {place}; an experiment needs up to {ROOM_MB}"
+            f"{directory} cannot be written; choose another directory with root=DIR"
+        )
+    free = shutil.disk_usage(directory).free // 2**20
+    if free < NEEDED_MB:
+        lines.append(
+            f"{free} MB are free below {directory}; "
+            f"an experiment needs up to {NEEDED_MB}"
         )
     if "JAX_COMPILATION_CACHE_DIR" not in os.environ:
         lines.append(
-            "set JAX_COMPILATION_CACHE_DIR to a directory, and later runs compile nothing twice"
+            "set JAX_COMPILATION_CACHE_DIR to a directory, so that later runs "
+            "do not compile again"
         )
     if all(device.startswith("cpu") for device in devices) and shutil.which(
         "nvidia-smi"

@@ -13,32 +13,33 @@ FOLDER = "export"
 
 
 def run(settings: dict[str, Any]) -> dict[str, Any]:
-    """Write what lies there; nothing is trained or certified now.
+    """Export the policy of the run; nothing is trained or certified.
 
     Raises:
-        ArtefactError: no policy was trained there, it is damaged, or it was trained
+        ArtefactError: the run has no policy, or one that is damaged or was trained
             with other settings.
     """
-    place = store.run_directory(settings)
-    if not artefacts.exists(place / "policy.npz"):
+    run_dir = store.run_directory(settings)
+    if not artefacts.exists(run_dir / "policy.npz"):
         raise artefacts.ArtefactError(
-            f"{place} holds no trained controller; run train with the same options first"
+            f"{run_dir} holds no trained controller; "
+            "run train with the same options first"
         )
     return _write(settings)
 
 
 @store.exclusive
 def _write(settings: dict[str, Any]) -> dict[str, Any]:
-    """Export the policy that lies there."""
-    place = store.run_directory(settings)
+    """Export the policy while no other process writes to the run directory."""
+    run_dir = store.run_directory(settings)
     store.claim(settings)
-    _, manifest = artefacts.read_arrays(place / "policy.npz", kind=policy.KIND)
+    _, manifest = artefacts.read_arrays(run_dir / "policy.npz", kind=policy.KIND)
     trained = policy.load(
-        place, controller=settings["controller"], env_source=settings["env_source"]
+        run_dir, controller=settings["controller"], env_source=settings["env_source"]
     )
     if trained.certificate is None:
         artefacts.print_message("exported without a certificate and without a monitor")
-    folder = place / FOLDER
+    folder = run_dir / FOLDER
     write_controller(
         trained,
         folder,
@@ -46,7 +47,8 @@ def _write(settings: dict[str, Any]) -> dict[str, Any]:
         **build.as_kwargs(settings["export"]),
     )
     artefacts.print_message(
-        f"exported: {folder}; python {folder / 'run_controller.py'} runs it without sfkd_jax"
+        f"exported: {folder}; python {folder / 'run_controller.py'} "
+        "runs it without sfkd_jax"
     )
     files = {
         "blob": "controller.stablehlo",

@@ -10,14 +10,12 @@ from sfkd_jax.pipeline import stages, store
 
 
 def run(settings: dict[str, Any]) -> dict[str, Any]:
-    """Generate the data set, unless it lies on the shelf already."""
+    """Make the data set, unless it is stored already."""
     began = time.perf_counter()
     dataset, _ = stages.ensure_dataset(settings)
     return {
         "dataset": str(store.dataset_path(settings)),
-        "segments": sum(
-            getattr(dataset, part).controls.shape[0] for part in store.PARTS
-        ),
+        "segments": sum(len(getattr(dataset, part).controls) for part in store.PARTS),
         "seconds": time.perf_counter() - began,
     }
 

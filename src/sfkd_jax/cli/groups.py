@@ -53,7 +53,7 @@ _CHANNELS = {"noise_std": 2, "control_rate": 2}
 
 
 class Demo(NamedTuple):
-    """What `demo` drives."""
+    """Episodes of `demo`."""
 
     episodes: int
     episode_s: _Seconds

@@ -70,8 +70,8 @@ def did_you_mean(name: str, known: Collection[str]) -> str:
     ends = {one.rpartition(".")[2] for one in known}
     last = name.rpartition(".")[2]
     ending = difflib.get_close_matches(last, ends, n=1, cutoff=SIMILAR)
-    found = [one for one in known if one.rpartition(".")[2] in ending]
-    return f"; did you mean {' or '.join(found[:3])}?" if found else ""
+    similar = [one for one in known if one.rpartition(".")[2] in ending]
+    return f"; did you mean {' or '.join(similar[:3])}?" if similar else ""
 
 
 def setting_names(settings: Any, above: str = "") -> Iterator[str]:
@@ -87,7 +87,8 @@ def _unknown_option(reason: MissingConfigException) -> str:
     group, _, option = str(reason.missing_cfg_file).rpartition("/")
     known = [one for one in reason.options or () if not one.endswith(SCHEMA)]
     hint = did_you_mean(option, known) or "."
-    return f"unknown option {group}={option}{hint} Options: {', '.join(known)}"
+    prefix = "+" if group == EXPERIMENT else ""
+    return f"unknown option {prefix}{group}={option}{hint} Options: {', '.join(known)}"
 
 
 def _names_under(overrides: Sequence[str]) -> list[str]:

@@ -7,9 +7,9 @@ from pathlib import Path
 from omegaconf import OmegaConf
 
 GROUPS = {
-    "vehicle": "the simulated vehicle, or own for one that is known from logs",
+    "vehicle": "the simulated vehicle; own is your own, with a step or with logs",
     "scenario": "friction and wind along the road",
-    "dataset": "how training data are driven, or read from log files",
+    "dataset": "simulated training data, or log files",
     "model": "the learned dynamics",
     "controller": "the planner and its cost",
     "training": "loss, batches and optimiser",

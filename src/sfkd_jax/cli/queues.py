@@ -1,4 +1,4 @@
-"""Jobs that submitit queues, under Slurm or on this machine: all are waited for, and what became of each is told."""
+"""Wait for all jobs that submitit queues, and report the outcome of each."""
 
 from __future__ import annotations
 
@@ -15,14 +15,10 @@ from hydra.core.utils import JobReturn, JobStatus
 KILLED = frozenset(
     {"BOOT_FAIL", "CANCELLED", "DEADLINE", "NODE_FAIL", "OUT_OF_MEMORY", "TIMEOUT"}
 )
-"""States of Slurm from which a job does not go on by itself, and which leave no result
-to wait for.
-"""
+"""States of Slurm in which a job has ended without a result."""
 ENDED = KILLED | {"COMPLETED", "FAILED"}
 GONE, NEVER = "GONE", "NEVER_STARTS"
-"""States for a job that Slurm no longer knows, and for one that is pending for a reason
-that will not pass.
-"""
+"""States of a job that Slurm no longer lists, and of one that can never start."""
 _PARTITION = {"PartitionConfig", "PartitionNodeLimit", "PartitionTimeLimit"}
 HOPELESS = _PARTITION | {
     "BadConstraints",
@@ -30,32 +26,28 @@ HOPELESS = _PARTITION | {
     "InvalidAccount",
     "InvalidQOS",
 }
-"""Slurm's reasons for a pending job that only other settings or an administrator can
-remove.
-"""
+"""Slurm's reasons for a pending job that only a user or an administrator can remove."""
 HOPELESS_S = 30
-"""How long such a reason must last to be believed; Slurm also gives it for a moment
-before it has looked.
+"""Seconds for which such a reason must last: Slurm also gives it for a moment before it
+has examined a job.
 """
 POLL_S = 30
-"""Longest time between two questions to Slurm, which forgets a job some time after its
-end (MinJobAge, 300 s).
-"""
+"""Seconds between two queries; Slurm forgets a job 300 s after its end (MinJobAge)."""
 
 
 @contextmanager
-def patient(launcher: Any) -> Iterator[list[str]]:
-    """While it lasts, a job of submitit that failed is a result like another, so that the others are waited for.
+def wait_for_all(launcher: Any) -> Iterator[list[str]]:
+    """Make submitit return a failed job like any other, so that all are waited for.
 
-    States come from squeue: sacct, which submitit asks, needs an accounting data base,
-    and without one a job that was killed would be waited for without end.
+    States come from squeue: sacct, which submitit calls, needs an accounting database,
+    and without one submitit would wait forever for a job that was killed.
 
     Args:
-        launcher: of Hydra; one that does not use submitit is left alone.
+        launcher: of Hydra; nothing changes for one that does not use submitit.
 
     Yields:
-        The log file of each job, in the order in which they were launched; "" of one
-        that never began.
+        The log file of each job, in the order in which they were launched; "" for one
+        that never started.
     """
     logs: list[str] = []
     if not type(launcher).__module__.startswith(
@@ -78,20 +70,20 @@ def patient(launcher: Any) -> Iterator[list[str]]:
                 or job.paths.result_pickle.exists()
             ):
                 return wait(job)
-            told = _said(known)
+            message = _state_message(known)
         except (FailedJobError, UncompletedJobError) as reason:
-            told = _said(known) if "Reason" in known else one_line(reason)
+            message = _state_message(known) if "Reason" in known else one_line(reason)
         if known.get("State") == NEVER:
             job.cancel(check=False)
-        return [JobReturn(status=JobStatus.FAILED, _return_value=RuntimeError(told))]
+        return [JobReturn(status=JobStatus.FAILED, _return_value=RuntimeError(message))]
 
     setattr(submitit.Job, "results", results)  # noqa: B010
     submitit.SlurmJob.watcher = _queue()
     try:
         yield logs
     except KeyboardInterrupt:
-        _say(
-            "the jobs that were submitted go on; squeue --me lists them, scancel stops them"
+        _print_message(
+            "the submitted jobs continue; squeue --me lists them, scancel stops them"
         )
         raise
     finally:
@@ -100,7 +92,7 @@ def patient(launcher: Any) -> Iterator[list[str]]:
 
 
 def one_line(reason: object) -> str:
-    """What was raised, in one line; of submitit's errors, what it was told by others."""
+    """Return an exception in one line, with its type unless the text suffices."""
     words = " ".join(str(reason).split())[:400]
     if (
         isinstance(
@@ -113,7 +105,7 @@ def one_line(reason: object) -> str:
 
 
 def _queue() -> Any:
-    """A watcher for submitit that asks squeue, and says when something changes."""
+    """Return a watcher for submitit that calls squeue and prints changes of state."""
     from submitit.slurm.slurm import SlurmInfoWatcher
 
     class Queue(SlurmInfoWatcher):
@@ -140,20 +132,20 @@ def _queue() -> Any:
                 line.strip().split("|", 1) for line in text.splitlines() if "|" in line
             )
             arrays = {job.split("_")[0] for job in self._registered if "_" in job}
-            found = {}
+            states = {}
             for job in self._registered - self._finished - arrays:
                 state, reason = listed.get(
                     job, f"{GONE}|not in the queue any more"
                 ).split("|")
-                found[job] = {
+                states[job] = {
                     "State": NEVER if self._never(job, state, reason) else state,
                     "Reason": reason,
                 }
-            line = _counted(self._info_dict | found)
+            line = _counted(self._info_dict | states)
             if line != self._line:
                 self._line = line
-                _say(f"Slurm: {line}")
-            return found
+                _print_message(f"Slurm: {line}")
+            return states
 
         def is_done(self, job_id: str, mode: str = "standard") -> bool:
             return self.get_state(job_id, mode=mode) in (*ENDED, GONE, NEVER)
@@ -172,7 +164,7 @@ def _queue() -> Any:
 
 
 def _counted(jobs: dict[str, dict[str, str]]) -> str:
-    """How many jobs are in which state, and why some wait."""
+    """Return the number of jobs in each state, with the reason of those that wait."""
 
     def words(known: dict[str, str]) -> str:
         waits = known["State"] == "PENDING" and known["Reason"] != "None"
@@ -182,12 +174,15 @@ def _counted(jobs: dict[str, dict[str, str]]) -> str:
     return ", ".join(f"{count} {state}" for state, count in sorted(states.items()))
 
 
-def _said(known: dict[str, str]) -> str:
-    """Slurm's last word on a job."""
+def _state_message(known: dict[str, str]) -> str:
+    """Return the last state of a job that gave no result."""
     if known["State"] == NEVER:
-        return f"it can never start (Slurm says {known['Reason']}); hydra.launcher asks for too much"
+        return (
+            f"it can never start (Slurm says {known['Reason']}); "
+            "hydra.launcher asks for too much"
+        )
     return f"Slurm says {known['State']} ({known['Reason']})"
 
 
-def _say(text: str) -> None:
+def _print_message(text: str) -> None:
     print(f"sfkd_jax: {text}", file=sys.stderr, flush=True)

@@ -1,4 +1,4 @@
-"""Sweeps: a run directory for every job, and one line for every job that failed."""
+"""Sweeps: a run directory for each job, and one line for each job that failed."""
 
 from __future__ import annotations
 
@@ -21,11 +21,11 @@ from sfkd_jax.cli import queues
 from sfkd_jax.pipeline import store
 
 NAMED = frozenset({"model", "seed"})
-"""Swept settings that a run directory names by itself."""
+"""Swept settings that the path of a run directory contains anyway."""
 LONGEST = 40
-"""Characters of a value that a directory spells out; of what is longer, a hash."""
+"""Characters of a value in a directory name; a longer value is cut and hashed."""
 LONGEST_NAME = 160
-"""Characters of all swept settings together; file systems take 255."""
+"""Characters of all swept settings together; file systems allow 255."""
 
 
 class SweepError(RuntimeError):
@@ -45,22 +45,28 @@ class Outcome(NamedTuple):
 
 
 class Sweep:
-    """What became of the jobs of one command."""
+    """The jobs of one command and their failures.
+
+    Attributes:
+        jobs: how many have ended.
+        failures: one line for each that failed.
+        is_study: whether a sweeper searches, so that single trials may fail.
+    """
 
     def __init__(self) -> None:
-        """Begin with none."""
+        """Start without jobs."""
         self.jobs = 0
         self.failures: list[str] = []
         self.is_study = False
 
     def status(self) -> int:
-        """Exit status: 1 if a job failed; of a study, whose trials may fail, 1 if all did."""
+        """Return the exit status: 1 if a job failed; for a study, if all did."""
         if self.is_study:
             return int(self.jobs > 0 and len(self.failures) == self.jobs)
         return int(bool(self.failures))
 
     def report(self) -> None:
-        """One line for each job that failed, and how many did, on stderr."""
+        """Print one line for each job that failed, and their number, on stderr."""
         if self.failures:
             count = f"{len(self.failures)} of {self.jobs} jobs failed"
             lines = [
@@ -76,18 +82,18 @@ class Sweep:
 
 
 class _NamedJobs(Launcher):
-    """Any launcher, whose jobs have a directory each and tell the sweep what became of them."""
+    """A launcher that gives each job a run directory and records its outcome."""
 
     def __init__(self, inner: Launcher, sweep: Sweep) -> None:
         self._inner, self._sweep = inner, sweep
 
     def setup(self, **_: Any) -> None:
-        """Nothing to do: the inner launcher is set up."""
+        """Do nothing: the inner launcher is set up."""
 
     def launch(
         self, job_overrides: Sequence[Sequence[str]], initial_job_idx: int
     ) -> Sequence[JobReturn]:
-        """Launch, and wait for all.
+        """Launch all jobs and wait for them.
 
         Raises:
             SweepError: they could not be launched.
@@ -105,9 +111,9 @@ class _NamedJobs(Launcher):
                 with_name(list(overrides), composed, directory(composed, named))
             )
         try:
-            with queues.patient(inner) as logs:
+            with queues.wait_for_all(inner) as logs:
                 returned = inner.launch(jobs, initial_job_idx=initial_job_idx)
-        except Exception as reason:  # each launcher raises what its own libraries raise
+        except Exception as reason:  # launchers raise the errors of many libraries
             raise SweepError(
                 f"the sweep stopped: {queues.one_line(reason)}"
             ) from reason
@@ -122,19 +128,19 @@ class _NamedJobs(Launcher):
 
     def _note(self, job: JobReturn, name: str, log: str | None) -> None:
         """Count a job, and give its objective to the sweeper."""
-        found = job._return_value
-        if not isinstance(found, Outcome):  # it never came to its end
-            found = Outcome(float("inf"), queues.one_line(found))
+        outcome = job._return_value
+        if not isinstance(outcome, Outcome):  # the job did not end by itself
+            outcome = Outcome(float("inf"), queues.one_line(outcome))
         self._sweep.jobs += 1
-        if found.failure is not None:
+        if outcome.failure is not None:
             where = f"; log: {log}" if log else ""
-            self._sweep.failures.append(f"{name} failed: {found.failure}{where}")
-        job.status, job.return_value = JobStatus.COMPLETED, found.objective
+            self._sweep.failures.append(f"{name} failed: {outcome.failure}{where}")
+        job.status, job.return_value = JobStatus.COMPLETED, outcome.objective
 
 
 @contextmanager
 def watched() -> Iterator[Sweep]:
-    """While it lasts, jobs that Hydra launches are named and counted, whatever launches them."""
+    """Name and count the jobs that Hydra launches, with any launcher."""
     sweep, instantiate = Sweep(), Plugins.instantiate_launcher
 
     def watching(
@@ -151,20 +157,28 @@ def watched() -> Iterator[Sweep]:
 
 
 def swept_settings(config: DictConfig) -> set[str]:
-    """The settings that a sweep varies, of its composed `config`."""
+    """Return the names of the settings that a sweep varies.
+
+    Args:
+        config: composed, of the sweep.
+    """
     params = (config.hydra.sweeper or {}).get("params") or {}
-    asked = chain(
+    overrides = chain(
         config.hydra.overrides.task, (f"{key}={value}" for key, value in params.items())
     )
-    parsed = OverridesParser.create().parse_overrides(list(asked))
-    return {found.key_or_group for found in parsed if found.is_sweep_override()}
+    parsed = OverridesParser.create().parse_overrides(list(overrides))
+    return {one.key_or_group for one in parsed if one.is_sweep_override()}
 
 
 def directory(config: DictConfig, swept: set[str]) -> str:
-    """What tells a job's run from the others: key=value,... in the order of keys; "" if nothing does.
+    """Return key=value,... of the swept settings of a job, sorted by key.
 
-    The value is that of the composed settings, so that 1e-3 and 0.001 are one, or the
-    option of a group.
+    A value is that of the composed settings, so that 1e-3 and 0.001 give one name, or
+    the option of a group.
+
+    Args:
+        config: composed, of the job.
+        swept: names of the settings; "" is returned for none.
     """
     choices = config.hydra.runtime.choices
     parts = []
@@ -176,14 +190,16 @@ def directory(config: DictConfig, swept: set[str]) -> str:
 
 
 def with_name(overrides: list[str], config: DictConfig, added: str) -> list[str]:
-    """The overrides of a job whose run is called name/added, and so are the policies of a comparison if it is one."""
+    """Return the overrides of a job with name/added as the name of its run.
+
+    The policies of a comparison get the same ending.
+    """
     names = {"name": config.name, "comparison.policies": config.comparison.policies}
     for key, name in names.items() if added else ():
         if key != "name" and name == config.name:
-            continue  # it follows
-        escaped = re.sub(
-            r"([\\()\[\]{}:=, \t])", r"\\\1", f"{name}/{added}"
-        )  # what Hydra reads as its own grammar
+            continue  # it follows the name by interpolation
+        # Characters of Hydra's grammar are escaped.
+        escaped = re.sub(r"([\\()\[\]{}:=, \t])", r"\\\1", f"{name}/{added}")
         overrides = [
             *(word for word in overrides if not word.startswith(f"{key}=")),
             f"{key}={escaped}",
@@ -192,7 +208,7 @@ def with_name(overrides: list[str], config: DictConfig, added: str) -> list[str]
 
 
 def _spelled(value: Any) -> str:
-    """A value as part of a file name: itself if it is short and plain, else what is plain of it and a hash."""
+    """Return a value as part of a file name; a long or special one gets a hash."""
     if OmegaConf.is_config(value):
         value = OmegaConf.to_container(value, resolve=True)
     text = value if isinstance(value, str) else json.dumps(value)
