@@ -8,7 +8,8 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from sfkd_jax.scenarios import side_pushes
+from sfkd_jax.core.ranges import Real
+from sfkd_jax.scenarios import random_side_forces
 from sfkd_jax.types import Key
 from sfkd_jax.vehicle import Vehicle, equivalent_wind
 
@@ -27,7 +28,7 @@ def observed_environment(
     dt: float,
     delay_s: float = 0.0,
     noise: tuple[float, float] = (0.0, 0.0),
-    bias: tuple[float, float] = (0.0, 0.0),
+    bias: tuple[Real, Real] = (0.0, 0.0),
 ) -> Float[Array, "time 2"]:
     """Return ê_k = e_{k−d} + b + n_k: delayed, biased, with white noise.
 
@@ -74,7 +75,7 @@ def disturbed_environment(
         raise ValueError(
             "evaluation.side_forces act through the wind, but vehicle.wind_force is 0"
         )
-    force = side_pushes(
+    force = random_side_forces(
         jax.random.fold_in(key, FORCE_STREAM),
         steps=envs.shape[0],
         dt=plant.dt,
