@@ -146,7 +146,8 @@ ARGUED = {
         *('mode <= "joint"', "if name <= JOINT[0]"),
     ),
     "nothing that is proved or measured depends on it": (
-        *("np.nextafter(0.0, 2.0)", "initial= -1.0", "strict=False)])"),
+        *("np.nextafter(0.0, 2.0)", "initial= -1.0", "largest, limit = 1.0"),
+        "zip(reference.scores.T, shares, strict=False)",
         # Sizes of batches, compilation, and one iteration more or less.
         *("CHUNK = ", "-(-count * CHUNK) * CHUNK", "BATCH = "),
         *("def _largest", "def _fixed_points_on_grid("),
