@@ -25,7 +25,7 @@ def foot(curvature: float, progress: float) -> jax.Array:
 
 @pytest.mark.parametrize("curvature", CURVATURES)
 @pytest.mark.parametrize("progress", [-2.0, 0.0, 1.3])
-def test_a_pose_beside_a_circle_is_found_again(curvature, progress):
+def test_a_pose_beside_a_circle_has_its_own_coordinates(curvature, progress):
     for lateral, heading in ((0.0, 0.0), (0.7, -0.2), (-1.5, 0.4)):
         pose = compose(foot(curvature, progress), jnp.asarray([0.0, lateral, heading]))
         np.testing.assert_allclose(
@@ -42,7 +42,7 @@ def test_derivatives_exist_also_without_curvature_and_beyond_the_centre(curvatur
         assert all(bool(jnp.all(jnp.isfinite(leaf))) for leaf in jax.tree.leaves(rates))
 
 
-def test_a_car_near_the_centre_of_curvature_is_told_and_stays_finite():
+def test_a_car_near_the_centre_of_curvature_is_invalid_but_finite():
     assert bool(is_valid(jnp.asarray(7.9), jnp.asarray(0.1)))
     assert not bool(is_valid(jnp.asarray(8.1), jnp.asarray(0.1)))
     assert not bool(is_valid(jnp.asarray(jnp.nan), jnp.asarray(0.1)))
@@ -55,7 +55,7 @@ def test_a_car_near_the_centre_of_curvature_is_told_and_stays_finite():
     "plant", [vehicle.kinematic(), vehicle.dynamic()], ids=lambda plant: plant.name
 )
 @pytest.mark.parametrize("curvature", [-0.02, 0.0, 0.015])
-def test_the_loop_in_path_coordinates_drives_what_the_vehicle_drives_in_the_world(
+def test_the_loop_in_path_coordinates_agrees_with_the_drive_in_the_world(
     plant, curvature
 ):
     """The same feedback, once on ξ and once on the projection onto a path of constant
@@ -73,25 +73,25 @@ def test_the_loop_in_path_coordinates_drives_what_the_vehicle_drives_in_the_worl
     path = path_from_curvature(jnp.full(400, curvature), spacing=0.5)
     world = jnp.zeros(size).at[1].set(0.3).at[3].set(9.5)
     along = path_state(world[1:])
-    place = jnp.zeros(())
+    progress = jnp.zeros(())
 
     @jax.jit
-    def in_the_world(world, place):
-        heading = world[2] - curvature * place
+    def in_the_world(world, progress):
+        heading = world[2] - curvature * progress
         xi = jnp.concatenate(
-            [jnp.stack([project(path, world[:2], place)[1], heading]), world[3:]]
+            [jnp.stack([project(path, world[:2], progress)[1], heading]), world[3:]]
         )
         world = plant.step(world, law(xi, curvature, 9.0, env) + inputs[:2], env)
-        return world, *project(path, world[:2], place + 0.9)
+        return world, *project(path, world[:2], progress + 0.9)
 
     for _ in range(40):
-        world, place, lateral = in_the_world(world, place)
+        world, progress, lateral = in_the_world(world, progress)
         along = step(along, inputs, env)
         np.testing.assert_allclose(along[BODY][0], lateral, atol=2e-4)
     np.testing.assert_allclose(along[BODY][2:], world[3:], atol=2e-4)
     assert not np.any(np.asarray(along[:3]))
 
 
-def test_a_vehicle_without_limits_cannot_be_closed_around():
+def test_a_vehicle_without_limits_has_no_closed_loop():
     with pytest.raises(ValueError, match="control_low"):
         vehicle.along_path(vehicle.own(), lambda xi, kappa, speed, env: jnp.zeros(2))

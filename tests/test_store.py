@@ -1,10 +1,17 @@
-"""Run directories from which checkpoints cannot be read are refused before training."""
+"""Run directories from which checkpoints cannot be read are refused before training;
+data sets come back with the scenario of every segment.
+"""
 
 from pathlib import Path
 
+import jax.numpy as jnp
+import numpy as np
 import pytest
+from helpers import dataset
 
-from sfkd_jax.pipeline import store
+from sfkd_jax import datasets
+from sfkd_jax.artefacts import ArtefactError
+from sfkd_jax.pipeline import stages, store
 
 SETTINGS = {name: {} for name in store.IDENTITY} | {
     "model": {"system": "sfkd"},
@@ -24,3 +31,53 @@ def test_other_unusual_names_are_claimed(tmp_path):
     settings = SETTINGS | {"root": str(tmp_path), "name": "a=0.1,b=c d"}
     store.claim(settings)
     assert (Path(store.run_directory(settings)) / "settings.json").exists()
+
+
+def generated(tmp_path):
+    """Settings of a generated data set, which is stored."""
+    box = {"env_low": [0.3, -8.0], "env_high": [0.9, 8.0]}
+    settings = SETTINGS | {"root": str(tmp_path), "dataset": box}
+    settings |= {"vehicle": {"name": "kinematic"}}
+    store.write_dataset(settings, dataset(count=20, steps=8))
+    return settings
+
+
+def test_a_data_set_comes_back_with_the_scenario_of_every_segment(tmp_path):
+    stored, _ = store.read_dataset(generated(tmp_path))
+    for part, labels in dataset(count=20, steps=8).scenarios.items():
+        np.testing.assert_array_equal(stored.scenarios[part], labels)
+        assert len(labels) == len(getattr(stored, part).controls)
+
+
+def test_a_data_set_of_an_earlier_version_is_refused_in_one_line(tmp_path):
+    settings = generated(tmp_path)
+    store.write_dataset(settings, dataset(count=20, steps=8)._replace(scenarios=None))
+    with pytest.raises(ArtefactError, match="made by an earlier version") as refusal:
+        store.read_dataset(settings)
+    assert "\n" not in str(refusal.value)
+
+
+def test_coverage_is_measured_on_the_segments_of_each_scenario(tmp_path, monkeypatch):
+    monkeypatch.setattr(stages, "_switching", lambda options: "drives of S3")
+    data = dataset(count=20, steps=8)
+    labels = np.arange(len(data.test.controls)) % len(datasets.SCENARIOS)
+    data = data._replace(scenarios={"test": labels})
+    parts = stages.held_out_parts(generated(tmp_path), data)
+    assert set(parts) == {"test", "s3", *np.take(datasets.SCENARIOS, np.unique(labels))}
+    for code, name in enumerate(datasets.SCENARIOS):
+        if name in parts:
+            np.testing.assert_array_equal(
+                parts[name].states, np.asarray(data.test.states)[labels == code]
+            )
+
+
+def test_baselines_stand_beside_the_errors_of_the_model():
+    errors = jnp.asarray([[0.3, 0.4, 0.1, 0.2], [0.6, 0.8, 0.2, 0.3]])
+    document = store.open_loop_document(
+        errors, dataset(count=20, steps=8).test, 0.1, {"constant_turn": 2.0 * errors}
+    )
+    assert document["steps"] == [1, 2]
+    np.testing.assert_allclose(document["position_rmse_m"], [0.5, 1.0])
+    turn = document["baselines"]["constant_turn"]
+    assert set(turn) == set(document) - {"steps", "dt", "trajectories", "baselines"}
+    np.testing.assert_allclose(turn["position_rmse_m"], [1.0, 2.0])

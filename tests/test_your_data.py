@@ -1,4 +1,4 @@
-"""Logs of one's own through the command: from csv files to a certified policy that loads."""
+"""Recorded drives through the commands: from csv files to a policy that loads."""
 
 import json
 import shutil
@@ -9,7 +9,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from helpers import run_command, last_line
+from helpers import last_line, run_command
 from hydra import compose, initialize_config_dir
 from omegaconf import OmegaConf
 
@@ -82,6 +82,18 @@ def test_logs_become_a_certified_policy_of_a_robot_that_nothing_drives(logs):
     )
     assert walked["results"] is None
     assert "not driven" in done.stderr
+    errors = json.loads((logs.parent / walked["run"] / "open_loop.json").read_text())
+    assert set(errors["baselines"]) == {
+        "constant_velocity",
+        "constant_turn",
+        "kinematic_bicycle",
+        "fitted_bicycle",
+    }
+    fitted = errors["baselines"]["fitted_bicycle"]["position_rmse_m"]
+    assert len(fitted) == len(errors["position_rmse_m"]) == 5
+    assert max(fitted) < max(
+        errors["baselines"]["constant_velocity"]["position_rmse_m"]
+    )
     certificate = json.loads((logs.parent / walked["certificate"]).read_text())
     assert certificate["valid"]
     assert certificate["boxes"]["names"] == {
@@ -102,7 +114,7 @@ def test_logs_become_a_certified_policy_of_a_robot_that_nothing_drives(logs):
     ].shape == (2,)
 
 
-def test_logs_lie_on_the_shelf_with_their_coverage_and_test_drives_alone_are_held_out(
+def test_logs_are_stored_with_their_coverage_and_only_test_drives_are_held_out(
     logs, monkeypatch
 ):
     monkeypatch.chdir(logs.parent)
@@ -118,6 +130,47 @@ def test_logs_lie_on_the_shelf_with_their_coverage_and_test_drives_alone_are_hel
     )
     assert set(covered["state"]) == {"v", "yaw_rate"}
     assert 4.0 <= covered["state"]["v"]["low"] < covered["state"]["v"]["high"] <= 6.0
+
+
+def test_logs_with_units_jumps_and_standstill_become_a_data_set(
+    logs, tmp_path, monkeypatch, capsys
+):
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "logs").mkdir()
+    for k in range(8):
+        columns = drive(seconds=12.0, phase=0.8 * k)
+        columns["yaw_rate (deg/s)"] = np.rad2deg(
+            np.gradient(columns["yaw"], columns["t"])
+        )
+        columns["p_x"] = columns["p_x"] + 50.0 * (columns["t"] > 5.95)
+        columns["v"] = np.where(columns["t"] > 9.95, 0.0, columns["v"])
+        columns["v [km/h]"] = 3.6 * columns.pop("v")
+        write_csv(tmp_path / "logs" / f"{k}.csv", columns)
+    with pytest.raises(ValueError, match=r"positions move|jump"):
+        stages.ensure_dataset(settings(*SMALL))
+    cut = ("dataset.split_at_jumps=true", "dataset.min_speed=0.5")
+    dataset, _ = stages.ensure_dataset(settings(*SMALL, *cut))
+    lines = capsys.readouterr().err
+    assert "v [km/h] to m/s" in lines
+    assert "jump 50" in lines
+    assert "dropped by dataset.min_speed=0.5" in lines
+    # 6 s before the jump are 5 segments of 1 s, 3.9 s behind it are 3.
+    assert sum(len(part.states) for part in dataset[:4]) == 8 * (5 + 3)
+    assert dataset.scenarios is None
+    turned = np.asarray(dataset.train.states)[..., 4]
+    assert np.abs(turned).max() < 0.37
+
+
+def test_a_step_of_the_wrong_shape_is_one_line(tmp_path, monkeypatch):
+    (tmp_path / "short_step.py").write_text("def step(x, u, e):\n    return x[:3]\n")
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.syspath_prepend(tmp_path)
+    limits = ("vehicle.control_low=[-0.4,-3.0]", "vehicle.control_high=[0.4,2.0]")
+    own = settings(
+        "dataset=tiny", "vehicle=own", "vehicle.step=short_step:step", *limits
+    )
+    with pytest.raises(ValueError, match=r"^the step of vehicle own [^\n]*$"):
+        stages.ensure_dataset(own)
 
 
 def test_what_logs_cannot_support_is_refused_before_a_run_is_begun(logs, monkeypatch):

@@ -9,7 +9,6 @@ from typing import Any
 
 import jax
 import jax.numpy as jnp
-import numpy as np
 
 from sfkd_jax import artefacts, build, policy
 from sfkd_jax.datasets import (
@@ -26,8 +25,6 @@ from sfkd_jax.types import Trajectory
 from sfkd_jax.vehicle import check_step
 
 SPLIT = ("shares", "env_low", "env_high", "seed")
-CONSTANT = ("s1", "held")
-"""Scenarios of generated segments in which the environment is constant."""
 SWITCHING = 2
 """Stream folded into the data set's seed; simulation and split use streams 0 and 1."""
 
@@ -125,24 +122,22 @@ def _check_calibration_size(settings: dict[str, Any]) -> None:
 def held_out_parts(settings: dict[str, Any], dataset: Dataset) -> dict[str, Trajectory]:
     """Return the trajectories on which coverage is measured, by name.
 
-    These are the test part, its segments with a constant environment ("s1") and with a
-    varying one ("s2"), by the scenarios that they were generated from, and as many new
-    segments under the switching of S3. Logs have the test part only: their scenario is
-    unknown, and they cannot be driven again.
+    These are the test part, its segments of each scenario, and as many drives of S3,
+    which training never uses. Logged drives have no scenario: of them it is the test
+    part only.
 
     Args:
         settings: of the run.
-        dataset: its data set.
+        dataset: of the run.
     """
     if dataset.scenarios is None:
         return {"test": dataset.test}
-    scenarios = np.asarray(dataset.scenarios["test"])
-    constant = np.isin(scenarios, [SCENARIOS.index(name) for name in CONSTANT])
+    labels = dataset.scenarios["test"]
     options = {name: settings[name] for name in ("vehicle", "dataset", "root")}
     options |= {"segments": dataset.test.controls.shape[0]}
     parts = {"test": dataset.test, "s3": _switching(json.dumps(options))}
-    for name, chosen in (("s1", constant), ("s2", ~constant)):
-        if chosen.any():
+    for code, name in enumerate(SCENARIOS):
+        if (chosen := labels == code).any():
             parts[name] = jax.tree.map(
                 lambda leaf, chosen=chosen: leaf[chosen], dataset.test
             )
