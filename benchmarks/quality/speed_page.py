@@ -107,4 +107,4 @@ if __name__ == "__main__":
     measured = json.loads(MEASURED.read_text("utf-8"))
     PAGE.write_text(page(PAGE.read_text("utf-8"), measured), "utf-8")
     shown = {name: result["cells"] for name, result in measured["cars"].items()}
-    print(draw_speed(FIGURE, shown, room=measured["room_m"]))
+    print(draw_speed(FIGURE, shown, margin=measured["room_m"]))

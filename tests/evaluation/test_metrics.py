@@ -9,7 +9,7 @@ from test_scores import CALM, DT, STEPS, about, episode
 
 from sfkd_jax.evaluation import Episode, pool, row, score
 from sfkd_jax.evaluation.formats import DASH
-from sfkd_jax.evaluation.metrics import BY_NAME, METRICS, Metric, in_table
+from sfkd_jax.evaluation.metrics import BY_NAME, METRICS, Metric, in_table, text_table
 
 MEASURED = [metric for metric in METRICS if metric.measure]
 SHOWN = [metric for metric in METRICS if metric.label]
@@ -171,3 +171,17 @@ def test_a_new_metric_takes_one_entry(monkeypatch):
     assert made()["largest_steering_rad"] == pytest.approx(0.1 * 0.9 * STEPS * DT)
     assert pool([made(0), made(1)])["largest_steering_rad"] == pytest.approx(1.8)
     assert new in in_table("tracking")
+
+
+def test_a_printed_table_is_aligned_and_in_millimetres():
+    rows = [
+        {"system": "sfkd", "rmse_m": {"mean": 0.0342}, "max_deviation_m": 0.1368},
+        {"system": "nominal", "rmse_m": {"mean": 0.12}},
+    ]
+    head, *lines = text_table(rows, "rmse_m", "max_deviation_m")
+    assert head.split("   ")[-1] == "Largest deviation [mm]"
+    assert [line.split() for line in lines] == [
+        ["sfkd", "34.2", "137"],
+        ["nominal", "120.0", DASH],
+    ]
+    assert len({len(line) for line in (head, *lines)}) == 1

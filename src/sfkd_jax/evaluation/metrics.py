@@ -211,7 +211,7 @@ def _ahead(steps: int) -> Metric:
 
 # fmt: off
 METRICS: tuple[Metric, ...] = (
-    Metric("rmse_m", "RMSE, mean ± std", "m", "tracking", mean_std, 1, _rmse, summary,
+    Metric("rmse_m", "RMSE", "m", "tracking", mean_std, 1, _rmse, summary,
            lambda rows: summary(np.asarray(_of_trainings(rows)))),
     Metric("rmse_m.ci95", "95 % interval", "m", "tracking", interval),
     Metric("rmse_m.median", "Median", "m", "spread", number, 1),
@@ -230,11 +230,11 @@ METRICS: tuple[Metric, ...] = (
     Metric("violation.v0", "V0, theorem", "%", "claims", percent),
     Metric("violation.v1", "V1, certified tube", "%", "claims", percent,
            read=_certified("v1")),
-    Metric("violation.v1_radius_m", "mean radius of the certified tube", "m", "claims",
+    Metric("violation.v1_radius_m", "Radius of the certified tube", "m", "claims",
            read=_certified("v1_radius_m")),
     Metric("violation.v1_conformal", "V1, conformal tube", "%", "claims", percent,
            read=_conformal("v1_conformal", "v1")),
-    Metric("violation.v1_conformal_radius_m", "mean radius of the conformal tube", "m",
+    Metric("violation.v1_conformal_radius_m", "Radius of the conformal tube", "m",
            "claims", read=_conformal("v1_conformal_radius_m", "v1_radius_m")),
     Metric("violation.v2", "V2, threshold", "%", "claims", percent),
     Metric("departures", "Left the lane", "", "spread", short, None, _departed,
@@ -274,3 +274,16 @@ BY_NAME: dict[str, Metric] = {metric.name: metric for metric in METRICS}
 def in_table(table: str) -> list[Metric]:
     """The metrics that a table shows."""
     return [metric for metric in METRICS if metric.table == table]
+
+
+def text_table(rows: list[Row], *names: str) -> list[str]:
+    """Metrics of rows as the lines of a table, lengths in millimetres."""
+    metrics = [BY_NAME[name] for name in names]
+    cells = [["system", *(metric.head(mm=True) for metric in metrics)]]
+    for row in rows:
+        cells.append([row["system"], *(one.text(row, mm=True) for one in metrics)])
+    widths = [max(map(len, column)) for column in zip(*cells, strict=True)]
+    return [
+        "   ".join(cell.rjust(width) for cell, width in zip(line, widths, strict=True))
+        for line in cells
+    ]

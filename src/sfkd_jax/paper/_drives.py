@@ -1,4 +1,4 @@
-"""The first episode of every cell of a comparison, as far as its arrays are there."""
+"""The first episode of the rows of a comparison, if its arrays exist."""
 
 from __future__ import annotations
 
@@ -48,9 +48,11 @@ class Drive(NamedTuple):
 
 def drives(directory: Path, rows: list[Row]) -> tuple[list[Drive], list[str]]:
     """Read the first episode of rows, and name the rows without a usable episode."""
-    read = [_drive(directory, row) for row in rows]
-    missing = [name_of(row) for row, one in zip(rows, read, strict=True) if one is None]
-    return [one for one in read if one], missing
+    loaded = [_drive(directory, row) for row in rows]
+    missing = [
+        name_of(row) for row, one in zip(rows, loaded, strict=True) if one is None
+    ]
+    return [one for one in loaded if one], missing
 
 
 def _drive(directory: Path, row: Row) -> Drive | None:

@@ -1,4 +1,4 @@
-"""Figure: what a certified contraction factor costs and what it buys, over many runs."""
+"""Figure of many runs: prediction, tracking and bounds by certified contraction."""
 
 from __future__ import annotations
 
@@ -33,11 +33,11 @@ _HOLLOW: dict[str, Any] = {
     "zorder": 1.5,
 }
 _SPREAD = 4.0
-"""Ratio of largest to smallest from which a logarithmic axis shows more."""
+"""Ratio of largest to smallest value from which the axis is logarithmic."""
 
 
 def title_of(record: Record, records: list[Record]) -> str:
-    """The control convention of a run, with its system and vehicle where runs differ in them."""
+    """The inner loop of a run, with its system and vehicle if runs differ in them."""
     differing = [
         key
         for key in ("system", "vehicle")
@@ -50,7 +50,7 @@ def title_of(record: Record, records: list[Record]) -> str:
 
 
 def tradeoff(records: list[Record]) -> Figure:
-    """Prediction, tracking and the two latent bounds against certified α, one line per control convention.
+    """Prediction, tracking and latent bounds by certified α, one line per inner loop.
 
     Args:
         records: of `records_of`, with at least one certificate among them.
@@ -73,18 +73,12 @@ def tradeoff(records: list[Record]) -> Figure:
         ),
         "ultimate bound\n[latent units]": ("ultimate",),
     }
-    for axes, (name, keys) in zip(panels.flat, measures.items(), strict=True):
+    for axes, (title, keys) in zip(panels.flat, measures.items(), strict=True):
         for line, (marker, colour) in zip(lines, cycle(_LOOKS), strict=False):
-            style: dict[str, Any] = {
-                "color": colour,
-                "marker": marker,
-                "markersize": 5.5,
-            }
-            axes.plot(
-                *_points(line, "alpha", keys),
-                **style,
-                label=literal(title_of(line[0], records)),
-            )
+            style: dict[str, Any] = {"color": colour, "marker": marker}
+            style |= {"markersize": 5.5}
+            name = literal(title_of(line[0], records))
+            axes.plot(*_points(line, "alpha", keys), label=name, **style)
             if keys[0] == "closed_loop":
                 _whiskers(axes, line, keys[:-1], colour)
             if keys == ("ultimate",):
@@ -93,7 +87,7 @@ def tradeoff(records: list[Record]) -> Figure:
                     **style | _HOLLOW,
                 )
         _scale(axes)
-        axes.set_ylabel(name)
+        axes.set_ylabel(title)
     for axes in panels[1]:
         axes.set_xlabel("certified α [-]")
     figure.align_ylabels()
@@ -113,13 +107,10 @@ def tradeoff(records: list[Record]) -> Figure:
 
 
 def _points(line: list[Record], abscissa: str, keys: tuple[str, ...]) -> np.ndarray:
-    """The pairs of which both numbers are known, (2, count)."""
+    """The pairs with two finite numbers, (2, count)."""
     pairs = [(record[abscissa], dig(record, *keys)) for record in line]
-    return (
-        np.array([pair for pair in pairs if all(map(is_number, pair))], dtype=float)
-        .reshape(-1, 2)
-        .T
-    )
+    known = [pair for pair in pairs if all(map(is_number, pair))]
+    return np.array(known, dtype=float).reshape(-1, 2).T
 
 
 def _whiskers(
@@ -129,18 +120,12 @@ def _whiskers(
     for record in line:
         bounds = dig(record, *keys, "ci95")
         if interval(bounds) != DASH:
-            axes.plot(
-                [record["alpha"]] * 2,
-                bounds,
-                color=colour,
-                linewidth=1.0,
-                marker="_",
-                markersize=6,
-            )
+            ends = {"color": colour, "linewidth": 1.0, "marker": "_", "markersize": 6}
+            axes.plot([record["alpha"]] * 2, bounds, **ends)
 
 
 def _scale(axes: Any) -> None:
-    """From zero up, or logarithmic with plain numbers where values lie far apart."""
+    """An axis from zero, or a logarithmic one for values of different magnitude."""
     values = np.concatenate(
         [line.get_ydata() for line in axes.get_lines()] or [np.zeros(0)]
     )

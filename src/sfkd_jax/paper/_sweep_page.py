@@ -1,21 +1,15 @@
-"""The comparison of many runs: reads what lies in their directories and writes page, Markdown, records and figure."""
+"""The page of a sweep over contraction factors, with its records and its figure."""
 
 from __future__ import annotations
 
+import tomllib
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
 from sfkd_jax.artefacts import write_bytes, write_json, writing
-from sfkd_jax.evaluation.formats import (
-    dig,
-    mean_std,
-    number,
-    percent,
-    plain,
-    short,
-    upper,
-)
+from sfkd_jax.evaluation.formats import dig, percent, plain
+from sfkd_jax.evaluation.metrics import BY_NAME
 from sfkd_jax.paper._sweep_figure import tradeoff
 from sfkd_jax.paper._sweep_records import (
     Record,
@@ -24,7 +18,7 @@ from sfkd_jax.paper._sweep_records import (
     scenario_of,
     steps_of,
 )
-from sfkd_jax.paper._sweep_text import paragraph
+from sfkd_jax.paper._sweep_text import FILE, paragraph, text
 from sfkd_jax.reporting.blocks import (
     Block,
     Code,
@@ -36,14 +30,30 @@ from sfkd_jax.reporting.blocks import (
     to_markdown,
 )
 from sfkd_jax.reporting.style import save, scenario_label
+from sfkd_jax.reporting.texts import fill
+
+_TABLES: dict[str, dict[str, str]] = tomllib.loads(FILE.read_text("utf-8"))
+_DRIVEN = {
+    "rmse_m": "rmse_m",
+    "ratio_to_oracle": "ratio_to_oracle",
+    "smoothness_rad_per_s": "smoothness_rad_per_s",
+    "v0": "violation.v0",
+    "v1_certified": "violation.v1",
+    "v1_certified_radius_m": "violation.v1_radius_m",
+    "v1_conformal": "violation.v1_conformal",
+    "v1_conformal_radius_m": "violation.v1_conformal_radius_m",
+}
+"""Key in a record -> name of the metric."""
+_Columns = dict[str, Callable[[Record], str]]
 
 
 def write_comparison(root: Path, pattern: str, name: str) -> dict[str, Any]:
-    """Write `root/name/comparison/`: `index.html`, `report.md`, `comparison.json` and `figures/<name>.png`.
+    """Write index.html, report.md, comparison.json and a figure of many runs.
 
-    Reads settings.json, policy.json, open_loop.json, certificate.json and results.json
-    of every run. All but settings.json may be missing: what they would say is null. The
-    only arithmetic is d̄ / (1 − α), for the separate α and for d̄ on validation drives.
+    The files are in `root/name/comparison/`. Reads settings.json, policy.json,
+    open_loop.json, certificate.json and results.json of every run; what is in a missing
+    file is null, except for settings.json. The only arithmetic is d̄ / (1 − α), for the
+    separate α and for d̄ on validation drives.
 
     Args:
         root: of all artefacts.
@@ -63,181 +73,116 @@ def write_comparison(root: Path, pattern: str, name: str) -> dict[str, Any]:
 
 
 def _write(root: Path, pattern: str, name: str) -> dict[str, Any]:
-    """`write_comparison`, errors as they come."""
+    """`write_comparison`, without conversion of errors of the disk."""
     records = records_of(root, pattern)
-    place, figure = root / name / "comparison", Path(name).name
-    (place / "figures").mkdir(parents=True, exist_ok=True)
-    (place / "figures" / f"{figure}.png").unlink(missing_ok=True)
-    title = f"Comparison of runs: {name}"
+    directory, title = root / name / "comparison", f"Comparison of runs: {name}"
+    figure = directory / "figures" / f"{Path(name).name}.png"
+    figure.parent.mkdir(parents=True, exist_ok=True)
+    figure.unlink(missing_ok=True)
     page: list[Block] = [Heading(1, title), Text(paragraph(records), kind="lead")]
     if curves(records):
-        beta = plain(curves(records)[0][0]["beta"])
-        picture = save(place / "figures" / f"{figure}.png", tradeoff, records)
-        page.append(Picture(picture, _caption(beta, scenario_of(records))))
+        page.append(Picture(save(figure, tradeoff, records), _caption(records)))
     page += _tables(records)
     page += [Heading(2, "How to make it again"), Code(_command(root, pattern, name))]
-    write_json(place / "comparison.json", {"pattern": pattern, "rows": records})
-    write_bytes(place / "index.html", to_html(title, page).encode())
-    write_bytes(place / "report.md", to_markdown(page).encode())
+    write_json(directory / "comparison.json", {"pattern": pattern, "rows": records})
+    write_bytes(directory / "index.html", to_html(title, page).encode())
+    write_bytes(directory / "report.md", to_markdown(page).encode())
     return {
-        "report": str(place / "index.html"),
-        "comparison": str(place / "comparison.json"),
+        "report": str(directory / "index.html"),
+        "comparison": str(directory / "comparison.json"),
         "figures": [str(block.path) for block in page if isinstance(block, Picture)],
     }
 
 
 def _command(root: Path, pattern: str, name: str) -> str:
-    """The command line of this page, quoted twice: for the shell, and for Hydra, to which = and * mean something."""
+    """The command of this page; Hydra needs quotes inside those of the shell."""
     settings = {"report.compare": pattern, "name": name, "root": root}
-    return " ".join(
-        [
-            "python -m sfkd_jax.report",
-            *(f"\"{key}='{value}'\"" for key, value in settings.items()),
-        ]
-    )
+    words = [f"\"{key}='{value}'\"" for key, value in settings.items()]
+    return " ".join(["python -m sfkd_jax.report", *words])
 
 
-def _caption(beta: str, scenario: str | None) -> str:
-    driven = (
-        f" Whiskers: 95 % interval of the mean over episodes of {scenario_label(scenario)}."
-        if scenario
-        else ""
-    )
-    return (
-        f"Runs with β = {beta}, one point a run, against the contraction factor that is certified.{driven} Hollow: "
-        "the same run, if only the separate bounds ρ and β were added. Latent units are those of each run."
-    )
-
-
-_Columns = dict[str, Callable[[Record], str]]
-
-_PROVED: _Columns = {
-    "Vehicle": lambda record: plain(record["vehicle"]),
-    "Inner\nloop": lambda record: plain(record["inner_loop"]),
-    "ρ\nasked": lambda record: plain(record["rho"]),
-    "β\nasked": lambda record: plain(record["beta"]),
-    "α\ncertified": lambda record: upper(record["alpha"]),
-    "α\nseparate": lambda record: upper(record["alpha_separate"]),
-    "α\njoint": lambda record: upper(record["alpha_joint"]),
-    "Attack": lambda record: short(record["attack"], 6),
-    "Tightness": lambda record: number(record["tightness"], 4),
-}
-
-_MEASURED: _Columns = {
-    "d̄": lambda record: upper(record["d_bar"]),
-    "d̄ on\nvalidation": lambda record: upper(record["d_bar_validation"]),
-    "Tube at T,\nlatent": lambda record: upper(record["tube"]["latent"]),
-    "Ultimate\nbound": lambda record: upper(record["ultimate"]),
-    "Ultimate on\nvalidation, body": lambda record: upper(
-        record["ultimate_body_validation"]
-    ),
-    "Tube at T,\nposition [m]": lambda record: upper(record["tube"]["position_m"]),
-}
-
-_PREDICTED: _Columns = {
-    "Position\n[m]": lambda record: number(record["open_loop"]["position_rmse_m"], 4),
-    "Along\n[m]": lambda record: number(record["open_loop"]["longitudinal_rmse_m"], 4),
-    "Across\n[m]": lambda record: number(record["open_loop"]["lateral_rmse_m"], 4),
-}
-
-_DRIVEN: _Columns = {
-    "RMSE [m]\nmean ± std": lambda row: mean_std(row.get("rmse_m"), 4),
-    "RMSE over\noracle": lambda row: number(row.get("ratio_to_oracle"), 2),
-    "Steering rate\n[rad/s]": lambda row: number(row.get("smoothness_rad_per_s")),
-    "V0, theorem\n[%]": lambda row: percent(row.get("v0")),
-    "V1, certified\ntube [%]": lambda row: percent(row.get("v1_certified")),
-    "its mean\nradius [m]": lambda row: number(row.get("v1_certified_radius_m")),
-    "V1, conformal\ntube [%]": lambda row: percent(row.get("v1_conformal")),
-    "mean radius\nof that [m]": lambda row: number(row.get("v1_conformal_radius_m")),
-}
+def _caption(records: list[Record]) -> str:
+    scenario, whiskers = scenario_of(records), ""
+    if scenario:
+        whiskers = text("text.whiskers", scenario=scenario_label(scenario))
+    beta = curves(records)[0][0]["beta"]
+    return text("text.caption", beta=beta, whiskers=whiskers)
 
 
 def _tables(records: list[Record]) -> list[Block]:
-    scenarios = sorted({name for record in records for name in record["closed_loop"]})
     covered = sorted({name for record in records for name in record["coverage"]})
-    coverage: _Columns = {
-        f"Covered,\n{scenario_label(name)} [%]": _coverage(name) for name in covered
+    coverage = {
+        f"Covered, {scenario_label(name)} [%]": _coverage(name) for name in covered
     }
-    best = [record["smallest_of_its_betas"] for record in records]
-    marked = f"{_MARKED} " if any(best) else ""
-    blocks: list[Block] = [
+    best = [i for i, one in enumerate(records) if one["smallest_of_its_betas"]]
+    stressed = text("text.stressed") if best else ""
+    note = text("text.covered", stressed=stressed, steps=steps_of(records, "tube"))
+    ahead = f"after {steps_of(records, 'open_loop')} steps"
+    return [
         Heading(2, "What is certified"),
-        _table(records, _PROVED),
+        _table(records, _columns("certified")),
         *_reasons(records),
-        Heading(2, "What the bounds come to"),
-        _table(
-            records,
-            _MEASURED | coverage,
-            tuple(place for place, one in enumerate(best) if one),
-        ),
-        Text(
-            f"{marked}T is {steps_of(records, 'tube')} steps. {_COVERED}", kind="note"
-        ),
-        Heading(
-            2,
-            f"Prediction without feedback, after {steps_of(records, 'open_loop')} steps",
-        ),
-        _table(records, _PREDICTED),
+        Heading(2, "The bounds that follow"),
+        _table(records, _columns("bounds") | coverage, tuple(best)),
+        Text(note, kind="note"),
+        Heading(2, f"Prediction without feedback, {ahead}"),
+        _table(records, _columns("predicted")),
+        *_driven(records),
     ]
-    for name in scenarios:
-        rows = {key: _of(name, cell) for key, cell in _DRIVEN.items()}
-        blocks += [
-            Heading(2, f"Driven: scenario {scenario_label(name)}"),
-            _table(records, rows),
-        ]
-    return blocks
 
 
-_MARKED = (
-    "Stressed: the smallest ultimate bound of the body state, L d̄ / (1 − α), on validation drives among runs that "
-    "share one vehicle, one inner loop and one ρ + β; this is what chooses β, and no calibration drive takes part in "
-    "it. The latent's unit differs from run to run; the body state's does not."
-)
-_COVERED = (
-    "Covered: share of drives, calibration aside, of which every one-step error is at most d̄, by the scenario they "
-    "come from."
-)
+def _columns(section: str) -> _Columns:
+    """The columns of a section of the texts."""
+
+    def column(template: str) -> Callable[[Record], str]:
+        return lambda record: fill(template, record)
+
+    return {name: column(template) for name, template in _TABLES[section].items()}
 
 
 def _coverage(name: str) -> Callable[[Record], str]:
     return lambda record: percent(record["coverage"].get(name))
 
 
-def _of(scenario: str, cell: Callable[[Record], str]) -> Callable[[Record], str]:
-    """A column of the scenario's row of each run."""
-    return lambda record: cell(dig(record, "closed_loop", scenario) or {})
+def _driven(records: list[Record]) -> list[Block]:
+    """The closed-loop metrics of every run, by scenario."""
+
+    def column(scenario: str, key: str) -> Callable[[Record], str]:
+        write = BY_NAME[_DRIVEN[key]].write
+        return lambda record: write(dig(record, "closed_loop", scenario, key))
+
+    blocks: list[Block] = []
+    for name in sorted({name for one in records for name in one["closed_loop"]}):
+        heading = Heading(2, f"Driven: scenario {scenario_label(name)}")
+        columns = {BY_NAME[m].head(): column(name, key) for key, m in _DRIVEN.items()}
+        blocks += [heading, _table(records, columns)]
+    return blocks
 
 
 def _table(
     records: list[Record], columns: _Columns, strong: tuple[int, ...] = ()
 ) -> Table:
-    names = _short([record["run"] for record in records])
     rows = [
         [name, *(cell(record) for cell in columns.values())]
-        for name, record in zip(names, records, strict=True)
+        for name, record in zip(_short_names(records), records, strict=True)
     ]
     return Table(["Run", *columns], rows, strong)
 
 
 def _reasons(records: list[Record]) -> list[Block]:
-    names = _short([record["run"] for record in records])
-    rows = [
-        [name, plain(r["reason"])]
-        for name, r in zip(names, records, strict=True)
-        if r["reason"]
-    ]
-    return (
-        [Heading(3, "Not certified"), Table(["Run", "Reason"], rows, prose=True)]
-        if rows
-        else []
-    )
+    """The runs without a certificate."""
+    named = zip(_short_names(records), records, strict=True)
+    rows = [[name, plain(one["reason"])] for name, one in named if one["reason"]]
+    table = Table(["Run", "Reason"], rows, prose=True)
+    return [Heading(3, "Not certified"), table] if rows else []
 
 
-def _short(places: list[str]) -> list[str]:
-    """Paths without the folders that they begin and end with in common; a single one in full."""
-    paths = [place.split("/") for place in places]
+def _short_names(records: list[Record]) -> list[str]:
+    """Paths of several runs without the folders at both ends that all share."""
+    names = [record["run"] for record in records]
+    paths = [name.split("/") for name in names]
     while len({path[0] for path in paths}) == 1 < min(map(len, paths)):
         paths = [path[1:] for path in paths]
     while len({path[-1] for path in paths}) == 1 < min(map(len, paths)):
         paths = [path[:-1] for path in paths]
-    return ["/".join(path) for path in paths] if len(places) > 1 else places
+    return ["/".join(path) for path in paths] if len(names) > 1 else names

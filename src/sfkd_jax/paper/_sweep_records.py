@@ -1,4 +1,4 @@
-"""Many runs as records: what each was asked for, what is certified about it, how it predicts and how it drives."""
+"""Many runs as records: settings, certificate, prediction and driving of each."""
 
 from __future__ import annotations
 
@@ -16,101 +16,87 @@ Record: TypeAlias = dict[str, Any]
 
 
 def records_of(root: Path, pattern: str) -> list[Record]:
-    """One record per run, ordered by system, vehicle, inner loop, ρ + β, β and place.
+    """One record per run, ordered by system, vehicle, inner loop, ρ + β, β and path.
 
     Args:
-        root: that the pattern starts from.
-        pattern: of run directories; those without settings.json are no runs.
+        root: at which the pattern starts.
+        pattern: of run directories; those without settings.json are skipped.
 
     Raises:
         ValueError: no run matches, or a file of a run is not JSON.
     """
-    places = [
-        place
-        for place in sorted(glob.glob(pattern, root_dir=root))
-        if (root / place / "settings.json").exists()
+    names = [
+        name
+        for name in sorted(glob.glob(pattern, root_dir=root))
+        if (root / name / "settings.json").exists()
     ]
-    if not places:
+    if not names:
         raise ValueError(f"no run under {root} matches {pattern!r}")
-    records = [_record(root / place, place) for place in places]
-    records.sort(
-        key=lambda record: (
-            *_convention(record),
-            *map(_last, (_asked(record), record["beta"])),
-            record["run"],
-        )
-    )
+    records = sorted((_record(root / name, name) for name in names), key=_order)
     for record in records:
-        record["smallest_of_its_betas"] = record is _best(
-            [r for r in records if _rivals(r, record)]
-        )
+        similar = [other for other in records if _same_sum(other, record)]
+        record["smallest_of_its_betas"] = record is _best(similar)
     return records
 
 
+def _order(record: Record) -> tuple[Any, ...]:
+    """Sort key; null comes last."""
+    sides = _sum(record), record["beta"]
+    known = (x if is_number(x) else float("inf") for x in sides)
+    return (*_setting(record), *known, record["run"])
+
+
 def curves(records: list[Record]) -> list[list[Record]]:
-    """The certified runs at the most common β: one list per system, vehicle and inner loop, by rising α."""
+    """The certified runs at the most common β by α, for each vehicle and inner loop."""
     certified = [record for record in records if is_number(record["alpha"])]
-    betas = Counter(
-        sorted(record["beta"] for record in certified if is_number(record["beta"]))
-    )
-    main = [
-        record
-        for record in certified
-        if record["beta"] == (betas.most_common(1) or [(None, 0)])[0][0]
-    ]
-    lines = [
-        [record for record in main if _convention(record) == one]
-        for one in dict.fromkeys(map(_convention, main))
-    ]
+    betas = Counter(sorted(r["beta"] for r in certified if is_number(r["beta"])))
+    usual = (betas.most_common(1) or [(None, 0)])[0][0]
+    main = [record for record in certified if record["beta"] == usual]
+    settings = dict.fromkeys(map(_setting, main))
+    lines = [[r for r in main if _setting(r) == one] for one in settings]
     return [sorted(line, key=lambda record: record["alpha"]) for line in lines]
 
 
 def scenario_of(records: list[Record]) -> str | None:
-    """The scenario that most runs were driven on; of several, the last by name."""
-    names = Counter(
-        sorted(
-            (name for record in records for name in record["closed_loop"]), reverse=True
-        )
-    )
+    """The scenario of most runs; of several, the last by name."""
+    names = [name for record in records for name in record["closed_loop"]]
+    names = Counter(sorted(names, reverse=True))
     return names.most_common(1)[0][0] if names else None
 
 
 def steps_of(records: list[Record], key: str) -> str:
-    """How many steps `key` (open_loop or tube) reaches, if all runs agree, else "T"."""
-    found = {record[key]["steps"] for record in records if record[key]["steps"]}
-    return str(found.pop()) if len(found) == 1 else "T"
+    """The horizon of `key` (open_loop or tube) if all runs agree, else "T"."""
+    steps = {record[key]["steps"] for record in records if record[key]["steps"]}
+    return str(steps.pop()) if len(steps) == 1 else "T"
 
 
-def _record(run: Path, place: str) -> Record:
-    settings, errors = (
-        read_optional(run / "settings.json") or {},
-        read_optional(run / "open_loop.json"),
-    )
+def _record(run: Path, name: str) -> Record:
+    settings = read_optional(run / "settings.json") or {}
+    errors = read_optional(run / "open_loop.json")
     certificate = read_certificate(run, read_optional(run / "policy.json") or {})
     rows = (read_optional(run / "results.json") or {}).get("rows") or []
     with as_artefact_error(run / "settings.json", ValueError):
         model, system = settings.get("model"), model_of(settings)
-        asked = {
+        record = {
+            "run": name,
+            "system": system,
+            "vehicle": dig(settings, "vehicle", "name"),
+            "inner_loop": dig(settings, "vehicle", "inner_loop"),
             "rho": dig(model, "rho"),
             "beta": dig(model, "beta"),
             "seed": settings.get("seed"),
         }
-        vehicle = {
-            "vehicle": dig(settings, "vehicle", "name"),
-            "inner_loop": dig(settings, "vehicle", "inner_loop"),
-        }
     with as_artefact_error(run / "certificate.json", ValueError):
-        certified = _certified(certificate)
+        record |= _certified(certificate)
     with as_artefact_error(run / "open_loop.json", ValueError):
-        predicting = _predicting(errors)
+        record["open_loop"] = _predicting(errors)
     with as_artefact_error(run / "results.json", ValueError):
-        driving = _driving(rows, system)
-    found = {"run": place, "system": system, **vehicle, **asked, **certified}
-    return found | {"open_loop": predicting, "closed_loop": driving}
+        record["closed_loop"] = _driving(rows, system)
+    return record
 
 
 def _certified(certificate: dict[str, Any] | None) -> Record:
-    """What a certificate says, or nulls and the reason why it says nothing."""
+    """The bounds of a certificate, or nulls and the reason for them."""
     reason = None
     if certificate is None:
         reason = "certificate.json is missing"
@@ -119,10 +105,7 @@ def _certified(certificate: dict[str, Any] | None) -> Record:
     proof = {} if reason or certificate is None else certificate
     alpha, separate = proof.get("alpha"), proof.get("alpha_separate")
     bound, tube = dig(proof, "d_bar") or {}, dig(proof, "tube") or {}
-    radii, position = (
-        tube.get("latent") or [],
-        dig(tube, "physical", "position_m") or [],
-    )
+    radii = tube.get("latent") or []
     drives = bound.get("by_scenario") or {}
     on_validation = _ultimate(bound.get("validation"), alpha)
     return {
@@ -136,13 +119,13 @@ def _certified(certificate: dict[str, Any] | None) -> Record:
         "d_bar_validation": bound.get("validation"),
         "tube": {
             "steps": len(radii),
-            "latent": _end(radii),
-            "position_m": _end(position),
+            "latent": dig(radii, "-1"),
+            "position_m": dig(tube, "physical", "position_m", "-1"),
         },
         "ultimate": tube.get("ultimate"),
         "ultimate_separate": _ultimate(bound.get("value"), separate),
         "ultimate_validation": on_validation,
-        "ultimate_body_validation": _times(
+        "ultimate_body_validation": _product(
             dig(proof, "lipschitz", "body"), on_validation
         ),
         "coverage": {
@@ -152,34 +135,29 @@ def _certified(certificate: dict[str, Any] | None) -> Record:
 
 
 def _ultimate(d_bar: Any, alpha: Any) -> float | None:
-    """d̄ / (1 − α), which no α of one or more has."""
-    return (
-        d_bar / (1 - alpha)
-        if is_number(d_bar) and is_number(alpha) and alpha < 1
-        else None
-    )
+    """d̄ / (1 − α), or None for α of one or more."""
+    known = is_number(d_bar) and is_number(alpha)
+    return d_bar / (1 - alpha) if known and alpha < 1 else None
 
 
-def _times(left: Any, right: Any) -> float | None:
+def _product(left: Any, right: Any) -> float | None:
     return left * right if is_number(left) and is_number(right) else None
 
 
 def _predicting(errors: dict[str, Any] | None) -> Record:
     """Errors at the last step ahead."""
     keys = ("position_rmse_m", "longitudinal_rmse_m", "lateral_rmse_m")
-    return {"steps": _end(dig(errors, "steps") or [])} | {
-        key: _end(dig(errors, key) or []) for key in keys
-    }
+    return {key: dig(errors, key, "-1") for key in ("steps", *keys)}
 
 
 def _driving(rows: list[dict[str, Any]], system: str) -> dict[str, Record]:
-    """The system's own row of each scenario; the one with feedback sampling where there are several."""
-    found: dict[str, Record] = {}
-    for block in groups_of(rows):
-        own = row_of(block, system)
+    """The row of the system by scenario; of several, that of feedback sampling."""
+    driven: dict[str, Record] = {}
+    for group in groups_of(rows):
+        own = row_of(group, system)
         if own:
-            found.setdefault(str(own.get("scenario")), _driven(own))
-    return found
+            driven.setdefault(str(own.get("scenario")), _driven(own))
+    return driven
 
 
 def _driven(row: dict[str, Any]) -> Record:
@@ -197,40 +175,27 @@ def _driven(row: dict[str, Any]) -> Record:
 
 
 def _best(records: list[Record]) -> Record | None:
-    """The smallest ultimate bound on validation drives, where there are several β to choose from.
+    """The record with the smallest ultimate bound on validation drives.
 
-    In units of the body state: the latent's own unit differs from run to run.
+    The bound is that of the body state, because the unit of the latent differs from run
+    to run. None if all have the same β.
     """
-    known = [
-        record for record in records if is_number(record["ultimate_body_validation"])
-    ]
+    key = "ultimate_body_validation"
+    known = [record for record in records if is_number(record[key])]
     several = len({record["beta"] for record in known}) > 1
-    return (
-        min(known, key=lambda record: record["ultimate_body_validation"])
-        if several
-        else None
-    )
+    return min(known, key=lambda record: record[key]) if several else None
 
 
-def _rivals(one: Record, other: Record) -> bool:
-    """Whether two runs differ in how they share ρ + β out, not in its sum."""
-    return (_convention(one), _asked(one)) == (_convention(other), _asked(other))
+def _same_sum(one: Record, other: Record) -> bool:
+    """Whether two runs have the same vehicle, inner loop and ρ + β."""
+    return (_setting(one), _sum(one)) == (_setting(other), _sum(other))
 
 
-def _convention(record: Record) -> tuple[str, ...]:
+def _setting(record: Record) -> tuple[str, ...]:
     return tuple(str(record[key]) for key in ("system", "vehicle", "inner_loop"))
 
 
-def _asked(record: Record) -> float | None:
-    """ρ + β as asked for, less the rounding of the sum."""
+def _sum(record: Record) -> float | None:
+    """ρ + β of the settings, without rounding errors."""
     sides = record["rho"], record["beta"]
     return round(sum(sides), 9) if all(map(is_number, sides)) else None
-
-
-def _last(value: Any) -> float:
-    """A key to sort by, null last."""
-    return value if is_number(value) else float("inf")
-
-
-def _end(values: list[Any]) -> Any:
-    return values[-1] if values else None
