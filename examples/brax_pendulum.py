@@ -1,4 +1,4 @@
-"""SFKD on brax's inverted pendulum, gravity is e: collect, train, certify, and let MPPI move the cart along a target.
+"""SFKD on brax's inverted pendulum with gravity as e: collect, train, certify, control.
 
 A contracting latent cannot hold a pendulum that falls, so what is learned and planned
 for is the plant under a fixed gain: u = clip(v - K s), K from a Riccati recursion at
@@ -214,10 +214,12 @@ def main(
     params = jax.jit(partial(fold, model))(params)  # once, not at every step
     tube = proof["tube"]["physical"]["body"]
     print(
-        f"certified: alpha {proof['alpha']:.4f}; at least {proof['attacks']['step_slopes']:.4f} by an attack"
+        f"certified: alpha {proof['alpha']:.4f}; "
+        f"an attack reaches {proof['attacks']['step_slopes']:.4f}"
     )
     print(
-        f"tube of the body state: {tube[0]:.3f} after one step, {tube[-1]:.3f} after {horizon}"
+        f"tube of the body state: {tube[0]:.3f} after one step, "
+        f"{tube[-1]:.3f} after {horizon}"
     )
 
     limits = {"control_low": plant.control_low, "control_high": plant.control_high}
@@ -265,7 +267,8 @@ def main(
         row = rows[way] = drive(
             controller, knows, partial(physics, under), start, **sizes
         )
-        fate = f"angle up to {row['angle_rad']:.3f} rad, {'fallen' if row['fallen'] else 'upright'}"
+        end = "fallen" if row["fallen"] else "upright"
+        fate = f"angle up to {row['angle_rad']:.3f} rad, {end}"
         print(f"{way:24} RMS cart error {row['rms_m']:.3f} m, {fate}", flush=True)
     return {"certificate": proof, "rows": rows}
 

@@ -1,4 +1,4 @@
-"""SFKD on data of your own: read logged drives, train, certify, and plan with the result.
+"""SFKD on your own data: read logged drives, train, certify and plan.
 
 python examples/own_data.py LOGS.npz with arrays x (drive, time + 1, state), u (drive,
 time, control) and e (drive, time, environment); the state begins with position [m] and

@@ -1,4 +1,4 @@
-"""A ROS 2 node around a trained controller: odometry, path and road condition in, drive commands out, at 10 Hz.
+"""A ROS 2 node around a trained controller: odometry in, drive commands out, at 10 Hz.
 
 ros2 run, or python controller_node.py --ros-args -p policy:=runs/s3/sfkd_path/seed=0
 Needs rclpy, nav_msgs, std_msgs and ackermann_msgs of a ROS 2 installation beside this
