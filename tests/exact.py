@@ -148,8 +148,8 @@ def exact_witness(weights, multipliers, bound, linear, metric):
 
 
 def search(cases, seed):
-    """Counts of what the core was asked and accepted; raises at the first falsehood
-    that it accepts.
+    """Count the cases that hold and that the core accepts; fail at the first accepted
+    case that is false.
     """
     from sfkd_jax.certification import check_witness, is_positive_definite
 
