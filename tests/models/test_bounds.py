@@ -114,7 +114,7 @@ def test_gradients_are_finite_where_singular_values_coincide(scale):
 
 
 def environments(count=200):
-    """Inside the box, far outside it, and at the ends of the earth."""
+    """Environments inside the box, outside it, and very far outside it."""
     random = np.random.default_rng(0)
     near = random.uniform([0.3, -8.0], [0.9, 8.0], (count, 2))
     return np.concatenate(
@@ -137,7 +137,9 @@ def test_the_operator_is_bounded_for_every_environment_and_every_weight(name, sc
 
 @pytest.mark.parametrize("seed", range(3))
 def test_opposed_operators_mix_within_the_bound(seed):
-    """The hull of A and −A holds 0: the norm of a mixture is smaller, never larger."""
+    """The hull of A and −A contains 0: a mixture has a smaller norm, never a larger
+    one.
+    """
     model, params = model_and_params("sfkd")
     free = np.random.default_rng(seed).standard_normal((3, 8, 8)).astype(np.float32)
     params = params | {

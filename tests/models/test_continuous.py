@@ -1,6 +1,4 @@
-"""Models in continuous time: the order of the solver, symmetry, what is affine in what,
-and who sees e.
-"""
+"""Models in continuous time: solver order, symmetry, affine inputs, use of e."""
 
 from functools import cache, partial
 
@@ -39,7 +37,7 @@ def x64():
 
 
 def small(name, body=1, scales=None, **changes):
-    """A small one of some size of body."""
+    """A small model with a body state of the given size."""
     known = (
         {"nominal": PLANTS[body]().nominal_derivative} if name == "icode_mppi" else {}
     )
@@ -48,7 +46,7 @@ def small(name, body=1, scales=None, **changes):
 
 @cache
 def drawn(name, body=1):
-    """Generic parameters of unit gain, none of them 0."""
+    """Random parameters of unit gain, none of them 0."""
     random = np.random.default_rng(3)
     leaves = jax.eval_shape(small(name, body).init, jax.random.key(0))
     return jax.tree.map(

@@ -33,7 +33,7 @@ SFKD = tuple(VARIANTS)
 
 
 def chain(model, params, trajectory):
-    """Everything a model does, in a row: two steps with a switch between them."""
+    """Two steps with a switch of the environment: every function of a model is called."""
     here, there = (
         model.fiber(params, env) for env in (trajectory.envs[0], trajectory.envs[1])
     )
@@ -188,9 +188,7 @@ def test_gradients_of_a_rollout_are_finite_and_reach_every_parameter_in_use(name
 
 @pytest.mark.parametrize("name", EVERY)
 def test_predictions_move_with_the_frame_of_the_world(name, one):
-    """SE(2): start elsewhere, facing elsewhere, and every predicted pose is moved
-    along; body states stay.
-    """
+    """SE(2): a motion of the initial pose moves every predicted pose; body states stay."""
     world = jnp.asarray([30.0, -20.0, 1.1])
     states = jax.vmap(lambda state: state.at[POSE].set(compose(world, state[POSE])))(
         one.states
@@ -324,7 +322,7 @@ def test_folded_parameters_are_the_same_model_and_the_same_claim(name, one):
 
 
 def test_no_gradient_of_training_passes_through_a_matrix_for_every_environment():
-    """One copy of such a gradient took half of a training step; folded parameters, made
+    """Such a gradient took half of a training step; folded parameters, which are made
     for driving, have it.
     """
     model, params = model_and_params("sfkd")
@@ -346,8 +344,8 @@ def test_no_gradient_of_training_passes_through_a_matrix_for_every_environment()
 
 @pytest.mark.parametrize("name", ["sfkd", "r2dn"])
 def test_nothing_is_factorised_in_a_control_step_with_folded_parameters(name, one):
-    """A linear algebra library's own threads wait in circles on a busy host: one
-    inverse may cost a sampling period.
+    """The threads of a linear algebra library spin on a busy host: one inverse may take
+    a sampling period.
     """
     model, params = model_and_params(name)
     program = [
@@ -364,7 +362,7 @@ def test_nothing_is_factorised_in_a_control_step_with_folded_parameters(name, on
 
 @pytest.mark.parametrize("name", ["sfkd", "r2dn"])
 def test_a_claim_about_folded_parameters_is_about_the_matrices_that_run(name):
-    """Spoiled after folding, they must not be certified as what they were folded from."""
+    """Parameters changed after folding must not be certified as the original ones."""
     model, params = model_and_params(name)
     folded = jit(partial(fold, model))(params)
     spoiled = folded._replace(

@@ -18,7 +18,7 @@ RATE = 0.05
 
 @cache
 def parts(body, rate=RATE, dt=0.1):
-    """A model with its `explicit`, compiled once."""
+    """A model and its `explicit`, compiled once."""
     model = models.control_synth(
         space(body), rate=rate, dt=dt, width=24, input_hidden=(16,)
     )
@@ -26,7 +26,7 @@ def parts(body, rate=RATE, dt=0.1):
 
 
 def drawn(body, scale, seed=0):
-    """Weights of `scale` from a bell curve, none of them 0."""
+    """Normal weights of the given scale, none of them 0."""
     random = np.random.default_rng(seed)
     shapes = jax.eval_shape(parts(body)[0].init, jax.random.key(0))
     return jax.tree.map(
@@ -51,7 +51,7 @@ def test_the_given_rate_is_proved_for_all_weights(body, scale):
 @pytest.mark.parametrize("body", [1, 4])
 @pytest.mark.parametrize("rate", [1e-3, 0.05, 1.0, 5.0])
 def test_the_proved_rate_is_the_given_one_and_little_more(body, rate):
-    """With B = 0 in one direction and X = 0 nothing damps it but the rate itself."""
+    """With B = 0 in one direction and X = 0 only the rate itself damps it."""
     params = drawn(body, 0.1)
     params["free"]["X"][:] = 0.0
     params["free"]["B"][0] = 0.0
@@ -62,8 +62,8 @@ def test_the_proved_rate_is_the_given_one_and_little_more(body, rate):
 
 
 def test_the_matrices_reach_beyond_the_decay_they_prove():
-    """With slopes of 1 the state may run back much faster than γ: the bound is on the
-    slowest direction only.
+    """With slopes of 1 the state may decay much faster than γ: the bound is on the
+    slowest direction.
     """
     weights = exported(4, drawn(4, 1.0))
     assert np.linalg.norm(weights.linear) > 20 * RATE
@@ -73,7 +73,7 @@ def test_the_matrices_reach_beyond_the_decay_they_prove():
 @pytest.mark.parametrize("body", [1, 4])
 @pytest.mark.parametrize("scale", [0.1, 1.0])
 def test_two_solutions_under_the_same_inputs_approach_at_least_at_the_rate(body, scale):
-    """Small Runge-Kutta steps stand for the flow; inputs and environments jump; |·|_P
+    """Small Runge-Kutta steps approximate the flow; inputs and environments jump; |·|_P
     in scaled units.
     """
     dt, steps = 0.01, 200

@@ -1,6 +1,4 @@
-"""Identification: ridge regression, and the same under a norm bound (eq:koopid),
-against a convex program.
-"""
+"""Ridge regression, free and under a norm bound (eq:koopid), against a convex program."""
 
 from functools import cache
 
@@ -48,9 +46,7 @@ def test_regression_survives_columns_that_normal_equations_do_not():
 
 @cache
 def problem():
-    """Two vertices whose own operators have norms of about 2, states that are far from
-    round, and noise.
-    """
+    """Two vertices with operators of norm 2, states of unequal spread, and noise."""
     random = np.random.default_rng(2)
     states = random.standard_normal((80, RANK)) * np.float64([3.0, 1.0, 0.3, 0.1])
     mixtures = random.dirichlet([1.0, 1.0], 80)

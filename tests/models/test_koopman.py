@@ -1,6 +1,4 @@
-"""EDMD: the circles it looks from, the regression, and plants that it must recover
-exactly.
-"""
+"""EDMD: coordinates along circles, the regression, and plants that it recovers exactly."""
 
 from functools import cache, partial
 
@@ -31,9 +29,7 @@ def two_body_space():
 
 
 def parked(change, count=60, steps=12):
-    """Trajectories of a plant that stands somewhere while its body state, of two
-    entries, changes.
-    """
+    """Trajectories of a plant that stands still while its two body states change."""
     keys = jax.random.split(jax.random.key(8), 3)
     controls = jax.random.uniform(keys[0], (count, steps, 2), minval=-0.4, maxval=0.4)
     envs = jnp.asarray([0.6, 0.0]) + jnp.asarray([0.3, 8.0]) * jax.random.uniform(
@@ -70,9 +66,7 @@ def identified(model, trajectories):
 
 
 def physical(model, params, env):
-    """x⁺ = A x + B u + d κ + c in physical units, for a lift that holds the state
-    alone.
-    """
+    """x⁺ = A x + B u + d κ + c in physical units, for a lift of the state alone."""
     linear = model.structure.linear(model.fiber(params, jnp.asarray(env)))
     A = linear.C @ linear.A @ jnp.linalg.inv(linear.C)
     return (
@@ -85,9 +79,7 @@ def physical(model, params, env):
 
 @pytest.mark.parametrize("curvature", [-0.03, 0.0, 1e-4, 0.02])
 def test_states_along_a_circle_have_the_coordinates_they_were_made_with(curvature):
-    """Built in the world from progress, offset and heading, and read back: one frame,
-    any radius.
-    """
+    """Poses built from progress, offset and heading give these back, for any radius."""
     progress, left, heading = np.float32(
         [[0.0, 1.0, 12.0], [0.5, -0.8, 2.0], [0.1, 0.0, -0.3]]
     )
@@ -154,9 +146,7 @@ def test_a_plant_that_varies_with_the_environment_is_recovered_at_every_environm
 
 
 def test_a_plant_that_is_linear_in_the_lift_is_predicted_exactly():
-    """The lift of fresh states, environments and curvatures one step later, thin-plate
-    functions included.
-    """
+    """The lift of new states one step later, thin-plate functions included."""
     lift = Lift(
         space(), 20, 2, lateral_range=4.0, heading_range=0.5, curvature_range=0.03
     )
@@ -200,8 +190,8 @@ def driving(environment=True):
 
 @pytest.mark.parametrize("environment", [True, False])
 def test_driving_is_predicted_far_better_than_by_no_change(environment):
-    """Initial parameters predict that nothing changes; drives that neither fit nor
-    selection saw.
+    """Initial parameters predict no change; the drives are neither for fitting nor
+    selection.
     """
     model, params = driving(environment)
     miss = jit(
@@ -252,7 +242,7 @@ def test_a_model_that_does_not_see_the_environment_is_the_pooled_original():
 
 
 def test_the_ridge_that_predicts_best_is_chosen():
-    """One of the two is absurd; their order does not matter."""
+    """One of the two is far too large; their order does not matter."""
     for ridges in ((1e-5, 1e3), (1e3, 1e-5)):
         model = models.koopman(two_body_space(), functions=4, ridges=ridges)
         linear = model.structure.linear(
@@ -285,7 +275,7 @@ def test_the_model_and_its_linear_predictor_are_one_on_a_straight_path():
 
 
 def test_a_path_that_bends_left_turns_the_car_right_against_it():
-    """Per step of a metre, the heading error falls by about the turn of the path."""
+    """For a step of 1 m the heading error decreases by about the turn of the path."""
     model, params = driving()
     linear = model.structure.linear(model.fiber(params, jnp.asarray([0.7, 0.0])))
     np.testing.assert_allclose((linear.C @ linear.d)[2], -1.0, atol=0.1)

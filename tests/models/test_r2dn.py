@@ -1,6 +1,4 @@
-"""R2DN: a hard contraction factor for the whole interconnection, under attack, and
-exact where it is known.
-"""
+"""R2DN: a hard contraction factor of the whole interconnection, also under attack."""
 
 import jax
 import jax.numpy as jnp
@@ -28,7 +26,7 @@ CONTRACTING = jit(jax.vmap(lambda A, B1, C1: contracting(A, B1, C1, ALPHA)))
 
 
 def drawn(scale, seed=0):
-    """Random parameters in the shape of the model's own, but for the decoder's bound."""
+    """Random parameters with the model's shapes, except for the decoder's bound."""
     random = np.random.default_rng(seed)
     params = jax.tree.map(
         lambda leaf: jnp.asarray(
@@ -43,7 +41,9 @@ def drawn(scale, seed=0):
 
 
 def steepest():
-    """Parameters whose loop spends all that the constraint allows along the first axis: the step is α z₁ near 0.
+    """Parameters for which the constraint is active along the first axis.
+
+    The step is α z₁ near 0.
 
     There A = α/2, B₁ = C₁/α = 1/√2 and φ'(0) = 1: X = 0, Y = √2 − 1 make the Cayley
     block A = −B = 1/√2, and Y = 1 makes it A = 0, B = −1, so that V₂ V₁ = 2 B₂ A₁' B₁ =
@@ -64,9 +64,7 @@ def steepest():
 
 
 def mutant(layer):
-    """The model with C₁ (layer 0) or B₁ (layer −1) half as long again after the bound,
-    in all that it exposes.
-    """
+    """The model with C₁ (layer 0) or B₁ (layer −1) scaled by 1.5 after the bound."""
 
     def lengthened(matrices):
         return tuple(
@@ -180,9 +178,7 @@ def test_a_longer_loop_raises_the_certified_factor_of_any_parameters(layer):
 
 
 def test_two_trajectories_under_the_same_inputs_come_together_at_the_rate():
-    """The claim itself, over many steps, with an environment that switches at every
-    one.
-    """
+    """The claim over many steps, with an environment that switches at every step."""
     params, drive = drawn(1.0), at(driven(), 0)
 
     def along(z):

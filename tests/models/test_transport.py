@@ -1,4 +1,4 @@
-"""Transport between fibers: an isometry, the identity at home, and a cocycle."""
+"""Transport between fibers: an isometry, the identity for e = e', and a cocycle."""
 
 import jax
 import jax.numpy as jnp

@@ -174,7 +174,7 @@ def test_an_episode_starts_on_the_path_at_its_speed_and_the_path_outlasts_it():
 
 
 def test_road_and_weather_come_from_independent_streams():
-    """The same key drives the same road whatever the weather."""
+    """The same key gives the same road in every family."""
     roads = [jit(make(name))(KEYS[0]).path.points for name in ("s1", "s2", "s3")]
     np.testing.assert_array_equal(roads[0], roads[1])
     np.testing.assert_array_equal(roads[0], roads[2])

@@ -36,7 +36,7 @@ def road():
 
 
 def left_of(path, s, offset):
-    """The positions `offset` [m] to the left of the path at s."""
+    """The positions at distance `offset` [m] to the left of the path."""
     points = np.asarray(POINTS(path, s))
     return points[:, :2] + offset[:, None] * np.stack(
         [-np.sin(points[:, 2]), np.cos(points[:, 2])], axis=1

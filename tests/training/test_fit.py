@@ -1,4 +1,4 @@
-"""Training goes down, survives a kill, repeats exactly, and stops when numbers go bad."""
+"""The loss decreases; a run survives a kill, is reproducible, and stops at NaN."""
 
 import json
 import signal
@@ -61,8 +61,8 @@ def lines(directory):
 
 
 def test_training_goes_on_from_parameters_that_init_returns(task, tmp_path):
-    """A parabola instead of a model's loss: ten small steps move towards its minimum,
-    from where `init` stands.
+    """A parabola instead of a model's loss: ten small steps from `init` approach its
+    minimum.
     """
     model, _, data = task
 

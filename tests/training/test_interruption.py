@@ -1,6 +1,4 @@
-"""SIGINT and SIGTERM during training: a checkpoint at once, and an end as if nothing
-had been.
-"""
+"""SIGINT and SIGTERM during training: a checkpoint at once, and the same final weights."""
 
 import json
 import os
@@ -37,7 +35,7 @@ EXACT = ("step", "loss", "validation_loss", "learning_rate", "gradient_norm")
 
 
 def train(directory):
-    """Weights after 80 steps, and the best of them; checkpoints are rare."""
+    """The weights after 80 steps and the best step, with few checkpoints."""
     data = dataset()
     space = measure_space(data)
     model, draw = sfkd(space, **TINY), partial(random_windows, batch=16, length=8)
@@ -64,8 +62,8 @@ def lines(directory):
 
 
 def stopped(directory, number, step):
-    """Send a signal to a training that has logged a step: how long it takes to leave
-    [s], and its status.
+    """Signal a run that has logged a step; return the time until it exits [s] and its
+    status.
     """
     process = subprocess.Popen(
         [sys.executable, "-c", WORKER, str(directory), str(Path(__file__).parents[1])]

@@ -66,7 +66,7 @@ def test_lateral_error_and_heading_count_as_position_and_yaw(learned):
 
 
 def test_alpha_follows_the_loss_and_stays_below_its_largest(learned):
-    """A heavy tube alone drives α down; the weights hold for any α."""
+    """A large tube weight decreases α; the bounds hold for any α."""
     model, space, params, batch = learned
     loss = multi_step_loss(
         model,

@@ -1,4 +1,4 @@
-"""Two plants, double precision where mathematics is compared, and a way to drive."""
+"""Two plants, double precision for comparisons with formulas, and simulation helpers."""
 
 from collections.abc import Callable, Iterator
 from functools import cache, partial
@@ -40,8 +40,8 @@ def vehicle(factory):
 
 @pytest.fixture
 def coasting(factory):
-    """The same plant without drag and rolling resistance: what accelerates it are its
-    tyres and the wind.
+    """The same plant without drag and rolling resistance: only tyres and wind
+    accelerate it.
     """
     return factory(drag=0.0, rolling=0.0)
 

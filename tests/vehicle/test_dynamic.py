@@ -1,4 +1,4 @@
-"""What only the dynamic plant has: hidden slip, a steering actuator, load transfer."""
+"""The dynamic plant: hidden slip, a steering actuator, load transfer."""
 
 from functools import cache
 
@@ -41,9 +41,7 @@ def straight(speed):
 
 @pytest.fixture(params=[0.3, 0.9])
 def linearised(dynamic_plant, request):
-    """Which function -> its Jacobian of (v_y, yaw rate, steering) in straight driving,
-    one for each of SPEEDS.
-    """
+    """The Jacobian of (v_y, yaw rate, steering) in straight driving at each of SPEEDS."""
 
     def of(which):
         states, env = (

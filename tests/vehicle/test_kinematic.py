@@ -1,6 +1,4 @@
-"""What only the kinematic plant promises: quasi-steady slip, and a state that hides
-nothing.
-"""
+"""The kinematic plant: quasi-steady slip, and no hidden state."""
 
 import jax
 import jax.numpy as jnp
@@ -20,8 +18,8 @@ pytestmark = pytest.mark.usefixtures("x64")
     [(0.9, 0.0, 5.0), (0.5, 4.0, 12.0), (0.3, -8.0, 20.0)],
 )
 def test_slip_balances_force_and_moment_at_both_axles(friction, wind, speed):
-    """Whatever the curvature the circle leaves, the course is the one at which the rear
-    tyres carry their share.
+    """For any curvature in the friction circle, the rear tyres carry their share of the
+    force.
     """
     env = jnp.array([friction, wind])
     rate = kinematic().derivative(

@@ -1,4 +1,4 @@
-"""A robot of one's own: driven by a function that is named, or known from logs alone."""
+"""A user's own vehicle: given by a named function, or by logs alone."""
 
 from pathlib import Path
 

@@ -1,6 +1,4 @@
-"""What holds for every plant, whatever its tyres: frames, mirrors, batches,
-derivatives.
-"""
+"""Properties of every plant: frames, mirror symmetry, batches, derivatives."""
 
 import jax
 import jax.numpy as jnp

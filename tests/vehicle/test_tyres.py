@@ -1,6 +1,4 @@
-"""The friction circle, and steady cornering below it: closed formulas that both plants
-must meet.
-"""
+"""The friction circle and steady cornering: closed formulas for both plants."""
 
 import jax
 import jax.numpy as jnp
@@ -17,8 +15,8 @@ pytestmark = pytest.mark.usefixtures("x64")
 
 
 def axle_stiffness(vehicle, friction):
-    """Of both axles [N/rad]: proportional to μ in the kinematic plant, independent of
-    it in the dynamic one.
+    """The stiffness of both axles [N/rad], proportional to μ in the kinematic plant
+    only.
     """
     return (
         (6.0e4 * friction, 7.0e4 * friction)
@@ -32,9 +30,7 @@ def understeer(front, rear):
 
 
 def tyre_acceleration(vehicle, state, control, env):
-    """(a_x, a_y) by the tyres of a car without resistance [m/s²]: what the body gets
-    less what the wind gives.
-    """
+    """(a_x, a_y) by the tyres [m/s²]: of the body, without resistance and wind."""
     rate = vehicle.derivative(state, control, env)
     side = -10.0 * env[1] * jnp.abs(env[1]) / MASS
     if vehicle.name == "kinematic":
@@ -45,7 +41,7 @@ def tyre_acceleration(vehicle, state, control, env):
 
 
 def final_curvature(states):
-    """Of the path of the centre of mass, from the last two states [1/m]."""
+    """Curvature of the path of the centre of mass from the last two states [1/m]."""
     x, y, turned = between(states[-2, :3], states[-1, :3])
     return turned / jnp.hypot(x, y)
 
