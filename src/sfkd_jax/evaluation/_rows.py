@@ -159,7 +159,7 @@ _COMPARISONS = (
 def pool(rows: list[Row]) -> Row:
     """Pool rows that differ in the training seed alone.
 
-    Metrics are pooled as their table says, by default averaged.
+    Metrics are pooled as in their table, by default averaged.
 
     Args:
         rows: at least one, in the order of their seeds, of the same episodes.

@@ -73,7 +73,7 @@ def _drive(directory: Path, row: Row) -> Drive | None:
 
 
 def _file(directory: Path, row: Row) -> Path:
-    """The arrays of a row: as the row says, else by its identity."""
+    """The arrays of a row: those it names, else those of its identity."""
     if isinstance(row.get("arrays"), str):
         path = PurePath(row["arrays"])
         if path.is_absolute() or ".." in path.parts:

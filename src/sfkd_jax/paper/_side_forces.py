@@ -63,7 +63,7 @@ def violations(rows: list[Row]) -> Figure:
     _draw_radii(figure.add_subplot(grid[:, 1]), rows)
     style.legend(figure, tubes)
     if any(map(_is_certified, rows)):
-        grey = {"color": style.MUTED}
+        grey: dict[str, Any] = {"color": style.MUTED}
         marks = [Line2D([], [], label=n, **s | grey) for n, s in _KINDS.items()]
         figure.legend(handles=marks, loc="outside lower left", ncols=3)
     return figure

@@ -25,8 +25,6 @@ _REACH = (4.0, 11.0)
 """Least and most of half the height of the view from above [m]."""
 _MARGIN = 14.0
 """Before and behind the predicted stretch [m]."""
-_BOXES = ("state", "control", "env")
-_NOT_READ = ", which the model does not read"
 _UNITS = {"position_m": "position [m]", "yaw_rad": "yaw [rad]", "body": "body state"}
 
 
@@ -60,7 +58,8 @@ def _words(record: dict[str, Any]) -> list[Text]:
     if not holds(record):
         reason = record.get("reason") or "the file gives no reason"
         return [Text(text("certificate.none", reason=reason), "Nothing is proved.")]
-    boxes = [f"{name}: {_box(record, name)}" for name in _BOXES if _axes(record, name)]
+    names = "state", "control", "env"
+    boxes = [f"{name}: {_box(record, name)}" for name in names if _axes(record, name)]
     known = is_number(dig(record, "d_bar", "coverage"))
     covered = text("certificate.covered", record) if known else ""
     measured = text("certificate.measured", record, covered=covered)
@@ -77,7 +76,7 @@ def _proved(record: dict[str, Any]) -> str:
     return text(
         "certificate.proved",
         record,
-        where=f" with {_box(record, 'env')}" if known else _NOT_READ,
+        where=f" with {_box(record, 'env')}" if known else text("certificate.not_read"),
         radii=text("certificate.radii", record, steps=len(radii)) if radii else "",
         limit=text("certificate.limit", record) if limited else "",
     )

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from itertools import pairwise
 from pathlib import Path
 from typing import Any
@@ -51,7 +52,7 @@ def _scores(group: list[Row]) -> list[Block]:
 
 def _figures(scene: Scene, folder: Path, *, full: bool) -> list[Block]:
     """Deviation; with `full` also all episodes, the road and the steering."""
-    shown = {"deviation": deviation}
+    shown: dict[str, Callable[..., Figure]] = {"deviation": deviation}
     if full:
         shown["episodes"] = spread
         shown |= {"track": track} if scene.path is not None and scene.states else {}

@@ -17,8 +17,6 @@ from sfkd_jax.reporting.run import Run
 from sfkd_jax.reporting.tables import baseline_table, open_loop_table
 from sfkd_jax.reporting.texts import text
 
-_BESIDE = "Position error [m], beside naive predictors"
-
 
 def predicting(run: Run) -> list[Block]:
     """Prediction errors without feedback, by step ahead."""
@@ -28,7 +26,7 @@ def predicting(run: Run) -> list[Block]:
     caption, note = text("model.open_loop"), text("model.trajectories", errors)
     figure = picture(run.figures, "open_loop", caption, open_loop, errors)
     baselines = baseline_table(errors)
-    beside = [Heading(3, _BESIDE), baselines] if baselines else []
+    beside = [Heading(3, text("model.beside")), baselines] if baselines else []
     words = Text(note, kind="note")
     return [heading, figure, open_loop_table(errors), words, *beside]
 
@@ -76,8 +74,8 @@ def open_loop(errors: dict[str, Any]) -> Figure:
     """Prediction error without feedback by time ahead: position, yaw and speed."""
     figure = style.canvas(3.4)
     grid = figure.add_gridspec(2, 2, width_ratios=[1.45, 1])
-    cells = grid[:, 0], grid[0, 1], grid[1, 1]
-    position, yaw, speed = panels = [figure.add_subplot(cell) for cell in cells]
+    parts = grid[:, 0], grid[0, 1], grid[1, 1]
+    position, yaw, speed = panels = [figure.add_subplot(part) for part in parts]
     known = is_number(errors.get("dt"))
     ahead = np.asarray(errors["steps"], dtype=float) * (errors["dt"] if known else 1.0)
     for axes, key, name, colour in (

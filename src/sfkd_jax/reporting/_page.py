@@ -32,8 +32,8 @@ def write_report(run_dir: Path, *, studies: Studies | None = None) -> dict[str, 
     Args:
         run_dir: of a run. All but policy.json may be missing; the page names the
             command that makes it.
-        studies: adds what studies say about groups of comparable rows; gets the groups
-            and the folder of the figures.
+        studies: makes further blocks from the groups of comparable rows and the folder
+            of the figures.
 
     Returns:
         `report`: path of the page. `figures`: paths of the figures, in the order of the

@@ -138,7 +138,7 @@ def _draw_car(
         departure: the step at which it leaves its lane, and the words for that.
     """
     (points, offset), states = drawn, np.asarray(car.states)
-    body = dict(fc=car.colour, ec=style.DARK, linewidth=0.8, zorder=6)
+    body: dict[str, Any] = dict(fc=car.colour, ec=style.DARK, linewidth=0.8, zorder=6)
     shape = axes.add_patch(Polygon(_CAR.T, **body))
     trail = axes.plot([], [], color=car.colour, linewidth=1.8, zorder=4)[0]
     look: dict[str, Any] = {"fontsize": 10, "fontweight": "bold", "va": "center"}

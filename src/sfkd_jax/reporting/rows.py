@@ -10,7 +10,7 @@ from sfkd_jax.evaluation.metrics import Row
 from sfkd_jax.reporting.style import family, file_stem, label, ordered, scenario_label
 
 NO_MODEL = ("nominal", "oracle", "law")
-"""Systems that learn nothing; their name says whether they observe e."""
+"""Systems without a learned model; their names imply whether they observe e."""
 SAMPLINGS = {
     "feedback": "sampling around a feedback law",
     "plain": "plain sampling",

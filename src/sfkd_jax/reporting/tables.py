@@ -28,7 +28,7 @@ def metric_table(group: list[Row], *tables: str, observed: bool = False) -> Tabl
     Args:
         group: rows that may be compared.
         tables: as in `Metric.table`.
-        observed: whether a column says how each system observes e.
+        observed: whether a column shows how each system observes e.
 
     Returns:
         Only columns in which a row has a value.
