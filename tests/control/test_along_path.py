@@ -1,6 +1,4 @@
-"""Planning in path coordinates: what is projected, previewed, added to the law, and
-never left.
-"""
+"""Planning in path coordinates: projection, curvature preview, and limits of ν."""
 
 from functools import partial
 
@@ -72,7 +70,7 @@ def test_without_samples_the_law_alone_drives():
 
 
 def test_what_is_added_to_the_law_stays_within_its_bounds():
-    """However much noise is drawn, and with a cost that asks for more."""
+    """Also with large noise, and with a cost that favours more."""
     reference, _ = bend()
     controller = planner(64, temperature=0.1)
     loud = controller.init(jax.random.key(0))
@@ -89,8 +87,8 @@ def test_what_is_added_to_the_law_stays_within_its_bounds():
 
 
 def test_predicted_states_lie_where_the_car_then_is():
-    """On a bend, with the true plant as the model: within a centimetre across, and the
-    speed's error along.
+    """On a bend, with the true plant as the model: within 1 cm laterally; along the
+    path the speed error remains.
     """
     reference, path = bend()
     controller = planner(1)

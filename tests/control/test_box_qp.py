@@ -1,4 +1,4 @@
-"""The quadratic program: against a convex solver, at its bounds, and from a good guess."""
+"""The quadratic program: against a convex solver, at its bounds, and warm started."""
 
 from functools import partial
 
@@ -15,9 +15,7 @@ SIZE = 24
 
 
 def problem(seed, condition=1e3):
-    """A random strictly convex cost whose free minimum lies outside the box in about
-    half of its entries.
-    """
+    """A random strictly convex cost; about half of its free minimum is outside the box."""
     random = np.random.default_rng(seed)
     axes, _ = np.linalg.qr(random.standard_normal((SIZE, SIZE)))
     H = (axes * np.geomspace(1.0, condition, SIZE)) @ axes.T

@@ -47,7 +47,7 @@ SMALL = {
 
 
 def along_path(law, **settings):
-    """The task of following a path with the textbook bicycle, and its parameters."""
+    """The task of tracking a path with the kinematic bicycle, and its parameters."""
     model, params = model_and_params("nominal")
     cost = control.tracking_cost(dt=PLANT.dt)
     return control.path_tracking(
@@ -85,7 +85,7 @@ def registered(name):
 
 
 def delay_compensated():
-    """For actuators two steps late."""
+    """With actuators that are two steps late."""
     controller, params = mppi(FEEDBACK)
     return control.delay_compensated(
         controller, model_and_params("nominal")[0], delay=2
@@ -108,8 +108,8 @@ def monitored():
 
 
 def shielded():
-    """A planner in path coordinates, filtered; with a tiny model as it is drawn,
-    folded.
+    """With a filter, in path coordinates; the model is a tiny SFKD at its initial
+    parameters, folded.
     """
     law, limits = any_law(), LIMITS | BOX
     model = models.sfkd(path_space(), **TINY | {"budget": "joint"}, frame="path")
@@ -126,7 +126,7 @@ def shielded():
 
 
 def estimated():
-    """With an environment that is inferred from the motion, on a coarse grid."""
+    """With an environment estimated on a coarse grid."""
     controller, params = mppi(FEEDBACK)
     model = model_and_params("nominal")[0]
     return control.estimated(controller, model, **BOX, states=4, points=(3, 4)), params
@@ -167,8 +167,8 @@ every_sampling = pytest.mark.parametrize(
 
 @cache
 def compiled(name):
-    """A controller by name, its parameters, its compiled act, and a list with an entry
-    for every trace of it.
+    """A controller, its parameters, its compiled act, and a list with one entry per
+    trace.
     """
     controller, params = BUILDERS[name]()
     traces = []
@@ -187,8 +187,8 @@ def act_once(name, seed=0):
 
 @cache
 def drive(name):
-    """Controls and infos of eight steps in one scan, with blackouts and a car far off
-    the road at the end.
+    """Controls and infos of eight steps in one scan, with blackouts, and far off the
+    road at the end.
     """
     controller, params = BUILDERS[name]()
     observations, envs = np.tile(OFFSET, (8, 1)), np.tile(ENV, (8, 1))
@@ -228,7 +228,7 @@ def test_the_state_keeps_its_structure_shapes_and_types(name):
 
 @every
 def test_an_episode_finds_in_info_what_it_records(name):
-    """`simulate` reads it by name; only shapes are computed."""
+    """`simulate` reads them by name; only shapes are computed."""
     controller, params = BUILDERS[name]()
     road = scenarios.Scenario(
         jnp.asarray(OFFSET),
@@ -369,7 +369,7 @@ REQUIRED = {
 
 @jaxtyped(typechecker=None)
 def undocumented(info):
-    """Entries of an info that `ControllerInfo` does not document with their shape."""
+    """The entries of an info that `ControllerInfo` does not document with their shape."""
     return {
         key: value.shape
         for key, value in info.items()

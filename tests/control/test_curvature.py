@@ -1,6 +1,4 @@
-"""Noise shaped by the curvature of the cost: against its closed form, and what it is
-worth where cost is stretched.
-"""
+"""Noise shaped by the Hessian: against its closed form, and for a badly scaled cost."""
 
 import jax
 import jax.numpy as jnp
@@ -38,7 +36,7 @@ TASK = control.free_task(
 
 
 def cost(plan):
-    """J of one plan from one state."""
+    """The cost of one plan from one state."""
 
     def step(state, action):
         after = dynamics({}, state, action, None)
@@ -108,8 +106,8 @@ def test_where_the_cost_bends_down_noise_is_as_wide_as_where_it_is_flat():
 
 
 def regret(**settings):
-    """Cost above the optimum of the mean plan after some steps from one state, as a
-    share of it.
+    """Relative excess cost of the mean plan over the optimum, after some steps from one
+    state.
     """
     planner = control.mppi(
         TASK, horizon=HORIZON, noise="white", noise_std=(0.5, 2.0), **settings

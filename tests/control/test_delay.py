@@ -1,4 +1,4 @@
-"""Actuators that answer late."""
+"""Delay compensation."""
 
 import jax
 import jax.numpy as jnp
@@ -25,7 +25,7 @@ def planner():
 
 
 def drive(controller, steps=12):
-    """A plant that applies what was sent DELAY steps before; zero until then."""
+    """A plant that applies the control sent DELAY steps before; zero until then."""
     reference = straight(HORIZON)
 
     @jit

@@ -1,6 +1,4 @@
-"""The environment inferred while driving: against what truly held, and what must not
-change it.
-"""
+"""The estimated environment: accuracy, and what must not affect it."""
 
 from functools import cache
 
@@ -30,7 +28,7 @@ SWITCHED = np.where(TIME[:, None] < 30, CALM, STORM)
 
 
 def scripted(controls=CONTROLS):
-    """Plays recorded controls and shows in its info what it was given."""
+    """Play recorded controls and report the inputs in the info."""
 
     def act(params, count, observation, env, reference):
         return (
@@ -95,14 +93,14 @@ def test_without_noise_an_environment_of_the_grid_is_found_exactly(env):
 
 
 def test_between_hypotheses_the_estimate_lies_within_a_cell_of_the_truth():
-    """0.55 and 3.3 m/s are on no node; a cell is 0.1 and 1 m/s."""
+    """0.55 and 3.3 m/s are between grid points; the grid spacing is 0.1 and 1 m/s."""
     info, _ = follow(driven(np.tile([0.55, 3.3], (STEPS, 1))), **EXACT)
     assert np.all(np.abs(info["env_estimate"][-10:] - [0.55, 3.3]) < [0.1, 1.0])
 
 
 def test_a_switch_is_seen_within_a_few_noisy_steps():
-    """A storm of 8 m/s is known to a quarter after six of them, but for a false alarm
-    now and then.
+    """Six steps after a storm of 8 m/s begins, its estimate is within 2 m/s, apart from
+    rare false alarms.
     """
     winds = np.stack(
         [
@@ -116,8 +114,8 @@ def test_a_switch_is_seen_within_a_few_noisy_steps():
 
 
 def test_the_true_environment_lies_inside_the_reported_spread():
-    """At least nine steps of ten within two standard deviations, at environments off
-    the grid, with noise.
+    """In at least 90 % of the steps within two standard deviations, off the grid and
+    with noise.
     """
     inside = []
     for seed in range(4):
@@ -131,8 +129,8 @@ def test_the_true_environment_lies_inside_the_reported_spread():
 
 
 def test_what_the_motion_does_not_show_stays_unknown():
-    """A model whose motion ignores both entries: mean and deviation of an even grid,
-    for ever.
+    """If the motion depends on neither entry, mean and deviation stay those of an even
+    grid.
     """
     blind = models.physics(PLANT.nominal)
     planner = control.estimated(scripted(), blind, points=(3, 5), **BOX)
@@ -151,7 +149,9 @@ def test_what_the_motion_does_not_show_stays_unknown():
 
 
 def test_where_the_drive_starts_and_heads_does_not_matter():
-    """Observations moved by an element of SE(2), heading across ±π: the same estimates."""
+    """Observations transformed by an element of SE(2), heading across ±π: the same
+    estimates.
+    """
     here = driven(SWITCHED)
     turn = 3.1
     moved = driven(SWITCHED, start=(250.0, -90.0, turn, 10.0))

@@ -1,6 +1,4 @@
-"""MPC in a lift: what it minimises, that it does, how it drives, and what it never
-does.
-"""
+"""Linear MPC in a lift: its cost, its solution, its driving, and its limits."""
 
 from functools import cache, partial
 
@@ -74,8 +72,8 @@ def whole(action, state):
 
 @cache
 def quadratic_programs():
-    """(H, f, low, high, start) of three steps in a row, the first far off the path, as
-    they reach the solver.
+    """(H, f, low, high, start) of three consecutive steps as the solver receives them;
+    the first is far off the path.
     """
     model, params = koopman()
     controller = control.koopman_mpc(model, horizon=HORIZON, **LIMITS)
@@ -160,9 +158,7 @@ def test_the_cost_is_the_tracking_cost_of_what_is_predicted(speed_loop):
 
 
 def test_no_other_plan_inside_the_box_is_cheaper():
-    """By that cost: the gradient of the quadratic vanishes at the plan, or pushes
-    against a bound.
-    """
+    """The gradient of the quadratic vanishes at the plan, or points out of the box."""
     action, state, info = act(jnp.asarray([0.0, 6.0, 0.0, 4.0]))
     H, f, low, high, _ = quadratic_programs()[0]
     plan = whole(action, state).ravel().astype(np.float64)
@@ -173,7 +169,7 @@ def test_no_other_plan_inside_the_box_is_cheaper():
 
 @cache
 def drive(curvature, offset, seconds=5.0, env=(0.8, 0.0)):
-    """A whole episode beside a path of constant curvature, without sensor noise."""
+    """An episode beside a path of constant curvature, without sensor noise."""
     path = scenarios.path_from_curvature(jnp.full(300, curvature), spacing=0.5)
     start = jnp.asarray([0.0, offset, 0.0, 10.0])
     envs = jnp.tile(jnp.asarray(env), (round(seconds / 0.1), 1))
@@ -282,7 +278,7 @@ def test_an_environment_outside_its_box_is_clamped_and_flagged():
 
 
 def test_a_predictor_that_knows_nothing_keeps_a_finite_plan():
-    """Initial parameters: no control does anything, so nothing is to be done."""
+    """With initial parameters no control has any effect, so the best control is none."""
     model = models.koopman(datasets.measure_space(dataset()), functions=4)
     controller = control.koopman_mpc(model, horizon=HORIZON, speed_loop=True, **LIMITS)
     params = model.init(jax.random.key(0))

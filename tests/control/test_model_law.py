@@ -1,6 +1,4 @@
-"""The law that comes out of a model: steady turns that are steady, and gains that solve
-the Riccati equation.
-"""
+"""The law of a model: its turns are steady, and its gains solve the Riccati equation."""
 
 from functools import cache
 
@@ -22,9 +20,7 @@ CURVATURE = jnp.asarray([0.0, 0.01, -0.02])
 
 @cache
 def turns(name, bend=1.0):
-    """Steady turns of a plant for three curvatures, and the step in path coordinates
-    that they belong to.
-    """
+    """Steady turns of a plant for three curvatures, and the step in path coordinates."""
     plant = PLANTS[name]
     model, size = models.physics(plant.step), len(plant.state_names)
 
@@ -92,7 +88,7 @@ def test_a_turn_that_no_tyre_can_hold_falls_back_to_driving_straight():
 
 
 def test_a_planner_around_it_needs_no_samples_to_stay_near_the_path_in_side_wind():
-    """The plan of zeros, the law alone, against the hand-made law: a steady crosswind
+    """The law alone (a plan of zeros) against the hand-made law, in a steady crosswind
     on a straight road.
     """
     plant, model = PLANTS["kinematic"], models.physics(PLANTS["kinematic"].step)
@@ -145,8 +141,8 @@ def test_elimination_solves_what_needs_pivots(size):
 
 
 def test_as_an_ancillary_it_is_one_more_sample_of_a_planner_around_another_law():
-    """The cheapest of two plans: the hand-made law's, which is the plan of zeros, and
-    the model's own.
+    """The cheaper of two plans: that of the hand-made law (zeros) and that of the
+    model's law.
     """
     plant, model = PLANTS["kinematic"], models.physics(PLANTS["kinematic"].step)
     limits = {"control_low": plant.control_low, "control_high": plant.control_high}

@@ -1,6 +1,4 @@
-"""The monitor: what it flags and when, what it never touches, and what its fallbacks
-do.
-"""
+"""The monitor: its flags, its fallbacks, and that it changes nothing else."""
 
 from functools import cache, partial
 
@@ -32,9 +30,7 @@ CLEAN = Trajectory(*map(np.asarray, at(driven(), 0)))
 
 
 def scripted(controls):
-    """A controller that plays recorded controls and shows in its info what it was
-    shown.
-    """
+    """A controller that plays recorded controls and reports its inputs in the info."""
 
     def act(params, count, observation, env, reference):
         return (
@@ -54,7 +50,7 @@ def changed(drive, field, step, entry, value):
 
 
 def one_by_one(act, state, params, drive, reference=REFERENCE):
-    """States and infos of a monitor that sees a drive, step by step."""
+    """States and infos of a monitor along a drive, step by step."""
     steps = []
     for observation, env in zip(drive.states[:-1], drive.envs, strict=True):
         _, state, info = act(params, state, observation, env, reference)
@@ -67,9 +63,7 @@ def stacked(trees):
 
 
 def watch_with(name="oracle", bounds=TIGHT, **settings):
-    """(drive, reference) -> infos and states of a monitor over a model by name, all
-    steps in one scan.
-    """
+    """(drive, reference) -> infos and states of a monitor of a model, in one scan."""
     model, params = model_and_params(name)
 
     def watch(drive, reference):
@@ -109,7 +103,7 @@ def flagged(steps):
 
 @pytest.mark.parametrize("name", ["segment", "nominal"])
 def test_along_a_trajectory_the_kinds_are_those_that_bounds_are_calibrated_on(name):
-    """With the anchor that calibration uses, the start of the trajectory."""
+    """With the anchor of the calibration, the start of the trajectory."""
     model, params = model_and_params(name)
 
     @jit
@@ -146,9 +140,7 @@ def test_a_perfect_model_without_noise_is_never_accused():
 
 
 def misses(drive):
-    """|d| of the nominal bicycle, from the definition; the latent of a physics model is
-    the body state.
-    """
+    """|d| of the nominal bicycle from the definition; its latent is the body state."""
     before, after = (np.float64(part) for part in (drive.states[:-1], drive.states[1:]))
     predicted = np.float64(
         jax.vmap(PLANT.nominal)(*map(jnp.asarray, (before, drive.controls, drive.envs)))
@@ -177,8 +169,8 @@ def test_a_breach_is_flagged_exactly_where_a_kind_exceeds_its_bound(kind):
 def test_a_sideways_shove_is_flagged_at_the_step_that_shows_it_and_only_there(
     shove, breaches
 ):
-    """The car is moved sideways by a known distance after step 5; from there on it
-    drives as the model says.
+    """The car is displaced sideways after step 5; from then on it drives as the model
+    predicts.
     """
     states = np.array(CLEAN.states)
     yaw = states[6, 2]
@@ -278,7 +270,7 @@ def test_what_lies_outside_its_box_is_flagged_then_and_only_then(
 
 @pytest.mark.parametrize(("field", "entry"), [("states", 3), ("envs", 1)])
 def test_the_first_step_is_checked_as_far_as_it_can_be(field, entry):
-    """s_0 and e_0 have boxes; there is no u_{-1}, whatever the control box is."""
+    """s_0 and e_0 have boxes; there is no u_{-1}, so the control box does not apply."""
     info = watched(changed(CLEAN, field, 0, entry, 99.0), bounds=WIDE)
     assert flagged(info["box_exit"]) == [0]
     braking = {"control_low": (-0.5, -6.0), "control_high": (0.5, -1.0)}
@@ -358,7 +350,7 @@ def test_a_breach_calls_the_fallback_as_an_exit_does():
 
 
 def test_holding_waits_for_a_first_clean_step():
-    """Before it there is no plan that could be continued."""
+    """Before it there is no plan to continue."""
     drive = changed(changed(CLEAN, "states", 0, 0, np.nan), "envs", 1, 0, 1.5)
     info = watched(drive, bounds=WIDE, fallback="hold", release=3)
     assert flagged(info["box_exit"]) == [0, 1]
@@ -366,9 +358,7 @@ def test_holding_waits_for_a_first_clean_step():
 
 
 def test_holding_ends_with_the_plan_and_begins_again_once_all_was_well():
-    """A car that left its box while its plan was held would else be steered by the last
-    control for ever.
-    """
+    """Otherwise the last control would steer a car that left its box for ever."""
     drive = CLEAN
     for step in (*range(8), 11):
         drive = changed(drive, "envs", step, 0, 1.5)
@@ -408,8 +398,8 @@ def guarded(fallback="none", **settings):
 
 @cache
 def compiled(fallback="none"):
-    """A monitor over the planner, its act, and the planner's own; the car may stand
-    still: no bound forbids it.
+    """A monitor of the planner, its act, and the planner's own; no bound forbids
+    standing still.
     """
     monitor = guarded(fallback, release=3, bounds=WIDE)
     return monitor, jit(monitor.act), planner_alone()
@@ -461,9 +451,7 @@ def test_a_monitor_that_only_reports_changes_nothing_of_what_is_done():
 
 
 def circle(radius, *, steps, start):
-    """Poses 1 m apart along a circle, the yaw kept in [-π, π], at speeds that grow
-    along it.
-    """
+    """Poses 1 m apart along a circle, yaw in [-π, π], at increasing speeds."""
     angle = start + np.arange(1, steps + 1) / radius
     yaw = (angle + np.pi) % (2 * np.pi) - np.pi
     return np.float32(
@@ -480,7 +468,9 @@ def circle(radius, *, steps, start):
 
 
 def distance_to_polyline(point, corners):
-    """Of a point in the plane to the nearest segment between neighbouring corners."""
+    """Distance of a point in the plane to the nearest segment between consecutive
+    corners.
+    """
     start, step = corners[:-1], np.diff(corners, axis=0)
     share = np.clip(
         np.sum((point - start) * step, axis=1) / np.sum(step**2, axis=1), 0.0, 1.0
@@ -492,9 +482,7 @@ def distance_to_polyline(point, corners):
 def test_slowed_down_the_reference_lies_on_the_same_path_and_is_driven_at_a_lower_speed(
     factor,
 ):
-    """On a circle through yaw ±π: arc lengths, speeds and yaws are known, and the path
-    now is one step back.
-    """
+    """On a circle through yaw ±π, where arc lengths, speeds and yaws are known."""
     radius, start = 50.0, np.pi - 0.05
     reference = circle(radius, steps=HORIZON, start=start)
     drive = changed(CLEAN, "envs", 2, 0, 1.5)
@@ -524,9 +512,7 @@ def test_slowed_down_on_a_straight_road_it_is_the_window_of_a_slower_drive():
 
 
 def test_a_car_outside_its_box_slows_down_on_its_path_and_the_one_inside_does_not():
-    """The planner is monitored in the ordinary closed loop, at a friction inside the
-    box and at one above it.
-    """
+    """In the ordinary closed loop, at a friction inside the box and at one above it."""
     monitor = guarded("slow")
 
     @jit
@@ -597,7 +583,7 @@ def test_it_is_traced_once_while_everything_changes():
 
 
 def scans(jaxpr):
-    """How many loops a jaxpr holds, at any depth."""
+    """The number of loops in a jaxpr, at any depth."""
     count = 0
     for equation in jaxpr.eqns:
         count += equation.primitive.name in ("scan", "while")
@@ -610,9 +596,7 @@ def scans(jaxpr):
 
 @pytest.mark.parametrize("fallback", ["none", "hold", "slow"])
 def test_the_planner_is_run_once_whatever_the_fallback(fallback):
-    """What the monitor adds is one step of the model, which has a loop of its own over
-    its substeps.
-    """
+    """The monitor adds one step of the model, which has a loop over its substeps."""
 
     def loops(function, *inputs):
         return scans(jax.make_jaxpr(function)(*inputs).jaxpr)

@@ -1,6 +1,4 @@
-"""The planner: what it converges to, what it never does, and what a compiler sees of
-it.
-"""
+"""MPPI: its convergence, its limits, and its compiled program."""
 
 from functools import cache, partial
 
@@ -130,8 +128,8 @@ def test_as_the_temperature_falls_the_plan_becomes_the_best_samples():
 
 
 def test_the_shifted_plan_is_one_of_the_samples():
-    """On the path nothing is to be done: only the plan of zeros costs next to nothing,
-    whatever the others do.
+    """On the path, only the plan of zeros costs next to nothing, whatever the other
+    samples do.
     """
     on_path = np.float32([0.0, 0.0, 0.0, 10.0])
     _, _, info = act_once(
@@ -175,8 +173,8 @@ def test_the_plan_carried_over_is_shifted_by_one_step():
     ("std", "law"), [(1e3, FEEDBACK), (1e30, control.no_feedback())]
 )
 def test_controls_stay_inside_their_bounds_however_large_the_noise(std, law):
-    """And perturbations are stored as they were effective after clipping: no larger
-    than the actuator box is wide.
+    """The stored perturbations are those after clipping: at most as large as the
+    actuator box.
     """
     low, high = np.float32(PLANT.control_low), np.float32(PLANT.control_high)
     state = None
@@ -282,8 +280,8 @@ def test_a_broken_environment_does_the_same(entry):
 
 @pytest.mark.parametrize("broken", ["observation", "env", "reference"])
 def test_what_is_not_finite_is_noticed_even_where_the_model_does_not_look(broken):
-    """The nominal bicycle does not read e; the last entry of the reference is read by
-    the cost alone.
+    """The nominal bicycle does not read e, and only the cost reads the last entry of
+    the reference.
     """
     inputs = {"observation": OFFSET, "env": ENV, "reference": REFERENCE}
     inputs[broken] = with_entry(inputs[broken], -1, np.nan)
@@ -306,8 +304,8 @@ def test_a_broken_first_observation_gives_a_finite_control_inside_the_bounds():
 
 @pytest.mark.parametrize("law", [FEEDBACK, control.ModelLaw(dt=0.1)])
 def test_a_reading_far_off_leaves_no_more_in_the_plan_than_the_actuators_can_do(law):
-    """The law then asks for thousands of radians in vain; a perturbation that made up
-    for them would outlast them.
+    """The law requests thousands of radians; a perturbation that compensates for them
+    would persist.
     """
     controller, params, act = compiled(law=law)
     span = np.subtract(PLANT.control_high, PLANT.control_low)
@@ -341,8 +339,8 @@ def breaks_where(condition):
 
 @pytest.mark.parametrize("law", [FEEDBACK, control.no_feedback()])
 def test_a_model_that_breaks_for_half_of_the_samples_still_gives_a_finite_plan(law):
-    """Noise with correlation 1 keeps its sign: half of the samples steer left
-    somewhere, and break.
+    """Noise with correlation 1 keeps its sign: half of the samples steer left and
+    become NaN.
     """
     on_path = jnp.asarray([0.0, 0.0, 0.0, 10.0])
     model = breaks_where(lambda action: action[0] > 0)
@@ -388,7 +386,7 @@ def test_the_latent_weight_changes_the_plan():
 
 
 def nested(jaxpr):
-    """Every jaxpr inside the equations of one, with the primitive that holds it."""
+    """Every jaxpr inside the equations of one, with the name of its primitive."""
     for equation in jaxpr.eqns:
         for value in equation.params.values():
             for part in value if isinstance(value, tuple | list) else (value,):
@@ -411,8 +409,8 @@ def scan_bodies(jaxpr):
 
 
 def square_products(jaxpr):
-    """Products of two square matrices of one size, as a Gram iteration is made of, at
-    any depth.
+    """The number of products of two square matrices of one size, as in a Gram
+    iteration.
     """
     here = [eqn for eqn in jaxpr.eqns if eqn.primitive.name == "dot_general"]
     shapes = [[operand.aval.shape[-2:] for operand in eqn.invars] for eqn in here]

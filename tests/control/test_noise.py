@@ -1,6 +1,4 @@
-"""Perturbations: what their course over the horizon has to be, and that every step has
-the same spread.
-"""
+"""Noise: its correlation over the horizon, and equal variance at every step."""
 
 import jax
 import jax.numpy as jnp
@@ -27,7 +25,7 @@ def drawn(kind, seed=0, samples=SAMPLES, **settings):
 
 
 def correlations(noise):
-    """Of all pairs of steps, first control."""
+    """Correlations between all pairs of steps, of the first control."""
     return np.corrcoef(noise[:, :, 0])
 
 
@@ -64,9 +62,7 @@ def test_autoregressive_noise_from_independent_and_from_halton_numbers_has_one_l
 
 @pytest.mark.parametrize("exponent", [0.0, 1.0, 2.0])
 def test_the_spectrum_of_coloured_noise_falls_as_asked(exponent):
-    """Slope of the log spectrum of tapered windows, between the ends that a window of
-    20 steps resolves.
-    """
+    """Slope of the log spectrum of tapered windows, in the band that 20 steps resolve."""
     horizon = 64
     draw = control.noise_sampler("coloured", horizon=horizon, exponent=exponent)
     noise = np.asarray(draw(jax.random.key(0), 2000, STD))[:, :, 0]
@@ -81,7 +77,7 @@ def test_the_spectrum_of_coloured_noise_falls_as_asked(exponent):
 
 @pytest.mark.parametrize("knots", [2, 3, 4, 7])
 def test_a_spline_through_knots_is_exact_for_the_polynomials_it_can_hold(knots):
-    """Row by row the weights of the knots sum to one before scaling: a cubic is
+    """Before scaling, the weights of the knots sum to one in every row, and a cubic is
     reproduced.
     """
     from sfkd_jax.control.planners._noise import _spline
@@ -96,9 +92,7 @@ def test_a_spline_through_knots_is_exact_for_the_polynomials_it_can_hold(knots):
 
 
 def test_halton_points_fill_their_space_more_evenly_than_independent_ones():
-    """The mean of a smooth function of four numbers: quasi-random points miss it by far
-    less.
-    """
+    """For the mean of a smooth function of four numbers, the error is far smaller."""
     misses = {halton: [] for halton in (True, False)}
     for halton, errors in misses.items():
         draw = control.noise_sampler("spline", horizon=HORIZON, knots=2, halton=halton)

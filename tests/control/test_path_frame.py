@@ -1,4 +1,4 @@
-"""Errors against a reference, the law the planner samples around, and the cost."""
+"""Path errors, the hand-made feedback law, and the tracking cost."""
 
 import jax
 import jax.numpy as jnp
@@ -14,8 +14,8 @@ RADIUS = 40.0
 
 
 def on_circle(along, offset=0.0):
-    """Poses that drive a left-hand circle through the origin, `along` [m] from there,
-    `offset` to its left.
+    """Poses along a left-hand circle through the origin at `along` [m], `offset` [m] to
+    its left.
     """
     yaw = along / RADIUS
     radius = RADIUS - offset
@@ -39,9 +39,7 @@ def errors_at(states, point=(0.0, 0.0, 0.0, 9.0), curvature=1 / RADIUS):
 
 
 def test_path_errors_vanish_on_the_circle_that_the_reference_describes():
-    """To second order in the distance s along it: what is left of the lateral error is
-    below s⁴/(8 R³).
-    """
+    """To second order in the distance s along it: the lateral error is below s⁴/(8 R³)."""
     along = np.linspace(-4.0, 4.0, 17)
     errors = errors_at(on_circle(along))
     assert np.all(np.abs(errors.lateral) <= along**4 / (8 * RADIUS**3) + 1e-5)
@@ -143,13 +141,13 @@ def stage(
 
 
 def charge(seen, **settings):
-    """What the cost charges with the weights it was made with."""
+    """The cost with the weights it was made with."""
     cost = control.tracking_cost(dt=0.1, **settings)
     return cost.stage(cost.weights, seen)
 
 
 def test_the_cost_is_zero_on_the_path_whatever_the_body_heading():
-    """A car that crabs against the wind keeps its course, not its heading."""
+    """A car that crabs in a side wind keeps its course, not its heading."""
     assert float(charge(stage(heading=0.3, steering=0.1, steering_before=0.1))) == 0.0
 
 

@@ -1,6 +1,4 @@
-"""A law derived from a plant's own step: it holds the car, everywhere in the box, and
-is stored as arrays.
-"""
+"""A law derived from a plant's step: it stabilises the car and can be stored."""
 
 from functools import partial
 
@@ -42,7 +40,7 @@ def test_a_turn_at_a_point_of_the_tables_is_steady(derived):
 @pytest.mark.parametrize("env", [(0.3, 8.0), (0.3, -8.0), (0.9, 0.0), (0.55, 5.0)])
 def test_the_law_alone_keeps_the_car_on_its_path(derived, env):
     """10 m/s, lateral acceleration 1.6 m/s², from 0.4 m beside the path: then within 7
-    cm, tables coarse.
+    cm.
     """
     plant, law = derived
     loop = vehicle.along_path(plant, law)
@@ -61,8 +59,8 @@ def test_the_law_alone_keeps_the_car_on_its_path(derived, env):
 
 
 def test_the_loop_contracts_alike_where_tyres_give_little(derived):
-    """Steering is charged by the curvature it makes: the slowest mode on ice with wind
-    is not slower than 0.92.
+    """Steering is weighted by the curvature it makes: the slowest mode on ice with wind
+    is below 0.92.
     """
     plant, law = derived
     loop = vehicle.along_path(plant, law)
@@ -92,9 +90,7 @@ def test_a_law_survives_being_stored(derived):
 
 
 def test_a_step_without_a_derivative_will_do():
-    """A plant on the host, as CommonRoad's cars are: the textbook bicycle by Euler's
-    method, in numpy.
-    """
+    """A plant on the host, like CommonRoad's vehicles: the kinematic bicycle in numpy."""
 
     def euler(x, u, e):
         del e

@@ -1,6 +1,4 @@
-"""What planners do beyond the path: any task, any temperature, any limits, several
-environments, any devices.
-"""
+"""All planners: any task, temperature and limits, several environments and devices."""
 
 import os
 import subprocess
@@ -59,9 +57,7 @@ every = pytest.mark.parametrize("search", SEARCHES)
 
 
 def plan_for(search, task=None, steps=12, start=START, env=NOTHING, **settings):
-    """Plan again and again from the same state, without moving on: what the search
-    converges to.
-    """
+    """Plan repeatedly from the same state: the plan to which the search converges."""
     task = task or double_integrator()
     controller = SEARCHES[search](task, horizon=HORIZON, noise_std=(2.0,), **settings)
 
@@ -81,8 +77,8 @@ def plan_for(search, task=None, steps=12, start=START, env=NOTHING, **settings):
 
 
 def optimal():
-    """Least cost of the linear-quadratic problem, and its controls: the Riccati
-    recursion in double precision.
+    """Optimal cost and controls of the linear-quadratic problem, by a Riccati recursion
+    in float64.
     """
     a, b, q = A.astype(float), B.astype(float), np.diag(Q).astype(float)
     value, gains = np.zeros((2, 2)), []
@@ -125,8 +121,8 @@ def test_the_gradient_planner_never_goes_up_and_ends_at_the_optimal_plan():
 def test_a_call_that_comes_late_continues_the_plan_from_where_it_would_be_by_then(
     search, elapsed
 ):
-    """Nothing can be read at that call, so what it does is the plan alone; a plan is
-    kept as of one period later.
+    """The observation of that call is NaN, so its control is the plan's; the stored
+    plan is one period old.
     """
     controller = SEARCHES[search](
         double_integrator(), horizon=HORIZON, noise_std=(2.0,)
@@ -148,7 +144,7 @@ def test_a_call_that_comes_late_continues_the_plan_from_where_it_would_be_by_the
 
 @every
 def test_a_clock_that_tells_no_number_counts_as_a_call_in_time(search):
-    """Else the plan would be NaN from then on, and with it every control."""
+    """Otherwise the plan and all later controls would be NaN."""
     controller = SEARCHES[search](
         double_integrator(), horizon=HORIZON, noise_std=(2.0,)
     )
@@ -228,7 +224,7 @@ def test_a_proposal_that_is_best_is_found_at_once(search):
 @every
 @pytest.mark.parametrize("window", [0, 5])
 def test_limits_hold_exactly_from_the_measured_actuator_on(search, window):
-    """The state carries the actuator: its second entry here stands for it."""
+    """The second entry of the state stands for the actuator position."""
     low, high, rate = (-1.0,), (0.8,), (3.0,)
     limits = {"control_low": low, "control_high": high, "control_rate": rate}
     task = double_integrator(**limits, actuator=lambda state: 0.1 * state[1:])
@@ -328,7 +324,7 @@ def test_environments_that_are_all_the_same_count_as_one(risk):
 
 
 def test_the_worst_case_is_cheaper_for_a_plan_that_was_made_for_it():
-    """Pushes from both sides, one three times as strong."""
+    """Pushes from both sides, one three times as strong as the other."""
     envs = jnp.asarray([[0.03, 0.0], [-0.09, 0.0]])
     costs = {}
     for risk in ("mean", "worst"):

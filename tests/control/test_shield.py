@@ -1,6 +1,4 @@
-"""The safety filter: what it lets through, what it holds whatever is planned, and what
-it reports.
-"""
+"""The safety filter: what passes, what it guarantees, and what it reports."""
 
 from functools import cache, partial
 
@@ -58,11 +56,11 @@ def toy():
 TOY = toy()
 POWERS = [np.linalg.matrix_power(A, k)[0] for k in range(STEPS)]
 TUBE = 1.001 * float(sum(np.abs(row) @ DISTURBANCE for row in POWERS))
-"""The exact largest |e_y - copy's e_y| after `STEPS` disturbances within their bounds,
-and a margin for rounding.
+"""The largest possible |e_y - copy's e_y| after `STEPS` bounded disturbances, and a
+margin for rounding.
 """
 WORST = np.asarray([np.sign(row) * DISTURBANCE for row in reversed(POWERS)])
-"""The disturbances that reach it at the last step."""
+"""The disturbances that attain it at the last step."""
 
 
 def circle(curvature=0.0, horizon=HORIZON, speed=SPEED):
@@ -82,9 +80,7 @@ def circle(curvature=0.0, horizon=HORIZON, speed=SPEED):
 
 
 def scripted():
-    """A planner that adds params[k] to the law at step k, whatever that leads to; or
-    params["script"][k].
-    """
+    """A planner that adds params[k], or params["script"][k], to the law at step k."""
 
     def act(params, k, observation, env, reference):
         params = unfold(params)
@@ -114,8 +110,8 @@ def drive(
     seen=None,
     envs=None,
 ):
-    """xi of the car before every step, controls and info; the plant is the toy,
-    disturbed; `seen` is 1 or NaN.
+    """xi of the car before every step, controls and info; the plant is the disturbed
+    toy; `seen` is 1 or NaN.
     """
     reference = circle(curvature)
     count = len(disturbances)
@@ -147,7 +143,7 @@ def drive(
 
 
 def scripts():
-    """Planners that mean harm, (script, step, 2)."""
+    """Adversarial planners, (script, step, 2)."""
     noise = np.random.default_rng(0)
     resonant = np.sign(np.sin(2 * np.pi * np.arange(STEPS) / 50))[:, None] * LIMIT
     return {
@@ -165,7 +161,7 @@ def scripts():
 
 @cache
 def attacked():
-    """All of them at once, against the worst disturbances: xi, controls, info by name."""
+    """All of them against the worst disturbances: xi, controls, info by name."""
     named = scripts()
     together = jnp.asarray(np.stack(list(named.values())), dtype=float)
     tracks = jit(jax.vmap(lambda script: drive(filtered(), script, WORST)))(together)
@@ -189,8 +185,8 @@ def test_car_and_copy_stay_in_their_corridors_whatever_is_planned(name):
 
 @pytest.mark.parametrize("name", scripts())
 def test_once_feasible_it_stays_feasible(name):
-    """The preview is constant, so that what the law does next has been looked at
-    already.
+    """The preview is constant, so the filter has already predicted the law's next
+    steps.
     """
     _, _, info = attacked()[name]
     assert np.all(info["feasible"])
@@ -207,14 +203,14 @@ def test_without_the_filter_the_same_planner_leaves_the_corridor(name):
 
 
 def test_the_worst_disturbance_reaches_the_tube():
-    """Else a tube that is far too wide would pass above."""
+    """Otherwise a tube that is far too wide would pass the test above."""
     xi, _, info = attacked()["nan"]
     assert abs(xi[-1, 0] - info["copy"][-1, 0]) > 0.99 * TUBE
 
 
 @pytest.mark.parametrize("added", [0.0, 0.05])
 def test_who_asks_for_nothing_or_for_little_is_left_alone(added):
-    """The control is the planner's own to the last bit."""
+    """Bit for bit."""
     script, reference = jnp.tile(added * jnp.asarray(LIMIT), (40, 1)), circle()
     xi, controls, info = jit(partial(drive, filtered()))(
         script, jnp.zeros((40, 3)), (0.05, 0.0, 8.0)
@@ -231,7 +227,7 @@ def test_who_asks_for_nothing_or_for_little_is_left_alone(added):
 
 
 def margin_of(xi, nu, road):
-    """In float64, by the definition."""
+    """The margin from its definition, in float64."""
     largest = 0.0
     for k in range(HORIZON):
         push = np.asarray([0.0, 2e-4 * float(ENV[1]) + 0.3 * road[0], 0.1 * road[1]])
@@ -299,8 +295,8 @@ def test_a_share_of_one_is_the_request_to_the_last_bit():
 def test_where_the_law_alone_leaves_the_corridor_the_copy_is_steered_back(
     lateral, enough, side
 ):
-    """Turned outward near the edge: one step of the largest steering makes it good, or
-    makes it better.
+    """Heading outward near the edge, one step of the largest steering is sufficient or
+    an improvement.
     """
     xi = np.asarray([side * lateral, side * 0.03, SPEED])
     alone, back = margin_of(xi, np.zeros(2), ROAD), -side * LIMIT * (1, 0)
@@ -354,7 +350,7 @@ def test_a_second_without_observations_is_driven_by_the_copy():
 
 
 def test_a_switch_of_the_environment_moves_copy_and_car_alike():
-    """The latent is carried into the new fibre: its unit changes, its meaning does not.
+    """The latent is transported to the new fibre: its unit changes, its state does not.
     Gaps in e are bridged.
     """
     envs = jnp.tile(ENV, (40, 1)).at[10:].set(jnp.asarray([0.3, -6.0]))
@@ -380,8 +376,8 @@ def test_a_switch_of_the_environment_moves_copy_and_car_alike():
 
 
 def test_a_car_that_the_bound_does_not_hold_for_is_told_and_followed():
-    """Pushed aside by 0.5 m: one breach, then the copy is where the car is; or without
-    end if it is not moved.
+    """Displaced by 0.5 m: one breach, then the copy is at the car; or breaches for ever
+    without reanchoring.
     """
     kick = np.zeros((20, 3))
     kick[9, 0] = 0.5
@@ -407,7 +403,7 @@ def test_a_car_that_the_bound_does_not_hold_for_is_told_and_followed():
     ],
 )
 def test_outside_a_box_the_law_drives_alone(box, value):
-    """The certificate says nothing there; inside the box the same request passes."""
+    """The certificate does not apply there; inside the box the same request passes."""
     wanted = jnp.tile(0.1 * jnp.asarray(LIMIT), (2, 1))
     start = (0.0, 0.005, SPEED + 1.0)
     for options in ({}, {box: value}):
@@ -467,7 +463,7 @@ def test_before_anything_is_seen_the_planner_passes_within_the_limits():
 
 
 def test_without_a_reference_the_last_preview_is_driven_on():
-    """On a circle, where the curvature that was ahead is the one that comes."""
+    """On a circle, where the previewed curvature is the actual one."""
     controller = filtered()
     act, memory = jit(controller.act), controller.init(jax.random.key(0))
     xi, reference = vehicle_state(jnp.asarray([0.1, 0.0, SPEED])), circle(0.01)
@@ -482,8 +478,8 @@ def test_without_a_reference_the_last_preview_is_driven_on():
 
 
 def test_where_law_and_planner_are_at_the_same_limit_nothing_was_asked_for():
-    """A law beyond its limit gives the limit; the copy, whose law is as strong, must
-    not be given a perturbation.
+    """The clipped law gives the limit; the copy, whose law is clipped alike, gets no
+    perturbation.
     """
     controller = filtered(control_high=(0.05, 5.0), width=5.0)
     start = vehicle_state(jnp.asarray([-3.0, -0.2, SPEED]))
@@ -495,8 +491,8 @@ def test_where_law_and_planner_are_at_the_same_limit_nothing_was_asked_for():
 
 
 def test_it_is_exported_in_a_scan_and_does_as_call_by_call():
-    """A tiny SFKD as it is drawn, a switch of e and one that cannot be read; jit and
-    vmap are in the contracts.
+    """A tiny SFKD at its initial parameters, with a switch of e and an e that is not
+    finite.
     """
     model = models.sfkd(path_space(), **TINY | {"budget": "joint"}, frame="path")
     params = jit(lambda key: fold(model, model.init(key)))(jax.random.key(0))
@@ -583,8 +579,8 @@ def test_a_model_of_the_world_and_an_environment_of_another_size_are_refused():
 
 
 def test_the_box_of_a_certificate_holds_its_corridor(monkeypatch):
-    """A data set that strayed to one side only must not make the other side of the
-    corridor void.
+    """A data set on one side of the path must not make the other side of the corridor
+    void.
     """
     corridor = {
         "bounds": {"nominal": 0.08, "followed_position": 0.06},

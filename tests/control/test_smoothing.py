@@ -1,6 +1,4 @@
-"""Savitzky-Golay smoothing: the filter from its definition, and what the planner does
-with it.
-"""
+"""Savitzky-Golay smoothing: the filter's definition, and its use in the planner."""
 
 from fractions import Fraction
 from functools import cache, partial
@@ -50,8 +48,8 @@ def test_the_filter_has_the_published_coefficients_exactly(
 
 @pytest.mark.parametrize(("window", "order"), WINDOWS)
 def test_the_fit_is_the_orthogonal_projection_onto_polynomials(window, order):
-    """H = Hᵀ = H² with trace order + 1, and every power up to the order is left as it
-    is; in exact arithmetic.
+    """H = Hᵀ = H² with trace order + 1, and H reproduces every power up to the order,
+    exactly.
     """
     fit = np.array(control.savitzky_golay_weights(window=window, order=order))
     points = np.array([Fraction(i - window // 2) for i in range(window)])
@@ -64,7 +62,7 @@ def test_the_fit_is_the_orthogonal_projection_onto_polynomials(window, order):
 
 @pytest.mark.parametrize(("window", "order"), WINDOWS)
 def test_a_plan_is_smoothed_as_the_record_that_it_continues(window, order):
-    """Against scipy, whose mode "interp" makes the same one-sided fit at the far end."""
+    """Against scipy, whose mode "interp" makes the same one-sided fit at the end."""
     half = window // 2
     record = np.random.default_rng(0).standard_normal((half + 12, 2))
     smooth = control.plan_smoother(horizon=12, window=window, order=order)
@@ -79,8 +77,8 @@ def test_a_plan_is_smoothed_as_the_record_that_it_continues(window, order):
 @pytest.mark.parametrize(("window", "horizon"), [(5, 3), (5, 6), (9, 5), (9, 20)])
 @pytest.mark.parametrize("order", [0, 1, 2])
 def test_a_polynomial_that_continues_the_past_stays_what_it_is(window, horizon, order):
-    """Also for the shortest horizon of a window. One order more is bent, and so is the
-    same plan after another past.
+    """Also for the shortest horizon. A polynomial of higher order is changed, and so is
+    a plan after another past.
     """
     half = window // 2
     smooth = control.plan_smoother(horizon=horizon, window=window, order=order)
@@ -159,9 +157,7 @@ def started(law="plain", **settings):
 
 
 def test_the_chosen_plan_is_the_weighted_one_smoothed_after_what_was_applied():
-    """The planner without a filter, given the same state, tells what was to be
-    smoothed; no limit is in the way.
-    """
+    """The planner without a filter gives the plan before smoothing; no limit is active."""
     _, state, _ = act(started(**WIDE), **WIDE)
     _, state, _ = act(state, **WIDE)
     _, smoothed, _ = act(state, **WIDE)

@@ -14,13 +14,13 @@ from benchmarks.robustness import faults, faulty_road
 
 STEPS = 1000
 RELEASE = 10
-"""Steps that the shipped monitor's fallback lasts after its last flag."""
+"""Steps for which the shipped monitor's fallback stays active after the last flag."""
 
 
 @cache
 def driven():
-    """The loop, which fault there is at each step, and (controls, distance, lost,
-    healthy, entries not finite).
+    """The loop, the fault at each step, and (controls, distance, lost, healthy, entries
+    not finite).
     """
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(faults, "PAUSE", (2 * RELEASE + 2, 40))
