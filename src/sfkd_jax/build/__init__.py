@@ -4,11 +4,11 @@ from sfkd_jax.build._choices import Settings as Settings
 from sfkd_jax.build._choices import as_kwargs as as_kwargs
 from sfkd_jax.build._choices import choose as choose
 from sfkd_jax.build._controllers import ENV_SOURCES as ENV_SOURCES
-from sfkd_jax.build._controllers import PLANNERS as PLANNERS
-from sfkd_jax.build._controllers import Planner as Planner
 from sfkd_jax.build._controllers import build_controller as build_controller
-from sfkd_jax.build._controllers import controller_horizon as controller_horizon
 from sfkd_jax.build._controllers import in_corridor as in_corridor
+from sfkd_jax.build._planners import PLANNERS as PLANNERS
+from sfkd_jax.build._planners import Planner as Planner
+from sfkd_jax.build._planners import controller_horizon as controller_horizon
 from sfkd_jax.build._plants import INNER_LOOPS as INNER_LOOPS
 from sfkd_jax.build._plants import PLANTS as PLANTS
 from sfkd_jax.build._plants import build_driver as build_driver

@@ -10,6 +10,7 @@ from collections.abc import Iterator, Sequence
 
 from sfkd_jax.cli import groups, options
 from sfkd_jax.cli.commands import COMMANDS
+from sfkd_jax.cli.schemas import is_schema
 
 USAGE = """\
 usage: sfkd completion bash
@@ -68,7 +69,7 @@ def words() -> list[str]:
 def _names(schema: type, above: str = "") -> Iterator[str]:
     """Yield the dotted names of the settings of a schema."""
     for entry in dataclasses.fields(schema):
-        if dataclasses.is_dataclass(entry.type):
+        if is_schema(entry.type):
             yield from _names(entry.type, f"{above}{entry.name}.")
         else:
             yield f"{above}{entry.name}"

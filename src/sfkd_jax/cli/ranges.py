@@ -11,7 +11,7 @@ from omegaconf import DictConfig, OmegaConf
 
 from sfkd_jax.cli import messages
 from sfkd_jax.cli.options import GROUPS
-from sfkd_jax.cli.schemas import Rule
+from sfkd_jax.cli.schemas import Rule, is_schema
 from sfkd_jax.core.ranges import Entries, Interval
 
 LARGEST = {int: 2**31 - 1, float: 3e38}
@@ -57,7 +57,7 @@ def _check_node(
         inner = _schema_of(node, key) or (
             declared[key].type if key in declared else None
         )
-        if dataclasses.is_dataclass(inner):
+        if is_schema(inner):
             below = value if isinstance(value, dict) else {}
             _check_node(f"{name}.", below, node.get(key), inner, names)
         elif name in GROUPS:
@@ -77,7 +77,7 @@ def _schema_of(node: Any, key: str) -> Any:
     if not isinstance(node, DictConfig) or key not in node:
         return None
     kind = OmegaConf.get_type(node, key)
-    return kind if dataclasses.is_dataclass(kind) else None
+    return kind if is_schema(kind) else None
 
 
 def _check_value(name: str, value: Any, rule: Rule) -> None:
@@ -95,7 +95,7 @@ def _check_value(name: str, value: Any, rule: Rule) -> None:
         return  # nothing is stated about it
     if problem := _problem(value, rule):
         raise ValueError(f"{name} must be {problem}, got {value!r}")
-    if rule.below_root and not is_below(value):
+    if rule.below_root and not is_below(str(value)):
         raise ValueError(
             f"{name} must be a path below root without '..', empty parts or \\, "
             f"got {value!r}"

@@ -6,8 +6,8 @@ import inspect
 import types
 import typing
 from collections.abc import Callable, Mapping
-from dataclasses import MISSING, field, make_dataclass
-from typing import Any, NamedTuple
+from dataclasses import MISSING, field, is_dataclass, make_dataclass
+from typing import Any, NamedTuple, TypeGuard
 
 from sfkd_jax.core.ranges import Ascending, Entries, Interval
 
@@ -78,6 +78,11 @@ def schema(
                 chosen[name] = _field(name, hint, parameter.default)
     required_first = sorted(chosen.values(), key=lambda entry: not _required(entry[2]))
     return make_dataclass(title, required_first)
+
+
+def is_schema(hint: Any) -> TypeGuard[type]:
+    """Return whether a type is a nested group of settings."""
+    return isinstance(hint, type) and is_dataclass(hint)
 
 
 def rule_of(hint: Any) -> Rule:
