@@ -57,20 +57,20 @@ def settings(*overrides):
 @pytest.fixture(scope="module")
 def logs(tmp_path_factory):
     """Eight drives with a yaw rate; nobody measured friction or wind."""
-    place = tmp_path_factory.mktemp("own") / "logs"
-    place.mkdir()
+    folder = tmp_path_factory.mktemp("own") / "logs"
+    folder.mkdir()
     for k in range(8):
         columns = drive(seconds=12.0, phase=0.8 * k)
         columns["yaw_rate"] = np.gradient(columns["yaw"], columns["t"])
         write_csv(
-            place / f"{k}.csv",
+            folder / f"{k}.csv",
             {
                 name: columns[name]
                 for name in columns
                 if name not in ("friction", "wind")
             },
         )
-    return place
+    return folder
 
 
 @pytest.mark.slow
@@ -118,15 +118,15 @@ def test_logs_are_stored_with_their_coverage_and_only_test_drives_are_held_out(
     logs, monkeypatch
 ):
     monkeypatch.chdir(logs.parent)
-    asked = settings(*SMALL)
-    dataset, _ = stages.ensure_dataset(asked)
+    options = settings(*SMALL)
+    dataset, _ = stages.ensure_dataset(options)
     assert [part.states.shape[1:] for part in dataset[:4]] == [(11, 5)] * 4
     assert sum(len(part.states) for part in dataset[:4]) == 8 * 12
-    held_out = stages.held_out_parts(asked, dataset)
+    held_out = stages.held_out_parts(options, dataset)
     assert set(held_out) == {"test"}
     assert held_out["test"] is dataset.test
     covered = json.loads(
-        (store.dataset_path(asked).parent / "coverage.json").read_text()
+        (store.dataset_path(options).parent / "coverage.json").read_text()
     )
     assert set(covered["state"]) == {"v", "yaw_rate"}
     assert 4.0 <= covered["state"]["v"]["low"] < covered["state"]["v"]["high"] <= 6.0
@@ -175,9 +175,9 @@ def test_a_step_of_the_wrong_shape_is_one_line(tmp_path, monkeypatch):
 
 def test_what_logs_cannot_support_is_refused_before_a_run_is_begun(logs, monkeypatch):
     monkeypatch.chdir(logs.parent)
-    asked = settings(*SMALL, "name=other", "certification.level=0.99")
+    options = settings(*SMALL, "name=other", "certification.level=0.99")
     with pytest.raises(ValueError, match="12 calibration segments are too few for"):
-        stages.ensure_policy(asked)
+        stages.ensure_policy(options)
     with pytest.raises(
         ValueError, match="no column friction for the environment; pass env_source=none"
     ):
@@ -191,8 +191,8 @@ def test_what_logs_cannot_support_is_refused_before_a_run_is_begun(logs, monkeyp
 
 
 def test_logs_that_moved_are_the_same_data_set_and_changed_ones_are_not(logs, tmp_path):
-    def identity(place):
-        return store.identity(settings(*SMALL, f"dataset.path={place}"))
+    def identity(folder):
+        return store.identity(settings(*SMALL, f"dataset.path={folder}"))
 
     here = identity(logs)
     shutil.copytree(logs, tmp_path / "moved")

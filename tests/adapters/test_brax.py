@@ -105,22 +105,24 @@ def test_a_controller_drives_it_as_the_test_track_has_it_driven():
         after.pipeline_state.state, episode.states[1:], atol=2e-4
     )
     np.testing.assert_allclose(after.pipeline_state.lateral, episode.lateral, atol=2e-4)
-    asked = jit(jax.vmap(lambda state: law(*env().situation(state)[::2])))(after)
-    np.testing.assert_allclose(asked[:-1], episode.controls[1:], atol=1e-4)
+    expected_controls = jit(jax.vmap(lambda state: law(*env().situation(state)[::2])))(
+        after
+    )
+    np.testing.assert_allclose(expected_controls[:-1], episode.controls[1:], atol=1e-4)
 
 
-def test_the_observation_is_laid_out_as_documented():
+def test_the_observation_has_the_documented_order():
     start, after = driven(gentle(), "dynamic")
     last, road = at(after, -1), start.info["road"]
 
     @jit
-    def told(state):
+    def observed(state):
         pose, environment, reference = env("dynamic").situation(state)
         rows = state.obs[10:].reshape(10, 4)
         back = jax.vmap(se2.compose, in_axes=(None, 0))(pose[:3], rows[:, :3])
         return environment, reference, jnp.concatenate([back, rows[:, 3:]], axis=1)
 
-    environment, reference, seen = told(last)
+    environment, reference, seen = observed(last)
     moment = last.pipeline_state
     np.testing.assert_allclose(last.obs[0], moment.lateral, atol=1e-6)
     np.testing.assert_allclose(last.obs[2:6], moment.state[3:], atol=1e-6)
@@ -133,16 +135,18 @@ def test_the_observation_is_laid_out_as_documented():
 
 def test_the_observation_does_not_depend_on_where_the_road_lies():
     start, after = driven(gentle())
-    place = jnp.asarray([30.0, -20.0, 2.0])
+    origin = jnp.asarray([30.0, -20.0, 2.0])
 
     @jit
     def both(road, moment):
-        moved = jax.vmap(se2.compose, in_axes=(None, 0))(place, road.path.points[:, :3])
+        moved = jax.vmap(se2.compose, in_axes=(None, 0))(
+            origin, road.path.points[:, :3]
+        )
         elsewhere = road._replace(
             path=road.path._replace(points=road.path.points.at[:, :3].set(moved))
         )
         there = moment._replace(
-            state=moment.state.at[:3].set(se2.compose(place, moment.state[:3]))
+            state=moment.state.at[:3].set(se2.compose(origin, moment.state[:3]))
         )
         return env().task.observe(elsewhere, there), env().task.observe(road, moment)
 

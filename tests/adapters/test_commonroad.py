@@ -124,10 +124,10 @@ def test_a_step_steer_is_what_it_was_and_what_the_packages_own_equations_give(
     """0.18 rad at 12 m/s for 1 s, BMW 320i, commonroad-vehicle-models 3.0.2; recorded from `by_runge_kutta` with
     5000 steps and rounded. The package's own stored reference of this model does not hold for its own version.
     """
-    found = held(model, (0.18, 0.0), (friction, 0.0), 1.0)[-1, :7]
-    np.testing.assert_allclose(found, STEP_STEER[model, friction], atol=2e-4)
+    result = held(model, (0.18, 0.0), (friction, 0.0), 1.0)[-1, :7]
+    np.testing.assert_allclose(result, STEP_STEER[model, friction], atol=2e-4)
     np.testing.assert_allclose(
-        found, by_runge_kutta(model, (0.18, 0.0), friction, 1.0, 500), atol=1e-4
+        result, by_runge_kutta(model, (0.18, 0.0), friction, 1.0, 500), atol=1e-4
     )
 
 
@@ -142,10 +142,14 @@ def test_positions_move_with_the_velocity_rotated_by_yaw(model):
     start[7:] += 0.01 * np.random.default_rng(0).normal(size=len(start) - 7)
     short = adapters.commonroad_vehicle(model=model, dt=1e-4)
     with jax.enable_x64(True):
-        asked = (jnp.asarray(start), jnp.asarray([0.05, 0.5]), jnp.asarray([0.8, 0.0]))
+        settings = (
+            jnp.asarray(start),
+            jnp.asarray([0.05, 0.5]),
+            jnp.asarray([0.8, 0.0]),
+        )
         rate, quotient = (
-            np.asarray(short.derivative(*asked)),
-            np.asarray((short.step(*asked) - asked[0]) / 1e-4),
+            np.asarray(short.derivative(*settings)),
+            np.asarray((short.step(*settings) - settings[0]) / 1e-4),
         )
     turned = (
         np.asarray([[np.cos(0.7), -np.sin(0.7)], [np.sin(0.7), np.cos(0.7)]])
@@ -310,16 +314,16 @@ def test_a_controller_for_our_plant_keeps_such_a_car_in_its_lane(model):
 
 
 @pytest.mark.parametrize(
-    ("asked", "message"),
+    ("settings", "message"),
     [
         ({"model": "st"}, "unknown model 'st'; choose one of std, mb"),
         ({"car": 4}, "car must be one of 1, 2, 3, got 4"),
         ({"dt": 0.0}, "dt and steering_lag must be positive, got 0.0 and 0.1"),
     ],
 )
-def test_what_is_no_such_car_is_refused_in_one_line(asked, message):
+def test_an_unknown_car_is_refused_in_one_line(settings, message):
     with pytest.raises(ValueError, match=message) as refusal:
-        adapters.commonroad_vehicle(**asked)
+        adapters.commonroad_vehicle(**settings)
     assert "\n" not in str(refusal.value)
 
 
@@ -331,7 +335,9 @@ def test_an_observation_of_another_size_is_refused():
 
 
 def test_the_snippet_of_the_page_runs_as_it_stands(capsys):
-    page = (Path(__file__).parents[2] / "docs" / "results" / "other-cars.md").read_text("utf-8")
+    page = (Path(__file__).parents[2] / "docs" / "results" / "other-cars.md").read_text(
+        "utf-8"
+    )
     (snippet,) = re.findall(r"```python\n(.*?)```", page, re.DOTALL)
     exec(compile(snippet, "docs/results/other-cars.md", "exec"), {})
     assert "(7,)" in capsys.readouterr().out

@@ -30,11 +30,13 @@ def test_one_step_is_that_of_the_package():
     ]
     controls = [[0.05, 1.0], [-0.2, -1.0], [0.12, 2.5], [0.15, -0.5]]
     envs = [[0.9, 0.0], [0.3, 8.0], [0.6, -5.0], [0.3, -8.0]]
-    found = traced_car.disagreement(*map(jnp.asarray, (states, controls, envs)))
-    wheels = {name: value for name, value in found.items() if name.startswith("hidden")}
+    result = traced_car.disagreement(*map(jnp.asarray, (states, controls, envs)))
+    wheels = {
+        name: value for name, value in result.items() if name.startswith("hidden")
+    }
     assert {
         name: value
-        for name, value in found.items()
+        for name, value in result.items()
         if value > (WHEELS if name in wheels else CLOSE)
     } == {}
     assert len(wheels) == 2

@@ -36,7 +36,7 @@ JUMPS = {
 
 @pytest.mark.parametrize("kind", JUMPS)
 def test_jumps_refuse_a_drive_or_cut_it(tmp_path, kind):
-    spoil, says, pieces = JUMPS[kind]
+    spoil, message, pieces = JUMPS[kind]
     columns = drive()
     spoil(columns)
     path = write_csv(tmp_path / "a.csv", columns)
@@ -44,7 +44,7 @@ def test_jumps_refuse_a_drive_or_cut_it(tmp_path, kind):
     logged, lines = read(path, split_at_jumps=True)
     (warning,) = (line for line in lines if line.endswith("the drive is cut there"))
     assert warning.startswith(f"warning: {path}, line ")
-    assert says in warning
+    assert message in warning
     states = segments_of(logged)[0]
     assert 30 - 2 * pieces < len(states) <= 30
     assert longest_move(states) < 0.61  # v ≤ 6 m/s
@@ -111,7 +111,7 @@ def test_a_drive_that_is_slow_throughout_is_left_out(tmp_path):
 
 
 def test_both_parts_of_a_cut_drive_stay_in_one_part_of_the_data(tmp_path):
-    """Neighbours in time resemble each other, whatever lies between them."""
+    """Neighbours in time resemble each other, whatever is between them."""
     for k in range(8):
         columns = drive(seconds=10.0, phase=0.3 * k)
         columns["p_x"] = columns["p_x"] + 100.0 * (columns["t"] > 5.05)

@@ -56,14 +56,14 @@ def expected(columns, steps=STEPS):
     return [part.astype(np.float32) for part in (states, *cut)]
 
 
-def same_segments(found, wanted):
+def same_segments(result, wanted):
     """Whether two sets of segments are the same in some order, to the last bit."""
     order = [
-        np.lexsort(part[0].reshape(len(part[0]), -1).T) for part in (found, wanted)
+        np.lexsort(part[0].reshape(len(part[0]), -1).T) for part in (result, wanted)
     ]
     return all(
         np.array_equal(a[order[0]], b[order[1]])
-        for a, b in zip(found, wanted, strict=True)
+        for a, b in zip(result, wanted, strict=True)
     )
 
 
@@ -201,9 +201,9 @@ def test_resampling_interpolates_states_and_holds_controls(tmp_path, period):
 
 def test_a_gap_splits_a_drive_and_nothing_is_invented_in_it(tmp_path):
     columns = drive()
-    kept = (columns["t"] <= 10.0 + 1e-9) | (columns["t"] >= 20.0 - 1e-9)
+    saved = (columns["t"] <= 10.0 + 1e-9) | (columns["t"] >= 20.0 - 1e-9)
     path = write_csv(
-        tmp_path / "a.csv", {name: values[kept] for name, values in columns.items()}
+        tmp_path / "a.csv", {name: values[saved] for name, values in columns.items()}
     )
     logged, lines = read(path)
     assert (
@@ -333,11 +333,11 @@ WRONG = {
 
 @pytest.mark.parametrize("kind", WRONG)
 def test_what_cannot_be_right_is_one_line_with_its_place(tmp_path, kind):
-    spoil, says = WRONG[kind]
+    spoil, message = WRONG[kind]
     columns = drive()
     spoil(columns)
     line = refusal(write_csv(tmp_path / "a.csv", columns))
-    assert says in line
+    assert message in line
     if kind not in ("short", "few"):  # of all files together
         assert line.startswith(f"{tmp_path / 'a.csv'}")
 
@@ -371,9 +371,9 @@ TEXTS = {
 
 @pytest.mark.parametrize("kind", TEXTS)
 def test_a_malformed_csv_is_one_line_with_its_place(tmp_path, kind):
-    text, says = TEXTS[kind]
+    text, message = TEXTS[kind]
     (tmp_path / "a.csv").write_text(text)
-    assert refusal(tmp_path / "a.csv") == f"{tmp_path / 'a.csv'}{says}"
+    assert refusal(tmp_path / "a.csv") == f"{tmp_path / 'a.csv'}{message}"
 
 
 ARRAYS = {
@@ -396,8 +396,8 @@ ARRAYS = {
 
 @pytest.mark.parametrize("kind", ARRAYS)
 def test_a_malformed_npz_is_one_line(tmp_path, kind):
-    arrays, says = ARRAYS[kind]
-    assert says in refusal(write_npz(tmp_path / "a.npz", arrays))
+    arrays, message = ARRAYS[kind]
+    assert message in refusal(write_npz(tmp_path / "a.npz", arrays))
 
 
 def test_every_refused_file_is_reported(tmp_path):
@@ -413,7 +413,7 @@ def test_every_refused_file_is_reported(tmp_path):
 
 
 @pytest.mark.parametrize(
-    ("path", "says"),
+    ("path", "message"),
     [
         ("???", "dataset.path is not set"),
         ("nowhere.csv", "no such file or folder, and no file matches it"),
@@ -422,10 +422,10 @@ def test_every_refused_file_is_reported(tmp_path):
         ("notes.txt", "unknown kind of log"),
     ],
 )
-def test_a_path_that_means_no_logs_is_refused(tmp_path, monkeypatch, path, says):
+def test_a_path_that_means_no_logs_is_refused(tmp_path, monkeypatch, path, message):
     monkeypatch.chdir(tmp_path)
     (tmp_path / "notes.txt").write_text("")
-    assert says in refusal(path)
+    assert message in refusal(path)
 
 
 def test_the_same_drive_twice_is_refused(tmp_path):
@@ -435,19 +435,19 @@ def test_the_same_drive_twice_is_refused(tmp_path):
 
 
 def test_contents_decide_which_data_set_it_is(tmp_path):
-    for place in ("here", "there"):
-        (tmp_path / place).mkdir()
+    for folder in ("here", "there"):
+        (tmp_path / folder).mkdir()
     write_csv(tmp_path / "here" / "a.csv", drive())
     write_csv(tmp_path / "there" / "renamed.csv", drive())
     first, moved = (
-        datasets.fingerprint(str(tmp_path / place)) for place in ("here", "there")
+        datasets.fingerprint(str(tmp_path / folder)) for folder in ("here", "there")
     )
     write_csv(tmp_path / "here" / "a.csv", drive(phase=0.1))
     assert first == moved != datasets.fingerprint(str(tmp_path / "here"))
 
 
 @pytest.mark.parametrize(
-    ("columns", "says"),
+    ("columns", "message"),
     [
         (
             Columns(state=("p_x", "p_y", "yaw")),
@@ -461,12 +461,12 @@ def test_contents_decide_which_data_set_it_is(tmp_path):
         (Columns(environment=()), "pass env_source=none"),
     ],
 )
-def test_invalid_columns_are_refused(tmp_path, columns, says):
-    assert says in refusal(write_csv(tmp_path / "a.csv", drive()), columns)
+def test_invalid_columns_are_refused(tmp_path, columns, message):
+    assert message in refusal(write_csv(tmp_path / "a.csv", drive()), columns)
 
 
 @pytest.mark.parametrize(
-    ("spoil", "options", "says"),
+    ("spoil", "options", "message"),
     [
         (scale("steering", np.negative), {}, "the robot turns against steering"),
         (scale("steering", np.sign), {}, "steering takes only 2 values"),
@@ -483,24 +483,24 @@ def test_invalid_columns_are_refused(tmp_path, columns, says):
         ),
     ],
 )
-def test_oddities_are_warned_of(tmp_path, spoil, options, says):
+def test_oddities_are_warned_of(tmp_path, spoil, options, message):
     columns = drive()
     spoil(columns)
     _, lines = read(write_csv(tmp_path / "a.csv", columns), **options)
     assert any(
-        line.startswith(f"warning: {tmp_path}") and says in line for line in lines
+        line.startswith(f"warning: {tmp_path}") and message in line for line in lines
     )
 
 
 def test_the_box_of_environments_is_what_logs_reach_or_what_is_asked(tmp_path):
     columns = drive()
     path = write_csv(tmp_path / "a.csv", columns)
-    found = read(path)[0].dataset
-    envs = together(found)[2]
-    np.testing.assert_array_equal(found.env_low, envs.min(axis=(0, 1)))
-    np.testing.assert_array_equal(found.env_high, envs.max(axis=(0, 1)))
-    asked = read(path, env_low=(0.3, -8.0), env_high=(0.9, 8.0))[0].dataset
-    np.testing.assert_array_equal(asked.env_low, np.float32([0.3, -8.0]))
+    result = read(path)[0].dataset
+    envs = together(result)[2]
+    np.testing.assert_array_equal(result.env_low, envs.min(axis=(0, 1)))
+    np.testing.assert_array_equal(result.env_high, envs.max(axis=(0, 1)))
+    chosen = read(path, env_low=(0.3, -8.0), env_high=(0.9, 8.0))[0].dataset
+    np.testing.assert_array_equal(chosen.env_low, np.float32([0.3, -8.0]))
     first = int(np.argmax(columns["wind"] > 1.0 + 1e-5))
     line = refusal(path, env_low=(0.3, -8.0), env_high=(0.9, 1.0))
     assert line.startswith(f"{path}, line {first + 2}: wind is ")

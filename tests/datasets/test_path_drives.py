@@ -1,4 +1,4 @@
-"""Drives in path coordinates: within what was asked for, everywhere in E, and the same
+"""Drives in path coordinates: within their limits, everywhere in E, and the same
 as logs of the world.
 """
 

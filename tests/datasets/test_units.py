@@ -84,7 +84,7 @@ def test_a_name_in_full_is_read_as_it_is_or_converted_if_its_unit_is_known(tmp_p
 
 
 @pytest.mark.parametrize(
-    ("changes", "says"),
+    ("changes", "message"),
     [
         (
             {"v": "v [furlong/day]"},
@@ -97,12 +97,12 @@ def test_a_name_in_full_is_read_as_it_is_or_converted_if_its_unit_is_known(tmp_p
         ({"t": "t (m)"}, "column t (m) has a unit of length, time is needed"),
     ],
 )
-def test_other_units_are_one_line(tmp_path, changes, says):
+def test_other_units_are_one_line(tmp_path, changes, message):
     columns = {changes.get(name, name): a for name, a in drive().items()}
     path = write_csv(tmp_path / "a.csv", columns)
     with pytest.raises(ValueError, match=r"^[^\n]*$") as refusal:
         read(path)
-    assert str(refusal.value).startswith(f"{path}: {says}")
+    assert str(refusal.value).startswith(f"{path}: {message}")
 
 
 def test_two_columns_that_fit_are_refused(tmp_path):

@@ -46,8 +46,8 @@ def circle(yaw_rate, speed=8.0):
 
 def errors(train, test, **options):
     options = {"nominal": PLANT.nominal, "dt": DT, "horizon": HORIZON} | options
-    found = evaluation.baselines(train, test, **options)
-    return {name: np.asarray(rmse) for name, rmse in found.items()}
+    result = evaluation.baselines(train, **options)
+    return {name: np.asarray(jit(rmse)(test)) for name, rmse in result.items()}
 
 
 def test_constant_velocity_is_exact_on_a_straight_line_and_errs_on_a_circle():
@@ -78,8 +78,8 @@ def test_the_fit_finds_the_parameters_of_a_bicycle():
     start = jnp.asarray([0.0, 0.0, 0.2, 9.0])
     driven = rolled(evaluation.bicycle_step(true, dt=DT), start, noise)
     fitted = evaluation.fit_bicycle(driven, dt=DT)
-    for found, wanted in zip(fitted[:3], true[:3], strict=True):
-        np.testing.assert_allclose(found, wanted, rtol=2e-2, atol=2e-3)
+    for result, wanted in zip(fitted[:3], true[:3], strict=True):
+        np.testing.assert_allclose(result, wanted, rtol=2e-2, atol=2e-3)
     assert fitted.is_angle
 
 
@@ -119,10 +119,10 @@ def test_in_path_coordinates_a_straight_course_beside_a_straight_path_is_exact()
     controls = jnp.tile(jnp.asarray([0.0, 0.0, 0.0, 8.0]), (1, STEPS, 1))
     data = Trajectory(states, controls, jnp.zeros((1, STEPS, 2)))
     loop = build.build_loop(PLANT, any_law(3))
-    found = errors(data, data, nominal=loop.nominal, along_path=True)
-    assert set(found) == {"constant_velocity", "constant_turn", "kinematic_bicycle"}
+    result = errors(data, data, nominal=loop.nominal, along_path=True)
+    assert set(result) == {"constant_velocity", "constant_turn", "kinematic_bicycle"}
     for name in ("constant_velocity", "constant_turn"):
-        np.testing.assert_allclose(found[name], np.zeros((HORIZON, 4)), atol=1e-4)
+        np.testing.assert_allclose(result[name], np.zeros((HORIZON, 4)), atol=1e-4)
     bent = data._replace(controls=controls.at[..., 2].set(0.02))
     assert (
         errors(bent, bent, nominal=loop.nominal, along_path=True)["constant_velocity"][

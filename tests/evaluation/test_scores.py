@@ -205,8 +205,8 @@ def test_an_episode_shorter_than_three_seconds_is_scored():
 
 
 def test_the_interval_of_a_constant_is_that_constant():
-    found = summary(np.full(7, 0.25))
-    assert found == {
+    result = summary(np.full(7, 0.25))
+    assert result == {
         "mean": 0.25,
         "std": 0.0,
         "ci95": [0.25, 0.25],
@@ -221,15 +221,15 @@ def test_a_single_episode_has_no_spread():
 
 def test_a_summary_holds_what_it_says():
     values = np.random.default_rng(0).normal(3.0, 2.0, 400)
-    found = summary(values)
-    np.testing.assert_allclose(found["mean"], values.mean())
-    np.testing.assert_allclose(found["std"], values.std(ddof=1))
+    result = summary(values)
+    np.testing.assert_allclose(result["mean"], values.mean())
+    np.testing.assert_allclose(result["std"], values.std(ddof=1))
     np.testing.assert_allclose(
-        [found["median"], found["p95"]], np.quantile(values, [0.5, 0.95])
+        [result["median"], result["p95"]], np.quantile(values, [0.5, 0.95])
     )
     half = 1.96 * values.std() / np.sqrt(400)
     np.testing.assert_allclose(
-        found["ci95"], [values.mean() - half, values.mean() + half], atol=0.1 * half
+        result["ci95"], [values.mean() - half, values.mean() + half], atol=0.1 * half
     )
 
 

@@ -201,10 +201,10 @@ def test_the_true_plant_predicts_without_error():
 
 
 def test_a_wrong_model_errs_and_more_so_the_further_it_looks():
-    found = errors("nominal", driven(), 12)
-    assert np.all(found[:, :3] > 0)
-    assert np.all(np.diff(found[:, 1]) > 0)
-    assert found[-1, 1] > 5 * found[0, 1]
+    result = errors("nominal", driven(), 12)
+    assert np.all(result[:, :3] > 0)
+    assert np.all(np.diff(result[:, 1]) > 0)
+    assert result[-1, 1] > 5 * result[0, 1]
 
 
 def test_errors_along_and_across_mean_the_same_on_every_heading():
@@ -228,9 +228,9 @@ def test_a_constant_offset_in_speed_is_the_error_of_its_column():
     model = models.physics(lambda state, action, env: state.at[3].add(0.5))
     data = driven()
     still = data._replace(states=jnp.zeros_like(data.states))
-    found = np.asarray(evaluation.open_loop(model, {}, still, horizon=4))
-    np.testing.assert_allclose(found[:, 3], [0.5, 1.0, 1.5, 2.0], rtol=1e-6)
-    np.testing.assert_array_equal(found[:, :3], np.zeros((4, 3)))
+    result = np.asarray(evaluation.open_loop(model, {}, still, horizon=4))
+    np.testing.assert_allclose(result[:, 3], [0.5, 1.0, 1.5, 2.0], rtol=1e-6)
+    np.testing.assert_array_equal(result[:, :3], np.zeros((4, 3)))
 
 
 def test_a_horizon_longer_than_the_trajectories_is_refused():

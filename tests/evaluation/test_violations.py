@@ -100,16 +100,16 @@ def test_the_errors_of_a_window_are_those_of_the_rollout_from_its_true_state():
 
 
 def test_drives_are_cut_into_segments_and_the_rest_is_left_out():
-    found = predicted(
+    result = predicted(
         drifting(0.1, 0, 0, 0), {}, still(count=3, steps=23), length=10, horizon=4
     )
-    assert found.errors.shape == (
+    assert result.errors.shape == (
         6,
         2,
         4,
         3,
     )  # 3 drives of 2 segments, windows from 0 and 5
-    assert found.latent_errors.shape == found.defects.shape == (6, 2, 4)
+    assert result.latent_errors.shape == result.defects.shape == (6, 2, 4)
 
 
 # --- counting --------------------------------------------------------------------------------------------------------
@@ -124,15 +124,15 @@ def test_a_segment_leaves_its_tube_if_any_window_step_or_kind_does():
 
 
 def test_a_drift_of_known_size_leaves_tubes_below_it_and_no_others():
-    found = predicted(
+    result = predicted(
         drifting(0.0, 0.25, 0, 0), {}, still(steps=20), length=10, horizon=4
     )
-    assert tube_violations(found.errors, tube(1.001)) == (0, 4)
-    assert tube_violations(found.errors, tube(0.999)) == (4, 4)
+    assert tube_violations(result.errors, tube(1.001)) == (0, 4)
+    assert tube_violations(result.errors, tube(0.999)) == (4, 4)
     growing = tube(0.0) | {"position_m": [0.2501, 0.5001, 0.7501, 1.0001]}
-    assert tube_violations(found.errors, growing) == (0, 4)
+    assert tube_violations(result.errors, growing) == (0, 4)
     assert tube_violations(
-        found.errors, growing | {"position_m": [0.2499, 9.0, 9.0, 9.0]}
+        result.errors, growing | {"position_m": [0.2499, 9.0, 9.0, 9.0]}
     ) == (4, 4)
 
 
@@ -174,17 +174,17 @@ def test_a_linear_model_whose_defects_all_point_one_way_fills_the_tube_and_no_mo
         speeds.append(alpha * speeds[-1] + d_bar)
     data = still(count=1, steps=20)
     data = data._replace(states=data.states.at[0, :, 3].set(jnp.asarray(speeds)))
-    found = predicted(model, {}, data, length=20, horizon=horizon)
+    result = predicted(model, {}, data, length=20, horizon=horizon)
     np.testing.assert_allclose(
-        found.latent_errors[0, 0], radii(alpha, d_bar, horizon), rtol=1e-5
+        result.latent_errors[0, 0], radii(alpha, d_bar, horizon), rtol=1e-5
     )
     count, total = theorem_violations(
-        found.latent_errors, found.defects, radii(alpha, d_bar, horizon), d_bar + 1e-6
+        result.latent_errors, result.defects, radii(alpha, d_bar, horizon), d_bar + 1e-6
     )
     assert (count, total) == (0, 3 * horizon)
     tighter = radii(alpha, d_bar, horizon) * (1 - 1e-3)
     assert theorem_violations(
-        found.latent_errors, found.defects, tighter, d_bar + 1e-6
+        result.latent_errors, result.defects, tighter, d_bar + 1e-6
     ) == (total, total)
 
 
@@ -214,8 +214,8 @@ def attacked(name, d_bar, horizon=12):
                 model.transport(fiber, after, model.step(fiber, z, control))
                 for z in pair
             )
-            apart = true.z - guess.z + 1e-6 * start
-            push = 0.9999 * d_bar * apart / jnp.linalg.norm(apart)
+            gap = true.z - guess.z + 1e-6 * start
+            push = 0.9999 * d_bar * gap / jnp.linalg.norm(gap)
             true = true._replace(z=true.z + push)
             return (true, guess), jnp.concatenate([true.pose, true.z])
 
@@ -235,27 +235,27 @@ def test_no_defect_within_the_bound_takes_the_latent_out_of_its_tube(name):
     """Real weights, environments that switch at every step, defects of full size in the
     worst direction.
     """
-    found, d_bar, alpha = attacked(name, 0.1), 0.1, 0.995
+    result, d_bar, alpha = attacked(name, 0.1), 0.1, 0.995
     count, total = theorem_violations(
-        found.latent_errors, found.defects, radii(alpha, d_bar, 12), d_bar
+        result.latent_errors, result.defects, radii(alpha, d_bar, 12), d_bar
     )
     assert (count, total) == (0, 3 * 12)
 
 
 @pytest.mark.parametrize("name", ["sfkd", "no_transport", "no_fiber"])
 def test_the_check_notices_a_rate_that_is_wrong(name):
-    found, d_bar, alpha = attacked(name, 0.1), 0.1, 0.995 / 4
+    result, d_bar, alpha = attacked(name, 0.1), 0.1, 0.995 / 4
     count, total = theorem_violations(
-        found.latent_errors, found.defects, radii(alpha, d_bar, 12), d_bar
+        result.latent_errors, result.defects, radii(alpha, d_bar, 12), d_bar
     )
     assert total == 3 * 12
     assert count > total / 2
 
 
 def test_the_latent_errors_of_the_true_plant_are_nothing_and_those_of_its_segments_are_the_rollouts():
-    found = predicted(*model_and_params("oracle"), driven(), length=12, horizon=6)
-    assert float(np.max(found.latent_errors)) < 1e-5
-    assert float(np.max(found.defects)) < 1e-5
+    result = predicted(*model_and_params("oracle"), driven(), length=12, horizon=6)
+    assert float(np.max(result.latent_errors)) < 1e-5
+    assert float(np.max(result.defects)) < 1e-5
     wrong = predicted(*model_and_params("nominal"), driven(), length=12, horizon=6)
     np.testing.assert_allclose(
         wrong.latent_errors, wrong.errors[..., 2], atol=1e-6
@@ -284,24 +284,24 @@ def test_the_reach_is_the_largest_error_in_units_of_its_bound_where_the_hypothes
 def test_the_record_names_the_tube_it_speaks_of_and_is_null_where_nothing_is_claimed():
     errors = np.zeros((4, 1, 4, 3))
     errors[0, 0, 3, 0] = 1.5
-    found = Predictions(errors, np.full((4, 1, 4), 0.3), np.full((4, 1, 4), 0.1))
+    result = Predictions(errors, np.full((4, 1, 4), 0.3), np.full((4, 1, 4), 0.1))
     everything = Claims(
         tube(2.0), tube(1.0), 0.95, np.asarray([0.2, 0.4, 0.4, 0.4]), 0.1, 1.4
     )
-    assert violations(found, everything) == {
+    assert violations(result, everything) == {
         "v0": 0.25, "v0_reach": pytest.approx([1.5, 0.75, 0.75, 0.75]),
         "v1": 0.0, "v1_tube": "certified", "v1_radius_m": 2.0, "v1_conformal": 0.25,
         "v1_conformal_radius_m": 1.0, "v1_level": 0.95, "v2": 0.25, "v2_threshold_m": 1.4, "segments": 4,
         "window_error_m": {"median": 0.0, "p95": pytest.approx(0.85 * 1.5)},
     }  # fmt: skip
-    measured = violations(found, Claims(conformal=tube(1.0), level=0.95))
+    measured = violations(result, Claims(conformal=tube(1.0), level=0.95))
     assert (measured["v0"], measured["v1"], measured["v1_tube"], measured["v2"]) == (
         None,
         0.25,
         "conformal",
         None,
     )
-    nothing = violations(found, Claims())
+    nothing = violations(result, Claims())
     assert {name for name, value in nothing.items() if value is not None} == {
         "segments",
         "window_error_m",
@@ -429,7 +429,9 @@ def test_a_controller_observes_the_wind_but_not_the_side_force():
 
 def test_pushes_are_redrawn_every_second_evenly_within_their_bound_and_grow_with_it():
     key = jax.random.key(1)
-    force = np.asarray(scenarios.random_side_forces(key, steps=20005, dt=DT, largest=300.0))
+    force = np.asarray(
+        scenarios.random_side_forces(key, steps=20005, dt=DT, largest=300.0)
+    )
     assert len(force) == 20005
     levels = force[:20000].reshape(-1, 10)
     assert np.all(levels == levels[:, :1])

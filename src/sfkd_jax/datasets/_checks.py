@@ -54,12 +54,12 @@ def channels(log: Log, columns: Columns) -> dict[str, Float[np.ndarray, " time"]
         "control": log.controls,
         "environment": log.envs,
     }
-    found = {columns.time: log.time}
+    named = {columns.time: log.time}
     for setting, values in groups.items():
         names = getattr(columns, setting)
         if len(names) == values.shape[1]:
-            found |= dict(zip(names, values.T, strict=True))
-    return found
+            named |= dict(zip(names, values.T, strict=True))
+    return named
 
 
 def motion(log: Log, *, dt: float, gap: float) -> Motion:

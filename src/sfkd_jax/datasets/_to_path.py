@@ -56,7 +56,7 @@ def logged_path(positions: Float[Array, "point 2"], *, spacing: float = 0.5) -> 
     if not largest <= TIGHTEST:
         raise ValueError(
             f"the curvature of the logged path reaches {largest:.3g} 1/m, a car "
-            f"follows {TIGHTEST}: its positions are too noisy or too far apart; "
+            f"follows {TIGHTEST}: its positions are too noisy or too sparse; "
             "smooth them"
         )
     return path
