@@ -238,7 +238,7 @@ def test_foreign_interfaces_are_known_to_their_adapters_only():
         (imported.split(".")[0], name) for name in FILES for imported in imports(name)
     }
     assert {
-        package: {name for found, name in reached if found == package}
+        package: {name for result, name in reached if result == package}
         for package in FOREIGN
     } == FOREIGN
 

@@ -84,18 +84,24 @@ def spans_of(page):
 @cache
 def names_in(*parts):
     """What a module of the package offers, read from its source."""
-    place = PACKAGE.joinpath(*parts)
-    source = place / "__init__.py" if place.is_dir() else place.with_suffix(".py")
-    found = {file.stem for file in place.iterdir()} if place.is_dir() else set()
+    directory = PACKAGE.joinpath(*parts)
+    source = (
+        directory / "__init__.py"
+        if directory.is_dir()
+        else directory.with_suffix(".py")
+    )
+    result = (
+        {file.stem for file in directory.iterdir()} if directory.is_dir() else set()
+    )
     for node in ast.walk(ast.parse(source.read_text("utf-8"))):
         if isinstance(node, ast.ImportFrom):
-            found |= {alias.asname or alias.name for alias in node.names}
+            result |= {alias.asname or alias.name for alias in node.names}
         elif isinstance(node, ast.FunctionDef | ast.ClassDef):
-            found.add(node.name)
+            result.add(node.name)
         elif isinstance(node, ast.Assign | ast.AnnAssign):
             targets = node.targets if isinstance(node, ast.Assign) else [node.target]
-            found |= {target.id for target in targets if isinstance(target, ast.Name)}
-    return found
+            result |= {target.id for target in targets if isinstance(target, ast.Name)}
+    return result
 
 
 @every_page
@@ -157,9 +163,9 @@ def test_every_program_names_what_the_package_has(page):
         tree = ast.parse(block)
         modules = {"sfkd_jax": ()}
         for node in ast.walk(tree):
-            package, *place = (getattr(node, "module", None) or "").split(".")
+            package, *directory = (getattr(node, "module", None) or "").split(".")
             if isinstance(node, ast.ImportFrom) and package == "sfkd_jax":
-                assert {alias.name for alias in node.names} <= names_in(*place), (
+                assert {alias.name for alias in node.names} <= names_in(*directory), (
                     node.module
                 )
                 modules |= {
@@ -240,12 +246,12 @@ def test_the_tables_of_the_certificates_page_are_those_of_their_files():
         file.read_text("utf-8")
         for file in (DOCS / "certificate.md", ROOT / "README.md")
     )
-    found = json.loads((ROOT / "benchmarks/quality/theorem_power.json").read_text())[
+    result = json.loads((ROOT / "benchmarks/quality/theorem_power.json").read_text())[
         "rows"
     ]
     rows = [
         row
-        for row in found
+        for row in result
         if (row["vehicle"], row["scenario"]) == ("kinematic", "s1, s2")
     ]
     shown = [
@@ -342,7 +348,7 @@ def test_what_the_tests_of_a_certificate_notice_is_what_was_counted():
 
 def test_the_page_about_an_estimated_environment_says_what_the_results_say():
     """Every number of its table, and the differences that the text draws from it."""
-    found, table = (
+    result, table = (
         json.loads((ROOT / "experiments" / name / "results.json").read_text())["rows"]
         for name in ("estimated", "table1_closed_loop")
     )
@@ -356,7 +362,7 @@ def test_the_page_about_an_estimated_environment_says_what_the_results_say():
         return [
             next(
                 1e3 * row["rmse_m"]["mean"]
-                for row in found
+                for row in result
                 if (row["vehicle"], row["scenario"], row["variation"], row["system"])
                 == (*drive, variation, "sfkd")
             )
@@ -401,18 +407,18 @@ def test_the_page_about_an_estimated_environment_says_what_the_results_say():
 
 def test_what_the_fuzzer_found_is_what_the_page_says():
     """Every file was accepted or refused."""
-    found = json.loads((ROOT / "benchmarks/robustness/fuzz.json").read_text())
+    result = json.loads((ROOT / "benchmarks/robustness/fuzz.json").read_text())
     page = " ".join((DOCS / "failures.md").read_text("utf-8").split())
     accepted, refused = (
-        sum(row.get(key, 0) for row in found["readers"].values())
+        sum(row.get(key, 0) for row in result["readers"].values())
         for key in ("accepted", "refused")
     )
-    told = f"accepted {accepted:_} files, refused {refused:_}, and found {len(found['faults'])} faults".replace(
+    observed = f"accepted {accepted:_} files, refused {refused:_}, and found {len(result['faults'])} faults".replace(
         "_", " "
     )
-    assert told in page
-    assert f"memory grew by {found['memory_MiB']['grown_by']} MiB" in page
-    assert accepted + refused == found["cases"] == 100_000
+    assert observed in page
+    assert f"memory grew by {result['memory_MiB']['grown_by']} MiB" in page
+    assert accepted + refused == result["cases"] == 100_000
 
 
 def test_the_table_of_drills_is_that_of_the_run():
@@ -427,9 +433,9 @@ def test_the_table_of_drills_is_that_of_the_run():
     )
     assert shown.strip() == table
     assert table.endswith("| 0 | 0 | 0 |")
-    asked = {name: kills for name, (kills, *_) in drills["settings"]["jobs"].items()}
-    assert {name: drills[name]["kills"] for name in asked} == asked
-    assert sum(asked.values()) == 200
+    args = {name: kills for name, (kills, *_) in drills["settings"]["jobs"].items()}
+    assert {name: drills[name]["kills"] for name in args} == args
+    assert sum(args.values()) == 200
 
 
 def test_the_readme_says_of_the_corridor_what_its_page_says():
@@ -473,17 +479,17 @@ def test_the_tables_about_speed_are_those_of_their_run():
     measured = json.loads((ROOT / "benchmarks/quality/speed.json").read_text())
     text = (DOCS / "corridor.md").read_text("utf-8")
     assert speed_page.page(text, measured) == text
-    for name, found in measured["cars"].items():
+    for name, result in measured["cars"].items():
         certificate = json.loads(
             (PACKAGE / "pretrained" / f"{name}_path" / "certificate.json").read_text()
         )
-        assert found["policy_sha256"] == certificate["policy_sha256"]
+        assert result["policy_sha256"] == certificate["policy_sha256"]
         about = certificate["corridor"]["class"]
         for key, ends in (
             ("speed", about["speed"]),
             ("friction", [side[0] for side in about["env_box"]]),
         ):
-            values = {cell[key] for cell in found["cells"]}
+            values = {cell[key] for cell in result["cells"]}
             assert [min(values), max(values)] == ends
 
 
@@ -501,16 +507,16 @@ def test_the_page_about_path_coordinates_says_what_the_results_say():
 
 def test_the_table_of_the_long_drive_is_that_of_its_run():
     """Every leg is there, and none failed at what is asked of all."""
-    found = json.loads((ROOT / "benchmarks/robustness/soak.json").read_text())
+    result = json.loads((ROOT / "benchmarks/robustness/soak.json").read_text())
     shown = (
         (DOCS / "failures.md")
         .read_text("utf-8")
         .split("<!-- soak -->")[1]
         .split("<!-- end of soak -->")[0]
     )
-    assert shown.strip() == soak.table(found)
-    assert found["legs"].keys() == soak.LEGS.keys()
-    for leg in found["legs"].values():
+    assert shown.strip() == soak.table(result)
+    assert result["legs"].keys() == soak.LEGS.keys()
+    for leg in result["legs"].values():
         assert (
             leg["outside_limits"]
             == leg["not_finite"]
@@ -546,7 +552,7 @@ def test_the_tables_of_the_shield_are_those_of_the_run():
         name: PACKAGE / "pretrained" / f"{name}_path" / "certificate.json"
         for name in measured["cars"]
     }
-    for name, place in policies.items():
-        certificate = json.loads(place.read_text())
+    for name, directory in policies.items():
+        certificate = json.loads(directory.read_text())
         assert measured["cars"][name]["policy_sha256"] == certificate["policy_sha256"]
         assert measured["cars"][name]["bounds"] == certificate["corridor"]["bounds"]

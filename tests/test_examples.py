@@ -40,10 +40,10 @@ def test_the_delivery_robot_stays_on_its_path(monkeypatch):
 
 
 def test_logged_drives_become_a_certified_model_that_plans(monkeypatch):
-    found = example("own_data", monkeypatch)["main"](drives=60, steps=100)
-    assert found["alpha"] < 1.0
-    assert np.isfinite(found["position_error_m"])
-    assert abs(found["first_control"]) <= 1.0
+    result = example("own_data", monkeypatch)["main"](drives=60, steps=100)
+    assert result["alpha"] < 1.0
+    assert np.isfinite(result["position_error_m"])
+    assert abs(result["first_control"]) <= 1.0
 
 
 def test_logged_drives_are_read_from_a_file_of_ones_own(monkeypatch, tmp_path):
@@ -60,8 +60,8 @@ def test_the_brax_pendulum_is_learned_certified_and_driven(monkeypatch, capsys):
     not yet a good driver.
     """
     sizes = {"drives": 50, "steps": 50, "samples": 64, "horizon": 20, "seconds": 2.0}
-    found = example("brax_pendulum", monkeypatch)["main"](**sizes)
-    proof, rows = found["certificate"], found["rows"]
+    result = example("brax_pendulum", monkeypatch)["main"](**sizes)
+    proof, rows = result["certificate"], result["rows"]
     assert proof["valid"]
     assert proof["attacks"]["step_slopes"] <= proof["alpha"] < 1.0
     assert len(proof["tube"]["latent"]) == 20

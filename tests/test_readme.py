@@ -85,10 +85,10 @@ def test_an_experiment_is_a_script_an_expectation_and_a_result_that_meets_it(fol
                     row["vehicle"],
                     name,
                 )
-    found = {(row.get("scenario"), row["system"]): row for row in rows}
+    result = {(row.get("scenario"), row["system"]): row for row in rows}
     for scenario, systems in expected.get("rows", {}).items():
         for system, bounds in systems.items():
-            row = found[scenario, system]
+            row = result[scenario, system]
             for name, limits in bounds.items():
                 assert within(named(row, name), limits), (scenario, system, name)
 
@@ -96,9 +96,9 @@ def test_an_experiment_is_a_script_an_expectation_and_a_result_that_meets_it(fol
 @pytest.mark.parametrize(
     ("folder", "page"),
     [
-        found
-        for found in PAGES.values()
-        if (ROOT / "experiments" / found[0] / "results.json").exists()
+        result
+        for result in PAGES.values()
+        if (ROOT / "experiments" / result[0] / "results.json").exists()
     ],
 )
 def test_a_page_of_results_says_what_the_results_say(folder, page):

@@ -8,7 +8,7 @@ from benchmarks.quality import shield_table
 
 
 def summary(departures=0, largest=0.0981, **shares):
-    kept = {
+    saved = {
         "copy_m": 0.0774,
         "distance_m": 0.0412,
         "inside": 1.0,
@@ -23,7 +23,7 @@ def summary(departures=0, largest=0.0981, **shares):
             "void": 0.0,
             "broken": 0.0,
         }
-        | kept
+        | saved
         | shares
     )
 

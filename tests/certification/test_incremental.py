@@ -244,10 +244,10 @@ def untrained(name="control_synth"):
     params = jit(build.build_model(settings["model"], space(), plant).init)(
         jax.random.key(0)
     )
-    kept = settings | {"space": build.space_to_settings(space())}
+    saved = settings | {"space": build.space_to_settings(space())}
     store.claim(settings)
     policy.save(
-        store.run_directory(settings) / "policy.npz", params, kept, made_from={}
+        store.run_directory(settings) / "policy.npz", params, saved, made_from={}
     )
     return settings
 

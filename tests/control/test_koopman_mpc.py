@@ -77,11 +77,11 @@ def quadratic_programs():
     """
     model, params = koopman()
     controller = control.koopman_mpc(model, horizon=HORIZON, **LIMITS)
-    kept, solve = [], _koopman_mpc.box_qp
+    saved, solve = [], _koopman_mpc.box_qp
     state = controller.init(jax.random.key(0))
     try:
         _koopman_mpc.box_qp = lambda *data, **options: (
-            kept.append(data) or solve(*data, **options)
+            saved.append(data) or solve(*data, **options)
         )
         for observation in (
             jnp.asarray([0.0, 6.0, 0.0, 4.0]),
@@ -91,7 +91,7 @@ def quadratic_programs():
             _, state, _ = controller.act(params, state, observation, ENV, BEND)
     finally:
         _koopman_mpc.box_qp = solve
-    return [[np.asarray(part, np.float64) for part in data] for data in kept]
+    return [[np.asarray(part, np.float64) for part in data] for data in saved]
 
 
 @pytest.mark.parametrize("step", range(3))

@@ -91,12 +91,12 @@ def test_a_polynomial_that_continues_the_past_stays_what_it_is(window, horizon, 
         )
         return np.max(np.abs(smoothed - record[half:]))
 
-    kept = np.sum(
+    saved = np.sum(
         [(k + 1) * np.hstack([times, -times]) ** k for k in range(order + 1)], axis=0
     )
-    assert change(kept) < 1e-5
-    assert change(kept + times ** (order + 1)) > 1e-3
-    assert change(kept, np.zeros((half, 2))) > 1e-2
+    assert change(saved) < 1e-5
+    assert change(saved + times ** (order + 1)) > 1e-3
+    assert change(saved, np.zeros((half, 2))) > 1e-2
 
 
 def test_a_plan_without_a_filter_is_the_same_array():

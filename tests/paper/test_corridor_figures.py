@@ -14,7 +14,7 @@ def hostile_drives():
     free = np.zeros((2, steps))
     free[0, 10:], free[1, 20:] = np.linspace(0.0, 9.0, steps - 10), np.nan
     envs = np.repeat([[0.9, 0.0], [0.3, 8.0]], steps // 2, axis=0)
-    kept = {
+    saved = {
         name: 0.05 * random.standard_normal((2, steps)) for name in ("worst", "random")
     }
     about = {
@@ -24,7 +24,7 @@ def hostile_drives():
         "onset": np.array([10, 20]),
         "name": "full lock",
     }
-    return about | {"kept": kept, "held": np.zeros((2, steps)), "free": free}
+    return about | {"kept": saved, "held": np.zeros((2, steps)), "free": free}
 
 
 def test_hostile_planners_are_drawn_until_they_leave_and_the_corridor_is_to_scale(
@@ -52,8 +52,8 @@ def test_hostile_planners_are_drawn_until_they_leave_and_the_corridor_is_to_scal
         if len(set(line.get_xdata())) == 1
     }
     assert 3.0 in switched
-    place = draw_hostile(tmp_path / "figure.png", width=0.1, tube=0.05, **drives)
-    with Image.open(place) as image:
+    directory = draw_hostile(tmp_path / "figure.png", width=0.1, tube=0.05, **drives)
+    with Image.open(directory) as image:
         assert image.size[0] > 900
 
 

@@ -101,9 +101,9 @@ def document(vehicles=("kinematic",), samplings=("feedback", "plain")):
         for system, env in SYSTEMS:
             if system != "koopman_mpc" or sampling == "feedback":
                 rows.append(row(system, env, scenario, vehicle, sampling))
-    for place, entry in enumerate(rows):
+    for folder, entry in enumerate(rows):
         if (entry["scenario"], entry["sampling"]) == ("s3", "feedback"):
-            rows[place] = entry | {
+            rows[folder] = entry | {
                 "disturbed": driven_under_forces(entry["system"], entry["env"])[
                     "disturbed"
                 ]
@@ -177,14 +177,14 @@ def cell(
         for name, values in arrays.items()
     }
     kind = "qp" if system == "koopman_mpc" else sampling
-    place = directory / "cells" / vehicle / "s3" / kind
-    place.mkdir(parents=True, exist_ok=True)
+    folder = directory / "cells" / vehicle / "s3" / kind
+    folder.mkdir(parents=True, exist_ok=True)
     arrays = {
         name: values
         for name, values in (arrays | {"dt": np.float64(0.1)} | changes).items()
         if values is not None
     }
-    write_arrays(place / f"{system}-{env}.npz", arrays, kind="cell", config={})
+    write_arrays(folder / f"{system}-{env}.npz", arrays, kind="cell", config={})
 
 
 def reported(directory, results):
@@ -236,26 +236,26 @@ FEEDBACK = "Kinematic vehicle, sampling around a feedback law"
 
 
 def test_tracking_stands_beside_the_paper_with_intervals_in_millimetres(whole):
-    found = tables_of(text_of(whole[0], "results.md"), f"Tracking: {FEEDBACK}")
-    assert found["SFKD"] == [
+    result = tables_of(text_of(whole[0], "results.md"), f"Tracking: {FEEDBACK}")
+    assert result["SFKD"] == [
         "10.0 (9.0–11.0)",
         "16.0 (14.4–17.6)",
         "98 ± 14",
         "20.0 (18.0–22.0)",
         "120 ± 18",
     ]
-    assert found["ICODE-MPPI (e)"][-1] == found["ICODE-MPPI (no e)"][-1] == "174 ± 25"
-    assert found["ICODE-MPPI, one step (e)"][-2:] == ["40.0 (36.0–44.0)", "174 ± 25"]
-    assert found["Oracle"][-1] == "–"
+    assert result["ICODE-MPPI (e)"][-1] == result["ICODE-MPPI (no e)"][-1] == "174 ± 25"
+    assert result["ICODE-MPPI, one step (e)"][-2:] == ["40.0 (36.0–44.0)", "174 ± 25"]
+    assert result["Oracle"][-1] == "–"
 
 
 def test_differences_are_marked_where_the_interval_leaves_zero_on_either_side(whole):
-    found = tables_of(
+    result = tables_of(
         text_of(whole[0], "results.md"), f"Against SFKD and the oracle: {FEEDBACK}"
     )
-    assert found["ICODE-MPPI (e)"][2] == r"+5.0 (4.0–6.0) \*"
-    assert found["SFKD − contraction"][2] == "−2.0 (−3.0 to −1.0) †"
-    assert found["SFKD"] == ["–", "–", "–", "1.25 / 1.25 / 1.25"]
+    assert result["ICODE-MPPI (e)"][2] == r"+5.0 (4.0–6.0) \*"
+    assert result["SFKD − contraction"][2] == "−2.0 (−3.0 to −1.0) †"
+    assert result["SFKD"] == ["–", "–", "–", "1.25 / 1.25 / 1.25"]
 
 
 def test_a_quadratic_program_is_compared_with_the_sampling_it_was_compared_with(whole):
@@ -280,22 +280,22 @@ def test_rows_in_path_coordinates_have_the_names_of_their_systems_under_a_title_
         "system": "sfkd_path_no_contraction"
     }
     text = results_markdown(document() | {"rows": [ours, unbound, theirs]})
-    found = tables_of(
+    result = tables_of(
         text,
         "Against SFKD and the oracle: Kinematic vehicle, path coordinates, sampling around their law",
     )
-    assert list(found) == ["Row", "SFKD", "SFKD − contraction", "Neural ODE (e)"]
-    assert found["Neural ODE (e)"][0].startswith("+")
+    assert list(result) == ["Row", "SFKD", "SFKD − contraction", "Neural ODE (e)"]
+    assert result["Neural ODE (e)"][0].startswith("+")
 
 
 def test_claims_predictions_and_cost_are_there(whole):
     markdown = text_of(whole[0], "results.md")
-    found = tables_of(markdown, f"Claims: {FEEDBACK}")
-    assert found["SFKD"][:3] == ["0 / 0 / 0", "1.0 / 1.0 / 1.0", "2.00 / 2.00 / 2.00"]
-    assert found["Nominal"][:3] == ["–", "–", "–"]
-    found = tables_of(markdown, f"Threshold and planner: {FEEDBACK}")
-    assert found["SFKD"] == ["0.1 / 0.2 / 0.2", "3.0", "0 / 0 / 0", "–", "–"]
-    assert found["Oracle"][:2] == ["0.1 / 0.1 / 0.2", "–"]
+    result = tables_of(markdown, f"Claims: {FEEDBACK}")
+    assert result["SFKD"][:3] == ["0 / 0 / 0", "1.0 / 1.0 / 1.0", "2.00 / 2.00 / 2.00"]
+    assert result["Nominal"][:3] == ["–", "–", "–"]
+    result = tables_of(markdown, f"Threshold and planner: {FEEDBACK}")
+    assert result["SFKD"] == ["0.1 / 0.2 / 0.2", "3.0", "0 / 0 / 0", "–", "–"]
+    assert result["Oracle"][:2] == ["0.1 / 0.1 / 0.2", "–"]
     assert tables_of(markdown, "Prediction without feedback, position error")[
         "SFKD"
     ] == ["0.2", "2.0", "20.0", "100.0"]
@@ -338,11 +338,11 @@ def test_the_papers_claim_is_beside_ours_with_its_paired_interval(whole):
 def test_rows_that_beat_sfkd_are_named_and_no_others():
     (setup,) = setups([row(*one) for one in SYSTEMS])
     table, rest = better_rows(setup)
-    found = dict(table.rows)
-    assert found["S3 RMSE [mm]: 20.0"] == "SFKD − contraction 18.0 †; Oracle 16.0 †"
-    assert found["prediction 20 steps ahead [mm]: 100.0"] == "SFKD − contraction 90.0"
+    result = dict(table.rows)
+    assert result["S3 RMSE [mm]: 20.0"] == "SFKD − contraction 18.0 †; Oracle 16.0 †"
+    assert result["prediction 20 steps ahead [mm]: 100.0"] == "SFKD − contraction 90.0"
     assert "S3 steering rate [rad/s]: 0.054" in rest.text
-    assert not any(name.startswith("S3 steering rate") for name in found)
+    assert not any(name.startswith("S3 steering rate") for name in result)
     worst = [row(*one) for one in SYSTEMS if one != ("sfkd", "measured")] + [
         row("sfkd", "measured", factor=20)
     ]
@@ -522,17 +522,17 @@ def test_variations_show_every_row_beside_itself_without_one(whole):
         "sensor noise x 2",
     ]
     assert variations(rows, plain, study) == []
-    found = tables_of(
+    result = tables_of(
         text_of(whole[0], "results.md"), f"Cost of a variation, S3: {FEEDBACK}"
     )
-    assert found["Row"][1] == "environment 0.5 s late \\[mm\\]"
-    assert found["Nominal"] == [
+    assert result["Row"][1] == "environment 0.5 s late \\[mm\\]"
+    assert result["Nominal"] == [
         "120.0",
         "180.0 (1.50)",
         "300.0 (2.50)",
         "150.0 (1.25), 2 left",
     ]
-    assert set(found) == {"Row", *(line.name for line in setup.entries)}
+    assert set(result) == {"Row", *(line.name for line in setup.entries)}
     figure = variations_figure(varied)
     assert [axes.get_title(loc="left").replace("\n", " ") for axes in figure.axes][
         2
@@ -565,8 +565,8 @@ def test_shares_of_the_data_rise_to_the_whole_of_it():
     assert markdown.startswith(
         "# Less training data, row by row\n\nThe policies are trained from scratch on a share of"
     )
-    found = tables_of(markdown, f"Share of the training data, S3: {FEEDBACK}")
-    assert found["SFKD"] == ["60.0 (3.00)", "30.0 (1.50)", "20.0"]
+    result = tables_of(markdown, f"Share of the training data, S3: {FEEDBACK}")
+    assert result["SFKD"] == ["60.0 (3.00)", "30.0 (1.50)", "20.0"]
     assert markdown.index("Share of the training data") < markdown.index("Tracking: ")
 
 
@@ -577,8 +577,8 @@ def test_every_training_of_a_row_is_drawn_and_listed():
         for name, values in trained.items()
     ]
     markdown = results_markdown({"rows": rows, "config": {"name": "seeds"}})
-    found = tables_of(markdown, f"Single trainings: {FEEDBACK}")
-    assert found == {
+    result = tables_of(markdown, f"Single trainings: {FEEDBACK}")
+    assert result == {
         "Row": ["S3 \\[mm\\], seed 0, 1"],
         "SFKD": ["18.0, 22.0 ± 2.8"],
         "Oracle": ["16.0"],
@@ -639,9 +639,9 @@ def test_steady_levels_come_from_seen_to_extrapolated_and_are_not_held_against_t
         },
     }
     markdown = results_markdown(results)
-    found = tables_of(markdown, f"Tracking: {FEEDBACK}")
-    assert found["Row"] == [rf"{name} RMSE \[mm\] (95 %)" for name in names.values()]
-    assert found["SFKD"] == ["10.0 (9.0–11.0)", "16.0 (14.4–17.6)", "20.0 (18.0–22.0)"]
+    result = tables_of(markdown, f"Tracking: {FEEDBACK}")
+    assert result["Row"] == [rf"{name} RMSE \[mm\] (95 %)" for name in names.values()]
+    assert result["SFKD"] == ["10.0 (9.0–11.0)", "16.0 (14.4–17.6)", "20.0 (18.0–22.0)"]
     assert "At extrapolated levels 20.0 against 25.0 mm, 20 % lower" in markdown
     assert "On S3" not in markdown
     assert "crosses" not in markdown
@@ -683,9 +683,9 @@ def test_rows_are_grouped_by_access_to_e_and_sorted_by_rmse(whole):
 
 
 def test_side_forces_are_in_a_table_and_in_a_figure_that_hold_the_same(whole):
-    found = tables_of(text_of(whole[0], "results.md"), f"Side forces: {FEEDBACK}")
-    assert found["Row"] == [r"RMSE \[mm\] 0 N", r"RMSE \[mm\] 500 N", "Left the lane"]
-    assert found["SFKD"] == ["20.0", "–", "2 / 0"]
+    result = tables_of(text_of(whole[0], "results.md"), f"Side forces: {FEEDBACK}")
+    assert result["Row"] == [r"RMSE \[mm\] 0 N", r"RMSE \[mm\] 500 N", "Left the lane"]
+    assert result["SFKD"] == ["20.0", "–", "2 / 0"]
     forces = forces_of(setups(document()["rows"])[0])
     claimed = {name: cells for name, *cells in forces_tables(forces)[1].rows}
     assert claimed["SFKD"] == ["0 / 0", "10.0 / 10.0", "0 / 50.0", "0 / 0"]
@@ -724,10 +724,10 @@ def test_what_was_not_measured_is_a_dash_and_never_a_zero(tmp_path, hole):
         for entry in results["rows"]
     ]
     markdown = results_markdown(results)
-    found = tables_of(markdown, f"Tracking: {FEEDBACK}")
+    result = tables_of(markdown, f"Tracking: {FEEDBACK}")
     assert {
         cell
-        for name, cells in found.items()
+        for name, cells in result.items()
         if name != "Row"
         for cell in cells
         if "±" not in cell

@@ -43,7 +43,7 @@ def driven(system, scenario, mean, **violation):
     }  # fmt: skip
 
 
-def write_run(place, loop, rho, beta, proof, scale=1.0):
+def write_run(directory, loop, rho, beta, proof, scale=1.0):
     settings = {"vehicle": {"name": "kinematic", "inner_loop": loop}, "seed": 0}
     settings["model"] = {"name": "sfkd", "system": "sfkd", "rho": rho, "beta": beta}
     claim = {"v0": 0.0, "v1": 0.01, "v1_tube": "certified", "v1_radius_m": 1.5}
@@ -58,10 +58,10 @@ def write_run(place, loop, rho, beta, proof, scale=1.0):
         "policy": {"sha256": "ab" * 32, "config": settings},
     }
     documents |= {"open_loop": ahead, "results": {"rows": rows}, "certificate": proof}
-    place.mkdir(parents=True)
+    directory.mkdir(parents=True)
     for name, document in documents.items():
         if document is not None:
-            (place / f"{name}.json").write_text(json.dumps(document))
+            (directory / f"{name}.json").write_text(json.dumps(document))
 
 
 @pytest.fixture

@@ -33,16 +33,16 @@ def certificate(**changes):
         },
     }  # fmt: skip
     outputs = {"position": {"alpha": 0.84384}}
-    found = documents()["certificate.json"]
-    boxes = found["boxes"] | {"state": [[-0.2, -0.1, 7.0], [0.3, 0.1, 11.0]]}
-    return found | {"outputs": outputs, "boxes": boxes, "corridor": corridor | changes}
+    result = documents()["certificate.json"]
+    boxes = result["boxes"] | {"state": [[-0.2, -0.1, 7.0], [0.3, 0.1, 11.0]]}
+    return result | {"outputs": outputs, "boxes": boxes, "corridor": corridor | changes}
 
 
 @pytest.fixture(scope="module")
 def page(tmp_path_factory):
     run = write_run(tmp_path_factory.mktemp("corridor"), certificate=certificate())
-    found, made = report_of(run)
-    return text_of(found), made
+    result, made = report_of(run)
+    return text_of(result), made
 
 
 @pytest.mark.parametrize(
@@ -97,13 +97,13 @@ def test_no_corridor_no_section(tmp_path):
             certificate(corridor_m=None),
         )
     ):
-        found = text_of(
+        result = text_of(
             report_of(
                 write_run(tmp_path / str(number), certificate=document, episodes=None)
             )[0]
         )
-        assert HEADING not in found
-        assert "Certified corridor" not in found
+        assert HEADING not in result
+        assert "Certified corridor" not in result
 
 
 def test_missing_entries_read_as_an_en_dash(tmp_path):
@@ -113,11 +113,11 @@ def test_missing_entries_read_as_an_en_dash(tmp_path):
     for number, document in enumerate(
         (bare, certificate() | {"corridor": {"corridor_m": 0.21311}})
     ):
-        found = text_of(
+        result = text_of(
             report_of(
                 write_run(tmp_path / str(number), certificate=document, episodes=None)
             )[0]
         )
-        assert "within 0.2132 m" in found
-        assert "at – to – m/s" in found
-        assert "None" not in found
+        assert "within 0.2132 m" in result
+        assert "at – to – m/s" in result
+        assert "None" not in result

@@ -60,13 +60,13 @@ def test_a_car_is_drawn_until_it_leaves_and_its_lane_is_said_to_be_left():
     axes, film = Figure().subplots(), shown(drives(departing()))
     assert film.widening(STEPS) == 10
     move = draw_road(axes, film, STEPS)
-    kept, lost = (patch for patch in axes.patches if len(patch.get_xy()) == 6)
+    saved, lost = (patch for patch in axes.patches if len(patch.get_xy()) == 6)
     *_, name = axes.texts[:2]
     visible = []
     for step in range(STEPS):
         move(step)
         visible.append(lost.get_visible())
-        assert kept.get_visible()
+        assert saved.get_visible()
         assert np.all(np.isfinite(lost.get_xy()))
     assert visible == [True] * 5 + [False] * (STEPS - 5)
     assert name.get_text() == "lost\nleft its lane (0.85 m) at 0.7 s"
@@ -100,9 +100,9 @@ def test_the_scale_keeps_a_wide_corridor_and_every_car_that_stays_in_its_lane():
 
 
 def test_the_film_of_a_car_that_is_lost_is_small_and_moves(tmp_path):
-    place = draw_film(tmp_path / "film.gif", **drives(departing()))
-    assert place.stat().st_size <= MAX_BYTES
-    with Image.open(place) as image:
+    directory = draw_film(tmp_path / "film.gif", **drives(departing()))
+    assert directory.stat().st_size <= MAX_BYTES
+    with Image.open(directory) as image:
         assert image.n_frames == STEPS
         frames = []
         for frame in (0, STEPS - 1):

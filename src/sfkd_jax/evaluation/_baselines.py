@@ -45,14 +45,13 @@ class FittedBicycle(NamedTuple):
 
 def baselines(
     train: Trajectory,
-    test: Trajectory,
     *,
     nominal: Step,
     dt: float,
     horizon: int,
     along_path: bool = False,
-) -> dict[str, Float[Array, "horizon 4"]]:
-    """Return the open-loop RMSE of naive predictors on the windows of `open_loop`.
+) -> dict[str, Callable[[Trajectory], Float[Array, "horizon 4"]]]:
+    """Return naive predictors as trajectories -> RMSE on the windows of `open_loop`.
 
     "constant_velocity" keeps course and speed, "constant_turn" also the yaw rate,
     measured over the first step. "kinematic_bicycle" is the nominal model,
@@ -61,7 +60,6 @@ def baselines(
 
     Args:
         train: for the fit.
-        test: held out.
         nominal: step of the kinematic bicycle on these states and controls.
         dt: sampling period [s].
         horizon: steps.
@@ -82,9 +80,7 @@ def baselines(
         fitted = bicycle_step(fit_bicycle(train, dt=dt), dt=dt)
         predictors["fitted_bicycle"] = partial(_simulate, fitted)
     return {
-        name: jax.jit(
-            partial(prediction_rmse, predict, horizon=horizon, along_path=along_path)
-        )(test)
+        name: partial(prediction_rmse, predict, horizon=horizon, along_path=along_path)
         for name, predict in predictors.items()
     }
 

@@ -13,10 +13,10 @@ from jaxtyping import Array, Float
 
 from sfkd_jax.core.rollouts import (
     defects,
-    every_window,
     in_batches,
     prediction_errors,
     rollout,
+    sliding_windows,
 )
 from sfkd_jax.types import Model, Params, Trajectory
 
@@ -80,11 +80,11 @@ def predictions(
     Raises:
         ValueError: drives shorter than a segment, or segments shorter than the horizon.
     """
-    cut = jax.vmap(partial(every_window, horizon=length, stride=length))
+    cut = jax.vmap(partial(sliding_windows, horizon=length, stride=length))
     segments = jax.tree.map(lambda leaf: leaf.reshape(-1, *leaf.shape[2:]), cut(driven))
 
     def one(segment: Trajectory) -> Predictions:
-        windows = every_window(segment, horizon=horizon, stride=STRIDE)
+        windows = sliding_windows(segment, horizon=horizon, stride=STRIDE)
         return jax.vmap(partial(_along_window, model, params))(windows)
 
     return in_batches(one, segments, size=16)
