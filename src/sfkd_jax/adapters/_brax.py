@@ -44,9 +44,8 @@ class BraxVehicle(Env):
         zero = jnp.zeros(())
         metrics = dict.fromkeys(MEASURES, zero)
         info = {"road": road, "time_out": zero}
-        return State(
-            moment, self._task.observe(road, moment), zero, zero, metrics, info
-        )  # pyright: ignore
+        observation = self._task.observe(road, moment)
+        return State(moment, observation, zero, zero, metrics, info)  # pyright: ignore
 
     def step(self, state: State, action: jax.Array) -> State:
         """Simulate one sampling period; keep other entries of `metrics` and `info`."""

@@ -29,14 +29,12 @@ class RoadView:
 
         self._dt, self._lane, self._interactive = dt, lane, False
         if human:
-            import matplotlib
-            from matplotlib import pyplot
+            from matplotlib import get_backend, pyplot
+            from matplotlib.backends import BackendFilter, backend_registry
 
             self._figure = pyplot.figure(figsize=SIZE, dpi=100)
-            known = matplotlib.backends.backend_registry.list_builtin(
-                matplotlib.backends.BackendFilter.INTERACTIVE
-            )
-            backend = matplotlib.get_backend().lower()
+            known = backend_registry.list_builtin(BackendFilter.INTERACTIVE)
+            backend = get_backend().lower()
             self._interactive = backend in {name.lower() for name in known}
             if self._interactive:
                 pyplot.show(block=False)

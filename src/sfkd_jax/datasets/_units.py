@@ -140,16 +140,22 @@ def find_column(
     if name in headers:
         split = split_unit(name)
         unit = split and find_unit(split[1])
-        return _converted(name, split[1], unit, dimension) if unit else Match(name)
-    behind = {header: split_unit(header) for header in headers}
-    fitting = [header for header, split in behind.items() if split and split[0] == name]
+        if split is None or unit is None:
+            return Match(name)
+        return _converted(name, split[1], unit, dimension)
+    symbols = {
+        header: split[1]
+        for header in headers
+        if (split := split_unit(header)) and split[0] == name
+    }
+    fitting = list(symbols)
     if not fitting:
         return None
     if len(fitting) > 1:
         raise ValueError(
             f"columns {' and '.join(fitting)} both fit {name}; configure one in full"
         )
-    symbol = behind[fitting[0]][1]
+    symbol = symbols[fitting[0]]
     unit = find_unit(symbol)
     if unit is None:
         raise ValueError(
