@@ -3,6 +3,7 @@
 import ast
 import importlib.util
 import os
+import re
 import statistics
 import subprocess
 import sys
@@ -258,6 +259,28 @@ def test_the_top_level_stays_small():
     modules = {file.stem for file in SRC.glob("*.py")} - {"__init__"}
     assert modules == COMMANDS | {"types", "policy", "__main__"}
     assert len(modules) <= 12
+
+
+def test_the_old_private_words_are_gone():
+    """Names of packages and identifiers that only this project understood."""
+    root = SRC.parents[1]
+    words = "shelf|hallway|rehears|assembly|itinerar|rooms|doors|finite_or_dear"
+    gone = re.compile(rf"\b({words})", re.IGNORECASE)
+    names = {"told", "met", "found", "place", "asked", "said", "pushed", "understood"}
+    folders = ("src", "conf", "docs", "examples", "benchmarks", "experiments")
+    files = [file for folder in folders for file in (root / folder).rglob("*")]
+    files += [
+        root / f"{name}.md" for name in ("README", "ARCHITECTURE", "CONTRIBUTING")
+    ]
+    for file in files:
+        if file.suffix in (".py", ".md", ".yaml", ".toml", ".sh", ".html"):
+            assert gone.findall(file.read_text("utf-8")) == [], file
+    tokens = {
+        (name, node.id if isinstance(node, ast.Name) else node.arg)
+        for name in FILES
+        for node in nodes(name, ast.Name, ast.arg)
+    }
+    assert sorted(pair for pair in tokens if pair[1] in names) == []
 
 
 def test_public_functions_are_annotated():

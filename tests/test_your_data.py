@@ -75,14 +75,14 @@ def logs(tmp_path_factory):
 
 @pytest.mark.slow
 def test_logs_become_a_certified_policy_of_a_robot_that_nothing_drives(logs):
-    walked = last_line(
+    document = last_line(
         done := run_command(
             "train", *SMALL, *TINY, *FAST, "model.environment=false", cwd=logs.parent
         )
     )
-    assert walked["results"] is None
+    assert document["results"] is None
     assert "not driven" in done.stderr
-    errors = json.loads((logs.parent / walked["run"] / "open_loop.json").read_text())
+    errors = json.loads((logs.parent / document["run"] / "open_loop.json").read_text())
     assert set(errors["baselines"]) == {
         "constant_velocity",
         "constant_turn",
@@ -94,15 +94,15 @@ def test_logs_become_a_certified_policy_of_a_robot_that_nothing_drives(logs):
     assert max(fitted) < max(
         errors["baselines"]["constant_velocity"]["position_rmse_m"]
     )
-    certificate = json.loads((logs.parent / walked["certificate"]).read_text())
+    certificate = json.loads((logs.parent / document["certificate"]).read_text())
     assert certificate["valid"]
     assert certificate["boxes"]["names"] == {
         "state": ["v", "yaw_rate"],
         "control": ["steering", "acceleration"],
         "env": [],
     }
-    assert "Not driven" in (logs.parent / walked["report"]).read_text()
-    policy = sfkd_jax.load(logs.parent / walked["run"])
+    assert "Not driven" in (logs.parent / document["report"]).read_text()
+    policy = sfkd_jax.load(logs.parent / document["run"])
     assert policy.certificate is not None
     limits = [policy.settings["vehicle"][f"control_{side}"] for side in ("low", "high")]
     assert limits == certificate["boxes"]["control"]

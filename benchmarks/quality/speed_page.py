@@ -13,7 +13,7 @@ HOME = Path(__file__).resolve().parents[2]
 MEASURED = HOME / "benchmarks" / "speed.json"
 PAGE, FIGURE = HOME / "docs" / "corridor.md", HOME / "docs" / "corridor_speed.png"
 OPEN, CLOSE = "<!-- speed -->\n", "<!-- end of speed -->"
-ROOMS = (0.1, 0.15, 0.2, 0.3)
+CLEARANCES = (0.1, 0.15, 0.2, 0.3)
 """Besides the one that was asked for [m]."""
 
 
@@ -74,7 +74,8 @@ def tables(document):
         inside = "{:.1f} % of all test drives are inside ({:.1f} to {:.1f} %), {:.1f} to {:.1f} % by cell"
         lines += [table(name, result)]
         lines += [
-            f"- {answer(result, room)}" for room in sorted({*ROOMS, document["room_m"]})
+            f"- {answer(result, room)}"
+            for room in sorted({*CLEARANCES, document["room_m"]})
         ]
         lines += [
             f"- {result['drives']} drives of {result['duration_s']:g} s fix the units of a cell, as many calibrate and "

@@ -3,7 +3,7 @@
 python -m benchmarks.robustness.slurm_sweep [--only failures requeue limit large --out
 benchmarks/robustness/slurm_sweep.json] As root on Debian: apt-get install munge slurmctld slurmd
 slurm-client. The cluster (slurm_cluster.py) is one node with two CPUs on the loopback
-address and goes when the script ends. A job is the small walk of drills.py. What the
+address and goes when the script ends. A job is the small run of drills.py. What the
 file says of drills that are not asked for stays.
 """
 

@@ -186,11 +186,11 @@ def test_a_decoder_that_emits_a_constant_has_constant_zero():
 @pytest.mark.parametrize("name", [*HARD, "no_residual"])
 def test_a_certificate_passes_its_own_check_also_after_a_walk_through_json(name):
     model, params = model_and_params(name)
-    walked = Certificate.from_document(
+    restored = Certificate.from_document(
         json.loads(json.dumps(certified(name).document()))
     )
-    assert walked == Certificate.from_document(certified(name).document())
-    verify(walked, params, model=model)
+    assert restored == Certificate.from_document(certified(name).document())
+    verify(restored, params, model=model)
 
 
 CLAIMS = ("alpha", "alpha_separate", "alpha_joint", "rho", "beta", "kappa")

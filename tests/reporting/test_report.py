@@ -581,13 +581,13 @@ def test_the_command_is_the_one_that_was_typed_where_it_was_kept(tmp_path):
         code = [
             html.unescape(text) for text in re.findall(r"<pre><code>(.*?)</code>", page)
         ]
-        walked = [
+        items = [
             text
             for text in code
             if ".train" in text or ".evaluate +experiment=s3 evaluation" in text
         ]
-        assert len(walked) == shown
-        assert walked[-1] == (
+        assert len(items) == shown
+        assert items[-1] == (
             command or "python -m sfkd_jax.train +experiment=s3 seed=0"
         )
 

@@ -52,7 +52,7 @@ def dot_panels(
     for head, group in groups.items():
         if group:
             start = heights[-1] + 1.3 if heights else 0.0
-            heights += [start + place for place in range(1 + len(group))]
+            heights += [start + index for index in range(1 + len(group))]
             ordered = sorted(group, key=lambda one: _last(score(one)))
             names += [(head, None), *((one.name, one) for one in ordered)]
     deep = 1 + max((title.count("\n") for title in titles), default=0)
