@@ -30,7 +30,10 @@ class RoadView:
         self._dt, self._lane, self._interactive = dt, lane, False
         if human:
             from matplotlib import get_backend, pyplot
-            from matplotlib.backends import BackendFilter, backend_registry
+            from matplotlib.backends.registry import (
+                BackendFilter,
+                backend_registry,
+            )
 
             self._figure = pyplot.figure(figsize=SIZE, dpi=100)
             known = backend_registry.list_builtin(BackendFilter.INTERACTIVE)
