@@ -203,6 +203,7 @@ def test_certify_exits_0_then_3_when_weights_changed_then_0_when_renewed(copied)
     assert renewed["alpha"] < 1.0
 
 
+@pytest.mark.exhaustive
 def test_a_model_without_a_bound_is_evaluated_but_not_certified(smoke):
     directory = smoke[0]
     small = (

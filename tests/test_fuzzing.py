@@ -5,9 +5,12 @@ import subprocess
 import sys
 from pathlib import Path
 
+import pytest
+
 ENGINE = Path(__file__).with_name("fuzzing.py")
 
 
+@pytest.mark.exhaustive
 def test_no_changed_file_is_misread_hangs_or_takes_memory():
     command = [sys.executable, str(ENGINE), "--cases", "10000", "--seed", "0"]
     done = subprocess.run(command, capture_output=True, text=True, timeout=500)

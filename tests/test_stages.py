@@ -3,6 +3,7 @@
 import json
 
 import numpy as np
+import pytest
 from helpers import last_line, run_command
 
 
@@ -32,6 +33,7 @@ def step(x, u, e):
 """
 
 
+@pytest.mark.exhaustive
 def test_all_stages_run_for_a_users_step_function_under_a_speed_loop(tmp_path):
     """A step function in the current directory gives data, weights, a certificate,
     episodes and a report.

@@ -309,7 +309,7 @@ def test_a_batch_of_controllers_acts_as_each_one_alone(name):
         batch,
         stack(*[act(params, *each, REFERENCE) for each in inputs]),
         rtol=1e-4,
-        atol=1e-5,
+        atol=1e-4 if name == "koopman_mpc" else 1e-5,  # an iterative program
     )
     assert len(np.unique(np.asarray(batch[0]), axis=0)) == 3
 
