@@ -143,6 +143,7 @@ def load(
     *,
     controller: Mapping[str, Any] | None = None,
     env_source: str = "measured",
+    adaptive: bool = False,
 ) -> Policy:
     """Return the policy in a run directory, with its certificate verified.
 
@@ -153,6 +154,8 @@ def load(
         controller: settings of a controller to build instead of the saved one.
         env_source: "estimated" for a controller that estimates the environment and
             ignores the one it is given.
+        adaptive: whether a policy in path coordinates estimates unmeasured forces and
+            errors of its inputs while driving, see `control.adaptive`.
 
     Raises:
         ArtefactError: as `restore`; a certificate that does not hold; or none, and
@@ -180,6 +183,7 @@ def load(
             env_source=env_source,
             certificate=certificate,
             law=trained.law,
+            adaptive=adaptive,
         )
     if certificate is None:
         if fallback != "none":

@@ -250,6 +250,17 @@ class ControllerInfo(TypedDict, total=False):
     # estimated
     env_estimate: Environment  # mean over the hypotheses
     env_spread: Environment  # standard deviation over the hypotheses
+    # adaptive, with env_estimate
+    causes: Float[Array, " 5"]  # force, steering, drive; steering and force in turns
+    causes_std: Float[Array, " 5"]  # standard deviations of the estimates
+    rejected: Bool[Array, ""]  # nothing was learned from the measurement
+    adapting: Bool[Array, ""]  # the causes do not predict worse than none
+    # online_tube
+    tube: Float[Array, " horizon"]  # radius around the plan [m]
+    tube_errors: Float[Array, " horizon"]  # of the plans of 1 … horizon steps ago [m]
+    tube_missed: Bool[Array, " horizon"]  # an error exceeds the radius it had
+    online_corridor: Scalar  # largest |e_y| of the plan with its tube [m]
+    speed_factor: Scalar  # of the reference speed at the next step
     # delay_compensated
     arrival_state: State  # predicted state at which the control arrives
     # shielded

@@ -25,6 +25,7 @@ from jaxtyping import jaxtyped
 
 from sfkd_jax import build, control, evaluation, models, scenarios, vehicle
 from sfkd_jax.core.folding import fold
+from sfkd_jax.core.offsets import with_offset
 from sfkd_jax.types import ControllerInfo
 
 PLANT = vehicle.kinematic()
@@ -107,22 +108,44 @@ def monitored():
     return watched, params
 
 
-def shielded():
-    """With a filter, in path coordinates; the model is a tiny SFKD at its initial
-    parameters, folded.
-    """
-    law, limits = any_law(), LIMITS | BOX
-    model = models.sfkd(path_space(), **TINY | {"budget": "joint"}, frame="path")
+def around_law(model, law):
+    """A tiny planner along a path."""
     task = control.following_law(
         model, control.tracking_cost(dt=PLANT.dt), law, dt=PLANT.dt, **LIMITS
     )
-    planner = control.mppi(
+    return control.mppi(
         task, num_samples=16, horizon=HORIZON, noise_std=(0.01, 0.3), **BOX
     )
+
+
+def path_model():
+    """A tiny SFKD in path coordinates and its initial parameters, folded."""
+    model = models.sfkd(path_space(), **TINY | {"budget": "joint"}, frame="path")
+    return model, jit(partial(fold, model))(jit(model.init)(jax.random.key(0)))
+
+
+def shielded():
+    """With a filter, in path coordinates."""
+    law, limits = any_law(), LIMITS | BOX
+    model, params = path_model()
     filtered = control.shielded(
-        planner, model, law, width=0.5, tube=0.2, horizon=8, **limits
+        around_law(model, law), model, law, width=0.5, tube=0.2, horizon=8, **limits
     )
-    return filtered, jit(partial(fold, model))(jit(model.init)(jax.random.key(0)))
+    return filtered, params
+
+
+def adaptive():
+    """With estimates of unmeasured causes, in path coordinates."""
+    law, limits = any_law(), LIMITS | BOX
+    model, params = path_model()
+    planner = around_law(with_offset(model), law)
+    return control.adaptive(planner, model, law, coordinates=3, **limits), params
+
+
+def online_tube():
+    """With a tube calibrated while driving, and a lane that is too narrow for it."""
+    controller, params = mppi(FEEDBACK)
+    return control.online_tube(controller, horizon=HORIZON, lane=0.02), params
 
 
 def estimated():
@@ -146,6 +169,8 @@ WRAPPERS = {
     "monitored": monitored,
     "estimated": estimated,
     "shielded": shielded,
+    "adaptive": adaptive,
+    "online_tube": online_tube,
 }
 BUILDERS = PLANNERS | VARIANTS | WRAPPERS
 """Name -> () -> (controller, params), for `HORIZON` steps of the kinematic plant within

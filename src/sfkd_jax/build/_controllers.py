@@ -7,6 +7,7 @@ from typing import Any
 from sfkd_jax import control, vehicle
 from sfkd_jax.build._choices import Settings, as_kwargs, floats
 from sfkd_jax.build._planners import chosen_planner
+from sfkd_jax.core.offsets import with_offset
 from sfkd_jax.core.path_frame import LATERAL
 from sfkd_jax.types import Controller, Model
 
@@ -30,6 +31,7 @@ def build_controller(
     certificate: Settings | None = None,
     env_source: str = "measured",
     law: control.PathLaw | None = None,
+    adaptive: bool = False,
 ) -> Controller:
     """Return the planner of the settings with its monitor, estimator or shield.
 
@@ -43,10 +45,13 @@ def build_controller(
             `settings["shield"]`, of a shield.
         env_source: one of `ENV_SOURCES`; "estimated" adds an estimator.
         law: that a model in path coordinates was learned around.
+        adaptive: whether a controller along a path estimates unmeasured forces and
+            errors of its inputs while driving; with "estimated" it always does.
 
     Raises:
-        ValueError: an unknown planner, a vehicle without limits of its controls, or a
-            model and a planner in different coordinates.
+        ValueError: an unknown planner, a vehicle without limits of its controls, a
+            model and a planner in different coordinates, or adaptation without path
+            coordinates.
     """
     if not plant.control_low:
         raise ValueError(
@@ -55,15 +60,21 @@ def build_controller(
         )
     build = chosen_planner(settings).build
     if model.along_path:
-        if settings["sampling"] != "law" or env_source == "estimated" or law is None:
+        if settings["sampling"] != "law" or law is None:
             raise ValueError(
-                "a model in path coordinates needs controller.sampling=law, its law, "
-                "and env_source=measured or none"
+                "a model in path coordinates needs controller.sampling=law and its law"
             )
-        planner = build(settings, model, plant, env_low, env_high, law)
+        adaptive |= env_source == "estimated"
+        planned = with_offset(model) if adaptive else model
+        planner = build(settings, planned, plant, env_low, env_high, law)
         if certificate and certificate.get("corridor") and settings.get("shield"):
-            return in_corridor(planner, model, plant, law, certificate)
-        return planner
+            planner = in_corridor(planner, planned, plant, law, certificate)
+        if not adaptive:
+            return planner
+        box = env_low, env_high
+        return _adaptive(planner, model, plant, law, box, env_source)
+    if adaptive:
+        raise ValueError("adaptation needs a model in path coordinates")
     planner = build(settings, model, plant, env_low, env_high)
     watched = (
         planner
@@ -138,6 +149,29 @@ def _monitored(
     bounds = tuple(certificate["monitor"]["bounds"])
     return control.monitored(
         planner, model, bounds=bounds, **boxes, **as_kwargs(settings.get("monitor", {}))
+    )
+
+
+def _adaptive(
+    planner: Controller,
+    model: Model,
+    plant: vehicle.Vehicle,
+    law: control.PathLaw,
+    box: tuple[Any, Any],
+    env_source: str,
+) -> Controller:
+    if box[0] is None or box[1] is None:
+        raise ValueError("adaptation needs env_low and env_high")
+    return control.adaptive(
+        planner,
+        model,
+        law,
+        coordinates=len(plant.state_names) - 1,
+        control_low=plant.control_low,
+        control_high=plant.control_high,
+        env_low=tuple(box[0]),
+        env_high=tuple(box[1]),
+        estimate_env=env_source == "estimated",
     )
 
 

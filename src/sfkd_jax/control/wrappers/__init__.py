@@ -1,1 +1,1 @@
-"""Controllers around a controller: monitor, estimator, delay compensation, shield."""
+"""Controllers around a controller: monitor, estimator, adaptation, delay, shield."""

@@ -5,10 +5,10 @@ from __future__ import annotations
 import jax.numpy as jnp
 
 from sfkd_jax.core.se2 import between, compose, wrap_angle
-from sfkd_jax.types import POSE, Reference
+from sfkd_jax.types import POSE, Reference, Scalar
 
 
-def slow_down(reference: Reference, factor: float) -> Reference:
+def slow_down(reference: Reference, factor: float | Scalar) -> Reference:
     """Follow the same path at a lower speed, linear between its points.
 
         g'(t) = g(c t),   v'(t) = c v(c t)

@@ -1,0 +1,208 @@
+"""A tube that is calibrated while driving, and the speed at which it fits the lane."""
+
+from __future__ import annotations
+
+import math
+from functools import partial
+from typing import Annotated, Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+from sfkd_jax.control.planners._plans import all_finite
+from sfkd_jax.control.tasks._along_path import curvature_ahead, path_coordinates
+from sfkd_jax.control.wrappers._slow import slow_down
+from sfkd_jax.core.path_frame import LATERAL
+from sfkd_jax.core.ranges import Fraction, Interval, Positive, PositiveFraction
+from sfkd_jax.types import (
+    Control,
+    Controller,
+    ControllerInfo,
+    Environment,
+    Key,
+    Params,
+    Reference,
+    Scalar,
+    State,
+)
+
+RADIUS_RANGE = (1e-3, 1e2)
+"""Least and largest radius [m]."""
+
+
+class OnlineTubeState(NamedTuple):
+    """What the calibration carries from one control step to the next.
+
+    Attributes:
+        inner: state of the wrapped controller.
+        plans: e_y that the last plans predicted, newest first [m]; NaN before.
+        radii: r_h of the tube [m].
+        speed_factor: of the reference speed.
+    """
+
+    inner: Any
+    plans: Float[Array, "horizon horizon"]
+    radii: Float[Array, " horizon"]
+    speed_factor: Scalar
+
+
+class _Settings(NamedTuple):
+    """Settings of `online_tube` as its functions need them."""
+
+    controller: Controller
+    horizon: int
+    level: float
+    rate: float
+    start_radius: float
+    lane: float
+    slowest: float
+    fall: float
+
+
+def online_tube(
+    controller: Controller,
+    *,
+    horizon: int,
+    level: Fraction = 0.95,
+    rate: Positive = 0.2,
+    start_radius: Positive = 0.03,
+    lane: Annotated[float, Interval("(0, inf]")] = math.inf,
+    slowest: PositiveFraction = 0.8,
+    fall: Fraction = 0.005,
+) -> Controller:
+    """Wrap a controller with a tube around its plans, and slow down until it fits.
+
+    For every h up to the horizon, the plan of h steps ago said where the car would be
+    across the path now. Adaptive conformal inference on the scale of the radius:
+
+        r_h ← r_h exp(γ (1{|e_y − ê_{y,h}| > r_h} − (1 − level)))
+
+    so that in N steps, whatever happens, the share of misses differs from 1 − level by
+    at most |log(r_N / r_0)| / (γ N). Nothing is assumed about the drive, and nothing is
+    proved about a single step. Errors are those of the measured position.
+
+    The online corridor is max_h |ê_{y,h}| + r_h. While it exceeds `lane`, the reference
+    speed falls; otherwise it rises, so much slower that the speed settles where the
+    corridor fits in a share `level` of the steps. Both are gentle: hard braking would
+    take the grip that the tyres need to stay on the path.
+
+    Args:
+        controller: any planner of a path; its `info` has `predicted_states`.
+        horizon: number of predicted steps.
+        level: of the coverage.
+        rate: γ.
+        start_radius: r_h at the start [m].
+        lane: largest |e_y| that is acceptable [m].
+        slowest: least factor of the reference speed.
+        fall: of the factor per step, while the corridor exceeds the lane.
+
+    Returns:
+        A `Controller`; `info` gains `tube` (horizon,) [m], `tube_errors` (horizon,) [m]
+        (NaN without a plan to compare with), `tube_missed` (horizon,),
+        `online_corridor` [m] and `speed_factor`.
+
+    Raises:
+        ValueError: a setting is out of its range.
+
+    Source: Gibbs and Candès (2021), Adaptive Conformal Inference Under Distribution
+    Shift.
+    """
+    _check(level, rate, start_radius, lane, slowest)
+    settings = _Settings(
+        controller, horizon, level, rate, start_radius, lane, slowest, fall
+    )
+    return Controller(partial(_init, settings), partial(_act, settings))
+
+
+def _init(settings: _Settings, key: Key) -> OnlineTubeState:
+    """The state before the first control step."""
+    horizon = settings.horizon
+    return OnlineTubeState(
+        inner=settings.controller.init(key),
+        plans=jnp.full((horizon, horizon), jnp.nan, dtype=float),
+        radii=jnp.full(horizon, settings.start_radius, dtype=float),
+        speed_factor=jnp.ones(()),
+    )
+
+
+def _act(
+    settings: _Settings,
+    params: Params,
+    state: OnlineTubeState,
+    observation: State,
+    env: Environment,
+    reference: Reference,
+) -> tuple[Control, OnlineTubeState, ControllerInfo]:
+    """One control step."""
+    measured = path_coordinates(
+        observation, reference[0], curvature_ahead(reference)[0]
+    )
+    errors = jnp.abs(measured[LATERAL] - jnp.diagonal(state.plans))
+    missed = errors > state.radii
+    radii = _calibrated(settings, state.radii, errors)
+    slowed = slow_down(reference, state.speed_factor)
+    target = jnp.where(state.speed_factor < 1.0, slowed, reference)
+    control, inner, info = settings.controller.act(
+        params, state.inner, observation, env, target
+    )
+    plan = _lateral(info["predicted_states"], target)
+    corridor = jnp.max(jnp.abs(plan) + radii)
+    rise = settings.fall * (1.0 - settings.level) / settings.level
+    change = jnp.where(corridor > settings.lane, -settings.fall, rise)
+    factor = jnp.clip(state.speed_factor + change, settings.slowest, 1.0)
+    after = OnlineTubeState(
+        inner=inner,
+        plans=jnp.concatenate([plan[None], state.plans[:-1]]),
+        radii=radii,
+        speed_factor=factor,
+    )
+    report: ControllerInfo = {
+        **info,
+        "tube": radii,
+        "tube_errors": errors,
+        "tube_missed": missed,
+        "online_corridor": corridor,
+        "speed_factor": factor,
+    }
+    return control, after, report
+
+
+def _calibrated(
+    settings: _Settings,
+    radii: Float[Array, " horizon"],
+    errors: Float[Array, " horizon"],
+) -> Float[Array, " horizon"]:
+    """The radii after a comparison; unchanged where there was none."""
+    missed = errors > radii
+    change = settings.rate * (missed - (1.0 - settings.level))
+    after = jnp.clip(radii * jnp.exp(change), *RADIUS_RANGE)
+    return jnp.where(jnp.isfinite(errors), after, radii)
+
+
+def _lateral(
+    states: Float[Array, "horizon state"], reference: Reference
+) -> Float[Array, " horizon"]:
+    """e_y of predicted states; NaN for a plan that is not finite."""
+    coordinates = jax.vmap(path_coordinates)(
+        states, reference, curvature_ahead(reference)
+    )
+    lateral = coordinates[:, LATERAL]
+    return jnp.where(all_finite(lateral), lateral, jnp.nan)
+
+
+def _check(
+    level: float, rate: float, start_radius: float, lane: float, slowest: float
+) -> None:
+    """Raise a ValueError that names a setting out of its range."""
+    if not 0 < level < 1 or not 0 < rate < math.inf:
+        raise ValueError(
+            f"level must lie in (0, 1) and rate be positive, got {level} and {rate}"
+        )
+    if not RADIUS_RANGE[0] <= start_radius <= RADIUS_RANGE[1] or not lane > 0:
+        raise ValueError(
+            f"start_radius must lie in {list(RADIUS_RANGE)} and lane be positive, "
+            f"got {start_radius} and {lane}"
+        )
+    if not 0 < slowest <= 1:
+        raise ValueError(f"slowest must lie in (0, 1], got {slowest}")

@@ -1,0 +1,351 @@
+"""Adaptation while driving: what is estimated, what stays proved, and hostile inputs."""
+
+from functools import cache, partial
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from helpers import ENV_HIGH, ENV_LOW, any_law, certified, jit, model_and_params
+
+from sfkd_jax import build, certification, control, models, vehicle
+from sfkd_jax.certification._exported import exported
+from sfkd_jax.control.wrappers import _disturbances as disturbances
+from sfkd_jax.control.wrappers import _kalman as kalman
+from sfkd_jax.core.offsets import Offset, with_offset
+from sfkd_jax.core.path_frame import path_state
+from sfkd_jax.types import BODY, Controller
+
+PLANT, LAW = vehicle.kinematic(), any_law()
+MODEL = models.physics(build.build_loop(PLANT, LAW).step, along_path=True)
+"""The true loop as a model, so that every estimate has an exact answer."""
+LOOP = disturbances.Loop(MODEL, LAW, jnp.asarray(ENV_LOW), jnp.asarray(ENV_HIGH))
+NOISE = np.float32([0.015, 0.002, 0.03])
+STEPS = 120
+SETTINGS = {
+    "coordinates": 3,
+    "control_low": PLANT.control_low,
+    "control_high": PLANT.control_high,
+    "env_low": ENV_LOW,
+    "env_high": ENV_HIGH,
+}
+HORIZON = 4
+
+
+def law_alone():
+    """A controller along a path whose plan is the law, with offset parameters."""
+
+    def act(params, state, observation, env, reference):
+        curvature = control.curvature_ahead(reference)[0]
+        xi = control.path_coordinates(observation, reference[0], curvature)
+        wanted = LAW(xi, curvature, reference[0, 3], env)
+        ahead = jnp.tile(observation, (reference.shape[0], 1))
+        info = {
+            "healthy": jnp.asarray(True),
+            "predicted_states": ahead,
+            "seen": observation,
+        }
+        return wanted, state, info
+
+    return Controller(lambda key: jnp.zeros(()), act)
+
+
+@cache
+def adaptive(**settings):
+    return control.adaptive(law_alone(), MODEL, LAW, **SETTINGS | settings)
+
+
+def road(time, speed=10.0):
+    """Reference points ahead of a car that drives along a straight line."""
+    ahead = speed * 0.1 * (time + 1.0 + jnp.arange(HORIZON))
+    zero = jnp.zeros(HORIZON)
+    return jnp.stack([ahead, zero, zero, zero + speed], axis=1)
+
+
+def spotless(time, seen, last):
+    return seen
+
+
+def jump(time, seen, last):
+    return seen.at[1].add(jnp.where(time == 60, 5.0, 0.0))
+
+
+def freeze(time, seen, last):
+    return jnp.where((time >= 60) & (time < 64), last, seen)
+
+
+def lose(time, seen, last):
+    return jnp.where((time >= 60) & (time < 64), jnp.nan, seen)
+
+
+def overflow(time, seen, last):
+    return jnp.where(time == 60, 1e30, seen)
+
+
+def hostile(time, seen, last):
+    """Every few steps a value that no sensor should give."""
+    values = jnp.asarray([jnp.nan, jnp.inf, -1e30, 1e-40, 1e6, 0.0, 3e38, 1e3])
+    which = (7.0 * time).astype(int)
+    value, entry = values[which % 8], which % 4
+    return seen.at[entry].set(jnp.where(time % 5 == 3, value, seen[entry]))
+
+
+FAULTS = (spotless, jump, freeze, lose, overflow, hostile)
+"""(step, observation, last observation) -> observation."""
+
+
+@cache
+def driver(**settings):
+    """Infos and beliefs of drives in a loop with unmeasured causes, compiled once."""
+    controller = adaptive(**settings)
+    env = jnp.asarray([0.7, 0.0])
+
+    @jit
+    def run(seed, force, steering, noise, fault):
+        pushed = disturbances.split_force(LOOP, env, force)[0]
+
+        def step(carry, inputs):
+            state, memory, last = carry
+            time, key = inputs
+            # The car is put back onto the abscissa of the reference.
+            state = state.at[0].set(time)
+            seen = state.at[1:4].add(noise * NOISE * jax.random.normal(key, (3,)))
+            seen = jax.lax.switch(fault, FAULTS, time, seen, last)
+            action, memory, info = controller.act({}, memory, seen, env, road(time))
+            state = PLANT.step(state, action.at[0].add(steering), pushed)
+            return (state, memory, seen), (info, memory.belief)
+
+        start = jnp.asarray([0.0, 0.0, 0.0, 10.0])
+        carry = (start, controller.init(jax.random.key(0)), start)
+        keys = jax.random.split(jax.random.key(seed), STEPS)
+        return jax.lax.scan(step, carry, (jnp.arange(float(STEPS)), keys))[1]
+
+    return run
+
+
+def drive(seed=0, force=0.0, steering=0.0, noise=0.0, fault=spotless, **settings):
+    run = driver(**settings)
+    return jax.tree.map(
+        np.asarray, run(seed, force, steering, noise, FAULTS.index(fault))
+    )
+
+
+def test_an_offset_shifts_a_step_and_nothing_else():
+    """F(z, u + δ) + b, so that two predictions differ by the same as before."""
+    model, params = model_and_params("path")
+    shifted, env = with_offset(model), jnp.asarray([0.5, 3.0])
+    fiber = model.fiber(params, env)
+    states = [path_state(jnp.asarray([9.5 + k])) for k in range(2)]
+    control_, delta = jnp.asarray([0.01, 0.2]), jnp.full(2, 0.01)
+    latents = [model.encode(fiber, state) for state in states]
+    push = jax.tree.map(lambda leaf: 0.1 * jnp.ones_like(leaf), latents[0])
+    fiber_ = shifted.fiber(Offset(params, delta, push), env)
+    plain = [model.step(fiber, latent, control_ + delta) for latent in latents]
+    moved = [shifted.step(fiber_, latent, control_) for latent in latents]
+    gap = lambda pair: model.vector(pair[1]) - model.vector(pair[0])
+    np.testing.assert_allclose(gap(moved), gap(plain), atol=1e-6)
+    np.testing.assert_allclose(
+        model.vector(moved[0]) - model.vector(plain[0]), 0.1, atol=1e-6
+    )
+
+
+def test_the_certificate_of_the_model_holds_for_the_adapted_one():
+    """Its explicit weights are the same arrays; other weights are refused."""
+    model, params = model_and_params("path")
+    certificate = certified("path")
+    latent = jax.eval_shape(
+        lambda: model.encode(model.fiber(params, jnp.zeros(2)), jnp.zeros(4))
+    )
+    push = jax.tree.map(lambda leaf: jnp.full(leaf.shape, 1e3), latent)
+    offset = Offset(params, jnp.full(2, 50.0), push)
+    adapted = exported(with_offset(model), offset)
+    certification.verify(certificate, offset.params, model=model, weights=adapted)
+    larger = jax.tree.map(lambda leaf: 3.0 * leaf, params)
+    broken = exported(with_offset(model), offset._replace(params=larger))
+    with pytest.raises(certification.CertificationRefused):
+        certification.verify(certificate, params, model=model, weights=broken)
+
+
+def test_one_filter_is_the_textbook_kalman_filter():
+    random = np.random.default_rng(0)
+    mean, slope = random.normal(size=3), random.normal(size=(3, 3))
+    root, noise = random.normal(size=(3, 3)), np.diag([0.1, 0.2, 0.3])
+    sensors, measured = np.array([0.5, 0.1]), random.normal(size=2)
+    ahead = slope @ (root @ root.T) @ slope.T + noise
+    H = np.eye(2, 3)
+    gain = ahead @ H.T @ np.linalg.inv(H @ ahead @ H.T + np.diag(sensors))
+    expected = mean + gain @ (measured - H @ mean), (np.eye(3) - gain @ H) @ ahead
+    covariance = kalman.propagated(
+        jnp.asarray(root @ root.T)[None],
+        jnp.asarray(slope)[None],
+        jnp.asarray(noise)[None],
+    )
+    bank = kalman.Bank(jnp.asarray(mean)[None], covariance, jnp.ones(1))
+    bank, explained = kalman.corrected(
+        bank, jnp.asarray(measured), jnp.asarray(sensors)
+    )
+    assert explained
+    np.testing.assert_allclose(bank.mean(), expected[0], rtol=1e-4, atol=1e-5)
+    np.testing.assert_allclose(bank.covariances[0], expected[1], rtol=1e-3, atol=1e-4)
+
+
+def test_mixing_keeps_mean_and_total_variance():
+    """The laws of total expectation and variance, for any chain."""
+    random = np.random.default_rng(1)
+    roots = random.normal(size=(3, 2, 2))
+    chain = random.dirichlet(np.ones(3), size=3)
+    before = kalman.Bank(
+        jnp.asarray(random.normal(size=(3, 2))),
+        jnp.asarray(roots @ roots.transpose(0, 2, 1)),
+        jnp.asarray(random.dirichlet(np.ones(3))),
+    )
+    after = kalman.mixed(before, jnp.asarray(chain))
+    np.testing.assert_allclose(after.probabilities.sum(), 1.0, atol=1e-6)
+    np.testing.assert_allclose(after.mean(), before.mean(), atol=1e-6)
+    np.testing.assert_allclose(after.variance(), before.variance(), rtol=1e-5)
+
+
+@pytest.mark.parametrize("force", [-0.6, 0.4])
+def test_a_constant_side_force_is_found(force):
+    info, _ = drive(force=force, shrinkage=0.0)
+    causes = info["causes"][-20:]
+    np.testing.assert_allclose(causes[:, disturbances.FORCE], force, atol=0.05)
+    np.testing.assert_allclose(causes[:, disturbances.STEERING], 0.0, atol=0.002)
+
+
+def test_a_wrong_steering_angle_is_found_and_removed():
+    info, _ = drive(steering=0.02)
+    causes = info["causes"][-20:]
+    np.testing.assert_allclose(causes[:, disturbances.STEERING], 0.02, atol=1e-3)
+    assert np.all(info["adapting"][20:])
+    assert np.abs(info["seen"][-20:, 1]).max() < 0.01
+
+
+def test_without_causes_noise_is_not_taken_for_one():
+    """The shrunk force is less than 6 % of the largest one of E, root mean square."""
+    info, _ = drive(noise=1.0)
+    assert np.sqrt(np.mean(info["causes"][20:, disturbances.FORCE] ** 2)) < 0.06
+    assert np.abs(info["causes"][60:, disturbances.STEERING]).max() < 0.004
+
+
+def test_the_true_cause_lies_within_the_reported_spread():
+    """Within three standard deviations in at least 95 % of the steps."""
+    truth = np.array([0.5, 0.01])
+    inside = []
+    for seed in range(3):
+        settings = {"force": truth[0], "steering": truth[1], "noise": 1.0}
+        info, _ = drive(seed, shrinkage=0.0, **settings)
+        gap = np.abs(info["causes"][30:, :2] - truth)
+        inside.append(gap <= 3.0 * info["causes_std"][30:, :2] + 1e-3)
+    assert np.mean(inside) > 0.95
+
+
+def test_wind_is_estimated_if_it_is_not_measured():
+    """A force of 0.5 is a wind of √0.5 of the largest; e is not read."""
+    info, _ = drive(force=0.5, estimate_env=True)
+    wind = info["env_estimate"][-20:, 1]
+    np.testing.assert_allclose(wind, np.sqrt(0.5) * ENV_HIGH[1], atol=0.8)
+
+
+@pytest.mark.parametrize("fault", [jump, freeze, lose, overflow])
+def test_a_sensor_fault_is_not_learned_as_a_cause(fault):
+    """At the fault the causes move by less than a tenth of what was learned."""
+    settings = {"force": 0.5, "steering": 0.01, "noise": 1.0, "shrinkage": 0.0}
+    info, belief = drive(fault=fault, **settings)
+    assert info["rejected"][60]
+    change = np.abs(np.diff(info["causes"][58:66, :2], axis=0)).max(axis=0)
+    usual = np.abs(np.diff(info["causes"][30:58, :2], axis=0)).max(axis=0)
+    assert np.all(change <= np.maximum(2.0 * usual, [0.05, 0.001]))
+    assert all(np.isfinite(leaf).all() for leaf in jax.tree.leaves(belief.bank))
+
+
+def test_a_few_lost_measurements_are_bridged_by_the_estimate_and_reported():
+    info, _ = drive(fault=lose, noise=1.0)
+    assert np.isfinite(info["seen"][60:64]).all()
+    assert not info["healthy"][60:64].any()
+    assert info["healthy"][64:].all()
+
+
+def test_hostile_measurements_leave_finite_bounded_estimates():
+    info, belief = drive(fault=hostile, force=0.5, noise=1.0)
+    assert all(np.isfinite(leaf).all() for leaf in jax.tree.leaves(belief.bank))
+    largest = [control.wrappers._adaptation.BOUNDS[k] for k in range(5)]
+    assert np.all(np.abs(info["causes"]) <= largest)
+    diagonals = np.diagonal(belief.bank.covariances, axis1=-2, axis2=-1)
+    assert diagonals.min() >= 0.0
+    np.testing.assert_allclose(belief.bank.probabilities.sum(axis=-1), 1.0, atol=1e-4)
+
+
+def test_causes_that_predict_worse_than_none_are_not_used():
+    """The scores of the last seconds decide."""
+    controller = adaptive()
+    state = controller.init(jax.random.key(0))
+    belief = state.belief._replace(
+        scores=jnp.asarray([2.0, 1.0]), started=jnp.asarray(True)
+    )
+    act = jit(controller.act)
+    inputs = jnp.asarray([0.0, 0.0, 0.0, 10.0]), jnp.asarray([0.7, 0.0]), road(0.0)
+    _, _, info = act({}, state._replace(belief=belief), *inputs)
+    assert not info["adapting"]
+    np.testing.assert_array_equal(info["causes"], 0.0)
+
+
+def test_a_force_beyond_the_box_is_balanced_without_a_lateral_error():
+    """At the fixed point of the linearised loop with d and its steering, e_y = 0."""
+    env, turn = jnp.asarray([0.7, 8.0]), jnp.asarray([0.0, 10.0])
+    xi = LAW.turn(turn[0], turn[1], env).state.at[2].set(10.0)
+    compensate = jit(partial(disturbances.compensation, LOOP))
+    offset = compensate({}, env, turn, xi, jnp.asarray(0.3))
+    assert abs(float(offset.inputs[0])) > 1e-3
+    shifted = with_offset(MODEL)
+
+    @jit
+    def settle(inputs):
+        fiber = shifted.fiber(offset._replace(inputs=inputs), env)
+        plain = MODEL.fiber({}, env)
+        w = jnp.concatenate([jnp.zeros(2), turn])
+
+        def both(states, _):
+            first = shifted.step(fiber, states[0], w)
+            return (first, MODEL.step(plain, states[1], w)), None
+
+        start = path_state(xi)
+        (pushed, alone), _ = jax.lax.scan(both, (start, start), length=300)
+        return (pushed - alone)[BODY][0]
+
+    unbalanced = abs(float(settle(jnp.zeros(4))))
+    assert abs(float(settle(offset.inputs))) < 0.1 * unbalanced
+
+
+def test_the_belief_can_be_saved_and_resumed():
+    _, belief = drive(force=0.5)
+    last = jax.tree.map(lambda leaf: jnp.asarray(leaf[-1]), belief)
+    controller = adaptive()
+    fresh = controller.init(jax.random.key(0))._replace(belief=last)
+    coordinates = last.bank.mean()[:3]
+    seen = jnp.concatenate([jnp.asarray([120.0]), coordinates])
+    _, _, info = jit(controller.act)(
+        {}, fresh, seen, jnp.asarray([0.7, 0.0]), road(120.0)
+    )
+    np.testing.assert_allclose(info["causes"][0], 0.5, atol=0.15)
+
+
+@pytest.mark.parametrize(
+    ("change", "word"),
+    [
+        ({"env_low": (0.3, -7.0)}, "wind"),
+        ({"env_low": (0.3,)}, "wind"),
+        ({"sensor_noise": (0.1,)}, "sensor_noise"),
+        ({"model_error": (0.0, 0.1, 0.1)}, "model_error"),
+        ({"patience": 0}, "patience"),
+    ],
+)
+def test_invalid_settings_are_refused_by_name(change, word):
+    with pytest.raises(ValueError, match=word):
+        control.adaptive(law_alone(), MODEL, LAW, **SETTINGS | change)
+
+
+def test_a_model_in_the_world_is_refused():
+    world = models.physics(PLANT.step)
+    with pytest.raises(ValueError, match="path coordinates"):
+        control.adaptive(law_alone(), world, LAW, **SETTINGS)

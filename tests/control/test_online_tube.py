@@ -1,0 +1,120 @@
+"""The tube that is calibrated while driving: coverage under an adversary, and speed."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from helpers import jit, straight
+
+from sfkd_jax import control
+from sfkd_jax.types import Controller
+
+HORIZON, STEPS, LEVEL, RATE = 5, 600, 0.9, 0.2
+
+
+def straight_plan():
+    """A planner that predicts the reference itself and reports its speed."""
+
+    def act(params, state, observation, env, reference):
+        info = {"predicted_states": reference, "asked": reference[-1, 3]}
+        return jnp.zeros(2), state, info
+
+    return Controller(lambda key: jnp.zeros(()), act)
+
+
+def follow(laterals, **settings):
+    """Infos while the car is at the given distances left of a straight path."""
+    options = {"horizon": HORIZON, "level": LEVEL, "rate": RATE} | settings
+    controller = control.online_tube(straight_plan(), **options)
+    reference = jnp.asarray(straight(HORIZON))
+
+    def step(state, lateral):
+        seen = jnp.stack([jnp.zeros(()), lateral, jnp.zeros(()), jnp.asarray(10.0)])
+        _, state, info = controller.act({}, state, seen, jnp.zeros(2), reference)
+        return state, info
+
+    @jit
+    def run(laterals):
+        start = controller.init(jax.random.key(0))
+        return jax.lax.scan(step, start, laterals)[1]
+
+    return jax.tree.map(np.asarray, run(jnp.asarray(laterals, dtype=float)))
+
+
+RANDOM = np.random.default_rng(0)
+ADVERSARIES = {
+    "noise": 0.02 * RANDOM.normal(size=STEPS),
+    "growing": 0.01 * np.exp(np.linspace(0.0, 5.0, STEPS)),
+    "shift": np.where(np.arange(STEPS) < 300, 0.005, 0.5),
+    "heavy": 0.01 * RANDOM.standard_cauchy(size=STEPS),
+    "alternating": np.where(np.arange(STEPS) % 7 == 0, 1.0, 1e-3),
+}
+
+
+@pytest.mark.parametrize("name", ADVERSARIES)
+def test_the_share_of_misses_is_bounded_by_the_change_of_the_radius(name):
+    """|misses / N − (1 − level)| ≤ |log(r_N / r_0)| / (γ N), for every horizon."""
+    info = follow(ADVERSARIES[name])
+    start = control.online_tube(straight_plan(), horizon=HORIZON).init(
+        jax.random.key(0)
+    )
+    compared = np.isfinite(info["tube_errors"])
+    for h in range(HORIZON):
+        count = compared[:, h].sum()
+        assert count == STEPS - h - 1
+        share = info["tube_missed"][compared[:, h], h].mean()
+        change = np.log(info["tube"][-1, h] / float(start.radii[h]))
+        bound = abs(change) / (RATE * count)
+        assert abs(share - (1.0 - LEVEL)) <= bound + 1e-3
+
+
+def test_a_quiet_drive_keeps_its_level_and_a_tube_of_its_quantile():
+    info = follow(ADVERSARIES["noise"])
+    assert abs(info["tube_missed"][100:].mean() - (1.0 - LEVEL)) < 0.02
+    quantile = np.quantile(np.abs(ADVERSARIES["noise"]), LEVEL)
+    assert 0.8 < np.median(info["tube"][200:]) / quantile < 1.25
+
+
+def test_the_speed_falls_until_the_corridor_fits_and_rises_again():
+    errors = np.where(np.arange(STEPS) < 200, 0.3, 0.0)
+    info = follow(errors, lane=0.2, slowest=0.7, fall=0.01)
+    assert info["speed_factor"].min() == pytest.approx(0.7)
+    assert info["speed_factor"][-1] > info["speed_factor"].min()
+    assert np.all(np.diff(info["speed_factor"]) >= -0.01 - 1e-6)
+    slowed = info["asked"] < 10.0
+    np.testing.assert_allclose(
+        info["asked"][1:], 10.0 * info["speed_factor"][:-1], rtol=1e-5
+    )
+    assert slowed.any()
+
+
+def test_without_a_lane_the_reference_passes_unchanged():
+    info = follow(ADVERSARIES["shift"])
+    np.testing.assert_array_equal(info["speed_factor"], 1.0)
+    np.testing.assert_array_equal(info["asked"], 10.0)
+
+
+def test_measurements_that_are_not_finite_change_no_radius():
+    laterals = ADVERSARIES["noise"].copy()
+    laterals[100:110] = np.nan
+    info = follow(laterals, lane=0.5)
+    np.testing.assert_array_equal(
+        info["tube"][100:110], np.tile(info["tube"][99], (10, 1))
+    )
+    assert np.isfinite(info["tube"]).all()
+    np.testing.assert_array_equal(info["speed_factor"], 1.0)
+
+
+@pytest.mark.parametrize(
+    ("change", "word"),
+    [
+        ({"level": 1.0}, "level"),
+        ({"rate": 0.0}, "rate"),
+        ({"start_radius": 0.0}, "start_radius"),
+        ({"lane": -1.0}, "lane"),
+        ({"slowest": 0.0}, "slowest"),
+    ],
+)
+def test_invalid_settings_are_refused_by_name(change, word):
+    with pytest.raises(ValueError, match=word):
+        control.online_tube(straight_plan(), horizon=HORIZON, **change)
