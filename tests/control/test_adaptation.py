@@ -12,6 +12,7 @@ from sfkd_jax import build, certification, control, models, vehicle
 from sfkd_jax.certification._exported import exported
 from sfkd_jax.control.wrappers import _disturbances as disturbances
 from sfkd_jax.control.wrappers import _kalman as kalman
+from sfkd_jax.control.wrappers._adaptation import BOUNDS
 from sfkd_jax.core.offsets import Offset, with_offset
 from sfkd_jax.core.path_frame import path_state
 from sfkd_jax.types import BODY, Controller
@@ -269,7 +270,7 @@ def test_a_few_lost_measurements_are_bridged_by_the_estimate_and_reported():
 def test_hostile_measurements_leave_finite_bounded_estimates():
     info, belief = drive(fault=hostile, force=0.5, noise=1.0)
     assert all(np.isfinite(leaf).all() for leaf in jax.tree.leaves(belief.bank))
-    largest = [control.wrappers._adaptation.BOUNDS[k] for k in range(5)]
+    largest = [BOUNDS[k] for k in range(5)]
     assert np.all(np.abs(info["causes"]) <= largest)
     diagonals = np.diagonal(belief.bank.covariances, axis1=-2, axis2=-1)
     assert diagonals.min() >= 0.0

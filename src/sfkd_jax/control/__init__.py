@@ -55,8 +55,8 @@ from sfkd_jax.control.tasks._task import StepResult as StepResult
 from sfkd_jax.control.tasks._task import Task as Task
 from sfkd_jax.control.tasks._task import actuator_limits as actuator_limits
 from sfkd_jax.control.tasks._task import free_task as free_task
-from sfkd_jax.control.wrappers._adaptation import AdaptiveState as AdaptiveState
 from sfkd_jax.control.wrappers._adaptation import adaptive as adaptive
+from sfkd_jax.control.wrappers._adaptive_step import AdaptiveState as AdaptiveState
 from sfkd_jax.control.wrappers._delay import DelayState as DelayState
 from sfkd_jax.control.wrappers._delay import delay_compensated as delay_compensated
 from sfkd_jax.control.wrappers._estimation import EstimatorState as EstimatorState

@@ -31,7 +31,7 @@ from sfkd_jax.core.path_frame import (
     circle_errors,
     path_state,
 )
-from sfkd_jax.core.se2 import between, wrap_angle
+from sfkd_jax.core.se2 import between, compose, wrap_angle
 from sfkd_jax.types import (
     BODY,
     POSE,
@@ -110,6 +110,21 @@ def path_coordinates(
     """
     lateral, heading = circle_errors(between(point[POSE], state[POSE]), curvature)
     return jnp.concatenate([jnp.stack([lateral, heading]), state[BODY]])
+
+
+def world_state(coordinates: PathState, reference: Reference) -> State:
+    """Return the state at path coordinates beside the present point of a reference.
+
+    That point is one step back from the first one, along the circle through the first
+    two: the point where the vehicle should be now.
+
+    Args:
+        coordinates: ξ.
+        reference: poses and speeds from the next step on.
+    """
+    now = compose(reference[0, POSE], between(reference[1, POSE], reference[0, POSE]))
+    beside = jnp.stack([jnp.zeros(()), coordinates[LATERAL], coordinates[HEADING]])
+    return jnp.concatenate([compose(now, beside), coordinates[PATH_SPEED:]])
 
 
 def following_law(

@@ -3,15 +3,13 @@
 from __future__ import annotations
 
 from functools import partial
-from typing import Annotated, Any, NamedTuple
+from typing import Annotated
 
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Float
 
 from sfkd_jax.control.laws._path_law import PathLaw
-from sfkd_jax.control.planners._plans import all_finite
-from sfkd_jax.control.tasks._along_path import curvature_ahead, path_coordinates
+from sfkd_jax.control.wrappers._adaptive_step import AdaptiveSettings, act, initial
 from sfkd_jax.control.wrappers._disturbances import (
     CAUSES,
     DRIVE,
@@ -21,66 +19,21 @@ from sfkd_jax.control.wrappers._disturbances import (
     TURN_FORCE,
     TURN_STEERING,
     WIND,
-    Applied,
     Loop,
-    compensation,
-    input_error,
-    side_force,
-    split_force,
 )
-from sfkd_jax.control.wrappers._estimator import Belief, Estimator, Measured, follow
+from sfkd_jax.control.wrappers._estimator import (
+    Estimator,
+)
 from sfkd_jax.control.wrappers._kalman import Bank
 from sfkd_jax.control.wrappers._multiple_models import transition_matrix
-from sfkd_jax.core.folding import fold
-from sfkd_jax.core.path_frame import HEADING, LATERAL
 from sfkd_jax.core.ranges import AtLeastTwo, Fraction, Interval, Positive
-from sfkd_jax.core.se2 import between, compose
 from sfkd_jax.types import (
-    POSE,
-    Control,
     Controller,
-    ControllerInfo,
-    Environment,
-    Key,
     Model,
-    Params,
-    Reference,
-    State,
 )
 
 BOUNDS = {FORCE: 4.0, STEERING: 0.1, DRIVE: 3.0, TURN_STEERING: 0.1, TURN_FORCE: 4.0}
 """Largest causes that are believed: four times the side force of E, 6° of steering."""
-
-TOLERANCE = 1.1
-"""The estimates are not used while their squared prediction errors exceed those of the
-model alone by more than this factor.
-"""
-
-
-class AdaptiveState(NamedTuple):
-    """What the adaptation carries from one control step to the next.
-
-    Attributes:
-        inner: state of the wrapped controller.
-        belief: of the estimator; the part to save and resume.
-    """
-
-    inner: Any
-    belief: Belief
-
-
-class _Settings(NamedTuple):
-    """Settings of `adaptive` as its functions need them."""
-
-    controller: Controller
-    loop: Loop
-    estimator: Estimator
-    control_low: Control
-    control_high: Control
-    initial: Bank
-    estimated: bool
-    shrinkage: float
-    patience: int
 
 
 def adaptive(
@@ -192,7 +145,7 @@ def adaptive(
     prior = jnp.asarray([*noise, 1.0 if estimate_env else 0.1, *slow_prior]) ** 2
     loop = Loop(model, law, low, high)
     count = 2 * points
-    settings = _Settings(
+    settings = AdaptiveSettings(
         controller=controller,
         loop=loop,
         estimator=Estimator(
@@ -214,116 +167,7 @@ def adaptive(
         shrinkage=0.0 if estimate_env else shrinkage,
         patience=patience,
     )
-    return Controller(partial(_init, settings), partial(_act, settings))
-
-
-def _init(settings: _Settings, key: Key) -> AdaptiveState:
-    """The state before the first control step."""
-    states = 1 + settings.estimator.sensors.shape[0]
-    unknown = jnp.full(2, jnp.nan, dtype=float)
-    return AdaptiveState(
-        inner=settings.controller.init(key),
-        belief=Belief(
-            bank=settings.initial,
-            applied=Applied(jnp.zeros(2), unknown, unknown),
-            observation=jnp.full(states, jnp.nan, dtype=float),
-            started=jnp.asarray(False),
-            missing=jnp.zeros((), dtype=jnp.int32),
-            scores=jnp.zeros(2),
-        ),
-    )
-
-
-def _act(
-    settings: _Settings,
-    params: Params,
-    state: AdaptiveState,
-    observation: State,
-    env: Environment,
-    reference: Reference,
-) -> tuple[Control, AdaptiveState, ControllerInfo]:
-    """One control step."""
-    loop, before = settings.loop, state.belief
-    params = fold(loop.model, params)
-    clean = all_finite((observation, reference))
-    clean &= settings.estimated | all_finite(env)
-    env = _known_environment(settings, before, env)
-    road = jnp.stack([curvature_ahead(reference)[0], reference[0, 3]])
-    coordinates = path_coordinates(observation, reference[0], road[0])
-    repeated = jnp.all(observation == before.observation)
-    usable = all_finite((observation, coordinates, env, reference)) & ~repeated
-    belief, rejected = follow(
-        settings.estimator, params, before, Measured(coordinates, usable)
-    )
-    adapting = belief.scores[0] <= TOLERANCE * belief.scores[1]
-    causes = jnp.where(adapting | settings.estimated, _causes(settings, belief), 0.0)
-
-    size = coordinates.shape[0]
-    if settings.estimated:
-        friction = belief.bank.probabilities @ settings.estimator.frictions
-        env = jnp.zeros_like(env).at[FRICTION].set(friction)
-    inside, excess = split_force(loop, env, side_force(causes, road))
-    estimate = belief.bank.mean()[:size]
-    offset = compensation(loop, params, inside, road, estimate, excess)
-    bridged = (belief.missing > 0) & (belief.missing <= settings.patience)
-    bridged &= belief.started & all_finite((estimate, reference))
-    seen = jnp.where(bridged, _in_world(estimate, reference), observation)
-    control, inner, info = settings.controller.act(
-        offset, state.inner, seen, inside, reference
-    )
-    control = control + offset.inputs[:2] - input_error(causes, road)
-    control = jnp.clip(control, settings.control_low, settings.control_high)
-
-    belief = belief._replace(
-        applied=_next_applied(before.applied, Applied(control, road, env)),
-        observation=observation,
-    )
-    report: ControllerInfo = {
-        **info,
-        "healthy": info["healthy"] & clean,
-        "env_estimate": inside,
-        "causes": causes,
-        "causes_std": jnp.sqrt(belief.bank.variance()[size:]),
-        "rejected": rejected,
-        "adapting": adapting,
-    }
-    return control, AdaptiveState(inner, belief), report
-
-
-def _known_environment(
-    settings: _Settings, belief: Belief, env: Environment
-) -> Environment:
-    """e in its box; where it is not finite, the last one; any if it is estimated."""
-    centre = 0.5 * (settings.loop.low + settings.loop.high)
-    if settings.estimated:
-        return centre
-    known = jnp.where(all_finite(env), env, belief.applied.env)
-    return jnp.clip(known, settings.loop.low, settings.loop.high)
-
-
-def _causes(settings: _Settings, belief: Belief) -> Float[Array, " cause"]:
-    """The estimated causes; a force that could be noise is shrunk."""
-    size = settings.estimator.sensors.shape[0]
-    causes, variance = belief.bank.mean()[size:], belief.bank.variance()[size:]
-    share = 1.0 - settings.shrinkage * variance[FORCE] / (causes[FORCE] ** 2 + 1e-9)
-    return causes.at[FORCE].multiply(jnp.maximum(share, 0.0))
-
-
-def _in_world(coordinates: Float[Array, " n"], reference: Reference) -> State:
-    """The state at path coordinates beside the point where the vehicle should be now.
-
-    That point is one step back along the circle through the first two reference points.
-    """
-    now = compose(reference[0, POSE], between(reference[1, POSE], reference[0, POSE]))
-    beside = jnp.stack([jnp.zeros(()), coordinates[LATERAL], coordinates[HEADING]])
-    return jnp.concatenate([compose(now, beside), coordinates[HEADING + 1 :]])
-
-
-def _next_applied(before: Applied, now: Applied) -> Applied:
-    """What acts over the next step; the last finite values where now is not finite."""
-    return jax.tree.map(
-        lambda new, old: jnp.where(jnp.isfinite(new), new, old), now, before
-    )
+    return Controller(partial(initial, settings), partial(act, settings))
 
 
 def _check(

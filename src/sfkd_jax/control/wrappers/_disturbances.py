@@ -203,7 +203,7 @@ def compensation(
     fiber = model.fiber(params, env)
     law_control = loop.law(coordinates, road[0], road[1], env)
     applied = Applied(law_control, road, env)
-    pushed = excess * force_slope(loop, params, applied, coordinates)
+    shifted = excess * force_slope(loop, params, applied, coordinates)
 
     def advance(xi: PathState, nu: Control) -> PathState:
         latent = model.encode(fiber, path_state(xi))
@@ -213,10 +213,10 @@ def compensation(
     A, B = jax.jacfwd(advance, (0, 1))(coordinates, jnp.zeros(2))
     equations = jnp.eye(size) - A
     equations = equations.at[:, LATERAL].set(-B[:, 0]).at[:, PATH_SPEED].set(-B[:, 1])
-    steering = jnp.linalg.solve(equations, pushed)[LATERAL]
+    steering = jnp.linalg.solve(equations, shifted)[LATERAL]
     most = 2.0 * loop.law.perturbation[0]
     steering = jnp.clip(jnp.nan_to_num(steering), -most, most)
-    moved = path_state(pushed)
+    moved = path_state(shifted)
     _, latent = jax.jvp(
         lambda state: model.encode(fiber, state), (path_state(coordinates),), (moved,)
     )

@@ -10,6 +10,7 @@ from jaxtyping import Array, Bool, Float, Int
 
 from sfkd_jax.control.planners._plans import all_finite
 from sfkd_jax.control.wrappers._disturbances import (
+    FORCE,
     FRICTION,
     Applied,
     Loop,
@@ -113,6 +114,31 @@ def follow(
         scores=jnp.where(learned & all_finite(scores), scores, belief.scores),
     )
     return belief, ~learned
+
+
+def believed_causes(
+    settings: Estimator, belief: Belief, shrinkage: float
+) -> Float[Array, " cause"]:
+    """Return the estimated causes; a force that could be noise is shrunk.
+
+    f̂ max(0, 1 − s var f / f̂²)
+
+    Args:
+        settings: of the estimator.
+        belief: after a measurement.
+        shrinkage: s.
+    """
+    size = settings.sensors.shape[0]
+    causes, variance = belief.bank.mean()[size:], belief.bank.variance()[size:]
+    share = 1.0 - shrinkage * variance[FORCE] / (causes[FORCE] ** 2 + 1e-9)
+    return causes.at[FORCE].multiply(jnp.maximum(share, 0.0))
+
+
+def applied_next(before: Applied, now: Applied) -> Applied:
+    """Return what acts over the next step; where it is not finite, what acted last."""
+    return jax.tree.map(
+        lambda new, old: jnp.where(jnp.isfinite(new), new, old), now, before
+    )
 
 
 def _advanced(settings: Estimator, params: Params, belief: Belief) -> Bank:

@@ -1,0 +1,162 @@
+"""One control step with estimates of unmeasured causes."""
+
+from __future__ import annotations
+
+from typing import Any, NamedTuple
+
+import jax.numpy as jnp
+
+from sfkd_jax.control.planners._plans import all_finite
+from sfkd_jax.control.tasks._along_path import (
+    curvature_ahead,
+    path_coordinates,
+    world_state,
+)
+from sfkd_jax.control.wrappers._disturbances import (
+    FRICTION,
+    Applied,
+    Loop,
+    compensation,
+    input_error,
+    side_force,
+    split_force,
+)
+from sfkd_jax.control.wrappers._estimator import (
+    Belief,
+    Estimator,
+    Measured,
+    applied_next,
+    believed_causes,
+    follow,
+)
+from sfkd_jax.control.wrappers._kalman import Bank
+from sfkd_jax.core.folding import fold
+from sfkd_jax.types import (
+    Control,
+    Controller,
+    ControllerInfo,
+    Environment,
+    Key,
+    Params,
+    Reference,
+    State,
+)
+
+TOLERANCE = 1.1
+"""The estimates are not used while their squared prediction errors exceed those of the
+model alone by more than this factor.
+"""
+
+
+class AdaptiveState(NamedTuple):
+    """What the adaptation carries from one control step to the next.
+
+    Attributes:
+        inner: state of the wrapped controller.
+        belief: of the estimator; the part to save and resume.
+    """
+
+    inner: Any
+    belief: Belief
+
+
+class AdaptiveSettings(NamedTuple):
+    """Settings of `adaptive` as its functions need them."""
+
+    controller: Controller
+    loop: Loop
+    estimator: Estimator
+    control_low: Control
+    control_high: Control
+    initial: Bank
+    estimated: bool
+    shrinkage: float
+    patience: int
+
+
+def initial(settings: AdaptiveSettings, key: Key) -> AdaptiveState:
+    """Return the state before the first control step."""
+    states = 1 + settings.estimator.sensors.shape[0]
+    unknown = jnp.full(2, jnp.nan, dtype=float)
+    return AdaptiveState(
+        inner=settings.controller.init(key),
+        belief=Belief(
+            bank=settings.initial,
+            applied=Applied(jnp.zeros(2), unknown, unknown),
+            observation=jnp.full(states, jnp.nan, dtype=float),
+            started=jnp.asarray(False),
+            missing=jnp.zeros((), dtype=jnp.int32),
+            scores=jnp.zeros(2),
+        ),
+    )
+
+
+def act(
+    settings: AdaptiveSettings,
+    params: Params,
+    state: AdaptiveState,
+    observation: State,
+    env: Environment,
+    reference: Reference,
+) -> tuple[Control, AdaptiveState, ControllerInfo]:
+    """Take one control step."""
+    loop, before = settings.loop, state.belief
+    params = fold(loop.model, params)
+    clean = all_finite((observation, reference))
+    clean &= settings.estimated | all_finite(env)
+    env = _known_environment(settings, before, env)
+    road = jnp.stack([curvature_ahead(reference)[0], reference[0, 3]])
+    coordinates = path_coordinates(observation, reference[0], road[0])
+    repeated = jnp.all(observation == before.observation)
+    usable = all_finite((observation, coordinates, env, reference)) & ~repeated
+    belief, rejected = follow(
+        settings.estimator, params, before, Measured(coordinates, usable)
+    )
+    adapting = belief.scores[0] <= TOLERANCE * belief.scores[1]
+    causes = jnp.where(
+        adapting | settings.estimated,
+        believed_causes(settings.estimator, belief, settings.shrinkage),
+        0.0,
+    )
+
+    size = coordinates.shape[0]
+    if settings.estimated:
+        friction = belief.bank.probabilities @ settings.estimator.frictions
+        env = jnp.zeros_like(env).at[FRICTION].set(friction)
+    inside, excess = split_force(loop, env, side_force(causes, road))
+    estimate = belief.bank.mean()[:size]
+    offset = compensation(loop, params, inside, road, estimate, excess)
+    bridged = (belief.missing > 0) & (belief.missing <= settings.patience)
+    bridged &= belief.started & all_finite((estimate, reference))
+    seen = jnp.where(bridged, world_state(estimate, reference), observation)
+    control, inner, info = settings.controller.act(
+        offset, state.inner, seen, inside, reference
+    )
+    control = control + offset.inputs[:2] - input_error(causes, road)
+    control = jnp.clip(control, settings.control_low, settings.control_high)
+
+    belief = belief._replace(
+        applied=applied_next(before.applied, Applied(control, road, env)),
+        observation=observation,
+    )
+    report: ControllerInfo = {
+        **info,
+        "healthy": info["healthy"] & clean,
+        "env_estimate": inside,
+        "causes": causes,
+        "causes_std": jnp.sqrt(belief.bank.variance()[size:]),
+        "rejected": rejected,
+        "adapting": adapting,
+    }
+    return control, AdaptiveState(inner, belief), report
+
+
+def _known_environment(
+    settings: AdaptiveSettings, belief: Belief, env: Environment
+) -> Environment:
+    """e in its box; where it is not finite, the last one; any if it is estimated."""
+    centre = 0.5 * (settings.loop.low + settings.loop.high)
+    if settings.estimated:
+        return centre
+    known = jnp.where(all_finite(env), env, belief.applied.env)
+    return jnp.clip(known, settings.loop.low, settings.loop.high)
