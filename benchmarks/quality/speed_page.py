@@ -10,7 +10,7 @@ from sfkd_jax.corridor import fastest_speeds
 from sfkd_jax.paper import draw_speed
 
 HOME = Path(__file__).resolve().parents[2]
-MEASURED = HOME / "benchmarks" / "speed.json"
+MEASURED = HOME / "benchmarks" / "quality" / "speed.json"
 PAGE, FIGURE = HOME / "docs" / "corridor.md", HOME / "docs" / "corridor_speed.png"
 OPEN, CLOSE = "<!-- speed -->\n", "<!-- end of speed -->"
 CLEARANCES = (0.1, 0.15, 0.2, 0.3)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import Any, NamedTuple
 
 import jax
@@ -27,6 +28,7 @@ class Episode(NamedTuple):
             (time, environment).
         breach: of a monitor's bounds, False without a monitor, (time,).
         box_exit: whether a monitor saw its domain left, (time,).
+        report: what `simulate` was asked to record besides, (time, …); () for nothing.
     """
 
     states: Float[Array, "time_plus_1 state"]
@@ -39,6 +41,7 @@ class Episode(NamedTuple):
     assumed_envs: Float[Array, "time environment"]
     breach: Array
     box_exit: Array
+    report: Any = ()
 
 
 def simulate(
@@ -51,6 +54,7 @@ def simulate(
     dt: float,
     horizon: int,
     observation_noise: tuple[float, ...] = (),
+    report: Callable[[ControllerInfo], Any] | None = None,
 ) -> Episode:
     """Simulate one episode.
 
@@ -68,6 +72,7 @@ def simulate(
         horizon: length of the reference window.
         observation_noise: standard deviation per state, entries beyond the state are
             not used; () for none.
+        report: of the controller's info, what else to record of every step.
     """
     planner_key, noise_key = jax.random.split(key)
     spread = _noise_levels(observation_noise, scenario.initial_state)
@@ -95,6 +100,7 @@ def simulate(
             lateral,
             progress,
             *_record(info, state, observed_env),
+            () if report is None else report(info),
         )
         return (state, progress, memory), record
 

@@ -119,10 +119,9 @@ def adaptive(
 
     Returns:
         A `Controller`; `info` gains `env_estimate` (the e planned with), `causes` (5,),
-        `causes_std` (5,), `rejected` (nothing was learned from the
-        measurement) and `adapting` (over
-        the last seconds the estimates did not predict worse than the model alone;
-        otherwise they are not used).
+        `causes_std` (5,), `rejected` (nothing was learned from the measurement) and
+        `adapting` (over the last seconds the estimates did not predict worse than the
+        model alone; otherwise they are not used).
 
     Raises:
         ValueError: a setting is out of its range or has the wrong number of entries.

@@ -132,7 +132,8 @@ def act(
     control, inner, info = settings.controller.act(
         offset, state.inner, seen, inside, reference
     )
-    control = control + offset.inputs[:2] - input_error(causes, road)
+    correction = offset.inputs[:2] - input_error(causes, road)
+    control = control + jnp.where(jnp.isfinite(correction), correction, 0.0)
     control = jnp.clip(control, settings.control_low, settings.control_high)
 
     belief = belief._replace(

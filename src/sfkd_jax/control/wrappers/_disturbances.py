@@ -220,4 +220,5 @@ def compensation(
     _, latent = jax.jvp(
         lambda state: model.encode(fiber, state), (path_state(coordinates),), (moved,)
     )
+    latent = jax.tree.map(lambda leaf: jnp.where(jnp.isfinite(leaf), leaf, 0.0), latent)
     return Offset(params, jnp.zeros(4).at[0].set(steering), latent)
