@@ -205,9 +205,7 @@ def summary(episodes):
         "rmse_mm": 1e3 * float(np.mean(rmse)),
         "rmse_episodes_mm": (1e3 * rmse).tolist(),
         "largest_mm": 1e3 * float(np.abs(lateral).max()),
-        "speed_m_per_s": float(
-            np.mean(episodes.states[..., BODY][..., PATH_SPEED - 2])
-        ),
+        "speed_m_per_s": float(np.mean(episodes.states[..., SPEED])),
     }
     if len(episodes.report):
         missed, known, radius = (np.asarray(part) for part in episodes.report)

@@ -57,9 +57,9 @@ def test_an_episode_has_the_documented_shapes():
     assert one.states.shape == (STEPS + 1, 4)
     assert one.controls.shape == (STEPS, 2)
     assert one.assumed_envs.shape == (STEPS, 2)
-    assert all(
-        leaf.shape == (STEPS,) for leaf in one._replace(assumed_envs=one.lateral)[2:]
-    )
+    assert one.report == ()
+    per_step = one._replace(assumed_envs=one.lateral, report=one.lateral)[2:]
+    assert all(leaf.shape == (STEPS,) for leaf in per_step)
 
 
 def test_the_states_of_an_episode_are_the_plants():
