@@ -6,7 +6,7 @@ from typing import Any
 
 from sfkd_jax import control, vehicle
 from sfkd_jax.build._choices import Settings, as_kwargs, floats
-from sfkd_jax.build._planners import chosen_planner
+from sfkd_jax.build._planners import chosen_planner, controller_horizon
 from sfkd_jax.core.offsets import with_offset
 from sfkd_jax.core.path_frame import LATERAL
 from sfkd_jax.types import Controller, Model
@@ -46,7 +46,9 @@ def build_controller(
         env_source: one of `ENV_SOURCES`; "estimated" adds an estimator.
         law: that a model in path coordinates was learned around.
         adaptive: whether a controller along a path estimates unmeasured forces and
-            errors of its inputs while driving; with "estimated" it always does.
+            errors of its inputs while driving, and slows down while its online tube
+            does not fit the lane, even if the settings do not say so; with "estimated"
+            it always does.
 
     Raises:
         ValueError: an unknown planner, a vehicle without limits of its controls, a
@@ -64,7 +66,7 @@ def build_controller(
             raise ValueError(
                 "a model in path coordinates needs controller.sampling=law and its law"
             )
-        adaptive |= env_source == "estimated"
+        adaptive |= settings.get("adaptive", False) or env_source == "estimated"
         planned = with_offset(model) if adaptive else model
         planner = build(settings, planned, plant, env_low, env_high, law)
         if certificate and certificate.get("corridor") and settings.get("shield"):
@@ -72,8 +74,8 @@ def build_controller(
         if not adaptive:
             return planner
         box = env_low, env_high
-        return _adaptive(planner, model, plant, law, box, env_source)
-    if adaptive:
+        return _adaptive(planner, settings, model, plant, law, box, env_source)
+    if adaptive or settings.get("adaptive"):
         raise ValueError("adaptation needs a model in path coordinates")
     planner = build(settings, model, plant, env_low, env_high)
     watched = (
@@ -154,6 +156,7 @@ def _monitored(
 
 def _adaptive(
     planner: Controller,
+    settings: Settings,
     model: Model,
     plant: vehicle.Vehicle,
     law: control.PathLaw,
@@ -162,7 +165,7 @@ def _adaptive(
 ) -> Controller:
     if box[0] is None or box[1] is None:
         raise ValueError("adaptation needs env_low and env_high")
-    return control.adaptive(
+    adaptive = control.adaptive(
         planner,
         model,
         law,
@@ -172,6 +175,12 @@ def _adaptive(
         env_low=tuple(box[0]),
         env_high=tuple(box[1]),
         estimate_env=env_source == "estimated",
+        **as_kwargs(settings.get("adaptation", {})),
+    )
+    return control.online_tube(
+        adaptive,
+        horizon=controller_horizon(settings),
+        **as_kwargs(settings.get("online_tube", {})),
     )
 
 

@@ -131,6 +131,16 @@ def _controllers() -> dict[str, type]:
             skip=(*_BY_PLANT, "bounds", "state_low", "state_high"),
         ),
     }
+    along_path = {
+        "adaptation": schema(
+            "AdaptationConfig",
+            control.adaptive,
+            skip=(*_BY_PLANT, "coordinates", "estimate_env"),
+        ),
+        "online_tube": schema(
+            "OnlineTubeConfig", control.online_tube, skip=("horizon",)
+        ),
+    }
     wrappers["cost"] = schema("CostConfig", control.tracking_cost, skip=_BY_PLANT)
     nodes = {}
     for name, planner in build.PLANNERS.items():
@@ -143,7 +153,8 @@ def _controllers() -> dict[str, type]:
         parts: dict[str, Any] = wrappers | {name: own, "task": _task(planner.samples)}
         sources: tuple[Any, ...] = (settings.Chosen,)
         if planner.samples:
-            sources, parts = (settings.Chosen, settings.Sampling), parts | _laws()
+            sources = (settings.Chosen, settings.Sampling)
+            parts |= _laws() | along_path
         nodes[f"{name}_schema"] = schema("ControllerConfig", *sources, **parts)
     return nodes
 

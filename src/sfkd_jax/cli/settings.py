@@ -162,3 +162,4 @@ class Sampling(NamedTuple):
 
     ancillary: bool = False
     shield: bool = False
+    adaptive: bool = False

@@ -8,13 +8,13 @@ from typing import Annotated, Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Float
+from jaxtyping import Array, Bool, Float
 
 from sfkd_jax.control.planners._plans import all_finite
 from sfkd_jax.control.tasks._along_path import curvature_ahead, path_coordinates
 from sfkd_jax.control.wrappers._slow import slow_down
 from sfkd_jax.core.path_frame import LATERAL
-from sfkd_jax.core.ranges import Fraction, Interval, Positive, PositiveFraction
+from sfkd_jax.core.ranges import Fraction, Interval, Positive
 from sfkd_jax.types import (
     Control,
     Controller,
@@ -29,6 +29,8 @@ from sfkd_jax.types import (
 
 RADIUS_RANGE = (1e-3, 1e2)
 """Least and largest radius [m]."""
+GRIP_SHARE = 0.8
+"""Share of the grip that a turn must ask for to prove it."""
 
 
 class OnlineTubeState(NamedTuple):
@@ -38,13 +40,17 @@ class OnlineTubeState(NamedTuple):
         inner: state of the wrapped controller.
         plans: e_y that the last plans predicted, newest first [m]; NaN before.
         radii: r_h of the tube [m].
-        speed_factor: of the reference speed.
+        corridor_factor: of the reference speed, at which the corridor fits the lane.
+        speed_factor: of the reference speed that is followed.
+        grip: lateral acceleration at which the corridor fitted the lane [m/s²].
     """
 
     inner: Any
     plans: Float[Array, "horizon horizon"]
     radii: Float[Array, " horizon"]
+    corridor_factor: Scalar
     speed_factor: Scalar
+    grip: Scalar
 
 
 class _Settings(NamedTuple):
@@ -58,6 +64,7 @@ class _Settings(NamedTuple):
     lane: float
     slowest: float
     fall: float
+    grip: float
 
 
 def online_tube(
@@ -67,9 +74,10 @@ def online_tube(
     level: Fraction = 0.95,
     rate: Positive = 0.2,
     start_radius: Positive = 0.03,
-    lane: Annotated[float, Interval("(0, inf]")] = math.inf,
-    slowest: PositiveFraction = 0.8,
-    fall: Fraction = 0.005,
+    lane: Annotated[float, Interval("(0, inf]")] = 0.1,
+    slowest: Positive = 8.0,
+    fall: Fraction = 0.01,
+    grip: Annotated[float, Interval("(0, inf]")] = math.inf,
 ) -> Controller:
     """Wrap a controller with a tube around its plans, and slow down until it fits.
 
@@ -87,20 +95,30 @@ def online_tube(
     corridor fits in a share `level` of the steps. Both are gentle: hard braking would
     take the grip that the tyres need to stay on the path.
 
+    With a finite `grip`, a turn ahead is taken at a lateral acceleration at which the
+    corridor has fitted before, whatever friction is measured. Nothing but a turn shows
+    how much grip there is, and then it is too late to brake:
+
+        c ≤ √(a / max_h v_h² |κ_h|)
+
+    a rises while the corridor fits at 80 % of it, and falls while it does not.
+
     Args:
         controller: any planner of a path; its `info` has `predicted_states`.
         horizon: number of predicted steps.
         level: of the coverage.
         rate: γ.
         start_radius: r_h at the start [m].
-        lane: largest |e_y| that is acceptable [m].
-        slowest: least factor of the reference speed.
+        lane: largest |e_y| that is acceptable [m]; inf for a tube that only reports.
+        slowest: least speed that the corridor can ask for [m/s]: a model is of little
+            use below the speeds that it was learned at.
         fall: of the factor per step, while the corridor exceeds the lane.
+        grip: a at the start [m/s²]; inf where friction is trusted.
 
     Returns:
         A `Controller`; `info` gains `tube` (horizon,) [m], `tube_errors` (horizon,) [m]
         (NaN without a plan to compare with), `tube_missed` (horizon,),
-        `online_corridor` [m] and `speed_factor`.
+        `online_corridor` [m], `speed_factor` and `grip` [m/s²].
 
     Raises:
         ValueError: a setting is out of its range.
@@ -108,9 +126,9 @@ def online_tube(
     Source: Gibbs and Candès (2021), Adaptive Conformal Inference Under Distribution
     Shift.
     """
-    _check(level, rate, start_radius, lane, slowest)
+    _check(level, rate, start_radius, lane, slowest, grip)
     settings = _Settings(
-        controller, horizon, level, rate, start_radius, lane, slowest, fall
+        controller, horizon, level, rate, start_radius, lane, slowest, fall, grip
     )
     return Controller(partial(_init, settings), partial(_act, settings))
 
@@ -122,7 +140,9 @@ def _init(settings: _Settings, key: Key) -> OnlineTubeState:
         inner=settings.controller.init(key),
         plans=jnp.full((horizon, horizon), jnp.nan, dtype=float),
         radii=jnp.full(horizon, settings.start_radius, dtype=float),
+        corridor_factor=jnp.ones(()),
         speed_factor=jnp.ones(()),
+        grip=jnp.asarray(settings.grip, dtype=float),
     )
 
 
@@ -148,14 +168,15 @@ def _act(
     )
     plan = _lateral(info["predicted_states"], target)
     corridor = jnp.max(jnp.abs(plan) + radii)
-    rise = settings.fall * (1.0 - settings.level) / settings.level
-    change = jnp.where(corridor > settings.lane, -settings.fall, rise)
-    factor = jnp.clip(state.speed_factor + change, settings.slowest, 1.0)
+    fits = corridor <= settings.lane
+    corridor_factor, grip, factor = _speeds(settings, state, reference, fits)
     after = OnlineTubeState(
         inner=inner,
         plans=jnp.concatenate([plan[None], state.plans[:-1]]),
         radii=radii,
+        corridor_factor=corridor_factor,
         speed_factor=factor,
+        grip=grip,
     )
     report: ControllerInfo = {
         **info,
@@ -164,8 +185,33 @@ def _act(
         "tube_missed": missed,
         "online_corridor": corridor,
         "speed_factor": factor,
+        "grip": grip,
     }
     return control, after, report
+
+
+def _speeds(
+    settings: _Settings,
+    state: OnlineTubeState,
+    reference: Reference,
+    fits: Bool[Array, ""],
+) -> tuple[Scalar, Scalar, Scalar]:
+    """The next corridor_factor, grip and speed_factor."""
+    rise = settings.fall * (1.0 - settings.level) / settings.level
+    change = jnp.where(fits, rise, -settings.fall)
+    least = jnp.clip(settings.slowest / reference[0, 3], 0.0, 1.0)
+    corridor_factor = jnp.clip(state.corridor_factor + change, least, 1.0)
+
+    ahead = reference[:, 3] ** 2 * jnp.abs(curvature_ahead(reference))
+    now = state.speed_factor**2 * ahead[0]
+    proved = jnp.where(now > GRIP_SHARE * state.grip, 1.0 + settings.fall, 1.0)
+    grip = state.grip * jnp.where(fits, proved, 1.0 - settings.fall)
+    cap = jnp.sqrt(grip / jnp.maximum(jnp.max(ahead), 1e-6))
+    cap = jnp.maximum(jnp.where(jnp.isfinite(cap), cap, 1.0), least)
+    factor = jnp.minimum(corridor_factor, cap)
+    before = state.speed_factor
+    factor = jnp.clip(factor, before - settings.fall, before + settings.fall)
+    return corridor_factor, grip, factor
 
 
 def _calibrated(
@@ -192,7 +238,12 @@ def _lateral(
 
 
 def _check(
-    level: float, rate: float, start_radius: float, lane: float, slowest: float
+    level: float,
+    rate: float,
+    start_radius: float,
+    lane: float,
+    slowest: float,
+    grip: float,
 ) -> None:
     """Raise a ValueError that names a setting out of its range."""
     if not 0 < level < 1 or not 0 < rate < math.inf:
@@ -204,5 +255,5 @@ def _check(
             f"start_radius must lie in {list(RADIUS_RANGE)} and lane be positive, "
             f"got {start_radius} and {lane}"
         )
-    if not 0 < slowest <= 1:
-        raise ValueError(f"slowest must lie in (0, 1], got {slowest}")
+    if not 0 < slowest < math.inf or not grip > 0:
+        raise ValueError(f"slowest and grip must be positive, got {slowest} and {grip}")
