@@ -98,18 +98,20 @@ def not_finite(state):
     return sum(jnp.sum(~jnp.isfinite(leaf)) for leaf in leaves)
 
 
-def controlled(plant, env_source, delay, samples):
+def controlled(plant, env_source, delay, samples, adaptive):
     """The shipped policy as a user has it: (vehicle, params, controller, sensor noise)."""
-    directory = SHIPPED / plant
+    directory = SHIPPED / (f"{plant}_path" if adaptive else plant)
     settings = sfkd_jax.load(directory).settings
     changes = {"monitor": {"fallback": "hold"}, "mppi": {"num_samples": samples}}
-    chosen = settings["controller"]
-    chosen = chosen | {name: chosen[name] | change for name, change in changes.items()}
+    chosen = settings["controller"] | {"adaptive": adaptive}
+    chosen |= {name: chosen[name] | change for name, change in changes.items()}
     policy = sfkd_jax.load(directory, controller=chosen, env_source=env_source)
     controller = policy.controller
     if delay:
         controller = control.delay_compensated(controller, policy.model, delay=delay)
-    noise = policy.certificate["monitor"]["sensor_noise"]
+    certificate = policy.certificate
+    where = certificate["corridor"]["class"] if adaptive else certificate["monitor"]
+    noise = where["sensor_noise"]
     return (
         build.build_vehicle(settings["vehicle"]),
         policy.params,
@@ -119,10 +121,19 @@ def controlled(plant, env_source, delay, samples):
 
 
 def track(
-    plant, *, env_source="measured", delay=0, samples=SAMPLES, faulty=True, steps=ROAD
+    plant,
+    *,
+    env_source="measured",
+    delay=0,
+    samples=SAMPLES,
+    faulty=True,
+    adaptive=False,
+    steps=ROAD,
 ):
     """The closed loop over roads of `steps` steps."""
-    car, params, controller, noise = controlled(plant, env_source, delay, samples)
+    car, params, controller, noise = controlled(
+        plant, env_source, delay, samples, adaptive
+    )
     size = len(car.state_names)
     spread = jnp.asarray(noise[:size])
     family = scenarios.scenario(

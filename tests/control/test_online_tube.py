@@ -24,11 +24,20 @@ def straight_plan():
     return Controller(lambda key: jnp.zeros(()), act)
 
 
-def follow(laterals, **settings):
-    """Infos while the car is at the given distances left of a straight path."""
+def circle(curvature, speed=10.0, dt=0.1):
+    """A reference along a circle."""
+    angle = curvature * speed * dt * np.arange(1, HORIZON + 1)
+    radius = 1.0 / curvature
+    x, y = radius * np.sin(angle), radius * (1.0 - np.cos(angle))
+    return np.stack([x, y, angle, np.full(HORIZON, speed)], axis=1)
+
+
+def follow(laterals, reference=None, **settings):
+    """Infos while the car is at the given distances left of a path."""
     options = {"horizon": HORIZON, "level": LEVEL, "rate": RATE} | settings
     controller = control.online_tube(straight_plan(), **options)
-    reference = jnp.asarray(straight(HORIZON))
+    reference = straight(HORIZON) if reference is None else reference
+    reference = jnp.asarray(reference, dtype=float)
 
     def step(state, lateral):
         seen = jnp.stack([jnp.zeros(()), lateral, jnp.zeros(()), jnp.asarray(10.0)])
@@ -79,7 +88,7 @@ def test_a_quiet_drive_keeps_its_level_and_a_tube_of_its_quantile():
 
 def test_the_speed_falls_until_the_corridor_fits_and_rises_again():
     errors = np.where(np.arange(STEPS) < 200, 0.3, 0.0)
-    info = follow(errors, lane=0.2, slowest=0.7, fall=0.01)
+    info = follow(errors, lane=0.2, slowest=7.0, fall=0.01)
     assert info["speed_factor"].min() == pytest.approx(0.7)
     assert info["speed_factor"][-1] > info["speed_factor"].min()
     assert np.all(np.diff(info["speed_factor"]) >= -0.01 - 1e-6)
@@ -88,6 +97,26 @@ def test_the_speed_falls_until_the_corridor_fits_and_rises_again():
         info["asked"][1:], 10.0 * info["speed_factor"][:-1], rtol=1e-5
     )
     assert slowed.any()
+
+
+def test_a_turn_is_taken_at_a_lateral_acceleration_that_fitted_before():
+    settings = {"reference": circle(0.02), "grip": 1.0, "slowest": 1.0, "fall": 0.01}
+    info = follow(np.zeros(STEPS), lane=0.5, **settings)
+    demand = 0.02 * (10.0 * info["speed_factor"]) ** 2
+    assert demand[0] > 1.9
+    assert np.all(demand[60:] <= np.maximum(info["grip"][60:], 1.0) * 1.001)
+    assert demand[:100].min() < 1.5
+    np.testing.assert_allclose(info["speed_factor"][-1], 1.0)
+    assert np.abs(np.diff(info["speed_factor"])).max() <= 0.01 + 1e-6
+    lost = follow(np.where(np.arange(STEPS) < 300, 0.0, 1.0), lane=0.5, **settings)
+    assert lost["grip"][-1] < 0.5 * lost["grip"][299]
+    np.testing.assert_array_equal(lost["grip"][:300], info["grip"][:300])
+
+
+def test_on_a_straight_no_grip_is_needed_and_none_is_shown():
+    info = follow(np.zeros(STEPS), lane=0.5, grip=0.1)
+    np.testing.assert_array_equal(info["speed_factor"], 1.0)
+    np.testing.assert_allclose(info["grip"], 0.1)
 
 
 def test_without_a_lane_the_reference_passes_unchanged():
@@ -115,6 +144,7 @@ def test_measurements_that_are_not_finite_change_no_radius():
         ({"start_radius": 0.0}, "start_radius"),
         ({"lane": -1.0}, "lane"),
         ({"slowest": 0.0}, "slowest"),
+        ({"grip": 0.0}, "grip"),
     ],
 )
 def test_invalid_settings_are_refused_by_name(change, word):
