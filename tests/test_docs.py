@@ -12,7 +12,13 @@ from pathlib import Path
 import pytest
 import yaml
 
-from benchmarks.quality import corridor_page, path_frame, shield_table, speed_page
+from benchmarks.quality import (
+    adaptation_page,
+    corridor_page,
+    path_frame,
+    shield_table,
+    speed_page,
+)
 from benchmarks.robustness import drills as drills_benchmark
 from benchmarks.robustness import soak
 
@@ -503,6 +509,13 @@ def test_the_page_about_path_coordinates_says_what_the_results_say():
         for name, build in path_frame.TABLES.items()
         if f"<!-- {name} -->\n{build()}\n<!-- end -->" not in text
     ] == []
+
+
+def test_the_tables_of_adaptation_are_those_of_its_runs():
+    text = (DOCS / "adaptation.md").read_text("utf-8")
+    assert adaptation_page.page(text) == text
+    for name, table in adaptation_page.TABLES.items():
+        assert table() in text, name
 
 
 def test_the_table_of_the_long_drive_is_that_of_its_run():

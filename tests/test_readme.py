@@ -118,8 +118,23 @@ def test_the_page_about_foreign_plants_says_what_the_results_say():
     ).stdout
     page = (RESULTS / "other-cars.md").read_text("utf-8")
     tables = printed.strip().split("\n\n")
-    assert len(tables) == 6
+    assert len(tables) == 7
     assert [table for table in tables if table not in page] == []
+
+
+def test_the_ratios_of_adapting_on_foreign_cars_are_those_of_its_run():
+    file = ROOT / "experiments" / "commonroad" / "adaptive.json"
+    cars = json.loads(file.read_text())["cars"]
+    ratios = [
+        sum(ours) / sum(nominal)
+        for rows in cars.values()
+        for ours, nominal in zip(
+            rows["SFKD, adaptive"]["after_mm"], rows["nominal"]["after_mm"], strict=True
+        )
+    ]
+    words = f"{min(ratios):.2f} to {max(ratios):.2f} times"
+    assert words in README
+    assert words in (RESULTS / "index.md").read_text("utf-8")
 
 
 def named(row, name):

@@ -5,21 +5,31 @@ python -m benchmarks.quality.adaptation_page
 
 import json
 import re
+import statistics
 from functools import partial
 
 from benchmarks.harness import ROOT
 
 PAGE = ROOT / "docs" / "adaptation.md"
-COLUMNS = (
+MAIN = (
     "oracle that knows",
     "oracle that does not know",
+    "oracle, e estimated",
     "SFKD",
     "SFKD, adaptive",
     "SFKD, adaptive, slower",
+    "SFKD, adaptive, cautious",
+)
+RIVALS = (
+    "SFKD, adaptive",
     "SFKD, one filter",
     "SFKD, no slow causes",
-    "oracle, e estimated",
+    "SFKD, bank",
+    "neural ODE",
+    "neural ODE, last layer",
 )
+FRICTION = "friction 0.2, told 0.9, 12 m/s"
+LEADS = ("1", "5", "10", "20")
 VEHICLES = ("kinematic", "dynamic")
 
 
@@ -31,39 +41,67 @@ def measured(name):
 
 def errors(name):
     """Lateral RMSE of every row, with its ratio to the oracle that knows."""
-    lines = [_line([f"{name} [mm]", *COLUMNS]), _line(["---"] * (1 + len(COLUMNS)))]
+    lines = _head([f"{name} [mm]", *MAIN])
     for case, rows in measured(name).items():
-        best = rows["oracle that knows"]["rmse_mm"]
-        cells = [_error(rows.get(column), best) for column in COLUMNS]
-        lines.append(_line([case, *cells]))
+        if case != FRICTION:
+            best = rows["oracle that knows"]["rmse_mm"]
+            lines.append(_line([case, *(_error(rows.get(row), best) for row in MAIN)]))
+    return "\n".join(lines)
+
+
+def rivals(name):
+    """The same of ablations and of baselines."""
+    lines = _head([f"{name} [mm]", *RIVALS])
+    for case, rows in measured(name).items():
+        if RIVALS[-1] in rows:
+            best = rows["oracle that knows"]["rmse_mm"]
+            lines.append(
+                _line([case, *(_error(rows.get(row), best) for row in RIVALS)])
+            )
+    return "\n".join(lines)
+
+
+def friction(name):
+    """Who leaves the lane on a road three times as slippery as E allows."""
+    rows = measured(name)[FRICTION]
+    lines = _head(
+        [name, "left the lane", "largest error, median [m]", "speed, mean [m/s]"]
+    )
+    for row, found in rows.items():
+        largest = found["largest_mm"]
+        left = f"{found['left_the_lane']} of {len(largest)}"
+        middle = f"{statistics.median(largest) / 1e3:.2f}"
+        lines.append(_line([row, left, middle, f"{found['speed_m_per_s']:.1f}"]))
     return "\n".join(lines)
 
 
 def coverage(name):
-    """Coverage of the tube at level 95 %, its radius, and speeds of the rows with it."""
-    leads = ("1", "5", "10", "20")
-    heads = [f"{lead} ahead" for lead in leads]
-    slower = [
-        "radius 10 ahead [m]",
-        "speed [m/s]",
-        "slower: speed [m/s]",
-        "largest [mm]",
-    ]
-    lines = [_line([name, *heads, *slower]), _line(["---"] * 9)]
+    """Coverage of the tube at level 95 % and its radius; speed and largest error."""
+    heads = [f"{lead} ahead" for lead in LEADS]
+    heads += ["radius 10 ahead [m]", "largest error [mm]"]
+    heads += ["slower: speed [m/s]", "slower: largest error [mm]"]
+    lines = _head([name, *heads])
     for case, rows in measured(name).items():
-        own, slow = rows["SFKD, adaptive"], rows["SFKD, adaptive, slower"]
-        cells = [f"{100 * own['coverage'][lead]:.1f} %" for lead in leads]
+        own, slow = rows["SFKD, adaptive"], rows.get("SFKD, adaptive, slower")
+        cells = [f"{100 * own['coverage'][lead]:.1f} %" for lead in LEADS]
         cells.append(f"{own['tube_m']['10']:.3f}")
-        cells += [f"{row['speed_m_per_s']:.1f}" for row in (own, slow)]
-        cells.append(f"{own['largest_mm']:.0f}, slower {slow['largest_mm']:.0f}")
+        cells.append(f"{max(own['largest_mm']):.0f}")
+        speed = f"{slow['speed_m_per_s']:.1f}" if slow else "–"
+        cells += [speed, f"{max(slow['largest_mm']):.0f}" if slow else "–"]
         lines.append(_line([case, *cells]))
     return "\n".join(lines)
 
 
+KINDS = {
+    "errors": errors,
+    "rivals": rivals,
+    "friction": friction,
+    "coverage": coverage,
+}
 TABLES = {
     f"{kind}_{name}": partial(build, name)
     for name in VEHICLES
-    for kind, build in (("errors", errors), ("coverage", coverage))
+    for kind, build in KINDS.items()
 }
 """Marker in the page -> its table."""
 
@@ -81,6 +119,11 @@ def _error(row, best):
     if row is None:
         return "–"
     return f"{row['rmse_mm']:.1f} ({row['rmse_mm'] / best:.2f})"
+
+
+def _head(cells):
+    """The first two lines of a Markdown table."""
+    return [_line(cells), _line(["---"] * len(cells))]
 
 
 def _line(cells):

@@ -41,7 +41,7 @@ VARIANTS = {
     "delayed": ("short", {"delay": 2}),
     "no_faults": ("short", {"faulty": False}),
     "full": ("full", {"samples": 1500}),
-    "adaptive": ("steps", {"adaptive": True}),
+    "adaptive": ("short", {"adaptive": True}),
 }
 """Name -> which option says how many steps, and what is not as in `track`."""
 LEGS = {

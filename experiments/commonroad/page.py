@@ -199,6 +199,32 @@ def along_path():
     )
 
 
+def adaptive():
+    """Lateral RMSE in the second half of a minute, and its ratio to nominal-MPPI."""
+    document = json.loads(
+        (ROOT / "experiments" / "commonroad" / "adaptive.json").read_text()
+    )
+    heads, lines = ["after 30 s [mm] (over nominal)"], {}
+    for car, rows in document["cars"].items():
+        heads += [
+            f"{CARS[f'commonroad_{car}']}, {friction}"
+            for friction in document["protocol"]["frictions"]
+        ]
+        nominal = _means(rows["nominal"])
+        for row, found in rows.items():
+            entries = [
+                f"{mean:.1f} ({mean / best:.2f})"
+                for mean, best in zip(_means(found), nominal, strict=True)
+            ]
+            lines.setdefault(row, [row]).extend(entries)
+    return tables.table(heads, list(lines.values()))
+
+
+def _means(found):
+    """Over the paths of a friction."""
+    return [sum(paths) / len(paths) for paths in found["after_mm"]]
+
+
 def counted(result):
     """Drives inside of how many, with the interval of the share."""
     low, high = result["coverage_ci95"]
@@ -217,6 +243,7 @@ TABLES = {
     "tuning": tuning,
     "export": export,
     "along path": along_path,
+    "adaptive": adaptive,
 }
 
 

@@ -277,6 +277,59 @@ def test_hostile_measurements_leave_finite_bounded_estimates():
     np.testing.assert_allclose(belief.bank.probabilities.sum(axis=-1), 1.0, atol=1e-4)
 
 
+def test_changed_weights_are_noticed():
+    """One bit of one weight is enough; two weights that swap are noticed as well."""
+    controller = adaptive()
+    act = jit(controller.act)
+    inputs = jnp.asarray([0.0, 0.0, 0.0, 10.0]), jnp.asarray([0.7, 0.0]), road(0.0)
+    weights = {"a": jnp.asarray([1.0, 2.0, 3.0]), "b": jnp.asarray([[-0.0, 1e-40]])}
+    state = controller.init(jax.random.key(0))
+    for _ in range(2):
+        _, state, info = act(weights, state, *inputs)
+        assert not info["weights_changed"]
+    for change in (
+        {"a": jnp.nextafter(weights["a"], 9.0)},
+        {"a": weights["a"][::-1]},
+        {"b": -weights["b"]},
+        {"b": weights["b"].at[0, 1].set(jnp.nan)},
+    ):
+        _, _, info = act(weights | change, state, *inputs)
+        assert info["weights_changed"]
+        assert not info["healthy"]
+
+
+@pytest.mark.exhaustive
+def test_a_hundred_thousand_hostile_steps_leave_finite_bounded_estimates():
+    controller, env = adaptive(), jnp.asarray([0.7, 0.0])
+    limits = jnp.asarray([BOUNDS[k] for k in range(5)])
+
+    def step(carry, inputs):
+        state, memory, last = carry
+        time, key = inputs
+        state = state.at[0].set(0.0)
+        seen = state.at[1:4].add(NOISE * jax.random.normal(key, (3,)))
+        which = (time // 500).astype(int) % len(FAULTS)
+        seen = jax.lax.switch(which, FAULTS, time % 120.0, seen, last)
+        action, memory, info = controller.act({}, memory, seen, env, road(0.0))
+        force = 0.5 * jnp.sign(jnp.sin(time / 40.0))
+        state = PLANT.step(state, action, disturbances.split_force(LOOP, env, force)[0])
+        state = jnp.where(jnp.abs(state[1]) < 5.0, state, start)
+        bank = memory.belief.bank
+        fine = jnp.stack([jnp.isfinite(leaf).all() for leaf in jax.tree.leaves(bank)])
+        fine = fine.all() & jnp.all(jnp.abs(info["causes"]) <= limits)
+        fine &= (
+            jnp.isfinite(action).all() & (bank.covariances.diagonal(0, 1, 2) >= 0).all()
+        )
+        return (state, memory, seen), fine
+
+    start = jnp.asarray([0.0, 0.0, 0.0, 10.0])
+    keys = jax.random.split(jax.random.key(1), 100_000)
+    carry = (start, controller.init(jax.random.key(0)), start)
+    times = jnp.arange(100_000, dtype=float)
+    fine = jit(lambda: jax.lax.scan(step, carry, (times, keys))[1])()
+    assert bool(fine.all())
+
+
 def test_causes_that_predict_worse_than_none_are_not_used():
     """The scores of the last seconds decide."""
     controller = adaptive()

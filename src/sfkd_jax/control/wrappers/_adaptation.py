@@ -119,9 +119,10 @@ def adaptive(
 
     Returns:
         A `Controller`; `info` gains `env_estimate` (the e planned with), `causes` (5,),
-        `causes_std` (5,), `rejected` (nothing was learned from the measurement) and
+        `causes_std` (5,), `rejected` (nothing was learned from the measurement),
         `adapting` (over the last seconds the estimates did not predict worse than the
-        model alone; otherwise they are not used).
+        model alone; otherwise they are not used) and `weights_changed` (the parameters
+        are not those of the first step).
 
     Raises:
         ValueError: a setting is out of its range or has the wrong number of entries.

@@ -4,7 +4,9 @@ from __future__ import annotations
 
 from typing import Any, NamedTuple
 
+import jax
 import jax.numpy as jnp
+from jaxtyping import Array, UInt32
 
 from sfkd_jax.control.planners._plans import all_finite
 from sfkd_jax.control.tasks._along_path import (
@@ -54,10 +56,12 @@ class AdaptiveState(NamedTuple):
     Attributes:
         inner: state of the wrapped controller.
         belief: of the estimator; the part to save and resume.
+        weights: checksum of the parameters at the first step; 0 before.
     """
 
     inner: Any
     belief: Belief
+    weights: UInt32[Array, ""]
 
 
 class AdaptiveSettings(NamedTuple):
@@ -88,6 +92,7 @@ def initial(settings: AdaptiveSettings, key: Key) -> AdaptiveState:
             missing=jnp.zeros((), dtype=jnp.int32),
             scores=jnp.zeros(2),
         ),
+        weights=jnp.zeros((), dtype=jnp.uint32),
     )
 
 
@@ -101,6 +106,8 @@ def act(
 ) -> tuple[Control, AdaptiveState, ControllerInfo]:
     """Take one control step."""
     loop, before = settings.loop, state.belief
+    weights = _checksum(params)
+    changed = (state.weights != 0) & (weights != state.weights)
     params = fold(loop.model, params)
     clean = all_finite((observation, reference))
     clean &= settings.estimated | all_finite(env)
@@ -142,14 +149,32 @@ def act(
     )
     report: ControllerInfo = {
         **info,
-        "healthy": info["healthy"] & clean,
+        "healthy": info["healthy"] & clean & ~changed,
         "env_estimate": inside,
         "causes": causes,
         "causes_std": jnp.sqrt(belief.bank.variance()[size:]),
         "rejected": rejected,
         "adapting": adapting,
+        "weights_changed": changed,
     }
-    return control, AdaptiveState(inner, belief), report
+    first = jnp.where(state.weights == 0, weights, state.weights)
+    return control, AdaptiveState(inner, belief, first), report
+
+
+def _checksum(params: Params) -> UInt32[Array, ""]:
+    """A sum over the bits of all weights in their order, mixed as MurmurHash3 does.
+
+    Between two steps it shows a changed weight, not a forged one: the hash of the
+    certificate does that.
+    """
+    total = jnp.ones((), dtype=jnp.uint32)
+    for leaf in jax.tree.leaves(params):
+        bits = jax.lax.bitcast_convert_type(jnp.asarray(leaf, float), jnp.uint32)
+        index = jnp.arange(bits.size, dtype=jnp.uint32)
+        mixed = bits.ravel() + jnp.uint32(0x9E3779B9) * index
+        mixed = (mixed ^ (mixed >> 16)) * jnp.uint32(0x85EBCA6B)
+        total = 31 * total + jnp.sum(mixed ^ (mixed >> 13), dtype=jnp.uint32)
+    return jnp.maximum(total, 1)
 
 
 def _known_environment(

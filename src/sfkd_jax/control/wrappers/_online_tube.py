@@ -38,15 +38,18 @@ class OnlineTubeState(NamedTuple):
 
     Attributes:
         inner: state of the wrapped controller.
-        plans: e_y that the last plans predicted, newest first [m]; NaN before.
+        plans: e_y that the last plans predicted, newest first [m].
+        known: which of them were finite.
         radii: r_h of the tube [m].
         corridor_factor: of the reference speed, at which the corridor fits the lane.
         speed_factor: of the reference speed that is followed.
-        grip: lateral acceleration at which the corridor fitted the lane [m/s²].
+        grip: lateral acceleration at which the corridor fitted the lane [m/s²]; 0 if
+            it is not limited.
     """
 
     inner: Any
     plans: Float[Array, "horizon horizon"]
+    known: Bool[Array, " horizon"]
     radii: Float[Array, " horizon"]
     corridor_factor: Scalar
     speed_factor: Scalar
@@ -118,7 +121,7 @@ def online_tube(
     Returns:
         A `Controller`; `info` gains `tube` (horizon,) [m], `tube_errors` (horizon,) [m]
         (NaN without a plan to compare with), `tube_missed` (horizon,),
-        `online_corridor` [m], `speed_factor` and `grip` [m/s²].
+        `online_corridor` [m], `speed_factor` and `grip` [m/s²; 0 without limit].
 
     Raises:
         ValueError: a setting is out of its range.
@@ -138,11 +141,12 @@ def _init(settings: _Settings, key: Key) -> OnlineTubeState:
     horizon = settings.horizon
     return OnlineTubeState(
         inner=settings.controller.init(key),
-        plans=jnp.full((horizon, horizon), jnp.nan, dtype=float),
+        plans=jnp.zeros((horizon, horizon), dtype=float),
+        known=jnp.zeros(horizon, dtype=bool),
         radii=jnp.full(horizon, settings.start_radius, dtype=float),
         corridor_factor=jnp.ones(()),
         speed_factor=jnp.ones(()),
-        grip=jnp.asarray(settings.grip, dtype=float),
+        grip=jnp.asarray(settings.grip if settings.grip < math.inf else 0.0),
     )
 
 
@@ -159,6 +163,7 @@ def _act(
         observation, reference[0], curvature_ahead(reference)[0]
     )
     errors = jnp.abs(measured[LATERAL] - jnp.diagonal(state.plans))
+    errors = jnp.where(state.known, errors, jnp.nan)
     missed = errors > state.radii
     radii = _calibrated(settings, state.radii, errors)
     slowed = slow_down(reference, state.speed_factor)
@@ -172,7 +177,8 @@ def _act(
     corridor_factor, grip, factor = _speeds(settings, state, reference, fits)
     after = OnlineTubeState(
         inner=inner,
-        plans=jnp.concatenate([plan[None], state.plans[:-1]]),
+        plans=jnp.concatenate([jnp.nan_to_num(plan)[None], state.plans[:-1]]),
+        known=jnp.append(all_finite(plan), state.known[:-1]),
         radii=radii,
         corridor_factor=corridor_factor,
         speed_factor=factor,
@@ -200,18 +206,31 @@ def _speeds(
     rise = settings.fall * (1.0 - settings.level) / settings.level
     change = jnp.where(fits, rise, -settings.fall)
     least = jnp.clip(settings.slowest / reference[0, 3], 0.0, 1.0)
+    least = jnp.where(jnp.isfinite(least), least, 0.0)
     corridor_factor = jnp.clip(state.corridor_factor + change, least, 1.0)
 
+    before = state.speed_factor
+    cap, grip = jnp.ones(()), state.grip
+    if settings.grip < math.inf:
+        cap, grip = _shown(settings, state, reference, fits)
+    factor = jnp.minimum(corridor_factor, jnp.maximum(cap, least))
+    factor = jnp.clip(factor, before - settings.fall, before + settings.fall)
+    return corridor_factor, grip, factor
+
+
+def _shown(
+    settings: _Settings,
+    state: OnlineTubeState,
+    reference: Reference,
+    fits: Bool[Array, ""],
+) -> tuple[Scalar, Scalar]:
+    """The speed_factor for which the grip was shown, and the next grip."""
     ahead = reference[:, 3] ** 2 * jnp.abs(curvature_ahead(reference))
     now = state.speed_factor**2 * ahead[0]
     proved = jnp.where(now > GRIP_SHARE * state.grip, 1.0 + settings.fall, 1.0)
     grip = state.grip * jnp.where(fits, proved, 1.0 - settings.fall)
     cap = jnp.sqrt(grip / jnp.maximum(jnp.max(ahead), 1e-6))
-    cap = jnp.maximum(jnp.where(jnp.isfinite(cap), cap, 1.0), least)
-    factor = jnp.minimum(corridor_factor, cap)
-    before = state.speed_factor
-    factor = jnp.clip(factor, before - settings.fall, before + settings.fall)
-    return corridor_factor, grip, factor
+    return jnp.where(jnp.isfinite(cap), cap, 1.0), grip
 
 
 def _calibrated(
