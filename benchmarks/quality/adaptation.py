@@ -239,7 +239,7 @@ def systems(rows, case, car, rival):
     made = {
         "oracle that knows": (knows, {}, True),
         "SFKD": (rows.planner(rows.loaded.model), own, False),
-        "SFKD, adaptive": (with_tube(adapting, lane=np.inf), own, False),
+        "SFKD, adaptive": (with_tube(adapting, lane=None), own, False),
     }
     if not (case.car or case.steering):
         made["SFKD, adaptive, slower"] = (with_tube(adapting), own, False)
@@ -255,8 +255,8 @@ def systems(rows, case, car, rival):
         made["oracle that does not know"] = (nominal, {}, False)
     if case.rivals:
         single, fast = rows.adaptive(**ONE_FILTER), rows.adaptive(**FAST_ONLY)
-        made["SFKD, one filter"] = (with_tube(single, lane=np.inf), own, False)
-        made["SFKD, no slow causes"] = (with_tube(fast, lane=np.inf), own, False)
+        made["SFKD, one filter"] = (with_tube(single, lane=None), own, False)
+        made["SFKD, no slow causes"] = (with_tube(fast, lane=None), own, False)
     if case.estimate_env:
         best = rows.adaptive(rows.oracle(rows.plant), **unknown)
         made["oracle, e estimated"] = (best, {}, False)

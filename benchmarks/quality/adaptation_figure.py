@@ -53,8 +53,8 @@ def drives(name, episode):
     rows = adaptation.Rows(name, loaded, plant)
     made, keys = adaptation.roads(plant, CASE, EPISODES, SECONDS, SEED)
     scene, key = jax.tree.map(lambda leaf: leaf[episode], (made, keys))
-    plain = adaptation.with_tube(rows.planner(loaded.model), lane=np.inf)
-    adapting = adaptation.with_tube(rows.adaptive(), lane=np.inf)
+    plain = adaptation.with_tube(rows.planner(loaded.model), lane=None)
+    adapting = adaptation.with_tube(rows.adaptive(), lane=None)
     shown = {"not adapting": plain, "adapting": adapting}
     made = {
         label: drive(rows, controller, scene, key)

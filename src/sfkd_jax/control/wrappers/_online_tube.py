@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from functools import partial
-from typing import Annotated, Any, NamedTuple
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -14,7 +14,7 @@ from sfkd_jax.control.planners._plans import all_finite
 from sfkd_jax.control.tasks._along_path import curvature_ahead, path_coordinates
 from sfkd_jax.control.wrappers._slow import slow_down
 from sfkd_jax.core.path_frame import LATERAL
-from sfkd_jax.core.ranges import Fraction, Interval, Positive
+from sfkd_jax.core.ranges import Fraction, Positive
 from sfkd_jax.types import (
     Control,
     Controller,
@@ -64,10 +64,10 @@ class _Settings(NamedTuple):
     level: float
     rate: float
     start_radius: float
-    lane: float
+    lane: float | None
     slowest: float
     fall: float
-    grip: float
+    grip: float | None
 
 
 def online_tube(
@@ -77,10 +77,10 @@ def online_tube(
     level: Fraction = 0.95,
     rate: Positive = 0.2,
     start_radius: Positive = 0.03,
-    lane: Annotated[float, Interval("(0, inf]")] = 0.1,
+    lane: Positive | None = 0.1,
     slowest: Positive = 8.0,
     fall: Fraction = 0.01,
-    grip: Annotated[float, Interval("(0, inf]")] = math.inf,
+    grip: Positive | None = None,
 ) -> Controller:
     """Wrap a controller with a tube around its plans, and slow down until it fits.
 
@@ -112,11 +112,11 @@ def online_tube(
         level: of the coverage.
         rate: γ.
         start_radius: r_h at the start [m].
-        lane: largest |e_y| that is acceptable [m]; inf for a tube that only reports.
+        lane: largest |e_y| that is acceptable [m]; None for a tube that only reports.
         slowest: least speed that the corridor can ask for [m/s]: a model is of little
             use below the speeds that it was learned at.
         fall: of the factor per step, while the corridor exceeds the lane.
-        grip: a at the start [m/s²]; inf where friction is trusted.
+        grip: a at the start [m/s²]; None where friction is trusted.
 
     Returns:
         A `Controller`; `info` gains `tube` (horizon,) [m], `tube_errors` (horizon,) [m]
@@ -146,7 +146,7 @@ def _init(settings: _Settings, key: Key) -> OnlineTubeState:
         radii=jnp.full(horizon, settings.start_radius, dtype=float),
         corridor_factor=jnp.ones(()),
         speed_factor=jnp.ones(()),
-        grip=jnp.asarray(settings.grip if settings.grip < math.inf else 0.0),
+        grip=jnp.asarray(settings.grip or 0.0),
     )
 
 
@@ -173,7 +173,7 @@ def _act(
     )
     plan = _lateral(info["predicted_states"], target)
     corridor = jnp.max(jnp.abs(plan) + radii)
-    fits = corridor <= settings.lane
+    fits = corridor <= (math.inf if settings.lane is None else settings.lane)
     corridor_factor, grip, factor = _speeds(settings, state, reference, fits)
     after = OnlineTubeState(
         inner=inner,
@@ -211,7 +211,7 @@ def _speeds(
 
     before = state.speed_factor
     cap, grip = jnp.ones(()), state.grip
-    if settings.grip < math.inf:
+    if settings.grip is not None:
         cap, grip = _shown(settings, state, reference, fits)
     factor = jnp.minimum(corridor_factor, jnp.maximum(cap, least))
     factor = jnp.clip(factor, before - settings.fall, before + settings.fall)
@@ -260,19 +260,21 @@ def _check(
     level: float,
     rate: float,
     start_radius: float,
-    lane: float,
+    lane: float | None,
     slowest: float,
-    grip: float,
+    grip: float | None,
 ) -> None:
     """Raise a ValueError that names a setting out of its range."""
     if not 0 < level < 1 or not 0 < rate < math.inf:
         raise ValueError(
             f"level must lie in (0, 1) and rate be positive, got {level} and {rate}"
         )
-    if not RADIUS_RANGE[0] <= start_radius <= RADIUS_RANGE[1] or not lane > 0:
+    if not RADIUS_RANGE[0] <= start_radius <= RADIUS_RANGE[1]:
         raise ValueError(
-            f"start_radius must lie in {list(RADIUS_RANGE)} and lane be positive, "
-            f"got {start_radius} and {lane}"
+            f"start_radius must lie in {list(RADIUS_RANGE)}, got {start_radius}"
         )
-    if not 0 < slowest < math.inf or not grip > 0:
-        raise ValueError(f"slowest and grip must be positive, got {slowest} and {grip}")
+    for name, value in (("lane", lane), ("grip", grip)):
+        if value is not None and not 0 < value < math.inf:
+            raise ValueError(f"{name} must be positive or None, got {value}")
+    if not 0 < slowest < math.inf:
+        raise ValueError(f"slowest must be positive, got {slowest}")
