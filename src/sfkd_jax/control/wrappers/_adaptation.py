@@ -52,7 +52,7 @@ def adaptive(
     force_drift: Positive = 0.05,
     slow_prior: tuple[Positive, ...] = (0.01, 0.05, 0.02, 2.0),
     slow_drift: tuple[Positive, ...] = (1e-4, 0.005, 1e-4, 0.02),
-    shrinkage: Annotated[float, Interval("[0, inf)")] = 0.3,
+    shrinkage: float = 0.3,
     friction_points: AtLeastTwo = 7,
     friction_drift: Positive = 0.01,
     dwell: Annotated[float, Interval("(1, inf)")] = 30.0,
@@ -65,7 +65,7 @@ def adaptive(
         0.0015,
         0.0005,
     ),
-    patience: Annotated[int, Interval("[1, inf)")] = 5,
+    patience: int = 5,
 ) -> Controller:
     """Wrap a controller along a path with estimates of what nobody measures.
 
