@@ -20,6 +20,8 @@ PLAN = {
     "variations": {"as it is": None, "late": "evaluation.env_sensor.delay_s=0.5"},
     "policies": "table",
     "only": [],
+    "untrained": [],
+    "tuned": {},
 }
 
 
@@ -32,6 +34,22 @@ def test_every_row_has_every_scenario_under_each_of_its_controllers():
     assert {cell.scenario for cell in result if cell.controller == "mppi_plain"} == {
         "s1"
     }
+
+
+def test_a_row_that_trains_nothing_has_the_first_seed_alone():
+    result = grid.list_cells(PLAN | {"untrained": ["ours"]})
+    assert {cell.seed for cell in result if cell.label == "ours"} == {0}
+    assert {cell.seed for cell in result if cell.label == "program"} == {0, 1}
+    with pytest.raises(ValueError, match=r"unknown comparison\.untrained us"):
+        grid.list_cells(PLAN | {"untrained": ["us"]})
+
+
+def test_what_was_tuned_for_a_vehicle_changes_its_cells_alone():
+    tuned = PLAN | {"tuned": {"dynamic": {"ours": "model.rank=24 seed=7"}}}
+    for cell in grid.list_cells(tuned):
+        more = set(grid.overrides(cell, tuned)) - set(grid.overrides(cell, PLAN))
+        is_tuned = (cell.vehicle, cell.label) == ("dynamic", "ours")
+        assert more == ({"model.rank=24", "seed=7"} if is_tuned else set())
 
 
 def test_rows_can_be_picked_and_an_unknown_one_is_named_with_the_choices():

@@ -183,6 +183,12 @@ class Rows(NamedTuple):
         return build.reference_systems(car, self.loaded.law)["oracle"].model
 
 
+def shipped(name):
+    """The policy of a vehicle that is part of the package."""
+    loaded = policy.load(Path(policy.__file__).parent / "pretrained" / f"{name}_path")
+    return Rows(name, loaded, build.build_vehicle(loaded.settings["vehicle"]))
+
+
 def with_tube(controller, **settings):
     """Calibrated while driving; slower with the default lane."""
     return control.online_tube(controller, horizon=20, **settings)
@@ -350,9 +356,7 @@ def main():
         document = artefacts.read_json(out, keys=("protocol", "cases"))
         if document["protocol"] != protocol:
             raise SystemExit(f"{out}: another protocol; choose another --out")
-    shipped = Path(policy.__file__).parent / "pretrained" / f"{name}_path"
-    loaded = policy.load(shipped)
-    rows = Rows(name, loaded, build.build_vehicle(loaded.settings["vehicle"]))
+    rows = shipped(name)
     rival = neural_ode(name, given.root)
     for label in given.cases:
         case = CASES[label]

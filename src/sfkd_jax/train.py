@@ -21,7 +21,8 @@ from sfkd_jax.vehicle import check_step
 def run(settings: dict[str, Any]) -> dict[str, Any]:
     """Make data, policy, certificate, closed-loop results and report of a run.
 
-    A vehicle without a step function is not evaluated in closed loop.
+    A vehicle without a step function is not evaluated in closed loop. With
+    `evaluation.systems=[]` the model is trained alone, as a search needs it.
     """
     began = time.perf_counter()
     plant = build.build_vehicle(settings["vehicle"])
@@ -37,6 +38,9 @@ def _run_stages(settings: dict[str, Any]) -> dict[str, Any]:
     """Run all stages in the run directory."""
     stages.ensure_policy(settings)
     run_dir = store.run_directory(settings)
+    trained = _about_training(run_dir)
+    if not settings["evaluation"]["systems"]:
+        return trained
     certificate = certificates.certify_policy(settings)
     if build.build_vehicle(settings["vehicle"]).simulated:
         typed = command_line("train") if HydraConfig.initialized() else None
@@ -50,32 +54,24 @@ def _run_stages(settings: dict[str, Any]) -> dict[str, Any]:
     with artefacts.as_artefact_error(run_dir):
         pages = write_report(run_dir, studies=beside_the_paper)
     artefacts.print_message(f"report: {pages['report']}")
-    return {
-        "run": str(run_dir),
-        "checkpoint": str(run_dir / "checkpoints"),
+    return trained | {
         "certificate": str(certificates.certificate_path(run_dir)),
         "results": results,
         "report": pages["report"],
-        "open_loop_rmse_m": _position_errors(run_dir),
         "alpha": certificate.get("alpha"),
-        "objective": _objective(run_dir),
     }
 
 
-def _position_errors(run_dir: Path) -> list[float]:
-    """Position errors of open-loop predictions by steps ahead [m]."""
+def _about_training(run_dir: Path) -> dict[str, Any]:
+    """Where the model is, its errors by steps ahead, and what a search minimises."""
     key = "position_rmse_m"
-    return artefacts.read_json(run_dir / "open_loop.json", keys=(key,))[key]
-
-
-def _objective(run_dir: Path) -> float | None:
-    """The lowest validation loss, which a sweep minimises; None if none was logged."""
-    log = run_dir / "metrics.jsonl"
-    if not log.exists():
-        return None
-    lines = artefacts.read_jsonl(log, damaged=artefacts.print_message)
-    losses = [line["validation_loss"] for line in lines if "validation_loss" in line]
-    return min(losses, default=None)
+    errors = artefacts.read_json(run_dir / "open_loop.json", keys=(key,))
+    return {
+        "run": str(run_dir),
+        "checkpoint": str(run_dir / "checkpoints"),
+        "open_loop_rmse_m": errors[key],
+        "objective": errors.get("validation_score"),
+    }
 
 
 if __name__ == "__main__":

@@ -223,30 +223,30 @@ def test_the_quick_softplus_is_as_exact_as_float32_and_rises_by_the_sigmoid():
     assert np.isnan(softplus(jnp.asarray(jnp.nan)))
 
 
-@pytest.mark.parametrize("reads_env", [False, True])
-def test_the_gain_of_the_steering_depends_on_the_environment_only_where_it_is_read(
-    reads_env,
-):
+@pytest.mark.parametrize("affine_in", ["both", "env", "control"])
+def test_rates_are_affine_in_the_inputs_that_are_named_and_in_no_other(affine_in):
     init, rates = affine_rates(
-        space(), (8,), (jnp.tanh,), last=1.0, reads_env=reads_env
+        space(), (8,), (jnp.tanh,), last=1.0, affine_in=affine_in
     )
-    params, body, way = (
-        init(jax.random.key(0)),
-        jnp.asarray([0.3]),
-        jnp.asarray([0.7, -0.4]),
-    )
+    params, body = init(jax.random.key(0)), jnp.asarray([0.3])
+    inputs = {"control": jnp.asarray([0.7, -0.4]), "env": jnp.asarray([0.5, 0.6])}
 
-    def change(env, t):
-        fiber = Conditioned(params, jnp.asarray(env))
-        return rates(fiber, body, t * way) - rates(fiber, body, 0.0 * way)
+    def at(t, moved):
+        scaled = {name: (t if name in moved else 1.0) * inputs[name] for name in inputs}
+        return rates(Conditioned(params, scaled["env"]), body, scaled["control"])
 
-    np.testing.assert_allclose(
-        change([0.5, 0.5], 3.0), 3.0 * change([0.5, 0.5], 1.0), rtol=1e-5
-    )
-    assert (
-        np.allclose(change([0.5, 0.5], 1.0), change([-0.5, 0.9], 1.0), rtol=1e-5)
-        != reads_env
-    )
+    for moved in (("control",), ("env",), ("control", "env")):
+        affine = np.allclose(
+            at(3.0, moved) - at(0.0, moved),
+            3 * at(1.0, moved) - 3 * at(0.0, moved),
+            rtol=1e-4,
+        )
+        assert affine == (affine_in == "both" or moved == (affine_in,))
+
+
+def test_another_way_to_be_affine_is_refused_with_the_choices():
+    with pytest.raises(ValueError, match="must be one of both, env, control, got 'e'"):
+        affine_rates(space(), (8,), (jnp.tanh,), last=1.0, affine_in="e")
 
 
 @pytest.mark.parametrize("name", LEARNED)

@@ -5,7 +5,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from sfkd_jax.vehicle import kinematic
+from sfkd_jax.vehicle import kinematic, kinematic_stiff
 
 MASS, FRONT, REAR, LEVER = 1500.0, 1.2, 1.5, 0.4
 LENGTH = FRONT + REAR
@@ -17,17 +17,19 @@ pytestmark = pytest.mark.usefixtures("x64")
     ("friction", "wind", "speed"),
     [(0.9, 0.0, 5.0), (0.5, 4.0, 12.0), (0.3, -8.0, 20.0)],
 )
-def test_slip_balances_force_and_moment_at_both_axles(friction, wind, speed):
+@pytest.mark.parametrize("car", [kinematic, kinematic_stiff])
+def test_slip_balances_force_and_moment_at_both_axles(car, friction, wind, speed):
     """For any curvature in the friction circle, the rear tyres carry their share of the
     force.
     """
     env = jnp.array([friction, wind])
-    rate = kinematic().derivative(
+    rate = car().derivative(
         jnp.array([0.0, 0.0, 0.0, speed]), jnp.array([0.05, 0.0]), env
     )
     slip, curvature = np.arctan2(rate[1], rate[0]), rate[2] / speed
     force, lateral = 10.0 * wind * abs(wind), MASS * speed**2 * curvature
-    rear = -7.0e4 * friction * (slip - REAR * curvature)
+    grip = friction if car is kinematic else 1.0
+    rear = -7.0e4 * grip * (slip - REAR * curvature)
     front = lateral - force - rear
     assert float(FRONT * front - REAR * rear + LEVER * force) == pytest.approx(
         0.0, abs=1e-6
@@ -43,7 +45,8 @@ def test_below_the_limit_the_front_tyre_follows_the_linear_law(friction, wind):
     )
     slip, curvature = np.arctan2(rate[1], rate[0]), rate[2] / speed
     force = 10.0 * env[1] * abs(env[1])
-    rear = -7.0e4 * friction * (slip - REAR * curvature)
+    grip = friction if car is kinematic else 1.0
+    rear = -7.0e4 * grip * (slip - REAR * curvature)
     front = MASS * speed**2 * curvature - force - rear
     law = -6.0e4 * friction * (slip + FRONT * curvature - steering)
     assert float(front) == pytest.approx(float(law), rel=1e-4)
@@ -87,3 +90,22 @@ def test_the_nominal_bicycle_drives_its_circle_whatever_road_and_weather(hold):
     assert float(ends[0][2]) == pytest.approx(20.0 * curvature, rel=1e-10)
     chord = 2.0 / curvature * np.sin(10.0 * curvature)
     assert float(jnp.linalg.norm(ends[0][:2])) == pytest.approx(abs(chord), rel=1e-3)
+
+
+def test_with_stiff_tyres_friction_is_felt_at_the_limit_alone():
+    """A gentle turn is the same on ice, a sharp one is not; with stiffnesses in
+    proportion to friction both differ.
+    """
+
+    def curvature(car, steering, friction):
+        state = jnp.array([0.0, 0.0, 0.0, 10.0])
+        env = jnp.array([friction, 0.0])
+        return float(car().derivative(state, jnp.array([steering, 0.0]), env)[2])
+
+    def change(car, steering):
+        return curvature(car, steering, 0.3) / curvature(car, steering, 0.9) - 1.0
+
+    assert (
+        abs(change(kinematic_stiff, 1e-4)) < 1e-4 < 0.05 < abs(change(kinematic, 1e-4))
+    )
+    assert change(kinematic_stiff, 0.2) < -0.3

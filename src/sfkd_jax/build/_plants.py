@@ -12,6 +12,7 @@ from sfkd_jax.types import Control, Model, Reference, Space, State
 
 PLANTS = {
     "kinematic": vehicle.kinematic,
+    "kinematic_stiff": vehicle.kinematic_stiff,
     "dynamic": vehicle.dynamic,
     "own": vehicle.own,
 }

@@ -79,7 +79,9 @@ def _vehicles() -> dict[str, type]:
             "VehicleConfig", settings.Loop, settings.OwnStep, plant
         )
         if name == "own"
-        else schema("VehicleConfig", settings.Loop, plant)
+        else schema(
+            "VehicleConfig", settings.Loop, plant, skip=("stiffness_by_friction",)
+        )
         for name, plant in build.PLANTS.items()
     }
 

@@ -103,7 +103,7 @@ class Protocol(NamedTuple):
         episodes: per system.
         episode_s: [s].
         seed: of roads, environments, sensor noise and samplers.
-        systems: "self" and reference systems.
+        systems: "self" and reference systems; none: `train` trains alone.
         observation_noise: standard deviations of p_x, p_y [m], yaw [rad], v, v_y [m/s],
             yaw rate [rad/s], steering [rad]; by default of a satellite and inertial
             unit of survey grade.
@@ -117,7 +117,11 @@ class Protocol(NamedTuple):
     episodes: int = 8
     episode_s: _Seconds = 60.0
     seed: NonNegativeInt = 2026
-    systems: tuple[str, ...] = ("self", "nominal", "oracle")
+    systems: Annotated[tuple[str, ...], Entries(least=0)] = (
+        "self",
+        "nominal",
+        "oracle",
+    )
     observation_noise: Numbers = (0.015, 0.015, 0.002, 0.03, 0.02, 0.002, 0.001)
     timed_steps: NonNegativeInt = 50
     side_forces: Numbers = ()
@@ -138,7 +142,9 @@ class Comparison(NamedTuple):
     vehicles: Names
     seeds: Annotated[tuple[NonNegativeInt, ...], Entries(least=0)]
     only: Names
+    untrained: Names
     rows: _Overrides
+    tuned: dict[str, dict[str, str]]
     variations: _Overrides
     paper: dict[str, Any]
     page: dict[str, Any]

@@ -1,4 +1,4 @@
-"""ICODE: a neural ODE with rates affine in control and environment."""
+"""ICODE: a neural ODE with rates affine in its inputs."""
 
 from __future__ import annotations
 
@@ -35,15 +35,22 @@ def _(primals: tuple[Array], tangents: tuple[Array]) -> tuple[Array, Array]:
     return softplus(*primals), nn.sigmoid(*primals) * tangents[0]
 
 
+AFFINE_IN = ("both", "env", "control")
+
+
 def affine_rates(
     space: Space,
     hidden: Sequence[int],
     activations: Sequence[Callable[[Array], Array]],
     *,
     last: float,
-    reads_env: bool = False,
+    affine_in: str = "both",
 ) -> tuple[Callable[[Key], Params], Callable[[Conditioned, Array, Control], Array]]:
-    """Return `init` and `rates` of a model with rates f(s) + G(s) [u; e].
+    """Return `init` and `rates` of a model whose rates are affine in its inputs.
+
+        "both":     f(s) + G(s) [u; e]
+        "env":      f(s, u) + G(s, u) e
+        "control":  f(s, e) + G(s, e) u
 
     f and G are two networks of the same hidden layers.
 
@@ -52,13 +59,29 @@ def affine_rates(
         hidden: widths of the hidden layers of f and of G.
         activations: the activation after each hidden layer.
         last: initial scale of both last layers.
-        reads_env: f(s, e) + G(s, e) u instead, affine in the control alone.
+        affine_in: the input that enters affinely, as above.
+
+    Raises:
+        ValueError: another `affine_in`.
     """
-    body, control, env = (
-        part.shape[0] for part in (space.body_mean, space.control_mean, space.env_mean)
-    )
-    outputs, inputs = 3 + body, control + (0 if reads_env else env)
-    start = jnp.zeros(body + (env if reads_env else 0))
+    if affine_in not in AFFINE_IN:
+        raise ValueError(
+            f"model.affine_in must be one of {', '.join(AFFINE_IN)}, got {affine_in!r}"
+        )
+    zeros = {
+        "body": jnp.zeros_like(space.body_mean),
+        "control": jnp.zeros_like(space.control_mean),
+        "env": jnp.zeros_like(space.env_mean),
+    }
+    driving = ("control", "env") if affine_in == "both" else (affine_in,)
+    reading = tuple(name for name in zeros if name not in driving)
+
+    def joined(names: tuple[str, ...], parts: dict[str, Array]) -> Array:
+        return jnp.concatenate([parts[name] for name in names])
+
+    start = joined(reading, zeros)
+    inputs = joined(driving, zeros).shape[0]
+    outputs = 3 + space.body_mean.shape[0]
     f = mlp(hidden, outputs, activations, last=last)
     G = mlp(hidden, outputs * inputs, activations, last=last)
 
@@ -72,13 +95,13 @@ def affine_rates(
     def rates(
         fiber: Conditioned, body: Float[Array, " body"], control: Control
     ) -> Float[Array, " rates"]:
-        read = jnp.concatenate([body, fiber.env]) if reads_env else body
-        driven = control if reads_env else jnp.concatenate([control, fiber.env])
+        parts = {"body": body, "control": control, "env": fiber.env}
+        read = joined(reading, parts)
         free = cast(jax.Array, f.apply({"params": fiber.params["f"]}, read))
         gain = cast(jax.Array, G.apply({"params": fiber.params["G"]}, read)).reshape(
             outputs, inputs
         )
-        return free + gain @ driven
+        return free + gain @ joined(driving, parts)
 
     return init, rates
 
@@ -91,6 +114,7 @@ def icode(
     layers: int = 3,
     solver: str = "euler",
     environment: bool = True,
+    affine_in: str = "both",
 ) -> Model:
     """Input concomitant neural ODE: rates affine in control and environment.
 
@@ -107,17 +131,21 @@ def icode(
         width: of the hidden layers of f and of G.
         layers: number of hidden layers of f and of G.
         solver: "euler" or "rk4".
-        environment: whether e is used; if not, G(s) [u; 0].
+        environment: whether e is used; if not, e is 0.
+        affine_in: "both" as above; "env" for f(s, u) + G(s, u) e, where e is what the
+            paper calls an extrinsic input; "control" for f(s, e) + G(s, e) u.
 
     Raises:
-        ValueError: no hidden layer.
+        ValueError: no hidden layer, or another `affine_in`.
 
     Source: Li et al., arXiv 2411.13914.
     """
     if layers < 1:
         raise ValueError(f"model.layers must be at least 1, got {layers}")
     activations = (nn.tanh, *(softplus,) * (layers - 1))
-    init, rates = affine_rates(space, (width,) * layers, activations, last=0.1)
+    init, rates = affine_rates(
+        space, (width,) * layers, activations, last=0.1, affine_in=affine_in
+    )
     return continuous(
         space,
         dt=dt,

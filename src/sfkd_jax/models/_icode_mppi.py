@@ -14,7 +14,7 @@ def icode_mppi(
     dt: float = 0.1,
     hidden: tuple[int, ...] = (64, 64),
     environment: bool = True,
-    reads_env: bool = False,
+    affine_in: str = "both",
 ) -> Model:
     """Known dynamics plus a residual f(s) + G(s) [u; e], the sum solved by RK4 at dt.
 
@@ -31,15 +31,18 @@ def icode_mppi(
             gives it the centre of the environment box.
         dt: sampling period [s], the solver's step in training and in use.
         hidden: widths of f and of G.
-        environment: whether e is used; if not, G(s) [u; 0].
-        reads_env: f(s, e) + G(s, e) u instead, so that the gain of the steering may
-            depend on friction. The original has less; a residual affine in the control
-            cannot have more.
+        environment: whether e is used; if not, e is 0.
+        affine_in: "both" as above; "env" for f(s, u) + G(s, u) e, the extrinsic input
+            of ICODE; "control" for f(s, e) + G(s, e) u, so that the gain of the
+            steering may depend on friction.
+
+    Raises:
+        ValueError: another `affine_in`.
 
     Source: Song et al., arXiv 2605.03260, eqs. 10 and 11.
     """
     init, rates = affine_rates(
-        space, hidden, (softplus,) * len(hidden), last=1e-3, reads_env=reads_env
+        space, hidden, (softplus,) * len(hidden), last=1e-3, affine_in=affine_in
     )
 
     def known(fiber: Conditioned, state: State, control: Control) -> State:

@@ -42,19 +42,22 @@ def list_cells(comparison: dict[str, Any]) -> list[Cell]:
     """Return all cells in the order of evaluation; those of one system are adjacent.
 
     Raises:
-        ValueError: `only` names an unknown row.
+        ValueError: `only` or `untrained` names an unknown row.
     """
     rows, only = comparison["rows"], comparison["only"]
-    if unknown := set(only) - set(rows):
-        raise ValueError(
-            f"unknown comparison.only {', '.join(sorted(unknown))}; "
-            f"choose of {', '.join(rows) or 'none'}"
-        )
+    for name in ("only", "untrained"):
+        if unknown := set(comparison[name]) - set(rows):
+            raise ValueError(
+                f"unknown comparison.{name} {', '.join(sorted(unknown))}; "
+                f"choose of {', '.join(rows) or 'none'}"
+            )
     labels = [label for label in rows if label in (only or rows)]
     cells = []
     for vehicle, seed, label in itertools.product(
         comparison["vehicles"], comparison["seeds"], labels
     ):
+        if label in comparison["untrained"] and seed != comparison["seeds"][0]:
+            continue
         for common, scenarios in comparison["controllers"].items():
             own = comparison["own_controllers"].get(label, {}).get(common, common)
             varied = itertools.product(
@@ -100,6 +103,7 @@ def take_share(groups: list[list[Cell]], share: list[int] | None) -> list[list[C
 def overrides(cell: Cell, comparison: dict[str, Any]) -> list[str]:
     """Return the overrides of a cell, beyond those of the command."""
     row = comparison["rows"][cell.label]
+    tuned = comparison["tuned"].get(cell.vehicle, {}).get(cell.label)
     variation = comparison["variations"][cell.variation]
     return [
         f"vehicle={cell.vehicle}",
@@ -107,6 +111,7 @@ def overrides(cell: Cell, comparison: dict[str, Any]) -> list[str]:
         f"controller={cell.controller}",
         f"seed={cell.seed}",
         *(row or "").split(),
+        *(tuned or "").split(),
         *(variation or "").split(),
     ]
 

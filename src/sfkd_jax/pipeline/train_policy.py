@@ -6,11 +6,13 @@ from functools import partial
 from typing import Any
 
 import jax
+import numpy as np
 
 from sfkd_jax import artefacts, build, policy
 from sfkd_jax.certification import contraction_metrics
 from sfkd_jax.core.folding import fold
 from sfkd_jax.datasets import (
+    SCENARIOS,
     Dataset,
     first_share,
     measure_space,
@@ -23,6 +25,8 @@ from sfkd_jax.training import fit, multi_step_loss
 from sfkd_jax.types import Key, Model, Params, Space, Trajectory
 
 STARTS = ("random", "identified")
+SCORED_SCENARIOS = ("s1", "s2")
+"""Of the validation drives that trainings are compared on: S3 stays unseen."""
 START = 1
 """Stream folded into the run's seed; initial weights and windows use stream 0."""
 
@@ -68,6 +72,9 @@ def train_policy(settings: dict[str, Any], dataset: Dataset, data_hash: str) -> 
         settings["vehicle"]["dt"],
         _baselines(settings, dataset, horizon),
     )
+    document["validation_score"] = _validation_score(
+        model, params, space, dataset, horizon
+    )
     artefacts.write_json(run_dir / "open_loop.json", document)
     recorded |= {"controller": settings["controller"], "experiment": settings["name"]}
     recorded |= {"space": build.space_to_settings(space), "best_step": best}
@@ -78,6 +85,25 @@ def train_policy(settings: dict[str, Any], dataset: Dataset, data_hash: str) -> 
         made_from={"dataset": data_hash},
         law=path_law.ensure_law(settings),
     )
+
+
+def _validation_score(
+    model: Model, params: Params, space: Space, dataset: Dataset, horizon: int
+) -> float:
+    """Prediction loss on validation drives of S1 and S2, or on all recorded ones.
+
+    Its weights are the defaults whatever was trained with, so that trainings with
+    different weights can be compared.
+    """
+    held_out = dataset.validation
+    if dataset.scenarios is not None:
+        wanted = [SCENARIOS.index(name) for name in SCORED_SCENARIOS]
+        rows = np.isin(dataset.scenarios["validation"], wanted)
+        held_out = jax.tree.map(lambda leaf: leaf[rows], held_out)
+    score = multi_step_loss(
+        model, space, consistency=0.0, reconstruction=0.0, transport=0.0
+    )
+    return float(jax.jit(score)(params, spread_windows(held_out, length=horizon))[0])
 
 
 def _baselines(

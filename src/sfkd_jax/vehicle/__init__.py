@@ -4,9 +4,11 @@ from sfkd_jax.vehicle._along_path import along_path as along_path
 from sfkd_jax.vehicle._dynamic import dynamic as dynamic
 from sfkd_jax.vehicle._integrators import rk4 as rk4
 from sfkd_jax.vehicle._kinematic import kinematic as kinematic
+from sfkd_jax.vehicle._kinematic import kinematic_stiff as kinematic_stiff
 from sfkd_jax.vehicle._own import check_step as check_step
 from sfkd_jax.vehicle._own import own as own
 from sfkd_jax.vehicle._own import step_named as step_named
 from sfkd_jax.vehicle._vehicle import Vehicle as Vehicle
 from sfkd_jax.vehicle._vehicle import equivalent_wind as equivalent_wind
+from sfkd_jax.vehicle._vehicle import side_force as side_force
 from sfkd_jax.vehicle._vehicle import with_speed_loop as with_speed_loop

@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import functools
+from typing import Any
+
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
@@ -39,11 +42,12 @@ def kinematic(
     wind_lever: Real = 0.4,
     drag: float = 0.4,
     rolling: float = 0.012,
+    stiffness_by_friction: bool = True,
 ) -> Vehicle:
     """Bicycle with friction saturation and quasi-steady side wind.
 
     x = (p_x, p_y, yaw, v), p the centre of mass. With F = c_w w|w| and axle stiffnesses
-    C = c μ, the steady single track turns with curvature
+    C = c μ, or C = c, the steady single track turns with curvature
 
         κ° = (tan δ + γ F) / (L + K v²),   K = m (l_r/C_f − l_f/C_r) / L,
         γ  = ((l_r + l_w)/C_f − (l_f − l_w)/C_r) / L,
@@ -70,6 +74,8 @@ def kinematic(
         wind_lever: l_w, how far ahead of the centre of mass the side force acts [m].
         drag: ρ C_d A / 2 [N s²/m²].
         rolling: rolling resistance coefficient [-].
+        stiffness_by_friction: whether C = c μ; if not, friction enters by saturation
+            alone.
     """
     length = front_length + rear_length
     bicycle = nominal_derivative(length, rear_length)
@@ -78,7 +84,8 @@ def kinematic(
         yaw, speed = state[2], state[3]
         steering, acceleration = control[0], control[1]
         friction, wind = env[0], env[1]
-        front, rear = front_stiffness * friction, rear_stiffness * friction
+        grip = friction if stiffness_by_friction else 1.0
+        front, rear = front_stiffness * grip, rear_stiffness * grip
         force = side_force(wind, wind_force=wind_force)
         understeer = mass / length * (rear_length / front - front_length / rear)
         push = (
@@ -107,7 +114,7 @@ def kinematic(
         )
 
     return Vehicle(
-        name="kinematic",
+        name="kinematic" if stiffness_by_friction else "kinematic_stiff",
         dt=dt,
         wheelbase=length,
         state_names=("p_x", "p_y", "yaw", "v"),
@@ -119,3 +126,16 @@ def kinematic(
         control_high=(STEERING_LIMIT, ACCELERATION_RANGE[1]),
         wind_force=wind_force,
     )
+
+
+@functools.wraps(kinematic, assigned=("__annotations__",))
+def kinematic_stiff(**settings: Any) -> Vehicle:
+    """Return `kinematic` with stiffnesses that do not depend on friction.
+
+    Friction then limits forces and does not scale the effect of the steering, which a
+    model that is affine in (u, e) can represent below saturation.
+
+    Args:
+        settings: of `kinematic`, stiffnesses in N/rad.
+    """
+    return kinematic(**settings, stiffness_by_friction=False)

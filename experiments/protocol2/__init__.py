@@ -1,0 +1,1 @@
+"""The protocol sfkd-bench-2."""
