@@ -45,8 +45,7 @@ def test_below_the_limit_the_front_tyre_follows_the_linear_law(friction, wind):
     )
     slip, curvature = np.arctan2(rate[1], rate[0]), rate[2] / speed
     force = 10.0 * env[1] * abs(env[1])
-    grip = friction if car is kinematic else 1.0
-    rear = -7.0e4 * grip * (slip - REAR * curvature)
+    rear = -7.0e4 * friction * (slip - REAR * curvature)
     front = MASS * speed**2 * curvature - force - rear
     law = -6.0e4 * friction * (slip + FRONT * curvature - steering)
     assert float(front) == pytest.approx(float(law), rel=1e-4)
