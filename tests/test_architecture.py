@@ -65,7 +65,7 @@ THIRD_PARTY = {
     "control": {"flax"},
     "training": {"optax", "orbax", "tensorboardX", "rich"},
     "certification": {"numpy", "scipy", "threadpoolctl", "cvxpy", "clarabel"},
-    "evaluation": {"numpy"},
+    "evaluation": {"numpy", "scipy"},
     "reporting": {"numpy", "matplotlib"},
     "policy": {"numpy"},
     "corridor": {"numpy"},

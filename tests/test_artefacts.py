@@ -4,6 +4,7 @@ import json
 import os
 import pickle
 import random
+import shutil
 import signal
 import subprocess
 import sys
@@ -11,13 +12,14 @@ import textwrap
 import time
 from pathlib import Path
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
 from helpers import largest_file
 
 from sfkd_jax import artefacts
-from sfkd_jax.artefacts import ArtefactError
+from sfkd_jax.artefacts import ArtefactError, _provenance, provenance, source_hash
 
 CONFIG = {
     "model": {"rank": 16, "layers": [32, 32]},
@@ -640,3 +642,33 @@ def test_a_log_on_a_full_disk_keeps_its_lines(tmp_path, monkeypatch):
     assert names(tmp_path) == ["metrics.jsonl"]
     artefacts.append_jsonl(log, {"step": 1})
     assert artefacts.read_jsonl(log) == [{"step": 0}, {"step": 1}]
+
+
+def test_the_source_hash_is_that_of_paths_and_contents(tmp_path, monkeypatch):
+    def hashed(**files):
+        shutil.rmtree(tmp_path)
+        for name, text in files.items():
+            file = tmp_path / f"{name.replace('_in_', '/')}.py"
+            file.parent.mkdir(parents=True, exist_ok=True)
+            file.write_text(text)
+        source_hash.cache_clear()
+        return source_hash()
+
+    monkeypatch.setattr(_provenance, "PACKAGE", tmp_path)
+    first = hashed(a="x", b_in_c="y")
+    assert first == hashed(b_in_c="y", a="x")
+    changed = {
+        hashed(a="x", b_in_c="z"),
+        hashed(a="y", b_in_c="x"),
+        hashed(a="x", b="y"),
+    }
+    assert len(changed | {first}) == 4
+    source_hash.cache_clear()
+
+
+def test_provenance_names_the_code_the_device_and_the_commit_of_a_checkout():
+    about = provenance()
+    assert about["source"] == source_hash()
+    assert about["device"].startswith(jax.default_backend())
+    checkout = (Path(_provenance.PACKAGE).parents[1] / ".git").exists()
+    assert (about["commit"] is not None) == checkout

@@ -518,6 +518,40 @@ def test_the_tables_of_adaptation_are_those_of_its_runs():
         assert table() in text, name
 
 
+def test_the_prose_of_adaptation_is_true_of_its_runs():
+    cases = {name: adaptation_page.measured(name) for name in adaptation_page.VEHICLES}
+
+    def ratio(vehicle, case, row="SFKD, adaptive", over="oracle that knows"):
+        rows = cases[vehicle][case]
+        return rows[row]["rmse_mm"] / rows[over]["rmse_mm"]
+
+    for vehicle in cases:
+        rows = cases[vehicle]["force, 3 s"]
+        blind, own, best = (
+            rows[row]["rmse_mm"]
+            for row in ("SFKD", "SFKD, adaptive", "oracle that knows")
+        )
+        assert (blind - own) / (blind - best) > 0.8
+        for case in ("mass + 30 %", "steering + 1 degree", "wheelbase + 5 %"):
+            assert ratio(vehicle, case) <= 1.2
+    assert round(ratio("dynamic", "stiffness - 30 %"), 2) == 1.25
+    assert ratio("kinematic", "stiffness - 30 %") < 1.0
+    bounds = {}
+    for vehicle in cases:
+        file = ROOT / f"benchmarks/quality/estimation_bound_{vehicle}.json"
+        driven = json.loads(file.read_text())["rmse_mm"]
+        wrong, right = (
+            driven["oracle, e as wrong as the bound"],
+            driven["oracle, e measured"],
+        )
+        bounds[vehicle] = round(wrong / right, 2)
+    assert bounds == {"kinematic": 1.46, "dynamic": 1.05}
+    for vehicle, leave in {"kinematic": 1, "dynamic": 0}.items():
+        rows = cases[vehicle][adaptation_page.FRICTION]
+        assert rows["oracle told late, cautious"]["left_the_lane"] == leave
+    assert rows["SFKD, adaptive, cautious"]["left_the_lane"] == 0
+
+
 def test_the_table_of_the_long_drive_is_that_of_its_run():
     """Every leg is there, and none failed at what is asked of all."""
     result = json.loads((ROOT / "benchmarks/robustness/soak.json").read_text())

@@ -5,7 +5,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from sfkd_jax.artefacts import write_json
+from sfkd_jax.artefacts import source_hash, write_json
 from sfkd_jax.pipeline import grid
 
 PLAN = {
@@ -232,3 +232,14 @@ def test_every_row_belongs_to_exactly_one_share():
     assert grid.take_share(groups, None) == groups
     with pytest.raises(ValueError, match=r"comparison\.share"):
         grid.take_share(groups, [3, 3])
+
+
+def test_cells_of_other_code_are_used_and_announced(tmp_path, capsys):
+    cells = grid.list_cells(PLAN)[:2]
+    for cell, source in zip(cells, (source_hash(), "another"), strict=True):
+        path = grid.cell_path(cell, settings(tmp_path))
+        path.parent.mkdir(parents=True, exist_ok=True)
+        entry = row("icode", 1.0, 0) | {"provenance": {"source": source}}
+        write_json(rows_file(path), {"row": entry, "made_with": "now"})
+    assert len(grid.collect_rows(cells, settings(tmp_path), lambda cell: "now")) == 2
+    assert "1 cells were made by other code" in capsys.readouterr().err

@@ -1,4 +1,4 @@
-"""Write the tables of docs/adaptation.md from what benchmarks/quality/adaptation.py measured.
+"""Write the tables of docs/adaptation.md from measurements in benchmarks/quality.
 
 python -m benchmarks.quality.adaptation_page
 """
@@ -35,8 +35,7 @@ VEHICLES = ("kinematic", "dynamic")
 
 def measured(name):
     """The cases of a vehicle."""
-    file = ROOT / f"benchmarks/quality/adaptation_{name}.json"
-    return json.loads(file.read_text())["cases"]
+    return _stored(f"adaptation_{name}")["cases"]
 
 
 def errors(name):
@@ -81,8 +80,14 @@ def coverage(name):
     heads += ["radius 10 ahead [m]", "largest error [mm]"]
     heads += ["slower: speed [m/s]", "slower: largest error [mm]"]
     lines = _head([name, *heads])
-    for case, rows in measured(name).items():
-        own, slow = rows["SFKD, adaptive"], rows.get("SFKD, adaptive, slower")
+    cases = measured(name)
+    given = {
+        case: (rows["SFKD, adaptive"], rows.get("SFKD, adaptive, slower"))
+        for case, rows in cases.items()
+    }
+    careful = cases[FRICTION]["SFKD, e estimated, cautious"]
+    given[f"{FRICTION}; e estimated, cautious"] = careful, None
+    for case, (own, slow) in given.items():
         cells = [f"{100 * own['coverage'][lead]:.1f} %" for lead in LEADS]
         cells.append(f"{own['tube_m']['10']:.3f}")
         cells.append(f"{max(own['largest_mm']):.0f}")
@@ -92,7 +97,24 @@ def coverage(name):
     return "\n".join(lines)
 
 
+def information(name):
+    """Errors of estimated friction and force after a switch, beside their bound."""
+    document = _stored(f"estimation_bound_{name}")
+    rows = document["errors"]
+    steps = list(rows["bound"])
+    head = [f"{name}: friction / side force [N], steps after a switch", *steps]
+    lines = _head([*head, "lateral RMSE [mm]"])
+    driven = document["rmse_mm"]
+    driven = driven | {"bound": driven["oracle, e as wrong as the bound"]}
+    for row, errors in rows.items():
+        cells = [f"{errors[at][0]:.2f} / {errors[at][1]:.0f}" for at in steps]
+        lines.append(_line([row, *cells, f"{driven[row]:.1f}"]))
+    exact = f"{driven['oracle, e measured']:.1f}"
+    return "\n".join([*lines, _line(["e measured", *["0 / 0"] * len(steps), exact])])
+
+
 KINDS = {
+    "information": information,
     "errors": errors,
     "rivals": rivals,
     "friction": friction,
@@ -112,6 +134,11 @@ def page(text):
         pattern = re.compile(rf"<!-- {name} -->\n.*?<!-- end -->", re.DOTALL)
         text = pattern.sub(f"<!-- {name} -->\n{build()}\n<!-- end -->", text)
     return text
+
+
+def _stored(name):
+    """A document of this folder."""
+    return json.loads((ROOT / f"benchmarks/quality/{name}.json").read_text())
 
 
 def _error(row, best):

@@ -7,7 +7,6 @@ from sfkd_jax.artefacts._content import differences as differences
 from sfkd_jax.artefacts._content import flatten as flatten
 from sfkd_jax.artefacts._content import sha256 as sha256
 from sfkd_jax.artefacts._content import unflatten as unflatten
-from sfkd_jax.artefacts._content import versions as versions
 from sfkd_jax.artefacts._drives import ROAD as ROAD
 from sfkd_jax.artefacts._drives import SHARED as SHARED
 from sfkd_jax.artefacts._drives import drive_name as drive_name
@@ -30,3 +29,6 @@ from sfkd_jax.artefacts._lines import truncate_jsonl as truncate_jsonl
 from sfkd_jax.artefacts._locks import DirectoryLocked as DirectoryLocked
 from sfkd_jax.artefacts._locks import locked as locked
 from sfkd_jax.artefacts._npz import read_npz as read_npz
+from sfkd_jax.artefacts._provenance import provenance as provenance
+from sfkd_jax.artefacts._provenance import source_hash as source_hash
+from sfkd_jax.artefacts._provenance import versions as versions

@@ -27,7 +27,7 @@ from typing import Any
 
 import numpy as np
 
-from sfkd_jax.artefacts._content import differences, plain, sha256, versions
+from sfkd_jax.artefacts._content import differences, plain, sha256
 from sfkd_jax.artefacts._files import (
     ArtefactError,
     encode,
@@ -38,6 +38,7 @@ from sfkd_jax.artefacts._files import (
     synchronise,
 )
 from sfkd_jax.artefacts._npz import PORTABLE, check_zip, members, write_npz
+from sfkd_jax.artefacts._provenance import versions
 
 FORMAT = 1
 """Version of the manifest; a reader refuses every other one."""

@@ -1,13 +1,11 @@
-"""Flatten trees, hash content, compare settings and list versions."""
+"""Flatten trees, hash content and compare settings."""
 
 from __future__ import annotations
 
 import hashlib
 import json
 import math
-import platform
 from collections.abc import Mapping, Sequence
-from importlib import import_module, metadata
 from pathlib import Path
 from typing import Any
 
@@ -98,17 +96,6 @@ def differences(old: Mapping[str, Any], new: Mapping[str, Any]) -> list[str]:
         elif isinstance(a, bool) != isinstance(b, bool) or plain(a) != plain(b):
             lines.append(f"{key} was {_short(a)}, is now {_short(b)}")
     return lines
-
-
-def versions() -> dict[str, str]:
-    """Return the versions of Python and of the packages that numbers depend on."""
-    installed = {"python": platform.python_version()}
-    for name in ("numpy", "jax", "sfkd_jax"):
-        try:
-            installed[name] = metadata.version(name)
-        except metadata.PackageNotFoundError:
-            installed[name] = import_module(name).__version__
-    return installed
 
 
 def plain(value: Any) -> Any:

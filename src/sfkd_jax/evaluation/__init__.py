@@ -24,7 +24,9 @@ from sfkd_jax.evaluation._rows import disturbed as disturbed
 from sfkd_jax.evaluation._rows import pool as pool
 from sfkd_jax.evaluation._rows import row as row
 from sfkd_jax.evaluation._rows import score as score
-from sfkd_jax.evaluation._statistics import bootstrap_mean as bootstrap_mean
+from sfkd_jax.evaluation._statistics import holm as holm
+from sfkd_jax.evaluation._statistics import mean_interval as mean_interval
+from sfkd_jax.evaluation._statistics import p_value as p_value
 from sfkd_jax.evaluation._statistics import paired_difference as paired_difference
 from sfkd_jax.evaluation._statistics import summary as summary
 from sfkd_jax.evaluation._violations import STRIDE as STRIDE

@@ -8,7 +8,7 @@ import numpy as np
 from jaxtyping import Float
 
 from sfkd_jax.evaluation._closed_loop import Episode
-from sfkd_jax.evaluation._statistics import paired_difference
+from sfkd_jax.evaluation._statistics import holm, paired_difference
 from sfkd_jax.evaluation.metrics import METRICS, PerEpisode, Recording, Row
 
 _ARRAYS = (
@@ -111,7 +111,7 @@ def compare(rows: list[dict[str, Any]]) -> list[dict[str, Any]]:
 
     A row without sampling (a quadratic program) is compared with rows that sample
     around feedback. Of several rows of a system, the one with the same controller and
-    planner is taken.
+    planner is taken. `p_holm` of the differences to SFKD is adjusted for all rows.
     """
     for entry in rows:
         same = [other for other in rows if _episodes(other) == _episodes(entry)]
@@ -121,7 +121,15 @@ def compare(rows: list[dict[str, Any]]) -> list[dict[str, Any]]:
             if other is None or (systems == _SFKD and other is entry):
                 continue
             entry[name] = measure(_by_seed(entry), _by_seed(other))
+    family = [entry["difference_to_sfkd"] for entry in rows if _has_p(entry)]
+    for record, p in zip(family, holm([one["p"] for one in family]), strict=True):
+        record["p_holm"] = p
     return rows
+
+
+def _has_p(entry: dict[str, Any]) -> bool:
+    """Whether a row was tested against SFKD."""
+    return (entry.get("difference_to_sfkd") or {}).get("p") is not None
 
 
 def _episodes(entry: dict[str, Any]) -> tuple[Any, ...]:
@@ -130,7 +138,7 @@ def _episodes(entry: dict[str, Any]) -> tuple[Any, ...]:
     return (
         *(entry[name] for name in names),
         entry["sampling"] or "feedback",
-        _by_seed(entry).shape,
+        _by_seed(entry).shape[1],
     )
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import shlex
+from collections import Counter
 from typing import Any
 
 from sfkd_jax.evaluation.formats import DASH, dig, is_number, number, plain
@@ -17,7 +18,7 @@ from sfkd_jax.reporting.tables import named_values
 def lead(results: dict[str, Any], setups: list[Setup], study: Study) -> str:
     """How much was simulated."""
     entries = [entry for setup in setups for entry in setup.entries]
-    rows = [row for entry in entries for row in entry.rows.values()]
+    rows = _rows(setups)
     vehicles = list(dict.fromkeys(setup.vehicle for setup in setups))
     plural = "s" if len(vehicles) != 1 else ""
     amount = text(
@@ -64,7 +65,37 @@ def provenance(results: dict[str, Any], setups: list[Setup]) -> list[Block]:
         named_values(("Group", "Settings"), _without_page(config)),
         Heading(3, "Versions"),
         Table(["Package", "Version"], packages, prose=True),
+        *_code(setups),
     ]
+
+
+def _code(setups: list[Setup]) -> list[Block]:
+    """Which code made how many rows; rows of earlier versions do not say."""
+    counts: Counter[tuple[str, ...]] = Counter()
+    for row in _rows(setups):
+        about = row.get("provenance")
+        if isinstance(about, dict):
+            counts[_made_by(about)] += 1
+    if not counts:
+        return []
+    head = ["Source", "Commit", "Version", "jax", "Device", "Rows"]
+    rows = [[*about, str(count)] for about, count in counts.most_common()]
+    return [Heading(3, "Code"), Table(head, rows, prose=True)]
+
+
+def _made_by(about: dict[str, Any]) -> tuple[str, ...]:
+    """Provenance of a row; "several" where its trainings differ."""
+    short = {"source": 12, "commit": 10}
+    return tuple(
+        str(about.get(key) or "several")[: short.get(key)]
+        for key in ("source", "commit", "version", "jax", "device")
+    )
+
+
+def _rows(setups: list[Setup]) -> list[Row]:
+    """The rows of all setups."""
+    entries = [entry for setup in setups for entry in setup.entries]
+    return [row for entry in entries for row in entry.rows.values()]
 
 
 def _counts(setup: Setup, scenario: str) -> list[str]:

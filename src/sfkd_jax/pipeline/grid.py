@@ -204,7 +204,8 @@ def write_cell(
     file = path.with_name(f"{path.name}.npz")
     artefacts.write_arrays(file, stored, kind=KIND, config=settings["scenario"])
     row = result.row | {
-        "arrays": str(file.relative_to(Path(settings["root"], settings["name"])))
+        "arrays": str(file.relative_to(Path(settings["root"], settings["name"]))),
+        "provenance": artefacts.provenance(),
     }
     artefacts.write_json(
         _row_file(path), {"row": row, "made_with": settings_hash(settings)}
@@ -221,7 +222,7 @@ def collect_rows(
 ) -> list[dict[str, Any]]:
     """Return the rows of all stored cells, with seeds pooled and systems compared.
 
-    Prints how many cells were made with other settings.
+    Prints how many cells were made with other settings, and how many by other code.
 
     Args:
         cells: of the comparison.
@@ -230,7 +231,7 @@ def collect_rows(
         older: also use cells that were made with other settings.
     """
     pooled: dict[Cell, list[dict[str, Any]]] = {}
-    others = []
+    others, by_other_code = [], []
     for cell in cells:
         path = _row_file(cell_path(cell, settings))
         if not path.exists():
@@ -240,12 +241,20 @@ def collect_rows(
         if not is_current:
             others.append(path)
         if older or is_current:
-            pooled.setdefault(cell._replace(seed=0), []).append(document["row"])
+            row = document["row"]
+            pooled.setdefault(cell._replace(seed=0), []).append(row)
+            if row.get("provenance", {}).get("source") != artefacts.source_hash():
+                by_other_code.append(path)
     if others:
         outcome = "used" if older else "left out; comparison.older=true uses them"
         artefacts.print_message(
             f"{len(others)} cells were made with other settings, "
             f"such as {others[0]}: {outcome}"
+        )
+    if by_other_code:
+        artefacts.print_message(
+            f"{len(by_other_code)} cells were made by other code, "
+            f"such as {by_other_code[0]}: used, and marked on the page"
         )
     return evaluation.compare([evaluation.pool(rows) for rows in pooled.values()])
 

@@ -12,7 +12,8 @@ from sfkd_jax.vehicle import Vehicle
 def load_systems(settings: dict[str, Any], plant: Vehicle) -> dict[str, build.System]:
     """Return the systems of `evaluation.systems` by name.
 
-    "self" is the policy of the run, which is trained if it is missing.
+    "self" is the policy of the run, which is trained if it is missing. With
+    `env_source=estimated` every system that reads e estimates it.
 
     Args:
         settings: of the run.
@@ -22,6 +23,13 @@ def load_systems(settings: dict[str, Any], plant: Vehicle) -> dict[str, build.Sy
         ValueError: an unknown system.
     """
     references = build.reference_systems(plant, path_law.ensure_law(settings))
+    if settings["env_source"] == "estimated":
+        references = {
+            name: system
+            if system.env_source == "none"
+            else system._replace(env_source="estimated")
+            for name, system in references.items()
+        }
     systems = {}
     for name in settings["evaluation"]["systems"]:
         if name == "self":

@@ -1,10 +1,10 @@
 """Tune every trained row of sfkd-bench-2 with one budget, on validation drives alone.
 
-python -m experiments.protocol2.tune [--vehicles dynamic --rows sfkd … --root runs]
+python -m benchmarks.quality.protocol2_tuning [--vehicles dynamic --rows sfkd … --root runs]
 A row has 8 trials of 1000 steps on each plant: its own settings, then seven that a
 scrambled Sobol sequence draws from `SPACES`. A trial is a run of +experiment=tune. The
 best prediction loss on validation drives of S1 and S2 wins; nothing is driven. Trials
-that are stored are not repeated. Writes trials/VEHICLE/ROW.json, and with --choose
+that are stored are not repeated. Writes protocol2_trials/VEHICLE/ROW.json, and with --choose
 conf/comparison/tuned.yaml from all of them.
 """
 
@@ -125,7 +125,7 @@ def composed(root, name, vehicle, row, overrides):
 
 def tune(root, vehicle, label, row):
     """Run the trials of a row that are missing, and write all of them."""
-    out = HERE / "trials" / vehicle / f"{label}.json"
+    out = HERE / "protocol2_trials" / vehicle / f"{label}.json"
     trials = json.loads(out.read_text())["trials"] if out.exists() else []
     space = space_of(composed(root, "any", vehicle, row, []))
     for number, overrides in list(enumerate(trials_of(space)))[len(trials) :]:
@@ -172,7 +172,7 @@ def chosen(document):
 def choose():
     """Write the best trials as the settings of the comparison."""
     tuned = {}
-    for file in sorted((HERE / "trials").glob("*/*.json")):
+    for file in sorted((HERE / "protocol2_trials").glob("*/*.json")):
         document = json.loads(file.read_text())
         if len(document["trials"]) < TRIALS:
             raise SystemExit(f"{file}: {len(document['trials'])} of {TRIALS} trials")

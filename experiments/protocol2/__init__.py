@@ -1,1 +1,0 @@
-"""The protocol sfkd-bench-2."""
