@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import functools
 import time
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -16,6 +17,7 @@ from sfkd_jax.pipeline.comparison import (
     ComposeCell,
     cached_episodes,
     evaluate_group,
+    rehearse_group,
 )
 from sfkd_jax.training import TrainingStopped
 
@@ -23,8 +25,9 @@ from sfkd_jax.training import TrainingStopped
 def run(settings: dict[str, Any]) -> dict[str, Any]:
     """Evaluate all cells that are not done, then collect, compare and draw all rows.
 
-    With `comparison.share` only this share of the rows is evaluated, and nothing is
-    collected.
+    Every row is rehearsed before the first one is trained; those that cannot be built
+    are named and left out. With `comparison.share` only this share of the rows is
+    evaluated, and nothing is collected.
     """
     began, comparison = time.perf_counter(), settings["comparison"]
     cells = grid.list_cells(comparison)
@@ -35,13 +38,20 @@ def run(settings: dict[str, Any]) -> dict[str, Any]:
     )
     compose_cell = functools.cache(functools.partial(_compose, comparison=comparison))
     make_episodes = cached_episodes()
-    done, failed = 0, {}
-    for number, group in enumerate(groups, 1):
+    failed: dict[str, str] = {}
+
+    def attempt(work: Callable[..., Any], group: list[grid.Cell]) -> Any:
         try:
-            done += evaluate_group(group, comparison, compose_cell, make_episodes)
+            return work(group, comparison, compose_cell, make_episodes)
         except (TrainingStopped, ValueError, artefacts.ArtefactError) as reason:
             failed["/".join(map(str, group[0][:4]))] = str(reason)
             artefacts.print_message(f"failed: {reason}")
+            return 0
+
+    groups = [group for group in groups if attempt(rehearse_group, group) is None]
+    done = 0
+    for number, group in enumerate(groups, 1):
+        done += attempt(evaluate_group, group)
         if done:
             _print_estimate(number, len(groups), time.perf_counter() - began)
     if comparison["share"] is not None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import sys
 import warnings
 from collections.abc import Mapping
 from functools import lru_cache
@@ -117,12 +118,13 @@ def restore(path: str | Path) -> TrainedModel:
 
     Raises:
         ArtefactError: missing, truncated, foreign, changed since it was written, saved
-            with settings that this version does not have, or weights that are not
-            finite or do not fit the model.
+            with settings that this version does not have, weights that are not finite
+            or do not fit the model, or a model of a module that is not imported.
     """
     file = _file(path)
     arrays, manifest = artefacts.read_arrays(file, kind=KIND)
     settings = manifest["config"]
+    _refuse_unknown_code(file, settings)
     version = str(manifest.get("versions", {}).get("sfkd_jax", "unknown"))
     with artefacts.as_artefact_error(
         file.with_suffix(".json"), ValueError, advice=_advice(version)
@@ -252,6 +254,17 @@ def _build(settings: str) -> tuple[Vehicle, Model]:
 def _file(path: str | Path) -> Path:
     """Return policy.npz of a run directory, or the file itself."""
     return Path(path) if Path(path).suffix == ".npz" else Path(path) / "policy.npz"
+
+
+def _refuse_unknown_code(file: Path, settings: Any) -> None:
+    """Raise an ArtefactError where a file names code that the caller did not import."""
+    model = settings.get("model") if isinstance(settings, Mapping) else None
+    factory = model.get("factory") if isinstance(model, Mapping) else None
+    module = str(factory).partition(":")[0]
+    if factory is not None and module not in sys.modules:
+        raise artefacts.ArtefactError(
+            f"{file}: its model is {factory}: import {module} first, if you trust it"
+        )
 
 
 def _advice(version: str) -> str:

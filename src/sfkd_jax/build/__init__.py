@@ -10,6 +10,7 @@ from sfkd_jax.build._planners import PLANNERS as PLANNERS
 from sfkd_jax.build._planners import Planner as Planner
 from sfkd_jax.build._planners import controller_horizon as controller_horizon
 from sfkd_jax.build._plants import INNER_LOOPS as INNER_LOOPS
+from sfkd_jax.build._plants import MODELS as MODELS
 from sfkd_jax.build._plants import PLANTS as PLANTS
 from sfkd_jax.build._plants import build_driver as build_driver
 from sfkd_jax.build._plants import build_model as build_model

@@ -16,6 +16,8 @@ PLANTS = {
     "dynamic": vehicle.dynamic,
     "own": vehicle.own,
 }
+MODELS = models.FACTORIES | {"own": models.own}
+"""Models of settings: those of the package, and one from outside by name."""
 INNER_LOOPS = ("none", "speed")
 
 
@@ -57,7 +59,7 @@ def build_model(settings: Settings, space: Space, plant: vehicle.Vehicle) -> Mod
     Raises:
         ValueError: an unknown model, or arguments that its factory refuses.
     """
-    factory = choose(models.FACTORIES, settings["name"], "model")
+    factory = choose(MODELS, settings["name"], "model")
     priors = {"dt": plant.dt, "nominal": plant.nominal_derivative}
     prior = {
         name: value

@@ -13,7 +13,6 @@ from sfkd_jax import (
     datasets,
     evaluation,
     exporting,
-    models,
     scenarios,
     training,
 )
@@ -115,7 +114,7 @@ def _models() -> dict[str, type]:
     given = ("dt", "nominal")
     return {
         f"{name}_schema": schema("ModelConfig", settings.Named, factory, skip=given)
-        for name, factory in models.FACTORIES.items()
+        for name, factory in build.MODELS.items()
     }
 
 

@@ -18,6 +18,7 @@ from sfkd_jax.scenarios import (
     family,
     project,
     reference_window,
+    smooth_path,
     switching_road,
     uniform_road,
     wet_road,
@@ -33,7 +34,9 @@ BURN_IN = 10
 """Steps simulated before a segment starts, so that slip, yaw rate and steering have
 settled.
 """
-PATH = {"peak_curvature": 0.025, "wavelengths": (60.0, 240.0)}
+ROADS = partial(
+    smooth_path, length=150.0, peak_curvature=0.025, wavelengths=(60.0, 240.0)
+)
 """Paths for training: other wavelengths and a wider range of curvature than those of
 the benchmark.
 """
@@ -170,10 +173,9 @@ def _segment(
     )
     sample = family(
         conditions,
-        length=150.0,
+        ROADS,
         speed=10.0,
         state_size=len(vehicle.state_names),
-        **PATH,
     )
     scenario: Scenario = sample(road_key)._replace(speed=speed)
     logs = jnp.log(excitation)

@@ -5,6 +5,7 @@ from sfkd_jax.models._icode import icode as icode
 from sfkd_jax.models._icode_mppi import icode_mppi as icode_mppi
 from sfkd_jax.models._koopman import koopman as koopman
 from sfkd_jax.models._neural_ode import neural_ode as neural_ode
+from sfkd_jax.models._own import own as own
 from sfkd_jax.models._physics import physics as physics
 from sfkd_jax.models._r2dn import r2dn as r2dn
 from sfkd_jax.models._state_model import state_model as state_model

@@ -42,6 +42,34 @@ def cached_episodes() -> MakeEpisodes:
     return make_episodes
 
 
+def rehearse_group(
+    group: list[grid.Cell],
+    comparison: dict[str, Any],
+    compose_cell: ComposeCell,
+    make_episodes: MakeEpisodes,
+) -> None:
+    """Build what the cells of one row need that are not done, without training.
+
+    Args:
+        group: of `grid.group_cells`.
+        comparison: its settings.
+        compose_cell: for the settings of a cell.
+        make_episodes: of `cached_episodes`.
+
+    Raises:
+        ValueError: settings that cannot be built.
+    """
+    for cell in group:
+        settings = compose_cell(cell)
+        if grid.is_done(grid.cell_path(cell, settings), settings):
+            continue
+        plant = build.build_vehicle(settings["vehicle"])
+        make_episodes(settings, plant)
+        run_settings = _run_settings(cell, comparison, compose_cell)
+        if "self" in settings["evaluation"]["systems"]:
+            dry_run.check_settings(run_settings, plant)
+
+
 def evaluate_group(
     group: list[grid.Cell],
     comparison: dict[str, Any],
@@ -73,7 +101,6 @@ def evaluate_group(
         if grid.is_done(path, settings):
             continue
         plant = build.build_vehicle(settings["vehicle"])
-        # The scenario is checked before anything is trained.
         episodes = make_episodes(settings, plant)
         key = grid.compilation_key(run_settings)
         if key not in evaluators:
@@ -101,7 +128,6 @@ def _compile_evaluator(
 ) -> evaluate_system.Evaluator:
     """Compile the only system of a row; train and certify it first if it learns."""
     if "self" in settings["evaluation"]["systems"]:
-        dry_run.check_settings(settings, plant)
         certificates.ensure_certificate(settings)
     ((name, system),) = systems.load_systems(settings, plant).items()
     return evaluate_system.compile_system(

@@ -11,6 +11,7 @@ import jax
 import jax.numpy as jnp
 
 from sfkd_jax import artefacts, build, policy
+from sfkd_jax.core.named import imported
 from sfkd_jax.datasets import (
     SCENARIOS,
     Columns,
@@ -163,6 +164,8 @@ def ensure_policy(settings: dict[str, Any]) -> policy.TrainedModel:
         ValueError: the logs are too few for the levels of the certificate.
     """
     run_dir = store.run_directory(settings)
+    if factory := settings["model"].get("factory"):
+        imported(factory, "model.factory")
     if not artefacts.exists(run_dir / "policy.npz"):
         if store.is_logged(settings):
             _check_calibration_size(settings)

@@ -1,4 +1,4 @@
-"""Driving scenarios: paths, environment schedules, and the families S1, S2, S3."""
+"""Driving scenarios: paths, environment schedules, S1 to S3, and manoeuvres."""
 
 from sfkd_jax.scenarios._conditions import gusts as gusts
 from sfkd_jax.scenarios._conditions import held_road as held_road
@@ -8,7 +8,10 @@ from sfkd_jax.scenarios._conditions import steady_road as steady_road
 from sfkd_jax.scenarios._conditions import switching_road as switching_road
 from sfkd_jax.scenarios._conditions import uniform_road as uniform_road
 from sfkd_jax.scenarios._conditions import wet_road as wet_road
+from sfkd_jax.scenarios._manoeuvres import MANOEUVRES as MANOEUVRES
+from sfkd_jax.scenarios._manoeuvres import Manoeuvre as Manoeuvre
 from sfkd_jax.scenarios._paths import Path as Path
+from sfkd_jax.scenarios._paths import pace_at as pace_at
 from sfkd_jax.scenarios._paths import path_from_curvature as path_from_curvature
 from sfkd_jax.scenarios._paths import path_through as path_through
 from sfkd_jax.scenarios._paths import point_at as point_at

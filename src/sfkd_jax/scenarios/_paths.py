@@ -18,10 +18,13 @@ class Path(NamedTuple):
         points: x [m], y [m], yaw [rad], curvature [1/m] at s = 0, h, 2h, …, shape
             (point, 4).
         spacing: h [m].
+        pace: share of the scenario's speed to hold at each point, (point,); None to
+            hold all of it.
     """
 
     points: Float[Array, "point 4"]
     spacing: Scalar
+    pace: Float[Array, " point"] | None = None
 
 
 def smooth_path(
@@ -143,10 +146,26 @@ def project(
 def reference_window(
     path: Path, s: Scalar, speed: Scalar, *, dt: float, horizon: int
 ) -> Reference:
-    """Return the next points at the given speed: x, y, yaw, speed, (horizon, 4)."""
-    ahead = s + speed * dt * jnp.arange(1, horizon + 1)
+    """Return the next points at the path's pace: x, y, yaw, speed, (horizon, 4)."""
+    if path.pace is None:
+        ahead = s + speed * dt * jnp.arange(1, horizon + 1)
+    else:
+
+        def advance(s: Scalar, _: None) -> tuple[Scalar, Scalar]:
+            s = s + speed * pace_at(path, s) * dt
+            return s, s
+
+        _, ahead = jax.lax.scan(advance, s, length=horizon)
     points = jax.vmap(point_at, in_axes=(None, 0))(path, ahead)
-    return points.at[:, 3].set(speed)
+    return points.at[:, 3].set(speed * pace_at(path, ahead))
+
+
+def pace_at(path: Path, s: Float[Array, "*batch"]) -> Float[Array, "*batch"]:
+    """Return the share of the scenario's speed to hold at arc lengths s [m]."""
+    if path.pace is None:
+        return jnp.ones_like(s)
+    along = jnp.arange(path.pace.shape[0]) * path.spacing
+    return jnp.interp(s, along, path.pace)
 
 
 def _offsets(

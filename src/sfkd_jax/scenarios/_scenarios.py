@@ -16,6 +16,7 @@ from sfkd_jax.scenarios._conditions import (
     uniform_road,
     wet_road,
 )
+from sfkd_jax.scenarios._manoeuvres import MANOEUVRES
 from sfkd_jax.scenarios._paths import Path, smooth_path
 from sfkd_jax.types import Key, Scalar, State
 
@@ -54,7 +55,8 @@ FAMILIES: dict[str, Callable[[Key, int, float], Schedule]] = {
         key, steps=steps, friction=(0.27, 0.3), wind=(8.0, 9.0)
     ),
 }
-"""Environments of an episode: name -> (key, steps, sampling period [s]) -> schedule."""
+"""Environments of random roads: name -> (key, steps, sampling period [s]) -> e."""
+NAMES = (*FAMILIES, *MANOEUVRES)
 
 
 def scenario(
@@ -72,14 +74,15 @@ def scenario(
     "s1" is a uniform road, "s2" a wet road with gusts, "s3" a switching road. Three
     more have one constant pair of friction and wind per episode: "seen" in the range of
     the training drives, "interpolated" between friction levels that these have under
-    wind, "extrapolated" outside their box.
+    wind, "extrapolated" outside their box. Manoeuvres have paths of their own:
+    "double_lane_change", "gust_step", "gust_cosine", "friction_step", "braking_turn".
 
     Args:
         name: of the family.
         duration: of an episode [s].
         speed: to hold [m/s].
-        peak_curvature: of the random path, see `smooth_path`.
-        wavelengths: of the random path, see `smooth_path`.
+        peak_curvature: of a random path, see `smooth_path`.
+        wavelengths: of a random path, see `smooth_path`.
         state_size: of the vehicle; the episode starts on the path at `speed`, other
             body states zero.
         dt: sampling period [s].
@@ -87,51 +90,50 @@ def scenario(
     Raises:
         ValueError: unknown name.
     """
-    if name not in FAMILIES:
-        raise ValueError(
-            f"unknown scenario {name!r}; choose one of {', '.join(FAMILIES)}"
-        )
-    conditions, steps = FAMILIES[name], round(duration / dt)
+    if name not in NAMES:
+        raise ValueError(f"unknown scenario {name!r}; choose one of {', '.join(NAMES)}")
+    steps, length = round(duration / dt), speed * duration * 1.1 + 50.0
+    if name in MANOEUVRES:
+        conditions, paths = MANOEUVRES[name].conditions, MANOEUVRES[name].path
+    else:
+        conditions = FAMILIES[name]
+
+        def paths(key: Key, length: float) -> Path:
+            return smooth_path(
+                key,
+                length=length,
+                peak_curvature=peak_curvature,
+                wavelengths=wavelengths,
+            )
+
     return family(
         lambda key: conditions(key, steps, dt),
-        length=speed * duration * 1.1 + 50.0,
+        lambda key: paths(key, length),
         speed=speed,
-        peak_curvature=peak_curvature,
-        wavelengths=wavelengths,
         state_size=state_size,
     )
 
 
 def family(
     conditions: Callable[[Key], Schedule],
+    paths: Callable[[Key], Path],
     *,
-    length: float,
     speed: float,
-    peak_curvature: float,
-    wavelengths: tuple[float, float],
     state_size: int,
 ) -> Family:
     """Combine a schedule of conditions and a family of paths.
 
     Args:
         conditions: key -> e_0 … e_{T-1}.
-        length: of the path [m].
+        paths: key -> path from the origin along x.
         speed: to hold [m/s].
-        peak_curvature: of the path, see `smooth_path`.
-        wavelengths: of the path, see `smooth_path`.
         state_size: of the vehicle.
     """
 
     def sample(key: Key) -> Scenario:
         path_key, condition_key = jax.random.split(key)
-        path = smooth_path(
-            path_key,
-            length=length,
-            peak_curvature=peak_curvature,
-            wavelengths=wavelengths,
-        )
         start = jnp.zeros(state_size).at[3].set(speed)
         envs = conditions(condition_key)
-        return Scenario(start, envs, envs, path, jnp.asarray(speed))
+        return Scenario(start, envs, envs, paths(path_key), jnp.asarray(speed))
 
     return sample

@@ -2,11 +2,10 @@
 
 from __future__ import annotations
 
-from importlib import import_module
-
 import jax
 import jax.numpy as jnp
 
+from sfkd_jax.core.named import imported
 from sfkd_jax.core.ranges import Bounds, Positive
 from sfkd_jax.types import Control, Environment, State, Step
 from sfkd_jax.vehicle._vehicle import Vehicle, forward_rk4, nominal_derivative
@@ -106,14 +105,11 @@ def step_named(name: str) -> Step:
     """
 
     def step(state: State, control: Control, env: Environment) -> State:
-        module, _, function = name.partition(":")
         try:
-            imported = getattr(import_module(module), function)
-        except (ImportError, AttributeError, ValueError) as reason:
-            raise _MissingStep(
-                f"vehicle.step={name}: {reason}; name it as package.module:function"
-            ) from None
-        return imported(state, control, env)
+            function = imported(name, "vehicle.step")
+        except ValueError as reason:
+            raise _MissingStep(str(reason)) from None
+        return function(state, control, env)
 
     return step
 

@@ -1,0 +1,110 @@
+"""A row of the benchmark from outside the package, as docs/add-a-row.md does it."""
+
+import json
+import re
+import shlex
+import sys
+from pathlib import Path
+
+import jax
+import jax.numpy as jnp
+import pytest
+from helpers import last_line, run_command
+
+import sfkd_jax
+from sfkd_jax import models
+from sfkd_jax.artefacts import ArtefactError
+from sfkd_jax.types import Space
+
+PAGE = Path(__file__).parents[1] / "docs" / "add-a-row.md"
+SPACE = Space(*(part(size) for size in (1, 2, 2, 3) for part in (jnp.zeros, jnp.ones)))
+
+
+def block(marker):
+    """The code after a marker of the page."""
+    text = PAGE.read_text("utf-8").split(f"<!-- {marker} -->")[1]
+    return re.search(r"```\w+\n(.*?)```", text, re.DOTALL).group(1)
+
+
+def nothing(state, control, env):
+    return jnp.zeros_like(state)
+
+
+def named(monkeypatch, tmp_path, source, **settings):
+    """The model of a factory in a new module."""
+    name = f"made_{abs(hash(source))}"
+    (tmp_path / f"{name}.py").write_text(source)
+    monkeypatch.syspath_prepend(tmp_path)
+    factory = settings.pop("factory", f"{name}:make")
+    return models.own(SPACE, nominal=nothing, factory=factory, **settings)
+
+
+@pytest.mark.slow
+def test_a_stranger_adds_a_row_as_the_page_says(tmp_path):
+    """The page's file and command, on fewer data; a changed name of the function fails
+    before anything is trained.
+    """
+    (tmp_path / "my_models.py").write_text(block("row"))
+    program, *words = shlex.split(block("command").replace("\\\n", " "))
+    assert (program, *words[:2]) == ("python", "-m", "sfkd_jax.compare")
+    small = ("comparison.vehicles=[dynamic]", "comparison.seeds=[0]", "evaluation=tiny")
+    small += ("comparison.controllers={mppi: [s3]}", "comparison.only=[oracle,mine]")
+    small += ("dataset=tiny", "training.steps=50", "training.save_every=50")
+    small += ("controller.mppi.num_samples=32", "evaluation.systems=[self]")
+    wrong = [word.replace("corrected_bicycle", "bicycle") for word in words[2:]]
+    refused = run_command("compare", *wrong, *small, cwd=tmp_path)
+    assert "model.factory=my_models:bicycle" in refused.stderr
+    assert "training mine" not in refused.stderr
+    done = last_line(run_command("compare", *words[2:], *small, cwd=tmp_path))
+    rows = json.loads((tmp_path / done["results"]).read_text())["rows"]
+    assert {row["system"] for row in rows} == {"oracle", "mine"}
+    run = next((tmp_path / "runs").rglob("policy.npz"))
+    with pytest.raises(ArtefactError, match="import my_models first"):
+        sfkd_jax.load(run)
+    assert "my_models" not in sys.modules
+
+
+def test_options_and_what_is_offered_reach_the_factory(monkeypatch, tmp_path):
+    source = (
+        "from sfkd_jax.models import state_model\n"
+        "def make(space, *, dt, gain):\n"
+        "    return state_model(lambda key: {}, lambda p, e: e,\n"
+        "                       lambda e, x, u: x + dt * gain * e[0])\n"
+    )
+    model = named(monkeypatch, tmp_path, source, dt=0.5, options={"gain": 4.0})
+    state, control, env = jnp.zeros(4), jnp.zeros(2), jnp.asarray([3.0, 0.0])
+    assert model.step(model.fiber({}, env), state, control)[0] == 6.0
+    blind = named(
+        monkeypatch, tmp_path, source, options={"gain": 4.0}, environment=False
+    )
+    assert blind.step(blind.fiber({}, env), state, control)[0] == 0.0
+
+
+@pytest.mark.parametrize(
+    ("source", "settings", "says"),
+    [
+        ("def make(space): return 3", {}, "returned int, not"),
+        ("def make(space): return 3", {"options": {"a": 1}}, "argument 'a'"),
+        ("def other(space): return 3", {}, "has no attribute 'make'"),
+        ("", {"factory": "nowhere_at_all:make"}, "No module named"),
+        ("", {"factory": ""}, "name it as package.module:function"),
+    ],
+)
+def test_a_factory_that_makes_no_model_is_one_line(
+    monkeypatch, tmp_path, source, settings, says
+):
+    with pytest.raises(ValueError, match=says) as refusal:
+        named(monkeypatch, tmp_path, source, **settings)
+    assert "\n" not in str(refusal.value)
+
+
+def test_the_model_of_the_page_steps_the_nominal_bicycle_before_it_is_trained(
+    monkeypatch, tmp_path
+):
+    factory = named(
+        monkeypatch, tmp_path, block("row").replace("corrected_bicycle", "make")
+    )
+    params = factory.init(jax.random.key(0))
+    state = jnp.arange(4.0)
+    fiber = factory.fiber(params, jnp.ones(2))
+    assert bool(jnp.all(factory.step(fiber, state, jnp.ones(2)) == state))
