@@ -46,6 +46,8 @@ def test_every_option_composes_and_is_within_the_ranges(group, option):
 @pytest.mark.parametrize("option", MODELS)
 def test_every_model_option_builds_and_names_its_system(option):
     plain = settings(f"model={option}")
+    if option == "own":
+        plain["model"]["factory"] = "sfkd_jax.models:neural_ode"
     assert plain["model"]["system"] == option.removesuffix("_tiny")
     build.build_model(plain["model"], space(), vehicle.kinematic())
 

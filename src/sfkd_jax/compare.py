@@ -16,8 +16,8 @@ from sfkd_jax.pipeline import grid
 from sfkd_jax.pipeline.comparison import (
     ComposeCell,
     cached_episodes,
+    check_group,
     evaluate_group,
-    rehearse_group,
 )
 from sfkd_jax.training import TrainingStopped
 
@@ -25,8 +25,8 @@ from sfkd_jax.training import TrainingStopped
 def run(settings: dict[str, Any]) -> dict[str, Any]:
     """Evaluate all cells that are not done, then collect, compare and draw all rows.
 
-    Every row is rehearsed before the first one is trained; those that cannot be built
-    are named and left out. With `comparison.share` only this share of the rows is
+    Every row is built before the first one is trained; those that cannot be built are
+    named and left out. With `comparison.share` only this share of the rows is
     evaluated, and nothing is collected.
     """
     began, comparison = time.perf_counter(), settings["comparison"]
@@ -48,7 +48,7 @@ def run(settings: dict[str, Any]) -> dict[str, Any]:
             artefacts.print_message(f"failed: {reason}")
             return 0
 
-    groups = [group for group in groups if attempt(rehearse_group, group) is None]
+    groups = [group for group in groups if attempt(check_group, group) is None]
     done = 0
     for number, group in enumerate(groups, 1):
         done += attempt(evaluate_group, group)

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import sys
 import warnings
 from collections.abc import Mapping
 from functools import lru_cache
@@ -118,13 +117,14 @@ def restore(path: str | Path) -> TrainedModel:
 
     Raises:
         ArtefactError: missing, truncated, foreign, changed since it was written, saved
-            with settings that this version does not have, weights that are not finite
-            or do not fit the model, or a model of a module that is not imported.
+            with settings that this version lacks or weights that do not fit the model;
+            or a model of a module that is not imported.
     """
     file = _file(path)
     arrays, manifest = artefacts.read_arrays(file, kind=KIND)
     settings = manifest["config"]
-    _refuse_unknown_code(file, settings)
+    with artefacts.as_artefact_error(file.with_suffix(".json"), ValueError):
+        build.check_imported(settings)
     version = str(manifest.get("versions", {}).get("sfkd_jax", "unknown"))
     with artefacts.as_artefact_error(
         file.with_suffix(".json"), ValueError, advice=_advice(version)
@@ -256,17 +256,6 @@ def _file(path: str | Path) -> Path:
     return Path(path) if Path(path).suffix == ".npz" else Path(path) / "policy.npz"
 
 
-def _refuse_unknown_code(file: Path, settings: Any) -> None:
-    """Raise an ArtefactError where a file names code that the caller did not import."""
-    model = settings.get("model") if isinstance(settings, Mapping) else None
-    factory = model.get("factory") if isinstance(model, Mapping) else None
-    module = str(factory).partition(":")[0]
-    if factory is not None and module not in sys.modules:
-        raise artefacts.ArtefactError(
-            f"{file}: its model is {factory}: import {module} first, if you trust it"
-        )
-
-
 def _advice(version: str) -> str:
     return f"saved by sfkd_jax {version}: train again"
 
@@ -305,8 +294,7 @@ def _weights(file: Path, arrays: Mapping[str, np.ndarray], model: Model) -> Para
 
 def _by_path(tree: Any) -> dict[str, Any]:
     """Return the leaves by path."""
-    leaves = jax.tree_util.tree_flatten_with_path(tree)[0]
     return {
         "/".join(str(getattr(key, "key", key)) for key in path): leaf
-        for path, leaf in leaves
+        for path, leaf in jax.tree_util.tree_flatten_with_path(tree)[0]
     }

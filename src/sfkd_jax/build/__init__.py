@@ -16,6 +16,7 @@ from sfkd_jax.build._plants import build_driver as build_driver
 from sfkd_jax.build._plants import build_model as build_model
 from sfkd_jax.build._plants import build_scenario as build_scenario
 from sfkd_jax.build._plants import build_vehicle as build_vehicle
+from sfkd_jax.build._plants import check_imported as check_imported
 from sfkd_jax.build._plants import space_from_settings as space_from_settings
 from sfkd_jax.build._plants import space_to_settings as space_to_settings
 from sfkd_jax.build._systems import System as System

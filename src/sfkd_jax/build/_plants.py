@@ -3,6 +3,9 @@
 from __future__ import annotations
 
 import inspect
+import sys
+from collections.abc import Mapping
+from typing import Any
 
 import jax.numpy as jnp
 
@@ -67,6 +70,21 @@ def build_model(settings: Settings, space: Space, plant: vehicle.Vehicle) -> Mod
         if name in inspect.signature(factory).parameters
     }
     return factory(space, **prior, **as_kwargs(settings, "name", "system"))
+
+
+def check_imported(settings: Any) -> None:
+    """Check that the code that stored settings name was imported by the caller.
+
+    Raises:
+        ValueError: `model.factory` is of a module that is not imported.
+    """
+    model = settings.get("model") if isinstance(settings, Mapping) else None
+    factory = model.get("factory") if isinstance(model, Mapping) else None
+    module = str(factory).partition(":")[0]
+    if factory is not None and module not in sys.modules:
+        raise ValueError(
+            f"its model is {factory}: import {module} first, if you trust it"
+        )
 
 
 def space_to_settings(space: Space) -> dict[str, list[float]]:

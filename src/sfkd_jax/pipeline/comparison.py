@@ -42,7 +42,7 @@ def cached_episodes() -> MakeEpisodes:
     return make_episodes
 
 
-def rehearse_group(
+def check_group(
     group: list[grid.Cell],
     comparison: dict[str, Any],
     compose_cell: ComposeCell,

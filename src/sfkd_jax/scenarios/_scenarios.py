@@ -16,7 +16,7 @@ from sfkd_jax.scenarios._conditions import (
     uniform_road,
     wet_road,
 )
-from sfkd_jax.scenarios._manoeuvres import MANOEUVRES
+from sfkd_jax.scenarios._manoeuvres import MANOEUVRES, Manoeuvre
 from sfkd_jax.scenarios._paths import Path, smooth_path
 from sfkd_jax.types import Key, Scalar, State
 
@@ -93,22 +93,16 @@ def scenario(
     if name not in NAMES:
         raise ValueError(f"unknown scenario {name!r}; choose one of {', '.join(NAMES)}")
     steps, length = round(duration / dt), speed * duration * 1.1 + 50.0
-    if name in MANOEUVRES:
-        conditions, paths = MANOEUVRES[name].conditions, MANOEUVRES[name].path
-    else:
-        conditions = FAMILIES[name]
 
-        def paths(key: Key, length: float) -> Path:
-            return smooth_path(
-                key,
-                length=length,
-                peak_curvature=peak_curvature,
-                wavelengths=wavelengths,
-            )
+    def random_road(key: Key, length: float) -> Path:
+        return smooth_path(
+            key, length=length, peak_curvature=peak_curvature, wavelengths=wavelengths
+        )
 
+    chosen = MANOEUVRES.get(name) or Manoeuvre(random_road, FAMILIES[name])
     return family(
-        lambda key: conditions(key, steps, dt),
-        lambda key: paths(key, length),
+        lambda key: chosen.conditions(key, steps, dt),
+        lambda key: chosen.path(key, length),
         speed=speed,
         state_size=state_size,
     )
