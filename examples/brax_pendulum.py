@@ -149,7 +149,7 @@ def learned_task(model, plant) -> control.Task:
             fiber, (model.encode(fiber, observation), applied.control), reference
         )
 
-    def step(weights, fiber, before, wanted, target, last):
+    def step(weights, fiber, before, wanted, target, at):
         v = jnp.clip(wanted, low, high)
         latent = model.step(fiber, before[0], v)
         state = model.decode(fiber, latent)

@@ -62,7 +62,7 @@ THIRD_PARTY = {
     "artefacts": {"numpy", "filelock"},
     "datasets": {"numpy", "pyarrow"},
     "models": {"flax"},
-    "control": {"flax"},
+    "control": {"numpy"},
     "training": {"optax", "orbax", "tensorboardX", "rich"},
     "certification": {"numpy", "scipy", "threadpoolctl", "cvxpy", "clarabel"},
     "evaluation": {"numpy", "scipy"},

@@ -30,6 +30,7 @@ from sfkd_jax.control.planners._plans import PlannerState as PlannerState
 from sfkd_jax.control.planners._plans import Search as Search
 from sfkd_jax.control.planners._plans import SearchResult as SearchResult
 from sfkd_jax.control.planners._plans import Tuning as Tuning
+from sfkd_jax.control.planners._plans import tuned as tuned
 from sfkd_jax.control.planners._risk import risk_measure as risk_measure
 from sfkd_jax.control.planners._smoothing import plan_smoother as plan_smoother
 from sfkd_jax.control.planners._smoothing import (
@@ -48,13 +49,14 @@ from sfkd_jax.control.tasks._along_path import path_coordinates as path_coordina
 from sfkd_jax.control.tasks._costs import Cost as Cost
 from sfkd_jax.control.tasks._costs import StageInputs as StageInputs
 from sfkd_jax.control.tasks._costs import tracking_cost as tracking_cost
+from sfkd_jax.control.tasks._free_task import free_task as free_task
 from sfkd_jax.control.tasks._path_tracking import path_tracking as path_tracking
-from sfkd_jax.control.tasks._task import PreviousControl as PreviousControl
+from sfkd_jax.control.tasks._task import PlanningStart as PlanningStart
 from sfkd_jax.control.tasks._task import RolloutSetup as RolloutSetup
+from sfkd_jax.control.tasks._task import StepIndex as StepIndex
 from sfkd_jax.control.tasks._task import StepResult as StepResult
 from sfkd_jax.control.tasks._task import Task as Task
 from sfkd_jax.control.tasks._task import actuator_limits as actuator_limits
-from sfkd_jax.control.tasks._task import free_task as free_task
 from sfkd_jax.control.wrappers._adaptation import adaptive as adaptive
 from sfkd_jax.control.wrappers._adaptive_step import AdaptiveState as AdaptiveState
 from sfkd_jax.control.wrappers._delay import DelayState as DelayState

@@ -96,7 +96,7 @@ def cem(
             mean, spread = weighted_mean_and_std(
                 weights, replace_nonfinite(effective, 0.0)[:, chosen]
             )
-            scale = jnp.maximum(spread / std, smallest_scale)
+            scale = jnp.maximum(spread / std[None], smallest_scale)
             usable, size = jnp.any(counts > 0), jnp.sum(counts)
             return (mean, scale), SearchResult(mean, usable, -negated[0], size)
 

@@ -8,7 +8,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from sfkd_jax.control.tasks._task import PreviousControl
+from sfkd_jax.control.tasks._task import PlanningStart
 from sfkd_jax.core.se2 import between, compose
 from sfkd_jax.types import BODY, POSE, LinearPredictor, Reference, Scalar, State
 
@@ -43,7 +43,7 @@ def condensed_cost(
     prediction: Prediction,
     start: State,
     speeds: Float[Array, " horizon"],
-    previous: PreviousControl,
+    previous: PlanningStart,
     *,
     weights: Float[Array, " term"],
     step_weights: Float[Array, " horizon"],

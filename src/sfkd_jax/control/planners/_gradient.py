@@ -70,10 +70,10 @@ def gradient_planner(
 
         def descend(plan: Plan, _: None) -> tuple[Plan, SearchResult]:
             slope = replace_nonfinite(jax.grad(cost_of)(plan), 0.0)
-            downhill = -slope * std  # in units of std
+            downhill = -slope * std[None]  # in units of std
             size = jnp.sqrt(jnp.mean(downhill**2))
-            direction = downhill / jnp.where(size > 0, size, 1.0) * std
-            return best_of(plan[:, None] + sizes[:, None] * direction[:, None])
+            direction = downhill / jnp.where(size > 0, size, 1.0) * std[None]
+            return best_of(plan[:, None] + sizes[None, :, None] * direction[:, None])
 
         def best_of(plans: Plans) -> tuple[Plan, SearchResult]:
             costs, effective = evaluate(plans)

@@ -14,7 +14,7 @@ from sfkd_jax.control.planners._box_qp import box_qp
 from sfkd_jax.control.planners._condensed import condense, condensed_cost, to_world
 from sfkd_jax.control.planners._plans import all_finite, clip_environment, shift
 from sfkd_jax.control.tasks._path_tracking import check_path
-from sfkd_jax.control.tasks._task import PreviousControl
+from sfkd_jax.control.tasks._task import PlanningStart
 from sfkd_jax.core.ranges import AtLeastTwo
 from sfkd_jax.types import (
     POSE,
@@ -187,7 +187,7 @@ def _act(
         prediction,
         start,
         reference[:, 3],
-        PreviousControl(state.previous, state.started),
+        PlanningStart(state.previous, state.started),
         weights=settings.weights,
         step_weights=settings.step_weights,
         dt=settings.dt,

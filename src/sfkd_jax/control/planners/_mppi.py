@@ -133,7 +133,7 @@ def mppi(
                 weights, replace_nonfinite(effective, 0.0)
             )
             if adapt:
-                scale = (1 - adapt) * scale + adapt * spread / std
+                scale = (1 - adapt) * scale + adapt * spread / std[None]
                 scale = jnp.maximum(scale, MIN_NOISE_SCALE)
             lowest = jnp.min(replace_nonfinite(costs, jnp.inf))
             size = effective_sample_size(weights)
@@ -152,7 +152,7 @@ def mppi(
 
 def _control_cost(plan: Array, plans: Plans, std: Array) -> Float[Array, " sample"]:
     """Σ_k ν_k' Σ⁻¹ (ν_k^m − ν_k)."""
-    return jnp.einsum("tc,tmc->m", plan / std**2, plans - plan[:, None])
+    return jnp.einsum("tc,tmc->m", plan / std[None] ** 2, plans - plan[:, None])
 
 
 def _check(

@@ -8,6 +8,7 @@ from typing import TypeAlias
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Float
 
 from sfkd_jax.types import Control, Key
@@ -38,7 +39,9 @@ def correlated_noise(
         std: standard deviation per control, in control units.
         correlation: ρ in [0, 1).
     """
-    white = jax.random.normal(key, (horizon, num_samples, std.shape[0])) * std
+    white = (
+        jax.random.normal(key, (horizon, num_samples, std.shape[0])) * std[None, None]
+    )
     fresh = jnp.sqrt(1.0 - correlation**2)
 
     def step(before: Array, new: Array) -> tuple[Array, Array]:
@@ -79,7 +82,9 @@ def noise_sampler(
     Raises:
         ValueError: the kind is unknown, or a setting is out of its range.
     """
-    factor = _factor(kind, horizon, correlation, exponent, knots)
+    factor = jnp.asarray(
+        _factor(kind, horizon, correlation, exponent, knots), dtype=float
+    )
 
     def draw(key: Key, num_samples: int, std: Control) -> Noise:
         if halton:
@@ -97,7 +102,7 @@ def noise_sampler(
         # Full precision: accelerators otherwise round float32 factors to ten bits.
         return (
             jnp.einsum("tk,kmc->tmc", factor, w, precision=jax.lax.Precision.HIGHEST)
-            * std
+            * std[None, None]
         )
 
     return draw
@@ -105,7 +110,7 @@ def noise_sampler(
 
 def _factor(
     kind: str, horizon: int, correlation: float, exponent: float, knots: int
-) -> Float[Array, "horizon k"]:
+) -> Float[np.ndarray, "horizon k"]:
     """L of `noise_sampler`."""
     if kind not in KINDS:
         raise ValueError(f"noise must be one of {', '.join(KINDS)}, got {kind!r}")
@@ -115,62 +120,64 @@ def _factor(
         raise ValueError(f"noise_exponent must be at least 0, got {exponent}")
     if kind in ("rbf", "spline") and not 2 <= knots <= horizon:
         raise ValueError(f"noise_knots must lie in [2, {horizon}], got {knots}")
-    steps = jnp.arange(horizon)
+    if horizon < 1:
+        raise ValueError(f"horizon must be at least 1, got {horizon}")
+    steps = np.arange(horizon)
     if kind == "white":
-        return jnp.eye(horizon)
+        return np.eye(horizon)
     if kind == "ar1":
-        lag = steps[:, None] - steps
-        fresh = jnp.where(steps == 0, 1.0, math.sqrt(1.0 - correlation**2))
-        return jnp.where(lag >= 0, correlation ** jnp.maximum(lag, 0), 0.0) * fresh
+        lag = steps[:, None] - steps[None]
+        fresh = np.where(steps == 0, 1.0, math.sqrt(1.0 - correlation**2))
+        return np.where(lag >= 0, correlation ** np.maximum(lag, 0), 0.0) * fresh[None]
     if kind == "coloured":
         return _coloured(horizon, exponent)
-    centres = jnp.linspace(0.0, horizon - 1.0, knots)
+    centres = np.linspace(0.0, horizon - 1.0, knots)
     width = centres[1] - centres[0]
     if kind == "rbf":
-        factor = jnp.exp(-0.5 * ((steps[:, None] - centres) / width) ** 2)
+        factor = np.exp(-0.5 * ((steps[:, None] - centres[None]) / width) ** 2)
     else:
         factor = _spline(steps / width, knots)
-    return factor / jnp.linalg.norm(factor, axis=1, keepdims=True)
+    return factor / np.linalg.norm(factor, axis=1, keepdims=True)
 
 
-def _coloured(horizon: int, exponent: float) -> Float[Array, "horizon horizon"]:
+def _coloured(horizon: int, exponent: float) -> Float[np.ndarray, "horizon horizon"]:
     """Cholesky factor of the covariance with spectrum 1 / f^exponent.
 
     The longest period is four horizons: a plan is a window of a longer stationary
     process, so its end is not correlated with its beginning as in a periodic one.
     """
     period = 4 * horizon
-    frequency = jnp.arange(1, period // 2 + 1) / period
+    frequency = np.arange(1, period // 2 + 1) / period
     power = frequency**-exponent
-    lags = jnp.arange(horizon)
-    covariance = jnp.cos(2 * jnp.pi * lags[:, None] * frequency) @ (
-        power / jnp.sum(power)
+    lags = np.arange(horizon)
+    covariance = np.cos(2 * np.pi * lags[:, None] * frequency[None]) @ (
+        power / np.sum(power)
     )
-    table = covariance[jnp.abs(lags[:, None] - lags)]
-    factor = jnp.linalg.cholesky(table + 1e-5 * jnp.eye(horizon))
-    return factor / jnp.linalg.norm(factor, axis=1, keepdims=True)
+    table = covariance[np.abs(lags[:, None] - lags[None])]
+    factor = np.linalg.cholesky(table + 1e-5 * np.eye(horizon))
+    return factor / np.linalg.norm(factor, axis=1, keepdims=True)
 
 
 def _spline(
-    times: Float[Array, " horizon"], knots: int
-) -> Float[Array, "horizon knots"]:
+    times: Float[np.ndarray, " horizon"], knots: int
+) -> Float[np.ndarray, "horizon knots"]:
     """Weights of cubic interpolation at each time, in units of the knot distance.
 
     With fewer than four knots, the order is lower.
     """
     order = min(4, knots)
-    left = jnp.clip(jnp.floor(times).astype(int) - (order - 1) // 2, 0, knots - order)
+    left = np.clip(np.floor(times).astype(int) - (order - 1) // 2, 0, knots - order)
     columns = []
     for knot in range(knots):
         offset = knot - left
-        weight = jnp.ones_like(times)
+        weight = np.ones_like(times)
         for other in range(order):
-            gap = jnp.where(offset == other, 1.0, offset - other)
-            weight = weight * jnp.where(
+            gap = np.where(offset == other, 1.0, offset - other)
+            weight = weight * np.where(
                 offset == other, 1.0, (times - left - other) / gap
             )
-        columns.append(jnp.where((offset >= 0) & (offset < order), weight, 0.0))
-    return jnp.stack(columns, axis=1)
+        columns.append(np.where((offset >= 0) & (offset < order), weight, 0.0))
+    return np.stack(columns, axis=1)
 
 
 def _halton_normal(
@@ -199,7 +206,7 @@ def _radical_inverse(index: Array, base: int, largest: int) -> Float[Array, " sa
     total, scale = jnp.zeros(index.shape), 1.0 / base
     for _ in range(math.ceil(math.log(largest + 1, base))):
         total, index, scale = (
-            total + scale * (index % base),
+            total + scale * (index % base).astype(float),
             index // base,
             scale / base,
         )

@@ -7,7 +7,7 @@ from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Float
+from jaxtyping import Array, Bool
 
 from sfkd_jax.control.planners._plans import (
     PlannerState,
@@ -25,12 +25,7 @@ from sfkd_jax.control.planners._rollouts import (
     rollout_function,
 )
 from sfkd_jax.control.planners._smoothing import Smoother, plan_smoother
-from sfkd_jax.control.tasks._task import (
-    Environments,
-    PreviousControl,
-    RolloutSetup,
-    Task,
-)
+from sfkd_jax.control.tasks._task import PlanningStart, RolloutSetup, Task
 from sfkd_jax.core.ranges import AtLeastTwo, NonNegativeInt, Positive, PositiveFraction
 from sfkd_jax.types import (
     Control,
@@ -39,7 +34,6 @@ from sfkd_jax.types import (
     Key,
     Params,
     Scalar,
-    State,
 )
 
 
@@ -49,7 +43,6 @@ class _Settings(NamedTuple):
     task: Task
     search: Search
     horizon: int
-    final_step: Float[Array, " horizon"]
     num_proposals: int
     smooth: Smoother
     smoothing_window: int
@@ -58,6 +51,7 @@ class _Settings(NamedTuple):
     sharding: jax.sharding.Sharding | None
     env_low: tuple[float, ...] | None
     env_high: tuple[float, ...] | None
+    several: bool | None
     tuning: Tuning
 
 
@@ -78,6 +72,7 @@ def planner(
     sharding: jax.sharding.Sharding | None = None,
     env_low: tuple[float, ...] | None = None,
     env_high: tuple[float, ...] | None = None,
+    several: bool | None = None,
 ) -> Controller:
     """Return the receding-horizon controller of a task and a search for its best plan.
 
@@ -114,6 +109,8 @@ def planner(
             of devices, which must divide the number of samples.
         env_low: lower end of the environment box; an environment outside is clipped.
         env_high: upper end of the environment box.
+        several: whether the leading axis of every leaf of an environment runs over
+            equally likely ones; None if it does for a matrix alone.
 
     Returns:
         A `Controller`; `info` has `cost` (lowest), `mean_cost` (of the chosen plan),
@@ -121,9 +118,14 @@ def planner(
         state) of the chosen plan.
 
     Raises:
-        ValueError: `noise_std` does not fit the task, the risk is unknown, or the
-            filter does not fit the horizon.
+        ValueError: `noise_std` does not fit the task, the horizon or the temperature
+            is not positive, the risk is unknown, or the filter does not fit the
+            horizon.
     """
+    if horizon < 1:
+        raise ValueError(f"horizon must be at least 1, got {horizon}")
+    if not temperature > 0:
+        raise ValueError(f"temperature must be positive, got {temperature}")
     if len(noise_std) != task.low.shape[0] or not all(std > 0 for std in noise_std):
         raise ValueError(
             f"noise_std needs {task.low.shape[0]} positive numbers, got {noise_std}"
@@ -132,7 +134,6 @@ def planner(
         task=task,
         search=search,
         horizon=horizon,
-        final_step=jnp.zeros(horizon).at[-1].set(1.0),
         num_proposals=num_proposals,
         smooth=plan_smoother(
             horizon=horizon, window=smoothing_window, order=smoothing_order
@@ -143,6 +144,7 @@ def planner(
         sharding=sharding,
         env_low=env_low,
         env_high=env_high,
+        several=several,
         tuning=Tuning(
             temperature=jnp.asarray(temperature, dtype=float),
             effective_samples=jnp.asarray(effective_samples, dtype=float),
@@ -156,18 +158,31 @@ def planner(
     return Controller(partial(_init, settings), partial(_act, settings))
 
 
+TASK_STREAM = 31324
+"""Folded into the key of a control step for the task's own noise."""
+KEY_KINDS = {2: "threefry2x32", 4: "rbg"}
+"""Implementations of random keys by the number of words of their data."""
+
+
 def _init(settings: _Settings, key: Key) -> PlannerState:
-    """The state before the first control step: a plan of zeros, the law alone."""
-    zeros = jnp.zeros((settings.horizon, settings.task.low.shape[0]))
+    """The state before the first control step: a plan of zeros, the law alone.
+
+    No two entries share a buffer, so that the state can be donated.
+    """
+    channels = settings.task.low.shape[0]
+
+    def zeros(*shape: int) -> Array:
+        return jnp.zeros((*shape, channels))
+
     return PlannerState(
-        plan=zeros,
-        controls=zeros,
-        previous=zeros[0],
+        plan=zeros(settings.horizon),
+        controls=zeros(settings.horizon),
+        previous=zeros(),
         started=jnp.asarray(False),
-        key=key,
-        past=zeros[: settings.smoothing_window // 2],
-        proposals=jnp.zeros((settings.num_proposals, *zeros.shape)),
-        tuning=settings.tuning,
+        key=jax.random.key_data(key),
+        past=zeros(settings.smoothing_window // 2),
+        proposals=zeros(settings.num_proposals, settings.horizon),
+        tuning=jax.tree.map(jnp.array, settings.tuning),
     )
 
 
@@ -175,26 +190,32 @@ def _act(
     settings: _Settings,
     params: Params,
     state: PlannerState,
-    observation: State,
-    env: Environments,
+    observation: Any,
+    env: Any,
     reference: Any,
 ) -> tuple[Control, PlannerState, ControllerInfo]:
     """One control step."""
-    task, several = settings.task, env.ndim == 2
+    task, several = settings.task, _is_several(settings, env)
     task.check(observation, env, reference, settings.horizon)
     elapsed, state = _catch_up(state)
-    search_key, next_key = jax.random.split(state.key)
+    key = jax.random.wrap_key_data(state.key, impl=KEY_KINDS[state.key.shape[0]])
+    search_key, next_key = jax.random.split(key)
+    task_key = jax.random.fold_in(key, TASK_STREAM)
     clean = all_finite((observation, env, reference))
     inside = clip_environment(env, settings.env_low, settings.env_high)
 
-    prepare = task.prepare
-    if several:
-        prepare = jax.vmap(prepare, in_axes=(None, None, 0, None, None))
-    previous = PreviousControl(state.previous, state.started)
-    setup = prepare(params, observation, inside, reference, previous)
-    roll_out = rollout_function(
-        task, state.tuning.cost, setup, settings.final_step, several=several
+    prepare, start = (
+        task.prepare,
+        PlanningStart(state.previous, state.started, task_key),
     )
+    if several:
+        count = jax.tree.leaves(env)[0].shape[0]
+        start = start._replace(key=jax.random.split(task_key, count))
+        shared = jax.tree.map(lambda _: None, start)
+        axes = (None, None, 0, None, shared._replace(key=0))
+        prepare = jax.vmap(prepare, in_axes=axes)
+    setup = prepare(params, observation, inside, reference, start)
+    roll_out = rollout_function(task, state.tuning.cost, setup, several=several)
     risk = settings.risk if several else None
     evaluate = evaluate_function(
         roll_out, risk, chunk=settings.chunk, sharding=settings.sharding
@@ -215,7 +236,7 @@ def _act(
         "mean_cost": rollout.cost,
         "effective_samples": result.effective_samples,
         "healthy": healthy,
-        "env_inside": jnp.all(inside == env),
+        "env_inside": _is_inside(settings, env, inside),
         "predicted_states": rollout.states,
     }
     elapsed = jnp.minimum(elapsed, 1.0)
@@ -224,10 +245,23 @@ def _act(
         controls=shift(controls, elapsed),
         previous=control,
         started=state.started | healthy,
-        key=next_key,
+        key=jax.random.key_data(next_key),
         past=jnp.concatenate([state.past, plan[:1]])[1:],
+        tuning=state.tuning._replace(elapsed=jnp.ones_like(state.tuning.elapsed)),
     )
     return control, after, info
+
+
+def _is_several(settings: _Settings, env: Any) -> bool:
+    """Whether an environment is several that are equally likely."""
+    if settings.several is not None:
+        return settings.several
+    return getattr(env, "ndim", 0) == 2
+
+
+def _is_inside(settings: _Settings, env: Any, inside: Any) -> Bool[Array, ""]:
+    """Whether an environment was not changed by its box."""
+    return jnp.all(inside == env) if settings.env_low else jnp.asarray(True)
 
 
 def _catch_up(state: PlannerState) -> tuple[Scalar, PlannerState]:

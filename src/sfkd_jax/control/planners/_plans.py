@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from functools import partial
 from typing import Any, NamedTuple, TypeAlias
 
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Bool, Float
+from jaxtyping import Array, Bool, Float, UInt32
 
 from sfkd_jax.types import Control, Key, Scalar
 
@@ -18,7 +19,7 @@ Plans: TypeAlias = Float[Array, "horizon sample control"]
 class Tuning(NamedTuple):
     """Settings that are data of a running planner: changing them recompiles nothing.
 
-    Set them with `state._replace(tuning=state.tuning._replace(…))`.
+    Set them with `tuned(state, temperature=…)`, which keeps their types.
 
     Attributes:
         temperature: λ of MPPI, in units of cost.
@@ -26,7 +27,8 @@ class Tuning(NamedTuple):
             with one.
         noise_std: per control channel, in control units.
         elapsed: sampling periods since the last call. The plan is shifted by as many,
-            fractions included; NaN counts as one.
+            fractions included; NaN counts as one, and so does every later call that
+            does not set it again.
         cost: weights of the task's cost.
     """
 
@@ -45,7 +47,8 @@ class PlannerState(NamedTuple):
         controls: the controls of the last healthy rollout of that plan.
         previous: the control applied last.
         started: whether a control was planned before.
-        key: random key of the next samples.
+        key: data of the random key of the next samples, so that the state consists of
+            plain arrays and can be stored.
         past: perturbations applied before the plan, oldest first, as many as smoothing
             needs; zero before the start.
         proposals: the user's own plans, evaluated beside the sampled ones at every
@@ -57,10 +60,48 @@ class PlannerState(NamedTuple):
     controls: Plan
     previous: Control
     started: Bool[Array, ""]
-    key: Key
+    key: UInt32[Array, " word"]
     past: Float[Array, "past control"]
     proposals: Float[Array, "proposal horizon control"]
     tuning: Tuning
+
+
+def tuned(state: PlannerState, **changes: Any) -> PlannerState:
+    """Return the state with other entries of `Tuning`, of the types that it has.
+
+    A plain number in their place would be of a weaker type, and compile the planner
+    again.
+
+    Args:
+        state: of a planner.
+        changes: entries of `Tuning`; of `cost`, any part of a dict.
+
+    Raises:
+        ValueError: an unknown entry, or another shape.
+    """
+    before = state.tuning._asdict()
+    for name, value in changes.items():
+        if name not in before:
+            known = ", ".join(before)
+            raise ValueError(f"unknown tuning {name!r}; choose of {known}")
+        if name == "cost" and isinstance(before[name], dict):
+            if unknown := value.keys() - before[name].keys():
+                raise ValueError(
+                    f"the cost has no weights {', '.join(sorted(unknown))}"
+                )
+            value = before[name] | value
+        before[name] = jax.tree.map(partial(_of_type, name), before[name], value)
+    return state._replace(tuning=Tuning(**before))
+
+
+def _of_type(name: str, before: Array, value: Any) -> Array:
+    """A value as an array of the type of the one before."""
+    after = jnp.asarray(value, dtype=before.dtype)
+    if after.shape != before.shape:
+        raise ValueError(
+            f"tuning {name} must have shape {before.shape}, got {after.shape}"
+        )
+    return after
 
 
 class SearchResult(NamedTuple):
@@ -114,25 +155,29 @@ def replace_nonfinite(
 def shift(plan: Plan, elapsed: Scalar) -> Plan:
     """Shift a plan by `elapsed` periods: linear in between, the last step held."""
     last = plan.shape[0] - 1
-    times = jnp.clip(jnp.arange(plan.shape[0]) + elapsed, 0, last)
-    index = jnp.floor(times).astype(int)
+    steps = jnp.arange(plan.shape[0], dtype=plan.dtype)
+    times = jnp.clip(steps + elapsed, 0, last)
+    whole = jnp.floor(times)
+    index = whole.astype(int)
     after = plan[jnp.minimum(index + 1, last)]
-    return plan[index] + (times - index)[:, None] * (after - plan[index])
+    return plan[index] + (times - whole)[:, None] * (after - plan[index])
 
 
 def all_finite(tree: Any) -> Bool[Array, ""]:
-    """Whether every entry of every leaf is finite."""
+    """Whether every real or complex entry of every leaf is finite."""
+    leaves = [jnp.asarray(leaf) for leaf in jax.tree.leaves(tree)]
+    real = [leaf for leaf in leaves if jnp.issubdtype(leaf.dtype, jnp.inexact)]
     return jnp.all(
-        jnp.stack([jnp.all(jnp.isfinite(leaf)) for leaf in jax.tree.leaves(tree)])
+        jnp.stack([jnp.asarray(True), *(jnp.all(jnp.isfinite(leaf)) for leaf in real)])
     )
 
 
 def clip_environment(
-    env: Float[Array, "*particle environment"],
-    low: tuple[float, ...] | None,
-    high: tuple[float, ...] | None,
-) -> Float[Array, "*particle environment"]:
+    env: Any, low: tuple[float, ...] | None, high: tuple[float, ...] | None
+) -> Any:
     """Clip an environment to its box, if there is one."""
     if low is None or high is None:
         return env
-    return jnp.clip(env, jnp.array(low), jnp.array(high))
+    box = (jnp.asarray(end, dtype=env.dtype) for end in (low, high))
+    lowest, highest = (jnp.broadcast_to(end, env.shape) for end in box)
+    return jnp.clip(env, lowest, highest)

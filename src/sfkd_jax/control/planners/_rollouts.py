@@ -12,7 +12,7 @@ from jaxtyping import Array, Float
 
 from sfkd_jax.control.planners._plans import Evaluate, Plan, Plans
 from sfkd_jax.control.planners._risk import RiskMeasure
-from sfkd_jax.control.tasks._task import RolloutSetup, Task
+from sfkd_jax.control.tasks._task import RolloutSetup, StepIndex, Task
 from sfkd_jax.types import Scalar
 
 
@@ -23,13 +23,13 @@ class Rollouts(NamedTuple):
         costs: of the whole rollouts.
         controls: applied, within the limits.
         perturbations: that the limits allowed.
-        states: predicted.
+        states: predicted, (*particle, horizon, sample, …) of every leaf.
     """
 
     costs: Float[Array, "*particle sample"]
     controls: Float[Array, "*particle horizon sample control"]
     perturbations: Float[Array, "*particle horizon sample control"]
-    states: Float[Array, "*particle horizon sample state"]
+    states: Any
 
 
 class PlanRollout(NamedTuple):
@@ -39,13 +39,13 @@ class PlanRollout(NamedTuple):
         cost: of the whole rollout; of several environments, the risk over them.
         controls: applied, within the limits.
         perturbations: that the limits allowed.
-        states: predicted.
+        states: predicted, (horizon, …) of every leaf.
     """
 
     cost: Scalar
     controls: Plan
     perturbations: Plan
-    states: Float[Array, "horizon state"]
+    states: Any
 
 
 RollOut: TypeAlias = Callable[[Plans], Rollouts]
@@ -55,7 +55,6 @@ def rollout_function(
     task: Task,
     weights: Any,
     setup: RolloutSetup,
-    final_step: Float[Array, " horizon"],
     *,
     several: bool,
 ) -> RollOut:
@@ -65,10 +64,9 @@ def rollout_function(
         task: the planning problem.
         weights: of its cost.
         setup: of this control step.
-        final_step: 1 at the last step of the horizon, 0 before it.
         several: whether `setup` has a leading axis of environments.
     """
-    roll_out = partial(_roll_out, task, weights, final_step)
+    roll_out = partial(_roll_out, task, weights)
     if several:
         roll_out = jax.vmap(roll_out, in_axes=(0, None))
     return partial(roll_out, setup)
@@ -107,39 +105,56 @@ def roll_out_plan(
 ) -> PlanRollout:
     """Roll out one plan; `risk` as in `evaluate_function`."""
     costs, *trajectories = roll_out(plan[:, None])
-    if risk is None:
-        return PlanRollout(costs[0], *(leaf[:, 0] for leaf in trajectories))
-    return PlanRollout(risk(costs)[0], *(leaf[0, :, 0] for leaf in trajectories))
+    cost = costs[0] if risk is None else risk(costs)[0]
+    first = (slice(None), 0) if risk is None else (0, slice(None), 0)
+    return PlanRollout(cost, *jax.tree.map(lambda leaf: leaf[first], trajectories))
 
 
-def _roll_out(
-    task: Task,
-    weights: Any,
-    final_step: Float[Array, " horizon"],
-    setup: RolloutSetup,
-    plans: Plans,
-) -> Rollouts:
+def _roll_out(task: Task, weights: Any, setup: RolloutSetup, plans: Plans) -> Rollouts:
     """Roll out all plans in one environment, in one scan over the horizon."""
-    count = plans.shape[1]
-    start = jax.tree.map(
-        lambda leaf: jnp.broadcast_to(leaf, (count, *leaf.shape)), setup.start
+    horizon, count = plans.shape[:2]
+    numbers = jnp.arange(horizon)
+    places = StepIndex(numbers, (numbers == horizon - 1).astype(plans.dtype))
+    step = jax.vmap(
+        partial(task.step, weights, setup.context), in_axes=(0, 0, None, None)
     )
+    start = jax.tree.map(
+        lambda leaf: jnp.broadcast_to(leaf, (count, *jnp.shape(leaf))), setup.start
+    )
+    first = jax.tree.map(lambda leaf: leaf[0], (plans, setup.targets, places))
 
     def body(carry: Any, inputs: Any) -> Any:
         costs, samples = carry
-        nus, target, last = inputs
-        step = jax.vmap(task.step, in_axes=(None, None, 0, 0, None, None))
-        after = step(weights, setup.context, samples, nus, target, last)
+        after = step(samples, *inputs)
         return (costs + after.cost, after.sample), (
             after.control,
             after.perturbation,
             after.state,
         )
 
-    (costs, _), trajectories = jax.lax.scan(
-        body, (jnp.zeros(count), start), (plans, setup.targets, final_step)
+    carry = _as_returned(
+        lambda carry: body(carry, first)[0], (jnp.zeros(count, plans.dtype), start)
     )
+    (costs, _), trajectories = jax.lax.scan(body, carry, (plans, setup.targets, places))
     return Rollouts(costs, *trajectories)
+
+
+def _as_returned(function: Callable[[Any], Any], carry: Any) -> Any:
+    """Return a carry in the types that the function returns.
+
+    An integer observation becomes real, for example, if the dynamics make it so.
+    """
+    if len({leaf.dtype for leaf in jax.tree.leaves(carry)}) == 1:
+        return carry
+    for _ in range(2):
+        after = jax.eval_shape(function, carry)
+        carry = jax.tree.map(_as_type, carry, after)
+    return carry
+
+
+def _as_type(leaf: Array, like: jax.ShapeDtypeStruct) -> Array:
+    """A leaf in another type; one of the same type as it is, a random key as well."""
+    return leaf if leaf.dtype == like.dtype else leaf.astype(like.dtype)
 
 
 def _in_chunks(roll_out: RollOut, plans: Plans, chunk: int) -> Rollouts:
@@ -153,12 +168,14 @@ def _in_chunks(roll_out: RollOut, plans: Plans, chunk: int) -> Rollouts:
         .swapaxes(0, 1)
     )
     rollouts = jax.lax.map(roll_out, parts)
+    particles = rollouts.costs.ndim - 2
 
-    def join(leaf: Array) -> Array:
-        """Join the chunks along the sample axis, the second to last."""
-        return jnp.moveaxis(leaf, 0, -3).reshape(*leaf.shape[1:-2], -1, leaf.shape[-1])[
-            ..., :count, :
-        ]
+    def join(leaf: Array, axis: int) -> Array:
+        """Join the chunks along the axis of the samples."""
+        leaf = jnp.moveaxis(leaf, 0, axis)
+        shape = (*leaf.shape[:axis], -1, *leaf.shape[axis + 2 :])
+        return jax.lax.slice_in_dim(leaf.reshape(shape), 0, count, axis=axis)
 
-    costs = join(rollouts.costs[..., None])[..., 0]
-    return Rollouts(costs, *(join(leaf) for leaf in rollouts[1:]))
+    costs = join(rollouts.costs, particles)
+    trajectories = jax.tree.map(partial(join, axis=particles + 1), rollouts[1:])
+    return Rollouts(costs, *trajectories)

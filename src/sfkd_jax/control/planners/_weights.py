@@ -20,12 +20,17 @@ lower end is that small because a single outlier widens the range.
 def softmin(
     costs: Float[Array, " sample"], temperature: Scalar
 ) -> tuple[Float[Array, " sample"], Bool[Array, ""]]:
-    """Return weights ∝ exp(−J/λ) over the finite costs, and whether any is finite."""
+    """Return weights ∝ exp(−J/λ) over the finite costs, and whether they are usable.
+
+    They are not if no cost is finite, or λ is not positive.
+    """
     finite = jnp.isfinite(costs)
-    usable = jnp.any(finite)
-    scores = jnp.where(finite, -costs / temperature, -jnp.inf)
-    weights = jax.nn.softmax(jnp.where(usable, scores, 0.0))
-    return weights, usable
+    positive = temperature > 0
+    usable = jnp.any(finite) & positive
+    # Both branches are finite, or their derivatives would be NaN.
+    scaled = jnp.where(finite, costs, 0.0) / jnp.where(positive, temperature, 1.0)
+    scores = jnp.where(usable, jnp.where(finite, -scaled, -jnp.inf), 0.0)
+    return jax.nn.softmax(scores), usable
 
 
 def effective_sample_size(weights: Float[Array, " sample"]) -> Scalar:
@@ -33,6 +38,7 @@ def effective_sample_size(weights: Float[Array, " sample"]) -> Scalar:
     return 1.0 / jnp.sum(weights**2)
 
 
+@jax.custom_jvp
 def temperature_for_sample_size(
     costs: Float[Array, " sample"], wanted: Scalar
 ) -> Scalar:
@@ -40,7 +46,9 @@ def temperature_for_sample_size(
 
     The bracket scales with the range of the finite costs, so λ scales with the costs.
     If `wanted` exceeds the number of finite costs, or is less than the number of
-    samples that share the lowest cost, the result is an end of the bracket.
+    samples that share the lowest cost, the result is an end of the bracket, and its
+    derivative is 0. Elsewhere that is −(∂N/∂J dJ − dN) / (∂N/∂λ), N the effective
+    sample size (implicit function theorem).
 
     Args:
         costs: may contain values that are not finite.
@@ -63,3 +71,23 @@ def temperature_for_sample_size(
     ends = jnp.log(10.0) * jnp.asarray(DECADES)
     low, high = jax.lax.fori_loop(0, BISECTIONS, narrow, (ends[0], ends[1]))
     return spread * jnp.exp(0.5 * (low + high))
+
+
+@temperature_for_sample_size.defjvp
+def _(
+    primals: tuple[Array, Array], tangents: tuple[Array, Array]
+) -> tuple[Scalar, Scalar]:
+    costs, wanted = primals
+    temperature = temperature_for_sample_size(costs, wanted)
+
+    def size(costs: Array, temperature: Array) -> Scalar:
+        return effective_sample_size(softmin(costs, temperature)[0])
+
+    unchanged = jnp.zeros_like(temperature)
+    reached, by_costs = jax.jvp(size, (costs, temperature), (tangents[0], unchanged))
+    _, slope = jax.jvp(
+        size, (costs, temperature), (jnp.zeros_like(costs), unchanged + 1.0)
+    )
+    inside = (jnp.abs(reached - wanted) < 1e-2 * wanted) & (slope > 0)
+    change = (tangents[1] - by_costs) / jnp.where(inside, slope, 1.0)
+    return temperature, jnp.where(inside, change, 0.0)

@@ -16,8 +16,9 @@ from sfkd_jax.control.tasks._costs import Cost, StageInputs
 from sfkd_jax.control.tasks._path_tracking import check_path
 from sfkd_jax.control.tasks._task import (
     Limiter,
-    PreviousControl,
+    PlanningStart,
     RolloutSetup,
+    StepIndex,
     StepResult,
     Task,
     actuator_limits,
@@ -184,7 +185,7 @@ def _prepare(
     observation: State,
     env: Environment,
     reference: Reference,
-    previous: PreviousControl,
+    previous: PlanningStart,
 ) -> RolloutSetup:
     """Project the observation and evaluate fibre and law once per control step."""
     model, law = problem.model, problem.law
@@ -209,7 +210,7 @@ def _step(
     before: AlongSample,
     nu: Control,
     target: AlongTarget,
-    last: Scalar,
+    at: StepIndex,
 ) -> StepResult:
     """One step of one rollout: law plus perturbation, limits, model, cost."""
     point, law = target.point, problem.law
@@ -224,7 +225,7 @@ def _step(
     errors_before = _errors(before.coordinates, point[3])
     stage = StageInputs(errors, errors_before, control, before.control, point[3])
     cost = problem.cost.stage(weights, stage)
-    cost = cost * (1.0 + problem.terminal_weight * last)
+    cost = cost * (1.0 + problem.terminal_weight * at.last)
     position = point[:2] + coordinates[LATERAL] * target.normal
     yaw = point[2] + coordinates[HEADING]
     state = jnp.concatenate([position, yaw[None], coordinates[PATH_SPEED:]])

@@ -21,15 +21,16 @@ from sfkd_jax.control.tasks._task import (
     Actuator,
     Environments,
     Limiter,
-    PreviousControl,
+    PlanningStart,
     RolloutSetup,
+    StepIndex,
     StepResult,
     Task,
     actuator_limits,
 )
 from sfkd_jax.core.folding import fold
 from sfkd_jax.core.ranges import Positive
-from sfkd_jax.types import Control, Environment, Model, Params, Reference, Scalar, State
+from sfkd_jax.types import Control, Environment, Model, Params, Reference, State
 
 
 class PathSample(NamedTuple):
@@ -138,7 +139,7 @@ def _prepare(
     observation: State,
     env: Environment,
     reference: Reference,
-    previous: PreviousControl,
+    previous: PlanningStart,
 ) -> RolloutSetup:
     """Evaluate fibre, encoder, law and targets once per control step."""
     model, law = problem.model, problem.law
@@ -173,7 +174,7 @@ def _step(
     before: PathSample,
     nu: Control,
     target: PathTarget,
-    last: Scalar,
+    at: StepIndex,
 ) -> StepResult:
     """One step of one rollout: law plus perturbation, limits, model, cost."""
     model, point = problem.model, target.point
@@ -188,7 +189,7 @@ def _step(
         cost = cost + problem.latent_weight * jnp.sum(
             (model.vector(latent) - model.vector(target.goal)) ** 2
         )
-    cost = cost * (1.0 + problem.terminal_weight * last)
+    cost = cost * (1.0 + problem.terminal_weight * at.last)
     sample = PathSample(latent, errors, control)
     return StepResult(sample, cost, control, control - law_control, after)
 
@@ -224,7 +225,8 @@ def _ancillary_plan(
         state = model.decode(fiber, before.latent)
         control = ancillary.control(turn, state, target.point, target.curvature)
         nu = control - _law_control(problem, state, target)
-        after = _step(problem, weights, fiber, before, nu, target, jnp.zeros(()))
+        anywhere = StepIndex(jnp.zeros((), int), jnp.zeros(()))
+        after = _step(problem, weights, fiber, before, nu, target, anywhere)
         return after.sample, after.perturbation
 
     return jax.lax.scan(follow, start, (targets, turns))[1][None]

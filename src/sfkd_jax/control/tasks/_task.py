@@ -5,11 +5,10 @@ from __future__ import annotations
 from collections.abc import Callable
 from typing import Any, NamedTuple, TypeAlias
 
-import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Bool, Float
+from jaxtyping import Array, Bool, Float, Int
 
-from sfkd_jax.types import Control, Environment, Params, Scalar, State
+from sfkd_jax.types import Control, Key, Params, Scalar, State
 
 Environments: TypeAlias = Float[Array, "*particle environment"]
 """One environment, or several that are equally likely."""
@@ -19,16 +18,30 @@ Limiter: TypeAlias = Callable[[Control, Control], Control]
 """(wanted control, control before) -> the nearest control that the actuators allow."""
 
 
-class PreviousControl(NamedTuple):
-    """The control in force when planning starts.
+class PlanningStart(NamedTuple):
+    """What a planner knows at the start of a control step.
 
     Attributes:
         control: applied at the previous control step.
         known: False at the first step, where no control was applied before.
+        key: of this control step (and environment), for a task that is random itself.
     """
 
     control: Control
     known: Bool[Array, ""]
+    key: Key | None = None
+
+
+class StepIndex(NamedTuple):
+    """The place of a step in the horizon.
+
+    Attributes:
+        number: 0, 1, …
+        last: 1 at the final step and 0 before it.
+    """
+
+    number: Int[Array, ""]
+    last: Scalar
 
 
 class RolloutSetup(NamedTuple):
@@ -62,7 +75,7 @@ class StepResult(NamedTuple):
     cost: Scalar
     control: Control
     perturbation: Control
-    state: State
+    state: Any
 
 
 class Task(NamedTuple):
@@ -73,9 +86,10 @@ class Task(NamedTuple):
         high: upper control limits.
         weights: of the cost, a pytree of numbers. Planners carry them in their state,
             so changing them does not recompile anything.
-        prepare: (params, observation, env, reference, previous) -> `RolloutSetup`.
-        step: (weights, context, sample, perturbation, target, last) -> `StepResult`;
-            `last` is 1 at the final step of the horizon and 0 before it.
+        prepare: (params, observation, env, reference, planning start) ->
+            `RolloutSetup`.
+        step: (weights, context, sample, perturbation, target, step index) ->
+            `StepResult`.
         check: (observation, env, reference, horizon) -> None; raises a ValueError that
             names an argument of the wrong shape.
     """
@@ -83,9 +97,9 @@ class Task(NamedTuple):
     low: Control
     high: Control
     weights: Any
-    prepare: Callable[[Params, State, Environment, Any, PreviousControl], RolloutSetup]
-    step: Callable[[Any, Any, Any, Control, Any, Scalar], StepResult]
-    check: Callable[[State, Environments, Any, int], None]
+    prepare: Callable[[Params, Any, Any, Any, PlanningStart], RolloutSetup]
+    step: Callable[[Any, Any, Any, Control, Any, StepIndex], StepResult]
+    check: Callable[[Any, Any, Any, int], None]
 
 
 def actuator_limits(
@@ -128,102 +142,3 @@ def actuator_limits(
         )
 
     return limit
-
-
-class FreeSample(NamedTuple):
-    """State of one rollout of a plain state equation: state and last control."""
-
-    state: State
-    control: Control
-
-
-StageCost: TypeAlias = Callable[[Any, State, Control, Control, Any], Scalar]
-"""(weights, state, control, control before, reference) -> cost of one step."""
-
-
-def free_task(
-    dynamics: Callable[[Params, State, Control, Environment], State],
-    stage: StageCost,
-    *,
-    dt: float = 1.0,
-    control_low: tuple[float, ...],
-    control_high: tuple[float, ...],
-    control_rate: tuple[float, ...] | None = None,
-    terminal: Callable[[Any, State, Any], Scalar] | None = None,
-    weights: Any = (),
-    actuator: Actuator | None = None,
-) -> Task:
-    """Return the task of minimising any cost under any state equation.
-
-        x⁺ = f(params, x, u, e),   J = Σ_k ℓ(weights, x_{k+1}, u_k, u_{k−1}, ref_k) + φ
-
-    Args:
-        dynamics: f.
-        stage: ℓ, evaluated at the state after the control.
-        dt: sampling period [s], used by `control_rate` alone.
-        control_low: lower control limits.
-        control_high: upper control limits.
-        control_rate: largest change of a control per second, or None.
-        terminal: φ(weights, x_T, ref_T).
-        weights: a pytree of numbers that both costs read; it can be changed at run
-            time through the planner's state.
-        actuator: reads the actuator positions from the observation; without it, slew
-            limits count from the control applied last.
-
-    Returns:
-        A `Task` whose reference is any array or pytree with the horizon as its leading
-        axis, or () if there is none.
-
-    Raises:
-        ValueError: the limits are inconsistent, see `actuator_limits`.
-    """
-    limit = actuator_limits(control_low, control_high, control_rate, dt)
-    low, high = (
-        jnp.asarray(control_low, dtype=float),
-        jnp.asarray(control_high, dtype=float),
-    )
-    initial = jnp.clip(jnp.zeros_like(low), low, high)
-
-    def prepare(
-        params: Params,
-        observation: State,
-        env: Environment,
-        reference: Any,
-        previous: PreviousControl,
-    ) -> RolloutSetup:
-        before = jnp.where(previous.known, previous.control, initial)
-        if actuator is not None:
-            before = actuator(observation)
-        return RolloutSetup((params, env), FreeSample(observation, before), reference)
-
-    def step(
-        weights: Any,
-        context: Any,
-        before: FreeSample,
-        nu: Control,
-        goal: Any,
-        last: Scalar,
-    ) -> StepResult:
-        params, env = context
-        control = limit(nu, before.control)
-        state = dynamics(params, before.state, control, env)
-        cost = stage(weights, state, control, before.control, goal)
-        if terminal is not None:
-            cost = cost + last * terminal(weights, state, goal)
-        return StepResult(FreeSample(state, control), cost, control, control, state)
-
-    return Task(low, high, weights, prepare, step, _check_shapes)
-
-
-def _check_shapes(
-    observation: State, env: Environments, reference: Any, horizon: int
-) -> None:
-    """Raise a ValueError that names an argument of the wrong shape."""
-    if observation.ndim != 1:
-        raise ValueError(f"observation must have shape (nx,), got {observation.shape}")
-    for leaf in jax.tree.leaves(reference):
-        if leaf.shape[:1] != (horizon,):
-            raise ValueError(
-                f"reference must have {horizon} steps as its leading axis, "
-                f"got shape {leaf.shape}"
-            )
