@@ -161,7 +161,13 @@ VARIANTS = {
     "mppi_plain": partial(mppi, control.no_feedback(), noise_std=(0.06, 0.6)),
     "mppi_smoothed": partial(mppi, FEEDBACK, smoothing_window=5),
     "mppi_knots": partial(
-        mppi, FEEDBACK, noise="rbf", noise_knots=3, effective_samples=4.0, iterations=2
+        mppi,
+        FEEDBACK,
+        noise="rbf",
+        noise_knots=3,
+        effective_samples=4.0,
+        iterations=2,
+        info_level="samples",
     ),
 }
 WRAPPERS = {

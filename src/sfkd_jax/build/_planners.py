@@ -115,9 +115,11 @@ class Planner(NamedTuple):
 def _searching(name: str, search: Callable[..., Any], *given: str) -> Planner:
     """Return a planner that searches around a law."""
     build = partial(_sampled, name, search)
-    return Planner(build, (search, control.planner), given)
+    return Planner(build, (search, control.planner), (*_IN_PROGRAMS, *given))
 
 
+_IN_PROGRAMS = ("several", "info_level")
+"""Of programs that build their own planner."""
 _WEIGHTS = ("effective_samples", "temperature")
 """Of the weighted mean, which only MPPI takes."""
 _COST = (

@@ -15,6 +15,8 @@ from sfkd_jax.control.laws._path_law import PathLaw as PathLaw
 from sfkd_jax.control.laws._path_law import law_from_arrays as law_from_arrays
 from sfkd_jax.control.laws._path_law import law_to_arrays as law_to_arrays
 from sfkd_jax.control.laws._path_law import turn_control as turn_control
+from sfkd_jax.control.planners._autotune import Autotuned as Autotuned
+from sfkd_jax.control.planners._autotune import autotune as autotune
 from sfkd_jax.control.planners._box_qp import BoxSolution as BoxSolution
 from sfkd_jax.control.planners._box_qp import box_qp as box_qp
 from sfkd_jax.control.planners._cem import cem as cem

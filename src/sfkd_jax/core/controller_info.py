@@ -18,6 +18,11 @@ class ControllerInfo(TypedDict, total=False):
     healthy: Required[Bool[Array, ""]]  # False: the last finite plan is continued
     env_inside: Required[Bool[Array, ""]]  # whether e is in its box
     predicted_states: Required[Float[Array, "horizon state"]]  # of the chosen plan
+    # planners with info_level="samples", of all candidates
+    sample_costs: Float[Array, " sample"]
+    sample_weights: Float[Array, " sample"]  # in the chosen plan
+    sample_plans: Float[Array, "horizon sample control"]  # allowed perturbations
+    sample_states: Float[Array, "horizon sample state"]  # predicted
     # koopman_mpc
     residual: Scalar  # of the quadratic program, in control units
     # monitored

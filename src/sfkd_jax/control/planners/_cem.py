@@ -13,6 +13,7 @@ from sfkd_jax.control.planners._plans import (
     Evaluate,
     Plan,
     PlannerState,
+    Samples,
     SearchResult,
     candidate_plans,
     replace_nonfinite,
@@ -36,6 +37,7 @@ def cem(
     noise_exponent: float = 2.0,
     noise_knots: AtLeastTwo = 5,
     halton: bool = False,
+    info_level: str = "plan",
     **options: Any,
 ) -> Controller:
     """Return the cross-entropy controller of a task.
@@ -59,6 +61,7 @@ def cem(
         noise_exponent: see `noise_sampler`.
         noise_knots: see `noise_sampler`.
         halton: see `noise_sampler`.
+        info_level: see `planner`.
         options: of `planner`.
 
     Raises:
@@ -88,20 +91,25 @@ def cem(
         ) -> tuple[tuple[Plan, Plan], SearchResult]:
             plan, scale = carry
             noise = draw(key, num_samples, std) * scale[:, None]
-            costs, effective = evaluate(candidate_plans(plan, noise, state))
-            costs = replace_nonfinite(costs, jnp.inf)
+            evaluated = evaluate(candidate_plans(plan, noise, state))
+            costs = replace_nonfinite(evaluated.costs, jnp.inf)
             negated, chosen = jax.lax.top_k(-costs, elites)
             counts = jnp.isfinite(negated).astype(float)
             weights = counts / jnp.maximum(jnp.sum(counts), 1.0)
             mean, spread = weighted_mean_and_std(
-                weights, replace_nonfinite(effective, 0.0)[:, chosen]
+                weights, replace_nonfinite(evaluated.perturbations, 0.0)[:, chosen]
             )
             scale = jnp.maximum(spread / std[None], smallest_scale)
             usable, size = jnp.any(counts > 0), jnp.sum(counts)
-            return (mean, scale), SearchResult(mean, usable, -negated[0], size)
+            samples = None
+            if info_level == "samples":
+                kept = jnp.zeros_like(costs).at[chosen].set(weights)
+                samples = Samples(evaluated, kept)
+            result = SearchResult(mean, usable, -negated[0], size, samples)
+            return (mean, scale), result
 
         start = (state.plan, jnp.ones_like(state.plan))
         _, results = jax.lax.scan(improve, start, jax.random.split(key, iterations))
         return jax.tree.map(lambda leaf: leaf[-1], results)
 
-    return planner(task, search, horizon=horizon, **options)
+    return planner(task, search, horizon=horizon, info_level=info_level, **options)

@@ -13,6 +13,7 @@ from sfkd_jax.control.planners._plans import (
     Plan,
     PlannerState,
     Plans,
+    Samples,
     SearchResult,
     replace_nonfinite,
 )
@@ -28,6 +29,7 @@ def gradient_planner(
     iterations: int = 5,
     steps: AtLeastTwo = 8,
     shrink: Fraction = 0.4,
+    info_level: str = "plan",
     **options: Any,
 ) -> Controller:
     """Return the controller that descends the gradient of the rollout's cost.
@@ -49,6 +51,7 @@ def gradient_planner(
         iterations: of gradient and line search per control step.
         steps: candidates of a line search.
         shrink: c in (0, 1).
+        info_level: see `planner`; the samples are those of the last line search.
         options: of `planner`; noise_std is the unit of a step.
 
     Raises:
@@ -66,7 +69,7 @@ def gradient_planner(
         std = state.tuning.noise_std
 
         def cost_of(plan: Plan) -> Scalar:
-            return evaluate(plan[:, None])[0][0]
+            return evaluate(plan[:, None]).costs[0]
 
         def descend(plan: Plan, _: None) -> tuple[Plan, SearchResult]:
             slope = replace_nonfinite(jax.grad(cost_of)(plan), 0.0)
@@ -76,12 +79,17 @@ def gradient_planner(
             return best_of(plan[:, None] + sizes[None, :, None] * direction[:, None])
 
         def best_of(plans: Plans) -> tuple[Plan, SearchResult]:
-            costs, effective = evaluate(plans)
+            evaluated = evaluate(plans)
+            effective, costs = evaluated.perturbations, evaluated.costs
             costs = replace_nonfinite(costs, jnp.inf)
             best = jnp.argmin(costs)
             plan, lowest = replace_nonfinite(effective[:, best], 0.0), costs[best]
             usable = jnp.isfinite(lowest)
-            return plan, SearchResult(plan, usable, lowest, jnp.ones(()))
+            samples = None
+            if info_level == "samples":
+                chosen = (jnp.arange(costs.shape[0]) == best).astype(costs.dtype)
+                samples = Samples(evaluated, chosen)
+            return plan, SearchResult(plan, usable, lowest, jnp.ones(()), samples)
 
         plan = state.plan
         if state.proposals.shape[0]:
@@ -90,4 +98,4 @@ def gradient_planner(
         _, results = jax.lax.scan(descend, plan, None, length=iterations)
         return jax.tree.map(lambda leaf: leaf[-1], results)
 
-    return planner(task, search, horizon=horizon, **options)
+    return planner(task, search, horizon=horizon, info_level=info_level, **options)

@@ -16,6 +16,7 @@ from sfkd_jax.control.planners._plans import (
     Plan,
     PlannerState,
     Plans,
+    Samples,
     SearchResult,
     candidate_plans,
     replace_nonfinite,
@@ -50,6 +51,7 @@ def mppi(
     curvature: bool = False,
     adapt: UnitInterval = 0.0,
     control_cost: float = 0.0,
+    info_level: str = "plan",
     **options: Any,
 ) -> Controller:
     """Return the information-theoretic MPPI controller of a task.
@@ -79,6 +81,7 @@ def mppi(
             and control, moves to that of the weighted samples after each iteration. It
             is reset at every control step.
         control_cost: γ, in units of cost; Williams et al. have λ (1 − α).
+        info_level: see `planner`.
         options: of `planner`: temperature, noise_std, smoothing, risk, chunk, sharding,
             environment box.
 
@@ -105,7 +108,7 @@ def mppi(
         if not curvature:
             return lambda key: draw(key, num_samples, std)
         factor = curvature_factor(
-            lambda plan: evaluate(plan[:, None])[0][0], state.plan, std
+            lambda plan: evaluate(plan[:, None]).costs[0], state.plan, std
         )
         return lambda key: shape_noise(
             factor, draw(key, num_samples, jnp.ones_like(std))
@@ -120,7 +123,8 @@ def mppi(
         ) -> tuple[tuple[Plan, Plan], SearchResult]:
             plan, scale = carry
             plans = candidate_plans(plan, sample(key) * scale[:, None], state)
-            costs, effective = evaluate(plans)
+            evaluated = evaluate(plans)
+            costs = evaluated.costs
             total = costs
             if control_cost:
                 total = costs + control_cost * _control_cost(plan, plans, std)
@@ -130,14 +134,15 @@ def mppi(
                 temperature = temperature_for_sample_size(total, wanted)
             weights, usable = softmin(total, temperature)
             mean, spread = weighted_mean_and_std(
-                weights, replace_nonfinite(effective, 0.0)
+                weights, replace_nonfinite(evaluated.perturbations, 0.0)
             )
             if adapt:
                 scale = (1 - adapt) * scale + adapt * spread / std[None]
                 scale = jnp.maximum(scale, MIN_NOISE_SCALE)
             lowest = jnp.min(replace_nonfinite(costs, jnp.inf))
             size = effective_sample_size(weights)
-            return (mean, scale), SearchResult(mean, usable, lowest, size)
+            samples = Samples(evaluated, weights) if info_level == "samples" else None
+            return (mean, scale), SearchResult(mean, usable, lowest, size, samples)
 
         start = (state.plan, jnp.ones_like(state.plan))
         if iterations == 1:
@@ -146,7 +151,12 @@ def mppi(
         return jax.tree.map(lambda leaf: leaf[-1], results)
 
     return planner(
-        task, search, horizon=horizon, effective_samples=effective_samples, **options
+        task,
+        search,
+        horizon=horizon,
+        effective_samples=effective_samples,
+        info_level=info_level,
+        **options,
     )
 
 

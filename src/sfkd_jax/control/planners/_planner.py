@@ -10,9 +10,11 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool
 
 from sfkd_jax.control.planners._plans import (
+    INFO_LEVELS,
     PlannerState,
     Search,
     Tuning,
+    about_samples,
     all_finite,
     clip_environment,
     replace_nonfinite,
@@ -73,6 +75,7 @@ def planner(
     env_low: tuple[float, ...] | None = None,
     env_high: tuple[float, ...] | None = None,
     several: bool | None = None,
+    info_level: str = "plan",
 ) -> Controller:
     """Return the receding-horizon controller of a task and a search for its best plan.
 
@@ -111,11 +114,13 @@ def planner(
         env_high: upper end of the environment box.
         several: whether the leading axis of every leaf of an environment runs over
             equally likely ones; None if it does for a matrix alone.
+        info_level: "plan", or "samples" to report every candidate as well.
 
     Returns:
         A `Controller`; `info` has `cost` (lowest), `mean_cost` (of the chosen plan),
         `effective_samples`, `healthy`, `env_inside` and `predicted_states` (horizon,
-        state) of the chosen plan.
+        state) of the chosen plan. With `info_level="samples"` it has `sample_costs`,
+        `sample_weights`, `sample_plans` (perturbations) and `sample_states` too.
 
     Raises:
         ValueError: `noise_std` does not fit the task, the horizon or the temperature
@@ -124,6 +129,10 @@ def planner(
     """
     if horizon < 1:
         raise ValueError(f"horizon must be at least 1, got {horizon}")
+    if info_level not in INFO_LEVELS:
+        raise ValueError(
+            f"info_level must be one of {', '.join(INFO_LEVELS)}, got {info_level!r}"
+        )
     if not temperature > 0:
         raise ValueError(f"temperature must be positive, got {temperature}")
     if len(noise_std) != task.low.shape[0] or not all(std > 0 for std in noise_std):
@@ -238,6 +247,7 @@ def _act(
         "healthy": healthy,
         "env_inside": _is_inside(settings, env, inside),
         "predicted_states": rollout.states,
+        **about_samples(result.samples),
     }
     elapsed = jnp.minimum(elapsed, 1.0)
     after = state._replace(

@@ -4,13 +4,13 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from functools import partial
-from typing import Any, NamedTuple, TypeAlias
+from typing import Any, NamedTuple, TypeAlias, cast
 
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, UInt32
 
-from sfkd_jax.types import Control, Key, Scalar
+from sfkd_jax.types import Control, ControllerInfo, Key, Scalar
 
 Plan: TypeAlias = Float[Array, "horizon control"]
 Plans: TypeAlias = Float[Array, "horizon sample control"]
@@ -104,6 +104,32 @@ def _of_type(name: str, before: Array, value: Any) -> Array:
     return after
 
 
+class Evaluated(NamedTuple):
+    """What the rollouts of plans came to.
+
+    Attributes:
+        costs: of the whole rollouts; of several environments, the risk over them.
+        perturbations: that the limits allowed; of several environments, their mean.
+        states: predicted, (horizon, sample, …); of several environments, in the first.
+    """
+
+    costs: Float[Array, " sample"]
+    perturbations: Plans
+    states: Any
+
+
+class Samples(NamedTuple):
+    """The candidates of the last iteration of a search.
+
+    Attributes:
+        evaluated: costs, perturbations and states.
+        weights: in the chosen plan.
+    """
+
+    evaluated: Evaluated
+    weights: Float[Array, " sample"]
+
+
 class SearchResult(NamedTuple):
     """The outcome of a search.
 
@@ -112,17 +138,35 @@ class SearchResult(NamedTuple):
         usable: whether any rollout had a finite cost.
         cost: the lowest cost of all samples.
         effective_samples: 1 / Σ w² of the sample weights.
+        samples: the candidates, for a planner that reports them.
     """
 
     plan: Plan
     usable: Bool[Array, ""]
     cost: Scalar
     effective_samples: Scalar
+    samples: Samples | None = None
 
 
-Evaluate: TypeAlias = Callable[[Plans], tuple[Float[Array, " sample"], Plans]]
-"""Plans -> their costs, and the perturbations that the limits allowed."""
+INFO_LEVELS = ("plan", "samples")
+"""What a planner reports: the chosen plan, or all candidates as well."""
+Evaluate: TypeAlias = Callable[[Plans], Evaluated]
+"""Rolls out plans."""
 Search: TypeAlias = Callable[[Key, PlannerState, Evaluate], SearchResult]
+
+
+def about_samples(samples: Samples | None) -> ControllerInfo:
+    """Return the entries of `info` about all candidates, if they are reported."""
+    if samples is None:
+        return cast(ControllerInfo, {})
+    evaluated = samples.evaluated
+    about = {
+        "sample_costs": evaluated.costs,
+        "sample_weights": samples.weights,
+        "sample_plans": evaluated.perturbations,
+        "sample_states": evaluated.states,
+    }
+    return cast(ControllerInfo, about)
 
 
 def candidate_plans(

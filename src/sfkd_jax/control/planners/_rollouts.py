@@ -10,7 +10,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from sfkd_jax.control.planners._plans import Evaluate, Plan, Plans
+from sfkd_jax.control.planners._plans import Evaluate, Evaluated, Plan, Plans
 from sfkd_jax.control.planners._risk import RiskMeasure
 from sfkd_jax.control.tasks._task import RolloutSetup, StepIndex, Task
 from sfkd_jax.types import Scalar
@@ -88,14 +88,20 @@ def evaluate_function(
         sharding: of the samples over devices, or None.
     """
 
-    def evaluate(plans: Plans) -> tuple[Float[Array, " sample"], Plans]:
+    def evaluate(plans: Plans) -> Evaluated:
         # A single plan cannot be split over devices.
         if sharding is not None and plans.shape[1] > 1:
             plans = jax.lax.with_sharding_constraint(plans, sharding)
         rollouts = _in_chunks(roll_out, plans, chunk)
+        costs, perturbations, states = (
+            rollouts.costs,
+            rollouts.perturbations,
+            rollouts.states,
+        )
         if risk is None:
-            return rollouts.costs, rollouts.perturbations
-        return risk(rollouts.costs), jnp.mean(rollouts.perturbations, axis=0)
+            return Evaluated(costs, perturbations, states)
+        first = jax.tree.map(lambda leaf: leaf[0], states)
+        return Evaluated(risk(costs), jnp.mean(perturbations, axis=0), first)
 
     return evaluate
 
