@@ -9,7 +9,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from sfkd_jax.control.planners._noise import noise_sampler
+from sfkd_jax.control.planners._noise import NoiseSampler, noise_sampler
 from sfkd_jax.control.planners._planner import planner
 from sfkd_jax.control.planners._plans import (
     Evaluate,
@@ -102,21 +102,9 @@ def mppi(
         halton=halton,
     )
 
-    def noise_around(state: PlannerState, evaluate: Evaluate) -> Callable[[Key], Plans]:
-        """The sampler of this control step."""
-        std = state.tuning.noise_std
-        if not curvature:
-            return lambda key: draw(key, num_samples, std)
-        factor = curvature_factor(
-            lambda plan: evaluate(plan[:, None]).costs[0], state.plan, std
-        )
-        return lambda key: shape_noise(
-            factor, draw(key, num_samples, jnp.ones_like(std))
-        )
-
     def search(key: Key, state: PlannerState, evaluate: Evaluate) -> SearchResult:
         std = state.tuning.noise_std
-        sample = noise_around(state, evaluate)
+        sample = _sampler(draw, num_samples, curvature, state, evaluate)
 
         def improve(
             carry: tuple[Plan, Plan], key: Key
@@ -158,6 +146,23 @@ def mppi(
         info_level=info_level,
         **options,
     )
+
+
+def _sampler(
+    draw: NoiseSampler,
+    num_samples: int,
+    curvature: bool,
+    state: PlannerState,
+    evaluate: Evaluate,
+) -> Callable[[Key], Plans]:
+    """The noise of this control step, shaped by the cost of the plan on request."""
+    std = state.tuning.noise_std
+    if not curvature:
+        return lambda key: draw(key, num_samples, std)
+    factor = curvature_factor(
+        lambda plan: evaluate(plan[:, None]).costs[0], state.plan, std
+    )
+    return lambda key: shape_noise(factor, draw(key, num_samples, jnp.ones_like(std)))
 
 
 def _control_cost(plan: Array, plans: Plans, std: Array) -> Float[Array, " sample"]:
