@@ -16,6 +16,7 @@ from benchmarks.quality import (
     adaptation_page,
     corridor_page,
     path_frame,
+    protocol2_power,
     shield_table,
     speed_page,
 )
@@ -516,6 +517,12 @@ def test_the_tables_of_adaptation_are_those_of_its_runs():
     assert adaptation_page.page(text) == text
     for name, table in adaptation_page.TABLES.items():
         assert table() in text, name
+
+
+def test_the_table_of_what_protocol_2_can_tell_is_that_of_its_runs():
+    text = protocol2_power.PAGE.read_text("utf-8")
+    assert protocol2_power.page(text) == text
+    assert protocol2_power.table() in text
 
 
 def test_the_prose_of_adaptation_is_true_of_its_runs():

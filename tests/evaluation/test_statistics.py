@@ -4,7 +4,13 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from sfkd_jax.evaluation import holm, mean_interval, p_value, paired_difference
+from sfkd_jax.evaluation import (
+    holm,
+    mean_interval,
+    mean_squares,
+    p_value,
+    paired_difference,
+)
 
 DRAWS = 2000
 SIZES = [(3, 16), (3, 12), (5, 16), (10, 200)]
@@ -120,3 +126,12 @@ def test_trainings_that_the_other_row_lacks_do_not_count_and_one_is_compared_wit
     assert paired_difference(three, one)["mean"] == pytest.approx(
         three.mean() - one.mean()
     )
+
+
+def test_mean_squares_have_the_expectations_of_their_variances():
+    random = np.random.default_rng(11)
+    tables = crossed(random, (3, 16), (0.5, 1.0, 0.7))
+    means = np.mean([mean_squares(table) for table in tables], axis=0)
+    rest = 0.7**2
+    expected = 16 * 0.5**2 + rest, 3 * 1.0**2 + rest, rest
+    np.testing.assert_allclose(means, expected, rtol=0.07)

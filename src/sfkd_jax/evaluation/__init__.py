@@ -26,6 +26,7 @@ from sfkd_jax.evaluation._rows import row as row
 from sfkd_jax.evaluation._rows import score as score
 from sfkd_jax.evaluation._statistics import holm as holm
 from sfkd_jax.evaluation._statistics import mean_interval as mean_interval
+from sfkd_jax.evaluation._statistics import mean_squares as mean_squares
 from sfkd_jax.evaluation._statistics import p_value as p_value
 from sfkd_jax.evaluation._statistics import paired_difference as paired_difference
 from sfkd_jax.evaluation._statistics import summary as summary

@@ -70,6 +70,27 @@ def mean_interval(
     return spread.mean, [spread.mean - half, spread.mean + half]
 
 
+def mean_squares(
+    values: Float[np.ndarray, "seed episode"],
+) -> tuple[float, float, float]:
+    """Return M_a, M_b, M_c of a two-way analysis of variance without replication.
+
+    Their expectations are E σ_a² + σ_c², T σ_b² + σ_c² and σ_c², with T trainings and E
+    episodes.
+
+    Args:
+        values: at least two trainings and two episodes.
+    """
+    trainings, episodes = values.shape
+    by_training, by_episode = values.mean(axis=1), values.mean(axis=0)
+    rest = values - by_training[:, None] - by_episode + values.mean()
+    return (
+        float(episodes * np.var(by_training, ddof=1)),
+        float(trainings * np.var(by_episode, ddof=1)),
+        float(np.sum(rest**2) / ((trainings - 1) * (episodes - 1))),
+    )
+
+
 def p_value(values: Float[np.ndarray, "*seed episode"]) -> float | None:
     """Return the p at which the 1 − p interval of `mean_interval` touches 0.
 
@@ -146,12 +167,8 @@ def _spread(values: Float[np.ndarray, "*seed episode"]) -> Spread | None:
         error = float(np.std(table, ddof=1) / np.sqrt(table.size))
         freedom = table.size - 1
         return Spread(mean, error, float(episodes == 1), (freedom, freedom))
-    by_training, by_episode = table.mean(axis=1), table.mean(axis=0)
-    rest = table - by_training[:, None] - by_episode + mean
     freedom = trainings - 1, episodes - 1
-    of_trainings = episodes * np.var(by_training, ddof=1)
-    of_episodes = trainings * np.var(by_episode, ddof=1)
-    of_rest = np.sum(rest**2) / (freedom[0] * freedom[1])
+    of_trainings, of_episodes, of_rest = mean_squares(table)
     total = max(of_trainings + of_episodes - of_rest, of_trainings, of_episodes)
     share = max(of_trainings - of_rest, 0.0) / total if total > 0 else 0.0
     return Spread(mean, float(np.sqrt(total / table.size)), float(share), freedom)
