@@ -259,12 +259,21 @@ def test_a_scenario_of_choice_adds_rows_and_keeps_the_others(copied):
     assert all((copied / figure).exists() for figure in report["figures"])
 
 
+def test_without_systems_a_model_is_trained_alone_and_scored_for_a_search(smoke):
+    done = last_line(
+        run_command("train", "+experiment=smoke", "evaluation=none", cwd=smoke[0])
+    )
+    assert done["objective"] > 0
+    assert "certificate" not in done
+
+
 @pytest.mark.parametrize(
     ("arguments", "says"),
     [
         (("+experiment=s9",), "smoke"),
         (("+experiment=smoke", "model=sfdk"), "sfkd_segment"),
         (("+experiment=smoke", "evaluation.systems=[oracel]"), "oracle"),
+        (("+experiment=smoke", "evaluation.systems=[]"), "nothing to evaluate"),
         (("+experiment=smoke", "model.frame=boddy", "name=bad"), "segment"),
         (("+experiment=smoke", "training.window=80", "name=bad"), "80"),
         (("+experiment=smoke", "dataset.shares=[0.5,0.5,0.5,0.5]"), "shares"),
