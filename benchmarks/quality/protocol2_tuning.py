@@ -12,7 +12,6 @@ import argparse
 import json
 import math
 import sys
-import time
 from pathlib import Path
 from typing import NamedTuple
 
@@ -131,7 +130,6 @@ def tune(root, vehicle, label, row):
     for number, overrides in list(enumerate(trials_of(space)))[len(trials) :]:
         name = f"tune/{vehicle}/{label}/{number}"
         settings = composed(root, name, vehicle, row, overrides)
-        began = time.perf_counter()
         trial = {"overrides": overrides, "score": None}
         try:
             document = train.run(settings)
@@ -140,7 +138,6 @@ def tune(root, vehicle, label, row):
             trial["parameters"] = sum(leaf.size for leaf in jax.tree.leaves(weights))
         except (ValueError, RuntimeError) as reason:
             trial["failed"] = str(reason)
-        trial["seconds"] = round(time.perf_counter() - began, 1)
         trials.append(trial)
         out.parent.mkdir(parents=True, exist_ok=True)
         artefacts.write_json(
