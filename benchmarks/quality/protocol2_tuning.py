@@ -27,7 +27,9 @@ TRIALS = 8
 STEPS = 1000
 SEED = 1000
 """Of the trials' weights and windows; the rows themselves use 0, 1 and 2."""
-VEHICLES = ("kinematic", "kinematic_stiff", "dynamic")
+VEHICLES = ("kinematic_stiff", "dynamic")
+SAME_STATES = {"kinematic": "kinematic_stiff"}
+"""A plant that takes the settings of another one with the same states."""
 HERE = Path(__file__).parent
 TUNED = HERE.parents[1] / "conf" / "comparison" / "tuned.yaml"
 
@@ -174,6 +176,8 @@ def choose():
         if len(document["trials"]) < TRIALS:
             raise SystemExit(f"{file}: {len(document['trials'])} of {TRIALS} trials")
         tuned.setdefault(file.parent.name, {})[file.stem] = chosen(document)
+    for vehicle, like in SAME_STATES.items():
+        tuned[vehicle] = tuned[like]
     head, *_ = TUNED.read_text("utf-8").splitlines()
     TUNED.write_text(f"{head}\n{yaml.safe_dump({'tuned': tuned}, width=200)}", "utf-8")
 
