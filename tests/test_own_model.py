@@ -12,7 +12,7 @@ import pytest
 from helpers import last_line, run_command
 
 import sfkd_jax
-from sfkd_jax import models
+from sfkd_jax import build, models
 from sfkd_jax.artefacts import ArtefactError
 from sfkd_jax.types import Space
 
@@ -108,3 +108,15 @@ def test_the_model_of_the_page_steps_the_nominal_bicycle_before_it_is_trained(
     state = jnp.arange(4.0)
     fiber = factory.fiber(params, jnp.ones(2))
     assert bool(jnp.all(factory.step(fiber, state, jnp.ones(2)) == state))
+
+
+@pytest.mark.parametrize("factory", ["os:system", "importlib.util:find_spec"])
+def test_a_stored_model_cannot_name_a_function_of_python(factory):
+    """These modules are imported in every process, so that alone is no consent."""
+    with pytest.raises(ValueError, match="Python's own"):
+        build.check_imported({"model": {"factory": factory}})
+
+
+@pytest.mark.parametrize("settings", [None, [], {}, {"model": None}, {"model": {}}])
+def test_settings_without_a_factory_name_no_code(settings):
+    build.check_imported(settings)

@@ -309,19 +309,25 @@ def drive(rows, case, car, given, scene):
         seen = jnp.where(late[:, None], made.observed_envs, made.envs)
         made = made._replace(observed_envs=seen)
 
+    scene = made, keys
+    return summary(episodes_of(rows, car, (controller, params), scene, report=reported))
+
+
+def episodes_of(rows, car, system, scene, **options):
+    """All episodes of a (controller, parameters) on a car, at once."""
+
     def one(inputs):
         return evaluation.simulate(
             car.step,
-            controller,
-            params,
+            *system,
             *inputs,
             dt=car.dt,
             horizon=20,
             observation_noise=sensor_noise(rows),
-            report=reported,
+            **options,
         )
 
-    return summary(jax.jit(jax.vmap(one))((made, keys)))
+    return jax.jit(jax.vmap(one))(scene)
 
 
 def sensor_noise(rows):

@@ -18,7 +18,7 @@ import numpy as np
 
 from benchmarks import harness
 from benchmarks.quality import adaptation
-from sfkd_jax import artefacts, evaluation
+from sfkd_jax import artefacts
 from sfkd_jax.vehicle import side_force
 
 AFTER = (0, 1, 2, 3, 5, 10, 20, 29)
@@ -92,22 +92,10 @@ def bounds_of(plant, noise, prior, episodes, envs):
     return np.stack(spread), since
 
 
-def episodes_of(rows, plant, system, scene):
-    """Episodes of a controller in its scenario."""
-    controller, params = system
-
-    def one(inputs):
-        return evaluation.simulate(
-            plant.step,
-            controller,
-            params,
-            *inputs,
-            dt=plant.dt,
-            horizon=20,
-            observation_noise=adaptation.sensor_noise(rows),
-        )
-
-    return jax.tree.map(np.asarray, jax.jit(jax.vmap(one))(scene))
+def episodes_of(rows, system, scene):
+    """Episodes of a (controller, parameters) in its scenario, as numpy arrays."""
+    episodes = adaptation.episodes_of(rows, rows.plant, system, scene)
+    return jax.tree.map(np.asarray, episodes)
 
 
 def by_steps(errors, since):
@@ -144,7 +132,7 @@ def main():
     noise = adaptation.sensor_noise(rows)
 
     oracle = rows.planner(rows.oracle(plant)), {}
-    told = episodes_of(rows, plant, oracle, (made, keys))
+    told = episodes_of(rows, oracle, (made, keys))
     spread, since = bounds_of(plant, noise, prior, told, envs)
     visits = since[0] == 0
     draw = np.random.default_rng(given.seed).standard_normal((*envs.shape,))
@@ -154,7 +142,7 @@ def main():
     rows_driven = {
         "oracle, e measured": rmse(told),
         "oracle, e as wrong as the bound": rmse(
-            episodes_of(rows, plant, oracle, (misled, keys))
+            episodes_of(rows, oracle, (misled, keys))
         ),
     }
     estimators = {
@@ -164,7 +152,7 @@ def main():
     errors = {"bound": by_steps(spread, since)}
     for name, (model, params) in estimators.items():
         system = rows.adaptive(model, estimate_env=True), params
-        driven = episodes_of(rows, plant, system, (made, keys))
+        driven = episodes_of(rows, system, (made, keys))
         error = to_force(plant, driven.assumed_envs) - to_force(plant, envs)
         errors[name] = by_steps(error, since)
         rows_driven[name] = rmse(driven)

@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import functools
 import time
-from collections.abc import Callable
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -39,19 +40,14 @@ def run(settings: dict[str, Any]) -> dict[str, Any]:
     compose_cell = functools.cache(functools.partial(_compose, comparison=comparison))
     make_episodes = cached_episodes()
     failed: dict[str, str] = {}
-
-    def attempt(work: Callable[..., Any], group: list[grid.Cell]) -> Any:
-        try:
-            return work(group, comparison, compose_cell, make_episodes)
-        except (TrainingStopped, ValueError, artefacts.ArtefactError) as reason:
-            failed["/".join(map(str, group[0][:4]))] = str(reason)
-            artefacts.print_message(f"failed: {reason}")
-            return 0
-
-    groups = [group for group in groups if attempt(check_group, group) is None]
+    for group in groups:
+        with _named_if_it_fails(group, failed):
+            check_group(group, comparison, compose_cell, make_episodes)
+    groups = [group for group in groups if _name(group) not in failed]
     done = 0
     for number, group in enumerate(groups, 1):
-        done += attempt(evaluate_group, group)
+        with _named_if_it_fails(group, failed):
+            done += evaluate_group(group, comparison, compose_cell, make_episodes)
         if done:
             _print_estimate(number, len(groups), time.perf_counter() - began)
     if comparison["share"] is not None:
@@ -59,6 +55,23 @@ def run(settings: dict[str, Any]) -> dict[str, Any]:
     seconds = time.perf_counter() - began if done else None
     with artefacts.locked(_directory(settings), wait=True):
         return _collect(cells, settings, compose_cell, failed, seconds)
+
+
+@contextmanager
+def _named_if_it_fails(
+    group: list[grid.Cell], failed: dict[str, str]
+) -> Iterator[None]:
+    """Print and store why a row failed, and go on with the others."""
+    try:
+        yield
+    except (TrainingStopped, ValueError, artefacts.ArtefactError) as reason:
+        failed[_name(group)] = str(reason)
+        artefacts.print_message(f"failed: {reason}")
+
+
+def _name(group: list[grid.Cell]) -> str:
+    """The name of a row under one controller."""
+    return "/".join(map(str, group[0][:4]))
 
 
 def _directory(settings: dict[str, Any]) -> Path:

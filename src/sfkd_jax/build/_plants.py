@@ -75,13 +75,19 @@ def build_model(settings: Settings, space: Space, plant: vehicle.Vehicle) -> Mod
 def check_imported(settings: Any) -> None:
     """Check that the code that stored settings name was imported by the caller.
 
+    Modules of the standard library are imported by anybody, and no models.
+
     Raises:
-        ValueError: `model.factory` is of a module that is not imported.
+        ValueError: `model.factory` is of a module that is not imported, or of Python.
     """
     model = settings.get("model") if isinstance(settings, Mapping) else None
     factory = model.get("factory") if isinstance(model, Mapping) else None
     module = str(factory).partition(":")[0]
-    if factory is not None and module not in sys.modules:
+    if factory is None:
+        return
+    if module.partition(".")[0] in sys.stdlib_module_names:
+        raise ValueError(f"its model is {factory}, which is no model but Python's own")
+    if module not in sys.modules:
         raise ValueError(
             f"its model is {factory}: import {module} first, if you trust it"
         )

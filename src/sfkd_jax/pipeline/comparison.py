@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from pathlib import Path
 from typing import Any, TypeAlias
 
 from sfkd_jax import artefacts, build
@@ -59,14 +60,11 @@ def check_group(
     Raises:
         ValueError: settings that cannot be built.
     """
-    for cell in group:
-        settings = compose_cell(cell)
-        if grid.is_done(grid.cell_path(cell, settings), settings):
-            continue
+    for cell, settings, _ in _pending(group, compose_cell):
         plant = build.build_vehicle(settings["vehicle"])
         make_episodes(settings, plant)
-        run_settings = _run_settings(cell, comparison, compose_cell)
         if "self" in settings["evaluation"]["systems"]:
+            run_settings = _run_settings(cell, comparison, compose_cell)
             dry_run.check_settings(run_settings, plant)
 
 
@@ -94,12 +92,8 @@ def evaluate_group(
     """
     evaluators: dict[str, evaluate_system.Evaluator] = {}
     done = 0
-    for cell in group:
-        settings = compose_cell(cell)
-        path = grid.cell_path(cell, settings)
+    for cell, settings, path in _pending(group, compose_cell):
         run_settings = _run_settings(cell, comparison, compose_cell)
-        if grid.is_done(path, settings):
-            continue
         plant = build.build_vehicle(settings["vehicle"])
         episodes = make_episodes(settings, plant)
         key = grid.compilation_key(run_settings)
@@ -111,6 +105,17 @@ def evaluate_group(
         artefacts.print_message(f"{' '.join(map(str, cell))}: {error:.1f} mm")
         done += 1
     return done
+
+
+def _pending(
+    group: list[grid.Cell], compose_cell: ComposeCell
+) -> Iterator[tuple[grid.Cell, dict[str, Any], Path]]:
+    """The cells that are not done, their settings and their paths."""
+    for cell in group:
+        settings = compose_cell(cell)
+        path = grid.cell_path(cell, settings)
+        if not grid.is_done(path, settings):
+            yield cell, settings, path
 
 
 def _run_settings(

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from functools import partial
 from typing import NamedTuple
 
 import jax
@@ -91,41 +92,35 @@ def braking_turn(key: Key, length: float) -> Path:
 def gust_steps(key: Key, steps: int, dt: float) -> Schedule:
     """Gusts that begin and end at once: every 6 s for 3 s, from a random side."""
     phase, side = _phase(key, steps, dt, period=6.0)
-    return _wind(DRY, jnp.where(phase < 0.5, side * WIND, 0.0))
+    return _schedule(DRY, jnp.where(phase < 0.5, side * WIND, 0.0))
 
 
 def gust_cosines(key: Key, steps: int, dt: float) -> Schedule:
     """Gusts of the shape 1 − cos, every 6 s for 3 s, from a random side."""
     phase, side = _phase(key, steps, dt, period=6.0)
     shape = 0.5 - 0.5 * jnp.cos(4.0 * jnp.pi * jnp.minimum(phase, 0.5))
-    return _wind(DRY, side * WIND * shape)
+    return _schedule(DRY, side * WIND * shape)
 
 
-def dry_and_slippery(key: Key, steps: int, dt: float) -> Schedule:
-    """Friction that drops for half of every 6 s."""
+def friction_drops(key: Key, steps: int, dt: float, *, to: float) -> Schedule:
+    """Friction of a dry road that drops for 3 s of every 6."""
     phase, _ = _phase(key, steps, dt, period=6.0)
-    return _wind(jnp.where(phase < 0.5, SLIPPERY, DRY), jnp.zeros(steps))
-
-
-def dry_and_wet(key: Key, steps: int, dt: float) -> Schedule:
-    """The same, to a wet road."""
-    phase, _ = _phase(key, steps, dt, period=6.0)
-    return _wind(jnp.where(phase < 0.5, WET, DRY), jnp.zeros(steps))
+    return _schedule(jnp.where(phase < 0.5, to, DRY), jnp.zeros(steps))
 
 
 def wet(key: Key, steps: int, dt: float) -> Schedule:
     """Friction from wet to dry, constant for an episode, and no wind."""
     del dt
     level = jax.random.uniform(key, (), minval=WET, maxval=DRY)
-    return _wind(jnp.full(steps, level), jnp.zeros(steps))
+    return _schedule(jnp.full(steps, level), jnp.zeros(steps))
 
 
 MANOEUVRES = {
     "double_lane_change": Manoeuvre(lane_changes, wet),
     "gust_step": Manoeuvre(straight, gust_steps),
     "gust_cosine": Manoeuvre(straight, gust_cosines),
-    "friction_step": Manoeuvre(turn, dry_and_slippery),
-    "braking_turn": Manoeuvre(braking_turn, dry_and_wet),
+    "friction_step": Manoeuvre(turn, partial(friction_drops, to=SLIPPERY)),
+    "braking_turn": Manoeuvre(braking_turn, partial(friction_drops, to=WET)),
 }
 """Manoeuvres by the names of their scenarios."""
 
@@ -163,6 +158,6 @@ def _phase(
     return jnp.where(time < 0, 1.0, time / period % 1.0), sides[number]
 
 
-def _wind(friction: Array | float, wind: Float[Array, " time"]) -> Schedule:
+def _schedule(friction: Array | float, wind: Float[Array, " time"]) -> Schedule:
     """Friction and wind as a schedule."""
     return jnp.stack([jnp.broadcast_to(friction, wind.shape), wind], axis=1)

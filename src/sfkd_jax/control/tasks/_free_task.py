@@ -10,6 +10,7 @@ from typing import Any, NamedTuple, TypeAlias
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 
 from sfkd_jax.control.tasks._task import (
     Actuator,
@@ -98,12 +99,10 @@ def free_task(
     Raises:
         ValueError: the limits are inconsistent, see `actuator_limits`.
     """
-    sizes = {
-        len(limit)
-        for limit in (control_low, control_high, control_rate)
-        if isinstance(limit, Sequence)
-    }
-    count = num_controls or max(sizes, default=1)
+    limits = (control_low, control_high, control_rate)
+    count = num_controls or max(
+        1 if limit is None else np.size(limit) for limit in limits
+    )
     low = _filled(control_low, count, -math.inf)
     high = _filled(control_high, count, math.inf)
     rate = None if control_rate is None else _filled(control_rate, count, math.inf)
@@ -188,11 +187,8 @@ def _filled(limit: Limit, count: int, missing: float) -> tuple[float, ...]:
     """A limit as one number for each control."""
     if limit is None:
         return (missing,) * count
-    if isinstance(limit, Sequence):
-        return tuple(limit)
-    if isinstance(limit, jax.Array) or hasattr(limit, "__array__"):
-        return tuple(float(entry) for entry in jnp.ravel(jnp.asarray(limit)))
-    return (float(limit),) * count
+    entries = tuple(float(entry) for entry in np.ravel(limit))
+    return entries * count if np.ndim(limit) == 0 else entries
 
 
 def _check_reference(observation: Any, env: Any, reference: Any, horizon: int) -> None:
