@@ -5,7 +5,8 @@ set -euo pipefail
 name=$1 && shift
 cores=$(command -v nvidia-smi >/dev/null && echo 1 || nproc)
 if command -v taskset >/dev/null && [ "$cores" -gt 1 ]; then
-  for vehicle in kinematic dynamic; do python -m sfkd_jax.generate "+experiment=$name" vehicle="$vehicle" "$@"; done
+  case $name in protocol2*) vehicles="kinematic kinematic_stiff dynamic" ;; *) vehicles="kinematic dynamic" ;; esac
+  for vehicle in $vehicles; do python -m sfkd_jax.generate "+experiment=$name" vehicle="$vehicle" "$@"; done
   for ((core = 0; core < cores; core++)); do
     taskset -c "$core" python -m sfkd_jax.compare "+experiment=$name" "comparison.share=[$core,$cores]" "$@" &
   done

@@ -7,11 +7,11 @@ size of the experiment, not a result.
 """
 
 import json
-import re
 
 import numpy as np
 from scipy import stats
 
+from benchmarks import markdown
 from benchmarks.harness import ROOT
 from sfkd_jax import evaluation
 
@@ -56,7 +56,7 @@ def detectable(spread, size):
 def table():
     """One line for each plant, scenario and rival of SFKD."""
     head = ["row − SFKD", "trainings", "episodes", "rest", *SIZES]
-    lines = [_line(head), _line(["---"] * len(head))]
+    lines = []
     rows = json.loads(MEASURED.read_text())["rows"]
     errors = {
         (row["vehicle"], row["scenario"], row["system"]): 1e3
@@ -69,19 +69,13 @@ def table():
         spread = deviations(values - errors[plant, scenario, REFERENCE])
         found = [f"{detectable(spread, size):.1f}" for size in SIZES.values()]
         cells = [f"{plant}, {scenario.upper()}: {system}"]
-        lines.append(_line([*cells, *(f"{part:.2f}" for part in spread), *found]))
-    return "\n".join(lines)
+        lines.append([*cells, *(f"{part:.2f}" for part in spread), *found])
+    return markdown.table(head, lines)
 
 
 def page(text):
     """The page with its table."""
-    pattern = re.compile(r"<!-- power -->\n.*?<!-- end -->", re.DOTALL)
-    return pattern.sub(f"<!-- power -->\n{table()}\n<!-- end -->", text)
-
-
-def _line(cells):
-    """A line of a Markdown table."""
-    return "| " + " | ".join(cells) + " |"
+    return markdown.filled(text, {"power": table()})
 
 
 if __name__ == "__main__":

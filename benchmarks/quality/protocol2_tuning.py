@@ -175,7 +175,9 @@ def choose():
         document = json.loads(file.read_text())
         if len(document["trials"]) < TRIALS:
             raise SystemExit(f"{file}: {len(document['trials'])} of {TRIALS} trials")
-        tuned.setdefault(file.parent.name, {})[file.stem] = chosen(document)
+        found = tuned.setdefault(file.parent.name, {})
+        # A row takes its settings without e as well.
+        found |= dict.fromkeys((file.stem, f"{file.stem}_blind"), chosen(document))
     for vehicle, like in SAME_STATES.items():
         tuned[vehicle] = tuned[like]
     head, *_ = TUNED.read_text("utf-8").splitlines()

@@ -41,6 +41,9 @@ class Cell(NamedTuple):
 def list_cells(comparison: dict[str, Any]) -> list[Cell]:
     """Return all cells in the order of evaluation; those of one system are adjacent.
 
+    Every row is evaluated from one seed before any from the next, so that a table that
+    was interrupted still compares all rows.
+
     Raises:
         ValueError: `only` or `untrained` names an unknown row.
     """
@@ -53,8 +56,8 @@ def list_cells(comparison: dict[str, Any]) -> list[Cell]:
             )
     labels = [label for label in rows if label in (only or rows)]
     cells = []
-    for vehicle, seed, label in itertools.product(
-        comparison["vehicles"], comparison["seeds"], labels
+    for seed, vehicle, label in itertools.product(
+        comparison["seeds"], comparison["vehicles"], labels
     ):
         if label in comparison["untrained"] and seed != comparison["seeds"][0]:
             continue

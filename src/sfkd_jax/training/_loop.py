@@ -102,12 +102,12 @@ def fit(
             Interruption() as interruption,
         ):
             advance = interruption.compiled(
-                _chunk(loss, transform, draw, data_key, length=log_every), state, data
+                _chunk(loss, transform, draw, length=log_every), state, data, data_key
             )
             validate = interruption.compiled(jax.jit(loss), params, held_out)
             began = time.perf_counter()
             for done in range(start + log_every, steps + 1, log_every):
-                state, record = interruption.ready(advance(state, data))
+                state, record = interruption.ready(advance(state, data, data_key))
                 record = {name: float(value) for name, value in record.items()}
                 record |= _progress(done, schedule, began)
                 saves = done % save_every == 0 or done == steps
@@ -161,17 +161,17 @@ def _chunk(
     loss: Loss,
     transform: optax.GradientTransformation,
     draw: Draw,
-    key: Key,
     *,
     length: int,
 ) -> Any:
-    """Compile `length` optimiser steps: (state, data) -> state, mean metrics."""
+    """Compile `length` optimiser steps: (state, data, key) -> state, mean metrics."""
     gradient = jax.value_and_grad(loss, has_aux=True)
 
-    # Not donated: an interrupted run saves the state from which a chunk started.
+    # Not donated: an interrupted run saves the state from which a chunk started. The
+    # key is an argument, so that trainings from other seeds share a compiled program.
     @jax.jit
     def chunk(
-        state: TrainState, data: Trajectory
+        state: TrainState, data: Trajectory, key: Key
     ) -> tuple[TrainState, dict[str, jax.Array]]:
         def step(state: TrainState, _: None) -> tuple[TrainState, dict[str, jax.Array]]:
             batch = draw(data, jax.random.fold_in(key, state.step))
