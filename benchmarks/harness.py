@@ -14,6 +14,7 @@ from importlib import metadata
 from pathlib import Path
 
 ROOT = Path(__file__).parents[1]
+SHIPPED = ROOT / "src" / "sfkd_jax" / "pretrained"
 WARM_UP = 9
 LOAD = os.getloadavg()[0]
 """How many processes wanted a core in the minute before: another job beside a benchmark

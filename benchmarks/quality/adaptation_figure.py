@@ -27,6 +27,9 @@ FILM_SECONDS, WINDOW, FRAME = 15.0, 6.0, 2
 """Length of the film [s], what it shows of the past [s], control steps per frame."""
 LARGEST = 0.08
 """Half height of the panels [m]."""
+ABOVE = {"loc": "lower right", "bbox_to_anchor": (1.0, 0.98)}
+ABOVE |= {"frameon": False, "fontsize": 8}
+"""Legends hide no data."""
 
 
 class Drive(NamedTuple):
@@ -116,7 +119,7 @@ def draw(force, shown, dt, path):
         axes.fill_between(*band, color=style.ROAD, label="plan and tube 1 s before")
         axes.plot(time, 1e3 * found.lateral, color=style.ACCENT, label=label)
         axes.set(ylabel="$e_y$ [mm]", ylim=(-1e3 * LARGEST, 1e3 * LARGEST))
-        axes.legend(loc="upper right", ncols=2, frameon=False, fontsize=8)
+        axes.legend(**ABOVE, ncols=2)
     mean, spread = shown["adapting"].force.T
     panels[2].fill_between(
         time, mean - 2 * spread, mean + 2 * spread, color=style.ROAD, label="± 2 std"
@@ -124,7 +127,7 @@ def draw(force, shown, dt, path):
     panels[2].plot(time, force, color=style.DARK, label="side force")
     panels[2].plot(time, mean, color=style.SECOND, label="estimate")
     panels[2].set(ylabel="force [N]", xlabel="time [s]", xlim=(0.0, time[-1]))
-    panels[2].legend(loc="upper right", ncols=3, frameon=False, fontsize=8)
+    panels[2].legend(**ABOVE, ncols=3)
     figure.savefig(path, dpi=150, metadata={"Software": None})
 
 

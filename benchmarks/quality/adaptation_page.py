@@ -4,11 +4,11 @@ python -m benchmarks.quality.adaptation_page
 """
 
 import json
-import re
 import statistics
 from functools import partial
 
 from benchmarks.harness import ROOT
+from benchmarks.markdown import filled, table
 
 PAGE = ROOT / "docs" / "adaptation.md"
 MAIN = (
@@ -40,38 +40,35 @@ def measured(name):
 
 def errors(name):
     """Lateral RMSE of every row, with its ratio to the oracle that knows."""
-    lines = _head([f"{name} [mm]", *MAIN])
+    lines = []
     for case, rows in measured(name).items():
         if case != FRICTION:
             best = rows["oracle that knows"]["rmse_mm"]
-            lines.append(_line([case, *(_error(rows.get(row), best) for row in MAIN)]))
-    return "\n".join(lines)
+            lines.append([case, *(_error(rows.get(row), best) for row in MAIN)])
+    return table([f"{name} [mm]", *MAIN], lines)
 
 
 def rivals(name):
     """The same of ablations and of baselines."""
-    lines = _head([f"{name} [mm]", *RIVALS])
+    lines = []
     for case, rows in measured(name).items():
         if RIVALS[-1] in rows:
             best = rows["oracle that knows"]["rmse_mm"]
-            lines.append(
-                _line([case, *(_error(rows.get(row), best) for row in RIVALS)])
-            )
-    return "\n".join(lines)
+            lines.append([case, *(_error(rows.get(row), best) for row in RIVALS)])
+    return table([f"{name} [mm]", *RIVALS], lines)
 
 
 def friction(name):
     """Who leaves the lane on a road three times as slippery as E allows."""
     rows = measured(name)[FRICTION]
-    lines = _head(
-        [name, "left the lane", "largest error, median [m]", "speed, mean [m/s]"]
-    )
+    head = [name, "left the lane", "largest error, median [m]", "speed, mean [m/s]"]
+    lines = []
     for row, found in rows.items():
         largest = found["largest_mm"]
         left = f"{found['left_the_lane']} of {len(largest)}"
         middle = f"{statistics.median(largest) / 1e3:.2f}"
-        lines.append(_line([row, left, middle, f"{found['speed_m_per_s']:.1f}"]))
-    return "\n".join(lines)
+        lines.append([row, left, middle, f"{found['speed_m_per_s']:.1f}"])
+    return table(head, lines)
 
 
 def coverage(name):
@@ -79,7 +76,7 @@ def coverage(name):
     heads = [f"{lead} ahead" for lead in LEADS]
     heads += ["radius 10 ahead [m]", "largest error [mm]"]
     heads += ["slower: speed [m/s]", "slower: largest error [mm]"]
-    lines = _head([name, *heads])
+    lines = []
     cases = measured(name)
     given = {
         case: (rows["SFKD, adaptive"], rows.get("SFKD, adaptive, slower"))
@@ -93,8 +90,8 @@ def coverage(name):
         cells.append(f"{max(own['largest_mm']):.0f}")
         speed = f"{slow['speed_m_per_s']:.1f}" if slow else "–"
         cells += [speed, f"{max(slow['largest_mm']):.0f}" if slow else "–"]
-        lines.append(_line([case, *cells]))
-    return "\n".join(lines)
+        lines.append([case, *cells])
+    return table([name, *heads], lines)
 
 
 def information(name):
@@ -103,14 +100,15 @@ def information(name):
     rows = document["errors"]
     steps = list(rows["bound"])
     head = [f"{name}: friction / side force [N], steps after a switch", *steps]
-    lines = _head([*head, "lateral RMSE [mm]"])
+    lines = []
     driven = document["rmse_mm"]
     driven = driven | {"bound": driven["oracle, e as wrong as the bound"]}
     for row, errors in rows.items():
         cells = [f"{errors[at][0]:.2f} / {errors[at][1]:.0f}" for at in steps]
-        lines.append(_line([row, *cells, f"{driven[row]:.1f}"]))
+        lines.append([row, *cells, f"{driven[row]:.1f}"])
     exact = f"{driven['oracle, e measured']:.1f}"
-    return "\n".join([*lines, _line(["e measured", *["0 / 0"] * len(steps), exact])])
+    lines.append(["e measured", *["0 / 0"] * len(steps), exact])
+    return table([*head, "lateral RMSE [mm]"], lines)
 
 
 KINDS = {
@@ -130,10 +128,7 @@ TABLES = {
 
 def page(text):
     """The page with its tables."""
-    for name, build in TABLES.items():
-        pattern = re.compile(rf"<!-- {name} -->\n.*?<!-- end -->", re.DOTALL)
-        text = pattern.sub(f"<!-- {name} -->\n{build()}\n<!-- end -->", text)
-    return text
+    return filled(text, {name: build() for name, build in TABLES.items()})
 
 
 def _stored(name):
@@ -146,16 +141,6 @@ def _error(row, best):
     if row is None:
         return "–"
     return f"{row['rmse_mm']:.1f} ({row['rmse_mm'] / best:.2f})"
-
-
-def _head(cells):
-    """The first two lines of a Markdown table."""
-    return [_line(cells), _line(["---"] * len(cells))]
-
-
-def _line(cells):
-    """A line of a Markdown table."""
-    return "| " + " | ".join(cells) + " |"
 
 
 if __name__ == "__main__":

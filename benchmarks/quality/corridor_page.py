@@ -10,8 +10,9 @@ import json
 import shutil
 from pathlib import Path
 
+from benchmarks.harness import SHIPPED
+
 HOME = Path(__file__).resolve().parents[2]
-SHIPPED = HOME / "src" / "sfkd_jax" / "pretrained"
 RESULTS = HOME / "experiments" / "corridor" / "results.json"
 PAGE = HOME / "docs" / "corridor.md"
 PLANTS = ("dynamic", "kinematic")

@@ -76,19 +76,24 @@ def drive(policy, plant, planner, roads, keys):
     return 1e3 * np.sqrt((np.asarray(episodes.lateral) ** 2).mean(axis=1)), float(rate)
 
 
+def episodes_of(plant, scenario, args):
+    """Roads of a scenario and the keys of their drives, from a seed."""
+    road_key, drive_key = jax.random.split(jax.random.key(args.seed))
+    family = scenarios.scenario(
+        name=scenario,
+        duration=args.seconds,
+        state_size=len(plant.state_names),
+        dt=plant.dt,
+    )
+    roads = jax.jit(jax.vmap(family))(jax.random.split(road_key, args.episodes))
+    return roads, jax.random.split(drive_key, args.episodes)
+
+
 def compared(run, scenario, args):
     """Rows of one policy on one scenario; printed as they come."""
     policy = sfkd_jax.load(run)
     plant = build_vehicle(policy.settings["vehicle"])
-    sizes = {
-        "duration": args.seconds,
-        "state_size": len(plant.state_names),
-        "dt": plant.dt,
-    }
-    road_key, drive_key = jax.random.split(jax.random.key(args.seed))
-    family = scenarios.scenario(name=scenario, **sizes)
-    roads = jax.jit(jax.vmap(family))(jax.random.split(road_key, args.episodes))
-    keys = jax.random.split(drive_key, args.episodes)
+    roads, keys = episodes_of(plant, scenario, args)
     first = None
     for label in args.only:
         began = time.perf_counter()

@@ -11,9 +11,8 @@ from functools import reduce
 from operator import getitem
 from pathlib import Path
 
+from benchmarks.markdown import put, table
 from benchmarks.quality import path_figure
-from benchmarks.timing import tables
-from benchmarks.timing.performance_page import put
 
 HOME = Path(__file__).resolve().parents[2]
 KEPT = HOME / "experiments" / "path_frame"
@@ -71,7 +70,7 @@ def drive_options(plant):
             )
     heads = [f"{scenario.upper()} [mm]" for scenario in SCENARIOS]
     minus = [f"{scenario.upper()} minus SFKD [mm]" for scenario in SCENARIOS]
-    return tables.table([plant, *heads, *minus, "largest [mm]"], lines)
+    return table([plant, *heads, *minus, "largest [mm]"], lines)
 
 
 def millimetres(measure):
@@ -121,7 +120,7 @@ def frames():
         for frame in ("body", "path")
         for scenario in SCENARIOS
     ]
-    return tables.table(["", *heads], lines)
+    return table(["", *heads], lines)
 
 
 def claims():
@@ -140,7 +139,7 @@ def claims():
                 [f"{plant}, {name}", *ahead, *tubes(plant, system), row["params"]]
             )
     heads = ["", "e_y 1 ahead [mm]", "e_y 20 ahead [mm]", "α", *TUBES, "parameters"]
-    return tables.table(heads, lines)
+    return table(heads, lines)
 
 
 TUBES = {
@@ -182,7 +181,7 @@ def weights():
                 *(millimetres(row["rmse_m"]) for row in rows.values()),
             ]
         )
-    return tables.table(
+    return table(
         [
             "",
             "weight",
@@ -219,7 +218,7 @@ def choices():
         plant, steps, model, *overrides = name.split()
         shown = [f"{entry[part]:.4f}" for part in ("error", "prediction", "one_step")]
         lines.append([model, f"`{' '.join(overrides)}`", *shown, f"{plant}, {steps}"])
-    return tables.table(
+    return table(
         [
             "model",
             "settings",

@@ -13,6 +13,7 @@ import jax.numpy as jnp
 from benchmarks import harness
 from benchmarks.timing import own_model
 from sfkd_jax import control
+from sfkd_jax.control.planners._rollouts import rollout_function
 
 SMALL = "[2]"
 
@@ -29,34 +30,22 @@ def task_of(plant, model, *, law=None, cost=None):
     )
 
 
-def begin_of(task):
+def prepare_of(task):
     """What is evaluated once a step: fibre, encoder, curvature."""
-    applied = control.PreviousControl(jnp.zeros(2), jnp.asarray(False))
-    return jax.jit(lambda params, *measured: task.prepare(params, *measured, applied))
+    start = control.PlanningStart(jnp.zeros(2), jnp.asarray(False), jax.random.key(0))
+    return jax.jit(lambda params, *measured: task.prepare(params, *measured, start))
 
 
-def rollouts_of(task, horizon):
-    """Costs of all plans, by the scan that the planner has."""
-    last = jnp.zeros(horizon).at[-1].set(1.0)
+def rollouts_of(task):
+    """Costs and last states of all plans, as the planner computes them."""
+    tuning = control.mppi(task).init(jax.random.key(0)).tuning
 
-    def roll(began, plans):
-        count = plans.shape[1]
-        batch = jax.tree.map(
-            lambda leaf: jnp.broadcast_to(leaf, (count, *leaf.shape)), began.start
-        )
+    @jax.jit
+    def roll_out(setup, plans):
+        rollouts = rollout_function(task, tuning, setup, several=False)(plans)
+        return rollouts.costs, rollouts.states[-1]
 
-        def body(carry, given):
-            costs, samples = carry
-            step = jax.vmap(task.step, in_axes=(None, None, 0, 0, None, None))
-            after = step(task.weights, began.context, samples, *given)
-            return (costs + after.cost, after.sample), after.perturbation
-
-        (costs, samples), effective = jax.lax.scan(
-            body, (jnp.zeros(count), batch), (plans, began.targets, last)
-        )
-        return costs, effective, samples.latent
-
-    return jax.jit(roll)
+    return roll_out
 
 
 def whole(samples, horizon, **options):
@@ -70,9 +59,9 @@ def rollouts(samples, horizon, *overrides, **changes):
     plant, model, _ = own_model.belief(*overrides)
     params, *measured = own_model.inputs(plant, model, horizon)
     task = task_of(plant, model, **changes)
-    began = begin_of(task)(params, *measured)
+    setup = prepare_of(task)(params, *measured)
     plans = 0.02 * jax.random.normal(jax.random.key(2), (horizon, samples, 2))
-    return _call(rollouts_of(task, horizon), began, plans)
+    return _call(rollouts_of(task), setup, plans)
 
 
 def parts(samples, horizon):
@@ -88,8 +77,9 @@ def parts(samples, horizon):
         "whole step, 30 effective samples": whole(
             samples, horizon, effective_samples=30.0
         ),
+        "whole step, gains from 32 samples": whole(samples, horizon, gain_samples=32),
         "whole step, one sample": whole(1, horizon),
-        "fibre, encoder, curvature": _call(begin_of(task_of(plant, model)), *given),
+        "fibre, encoder, curvature": _call(prepare_of(task_of(plant, model)), *given),
         "noise": _call(noise, jax.random.key(3)),
         "rollouts": rollouts(samples, horizon),
         "rollouts, one sample": rollouts(1, horizon),

@@ -5,9 +5,9 @@ python -m benchmarks.timing.performance_page [--write] A table stands in the pag
 """
 
 import argparse
-import re
 
 from benchmarks import harness
+from benchmarks.markdown import put
 from benchmarks.timing import tables, targets
 
 PAGE = harness.ROOT / "docs" / "results" / "performance.md"
@@ -33,22 +33,6 @@ def built(build):
         return build()
     except FileNotFoundError as absent:
         return f"Not measured yet: there is no benchmarks/timing/{absent.filename.rsplit('/', 1)[-1]}."
-
-
-def put(path, made):
-    """Tables into their places in a page."""
-    page = path.read_text()
-    for name, text in made.items():
-        pattern = re.compile(rf"<!-- {name} -->\n.*?<!-- end -->", re.DOTALL)
-        page, count = pattern.subn(
-            lambda _, text=text, name=name: f"<!-- {name} -->\n{text}\n<!-- end -->",
-            page,
-        )
-        if count != 1:
-            raise SystemExit(
-                f"{path.name} has {count} places for the table {name!r}, not 1"
-            )
-    path.write_text(page)
 
 
 def main():

@@ -2,6 +2,8 @@
 
 import json
 
+from benchmarks.markdown import table
+
 FILES = ("control_step", "scaling", "realtime", "plan_quality", "own_profile")
 OWN = ("own_model", "own_model_ess", "own_model_sharded")
 LABELS = {
@@ -44,12 +46,6 @@ TAIL_HEADS = ("p50 [ms]", "p99 [ms]", "p99.9 [ms]", "max [ms]", "above 100 ms", 
 def read(name):
     """A document beside this script."""
     return json.loads((HERE / f"{name}.json").read_text())
-
-
-def table(heads, rows):
-    """Markdown."""
-    lines = [heads, ["---"] * len(heads), *rows]
-    return "\n".join("| " + " | ".join(map(str, line)) + " |" for line in lines)
 
 
 def numbers(row, digits):

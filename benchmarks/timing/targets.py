@@ -2,7 +2,8 @@
 
 from contextlib import suppress
 
-from benchmarks.timing.tables import LABELS, read, table
+from benchmarks.markdown import table
+from benchmarks.timing.tables import LABELS, read
 
 JAX_PEERS = ("jax_mppi", "evosax_cma_es")
 

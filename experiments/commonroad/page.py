@@ -181,14 +181,14 @@ def along_path():
         "test drives inside": inside["for_ever"],
         "the same, `followed` [m]": f"{tube['followed']:.3f}",
         "test drives inside it": inside["followed"],
-        "corridor \\|e_y\\| on drives of the class [m]": f"{corridor['corridor_m']:.3f}",
+        "corridor |e_y| on drives of the class [m]": f"{corridor['corridor_m']:.3f}",
         "of it W; tube around the copy, `followed` [m]": f"{bounds['nominal']:.3f}; {bounds['followed_position']:.3f}",
         "tube around the copy, `for_ever` [m]": f"{bounds['for_ever_position']:.3f}",
         "fresh drives of the class inside": counted(corridor),
         "S3 drives of 60 s inside, never calibrated on": counted(s3),
         "drives of the class by the package's functions inside": counted(package),
-        "of these with \\|e_y\\| within the corridor": f"{package['inside_corridor']} of {package['coverage_drives']}",
-        "their largest \\|e_y\\|; \\|e_y − ê_y\\| [m]": f"{package['lateral_m']:.3f}; {package['distance_m']:.3f}",
+        "of these with |e_y| within the corridor": f"{package['inside_corridor']} of {package['coverage_drives']}",
+        "their largest |e_y|; |e_y − ê_y| [m]": f"{package['lateral_m']:.3f}; {package['distance_m']:.3f}",
         f"one step beside the package's, largest of {step['steps']}: position [m]; v [m/s]": (
             f"{max(separate['p_x'], separate['p_y']):.0e}; {separate['v']:.0e}"
         ),
