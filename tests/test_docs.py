@@ -16,6 +16,7 @@ from benchmarks.quality import (
     adaptation_page,
     corridor_page,
     path_frame,
+    planner_page,
     protocol2_power,
     shield_table,
     speed_page,
@@ -516,6 +517,13 @@ def test_the_tables_of_adaptation_are_those_of_its_runs():
     text = (DOCS / "adaptation.md").read_text("utf-8")
     assert adaptation_page.page(text) == text
     for name, table in adaptation_page.TABLES.items():
+        assert table() in text, name
+
+
+def test_the_tables_of_the_planner_are_those_of_its_runs():
+    text = planner_page.PAGE.read_text("utf-8")
+    assert planner_page.page(text) == text
+    for name, table in planner_page.TABLES.items():
         assert table() in text, name
 
 

@@ -155,6 +155,20 @@ def estimated():
     return control.estimated(controller, model, **BOX, states=4, points=(3, 4)), params
 
 
+def constrained():
+    """With a lane as a constraint, and gains of the plan."""
+    task, params = along_path(FEEDBACK)
+    lane = lambda data, state, u, target, at: jnp.abs(state[1:2]) - data
+    planned = control.mppi(
+        control.constrained(task, lane, 3.0),
+        num_samples=16,
+        horizon=HORIZON,
+        gain_samples=4,
+        **BOX,
+    )
+    return planned, params
+
+
 FEEDBACK = control.path_feedback(wheelbase=PLANT.wheelbase)
 PLANNERS = {name: partial(registered, name) for name in build.PLANNERS}
 VARIANTS = {
@@ -169,6 +183,7 @@ VARIANTS = {
         iterations=2,
         info_level="samples",
     ),
+    "mppi_constrained": constrained,
 }
 WRAPPERS = {
     "delay_compensated": delay_compensated,

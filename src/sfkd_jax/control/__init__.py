@@ -20,6 +20,7 @@ from sfkd_jax.control.planners._autotune import autotune as autotune
 from sfkd_jax.control.planners._box_qp import BoxSolution as BoxSolution
 from sfkd_jax.control.planners._box_qp import box_qp as box_qp
 from sfkd_jax.control.planners._cem import cem as cem
+from sfkd_jax.control.planners._gains import between_plans as between_plans
 from sfkd_jax.control.planners._gradient import gradient_planner as gradient_planner
 from sfkd_jax.control.planners._koopman_mpc import KoopmanMpcState as KoopmanMpcState
 from sfkd_jax.control.planners._koopman_mpc import koopman_mpc as koopman_mpc
@@ -48,6 +49,12 @@ from sfkd_jax.control.planners._weights import (
 from sfkd_jax.control.tasks._along_path import curvature_ahead as curvature_ahead
 from sfkd_jax.control.tasks._along_path import following_law as following_law
 from sfkd_jax.control.tasks._along_path import path_coordinates as path_coordinates
+from sfkd_jax.control.tasks._constraints import Constraint as Constraint
+from sfkd_jax.control.tasks._constraints import at_step as at_step
+from sfkd_jax.control.tasks._constraints import constrained as constrained
+from sfkd_jax.control.tasks._constraints import inside_limits as inside_limits
+from sfkd_jax.control.tasks._constraints import outside_boxes as outside_boxes
+from sfkd_jax.control.tasks._constraints import outside_circles as outside_circles
 from sfkd_jax.control.tasks._costs import Cost as Cost
 from sfkd_jax.control.tasks._costs import StageInputs as StageInputs
 from sfkd_jax.control.tasks._costs import tracking_cost as tracking_cost

@@ -23,6 +23,11 @@ class ControllerInfo(TypedDict, total=False):
     sample_weights: Float[Array, " sample"]  # in the chosen plan
     sample_plans: Float[Array, "horizon sample control"]  # allowed perturbations
     sample_states: Float[Array, "horizon sample state"]  # predicted
+    # planners of a constrained task
+    violation: Scalar  # the largest of a constraint along the chosen plan, not below 0
+    constraints_kept: Bool[Array, ""]  # it is 0
+    # planners with gain_samples
+    gains: Float[Array, "control state"]  # du/dx of the plan, see `between_plans`
     # koopman_mpc
     residual: Scalar  # of the quadratic program, in control units
     # monitored

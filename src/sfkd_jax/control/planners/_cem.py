@@ -19,6 +19,7 @@ from sfkd_jax.control.planners._plans import (
     replace_nonfinite,
     weighted_mean_and_std,
 )
+from sfkd_jax.control.planners._weights import keep_constraints
 from sfkd_jax.control.tasks._task import Task
 from sfkd_jax.core.ranges import AtLeastTwo, UnitInterval
 from sfkd_jax.types import Controller, Key
@@ -92,7 +93,10 @@ def cem(
             plan, scale = carry
             noise = draw(key, num_samples, std) * scale[:, None]
             evaluated = evaluate(candidate_plans(plan, noise, state))
-            costs = replace_nonfinite(evaluated.costs, jnp.inf)
+            costs, best = replace_nonfinite(evaluated.costs, jnp.inf), None
+            if evaluated.violations is not None:
+                costs, _ = keep_constraints(costs, evaluated.violations)
+                best = evaluated.perturbations[:, jnp.argmin(costs)]
             negated, chosen = jax.lax.top_k(-costs, elites)
             counts = jnp.isfinite(negated).astype(float)
             weights = counts / jnp.maximum(jnp.sum(counts), 1.0)
@@ -105,7 +109,7 @@ def cem(
             if info_level == "samples":
                 kept = jnp.zeros_like(costs).at[chosen].set(weights)
                 samples = Samples(evaluated, kept)
-            result = SearchResult(mean, usable, -negated[0], size, samples)
+            result = SearchResult(mean, usable, -negated[0], size, samples, best)
             return (mean, scale), result
 
         start = (state.plan, jnp.ones_like(state.plan))

@@ -23,13 +23,9 @@ from sfkd_jax.control.planners._plans import (
     weighted_mean_and_std,
 )
 from sfkd_jax.control.planners._shaped_noise import curvature_factor, shape_noise
-from sfkd_jax.control.planners._weights import (
-    effective_sample_size,
-    softmin,
-    temperature_for_sample_size,
-)
+from sfkd_jax.control.planners._weights import weigh
 from sfkd_jax.control.tasks._task import Task
-from sfkd_jax.core.ranges import AtLeastTwo, UnitInterval
+from sfkd_jax.core.ranges import AtLeastTwo, NonNegativeInt, UnitInterval
 from sfkd_jax.types import Controller, Key
 
 MIN_NOISE_SCALE = 0.05
@@ -52,6 +48,7 @@ def mppi(
     adapt: UnitInterval = 0.0,
     control_cost: float = 0.0,
     info_level: str = "plan",
+    gain_samples: NonNegativeInt = 0,
     **options: Any,
 ) -> Controller:
     """Return the information-theoretic MPPI controller of a task.
@@ -82,6 +79,7 @@ def mppi(
             is reset at every control step.
         control_cost: γ, in units of cost; Williams et al. have λ (1 − α).
         info_level: see `planner`.
+        gain_samples: see `planner`.
         options: of `planner`: temperature, noise_std, smoothing, risk, chunk, sharding,
             environment box.
 
@@ -112,25 +110,27 @@ def mppi(
             plan, scale = carry
             plans = candidate_plans(plan, sample(key) * scale[:, None], state)
             evaluated = evaluate(plans)
-            costs = evaluated.costs
-            total = costs
+            total = costs = evaluated.costs
             if control_cost:
                 total = costs + control_cost * _control_cost(plan, plans, std)
-            temperature = state.tuning.temperature
-            if effective_samples:
-                wanted = state.tuning.effective_samples
-                temperature = temperature_for_sample_size(total, wanted)
-            weights, usable = softmin(total, temperature)
+            solve = effective_samples != 0.0
+            chosen = weigh(total, evaluated.violations, state.tuning, solve=solve)
+            allowed, weights = evaluated.perturbations, chosen.weights
             mean, spread = weighted_mean_and_std(
-                weights, replace_nonfinite(evaluated.perturbations, 0.0)
+                weights, replace_nonfinite(allowed, 0.0)
             )
             if adapt:
                 scale = (1 - adapt) * scale + adapt * spread / std[None]
                 scale = jnp.maximum(scale, MIN_NOISE_SCALE)
             lowest = jnp.min(replace_nonfinite(costs, jnp.inf))
-            size = effective_sample_size(weights)
-            samples = Samples(evaluated, weights) if info_level == "samples" else None
-            return (mean, scale), SearchResult(mean, usable, lowest, size, samples)
+            samples = best = None
+            if info_level == "samples" or gain_samples:
+                samples = Samples(evaluated, weights, chosen.temperature)
+            if evaluated.violations is not None:
+                best = allowed[:, chosen.best]
+            return (mean, scale), SearchResult(
+                mean, chosen.usable, lowest, chosen.size, samples, best
+            )
 
         start = (state.plan, jnp.ones_like(state.plan))
         if iterations == 1:
@@ -144,6 +144,7 @@ def mppi(
         horizon=horizon,
         effective_samples=effective_samples,
         info_level=info_level,
+        gain_samples=gain_samples,
         **options,
     )
 

@@ -1,60 +1,23 @@
-"""The control step that all planners share: warm start, search, limits, fallback."""
+"""The receding-horizon controller of a task and a search."""
 
 from __future__ import annotations
 
 from functools import partial
-from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Bool
 
-from sfkd_jax.control.planners._plans import (
-    INFO_LEVELS,
-    PlannerState,
-    Search,
-    Tuning,
-    about_samples,
-    all_finite,
-    clip_environment,
-    replace_nonfinite,
-    shift,
+from sfkd_jax.control.planners._control_step import (
+    StepSettings,
+    control_step,
+    initial_state,
 )
-from sfkd_jax.control.planners._risk import RiskMeasure, risk_measure
-from sfkd_jax.control.planners._rollouts import (
-    evaluate_function,
-    roll_out_plan,
-    rollout_function,
-)
-from sfkd_jax.control.planners._smoothing import Smoother, plan_smoother
-from sfkd_jax.control.tasks._task import PlanningStart, RolloutSetup, Task
+from sfkd_jax.control.planners._plans import INFO_LEVELS, Search, Tuning
+from sfkd_jax.control.planners._risk import risk_measure
+from sfkd_jax.control.planners._smoothing import plan_smoother
+from sfkd_jax.control.tasks._task import Task
 from sfkd_jax.core.ranges import AtLeastTwo, NonNegativeInt, Positive, PositiveFraction
-from sfkd_jax.types import (
-    Control,
-    Controller,
-    ControllerInfo,
-    Key,
-    Params,
-    Scalar,
-)
-
-
-class _Settings(NamedTuple):
-    """Settings of `planner` as its functions need them."""
-
-    task: Task
-    search: Search
-    horizon: int
-    num_proposals: int
-    smooth: Smoother
-    smoothing_window: int
-    risk: RiskMeasure
-    chunk: int
-    sharding: jax.sharding.Sharding | None
-    env_low: tuple[float, ...] | None
-    env_high: tuple[float, ...] | None
-    several: bool | None
-    tuning: Tuning
+from sfkd_jax.types import Controller
 
 
 def planner(
@@ -76,6 +39,7 @@ def planner(
     env_high: tuple[float, ...] | None = None,
     several: bool | None = None,
     info_level: str = "plan",
+    gain_samples: NonNegativeInt = 0,
 ) -> Controller:
     """Return the receding-horizon controller of a task and a search for its best plan.
 
@@ -115,17 +79,21 @@ def planner(
         several: whether the leading axis of every leaf of an environment runs over
             equally likely ones; None if it does for a matrix alone.
         info_level: "plan", or "samples" to report every candidate as well.
+        gain_samples: number of samples, those with the largest weights, from which the
+            feedback gains of the plan are computed, see `between_plans`; 0 for none.
 
     Returns:
         A `Controller`; `info` has `cost` (lowest), `mean_cost` (of the chosen plan),
         `effective_samples`, `healthy`, `env_inside` and `predicted_states` (horizon,
         state) of the chosen plan. With `info_level="samples"` it has `sample_costs`,
-        `sample_weights`, `sample_plans` (perturbations) and `sample_states` too.
+        `sample_weights`, `sample_plans` (perturbations) and `sample_states` too, with
+        `gain_samples` `gains` (control, state), zero where `healthy` is False, for a
+        `constrained` task `violation` of the chosen plan and `constraints_kept`.
 
     Raises:
         ValueError: `noise_std` does not fit the task, the horizon or the temperature
-            is not positive, the risk is unknown, or the filter does not fit the
-            horizon.
+            is not positive, the risk is unknown, the filter does not fit the horizon,
+            `gain_samples` is negative, or gains are wanted of a smoothed plan.
     """
     if horizon < 1:
         raise ValueError(f"horizon must be at least 1, got {horizon}")
@@ -139,7 +107,11 @@ def planner(
         raise ValueError(
             f"noise_std needs {task.low.shape[0]} positive numbers, got {noise_std}"
         )
-    settings = _Settings(
+    if gain_samples < 0:
+        raise ValueError(f"gain_samples must not be negative, got {gain_samples}")
+    if gain_samples and smoothing_window:
+        raise ValueError("gain_samples and smoothing_window exclude each other")
+    settings = StepSettings(
         task=task,
         search=search,
         horizon=horizon,
@@ -154,6 +126,8 @@ def planner(
         env_low=env_low,
         env_high=env_high,
         several=several,
+        reports_samples=info_level == "samples",
+        gain_samples=gain_samples,
         tuning=Tuning(
             temperature=jnp.asarray(temperature, dtype=float),
             effective_samples=jnp.asarray(effective_samples, dtype=float),
@@ -162,137 +136,9 @@ def planner(
             cost=jax.tree.map(
                 lambda weight: jnp.asarray(weight, dtype=float), task.weights
             ),
+            constraints=jax.tree.map(
+                lambda value: jnp.asarray(value, dtype=float), task.constraint_data
+            ),
         ),
     )
-    return Controller(partial(_init, settings), partial(_act, settings))
-
-
-TASK_STREAM = 31324
-"""Folded into the key of a control step for the task's own noise."""
-KEY_KINDS = {2: "threefry2x32", 4: "rbg"}
-"""Implementations of random keys by the number of words of their data."""
-
-
-def _init(settings: _Settings, key: Key) -> PlannerState:
-    """The state before the first control step: a plan of zeros, the law alone.
-
-    No two entries share a buffer, so that the state can be donated.
-    """
-    channels = settings.task.low.shape[0]
-
-    def zeros(*shape: int) -> Array:
-        return jnp.zeros((*shape, channels))
-
-    return PlannerState(
-        plan=zeros(settings.horizon),
-        controls=zeros(settings.horizon),
-        previous=zeros(),
-        started=jnp.asarray(False),
-        key=jax.random.key_data(key),
-        past=zeros(settings.smoothing_window // 2),
-        proposals=zeros(settings.num_proposals, settings.horizon),
-        tuning=jax.tree.map(jnp.array, settings.tuning),
-    )
-
-
-def _act(
-    settings: _Settings,
-    params: Params,
-    state: PlannerState,
-    observation: Any,
-    env: Any,
-    reference: Any,
-) -> tuple[Control, PlannerState, ControllerInfo]:
-    """One control step."""
-    task, several = settings.task, _is_several(settings, env)
-    task.check(observation, env, reference, settings.horizon)
-    elapsed, state = _catch_up(state)
-    key = jax.random.wrap_key_data(state.key, impl=KEY_KINDS[state.key.shape[0]])
-    search_key, next_key = jax.random.split(key)
-    task_key = jax.random.fold_in(key, TASK_STREAM)
-    clean = all_finite((observation, env, reference))
-    inside = clip_environment(env, settings.env_low, settings.env_high)
-
-    prepare, start = (
-        task.prepare,
-        PlanningStart(state.previous, state.started, task_key),
-    )
-    if several:
-        count = jax.tree.leaves(env)[0].shape[0]
-        start = start._replace(key=jax.random.split(task_key, count))
-        shared = jax.tree.map(lambda _: None, start)
-        axes = (None, None, 0, None, shared._replace(key=0))
-        prepare = jax.vmap(prepare, in_axes=axes)
-    setup = prepare(params, observation, inside, reference, start)
-    roll_out = rollout_function(task, state.tuning.cost, setup, several=several)
-    risk = settings.risk if several else None
-    evaluate = evaluate_function(
-        roll_out, risk, chunk=settings.chunk, sharding=settings.sharding
-    )
-    proposed = _with_proposals(state, setup, several=several)
-    result = settings.search(search_key, proposed, evaluate)
-    plan = settings.smooth(state.past, result.plan)
-    rollout = roll_out_plan(roll_out, risk, plan)
-    healthy = clean & result.usable & jnp.isfinite(rollout.cost)
-    if settings.smoothing_window:  # a smoothed plan can exceed the limits again
-        plan = replace_nonfinite(rollout.perturbations, 0.0)
-
-    plan = jnp.where(healthy, plan, state.plan)
-    controls = jnp.where(healthy, rollout.controls, state.controls)
-    control = jnp.clip(controls[0], task.low, task.high)
-    info: ControllerInfo = {
-        "cost": result.cost,
-        "mean_cost": rollout.cost,
-        "effective_samples": result.effective_samples,
-        "healthy": healthy,
-        "env_inside": _is_inside(settings, env, inside),
-        "predicted_states": rollout.states,
-        **about_samples(result.samples),
-    }
-    elapsed = jnp.minimum(elapsed, 1.0)
-    after = state._replace(
-        plan=shift(plan, elapsed),
-        controls=shift(controls, elapsed),
-        previous=control,
-        started=state.started | healthy,
-        key=jax.random.key_data(next_key),
-        past=jnp.concatenate([state.past, plan[:1]])[1:],
-        tuning=state.tuning._replace(elapsed=jnp.ones_like(state.tuning.elapsed)),
-    )
-    return control, after, info
-
-
-def _is_several(settings: _Settings, env: Any) -> bool:
-    """Whether an environment is several that are equally likely."""
-    if settings.several is not None:
-        return settings.several
-    return getattr(env, "ndim", 0) == 2
-
-
-def _is_inside(settings: _Settings, env: Any, inside: Any) -> Bool[Array, ""]:
-    """Whether an environment was not changed by its box."""
-    return jnp.all(inside == env) if settings.env_low else jnp.asarray(True)
-
-
-def _catch_up(state: PlannerState) -> tuple[Scalar, PlannerState]:
-    """Shift the plan of a late call; return the elapsed periods as well.
-
-    The stored plan is that of one period after the last call. `elapsed` is known only
-    at the next call, so any further delay is made up for here.
-    """
-    # A clock that fails gives NaN; the call then counts as being in time.
-    elapsed = jnp.where(jnp.isnan(state.tuning.elapsed), 1.0, state.tuning.elapsed)
-    late = jnp.maximum(elapsed - 1.0, 0.0)
-    return elapsed, state._replace(
-        plan=shift(state.plan, late), controls=shift(state.controls, late)
-    )
-
-
-def _with_proposals(
-    state: PlannerState, setup: RolloutSetup, *, several: bool
-) -> PlannerState:
-    """The state with the task's proposals beside the user's."""
-    if setup.proposals is None:
-        return state
-    suggested = setup.proposals[0] if several else setup.proposals
-    return state._replace(proposals=jnp.concatenate([state.proposals, suggested]))
+    return Controller(partial(initial_state, settings), partial(control_step, settings))

@@ -30,6 +30,7 @@ class Tuning(NamedTuple):
             fractions included; NaN counts as one, and so does every later call that
             does not set it again.
         cost: weights of the task's cost.
+        constraints: data of the task's constraints, see `constrained`.
     """
 
     temperature: Scalar
@@ -37,6 +38,7 @@ class Tuning(NamedTuple):
     noise_std: Control
     elapsed: Scalar
     cost: Any
+    constraints: Any = ()
 
 
 class PlannerState(NamedTuple):
@@ -111,11 +113,14 @@ class Evaluated(NamedTuple):
         costs: of the whole rollouts; of several environments, the risk over them.
         perturbations: that the limits allowed; of several environments, their mean.
         states: predicted, (horizon, sample, …); of several environments, in the first.
+        violations: the largest of a constraint over the horizon and the environments,
+            not below 0; None without constraints.
     """
 
     costs: Float[Array, " sample"]
     perturbations: Plans
     states: Any
+    violations: Float[Array, " sample"] | None = None
 
 
 class Samples(NamedTuple):
@@ -124,10 +129,12 @@ class Samples(NamedTuple):
     Attributes:
         evaluated: costs, perturbations and states.
         weights: in the chosen plan.
+        temperature: λ of the weights; None if they do not depend smoothly on the costs.
     """
 
     evaluated: Evaluated
     weights: Float[Array, " sample"]
+    temperature: Scalar | None = None
 
 
 class SearchResult(NamedTuple):
@@ -139,6 +146,7 @@ class SearchResult(NamedTuple):
         cost: the lowest cost of all samples.
         effective_samples: 1 / Σ w² of the sample weights.
         samples: the candidates, for a planner that reports them.
+        best: the best single candidate, for a task with constraints.
     """
 
     plan: Plan
@@ -146,6 +154,7 @@ class SearchResult(NamedTuple):
     cost: Scalar
     effective_samples: Scalar
     samples: Samples | None = None
+    best: Plan | None = None
 
 
 INFO_LEVELS = ("plan", "samples")
@@ -213,6 +222,20 @@ def all_finite(tree: Any) -> Bool[Array, ""]:
     real = [leaf for leaf in leaves if jnp.issubdtype(leaf.dtype, jnp.inexact)]
     return jnp.all(
         jnp.stack([jnp.asarray(True), *(jnp.all(jnp.isfinite(leaf)) for leaf in real)])
+    )
+
+
+def catch_up(state: PlannerState) -> tuple[Scalar, PlannerState]:
+    """Shift the plan of a late call; return the elapsed periods as well.
+
+    The stored plan is that of one period after the last call. `elapsed` is known only
+    at the next call, so any further delay is made up for here.
+    """
+    # A clock that fails gives NaN; the call then counts as being in time.
+    elapsed = jnp.where(jnp.isnan(state.tuning.elapsed), 1.0, state.tuning.elapsed)
+    late = jnp.maximum(elapsed - 1.0, 0.0)
+    return elapsed, state._replace(
+        plan=shift(state.plan, late), controls=shift(state.controls, late)
     )
 
 

@@ -10,10 +10,15 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from sfkd_jax.control.planners._plans import Evaluate, Evaluated, Plan, Plans
+from sfkd_jax.control.planners._plans import Evaluate, Evaluated, Plan, Plans, Tuning
 from sfkd_jax.control.planners._risk import RiskMeasure
 from sfkd_jax.control.tasks._task import RolloutSetup, StepIndex, Task
 from sfkd_jax.types import Scalar
+
+UNROLL = 2
+"""Steps that the compiler sees at once: it fuses across them. Four gain no more, and a
+single plan gains nothing.
+"""
 
 
 class Rollouts(NamedTuple):
@@ -24,12 +29,14 @@ class Rollouts(NamedTuple):
         controls: applied, within the limits.
         perturbations: that the limits allowed.
         states: predicted, (*particle, horizon, sample, …) of every leaf.
+        violations: largest of a constraint, not below 0; None without constraints.
     """
 
     costs: Float[Array, "*particle sample"]
     controls: Float[Array, "*particle horizon sample control"]
     perturbations: Float[Array, "*particle horizon sample control"]
     states: Any
+    violations: Float[Array, "*particle sample"] | None = None
 
 
 class PlanRollout(NamedTuple):
@@ -40,12 +47,14 @@ class PlanRollout(NamedTuple):
         controls: applied, within the limits.
         perturbations: that the limits allowed.
         states: predicted, (horizon, …) of every leaf.
+        violation: largest of a constraint; None without constraints.
     """
 
     cost: Scalar
     controls: Plan
     perturbations: Plan
     states: Any
+    violation: Scalar | None = None
 
 
 RollOut: TypeAlias = Callable[[Plans], Rollouts]
@@ -53,7 +62,7 @@ RollOut: TypeAlias = Callable[[Plans], Rollouts]
 
 def rollout_function(
     task: Task,
-    weights: Any,
+    tuning: Tuning,
     setup: RolloutSetup,
     *,
     several: bool,
@@ -62,11 +71,11 @@ def rollout_function(
 
     Args:
         task: the planning problem.
-        weights: of its cost.
+        tuning: weights of its cost, data of its constraints.
         setup: of this control step.
         several: whether `setup` has a leading axis of environments.
     """
-    roll_out = partial(_roll_out, task, weights)
+    roll_out = partial(_roll_out, task, tuning)
     if several:
         roll_out = jax.vmap(roll_out, in_axes=(0, None))
     return partial(roll_out, setup)
@@ -93,15 +102,12 @@ def evaluate_function(
         if sharding is not None and plans.shape[1] > 1:
             plans = jax.lax.with_sharding_constraint(plans, sharding)
         rollouts = _in_chunks(roll_out, plans, chunk)
-        costs, perturbations, states = (
-            rollouts.costs,
-            rollouts.perturbations,
-            rollouts.states,
-        )
+        costs, _, perturbations, states, violations = rollouts
         if risk is None:
-            return Evaluated(costs, perturbations, states)
+            return Evaluated(costs, perturbations, states, violations)
         first = jax.tree.map(lambda leaf: leaf[0], states)
-        return Evaluated(risk(costs), jnp.mean(perturbations, axis=0), first)
+        mean = jnp.mean(perturbations, axis=0)
+        return Evaluated(risk(costs), mean, first, _worst(violations))
 
     return evaluate
 
@@ -110,39 +116,71 @@ def roll_out_plan(
     roll_out: RollOut, risk: RiskMeasure | None, plan: Plan
 ) -> PlanRollout:
     """Roll out one plan; `risk` as in `evaluate_function`."""
-    costs, *trajectories = roll_out(plan[:, None])
-    cost = costs[0] if risk is None else risk(costs)[0]
+    costs, controls, perturbations, states, violations = roll_out(plan[:, None])
     first = (slice(None), 0) if risk is None else (0, slice(None), 0)
-    return PlanRollout(cost, *jax.tree.map(lambda leaf: leaf[first], trajectories))
+    trajectories = (controls, perturbations, states)
+    controls, perturbations, states = jax.tree.map(
+        lambda leaf: leaf[first], trajectories
+    )
+    if risk is not None:
+        costs, violations = risk(costs), _worst(violations)
+    violation = None if violations is None else violations[0]
+    return PlanRollout(costs[0], controls, perturbations, states, violation)
 
 
-def _roll_out(task: Task, weights: Any, setup: RolloutSetup, plans: Plans) -> Rollouts:
+def _worst(violations: Array | None) -> Float[Array, " sample"] | None:
+    """The largest violation over several environments."""
+    return None if violations is None else jnp.max(violations, axis=0)
+
+
+def _roll_out(
+    task: Task, tuning: Tuning, setup: RolloutSetup, plans: Plans
+) -> Rollouts:
     """Roll out all plans in one environment, in one scan over the horizon."""
     horizon, count = plans.shape[:2]
     numbers = jnp.arange(horizon)
     places = StepIndex(numbers, (numbers == horizon - 1).astype(plans.dtype))
     step = jax.vmap(
-        partial(task.step, weights, setup.context), in_axes=(0, 0, None, None)
+        partial(task.step, tuning.cost, setup.context), in_axes=(0, 0, None, None)
     )
+    violate = jax.vmap(partial(_violation, task, tuning), in_axes=(0, 0, None, None))
     start = jax.tree.map(
         lambda leaf: jnp.broadcast_to(leaf, (count, *jnp.shape(leaf))), setup.start
     )
     first = jax.tree.map(lambda leaf: leaf[0], (plans, setup.targets, places))
 
     def body(carry: Any, inputs: Any) -> Any:
-        costs, samples = carry
+        costs, samples, worst = carry
         after = step(samples, *inputs)
-        return (costs + after.cost, after.sample), (
+        if worst is not None:
+            now = violate(after.state, after.control, *inputs[1:])
+            worst = jnp.maximum(worst, now)
+        return (costs + after.cost, after.sample, worst), (
             after.control,
             after.perturbation,
             after.state,
         )
 
+    none = jnp.zeros(count, plans.dtype)
     carry = _as_returned(
-        lambda carry: body(carry, first)[0], (jnp.zeros(count, plans.dtype), start)
+        lambda carry: body(carry, first)[0],
+        (none, start, None if task.constraint is None else none),
     )
-    (costs, _), trajectories = jax.lax.scan(body, carry, (plans, setup.targets, places))
-    return Rollouts(costs, *trajectories)
+    inputs, unroll = (plans, setup.targets, places), UNROLL if count > 1 else 1
+    (costs, _, worst), (controls, perturbations, states) = jax.lax.scan(
+        body, carry, inputs, unroll=unroll
+    )
+    return Rollouts(costs, controls, perturbations, states, worst)
+
+
+def _violation(
+    task: Task, tuning: Tuning, state: Any, control: Array, target: Any, at: StepIndex
+) -> Scalar:
+    """The largest violation of a step; infinite where it is not a number."""
+    assert task.constraint is not None
+    all_of_them = task.constraint(tuning.constraints, state, control, target, at)
+    largest = jnp.max(all_of_them)
+    return jnp.where(jnp.isnan(largest), jnp.inf, largest)
 
 
 def _as_returned(function: Callable[[Any], Any], carry: Any) -> Any:
@@ -182,6 +220,10 @@ def _in_chunks(roll_out: RollOut, plans: Plans, chunk: int) -> Rollouts:
         shape = (*leaf.shape[:axis], -1, *leaf.shape[axis + 2 :])
         return jax.lax.slice_in_dim(leaf.reshape(shape), 0, count, axis=axis)
 
-    costs = join(rollouts.costs, particles)
-    trajectories = jax.tree.map(partial(join, axis=particles + 1), rollouts[1:])
-    return Rollouts(costs, *trajectories)
+    controls, perturbations, states = jax.tree.map(
+        partial(join, axis=particles + 1), rollouts[1:4]
+    )
+    costs, violations = jax.tree.map(
+        partial(join, axis=particles), (rollouts.costs, rollouts.violations)
+    )
+    return Rollouts(costs, controls, perturbations, states, violations)

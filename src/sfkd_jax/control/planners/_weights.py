@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
-from typing import Any
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Bool, Float
+from jaxtyping import Array, Bool, Float, Int
 
+from sfkd_jax.control.planners._plans import Tuning
 from sfkd_jax.types import Scalar
 
 BISECTIONS = 24
@@ -31,6 +32,29 @@ def softmin(
     scaled = jnp.where(finite, costs, 0.0) / jnp.where(positive, temperature, 1.0)
     scores = jnp.where(usable, jnp.where(finite, -scaled, -jnp.inf), 0.0)
     return jax.nn.softmax(scores), usable
+
+
+FEW = 10.0
+"""Effective samples where every sample violates a constraint."""
+
+
+def keep_constraints(
+    costs: Float[Array, " sample"],
+    violations: Float[Array, " sample"],
+) -> tuple[Float[Array, " sample"], Bool[Array, ""]]:
+    """Return costs in lexicographic order, and whether a sample keeps all constraints.
+
+    The cost of a sample that violates one is infinite then; otherwise the costs are the
+    violations.
+
+    Args:
+        costs: of the samples.
+        violations: largest of each sample, not below 0.
+    """
+    kept = (violations <= 0.0) & jnp.isfinite(costs)
+    any_kept = jnp.any(kept)
+    violations = jnp.where(jnp.isfinite(costs), violations, jnp.inf)
+    return jnp.where(any_kept, jnp.where(kept, costs, jnp.inf), violations), any_kept
 
 
 def effective_sample_size(weights: Float[Array, " sample"]) -> Scalar:
@@ -91,3 +115,52 @@ def _(
     inside = (jnp.abs(reached - wanted) < 1e-2 * wanted) & (slope > 0)
     change = (tangents[1] - by_costs) / jnp.where(inside, slope, 1.0)
     return temperature, jnp.where(inside, change, 0.0)
+
+
+class Weighted(NamedTuple):
+    """Weights of samples.
+
+    Attributes:
+        weights: that sum to 1.
+        usable: whether any cost is finite.
+        temperature: λ by which the weights follow from the costs; infinite where they
+            follow from violations.
+        size: effective number of samples.
+        best: index of the best sample.
+    """
+
+    weights: Float[Array, " sample"]
+    usable: Bool[Array, ""]
+    temperature: Scalar
+    size: Scalar
+    best: Int[Array, ""]
+
+
+def weigh(
+    costs: Float[Array, " sample"],
+    violations: Float[Array, " sample"] | None,
+    tuning: Tuning,
+    *,
+    solve: bool,
+) -> Weighted:
+    """Weigh samples by their costs, under constraints by `keep_constraints`.
+
+    Args:
+        costs: of the samples.
+        violations: of the constraints; None without any.
+        tuning: λ and the wanted number of effective samples.
+        solve: whether λ follows from that number.
+    """
+    temperature, any_kept = tuning.temperature, None
+    if violations is not None:
+        costs, any_kept = keep_constraints(costs, violations)
+    if solve:
+        temperature = temperature_for_sample_size(costs, tuning.effective_samples)
+    scale = temperature
+    if any_kept is not None:  # violations are in other units than costs
+        few = temperature_for_sample_size(costs, jnp.asarray(FEW))
+        scale = jnp.where(any_kept, temperature, few)
+        temperature = jnp.where(any_kept, temperature, jnp.inf)
+    weights, usable = softmin(costs, scale)
+    size = effective_sample_size(weights)
+    return Weighted(weights, usable, temperature, size, jnp.argmin(costs))

@@ -34,9 +34,17 @@ from sfkd_jax.types import Control, Environment, Model, Params, Reference, State
 
 
 class PathSample(NamedTuple):
-    """State of one rollout along a path: latent, last path errors, last control."""
+    """State of one rollout along a path.
+
+    Attributes:
+        latent: of the model.
+        state: decoded from it; kept, because the law of the next step needs it again.
+        errors: of the last step from the path.
+        control: of the last step.
+    """
 
     latent: Any
+    state: State
     errors: PathErrors
     control: Control
 
@@ -159,7 +167,8 @@ def _prepare(
     before = jnp.where(previous.known, previous.control, law_control)
     if problem.actuator is not None:
         before = problem.actuator(observation)
-    start = PathSample(model.encode(fiber, observation), errors, before)
+    latent = model.encode(fiber, observation)
+    start = PathSample(latent, model.decode(fiber, latent), errors, before)
     proposals = None
     if (ancillary := problem.ancillary) is not None:
         turns = ancillary.prepare(model, fiber, observation, reference, curvature)
@@ -178,7 +187,7 @@ def _step(
 ) -> StepResult:
     """One step of one rollout: law plus perturbation, limits, model, cost."""
     model, point = problem.model, target.point
-    law_control = _law_control(problem, model.decode(fiber, before.latent), target)
+    law_control = _law_control(problem, before.state, target)
     control = problem.limit(law_control + nu, before.control)
     latent = model.step(fiber, before.latent, control)
     after = model.decode(fiber, latent)
@@ -190,7 +199,7 @@ def _step(
             (model.vector(latent) - model.vector(target.goal)) ** 2
         )
     cost = cost * (1.0 + problem.terminal_weight * at.last)
-    sample = PathSample(latent, errors, control)
+    sample = PathSample(latent, after, errors, control)
     return StepResult(sample, cost, control, control - law_control, after)
 
 
@@ -218,13 +227,12 @@ def _ancillary_plan(
     turns: SteadyTurn,
 ) -> Float[Array, "1 horizon control"]:
     """What the ancillary law does along the horizon, as perturbations of the law."""
-    model, weights = problem.model, problem.cost.weights
+    weights = problem.cost.weights
 
     def follow(before: PathSample, inputs: Any) -> tuple[PathSample, Control]:
         target, turn = inputs
-        state = model.decode(fiber, before.latent)
-        control = ancillary.control(turn, state, target.point, target.curvature)
-        nu = control - _law_control(problem, state, target)
+        control = ancillary.control(turn, before.state, target.point, target.curvature)
+        nu = control - _law_control(problem, before.state, target)
         anywhere = StepIndex(jnp.zeros((), int), jnp.zeros(()))
         after = _step(problem, weights, fiber, before, nu, target, anywhere)
         return after.sample, after.perturbation

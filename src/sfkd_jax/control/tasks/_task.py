@@ -92,6 +92,8 @@ class Task(NamedTuple):
             `StepResult`.
         check: (observation, env, reference, horizon) -> None; raises a ValueError that
             names an argument of the wrong shape.
+        constraint: see `constrained`; None for no constraint.
+        constraint_data: that the constraint is given.
     """
 
     low: Control
@@ -100,6 +102,8 @@ class Task(NamedTuple):
     prepare: Callable[[Params, Any, Any, Any, PlanningStart], RolloutSetup]
     step: Callable[[Any, Any, Any, Control, Any, StepIndex], StepResult]
     check: Callable[[Any, Any, Any, int], None]
+    constraint: Callable[[Any, Any, Control, Any, StepIndex], Array] | None = None
+    constraint_data: Any = ()
 
 
 def actuator_limits(
