@@ -1,5 +1,6 @@
 """The examples run, and do what they say."""
 
+import re
 import runpy
 import sys
 import types
@@ -31,6 +32,33 @@ def test_the_pendulum_example_is_short():
         if line.strip() and "import" not in line and '"""' not in line
     ]
     assert len(lines) <= 45
+
+
+def test_the_pole_on_the_cart_ends_upright(monkeypatch, tmp_path):
+    figure = tmp_path / "cartpole.png"
+    assert example("cartpole", monkeypatch)["main"](samples=256, figure=figure) > 0.95
+    assert figure.stat().st_size > 10_000
+
+
+def test_the_quadrotor_passes_the_window(monkeypatch):
+    distance, depth = example("quadrotor_window", monkeypatch)["main"](samples=512)
+    assert distance < 0.3
+    assert depth <= 1e-5
+
+
+def test_a_fleet_arrives_and_touches_no_pillar(monkeypatch):
+    left, gap = example("fleet", monkeypatch)["main"](count=16, samples=128)
+    assert left < 0.5
+    assert gap >= -1e-5
+
+
+@pytest.mark.parametrize("name", ["cartpole", "quadrotor_window", "fleet"])
+def test_an_example_of_the_planner_is_short(name):
+    """Without docstrings, empty lines, imports and the figure."""
+    text = (EXAMPLES / f"{name}.py").read_text("utf-8")
+    code = re.sub(r'""".*?"""|    if figure:.*?\n(?=    \S)', "", text, flags=re.S)
+    lines = [line for line in code.splitlines() if line.strip()]
+    assert len([line for line in lines if "import" not in line]) <= 60
 
 
 def test_the_delivery_robot_stays_on_its_path(monkeypatch):
