@@ -52,7 +52,25 @@ def test_a_fleet_arrives_and_touches_no_pillar(monkeypatch):
     assert gap >= -1e-5
 
 
-@pytest.mark.parametrize("name", ["cartpole", "quadrotor_window", "fleet"])
+def test_a_lap_is_driven_within_the_track_and_the_grip(monkeypatch):
+    sizes = {"samples": 192, "seconds": 29.0}
+    lap, slip, depth = example("racing_line", monkeypatch)["main"](**sizes)
+    assert lap < 29.0
+    assert slip <= 1e-5
+    assert depth <= 1e-5
+
+
+def test_a_learned_residual_keeps_the_boat_off_the_rocks(monkeypatch):
+    results = example("dubins_residual", monkeypatch)["main"](samples=256)
+    (left, gap), (nominal_left, nominal_gap) = results["learned"], results["nominal"]
+    assert left < nominal_left - 0.05
+    assert gap > max(0.0, nominal_gap + 0.1)
+
+
+@pytest.mark.parametrize(
+    "name",
+    ["cartpole", "quadrotor_window", "fleet", "racing_line", "dubins_residual"],
+)
 def test_an_example_of_the_planner_is_short(name):
     """Without docstrings, empty lines, imports and the figure."""
     text = (EXAMPLES / f"{name}.py").read_text("utf-8")
