@@ -209,8 +209,19 @@ def test_noise_of_the_dynamics_is_the_same_for_all_samples_and_new_at_every_step
         ({"control_low": None, "control_high": None}, -6.0),
         ({"control_low": -np.inf, "control_high": 1.0}, -6.0),
         ({"control_low": (-0.5,), "control_high": None}, -0.5),
-        ({"control_low": -0.5, "control_high": 0.5, "control_rate": 0.25}, -0.25),
-        ({"control_low": -0.5, "control_high": 0.5, "control_rate": (np.inf,)}, -0.5),
+        (
+            {"control_low": -0.5, "control_high": 0.5, "control_rate": 0.25, "dt": 1.0},
+            -0.25,
+        ),
+        (
+            {
+                "control_low": -0.5,
+                "control_high": 0.5,
+                "control_rate": (np.inf,),
+                "dt": 1.0,
+            },
+            -0.5,
+        ),
     ],
 )
 def test_limits_may_be_one_number_infinite_or_missing(limits, reached):
@@ -223,6 +234,11 @@ def test_limits_may_be_one_number_infinite_or_missing(limits, reached):
     assert bool(info["healthy"])
     assert bool(jnp.isfinite(u).all())
     assert u[0] == pytest.approx(reached, abs=0.01) if reached > -1 else u[0] < -1.5
+
+
+def test_a_slew_limit_without_a_sampling_period_is_refused():
+    with pytest.raises(ValueError, match="needs dt"):
+        task(control_rate=0.25)
 
 
 def test_several_controls_without_limits_are_counted():

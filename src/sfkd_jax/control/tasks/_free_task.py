@@ -60,7 +60,7 @@ def free_task(
     dynamics: Callable[..., Any],
     stage: StageCost,
     *,
-    dt: float = 1.0,
+    dt: float | None = None,
     control_low: Limit = None,
     control_high: Limit = None,
     control_rate: Limit = None,
@@ -82,7 +82,7 @@ def free_task(
         dynamics: f; may take `step` and `key` besides.
         stage: ℓ, evaluated at the state after the control; may take `params`, `env` and
             `step` besides.
-        dt: sampling period [s], used by `control_rate` alone.
+        dt: sampling period [s]; needed with `control_rate`, and used by it alone.
         control_low: lower control limits, one number for all controls, or None.
         control_high: upper control limits, one number for all controls, or None.
         control_rate: largest change of a control per second, or None.
@@ -97,8 +97,11 @@ def free_task(
         A `Task` whose reference has the horizon as the leading axis of every leaf.
 
     Raises:
-        ValueError: the limits are inconsistent, see `actuator_limits`.
+        ValueError: the limits are inconsistent, see `actuator_limits`, or
+            `control_rate` is given without `dt`.
     """
+    if control_rate is not None and dt is None:
+        raise ValueError("control_rate needs dt, the sampling period in seconds")
     limits = (control_low, control_high, control_rate)
     count = num_controls or max(
         1 if limit is None else np.size(limit) for limit in limits
@@ -111,7 +114,7 @@ def free_task(
         dynamics=_with_extras(dynamics),
         stage=_with_extras(stage),
         terminal=None if terminal is None else _with_extras(terminal),
-        limit=actuator_limits(low, high, rate, dt),
+        limit=actuator_limits(low, high, rate, dt or 1.0),
         initial=jnp.clip(jnp.zeros(len(low)), lowest, highest),
         actuator=actuator,
     )
