@@ -165,11 +165,14 @@ def chosen(document):
         value = trial["score"]
         return value if value is not None and math.isfinite(value) else math.inf
 
-    return " ".join(min(document["trials"], key=score)["overrides"])
+    best = min(document["trials"], key=score)
+    if math.isinf(score(best)):
+        raise SystemExit(f"no trial of {document['row']} has a score")
+    return " ".join(best["overrides"])
 
 
-def choose():
-    """Write the best trials as the settings of the comparison."""
+def winners():
+    """Vehicle -> row -> the overrides of its best trial."""
     tuned = {}
     for file in sorted((HERE / "protocol2_trials").glob("*/*.json")):
         document = json.loads(file.read_text())
@@ -178,10 +181,14 @@ def choose():
         found = tuned.setdefault(file.parent.name, {})
         # A row takes its settings without e as well.
         found |= dict.fromkeys((file.stem, f"{file.stem}_blind"), chosen(document))
-    for vehicle, like in SAME_STATES.items():
-        tuned[vehicle] = tuned[like]
+    return tuned | {vehicle: tuned[like] for vehicle, like in SAME_STATES.items()}
+
+
+def choose():
+    """Write the best trials as the settings of the comparison."""
     head, *_ = TUNED.read_text("utf-8").splitlines()
-    TUNED.write_text(f"{head}\n{yaml.safe_dump({'tuned': tuned}, width=200)}", "utf-8")
+    text = yaml.safe_dump({"tuned": winners()}, width=200)
+    TUNED.write_text(f"{head}\n{text}", "utf-8")
 
 
 def main():
@@ -189,7 +196,9 @@ def main():
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
-    rows = rows_of("protocol2") | rows_of("protocol2_path", "dataset=path ")
+    rows = rows_of("protocol2") | rows_of(
+        "protocol2_path", "dataset=path controller=mppi_path "
+    )
     parser.add_argument("--vehicles", nargs="*", default=VEHICLES)
     parser.add_argument("--rows", nargs="*", choices=rows, default=list(rows))
     parser.add_argument("--root", default="runs")

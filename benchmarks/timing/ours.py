@@ -2,6 +2,8 @@
 arrays.
 """
 
+from functools import partial
+
 from benchmarks import harness
 from benchmarks.timing import problem
 
@@ -27,7 +29,8 @@ def planner(samples, horizon, **settings):
         "control_high": (problem.HIGH,) * problem.CONTROLS,
     }
     task = control.free_task(dynamics, stage, **limits)
-    settings = {"noise": "white", "temperature": problem.TEMPERATURE, **settings}
+    same = {"noise": "white", "temperature": problem.TEMPERATURE}
+    settings = {**same, "unroll": 4, **settings}
     noise = (problem.NOISE,) * problem.CONTROLS
     return control.mppi(
         task, num_samples=samples, horizon=horizon, noise_std=noise, **settings
@@ -50,16 +53,18 @@ def arguments(controller, w, horizon, seed=0):
 
 
 def sfkd_jax(samples, horizon, seed=0, **settings):
-    """The algorithm that the others have: white noise, one temperature."""
+    """The algorithm that the others have: white noise, one temperature, weights that
+    are constants of the compiled step.
+    """
     import jax
     import numpy as np
 
     controller, w = planner(samples, horizon, **settings)
     _, state, _, env, _ = arguments(controller, w, horizon, seed)
-    act, memory = jax.jit(controller.act), [state]
+    act, memory = jax.jit(partial(controller.act, w)), [state]
 
     def step(z, target):
-        u, memory[0], _ = act(w, memory[0], z, env, np.tile(target, (horizon, 1)))
+        u, memory[0], _ = act(memory[0], z, env, np.tile(target, (horizon, 1)))
         return np.asarray(u)
 
     return step

@@ -72,8 +72,8 @@ def weights(model):
     return jax.tree.map(drawn, jax.eval_shape(model.init, jax.random.key(0)))
 
 
-def inputs(plant, model, horizon):
-    """Parameters, observation, environment and reference: into a bend, with side wind."""
+def measured(plant, horizon):
+    """Observation, environment and reference: into a bend, with side wind."""
     import jax.numpy as jnp
 
     angle = plant.dt * SPEED / RADIUS * jnp.arange(1, horizon + 1)
@@ -82,7 +82,12 @@ def inputs(plant, model, horizon):
         [RADIUS * jnp.sin(angle), RADIUS * (1 - jnp.cos(angle)), angle, speed], axis=1
     )
     observation = jnp.zeros(len(plant.state_names)).at[3].set(SPEED)
-    return weights(model), observation, jnp.asarray([0.6, 2.0]), reference
+    return observation, jnp.asarray([0.6, 2.0]), reference
+
+
+def inputs(plant, model, horizon):
+    """Random parameters, and what is measured."""
+    return weights(model), *measured(plant, horizon)
 
 
 def problem(samples, horizon, seed=0, **options):

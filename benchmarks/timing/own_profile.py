@@ -42,7 +42,7 @@ def rollouts_of(task):
 
     @jax.jit
     def roll_out(setup, plans):
-        rollouts = rollout_function(task, tuning, setup, several=False)(plans)
+        rollouts = rollout_function(task, tuning, setup, several=False, unroll=2)(plans)
         return rollouts.costs, rollouts.states[-1]
 
     return roll_out

@@ -236,6 +236,17 @@ def test_limits_may_be_one_number_infinite_or_missing(limits, reached):
     assert u[0] == pytest.approx(reached, abs=0.01) if reached > -1 else u[0] < -1.5
 
 
+@pytest.mark.parametrize("unroll", [1, 3, HORIZON, 100])
+def test_steps_that_are_compiled_together_change_no_plan(unroll):
+    plans = [act(mppi(unroll=number))[1].plan for number in (2, unroll)]
+    np.testing.assert_allclose(*plans, atol=1e-6)
+
+
+def test_no_steps_compiled_together_are_refused():
+    with pytest.raises(ValueError, match="unroll"):
+        mppi(unroll=0)
+
+
 def test_a_slew_limit_without_a_sampling_period_is_refused():
     with pytest.raises(ValueError, match="needs dt"):
         task(control_rate=0.25)

@@ -30,6 +30,7 @@ _BY_PLANT = (
     "env_low",
     "env_high",
     "sharding",
+    "unroll",
     "actuator",
 )
 """Arguments of controllers that the vehicle, the data set and the machine decide."""

@@ -29,6 +29,7 @@ from sfkd_jax.control.planners._plans import (
 from sfkd_jax.control.planners._risk import RiskMeasure
 from sfkd_jax.control.planners._rollouts import (
     PlanRollout,
+    RollOut,
     evaluate_function,
     roll_out_plan,
     rollout_function,
@@ -54,6 +55,7 @@ class StepSettings(NamedTuple):
     smoothing_window: int
     risk: RiskMeasure
     chunk: int
+    unroll: int
     sharding: jax.sharding.Sharding | None
     env_low: tuple[float, ...] | None
     env_high: tuple[float, ...] | None
@@ -118,7 +120,7 @@ def control_step(
         axes = (None, None, 0, None, shared._replace(key=0))
         prepare = jax.vmap(prepare, in_axes=axes)
     setup = prepare(params, observation, inside, reference, start)
-    roll_out = rollout_function(task, state.tuning, setup, several=several)
+    roll_out = _rollouts(settings, state.tuning, setup, several)
     risk = settings.risk if several else None
     evaluate = evaluate_function(
         roll_out, risk, chunk=settings.chunk, sharding=settings.sharding
@@ -217,7 +219,7 @@ def _gains(
 
     def evaluate(start: Any, plans: Plans) -> Evaluated:
         moved = setup._replace(start=start)
-        roll_out = rollout_function(task, tuning, moved, several=several)
+        roll_out = _rollouts(settings, tuning, moved, several)
         risk = settings.risk if several else None
         return evaluate_function(roll_out, risk, chunk=0, sharding=None)(plans)
 
@@ -239,6 +241,15 @@ def _gains(
         observation,
         result.plan,
         settings.gain_samples,
+    )
+
+
+def _rollouts(
+    settings: StepSettings, tuning: Tuning, setup: RolloutSetup, several: bool
+) -> RollOut:
+    """The function that rolls out plans from a setup."""
+    return rollout_function(
+        settings.task, tuning, setup, several=several, unroll=settings.unroll
     )
 
 

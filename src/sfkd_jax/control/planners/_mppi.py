@@ -80,8 +80,8 @@ def mppi(
         control_cost: γ, in units of cost; Williams et al. have λ (1 − α).
         info_level: see `planner`.
         gain_samples: see `planner`.
-        options: of `planner`: temperature, noise_std, smoothing, risk, chunk, sharding,
-            environment box.
+        options: of `planner`: temperature, noise_std, smoothing, risk, chunk, unroll,
+            sharding, environment box.
 
     Raises:
         ValueError: a setting is out of its range, or two settings exclude each other.

@@ -34,6 +34,7 @@ def planner(
     risk: str = "mean",
     risk_level: PositiveFraction = 0.25,
     chunk: NonNegativeInt = 0,
+    unroll: int = 2,
     sharding: jax.sharding.Sharding | None = None,
     env_low: tuple[float, ...] | None = None,
     env_high: tuple[float, ...] | None = None,
@@ -71,6 +72,8 @@ def planner(
         risk_level: fraction of the largest costs that "cvar" averages.
         chunk: number of samples rolled out at a time, to bound the memory; 0 for all
             at once.
+        unroll: number of steps of a rollout that are compiled as one, which saves time
+            where steps are short; the plan is the same up to rounding.
         sharding: of the samples over devices, for plans of shape (horizon, sample,
             control). Up to the order of sums, the plan does not depend on the number
             of devices, which must divide the number of samples.
@@ -93,7 +96,8 @@ def planner(
     Raises:
         ValueError: `noise_std` does not fit the task, the horizon or the temperature
             is not positive, the risk is unknown, the filter does not fit the horizon,
-            `gain_samples` is negative, or gains are wanted of a smoothed plan.
+            `unroll` is not positive, `gain_samples` is negative, or gains are wanted of
+            a smoothed plan.
     """
     if horizon < 1:
         raise ValueError(f"horizon must be at least 1, got {horizon}")
@@ -107,6 +111,8 @@ def planner(
         raise ValueError(
             f"noise_std needs {task.low.shape[0]} positive numbers, got {noise_std}"
         )
+    if unroll < 1:
+        raise ValueError(f"unroll must be at least 1, got {unroll}")
     if gain_samples < 0:
         raise ValueError(f"gain_samples must not be negative, got {gain_samples}")
     if gain_samples and smoothing_window:
@@ -122,6 +128,7 @@ def planner(
         smoothing_window=smoothing_window,
         risk=risk_measure(risk, risk_level),
         chunk=chunk,
+        unroll=unroll,
         sharding=sharding,
         env_low=env_low,
         env_high=env_high,

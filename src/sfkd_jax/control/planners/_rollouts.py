@@ -15,11 +15,6 @@ from sfkd_jax.control.planners._risk import RiskMeasure
 from sfkd_jax.control.tasks._task import RolloutSetup, StepIndex, Task
 from sfkd_jax.types import Scalar
 
-UNROLL = 2
-"""Steps that the compiler sees at once: it fuses across them. Four gain no more, and a
-single plan gains nothing.
-"""
-
 
 class Rollouts(NamedTuple):
     """Rollouts of many plans.
@@ -66,6 +61,7 @@ def rollout_function(
     setup: RolloutSetup,
     *,
     several: bool,
+    unroll: int,
 ) -> RollOut:
     """Return the function that rolls out plans.
 
@@ -74,8 +70,9 @@ def rollout_function(
         tuning: weights of its cost, data of its constraints.
         setup: of this control step.
         several: whether `setup` has a leading axis of environments.
+        unroll: number of steps that are compiled as one.
     """
-    roll_out = partial(_roll_out, task, tuning)
+    roll_out = partial(_roll_out, task, tuning, unroll)
     if several:
         roll_out = jax.vmap(roll_out, in_axes=(0, None))
     return partial(roll_out, setup)
@@ -134,7 +131,7 @@ def _worst(violations: Array | None) -> Float[Array, " sample"] | None:
 
 
 def _roll_out(
-    task: Task, tuning: Tuning, setup: RolloutSetup, plans: Plans
+    task: Task, tuning: Tuning, unroll: int, setup: RolloutSetup, plans: Plans
 ) -> Rollouts:
     """Roll out all plans in one environment, in one scan over the horizon."""
     horizon, count = plans.shape[:2]
@@ -166,9 +163,10 @@ def _roll_out(
         lambda carry: body(carry, first)[0],
         (none, start, None if task.constraint is None else none),
     )
-    inputs, unroll = (plans, setup.targets, places), UNROLL if count > 1 else 1
+    inputs = (plans, setup.targets, places)
+    # A single plan gains nothing from it.
     (costs, _, worst), (controls, perturbations, states) = jax.lax.scan(
-        body, carry, inputs, unroll=unroll
+        body, carry, inputs, unroll=unroll if count > 1 else 1
     )
     return Rollouts(costs, controls, perturbations, states, worst)
 
