@@ -119,7 +119,7 @@ def measured(vehicle, args):
     for label, row in ROWS.items():
         planner = planner_of(policy, plant, "feedback", row.samples, row.options)
         run = partial(episode, plant, fast, planner, row, policy.params)
-        lateral, steering = jax.jit(jax.vmap(run))(roads, keys)
+        lateral, steering = jax.jit(evaluation.over_episodes(run))(roads, keys)
         settled = np.asarray(lateral)[:, round(SETTLE_S / fast.dt) :]
         error = 1e3 * np.sqrt(np.mean(settled**2, axis=1))
         rate = np.abs(np.diff(np.asarray(steering), axis=1)).mean() / fast.dt

@@ -167,7 +167,7 @@ def measured(vehicle, args):
             horizon=20,
             observation_noise=SENSORS,
         )
-        episodes = jax.jit(jax.vmap(run))(driven, drive_keys)
+        episodes = jax.jit(evaluation.over_episodes(run))(driven, drive_keys)
         states = np.asarray(episodes.states, np.float64)
         deepest = [
             depth(np, drive[:, :3], cars).max()

@@ -24,9 +24,8 @@ def roads(count=2):
     return jit(jax.vmap(family))(jax.random.split(jax.random.key(0), count))
 
 
-@cache
-def driving(step, noise=SENSORS):
-    """Episodes with a planner over a one-step function, compiled once."""
+def one_episode(step, noise=SENSORS):
+    """An episode with a planner over a one-step function."""
     task = control.path_tracking(
         models.physics(step),
         control.tracking_cost(dt=0.1),
@@ -36,7 +35,7 @@ def driving(step, noise=SENSORS):
         control_high=PLANT.control_high,
     )
     controller = control.mppi(task, num_samples=96, horizon=HORIZON)
-    drive = partial(
+    return partial(
         evaluation.simulate,
         PLANT.step,
         controller,
@@ -45,7 +44,12 @@ def driving(step, noise=SENSORS):
         horizon=HORIZON,
         observation_noise=noise,
     )
-    return jit(jax.vmap(drive))
+
+
+@cache
+def driving(step, noise=SENSORS):
+    """Several episodes, compiled once."""
+    return jit(evaluation.over_episodes(one_episode(step, noise)))
 
 
 def episodes(step, noise=SENSORS, seed=1):
@@ -60,6 +64,14 @@ def test_an_episode_has_the_documented_shapes():
     assert one.report == ()
     per_step = one._replace(assumed_envs=one.lateral, report=one.lateral)[2:]
     assert all(leaf.shape == (STEPS,) for leaf in per_step)
+
+
+def test_episodes_one_by_one_are_those_driven_at_once():
+    at_once = jit(jax.vmap(one_episode(PLANT.step)))
+    keys = jax.random.split(jax.random.key(1), 2)
+    np.testing.assert_allclose(
+        at_once(roads(), keys).states, episodes(PLANT.step).states, atol=1e-4
+    )
 
 
 def test_the_states_of_an_episode_are_the_plants():

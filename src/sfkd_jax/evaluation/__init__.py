@@ -5,6 +5,7 @@ from sfkd_jax.evaluation._baselines import bicycle_step as bicycle_step
 from sfkd_jax.evaluation._baselines import fit_bicycle as fit_bicycle
 from sfkd_jax.evaluation._closed_loop import Episode as Episode
 from sfkd_jax.evaluation._closed_loop import first_reference as first_reference
+from sfkd_jax.evaluation._closed_loop import over_episodes as over_episodes
 from sfkd_jax.evaluation._closed_loop import simulate as simulate
 from sfkd_jax.evaluation._corridor_attack import AIMS as AIMS
 from sfkd_jax.evaluation._corridor_attack import Outcome as Outcome

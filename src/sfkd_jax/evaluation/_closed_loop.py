@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, TypeVar
 
 import jax
 import jax.numpy as jnp
@@ -42,6 +42,27 @@ class Episode(NamedTuple):
     breach: Array
     box_exit: Array
     report: Any = ()
+
+
+Outcome = TypeVar("Outcome")
+
+
+def over_episodes(drive: Callable[..., Outcome]) -> Callable[..., Outcome]:
+    """Return the function that drives every episode of a batch.
+
+    On a single CPU one episode follows the other: the samples of one plan stay in its
+    caches, those of all episodes do not. On accelerators, or several devices, all are
+    driven at once.
+
+    Args:
+        drive: of one episode, such as `simulate` with its first arguments bound.
+
+    Returns:
+        A function of the same arguments with a leading axis of episodes.
+    """
+    if jax.default_backend() != "cpu" or len(jax.devices()) > 1:
+        return jax.vmap(drive)
+    return lambda *batch: jax.lax.map(lambda one: drive(*one), batch)
 
 
 def simulate(

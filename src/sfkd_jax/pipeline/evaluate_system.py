@@ -140,7 +140,7 @@ def compile_system(
         options=options,
         protocol=protocol,
         columns=columns,
-        simulate=jax.jit(jax.vmap(simulate)),
+        simulate=jax.jit(evaluation.over_episodes(simulate)),
         score=scoring.scorer(settings, system, dataset, plant.dt),
         watched=system.certificate is not None,
         act_ms=[],
