@@ -1,6 +1,6 @@
 """Trained policies driven by MPPI around different laws, samplers and numbers of samples, on the same episodes.
 
-python -m benchmarks.quality.laws RUN ... [--scenarios s2 s3 --episodes 6 --seconds 15 --only
+python -m benchmarks.quality.laws RUN ... [--scenarios s2 s3 --episodes 32 --seconds 15 --only
 LABEL ... --out FILE] RUN: directories with policy.npz in them. Differences are to the
 first contender, with a paired 95 % interval.
 """
@@ -20,20 +20,36 @@ from sfkd_jax.build import build_vehicle
 SENSORS = (0.015, 0.015, 0.002, 0.03, 0.02, 0.002, 0.001)
 SPREAD = (0.02, 0.3)
 WHITE = {"noise": "white"}
-KNOTS = {"noise": "rbf", "noise_knots": 4, "effective_samples": 30.0}
-CURVED = WHITE | {"curvature": True, "effective_samples": 30.0}
+KNOTS = {"noise": "rbf", "noise_knots": 4}
+CURVED = WHITE | {"curvature": True}
+
+
+def tenth(samples, **options):
+    """Options under which a tenth of the samples counts, at most 30."""
+    return {"effective_samples": min(30.0, samples / 10), **options}
+
+
 CONTENDERS = {
     "feedback, 1500, white": ("feedback", 1500, WHITE),
     "feedback, 1500": ("feedback", 1500, {}),
     "feedback, 300, white": ("feedback", 300, WHITE),
     "feedback, 300": ("feedback", 300, {}),
-    "feedback, 300, knots": ("feedback", 300, KNOTS),
-    "feedback, 300, curvature": ("feedback", 300, CURVED),
+    "feedback, 300, 30 effective": ("feedback", 300, tenth(300)),
+    "feedback, 75, 7.5 effective": ("feedback", 75, tenth(75)),
+    "feedback, 300, knots": ("feedback", 300, tenth(300, **KNOTS)),
+    "feedback, 300, curvature": ("feedback", 300, tenth(300, **CURVED)),
     "feedback, 300, ancillary": ("ancillary", 300, {}),
-    "feedback, 300, curvature, ancillary": ("ancillary", 300, CURVED),
+    "feedback, 75, ancillary": ("ancillary", 75, tenth(75)),
+    "feedback, 300, curvature, ancillary": ("ancillary", 300, tenth(300, **CURVED)),
+    "model, 1500": ("model", 1500, {}),
     "model, 300": ("model", 300, {}),
-    "model, 300, curvature": ("model", 300, CURVED),
-    "model, 75, curvature": ("model", 75, CURVED | {"effective_samples": 10.0}),
+    "model, 300, 30 effective": ("model", 300, tenth(300)),
+    "model, 75, 7.5 effective": ("model", 75, tenth(75)),
+    "model, 300, knots": ("model", 300, tenth(300, **KNOTS)),
+    "model, 300, curvature": ("model", 300, tenth(300, **CURVED)),
+    "model, 150, curvature": ("model", 150, tenth(150, **CURVED)),
+    "model, 75, curvature": ("model", 75, tenth(75, **CURVED)),
+    "model, 50, curvature": ("model", 50, tenth(50, **CURVED)),
     "model, alone": ("model", 1, {"noise_std": (1e-6, 1e-6)}),
 }
 """Label -> law, number of samples, options of the planner."""
@@ -67,9 +83,15 @@ def planner_of(policy, plant, law, samples, options):
 def drive(policy, plant, planner, roads, keys):
     """Lateral RMSE of every episode [mm], and the mean steering rate [rad/s]."""
     run = partial(
-        evaluation.simulate, plant.step, planner, policy.params, dt=plant.dt, horizon=20
+        evaluation.simulate,
+        plant.step,
+        planner,
+        policy.params,
+        dt=plant.dt,
+        horizon=20,
+        observation_noise=SENSORS,
     )
-    episodes = jax.jit(jax.vmap(partial(run, observation_noise=SENSORS)))(roads, keys)
+    episodes = jax.jit(evaluation.over_episodes(run))(roads, keys)
     rate = (
         np.abs(np.diff(np.asarray(episodes.controls)[..., 0], axis=1)).mean() / plant.dt
     )
@@ -131,7 +153,7 @@ def main():
     )
     parser.add_argument("runs", nargs="+", metavar="RUN")
     parser.add_argument("--scenarios", nargs="+", default=["s2", "s3"])
-    parser.add_argument("--episodes", type=int, default=6)
+    parser.add_argument("--episodes", type=int, default=32)
     parser.add_argument("--seconds", type=float, default=15.0)
     parser.add_argument("--seed", type=int, default=2026)
     parser.add_argument(
