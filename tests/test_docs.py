@@ -23,6 +23,7 @@ from benchmarks.quality import (
 )
 from benchmarks.robustness import drills as drills_benchmark
 from benchmarks.robustness import soak
+from benchmarks.timing import performance_page
 
 ROOT = Path(__file__).parents[1]
 DOCS, PACKAGE = ROOT / "docs", ROOT / "src" / "sfkd_jax"
@@ -521,10 +522,15 @@ def test_the_tables_of_adaptation_are_those_of_its_runs():
 
 
 def test_the_tables_of_the_planner_are_those_of_its_runs():
-    text = planner_page.PAGE.read_text("utf-8")
-    assert planner_page.page(text) == text
-    for name, table in planner_page.TABLES.items():
-        assert table() in text, name
+    for name, tables in planner_page.PAGES.items():
+        text = (DOCS / name).read_text("utf-8")
+        assert planner_page.page(name) == text
+        for marker, table in tables.items():
+            assert table() in text, marker
+
+
+def test_the_tables_of_performance_are_those_of_its_runs():
+    assert performance_page.page() == performance_page.PAGE.read_text("utf-8")
 
 
 def test_the_table_of_what_protocol_2_can_tell_is_that_of_its_runs():

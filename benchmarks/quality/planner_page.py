@@ -1,4 +1,4 @@
-"""Write the tables of docs/planner.md from feedback.json and obstacles.json.
+"""Write the tables of docs/planner.md and docs/which-planner.md from the measurements.
 
 python -m benchmarks.quality.planner_page
 """
@@ -9,9 +9,23 @@ from pathlib import Path
 
 from benchmarks.harness import ROOT
 from benchmarks.markdown import filled, table
+from benchmarks.quality.laws import CONTENDERS
 
-PAGE = ROOT / "docs" / "planner.md"
 HERE = Path(__file__).parent
+DOCS = ROOT / "docs"
+TIMES = ROOT / "benchmarks" / "timing" / "laws.json"
+LAWS = {
+    "feedback": "hand-made",
+    "ancillary": "hand-made, the model's as one sample",
+    "model": "the model's",
+}
+NOISES = {
+    "curvature": "curvature",
+    "rbf": "4 knots",
+    "white": "white",
+    "ar1": "AR(1)",
+}
+CARS = ("kinematic", "dynamic")
 
 
 def stored(name):
@@ -50,18 +64,69 @@ def obstacles():
     return table([*head, "largest deviation from the path [m]"], lines)
 
 
-TABLES = {"feedback": feedback, "obstacles": obstacles}
-"""Marker on the page -> its table."""
+def laws():
+    """Every law, noise and number of samples: mean and worst episode of each car."""
+    drives, times = stored("laws")["rows"], json.loads(TIMES.read_text())["rows"]
+    heads = [f"{car}, {what}" for car in CARS for what in ("mean", "worst")]
+    heads = ["law", "noise", "samples, effective", *heads]
+    lines = []
+    for label, contender in CONTENDERS.items():
+        cells = _choices(*contender)
+        rates = []
+        for car in CARS:
+            rows = [
+                row for row in drives if (row["vehicle"], row["label"]) == (car, label)
+            ]
+            errors = [error for row in rows for error in row["rmse_mm"]]
+            cells += [f"{statistics.mean(errors):.1f}", f"{max(errors):.0f}"]
+            rates += [row["steering_rate"] for row in rows]
+        step = times[label]
+        cells += [f"{min(rates):.3f} to {max(rates):.3f}", f"{step['best_ms']:.1f}"]
+        lines.append([*cells, f"{step['compile_s']:.1f}"])
+    return table([*heads, "steering rate [rad/s]", "step [ms]", "compile [s]"], lines)
 
 
-def page(text):
-    """The page with its tables written anew."""
-    return filled(text, {name: build() for name, build in TABLES.items()})
+def laws_again():
+    """The recommended settings beside the paper's, on another seed."""
+    heads = ["car, scenario", "law", "noise", "samples, effective"]
+    lines = []
+    for row in stored("laws_again")["rows"]:
+        gap, errors = row["difference_mm"], row["rmse_mm"]
+        low, high = gap["ci95"]
+        cells = [f"{row['vehicle']}, {row['scenario'].upper()}"]
+        cells += _choices(*CONTENDERS[row["label"]])
+        cells += [f"{statistics.mean(errors):.1f}", f"{max(errors):.0f}"]
+        lines.append([*cells, f"{gap['mean']:+.1f} ({low:+.1f} to {high:+.1f})"])
+    return table([*heads, "mean [mm]", "worst", "difference"], lines)
+
+
+def _choices(law, samples, options):
+    """Law, noise and samples of a contender in words."""
+    if samples == 1:
+        return [LAWS[law], "none", "0"]
+    noise = "curvature" if options.get("curvature") else options.get("noise", "ar1")
+    effective = options.get("effective_samples")
+    counted = f"{samples}, {effective:g}" if effective else f"{samples}"
+    return [LAWS[law], NOISES[noise], counted]
+
+
+PAGES = {
+    "planner.md": {"feedback": feedback, "obstacles": obstacles},
+    "which-planner.md": {"laws": laws, "laws again": laws_again},
+}
+"""Page -> marker -> its table."""
+
+
+def page(name):
+    """A page with its tables written anew."""
+    text = (DOCS / name).read_text("utf-8")
+    return filled(text, {marker: build() for marker, build in PAGES[name].items()})
 
 
 def main():
-    """Write the page."""
-    PAGE.write_text(page(PAGE.read_text("utf-8")), encoding="utf-8")
+    """Write the pages."""
+    for name in PAGES:
+        (DOCS / name).write_text(page(name), encoding="utf-8")
 
 
 if __name__ == "__main__":

@@ -1,4 +1,4 @@
-"""Print the tables of docs/results/performance.md from the JSON files beside this script; with --write put them into the page.
+"""Print docs/results/performance.md with its tables made from the JSON files beside this script; with --write write it.
 
 python -m benchmarks.timing.performance_page [--write] A table stands in the page between <!-- NAME --> and
 <!-- end -->; the words around it are written by hand.
@@ -7,7 +7,7 @@ python -m benchmarks.timing.performance_page [--write] A table stands in the pag
 import argparse
 
 from benchmarks import harness
-from benchmarks.markdown import put
+from benchmarks.markdown import filled
 from benchmarks.timing import tables, targets
 
 PAGE = harness.ROOT / "docs" / "results" / "performance.md"
@@ -24,6 +24,7 @@ TABLES = {
     "closed loop": tables.closed_loop,
     "own steps": lambda: tables.steps(True),
     "profile": tables.profile,
+    "rows": tables.rows,
 }
 
 
@@ -33,6 +34,12 @@ def built(build):
         return build()
     except FileNotFoundError as absent:
         return f"Not measured yet: there is no benchmarks/timing/{absent.filename.rsplit('/', 1)[-1]}."
+
+
+def page():
+    """The page with its tables written anew."""
+    made = {name: built(build) for name, build in TABLES.items()}
+    return filled(PAGE.read_text("utf-8"), made)
 
 
 def main():
@@ -45,15 +52,10 @@ def main():
         action="store_true",
         help="put the tables into docs/results/performance.md",
     )
-    made = {name: built(build) for name, build in TABLES.items()}
-    if not parser.parse_args().write:
-        print(
-            "\n\n".join(
-                f"<!-- {name} -->\n{text}\n<!-- end -->" for name, text in made.items()
-            )
-        )
-        return
-    put(PAGE, made)
+    if parser.parse_args().write:
+        PAGE.write_text(page(), "utf-8")
+    else:
+        print(page())
 
 
 if __name__ == "__main__":

@@ -1,10 +1,19 @@
 """Markdown tables from the JSON files beside this script."""
 
 import json
+from pathlib import Path
 
 from benchmarks.markdown import table
 
-FILES = ("control_step", "scaling", "realtime", "plan_quality", "own_profile")
+HERE = Path(__file__).parent
+FILES = (
+    "control_step",
+    "scaling",
+    "realtime",
+    "plan_quality",
+    "own_profile",
+    "rows",
+)
 OWN = ("own_model", "own_model_ess", "own_model_sharded")
 LABELS = {
     "sfkd_jax": "this library",
@@ -241,3 +250,12 @@ def runs():
         load = load if isinstance(load, str) else f"{load:.1f}"
         rows.append([f"{name}.json", args, load, versions])
     return table(["file", "settings", "load average before", "versions"], rows)
+
+
+def rows():
+    """A control step of every row of sfkd-bench-2."""
+    digits = {"best_ms": 1, "median_ms": 1, "cpu_ms": 1}
+    lines = [
+        [label, *numbers(row, digits)] for label, row in read("rows")["rows"].items()
+    ]
+    return table(["row", "best [ms]", "median [ms]", "CPU [ms]"], lines)
