@@ -8,8 +8,8 @@ import argparse
 import json
 
 from benchmarks.harness import ROOT
+from benchmarks.markdown import put
 from benchmarks.timing import tables
-from benchmarks.timing.performance_page import put
 
 FIGURE = ROOT / "docs" / "results" / "other-cars_files" / "rmse.png"
 SYSTEMS = {
