@@ -53,7 +53,7 @@ class Sweep:
             "--multirun",
         ]
         self.directory, self.cluster, self.began = directory, cluster, time.monotonic()
-        self._said = (directory / f"said{len(list(place.glob('said*')))}.txt").open(
+        self._said = (directory / f"said{len(list(directory.glob('said*')))}.txt").open(
             "w+"
         )
         command = [sys.executable, "-m", "sfkd_jax.train", *args]

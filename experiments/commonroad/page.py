@@ -8,8 +8,7 @@ import argparse
 import json
 
 from benchmarks.harness import ROOT
-from benchmarks.markdown import put
-from benchmarks.timing import tables
+from benchmarks.markdown import put, table
 
 FIGURE = ROOT / "docs" / "results" / "other-cars_files" / "rmse.png"
 SYSTEMS = {
@@ -43,7 +42,7 @@ def deviations():
             [label, *map(deviation, mine), sum(row["departures"] for row in mine)]
         )
     first = [row for row in rows if row["system"] == "nominal"]
-    return tables.table(
+    return table(
         [
             "",
             *(f"{CARS[row['vehicle']]}, {row['friction']}" for row in first),
@@ -87,9 +86,7 @@ def ratios():
             flags = " / ".join(f"{100 * row['breach_steps']:.0f}" for row in mine)
             lines.append([f"{label}, {words}", *entries, untuned, flags])
     heads = [f"over nominal, {friction} (worst path)" for friction in FRICTIONS]
-    return tables.table(
-        ["RMSE", *heads, "over the same untuned", "steps flagged [%]"], lines
-    )
+    return table(["RMSE", *heads, "over the same untuned", "steps flagged [%]"], lines)
 
 
 def times(ratio):
@@ -128,7 +125,7 @@ def tuning():
         "held-out drives inside d̄",
         "CPU [s]",
     ]
-    return tables.table(heads, lines)
+    return table(heads, lines)
 
 
 def handling():
@@ -139,7 +136,7 @@ def handling():
         [names[name], *(f"{value:.3f}" for value in row)]
         for name, row in results()["handling"].items()
     ]
-    return tables.table(
+    return table(
         ["curvature over the bicycle's", *(f"friction {each}" for each in FRICTIONS)],
         lines,
     )
@@ -153,9 +150,7 @@ def export():
         f"{1e3 * result['rmse_m']:.1f}",
         f"{result['largest_difference']:g}",
     ]
-    return tables.table(
-        ["steps", "RMSE [mm]", "largest difference of a control"], [numbers]
-    )
+    return table(["steps", "RMSE [mm]", "largest difference of a control"], [numbers])
 
 
 def along_path():
@@ -194,7 +189,7 @@ def along_path():
         ),
         "certify everything [s]": f"{certificate['seconds']:.0f}",
     }
-    return tables.table(
+    return table(
         ["single-track drift, along a path", ""], list(map(list, lines.items()))
     )
 
@@ -217,7 +212,7 @@ def adaptive():
                 for mean, best in zip(_means(found), nominal, strict=True)
             ]
             lines.setdefault(row, [row]).extend(entries)
-    return tables.table(heads, list(lines.values()))
+    return table(heads, list(lines.values()))
 
 
 def _means(found):
