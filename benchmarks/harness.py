@@ -2,6 +2,7 @@
 the machine, JSON.
 """
 
+import argparse
 import json
 import os
 import platform
@@ -124,3 +125,22 @@ def in_turn(jobs, rounds, steps=3):
         }
         for label in jobs
     }
+
+
+def of_vehicle(description, measure, show):
+    """The command of a measurement of steps in turn: parse, measure, print, write.
+
+    `measure(vehicle, rounds)` gives label -> row, `show(row)` the words of a row.
+    """
+    parser = argparse.ArgumentParser(
+        description=description, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument("--vehicle", default="kinematic")
+    parser.add_argument("--rounds", type=int, default=15)
+    parser.add_argument("--out")
+    args = parser.parse_args()
+    rows = measure(args.vehicle, args.rounds)
+    for label, row in rows.items():
+        print(f"{label:36} {show(row)}")
+    settings = {"vehicle": args.vehicle, "rounds": args.rounds}
+    write(args.out, {"rows": rows, "settings": settings, "machine": machine()})

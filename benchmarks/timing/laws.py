@@ -4,7 +4,6 @@ python -m benchmarks.timing.laws [--vehicle kinematic --rounds 15 --out
 benchmarks/timing/laws.json]
 """
 
-import argparse
 import time
 
 import jax
@@ -20,8 +19,8 @@ from sfkd_jax.build import build_vehicle
 def step_of(policy, plant, contender):
     """A control step into a bend, and the seconds to trace and compile it."""
     planner = planner_of(policy, plant, *contender)
-    measured = own_model.measured(plant, horizon=20)
-    given = (policy.params, planner.init(jax.random.key(0)), *measured)
+    seen = own_model.measured(plant, horizon=20)
+    given = (policy.params, planner.init(jax.random.key(0)), *seen)
     began = time.perf_counter()
     act = jax.jit(planner.act).lower(*given).compile()
     return lambda: jax.block_until_ready(act(*given)), time.perf_counter() - began
@@ -40,25 +39,10 @@ def measured(vehicle, rounds):
     return {label: row | {"compile_s": built[label][1]} for label, row in times.items()}
 
 
-def main():
-    """Parse, time, print, write."""
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
-    parser.add_argument("--vehicle", default="kinematic")
-    parser.add_argument("--rounds", type=int, default=15)
-    parser.add_argument("--out")
-    args = parser.parse_args()
-    rows = measured(args.vehicle, args.rounds)
-    for label, row in rows.items():
-        print(
-            f"{label:36} {row['best_ms']:6.2f} ms, compiled in {row['compile_s']:.1f} s"
-        )
-    settings = {"vehicle": args.vehicle, "rounds": args.rounds}
-    harness.write(
-        args.out, {"rows": rows, "settings": settings, "machine": harness.machine()}
-    )
+def show(row):
+    """A row in words."""
+    return f"{row['best_ms']:6.2f} ms, compiled in {row['compile_s']:.1f} s"
 
 
 if __name__ == "__main__":
-    main()
+    harness.of_vehicle(__doc__, measured, show)

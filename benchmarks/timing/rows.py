@@ -4,7 +4,6 @@ python -m benchmarks.timing.rows [--vehicle kinematic --rounds 15 --out
 benchmarks/timing/rows.json]
 """
 
-import argparse
 from functools import partial
 
 import jax
@@ -51,9 +50,9 @@ def step_of(settings):
         settings["controller"], model, plant, law=law, **box
     )
     horizon = build.controller_horizon(settings["controller"])
-    measured = own_model.measured(plant, horizon)
+    seen = own_model.measured(plant, horizon)
     act, state = jax.jit(controller.act), controller.init(jax.random.key(0))
-    return lambda: jax.block_until_ready(act(params, state, *measured))
+    return lambda: jax.block_until_ready(act(params, state, *seen))
 
 
 def steps(vehicle):
@@ -71,23 +70,15 @@ def steps(vehicle):
     return jobs
 
 
-def main():
-    """Parse, time, print, write."""
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
-    parser.add_argument("--vehicle", default="kinematic")
-    parser.add_argument("--rounds", type=int, default=15)
-    parser.add_argument("--out")
-    args = parser.parse_args()
-    rows = harness.in_turn(steps(args.vehicle), args.rounds)
-    for label, row in rows.items():
-        print(f"{label:28} {row['best_ms']:6.2f} ms, median {row['median_ms']:6.2f} ms")
-    settings = {"vehicle": args.vehicle, "rounds": args.rounds}
-    harness.write(
-        args.out, {"rows": rows, "settings": settings, "machine": harness.machine()}
-    )
+def measured(vehicle, rounds):
+    """Row -> times of a step [ms]."""
+    return harness.in_turn(steps(vehicle), rounds)
+
+
+def show(row):
+    """A row in words."""
+    return f"{row['best_ms']:6.2f} ms, median {row['median_ms']:6.2f} ms"
 
 
 if __name__ == "__main__":
-    main()
+    harness.of_vehicle(__doc__, measured, show)
