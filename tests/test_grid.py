@@ -21,6 +21,7 @@ PLAN = {
     "policies": "table",
     "only": [],
     "untrained": [],
+    "trained_once": [],
     "tuned": {},
 }
 
@@ -36,12 +37,13 @@ def test_every_row_has_every_scenario_under_each_of_its_controllers():
     }
 
 
-def test_a_row_that_trains_nothing_has_the_first_seed_alone():
-    result = grid.list_cells(PLAN | {"untrained": ["ours"]})
+@pytest.mark.parametrize("name", ["untrained", "trained_once"])
+def test_a_row_that_is_not_trained_again_has_the_first_seed_alone(name):
+    result = grid.list_cells(PLAN | {name: ["ours"]})
     assert {cell.seed for cell in result if cell.label == "ours"} == {0}
     assert {cell.seed for cell in result if cell.label == "program"} == {0, 1}
-    with pytest.raises(ValueError, match=r"unknown comparison\.untrained us"):
-        grid.list_cells(PLAN | {"untrained": ["us"]})
+    with pytest.raises(ValueError, match=rf"unknown comparison\.{name} us"):
+        grid.list_cells(PLAN | {name: ["us"]})
 
 
 def test_what_was_tuned_for_a_vehicle_changes_its_cells_alone():

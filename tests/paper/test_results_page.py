@@ -258,6 +258,17 @@ def test_differences_are_marked_where_the_interval_leaves_zero_on_either_side(wh
     assert result["SFKD"] == ["–", "–", "–", "1.25 / 1.25 / 1.25"]
 
 
+@pytest.mark.parametrize(("p", "mark"), [(0.04, r" \*"), (0.06, "")])
+def test_a_difference_is_decided_by_its_corrected_p_and_not_by_its_interval(p, mark):
+    sfkd, other = row("sfkd", "measured"), row("icode_mppi", "measured")
+    other["difference_to_sfkd"] |= {"p": 0.01, "p_holm": p}
+    text = results_markdown(document() | {"rows": [sfkd, other]})
+    found = tables_of(text, f"Against SFKD and the oracle: {FEEDBACK}")
+    assert found["ICODE-MPPI (e)"][0] == "+5.0 (4.0–6.0)" + mark
+    assert "p is above 0.05 with Holm's correction" in text
+    assert ("so SFKD is better" if mark else "undecided with Holm's correction") in text
+
+
 def test_a_quadratic_program_is_compared_with_the_sampling_it_was_compared_with(whole):
     markdown = text_of(whole[0], "results.md")
     own = tables_of(markdown, f"Against SFKD and the oracle: {FEEDBACK}")[

@@ -143,6 +143,7 @@ class Comparison(NamedTuple):
     seeds: Annotated[tuple[NonNegativeInt, ...], Entries(least=0)]
     only: Names
     untrained: Names
+    trained_once: Names
     rows: _Overrides
     tuned: dict[str, dict[str, str]]
     variations: _Overrides

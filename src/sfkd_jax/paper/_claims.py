@@ -92,11 +92,11 @@ def better_rows(setup: Setup) -> list[Block]:
 
 
 def _certainty(setup: Setup, entry: Entry, score: _Score) -> str:
-    """† where the paired interval is below zero; only RMSE has one."""
+    """† where the paired difference is below zero; only RMSE has one."""
     if score.scenario is None:
         return ""
     record = difference(setup, entry, score.scenario)
-    return " †" if side(dig(record, "ci95")) < 0 else ""
+    return " †" if side(record) < 0 else ""
 
 
 def _scores(setup: Setup) -> Iterator[_Score]:
@@ -208,11 +208,14 @@ def _against(setup: Setup, entry: Entry) -> str:
     shown = bounds(dig(record, "ci95"))
     if shown == DASH:
         return f"{text}."
+    corrected = is_number(dig(record, "p_holm"))
     verdict = {
         1: "so SFKD is better",
         -1: f"so {entry.name} is better",
-        0: "which holds zero, so it is undecided",
-    }[side(dig(record, "ci95"))]
+        0: "undecided with Holm's correction"
+        if corrected
+        else "which holds zero, so it is undecided",
+    }[side(record)]
     gap = f"paired difference {millimetres(dig(record, 'mean'))} mm"
     return f"{text}; {gap}, 95 % interval {shown}, {verdict}."
 

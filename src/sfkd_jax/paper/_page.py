@@ -238,7 +238,7 @@ def _setup(setup: Setup, study: Study) -> list[_Part]:
         ),
         "Against SFKD and the oracle": (
             tables.relative(setup),
-            text("tables.relative"),
+            text("tables.relative", undecided=text(f"tables.{tables.decided(setup)}")),
         ),
         "Extremes and smoothness": (tables.extremes(setup, study), ""),
         "Claims": (tables.claims(setup), text("tables.claims")),

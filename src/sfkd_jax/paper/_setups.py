@@ -10,6 +10,8 @@ from sfkd_jax.evaluation.metrics import Metric, Row
 from sfkd_jax.reporting.rows import SAMPLINGS, name_of, vehicle_stem
 from sfkd_jax.reporting.style import family, rank
 
+LEVEL = 0.05
+"""A difference counts if its corrected p-value is smaller."""
 OFF_THE_ROAD_M = 1.0
 """Mean deviation from which a figure writes a number instead of drawing a mark."""
 _VEHICLES = ("kinematic", "dynamic")
@@ -203,8 +205,15 @@ def _is_about(
     return abs(combine(ours, theirs) - value) <= 1e-6 * max(1.0, abs(value))
 
 
-def side(bounds: Any) -> int:
-    """Sign of an interval: 1 above zero, −1 below, 0 if it holds zero or is none."""
-    if not is_pair(bounds):
+def side(record: Any) -> int:
+    """Sign of a difference to SFKD: 1 above zero, −1 below, 0 if it is undecided.
+
+    It is decided by its p-value with Holm's correction. Results of older versions have
+    none; there its interval must exclude zero.
+    """
+    mean, bounds = dig(record, "mean"), dig(record, "ci95")
+    if not (is_number(mean) and is_pair(bounds)):
         return 0
-    return 1 if min(bounds) > 0 else -1 if max(bounds) < 0 else 0
+    p = dig(record, "p_holm")
+    excluded = p < LEVEL if is_number(p) else min(bounds) * max(bounds) > 0
+    return (1 if mean > 0 else -1) if excluded else 0

@@ -44,7 +44,7 @@ def signed(record: Any) -> str:
     """A paired difference with its interval, marked where that excludes zero."""
     shown, mean = with_interval(record), dig(record, "mean")
     plus = "+" if is_number(mean) and mean > 0 else ""
-    return plus + shown + {1: " *", 0: "", -1: " †"}[side(dig(record, "ci95"))]
+    return plus + shown + {1: " *", 0: "", -1: " †"}[side(record)]
 
 
 def slashed(words: list[str]) -> str:
@@ -76,6 +76,20 @@ def relative(setup: Setup) -> Table:
         [number(ratio(setup, entry, name), 2) for name in names]
     )
     return _table(setup, columns)
+
+
+def decided(setup: Setup) -> str:
+    """How the marks of `relative` are found: "by_p", in older results "by_interval"."""
+    records = [
+        difference(setup, entry, name)
+        for entry in setup.entries
+        for name in setup.scenarios
+    ]
+    return (
+        "by_p"
+        if any(is_number(dig(one, "p_holm")) for one in records)
+        else "by_interval"
+    )
 
 
 def extremes(setup: Setup, study: Study) -> Table:

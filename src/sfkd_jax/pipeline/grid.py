@@ -45,21 +45,22 @@ def list_cells(comparison: dict[str, Any]) -> list[Cell]:
     was interrupted still compares all rows.
 
     Raises:
-        ValueError: `only` or `untrained` names an unknown row.
+        ValueError: `only`, `untrained` or `trained_once` names an unknown row.
     """
     rows, only = comparison["rows"], comparison["only"]
-    for name in ("only", "untrained"):
+    for name in ("only", "untrained", "trained_once"):
         if unknown := set(comparison[name]) - set(rows):
             raise ValueError(
                 f"unknown comparison.{name} {', '.join(sorted(unknown))}; "
                 f"choose of {', '.join(rows) or 'none'}"
             )
     labels = [label for label in rows if label in (only or rows)]
+    first_seed_only = {*comparison["untrained"], *comparison["trained_once"]}
     cells = []
     for seed, vehicle, label in itertools.product(
         comparison["seeds"], comparison["vehicles"], labels
     ):
-        if label in comparison["untrained"] and seed != comparison["seeds"][0]:
+        if label in first_seed_only and seed != comparison["seeds"][0]:
             continue
         for common, scenarios in comparison["controllers"].items():
             own = comparison["own_controllers"].get(label, {}).get(common, common)
