@@ -158,6 +158,12 @@ def rows_of(experiment, data=""):
     }
 
 
+def trained_rows():
+    """Label -> overrides of every row that is tuned, in both frames."""
+    path = rows_of("protocol2_path", "dataset=path controller=mppi_path ")
+    return rows_of("protocol2") | path
+
+
 def chosen(document):
     """The overrides of the best trial."""
 
@@ -196,9 +202,7 @@ def main():
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
-    rows = rows_of("protocol2") | rows_of(
-        "protocol2_path", "dataset=path controller=mppi_path "
-    )
+    rows = trained_rows()
     parser.add_argument("--vehicles", nargs="*", default=VEHICLES)
     parser.add_argument("--rows", nargs="*", choices=rows, default=list(rows))
     parser.add_argument("--root", default="runs")

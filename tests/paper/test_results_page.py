@@ -587,11 +587,13 @@ def test_every_training_of_a_row_is_drawn_and_listed():
         row(name, "measured", rmse_trainings_m=values)
         for name, values in trained.items()
     ]
+    rows.append(row("icode_mppi", "measured"))  # trained once
     markdown = results_markdown({"rows": rows, "config": {"name": "seeds"}})
     result = tables_of(markdown, f"Single trainings: {FEEDBACK}")
     assert result == {
         "Row": ["S3 \\[mm\\], seed 0, 1"],
         "SFKD": ["18.0, 22.0 ± 2.8"],
+        "ICODE-MPPI (e)": ["25.0"],
         "Oracle": ["16.0"],
     }
     assert "interval over trainings and episodes" in markdown

@@ -65,7 +65,7 @@ class Setup(NamedTuple):
     def vehicle_title(self) -> str:
         """The vehicle as text."""
         loop = " under a speed loop" if self.inner_loop == "speed" else ""
-        return f"{self.vehicle.capitalize()} vehicle{loop}"
+        return f"{self.vehicle.replace('_', ' ').capitalize()} vehicle{loop}"
 
     @property
     def title(self) -> str:

@@ -141,7 +141,7 @@ def cost(group: list[Setup]) -> Table:
 
 def trainings(row: Row | None) -> list[float]:
     """RMSE of every training in m, by seed; equal numbers only once."""
-    values = (row or {}).get("rmse_trainings_m") or []
+    values = dig(row, "rmse_trainings_m") or [dig(row, "rmse_m", "mean")]
     return list(dict.fromkeys(values)) if all(map(is_number, values)) else []
 
 
