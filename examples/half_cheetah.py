@@ -52,7 +52,7 @@ def main(samples=96, seconds=4.0, figure=None):
         import matplotlib.pyplot as plt
 
         _, axis = plt.subplots(figsize=(9, 1.8), layout="constrained")
-        every = slice(None, None, 4)
+        every = slice(None, None, 7)
         for child, parent in enumerate(CHEETAH.sys.link_parents):
             ends = links[every, jnp.asarray([max(parent, 0), child])]
             axis.plot(ends[..., 0].T, ends[..., 2].T, color="tab:blue")

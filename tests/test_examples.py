@@ -67,9 +67,21 @@ def test_a_learned_residual_keeps_the_boat_off_the_rocks(monkeypatch):
     assert gap > max(0.0, nominal_gap + 0.1)
 
 
+@pytest.mark.exhaustive
+def test_a_half_cheetah_runs(monkeypatch):
+    assert example("half_cheetah", monkeypatch)["main"](samples=48, seconds=1.5) > 1.0
+
+
 @pytest.mark.parametrize(
     "name",
-    ["cartpole", "quadrotor_window", "fleet", "racing_line", "dubins_residual"],
+    [
+        "cartpole",
+        "quadrotor_window",
+        "fleet",
+        "racing_line",
+        "dubins_residual",
+        "half_cheetah",
+    ],
 )
 def test_an_example_of_the_planner_is_short(name):
     """Without docstrings, empty lines, imports and the figure."""

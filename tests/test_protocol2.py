@@ -11,7 +11,7 @@ from benchmarks.quality import protocol2_tuning as tuning
 ROWS = tuning.trained_rows()
 
 
-@pytest.mark.parametrize(("vehicle", "label"), product(tuning.VEHICLES, ROWS))
+@pytest.mark.parametrize(("vehicle", "label"), [*product(tuning.VEHICLES, ROWS)])
 def test_every_row_had_the_same_trials_and_steps(vehicle, label):
     file = tuning.HERE / "protocol2_trials" / vehicle / f"{label}.json"
     document = json.loads(file.read_text())

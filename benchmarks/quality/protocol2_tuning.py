@@ -185,8 +185,9 @@ def winners():
         if len(document["trials"]) < TRIALS:
             raise SystemExit(f"{file}: {len(document['trials'])} of {TRIALS} trials")
         found = tuned.setdefault(file.parent.name, {})
-        # A row takes its settings without e as well.
-        found |= dict.fromkeys((file.stem, f"{file.stem}_blind"), chosen(document))
+        if best := chosen(document):  # otherwise the row keeps its own settings
+            # A row takes its settings without e as well.
+            found |= dict.fromkeys((file.stem, f"{file.stem}_blind"), best)
     return tuned | {vehicle: tuned[like] for vehicle, like in SAME_STATES.items()}
 
 

@@ -11,6 +11,7 @@ from typing import Any, NamedTuple, TypeAlias
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax.typing import ArrayLike
 
 from sfkd_jax.control.tasks._task import (
     Actuator,
@@ -24,7 +25,7 @@ from sfkd_jax.control.tasks._task import (
 )
 from sfkd_jax.types import Control, Key, Params, Scalar
 
-Limit: TypeAlias = float | Sequence[float] | None
+Limit: TypeAlias = ArrayLike | Sequence[float] | None
 """One number for every control, one for each, or None for no limit."""
 StageCost: TypeAlias = Callable[..., Scalar]
 """(weights, state, control, control before, reference) -> cost of one step."""
