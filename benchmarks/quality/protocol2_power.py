@@ -13,12 +13,17 @@ from scipy import stats
 
 from benchmarks import markdown
 from benchmarks.harness import ROOT
+from benchmarks.quality.protocol2_tuning import settings_of
 from sfkd_jax import evaluation
+from sfkd_jax.pipeline import grid
 
 PAGE = ROOT / "docs" / "results" / "protocol-2.md"
 MEASURED = ROOT / "experiments" / "seeds" / "results.json"
 SIZES = {"1 x 6": (1, 6), "3 x 16": (3, 16), "10 x 200": (10, 200)}
 """Trainings and episodes of protocol 1, of this one, and with an accelerator."""
+MARKED = (3, 16)
+PARTS = ("protocol2_path", "protocol2")
+"""In path coordinates, and in the body frame."""
 POWER = 0.8
 REFERENCE = "sfkd"
 
@@ -53,9 +58,30 @@ def detectable(spread, size):
     return float(np.sqrt(total) * np.dot((share, 1.0 - share), quantiles))
 
 
+def markable(spread, size, family):
+    """The difference that is marked with probability `POWER` at Holm's first step.
+
+    It is that of the trained policies as they are, so trainings do not enter.
+    """
+    trainings, episodes = size
+    _, by_episode, rest = np.square(spread)
+    error = np.sqrt((by_episode + rest / trainings) / episodes)
+    shares = 1.0 - 0.025 / family, POWER
+    return float(error * sum(stats.t.ppf(share, episodes - 1) for share in shares))
+
+
+def family(part):
+    """The number of differences to SFKD in a part."""
+    cells = grid.list_cells(settings_of(f"+experiment={part}")["comparison"])
+    rows = {cell._replace(seed=0) for cell in cells}
+    return sum(row.label not in ("sfkd", "sfkd_path") for row in rows)
+
+
 def table():
     """One line for each plant, scenario and rival of SFKD."""
     head = ["row − SFKD", "trainings", "episodes", "rest", *SIZES]
+    families = [family(part) for part in PARTS]
+    head += [f"mark, {size}" for size in families]
     lines = []
     rows = json.loads(MEASURED.read_text())["rows"]
     errors = {
@@ -68,6 +94,7 @@ def table():
             continue
         spread = deviations(values - errors[plant, scenario, REFERENCE])
         found = [f"{detectable(spread, size):.1f}" for size in SIZES.values()]
+        found += [f"{markable(spread, MARKED, size):.1f}" for size in families]
         cells = [f"{plant}, {scenario.upper()}: {system}"]
         lines.append([*cells, *(f"{part:.2f}" for part in spread), *found])
     return markdown.table(head, lines)

@@ -32,6 +32,11 @@ PAGES = {
     "small_data": ("small_data", "small-data"),
     "seeds": ("seeds", "seeds"),
     "longer": ("longer", "longer"),
+    "protocol2": ("protocol2", "bench-2"),
+    "protocol2_path": ("protocol2_path", "bench-2-path"),
+    "protocol2_plain": ("protocol2_plain", "bench-2-plain"),
+    "protocol2_speed": ("protocol2_speed", "bench-2-speed"),
+    "protocol2_blind": ("protocol2_blind", "bench-2-blind"),
 }
 """Name of a comparison -> its folder in experiments/ and its page in docs/results/."""
 FROM_ARRAYS = ("figure1_*", "*.gif")

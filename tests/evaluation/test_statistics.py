@@ -17,6 +17,8 @@ SIZES = [(3, 16), (3, 12), (5, 16), (10, 200)]
 """Trainings and episodes of the benchmarks."""
 DEVIATIONS = [(0.0, 1.0, 0.3), (0.3, 1.0, 0.5), (1.0, 1.0, 1.0), (1.0, 0.3, 0.3)]
 """Of trainings, episodes and the rest."""
+HARDEST = (0.36, 0.0, 0.59)
+"""Trainings vary, and their variance is seldom seen beside that of the rest."""
 
 
 def crossed(random, size, deviations, draws=DRAWS):
@@ -42,6 +44,12 @@ def test_the_interval_covers_the_mean_of_all_trainings_and_episodes(size, deviat
     assert 0.927 <= coverage(crossed(random, size, deviations)) <= 0.983
 
 
+def test_the_coverage_where_it_is_least():
+    """91.5 % over 20 000 draws."""
+    tables = crossed(np.random.default_rng(2), (3, 16), HARDEST)
+    assert 0.895 <= coverage(tables) <= 0.935
+
+
 @pytest.mark.parametrize("size", [(3, 16), (10, 200)])
 def test_episodes_of_one_training_are_not_that_many_trials(size):
     random = np.random.default_rng(6)
@@ -56,9 +64,6 @@ def test_one_training_has_the_t_interval_of_its_episodes():
         mean, interval = mean_interval(shaped)
         assert mean == pytest.approx(values.mean())
         np.testing.assert_allclose(interval, ends)
-        assert p_value(shaped - 0.5) == pytest.approx(
-            stats.ttest_1samp(values, 0.5).pvalue, rel=1e-6
-        )
 
 
 def test_many_trainings_of_one_episode_have_their_t_interval():
@@ -67,14 +72,28 @@ def test_many_trainings_of_one_episode_have_their_t_interval():
     np.testing.assert_allclose(mean_interval(values)[1], ends)
 
 
-def test_the_p_value_is_the_level_at_which_the_interval_touches_zero():
-    random = np.random.default_rng(9)
-    for table in crossed(random, (3, 16), (0.5, 1.0, 0.5), 50):
-        low, high = mean_interval(table)[1]
-        assert p_value(table - low) == pytest.approx(0.05, rel=1e-6)
-        assert p_value(table - high) == pytest.approx(0.05, rel=1e-6)
-        assert p_value(table - table.mean()) == 1.0
-        assert p_value(table + 1e6) == 0.0
+def test_the_p_value_is_that_of_a_t_test_over_episodes():
+    values = np.random.default_rng(9).standard_exponential(16)
+    for mean in (0.5, 1.0, 5.0):
+        expected = stats.ttest_1samp(values, mean).pvalue
+        assert p_value(values - mean) == pytest.approx(expected, rel=1e-9)
+    assert p_value(values - values.mean()) == pytest.approx(1.0)
+    assert p_value(np.ones(16)) == 0.0
+
+
+@pytest.mark.parametrize("deviations", [*DEVIATIONS, HARDEST])
+def test_policies_that_are_equal_on_all_roads_are_seldom_told_apart(deviations):
+    """At the level that Holm's first step has in a family of 20, given the trainings."""
+    random = np.random.default_rng(12)
+    of_trainings, of_episodes, rest = deviations
+    policies = of_trainings * random.standard_normal((3, 1))
+    tables = (
+        policies
+        - policies.mean()
+        + crossed(random, (3, 16), (0.0, of_episodes, rest), 10 * DRAWS)
+    )
+    found = [paired_difference(table, 0.0 * table)["p"] < 0.05 / 20 for table in tables]
+    assert 0.0015 <= np.mean(found) <= 0.0035
 
 
 def test_what_cannot_be_tested_has_neither_interval_nor_p():
