@@ -240,7 +240,10 @@ def _setup(setup: Setup, study: Study) -> list[_Part]:
             tables.relative(setup),
             text("tables.relative", undecided=text(f"tables.{tables.decided(setup)}")),
         ),
-        "Extremes and smoothness": (tables.extremes(setup, study), ""),
+        "Extremes and smoothness": (
+            tables.extremes(setup, study),
+            text("tables.extremes") if several else "",
+        ),
         "Claims": (tables.claims(setup), text("tables.claims")),
         "Threshold and planner": (tables.limits(setup, study), text("tables.limits")),
     }
