@@ -88,6 +88,7 @@ def test_option_files_stay_short():
     assert all(
         len((CONF / group / f"{name}.yaml").read_text().splitlines()) <= 30
         for group, name in OPTIONS
+        if name != "tuned"  # a line per row and vehicle, written by a program
     )
 
 

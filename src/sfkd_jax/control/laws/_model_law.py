@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 from typing import Any, NamedTuple
 
 import jax
@@ -84,35 +85,25 @@ class ModelLaw(NamedTuple):
         """
         speeds = reference[:, 3]
         step = _along_circle(model, fiber, like.shape[0], self.dt)
-        turn = jax.vmap(
-            lambda kappa, speed: _steady(step, like.shape[0] - 1, kappa, speed)
+        steady = functools.partial(_steady, step, like.shape[0] - 1)
+        both = jax.vmap(jax.vmap(steady), in_axes=(0, None))(
+            jnp.stack([curvature, 0.0 * curvature]), speeds
         )
-        both = turn(
-            jnp.stack([curvature, 0.0 * curvature]).ravel(), jnp.tile(speeds, 2)
-        )
-        states, controls, residuals = (jnp.stack(jnp.split(part, 2)) for part in both)
-        finite = jnp.all(
-            jnp.isfinite(jnp.concatenate([states[0], controls[0]], axis=1)), axis=1
-        )
-        valid = finite & (residuals[0] < RESIDUAL_TOLERANCE)
-        states, controls = (
-            jnp.where(valid[:, None], part[0], part[1]) for part in (states, controls)
-        )
-        at = jnp.where(valid, curvature, 0.0)
+        valid = _is_valid(jax.tree.map(lambda part: part[0], both))
+        chosen = jax.tree.map(lambda part: jax.vmap(jnp.where)(valid, *part), both)
         # One gain, of the first step: it varies little over a horizon, and the Riccati
         # recursion is the most expensive part.
-        gain = self._gain(step, states[0], controls[0], at[0], speeds[0])
+        gain = self._gain(chosen.A[0], chosen.B[0])
         return SteadyTurn(
-            states, controls, jnp.broadcast_to(gain, (*controls.shape, states.shape[1]))
+            chosen.state,
+            chosen.control,
+            jnp.broadcast_to(gain, (*chosen.control.shape, gain.shape[1])),
         )
 
-    def _gain(
-        self, step: Any, state: Array, control: Control, kappa: Scalar, speed: Scalar
-    ) -> Array:
+    def _gain(self, A: Array, B: Array) -> Array:
         """K by the Riccati recursion."""
-        A, B = jax.jacfwd(step, argnums=(0, 1))(state, control, kappa, speed)
         Q = jnp.diag(
-            jnp.zeros(state.shape[0])
+            jnp.zeros(A.shape[0])
             .at[:3]
             .set(jnp.asarray([self.lateral, self.heading, self.speed]))
         )
@@ -179,38 +170,54 @@ def _along_circle(model: Model, fiber: Fiber, size: int, dt: float) -> Any:
     return step
 
 
-def _steady(
-    step: Any, coordinates: int, kappa: Scalar, speed: Scalar
-) -> tuple[Array, Control, Scalar]:
-    """ξ* and u* by Newton's method, and the residual.
+class _Linear(NamedTuple):
+    """A step of the model around a state: its matrices, and how far it moves."""
 
-    The unknowns are the relative yaw, the body state without v, and u.
+    state: Array
+    control: Control
+    A: Array
+    B: Array
+    residual: Scalar
+
+
+def _is_valid(turn: _Linear) -> Array:
+    """Whether Newton's method has found a steady turn."""
+    finite = jnp.isfinite(jnp.concatenate([turn.state, turn.control], axis=1))
+    return jnp.all(finite, axis=1) & (turn.residual < RESIDUAL_TOLERANCE)
+
+
+def _steady(step: Any, coordinates: int, kappa: Scalar, speed: Scalar) -> _Linear:
+    """ξ* and u* by Newton's method, and the model around them.
+
+    The unknowns are the relative yaw, the body state without v, and u. The loop holds
+    the only copy of the model and its derivative, which take long to compile; its last
+    pass evaluates them where the others have led.
     """
+    free = jnp.asarray([1, *range(3, coordinates)])
 
-    def unpack(unknown: Array) -> tuple[Array, Array]:
-        state = (
-            jnp.zeros(coordinates)
-            .at[1]
-            .set(unknown[0])
-            .at[2]
-            .set(speed)
-            .at[3:]
-            .set(unknown[1:-2])
-        )
-        return state, unknown[-2:]
+    def moved(state: Array, control: Control) -> tuple[Array, Array]:
+        after = step(state, control, kappa, speed)
+        return after, after
 
-    def residual(unknown: Array) -> Array:
-        state, control = unpack(unknown)
-        return step(state, control, kappa, speed) - state
+    def newton(_: Any, carry: tuple[Array, _Linear]) -> tuple[Array, _Linear]:
+        unknown, _ = carry
+        state = jnp.zeros(coordinates).at[2].set(speed).at[free].set(unknown[:-2])
+        control = unknown[-2:]
+        (A, B), after = jax.jacfwd(moved, argnums=(0, 1), has_aux=True)(state, control)
+        gap = after - state
+        matrix = jnp.concatenate([(A - jnp.eye(coordinates))[:, free], B], axis=1)
+        better = unknown - solve(matrix, gap[:, None])[:, 0]
+        return better, _Linear(state, control, A, B, jnp.max(jnp.abs(gap)))
 
-    def newton(_: Any, unknown: Array) -> Array:
-        return (
-            unknown
-            - solve(jax.jacfwd(residual)(unknown), residual(unknown)[:, None])[:, 0]
-        )
-
-    unknown = jax.lax.fori_loop(0, NEWTON, newton, jnp.zeros(coordinates))
-    return *unpack(unknown), jnp.max(jnp.abs(residual(unknown)))
+    start = jnp.zeros(coordinates)
+    nothing = _Linear(
+        state=start,
+        control=jnp.zeros(2),
+        A=jnp.zeros((coordinates, coordinates)),
+        B=jnp.zeros((coordinates, 2)),
+        residual=jnp.zeros(()),
+    )
+    return jax.lax.fori_loop(0, NEWTON + 1, newton, (start, nothing))[1]
 
 
 def solve(
@@ -222,11 +229,18 @@ def solve(
     with several such calls inside maps.
     """
     size = matrix.shape[0]
-    rows = jnp.concatenate([matrix, right], axis=1)
-    for column in range(size):
-        pivot = column + jnp.argmax(jnp.abs(rows[column:, column]))
-        order = jnp.arange(size).at[column].set(pivot).at[pivot].set(column)
+    indices = jnp.arange(size)
+
+    def eliminate(column: Array, rows: Array) -> Array:
+        candidates = jnp.where(indices < column, -1.0, jnp.abs(rows[:, column]))
+        pivot = jnp.argmax(candidates)
+        order = indices.at[column].set(pivot).at[pivot].set(column)
         rows = rows[order]
         lead = rows[column] / rows[column, column]
-        rows = (rows - rows[:, column : column + 1] * lead).at[column].set(lead)
+        return (rows - rows[:, column, None] * lead).at[column].set(lead)
+
+    # A loop that is not unrolled: half of the instructions of a law are in here.
+    rows = jax.lax.fori_loop(
+        0, size, eliminate, jnp.concatenate([matrix, right], axis=1)
+    )
     return rows[:, size:]
