@@ -18,7 +18,8 @@ ROW = {
     "seeds": [0, 1, 2],
     "episodes": 16,
     "params": 1234,
-    "rmse_m": {"mean": 0.0123, "ci95": [0.0111, 0.0135], "worst": 0.0201},
+    "rmse_m": {"mean": 0.0123, "ci95": [0.0111, 0.0135]},
+    "rmse_episodes_m": [0.0123, 0.0202, 0.0201, 0.0123, 0.02, 0.0123],
     "departures": 1,
     "ratio_to_oracle": 1.2,
     "provenance": {

@@ -19,7 +19,7 @@ class Study(NamedTuple):
     Attributes:
         title: heading of the page.
         intro: first sentences of the page.
-        scenario: of the figure of the first episode, and of the film.
+        scenario: of the figure of the first episode, and of the film; empty for none.
         rivals: systems that the text compares SFKD with, the main one first.
         variations: heading of the sections on variations of the protocol.
         varied: what the filled marks of their figures show.
