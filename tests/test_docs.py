@@ -15,6 +15,7 @@ import yaml
 from benchmarks.quality import (
     adaptation_page,
     corridor_page,
+    paper_terms_page,
     path_frame,
     planner_page,
     protocol2_power,
@@ -527,6 +528,12 @@ def test_the_tables_of_the_planner_are_those_of_its_runs():
         assert planner_page.page(name) == text
         for marker, table in tables.items():
             assert table() in text, marker
+
+
+def test_the_table_of_the_papers_terms_is_that_of_its_run():
+    text = paper_terms_page.PAGE.read_text("utf-8")
+    assert paper_terms_page.page() == text
+    assert paper_terms_page.tables() in text
 
 
 def test_the_tables_of_performance_are_those_of_its_runs():
