@@ -7,6 +7,7 @@ import pytest
 
 from sfkd_jax import scenarios
 from sfkd_jax.scenarios import pace_at, reference_window
+from sfkd_jax.scenarios._silverstone import circuit_curvature, pace_of
 
 SPEED, DT = 10.0, 0.1
 KEYS = jax.random.split(jax.random.key(3), 8)
@@ -88,3 +89,30 @@ def test_a_pace_of_one_changes_nothing():
         atol=1e-4,
     )
     assert float(pace_at(road, s)) == 1.0
+
+
+def test_a_lap_of_the_circuit_closes_and_has_its_published_length():
+    """Otherwise the second lap would be beside the first."""
+    curvature = circuit_curvature()
+    assert curvature.shape[0] * 0.5 == 5891.0
+    once_more = np.append(curvature, curvature[0])
+    lap = scenarios.path_from_curvature(jnp.asarray(once_more), spacing=0.5).points
+    np.testing.assert_allclose(lap[-1, :2], lap[0, :2], atol=0.2)
+    assert lap[-1, 2] == pytest.approx(-2 * np.pi, abs=1e-3)  # driven clockwise
+
+
+def test_the_pace_of_a_lap_keeps_its_limits_also_across_the_finish():
+    curvature = circuit_curvature()
+    squared = np.asarray(pace_of(curvature)) ** 2
+    assert (squared * np.abs(curvature)).max() <= 0.02 * (1 + 1e-5)
+    slope = np.diff(np.append(squared, squared[0])) / 0.5
+    assert -0.05 * (1 + 1e-3) <= slope.min() < -0.04
+    assert 0.015 < slope.max() <= 0.016 * (1 + 1e-3)
+    assert squared.max() == 1.0
+
+
+def test_laps_start_at_full_pace_at_different_places():
+    road = episodes("silverstone").path
+    assert (road.pace[:, 0] == 1.0).all()
+    assert not road.points[:, 0].any()
+    assert len(np.unique(road.points[:, 400, 2].round(3))) > 4

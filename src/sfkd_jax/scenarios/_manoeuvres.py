@@ -10,12 +10,11 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from sfkd_jax.scenarios._conditions import Schedule
-from sfkd_jax.scenarios._paths import Path, path_from_curvature
+from sfkd_jax.scenarios._conditions import Schedule, switching_road
+from sfkd_jax.scenarios._paths import SPACING, Path, blended_in, path_from_curvature
+from sfkd_jax.scenarios._silverstone import lap
 from sfkd_jax.types import Key, Scalar
 
-SPACING = 0.5
-"""Between samples of a path [m]."""
 RUN_UP = (20.0, 50.0)
 """Range of the straight road before the first manoeuvre [m]."""
 LANE = 3.5
@@ -70,8 +69,7 @@ def straight(key: Key, length: float) -> Path:
 def turn(key: Key, length: float) -> Path:
     """Turn to a random side with a constant radius, after a straight road."""
     s, side = _since_start(key, length, repeated=False)
-    blend = jnp.clip(s / RUN_UP[0], 0.0, 1.0)
-    curvature = side / RADIUS * blend**2 * (3.0 - 2.0 * blend)
+    curvature = blended_in(side / RADIUS, s)
     return path_from_curvature(curvature, spacing=SPACING)
 
 
@@ -121,6 +119,9 @@ MANOEUVRES = {
     "gust_cosine": Manoeuvre(straight, gust_cosines),
     "friction_step": Manoeuvre(turn, partial(friction_drops, to=SLIPPERY)),
     "braking_turn": Manoeuvre(braking_turn, partial(friction_drops, to=WET)),
+    "silverstone": Manoeuvre(
+        lap, lambda key, steps, dt: switching_road(key, steps=steps, dt=dt)
+    ),
 }
 """Manoeuvres by the names of their scenarios."""
 

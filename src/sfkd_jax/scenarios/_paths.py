@@ -10,6 +10,11 @@ from jaxtyping import Array, Float
 
 from sfkd_jax.types import Key, Reference, Scalar
 
+SPACING = 0.5
+"""Between samples of a path [m]."""
+RUN_UP = 20.0
+"""Over which the curvature of a path is blended in [m]."""
+
 
 class Path(NamedTuple):
     """A path sampled at equal arc length.
@@ -31,10 +36,10 @@ def smooth_path(
     key: Key,
     *,
     length: float,
-    spacing: float = 0.5,
+    spacing: float = SPACING,
     peak_curvature: float = 0.02,
     wavelengths: tuple[float, float] = (50.0, 160.0),
-    run_up: float = 20.0,
+    run_up: float = RUN_UP,
 ) -> Path:
     """Draw a path whose curvature is a sum of three sinusoids.
 
@@ -59,10 +64,17 @@ def smooth_path(
     )
     phases = jax.random.uniform(phase_key, (3, 1), maxval=2 * jnp.pi)
     curvature = jnp.sum(amplitudes * jnp.sin(2 * jnp.pi * s / waves + phases), axis=0)
-    blend = jnp.clip(s / run_up, 0.0, 1.0)
-    curvature = curvature * blend**2 * (3.0 - 2.0 * blend)
+    curvature = blended_in(curvature, s, run_up)
     curvature = curvature * peak_curvature / jnp.max(jnp.abs(curvature))
     return path_from_curvature(curvature, spacing=spacing)
+
+
+def blended_in(
+    curvature: Float[Array, "*point"], s: Float[Array, " point"], run_up: float = RUN_UP
+) -> Float[Array, " point"]:
+    """Return a curvature that rises smoothly from 0 at s = 0 within the run-up [m]."""
+    blend = jnp.clip(s / run_up, 0.0, 1.0)
+    return curvature * blend**2 * (3.0 - 2.0 * blend)
 
 
 def path_from_curvature(curvature: Float[Array, " point"], *, spacing: float) -> Path:
@@ -78,7 +90,7 @@ def path_from_curvature(curvature: Float[Array, " point"], *, spacing: float) ->
     return Path(jnp.stack([x, y, yaw, curvature], axis=1), jnp.asarray(spacing))
 
 
-def path_through(points: Float[Array, "point 2"], *, spacing: float = 0.5) -> Path:
+def path_through(points: Float[Array, "point 2"], *, spacing: float = SPACING) -> Path:
     """Return a path through positions, resampled at equal distances.
 
     Yaw and curvature are central differences. The path is straight between positions,

@@ -75,7 +75,8 @@ def scenario(
     more have one constant pair of friction and wind per episode: "seen" in the range of
     the training drives, "interpolated" between friction levels that these have under
     wind, "extrapolated" outside their box. Manoeuvres have paths of their own:
-    "double_lane_change", "gust_step", "gust_cosine", "friction_step", "braking_turn".
+    "double_lane_change", "gust_step", "gust_cosine", "friction_step", "braking_turn",
+    and "silverstone", the circuit, with the environment of "s3".
 
     Args:
         name: of the family.
