@@ -1,26 +1,5 @@
 """The centre line of Silverstone, as a path with a pace that its bends allow.
 
-The positions are those of f1-circuits, in metres east and north of 52.071 N, 1.017 W:
-
-Copyright (c) 2019-2022 Tomislav Bacinger
-
-Permission is hereby granted, free of charge, to any person obtaining a copy of this
-software and associated documentation files (the "Software"), to deal in the Software
-without restriction, including without limitation the rights to use, copy, modify,
-merge, publish, distribute, sublicense, and/or sell copies of the Software, and to
-permit persons to whom the Software is furnished to do so, subject to the following
-conditions:
-
-The above copyright notice and this permission notice shall be included in all copies or
-substantial portions of the Software.
-
-THE SOFTWARE IS PROVIDED "AS IS", WITHOUT WARRANTY OF ANY KIND, EXPRESS OR IMPLIED,
-INCLUDING BUT NOT LIMITED TO THE WARRANTIES OF MERCHANTABILITY, FITNESS FOR A PARTICULAR
-PURPOSE AND NONINFRINGEMENT. IN NO EVENT SHALL THE AUTHORS OR COPYRIGHT HOLDERS BE
-LIABLE FOR ANY CLAIM, DAMAGES OR OTHER LIABILITY, WHETHER IN AN ACTION OF CONTRACT, TORT
-OR OTHERWISE, ARISING FROM, OUT OF OR IN CONNECTION WITH THE SOFTWARE OR THE USE OR
-OTHER DEALINGS IN THE SOFTWARE.
-
 Source: https://github.com/bacinger/f1-circuits, circuits/gb-1948.geojson.
 """
 
@@ -41,6 +20,26 @@ PEAK_CURVATURE = 0.02
 """Up to which a bend is driven at full speed, as on the random roads [1/m]."""
 BRAKING, ACCELERATING = 0.05, 0.016
 """Largest slopes of the squared pace [1/m]: 2.5 and 0.8 m/s² at 10 m/s."""
+# The positions are from the file above, under this notice:
+#
+# Copyright (c) 2019-2022 Tomislav Bacinger
+#
+# Permission is hereby granted, free of charge, to any person obtaining a copy of this
+# software and associated documentation files (the "Software"), to deal in the Software
+# without restriction, including without limitation the rights to use, copy, modify,
+# merge, publish, distribute, sublicense, and/or sell copies of the Software, and to
+# permit persons to whom the Software is furnished to do so, subject to the following
+# conditions:
+#
+# The above copyright notice and this permission notice shall be included in all copies
+# or substantial portions of the Software.
+#
+# THE SOFTWARE IS PROVIDED "AS IS", WITHOUT WARRANTY OF ANY KIND, EXPRESS OR IMPLIED,
+# INCLUDING BUT NOT LIMITED TO THE WARRANTIES OF MERCHANTABILITY, FITNESS FOR A
+# PARTICULAR PURPOSE AND NONINFRINGEMENT. IN NO EVENT SHALL THE AUTHORS OR COPYRIGHT
+# HOLDERS BE LIABLE FOR ANY CLAIM, DAMAGES OR OTHER LIABILITY, WHETHER IN AN ACTION OF
+# CONTRACT, TORT OR OTHERWISE, ARISING FROM, OUT OF OR IN CONNECTION WITH THE SOFTWARE
+# OR THE USE OR OTHER DEALINGS IN THE SOFTWARE.
 # fmt: off
 CENTRE_LINE = (
     (116.1, 867.3), (300.3, 883.0), (333.6, 881.0), (359.2, 872.6), (375.8, 861.6),
@@ -74,7 +73,7 @@ CENTRE_LINE = (
     (-108.8, 844.8), (-58.0, 851.1), (113.2, 866.8),
 )
 # fmt: on
-"""East and north of the middle of the circuit [m], clockwise from the start."""
+"""Metres east and north of 52.071 N, 1.017 W, clockwise from the start."""
 
 
 def lap(key: Key, length: float) -> Path:
