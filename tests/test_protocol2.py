@@ -37,20 +37,57 @@ def test_the_settings_of_the_table_are_the_winners_of_the_trials():
     assert yaml.safe_load(tuning.TUNED.read_text())["tuned"] == tuning.winners()
 
 
-def test_a_part_without_all_its_cells_is_refused():
-    comparison = tuning.settings_of("+experiment=protocol2_path")["comparison"]
-    cells = grid.list_cells(comparison)
+def document_of(part, seeds, only=()):
+    """Results of a part that lack nothing, driven with these trainings and rows."""
+    comparison = tuning.settings_of(f"+experiment={part}")["comparison"]
+    used = comparison | {"seeds": seeds, "only": list(only)}
     names = ("vehicle", "system", "controller", "scenario")
+    cells = Counter(
+        (cell.vehicle, cell.label, cell.controller, cell.scenario)
+        for cell in grid.list_cells(used)
+    )
     rows = [
-        dict(zip(names, row, strict=True)) | {"seeds": [0] * count}
-        for row, count in Counter(
-            (cell.vehicle, cell.label, cell.controller, cell.scenario) for cell in cells
-        ).items()
+        dict(zip(names, cell, strict=True)) | {"seeds": seeds[:count]}
+        for cell, count in cells.items()
     ]
-    assert protocol2_page.missing("protocol2_path", rows) == []
-    assert len(protocol2_page.missing("protocol2_path", rows[1:])) == 1
+    return {"config": {"comparison": used}, "rows": rows}
+
+
+def test_a_part_without_all_its_cells_is_refused():
+    part = "protocol2_path"
+    whole = document_of(part, [0, 1, 2])
+    assert protocol2_page.missing(part, whole) == []
+    rows = whole["rows"]
+    assert len(protocol2_page.missing(part, whole | {"rows": rows[1:]})) == 1
     two = [row | {"seeds": [0, 1]} if len(row["seeds"]) == 3 else row for row in rows]
-    assert protocol2_page.missing("protocol2_path", two) != []
+    assert protocol2_page.missing(part, whole | {"rows": two}) != []
+
+
+def test_a_part_may_stop_after_its_first_trainings_or_rows_and_says_so(monkeypatch):
+    part = "protocol2"
+    some = document_of(part, [0], ["oracle", "sfkd"])
+    assert protocol2_page.missing(part, some) == []
+    monkeypatch.setattr(protocol2_page, "document_of", lambda _: some)
+    left = protocol2_page.left(part)
+    assert "ICODE-MPPI" in left
+    assert "SFKD − contraction" in left
+    assert "1 of 3" in left
+    monkeypatch.setattr(
+        protocol2_page, "document_of", lambda _: document_of(part, [0, 1, 2])
+    )
+    assert protocol2_page.left(part) == ""
+
+
+@pytest.mark.parametrize("seeds", [[], [1], [0, 2], [0, 1, 2, 3]])
+def test_trainings_cannot_be_picked(seeds):
+    """Otherwise a part could be told from the trainings that went well."""
+    part = "protocol2"
+    with pytest.raises(SystemExit, match="not the first"):
+        protocol2_page.missing(
+            part,
+            document_of(part, seeds or [0])
+            | {"config": {"comparison": {"seeds": seeds, "only": []}}},
+        )
 
 
 def test_fewer_effective_samples_do_not_help_along_a_path():

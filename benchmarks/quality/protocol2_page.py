@@ -2,7 +2,9 @@
 
 python -m benchmarks.quality.protocol2_page
 From the results in experiments/protocol2 and experiments/protocol2_path. A part
-that is not there yet is left alone; one whose cells are not all there is refused.
+that is not there yet is left alone; one whose cells are not all there is refused. A part
+may be collected for the first trainings or for some of its rows only: its table then
+says what is left.
 """
 
 import json
@@ -37,16 +39,58 @@ def results_of(part):
     return ROOT / "experiments" / part / "results.json"
 
 
-def missing(part, rows):
+def document_of(part):
+    """The results of a part."""
+    return json.loads(results_of(part).read_text("utf-8"))
+
+
+def protocol_of(part):
+    """Settings of the comparison that the protocol asks for."""
+    return settings_of(f"+experiment={part}")["comparison"]
+
+
+def collected(part, results):
+    """The protocol's comparison, cut to the rows and the trainings of the results.
+
+    Raises:
+        SystemExit: other trainings than the protocol's first ones.
+    """
+    asked, used = protocol_of(part), results["config"]["comparison"]
+    seeds = used["seeds"]
+    if not seeds or seeds != asked["seeds"][: len(seeds)]:
+        raise SystemExit(f"{part}: seeds {seeds} are not the first of {asked['seeds']}")
+    return asked | {"seeds": seeds, "only": used["only"]}
+
+
+def missing(part, results):
     """Cells of a part that no row covers, and those that it should not have."""
-    comparison = settings_of(f"+experiment={part}")["comparison"]
     asked = Counter(
         (cell.vehicle, cell.label, cell.controller, cell.scenario)
-        for cell in grid.list_cells(comparison)
+        for cell in grid.list_cells(collected(part, results))
     )
     names = ("vehicle", "system", "controller", "scenario")
-    found = {tuple(row[name] for name in names): len(row["seeds"]) for row in rows}
+    found = {
+        tuple(row[name] for name in names): len(row["seeds"]) for row in results["rows"]
+    }
     return sorted(set(asked.items()) ^ set(found.items()))
+
+
+def left(part):
+    """Rows and trainings of the protocol that are not driven yet, in a sentence."""
+    asked = protocol_of(part)
+    now = collected(part, document_of(part))
+    rows = [
+        label(row) for row in asked["rows"] if now["only"] and row not in now["only"]
+    ]
+    sentences = []
+    if rows:
+        sentences.append(f"Not driven yet: {', '.join(rows)}.")
+    if len(now["seeds"]) < len(asked["seeds"]):
+        sentences.append(
+            f"Trainings driven so far: {len(now['seeds'])} of {len(asked['seeds'])}; "
+            "intervals and marks are about other episodes, not about other trainings."
+        )
+    return " ".join(sentences)
 
 
 def rows_of(part, sampling):
@@ -55,13 +99,13 @@ def rows_of(part, sampling):
     Raises:
         SystemExit: cells are missing.
     """
-    rows = json.loads(results_of(part).read_text("utf-8"))["rows"]
-    if gaps := missing(part, rows):
+    document = document_of(part)
+    if gaps := missing(part, document):
         raise SystemExit(
             f"{part}: {len(gaps)} rows are not complete, such as {gaps[0]}"
         )
     found = {}
-    for row in rows:
+    for row in document["rows"]:
         if (row["sampling"] or sampling) == sampling:
             driven = found.setdefault(family(row["system"]), {})
             driven.setdefault(row["vehicle"], {})[row["scenario"]] = row
@@ -160,7 +204,8 @@ def pages():
         made[IN_SHORT] |= {"bench path": errors(rows), "bench claim": claim(rows)}
     if results_of(BODY[0]).exists():
         rows = rows_of(*BODY)
-        made[IN_SHORT] |= {"bench body": errors(rows), "bench sides": sides(rows)}
+        shown = "\n\n".join(filter(None, (errors(rows), left(BODY[0]))))
+        made[IN_SHORT] |= {"bench body": shown, "bench sides": sides(rows)}
     return made
 
 
