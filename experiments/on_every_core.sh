@@ -3,13 +3,26 @@
 # several times faster than one process on all of them. With an accelerator it is one process.
 set -euo pipefail
 name=$1 && shift
-cores=$(command -v nvidia-smi >/dev/null && echo 1 || nproc)
-if command -v taskset >/dev/null && [ "$cores" -gt 1 ]; then
+cores=()
+if command -v taskset >/dev/null && ! command -v nvidia-smi >/dev/null; then
+  read -ra cores <<<"$(python -c 'import os; print(*sorted(os.sched_getaffinity(0)))')"
+fi
+if [ "${#cores[@]}" -gt 1 ]; then
   case $name in protocol2*) vehicles="kinematic kinematic_stiff dynamic" ;; *) vehicles="kinematic dynamic" ;; esac
   for vehicle in $vehicles; do python -m sfkd_jax.generate "+experiment=$name" vehicle="$vehicle" "$@"; done
-  for ((core = 0; core < cores; core++)); do
-    taskset -c "$core" python -m sfkd_jax.compare "+experiment=$name" "comparison.share=[$core,$cores]" "$@" &
+  shares=()
+  # Jobs in the background ignore Ctrl-C, so that they would go on alone.
+  trap 'kill "${shares[@]}" 2>/dev/null; wait; exit 130' INT TERM
+  for number in "${!cores[@]}"; do
+    taskset -c "${cores[number]}" python -m sfkd_jax.compare "+experiment=$name" "comparison.share=[$number,${#cores[@]}]" "$@" &
+    shares+=($!)
   done
-  wait
+  failed=0
+  for share in "${shares[@]}"; do wait "$share" || failed=1; done
+  trap - INT TERM
+  if [ "$failed" = 1 ]; then
+    echo "a process failed; the same command continues" >&2
+    exit 1
+  fi
 fi
 python -m sfkd_jax.compare "+experiment=$name" "$@"

@@ -107,13 +107,17 @@ def settings(root, **changes):
     )
     options = {name: {"name": name} for name in names} | {
         "vehicle": {"dt": 0.1},
-        "evaluation": {"episodes": 4},
+        "evaluation": {"episodes": 4, "episode_s": 30.0, "seed": 1},
     }
     return (
         options
         | {"env_source": "measured", "root": str(root), "name": "table"}
         | changes
     )
+
+
+LEVELS = {"sfkd": 1.0, "icode": 3.0}
+"""Error of the first episode of two rows [m]."""
 
 
 def rows_file(path):
@@ -127,7 +131,8 @@ def test_a_cell_is_done_only_with_its_own_settings_and_undamaged(tmp_path):
     path.parent.mkdir(parents=True)
     write_json(rows_file(path), {"row": {}, "made_with": grid.settings_hash(options)})
     assert grid.is_done(path, options)
-    assert not grid.is_done(path, settings(tmp_path, evaluation={"episodes": 8}))
+    more = options["evaluation"] | {"episodes": 8}
+    assert not grid.is_done(path, settings(tmp_path, evaluation=more))
     assert not grid.is_done(path, settings(tmp_path, env_source="estimated"))
     rows_file(path).write_bytes(rows_file(path).read_bytes()[:-5])
     assert not grid.is_done(path, options)
@@ -159,6 +164,14 @@ def row(system, level, seed):
     )
 
 
+def store(tmp_path, cell, entry, **made_with):
+    """A stored cell, made with these changes of its settings."""
+    path = grid.cell_path(cell, settings(tmp_path))
+    path.parent.mkdir(parents=True, exist_ok=True)
+    made = grid.settings_hash(settings(tmp_path, **made_with))
+    write_json(rows_file(path), {"row": entry, "made_with": made})
+
+
 @pytest.mark.parametrize("seeds", [1, 2])
 def test_collecting_pools_the_seeds_and_compares_what_is_there(tmp_path, seeds):
     plan = PLAN | {
@@ -173,17 +186,12 @@ def test_collecting_pools_the_seeds_and_compares_what_is_there(tmp_path, seeds):
     wanted = grid.list_cells(plan)
     for cell in wanted:
         if cell.label != "missing":
-            path = grid.cell_path(cell, settings(tmp_path))
-            path.parent.mkdir(parents=True, exist_ok=True)
             level = 1.0 if cell.label == "sfkd" else 3.0
-            write_json(
-                rows_file(path),
-                {"row": row(cell.label, level, cell.seed), "made_with": cell.label},
-            )
+            store(tmp_path, cell, row(cell.label, level, cell.seed))
     result = {
         entry["system"]: entry
         for entry in grid.collect_rows(
-            wanted, settings(tmp_path), lambda cell: cell.label
+            wanted, settings(tmp_path), lambda cell: settings(tmp_path)
         )
     }
     assert set(result) == {"sfkd", "icode"}
@@ -207,19 +215,75 @@ def test_a_row_that_was_made_with_other_settings_enters_no_table_unseen(
         for label in ("sfkd", "icode")
     ]
     for cell in wanted:
-        path = grid.cell_path(cell, settings(tmp_path))
-        path.parent.mkdir(parents=True, exist_ok=True)
-        write_json(
-            rows_file(path), {"row": row(cell.label, 1.0, 0), "made_with": cell.label}
-        )
+        of_another = {} if cell.label == "sfkd" else {"controller": "another"}
+        store(tmp_path, cell, row(cell.label, 1.0, 0), **of_another)
     result = grid.collect_rows(
-        wanted, settings(tmp_path), lambda cell: "sfkd", older=older
+        wanted, settings(tmp_path), lambda cell: settings(tmp_path), older=older
     )
     assert {entry["system"] for entry in result} == systems
     output = capsys.readouterr().err
     assert output.startswith("1 cells were made with other settings, such as")
     assert "icode-seed=0" in output
     assert message in output
+
+
+def collected(tmp_path, entries, missing=(), **changes):
+    """System -> row of a comparison on S1; `changes` are of the settings of icode."""
+
+    def compose(cell):
+        return settings(tmp_path, **(changes if cell.label == "icode" else {}))
+
+    cells = []
+    for label in [*entries, *missing]:
+        cells.append(grid.Cell("kinematic", label, 0, "mppi", "as it is", "s1"))
+        if label in entries:
+            made = changes if label == "icode" else {}
+            store(tmp_path, cells[-1], entries[label], **made)
+    rows = grid.collect_rows(cells, settings(tmp_path), compose)
+    return {entry["system"]: entry for entry in rows}
+
+
+@pytest.mark.parametrize(
+    ("changes", "are_paired"),
+    [
+        ({}, True),
+        ({"model": "another"}, True),
+        ({"scenario": {"name": "s1", "speed": 5.0}}, False),
+        ({"vehicle": {"dt": 0.1, "mass": 1.0}}, False),
+        ({"evaluation": {"episodes": 4, "episode_s": 30.0, "seed": 2}}, False),
+    ],
+)
+def test_rows_that_met_other_roads_are_not_paired(tmp_path, changes, are_paired):
+    entries = {label: row(label, level, 0) for label, level in LEVELS.items()}
+    found = collected(tmp_path, entries, **changes)
+    assert (found["icode"]["difference_to_sfkd"] is not None) == are_paired
+
+
+def test_an_unfinished_comparison_marks_no_more_than_the_finished_one(tmp_path):
+    """Rows that are still to be driven count in Holm's correction."""
+    entries = {label: row(label, level, 0) for label, level in LEVELS.items()}
+    for number, entry in enumerate(entries.values()):
+        entry["rmse_episodes_m"] = [1.0 + number, 1.1 + number, 1.3 + 1.1 * number]
+    alone = collected(tmp_path / "a", entries)["icode"]["difference_to_sfkd"]
+    more = collected(tmp_path / "b", entries, [f"row{k}" for k in range(9)])
+    beside = more["icode"]["difference_to_sfkd"]
+    assert beside["p"] == alone["p"] < 0.01
+    assert alone["p_holm"] == pytest.approx(alone["p"])
+    assert beside["p_holm"] == pytest.approx(10 * alone["p"])
+
+
+def test_an_error_that_is_not_finite_is_shown_and_does_not_hide_other_rows(tmp_path):
+    entries = {label: row(label, level, 0) for label, level in LEVELS.items()}
+    entries["icode"]["rmse_episodes_m"] = [3.0, None]  # as NaN is stored
+    found = collected(tmp_path, entries)
+    assert found["sfkd"]["rmse_episodes_m"] == [1.0, 2.0]
+    assert np.isnan(found["icode"]["difference_to_sfkd"]["mean"])
+    assert "p_holm" not in found["icode"]["difference_to_sfkd"]
+
+
+def test_a_seed_is_not_counted_twice():
+    with pytest.raises(ValueError, match=r"comparison\.seeds=\[0, 0\] repeats"):
+        grid.list_cells(PLAN | {"seeds": [0, 0]})
 
 
 def test_every_row_belongs_to_exactly_one_share():
@@ -239,9 +303,9 @@ def test_every_row_belongs_to_exactly_one_share():
 def test_cells_of_other_code_are_used_and_announced(tmp_path, capsys):
     cells = grid.list_cells(PLAN)[:2]
     for cell, source in zip(cells, (source_hash(), "another"), strict=True):
-        path = grid.cell_path(cell, settings(tmp_path))
-        path.parent.mkdir(parents=True, exist_ok=True)
-        entry = row("icode", 1.0, 0) | {"provenance": {"source": source}}
-        write_json(rows_file(path), {"row": entry, "made_with": "now"})
-    assert len(grid.collect_rows(cells, settings(tmp_path), lambda cell: "now")) == 2
+        store(tmp_path, cell, row("icode", 1.0, 0) | {"provenance": {"source": source}})
+    found = grid.collect_rows(
+        cells, settings(tmp_path), lambda cell: settings(tmp_path)
+    )
+    assert len(found) == 2
     assert "1 cells were made by other code" in capsys.readouterr().err

@@ -26,6 +26,13 @@ def block(marker):
     return re.search(r"```\w+\n(.*?)```", text, re.DOTALL).group(1)
 
 
+STATE_MODEL = """
+from sfkd_jax.models import state_model
+def make(space):
+    return state_model(lambda key: {{}}, lambda p, e: e, lambda e, x, u: {})
+"""
+
+
 def nothing(state, control, env):
     return jnp.zeros_like(state)
 
@@ -88,6 +95,11 @@ def test_options_and_what_is_offered_reach_the_factory(monkeypatch, tmp_path):
         ("def other(space): return 3", {}, "has no attribute 'make'"),
         ("", {"factory": "nowhere_at_all:make"}, "No module named"),
         ("", {"factory": ""}, "name it as package.module:function"),
+        ("def make(space): return {}['a']", {}, "KeyError: 'a'"),
+        ("def make(space): return space.nothing", {}, "AttributeError: .*nothing"),
+        (STATE_MODEL.format("x @ u"), {}, "TypeError: .*contracting"),
+        (STATE_MODEL.format("x[1:]"), {}, r"a state of \(4,\) one of \(3,\)"),
+        (STATE_MODEL.format("x + p['missing']"), {}, "NameError"),
     ],
 )
 def test_a_factory_that_makes_no_model_is_one_line(

@@ -37,23 +37,24 @@ def test_the_settings_of_the_table_are_the_winners_of_the_trials():
     assert yaml.safe_load(tuning.TUNED.read_text())["tuned"] == tuning.winners()
 
 
-def document_of(part, seeds, only=()):
+def document_of(part, seeds, labels=None):
     """Results of a part that lack nothing, driven with these trainings and rows."""
-    comparison = tuning.settings_of(f"+experiment={part}")["comparison"]
-    used = comparison | {"seeds": seeds, "only": list(only)}
+    settings = tuning.settings_of(f"+experiment={part}")
+    settings["comparison"] |= {"seeds": seeds}
     names = ("vehicle", "system", "controller", "scenario")
     cells = Counter(
         (cell.vehicle, cell.label, cell.controller, cell.scenario)
-        for cell in grid.list_cells(used)
+        for cell in grid.list_cells(settings["comparison"])
+        if labels is None or cell.label in labels
     )
     rows = [
         dict(zip(names, cell, strict=True)) | {"seeds": seeds[:count]}
         for cell, count in cells.items()
     ]
-    return {"config": {"comparison": used}, "rows": rows}
+    return {"config": settings, "rows": rows}
 
 
-def test_a_part_without_all_its_cells_is_refused():
+def test_a_row_without_all_its_cells_is_refused():
     part = "protocol2_path"
     whole = document_of(part, [0, 1, 2])
     assert protocol2_page.missing(part, whole) == []
@@ -65,29 +66,46 @@ def test_a_part_without_all_its_cells_is_refused():
 
 def test_a_part_may_stop_after_its_first_trainings_or_rows_and_says_so(monkeypatch):
     part = "protocol2"
-    some = document_of(part, [0], ["oracle", "sfkd"])
+    some = document_of(part, [0], ["oracle", "sfkd", "icode"])
     assert protocol2_page.missing(part, some) == []
     monkeypatch.setattr(protocol2_page, "document_of", lambda _: some)
-    left = protocol2_page.left(part)
-    assert "ICODE-MPPI" in left
-    assert "SFKD − contraction" in left
-    assert "1 of 3" in left
-    monkeypatch.setattr(
-        protocol2_page, "document_of", lambda _: document_of(part, [0, 1, 2])
-    )
-    assert protocol2_page.left(part) == ""
+    said = protocol2_page.with_left("- Bullets.", part)
+    assert "ICODE-MPPI" in said
+    assert "SFKD − contraction" in said
+    assert "1 of 3" in said
+    whole = document_of(part, [0, 1, 2])
+    monkeypatch.setattr(protocol2_page, "document_of", lambda _: whole)
+    assert protocol2_page.with_left("- Bullets.", part) == "- Bullets."
 
 
 @pytest.mark.parametrize("seeds", [[], [1], [0, 2], [0, 1, 2, 3]])
 def test_trainings_cannot_be_picked(seeds):
     """Otherwise a part could be told from the trainings that went well."""
-    part = "protocol2"
+    document = document_of("protocol2", seeds or [0])
+    document["config"]["comparison"]["seeds"] = seeds
     with pytest.raises(SystemExit, match="not the first"):
-        protocol2_page.missing(
-            part,
-            document_of(part, seeds or [0])
-            | {"config": {"comparison": {"seeds": seeds, "only": []}}},
-        )
+        protocol2_page.missing("protocol2", document)
+
+
+@pytest.mark.parametrize(
+    ("group", "name", "value"),
+    [
+        ("evaluation", "seed", 2026),
+        ("evaluation", "observation_noise", []),
+        ("comparison", "older", True),
+    ],
+)
+def test_results_of_another_protocol_are_refused(group, name, value):
+    document = document_of("protocol2", [0])
+    document["config"][group][name] = value
+    with pytest.raises(SystemExit, match="not driven as"):
+        protocol2_page.missing("protocol2", document)
+
+
+def test_a_part_without_the_oracle_is_refused():
+    document = document_of("protocol2", [0], ["sfkd", "icode"])
+    with pytest.raises(SystemExit, match="no row of SFKD or of the oracle"):
+        protocol2_page.missing("protocol2", document)
 
 
 def test_fewer_effective_samples_do_not_help_along_a_path():

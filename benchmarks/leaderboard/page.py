@@ -3,16 +3,20 @@
 python -m benchmarks.leaderboard.page
 """
 
-import json
-
 from benchmarks.harness import ROOT
 from benchmarks.leaderboard.entry import HERE, check
 from benchmarks.markdown import filled, table
+from sfkd_jax import artefacts
 
 PAGE = ROOT / "docs" / "results" / "leaderboard.md"
 VEHICLES = ("kinematic", "kinematic_stiff", "dynamic")
 SCENARIOS = ("s1", "s2", "s3")
-SAMPLING = {"feedback": "", "law": " (path)", "plain": " (plain)", None: " (QP)"}
+BLOCKS = {
+    "in path coordinates, around one law": ("law",),
+    "in the body frame, around feedback": ("feedback", None),
+    "in the body frame, plain sampling": ("plain",),
+}
+"""What is comparable -> its sampling; a quadratic program does not sample."""
 NONE = "No entries yet."
 
 
@@ -20,11 +24,11 @@ def entries(folder=HERE / "entries"):
     """All entries, by file name.
 
     Raises:
-        ValueError: a file that does not have the schema, named.
+        ValueError: a file that is damaged or no entry, named.
     """
     found = []
     for file in sorted(folder.glob("*.json")):
-        entry = json.loads(file.read_text("utf-8"))
+        entry = artefacts.read_json(file)
         try:
             check(entry)
         except ValueError as reason:
@@ -34,30 +38,32 @@ def entries(folder=HERE / "entries"):
 
 
 def tables(found):
-    """A table a plant, by the error on S3; entries without S3 come last."""
-    if not found:
-        return NONE
-    return "\n\n".join(
-        f"**{vehicle}**\n\n{table}"
+    """A table a block and plant, by the error on S3."""
+    made = [
+        f"**{vehicle}, {words}**\n\n{table}"
+        for words, sampling in BLOCKS.items()
         for vehicle in VEHICLES
-        if (table := table_of(found, vehicle))
-    )
+        if (table := table_of(found, vehicle, sampling))
+    ]
+    return "\n\n".join(made) or NONE
 
 
-def table_of(found, vehicle):
-    """The table of a plant, or "" if nobody has driven it."""
+def table_of(found, vehicle, sampling):
+    """The table of a plant and a block, or "" if nobody has driven it."""
     lines = []
     for entry in found:
-        about = [one for one in entry["results"] if one["vehicle"] == vehicle]
-        for sampling in dict.fromkeys(one["sampling"] for one in about):
-            driven = {
-                one["scenario"]: one for one in about if one["sampling"] == sampling
-            }
-            lines.append((rank(driven), line_of(entry, sampling, driven)))
+        driven = {
+            one["scenario"]: one
+            for one in entry["results"]
+            if one["vehicle"] == vehicle and one["sampling"] in sampling
+        }
+        if driven:
+            lines.append((rank(driven), line_of(entry, driven)))
     if not lines:
         return ""
+    lines.sort(key=lambda line: line[0])
     head = ["entry", "by", "S1", "S2", "S3 [mm]", "worst on S3", "left", "trainings"]
-    return table([*head, "parameters", "source"], [line for _, line in sorted(lines)])
+    return table([*head, "parameters", "source"], [line for _, line in lines])
 
 
 def rank(driven):
@@ -65,18 +71,19 @@ def rank(driven):
     return driven["s3"]["rmse_mm"] if "s3" in driven else float("inf")
 
 
-def line_of(entry, sampling, driven):
+def line_of(entry, driven):
     """A row of the table."""
-    name = entry["label"] + SAMPLING[sampling]
-    last = driven.get("s3")
+    last, results = driven.get("s3"), driven.values()
+    learned = [one["parameters"] for one in results if one["parameters"]]
+    name = entry["label"]
     return [
         f"[{name}]({entry['code']})" if entry["code"] else name,
         entry["by"],
         *(error_of(driven.get(scenario)) for scenario in SCENARIOS),
         f"{last['worst_mm']:.1f}" if last else "–",
-        sum(one["departures"] for one in driven.values()),
-        min(one["trainings"] for one in driven.values()),
-        entry["parameters"] or "–",
+        sum(one["departures"] for one in results),
+        min(one["trainings"] for one in results) if learned else "–",
+        f"{max(learned):,}" if learned else "–",
         f"`{entry['provenance']['source'][:12]}`",
     ]
 
@@ -96,7 +103,10 @@ def page(text):
 
 def main():
     """Write the page."""
-    PAGE.write_text(page(PAGE.read_text("utf-8")), encoding="utf-8")
+    try:
+        PAGE.write_text(page(PAGE.read_text("utf-8")), encoding="utf-8")
+    except (ValueError, artefacts.ArtefactError) as reason:
+        raise SystemExit(str(reason)) from None
 
 
 if __name__ == "__main__":

@@ -3,8 +3,8 @@
 python -m benchmarks.quality.protocol2_page
 From the results in experiments/protocol2 and experiments/protocol2_path. A part
 that is not there yet is left alone; one whose cells are not all there is refused. A part
-may be collected for the first trainings or for some of its rows only: its table then
-says what is left.
+may be driven for the first trainings or for some of its rows only: what is said of it
+then ends with what is left.
 """
 
 import json
@@ -45,25 +45,33 @@ def document_of(part):
 
 
 def protocol_of(part):
-    """Settings of the comparison that the protocol asks for."""
-    return settings_of(f"+experiment={part}")["comparison"]
+    """Settings that the protocol asks for."""
+    return settings_of(f"+experiment={part}")
 
 
 def collected(part, results):
     """The protocol's comparison, cut to the rows and the trainings of the results.
 
     Raises:
-        SystemExit: other trainings than the protocol's first ones.
+        SystemExit: other episodes, other trainings than the protocol's first ones, cells
+            of other settings, or no row to compare with.
     """
-    asked, used = protocol_of(part), results["config"]["comparison"]
-    seeds = used["seeds"]
-    if not seeds or seeds != asked["seeds"][: len(seeds)]:
-        raise SystemExit(f"{part}: seeds {seeds} are not the first of {asked['seeds']}")
-    return asked | {"seeds": seeds, "only": used["only"]}
+    asked, used = protocol_of(part), results["config"]
+    if used["evaluation"] != asked["evaluation"] or used["comparison"]["older"]:
+        raise SystemExit(f"{part}: not driven as sfkd-bench-2 asks")
+    comparison, seeds = asked["comparison"], used["comparison"]["seeds"]
+    if not seeds or seeds != comparison["seeds"][: len(seeds)]:
+        first = comparison["seeds"]
+        raise SystemExit(f"{part}: seeds {seeds} are not the first of {first}")
+    driven = {row["system"] for row in results["rows"]}
+    labels = [label for label in comparison["rows"] if label in driven]
+    if not {"oracle", "sfkd"} <= set(map(family, labels)):
+        raise SystemExit(f"{part}: there is no row of SFKD or of the oracle")
+    return comparison | {"seeds": seeds, "only": labels}
 
 
 def missing(part, results):
-    """Cells of a part that no row covers, and those that it should not have."""
+    """Cells of rows that are not complete, and those that they should not have."""
     asked = Counter(
         (cell.vehicle, cell.label, cell.controller, cell.scenario)
         for cell in grid.list_cells(collected(part, results))
@@ -76,19 +84,14 @@ def missing(part, results):
 
 
 def left(part):
-    """Rows and trainings of the protocol that are not driven yet, in a sentence."""
-    asked = protocol_of(part)
-    now = collected(part, document_of(part))
-    rows = [
-        label(row) for row in asked["rows"] if now["only"] and row not in now["only"]
-    ]
-    sentences = []
-    if rows:
-        sentences.append(f"Not driven yet: {', '.join(rows)}.")
+    """Rows and trainings of the protocol that are not driven yet, in sentences."""
+    asked, now = protocol_of(part)["comparison"], collected(part, document_of(part))
+    rows = [label(row) for row in asked["rows"] if row not in now["only"]]
+    sentences = [f"Not driven yet: {', '.join(rows)}."] if rows else []
     if len(now["seeds"]) < len(asked["seeds"]):
         sentences.append(
-            f"Trainings driven so far: {len(now['seeds'])} of {len(asked['seeds'])}; "
-            "intervals and marks are about other episodes, not about other trainings."
+            f"Trainings driven so far: {len(now['seeds'])} of {len(asked['seeds'])}. "
+            "Intervals and marks are then about other episodes, not other trainings."
         )
     return " ".join(sentences)
 
@@ -195,17 +198,24 @@ def sides(rows):
     return f"- Better than SFKD [mm]: {better}.\n- Worse: {worse}."
 
 
+def with_left(bullets, part):
+    """Bullets, and one more about what is left of a part."""
+    rest = left(part)
+    return f"{bullets}\n- {rest}" if rest else bullets
+
+
 def pages():
     """Page -> marker -> its table or sentences, of the parts that are there."""
     made = {README: {}, IN_SHORT: {}}
     if results_of(PATH[0]).exists():
         rows = rows_of(*PATH)
-        made[README] |= {"bench": claim(rows)}
-        made[IN_SHORT] |= {"bench path": errors(rows), "bench claim": claim(rows)}
+        claims = with_left(claim(rows), PATH[0])
+        made[README] |= {"bench": claims}
+        made[IN_SHORT] |= {"bench path": errors(rows), "bench claim": claims}
     if results_of(BODY[0]).exists():
         rows = rows_of(*BODY)
-        shown = "\n\n".join(filter(None, (errors(rows), left(BODY[0]))))
-        made[IN_SHORT] |= {"bench body": shown, "bench sides": sides(rows)}
+        ends = with_left(sides(rows), BODY[0])
+        made[IN_SHORT] |= {"bench body": errors(rows), "bench sides": ends}
     return made
 
 

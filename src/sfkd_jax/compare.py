@@ -9,7 +9,12 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
+from hydra.errors import HydraException
+from jax.errors import JaxRuntimeError
+from omegaconf.errors import OmegaConfBaseException
+
 from sfkd_jax import artefacts
+from sfkd_jax.cli import messages
 from sfkd_jax.cli.config import command_line, compose
 from sfkd_jax.cli.entry import hydra_command
 from sfkd_jax.paper import write_results_page
@@ -64,9 +69,15 @@ def _named_if_it_fails(
     """Print and store why a row failed, and go on with the others."""
     try:
         yield
-    except (TrainingStopped, ValueError, artefacts.ArtefactError) as reason:
-        failed[_name(group)] = str(reason)
-        artefacts.print_message(f"failed: {reason}")
+    except (
+        TrainingStopped,
+        ValueError,
+        artefacts.ArtefactError,
+        JaxRuntimeError,  # such as memory that does not suffice
+    ) as reason:
+        line = next(iter(str(reason).splitlines()), type(reason).__name__)
+        failed[_name(group)] = line
+        artefacts.print_message(f"failed: {line}")
 
 
 def _name(group: list[grid.Cell]) -> str:
@@ -91,7 +102,7 @@ def _collect(
         rows = grid.collect_rows(
             cells,
             settings,
-            lambda cell: grid.settings_hash(compose_cell(cell)),
+            compose_cell,
             older=settings["comparison"]["older"],
         )
     if not rows:
@@ -116,8 +127,18 @@ def _collect(
 
 
 def _compose(cell: grid.Cell, comparison: dict[str, Any]) -> dict[str, Any]:
-    """The settings of a cell, under the name of the comparison."""
-    settings = compose(*grid.overrides(cell, comparison))
+    """The settings of a cell, under the name of the comparison.
+
+    Raises:
+        ValueError: naming the row, if it has an unknown setting or option.
+    """
+    overrides = grid.overrides(cell, comparison)
+    try:
+        settings = compose(*overrides)
+    except (HydraException, OmegaConfBaseException) as reason:
+        raise ValueError(
+            f"row {cell.label}: {messages.one_line(reason, overrides)}"
+        ) from None
     is_varied = comparison["variations"][cell.variation]
     settings["evaluation"]["variation"] = cell.variation if is_varied else None
     return settings

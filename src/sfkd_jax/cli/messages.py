@@ -5,9 +5,11 @@ from __future__ import annotations
 import difflib
 import re
 from collections.abc import Collection, Iterator, Sequence
+from contextlib import nullcontext
 from typing import Any
 
 import hydra
+from hydra.core.global_hydra import GlobalHydra
 from hydra.errors import (
     HydraException,
     MissingConfigException,
@@ -95,7 +97,12 @@ def _names_under(overrides: Sequence[str]) -> list[str]:
     """Return the names of all settings under the options that the overrides choose."""
     groups = (*GROUPS, *(f"+{group}" for group in (*GROUPS, EXPERIMENT)))
     chosen = [word for word in overrides if word.partition("=")[0] in groups]
-    with hydra.initialize_config_dir(conf_path(), version_base="1.3"):
+    running = GlobalHydra.instance().is_initialized()  # a row of a comparison
+    with (
+        nullcontext()
+        if running
+        else hydra.initialize_config_dir(conf_path(), version_base="1.3")
+    ):
         for attempt in (chosen, []):
             try:
                 config = hydra.compose("config", attempt)

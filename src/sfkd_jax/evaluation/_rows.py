@@ -106,12 +106,16 @@ def disturbed(
     }
 
 
-def compare(rows: list[dict[str, Any]]) -> list[dict[str, Any]]:
+def compare(rows: list[dict[str, Any]], *, not_driven: int = 0) -> list[dict[str, Any]]:
     """Add comparisons of systems that drove the same episodes with the same sampling.
 
     A row without sampling (a quadratic program) is compared with rows that sample
     around feedback. Of several rows of a system, the one with the same controller and
     planner is taken. `p_holm` of the differences to SFKD is adjusted for all rows.
+
+    Args:
+        rows: that were driven; `drives`, if they have it, tells which episodes.
+        not_driven: number of rows that belong to the same comparison and are missing.
     """
     for entry in rows:
         same = [other for other in rows if _episodes(other) == _episodes(entry)]
@@ -122,7 +126,8 @@ def compare(rows: list[dict[str, Any]]) -> list[dict[str, Any]]:
                 continue
             entry[name] = measure(_by_seed(entry), _by_seed(other))
     family = [entry["difference_to_sfkd"] for entry in rows if _has_p(entry)]
-    for record, p in zip(family, holm([one["p"] for one in family]), strict=True):
+    adjusted = holm([one["p"] for one in family], not_made=not_driven)
+    for record, p in zip(family, adjusted, strict=True):
         record["p_holm"] = p
     return rows
 
@@ -138,6 +143,7 @@ def _episodes(entry: dict[str, Any]) -> tuple[Any, ...]:
     return (
         *(entry[name] for name in names),
         entry["sampling"] or "feedback",
+        entry.get("drives"),
         _by_seed(entry).shape[1],
     )
 
@@ -149,7 +155,9 @@ def _search(entry: dict[str, Any]) -> tuple[Any, ...]:
 
 def _by_seed(entry: dict[str, Any]) -> np.ndarray:
     """RMSE, one line per training seed, one column per episode."""
-    return np.asarray(entry["rmse_episodes_m"]).reshape(len(entry["seeds"]), -1)
+    # An error that is not finite is stored as null.
+    errors = np.asarray(entry["rmse_episodes_m"], dtype=float)
+    return errors.reshape(len(entry["seeds"]), -1)
 
 
 def _ratio(values: np.ndarray, reference: np.ndarray) -> float:
@@ -189,6 +197,8 @@ def _mean(values: list[Any]) -> Any:
     A leaf that is not a number stays where all agree and is None otherwise.
     """
     first = values[0]
+    if any(value is None for value in values):
+        return None
     if isinstance(first, dict):
         return {
             # Older rows lack newer metrics.

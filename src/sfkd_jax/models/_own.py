@@ -3,10 +3,15 @@
 from __future__ import annotations
 
 import inspect
+from collections.abc import Iterator
+from contextlib import contextmanager
 from typing import Any
 
+import jax
+import jax.numpy as jnp
+
 from sfkd_jax.core.named import imported
-from sfkd_jax.types import Environment, Fiber, Model, Params, Space, Step
+from sfkd_jax.types import Environment, Fiber, Key, Model, Params, Space, State, Step
 
 SETTING = "model.factory"
 
@@ -35,22 +40,23 @@ def own(
             centre of E instead of e.
 
     Raises:
-        ValueError: there is no such function, it does not take the options, or returns
-            something else than a model.
+        ValueError: there is no such function, it fails, does not take the options, or
+            returns something else than a model; or a function of the model fails or
+            returns a state of another shape.
     """
     function = imported(factory, SETTING)
-    try:
+    with _one_line(factory):
         takes = inspect.signature(function).parameters
         offered = {"dt": dt, "nominal": nominal, "environment": environment}
         given = {name: value for name, value in offered.items() if name in takes}
         model = function(space, **given, **(options or {}))
-    except TypeError as reason:
-        raise ValueError(f"{SETTING}={factory}: {reason}") from None
     if not isinstance(model, Model):
         kind = type(model).__name__
         raise ValueError(
             f"{SETTING}={factory} returned {kind}, not sfkd_jax.types.Model"
         )
+    with _one_line(factory):
+        _check_shapes(model, space)
     if environment or "environment" in takes:
         return model
 
@@ -59,3 +65,29 @@ def own(
         return model.fiber(params, space.env_mean)
 
     return model._replace(fiber=fiber)
+
+
+@contextmanager
+def _one_line(factory: str) -> Iterator[None]:
+    """Turn whatever somebody else's code raises into one line about the setting."""
+    try:
+        yield
+    except Exception as reason:
+        first = next(iter(str(reason).splitlines()), "")
+        kind = type(reason).__name__
+        raise ValueError(f"{SETTING}={factory}: {kind}: {first}") from reason
+
+
+def _check_shapes(model: Model, space: Space) -> None:
+    """Trace one step of a model, so that a wrong shape shows before it is trained."""
+    sizes = (3 + space.body_mean.size, space.control_mean.size, space.env_mean.size)
+    state, control, env = map(jnp.zeros, sizes)
+
+    def one_step(key: Key) -> State:
+        fiber = model.fiber(model.init(key), env)
+        latent = model.step(fiber, model.encode(fiber, state), control)
+        return model.decode(fiber, latent)
+
+    after = jax.eval_shape(one_step, jax.random.key(0))
+    if after.shape != state.shape:
+        raise ValueError(f"a step makes a state of {state.shape} one of {after.shape}")

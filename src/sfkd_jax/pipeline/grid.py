@@ -45,7 +45,8 @@ def list_cells(comparison: dict[str, Any]) -> list[Cell]:
     was interrupted still compares all rows.
 
     Raises:
-        ValueError: `only`, `untrained` or `trained_once` names an unknown row.
+        ValueError: `only`, `untrained` or `trained_once` names an unknown row, or a
+            seed is repeated.
     """
     rows, only = comparison["rows"], comparison["only"]
     for name in ("only", "untrained", "trained_once"):
@@ -54,13 +55,16 @@ def list_cells(comparison: dict[str, Any]) -> list[Cell]:
                 f"unknown comparison.{name} {', '.join(sorted(unknown))}; "
                 f"choose of {', '.join(rows) or 'none'}"
             )
+    seeds = comparison["seeds"]
+    if len(set(seeds)) < len(seeds):
+        raise ValueError(f"comparison.seeds={seeds} repeats a seed")
     labels = [label for label in rows if label in (only or rows)]
     first_seed_only = {*comparison["untrained"], *comparison["trained_once"]}
     cells = []
     for seed, vehicle, label in itertools.product(
-        comparison["seeds"], comparison["vehicles"], labels
+        seeds, comparison["vehicles"], labels
     ):
-        if label in first_seed_only and seed != comparison["seeds"][0]:
+        if label in first_seed_only and seed != seeds[0]:
             continue
         for common, scenarios in comparison["controllers"].items():
             own = comparison["own_controllers"].get(label, {}).get(common, common)
@@ -176,6 +180,18 @@ def settings_hash(settings: dict[str, Any]) -> str:
     return artefacts.sha256(hashed)
 
 
+def drives_hash(settings: dict[str, Any]) -> str:
+    """Hash what the roads and the plant of a cell depend on.
+
+    Rows with another hash met other episodes, and are not paired with it.
+    """
+    protocol = settings["evaluation"]
+    drives = {name: protocol[name] for name in ("seed", "episodes", "episode_s")}
+    return artefacts.sha256(
+        {name: settings[name] for name in ("vehicle", "scenario")} | drives
+    )
+
+
 def is_done(path: Path, settings: dict[str, Any]) -> bool:
     """Whether an undamaged cell with exactly these settings is stored."""
     try:
@@ -220,7 +236,7 @@ def write_cell(
 def collect_rows(
     cells: list[Cell],
     settings: dict[str, Any],
-    expected: Callable[[Cell], str],
+    compose_cell: Callable[[Cell], dict[str, Any]],
     *,
     older: bool = False,
 ) -> list[dict[str, Any]]:
@@ -231,7 +247,7 @@ def collect_rows(
     Args:
         cells: of the comparison.
         settings: of the comparison.
-        expected: cell -> the `settings_hash` of its settings.
+        compose_cell: cell -> its settings.
         older: also use cells that were made with other settings.
     """
     pooled: dict[Cell, list[dict[str, Any]]] = {}
@@ -241,11 +257,12 @@ def collect_rows(
         if not path.exists():
             continue
         document = artefacts.read_json(path, keys=("row", "made_with"))
-        is_current = document["made_with"] == expected(cell)
+        cell_settings = compose_cell(cell)
+        is_current = document["made_with"] == settings_hash(cell_settings)
         if not is_current:
             others.append(path)
         if older or is_current:
-            row = document["row"]
+            row = document["row"] | {"drives": drives_hash(cell_settings)}
             pooled.setdefault(cell._replace(seed=0), []).append(row)
             if row.get("provenance", {}).get("source") != artefacts.source_hash():
                 by_other_code.append(path)
@@ -260,7 +277,12 @@ def collect_rows(
             f"{len(by_other_code)} cells were made by other code, "
             f"such as {by_other_code[0]}: used, and marked on the page"
         )
-    return evaluation.compare([evaluation.pool(rows) for rows in pooled.values()])
+    not_driven = len({cell._replace(seed=0) for cell in cells}) - len(pooled)
+    rows = []
+    for cell, trainings in pooled.items():
+        with artefacts.as_artefact_error(cell_path(cell, settings).parent / cell.label):
+            rows.append(evaluation.pool(trainings))
+    return evaluation.compare(rows, not_driven=not_driven)
 
 
 def _row_file(path: Path) -> Path:
