@@ -2,6 +2,7 @@
 data sets come back with the scenario of every segment.
 """
 
+import json
 from pathlib import Path
 
 import jax.numpy as jnp
@@ -31,6 +32,20 @@ def test_other_unusual_names_are_claimed(tmp_path):
     settings = SETTINGS | {"root": str(tmp_path), "name": "a=0.1,b=c d"}
     store.claim(settings)
     assert (Path(store.run_directory(settings)) / "settings.json").exists()
+
+
+def test_a_run_that_kept_nothing_does_not_block_its_correction(tmp_path):
+    """A first attempt with a mistake records its settings before it fails."""
+    first = SETTINGS | {"root": str(tmp_path)}
+    second = first | {"training": {"steps": 25}}
+    store.claim(first)
+    store.claim(second)
+    recorded = Path(store.run_directory(second)) / "settings.json"
+    assert json.loads(recorded.read_text())["training"] == {"steps": 25}
+    (recorded.parent / "checkpoints" / "25").mkdir(parents=True)
+    store.claim(second)
+    with pytest.raises(ArtefactError, match="was made with other settings"):
+        store.claim(first)
 
 
 def generated(tmp_path):

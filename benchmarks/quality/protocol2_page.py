@@ -28,6 +28,11 @@ VEHICLES = {
     "dynamic": "dynamic",
 }
 NOT_TRAINED = ("oracle", "nominal", "law")
+BESIDE = {
+    "law": "The law alone, which knows the true plant and learns nothing,",
+    "sfkd_no_contraction": "SFKD without its contraction bound",
+}
+"""Rows about which a question is asked: what planning brings, and what the bound does."""
 README = ROOT / "README.md"
 IN_SHORT = ROOT / "docs" / "results" / "index.md"
 PATH, BODY = ("protocol2_path", "law"), ("protocol2", "feedback")
@@ -151,51 +156,92 @@ def error_of(row):
 
 
 def claim(rows):
-    """SFKD beside the oracle where it is furthest behind on every plant, then `sides`."""
+    """What a part found, in a few bullets.
+
+    SFKD beside the oracle where it is furthest behind on every plant, the extremes, the
+    rows of `BESIDE`, then `sides`.
+    """
     lines = []
     for vehicle, words in VEHICLES.items():
         driven = rows["oracle"][vehicle]
         scenario = min(
             driven, key=lambda one: driven[one]["difference_to_sfkd"]["mean"]
         )
-        gap = driven[scenario]["difference_to_sfkd"]
-        low, high = (-1e3 * bound for bound in reversed(gap["ci95"]))
+        gap = size_of(driven[scenario]["difference_to_sfkd"])
         lines.append(
-            f"{number(-1e3 * gap['mean'], 1)} mm ({number(low, 1)} to {number(high, 1)}) "
-            f"behind its {millimetres(driven[scenario]['rmse_m'])} mm on the {words} plant "
-            f"({scenario.upper()})"
+            f"{gap} mm behind its {millimetres(driven[scenario]['rmse_m'])} mm "
+            f"on the {words} plant ({scenario.upper()})"
         )
-    own, its = (furthest(rows[system]) for system in ("sfkd", "oracle"))
+    (worst, its_worst), (peak, its_peak) = (
+        [millimetres(extreme(rows[system], of), 0) for system in ("sfkd", "oracle")]
+        for of in (worst_episode, lambda row: row["max_deviation_m"])
+    )
+    bullets = [
+        f"Where it is furthest behind the oracle, SFKD is {'; '.join(lines)}.",
+        f"Worst RMSE of an episode: {worst} mm, the oracle's {its_worst} mm; "
+        f"largest deviation at any time: {peak} mm, the oracle's {its_peak} mm.",
+    ]
+    bullets += [
+        by_interval(who, rows[row]) for row, who in BESIDE.items() if row in rows
+    ]
+    return "\n".join(f"- {bullet}" for bullet in bullets) + f"\n{sides(rows)}"
+
+
+def extreme(driven, of):
+    """The largest value of a measure of a row on any plant and scenario."""
+    return max(of(row) for one in driven.values() for row in one.values())
+
+
+def size_of(difference):
+    """The size of a difference with its interval [mm]."""
+    sign = 1e3 if difference["mean"] > 0 else -1e3
+    low, high = sorted(sign * bound for bound in difference["ci95"])
+    return f"{number(sign * difference['mean'], 1)} ({number(low, 1)} to {number(high, 1)})"
+
+
+def places_of(driven, chosen):
+    """Plants and scenarios where a row's difference to SFKD is chosen, with its size."""
+    return [
+        f"{VEHICLES[vehicle]} {scenario.upper()} {size_of(row['difference_to_sfkd'])}"
+        for vehicle, one in driven.items()
+        for scenario, row in one.items()
+        if chosen(row)
+    ]
+
+
+def by_interval(who, driven):
+    """Where a row is better than SFKD and where worse, by its interval alone."""
+    better, worse = (
+        ", ".join(places_of(driven, lambda row, side=side: apart(row) == side))
+        for side in (-1, 1)
+    )
     return (
-        f"- Where it is furthest behind the oracle, SFKD is {'; '.join(lines)}.\n"
-        f"- Worst episode of all: {own} mm, the oracle's {its} mm.\n{sides(rows)}"
+        f"{who} is better than SFKD on [mm]: {better or 'none'}; "
+        f"worse on: {worse or 'none'}; elsewhere the interval holds zero."
     )
 
 
-def furthest(driven):
-    """The worst episode on any plant and scenario [mm]."""
-    found = (worst_episode(row) for one in driven.values() for row in one.values())
-    return millimetres(max(found), 0)
+def apart(row):
+    """1 if the interval of a row's difference to SFKD is above zero, −1 if below."""
+    low, high = row["difference_to_sfkd"]["ci95"]
+    return int(low > 0) - int(high < 0)
 
 
 def sides(rows):
     """The rows that are better than SFKD, and those that are worse, and where."""
     found = {-1: [], 1: []}
     for system, driven in rows.items():
-        if system in ("oracle", "sfkd"):
+        if system in ("oracle", "sfkd", *BESIDE):
             continue
         for side, words in found.items():
-            places = [
-                f"{VEHICLES[vehicle]} {scenario.upper()}: "
-                f"{number(abs(1e3 * row['difference_to_sfkd']['mean']), 1)}"
-                for vehicle, one in driven.items()
-                for scenario, row in one.items()
-                if verdict(row) == side
-            ]
-            if places:
-                words.append(f"{label(system)} ({'; '.join(places)})")
-    better, worse = (", ".join(found[side]) or "none" for side in (-1, 1))
-    return f"- Better than SFKD [mm]: {better}.\n- Worse: {worse}."
+            chosen = places_of(driven, lambda row, side=side: verdict(row) == side)
+            if chosen:
+                words.append(f"{label(system)} on {', '.join(chosen)}")
+    better, worse = ("; ".join(found[side]) or "none" for side in (-1, 1))
+    return (
+        f"- Other models that are better, after Holm's correction [mm]: {better}.\n"
+        f"- Other models that are worse: {worse}."
+    )
 
 
 def with_left(bullets, part):

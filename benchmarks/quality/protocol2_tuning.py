@@ -22,6 +22,7 @@ from scipy.stats import qmc
 
 from sfkd_jax import artefacts, policy, train
 from sfkd_jax.cli.config import conf_path, plain_settings, register
+from sfkd_jax.training import TrainingStopped
 
 TRIALS = 8
 STEPS = 1000
@@ -127,9 +128,9 @@ def composed(root, name, vehicle, row, overrides):
 def tune(root, vehicle, label, row):
     """Run the trials of a row that are missing, and write all of them."""
     out = HERE / "protocol2_trials" / vehicle / f"{label}.json"
-    trials = json.loads(out.read_text())["trials"] if out.exists() else []
-    space = space_of(composed(root, "any", vehicle, row, []))
-    for number, overrides in list(enumerate(trials_of(space)))[len(trials) :]:
+    planned = trials_of(space_of(composed(root, "any", vehicle, row, [])))
+    trials = stored(out, row, planned)
+    for number, overrides in list(enumerate(planned))[len(trials) :]:
         name = f"tune/{vehicle}/{label}/{number}"
         settings = composed(root, name, vehicle, row, overrides)
         trial = {"overrides": overrides, "score": None}
@@ -138,14 +139,33 @@ def tune(root, vehicle, label, row):
             weights = policy.restore(Path(document["run"])).params
             trial["score"] = document["objective"]
             trial["parameters"] = sum(leaf.size for leaf in jax.tree.leaves(weights))
-        except (ValueError, RuntimeError) as reason:
+        except (ValueError, TrainingStopped) as reason:
             trial["failed"] = str(reason)
         trials.append(trial)
         out.parent.mkdir(parents=True, exist_ok=True)
-        artefacts.write_json(
-            out, {"row": row, "seed": SEED, "steps": STEPS, "trials": trials}
-        )
+        artefacts.write_json(out, about(row) | {"trials": trials})
         print(f"{vehicle} {label} {trial}", file=sys.stderr, flush=True)
+
+
+def about(row):
+    """What all trials of a row have in common."""
+    return {"row": row, "seed": SEED, "steps": STEPS}
+
+
+def stored(file, row, planned):
+    """The trials of a row that were made.
+
+    Raises:
+        SystemExit: they are of another row, budget or search.
+    """
+    if not file.exists():
+        return []
+    document = artefacts.read_json(file, keys=("trials",))
+    trials = document.pop("trials")
+    overrides = [trial["overrides"] for trial in trials]
+    if document != about(row) or overrides != planned[: len(trials)]:
+        raise SystemExit(f"{file}: trials of another row, budget or search")
+    return trials
 
 
 def rows_of(experiment, data=""):

@@ -45,6 +45,7 @@ def certify_policy(settings: dict[str, Any]) -> dict[str, Any]:
     document |= {
         "weights_sha256": trained.weights_sha256,
         "policy_sha256": trained.sha256,
+        "certification": _options(settings),
         "versions": versions,
     }
     document["seconds"] = time.perf_counter() - began
@@ -111,12 +112,33 @@ def _certify_tubes(
 
 
 def ensure_certificate(settings: dict[str, Any]) -> None:
-    """Train and certify the policy of the run, unless both exist."""
+    """Train and certify the policy of the run, unless both exist.
+
+    A certificate of other settings of the certification is made again.
+    """
     run_dir = store.run_directory(settings)
-    if artefacts.exists(run_dir / "policy.npz") and certificate_path(run_dir).exists():
+    if artefacts.exists(run_dir / "policy.npz") and _is_certified(settings):
         stages.ensure_policy(settings)
         return
     with artefacts.locked(run_dir, wait=True):  # another process may be training it
         stages.ensure_policy(settings)
-        if not certificate_path(run_dir).exists():
+        if not _is_certified(settings):
             certify_policy(settings)
+
+
+def _options(settings: dict[str, Any]) -> dict[str, Any]:
+    """The settings that a certificate is made with."""
+    certification = settings["certification"]
+    return {name: certification[name] for name in certification if name != "renew"}
+
+
+def _is_certified(settings: dict[str, Any]) -> bool:
+    """Whether there is a certificate or a refusal with these settings.
+
+    Older certificates do not record theirs, and count.
+    """
+    path = certificate_path(store.run_directory(settings))
+    if not path.exists():
+        return False
+    recorded = artefacts.read_json(path).get("certification")
+    return recorded is None or not artefacts.differences(recorded, _options(settings))

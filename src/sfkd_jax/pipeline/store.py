@@ -165,6 +165,8 @@ def is_along_path(settings: dict[str, Any]) -> bool:
 def claim(settings: dict[str, Any]) -> None:
     """Record the settings of a run in its directory, or check the recorded ones.
 
+    Those of a run that failed before it kept anything are replaced.
+
     Raises:
         ArtefactError: the run was made with other settings; names the differences.
         ValueError: a path from which orbax cannot read.
@@ -178,14 +180,22 @@ def claim(settings: dict[str, Any]) -> None:
         )
     if path.exists():
         changed = artefacts.differences(artefacts.read_json(path), identity(settings))
-        if changed:
+        if not changed:
+            return
+        if _has_weights(path.parent):
             raise artefacts.ArtefactError(
                 f"{path.parent} was made with other settings "
                 f"({'; '.join(changed[:3])}); pass name=… for another run"
             )
-        return
     path.parent.mkdir(parents=True, exist_ok=True)
     artefacts.write_json(path, identity(settings))
+
+
+def _has_weights(run_dir: Path) -> bool:
+    """Whether a run has trained weights or a checkpoint."""
+    checkpoints = run_dir / "checkpoints"
+    kept = checkpoints.is_dir() and any(checkpoints.iterdir())
+    return kept or artefacts.exists(run_dir / "policy.npz")
 
 
 def boxes(dataset: Dataset) -> dict[str, Any]:
