@@ -20,7 +20,7 @@ from sfkd_jax.reporting.style import family, label, rank
 
 LEVEL = 0.05
 """A difference counts if its p-value with Holm's correction is smaller."""
-SHOWN = ("s2", "s3")
+SHOWN = ("s1", "s2", "s3")
 """Scenarios of the tables."""
 VEHICLES = {
     "kinematic": "kinematic",

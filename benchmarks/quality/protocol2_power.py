@@ -22,8 +22,8 @@ MEASURED = ROOT / "experiments" / "seeds" / "results.json"
 SIZES = {"1 x 6": (1, 6), "3 x 16": (3, 16), "10 x 200": (10, 200)}
 """Trainings and episodes of protocol 1, of this one, and with an accelerator."""
 MARKED = (3, 16)
-PARTS = ("protocol2_path", "protocol2")
-"""In path coordinates, and in the body frame."""
+PART = "protocol2"
+"""In the body frame, as the deviations; along a path they are far smaller."""
 POWER = 0.8
 REFERENCE = "sfkd"
 
@@ -36,10 +36,15 @@ def deviations(difference):
     return np.sqrt(np.maximum(parts, 0.0))
 
 
-def detectable(spread, size):
-    """The difference that is found with probability `POWER` at level 5 %.
+def detectable(spread, size, level=0.05):
+    """The difference that is found with probability `POWER`.
 
     With one training its own deviation counts as part of the difference.
+
+    Args:
+        spread: of `deviations`.
+        size: trainings and episodes.
+        level: of the test; 5 % over the size of a family at Holm's first step.
     """
     trainings, episodes = size
     by_training, by_episode, rest = np.square(spread) / (
@@ -53,21 +58,10 @@ def detectable(spread, size):
     share = by_training / total
     freedom = max(trainings - 1, 1), episodes - 1
     quantiles = [
-        stats.t.ppf(0.975, degrees) + stats.t.ppf(POWER, degrees) for degrees in freedom
+        stats.t.ppf(1.0 - level / 2, degrees) + stats.t.ppf(POWER, degrees)
+        for degrees in freedom
     ]
     return float(np.sqrt(total) * np.dot((share, 1.0 - share), quantiles))
-
-
-def markable(spread, size, family):
-    """The difference that is marked with probability `POWER` at Holm's first step.
-
-    It is that of the trained policies as they are, so trainings do not enter.
-    """
-    trainings, episodes = size
-    _, by_episode, rest = np.square(spread)
-    error = np.sqrt((by_episode + rest / trainings) / episodes)
-    shares = 1.0 - 0.025 / family, POWER
-    return float(error * sum(stats.t.ppf(share, episodes - 1) for share in shares))
 
 
 def family(part):
@@ -80,8 +74,8 @@ def family(part):
 def table():
     """One line for each plant, scenario and rival of SFKD."""
     head = ["row − SFKD", "trainings", "episodes", "rest", *SIZES]
-    families = [family(part) for part in PARTS]
-    head += [f"mark, {size}" for size in families]
+    size = family(PART)
+    head.append(f"mark, {size}")
     lines = []
     rows = json.loads(MEASURED.read_text())["rows"]
     errors = {
@@ -93,8 +87,8 @@ def table():
         if system in (REFERENCE, "oracle"):
             continue
         spread = deviations(values - errors[plant, scenario, REFERENCE])
-        found = [f"{detectable(spread, size):.1f}" for size in SIZES.values()]
-        found += [f"{markable(spread, MARKED, size):.1f}" for size in families]
+        found = [f"{detectable(spread, one):.1f}" for one in SIZES.values()]
+        found.append(f"{detectable(spread, MARKED, 0.05 / size):.1f}")
         cells = [f"{plant}, {scenario.upper()}: {system}"]
         lines.append([*cells, *(f"{part:.2f}" for part in spread), *found])
     return markdown.table(head, lines)

@@ -50,6 +50,13 @@ def test_the_coverage_where_it_is_least():
     assert 0.895 <= coverage(tables) <= 0.935
 
 
+def test_the_coverage_of_a_skewed_error():
+    """Errors as those of kinematic S3, whose logarithms have a deviation of 0.5."""
+    random = np.random.default_rng(3)
+    tables = np.exp(0.5 * random.standard_normal((5 * DRAWS, 1, 16)))
+    assert 0.915 <= coverage(tables - np.exp(0.125)) <= 0.94
+
+
 @pytest.mark.parametrize("size", [(3, 16), (10, 200)])
 def test_episodes_of_one_training_are_not_that_many_trials(size):
     random = np.random.default_rng(6)
