@@ -50,9 +50,9 @@ def _facts(plant: str) -> dict[str, str]:
     rest = [corridor["fixed_points"][name] for name in ("corridor_m", "after_switch_m")]
     low, high = corridor["coverage_ci95"]
     return {
-        "**corridor \\|e_y\\| on drives of the class [m]**": f"**{corridor['corridor_m']:.3f}**",
+        "**corridor: bound on \\|e_y\\| for 95 % of drives of the class [m]**": f"**{corridor['corridor_m']:.3f}**",
         "half width W of the nominal corridor [m]": f"{bounds['nominal']:.3f}",
-        "tube around the copy, `followed` [m]": f"{bounds['followed_position']:.3f}",
+        "of it, car to its simulated model (`followed`) [m]": f"{bounds['followed_position']:.3f}",
         "tube around the copy, `for_ever` [m]": f"{bounds['for_ever_position']:.3f}",
         "share of fresh drives of the class inside": f"{corridor['coverage']:.3f} ({low:.3f} to {high:.3f})",
         "share of S3 drives of 60 s inside, never calibrated on": f"{s3['coverage']:.3f}",
@@ -66,9 +66,9 @@ def _facts(plant: str) -> dict[str, str]:
             f"{part['planner']:.3f}" for part in rest
         ),
         "α in the metric of e_y, proved; in the 2-norm": f"{output['alpha']:.3f}; {certificate['alpha']:.3f}",
-        "attack, r_k within its bound: share of the tube": f"{attack['over_tube']:.2f}",
-        "attack, any disturbance: \\|e_y\\| [m]": f"{attack['shielded_lateral_m']:.2f}",
-        "S3 inside the shield, RMSE [mm]; over the oracle": (
+        "attack that keeps the error bound: share of the tube reached": f"{attack['over_tube']:.2f}",
+        "attack that may break it: \\|e_y\\| [m]": f"{attack['shielded_lateral_m']:.2f}",
+        "S3 inside the shield, RMSE [mm]; divided by the oracle's": (
             f"{1e3 * own['rmse_m']['mean']:.1f}; {own['ratio_to_oracle']:.3f}"
         ),
         "S3, largest \\|e_y\\| [m]; departures": f"{own['max_deviation_m']:.3f}; {own['departures']}",
