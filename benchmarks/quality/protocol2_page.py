@@ -33,6 +33,7 @@ BESIDE = {
     "sfkd_no_contraction": "SFKD without its contraction bound",
 }
 """Rows about which a question is asked: what planning brings, and what the bound does."""
+NOT_MODELS = ("oracle", "sfkd", *BESIDE)
 README = ROOT / "README.md"
 IN_SHORT = ROOT / "docs" / "results" / "index.md"
 PATH, BODY = ("protocol2_path", "law"), ("protocol2", "feedback")
@@ -159,32 +160,66 @@ def claim(rows):
     """What a part found, in a few bullets.
 
     SFKD beside the oracle where it is furthest behind on every plant, the extremes, the
-    rows of `BESIDE`, then `sides`.
+    rows of `BESIDE`, then the other models.
     """
-    lines = []
-    for vehicle, words in VEHICLES.items():
-        driven = rows["oracle"][vehicle]
-        scenario = min(
-            driven, key=lambda one: driven[one]["difference_to_sfkd"]["mean"]
-        )
-        gap = size_of(driven[scenario]["difference_to_sfkd"])
-        lines.append(
-            f"{gap} mm behind its {millimetres(driven[scenario]['rmse_m'])} mm "
-            f"on the {words} plant ({scenario.upper()})"
-        )
     (worst, its_worst), (peak, its_peak) = (
-        [millimetres(extreme(rows[system], of), 0) for system in ("sfkd", "oracle")]
-        for of in (worst_episode, lambda row: row["max_deviation_m"])
+        extremes(rows, of) for of in (worst_episode, lambda row: row["max_deviation_m"])
     )
     bullets = [
-        f"Where it is furthest behind the oracle, SFKD is {'; '.join(lines)}.",
+        f"Where it is furthest behind the oracle, SFKD is {gaps(rows)}.",
         f"Worst RMSE of an episode: {worst} mm, the oracle's {its_worst} mm; "
         f"largest deviation at any time: {peak} mm, the oracle's {its_peak} mm.",
     ]
     bullets += [
         by_interval(who, rows[row]) for row, who in BESIDE.items() if row in rows
     ]
-    return "\n".join(f"- {bullet}" for bullet in bullets) + f"\n{sides(rows)}"
+    bullets += sides({row: rows[row] for row in rows if row not in NOT_MODELS})
+    return "\n".join(f"- {bullet}" for bullet in bullets)
+
+
+def first_page(rows):
+    """The same in two bullets: SFKD beside the oracle, and who is better than SFKD."""
+    worst, its_worst = extremes(rows, worst_episode)
+    better = []
+    for system, driven in rows.items():
+        if system in ("oracle", "sfkd"):
+            continue
+        judge = apart if system in BESIDE else verdict
+        places = [
+            f"{VEHICLES[vehicle]} {scenario.upper()} "
+            f"{number(-1e3 * row['difference_to_sfkd']['mean'], 1)}"
+            for vehicle, one in driven.items()
+            for scenario, row in one.items()
+            if judge(row) == -1
+        ]
+        if places:
+            better.append(f"{label(system)} on {', '.join(places)}")
+    return (
+        f"- Where it is furthest behind the oracle, SFKD is {gaps(rows)}; worst RMSE of "
+        f"an episode {worst} mm, the oracle's {its_worst} mm.\n"
+        f"- Better than SFKD [mm]: {'; '.join(better) or 'none'}."
+    )
+
+
+def gaps(rows):
+    """How far SFKD is behind the oracle where it is furthest behind, on every plant."""
+    found = []
+    for vehicle, words in VEHICLES.items():
+        driven = rows["oracle"][vehicle]
+        scenario = min(
+            driven, key=lambda one: driven[one]["difference_to_sfkd"]["mean"]
+        )
+        gap = size_of(driven[scenario]["difference_to_sfkd"])
+        found.append(
+            f"{gap} mm behind its {millimetres(driven[scenario]['rmse_m'])} mm "
+            f"on the {words} plant ({scenario.upper()})"
+        )
+    return "; ".join(found)
+
+
+def extremes(rows, of):
+    """The largest value of a measure for SFKD and for the oracle [mm]."""
+    return [millimetres(extreme(rows[system], of), 0) for system in ("sfkd", "oracle")]
 
 
 def extreme(driven, of):
@@ -228,19 +263,20 @@ def apart(row):
 
 
 def sides(rows):
-    """The rows that are better than SFKD, and those that are worse, and where."""
-    found = {-1: [], 1: []}
+    """The rows that are better than SFKD, with the sizes, and how often rows are worse."""
+    better, worse = [], []
     for system, driven in rows.items():
-        if system in ("oracle", "sfkd", *BESIDE):
-            continue
-        for side, words in found.items():
-            chosen = places_of(driven, lambda row, side=side: verdict(row) == side)
-            if chosen:
-                words.append(f"{label(system)} on {', '.join(chosen)}")
-    better, worse = ("; ".join(found[side]) or "none" for side in (-1, 1))
+        verdicts = [verdict(row) for one in driven.values() for row in one.values()]
+        if -1 in verdicts:
+            places = places_of(driven, lambda row: verdict(row) == -1)
+            better.append(f"{label(system)} on {', '.join(places)}")
+        if count := verdicts.count(1):
+            worse.append(f"{label(system)} ({count})")
+    size = len(VEHICLES) * len(SHOWN)
     return (
-        f"- Other models that are better, after Holm's correction [mm]: {better}.\n"
-        f"- Other models that are worse: {worse}."
+        "Other models that are better, after Holm's correction [mm]: "
+        f"{'; '.join(better) or 'none'}.",
+        f"Worse, on so many of {size} plants and scenarios: {'; '.join(worse) or 'none'}.",
     )
 
 
@@ -253,15 +289,12 @@ def with_left(bullets, part):
 def pages():
     """Page -> marker -> its table or sentences, of the parts that are there."""
     made = {README: {}, IN_SHORT: {}}
-    if results_of(PATH[0]).exists():
-        rows = rows_of(*PATH)
-        claims = with_left(claim(rows), PATH[0])
-        made[README] |= {"bench": claims}
-        made[IN_SHORT] |= {"bench path": errors(rows), "bench claim": claims}
-    if results_of(BODY[0]).exists():
-        rows = rows_of(*BODY)
-        ends = with_left(sides(rows), BODY[0])
-        made[IN_SHORT] |= {"bench body": errors(rows), "bench sides": ends}
+    for part, marker in ((PATH, "bench path"), (BODY, "bench body")):
+        if results_of(part[0]).exists():
+            rows, name = rows_of(*part), part[0]
+            made[README] |= {marker: with_left(first_page(rows), name)}
+            claims = with_left(claim(rows), name)
+            made[IN_SHORT] |= {marker: errors(rows), f"{marker} claim": claims}
     return made
 
 
