@@ -27,12 +27,19 @@ VEHICLES = {
     "kinematic_stiff": "stiff kinematic",
     "dynamic": "dynamic",
 }
+SHORT = VEHICLES | {"kinematic_stiff": "stiff"}
 NOT_TRAINED = ("oracle", "nominal", "law")
 BESIDE = {
     "law": "The law alone, which knows the true plant and learns nothing,",
     "sfkd_no_contraction": "SFKD without its contraction bound",
+    "sfkd_soft": "SFKD with the soft hinge instead of the bound",
+    "sfkd_no_transport": "SFKD without transport",
+    "sfkd_no_residual": "SFKD without its residual",
+    "sfkd_no_fiber": "SFKD that does not observe e",
 }
-"""Rows about which a question is asked: what planning brings, and what the bound does."""
+"""Rows that say what planning brings and what the parts of SFKD do."""
+SMALLEST = 5e-5
+"""Differences that the first page names [m]; smaller ones round to 0.0 mm."""
 NOT_MODELS = ("oracle", "sfkd", *BESIDE)
 README = ROOT / "README.md"
 IN_SHORT = ROOT / "docs" / "results" / "index.md"
@@ -93,11 +100,11 @@ def left(part):
     """Rows and trainings of the protocol that are not driven yet, in sentences."""
     asked, now = protocol_of(part)["comparison"], collected(part, document_of(part))
     rows = [label(row) for row in asked["rows"] if row not in now["only"]]
-    sentences = [f"Not driven yet: {', '.join(rows)}."] if rows else []
+    sentences = [f"Not driven yet: {'; '.join(rows)}."] if rows else []
     if len(now["seeds"]) < len(asked["seeds"]):
         sentences.append(
-            f"Trainings driven so far: {len(now['seeds'])} of {len(asked['seeds'])}. "
-            "Intervals and marks are then about other episodes, not other trainings."
+            f"Trainings so far: {len(now['seeds'])} of {len(asked['seeds'])}; intervals "
+            "and marks are about other episodes alone."
         )
     return " ".join(sentences)
 
@@ -166,7 +173,7 @@ def claim(rows):
         extremes(rows, of) for of in (worst_episode, lambda row: row["max_deviation_m"])
     )
     bullets = [
-        f"Where it is furthest behind the oracle, SFKD is {gaps(rows)}.",
+        f"Where SFKD is furthest behind the oracle [mm]: {gaps(rows)}.",
         f"Worst RMSE of an episode: {worst} mm, the oracle's {its_worst} mm; "
         f"largest deviation at any time: {peak} mm, the oracle's {its_peak} mm.",
     ]
@@ -186,35 +193,34 @@ def first_page(rows):
             continue
         judge = apart if system in BESIDE else verdict
         places = [
-            f"{VEHICLES[vehicle]} {scenario.upper()} "
+            f"{SHORT[vehicle]} {scenario.upper()} "
             f"{number(-1e3 * row['difference_to_sfkd']['mean'], 1)}"
             for vehicle, one in driven.items()
             for scenario, row in one.items()
-            if judge(row) == -1
+            if judge(row) == -1 and abs(row["difference_to_sfkd"]["mean"]) >= SMALLEST
         ]
         if places:
             better.append(f"{label(system)} on {', '.join(places)}")
     return (
-        f"- Where it is furthest behind the oracle, SFKD is {gaps(rows)}; worst RMSE of "
-        f"an episode {worst} mm, the oracle's {its_worst} mm.\n"
+        f"- Where it is furthest behind the oracle [mm]: {gaps(rows, SHORT)}; worst "
+        f"RMSE of an episode {worst}, the oracle's {its_worst}.\n"
         f"- Better than SFKD [mm]: {'; '.join(better) or 'none'}."
     )
 
 
-def gaps(rows):
+def gaps(rows, names=VEHICLES):
     """How far SFKD is behind the oracle where it is furthest behind, on every plant."""
     found = []
-    for vehicle, words in VEHICLES.items():
+    for vehicle, words in names.items():
         driven = rows["oracle"][vehicle]
         scenario = min(
             driven, key=lambda one: driven[one]["difference_to_sfkd"]["mean"]
         )
-        gap = size_of(driven[scenario]["difference_to_sfkd"])
         found.append(
-            f"{gap} mm behind its {millimetres(driven[scenario]['rmse_m'])} mm "
-            f"on the {words} plant ({scenario.upper()})"
+            f"{size_of(driven[scenario]['difference_to_sfkd'])} of "
+            f"{millimetres(driven[scenario]['rmse_m'])} on {words} {scenario.upper()}"
         )
-    return "; ".join(found)
+    return ", ".join(found)
 
 
 def extremes(rows, of):
