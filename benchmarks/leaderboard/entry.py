@@ -65,6 +65,18 @@ def part_of(document, row):
     if not same:
         raise ValueError("comparison.controllers are not those of sfkd-bench-2")
     (asked,) = same
+    check_settings(used, asked)
+    check_words(row, comparison, asked["comparison"])
+    return asked
+
+
+def check_settings(used, asked):
+    """Raise a ValueError if results were driven under other settings.
+
+    Args:
+        used: settings of the results.
+        asked: those of a part of the protocol.
+    """
     for group in FROZEN:
         # `systems` is of the row.
         theirs, ours = (
@@ -72,11 +84,11 @@ def part_of(document, row):
             for one in (used, asked)
         )
         if changed := artefacts.differences(ours, theirs):
-            raise ValueError(f"not as sfkd-bench-2 asks: {group}.{changed[0]}")
-    if comparison["older"] or used["env_source"] != asked["env_source"]:
-        raise ValueError("not as sfkd-bench-2 asks: comparison.older or env_source")
-    check_words(row, comparison, asked["comparison"])
-    return asked
+            raise ValueError(f"not driven as sfkd-bench-2 asks: {group}.{changed[0]}")
+    if used["comparison"]["older"] or used["env_source"] != asked["env_source"]:
+        raise ValueError(
+            "not driven as sfkd-bench-2 asks: comparison.older or env_source"
+        )
 
 
 def check_words(row, used, asked):

@@ -11,7 +11,7 @@ import json
 from collections import Counter
 
 from benchmarks.harness import ROOT
-from benchmarks.leaderboard.entry import worst_episode
+from benchmarks.leaderboard.entry import check_settings, worst_episode
 from benchmarks.markdown import put, table
 from benchmarks.quality.protocol2_tuning import settings_of
 from sfkd_jax.evaluation.formats import interval, millimetres, number
@@ -70,8 +70,10 @@ def collected(part, results):
             of other settings, or no row to compare with.
     """
     asked, used = protocol_of(part), results["config"]
-    if used["evaluation"] != asked["evaluation"] or used["comparison"]["older"]:
-        raise SystemExit(f"{part}: not driven as sfkd-bench-2 asks")
+    try:
+        check_settings(used, asked)
+    except ValueError as reason:
+        raise SystemExit(f"{part}: {reason}") from None
     comparison, seeds = asked["comparison"], used["comparison"]["seeds"]
     if not seeds or seeds != comparison["seeds"][: len(seeds)]:
         first = comparison["seeds"]
@@ -192,17 +194,18 @@ def first_page(rows):
         if system in ("oracle", "sfkd"):
             continue
         judge = apart if system in BESIDE else verdict
-        places = [
-            f"{SHORT[vehicle]} {scenario.upper()} "
-            f"{number(-1e3 * row['difference_to_sfkd']['mean'], 1)}"
-            for vehicle, one in driven.items()
-            for scenario, row in one.items()
-            if judge(row) == -1 and abs(row["difference_to_sfkd"]["mean"]) >= SMALLEST
-        ]
+        places = places_of(
+            driven,
+            lambda row, judge=judge: (
+                judge(row) == -1 and row["difference_to_sfkd"]["mean"] <= -SMALLEST
+            ),
+            names=SHORT,
+            shown=lambda difference: number(-1e3 * difference["mean"], 1),
+        )
         if places:
             better.append(f"{label(system)} on {', '.join(places)}")
     return (
-        f"- Where it is furthest behind the oracle [mm]: {gaps(rows, SHORT)}; worst "
+        f"- Where SFKD is furthest behind the oracle [mm]: {gaps(rows, SHORT)}; worst "
         f"RMSE of an episode {worst}, the oracle's {its_worst}.\n"
         f"- Better than SFKD [mm]: {'; '.join(better) or 'none'}."
     )
@@ -225,12 +228,10 @@ def gaps(rows, names=VEHICLES):
 
 def extremes(rows, of):
     """The largest value of a measure for SFKD and for the oracle [mm]."""
-    return [millimetres(extreme(rows[system], of), 0) for system in ("sfkd", "oracle")]
-
-
-def extreme(driven, of):
-    """The largest value of a measure of a row on any plant and scenario."""
-    return max(of(row) for one in driven.values() for row in one.values())
+    return [
+        millimetres(max(of(row) for one in driven.values() for row in one.values()), 0)
+        for driven in (rows["sfkd"], rows["oracle"])
+    ]
 
 
 def size_of(difference):
@@ -240,10 +241,10 @@ def size_of(difference):
     return f"{number(sign * difference['mean'], 1)} ({number(low, 1)} to {number(high, 1)})"
 
 
-def places_of(driven, chosen):
+def places_of(driven, chosen, *, names=VEHICLES, shown=size_of):
     """Plants and scenarios where a row's difference to SFKD is chosen, with its size."""
     return [
-        f"{VEHICLES[vehicle]} {scenario.upper()} {size_of(row['difference_to_sfkd'])}"
+        f"{names[vehicle]} {scenario.upper()} {shown(row['difference_to_sfkd'])}"
         for vehicle, one in driven.items()
         for scenario, row in one.items()
         if chosen(row)

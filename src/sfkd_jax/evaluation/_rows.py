@@ -9,7 +9,7 @@ from jaxtyping import Float
 
 from sfkd_jax.evaluation._closed_loop import Episode
 from sfkd_jax.evaluation._statistics import holm, paired_difference
-from sfkd_jax.evaluation.metrics import METRICS, PerEpisode, Recording, Row
+from sfkd_jax.evaluation.metrics import METRICS, PerEpisode, Recording, Row, as_numbers
 
 _ARRAYS = (
     "states",
@@ -155,9 +155,7 @@ def _search(entry: dict[str, Any]) -> tuple[Any, ...]:
 
 def _by_seed(entry: dict[str, Any]) -> np.ndarray:
     """RMSE, one line per training seed, one column per episode."""
-    # An error that is not finite is stored as null.
-    errors = np.asarray(entry["rmse_episodes_m"], dtype=float)
-    return errors.reshape(len(entry["seeds"]), -1)
+    return as_numbers(entry["rmse_episodes_m"]).reshape(len(entry["seeds"]), -1)
 
 
 def _ratio(values: np.ndarray, reference: np.ndarray) -> float:

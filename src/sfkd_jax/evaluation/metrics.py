@@ -176,12 +176,14 @@ def _each(values: np.ndarray) -> list[float]:
     return [float(value) for value in values]
 
 
-def _of_trainings(rows: list[Row]) -> list[list[float]]:
-    """RMSE of every episode, one list per training.
+def as_numbers(values: list[float | None]) -> np.ndarray:
+    """Stored numbers as an array; null, for one that was not finite, is NaN."""
+    return np.asarray(values, dtype=float)
 
-    One that is not finite is stored as null.
-    """
-    return [np.asarray(row["rmse_episodes_m"], dtype=float).tolist() for row in rows]
+
+def _of_trainings(rows: list[Row]) -> list[list[float]]:
+    """RMSE of every episode, one list per training."""
+    return [as_numbers(row["rmse_episodes_m"]).tolist() for row in rows]
 
 
 def _certified(key: str) -> Callable[[Row], Any]:
@@ -225,8 +227,8 @@ METRICS: tuple[Metric, ...] = (
            pool_seeds=lambda rows: [float(np.mean(x)) for x in _of_trainings(rows)]),
     Metric("max_deviation_m", "Largest deviation", "m", "tracking", number, 0,
            _max_deviation, lambda values: float(np.max(values)),
-           lambda rows: float(np.max(np.asarray(
-               [row["max_deviation_m"] for row in rows], dtype=float)))),
+           lambda rows: float(np.max(as_numbers(
+               [row["max_deviation_m"] for row in rows])))),
     Metric("rmse_after_switch_m", "RMSE after a switch", "m", "spread", number, 1,
            _rmse_after_switch, _mean_known),
     Metric("smoothness_rad_per_s", "Steering rate", "rad/s", "tracking",

@@ -45,7 +45,7 @@ def certify_policy(settings: dict[str, Any]) -> dict[str, Any]:
     document |= {
         "weights_sha256": trained.weights_sha256,
         "policy_sha256": trained.sha256,
-        "certification": _options(settings),
+        "certification": build.as_kwargs(settings["certification"], "renew"),
         "versions": versions,
     }
     document["seconds"] = time.perf_counter() - began
@@ -126,12 +126,6 @@ def ensure_certificate(settings: dict[str, Any]) -> None:
             certify_policy(settings)
 
 
-def _options(settings: dict[str, Any]) -> dict[str, Any]:
-    """The settings that a certificate is made with."""
-    certification = settings["certification"]
-    return {name: certification[name] for name in certification if name != "renew"}
-
-
 def _is_certified(settings: dict[str, Any]) -> bool:
     """Whether there is a certificate or a refusal with these settings.
 
@@ -141,4 +135,5 @@ def _is_certified(settings: dict[str, Any]) -> bool:
     if not path.exists():
         return False
     recorded = artefacts.read_json(path).get("certification")
-    return recorded is None or not artefacts.differences(recorded, _options(settings))
+    options = build.as_kwargs(settings["certification"], "renew")
+    return recorded is None or not artefacts.differences(recorded, options)
