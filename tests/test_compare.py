@@ -41,11 +41,18 @@ def test_compare_evaluates_every_row_and_continues_where_it_stopped(tmp_path):
     assert remade == first_made
 
 
-def test_a_row_that_cannot_be_made_is_named_and_the_others_come_out(tmp_path):
-    done = run_command("compare", *COMPARED, "model.frame=boddy", cwd=tmp_path)
+def test_rows_that_cannot_be_made_are_named_and_the_others_come_out(tmp_path):
+    done = run_command(
+        "compare",
+        *COMPARED,
+        "model.frame=boddy",
+        "+comparison.rows.mistyped='training.step=3'",
+        cwd=tmp_path,
+    )
     assert last_line(done)["rows"] == 1
-    assert last_line(done)["failed"] == 1
+    assert last_line(done)["failed"] == 2
     assert "segment" in done.stderr
+    assert "row mistyped: unknown setting training.step" in done.stderr
 
 
 def test_a_row_that_could_not_be_certified_is_refused_before_it_is_trained(tmp_path):
