@@ -59,10 +59,16 @@ def test_the_settings_of_the_table_are_the_winners_of_the_trials():
     assert yaml.safe_load(tuning.TUNED.read_text())["tuned"] == tuning.winners()
 
 
-def document_of(part, seeds, labels=None):
-    """Results of a part that lack nothing, driven with these trainings and rows."""
+def document_of(part, seeds, labels=None, once=()):
+    """Results of a part that lack nothing, driven with these trainings and rows.
+
+    Rows in `once` are trained once although the protocol asks for more.
+    """
     settings = tuning.settings_of(f"+experiment={part}")
-    settings["comparison"] |= {"seeds": seeds}
+    settings["comparison"] |= {
+        "seeds": seeds,
+        "trained_once": [*settings["comparison"]["trained_once"], *once],
+    }
     names = ("vehicle", "system", "controller", "scenario")
     cells = Counter(
         (cell.vehicle, cell.label, cell.controller, cell.scenario)
@@ -98,6 +104,17 @@ def test_a_part_may_stop_after_its_first_trainings_or_rows_and_says_so(monkeypat
     whole = document_of(part, [0, 1, 2])
     monkeypatch.setattr(protocol2_page, "document_of", lambda _: whole)
     assert protocol2_page.with_left("- Bullets.", part) == "- Bullets."
+
+
+def test_a_row_may_be_trained_once_only_if_the_results_say_so(monkeypatch):
+    part, row = "protocol2", "icode_mppi_extrinsic"
+    some = document_of(part, [0, 1, 2], once=[row])
+    assert protocol2_page.missing(part, some) == []
+    monkeypatch.setattr(protocol2_page, "document_of", lambda _: some)
+    assert "Trained once so far, not 3 times: ICODE-MPPI" in protocol2_page.left(part)
+    whole = document_of(part, [0, 1, 2])
+    assert protocol2_page.missing(part, some | {"config": whole["config"]}) != []
+    assert protocol2_page.missing(part, whole | {"config": some["config"]}) != []
 
 
 @pytest.mark.parametrize("seeds", [[], [1], [0, 2], [0, 1, 2, 3]])

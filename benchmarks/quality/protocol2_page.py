@@ -3,8 +3,8 @@
 python -m benchmarks.quality.protocol2_page
 From the results in experiments/protocol2 and experiments/protocol2_path. A part
 that is not there yet is left alone; one whose cells are not all there is refused. A part
-may be driven for the first trainings or for some of its rows only: what is said of it
-then ends with what is left.
+may be driven for the first trainings or for some of its rows only, and more of its rows
+may be trained once than the protocol asks: what is said of it then ends with what is left.
 """
 
 import json
@@ -75,6 +75,8 @@ def collected(part, results):
     except ValueError as reason:
         raise SystemExit(f"{part}: {reason}") from None
     comparison, seeds = asked["comparison"], used["comparison"]["seeds"]
+    once = comparison["trained_once"]
+    once = once + [row for row in used["comparison"]["trained_once"] if row not in once]
     if not seeds or seeds != comparison["seeds"][: len(seeds)]:
         first = comparison["seeds"]
         raise SystemExit(f"{part}: seeds {seeds} are not the first of {first}")
@@ -82,7 +84,7 @@ def collected(part, results):
     labels = [label for label in comparison["rows"] if label in driven]
     if not {"oracle", "sfkd"} <= set(map(family, labels)):
         raise SystemExit(f"{part}: there is no row of SFKD or of the oracle")
-    return comparison | {"seeds": seeds, "only": labels}
+    return comparison | {"seeds": seeds, "trained_once": once, "only": labels}
 
 
 def missing(part, results):
@@ -103,6 +105,13 @@ def left(part):
     asked, now = protocol_of(part)["comparison"], collected(part, document_of(part))
     rows = [label(row) for row in asked["rows"] if row not in now["only"]]
     sentences = [f"Not driven yet: {'; '.join(rows)}."] if rows else []
+    once = [
+        label(row) for row in now["trained_once"] if row not in asked["trained_once"]
+    ]
+    if once:
+        sentences.append(
+            f"Trained once so far, not {len(asked['seeds'])} times: {'; '.join(once)}."
+        )
     if len(now["seeds"]) < len(asked["seeds"]):
         sentences.append(
             f"Trainings so far: {len(now['seeds'])} of {len(asked['seeds'])}; intervals "
