@@ -25,6 +25,7 @@ from sfkd_jax.paper._variations import (
 )
 from sfkd_jax.reporting.blocks import Table
 from sfkd_jax.reporting.film import MAX_BYTES
+from sfkd_jax.reporting.rows import name_of
 
 ORACLE, SFKD = 0.016, 0.020
 LEVELS = ((0.9, 0.0), (0.6, -4.0), (0.3, 8.0), (0.6, 4.0))
@@ -579,6 +580,19 @@ def test_shares_of_the_data_rise_to_the_whole_of_it():
     result = tables_of(markdown, f"Share of the training data, S3: {FEEDBACK}")
     assert result["SFKD"] == ["60.0 (3.00)", "30.0 (1.50)", "20.0"]
     assert markdown.index("Share of the training data") < markdown.index("Tracking: ")
+
+
+@pytest.mark.parametrize(
+    ("system", "env", "name"),
+    [
+        ("icode", "measured", "ICODE (e)"),
+        ("icode_mppi_reads_env", "measured", "ICODE-MPPI, reads e"),
+        ("icode_extrinsic", "measured", "ICODE, f(s, u) + G(s, u) e"),
+        ("icode_extrinsic", "none", "ICODE, f(s, u) + G(s, u) e (no e)"),
+    ],
+)
+def test_a_row_says_once_that_it_observes_e(system, env, name):
+    assert name_of({"system": system, "env": env}) == name
 
 
 def test_every_training_of_a_row_is_drawn_and_listed():
