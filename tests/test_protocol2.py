@@ -169,7 +169,7 @@ def test_what_the_first_pages_say_is_what_the_benchmark_found():
 
 
 def test_what_brings_accuracy_is_what_the_first_page_says():
-    """Observing e everywhere, the residual on the dynamic plant, nothing else."""
+    """Observing e everywhere but on dynamic S2; no other part by more than 0.3 mm."""
     body = protocol2_page.rows_of(*protocol2_page.BODY)
     path = protocol2_page.rows_of(*protocol2_page.PATH)
 
@@ -181,15 +181,46 @@ def test_what_brings_accuracy_is_what_the_first_page_says():
             if protocol2_page.apart(row) == 1
         }
 
-    assert len(worse_without(body["sfkd_no_fiber"])) == 9
-    residual = worse_without(body["sfkd_no_residual"])
-    assert {("dynamic", "s2"), ("dynamic", "s3")} <= set(residual)
-    for row in (
-        body["sfkd_no_transport"],
-        body["sfkd_no_contraction"],
-        path["sfkd_no_contraction"],
+    places = {
+        (vehicle, scenario)
+        for vehicle, one in body["sfkd_no_fiber"].items()
+        for scenario in one
+    }
+    assert places - {("dynamic", "s2")} == {*worse_without(body["sfkd_no_fiber"])}
+    for row, most in (
+        (body["sfkd_no_transport"], 0.0),
+        (body["sfkd_no_residual"], 0.35),
+        (body["sfkd_no_contraction"], 0.1),
+        (path["sfkd_no_contraction"], 0.1),
     ):
-        assert max(worse_without(row).values(), default=0.0) < 0.1
+        assert max(worse_without(row).values(), default=0.0) <= most
+
+
+@pytest.mark.parametrize(
+    ("part", "vehicle"),
+    [(protocol2_page.PATH, "kinematic"), (protocol2_page.BODY, "dynamic")],
+)
+def test_every_training_is_worse_than_every_one_without_the_bound_where_they_differ_most(
+    part, vehicle
+):
+    rows = protocol2_page.rows_of(*part)
+    (said,) = protocol2_page.trainings(rows, protocol2_page.SHORT)
+    assert f"{vehicle} S2" in said
+    bound, free = (
+        rows[row][vehicle]["s2"]["rmse_trainings_m"]
+        for row in ("sfkd", "sfkd_no_contraction")
+    )
+    assert len(bound) == len(free) == 3
+    assert max(free) < min(bound)
+
+
+@pytest.mark.parametrize("seeds", [[0], [0, 1]])
+def test_trainings_are_told_apart_only_if_there_are_several(seeds):
+    row = {"seeds": seeds, "rmse_trainings_m": [0.001, 0.002] if seeds[1:] else None}
+    rows = {"sfkd": {"dynamic": {"s2": row, "s3": row}}}
+    said = protocol2_page.trainings(rows, protocol2_page.SHORT)
+    assert bool(said) == bool(seeds[1:])
+    assert all("dynamic S2 [mm]: 1.0, 2.0; 0 of" in bullet for bullet in said)
 
 
 @pytest.mark.parametrize(

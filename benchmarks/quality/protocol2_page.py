@@ -10,6 +10,8 @@ may be trained once than the protocol asks: what is said of it then ends with wh
 import json
 from collections import Counter
 
+import numpy as np
+
 from benchmarks.harness import ROOT
 from benchmarks.leaderboard.entry import check_settings, worst_episode
 from benchmarks.markdown import put, table
@@ -177,8 +179,8 @@ def error_of(row):
 def claim(rows):
     """What a part found, in a few bullets.
 
-    SFKD beside the oracle where it is furthest behind on every plant, the extremes, the
-    rows of `BESIDE`, then the other models.
+    SFKD beside the oracle where it is furthest behind on every plant, the extremes, how
+    its trainings differ, the rows of `BESIDE`, then the other models.
     """
     (worst, its_worst), (peak, its_peak) = (
         extremes(rows, of) for of in (worst_episode, lambda row: row["max_deviation_m"])
@@ -188,6 +190,7 @@ def claim(rows):
         f"Worst RMSE of an episode: {worst} mm, the oracle's {its_worst} mm; "
         f"largest deviation at any time: {peak} mm, the oracle's {its_peak} mm.",
     ]
+    bullets += trainings(rows, VEHICLES)
     bullets += [
         by_interval(who, rows[row]) for row, who in BESIDE.items() if row in rows
     ]
@@ -196,7 +199,7 @@ def claim(rows):
 
 
 def first_page(rows):
-    """The same in two bullets: SFKD beside the oracle, and who is better than SFKD."""
+    """The same in short: SFKD beside the oracle, its trainings, and who is better."""
     worst, its_worst = extremes(rows, worst_episode)
     better = []
     for system, driven in rows.items():
@@ -213,11 +216,13 @@ def first_page(rows):
         )
         if places:
             better.append(f"{label(system)} on {', '.join(places)}")
-    return (
-        f"- Where SFKD is furthest behind the oracle [mm]: {gaps(rows, SHORT)}; worst "
-        f"RMSE of an episode {worst}, the oracle's {its_worst}.\n"
-        f"- Better than SFKD [mm]: {'; '.join(better) or 'none'}."
-    )
+    bullets = [
+        f"Where SFKD is furthest behind the oracle [mm]: {gaps(rows, SHORT)}; worst "
+        f"RMSE of an episode {worst}, the oracle's {its_worst}.",
+        f"Better than SFKD [mm]: {'; '.join(better) or 'none'}.",
+        *trainings(rows, SHORT),
+    ]
+    return "\n".join(f"- {bullet}" for bullet in bullets)
 
 
 def gaps(rows, names=VEHICLES):
@@ -233,6 +238,42 @@ def gaps(rows, names=VEHICLES):
             f"{millimetres(driven[scenario]['rmse_m'])} on {words} {scenario.upper()}"
         )
     return ", ".join(found)
+
+
+def trainings(rows, names):
+    """A sentence about where SFKD's trainings differ most, if there are several.
+
+    It has the error of each one and of each one without the contraction bound, and how
+    many learned rows have a smaller mean error there: where trainings differ, even large
+    differences are not marked.
+    """
+    several = {
+        (vehicle, scenario): row["rmse_trainings_m"]
+        for vehicle, one in rows["sfkd"].items()
+        for scenario, row in one.items()
+        if len(row["seeds"]) > 1
+    }
+    if not several:
+        return []
+    vehicle, scenario = max(several, key=lambda place: np.ptp(several[place]))
+
+    def each(row):
+        errors = rows[row][vehicle][scenario]["rmse_trainings_m"] or []
+        return ", ".join(number(1e3 * error, 1) for error in errors)
+
+    free = each("sfkd_no_contraction") if "sfkd_no_contraction" in rows else ""
+    beside = f"; without its bound: {free}" if free else ""
+    others = [
+        rows[row][vehicle][scenario]["difference_to_sfkd"]["mean"]
+        for row in rows
+        if row not in (*NOT_TRAINED, "sfkd")
+    ]
+    ahead = sum(mean < 0 for mean in others)
+    return [
+        f"SFKD's trainings differ most on {names[vehicle]} {scenario.upper()} [mm]: "
+        f"{each('sfkd')}{beside}; {ahead} of the {len(others)} other learned rows have "
+        "a smaller mean there."
+    ]
 
 
 def extremes(rows, of):
