@@ -24,8 +24,8 @@ def name_of(row: Row) -> str:
     shown = label(system)
     if env == "estimated":
         return f"{shown} (e estimated)"
-    said = env == "measured" and shown.endswith(" e")  # as in "reads e"
-    if said or system in NO_MODEL or system.startswith("sfkd"):
+    in_name = env == "measured" and shown.endswith(" e")  # as in "reads e"
+    if in_name or system in NO_MODEL or system.startswith("sfkd"):
         return shown
     return shown + {"measured": " (e)", "none": " (no e)"}.get(env, "")
 
