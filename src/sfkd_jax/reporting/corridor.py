@@ -110,7 +110,8 @@ def band(axes: Any, width: float, tube: float, *, named: bool = True) -> None:
     for side in (-edge, edge):
         axes.axhline(side, color=style.ACCENT, linewidth=1.2, zorder=2)
     for name, height in {"W + tube": edge, "W": width}.items() if named else ():
-        look = {"va": "bottom", "ha": "right", "color": style.ACCENT, "zorder": 6}
+        # Below the curves, whose peaks it would hide.
+        look = {"va": "bottom", "ha": "right", "color": style.ACCENT, "zorder": 1.5}
         look["transform"] = axes.get_yaxis_transform()
         words = f"{name} = {number(height)} m"
         style.note(axes, 0.995, height + 0.03 * edge, words, **look)
