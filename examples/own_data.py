@@ -15,7 +15,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from sfkd_jax import certification, control, models
-from sfkd_jax.datasets import (
+from sfkd_jax.data import (
     Dataset,
     measure_space,
     random_windows,
@@ -116,7 +116,7 @@ def main(
 
 def loss_of_position(model, params, window):
     """Distance between the last predicted position and the true one [m]."""
-    from sfkd_jax.core.rollouts import rollout
+    from sfkd_jax.rollout import rollout
 
     predicted, _, _ = rollout(model, params, window)
     return jnp.linalg.norm(predicted[-1, :2] - window.states[-1, :2])

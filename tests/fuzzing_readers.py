@@ -18,8 +18,9 @@ import jax.export
 import jax.numpy as jnp
 import numpy as np
 
-from sfkd_jax import artefacts, datasets, paper, policy, reporting
-from sfkd_jax.exporting import _run_controller as loader
+from sfkd_jax import artefacts, paper, policy, reporting
+from sfkd_jax import data as datasets
+from sfkd_jax.export import _run_controller as loader
 
 ROOT = Path(__file__).parents[1]
 SHIPPED = ROOT / "src" / "sfkd_jax" / "pretrained" / "kinematic"

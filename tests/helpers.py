@@ -13,7 +13,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from sfkd_jax import artefacts, certification, control, datasets, models, vehicle
+from sfkd_jax import artefacts, certification, control, models, plants
+from sfkd_jax import data as datasets
 from sfkd_jax.types import Space, Trajectory
 
 jit = partial(jax.jit, compiler_options={"xla_backend_optimization_level": 0})
@@ -113,7 +114,7 @@ def model_and_params(name="sfkd", scale=1.0):
     """A model by the name of a variant or of a physics row, and generic parameters,
     multiplied by `scale`.
     """
-    plant = vehicle.kinematic()
+    plant = plants.kinematic()
     if name in PHYSICS:
         return models.physics(plant.step if name == "oracle" else plant.nominal), {}
     return _model(name), jax.tree.map(lambda leaf: scale * leaf, generic(name))
@@ -125,7 +126,7 @@ def _model(name):
     if name not in OTHERS:
         return tiny(name)
     factory = models.FACTORIES[name]
-    known = {"nominal": vehicle.kinematic().nominal_derivative}
+    known = {"nominal": plants.kinematic().nominal_derivative}
     return factory(
         space(),
         **{
@@ -218,7 +219,7 @@ def driven(count=3, steps=12):
     """A few trajectories of the kinematic plant with bold controls and an environment
     that switches at every step.
     """
-    plant = vehicle.kinematic()
+    plant = plants.kinematic()
     start_key, control_key, env_key = jax.random.split(jax.random.key(5), 3)
     spread = jnp.asarray([3.0, 3.0, 4.0, 2.0])
     initial = jnp.asarray([0.0, 0.0, 0.0, 10.0]) + spread * jax.random.uniform(
@@ -250,7 +251,7 @@ def driver(plant):
 @cache
 def generator(count=120, steps=25):
     """key -> training segments of the kinematic plant, compiled once."""
-    plant = vehicle.kinematic()
+    plant = plants.kinematic()
     return jit(
         partial(datasets.generate, plant, driver(plant), segments=count, steps=steps)
     )

@@ -4,7 +4,7 @@ import json
 
 from helpers import last_line, run_command
 
-from sfkd_jax import vehicle
+from sfkd_jax import plants
 from sfkd_jax.pipeline import comparison
 
 SMALL = ("training.steps=75", "training.save_every=75", "dataset.segments=200")
@@ -76,7 +76,7 @@ def test_episodes_are_made_once_for_all_rows_and_again_for_another_protocol():
         "scenario": {"name": "s1"},
         "evaluation": protocol,
     }
-    make_episodes, plant = comparison.cached_episodes(), vehicle.kinematic()
+    make_episodes, plant = comparison.cached_episodes(), plants.kinematic()
     first, second = (
         make_episodes(options | {"model": {"name": model}}, plant)
         for model in ("sfkd", "icode")

@@ -9,7 +9,7 @@ from hydra.errors import HydraException
 from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
-from sfkd_jax import build, models, vehicle
+from sfkd_jax import build, models, plants
 from sfkd_jax.cli import config
 
 CONF = Path(config.conf_path())
@@ -49,7 +49,7 @@ def test_every_model_option_builds_and_names_its_system(option):
     if option == "own":
         plain["model"]["factory"] = "sfkd_jax.models:neural_ode"
     assert plain["model"]["system"] == option.removesuffix("_tiny")
-    build.build_model(plain["model"], space(), vehicle.kinematic())
+    build.build_model(plain["model"], space(), plants.kinematic())
 
 
 @pytest.mark.parametrize(

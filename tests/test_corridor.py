@@ -12,7 +12,8 @@ import pytest
 from helpers import any_law
 from test_path_policy import saved, settings
 
-from sfkd_jax import build, datasets, policy
+from sfkd_jax import build, policy
+from sfkd_jax import data as datasets
 from sfkd_jax.certification import (
     CertificationRefused,
     issue,
@@ -20,8 +21,8 @@ from sfkd_jax.certification import (
     verify_document,
 )
 from sfkd_jax.corridor import certify_corridor, corridor_by_speed, fastest_speeds
+from sfkd_jax.plants import along_path, kinematic
 from sfkd_jax.types import Trajectory
-from sfkd_jax.vehicle import along_path, kinematic
 
 DRIVEN = {"env_low": (0.3, -8.0), "env_high": (0.9, 8.0)}
 SMALL = {"drives": 24, "duration": 4.0, "attack_steps": 3000}

@@ -10,9 +10,9 @@ import pytest
 
 PROGRAM = """
     import jax, jax.numpy as jnp, numpy as np
-    from sfkd_jax import control, evaluation, models, vehicle
+    from sfkd_jax import control, evaluation, models, plants
     from sfkd_jax.pipeline import evaluate_system
-    plant = vehicle.kinematic()
+    plant = plants.kinematic()
     sensor = {"delay_s": 0.0, "noise": [0.0, 0.0], "bias": [0.0, 0.0]}
     protocol = {"episodes": 4, "episode_s": 3.0, "seed": 1, "variation": None}
     settings = {

@@ -181,7 +181,7 @@ class Message(types.SimpleNamespace):
 def node(monkeypatch):
     """The example's node, with a tiny policy of random weights behind it."""
     import sfkd_jax
-    from sfkd_jax import control, models, vehicle
+    from sfkd_jax import control, models, plants
     from sfkd_jax.policy import Policy
 
     modules = {
@@ -193,7 +193,7 @@ def node(monkeypatch):
         module = types.ModuleType(name)
         module.__dict__.update(entries)
         monkeypatch.setitem(sys.modules, name, module)
-    plant = vehicle.kinematic()
+    plant = plants.kinematic()
     law, limits = control.path_feedback(wheelbase=plant.wheelbase), {}
     limits = {"control_low": plant.control_low, "control_high": plant.control_high}
     model = models.physics(plant.nominal)

@@ -23,8 +23,10 @@ from hydra import compose, initialize_config_dir
 from omegaconf import OmegaConf
 
 import sfkd_jax
-from sfkd_jax import artefacts, build, certification, export, exporting, policy
+from sfkd_jax import artefacts, build, certification, policy
+from sfkd_jax import export as exporting
 from sfkd_jax.cli import config
+from sfkd_jax.export import __main__ as export
 from sfkd_jax.pipeline import store
 from sfkd_jax.types import Controller
 

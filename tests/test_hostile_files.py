@@ -18,9 +18,10 @@ import numpy as np
 import pytest
 from fuzzing_mutations import bomb
 
-from sfkd_jax import artefacts, datasets, demo, paper, policy, reporting
+from sfkd_jax import artefacts, demo, paper, policy, reporting
+from sfkd_jax import data as datasets
 from sfkd_jax.artefacts import ArtefactError
-from sfkd_jax.exporting import _run_controller as loader
+from sfkd_jax.export import _run_controller as loader
 
 SHIPPED = demo.SHIPPED / "kinematic"
 MIB = 1 << 20

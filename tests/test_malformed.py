@@ -17,7 +17,8 @@ import pytest
 from helpers import ENV_HIGH, ENV_LOW, SHARES, dataset, refusal_of
 from jaxtyping import TypeCheckError
 
-from sfkd_jax import artefacts, datasets, demo, policy, report, training
+from sfkd_jax import artefacts, demo, policy, report, training
+from sfkd_jax import data as datasets
 from sfkd_jax.cli import entry
 from sfkd_jax.pipeline import evaluate_run, store
 

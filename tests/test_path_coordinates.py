@@ -7,9 +7,8 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from sfkd_jax import vehicle
-from sfkd_jax.core.path_frame import circle_errors, closed_loop, is_valid, path_state
-from sfkd_jax.core.se2 import compose
+from sfkd_jax import plants
+from sfkd_jax.geometry import circle_errors, closed_loop, compose, is_valid, path_state
 from sfkd_jax.scenarios import path_from_curvature, project
 from sfkd_jax.types import BODY
 
@@ -52,7 +51,7 @@ def test_a_car_near_the_centre_of_curvature_is_invalid_but_finite():
 
 
 @pytest.mark.parametrize(
-    "plant", [vehicle.kinematic(), vehicle.dynamic()], ids=lambda plant: plant.name
+    "plant", [plants.kinematic(), plants.dynamic()], ids=lambda plant: plant.name
 )
 @pytest.mark.parametrize("curvature", [-0.02, 0.0, 0.015])
 def test_the_loop_in_path_coordinates_agrees_with_the_drive_in_the_world(
@@ -94,4 +93,4 @@ def test_the_loop_in_path_coordinates_agrees_with_the_drive_in_the_world(
 
 def test_a_vehicle_without_limits_has_no_closed_loop():
     with pytest.raises(ValueError, match="control_low"):
-        vehicle.along_path(vehicle.own(), lambda xi, kappa, speed, env: jnp.zeros(2))
+        plants.along_path(plants.own(), lambda xi, kappa, speed, env: jnp.zeros(2))

@@ -8,7 +8,7 @@ from helpers import TINY, any_law, path_space
 from hydra import compose, initialize_config_dir
 from omegaconf import OmegaConf
 
-from sfkd_jax import artefacts, build, policy, vehicle
+from sfkd_jax import artefacts, build, plants, policy
 from sfkd_jax.cli import config
 from sfkd_jax.pipeline import dry_run
 
@@ -36,7 +36,7 @@ def saved(run_dir, *, law, samples=4):
     }
     options["model"] |= {"budget": "joint"}
     scales = path_space()
-    model = build.build_model(options["model"], scales, vehicle.kinematic())
+    model = build.build_model(options["model"], scales, plants.kinematic())
     options |= {"space": build.space_to_settings(scales)}
     return policy.save(
         run_dir / "policy.npz",
@@ -94,7 +94,7 @@ def test_the_system_law_exists_in_path_coordinates_only():
     with pytest.raises(ValueError, match=r"evaluation\.systems entry 'law'"):
         dry_run.check_settings(
             settings("dataset=standard", "model=sfkd", "evaluation.systems=[law]"),
-            vehicle.kinematic(),
+            plants.kinematic(),
         )
 
 

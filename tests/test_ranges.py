@@ -14,8 +14,8 @@ from omegaconf.errors import OmegaConfBaseException
 
 from sfkd_jax import build
 from sfkd_jax.cli import config, groups, messages, ranges
-from sfkd_jax.core.ranges import Interval
 from sfkd_jax.pipeline import dry_run
+from sfkd_jax.ranges import Interval
 
 MODELS = (
     "sfkd",

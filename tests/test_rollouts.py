@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from helpers import at, driven, jit, model_and_params
 
-from sfkd_jax.core.rollouts import defects, fibers_along, in_batches, rollout
+from sfkd_jax.rollout import defects, fibers_along, in_batches, rollout
 
 
 @pytest.fixture(scope="module")

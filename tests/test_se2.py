@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from helpers import jit
 
-from sfkd_jax.core.se2 import between, compose, rotate, wrap_angle
+from sfkd_jax.geometry import between, compose, rotate, wrap_angle
 
 RANDOM = np.random.default_rng(0)
 POSES = RANDOM.uniform(-5.0, 5.0, (50, 3)).astype(np.float32)

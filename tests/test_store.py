@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from helpers import dataset
 
-from sfkd_jax import datasets
+from sfkd_jax import data as datasets
 from sfkd_jax.artefacts import ArtefactError
 from sfkd_jax.pipeline import stages, store
 

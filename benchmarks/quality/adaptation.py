@@ -22,11 +22,11 @@ import numpy as np
 
 from benchmarks import harness
 from benchmarks.quality import adaptive_baselines
-from sfkd_jax import artefacts, build, control, evaluation, policy, scenarios, vehicle
-from sfkd_jax.core.offsets import with_offset
+from sfkd_jax import artefacts, build, control, evaluation, plants, policy, scenarios
 from sfkd_jax.evaluation import metrics
+from sfkd_jax.plants import equivalent_wind
+from sfkd_jax.rollout import with_offset
 from sfkd_jax.scenarios import random_side_forces
-from sfkd_jax.vehicle import equivalent_wind
 
 SPEED = 3
 """Index of the speed in a state."""
@@ -101,7 +101,7 @@ def changed_car(name, case):
     """The car of a case."""
     own = SHARED | DEFAULTS[name]
     changes = {key: factor * own[key] for key, factor in case.car}
-    car = getattr(vehicle, name)(**changes)
+    car = getattr(plants, name)(**changes)
     if not case.steering:
         return car
 
@@ -148,7 +148,7 @@ class Rows(NamedTuple):
 
     name: str
     loaded: policy.Policy
-    plant: vehicle.Vehicle
+    plant: plants.Vehicle
 
     @property
     def box(self):

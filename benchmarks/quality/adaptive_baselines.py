@@ -7,7 +7,7 @@ import jax
 import jax.numpy as jnp
 
 from sfkd_jax.control import PathLaw, curvature_ahead, path_coordinates
-from sfkd_jax.core.path_frame import path_state
+from sfkd_jax.geometry import path_state
 from sfkd_jax.types import BODY, Controller, Model
 
 OUTLIER = 100.0

@@ -19,7 +19,7 @@ import numpy as np
 from benchmarks import harness
 from benchmarks.quality import adaptation
 from sfkd_jax import artefacts
-from sfkd_jax.vehicle import side_force
+from sfkd_jax.plants import side_force
 
 AFTER = (0, 1, 2, 3, 5, 10, 20, 29)
 """Steps after a switch that are reported."""

@@ -18,7 +18,7 @@ from omegaconf import OmegaConf
 
 from sfkd_jax import build
 from sfkd_jax.cli import config
-from sfkd_jax.datasets import measure_space, random_windows, spread_windows
+from sfkd_jax.data import measure_space, random_windows, spread_windows
 from sfkd_jax.pipeline import stages
 from sfkd_jax.training import fit, multi_step_loss
 

@@ -21,11 +21,11 @@ from benchmarks.quality.shield_table import ASKED, FLAGS, misses, table
 from benchmarks.robustness.soak import ENVIRONMENT, LANE
 from sfkd_jax import build, policy, scenarios
 from sfkd_jax.control import PathLaw, curvature_ahead, path_coordinates
-from sfkd_jax.core.folding import fold
-from sfkd_jax.core.path_frame import LATERAL
 from sfkd_jax.evaluation import first_reference
+from sfkd_jax.geometry import LATERAL
+from sfkd_jax.plants import Vehicle
+from sfkd_jax.rollout import fold
 from sfkd_jax.types import Controller
-from sfkd_jax.vehicle import Vehicle
 
 SCRIPTS = ("nothing", "worst", "bang-bang", "random", "constant", "NaN", "full lock")
 """ν = 0; at its limit, outwards of the measured e_y; to and fro with a period of 1 to 8

@@ -16,11 +16,11 @@ from pathlib import Path
 import jax
 import numpy as np
 
-from sfkd_jax import artefacts, build, datasets, demo, evaluation, policy
+from sfkd_jax import artefacts, build, demo, evaluation, policy
+from sfkd_jax import data as datasets
 from sfkd_jax.certification import latent_tube
-from sfkd_jax.core.folding import fold
-from sfkd_jax.core.rollouts import step_disturbances
 from sfkd_jax.evaluation import predictions, theorem_reach, theorem_violations
+from sfkd_jax.rollout import fold, step_disturbances
 
 HORIZON, SEED = 20, 12345
 FORGED_ALPHA, FORGED_D_BAR = (0.98, 0.95, 0.9, 0.5), (0.5, 0.25)

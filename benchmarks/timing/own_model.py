@@ -6,7 +6,7 @@ from functools import partial
 
 from benchmarks import harness
 from benchmarks.timing import ours
-from sfkd_jax.core.folding import fold
+from sfkd_jax.rollout import fold
 
 SPEED, RADIUS = 10.0, 50.0
 PLANT = "vehicle=dynamic"

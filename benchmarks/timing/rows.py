@@ -12,7 +12,7 @@ import jax.numpy as jnp
 from benchmarks import harness
 from benchmarks.timing import own_model
 from sfkd_jax import build
-from sfkd_jax.core.folding import fold
+from sfkd_jax.rollout import fold
 from sfkd_jax.types import Space
 
 TABLES = ("protocol2", "protocol2_path")

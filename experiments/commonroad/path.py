@@ -21,15 +21,15 @@ from experiments.commonroad import traced_car
 from sfkd_jax import adapters, artefacts, policy
 from sfkd_jax.certification import corridor_coverage, output_metrics_from
 from sfkd_jax.control import law_to_arrays
-from sfkd_jax.core.path_frame import (
+from sfkd_jax.corridor import drive_measurement, drive_options, policy_loop
+from sfkd_jax.data import drive_switching
+from sfkd_jax.geometry import (
     CURVATURE,
     PATH_SPEED,
     PERTURBATION,
     REFERENCE_SPEED,
     vehicle_state,
 )
-from sfkd_jax.corridor import drive_measurement, drive_options, policy_loop
-from sfkd_jax.datasets import drive_switching
 from sfkd_jax.types import BODY, Trajectory
 
 RUN = Path("commonroad_path", "sfkd_path", "seed=0")

@@ -20,7 +20,8 @@ import numpy as np
 import sfkd_jax
 from benchmarks.timing.own_model import settings as composed
 from experiments.commonroad import tune
-from sfkd_jax import adapters, artefacts, build, evaluation, exporting, scenarios
+from sfkd_jax import adapters, artefacts, build, evaluation, scenarios
+from sfkd_jax import export as exporting
 from sfkd_jax.types import Controller
 
 FRICTIONS = (0.9, 0.6, 0.3)

@@ -14,9 +14,11 @@ from sfkd_jax import (
     artefacts,
     build,
     certification,
-    datasets,
     evaluation,
     policy,
+)
+from sfkd_jax import (
+    data as datasets,
 )
 from sfkd_jax.pipeline import store
 from sfkd_jax.training import fit, multi_step_loss

@@ -5,7 +5,7 @@ from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
     from sfkd_jax.artefacts import ArtefactError as ArtefactError
-    from sfkd_jax.exporting import warm_up as warm_up
+    from sfkd_jax.export import warm_up as warm_up
     from sfkd_jax.policy import Policy as Policy
     from sfkd_jax.policy import load as load
 
@@ -14,7 +14,7 @@ __version__ = "0.1.0"
 _LAZY = {
     "load": "policy",
     "Policy": "policy",
-    "warm_up": "exporting",
+    "warm_up": "export",
     "ArtefactError": "artefacts",
 }
 

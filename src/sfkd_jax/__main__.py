@@ -6,7 +6,7 @@ import sys
 from importlib import import_module
 
 from sfkd_jax.cli import messages
-from sfkd_jax.cli.commands import COMMANDS, VERSION, summary
+from sfkd_jax.cli.commands import COMMANDS, VERSION, module, summary
 from sfkd_jax.cli.help import USAGE, information
 
 COMPLETION = "completion"
@@ -27,7 +27,7 @@ def main() -> None:
     elif command in COMMANDS:
         entry = import_module("sfkd_jax.cli.entry")
         sys.argv = [f"sfkd {command}", *rest]
-        entry.hydra_command(import_module(f"sfkd_jax.{command}").run)()
+        entry.hydra_command(import_module(module(command)).run)()
     else:
         hint = messages.did_you_mean(command, (*COMMANDS, COMPLETION))
         sys.exit(f"sfkd_jax: unknown command {command}{hint or ';'} sfkd lists them")

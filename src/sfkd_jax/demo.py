@@ -11,7 +11,7 @@ from sfkd_jax.cli.entry import hydra_command
 from sfkd_jax.evaluation.metrics import text_table
 from sfkd_jax.paper import animate
 from sfkd_jax.pipeline import evaluate_system, grid, store
-from sfkd_jax.vehicle import Vehicle
+from sfkd_jax.plants import Vehicle
 
 SHIPPED = Path(__file__).with_name("pretrained")
 """vehicle, or vehicle_path in path coordinates -> policy.npz, its manifest and

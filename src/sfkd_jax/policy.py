@@ -15,9 +15,9 @@ import numpy as np
 
 from sfkd_jax import artefacts, build
 from sfkd_jax.control import PathLaw, law_from_arrays, law_to_arrays
-from sfkd_jax.core.folding import fold, unfold
+from sfkd_jax.plants import Vehicle
+from sfkd_jax.rollout import fold, unfold
 from sfkd_jax.types import Controller, Model, Params
-from sfkd_jax.vehicle import Vehicle
 
 KIND, LAW = "policy", "law"
 CERTIFICATE = "certificate.json"

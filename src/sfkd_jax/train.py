@@ -14,8 +14,8 @@ from sfkd_jax.cli.entry import hydra_command
 from sfkd_jax.paper import beside_the_paper
 from sfkd_jax.pipeline import certificates, dry_run, stages, store
 from sfkd_jax.pipeline.evaluate_run import evaluate_run
+from sfkd_jax.plants import check_step
 from sfkd_jax.reporting import write_report
-from sfkd_jax.vehicle import check_step
 
 
 def run(settings: dict[str, Any]) -> dict[str, Any]:

@@ -13,8 +13,7 @@ from brax import envs
 from brax.envs.wrappers.training import EvalWrapper, wrap
 from helpers import at, jit
 
-from sfkd_jax import adapters, build, control, evaluation, vehicle
-from sfkd_jax.core import se2
+from sfkd_jax import adapters, build, control, evaluation, geometry, plants
 from sfkd_jax.types import Controller
 
 STEPS = 25
@@ -62,7 +61,7 @@ def gentle(steps=STEPS, seed=3):
 
 @pytest.mark.parametrize("name", ["kinematic", "dynamic"])
 def test_it_steps_the_plant_and_nothing_else(name):
-    plant = getattr(vehicle, name)()
+    plant = getattr(plants, name)()
     start, after = driven(gentle(), name)
     moments, road = after.pipeline_state, start.info["road"]
     states = jnp.concatenate([start.pipeline_state.state[None], moments.state])
@@ -82,7 +81,7 @@ def test_a_controller_drives_it_as_the_test_track_has_it_driven():
     """The controls of a simulated episode, as actions: the same motion, and the same
     questions to the controller.
     """
-    plant, law = vehicle.kinematic(), build.build_driver(vehicle.kinematic())
+    plant, law = plants.kinematic(), build.build_driver(plants.kinematic())
 
     def act(params, state, observation, env, reference):
         info = {
@@ -119,7 +118,7 @@ def test_the_observation_has_the_documented_order():
     def observed(state):
         pose, environment, reference = env("dynamic").situation(state)
         rows = state.obs[10:].reshape(10, 4)
-        back = jax.vmap(se2.compose, in_axes=(None, 0))(pose[:3], rows[:, :3])
+        back = jax.vmap(geometry.compose, in_axes=(None, 0))(pose[:3], rows[:, :3])
         return environment, reference, jnp.concatenate([back, rows[:, 3:]], axis=1)
 
     environment, reference, seen = observed(last)
@@ -139,14 +138,14 @@ def test_the_observation_does_not_depend_on_where_the_road_lies():
 
     @jit
     def both(road, moment):
-        moved = jax.vmap(se2.compose, in_axes=(None, 0))(
+        moved = jax.vmap(geometry.compose, in_axes=(None, 0))(
             origin, road.path.points[:, :3]
         )
         elsewhere = road._replace(
             path=road.path._replace(points=road.path.points.at[:, :3].set(moved))
         )
         there = moment._replace(
-            state=moment.state.at[:3].set(se2.compose(origin, moment.state[:3]))
+            state=moment.state.at[:3].set(geometry.compose(origin, moment.state[:3]))
         )
         return env().task.observe(elsewhere, there), env().task.observe(road, moment)
 
@@ -333,7 +332,7 @@ def test_bad_settings_are_refused_in_one_line(settings, message):
     if settings.get("scenario") == "family":
         settings = settings | {
             "scenario": build.build_scenario(
-                {"name": "s1"}, vehicle.kinematic(), duration=2.0
+                {"name": "s1"}, plants.kinematic(), duration=2.0
             )
         }
     with pytest.raises(ValueError, match=message) as refusal:
@@ -342,7 +341,7 @@ def test_bad_settings_are_refused_in_one_line(settings, message):
 
 
 def test_a_plant_and_a_family_of_ones_own():
-    plant = vehicle.with_speed_loop(vehicle.dynamic(dt=0.05))
+    plant = plants.with_speed_loop(plants.dynamic(dt=0.05))
     family = build.build_scenario({"name": "seen"}, plant, duration=1.0)
     task = adapters.BraxVehicle(vehicle=plant, scenario=family).task
     assert (task.plant.dt, task.steps, task.observation_size) == (0.05, 20, 50)

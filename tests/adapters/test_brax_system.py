@@ -11,7 +11,8 @@ import pytest
 from brax import envs
 from helpers import at, jit
 
-from sfkd_jax import adapters, datasets
+from sfkd_jax import adapters
+from sfkd_jax import data as datasets
 from sfkd_jax.types import BODY, POSE
 
 PARAMETERS = ("gravity", "damping", "motor")

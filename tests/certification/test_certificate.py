@@ -26,7 +26,7 @@ from sfkd_jax.certification import (
     certify,
     verify,
 )
-from sfkd_jax.core.se2 import between
+from sfkd_jax.geometry import between
 from sfkd_jax.types import POSE
 
 RHO, BETA = 0.895, 0.1

@@ -11,8 +11,8 @@ from helpers import driven, jit, model_and_params
 from sfkd_jax import models
 from sfkd_jax.certification import clopper_pearson, conformal_tube, physical_tube
 from sfkd_jax.certification._calibration import conformal_quantile
-from sfkd_jax.core.rollouts import window_errors
 from sfkd_jax.evaluation import tube_violations
+from sfkd_jax.rollout import window_errors
 from sfkd_jax.types import Trajectory
 
 OPTIONS = {"level": 0.9, "horizon": 4, "stride": 2}

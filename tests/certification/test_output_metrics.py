@@ -21,8 +21,7 @@ from sfkd_jax.certification._claims import Refuted, readouts
 from sfkd_jax.certification._exported import exported
 from sfkd_jax.certification._metric_search import propose_metric
 from sfkd_jax.certification._radii import Residuals, worst_gaps
-from sfkd_jax.core.folding import fold
-from sfkd_jax.core.rollouts import rollout
+from sfkd_jax.rollout import fold, rollout
 from sfkd_jax.types import Trajectory
 
 OPTIONS = TINY | {

@@ -7,8 +7,8 @@ import pytest
 from helpers import ENV_HIGH, ENV_LOW, at, certified, driven, jit, model_and_params
 
 from sfkd_jax.certification import certify, disturbances, latent_tube, physical_tube
-from sfkd_jax.core.rollouts import rollout
-from sfkd_jax.core.se2 import wrap_angle
+from sfkd_jax.geometry import wrap_angle
+from sfkd_jax.rollout import rollout
 
 
 @pytest.mark.parametrize(

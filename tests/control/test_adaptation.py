@@ -8,16 +8,16 @@ import numpy as np
 import pytest
 from helpers import ENV_HIGH, ENV_LOW, any_law, certified, jit, model_and_params
 
-from sfkd_jax import build, certification, control, models, vehicle
+from sfkd_jax import build, certification, control, models, plants
 from sfkd_jax.certification._exported import exported
 from sfkd_jax.control.wrappers import _disturbances as disturbances
 from sfkd_jax.control.wrappers import _kalman as kalman
 from sfkd_jax.control.wrappers._adaptation import BOUNDS
-from sfkd_jax.core.offsets import Offset, with_offset
-from sfkd_jax.core.path_frame import path_state
+from sfkd_jax.geometry import path_state
+from sfkd_jax.rollout import Offset, with_offset
 from sfkd_jax.types import BODY, Controller
 
-PLANT, LAW = vehicle.kinematic(), any_law()
+PLANT, LAW = plants.kinematic(), any_law()
 MODEL = models.physics(build.build_loop(PLANT, LAW).step, along_path=True)
 """The true loop as a model, so that every estimate has an exact answer."""
 LOOP = disturbances.Loop(MODEL, LAW, jnp.asarray(ENV_LOW), jnp.asarray(ENV_HIGH))

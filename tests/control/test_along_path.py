@@ -8,12 +8,12 @@ import numpy as np
 import pytest
 from helpers import any_law, tiny
 
-from sfkd_jax import build, control, vehicle
+from sfkd_jax import build, control, plants
 from sfkd_jax.control import curvature_ahead, path_coordinates, turn_control
-from sfkd_jax.core.se2 import compose
+from sfkd_jax.geometry import compose
 from sfkd_jax.scenarios import path_from_curvature, reference_window
 
-PLANT = vehicle.kinematic()
+PLANT = plants.kinematic()
 LAW = any_law()
 ENV = jnp.asarray([0.6, 2.0])
 LIMITS = {

@@ -23,12 +23,11 @@ from helpers import (
 )
 from jaxtyping import jaxtyped
 
-from sfkd_jax import build, control, evaluation, models, scenarios, vehicle
-from sfkd_jax.core.folding import fold
-from sfkd_jax.core.offsets import with_offset
+from sfkd_jax import build, control, evaluation, models, plants, scenarios
+from sfkd_jax.rollout import fold, with_offset
 from sfkd_jax.types import ControllerInfo
 
-PLANT = vehicle.kinematic()
+PLANT = plants.kinematic()
 LIMITS = {"control_low": PLANT.control_low, "control_high": PLANT.control_high}
 BOX = {"env_low": ENV_LOW, "env_high": ENV_HIGH}
 HORIZON = 5

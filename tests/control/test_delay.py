@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 from helpers import jit, straight
 
-from sfkd_jax import control, models, vehicle
+from sfkd_jax import control, models, plants
 
-PLANT = vehicle.kinematic()
+PLANT = plants.kinematic()
 HORIZON, DELAY = 8, 3
 ENV = jnp.asarray([0.7, 3.0])
 START = jnp.asarray([0.0, 0.4, 0.1, 10.0])

@@ -8,10 +8,10 @@ import numpy as np
 import pytest
 from helpers import ENV_HIGH, ENV_LOW, jit
 
-from sfkd_jax import control, models, vehicle
+from sfkd_jax import control, models, plants
 from sfkd_jax.types import Controller, Model
 
-PLANT = vehicle.kinematic()
+PLANT = plants.kinematic()
 BOX = {"env_low": ENV_LOW, "env_high": ENV_HIGH, "states": 4}
 NOISE = (0.015, 0.015, 0.002, 0.03)
 EXACT = {

@@ -5,7 +5,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from sfkd_jax import control, models, vehicle
+from sfkd_jax import control, models, plants
 
 A = jnp.asarray([[1.0, 0.1], [0.0, 1.0]])
 B = jnp.asarray([[0.0], [0.1]])
@@ -77,7 +77,7 @@ def test_the_heaviest_samples_are_enough():
 
 def test_the_feedback_law_of_a_task_is_part_of_the_gains():
     """Along a path, by finite differences; the law's gain is most of it."""
-    plant = vehicle.kinematic()
+    plant = plants.kinematic()
     task = control.path_tracking(
         models.physics(plant.step),
         control.tracking_cost(dt=plant.dt),

@@ -9,11 +9,12 @@ import numpy as np
 import pytest
 from helpers import ENV_HIGH, ENV_LOW, dataset, jit, model_and_params, same, straight
 
-from sfkd_jax import control, datasets, evaluation, models, scenarios, vehicle
+from sfkd_jax import control, evaluation, models, plants, scenarios
+from sfkd_jax import data as datasets
 from sfkd_jax.control import StageInputs
 from sfkd_jax.control.planners import _koopman_mpc
 
-PLANT = vehicle.kinematic()
+PLANT = plants.kinematic()
 LIMITS = {
     "dt": PLANT.dt,
     "control_low": PLANT.control_low,

@@ -9,11 +9,11 @@ import pytest
 import scipy.linalg
 from helpers import jit, model_and_params, straight
 
-from sfkd_jax import control, models, vehicle
+from sfkd_jax import control, models, plants
 from sfkd_jax.control.laws._model_law import _along_circle, solve
 
 LAW = control.ModelLaw(dt=0.1)
-PLANTS = {"kinematic": vehicle.kinematic(), "dynamic": vehicle.dynamic()}
+PLANTS = {"kinematic": plants.kinematic(), "dynamic": plants.dynamic()}
 ENV = jnp.asarray([0.6, 5.0])
 CURVATURE = jnp.asarray([0.0, 0.01, -0.02])
 

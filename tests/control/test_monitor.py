@@ -8,11 +8,11 @@ import numpy as np
 import pytest
 from helpers import ENV_HIGH, ENV_LOW, at, driven, jit, model_and_params, same, straight
 
-from sfkd_jax import certification, control, evaluation, models, scenarios, vehicle
-from sfkd_jax.core.rollouts import fibers_along, step_disturbances
+from sfkd_jax import certification, control, evaluation, models, plants, scenarios
+from sfkd_jax.rollout import fibers_along, step_disturbances
 from sfkd_jax.types import Controller, Trajectory
 
-PLANT = vehicle.kinematic()
+PLANT = plants.kinematic()
 BOXES = {
     "state_low": (0.0,),
     "state_high": (30.0,),

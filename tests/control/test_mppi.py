@@ -8,9 +8,9 @@ import numpy as np
 import pytest
 from helpers import ENV_HIGH, ENV_LOW, jit, model_and_params, same, straight
 
-from sfkd_jax import control, evaluation, models, scenarios, vehicle
+from sfkd_jax import control, evaluation, models, plants, scenarios
 
-PLANT = vehicle.kinematic()
+PLANT = plants.kinematic()
 LIMITS = {"control_low": PLANT.control_low, "control_high": PLANT.control_high}
 WIDE = {"control_low": (-1e3, -1e3), "control_high": (1e3, 1e3)}
 BOX = {"env_low": ENV_LOW, "env_high": ENV_HIGH}

@@ -7,13 +7,13 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from sfkd_jax import artefacts, vehicle
+from sfkd_jax import artefacts, plants
 from sfkd_jax.control import derive_path_law, law_from_arrays, law_to_arrays
-from sfkd_jax.core.path_frame import path_state, path_step
+from sfkd_jax.geometry import path_state, path_step
 from sfkd_jax.types import BODY
 
 BOX = {"env_low": (0.3, -8.0), "env_high": (0.9, 8.0)}
-PLANTS = {"kinematic": vehicle.kinematic(), "dynamic": vehicle.dynamic()}
+PLANTS = {"kinematic": plants.kinematic(), "dynamic": plants.dynamic()}
 
 
 @pytest.fixture(scope="module", params=PLANTS)
@@ -43,7 +43,7 @@ def test_the_law_alone_keeps_the_car_on_its_path(derived, env):
     cm.
     """
     plant, law = derived
-    loop = vehicle.along_path(plant, law)
+    loop = plants.along_path(plant, law)
     inputs = jnp.asarray([0.0, 0.0, 0.016, 10.0])
     start = path_state(
         jnp.zeros(len(plant.state_names) - 1).at[0].set(0.4).at[2].set(9.0)
@@ -63,7 +63,7 @@ def test_the_loop_contracts_alike_where_tyres_give_little(derived):
     is below 0.92.
     """
     plant, law = derived
-    loop = vehicle.along_path(plant, law)
+    loop = plants.along_path(plant, law)
     for env in ((0.3, 8.0), (0.9, 0.0)):
         turn = law.turn(jnp.asarray(0.02), jnp.asarray(10.0), jnp.asarray(env))
         inputs = jnp.asarray([0.0, 0.0, 0.02, 10.0])

@@ -10,10 +10,10 @@ from helpers import TINY, any_law, jit, path_space, same, tiny
 
 from sfkd_jax import build, control, models
 from sfkd_jax.control import curvature_ahead, path_coordinates, safety_filter, shielded
-from sfkd_jax.core.folding import fold, unfold
-from sfkd_jax.core.path_frame import path_state, vehicle_state
+from sfkd_jax.geometry import path_state, vehicle_state
+from sfkd_jax.plants import kinematic
+from sfkd_jax.rollout import fold, unfold
 from sfkd_jax.types import BODY, Controller, Model
-from sfkd_jax.vehicle import kinematic
 
 LAW = any_law()
 ENV = jnp.asarray([0.6, 2.0])

@@ -10,11 +10,11 @@ import numpy as np
 import pytest
 from helpers import any_law, dataset, jit
 
-from sfkd_jax import build, evaluation, vehicle
+from sfkd_jax import build, evaluation, plants
 from sfkd_jax.types import Trajectory
 
 DT, HORIZON, STEPS = 0.1, 10, 20
-PLANT = vehicle.kinematic()
+PLANT = plants.kinematic()
 
 
 def rolled(step, start, controls):

@@ -10,10 +10,10 @@ import numpy as np
 import pytest
 from helpers import at, driven, jit, model_and_params
 
-from sfkd_jax import control, evaluation, models, scenarios, vehicle
+from sfkd_jax import control, evaluation, models, plants, scenarios
 from sfkd_jax.types import Controller
 
-PLANT = vehicle.kinematic()
+PLANT = plants.kinematic()
 HORIZON, STEPS = 12, 100
 SENSORS = (0.02, 0.02, 0.005, 0.05)
 

@@ -10,8 +10,7 @@ import numpy as np
 import pytest
 from helpers import at, driven, jit, model_and_params
 
-from sfkd_jax import evaluation, models, scenarios, vehicle
-from sfkd_jax.core.rollouts import fibers_along, rollout, sliding_windows, window_errors
+from sfkd_jax import evaluation, models, plants, scenarios
 from sfkd_jax.evaluation import (
     Claims,
     Predictions,
@@ -22,10 +21,11 @@ from sfkd_jax.evaluation import (
     tube_violations,
     violations,
 )
+from sfkd_jax.rollout import fibers_along, rollout, sliding_windows, window_errors
 from sfkd_jax.types import Controller, Trajectory
 
 DT = 0.1
-PLANTS = {"kinematic": vehicle.kinematic(), "dynamic": vehicle.dynamic()}
+PLANTS = {"kinematic": plants.kinematic(), "dynamic": plants.dynamic()}
 
 
 def still(count=2, steps=12):
@@ -323,7 +323,7 @@ def test_the_record_names_the_tube_it_speaks_of_and_is_null_where_nothing_is_cla
 )
 def test_a_push_is_the_wind_that_pushes_as_hard(name, wind, force):
     plant = PLANTS[name]
-    felt = vehicle.equivalent_wind(
+    felt = plants.equivalent_wind(
         jnp.asarray(wind), jnp.asarray(force), wind_force=plant.wind_force
     )
     expected = plant.wind_force * wind * abs(wind) + force
@@ -338,7 +338,7 @@ def test_a_push_accelerates_the_dynamic_plant_by_force_over_mass_and_turns_it_by
         jnp.asarray([0.0, 0.0, 0.3, 10.0, 0.1, 0.05, 0.02]),
         jnp.asarray([0.03, 0.5]),
     )
-    felt = vehicle.equivalent_wind(
+    felt = plants.equivalent_wind(
         jnp.asarray(4.0), jnp.asarray(force), wind_force=plant.wind_force
     )
     rates = [
@@ -358,7 +358,7 @@ def test_a_side_force_is_the_wind_that_pushes_as_hard():
     """
     road, plant = at(roads(), 0), PLANTS["kinematic"]
     calm, windy = road.envs.at[:, 1].set(0.0), road.envs.at[:, 1].set(5.0)
-    felt = jax.vmap(partial(vehicle.equivalent_wind, wind_force=plant.wind_force))(
+    felt = jax.vmap(partial(plants.equivalent_wind, wind_force=plant.wind_force))(
         calm[:, 1], jnp.full(len(calm), 250.0)
     )
     drive = jit(

@@ -19,8 +19,8 @@ from helpers import (
 
 from sfkd_jax import models
 from sfkd_jax.certification import lipschitz_upper
-from sfkd_jax.core.folding import fold
 from sfkd_jax.models.sfkd import Sandwich, bounded, cayley, gram_bound
+from sfkd_jax.rollout import fold
 
 RHO, BETA = 0.895, 0.1
 MARGIN = 1e-5

@@ -10,8 +10,8 @@ import scipy.linalg
 import scipy.special
 from helpers import jit, same, space
 
-from sfkd_jax import models, vehicle
-from sfkd_jax.core.se2 import compose
+from sfkd_jax import models, plants
+from sfkd_jax.geometry import compose
 from sfkd_jax.models._continuous import Conditioned, continuous
 from sfkd_jax.models._icode import affine_rates, softplus
 from sfkd_jax.types import BODY, POSE
@@ -22,7 +22,7 @@ SIZES = {
     "icode": {"width": 8},
     "icode_mppi": {"hidden": (8, 8)},
 }
-PLANTS = {1: vehicle.kinematic, 4: vehicle.dynamic}
+PLANTS = {1: plants.kinematic, 4: plants.dynamic}
 STATES = {
     1: jnp.asarray([5.0, -2.0, 0.7, 11.0]),
     4: jnp.asarray([5.0, -2.0, 0.7, 11.0, -0.3, 0.2, 0.1]),
@@ -265,7 +265,7 @@ def test_a_blind_model_ignores_the_environment_exactly_and_any_other_does_not(na
 @pytest.mark.usefixtures("x64")
 @pytest.mark.parametrize(
     "loop",
-    [lambda plant: plant, vehicle.with_speed_loop],
+    [lambda plant: plant, plants.with_speed_loop],
     ids=["acceleration", "speed"],
 )
 @pytest.mark.parametrize("body", PLANTS)
@@ -275,14 +275,14 @@ def test_without_a_residual_the_known_dynamics_are_all_that_moves(body, loop):
     nothing = jax.tree.map(jnp.zeros_like, drawn("icode_mppi", body))
     state, control = STATES[body].astype(jnp.float64), CONTROL.astype(jnp.float64)
     moved = stepped(model, nothing, state, control)
-    expected = vehicle.rk4(plant.nominal_derivative, dt=0.1)(state, control, ENV)
+    expected = plants.rk4(plant.nominal_derivative, dt=0.1)(state, control, ENV)
     np.testing.assert_allclose(moved, expected, rtol=0, atol=1e-13)
 
 
 def test_the_initial_residual_is_too_small_to_matter():
     plant, model = (
-        vehicle.kinematic(),
-        models.icode_mppi(space(), nominal=vehicle.kinematic().nominal_derivative),
+        plants.kinematic(),
+        models.icode_mppi(space(), nominal=plants.kinematic().nominal_derivative),
     )
     moved = stepped(model, model.init(jax.random.key(0)), STATES[1])
     np.testing.assert_allclose(moved, plant.nominal(STATES[1], CONTROL, ENV), atol=2e-2)
@@ -291,7 +291,7 @@ def test_the_initial_residual_is_too_small_to_matter():
 @pytest.mark.parametrize("name", LEARNED)
 def test_no_model_is_much_larger_or_smaller_than_the_others(name):
     known = (
-        {"nominal": vehicle.kinematic().nominal_derivative}
+        {"nominal": plants.kinematic().nominal_derivative}
         if name == "icode_mppi"
         else {}
     )

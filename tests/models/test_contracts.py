@@ -22,9 +22,8 @@ from helpers import (
 )
 
 from sfkd_jax import artefacts, models
-from sfkd_jax.core.folding import fold
-from sfkd_jax.core.rollouts import rollout
-from sfkd_jax.core.se2 import compose
+from sfkd_jax.geometry import compose
+from sfkd_jax.rollout import fold, rollout
 from sfkd_jax.types import POSE
 
 EVERY = (*VARIANTS, *OTHERS, *PHYSICS)

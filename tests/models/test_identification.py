@@ -10,12 +10,12 @@ import pytest
 from helpers import driven, jit, space, tiny
 
 from sfkd_jax import models
-from sfkd_jax.core.rollouts import defects
 from sfkd_jax.models._identification import bounded_ridge, ridge_regression
 from sfkd_jax.models.sfkd import bounded
 from sfkd_jax.models.sfkd._bounds import attainable, unbounded
 from sfkd_jax.models.sfkd._budget import budget_factors
 from sfkd_jax.pipeline import train_policy
+from sfkd_jax.rollout import defects
 
 RIDGE, BOUND, RANK = 1e-3, 0.7, 4
 

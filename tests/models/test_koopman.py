@@ -8,12 +8,13 @@ import numpy as np
 import pytest
 from helpers import at, dataset, jit, same, space
 
-from sfkd_jax import datasets, models
-from sfkd_jax.core.rollouts import defects, rollout
-from sfkd_jax.core.se2 import between, compose
+from sfkd_jax import data as datasets
+from sfkd_jax import models
+from sfkd_jax.geometry import between, compose
 from sfkd_jax.models._edmd import along_circle, thin_plate
 from sfkd_jax.models._identification import ridge_regression
 from sfkd_jax.models._koopman_lift import Lift
+from sfkd_jax.rollout import defects, rollout
 from sfkd_jax.types import POSE, Trajectory
 
 F = np.float32([[0.9, 0.1], [-0.2, 0.7]])

@@ -14,7 +14,7 @@ import numpy as np
 import pytest
 from helpers import TINY, dataset, largest_file
 
-from sfkd_jax.datasets import measure_space, random_windows, spread_windows
+from sfkd_jax.data import measure_space, random_windows, spread_windows
 from sfkd_jax.models import sfkd
 from sfkd_jax.training import Checkpoints, TrainingStopped, fit, multi_step_loss
 from sfkd_jax.training._log import TrainingLog
@@ -196,7 +196,7 @@ import jax
 from functools import partial
 from pathlib import Path
 from helpers import TINY, dataset
-from sfkd_jax.datasets import measure_space, random_windows, spread_windows
+from sfkd_jax.data import measure_space, random_windows, spread_windows
 from sfkd_jax.models import sfkd
 from sfkd_jax.training import fit, multi_step_loss
 data = dataset()

@@ -15,7 +15,7 @@ import pytest
 from helpers import TINY, dataset, largest_file
 
 from sfkd_jax import artefacts
-from sfkd_jax.datasets import measure_space, random_windows, spread_windows
+from sfkd_jax.data import measure_space, random_windows, spread_windows
 from sfkd_jax.models import sfkd
 from sfkd_jax.training import Checkpoints, fit, multi_step_loss
 from sfkd_jax.training._log import TrainingLog

@@ -10,9 +10,9 @@ import numpy as np
 import pytest
 from helpers import TINY, any_law
 
-from sfkd_jax import models, vehicle
-from sfkd_jax.core.rollouts import defects
-from sfkd_jax.datasets import generate_along_path, measure_space, random_windows, split
+from sfkd_jax import models, plants
+from sfkd_jax.data import generate_along_path, measure_space, random_windows, split
+from sfkd_jax.rollout import defects
 from sfkd_jax.training import multi_step_loss
 from sfkd_jax.training._losses import error_units, power_mean
 
@@ -21,7 +21,7 @@ LOW, HIGH = (0.3, -8.0), (0.9, 8.0)
 
 @pytest.fixture(scope="module")
 def learned():
-    loop = vehicle.along_path(vehicle.kinematic(), any_law())
+    loop = plants.along_path(plants.kinematic(), any_law())
     drives = jax.jit(
         partial(
             generate_along_path, loop, segments=32, steps=12, env_low=LOW, env_high=HIGH

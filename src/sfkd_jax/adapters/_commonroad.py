@@ -24,8 +24,8 @@ from sfkd_jax.adapters._commonroad_equations import (
     to_commonroad,
     with_friction,
 )
+from sfkd_jax.plants import Vehicle, dynamic
 from sfkd_jax.types import Control, Controller, Environment, State, Step
-from sfkd_jax.vehicle import Vehicle, dynamic
 
 SLOWEST = 0.5  # m/s; the multi-body car divides by the speed over ground at every wheel
 ACCURACY: dict[str, Any] = {"method": "RK23", "rtol": 1e-5, "atol": 1e-7}

@@ -7,8 +7,8 @@ import math
 import jax
 
 from sfkd_jax import build
+from sfkd_jax.plants import Vehicle
 from sfkd_jax.scenarios import Family
-from sfkd_jax.vehicle import Vehicle
 
 
 def choose_plant(vehicle: str | Vehicle, inner_loop: str) -> Vehicle:

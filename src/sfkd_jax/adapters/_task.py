@@ -18,7 +18,8 @@ from sfkd_jax.adapters._settings import (
     count_steps,
     observation_bounds,
 )
-from sfkd_jax.core.se2 import between, wrap_angle
+from sfkd_jax.geometry import between, wrap_angle
+from sfkd_jax.plants import Vehicle
 from sfkd_jax.scenarios import Family, Scenario, point_at, project, reference_window
 from sfkd_jax.types import (
     BODY,
@@ -30,7 +31,6 @@ from sfkd_jax.types import (
     Scalar,
     State,
 )
-from sfkd_jax.vehicle import Vehicle
 
 MEASURES = ("lateral", "speed_error", "steering_rate")
 

@@ -4,11 +4,11 @@ from __future__ import annotations
 
 from typing import Any
 
-from sfkd_jax import control, vehicle
+from sfkd_jax import control, plants
 from sfkd_jax.build._choices import Settings, as_kwargs, floats
 from sfkd_jax.build._planners import chosen_planner, controller_horizon
-from sfkd_jax.core.offsets import with_offset
-from sfkd_jax.core.path_frame import LATERAL
+from sfkd_jax.geometry import LATERAL
+from sfkd_jax.rollout import with_offset
 from sfkd_jax.types import Controller, Model
 
 ROAD_MARGIN = 0.05
@@ -24,7 +24,7 @@ ENV_SOURCES = ("measured", "estimated", "none")
 def build_controller(
     settings: Settings,
     model: Model,
-    plant: vehicle.Vehicle,
+    plant: plants.Vehicle,
     *,
     env_low: Any = None,
     env_high: Any = None,
@@ -93,7 +93,7 @@ def build_controller(
 def in_corridor(
     planner: Controller,
     model: Model,
-    plant: vehicle.Vehicle,
+    plant: plants.Vehicle,
     law: control.PathLaw,
     certificate: Settings,
 ) -> Controller:
@@ -158,7 +158,7 @@ def _adaptive(
     planner: Controller,
     settings: Settings,
     model: Model,
-    plant: vehicle.Vehicle,
+    plant: plants.Vehicle,
     law: control.PathLaw,
     box: tuple[Any, Any],
     env_source: str,
@@ -188,7 +188,7 @@ def _estimated(
     planner: Controller,
     settings: Settings,
     model: Model,
-    plant: vehicle.Vehicle,
+    plant: plants.Vehicle,
     env_low: Any,
     env_high: Any,
 ) -> Controller:

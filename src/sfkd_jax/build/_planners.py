@@ -6,7 +6,7 @@ from collections.abc import Callable
 from functools import partial
 from typing import Any, NamedTuple
 
-from sfkd_jax import control, vehicle
+from sfkd_jax import control, plants
 from sfkd_jax.build._choices import Settings, as_kwargs, choose, floats
 from sfkd_jax.types import Controller, Model
 
@@ -16,7 +16,7 @@ def _sampled(
     search: Callable[..., Controller],
     settings: Settings,
     model: Model,
-    plant: vehicle.Vehicle,
+    plant: plants.Vehicle,
     env_low: Any,
     env_high: Any,
     law: control.PathLaw | None = None,
@@ -57,18 +57,18 @@ def _sampled(
     return search(task, **boxes, **as_kwargs(settings[name]))
 
 
-def _feedback(settings: Settings, plant: vehicle.Vehicle) -> control.FeedbackLaw:
+def _feedback(settings: Settings, plant: plants.Vehicle) -> control.FeedbackLaw:
     gains = as_kwargs(settings["feedback"])
     return control.path_feedback(
         wheelbase=plant.wheelbase, speed_loop=plant.speed_loop, **gains
     )
 
 
-def _model_law(settings: Settings, plant: vehicle.Vehicle) -> control.ModelLaw:
+def _model_law(settings: Settings, plant: plants.Vehicle) -> control.ModelLaw:
     return control.ModelLaw(dt=plant.dt, **as_kwargs(settings["model_law"]))
 
 
-def _no_feedback(settings: Settings, plant: vehicle.Vehicle) -> control.FeedbackLaw:
+def _no_feedback(settings: Settings, plant: plants.Vehicle) -> control.FeedbackLaw:
     del settings
     return control.no_feedback(speed_loop=plant.speed_loop)
 
@@ -76,7 +76,7 @@ def _no_feedback(settings: Settings, plant: vehicle.Vehicle) -> control.Feedback
 def _koopman_mpc(
     settings: Settings,
     model: Model,
-    plant: vehicle.Vehicle,
+    plant: plants.Vehicle,
     env_low: Any,
     env_high: Any,
 ) -> Controller:

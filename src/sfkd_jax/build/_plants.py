@@ -9,22 +9,23 @@ from typing import Any
 
 import jax.numpy as jnp
 
-from sfkd_jax import control, datasets, models, scenarios, vehicle
+from sfkd_jax import control, models, plants, scenarios
+from sfkd_jax import data as datasets
 from sfkd_jax.build._choices import Settings, as_kwargs, choose
 from sfkd_jax.types import Control, Model, Reference, Space, State
 
 PLANTS = {
-    "kinematic": vehicle.kinematic,
-    "kinematic_stiff": vehicle.kinematic_stiff,
-    "dynamic": vehicle.dynamic,
-    "own": vehicle.own,
+    "kinematic": plants.kinematic,
+    "kinematic_stiff": plants.kinematic_stiff,
+    "dynamic": plants.dynamic,
+    "own": plants.own,
 }
 MODELS = models.FACTORIES | {"own": models.own}
 """Models of settings: those of the package, and one from outside by name."""
 INNER_LOOPS = ("none", "speed")
 
 
-def build_vehicle(settings: Settings) -> vehicle.Vehicle:
+def build_vehicle(settings: Settings) -> plants.Vehicle:
     """Return the vehicle of the settings, with its inner loop.
 
     Raises:
@@ -39,16 +40,16 @@ def build_vehicle(settings: Settings) -> vehicle.Vehicle:
     factory = choose(PLANTS, settings["name"], "vehicle")
     options = as_kwargs(settings, "name", "inner_loop", "speed_gain")
     if options.get("step") is not None:
-        options["step"] = vehicle.step_named(options["step"])
+        options["step"] = plants.step_named(options["step"])
     plant = factory(**options)
     return (
-        vehicle.with_speed_loop(plant, gain=settings["speed_gain"])
+        plants.with_speed_loop(plant, gain=settings["speed_gain"])
         if loop == "speed"
         else plant
     )
 
 
-def build_model(settings: Settings, space: Space, plant: vehicle.Vehicle) -> Model:
+def build_model(settings: Settings, space: Space, plant: plants.Vehicle) -> Model:
     """Return the model of the settings.
 
     Models with prior knowledge take it from the vehicle: the sampling period and the
@@ -112,7 +113,7 @@ def space_from_settings(settings: Settings) -> Space:
 
 
 def build_scenario(
-    settings: Settings, plant: vehicle.Vehicle, *, duration: float
+    settings: Settings, plant: plants.Vehicle, *, duration: float
 ) -> scenarios.Family:
     """Return the scenario family of the settings.
 
@@ -129,7 +130,7 @@ def build_scenario(
     )
 
 
-def build_driver(plant: vehicle.Vehicle) -> datasets.Driver:
+def build_driver(plant: plants.Vehicle) -> datasets.Driver:
     """Return the path-following law that drives while data are collected."""
     law = control.path_feedback(wheelbase=plant.wheelbase, speed_loop=plant.speed_loop)
 

@@ -6,7 +6,7 @@ from collections.abc import Callable
 from functools import partial
 from typing import Any, NamedTuple
 
-from sfkd_jax import control, models, vehicle
+from sfkd_jax import control, models, plants
 from sfkd_jax.build._choices import Settings, as_kwargs, floats
 from sfkd_jax.types import Environment, Model
 
@@ -29,7 +29,7 @@ class System(NamedTuple):
     law: control.PathLaw | None = None
 
 
-def build_law(settings: Settings, plant: vehicle.Vehicle) -> control.PathLaw | None:
+def build_law(settings: Settings, plant: plants.Vehicle) -> control.PathLaw | None:
     """Derive the law of a data set in path coordinates from the vehicle's step.
 
     Args:
@@ -48,14 +48,14 @@ def build_law(settings: Settings, plant: vehicle.Vehicle) -> control.PathLaw | N
     )
 
 
-def build_loop(plant: vehicle.Vehicle, law: control.PathLaw) -> vehicle.Vehicle:
+def build_loop(plant: plants.Vehicle, law: control.PathLaw) -> plants.Vehicle:
     """Return the closed loop of plant and law, in the coordinates of `path_frame`."""
     steering, drive = (float(largest) for largest in law.perturbation)
-    return vehicle.along_path(plant, law, perturbation=(steering, drive))
+    return plants.along_path(plant, law, perturbation=(steering, drive))
 
 
 def reference_systems(
-    plant: vehicle.Vehicle, law: control.PathLaw | None = None
+    plant: plants.Vehicle, law: control.PathLaw | None = None
 ) -> dict[str, System]:
     """Return the systems that need no learning, by name.
 

@@ -15,7 +15,7 @@ from sfkd_jax.certification._attack import (
 )
 from sfkd_jax.certification._claims import Claims, decoders
 from sfkd_jax.certification._exported import CertificationRefused, Exported, one_thread
-from sfkd_jax.core.folding import fold
+from sfkd_jax.rollout import fold
 from sfkd_jax.types import Model, Params, Polytope
 
 FLOAT32 = 1e-5

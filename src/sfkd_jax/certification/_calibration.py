@@ -12,7 +12,7 @@ import numpy as np
 from jaxtyping import Array, Float
 from scipy.special import betaincinv
 
-from sfkd_jax.core.rollouts import fibers_along, step_disturbances
+from sfkd_jax.rollout import fibers_along, step_disturbances
 from sfkd_jax.types import Model, Params, Trajectory
 
 

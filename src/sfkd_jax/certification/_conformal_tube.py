@@ -10,7 +10,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from sfkd_jax.certification._calibration import conformal_quantile
-from sfkd_jax.core.rollouts import in_batches, window_errors
+from sfkd_jax.rollout import in_batches, window_errors
 from sfkd_jax.types import Model, Params, Trajectory
 
 KINDS = ("position_m", "yaw_rad", "body")

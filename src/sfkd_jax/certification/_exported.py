@@ -11,7 +11,7 @@ import jax
 import numpy as np
 from threadpoolctl import ThreadpoolController
 
-from sfkd_jax.core.folding import unfold
+from sfkd_jax.rollout import unfold
 from sfkd_jax.types import Incremental, Model, Params, Samples
 
 ACTIVATIONS = ("tanh", "relu", "sigmoid", "softplus", "elu")

@@ -27,8 +27,8 @@ from jaxtyping import Array, Float
 
 from sfkd_jax.certification._claims import Refuted
 from sfkd_jax.certification._output_metrics import OutputMetric
-from sfkd_jax.core.path_frame import LATERAL, PERTURBATION
-from sfkd_jax.core.rollouts import in_batches
+from sfkd_jax.geometry import LATERAL, PERTURBATION
+from sfkd_jax.rollout import in_batches
 from sfkd_jax.types import BODY, Environment, Latent, Model, Params, State
 
 BATCH = 500

@@ -33,8 +33,8 @@ from sfkd_jax.certification._tube import (
     physical_tube,
     ultimate_tube,
 )
-from sfkd_jax.core.folding import fold
-from sfkd_jax.core.ranges import Fraction, Interval, NonNegativeInt
+from sfkd_jax.ranges import Fraction, Interval, NonNegativeInt
+from sfkd_jax.rollout import fold
 from sfkd_jax.types import Key, Model, Params, Polytope, Trajectory
 
 

@@ -11,8 +11,8 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from sfkd_jax.certification._output_metrics import OUTPUTS, OutputMetric
-from sfkd_jax.core.path_frame import HEADING, LATERAL
-from sfkd_jax.core.rollouts import defects, in_batches
+from sfkd_jax.geometry import HEADING, LATERAL
+from sfkd_jax.rollout import defects, in_batches
 from sfkd_jax.types import BODY, Model, Params, Trajectory
 
 BATCH = 50

@@ -22,8 +22,17 @@ COMMANDS = (
 VERSION = f"sfkd_jax {__version__}"
 
 
+def module(command: str) -> str:
+    """Return the name of a command's module: a package runs its `__main__`."""
+    package = Path(__file__).parents[1] / command / "__main__.py"
+    return f"sfkd_jax.{command}" + (".__main__" if package.exists() else "")
+
+
 def summary(command: str) -> str:
     """Return the first line of a command's module docstring, without importing it."""
-    file = Path(__file__).parents[1] / f"{command}.py"
+    root = Path(__file__).parents[1]
+    file = root / f"{command}.py"
+    if not file.exists():
+        file = root / command / "__main__.py"
     text = ast.get_docstring(ast.parse(file.read_text("utf-8"))) or ""
     return text.split("\n")[0]

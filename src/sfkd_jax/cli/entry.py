@@ -109,7 +109,7 @@ def _name(run: Run) -> str:
     """Return the name of the module of a command, also if it runs as a script."""
     spec = getattr(sys.modules.get(run.__module__), "__spec__", None)
     module = spec.name if spec else Path(sys.argv[0]).stem
-    return module.rpartition(".")[2]
+    return module.removesuffix(".__main__").rpartition(".")[2]
 
 
 def _typed() -> list[str]:

@@ -10,11 +10,15 @@ from hydra.core.config_store import ConfigStore
 from sfkd_jax import (
     build,
     control,
-    datasets,
     evaluation,
-    exporting,
     scenarios,
     training,
+)
+from sfkd_jax import (
+    data as datasets,
+)
+from sfkd_jax import (
+    export as exporting,
 )
 from sfkd_jax.certification import issue
 from sfkd_jax.cli import settings

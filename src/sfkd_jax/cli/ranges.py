@@ -12,7 +12,7 @@ from omegaconf import DictConfig, OmegaConf
 from sfkd_jax.cli import messages
 from sfkd_jax.cli.options import GROUPS
 from sfkd_jax.cli.schemas import Rule, is_schema
-from sfkd_jax.core.ranges import Entries, Interval
+from sfkd_jax.ranges import Entries, Interval
 
 LARGEST = {int: 2**31 - 1, float: 3e38}
 """What int32 and float32 hold."""

@@ -9,7 +9,7 @@ from collections.abc import Callable, Mapping
 from dataclasses import MISSING, field, is_dataclass, make_dataclass
 from typing import Any, NamedTuple, TypeGuard
 
-from sfkd_jax.core.ranges import Ascending, Entries, Interval
+from sfkd_jax.ranges import Ascending, Entries, Interval
 
 
 class BelowRoot:

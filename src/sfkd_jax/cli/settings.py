@@ -5,7 +5,7 @@ from __future__ import annotations
 from typing import Annotated, Any, NamedTuple
 
 from sfkd_jax.cli.schemas import BelowRoot, FileNames
-from sfkd_jax.core.ranges import (
+from sfkd_jax.ranges import (
     Entries,
     Fraction,
     Interval,

@@ -23,8 +23,6 @@ from sfkd_jax.certification import (
     fixed_points,
 )
 from sfkd_jax.control import safety_filter
-from sfkd_jax.core.path_frame import PATH_SPEED, path_state
-from sfkd_jax.core.ranges import Interval, Span
 from sfkd_jax.corridor._drives import (
     EXCITATION,
     ROADS,
@@ -33,8 +31,10 @@ from sfkd_jax.corridor._drives import (
     drive_options,
     policy_loop,
 )
-from sfkd_jax.datasets import drive_switching, generate_s3_along_path
+from sfkd_jax.data import drive_switching, generate_s3_along_path
 from sfkd_jax.evaluation import Outcome, Tube, attack_corridor, outcome_of
+from sfkd_jax.geometry import PATH_SPEED, path_state
+from sfkd_jax.ranges import Interval, Span
 from sfkd_jax.types import Control, Key
 
 STREAM = 4

@@ -20,9 +20,9 @@ from sfkd_jax.certification import (
     residuals,
 )
 from sfkd_jax.control import PathLaw
-from sfkd_jax.core.folding import fold
-from sfkd_jax.core.path_frame import LATERAL, PERTURBATION
-from sfkd_jax.core.rollouts import in_batches, rollout
+from sfkd_jax.geometry import LATERAL, PERTURBATION
+from sfkd_jax.plants import Vehicle
+from sfkd_jax.rollout import fold, in_batches, rollout
 from sfkd_jax.types import (
     BODY,
     Control,
@@ -33,7 +33,6 @@ from sfkd_jax.types import (
     State,
     Trajectory,
 )
-from sfkd_jax.vehicle import Vehicle
 
 ROADS = ("speed", "peak_curvature", "wavelengths", "lateral_acceleration")
 EXCITATION = ("steering_excitation", "speed_excitation")

@@ -18,7 +18,7 @@ from sfkd_jax.certification import (
     output_metrics_from,
 )
 from sfkd_jax.corridor._drives import drive_measurement, drive_options, policy_loop
-from sfkd_jax.datasets import drive_switching
+from sfkd_jax.data import drive_switching
 from sfkd_jax.types import Key, Scalar, Trajectory
 
 FRICTION = 0

@@ -11,10 +11,9 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from sfkd_jax.core.path_frame import CURVATURE, HEADING, PATH_SPEED, path_step
-from sfkd_jax.core.path_frame import path_state as as_path_state
-from sfkd_jax.core.se2 import wrap_angle
 from sfkd_jax.evaluation._open_loop import prediction_rmse
+from sfkd_jax.geometry import CURVATURE, HEADING, PATH_SPEED, path_step, wrap_angle
+from sfkd_jax.geometry import path_state as as_path_state
 from sfkd_jax.types import BODY, Control, Environment, Scalar, State, Step, Trajectory
 
 STEEP = 1.4

@@ -10,9 +10,9 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from sfkd_jax.core.path_frame import LATERAL, path_state
+from sfkd_jax.geometry import LATERAL, path_state
+from sfkd_jax.plants import Vehicle
 from sfkd_jax.types import BODY, Environment, Key, Model, Params
-from sfkd_jax.vehicle import Vehicle
 
 BLOCK = 5
 """Steps for which the attack holds ν."""

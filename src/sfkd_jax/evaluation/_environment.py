@@ -8,10 +8,10 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from sfkd_jax.core.ranges import Real
+from sfkd_jax.plants import Vehicle, equivalent_wind
+from sfkd_jax.ranges import Real
 from sfkd_jax.scenarios import random_side_forces
 from sfkd_jax.types import Key
-from sfkd_jax.vehicle import Vehicle, equivalent_wind
 
 FORCE_STREAM = 2
 SENSOR_STREAM = 3

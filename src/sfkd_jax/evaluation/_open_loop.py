@@ -9,9 +9,8 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from sfkd_jax.core.path_frame import HEADING, LATERAL, PATH_SPEED
-from sfkd_jax.core.rollouts import in_batches, rollout, sliding_windows
-from sfkd_jax.core.se2 import rotate, wrap_angle
+from sfkd_jax.geometry import HEADING, LATERAL, PATH_SPEED, rotate, wrap_angle
+from sfkd_jax.rollout import in_batches, rollout, sliding_windows
 from sfkd_jax.types import BODY, Model, Params, Trajectory
 
 

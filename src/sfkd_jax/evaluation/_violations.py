@@ -11,7 +11,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from sfkd_jax.core.rollouts import (
+from sfkd_jax.rollout import (
     defects,
     in_batches,
     prediction_errors,

@@ -9,7 +9,7 @@ import flax.linen as nn
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from sfkd_jax.core.se2 import rotate
+from sfkd_jax.geometry import rotate
 from sfkd_jax.models._state_model import NO_STRUCTURE, state_model
 from sfkd_jax.types import (
     BODY,

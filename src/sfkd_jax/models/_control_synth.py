@@ -9,8 +9,8 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from sfkd_jax.core.ranges import Positive
 from sfkd_jax.models._continuous import continuous, mlp
+from sfkd_jax.ranges import Positive
 from sfkd_jax.types import (
     Control,
     Declared,

@@ -6,7 +6,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from sfkd_jax.core.se2 import between, compose, wrap_angle
+from sfkd_jax.geometry import between, compose, wrap_angle
 from sfkd_jax.types import BODY, POSE, Scalar, State
 
 STRAIGHT = 1e-12

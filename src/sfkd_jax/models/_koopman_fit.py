@@ -6,7 +6,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from sfkd_jax.core.se2 import between
+from sfkd_jax.geometry import between
 from sfkd_jax.models._edmd import along_circle
 from sfkd_jax.models._identification import ridge_regression
 from sfkd_jax.models._koopman_lift import Lift

@@ -10,7 +10,7 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 
-from sfkd_jax.core.named import imported
+from sfkd_jax.ranges import imported
 from sfkd_jax.types import Environment, Fiber, Key, Model, Params, Space, State, Step
 
 SETTING = "model.factory"

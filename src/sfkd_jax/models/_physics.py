@@ -21,7 +21,7 @@ def physics(
             never import the vehicle).
         distort: the environment that the model assumes instead of e; the identity for
             the true plant.
-        along_path: whether x and u are those of `core.path_frame`.
+        along_path: whether x and u are those of `geometry`.
     """
     return state_model(
         init=lambda key: {},

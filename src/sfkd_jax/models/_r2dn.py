@@ -9,14 +9,14 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from sfkd_jax.core.folding import Folded, unfold
-from sfkd_jax.core.ranges import Fraction
-from sfkd_jax.core.se2 import compose
+from sfkd_jax.geometry import compose
 from sfkd_jax.models._continuous import has_pose, scaled_env
 from sfkd_jax.models._r2dn_weights import Affine, Interconnection, Shared
 from sfkd_jax.models.sfkd._networks import Biases, Encoder
 from sfkd_jax.models.sfkd._records import SfkdLatent
 from sfkd_jax.models.sfkd._sandwich import apply
+from sfkd_jax.ranges import Fraction
+from sfkd_jax.rollout import Folded, unfold
 from sfkd_jax.types import (
     BODY,
     POSE,

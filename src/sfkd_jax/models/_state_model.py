@@ -50,7 +50,7 @@ def state_model(
             accepts any.
         fitting: as in `Model`.
         structure: as in `Model`.
-        along_path: whether states and controls are those of `core.path_frame`.
+        along_path: whether states and controls are those of `geometry`.
     """
 
     def encode(fiber: Fiber, state: State) -> State:

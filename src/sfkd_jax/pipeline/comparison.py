@@ -16,7 +16,7 @@ from sfkd_jax.pipeline import (
     store,
     systems,
 )
-from sfkd_jax.vehicle import Vehicle
+from sfkd_jax.plants import Vehicle
 
 ComposeCell: TypeAlias = Callable[[grid.Cell], dict[str, Any]]
 """cell -> its settings, under the name of the comparison."""

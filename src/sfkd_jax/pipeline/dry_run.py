@@ -9,10 +9,10 @@ import jax.numpy as jnp
 from sfkd_jax import build
 from sfkd_jax.certification import MODES
 from sfkd_jax.control import PathLaw
-from sfkd_jax.datasets import check_shares
+from sfkd_jax.data import check_shares
 from sfkd_jax.pipeline import store
+from sfkd_jax.plants import Vehicle
 from sfkd_jax.types import Model, Space
-from sfkd_jax.vehicle import Vehicle
 
 
 def check_settings(settings: dict[str, Any], plant: Vehicle) -> None:

@@ -11,12 +11,12 @@ import jax
 import numpy as np
 
 from sfkd_jax import build, evaluation
-from sfkd_jax.core.folding import fold, unfold
-from sfkd_jax.datasets import Dataset
+from sfkd_jax.data import Dataset
 from sfkd_jax.pipeline import scoring
+from sfkd_jax.plants import Vehicle, check_step
+from sfkd_jax.rollout import fold, unfold
 from sfkd_jax.scenarios import Scenario
 from sfkd_jax.types import Controller, Key, Params
-from sfkd_jax.vehicle import Vehicle, check_step
 
 WARM_UP = 10
 """Control steps before timing starts."""

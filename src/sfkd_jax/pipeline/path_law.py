@@ -12,7 +12,7 @@ from jaxtyping import Int
 
 from sfkd_jax import artefacts, build
 from sfkd_jax.control import PathLaw, law_from_arrays, law_to_arrays
-from sfkd_jax.datasets import (
+from sfkd_jax.data import (
     generate,
     generate_along_path,
     generate_s3_along_path,
@@ -21,8 +21,8 @@ from sfkd_jax.datasets import (
     segment_scenarios_along_path,
 )
 from sfkd_jax.pipeline import store
+from sfkd_jax.plants import Vehicle
 from sfkd_jax.types import Key, Trajectory
-from sfkd_jax.vehicle import Vehicle
 
 
 def ensure_law(settings: dict[str, Any]) -> PathLaw | None:

@@ -13,7 +13,7 @@ import numpy as np
 from sfkd_jax import artefacts, build, evaluation
 from sfkd_jax.certification import conformal_tube, latent_tube
 from sfkd_jax.control import PathLaw
-from sfkd_jax.datasets import Dataset, to_path
+from sfkd_jax.data import Dataset, to_path
 from sfkd_jax.scenarios import Scenario
 from sfkd_jax.types import Trajectory
 

@@ -11,8 +11,7 @@ import jax
 import jax.numpy as jnp
 
 from sfkd_jax import artefacts, build, policy
-from sfkd_jax.core.named import imported
-from sfkd_jax.datasets import (
+from sfkd_jax.data import (
     SCENARIOS,
     Columns,
     Dataset,
@@ -22,8 +21,9 @@ from sfkd_jax.datasets import (
 )
 from sfkd_jax.pipeline import path_law, store
 from sfkd_jax.pipeline.train_policy import train_policy
+from sfkd_jax.plants import check_step
+from sfkd_jax.ranges import imported
 from sfkd_jax.types import Trajectory
-from sfkd_jax.vehicle import check_step
 
 SPLIT = ("shares", "env_low", "env_high", "seed")
 SWITCHING = 2

@@ -12,7 +12,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from sfkd_jax import artefacts
-from sfkd_jax.datasets import Dataset, environment_box, fingerprint
+from sfkd_jax.data import Dataset, environment_box, fingerprint
 from sfkd_jax.types import BODY, Trajectory
 
 DATASET = "dataset"

@@ -6,7 +6,7 @@ from typing import Any
 
 from sfkd_jax import artefacts, build, policy
 from sfkd_jax.pipeline import path_law, stages, store
-from sfkd_jax.vehicle import Vehicle
+from sfkd_jax.plants import Vehicle
 
 
 def load_systems(settings: dict[str, Any], plant: Vehicle) -> dict[str, build.System]:

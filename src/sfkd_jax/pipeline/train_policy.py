@@ -10,8 +10,7 @@ import numpy as np
 
 from sfkd_jax import artefacts, build, policy
 from sfkd_jax.certification import contraction_metrics
-from sfkd_jax.core.folding import fold
-from sfkd_jax.datasets import (
+from sfkd_jax.data import (
     SCENARIOS,
     Dataset,
     first_share,
@@ -21,6 +20,7 @@ from sfkd_jax.datasets import (
 )
 from sfkd_jax.evaluation import baselines, open_loop
 from sfkd_jax.pipeline import path_law, store
+from sfkd_jax.rollout import fold
 from sfkd_jax.training import fit, multi_step_loss
 from sfkd_jax.types import Key, Model, Params, Space, Trajectory
 

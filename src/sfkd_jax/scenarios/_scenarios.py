@@ -8,7 +8,7 @@ from typing import NamedTuple, TypeAlias
 import jax
 import jax.numpy as jnp
 
-from sfkd_jax.core.ranges import Positive, Span
+from sfkd_jax.ranges import Positive, Span
 from sfkd_jax.scenarios._conditions import (
     Schedule,
     steady_road,

@@ -12,7 +12,7 @@ import jax
 import jax.numpy as jnp
 import optax
 
-from sfkd_jax.core.ranges import Positive
+from sfkd_jax.ranges import Positive
 from sfkd_jax.training._checkpoints import Checkpoints
 from sfkd_jax.training._interruption import Interrupted, Interruption
 from sfkd_jax.training._log import TrainingLog

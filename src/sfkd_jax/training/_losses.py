@@ -10,10 +10,9 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from sfkd_jax.core.path_frame import HEADING, LATERAL
-from sfkd_jax.core.ranges import Numbers
-from sfkd_jax.core.rollouts import defects, rollout
-from sfkd_jax.core.se2 import rotate, wrap_angle
+from sfkd_jax.geometry import HEADING, LATERAL, rotate, wrap_angle
+from sfkd_jax.ranges import Numbers
+from sfkd_jax.rollout import defects, rollout
 from sfkd_jax.types import (
     BODY,
     Environment,

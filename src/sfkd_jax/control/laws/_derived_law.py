@@ -12,8 +12,8 @@ from jaxtyping import Array, Float
 
 from sfkd_jax.control.laws._model_law import RESIDUAL_TOLERANCE, RICCATI_STEPS, solve
 from sfkd_jax.control.laws._path_law import PathLaw
-from sfkd_jax.core.path_frame import LATERAL, PATH_SPEED, path_step
-from sfkd_jax.core.ranges import AtLeastTwo, Positive, Span
+from sfkd_jax.geometry import LATERAL, PATH_SPEED, path_step
+from sfkd_jax.ranges import AtLeastTwo, Positive, Span
 from sfkd_jax.types import Control, Scalar, Step
 
 NEWTON = 6

@@ -10,7 +10,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from sfkd_jax.control.laws._path_errors import path_errors
-from sfkd_jax.core.ranges import Positive
+from sfkd_jax.ranges import Positive
 from sfkd_jax.types import BODY, Control, Fiber, Model, Reference, Scalar, State
 
 NEWTON = 4

@@ -8,7 +8,7 @@ from typing import NamedTuple, TypeAlias
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from sfkd_jax.core.se2 import wrap_angle
+from sfkd_jax.geometry import wrap_angle
 from sfkd_jax.types import Control, Reference, Scalar, State
 
 

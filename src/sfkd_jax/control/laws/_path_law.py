@@ -11,7 +11,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float, Int
 
 from sfkd_jax.control.laws._model_law import SteadyTurn
-from sfkd_jax.core.path_frame import PATH_SPEED, PathState
+from sfkd_jax.geometry import PATH_SPEED, PathState
 from sfkd_jax.types import Control, Environment, Scalar
 
 

@@ -21,7 +21,7 @@ from sfkd_jax.control.planners._plans import (
 )
 from sfkd_jax.control.planners._weights import keep_constraints
 from sfkd_jax.control.tasks._task import Task
-from sfkd_jax.core.ranges import AtLeastTwo, UnitInterval
+from sfkd_jax.ranges import AtLeastTwo, UnitInterval
 from sfkd_jax.types import Controller, Key
 
 

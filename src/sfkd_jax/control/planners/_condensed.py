@@ -9,7 +9,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from sfkd_jax.control.tasks._task import PlanningStart
-from sfkd_jax.core.se2 import between, compose
+from sfkd_jax.geometry import between, compose
 from sfkd_jax.types import BODY, POSE, LinearPredictor, Reference, Scalar, State
 
 

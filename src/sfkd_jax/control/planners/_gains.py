@@ -10,7 +10,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from sfkd_jax.control.planners._plans import Evaluated, Plan, Plans, Samples
-from sfkd_jax.core.se2 import wrap_angle
+from sfkd_jax.geometry import wrap_angle
 from sfkd_jax.types import Control, Scalar
 
 EvaluateFrom = Callable[[Any, Plans], Evaluated]

@@ -18,7 +18,7 @@ from sfkd_jax.control.planners._plans import (
     replace_nonfinite,
 )
 from sfkd_jax.control.tasks._task import Task
-from sfkd_jax.core.ranges import AtLeastTwo, Fraction
+from sfkd_jax.ranges import AtLeastTwo, Fraction
 from sfkd_jax.types import Controller, Key, Scalar
 
 

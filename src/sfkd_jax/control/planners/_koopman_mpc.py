@@ -15,7 +15,7 @@ from sfkd_jax.control.planners._condensed import condense, condensed_cost, to_wo
 from sfkd_jax.control.planners._plans import all_finite, clip_environment, shift
 from sfkd_jax.control.tasks._path_tracking import check_path
 from sfkd_jax.control.tasks._task import PlanningStart
-from sfkd_jax.core.ranges import AtLeastTwo
+from sfkd_jax.ranges import AtLeastTwo
 from sfkd_jax.types import (
     POSE,
     Control,

@@ -25,7 +25,7 @@ from sfkd_jax.control.planners._plans import (
 from sfkd_jax.control.planners._shaped_noise import curvature_factor, shape_noise
 from sfkd_jax.control.planners._weights import weigh
 from sfkd_jax.control.tasks._task import Task
-from sfkd_jax.core.ranges import AtLeastTwo, NonNegativeInt, UnitInterval
+from sfkd_jax.ranges import AtLeastTwo, NonNegativeInt, UnitInterval
 from sfkd_jax.types import Controller, Key
 
 MIN_NOISE_SCALE = 0.05

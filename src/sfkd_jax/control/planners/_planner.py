@@ -16,7 +16,7 @@ from sfkd_jax.control.planners._plans import INFO_LEVELS, Search, Tuning
 from sfkd_jax.control.planners._risk import risk_measure
 from sfkd_jax.control.planners._smoothing import plan_smoother
 from sfkd_jax.control.tasks._task import Task
-from sfkd_jax.core.ranges import AtLeastTwo, NonNegativeInt, Positive, PositiveFraction
+from sfkd_jax.ranges import AtLeastTwo, NonNegativeInt, Positive, PositiveFraction
 from sfkd_jax.types import Controller
 
 

@@ -23,16 +23,18 @@ from sfkd_jax.control.tasks._task import (
     Task,
     actuator_limits,
 )
-from sfkd_jax.core.folding import fold
-from sfkd_jax.core.path_frame import (
+from sfkd_jax.geometry import (
     HEADING,
     LATERAL,
     PATH_SPEED,
     PathState,
+    between,
     circle_errors,
+    compose,
     path_state,
+    wrap_angle,
 )
-from sfkd_jax.core.se2 import between, compose, wrap_angle
+from sfkd_jax.rollout import fold
 from sfkd_jax.types import (
     BODY,
     POSE,

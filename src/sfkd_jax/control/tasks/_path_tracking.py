@@ -28,8 +28,8 @@ from sfkd_jax.control.tasks._task import (
     Task,
     actuator_limits,
 )
-from sfkd_jax.core.folding import fold
-from sfkd_jax.core.ranges import Positive
+from sfkd_jax.ranges import Positive
+from sfkd_jax.rollout import fold
 from sfkd_jax.types import Control, Environment, Model, Params, Reference, State
 
 

@@ -32,7 +32,7 @@ from sfkd_jax.control.wrappers._estimator import (
     follow,
 )
 from sfkd_jax.control.wrappers._kalman import Bank
-from sfkd_jax.core.folding import fold
+from sfkd_jax.rollout import fold
 from sfkd_jax.types import (
     Control,
     Controller,

@@ -9,8 +9,8 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from sfkd_jax.control.laws._path_law import PathLaw
-from sfkd_jax.core.offsets import Offset
-from sfkd_jax.core.path_frame import LATERAL, PATH_SPEED, PathState, path_state
+from sfkd_jax.geometry import LATERAL, PATH_SPEED, PathState, path_state
+from sfkd_jax.rollout import Offset
 from sfkd_jax.types import BODY, Control, Environment, Model, Params, Scalar
 
 FRICTION, WIND = 0, 1

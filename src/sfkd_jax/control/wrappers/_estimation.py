@@ -17,7 +17,7 @@ from sfkd_jax.control.wrappers._multiple_models import (
     transition_matrix,
     update,
 )
-from sfkd_jax.core.ranges import AtLeastTwo, Interval, Positive
+from sfkd_jax.ranges import AtLeastTwo, Interval, Positive
 from sfkd_jax.types import (
     Control,
     Controller,

@@ -17,7 +17,7 @@ from sfkd_jax.control.wrappers._disturbances import (
     predicted,
 )
 from sfkd_jax.control.wrappers._kalman import Bank, corrected, mixed, propagated
-from sfkd_jax.core.path_frame import PathState
+from sfkd_jax.geometry import PathState
 from sfkd_jax.types import Environment, Params, State
 
 MEMORY = 0.97

@@ -10,8 +10,8 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
 from sfkd_jax.control.wrappers._slow import slow_down
-from sfkd_jax.core.ranges import PositiveFraction
-from sfkd_jax.core.rollouts import step_disturbances
+from sfkd_jax.ranges import PositiveFraction
+from sfkd_jax.rollout import step_disturbances
 from sfkd_jax.types import (
     BODY,
     Control,

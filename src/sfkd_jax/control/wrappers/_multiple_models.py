@@ -10,7 +10,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
-from sfkd_jax.core.se2 import wrap_angle
+from sfkd_jax.geometry import wrap_angle
 from sfkd_jax.types import POSE, Control, Environment, Model, Params, State
 
 YAW = POSE.stop - 1

@@ -13,8 +13,8 @@ from jaxtyping import Array, Bool, Float
 from sfkd_jax.control.laws._path_law import PathLaw
 from sfkd_jax.control.planners._plans import all_finite
 from sfkd_jax.control.tasks._along_path import curvature_ahead, path_coordinates
-from sfkd_jax.core.folding import fold
-from sfkd_jax.core.path_frame import LATERAL, PathState, is_valid, path_state
+from sfkd_jax.geometry import LATERAL, PathState, is_valid, path_state
+from sfkd_jax.rollout import fold
 from sfkd_jax.types import (
     BODY,
     Control,

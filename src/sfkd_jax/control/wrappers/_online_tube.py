@@ -13,8 +13,8 @@ from jaxtyping import Array, Bool, Float
 from sfkd_jax.control.planners._plans import all_finite
 from sfkd_jax.control.tasks._along_path import curvature_ahead, path_coordinates
 from sfkd_jax.control.wrappers._slow import slow_down
-from sfkd_jax.core.path_frame import LATERAL
-from sfkd_jax.core.ranges import Fraction, Positive
+from sfkd_jax.geometry import LATERAL
+from sfkd_jax.ranges import Fraction, Positive
 from sfkd_jax.types import (
     Control,
     Controller,

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import jax.numpy as jnp
 
-from sfkd_jax.core.se2 import between, compose, wrap_angle
+from sfkd_jax.geometry import between, compose, wrap_angle
 from sfkd_jax.types import POSE, Reference, Scalar
 
 

@@ -9,13 +9,13 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from sfkd_jax.core.folding import Folded, unfold
-from sfkd_jax.core.se2 import between, compose
+from sfkd_jax.geometry import between, compose
 from sfkd_jax.models._continuous import scaled_env
 from sfkd_jax.models.sfkd._networks import Encoder, Networks, PerEnvironment, Shared
 from sfkd_jax.models.sfkd._records import Mixture, SfkdFiber, SfkdLatent
 from sfkd_jax.models.sfkd._sandwich import apply
 from sfkd_jax.models.sfkd._transport import rotate_planes
+from sfkd_jax.rollout import Folded, unfold
 from sfkd_jax.types import (
     BODY,
     POSE,

@@ -6,11 +6,11 @@ from functools import partial
 
 import jax.numpy as jnp
 
-from sfkd_jax.core.ranges import Fraction, NonNegativeInt
 from sfkd_jax.models.sfkd._dynamics import Dynamics
 from sfkd_jax.models.sfkd._networks import Encoder, Networks
 from sfkd_jax.models.sfkd._settings import check_settings
 from sfkd_jax.models.sfkd._start import identify_start
+from sfkd_jax.ranges import Fraction, NonNegativeInt
 from sfkd_jax.types import Fitting, Model, Space, Structure
 
 SEGMENT_STEPS = 20.0
@@ -64,7 +64,7 @@ def sfkd(
         embedding: size of ψ(e).
         frame: "body" composes the pose on SE(2) outside z; "segment" is the paper's
             reading, the pose relative to the start of the window inside z; "path" has
-            path coordinates as body (see `core.path_frame`) and no pose.
+            path coordinates as body (see `geometry`) and no pose.
         residual: "sandwich", "free" (no bound by construction; ||A_j|| ≤ ρ) or "none"
             (||A_j|| ≤ ρ).
         budget: "joint" or "sum", of a sandwich residual.

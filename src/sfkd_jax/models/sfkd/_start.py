@@ -8,11 +8,11 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from sfkd_jax.core.rollouts import fibers_along
 from sfkd_jax.models._identification import bounded_ridge
 from sfkd_jax.models.sfkd._bounds import attainable, unbounded
 from sfkd_jax.models.sfkd._budget import budget_factors
 from sfkd_jax.models.sfkd._dynamics import Dynamics
+from sfkd_jax.rollout import fibers_along
 from sfkd_jax.types import Key, Model, Params, Trajectory
 
 

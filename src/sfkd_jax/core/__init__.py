@@ -1,1 +1,0 @@
-"""Planar poses, path coordinates, folded parameters, and rollouts of any model."""

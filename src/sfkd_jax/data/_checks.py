@@ -1,0 +1,221 @@
+"""Check a recorded drive row by row: finite numbers, rising time, jumps, sampling."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from typing import NamedTuple
+
+import numpy as np
+from jaxtyping import Bool, Float
+
+from sfkd_jax.data._logs import Columns, Log
+
+SLOWER = 1.2
+"""A log whose period is this many times the model's is refused: rows between its own
+would be invented.
+"""
+LARGEST = 1e38
+"""Largest number whose differences float32, which segments are stored in, can hold."""
+STALE = 0.2
+"""Share of driving rows that repeat the position of the row before, from which
+positions count as stale.
+"""
+
+
+class Finding(NamedTuple):
+    """One line about a log, and whether the log is refused for it."""
+
+    line: str
+    refused: bool = True
+
+
+class Motion(NamedTuple):
+    """A drive step by step.
+
+    Attributes:
+        waits: time between rows [s].
+        period: median of it [s].
+        gaps: whether a wait is longer than what is bridged.
+        moved: distance between positions [m].
+        integrated: distance by the speed [m].
+    """
+
+    waits: Float[np.ndarray, " step"]
+    period: float
+    gaps: Bool[np.ndarray, " step"]
+    moved: Float[np.ndarray, " step"]
+    integrated: Float[np.ndarray, " step"]
+
+
+def channels(log: Log, columns: Columns) -> dict[str, Float[np.ndarray, " time"]]:
+    """Return every column of a drive by its name, less an unknown environment."""
+    groups = {
+        "state": log.states,
+        "control": log.controls,
+        "environment": log.envs,
+    }
+    named = {columns.time: log.time}
+    for setting, values in groups.items():
+        names = getattr(columns, setting)
+        if len(names) == values.shape[1]:
+            named |= dict(zip(names, values.T, strict=True))
+    return named
+
+
+def motion(log: Log, *, dt: float, gap: float) -> Motion:
+    """Measure the steps of a drive; steps across a cut count neither way.
+
+    Args:
+        log: at least two joined rows, all finite.
+        dt: of the model [s].
+        gap: the longest wait that is bridged, in periods: of the log or dt, whichever
+            is longer.
+    """
+    waits = np.diff(log.time)
+    period = float(np.median(waits[log.joined]))
+    moved = np.linalg.norm(np.diff(log.states[:, :2], axis=0), axis=1)
+    speed = np.abs(log.states[:, 3])
+    integrated = 0.5 * (speed[1:] + speed[:-1]) * waits
+    gaps = waits > gap * max(period, dt)
+    return Motion(waits, period, gaps & log.joined, moved, integrated)
+
+
+def check_finite(log: Log, columns: Columns) -> Iterator[Finding]:
+    """Refuse numbers that are not finite in float32."""
+    for name, values in channels(log, columns).items():
+        bad = ~np.isfinite(values) | (np.abs(values) > LARGEST)
+        if bad.any():
+            yield Finding(
+                f"{_first(log, bad)}: {name} is {values[bad.argmax()]}{more(bad)}"
+            )
+
+
+def check_time(log: Log, columns: Columns) -> Iterator[Finding]:
+    """Refuse time that does not increase."""
+    if (back := backwards(log)).any():
+        yield Finding(
+            f"{describe_backwards(log, columns, back)}; "
+            "two drives in one file? dataset.columns.drive, dataset.split_at_jumps"
+        )
+
+
+def backwards(log: Log) -> Bool[np.ndarray, " step"]:
+    """Return the steps at which time repeats or goes back."""
+    return (np.diff(log.time) <= 0) & log.joined
+
+
+def describe_backwards(
+    log: Log, columns: Columns, back: Bool[np.ndarray, " step"]
+) -> str:
+    """Describe the first of such steps."""
+    k = int(back.argmax())
+    before, after = log.time[k], log.time[k + 1]
+    change = (
+        f"repeats {after:.12g}"
+        if before == after
+        else f"goes back from {before:.12g} to {after:.12g}"
+    )
+    return f"{log.at(k + 1)}: {columns.time} {change}{more(back)}"
+
+
+def check_motion(
+    log: Log, columns: Columns, *, dt: float, gap: float
+) -> Iterator[Finding]:
+    """Check sampling, stale positions, and jumps of position and yaw."""
+    steps = motion(log, dt=dt, gap=gap)
+    yield from _check_sampling(log, steps, dt)
+    if (stale := stale_steps(log, steps)).any():
+        yield Finding(
+            f"{_first(log, stale, 1)}: the position of the row before "
+            f"at {log.states[stale.argmax() + 1, 3]:.3g} m/s{more(stale)}; "
+            f"log positions as often as {columns.time}, or leave rows out"
+        )
+        return
+    if (jumps := position_jumps(log, steps)).any():
+        yield Finding(describe_jump(log, columns, steps, jumps))
+    if (turns := yaw_jumps(log, steps)).any():
+        yield Finding(describe_turn(log, columns, turns))
+
+
+def _check_sampling(log: Log, steps: Motion, dt: float) -> Iterator[Finding]:
+    """Refuse slow sampling; warn of gaps and uneven sampling."""
+    waits, period, gaps = steps.waits, steps.period, steps.gaps
+    if period > SLOWER * dt:
+        yield Finding(
+            f"{log.whole}: recorded every {period:.4g} s, slower than "
+            f"vehicle.dt={dt:g}; pass vehicle.dt={period:.2g}"
+        )
+    if gaps.any():
+        k = int(gaps.argmax())
+        yield Finding(
+            f"{log.at(k + 1)}: {waits[k]:.4g} s without rows; "
+            f"drives are split there{more(gaps)}",
+            refused=False,
+        )
+    uneven = (np.abs(waits - period) > 0.5 * period) & ~gaps & log.joined
+    if uneven.mean() > 0.1:
+        yield Finding(
+            f"{_first(log, uneven, 1)}: uneven sampling, "
+            f"{waits[uneven.argmax()]:.4g} s after the row before{more(uneven)}",
+            refused=False,
+        )
+
+
+def stale_steps(log: Log, steps: Motion) -> Bool[np.ndarray, " step"]:
+    """Return steps without motion while driving; none if they are few."""
+    integrated = steps.integrated
+    driving = integrated > 0.1 * np.quantile(integrated[log.joined], 0.9)
+    driving &= log.joined
+    stale = driving & (steps.moved == 0.0)
+    many = stale.sum() > STALE * max(driving.sum(), 1)
+    return stale if many else np.zeros_like(stale)
+
+
+def position_jumps(log: Log, steps: Motion) -> Bool[np.ndarray, " step"]:
+    """Return steps much longer than the speed explains."""
+    moved, integrated = steps.moved, steps.integrated
+    spread = 1.4826 * np.median(np.abs(moved - integrated)[log.joined])
+    jumps = moved - integrated > integrated + 15.0 * spread + 1e-6
+    return jumps & ~steps.gaps & log.joined
+
+
+def yaw_jumps(log: Log, steps: Motion) -> Bool[np.ndarray, " step"]:
+    """Return steps that turn much more than the others, between rows near in time."""
+    turned = _turned(log)
+    usual = float(np.median(turned[log.joined]))
+    return ~steps.gaps & log.joined & (turned > max(1.0, 10.0 * usual))
+
+
+def describe_jump(
+    log: Log, columns: Columns, steps: Motion, jumps: Bool[np.ndarray, " step"]
+) -> str:
+    """Describe the first jump of position."""
+    k = int(jumps.argmax())
+    return (
+        f"{log.at(k + 1)}: {columns.state[0]}, {columns.state[1]} "
+        f"jump {steps.moved[k]:.3g} m at {log.states[k, 3]:.3g} m/s{more(jumps)}"
+    )
+
+
+def describe_turn(log: Log, columns: Columns, jumps: Bool[np.ndarray, " step"]) -> str:
+    """Describe the first jump of yaw."""
+    k = int(jumps.argmax())
+    return (
+        f"{log.at(k + 1)}: {columns.state[2]} jumps by "
+        f"{_turned(log)[k]:.3g} rad{more(jumps)}"
+    )
+
+
+def _turned(log: Log) -> Float[np.ndarray, " step"]:
+    """Angle between the yaws of neighbouring rows [rad]."""
+    return np.abs(np.diff(np.unwrap(log.states[:, 2])))
+
+
+def _first(log: Log, bad: Bool[np.ndarray, " time"], shift: int = 0) -> str:
+    """The position of the first of some rows."""
+    return log.at(int(bad.argmax()) + shift)
+
+
+def more(bad: Bool[np.ndarray, " time"]) -> str:
+    """Return how many rows there are like the first, for messages."""
+    return f" ({int(bad.sum())} rows like this)" if bad.sum() > 1 else ""

@@ -1,0 +1,62 @@
+"""Export a controller for programs without sfkd_jax, or for C and C++."""
+
+from __future__ import annotations
+
+from typing import Any
+
+from sfkd_jax import artefacts, build, policy
+from sfkd_jax.cli.entry import hydra_command
+from sfkd_jax.export import write_controller
+from sfkd_jax.pipeline import store
+
+FOLDER = "export"
+
+
+def run(settings: dict[str, Any]) -> dict[str, Any]:
+    """Export the policy of the run; nothing is trained or certified.
+
+    Raises:
+        ArtefactError: the run has no policy, or one that is damaged or was trained
+            with other settings.
+    """
+    run_dir = store.run_directory(settings)
+    if not artefacts.exists(run_dir / "policy.npz"):
+        raise artefacts.ArtefactError(
+            f"{run_dir} holds no trained controller; "
+            "run train with the same options first"
+        )
+    return _write(settings)
+
+
+@store.exclusive
+def _write(settings: dict[str, Any]) -> dict[str, Any]:
+    """Export the policy while no other process writes to the run directory."""
+    run_dir = store.run_directory(settings)
+    store.claim(settings)
+    _, manifest = artefacts.read_arrays(run_dir / "policy.npz", kind=policy.KIND)
+    trained = policy.load(
+        run_dir, controller=settings["controller"], env_source=settings["env_source"]
+    )
+    if trained.certificate is None:
+        artefacts.print_message("exported without a certificate and without a monitor")
+    folder = run_dir / FOLDER
+    write_controller(
+        trained,
+        folder,
+        made_from=manifest["made_from"],
+        **build.as_kwargs(settings["export"]),
+    )
+    artefacts.print_message(
+        f"exported: {folder}; python {folder / 'run_controller.py'} "
+        "runs it without sfkd_jax"
+    )
+    files = {
+        "blob": "controller.stablehlo",
+        "manifest": "controller.json",
+        "npz": "policy.npz",
+    }
+    return {key: str(folder / name) for key, name in files.items()}
+
+
+if __name__ == "__main__":
+    hydra_command(run)()

@@ -1,0 +1,144 @@
+"""Poses in the plane, and path coordinates: a vehicle relative to its path.
+
+A path state is a `State` whose pose is that of the foot point in its own frame, 0, and
+whose body is ξ = (e_y [m], e_ψ [rad], v [m/s], …): distance left of the path, yaw
+relative to it, and the vehicle's own body state. Its control is w = (ν, κ, v_ref): a
+perturbation added to the law's control, the path's curvature [1/m] over the step, and
+the reference speed [m/s].
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import TypeAlias
+
+import jax.numpy as jnp
+from jaxtyping import Array, Bool, Float
+
+from sfkd_jax.types import BODY, POSE, Control, Environment, Pose, Scalar, State, Step
+
+
+def wrap_angle(angle: Float[Array, "*shape"]) -> Float[Array, "*shape"]:
+    """Return the same angle in [-π, π], with gradient 1."""
+    return angle - 2 * jnp.pi * jnp.round(angle / (2 * jnp.pi))
+
+
+def rotate(angle: Float[Array, ""], vector: Float[Array, " 2"]) -> Float[Array, " 2"]:
+    """Return R(angle) vector."""
+    c, s = jnp.cos(angle), jnp.sin(angle)
+    return jnp.stack([c * vector[0] - s * vector[1], s * vector[0] + c * vector[1]])
+
+
+def compose(
+    pose: Float[Array, " 3"], increment: Float[Array, " 3"]
+) -> Float[Array, " 3"]:
+    """Return g ∘ Δ, the pose after a motion Δ in the frame of g; yaw is not wrapped."""
+    position = pose[:2] + rotate(pose[2], increment[:2])
+    return jnp.concatenate([position, pose[2:] + increment[2:]])
+
+
+def between(
+    pose: Float[Array, " 3"], pose_next: Float[Array, " 3"]
+) -> Float[Array, " 3"]:
+    """Return g⁻¹ ∘ g', the motion from g to g' in the frame of g, yaw wrapped."""
+    position = rotate(-pose[2], pose_next[:2] - pose[:2])
+    return jnp.concatenate([position, wrap_angle(pose_next[2:] - pose[2:])])
+
+
+PathState: TypeAlias = Float[Array, " coordinate"]
+"""ξ = (e_y, e_ψ, v, …): the body of a path state."""
+LATERAL, HEADING, PATH_SPEED = 0, 1, 2
+"""Indices of e_y, e_ψ and v in ξ."""
+PERTURBATION = slice(0, 2)
+"""Entries of ν in w."""
+CURVATURE, REFERENCE_SPEED = 2, 3
+"""Indices of κ and v_ref in w."""
+SMALLEST_SCALE = 0.2
+"""Lower limit of 1 − κ e_y: below it the car is too close to the path's centre of
+curvature for path coordinates to be meaningful.
+"""
+
+PathFeedback: TypeAlias = Callable[[PathState, Scalar, Scalar, Environment], Control]
+"""(ξ, κ, v_ref, e) -> u, not yet clipped."""
+
+
+def circle_errors(pose: Pose, curvature: Scalar) -> tuple[Scalar, Scalar]:
+    """Return e_y [m] and e_ψ [rad] of a pose relative to a circle through the origin.
+
+        q = κ (x² + y²) − 2 y,   e_y = −q / (1 + √(1 + κ q)),
+        e_ψ = yaw − atan2(κ x, 1 − κ y)
+
+    Exact, and without a singularity at κ = 0. √(1 + κ q) = 1 − κ e_y is limited from
+    below to `SMALLEST_SCALE`, so that the result is always finite; see `is_valid`.
+
+    Args:
+        pose: x [m], y [m], yaw [rad] in the frame whose x axis is tangent to the circle
+            at the origin.
+        curvature: κ [1/m], left positive.
+    """
+    x, y, yaw = pose[0], pose[1], pose[2]
+    q = curvature * (x**2 + y**2) - 2.0 * y
+    scale = jnp.sqrt(jnp.maximum(1.0 + curvature * q, SMALLEST_SCALE**2))
+    turned = jnp.arctan2(curvature * x, 1.0 - curvature * y)
+    return -q / (1.0 + scale), wrap_angle(yaw - turned)
+
+
+def is_valid(
+    lateral: Float[Array, "*shape"], curvature: Float[Array, "*shape"]
+) -> Bool[Array, "*shape"]:
+    """Whether path coordinates are meaningful: 1 − κ e_y > 0.2; False for NaN."""
+    return 1.0 - curvature * lateral > SMALLEST_SCALE
+
+
+def path_state(coordinates: PathState) -> State:
+    """Return ξ as a `State`: the pose of the foot in its own frame, 0, and body ξ."""
+    return jnp.concatenate([jnp.zeros(3), coordinates])
+
+
+def vehicle_state(coordinates: PathState) -> State:
+    """Return the vehicle's state in the foot frame: pose (0, e_y, e_ψ), body s."""
+    return jnp.concatenate([jnp.zeros(1), coordinates])
+
+
+def path_step(
+    step: Step,
+) -> Callable[[PathState, Control, Scalar, Environment], PathState]:
+    """Return (ξ, u, κ, e) -> ξ one period later, exact on a circle of curvature κ.
+
+    Args:
+        step: of the vehicle, in the world frame.
+    """
+
+    def along(
+        coordinates: PathState, control: Control, curvature: Scalar, env: Environment
+    ) -> PathState:
+        after = step(vehicle_state(coordinates), control, env)
+        lateral, heading = circle_errors(after[POSE], curvature)
+        return jnp.concatenate([jnp.stack([lateral, heading]), after[BODY]])
+
+    return along
+
+
+def closed_loop(
+    step: Step, law: PathFeedback, low: tuple[float, ...], high: tuple[float, ...]
+) -> Step:
+    """Return (path state, w, e) -> path state, the vehicle in closed loop with a law.
+
+        ξ⁺ = F(ξ, clip(law(ξ; κ, v_ref, e) + ν); κ, e)
+
+    Args:
+        step: of the vehicle, in the world frame.
+        law: (ξ, κ, v_ref, e) -> u.
+        low: lower limits of the vehicle's controls.
+        high: upper limits of the vehicle's controls.
+    """
+    along = path_step(step)
+    bottom, top = jnp.asarray(low), jnp.asarray(high)
+
+    def closed(state: State, inputs: Control, env: Environment) -> State:
+        curvature = inputs[CURVATURE]
+        wanted = law(state[BODY], curvature, inputs[REFERENCE_SPEED], env)
+        control = jnp.clip(wanted + inputs[PERTURBATION], bottom, top)
+        return path_state(along(state[BODY], control, curvature, env))
+
+    return closed

@@ -1,0 +1,191 @@
+"""High-fidelity plant: single track, brush tyres, and a steering actuator."""
+
+from __future__ import annotations
+
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+from sfkd_jax.plants._vehicle import (
+    ACCELERATION_RANGE,
+    GRAVITY,
+    STEERING_LIMIT,
+    Vehicle,
+    forward_rk4,
+    nominal_derivative,
+    resistance,
+    side_force,
+)
+from sfkd_jax.ranges import Positive, Real
+from sfkd_jax.types import Control, Environment, State, Step
+
+BRAKING_SHARE = 0.95  # of μ g, so that the tyres keep some lateral grip
+
+
+def dynamic(
+    *,
+    dt: Positive = 0.1,
+    substeps: int = 5,
+    mass: Positive = 1500.0,
+    yaw_inertia: Positive = 2500.0,
+    front_length: Positive = 1.2,
+    rear_length: Positive = 1.5,
+    height: float = 0.55,
+    front_stiffness: Positive = 9.0e4,
+    rear_stiffness: Positive = 1.05e5,
+    steering_lag: Positive = 0.1,
+    steering_rate: Positive = 0.5,
+    wind_force: float = 10.0,
+    wind_lever: Real = 0.4,
+    drag: float = 0.4,
+    rolling: float = 0.012,
+    creep_speed: Positive = 3.0,
+) -> Vehicle:
+    """Single track on brush tyres, x = (p_x, p_y, yaw, v, v_y, yaw rate ω, δ).
+
+        a_x = 0.95 μ g tanh(a / (0.95 μ g)), braking fades like tanh(v / 0.2 m/s),
+        N_f, N_r = m (g l_r ∓ a_x h)/L,  m (g l_f ± a_x h)/L,
+        Y_i = −C_i t_i if small, at most √((μ N_i)² − (N_i a_x/g)²), see `_brush`,
+        m (v̇ − v_y ω) = a_x (N_f cos δ + N_r)/g − Y_f sin δ − resistance,
+        m (v̇_y + v ω) = (N_f a_x/g) sin δ + Y_f cos δ + Y_r + F,
+        I ω̇ = l_f ((N_f a_x/g) sin δ + Y_f cos δ) − l_r Y_r + l_w F,
+        δ̇ = δ̇_max tanh((δ_cmd − δ)/(τ δ̇_max)),
+
+    p is the centre of mass, F = c_w w|w|, and t_i the slip (lateral over longitudinal
+    speed in the frame of wheel i). Drive and brakes act on both axles in proportion to
+    load, so both use the same share of their friction circle. The cornering stiffness
+    does not depend on μ (only the limit does), unlike that of `kinematic`, which is
+    linear in μ.
+
+    Below creep_speed the slip is relative to a speed that stays above creep_speed / 2.
+    The tyre is then a strong damper of side slip, as in the kinematic bicycle, and the
+    equations stay finite and non-stiff; the wind fades out with v, because a tyre that
+    does not roll holds the car. Needs dt / substeps ≤ 0.02 s with the given stiffness,
+    and μ > 0. A car that spins past 90° stops at v = 0 instead of rolling backwards.
+
+    Args:
+        dt: sampling period [s].
+        substeps: RK4 steps per period.
+        mass: [kg].
+        yaw_inertia: [kg m²].
+        front_length: front axle to centre of mass [m].
+        rear_length: rear axle to centre of mass [m].
+        height: of the centre of mass [m].
+        front_stiffness: cornering stiffness of the front axle [N/rad].
+        rear_stiffness: cornering stiffness of the rear axle [N/rad].
+        steering_lag: τ [s].
+        steering_rate: δ̇_max [rad/s].
+        wind_force: side force per squared wind speed, c_w [N s²/m²].
+        wind_lever: l_w, how far ahead of the centre of mass the side force acts [m].
+        drag: ρ C_d A / 2 [N s²/m²].
+        rolling: rolling resistance coefficient [-].
+        creep_speed: v_0, below it the tyres are regularised [m/s].
+    """
+    length = front_length + rear_length
+    bicycle = nominal_derivative(length, rear_length)
+
+    def derivative(state: State, control: Control, env: Environment) -> State:
+        yaw, speed, side_speed, yaw_rate, steering = (state[k] for k in range(2, 7))
+        grip = env[0] * GRAVITY
+        cos, sin = jnp.cos(steering), jnp.sin(steering)
+        drive = _acceleration(control, speed, grip)
+        front_mass = mass * (rear_length - height * drive / GRAVITY) / length
+        lateral_grip = jnp.sqrt(grip**2 - drive**2)
+        wind = _rolling(speed, creep_speed) * side_force(env[1], wind_force=wind_force)
+
+        front_side = side_speed + front_length * yaw_rate
+        front_slip = _slip(
+            speed * cos + front_side * sin, front_side * cos - speed * sin, creep_speed
+        )
+        rear_slip = _slip(speed, side_speed - rear_length * yaw_rate, creep_speed)
+        front = _brush(front_slip, front_stiffness, front_mass * lateral_grip)
+        rear = _brush(rear_slip, rear_stiffness, (mass - front_mass) * lateral_grip)
+        forward = front_mass * drive * cos + (mass - front_mass) * drive - front * sin
+        sideways = front_mass * drive * sin + front * cos
+
+        slowed = resistance(speed, mass=mass, drag=drag, rolling=rolling)
+        return jnp.stack(
+            [
+                speed * jnp.cos(yaw) - side_speed * jnp.sin(yaw),
+                speed * jnp.sin(yaw) + side_speed * jnp.cos(yaw),
+                yaw_rate,
+                forward / mass + side_speed * yaw_rate - slowed,
+                (sideways + rear + wind) / mass - speed * yaw_rate,
+                (front_length * sideways - rear_length * rear + wind_lever * wind)
+                / yaw_inertia,
+                steering_rate
+                * jnp.tanh((control[0] - steering) / (steering_lag * steering_rate)),
+            ]
+        )
+
+    return Vehicle(
+        name="dynamic",
+        dt=dt,
+        wheelbase=length,
+        state_names=("p_x", "p_y", "yaw", "v", "v_y", "yaw_rate", "steering"),
+        step=forward_rk4(derivative, dt=dt, substeps=substeps),
+        derivative=derivative,
+        nominal=_quasi_steady(forward_rk4(bicycle, dt=dt), length, rear_length),
+        nominal_derivative=_padded(bicycle),
+        control_low=(-STEERING_LIMIT, ACCELERATION_RANGE[0]),
+        control_high=(STEERING_LIMIT, ACCELERATION_RANGE[1]),
+        wind_force=wind_force,
+    )
+
+
+def _acceleration(
+    control: Control, speed: Float[Array, ""], grip: Float[Array, ""]
+) -> Float[Array, ""]:
+    """a_x [m/s²]: the commanded one within the grip; braking fades at standstill."""
+    drive = BRAKING_SHARE * grip * jnp.tanh(control[1] / (BRAKING_SHARE * grip))
+    return jnp.maximum(drive, 0.0) + jnp.minimum(drive, 0.0) * jnp.tanh(speed / 0.2)
+
+
+def _rolling(speed: Float[Array, ""], creep_speed: float) -> Float[Array, ""]:
+    """Share of the wind that moves the car: 0 at standstill, 1 above creep_speed."""
+    share = jnp.clip(jnp.abs(speed) / creep_speed, 0.0, 1.0)
+    return share**2 * (3.0 - 2.0 * share)
+
+
+def _slip(
+    along: Float[Array, ""], across: Float[Array, ""], creep_speed: float
+) -> Float[Array, ""]:
+    """Tangent of the slip angle, v_across / |v_along|.
+
+    Below v_0, |v| becomes (v² + v_0²)/(2 v_0) ≥ v_0/2, continuously differentiable.
+    """
+    below = jnp.minimum(jnp.abs(along), creep_speed)
+    beyond = jnp.maximum(jnp.abs(along), creep_speed) - creep_speed
+    return across / ((below**2 + creep_speed**2) / (2.0 * creep_speed) + beyond)
+
+
+def _brush(
+    slip: Float[Array, ""], stiffness: float, limit: Float[Array, ""]
+) -> Float[Array, ""]:
+    """Side force of a brush (Fiala) tyre, −F_max (3θ − 3θ|θ| + θ³).
+
+    θ = C t / (3 F_max), clipped to [-1, 1].
+    """
+    bristle = jnp.clip(stiffness * slip / (3.0 * limit), -1.0, 1.0)
+    return -limit * bristle * (3.0 - 3.0 * jnp.abs(bristle) + bristle**2)
+
+
+def _quasi_steady(bicycle: Step, length: float, rear_length: float) -> Step:
+    """A 4-state bicycle on 7 states: δ = δ_cmd, ω = v κ, v_y = l_r ω."""
+
+    def step(state: State, control: Control, env: Environment) -> State:
+        after = bicycle(state[:4], control, env)
+        yaw_rate = after[3] * jnp.tan(control[0]) / length
+        return jnp.concatenate(
+            [after, jnp.stack([rear_length * yaw_rate, yaw_rate, control[0]])]
+        )
+
+    return step
+
+
+def _padded(bicycle: Step) -> Step:
+    """dx/dt of a 4-state bicycle on 7 states; the rates of v_y, ω and δ are 0."""
+
+    def derivative(state: State, control: Control, env: Environment) -> State:
+        return jnp.concatenate([bicycle(state[:4], control, env), jnp.zeros(3)])
+
+    return derivative

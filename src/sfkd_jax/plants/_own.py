@@ -1,0 +1,140 @@
+"""A vehicle of the user's own, given by a step function or by logs alone."""
+
+from __future__ import annotations
+
+import jax
+import jax.numpy as jnp
+
+from sfkd_jax.plants._vehicle import Vehicle, forward_rk4, nominal_derivative
+from sfkd_jax.ranges import Bounds, Positive, imported
+from sfkd_jax.types import Control, Environment, State, Step
+
+
+class _MissingStep(ValueError):
+    """There is no step to evaluate; the message names the setting."""
+
+
+def own(
+    *,
+    dt: Positive = 0.1,
+    state_names: tuple[str, ...] = ("p_x", "p_y", "yaw", "v"),
+    control_low: Bounds = (),
+    control_high: Bounds = (),
+    wheelbase: Positive = 2.7,
+    wind_force: float = 0.0,
+    speed_loop: bool = False,
+    step: Step | None = None,
+) -> Vehicle:
+    """Return a plant from plain numbers and, optionally, its step.
+
+    Without a step a model of the vehicle can be learned and planned with, but the
+    vehicle cannot be simulated. Its nominal model is the textbook kinematic bicycle on
+    (p_x, p_y, yaw, v), with the centre of mass in the middle; further states are
+    constant.
+
+    Args:
+        dt: sampling period [s].
+        state_names: pose first (p_x, p_y [m], yaw [rad]), then the speed [m/s].
+        control_low: lower limits of the actuators; () without a step, where the logs
+            give them.
+        control_high: upper limits of the actuators.
+        wheelbase: [m], for the nominal bicycle and the path-following law.
+        wind_force: c_w of `side_force` [N s²/m²]; 0 if e_2 is no wind.
+        speed_loop: whether u_2 is a speed command [m/s] instead of an acceleration
+            [m/s²].
+        step: (x, u, e) -> x one sampling period later, pure and traceable by jax.
+
+    Raises:
+        ValueError: fewer than four states, or limits that are missing or not two
+            numbers each.
+    """
+    if len(state_names) < 4:
+        raise ValueError(
+            "vehicle.state_names must be p_x, p_y, yaw, v, …, "
+            f"got {', '.join(state_names) or 'none'}"
+        )
+    sizes = {len(control_low), len(control_high)}
+    if sizes != {2} and (sizes != {0} or step is not None):
+        raise ValueError(
+            "vehicle.control_low and vehicle.control_high must be two numbers each, "
+            "as in [-0.4,-3.0]"
+        )
+    bicycle = nominal_derivative(wheelbase, 0.5 * wheelbase)
+    simulate = _no_step if step is None else step
+
+    def derivative(state: State, control: Control, env: Environment) -> State:
+        return (simulate(state, control, env) - state) / dt
+
+    def padded(state: State, control: Control, env: Environment) -> State:
+        return jnp.concatenate(
+            [bicycle(state[:4], control, env), jnp.zeros(len(state_names) - 4)]
+        )
+
+    return Vehicle(
+        name="own",
+        dt=dt,
+        wheelbase=wheelbase,
+        state_names=tuple(state_names),
+        step=simulate,
+        derivative=derivative,
+        nominal=forward_rk4(padded, dt=dt),
+        nominal_derivative=padded,
+        control_low=tuple(control_low),
+        control_high=tuple(control_high),
+        wind_force=wind_force,
+        speed_loop=speed_loop,
+        simulated=step is not None,
+    )
+
+
+def _no_step(state: State, control: Control, env: Environment) -> State:
+    """The step of a vehicle that is known from logs alone."""
+    raise _MissingStep(
+        "vehicle=own is known from logs alone, so nothing can drive it: "
+        "pass vehicle.step=module:function"
+    )
+
+
+def step_named(name: str) -> Step:
+    """Return the step "package.module:function", imported at its first call.
+
+    Args:
+        name: of a function (x, u, e) -> x one sampling period later, as in
+            `vehicle.step`. If there is no such function, the call raises ValueError.
+    """
+
+    def step(state: State, control: Control, env: Environment) -> State:
+        try:
+            function = imported(name, "vehicle.step")
+        except ValueError as reason:
+            raise _MissingStep(str(reason)) from None
+        return function(state, control, env)
+
+    return step
+
+
+def check_step(plant: Vehicle) -> None:
+    """Evaluate a plant's step on shapes only.
+
+    Raises:
+        ValueError: there is no step, it fails, or it does not return a state.
+    """
+    sizes = (len(plant.state_names), 2, 2)
+    try:
+        after = jax.eval_shape(plant.step, *(jnp.zeros(size) for size in sizes))
+    except _MissingStep:
+        raise
+    except Exception as reason:  # a function of the user raises anything
+        given = (
+            f"{sizes[0]} states (vehicle.state_names), 2 controls and 2 environments"
+        )
+        first = (str(reason).splitlines() or [type(reason).__name__])[0]
+        raise ValueError(
+            f"the step of vehicle {plant.name} fails on {given}: {first}"
+        ) from None
+    if getattr(after, "shape", None) != (sizes[0],):
+        shape = getattr(after, "shape", type(after).__name__)
+        raise ValueError(
+            f"the step of vehicle {plant.name} returns {shape}, "
+            f"vehicle.state_names has {sizes[0]} names"
+        )

@@ -1,0 +1,164 @@
+"""The `Vehicle` record, parts that all plants share, and the inner speed loop."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+from sfkd_jax.plants._integrators import rk4
+from sfkd_jax.types import Control, Environment, State, Step
+
+GRAVITY = 9.81  # m/s²
+STEERING_LIMIT = 0.5  # rad
+ACCELERATION_RANGE = (-6.0, 3.0)  # m/s²
+SPEED_RANGE = (0.0, 25.0)  # m/s
+
+
+class Vehicle(NamedTuple):
+    """A plant sampled at dt.
+
+    Attributes:
+        name: of the plant.
+        dt: sampling period [s].
+        wheelbase: [m].
+        state_names: pose first, then the body state.
+        step: (x, u, e) -> x one sampling period later.
+        derivative: dx/dt of the plant before any wrapper.
+        nominal: the textbook kinematic bicycle without friction or wind, as a step on
+            the same state.
+        nominal_derivative: dx/dt of that bicycle, for models that add to it.
+        control_low: lower actuator limits.
+        control_high: upper actuator limits.
+        wind_force: c_w of `side_force` [N s²/m²].
+        speed_loop: whether u_2 is a speed command [m/s] instead of an acceleration
+            [m/s²].
+        simulated: whether there is a step; False for a vehicle that is known from logs
+            alone.
+    """
+
+    name: str
+    dt: float
+    wheelbase: float
+    state_names: tuple[str, ...]
+    step: Step
+    derivative: Step
+    nominal: Step
+    nominal_derivative: Step
+    control_low: tuple[float, ...]
+    control_high: tuple[float, ...]
+    wind_force: float
+    speed_loop: bool = False
+    simulated: bool = True
+
+
+def side_force(wind: Float[Array, ""], *, wind_force: float) -> Float[Array, ""]:
+    """Return the lateral force of a side wind on the body, F = c_w w|w| [N]."""
+    return wind_force * wind * jnp.abs(wind)
+
+
+def equivalent_wind(
+    wind: Float[Array, ""], force: Float[Array, ""], *, wind_force: float
+) -> Float[Array, ""]:
+    """Return the wind w' [m/s] with c_w w'|w'| = c_w w|w| + F.
+
+    Args:
+        wind: w [m/s].
+        force: F [N].
+        wind_force: c_w [N s²/m²].
+    """
+    total = side_force(wind, wind_force=wind_force) + force
+    return jnp.where(
+        force == 0.0, wind, jnp.sign(total) * jnp.sqrt(jnp.abs(total) / wind_force)
+    )
+
+
+def resistance(
+    speed: Float[Array, ""], *, mass: float, drag: float, rolling: float
+) -> Float[Array, ""]:
+    """Return the deceleration by air drag and rolling [m/s²]; 0 at rest.
+
+    ρ C_d A v²/(2m) + c_rr g tanh(v / 0.2 m/s)
+    """
+    return drag * speed**2 / mass + rolling * GRAVITY * jnp.tanh(speed / 0.2)
+
+
+def nominal_derivative(length: float, rear_length: float) -> Step:
+    """Return dx/dt of the kinematic bicycle without friction or wind.
+
+    κ = tan δ / L,   β = l_r κ,   x = (p_x, p_y, yaw, v)
+    """
+
+    def derivative(state: State, control: Control, env: Environment) -> State:
+        del env
+        yaw, speed = state[2], state[3]
+        curvature = jnp.tan(control[0]) / length
+        course = yaw + rear_length * curvature
+        return jnp.stack(
+            [
+                speed * jnp.cos(course),
+                speed * jnp.sin(course),
+                speed * curvature,
+                control[1],
+            ]
+        )
+
+    return derivative
+
+
+def forward_rk4(derivative: Step, *, dt: float, substeps: int = 1) -> Step:
+    """Return RK4 for a car that brakes cannot reverse: v ≥ 0 after every step.
+
+    The derivative is evaluated at max(v, 0), so that a car whose v falls below 0 within
+    a step stands: neither its position nor its yaw moves backwards.
+    """
+
+    def forwards(state: State) -> State:
+        return jnp.where((jnp.arange(state.shape[0]) == 3) & (state < 0.0), 0.0, state)
+
+    def held(state: State, control: Control, env: Environment) -> State:
+        return derivative(forwards(state), control, env)
+
+    integrate = rk4(held, dt=dt, substeps=substeps)
+
+    def step(state: State, control: Control, env: Environment) -> State:
+        return forwards(integrate(state, control, env))
+
+    return step
+
+
+def with_speed_loop(vehicle: Vehicle, *, gain: float = 1.0) -> Vehicle:
+    """Return the vehicle with a speed command instead of an acceleration.
+
+    a = clip(k_v (v_cmd − v)), held over dt.
+
+    Args:
+        vehicle: any plant whose second control is an acceleration.
+        gain: k_v [1/s].
+
+    Raises:
+        ValueError: the vehicle takes speed commands already, or has no limits.
+    """
+    if vehicle.speed_loop or not vehicle.control_low:
+        raise ValueError(
+            "vehicle.inner_loop=speed needs limits of the acceleration; "
+            "of speed commands: speed_loop=true"
+        )
+    low, high = vehicle.control_low[1], vehicle.control_high[1]
+
+    def close(step: Step) -> Step:
+        def closed(state: State, control: Control, env: Environment) -> State:
+            acceleration = jnp.clip(gain * (control[1] - state[3]), low, high)
+            return step(state, control.at[1].set(acceleration), env)
+
+        return closed
+
+    return vehicle._replace(
+        step=close(vehicle.step),
+        nominal=close(vehicle.nominal),
+        nominal_derivative=close(vehicle.nominal_derivative),
+        control_low=(vehicle.control_low[0], SPEED_RANGE[0]),
+        control_high=(vehicle.control_high[0], SPEED_RANGE[1]),
+        speed_loop=True,
+    )

@@ -1,0 +1,69 @@
+"""Ranges that annotate settings, and objects that settings name."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from importlib import import_module
+from typing import Annotated, Any, TypeAlias
+
+
+@dataclass(frozen=True)
+class Interval:
+    """The numbers between two ends: "(0, 1]" excludes 0 and includes 1."""
+
+    text: str
+
+    def contains(self, value: int | float) -> bool:
+        """Return whether the value lies in the interval."""
+        low, high = map(float, self.text[1:-1].split(","))
+        above = low < value if self.text[0] == "(" else low <= value
+        below = value < high if self.text[-1] == ")" else value <= high
+        return above and below
+
+
+@dataclass(frozen=True)
+class Entries:
+    """The number of entries of a sequence: at least `least`, or exactly `exactly`."""
+
+    least: int = 1
+    exactly: int | None = None
+
+
+@dataclass(frozen=True)
+class Ascending:
+    """The entries of a sequence are in ascending order."""
+
+
+Real: TypeAlias = Annotated[float, Interval("(-inf, inf)")]
+Positive: TypeAlias = Annotated[float, Interval("(0, inf)")]
+Fraction: TypeAlias = Annotated[float, Interval("(0, 1)")]
+PositiveFraction: TypeAlias = Annotated[float, Interval("(0, 1]")]
+UnitInterval: TypeAlias = Annotated[float, Interval("[0, 1]")]
+NonNegativeInt: TypeAlias = Annotated[int, Interval("[0, inf)")]
+AtLeastTwo: TypeAlias = Annotated[int, Interval("[2, inf)")]
+Span: TypeAlias = Annotated[tuple[Positive, Positive], Ascending()]
+Numbers: TypeAlias = Annotated[tuple[float, ...], Entries(least=0)]
+"""Any number of numbers, none included."""
+Names: TypeAlias = Annotated[tuple[str, ...], Entries(least=0)]
+"""Any number of names, none included."""
+Bounds: TypeAlias = Annotated[tuple[Real, ...], Entries(least=0)]
+"""Lower or upper ends of intervals; none where they are unknown."""
+
+
+def imported(name: str, setting: str) -> Any:
+    """Import and return "package.module:name".
+
+    Args:
+        name: of the object.
+        setting: that names it, for the message.
+
+    Raises:
+        ValueError: there is no such module or name.
+    """
+    module, _, attribute = name.partition(":")
+    try:
+        return getattr(import_module(module), attribute)
+    except (ImportError, AttributeError, ValueError) as reason:
+        raise ValueError(
+            f"{setting}={name}: {reason}; name it as package.module:function"
+        ) from None

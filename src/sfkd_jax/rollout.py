@@ -1,0 +1,337 @@
+"""Predictions of any `Model`: rollouts, one-step errors, folded and shifted models."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+from sfkd_jax.geometry import HEADING, LATERAL, PATH_SPEED, between, wrap_angle
+from sfkd_jax.types import (
+    BODY,
+    POSE,
+    Control,
+    Environment,
+    Explicit,
+    Fiber,
+    Incremental,
+    Key,
+    Latent,
+    Model,
+    Params,
+    State,
+    Structure,
+    Trajectory,
+)
+
+
+class Folded(NamedTuple):
+    """Parameters to drive with: `Model.fiber` need not bound or factorise them again.
+
+    Attributes:
+        weights: the parameters as they were learned and stored.
+        shared: `Model.shared` of these parameters.
+    """
+
+    weights: Params
+    shared: Any
+
+
+def fold(model: Model, params: Params) -> Params:
+    """Evaluate once what every control step would otherwise evaluate again.
+
+    `policy.load` and the evaluation pipeline do this; only a program that drives with
+    parameters it has just trained calls it, and compiles it.
+
+    Args:
+        model: any model.
+        params: of the model; folded ones are returned unchanged.
+
+    Returns:
+        `Folded`, or the parameters themselves if the model has nothing to share.
+    """
+    if model.shared is None or isinstance(params, Folded):
+        return params
+    return Folded(params, model.shared(params))
+
+
+def unfold(params: Params) -> Params:
+    """Return the parameters as they were learned, folded or not."""
+    return params.weights if isinstance(params, Folded) else params
+
+
+class Offset(NamedTuple):
+    """Parameters of a model together with a shift of its steps.
+
+    Attributes:
+        params: of the model, folded or not.
+        inputs: added to every control, as a bias of B(e) u and of the residual.
+        latent: added to every latent step, a pytree like the latent; None for nothing.
+    """
+
+    params: Params
+    inputs: Control
+    latent: Latent | None
+
+
+class OffsetFiber(NamedTuple):
+    """The fiber of the model and the shift."""
+
+    fiber: Fiber
+    inputs: Control
+    latent: Latent | None
+
+
+def with_offset(model: Model) -> Model:
+    """Return the model z⁺ = F(z, u + δ; e) + b with parameters `Offset`(params, δ, b).
+
+    Neither δ nor b depends on z, so two predictions differ as those of the model do:
+    the weights that a certificate is about, its rate and its witness are the same. δ
+    and b are data, so changing them compiles nothing.
+
+    Args:
+        model: any model; its own parameters stay as they are.
+    """
+
+    def init(key: Key) -> Offset:
+        return Offset(model.init(key), jnp.zeros(()), None)
+
+    def fiber(params: Offset, env: Environment) -> OffsetFiber:
+        return OffsetFiber(model.fiber(params.params, env), *params[1:])
+
+    def step(fiber: OffsetFiber, latent: Latent, control: Control) -> Latent:
+        after = model.step(fiber.fiber, latent, control + fiber.inputs)
+        if fiber.latent is None:
+            return after
+        return jax.tree.map(jnp.add, after, fiber.latent)
+
+    def encode(fiber: OffsetFiber, state: State) -> Latent:
+        return model.encode(fiber.fiber, state)
+
+    def decode(fiber: OffsetFiber, latent: Latent) -> State:
+        return model.decode(fiber.fiber, latent)
+
+    def transport(before: OffsetFiber, after: OffsetFiber, latent: Latent) -> Latent:
+        return model.transport(before.fiber, after.fiber, latent)
+
+    def observe(fiber: OffsetFiber, latent: Latent, state: State) -> Latent:
+        return model.observe(fiber.fiber, latent, state)
+
+    return model._replace(
+        init=init,
+        fiber=fiber,
+        encode=encode,
+        step=step,
+        decode=decode,
+        transport=transport,
+        observe=observe,
+        shared=None,
+        structure=_structure(model.structure),
+    )
+
+
+def _structure(structure: Structure) -> Structure:
+    """What is known of the weights, which an offset does not change."""
+    explicit, rate = structure.explicit, structure.rate
+
+    def explicit_of(params: Offset) -> Explicit | Incremental:
+        assert explicit is not None
+        return explicit(params.params)
+
+    return Structure(
+        explicit=explicit and explicit_of,
+        rate=rate and (lambda params: rate(params.params)),
+    )
+
+
+def fibers_along(
+    model: Model, params: Params, trajectory: Trajectory
+) -> tuple[Fiber, Fiber]:
+    """Return the fibers of e_0 … e_{T-1} and of e_1 … e_{T-1}, e_{T-1}."""
+    fibers = jax.vmap(model.fiber, in_axes=(None, 0))(params, trajectory.envs)
+    later = jax.tree.map(lambda leaf: jnp.concatenate([leaf[1:], leaf[-1:]]), fibers)
+    return fibers, later
+
+
+def rollout(
+    model: Model, params: Params, trajectory: Trajectory
+) -> tuple[Float[Array, "time state"], Latent, tuple[Fiber, Fiber]]:
+    """Predict x_1 … x_T from x_0, u and e; return the latents and fibers as well."""
+    fibers, later = fibers_along(model, params, trajectory)
+    start = model.encode(_at(fibers, 0), trajectory.states[0])
+
+    def step(latent: Latent, inputs: Any) -> tuple[Latent, Latent]:
+        fiber, fiber_next, control = inputs
+        latent = model.transport(fiber, fiber_next, model.step(fiber, latent, control))
+        return latent, latent
+
+    _, latents = jax.lax.scan(step, start, (fibers, later, trajectory.controls))
+    return jax.vmap(model.decode)(later, latents), latents, (fibers, later)
+
+
+def sliding_windows(trajectory: Trajectory, *, horizon: int, stride: int) -> Trajectory:
+    """Return the windows of one trajectory along a new leading axis.
+
+    Args:
+        trajectory: one, states (T + 1, state).
+        horizon: steps of a window.
+        stride: steps between the starts of two windows.
+
+    Raises:
+        ValueError: the horizon does not fit the trajectory.
+    """
+    steps = trajectory.controls.shape[0]
+    if horizon > steps:
+        raise ValueError(
+            f"a horizon of {horizon} steps does not fit trajectories of {steps} steps"
+        )
+    starts = jnp.arange(0, steps - horizon + 1, stride)
+    states = trajectory.states[starts[:, None] + jnp.arange(horizon + 1)]
+    inside = starts[:, None] + jnp.arange(horizon)
+    return Trajectory(states, trajectory.controls[inside], trajectory.envs[inside])
+
+
+def window_errors(
+    model: Model, params: Params, trajectory: Trajectory, *, horizon: int, stride: int
+) -> Float[Array, "window horizon 3"]:
+    """Return `prediction_errors` 1 … horizon steps ahead, for every window.
+
+    Args:
+        model: any model.
+        params: of the model.
+        trajectory: one, states (T + 1, state).
+        horizon: steps of a window.
+        stride: steps between the starts of two windows.
+
+    Raises:
+        ValueError: the horizon does not fit the trajectory.
+    """
+
+    def one(window: Trajectory) -> Float[Array, "horizon 3"]:
+        return prediction_errors(
+            rollout(model, params, window)[0], window, along_path=model.along_path
+        )
+
+    return jax.vmap(one)(sliding_windows(trajectory, horizon=horizon, stride=stride))
+
+
+def prediction_errors(
+    predicted: Float[Array, "horizon state"],
+    window: Trajectory,
+    *,
+    along_path: bool = False,
+) -> Float[Array, "horizon 3"]:
+    """Return the errors of position [m], yaw [rad] (wrapped) and body state, as norms.
+
+    Along a path: |e_y| [m], |e_ψ| [rad], 2-norm of the vehicle's own body state.
+    """
+    gap = predicted - window.states[1:]
+    kinds = (
+        _kinds_along_path(gap)
+        if along_path
+        else (gap[:, :2], gap[:, 2:3], gap[:, BODY])
+    )
+    position, yaw, body = kinds
+    return jnp.column_stack(
+        [jnp.linalg.norm(kind, axis=1) for kind in (position, wrap_angle(yaw), body)]
+    )
+
+
+def _kinds_along_path(gap: Float[Array, "*batch state"]) -> tuple[Array, Array, Array]:
+    """Split path states into e_y, e_ψ (for position and yaw) and the vehicle's body."""
+    xi = gap[..., BODY]
+    return xi[..., LATERAL, None], xi[..., HEADING, None], xi[..., PATH_SPEED:]
+
+
+def in_batches(function: Callable[[Any], Any], items: Any, *, size: int) -> Any:
+    """Map a function over the leading axis, `size` items at a time.
+
+    The last batch is padded and the padding dropped: `jax.lax.map` would compile a
+    second program for the rest.
+    """
+    count = jax.tree.leaves(items)[0].shape[0]
+    size = min(size, count)
+    rows = (jnp.arange(-(-count // size) * size) % count).reshape(-1, size)
+    results = jax.lax.map(
+        lambda chosen: jax.vmap(function)(
+            jax.tree.map(lambda leaf: leaf[chosen], items)
+        ),
+        rows,
+    )
+    return jax.tree.map(lambda leaf: leaf.reshape(-1, *leaf.shape[2:])[:count], results)
+
+
+def defects(
+    model: Model,
+    params: Params,
+    trajectory: Trajectory,
+    along: tuple[Fiber, Fiber] | None = None,
+) -> tuple[Float[Array, "time rank"], Float[Array, "time state"]]:
+    """Return the one-step disturbances d_k and the one-step predictions of the states.
+
+        d_k = z_{k+1} − T(e_k → e_{k+1}) F(z_k, u_k, e_k),   z_k = Φ(x_k, e_k)
+
+    F is the latent step.
+
+    Args:
+        model: any model.
+        params: of the model.
+        trajectory: one, states (T + 1, state).
+        along: the result of `fibers_along`, if it is available.
+    """
+    fibers, later = along or fibers_along(model, params, trajectory)
+    origin = model.encode(_at(fibers, 0), trajectory.states[0])
+    observe = jax.vmap(model.observe, in_axes=(0, None, 0))
+    now = observe(fibers, origin, trajectory.states[:-1])
+    expected = jax.vmap(model.step)(fibers, now, trajectory.controls)
+    expected = jax.vmap(model.transport)(fibers, later, expected)
+    after = observe(later, origin, trajectory.states[1:])
+    gap = jax.vmap(model.vector)(after) - jax.vmap(model.vector)(expected)
+    return gap, jax.vmap(model.decode)(later, expected)
+
+
+def step_disturbances(
+    model: Model,
+    fiber: Fiber,
+    fiber_next: Fiber,
+    origin: Latent,
+    before: State,
+    control: Control,
+    after: State,
+) -> Float[Array, " 4"]:
+    """Return the one-step residuals of latent, position [m], yaw [rad] and body state.
+
+        |z' − ẑ'|, |p(g⁻¹ g') − p(g⁻¹ ĝ')|, |yaw(g⁻¹ g') − yaw(g⁻¹ ĝ')|, |s' − ŝ'|,
+        ẑ' = T(e → e') F(z, u, e)
+
+    Along a path the last three are e_y [m], e_ψ [rad] and the vehicle's own body state.
+
+    Args:
+        model: any model.
+        fiber: of e.
+        fiber_next: of e'.
+        origin: a latent in whose frame z and z' are expressed; `model.encode(fiber,
+            before)` gives a new frame at x.
+        before: x.
+        control: u.
+        after: x'.
+    """
+    now = model.observe(fiber, origin, before)
+    expected = model.transport(fiber, fiber_next, model.step(fiber, now, control))
+    predicted = model.decode(fiber_next, expected)
+    gap = model.vector(model.observe(fiber_next, origin, after)) - model.vector(
+        expected
+    )
+    motion = between(before[POSE], predicted[POSE]) - between(before[POSE], after[POSE])
+    kinds = (motion[:2], motion[2:], predicted[BODY] - after[BODY])
+    if model.along_path:
+        kinds = _kinds_along_path(predicted - after)
+    return jnp.stack([jnp.linalg.norm(kind) for kind in (gap, *kinds)])
+
+
+def _at(tree: Any, index: int) -> Any:
+    """Index the leading axis of every leaf."""
+    return jax.tree.map(lambda leaf: leaf[index], tree)

@@ -1,0 +1,544 @@
+"""Recorded drives are read without loss, and implausible ones are refused in one line
+with their row.
+"""
+
+import re
+import sys
+
+import numpy as np
+import pytest
+from recorded import NAMES, STATE, drive, write_csv, write_npz
+
+from sfkd_jax import data as datasets
+from sfkd_jax.data import Columns, _assignment
+
+DT, STEPS = 0.1, 10
+
+
+def read(path, columns=None, **options):
+    """The data set of some logs, and every line that was reported."""
+    lines = []
+    options = {"report": lines.append} | options
+    options = {"dt": DT, "wheelbase": 2.7, "steps": STEPS} | options
+    return datasets.from_logs(str(path), columns or Columns(), **options), lines
+
+
+def refusal(path, columns=None, **options):
+    """Why logs are refused: one line."""
+    with pytest.raises(ValueError) as caught:  # noqa: PT011
+        read(path, columns, **options)
+    assert "\n" not in str(caught.value)
+    return str(caught.value)
+
+
+def together(dataset):
+    """Every segment of a data set, whatever part it went to."""
+    parts = (dataset.train, dataset.validation, dataset.calibration, dataset.test)
+    return [
+        np.concatenate([np.asarray(getattr(part, name)) for part in parts])
+        for name in ("states", "controls", "envs")
+    ]
+
+
+def expected(columns, steps=STEPS):
+    """The same drive cut by hand: positions from the segment's first."""
+    rows = [slice(k, k + steps + 1) for k in range(0, len(columns["t"]) - steps, steps)]
+    states = np.stack(
+        [np.column_stack([columns[name] for name in STATE])[row] for row in rows]
+    )
+    states[..., :2] -= states[:, :1, :2]
+    cut = [
+        np.stack(
+            [np.column_stack([columns[n] for n in names])[row][:-1] for row in rows]
+        )
+        for names in (NAMES[5:7], NAMES[7:])
+    ]
+    return [part.astype(np.float32) for part in (states, *cut)]
+
+
+def same_segments(result, wanted):
+    """Whether two sets of segments are the same in some order, to the last bit."""
+    order = [
+        np.lexsort(part[0].reshape(len(part[0]), -1).T) for part in (result, wanted)
+    ]
+    return all(
+        np.array_equal(a[order[0]], b[order[1]])
+        for a, b in zip(result, wanted, strict=True)
+    )
+
+
+@pytest.mark.parametrize("separator", [",", ";", "\t", " "])
+def test_a_drive_comes_back_from_csv_to_the_last_bit(tmp_path, separator):
+    columns = drive()
+    write_csv(tmp_path / "a.csv", columns, separator)
+    assert same_segments(together(read(tmp_path)[0].dataset), expected(columns))
+
+
+def test_a_drive_comes_back_from_npz_to_the_last_bit(tmp_path):
+    columns = drive()
+    write_npz(tmp_path / "a.npz", columns | {"camera": np.zeros((3, 4))})
+    assert same_segments(
+        together(read(tmp_path / "a.npz")[0].dataset), expected(columns)
+    )
+
+
+def test_whole_drives_as_x_u_e_come_back_to_the_last_bit(tmp_path):
+    drives = [drive(seconds=1.0, phase=0.3 * k) for k in range(12)]
+    x, u, e = (
+        np.stack(
+            [np.column_stack([one[name] for name in names])[:end] for one in drives]
+        )
+        for names, end in ((STATE, None), (NAMES[5:7], -1), (NAMES[7:], -1))
+    )
+    np.savez(tmp_path / "a.npz", x=x, u=u, e=e)
+    wanted = [
+        np.concatenate(parts) for parts in zip(*map(expected, drives), strict=True)
+    ]
+    logged, lines = read(tmp_path / "a.npz")
+    assert same_segments(together(logged.dataset), wanted)
+    assert not [line for line in lines if "too few drives" in line]
+
+
+def test_a_drive_comes_back_from_parquet_to_the_last_bit(tmp_path):
+    pyarrow = pytest.importorskip("pyarrow")
+    parquet = pytest.importorskip("pyarrow.parquet")
+    columns = drive()
+    parquet.write_table(pyarrow.table(columns), tmp_path / "a.parquet")
+    assert same_segments(together(read(tmp_path)[0].dataset), expected(columns))
+
+
+def test_parquet_without_its_package_names_the_extra(tmp_path, monkeypatch):
+    monkeypatch.setitem(sys.modules, "pyarrow", None)
+    (tmp_path / "a.parquet").write_bytes(b"PAR1")
+    assert refusal(tmp_path).endswith(
+        'a.parquet: parquet files need pyarrow: pip install "sfkd-jax[parquet]"'
+    )
+
+
+def test_other_names_are_mapped(tmp_path):
+    columns = drive()
+    names = dict(
+        zip(
+            NAMES,
+            (
+                "time",
+                "x",
+                "y",
+                "heading",
+                "speed",
+                "delta",
+                "throttle",
+                "mu",
+                "side wind",
+            ),
+            strict=True,
+        )
+    )
+    write_csv(
+        tmp_path / "a.csv", {names[name]: values for name, values in columns.items()}
+    )
+    mapped = Columns(
+        "time",
+        ("x", "y", "heading", "speed"),
+        ("delta", "throttle"),
+        ("mu", "side wind"),
+    )
+    assert same_segments(together(read(tmp_path, mapped)[0].dataset), expected(columns))
+
+
+def test_a_column_tells_drives_in_one_file_apart(tmp_path):
+    drives = [drive(seconds=5.0, phase=0.3 * k) for k in range(8)]
+    joined = {name: np.concatenate([one[name] for one in drives]) for name in NAMES}
+    labels = np.repeat(np.arange(8), 51)
+    write_csv(tmp_path / "a.csv", joined | {"run": labels})
+    wanted = [
+        np.concatenate(parts) for parts in zip(*map(expected, drives), strict=True)
+    ]
+    assert same_segments(
+        together(read(tmp_path, Columns(drive="run"))[0].dataset), wanted
+    )
+
+
+def test_an_unknown_environment_becomes_a_constant(tmp_path):
+    columns = {
+        name: values for name, values in drive().items() if name not in NAMES[7:]
+    }
+    write_csv(tmp_path / "a.csv", columns)
+    logged, _ = read(tmp_path, needs_environment=False)
+    assert together(logged.dataset)[2].shape == (30, STEPS, 2)
+    assert not together(logged.dataset)[2].any()
+    assert logged.coverage["environment"] == {}
+    assert np.all(np.asarray(logged.dataset.env_high) >= 1e6)  # nothing can be outside
+
+
+@pytest.mark.parametrize("period", [0.01, 0.03, 0.04])
+def test_resampling_interpolates_states_and_holds_controls(tmp_path, period):
+    recorded = drive(period=period)
+    recorded["yaw"] = (
+        np.mod(recorded["yaw"] + 3.0 + np.pi, 2 * np.pi) - np.pi
+    )  # wraps around at ±π
+    turned = np.cos(3.0), np.sin(3.0)
+    x, y = recorded["p_x"], recorded["p_y"]
+    recorded |= {
+        "p_x": turned[0] * x - turned[1] * y,
+        "p_y": turned[1] * x + turned[0] * y,
+    }
+    write_csv(tmp_path / "a.csv", recorded)
+    states, controls, _ = together(read(tmp_path)[0].dataset)
+    t = recorded["t"]
+    moments = DT * np.arange(len(states) * STEPS)
+    speed = np.sort(np.interp(moments, t, recorded["v"]).astype(np.float32))
+    np.testing.assert_allclose(np.sort(states[:, :-1, 3].ravel()), speed, rtol=1e-6)
+    held = recorded["steering"][np.searchsorted(t, moments + 1e-9, side="right") - 1]
+    np.testing.assert_array_equal(
+        np.sort(controls[..., 0].ravel()), np.sort(held.astype(np.float32))
+    )
+    steps = np.diff(states[..., 2], axis=1)
+    assert (
+        np.abs(steps).max() < 0.37 * DT
+    )  # |d yaw / dt| ≤ 0.36: no turn by 2π between two moments
+
+
+def test_a_gap_splits_a_drive_and_nothing_is_invented_in_it(tmp_path):
+    columns = drive()
+    saved = (columns["t"] <= 10.0 + 1e-9) | (columns["t"] >= 20.0 - 1e-9)
+    path = write_csv(
+        tmp_path / "a.csv", {name: values[saved] for name, values in columns.items()}
+    )
+    logged, lines = read(path)
+    assert (
+        f"warning: {path}, line 103: 10 s without rows; drives are split there" in lines
+    )
+    states = together(logged.dataset)[0]
+    assert len(states) == 20
+    assert (
+        np.linalg.norm(np.diff(states[..., :2], axis=1), axis=-1).max() < 0.61
+    )  # v ≤ 6 m/s
+
+
+def test_moments_of_a_clock_and_places_on_earth_lose_no_digits(tmp_path):
+    columns = drive()
+    here = expected(columns)
+    moved = columns | {
+        "t": columns["t"] + 1.7e9,
+        "p_x": columns["p_x"] + 4.5e5,
+        "p_y": columns["p_y"] + 5.3e6,
+    }
+    write_csv(tmp_path / "a.csv", moved)
+    there = together(read(tmp_path)[0].dataset)
+    order = [np.lexsort(part[1].reshape(len(part[1]), -1).T) for part in (here, there)]
+    np.testing.assert_allclose(there[0][order[1]], here[0][order[0]], atol=1e-5)
+
+
+def change(name, row, value):
+    def spoil(columns):
+        columns[name] = columns[name].copy()
+        columns[name][row] = value
+
+    return spoil
+
+
+def scale(name, how):
+    return lambda columns: columns.update({name: how(columns[name])})
+
+
+def swap(one, other):
+    return lambda columns: columns.update({one: columns[other], other: columns[one]})
+
+
+def jump(columns):
+    columns["p_x"] = columns["p_x"] + 3.0 * (columns["t"] > 10.05)
+
+
+def stale(columns):
+    held = np.arange(301) // 10 * 10
+    columns.update({name: columns[name][held] for name in ("p_x", "p_y")})
+
+
+WRONG = {
+    "nan": (change("yaw", 7, np.nan), ", line 9: yaw is nan"),
+    "many nan": (
+        change("v", slice(3, 6), np.nan),
+        ", line 5: v is nan (3 rows like this)",
+    ),
+    "infinite": (change("steering", 100, np.inf), ", line 102: steering is inf"),
+    "nan in e": (change("wind", 0, np.nan), ", line 2: wind is nan"),
+    "nan in t": (change("t", 4, np.nan), ", line 6: t is nan"),
+    "time back": (
+        change("t", 50, 4.8),
+        ", line 52: t goes back from 4.9 to 4.8; two drives in one file? dataset.columns.drive",
+    ),
+    "time twice": (change("t", 50, 4.9), ", line 52: t repeats 4.9"),
+    "degrees": (
+        scale("yaw", np.rad2deg),
+        ", lines 2 to 302: yaw and the direction of travel differ; yaw is probably in degrees",
+    ),
+    "clockwise": (scale("yaw", np.negative), "yaw probably counts clockwise"),
+    "compass": (
+        scale("yaw", lambda yaw: np.pi / 2 - yaw),
+        "yaw is probably a compass heading (from north, clockwise)",
+    ),
+    "reversed": (
+        scale("yaw", lambda yaw: yaw + np.pi),
+        "v is probably of the wrong sign",
+    ),
+    "km/h": (
+        scale("v", lambda v: 3.6 * v),
+        "0.278 times as fast as v; the speed is probably in km/h",
+    ),
+    "milliseconds": (scale("t", lambda t: 1e3 * t), "time is probably in ms"),
+    "centimetres": (
+        lambda c: c.update(p_x=100 * c["p_x"], p_y=100 * c["p_y"]),
+        "positions are probably in cm",
+    ),
+    "yaw and v": (
+        swap("yaw", "v"),
+        "yaw fits as the speed: have columns changed places?",
+    ),
+    "p_x and p_y": (swap("p_x", "p_y"), "or p_x and p_y changed places"),
+    "p_x and v": (swap("p_x", "v"), "wrong units, or columns changed places?"),
+    "standing": (scale("v", np.zeros_like), "v stands still while the position moves"),
+    "position jumps": (jump, ", line 103: p_x, p_y jump 3.46 m at 5.66 m/s"),
+    "yaw jumps": (change("yaw", 100, 3.5), ", line 102: yaw jumps by"),
+    "stale": (
+        stale,
+        ", line 3: the position of the row before at 5.07 m/s (270 rows like this)",
+    ),
+    "no excitation": (
+        scale("steering", np.zeros_like),
+        ", lines 2 to 302: steering is always 0; without excitation",
+    ),
+    "slow": (
+        lambda c: c.update({n: c[n][::3] for n in NAMES}),
+        "recorded every 0.3 s, slower than vehicle.dt=0.1",
+    ),
+    "short": (
+        lambda c: c.update({n: c[n][:8] for n in NAMES}),
+        "the longest drive without a gap has 7 steps, a segment 10",
+    ),
+    "few": (
+        lambda c: c.update({n: c[n][:21] for n in NAMES}),
+        "2 segments are too few for dataset.shares=",
+    ),
+    "missing": (
+        lambda c: c.pop("yaw"),
+        "no column yaw among t, p_x, p_y, v, steering, acceleration, friction, wind; map it",
+    ),
+    "missing e": (
+        lambda c: c.pop("wind"),
+        "no column wind for the environment; pass env_source=none, or map",
+    ),
+}
+
+
+@pytest.mark.parametrize("kind", WRONG)
+def test_what_cannot_be_right_is_one_line_with_its_place(tmp_path, kind):
+    spoil, message = WRONG[kind]
+    columns = drive()
+    spoil(columns)
+    line = refusal(write_csv(tmp_path / "a.csv", columns))
+    assert message in line
+    if kind not in ("short", "few"):  # of all files together
+        assert line.startswith(f"{tmp_path / 'a.csv'}")
+
+
+TEXTS = {
+    "empty": ("", ": the file is empty"),
+    "header only": (",".join(NAMES) + "\n", ": no rows below the header"),
+    "no header": (
+        "0,1,2\n1,2,3\n",
+        ", line 1: numbers where the names of the columns should be",
+    ),
+    "twice": ("t,t\n0,1\n", ", line 1: the column t appears twice"),
+    "ragged": (
+        ",".join(NAMES) + "\n" + "0," * 8 + "0\n0,1,2\n",
+        ", line 3: 3 cells below a header of 9",
+    ),
+    "empty cell": (
+        ",".join(NAMES) + "\n" + "0," * 8 + "0\n1,,0,0,0,0,0,0,0\n",
+        ", line 3: p_x is empty, not a number",
+    ),
+    "word": (
+        ",".join(NAMES) + "\n" + "0," * 8 + "off\n",
+        ", line 2: wind is 'off', not a number",
+    ),
+    "decimal comma": (
+        ";".join(NAMES) + "\n" + "0,5;" * 8 + "0\n",
+        ", line 2: t is '0,5', not a number",
+    ),
+}
+
+
+@pytest.mark.parametrize("kind", TEXTS)
+def test_a_malformed_csv_is_one_line_with_its_place(tmp_path, kind):
+    text, message = TEXTS[kind]
+    (tmp_path / "a.csv").write_text(text)
+    assert refusal(tmp_path / "a.csv") == f"{tmp_path / 'a.csv'}{message}"
+
+
+ARRAYS = {
+    "objects": ({"t": np.array([None, 1])}, "a.npz: holds pickled objects, refused"),
+    "shapes": ({"t": np.zeros(3), "p_x": np.zeros(4)}, "p_x has shape (4,), t (3,)"),
+    "x alone": (
+        {"x": np.zeros((2, 5, 4)), "u": np.zeros((2, 5, 2)), "e": np.zeros((2, 4, 2))},
+        "u has shape (2, 5, 2), expected (2, 4, 2)",
+    ),
+    "states": (
+        {"x": np.zeros((2, 5, 3)), "u": np.zeros((2, 4, 2)), "e": np.zeros((2, 4, 2))},
+        "x has shape (2, 5, 3), expected (2, 5, 4)",
+    ),
+    "no e": (
+        {"x": np.zeros((2, 5, 4)), "u": np.zeros((2, 4, 2))},
+        "no column e for the environment; pass env_source=none",
+    ),
+}
+
+
+@pytest.mark.parametrize("kind", ARRAYS)
+def test_a_malformed_npz_is_one_line(tmp_path, kind):
+    arrays, message = ARRAYS[kind]
+    assert message in refusal(write_npz(tmp_path / "a.npz", arrays))
+
+
+def test_every_refused_file_is_reported(tmp_path):
+    for name, row in (("a", 3), ("b", 8)):
+        columns = drive(phase=row)
+        change("yaw", row, np.nan)(columns)
+        write_csv(tmp_path / f"{name}.csv", columns)
+    lines = []
+    with pytest.raises(ValueError, match=r"yaw is nan \(the first of 2 findings\)"):
+        read(tmp_path, report=lines.append)
+    assert len(lines) == 1
+    assert re.search(r"[ab]\.csv, line (5|10): yaw is nan$", lines[0])
+
+
+@pytest.mark.parametrize(
+    ("path", "message"),
+    [
+        ("???", "dataset.path is not set"),
+        ("nowhere.csv", "no such file or folder, and no file matches it"),
+        ("*.csv", "no such file or folder, and no file matches it"),
+        (".", "no .csv, .npz, .parquet in this folder"),
+        ("notes.txt", "unknown kind of log"),
+    ],
+)
+def test_a_path_that_means_no_logs_is_refused(tmp_path, monkeypatch, path, message):
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "notes.txt").write_text("")
+    assert message in refusal(path)
+
+
+def test_the_same_drive_twice_is_refused(tmp_path):
+    for name in "ab":
+        write_csv(tmp_path / f"{name}.csv", drive())
+    assert "b.csv: the same contents as" in refusal(tmp_path)
+
+
+def test_contents_decide_which_data_set_it_is(tmp_path):
+    for folder in ("here", "there"):
+        (tmp_path / folder).mkdir()
+    write_csv(tmp_path / "here" / "a.csv", drive())
+    write_csv(tmp_path / "there" / "renamed.csv", drive())
+    first, moved = (
+        datasets.fingerprint(str(tmp_path / folder)) for folder in ("here", "there")
+    )
+    write_csv(tmp_path / "here" / "a.csv", drive(phase=0.1))
+    assert first == moved != datasets.fingerprint(str(tmp_path / "here"))
+
+
+@pytest.mark.parametrize(
+    ("columns", "message"),
+    [
+        (
+            Columns(state=("p_x", "p_y", "yaw")),
+            "dataset.columns.state must name position, position, yaw and speed first",
+        ),
+        (
+            Columns(control=("steering",)),
+            "dataset.columns.control must name two columns, got 1",
+        ),
+        (Columns(environment=("friction", "v")), "dataset.columns names v twice"),
+        (Columns(environment=()), "pass env_source=none"),
+    ],
+)
+def test_invalid_columns_are_refused(tmp_path, columns, message):
+    assert message in refusal(write_csv(tmp_path / "a.csv", drive()), columns)
+
+
+@pytest.mark.parametrize(
+    ("spoil", "options", "message"),
+    [
+        (scale("steering", np.negative), {}, "the robot turns against steering"),
+        (scale("steering", np.sign), {}, "steering takes only 2 values"),
+        (scale("yaw", lambda yaw: yaw + 1.0), {}, "differ by -1.00 rad throughout"),
+        (
+            scale("t", lambda t: t),
+            {"wheelbase": 0.3},
+            "suggest a wheelbase of 2.7 m, vehicle.wheelbase is 0.3",
+        ),
+        (
+            scale("t", lambda t: t),
+            {"limits": ((-0.1, -1.0), (0.1, 1.0))},
+            "outside -0.1 to 0.1 of vehicle.control_low",
+        ),
+    ],
+)
+def test_oddities_are_warned_of(tmp_path, spoil, options, message):
+    columns = drive()
+    spoil(columns)
+    _, lines = read(write_csv(tmp_path / "a.csv", columns), **options)
+    assert any(
+        line.startswith(f"warning: {tmp_path}") and message in line for line in lines
+    )
+
+
+def test_the_box_of_environments_is_what_logs_reach_or_what_is_asked(tmp_path):
+    columns = drive()
+    path = write_csv(tmp_path / "a.csv", columns)
+    result = read(path)[0].dataset
+    envs = together(result)[2]
+    np.testing.assert_array_equal(result.env_low, envs.min(axis=(0, 1)))
+    np.testing.assert_array_equal(result.env_high, envs.max(axis=(0, 1)))
+    chosen = read(path, env_low=(0.3, -8.0), env_high=(0.9, 8.0))[0].dataset
+    np.testing.assert_array_equal(chosen.env_low, np.float32([0.3, -8.0]))
+    first = int(np.argmax(columns["wind"] > 1.0 + 1e-5))
+    line = refusal(path, env_low=(0.3, -8.0), env_high=(0.9, 1.0))
+    assert line.startswith(f"{path}, line {first + 2}: wind is ")
+    assert "must be 2 numbers each" in refusal(path, env_low=(0.3,), env_high=(0.9,))
+    assert "must be 2 numbers each" in refusal(path, env_low=(0.3, -8.0))
+
+
+def assign(drives, shares=(0.6, 0.1, 0.2, 0.1), seed=0):
+    return _assignment.assign_parts(np.asarray(drives), shares=shares, seed=seed)
+
+
+@pytest.mark.parametrize("drives", [20, 50, 200])
+def test_drives_are_assigned_whole_where_there_are_enough(drives):
+    labels = np.repeat(np.arange(drives), 7)
+    assigned = assign(labels)
+    assert assigned.whole
+    assert all(
+        len(set(assigned.parts[labels == drive])) == 1 for drive in range(drives)
+    )
+    shares = np.bincount(assigned.parts) / len(labels)
+    assert np.all(np.abs(shares - [0.6, 0.1, 0.2, 0.1]) <= 1.0 / drives + 1e-9)
+
+
+@pytest.mark.parametrize("sizes", [(40,), (20, 20), (100, 1, 1, 1, 1, 1)])
+def test_too_few_drives_are_cut_in_time(sizes):
+    assigned = assign(np.repeat(np.arange(len(sizes)), sizes))
+    assert not assigned.whole
+    first = assigned.parts[: sizes[0]]
+    assert np.all(np.diff(first) >= 0)
+    np.testing.assert_allclose(
+        np.bincount(first) / sizes[0], [0.6, 0.1, 0.2, 0.1], atol=1.0 / sizes[0]
+    )
+
+
+def test_coverage_counts_the_tenths_that_were_visited():
+    values = np.concatenate([np.linspace(0.0, 0.499, 999), [1.0]])
+    covered = datasets.coverage({"v": values, "still": np.zeros(5)})
+    assert covered["v"]["low"] == 0.0
+    assert covered["v"]["high"] == 1.0
+    assert covered["v"]["bins_visited"] == 0.6
+    assert covered["still"]["bins_visited"] == 0.0

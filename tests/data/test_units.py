@@ -1,0 +1,141 @@
+"""Columns whose names have units are read in SI units, or refused in one line."""
+
+import numpy as np
+import pytest
+from recorded import drive, write_csv, write_npz
+
+from sfkd_jax import data as datasets
+from sfkd_jax.data import Columns
+from sfkd_jax.data._units import UNITS, find_column, find_unit, split_unit
+
+WITH_UNITS = {
+    "t": ("t (ms)", 1e3),
+    "p_x": ("p_x(m)", 1.0),
+    "p_y": ("p_y [cm]", 1e2),
+    "yaw": ("yaw(deg)", 180.0 / np.pi),
+    "v": ("v [km/h]", 3.6),
+    "steering": ("steering(°)", 180.0 / np.pi),
+    "acceleration": ("acceleration [m/s^2]", 1.0),
+    "friction": ("friction[%]", 1e2),
+    "wind": ("wind (kn)", 3600 / 1852),
+}
+
+
+def read(path, columns=None):
+    lines = []
+    options = {"dt": 0.1, "wheelbase": 2.7, "steps": 10, "report": lines.append}
+    return datasets.from_logs(str(path), columns or Columns(), **options), lines
+
+
+def values(logged):
+    part = logged.dataset.train
+    return [np.asarray(leaf) for leaf in part]
+
+
+def with_units(columns):
+    return {WITH_UNITS[n][0]: WITH_UNITS[n][1] * a for n, a in columns.items()}
+
+
+@pytest.mark.parametrize("write", [write_csv, write_npz])
+def test_units_in_column_names_are_converted_and_reported(tmp_path, write):
+    suffix = "csv" if write is write_csv else "npz"
+    plain, _ = read(write(tmp_path / f"plain.{suffix}", drive()))
+    logged, lines = read(write(tmp_path / f"units.{suffix}", with_units(drive())))
+    for given, expected in zip(values(logged), values(plain), strict=True):
+        np.testing.assert_allclose(given, expected, rtol=1e-5, atol=1e-5)
+    (line,) = (line for line in lines if line.startswith("converted"))
+    assert line == (
+        "converted to SI units: t (ms) to s (x 0.001), p_y [cm] to m (x 0.01), "
+        "yaw(deg) to rad (x 0.0174533), v [km/h] to m/s (x 0.277778), "
+        "steering(°) to rad (x 0.0174533), friction[%] to - (x 0.01), "
+        "wind (kn) to m/s (x 0.514444)"
+    )
+
+
+def test_si_units_change_no_bit(tmp_path):
+    columns = drive()
+    named = {f"{name}({'s' if name == 't' else '-'})": a for name, a in columns.items()}
+    named = {
+        n.replace("p_x(-)", "p_x(m)").replace("p_y(-)", "p_y (m)"): a
+        for n, a in named.items()
+    }
+    named = {
+        n.replace("yaw(-)", "yaw[rad]").replace("v(-)", "v [m/s]"): a
+        for n, a in named.items()
+    }
+    plain, _ = read(write_csv(tmp_path / "plain.csv", columns))
+    logged, lines = read(write_csv(tmp_path / "units.csv", named))
+    for given, expected in zip(values(logged), values(plain), strict=True):
+        np.testing.assert_array_equal(given, expected)
+    assert not any(line.startswith("converted") for line in lines)
+
+
+def test_a_name_in_full_is_read_as_it_is_or_converted_if_its_unit_is_known(tmp_path):
+    columns = drive()
+    columns["friction (estimate)"] = columns.pop("friction")
+    columns["v [km/h]"] = 3.6 * columns.pop("v")
+    names = Columns(
+        state=("p_x", "p_y", "yaw", "v [km/h]"),
+        environment=("friction (estimate)", "wind"),
+    )
+    logged, lines = read(write_csv(tmp_path / "a.csv", columns), names)
+    assert lines[0] == "converted to SI units: v [km/h] to m/s (x 0.277778)"
+    assert logged.coverage["state"]["v [km/h]"]["high"] < 6.1
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        (
+            {"v": "v [furlong/day]"},
+            "unknown unit 'furlong/day' of column v [furlong/day]",
+        ),
+        (
+            {"p_x": "p_x (deg)"},
+            "column p_x (deg) has a unit of angle, length is needed",
+        ),
+        ({"t": "t (m)"}, "column t (m) has a unit of length, time is needed"),
+    ],
+)
+def test_other_units_are_one_line(tmp_path, changes, message):
+    columns = {changes.get(name, name): a for name, a in drive().items()}
+    path = write_csv(tmp_path / "a.csv", columns)
+    with pytest.raises(ValueError, match=r"^[^\n]*$") as refusal:
+        read(path)
+    assert str(refusal.value).startswith(f"{path}: {message}")
+
+
+def test_two_columns_that_fit_are_refused(tmp_path):
+    columns = drive()
+    columns["v (m/s)"] = columns["v [km/h]"] = columns.pop("v")
+    with pytest.raises(ValueError, match="both fit v; configure one in full"):
+        read(write_csv(tmp_path / "a.csv", columns))
+
+
+def test_the_exact_name_comes_first():
+    assert find_column("x", ["x(ft)", "x"], "length").header == "x"
+    assert find_column("x", ["y", "xx(m)"], "length") is None
+
+
+@pytest.mark.parametrize(
+    ("header", "parts"),
+    [
+        ("x(m)", ("x", "m")),
+        ("speed [km/h] ", ("speed", "km/h")),
+        ("a  ( m/s^2 )", ("a", "m/s^2")),
+        ("f()", ("f", "")),
+        ("plain", None),
+        ("(m)", None),
+    ],
+)
+def test_units_are_split_from_names(header, parts):
+    assert split_unit(header) == parts
+
+
+def test_every_dimension_begins_with_its_si_unit():
+    for dimension, units in UNITS.items():
+        assert next(iter(units.values())) == 1.0
+        for symbol, factor in units.items():
+            assert find_unit(symbol).factor == factor
+            assert find_unit(symbol).dimension == dimension
+    assert find_unit("KM/H").factor == pytest.approx(1 / 3.6)

@@ -1,0 +1,141 @@
+"""A user's own vehicle: given by a named function, or by logs alone."""
+
+from pathlib import Path
+
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from sfkd_jax import build, evaluation, plants
+
+NAMES = ("p_x", "p_y", "yaw", "v", "yaw_rate")
+LIMITS = {"control_low": (-1.0, -2.0), "control_high": (1.0, 2.0)}
+SETTINGS = {
+    "name": "own",
+    "inner_loop": "none",
+    "speed_gain": 1.0,
+    "state_names": list(NAMES),
+}
+SETTINGS |= {name: list(values) for name, values in LIMITS.items()}
+EXAMPLES = Path(__file__).parents[2] / "examples"
+
+
+def test_a_step_is_named_in_the_settings_and_is_the_function_itself(monkeypatch):
+    monkeypatch.syspath_prepend(EXAMPLES)
+    plant = build.build_vehicle(SETTINGS | {"step": "own_vehicle:step"})
+    plants.check_step(plant)
+    from own_vehicle import step
+
+    state, control, env = (
+        jnp.asarray([1.0, 2.0, 0.3, 4.0, 0.1]),
+        jnp.asarray([0.2, 0.5]),
+        jnp.asarray([0.7, 3.0]),
+    )
+    np.testing.assert_array_equal(
+        plant.step(state, control, env), step(state, control, env)
+    )
+    assert plant.simulated
+    assert (plant.control_low, plant.control_high) == ((-1.0, -2.0), (1.0, 2.0))
+
+
+@pytest.mark.parametrize(
+    ("step", "message"),
+    [
+        (
+            "nowhere.at_all:step",
+            "vehicle.step=nowhere.at_all:step: No module named 'nowhere'; name it as",
+        ),
+        (
+            "own_vehicle:leap",
+            "vehicle.step=own_vehicle:leap: module 'own_vehicle' has no attribute 'leap'; name it as",
+        ),
+        ("own_vehicle", "name it as package.module:function"),
+    ],
+)
+def test_a_missing_step_is_reported_when_it_is_needed_and_not_before(
+    monkeypatch, step, message
+):
+    monkeypatch.syspath_prepend(EXAMPLES)
+    plant = build.build_vehicle(SETTINGS | {"step": step})
+    with pytest.raises(ValueError, match=r"vehicle\.step") as caught:
+        plants.check_step(plant)
+    assert message in str(caught.value)
+
+
+def test_a_step_of_another_size_is_refused_by_its_shapes():
+    names = ("p_x", "p_y", "yaw", "v")
+    plant = plants.own(
+        state_names=names, step=lambda x, u, e: jnp.append(x, u[0]), **LIMITS
+    )
+    with pytest.raises(
+        ValueError,
+        match=r"the step of vehicle own returns \(5,\), vehicle.state_names has 4 names",
+    ):
+        plants.check_step(plant)
+
+
+def test_a_step_that_fails_is_reported_with_the_sizes_it_was_given():
+    def step(x, u, e):
+        p_x, p_y, yaw, v, rate = x
+        return jnp.stack([p_x, p_y, yaw, v, rate])
+
+    plant = plants.own(step=step, **LIMITS)
+    with pytest.raises(
+        ValueError,
+        match=r"fails on 4 states \(vehicle.state_names\), .*: not enough values to unpack",
+    ):
+        plants.check_step(plant)
+
+
+def test_a_robot_known_from_logs_alone_is_not_driven():
+    plant = plants.own(state_names=NAMES)
+    assert not plant.simulated
+    with pytest.raises(
+        ValueError, match="known from logs alone, so nothing can drive it"
+    ):
+        plants.check_step(plant)
+
+
+@pytest.mark.parametrize(
+    ("settings", "message"),
+    [
+        (
+            {"state_names": ("p_x", "p_y", "yaw")},
+            "state_names must be p_x, p_y, yaw, v",
+        ),
+        ({"control_low": (-1.0,), "control_high": (1.0,)}, "two numbers each"),
+        ({"control_low": (-1.0, -2.0)}, "two numbers each"),
+        ({"step": lambda x, u, e: x}, "two numbers each"),
+    ],
+)
+def test_invalid_settings_are_refused(settings, message):
+    with pytest.raises(ValueError, match=message):
+        plants.own(**settings)
+
+
+def test_a_speed_loop_needs_limits_and_an_acceleration():
+    for plant in (plants.own(), plants.own(speed_loop=True, **LIMITS)):
+        with pytest.raises(
+            ValueError, match="inner_loop=speed needs limits of the acceleration"
+        ):
+            plants.with_speed_loop(plant)
+
+
+def test_its_nominal_model_is_the_bicycle_and_leaves_further_states_alone():
+    plant = plants.own(dt=0.01, wheelbase=1.0, state_names=NAMES)
+    state, control = jnp.asarray([0.0, 0.0, 0.0, 2.0, 0.7]), jnp.asarray([0.1, 0.0])
+    rate = plant.nominal_derivative(state, control, jnp.zeros(2))
+    np.testing.assert_allclose(rate[2], 2.0 * np.tan(0.1) / 1.0, rtol=1e-6)
+    after = plant.nominal(state, control, jnp.zeros(2))
+    np.testing.assert_allclose(after[2], 0.01 * rate[2], rtol=1e-5)
+    assert after[4] == state[4]
+
+
+def test_side_forces_need_a_plant_that_wind_acts_on(key):
+    with pytest.raises(
+        ValueError,
+        match=r"side_forces act through the wind, but vehicle\.wind_force is 0",
+    ):
+        evaluation.disturbed_environment(
+            plants.own(), jnp.zeros((3, 2)), key, largest=10.0
+        )
