@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import json
 import warnings
-from collections.abc import Mapping
-from functools import lru_cache
+from collections.abc import Callable, Mapping
+from functools import lru_cache, wraps
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -197,8 +197,22 @@ def load(
             f"{file}: nothing is certified and nothing is monitored; {reason}",
             stacklevel=2,
         )
-    params = jax.jit(fold, static_argnums=0)(trained.model, trained.params)
+    # A certificate speaks of float32; accelerators would multiply with ten bits.
+    with jax.default_matmul_precision("float32"):
+        params = jax.jit(fold, static_argnums=0)(trained.model, trained.params)
+    planner = planner._replace(act=_in_float32(planner.act))
     return Policy(trained.model, params, planner, certificate, settings, trained.law)
+
+
+def _in_float32(act: Callable[..., Any]) -> Callable[..., Any]:
+    """Return the same function, whose products are float32 on any device."""
+
+    @wraps(act)
+    def precise(*arguments: Any) -> Any:
+        with jax.default_matmul_precision("float32"):
+            return act(*arguments)
+
+    return precise
 
 
 def read_certificate(

@@ -65,9 +65,19 @@ def explicit_weights(model: Model, params: Params) -> Exported:
     if model.structure.explicit is None:
         raise CertificationRefused("this model exposes no explicit weights to certify")
     evaluate = jax.jit(model.structure.explicit, compiler_options=COMPILER_OPTIONS)
-    return jax.tree.map(
-        lambda leaf: np.asarray(leaf, dtype=np.float64), evaluate(unfold(params))
-    )
+    # Accelerators round float32 factors to ten bits, which the witnesses of another
+    # machine do not survive: evaluated on the host, or else in full precision.
+    with jax.default_device(_host()), jax.default_matmul_precision("float32"):
+        weights = evaluate(jax.tree.map(np.asarray, unfold(params)))
+    return jax.tree.map(lambda leaf: np.asarray(leaf, dtype=np.float64), weights)
+
+
+def _host() -> jax.Device | None:
+    """Return the processor as a device; None if the process may not use it."""
+    try:
+        return jax.local_devices(backend="cpu")[0]
+    except RuntimeError:  # JAX_PLATFORMS names accelerators only
+        return None
 
 
 def require_finite(weights: Exported) -> None:
