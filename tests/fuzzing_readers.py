@@ -18,8 +18,8 @@ import jax.export
 import jax.numpy as jnp
 import numpy as np
 
-from sfkd_jax import artefacts, paper, policy, reporting
 from sfkd_jax import data as datasets
+from sfkd_jax import paper, policy, reporting, store
 from sfkd_jax.export import _run_controller as loader
 
 ROOT = Path(__file__).parents[1]
@@ -42,7 +42,7 @@ class Reader(NamedTuple):
     files: dict[str, Change]
     read: Callable[[Path], Any]
     holds: Callable[[Any, Path], bool]
-    refusals: tuple[type[Exception], ...] = (artefacts.ArtefactError,)
+    refusals: tuple[type[Exception], ...] = (store.ArtefactError,)
 
 
 # ---- documents
@@ -68,25 +68,25 @@ def make_document(folder: Path) -> None:
 
 
 def read_document(folder: Path) -> Any:
-    return artefacts.read_json(folder / "a.json")
+    return store.read_json(folder / "a.json")
 
 
 def document_holds(result: Any, folder: Path) -> bool:
     return equal(result, plain_json((folder / "a.json").read_bytes())) and equal(
-        artefacts.sha256(result)[:0], ""
+        store.sha256(result)[:0], ""
     )
 
 
 def make_lines(folder: Path) -> None:
     for step in range(12):
-        artefacts.append_jsonl(
+        store.append_jsonl(
             folder / "a.jsonl",
             {"step": step, "loss": 0.5**step, "parts": {"x": [step]}, "w": "é"},
         )
 
 
 def read_lines(folder: Path) -> Any:
-    return artefacts.read_jsonl(folder / "a.jsonl")
+    return store.read_jsonl(folder / "a.jsonl")
 
 
 def lines_hold(result: Any, folder: Path) -> bool:
@@ -110,22 +110,20 @@ ARRAYS = {
 
 
 def make_arrays(folder: Path) -> None:
-    artefacts.write_arrays(
+    store.write_arrays(
         folder / "a.npz",
         ARRAYS,
         kind="fuzzed",
         config={"seed": 0, "model": {"rank": 3}},
     )
-    manifest = artefacts.read_json(folder / "a.json")
+    manifest = store.read_json(folder / "a.json")
     manifest.pop("file_sha256", None)  # as an earlier version or an attacker writes it
     shutil.copy(folder / "a.npz", folder / "b.npz")
-    artefacts.write_json(folder / "b.json", manifest)
+    store.write_json(folder / "b.json", manifest)
 
 
 def read_arrays(folder: Path) -> Any:
-    return [
-        artefacts.read_arrays(folder / f"{name}.npz", kind="fuzzed") for name in "ab"
-    ]
+    return [store.read_arrays(folder / f"{name}.npz", kind="fuzzed") for name in "ab"]
 
 
 def arrays_hold(result: Any, folder: Path) -> bool:
@@ -155,7 +153,7 @@ def make_npz(folder: Path) -> None:
 
 
 def read_npz(folder: Path) -> Any:
-    return artefacts.read_npz(folder / "a.npz")
+    return store.read_npz(folder / "a.npz")
 
 
 def npz_holds(result: Any, folder: Path) -> bool:
@@ -208,7 +206,7 @@ def log_reader(name: str, make: Callable[[Path], None], change: Change) -> Reade
         )
 
     return Reader(
-        make, {name: change}, read, log_holds, (artefacts.ArtefactError, ValueError)
+        make, {name: change}, read, log_holds, (store.ArtefactError, ValueError)
     )
 
 
@@ -242,15 +240,15 @@ def results() -> dict[str, Any]:
 
 
 def make_run(folder: Path) -> None:
-    artefacts.write_json(folder / "results.json", results())
+    store.write_json(folder / "results.json", results())
     shutil.copy(SHIPPED / "policy.json", folder / "policy.json")
 
 
 def read_rows(folder: Path) -> Any:
     path = folder / "results.json"
-    rows = artefacts.read_json(path, keys=("rows",))["rows"]
-    with artefacts.as_artefact_error(path):
-        return artefacts.merge([], rows)
+    rows = store.read_json(path, keys=("rows",))["rows"]
+    with store.as_artefact_error(path):
+        return store.merge([], rows)
 
 
 def rows_hold(result: Any, folder: Path) -> bool:
@@ -269,8 +267,8 @@ def page_holds(result: Any, folder: Path) -> bool:
 
 def read_benchmark(folder: Path) -> Any:
     path = folder / "results.json"
-    document = artefacts.read_json(path, keys=("rows",))
-    with artefacts.as_artefact_error(path):
+    document = store.read_json(path, keys=("rows",))
+    with store.as_artefact_error(path):
         return paper.results_markdown(document)
 
 
@@ -278,7 +276,7 @@ def make_runs(folder: Path) -> None:
     for seed in range(2):
         run = folder / "runs" / f"seed={seed}"
         make_run(run) if run.mkdir(parents=True) is None else None
-        artefacts.write_json(
+        store.write_json(
             run / "settings.json",
             {"seed": seed, "model": {"system": "sfkd", "rho": 0.9, "beta": 0.1}},
         )
@@ -351,7 +349,7 @@ def make_export(folder: Path) -> None:
             *inputs.values()
         )
         content = bytes(exported.serialize())
-        artefacts.write_bytes(folder / f"{name}.stablehlo", content)
+        store.write_bytes(folder / f"{name}.stablehlo", content)
         programs[name] = {
             "file": f"{name}.stablehlo",
             "bytes": len(content),

@@ -13,7 +13,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from sfkd_jax import artefacts, certification, control, models, plants
+from sfkd_jax import certification, control, models, plants, store
 from sfkd_jax import data as datasets
 from sfkd_jax.types import Space, Trajectory
 
@@ -343,7 +343,7 @@ def refusal_of(action):
     """
     try:
         action()
-    except (artefacts.ArtefactError, ValueError, OSError) as reason:
+    except (store.ArtefactError, ValueError, OSError) as reason:
         line = str(reason)
     else:
         return None

@@ -28,31 +28,31 @@ COMMANDS = {
     "demo",
 }
 PLANT = CORE | {"plants"}
-MODEL_AND_DATA = PLANT | {"artefacts", "build", "certification", "control", "data"}
+MODEL_AND_DATA = PLANT | {"store", "build", "certification", "control", "data"}
 ARROWS = {
     "types": set(),
     "geometry": CORE,
     "rollout": CORE,
     "ranges": set(),
-    "artefacts": set(),
+    "store": set(),
     "plants": CORE,
     "models": CORE,
     "control": CORE,
     "certification": CORE,
-    "training": CORE | {"artefacts"},
+    "training": CORE | {"store"},
     "scenarios": PLANT,
-    "data": PLANT | {"scenarios", "artefacts"},
+    "data": PLANT | {"scenarios", "store"},
     "evaluation": PLANT | {"scenarios"},
     "build": PLANT | {"scenarios", "data", "models", "control"},
     "adapters": PLANT | {"scenarios", "build"},
-    "policy": PLANT | {"artefacts", "build", "certification", "control", "models"},
-    "export": CORE | {"artefacts", "build", "policy"},
+    "policy": PLANT | {"store", "build", "certification", "control", "models"},
+    "export": CORE | {"store", "build", "policy"},
     "corridor": MODEL_AND_DATA | {"evaluation", "policy"},
     "pipeline": MODEL_AND_DATA
     | {"corridor", "evaluation", "policy", "scenarios", "training"},
-    "reporting": {"artefacts", "evaluation"},
-    "paper": {"artefacts", "evaluation", "reporting"},
-    "__init__": {"artefacts", "export", "policy"},
+    "reporting": {"store", "evaluation"},
+    "paper": {"store", "evaluation", "reporting"},
+    "__init__": {"store", "export", "policy"},
 }
 LIBRARY = set(ARROWS)
 ARROWS |= {"cli": LIBRARY}
@@ -61,7 +61,7 @@ ARROWS |= {command: LIBRARY | COMMANDS | {"cli"} for command in COMMANDS | {"__m
 ALLOWED_EVERYWHERE = set(sys.stdlib_module_names) | {PACKAGE, "jax", "jaxtyping"}
 COMMAND_LINE = {"hydra", "omegaconf", "numpy", "rich"}
 THIRD_PARTY = {
-    "artefacts": {"numpy", "filelock"},
+    "store": {"numpy", "filelock"},
     "data": {"numpy", "pyarrow"},
     "models": {"flax"},
     "control": {"numpy"},

@@ -18,8 +18,8 @@ import numpy as np
 import pytest
 from helpers import largest_file
 
-from sfkd_jax import artefacts
-from sfkd_jax.artefacts import ArtefactError, _provenance, provenance, source_hash
+from sfkd_jax import store
+from sfkd_jax.store import ArtefactError, _provenance, provenance, source_hash
 
 CONFIG = {
     "model": {"rank": 16, "layers": [32, 32]},
@@ -42,13 +42,13 @@ OLD = {"x": np.arange(4.0)}
 
 
 def write(path, arrays=ARRAYS, **changes):
-    return artefacts.write_arrays(
+    return store.write_arrays(
         path, arrays, **{"kind": "policy", "config": CONFIG, **changes}
     )
 
 
 def read(path, **changes):
-    return artefacts.read_arrays(path, **{"kind": "policy", **changes})
+    return store.read_arrays(path, **{"kind": "policy", **changes})
 
 
 def refusal(action, *arguments, **settings) -> str:
@@ -87,7 +87,7 @@ def test_trees_come_back_from_flat_names():
         "step": 3,
         "scale": 0.5,
     }
-    flat = artefacts.flatten(tree)
+    flat = store.flatten(tree)
     assert list(flat) == [
         "params/dense/kernel",
         "params/dense/bias",
@@ -96,14 +96,14 @@ def test_trees_come_back_from_flat_names():
         "scale",
     ]
     assert all(isinstance(leaf, np.ndarray) for leaf in flat.values())
-    back = artefacts.unflatten(flat)
+    back = store.unflatten(flat)
     assert back["params"]["none"] == {}
     assert back["step"].shape == ()
     np.testing.assert_array_equal(
         back["params"]["dense"]["kernel"], np.ones((2, 3), np.float32), strict=True
     )
-    assert artefacts.flatten(back).keys() == flat.keys()
-    assert artefacts.unflatten(artefacts.flatten({})) == {}
+    assert store.flatten(back).keys() == flat.keys()
+    assert store.unflatten(store.flatten({})) == {}
 
 
 @pytest.mark.parametrize(
@@ -111,26 +111,26 @@ def test_trees_come_back_from_flat_names():
 )
 def test_trees_without_a_flat_form_are_refused(tree):
     with pytest.raises(ValueError, match="cannot flatten"):
-        artefacts.flatten(tree)
+        store.flatten(tree)
 
 
 @pytest.mark.parametrize("flat_names", [("a", "a/b"), ("a/b", "a"), ("a/b/c", "a/b")])
 def test_a_leaf_is_not_a_dict(flat_names):
     with pytest.raises(ValueError, match="leaf"):
-        artefacts.unflatten({name: np.zeros(1) for name in flat_names})
+        store.unflatten({name: np.zeros(1) for name in flat_names})
 
 
 def test_hash_sees_content_and_nothing_else():
-    digest = artefacts.sha256(ARRAYS)
-    assert digest == artefacts.sha256(dict(reversed(ARRAYS.items())))
-    assert digest == artefacts.sha256(
+    digest = store.sha256(ARRAYS)
+    assert digest == store.sha256(dict(reversed(ARRAYS.items())))
+    assert digest == store.sha256(
         {name: np.array(array, order="F") for name, array in ARRAYS.items()}
     )
     strided = np.zeros((6, 8), np.float32)[::2, ::2]
     strided[:] = ARRAYS["params/A"]
-    assert digest == artefacts.sha256(ARRAYS | {"params/A": strided})
+    assert digest == store.sha256(ARRAYS | {"params/A": strided})
     a = ARRAYS["params/A"]
-    assert artefacts.sha256({"a": jnp.asarray(a)}) == artefacts.sha256({"a": a})
+    assert store.sha256({"a": jnp.asarray(a)}) == store.sha256({"a": a})
     others = [
         {"b": a},
         {"a": a.T},
@@ -142,20 +142,17 @@ def test_hash_sees_content_and_nothing_else():
     ]
     others += [{"a": a.astype(">f4")}, {"a": a.view(np.int32)}, {"a": a.tolist()}]
     assert (
-        len({artefacts.sha256(other) for other in [{"a": a}, *others]})
-        == len(others) + 1
+        len({store.sha256(other) for other in [{"a": a}, *others]}) == len(others) + 1
     )
 
 
 def test_hash_of_json_sees_content_and_nothing_else():
-    digest = artefacts.sha256(CONFIG)
-    assert digest == artefacts.sha256(dict(reversed(CONFIG.items())))
-    assert digest == artefacts.sha256(json.loads(json.dumps(CONFIG)))
-    assert digest == artefacts.sha256(CONFIG | {"seed": np.int64(0)})
-    assert digest != artefacts.sha256(CONFIG | {"seed": 1})
-    assert (
-        artefacts.sha256([1, 2]) == artefacts.sha256((1, 2)) != artefacts.sha256([2, 1])
-    )
+    digest = store.sha256(CONFIG)
+    assert digest == store.sha256(dict(reversed(CONFIG.items())))
+    assert digest == store.sha256(json.loads(json.dumps(CONFIG)))
+    assert digest == store.sha256(CONFIG | {"seed": np.int64(0)})
+    assert digest != store.sha256(CONFIG | {"seed": 1})
+    assert store.sha256([1, 2]) == store.sha256((1, 2)) != store.sha256([2, 1])
 
 
 def test_differences_are_listed_by_dotted_key():
@@ -164,19 +161,17 @@ def test_differences_are_listed_by_dotted_key():
         "training": {"steps": 100, "rate": 1e-3},
         "name": "a" * 99,
     }
-    assert artefacts.differences(CONFIG, options) == [
+    assert store.differences(CONFIG, options) == [
         "model.layers was [32, 32], is now [32, 64]",
         "training.steps was 4000, is now 100",
         "seed was 0, is now absent",
         f"name was absent, is now {'a' * 57}...",
     ]
-    assert artefacts.differences(CONFIG, json.loads(json.dumps(CONFIG))) == []
-    assert artefacts.differences({"a": {"b": 1}}, {"a": 1}) == [
-        "a was {'b': 1}, is now 1"
+    assert store.differences(CONFIG, json.loads(json.dumps(CONFIG))) == []
+    assert store.differences({"a": {"b": 1}}, {"a": 1}) == ["a was {'b': 1}, is now 1"]
+    assert store.differences({"a": True, "b": None}, {"a": 1, "b": float("nan")}) == [
+        "a was True, is now 1"
     ]
-    assert artefacts.differences(
-        {"a": True, "b": None}, {"a": 1, "b": float("nan")}
-    ) == ["a was True, is now 1"]
 
 
 # ---- JSON
@@ -191,12 +186,12 @@ def test_json_comes_back_with_arrays_as_lists_and_nan_as_null(path):
         "e": np.eye(2),
     }
     document = path.with_suffix(".json")
-    artefacts.write_json(
+    store.write_json(
         document,
         numbers
         | {"at": Path("runs"), "none": None, "deep": {"f": np.array([1.0, -np.inf])}},
     )
-    assert artefacts.read_json(document, keys=("a", "at")) == {
+    assert store.read_json(document, keys=("a", "at")) == {
         "a": 0.5,
         "b": [0, 1, 2],
         "c": None,
@@ -211,7 +206,7 @@ def test_json_comes_back_with_arrays_as_lists_and_nan_as_null(path):
 
 def test_json_that_cannot_be_read_is_refused(tmp_path):
     document = tmp_path / "a.json"
-    assert refusal(artefacts.read_json, document) == f"{document}: missing"
+    assert refusal(store.read_json, document) == f"{document}: missing"
     whole = json.dumps(CONFIG).encode()
     for text in (
         b"",
@@ -222,23 +217,23 @@ def test_json_that_cannot_be_read_is_refused(tmp_path):
         b"[" * 100_000,
     ):
         document.write_bytes(text)
-        assert "truncated or not JSON" in refusal(artefacts.read_json, document)
+        assert "truncated or not JSON" in refusal(store.read_json, document)
     document.write_bytes(b"[1]")
-    assert refusal(artefacts.read_json, document) == f"{document}: not a JSON object"
+    assert refusal(store.read_json, document) == f"{document}: not a JSON object"
     document.write_bytes(whole)
     assert (
-        refusal(artefacts.read_json, document, keys=("seed", "rows", "b"))
+        refusal(store.read_json, document, keys=("seed", "rows", "b"))
         == f"{document}: lacks rows, b"
     )
-    assert refusal(artefacts.read_json, tmp_path) == f"{tmp_path}: Is a directory"
+    assert refusal(store.read_json, tmp_path) == f"{tmp_path}: Is a directory"
 
 
 def test_a_value_that_is_not_json_leaves_the_earlier_file(tmp_path):
     document = tmp_path / "a.json"
-    artefacts.write_json(document, CONFIG)
+    store.write_json(document, CONFIG)
     for value in ({1, 2}, b"bytes", object()):
-        assert str(document) in refusal(artefacts.write_json, document, {"a": value})
-    assert artefacts.read_json(document) == CONFIG
+        assert str(document) in refusal(store.write_json, document, {"a": value})
+    assert store.read_json(document) == CONFIG
 
 
 # ---- arrays
@@ -246,13 +241,13 @@ def test_a_value_that_is_not_json_leaves_the_earlier_file(tmp_path):
 
 @pytest.mark.parametrize("compressed", [False, True])
 def test_arrays_come_back_as_they_were(path, compressed):
-    assert not artefacts.exists(path)
+    assert not store.exists(path)
     written = write(path, made_from={"dataset": "0" * 64}, compressed=compressed)
-    assert artefacts.exists(path)
+    assert store.exists(path)
     arrays, manifest = read(path, config=CONFIG)
     same(arrays, ARRAYS)
     assert manifest == written
-    assert manifest["sha256"] == artefacts.sha256(arrays) == artefacts.sha256(ARRAYS)
+    assert manifest["sha256"] == store.sha256(arrays) == store.sha256(ARRAYS)
     assert manifest["config"] == CONFIG
     assert manifest["made_from"] == {"dataset": "0" * 64}
     assert set(manifest["versions"]) == {"python", "numpy", "jax", "sfkd_jax"}
@@ -298,8 +293,8 @@ def test_other_settings_kinds_and_formats_are_refused(path):
     assert (
         refusal(read, path, kind="dataset") == f"{path}: is of kind policy, not dataset"
     )
-    manifest = artefacts.read_json(path.with_suffix(".json"))
-    artefacts.write_json(path.with_suffix(".json"), manifest | {"format": 2})
+    manifest = store.read_json(path.with_suffix(".json"))
+    store.write_json(path.with_suffix(".json"), manifest | {"format": 2})
     assert refusal(read, path) == f"{path}: is of format 2, this version reads 1"
 
 
@@ -307,14 +302,14 @@ def test_half_of_a_pair_is_refused(path):
     assert refusal(read, path) == f"{path}: missing"
     write(path)
     path.with_suffix(".json").unlink()
-    assert not artefacts.exists(path)
+    assert not store.exists(path)
     assert (
         refusal(read, path)
         == f"{path}: incomplete, its manifest policy.json is missing"
     )
     write(path)
     path.unlink()
-    assert not artefacts.exists(path)
+    assert not store.exists(path)
     assert refusal(read, path) == f"{path}: missing"
 
 
@@ -327,11 +322,11 @@ def test_a_damaged_manifest_is_refused_and_can_be_written_over(path):
         {"sha256": None},
         {"sha256": "ab"},
     ):
-        artefacts.write_json(manifest, good | changes)
+        store.write_json(manifest, good | changes)
         assert "not a manifest" in refusal(read, path)
         write(path)
         same(read(path)[0], ARRAYS)
-    artefacts.write_json(
+    store.write_json(
         manifest, {key: value for key, value in good.items() if key != "sha256"}
     )
     assert refusal(read, path) == f"{manifest}: lacks sha256"
@@ -363,9 +358,9 @@ def test_foreign_files_are_refused_each_in_its_own_words(path, tmp_path):
 
 def without_file_hash(path):
     """Make a manifest one of an earlier version, which knew no hash of the file."""
-    manifest = artefacts.read_json(path.with_suffix(".json"))
+    manifest = store.read_json(path.with_suffix(".json"))
     del manifest["file_sha256"]
-    artefacts.write_json(path.with_suffix(".json"), manifest)
+    store.write_json(path.with_suffix(".json"), manifest)
 
 
 class Unpicklable:
@@ -422,13 +417,13 @@ def test_no_flipped_byte_changes_what_is_read(path, compressed):
 
 def test_reading_while_another_process_writes_gives_the_new_arrays(path, monkeypatch):
     write(path, OLD)
-    load, calls = artefacts._arrays._load, []
+    load, calls = store._arrays._load, []
 
     def overtaken(*arguments):
         calls.append(write(path) if not calls else None)
         return load(*arguments)
 
-    monkeypatch.setattr(artefacts._arrays, "_load", overtaken)
+    monkeypatch.setattr(store._arrays, "_load", overtaken)
     same(read(path)[0], ARRAYS)
     assert len(calls) == 2
 
@@ -459,14 +454,14 @@ def test_a_full_disk_leaves_the_earlier_pair(path, monkeypatch, call, working):
 def test_a_write_that_ends_in_the_middle_leaves_the_earlier_files(path, size):
     document = path.with_name("results.json")
     write(path, OLD)
-    artefacts.write_json(document, CONFIG)
+    store.write_json(document, CONFIG)
     with largest_file(size):
         assert "File too large" in refusal(write, path, {"x": np.zeros(1_000_000)})
         assert "File too large" in refusal(
-            artefacts.write_json, document, {"x": "0" * 1_000_000}
+            store.write_json, document, {"x": "0" * 1_000_000}
         )
     same(read(path)[0], OLD)
-    assert artefacts.read_json(document) == CONFIG
+    assert store.read_json(document) == CONFIG
     assert names(path.parent) == ["policy.json", "policy.npz", "results.json"]
 
 
@@ -474,7 +469,7 @@ def test_a_directory_that_cannot_be_written_is_reported_in_one_line(tmp_path):
     (tmp_path / "file").touch()
     below = tmp_path / "file" / "policy.npz"
     assert str(below) in refusal(write, below).replace(".json", ".npz")
-    for writer in (artefacts.write_json, artefacts.append_jsonl):
+    for writer in (store.write_json, store.append_jsonl):
         assert refusal(writer, below, CONFIG) in (
             f"{below}: Not a directory",
             f"{below}: File exists",
@@ -496,18 +491,18 @@ package.__path__, package.__version__ = [sys.argv[1]], "0"
 sys.modules["sfkd_jax"] = package
 from pathlib import Path
 import numpy as np
-from sfkd_jax import artefacts
+from sfkd_jax import store
 path = Path(sys.argv[2])
 def kill(*_):
     os.kill(os.getpid(), signal.SIGKILL)
 def write(n):
-    artefacts.write_arrays(path, {"x": np.full(650_000, n, float)}, kind="policy", config={"n": n})
+    store.write_arrays(path, {"x": np.full(650_000, n, float)}, kind="policy", config={"n": n})
 """
 
 
 def child(path, code):
     source = CHILD + textwrap.dedent(code)
-    package = Path(artefacts.__file__).parents[1]
+    package = Path(store.__file__).parents[1]
     return subprocess.Popen(
         [sys.executable, "-c", source, package, path], stdout=subprocess.PIPE
     )
@@ -545,7 +540,7 @@ def test_a_kill_at_each_step_of_a_write_leaves_one_of_the_two_pairs(
         assert process.wait(20) == -signal.SIGKILL
     assert version(path) == left
     assert len(names(path.parent)) > 2
-    artefacts.write_arrays(
+    store.write_arrays(
         path, {"x": np.full(650_000, 3.0)}, kind="policy", config={"n": 3}
     )
     assert version(path) == 3
@@ -589,18 +584,18 @@ def test_two_writers_of_one_path_do_not_disturb_each_other(path):
 
 def test_logs_grow_line_by_line_and_are_cut_for_a_resumed_run(tmp_path):
     log = tmp_path / "new" / "metrics.jsonl"
-    artefacts.truncate_jsonl(log, lambda record: True)
-    assert refusal(artefacts.read_jsonl, log) == f"{log}: missing"
+    store.truncate_jsonl(log, lambda record: True)
+    assert refusal(store.read_jsonl, log) == f"{log}: missing"
     for step in range(5):
-        artefacts.append_jsonl(
+        store.append_jsonl(
             log, {"step": step, "loss": np.float32(0.5), "gap": float("nan")}
         )
     records = [{"step": step, "loss": 0.5, "gap": None} for step in range(5)]
-    assert artefacts.read_jsonl(log) == records
-    artefacts.truncate_jsonl(log, lambda record: record["step"] < 3)
-    assert artefacts.read_jsonl(log) == records[:3]
-    artefacts.truncate_jsonl(log, lambda record: False)
-    assert artefacts.read_jsonl(log) == []
+    assert store.read_jsonl(log) == records
+    store.truncate_jsonl(log, lambda record: record["step"] < 3)
+    assert store.read_jsonl(log) == records[:3]
+    store.truncate_jsonl(log, lambda record: False)
+    assert store.read_jsonl(log) == []
 
 
 def test_a_last_line_cut_short_is_dropped_and_not_built_on(tmp_path):
@@ -611,37 +606,37 @@ def test_a_last_line_cut_short_is_dropped_and_not_built_on(tmp_path):
         whole = [
             {"step": step} for step in range((size + 1) // 12)
         ]  # complete, with or without its end of line
-        assert artefacts.read_jsonl(log) == whole
-        artefacts.append_jsonl(log, {"step": 9})
-        assert artefacts.read_jsonl(log) == [*whole, {"step": 9}]
+        assert store.read_jsonl(log) == whole
+        store.append_jsonl(log, {"step": 9})
+        assert store.read_jsonl(log) == [*whole, {"step": 9}]
 
 
 def test_a_bad_line_before_the_last_is_refused(tmp_path):
     log = tmp_path / "metrics.jsonl"
     log.write_bytes(b'{"step": 0}\n{"ste\n{"step": 2}\n')
-    assert "line 2 truncated or not JSON" in refusal(artefacts.read_jsonl, log)
+    assert "line 2 truncated or not JSON" in refusal(store.read_jsonl, log)
     log.write_bytes(b'{"step": 0}\n\n7\n')
-    assert refusal(artefacts.read_jsonl, log) == f"{log}: line 3 not a JSON object"
+    assert refusal(store.read_jsonl, log) == f"{log}: line 3 not a JSON object"
 
 
 def test_a_log_on_a_full_disk_keeps_its_lines(tmp_path, monkeypatch):
     log = tmp_path / "metrics.jsonl"
-    artefacts.append_jsonl(log, {"step": 0})
+    store.append_jsonl(log, {"step": 0})
     with largest_file(log.stat().st_size + 5):
         assert (
-            refusal(artefacts.append_jsonl, log, {"step": 1})
+            refusal(store.append_jsonl, log, {"step": 1})
             == f"{log}: No space left on device"
         )
     assert log.read_bytes() == b'{"step": 0}\n'
     with largest_file(4):
         assert (
-            refusal(artefacts.truncate_jsonl, log, lambda record: True)
+            refusal(store.truncate_jsonl, log, lambda record: True)
             == f"{log}: File too large"
         )
-    assert artefacts.read_jsonl(log) == [{"step": 0}]
+    assert store.read_jsonl(log) == [{"step": 0}]
     assert names(tmp_path) == ["metrics.jsonl"]
-    artefacts.append_jsonl(log, {"step": 1})
-    assert artefacts.read_jsonl(log) == [{"step": 0}, {"step": 1}]
+    store.append_jsonl(log, {"step": 1})
+    assert store.read_jsonl(log) == [{"step": 0}, {"step": 1}]
 
 
 def test_the_source_hash_is_that_of_paths_and_contents(tmp_path, monkeypatch):

@@ -2,8 +2,8 @@
 
 import pytest
 
-from sfkd_jax.artefacts import write_json
-from sfkd_jax.pipeline import certificates, stages, store
+from sfkd_jax.pipeline import certificates, runs, stages
+from sfkd_jax.store import write_json
 
 CERTIFICATION = {"mode": "joint", "monitor_level": 0.95, "corridor": {"level": 0.95}}
 
@@ -14,7 +14,7 @@ def certified(monkeypatch, tmp_path):
     made = []
     monkeypatch.setattr(certificates, "certify_policy", made.append)
     monkeypatch.setattr(stages, "ensure_policy", lambda settings: None)
-    monkeypatch.setattr(store, "run_directory", lambda settings: tmp_path)
+    monkeypatch.setattr(runs, "run_directory", lambda settings: tmp_path)
     (tmp_path / "policy.npz").touch()
 
     def count(recorded, **changes):

@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 from helpers import last_line, run_command
 
-from sfkd_jax import artefacts
+from sfkd_jax import store
 
 
 @pytest.fixture(scope="session")
@@ -91,7 +91,7 @@ def test_results_have_the_rows_and_keys_that_other_programs_use(smoke):
 def test_the_certificate_is_about_the_saved_weights(smoke):
     directory, document = smoke
     certificate = json.loads((directory / document["certificate"]).read_text())
-    _, manifest = artefacts.read_arrays(
+    _, manifest = store.read_arrays(
         directory / document["run"] / "policy.npz", kind="policy"
     )
     assert certificate["valid"]
@@ -180,11 +180,11 @@ def test_load_gives_a_policy_without_heavy_imports(smoke):
 def test_certify_exits_0_then_3_when_weights_changed_then_0_when_renewed(copied):
     assert last_line(run_command("certify", "+experiment=smoke", cwd=copied))["valid"]
     file = copied / "runs/smoke/sfkd/seed=0/policy.npz"
-    arrays, manifest = artefacts.read_arrays(file, kind="policy")
+    arrays, manifest = store.read_arrays(file, kind="policy")
     changed = {
         name: np.asarray(array) * np.float32(1.01) for name, array in arrays.items()
     }
-    artefacts.write_arrays(
+    store.write_arrays(
         file,
         changed,
         kind="policy",
@@ -239,10 +239,10 @@ def test_a_damaged_policy_is_named_in_one_line(copied, damage):
 
 def test_a_policy_without_its_manifest_is_finished_again_from_the_checkpoint(copied):
     file = copied / "runs/smoke/sfkd/seed=0/policy.npz"
-    weights = artefacts.read_arrays(file, kind="policy")[1]["sha256"]
+    weights = store.read_arrays(file, kind="policy")[1]["sha256"]
     file.with_suffix(".json").unlink()
     run_command("certify", "+experiment=smoke", cwd=copied)
-    assert artefacts.read_arrays(file, kind="policy")[1]["sha256"] == weights
+    assert store.read_arrays(file, kind="policy")[1]["sha256"] == weights
 
 
 def test_a_scenario_of_choice_adds_rows_and_keeps_the_others(copied):

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from helpers import last_line, run_command, straight
 
-from sfkd_jax import artefacts, demo, policy
+from sfkd_jax import demo, policy, store
 from sfkd_jax.certification import Certificate, verify
 
 VEHICLES = sorted(entry.name for entry in demo.SHIPPED.iterdir())
@@ -90,15 +90,15 @@ def test_shipped_policies_load_and_their_certificates_follow_from_witnesses(vehi
 def test_a_policy_with_settings_of_another_version_is_named_in_one_line(
     tmp_path, change, says
 ):
-    arrays, manifest = artefacts.read_arrays(
+    arrays, manifest = store.read_arrays(
         demo.SHIPPED / "kinematic" / "policy.npz", kind=policy.KIND
     )
     change(manifest["config"]["controller"])
-    artefacts.write_arrays(
+    store.write_arrays(
         tmp_path / "policy.npz", arrays, kind=policy.KIND, config=manifest["config"]
     )
     with pytest.raises(
-        artefacts.ArtefactError,
+        store.ArtefactError,
         match=rf"policy\.json.*{says}.*saved by sfkd_jax .*: train again",
     ):
         policy.load(tmp_path)

@@ -213,7 +213,7 @@ def test_every_page_is_in_the_navigation_and_nothing_else_is():
 
 def test_every_public_package_has_a_page_of_the_reference():
     pages = "".join(page.read_text("utf-8") for page in (DOCS / "api").glob("*.md"))
-    private = {"artefacts", "build", "cli", "core", "paper", "pipeline", "reporting"}
+    private = {"store", "build", "cli", "core", "paper", "pipeline", "reporting"}
     assert {
         package
         for package in PACKAGES - private

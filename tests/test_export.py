@@ -23,11 +23,11 @@ from hydra import compose, initialize_config_dir
 from omegaconf import OmegaConf
 
 import sfkd_jax
-from sfkd_jax import artefacts, build, certification, policy
+from sfkd_jax import build, certification, policy, store
 from sfkd_jax import export as exporting
 from sfkd_jax.cli import config
 from sfkd_jax.export import __main__ as export
-from sfkd_jax.pipeline import store
+from sfkd_jax.pipeline import runs
 from sfkd_jax.types import Controller
 
 HORIZON, STEPS = 5, 6
@@ -77,8 +77,8 @@ def exported(tmp_path_factory):
         jax.random.key(0)
     )
     stored = requested | {"space": build.space_to_settings(space())}
-    store.claim(requested)
-    run_dir = store.run_directory(requested)
+    runs.claim(requested)
+    run_dir = runs.run_directory(requested)
     policy.save(run_dir / "policy.npz", params, stored, made_from={"dataset": "d" * 64})
     trained, data = policy.restore(run_dir), dataset()
     splits = {
@@ -90,7 +90,7 @@ def exported(tmp_path_factory):
     certificate = certification.issue(
         trained.model, trained.params, **splits, boxes=BOXES, **options
     )
-    artefacts.write_json(
+    store.write_json(
         run_dir / "certificate.json", certificate | {"policy_sha256": trained.sha256}
     )
     return requested, export.run(requested)
@@ -281,7 +281,7 @@ def test_the_manifest_lists_the_inputs_of_programs_and_what_they_were_made_from(
     assert {"name": "state.inner.key", "shape": [2], "dtype": "uint32"} in states
     assert (
         manifest["weights_sha256"]
-        == policy.restore(store.run_directory(requested)).weights_sha256
+        == policy.restore(runs.run_directory(requested)).weights_sha256
     )
     assert (
         manifest["certificate_sha256"]
@@ -332,9 +332,9 @@ def test_the_controller_of_the_command_is_what_is_exported(spoiled):
 
 def test_a_refused_certificate_leaves_the_export_without_one(spoiled, capsys):
     requested = settings(spoiled)
-    run_dir = store.run_directory(requested)
+    run_dir = runs.run_directory(requested)
     assert (run_dir / "export" / "certificate.json").exists()
-    artefacts.write_json(
+    store.write_json(
         run_dir / "certificate.json", {"valid": False, "reason": "alpha is not below 1"}
     )
     printed = export.run(requested)
@@ -350,7 +350,7 @@ def test_a_refused_certificate_leaves_the_export_without_one(spoiled, capsys):
 def sealed(path, manifest):
     """A manifest with the hash that belongs to it."""
     output = {name: value for name, value in manifest.items() if name != "sha256"}
-    path.write_text(json.dumps(output | {"sha256": artefacts.sha256(output)}))
+    path.write_text(json.dumps(output | {"sha256": store.sha256(output)}))
 
 
 @pytest.mark.parametrize(
@@ -432,9 +432,7 @@ def test_the_script_steps_a_controller_by_itself(exported):
 
 
 def test_a_run_without_a_policy_is_sent_to_train(tmp_path):
-    with pytest.raises(
-        artefacts.ArtefactError, match="run train with the same options"
-    ):
+    with pytest.raises(store.ArtefactError, match="run train with the same options"):
         export.run(settings(tmp_path))
     assert list(tmp_path.iterdir()) == []
 

@@ -5,8 +5,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from sfkd_jax.artefacts import source_hash, write_json
 from sfkd_jax.pipeline import grid
+from sfkd_jax.store import source_hash, write_json
 
 PLAN = {
     "vehicles": ["kinematic", "dynamic"],
@@ -164,7 +164,7 @@ def row(system, level, seed):
     )
 
 
-def store(tmp_path, cell, entry, **made_with):
+def keep(tmp_path, cell, entry, **made_with):
     """A stored cell, made with these changes of its settings."""
     path = grid.cell_path(cell, settings(tmp_path))
     path.parent.mkdir(parents=True, exist_ok=True)
@@ -187,7 +187,7 @@ def test_collecting_pools_the_seeds_and_compares_what_is_there(tmp_path, seeds):
     for cell in wanted:
         if cell.label != "missing":
             level = 1.0 if cell.label == "sfkd" else 3.0
-            store(tmp_path, cell, row(cell.label, level, cell.seed))
+            keep(tmp_path, cell, row(cell.label, level, cell.seed))
     result = {
         entry["system"]: entry
         for entry in grid.collect_rows(
@@ -216,7 +216,7 @@ def test_a_row_that_was_made_with_other_settings_enters_no_table_unseen(
     ]
     for cell in wanted:
         of_another = {} if cell.label == "sfkd" else {"controller": "another"}
-        store(tmp_path, cell, row(cell.label, 1.0, 0), **of_another)
+        keep(tmp_path, cell, row(cell.label, 1.0, 0), **of_another)
     result = grid.collect_rows(
         wanted, settings(tmp_path), lambda cell: settings(tmp_path), older=older
     )
@@ -238,7 +238,7 @@ def collected(tmp_path, entries, missing=(), **changes):
         cells.append(grid.Cell("kinematic", label, 0, "mppi", "as it is", "s1"))
         if label in entries:
             made = changes if label == "icode" else {}
-            store(tmp_path, cells[-1], entries[label], **made)
+            keep(tmp_path, cells[-1], entries[label], **made)
     rows = grid.collect_rows(cells, settings(tmp_path), compose)
     return {entry["system"]: entry for entry in rows}
 
@@ -303,7 +303,7 @@ def test_every_row_belongs_to_exactly_one_share():
 def test_cells_of_other_code_are_used_and_announced(tmp_path, capsys):
     cells = grid.list_cells(PLAN)[:2]
     for cell, source in zip(cells, (source_hash(), "another"), strict=True):
-        store(tmp_path, cell, row("icode", 1.0, 0) | {"provenance": {"source": source}})
+        keep(tmp_path, cell, row("icode", 1.0, 0) | {"provenance": {"source": source}})
     found = grid.collect_rows(
         cells, settings(tmp_path), lambda cell: settings(tmp_path)
     )

@@ -18,10 +18,10 @@ import numpy as np
 import pytest
 from fuzzing_mutations import bomb
 
-from sfkd_jax import artefacts, demo, paper, policy, reporting
 from sfkd_jax import data as datasets
-from sfkd_jax.artefacts import ArtefactError
+from sfkd_jax import demo, paper, policy, reporting, store
 from sfkd_jax.export import _run_controller as loader
+from sfkd_jax.store import ArtefactError
 
 SHIPPED = demo.SHIPPED / "kinematic"
 MIB = 1 << 20
@@ -76,7 +76,7 @@ FILES = {
     "policy.npz": lambda run: policy.load(run),
     "policy.json": lambda run: policy.load(run),
     "certificate.json": lambda run: policy.load(run),
-    "metrics.jsonl": lambda run: artefacts.read_jsonl(run / "metrics.jsonl"),
+    "metrics.jsonl": lambda run: store.read_jsonl(run / "metrics.jsonl"),
     "results.json": lambda run: reporting.write_report(run),
     "episodes.npz": lambda run: reporting.write_report(run),
 }
@@ -155,12 +155,10 @@ def test_documents_that_readers_would_understand_differently_are_refused(
 ):
     path = tmp_path / "a.json"
     path.write_text(text)
-    assert refusal(artefacts.read_json, path).startswith(
-        f"{path}: truncated or not JSON ("
-    )
+    assert refusal(store.read_json, path).startswith(f"{path}: truncated or not JSON (")
     path = tmp_path / "a.jsonl"
     path.write_text(f"{text}\n")
-    assert refusal(artefacts.read_jsonl, path).startswith(
+    assert refusal(store.read_jsonl, path).startswith(
         f"{path}: line 1 truncated or not JSON ("
     )
 
@@ -170,14 +168,14 @@ def test_a_mark_of_byte_order_and_whole_surrogate_pairs_are_read(tmp_path):
     path.write_bytes(
         b"\xef\xbb\xbf" + rb'{"a": "\ud83d\ude00", "b": 18446744073709551615}'
     )
-    assert artefacts.read_json(path) == {"a": "\U0001f600", "b": 2**64 - 1}
+    assert store.read_json(path) == {"a": "\U0001f600", "b": 2**64 - 1}
 
 
 def test_a_document_is_not_read_beyond_its_bound(tmp_path):
     path = tmp_path / "a.json"
     with path.open("wb") as file:
         file.truncate(1 << 40)
-    assert refusal(artefacts.read_json, path) == f"{path}: larger than 16 MiB"
+    assert refusal(store.read_json, path) == f"{path}: larger than 16 MiB"
 
 
 @pytest.mark.parametrize("value", ["word", [], 3, None])
@@ -243,7 +241,7 @@ def header(descr="'<f8'", order="False", shape="(3,)"):
 )
 def test_headers_are_compared_with_the_bytes_and_not_evaluated(tmp_path, text, message):
     path = write_zip(tmp_path / "x.npz", text)
-    line = refusal(artefacts.read_npz, path)
+    line = refusal(store.read_npz, path)
     assert line.startswith(f"{path}: ")
     assert message in line
     with bounded(), pytest.raises(ValueError, match=r"x\.npz"):
@@ -259,52 +257,46 @@ def test_headers_are_compared_with_the_bytes_and_not_evaluated(tmp_path, text, m
 def test_a_zip_file_of_another_compression_is_refused(tmp_path):
     with zipfile.ZipFile(tmp_path / "x.npz", "w", zipfile.ZIP_LZMA) as packed:
         packed.writestr("x.npy", b"\x93NUMPY")
-    assert "another method than deflate" in refusal(
-        artefacts.read_npz, tmp_path / "x.npz"
-    )
+    assert "another method than deflate" in refusal(store.read_npz, tmp_path / "x.npz")
 
 
 def test_compressed_members_are_bounded_before_they_are_inflated(tmp_path):
     path = tmp_path / "x.npz"
     path.write_bytes(bomb(600))
-    assert "inflates to 600 MiB, more than 512" in refusal(artefacts.read_npz, path)
+    assert "inflates to 600 MiB, more than 512" in refusal(store.read_npz, path)
     whole = bytearray(bomb(8))
     at = whole.rfind(b"PK\x01\x02") + 24
     whole[at : at + 4] = struct.pack(
         "<I", 1 << 28
     )  # declared larger than its 8 KiB can be
     path.write_bytes(whole)
-    assert "larger than it can inflate to" in refusal(artefacts.read_npz, path)
+    assert "larger than it can inflate to" in refusal(store.read_npz, path)
 
 
 def test_nothing_is_inflated_that_is_not_what_the_manifest_records(tmp_path):
     path = tmp_path / "x.npz"
-    artefacts.write_arrays(
-        path, {"x": np.zeros(3)}, kind="k", config={}, compressed=True
-    )
+    store.write_arrays(path, {"x": np.zeros(3)}, kind="k", config={}, compressed=True)
     path.write_bytes(bomb(400))
     assert "does not match its manifest: sha256" in refusal(
-        artefacts.read_arrays, path, kind="k"
+        store.read_arrays, path, kind="k"
     )
 
 
 def test_manifests_without_a_hash_of_the_file_stay_readable(tmp_path):
     path = tmp_path / "x.npz"
-    manifest = artefacts.write_arrays(path, {"x": np.arange(3)}, kind="k", config={})
+    manifest = store.write_arrays(path, {"x": np.arange(3)}, kind="k", config={})
     del manifest["file_sha256"]
-    artefacts.write_json(path.with_suffix(".json"), manifest)
+    store.write_json(path.with_suffix(".json"), manifest)
     np.testing.assert_array_equal(
-        artefacts.read_arrays(path, kind="k")[0]["x"], np.arange(3)
+        store.read_arrays(path, kind="k")[0]["x"], np.arange(3)
     )
-    artefacts.write_json(
-        path.with_suffix(".json"), manifest | {"file_sha256": "no hash"}
-    )
-    assert "file_sha256 is malformed" in refusal(artefacts.read_arrays, path, kind="k")
+    store.write_json(path.with_suffix(".json"), manifest | {"file_sha256": "no hash"})
+    assert "file_sha256 is malformed" in refusal(store.read_arrays, path, kind="k")
 
 
 def test_the_same_arrays_make_the_same_file(tmp_path):
     made = [
-        artefacts.write_arrays(
+        store.write_arrays(
             tmp_path / f"{name}.npz", {"x": np.eye(3)}, kind="k", config={}
         )
         for name in "ab"
@@ -318,7 +310,7 @@ def test_other_bytes_of_the_same_content_that_wait_do_not_hide_those_recorded(
     tmp_path, monkeypatch, compressed
 ):
     path, replace = tmp_path / "x.npz", os.replace
-    artefacts.write_arrays(path, {"x": np.zeros(99)}, kind="k", config={})
+    store.write_arrays(path, {"x": np.zeros(99)}, kind="k", config={})
 
     def killed(source, target):
         if Path(target).suffix == ".json":
@@ -327,12 +319,12 @@ def test_other_bytes_of_the_same_content_that_wait_do_not_hide_those_recorded(
 
     monkeypatch.setattr(os, "replace", killed)
     with pytest.raises(KeyboardInterrupt):
-        artefacts.write_arrays(
+        store.write_arrays(
             path, {"x": np.zeros(99)}, kind="k", config={}, compressed=compressed
         )
     monkeypatch.undo()
     np.testing.assert_array_equal(
-        artefacts.read_arrays(path, kind="k")[0]["x"], np.zeros(99)
+        store.read_arrays(path, kind="k")[0]["x"], np.zeros(99)
     )
 
 
@@ -433,7 +425,7 @@ def test_a_report_that_the_disk_refuses_is_one_line(tmp_path):
 def test_a_report_of_rows_that_are_none_names_the_file(tmp_path):
     fuzzing_readers.make_run(tmp_path)
     for rows in ("word", [1], {"a": 1}, 7):
-        artefacts.write_json(tmp_path / "results.json", {"rows": rows})
+        store.write_json(tmp_path / "results.json", {"rows": rows})
         assert "results.json: malformed" in refusal(reporting.write_report, tmp_path)
 
 
@@ -444,6 +436,6 @@ def test_a_row_cannot_name_arrays_outside_its_folder(tmp_path):
         ).read_bytes()
     )
     rows = [row | {"arrays": "../../outside.npz"} for row in document["rows"][:3]]
-    artefacts.write_json(tmp_path / "results.json", document | {"rows": rows})
+    store.write_json(tmp_path / "results.json", document | {"rows": rows})
     with pytest.raises(ArtefactError, match="outside this folder"):
         paper.write_results_page(tmp_path)

@@ -11,7 +11,7 @@ import pytest
 from benchmarks.leaderboard import entry as entry_module
 from benchmarks.leaderboard import page
 from benchmarks.quality.protocol2_tuning import settings_of
-from sfkd_jax.artefacts import ArtefactError
+from sfkd_jax.store import ArtefactError
 
 ROW = {
     "system": "mine",

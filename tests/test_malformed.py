@@ -17,10 +17,10 @@ import pytest
 from helpers import ENV_HIGH, ENV_LOW, SHARES, dataset, refusal_of
 from jaxtyping import TypeCheckError
 
-from sfkd_jax import artefacts, demo, policy, report, training
 from sfkd_jax import data as datasets
+from sfkd_jax import demo, policy, report, store, training
 from sfkd_jax.cli import entry
-from sfkd_jax.pipeline import evaluate_run, store
+from sfkd_jax.pipeline import evaluate_run, runs
 
 SHIPPED = demo.SHIPPED / "kinematic"
 WORSE = (None, "word", [], {}, -1, float("nan"), [[1, 2], 3], True, 10**400)
@@ -56,8 +56,8 @@ def run(tmp_path):
     """A run directory with the documents that `train` writes."""
     run_dir = tmp_path / "runs" / "smoke" / "sfkd" / "seed=0"
     shutil.copytree(SHIPPED, run_dir)
-    artefacts.write_json(run_dir / "results.json", {"rows": [ROW]})
-    artefacts.write_json(
+    store.write_json(run_dir / "results.json", {"rows": [ROW]})
+    store.write_json(
         run_dir / "settings.json",
         {"seed": 0, "model": {"rank": 32}, "training": {"steps": 100}},
     )
@@ -98,7 +98,7 @@ def read(run, name):
     if name == "results.json":
         evaluate_run.read_results(run)
     elif name == "settings.json":
-        store.claim(settings_of(run))
+        runs.claim(settings_of(run))
     else:
         read_policy(run)
 
@@ -196,11 +196,11 @@ def test_damaged_bytes_are_refused_or_read_the_same(run, name):
     draw, file, read_it = random.Random(2), run / name, read_policy
     if name == "dataset.npz":
         settings = settings_of(run)
-        store.write_dataset(settings, dataset(count=20, steps=8))
-        file = store.dataset_path(settings)
+        runs.write_dataset(settings, dataset(count=20, steps=8))
+        file = runs.dataset_path(settings)
 
         def read_it(_):
-            store.read_dataset(settings)
+            runs.read_dataset(settings)
 
     lines = [
         survives(lambda: read_it(run), file, damaged(file.read_bytes(), draw))
@@ -241,7 +241,7 @@ def test_lines_of_a_training_log_that_are_none_are_dropped(tmp_path):
     for tail in (b"7\n", b"{}\n", b'{"step": "a"}\n', b'{"step": 1', b"\x00\n"):
         (tmp_path / "metrics.jsonl").write_bytes(good + tail)
         training._log.TrainingLog(tmp_path, steps=10, resumed_at=5)
-        assert artefacts.read_jsonl(tmp_path / "metrics.jsonl") == [json.loads(good)]
+        assert store.read_jsonl(tmp_path / "metrics.jsonl") == [json.loads(good)]
 
 
 # ---- a command with what cannot be composed; a full disk; a directory that cannot be written
@@ -297,8 +297,8 @@ def test_a_full_disk_is_one_line_keeps_what_was_there_and_the_same_call_continue
     )
 
     def work():
-        artefacts.write_json(run / "results.json", {"rows": [ROW, ROW]})
-        store.write_dataset(settings, drives)
+        store.write_json(run / "results.json", {"rows": [ROW, ROW]})
+        runs.write_dataset(settings, drives)
 
     before = snapshot(root)
     with monkeypatch.context() as disk:
@@ -306,8 +306,8 @@ def test_a_full_disk_is_one_line_keeps_what_was_there_and_the_same_call_continue
         assert refusal_of(work) == f"{run / 'results.json'}: No space left on device"
     assert snapshot(root) == before
     work()
-    assert len(artefacts.read_json(run / "results.json")["rows"]) == 2
-    store.read_dataset(settings)
+    assert len(store.read_json(run / "results.json")["rows"]) == 2
+    runs.read_dataset(settings)
 
 
 def refuse(*_, **__):
@@ -320,14 +320,14 @@ def test_a_read_only_directory_is_one_line_and_keeps_its_files(run, monkeypatch,
     before = snapshot(root)
     with monkeypatch.context() as read_only:
         read_only.setattr(Path, call, refuse)
-        assert "Read-only file system" in refusal_of(lambda: store.claim(settings))
+        assert "Read-only file system" in refusal_of(lambda: runs.claim(settings))
         assert "Read-only file system" in refusal_of(
-            lambda: artefacts.write_json(run / "results.json", {"rows": []})
+            lambda: store.write_json(run / "results.json", {"rows": []})
         )
     assert {
         file: content for file, content in snapshot(root).items() if file in before
     } == before
-    store.claim(settings)
+    runs.claim(settings)
 
 
 def test_segments_that_are_not_finite_are_no_data_set():

@@ -13,7 +13,7 @@ from helpers import last_line, run_command
 
 import sfkd_jax
 from sfkd_jax import build, models
-from sfkd_jax.artefacts import ArtefactError
+from sfkd_jax.store import ArtefactError
 from sfkd_jax.types import Space
 
 PAGE = Path(__file__).parents[1] / "docs" / "add-a-row.md"

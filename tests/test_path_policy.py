@@ -8,7 +8,7 @@ from helpers import TINY, any_law, path_space
 from hydra import compose, initialize_config_dir
 from omegaconf import OmegaConf
 
-from sfkd_jax import artefacts, build, plants, policy
+from sfkd_jax import build, plants, policy, store
 from sfkd_jax.cli import config
 from sfkd_jax.pipeline import dry_run
 
@@ -75,7 +75,7 @@ def test_the_law_is_stored_hashed_and_loaded_with_the_weights(tmp_path):
 
 def test_a_policy_that_lost_its_law_is_refused(tmp_path):
     saved(tmp_path, law=None)
-    with pytest.raises(artefacts.ArtefactError, match=r"policy\.npz.*'law'"):
+    with pytest.raises(store.ArtefactError, match=r"policy\.npz.*'law'"):
         policy.load(tmp_path)
 
 

@@ -16,7 +16,7 @@ from sfkd_jax.cli import queues, sweeps
 SCRIPT = """
     import os
 
-    from sfkd_jax.pipeline import store
+    from sfkd_jax.pipeline import runs
     from sfkd_jax.cli.config import command_line
     from sfkd_jax.cli.entry import hydra_command
 
@@ -28,7 +28,7 @@ SCRIPT = """
         if settings["seed"] == 4:
             os._exit(9)
         print("typed", command_line("toy"))
-        return {"objective": (settings["seed"] - 3.0) ** 2, "run": str(store.run_directory(settings))}
+        return {"objective": (settings["seed"] - 3.0) ** 2, "run": str(runs.run_directory(settings))}
 
     if __name__ == "__main__":
         hydra_command(run)()

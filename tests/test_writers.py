@@ -13,11 +13,11 @@ import numpy as np
 import pytest
 from helpers import refusal_of
 
-from sfkd_jax import artefacts
-from sfkd_jax.artefacts import DirectoryLocked, locked
+from sfkd_jax import store
 from sfkd_jax.pipeline import evaluate_run
 from sfkd_jax.reporting.rows import group_title, groups_of
 from sfkd_jax.reporting.scene import scenes_of
+from sfkd_jax.store import DirectoryLocked, locked
 
 ROW = {
     "system": "sfkd", "scenario": "s3", "vehicle": "kinematic", "inner_loop": "none", "controller": "mppi",
@@ -27,7 +27,7 @@ SETTINGS = {"vehicle": {}, "controller": {}, "evaluation": {}}
 HOLD = """
     import sys, time
     from pathlib import Path
-    from sfkd_jax.artefacts import locked
+    from sfkd_jax.store import locked
     with locked(Path(sys.argv[1])):
         print("held", flush=True)
         time.sleep(float(sys.argv[2]))
@@ -53,14 +53,14 @@ def driven(row, value=0.0, episodes=2, steps=40):
         "envs": (steps, 2),
         "path": (9, 4),
     }
-    name = artefacts.drive_name(row)
+    name = store.drive_name(row)
     return {
         f"{name}/{part}": np.full((episodes, *shape), float(value))
         for part, shape in shapes.items()
     }
 
 
-def store(run_dir, row, value=0.0):
+def keep(run_dir, row, value=0.0):
     evaluate_run.write_results(
         run_dir, SETTINGS, [row], driven(row, value) | {"dt": np.asarray(0.1)}, 0.0
     )
@@ -68,8 +68,8 @@ def store(run_dir, row, value=0.0):
 
 def stored(run_dir):
     """Rows, and the arrays by the name of their drive."""
-    rows = artefacts.read_json(run_dir / "results.json")["rows"]
-    return rows, artefacts.read_arrays(run_dir / "episodes.npz", kind="episodes")[0]
+    rows = store.read_json(run_dir / "results.json")["rows"]
+    return rows, store.read_arrays(run_dir / "episodes.npz", kind="episodes")[0]
 
 
 # ---- the lock
@@ -99,7 +99,7 @@ def test_kill_9_frees_a_directory(tmp_path):
     holder.send_signal(signal.SIGKILL)
     holder.wait()
     with locked(tmp_path):
-        assert artefacts.read_json(tmp_path / ".lock.json")["pid"] != holder.pid
+        assert store.read_json(tmp_path / ".lock.json")["pid"] != holder.pid
     assert not (tmp_path / ".lock.json").exists()
 
 
@@ -156,13 +156,13 @@ WRITER = """
     import sys, time
     sys.path.insert(0, sys.argv[3])
     from pathlib import Path
-    from test_writers import ROW, store
+    from test_writers import ROW, keep
     run_dir, me = Path(sys.argv[1]), int(sys.argv[2])
     print("ready", flush=True)
     begins = float(sys.stdin.readline())
     for number in range(10):
         time.sleep(max(0.0, begins + 0.3 * number + 0.02 * me - time.time()))
-        store(run_dir, ROW | {"system": f"writer{me}", "scenario": f"road{number}"}, 10 * me + number)
+        keep(run_dir, ROW | {"system": f"writer{me}", "scenario": f"road{number}"}, 10 * me + number)
 """
 
 
@@ -179,7 +179,7 @@ def test_two_processes_20_ms_after_each_other_lose_no_row_and_no_episode(tmp_pat
     assert len(rows) == 20
     for row in rows:
         value = 10 * int(row["system"][-1]) + int(row["scenario"][4:])
-        assert np.all(arrays[f"{artefacts.drive_name(row)}/lateral"] == value)
+        assert np.all(arrays[f"{store.drive_name(row)}/lateral"] == value)
 
 
 def test_three_planners_in_one_directory_keep_three_rows_with_their_episodes(tmp_path):
@@ -188,12 +188,12 @@ def test_three_planners_in_one_directory_keep_three_rows_with_their_episodes(tmp
         for name in ("mppi", "cem", "gradient")
     ]
     for value, row in enumerate(rows, 1):
-        store(tmp_path, row, value)
+        keep(tmp_path, row, value)
     retained, arrays = stored(tmp_path)
     assert [row["planner"] for row in retained] == ["mppi", "cem", "gradient"]
     for value, row in enumerate(retained, 1):
         for part in ("lateral", "states", "controls", "envs", "path"):
-            assert np.all(arrays[f"{artefacts.drive_name(row)}/{part}"] == value)
+            assert np.all(arrays[f"{store.drive_name(row)}/{part}"] == value)
     scenes = scenes_of(tmp_path)
     assert {scene.lateral["sfkd"][0, 0]: "cem" in scene.label for scene in scenes} == {
         1: False,
@@ -204,24 +204,22 @@ def test_three_planners_in_one_directory_keep_three_rows_with_their_episodes(tmp
     blocks = groups_of(retained)
     assert [len(block) for block in blocks] == [1, 1, 1]
     assert len({group_title(block) for block in blocks}) == 3
-    store(tmp_path, rows[1], 7.0)
+    keep(tmp_path, rows[1], 7.0)
     retained, arrays = stored(tmp_path)
     assert len(retained) == 3
-    assert np.all(arrays[f"{artefacts.drive_name(rows[1])}/lateral"] == 7.0)
+    assert np.all(arrays[f"{store.drive_name(rows[1])}/lateral"] == 7.0)
 
 
 @pytest.mark.parametrize("name", list(ROW))
 def test_rows_that_differ_in_one_part_of_their_identity_are_two(name):
     other = ROW | {name: "other"}
-    assert artefacts.merge([ROW], [other]) == [ROW, other]
-    assert artefacts.merge([ROW], [dict(ROW)]) == [ROW]
-    assert artefacts.drive_name(ROW) != artefacts.drive_name(other)
+    assert store.merge([ROW], [other]) == [ROW, other]
+    assert store.merge([ROW], [dict(ROW)]) == [ROW]
+    assert store.drive_name(ROW) != store.drive_name(other)
     known = {
-        key: value
-        for key, value in artefacts.identity(other).items()
-        if value is not None
+        key: value for key, value in store.identity(other).items() if value is not None
     }
-    assert artefacts.parse_drive_name(artefacts.drive_name(other)) == known
+    assert store.parse_drive_name(store.drive_name(other)) == known
 
 
 def test_rows_and_episodes_of_an_earlier_version_are_read_and_replaced(tmp_path):
@@ -235,22 +233,22 @@ def test_rows_and_episodes_of_an_earlier_version_are_read_and_replaced(tmp_path)
         f"sfkd/s3/{name.rpartition('/')[2]}": array
         for name, array in driven(ROW, 1.0).items()
     }
-    arrays |= {f"s3/{part}": arrays.pop(f"sfkd/s3/{part}") for part in artefacts.ROAD}
-    artefacts.write_arrays(
+    arrays |= {f"s3/{part}": arrays.pop(f"sfkd/s3/{part}") for part in store.ROAD}
+    store.write_arrays(
         tmp_path / "episodes.npz",
         arrays | {"dt": np.asarray(0.1)},
         kind="episodes",
         config={},
     )
-    artefacts.write_json(tmp_path / "results.json", {"rows": [old]})
+    store.write_json(tmp_path / "results.json", {"rows": [old]})
     (scene,) = scenes_of(tmp_path)
     assert (scene.label, scene.stem, list(scene.lateral)) == ("S3", "s3", ["sfkd"])
-    store(tmp_path, ROW | {"planner": "cem"}, 2.0)
+    keep(tmp_path, ROW | {"planner": "cem"}, 2.0)
     rows, retained = stored(tmp_path)
     assert len(rows) == 2
-    for part in ("lateral", *artefacts.ROAD):
-        assert np.all(retained[f"{artefacts.drive_name(ROW)}/{part}"] == 1.0)
-    store(tmp_path, ROW, 3.0)
+    for part in ("lateral", *store.ROAD):
+        assert np.all(retained[f"{store.drive_name(ROW)}/{part}"] == 1.0)
+    keep(tmp_path, ROW, 3.0)
     assert json.loads((tmp_path / "results.json").read_text())["rows"] == [
         ROW | {"planner": "cem"},
         ROW,
@@ -260,9 +258,9 @@ def test_rows_and_episodes_of_an_earlier_version_are_read_and_replaced(tmp_path)
 
 def test_drives_on_other_roads_are_other_scenes(tmp_path):
     """As when the rest of the systems are driven again with more episodes."""
-    store(tmp_path, ROW | {"system": "nominal", "env": "none"}, 1.0)
-    store(tmp_path, ROW | {"system": "oracle"}, 1.0)
-    store(tmp_path, ROW, 2.0)
+    keep(tmp_path, ROW | {"system": "nominal", "env": "none"}, 1.0)
+    keep(tmp_path, ROW | {"system": "oracle"}, 1.0)
+    keep(tmp_path, ROW, 2.0)
     assert sorted(sorted(scene.lateral) for scene in scenes_of(tmp_path)) == [
         ["nominal", "oracle"],
         ["sfkd"],

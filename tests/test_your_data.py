@@ -16,7 +16,7 @@ from omegaconf import OmegaConf
 import sfkd_jax
 from sfkd_jax import evaluate
 from sfkd_jax.cli import config
-from sfkd_jax.pipeline import stages, store
+from sfkd_jax.pipeline import runs, stages
 
 sys.path.append(str(Path(__file__).parent / "datasets"))
 from recorded import drive, write_csv
@@ -126,7 +126,7 @@ def test_logs_are_stored_with_their_coverage_and_only_test_drives_are_held_out(
     assert set(held_out) == {"test"}
     assert held_out["test"] is dataset.test
     covered = json.loads(
-        (store.dataset_path(options).parent / "coverage.json").read_text()
+        (runs.dataset_path(options).parent / "coverage.json").read_text()
     )
     assert set(covered["state"]) == {"v", "yaw_rate"}
     assert 4.0 <= covered["state"]["v"]["low"] < covered["state"]["v"]["high"] <= 6.0
@@ -192,7 +192,7 @@ def test_what_logs_cannot_support_is_refused_before_a_run_is_begun(logs, monkeyp
 
 def test_logs_that_moved_are_the_same_data_set_and_changed_ones_are_not(logs, tmp_path):
     def identity(folder):
-        return store.identity(settings(*SMALL, f"dataset.path={folder}"))
+        return runs.identity(settings(*SMALL, f"dataset.path={folder}"))
 
     here = identity(logs)
     shutil.copytree(logs, tmp_path / "moved")

@@ -15,7 +15,7 @@ import jsonschema
 import numpy as np
 
 from benchmarks.quality.protocol2_tuning import settings_of
-from sfkd_jax import artefacts
+from sfkd_jax import store
 
 HERE = Path(__file__).parent
 SCHEMA = json.loads((HERE / "schema.json").read_text("utf-8"))
@@ -83,7 +83,7 @@ def check_settings(used, asked):
             {key: value for key, value in one[group].items() if key != "systems"}
             for one in (used, asked)
         )
-        if changed := artefacts.differences(ours, theirs):
+        if changed := store.differences(ours, theirs):
             raise ValueError(f"not driven as sfkd-bench-2 asks: {group}.{changed[0]}")
     if used["comparison"]["older"] or used["env_source"] != asked["env_source"]:
         raise ValueError(
@@ -206,8 +206,8 @@ def main():
     given = parser.parse_args()
     source = given.directory / "results.json"
     try:
-        document = artefacts.read_json(source, keys=("config", "rows"))
-        with artefacts.as_artefact_error(source):
+        document = store.read_json(source, keys=("config", "rows"))
+        with store.as_artefact_error(source):
             entry = entry_of(
                 document,
                 given.row,
@@ -216,8 +216,8 @@ def main():
                 code=given.code,
                 digest=hashlib.sha256(source.read_bytes()).hexdigest(),
             )
-        artefacts.write_json(given.out, entry)
-    except artefacts.ArtefactError as reason:
+        store.write_json(given.out, entry)
+    except store.ArtefactError as reason:
         raise SystemExit(str(reason)) from None
     except ValueError as reason:
         raise SystemExit(f"{source}: {reason}") from None

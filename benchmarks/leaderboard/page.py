@@ -6,7 +6,7 @@ python -m benchmarks.leaderboard.page
 from benchmarks.harness import ROOT
 from benchmarks.leaderboard.entry import HERE, check
 from benchmarks.markdown import filled, table
-from sfkd_jax import artefacts
+from sfkd_jax import store
 
 PAGE = ROOT / "docs" / "results" / "leaderboard.md"
 VEHICLES = ("kinematic", "kinematic_stiff", "dynamic")
@@ -28,7 +28,7 @@ def entries(folder=HERE / "entries"):
     """
     found = []
     for file in sorted(folder.glob("*.json")):
-        entry = artefacts.read_json(file)
+        entry = store.read_json(file)
         try:
             check(entry)
         except ValueError as reason:
@@ -105,7 +105,7 @@ def main():
     """Write the page."""
     try:
         PAGE.write_text(page(PAGE.read_text("utf-8")), encoding="utf-8")
-    except (ValueError, artefacts.ArtefactError) as reason:
+    except (ValueError, store.ArtefactError) as reason:
         raise SystemExit(str(reason)) from None
 
 

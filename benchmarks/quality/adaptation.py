@@ -22,7 +22,7 @@ import numpy as np
 
 from benchmarks import harness
 from benchmarks.quality import adaptive_baselines
-from sfkd_jax import artefacts, build, control, evaluation, plants, policy, scenarios
+from sfkd_jax import build, control, evaluation, plants, policy, scenarios, store
 from sfkd_jax.evaluation import metrics
 from sfkd_jax.plants import equivalent_wind
 from sfkd_jax.rollout import with_offset
@@ -359,7 +359,7 @@ def main():
     }
     document = {"protocol": protocol, "cases": {}}
     if out.exists():
-        document = artefacts.read_json(out, keys=("protocol", "cases"))
+        document = store.read_json(out, keys=("protocol", "cases"))
         if document["protocol"] != protocol:
             raise SystemExit(f"{out}: another protocol; choose another --out")
     rows = shipped(name)
@@ -379,8 +379,8 @@ def main():
             line = f"{label}: {row}: {done[row]['rmse_mm']:.1f} mm ({took:.0f} s)"
             print(line, file=sys.stderr, flush=True)
             document["machine"] = harness.machine()
-            document["versions"] = artefacts.versions()
-            artefacts.write_json(out, document)
+            document["versions"] = store.versions()
+            store.write_json(out, document)
     print(json.dumps({"results": str(out)}))
 
 

@@ -18,7 +18,7 @@ import numpy as np
 
 from benchmarks import harness
 from benchmarks.quality import adaptation
-from sfkd_jax import artefacts
+from sfkd_jax import store
 from sfkd_jax.plants import side_force
 
 AFTER = (0, 1, 2, 3, 5, 10, 20, 29)
@@ -162,10 +162,10 @@ def main():
         "errors": errors,
         "rmse_mm": rows_driven,
         "machine": harness.machine(),
-        "versions": artefacts.versions(),
+        "versions": store.versions(),
     }
     out = harness.ROOT / f"benchmarks/quality/estimation_bound_{given.vehicle}.json"
-    artefacts.write_json(out, document)
+    store.write_json(out, document)
     print(json.dumps({"results": str(out)}))
 
 

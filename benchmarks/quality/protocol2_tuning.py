@@ -20,7 +20,7 @@ import yaml
 from hydra import compose, initialize_config_dir
 from scipy.stats import qmc
 
-from sfkd_jax import artefacts, policy, train
+from sfkd_jax import policy, store, train
 from sfkd_jax.cli.config import conf_path, plain_settings, register
 from sfkd_jax.training import TrainingStopped
 
@@ -143,7 +143,7 @@ def tune(root, vehicle, label, row):
             trial["failed"] = str(reason)
         trials.append(trial)
         out.parent.mkdir(parents=True, exist_ok=True)
-        artefacts.write_json(out, about(row) | {"trials": trials})
+        store.write_json(out, about(row) | {"trials": trials})
         print(f"{vehicle} {label} {trial}", file=sys.stderr, flush=True)
 
 
@@ -160,7 +160,7 @@ def stored(file, row, planned):
     """
     if not file.exists():
         return []
-    document = artefacts.read_json(file, keys=("trials",))
+    document = store.read_json(file, keys=("trials",))
     trials = document.pop("trials")
     overrides = [trial["overrides"] for trial in trials]
     if document != about(row) or overrides != planned[: len(trials)]:

@@ -13,7 +13,7 @@ import numpy as np
 
 from benchmarks.quality import shield
 from benchmarks.quality.speed_page import answer, table
-from sfkd_jax import artefacts
+from sfkd_jax import store
 from sfkd_jax.corridor import corridor_by_speed
 
 FRICTIONS, SPEEDS = 5, 6
@@ -54,9 +54,7 @@ def main():
         document["cars"][name] = result
         print(table(name, result), answer(result, args.room), sep="\n", flush=True)
         if args.out:
-            artefacts.write_json(
-                args.out, document | {"versions": artefacts.versions()}
-            )
+            store.write_json(args.out, document | {"versions": store.versions()})
 
 
 if __name__ == "__main__":

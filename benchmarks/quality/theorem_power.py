@@ -16,7 +16,7 @@ from pathlib import Path
 import jax
 import numpy as np
 
-from sfkd_jax import artefacts, build, demo, evaluation, policy
+from sfkd_jax import build, demo, evaluation, policy, store
 from sfkd_jax import data as datasets
 from sfkd_jax.certification import latent_tube
 from sfkd_jax.evaluation import predictions, theorem_reach, theorem_violations
@@ -169,10 +169,10 @@ def main():
     document = {
         "rows": result,
         "segments": args.segments,
-        "versions": artefacts.versions(),
+        "versions": store.versions(),
     }
     if args.out:
-        artefacts.write_json(args.out, document)
+        store.write_json(args.out, document)
     print(json.dumps(document, indent=1))
 
 

@@ -223,15 +223,13 @@ def content(file):
     Raises:
         ArtefactError: it is damaged.
     """
-    artefacts = importlib.import_module("sfkd_jax.artefacts")
+    store = importlib.import_module("sfkd_jax.store")
     if file.suffix == ".npz":
-        kind = artefacts.read_json(file.with_suffix(".json"), keys=("kind",))["kind"]
-        return artefacts.read_arrays(file, kind=kind)[1]["sha256"]
+        kind = store.read_json(file.with_suffix(".json"), keys=("kind",))["kind"]
+        return store.read_arrays(file, kind=kind)[1]["sha256"]
     if file.suffix in (".json", ".jsonl"):
         return without_times(
-            artefacts.read_jsonl(file)
-            if file.suffix == ".jsonl"
-            else artefacts.read_json(file)
+            store.read_jsonl(file) if file.suffix == ".jsonl" else store.read_json(file)
         )
     return hashlib.sha256(file.read_bytes()).hexdigest()
 
@@ -240,7 +238,7 @@ def files(directory):
     """What counts as written: not checkpoints (the next job tells), boards, pages with
     times in them, hidden files.
     """
-    artefacts = importlib.import_module("sfkd_jax.artefacts")
+    store = importlib.import_module("sfkd_jax.store")
     for file in sorted((directory / "runs").rglob("*")):
         parts = file.relative_to(directory).parts
         skipped = {"checkpoints", "tensorboard", "sweeps"} & set(parts) or any(
@@ -251,7 +249,7 @@ def files(directory):
             file.is_file()
             and not skipped
             and not page
-            and (file.suffix != ".npz" or artefacts.exists(file))
+            and (file.suffix != ".npz" or store.exists(file))
         ):
             yield file
 
@@ -262,7 +260,7 @@ def damaged(directory):
     for file in files(directory):
         try:
             content(file)
-        except importlib.import_module("sfkd_jax.artefacts").ArtefactError as reason:
+        except importlib.import_module("sfkd_jax.store").ArtefactError as reason:
             result.append(str(reason))
     return result
 

@@ -38,7 +38,7 @@ from cosmic_ray.mutating import mutate_code  # noqa: E402
 from cosmic_ray.operators.provider import OperatorProvider  # noqa: E402
 
 from benchmarks.robustness.named_mutants import ARGUED, FILES, NAMED  # noqa: E402
-from sfkd_jax import artefacts, certification  # noqa: E402
+from sfkd_jax import certification, store  # noqa: E402
 
 ROOT = Path(__file__).resolve().parents[2]
 SOURCES = Path(certification.__file__).parent
@@ -280,13 +280,13 @@ def main():
 
 def write(path, rows):
     """Write the counts; rows of other files in the document stay."""
-    known = artefacts.read_json(path)["files"] if path.exists() else {}
+    known = store.read_json(path)["files"] if path.exists() else {}
     rows = known | rows
     document = {
         "files": {name: rows[name] for name in FILES if name in rows},
-        "versions": artefacts.versions(),
+        "versions": store.versions(),
     }
-    artefacts.write_json(path, document)
+    store.write_json(path, document)
 
 
 if __name__ == "__main__":

@@ -19,7 +19,7 @@ sys.path.append(str(HERE.parents[1] / "tests"))
 
 from exact import search  # noqa: E402  the tests run the same search with fewer cases
 
-from sfkd_jax import artefacts  # noqa: E402
+from sfkd_jax import store  # noqa: E402
 
 
 def main():
@@ -39,10 +39,10 @@ def main():
         "false_and_accepted": 0,
         **counts,
         "seconds": round(time.perf_counter() - began),
-        "versions": artefacts.versions(),
+        "versions": store.versions(),
     }
     if options.out:
-        artefacts.write_json(options.out, document)
+        store.write_json(options.out, document)
     print(json.dumps(document))
 
 

@@ -19,7 +19,7 @@ import sfkd_jax
 from benchmarks.timing.own_model import settings as composed
 from experiments.commonroad.train import FRICTIONS, SHIPPED, Driver, make_road
 from experiments.commonroad.train import nominal_driver as in_world_frame
-from sfkd_jax import adapters, artefacts, build, evaluation, policy
+from sfkd_jax import adapters, build, evaluation, policy, store
 
 SETTLED = 20
 """Steps at the start of an episode that do not count: 2 s."""
@@ -87,7 +87,7 @@ def main():
     protocol["frictions"] = list(FRICTIONS)
     path, document = given.out / "adaptive.json", {"protocol": protocol, "cars": {}}
     if path.exists():
-        document = artefacts.read_json(path, keys=("protocol", "cars"))
+        document = store.read_json(path, keys=("protocol", "cars"))
         if document["protocol"] != protocol:
             raise SystemExit(f"{path}: another protocol; choose another --out")
     for name in given.cars:
@@ -102,8 +102,8 @@ def main():
             means = np.mean(done[row]["after_mm"], axis=1).round(1)
             took = time.perf_counter() - began
             print(f"{name}: {row}: {means} mm ({took:.0f} s)", file=sys.stderr)
-            document["versions"] = artefacts.versions()
-            artefacts.write_json(path, document)
+            document["versions"] = store.versions()
+            store.write_json(path, document)
     print(json.dumps({"results": str(path)}))
 
 

@@ -18,7 +18,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from experiments.commonroad import traced_car
-from sfkd_jax import adapters, artefacts, policy
+from sfkd_jax import adapters, policy, store
 from sfkd_jax.certification import corridor_coverage, output_metrics_from
 from sfkd_jax.control import law_to_arrays
 from sfkd_jax.corridor import drive_measurement, drive_options, policy_loop
@@ -51,7 +51,7 @@ def collect(loop, about, drives, directory):
         zip(("env_low", "env_high"), map(tuple, about["env_box"]), strict=True)
     )
     drive = jax.jit(partial(drive_switching, loop.plant, **options))
-    law = artefacts.sha256(
+    law = store.sha256(
         {
             name: np.asarray(table).tolist()
             for name, table in law_to_arrays(loop.law).items()
@@ -63,19 +63,19 @@ def collect(loop, about, drives, directory):
             directory / f"{index}.npz",
             {"class": about, "law": law, "index": index, "seed": SEED},
         )
-        if not artefacts.exists(path):
+        if not store.exists(path):
             began = time.perf_counter()
             made = jax.tree.map(
                 np.asarray, drive(jax.random.fold_in(jax.random.key(SEED), index))
             )
             path.parent.mkdir(parents=True, exist_ok=True)
-            artefacts.write_arrays(path, made._asdict(), kind="drives", config=config)
+            store.write_arrays(path, made._asdict(), kind="drives", config=config)
             print(
                 f"{BATCH} drives in {time.perf_counter() - began:.0f} s",
                 file=sys.stderr,
                 flush=True,
             )
-        saved = artefacts.read_arrays(path, kind="drives", config=config)[0]
+        saved = store.read_arrays(path, kind="drives", config=config)[0]
         parts.append(
             Trajectory(**{name: jnp.asarray(leaf) for name, leaf in saved.items()})
         )
@@ -168,8 +168,8 @@ def main():
         "package": result,
         "step": compared(trained, made),
     }
-    document |= {"settings": trained.settings, "versions": artefacts.versions()}
-    artefacts.write_json(given.out / "path.json", document)
+    document |= {"settings": trained.settings, "versions": store.versions()}
+    store.write_json(given.out / "path.json", document)
     print(json.dumps({"results": str(given.out / "path.json"), **result}))
 
 

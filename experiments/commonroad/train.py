@@ -20,7 +20,7 @@ import numpy as np
 import sfkd_jax
 from benchmarks.timing.own_model import settings as composed
 from experiments.commonroad import tune
-from sfkd_jax import adapters, artefacts, build, evaluation, scenarios
+from sfkd_jax import adapters, build, evaluation, scenarios, store
 from sfkd_jax import export as exporting
 from sfkd_jax.types import Controller
 
@@ -273,10 +273,10 @@ def main():
             path = directory / f"{driver.about['system']}.json"
             if not path.exists():
                 path.parent.mkdir(parents=True, exist_ok=True)
-                artefacts.write_json(
+                store.write_json(
                     path, {"rows": rows_of(plant, driver, track, args, given.paths)}
                 )
-            rows += artefacts.read_json(path)["rows"]
+            rows += store.read_json(path)["rows"]
     track = make_road(
         plants["std"], given.paths, given.seconds, args["evaluation"]["seed"]
     )
@@ -292,9 +292,9 @@ def main():
         "export": alike,
         "config": saved | args,
     }
-    document["versions"] = artefacts.versions()
-    artefacts.write_json(given.out / "results.json", document)
-    document = artefacts.read_json(given.out / "results.json")
+    document["versions"] = store.versions()
+    store.write_json(given.out / "results.json", document)
+    document = store.read_json(given.out / "results.json")
     for row in document["rows"]:
         mean = (
             "spun"

@@ -11,16 +11,16 @@ import numpy as np
 import sfkd_jax
 from sfkd_jax import (
     adapters,
-    artefacts,
     build,
     certification,
     evaluation,
     policy,
+    store,
 )
 from sfkd_jax import (
     data as datasets,
 )
-from sfkd_jax.pipeline import store
+from sfkd_jax.pipeline import runs
 from sfkd_jax.training import fit, multi_step_loss
 from sfkd_jax.types import Trajectory
 
@@ -39,7 +39,7 @@ def collect(plant, args, segments, path):
     """Drives of 5 s as our own data sets have them: S1 and S2 with levels drawn per
     drive, both controls excited.
     """
-    if not artefacts.exists(path):
+    if not store.exists(path):
         began = time.perf_counter()
         drive = jax.jit(
             partial(
@@ -52,7 +52,7 @@ def collect(plant, args, segments, path):
         )
         driven = jax.tree.map(np.asarray, drive(jax.random.key(SEED)))
         path.parent.mkdir(parents=True, exist_ok=True)
-        artefacts.write_arrays(
+        store.write_arrays(
             path,
             driven._asdict(),
             kind="drives",
@@ -63,7 +63,7 @@ def collect(plant, args, segments, path):
             file=sys.stderr,
             flush=True,
         )
-    driven = Trajectory(**artefacts.read_arrays(path, kind="drives")[0])
+    driven = Trajectory(**store.read_arrays(path, kind="drives")[0])
     whole = np.isfinite(driven.states).all(axis=(1, 2))
     box = {
         f"env_{side}": jnp.asarray(args["dataset"][f"env_{side}"])
@@ -77,7 +77,7 @@ def collect(plant, args, segments, path):
 
 def seen(data, states):
     """The same drives as a model of so many states is told of them."""
-    parts = {name: getattr(data, name) for name in store.PARTS}
+    parts = {name: getattr(data, name) for name in runs.PARTS}
     parts = {
         name: part._replace(
             states=adapters.commonroad_observation(part.states, states=states)
@@ -106,7 +106,7 @@ def tune(trained, data, args, directory, steps):
         params,
         **{name: getattr(data, name) for name in ("validation", "calibration")},
         held_out={"test": data.test},
-        boxes=store.boxes(data),
+        boxes=runs.boxes(data),
         sensor_noise=tuple(args["evaluation"]["observation_noise"]),
         level=LEVEL,
         monitor_level=LEVEL,
@@ -118,7 +118,7 @@ def tune(trained, data, args, directory, steps):
         "weights_sha256": manifest["sha256"],
         "policy_sha256": policy.policy_hash(manifest),
     }
-    artefacts.write_json(directory / "certificate.json", proof | about)
+    store.write_json(directory / "certificate.json", proof | about)
     errors = {"before": trained.params, "after": params}
     predict = jax.jit(
         partial(evaluation.open_loop, trained.model, horizon=WINDOWS["length"])
@@ -151,8 +151,8 @@ def tune_all(before, plant, args, root, *, segments, steps):
         record = directory / "record.json"
         if not record.exists():
             states = len(build.build_vehicle(trained.settings["vehicle"]).state_names)
-            artefacts.write_json(
+            store.write_json(
                 record, tune(trained, seen(data, states), args, directory, steps)
             )
-        after[row], records[row] = sfkd_jax.load(directory), artefacts.read_json(record)
+        after[row], records[row] = sfkd_jax.load(directory), store.read_json(record)
     return after, records

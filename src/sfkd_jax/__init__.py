@@ -4,10 +4,10 @@ from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
-    from sfkd_jax.artefacts import ArtefactError as ArtefactError
     from sfkd_jax.export import warm_up as warm_up
     from sfkd_jax.policy import Policy as Policy
     from sfkd_jax.policy import load as load
+    from sfkd_jax.store import ArtefactError as ArtefactError
 
 __version__ = "0.1.0"
 
@@ -15,7 +15,7 @@ _LAZY = {
     "load": "policy",
     "Policy": "policy",
     "warm_up": "export",
-    "ArtefactError": "artefacts",
+    "ArtefactError": "store",
 }
 
 

@@ -7,10 +7,10 @@ from __future__ import annotations
 
 from typing import Any
 
-from sfkd_jax import artefacts
+from sfkd_jax import store
 from sfkd_jax.certification import CertificateStale, CertificationRefused
 from sfkd_jax.cli.entry import hydra_command
-from sfkd_jax.pipeline import certificates, stages, store
+from sfkd_jax.pipeline import certificates, runs, stages
 
 SECONDS = 2.3e-5
 """Training time on two cores per step, segment of the batch and time step of the
@@ -18,7 +18,7 @@ window, measured with +experiment=s3.
 """
 
 
-@store.exclusive
+@runs.exclusive
 def run(settings: dict[str, Any]) -> dict[str, Any]:
     """Certify the policy of the run, which is trained if it is missing.
 
@@ -27,12 +27,12 @@ def run(settings: dict[str, Any]) -> dict[str, Any]:
             `certification.renew` is false.
         CertificationRefused: nothing could be certified.
     """
-    if not artefacts.exists(store.run_directory(settings) / "policy.npz"):
-        artefacts.print_message(_announcement(settings))
+    if not store.exists(runs.run_directory(settings) / "policy.npz"):
+        store.print_message(_announcement(settings))
     trained = stages.ensure_policy(settings)
-    path = certificates.certificate_path(store.run_directory(settings))
+    path = certificates.certificate_path(runs.run_directory(settings))
     if path.exists() and not settings["certification"]["renew"]:
-        certified = artefacts.read_json(path).get("policy_sha256")
+        certified = store.read_json(path).get("policy_sha256")
         if certified != trained.sha256:
             raise CertificateStale(
                 f"{path} is about other weights or settings; "
@@ -41,7 +41,7 @@ def run(settings: dict[str, Any]) -> dict[str, Any]:
     document = certificates.certify_policy(settings)
     if not document["valid"]:
         raise CertificationRefused(document["reason"])
-    path = certificates.certificate_path(store.run_directory(settings))
+    path = certificates.certificate_path(runs.run_directory(settings))
     d_bar = document.get("d_bar", {"value": None})["value"]
     keys = ("valid", "alpha", "alpha_separate", "rho", "beta", "tightness", "seconds")
     summary = {"certificate": str(path), "reason": None, "d_bar": d_bar}
@@ -54,7 +54,7 @@ def _announcement(settings: dict[str, Any]) -> str:
     steps = options["steps"]
     seconds = SECONDS * steps * options["batch"] * options["window"]
     return (
-        f"{store.run_directory(settings)} holds no trained policy: "
+        f"{runs.run_directory(settings)} holds no trained policy: "
         f"{settings['model']['system']} is trained first, at most {steps} steps, "
         f"about {max(1, round(seconds / 60))} min on two cores; then it is certified"
     )

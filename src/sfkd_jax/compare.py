@@ -13,7 +13,7 @@ from hydra.errors import HydraException
 from jax.errors import JaxRuntimeError
 from omegaconf.errors import OmegaConfBaseException
 
-from sfkd_jax import artefacts
+from sfkd_jax import store
 from sfkd_jax.cli import messages
 from sfkd_jax.cli.config import command_line, compose
 from sfkd_jax.cli.entry import hydra_command
@@ -58,7 +58,7 @@ def run(settings: dict[str, Any]) -> dict[str, Any]:
     if comparison["share"] is not None:
         return {"results": None, "rows": done, "failed": len(failed)}
     seconds = time.perf_counter() - began if done else None
-    with artefacts.locked(_directory(settings), wait=True):
+    with store.locked(_directory(settings), wait=True):
         return _collect(cells, settings, compose_cell, failed, seconds)
 
 
@@ -72,12 +72,12 @@ def _named_if_it_fails(
     except (
         TrainingStopped,
         ValueError,
-        artefacts.ArtefactError,
+        store.ArtefactError,
         JaxRuntimeError,  # such as memory that does not suffice
     ) as reason:
         line = next(iter(str(reason).splitlines()), type(reason).__name__)
         failed[_name(group)] = line
-        artefacts.print_message(f"failed: {line}")
+        store.print_message(f"failed: {line}")
 
 
 def _name(group: list[grid.Cell]) -> str:
@@ -98,7 +98,7 @@ def _collect(
 ) -> dict[str, Any]:
     """Write the results of all cells that are done, and their report."""
     directory = _directory(settings)
-    with artefacts.as_artefact_error(directory / "cells"):
+    with store.as_artefact_error(directory / "cells"):
         rows = grid.collect_rows(
             cells,
             settings,
@@ -111,12 +111,12 @@ def _collect(
     document = {
         "rows": rows,
         "config": settings | {"command": command_line("compare")},
-        "versions": artefacts.versions(),
+        "versions": store.versions(),
         "failed": failed,
         "seconds": seconds,
     }
-    artefacts.write_json(directory / "results.json", document)
-    with artefacts.as_artefact_error(directory):
+    store.write_json(directory / "results.json", document)
+    with store.as_artefact_error(directory):
         pages = write_results_page(directory)
     return {
         "results": str(directory / "results.json"),
@@ -147,7 +147,7 @@ def _compose(cell: grid.Cell, comparison: dict[str, Any]) -> dict[str, Any]:
 def _print_estimate(done: int, total: int, seconds: float) -> None:
     """Print how many groups are done, and how long the others may take."""
     left = seconds / done * (total - done)
-    artefacts.print_message(
+    store.print_message(
         f"[{done}/{total}] {seconds / 60:.0f} min so far, "
         f"about {left / 60:.0f} min left"
     )

@@ -6,11 +6,11 @@ import time
 from pathlib import Path
 from typing import Any
 
-from sfkd_jax import artefacts, build, evaluation, policy
+from sfkd_jax import build, evaluation, policy, store
 from sfkd_jax.cli.entry import hydra_command
 from sfkd_jax.evaluation.metrics import text_table
 from sfkd_jax.paper import animate
-from sfkd_jax.pipeline import evaluate_system, grid, store
+from sfkd_jax.pipeline import evaluate_system, grid, runs
 from sfkd_jax.plants import Vehicle
 
 SHIPPED = Path(__file__).with_name("pretrained")
@@ -39,10 +39,10 @@ def run(settings: dict[str, Any]) -> dict[str, Any]:
     episodes = evaluate_system.make_episodes(settings, plant)
     directory = Path(settings["root"]) / settings["name"]
     results = directory / f"{episodes.name}_{_name(settings)}"
-    with artefacts.locked(results):
+    with store.locked(results):
         rows = []
         for name, system in _systems(settings, plant, trained).items():
-            artefacts.print_message(
+            store.print_message(
                 f"driving {settings['demo']['episodes']} x "
                 f"{settings['demo']['episode_s']:.0f} s: {name}"
             )
@@ -52,12 +52,12 @@ def run(settings: dict[str, Any]) -> dict[str, Any]:
             path, result = results / name, evaluate(episodes)
             rows.append(grid.write_cell(path, settings, episodes, result))
         rows = evaluation.compare(rows)
-        document = {"rows": rows, "config": settings, "versions": artefacts.versions()}
-        artefacts.write_json(results / "results.json", document)
+        document = {"rows": rows, "config": settings, "versions": store.versions()}
+        store.write_json(results / "results.json", document)
         for line in text_table(rows, *PRINTED):
-            artefacts.print_message(line)
+            store.print_message(line)
         film = animate(directory, rows, episodes.name, corridor=_half_width(trained))
-    artefacts.print_message(
+    store.print_message(
         f"animation: {film}; {time.perf_counter() - began:.0f} s in all"
     )
     return {
@@ -69,7 +69,7 @@ def run(settings: dict[str, Any]) -> dict[str, Any]:
 
 def _name(settings: dict[str, Any]) -> str:
     """Return the name of the shipped policy for these settings."""
-    return settings["vehicle"]["name"] + ALONG_PATH * store.is_along_path(settings)
+    return settings["vehicle"]["name"] + ALONG_PATH * runs.is_along_path(settings)
 
 
 def _systems(
@@ -112,16 +112,16 @@ def _load_shipped(settings: dict[str, Any]) -> policy.Policy:
             f"controllers ship for {known} as they are; for another vehicle run train"
         )
     if trained.certificate is None:
-        raise artefacts.ArtefactError(
+        raise store.ArtefactError(
             f"{SHIPPED / name} was changed: its certificate is about other weights"
         )
     alpha, seconds = trained.certificate["alpha"], time.perf_counter() - began
-    artefacts.print_message(
+    store.print_message(
         f"certificate: holds, alpha {alpha:.4f}; loaded and verified in {seconds:.1f} s"
     )
     if half := _half_width(trained):
         share = 100 * trained.certificate["corridor"]["level"]
-        artefacts.print_message(
+        store.print_message(
             f"corridor: {half:.2f} m to each side, "
             f"on {share:.0f} % of the drives of its class"
         )

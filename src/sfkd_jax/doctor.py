@@ -12,7 +12,7 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 
-from sfkd_jax import artefacts
+from sfkd_jax import store
 from sfkd_jax.cli.entry import hydra_command
 
 CORE = (
@@ -51,7 +51,7 @@ def run(settings: dict[str, Any]) -> dict[str, Any]:
     Raises:
         ValueError: jax cannot compute here.
     """
-    versions = artefacts.versions() | {name: _version(name) for name in CORE}
+    versions = store.versions() | {name: _version(name) for name in CORE}
     print("  ".join(f"{name} {version}" for name, version in versions.items()))
     devices = [f"{device.platform}: {device.device_kind}" for device in jax.devices()]
     print(f"devices: {', '.join(devices)}; {_cores()} processor cores for this process")

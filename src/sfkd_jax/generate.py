@@ -6,7 +6,7 @@ import time
 from typing import Any
 
 from sfkd_jax.cli.entry import hydra_command
-from sfkd_jax.pipeline import stages, store
+from sfkd_jax.pipeline import runs, stages
 
 
 def run(settings: dict[str, Any]) -> dict[str, Any]:
@@ -14,8 +14,8 @@ def run(settings: dict[str, Any]) -> dict[str, Any]:
     began = time.perf_counter()
     dataset, _ = stages.ensure_dataset(settings)
     return {
-        "dataset": str(store.dataset_path(settings)),
-        "segments": sum(len(getattr(dataset, part).controls) for part in store.PARTS),
+        "dataset": str(runs.dataset_path(settings)),
+        "segments": sum(len(getattr(dataset, part).controls) for part in runs.PARTS),
         "seconds": time.perf_counter() - began,
     }
 

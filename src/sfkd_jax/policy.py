@@ -13,7 +13,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from sfkd_jax import artefacts, build
+from sfkd_jax import build, store
 from sfkd_jax.control import PathLaw, law_from_arrays, law_to_arrays
 from sfkd_jax.plants import Vehicle
 from sfkd_jax.rollout import fold, unfold
@@ -96,17 +96,15 @@ def save(
         The manifest; its `sha256` is the hash of weights and law.
     """
     tree = params if law is None else params | {LAW: law_to_arrays(law)}
-    flat = {name: np.asarray(leaf) for name, leaf in artefacts.flatten(tree).items()}
-    return artefacts.write_arrays(
+    flat = {name: np.asarray(leaf) for name, leaf in store.flatten(tree).items()}
+    return store.write_arrays(
         path, flat, kind=KIND, config=settings, made_from=made_from
     )
 
 
 def policy_hash(manifest: Mapping[str, Any]) -> str:
     """Return the hash of the weights and all settings of a policy."""
-    return artefacts.sha256(
-        {"weights": manifest["sha256"], "settings": manifest["config"]}
-    )
+    return store.sha256({"weights": manifest["sha256"], "settings": manifest["config"]})
 
 
 def restore(path: str | Path) -> TrainedModel:
@@ -121,12 +119,12 @@ def restore(path: str | Path) -> TrainedModel:
             or a model of a module that is not imported.
     """
     file = _file(path)
-    arrays, manifest = artefacts.read_arrays(file, kind=KIND)
+    arrays, manifest = store.read_arrays(file, kind=KIND)
     settings = manifest["config"]
-    with artefacts.as_artefact_error(file.with_suffix(".json"), ValueError):
+    with store.as_artefact_error(file.with_suffix(".json"), ValueError):
         build.check_imported(settings)
     version = str(manifest.get("versions", {}).get("sfkd_jax", "unknown"))
-    with artefacts.as_artefact_error(
+    with store.as_artefact_error(
         file.with_suffix(".json"), ValueError, advice=_advice(version)
     ):
         parts = {name: settings[name] for name in ("vehicle", "space", "model")}
@@ -171,7 +169,7 @@ def load(
     errors: tuple[type[Exception], ...] = (ValueError,)
     if controller is not None:
         settings, errors = settings | {"controller": dict(controller)}, ()
-    with artefacts.as_artefact_error(
+    with store.as_artefact_error(
         file.with_suffix(".json"), *errors, advice=_advice(trained.version)
     ):
         options, box = settings["controller"], settings["dataset"]
@@ -189,7 +187,7 @@ def load(
         )
     if certificate is None:
         if fallback != "none":
-            raise artefacts.ArtefactError(
+            raise store.ArtefactError(
                 f"{file}: controller.monitor.fallback={fallback} "
                 f"needs a certificate; {reason}"
             )
@@ -235,21 +233,21 @@ def read_certificate(
     file = _file(path).with_name(CERTIFICATE)
     if not file.exists():
         return None, f"{CERTIFICATE} is missing"
-    document = artefacts.read_json(file, keys=("valid",))
+    document = store.read_json(file, keys=("valid",))
     if document["valid"] is not True:
         return None, f"the certificate was refused: {document.get('reason')}"
     try:
-        with artefacts.as_artefact_error(file):
+        with store.as_artefact_error(file):
             bound = {"model": trained.model, "policy_sha256": trained.sha256}
             certification.verify_document(document, trained.params, **bound)
     except certification.CertificateStale as reason:
         return None, f"{reason}; certify again"
     except certification.CertificationRefused as reason:
-        raise artefacts.ArtefactError(f"{file}: {reason}") from None
+        raise store.ArtefactError(f"{file}: {reason}") from None
     space, boxes = trained.settings["space"], document["boxes"]
     for name, part in BOXES.items():
         if len(boxes[name][0]) != len(space[f"{part}_mean"]):
-            raise artefacts.ArtefactError(
+            raise store.ArtefactError(
                 f"{file}: boxes.{name} is of another size than the model"
             )
     return document, ""
@@ -277,32 +275,32 @@ def _advice(version: str) -> str:
 def _law(file: Path, arrays: Mapping[str, np.ndarray]) -> PathLaw:
     """Return the law that arrays hold, or raise an ArtefactError."""
     if not all(np.all(np.isfinite(leaf)) for leaf in arrays.values()):
-        raise artefacts.ArtefactError(f"{file}: the law's arrays are not finite")
-    with artefacts.as_artefact_error(file, ValueError):
-        return law_from_arrays(artefacts.unflatten(arrays)[LAW])
+        raise store.ArtefactError(f"{file}: the law's arrays are not finite")
+    with store.as_artefact_error(file, ValueError):
+        return law_from_arrays(store.unflatten(arrays)[LAW])
 
 
 def _weights(file: Path, arrays: Mapping[str, np.ndarray], model: Model) -> Params:
     """Return arrays as the parameters of a model, or raise an ArtefactError."""
-    with artefacts.as_artefact_error(file, ValueError):
-        params = artefacts.unflatten(arrays)
+    with store.as_artefact_error(file, ValueError):
+        params = store.unflatten(arrays)
         # Settings of a wrong type fail only here.
         expected = _by_path(jax.eval_shape(model.init, jax.random.key(0)))
     leaves = _by_path(params)
     if wrong := sorted(expected.keys() ^ leaves.keys()):
         verb = "lacks" if wrong[0] in expected else "holds"
-        raise artefacts.ArtefactError(
+        raise store.ArtefactError(
             f"{file}: {verb} weights {wrong[0]}, which does not fit the model"
         )
     for name, leaf in leaves.items():
         if (leaf.shape, leaf.dtype) != (expected[name].shape, expected[name].dtype):
             wanted = f"{expected[name].dtype}{list(expected[name].shape)}"
-            raise artefacts.ArtefactError(
+            raise store.ArtefactError(
                 f"{file}: weights {name} are {leaf.dtype}{list(leaf.shape)}, "
                 f"not {wanted}"
             )
         if not np.all(np.isfinite(leaf)):
-            raise artefacts.ArtefactError(f"{file}: weights {name} are not finite")
+            raise store.ArtefactError(f"{file}: weights {name} are not finite")
     return jax.tree.map(jnp.asarray, params)
 
 

@@ -6,26 +6,26 @@ from contextlib import nullcontext
 from pathlib import Path
 from typing import Any
 
-from sfkd_jax import artefacts
+from sfkd_jax import store
 from sfkd_jax.cli.entry import hydra_command
 from sfkd_jax.paper import beside_the_paper, write_comparison
-from sfkd_jax.pipeline import store
+from sfkd_jax.pipeline import runs
 from sfkd_jax.reporting import write_report
 
 
 def run(settings: dict[str, Any]) -> dict[str, Any]:
     """Write the report of the run, or of all runs that `report.compare` matches."""
     pattern = settings["report"]["compare"]
-    directory = Path(settings["root"]) if pattern else store.run_directory(settings)
+    directory = Path(settings["root"]) if pattern else runs.run_directory(settings)
     # A lock would make a directory that does not exist.
-    exclusive = artefacts.locked(directory) if directory.exists() else nullcontext()
-    with exclusive, artefacts.as_artefact_error(directory):
+    exclusive = store.locked(directory) if directory.exists() else nullcontext()
+    with exclusive, store.as_artefact_error(directory):
         pages = (
             write_comparison(directory, pattern, settings["name"])
             if pattern
             else write_report(directory, studies=beside_the_paper)
         )
-    artefacts.print_message(f"report: {pages['report']}")
+    store.print_message(f"report: {pages['report']}")
     return pages
 
 

@@ -8,11 +8,11 @@ from typing import Any
 
 from hydra.core.hydra_config import HydraConfig
 
-from sfkd_jax import artefacts, build
+from sfkd_jax import build, store
 from sfkd_jax.cli.config import command_line
 from sfkd_jax.cli.entry import hydra_command
 from sfkd_jax.paper import beside_the_paper
-from sfkd_jax.pipeline import certificates, dry_run, stages, store
+from sfkd_jax.pipeline import certificates, dry_run, runs, stages
 from sfkd_jax.pipeline.evaluate_run import evaluate_run
 from sfkd_jax.plants import check_step
 from sfkd_jax.reporting import write_report
@@ -33,11 +33,11 @@ def run(settings: dict[str, Any]) -> dict[str, Any]:
     return document | {"seconds": time.perf_counter() - began}
 
 
-@store.exclusive
+@runs.exclusive
 def _run_stages(settings: dict[str, Any]) -> dict[str, Any]:
     """Run all stages in the run directory."""
     stages.ensure_policy(settings)
-    run_dir = store.run_directory(settings)
+    run_dir = runs.run_directory(settings)
     trained = _about_training(run_dir)
     if not settings["evaluation"]["systems"]:
         return trained
@@ -47,13 +47,13 @@ def _run_stages(settings: dict[str, Any]) -> dict[str, Any]:
         results = evaluate_run(settings, command=typed)["results"]
     else:
         results = None
-        artefacts.print_message(
+        store.print_message(
             "not driven: vehicle=own is known from logs alone; "
             "vehicle.step=package.module:function drives it"
         )
-    with artefacts.as_artefact_error(run_dir):
+    with store.as_artefact_error(run_dir):
         pages = write_report(run_dir, studies=beside_the_paper)
-    artefacts.print_message(f"report: {pages['report']}")
+    store.print_message(f"report: {pages['report']}")
     return trained | {
         "certificate": str(certificates.certificate_path(run_dir)),
         "results": results,
@@ -65,7 +65,7 @@ def _run_stages(settings: dict[str, Any]) -> dict[str, Any]:
 def _about_training(run_dir: Path) -> dict[str, Any]:
     """Where the model is, its errors by steps ahead, and what a search minimises."""
     key = "position_rmse_m"
-    errors = artefacts.read_json(run_dir / "open_loop.json", keys=(key,))
+    errors = store.read_json(run_dir / "open_loop.json", keys=(key,))
     return {
         "run": str(run_dir),
         "checkpoint": str(run_dir / "checkpoints"),

@@ -14,7 +14,7 @@ import pytest
 from helpers import entry_at, put, refusal_of
 from jaxtyping import TypeCheckError
 
-from sfkd_jax import artefacts, demo, policy
+from sfkd_jax import demo, policy, store
 from sfkd_jax.certification import (
     CertificateStale,
     CertificationRefused,
@@ -31,7 +31,7 @@ def shipped(plant="kinematic"):
 
 @cache
 def honest(plant="kinematic"):
-    return artefacts.read_json(demo.SHIPPED / plant / "certificate.json")
+    return store.read_json(demo.SHIPPED / plant / "certificate.json")
 
 
 def check(document, plant="kinematic"):
@@ -223,7 +223,7 @@ def copied(tmp_path):
 
 
 def test_the_hash_changes_with_every_single_setting():
-    manifest = artefacts.read_json(demo.SHIPPED / "kinematic" / "policy.json")
+    manifest = store.read_json(demo.SHIPPED / "kinematic" / "policy.json")
     settings = dict(leaves(manifest["config"]))
     changed = {
         policy.policy_hash(
@@ -254,8 +254,8 @@ def test_the_hash_changes_with_every_single_setting():
 def test_a_setting_that_changed_leaves_nothing_certified_and_says_so(
     copied, path, value
 ):
-    manifest = artefacts.read_json(copied / "policy.json")
-    artefacts.write_json(
+    manifest = store.read_json(copied / "policy.json")
+    store.write_json(
         copied / "policy.json",
         manifest | {"config": put(manifest["config"], path, value)},
     )
@@ -292,12 +292,12 @@ def test_a_fallback_needs_a_certificate(copied, fallback):
 
 def test_a_forged_certificate_is_an_error_that_names_the_file(copied):
     forged = put(honest(), "alpha", 0.5)
-    artefacts.write_json(copied / "certificate.json", forged)
+    store.write_json(copied / "certificate.json", forged)
     assert "certificate.json: " in refusal_of(lambda: policy.load(copied))
 
 
 def test_a_refusal_is_told_with_its_reason(copied):
-    artefacts.write_json(
+    store.write_json(
         copied / "certificate.json",
         {"valid": False, "reason": "alpha = 2.0 is not below 1"},
     )
@@ -320,13 +320,13 @@ def test_a_refusal_is_told_with_its_reason(copied):
 def test_weights_that_do_not_fit_the_model_are_refused_in_one_line(
     copied, spoil, message
 ):
-    arrays, manifest = artefacts.read_arrays(copied / "policy.npz", kind=policy.KIND)
+    arrays, manifest = store.read_arrays(copied / "policy.npz", kind=policy.KIND)
     changed = spoil("networks/operators", arrays["networks/operators"])
     arrays = {
         name: leaf for name, leaf in arrays.items() if name != "networks/operators"
     }
     arrays |= {} if changed is None else {"networks/operators": changed}
-    artefacts.write_arrays(
+    store.write_arrays(
         copied / "policy.npz", arrays, kind=policy.KIND, config=manifest["config"]
     )
     line = refusal_of(lambda: policy.load(copied))
@@ -335,9 +335,9 @@ def test_weights_that_do_not_fit_the_model_are_refused_in_one_line(
 
 
 def test_weights_that_the_model_does_not_have_are_refused(copied):
-    arrays, manifest = artefacts.read_arrays(copied / "policy.npz", kind=policy.KIND)
+    arrays, manifest = store.read_arrays(copied / "policy.npz", kind=policy.KIND)
     arrays["networks/extra"] = np.zeros(3, np.float32)
-    artefacts.write_arrays(
+    store.write_arrays(
         copied / "policy.npz", arrays, kind=policy.KIND, config=manifest["config"]
     )
     assert "holds weights networks/extra" in refusal_of(lambda: policy.load(copied))

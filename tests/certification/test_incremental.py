@@ -13,7 +13,7 @@ from helpers import ENV_HIGH, ENV_LOW, jit, model_and_params, space
 from hydra import compose, initialize_config_dir
 from omegaconf import OmegaConf
 
-from sfkd_jax import artefacts, build, certification, certify, models, policy
+from sfkd_jax import build, certification, certify, models, policy, store
 from sfkd_jax.certification import (
     CertificateStale,
     CertificationRefused,
@@ -25,7 +25,7 @@ from sfkd_jax.certification import (
     is_incremental,
 )
 from sfkd_jax.cli import config
-from sfkd_jax.pipeline import certificates, store
+from sfkd_jax.pipeline import certificates, runs
 from sfkd_jax.types import Declared, Incremental, Structure
 
 
@@ -245,9 +245,9 @@ def untrained(name="control_synth"):
         jax.random.key(0)
     )
     saved = settings | {"space": build.space_to_settings(space())}
-    store.claim(settings)
+    runs.claim(settings)
     policy.save(
-        store.run_directory(settings) / "policy.npz", params, saved, made_from={}
+        runs.run_directory(settings) / "policy.npz", params, saved, made_from={}
     )
     return settings
 
@@ -273,7 +273,7 @@ def test_the_door_writes_the_rate_apart_from_certificates_of_steps(
         policy.load(file.parent).certificate is None
     )  # nothing that a monitor could take for its bounds
     assert document["weights_sha256"] == policy.restore(file.parent).weights_sha256
-    artefacts.write_json(file, document | {"policy_sha256": "others"})
+    store.write_json(file, document | {"policy_sha256": "others"})
     with pytest.raises(CertificateStale, match="other weights"):
         certify.run(settings)
     assert certificates.certify_policy(settings)["alpha"] == document["alpha"]

@@ -7,7 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from sfkd_jax import artefacts, plants
+from sfkd_jax import plants, store
 from sfkd_jax.control import derive_path_law, law_from_arrays, law_to_arrays
 from sfkd_jax.geometry import path_state, path_step
 from sfkd_jax.types import BODY
@@ -77,9 +77,9 @@ def test_a_law_survives_being_stored(derived):
     law = derived[1]
     flat = {
         name: np.asarray(leaf)
-        for name, leaf in artefacts.flatten({"law": law_to_arrays(law)}).items()
+        for name, leaf in store.flatten({"law": law_to_arrays(law)}).items()
     }
-    again = law_from_arrays(artefacts.unflatten(flat)["law"])
+    again = law_from_arrays(store.unflatten(flat)["law"])
     given = (
         jnp.full(law.state.shape[-1], 0.1),
         jnp.asarray(0.01),

@@ -21,7 +21,7 @@ from helpers import (
     tiny,
 )
 
-from sfkd_jax import artefacts, models
+from sfkd_jax import models, store
 from sfkd_jax.geometry import compose
 from sfkd_jax.rollout import fold, rollout
 from sfkd_jax.types import POSE
@@ -133,14 +133,14 @@ def test_parameters_are_nested_dicts_of_float32_arrays_that_can_be_stored(
     name, tmp_path
 ):
     _, params = model_and_params(name)
-    flat = {path: np.asarray(leaf) for path, leaf in artefacts.flatten(params).items()}
+    flat = {path: np.asarray(leaf) for path, leaf in store.flatten(params).items()}
     assert all(
         array.dtype == np.float32 and np.all(np.isfinite(array))
         for array in flat.values()
     )
-    artefacts.write_arrays(tmp_path / "weights.npz", flat, kind="weights", config={})
-    read, _ = artefacts.read_arrays(tmp_path / "weights.npz", kind="weights")
-    assert same(artefacts.unflatten(read), params, rtol=0, atol=0)
+    store.write_arrays(tmp_path / "weights.npz", flat, kind="weights", config={})
+    read, _ = store.read_arrays(tmp_path / "weights.npz", kind="weights")
+    assert same(store.unflatten(read), params, rtol=0, atol=0)
 
 
 def test_initial_parameters_depend_on_the_key_alone():
@@ -167,7 +167,7 @@ def test_gradients_of_a_rollout_are_finite_and_reach_every_parameter_in_use(name
             )
         return total
 
-    flat = artefacts.flatten(jit(jax.grad(loss))(params))
+    flat = store.flatten(jit(jax.grad(loss))(params))
     assert all(np.all(np.isfinite(gradient)) for gradient in flat.values())
     unused = {name for name, gradient in flat.items() if not np.any(gradient)}
     allowed = {

@@ -9,7 +9,6 @@ import pytest
 from PIL import Image
 
 from benchmarks.quality.result_pages import page_texts
-from sfkd_jax.artefacts import ArtefactError, write_arrays
 from sfkd_jax.paper import results_markdown, write_results_page
 from sfkd_jax.paper._animation import film
 from sfkd_jax.paper._claims import better_rows
@@ -26,6 +25,7 @@ from sfkd_jax.paper._variations import (
 from sfkd_jax.reporting.blocks import Table
 from sfkd_jax.reporting.film import MAX_BYTES
 from sfkd_jax.reporting.rows import name_of
+from sfkd_jax.store import ArtefactError, write_arrays
 
 ORACLE, SFKD = 0.016, 0.020
 LEVELS = ((0.9, 0.0), (0.6, -4.0), (0.3, 8.0), (0.6, 4.0))

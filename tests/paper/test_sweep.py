@@ -7,10 +7,10 @@ import pytest
 from PIL import Image
 
 from sfkd_jax import report
-from sfkd_jax.artefacts import ArtefactError
 from sfkd_jax.paper import write_comparison
 from sfkd_jax.paper._sweep_figure import tradeoff
 from sfkd_jax.paper._sweep_records import curves, records_of
+from sfkd_jax.store import ArtefactError
 
 PATTERN = "sweep/*/sfkd/seed=*"
 

@@ -11,7 +11,6 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from sfkd_jax.artefacts import ArtefactError
 from sfkd_jax.evaluation.formats import upper
 from sfkd_jax.evaluation.metrics import METRICS, Metric
 from sfkd_jax.paper import beside_the_paper
@@ -19,6 +18,7 @@ from sfkd_jax.paper._side_forces import violations
 from sfkd_jax.reporting import write_report
 from sfkd_jax.reporting._certificate import tube_on_drive
 from sfkd_jax.reporting.scene import scenes_of
+from sfkd_jax.store import ArtefactError
 
 STEPS, DT, EPISODES, SPEED = 600, 0.1, 4, 10.0
 LEVELS = ((0.9, 0.0), (0.6, 4.0), (0.3, 8.0), (0.6, -4.0))

@@ -14,7 +14,7 @@ import numpy as np
 import pytest
 from helpers import TINY, dataset, largest_file
 
-from sfkd_jax import artefacts
+from sfkd_jax import store
 from sfkd_jax.data import measure_space, random_windows, spread_windows
 from sfkd_jax.models import sfkd
 from sfkd_jax.training import Checkpoints, fit, multi_step_loss
@@ -57,7 +57,7 @@ def lines(directory):
     """The log of every step without its times."""
     return [
         {name: line.get(name) for name in EXACT}
-        for line in artefacts.read_jsonl(directory / "metrics.jsonl")
+        for line in store.read_jsonl(directory / "metrics.jsonl")
     ]
 
 
@@ -70,7 +70,7 @@ def stopped(directory, number, step):
     )
     log, patience = directory / "metrics.jsonl", time.monotonic() + 120
     while not (
-        log.exists() and any(line["step"] >= step for line in artefacts.read_jsonl(log))
+        log.exists() and any(line["step"] >= step for line in store.read_jsonl(log))
     ):
         assert process.poll() is None
         assert time.monotonic() < patience
@@ -158,7 +158,7 @@ def test_a_log_that_cannot_be_rewritten_stays_and_is_one_line(tmp_path):
     log.write_text(text)
     with (
         largest_file(5),
-        pytest.raises(artefacts.ArtefactError, match="File too large"),
+        pytest.raises(store.ArtefactError, match="File too large"),
     ):
         TrainingLog(tmp_path, steps=40, resumed_at=30)
     assert log.read_text() == text

@@ -20,10 +20,10 @@ from omegaconf import DictConfig
 from omegaconf.errors import OmegaConfBaseException
 
 from sfkd_jax import training
-from sfkd_jax.artefacts import ArtefactError
 from sfkd_jax.certification import CertificateStale, CertificationRefused
 from sfkd_jax.cli import config, messages, queues, sweeps
 from sfkd_jax.cli.help import information
+from sfkd_jax.store import ArtefactError
 
 FAILED = 1
 REFUSED = 2

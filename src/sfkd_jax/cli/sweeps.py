@@ -16,9 +16,9 @@ from hydra.core.utils import JobReturn, JobStatus
 from hydra.plugins.launcher import Launcher
 from omegaconf import DictConfig, OmegaConf
 
-from sfkd_jax import artefacts
+from sfkd_jax import store
 from sfkd_jax.cli import queues
-from sfkd_jax.pipeline import store
+from sfkd_jax.pipeline import runs
 
 NAMED = frozenset({"model", "seed"})
 """Swept settings that the path of a run directory contains anyway."""
@@ -101,7 +101,7 @@ class _NamedJobs(Launcher):
         inner: Any = self._inner
         swept = swept_settings(inner.config)
         named = {
-            key for key in swept if key.split(".")[0] in (*store.IDENTITY, "env_source")
+            key for key in swept if key.split(".")[0] in (*runs.IDENTITY, "env_source")
         } - NAMED
         load = inner.hydra_context.config_loader.load_sweep_config
         jobs = []
@@ -221,4 +221,4 @@ def _spelled(value: Any) -> str:
 
 
 def _hash(text: str) -> str:
-    return artefacts.sha256([text])[:8]
+    return store.sha256([text])[:8]

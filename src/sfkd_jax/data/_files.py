@@ -7,7 +7,7 @@ import hashlib
 from functools import cache
 from pathlib import Path
 
-from sfkd_jax.artefacts import open_regular
+from sfkd_jax.store import open_regular
 
 SUFFIXES = (".csv", ".npz", ".parquet")
 

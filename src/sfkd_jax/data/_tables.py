@@ -12,7 +12,7 @@ from typing import Any, NamedTuple, NoReturn
 import numpy as np
 from jaxtyping import Float, Int, Shaped
 
-from sfkd_jax.artefacts import open_regular
+from sfkd_jax.store import open_regular
 
 WIDEST = 64
 """Characters of a cell up to which a csv column is stored as text of fixed width."""

@@ -4,10 +4,10 @@ from __future__ import annotations
 
 from typing import Any
 
-from sfkd_jax import artefacts, build, policy
+from sfkd_jax import build, policy, store
 from sfkd_jax.cli.entry import hydra_command
 from sfkd_jax.export import write_controller
-from sfkd_jax.pipeline import store
+from sfkd_jax.pipeline import runs
 
 FOLDER = "export"
 
@@ -19,26 +19,26 @@ def run(settings: dict[str, Any]) -> dict[str, Any]:
         ArtefactError: the run has no policy, or one that is damaged or was trained
             with other settings.
     """
-    run_dir = store.run_directory(settings)
-    if not artefacts.exists(run_dir / "policy.npz"):
-        raise artefacts.ArtefactError(
+    run_dir = runs.run_directory(settings)
+    if not store.exists(run_dir / "policy.npz"):
+        raise store.ArtefactError(
             f"{run_dir} holds no trained controller; "
             "run train with the same options first"
         )
     return _write(settings)
 
 
-@store.exclusive
+@runs.exclusive
 def _write(settings: dict[str, Any]) -> dict[str, Any]:
     """Export the policy while no other process writes to the run directory."""
-    run_dir = store.run_directory(settings)
-    store.claim(settings)
-    _, manifest = artefacts.read_arrays(run_dir / "policy.npz", kind=policy.KIND)
+    run_dir = runs.run_directory(settings)
+    runs.claim(settings)
+    _, manifest = store.read_arrays(run_dir / "policy.npz", kind=policy.KIND)
     trained = policy.load(
         run_dir, controller=settings["controller"], env_source=settings["env_source"]
     )
     if trained.certificate is None:
-        artefacts.print_message("exported without a certificate and without a monitor")
+        store.print_message("exported without a certificate and without a monitor")
     folder = run_dir / FOLDER
     write_controller(
         trained,
@@ -46,7 +46,7 @@ def _write(settings: dict[str, Any]) -> dict[str, Any]:
         made_from=manifest["made_from"],
         **build.as_kwargs(settings["export"]),
     )
-    artefacts.print_message(
+    store.print_message(
         f"exported: {folder}; python {folder / 'run_controller.py'} "
         "runs it without sfkd_jax"
     )

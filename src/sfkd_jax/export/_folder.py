@@ -11,7 +11,7 @@ from typing import Any
 import jax
 import numpy as np
 
-from sfkd_jax import artefacts, build, policy
+from sfkd_jax import build, policy, store
 from sfkd_jax.export._iree import compile_iree
 from sfkd_jax.export._programs import Leaf, flat_programs, lower
 from sfkd_jax.ranges import Names
@@ -102,18 +102,18 @@ def write_controller(
         **_vehicle(trained),
         "parameters": _count(trained.weights),
         "settings": trained.settings,
-        "versions": artefacts.versions(),
+        "versions": store.versions(),
     }
     script = resources.files("sfkd_jax.export").joinpath(f"_{SCRIPT}").read_bytes()
-    artefacts.write_bytes(folder / SCRIPT, script)
-    manifest["sha256"] = artefacts.sha256(manifest)
-    artefacts.write_json(folder / MANIFEST, manifest)
+    store.write_bytes(folder / SCRIPT, script)
+    manifest["sha256"] = store.sha256(manifest)
+    store.write_json(folder / MANIFEST, manifest)
     return manifest
 
 
 def _write(path: Path, content: bytes) -> dict[str, Any]:
     """Write a file and return its name, size and hash."""
-    artefacts.write_bytes(path, content)
+    store.write_bytes(path, content)
     return {
         "file": path.name,
         "bytes": len(content),
@@ -134,7 +134,7 @@ def _certificate(
     """
     if trained.certificate is None:
         return None
-    artefacts.write_json(
+    store.write_json(
         folder / CERTIFICATE, trained.certificate | {"policy_sha256": policy_sha256}
     )
     return hashlib.sha256((folder / CERTIFICATE).read_bytes()).hexdigest()

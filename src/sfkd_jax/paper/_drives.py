@@ -8,10 +8,10 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Float
 
-from sfkd_jax.artefacts import ArtefactError, exists, read_arrays
 from sfkd_jax.evaluation.metrics import Row
 from sfkd_jax.reporting.rows import name_of
 from sfkd_jax.reporting.style import family
+from sfkd_jax.store import ArtefactError, exists, read_arrays
 
 KIND = "cell"
 

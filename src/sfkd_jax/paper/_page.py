@@ -8,7 +8,6 @@ from typing import Any, NamedTuple, TypeAlias
 
 from matplotlib.figure import Figure
 
-from sfkd_jax.artefacts import as_artefact_error, read_json, write_bytes, writing
 from sfkd_jax.evaluation.metrics import Row
 from sfkd_jax.paper import _figures as figures
 from sfkd_jax.paper import _tables as tables
@@ -36,6 +35,7 @@ from sfkd_jax.reporting.blocks import (
     to_markdown,
 )
 from sfkd_jax.reporting.style import save, scenario_label
+from sfkd_jax.store import as_artefact_error, read_json, write_bytes, writing
 
 FILES = "results_files"
 MOST_BYTES = 5_000_000

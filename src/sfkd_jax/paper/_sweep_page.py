@@ -7,7 +7,6 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-from sfkd_jax.artefacts import write_bytes, write_json, writing
 from sfkd_jax.evaluation.formats import dig, percent, plain
 from sfkd_jax.evaluation.metrics import BY_NAME
 from sfkd_jax.paper._sweep_figure import tradeoff
@@ -31,6 +30,7 @@ from sfkd_jax.reporting.blocks import (
 )
 from sfkd_jax.reporting.style import save, scenario_label
 from sfkd_jax.reporting.texts import fill
+from sfkd_jax.store import write_bytes, write_json, writing
 
 _TABLES: dict[str, dict[str, str]] = tomllib.loads(FILE.read_text("utf-8"))
 _DRIVEN = {
@@ -56,7 +56,7 @@ def write_comparison(root: Path, pattern: str, name: str) -> dict[str, Any]:
     separate α and for d̄ on validation drives.
 
     Args:
-        root: of all artefacts.
+        root: of all store.
         pattern: of run directories below it, as `contraction/*/*/seed=*`.
         name: of the page.
 

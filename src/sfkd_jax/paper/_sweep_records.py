@@ -7,10 +7,10 @@ from collections import Counter
 from pathlib import Path
 from typing import Any, TypeAlias
 
-from sfkd_jax.artefacts import as_artefact_error
 from sfkd_jax.evaluation.formats import dig, is_number
 from sfkd_jax.reporting.rows import groups_of, model_of, row_of
 from sfkd_jax.reporting.run import holds, read_certificate, read_optional
+from sfkd_jax.store import as_artefact_error
 
 Record: TypeAlias = dict[str, Any]
 

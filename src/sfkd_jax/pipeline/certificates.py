@@ -6,7 +6,7 @@ import time
 from pathlib import Path
 from typing import Any
 
-from sfkd_jax import artefacts, build, policy
+from sfkd_jax import build, policy, store
 from sfkd_jax.certification import (
     CertificationRefused,
     certify_incremental,
@@ -15,7 +15,7 @@ from sfkd_jax.certification import (
     output_metrics_from,
 )
 from sfkd_jax.corridor import certify_corridor
-from sfkd_jax.pipeline import stages, store
+from sfkd_jax.pipeline import runs, stages
 
 INCREMENTAL = "incremental.json"
 """File for the rate of a continuous flow, which has no tubes and no monitor bounds."""
@@ -33,7 +33,7 @@ def certify_policy(settings: dict[str, Any]) -> dict[str, Any]:
     A refusal is a document too: `valid` is false, and `reason` is given.
     """
     began = time.perf_counter()
-    run_dir = store.run_directory(settings)
+    run_dir = runs.run_directory(settings)
     trained = stages.ensure_policy(settings)
     incremental = is_incremental(trained.model, trained.params)
     certify = _certify_rate if incremental else _certify_tubes
@@ -41,7 +41,7 @@ def certify_policy(settings: dict[str, Any]) -> dict[str, Any]:
         document = certify(settings, trained)
     except CertificationRefused as reason:
         document = {"valid": False, "reason": str(reason)}
-    versions = artefacts.versions() | document.get("versions", {})
+    versions = store.versions() | document.get("versions", {})
     document |= {
         "weights_sha256": trained.weights_sha256,
         "policy_sha256": trained.sha256,
@@ -52,8 +52,8 @@ def certify_policy(settings: dict[str, Any]) -> dict[str, Any]:
     names = (INCREMENTAL, policy.CERTIFICATE)
     written, stale = names if incremental else reversed(names)
     (run_dir / stale).unlink(missing_ok=True)
-    artefacts.write_json(run_dir / written, document)
-    artefacts.print_message(f"certificate: {_verdict(document)}")
+    store.write_json(run_dir / written, document)
+    store.print_message(f"certificate: {_verdict(document)}")
     return document
 
 
@@ -84,12 +84,12 @@ def _certify_tubes(
 ) -> dict[str, Any]:
     """Certify the steps of a model, with tubes calibrated on the data of the run."""
     dataset, _ = stages.ensure_dataset(settings)
-    is_logged = store.is_logged(settings)
+    is_logged = runs.is_logged(settings)
     options = build.as_kwargs(settings["certification"], "renew", "corridor")
-    boxes = store.boxes(dataset)
+    boxes = runs.boxes(dataset)
     noise = tuple(settings["evaluation"]["observation_noise"])
     if is_logged:  # the noise of the sensors is already in the logs
-        boxes, noise = boxes | {"names": store.channel_names(settings)}, ()
+        boxes, noise = boxes | {"names": runs.channel_names(settings)}, ()
     document = issue(
         trained.model,
         trained.params,
@@ -116,11 +116,11 @@ def ensure_certificate(settings: dict[str, Any]) -> None:
 
     A certificate of other settings of the certification is made again.
     """
-    run_dir = store.run_directory(settings)
-    if artefacts.exists(run_dir / "policy.npz") and _is_certified(settings):
+    run_dir = runs.run_directory(settings)
+    if store.exists(run_dir / "policy.npz") and _is_certified(settings):
         stages.ensure_policy(settings)
         return
-    with artefacts.locked(run_dir, wait=True):  # another process may be training it
+    with store.locked(run_dir, wait=True):  # another process may be training it
         stages.ensure_policy(settings)
         if not _is_certified(settings):
             certify_policy(settings)
@@ -131,9 +131,9 @@ def _is_certified(settings: dict[str, Any]) -> bool:
 
     Older certificates do not record theirs, and count.
     """
-    path = certificate_path(store.run_directory(settings))
+    path = certificate_path(runs.run_directory(settings))
     if not path.exists():
         return False
-    recorded = artefacts.read_json(path).get("certification")
+    recorded = store.read_json(path).get("certification")
     options = build.as_kwargs(settings["certification"], "renew")
-    return recorded is None or not artefacts.differences(recorded, options)
+    return recorded is None or not store.differences(recorded, options)

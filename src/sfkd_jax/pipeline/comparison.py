@@ -6,14 +6,14 @@ from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any, TypeAlias
 
-from sfkd_jax import artefacts, build
+from sfkd_jax import build, store
 from sfkd_jax.pipeline import (
     certificates,
     dry_run,
     evaluate_system,
     grid,
+    runs,
     stages,
-    store,
     systems,
 )
 from sfkd_jax.plants import Vehicle
@@ -33,7 +33,7 @@ def cached_episodes() -> MakeEpisodes:
     def make_episodes(
         settings: dict[str, Any], plant: Vehicle
     ) -> evaluate_system.EpisodeSet:
-        key = artefacts.sha256(
+        key = store.sha256(
             {name: settings[name] for name in ("vehicle", "scenario", "evaluation")}
         )
         if key not in cache:
@@ -102,7 +102,7 @@ def evaluate_group(
         result = evaluators[key](episodes)
         grid.write_cell(path, settings, episodes, result)
         error = 1e3 * result.row["rmse_m"]["mean"]
-        artefacts.print_message(f"{' '.join(map(str, cell))}: {error:.1f} mm")
+        store.print_message(f"{' '.join(map(str, cell))}: {error:.1f} mm")
         done += 1
     return done
 
@@ -124,7 +124,7 @@ def _run_settings(
     """The settings of a cell, under the name of the run of its policy."""
     settings = compose_cell(cell)
     usual = cell._replace(variation=next(iter(comparison["variations"])))
-    retrained = store.identity(settings) != store.identity(compose_cell(usual))
+    retrained = runs.identity(settings) != runs.identity(compose_cell(usual))
     return settings | {"name": grid.policy_name(cell, comparison, retrained=retrained)}
 
 

@@ -10,7 +10,7 @@ from sfkd_jax import build
 from sfkd_jax.certification import MODES
 from sfkd_jax.control import PathLaw
 from sfkd_jax.data import check_shares
-from sfkd_jax.pipeline import store
+from sfkd_jax.pipeline import runs
 from sfkd_jax.plants import Vehicle
 from sfkd_jax.types import Model, Space
 
@@ -35,7 +35,7 @@ def check_settings(settings: dict[str, Any], plant: Vehicle) -> None:
     build.choose(
         dict.fromkeys(MODES), settings["certification"]["mode"], "certification.mode"
     )
-    along_path = store.is_along_path(settings)
+    along_path = runs.is_along_path(settings)
     sizes = _sizes(settings, plant)
     law = _zero_law(sizes) if along_path else None
     systems = {"self": None} | build.reference_systems(plant, law)
@@ -56,10 +56,10 @@ def check_settings(settings: dict[str, Any], plant: Vehicle) -> None:
 
 def _sizes(settings: dict[str, Any], plant: Vehicle) -> dict[str, int]:
     """Sizes of body state, control and environment that the model reads."""
-    logged = store.is_logged(settings)
+    logged = runs.is_logged(settings)
     columns = settings["dataset"]["columns"]["environment"] if logged else ()
     state = len(plant.state_names) - 3
-    if store.is_along_path(settings):
+    if runs.is_along_path(settings):
         return {"state": state + 2, "control": 4, "env": len(columns) or 2}
     return {"state": state, "control": 2, "env": len(columns) or 2}
 

@@ -8,8 +8,8 @@ from typing import Any
 
 import numpy as np
 
-from sfkd_jax import artefacts, build, evaluation
-from sfkd_jax.pipeline import dry_run, evaluate_system, stages, store, systems
+from sfkd_jax import build, evaluation, store
+from sfkd_jax.pipeline import dry_run, evaluate_system, runs, stages, systems
 
 KIND = "episodes"
 
@@ -34,7 +34,7 @@ def evaluate_run(
         ArtefactError: the earlier results are damaged.
     """
     began = time.perf_counter()
-    run_dir = store.run_directory(settings)
+    run_dir = runs.run_directory(settings)
     plant = build.build_vehicle(settings["vehicle"])
     # Vehicle, settings and earlier results are checked before anything is trained.
     episodes = evaluate_system.make_episodes(settings, plant)
@@ -53,7 +53,7 @@ def evaluate_run(
         rows.append(result.row)
         arrays |= _named_arrays(result, episodes)
         error, worst = result.row["rmse_m"]["mean"], result.row["max_deviation_m"]
-        artefacts.print_message(f"  rmse {error:.4f} m, worst {worst:.3f} m")
+        store.print_message(f"  rmse {error:.4f} m, worst {worst:.3f} m")
     arrays["dt"] = np.asarray(plant.dt)
     recorded = settings | ({} if command is None else {"command": command})
     seconds = time.perf_counter() - began
@@ -65,7 +65,7 @@ def _announce(settings: dict[str, Any], name: str, scenario: str) -> None:
     """Print which system is evaluated, and for how long."""
     protocol = settings["evaluation"]
     length = f"{protocol['episodes']} episodes of {protocol['episode_s']:.0f} s"
-    artefacts.print_message(f"driving {length}: {name} on {scenario}")
+    store.print_message(f"driving {length}: {name} on {scenario}")
 
 
 def _named_arrays(
@@ -73,10 +73,8 @@ def _named_arrays(
 ) -> dict[str, Any]:
     """The arrays of a drive under the names of episodes.npz."""
     scenarios = episodes.scenarios
-    road = dict(
-        zip(artefacts.ROAD, (scenarios.envs, scenarios.path.points), strict=True)
-    )
-    prefix = artefacts.drive_name(result.row)
+    road = dict(zip(store.ROAD, (scenarios.envs, scenarios.path.points), strict=True))
+    prefix = store.drive_name(result.row)
     return {f"{prefix}/{part}": array for part, array in (result.arrays | road).items()}
 
 
@@ -89,11 +87,11 @@ def read_results(run_dir: Path) -> tuple[list[dict[str, Any]], dict[str, Any]]:
     results, episodes = run_dir / "results.json", run_dir / "episodes.npz"
     rows, arrays = [], {}
     if results.exists():
-        rows = artefacts.read_json(results, keys=("rows",))["rows"]
-    if artefacts.exists(episodes):
-        arrays, _ = artefacts.read_arrays(episodes, kind=KIND)
-    with artefacts.as_artefact_error(results):
-        return artefacts.merge([], rows), artefacts.with_current_names(arrays, rows)
+        rows = store.read_json(results, keys=("rows",))["rows"]
+    if store.exists(episodes):
+        arrays, _ = store.read_arrays(episodes, kind=KIND)
+    with store.as_artefact_error(results):
+        return store.merge([], rows), store.with_current_names(arrays, rows)
 
 
 def write_results(
@@ -113,16 +111,14 @@ def write_results(
         seconds: that the evaluation took [s].
     """
     config = {name: settings[name] for name in ("vehicle", "controller", "evaluation")}
-    with artefacts.locked(run_dir, wait=True):
+    with store.locked(run_dir, wait=True):
         earlier, old = read_results(run_dir)
         arrays = old | {name: np.asarray(array) for name, array in arrays.items()}
-        artefacts.write_arrays(
-            run_dir / "episodes.npz", arrays, kind=KIND, config=config
-        )
+        store.write_arrays(run_dir / "episodes.npz", arrays, kind=KIND, config=config)
         document = {
-            "rows": artefacts.merge(earlier, rows),
+            "rows": store.merge(earlier, rows),
             "config": settings,
-            "versions": artefacts.versions(),
+            "versions": store.versions(),
             "seconds": seconds,
         }
-        artefacts.write_json(run_dir / "results.json", document)
+        store.write_json(run_dir / "results.json", document)

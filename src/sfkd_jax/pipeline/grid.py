@@ -9,8 +9,8 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from sfkd_jax import artefacts, evaluation
-from sfkd_jax.pipeline import store
+from sfkd_jax import evaluation, store
+from sfkd_jax.pipeline import runs
 from sfkd_jax.pipeline.evaluate_system import EpisodeSet, SystemResult
 
 KIND = "cell"
@@ -153,13 +153,13 @@ def cell_path(cell: Cell, settings: dict[str, Any]) -> Path:
 
 def compilation_key(settings: dict[str, Any]) -> str:
     """Hash the settings that a compiled evaluator depends on; equal keys share it."""
-    names = (*store.IDENTITY, "env_source", "controller", "certification", "name")
+    names = (*runs.IDENTITY, "env_source", "controller", "certification", "name")
     protocol = {
         name: value
         for name, value in settings["evaluation"].items()
         if name not in ("env_sensor", "variation")
     }
-    return artefacts.sha256(
+    return store.sha256(
         {name: settings[name] for name in names} | {"evaluation": protocol}
     )
 
@@ -169,7 +169,7 @@ def settings_hash(settings: dict[str, Any]) -> str:
 
     Neither the code nor the location of the artefacts enters.
     """
-    names = (*store.IDENTITY, "controller", "scenario", "certification")
+    names = (*runs.IDENTITY, "controller", "scenario", "certification")
     hashed = {name: settings[name] for name in names}
     # Two settings keep the keys under which stored cells were hashed.
     hashed["env"] = settings["env_source"]
@@ -177,7 +177,7 @@ def settings_hash(settings: dict[str, Any]) -> str:
         "told" if name == "env_sensor" else name: value
         for name, value in settings["evaluation"].items()
     }
-    return artefacts.sha256(hashed)
+    return store.sha256(hashed)
 
 
 def drives_hash(settings: dict[str, Any]) -> str:
@@ -187,7 +187,7 @@ def drives_hash(settings: dict[str, Any]) -> str:
     """
     protocol = settings["evaluation"]
     drives = {name: protocol[name] for name in ("seed", "episodes", "episode_s")}
-    return artefacts.sha256(
+    return store.sha256(
         {name: settings[name] for name in ("vehicle", "scenario")} | drives
     )
 
@@ -195,9 +195,9 @@ def drives_hash(settings: dict[str, Any]) -> str:
 def is_done(path: Path, settings: dict[str, Any]) -> bool:
     """Whether an undamaged cell with exactly these settings is stored."""
     try:
-        document = artefacts.read_json(_row_file(path), keys=("row",))
+        document = store.read_json(_row_file(path), keys=("row",))
         return document["made_with"] == settings_hash(settings)
-    except (artefacts.ArtefactError, OSError, KeyError):
+    except (store.ArtefactError, OSError, KeyError):
         return False
 
 
@@ -222,12 +222,12 @@ def write_cell(
     }
     stored["dt"] = np.asarray(settings["vehicle"]["dt"])
     file = path.with_name(f"{path.name}.npz")
-    artefacts.write_arrays(file, stored, kind=KIND, config=settings["scenario"])
+    store.write_arrays(file, stored, kind=KIND, config=settings["scenario"])
     row = result.row | {
         "arrays": str(file.relative_to(Path(settings["root"], settings["name"]))),
-        "provenance": artefacts.provenance(),
+        "provenance": store.provenance(),
     }
-    artefacts.write_json(
+    store.write_json(
         _row_file(path), {"row": row, "made_with": settings_hash(settings)}
     )
     return row
@@ -256,7 +256,7 @@ def collect_rows(
         path = _row_file(cell_path(cell, settings))
         if not path.exists():
             continue
-        document = artefacts.read_json(path, keys=("row", "made_with"))
+        document = store.read_json(path, keys=("row", "made_with"))
         cell_settings = compose_cell(cell)
         is_current = document["made_with"] == settings_hash(cell_settings)
         if not is_current:
@@ -264,23 +264,23 @@ def collect_rows(
         if older or is_current:
             row = document["row"] | {"drives": drives_hash(cell_settings)}
             pooled.setdefault(cell._replace(seed=0), []).append(row)
-            if row.get("provenance", {}).get("source") != artefacts.source_hash():
+            if row.get("provenance", {}).get("source") != store.source_hash():
                 by_other_code.append(path)
     if others:
         outcome = "used" if older else "left out; comparison.older=true uses them"
-        artefacts.print_message(
+        store.print_message(
             f"{len(others)} cells were made with other settings, "
             f"such as {others[0]}: {outcome}"
         )
     if by_other_code:
-        artefacts.print_message(
+        store.print_message(
             f"{len(by_other_code)} cells were made by other code, "
             f"such as {by_other_code[0]}: used, and marked on the page"
         )
     not_driven = len({cell._replace(seed=0) for cell in cells}) - len(pooled)
     rows = []
     for cell, trainings in pooled.items():
-        with artefacts.as_artefact_error(cell_path(cell, settings).parent / cell.label):
+        with store.as_artefact_error(cell_path(cell, settings).parent / cell.label):
             rows.append(evaluation.pool(trainings))
     return evaluation.compare(rows, not_driven=not_driven)
 

@@ -10,7 +10,7 @@ import jax
 import numpy as np
 from jaxtyping import Int
 
-from sfkd_jax import artefacts, build
+from sfkd_jax import build, store
 from sfkd_jax.control import PathLaw, law_from_arrays, law_to_arrays
 from sfkd_jax.data import (
     generate,
@@ -20,7 +20,7 @@ from sfkd_jax.data import (
     segment_scenarios,
     segment_scenarios_along_path,
 )
-from sfkd_jax.pipeline import store
+from sfkd_jax.pipeline import runs
 from sfkd_jax.plants import Vehicle
 from sfkd_jax.types import Key, Trajectory
 
@@ -31,14 +31,14 @@ def ensure_law(settings: dict[str, Any]) -> PathLaw | None:
     Returns:
         The law, or None if the data set is not in path coordinates.
     """
-    if not store.is_along_path(settings):
+    if not runs.is_along_path(settings):
         return None
-    if not artefacts.exists(store.law_path(settings)):
+    if not store.exists(runs.law_path(settings)):
         plant = build.build_vehicle(settings["vehicle"])
-        artefacts.print_message(f"deriving the law of vehicle {plant.name}")
+        store.print_message(f"deriving the law of vehicle {plant.name}")
         law = jax.jit(partial(build.build_law, settings["dataset"], plant))()
-        store.write_law(settings, law_to_arrays(law))
-    return law_from_arrays(store.read_law(settings))
+        runs.write_law(settings, law_to_arrays(law))
+    return law_from_arrays(runs.read_law(settings))
 
 
 def closed_loop(settings: dict[str, Any]) -> Vehicle:
@@ -63,7 +63,7 @@ def generator(
         options: of the generator, without the environment box.
         switching: whether the environment follows S3.
     """
-    if not store.is_along_path(settings):
+    if not runs.is_along_path(settings):
         plant = build.build_vehicle(settings["vehicle"])
         return partial(
             generate_switching if switching else generate,
@@ -81,7 +81,7 @@ def generated_scenarios(settings: dict[str, Any]) -> Int[np.ndarray, " segment"]
     """Return the scenario of every segment of `generator`, as index into SCENARIOS."""
     of_segments = (
         segment_scenarios_along_path
-        if store.is_along_path(settings)
+        if runs.is_along_path(settings)
         else segment_scenarios
     )
     return of_segments(settings["dataset"]["segments"])

@@ -10,7 +10,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from sfkd_jax import artefacts, build, evaluation
+from sfkd_jax import build, evaluation, store
 from sfkd_jax.certification import conformal_tube, latent_tube
 from sfkd_jax.control import PathLaw
 from sfkd_jax.data import Dataset, to_path
@@ -87,12 +87,12 @@ def _claims(
             )
             claims = claims._replace(conformal=tube)
         except ValueError as reason:
-            artefacts.print_message(f"  no conformal tube: {reason}")
+            store.print_message(f"  no conformal tube: {reason}")
     proof = system.certificate
     if proof is None:
         return claims
     if (len(proof["tube"]["latent"]), proof["d_bar"]["level"]) != (horizon, level):
-        artefacts.print_message(
+        store.print_message(
             "  the certificate is of another horizon or level and is not compared"
         )
         return claims

@@ -10,7 +10,7 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 
-from sfkd_jax import artefacts, build, policy
+from sfkd_jax import build, policy, store
 from sfkd_jax.data import (
     SCENARIOS,
     Columns,
@@ -19,7 +19,7 @@ from sfkd_jax.data import (
     from_logs,
     split,
 )
-from sfkd_jax.pipeline import path_law, store
+from sfkd_jax.pipeline import path_law, runs
 from sfkd_jax.pipeline.train_policy import train_policy
 from sfkd_jax.plants import check_step
 from sfkd_jax.ranges import imported
@@ -32,13 +32,13 @@ SWITCHING = 2
 
 def ensure_dataset(settings: dict[str, Any]) -> tuple[Dataset, str]:
     """Return the data set and its hash; simulate or read it if it is missing."""
-    path = store.dataset_path(settings)
-    if not artefacts.exists(path):
-        with artefacts.locked(path.parent, wait=True):  # other runs share the data set
-            if not artefacts.exists(path):
-                make = _read_logs if store.is_logged(settings) else _simulate
-                store.write_dataset(settings, make(settings))
-    return store.read_dataset(settings)
+    path = runs.dataset_path(settings)
+    if not store.exists(path):
+        with store.locked(path.parent, wait=True):  # other runs share the data set
+            if not store.exists(path):
+                make = _read_logs if runs.is_logged(settings) else _simulate
+                runs.write_dataset(settings, make(settings))
+    return runs.read_dataset(settings)
 
 
 def _simulate(settings: dict[str, Any]) -> Dataset:
@@ -51,9 +51,9 @@ def _simulate(settings: dict[str, Any]) -> Dataset:
     options = settings["dataset"]
     drive_key, split_key = jax.random.split(jax.random.key(options["seed"]))
     generate = path_law.generator(settings, build.as_kwargs(options, *SPLIT, "law"))
-    artefacts.print_message(f"generating {options['segments']} segments")
+    store.print_message(f"generating {options['segments']} segments")
     trajectories = jax.jit(generate)(drive_key)
-    if store.is_along_path(settings):
+    if runs.is_along_path(settings):
         check_on_path(trajectories)
     low, high = jnp.asarray(options["env_low"]), jnp.asarray(options["env_high"])
     return split(
@@ -80,19 +80,19 @@ def _read_logs(settings: dict[str, Any]) -> Dataset:
             f"vehicle {plant.name} has {', '.join(plant.state_names)}; "
             "name as many, in this order"
         )
-    artefacts.print_message(f"reading {options['path']}")
+    store.print_message(f"reading {options['path']}")
     logged = from_logs(
         options["path"],
         columns,
-        report=artefacts.print_message,
+        report=store.print_message,
         dt=plant.dt,
         wheelbase=plant.wheelbase,
-        needs_environment=store.has_environment(settings),
+        needs_environment=runs.has_environment(settings),
         limits=(plant.control_low or None, plant.control_high or None),
         **build.as_kwargs(options, "path", "columns"),
     )
-    artefacts.write_json(
-        store.dataset_path(settings).with_name("coverage.json"), logged.coverage
+    store.write_json(
+        runs.dataset_path(settings).with_name("coverage.json"), logged.coverage
     )
     return logged.dataset
 
@@ -163,15 +163,15 @@ def ensure_policy(settings: dict[str, Any]) -> policy.TrainedModel:
             trained by another process.
         ValueError: the logs are too few for the levels of the certificate.
     """
-    run_dir = store.run_directory(settings)
+    run_dir = runs.run_directory(settings)
     if factory := settings["model"].get("factory"):
         imported(factory, "model.factory")
-    if not artefacts.exists(run_dir / "policy.npz"):
-        if store.is_logged(settings):
+    if not store.exists(run_dir / "policy.npz"):
+        if runs.is_logged(settings):
             _check_calibration_size(settings)
-        with artefacts.locked(run_dir):
-            store.claim(settings)
-            if not artefacts.exists(run_dir / "policy.npz"):
+        with store.locked(run_dir):
+            runs.claim(settings)
+            if not store.exists(run_dir / "policy.npz"):
                 train_policy(settings, *ensure_dataset(settings))
-    store.claim(settings)
+    runs.claim(settings)
     return policy.restore(run_dir)

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 from typing import Any
 
-from sfkd_jax import artefacts, build, policy
-from sfkd_jax.pipeline import path_law, stages, store
+from sfkd_jax import build, policy, store
+from sfkd_jax.pipeline import path_law, runs, stages
 from sfkd_jax.plants import Vehicle
 
 
@@ -49,13 +49,9 @@ def policy_system(settings: dict[str, Any]) -> build.System:
     """
     trained = stages.ensure_policy(settings)
     fallback = settings["controller"].get("monitor", {}).get("fallback", "none")
-    certificate, reason = policy.read_certificate(
-        store.run_directory(settings), trained
-    )
+    certificate, reason = policy.read_certificate(runs.run_directory(settings), trained)
     if certificate is None:
-        artefacts.print_message(
-            f"nothing is certified and nothing is monitored: {reason}"
-        )
+        store.print_message(f"nothing is certified and nothing is monitored: {reason}")
         if fallback != "none":
             raise ValueError(
                 f"controller.monitor.fallback={fallback} needs a certificate; {reason}"

@@ -8,7 +8,7 @@ from typing import Any
 import jax
 import numpy as np
 
-from sfkd_jax import artefacts, build, policy
+from sfkd_jax import build, policy, store
 from sfkd_jax.certification import contraction_metrics
 from sfkd_jax.data import (
     SCENARIOS,
@@ -19,7 +19,7 @@ from sfkd_jax.data import (
     spread_windows,
 )
 from sfkd_jax.evaluation import baselines, open_loop
-from sfkd_jax.pipeline import path_law, store
+from sfkd_jax.pipeline import path_law, runs
 from sfkd_jax.rollout import fold
 from sfkd_jax.training import fit, multi_step_loss
 from sfkd_jax.types import Key, Model, Params, Space, Trajectory
@@ -39,8 +39,8 @@ def train_policy(settings: dict[str, Any], dataset: Dataset, data_hash: str) -> 
         dataset: all of its parts.
         data_hash: of the data set.
     """
-    run_dir, options = store.run_directory(settings), dict(settings["training"])
-    recorded = store.policy_settings(settings, dataset)
+    run_dir, options = runs.run_directory(settings), dict(settings["training"])
+    recorded = runs.policy_settings(settings, dataset)
     dataset = dataset._replace(
         train=first_share(dataset.train, options.pop("data_share"))
     )
@@ -51,9 +51,7 @@ def train_policy(settings: dict[str, Any], dataset: Dataset, data_hash: str) -> 
     horizon = options["window"]
     key = jax.random.fold_in(jax.random.key(settings["seed"]), 0)
     if model.fitting.identify is not None:
-        artefacts.print_message(
-            f"identifying {settings['model']['system']} in {run_dir}"
-        )
+        store.print_message(f"identifying {settings['model']['system']} in {run_dir}")
         params, best = (
             model.fitting.identify(dataset.train, dataset.validation, key),
             None,
@@ -66,7 +64,7 @@ def train_policy(settings: dict[str, Any], dataset: Dataset, data_hash: str) -> 
         )
     )
     errors = predict(params, dataset.test)
-    document = store.open_loop_document(
+    document = runs.open_loop_document(
         errors,
         dataset.test,
         settings["vehicle"]["dt"],
@@ -75,7 +73,7 @@ def train_policy(settings: dict[str, Any], dataset: Dataset, data_hash: str) -> 
     document["validation_score"] = _validation_score(
         model, params, space, dataset, horizon
     )
-    artefacts.write_json(run_dir / "open_loop.json", document)
+    store.write_json(run_dir / "open_loop.json", document)
     recorded |= {"controller": settings["controller"], "experiment": settings["name"]}
     recorded |= {"space": build.space_to_settings(space), "best_step": best}
     policy.save(
@@ -110,7 +108,7 @@ def _baselines(
     settings: dict[str, Any], dataset: Dataset, horizon: int
 ) -> dict[str, jax.Array]:
     """Open-loop errors of naive predictors on the test part."""
-    along_path = store.is_along_path(settings)
+    along_path = runs.is_along_path(settings)
     plant = (
         path_law.closed_loop(settings)
         if along_path
@@ -135,12 +133,12 @@ def _fit(
     key: Key,
 ) -> tuple[Params, int | None]:
     """Fit a model by gradient descent; return the best weights and their step."""
-    run_dir, options = store.run_directory(settings), dict(options)
+    run_dir, options = runs.run_directory(settings), dict(options)
     length, start = options.pop("window"), options.pop("start", "random")
     loss = multi_step_loss(model, space, **options.pop("loss"))
     draw = partial(random_windows, batch=options.pop("batch"), length=length)
     held_out = spread_windows(dataset.validation, length=length)
-    artefacts.print_message(
+    store.print_message(
         f"training {settings['model']['system']}, {options['steps']} steps, "
         f"in {run_dir}"
     )

@@ -7,7 +7,6 @@ from functools import partial
 from pathlib import Path
 from typing import Any, TypeAlias
 
-from sfkd_jax.artefacts import ArtefactError, as_artefact_error, write_bytes, writing
 from sfkd_jax.evaluation.formats import plain
 from sfkd_jax.evaluation.metrics import Row
 from sfkd_jax.reporting._certificate import certified
@@ -18,6 +17,7 @@ from sfkd_jax.reporting.blocks import Block, Heading, Picture, to_html, to_markd
 from sfkd_jax.reporting.corridor import corridor
 from sfkd_jax.reporting.run import Run, read_optional, read_run
 from sfkd_jax.reporting.style import label
+from sfkd_jax.store import ArtefactError, as_artefact_error, write_bytes, writing
 
 Studies: TypeAlias = Callable[[list[list[Row]], Path], list[Block]]
 

@@ -5,11 +5,11 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from sfkd_jax.artefacts import as_artefact_error, print_message, read_json, read_jsonl
 from sfkd_jax.evaluation.formats import dig, is_number
 from sfkd_jax.evaluation.metrics import Row
 from sfkd_jax.reporting.rows import groups_of, headline, model_of
 from sfkd_jax.reporting.scene import Scene, scenes_of
+from sfkd_jax.store import as_artefact_error, print_message, read_json, read_jsonl
 
 
 class Run(NamedTuple):

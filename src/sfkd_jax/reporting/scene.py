@@ -9,9 +9,9 @@ from typing import Any, NamedTuple, TypeAlias
 import numpy as np
 from jaxtyping import Float
 
-from sfkd_jax.artefacts import ROAD, SHARED, parse_drive_name, read_npz
 from sfkd_jax.reporting.rows import search_words
 from sfkd_jax.reporting.style import file_stem, literal, scenario_label
+from sfkd_jax.store import ROAD, SHARED, parse_drive_name, read_npz
 
 _Arrays: TypeAlias = dict[str, np.ndarray]
 _Drive: TypeAlias = tuple[dict[str, str], _Arrays, _Arrays]

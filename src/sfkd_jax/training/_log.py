@@ -23,7 +23,7 @@ from tensorboardX.event_file_writer import EventsWriter
 from tensorboardX.proto.event_pb2 import Event, SessionLog  # pyright: ignore[reportAttributeAccessIssue] made by protobuf
 from tensorboardX.summary import scalar
 
-from sfkd_jax.artefacts import print_message, truncate_jsonl
+from sfkd_jax.store import print_message, truncate_jsonl
 
 RESUME_HINT = "the same command goes on from the last checkpoint"
 

@@ -14,8 +14,8 @@ from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any, BinaryIO
 
-from sfkd_jax.artefacts._content import plain
-from sfkd_jax.artefacts._json import parse
+from sfkd_jax.store._content import plain
+from sfkd_jax.store._json import parse
 
 MAX_BYTES = 1 << 24
 """Size of a document; the largest of this package has 0.6 MB. Parsed JSON takes up to

@@ -11,10 +11,10 @@ import pytest
 from helpers import dataset
 
 from sfkd_jax import data as datasets
-from sfkd_jax.artefacts import ArtefactError
-from sfkd_jax.pipeline import stages, store
+from sfkd_jax.pipeline import runs, stages
+from sfkd_jax.store import ArtefactError
 
-SETTINGS = {name: {} for name in store.IDENTITY} | {
+SETTINGS = {name: {} for name in runs.IDENTITY} | {
     "model": {"system": "sfkd"},
     "seed": 0,
     "name": "trial",
@@ -24,28 +24,28 @@ SETTINGS = {name: {} for name in store.IDENTITY} | {
 @pytest.mark.parametrize("name", ["[a]", "trial=[1,2]"])
 def test_a_path_that_checkpoints_cannot_be_read_from_is_refused_at_once(tmp_path, name):
     with pytest.raises(ValueError, match=r"cannot be read back from a path with \[ \]"):
-        store.claim(SETTINGS | {"root": str(tmp_path), "name": name})
+        runs.claim(SETTINGS | {"root": str(tmp_path), "name": name})
     assert list(tmp_path.iterdir()) == []
 
 
 def test_other_unusual_names_are_claimed(tmp_path):
     settings = SETTINGS | {"root": str(tmp_path), "name": "a=0.1,b=c d"}
-    store.claim(settings)
-    assert (Path(store.run_directory(settings)) / "settings.json").exists()
+    runs.claim(settings)
+    assert (Path(runs.run_directory(settings)) / "settings.json").exists()
 
 
 def test_a_run_that_kept_nothing_does_not_block_its_correction(tmp_path):
     """A first attempt with a mistake records its settings before it fails."""
     first = SETTINGS | {"root": str(tmp_path)}
     second = first | {"training": {"steps": 25}}
-    store.claim(first)
-    store.claim(second)
-    recorded = Path(store.run_directory(second)) / "settings.json"
+    runs.claim(first)
+    runs.claim(second)
+    recorded = Path(runs.run_directory(second)) / "settings.json"
     assert json.loads(recorded.read_text())["training"] == {"steps": 25}
     (recorded.parent / "checkpoints" / "25").mkdir(parents=True)
-    store.claim(second)
+    runs.claim(second)
     with pytest.raises(ArtefactError, match="was made with other settings"):
-        store.claim(first)
+        runs.claim(first)
 
 
 def generated(tmp_path):
@@ -53,12 +53,12 @@ def generated(tmp_path):
     box = {"env_low": [0.3, -8.0], "env_high": [0.9, 8.0]}
     settings = SETTINGS | {"root": str(tmp_path), "dataset": box}
     settings |= {"vehicle": {"name": "kinematic"}}
-    store.write_dataset(settings, dataset(count=20, steps=8))
+    runs.write_dataset(settings, dataset(count=20, steps=8))
     return settings
 
 
 def test_a_data_set_comes_back_with_the_scenario_of_every_segment(tmp_path):
-    stored, _ = store.read_dataset(generated(tmp_path))
+    stored, _ = runs.read_dataset(generated(tmp_path))
     for part, labels in dataset(count=20, steps=8).scenarios.items():
         np.testing.assert_array_equal(stored.scenarios[part], labels)
         assert len(labels) == len(getattr(stored, part).controls)
@@ -66,9 +66,9 @@ def test_a_data_set_comes_back_with_the_scenario_of_every_segment(tmp_path):
 
 def test_a_data_set_of_an_earlier_version_is_refused_in_one_line(tmp_path):
     settings = generated(tmp_path)
-    store.write_dataset(settings, dataset(count=20, steps=8)._replace(scenarios=None))
+    runs.write_dataset(settings, dataset(count=20, steps=8)._replace(scenarios=None))
     with pytest.raises(ArtefactError, match="made by an earlier version") as refusal:
-        store.read_dataset(settings)
+        runs.read_dataset(settings)
     assert "\n" not in str(refusal.value)
 
 
@@ -88,7 +88,7 @@ def test_coverage_is_measured_on_the_segments_of_each_scenario(tmp_path, monkeyp
 
 def test_baselines_stand_beside_the_errors_of_the_model():
     errors = jnp.asarray([[0.3, 0.4, 0.1, 0.2], [0.6, 0.8, 0.2, 0.3]])
-    document = store.open_loop_document(
+    document = runs.open_loop_document(
         errors, dataset(count=20, steps=8).test, 0.1, {"constant_turn": 2.0 * errors}
     )
     assert document["steps"] == [1, 2]

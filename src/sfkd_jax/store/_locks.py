@@ -14,8 +14,8 @@ from pathlib import Path
 
 from filelock import BaseFileLock, FileLock, SoftFileLock, Timeout
 
-from sfkd_jax.artefacts._files import ArtefactError, failure, read_json, write_json
-from sfkd_jax.artefacts._lines import print_message
+from sfkd_jax.store._files import ArtefactError, failure, read_json, write_json
+from sfkd_jax.store._lines import print_message
 
 LOCK, HOLDER = ".lock", ".lock.json"
 GRACE_S = 2.0

@@ -11,7 +11,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from sfkd_jax import artefacts
+from sfkd_jax import store
 from sfkd_jax.data import Dataset, environment_box, fingerprint
 from sfkd_jax.types import BODY, Trajectory
 
@@ -39,7 +39,7 @@ def exclusive(run: Callable[[dict[str, Any]], Any]) -> Callable[[dict[str, Any]]
 
     @functools.wraps(run)
     def locked(settings: dict[str, Any]) -> Any:
-        with artefacts.locked(run_directory(settings)):
+        with store.locked(run_directory(settings)):
             return run(settings)
 
     return locked
@@ -47,7 +47,7 @@ def exclusive(run: Callable[[dict[str, Any]], Any]) -> Callable[[dict[str, Any]]
 
 def dataset_path(settings: dict[str, Any]) -> Path:
     """Return the path of a data set, which runs of equal data settings share."""
-    digest = artefacts.sha256(dataset_config(settings))[:8]
+    digest = store.sha256(dataset_config(settings))[:8]
     name = f"{settings['vehicle']['name']}-{digest}"
     return Path(settings["root"]) / "datasets" / name / "dataset.npz"
 
@@ -92,7 +92,7 @@ def write_dataset(settings: dict[str, Any], dataset: Dataset) -> dict[str, Any]:
         arrays |= {f"{part}/scenario": np.asarray(labels[part]) for part in PARTS}
     path = dataset_path(settings)
     path.parent.mkdir(parents=True, exist_ok=True)
-    return artefacts.write_arrays(
+    return store.write_arrays(
         path, arrays, kind=DATASET, config=dataset_config(settings)
     )
 
@@ -104,10 +104,10 @@ def read_dataset(settings: dict[str, Any]) -> tuple[Dataset, str]:
         ArtefactError: missing, damaged, made with other settings, or by an earlier
             version that did not store scenarios.
     """
-    arrays, manifest = artefacts.read_arrays(
+    arrays, manifest = store.read_arrays(
         dataset_path(settings), kind=DATASET, config=dataset_config(settings)
     )
-    with artefacts.as_artefact_error(dataset_path(settings)):
+    with store.as_artefact_error(dataset_path(settings)):
         parts = [
             Trajectory(
                 *(jnp.asarray(arrays[f"{part}/{name}"]) for name in Trajectory._fields)
@@ -117,7 +117,7 @@ def read_dataset(settings: dict[str, Any]) -> tuple[Dataset, str]:
     scenarios = None
     if not is_logged(settings):
         if f"{PARTS[0]}/scenario" not in arrays:
-            raise artefacts.ArtefactError(
+            raise store.ArtefactError(
                 f"{dataset_path(settings)}: made by an earlier version, without the "
                 "scenario of each segment; delete it and generate it again"
             )
@@ -142,12 +142,12 @@ def write_law(settings: dict[str, Any], arrays: dict[str, Any]) -> None:
     path = law_path(settings)
     path.parent.mkdir(parents=True, exist_ok=True)
     plain = {name: np.asarray(array) for name, array in arrays.items()}
-    artefacts.write_arrays(path, plain, kind=LAW, config=dataset_config(settings))
+    store.write_arrays(path, plain, kind=LAW, config=dataset_config(settings))
 
 
 def read_law(settings: dict[str, Any]) -> dict[str, np.ndarray]:
     """Return the arrays of the law."""
-    return artefacts.read_arrays(
+    return store.read_arrays(
         law_path(settings), kind=LAW, config=dataset_config(settings)
     )[0]
 
@@ -179,23 +179,23 @@ def claim(settings: dict[str, Any]) -> None:
             f"with {' '.join(sorted(unreadable))}: {path}"
         )
     if path.exists():
-        changed = artefacts.differences(artefacts.read_json(path), identity(settings))
+        changed = store.differences(store.read_json(path), identity(settings))
         if not changed:
             return
         if _has_weights(path.parent):
-            raise artefacts.ArtefactError(
+            raise store.ArtefactError(
                 f"{path.parent} was made with other settings "
                 f"({'; '.join(changed[:3])}); pass name=… for another run"
             )
     path.parent.mkdir(parents=True, exist_ok=True)
-    artefacts.write_json(path, identity(settings))
+    store.write_json(path, identity(settings))
 
 
 def _has_weights(run_dir: Path) -> bool:
     """Whether a run has trained weights or a checkpoint."""
     checkpoints = run_dir / "checkpoints"
     kept = checkpoints.is_dir() and any(checkpoints.iterdir())
-    return kept or artefacts.exists(run_dir / "policy.npz")
+    return kept or store.exists(run_dir / "policy.npz")
 
 
 def boxes(dataset: Dataset) -> dict[str, Any]:

@@ -10,7 +10,7 @@ from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from sfkd_jax.artefacts._files import (
+from sfkd_jax.store._files import (
     ArtefactError,
     decode,
     encode,

@@ -19,7 +19,7 @@ from typing import Any, BinaryIO, Literal
 
 import numpy as np
 
-from sfkd_jax.artefacts._files import ArtefactError, failure, open_regular
+from sfkd_jax.store._files import ArtefactError, failure, open_regular
 
 PORTABLE = "biufcSUmM"
 """Kinds of dtype that an .npz file preserves."""

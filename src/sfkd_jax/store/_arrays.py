@@ -27,8 +27,8 @@ from typing import Any
 
 import numpy as np
 
-from sfkd_jax.artefacts._content import differences, plain, sha256
-from sfkd_jax.artefacts._files import (
+from sfkd_jax.store._content import differences, plain, sha256
+from sfkd_jax.store._files import (
     ArtefactError,
     encode,
     failure,
@@ -37,8 +37,8 @@ from sfkd_jax.artefacts._files import (
     replacement,
     synchronise,
 )
-from sfkd_jax.artefacts._npz import PORTABLE, check_zip, members, write_npz
-from sfkd_jax.artefacts._provenance import versions
+from sfkd_jax.store._npz import PORTABLE, check_zip, members, write_npz
+from sfkd_jax.store._provenance import versions
 
 FORMAT = 1
 """Version of the manifest; a reader refuses every other one."""

@@ -1,0 +1,34 @@
+"""Read and write arrays and JSON; every failure is one line that names the file."""
+
+from sfkd_jax.store._arrays import exists as exists
+from sfkd_jax.store._arrays import read_arrays as read_arrays
+from sfkd_jax.store._arrays import write_arrays as write_arrays
+from sfkd_jax.store._content import differences as differences
+from sfkd_jax.store._content import flatten as flatten
+from sfkd_jax.store._content import sha256 as sha256
+from sfkd_jax.store._content import unflatten as unflatten
+from sfkd_jax.store._drives import ROAD as ROAD
+from sfkd_jax.store._drives import SHARED as SHARED
+from sfkd_jax.store._drives import drive_name as drive_name
+from sfkd_jax.store._drives import identity as identity
+from sfkd_jax.store._drives import merge as merge
+from sfkd_jax.store._drives import parse_drive_name as parse_drive_name
+from sfkd_jax.store._drives import with_current_names as with_current_names
+from sfkd_jax.store._files import ArtefactError as ArtefactError
+from sfkd_jax.store._files import as_artefact_error as as_artefact_error
+from sfkd_jax.store._files import one_line as one_line
+from sfkd_jax.store._files import open_regular as open_regular
+from sfkd_jax.store._files import read_json as read_json
+from sfkd_jax.store._files import write_bytes as write_bytes
+from sfkd_jax.store._files import write_json as write_json
+from sfkd_jax.store._files import writing as writing
+from sfkd_jax.store._lines import append_jsonl as append_jsonl
+from sfkd_jax.store._lines import print_message as print_message
+from sfkd_jax.store._lines import read_jsonl as read_jsonl
+from sfkd_jax.store._lines import truncate_jsonl as truncate_jsonl
+from sfkd_jax.store._locks import DirectoryLocked as DirectoryLocked
+from sfkd_jax.store._locks import locked as locked
+from sfkd_jax.store._npz import read_npz as read_npz
+from sfkd_jax.store._provenance import provenance as provenance
+from sfkd_jax.store._provenance import source_hash as source_hash
+from sfkd_jax.store._provenance import versions as versions
