@@ -128,8 +128,6 @@ def test_rows_count_violations_and_the_theorem_is_never_one(smoke):
     assert rows["sfkd"]["violation"]["v1_tube"] == "certified"
     assert rows["nominal"]["violation"]["v0"] is None
     assert rows["nominal"]["violation"]["v1_tube"] == "conformal"
-    assert 0.0 <= rows["sfkd"]["breach_steps"] <= 1.0
-    assert rows["nominal"]["breach_steps"] is None
 
 
 def test_the_same_command_again_trains_nothing_and_ends_the_same(smoke):
@@ -160,10 +158,6 @@ def test_load_gives_a_policy_without_heavy_imports(smoke):
         act = jax.jit(policy.controller.act)
         control, state, info = act(policy.params, state, jnp.array([0.0, 0.3, 0.0, 10.0]), env, road)
         assert control.shape == (2,) and bool(info["healthy"]) and policy.certificate["valid"]
-        assert not bool(info["breach"]) and not bool(info["box_exit"])
-        far = jnp.array([0.0, 0.3, 0.0, 40.0])
-        _, state, info = act(policy.params, state, far, env, road)
-        assert bool(info["breach"]) and bool(info["box_exit"]) and int(info["breaches"]) == 1
         from sfkd_jax.certification import Certificate, verify
         verify(Certificate.from_document(policy.certificate), policy.params, model=policy.model)
         assert "cvxpy" not in sys.modules

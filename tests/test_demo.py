@@ -105,7 +105,9 @@ def test_a_policy_with_settings_of_another_version_is_named_in_one_line(
 
 
 def test_shipped_policies_also_work_with_an_estimated_environment():
-    trained = policy.load(demo.SHIPPED / "kinematic", env_source="estimated")
+    with pytest.raises(ValueError, match="path coordinates"):
+        policy.load(demo.SHIPPED / "kinematic", env_source="estimated")
+    trained = policy.load(demo.SHIPPED / "kinematic_path", env_source="estimated")
     act, state = (
         jax.jit(trained.controller.act),
         trained.controller.init(jax.random.key(0)),
@@ -121,4 +123,3 @@ def test_shipped_policies_also_work_with_an_estimated_environment():
     np.testing.assert_allclose(
         info["env_estimate"], [0.6, 0.0], atol=1e-4
     )  # nothing has moved yet
-    assert not info["box_exit"]

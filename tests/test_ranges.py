@@ -60,7 +60,6 @@ UNKNOWN = {
     "controller.sampling": "none",
     "controller.mppi.noise": "brown",
     "controller.mppi.risk": "most",
-    "controller.monitor.fallback": "stop",
     "certification.mode": "both",
     "evaluation.systems": ["self", "oracel"],
     "env_source": "guessed",

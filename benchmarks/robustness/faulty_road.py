@@ -102,9 +102,8 @@ def controlled(plant, env_source, delay, samples, adaptive):
     """The shipped policy as a user has it: (vehicle, params, controller, sensor noise)."""
     directory = SHIPPED / (f"{plant}_path" if adaptive else plant)
     settings = sfkd_jax.load(directory).settings
-    changes = {"monitor": {"fallback": "hold"}, "mppi": {"num_samples": samples}}
     chosen = settings["controller"] | {"adaptive": adaptive}
-    chosen |= {name: chosen[name] | change for name, change in changes.items()}
+    chosen["mppi"] = chosen["mppi"] | {"num_samples": samples}
     policy = sfkd_jax.load(directory, controller=chosen, env_source=env_source)
     controller = policy.controller
     if delay:

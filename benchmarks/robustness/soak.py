@@ -37,7 +37,7 @@ ENVIRONMENT = {
 PAGE_KB = os.sysconf("SC_PAGE_SIZE") / 1024
 VARIANTS = {
     "measured": ("steps", {}),
-    "estimated": ("short", {"env_source": "estimated"}),
+    "estimated": ("short", {"env_source": "estimated", "adaptive": True}),
     "delayed": ("short", {"delay": 2}),
     "no_faults": ("short", {"faulty": False}),
     "full": ("full", {"samples": 1500}),

@@ -50,12 +50,7 @@ def policy_driver(trained, system):
         "env": "measured",
         "alpha": trained.certificate and trained.certificate["alpha"],
     }
-    return Driver(
-        trained.controller,
-        trained.params,
-        len(names),
-        about | {"watched": trained.certificate is not None},
-    )
+    return Driver(trained.controller, trained.params, len(names), about)
 
 
 def nominal_driver(args, plant, system, states):
@@ -66,7 +61,7 @@ def nominal_driver(args, plant, system, states):
         controller,
         result.params,
         states,
-        {"system": system, "env": result.env_source, "alpha": None, "watched": False},
+        {"system": system, "env": result.env_source, "alpha": None},
     )
 
 
@@ -110,20 +105,13 @@ def rows_of(plant, driver, track, args, paths):
             lambda leaf, chosen=chosen: leaf[chosen], (episodes, roads.envs)
         )
         scores = evaluation.score(part, np.asarray(envs), dt=plant.dt)
-        about = {
-            name: value for name, value in driver.about.items() if name != "watched"
-        }
-        about |= {
+        about = driver.about | {
             "scenario": f"s1, friction {friction}",
             "friction": friction,
             "vehicle": plant.name,
         }
         about |= {"sampling": args["controller"]["sampling"], "variation": None}
-        rows.append(
-            evaluation.row(
-                scores, about, None, nothing, watched=driver.about["watched"]
-            )
-        )
+        rows.append(evaluation.row(scores, about, None, nothing))
     return rows
 
 

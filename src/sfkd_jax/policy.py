@@ -152,28 +152,30 @@ def load(
     Args:
         path: of the directory, or of a policy.npz with its manifest beside it.
         controller: settings of a controller to build instead of the saved one.
-        env_source: "estimated" for a controller that estimates the environment and
-            ignores the one it is given.
+        env_source: "estimated" for a policy in path coordinates that estimates the
+            environment and ignores the one it is given.
         adaptive: whether a policy in path coordinates estimates unmeasured forces and
             errors of its inputs while driving, see `control.adaptive`.
 
     Raises:
-        ArtefactError: as `restore`; a certificate that does not hold; or none, and
-            `controller.monitor.fallback` needs one.
+        ArtefactError: as `restore`, or a certificate that does not hold.
+        ValueError: `controller` does not fit the policy, or an estimate is asked of a
+            policy that is not in path coordinates.
     """
     trained = restore(path)
     file = _file(path)
     certificate, reason = read_certificate(path, trained)
     settings: dict[str, Any] = trained.settings | {"env_source": env_source}
-    # A ValueError is about the file, unless the caller gave the controller.
+    # A ValueError is about the file, unless the caller asked for something else.
     errors: tuple[type[Exception], ...] = (ValueError,)
+    if controller is not None or env_source != "measured" or adaptive:
+        errors = ()
     if controller is not None:
-        settings, errors = settings | {"controller": dict(controller)}, ()
+        settings |= {"controller": dict(controller)}
     with store.as_artefact_error(
         file.with_suffix(".json"), *errors, advice=_advice(trained.version)
     ):
         options, box = settings["controller"], settings["dataset"]
-        fallback = options.get("monitor", {}).get("fallback", "none")
         planner = build.build_controller(
             options,
             trained.model,
@@ -186,15 +188,7 @@ def load(
             adaptive=adaptive,
         )
     if certificate is None:
-        if fallback != "none":
-            raise store.ArtefactError(
-                f"{file}: controller.monitor.fallback={fallback} "
-                f"needs a certificate; {reason}"
-            )
-        warnings.warn(
-            f"{file}: nothing is certified and nothing is monitored; {reason}",
-            stacklevel=2,
-        )
+        warnings.warn(f"{file}: nothing is certified; {reason}", stacklevel=2)
     # A certificate speaks of float32; accelerators would multiply with ten bits.
     with jax.default_matmul_precision("float32"):
         params = jax.jit(fold, static_argnums=0)(trained.model, trained.params)

@@ -250,17 +250,8 @@ class ControllerInfo(TypedDict, total=False):
     gains: Float[Array, "control state"]  # du/dx of the plan, see `between_plans`
     # koopman_mpc
     residual: Scalar  # of the quadratic program, in control units
-    # monitored
-    breach: Bool[Array, ""]  # a disturbance exceeds its bound
-    box_exit: Bool[Array, ""]  # (s, u, e) is outside its box
-    breaches: Int[Array, ""]  # number of steps with a breach so far
-    box_exits: Int[Array, ""]  # number of steps with a box exit so far
-    disturbance: Float[Array, " 4"]  # latent [-], position [m], yaw [rad], body state
-    fallback_active: Bool[Array, ""]
-    # estimated
-    env_estimate: Float[Array, " environment"]  # mean over the hypotheses
-    env_spread: Float[Array, " environment"]  # standard deviation over the hypotheses
-    # adaptive, with env_estimate
+    # adaptive
+    env_estimate: Float[Array, " environment"]  # the e planned with
     causes: Float[Array, " 5"]  # force, steering, drive; steering and force in turns
     causes_std: Float[Array, " 5"]  # standard deviations of the estimates
     rejected: Bool[Array, ""]  # nothing was learned from the measurement

@@ -261,33 +261,16 @@ def test_a_setting_that_changed_leaves_nothing_certified_and_says_so(
     )
     with pytest.warns(
         UserWarning,
-        match="nothing is certified and nothing is monitored; .* other weights or settings",
+        match="nothing is certified; .* other weights or settings",
     ):
         loaded = policy.load(copied)
     assert loaded.certificate is None
 
 
-def test_a_certificate_is_loaded_without_a_word_and_its_monitor_with_it(copied):
+def test_a_certificate_is_loaded_without_a_word(copied):
     with warnings.catch_warnings():
         warnings.simplefilter("error")
         assert policy.load(copied).certificate["valid"]
-
-
-@pytest.mark.parametrize("fallback", ["hold", "slow"])
-def test_a_fallback_needs_a_certificate(copied, fallback):
-    controller = shipped().settings["controller"]
-    controller = controller | {
-        "monitor": controller["monitor"] | {"fallback": fallback}
-    }
-    policy.load(copied, controller=controller)
-    (copied / "certificate.json").unlink()
-    line = refusal_of(lambda: policy.load(copied, controller=controller))
-    assert (
-        f"controller.monitor.fallback={fallback} needs a certificate; certificate.json is missing"
-        in line
-    )
-    with pytest.warns(UserWarning, match=r"certificate.json is missing"):
-        assert policy.load(copied).certificate is None
 
 
 def test_a_forged_certificate_is_an_error_that_names_the_file(copied):

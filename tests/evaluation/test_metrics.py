@@ -24,8 +24,6 @@ EXPECTED = {
     "smoothness_rad_per_s": ((0.01, 0.02, 0.06, 0.09), 0.045, 0.045),
     "departures": ((False, False, False, True), 1, 2),
     "unhealthy_steps": ((0.1, 0.2, 0.6, 0.9), 0.45, 0.45),
-    "breach_steps": ((0.1, 0.2, 0.6, 0.9), 0.45, 0.45),
-    "box_exit_steps": ((0.9, 0.8, 0.4, 0.1), 0.55, 0.55),
     "ess": ((10.0, 20.0, 60.0, 90.0), 40.0, 40.0),
 }
 
@@ -41,17 +39,16 @@ def batch():
             steering=0.1 * level * time,
             ess=np.full(STEPS, 100.0 * level),
             healthy=~flagged,
-            breach=flagged,
         )
-        parts.append(part._replace(box_exit=~flagged[None]))
+        parts.append(part)
         envs[number, 100:, 0] = 0.3 if number else 0.9
     joined = Episode(*(np.concatenate(leaf) for leaf in zip(*parts, strict=True)))
     return joined, envs
 
 
-def made(seed=0, *, watched=True):
+def made(seed=0):
     scores = score(*batch(), dt=DT)
-    return row(scores, about("sfkd", seeds=[seed]), (1.5, 2.5), {}, watched=watched)
+    return row(scores, about("sfkd", seeds=[seed]), (1.5, 2.5), {})
 
 
 def mean_of(value):
@@ -82,12 +79,6 @@ def test_a_metric_of_known_episodes_is_exact_and_pools_as_stated(name):
     pooled = pool([made(0), made(1)])
     np.testing.assert_allclose(mean_of(metric.value(pooled)), of_seeds, rtol=1e-12)
     assert pool([made()]) == made()
-
-
-@pytest.mark.parametrize("metric", MEASURED, ids=lambda metric: metric.name)
-def test_a_metric_is_null_without_a_monitor_only_if_it_needs_one(metric):
-    value = metric.value(made(watched=False))
-    assert (value is None) == metric.monitored
 
 
 @pytest.mark.parametrize("metric", SHOWN, ids=lambda metric: metric.name)

@@ -17,7 +17,7 @@ TIME = np.arange(1, STEPS + 1) * DT
 CALM = np.broadcast_to([0.9, 0.0], (1, STEPS, 2))
 
 
-def episode(lateral, steering=None, states=None, ess=None, healthy=None, breach=None):
+def episode(lateral, steering=None, states=None, ess=None, healthy=None):
     """One episode as a batch, with what matters given and the rest at rest."""
     steps = len(lateral)
     controls = np.zeros((1, steps, 2))
@@ -35,10 +35,6 @@ def episode(lateral, steering=None, states=None, ess=None, healthy=None, breach=
         else np.asarray(healthy)[None],
         prediction_error=np.zeros((1, steps)),
         assumed_envs=np.zeros((1, steps, 2)),
-        breach=np.zeros((1, steps), bool)
-        if breach is None
-        else np.asarray(breach)[None],
-        box_exit=np.zeros((1, steps), bool),
     )
 
 
@@ -167,14 +163,9 @@ def test_a_state_that_is_not_finite_is_a_departure_whenever_it_happens(when):
 def test_sample_sizes_and_held_plans_are_summed_up():
     ess = np.where(np.arange(STEPS) < 150, 10.0, 1000.0)
     healthy = np.arange(STEPS) >= 20
-    scores = score(
-        episode(np.zeros(STEPS), ess=ess, healthy=healthy, breach=~healthy), CALM, dt=DT
-    )
+    scores = score(episode(np.zeros(STEPS), ess=ess, healthy=healthy), CALM, dt=DT)
     assert scores["ess"][0] == 10.0
     np.testing.assert_allclose(scores["unhealthy_steps"], [0.1])
-    np.testing.assert_allclose(
-        [*scores["breach_steps"], *scores["box_exit_steps"]], [0.1, 0.0]
-    )
 
 
 def test_episodes_are_scored_one_by_one():

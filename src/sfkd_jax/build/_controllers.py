@@ -5,7 +5,7 @@ from __future__ import annotations
 from typing import Any
 
 from sfkd_jax import control, plants
-from sfkd_jax.build._choices import Settings, as_kwargs, floats
+from sfkd_jax.build._choices import Settings, as_kwargs
 from sfkd_jax.build._planners import chosen_planner, controller_horizon
 from sfkd_jax.geometry import LATERAL
 from sfkd_jax.rollout import with_offset
@@ -33,7 +33,7 @@ def build_controller(
     law: control.PathLaw | None = None,
     adaptive: bool = False,
 ) -> Controller:
-    """Return the planner of the settings with its monitor, estimator or shield.
+    """Return the planner of the settings with its shield and adaptation.
 
     Args:
         settings: of the controller.
@@ -41,9 +41,8 @@ def build_controller(
         plant: vehicle, whose limits the controls keep.
         env_low: lower ends of the environment box E.
         env_high: upper ends of E.
-        certificate: bounds of a monitor around the planner; with a corridor and
-            `settings["shield"]`, of a shield.
-        env_source: one of `ENV_SOURCES`; "estimated" adds an estimator.
+        certificate: with a corridor and `settings["shield"]`, of a shield.
+        env_source: one of `ENV_SOURCES`; "estimated" needs path coordinates.
         law: that a model in path coordinates was learned around.
         adaptive: whether a controller along a path estimates unmeasured forces and
             errors of its inputs while driving, and slows down while its online tube
@@ -52,8 +51,8 @@ def build_controller(
 
     Raises:
         ValueError: an unknown planner, a vehicle without limits of its controls, a
-            model and a planner in different coordinates, or adaptation without path
-            coordinates.
+            model and a planner in different coordinates, or an estimate or adaptation
+            without path coordinates.
     """
     if not plant.control_low:
         raise ValueError(
@@ -75,19 +74,13 @@ def build_controller(
             return planner
         box = env_low, env_high
         return _adaptive(planner, settings, model, plant, law, box, env_source)
+    if env_source == "estimated":
+        raise ValueError(
+            "env_source=estimated needs a model in path coordinates: model.frame=path"
+        )
     if adaptive or settings.get("adaptive"):
         raise ValueError("adaptation needs a model in path coordinates")
-    planner = build(settings, model, plant, env_low, env_high)
-    watched = (
-        planner
-        if certificate is None
-        else _monitored(planner, settings, model, certificate)
-    )
-    return (
-        _estimated(watched, settings, model, plant, env_low, env_high)
-        if env_source == "estimated"
-        else watched
-    )
+    return build(settings, model, plant, env_low, env_high)
 
 
 def in_corridor(
@@ -139,21 +132,6 @@ def in_corridor(
     )
 
 
-def _monitored(
-    planner: Controller, settings: Settings, model: Model, certificate: Settings
-) -> Controller:
-    corners = {name: certificate["boxes"][name] for name in ("state", "control", "env")}
-    boxes = {
-        f"{name}_{side}": tuple(box[k])
-        for name, box in corners.items()
-        for k, side in enumerate(("low", "high"))
-    }
-    bounds = tuple(certificate["monitor"]["bounds"])
-    return control.monitored(
-        planner, model, bounds=bounds, **boxes, **as_kwargs(settings.get("monitor", {}))
-    )
-
-
 def _adaptive(
     planner: Controller,
     settings: Settings,
@@ -181,19 +159,4 @@ def _adaptive(
         adaptive,
         horizon=controller_horizon(settings),
         **as_kwargs(settings.get("online_tube", {})),
-    )
-
-
-def _estimated(
-    planner: Controller,
-    settings: Settings,
-    model: Model,
-    plant: plants.Vehicle,
-    env_low: Any,
-    env_high: Any,
-) -> Controller:
-    box = {"env_low": floats(env_low), "env_high": floats(env_high)}
-    sizes = {"states": len(plant.state_names), "controls": len(plant.control_low)}
-    return control.estimated(
-        planner, model, **box, **sizes, **as_kwargs(settings.get("estimator", {}))
     )

@@ -125,18 +125,7 @@ def _models() -> dict[str, type]:
 
 def _controllers() -> dict[str, type]:
     """One schema a planner: its own settings, and those of what is built around it."""
-    wrappers = {
-        "estimator": schema(
-            "EstimatorConfig",
-            control.estimated,
-            skip=(*_BY_PLANT, "states", "controls"),
-        ),
-        "monitor": schema(
-            "MonitorConfig",
-            control.monitored,
-            skip=(*_BY_PLANT, "bounds", "state_low", "state_high"),
-        ),
-    }
+    cost = schema("CostConfig", control.tracking_cost, skip=_BY_PLANT)
     along_path = {
         "adaptation": schema(
             "AdaptationConfig",
@@ -147,7 +136,6 @@ def _controllers() -> dict[str, type]:
             "OnlineTubeConfig", control.online_tube, skip=("horizon",)
         ),
     }
-    wrappers["cost"] = schema("CostConfig", control.tracking_cost, skip=_BY_PLANT)
     nodes = {}
     for name, planner in build.PLANNERS.items():
         own = schema(
@@ -156,7 +144,11 @@ def _controllers() -> dict[str, type]:
             skip=(*_BY_PLANT, *planner.given),
             entries=_CHANNELS,
         )
-        parts: dict[str, Any] = wrappers | {name: own, "task": _task(planner.samples)}
+        parts: dict[str, Any] = {
+            "cost": cost,
+            name: own,
+            "task": _task(planner.samples),
+        }
         sources: tuple[Any, ...] = (settings.Chosen,)
         if planner.samples:
             sources = (settings.Chosen, settings.Sampling)

@@ -70,10 +70,6 @@ from sfkd_jax.control.wrappers._adaptation import adaptive as adaptive
 from sfkd_jax.control.wrappers._adaptive_step import AdaptiveState as AdaptiveState
 from sfkd_jax.control.wrappers._delay import DelayState as DelayState
 from sfkd_jax.control.wrappers._delay import delay_compensated as delay_compensated
-from sfkd_jax.control.wrappers._estimation import EstimatorState as EstimatorState
-from sfkd_jax.control.wrappers._estimation import estimated as estimated
-from sfkd_jax.control.wrappers._monitor import MonitorState as MonitorState
-from sfkd_jax.control.wrappers._monitor import monitored as monitored
 from sfkd_jax.control.wrappers._online_tube import OnlineTubeState as OnlineTubeState
 from sfkd_jax.control.wrappers._online_tube import online_tube as online_tube
 from sfkd_jax.control.wrappers._safety_filter import FILTER_SCALES as FILTER_SCALES

@@ -26,8 +26,6 @@ class Episode(NamedTuple):
         prediction_error: one-step position error of the planner's model [m], (time,).
         assumed_envs: e that the controller planned with, observed or estimated,
             (time, environment).
-        breach: of a monitor's bounds, False without a monitor, (time,).
-        box_exit: whether a monitor saw its domain left, (time,).
         report: what `simulate` was asked to record besides, (time, …); () for nothing.
     """
 
@@ -39,8 +37,6 @@ class Episode(NamedTuple):
     healthy: Array
     prediction_error: Float[Array, " time"]
     assumed_envs: Float[Array, "time environment"]
-    breach: Array
-    box_exit: Array
     report: Any = ()
 
 
@@ -142,9 +138,8 @@ def _record(
 ) -> tuple[Array, ...]:
     """Fields of an `Episode` that the controller reports, from effective samples on."""
     miss = jnp.linalg.norm(info["predicted_states"][0, :2] - state[:2])
-    flags = [jnp.asarray(info.get(name, False)) for name in ("breach", "box_exit")]
     assumed = info.get("env_estimate", observed_env)
-    return info["effective_samples"], info["healthy"], miss, assumed, *flags
+    return info["effective_samples"], info["healthy"], miss, assumed
 
 
 def first_reference(

@@ -16,8 +16,6 @@ _ARRAYS = (
     "controls",
     "effective_samples",
     "healthy",
-    "breach",
-    "box_exit",
 )
 """Of an episode, as they are."""
 
@@ -50,8 +48,6 @@ def row(
     about: dict[str, Any],
     act_ms: tuple[float, float] | None,
     violation: dict[str, Any],
-    *,
-    watched: bool = False,
 ) -> Row:
     """One system on one scenario; what does not apply is None.
 
@@ -61,9 +57,8 @@ def row(
             episodes, episode_s, params.
         act_ms: median and 99 % quantile of one control step.
         violation: from `violations`.
-        watched: whether a monitor was active.
     """
-    pooled = _pooled(scores, watched=watched)
+    pooled = _pooled(scores)
     given = {
         "violation": violation,
         "act_ms": None if act_ms is None else {"p50": act_ms[0], "p99": act_ms[1]},
@@ -75,12 +70,10 @@ def row(
     return about | {key: values[key] for key in keys if key in values}
 
 
-def _pooled(scores: Scores, *, watched: bool = False) -> Row:
+def _pooled(scores: Scores) -> Row:
     """The values of all metrics that are measured on episodes."""
     return {
         metric.name: metric.pool(scores[metric.name])
-        if watched or not metric.monitored
-        else None
         for metric in METRICS
         if metric.pool
     }

@@ -50,8 +50,6 @@ class Recording(NamedTuple):
         controls: applied.
         effective_samples: of the planner.
         healthy: whether the planner's plan was usable.
-        breach: whether a monitor reported a breach.
-        box_exit: whether a monitor saw its domain left.
     """
 
     dt: float
@@ -61,8 +59,6 @@ class Recording(NamedTuple):
     controls: Float[np.ndarray, "episode time control"]
     effective_samples: Float[np.ndarray, "episode time"]
     healthy: Bool[np.ndarray, "episode time"]
-    breach: Bool[np.ndarray, "episode time"]
-    box_exit: Bool[np.ndarray, "episode time"]
 
 
 class Metric(NamedTuple):
@@ -81,7 +77,6 @@ class Metric(NamedTuple):
         pool_seeds: the JSON value of rows that differ in the training seed; None for
             the mean of their numbers.
         read: the JSON value of a row, where that is more than a look-up by name.
-        monitored: whether it is null for a system without a monitor.
     """
 
     name: str
@@ -94,7 +89,6 @@ class Metric(NamedTuple):
     pool: Callable[[PerEpisode], Any] | None = None
     pool_seeds: Callable[[list[Row]], Any] | None = None
     read: Callable[[Row], Any] | None = None
-    monitored: bool = False
 
     def value(self, row: Row) -> Any:
         """The JSON value in a row, or None."""
@@ -248,12 +242,6 @@ METRICS: tuple[Metric, ...] = (
            lambda rows: sum(row["departures"] for row in rows)),
     Metric("unhealthy_steps", "Steps with the last plan held", "%", "planner", percent,
            measure=lambda drive: 1.0 - np.mean(drive.healthy, axis=1), pool=_mean),
-    Metric("breach_steps", "Steps beyond the monitored bounds", "%", "claims", percent,
-           measure=lambda drive: np.mean(drive.breach, axis=1), pool=_mean,
-           monitored=True),
-    Metric("box_exit_steps", "Steps outside the monitored domain", "%", "claims",
-           percent, measure=lambda drive: np.mean(drive.box_exit, axis=1), pool=_mean,
-           monitored=True),
     Metric("ess", "Effective samples", "", "planner", partial(number, digits=0), None,
            lambda drive: np.median(drive.effective_samples, axis=1), _median),
     Metric("act_ms.p50", "Control step, median", "ms", "cost",

@@ -38,7 +38,7 @@ def _write(settings: dict[str, Any]) -> dict[str, Any]:
         run_dir, controller=settings["controller"], env_source=settings["env_source"]
     )
     if trained.certificate is None:
-        store.print_message("exported without a certificate and without a monitor")
+        store.print_message("exported without a certificate")
     folder = run_dir / FOLDER
     write_controller(
         trained,

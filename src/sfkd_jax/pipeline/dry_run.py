@@ -71,7 +71,7 @@ def _build_controller(
     sizes: dict[str, int],
     law: PathLaw | None,
 ) -> None:
-    """Build the controller under a certificate with unit boxes and bounds."""
+    """Build the controller under a certificate with unit boxes."""
     boxes = {name: ((-1.0,) * size, (1.0,) * size) for name, size in sizes.items()}
     low, high = boxes["env"]
     build.build_controller(
@@ -81,7 +81,7 @@ def _build_controller(
         env_low=low,
         env_high=high,
         law=law,
-        certificate={"boxes": boxes, "monitor": {"bounds": (1.0,) * 4}},
+        certificate={"boxes": boxes},
         env_source=settings["env_source"],
     )
 

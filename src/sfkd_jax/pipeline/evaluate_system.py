@@ -60,7 +60,6 @@ class _Compiled(NamedTuple):
         columns: of the row that do not depend on episodes.
         simulate: (scenarios, keys) -> episodes.
         score: (episodes, scenarios) -> scores and violations.
-        watched: whether a monitor runs beside the controller.
         act_ms: empty, or the time of a control step once it was measured.
     """
 
@@ -72,7 +71,6 @@ class _Compiled(NamedTuple):
     columns: dict[str, Any]
     simulate: Callable[[Scenario, Key], evaluation.Episode]
     score: scoring.Scorer
-    watched: bool
     act_ms: list[tuple[float, float] | None]
 
 
@@ -142,7 +140,6 @@ def compile_system(
         columns=columns,
         simulate=jax.jit(evaluation.over_episodes(simulate)),
         score=scoring.scorer(settings, system, dataset, plant.dt),
-        watched=system.certificate is not None,
         act_ms=[],
     )
     return partial(_evaluate, compiled)
@@ -184,7 +181,6 @@ def _evaluate(compiled: _Compiled, episodes: EpisodeSet) -> SystemResult:
         compiled.columns | {"scenario": episodes.name, "variation": episodes.variation},
         compiled.act_ms[0],
         violation,
-        watched=compiled.watched,
     )
     if compiled.protocol["side_forces"]:
         row["disturbed"] = [

@@ -42,20 +42,11 @@ def load_systems(settings: dict[str, Any], plant: Vehicle) -> dict[str, build.Sy
 
 
 def policy_system(settings: dict[str, Any]) -> build.System:
-    """Return the policy of the run as a system, with its certificate if there is one.
-
-    Raises:
-        ValueError: there is none, and the fallback of the monitor needs one.
-    """
+    """Return the policy of the run as a system, with its certificate if there is one."""
     trained = stages.ensure_policy(settings)
-    fallback = settings["controller"].get("monitor", {}).get("fallback", "none")
     certificate, reason = policy.read_certificate(runs.run_directory(settings), trained)
     if certificate is None:
-        store.print_message(f"nothing is certified and nothing is monitored: {reason}")
-        if fallback != "none":
-            raise ValueError(
-                f"controller.monitor.fallback={fallback} needs a certificate; {reason}"
-            )
+        store.print_message(f"nothing is certified: {reason}")
     reads_env = trained.settings["model"]["environment"]
     env_source = settings["env_source"] if reads_env else "none"
     return build.System(

@@ -1,1 +1,1 @@
-"""Controllers around a controller: monitor, estimator, adaptation, delay, shield."""
+"""Controllers around a controller: shield, adaptation, delay."""

@@ -24,8 +24,7 @@ from sfkd_jax.control.wrappers._disturbances import (
 from sfkd_jax.control.wrappers._estimator import (
     Estimator,
 )
-from sfkd_jax.control.wrappers._kalman import Bank
-from sfkd_jax.control.wrappers._multiple_models import transition_matrix
+from sfkd_jax.control.wrappers._kalman import Bank, transition_matrix
 from sfkd_jax.ranges import AtLeastTwo, Fraction, Interval, Positive
 from sfkd_jax.types import (
     Controller,

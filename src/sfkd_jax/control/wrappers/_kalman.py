@@ -109,3 +109,28 @@ def corrected(
     weights = bank.probabilities * relative
     explained = jnp.max(jnp.nan_to_num(surprise, nan=-math.inf)) > OUTLIER
     return Bank(means, covariances, weights / weights.sum()), explained
+
+
+def transition_matrix(
+    low: tuple[float, ...],
+    high: tuple[float, ...],
+    points: tuple[int, ...],
+    drift: tuple[float, ...],
+    dwell: float,
+) -> Float[Array, "m m"]:
+    """Return Π, symmetric: diffusion by the drift within E, and jumps.
+
+    Args:
+        low: lower end of each axis.
+        high: upper end of each axis.
+        points: number of values along each axis.
+        drift: standard deviation of e over one step, per axis.
+        dwell: mean number of steps between jumps.
+    """
+    diffusion = jnp.ones((1, 1))
+    for start, end, count, spread in zip(low, high, points, drift, strict=True):
+        rate = min(0.5 * (spread * (count - 1) / (end - start)) ** 2, 1.0 / 3.0)
+        neighbours = rate * (jnp.eye(count, k=1) + jnp.eye(count, k=-1))
+        stay = jnp.diag(1.0 - neighbours.sum(axis=1))
+        diffusion = jnp.kron(diffusion, neighbours + stay)
+    return (1.0 - 1.0 / dwell) * diffusion + 1.0 / (dwell * diffusion.shape[0])
