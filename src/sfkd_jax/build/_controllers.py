@@ -6,7 +6,7 @@ from typing import Any
 
 from sfkd_jax import control, plants
 from sfkd_jax.build._choices import Settings, as_kwargs
-from sfkd_jax.build._planners import chosen_planner, controller_horizon
+from sfkd_jax.build._planners import PLANNERS, chosen_planner, controller_horizon
 from sfkd_jax.geometry import LATERAL
 from sfkd_jax.rollout import with_offset
 from sfkd_jax.types import Controller, Model
@@ -19,6 +19,14 @@ ALLOWANCE = 3.0
 """Standard deviations of a measured position by which the tube is enlarged."""
 ENV_SOURCES = ("measured", "estimated", "none")
 """Where a controller takes the environment from."""
+_NAMES = frozenset(
+    (
+        *PLANNERS,
+        *("name", "planner", "sampling", "ancillary", "feedback", "model_law"),
+        *("task", "cost", "shield", "adaptive", "adaptation", "online_tube"),
+    )
+)
+"""Settings of a controller."""
 
 
 def build_controller(
@@ -50,7 +58,7 @@ def build_controller(
             it always does.
 
     Raises:
-        ValueError: an unknown planner, a vehicle without limits of its controls, a
+        ValueError: an unknown planner or setting, a vehicle without limits of its controls, a
             model and a planner in different coordinates, or an estimate or adaptation
             without path coordinates.
     """
@@ -59,6 +67,9 @@ def build_controller(
             "a controller needs vehicle.control_low and vehicle.control_high, "
             "as in [-0.4,-3.0]"
         )
+    # A setting that nothing reads could be one that somebody relies on.
+    if unknown := sorted(settings.keys() - _NAMES):
+        raise ValueError(f"unknown setting controller.{unknown[0]}")
     build = chosen_planner(settings).build
     if model.along_path:
         if settings["sampling"] != "law" or law is None:
