@@ -58,9 +58,9 @@ def build_controller(
             it always does.
 
     Raises:
-        ValueError: an unknown planner or setting, a vehicle without limits of its controls, a
-            model and a planner in different coordinates, or an estimate or adaptation
-            without path coordinates.
+        ValueError: an unknown planner or setting, a vehicle without limits of its
+            controls, a model and a planner in different coordinates, or an estimate or
+            adaptation without path coordinates.
     """
     if not plant.control_low:
         raise ValueError(

@@ -42,7 +42,7 @@ def load_systems(settings: dict[str, Any], plant: Vehicle) -> dict[str, build.Sy
 
 
 def policy_system(settings: dict[str, Any]) -> build.System:
-    """Return the policy of the run as a system, with its certificate if there is one."""
+    """Return the policy of the run as a system, with a certificate if it has one."""
     trained = stages.ensure_policy(settings)
     certificate, reason = policy.read_certificate(runs.run_directory(settings), trained)
     if certificate is None:
