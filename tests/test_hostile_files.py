@@ -430,11 +430,7 @@ def test_a_report_of_rows_that_are_none_names_the_file(tmp_path):
 
 
 def test_a_row_cannot_name_arrays_outside_its_folder(tmp_path):
-    document = json.loads(
-        (
-            Path(__file__).parents[1] / "experiments/table1_closed_loop/results.json"
-        ).read_bytes()
-    )
+    document = json.loads(Path(__file__).with_name("rows.json").read_bytes())
     rows = [row | {"arrays": "../../outside.npz"} for row in document["rows"][:3]]
     store.write_json(tmp_path / "results.json", document | {"rows": rows})
     with pytest.raises(ArtefactError, match="outside this folder"):

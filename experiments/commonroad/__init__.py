@@ -1,1 +1,0 @@
-"""CommonRoad's cars: training, tuning, the page."""

@@ -1,0 +1,231 @@
+"""Results in the repository: one JSON a benchmark, one line a row, and the tables of docs/results.md.
+
+    python -m experiments.results                       write the tables again
+    python -m experiments.results benchmark RUN         take runs/RUN/results.json first
+
+A row keeps the lateral RMSE of every episode of every training, from which intervals are
+computed here; Holm's correction needs the whole comparison and was made by `compare`.
+"""
+
+import argparse
+import json
+import re
+from pathlib import Path
+
+import numpy as np
+
+from sfkd_jax import evaluation
+
+HOME = Path(__file__).parent
+PAGE = HOME.parent / "docs" / "results.md"
+BENCHMARKS = ("benchmark", "benchmark_path", "table1", "figure2", "corridor")
+VEHICLES = {
+    "kinematic": "kinematic",
+    "kinematic_stiff": "stiff kinematic",
+    "dynamic": "dynamic",
+}
+LABELS = {
+    "sfkd": "SFKD",
+    "sfkd_no_fiber": "SFKD without e (− fiber)",
+    "sfkd_no_transport": "SFKD − transport",
+    "sfkd_no_residual": "SFKD − residual",
+    "sfkd_no_contraction": "SFKD − contraction",
+    "sfkd_soft": "SFKD, soft hinge",
+    "koopman_mpc": "Koopman MPC",
+    "neural_ode": "Neural ODE",
+    "icode": "ICODE",
+    "icode_extrinsic": "ICODE, e extrinsic",
+    "control_synth": "ControlSynth",
+    "icode_mppi": "ICODE-MPPI",
+    "icode_mppi_extrinsic": "ICODE-MPPI, e extrinsic",
+    "icode_mppi_reads_env": "ICODE-MPPI, reads e",
+    "icode_mppi_one_step": "ICODE-MPPI, one step",
+    "r2dn": "R2DN",
+    "law": "Law alone",
+    "nominal": "Nominal bicycle",
+    "oracle": "Oracle",
+}
+"""Row of a comparison -> its name in a table, in the order of the tables."""
+PAPER = {
+    "koopman_mpc": (0.181, 0.243),
+    "neural_ode": (0.162, 0.218),
+    "icode": (0.148, 0.204),
+    "control_synth": (0.139, 0.192),
+    "icode_mppi": (0.127, 0.174),
+    "sfkd_no_fiber": (0.119, 0.170),
+    "sfkd_no_contraction": (0.108, 0.145),
+    "sfkd": (0.098, 0.120),
+}
+"""RMSE on S2 and S3 as the paper's Table 1 prints it [m]."""
+LEVEL = 0.05
+
+
+def condense(results):
+    """What is kept of the results of `compare`: settings in short, rows in short.
+
+    Args:
+        results: content of results.json.
+    """
+    protocol = results.get("config", {}).get("evaluation", {})
+    made_by = {row.get("provenance", {}).get("commit") for row in results["rows"]}
+    return {
+        "commits": sorted(made_by - {None}),
+        "seed": protocol.get("seed"),
+        "episode_s": results["rows"][0]["episode_s"],
+        "rows": [_row(row) for row in results["rows"]],
+    }
+
+
+def _row(row):
+    """One line: who drove where, every episode's RMSE [mm] by training, extremes."""
+    seeds = row["seeds"]
+    errors = 1e3 * np.asarray(row["rmse_episodes_m"]).reshape(len(seeds), -1)
+    difference = row["difference_to_sfkd"] or {}
+    controller = row["controller"]
+    if controller == "mppi" and row["sampling"] == "plain":
+        # The option keeps the name of the planner that it changes.
+        controller = "mppi_plain"
+    kept = {
+        "row": re.sub("_path", "", row["system"]),
+        "vehicle": row["vehicle"],
+        "scenario": row["scenario"],
+        "controller": controller,
+        "seeds": seeds,
+        "parameters": row["params"],
+        "alpha": row["alpha"],
+        "p_holm": difference.get("p_holm"),
+        "largest_mm": round(1e3 * row["max_deviation_m"], 1),
+        "steering_rad_per_s": round(row["smoothness_rad_per_s"], 4),
+        "left_the_lane": row["departures"],
+        "rmse_mm": np.round(errors, 3).tolist(),
+    }
+    if row.get("disturbed"):
+        # Figure 2: side forces that nobody measures.
+        kept["forces"] = [
+            {
+                "force_n": one["force_n"],
+                "rmse_mm": round(1e3 * one["rmse_m"]["mean"], 3),
+                "left_the_tube": one["v1"],
+            }
+            for one in row["disturbed"]
+        ]
+    return kept
+
+
+def write(name, document):
+    """One line a row, so that a change of one row is a change of one line."""
+    rows = ",\n".join(f"  {json.dumps(row)}" for row in document["rows"])
+    head = json.dumps({key: document[key] for key in document if key != "rows"})
+    (HOME / f"{name}.json").write_text(
+        f'{head[:-1]}, "rows": [\n{rows}\n]}}\n', "utf-8"
+    )
+
+
+def read(name):
+    """The results of a benchmark."""
+    return json.loads((HOME / f"{name}.json").read_text("utf-8"))
+
+
+def of_scenario(name, scenario, controllers):
+    """Row -> vehicle -> its results on one scenario, in the order of the tables."""
+    found = {label: {} for label in LABELS}
+    for row in read(name)["rows"]:
+        if row["scenario"] == scenario and row["controller"] in controllers:
+            found.setdefault(row["row"], {})[row["vehicle"]] = row
+    return {label: rows for label, rows in found.items() if rows}
+
+
+def difference(row, reference):
+    """Mean of row − reference over equal episodes, with its 95 % interval [mm]."""
+    errors = (np.asarray(one["rmse_mm"]) for one in (row, reference))
+    return evaluation.paired_difference(*errors)
+
+
+def cell(row, reference):
+    """Mean and 95 % interval [mm]; † better, * worse than SFKD after Holm's correction."""
+    mean, (low, high) = evaluation.mean_interval(np.asarray(row["rmse_mm"]))
+    mark = ""
+    if row["p_holm"] is not None and row["p_holm"] < LEVEL:
+        mark = " \\*" if difference(row, reference)["mean"] > 0 else " †"
+    return f"{mean:.1f} ({low:.1f} to {high:.1f}){mark}"
+
+
+def table(heads, rows):
+    """A table in Markdown."""
+    lines = [heads, ["---"] * len(heads), *rows]
+    return "\n".join(f"| {' | '.join(map(str, cells))} |" for cells in lines)
+
+
+def benchmark_table(name, scenarios, controllers):
+    """Every row of sfkd-bench-2 on all plants; several scenarios below each other."""
+    lines = []
+    for scenario in scenarios:
+        rows = of_scenario(name, scenario, controllers)
+        for label, driven in rows.items():
+            title = LABELS[label]
+            if len(scenarios) > 1:
+                title = f"{scenario.upper()}: {title}"
+            cells = [cell(driven[car], rows["sfkd"][car]) for car in VEHICLES]
+            learned = driven["kinematic"]["parameters"] is not None
+            trainings = min(len(row["seeds"]) for row in driven.values())
+            lines.append([title, *cells, trainings if learned else "–"])
+    return table(["lateral RMSE [mm]", *VEHICLES.values(), "trainings"], lines)
+
+
+def paper_table():
+    """The paper's rows: what it prints beside what was driven here, kinematic plant."""
+    controllers = ("mppi", "koopman_mpc")
+    on = {name: of_scenario("table1", name, controllers) for name in ("s2", "s3")}
+    lines = []
+    for label in on["s3"]:
+        cells = []
+        for number, driven in enumerate(on.values()):
+            mean = np.mean(driven[label]["kinematic"]["rmse_mm"])
+            printed = PAPER.get(label)
+            cells += [f"{mean:.1f}", f"{1e3 * printed[number]:.0f}" if printed else "–"]
+        lines.append([LABELS[label], *cells])
+    heads = ["lateral RMSE [mm]", "S2, here", "S2, paper", "S3, here", "S3, paper"]
+    return table(heads, lines)
+
+
+def tables():
+    """Marker in docs/results.md -> its table."""
+    around_feedback = ("mppi", "koopman_mpc")
+    along_path = ("mppi_path",)
+    path_scenarios = ("s2", "s3")
+    return {
+        "body": benchmark_table("benchmark", ("s3",), around_feedback),
+        "path": benchmark_table("benchmark_path", path_scenarios, along_path),
+        "paper": paper_table(),
+    }
+
+
+def filled(page):
+    """The page with its tables between <!-- NAME --> and <!-- end -->."""
+    for name, text in tables().items():
+        place = re.compile(rf"<!-- {name} -->\n.*?<!-- end -->", re.DOTALL)
+        page, count = place.subn(
+            lambda _, t=text, n=name: f"<!-- {n} -->\n{t}\n<!-- end -->", page
+        )
+        if count != 1:
+            raise SystemExit(f"{PAGE}: {count} places for the table {name!r}, not 1")
+    return page
+
+
+def main():
+    """Take the results of a comparison, if one is named; write the page."""
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument("name", nargs="?", choices=BENCHMARKS)
+    parser.add_argument("run", nargs="?", help="folder below runs/; the same name")
+    given = parser.parse_args()
+    if given.name:
+        folder = HOME.parent / "runs" / (given.run or given.name)
+        results = json.loads((folder / "results.json").read_text("utf-8"))
+        write(given.name, condense(results))
+    PAGE.write_text(filled(PAGE.read_text("utf-8")), "utf-8")
+
+
+if __name__ == "__main__":
+    main()

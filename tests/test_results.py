@@ -1,0 +1,133 @@
+"""The results in the repository: docs/results.md says what its files hold."""
+
+import json
+import re
+
+import numpy as np
+import pytest
+
+from experiments import results
+from sfkd_jax import evaluation
+
+PAGE = results.PAGE.read_text("utf-8")
+PRETRAINED = results.HOME.parent / "src" / "sfkd_jax" / "pretrained"
+
+
+def row(name, scenario, label, vehicle, controller="mppi_path"):
+    return results.of_scenario(name, scenario, (controller,))[label][vehicle]
+
+
+def behind(name, scenario, label, vehicle, **about):
+    """SFKD's error minus that of a row [mm]."""
+    pair = [row(name, scenario, each, vehicle, **about) for each in ("sfkd", label)]
+    return results.difference(*pair)["mean"]
+
+
+def test_the_tables_are_what_the_files_hold():
+    assert results.filled(PAGE) == PAGE
+
+
+@pytest.mark.parametrize("name", results.BENCHMARKS)
+def test_a_file_has_a_line_a_row_and_every_row_its_episodes(name):
+    text = (results.HOME / f"{name}.json").read_text("utf-8")
+    document = json.loads(text)
+    assert len(text.splitlines()) == len(document["rows"]) + 2
+    for one in document["rows"]:
+        errors = np.asarray(one["rmse_mm"])
+        assert errors.shape[0] == len(one["seeds"])
+        assert np.all(np.isfinite(errors)) or one["left_the_lane"]
+
+
+def test_all_rows_of_a_benchmark_met_the_same_number_of_roads():
+    for name in ("benchmark", "benchmark_path"):
+        sizes = {len(one["rmse_mm"][0]) for one in results.read(name)["rows"]}
+        assert sizes == {16}
+
+
+def test_what_the_bound_costs_along_a_path():
+    s2 = {"name": "benchmark_path", "scenario": "s2", "vehicle": "kinematic"}
+    found = [
+        behind(label=label, **s2)
+        for label in ("oracle", "sfkd_no_contraction", "neural_ode")
+    ]
+    assert np.round(found, 1).tolist() == [2.7, 1.4, 2.6]
+    for vehicle in ("kinematic_stiff", "dynamic"):
+        for scenario in ("s1", "s2", "s3"):
+            assert behind("benchmark_path", scenario, "oracle", vehicle) < 0.15
+
+
+def test_what_observing_the_environment_brings():
+    ratios = []
+    for vehicle in results.VEHICLES:
+        blind, sfkd = (
+            np.mean(row("benchmark", "s3", label, vehicle, "mppi")["rmse_mm"])
+            for label in ("sfkd_no_fiber", "sfkd")
+        )
+        ratios.append(blind / sfkd)
+    assert np.round([min(ratios), max(ratios)], 1).tolist() == [1.6, 3.3]
+    assert "1.6 to 3.3 times as large" in re.sub(r"\s+", " ", PAGE)
+
+
+@pytest.mark.parametrize(
+    ("plant", "corridor", "error", "over_oracle"),
+    [("dynamic", 0.143, 7.1, 1.012), ("kinematic", 0.380, 14.4, 1.096)],
+)
+def test_the_corridor_and_what_was_driven_in_it(plant, corridor, error, over_oracle):
+    path = PRETRAINED / f"{plant}_path" / "certificate.json"
+    claims = json.loads(path.read_text("utf-8"))["corridor"]
+    assert round(claims["corridor_m"], 3) == corridor
+    assert round(claims["coverage"], 2) == 0.99
+    sfkd, oracle = (
+        np.mean(row("corridor", "s3", label, plant)["rmse_mm"])
+        for label in ("sfkd", "oracle")
+    )
+    assert round(sfkd, 1) == error
+    assert round(sfkd / oracle, 3) == over_oracle
+
+
+def test_adapting_on_cars_that_no_model_has_seen():
+    rows = json.loads((results.HOME / "commonroad.json").read_text("utf-8"))["rows"]
+    error = {
+        (one["row"], one["car"], one["friction"]): np.mean(one["second_half_mm"])
+        for one in rows
+    }
+    ratios = [
+        value / error["nominal", *where]
+        for (label, *where), value in error.items()
+        if label == "SFKD, adaptive"
+    ]
+    assert np.round([min(ratios), max(ratios)], 2).tolist() == [0.23, 0.34]
+    assert "0.23 to 0.34 times" in PAGE
+
+
+def test_results_of_compare_become_short_rows():
+    driven = {
+        "system": "sfkd_path",
+        "vehicle": "dynamic",
+        "scenario": "s3",
+        "controller": "mppi",
+        "sampling": "plain",
+        "seeds": [0, 1],
+        "params": 10,
+        "alpha": 0.9,
+        "rmse_episodes_m": [0.001, 0.002, 0.003, 0.004],
+        "max_deviation_m": 0.0123,
+        "smoothness_rad_per_s": 0.05,
+        "departures": 0,
+        "difference_to_sfkd": None,
+        "episode_s": 30.0,
+    }
+    document = results.condense({"rows": [driven], "config": {}})
+    (short,) = document["rows"]
+    assert short["row"] == "sfkd"
+    assert short["controller"] == "mppi_plain"
+    assert short["rmse_mm"] == [[1.0, 2.0], [3.0, 4.0]]
+    mean, interval = evaluation.mean_interval(np.asarray(short["rmse_mm"]))
+    assert mean == 2.5
+    assert interval[0] < 2.5 < interval[1]
+
+
+def test_what_is_committed_is_small():
+    files = list(results.HOME.glob("*.json"))
+    assert len(files) <= 10
+    assert sum(file.stat().st_size for file in files) < 5e5
