@@ -22,7 +22,7 @@ from omegaconf import OmegaConf
 import sfkd_jax
 from experiments import results
 from sfkd_jax import adapters, build, evaluation, policy
-from sfkd_jax.cli import config
+from sfkd_jax.experiment import command
 from sfkd_jax.types import Controller
 
 FRICTIONS = (0.9, 0.6, 0.3)
@@ -40,8 +40,8 @@ class Driver(NamedTuple):
 
 def composed():
     """The settings of the commands for the dynamic car."""
-    config.register()
-    with hydra.initialize_config_dir(config.conf_path(), version_base="1.3"):
+    command.register()
+    with hydra.initialize_config_dir(command.conf_path(), version_base="1.3"):
         chosen = hydra.compose("config", ["vehicle=dynamic"])
     return OmegaConf.to_container(chosen, resolve=True)
 
@@ -51,8 +51,7 @@ def drivers(settings):
     trained = policy.restore(SHIPPED)
     ours, along = trained.vehicle, dict(trained.settings["controller"], shield=False)
     box = {
-        f"env_{side}": trained.settings["dataset"][f"env_{side}"]
-        for side in ("low", "high")
+        f"env_{side}": trained.settings["environment"][side] for side in ("low", "high")
     }
     planner = partial(build.build_controller, plant=ours, law=trained.law)
     world = build.reference_systems(ours)["nominal"]

@@ -298,7 +298,8 @@ def policy_holds(result: Any, folder: Path) -> bool:
     expected = (
         shipped.settings
         if result.certificate is not None
-        else settings | {"env_source": "measured"}
+        else settings
+        | {"environment": settings["environment"] | {"source": "measured"}}
     )
     return all(np.array_equal(a, b) for a, b in pairs) and equal(
         result.settings, expected

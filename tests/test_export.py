@@ -14,20 +14,19 @@ import textwrap
 from functools import partial
 from pathlib import Path
 
+import composing
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
 from helpers import ENV_HIGH, ENV_LOW, dataset, jit, space, straight
-from hydra import compose, initialize_config_dir
-from omegaconf import OmegaConf
 
 import sfkd_jax
 from sfkd_jax import build, certification, policy, store
 from sfkd_jax import export as exporting
-from sfkd_jax.cli import config
+from sfkd_jax import settings as parsing
+from sfkd_jax.experiment import runs
 from sfkd_jax.export import __main__ as export
-from sfkd_jax.pipeline import runs
 from sfkd_jax.types import Controller
 
 HORIZON, STEPS = 5, 6
@@ -60,23 +59,20 @@ HEAVY = {
 
 
 def settings(root, *overrides):
-    config.register()
-    with initialize_config_dir(config.conf_path(), version_base="1.3"):
-        composed = compose("config", overrides=[*SMALL, f"root={root}", *overrides])
-    return OmegaConf.to_container(composed, resolve=True)
+    return composing.settings(*SMALL, f"root={root}", *overrides)
 
 
 @pytest.fixture(scope="module")
 def exported(tmp_path_factory):
     """A certified run with weights as they were drawn; what the command wrote and printed."""
     requested = settings(tmp_path_factory.mktemp("export") / "runs")
-    plant = build.build_vehicle(requested["vehicle"])
-    params = jit(build.build_model(requested["model"], space(), plant).init)(
+    plant = build.build_vehicle(requested.vehicle)
+    params = jit(build.build_model(requested.model, space(), plant).init)(
         jax.random.key(0)
     )
-    stored = requested | {"space": build.space_to_settings(space())}
+    stored = parsing.plain(requested) | {"space": build.space_to_settings(space())}
     runs.claim(requested)
-    run_dir = runs.run_directory(requested)
+    run_dir = requested.run_dir
     policy.save(run_dir / "policy.npz", params, stored, made_from={"dataset": "d" * 64})
     trained, data = policy.restore(run_dir), dataset()
     splits = {
@@ -278,8 +274,7 @@ def test_the_manifest_lists_the_inputs_of_programs_and_what_they_were_made_from(
     assert states == act["inputs"][:-3] == manifest["programs"]["init"]["outputs"]
     assert {"name": "state.inner.key", "shape": [2], "dtype": "uint32"} in states
     assert (
-        manifest["weights_sha256"]
-        == policy.restore(runs.run_directory(requested)).weights_sha256
+        manifest["weights_sha256"] == policy.restore(requested.run_dir).weights_sha256
     )
     assert (
         manifest["certificate_sha256"]
@@ -290,7 +285,7 @@ def test_the_manifest_lists_the_inputs_of_programs_and_what_they_were_made_from(
         HORIZON,
         None,
     )
-    plant = build.build_vehicle(requested["vehicle"])
+    plant = build.build_vehicle(requested.vehicle)
     assert (
         tuple(control["high"] for control in manifest["controls"]) == plant.control_high
     )
@@ -330,7 +325,7 @@ def test_the_controller_of_the_command_is_what_is_exported(spoiled):
 
 def test_a_refused_certificate_leaves_the_export_without_one(spoiled, capsys):
     requested = settings(spoiled)
-    run_dir = runs.run_directory(requested)
+    run_dir = requested.run_dir
     assert (run_dir / "export" / "certificate.json").exists()
     store.write_json(
         run_dir / "certificate.json", {"valid": False, "reason": "alpha is not below 1"}

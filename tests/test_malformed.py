@@ -10,6 +10,7 @@ import warnings
 from functools import cache
 from pathlib import Path
 
+import composing
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -19,8 +20,8 @@ from jaxtyping import TypeCheckError
 
 from sfkd_jax import data as datasets
 from sfkd_jax import demo, policy, report, store, training
-from sfkd_jax.cli import entry
-from sfkd_jax.pipeline import evaluate_run, runs
+from sfkd_jax.experiment import data, runs
+from sfkd_jax.settings import replace
 
 SHIPPED = demo.SHIPPED / "kinematic"
 WORSE = (None, "word", [], {}, -1, float("nan"), [[1, 2], 3], True, 10**400)
@@ -34,14 +35,6 @@ DOCUMENTS = {
 """Document -> how many times it is spoiled."""
 BYTES = {"policy.npz": 12, "policy.json": 8, "certificate.json": 8, "dataset.npz": 12}
 ROW = {"system": "sfkd", "scenario": "s3", "vehicle": "kinematic", "env": "measured"}
-SETTINGS = {
-    **{
-        name: {"name": "kinematic"}
-        for name in ("vehicle", "model", "controller", "training")
-    },
-    "dataset": {"env_low": [0.3, -8.0], "env_high": [0.9, 8.0]},
-    "seed": 0,
-}
 
 
 class Bomb:
@@ -67,12 +60,8 @@ def run(tmp_path):
 def settings_of(run):
     """Settings that lead to a run directory."""
     root, name = run.parents[2], run.parents[1].name
-    return SETTINGS | {
-        "root": str(root),
-        "name": name,
-        "model": {"system": run.parent.name},
-        "report": {"compare": None},
-    }
+    system = run.parent.name
+    return composing.settings(f"root={root}", f"name={name}", f"model.system={system}")
 
 
 @cache
@@ -96,7 +85,7 @@ def read_policy(run):
 def read(run, name):
     """Read a file as the commands do."""
     if name == "results.json":
-        evaluate_run.read_results(run)
+        runs.read_results(run)
     elif name == "settings.json":
         runs.claim(settings_of(run))
     else:
@@ -196,11 +185,11 @@ def test_damaged_bytes_are_refused_or_read_the_same(run, name):
     draw, file, read_it = random.Random(2), run / name, read_policy
     if name == "dataset.npz":
         settings = settings_of(run)
-        runs.write_dataset(settings, dataset(count=20, steps=8))
-        file = runs.dataset_path(settings)
+        data.write(data.source_of(settings), dataset(count=20, steps=8))
+        file = data.source_of(settings).path
 
         def read_it(_):
-            runs.read_dataset(settings)
+            data.read(data.source_of(settings))
 
     lines = [
         survives(lambda: read_it(run), file, damaged(file.read_bytes(), draw))
@@ -247,41 +236,6 @@ def test_lines_of_a_training_log_that_are_none_are_dropped(tmp_path):
 # ---- a command with what cannot be composed; a full disk; a directory that cannot be written
 
 
-def opened(run, monkeypatch, capsys, *arguments):
-    """The exit status of a command in this process, and its lines on stderr."""
-    monkeypatch.setattr("sys.argv", ["command", *arguments])
-    try:
-        entry.hydra_command(run)()
-        status = 0
-    except SystemExit as ended:
-        status = ended.code
-    return status, capsys.readouterr().err.strip().splitlines()
-
-
-@pytest.mark.parametrize(
-    ("argument", "expected_text"),
-    [
-        ("model.rank=abc", "model.rank"),
-        ("model=sfdk", "sfkd_no_fiber"),
-        ("+experiment=s9", "smoke"),
-        ("model.rnk=3", "rnk"),
-        ("modle.rank=3", "modle"),
-        ("training.loss.growht=1", "growht"),
-        ("seed=[", "seed=["),
-        ("dataset.seed=null", "dataset.seed"),
-    ],
-)
-def test_what_cannot_be_composed_is_one_line_of_a_command(
-    monkeypatch, capsys, argument, expected_text
-):
-    status, lines = opened(
-        lambda settings: pytest.fail("a command ran"), monkeypatch, capsys, argument
-    )
-    assert status == 1
-    assert len(lines) == 1
-    assert expected_text in lines[0]
-
-
 def full(*_):
     raise OSError(28, "No space left on device")
 
@@ -298,7 +252,7 @@ def test_a_full_disk_is_one_line_keeps_what_was_there_and_the_same_call_continue
 
     def work():
         store.write_json(run / "results.json", {"rows": [ROW, ROW]})
-        runs.write_dataset(settings, drives)
+        data.write(data.source_of(settings), drives)
 
     before = snapshot(root)
     with monkeypatch.context() as disk:
@@ -307,7 +261,7 @@ def test_a_full_disk_is_one_line_keeps_what_was_there_and_the_same_call_continue
     assert snapshot(root) == before
     work()
     assert len(store.read_json(run / "results.json")["rows"]) == 2
-    runs.read_dataset(settings)
+    data.read(data.source_of(settings))
 
 
 def refuse(*_, **__):
@@ -316,7 +270,7 @@ def refuse(*_, **__):
 
 @pytest.mark.parametrize("call", ["mkdir", "open"])
 def test_a_read_only_directory_is_one_line_and_keeps_its_files(run, monkeypatch, call):
-    settings, root = settings_of(run) | {"name": "another"}, run.parents[2]
+    settings, root = replace(settings_of(run), name="another"), run.parents[2]
     before = snapshot(root)
     with monkeypatch.context() as read_only:
         read_only.setattr(Path, call, refuse)

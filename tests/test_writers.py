@@ -1,6 +1,5 @@
 """Several processes write into one directory: locks, and no lost rows or episodes."""
 
-import json
 import re
 import signal
 import subprocess
@@ -14,7 +13,7 @@ import pytest
 from helpers import refusal_of
 
 from sfkd_jax import store
-from sfkd_jax.pipeline import evaluate_run
+from sfkd_jax.experiment import runs
 from sfkd_jax.reporting.rows import group_title, groups_of
 from sfkd_jax.reporting.scene import scenes_of
 from sfkd_jax.store import DirectoryLocked, locked
@@ -61,7 +60,7 @@ def driven(row, value=0.0, episodes=2, steps=40):
 
 
 def keep(run_dir, row, value=0.0):
-    evaluate_run.write_results(
+    runs.write_results(
         run_dir, SETTINGS, [row], driven(row, value) | {"dt": np.asarray(0.1)}, 0.0
     )
 
@@ -220,40 +219,6 @@ def test_rows_that_differ_in_one_part_of_their_identity_are_two(name):
         key: value for key, value in store.identity(other).items() if value is not None
     }
     assert store.parse_drive_name(store.drive_name(other)) == known
-
-
-def test_rows_and_episodes_of_an_earlier_version_are_read_and_replaced(tmp_path):
-    """It had no planner in its rows, and named arrays by system and scenario alone."""
-    old = {
-        name: value
-        for name, value in ROW.items()
-        if name not in ("planner", "inner_loop")
-    }
-    arrays = {
-        f"sfkd/s3/{name.rpartition('/')[2]}": array
-        for name, array in driven(ROW, 1.0).items()
-    }
-    arrays |= {f"s3/{part}": arrays.pop(f"sfkd/s3/{part}") for part in store.ROAD}
-    store.write_arrays(
-        tmp_path / "episodes.npz",
-        arrays | {"dt": np.asarray(0.1)},
-        kind="episodes",
-        config={},
-    )
-    store.write_json(tmp_path / "results.json", {"rows": [old]})
-    (scene,) = scenes_of(tmp_path)
-    assert (scene.label, scene.stem, list(scene.lateral)) == ("S3", "s3", ["sfkd"])
-    keep(tmp_path, ROW | {"planner": "cem"}, 2.0)
-    rows, retained = stored(tmp_path)
-    assert len(rows) == 2
-    for part in ("lateral", *store.ROAD):
-        assert np.all(retained[f"{store.drive_name(ROW)}/{part}"] == 1.0)
-    keep(tmp_path, ROW, 3.0)
-    assert json.loads((tmp_path / "results.json").read_text())["rows"] == [
-        ROW | {"planner": "cem"},
-        ROW,
-    ]
-    assert len(scenes_of(tmp_path)) == 2
 
 
 def test_drives_on_other_roads_are_other_scenes(tmp_path):

@@ -9,16 +9,14 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from composing import settings
 from helpers import last_line, run_command
-from hydra import compose, initialize_config_dir
-from omegaconf import OmegaConf
 
 import sfkd_jax
 from sfkd_jax import evaluate
-from sfkd_jax.cli import config
-from sfkd_jax.pipeline import runs, stages
+from sfkd_jax.experiment import data, runs, stages
 
-sys.path.append(str(Path(__file__).parent / "datasets"))
+sys.path.append(str(Path(__file__).parent / "data"))
 from recorded import drive, write_csv
 
 STATE = "dataset.columns.state=[p_x,p_y,yaw,v,yaw_rate]"
@@ -28,7 +26,7 @@ SMALL = (
     "dataset.path=logs",
     "dataset.steps=10",
     STATE,
-    "env_source=none",
+    "environment.source=none",
 )
 TINY = (
     "model.rank=8",
@@ -44,14 +42,6 @@ FAST = (
     "certification.horizon=5",
     "certification.attack_starts=0",
 )
-
-
-def settings(*overrides):
-    config.register()
-    with initialize_config_dir(config.conf_path(), version_base="1.3"):
-        return OmegaConf.to_container(
-            compose("config", overrides=list(overrides)), resolve=True
-        )
 
 
 @pytest.fixture(scope="module")
@@ -119,14 +109,14 @@ def test_logs_are_stored_with_their_coverage_and_only_test_drives_are_held_out(
 ):
     monkeypatch.chdir(logs.parent)
     options = settings(*SMALL)
-    dataset, _ = stages.ensure_dataset(options)
+    dataset, _ = data.ensure_dataset(data.source_of(options))
     assert [part.states.shape[1:] for part in dataset[:4]] == [(11, 5)] * 4
     assert sum(len(part.states) for part in dataset[:4]) == 8 * 12
-    held_out = stages.held_out_parts(options, dataset)
+    held_out = data.held_out_parts(data.source_of(options), dataset)
     assert set(held_out) == {"test"}
     assert held_out["test"] is dataset.test
     covered = json.loads(
-        (runs.dataset_path(options).parent / "coverage.json").read_text()
+        (data.source_of(options).path.parent / "coverage.json").read_text()
     )
     assert set(covered["state"]) == {"v", "yaw_rate"}
     assert 4.0 <= covered["state"]["v"]["low"] < covered["state"]["v"]["high"] <= 6.0
@@ -147,9 +137,9 @@ def test_logs_with_units_jumps_and_standstill_become_a_data_set(
         columns["v [km/h]"] = 3.6 * columns.pop("v")
         write_csv(tmp_path / "logs" / f"{k}.csv", columns)
     with pytest.raises(ValueError, match=r"positions move|jump"):
-        stages.ensure_dataset(settings(*SMALL))
+        data.ensure_dataset(data.source_of(settings(*SMALL)))
     cut = ("dataset.split_at_jumps=true", "dataset.min_speed=0.5")
-    dataset, _ = stages.ensure_dataset(settings(*SMALL, *cut))
+    dataset, _ = data.ensure_dataset(data.source_of(settings(*SMALL, *cut)))
     lines = capsys.readouterr().err
     assert "v [km/h] to m/s" in lines
     assert "jump 50" in lines
@@ -170,7 +160,7 @@ def test_a_step_of_the_wrong_shape_is_one_line(tmp_path, monkeypatch):
         "dataset=tiny", "vehicle=own", "vehicle.step=short_step:step", *limits
     )
     with pytest.raises(ValueError, match=r"^the step of vehicle own [^\n]*$"):
-        stages.ensure_dataset(own)
+        data.ensure_dataset(data.source_of(own))
 
 
 def test_what_logs_cannot_support_is_refused_before_a_run_is_begun(logs, monkeypatch):
@@ -179,9 +169,12 @@ def test_what_logs_cannot_support_is_refused_before_a_run_is_begun(logs, monkeyp
     with pytest.raises(ValueError, match="12 calibration segments are too few for"):
         stages.ensure_policy(options)
     with pytest.raises(
-        ValueError, match="no column friction for the environment; pass env_source=none"
+        ValueError,
+        match=r"no column friction for the environment; pass environment.source=none",
     ):
-        stages.ensure_policy(settings(*SMALL, "env_source=measured", "name=other"))
+        stages.ensure_policy(
+            settings(*SMALL, "environment.source=measured", "name=other")
+        )
     with pytest.raises(
         ValueError,
         match="vehicle=own is known from logs alone, so nothing can drive it",

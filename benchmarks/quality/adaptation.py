@@ -153,8 +153,8 @@ class Rows(NamedTuple):
     @property
     def box(self):
         """Of the environment."""
-        about = self.loaded.settings["dataset"]
-        return {side: tuple(about[side]) for side in ("env_low", "env_high")}
+        about = self.loaded.settings["environment"]
+        return {f"env_{side}": tuple(about[side]) for side in ("low", "high")}
 
     def planner(self, model, *, bounded=True):
         """The policy's own planner with another model, without a shield."""

@@ -110,7 +110,8 @@ def scripted(car, kind, onset=0):
 def planner(car, *, shield):
     """The policy's own planner."""
     box = {
-        side: car.trained.settings["dataset"][side] for side in ("env_low", "env_high")
+        f"env_{side}": car.trained.settings["environment"][side]
+        for side in ("low", "high")
     }
     settings, about = (
         car.settings | {"shield": shield},

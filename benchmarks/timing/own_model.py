@@ -17,7 +17,7 @@ def settings(*overrides):
     import hydra
     from omegaconf import OmegaConf
 
-    from sfkd_jax.cli import config
+    from sfkd_jax.experiment import command as config
 
     config.register()
     with hydra.initialize_config_dir(config.conf_path(), version_base="1.3"):
@@ -104,7 +104,7 @@ def problem(samples, horizon, seed=0, **options):
         "horizon": horizon,
         **options,
     }
-    limits = {name: args["dataset"][name] for name in ("env_low", "env_high")}
+    limits = {f"env_{side}": args["environment"][side] for side in ("low", "high")}
     controller = build.build_controller(args["controller"], model, plant, **limits)
     params, *rest = inputs(plant, model, horizon)
     params = jax.jit(partial(fold, model))(params)

@@ -25,9 +25,16 @@ def unit_space(body, controls):
     return Space(*(part(size) for size in sizes for part in (jnp.zeros, jnp.ones)))
 
 
+def box_of(settings):
+    """The box of the environment."""
+    return {f"env_{side}": settings["environment"][side] for side in ("low", "high")}
+
+
 def system_of(settings, plant):
     """Model and parameters of a row, and the law of its frame."""
-    law = build.build_law(settings["dataset"], plant)
+    law = None
+    if "law" in settings["dataset"]:
+        law = build.build_law(settings["dataset"]["law"], plant, **box_of(settings))
     (name,) = settings["evaluation"]["systems"]
     if name != "self":
         system = build.reference_systems(plant, law)[name]
@@ -45,7 +52,7 @@ def step_of(settings):
     """A control step of a row into a bend."""
     plant = build.build_vehicle(settings["vehicle"])
     model, params, law = system_of(settings, plant)
-    box = {side: settings["dataset"][side] for side in ("env_low", "env_high")}
+    box = box_of(settings)
     controller = build.build_controller(
         settings["controller"], model, plant, law=law, **box
     )

@@ -2,14 +2,27 @@
 
 from __future__ import annotations
 
+import ast
 import sys
 from importlib import import_module
+from pathlib import Path
 
-from sfkd_jax.cli import messages
-from sfkd_jax.cli.commands import COMMANDS, VERSION, module, summary
-from sfkd_jax.cli.help import USAGE, information
+from sfkd_jax import __version__
+from sfkd_jax.settings import did_you_mean
 
-COMPLETION = "completion"
+COMMANDS = (
+    "demo",
+    "train",
+    "generate",
+    "certify",
+    "evaluate",
+    "compare",
+    "report",
+    "export",
+    "doctor",
+)
+"""Modules that are commands, in the order in which they are listed."""
+VERSION = f"sfkd_jax {__version__}"
 
 
 def main() -> None:
@@ -19,37 +32,46 @@ def main() -> None:
         print(overview())
     elif command == "--version":
         print(VERSION)
-    elif command == COMPLETION:
-        # The import takes seconds, as that of a command does; the list is quick.
-        print(import_module("sfkd_jax.cli.completion").script(rest))
-    elif command in COMMANDS and (text := information(command, rest)):
-        print(text)
     elif command in COMMANDS:
-        entry = import_module("sfkd_jax.cli.entry")
+        # The imports take seconds; the list above is quick.
+        hydra_command = import_module("sfkd_jax.experiment.command").hydra_command
         sys.argv = [f"sfkd {command}", *rest]
-        entry.hydra_command(import_module(module(command)).run)()
+        hydra_command(import_module(_module(command)).run)()
     else:
-        hint = messages.did_you_mean(command, (*COMMANDS, COMPLETION))
-        sys.exit(f"sfkd_jax: unknown command {command}{hint or ';'} sfkd lists them")
+        hint = did_you_mean(command, COMMANDS) or ";"
+        sys.exit(f"sfkd_jax: unknown command {command}{hint} sfkd lists them")
 
 
 def overview() -> str:
     """Return the page that lists the commands."""
-    lines = {name: summary(name) for name in COMMANDS}
-    lines[COMPLETION] = "Print a script for the TAB key: sfkd completion bash."
-    width = max(map(len, lines))
+    width = max(map(len, COMMANDS))
     return "\n".join(
         [
             f"{VERSION}: learned dynamics with a stability certificate, driving MPPI.",
             "",
-            f"usage: sfkd COMMAND {USAGE}",
+            "usage: sfkd COMMAND [+experiment=NAME] [GROUP=OPTION] [SETTING=VALUE]",
             "",
-            *(f"  {name:{width}}  {sentence}" for name, sentence in lines.items()),
+            *(f"  {name:{width}}  {_summary(name)}" for name in COMMANDS),
             "",
-            "sfkd COMMAND --help lists the groups and their options.",
-            "python -m sfkd_jax.COMMAND does the same as sfkd COMMAND.",
+            "sfkd COMMAND --help lists groups and options, --cfg job all settings;",
+            "-sc install=bash completes words; -m seed=0,1 runs a job for each value.",
         ]
     )
+
+
+def _module(command: str) -> str:
+    """Return the name of a command's module: a package runs its `__main__`."""
+    package = Path(__file__).with_name(command) / "__main__.py"
+    return f"sfkd_jax.{command}" + (".__main__" if package.exists() else "")
+
+
+def _summary(command: str) -> str:
+    """Return the first line of a command's module docstring, without importing it."""
+    file = Path(__file__).with_name(f"{command}.py")
+    if not file.exists():
+        file = Path(__file__).with_name(command) / "__main__.py"
+    text = ast.get_docstring(ast.parse(file.read_text("utf-8"))) or ""
+    return text.split("\n")[0]
 
 
 if __name__ == "__main__":

@@ -9,8 +9,9 @@ from typing import Any
 
 from sfkd_jax import store
 from sfkd_jax.certification import CertificateStale, CertificationRefused
-from sfkd_jax.cli.entry import hydra_command
-from sfkd_jax.pipeline import certificates, runs, stages
+from sfkd_jax.experiment import runs, stages
+from sfkd_jax.experiment.command import hydra_command
+from sfkd_jax.experiment.options import Settings
 
 SECONDS = 2.3e-5
 """Training time on two cores per step, segment of the batch and time step of the
@@ -19,7 +20,7 @@ window, measured with +experiment=s3.
 
 
 @runs.exclusive
-def run(settings: dict[str, Any]) -> dict[str, Any]:
+def run(settings: Settings) -> dict[str, Any]:
     """Certify the policy of the run, which is trained if it is missing.
 
     Raises:
@@ -27,35 +28,35 @@ def run(settings: dict[str, Any]) -> dict[str, Any]:
             `certification.renew` is false.
         CertificationRefused: nothing could be certified.
     """
-    if not store.exists(runs.run_directory(settings) / "policy.npz"):
+    if not store.exists(settings.run_dir / "policy.npz"):
         store.print_message(_announcement(settings))
     trained = stages.ensure_policy(settings)
-    path = certificates.certificate_path(runs.run_directory(settings))
-    if path.exists() and not settings["certification"]["renew"]:
+    path = stages.certificate_path(settings.run_dir)
+    if path.exists() and not settings.certification.renew:
         certified = store.read_json(path).get("policy_sha256")
         if certified != trained.sha256:
             raise CertificateStale(
                 f"{path} is about other weights or settings; "
                 "certification.renew=true replaces it"
             )
-    document = certificates.certify_policy(settings)
+    document = stages.certify_policy(settings)
     if not document["valid"]:
         raise CertificationRefused(document["reason"])
-    path = certificates.certificate_path(runs.run_directory(settings))
+    path = stages.certificate_path(settings.run_dir)
     d_bar = document.get("d_bar", {"value": None})["value"]
     keys = ("valid", "alpha", "alpha_separate", "rho", "beta", "tightness", "seconds")
     summary = {"certificate": str(path), "reason": None, "d_bar": d_bar}
     return summary | {key: document.get(key) for key in keys}
 
 
-def _announcement(settings: dict[str, Any]) -> str:
+def _announcement(settings: Settings) -> str:
     """Return what happens before the certification of a policy that is not trained."""
-    options = settings["training"]
-    steps = options["steps"]
-    seconds = SECONDS * steps * options["batch"] * options["window"]
+    options = settings.training
+    steps = options.steps
+    seconds = SECONDS * steps * options.batch * options.window
     return (
-        f"{runs.run_directory(settings)} holds no trained policy: "
-        f"{settings['model']['system']} is trained first, at most {steps} steps, "
+        f"{settings.run_dir} holds no trained policy: "
+        f"{settings.model.system} is trained first, at most {steps} steps, "
         f"about {max(1, round(seconds / 60))} min on two cores; then it is certified"
     )
 

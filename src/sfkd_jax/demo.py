@@ -7,11 +7,13 @@ from pathlib import Path
 from typing import Any
 
 from sfkd_jax import build, evaluation, policy, store
-from sfkd_jax.cli.entry import hydra_command
 from sfkd_jax.evaluation.metrics import text_table
+from sfkd_jax.experiment import data, evaluating, grid
+from sfkd_jax.experiment.command import hydra_command
+from sfkd_jax.experiment.options import Settings
 from sfkd_jax.paper import animate
-from sfkd_jax.pipeline import evaluate_system, grid, runs
 from sfkd_jax.plants import Vehicle
+from sfkd_jax.settings import plain, replace
 
 SHIPPED = Path(__file__).with_name("pretrained")
 """vehicle, or vehicle_path in path coordinates -> policy.npz, its manifest and
@@ -22,7 +24,7 @@ PRINTED = ("rmse_m", "max_deviation_m", "smoothness_rad_per_s", "violation.v0")
 """Metrics of the table."""
 
 
-def run(settings: dict[str, Any]) -> dict[str, Any]:
+def run(settings: Settings) -> dict[str, Any]:
     """Simulate a shipped policy beside nominal and oracle; print a table, animate.
 
     Raises:
@@ -31,28 +33,28 @@ def run(settings: dict[str, Any]) -> dict[str, Any]:
     """
     began = time.perf_counter()
     trained = _load_shipped(settings)
-    settings = settings | {
-        "name": "demo",
-        "evaluation": settings["evaluation"] | settings["demo"],
-    }
-    plant = build.build_vehicle(settings["vehicle"])
-    episodes = evaluate_system.make_episodes(settings, plant)
-    directory = Path(settings["root"]) / settings["name"]
+    about = settings.demo
+    protocol = replace(settings.evaluation, **vars(about))
+    settings = replace(settings, name="demo", evaluation=protocol)
+    plant = build.build_vehicle(settings.vehicle)
+    episodes = evaluating.make_episodes(settings, plant)
+    directory = Path(settings.root) / settings.name
     results = directory / f"{episodes.name}_{_name(settings)}"
     with store.locked(results):
         rows = []
         for name, system in _systems(settings, plant, trained).items():
             store.print_message(
-                f"driving {settings['demo']['episodes']} x "
-                f"{settings['demo']['episode_s']:.0f} s: {name}"
+                f"driving {about.episodes} x {about.episode_s:.0f} s: {name}"
             )
-            evaluate = evaluate_system.compile_system(
-                settings, plant, name, system, None
-            )
-            path, result = results / name, evaluate(episodes)
-            rows.append(grid.write_cell(path, settings, episodes, result))
+            evaluate = evaluating.SystemEvaluation(settings, plant, name, system, None)
+            result, path = evaluate(episodes), results / name
+            rows.append(grid.write_cell(path, directory, settings, episodes, result))
         rows = evaluation.compare(rows)
-        document = {"rows": rows, "config": settings, "versions": store.versions()}
+        document = {
+            "rows": rows,
+            "config": plain(settings),
+            "versions": store.versions(),
+        }
         store.write_json(results / "results.json", document)
         for line in text_table(rows, *PRINTED):
             store.print_message(line)
@@ -67,20 +69,22 @@ def run(settings: dict[str, Any]) -> dict[str, Any]:
     }
 
 
-def _name(settings: dict[str, Any]) -> str:
+def _name(settings: Settings) -> str:
     """Return the name of the shipped policy for these settings."""
-    return settings["vehicle"]["name"] + ALONG_PATH * runs.is_along_path(settings)
+    return settings.vehicle.name + ALONG_PATH * bool(
+        data.source_of(settings).along_path
+    )
 
 
 def _systems(
-    settings: dict[str, Any], plant: Vehicle, trained: policy.Policy
+    settings: Settings, plant: Vehicle, trained: policy.Policy
 ) -> dict[str, build.System]:
     """Return the policy and the two references that it is compared with."""
     references = build.reference_systems(plant, trained.law)
     own = build.System(
         trained.model,
         trained.params,
-        settings["env_source"],
+        settings.environment.source,
         trained.certificate,
         trained.law,
     )
@@ -91,22 +95,22 @@ def _systems(
     }
 
 
-def _load_shipped(settings: dict[str, Any]) -> policy.Policy:
+def _load_shipped(settings: Settings) -> policy.Policy:
     """Return the policy for a vehicle, with its verified certificate."""
-    if settings["env_source"] == "none":
+    if settings.environment.source == "none":
         raise ValueError(
             "the controllers that ship read the environment; "
-            "choose env_source=measured or env_source=estimated"
+            "choose environment=measured or environment=estimated"
         )
     name = _name(settings)
     shipped = sorted(entry.name for entry in SHIPPED.iterdir() if entry.is_dir())
     began = time.perf_counter()
     trained = (
-        policy.load(SHIPPED / name, controller=settings["controller"])
+        policy.load(SHIPPED / name, controller=plain(settings.controller))
         if name in shipped
         else None
     )
-    if trained is None or trained.settings["vehicle"] != settings["vehicle"]:
+    if trained is None or trained.settings["vehicle"] != plain(settings.vehicle):
         known = " and ".join(one for one in shipped if not one.endswith(ALONG_PATH))
         raise ValueError(
             f"controllers ship for {known} as they are; for another vehicle run train"

@@ -13,7 +13,8 @@ import jax
 import jax.numpy as jnp
 
 from sfkd_jax import store
-from sfkd_jax.cli.entry import hydra_command
+from sfkd_jax.experiment.command import hydra_command
+from sfkd_jax.experiment.options import Settings
 
 CORE = (
     "jax",
@@ -45,7 +46,7 @@ NEEDED_MB = 500
 """Size of the data set, checkpoints and reports of one experiment, at most."""
 
 
-def run(settings: dict[str, Any]) -> dict[str, Any]:
+def run(settings: Settings) -> dict[str, Any]:
     """Print and return the state of the installation, with advice.
 
     Raises:
@@ -63,7 +64,7 @@ def run(settings: dict[str, Any]) -> dict[str, Any]:
             f"extra {name}: {reason or 'works'}"
             + (f'; pip install "sfkd-jax[{name}]"' if reason else "")
         )
-    advice = _advice(Path(settings["root"]), devices)
+    advice = _advice(Path(settings.root), devices)
     for line in advice:
         print(f"advice: {line}")
     working = [name for name, reason in extras.items() if reason is None]
@@ -148,11 +149,6 @@ def _advice(root: Path, devices: list[str]) -> list[str]:
         lines.append(
             f"{free} MB are free below {directory}; "
             f"an experiment needs up to {NEEDED_MB}"
-        )
-    if "JAX_COMPILATION_CACHE_DIR" not in os.environ:
-        lines.append(
-            "set JAX_COMPILATION_CACHE_DIR to a directory, so that later runs "
-            "do not compile again"
         )
     if all(device.startswith("cpu") for device in devices) and shutil.which(
         "nvidia-smi"

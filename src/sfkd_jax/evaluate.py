@@ -4,23 +4,26 @@ from __future__ import annotations
 
 from typing import Any
 
-from hydra.core.hydra_config import HydraConfig
+from sfkd_jax import build
+from sfkd_jax.experiment import stages
+from sfkd_jax.experiment.command import command_line, hydra_command
+from sfkd_jax.experiment.evaluating import evaluate_run
+from sfkd_jax.experiment.options import Settings
+from sfkd_jax.plants import check_step
 
-from sfkd_jax.cli.config import command_line
-from sfkd_jax.cli.entry import hydra_command
-from sfkd_jax.pipeline.evaluate_run import evaluate_run
 
-
-def run(settings: dict[str, Any]) -> dict[str, Any]:
+def run(settings: Settings) -> dict[str, Any]:
     """Evaluate the systems of the run and add their rows to its results.
 
     Raises:
         ValueError: there is no system to evaluate.
     """
-    if not settings["evaluation"]["systems"]:
+    if not settings.evaluation.systems:
         raise ValueError("evaluation.systems is empty: there is nothing to evaluate")
-    typed = command_line("evaluate") if HydraConfig.initialized() else None
-    return evaluate_run(settings, command=typed)
+    plant = build.build_vehicle(settings.vehicle)
+    check_step(plant)
+    stages.check_settings(settings, plant)
+    return evaluate_run(settings, command=command_line("evaluate"))
 
 
 if __name__ == "__main__":

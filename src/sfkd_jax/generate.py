@@ -5,17 +5,19 @@ from __future__ import annotations
 import time
 from typing import Any
 
-from sfkd_jax.cli.entry import hydra_command
-from sfkd_jax.pipeline import runs, stages
+from sfkd_jax.experiment import data
+from sfkd_jax.experiment.command import hydra_command
+from sfkd_jax.experiment.options import Settings
 
 
-def run(settings: dict[str, Any]) -> dict[str, Any]:
+def run(settings: Settings) -> dict[str, Any]:
     """Make the data set, unless it is stored already."""
     began = time.perf_counter()
-    dataset, _ = stages.ensure_dataset(settings)
+    source = data.source_of(settings)
+    dataset, _ = data.ensure_dataset(source)
     return {
-        "dataset": str(runs.dataset_path(settings)),
-        "segments": sum(len(getattr(dataset, part).controls) for part in runs.PARTS),
+        "dataset": str(source.path),
+        "segments": sum(len(getattr(dataset, part).controls) for part in data.PARTS),
         "seconds": time.perf_counter() - began,
     }
 

@@ -165,7 +165,9 @@ def load(
     trained = restore(path)
     file = _file(path)
     certificate, reason = read_certificate(path, trained)
-    settings: dict[str, Any] = trained.settings | {"env_source": env_source}
+    settings: dict[str, Any] = trained.settings | {
+        "environment": trained.settings["environment"] | {"source": env_source}
+    }
     # A ValueError is about the file, unless the caller asked for something else.
     errors: tuple[type[Exception], ...] = (ValueError,)
     if controller is not None or env_source != "measured" or adaptive:
@@ -175,13 +177,13 @@ def load(
     with store.as_artefact_error(
         file.with_suffix(".json"), *errors, advice=_advice(trained.version)
     ):
-        options, box = settings["controller"], settings["dataset"]
+        options, box = settings["controller"], settings["environment"]
         planner = build.build_controller(
             options,
             trained.model,
             trained.vehicle,
-            env_low=box["env_low"],
-            env_high=box["env_high"],
+            env_low=box["low"],
+            env_high=box["high"],
             env_source=env_source,
             certificate=certificate,
             law=trained.law,

@@ -7,21 +7,21 @@ from pathlib import Path
 from typing import Any
 
 from sfkd_jax import store
-from sfkd_jax.cli.entry import hydra_command
+from sfkd_jax.experiment.command import hydra_command
+from sfkd_jax.experiment.options import Settings
 from sfkd_jax.paper import beside_the_paper, write_comparison
-from sfkd_jax.pipeline import runs
 from sfkd_jax.reporting import write_report
 
 
-def run(settings: dict[str, Any]) -> dict[str, Any]:
+def run(settings: Settings) -> dict[str, Any]:
     """Write the report of the run, or of all runs that `report.compare` matches."""
-    pattern = settings["report"]["compare"]
-    directory = Path(settings["root"]) if pattern else runs.run_directory(settings)
+    pattern = settings.report.compare
+    directory = Path(settings.root) if pattern else settings.run_dir
     # A lock would make a directory that does not exist.
     exclusive = store.locked(directory) if directory.exists() else nullcontext()
     with exclusive, store.as_artefact_error(directory):
         pages = (
-            write_comparison(directory, pattern, settings["name"])
+            write_comparison(directory, pattern, settings.name)
             if pattern
             else write_report(directory, studies=beside_the_paper)
         )

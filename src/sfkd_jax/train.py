@@ -6,47 +6,44 @@ import time
 from pathlib import Path
 from typing import Any
 
-from hydra.core.hydra_config import HydraConfig
-
 from sfkd_jax import build, store
-from sfkd_jax.cli.config import command_line
-from sfkd_jax.cli.entry import hydra_command
+from sfkd_jax.experiment import runs, stages
+from sfkd_jax.experiment.command import command_line, hydra_command
+from sfkd_jax.experiment.evaluating import evaluate_run
+from sfkd_jax.experiment.options import Settings
 from sfkd_jax.paper import beside_the_paper
-from sfkd_jax.pipeline import certificates, dry_run, runs, stages
-from sfkd_jax.pipeline.evaluate_run import evaluate_run
 from sfkd_jax.plants import check_step
 from sfkd_jax.reporting import write_report
 
 
-def run(settings: dict[str, Any]) -> dict[str, Any]:
+def run(settings: Settings) -> dict[str, Any]:
     """Make data, policy, certificate, closed-loop results and report of a run.
 
     A vehicle without a step function is not evaluated in closed loop. With
     `evaluation.systems=[]` the model is trained alone, as a search needs it.
     """
     began = time.perf_counter()
-    plant = build.build_vehicle(settings["vehicle"])
+    plant = build.build_vehicle(settings.vehicle)
     if plant.simulated:
         check_step(plant)
-    dry_run.check_settings(settings, plant)
+    stages.check_settings(settings, plant)
     document = _run_stages(settings)
     return document | {"seconds": time.perf_counter() - began}
 
 
 @runs.exclusive
-def _run_stages(settings: dict[str, Any]) -> dict[str, Any]:
+def _run_stages(settings: Settings) -> dict[str, Any]:
     """Run all stages in the run directory."""
-    stages.ensure_policy(settings)
-    run_dir = runs.run_directory(settings)
-    trained = _about_training(run_dir)
-    if not settings["evaluation"]["systems"]:
-        return trained
-    certificate = certificates.certify_policy(settings)
-    if build.build_vehicle(settings["vehicle"]).simulated:
-        typed = command_line("train") if HydraConfig.initialized() else None
-        results = evaluate_run(settings, command=typed)["results"]
+    trained = stages.ensure_policy(settings)
+    run_dir = settings.run_dir
+    about = _about_training(run_dir)
+    if not settings.evaluation.systems:
+        return about
+    certificate = stages.certify_policy(settings)
+    results = None
+    if trained.vehicle.simulated:
+        results = evaluate_run(settings, command=command_line("train"))["results"]
     else:
-        results = None
         store.print_message(
             "not driven: vehicle=own is known from logs alone; "
             "vehicle.step=package.module:function drives it"
@@ -54,8 +51,8 @@ def _run_stages(settings: dict[str, Any]) -> dict[str, Any]:
     with store.as_artefact_error(run_dir):
         pages = write_report(run_dir, studies=beside_the_paper)
     store.print_message(f"report: {pages['report']}")
-    return trained | {
-        "certificate": str(certificates.certificate_path(run_dir)),
+    return about | {
+        "certificate": str(stages.certificate_path(run_dir)),
         "results": results,
         "report": pages["report"],
         "alpha": certificate.get("alpha"),

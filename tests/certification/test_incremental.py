@@ -9,9 +9,8 @@ import hypothesis.strategies as st
 import jax
 import numpy as np
 import pytest
+from composing import settings
 from helpers import ENV_HIGH, ENV_LOW, jit, model_and_params, space
-from hydra import compose, initialize_config_dir
-from omegaconf import OmegaConf
 
 from sfkd_jax import build, certification, certify, models, policy, store
 from sfkd_jax.certification import (
@@ -24,8 +23,8 @@ from sfkd_jax.certification import (
     incremental_rate,
     is_incremental,
 )
-from sfkd_jax.cli import config
-from sfkd_jax.pipeline import certificates, runs
+from sfkd_jax.experiment import runs, stages
+from sfkd_jax.settings import plain
 from sfkd_jax.types import Declared, Incremental, Structure
 
 
@@ -236,28 +235,23 @@ def test_no_certificate_of_steps_is_given_for_a_flow_and_none_of_a_flow_for_step
 
 def untrained(name="control_synth"):
     """Settings of a run with an untrained policy in its directory."""
-    config.register()
-    with initialize_config_dir(config.conf_path(), version_base="1.3"):
-        composed = compose("config", overrides=["+experiment=smoke", f"model={name}"])
-    settings = OmegaConf.to_container(composed, resolve=True)
-    plant = build.build_vehicle(settings["vehicle"])
-    params = jit(build.build_model(settings["model"], space(), plant).init)(
+    requested = settings("+experiment=smoke", f"model={name}")
+    plant = build.build_vehicle(requested.vehicle)
+    params = jit(build.build_model(requested.model, space(), plant).init)(
         jax.random.key(0)
     )
-    saved = settings | {"space": build.space_to_settings(space())}
-    runs.claim(settings)
-    policy.save(
-        runs.run_directory(settings) / "policy.npz", params, saved, made_from={}
-    )
-    return settings
+    saved = plain(requested) | {"space": build.space_to_settings(space())}
+    runs.claim(requested)
+    policy.save(requested.run_dir / "policy.npz", params, saved, made_from={})
+    return requested
 
 
 def test_the_door_writes_the_rate_apart_from_certificates_of_steps(
     tmp_path, monkeypatch
 ):
     monkeypatch.chdir(tmp_path)
-    settings = untrained()
-    printed = certify.run(settings)
+    requested = untrained()
+    printed = certify.run(requested)
     file = tmp_path / printed["certificate"]
     document = json.loads(file.read_text())
     assert printed["valid"]
@@ -275,5 +269,5 @@ def test_the_door_writes_the_rate_apart_from_certificates_of_steps(
     assert document["weights_sha256"] == policy.restore(file.parent).weights_sha256
     store.write_json(file, document | {"policy_sha256": "others"})
     with pytest.raises(CertificateStale, match="other weights"):
-        certify.run(settings)
-    assert certificates.certify_policy(settings)["alpha"] == document["alpha"]
+        certify.run(requested)
+    assert stages.certify_policy(requested)["alpha"] == document["alpha"]

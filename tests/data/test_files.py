@@ -168,7 +168,7 @@ def test_an_unknown_environment_becomes_a_constant(tmp_path):
     assert together(logged.dataset)[2].shape == (30, STEPS, 2)
     assert not together(logged.dataset)[2].any()
     assert logged.coverage["environment"] == {}
-    assert np.all(np.asarray(logged.dataset.env_high) >= 1e6)  # nothing can be outside
+    assert np.all(np.asarray(logged.environment.high) >= 1e6)  # nothing can be outside
 
 
 @pytest.mark.parametrize("period", [0.01, 0.03, 0.04])
@@ -326,7 +326,7 @@ WRONG = {
     ),
     "missing e": (
         lambda c: c.pop("wind"),
-        "no column wind for the environment; pass env_source=none, or map",
+        "no column wind for the environment; pass environment.source=none, or map",
     ),
 }
 
@@ -389,7 +389,7 @@ ARRAYS = {
     ),
     "no e": (
         {"x": np.zeros((2, 5, 4)), "u": np.zeros((2, 4, 2))},
-        "no column e for the environment; pass env_source=none",
+        "no column e for the environment; pass environment.source=none",
     ),
 }
 
@@ -458,7 +458,7 @@ def test_contents_decide_which_data_set_it_is(tmp_path):
             "dataset.columns.control must name two columns, got 1",
         ),
         (Columns(environment=("friction", "v")), "dataset.columns names v twice"),
-        (Columns(environment=()), "pass env_source=none"),
+        (Columns(environment=()), "pass environment.source=none"),
     ],
 )
 def test_invalid_columns_are_refused(tmp_path, columns, message):

@@ -10,11 +10,11 @@ import pytest
 from helpers import driven, jit, space, tiny
 
 from sfkd_jax import models
+from sfkd_jax.experiment import stages
 from sfkd_jax.models._identification import bounded_ridge, ridge_regression
 from sfkd_jax.models.sfkd import bounded
 from sfkd_jax.models.sfkd._bounds import attainable, unbounded
 from sfkd_jax.models.sfkd._budget import budget_factors
-from sfkd_jax.pipeline import train_policy
 from sfkd_jax.rollout import defects
 
 RIDGE, BOUND, RANK = 1e-3, 0.7, 4
@@ -166,11 +166,11 @@ def test_a_start_that_a_model_does_not_have_is_refused_by_name():
     with pytest.raises(
         ValueError, match=r"training\.start=identified needs a model=sfkd"
     ):
-        train_policy.with_start(blind, "identified", data, 0)
+        stages.with_start(blind, "identified", data, 0)
     with pytest.raises(
         ValueError,
         match=r"training\.start must be one of random, identified, got 'identfied'",
     ):
-        train_policy.with_start(ours, "identfied", data, 0)
-    assert train_policy.with_start(blind, "random", data, 0) is blind
-    assert train_policy.with_start(ours, "identified", data, 0).init is not ours.init
+        stages.with_start(ours, "identfied", data, 0)
+    assert stages.with_start(blind, "random", data, 0) is blind
+    assert stages.with_start(ours, "identified", data, 0).init is not ours.init

@@ -102,7 +102,7 @@ def test_signals_save_a_checkpoint_within_5_s_and_the_end_is_that_of_an_unbroken
 
 COMMAND = """
 import os, signal, time
-from sfkd_jax.cli.entry import hydra_command
+from sfkd_jax.experiment.command import hydra_command
 
 def run(settings):
     os.kill(os.getpid(), signal.SIGINT)

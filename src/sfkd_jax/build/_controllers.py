@@ -1,42 +1,188 @@
-"""Controllers from plain settings."""
+"""Controllers from their settings: the planners, and what is built around them."""
 
 from __future__ import annotations
 
-from typing import Any
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any, NamedTuple
 
 from sfkd_jax import control, plants
-from sfkd_jax.build._choices import Settings, as_kwargs
-from sfkd_jax.build._planners import PLANNERS, chosen_planner, controller_horizon
 from sfkd_jax.geometry import LATERAL
 from sfkd_jax.rollout import with_offset
+from sfkd_jax.settings import Kinds, Values, arguments, choose, parse, schema
 from sfkd_jax.types import Controller, Model
 
+ENV_SOURCES = ("measured", "estimated", "none")
+"""Where a controller takes the environment from."""
 ROAD_MARGIN = 0.05
 """Relative enlargement of the box of κ and v_ref, since the curvature of a reference is
 computed from its points.
 """
 ALLOWANCE = 3.0
 """Standard deviations of a measured position by which the tube is enlarged."""
-ENV_SOURCES = ("measured", "estimated", "none")
-"""Where a controller takes the environment from."""
-_NAMES = frozenset(
-    (
-        *PLANNERS,
-        *("name", "planner", "sampling", "ancillary", "feedback", "model_law"),
-        *("task", "cost", "shield", "adaptive", "adaptation", "online_tube"),
-    )
+
+
+class Planner(NamedTuple):
+    """A planner, and whose arguments are its settings.
+
+    Attributes:
+        factories: their keyword-only arguments are the settings `controller.NAME`.
+        given: of these arguments, those that are decided elsewhere.
+        samples: whether it searches around a law (`controller.sampling`).
+    """
+
+    factories: tuple[Callable[..., Controller], ...]
+    given: tuple[str, ...] = ()
+    samples: bool = True
+
+
+_IN_PROGRAMS = ("several", "info_level", "sharding", "unroll")
+"""Of programs that build their own planner."""
+_WEIGHTS = ("effective_samples", "temperature")
+"""Of the weighted mean, which only MPPI takes."""
+_COST = (
+    "lateral",
+    "course",
+    "speed",
+    "steering_rate",
+    "effort",
+    "terminal_weight",
 )
-"""Settings of a controller."""
+"""Of the cost, which all planners share."""
+PLANNERS = {
+    "mppi": Planner((control.mppi, control.planner), _IN_PROGRAMS),
+    "cem": Planner((control.cem, control.planner), (*_IN_PROGRAMS, *_WEIGHTS)),
+    "gradient": Planner(
+        (control.gradient_planner, control.planner), (*_IN_PROGRAMS, *_WEIGHTS)
+    ),
+    "koopman_mpc": Planner((control.koopman_mpc,), _COST, samples=False),
+}
+"""Planners by the name under which a controller's settings hold their own."""
+_BY_PLANT = (
+    "dt",
+    "wheelbase",
+    "speed_loop",
+    "control_low",
+    "control_high",
+    "env_low",
+    "env_high",
+    "actuator",
+)
+"""Arguments of controllers that the vehicle and the environment decide."""
+_CHANNELS = {"noise_std": 2, "control_rate": 2}
+"""One entry for each of the two controls."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class ControllerSettings(Kinds):
+    """A planner under a cost.
+
+    Attributes:
+        name: of its rows.
+        planner: its name in `PLANNERS`; `controller.PLANNER` are its own settings.
+        sampling: "feedback" around the path-following law, "model" around that of the
+            model, "plain" around nothing, "law" around that of the path coordinates.
+        cost: of `control.tracking_cost`.
+        task: of `control.path_tracking`.
+    """
+
+    name: str
+    planner: str = "mppi"
+    sampling: str | None = None
+    cost: Any = None
+    task: Any = None
+
+    @classmethod
+    def kind_of(cls, values: Values) -> type:
+        """Return the dataclass of the planner of this name."""
+        name = values.get("planner", "mppi")
+        kind = choose(CONTROLLER_SETTINGS, name, "controller.planner")
+        if name not in values:
+            raise ValueError(
+                f"controller.planner={name} needs the settings controller.{name}; "
+                f"choose the option controller={name}"
+            )
+        return kind
+
+    @property
+    def own(self) -> Any:
+        """The settings of the planner itself."""
+        return getattr(self, self.planner)
+
+    @property
+    def horizon(self) -> int:
+        """How many steps of the reference the controller reads."""
+        return self.own.horizon
+
+
+@dataclass(frozen=True, kw_only=True)
+class SearchSettings(ControllerSettings):
+    """A planner that searches around a law, and what is built around it.
+
+    Attributes:
+        ancillary: whether the law of the model corrects between plan and prediction.
+        shield: whether plans are kept inside the corridor of a certificate.
+        adaptive: whether unmeasured forces are estimated while driving.
+    """
+
+    ancillary: bool = False
+    shield: bool = False
+    adaptive: bool = False
+    feedback: Any = None
+    model_law: Any = None
+    adaptation: Any = None
+    online_tube: Any = None
+
+
+def _controller_schema(name: str, planner: Planner) -> type:
+    """One dataclass a planner: its own settings, and those of what is around it."""
+    skip, given = (*_BY_PLANT, *planner.given), _BY_PLANT
+    parts: dict[str, Any] = {
+        name: schema("Planner", None, *planner.factories, skip=skip, entries=_CHANNELS),
+        "cost": schema("Cost", None, control.tracking_cost, skip=given),
+    }
+    # A quadratic program has no rate limits and no latent states in its task.
+    unused = () if planner.samples else ("control_rate", "latent_weight")
+    parts["task"] = schema(
+        "Task",
+        None,
+        control.path_tracking,
+        skip=(*given, "ancillary", *unused),
+        entries=_CHANNELS,
+    )
+    if not planner.samples:
+        return schema("Controller", ControllerSettings, **parts)
+    wrappers = {
+        "feedback": (control.path_feedback, ()),
+        "model_law": (control.ModelLaw, ()),
+        "adaptation": (control.adaptive, ("coordinates", "estimate_env")),
+        "online_tube": (control.online_tube, ("horizon",)),
+    }
+    parts |= {
+        part: schema(part.title(), None, factory, skip=(*given, *decided))
+        for part, (factory, decided) in wrappers.items()
+    }
+    return schema("Controller", SearchSettings, **parts)
+
+
+CONTROLLER_SETTINGS: dict[str, type] = {
+    name: _controller_schema(name, planner) for name, planner in PLANNERS.items()
+}
+
+
+def controller_horizon(settings: ControllerSettings | Values) -> int:
+    """Return how many steps of the reference a controller reads."""
+    return parse(ControllerSettings, settings, "controller.").horizon
 
 
 def build_controller(
-    settings: Settings,
+    settings: ControllerSettings | Values,
     model: Model,
     plant: plants.Vehicle,
     *,
-    env_low: Any = None,
-    env_high: Any = None,
-    certificate: Settings | None = None,
+    env_low: Sequence[float] | None = None,
+    env_high: Sequence[float] | None = None,
+    certificate: Mapping[str, Any] | None = None,
     env_source: str = "measured",
     law: control.PathLaw | None = None,
     adaptive: bool = False,
@@ -49,7 +195,7 @@ def build_controller(
         plant: vehicle, whose limits the controls keep.
         env_low: lower ends of the environment box E.
         env_high: upper ends of E.
-        certificate: with a corridor and `settings["shield"]`, of a shield.
+        certificate: with a corridor and `settings.shield`, of a shield.
         env_source: one of `ENV_SOURCES`; "estimated" needs path coordinates.
         law: that a model in path coordinates was learned around.
         adaptive: whether a controller along a path estimates unmeasured forces and
@@ -58,40 +204,118 @@ def build_controller(
             it always does.
 
     Raises:
-        ValueError: an unknown planner or setting, a vehicle without limits of its
-            controls, a model and a planner in different coordinates, or an estimate or
-            adaptation without path coordinates.
+        ValueError: an unknown planner, a vehicle without limits of its controls, a
+            model and a planner in different coordinates, or adaptation without path
+            coordinates.
     """
+    settings = parse(ControllerSettings, settings, "controller.")
     if not plant.control_low:
         raise ValueError(
             "a controller needs vehicle.control_low and vehicle.control_high, "
             "as in [-0.4,-3.0]"
         )
-    # A setting that nothing reads could be one that somebody relies on.
-    if unknown := sorted(settings.keys() - _NAMES):
-        raise ValueError(f"unknown setting controller.{unknown[0]}")
-    build = chosen_planner(settings).build
+    box = {
+        "env_low": None if env_low is None else tuple(map(float, env_low)),
+        "env_high": None if env_high is None else tuple(map(float, env_high)),
+    }
+    searches = settings if isinstance(settings, SearchSettings) else None
+    adaptive |= searches is not None and searches.adaptive
     if model.along_path:
-        if settings["sampling"] != "law" or law is None:
+        if searches is None or searches.sampling != "law" or law is None:
             raise ValueError(
                 "a model in path coordinates needs controller.sampling=law and its law"
             )
-        adaptive |= settings.get("adaptive", False) or env_source == "estimated"
+        # Whoever estimates e learns the unmeasured forces with the same filter.
+        adaptive |= env_source == "estimated"
         planned = with_offset(model) if adaptive else model
-        planner = build(settings, planned, plant, env_low, env_high, law)
-        if certificate and certificate.get("corridor") and settings.get("shield"):
+        planner = _searching(searches, planned, plant, box, law)
+        if certificate and certificate.get("corridor") and searches.shield:
             planner = in_corridor(planner, planned, plant, law, certificate)
         if not adaptive:
             return planner
-        box = env_low, env_high
-        return _adaptive(planner, settings, model, plant, law, box, env_source)
+        estimates = env_source == "estimated"
+        return _adaptive(planner, searches, model, plant, law, box, estimates)
     if env_source == "estimated":
         raise ValueError(
-            "env_source=estimated needs a model in path coordinates: model.frame=path"
+            "environment.source=estimated needs a model in path coordinates: "
+            "model.frame=path"
         )
-    if adaptive or settings.get("adaptive"):
+    if adaptive:
         raise ValueError("adaptation needs a model in path coordinates")
-    return build(settings, model, plant, env_low, env_high)
+    if searches is None:
+        return _koopman_mpc(settings, model, plant, box)
+    return _searching(searches, model, plant, box, None)
+
+
+def _searching(
+    settings: SearchSettings,
+    model: Model,
+    plant: plants.Vehicle,
+    box: Mapping[str, Any],
+    law: control.PathLaw | None,
+) -> Controller:
+    """Return a planner that searches around a feedback law.
+
+    The law is the path-following one (`sampling: feedback`), that of the model
+    (`sampling: model`) or none (`sampling: plain`). In path coordinates it is the law
+    of the policy, which the model contains (`sampling: law`).
+    """
+    cost = control.tracking_cost(
+        dt=plant.dt,
+        speed_loop=plant.speed_loop,
+        **arguments(settings.cost, control.tracking_cost),
+    )
+    limits = {
+        "dt": plant.dt,
+        "control_low": plant.control_low,
+        "control_high": plant.control_high,
+    }
+    if law is not None:
+        options = arguments(settings.task, control.following_law)
+        task = control.following_law(model, cost, law, **limits, **options)
+    else:
+        model_law = control.ModelLaw(
+            dt=plant.dt, **arguments(settings.model_law, control.ModelLaw)
+        )
+        laws = {
+            "feedback": control.path_feedback(
+                wheelbase=plant.wheelbase,
+                speed_loop=plant.speed_loop,
+                **arguments(settings.feedback, control.path_feedback),
+            ),
+            "model": model_law,
+            "plain": control.no_feedback(speed_loop=plant.speed_loop),
+        }
+        task = control.path_tracking(
+            model,
+            cost,
+            choose(laws, settings.sampling, "controller.sampling"),
+            **limits,
+            ancillary=model_law if settings.ancillary else None,
+            **arguments(settings.task, control.path_tracking),
+        )
+    factories = PLANNERS[settings.planner].factories
+    return factories[0](task, **box, **arguments(settings.own, *factories))
+
+
+def _koopman_mpc(
+    settings: ControllerSettings,
+    model: Model,
+    plant: plants.Vehicle,
+    box: Mapping[str, Any],
+) -> Controller:
+    """Return a quadratic program over a linear predictor, with the planners' cost."""
+    return control.koopman_mpc(
+        model,
+        dt=plant.dt,
+        control_low=plant.control_low,
+        control_high=plant.control_high,
+        speed_loop=plant.speed_loop,
+        terminal_weight=settings.task.terminal_weight,
+        **box,
+        **arguments(settings.cost, control.tracking_cost),
+        **arguments(settings.own, control.koopman_mpc),
+    )
 
 
 def in_corridor(
@@ -99,7 +323,7 @@ def in_corridor(
     model: Model,
     plant: plants.Vehicle,
     law: control.PathLaw,
-    certificate: Settings,
+    certificate: Mapping[str, Any],
 ) -> Controller:
     """Return the planner with a shield that keeps the corridor of a certificate.
 
@@ -120,10 +344,8 @@ def in_corridor(
     allowance = ALLOWANCE * max(sensors[:2], default=0.0)
     edge = corridor["corridor_m"] + allowance
     state_low, state_high = (list(side) for side in boxes["state"])
-    state_low[LATERAL], state_high[LATERAL] = (
-        min(state_low[LATERAL], -edge),
-        max(state_high[LATERAL], edge),
-    )
+    state_low[LATERAL] = min(state_low[LATERAL], -edge)
+    state_high[LATERAL] = max(state_high[LATERAL], edge)
     return control.shielded(
         planner,
         model,
@@ -145,15 +367,15 @@ def in_corridor(
 
 def _adaptive(
     planner: Controller,
-    settings: Settings,
+    settings: SearchSettings,
     model: Model,
     plant: plants.Vehicle,
     law: control.PathLaw,
-    box: tuple[Any, Any],
-    env_source: str,
+    box: Mapping[str, Any],
+    estimate_env: bool,
 ) -> Controller:
-    if box[0] is None or box[1] is None:
-        raise ValueError("adaptation needs env_low and env_high")
+    if None in box.values():
+        raise ValueError("adaptation needs environment.low and environment.high")
     adaptive = control.adaptive(
         planner,
         model,
@@ -161,13 +383,9 @@ def _adaptive(
         coordinates=len(plant.state_names) - 1,
         control_low=plant.control_low,
         control_high=plant.control_high,
-        env_low=tuple(box[0]),
-        env_high=tuple(box[1]),
-        estimate_env=env_source == "estimated",
-        **as_kwargs(settings.get("adaptation", {})),
+        **box,
+        estimate_env=estimate_env,
+        **arguments(settings.adaptation, control.adaptive),
     )
-    return control.online_tube(
-        adaptive,
-        horizon=controller_horizon(settings),
-        **as_kwargs(settings.get("online_tube", {})),
-    )
+    options = arguments(settings.online_tube, control.online_tube)
+    return control.online_tube(adaptive, horizon=settings.horizon, **options)

@@ -1,18 +1,29 @@
-"""Build vehicles, models, scenarios and drivers from plain settings."""
+"""Vehicles, scenarios, models, laws and compared systems from their settings."""
 
 from __future__ import annotations
 
 import inspect
 import sys
-from collections.abc import Mapping
-from typing import Any
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from functools import partial
+from typing import Annotated, Any, NamedTuple
 
 import jax.numpy as jnp
 
 from sfkd_jax import control, models, plants, scenarios
-from sfkd_jax import data as datasets
-from sfkd_jax.build._choices import Settings, as_kwargs, choose
-from sfkd_jax.types import Control, Model, Reference, Space, State
+from sfkd_jax.data import Driver
+from sfkd_jax.ranges import Positive
+from sfkd_jax.settings import (
+    BelowRoot,
+    Kinds,
+    Values,
+    arguments,
+    choose,
+    parse,
+    schema,
+)
+from sfkd_jax.types import Control, Environment, Model, Reference, Space, State
 
 PLANTS = {
     "kinematic": plants.kinematic,
@@ -23,33 +34,132 @@ PLANTS = {
 MODELS = models.FACTORIES | {"own": models.own}
 """Models of settings: those of the package, and one from outside by name."""
 INNER_LOOPS = ("none", "speed")
+Directory = Annotated[str, BelowRoot()]
 
 
-def build_vehicle(settings: Settings) -> plants.Vehicle:
+@dataclass(frozen=True, kw_only=True)
+class VehicleSettings(Kinds):
+    """A vehicle with its inner loop; the other fields are arguments of its factory."""
+
+    name: str
+    dt: Positive = 0.1
+    inner_loop: str = "none"
+    speed_gain: Positive = 1.0
+
+    @classmethod
+    def kind_of(cls, values: Values) -> type:
+        """Return the dataclass of the vehicle of this name."""
+        return choose(VEHICLES, values.get("name"), "vehicle")
+
+
+@dataclass(frozen=True, kw_only=True)
+class OwnVehicleSettings(VehicleSettings):
+    """An own vehicle, with its step as package.module:function."""
+
+    step: str | None = None
+
+
+VEHICLES: dict[str, type] = {
+    name: schema("Vehicle", OwnVehicleSettings, plant, skip=("step",))
+    if name == "own"
+    else schema("Vehicle", VehicleSettings, plant, skip=("stiffness_by_friction",))
+    for name, plant in PLANTS.items()
+}
+
+
+def build_vehicle(settings: VehicleSettings | Values) -> plants.Vehicle:
     """Return the vehicle of the settings, with its inner loop.
 
     Raises:
         ValueError: an unknown vehicle or inner loop, or a step that does not exist.
     """
-    loop = settings["inner_loop"]
-    if loop not in INNER_LOOPS:
+    settings = parse(VehicleSettings, settings, "vehicle.")
+    if settings.inner_loop not in INNER_LOOPS:
         raise ValueError(
-            f"unknown vehicle.inner_loop {loop!r}; "
+            f"unknown vehicle.inner_loop {settings.inner_loop!r}; "
             f"choose one of {', '.join(INNER_LOOPS)}"
         )
-    factory = choose(PLANTS, settings["name"], "vehicle")
-    options = as_kwargs(settings, "name", "inner_loop", "speed_gain")
+    factory: Callable[..., plants.Vehicle] = PLANTS[settings.name]
+    options = arguments(settings, factory)
     if options.get("step") is not None:
         options["step"] = plants.step_named(options["step"])
     plant = factory(**options)
+    # Only the speed loop changes what the second control means.
     return (
-        plants.with_speed_loop(plant, gain=settings["speed_gain"])
-        if loop == "speed"
+        plants.with_speed_loop(plant, gain=settings.speed_gain)
+        if settings.inner_loop == "speed"
         else plant
     )
 
 
-def build_model(settings: Settings, space: Space, plant: plants.Vehicle) -> Model:
+@dataclass(frozen=True, kw_only=True)
+class ScenarioSettings(Kinds):
+    """Friction, wind and road; the other fields are arguments of `scenario`."""
+
+    name: str
+
+    @classmethod
+    def kind_of(cls, values: Values) -> type:
+        """Return the one dataclass."""
+        return SCENARIO
+
+
+SCENARIO: type = schema(
+    "Scenario",
+    ScenarioSettings,
+    scenarios.scenario,
+    skip=("state_size", "dt", "duration"),
+)
+
+
+def build_scenario(
+    settings: ScenarioSettings | Values, plant: plants.Vehicle, *, duration: float
+) -> scenarios.Family:
+    """Return the scenario family of the settings.
+
+    Args:
+        settings: the name of the family and its arguments.
+        plant: the vehicle that will drive.
+        duration: of an episode [s].
+    """
+    settings = parse(ScenarioSettings, settings, "scenario.")
+    return scenarios.scenario(
+        **arguments(settings, scenarios.scenario),
+        duration=duration,
+        state_size=len(plant.state_names),
+        dt=plant.dt,
+    )
+
+
+@dataclass(frozen=True, kw_only=True)
+class ModelSettings(Kinds):
+    """A model; the other fields are arguments of its factory.
+
+    Attributes:
+        name: of the factory.
+        system: name of its runs and rows.
+        environment: whether the model reads e.
+    """
+
+    name: str
+    system: Directory
+    environment: bool = True
+
+    @classmethod
+    def kind_of(cls, values: Values) -> type:
+        """Return the dataclass of the model of this name."""
+        return choose(MODEL_SETTINGS, values.get("name"), "model")
+
+
+MODEL_SETTINGS: dict[str, type] = {
+    name: schema("Model", ModelSettings, factory, skip=("dt", "nominal"))
+    for name, factory in MODELS.items()
+}
+
+
+def build_model(
+    settings: ModelSettings | Values, space: Space, plant: plants.Vehicle
+) -> Model:
     """Return the model of the settings.
 
     Models with prior knowledge take it from the vehicle: the sampling period and the
@@ -63,14 +173,12 @@ def build_model(settings: Settings, space: Space, plant: plants.Vehicle) -> Mode
     Raises:
         ValueError: an unknown model, or arguments that its factory refuses.
     """
-    factory = choose(MODELS, settings["name"], "model")
-    priors = {"dt": plant.dt, "nominal": plant.nominal_derivative}
-    prior = {
-        name: value
-        for name, value in priors.items()
-        if name in inspect.signature(factory).parameters
-    }
-    return factory(space, **prior, **as_kwargs(settings, "name", "system"))
+    settings = parse(ModelSettings, settings, "model.")
+    factory = MODELS[settings.name]
+    known = {"dt": plant.dt, "nominal": plant.nominal_derivative}
+    taken = inspect.signature(factory).parameters
+    prior = {name: value for name, value in known.items() if name in taken}
+    return factory(space, **prior, **arguments(settings, factory))
 
 
 def check_imported(settings: Any) -> None:
@@ -102,44 +210,125 @@ def space_to_settings(space: Space) -> dict[str, list[float]]:
     }
 
 
-def space_from_settings(settings: Settings) -> Space:
+def space_from_settings(settings: Values) -> Space:
     """Return the scales that a manifest holds."""
-    return Space(
-        **{
-            name: jnp.asarray(settings[name], dtype=jnp.float32)
-            for name in Space._fields
-        }
-    )
+    arrays = (jnp.asarray(settings[name], dtype="float32") for name in Space._fields)
+    return Space(*arrays)
 
 
-def build_scenario(
-    settings: Settings, plant: plants.Vehicle, *, duration: float
-) -> scenarios.Family:
-    """Return the scenario family of the settings.
-
-    Args:
-        settings: the name of the family and its arguments.
-        plant: the vehicle that will drive.
-        duration: of an episode [s].
-    """
-    return scenarios.scenario(
-        **as_kwargs(settings),
-        duration=duration,
-        state_size=len(plant.state_names),
-        dt=plant.dt,
-    )
-
-
-def build_driver(plant: plants.Vehicle) -> datasets.Driver:
+def build_driver(plant: plants.Vehicle) -> Driver:
     """Return the path-following law that drives while data are collected."""
     law = control.path_feedback(wheelbase=plant.wheelbase, speed_loop=plant.speed_loop)
 
     def driver(state: State, reference: Reference) -> Control:
         curvature = control.reference_curvature(reference)[0]
-        return law(
-            control.path_errors(state, reference[0], curvature),
-            curvature,
-            reference[0, 3],
-        )
+        errors = control.path_errors(state, reference[0], curvature)
+        return law(errors, curvature, reference[0, 3])
 
     return driver
+
+
+@dataclass(frozen=True, kw_only=True)
+class LawSettings(Kinds):
+    """The law of path coordinates; the fields are arguments of `derive_path_law`."""
+
+    @classmethod
+    def kind_of(cls, values: Values) -> type:
+        """Return the one dataclass."""
+        return LAW
+
+
+LAW: type = schema(
+    "Law",
+    LawSettings,
+    control.derive_path_law,
+    skip=("coordinates", "env_low", "env_high"),
+)
+
+
+def build_law(
+    settings: LawSettings | Values,
+    plant: plants.Vehicle,
+    *,
+    env_low: Sequence[float],
+    env_high: Sequence[float],
+) -> control.PathLaw:
+    """Derive the law of path coordinates from the vehicle's step.
+
+    Args:
+        settings: of the law.
+        plant: any vehicle with limits of its controls.
+        env_low: lower ends of the environment box E.
+        env_high: upper ends of E.
+    """
+    return control.derive_path_law(
+        plant.step,
+        coordinates=len(plant.state_names) - 1,
+        env_low=tuple(map(float, env_low)),
+        env_high=tuple(map(float, env_high)),
+        **arguments(
+            parse(LawSettings, settings, "dataset.law."), control.derive_path_law
+        ),
+    )
+
+
+def build_loop(plant: plants.Vehicle, law: control.PathLaw) -> plants.Vehicle:
+    """Return the closed loop of plant and law, in the coordinates of `path_frame`."""
+    steering, drive = (float(largest) for largest in law.perturbation)
+    return plants.along_path(plant, law, perturbation=(steering, drive))
+
+
+class System(NamedTuple):
+    """A system that an evaluation drives: a row of its table.
+
+    Attributes:
+        model: that the controller predicts with.
+        params: of the model.
+        env_source: where its environment comes from: "measured", "estimated" or "none".
+        certificate: verified, or None.
+        law: that a model in path coordinates was learned around, or None.
+    """
+
+    model: Model
+    params: Any
+    env_source: str
+    certificate: dict[str, Any] | None = None
+    law: control.PathLaw | None = None
+
+
+def reference_systems(
+    plant: plants.Vehicle, law: control.PathLaw | None = None
+) -> dict[str, System]:
+    """Return the systems that need no learning, by name.
+
+    "nominal" predicts with the bicycle, "oracle" with the true plant, and "oracle_…"
+    with the true plant under a wrong environment. With a law they describe its closed
+    loop, in path coordinates; "law" is then the oracle once more, for a planner without
+    samples (`num_samples=1`), so that the law drives alone.
+
+    Args:
+        plant: the true vehicle.
+        law: of path coordinates, or None.
+    """
+
+    def biased(entry: int, factor: float) -> Callable[[Environment], Environment]:
+        return lambda env: env.at[entry].multiply(factor)
+
+    along = law is not None
+    plant = plant if law is None else build_loop(plant, law)
+    oracle = partial(models.physics, plant.step, along_path=along)
+    rows = {
+        "nominal": System(models.physics(plant.nominal, along_path=along), {}, "none"),
+        "oracle": System(oracle(), {}, "measured"),
+    }
+    if along:
+        rows["law"] = rows["oracle"]
+    distortions = {
+        "friction_x0.7": (0, 0.7),
+        "friction_x1.3": (0, 1.3),
+        "wind_x0": (1, 0.0),
+        "wind_x2": (1, 2.0),
+    }
+    for name, change in distortions.items():
+        rows[f"oracle_{name}"] = System(oracle(distort=biased(*change)), {}, "measured")
+    return {name: row._replace(law=law) for name, row in rows.items()}

@@ -80,7 +80,7 @@ def certify_corridor(
         settings["evaluation"]["observation_noise"],
     )
     level = settings["certification"]["level"]
-    data = build.as_kwargs(settings["dataset"])
+    data = settings["dataset"]
     roads = {name: data[name] for name in ROADS}
     box = {name: data[name] for name in ("env_low", "env_high")}
     excited = roads | {name: data[name] for name in EXCITATION}

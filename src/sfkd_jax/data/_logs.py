@@ -97,6 +97,7 @@ def environment_columns(
     if not needs_environment and len(absent) == len(columns.environment):
         return ()
     raise ValueError(
-        f"{source}: no column {absent[0]} for the environment; pass env_source=none, "
-        "or map the columns with dataset.columns.environment"
+        f"{source}: no column {absent[0]} for the environment; "
+        "pass environment.source=none, or map the columns with "
+        "dataset.columns.environment"
     )

@@ -64,7 +64,7 @@ def check_ranges(
         or np.any(np.greater(low, high))
     ):
         yield Finding(
-            f"dataset.env_low and dataset.env_high must be {size} numbers each, "
+            f"environment.low and environment.high must be {size} numbers each, "
             "the low ones not above the high"
         )
         return

@@ -77,7 +77,7 @@ def _check_columns(columns: Columns, needs_environment: bool) -> None:
         raise ValueError(f"dataset.columns names {twice[0]} twice")
     if needs_environment and not columns.environment:
         raise ValueError(
-            "dataset.columns.environment is empty: pass env_source=none, "
+            "dataset.columns.environment is empty: pass environment.source=none, "
             "or name the columns that were measured"
         )
 

@@ -134,7 +134,7 @@ def _check_box(
     envs = trajectories.envs.reshape(-1, trajectories.envs.shape[-1])
     if not envs.shape[-1:] == jnp.shape(env_low) == jnp.shape(env_high):
         raise ValueError(
-            f"dataset.env_low and env_high need {envs.shape[-1]} entries, "
+            f"environment.low and environment.high need {envs.shape[-1]} entries, "
             f"got {env_low} and {env_high}"
         )
     if not bool(jnp.all((envs >= env_low - 1e-5) & (envs <= env_high + 1e-5))):
@@ -163,8 +163,8 @@ def measure_space(dataset: Dataset) -> Space:
     body = _range(train.states[..., BODY])
     control = _range(train.controls)
     centre, half = (
-        0.5 * (dataset.env_high + dataset.env_low),
-        0.5 * (dataset.env_high - dataset.env_low),
+        0.5 * (environment.high + environment.low),
+        0.5 * (environment.high - environment.low),
     )
     return Space(
         *body,

@@ -4,22 +4,24 @@ from __future__ import annotations
 
 from typing import Any
 
-from sfkd_jax import build, policy, store
-from sfkd_jax.cli.entry import hydra_command
+from sfkd_jax import policy, store
+from sfkd_jax.experiment import runs
+from sfkd_jax.experiment.command import hydra_command
+from sfkd_jax.experiment.options import Settings
 from sfkd_jax.export import write_controller
-from sfkd_jax.pipeline import runs
+from sfkd_jax.settings import arguments, plain
 
 FOLDER = "export"
 
 
-def run(settings: dict[str, Any]) -> dict[str, Any]:
+def run(settings: Settings) -> dict[str, Any]:
     """Export the policy of the run; nothing is trained or certified.
 
     Raises:
         ArtefactError: the run has no policy, or one that is damaged or was trained
             with other settings.
     """
-    run_dir = runs.run_directory(settings)
+    run_dir = settings.run_dir
     if not store.exists(run_dir / "policy.npz"):
         raise store.ArtefactError(
             f"{run_dir} holds no trained controller; "
@@ -29,13 +31,15 @@ def run(settings: dict[str, Any]) -> dict[str, Any]:
 
 
 @runs.exclusive
-def _write(settings: dict[str, Any]) -> dict[str, Any]:
+def _write(settings: Settings) -> dict[str, Any]:
     """Export the policy while no other process writes to the run directory."""
-    run_dir = runs.run_directory(settings)
+    run_dir = settings.run_dir
     runs.claim(settings)
     _, manifest = store.read_arrays(run_dir / "policy.npz", kind=policy.KIND)
     trained = policy.load(
-        run_dir, controller=settings["controller"], env_source=settings["env_source"]
+        run_dir,
+        controller=plain(settings.controller),
+        env_source=settings.environment.source,
     )
     if trained.certificate is None:
         store.print_message("exported without a certificate")
@@ -44,7 +48,7 @@ def _write(settings: dict[str, Any]) -> dict[str, Any]:
         trained,
         folder,
         made_from=manifest["made_from"],
-        **build.as_kwargs(settings["export"]),
+        **arguments(settings.export, write_controller),
     )
     store.print_message(
         f"exported: {folder}; python {folder / 'run_controller.py'} "

@@ -148,7 +148,7 @@ def _vehicle(trained: policy.Policy) -> dict[str, Any]:
     limits = zip(
         ("steering [rad]", drive), plant.control_low, plant.control_high, strict=True
     )
-    box = {side: list(settings["dataset"][f"env_{side}"]) for side in ("low", "high")}
+    box = {side: list(settings["environment"][side]) for side in ("low", "high")}
     return {
         "sampling_period_s": plant.dt,
         "horizon": build.controller_horizon(settings["controller"]),

@@ -5,13 +5,15 @@ from __future__ import annotations
 import itertools
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, TypeAlias
 
 import numpy as np
 
 from sfkd_jax import evaluation, store
-from sfkd_jax.pipeline import runs
-from sfkd_jax.pipeline.evaluate_system import EpisodeSet, SystemResult
+from sfkd_jax.experiment import runs
+from sfkd_jax.experiment.evaluating import EpisodeSet, SystemResult
+from sfkd_jax.experiment.options import ComparisonSettings, Settings
+from sfkd_jax.settings import plain, replace
 
 KIND = "cell"
 NUM_STORED_EPISODES = 2
@@ -38,7 +40,11 @@ class Cell(NamedTuple):
     scenario: str
 
 
-def list_cells(comparison: dict[str, Any]) -> list[Cell]:
+ComposeCell: TypeAlias = Callable[[Cell], Settings]
+"""cell -> its settings, under the name of the comparison."""
+
+
+def list_cells(comparison: ComparisonSettings) -> list[Cell]:
     """Return all cells in the order of evaluation; those of one system are adjacent.
 
     Every row is evaluated from one seed before any from the next, so that a table that
@@ -48,30 +54,26 @@ def list_cells(comparison: dict[str, Any]) -> list[Cell]:
         ValueError: `only`, `untrained` or `trained_once` names an unknown row, or a
             seed is repeated.
     """
-    rows, only = comparison["rows"], comparison["only"]
+    rows, seeds = comparison.rows, comparison.seeds
     for name in ("only", "untrained", "trained_once"):
-        if unknown := set(comparison[name]) - set(rows):
+        if unknown := set(getattr(comparison, name)) - set(rows):
             raise ValueError(
                 f"unknown comparison.{name} {', '.join(sorted(unknown))}; "
                 f"choose of {', '.join(rows) or 'none'}"
             )
-    seeds = comparison["seeds"]
     if len(set(seeds)) < len(seeds):
-        raise ValueError(f"comparison.seeds={seeds} repeats a seed")
-    labels = [label for label in rows if label in (only or rows)]
-    first_seed_only = {*comparison["untrained"], *comparison["trained_once"]}
+        raise ValueError(f"comparison.seeds={list(seeds)} repeats a seed")
+    labels = [label for label in rows if label in (comparison.only or rows)]
+    first_seed_only = {*comparison.untrained, *comparison.trained_once}
     cells = []
-    for seed, vehicle, label in itertools.product(
-        seeds, comparison["vehicles"], labels
-    ):
+    for seed, vehicle, label in itertools.product(seeds, comparison.vehicles, labels):
         if label in first_seed_only and seed != seeds[0]:
             continue
-        for common, scenarios in comparison["controllers"].items():
-            own = comparison["own_controllers"].get(label, {}).get(common, common)
-            varied = itertools.product(
-                comparison["variations"], scenarios if own else ()
-            )
-            cells += [Cell(vehicle, label, seed, own, *entry) for entry in varied]
+        for common, scenarios in comparison.controllers.items():
+            own = comparison.own_controllers.get(label, {}).get(common, common)
+            # A row may have no controller of its own for a common one.
+            varied = itertools.product(comparison.variations, scenarios if own else ())
+            cells += [Cell(vehicle, label, seed, str(own), *entry) for entry in varied]
     return cells
 
 
@@ -82,7 +84,9 @@ def group_cells(cells: list[Cell]) -> list[list[Cell]]:
     ]
 
 
-def take_share(groups: list[list[Cell]], share: list[int] | None) -> list[list[Cell]]:
+def take_share(
+    groups: list[list[Cell]], share: tuple[int, int] | None
+) -> list[list[Cell]]:
     """Return the groups of every n-th row from the k-th on, share = [k, n].
 
     All groups of a row are in one share, because they use the same policy.
@@ -99,20 +103,17 @@ def take_share(groups: list[list[Cell]], share: list[int] | None) -> list[list[C
     first, count = share
     if not 0 <= first < count:
         raise ValueError(
-            f"comparison.share must be [k, n] with 0 <= k < n, got {share}"
+            f"comparison.share must be [k, n] with 0 <= k < n, got {list(share)}"
         )
-    rows = {
-        row: number
-        for number, row in enumerate(dict.fromkeys(group[0][:3] for group in groups))
-    }
-    return [group for group in groups if rows[group[0][:3]] % count == first]
+    rows = list(dict.fromkeys(group[0][:3] for group in groups))
+    return [group for group in groups if rows.index(group[0][:3]) % count == first]
 
 
-def overrides(cell: Cell, comparison: dict[str, Any]) -> list[str]:
+def overrides(cell: Cell, comparison: ComparisonSettings) -> list[str]:
     """Return the overrides of a cell, beyond those of the command."""
-    row = comparison["rows"][cell.label]
-    tuned = comparison["tuned"].get(cell.vehicle, {}).get(cell.label)
-    variation = comparison["variations"][cell.variation]
+    row = comparison.rows[cell.label]
+    tuned = comparison.tuned.get(cell.vehicle, {}).get(cell.label)
+    variation = comparison.variations[cell.variation]
     return [
         f"vehicle={cell.vehicle}",
         f"scenario={cell.scenario}",
@@ -124,7 +125,7 @@ def overrides(cell: Cell, comparison: dict[str, Any]) -> list[str]:
     ]
 
 
-def policy_name(cell: Cell, comparison: dict[str, Any], *, retrained: bool) -> str:
+def policy_name(cell: Cell, comparison: ComparisonSettings, *, retrained: bool) -> str:
     """Return the name of the run that trains the policy of a cell.
 
     Args:
@@ -132,67 +133,61 @@ def policy_name(cell: Cell, comparison: dict[str, Any], *, retrained: bool) -> s
         comparison: its settings.
         retrained: whether the variation changes the training, and so needs its own run.
     """
-    parts = [comparison["policies"], cell.vehicle, cell.label]
+    parts = [comparison.policies, cell.vehicle, cell.label]
     return "/".join([*parts, _slug(cell.variation)] if retrained else parts)
 
 
-def cell_path(cell: Cell, settings: dict[str, Any]) -> Path:
+def cell_path(cell: Cell, directory: Path) -> Path:
     """Return the path of a cell's files, without their suffixes.
 
-    It is root/name/cells/vehicle/variation/scenario/controller/label-seed=N.
+    It is cells/vehicle/variation/scenario/controller/label-seed=N.
     """
     folders = (cell.vehicle, _slug(cell.variation), cell.scenario, cell.controller)
-    return Path(
-        settings["root"],
-        settings["name"],
-        "cells",
-        *folders,
-        f"{cell.label}-seed={cell.seed}",
+    return directory.joinpath("cells", *folders, f"{cell.label}-seed={cell.seed}")
+
+
+def compilation_key(settings: Settings) -> str:
+    """Hash the settings that a compiled evaluation depends on; equal keys share it.
+
+    Neither the sensor of e nor the name of a variation is compiled in.
+    """
+    compiled = replace(
+        settings,
+        environment=replace(settings.environment, sensor={}),
+        evaluation=replace(settings.evaluation, variation=None),
     )
+    about = {"name": settings.name, "scenario": None}
+    return store.sha256(_evaluated(compiled) | about)
 
 
-def compilation_key(settings: dict[str, Any]) -> str:
-    """Hash the settings that a compiled evaluator depends on; equal keys share it."""
-    names = (*runs.IDENTITY, "env_source", "controller", "certification", "name")
-    protocol = {
-        name: value
-        for name, value in settings["evaluation"].items()
-        if name not in ("env_sensor", "variation")
-    }
-    return store.sha256(
-        {name: settings[name] for name in names} | {"evaluation": protocol}
-    )
-
-
-def settings_hash(settings: dict[str, Any]) -> str:
+def settings_hash(settings: Settings) -> str:
     """Hash the settings that the result of a cell depends on.
 
     Neither the code nor the location of the artefacts enters.
     """
-    names = (*runs.IDENTITY, "controller", "scenario", "certification")
-    hashed = {name: settings[name] for name in names}
-    # Two settings keep the keys under which stored cells were hashed.
-    hashed["env"] = settings["env_source"]
-    hashed["evaluation"] = {
-        "told" if name == "env_sensor" else name: value
-        for name, value in settings["evaluation"].items()
-    }
-    return store.sha256(hashed)
+    return store.sha256(_evaluated(settings))
 
 
-def drives_hash(settings: dict[str, Any]) -> str:
+def _evaluated(settings: Settings) -> dict[str, Any]:
+    names = ("environment", "controller", "scenario", "certification", "evaluation")
+    chosen = {name: plain(getattr(settings, name)) for name in names}
+    return runs.identity(settings) | chosen
+
+
+def episodes_hash(settings: Settings) -> str:
     """Hash what the roads and the plant of a cell depend on.
 
     Rows with another hash met other episodes, and are not paired with it.
     """
-    protocol = settings["evaluation"]
-    drives = {name: protocol[name] for name in ("seed", "episodes", "episode_s")}
+    protocol = settings.evaluation
+    names = ("seed", "episodes", "episode_s")
     return store.sha256(
-        {name: settings[name] for name in ("vehicle", "scenario")} | drives
+        {name: getattr(protocol, name) for name in names}
+        | {"vehicle": plain(settings.vehicle), "scenario": plain(settings.scenario)}
     )
 
 
-def is_done(path: Path, settings: dict[str, Any]) -> bool:
+def is_done(path: Path, settings: Settings) -> bool:
     """Whether an undamaged cell with exactly these settings is stored."""
     try:
         document = store.read_json(_row_file(path), keys=("row",))
@@ -202,7 +197,11 @@ def is_done(path: Path, settings: dict[str, Any]) -> bool:
 
 
 def write_cell(
-    path: Path, settings: dict[str, Any], episodes: EpisodeSet, result: SystemResult
+    path: Path,
+    directory: Path,
+    settings: Settings,
+    episodes: EpisodeSet,
+    result: SystemResult,
 ) -> dict[str, Any]:
     """Write the arrays of the first episodes, then the row, and return the row.
 
@@ -210,6 +209,7 @@ def write_cell(
 
     Args:
         path: of the cell, without suffix.
+        directory: of the comparison.
         settings: of the cell.
         episodes: that were simulated.
         result: row and arrays.
@@ -220,25 +220,20 @@ def write_cell(
     stored = {
         name: np.asarray(array)[:NUM_STORED_EPISODES] for name, array in arrays.items()
     }
-    stored["dt"] = np.asarray(settings["vehicle"]["dt"])
+    stored["dt"] = np.asarray(settings.vehicle.dt)
     file = path.with_name(f"{path.name}.npz")
-    store.write_arrays(file, stored, kind=KIND, config=settings["scenario"])
+    store.write_arrays(file, stored, kind=KIND, config=plain(settings.scenario))
     row = result.row | {
-        "arrays": str(file.relative_to(Path(settings["root"], settings["name"]))),
+        "arrays": str(file.relative_to(directory)),
         "provenance": store.provenance(),
     }
-    store.write_json(
-        _row_file(path), {"row": row, "made_with": settings_hash(settings)}
-    )
+    document = {"row": row, "made_with": settings_hash(settings)}
+    store.write_json(_row_file(path), document)
     return row
 
 
 def collect_rows(
-    cells: list[Cell],
-    settings: dict[str, Any],
-    compose_cell: Callable[[Cell], dict[str, Any]],
-    *,
-    older: bool = False,
+    cells: list[Cell], directory: Path, compose_cell: ComposeCell
 ) -> list[dict[str, Any]]:
     """Return the rows of all stored cells, with seeds pooled and systems compared.
 
@@ -246,31 +241,28 @@ def collect_rows(
 
     Args:
         cells: of the comparison.
-        settings: of the comparison.
+        directory: of the comparison.
         compose_cell: cell -> its settings.
-        older: also use cells that were made with other settings.
     """
     pooled: dict[Cell, list[dict[str, Any]]] = {}
     others, by_other_code = [], []
     for cell in cells:
-        path = _row_file(cell_path(cell, settings))
+        path = _row_file(cell_path(cell, directory))
         if not path.exists():
             continue
         document = store.read_json(path, keys=("row", "made_with"))
-        cell_settings = compose_cell(cell)
-        is_current = document["made_with"] == settings_hash(cell_settings)
-        if not is_current:
+        settings = compose_cell(cell)
+        if document["made_with"] != settings_hash(settings):
             others.append(path)
-        if older or is_current:
-            row = document["row"] | {"drives": drives_hash(cell_settings)}
-            pooled.setdefault(cell._replace(seed=0), []).append(row)
-            if row.get("provenance", {}).get("source") != store.source_hash():
-                by_other_code.append(path)
+            continue
+        row = document["row"] | {"drives": episodes_hash(settings)}
+        pooled.setdefault(cell._replace(seed=0), []).append(row)
+        if row.get("provenance", {}).get("source") != store.source_hash():
+            by_other_code.append(path)
     if others:
-        outcome = "used" if older else "left out; comparison.older=true uses them"
         store.print_message(
             f"{len(others)} cells were made with other settings, "
-            f"such as {others[0]}: {outcome}"
+            f"such as {others[0]}: left out"
         )
     if by_other_code:
         store.print_message(
@@ -280,7 +272,7 @@ def collect_rows(
     not_driven = len({cell._replace(seed=0) for cell in cells}) - len(pooled)
     rows = []
     for cell, trainings in pooled.items():
-        with store.as_artefact_error(cell_path(cell, settings).parent / cell.label):
+        with store.as_artefact_error(cell_path(cell, directory)):
             rows.append(evaluation.pool(trainings))
     return evaluation.compare(rows, not_driven=not_driven)
 

@@ -1,1 +1,0 @@
-"""The command line: composition, schemas, checks of settings, sweeps."""

@@ -1,0 +1,1 @@
+"""From options to artefacts: settings, stages, run directories, comparisons."""

@@ -1,0 +1,180 @@
+"""What every command does around its work: compose, check, run, report, exit."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import os
+import re
+import shlex
+import sys
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import hydra
+import jax
+from hydra.core.config_store import ConfigStore
+from hydra.core.hydra_config import HydraConfig
+from hydra.types import RunMode
+from omegaconf import DictConfig, OmegaConf
+
+from sfkd_jax import training
+from sfkd_jax.certification import CertificateStale, CertificationRefused
+from sfkd_jax.experiment.options import Settings, hydra_schemas, parse_settings
+from sfkd_jax.experiment.runs import IDENTITY
+from sfkd_jax.settings import replace
+from sfkd_jax.store import ArtefactError
+
+FAILED = 1
+REFUSED = 2
+STALE = 3
+INTERRUPTED = 130
+"""Exit codes."""
+EXPECTED: dict[type[Exception], tuple[str, int]] = {
+    CertificationRefused: ("refused: ", REFUSED),
+    CertificateStale: ("stale: ", STALE),
+    ArtefactError: ("", FAILED),
+    ValueError: ("", FAILED),
+    training.TrainingStopped: ("", FAILED),
+    OSError: ("", FAILED),
+}
+"""Errors that become one line: what stands before it, and the exit code."""
+CACHE = "JAX_COMPILATION_CACHE_DIR"
+LONGEST_NAME = 160
+"""Characters of a directory name of a sweep; file systems allow 255."""
+
+Run = Callable[[Settings], dict[str, Any]]
+
+
+def hydra_command(run: Run) -> Callable[[], None]:
+    """Make `run(settings) -> document` a command.
+
+    The command composes its settings, works, and prints one JSON object as the last
+    line of stdout. Expected errors become one line on stderr and an exit code. A job of
+    a sweep returns the document's "objective" to the sweeper; one that fails raises,
+    which Hydra reports after all other jobs.
+    """
+    register()
+
+    def main(composed: DictConfig) -> Any:
+        sweeping = HydraConfig.get().mode == RunMode.MULTIRUN
+        try:
+            settings = settings_of(composed)
+            use_compilation_cache(Path(settings.root))
+            document = run(named_for_sweep(settings) if sweeping else settings)
+        except KeyboardInterrupt:
+            _report("interrupted; the same command continues")
+            # The interpreter would first wait for compiled code that nobody needs.
+            os._exit(INTERRUPTED)
+        except tuple(EXPECTED) as reason:
+            prefix, code = next(
+                about for kind, about in EXPECTED.items() if isinstance(reason, kind)
+            )
+            line = next(iter(str(reason).splitlines()), type(reason).__name__)
+            _report(f"{prefix}{line}")
+            if sweeping:  # an exit would end the jobs that follow
+                raise
+            sys.exit(code)
+        print(json.dumps(document), flush=True)
+        return document.get("objective")
+
+    return hydra.main(
+        config_path=conf_path(), config_name="config", version_base="1.3"
+    )(main)
+
+
+def conf_path() -> str:
+    """Return the folder of options: of the checkout, or of the installed package."""
+    package = Path(__file__).resolve().parents[1]
+    checkout = package.parents[1]
+    inside = (checkout / "conf" / "config.yaml").exists() and (
+        checkout / "pyproject.toml"
+    ).exists()
+    return str(checkout / "conf" if inside else package / "conf")
+
+
+def register() -> None:
+    """Put the schemas into Hydra's store."""
+    for group, nodes in hydra_schemas().items():
+        for name, node in nodes.items():
+            ConfigStore.instance().store(group=group, name=name, node=node)
+
+
+def settings_of(composed: DictConfig) -> Settings:
+    """Return composed options as checked settings.
+
+    Raises:
+        ValueError: naming the setting.
+    """
+    values: Any = OmegaConf.to_container(composed, resolve=True)
+    return parse_settings(values)
+
+
+def compose(*overrides: str) -> Settings:
+    """Return the settings of the running command under further overrides."""
+    typed = HydraConfig.get().overrides.task
+    return settings_of(hydra.compose("config", [*typed, *overrides]))
+
+
+def command_line(name: str) -> str | None:
+    """Return the running command as typed in a shell, without `root=`."""
+    if not HydraConfig.initialized():
+        return None
+    typed = [
+        word
+        for word in HydraConfig.get().overrides.task
+        if not word.startswith("root=")
+    ]
+    return " ".join(["python -m", f"sfkd_jax.{name}", shlex.join(typed)]).strip()
+
+
+def use_compilation_cache(root: Path) -> None:
+    """Keep compiled programs below `root`, or where the user has said.
+
+    The second run of a day then compiles nothing that the first one did.
+    """
+    defaults = {
+        CACHE: ("jax_compilation_cache_dir", str(root.resolve() / "compiled")),
+        "JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS": (
+            "jax_persistent_cache_min_compile_time_secs",
+            0.0,
+        ),
+        "JAX_PERSISTENT_CACHE_MIN_ENTRY_SIZE_BYTES": (
+            "jax_persistent_cache_min_entry_size_bytes",
+            -1,
+        ),
+    }
+    for variable, (option, value) in defaults.items():
+        if variable not in os.environ:
+            jax.config.update(option, value)
+
+
+def named_for_sweep(settings: Settings) -> Settings:
+    """Return the settings of a job of a sweep under a run name of its own.
+
+    It contains what the job overrides and what changes the weights, so that jobs do not
+    write into one directory. Model and seed are part of the path anyway.
+    """
+    overrides = [
+        word.lstrip("+")
+        for word in HydraConfig.get().overrides.task
+        if word.lstrip("+").split("=")[0].split(".")[0] in IDENTITY
+        and word.split("=")[0] not in ("model", "seed")
+    ]
+    if not overrides:
+        return settings
+    varied = ",".join(sorted(overrides))
+    name = "-".join(re.findall(r"[\w.+=,-]+", varied, re.ASCII))
+    if name != varied or len(name) > LONGEST_NAME:
+        digest = hashlib.sha256(varied.encode()).hexdigest()[:8]
+        name = f"{name[:LONGEST_NAME]}-{digest}"
+    # The policies of a comparison follow, unless they have a name of their own.
+    comparison = settings.comparison
+    if comparison.policies == settings.name:
+        comparison = replace(comparison, policies=f"{settings.name}/{name}")
+    return replace(settings, name=f"{settings.name}/{name}", comparison=comparison)
+
+
+def _report(line: str) -> None:
+    print(f"sfkd_jax: {line}", file=sys.stderr, flush=True)

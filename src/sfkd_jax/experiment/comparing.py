@@ -1,0 +1,174 @@
+"""Evaluate the rows of a table; train and certify the policies that they need."""
+
+from __future__ import annotations
+
+import functools
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any, TypeAlias
+
+from jax.errors import JaxRuntimeError
+
+from sfkd_jax import build, store
+from sfkd_jax.experiment import data, evaluating, grid, runs, stages
+from sfkd_jax.experiment.grid import Cell, ComposeCell
+from sfkd_jax.experiment.options import ComparisonSettings, Settings
+from sfkd_jax.plants import Vehicle
+from sfkd_jax.settings import plain, replace
+from sfkd_jax.training import TrainingStopped
+
+MakeEpisodes: TypeAlias = Callable[[Settings, Vehicle], evaluating.EpisodeSet]
+
+
+class Comparison:
+    """The rows of one table on their scenarios.
+
+    Attributes:
+        directory: of its cells and its page.
+        cells: of all rows.
+        failed: why a row failed, by its name.
+    """
+
+    def __init__(self, settings: Settings, compose_cell: ComposeCell) -> None:
+        """List the cells.
+
+        Args:
+            settings: of the comparison.
+            compose_cell: cell -> its settings, under the name of the comparison.
+        """
+        self.directory = Path(settings.root) / settings.name
+        self.cells = grid.list_cells(settings.comparison)
+        self.failed: dict[str, str] = {}
+        self._options: ComparisonSettings = settings.comparison
+        self._compose = functools.cache(compose_cell)
+        self._episodes: dict[str, evaluating.EpisodeSet] = {}
+
+    def evaluate(self) -> int:
+        """Evaluate all cells that are not done, and return how many there were.
+
+        Every row is built before the first one is trained; those that cannot be built
+        are named and left out. With `comparison.share` only this share of the rows is
+        evaluated.
+        """
+        began, done = time.perf_counter(), 0
+        groups = grid.take_share(grid.group_cells(self.cells), self._options.share)
+        for group in groups:
+            with self._named_if_it_fails(group):
+                self._check(group)
+        groups = [group for group in groups if _name(group) not in self.failed]
+        for number, group in enumerate(groups, 1):
+            with self._named_if_it_fails(group):
+                done += self._evaluate(group)
+            if done:
+                seconds = time.perf_counter() - began
+                left = seconds / number * (len(groups) - number)
+                store.print_message(
+                    f"[{number}/{len(groups)}] {seconds / 60:.0f} min so far, "
+                    f"about {left / 60:.0f} min left"
+                )
+        return done
+
+    def rows(self) -> list[dict[str, Any]]:
+        """Return the rows of all stored cells.
+
+        Raises:
+            ValueError: there is none.
+        """
+        with store.as_artefact_error(self.directory / "cells"):
+            rows = grid.collect_rows(self.cells, self.directory, self._compose)
+        if not rows:
+            reasons = "; ".join(self.failed.values()) or "none was requested"
+            raise ValueError(f"nothing to compare: no row came out ({reasons})")
+        return rows
+
+    @contextmanager
+    def _named_if_it_fails(self, group: list[Cell]) -> Iterator[None]:
+        """Print and store why a row failed, and go on with the others."""
+        try:
+            yield
+        except (
+            TrainingStopped,
+            ValueError,
+            store.ArtefactError,
+            JaxRuntimeError,  # such as memory that does not suffice
+        ) as reason:
+            line = next(iter(str(reason).splitlines()), type(reason).__name__)
+            self.failed[_name(group)] = line
+            store.print_message(f"failed: {line}")
+
+    def _check(self, group: list[Cell]) -> None:
+        """Build what the cells of one row need that are not done, without training."""
+        checked: set[str] = set()
+        for cell, settings, _ in self._pending(group):
+            plant = build.build_vehicle(settings.vehicle)
+            self._make_episodes(settings, plant)
+            key = grid.compilation_key(settings)
+            if "self" in settings.evaluation.systems and key not in checked:
+                checked.add(key)
+                stages.check_settings(self._run_settings(cell), plant)
+
+    def _evaluate(self, group: list[Cell]) -> int:
+        """Evaluate the cells of one row under one controller that are not done.
+
+        Raises:
+            ValueError: settings that cannot be built.
+            ArtefactError: damaged files, or a policy made with other settings.
+            TrainingStopped: the training of the policy diverged.
+        """
+        evaluations: dict[str, evaluating.SystemEvaluation] = {}
+        done = 0
+        for cell, settings, path in self._pending(group):
+            run_settings = self._run_settings(cell)
+            plant = build.build_vehicle(settings.vehicle)
+            episodes = self._make_episodes(settings, plant)
+            key = grid.compilation_key(run_settings)
+            if key not in evaluations:
+                evaluations[key] = _compile(run_settings, plant)
+            result = evaluations[key](episodes)
+            grid.write_cell(path, self.directory, settings, episodes, result)
+            error = 1e3 * result.row["rmse_m"]["mean"]
+            store.print_message(f"{' '.join(map(str, cell))}: {error:.1f} mm")
+            done += 1
+        return done
+
+    def _pending(self, group: list[Cell]) -> Iterator[tuple[Cell, Settings, Path]]:
+        """The cells that are not done, their settings and their paths."""
+        for cell in group:
+            settings = self._compose(cell)
+            path = grid.cell_path(cell, self.directory)
+            if not grid.is_done(path, settings):
+                yield cell, settings, path
+
+    def _run_settings(self, cell: Cell) -> Settings:
+        """The settings of a cell, under the name of the run of its policy."""
+        settings = self._compose(cell)
+        usual = cell._replace(variation=next(iter(self._options.variations)))
+        retrained = runs.identity(settings) != runs.identity(self._compose(usual))
+        name = grid.policy_name(cell, self._options, retrained=retrained)
+        return replace(settings, name=name)
+
+    def _make_episodes(
+        self, settings: Settings, plant: Vehicle
+    ) -> evaluating.EpisodeSet:
+        """The episodes of a cell; rows that are compared share them."""
+        parts = (settings.vehicle, settings.scenario, settings.environment)
+        key = store.sha256(plain([*parts, settings.evaluation]))
+        if key not in self._episodes:
+            self._episodes[key] = evaluating.make_episodes(settings, plant)
+        return self._episodes[key]
+
+
+def _name(group: list[Cell]) -> str:
+    """The name of a row under one controller."""
+    return "/".join(map(str, group[0][:4]))
+
+
+def _compile(settings: Settings, plant: Vehicle) -> evaluating.SystemEvaluation:
+    """Compile the only system of a row; train and certify it first if it learns."""
+    if "self" in settings.evaluation.systems:
+        stages.ensure_certificate(settings)
+    ((name, system),) = evaluating.load_systems(settings, plant).items()
+    dataset, _ = data.ensure_dataset(data.source_of(settings))
+    return evaluating.SystemEvaluation(settings, plant, name, system, dataset)

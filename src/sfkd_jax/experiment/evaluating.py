@@ -1,0 +1,428 @@
+"""Evaluate systems: simulate paired episodes, score them and count violations."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable
+from functools import partial
+from typing import Any, NamedTuple, TypeAlias
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from sfkd_jax import build, evaluation, policy, store
+from sfkd_jax.build import System
+from sfkd_jax.certification import conformal_tube, latent_tube
+from sfkd_jax.control import PathLaw
+from sfkd_jax.data import Dataset, to_path
+from sfkd_jax.experiment import data, runs, stages
+from sfkd_jax.experiment.data import source_of
+from sfkd_jax.experiment.options import Settings
+from sfkd_jax.plants import Vehicle, check_step
+from sfkd_jax.rollout import fold, unfold
+from sfkd_jax.scenarios import Scenario
+from sfkd_jax.settings import arguments, choose, plain
+from sfkd_jax.types import Controller, Key, Params, Trajectory
+
+WARM_UP = 10
+"""Control steps before timing starts."""
+OPEN_LOOP_STEPS = (1, 5, 10, 20)
+
+
+class EpisodeSet(NamedTuple):
+    """Paired episodes that every system is evaluated on.
+
+    Attributes:
+        name: of the scenario.
+        variation: of the protocol, or None.
+        scenarios: one per episode, leading axis first.
+        keys: one per episode, for sensors and samplers.
+    """
+
+    name: str
+    variation: str | None
+    scenarios: Scenario
+    keys: Key
+
+
+class SystemResult(NamedTuple):
+    """A row of results.json before comparisons, and the arrays behind it."""
+
+    row: dict[str, Any]
+    arrays: dict[str, np.ndarray]
+
+
+Evaluator: TypeAlias = Callable[[EpisodeSet], SystemResult]
+Scored: TypeAlias = tuple[evaluation.Scores, dict[str, Any]]
+Scorer: TypeAlias = Callable[[evaluation.Episode, Scenario], Scored]
+"""(episodes, their scenarios) -> scores, and the rates of violations."""
+
+
+def make_episodes(settings: Settings, plant: Vehicle) -> EpisodeSet:
+    """Draw the episodes of a scenario; several devices share them evenly.
+
+    Raises:
+        ValueError: a vehicle that cannot be simulated.
+    """
+    check_step(plant)
+    protocol = settings.evaluation
+    family = build.build_scenario(settings.scenario, plant, duration=protocol.episode_s)
+    sensor = arguments(settings.environment.sensor, evaluation.observed_environment)
+
+    @jax.jit
+    def draw(keys: Key, sensor_keys: Key) -> Scenario:
+        scenarios = jax.vmap(family)(keys)
+        observe = partial(evaluation.observed_environment, dt=plant.dt, **sensor)
+        observed = jax.vmap(observe)(scenarios.envs, sensor_keys)
+        return scenarios._replace(observed_envs=observed)
+
+    keys = jax.vmap(partial(jax.random.split, num=protocol.episodes))(
+        jax.random.split(jax.random.key(protocol.seed))
+    )
+    drawn = _shard((draw(keys[0], keys[1]), keys[1]))
+    return EpisodeSet(settings.scenario.name, protocol.variation, *drawn)
+
+
+def _shard(batch: Any) -> Any:
+    """Distribute episodes evenly over all devices, if their number allows it."""
+    devices = jax.devices()
+    if len(devices) == 1 or len(jax.tree.leaves(batch)[0]) % len(devices):
+        return batch
+    mesh = jax.sharding.Mesh(devices, ("episode",))
+    return jax.device_put(
+        batch, jax.sharding.NamedSharding(mesh, jax.sharding.PartitionSpec("episode"))
+    )
+
+
+def load_systems(settings: Settings, plant: Vehicle) -> dict[str, System]:
+    """Return the systems of `evaluation.systems` by name.
+
+    "self" is the policy of the run, which is trained if it is missing. With
+    `environment.source=estimated` every system that reads e estimates it.
+
+    Args:
+        settings: of the run.
+        plant: the true vehicle.
+
+    Raises:
+        ValueError: an unknown system.
+    """
+    law = data.ensure_law(source_of(settings))
+    references = build.reference_systems(plant, law)
+    systems = {}
+    for name in settings.evaluation.systems:
+        if name == "self":
+            systems[settings.model.system] = policy_system(settings)
+            continue
+        system = choose(references, name, "evaluation.systems entry")
+        if settings.environment.source == "estimated" and system.env_source != "none":
+            system = system._replace(env_source="estimated")
+        systems[name] = system
+    return systems
+
+
+def policy_system(settings: Settings) -> System:
+    """Return the policy of the run as a system, with a certificate if it has one."""
+    trained = stages.ensure_policy(settings)
+    certificate, reason = policy.read_certificate(settings.run_dir, trained)
+    if certificate is None:
+        store.print_message(f"nothing is certified: {reason}")
+    reads_env = trained.settings["model"]["environment"]
+    env_source = settings.environment.source if reads_env else "none"
+    return System(trained.model, trained.params, env_source, certificate, trained.law)
+
+
+class SystemEvaluation:
+    """One system, compiled once for all sets of episodes of one length.
+
+    Attributes:
+        controller: of the system.
+        params: of its model, folded.
+    """
+
+    controller: Controller
+    params: Params
+
+    def __init__(
+        self,
+        settings: Settings,
+        plant: Vehicle,
+        name: str,
+        system: System,
+        dataset: Dataset | None,
+    ) -> None:
+        """Build the controller and what scores it.
+
+        Args:
+            settings: of the run.
+            plant: the truth.
+            name: of the system.
+            system: to evaluate.
+            dataset: its calibration part gives the conformal tube and its test part the
+                open-loop error; without it there is neither.
+        """
+        self._protocol, self._plant = settings.evaluation, plant
+        self._times: list[tuple[float, float] | None] = []
+        box: Any = settings.environment.box
+        if dataset is not None:
+            box = dict(zip(box, (dataset.env_low, dataset.env_high), strict=True))
+        self.controller = build.build_controller(
+            settings.controller,
+            system.model,
+            plant,
+            **box,
+            certificate=system.certificate,
+            env_source=system.env_source,
+            law=system.law,
+        )
+        self._columns = _columns(settings, name, system)
+        # Folded once here; otherwise every control step would fold again.
+        folded = jax.jit(partial(fold, system.model))(system.params)
+        system, self.params = system._replace(params=folded), folded
+        self._columns["open_loop_rmse_m"] = _open_loop(settings, system, dataset)
+        self._horizon = settings.controller.horizon
+        self._simulate = jax.jit(evaluation.over_episodes(self._episode))
+        self._score = _scorer(settings, system, dataset, plant.dt)
+
+    def __call__(self, episodes: EpisodeSet) -> SystemResult:
+        """Simulate and score one set of episodes, without and with side forces."""
+        episode, scores, violation = self._scored(episodes, 0.0)
+        if not self._times:
+            self._times.append(self._act_ms(episodes))
+        about = {"scenario": episodes.name, "variation": episodes.variation}
+        row = evaluation.row(
+            scores,
+            self._columns | about,
+            self._times[0],
+            violation,
+        )
+        if self._protocol.side_forces:
+            row["disturbed"] = [
+                evaluation.disturbed(
+                    force,
+                    *(
+                        self._scored(episodes, force)[1:]
+                        if force
+                        else (scores, violation)
+                    ),
+                )
+                for force in self._protocol.side_forces
+            ]
+        parts = ("lateral", "states", "controls")
+        arrays = {part: np.asarray(getattr(episode, part)) for part in parts}
+        return SystemResult(row, arrays)
+
+    def _episode(self, scenario: Scenario, key: Key) -> evaluation.Episode:
+        return evaluation.simulate(
+            self._plant.step,
+            self.controller,
+            self.params,
+            scenario,
+            key,
+            horizon=self._horizon,
+            dt=self._plant.dt,
+            observation_noise=self._protocol.observation_noise,
+        )
+
+    def _scored(
+        self, episodes: EpisodeSet, force: float
+    ) -> tuple[evaluation.Episode, evaluation.Scores, dict[str, Any]]:
+        """Episodes under unmeasured side forces up to `force` [N], and their scores."""
+        scenarios = episodes.scenarios
+        if force:
+            disturb = partial(
+                evaluation.disturbed_environment, self._plant, largest=force
+            )
+            envs = jax.jit(jax.vmap(disturb))(scenarios.envs, episodes.keys)
+            scenarios = scenarios._replace(envs=envs)
+        episode = self._simulate(scenarios, episodes.keys)
+        return episode, *self._score(episode, episodes.scenarios)
+
+    def _act_ms(self, episodes: EpisodeSet) -> tuple[float, float] | None:
+        """Median and 99 % quantile of a compiled control step [ms]; None: not timed."""
+        if not self._protocol.timed_steps:
+            return None
+        scenario = jax.tree.map(lambda leaf: leaf[0], episodes.scenarios)
+        reference = evaluation.first_reference(
+            scenario, horizon=self._horizon, dt=self._plant.dt
+        )
+        observed = (scenario.initial_state, scenario.envs[0], reference)
+        act = jax.jit(self.controller.act)
+        state, times = self.controller.init(episodes.keys[0]), []
+        for _ in range(WARM_UP + self._protocol.timed_steps):
+            start = time.perf_counter()
+            _, state, _ = jax.block_until_ready(act(self.params, state, *observed))
+            times.append(1e3 * (time.perf_counter() - start))
+        times = times[WARM_UP:]
+        return float(np.median(times)), float(np.quantile(times, 0.99))
+
+
+def _columns(settings: Settings, name: str, system: System) -> dict[str, Any]:
+    """The columns of a row that do not depend on episodes."""
+    protocol, certificate = settings.evaluation, system.certificate
+    leaves = jax.tree.leaves(unfold(system.params))
+    return {
+        "system": name,
+        "model": settings.model.name if system.params else name,
+        "controller": settings.controller.name,
+        "planner": settings.controller.planner,
+        "sampling": settings.controller.sampling,
+        "env": system.env_source,
+        "vehicle": settings.vehicle.name,
+        "inner_loop": settings.vehicle.inner_loop,
+        "seeds": [settings.seed],
+        "episodes": protocol.episodes,
+        "episode_s": protocol.episode_s,
+        "params": sum(leaf.size for leaf in leaves) or None,
+        "alpha": certificate["alpha"] if certificate else None,
+    }
+
+
+def _open_loop(
+    settings: Settings, system: System, dataset: Dataset | None
+) -> dict[str, float] | None:
+    """Position RMSE of predictions on the test part, by steps ahead [m]."""
+    if dataset is None:
+        return None
+    horizon = settings.certification.horizon
+    errors = jax.jit(partial(evaluation.open_loop, system.model, horizon=horizon))(
+        system.params, dataset.test
+    )
+    distance = np.hypot(*np.asarray(errors, dtype=np.float64).T[:2])
+    return {
+        str(step): float(distance[step - 1])
+        for step in OPEN_LOOP_STEPS
+        if step <= horizon
+    }
+
+
+def _scorer(
+    settings: Settings, system: System, dataset: Dataset | None, dt: float
+) -> Scorer:
+    """Return the function that scores a batch of episodes of one system.
+
+    Args:
+        settings: of the run.
+        system: its parameters folded.
+        dataset: for the conformal tube, or None for none.
+        dt: sampling period [s].
+    """
+    length, horizon = settings.dataset.steps, settings.certification.horizon
+    claims = _claims(settings, system, dataset)
+
+    @jax.jit
+    def predict(params: Params, seen: Trajectory, scenarios: Scenario) -> Any:
+        convert = partial(_model_coordinates, system.law)
+        converted = jax.vmap(convert)(seen, scenarios)
+        return evaluation.predictions(
+            system.model, params, converted, length=length, horizon=horizon
+        )
+
+    def score(episodes: evaluation.Episode, scenarios: Scenario) -> Scored:
+        seen = Trajectory(episodes.states, episodes.controls, episodes.assumed_envs)
+        errors = None
+        # A prediction needs as many steps as a segment of the data set has.
+        if seen.controls.shape[1] >= length:
+            errors = jax.device_get(predict(system.params, seen, scenarios))
+        scores = evaluation.score(episodes, np.asarray(scenarios.envs), dt=dt)
+        return scores, evaluation.violations(errors, claims)
+
+    return score
+
+
+def _model_coordinates(
+    law: PathLaw | None, episode: Trajectory, scenario: Scenario
+) -> Trajectory:
+    """An episode in the coordinates of the model: of the world, or of the path."""
+    if law is None:
+        return episode
+    speeds = jnp.full(episode.controls.shape[0], scenario.speed)
+    return to_path(episode, scenario.path, law, speeds)
+
+
+def _claims(
+    settings: Settings, system: System, dataset: Dataset | None
+) -> evaluation.Claims:
+    """Claims about a system's predictions, of its certificate and of calibration."""
+    options = settings.certification
+    level, horizon = options.level, options.horizon
+    claims = evaluation.Claims(level=level, threshold=settings.evaluation.threshold_m)
+    if dataset is not None:
+        try:
+            tube = conformal_tube(
+                system.model,
+                system.params,
+                validation=dataset.validation,
+                calibration=dataset.calibration,
+                level=level,
+                horizon=horizon,
+                stride=evaluation.STRIDE,
+            )
+            claims = claims._replace(conformal=tube)
+        except ValueError as reason:
+            store.print_message(f"  no conformal tube: {reason}")
+    proof = system.certificate
+    if proof is None:
+        return claims
+    if (len(proof["tube"]["latent"]), proof["d_bar"]["level"]) != (horizon, level):
+        store.print_message(
+            "  the certificate is of another horizon or level and is not compared"
+        )
+        return claims
+    d_bar = proof["d_bar"]["value"]
+    latent = latent_tube(proof["alpha"], d_bar, horizon)
+    return claims._replace(
+        certified=proof["tube"]["physical"], latent=latent, d_bar=d_bar
+    )
+
+
+def evaluate_run(settings: Settings, *, command: str | None = None) -> dict[str, Any]:
+    """Evaluate every system of `evaluation.systems` and add its rows to the results.
+
+    Rows of other scenarios and controllers in the same run stay.
+
+    Args:
+        settings: of the run.
+        command: that was typed; it is stored with the results.
+
+    Returns:
+        `results`, the path of results.json, and the number of new `rows`.
+
+    Raises:
+        ValueError: settings that cannot be built, or a vehicle that cannot be
+            simulated.
+        ArtefactError: the earlier results are damaged.
+    """
+    began, protocol = time.perf_counter(), settings.evaluation
+    plant = build.build_vehicle(settings.vehicle)
+    # Vehicle and earlier results are checked before anything is trained.
+    episodes = make_episodes(settings, plant)
+    runs.read_results(settings.run_dir)
+    compared = load_systems(settings, plant)
+    dataset, _ = data.ensure_dataset(source_of(settings))
+    rows: list[dict[str, Any]] = []
+    arrays: dict[str, Any] = {"dt": plant.dt}
+    length = f"{protocol.episodes} episodes of {protocol.episode_s:.0f} s"
+    for name, system in compared.items():
+        store.print_message(f"driving {length}: {name} on {episodes.name}")
+        result = SystemEvaluation(settings, plant, name, system, dataset)(episodes)
+        rows.append(result.row)
+        arrays |= _named_arrays(result, episodes)
+        error, worst = result.row["rmse_m"]["mean"], result.row["max_deviation_m"]
+        store.print_message(f"  rmse {error:.4f} m, worst {worst:.3f} m")
+    seconds = time.perf_counter() - began
+    config = plain(settings) | ({"command": command} if command else {})
+    path = runs.write_results(
+        settings.run_dir, config, evaluation.compare(rows), arrays, seconds
+    )
+    return {"results": str(path), "rows": len(rows)}
+
+
+def _named_arrays(result: SystemResult, episodes: EpisodeSet) -> dict[str, Any]:
+    """The arrays of a row under the names of episodes.npz."""
+    scenarios = episodes.scenarios
+    road = (scenarios.envs, scenarios.path.points)
+    named = result.arrays | dict(zip(store.ROAD, road, strict=True))
+    prefix = store.drive_name(result.row)
+    return {f"{prefix}/{part}": array for part, array in named.items()}

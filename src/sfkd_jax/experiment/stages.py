@@ -1,0 +1,414 @@
+"""Policy and certificate of a run: loaded if they exist, made if they do not."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Mapping
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from sfkd_jax import build, policy, store
+from sfkd_jax.certification import (
+    MODES,
+    CertificationRefused,
+    certify_incremental,
+    contraction_metrics,
+    is_incremental,
+    issue,
+    output_metrics_from,
+)
+from sfkd_jax.control import PathLaw
+from sfkd_jax.corridor import certify_corridor
+from sfkd_jax.data import (
+    SCENARIOS,
+    Dataset,
+    check_shares,
+    first_share,
+    measure_space,
+    random_windows,
+    spread_windows,
+)
+from sfkd_jax.evaluation import baselines, open_loop
+from sfkd_jax.experiment import data, runs
+from sfkd_jax.experiment.data import Source, source_of
+from sfkd_jax.experiment.options import Settings, TrainingSettings
+from sfkd_jax.plants import Vehicle
+from sfkd_jax.ranges import imported
+from sfkd_jax.rollout import fold
+from sfkd_jax.settings import arguments, choose, plain
+from sfkd_jax.training import fit, multi_step_loss
+from sfkd_jax.types import Key, Model, Params, Space, Trajectory
+
+STARTS = ("random", "identified")
+SCORED_SCENARIOS = ("s1", "s2")
+"""Of the validation runs that trainings are compared on: S3 stays unseen."""
+START = 1
+"""Stream folded into the run's seed; initial weights and windows use stream 0."""
+INCREMENTAL = "incremental.json"
+"""File for the rate of a continuous flow, which has no tubes and no monitor bounds."""
+
+
+def check_settings(settings: Settings, plant: Vehicle) -> None:
+    """Build what the settings choose, with unit scales and an arbitrary certificate.
+
+    A long run then fails before its first hour, not after it.
+
+    Args:
+        settings: of the run.
+        plant: its vehicle.
+
+    Raises:
+        ValueError: naming the setting, or the choices.
+    """
+    options, window = settings.dataset, settings.training.window
+    check_shares(options.shares)
+    if window > options.steps:
+        raise ValueError(
+            f"training.window={window} does not fit segments "
+            f"of dataset.steps={options.steps}"
+        )
+    choose(dict.fromkeys(MODES), settings.certification.mode, "certification.mode")
+    source = source_of(settings)
+    sizes = _sizes(source, plant)
+    law = _zero_law(sizes) if source.along_path else None
+    systems = {"self": None} | build.reference_systems(plant, law)
+    for name in settings.evaluation.systems:
+        choose(systems, name, "evaluation.systems entry")
+    scales = (
+        part(size) for size in (*sizes.values(), 3) for part in (np.zeros, np.ones)
+    )
+    space = Space(*(jnp.asarray(scale, dtype="float32") for scale in scales))
+    model = build.build_model(settings.model, space, plant)
+    if model.along_path != (law is not None):
+        raise ValueError(
+            "model.frame=path and dataset=path go together: "
+            "path coordinates for both or for neither"
+        )
+    if not plant.control_low:  # known from logs alone, and not driven
+        return
+    unit = {name: ((-1.0,) * size, (1.0,) * size) for name, size in sizes.items()}
+    build.build_controller(
+        settings.controller,
+        model,
+        plant,
+        env_low=unit["env"][0],
+        env_high=unit["env"][1],
+        law=law,
+        certificate={"boxes": unit},
+        env_source=settings.environment.source,
+    )
+
+
+def _sizes(source: Source, plant: Vehicle) -> dict[str, int]:
+    """Sizes of body state, control and environment that the model reads."""
+    env = len(source.logs.columns.environment) if source.logs else 0
+    state = len(plant.state_names) - 3
+    if source.along_path:
+        return {"state": state + 2, "control": 4, "env": 2}
+    return {"state": state, "control": 2, "env": env or 2}
+
+
+def _zero_law(sizes: Mapping[str, int]) -> PathLaw:
+    """A law whose output is zero."""
+    axes, corners = 2 + sizes["env"], (2,) * (2 + sizes["env"])
+    shapes = (sizes["state"],), (2,), (2, sizes["state"])
+    tables = (np.zeros((*corners, *shape), np.float32) for shape in shapes)
+    ends = np.zeros(axes, np.float32), np.ones(axes, np.float32)
+    return PathLaw(*map(jnp.asarray, (*ends, np.ones(2, np.float32), *tables)))
+
+
+def ensure_policy(settings: Settings) -> policy.TrainedModel:
+    """Return the policy of the run; train it, or continue training, if it is missing.
+
+    Raises:
+        ArtefactError: the run was made with other settings, is damaged, or is being
+            trained by another process.
+        ValueError: the logs are too few for the levels of the certificate.
+    """
+    run_dir, source = settings.run_dir, source_of(settings)
+    if factory := getattr(settings.model, "factory", None):
+        imported(factory, "model.factory")
+    if not store.exists(run_dir / "policy.npz"):
+        if source.logs:
+            dataset, _ = data.ensure_dataset(source)
+            data.check_calibration_size(dataset, settings.certification)
+        with store.locked(run_dir):
+            runs.claim(settings)
+            if not store.exists(run_dir / "policy.npz"):
+                _train(settings, *data.ensure_dataset(source))
+    runs.claim(settings)
+    return policy.restore(run_dir)
+
+
+def _train(settings: Settings, dataset: Dataset, data_hash: str) -> None:
+    """Train, then write the best weights and their prediction error on the test part.
+
+    Args:
+        settings: of the run.
+        dataset: all of its parts.
+        data_hash: of the data set.
+    """
+    run_dir, options = settings.run_dir, settings.training
+    source, horizon = source_of(settings), settings.training.window
+    recorded = runs.policy_settings(settings, dataset)
+    dataset = dataset._replace(train=first_share(dataset.train, options.data_share))
+    space = measure_space(dataset)
+    plant = build.build_vehicle(settings.vehicle)
+    model = build.build_model(settings.model, space, plant)
+    key = jax.random.fold_in(jax.random.key(settings.seed), 0)
+    if model.fitting.identify is not None:
+        store.print_message(f"identifying {settings.model.system} in {run_dir}")
+        params = model.fitting.identify(dataset.train, dataset.validation, key)
+        best = None
+    else:
+        store.print_message(
+            f"training {settings.model.system}, {options.steps} steps, in {run_dir}"
+        )
+        started = with_start(model, options.start, dataset.train, settings.seed)
+        params, best = _fit(options, started, space, dataset, key, run_dir)
+    document = _open_loop_document(model, params, source, dataset, horizon)
+    document["validation_score"] = _validation_score(
+        model, params, space, dataset, horizon
+    )
+    store.write_json(run_dir / "open_loop.json", document)
+    recorded |= {"space": build.space_to_settings(space), "best_step": best}
+    policy.save(
+        run_dir / "policy.npz",
+        params,
+        recorded,
+        made_from={"dataset": data_hash},
+        law=data.ensure_law(source),
+    )
+
+
+def _fit(
+    options: TrainingSettings,
+    model: Model,
+    space: Space,
+    dataset: Dataset,
+    key: Key,
+    run_dir: Path,
+) -> tuple[Params, int | None]:
+    """Fit a model by gradient descent; return the best weights and their step."""
+    loss = multi_step_loss(model, space, **arguments(options.loss, multi_step_loss))
+    draw = partial(random_windows, batch=options.batch, length=options.window)
+    held_out = spread_windows(dataset.validation, length=options.window)
+    return fit(
+        model,
+        loss,
+        draw,
+        dataset.train,
+        held_out,
+        key,
+        run_dir,
+        inspect=partial(contraction_metrics, model),
+        **arguments(options, fit),
+    )
+
+
+def with_start(model: Model, start: str, train: Trajectory, seed: int) -> Model:
+    """Return the model with the initial weights of `training.start`.
+
+    Args:
+        model: to train.
+        start: "random", or "identified" for a linear part obtained by regression.
+        train: data of the regression.
+        seed: of the run.
+
+    Raises:
+        ValueError: an unknown start, or one that this model does not have.
+    """
+    if start not in STARTS:
+        raise ValueError(
+            f"training.start must be one of {', '.join(STARTS)}, got {start!r}"
+        )
+    if start == "random":
+        return model
+    if (regress := model.fitting.start) is None:
+        raise ValueError(
+            "training.start=identified needs a model=sfkd…, "
+            "whose linear part can be identified"
+        )
+    key = jax.random.fold_in(jax.random.key(seed), START)
+    return model._replace(init=lambda drawn: regress(model.init(drawn), train, key))
+
+
+def _open_loop_document(
+    model: Model, params: Params, source: Source, dataset: Dataset, horizon: int
+) -> dict[str, Any]:
+    """The content of open_loop.json: errors by steps ahead, and of naive predictors."""
+    plant = (
+        data.closed_loop(source)
+        if source.along_path
+        else build.build_vehicle(source.vehicle)
+    )
+    naive = baselines(
+        dataset.train,
+        nominal=plant.nominal,
+        dt=plant.dt,
+        horizon=horizon,
+        along_path=source.along_path is not None,
+    )
+
+    @jax.jit
+    def errors(params: Params, test: Trajectory) -> tuple[jax.Array, dict[str, Any]]:
+        own = open_loop(model, fold(model, params), test, horizon=horizon)
+        return own, {name: predict(test) for name, predict in naive.items()}
+
+    own, others = errors(params, dataset.test)
+    return {
+        "steps": list(range(1, horizon + 1)),
+        "dt": plant.dt,
+        "trajectories": dataset.test.controls.shape[0],
+        **_error_columns(own),
+        "baselines": {name: _error_columns(one) for name, one in others.items()},
+    }
+
+
+def _error_columns(errors: jax.Array) -> dict[str, list[float]]:
+    """Errors by coordinate as lists over the steps ahead."""
+    columns = np.asarray(errors, dtype=np.float64).T
+    return {
+        "position_rmse_m": np.hypot(columns[0], columns[1]).tolist(),
+        "longitudinal_rmse_m": columns[0].tolist(),
+        "lateral_rmse_m": columns[1].tolist(),
+        "yaw_rmse_rad": columns[2].tolist(),
+        "speed_rmse_m_per_s": columns[3].tolist(),
+    }
+
+
+def _validation_score(
+    model: Model, params: Params, space: Space, dataset: Dataset, horizon: int
+) -> float:
+    """Prediction loss on validation runs of S1 and S2, or on all recorded ones.
+
+    Its weights are the defaults whatever was trained with, so that trainings with
+    different weights can be compared.
+    """
+    held_out = dataset.validation
+    if dataset.scenarios is not None:
+        wanted = [SCENARIOS.index(name) for name in SCORED_SCENARIOS]
+        rows = np.isin(dataset.scenarios["validation"], wanted)
+        held_out = jax.tree.map(lambda leaf: leaf[rows], held_out)
+    score = multi_step_loss(
+        model, space, consistency=0.0, reconstruction=0.0, transport=0.0
+    )
+    return float(jax.jit(score)(params, spread_windows(held_out, length=horizon))[0])
+
+
+def certificate_path(run_dir: Path) -> Path:
+    """Return the path of the certificate of a run, whether or not it exists."""
+    incremental = run_dir / INCREMENTAL
+    return incremental if incremental.exists() else run_dir / policy.CERTIFICATE
+
+
+def certify_policy(settings: Settings) -> dict[str, Any]:
+    """Certify the policy of the run, and write and return the document.
+
+    A refusal is a document too: `valid` is false, and `reason` is given.
+    """
+    began, run_dir = time.perf_counter(), settings.run_dir
+    trained = ensure_policy(settings)
+    incremental = is_incremental(trained.model, trained.params)
+    try:
+        document = (
+            certify_incremental(trained.model, trained.params, dt=trained.vehicle.dt)
+            if incremental
+            else _certify_tubes(settings, trained)
+        )
+    except CertificationRefused as reason:
+        document = {"valid": False, "reason": str(reason)}
+    versions = store.versions() | document.get("versions", {})
+    document |= {
+        "weights_sha256": trained.weights_sha256,
+        "policy_sha256": trained.sha256,
+        "certification": _asked_for(settings),
+        "versions": versions,
+    }
+    document["seconds"] = time.perf_counter() - began
+    names = (INCREMENTAL, policy.CERTIFICATE)
+    written, stale = names if incremental else reversed(names)
+    (run_dir / stale).unlink(missing_ok=True)
+    store.write_json(run_dir / written, document)
+    store.print_message(f"certificate: {_verdict(document)}")
+    return document
+
+
+def _asked_for(settings: Settings) -> dict[str, Any]:
+    """The settings of the certification that a certificate records."""
+    asked = plain(settings.certification)
+    return {name: value for name, value in asked.items() if name != "renew"}
+
+
+def _verdict(document: Mapping[str, Any]) -> str:
+    """Summarise a document in one line."""
+    if not document["valid"]:
+        return f"refused: {document['reason']}"
+    verdict = f"alpha {document['alpha']:.6f}"
+    if "d_bar" in document:
+        d_bar = document["d_bar"]
+        verdict += f"; d_bar {d_bar['value']:.4g} holds for {d_bar['holds_for']}"
+    return verdict
+
+
+def _certify_tubes(settings: Settings, trained: policy.TrainedModel) -> dict[str, Any]:
+    """Certify the steps of a model, with tubes calibrated on the data of the run."""
+    source, options = source_of(settings), settings.certification
+    dataset, _ = data.ensure_dataset(source)
+    boxes: dict[str, Any] = data.boxes(dataset)
+    noise = settings.evaluation.observation_noise
+    if source.logs:  # the noise of the sensors is already in the logs
+        boxes, noise = boxes | {"names": source.columns}, ()
+    document = issue(
+        trained.model,
+        trained.params,
+        validation=dataset.validation,
+        calibration=dataset.calibration,
+        held_out=data.held_out_parts(source, dataset),
+        boxes=boxes,
+        drives=dataset.drives,
+        sensor_noise=noise,
+        **arguments(options, issue),
+    )
+    if document["outputs"] and source.logs is None:
+        document["corridor"] = certify_corridor(
+            {
+                "vehicle": settings.vehicle,
+                "dataset": plain(settings.dataset) | settings.environment.box,
+                "evaluation": {"observation_noise": noise},
+                "certification": {"level": options.level},
+            },
+            trained,
+            output_metrics_from(document["outputs"]),
+            **arguments(options.corridor, certify_corridor),
+        )
+    return document
+
+
+def ensure_certificate(settings: Settings) -> None:
+    """Train and certify the policy of the run, unless both exist.
+
+    A certificate of other settings of the certification is made again.
+    """
+    run_dir = settings.run_dir
+    if store.exists(run_dir / "policy.npz") and _is_certified(settings):
+        ensure_policy(settings)
+        return
+    with store.locked(run_dir, wait=True):  # another process may be training it
+        ensure_policy(settings)
+        if not _is_certified(settings):
+            certify_policy(settings)
+
+
+def _is_certified(settings: Settings) -> bool:
+    """Whether there is a certificate or a refusal with these settings."""
+    path = certificate_path(settings.run_dir)
+    if not path.exists():
+        return False
+    recorded = store.read_json(path).get("certification", {})
+    return not store.differences(recorded, _asked_for(settings))

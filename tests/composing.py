@@ -1,0 +1,26 @@
+"""Settings as a command composes them."""
+
+from functools import cache
+
+from hydra import compose, initialize_config_dir
+
+from sfkd_jax.experiment import command
+from sfkd_jax.settings import plain
+
+
+@cache
+def composed(*overrides):
+    """The configuration before it is checked."""
+    command.register()
+    with initialize_config_dir(command.conf_path(), version_base="1.3"):
+        return compose("config", overrides=list(overrides))
+
+
+def settings(*overrides):
+    """The checked settings."""
+    return command.settings_of(composed(*overrides))
+
+
+def plain_settings(*overrides):
+    """The checked settings as plain values, as results and policies record them."""
+    return plain(settings(*overrides))
