@@ -168,7 +168,7 @@ def test_an_unknown_environment_becomes_a_constant(tmp_path):
     assert together(logged.dataset)[2].shape == (30, STEPS, 2)
     assert not together(logged.dataset)[2].any()
     assert logged.coverage["environment"] == {}
-    assert np.all(np.asarray(logged.environment.high) >= 1e6)  # nothing can be outside
+    assert np.all(np.asarray(logged.dataset.env_high) >= 1e6)  # nothing can be outside
 
 
 @pytest.mark.parametrize("period", [0.01, 0.03, 0.04])

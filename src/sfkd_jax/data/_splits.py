@@ -163,8 +163,8 @@ def measure_space(dataset: Dataset) -> Space:
     body = _range(train.states[..., BODY])
     control = _range(train.controls)
     centre, half = (
-        0.5 * (environment.high + environment.low),
-        0.5 * (environment.high - environment.low),
+        0.5 * (dataset.env_high + dataset.env_low),
+        0.5 * (dataset.env_high - dataset.env_low),
     )
     return Space(
         *body,
