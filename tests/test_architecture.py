@@ -2,100 +2,67 @@
 
 import ast
 import importlib.util
+import io
 import os
 import re
 import statistics
 import subprocess
 import sys
+import tokenize
+from collections import Counter
 from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
 
 FUNCTION = (ast.FunctionDef, ast.AsyncFunctionDef)
-SRC = Path(__file__).parents[1] / "src" / "sfkd_jax"
+ROOT = Path(__file__).parents[1]
+SRC = ROOT / "src" / "sfkd_jax"
 PACKAGE = SRC.name
 CORE = {"types", "geometry", "rollout", "ranges"}
-COMMANDS = {
-    "generate",
-    "train",
-    "certify",
-    "evaluate",
-    "compare",
-    "report",
-    "export",
-    "doctor",
-    "demo",
-}
+COMMANDS = {"generate", "train", "certify", "evaluate", "compare", "doctor", "demo"}
+"""Modules that are commands alone; `export` and `report` are packages that run."""
 PLANT = CORE | {"plants"}
-MODEL_AND_DATA = PLANT | {"store", "build", "certification", "control", "data"}
+LEARNED = PLANT | {"scenarios", "data", "models", "control", "store"}
 ARROWS = {
     "types": set(),
+    "ranges": set(),
     "geometry": CORE,
     "rollout": CORE,
-    "ranges": set(),
     "store": set(),
     "plants": CORE,
     "models": CORE,
     "control": CORE,
-    "certification": CORE,
     "training": CORE | {"store"},
     "scenarios": PLANT,
     "data": PLANT | {"scenarios", "store"},
     "evaluation": PLANT | {"scenarios"},
-    "build": PLANT | {"scenarios", "data", "models", "control"},
-    "adapters": PLANT | {"scenarios", "build"},
-    "policy": PLANT | {"store", "build", "certification", "control", "models"},
-    "export": CORE | {"store", "build", "policy"},
-    "corridor": MODEL_AND_DATA | {"evaluation", "policy"},
-    "pipeline": MODEL_AND_DATA
-    | {"corridor", "evaluation", "policy", "scenarios", "training"},
-    "reporting": {"store", "evaluation"},
-    "paper": {"store", "evaluation", "reporting"},
+    "certification": LEARNED | {"evaluation"},
+    "policy": LEARNED | {"certification", "experiment"},
+    "adapters": PLANT | {"scenarios", "experiment"},
+    "report": {"store", "evaluation"},
     "__init__": {"store", "export", "policy"},
 }
-LIBRARY = set(ARROWS)
-ARROWS |= {"cli": LIBRARY}
-ARROWS |= {command: LIBRARY | COMMANDS | {"cli"} for command in COMMANDS | {"__main__"}}
+ARROWS |= {"export": CORE | {"store", "policy", "experiment"}}
+ARROWS |= {"experiment": set(ARROWS)}
+ARROWS |= {name: set(ARROWS) for name in COMMANDS | {"__main__"}}
 
 ALLOWED_EVERYWHERE = set(sys.stdlib_module_names) | {PACKAGE, "jax", "jaxtyping"}
-COMMAND_LINE = {"hydra", "omegaconf", "numpy", "rich"}
+COMMAND_LINE = {"hydra", "omegaconf", "numpy"}
 THIRD_PARTY = {
-    "store": {"numpy", "filelock"},
-    "data": {"numpy", "pyarrow"},
-    "models": {"flax"},
+    "store": {"numpy", "filelock", "safetensors"},
+    "data": {"numpy", "pyarrow", "pint"},
+    "models": {"flax", "numpy"},
     "control": {"numpy"},
-    "training": {"optax", "orbax", "tensorboardX", "rich"},
+    "training": {"optax", "orbax", "numpy"},
     "certification": {"numpy", "scipy", "threadpoolctl", "cvxpy", "clarabel"},
     "evaluation": {"numpy", "scipy"},
-    "reporting": {"numpy", "matplotlib"},
+    "report": {"numpy", "matplotlib", "pandas", "jinja2", "hydra", "omegaconf"},
     "policy": {"numpy"},
-    "corridor": {"numpy"},
-    "adapters": {
-        "brax",
-        "gymnasium",
-        "matplotlib",
-        "numpy",
-        "scipy",
-        "vehiclemodels",
-    },
-    "export": {"numpy", "iree"},
-    "pipeline": {"numpy"},
-    "paper": {"numpy", "matplotlib"},
-    "cli": COMMAND_LINE | {"submitit"},
+    "adapters": {"brax", "gymnasium", "matplotlib", "numpy", "scipy", "vehiclemodels"},
+    "export": {"numpy", "iree", "hydra", "omegaconf"},
+    "experiment": COMMAND_LINE | {"submitit"},
 } | {command: COMMAND_LINE for command in COMMANDS | {"__main__"}}
-
-FILES = {
-    file.relative_to(SRC).as_posix(): ast.parse(file.read_text("utf-8"))
-    for file in SRC.rglob("*.py")
-}
-PACKAGE_OF = {name: name.split("/")[0].removesuffix(".py") for name in FILES}
-FOREIGN = {
-    "brax": {"adapters/_brax.py", "adapters/_brax_system.py"},
-    "gymnasium": {"adapters/_gymnasium.py"},
-}
-FOREIGN |= {"iree": {"export/_iree.py"}, "pyarrow": {"data/_tables.py"}}
-FOREIGN |= {"vehiclemodels": {"adapters/_commonroad_equations.py"}}
 HEAVY = {
     "hydra",
     "omegaconf",
@@ -105,19 +72,42 @@ HEAVY = {
     "brax",
     "matplotlib",
     "optax",
+    "pandas",
+    "scipy",
+    "pyarrow",
+    "pint",
 }
-WRITES = {
-    f"os.environ.{verb}" for verb in ("update", "setdefault", "pop", "popitem", "clear")
+"""What `import sfkd_jax.control` does not load."""
+
+LINES = {
+    "src": 20_000,
+    "tests": 15_000,
+    "benchmarks, experiments": 3_000,
 }
-HOST = {"policy", "pipeline", "corridor", "training", "certification", "export"}
-"""Besides the commands and gymnasium's adapter, where code runs on the host and may
-compile.
-"""
-FORBIDDEN = WRITES | {"os.putenv", "os.unsetenv", "jax.config"}
-GIVES_BACK = "export/_jax_settings.py"
-"""The only library file that touches settings of jax: it sets them for one compilation
-or export, and restores.
-"""
+FILES_IN_SRC = 130
+OPTIONS, EXPERIMENTS = 65, 10
+COMMITTED = {"*.json": 2_000_000, "figures": 3_000_000}
+COMMENTS = 0.03
+"""Share of the lines of src that are comments."""
+LONGEST_FILE, LONGEST_FUNCTION, MEDIAN_FUNCTION = 500, 80, 9
+UNTYPED_SETTINGS = 0
+"""Annotations `dict[str, Any]` below the commands."""
+
+TEXTS = {
+    file.relative_to(SRC).as_posix(): file.read_text("utf-8")
+    for file in SRC.rglob("*.py")
+}
+FILES = {name: ast.parse(text) for name, text in TEXTS.items()}
+PACKAGE_OF = {name: name.split("/")[0].removesuffix(".py") for name in FILES}
+LIBRARY = [
+    name
+    for name in FILES
+    if PACKAGE_OF[name] not in COMMANDS | {"__main__", "experiment"}
+    and not name.endswith("__main__.py")
+]
+"""Files below the commands."""
+COMPILES = {"policy", "training", "certification", "export", "data"}
+"""Packages that run on the host, and may call `jax.jit`; so may gymnasium's adapter."""
 
 
 def imports(name: str) -> Iterator[str]:
@@ -134,9 +124,7 @@ def imports(name: str) -> Iterator[str]:
 
 
 def own(name: str) -> Iterator[list[str]]:
-    """The imports from this package, as [room, the rest ...]; the version string
-    belongs to no room.
-    """
+    """The imports from this package as [package, the rest ...]."""
     for imported in imports(name):
         package, *rest = imported.split(".")
         if package == PACKAGE and rest != ["__version__"]:
@@ -150,30 +138,33 @@ def nodes(name: str, *kinds: type) -> list:
 def lines_of_code(function: ast.FunctionDef) -> int:
     """Lines of a function with everything inside it, less docstrings."""
     documented = [
-        f
-        for f in ast.walk(function)
-        if isinstance(f, FUNCTION) and ast.get_docstring(f)
+        inner
+        for inner in ast.walk(function)
+        if isinstance(inner, FUNCTION) and ast.get_docstring(inner)
     ]
-    docstrings = [f.body[0] for f in documented]
+    docstrings = [inner.body[0] for inner in documented]
     taken = {line for d in docstrings for line in range(d.lineno, d.end_lineno + 1)}
     return len(set(range(function.lineno, function.end_lineno + 1)) - taken)
 
 
-def unannotated(function: ast.FunctionDef) -> bool:
-    given = function.args
-    arguments = [
-        *given.posonlyargs,
-        *given.args,
-        *given.kwonlyargs,
-        given.vararg,
-        given.kwarg,
+def tracked(*patterns: str) -> list[Path]:
+    """Files of the repository; in an unpacked archive, all files."""
+    listed = subprocess.run(
+        ["git", "ls-files", *patterns], cwd=ROOT, capture_output=True, text=True
+    )
+    if listed.returncode == 0 and listed.stdout:
+        return [ROOT / line for line in listed.stdout.splitlines()]
+    return [file for pattern in patterns for file in ROOT.rglob(pattern)]
+
+
+def lines_in(*folders: str) -> int:
+    files = [
+        file
+        for folder in folders
+        for kind in ("*.py", "*.sh", "*.html", "*.jinja")
+        for file in (ROOT / folder).rglob(kind)
     ]
-    bare = [
-        a
-        for a in arguments
-        if a and a.annotation is None and a.arg not in ("self", "cls")
-    ]
-    return bool(bare) or function.returns is None
+    return sum(len(file.read_text("utf-8").splitlines()) for file in files)
 
 
 def fresh(code: str, **settings: str) -> str:
@@ -191,32 +182,22 @@ def fresh(code: str, **settings: str) -> str:
 
 
 def test_every_file_has_a_package_and_follows_the_arrows():
-    assert FILES
-    assert set(PACKAGE_OF.values()) <= set(ARROWS), (
-        "state the new package's arrows here and in ARCHITECTURE.md"
-    )
+    assert set(PACKAGE_OF.values()) <= set(ARROWS), "state the arrows of a new package"
     reached = {(name, rest[0]) for name in FILES for rest in own(name)}
-    assert (
-        sorted(
-            pair
-            for pair in reached
-            if pair[1] not in ARROWS[PACKAGE_OF[pair[0]]] | {PACKAGE_OF[pair[0]]}
-        )
-        == []
-    )
+    assert [
+        pair
+        for pair in sorted(reached)
+        if pair[1] not in ARROWS[PACKAGE_OF[pair[0]]] | {PACKAGE_OF[pair[0]]}
+        and not pair[0].endswith("__main__.py")
+    ] == []
 
 
 def test_packages_are_imported_through_their_public_names():
-    reached = [
+    assert [
         (name, rest)
         for name in FILES
         for rest in own(name)
-        if rest[0] != PACKAGE_OF[name]
-    ]
-    assert [
-        (name, rest)
-        for name, rest in reached
-        if any(part.startswith("_") for part in rest[1:])
+        if rest[0] != PACKAGE_OF[name] and any(part.startswith("_") for part in rest[1:])
     ] == []
 
 
@@ -224,129 +205,114 @@ def test_third_party_packages_stay_where_they_belong():
     reached = {
         (name, imported.split(".")[0]) for name in FILES for imported in imports(name)
     }
-    allowed = {
-        name: ALLOWED_EVERYWHERE | THIRD_PARTY.get(package, set())
-        for name, package in PACKAGE_OF.items()
-    }
-    assert (
-        sorted(
-            (name, package) for name, package in reached if package not in allowed[name]
-        )
-        == []
-    )
+    assert [
+        (name, package)
+        for name, package in sorted(reached)
+        if package
+        not in ALLOWED_EVERYWHERE | THIRD_PARTY.get(PACKAGE_OF[name], set())
+    ] == []
 
 
-def test_foreign_interfaces_are_known_to_their_adapters_only():
-    reached = {
-        (imported.split(".")[0], name) for name in FILES for imported in imports(name)
+def test_the_house_stays_within_its_budgets():
+    """They only fall. Lines as ruff formats them."""
+    counted = {
+        "src": lines_in("src"),
+        "tests": lines_in("tests"),
+        "benchmarks, experiments": lines_in("benchmarks", "experiments"),
     }
-    assert {
-        package: {name for result, name in reached if result == package}
-        for package in FOREIGN
-    } == FOREIGN
+    assert {name: n for name, n in counted.items() if n > LINES[name]} == {}
+    assert len(FILES) <= FILES_IN_SRC
+    assert len(tracked("conf/*.yaml", "conf/**/*.yaml")) <= OPTIONS
+    assert len(list((ROOT / "conf" / "experiment").glob("*.yaml"))) <= EXPERIMENTS
+    figures = tracked("*.png", "*.gif", "*.svg")
+    sizes = {
+        "*.json": sum(file.stat().st_size for file in tracked("*.json")),
+        "figures": sum(file.stat().st_size for file in figures),
+    }
+    assert {name: n for name, n in sizes.items() if n > COMMITTED[name]} == {}
 
 
 def test_files_and_functions_stay_small():
-    lengths = {
-        name: len((SRC / name).read_text("utf-8").splitlines()) for name in FILES
-    }
-    assert {name: length for name, length in lengths.items() if length > 300} == {}
+    lengths = {name: len(text.splitlines()) for name, text in TEXTS.items()}
+    assert {name: n for name, n in lengths.items() if n > LONGEST_FILE} == {}
     functions = [(name, node) for name in FILES for node in nodes(name, *FUNCTION)]
     sizes = [(name, node.name, lines_of_code(node)) for name, node in functions]
-    assert [entry for entry in sizes if entry[2] > 80] == []
-    assert statistics.median(size for _, _, size in sizes) <= 8
+    assert [entry for entry in sizes if entry[2] > LONGEST_FUNCTION] == []
+    assert statistics.median(size for _, _, size in sizes) <= MEDIAN_FUNCTION
 
 
-def test_the_top_level_stays_small():
-    modules = {file.stem for file in SRC.glob("*.py")} - {"__init__"}
-    assert modules == (COMMANDS - {"export"}) | CORE | {"policy", "__main__"}
-    assert len(modules) <= 14
+def test_comments_say_why():
+    comments = sum(
+        token.type == tokenize.COMMENT
+        for text in TEXTS.values()
+        for token in tokenize.generate_tokens(io.StringIO(text).readline)
+    )
+    assert comments >= COMMENTS * sum(len(t.splitlines()) for t in TEXTS.values())
 
 
-def test_the_old_private_words_are_gone():
-    """Names of packages and identifiers that only this project understood."""
-    root = SRC.parents[1]
-    words = "shelf|hallway|rehears|assembly|itinerar|rooms|doors|finite_or_dear"
-    gone = re.compile(rf"\b({words})", re.IGNORECASE)
-    names = {"told", "met", "found", "place", "asked", "said", "pushed", "understood"}
-    folders = ("src", "conf", "docs", "examples", "benchmarks", "experiments")
-    files = [file for folder in folders for file in (root / folder).rglob("*")]
-    files += [
-        root / f"{name}.md" for name in ("README", "ARCHITECTURE", "CONTRIBUTING")
-    ]
-    for file in files:
-        if file.suffix in (".py", ".md", ".yaml", ".toml", ".sh", ".html"):
-            assert gone.findall(file.read_text("utf-8")) == [], file
-    tokens = {
-        (name, node.id if isinstance(node, ast.Name) else node.arg)
-        for name in FILES
-        for node in nodes(name, ast.Name, ast.arg)
-    }
-    assert sorted(pair for pair in tokens if pair[1] in names) == []
+def test_settings_below_the_commands_have_types():
+    found = Counter(
+        name
+        for name in LIBRARY
+        for line in TEXTS[name].splitlines()
+        if re.search(r"[sS]ettings: (dict|Mapping)\[str, Any\]", line)
+    )
+    assert found.total() <= UNTYPED_SETTINGS, found
 
 
 def test_public_functions_are_annotated():
+    def bare(function: ast.FunctionDef) -> bool:
+        given = function.args
+        arguments = [*given.posonlyargs, *given.args, *given.kwonlyargs]
+        arguments += [one for one in (given.vararg, given.kwarg) if one]
+        named = [one for one in arguments if one.arg not in ("self", "cls")]
+        return function.returns is None or any(one.annotation is None for one in named)
+
     scopes = [(n, s) for n in FILES for s in (FILES[n], *nodes(n, ast.ClassDef))]
-    functions = [
-        (n, node)
-        for n, scope in scopes
+    assert [
+        (name, node.name)
+        for name, scope in scopes
         for node in scope.body
-        if isinstance(node, FUNCTION)
-    ]
-    assert [
-        (n, f.name)
-        for n, f in functions
-        if not f.name.startswith("_") and unannotated(f)
+        if isinstance(node, FUNCTION) and not node.name.startswith("_") and bare(node)
     ] == []
 
 
-def test_only_commands_and_host_packages_compile():
-    library = [
+def test_only_host_packages_compile():
+    files = [name for name in LIBRARY if PACKAGE_OF[name] not in COMPILES]
+    assert {
         name
-        for name in FILES
-        if PACKAGE_OF[name] not in COMMANDS | HOST and name not in FOREIGN["gymnasium"]
-    ]
-    assert [
-        name for name in library if {"jax.jit", "jax.pmap"} & set(imports(name))
-    ] == []
-    uses = [(name, node) for name in library for node in nodes(name, ast.Attribute)]
-    assert [
-        (n, node.lineno)
-        for n, node in uses
-        if ast.unparse(node) in ("jax.jit", "jax.pmap")
-    ] == []
+        for name in files
+        if "gymnasium" not in set(imports(name))
+        and (
+            {"jax.jit", "jax.pmap"} & set(imports(name))
+            or any(
+                ast.unparse(node) in ("jax.jit", "jax.pmap")
+                for node in nodes(name, ast.Attribute)
+            )
+        )
+    } == set()
 
 
 def test_the_library_leaves_global_settings_alone():
-    library = [
-        name
-        for name in FILES
-        if PACKAGE_OF[name] not in COMMANDS | {"cli"} and name != GIVES_BACK
-    ]
-    assert [
-        name for name in library if (FORBIDDEN | {"os.environ"}) & set(imports(name))
-    ] == []
-    uses = [(name, node) for name in library for node in nodes(name, ast.Attribute)]
-    assert [
-        (n, node.lineno) for n, node in uses if ast.unparse(node) in FORBIDDEN
-    ] == []
-    items = [(name, node) for name in library for node in nodes(name, ast.Subscript)]
-    written = [(n, node) for n, node in items if not isinstance(node.ctx, ast.Load)]
-    assert [
-        (n, node.lineno)
-        for n, node in written
-        if ast.unparse(node.value) == "os.environ"
-    ] == []
+    """Neither environment variables nor `jax.config`, but for one file that restores
+    what it sets.
+    """
+    changes = re.compile(
+        r"os\.environ\.(update|setdefault|pop)|os\.putenv|os\.environ\[.*\] ="
+        r"|jax\.config"
+    )
+    found = {name for name in LIBRARY if changes.search(TEXTS[name])}
+    assert len(found) <= 1, found
+    assert all(PACKAGE_OF[name] == "export" for name in found)
 
 
 @pytest.mark.parametrize(
-    ("module", "kept_out"), [("control", HEAVY), ("policy", HEAVY - {"optax"})]
+    ("module", "kept_out"), [("control", HEAVY), ("policy", HEAVY - {"pandas"})]
 )
 def test_a_controller_is_imported_without_heavy_dependencies(module, kept_out):
-    if importlib.util.find_spec(f"{PACKAGE}.{module}") is None:
-        pytest.skip("not built yet")
     code = f"import sys, {PACKAGE}.{module}; print(*{{name.split('.')[0] for name in sys.modules}})"
-    assert not kept_out & set(fresh(code).split())
+    loaded = set(fresh(code).split())
+    assert not kept_out & loaded
 
 
 @pytest.mark.parametrize("module", [PACKAGE, f"{PACKAGE}.adapters"])
@@ -354,34 +320,8 @@ def test_a_foreign_package_is_loaded_when_its_adapter_is_asked_for(module):
     code = (
         f"import sys, {module}; print(*{{name.split('.')[0] for name in sys.modules}})"
     )
-    assert not {"brax", "mujoco", "gymnasium", "vehiclemodels"} & set(
-        fresh(code).split()
-    )
-
-
-@pytest.mark.parametrize(
-    ("name", "package", "extra"),
-    [
-        ("BraxVehicle", "brax", "brax"),
-        ("brax_plant", "brax", "brax"),
-        ("GymnasiumVehicle", "gymnasium", "gym"),
-        ("commonroad_vehicle", "vehiclemodels", "plants"),
-    ],
-)
-def test_an_adapter_without_its_package_names_the_extra(name, package, extra):
-    code = f"""
-import sys
-sys.modules["{package}"] = None
-from {PACKAGE} import adapters
-try:
-    adapters.{name}
-except ImportError as refusal:
-    print(refusal)
-"""
-    assert (
-        fresh(code).strip()
-        == f'{PACKAGE}.adapters.{name} needs {package}: pip install "sfkd-jax[{extra}]"'
-    )
+    foreign = {"brax", "mujoco", "gymnasium", "vehiclemodels"}
+    assert not foreign & set(fresh(code).split())
 
 
 def test_importing_the_controller_costs_little_beyond_jax(tmp_path):
@@ -389,14 +329,13 @@ def test_importing_the_controller_costs_little_beyond_jax(tmp_path):
     cache; a busy host needs more.
     """
     timed = "import time; start = time.process_time(); import {}; print(time.process_time() - start)"
-    seconds: dict[str, list[float]] = {"jax": [], f"{PACKAGE}.control": []}
-    for turn in range(15):
-        for module, measured in seconds.items():
-            measured.append(
-                float(fresh(timed.format(module), PYTHONPYCACHEPREFIX=str(tmp_path)))
+    best = {"jax": float("inf"), f"{PACKAGE}.control": float("inf")}
+    for _ in range(10):
+        for module in best:
+            seconds = float(
+                fresh(timed.format(module), PYTHONPYCACHEPREFIX=str(tmp_path))
             )
-        if turn >= 4 and min(seconds[f"{PACKAGE}.control"]) <= 1.3 * min(
-            seconds["jax"]
-        ):
+            best[module] = min(best[module], seconds)
+        if best[f"{PACKAGE}.control"] <= 1.3 * best["jax"]:
             return
-    assert min(seconds[f"{PACKAGE}.control"]) <= 1.3 * min(seconds["jax"])
+    assert best[f"{PACKAGE}.control"] <= 1.3 * best["jax"]
