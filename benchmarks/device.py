@@ -110,7 +110,7 @@ def episodes(name: str, samples: int, count: int, seed: int) -> dict[str, float]
 
 
 def main() -> None:
-    """Measure and print one JSON object."""
+    """Measure, print and store."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--samples", type=int, nargs="+", default=[1500])
     parser.add_argument("--steps", type=int, default=200)
@@ -121,22 +121,27 @@ def main() -> None:
     )
     parser.add_argument("--out", type=Path)
     asked = parser.parse_args()
-    device = jax.devices()[0]
-    result = {"device": device.device_kind, "jax": jax.__version__, "policies": {}}
+    device = jax.devices()[0].device_kind
+    policies = {}
     for name in asked.policies:
         steps = {
             str(samples): control_step(name, samples, asked.steps)
             for samples in asked.samples
         }
-        result["policies"][name] = {"control_step": steps}
+        policies[name] = {"control_step": steps}
         print(name, json.dumps(steps), flush=True)
         if asked.episodes:
             found = episodes(name, asked.samples[0], asked.episodes, asked.seed)
-            result["policies"][name]["s3"] = found
+            policies[name]["s3"] = found
             print(name, json.dumps(found), flush=True)
-        if asked.out:
-            asked.out.write_text(json.dumps(result, indent=1) + "\n")
-    print(json.dumps(result))
+    if asked.out:
+        # One file for all devices: the others' measurements stay.
+        known = json.loads(asked.out.read_text()) if asked.out.exists() else {}
+        known.setdefault("devices", {})[device] = {
+            "jax": jax.__version__,
+            "policies": policies,
+        }
+        asked.out.write_text(json.dumps(known, indent=1) + "\n")
 
 
 if __name__ == "__main__":

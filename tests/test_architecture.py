@@ -197,7 +197,8 @@ def test_packages_are_imported_through_their_public_names():
         (name, rest)
         for name in FILES
         for rest in own(name)
-        if rest[0] != PACKAGE_OF[name] and any(part.startswith("_") for part in rest[1:])
+        if rest[0] != PACKAGE_OF[name]
+        and any(part.startswith("_") for part in rest[1:])
     ] == []
 
 
@@ -208,8 +209,7 @@ def test_third_party_packages_stay_where_they_belong():
     assert [
         (name, package)
         for name, package in sorted(reached)
-        if package
-        not in ALLOWED_EVERYWHERE | THIRD_PARTY.get(PACKAGE_OF[name], set())
+        if package not in ALLOWED_EVERYWHERE | THIRD_PARTY.get(PACKAGE_OF[name], set())
     ] == []
 
 

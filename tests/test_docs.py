@@ -21,9 +21,7 @@ FENCED = re.compile(r"^```.*?^```", re.DOTALL | re.MULTILINE)
 PACKAGES = {
     folder.name for folder in PACKAGE.iterdir() if (folder / "__init__.py").exists()
 }
-PLACES = PACKAGES | {
-    folder.name for folder in ROOT.iterdir() if folder.is_dir()
-}
+PLACES = PACKAGES | {folder.name for folder in ROOT.iterdir() if folder.is_dir()}
 WORDS = 35_000
 """In all pages together."""
 every_page = pytest.mark.parametrize(

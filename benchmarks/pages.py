@@ -1,0 +1,154 @@
+"""Tables of numbers on the pages, from committed results.
+
+python -m benchmarks.pages    writes every block `<!-- NAME -->` … `<!-- end -->` again
+"""
+
+import json
+from pathlib import Path
+
+from benchmarks.markdown import filled, table
+
+ROOT = Path(__file__).parents[1]
+PRETRAINED = ROOT / "src" / "sfkd_jax" / "pretrained"
+CARS = ("dynamic", "kinematic")
+
+
+def read(name):
+    """A committed JSON document."""
+    return json.loads((ROOT / name).read_text("utf-8"))
+
+
+def corridor():
+    """What the certificates of the shipped policies say, and how they drive S3."""
+    certificates = [read(PRETRAINED / f"{car}_path/certificate.json") for car in CARS]
+    rows = read("experiments/corridor.json")["rows"]
+
+    def error(car, system):
+        row = next(r for r in rows if (r["vehicle"], r["row"]) == (car, system))
+        episodes = row["rmse_mm"][0]
+        return sum(episodes) / len(episodes)
+
+    about = [document["corridor"] for document in certificates]
+    bounds = [f"**{one['corridor_m']:.3f}**" for one in about]
+    low_high = [one["coverage_ci95"] for one in about]
+    lines = [
+        ["**corridor: bound on the distance from the path [m]**", *bounds],
+        [
+            "share of fresh one-minute runs inside, with its 95 % interval",
+            *(
+                f"{one['coverage']:.3f} ({low:.3f} to {high:.3f})"
+                for one, (low, high) in zip(about, low_high, strict=True)
+            ),
+        ],
+        [
+            "share of S3 runs inside, never calibrated on",
+            *(f"{one['by_scenario']['s3']['coverage']:.3f}" for one in about),
+        ],
+        [
+            "contraction rate, proved (metric of the distance)",
+            *(f"{one['outputs']['position']['alpha']:.3f}" for one in certificates),
+        ],
+        [
+            "S3, lateral RMSE [mm]; of a planner that knows the car",
+            *(f"{error(car, 'sfkd'):.1f}; {error(car, 'oracle'):.1f}" for car in CARS),
+        ],
+        [
+            "the same, nominal bicycle",
+            *(f"{error(car, 'nominal'):.0f}" for car in CARS),
+        ],
+    ]
+    return table(["", *CARS], lines)
+
+
+def shield():
+    """Hostile planners inside the filter, and without it."""
+    cars = read("benchmarks/quality/shield.json")["cars"]
+    kinds = ("worst", "bang-bang", "random", "NaN", "full lock")
+
+    def cells(car, kind):
+        both = cars[car]["scripts"][kind]
+        free, kept = both["without"]["departures"], both["with"]
+        count = kept["drives"]
+        return [
+            f"{free} of {count} → {kept['departures']}",
+            f"{kept['largest_m']:.3f} m, {100 * kept['inside']:.1f} %",
+        ]
+
+    head = ["planner"]
+    for car in CARS:
+        head += [
+            f"{car}: left the lane, without → with",
+            "largest distance, runs inside",
+        ]
+    return table(
+        head,
+        [[kind, *cells("dynamic", kind), *cells("kinematic", kind)] for kind in kinds],
+    )
+
+
+def timing():
+    """A control step of the shipped policies by device and number of samples."""
+    devices = read("benchmarks/device.json")["devices"]
+    lines = [
+        [
+            device,
+            samples,
+            f"{step['median_ms']:.1f}",
+            f"{step['p99_ms']:.1f}",
+            f"{about['policies']['dynamic_path']['s3']['steps_per_s']:.0f}"
+            if samples == "1500"
+            else "",
+        ]
+        for device, about in devices.items()
+        for samples, step in sorted(
+            about["policies"]["dynamic_path"]["control_step"].items(),
+            key=lambda item: int(item[0]),
+        )
+    ]
+    head = ["device", "samples", "control step, median [ms]", "99 % [ms]"]
+    return table([*head, "steps per second, many episodes at once"], lines)
+
+
+def adaptation():
+    """Errors with causes that nobody measures, dynamic car."""
+    cases = {
+        car: read(f"benchmarks/quality/adaptation_{car}.json")["cases"] for car in CARS
+    }
+    kinds = (
+        "force, 3 s",
+        "mass + 30 %",
+        "stiffness - 30 %",
+        "steering + 1 degree",
+        "nothing, S3",
+    )
+    systems = ("oracle that knows", "SFKD", "SFKD, adaptive")
+
+    def cell(car, kind):
+        return "; ".join(f"{cases[car][kind][name]['rmse_mm']:.1f}" for name in systems)
+
+    head = ["lateral RMSE [mm]: knows the cause; SFKD; SFKD, adaptive", *CARS]
+    return table(head, [[kind, *(cell(car, kind) for car in CARS)] for kind in kinds])
+
+
+BLOCKS = {
+    "README.md": {"corridor": corridor},
+    "docs/corridor.md": {"corridor": corridor, "shield": shield},
+    "docs/planner.md": {"timing": timing},
+    "docs/adaptation.md": {"adaptation": adaptation},
+}
+
+
+def written():
+    """Pages with their blocks as the results say: path -> text."""
+    return {
+        ROOT / name: filled(
+            (ROOT / name).read_text("utf-8"),
+            {mark: build() for mark, build in blocks.items()},
+        )
+        for name, blocks in BLOCKS.items()
+    }
+
+
+if __name__ == "__main__":
+    for path, text in written().items():
+        path.write_text(text, "utf-8")
