@@ -8,7 +8,7 @@ if command -v taskset >/dev/null && ! command -v nvidia-smi >/dev/null; then
   read -ra cores <<<"$(python -c 'import os; print(*sorted(os.sched_getaffinity(0)))')"
 fi
 if [ "${#cores[@]}" -gt 1 ]; then
-  case $name in protocol2*) vehicles="kinematic kinematic_stiff dynamic" ;; *) vehicles="kinematic dynamic" ;; esac
+  case $name in benchmark*) vehicles="kinematic kinematic_stiff dynamic" ;; *) vehicles="kinematic dynamic" ;; esac
   for vehicle in $vehicles; do python -m sfkd_jax.generate "+experiment=$name" vehicle="$vehicle" "$@"; done
   shares=()
   # Jobs in the background ignore Ctrl-C, so that they would go on alone.

@@ -13,10 +13,12 @@ import re
 from pathlib import Path
 
 import numpy as np
+import yaml
 
 from sfkd_jax import evaluation
 
 HOME = Path(__file__).parent
+TABLE1 = HOME.parent / "conf" / "comparison" / "table1.yaml"
 PAGE = HOME.parent / "docs" / "results.md"
 BENCHMARKS = ("benchmark", "benchmark_path", "table1", "figure2", "corridor")
 VEHICLES = {
@@ -46,17 +48,6 @@ LABELS = {
     "oracle": "Oracle",
 }
 """Row of a comparison -> its name in a table, in the order of the tables."""
-PAPER = {
-    "koopman_mpc": (0.181, 0.243),
-    "neural_ode": (0.162, 0.218),
-    "icode": (0.148, 0.204),
-    "control_synth": (0.139, 0.192),
-    "icode_mppi": (0.127, 0.174),
-    "sfkd_no_fiber": (0.119, 0.170),
-    "sfkd_no_contraction": (0.108, 0.145),
-    "sfkd": (0.098, 0.120),
-}
-"""RMSE on S2 and S3 as the paper's Table 1 prints it [m]."""
 LEVEL = 0.05
 
 
@@ -175,14 +166,17 @@ def benchmark_table(name, scenarios, controllers):
 def paper_table():
     """The paper's rows: what it prints beside what was driven here, kinematic plant."""
     controllers = ("mppi", "koopman_mpc")
+    settings = yaml.safe_load(TABLE1.read_text("utf-8"))["paper"]
+    at = [settings["columns"].index(f"rmse_{name}_m") for name in ("s2", "s3")]
     on = {name: of_scenario("table1", name, controllers) for name in ("s2", "s3")}
     lines = []
     for label in on["s3"]:
         cells = []
         for number, driven in enumerate(on.values()):
             mean = np.mean(driven[label]["kinematic"]["rmse_mm"])
-            printed = PAPER.get(label)
-            cells += [f"{mean:.1f}", f"{1e3 * printed[number]:.0f}" if printed else "–"]
+            printed = settings.get(label)
+            shown = f"{1e3 * printed[at[number]]:.0f}" if printed else "–"
+            cells += [f"{mean:.1f}", shown]
         lines.append([LABELS[label], *cells])
     heads = ["lateral RMSE [mm]", "S2, here", "S2, paper", "S3, here", "S3, paper"]
     return table(heads, lines)
@@ -191,7 +185,7 @@ def paper_table():
 def tables():
     """Marker in docs/results.md -> its table."""
     around_feedback = ("mppi", "koopman_mpc")
-    along_path = ("mppi_path",)
+    along_path = ("mppi_path_300",)
     path_scenarios = ("s2", "s3")
     return {
         "body": benchmark_table("benchmark", ("s3",), around_feedback),

@@ -37,7 +37,7 @@ def trained(tmp_path_factory):
 
 @pytest.fixture(scope="module")
 def config():
-    return settings("certification.level=0.9", "certification=tiny")
+    return settings("certification.level=0.9", "certification.attack_starts=1")
 
 
 @pytest.fixture(scope="module")

@@ -1,8 +1,6 @@
-"""A row of the benchmark from outside the package, as docs/add-a-row.md does it."""
+"""A row of the benchmark from outside the package: examples/own_model.py."""
 
 import json
-import re
-import shlex
 import sys
 from pathlib import Path
 
@@ -16,14 +14,8 @@ from sfkd_jax import build, models
 from sfkd_jax.store import ArtefactError
 from sfkd_jax.types import Space
 
-PAGE = Path(__file__).parents[1] / "docs" / "add-a-row.md"
+EXAMPLE = (Path(__file__).parents[1] / "examples" / "own_model.py").read_text("utf-8")
 SPACE = Space(*(part(size) for size in (1, 2, 2, 3) for part in (jnp.zeros, jnp.ones)))
-
-
-def block(marker):
-    """The code after a marker of the page."""
-    text = PAGE.read_text("utf-8").split(f"<!-- {marker} -->")[1]
-    return re.search(r"```\w+\n(.*?)```", text, re.DOTALL).group(1)
 
 
 STATE_MODEL = """
@@ -47,28 +39,34 @@ def named(monkeypatch, tmp_path, source, **settings):
 
 
 @pytest.mark.slow
-def test_a_stranger_adds_a_row_as_the_page_says(tmp_path):
-    """The page's file and command, on fewer data; a changed name of the function fails
-    before anything is trained.
+def test_a_stranger_adds_a_row_as_the_example_says(tmp_path):
+    """The example on fewer data; a changed name of the function fails before anything
+    is trained.
     """
-    (tmp_path / "my_models.py").write_text(block("row"))
-    program, *words = shlex.split(block("command").replace("\\\n", " "))
-    assert (program, *words[:2]) == ("python", "-m", "sfkd_jax.compare")
-    small = ("comparison.vehicles=[dynamic]", "comparison.seeds=[0]", "evaluation=tiny")
+    (tmp_path / "own_model.py").write_text(EXAMPLE)
+    row = "model=own model.factory=own_model:corrected_bicycle model.system=mine"
+    words = ["+experiment=benchmark", "name=mine"]
+    words += [f"+comparison.rows.mine='{row} training=state_model'"]
+    small = (
+        "comparison.vehicles=[dynamic]",
+        "comparison.seeds=[0]",
+        "evaluation.episodes=2",
+    )
+    small += ("evaluation.episode_s=12", "evaluation.timed_steps=0")
     small += ("comparison.controllers={mppi: [s3]}", "comparison.only=[oracle,mine]")
     small += ("dataset=tiny", "training.steps=50", "training.save_every=50")
     small += ("controller.mppi.num_samples=32", "evaluation.systems=[self]")
-    wrong = [word.replace("corrected_bicycle", "bicycle") for word in words[2:]]
+    wrong = [word.replace("corrected_bicycle", "bicycle") for word in words]
     refused = run_command("compare", *wrong, *small, cwd=tmp_path)
-    assert "model.factory=my_models:bicycle" in refused.stderr
+    assert "model.factory=own_model:bicycle" in refused.stderr
     assert "training mine" not in refused.stderr
-    done = last_line(run_command("compare", *words[2:], *small, cwd=tmp_path))
+    done = last_line(run_command("compare", *words, *small, cwd=tmp_path))
     rows = json.loads((tmp_path / done["results"]).read_text())["rows"]
     assert {row["system"] for row in rows} == {"oracle", "mine"}
     run = next((tmp_path / "runs").rglob("policy.npz"))
-    with pytest.raises(ArtefactError, match="import my_models first"):
+    with pytest.raises(ArtefactError, match="import own_model first"):
         sfkd_jax.load(run)
-    assert "my_models" not in sys.modules
+    assert "own_model" not in sys.modules
 
 
 def test_options_and_what_is_offered_reach_the_factory(monkeypatch, tmp_path):
@@ -110,12 +108,10 @@ def test_a_factory_that_makes_no_model_is_one_line(
     assert "\n" not in str(refusal.value)
 
 
-def test_the_model_of_the_page_steps_the_nominal_bicycle_before_it_is_trained(
+def test_the_model_of_the_example_steps_the_nominal_bicycle_before_it_is_trained(
     monkeypatch, tmp_path
 ):
-    factory = named(
-        monkeypatch, tmp_path, block("row").replace("corrected_bicycle", "make")
-    )
+    factory = named(monkeypatch, tmp_path, EXAMPLE.replace("corrected_bicycle", "make"))
     params = factory.init(jax.random.key(0))
     state = jnp.arange(4.0)
     fiber = factory.fiber(params, jnp.ones(2))

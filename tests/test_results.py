@@ -13,7 +13,7 @@ PAGE = results.PAGE.read_text("utf-8")
 PRETRAINED = results.HOME.parent / "src" / "sfkd_jax" / "pretrained"
 
 
-def row(name, scenario, label, vehicle, controller="mppi_path"):
+def row(name, scenario, label, vehicle, controller="mppi_path_300"):
     return results.of_scenario(name, scenario, (controller,))[label][vehicle]
 
 
