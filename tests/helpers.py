@@ -12,6 +12,7 @@ from functools import cache, partial
 import jax
 import jax.numpy as jnp
 import numpy as np
+from safetensors.numpy import save
 
 from sfkd_jax import certification, control, models, plants, store
 from sfkd_jax import data as datasets
@@ -335,6 +336,16 @@ def largest_file(size):
         yield
     finally:
         resource.setrlimit(resource.RLIMIT_FSIZE, (soft, hard))
+
+
+def write_policy(run, document):
+    """A policy.safetensors without weights whose manifest says what a test wants."""
+    manifest = {"kind": "policy", "format": store.FORMAT, "sha256": "ab" * 32}
+    manifest |= {"made_from": {}, "versions": {}} | document
+    manifest["config"] = document.get("settings") or document.get("config") or {}
+    manifest["content_sha256"] = store.content_hash(manifest)
+    content = save({"x": np.zeros(1)}, {"manifest": json.dumps(manifest)})
+    (run / f"policy{store.SUFFIX}").write_bytes(content)
 
 
 def refusal_of(action):

@@ -92,7 +92,7 @@ def test_the_certificate_is_about_the_saved_weights(smoke):
     directory, document = smoke
     certificate = json.loads((directory / document["certificate"]).read_text())
     _, manifest = store.read_arrays(
-        directory / document["run"] / "policy.npz", kind="policy"
+        directory / document["run"] / "policy.safetensors", kind="policy"
     )
     assert certificate["valid"]
     assert certificate["weights_sha256"] == manifest["sha256"]
@@ -132,9 +132,9 @@ def test_rows_count_violations_and_the_theorem_is_never_one(smoke):
 
 def test_the_same_command_again_trains_nothing_and_ends_the_same(smoke):
     directory, before = smoke
-    weights = (directory / before["run"] / "policy.npz").read_bytes()
+    weights = (directory / before["run"] / "policy.safetensors").read_bytes()
     again = last_line(run_command("train", "+experiment=smoke", cwd=directory))
-    assert (directory / again["run"] / "policy.npz").read_bytes() == weights
+    assert (directory / again["run"] / "policy.safetensors").read_bytes() == weights
     assert again["open_loop_rmse_m"] == before["open_loop_rmse_m"]
 
 
@@ -173,7 +173,7 @@ def test_load_gives_a_policy_without_heavy_imports(smoke):
 
 def test_certify_exits_0_then_3_when_weights_changed_then_0_when_renewed(copied):
     assert last_line(run_command("certify", "+experiment=smoke", cwd=copied))["valid"]
-    file = copied / "runs/smoke/sfkd/seed=0/policy.npz"
+    file = copied / "runs/smoke/sfkd/seed=0/policy.safetensors"
     arrays, manifest = store.read_arrays(file, kind="policy")
     changed = {
         name: np.asarray(array) * np.float32(1.01) for name, array in arrays.items()
@@ -216,12 +216,12 @@ def test_a_model_without_a_bound_is_evaluated_but_not_certified(smoke):
 
 @pytest.mark.parametrize("damage", ["truncate", "foreign", "flip"])
 def test_a_damaged_policy_is_named_in_one_line(copied, damage):
-    file = copied / "runs/smoke/sfkd/seed=0/policy.npz"
+    file = copied / "runs/smoke/sfkd/seed=0/policy.safetensors"
     content = bytearray(file.read_bytes())
     if damage == "truncate":
         file.write_bytes(content[: len(content) // 2])
     elif damage == "foreign":
-        file.write_bytes(b"not a zip file")
+        file.write_bytes(b"not safetensors")
     else:
         content[len(content) // 2] ^= 0xFF
         file.write_bytes(content)
@@ -231,10 +231,10 @@ def test_a_damaged_policy_is_named_in_one_line(copied, damage):
     assert (copied / "runs/smoke/sfkd/seed=0/results.json").exists()
 
 
-def test_a_policy_without_its_manifest_is_finished_again_from_the_checkpoint(copied):
-    file = copied / "runs/smoke/sfkd/seed=0/policy.npz"
+def test_a_lost_policy_is_finished_again_from_the_checkpoint(copied):
+    file = copied / "runs/smoke/sfkd/seed=0/policy.safetensors"
     weights = store.read_arrays(file, kind="policy")[1]["sha256"]
-    file.with_suffix(".json").unlink()
+    file.unlink()
     run_command("certify", "+experiment=smoke", cwd=copied)
     assert store.read_arrays(file, kind="policy")[1]["sha256"] == weights
 

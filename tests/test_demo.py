@@ -91,15 +91,18 @@ def test_a_policy_with_settings_of_another_version_is_named_in_one_line(
     tmp_path, change, says
 ):
     arrays, manifest = store.read_arrays(
-        demo.SHIPPED / "kinematic" / "policy.npz", kind=policy.KIND
+        demo.SHIPPED / "kinematic" / "policy.safetensors", kind=policy.KIND
     )
     change(manifest["config"]["controller"])
     store.write_arrays(
-        tmp_path / "policy.npz", arrays, kind=policy.KIND, config=manifest["config"]
+        tmp_path / "policy.safetensors",
+        arrays,
+        kind=policy.KIND,
+        config=manifest["config"],
     )
     with pytest.raises(
         store.ArtefactError,
-        match=rf"policy\.json.*{says}.*saved by sfkd_jax .*: train again",
+        match=rf"policy\.safetensors.*{says}.*saved by sfkd_jax .*: train again",
     ):
         policy.load(tmp_path)
 

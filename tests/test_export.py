@@ -73,7 +73,9 @@ def exported(tmp_path_factory):
     stored = parsing.plain(requested) | {"space": build.space_to_settings(space())}
     runs.claim(requested)
     run_dir = requested.run_dir
-    policy.save(run_dir / "policy.npz", params, stored, made_from={"dataset": "d" * 64})
+    policy.save(
+        run_dir / "policy.safetensors", params, stored, made_from={"dataset": "d" * 64}
+    )
     trained, data = policy.restore(run_dir), dataset()
     splits = {
         "validation": data.validation,
@@ -92,7 +94,7 @@ def exported(tmp_path_factory):
 
 @pytest.fixture(scope="module")
 def loaded(exported):
-    return sfkd_jax.load(Path(exported[1]["npz"]).parent)
+    return sfkd_jax.load(Path(exported[1]["policy"]).parent)
 
 
 @pytest.fixture
@@ -249,7 +251,7 @@ def test_the_manifest_lists_the_inputs_of_programs_and_what_they_were_made_from(
     requested, printed = exported
     manifest = json.loads(Path(printed["manifest"]).read_text())
     run_dir = Path(printed["blob"]).parent
-    assert set(printed) == {"blob", "manifest", "npz"}
+    assert set(printed) == {"blob", "manifest", "policy"}
     for program in manifest["programs"].values():
         content = (run_dir / program["file"]).read_bytes()
         assert program["sha256"] == hashlib.sha256(content).hexdigest()
@@ -315,7 +317,7 @@ def test_the_controller_of_the_command_is_what_is_exported(spoiled):
         settings(spoiled, "controller.mppi.horizon=4", "export.platforms=[cpu]")
     )
     assert json.loads(Path(printed["manifest"]).read_text())["horizon"] == 4
-    folder = Path(printed["npz"]).parent
+    folder = Path(printed["policy"]).parent
     assert sfkd_jax.load(folder).settings["controller"]["mppi"]["horizon"] == 4
     assert (
         sfkd_jax.load(folder.parent).settings["controller"]["mppi"]["horizon"]

@@ -63,7 +63,7 @@ def test_a_stranger_adds_a_row_as_the_example_says(tmp_path):
     done = last_line(run_command("compare", *words, *small, cwd=tmp_path))
     rows = json.loads((tmp_path / done["results"]).read_text())["rows"]
     assert {row["system"] for row in rows} == {"oracle", "mine"}
-    run = next((tmp_path / "runs").rglob("policy.npz"))
+    run = next((tmp_path / "runs").rglob("policy.safetensors"))
     with pytest.raises(ArtefactError, match="import own_model first"):
         sfkd_jax.load(run)
     assert "own_model" not in sys.modules

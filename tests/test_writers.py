@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 from helpers import refusal_of
 
-from sfkd_jax import store
+from sfkd_jax import evaluation, store
 from sfkd_jax.experiment import runs
 from sfkd_jax.reporting.rows import group_title, groups_of
 from sfkd_jax.reporting.scene import scenes_of
@@ -52,7 +52,7 @@ def driven(row, value=0.0, episodes=2, steps=40):
         "envs": (steps, 2),
         "path": (9, 4),
     }
-    name = store.drive_name(row)
+    name = evaluation.episode_name(row)
     return {
         f"{name}/{part}": np.full((episodes, *shape), float(value))
         for part, shape in shapes.items()
@@ -68,7 +68,7 @@ def keep(run_dir, row, value=0.0):
 def stored(run_dir):
     """Rows, and the arrays by the name of their drive."""
     rows = store.read_json(run_dir / "results.json")["rows"]
-    return rows, store.read_arrays(run_dir / "episodes.npz", kind="episodes")[0]
+    return rows, store.read_arrays(run_dir / "episodes.safetensors", kind="episodes")[0]
 
 
 # ---- the lock
@@ -123,21 +123,6 @@ def test_a_lock_is_reentrant_in_its_process(tmp_path):
     assert started(HOLD, tmp_path, 0).wait() == 0
 
 
-@pytest.mark.parametrize("errno", [38, 95, 37])
-def test_a_file_system_without_locks_gets_a_file_with_the_process_in_it(
-    tmp_path, monkeypatch, errno
-):
-    """Such a file outlives its process, so it must record the process."""
-
-    def absent(descriptor):
-        raise OSError(errno, "no locks here")
-
-    monkeypatch.setattr("filelock._unix.lock_fd_nonblocking", absent)
-    with locked(tmp_path):
-        assert (tmp_path / ".lock.soft").exists()
-    assert not (tmp_path / ".lock.soft").exists()
-
-
 def test_a_directory_that_cannot_be_made_is_one_line(tmp_path):
     (tmp_path / "file").touch()
 
@@ -178,7 +163,7 @@ def test_two_processes_20_ms_after_each_other_lose_no_row_and_no_episode(tmp_pat
     assert len(rows) == 20
     for row in rows:
         value = 10 * int(row["system"][-1]) + int(row["scenario"][4:])
-        assert np.all(arrays[f"{store.drive_name(row)}/lateral"] == value)
+        assert np.all(arrays[f"{evaluation.episode_name(row)}/lateral"] == value)
 
 
 def test_three_planners_in_one_directory_keep_three_rows_with_their_episodes(tmp_path):
@@ -192,7 +177,7 @@ def test_three_planners_in_one_directory_keep_three_rows_with_their_episodes(tmp
     assert [row["planner"] for row in retained] == ["mppi", "cem", "gradient"]
     for value, row in enumerate(retained, 1):
         for part in ("lateral", "states", "controls", "envs", "path"):
-            assert np.all(arrays[f"{store.drive_name(row)}/{part}"] == value)
+            assert np.all(arrays[f"{evaluation.episode_name(row)}/{part}"] == value)
     scenes = scenes_of(tmp_path)
     assert {scene.lateral["sfkd"][0, 0]: "cem" in scene.label for scene in scenes} == {
         1: False,
@@ -206,19 +191,21 @@ def test_three_planners_in_one_directory_keep_three_rows_with_their_episodes(tmp
     keep(tmp_path, rows[1], 7.0)
     retained, arrays = stored(tmp_path)
     assert len(retained) == 3
-    assert np.all(arrays[f"{store.drive_name(rows[1])}/lateral"] == 7.0)
+    assert np.all(arrays[f"{evaluation.episode_name(rows[1])}/lateral"] == 7.0)
 
 
 @pytest.mark.parametrize("name", list(ROW))
 def test_rows_that_differ_in_one_part_of_their_identity_are_two(name):
     other = ROW | {name: "other"}
-    assert store.merge([ROW], [other]) == [ROW, other]
-    assert store.merge([ROW], [dict(ROW)]) == [ROW]
-    assert store.drive_name(ROW) != store.drive_name(other)
+    assert evaluation.merge([ROW], [other]) == [ROW, other]
+    assert evaluation.merge([ROW], [dict(ROW)]) == [ROW]
+    assert evaluation.episode_name(ROW) != evaluation.episode_name(other)
     known = {
-        key: value for key, value in store.identity(other).items() if value is not None
+        key: value
+        for key, value in evaluation.identity(other).items()
+        if value is not None
     }
-    assert store.parse_drive_name(store.drive_name(other)) == known
+    assert evaluation.parse_episode_name(evaluation.episode_name(other)) == known
 
 
 def test_drives_on_other_roads_are_other_scenes(tmp_path):

@@ -197,7 +197,7 @@ def with_tube(controller, **settings):
 def neural_ode(name, root):
     """The policy of the baselines: the same law, data and planner; trained if missing."""
     directory = root / f"adaptation_{name}" / NODE / "seed=0"
-    if not (directory / "policy.npz").exists():
+    if not (directory / "policy.safetensors").exists():
         command = [sys.executable, "-m", "sfkd_jax.train", "+experiment=s3"]
         command += [f"vehicle={name}", f"model={NODE}", "training=state_model"]
         command += ["controller.shield=false", f"name=adaptation_{name}"]

@@ -112,7 +112,7 @@ def main():
     parser.add_argument(
         "run",
         metavar="DIR",
-        help="with policy.npz and a certificate.json that has a corridor",
+        help="with policy.safetensors and a certificate.json that has a corridor",
     )
     parser.add_argument("--seconds", type=float, default=30.0)
     parser.add_argument("--seed", type=int, default=3)

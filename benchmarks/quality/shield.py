@@ -1,7 +1,7 @@
 """Planners that try to drive a car off its road, through the shield of a certified policy and without it.
 
 python -m benchmarks.quality.shield --runs DIR ... [--drives 200 --episodes 16 --seconds 60
---out benchmarks/quality/shield.json] DIR: with policy.npz and a certificate.json that has a
+--out benchmarks/quality/shield.json] DIR: with policy.safetensors and a certificate.json that has a
 corridor. The true car on S3 roads, seen through its sensors. Asked for with the shield:
 no departure whatever is planned; for the policy's own planner at most 2 % more error on
 the same episodes, requests cut in at most 1 % of the steps, at most 1 ms more a step.

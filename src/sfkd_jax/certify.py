@@ -28,7 +28,7 @@ def run(settings: Settings) -> dict[str, Any]:
             `certification.renew` is false.
         CertificationRefused: nothing could be certified.
     """
-    if not store.exists(settings.run_dir / "policy.npz"):
+    if not (settings.run_dir / "policy.safetensors").is_file():
         store.print_message(_announcement(settings))
     trained = stages.ensure_policy(settings)
     path = stages.certificate_path(settings.run_dir)

@@ -16,7 +16,7 @@ from sfkd_jax.plants import Vehicle
 from sfkd_jax.settings import plain, replace
 
 SHIPPED = Path(__file__).with_name("pretrained")
-"""vehicle, or vehicle_path in path coordinates -> policy.npz, its manifest and
+"""vehicle, or vehicle_path in path coordinates -> policy.safetensors, its manifest and
 certificate, as `train` wrote them.
 """
 ALONG_PATH = "_path"

@@ -83,35 +83,30 @@ def save(
     made_from: Mapping[str, str],
     law: PathLaw | None = None,
 ) -> dict[str, Any]:
-    """Write policy.npz and its manifest, and return the manifest.
+    """Write policy.safetensors and return its manifest.
 
     Args:
-        path: of policy.npz.
+        path: of policy.safetensors.
         params: weights.
         settings: that they were made with.
         made_from: hashes of the artefacts that they were made from.
         law: that a model in path coordinates was learned around, or None.
 
     Returns:
-        The manifest; its `sha256` is the hash of weights and law.
+        The manifest; `sha256` is the hash of weights and law, `content_sha256` that of
+        weights, law and all settings.
     """
     tree = params if law is None else params | {LAW: law_to_arrays(law)}
-    flat = {name: np.asarray(leaf) for name, leaf in store.flatten(tree).items()}
     return store.write_arrays(
-        path, flat, kind=KIND, config=settings, made_from=made_from
+        path, _by_path(tree), kind=KIND, config=settings, made_from=made_from
     )
-
-
-def policy_hash(manifest: Mapping[str, Any]) -> str:
-    """Return the hash of the weights and all settings of a policy."""
-    return store.sha256({"weights": manifest["sha256"], "settings": manifest["config"]})
 
 
 def restore(path: str | Path) -> TrainedModel:
     """Return the model and weights in a run directory.
 
     Args:
-        path: of the directory, or of a policy.npz with its manifest beside it.
+        path: of the directory, or of a policy.safetensors.
 
     Raises:
         ArtefactError: missing, truncated, foreign, changed since it was written, saved
@@ -121,12 +116,10 @@ def restore(path: str | Path) -> TrainedModel:
     file = _file(path)
     arrays, manifest = store.read_arrays(file, kind=KIND)
     settings = manifest["config"]
-    with store.as_artefact_error(file.with_suffix(".json"), ValueError):
+    with store.as_artefact_error(file, ValueError):
         build.check_imported(settings)
     version = str(manifest.get("versions", {}).get("sfkd_jax", "unknown"))
-    with store.as_artefact_error(
-        file.with_suffix(".json"), ValueError, advice=_advice(version)
-    ):
+    with store.as_artefact_error(file, ValueError, advice=_advice(version)):
         parts = {name: settings[name] for name in ("vehicle", "space", "model")}
         plant, model = _build(json.dumps(parts))
     law = None
@@ -134,7 +127,7 @@ def restore(path: str | Path) -> TrainedModel:
         names = [name for name in arrays if name.startswith(f"{LAW}/")]
         law = _law(file, {name: arrays.pop(name) for name in names})
     params = _weights(file, arrays, model)
-    hashes = manifest["sha256"], policy_hash(manifest)
+    hashes = manifest["sha256"], manifest["content_sha256"]
     return TrainedModel(model, params, plant, settings, *hashes, version, law)
 
 
@@ -150,7 +143,7 @@ def load(
     Without a certificate it warns and gives the reason.
 
     Args:
-        path: of the directory, or of a policy.npz with its manifest beside it.
+        path: of the directory, or of a policy.safetensors.
         controller: settings of a controller to build instead of the saved one.
         env_source: "estimated" for a policy in path coordinates that estimates the
             environment and ignores the one it is given.
@@ -174,9 +167,7 @@ def load(
         errors = ()
     if controller is not None:
         settings |= {"controller": dict(controller)}
-    with store.as_artefact_error(
-        file.with_suffix(".json"), *errors, advice=_advice(trained.version)
-    ):
+    with store.as_artefact_error(file, *errors, advice=_advice(trained.version)):
         options, box = settings["controller"], settings["environment"]
         planner = build.build_controller(
             options,
@@ -215,7 +206,7 @@ def read_certificate(
     """Verify the certificate beside a policy.
 
     Args:
-        path: of the run directory, or of policy.npz.
+        path: of the run directory, or of policy.safetensors.
         trained: the policy.
 
     Returns:
@@ -260,8 +251,9 @@ def _build(settings: str) -> tuple[Vehicle, Model]:
 
 
 def _file(path: str | Path) -> Path:
-    """Return policy.npz of a run directory, or the file itself."""
-    return Path(path) if Path(path).suffix == ".npz" else Path(path) / "policy.npz"
+    """Return policy.safetensors of a run directory, or the file itself."""
+    named = Path(path).suffix == store.SUFFIX
+    return Path(path) if named else Path(path) / "policy.safetensors"
 
 
 def _advice(version: str) -> str:
@@ -270,25 +262,28 @@ def _advice(version: str) -> str:
 
 def _law(file: Path, arrays: Mapping[str, np.ndarray]) -> PathLaw:
     """Return the law that arrays hold, or raise an ArtefactError."""
+    if not arrays:
+        raise store.ArtefactError(f"{file}: lacks the law that its model needs")
     if not all(np.all(np.isfinite(leaf)) for leaf in arrays.values()):
         raise store.ArtefactError(f"{file}: the law's arrays are not finite")
     with store.as_artefact_error(file, ValueError):
-        return law_from_arrays(store.unflatten(arrays)[LAW])
+        return law_from_arrays(
+            {name.removeprefix(f"{LAW}/"): leaf for name, leaf in arrays.items()}
+        )
 
 
 def _weights(file: Path, arrays: Mapping[str, np.ndarray], model: Model) -> Params:
     """Return arrays as the parameters of a model, or raise an ArtefactError."""
     with store.as_artefact_error(file, ValueError):
-        params = store.unflatten(arrays)
         # Settings of a wrong type fail only here.
-        expected = _by_path(jax.eval_shape(model.init, jax.random.key(0)))
-    leaves = _by_path(params)
-    if wrong := sorted(expected.keys() ^ leaves.keys()):
+        shapes = jax.eval_shape(model.init, jax.random.key(0))
+    expected = _by_path(shapes)
+    if wrong := sorted(expected.keys() ^ arrays.keys()):
         verb = "lacks" if wrong[0] in expected else "holds"
         raise store.ArtefactError(
             f"{file}: {verb} weights {wrong[0]}, which does not fit the model"
         )
-    for name, leaf in leaves.items():
+    for name, leaf in arrays.items():
         if (leaf.shape, leaf.dtype) != (expected[name].shape, expected[name].dtype):
             wanted = f"{expected[name].dtype}{list(expected[name].shape)}"
             raise store.ArtefactError(
@@ -297,11 +292,12 @@ def _weights(file: Path, arrays: Mapping[str, np.ndarray], model: Model) -> Para
             )
         if not np.all(np.isfinite(leaf)):
             raise store.ArtefactError(f"{file}: weights {name} are not finite")
-    return jax.tree.map(jnp.asarray, params)
+    leaves = [jnp.asarray(arrays[name]) for name in expected]
+    return jax.tree.unflatten(jax.tree.structure(shapes), leaves)
 
 
 def _by_path(tree: Any) -> dict[str, Any]:
-    """Return the leaves by path."""
+    """Return the leaves by path, "a/b/c", in the order of the tree."""
     return {
         "/".join(str(getattr(key, "key", key)) for key in path): leaf
         for path, leaf in jax.tree_util.tree_flatten_with_path(tree)[0]

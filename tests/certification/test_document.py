@@ -223,18 +223,20 @@ def copied(tmp_path):
 
 
 def test_the_hash_changes_with_every_single_setting():
-    manifest = store.read_json(demo.SHIPPED / "kinematic" / "policy.json")
+    manifest = store.read_manifest(
+        demo.SHIPPED / "kinematic" / "policy.safetensors", kind=policy.KIND
+    )
     settings = dict(leaves(manifest["config"]))
     changed = {
-        policy.policy_hash(
+        store.content_hash(
             manifest | {"config": put(manifest["config"], path, another(value))}
         )
         for path, value in settings.items()
     }
     assert len(settings) > 120
     assert len(changed) == len(settings)
-    assert shipped().sha256 == policy.policy_hash(manifest) not in changed
-    assert policy.policy_hash(manifest | {"sha256": "0" * 64}) not in {
+    assert shipped().sha256 == store.content_hash(manifest) not in changed
+    assert store.content_hash(manifest | {"sha256": "0" * 64}) not in {
         *changed,
         shipped().sha256,
     }
@@ -254,11 +256,10 @@ def test_the_hash_changes_with_every_single_setting():
 def test_a_setting_that_changed_leaves_nothing_certified_and_says_so(
     copied, path, value
 ):
-    manifest = store.read_json(copied / "policy.json")
-    store.write_json(
-        copied / "policy.json",
-        manifest | {"config": put(manifest["config"], path, value)},
-    )
+    file = copied / "policy.safetensors"
+    arrays, manifest = store.read_arrays(file, kind=policy.KIND)
+    config = put(manifest["config"], path, value)
+    store.write_arrays(file, arrays, kind=policy.KIND, config=config)
     with pytest.warns(
         UserWarning,
         match="nothing is certified; .* other weights or settings",
@@ -303,25 +304,35 @@ def test_a_refusal_is_told_with_its_reason(copied):
 def test_weights_that_do_not_fit_the_model_are_refused_in_one_line(
     copied, spoil, message
 ):
-    arrays, manifest = store.read_arrays(copied / "policy.npz", kind=policy.KIND)
+    arrays, manifest = store.read_arrays(
+        copied / "policy.safetensors", kind=policy.KIND
+    )
     changed = spoil("networks/operators", arrays["networks/operators"])
     arrays = {
         name: leaf for name, leaf in arrays.items() if name != "networks/operators"
     }
     arrays |= {} if changed is None else {"networks/operators": changed}
     store.write_arrays(
-        copied / "policy.npz", arrays, kind=policy.KIND, config=manifest["config"]
+        copied / "policy.safetensors",
+        arrays,
+        kind=policy.KIND,
+        config=manifest["config"],
     )
     line = refusal_of(lambda: policy.load(copied))
     assert message in line
-    assert "policy.npz" in line
+    assert "policy.safetensors" in line
 
 
 def test_weights_that_the_model_does_not_have_are_refused(copied):
-    arrays, manifest = store.read_arrays(copied / "policy.npz", kind=policy.KIND)
+    arrays, manifest = store.read_arrays(
+        copied / "policy.safetensors", kind=policy.KIND
+    )
     arrays["networks/extra"] = np.zeros(3, np.float32)
     store.write_arrays(
-        copied / "policy.npz", arrays, kind=policy.KIND, config=manifest["config"]
+        copied / "policy.safetensors",
+        arrays,
+        kind=policy.KIND,
+        config=manifest["config"],
     )
     assert "holds weights networks/extra" in refusal_of(lambda: policy.load(copied))
 

@@ -242,7 +242,7 @@ def untrained(name="control_synth"):
     )
     saved = plain(requested) | {"space": build.space_to_settings(space())}
     runs.claim(requested)
-    policy.save(requested.run_dir / "policy.npz", params, saved, made_from={})
+    policy.save(requested.run_dir / "policy.safetensors", params, saved, made_from={})
     return requested
 
 

@@ -7,7 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from sfkd_jax import plants, store
+from sfkd_jax import plants
 from sfkd_jax.control import derive_path_law, law_from_arrays, law_to_arrays
 from sfkd_jax.geometry import path_state, path_step
 from sfkd_jax.types import BODY
@@ -75,11 +75,8 @@ def test_the_loop_contracts_alike_where_tyres_give_little(derived):
 
 def test_a_law_survives_being_stored(derived):
     law = derived[1]
-    flat = {
-        name: np.asarray(leaf)
-        for name, leaf in store.flatten({"law": law_to_arrays(law)}).items()
-    }
-    again = law_from_arrays(store.unflatten(flat)["law"])
+    flat = {name: np.asarray(leaf) for name, leaf in law_to_arrays(law).items()}
+    again = law_from_arrays(flat)
     given = (
         jnp.full(law.state.shape[-1], 0.1),
         jnp.asarray(0.01),

@@ -195,7 +195,7 @@ def cell(
         for name, values in (arrays | {"dt": np.float64(0.1)} | changes).items()
         if values is not None
     }
-    write_arrays(folder / f"{system}-{env}.npz", arrays, kind="cell", config={})
+    write_arrays(folder / f"{system}-{env}.safetensors", arrays, kind="cell", config={})
 
 
 def reported(directory, results):
@@ -517,13 +517,12 @@ def test_figure_1_draws_stored_episodes_and_names_the_missing_ones(whole, tmp_pa
 
 def test_the_arrays_of_a_row_are_where_the_row_says(tmp_path):
     cell(tmp_path, "sfkd", "measured")
-    for end in ("npz", "json"):
-        (tmp_path / f"cells/kinematic/s3/feedback/sfkd-measured.{end}").rename(
-            tmp_path / f"elsewhere.{end}"
-        )
+    (tmp_path / "cells/kinematic/s3/feedback/sfkd-measured.safetensors").rename(
+        tmp_path / "elsewhere.safetensors"
+    )
     rows = [row("sfkd", "measured")]
     assert film(tmp_path, rows, tmp_path / "s3.gif", seconds=0.5) is None
-    rows = [row("sfkd", "measured", arrays="elsewhere.npz")]
+    rows = [row("sfkd", "measured", arrays="elsewhere.safetensors")]
     path, names = film(tmp_path, rows, tmp_path / "s3.gif", seconds=0.5)
     assert names == ["SFKD"]
     within, _ = film(

@@ -4,6 +4,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from helpers import write_policy
 from PIL import Image
 
 from sfkd_jax import report
@@ -60,7 +61,9 @@ def write_run(directory, loop, rho, beta, proof, scale=1.0):
     documents |= {"open_loop": ahead, "results": {"rows": rows}, "certificate": proof}
     directory.mkdir(parents=True)
     for name, document in documents.items():
-        if document is not None:
+        if document is not None and name == "policy":
+            write_policy(directory, document)
+        elif document is not None:
             (directory / f"{name}.json").write_text(json.dumps(document))
 
 
@@ -95,8 +98,8 @@ def root(tmp_path):
     }
     write_run(home / "e/sfkd/seed=0", "speed", 0.9, 0.2, refusal)
     write_run(home / "f/sfkd/seed=0", "none", 0.9, 0.05, None)
-    for name in ("open_loop", "results", "policy"):
-        (home / f"f/sfkd/seed=0/{name}.json").unlink()
+    for name in ("open_loop.json", "results.json", "policy.safetensors"):
+        (home / f"f/sfkd/seed=0/{name}").unlink()
     (home / "g/sfkd/seed=0").mkdir(parents=True)
     return tmp_path
 
@@ -182,8 +185,7 @@ def test_a_refused_or_missing_certificate_is_a_row_of_nulls_with_its_reason(made
 
 
 def test_a_certificate_of_other_weights_is_not_believed(root):
-    file = root / "sweep/a/sfkd/seed=0/policy.json"
-    file.write_text(json.dumps({"sha256": "cd" * 32}))
+    write_policy(root / "sweep/a/sfkd/seed=0", {"sha256": "cd" * 32})
     row = rows_of(write_comparison(root, PATTERN, "curve"))["a"]
     assert row["alpha"] is None
     assert "other weights" in row["reason"]

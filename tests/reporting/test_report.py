@@ -9,6 +9,7 @@ from typing import ClassVar
 import matplotlib
 import numpy as np
 import pytest
+from helpers import write_policy
 from PIL import Image
 
 from sfkd_jax.evaluation.formats import upper
@@ -18,7 +19,7 @@ from sfkd_jax.paper._side_forces import violations
 from sfkd_jax.reporting import write_report
 from sfkd_jax.reporting._certificate import tube_on_drive
 from sfkd_jax.reporting.scene import scenes_of
-from sfkd_jax.store import ArtefactError
+from sfkd_jax.store import ArtefactError, read_arrays, write_arrays
 
 STEPS, DT, EPISODES, SPEED = 600, 0.1, 4, 10.0
 LEVELS = ((0.9, 0.0), (0.6, 4.0), (0.3, 8.0), (0.6, -4.0))
@@ -196,14 +197,18 @@ def write_run(run, **changes):
     run.mkdir(parents=True, exist_ok=True)
     for name, document in documents().items():
         document = changes.get(name.removesuffix(".json"), document)
-        if document is not None:
+        if document is not None and name == "policy.json":
+            write_policy(run, document)
+        elif document is not None:
             (run / name).write_text(json.dumps(document))
     if "metrics" not in changes:
         (run / "metrics.jsonl").write_text(
             "".join(json.dumps(line) + "\n" for line in metrics())
         )
     if "episodes" not in changes:
-        np.savez(run / "episodes.npz", **episodes())
+        write_arrays(
+            run / "episodes.safetensors", episodes(), kind="episodes", config={}
+        )
     return run
 
 
@@ -342,7 +347,7 @@ def test_the_same_run_gives_the_same_bytes_and_no_stale_figure(tmp_path):
     ("name", "command"),
     [
         ("metrics.jsonl", "train"), ("open_loop.json", "train"), ("certificate.json", "certify"),
-        ("results.json", "evaluate"), ("episodes.npz", "evaluate"),
+        ("results.json", "evaluate"), ("episodes.safetensors", "evaluate"),
     ],
 )  # fmt: skip
 def test_a_missing_input_is_named_with_the_command_that_makes_it(
@@ -364,9 +369,7 @@ def test_a_policy_alone_is_enough_and_no_policy_is_refused(tmp_path):
         "seed": 3,
     }
     settings["model"] = {"name": "sfkd", "system": "sfkd_soft"}
-    (tmp_path / "policy.json").write_text(
-        json.dumps({"config": settings})
-    )  # as a manifest holds them
+    write_policy(tmp_path, {"config": settings})
     page, made = report_of(tmp_path)
     assert made["figures"] == []
     assert text_of(page).count(" is missing from this run") == 5
@@ -471,7 +474,7 @@ def test_names_are_not_formulas(tmp_path):
         for part in ("lateral", "states", "controls")
     }
     arrays |= {f"a$x_$b/{name}/lateral": arrays["oracle/s3/lateral"][:, :50]}
-    np.savez(run / "episodes.npz", **arrays)
+    write_arrays(run / "episodes.safetensors", arrays, kind="episodes", config={})
     assert len(report_of(run)[1]["figures"]) == 9
 
 
@@ -502,11 +505,10 @@ def test_a_cut_off_log_a_lost_vehicle_and_one_short_episode(tmp_path):
     run = write_run(tmp_path)
     with (run / "metrics.jsonl").open("a") as log:
         log.write('{"step": 4050, "lo')
-    with np.load(run / "episodes.npz") as archive:
-        arrays = {
-            name: values[:1] if values.ndim else values
-            for name, values in archive.items()
-        }
+    archive, _ = read_arrays(run / "episodes.safetensors", kind="episodes")
+    arrays = {
+        name: values[:1] if values.ndim else values for name, values in archive.items()
+    }
     for part in ("lateral", "states", "controls"):
         arrays[f"nominal/s3/{part}"] = arrays[f"nominal/s3/{part}"].copy()
         arrays[f"nominal/s3/{part}"][:, 90:] = np.nan
@@ -514,7 +516,7 @@ def test_a_cut_off_log_a_lost_vehicle_and_one_short_episode(tmp_path):
         "icode/s1/lateral": arrays["sfkd/s3/lateral"][:, :40],
         "someone/s1/lateral": np.zeros((0, 40)),
     }
-    np.savez(run / "episodes.npz", **arrays)
+    write_arrays(run / "episodes.safetensors", arrays, kind="episodes", config={})
     page, made = report_of(run)
     assert "4000 steps" in text_of(page)
     assert "deviation_s1.png" in {Path(figure).name for figure in made["figures"]}
@@ -546,7 +548,9 @@ def test_feedback_and_plain_sampling_are_not_mixed(tmp_path):
 
 
 def test_the_tube_is_drawn_about_the_states_that_follow_one_that_was_driven(tmp_path):
-    np.savez(tmp_path / "episodes.npz", **episodes())
+    write_arrays(
+        tmp_path / "episodes.safetensors", episodes(), kind="episodes", config={}
+    )
     (scene,) = scenes_of(tmp_path)
     radii = [0.1, 0.4, 0.9, 1.6, 2.5]
     above, below = tube_on_drive(scene, "sfkd", radii, [0.01, None, 0.02]).axes

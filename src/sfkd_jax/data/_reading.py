@@ -10,9 +10,9 @@ import numpy as np
 from sfkd_jax.data._files import digest, log_files
 from sfkd_jax.data._logs import UNKNOWN, Columns, Log, environment_columns
 from sfkd_jax.data._stacked import stacked_drives
-from sfkd_jax.data._tables import Table, read_csv, read_parquet
+from sfkd_jax.data._tables import Table, read_csv, read_npz, read_parquet
 from sfkd_jax.data._units import find_column, split_unit
-from sfkd_jax.store import ArtefactError, one_line, read_npz
+from sfkd_jax.store import ArtefactError, one_line
 
 DIMENSIONS = ("length", "length", "angle", "speed")
 """Of the first states."""

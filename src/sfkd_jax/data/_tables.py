@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import csv
 import io
+import zipfile
 from collections.abc import Mapping
 from pathlib import Path
 from types import MappingProxyType
@@ -138,6 +139,29 @@ def _is_number(text: str) -> bool:
     except ValueError:
         return False
     return True
+
+
+def read_npz(file: Path) -> dict[str, Shaped[np.ndarray, ...]]:
+    """Return the arrays of an npz file.
+
+    Raises:
+        ValueError: damaged, of another kind, with objects, or larger than DECODED bytes
+            once inflated.
+    """
+    with open_regular(file) as stream:
+        try:
+            with zipfile.ZipFile(stream) as packed:
+                size = sum(part.file_size for part in packed.infolist())
+            if size > DECODED:
+                raise ValueError(
+                    f"{size >> 20} MiB once inflated, at most {DECODED >> 20} are read"
+                )
+            stream.seek(0)
+            # Pickles would run code.
+            with np.load(stream, allow_pickle=False) as opened:
+                return {name: opened[name] for name in opened.files}
+        except Exception as reason:  # a damaged file raises nearly anything
+            raise ValueError(f"{file}: not a readable npz file ({reason})") from None
 
 
 def read_parquet(file: Path) -> Table:

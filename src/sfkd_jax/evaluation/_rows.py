@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable, Mapping
 from typing import Any, TypeAlias
+from urllib.parse import parse_qsl, urlencode
 
 import numpy as np
 from jaxtyping import Float
@@ -18,6 +20,26 @@ _ARRAYS = (
     "healthy",
 )
 """Of an episode, as they are."""
+
+
+IDENTITY = (
+    "system",
+    "scenario",
+    "vehicle",
+    "inner_loop",
+    "controller",
+    "planner",
+    "sampling",
+    "env",
+    "variation",
+)
+"""Columns that identify a row of results.json; a new row replaces the old row of the
+same identity.
+"""
+ROAD = ("envs", "path")
+"""Arrays that describe the environment and the path of an episode."""
+SHARED = tuple(name for name in IDENTITY if name not in ("system", "env"))
+"""Columns that systems must share to be compared."""
 
 
 Scores: TypeAlias = dict[str, PerEpisode]
@@ -199,3 +221,30 @@ def _mean(values: list[Any]) -> Any:
     if all(isinstance(value, float) for value in values):
         return float(np.mean(values))
     return first if all(value == first for value in values) else None
+
+
+def identity(row: Mapping[str, Any]) -> dict[str, str | None]:
+    """Return the identity of a row."""
+    columns = {name: row.get(name) for name in IDENTITY}
+    return {
+        name: None if value is None else str(value) for name, value in columns.items()
+    }
+
+
+def merge(
+    old: Iterable[Mapping[str, Any]], new: Iterable[Mapping[str, Any]]
+) -> list[Any]:
+    """Return old and new rows; a new row replaces the old row of the same identity."""
+    fresh = list(new)
+    replaced = [identity(row) for row in fresh]
+    return [row for row in old if identity(row) not in replaced] + fresh
+
+
+def episode_name(row: Mapping[str, Any]) -> str:
+    """Return the prefix of a row's arrays, such as "system=sfkd&scenario=s3"."""
+    return urlencode({name: text for name, text in identity(row).items() if text})
+
+
+def parse_episode_name(name: str) -> dict[str, str]:
+    """Return the identity in a name."""
+    return dict(parse_qsl(name))

@@ -98,7 +98,7 @@ class Source(NamedTuple):
         """Of the data set."""
         digest = store.sha256(self.config)[:8]
         name = f"{self.vehicle.name}-{digest}"
-        return Path(self.root) / "datasets" / name / "dataset.npz"
+        return Path(self.root) / "datasets" / name / "dataset.safetensors"
 
     @property
     def columns(self) -> dict[str, list[str]]:
@@ -121,9 +121,9 @@ def source_of(settings: Settings) -> Source:
 def ensure_dataset(source: Source) -> tuple[Dataset, str]:
     """Return the data set and its hash; simulate or read it if it is missing."""
     path = source.path
-    if not store.exists(path):
+    if not path.is_file():
         with store.locked(path.parent, wait=True):  # other runs share the data set
-            if not store.exists(path):
+            if not path.is_file():
                 logs = source.logs
                 made = _read_logs(source, logs) if logs else _simulate(source)
                 write(source, made)
@@ -268,8 +268,8 @@ def ensure_law(source: Source) -> PathLaw | None:
     """
     if source.along_path is None:
         return None
-    path = source.path.with_name("law.npz")
-    if not store.exists(path):
+    path = source.path.with_name("law.safetensors")
+    if not path.is_file():
         plant = build.build_vehicle(source.vehicle)
         store.print_message(f"deriving the law of vehicle {plant.name}")
         settings, box = source.along_path.law, source.environment.box

@@ -420,9 +420,9 @@ def evaluate_run(settings: Settings, *, command: str | None = None) -> dict[str,
 
 
 def _named_arrays(result: SystemResult, episodes: EpisodeSet) -> dict[str, Any]:
-    """The arrays of a row under the names of episodes.npz."""
+    """The arrays of a row under the names of episodes.safetensors."""
     scenarios = episodes.scenarios
     road = (scenarios.envs, scenarios.path.points)
-    named = result.arrays | dict(zip(store.ROAD, road, strict=True))
-    prefix = store.drive_name(result.row)
+    named = result.arrays | dict(zip(evaluation.ROAD, road, strict=True))
+    prefix = evaluation.episode_name(result.row)
     return {f"{prefix}/{part}": array for part, array in named.items()}

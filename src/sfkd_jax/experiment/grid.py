@@ -13,6 +13,7 @@ from sfkd_jax import evaluation, store
 from sfkd_jax.experiment import runs
 from sfkd_jax.experiment.evaluating import EpisodeSet, SystemResult
 from sfkd_jax.experiment.options import ComparisonSettings, Settings
+from sfkd_jax.experiment.provenance import provenance, source_hash
 from sfkd_jax.settings import plain, replace
 
 KIND = "cell"
@@ -221,11 +222,11 @@ def write_cell(
         name: np.asarray(array)[:NUM_STORED_EPISODES] for name, array in arrays.items()
     }
     stored["dt"] = np.asarray(settings.vehicle.dt)
-    file = path.with_name(f"{path.name}.npz")
+    file = path.with_name(f"{path.name}.safetensors")
     store.write_arrays(file, stored, kind=KIND, config=plain(settings.scenario))
     row = result.row | {
         "arrays": str(file.relative_to(directory)),
-        "provenance": store.provenance(),
+        "provenance": provenance(),
     }
     document = {"row": row, "made_with": settings_hash(settings)}
     store.write_json(_row_file(path), document)
@@ -257,7 +258,7 @@ def collect_rows(
             continue
         row = document["row"] | {"drives": episodes_hash(settings)}
         pooled.setdefault(cell._replace(seed=0), []).append(row)
-        if row.get("provenance", {}).get("source") != store.source_hash():
+        if row.get("provenance", {}).get("source") != source_hash():
             by_other_code.append(path)
     if others:
         store.print_message(

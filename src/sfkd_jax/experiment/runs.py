@@ -9,7 +9,7 @@ from typing import Any, TypeVar
 
 import numpy as np
 
-from sfkd_jax import store
+from sfkd_jax import evaluation, store
 from sfkd_jax.data import Dataset
 from sfkd_jax.experiment.data import boxes, source_of
 from sfkd_jax.experiment.options import Settings
@@ -77,7 +77,7 @@ def _has_weights(run_dir: Path) -> bool:
     """Whether a run has trained weights or a checkpoint."""
     checkpoints = run_dir / "checkpoints"
     kept = checkpoints.is_dir() and any(checkpoints.iterdir())
-    return kept or store.exists(run_dir / "policy.npz")
+    return kept or (run_dir / "policy.safetensors").is_file()
 
 
 def policy_settings(settings: Settings, dataset: Dataset) -> dict[str, Any]:
@@ -109,14 +109,14 @@ def read_results(run_dir: Path) -> tuple[list[dict[str, Any]], dict[str, Any]]:
     Raises:
         ArtefactError: they are damaged.
     """
-    results, episodes = run_dir / "results.json", run_dir / "episodes.npz"
+    results, episodes = run_dir / "results.json", run_dir / "episodes.safetensors"
     rows, arrays = [], {}
     if results.exists():
         rows = store.read_json(results, keys=("rows",))["rows"]
-    if store.exists(episodes):
+    if episodes.is_file():
         arrays, _ = store.read_arrays(episodes, kind=EPISODES)
     with store.as_artefact_error(results):
-        return store.merge([], rows), dict(arrays)
+        return evaluation.merge([], rows), dict(arrays)
 
 
 def write_results(
@@ -132,7 +132,7 @@ def write_results(
         run_dir: of the run.
         config: plain settings that made the rows, and the command that was typed.
         rows: replace earlier rows of the same identity.
-        arrays: by the names of episodes.npz.
+        arrays: by the names of episodes.safetensors.
         seconds: that the evaluation took [s].
 
     Returns:
@@ -143,10 +143,10 @@ def write_results(
         earlier, old = read_results(run_dir)
         added = {name: np.asarray(array) for name, array in arrays.items()}
         store.write_arrays(
-            run_dir / "episodes.npz", old | added, kind=EPISODES, config=about
+            run_dir / "episodes.safetensors", old | added, kind=EPISODES, config=about
         )
         document = {
-            "rows": store.merge(earlier, rows),
+            "rows": evaluation.merge(earlier, rows),
             "config": config,
             "versions": store.versions(),
             "seconds": seconds,

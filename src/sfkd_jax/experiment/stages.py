@@ -133,13 +133,13 @@ def ensure_policy(settings: Settings) -> policy.TrainedModel:
     run_dir, source = settings.run_dir, source_of(settings)
     if factory := getattr(settings.model, "factory", None):
         imported(factory, "model.factory")
-    if not store.exists(run_dir / "policy.npz"):
+    if not (run_dir / "policy.safetensors").is_file():
         if source.logs:
             dataset, _ = data.ensure_dataset(source)
             data.check_calibration_size(dataset, settings.certification)
         with store.locked(run_dir):
             runs.claim(settings)
-            if not store.exists(run_dir / "policy.npz"):
+            if not (run_dir / "policy.safetensors").is_file():
                 _train(settings, *data.ensure_dataset(source))
     runs.claim(settings)
     return policy.restore(run_dir)
@@ -178,7 +178,7 @@ def _train(settings: Settings, dataset: Dataset, data_hash: str) -> None:
     store.write_json(run_dir / "open_loop.json", document)
     recorded |= {"space": build.space_to_settings(space), "best_step": best}
     policy.save(
-        run_dir / "policy.npz",
+        run_dir / "policy.safetensors",
         params,
         recorded,
         made_from={"dataset": data_hash},
@@ -396,7 +396,7 @@ def ensure_certificate(settings: Settings) -> None:
     A certificate of other settings of the certification is made again.
     """
     run_dir = settings.run_dir
-    if store.exists(run_dir / "policy.npz") and _is_certified(settings):
+    if (run_dir / "policy.safetensors").is_file() and _is_certified(settings):
         ensure_policy(settings)
         return
     with store.locked(run_dir, wait=True):  # another process may be training it

@@ -22,7 +22,7 @@ def run(settings: Settings) -> dict[str, Any]:
             with other settings.
     """
     run_dir = settings.run_dir
-    if not store.exists(run_dir / "policy.npz"):
+    if not (run_dir / "policy.safetensors").is_file():
         raise store.ArtefactError(
             f"{run_dir} holds no trained controller; "
             "run train with the same options first"
@@ -35,7 +35,7 @@ def _write(settings: Settings) -> dict[str, Any]:
     """Export the policy while no other process writes to the run directory."""
     run_dir = settings.run_dir
     runs.claim(settings)
-    _, manifest = store.read_arrays(run_dir / "policy.npz", kind=policy.KIND)
+    manifest = store.read_manifest(run_dir / "policy.safetensors", kind=policy.KIND)
     trained = policy.load(
         run_dir,
         controller=plain(settings.controller),
@@ -57,7 +57,7 @@ def _write(settings: Settings) -> dict[str, Any]:
     files = {
         "blob": "controller.stablehlo",
         "manifest": "controller.json",
-        "npz": "policy.npz",
+        "policy": "policy.safetensors",
     }
     return {key: str(folder / name) for key, name in files.items()}
 

@@ -75,7 +75,10 @@ def write_controller(
     for stale in (MANIFEST, CERTIFICATE, *(f"{stem}.vmfb" for stem in FILES.values())):
         (folder / stale).unlink(missing_ok=True)
     stored = policy.save(
-        folder / "policy.npz", trained.weights, trained.settings, made_from=made_from
+        folder / "policy.safetensors",
+        trained.weights,
+        trained.settings,
+        made_from=made_from,
     )
     manifest = {
         "kind": "controller",
@@ -98,7 +101,7 @@ def write_controller(
         or None,
         "iree_flags": list(iree_flags) if iree else None,
         "weights_sha256": stored["sha256"],
-        "certificate_sha256": _certificate(trained, folder, policy.policy_hash(stored)),
+        "certificate_sha256": _certificate(trained, folder, stored["content_sha256"]),
         **_vehicle(trained),
         "parameters": _count(trained.weights),
         "settings": trained.settings,

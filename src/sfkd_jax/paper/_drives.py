@@ -11,7 +11,7 @@ from jaxtyping import Float
 from sfkd_jax.evaluation.metrics import Row
 from sfkd_jax.reporting.rows import name_of
 from sfkd_jax.reporting.style import family
-from sfkd_jax.store import ArtefactError, exists, read_arrays
+from sfkd_jax.store import SUFFIX, ArtefactError, read_arrays
 
 KIND = "cell"
 
@@ -57,7 +57,7 @@ def drives(directory: Path, rows: list[Row]) -> tuple[list[Drive], list[str]]:
 
 def _drive(directory: Path, row: Row) -> Drive | None:
     file = _file(directory, row)
-    arrays = read_arrays(file, kind=KIND)[0] if exists(file) else {}
+    arrays = read_arrays(file, kind=KIND)[0] if file.is_file() else {}
     first = {
         name: np.asarray(values[0], dtype=float)
         for name, values in arrays.items()
@@ -83,4 +83,5 @@ def _file(directory: Path, row: Row) -> Path:
         return directory / row["arrays"]
     sampling = str(row.get("sampling") or "qp")
     cells = directory / "cells" / str(row.get("vehicle")) / str(row.get("scenario"))
-    return cells / sampling / f"{family(str(row.get('system')))}-{row.get('env')}.npz"
+    name = f"{family(str(row.get('system')))}-{row.get('env')}"
+    return cells / sampling / f"{name}{SUFFIX}"

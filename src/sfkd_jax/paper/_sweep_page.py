@@ -50,7 +50,7 @@ _Columns = dict[str, Callable[[Record], str]]
 def write_comparison(root: Path, pattern: str, name: str) -> dict[str, Any]:
     """Write index.html, report.md, comparison.json and a figure of many runs.
 
-    The files are in `root/name/comparison/`. Reads settings.json, policy.json,
+    The files are in `root/name/comparison/`. Reads settings.json, policy.safetensors,
     open_loop.json, certificate.json and results.json of every run; what is in a missing
     file is null, except for settings.json. The only arithmetic is d̄ / (1 − α), for the
     separate α and for d̄ on validation drives.

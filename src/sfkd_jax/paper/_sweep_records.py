@@ -9,7 +9,7 @@ from typing import Any, TypeAlias
 
 from sfkd_jax.evaluation.formats import dig, is_number
 from sfkd_jax.reporting.rows import groups_of, model_of, row_of
-from sfkd_jax.reporting.run import holds, read_certificate, read_optional
+from sfkd_jax.reporting.run import holds, read_certificate, read_optional, read_policy
 from sfkd_jax.store import as_artefact_error
 
 Record: TypeAlias = dict[str, Any]
@@ -73,7 +73,7 @@ def steps_of(records: list[Record], key: str) -> str:
 def _record(run: Path, name: str) -> Record:
     settings = read_optional(run / "settings.json") or {}
     errors = read_optional(run / "open_loop.json")
-    certificate = read_certificate(run, read_optional(run / "policy.json") or {})
+    certificate = read_certificate(run, read_policy(run) or {})
     rows = (read_optional(run / "results.json") or {}).get("rows") or []
     with as_artefact_error(run / "settings.json", ValueError):
         model, system = settings.get("model"), model_of(settings)

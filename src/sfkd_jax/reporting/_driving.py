@@ -34,7 +34,7 @@ def driving(run: Run) -> list[Block]:
         blocks += [*_scores(head), Text(text("driving.scores"), kind="note")]
     else:
         blocks += missing("results.json", again)
-    blocks += [] if run.scenes else missing("episodes.npz", again)
+    blocks += [] if run.scenes else missing("episodes.safetensors", again)
     for scene in run.scenes:
         blocks += _figures(scene, run.figures, full=scene is run.scenes[0])
     for group in run.groups:

@@ -15,7 +15,7 @@ from sfkd_jax.reporting._model import predicting, training
 from sfkd_jax.reporting._summary import command, provenance, summary
 from sfkd_jax.reporting.blocks import Block, Heading, Picture, to_html, to_markdown
 from sfkd_jax.reporting.corridor import corridor
-from sfkd_jax.reporting.run import Run, read_optional, read_run
+from sfkd_jax.reporting.run import Run, read_policy, read_run
 from sfkd_jax.reporting.style import label
 from sfkd_jax.store import ArtefactError, as_artefact_error, write_bytes, writing
 
@@ -25,12 +25,12 @@ Studies: TypeAlias = Callable[[list[list[Row]], Path], list[Block]]
 def write_report(run_dir: Path, *, studies: Studies | None = None) -> dict[str, Any]:
     """Write `run_dir/report/`: index.html, report.md and figures/*.png.
 
-    Reads policy.json, metrics.jsonl, open_loop.json, certificate.json, results.json and
-    episodes.npz of a run and recomputes none of their numbers; the same inputs give the
-    same bytes.
+    Reads policy.safetensors, metrics.jsonl, open_loop.json, certificate.json,
+    results.json and episodes.safetensors of a run and recomputes none of their numbers;
+    the same inputs give the same bytes.
 
     Args:
-        run_dir: of a run. All but policy.json may be missing; the page names the
+        run_dir: of a run. All but policy.safetensors may be missing; the page names the
             command that makes it.
         studies: makes further blocks from the groups of comparable rows and the folder
             of the figures.
@@ -40,8 +40,8 @@ def write_report(run_dir: Path, *, studies: Studies | None = None) -> dict[str, 
         page.
 
     Raises:
-        ArtefactError: no policy.json; a file that is not JSON, or whose content does
-            not fit on a page; or the disk refuses the page.
+        ArtefactError: no policy.safetensors; a file that is not JSON, or whose content
+            does not fit on a page; or the disk refuses the page.
     """
     with writing(run_dir / "report"):
         return _write(run_dir, studies)
@@ -49,15 +49,15 @@ def write_report(run_dir: Path, *, studies: Studies | None = None) -> dict[str, 
 
 def _write(directory: Path, studies: Studies | None) -> dict[str, Any]:
     """`write_report`, without conversion of errors of the disk."""
-    policy = read_optional(directory / "policy.json")
+    policy = read_policy(directory)
     if policy is None:
         makes = f"{command('train', {})} makes a run"
-        raise ArtefactError(f"{directory / 'policy.json'} is missing: {makes}")
+        raise ArtefactError(f"{directory / 'policy.safetensors'} is missing: {makes}")
     run = read_run(directory, policy)
     run.figures.mkdir(parents=True, exist_ok=True)
     for stale in run.figures.glob("*.png"):
         stale.unlink()
-    with as_artefact_error(directory / "policy.json", ValueError):
+    with as_artefact_error(directory / "policy.safetensors", ValueError):
         experiment = plain(run.settings.get("experiment") or "unnamed run")
         seed = plain(run.settings.get("seed"))
         title = f"{label(run.system)} on {experiment}, seed {seed}"

@@ -4,10 +4,10 @@ from __future__ import annotations
 
 from typing import Any
 
+from sfkd_jax.evaluation import identity
 from sfkd_jax.evaluation.formats import dig, is_number, short
 from sfkd_jax.evaluation.metrics import Row
 from sfkd_jax.reporting.style import family, file_stem, label, ordered, scenario_label
-from sfkd_jax.store import identity
 
 NO_MODEL = ("nominal", "oracle", "law")
 """Systems without a learned model; their names imply whether they observe e."""

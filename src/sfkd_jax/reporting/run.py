@@ -9,7 +9,7 @@ from sfkd_jax.evaluation.formats import dig, is_number
 from sfkd_jax.evaluation.metrics import Row
 from sfkd_jax.reporting.rows import groups_of, headline, model_of
 from sfkd_jax.reporting.scene import Scene, scenes_of
-from sfkd_jax.store import as_artefact_error, print_message, read_json, read_jsonl
+from sfkd_jax.store import as_artefact_error, read_json, read_jsonl, read_manifest
 
 
 class Run(NamedTuple):
@@ -21,7 +21,7 @@ class Run(NamedTuple):
         versions: of the packages, if recorded.
         command: that the results come from, if recorded.
         groups: its rows, by what may be compared.
-        scenes: of episodes.npz, the one with most switches first.
+        scenes: of episodes.safetensors, the one with most switches first.
         certificate: certificate.json, or a refusal.
         errors: open_loop.json.
         log: lines of metrics.jsonl.
@@ -53,7 +53,7 @@ def read_run(path: Path, policy: dict[str, Any]) -> Run:
 
     Args:
         path: of the run directory.
-        policy: its policy.json.
+        policy: manifest of its weights, see `read_policy`.
     """
     log, results = path / "metrics.jsonl", read_optional(path / "results.json") or {}
     with as_artefact_error(path / "results.json", ValueError):
@@ -67,8 +67,14 @@ def read_run(path: Path, policy: dict[str, Any]) -> Run:
         scenes=scenes,
         certificate=read_certificate(path, policy),
         errors=read_optional(path / "open_loop.json"),
-        log=read_jsonl(log, damaged=print_message) if log.exists() else [],
+        log=read_jsonl(log) if log.exists() else [],
     )
+
+
+def read_policy(run: Path) -> dict[str, Any] | None:
+    """The manifest of the weights of a run, or None without weights."""
+    path = run / "policy.safetensors"
+    return read_manifest(path, kind="policy") if path.exists() else None
 
 
 def read_optional(path: Path) -> dict[str, Any] | None:

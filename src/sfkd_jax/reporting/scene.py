@@ -1,4 +1,4 @@
-"""Simulated episodes of one scenario, from `episodes.npz`."""
+"""Simulated episodes of one scenario, from `episodes.safetensors`."""
 
 from __future__ import annotations
 
@@ -9,9 +9,10 @@ from typing import Any, NamedTuple, TypeAlias
 import numpy as np
 from jaxtyping import Float
 
+from sfkd_jax.evaluation import ROAD, SHARED, parse_episode_name
 from sfkd_jax.reporting.rows import search_words
 from sfkd_jax.reporting.style import file_stem, literal, scenario_label
-from sfkd_jax.store import ROAD, SHARED, parse_drive_name, read_npz
+from sfkd_jax.store import read_arrays
 
 _Arrays: TypeAlias = dict[str, np.ndarray]
 _Drive: TypeAlias = tuple[dict[str, str], _Arrays, _Arrays]
@@ -93,8 +94,8 @@ def scenes_of(run: Path) -> list[Scene]:
 
     A scene holds the systems that drove the same road with the same kind of search.
     """
-    path = run / "episodes.npz"
-    arrays = read_npz(path) if path.exists() else {}
+    path = run / "episodes.safetensors"
+    arrays = read_arrays(path, kind="episodes")[0] if path.exists() else {}
     dt = float(arrays.pop("dt", 0.1))
     parts: dict[str, _Arrays] = {}
     for name, values in arrays.items():
@@ -102,7 +103,7 @@ def scenes_of(run: Path) -> list[Scene]:
         parts.setdefault(drive, {})[part] = values
     groups: dict[tuple[Any, ...], list[_Drive]] = {}
     for name, own in parts.items():
-        row = parse_drive_name(name)
+        row = parse_episode_name(name)
         if own.get("lateral", np.zeros(0)).size:
             # Earlier versions store one road per scenario.
             available = parts.get(row.get("scenario", ""), {}) | own

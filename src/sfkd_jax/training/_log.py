@@ -23,7 +23,7 @@ from tensorboardX.event_file_writer import EventsWriter
 from tensorboardX.proto.event_pb2 import Event, SessionLog  # pyright: ignore[reportAttributeAccessIssue] made by protobuf
 from tensorboardX.summary import scalar
 
-from sfkd_jax.store import print_message, truncate_jsonl
+from sfkd_jax.store import truncate_jsonl
 
 RESUME_HINT = "the same command goes on from the last checkpoint"
 
@@ -53,7 +53,6 @@ class TrainingLog:
             self._path,
             lambda line: _step(line) <= resumed_at,
             keys=("step",),
-            damaged=print_message,
         )
         board = directory / "tensorboard" / "events"
         board.parent.mkdir(exist_ok=True)

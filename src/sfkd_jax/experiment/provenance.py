@@ -4,25 +4,16 @@ from __future__ import annotations
 
 import hashlib
 import os
-import platform
 import subprocess
 from functools import cache
-from importlib import import_module, metadata
 from pathlib import Path
 from typing import Any
 
+import jax
+
+from sfkd_jax.store import versions
+
 PACKAGE = Path(__file__).resolve().parents[1]
-
-
-def versions() -> dict[str, str]:
-    """Return the versions of Python and of the packages that numbers depend on."""
-    installed = {"python": platform.python_version()}
-    for name in ("numpy", "jax", "sfkd_jax"):
-        try:
-            installed[name] = metadata.version(name)
-        except metadata.PackageNotFoundError:
-            installed[name] = import_module(name).__version__
-    return installed
 
 
 @cache
@@ -44,8 +35,6 @@ def provenance() -> dict[str, Any]:
     Hash of the source, the commit if the package is a checkout ("+" if its files were
     changed since), version, jax, device, and the machine's load average.
     """
-    import jax
-
     device = jax.devices()[0]
     installed = versions()
     return {
@@ -60,17 +49,13 @@ def provenance() -> dict[str, Any]:
 
 @cache
 def _commit() -> str | None:
-    """The commit of the checkout, with "+" if the package differs; None outside one."""
+    """The commit of the checkout, with "+" if its files differ; None outside one."""
     if not (PACKAGE.parents[1] / ".git").exists():
         return None
-
-    def git(*words: str) -> str:
-        command = ["git", "-C", str(PACKAGE), *words]
-        done = subprocess.run(command, capture_output=True, text=True, check=True)
-        return done.stdout.strip()
-
+    command = ["git", "-C", str(PACKAGE), "describe", "--always", "--exclude=*"]
+    command += ["--abbrev=40", "--dirty=+"]
     try:
-        changed = git("status", "--porcelain", "--", ".")
-        return git("rev-parse", "HEAD") + ("+" if changed else "")
+        done = subprocess.run(command, capture_output=True, text=True, check=True)
     except (OSError, subprocess.CalledProcessError):
         return None
+    return done.stdout.strip()
