@@ -1,18 +1,24 @@
-"""Models in continuous time: learned rates, integrated together with the pose."""
+"""Models in continuous time: learned rates, one solver step a period; neural ODE."""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from typing import NamedTuple
+from typing import NamedTuple, cast
 
 import flax.linen as nn
+import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from sfkd_jax.geometry import rotate
+from sfkd_jax.models._networks import (
+    has_pose,
+    scaled_body,
+    scaled_control,
+    scaled_env,
+)
 from sfkd_jax.models._state_model import NO_STRUCTURE, state_model
 from sfkd_jax.types import (
-    BODY,
     Control,
     Environment,
     Fiber,
@@ -25,7 +31,6 @@ from sfkd_jax.types import (
 )
 
 SOLVERS = ("rk4", "euler")
-FRAMES = ("body", "path")
 
 
 class Conditioned(NamedTuple):
@@ -91,12 +96,8 @@ def continuous(
     def scaled_fiber(params: Params, env: Environment) -> Fiber:
         return fiber(params, scaled_env(space, env, environment))
 
-    def scaled_body(state: State) -> Float[Array, " body"]:
-        return (state[BODY] - space.body_mean) / space.body_scale
-
     def derivative(at: Fiber, state: State, control: Control) -> State:
-        scaled_control = (control - space.control_mean) / space.control_scale
-        rate = rates(at, scaled_body(state), scaled_control)
+        rate = rates(at, scaled_body(space, state), scaled_control(space, control))
         if not pose:
             return jnp.concatenate([jnp.zeros(3), space.body_scale * rate[3:]])
         twist = (drift + space.increment_scale * rate[:3]) / dt
@@ -112,7 +113,7 @@ def continuous(
         init,
         scaled_fiber,
         step,
-        vector=scaled_body,
+        vector=lambda state: scaled_body(space, state),
         state_size=3 + space.body_mean.shape[0],
         structure=structure,
         along_path=not pose,
@@ -130,28 +131,6 @@ def _solver_step(
     k3 = derivative(state + 0.5 * dt * k2)
     k4 = derivative(state + dt * k3)
     return state + dt / 6.0 * (k1 + 2.0 * k2 + 2.0 * k3 + k4)
-
-
-def has_pose(frame: str) -> bool:
-    """Whether a model in this frame predicts a pose; path coordinates have none.
-
-    Raises:
-        ValueError: an unknown frame.
-    """
-    if frame not in FRAMES:
-        raise ValueError(
-            f"model.frame must be one of {', '.join(FRAMES)}, got {frame!r}"
-        )
-    return frame == "body"
-
-
-def scaled_env(space: Space, env: Environment, environment: bool) -> Environment:
-    """Return (e − centre) / half width, or zeros for a model that ignores e.
-
-    Inside the box E every entry lies in [-1, 1].
-    """
-    scaled = (env - space.env_mean) / space.env_scale
-    return scaled if environment else jnp.zeros_like(scaled)
 
 
 def mlp(
@@ -176,3 +155,50 @@ def mlp(
     ]
     small = nn.initializers.variance_scaling(last**2, "fan_in", "truncated_normal")
     return nn.Sequential([*layers, nn.Dense(outputs, kernel_init=small)])
+
+
+def neural_ode(
+    space: Space,
+    *,
+    dt: float = 0.1,
+    hidden: tuple[int, ...] = (96, 96),
+    environment: bool = True,
+    frame: str = "body",
+) -> Model:
+    """Rates of the body state and the pose from one tanh network, solved by RK4 at dt.
+
+        (ġ, ṡ) = W_L tanh(… tanh(W_1 [s; u; e] + b_1) …) + b_L,   ġ in the body frame
+
+    The original has no inputs; here u and e are held over dt and are inputs like s.
+
+    Args:
+        space: measured scales; fixes all sizes.
+        dt: sampling period [s], the solver's step in training and in use.
+        hidden: widths.
+        environment: whether e is used.
+        frame: "body", or "path" for path coordinates.
+
+    Source: Chen et al., NeurIPS 2018, arXiv 1806.07366.
+    """
+    body = space.body_mean.shape[0]
+    inputs = body + space.control_mean.shape[0] + space.env_mean.shape[0]
+    network = mlp(hidden, 3 + body, (nn.tanh,) * len(hidden), last=0.1)
+
+    def init(key: Key) -> Params:
+        return network.init(key, jnp.zeros(inputs))["params"]
+
+    def rates(
+        fiber: Conditioned, body: Float[Array, " body"], control: Control
+    ) -> Float[Array, " rates"]:
+        read = jnp.concatenate([body, control, fiber.env])
+        return cast(jax.Array, network.apply({"params": fiber.params}, read))
+
+    return continuous(
+        space,
+        dt=dt,
+        init=init,
+        fiber=Conditioned,
+        rates=rates,
+        environment=environment,
+        frame=frame,
+    )

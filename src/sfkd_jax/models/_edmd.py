@@ -1,16 +1,160 @@
-"""Extended dynamic mode decomposition: radial functions and pairs along circles."""
+"""EDMD: the lift of the Koopman baseline and its regression on recorded runs."""
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+from itertools import combinations_with_replacement
+from typing import NamedTuple
+
 import jax
 import jax.numpy as jnp
+from jax.scipy.linalg import solve_triangular
 from jaxtyping import Array, Float
 
 from sfkd_jax.geometry import between, compose, wrap_angle
-from sfkd_jax.types import BODY, POSE, Scalar, State
+from sfkd_jax.models._networks import scaled_control
+from sfkd_jax.types import (
+    BODY,
+    POSE,
+    Control,
+    Environment,
+    Key,
+    Params,
+    Scalar,
+    Space,
+    State,
+    Trajectory,
+)
 
 STRAIGHT = 1e-12
 """Smallest curvature [1/m], so that nothing divides by 0."""
+VALIDATION_SHARE = 0.1
+"""Share of the ranges that the validation predictions use: a controller keeps the car
+near its path.
+"""
+
+
+class KoopmanFiber(NamedTuple):
+    """z⁺ = A z + B u + d κ + c for one environment, in units of the lift."""
+
+    A: Float[Array, "rank rank"]
+    B: Float[Array, "rank control"]
+    d: Float[Array, " rank"]
+    c: Float[Array, " rank"]
+    centres: Float[Array, "function coordinate"]
+
+
+@dataclass(frozen=True)
+class Lift:
+    """The lift z = (x, rbf(ξ)) and the regressors of its increment.
+
+        z⁺ − z = Wᵀ (rbf, m(e) ⊗ (ξ, u, κ, 1)),   x = (progress, ξ),   ξ = (e_y, e_ψ, s)
+
+    x and ξ are scaled.
+
+    Attributes:
+        space: measured scales.
+        functions: number of radial functions.
+        degree: of the monomials m(e).
+        lateral_range: unit of e_y [m].
+        heading_range: unit of e_ψ [rad].
+        curvature_range: unit of κ [1/m].
+    """
+
+    space: Space
+    functions: int
+    degree: int
+    lateral_range: float
+    heading_range: float
+    curvature_range: float
+
+    @property
+    def scale(self) -> State:
+        """The units of x."""
+        return jnp.concatenate(
+            [
+                jnp.asarray([1.0, self.lateral_range, self.heading_range]),
+                self.space.body_scale,
+            ]
+        )
+
+    @property
+    def centre(self) -> State:
+        """The value of x that is scaled to 0."""
+        return jnp.concatenate([jnp.zeros(3), self.space.body_mean])
+
+    @property
+    def size(self) -> int:
+        """Number of entries of x."""
+        return 3 + self.space.body_mean.shape[0]
+
+    @property
+    def rank(self) -> int:
+        """Number of entries of z."""
+        return self.size + self.functions
+
+    @property
+    def columns(self) -> int:
+        """Number of entries of (ξ, u, κ, 1)."""
+        return self.size - 1 + self.space.control_mean.shape[0] + 2
+
+    @property
+    def monomials(self) -> list[tuple[int, ...]]:
+        """The entries of e in each monomial; the first is the empty product, 1."""
+        entries = range(self.space.env_mean.shape[0])
+        return [
+            term
+            for degree in range(self.degree + 1)
+            for term in combinations_with_replacement(entries, degree)
+        ]
+
+    def __call__(
+        self, centres: Float[Array, "function coordinate"], path: State
+    ) -> Float[Array, " rank"]:
+        """Return z of a state along the path, which is in physical units."""
+        scaled = (path - self.centre) / self.scale
+        return jnp.concatenate([scaled, thin_plate(scaled[1:], centres)])
+
+    def features(self, env: Environment) -> Float[Array, " monomial"]:
+        """Return the monomials m(e)."""
+        scaled = (env - self.space.env_mean) / self.space.env_scale
+        return jnp.stack(
+            [jnp.prod(scaled[jnp.asarray(term, int)]) for term in self.monomials]
+        )
+
+    def regressors(
+        self,
+        z: Float[Array, " rank"],
+        control: Control,
+        env: Environment,
+        kappa: Scalar,
+    ) -> Float[Array, " regressor"]:
+        """Return (rbf, m(e) ⊗ (ξ, u, κ, 1))."""
+        inputs = scaled_control(self.space, control)
+        rest = jnp.stack([kappa / self.curvature_range, jnp.ones(())])
+        linear = jnp.concatenate([z[1 : self.size], inputs, rest])
+        return jnp.concatenate(
+            [z[self.size :], jnp.outer(self.features(env), linear).ravel()]
+        )
+
+    def at(self, params: Params, env: Environment) -> KoopmanFiber:
+        """Return the matrices at e."""
+        of_functions, of_features = jnp.split(params["weights"], [self.functions])
+        by_feature = of_features.reshape(-1, self.columns, self.rank)
+        linear = jnp.tensordot(self.features(env), by_feature, axes=1).T
+        states, inputs, bend, rest = jnp.split(
+            linear, (self.size - 1, self.columns - 2, self.columns - 1), axis=1
+        )
+        A = jnp.concatenate([jnp.zeros((self.rank, 1)), states, of_functions.T], axis=1)
+        B = inputs / self.space.control_scale
+        c = rest[:, 0] - B @ self.space.control_mean
+        return KoopmanFiber(
+            jnp.eye(self.rank) + A,
+            B,
+            bend[:, 0] / self.curvature_range,
+            c,
+            params["centres"],
+        )
 
 
 def thin_plate(
@@ -22,6 +166,120 @@ def thin_plate(
     return jnp.where(
         positive, 0.5 * squares * jnp.log(jnp.where(positive, squares, 1.0)), 0.0
     )
+
+
+def random_centres(lift: Lift, key: Key) -> Float[Array, "function coordinate"]:
+    """Draw centres uniformly from the box [-1, 1] of ξ."""
+    return jax.random.uniform(key, (lift.functions, lift.size - 1), minval=-1.0)
+
+
+def identify(
+    lift: Lift,
+    train: Trajectory,
+    validation: Trajectory,
+    key: Key,
+    *,
+    ridges: tuple[float, ...],
+    transitions: int,
+    horizon: int,
+) -> Params:
+    """Fit the weights by ridge regression, with the ridge that predicts best.
+
+    Args:
+        lift: with random centres, drawn here.
+        train: trajectories that the pairs come from.
+        validation: trajectories that choose the ridge.
+        key: consumed.
+        ridges: to choose from.
+        transitions: largest number of pairs.
+        horizon: of the validation predictions, steps.
+    """
+    centre_key, pair_key, circle_key = jax.random.split(key, 3)
+    centres = random_centres(lift, centre_key)
+    fits = ridge_regression(
+        *_pairs(lift, train, centres, pair_key, transitions), jnp.asarray(ridges)
+    )
+    count, steps = validation.controls.shape[:2]
+    length = min(horizon, steps)
+    states, *inputs = validation
+    windows = Trajectory(
+        states[:, : length + 1], *(leaf[:, :length] for leaf in inputs)
+    )
+    drawn = jax.tree.map(
+        lambda leaf: VALIDATION_SHARE * leaf, _circles(lift, circle_key, count)
+    )
+
+    def error(weights: Float[Array, "regressor rank"]) -> Scalar:
+        params = {"centres": centres, "weights": weights}
+        return jnp.mean(
+            jax.vmap(lambda *each: _prediction_error(lift, params, *each))(
+                windows, *drawn
+            )
+        )
+
+    errors = jax.lax.map(error, fits)
+    return {
+        "centres": centres,
+        "weights": fits[jnp.argmin(jnp.where(jnp.isfinite(errors), errors, jnp.inf))],
+    }
+
+
+def _circles(
+    lift: Lift, key: Key, count: int
+) -> tuple[Float[Array, "sample 2"], Float[Array, " sample"]]:
+    """Draw offsets (e_y, e_ψ) from circles, and their curvatures, uniformly."""
+    drawn = jax.random.uniform(key, (count, 3), minval=-1.0)
+    return drawn[:, :2] * jnp.asarray(
+        [lift.lateral_range, lift.heading_range]
+    ), lift.curvature_range * drawn[:, 2]
+
+
+def _pairs(
+    lift: Lift,
+    train: Trajectory,
+    centres: Float[Array, "function coordinate"],
+    key: Key,
+    most: int,
+) -> tuple[Float[Array, "sample regressor"], Float[Array, "sample rank"]]:
+    """Regressors and increments of the lift, one row per transition."""
+    choice_key, circle_key = jax.random.split(key)
+    ends = jnp.stack([train.states[:, :-1], train.states[:, 1:]], axis=2).reshape(
+        -1, 2, lift.size
+    )
+    chosen = jax.random.permutation(choice_key, ends.shape[0])[:most]
+    controls, envs = (
+        leaf.reshape(ends.shape[0], -1)[chosen] for leaf in (train.controls, train.envs)
+    )
+    offsets, curvatures = _circles(lift, circle_key, chosen.shape[0])
+    paths = jax.vmap(along_circle)(ends[chosen], offsets, curvatures)
+    before, after = (
+        jax.vmap(lift, in_axes=(None, 0))(centres, paths[:, k]) for k in (0, 1)
+    )
+    return jax.vmap(lift.regressors)(before, controls, envs, curvatures), after - before
+
+
+def _prediction_error(
+    lift: Lift,
+    params: Params,
+    window: Trajectory,
+    offset: Float[Array, " 2"],
+    change: Scalar,
+) -> Scalar:
+    """Mean square error of a prediction relative to a circle close to the window."""
+    steps = jnp.hypot(*jnp.diff(window.states[:, :2], axis=0).T)
+    turned = jax.vmap(between)(window.states[:-1, POSE], window.states[1:, POSE])[:, 2]
+    bend = jnp.sum(turned) / jnp.maximum(jnp.sum(steps), 1.0)
+    kappa = jnp.clip(bend + change, -lift.curvature_range, lift.curvature_range)
+    paths = along_circle(window.states, offset, kappa)
+
+    def advance(z: Array, inputs: tuple[Control, Environment]) -> tuple[Array, Array]:
+        z = z + lift.regressors(z, *inputs, kappa) @ params["weights"]
+        return z, z[1 : lift.size]
+
+    _, predicted = jax.lax.scan(
+        advance, lift(params["centres"], paths[0]), (window.controls, window.envs)
+    )
+    return jnp.mean((predicted - ((paths - lift.centre) / lift.scale)[1:, 1:]) ** 2)
 
 
 def along_circle(
@@ -57,3 +315,53 @@ def along_circle(
         )
 
     return jax.vmap(one)(states)
+
+
+def ridge_regression(
+    inputs: Float[Array, "sample p"],
+    targets: Float[Array, "sample q"],
+    ridges: Float[Array, " ridge"],
+) -> Float[Array, "ridge p q"]:
+    """Return W = argmin |X W − Y|² + λ N |D W|² for every λ.
+
+    D are the root mean squares of the columns of X. Solved by an orthogonal
+    factorisation of [X D⁻¹, Y] instead of X'X, which float32 cannot resolve.
+
+    Args:
+        inputs: X.
+        targets: Y.
+        ridges: λ > 0.
+    """
+    triangle, spread = _factorised(inputs, targets)
+
+    def solve(ridge: Scalar) -> Float[Array, "p q"]:
+        upper, right = _ridged(triangle, inputs.shape[1], ridge * inputs.shape[0])
+        return solve_triangular(upper, right) / spread[:, None]
+
+    return jax.lax.map(solve, ridges)
+
+
+def _factorised(
+    inputs: Float[Array, "sample p"], targets: Float[Array, "sample q"]
+) -> tuple[Float[Array, "rows columns"], Float[Array, " p"]]:
+    """The first p rows, at most, of R in [X D⁻¹, Y] = Q R, and the diagonal of D."""
+    spread = jnp.sqrt(jnp.mean(inputs**2, axis=0))
+    spread = jnp.where(spread > 0, spread, 1.0)
+    triangle = jnp.linalg.qr(
+        jnp.concatenate([inputs / spread, targets], axis=1), mode="r"
+    )
+    return triangle[: inputs.shape[1]], spread
+
+
+def _ridged(
+    triangle: Float[Array, "rows columns"], columns: int, ridge: Scalar | float
+) -> tuple[Float[Array, "p p"], Float[Array, "p q"]]:
+    """Return U, upper triangular, and V of the regularised least squares problem.
+
+    |X W − Y|² + ridge |D W|² = |U D W − V|² + a constant, X of p columns.
+    """
+    stacked = jnp.concatenate(
+        [triangle[:, :columns], jnp.sqrt(ridge) * jnp.eye(columns)]
+    )
+    orthogonal, upper = jnp.linalg.qr(stacked)
+    return upper, orthogonal[: triangle.shape[0]].T @ triangle[:, columns:]

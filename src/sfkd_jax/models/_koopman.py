@@ -9,8 +9,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from sfkd_jax.geometry import between, compose
-from sfkd_jax.models._koopman_fit import identify, random_centres
-from sfkd_jax.models._koopman_lift import KoopmanFiber, Lift
+from sfkd_jax.models._edmd import KoopmanFiber, Lift, identify, random_centres
 from sfkd_jax.ranges import AtLeastTwo, NonNegativeInt, Positive
 from sfkd_jax.types import (
     POSE,

@@ -2,23 +2,33 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any, NamedTuple, cast
 
+import flax.linen as nn
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from sfkd_jax.geometry import compose
-from sfkd_jax.models._continuous import has_pose, scaled_env
-from sfkd_jax.models._r2dn_weights import Affine, Interconnection, Shared
-from sfkd_jax.models.sfkd._networks import Biases, Encoder
-from sfkd_jax.models.sfkd._records import SfkdLatent
-from sfkd_jax.models.sfkd._sandwich import apply
+from sfkd_jax.models._networks import (
+    SMALL,
+    Biases,
+    Encoder,
+    PosedLatent,
+    Sandwich,
+    Weights,
+    apply,
+    bounded,
+    has_pose,
+    scaled_body,
+    scaled_control,
+    scaled_env,
+)
 from sfkd_jax.ranges import Fraction
 from sfkd_jax.rollout import Folded, unfold
 from sfkd_jax.types import (
-    BODY,
     POSE,
     Control,
     Declared,
@@ -33,6 +43,127 @@ from sfkd_jax.types import (
     State,
     Structure,
 )
+
+
+class Affine(NamedTuple):
+    """The biases of all layers of a network, concatenated, as [u; e] gain + offset."""
+
+    gain: Float[Array, "inputs all"]
+    offset: Float[Array, " all"]
+
+
+class Shared(NamedTuple):
+    """Plain weights, with all bounds enforced.
+
+    Attributes:
+        A: of z⁺ = A z + W_L tanh(… W_1 z …).
+        feedback: W_1 = V_1 C₁, …, W_L = B₁ V_L with V of φ, and φ's multipliers, which
+            prove α for the whole step.
+        feedback_inputs: biases of the feedback; the last one is B₂ [u; e] + b.
+        decoder: of the pose increment; empty without a pose.
+        decoder_inputs: biases of the decoder; None without a pose.
+        readout: C of the body state.
+        centre: c of the body state.
+    """
+
+    A: Float[Array, "rank rank"]
+    feedback: Weights
+    feedback_inputs: Affine
+    decoder: Weights
+    decoder_inputs: Affine | None
+    readout: Float[Array, "body rank"]
+    centre: Float[Array, " body"]
+
+
+class Interconnection(nn.Module):
+    """Everything learned except the encoder.
+
+    Attributes:
+        rank: size of z.
+        body: size of s.
+        inputs: size of [u; e].
+        hidden: hidden widths of φ.
+        decoder_hidden: hidden widths of the decoder.
+        alpha: α.
+        pose: whether there is a decoder of the pose.
+    """
+
+    rank: int
+    body: int
+    inputs: int
+    hidden: Sequence[int]
+    decoder_hidden: Sequence[int]
+    alpha: float
+    pose: bool = True
+
+    @nn.compact
+    def __call__(self) -> Shared:
+        """Return the explicit weights."""
+        square = (self.rank, self.rank)
+        A, B1, C1 = contracting(
+            self.param("A", lambda key, shape: jnp.eye(*shape), square),
+            self.param("B1", SMALL, square),
+            self.param("C1", SMALL, square),
+            self.alpha,
+        )
+        phi = Sandwich(self.rank, self.hidden, self.rank, name="phi")(1.0)
+        first, *middle, last = phi.matrices
+        decoder, decoder_inputs = self._decoder() if self.pose else (Weights(), None)
+        return Shared(
+            A=A,
+            feedback=Weights((first @ C1, *middle, B1 @ last), phi.multipliers),
+            feedback_inputs=self._affine(
+                "feedback", sum(self.hidden) + self.rank, SMALL
+            ),
+            decoder=decoder,
+            decoder_inputs=decoder_inputs,
+            readout=bounded(
+                self.param(
+                    "readout", nn.initializers.orthogonal(), (self.body, self.rank)
+                ),
+                1.0,
+            ),
+            centre=self.param("centre", nn.initializers.zeros, (self.body,)),
+        )
+
+    def _decoder(self) -> tuple[Weights, Affine]:
+        """Weights and biases of the decoder of the pose increment."""
+        bound = jnp.exp(
+            self.param("log_decoder_bound", nn.initializers.constant(1.0), ())
+        )
+        weights = Sandwich(self.rank, self.decoder_hidden, 3, name="decoder")(bound)
+        return weights, self._affine(
+            "decoder", sum(self.decoder_hidden) + 3, nn.initializers.lecun_normal()
+        )
+
+    def _affine(
+        self, name: str, size: int, spread: nn.initializers.Initializer
+    ) -> Affine:
+        """The learned biases of one network."""
+        gain = self.param(f"{name}_gain", spread, (self.inputs, size))
+        return Affine(
+            gain, self.param(f"{name}_offset", nn.initializers.zeros, (size,))
+        )
+
+
+def contracting(
+    A: Float[Array, "rank rank"],
+    B1: Float[Array, "rank w"],
+    C1: Float[Array, "v rank"],
+    alpha: float,
+) -> tuple[Float[Array, "rank rank"], Float[Array, "rank w"], Float[Array, "v rank"]]:
+    """Return (α Ã, B̃₁, α C̃₁) from free matrices, with ‖[Ã B̃₁; C̃₁ 0]‖₂ ≤ 1.
+
+    [Ã B̃₁; C̃₁ 0] = [A B₁; C₁ 0] / max(1, Gram bound of [A B₁; C₁ 0]).
+    """
+    zeros = jnp.zeros((C1.shape[0], B1.shape[1]))
+    block = bounded(jnp.block([[A, B1], [C1, zeros]]), 1.0)
+    rows, columns = A.shape
+    return (
+        alpha * block[:rows, :columns],
+        block[:rows, columns:],
+        alpha * block[rows:, :columns],
+    )
 
 
 class R2dnFiber(NamedTuple):
@@ -171,34 +302,30 @@ class _R2dn:
             encoder=unfold(params)["encoder"],
         )
 
-    def encode(self, fiber: R2dnFiber, state: State) -> SfkdLatent:
+    def encode(self, fiber: R2dnFiber, state: State) -> PosedLatent:
         """Return the latent of a state."""
-        space, size = self.space, 3 + self.space.body_mean.shape[0]
-        if state.shape != (size,):
-            raise ValueError(f"state must have shape ({size},), got {state.shape}")
-        scaled = (state[BODY] - space.body_mean) / space.body_scale
-        pose = state[POSE]
+        scaled = scaled_body(self.space, state)
         z = self.encoder.apply({"params": fiber.encoder}, scaled, fiber.env)
-        return SfkdLatent(pose, cast(jax.Array, z))
+        return PosedLatent(state[POSE], cast(jax.Array, z))
 
     def step(
-        self, fiber: R2dnFiber, latent: SfkdLatent, control: Control
-    ) -> SfkdLatent:
+        self, fiber: R2dnFiber, latent: PosedLatent, control: Control
+    ) -> PosedLatent:
         """Advance z and the pose by one sampling period."""
         space = self.space
-        u = (control - space.control_mean) / space.control_scale
+        u = scaled_control(space, control)
         z = fiber.A @ latent.z + apply(
             fiber.feedback, fiber.feedback_biases.at(u), latent.z
         )
         if not self.weights.pose:
-            return SfkdLatent(latent.pose, z)
+            return PosedLatent(latent.pose, z)
         motion = apply(fiber.decoder, fiber.decoder_biases.at(u), latent.z)
-        return SfkdLatent(
+        return PosedLatent(
             compose(latent.pose, space.increment_mean + space.increment_scale * motion),
             z,
         )
 
-    def decode(self, fiber: R2dnFiber, latent: SfkdLatent) -> State:
+    def decode(self, fiber: R2dnFiber, latent: PosedLatent) -> State:
         """Return the state of a latent."""
         scaled = fiber.readout @ latent.z + fiber.centre
         return jnp.concatenate(
@@ -235,7 +362,7 @@ def _biases(
 ) -> Biases:
     """b_k(u, e) of every layer; e enters linearly and shifts the offsets."""
     if inputs is None:
-        return Biases((), ())
+        return Biases()
     widths = [matrix.shape[0] for matrix in matrices]
     edges = [sum(widths[: k + 1]) for k in range(len(widths) - 1)]
     controls = inputs.gain.shape[0] - env.shape[0]

@@ -1,4 +1,4 @@
-"""Models whose latent is the physical state itself."""
+"""Models whose latent is the physical state itself; known dynamics as one."""
 
 from __future__ import annotations
 
@@ -16,6 +16,7 @@ from sfkd_jax.types import (
     Model,
     Params,
     State,
+    Step,
     Structure,
 )
 
@@ -72,5 +73,28 @@ def state_model(
         vector=vector,
         fitting=fitting,
         structure=structure,
+        along_path=along_path,
+    )
+
+
+def physics(
+    step: Step,
+    *,
+    distort: Callable[[Environment], Environment] = lambda env: env,
+    along_path: bool = False,
+) -> Model:
+    """Return a one-step function as a `Model` without parameters.
+
+    Args:
+        step: (x, u, e) -> x one sampling period later, passed in by the caller (models
+            never import the vehicle).
+        distort: the environment that the model assumes instead of e; the identity for
+            the true plant.
+        along_path: whether x and u are those of `geometry`.
+    """
+    return state_model(
+        init=lambda key: {},
+        fiber=lambda params, env: distort(env),
+        step=lambda env, state, control: step(state, control, env),
         along_path=along_path,
     )

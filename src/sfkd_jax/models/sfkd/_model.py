@@ -1,20 +1,235 @@
-"""Stable Fiber-Koopman Residual Dynamics, assembled as a `Model`."""
+"""Stable Fiber-Koopman Residual Dynamics: its functions, and the `Model` of them."""
 
 from __future__ import annotations
 
-from functools import partial
+from dataclasses import dataclass
+from typing import Any, NamedTuple, cast
 
+import jax
 import jax.numpy as jnp
+from jaxtyping import Array, Float
 
-from sfkd_jax.models.sfkd._dynamics import Dynamics
-from sfkd_jax.models.sfkd._networks import Encoder, Networks
-from sfkd_jax.models.sfkd._settings import check_settings
-from sfkd_jax.models.sfkd._start import identify_start
+from sfkd_jax.geometry import between, compose
+from sfkd_jax.models._networks import (
+    Biases,
+    Encoder,
+    PosedLatent,
+    apply,
+    scaled_body,
+    scaled_control,
+    scaled_env,
+)
+from sfkd_jax.models.sfkd._learned import LOWEST_RATE, Learned, PerEnvironment, Shared
+from sfkd_jax.models.sfkd._residual import BUDGETS, RESIDUALS
 from sfkd_jax.ranges import Fraction, NonNegativeInt
-from sfkd_jax.types import Fitting, Model, Space, Structure
+from sfkd_jax.rollout import Folded, unfold
+from sfkd_jax.types import (
+    POSE,
+    Control,
+    Declared,
+    Environment,
+    Explicit,
+    Fitting,
+    Key,
+    Model,
+    Params,
+    Polytope,
+    Pose,
+    Scalar,
+    Space,
+    State,
+    Structure,
+)
 
+FRAMES = ("body", "segment", "path")
 SEGMENT_STEPS = 20.0
 """Pose increments per unit of the segment-frame pose: the paper's horizon."""
+
+
+class Mixture(NamedTuple):
+    """A(e) = Σ_j w_j A_j, not summed.
+
+    In training every step of every window has its own e. Without the sum, the gradient
+    with respect to the A_j needs no matrix for each e.
+    """
+
+    weights: Float[Array, " vertex"]
+    vertices: Float[Array, "vertex rank rank"]
+
+    def __matmul__(self, z: Float[Array, " rank"]) -> Float[Array, " rank"]:
+        """Return A(e) z."""
+        return self.weights @ (self.vertices @ z)
+
+    def summed(self) -> Float[Array, "rank rank"]:
+        """Return A(e), for many steps under one e."""
+        return jnp.tensordot(self.weights, self.vertices, axes=1)
+
+
+class SfkdFiber(NamedTuple):
+    """All that depends on e; a network without matrices is absent."""
+
+    A: Mixture | Float[Array, "rank rank"]
+    local: PerEnvironment
+    residual: tuple[Float[Array, "_ _"], ...]
+    decoder: tuple[Float[Array, "_ _"], ...]
+    forcing: tuple[Float[Array, "_ _"], ...]
+    readout: Float[Array, "body rank"]
+    centre: Float[Array, " body"]
+    encoder: Any
+
+
+@dataclass(frozen=True, eq=False)
+class Sfkd:
+    """The functions of `Model`.
+
+    Attributes:
+        space: measured scales.
+        learned: everything learned except the encoder.
+        encoder: of the body state (and of the pose in the segment frame).
+        segment: whether the pose relative to the start of the segment is part of z.
+        environment: whether e is used.
+        soft_penalty: weight of `hinge`.
+    """
+
+    space: Space
+    learned: Learned
+    encoder: Encoder
+    segment: bool
+    environment: bool
+    soft_penalty: float
+
+    @property
+    def pose_scale(self) -> Float[Array, " 3"]:
+        """Units of what the decoder predicts: a step's motion, or a segment's."""
+        scale = jnp.asarray(self.space.increment_scale)
+        return scale * SEGMENT_STEPS if self.segment else scale
+
+    def init(self, key: Key) -> Params:
+        """Draw initial parameters."""
+        network_key, encoder_key = jax.random.split(key)
+        body = self.learned.body
+        inputs = jnp.zeros(body + 3 if self.segment else body)
+        env = jnp.zeros(self.space.env_mean.shape[0])
+        embedding = jnp.zeros(self.learned.embedding)
+        return {
+            "networks": self.learned.init(network_key, env)["params"],
+            "encoder": self.encoder.init(encoder_key, inputs, embedding)["params"],
+        }
+
+    def _apply(self, params: Params, method: str, *inputs: Array) -> Any:
+        """Call a method of the flax module."""
+        weights = {"params": unfold(params)["networks"]}
+        return self.learned.apply(weights, *inputs, method=method)
+
+    def shared(self, params: Params) -> Shared:
+        """Return the bounded weights, as they are if folded."""
+        if isinstance(params, Folded):
+            return params.shared
+        return cast(Shared, self._apply(params, "shared"))
+
+    def rate(self, params: Params) -> Scalar:
+        """Return α."""
+        return cast(Scalar, self._apply(params, "rate"))
+
+    def fiber(self, params: Params, env: Environment) -> SfkdFiber:
+        """Return all that depends on e; A(e) is summed for folded parameters only.
+
+        Training takes many environments and differentiates by the vertices; see
+        `Mixture`. A controller takes many steps under one environment.
+        """
+        shared = self.shared(params)
+        scaled = scaled_env(self.space, env, self.environment)
+        local = cast(PerEnvironment, self._apply(params, "per_environment", scaled))
+        operator = Mixture(local.mixture, shared.vertices)
+        return SfkdFiber(
+            A=operator.summed() if isinstance(params, Folded) else operator,
+            local=local,
+            residual=shared.residual.matrices,
+            decoder=shared.decoder.matrices,
+            forcing=shared.forcing,
+            readout=shared.readout,
+            centre=shared.centre,
+            encoder=unfold(params)["encoder"],
+        )
+
+    def encode(self, fiber: SfkdFiber, state: State) -> PosedLatent:
+        """Return the latent of a state, in a frame that starts at its pose."""
+        return self._lift(fiber, state[POSE], state)
+
+    def observe(
+        self, fiber: SfkdFiber, latent: PosedLatent, state: State
+    ) -> PosedLatent:
+        """Return the latent of a state, in the frame of `latent`."""
+        return self._lift(fiber, latent.pose if self.segment else state[POSE], state)
+
+    def _lift(self, fiber: SfkdFiber, at: Pose, state: State) -> PosedLatent:
+        """The latent of a state in the frame of a pose."""
+        inputs = scaled_body(self.space, state)
+        if self.segment:
+            motion = between(at, state[POSE]) / self.pose_scale
+            inputs = jnp.concatenate([motion, inputs])
+        z = self.encoder.apply({"params": fiber.encoder}, inputs, fiber.local.embedding)
+        return PosedLatent(at, rotate_planes(fiber.local.tangents, cast(jax.Array, z)))
+
+    def step(
+        self, fiber: SfkdFiber, latent: PosedLatent, control: Control
+    ) -> PosedLatent:
+        """Advance z and the pose by one sampling period."""
+        space, local = self.space, fiber.local
+        u = scaled_control(space, control)
+        z = fiber.A @ latent.z + local.B @ u
+        if fiber.forcing:
+            z = z + fiber.forcing[0] @ jnp.tanh(local.forcing.at(u)[0])
+        if fiber.residual:
+            z = z + apply(fiber.residual, local.residual.at(u), latent.z)
+        if self.segment or not fiber.decoder:
+            # The pose is part of z, or there is none: that of the start stays.
+            return PosedLatent(latent.pose, z)
+        motion = apply(fiber.decoder, local.decoder.at(u), latent.z)
+        motion = space.increment_mean + self.pose_scale * motion
+        return PosedLatent(compose(latent.pose, motion), z)
+
+    def decode(self, fiber: SfkdFiber, latent: PosedLatent) -> State:
+        """Return the state of a latent."""
+        pose, space = latent.pose, self.space
+        if self.segment:
+            offset = apply(fiber.decoder, fiber.local.decoder.offsets, latent.z)
+            pose = compose(pose, self.pose_scale * offset)
+        scaled = fiber.readout @ latent.z + fiber.centre
+        return jnp.concatenate([pose, space.body_mean + space.body_scale * scaled])
+
+    def transport(
+        self, fiber: SfkdFiber, fiber_next: SfkdFiber, latent: PosedLatent
+    ) -> PosedLatent:
+        """Carry z from the fiber of e to that of e', T(e → e') z = Q(e') Q(e)' z."""
+        unrotated = rotate_planes(-fiber.local.tangents, latent.z)
+        return latent._replace(z=rotate_planes(fiber_next.local.tangents, unrotated))
+
+    def explicit(self, params: Params) -> Explicit:
+        """Return the weights that a certificate is about."""
+        shared, learned = self.shared(params), self.learned
+        decoder = shared.decoder.matrices
+        if learned.pose:
+            decoder = (*decoder[:-1], self.pose_scale[:, None] * decoder[-1])
+        return Explicit(
+            operators=Polytope(shared.vertices),
+            residual=shared.residual.matrices,
+            residual_multipliers=shared.residual.multipliers,
+            decoder=decoder,
+            decoder_multipliers=shared.decoder.multipliers,
+            readout=jnp.asarray(self.space.body_scale)[:, None] * shared.readout,
+            declared=Declared(
+                "tanh", "rotation" if learned.transport else "identity", learned.control
+            ),
+        )
+
+    def hinge(self, fiber: SfkdFiber, latent: PosedLatent, control: Control) -> Scalar:
+        """Return the weighted penalty max(0, ||∂r/∂z||_2 − β)² (eq:contr_loss)."""
+        biases: Biases = fiber.local.residual
+        at = biases.at(scaled_control(self.space, control))
+        jacobian = jax.jacobian(lambda z: apply(fiber.residual, at, z))(latent.z)
+        excess = jnp.linalg.norm(jacobian, 2) - self.learned.beta
+        return self.soft_penalty * jnp.maximum(0.0, excess) ** 2
 
 
 def sfkd(
@@ -80,40 +295,97 @@ def sfkd(
     Raises:
         ValueError: unknown frame or residual, odd rank, or bounds outside (0, 1).
     """
-    check_settings(rank, rho, beta, frame, residual, budget, learn_alpha)
-    body, control = space.body_mean.shape[0], space.control_mean.shape[0]
-    pose = frame != "path"
-    hidden = tuple(residual_hidden), tuple(decoder_hidden)
-    bounds = (rho, beta, residual, transport, budget, pose, learn_alpha, forcing_hidden)
-    networks = Networks(rank, body, control, vertices, *hidden, embedding, *bounds)
-    dynamics = Dynamics(
-        space,
-        networks,
-        Encoder(rank, encoder_hidden, linear_lift),
-        pose_scale=jnp.asarray(space.increment_scale) * SEGMENT_STEPS,
-        segment=frame == "segment",
-        environment=environment,
-        soft_penalty=soft_penalty,
+    for setting, value, known in (
+        ("frame", frame, FRAMES),
+        ("residual", residual, RESIDUALS),
+        ("budget", budget, BUDGETS),
+    ):
+        if value not in known:
+            raise ValueError(
+                f"model.{setting} must be one of {', '.join(known)}, got {value!r}"
+            )
+    kind = RESIDUALS[residual]
+    joint = kind.shares_budget(budget)
+    _check_bounds(rank, rho, beta, learn_alpha, joint)
+    if soft_penalty and kind.network is None:
+        raise ValueError("model.soft_penalty needs a residual, got model.residual=none")
+    learned = Learned(
+        rank=rank,
+        body=space.body_mean.shape[0],
+        control=space.control_mean.shape[0],
+        vertices=vertices,
+        residual_hidden=tuple(residual_hidden),
+        decoder_hidden=tuple(decoder_hidden),
+        embedding=embedding,
+        rho=rho,
+        beta=beta,
+        kind=kind,
+        joint=joint,
+        transport=transport,
+        pose=frame != "path",
+        learn_alpha=learn_alpha,
+        forcing_hidden=forcing_hidden,
     )
-    model = Model(
-        init=dynamics.init,
-        fiber=dynamics.fiber,
-        encode=dynamics.encode,
-        step=dynamics.step,
-        decode=dynamics.decode,
-        transport=dynamics.transport,
-        observe=dynamics.observe,
+    encoder = Encoder(rank, encoder_hidden, linear_lift)
+    segment = frame == "segment"
+    functions = Sfkd(space, learned, encoder, segment, environment, soft_penalty)
+    return Model(
+        init=functions.init,
+        fiber=functions.fiber,
+        encode=functions.encode,
+        step=functions.step,
+        decode=functions.decode,
+        transport=functions.transport,
+        observe=functions.observe,
         vector=lambda latent: latent.z,
-        shared=dynamics.shared,
+        shared=functions.shared,
+        fitting=Fitting(penalty=functions.hinge if soft_penalty else None),
         structure=Structure(
-            explicit=dynamics.explicit,
-            rate=dynamics.rate if residual != "free" else None,
+            explicit=functions.explicit, rate=functions.rate if kind.bounded else None
         ),
-        along_path=not pose,
+        along_path=not learned.pose,
     )
-    return model._replace(
-        fitting=Fitting(
-            start=partial(identify_start, model, dynamics),
-            penalty=dynamics.hinge if soft_penalty else None,
+
+
+def _check_bounds(
+    rank: int, rho: float, beta: float, learn_alpha: bool, joint: bool
+) -> None:
+    """Raise ValueError for a rank or bounds that no such model has."""
+    if rank < 2 or rank % 2:
+        raise ValueError(f"model.rank must be even and at least 2, got {rank}")
+    if min(rho, beta) <= 0.0 or max(rho, beta) >= 1.0:
+        raise ValueError(
+            f"model.rho and model.beta must lie in (0, 1), got {rho} and {beta}"
         )
+    if learn_alpha and not joint:
+        raise ValueError(
+            "model.learn_alpha needs model.residual=sandwich and model.budget=joint"
+        )
+    if learn_alpha and rho + beta <= LOWEST_RATE:
+        raise ValueError(
+            "model.learn_alpha needs model.rho + model.beta above "
+            f"{LOWEST_RATE}, got {rho + beta}"
+        )
+
+
+def rotate_planes(
+    tangents: Float[Array, " plane"], z: Float[Array, " rank"]
+) -> Float[Array, " rank"]:
+    """Return Q z, where Q rotates plane i = (z_i, z_{i + r/2}) by 2 arctan t_i.
+
+    Q = (I − S)⁻¹(I + S) is the Cayley transform of S = diag(t_i J), J = [[0, −1], [1,
+    0]], in closed form; −t inverts t exactly. It is as general as a full orthogonal
+    Q(e): in the coordinates Q(e)' z the transport is the identity and A(e), B(e) and
+    the networks are conjugated, which a model with free A(e), B(e) represents anyway.
+    What matters is that T(e → e') is an isometry, T(e → e) = I, and a cocycle.
+
+    Args:
+        tangents: t, one entry per plane.
+        z: of even length.
+    """
+    first, second = jnp.split(z, 2)
+    scale = 1.0 / (1.0 + tangents**2)
+    cosine, sine = (1.0 - tangents**2) * scale, 2.0 * tangents * scale
+    return jnp.concatenate(
+        [cosine * first - sine * second, sine * first + cosine * second]
     )

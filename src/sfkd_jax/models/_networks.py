@@ -1,0 +1,269 @@
+"""What models of a latent share: networks with a bound in z, scales and the latent."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from itertools import pairwise
+from typing import NamedTuple
+
+import flax.linen as nn
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+from sfkd_jax.types import BODY, Control, Environment, Pose, Scalar, Space, State
+
+FLOAT32_MARGIN = 1e-5
+"""Relative margin for float32 rounding inside the Gram iteration (measured: 2.2e-6)."""
+GRAM_ITERATIONS = 6
+CAYLEY_RANGE = 8.0
+"""Largest 2-norm of the free matrices; beyond it I + Z is too ill-conditioned for
+orthogonality in float32.
+"""
+SMALL = nn.initializers.variance_scaling(0.1, "fan_in", "truncated_normal")
+"""Initial weights of heads whose output should start close to its bias."""
+FRAMES = ("body", "path")
+
+
+class PosedLatent(NamedTuple):
+    """State of a rollout: z and a pose, in the segment frame that of its start."""
+
+    pose: Pose
+    z: Float[Array, " rank"]
+
+
+class Weights(NamedTuple):
+    """Matrices of W_L σ(… σ(W_1 z + b_1) …) + b_L and the multipliers of its bound.
+
+    Attributes:
+        matrices: W_1 … W_L, each (out, in); () for the function 0.
+        multipliers: λ_1 … λ_{L-1}, one vector per hidden layer; () without a bound.
+    """
+
+    matrices: tuple[Float[Array, "_ _"], ...] = ()
+    multipliers: tuple[Float[Array, " _"], ...] = ()
+
+
+class Biases(NamedTuple):
+    """b_k(u, e) = gain_k(e) u + offset_k(e) for every layer of a network and one e.
+
+    Attributes:
+        gains: (out, control) per layer.
+        offsets: (out,) per layer.
+    """
+
+    gains: tuple[Float[Array, "_ control"], ...] = ()
+    offsets: tuple[Float[Array, " _"], ...] = ()
+
+    def at(self, control: Float[Array, " control"]) -> tuple[Float[Array, " _"], ...]:
+        """Return the biases for one scaled control."""
+        return tuple(
+            gain @ control + offset
+            for gain, offset in zip(self.gains, self.offsets, strict=True)
+        )
+
+
+def apply(
+    matrices: Sequence[Float[Array, "_ _"]],
+    biases: Sequence[Float[Array, " _"]],
+    z: Float[Array, " _"],
+) -> Float[Array, " _"]:
+    """Return W_L tanh(… tanh(W_1 z + b_1) …) + b_L."""
+    for matrix, bias in zip(matrices[:-1], biases[:-1], strict=True):
+        z = jnp.tanh(matrix @ z + bias)
+    return matrices[-1] @ z + biases[-1]
+
+
+class Sandwich(nn.Module):
+    """Weights of a sandwich (LBDN) network, |f(z) − f(z')| ≤ γ |z − z'|.
+
+    The bound holds for any biases and slopes in [0, 1]. With [A_k B_k] the rows of an
+    orthogonal Cayley block, A A' + B B' = I, and Ψ_k = diag(exp ψ_k),
+
+        W_1 = √(2γ) Ψ_1⁻¹ B_1,   W_k = 2 Ψ_k⁻¹ B_k A_{k-1}' Ψ_{k-1},
+        W_L = √(2γ) B_L A_{L-1}' Ψ_{L-1},
+
+    and Λ_k = γ Ψ_k² is the witness of the bound. Source: Wang and Manchester, arXiv
+    2301.11526.
+
+    Attributes:
+        inputs: number of inputs.
+        hidden: widths of the hidden layers, at least one.
+        outputs: number of outputs.
+    """
+
+    inputs: int
+    hidden: Sequence[int]
+    outputs: int
+
+    @nn.compact
+    def __call__(self, bound: Scalar | float) -> Weights:
+        """Return explicit weights for the Lipschitz bound γ."""
+        gamma = jnp.asarray(bound) * (1.0 - FLOAT32_MARGIN)
+        sizes = (self.inputs, *self.hidden, self.outputs)
+        spread = nn.initializers.lecun_normal()
+        matrices, multipliers = [], []
+        left = jnp.sqrt(gamma) * jnp.eye(self.inputs)
+        for k, (before, after) in enumerate(pairwise(sizes)):
+            square = bounded(
+                self.param(f"square_{k}", spread, (after, after)), CAYLEY_RANGE
+            )
+            tall = bounded(
+                self.param(f"tall_{k}", spread, (before, after)), CAYLEY_RANGE
+            )
+            A, B = cayley(square, tall)
+            if k == len(self.hidden):
+                matrices.append(jnp.sqrt(gamma) * B @ left)
+                break
+            psi = self.param(f"psi_{k}", nn.initializers.zeros, (after,))
+            # Beyond e^±5 the multipliers ψ² leave what float32 resolves beside 1.
+            psi = jnp.exp(jnp.clip(psi, -5.0, 5.0))
+            matrices.append(jnp.sqrt(2.0) * (B @ left) / psi[:, None])
+            multipliers.append(gamma * psi**2)
+            left = jnp.sqrt(2.0) * A.T * psi
+        return Weights(tuple(matrices), tuple(multipliers))
+
+
+class Free(nn.Module):
+    """The same network without a bound, an ablation: certified only if it contracts.
+
+    Attributes:
+        inputs: number of inputs.
+        hidden: widths of the hidden layers.
+        outputs: number of outputs.
+    """
+
+    inputs: int
+    hidden: Sequence[int]
+    outputs: int
+
+    @nn.compact
+    def __call__(self, bound: Scalar | float) -> Weights:
+        """Return plain weights; the bound is ignored."""
+        del bound
+        sizes = pairwise((self.inputs, *self.hidden, self.outputs))
+        spread = nn.initializers.lecun_normal()
+        matrices = tuple(
+            self.param(f"kernel_{k}", spread, (after, before))
+            for k, (before, after) in enumerate(sizes)
+        )
+        return Weights(matrices, ())
+
+
+class Encoder(nn.Module):
+    """φ(s, ψ(e)) = W_0 s + W_2 tanh(W_1 [s; ψ(e)] + b_1) + b_2.
+
+    The read-out of s is linear in z: a lift that contains s itself, W_0 s, need not
+    reconstruct it from saturating functions.
+
+    Attributes:
+        rank: r.
+        hidden: width.
+        linear: whether W_0 s is part of the lift.
+    """
+
+    rank: int
+    hidden: int
+    linear: bool = True
+
+    @nn.compact
+    def __call__(
+        self, body: Float[Array, " inputs"], embedding: Float[Array, " embedding"]
+    ) -> Array:
+        """Return z before rotation, shape (rank,)."""
+        hidden = nn.tanh(nn.Dense(self.hidden)(jnp.concatenate([body, embedding])))
+        z = nn.Dense(self.rank)(hidden)
+        return z + nn.Dense(self.rank, use_bias=False)(body) if self.linear else z
+
+
+def gram_bound(
+    matrix: Float[Array, "rows columns"], *, iterations: int = GRAM_ITERATIONS
+) -> Scalar:
+    """Return an upper bound on ||M||_2, too large by a factor r^(1/2^(k+1)) at most.
+
+    Gram iteration: G_0 = M, G_{k+1} = G_k' G_k rescaled to unit Frobenius norm; ||M||_2
+    ≤ ||G_k||_F^(1/2^k), scales undone. It needs no singular vectors, so the gradient is
+    finite at repeated singular values. Source: Delattre et al., arXiv 2305.16173.
+
+    Args:
+        matrix: any shape.
+        iterations: k.
+    """
+    scale = _frobenius(matrix)
+    gram = matrix / scale
+    log_norm = jnp.log(scale)
+    power = 1.0
+    for _ in range(iterations):
+        gram = gram.T @ gram
+        power /= 2.0
+        scale = _frobenius(gram)
+        gram = gram / scale
+        log_norm = log_norm + power * jnp.log(scale)
+    return jnp.exp(log_norm)
+
+
+def bounded(
+    matrix: Float[Array, "rows columns"], bound: float
+) -> Float[Array, "rows columns"]:
+    """Return M · ρ / max(ρ, gram(M)(1 + margin)), whose 2-norm is at most ρ.
+
+    A matrix with a Gram bound below ρ is returned as it is, up to the margin.
+    """
+    norm = gram_bound(matrix) * (1.0 + FLOAT32_MARGIN)
+    return matrix * (bound * (1.0 - FLOAT32_MARGIN) / jnp.maximum(bound, norm))
+
+
+def _frobenius(matrix: Float[Array, "rows columns"]) -> Scalar:
+    """||M||_F, away from zero so that its logarithm and gradient exist."""
+    return jnp.sqrt(jnp.sum(matrix**2) + 1e-24)
+
+
+def cayley(
+    square: Float[Array, "out out"], tall: Float[Array, "inputs out"]
+) -> tuple[Float[Array, "out out"], Float[Array, "out inputs"]]:
+    """Return A, B with A A' + B B' = I from free matrices X (square) and Y (tall).
+
+    Z = X − X' + Y'Y,   A' = (I − Z)(I + Z)⁻¹,   B' = −2 Y (I + Z)⁻¹
+    """
+    identity = jnp.eye(square.shape[0])
+    Z = square - square.T + tall.T @ tall
+    inverse = jnp.linalg.inv(identity + Z)
+    return ((identity - Z) @ inverse).T, (-2.0 * tall @ inverse).T
+
+
+def has_pose(frame: str) -> bool:
+    """Whether a model in this frame predicts a pose; path coordinates have none.
+
+    Raises:
+        ValueError: an unknown frame.
+    """
+    if frame not in FRAMES:
+        raise ValueError(
+            f"model.frame must be one of {', '.join(FRAMES)}, got {frame!r}"
+        )
+    return frame == "body"
+
+
+def scaled_body(space: Space, state: State) -> Float[Array, " body"]:
+    """Return the body state in scaled units.
+
+    Raises:
+        ValueError: the state has the wrong length.
+    """
+    size = 3 + space.body_mean.shape[0]
+    if state.shape != (size,):
+        raise ValueError(f"state must have shape ({size},), got {state.shape}")
+    return (state[BODY] - space.body_mean) / space.body_scale
+
+
+def scaled_control(space: Space, control: Control) -> Control:
+    """Return the control in scaled units."""
+    return (control - space.control_mean) / space.control_scale
+
+
+def scaled_env(space: Space, env: Environment, environment: bool) -> Environment:
+    """Return (e − centre) / half width, or zeros for a model that ignores e.
+
+    Inside the box E every entry lies in [-1, 1].
+    """
+    scaled = (env - space.env_mean) / space.env_scale
+    return scaled if environment else jnp.zeros_like(scaled)

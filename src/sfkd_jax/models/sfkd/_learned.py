@@ -1,0 +1,209 @@
+"""Everything that SFKD learns besides its encoder, as one flax module."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import flax.linen as nn
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+from sfkd_jax.models._networks import SMALL, Biases, Sandwich, Weights, bounded
+from sfkd_jax.models.sfkd._residual import Residual, separate_budget, share_budget
+from sfkd_jax.types import Scalar
+
+LOWEST_RATE = 0.5
+"""Smallest learned α: no car converges to its path faster than that in 0.1 s."""
+ALPHA_START = 2.0
+"""Initial logit of a learned α: 88 % of the way from the smallest to the largest."""
+
+
+class Shared(NamedTuple):
+    """Weights that do not depend on e: vertices, the bounded networks, the read-out."""
+
+    vertices: Float[Array, "vertex rank rank"]
+    residual: Weights
+    decoder: Weights
+    forcing: tuple[Float[Array, "_ _"], ...]
+    readout: Float[Array, "body rank"]
+    centre: Float[Array, " body"]
+
+
+class PerEnvironment(NamedTuple):
+    """Functions of e: mixture of the vertices, B(e), biases, rotation, embedding."""
+
+    mixture: Float[Array, " vertex"]
+    B: Float[Array, "rank control"]
+    residual: Biases
+    decoder: Biases
+    forcing: Biases
+    tangents: Float[Array, " plane"]
+    embedding: Float[Array, " embedding"]
+
+
+class Learned(nn.Module):
+    """Embedding ψ(e), operators, residual, decoder and transport: all but the encoder.
+
+    Attributes:
+        rank: r, even.
+        body: size of s.
+        control: size of u.
+        vertices: number of operator vertices.
+        residual_hidden: hidden widths of the residual.
+        decoder_hidden: hidden widths of the decoder.
+        embedding: size of ψ(e).
+        rho: ρ.
+        beta: β.
+        kind: of the residual.
+        joint: whether operators and residual are bounded as one map by α = ρ + β;
+            otherwise A(e) is bounded by ρ and the residual by β.
+        transport: whether Q(e) is learned.
+        pose: whether there is a decoder of the pose.
+        learn_alpha: whether a joint budget may choose α below ρ + β.
+        forcing_hidden: width of f(u, e), which is added to B(e) u; 0 for none.
+    """
+
+    rank: int
+    body: int
+    control: int
+    vertices: int
+    residual_hidden: Sequence[int]
+    decoder_hidden: Sequence[int]
+    embedding: int
+    rho: float
+    beta: float
+    kind: Residual
+    joint: bool
+    transport: bool
+    pose: bool
+    learn_alpha: bool
+    forcing_hidden: int
+
+    def setup(self) -> None:
+        """Declare submodules and parameters; stored policies have these names."""
+        layers = (nn.Dense(64), nn.Dense(64), nn.Dense(self.embedding))
+        self.psi = nn.Sequential(
+            [part for layer in layers for part in (layer, nn.tanh)]
+        )
+        self.mixture_head = nn.Dense(self.vertices, kernel_init=SMALL)
+        self.input_head = nn.Dense(self.rank * self.control)
+        self.tangent_head = nn.Dense(self.rank // 2, kernel_init=SMALL)
+        if self.kind.network is not None:
+            self.residual_weights = self.kind.network(
+                self.rank, self.residual_hidden, self.rank
+            )
+            self.residual_head = nn.Dense(
+                self._bias_size(self.residual_hidden, self.rank), kernel_init=SMALL
+            )
+        if self.pose:
+            self.decoder_weights = Sandwich(self.rank, self.decoder_hidden, 3)
+            self.decoder_head = nn.Dense(self._bias_size(self.decoder_hidden, 3))
+            self.log_decoder_bound = self.param(
+                "log_decoder_bound", nn.initializers.constant(1.0), ()
+            )
+        if self.forcing_hidden:
+            self.forcing_head = nn.Dense(self.forcing_hidden * (self.control + 1))
+            self.forcing_weights = self.param(
+                "forcing", nn.initializers.zeros, (self.rank, self.forcing_hidden)
+            )
+        # Flax numbers the keys of `param` by call: another order draws other weights.
+        square = (self.rank, self.rank)
+        self.operators = self.param(
+            "operators", _near_identity, (self.vertices, *square)
+        )
+        self.readout = self.param(
+            "readout", nn.initializers.orthogonal(), (self.body, self.rank)
+        )
+        self.centre = self.param("centre", nn.initializers.zeros, (self.body,))
+        if self.joint:
+            self.couplings = self.param("couplings", _couplings, (2, *square))
+        if self.joint and self.learn_alpha:
+            self.alpha_logit = self.param(
+                "alpha_logit", nn.initializers.constant(ALPHA_START), ()
+            )
+
+    def rate(self) -> Scalar:
+        """Return α = ρ + β, or less if it is learned."""
+        most = jnp.asarray(self.rho + self.beta)
+        if not (self.joint and self.learn_alpha):
+            return most
+        return LOWEST_RATE + (most - LOWEST_RATE) * nn.sigmoid(self.alpha_logit)
+
+    def __call__(self, env: Array) -> tuple[Shared, PerEnvironment]:
+        """Evaluate every part once, so that init creates all parameters."""
+        return self.shared(), self.per_environment(env)
+
+    def shared(self) -> Shared:
+        """Return the weights that do not depend on e, with every bound enforced."""
+        if self.joint:
+            vertices, residual = share_budget(
+                self.operators, self.couplings, self.residual_weights(1.0), self.rate()
+            )
+        else:
+            vertices, residual = separate_budget(self.operators, self.rho), Weights()
+            if self.kind.network is not None:
+                residual = self.residual_weights(self.beta)
+        decoder = Weights()
+        if self.pose:
+            decoder = self.decoder_weights(jnp.exp(self.log_decoder_bound))
+        return Shared(
+            vertices,
+            residual,
+            decoder,
+            forcing=(self.forcing_weights,) if self.forcing_hidden else (),
+            readout=bounded(self.readout, 1.0),
+            centre=self.centre,
+        )
+
+    def per_environment(self, env: Float[Array, " environment"]) -> PerEnvironment:
+        """Return the functions of e; `env` is scaled to about [-1, 1]."""
+        embedding = self.psi(env)
+        residual = decoder = forcing = Biases()
+        if self.kind.network is not None:
+            flat = self.residual_head(embedding)
+            residual = self._biases(flat, (*self.residual_hidden, self.rank))
+        if self.pose:
+            decoder = self._biases(
+                self.decoder_head(embedding), (*self.decoder_hidden, 3)
+            )
+        if self.forcing_hidden:
+            forcing = self._biases(self.forcing_head(embedding), (self.forcing_hidden,))
+        tangents = self.tangent_head(embedding)
+        return PerEnvironment(
+            mixture=nn.softmax(self.mixture_head(embedding)),
+            B=self.input_head(embedding).reshape(self.rank, self.control),
+            residual=residual,
+            decoder=decoder,
+            forcing=forcing,
+            tangents=tangents if self.transport else jnp.zeros_like(tangents),
+            embedding=embedding,
+        )
+
+    def _bias_size(self, hidden: Sequence[int], outputs: int) -> int:
+        return (sum(hidden) + outputs) * (self.control + 1)
+
+    def _biases(self, flat: Array, widths: Sequence[int]) -> Biases:
+        """Cut one flat vector into gains and offsets per layer."""
+        table = flat.reshape(sum(widths), self.control + 1)
+        edges = [sum(widths[: k + 1]) for k in range(len(widths) - 1)]
+        parts = jnp.split(table, edges)
+        return Biases(
+            tuple(part[:, :-1] for part in parts), tuple(part[:, -1] for part in parts)
+        )
+
+
+def _couplings(
+    key: Array, shape: tuple[int, ...], dtype: jnp.dtype = jnp.float32
+) -> Array:
+    """Initial couplings of norm 0.3: the initial gain of the residual is about 0.1."""
+    return jax.random.normal(key, shape, dtype) * (0.15 / shape[-1] ** 0.5)
+
+
+def _near_identity(
+    key: Array, shape: tuple[int, ...], dtype: jnp.dtype = jnp.float32
+) -> Array:
+    """Initial operators: I plus a little noise, which is slow dynamics."""
+    noise = jax.random.normal(key, shape, dtype) * (0.1 / shape[-1] ** 0.5)
+    return jnp.eye(shape[-1], dtype=dtype) + noise

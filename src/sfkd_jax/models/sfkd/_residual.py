@@ -1,0 +1,102 @@
+"""The residual of SFKD and the bound of a step: all that depends on its kind.
+
+A new kind is an entry of `RESIDUALS`: a flax module called like `Sandwich`. What it
+returns is W_L σ(… W_1 z + b_1(u, e) …) + b_L(u, e), because `Explicit` can state, and
+the trusted core check, no other form. A residual for planning alone, which no
+certificate is about, would be added in `_model.Sfkd.step` and left out of `explicit`.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import NamedTuple, Protocol
+
+import flax.linen as nn
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+from sfkd_jax.models._networks import Free, Sandwich, Weights, bounded
+from sfkd_jax.types import Scalar
+
+LARGEST_COUPLING = 0.999
+"""Bound of ||G||_2 and ||H||_2, so that I − G G' and I − H'H have a Cholesky factor in
+float32.
+"""
+BUDGETS = ("joint", "sum")
+
+
+class Network(Protocol):
+    """A flax module: called with a Lipschitz bound, it returns `Weights`."""
+
+    def __call__(
+        self, inputs: int, hidden: Sequence[int], outputs: int
+    ) -> nn.Module: ...
+
+
+class Residual(NamedTuple):
+    """A kind of residual r(z; u, e).
+
+    Attributes:
+        network: makes its weights for a Lipschitz bound; None: there is no residual.
+        bounded: whether a step contracts by construction. If not, a certificate exists
+            only if its search finds one.
+    """
+
+    network: Network | None
+    bounded: bool
+
+    def shares_budget(self, budget: str) -> bool:
+        """Whether operators and residual are bounded as one map."""
+        return budget == "joint" and self.bounded and self.network is not None
+
+
+RESIDUALS = {
+    "sandwich": Residual(Sandwich, bounded=True),
+    "free": Residual(Free, bounded=False),
+    "none": Residual(None, bounded=True),
+}
+
+
+def separate_budget(
+    operators: Float[Array, "vertex rank rank"], rho: float
+) -> Float[Array, "vertex rank rank"]:
+    """Return A_j with ||A_j||_2 ≤ ρ, whatever the residual is."""
+    return jax.vmap(lambda matrix: bounded(matrix, rho))(operators)
+
+
+def share_budget(
+    operators: Float[Array, "vertex rank rank"],
+    couplings: Float[Array, "2 rank rank"],
+    network: Weights,
+    alpha: float | Scalar,
+) -> tuple[Float[Array, "vertex rank rank"], Weights]:
+    """Return operators and a residual such that A_j z + G φ(α H z) is α-Lipschitz.
+
+        A_j = α L M_j R',   L L' = I − G G',   R R' = I − H'H,
+        ||M_j||_2, ||G||_2, ||H||_2 ≤ 1,   φ 1-Lipschitz
+
+    This is Parrott's parametrisation of all matrices [[A_j/α, G], [H, 0]] with norm at
+    most 1; hence |A dz + G dw|² + |α H dz|² ≤ α²|dz|² + |dw|², and |dw| ≤ |α H dz|.
+    Where the residual does not use a direction, the operator has the whole of α: ||A||
+    + Lip r may exceed 1, but their sum as one map cannot. By convexity the same holds
+    for every mixture of the A_j. The multipliers of φ are a witness of the joint bound.
+
+    Args:
+        operators: M_j before bounding.
+        couplings: (G, H) before bounding.
+        network: φ, bounded by 1.
+        alpha: α in (0, 1).
+
+    Returns:
+        A_j, and the residual with G and α H folded into its last and first weights.
+    """
+    out, into = (bounded(matrix, LARGEST_COUPLING) for matrix in couplings)
+    identity = jnp.eye(out.shape[0])
+    left = jnp.linalg.cholesky(identity - out @ out.T)
+    right = jnp.linalg.cholesky(identity - into.T @ into)
+    vertices = alpha * left @ separate_budget(operators, 1.0) @ right.T
+    first, *middle, last = network.matrices
+    return vertices, Weights(
+        (alpha * first @ into, *middle, out @ last), network.multipliers
+    )
