@@ -168,13 +168,10 @@ class Fitting(NamedTuple):
 
     Attributes:
         identify: (training, validation data, key) -> params by regression, or None.
-        start: (params, training data, key) -> params to train from, their linear part
-            by regression, or None.
         penalty: (fiber, latent, control) -> extra term of the training loss, or None.
     """
 
     identify: Callable[[Trajectory, Trajectory, Key], Params] | None = None
-    start: Callable[[Params, Trajectory, Key], Params] | None = None
     penalty: Callable[[Fiber, Latent, Control], Scalar] | None = None
 
 

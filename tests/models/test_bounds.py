@@ -19,7 +19,7 @@ from helpers import (
 
 from sfkd_jax import models
 from sfkd_jax.certification import lipschitz_upper
-from sfkd_jax.models.sfkd import Sandwich, bounded, cayley, gram_bound
+from sfkd_jax.models._networks import Sandwich, bounded, cayley, gram_bound
 from sfkd_jax.rollout import fold
 
 RHO, BETA = 0.895, 0.1
@@ -144,7 +144,7 @@ def test_opposed_operators_mix_within_the_bound(seed):
     free = np.random.default_rng(seed).standard_normal((3, 8, 8)).astype(np.float32)
     params = params | {
         "networks": params["networks"]
-        | {"operators": 50.0 * np.stack([free[0], -free[0], free[1]])}
+        | {"operators": 50.0 * jnp.stack([free[0], -free[0], free[1]])}
     }
     norms = spectral(
         jit(jax.vmap(lambda env: model.fiber(fold(model, params), env).A))(
@@ -341,7 +341,7 @@ def test_the_budget_is_the_callers():
     shapes = jax.eval_shape(model.init, jax.random.key(0))
     random = np.random.default_rng(0)
     params = jax.tree.map(
-        lambda leaf: 3.0 * random.standard_normal(leaf.shape).astype(np.float32), shapes
+        lambda leaf: jnp.float32(3.0 * random.standard_normal(leaf.shape)), shapes
     )
     weights = jax.tree.map(
         lambda leaf: np.asarray(leaf, dtype=np.float64),

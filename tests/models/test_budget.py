@@ -8,8 +8,8 @@ import pytest
 from helpers import certified, explicit, space
 
 from sfkd_jax import models
-from sfkd_jax.models.sfkd import share_budget
-from sfkd_jax.models.sfkd._sandwich import Weights
+from sfkd_jax.models._networks import Weights
+from sfkd_jax.models.sfkd._residual import share_budget
 
 ALPHA, RANK = 0.9, 6
 IDENTITY = Weights((jnp.eye(RANK), jnp.eye(RANK)), (jnp.ones(RANK),))

@@ -174,7 +174,6 @@ def test_gradients_of_a_rollout_are_finite_and_reach_every_parameter_in_use(name
     unused = {name for name, gradient in flat.items() if not np.any(gradient)}
     allowed = {
         "no_transport": ("tangent_head",),
-        "no_residual": ("residual",),
         "no_fiber": ("psi/layers_0/kernel",),  # which reads e
         "control_synth": ("free/Y",),  # Y − Y' of a single body state is 0
     }
@@ -183,8 +182,6 @@ def test_gradients_of_a_rollout_are_finite_and_reach_every_parameter_in_use(name
         for path in unused
         if not any(part in path for part in allowed.get(name, ()))
     }
-    if name == "no_residual":
-        assert unused
 
 
 @pytest.mark.parametrize("name", EVERY)
@@ -224,8 +221,8 @@ def test_what_is_certified_is_what_is_multiplied_by(name, one):
         )
     )(params)
     assert explicit.operators.vertices.shape == (TINY["vertices"], 8, 8)
-    if name != "no_residual":
-        assert same(explicit.residual, fiber.residual, rtol=0, atol=0)
+    assert same(explicit.residual, fiber.residual, rtol=0, atol=0)
+    assert bool(explicit.residual) == (name != "no_residual")
     assert same(explicit.decoder[:-1], fiber.decoder[:-1], rtol=0, atol=0)
     assert bool(explicit.decoder) == (not model.along_path)
     if explicit.decoder:

@@ -11,9 +11,7 @@ from helpers import at, dataset, jit, same, space
 from sfkd_jax import data as datasets
 from sfkd_jax import models
 from sfkd_jax.geometry import between, compose
-from sfkd_jax.models._edmd import along_circle, thin_plate
-from sfkd_jax.models._identification import ridge_regression
-from sfkd_jax.models._koopman_lift import Lift
+from sfkd_jax.models._edmd import Lift, along_circle, ridge_regression, thin_plate
 from sfkd_jax.rollout import defects, rollout
 from sfkd_jax.types import POSE, Trajectory
 
@@ -176,6 +174,30 @@ def test_a_plant_that_is_linear_in_the_lift_is_predicted_exactly():
     fitted = ridge_regression(seen, seen @ weights, jnp.asarray([1e-10]))[0]
     np.testing.assert_allclose(fresh @ fitted, fresh @ weights, atol=2e-3)
     assert float(jnp.std(fresh @ weights)) > 1
+
+
+def test_ridge_regression_minimises_its_objective():
+    random = np.random.default_rng(0)
+    X = random.standard_normal((200, 6)) * np.float64([1, 10, 0.1, 1, 1, 0])
+    Y, ridges = random.standard_normal((200, 3)), np.float32([1e-6, 0.1])
+    fits = ridge_regression(
+        jnp.asarray(X, jnp.float32), jnp.asarray(Y, jnp.float32), jnp.asarray(ridges)
+    )
+    D = np.sqrt(np.mean(X**2, axis=0)) + np.float64([0, 0, 0, 0, 0, 1])
+    for ridge, W in zip(ridges, fits, strict=True):
+        expected = np.linalg.solve(X.T @ X + ridge * 200 * np.diag(D**2), X.T @ Y)
+        np.testing.assert_allclose(W, expected, rtol=1e-4, atol=1e-5)
+
+
+def test_regression_survives_columns_that_normal_equations_do_not():
+    """Nearly parallel columns: in float32, X'X is singular."""
+    random = np.random.default_rng(1)
+    base = random.standard_normal(1000)
+    X = np.stack([base, base + 3e-4 * random.standard_normal(1000)], axis=1)
+    fits = ridge_regression(
+        *(jnp.asarray(part, jnp.float32) for part in (X, X @ np.ones((2, 1)), [1e-12]))
+    )
+    np.testing.assert_allclose(fits[0, :, 0], [1.0, 1.0], atol=1e-2)
 
 
 @cache

@@ -7,7 +7,7 @@ import pytest
 from helpers import ENV_HIGH, ENV_LOW, at, driven, jit, same, space
 
 from sfkd_jax import certification, models
-from sfkd_jax.models._r2dn_weights import contracting
+from sfkd_jax.models._r2dn import contracting
 
 ALPHA, RANK = 0.97, 6
 SETTINGS = {

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from helpers import ENV_HIGH, ENV_LOW, jit, model_and_params
 
-from sfkd_jax.models.sfkd import rotate_planes
+from sfkd_jax.models.sfkd._model import rotate_planes
 
 RANDOM = np.random.default_rng(0)
 ENVS = RANDOM.uniform(ENV_LOW, ENV_HIGH, (60, 3, 2)).astype(np.float32)

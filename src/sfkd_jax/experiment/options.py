@@ -126,14 +126,12 @@ class TrainingSettings(Kinds):
         batch: windows a step.
         window: steps of a window.
         data_share: part of the training trajectories that is used.
-        start: initial weights, "random" or "identified".
         loss: weights of `training.multi_step_loss`.
     """
 
     batch: int = 128
     window: int = 20
     data_share: PositiveFraction = 1.0
-    start: str = "random"
     steps: int = 4000
     loss: Any = None
 

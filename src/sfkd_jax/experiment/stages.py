@@ -44,11 +44,8 @@ from sfkd_jax.settings import arguments, choose, plain
 from sfkd_jax.training import fit, multi_step_loss
 from sfkd_jax.types import Key, Model, Params, Space, Trajectory
 
-STARTS = ("random", "identified")
 SCORED_SCENARIOS = ("s1", "s2")
 """Of the validation runs that trainings are compared on: S3 stays unseen."""
-START = 1
-"""Stream folded into the run's seed; initial weights and windows use stream 0."""
 INCREMENTAL = "incremental.json"
 """File for the rate of a continuous flow, which has no tubes and no monitor bounds."""
 
@@ -169,8 +166,7 @@ def _train(settings: Settings, dataset: Dataset, data_hash: str) -> None:
         store.print_message(
             f"training {settings.model.system}, {options.steps} steps, in {run_dir}"
         )
-        started = with_start(model, options.start, dataset.train, settings.seed)
-        params, best = _fit(options, started, space, dataset, key, run_dir)
+        params, best = _fit(options, model, space, dataset, key, run_dir)
     document = _open_loop_document(model, params, source, dataset, horizon)
     document["validation_score"] = _validation_score(
         model, params, space, dataset, horizon
@@ -209,33 +205,6 @@ def _fit(
         inspect=partial(contraction_metrics, model),
         **arguments(options, fit),
     )
-
-
-def with_start(model: Model, start: str, train: Trajectory, seed: int) -> Model:
-    """Return the model with the initial weights of `training.start`.
-
-    Args:
-        model: to train.
-        start: "random", or "identified" for a linear part obtained by regression.
-        train: data of the regression.
-        seed: of the run.
-
-    Raises:
-        ValueError: an unknown start, or one that this model does not have.
-    """
-    if start not in STARTS:
-        raise ValueError(
-            f"training.start must be one of {', '.join(STARTS)}, got {start!r}"
-        )
-    if start == "random":
-        return model
-    if (regress := model.fitting.start) is None:
-        raise ValueError(
-            "training.start=identified needs a model=sfkd…, "
-            "whose linear part can be identified"
-        )
-    key = jax.random.fold_in(jax.random.key(seed), START)
-    return model._replace(init=lambda drawn: regress(model.init(drawn), train, key))
 
 
 def _open_loop_document(
