@@ -18,7 +18,7 @@ from sfkd_jax import store
 from sfkd_jax.data import measure_space, random_windows, spread_windows
 from sfkd_jax.models import sfkd
 from sfkd_jax.training import Checkpoints, fit, multi_step_loss
-from sfkd_jax.training._log import TrainingLog
+from sfkd_jax.training._loop import open_log
 
 WORKER = """
 import os, sys
@@ -144,8 +144,7 @@ def test_a_damaged_line_is_reported_with_its_number_and_the_others_stay(
         for step in (10, 20, 30, 40)
     ]
     log.write_bytes(whole[0] + DAMAGE[damage](whole[1]) + whole[2] + whole[3])
-    with TrainingLog(tmp_path, steps=40, resumed_at=30):
-        pass
+    open_log(log, resumed_at=30)
     assert log.read_bytes() == whole[0] + whole[2]
     (line,) = capfd.readouterr().err.splitlines()
     assert line.startswith(f"{log}: line 2 ")
@@ -160,6 +159,6 @@ def test_a_log_that_cannot_be_rewritten_stays_and_is_one_line(tmp_path):
         largest_file(5),
         pytest.raises(store.ArtefactError, match="File too large"),
     ):
-        TrainingLog(tmp_path, steps=40, resumed_at=30)
+        open_log(log, resumed_at=30)
     assert log.read_text() == text
     assert os.listdir(tmp_path) == ["metrics.jsonl"]

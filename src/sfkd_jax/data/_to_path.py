@@ -7,7 +7,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from sfkd_jax.geometry import PathFeedback, is_valid, path_state, wrap_angle
-from sfkd_jax.scenarios import Path, pace_at, path_through, point_at, project
+from sfkd_jax.scenarios import Path, path_through, point_at, project
 from sfkd_jax.types import BODY, Scalar, State, Trajectory
 
 TIGHTEST = 0.2
@@ -28,10 +28,9 @@ def to_path(
             environments.
         path: that the drive followed.
         law: (ξ, κ, v_ref, e) -> u, not clipped.
-        speeds: v_ref [m/s], (T,), where the path's pace is 1.
+        speeds: v_ref [m/s], (T,).
     """
     progress, laterals = _feet(path, driven.states)
-    speeds = speeds * pace_at(path, progress[:-1])
     points = jax.vmap(point_at, in_axes=(None, 0))(path, progress)
     headings = wrap_angle(driven.states[:, 2] - points[:, 2])
     coordinates = jnp.column_stack([laterals, headings, driven.states[:, BODY]])

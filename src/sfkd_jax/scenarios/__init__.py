@@ -1,4 +1,4 @@
-"""Driving scenarios: paths, environment schedules, S1 to S3, and manoeuvres."""
+"""Driving scenarios: paths, environment schedules, S1 to S3."""
 
 from sfkd_jax.scenarios._conditions import gusts as gusts
 from sfkd_jax.scenarios._conditions import held_road as held_road
@@ -8,18 +8,16 @@ from sfkd_jax.scenarios._conditions import steady_road as steady_road
 from sfkd_jax.scenarios._conditions import switching_road as switching_road
 from sfkd_jax.scenarios._conditions import uniform_road as uniform_road
 from sfkd_jax.scenarios._conditions import wet_road as wet_road
-from sfkd_jax.scenarios._manoeuvres import MANOEUVRES as MANOEUVRES
-from sfkd_jax.scenarios._manoeuvres import Manoeuvre as Manoeuvre
 from sfkd_jax.scenarios._paths import Path as Path
-from sfkd_jax.scenarios._paths import pace_at as pace_at
 from sfkd_jax.scenarios._paths import path_from_curvature as path_from_curvature
 from sfkd_jax.scenarios._paths import path_through as path_through
 from sfkd_jax.scenarios._paths import point_at as point_at
 from sfkd_jax.scenarios._paths import project as project
 from sfkd_jax.scenarios._paths import reference_window as reference_window
 from sfkd_jax.scenarios._paths import smooth_path as smooth_path
-from sfkd_jax.scenarios._scenarios import FAMILIES as FAMILIES
+from sfkd_jax.scenarios._scenarios import ROADS as ROADS
 from sfkd_jax.scenarios._scenarios import Family as Family
+from sfkd_jax.scenarios._scenarios import Road as Road
 from sfkd_jax.scenarios._scenarios import Scenario as Scenario
 from sfkd_jax.scenarios._scenarios import family as family
 from sfkd_jax.scenarios._scenarios import scenario as scenario

@@ -16,6 +16,14 @@ RUN_UP = 20.0
 """Over which the curvature of a path is blended in [m]."""
 
 
+LANE = 3.5
+"""Offset of a lane change [m]."""
+SECTIONS = (30.0, 25.0, 25.0)
+"""Lengths of the change, the other lane and the change back [m], as in ISO 3888-1."""
+PERIOD = 150.0
+"""From one lane change to the next [m]."""
+
+
 class Path(NamedTuple):
     """A path sampled at equal arc length.
 
@@ -23,13 +31,10 @@ class Path(NamedTuple):
         points: x [m], y [m], yaw [rad], curvature [1/m] at s = 0, h, 2h, …, shape
             (point, 4).
         spacing: h [m].
-        pace: share of the scenario's speed to hold at each point, (point,); None to
-            hold all of it.
     """
 
     points: Float[Array, "point 4"]
     spacing: Scalar
-    pace: Float[Array, " point"] | None = None
 
 
 def smooth_path(
@@ -64,17 +69,35 @@ def smooth_path(
     )
     phases = jax.random.uniform(phase_key, (3, 1), maxval=2 * jnp.pi)
     curvature = jnp.sum(amplitudes * jnp.sin(2 * jnp.pi * s / waves + phases), axis=0)
-    curvature = blended_in(curvature, s, run_up)
+    blend = jnp.clip(s / run_up, 0.0, 1.0)
+    curvature = curvature * blend**2 * (3.0 - 2.0 * blend)
     curvature = curvature * peak_curvature / jnp.max(jnp.abs(curvature))
     return path_from_curvature(curvature, spacing=spacing)
 
 
-def blended_in(
-    curvature: Float[Array, "*point"], s: Float[Array, " point"], run_up: float = RUN_UP
-) -> Float[Array, " point"]:
-    """Return a curvature that rises smoothly from 0 at s = 0 within the run-up [m]."""
-    blend = jnp.clip(s / run_up, 0.0, 1.0)
-    return curvature * blend**2 * (3.0 - 2.0 * blend)
+def double_lane_change(key: Key, length: float) -> Path:
+    """Change to the lane at a random side and back, once a period (ISO 3888-1).
+
+    The heading of a change over ℓ is θ sin²(π s/ℓ), whose offset is close to θ ℓ / 2.
+
+    Args:
+        key: consumed.
+        length: smallest length [m].
+    """
+    first, middle, last = SECTIONS
+    start_key, side_key = jax.random.split(key)
+    start = jax.random.uniform(start_key, (), minval=20.0, maxval=50.0)
+    s = jnp.arange(int(length / SPACING) + 2) * SPACING - start
+    s = jnp.where(s > 0, s % PERIOD, s)  # straight until the first change
+
+    def change(begin: float, over: float, towards: float) -> Float[Array, " point"]:
+        share = jnp.clip((s - begin) / over, 0.0, 1.0)
+        largest = 2.0 * LANE / over
+        return towards * largest * jnp.pi / over * jnp.sin(2.0 * jnp.pi * share)
+
+    curvature = change(0.0, first, 1.0) + change(first + middle, last, -1.0)
+    side = jax.random.rademacher(side_key, (), dtype=float)
+    return path_from_curvature(side * curvature, spacing=SPACING)
 
 
 def path_from_curvature(curvature: Float[Array, " point"], *, spacing: float) -> Path:
@@ -158,26 +181,10 @@ def project(
 def reference_window(
     path: Path, s: Scalar, speed: Scalar, *, dt: float, horizon: int
 ) -> Reference:
-    """Return the next points at the path's pace: x, y, yaw, speed, (horizon, 4)."""
-    if path.pace is None:
-        ahead = s + speed * dt * jnp.arange(1, horizon + 1)
-    else:
-
-        def advance(s: Scalar, _: None) -> tuple[Scalar, Scalar]:
-            s = s + speed * pace_at(path, s) * dt
-            return s, s
-
-        _, ahead = jax.lax.scan(advance, s, length=horizon)
+    """Return the next points at a constant speed: x, y, yaw, speed, (horizon, 4)."""
+    ahead = s + speed * dt * jnp.arange(1, horizon + 1)
     points = jax.vmap(point_at, in_axes=(None, 0))(path, ahead)
-    return points.at[:, 3].set(speed * pace_at(path, ahead))
-
-
-def pace_at(path: Path, s: Float[Array, "*batch"]) -> Float[Array, "*batch"]:
-    """Return the share of the scenario's speed to hold at arc lengths s [m]."""
-    if path.pace is None:
-        return jnp.ones_like(s)
-    along = jnp.arange(path.pace.shape[0]) * path.spacing
-    return jnp.interp(s, along, path.pace)
+    return points.at[:, 3].set(speed)
 
 
 def _offsets(

@@ -16,8 +16,7 @@ from sfkd_jax.scenarios._conditions import (
     uniform_road,
     wet_road,
 )
-from sfkd_jax.scenarios._manoeuvres import MANOEUVRES, Manoeuvre
-from sfkd_jax.scenarios._paths import Path, smooth_path
+from sfkd_jax.scenarios._paths import Path, double_lane_change, smooth_path
 from sfkd_jax.types import Key, Scalar, State
 
 
@@ -41,22 +40,46 @@ class Scenario(NamedTuple):
 
 Family: TypeAlias = Callable[[Key], Scenario]
 
-FAMILIES: dict[str, Callable[[Key, int, float], Schedule]] = {
-    "s1": lambda key, steps, dt: uniform_road(key, steps=steps),
-    "s2": lambda key, steps, dt: wet_road(key, steps=steps, dt=dt),
-    "s3": lambda key, steps, dt: switching_road(key, steps=steps, dt=dt),
-    "seen": lambda key, steps, dt: steady_road(
-        key, steps=steps, friction=(0.55, 0.9), wind=(0.0, 8.0)
-    ),
-    "interpolated": lambda key, steps, dt: steady_road(
-        key, steps=steps, friction=(0.5, 0.55), wind=(4.0, 8.0)
-    ),
-    "extrapolated": lambda key, steps, dt: steady_road(
-        key, steps=steps, friction=(0.27, 0.3), wind=(8.0, 9.0)
-    ),
+
+class Road(NamedTuple):
+    """What a scenario is by name: an environment, and a path of its own or none.
+
+    Attributes:
+        conditions: (key, steps, sampling period [s]) -> e_0 … e_{T-1}.
+        path: (key, length [m]) -> path from the origin along x; None for `smooth_path`
+            with the curvature and the wavelengths of the settings.
+        outside: whether e may leave the box that models are trained in.
+    """
+
+    conditions: Callable[[Key, int, float], Schedule]
+    path: Callable[[Key, float], Path] | None = None
+    outside: bool = False
+
+
+def _steady(friction: Span, wind: tuple[float, float]) -> Callable[..., Schedule]:
+    """One friction level and one wind for a whole episode."""
+    return lambda key, steps, dt: steady_road(
+        key, steps=steps, friction=friction, wind=wind
+    )
+
+
+ROADS: dict[str, Road] = {
+    "s1": Road(lambda key, steps, dt: uniform_road(key, steps=steps)),
+    "s2": Road(lambda key, steps, dt: wet_road(key, steps=steps, dt=dt)),
+    "s3": Road(lambda key, steps, dt: switching_road(key, steps=steps, dt=dt)),
+    "seen": Road(_steady((0.55, 0.9), (0.0, 8.0))),
+    "interpolated": Road(_steady((0.5, 0.55), (4.0, 8.0))),
+    "extrapolated": Road(_steady((0.27, 0.3), (8.0, 9.0)), outside=True),
+    "double_lane_change": Road(_steady((0.6, 0.9), (0.0, 0.0)), double_lane_change),
 }
-"""Environments of random roads: name -> (key, steps, sampling period [s]) -> e."""
-NAMES = (*FAMILIES, *MANOEUVRES)
+"""Scenarios by name; an entry is all that a new one needs.
+
+"s1" is a uniform road, "s2" a wet road with gusts, "s3" a switching road. Three more
+have one constant pair of friction and wind per episode: "seen" in the range of the
+training data, "interpolated" between friction levels that these have under wind,
+"extrapolated" outside their box. "double_lane_change" has a path of its own, friction
+from wet to dry and no wind.
+"""
 
 
 def scenario(
@@ -69,14 +92,7 @@ def scenario(
     state_size: int,
     dt: float,
 ) -> Family:
-    """Return a family of the benchmark by name.
-
-    "s1" is a uniform road, "s2" a wet road with gusts, "s3" a switching road. Three
-    more have one constant pair of friction and wind per episode: "seen" in the range of
-    the training drives, "interpolated" between friction levels that these have under
-    wind, "extrapolated" outside their box. Manoeuvres have paths of their own:
-    "double_lane_change", "gust_step", "gust_cosine", "friction_step", "braking_turn",
-    and "silverstone", the circuit, with the environment of "s3".
+    """Return a family of the benchmark by name, see `ROADS`.
 
     Args:
         name: of the family.
@@ -91,19 +107,22 @@ def scenario(
     Raises:
         ValueError: unknown name.
     """
-    if name not in NAMES:
-        raise ValueError(f"unknown scenario {name!r}; choose one of {', '.join(NAMES)}")
-    steps, length = round(duration / dt), speed * duration * 1.1 + 50.0
+    if name not in ROADS:
+        raise ValueError(f"unknown scenario {name!r}; choose one of {', '.join(ROADS)}")
+    road, steps = ROADS[name], round(duration / dt)
+    # Longer than the distance by a tenth and a horizon: no plan meets its end.
+    length = speed * duration * 1.1 + 50.0
 
-    def random_road(key: Key, length: float) -> Path:
+    def path(key: Key) -> Path:
+        if road.path is not None:
+            return road.path(key, length)
         return smooth_path(
             key, length=length, peak_curvature=peak_curvature, wavelengths=wavelengths
         )
 
-    chosen = MANOEUVRES.get(name) or Manoeuvre(random_road, FAMILIES[name])
     return family(
-        lambda key: chosen.conditions(key, steps, dt),
-        lambda key: chosen.path(key, length),
+        lambda key: road.conditions(key, steps, dt),
+        path,
         speed=speed,
         state_size=state_size,
     )

@@ -11,7 +11,7 @@ import jax
 import orbax.checkpoint as ocp
 from orbax.checkpoint import checkpoint_managers as managers
 
-from sfkd_jax.training._log import RESUME_HINT
+RESUME_HINT = "the same command goes on from the last checkpoint"
 
 
 class Checkpoints:

@@ -2,10 +2,16 @@
 
 from __future__ import annotations
 
+import json
 import math
+import signal
+import sys
+import threading
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from pathlib import Path
+from types import FrameType
 from typing import Any, NamedTuple, TypeAlias
 
 import jax
@@ -13,14 +19,16 @@ import jax.numpy as jnp
 import optax
 
 from sfkd_jax.ranges import Positive
-from sfkd_jax.training._checkpoints import Checkpoints
-from sfkd_jax.training._interruption import Interrupted, Interruption
-from sfkd_jax.training._log import TrainingLog
+from sfkd_jax.store import truncate_jsonl
+from sfkd_jax.training._checkpoints import RESUME_HINT, Checkpoints
 from sfkd_jax.training._losses import Loss
-from sfkd_jax.training._optimizer import optimizer
 from sfkd_jax.types import Key, Model, Params, Trajectory
 
 Draw: TypeAlias = Callable[[Trajectory, Key], Trajectory]
+WARM_UP = 100
+"""Steps until the largest learning rate, in all but short runs."""
+FINAL_RATE = 0.01
+"""Last learning rate relative to the largest."""
 
 
 class TrainingStopped(RuntimeError):
@@ -53,9 +61,10 @@ def fit(
 ) -> tuple[Params, int]:
     """Train and return the parameters with the lowest validation loss.
 
-    A run that `directory` contains is resumed. Batches depend on the key and the step
-    only, so an interrupted run ends bit-identical to an uninterrupted one. SIGINT or
-    SIGTERM saves the state of the last log line before it raises.
+    Adam with linear warm-up and cosine decay. A run that `directory` contains is
+    resumed. Batches depend on the key and the step only, so an interrupted run ends
+    bit-identical to an uninterrupted one. SIGINT or SIGTERM saves the state after the
+    steps that are being computed and raises; a second one ends the process.
 
     Args:
         model: to be trained. To train on from given parameters, a model whose `init`
@@ -65,10 +74,10 @@ def fit(
         data: the training trajectories.
         held_out: windows of the validation loss.
         key: for the initial parameters and the batches.
-        directory: for checkpoints/, metrics.jsonl, tensorboard/.
+        directory: for checkpoints/ and metrics.jsonl.
         steps: optimiser steps.
-        learning_rate: see `optimizer`.
-        clip_norm: see `optimizer`.
+        learning_rate: the largest.
+        clip_norm: largest global gradient norm.
         log_every: steps per compiled chunk and per log line.
         save_every: steps per checkpoint, a multiple of `log_every`.
         inspect: params -> more finite numbers to log at every checkpoint, by name (what
@@ -88,87 +97,66 @@ def fit(
             f"log_every = {log_every}"
         )
     init_key, data_key = jax.random.split(key)
-    transform, schedule = optimizer(
-        steps=steps, learning_rate=learning_rate, clip_norm=clip_norm
-    )
+    transform, schedule = _optimizer(steps, learning_rate, clip_norm)
     params = jax.jit(model.init)(init_key)
     state = TrainState(jnp.zeros((), jnp.int32), params, transform.init(params))
     checkpoints = Checkpoints(directory / "checkpoints")
     try:
         state = checkpoints.resume(state)
-        start, logged = int(state.step), state
-        with (
-            TrainingLog(directory, steps=steps, resumed_at=start) as log,
-            Interruption() as interruption,
-        ):
-            advance = interruption.compiled(
-                _chunk(loss, transform, draw, length=log_every), state, data, data_key
-            )
-            validate = interruption.compiled(jax.jit(loss), params, held_out)
-            began = time.perf_counter()
+        start = int(state.step)
+        log = open_log(directory / "metrics.jsonl", resumed_at=start)
+        advance = _chunk(loss, transform, draw, length=log_every)
+        validate, began = jax.jit(loss), time.perf_counter()
+        with _requests() as requested:
             for done in range(start + log_every, steps + 1, log_every):
-                state, record = interruption.ready(advance(state, data, data_key))
-                record = {name: float(value) for name, value in record.items()}
-                record |= _progress(done, schedule, began)
+                state, means = advance(state, data, data_key)
+                record = {name: float(value) for name, value in means.items()}
+                record |= {
+                    "step": done,
+                    "learning_rate": float(jnp.asarray(schedule(done))),
+                    "seconds": time.perf_counter() - began,
+                }
                 saves = done % save_every == 0 or done == steps
                 if saves:
-                    total, parts = interruption.ready(validate(state.params, held_out))
-                    record |= {
-                        "validation_loss": float(total),
-                        "validation_prediction": float(parts["prediction"]),
-                    }
+                    total, parts = validate(state.params, held_out)
+                    record["validation_loss"] = float(total)
+                    record["validation_prediction"] = float(parts["prediction"])
                     record |= inspect(state.params) if inspect else {}
                 _require_finite(record, done, checkpoints)
                 # Before the checkpoint: a resumed run can drop lines, but not add them.
-                log.write(record)
-                logged = state
-                if saves:
-                    checkpoints.save(
-                        done, state, validation_loss=record["validation_loss"]
-                    )
+                append(log, record, steps=steps)
+                # A state between two checkpoints is saved to resume from, but never
+                # selected as the best: an uninterrupted run does not have it.
+                score = record["validation_loss"] if saves else math.inf
+                if saves or requested:
+                    checkpoints.save(done, state, validation_loss=score)
+                if requested:
+                    raise KeyboardInterrupt
         best = checkpoints.best_step() or steps
         return checkpoints.restore(best, state).params, best
-    except Interrupted:
-        # Never selected as the best: an uninterrupted run does not have this state.
-        if int(logged.step) > start:
-            checkpoints.save(int(logged.step), logged, validation_loss=math.inf)
-        raise
     finally:
         checkpoints.close()
 
 
-def _progress(step: int, schedule: optax.Schedule, began: float) -> dict[str, Any]:
-    """Step, learning rate and elapsed time for the log."""
-    return {
-        "step": step,
-        "learning_rate": float(jnp.asarray(schedule(step))),
-        "seconds": time.perf_counter() - began,
-    }
-
-
-def _require_finite(
-    record: dict[str, float], step: int, checkpoints: Checkpoints
-) -> None:
-    """Raise TrainingStopped if any entry of a record is not finite."""
-    if not all(math.isfinite(value) for value in record.values()):
-        raise TrainingStopped(
-            f"non-finite loss near step {step}; "
-            f"the last good checkpoint is step {checkpoints.latest_step()}"
-        )
+def _optimizer(
+    steps: int, learning_rate: float, clip_norm: float
+) -> tuple[optax.GradientTransformation, optax.Schedule]:
+    """Adam with linear warm-up and cosine decay, and its learning rate schedule."""
+    rise = min(WARM_UP, max(steps // 10, 1))
+    schedule = optax.warmup_cosine_decay_schedule(
+        0.0, learning_rate, rise, max(steps, rise + 1), learning_rate * FINAL_RATE
+    )
+    clip = optax.clip_by_global_norm(clip_norm)
+    return optax.chain(clip, optax.adam(schedule)), schedule
 
 
 def _chunk(
-    loss: Loss,
-    transform: optax.GradientTransformation,
-    draw: Draw,
-    *,
-    length: int,
+    loss: Loss, transform: optax.GradientTransformation, draw: Draw, *, length: int
 ) -> Any:
     """Compile `length` optimiser steps: (state, data, key) -> state, mean metrics."""
     gradient = jax.value_and_grad(loss, has_aux=True)
 
-    # Not donated: an interrupted run saves the state from which a chunk started. The
-    # key is an argument, so that trainings from other seeds share a compiled program.
+    # The key is an argument, so that trainings from other seeds share a program.
     @jax.jit
     def chunk(
         state: TrainState, data: Trajectory, key: Key
@@ -190,3 +178,95 @@ def _chunk(
         return state, jax.tree.map(jnp.mean, records)
 
     return chunk
+
+
+def _require_finite(
+    record: dict[str, float], step: int, checkpoints: Checkpoints
+) -> None:
+    """Raise TrainingStopped if any entry of a record is not finite."""
+    if not all(math.isfinite(value) for value in record.values()):
+        raise TrainingStopped(
+            f"non-finite loss near step {step}; "
+            f"the last good checkpoint is step {checkpoints.latest_step()}"
+        )
+
+
+@contextmanager
+def _requests() -> Iterator[list[int]]:
+    """Yield the list of stops requested by SIGINT or SIGTERM, to be looked at.
+
+    The first signal restores the handlers, so that a second one has its usual effect.
+    Signals that have a handler already, as in a notebook or under a launcher, and those
+    of other threads, where none can be installed, are left alone.
+    """
+    requested: list[int] = []
+    usual = {
+        signal.SIGINT: signal.default_int_handler,
+        signal.SIGTERM: signal.SIG_DFL,
+    }
+    taken = {
+        number: handler
+        for number, handler in usual.items()
+        if threading.current_thread() is threading.main_thread()
+        and signal.getsignal(number) == handler
+    }
+
+    def restore() -> None:
+        for number, handler in taken.items():
+            signal.signal(number, handler)
+
+    def request(number: int, frame: FrameType | None) -> None:
+        del frame
+        requested.append(number)
+        restore()
+
+    for number in taken:
+        signal.signal(number, request)
+    try:
+        yield requested
+    finally:
+        restore()
+
+
+def open_log(path: Path, *, resumed_at: int) -> Path:
+    """Return the path of a log without the lines after a step; damaged ones go.
+
+    Args:
+        path: of the log, JSON lines; created if it does not exist.
+        resumed_at: step at which the run is resumed.
+    """
+    path.parent.mkdir(parents=True, exist_ok=True)
+    path.touch()
+
+    def kept(line: dict[str, Any]) -> bool:
+        # A line without a number belongs to no step.
+        return isinstance(line["step"], int | float) and line["step"] <= resumed_at
+
+    truncate_jsonl(path, kept, keys=("step",))
+    return path
+
+
+def append(path: Path, record: dict[str, float], *, steps: int) -> None:
+    """Append one record to a log, and print its losses when they are validated.
+
+    Args:
+        path: of the log.
+        record: must have `step`.
+        steps: of the whole run.
+
+    Raises:
+        OSError: the line cannot be written.
+    """
+    step = int(record["step"])
+    try:
+        with path.open("a") as file:
+            file.write(json.dumps(record) + "\n")
+    except OSError as reason:
+        raise OSError(
+            f"{path.parent}: step {step} was not logged "
+            f"({reason.strerror}); {RESUME_HINT}"
+        ) from reason
+    if "validation_loss" in record:
+        losses = (f"{name} {record[name]:.3g}" for name in ("loss", "validation_loss"))
+        line = f"training {step} / {steps}  {' '.join(losses)}"
+        print(line, file=sys.stderr, flush=True)
