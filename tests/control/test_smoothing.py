@@ -261,7 +261,7 @@ def test_a_smoothed_plan_steers_more_calmly_and_still_reaches_the_path():
             np.asarray, jit(jax.vmap(drive, in_axes=(None, 0)))(road, keys)
         )
         assert np.all(np.abs(episodes.lateral[:, -20:]) < 0.1)
-        assert np.all(episodes.healthy)
+        assert np.all(episodes.signals["healthy"])
         rates[window] = np.mean(
             np.abs(np.diff(episodes.controls[:, :, 0], axis=1)), axis=1
         )

@@ -3,6 +3,7 @@
 import json
 import math
 
+import jax
 import numpy as np
 import pytest
 from test_scores import CALM, DT, STEPS, about, episode
@@ -42,7 +43,7 @@ def batch():
         )
         parts.append(part)
         envs[number, 100:, 0] = 0.3 if number else 0.9
-    joined = Episode(*(np.concatenate(leaf) for leaf in zip(*parts, strict=True)))
+    joined = jax.tree.map(lambda *leaves: np.concatenate(leaves), *parts)
     return joined, envs
 
 

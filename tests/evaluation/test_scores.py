@@ -27,14 +27,11 @@ def episode(lateral, steering=None, states=None, ess=None, healthy=None):
         controls=controls,
         lateral=np.asarray(lateral, dtype=float)[None],
         progress=np.zeros((1, steps)),
-        effective_samples=np.ones((1, steps))
-        if ess is None
-        else np.asarray(ess, dtype=float)[None],
-        healthy=np.ones((1, steps), bool)
-        if healthy is None
-        else np.asarray(healthy)[None],
-        prediction_error=np.zeros((1, steps)),
         assumed_envs=np.zeros((1, steps, 2)),
+        signals={
+            "effective_samples": np.full((1, steps), 1.0 if ess is None else ess),
+            "healthy": np.full((1, steps), True if healthy is None else healthy),
+        },
     )
 
 

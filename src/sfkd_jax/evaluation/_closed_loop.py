@@ -2,15 +2,16 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from typing import Any, NamedTuple, TypeVar
 
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
+from sfkd_jax.evaluation.metrics import SIGNALS, Signal
 from sfkd_jax.scenarios import Scenario, project, reference_window
-from sfkd_jax.types import Controller, ControllerInfo, Key, Params, Scalar, State, Step
+from sfkd_jax.types import Controller, Key, Params, Scalar, State, Step
 
 
 class Episode(NamedTuple):
@@ -21,44 +22,39 @@ class Episode(NamedTuple):
         controls: applied (time, control).
         lateral: signed distance of x_1 … x_T from the path [m], (time,).
         progress: arc length reached [m], (time,).
-        effective_samples: of the planner, (time,).
-        healthy: whether the planner's plan was usable, (time,).
-        prediction_error: one-step position error of the planner's model [m], (time,).
         assumed_envs: e that the controller planned with, observed or estimated,
             (time, environment).
-        report: what `simulate` was asked to record besides, (time, …); () for nothing.
+        signals: what metrics and the caller recorded of every step, by name,
+            (time, …).
     """
 
     states: Float[Array, "time_plus_1 state"]
     controls: Float[Array, "time control"]
     lateral: Float[Array, " time"]
     progress: Float[Array, " time"]
-    effective_samples: Float[Array, " time"]
-    healthy: Array
-    prediction_error: Float[Array, " time"]
     assumed_envs: Float[Array, "time environment"]
-    report: Any = ()
+    signals: dict[str, Any]
 
 
-Outcome = TypeVar("Outcome")
+Result = TypeVar("Result")
 
 
-def over_episodes(drive: Callable[..., Outcome]) -> Callable[..., Outcome]:
-    """Return the function that drives every episode of a batch.
+def over_episodes(run: Callable[..., Result]) -> Callable[..., Result]:
+    """Return the function that runs every episode of a batch.
 
     On a single CPU one episode follows the other: the samples of one plan stay in its
-    caches, those of all episodes do not. On accelerators, or several devices, all are
-    driven at once.
+    caches, those of all episodes do not. On accelerators, or several devices, all run
+    at once.
 
     Args:
-        drive: of one episode, such as `simulate` with its first arguments bound.
+        run: one episode, such as `simulate` with its first arguments bound.
 
     Returns:
         A function of the same arguments with a leading axis of episodes.
     """
     if jax.default_backend() != "cpu" or len(jax.devices()) > 1:
-        return jax.vmap(drive)
-    return lambda *batch: jax.lax.map(lambda one: drive(*one), batch)
+        return jax.vmap(run)
+    return lambda *batch: jax.lax.map(lambda one: run(*one), batch)
 
 
 def simulate(
@@ -71,12 +67,12 @@ def simulate(
     dt: float,
     horizon: int,
     observation_noise: tuple[float, ...] = (),
-    report: Callable[[ControllerInfo], Any] | None = None,
+    record: Mapping[str, Signal] | None = None,
 ) -> Episode:
     """Simulate one episode.
 
     The plant is in `scenario.envs`, the controller observes `scenario.observed_envs`.
-    Two systems given the same scenario and key drive the same path in the same
+    Two systems given the same scenario and key follow the same path in the same
     environment, with the same sensor noise and sampling keys.
 
     Args:
@@ -89,9 +85,10 @@ def simulate(
         horizon: length of the reference window.
         observation_noise: standard deviation per state, entries beyond the state are
             not used; () for none.
-        report: of the controller's info, what else to record of every step.
+        record: more signals of every step, by name, besides those of the metrics.
     """
     planner_key, noise_key = jax.random.split(key)
+    wanted = SIGNALS | dict(record or {})
     spread = _noise_levels(observation_noise, scenario.initial_state)
     noise_keys = jax.random.split(noise_key, scenario.envs.shape[0])
 
@@ -111,15 +108,10 @@ def simulate(
         progress, lateral = project(
             scenario.path, state[:2], progress + scenario.speed * dt
         )
-        record = (
-            state,
-            control,
-            lateral,
-            progress,
-            *_record(info, state, observed_env),
-            () if report is None else report(info),
-        )
-        return (state, progress, memory), record
+        assumed = info.get("env_estimate", observed_env)
+        signals = {name: signal(info) for name, signal in wanted.items()}
+        recorded = (state, control, lateral, progress, assumed, signals)
+        return (state, progress, memory), recorded
 
     start = (scenario.initial_state, jnp.zeros(()), controller.init(planner_key))
     inputs = (scenario.envs, scenario.observed_envs, noise_keys)
@@ -131,15 +123,6 @@ def _noise_levels(observation_noise: tuple[float, ...], state: State) -> State:
     """Standard deviation of every state's sensor; 0 where none is given."""
     known = jnp.asarray(observation_noise, dtype=float)[: state.shape[0]]
     return jnp.zeros_like(state).at[: known.shape[0]].set(known)
-
-
-def _record(
-    info: ControllerInfo, state: State, observed_env: Array
-) -> tuple[Array, ...]:
-    """Fields of an `Episode` that the controller reports, from effective samples on."""
-    miss = jnp.linalg.norm(info["predicted_states"][0, :2] - state[:2])
-    assumed = info.get("env_estimate", observed_env)
-    return info["effective_samples"], info["healthy"], miss, assumed
 
 
 def first_reference(

@@ -11,16 +11,14 @@ from jaxtyping import Float
 
 from sfkd_jax.evaluation._closed_loop import Episode
 from sfkd_jax.evaluation._statistics import holm, paired_difference
-from sfkd_jax.evaluation.metrics import METRICS, PerEpisode, Recording, Row, as_numbers
-
-_ARRAYS = (
-    "states",
-    "controls",
-    "effective_samples",
-    "healthy",
+from sfkd_jax.evaluation.metrics import (
+    METRICS,
+    SIGNALS,
+    PerEpisode,
+    Recording,
+    Row,
+    as_numbers,
 )
-"""Of an episode, as they are."""
-
 
 IDENTITY = (
     "system",
@@ -60,7 +58,9 @@ def score(
         dt=dt,
         envs=np.asarray(envs),
         lateral=np.asarray(episodes.lateral, dtype=np.float64),
-        **{name: np.asarray(getattr(episodes, name)) for name in _ARRAYS},
+        states=np.asarray(episodes.states),
+        controls=np.asarray(episodes.controls),
+        signals={name: np.asarray(episodes.signals[name]) for name in SIGNALS},
     )
     return {one.name: one.measure(recording) for one in METRICS if one.measure}
 
@@ -213,11 +213,7 @@ def _mean(values: list[Any]) -> Any:
     if any(value is None for value in values):
         return None
     if isinstance(first, dict):
-        return {
-            # Older rows lack newer metrics.
-            name: _mean([value.get(name) for value in values])
-            for name in first
-        }
+        return {name: _mean([value.get(name) for value in values]) for name in first}
     if all(isinstance(value, float) for value in values):
         return float(np.mean(values))
     return first if all(value == first for value in values) else None

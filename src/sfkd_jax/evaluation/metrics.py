@@ -1,4 +1,8 @@
-"""The table of metrics: what each one measures, how it is pooled and shown."""
+"""The table of metrics: what each one measures, how it is pooled and shown.
+
+A new metric is an entry of `METRICS`, also if it needs a signal that no episode has
+had so far: `simulate` records what the entries name.
+"""
 
 from __future__ import annotations
 
@@ -20,9 +24,12 @@ from sfkd_jax.evaluation.formats import (
     short,
     upper,
 )
+from sfkd_jax.types import ControllerInfo
 
 Row: TypeAlias = dict[str, Any]
 """One system on one scenario, as in results.json."""
+Signal: TypeAlias = Callable[[ControllerInfo], Any]
+"""A controller's info of a step -> what to record of it, an array."""
 PerEpisode: TypeAlias = Float[np.ndarray, " episode"] | Bool[np.ndarray, " episode"]
 
 SETTLING = 2.0
@@ -48,8 +55,7 @@ class Recording(NamedTuple):
         lateral: signed distance of x_1 … x_T from the path [m].
         states: x_0 … x_T.
         controls: applied.
-        effective_samples: of the planner.
-        healthy: whether the planner's plan was usable.
+        signals: recorded of every step, by name, (episode, time, …).
     """
 
     dt: float
@@ -57,8 +63,7 @@ class Recording(NamedTuple):
     lateral: Float[np.ndarray, "episode time"]
     states: Float[np.ndarray, "episode time_plus_1 state"]
     controls: Float[np.ndarray, "episode time control"]
-    effective_samples: Float[np.ndarray, "episode time"]
-    healthy: Bool[np.ndarray, "episode time"]
+    signals: dict[str, np.ndarray]
 
 
 class Metric(NamedTuple):
@@ -77,6 +82,7 @@ class Metric(NamedTuple):
         pool_seeds: the JSON value of rows that differ in the training seed; None for
             the mean of their numbers.
         read: the JSON value of a row, where that is more than a look-up by name.
+        records: signals that `measure` needs, by name.
     """
 
     name: str
@@ -89,6 +95,7 @@ class Metric(NamedTuple):
     pool: Callable[[PerEpisode], Any] | None = None
     pool_seeds: Callable[[list[Row]], Any] | None = None
     read: Callable[[Row], Any] | None = None
+    records: dict[str, Signal] = {}  # noqa: RUF012 never changed
 
     def value(self, row: Row) -> Any:
         """The JSON value in a row, or None."""
@@ -109,24 +116,24 @@ class Metric(NamedTuple):
         return f"{self.label} [{unit}]" if unit else self.label
 
 
-def _scored(drive: Recording) -> np.ndarray:
+def _scored(run: Recording) -> np.ndarray:
     """Lateral deviation after the start of the episode."""
-    return drive.lateral[:, round(SETTLING / drive.dt) :]
+    return run.lateral[:, round(SETTLING / run.dt) :]
 
 
-def _rmse(drive: Recording) -> np.ndarray:
-    return np.sqrt(np.mean(_scored(drive) ** 2, axis=1))
+def _rmse(run: Recording) -> np.ndarray:
+    return np.sqrt(np.mean(_scored(run) ** 2, axis=1))
 
 
-def _max_deviation(drive: Recording) -> np.ndarray:
-    return np.max(np.abs(_scored(drive)), axis=1)
+def _max_deviation(run: Recording) -> np.ndarray:
+    return np.max(np.abs(_scored(run)), axis=1)
 
 
-def _rmse_after_switch(drive: Recording) -> np.ndarray:
+def _rmse_after_switch(run: Recording) -> np.ndarray:
     """RMSE within AFTER_SWITCH of a switch; NaN for an episode without a switch."""
-    after = _after_switch(drive.envs, round(AFTER_SWITCH / drive.dt))
-    after[:, : round(SETTLING / drive.dt)] = False
-    squares = np.where(after, drive.lateral**2, 0.0).sum(axis=1)
+    after = _after_switch(run.envs, round(AFTER_SWITCH / run.dt))
+    after[:, : round(SETTLING / run.dt)] = False
+    squares = np.where(after, run.lateral**2, 0.0).sum(axis=1)
     counts = after.sum(axis=1)
     return np.where(counts > 0, np.sqrt(squares / np.maximum(counts, 1)), np.nan)
 
@@ -141,15 +148,15 @@ def _after_switch(envs: np.ndarray, steps: int) -> np.ndarray:
     return mask
 
 
-def _steering_rate(drive: Recording) -> np.ndarray:
+def _steering_rate(run: Recording) -> np.ndarray:
     """Mean |steering rate| of the applied controls."""
-    return np.mean(np.abs(np.diff(drive.controls[..., 0], axis=1)), axis=1) / drive.dt
+    return np.mean(np.abs(np.diff(run.controls[..., 0], axis=1)), axis=1) / run.dt
 
 
-def _departed(drive: Recording) -> np.ndarray:
+def _departed(run: Recording) -> np.ndarray:
     """Whether the car left its lane or a state is not finite."""
-    finite = np.all(np.isfinite(drive.states), axis=(1, 2))
-    stays = _max_deviation(drive) + VEHICLE_HALF_WIDTH <= LANE_HALF_WIDTH
+    finite = np.all(np.isfinite(run.states), axis=(1, 2))
+    stays = _max_deviation(run) + VEHICLE_HALF_WIDTH <= LANE_HALF_WIDTH
     return ~finite | ~stays
 
 
@@ -190,18 +197,6 @@ def _certified(key: str) -> Callable[[Row], Any]:
     return read
 
 
-def _conformal(key: str, own: str) -> Callable[[Row], Any]:
-    """Read an entry about the conformal tube; older rows have it as the tube in use."""
-
-    def read(row: Row) -> Any:
-        record = dig(row, "violation")
-        value = dig(record, key)
-        in_use = value is None and dig(record, "v1_tube") == "conformal"
-        return dig(record, own) if in_use else value
-
-    return read
-
-
 def _ahead(steps: int) -> Metric:
     """Position error of open-loop predictions."""
     label = f"{steps} step{'s' * (steps > 1)} ahead"
@@ -232,18 +227,19 @@ METRICS: tuple[Metric, ...] = (
            read=_certified("v1")),
     Metric("violation.v1_radius_m", "Radius of the certified tube", "m", "claims",
            read=_certified("v1_radius_m")),
-    Metric("violation.v1_conformal", "V1, conformal tube", "%", "claims", percent,
-           read=_conformal("v1_conformal", "v1")),
+    Metric("violation.v1_conformal", "V1, conformal tube", "%", "claims", percent),
     Metric("violation.v1_conformal_radius_m", "Radius of the conformal tube", "m",
-           "claims", read=_conformal("v1_conformal_radius_m", "v1_radius_m")),
+           "claims"),
     Metric("violation.v2", "V2, threshold", "%", "claims", percent),
     Metric("departures", "Left the lane", "", "spread", short, None, _departed,
            lambda values: int(np.sum(values)),
            lambda rows: sum(row["departures"] for row in rows)),
     Metric("unhealthy_steps", "Steps with the last plan held", "%", "planner", percent,
-           measure=lambda drive: 1.0 - np.mean(drive.healthy, axis=1), pool=_mean),
+           measure=lambda run: 1.0 - np.mean(run.signals["healthy"], axis=1),
+           pool=_mean, records={"healthy": lambda info: info["healthy"]}),
     Metric("ess", "Effective samples", "", "planner", partial(number, digits=0), None,
-           lambda drive: np.median(drive.effective_samples, axis=1), _median),
+           lambda run: np.median(run.signals["effective_samples"], axis=1), _median,
+           records={"effective_samples": lambda info: info["effective_samples"]}),
     Metric("act_ms.p50", "Control step, median", "ms", "cost",
            partial(number, digits=2)),
     Metric("act_ms.p99", "Control step, 99 %", "ms", "cost",
@@ -263,6 +259,12 @@ METRICS: tuple[Metric, ...] = (
 
 BY_NAME: dict[str, Metric] = {metric.name: metric for metric in METRICS}
 """The same by JSON key."""
+
+
+SIGNALS: dict[str, Signal] = {
+    name: signal for metric in METRICS for name, signal in metric.records.items()
+}
+"""Signals that the metrics need, by name."""
 
 
 def in_table(table: str) -> list[Metric]:
