@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 
 from sfkd_jax.adapters._task import DrivingTask as DrivingTask
 from sfkd_jax.adapters._task import Moment as Moment
-from sfkd_jax.adapters._task import Outcome as Outcome
+from sfkd_jax.adapters._task import Transition as Transition
 from sfkd_jax.adapters._task import tracking_task as tracking_task
 
 if TYPE_CHECKING:

@@ -11,7 +11,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from sfkd_jax.adapters._drawing import RoadView
-from sfkd_jax.adapters._task import DrivingTask, Moment, Outcome, tracking_task
+from sfkd_jax.adapters._task import DrivingTask, Moment, Transition, tracking_task
 from sfkd_jax.scenarios import Scenario, point_at
 from sfkd_jax.types import Control, Key
 
@@ -175,7 +175,7 @@ def _start(
 
 def _advance(
     task: DrivingTask, road: Scenario, moment: Moment, action: Control
-) -> tuple[Moment, Outcome, Float[Array, " observation"]]:
+) -> tuple[Moment, Transition, Float[Array, " observation"]]:
     """One step and its observation."""
     moment, outcome = task.step(road, moment, action)
     return moment, outcome, task.observe(road, moment)

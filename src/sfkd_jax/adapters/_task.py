@@ -2,22 +2,15 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from functools import partial
+import math
+from dataclasses import dataclass
 from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
-from sfkd_jax.adapters._settings import (
-    check_sizes,
-    check_weights,
-    choose_family,
-    choose_plant,
-    count_steps,
-    observation_bounds,
-)
+from sfkd_jax import build
 from sfkd_jax.geometry import between, wrap_angle
 from sfkd_jax.plants import Vehicle
 from sfkd_jax.scenarios import Family, Scenario, point_at, project, reference_window
@@ -53,8 +46,8 @@ class Moment(NamedTuple):
     count: Int[Array, ""]
 
 
-class Outcome(NamedTuple):
-    """The outcome of one step.
+class Transition(NamedTuple):
+    """What one step earned, and whether it was the last.
 
     Attributes:
         reward: −ℓ.
@@ -70,46 +63,20 @@ class Outcome(NamedTuple):
     measures: dict[str, Scalar]
 
 
-class DrivingTask(NamedTuple):
-    """Path following for one car; callers vmap.
+@dataclass(frozen=True, eq=False)
+class DrivingTask:
+    """Path following for one car, see `tracking_task`; callers vmap.
 
     Attributes:
         plant: that is simulated.
-        steps: of an episode, at most.
+        family: of roads.
+        preview: number of points ahead.
         lane: half width [m].
-        observation_low: smallest observation, −∞ where there is no limit.
-        observation_high: largest observation, ∞ where there is no limit.
-        action_size: entries of an action.
-        reset: key -> (road, moment).
-        step: (road, moment, action) -> (moment, outcome).
-        observe: (road, moment) -> observation.
-        situation: (road, moment) -> (state, environment, reference), what
-            `Controller.act` takes.
-        control: action in [-1, 1] -> control in physical units.
-        action: its inverse.
+        lateral: q_y [1/m²].
+        speed: q_v [s²/m²].
+        steering_rate: q_δ̇ [s²/rad²].
+        leaving: charged once [-].
     """
-
-    plant: Vehicle
-    steps: int
-    lane: float
-    observation_low: tuple[float, ...]
-    observation_high: tuple[float, ...]
-    action_size: int
-    reset: Callable[[Key], tuple[Scenario, Moment]]
-    step: Callable[[Scenario, Moment, Control], tuple[Moment, Outcome]]
-    observe: Callable[[Scenario, Moment], Float[Array, " observation"]]
-    situation: Callable[[Scenario, Moment], tuple[State, Environment, Reference]]
-    control: Callable[[Control], Control]
-    action: Callable[[Control], Control]
-
-    @property
-    def observation_size(self) -> int:
-        """Entries of an observation."""
-        return len(self.observation_low)
-
-
-class _Task(NamedTuple):
-    """The settings of `tracking_task`."""
 
     plant: Vehicle
     family: Family
@@ -119,6 +86,128 @@ class _Task(NamedTuple):
     speed: float
     steering_rate: float
     leaving: float
+
+    @property
+    def steps(self) -> int:
+        """Steps of an episode, at most; from shapes alone.
+
+        Raises:
+            ValueError: the family is for another plant.
+        """
+        road = jax.eval_shape(self.family, jax.random.key(0))
+        given, wanted = road.initial_state.shape, (len(self.plant.state_names),)
+        if given != wanted:
+            raise ValueError(
+                f"the scenario starts in a state of shape {given}, "
+                f"{self.plant.name!r} has {wanted}"
+            )
+        return road.envs.shape[0]
+
+    @property
+    def action_size(self) -> int:
+        """Entries of an action."""
+        return len(self.plant.control_low)
+
+    @property
+    def observation_high(self) -> tuple[float, ...]:
+        """Largest observation: of angles and actions, else ∞."""
+        inf, body = math.inf, len(self.plant.state_names) - 3
+        errors, points = (inf, math.pi), (inf, inf, math.pi, inf) * self.preview
+        return (*errors, *[inf] * body, *[1.0] * self.action_size, inf, inf, *points)
+
+    @property
+    def observation_low(self) -> tuple[float, ...]:
+        """Smallest observation; only friction is not symmetric about 0."""
+        low = [-value for value in self.observation_high]
+        low[2 + len(self.plant.state_names) - 3 + self.action_size] = 0.0
+        return tuple(low)
+
+    @property
+    def observation_size(self) -> int:
+        """Entries of an observation."""
+        return len(self.observation_high)
+
+    def control(self, action: Control) -> Control:
+        """Return an action in [-1, 1] in physical units, clipped to the limits."""
+        low, high = map(jnp.asarray, (self.plant.control_low, self.plant.control_high))
+        return low + (high - low) * 0.5 * (jnp.clip(action, -1.0, 1.0) + 1.0)
+
+    def action(self, control: Control) -> Control:
+        """Return a control in physical units as an action in [-1, 1]."""
+        low, high = map(jnp.asarray, (self.plant.control_low, self.plant.control_high))
+        return 2.0 * (control - low) / (high - low) - 1.0
+
+    def reset(self, key: Key) -> tuple[Scenario, Moment]:
+        """Draw a new road, with the car at its start."""
+        road = self.family(key)
+        progress, offset = project(road.path, road.initial_state[:2], jnp.zeros(()))
+        still = jnp.zeros(self.action_size)
+        count = jnp.zeros((), dtype=jnp.int32)
+        return road, Moment(road.initial_state, progress, offset, still, count)
+
+    def step(
+        self, road: Scenario, moment: Moment, action: Control
+    ) -> tuple[Moment, Transition]:
+        """Simulate one sampling period with an action in [-1, 1]."""
+        plant, applied = self.plant, self.control(action)
+        after = plant.step(moment.state, applied, _at(road.envs, moment))
+        guess = moment.progress + after[3] * plant.dt
+        progress, offset = project(road.path, after[:2], guess)
+        reached = Moment(after, progress, offset, applied, moment.count + 1)
+        sound = jnp.all(
+            jnp.isfinite(
+                jnp.concatenate([after, applied, jnp.stack([progress, offset])])
+            )
+        )
+        # A state that is not finite ends the episode; what is observed is the last one.
+        kept: Moment = jax.tree.map(
+            lambda new, old: jnp.where(sound, new, old), reached, moment
+        )
+        return kept, self._transition(road, moment, kept, sound)
+
+    def _transition(
+        self, road: Scenario, before: Moment, kept: Moment, sound: Bool[Array, ""]
+    ) -> Transition:
+        """Reward, end and measures of a step."""
+        backwards = jnp.abs(_heading(road, kept)) > 0.5 * jnp.pi
+        left = ~sound | (jnp.abs(kept.lateral) > self.lane) | backwards
+        length = (road.path.points.shape[0] - 1) * road.path.spacing
+        ended = (kept.count >= road.envs.shape[0]) | (kept.progress >= length)
+        missed = kept.state[3] - road.speed
+        turned = (kept.control[0] - before.control[0]) / self.plant.dt
+        cost = (
+            self.lateral * kept.lateral**2
+            + self.speed * missed**2
+            + self.steering_rate * turned**2
+        )
+        values = (kept.lateral, missed, turned)
+        measures = {
+            name: jnp.abs(value) for name, value in zip(MEASURES, values, strict=True)
+        }
+        reward = -cost - self.leaving * left
+        return Transition(reward, left, ~left & ended, measures)
+
+    def situation(
+        self, road: Scenario, moment: Moment
+    ) -> tuple[State, Environment, Reference]:
+        """Return state, environment and reference, what `Controller.act` takes."""
+        reference = reference_window(
+            road.path,
+            moment.progress,
+            road.speed,
+            dt=self.plant.dt,
+            horizon=self.preview,
+        )
+        return moment.state, _at(road.observed_envs, moment), reference
+
+    def observe(self, road: Scenario, moment: Moment) -> Float[Array, " observation"]:
+        """Return the observation, as `tracking_task` describes it."""
+        state, env, reference = self.situation(road, moment)
+        ahead = jax.vmap(between, in_axes=(None, 0))(state[POSE], reference[:, :3])
+        points = jnp.concatenate([ahead, reference[:, 3:]], axis=1).ravel()
+        errors = jnp.stack([moment.lateral, _heading(road, moment)])
+        action = self.action(moment.control)
+        return jnp.concatenate([errors, state[BODY], action, env, points])
 
 
 def tracking_task(
@@ -167,121 +256,40 @@ def tracking_task(
         ValueError: an unknown name, a size, width or duration that is not positive, or
             a negative weight.
     """
-    check_weights(
-        lateral=lateral, speed=speed, steering_rate=steering_rate, leaving=leaving
+    for name, weight in (
+        ("lateral", lateral),
+        ("speed", speed),
+        ("steering_rate", steering_rate),
+        ("leaving", leaving),
+    ):
+        if not (math.isfinite(weight) and weight >= 0):
+            raise ValueError(f"{name} must be finite and at least 0, got {weight}")
+    plant = (
+        vehicle
+        if isinstance(vehicle, Vehicle)
+        else build.build_vehicle(
+            {"name": vehicle, "inner_loop": inner_loop, "speed_gain": 1.0}
+        )
     )
-    plant = choose_plant(vehicle, inner_loop)
-    check_sizes(plant.dt, duration=duration, preview=preview, lane=lane)
-    family = choose_family(scenario, plant, duration)
-    task = _Task(plant, family, preview, lane, lateral, speed, steering_rate, leaving)
-    low, high = observation_bounds(plant, preview)
-    return DrivingTask(
-        plant=plant,
-        steps=count_steps(family, plant),
-        lane=lane,
-        observation_low=low,
-        observation_high=high,
-        action_size=len(plant.control_low),
-        reset=partial(_reset, task),
-        step=partial(_step, task),
-        observe=partial(_observe, task),
-        situation=partial(_situation, task),
-        control=partial(_control, plant),
-        action=partial(_action, plant),
+    if not (math.isfinite(duration) and duration >= plant.dt):
+        raise ValueError(
+            f"duration must be finite and at least one step of {plant.dt} s, "
+            f"got {duration}"
+        )
+    if preview < 1 or preview != int(preview):
+        raise ValueError(f"preview must be a whole number of at least 1, got {preview}")
+    if not lane > 0:
+        raise ValueError(f"lane must be positive, got {lane}")
+    family = (
+        build.build_scenario({"name": scenario}, plant, duration=duration)
+        if isinstance(scenario, str)
+        else scenario
     )
-
-
-def _control(plant: Vehicle, action: Control) -> Control:
-    """An action in physical units, clipped to the limits."""
-    low, high = jnp.asarray(plant.control_low), jnp.asarray(plant.control_high)
-    return low + (high - low) * 0.5 * (jnp.clip(action, -1.0, 1.0) + 1.0)
-
-
-def _action(plant: Vehicle, control: Control) -> Control:
-    """A control as an action in [-1, 1]."""
-    low, high = jnp.asarray(plant.control_low), jnp.asarray(plant.control_high)
-    return 2.0 * (control - low) / (high - low) - 1.0
-
-
-def _reset(task: _Task, key: Key) -> tuple[Scenario, Moment]:
-    """A new road, and the car at its start."""
-    road = task.family(key)
-    progress, offset = project(road.path, road.initial_state[:2], jnp.zeros(()))
-    still = jnp.zeros(len(task.plant.control_low))
-    return road, Moment(
-        road.initial_state, progress, offset, still, jnp.zeros((), dtype=jnp.int32)
+    task = DrivingTask(
+        plant, family, preview, lane, lateral, speed, steering_rate, leaving
     )
-
-
-def _step(
-    task: _Task, road: Scenario, moment: Moment, action: Control
-) -> tuple[Moment, Outcome]:
-    """One sampling period; a state that is not finite is replaced by the last one."""
-    plant = task.plant
-    applied = _control(plant, action)
-    after = plant.step(moment.state, applied, _at(road.envs, moment))
-    progress, offset = project(
-        road.path, after[:2], moment.progress + after[3] * plant.dt
-    )
-    reached = Moment(after, progress, offset, applied, moment.count + 1)
-    sound = jnp.all(
-        jnp.isfinite(jnp.concatenate([after, applied, jnp.stack([progress, offset])]))
-    )
-    kept: Moment = jax.tree.map(
-        lambda new, old: jnp.where(sound, new, old), reached, moment
-    )
-    return kept, _outcome(task, road, moment, kept, sound)
-
-
-def _outcome(
-    task: _Task, road: Scenario, before: Moment, kept: Moment, sound: Bool[Array, ""]
-) -> Outcome:
-    """Reward, end and measures of a step."""
-    backwards = jnp.abs(_heading(road, kept)) > 0.5 * jnp.pi
-    left = ~sound | (jnp.abs(kept.lateral) > task.lane) | backwards
-    over = ~left & (
-        (kept.count >= road.envs.shape[0]) | (kept.progress >= _length(road))
-    )
-    missed, turned = (
-        kept.state[3] - road.speed,
-        (kept.control[0] - before.control[0]) / task.plant.dt,
-    )
-    cost = (
-        task.lateral * kept.lateral**2
-        + task.speed * missed**2
-        + task.steering_rate * turned**2
-    )
-    values = (kept.lateral, missed, turned)
-    measures = {
-        name: jnp.abs(value) for name, value in zip(MEASURES, values, strict=True)
-    }
-    return Outcome(-cost - task.leaving * left, left, over, measures)
-
-
-def _situation(
-    task: _Task, road: Scenario, moment: Moment
-) -> tuple[State, Environment, Reference]:
-    """What a controller is given."""
-    reference = reference_window(
-        road.path,
-        moment.progress,
-        road.speed,
-        dt=task.plant.dt,
-        horizon=task.preview,
-    )
-    return moment.state, _at(road.observed_envs, moment), reference
-
-
-def _observe(
-    task: _Task, road: Scenario, moment: Moment
-) -> Float[Array, " observation"]:
-    """The observation, as `tracking_task` describes it."""
-    state, env, reference = _situation(task, road, moment)
-    ahead = jax.vmap(between, in_axes=(None, 0))(state[POSE], reference[:, :3])
-    points = jnp.concatenate([ahead, reference[:, 3:]], axis=1).ravel()
-    errors = jnp.stack([moment.lateral, _heading(road, moment)])
-    action = _action(task.plant, moment.control)
-    return jnp.concatenate([errors, state[BODY], action, env, points])
+    _ = task.steps  # refuses a family that is for another plant
+    return task
 
 
 def _at(envs: Float[Array, "time environment"], moment: Moment) -> Environment:
@@ -292,8 +300,3 @@ def _at(envs: Float[Array, "time environment"], moment: Moment) -> Environment:
 def _heading(road: Scenario, moment: Moment) -> Scalar:
     """Yaw relative to the path [rad]."""
     return wrap_angle(moment.state[2] - point_at(road.path, moment.progress)[2])
-
-
-def _length(road: Scenario) -> Scalar:
-    """Of the path [m]."""
-    return (road.path.points.shape[0] - 1) * road.path.spacing
