@@ -20,8 +20,6 @@ from __future__ import annotations
 import argparse
 import hashlib
 import json
-import os
-import stat
 import sys
 import time
 from pathlib import Path
@@ -218,23 +216,15 @@ def _compiled(folder: Path, manifest: dict[str, Any], name: str) -> Any:
 def _content(path: Path, most: int) -> bytes:
     """Return the content of a regular file of at most `most` bytes."""
     try:
-        number = os.open(path, os.O_RDONLY | os.O_NONBLOCK | os.O_NOCTTY | os.O_CLOEXEC)
-        try:
-            status = os.fstat(number)
-            if not stat.S_ISREG(status.st_mode):
-                raise ExportError(f"{path}: not a regular file")
-            if status.st_size > most:
-                raise ExportError(
-                    f"{path}: {status.st_size} bytes, at most {most} belong to it"
-                )
-            with open(number, "rb", closefd=False) as file:
-                return file.read(most)
-        finally:
-            os.close(number)
+        # Opening anything else, such as a pipe, could wait for ever.
+        if path.exists() and not path.is_file():
+            raise ExportError(f"{path}: not a regular file")
+        if (size := path.stat().st_size) > most:
+            raise ExportError(f"{path}: {size} bytes, at most {most} belong to it")
+        return path.read_bytes()
     except (OSError, ValueError) as error:  # ValueError: an impossible file name
-        raise ExportError(
-            _line(f"{path}: {getattr(error, 'strerror', None) or error}")
-        ) from None
+        reason = getattr(error, "strerror", None) or error
+        raise ExportError(_line(f"{path}: {reason}")) from None
 
 
 def _line(text: str) -> str:
