@@ -1,14 +1,14 @@
 """Simulated vehicles as pure step functions."""
 
-from sfkd_jax.plants._along_path import along_path as along_path
 from sfkd_jax.plants._dynamic import dynamic as dynamic
-from sfkd_jax.plants._integrators import rk4 as rk4
 from sfkd_jax.plants._kinematic import kinematic as kinematic
 from sfkd_jax.plants._kinematic import kinematic_stiff as kinematic_stiff
 from sfkd_jax.plants._own import check_step as check_step
 from sfkd_jax.plants._own import own as own
 from sfkd_jax.plants._own import step_named as step_named
 from sfkd_jax.plants._vehicle import Vehicle as Vehicle
+from sfkd_jax.plants._vehicle import along_path as along_path
 from sfkd_jax.plants._vehicle import equivalent_wind as equivalent_wind
+from sfkd_jax.plants._vehicle import rk4 as rk4
 from sfkd_jax.plants._vehicle import side_force as side_force
 from sfkd_jax.plants._vehicle import with_speed_loop as with_speed_loop

@@ -1,19 +1,22 @@
-"""The `Vehicle` record, parts that all plants share, and the inner speed loop."""
+"""The `Vehicle` record, what all plants share, the speed loop and the path loop."""
 
 from __future__ import annotations
 
 from typing import NamedTuple
 
+import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from sfkd_jax.plants._integrators import rk4
+from sfkd_jax.geometry import PathFeedback, closed_loop
 from sfkd_jax.types import Control, Environment, State, Step
 
 GRAVITY = 9.81  # m/s²
 STEERING_LIMIT = 0.5  # rad
 ACCELERATION_RANGE = (-6.0, 3.0)  # m/s²
 SPEED_RANGE = (0.0, 25.0)  # m/s
+STEEPEST = 0.2
+"""Largest curvature of a path [1/m]: more than any car can turn."""
 
 
 class Vehicle(NamedTuple):
@@ -107,6 +110,31 @@ def nominal_derivative(length: float, rear_length: float) -> Step:
     return derivative
 
 
+def rk4(derivative: Step, *, dt: float, substeps: int = 1) -> Step:
+    """Return a step by the classical Runge-Kutta method of order 4.
+
+    Args:
+        derivative: dx/dt = f(x, u, e).
+        dt: sampling period [s].
+        substeps: integration steps per sampling period.
+    """
+    h = dt / substeps
+
+    def step(state: State, control: Control, env: Environment) -> State:
+        def substep(x: State, _: None) -> tuple[State, None]:
+            k1 = derivative(x, control, env)
+            k2 = derivative(x + 0.5 * h * k1, control, env)
+            k3 = derivative(x + 0.5 * h * k2, control, env)
+            k4 = derivative(x + h * k3, control, env)
+            return x + h / 6.0 * (k1 + 2.0 * k2 + 2.0 * k3 + k4), None
+
+        return jax.lax.scan(
+            substep, jnp.asarray(state), None, length=substeps, unroll=True
+        )[0]
+
+    return step
+
+
 def forward_rk4(derivative: Step, *, dt: float, substeps: int = 1) -> Step:
     """Return RK4 for a car that brakes cannot reverse: v ≥ 0 after every step.
 
@@ -161,4 +189,55 @@ def with_speed_loop(vehicle: Vehicle, *, gain: float = 1.0) -> Vehicle:
         control_low=(vehicle.control_low[0], SPEED_RANGE[0]),
         control_high=(vehicle.control_high[0], SPEED_RANGE[1]),
         speed_loop=True,
+    )
+
+
+def along_path(
+    vehicle: Vehicle,
+    law: PathFeedback,
+    *,
+    perturbation: tuple[float, float] = (0.03, 1.0),
+) -> Vehicle:
+    """Return the closed loop as a plant with states (0, 0, 0, ξ) and controls w.
+
+    w = (ν, κ, v_ref), see `sfkd_jax.geometry`. One step is exact on a circle of
+    curvature κ for any step of the vehicle. Where 1 − κ e_y ≤ 0.2 the result is finite
+    but not meaningful; `path_frame.is_valid` tests for it.
+
+    Args:
+        vehicle: with limits of its controls.
+        law: (ξ, κ, v_ref, e) -> u.
+        perturbation: largest |ν| [rad, control unit], the limits of w; steps do not
+            enforce them.
+
+    Raises:
+        ValueError: the vehicle has no limits.
+    """
+    if not vehicle.control_low:
+        raise ValueError(
+            "a path-following loop needs vehicle.control_low and vehicle.control_high"
+        )
+    limits = (vehicle.control_low, vehicle.control_high)
+    step = closed_loop(vehicle.step, law, *limits)
+
+    def derivative(state: State, control: Control, env: Environment) -> State:
+        return (step(state, control, env) - state) / vehicle.dt
+
+    nominal = closed_loop(vehicle.nominal, law, *limits)
+
+    def nominal_derivative(state: State, control: Control, env: Environment) -> State:
+        return (nominal(state, control, env) - state) / vehicle.dt
+
+    return vehicle._replace(
+        state_names=("p_x", "p_y", "yaw", "e_y", "e_psi", *vehicle.state_names[3:]),
+        step=step,
+        derivative=derivative,
+        nominal=nominal,
+        nominal_derivative=nominal_derivative,
+        control_low=(
+            *(-largest for largest in perturbation),
+            -STEEPEST,
+            SPEED_RANGE[0],
+        ),
+        control_high=(*perturbation, STEEPEST, SPEED_RANGE[1]),
     )
