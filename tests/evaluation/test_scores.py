@@ -1,5 +1,6 @@
 """Scores of hand-made episodes, their statistics, and the rows made of them."""
 
+import jax
 import numpy as np
 import pytest
 
@@ -170,7 +171,7 @@ def test_episodes_are_scored_one_by_one():
         episode(np.full(STEPS, level), steering=level * TIME)
         for level in (0.1, 0.2, 2.0)
     ]
-    batch = Episode(*(np.concatenate(leaves) for leaves in zip(*parts, strict=True)))
+    batch = jax.tree.map(lambda *leaves: np.concatenate(leaves), *parts)
     envs = np.concatenate([switching(), switching(when=50), CALM])
     together = score(batch, envs, dt=DT)
     for k, part in enumerate(parts):
@@ -238,7 +239,7 @@ def about(system, **changes):
 
 def scored(level, count=4):
     parts = [episode(np.full(STEPS, level * (1 + 0.1 * k))) for k in range(count)]
-    batch = Episode(*(np.concatenate(leaves) for leaves in zip(*parts, strict=True)))
+    batch = jax.tree.map(lambda *leaves: np.concatenate(leaves), *parts)
     return score(batch, np.broadcast_to(CALM, (count, STEPS, 2)), dt=DT)
 
 
