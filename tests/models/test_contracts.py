@@ -69,20 +69,6 @@ def one():
 
 
 @pytest.mark.parametrize("name", EVERY)
-def test_compiling_changes_nothing(name, one):
-    model, params = model_and_params(name)
-    assert same(run(name, one), chain(model, params, one), rtol=1e-5, atol=1e-5)
-
-
-@pytest.mark.parametrize("name", EVERY)
-def test_a_batch_is_a_loop(name):
-    model, params = model_and_params(name)
-    batch = jit(jax.vmap(partial(chain, model), in_axes=(None, 0)))(params, driven())
-    for k in range(len(driven().states)):
-        assert same(at(batch, k), run(name, at(driven(), k)), rtol=1e-5, atol=1e-5)
-
-
-@pytest.mark.parametrize("name", EVERY)
 def test_other_parameters_and_environments_do_not_compile_again(name, one):
     _, params = model_and_params(name)
     run(name, one)
@@ -265,13 +251,6 @@ def test_what_is_certified_is_what_is_multiplied_by(name, one):
 def test_invalid_settings_are_refused_by_name(setting, value):
     with pytest.raises(ValueError, match=rf"model\.{setting}.*{value}"):
         models.sfkd(space(), **TINY | {setting: value})
-
-
-def test_an_unknown_frame_or_residual_lists_the_choices():
-    with pytest.raises(ValueError, match="body, segment"):
-        tiny(frame="world")
-    with pytest.raises(ValueError, match="sandwich, free, none"):
-        tiny(residual="soft")
 
 
 def test_only_the_soft_variant_has_a_penalty_and_it_is_the_hinge_on_the_jacobian(one):
