@@ -247,7 +247,7 @@ def test_a_controller_with_a_corridor_is_shielded_if_shield_is_set(
             assert info["corridor"] == pytest.approx(
                 document["corridor"]["corridor_m"], rel=1e-5
             )
-            assert not info["void"]
+            assert not info["outside_box"]
 
 
 def test_what_sensors_add_is_no_part_of_the_recorded_perturbation(trained):

@@ -25,7 +25,6 @@ from benchmarks.quality import adaptive_baselines
 from sfkd_jax import build, control, evaluation, plants, policy, scenarios, store
 from sfkd_jax.evaluation import metrics
 from sfkd_jax.plants import equivalent_wind
-from sfkd_jax.rollout import with_offset
 from sfkd_jax.scenarios import random_side_forces
 
 SPEED = 3
@@ -164,18 +163,21 @@ class Rows(NamedTuple):
             settings, model, self.plant, law=self.loaded.law, **box
         )
 
-    def adaptive(self, model=None, **settings):
-        """The same planner, adapting."""
-        model = self.loaded.model if model is None else model
-        return control.adaptive(
-            self.planner(with_offset(model)),
-            model,
-            self.loaded.law,
-            coordinates=len(self.plant.state_names) - 1,
-            control_low=self.plant.control_low,
-            control_high=self.plant.control_high,
+    def adaptive(self, model=None, *, tube, estimate_env=False, **settings):
+        """The same planner, adapting, with the settings of its online tube."""
+        chosen = dict(self.loaded.settings["controller"], shield=False)
+        chosen |= {
+            "adaptation": chosen["adaptation"] | settings,
+            "online_tube": chosen["online_tube"] | tube,
+        }
+        return build.build_controller(
+            chosen,
+            self.loaded.model if model is None else model,
+            self.plant,
+            law=self.loaded.law,
+            env_source="estimated" if estimate_env else "measured",
+            adaptive=True,
             **self.box,
-            **settings,
         )
 
     def oracle(self, car):
@@ -191,7 +193,8 @@ def shipped(name):
 
 def with_tube(controller, **settings):
     """Calibrated while driving; slower with the default lane."""
-    return control.online_tube(controller, horizon=20, **settings)
+    tube = control.OnlineTube(inner=controller, horizon=20, **settings)
+    return tube.controller()
 
 
 def neural_ode(name, root):
@@ -241,30 +244,33 @@ def systems(rows, case, car, rival):
     own = rows.loaded.params
     unknown = {"estimate_env": case.estimate_env}
     knows = rows.planner(rows.oracle(car), bounded=False)
-    adapting = rows.adaptive(**unknown)
+    adapting = partial(rows.adaptive, **unknown)
     made = {
         "oracle that knows": (knows, {}, True),
         "SFKD": (rows.planner(rows.loaded.model), own, False),
-        "SFKD, adaptive": (with_tube(adapting, lane=None), own, False),
+        "SFKD, adaptive": (adapting(tube={"lane": None}), own, False),
     }
     if not (case.car or case.steering):
-        made["SFKD, adaptive, slower"] = (with_tube(adapting), own, False)
+        made["SFKD, adaptive, slower"] = (adapting(tube={}), own, False)
     if case.friction or case == CASES["nothing, S3"]:
-        careful = with_tube(adapting, grip=GRIP)
+        careful = adapting(tube={"grip": GRIP})
         made["SFKD, adaptive, cautious"] = (careful, own, False)
     if case.friction:
-        guessing = with_tube(rows.adaptive(estimate_env=True), grip=GRIP)
+        guessing = rows.adaptive(tube={"grip": GRIP}, estimate_env=True)
         made["SFKD, e estimated, cautious"] = (guessing, own, False)
         made["oracle told late, cautious"] = (with_tube(knows, grip=GRIP), {}, LATE)
     if case.force:
         nominal = rows.planner(rows.oracle(rows.plant))
         made["oracle that does not know"] = (nominal, {}, False)
     if case.rivals:
-        single, fast = rows.adaptive(**ONE_FILTER), rows.adaptive(**FAST_ONLY)
-        made["SFKD, one filter"] = (with_tube(single, lane=None), own, False)
-        made["SFKD, no slow causes"] = (with_tube(fast, lane=None), own, False)
+        single, fast = (
+            rows.adaptive(tube={"lane": None}, **change)
+            for change in (ONE_FILTER, FAST_ONLY)
+        )
+        made["SFKD, one filter"] = (single, own, False)
+        made["SFKD, no slow causes"] = (fast, own, False)
     if case.estimate_env:
-        best = rows.adaptive(rows.oracle(rows.plant), **unknown)
+        best = adapting(rows.oracle(rows.plant), tube={"lane": None})
         made["oracle, e estimated"] = (best, {}, False)
     return made | (baselines(rows, rival) if case.rivals else {})
 

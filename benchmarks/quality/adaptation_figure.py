@@ -57,7 +57,7 @@ def drives(name, episode):
     made, keys = adaptation.roads(plant, CASE, EPISODES, SECONDS, SEED)
     scene, key = jax.tree.map(lambda leaf: leaf[episode], (made, keys))
     plain = adaptation.with_tube(rows.planner(loaded.model), lane=None)
-    adapting = adaptation.with_tube(rows.adaptive(), lane=None)
+    adapting = rows.adaptive(tube={"lane": None})
     shown = {"not adapting": plain, "adapting": adapting}
     made = {
         label: drive(rows, controller, scene, key)

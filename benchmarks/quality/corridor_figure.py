@@ -38,7 +38,8 @@ def drives(car, seconds, seed):
         )[0]
 
     def free(kind, onset, key):
-        return shield.drive(car, shield.scripted(car, kind, onset), road, key)[0]
+        alone = shield.alone(car, shield.scripted(car, kind, onset))
+        return shield.drive(car, alone, road, key)[0]
 
     kinds = np.repeat(
         [*map(shield.SCRIPTS.index, SHOWN), lock], [EACH] * len(SHOWN) + [LATE]

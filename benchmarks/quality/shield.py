@@ -20,7 +20,7 @@ from benchmarks import harness
 from benchmarks.quality.shield_table import ASKED, FLAGS, misses, table
 from benchmarks.robustness.soak import ENVIRONMENT, LANE
 from sfkd_jax import build, policy, scenarios
-from sfkd_jax.control import PathLaw, curvature_ahead, path_coordinates
+from sfkd_jax.control import PathLaw, along_reference
 from sfkd_jax.evaluation import first_reference
 from sfkd_jax.geometry import LATERAL
 from sfkd_jax.plants import Vehicle
@@ -79,13 +79,11 @@ def scripted(car, kind, onset=0):
     """
     low, high = jnp.asarray(car.plant.control_low), jnp.asarray(car.plant.control_high)
 
-    def act(params, state, observation, env, reference):
+    def act(params, state, xi, env, preview):
         key, step = state
         side_key, period_key, now = (
             jax.random.fold_in(key, stream) for stream in (0, 1, 2 + step)
         )
-        curvature = curvature_ahead(reference)[0]
-        xi = path_coordinates(observation, reference[0], curvature)
         side = jax.random.rademacher(side_key, (2,), float)
         period = jax.random.uniform(period_key, minval=1.0, maxval=8.0)
         swing = jnp.where(jnp.mod(step * car.plant.dt / period, 1.0) < 0.5, 1.0, -1.0)
@@ -97,12 +95,14 @@ def scripted(car, kind, onset=0):
             "constant": side,
             "NaN": jnp.full(2, jnp.nan),
         }
-        lawful = car.law(xi, curvature, reference[0, 3], env)
+        lawful = car.law(xi, *preview.road[0], env)
         args = [lawful + share * car.law.perturbation for share in shares.values()]
         control = jnp.stack([*args, jnp.where(side > 0.0, high, low)])[
             jnp.where(step < onset, 0, kind)
         ]
-        return jnp.clip(control, low, high), (key, step + 1), {}
+        ahead = jnp.tile(xi, (preview.road.shape[0], 1))
+        info = {"predicted_states": ahead}
+        return jnp.clip(control, low, high), (key, step + 1), info
 
     return Controller(lambda key: (key, jnp.zeros((), jnp.int32)), act)
 
@@ -122,11 +122,17 @@ def planner(car, *, shield):
     )
 
 
+def alone(car, controller):
+    """A controller along a path in the world."""
+    return along_reference(controller, coordinates=car.law.gain.shape[-1])
+
+
 def shielded(car, controller):
     """The same controller in the certified corridor."""
-    return build.in_corridor(
+    guarded = build.in_corridor(
         controller, car.trained.model, car.plant, car.law, car.certificate
     )
+    return alone(car, guarded)
 
 
 def drive(car, controller, road, key):
@@ -158,12 +164,12 @@ def drive_states(car, controller, road, key):
             road.path, state[:2], progress + road.speed * car.plant.dt
         )
         message = {}
-        if "copy" in info:
-            message = {name: info[name] for name in ("void", "broken")} | {
-                "infeasible": ~info["feasible"]
-            }
-            message |= {
-                "copy": info["copy"][LATERAL],
+        if "nominal_state" in info:
+            message = {
+                "void": info["outside_box"],
+                "broken": info["bound_exceeded"],
+                "infeasible": ~info["feasible"],
+                "copy": info["nominal_state"][LATERAL],
                 "intervened": info["intervention"] > 0.0,
             }
         return (state, progress, memory), (state, lateral, message)
@@ -229,7 +235,7 @@ def of_scripts(car, args, show):
         return drive(car, shielded(car, scripted(car, kind)), road, key)
 
     def free(kind, road, key):
-        return drive(car, scripted(car, kind), road, key)
+        return drive(car, alone(car, scripted(car, kind)), road, key)
 
     ways = {
         name: jax.jit(jax.vmap(way, (None, 0, 0)))

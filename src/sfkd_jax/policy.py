@@ -148,7 +148,7 @@ def load(
         env_source: "estimated" for a policy in path coordinates that estimates the
             environment and ignores the one it is given.
         adaptive: whether a policy in path coordinates estimates unmeasured forces and
-            errors of its inputs while driving, see `control.adaptive`.
+            errors of its inputs while driving, see `control.Adaptation`.
 
     Raises:
         ArtefactError: as `restore`, or a certificate that does not hold.

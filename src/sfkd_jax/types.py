@@ -247,14 +247,17 @@ class ControllerInfo(TypedDict, total=False):
     gains: Float[Array, "control state"]  # du/dx of the plan, see `between_plans`
     # koopman_mpc
     residual: Scalar  # of the quadratic program, in control units
-    # adaptive
+    # along_reference
+    path_state: Float[Array, " coordinate"]  # ξ; NaN where it is not known
+    planned_path: Float[Array, "horizon coordinate"]  # predicted ξ of the chosen plan
+    # Adaptation
     env_estimate: Float[Array, " environment"]  # the e planned with
     causes: Float[Array, " 5"]  # force, steering, drive; steering and force in turns
     causes_std: Float[Array, " 5"]  # standard deviations of the estimates
     rejected: Bool[Array, ""]  # nothing was learned from the measurement
     adapting: Bool[Array, ""]  # the causes do not predict worse than none
     weights_changed: Bool[Array, ""]  # since the first step
-    # online_tube
+    # OnlineTube
     tube: Float[Array, " horizon"]  # radius around the plan [m]
     tube_errors: Float[Array, " horizon"]  # of the plans of 1 … horizon steps ago [m]
     tube_missed: Bool[Array, " horizon"]  # an error exceeds the radius it had
@@ -265,22 +268,22 @@ class ControllerInfo(TypedDict, total=False):
     arrival_state: Float[
         Array, " state"
     ]  # predicted state at which the control arrives
-    # shielded
-    margin: Scalar  # distance of the nominal copy to the edge of its corridor [m]
+    # Shield
+    margin: Scalar  # distance of the nominal model to the edge of its corridor [m]
     intervention: Scalar  # share of the request that was removed, in [0, 1]
     perturbation: Float[
         Array, " control"
     ]  # ν applied on top of the law, in control units
-    copy: Float[Array, " coordinate"]  # path coordinates of the nominal copy
-    copy_distance: Scalar  # |e_y| between vehicle and copy [m]
+    nominal_state: Float[Array, " coordinate"]  # path coordinates of the nominal model
+    nominal_distance: Scalar  # |e_y| between vehicle and nominal model [m]
     corridor: Scalar  # certified half width [m]
     feasible: Bool[Array, ""]  # margin is not negative
-    broken: Bool[Array, ""]  # copy_distance exceeds the certified bound
-    void: Bool[Array, ""]  # outside the boxes of the certificate
+    bound_exceeded: Bool[Array, ""]  # nominal_distance exceeds the certified bound
+    outside_box: Bool[Array, ""]  # outside the boxes of the certificate
     dead_reckoning: Bool[Array, ""]  # observation or reference is not finite
     request_finite: Bool[Array, ""]  # the filtered controller gave a finite control
     interventions: Int[Array, ""]  # number of steps with an intervention so far
-    broken_steps: Int[Array, ""]  # number of broken steps so far
+    exceeded_steps: Int[Array, ""]  # number of steps with bound_exceeded so far
     shield_healthy: Bool[Array, ""]  # feasible, and the certificate applies
 
 
@@ -290,12 +293,13 @@ class Controller(NamedTuple):
     Attributes:
         init: key -> controller state.
         act: (params, controller_state, observation, env, reference) -> (control,
-            controller_state, info).
+            controller_state, info); what stands for observation and reference is up to
+            the task, see `control.free_task` and `control.along_reference`.
     """
 
     init: Callable[[Key], Any]
     act: Callable[
-        [Params, Any, State, Environment, Reference],
+        [Params, Any, State, Environment, Any],
         tuple[Control, Any, ControllerInfo],
     ]
 

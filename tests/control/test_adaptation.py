@@ -10,9 +10,8 @@ from helpers import ENV_HIGH, ENV_LOW, any_law, certified, jit, model_and_params
 
 from sfkd_jax import build, certification, control, models, plants
 from sfkd_jax.certification._exported import exported
-from sfkd_jax.control.wrappers import _disturbances as disturbances
-from sfkd_jax.control.wrappers import _kalman as kalman
-from sfkd_jax.control.wrappers._adaptation import BOUNDS
+from sfkd_jax.control.wrappers import _estimator as estimator
+from sfkd_jax.control.wrappers._adaptation import _compensation
 from sfkd_jax.geometry import path_state
 from sfkd_jax.rollout import Offset, with_offset
 from sfkd_jax.types import BODY, Controller
@@ -20,11 +19,10 @@ from sfkd_jax.types import BODY, Controller
 PLANT, LAW = plants.kinematic(), any_law()
 MODEL = models.physics(build.build_loop(PLANT, LAW).step, along_path=True)
 """The true loop as a model, so that every estimate has an exact answer."""
-LOOP = disturbances.Loop(MODEL, LAW, jnp.asarray(ENV_LOW), jnp.asarray(ENV_HIGH))
+LOOP = estimator.Loop(MODEL, LAW, jnp.asarray(ENV_LOW), jnp.asarray(ENV_HIGH))
 NOISE = np.float32([0.015, 0.002, 0.03])
 STEPS = 120
 SETTINGS = {
-    "coordinates": 3,
     "control_low": PLANT.control_low,
     "control_high": PLANT.control_high,
     "env_low": ENV_LOW,
@@ -36,24 +34,19 @@ HORIZON = 4
 def law_alone():
     """A controller along a path whose plan is the law, with offset parameters."""
 
-    def act(params, state, observation, env, reference):
-        curvature = control.curvature_ahead(reference)[0]
-        xi = control.path_coordinates(observation, reference[0], curvature)
-        wanted = LAW(xi, curvature, reference[0, 3], env)
-        ahead = jnp.tile(observation, (reference.shape[0], 1))
-        info = {
-            "healthy": jnp.asarray(True),
-            "predicted_states": ahead,
-            "seen": observation,
-        }
-        return wanted, state, info
+    def act(params, state, xi, env, preview):
+        ahead = jnp.tile(xi, (HORIZON, 1))
+        info = {"healthy": jnp.asarray(True), "predicted_states": ahead, "seen": xi}
+        return LAW(xi, *preview.road[0], env), state, info
 
     return Controller(lambda key: jnp.zeros(()), act)
 
 
 @cache
 def adaptive(**settings):
-    return control.adaptive(law_alone(), MODEL, LAW, **SETTINGS | settings)
+    options = SETTINGS | {"inner": law_alone(), "model": MODEL, "law": LAW} | settings
+    adaptation = control.Adaptation(**options)
+    return control.along_reference(adaptation.controller(), coordinates=3)
 
 
 def road(time, speed=10.0):
@@ -103,7 +96,7 @@ def driver(**settings):
 
     @jit
     def run(seed, force, steering, noise, fault):
-        pushed = disturbances.split_force(LOOP, env, force)[0]
+        pushed = LOOP.split_force(env, force)[0]
 
         def step(carry, inputs):
             state, memory, last = carry
@@ -114,7 +107,7 @@ def driver(**settings):
             seen = jax.lax.switch(fault, FAULTS, time, seen, last)
             action, memory, info = controller.act({}, memory, seen, env, road(time))
             state = PLANT.step(state, action.at[0].add(steering), pushed)
-            return (state, memory, seen), (info, memory.belief)
+            return (state, memory, seen), (info, memory.inner.belief)
 
         start = jnp.asarray([0.0, 0.0, 0.0, 10.0])
         carry = (start, controller.init(jax.random.key(0)), start)
@@ -176,13 +169,13 @@ def test_one_filter_is_the_textbook_kalman_filter():
     H = np.eye(2, 3)
     gain = ahead @ H.T @ np.linalg.inv(H @ ahead @ H.T + np.diag(sensors))
     expected = mean + gain @ (measured - H @ mean), (np.eye(3) - gain @ H) @ ahead
-    covariance = kalman.propagated(
+    covariance = estimator.propagated(
         jnp.asarray(root @ root.T)[None],
         jnp.asarray(slope)[None],
         jnp.asarray(noise)[None],
     )
-    bank = kalman.Bank(jnp.asarray(mean)[None], covariance, jnp.ones(1))
-    bank, explained = kalman.corrected(
+    bank = estimator.Bank(jnp.asarray(mean)[None], covariance, jnp.ones(1))
+    bank, explained = estimator.corrected(
         bank, jnp.asarray(measured), jnp.asarray(sensors)
     )
     assert explained
@@ -195,12 +188,12 @@ def test_mixing_keeps_mean_and_total_variance():
     random = np.random.default_rng(1)
     roots = random.normal(size=(3, 2, 2))
     chain = random.dirichlet(np.ones(3), size=3)
-    before = kalman.Bank(
+    before = estimator.Bank(
         jnp.asarray(random.normal(size=(3, 2))),
         jnp.asarray(roots @ roots.transpose(0, 2, 1)),
         jnp.asarray(random.dirichlet(np.ones(3))),
     )
-    after = kalman.mixed(before, jnp.asarray(chain))
+    after = estimator.mixed(before, jnp.asarray(chain))
     np.testing.assert_allclose(after.probabilities.sum(), 1.0, atol=1e-6)
     np.testing.assert_allclose(after.mean(), before.mean(), atol=1e-6)
     np.testing.assert_allclose(after.variance(), before.variance(), rtol=1e-5)
@@ -210,23 +203,23 @@ def test_mixing_keeps_mean_and_total_variance():
 def test_a_constant_side_force_is_found(force):
     info, _ = drive(force=force, shrinkage=0.0)
     causes = info["causes"][-20:]
-    np.testing.assert_allclose(causes[:, disturbances.FORCE], force, atol=0.05)
-    np.testing.assert_allclose(causes[:, disturbances.STEERING], 0.0, atol=0.002)
+    np.testing.assert_allclose(causes[:, estimator.FORCE], force, atol=0.05)
+    np.testing.assert_allclose(causes[:, estimator.STEERING], 0.0, atol=0.002)
 
 
 def test_a_wrong_steering_angle_is_found_and_removed():
     info, _ = drive(steering=0.02)
     causes = info["causes"][-20:]
-    np.testing.assert_allclose(causes[:, disturbances.STEERING], 0.02, atol=1e-3)
+    np.testing.assert_allclose(causes[:, estimator.STEERING], 0.02, atol=1e-3)
     assert np.all(info["adapting"][20:])
-    assert np.abs(info["seen"][-20:, 1]).max() < 0.01
+    assert np.abs(info["seen"][-20:, 0]).max() < 0.01
 
 
 def test_without_causes_noise_is_not_taken_for_one():
     """The shrunk force is less than 6 % of the largest one of E, root mean square."""
     info, _ = drive(noise=1.0)
-    assert np.sqrt(np.mean(info["causes"][20:, disturbances.FORCE] ** 2)) < 0.06
-    assert np.abs(info["causes"][60:, disturbances.STEERING]).max() < 0.004
+    assert np.sqrt(np.mean(info["causes"][20:, estimator.FORCE] ** 2)) < 0.06
+    assert np.abs(info["causes"][60:, estimator.STEERING]).max() < 0.004
 
 
 def test_the_true_cause_lies_within_the_reported_spread():
@@ -270,8 +263,7 @@ def test_a_few_lost_measurements_are_bridged_by_the_estimate_and_reported():
 def test_hostile_measurements_leave_finite_bounded_estimates():
     info, belief = drive(fault=hostile, force=0.5, noise=1.0)
     assert all(np.isfinite(leaf).all() for leaf in jax.tree.leaves(belief.bank))
-    largest = [BOUNDS[k] for k in range(5)]
-    assert np.all(np.abs(info["causes"]) <= largest)
+    assert np.all(np.abs(info["causes"]) <= estimator.BOUNDS)
     diagonals = np.diagonal(belief.bank.covariances, axis1=-2, axis2=-1)
     assert diagonals.min() >= 0.0
     np.testing.assert_allclose(belief.bank.probabilities.sum(axis=-1), 1.0, atol=1e-4)
@@ -298,48 +290,17 @@ def test_changed_weights_are_noticed():
         assert not info["healthy"]
 
 
-@pytest.mark.exhaustive
-def test_a_hundred_thousand_hostile_steps_leave_finite_bounded_estimates():
-    controller, env = adaptive(), jnp.asarray([0.7, 0.0])
-    limits = jnp.asarray([BOUNDS[k] for k in range(5)])
-
-    def step(carry, inputs):
-        state, memory, last = carry
-        time, key = inputs
-        state = state.at[0].set(0.0)
-        seen = state.at[1:4].add(NOISE * jax.random.normal(key, (3,)))
-        which = (time // 500).astype(int) % len(FAULTS)
-        seen = jax.lax.switch(which, FAULTS, time % 120.0, seen, last)
-        action, memory, info = controller.act({}, memory, seen, env, road(0.0))
-        force = 0.5 * jnp.sign(jnp.sin(time / 40.0))
-        state = PLANT.step(state, action, disturbances.split_force(LOOP, env, force)[0])
-        state = jnp.where(jnp.abs(state[1]) < 5.0, state, start)
-        bank = memory.belief.bank
-        fine = jnp.stack([jnp.isfinite(leaf).all() for leaf in jax.tree.leaves(bank)])
-        fine = fine.all() & jnp.all(jnp.abs(info["causes"]) <= limits)
-        fine &= (
-            jnp.isfinite(action).all() & (bank.covariances.diagonal(0, 1, 2) >= 0).all()
-        )
-        return (state, memory, seen), fine
-
-    start = jnp.asarray([0.0, 0.0, 0.0, 10.0])
-    keys = jax.random.split(jax.random.key(1), 100_000)
-    carry = (start, controller.init(jax.random.key(0)), start)
-    times = jnp.arange(100_000, dtype=float)
-    fine = jit(lambda: jax.lax.scan(step, carry, (times, keys))[1])()
-    assert bool(fine.all())
-
-
 def test_causes_that_predict_worse_than_none_are_not_used():
     """The scores of the last seconds decide."""
     controller = adaptive()
     state = controller.init(jax.random.key(0))
-    belief = state.belief._replace(
+    belief = state.inner.belief._replace(
         scores=jnp.asarray([2.0, 1.0]), started=jnp.asarray(True)
     )
+    state = state._replace(inner=state.inner._replace(belief=belief))
     act = jit(controller.act)
     inputs = jnp.asarray([0.0, 0.0, 0.0, 10.0]), jnp.asarray([0.7, 0.0]), road(0.0)
-    _, _, info = act({}, state._replace(belief=belief), *inputs)
+    _, _, info = act({}, state, *inputs)
     assert not info["adapting"]
     np.testing.assert_array_equal(info["causes"], 0.0)
 
@@ -348,7 +309,7 @@ def test_a_force_beyond_the_box_is_balanced_without_a_lateral_error():
     """At the fixed point of the linearised loop with d and its steering, e_y = 0."""
     env, turn = jnp.asarray([0.7, 8.0]), jnp.asarray([0.0, 10.0])
     xi = LAW.turn(turn[0], turn[1], env).state.at[2].set(10.0)
-    compensate = jit(partial(disturbances.compensation, LOOP))
+    compensate = jit(partial(_compensation, LOOP))
     offset = compensate({}, env, turn, xi, jnp.asarray(0.3))
     assert abs(float(offset.inputs[0])) > 1e-3
     shifted = with_offset(MODEL)
@@ -386,7 +347,7 @@ def test_an_input_that_is_not_finite_leaves_a_finite_control_and_belief(broken):
         action, state, info = act({}, state, *inputs.values())
         assert info["healthy"] == (inputs is good)
         assert all(
-            np.isfinite(leaf).all() for leaf in jax.tree.leaves(state.belief.bank)
+            np.isfinite(leaf).all() for leaf in jax.tree.leaves(state.inner.belief.bank)
         )
         if inputs is good:
             assert np.isfinite(action).all()
@@ -396,7 +357,8 @@ def test_the_belief_can_be_saved_and_resumed():
     _, belief = drive(force=0.5)
     last = jax.tree.map(lambda leaf: jnp.asarray(leaf[-1]), belief)
     controller = adaptive()
-    fresh = controller.init(jax.random.key(0))._replace(belief=last)
+    fresh = controller.init(jax.random.key(0))
+    fresh = fresh._replace(inner=fresh.inner._replace(belief=last))
     coordinates = last.bank.mean()[:3]
     seen = jnp.concatenate([jnp.asarray([120.0]), coordinates])
     _, _, info = jit(controller.act)(
@@ -413,14 +375,9 @@ def test_the_belief_can_be_saved_and_resumed():
         ({"sensor_noise": (0.1,)}, "sensor_noise"),
         ({"model_error": (0.0, 0.1, 0.1)}, "model_error"),
         ({"patience": 0}, "patience"),
+        ({"model": models.physics(PLANT.step)}, "path coordinates"),
     ],
 )
 def test_invalid_settings_are_refused_by_name(change, word):
     with pytest.raises(ValueError, match=word):
-        control.adaptive(law_alone(), MODEL, LAW, **SETTINGS | change)
-
-
-def test_a_model_in_the_world_is_refused():
-    world = models.physics(PLANT.step)
-    with pytest.raises(ValueError, match="path coordinates"):
-        control.adaptive(law_alone(), world, LAW, **SETTINGS)
+        adaptive.__wrapped__(**change)

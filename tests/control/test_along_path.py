@@ -1,6 +1,7 @@
 """Planning in path coordinates: projection, curvature preview, and limits of ν."""
 
 from functools import partial
+from pathlib import Path
 
 import jax
 import jax.numpy as jnp
@@ -8,12 +9,15 @@ import numpy as np
 import pytest
 from helpers import any_law, tiny
 
+import sfkd_jax
 from sfkd_jax import build, control, plants
 from sfkd_jax.control import curvature_ahead, path_coordinates, turn_control
+from sfkd_jax.control.tasks import _along_path
 from sfkd_jax.geometry import compose
 from sfkd_jax.scenarios import path_from_curvature, reference_window
 
 PLANT = plants.kinematic()
+SHIPPED = Path(sfkd_jax.__file__).parent / "pretrained"
 LAW = any_law()
 ENV = jnp.asarray([0.6, 2.0])
 LIMITS = {
@@ -34,7 +38,8 @@ def bend(slope=1e-4):
 def planner(samples, **options):
     model = build.reference_systems(PLANT, LAW)["oracle"].model
     task = control.following_law(model, control.tracking_cost(dt=0.1), LAW, **LIMITS)
-    return control.mppi(task, num_samples=samples, noise_std=(0.01, 0.2), **options)
+    along = control.mppi(task, num_samples=samples, noise_std=(0.01, 0.2), **options)
+    return control.along_reference(along, coordinates=3)
 
 
 def test_the_curvature_of_every_step_is_seen_ahead():
@@ -74,16 +79,15 @@ def test_what_is_added_to_the_law_stays_within_its_bounds():
     reference, _ = bend()
     controller = planner(64, temperature=0.1)
     loud = controller.init(jax.random.key(0))
-    loud = loud._replace(
-        tuning=loud.tuning._replace(noise_std=jnp.asarray([1.0, 10.0]))
-    )
+    noisy = control.tuned(loud.inner, noise_std=jnp.asarray([1.0, 10.0]))
+    loud = loud._replace(inner=noisy)
     state = jnp.asarray([30.0, 2.5, 0.3, 6.0])
     action, after, _ = jax.jit(controller.act)({}, loud, state, ENV, reference)
     curvature = curvature_ahead(reference)[0]
     xi = path_coordinates(state, reference[0], curvature)
     added = action - turn_control(LAW.turn(curvature, jnp.asarray(9.0), ENV), xi)
     assert np.all(np.abs(added) <= LAW.perturbation + 1e-6)
-    assert np.all(np.abs(after.plan) <= LAW.perturbation + 1e-6)
+    assert np.all(np.abs(after.inner.plan) <= LAW.perturbation + 1e-6)
 
 
 def test_predicted_states_lie_where_the_car_then_is():
@@ -126,3 +130,24 @@ def test_a_model_of_the_world_is_refused():
     )
     with pytest.raises(ValueError, match=r"model\.frame=path"):
         make(tiny())
+
+
+def test_a_step_of_the_adaptive_policy_projects_once_and_never_back(monkeypatch):
+    """Planner, shield, estimator and tube work on the same ξ."""
+    calls = []
+    project = _along_path.path_coordinates
+    monkeypatch.setattr(
+        _along_path,
+        "path_coordinates",
+        lambda *given: calls.append(given) or project(*given),
+    )
+    policy = sfkd_jax.load(SHIPPED / "kinematic_path", adaptive=True)
+    observation, reference = jnp.asarray([29.1, 0.1, 0.0, 9.0]), bend()[0]
+    state = policy.controller.init(jax.random.key(0))
+    jax.eval_shape(
+        policy.controller.act, policy.params, state, observation, ENV, reference
+    )
+    assert len(calls) == 1
+    sources = Path(control.__file__).parent.rglob("*.py")
+    naming = [path.name for path in sources if "path_coordinates(" in path.read_text()]
+    assert naming == ["_along_path.py"]

@@ -108,29 +108,43 @@ def path_model():
     return model, jit(partial(fold, model))(jit(model.init)(jax.random.key(0)))
 
 
+def along(controller):
+    """A controller along a path as one in the world."""
+    return control.along_reference(controller, coordinates=3)
+
+
 def shielded():
     """With a filter, in path coordinates."""
-    law, limits = any_law(), LIMITS | BOX
-    model, params = path_model()
-    filtered = control.shielded(
-        around_law(model, law), model, law, width=0.5, tube=0.2, horizon=8, **limits
+    law, (model, params) = any_law(), path_model()
+    shield = control.Shield(
+        inner=around_law(model, law),
+        model=model,
+        law=law,
+        width=0.5,
+        tube=0.2,
+        horizon=8,
+        control=(LIMITS["control_low"], LIMITS["control_high"]),
+        conditions=control.Conditions(env=(BOX["env_low"], BOX["env_high"])),
     )
-    return filtered, params
+    return along(shield.controller()), params
 
 
-def adaptive(**settings):
+def adaptive():
     """With estimates of unmeasured causes, in path coordinates."""
-    law, limits = any_law(), LIMITS | BOX
-    model, params = path_model()
+    law, (model, params) = any_law(), path_model()
     planner = around_law(with_offset(model), law)
-    adapted = control.adaptive(planner, model, law, coordinates=3, **limits, **settings)
-    return adapted, params
+    adaptation = control.Adaptation(
+        inner=planner, model=model, law=law, **LIMITS, **BOX
+    )
+    return along(adaptation.controller()), params
 
 
 def online_tube():
     """With a tube calibrated while driving, and a lane that is too narrow for it."""
-    controller, params = mppi(FEEDBACK)
-    return control.online_tube(controller, horizon=HORIZON, lane=0.02), params
+    law, (model, params) = any_law(), path_model()
+    inner = along(around_law(model, law))
+    tube = control.OnlineTube(inner=inner, horizon=HORIZON, lane=0.02)
+    return tube.controller(), params
 
 
 def constrained():
@@ -167,7 +181,6 @@ WRAPPERS = {
     "delay_compensated": delay_compensated,
     "shielded": shielded,
     "adaptive": adaptive,
-    "estimating": partial(adaptive, estimate_env=True),
     "online_tube": online_tube,
 }
 BUILDERS = PLANNERS | VARIANTS | WRAPPERS
@@ -176,8 +189,6 @@ BUILDERS = PLANNERS | VARIANTS | WRAPPERS
 """
 DETERMINISTIC = ("gradient", "koopman_mpc")
 """Those whose plan does not depend on the key."""
-IGNORING_ENV = ("estimating",)
-"""Those that do not read the environment, so that NaN there does not matter."""
 
 every = pytest.mark.parametrize("name", BUILDERS)
 every_but_mppi = pytest.mark.parametrize(
@@ -291,10 +302,7 @@ def test_controls_are_finite_and_within_the_limits_whatever_is_seen(name):
 def test_an_input_that_is_not_finite_is_reported_and_the_next_clean_step_recovers(name):
     _, info, _ = drive(name)
     healthy = np.asarray(info["healthy"])[:7]
-    broken = {BLACKOUTS[entry] for entry in BLACKOUTS if entry != "env"}
-    if name not in IGNORING_ENV:
-        broken.add(BLACKOUTS["env"])
-    assert set(np.flatnonzero(~healthy)) == broken
+    assert set(np.flatnonzero(~healthy)) == set(BLACKOUTS.values())
     assert np.all(np.isfinite(np.asarray(info["predicted_states"])[:7][healthy]))
 
 

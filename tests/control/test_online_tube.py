@@ -13,13 +13,15 @@ HORIZON, STEPS, LEVEL, RATE = 5, 600, 0.9, 0.2
 
 
 def straight_plan():
-    """A planner that predicts the reference itself and reports its speed."""
+    """A planner that predicts the path itself and reports the speed asked of it."""
 
-    def act(params, state, observation, env, reference):
-        info = {"predicted_states": reference, "asked": reference[-1, 3]}
+    def act(params, state, xi, env, preview):
+        ahead = jnp.zeros((HORIZON, 3)).at[:, 2].set(preview.road[:, 1])
+        info = {"predicted_states": ahead, "asked": preview.road[-1, 1]}
         return jnp.zeros(2), state, info
 
-    return Controller(lambda key: jnp.zeros(()), act)
+    planner = Controller(lambda key: jnp.zeros(()), act)
+    return control.along_reference(planner, coordinates=3)
 
 
 def circle(curvature, speed=10.0, dt=0.1):
@@ -33,7 +35,7 @@ def circle(curvature, speed=10.0, dt=0.1):
 def follow(laterals, reference=None, **settings):
     """Infos while the car is at the given distances left of a path."""
     options = {"horizon": HORIZON, "level": LEVEL, "rate": RATE} | settings
-    controller = control.online_tube(straight_plan(), **options)
+    controller = control.OnlineTube(inner=straight_plan(), **options)
     reference = straight(HORIZON) if reference is None else reference
     reference = jnp.asarray(reference, dtype=float)
 
@@ -64,15 +66,12 @@ ADVERSARIES = {
 def test_the_share_of_misses_is_bounded_by_the_change_of_the_radius(name):
     """|misses / N − (1 − level)| ≤ |log(r_N / r_0)| / (γ N), for every horizon."""
     info = follow(ADVERSARIES[name])
-    start = control.online_tube(straight_plan(), horizon=HORIZON).init(
-        jax.random.key(0)
-    )
     compared = np.isfinite(info["tube_errors"])
     for h in range(HORIZON):
         count = compared[:, h].sum()
         assert count == STEPS - h - 1
         share = info["tube_missed"][compared[:, h], h].mean()
-        change = np.log(info["tube"][-1, h] / float(start.radii[h]))
+        change = np.log(info["tube"][-1, h] / control.OnlineTube.start_radius)
         bound = abs(change) / (RATE * count)
         assert abs(share - (1.0 - LEVEL)) <= bound + 1e-3
 
@@ -147,4 +146,4 @@ def test_measurements_that_are_not_finite_change_no_radius():
 )
 def test_invalid_settings_are_refused_by_name(change, word):
     with pytest.raises(ValueError, match=word):
-        control.online_tube(straight_plan(), horizon=HORIZON, **change)
+        control.OnlineTube(inner=straight_plan(), horizon=HORIZON, **change)

@@ -155,8 +155,8 @@ def _controller_schema(name: str, planner: Planner) -> type:
     wrappers = {
         "feedback": (control.path_feedback, ()),
         "model_law": (control.ModelLaw, ()),
-        "adaptation": (control.adaptive, ("coordinates", "estimate_env")),
-        "online_tube": (control.online_tube, ("horizon",)),
+        "adaptation": (control.Adaptation, ("inner", "model", "law", "estimate_env")),
+        "online_tube": (control.OnlineTube, ("inner", "horizon")),
     }
     parts |= {
         part: schema(part.title(), None, factory, skip=(*given, *decided))
@@ -226,15 +226,20 @@ def build_controller(
                 "a model in path coordinates needs controller.sampling=law and its law"
             )
         # Whoever estimates e learns the unmeasured forces with the same filter.
-        adaptive |= env_source == "estimated"
-        planned = with_offset(model) if adaptive else model
-        planner = _searching(searches, planned, plant, box, law)
-        if certificate and certificate.get("corridor") and searches.shield:
-            planner = in_corridor(planner, planned, plant, law, certificate)
-        if not adaptive:
-            return planner
         estimates = env_source == "estimated"
-        return _adaptive(planner, searches, model, plant, law, box, estimates)
+        adaptive |= estimates
+        planned = with_offset(model) if adaptive else model
+        along = _along(searches, planned, plant, box, law, certificate)
+        if adaptive:
+            along = _adaptive(searches, along, model, plant, box, law, estimates)
+        size = law.gain.shape[-1]
+        # Here and nowhere else observation and reference become ξ and preview.
+        controller = control.along_reference(along, coordinates=size)
+        if not adaptive:
+            return controller
+        options = arguments(searches.online_tube, control.OnlineTube)
+        tube = control.OnlineTube(inner=controller, horizon=searches.horizon, **options)
+        return tube.controller()
     if env_source == "estimated":
         raise ValueError(
             "environment.source=estimated needs a model in path coordinates: "
@@ -331,7 +336,7 @@ def in_corridor(
     the corridor, since the claim holds there, whether or not the data reach that far.
 
     Args:
-        planner: any controller that needs no other input than that of `Controller.act`.
+        planner: any controller along a path, see `control.along_reference`.
         model: in path coordinates.
         plant: vehicle, whose limits the controls keep.
         law: around which the model was learned.
@@ -346,46 +351,58 @@ def in_corridor(
     state_low, state_high = (list(side) for side in boxes["state"])
     state_low[LATERAL] = min(state_low[LATERAL], -edge)
     state_high[LATERAL] = max(state_high[LATERAL], edge)
-    return control.shielded(
-        planner,
-        model,
-        law,
+    env_low, env_high = map(tuple, boxes["env"])
+    return control.Shield(
+        inner=planner,
+        model=model,
+        law=law,
         width=bounds["nominal"],
         tube=bounds["followed_position"],
         horizon=corridor["shield_horizon"],
         noise_allowance=allowance,
-        control_low=plant.control_low,
-        control_high=plant.control_high,
-        env_low=tuple(boxes["env"][0]),
-        env_high=tuple(boxes["env"][1]),
-        state_low=tuple(state_low),
-        state_high=tuple(state_high),
-        preview_low=low,
-        preview_high=high,
-    )
+        control=(plant.control_low, plant.control_high),
+        conditions=control.Conditions(
+            env=(env_low, env_high),
+            state=(tuple(state_low), tuple(state_high)),
+            road=(low, high),
+        ),
+    ).controller()
 
 
-def _adaptive(
-    planner: Controller,
+def _along(
     settings: SearchSettings,
     model: Model,
     plant: plants.Vehicle,
-    law: control.PathLaw,
     box: Mapping[str, Any],
+    law: control.PathLaw,
+    certificate: Mapping[str, Any] | None,
+) -> Controller:
+    """Return the planner along a path, with its shield if it has one."""
+    planner = _searching(settings, model, plant, box, law)
+    if certificate and certificate.get("corridor") and settings.shield:
+        return in_corridor(planner, model, plant, law, certificate)
+    return planner
+
+
+def _adaptive(
+    settings: SearchSettings,
+    inner: Controller,
+    model: Model,
+    plant: plants.Vehicle,
+    box: Mapping[str, Any],
+    law: control.PathLaw,
     estimate_env: bool,
 ) -> Controller:
+    """Return the controller along a path with adaptation, still along a path."""
     if None in box.values():
         raise ValueError("adaptation needs environment.low and environment.high")
-    adaptive = control.adaptive(
-        planner,
-        model,
-        law,
-        coordinates=len(plant.state_names) - 1,
+    return control.Adaptation(
+        inner=inner,
+        model=model,
+        law=law,
         control_low=plant.control_low,
         control_high=plant.control_high,
         **box,
         estimate_env=estimate_env,
-        **arguments(settings.adaptation, control.adaptive),
-    )
-    options = arguments(settings.online_tube, control.online_tube)
-    return control.online_tube(adaptive, horizon=settings.horizon, **options)
+        **arguments(settings.adaptation, control.Adaptation),
+    ).controller()

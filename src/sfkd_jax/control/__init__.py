@@ -1,6 +1,5 @@
 """Controllers: tasks, planners, feedback laws and wrappers, for any dynamics."""
 
-from sfkd_jax.control.laws._derived_law import derive_path_law as derive_path_law
 from sfkd_jax.control.laws._model_law import ModelLaw as ModelLaw
 from sfkd_jax.control.laws._model_law import SteadyTurn as SteadyTurn
 from sfkd_jax.control.laws._path_errors import FeedbackLaw as FeedbackLaw
@@ -12,6 +11,7 @@ from sfkd_jax.control.laws._path_errors import (
     reference_curvature as reference_curvature,
 )
 from sfkd_jax.control.laws._path_law import PathLaw as PathLaw
+from sfkd_jax.control.laws._path_law import derive_path_law as derive_path_law
 from sfkd_jax.control.laws._path_law import law_from_arrays as law_from_arrays
 from sfkd_jax.control.laws._path_law import law_to_arrays as law_to_arrays
 from sfkd_jax.control.laws._path_law import turn_control as turn_control
@@ -46,6 +46,8 @@ from sfkd_jax.control.planners._weights import softmin as softmin
 from sfkd_jax.control.planners._weights import (
     temperature_for_sample_size as temperature_for_sample_size,
 )
+from sfkd_jax.control.tasks._along_path import Preview as Preview
+from sfkd_jax.control.tasks._along_path import along_reference as along_reference
 from sfkd_jax.control.tasks._along_path import curvature_ahead as curvature_ahead
 from sfkd_jax.control.tasks._along_path import following_law as following_law
 from sfkd_jax.control.tasks._along_path import path_coordinates as path_coordinates
@@ -66,14 +68,16 @@ from sfkd_jax.control.tasks._task import StepIndex as StepIndex
 from sfkd_jax.control.tasks._task import StepResult as StepResult
 from sfkd_jax.control.tasks._task import Task as Task
 from sfkd_jax.control.tasks._task import actuator_limits as actuator_limits
-from sfkd_jax.control.wrappers._adaptation import adaptive as adaptive
-from sfkd_jax.control.wrappers._adaptive_step import AdaptiveState as AdaptiveState
+from sfkd_jax.control.wrappers._adaptation import Adaptation as Adaptation
+from sfkd_jax.control.wrappers._adaptation import AdaptiveState as AdaptiveState
 from sfkd_jax.control.wrappers._delay import DelayState as DelayState
 from sfkd_jax.control.wrappers._delay import delay_compensated as delay_compensated
+from sfkd_jax.control.wrappers._guard import FILTER_SCALES as FILTER_SCALES
+from sfkd_jax.control.wrappers._guard import Conditions as Conditions
+from sfkd_jax.control.wrappers._guard import FilterResult as FilterResult
+from sfkd_jax.control.wrappers._guard import NominalState as NominalState
+from sfkd_jax.control.wrappers._guard import Shield as Shield
+from sfkd_jax.control.wrappers._guard import ShieldState as ShieldState
+from sfkd_jax.control.wrappers._guard import safety_filter as safety_filter
+from sfkd_jax.control.wrappers._online_tube import OnlineTube as OnlineTube
 from sfkd_jax.control.wrappers._online_tube import OnlineTubeState as OnlineTubeState
-from sfkd_jax.control.wrappers._online_tube import online_tube as online_tube
-from sfkd_jax.control.wrappers._safety_filter import FILTER_SCALES as FILTER_SCALES
-from sfkd_jax.control.wrappers._safety_filter import FilterResult as FilterResult
-from sfkd_jax.control.wrappers._safety_filter import safety_filter as safety_filter
-from sfkd_jax.control.wrappers._shield import ShieldState as ShieldState
-from sfkd_jax.control.wrappers._shield import shielded as shielded

@@ -1,26 +1,35 @@
-"""A path-following law from a model: its steady turn and its Riccati gains."""
+"""Steady turns and Riccati gains: of a model while planning, or of any step.
+
+One derivation serves both laws, `ModelLaw` and `PathLaw`: Newton's method finds the
+steady turn, the Riccati recursion the gain around it. Only the derivative differs.
+"""
 
 from __future__ import annotations
 
-import functools
-from typing import Any, NamedTuple
+from collections.abc import Callable
+from typing import Any, NamedTuple, TypeAlias
 
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Float
+from jaxtyping import Array, Bool, Float
 
 from sfkd_jax.control.laws._path_errors import path_errors
 from sfkd_jax.ranges import Positive
 from sfkd_jax.types import BODY, Control, Fiber, Model, Reference, Scalar, State
 
 NEWTON = 4
-"""Newton steps to the steady turn from straight driving. For the benchmark's vehicles
+"""Newton steps to a steady turn from straight driving. For the benchmark's vehicles
 that reaches the accuracy of float32.
 """
 RICCATI_STEPS = 100
 """Steps of the Riccati recursion: 10 s at 10 Hz, several times the settling time."""
 RESIDUAL_TOLERANCE = 1e-2
 """Largest residual of a valid steady turn: m, rad and m/s over one step."""
+DIFFERENCE_STEP = 3e-3
+"""Step of the differences in every coordinate and control."""
+
+Derivative: TypeAlias = Callable[[Callable[[Array], Array], Array], tuple[Array, Array]]
+"""(function, point) -> (value, Jacobian)."""
 
 
 class SteadyTurn(NamedTuple):
@@ -36,6 +45,119 @@ class SteadyTurn(NamedTuple):
     state: Float[Array, "*step coordinate"]
     control: Float[Array, "*step control"]
     gain: Float[Array, "*step control coordinate"]
+
+
+class Linearised(NamedTuple):
+    """A step around ξ and u: its matrices, and how far ξ moves.
+
+    Attributes:
+        both: (ξ, u).
+        slopes: (A, B).
+        residual: largest |ξ⁺ − ξ| of an entry.
+    """
+
+    both: Float[Array, "*turn both"]
+    slopes: Float[Array, "*turn coordinate both"]
+    residual: Float[Array, "*turn"]
+
+    def is_steady(self) -> Bool[Array, "*turn"]:
+        """Whether Newton's method has found a steady turn; False for NaN."""
+        finite = jnp.all(jnp.isfinite(self.both), axis=-1)
+        return finite & (self.residual < RESIDUAL_TOLERANCE)
+
+
+def by_differentiation(
+    function: Callable[[Array], Array], at: Array
+) -> tuple[Array, Array]:
+    """Return value and Jacobian in forward mode, with one copy of the function."""
+
+    def twice(point: Array) -> tuple[Array, Array]:
+        value = function(point)
+        return value, value
+
+    jacobian, value = jax.jacfwd(twice, has_aux=True)(at)
+    return value, jacobian
+
+
+def by_differences(
+    function: Callable[[Array], Array], at: Array
+) -> tuple[Array, Array]:
+    """Return value and central differences, one column per entry, in a single batch.
+
+    The function need not be differentiable: a simulator on the host will do.
+    """
+    offsets = DIFFERENCE_STEP * jnp.eye(at.shape[0])
+    values = jax.vmap(function)(
+        at + jnp.concatenate([jnp.zeros((1, at.shape[0])), offsets, -offsets])
+    )
+    above, below = jnp.split(values[1:], 2)
+    return values[0], (above - below).T / (2.0 * DIFFERENCE_STEP)
+
+
+def steady_turn(
+    moved: Callable[[Array], Array],
+    start: Float[Array, " both"],
+    derivative: Derivative,
+    *,
+    steps: int,
+) -> Linearised:
+    """Solve ξ* = F(ξ*, u*) by Newton's method, and linearise F there.
+
+    The unknowns are the relative yaw, the body state without v, and u; e_y and v stay
+    as in `start`.
+
+    Args:
+        moved: (ξ, u) -> ξ one step later.
+        start: (ξ, u).
+        derivative: `by_differentiation` or `by_differences`.
+        steps: of Newton's method.
+    """
+    size = start.shape[0] - 2
+    free = jnp.asarray([1, *range(3, size + 2)])
+
+    def newton(_: Any, carry: tuple[Array, Linearised]) -> tuple[Array, Linearised]:
+        unknown, _ = carry
+        both = start.at[free].set(unknown)
+        after, slopes = derivative(moved, both)
+        gap = after - both[:size]
+        matrix = (slopes - jnp.eye(size, size + 2))[:, free]
+        better = unknown - solve(matrix, gap[:, None])[:, 0]
+        return better, Linearised(both, slopes, jnp.max(jnp.abs(gap)))
+
+    nothing = Linearised(start, jnp.zeros((size, size + 2)), jnp.zeros(()))
+    # The loop holds the only copy of the step and its derivative, which take long to
+    # compile; its last pass evaluates them where the others have led.
+    return jax.lax.fori_loop(0, steps + 1, newton, (start[free], nothing))[1]
+
+
+def riccati_gain(
+    slopes: Float[Array, "coordinate both"],
+    Q: Float[Array, "coordinate coordinate"],
+    R: Float[Array, "2 2"],
+) -> Float[Array, "2 coordinate"]:
+    """Return K of the Riccati recursion; 0 where it is not finite.
+
+    Args:
+        slopes: (A, B) of one step.
+        Q: weights of ξ.
+        R: weights of u.
+    """
+    A, B = jnp.split(slopes, [slopes.shape[0]], axis=1)
+
+    def best(value: Array) -> Array:
+        return solve(R + B.T @ value @ B, B.T @ value @ A)
+
+    def before(_: Any, value: Array) -> Array:
+        return Q + A.T @ value @ (A - B @ best(value))
+
+    gain = best(jax.lax.fori_loop(0, RICCATI_STEPS, before, Q))
+    # Without a gain the law is its feed-forward alone, which is finite.
+    return jnp.where(jnp.isfinite(gain), gain, 0.0)
+
+
+def weights_of(size: int, *entries: float) -> Float[Array, "size size"]:
+    """Return the diagonal matrix of the first entries; further ones weigh nothing."""
+    return jnp.diag(jnp.zeros(size).at[: len(entries)].set(jnp.asarray(entries)))
 
 
 class ModelLaw(NamedTuple):
@@ -83,41 +205,34 @@ class ModelLaw(NamedTuple):
             reference: x, y, yaw, speed of each step.
             curvature: of the path at each point [1/m].
         """
-        speeds = reference[:, 3]
+        size = like.shape[0] - 1
         step = _along_circle(model, fiber, like.shape[0], self.dt)
-        steady = functools.partial(_steady, step, like.shape[0] - 1)
-        both = jax.vmap(jax.vmap(steady), in_axes=(0, None))(
-            jnp.stack([curvature, 0.0 * curvature]), speeds
+
+        def turn(kappa: Scalar, speed: Scalar) -> Linearised:
+            return steady_turn(
+                lambda both: step(both[:size], both[size:], kappa, speed),
+                jnp.zeros(size + 2).at[2].set(speed),
+                by_differentiation,
+                steps=NEWTON,
+            )
+
+        both = jax.vmap(jax.vmap(turn), in_axes=(0, None))(
+            jnp.stack([curvature, 0.0 * curvature]), reference[:, 3]
         )
-        valid = _is_valid(jax.tree.map(lambda part: part[0], both))
+        # A circle that the tyres cannot hold has no steady turn: drive straight.
+        valid = both.is_steady()[0]
         chosen = jax.tree.map(lambda part: jax.vmap(jnp.where)(valid, *part), both)
         # One gain, of the first step: it varies little over a horizon, and the Riccati
         # recursion is the most expensive part.
-        gain = self._gain(chosen.A[0], chosen.B[0])
+        gain = riccati_gain(
+            chosen.slopes[0],
+            weights_of(size, self.lateral, self.heading, self.speed),
+            weights_of(2, self.steering, self.drive),
+        )
+        state, control = jnp.split(chosen.both, [size], axis=1)
         return SteadyTurn(
-            chosen.state,
-            chosen.control,
-            jnp.broadcast_to(gain, (*chosen.control.shape, gain.shape[1])),
+            state, control, jnp.broadcast_to(gain, (*control.shape, size))
         )
-
-    def _gain(self, A: Array, B: Array) -> Array:
-        """K by the Riccati recursion."""
-        Q = jnp.diag(
-            jnp.zeros(A.shape[0])
-            .at[:3]
-            .set(jnp.asarray([self.lateral, self.heading, self.speed]))
-        )
-        R = jnp.diag(jnp.asarray([self.steering, self.drive]))
-
-        def best(value: Array) -> Array:
-            return solve(R + B.T @ value @ B, B.T @ value @ A)
-
-        def before(_: Any, value: Array) -> Array:
-            closed = A - B @ best(value)
-            return Q + A.T @ value @ closed
-
-        gain = best(jax.lax.fori_loop(0, RICCATI_STEPS, before, Q))
-        return jnp.where(jnp.isfinite(gain), gain, 0.0)
 
     def control(
         self,
@@ -168,56 +283,6 @@ def _along_circle(model: Model, fiber: Fiber, size: int, dt: float) -> Any:
         )
 
     return step
-
-
-class _Linear(NamedTuple):
-    """A step of the model around a state: its matrices, and how far it moves."""
-
-    state: Array
-    control: Control
-    A: Array
-    B: Array
-    residual: Scalar
-
-
-def _is_valid(turn: _Linear) -> Array:
-    """Whether Newton's method has found a steady turn."""
-    finite = jnp.isfinite(jnp.concatenate([turn.state, turn.control], axis=1))
-    return jnp.all(finite, axis=1) & (turn.residual < RESIDUAL_TOLERANCE)
-
-
-def _steady(step: Any, coordinates: int, kappa: Scalar, speed: Scalar) -> _Linear:
-    """ξ* and u* by Newton's method, and the model around them.
-
-    The unknowns are the relative yaw, the body state without v, and u. The loop holds
-    the only copy of the model and its derivative, which take long to compile; its last
-    pass evaluates them where the others have led.
-    """
-    free = jnp.asarray([1, *range(3, coordinates)])
-
-    def moved(state: Array, control: Control) -> tuple[Array, Array]:
-        after = step(state, control, kappa, speed)
-        return after, after
-
-    def newton(_: Any, carry: tuple[Array, _Linear]) -> tuple[Array, _Linear]:
-        unknown, _ = carry
-        state = jnp.zeros(coordinates).at[2].set(speed).at[free].set(unknown[:-2])
-        control = unknown[-2:]
-        (A, B), after = jax.jacfwd(moved, argnums=(0, 1), has_aux=True)(state, control)
-        gap = after - state
-        matrix = jnp.concatenate([(A - jnp.eye(coordinates))[:, free], B], axis=1)
-        better = unknown - solve(matrix, gap[:, None])[:, 0]
-        return better, _Linear(state, control, A, B, jnp.max(jnp.abs(gap)))
-
-    start = jnp.zeros(coordinates)
-    nothing = _Linear(
-        state=start,
-        control=jnp.zeros(2),
-        A=jnp.zeros((coordinates, coordinates)),
-        B=jnp.zeros((coordinates, 2)),
-        residual=jnp.zeros(()),
-    )
-    return jax.lax.fori_loop(0, NEWTON + 1, newton, (start, nothing))[1]
 
 
 def solve(

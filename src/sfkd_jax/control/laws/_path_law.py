@@ -2,17 +2,36 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
+from functools import partial
 from itertools import product
 from math import prod
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, TypeAlias
 
+import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, Int
 
-from sfkd_jax.control.laws._model_law import SteadyTurn
-from sfkd_jax.geometry import PATH_SPEED, PathState
-from sfkd_jax.types import Control, Environment, Scalar
+from sfkd_jax.control.laws._model_law import (
+    SteadyTurn,
+    by_differences,
+    riccati_gain,
+    steady_turn,
+    weights_of,
+)
+from sfkd_jax.geometry import LATERAL, PATH_SPEED, PathState, path_step
+from sfkd_jax.ranges import AtLeastTwo, Positive, Span
+from sfkd_jax.types import Control, Environment, Scalar, Step
+
+NEWTON = 6
+"""Newton steps to a steady turn from that of the next smaller curvature."""
+STEERING_SLOPES = (0.5, 5.0)
+"""Limits of d steering / d curvature relative to straight driving. It diverges near the
+limit of the tyres.
+"""
+
+PathStep: TypeAlias = Callable[[Array, Control, Scalar, Array], Array]
+"""(ξ, u, κ, e) -> ξ one step later."""
 
 
 class PathLaw(NamedTuple):
@@ -103,3 +122,138 @@ def law_from_arrays(arrays: Mapping[str, Any]) -> PathLaw:
         KeyError: an array is missing.
     """
     return PathLaw(**{name: jnp.asarray(arrays[name]) for name in PathLaw._fields})
+
+
+def derive_path_law(
+    step: Step,
+    *,
+    coordinates: int,
+    env_low: tuple[float, ...],
+    env_high: tuple[float, ...],
+    lateral_acceleration: Positive = 2.2,
+    speed: Span = (8.0, 10.5),
+    points: tuple[AtLeastTwo, AtLeastTwo, AtLeastTwo] = (13, 3, 7),
+    perturbation: tuple[Positive, Positive] = (0.03, 1.0),
+    lateral: float = 10.0,
+    heading: float = 60.0,
+    velocity: float = 5.0,
+    curvature: Positive = 300.0,
+    drive: Positive = 0.5,
+) -> PathLaw:
+    """Tabulate steady turns and gains over (v_ref² κ, v_ref, e), from a step alone.
+
+        ξ* = F(ξ*, u*; κ, e),   e_y* = 0,   v* = v_ref
+
+    F is the vehicle's step in path coordinates, see `geometry.path_step`; K solves
+    the Riccati equation of F linearised at ξ*. Derivatives are finite differences, so
+    the step may be any function, such as a simulator on the host. Newton's method
+    starts every turn from that of the next smaller |κ|. If it does not converge (the
+    circle is too fast for the friction), the turn and gain of the smaller curvature are
+    used.
+
+    Args:
+        step: (x, u, e) -> x one sampling period later.
+        coordinates: size of ξ.
+        env_low: lower ends of the axes of e.
+        env_high: upper ends of the axes of e.
+        lateral_acceleration: end of the axis of v_ref² κ, to both sides [m/s²].
+        speed: ends of the axis of v_ref [m/s].
+        points: on the axes of v_ref² κ (odd), of v_ref, and of every entry of e.
+        perturbation: largest |ν|, stored with the law.
+        lateral: weight in the Riccati equation [1/m²].
+        heading: weight [1/rad²].
+        velocity: weight [s²/m²]; the weights of further coordinates are zero.
+        curvature: weight of the steering [m²], on the curvature that it produces on the
+            steady turns. Where the tyres give less, the law steers more, and the loop
+            stays as fast.
+        drive: weight, per control unit².
+
+    Raises:
+        ValueError: an axis is not ascending or has too few points.
+    """
+    low, high = (
+        (-lateral_acceleration, speed[0], *env_low),
+        (lateral_acceleration, speed[1], *env_high),
+    )
+    counts = (*points[:2], *points[2:] * len(env_low))
+    if (
+        len(points) != 3
+        or points[0] % 2 == 0
+        or min(counts) < 2
+        or not all(a < b for a, b in zip(low, high, strict=True))
+    ):
+        raise ValueError(
+            "a law needs rising axes and an odd number of accelerations, "
+            f"got {low}, {high}, {counts}"
+        )
+    axes = [jnp.linspace(a, b, n) for a, b, n in zip(low, high, counts, strict=True)]
+    grid = jnp.stack(jnp.meshgrid(*axes[1:], indexing="ij"), axis=-1).reshape(
+        -1, len(axes) - 1
+    )
+    row = partial(
+        _row,
+        path_step(step),
+        accelerations=axes[0],
+        state_weights=weights_of(coordinates, lateral, heading, velocity),
+        curvature=curvature,
+        drive=drive,
+    )
+    tables = jax.lax.map(row, grid, batch_size=64)
+    state, control, gain = (
+        jnp.moveaxis(table, 0, 1).reshape(*counts, *table.shape[2:]) for table in tables
+    )
+    ends = jnp.asarray(low), jnp.asarray(high)
+    return PathLaw(*ends, jnp.asarray(perturbation), state, control, gain)
+
+
+def _row(
+    step: PathStep,
+    condition: Array,
+    *,
+    accelerations: Array,
+    state_weights: Array,
+    curvature: float,
+    drive: float,
+) -> tuple[Array, Array, Array]:
+    """Steady states, controls and gains over all accelerations.
+
+    Args:
+        step: in path coordinates.
+        condition: v_ref and e.
+        accelerations: v_ref² κ, symmetric about 0.
+        state_weights: of the Riccati equation.
+        curvature: weight of the steering.
+        drive: weight of the second control.
+    """
+    points, size = accelerations.shape[0], state_weights.shape[0]
+    middle, curvatures = points // 2, accelerations / condition[0] ** 2
+
+    def moved(kappa: Scalar) -> Callable[[Array], Array]:
+        return lambda both: step(both[:size], both[size:], kappa, condition[1:])
+
+    def next_turn(known: Array, kappa: Scalar) -> tuple[Array, Array]:
+        start = known.at[LATERAL].set(0.0).at[PATH_SPEED].set(condition[0])
+        found = steady_turn(moved(kappa), start, by_differences, steps=NEWTON)
+        # Too fast for the friction: the turn of the next smaller curvature stays.
+        turn = jnp.where(found.is_steady(), found.both, known)
+        return turn, turn
+
+    def outward(side: Scalar) -> Array:
+        """Turns to one side, from straight driving on."""
+        straight = jnp.zeros(size + 2)
+        return jax.lax.scan(next_turn, straight, side * curvatures[middle:])[1]
+
+    left, right = jax.vmap(outward)(jnp.asarray([-1.0, 1.0]))
+    turns = jnp.concatenate([left[:0:-1], right])
+    slopes = jnp.asarray(jnp.gradient(turns[:, -2], curvatures[1] - curvatures[0]))
+    slopes = jnp.clip(slopes, *(limit * slopes[middle] for limit in STEERING_SLOPES))
+    control_weights = jax.vmap(jnp.diag)(
+        jnp.stack([curvature / slopes**2, jnp.full(points, drive)], axis=1)
+    )
+
+    def gain(kappa: Scalar, turn: Array, weights: Array) -> Array:
+        _, linear = by_differences(moved(kappa), turn)
+        return riccati_gain(linear, state_weights, weights)
+
+    gains = jax.vmap(gain)(curvatures, turns, control_weights)
+    return turns[:, :-2], turns[:, -2:], gains

@@ -1,17 +1,22 @@
-"""The task of following a path in path coordinates, with curvature preview."""
+"""Driving along a path: one projection a control step, and the task of following it.
+
+A controller along a path is a `Controller` whose observation is ξ and whose reference
+is a `Preview`. `along_reference` turns it into one that sees poses in the world.
+"""
 
 from __future__ import annotations
 
-from functools import partial
+from dataclasses import dataclass
 from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Float
+from jaxtyping import Array, Bool, Float
 
 from sfkd_jax.control.laws._model_law import SteadyTurn
 from sfkd_jax.control.laws._path_errors import PathErrors
 from sfkd_jax.control.laws._path_law import PathLaw, turn_control
+from sfkd_jax.control.planners._plans import all_finite
 from sfkd_jax.control.tasks._costs import Cost, StageInputs
 from sfkd_jax.control.tasks._path_tracking import check_path
 from sfkd_jax.control.tasks._task import (
@@ -30,7 +35,6 @@ from sfkd_jax.geometry import (
     PathState,
     between,
     circle_errors,
-    compose,
     path_state,
     wrap_angle,
 )
@@ -39,7 +43,10 @@ from sfkd_jax.types import (
     BODY,
     POSE,
     Control,
+    Controller,
+    ControllerInfo,
     Environment,
+    Key,
     Model,
     Params,
     Reference,
@@ -48,40 +55,25 @@ from sfkd_jax.types import (
 )
 
 
-class AlongSample(NamedTuple):
-    """State of one rollout: latent, path coordinates, last control."""
-
-    latent: Any
-    coordinates: PathState
-    control: Control
-
-
-class AlongTarget(NamedTuple):
-    """The reference of one step.
+class Preview(NamedTuple):
+    """The road ahead, as controllers along a path see it.
 
     Attributes:
-        point: x, y, yaw, speed.
-        normal: unit vector to the left of the path.
-        curvature: of the path over the step [1/m].
-        turn: steady turn of the law.
+        road: κ [1/m] and v_ref [m/s] of the next steps; NaN if the reference is not
+            finite.
+        repeated: whether the observation is bit for bit the last one, as of a sensor
+            that freezes.
     """
 
-    point: Float[Array, "*horizon 4"]
-    normal: Float[Array, "*horizon 2"]
-    curvature: Float[Array, "*horizon"]
-    turn: SteadyTurn
+    road: Float[Array, "horizon 2"]
+    repeated: Bool[Array, ""]
 
 
-class _Problem(NamedTuple):
-    """Settings of `following_law` as its functions need them."""
+class AlongReferenceState(NamedTuple):
+    """State of the wrapped controller, and the last observation in the world."""
 
-    model: Model
-    cost: Cost
-    law: PathLaw
-    limit: Limiter
-    low: Control
-    high: Control
-    terminal_weight: float
+    inner: Any
+    observation: State
 
 
 def curvature_ahead(reference: Reference) -> Float[Array, " horizon"]:
@@ -115,19 +107,78 @@ def path_coordinates(
     return jnp.concatenate([jnp.stack([lateral, heading]), state[BODY]])
 
 
-def world_state(coordinates: PathState, reference: Reference) -> State:
-    """Return the state at path coordinates beside the present point of a reference.
+def along_reference(controller: Controller, *, coordinates: int) -> Controller:
+    """Return a controller in the world from one along a path.
 
-    That point is one step back from the first one, along the circle through the first
-    two: the point where the vehicle should be now.
+    The only place where a state is projected, once per control step. Predicted states
+    are mapped back beside the reference points.
 
     Args:
-        coordinates: ξ.
-        reference: poses and speeds from the next step on.
+        controller: `act` takes ξ and a `Preview` in place of observation and reference.
+        coordinates: size of ξ.
+
+    Returns:
+        A `Controller` of poses in the world; `info` gains `path_state` (ξ, NaN where
+        observation or reference are not finite) and `planned_path` (predicted ξ).
     """
-    now = compose(reference[0, POSE], between(reference[1, POSE], reference[0, POSE]))
-    beside = jnp.stack([jnp.zeros(()), coordinates[LATERAL], coordinates[HEADING]])
-    return jnp.concatenate([compose(now, beside), coordinates[PATH_SPEED:]])
+
+    def init(key: Key) -> AlongReferenceState:
+        unknown = jnp.full(coordinates + 1, jnp.nan, dtype=float)
+        return AlongReferenceState(controller.init(key), unknown)
+
+    def act(
+        params: Params,
+        state: AlongReferenceState,
+        observation: State,
+        env: Environment,
+        reference: Reference,
+    ) -> tuple[Control, AlongReferenceState, ControllerInfo]:
+        check_path(observation, env, reference, reference.shape[0])
+        curvature = curvature_ahead(reference)
+        xi = path_coordinates(observation, reference[0], curvature[0])
+        road = jnp.stack([curvature, reference[:, 3]], axis=1)
+        # A position that is not finite can leave κ finite (points "coincide"); what
+        # cannot be trusted as a whole is NaN as a whole.
+        readable = all_finite(reference)
+        road = jnp.where(readable, road, jnp.nan)
+        xi = jnp.where(readable & all_finite(observation), xi, jnp.nan)
+        repeated = jnp.all(observation == state.observation)
+        control, inner, info = controller.act(
+            params, state.inner, xi, env, Preview(road, repeated)
+        )
+        planned = info["predicted_states"]
+        info = info.copy()
+        info["path_state"], info["planned_path"] = xi, planned
+        info["predicted_states"] = jax.vmap(_in_world)(planned, reference)
+        if "sample_states" in info:
+            samples = jax.vmap(_in_world, in_axes=(0, None))
+            info["sample_states"] = jax.vmap(samples)(info["sample_states"], reference)
+        return control, AlongReferenceState(inner, observation), info
+
+    return Controller(init, act)
+
+
+def _in_world(coordinates: PathState, point: Float[Array, " 4"]) -> State:
+    """The state beside a reference point, on the normal of the path there."""
+    normal = jnp.stack([-jnp.sin(point[2]), jnp.cos(point[2])])
+    position = point[:2] + coordinates[LATERAL] * normal
+    yaw = point[2] + coordinates[HEADING]
+    return jnp.concatenate([position, yaw[None], coordinates[PATH_SPEED:]])
+
+
+class AlongSample(NamedTuple):
+    """State of one rollout: latent, path coordinates, last control."""
+
+    latent: Any
+    coordinates: PathState
+    control: Control
+
+
+class AlongTarget(NamedTuple):
+    """The road of one step, κ [1/m] and v_ref [m/s], and the steady turn of the law."""
+
+    road: Float[Array, "*horizon 2"]
+    turn: SteadyTurn
 
 
 def following_law(
@@ -146,11 +197,9 @@ def following_law(
         ξ_{k+1} = F(ξ_k, (ν_k, κ_k, v_k); e),   u_k = limit(law(ξ_k; κ_k, v_k, e) + ν_k)
         J = Σ_k ℓ(ξ_{k+1}, u_k) + w_T ℓ(ξ_T, u_{T-1})
 
-    A plan is the perturbation ν of the law. Observation and reference are poses in the
-    world, as for every controller, and are projected once per control step. Rollouts
-    use ξ and the previewed curvature only; predicted states are mapped back to the
-    world beside the reference points. |ν| stays within `law.perturbation`, as it did
-    in the training data.
+    A plan is the perturbation ν of the law. A planner of this task is a controller
+    along a path, see `along_reference`; its predicted states are ξ. |ν| stays within
+    `law.perturbation`, as it did in the training data.
 
     Args:
         model: of the closed loop, with `along_path`.
@@ -176,63 +225,68 @@ def following_law(
         jnp.asarray(control_low, dtype=float),
         jnp.asarray(control_high, dtype=float),
     )
-    problem = _Problem(model, cost, law, limit, low, high, terminal_weight)
-    prepare, step = partial(_prepare, problem), partial(_step, problem)
-    return Task(low, high, cost.weights, prepare, step, check_path)
+    following = _Following(model, cost, law, limit, low, high, terminal_weight)
+    return Task(low, high, cost.weights, following.prepare, following.step, _check)
 
 
-def _prepare(
-    problem: _Problem,
-    params: Params,
-    observation: State,
-    env: Environment,
-    reference: Reference,
-    previous: PlanningStart,
-) -> RolloutSetup:
-    """Project the observation and evaluate fibre and law once per control step."""
-    model, law = problem.model, problem.law
-    fiber = model.fiber(fold(model, params), env)
-    curvatures = curvature_ahead(reference)
-    coordinates = path_coordinates(observation, reference[0], curvatures[0])
-    turns = jax.vmap(law.turn, in_axes=(0, 0, None))(curvatures, reference[:, 3], env)
-    first = jax.tree.map(lambda leaf: leaf[0], turns)
-    law_control = jnp.clip(turn_control(first, coordinates), problem.low, problem.high)
-    before = jnp.where(previous.known, previous.control, law_control)
-    latent = model.encode(fiber, path_state(coordinates))
-    start = AlongSample(latent, coordinates, before)
-    yaw = reference[:, 2]
-    normal = jnp.stack([-jnp.sin(yaw), jnp.cos(yaw)], axis=1)
-    return RolloutSetup(fiber, start, AlongTarget(reference, normal, curvatures, turns))
+@dataclass(frozen=True)
+class _Following:
+    """The functions of `following_law`."""
 
+    model: Model
+    cost: Cost
+    law: PathLaw
+    limit: Limiter
+    low: Control
+    high: Control
+    terminal_weight: float
 
-def _step(
-    problem: _Problem,
-    weights: Any,
-    fiber: Any,
-    before: AlongSample,
-    nu: Control,
-    target: AlongTarget,
-    at: StepIndex,
-) -> StepResult:
-    """One step of one rollout: law plus perturbation, limits, model, cost."""
-    point, law = target.point, problem.law
-    law_control = turn_control(target.turn, before.coordinates)
-    nu = jnp.clip(nu, -law.perturbation, law.perturbation)
-    control = problem.limit(law_control + nu, before.control)
-    effective = control - law_control
-    inputs = jnp.concatenate([effective, jnp.stack([target.curvature, point[3]])])
-    latent = problem.model.step(fiber, before.latent, inputs)
-    coordinates = problem.model.decode(fiber, latent)[BODY]
-    errors = _errors(coordinates, point[3])
-    errors_before = _errors(before.coordinates, point[3])
-    stage = StageInputs(errors, errors_before, control, before.control, point[3])
-    cost = problem.cost.stage(weights, stage)
-    cost = cost * (1.0 + problem.terminal_weight * at.last)
-    position = point[:2] + coordinates[LATERAL] * target.normal
-    yaw = point[2] + coordinates[HEADING]
-    state = jnp.concatenate([position, yaw[None], coordinates[PATH_SPEED:]])
-    sample = AlongSample(latent, coordinates, control)
-    return StepResult(sample, cost, control, effective, state)
+    def prepare(
+        self,
+        params: Params,
+        coordinates: PathState,
+        env: Environment,
+        preview: Preview,
+        previous: PlanningStart,
+    ) -> RolloutSetup:
+        """Evaluate fibre, encoder and law once per control step."""
+        fiber = self.model.fiber(fold(self.model, params), env)
+        turns = jax.vmap(self.law.turn, in_axes=(0, 0, None))(
+            preview.road[:, 0], preview.road[:, 1], env
+        )
+        first = jax.tree.map(lambda leaf: leaf[0], turns)
+        law_control = jnp.clip(turn_control(first, coordinates), self.low, self.high)
+        # Before the first step no control was applied: slew limits count from the law.
+        before = jnp.where(previous.known, previous.control, law_control)
+        latent = self.model.encode(fiber, path_state(coordinates))
+        start = AlongSample(latent, coordinates, before)
+        return RolloutSetup(fiber, start, AlongTarget(preview.road, turns))
+
+    def step(
+        self,
+        weights: Any,
+        fiber: Any,
+        before: AlongSample,
+        nu: Control,
+        target: AlongTarget,
+        at: StepIndex,
+    ) -> StepResult:
+        """One step of one rollout: law plus perturbation, limits, model, cost."""
+        speed = target.road[1]
+        law_control = turn_control(target.turn, before.coordinates)
+        nu = jnp.clip(nu, -self.law.perturbation, self.law.perturbation)
+        control = self.limit(law_control + nu, before.control)
+        effective = control - law_control
+        inputs = jnp.concatenate([effective, target.road])
+        latent = self.model.step(fiber, before.latent, inputs)
+        coordinates = self.model.decode(fiber, latent)[BODY]
+        errors = _errors(coordinates, speed)
+        errors_before = _errors(before.coordinates, speed)
+        stage = StageInputs(errors, errors_before, control, before.control, speed)
+        cost = self.cost.stage(weights, stage)
+        cost = cost * (1.0 + self.terminal_weight * at.last)
+        sample = AlongSample(latent, coordinates, control)
+        return StepResult(sample, cost, control, effective, coordinates)
 
 
 def _errors(coordinates: PathState, speed: Scalar) -> PathErrors:
@@ -240,3 +294,22 @@ def _errors(coordinates: PathState, speed: Scalar) -> PathErrors:
     return PathErrors(
         coordinates[LATERAL], coordinates[HEADING], coordinates[PATH_SPEED] - speed
     )
+
+
+def _check(coordinates: Any, env: Any, preview: Any, horizon: int) -> None:
+    """Raise a ValueError that names an argument of the wrong shape."""
+    if not isinstance(preview, Preview):
+        raise ValueError(
+            "a planner along a path takes ξ and a `Preview`; "
+            "`along_reference` makes them of poses in the world"
+        )
+    if coordinates.ndim != 1 or env.ndim not in (1, 2):
+        raise ValueError(
+            "ξ must have shape (coordinate,) and env (ne,), or (particle, ne), "
+            f"got {coordinates.shape} and {env.shape}"
+        )
+    if preview.road.shape != (horizon, 2):
+        raise ValueError(
+            f"reference must have shape ({horizon}, 4): x, y, yaw, speed; "
+            f"got {preview.road.shape[0]} steps"
+        )

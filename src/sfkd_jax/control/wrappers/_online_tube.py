@@ -3,19 +3,18 @@
 from __future__ import annotations
 
 import math
-from functools import partial
+from dataclasses import dataclass
 from typing import Any, NamedTuple
 
-import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
 from sfkd_jax.control.planners._plans import all_finite
-from sfkd_jax.control.tasks._along_path import curvature_ahead, path_coordinates
-from sfkd_jax.control.wrappers._slow import slow_down
-from sfkd_jax.geometry import LATERAL
+from sfkd_jax.control.tasks._along_path import curvature_ahead
+from sfkd_jax.geometry import LATERAL, between, compose, wrap_angle
 from sfkd_jax.ranges import Fraction, Positive
 from sfkd_jax.types import (
+    POSE,
     Control,
     Controller,
     ControllerInfo,
@@ -56,33 +55,9 @@ class OnlineTubeState(NamedTuple):
     grip: Scalar
 
 
-class _Settings(NamedTuple):
-    """Settings of `online_tube` as its functions need them."""
-
-    controller: Controller
-    horizon: int
-    level: float
-    rate: float
-    start_radius: float
-    lane: float | None
-    slowest: float
-    fall: float
-    grip: float | None
-
-
-def online_tube(
-    controller: Controller,
-    *,
-    horizon: int,
-    level: Fraction = 0.95,
-    rate: Positive = 0.2,
-    start_radius: Positive = 0.03,
-    lane: Positive | None = 0.1,
-    slowest: Positive = 8.0,
-    fall: Fraction = 0.01,
-    grip: Positive | None = None,
-) -> Controller:
-    """Wrap a controller with a tube around its plans, and slow down until it fits.
+@dataclass(frozen=True, kw_only=True)
+class OnlineTube:
+    """A tube around the plans of a controller, and a speed at which it fits the lane.
 
     For every h up to the horizon, the plan of h steps ago said where the car would be
     across the path now. Adaptive conformal inference on the scale of the radius:
@@ -106,8 +81,9 @@ def online_tube(
 
     a rises while the corridor fits at 80 % of it, and falls while it does not.
 
-    Args:
-        controller: any planner of a path; its `info` has `predicted_states`.
+    Attributes:
+        inner: in the world, of `along_reference`: its `info` has `path_state` and
+            `planned_path`, so that nothing is projected again.
         horizon: number of predicted steps.
         level: of the coverage.
         rate: γ.
@@ -118,8 +94,7 @@ def online_tube(
         fall: of the factor per step, while the corridor exceeds the lane.
         grip: a at the start [m/s²]; None where friction is trusted.
 
-    Returns:
-        A `Controller`; `info` gains `tube` (horizon,) [m], `tube_errors` (horizon,) [m]
+    `info` gains `tube` (horizon,) [m], `tube_errors` (horizon,) [m]
         (NaN without a plan to compare with), `tube_missed` (horizon,),
         `online_corridor` [m], `speed_factor` and `grip` [m/s²; 0 without limit].
 
@@ -129,152 +104,157 @@ def online_tube(
     Source: Gibbs and Candès (2021), Adaptive Conformal Inference Under Distribution
     Shift.
     """
-    _check(level, rate, start_radius, lane, slowest, grip)
-    settings = _Settings(
-        controller, horizon, level, rate, start_radius, lane, slowest, fall, grip
-    )
-    return Controller(partial(_init, settings), partial(_act, settings))
 
+    inner: Controller
+    horizon: int
+    level: Fraction = 0.95
+    rate: Positive = 0.2
+    start_radius: Positive = 0.03
+    lane: Positive | None = 0.1
+    slowest: Positive = 8.0
+    fall: Fraction = 0.01
+    grip: Positive | None = None
 
-def _init(settings: _Settings, key: Key) -> OnlineTubeState:
-    """The state before the first control step."""
-    horizon = settings.horizon
-    return OnlineTubeState(
-        inner=settings.controller.init(key),
-        plans=jnp.zeros((horizon, horizon), dtype=float),
-        known=jnp.zeros(horizon, dtype=bool),
-        radii=jnp.full(horizon, settings.start_radius, dtype=float),
-        corridor_factor=jnp.ones(()),
-        speed_factor=jnp.ones(()),
-        grip=jnp.asarray(settings.grip or 0.0),
-    )
+    def __post_init__(self) -> None:
+        level, rate, start_radius = self.level, self.rate, self.start_radius
+        if not 0 < level < 1 or not 0 < rate < math.inf:
+            raise ValueError(
+                f"level must lie in (0, 1) and rate be positive, got {level} and {rate}"
+            )
+        if not RADIUS_RANGE[0] <= start_radius <= RADIUS_RANGE[1]:
+            raise ValueError(
+                f"start_radius must lie in {list(RADIUS_RANGE)}, got {start_radius}"
+            )
+        for name in ("lane", "grip"):
+            value = getattr(self, name)
+            if value is not None and not 0 < value < math.inf:
+                raise ValueError(f"{name} must be positive or None, got {value}")
+        if not 0 < self.slowest < math.inf:
+            raise ValueError(f"slowest must be positive, got {self.slowest}")
 
+    def controller(self) -> Controller:
+        """Return the controller in the world."""
+        return Controller(self.init, self.act)
 
-def _act(
-    settings: _Settings,
-    params: Params,
-    state: OnlineTubeState,
-    observation: State,
-    env: Environment,
-    reference: Reference,
-) -> tuple[Control, OnlineTubeState, ControllerInfo]:
-    """One control step."""
-    measured = path_coordinates(
-        observation, reference[0], curvature_ahead(reference)[0]
-    )
-    errors = jnp.abs(measured[LATERAL] - jnp.diagonal(state.plans))
-    errors = jnp.where(state.known, errors, jnp.nan)
-    missed = errors > state.radii
-    radii = _calibrated(settings, state.radii, errors)
-    slowed = slow_down(reference, state.speed_factor)
-    target = jnp.where(state.speed_factor < 1.0, slowed, reference)
-    control, inner, info = settings.controller.act(
-        params, state.inner, observation, env, target
-    )
-    plan = _lateral(info["predicted_states"], target)
-    corridor = jnp.max(jnp.abs(plan) + radii)
-    fits = corridor <= (math.inf if settings.lane is None else settings.lane)
-    corridor_factor, grip, factor = _speeds(settings, state, reference, fits)
-    after = OnlineTubeState(
-        inner=inner,
-        plans=jnp.concatenate([jnp.nan_to_num(plan)[None], state.plans[:-1]]),
-        known=jnp.append(all_finite(plan), state.known[:-1]),
-        radii=radii,
-        corridor_factor=corridor_factor,
-        speed_factor=factor,
-        grip=grip,
-    )
-    report: ControllerInfo = {
-        **info,
-        "tube": radii,
-        "tube_errors": errors,
-        "tube_missed": missed,
-        "online_corridor": corridor,
-        "speed_factor": factor,
-        "grip": grip,
-    }
-    return control, after, report
-
-
-def _speeds(
-    settings: _Settings,
-    state: OnlineTubeState,
-    reference: Reference,
-    fits: Bool[Array, ""],
-) -> tuple[Scalar, Scalar, Scalar]:
-    """The next corridor_factor, grip and speed_factor."""
-    rise = settings.fall * (1.0 - settings.level) / settings.level
-    change = jnp.where(fits, rise, -settings.fall)
-    least = jnp.clip(settings.slowest / reference[0, 3], 0.0, 1.0)
-    least = jnp.where(jnp.isfinite(least), least, 0.0)
-    corridor_factor = jnp.clip(state.corridor_factor + change, least, 1.0)
-
-    before = state.speed_factor
-    cap, grip = jnp.ones(()), state.grip
-    if settings.grip is not None:
-        cap, grip = _shown(settings, state, reference, fits)
-    factor = jnp.minimum(corridor_factor, jnp.maximum(cap, least))
-    factor = jnp.clip(factor, before - settings.fall, before + settings.fall)
-    return corridor_factor, grip, factor
-
-
-def _shown(
-    settings: _Settings,
-    state: OnlineTubeState,
-    reference: Reference,
-    fits: Bool[Array, ""],
-) -> tuple[Scalar, Scalar]:
-    """The speed_factor for which the grip was shown, and the next grip."""
-    ahead = reference[:, 3] ** 2 * jnp.abs(curvature_ahead(reference))
-    now = state.speed_factor**2 * ahead[0]
-    proved = jnp.where(now > GRIP_SHARE * state.grip, 1.0 + settings.fall, 1.0)
-    grip = state.grip * jnp.where(fits, proved, 1.0 - settings.fall)
-    cap = jnp.sqrt(grip / jnp.maximum(jnp.max(ahead), 1e-6))
-    return jnp.where(jnp.isfinite(cap), cap, 1.0), grip
-
-
-def _calibrated(
-    settings: _Settings,
-    radii: Float[Array, " horizon"],
-    errors: Float[Array, " horizon"],
-) -> Float[Array, " horizon"]:
-    """The radii after a comparison; unchanged where there was none."""
-    missed = errors > radii
-    change = settings.rate * (missed - (1.0 - settings.level))
-    after = jnp.clip(radii * jnp.exp(change), *RADIUS_RANGE)
-    return jnp.where(jnp.isfinite(errors), after, radii)
-
-
-def _lateral(
-    states: Float[Array, "horizon state"], reference: Reference
-) -> Float[Array, " horizon"]:
-    """e_y of predicted states; NaN for a plan that is not finite."""
-    coordinates = jax.vmap(path_coordinates)(
-        states, reference, curvature_ahead(reference)
-    )
-    lateral = coordinates[:, LATERAL]
-    return jnp.where(all_finite(lateral), lateral, jnp.nan)
-
-
-def _check(
-    level: float,
-    rate: float,
-    start_radius: float,
-    lane: float | None,
-    slowest: float,
-    grip: float | None,
-) -> None:
-    """Raise a ValueError that names a setting out of its range."""
-    if not 0 < level < 1 or not 0 < rate < math.inf:
-        raise ValueError(
-            f"level must lie in (0, 1) and rate be positive, got {level} and {rate}"
+    def init(self, key: Key) -> OnlineTubeState:
+        """Return the state before the first control step."""
+        horizon = self.horizon
+        return OnlineTubeState(
+            inner=self.inner.init(key),
+            plans=jnp.zeros((horizon, horizon), dtype=float),
+            known=jnp.zeros(horizon, dtype=bool),
+            radii=jnp.full(horizon, self.start_radius, dtype=float),
+            corridor_factor=jnp.ones(()),
+            speed_factor=jnp.ones(()),
+            grip=jnp.asarray(self.grip or 0.0),
         )
-    if not RADIUS_RANGE[0] <= start_radius <= RADIUS_RANGE[1]:
-        raise ValueError(
-            f"start_radius must lie in {list(RADIUS_RANGE)}, got {start_radius}"
+
+    def act(
+        self,
+        params: Params,
+        state: OnlineTubeState,
+        observation: State,
+        env: Environment,
+        reference: Reference,
+    ) -> tuple[Control, OnlineTubeState, ControllerInfo]:
+        """Take one control step."""
+        slowed = slow_down(reference, state.speed_factor)
+        # At full speed the reference stays what it is, bit for bit.
+        target = jnp.where(state.speed_factor < 1.0, slowed, reference)
+        info: Any
+        control, inner, info = self.inner.act(
+            params, state.inner, observation, env, target
         )
-    for name, value in (("lane", lane), ("grip", grip)):
-        if value is not None and not 0 < value < math.inf:
-            raise ValueError(f"{name} must be positive or None, got {value}")
-    if not 0 < slowest < math.inf:
-        raise ValueError(f"slowest must be positive, got {slowest}")
+        # The plan of h steps ago said where the car would be now: the h-th diagonal.
+        errors = jnp.abs(info["path_state"][LATERAL] - jnp.diagonal(state.plans))
+        errors = jnp.where(state.known, errors, jnp.nan)
+        missed = errors > state.radii
+        radii = self._calibrated(state.radii, errors)
+        plan = info["planned_path"][:, LATERAL]
+        known = all_finite(plan)
+        plan = jnp.where(known, plan, jnp.nan)
+        corridor = jnp.max(jnp.abs(plan) + radii)
+        fits = corridor <= (math.inf if self.lane is None else self.lane)
+        corridor_factor, grip, factor = self._speeds(state, reference, fits)
+        after = OnlineTubeState(
+            inner=inner,
+            plans=jnp.concatenate([jnp.nan_to_num(plan)[None], state.plans[:-1]]),
+            known=jnp.append(known, state.known[:-1]),
+            radii=radii,
+            corridor_factor=corridor_factor,
+            speed_factor=factor,
+            grip=grip,
+        )
+        report: Any = {
+            **info,
+            "tube": radii,
+            "tube_errors": errors,
+            "tube_missed": missed,
+            "online_corridor": corridor,
+            "speed_factor": factor,
+            "grip": grip,
+        }
+        return control, after, report
+
+    def _speeds(
+        self, state: OnlineTubeState, reference: Reference, fits: Bool[Array, ""]
+    ) -> tuple[Scalar, Scalar, Scalar]:
+        """The next corridor_factor, grip and speed_factor."""
+        # So much slower up than down that it settles where `level` of the steps fit.
+        rise = self.fall * (1.0 - self.level) / self.level
+        change = jnp.where(fits, rise, -self.fall)
+        least = jnp.clip(self.slowest / reference[0, 3], 0.0, 1.0)
+        # A reference at rest has no speed to keep.
+        least = jnp.where(jnp.isfinite(least), least, 0.0)
+        corridor_factor = jnp.clip(state.corridor_factor + change, least, 1.0)
+
+        before, cap, grip = state.speed_factor, jnp.ones(()), state.grip
+        if self.grip is not None:
+            cap, grip = self._shown(state, reference, fits)
+        factor = jnp.minimum(corridor_factor, jnp.maximum(cap, least))
+        factor = jnp.clip(factor, before - self.fall, before + self.fall)
+        return corridor_factor, grip, factor
+
+    def _shown(
+        self, state: OnlineTubeState, reference: Reference, fits: Bool[Array, ""]
+    ) -> tuple[Scalar, Scalar]:
+        """The speed_factor for which the grip was shown, and the next grip."""
+        ahead = reference[:, 3] ** 2 * jnp.abs(curvature_ahead(reference))
+        now = state.speed_factor**2 * ahead[0]
+        # Only a turn that asks for the grip proves it; a corridor that does not fit
+        # disproves it anywhere.
+        proved = jnp.where(now > GRIP_SHARE * state.grip, 1.0 + self.fall, 1.0)
+        grip = state.grip * jnp.where(fits, proved, 1.0 - self.fall)
+        cap = jnp.sqrt(grip / jnp.maximum(jnp.max(ahead), 1e-6))
+        return jnp.where(jnp.isfinite(cap), cap, 1.0), grip
+
+    def _calibrated(
+        self, radii: Float[Array, " horizon"], errors: Float[Array, " horizon"]
+    ) -> Float[Array, " horizon"]:
+        """The radii after a comparison; unchanged where there was none."""
+        missed = errors > radii
+        change = self.rate * (missed - (1.0 - self.level))
+        after = jnp.clip(radii * jnp.exp(change), *RADIUS_RANGE)
+        return jnp.where(jnp.isfinite(errors), after, radii)
+
+
+def slow_down(reference: Reference, factor: float | Scalar) -> Reference:
+    """Follow the same path at a lower speed, linear between its points.
+
+        g'(t) = g(c t),   v'(t) = c v(c t)
+
+    Args:
+        reference: x, y, yaw, speed of each step.
+        factor: c in (0, 1].
+    """
+    horizon = reference.shape[0]
+    # reference[0] is the target one step from now. The target now is one step back
+    # along the circle through the first two poses. The pose of the vehicle would draw
+    # its error into the path.
+    now = compose(reference[0, POSE], between(reference[1, POSE], reference[0, POSE]))
+    points = jnp.concatenate([jnp.append(now, reference[0, 3])[None], reference])
+    times = factor * jnp.arange(1, horizon + 1)
+    index = jnp.minimum(jnp.floor(times).astype(int), horizon - 1)
+    start, step = points[index], points[index + 1] - points[index]
+    step = step.at[:, 2].set(wrap_angle(step[:, 2]))
+    return (start + (times - index)[:, None] * step).at[:, 3].multiply(factor)
