@@ -292,22 +292,6 @@ def test_under_brax_wrappers_episodes_end_in_time_and_begin_again(kind, repeat):
     )
 
 
-def test_a_wrapped_car_drives_as_the_bare_one():
-    """Before the first end of an episode; each car by its own key."""
-    reset, drive = compiled()
-    _, after = wrapped("create")
-    for car, key in enumerate(jax.random.split(jax.random.key(0), 3)):
-        alone = drive(reset(key), gentle())
-        np.testing.assert_allclose(
-            after.pipeline_state.state[:9, car],
-            alone.pipeline_state.state[:9],
-            atol=1e-4,
-        )
-        np.testing.assert_allclose(
-            after.reward[:9, car], alone.reward[:9], rtol=1e-3, atol=1e-3
-        )
-
-
 @pytest.mark.parametrize(
     ("settings", "message"),
     [

@@ -243,16 +243,6 @@ def test_errors_along_and_across_mean_the_same_on_every_heading():
     )
 
 
-def test_a_constant_offset_in_speed_is_the_error_of_its_column():
-    """A model that moves nothing and adds 0.5 m/s to a car at rest."""
-    model = models.physics(lambda state, action, env: state.at[3].add(0.5))
-    data = driven()
-    still = data._replace(states=jnp.zeros_like(data.states))
-    result = np.asarray(evaluation.open_loop(model, {}, still, horizon=4))
-    np.testing.assert_allclose(result[:, 3], [0.5, 1.0, 1.5, 2.0], rtol=1e-6)
-    np.testing.assert_array_equal(result[:, :3], np.zeros((4, 3)))
-
-
 def test_a_horizon_longer_than_the_trajectories_is_refused():
     model, params = model_and_params("oracle")
     with pytest.raises(

@@ -352,26 +352,6 @@ def test_a_push_accelerates_the_dynamic_plant_by_force_over_mass_and_turns_it_by
     )
 
 
-def test_a_side_force_is_the_wind_that_pushes_as_hard():
-    """5 m/s of wind against 250 N, F = c_w w|w| with c_w = 10: the same numbers, and so
-    the same drive.
-    """
-    road, plant = at(roads(), 0), PLANTS["kinematic"]
-    calm, windy = road.envs.at[:, 1].set(0.0), road.envs.at[:, 1].set(5.0)
-    felt = jax.vmap(partial(plants.equivalent_wind, wind_force=plant.wind_force))(
-        calm[:, 1], jnp.full(len(calm), 250.0)
-    )
-    drive = jit(
-        partial(evaluation.simulate, plant.step, follower(), {}, dt=DT, horizon=3)
-    )
-    key = jax.random.key(0)
-    observed = road._replace(envs=calm, observed_envs=calm)
-    disturbed = drive(observed._replace(envs=calm.at[:, 1].set(felt)), key)
-    blown = drive(observed._replace(envs=windy), key)
-    np.testing.assert_array_equal(disturbed.states, blown.states)
-    assert not np.array_equal(disturbed.states, drive(observed, key).states)
-
-
 @cache
 def roads():
     family = scenarios.scenario(name="s3", duration=6.0, state_size=4, dt=DT)

@@ -5,9 +5,8 @@ norms may sum to more.
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from helpers import certified, explicit, space
+from helpers import certified
 
-from sfkd_jax import models
 from sfkd_jax.models._networks import Weights
 from sfkd_jax.models.sfkd._residual import share_budget
 
@@ -77,17 +76,3 @@ def test_the_certificate_proves_the_budget_from_the_networks_own_multipliers(sca
     proved = certified("joint", scale)
     assert proved.alpha <= 0.995 * (1 + 2e-6)
     assert proved.alpha_separate > proved.alpha
-
-
-@pytest.mark.parametrize("budget", ["joint", "sum"])
-def test_the_budget_changes_weights_and_not_shapes(budget):
-    weights = explicit("joint" if budget == "joint" else "sfkd")
-    assert [matrix.shape for matrix in weights.residual] == [(8, 8)] * 3
-    assert weights.operators.vertices.shape == (3, 8, 8)
-
-
-def test_an_unknown_budget_is_named_with_the_choices():
-    with pytest.raises(
-        ValueError, match=r"model\.budget must be one of joint, sum, got 'both'"
-    ):
-        models.sfkd(space(), budget="both")

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 import scipy.linalg
 import scipy.special
-from helpers import jit, same, space
+from helpers import jit, space
 
 from sfkd_jax import models, plants
 from sfkd_jax.geometry import compose
@@ -127,18 +127,6 @@ def test_the_rates_are_increments_over_a_period_in_units_of_the_data():
     np.testing.assert_allclose(model.vector(jnp.asarray([1.0, 2.0, 3.0, 18.0])), [2.0])
 
 
-@pytest.mark.usefixtures("x64")
-@pytest.mark.parametrize("body", PLANTS)
-@pytest.mark.parametrize("name", LEARNED)
-def test_the_step_commutes_with_every_motion_of_the_plane(name, body):
-    step = partial(stepped, small(name, body), drawn(name, body))
-    frame = jnp.asarray([30.0, -20.0, 2.3])
-    move = lambda state: jnp.concatenate([compose(frame, state[POSE]), state[BODY]])
-    state = STATES[body].astype(jnp.float64)
-    np.testing.assert_allclose(step(move(state)), move(step(state)), rtol=0, atol=1e-12)
-    assert np.abs(step(state) - state).min() > 1e-5
-
-
 @pytest.mark.parametrize("body", PLANTS)
 @pytest.mark.parametrize("name", LEARNED)
 def test_sizes_follow_the_space_and_wrong_ones_are_refused(name, body):
@@ -249,19 +237,6 @@ def test_another_way_to_be_affine_is_refused_with_the_choices():
         affine_rates(space(), (8,), (jnp.tanh,), last=1.0, affine_in="e")
 
 
-@pytest.mark.parametrize("name", LEARNED)
-def test_a_blind_model_ignores_the_environment_exactly_and_any_other_does_not(name):
-    other = jnp.asarray([0.8, -5.0])
-    for environment in (True, False):
-        model = small(name, environment=environment)
-        here, there = (
-            stepped(model, drawn(name), STATES[1], env=env) for env in (ENV, other)
-        )
-        assert bool(jnp.all(here == there)) != environment
-    centre = stepped(small(name), drawn(name), STATES[1], env=space().env_mean)
-    assert same(centre, here, rtol=0, atol=0)
-
-
 @pytest.mark.usefixtures("x64")
 @pytest.mark.parametrize(
     "loop",
@@ -286,20 +261,6 @@ def test_the_initial_residual_is_too_small_to_matter():
     )
     moved = stepped(model, model.init(jax.random.key(0)), STATES[1])
     np.testing.assert_allclose(moved, plant.nominal(STATES[1], CONTROL, ENV), atol=2e-2)
-
-
-@pytest.mark.parametrize("name", LEARNED)
-def test_no_model_is_much_larger_or_smaller_than_the_others(name):
-    known = (
-        {"nominal": plants.kinematic().nominal_derivative}
-        if name == "icode_mppi"
-        else {}
-    )
-    for body in PLANTS:
-        params = jax.eval_shape(
-            getattr(models, name)(space(body), **known).init, jax.random.key(0)
-        )
-        assert 9_000 < sum(leaf.size for leaf in jax.tree.leaves(params)) < 18_000
 
 
 def test_an_icode_without_hidden_layers_is_refused():

@@ -144,33 +144,6 @@ def test_the_effect_of_the_input_does_not_depend_on_the_state(body):
     np.testing.assert_allclose(there, here, rtol=0.02, atol=2e-5)
 
 
-@pytest.mark.parametrize("body", [1, 4])
-def test_gradients_reach_every_part_and_are_finite(body):
-    model, _ = parts(body)
-    state = jnp.concatenate(
-        [jnp.zeros(3), space(body).body_mean + 0.3 * space(body).body_scale]
-    )
-
-    def loss(params):
-        fiber = model.fiber(params, jnp.asarray([0.5, 4.0]))
-        for _ in range(2):
-            after = model.step(fiber, state, jnp.asarray([0.1, 1.0]))
-        return jnp.sum(after**2)
-
-    gradients = jit(jax.grad(loss))(drawn(body, 0.3))
-    assert all(np.all(np.isfinite(leaf)) for leaf in jax.tree.leaves(gradients))
-    idle = {name for name, leaf in gradients["free"].items() if not np.any(leaf)}
-    assert idle == ({"Y"} if body == 1 else set())  # a number has no skew part
-
-
-def test_about_ten_thousand_parameters():
-    for body in (1, 4):
-        shapes = jax.eval_shape(
-            models.control_synth(space(body)).init, jax.random.key(0)
-        )
-        assert 10_000 <= sum(leaf.size for leaf in jax.tree.leaves(shapes)) <= 13_000
-
-
 @pytest.mark.parametrize(
     "setting", [{"rate": 0.0}, {"rate": float("nan")}, {"networks": 0}, {"width": 0}]
 )

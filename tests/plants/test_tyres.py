@@ -74,21 +74,6 @@ def test_a_light_side_wind_turns_a_car_by_the_formula_of_the_linear_single_track
     assert float(final_curvature(states)) == pytest.approx(expected, rel=1e-3)
 
 
-@pytest.mark.parametrize("wind", [-6.0, 6.0])
-def test_a_side_wind_bends_the_path_to_the_side_it_pushes(vehicle, wind, hold):
-    states = hold(vehicle, 15.0, (0.0, 0.0), (0.6, wind), 4.0)
-    offset = np.sign(wind) * states[:, 1]
-    assert (offset[1:] > 0).all()
-    assert (np.diff(offset, 2) > 0).all()
-    assert 0.5 < offset[-1] < 10.0
-
-
-def test_without_wind_a_straight_drive_stays_straight(vehicle, hold):
-    states = hold(vehicle, 15.0, (0.0, 1.0), (0.6, 0.0), 4.0)
-    assert (states[:, (1, 2)] == 0).all()
-    assert (states[:, 4:] == 0).all()
-
-
 def test_no_command_takes_more_from_the_tyres_than_friction_times_load(coasting, sweep):
     drawn = sweep(coasting, 20_000, overdrive=3.0)
     states = drawn.states.at[:, 3].max(3.0)
@@ -135,12 +120,6 @@ def test_what_is_used_for_driving_and_braking_is_missing_for_turning(
     both = tyre_acceleration(coasting, state, jnp.array([0.3, acceleration]), env)
     assert 0.0 < both[1] < 0.99 * turning[1]
     assert (both[0] - turning[0]) * np.sign(acceleration) > 0.5
-
-
-@pytest.mark.parametrize("acceleration", [-0.2, 0.2])
-def test_a_small_acceleration_command_is_obeyed(coasting, acceleration, hold):
-    states = hold(coasting, 10.0, (0.0, acceleration), (0.9, 0.0), 2.0)
-    assert float(states[-1, 3]) == pytest.approx(10.0 + 2.0 * acceleration, abs=1e-3)
 
 
 def test_coasting_down_follows_the_closed_solution_of_drag_and_rolling(vehicle, hold):

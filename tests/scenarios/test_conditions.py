@@ -163,16 +163,6 @@ def test_an_unknown_name_lists_the_choices():
         make("s4")
 
 
-def test_an_episode_starts_on_the_path_at_its_speed_and_the_path_outlasts_it():
-    episode = jit(make("s2", duration=20.0, speed=12.0))(KEYS[0])
-    np.testing.assert_array_equal(episode.initial_state, [0.0, 0.0, 0.0, 12.0])
-    np.testing.assert_array_equal(np.asarray(episode.path.points)[0, :3], np.zeros(3))
-    assert (len(episode.path.points) - 1) * float(
-        episode.path.spacing
-    ) >= 12.0 * 20.0 + 12.0 * 2.0
-    assert float(episode.speed) == 12.0
-
-
 def test_road_and_weather_come_from_independent_streams():
     """The same key gives the same road in every family."""
     roads = [jit(make(name))(KEYS[0]).path.points for name in ("s1", "s2", "s3")]

@@ -159,16 +159,6 @@ def test_a_path_is_at_least_as_long_as_requested():
         assert (path.points.shape[0] - 1) * 0.5 >= length
 
 
-def test_different_keys_make_different_roads_and_the_same_key_the_same_road():
-    make = jit(jax.vmap(partial(smooth_path, length=60.0)))
-    keys = jax.random.split(jax.random.key(0), 8)
-    first, again = make(keys), make(keys)
-    np.testing.assert_array_equal(first.points, again.points)
-    ends = np.asarray(first.points)[:, -1, :2]
-    distance = np.linalg.norm(ends[:, None] - ends[None], axis=2) + np.eye(8)
-    assert distance.min() > 1e-3
-
-
 def test_the_reference_window_holds_the_next_points_at_the_given_speed(circle):
     window = jit(partial(reference_window, dt=0.1, horizon=5))(
         circle, jnp.asarray(3.0), jnp.asarray(8.0)
