@@ -177,7 +177,7 @@ def test_what_logs_cannot_support_is_refused_before_a_run_is_begun(logs, monkeyp
         )
     with pytest.raises(
         ValueError,
-        match="vehicle=own is known from logs alone, so nothing can drive it",
+        match="vehicle=own is known from logs alone, so it cannot be simulated",
     ):
         evaluate.run(settings(*SMALL, "name=other"))
     assert not (logs.parent / "runs" / "other").exists()

@@ -29,7 +29,7 @@ from sfkd_jax.types import (
 
 
 class Folded(NamedTuple):
-    """Parameters to drive with: `Model.fiber` need not bound or factorise them again.
+    """Parameters of a controller: `Model.fiber` need not bound or factorise them again.
 
     Attributes:
         weights: the parameters as they were learned and stored.
@@ -43,7 +43,7 @@ class Folded(NamedTuple):
 def fold(model: Model, params: Params) -> Params:
     """Evaluate once what every control step would otherwise evaluate again.
 
-    `policy.load` and the evaluation pipeline do this; only a program that drives with
+    `policy.load` and the evaluation pipeline do this; only a program that controls with
     parameters it has just trained calls it, and compiles it.
 
     Args:

@@ -305,7 +305,7 @@ class Controller(NamedTuple):
 
 
 class Trajectory(NamedTuple):
-    """States, controls and environments of a drive.
+    """States, controls and environments of a run.
 
     Attributes:
         states: x_0 … x_T, shape (*batch, time + 1, state).

@@ -12,7 +12,7 @@ from helpers import at, driven, jit, model_and_params, same
 
 from sfkd_jax import evaluation, models, plants, scenarios
 from sfkd_jax.evaluation import (
-    Claims,
+    ClaimedBounds,
     Predictions,
     predictions,
     theorem_reach,
@@ -285,7 +285,7 @@ def test_the_record_names_the_tube_it_speaks_of_and_is_null_where_nothing_is_cla
     errors = np.zeros((4, 1, 4, 3))
     errors[0, 0, 3, 0] = 1.5
     result = Predictions(errors, np.full((4, 1, 4), 0.3), np.full((4, 1, 4), 0.1))
-    everything = Claims(
+    everything = ClaimedBounds(
         tube(2.0), tube(1.0), 0.95, np.asarray([0.2, 0.4, 0.4, 0.4]), 0.1, 1.4
     )
     assert violations(result, everything) == {
@@ -294,14 +294,14 @@ def test_the_record_names_the_tube_it_speaks_of_and_is_null_where_nothing_is_cla
         "v1_conformal_radius_m": 1.0, "v1_level": 0.95, "v2": 0.25, "v2_threshold_m": 1.4, "segments": 4,
         "window_error_m": {"median": 0.0, "p95": pytest.approx(0.85 * 1.5)},
     }  # fmt: skip
-    measured = violations(result, Claims(conformal=tube(1.0), level=0.95))
+    measured = violations(result, ClaimedBounds(conformal=tube(1.0), level=0.95))
     assert (measured["v0"], measured["v1"], measured["v1_tube"], measured["v2"]) == (
         None,
         0.25,
         "conformal",
         None,
     )
-    nothing = violations(result, Claims())
+    nothing = violations(result, ClaimedBounds())
     assert {name for name, value in nothing.items() if value is not None} == {
         "segments",
         "window_error_m",

@@ -91,7 +91,7 @@ def test_a_robot_known_from_logs_alone_is_not_driven():
     plant = plants.own(state_names=NAMES)
     assert not plant.simulated
     with pytest.raises(
-        ValueError, match="known from logs alone, so nothing can drive it"
+        ValueError, match="known from logs alone, so it cannot be simulated"
     ):
         plants.check_step(plant)
 

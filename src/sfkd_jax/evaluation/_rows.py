@@ -121,7 +121,7 @@ def disturbed(
     }
 
 
-def compare(rows: list[dict[str, Any]], *, not_driven: int = 0) -> list[dict[str, Any]]:
+def compare(rows: list[dict[str, Any]], *, missing: int = 0) -> list[dict[str, Any]]:
     """Add comparisons of systems that drove the same episodes with the same sampling.
 
     A row without sampling (a quadratic program) is compared with rows that sample
@@ -129,8 +129,8 @@ def compare(rows: list[dict[str, Any]], *, not_driven: int = 0) -> list[dict[str
     planner is taken. `p_holm` of the differences to SFKD is adjusted for all rows.
 
     Args:
-        rows: that were driven; `drives`, if they have it, tells which episodes.
-        not_driven: number of rows that belong to the same comparison and are missing.
+        rows: of evaluated systems; `drives`, if they have it, tells which episodes.
+        missing: number of rows of the same comparison that are not there yet.
     """
     for entry in rows:
         same = [other for other in rows if _episodes(other) == _episodes(entry)]
@@ -141,7 +141,7 @@ def compare(rows: list[dict[str, Any]], *, not_driven: int = 0) -> list[dict[str
                 continue
             entry[name] = measure(_by_seed(entry), _by_seed(other))
     family = [entry["difference_to_sfkd"] for entry in rows if _has_p(entry)]
-    adjusted = holm([one["p"] for one in family], not_made=not_driven)
+    adjusted = holm([one["p"] for one in family], not_made=missing)
     for record, p in zip(family, adjusted, strict=True):
         record["p_holm"] = p
     return rows

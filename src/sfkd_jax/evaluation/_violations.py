@@ -1,4 +1,4 @@
-"""Count how often predictions along closed-loop drives violate claimed bounds."""
+"""Count how often predictions along closed-loop runs violate claimed bounds."""
 
 from __future__ import annotations
 
@@ -45,12 +45,12 @@ class Predictions(NamedTuple):
     defects: Float[Array, "segment window horizon"]
 
 
-class Claims(NamedTuple):
+class ClaimedBounds(NamedTuple):
     """Claims about the predictions of a model; None where there is no claim.
 
     Attributes:
         certified: tube of a certificate, radii by `KINDS`, each (horizon,).
-        conformal: tube of calibration drives, in the same form.
+        conformal: tube of calibration runs, in the same form.
         level: 1 − δ of both.
         latent: R_1 … R_T of a certificate.
         d_bar: the one-step bound that the certificate assumes.
@@ -66,22 +66,22 @@ class Claims(NamedTuple):
 
 
 def predictions(
-    model: Model, params: Params, driven: Trajectory, *, length: int, horizon: int
+    model: Model, params: Params, runs: Trajectory, *, length: int, horizon: int
 ) -> Predictions:
-    """Predict along drives, cut into segments as long as calibration trajectories.
+    """Predict along runs, cut into segments as long as calibration trajectories.
 
     Args:
         model: any model.
         params: of the model.
-        driven: a batch; the environments are those that the model observes.
+        runs: a batch; the environments are those that the model observes.
         length: of a segment, that of a calibration trajectory.
         horizon: steps.
 
     Raises:
-        ValueError: drives shorter than a segment, or segments shorter than the horizon.
+        ValueError: runs shorter than a segment, or segments shorter than the horizon.
     """
     cut = jax.vmap(partial(sliding_windows, horizon=length, stride=length))
-    segments = jax.tree.map(lambda leaf: leaf.reshape(-1, *leaf.shape[2:]), cut(driven))
+    segments = jax.tree.map(lambda leaf: leaf.reshape(-1, *leaf.shape[2:]), cut(runs))
 
     def one(segment: Trajectory) -> Predictions:
         windows = sliding_windows(segment, horizon=horizon, stride=STRIDE)
@@ -160,7 +160,7 @@ def threshold_violations(
     return int(np.sum(~inside)), inside.size
 
 
-def violations(predicted: Predictions | None, claims: Claims) -> dict[str, Any]:
+def violations(predicted: Predictions | None, claims: ClaimedBounds) -> dict[str, Any]:
     """Return the violation rates V0, V1, V2 and tube radii as results.json has them.
 
     A rate without a claim is null. V1 is of the certified tube if there is one, else of

@@ -343,11 +343,13 @@ def _model_coordinates(
 
 def _claims(
     settings: Settings, system: System, dataset: Dataset | None
-) -> evaluation.Claims:
+) -> evaluation.ClaimedBounds:
     """Claims about a system's predictions, of its certificate and of calibration."""
     options = settings.certification
     level, horizon = options.level, options.horizon
-    claims = evaluation.Claims(level=level, threshold=settings.evaluation.threshold_m)
+    claims = evaluation.ClaimedBounds(
+        level=level, threshold=settings.evaluation.threshold_m
+    )
     if dataset is not None:
         try:
             tube = conformal_tube(

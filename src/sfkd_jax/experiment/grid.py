@@ -270,12 +270,12 @@ def collect_rows(
             f"{len(by_other_code)} cells were made by other code, "
             f"such as {by_other_code[0]}: used, and marked on the page"
         )
-    not_driven = len({cell._replace(seed=0) for cell in cells}) - len(pooled)
+    missing = len({cell._replace(seed=0) for cell in cells}) - len(pooled)
     rows = []
     for cell, trainings in pooled.items():
         with store.as_artefact_error(cell_path(cell, directory)):
             rows.append(evaluation.pool(trainings))
-    return evaluation.compare(rows, not_driven=not_driven)
+    return evaluation.compare(rows, missing=missing)
 
 
 def _row_file(path: Path) -> Path:

@@ -57,9 +57,9 @@ def koopman(
     no products of state and control enter, as in the original. A model that ignores e
     has the original's one (A, B) for all e; matrices that vary with e are an extension.
 
-    `identify` regresses z⁺ − z on pairs of driven states, each relative to a circle of
+    `identify` regresses z⁺ − z on pairs of logged states, each relative to a circle of
     random curvature and offset (how a car moves does not depend on the path it is on),
-    with the ridge that predicts validation drives best over a horizon; the original has
+    with the ridge that predicts validation runs best over a horizon; the original has
     no ridge. It is pure and may be compiled. A `Model` is given no path, so its rollout
     follows a straight path from its initial pose.
 

@@ -52,7 +52,7 @@ class Affine(NamedTuple):
     offset: Float[Array, " all"]
 
 
-class Shared(NamedTuple):
+class R2dnWeights(NamedTuple):
     """Plain weights, with all bounds enforced.
 
     Attributes:
@@ -97,7 +97,7 @@ class Interconnection(nn.Module):
     pose: bool = True
 
     @nn.compact
-    def __call__(self) -> Shared:
+    def __call__(self) -> R2dnWeights:
         """Return the explicit weights."""
         square = (self.rank, self.rank)
         A, B1, C1 = contracting(
@@ -109,7 +109,7 @@ class Interconnection(nn.Module):
         phi = Sandwich(self.rank, self.hidden, self.rank, name="phi")(1.0)
         first, *middle, last = phi.matrices
         decoder, decoder_inputs = self._decoder() if self.pose else (Weights(), None)
-        return Shared(
+        return R2dnWeights(
             A=A,
             feedback=Weights((first @ C1, *middle, B1 @ last), phi.multipliers),
             feedback_inputs=self._affine(
@@ -276,11 +276,11 @@ class _R2dn:
             "encoder": self.encoder.init(encoder_key, body, env)["params"],
         }
 
-    def shared(self, params: Params) -> Shared:
+    def shared(self, params: Params) -> R2dnWeights:
         """Return the explicit weights, as they are if folded."""
         if isinstance(params, Folded):
             return params.shared
-        return cast(Shared, self.weights.apply({"params": params["weights"]}))
+        return cast(R2dnWeights, self.weights.apply({"params": params["weights"]}))
 
     def fiber(self, params: Params, env: Environment) -> R2dnFiber:
         """Return the explicit weights with the biases of one environment."""

@@ -90,7 +90,7 @@ def own(
 def _no_step(state: State, control: Control, env: Environment) -> State:
     """The step of a vehicle that is known from logs alone."""
     raise _MissingStep(
-        "vehicle=own is known from logs alone, so nothing can drive it: "
+        "vehicle=own is known from logs alone, so it cannot be simulated: "
         "pass vehicle.step=module:function"
     )
 

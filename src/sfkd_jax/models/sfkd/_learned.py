@@ -20,7 +20,7 @@ ALPHA_START = 2.0
 """Initial logit of a learned α: 88 % of the way from the smallest to the largest."""
 
 
-class Shared(NamedTuple):
+class SharedWeights(NamedTuple):
     """Weights that do not depend on e: vertices, the bounded networks, the read-out."""
 
     vertices: Float[Array, "vertex rank rank"]
@@ -131,11 +131,11 @@ class Learned(nn.Module):
             return most
         return LOWEST_RATE + (most - LOWEST_RATE) * nn.sigmoid(self.alpha_logit)
 
-    def __call__(self, env: Array) -> tuple[Shared, PerEnvironment]:
+    def __call__(self, env: Array) -> tuple[SharedWeights, PerEnvironment]:
         """Evaluate every part once, so that init creates all parameters."""
         return self.shared(), self.per_environment(env)
 
-    def shared(self) -> Shared:
+    def shared(self) -> SharedWeights:
         """Return the weights that do not depend on e, with every bound enforced."""
         if self.joint:
             vertices, residual = share_budget(
@@ -148,7 +148,7 @@ class Learned(nn.Module):
         decoder = Weights()
         if self.pose:
             decoder = self.decoder_weights(jnp.exp(self.log_decoder_bound))
-        return Shared(
+        return SharedWeights(
             vertices,
             residual,
             decoder,

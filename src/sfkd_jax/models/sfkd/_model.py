@@ -19,7 +19,12 @@ from sfkd_jax.models._networks import (
     scaled_control,
     scaled_env,
 )
-from sfkd_jax.models.sfkd._learned import LOWEST_RATE, Learned, PerEnvironment, Shared
+from sfkd_jax.models.sfkd._learned import (
+    LOWEST_RATE,
+    Learned,
+    PerEnvironment,
+    SharedWeights,
+)
 from sfkd_jax.models.sfkd._residual import BUDGETS, RESIDUALS
 from sfkd_jax.ranges import Fraction, NonNegativeInt
 from sfkd_jax.rollout import Folded, unfold
@@ -121,11 +126,11 @@ class Sfkd:
         weights = {"params": unfold(params)["networks"]}
         return self.learned.apply(weights, *inputs, method=method)
 
-    def shared(self, params: Params) -> Shared:
+    def shared(self, params: Params) -> SharedWeights:
         """Return the bounded weights, as they are if folded."""
         if isinstance(params, Folded):
             return params.shared
-        return cast(Shared, self._apply(params, "shared"))
+        return cast(SharedWeights, self._apply(params, "shared"))
 
     def rate(self, params: Params) -> Scalar:
         """Return α."""
