@@ -24,6 +24,7 @@ from helpers import (
 
 from sfkd_jax import models, store
 from sfkd_jax.geometry import compose
+from sfkd_jax.models.sfkd import RESIDUALS
 from sfkd_jax.rollout import fold, rollout
 from sfkd_jax.types import POSE
 
@@ -79,6 +80,8 @@ def test_other_parameters_and_environments_do_not_compile_again(name, one):
 
 def test_every_registered_model_is_tested_here():
     assert {"sfkd", *OTHERS} == set(models.FACTORIES)
+    kinds = {variant.get("residual", "sandwich") for variant in VARIANTS.values()}
+    assert kinds == set(RESIDUALS)
 
 
 @pytest.mark.parametrize("name", EVERY)
