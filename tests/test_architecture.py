@@ -57,7 +57,7 @@ THIRD_PARTY = {
     "training": {"optax", "orbax", "numpy"},
     "certification": {"numpy", "scipy", "threadpoolctl", "cvxpy", "clarabel"},
     "evaluation": {"numpy", "scipy"},
-    "report": {"numpy", "matplotlib", "pandas", "jinja2", "hydra", "omegaconf"},
+    "report": {"numpy", "matplotlib", "PIL", "jinja2"},
     "policy": {"numpy"},
     "adapters": {"brax", "gymnasium", "matplotlib", "numpy", "scipy", "vehiclemodels"},
     "export": {"numpy", "iree", "hydra", "omegaconf"},

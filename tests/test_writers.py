@@ -14,8 +14,8 @@ from helpers import refusal_of
 
 from sfkd_jax import evaluation, store
 from sfkd_jax.experiment import runs
-from sfkd_jax.reporting.rows import group_title, groups_of
-from sfkd_jax.reporting.scene import scenes_of
+from sfkd_jax.report.episodes import of_run
+from sfkd_jax.report.rows import grouped, title_of
 from sfkd_jax.store import DirectoryLocked, locked
 
 ROW = {
@@ -178,16 +178,12 @@ def test_three_planners_in_one_directory_keep_three_rows_with_their_episodes(tmp
     for value, row in enumerate(retained, 1):
         for part in ("lateral", "states", "controls", "envs", "path"):
             assert np.all(arrays[f"{evaluation.episode_name(row)}/{part}"] == value)
-    scenes = scenes_of(tmp_path)
-    assert {scene.lateral["sfkd"][0, 0]: "cem" in scene.label for scene in scenes} == {
-        1: False,
-        2: True,
-        3: False,
-    }
-    assert len({scene.stem for scene in scenes}) == 3
-    blocks = groups_of(retained)
+    groups = of_run(tmp_path)
+    drawn = {one.lateral[0, 0]: one.row["planner"] for (one,) in groups}
+    assert drawn == {1: "mppi", 2: "cem", 3: "gradient"}
+    blocks = grouped(retained, evaluation.SHARED)
     assert [len(block) for block in blocks] == [1, 1, 1]
-    assert len({group_title(block) for block in blocks}) == 3
+    assert len({title_of(block, evaluation.SHARED) for block in blocks}) == 3
     keep(tmp_path, rows[1], 7.0)
     retained, arrays = stored(tmp_path)
     assert len(retained) == 3
@@ -213,7 +209,8 @@ def test_drives_on_other_roads_are_other_scenes(tmp_path):
     keep(tmp_path, ROW | {"system": "nominal", "env": "none"}, 1.0)
     keep(tmp_path, ROW | {"system": "oracle"}, 1.0)
     keep(tmp_path, ROW, 2.0)
-    assert sorted(sorted(scene.lateral) for scene in scenes_of(tmp_path)) == [
+    groups = of_run(tmp_path)
+    assert sorted([one.system for one in group] for group in groups) == [
         ["nominal", "oracle"],
         ["sfkd"],
     ]

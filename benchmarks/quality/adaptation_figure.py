@@ -20,7 +20,7 @@ from matplotlib.figure import Figure
 from benchmarks.harness import ROOT
 from benchmarks.quality import adaptation
 from sfkd_jax import build, evaluation, policy, scenarios
-from sfkd_jax.reporting import style
+from sfkd_jax.report import style
 
 CASE, SECONDS, EPISODES, SEED = adaptation.CASES["force, 3 s"], 30.0, 16, 2027
 FILM_SECONDS, WINDOW, FRAME = 15.0, 6.0, 2

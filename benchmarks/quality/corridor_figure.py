@@ -14,8 +14,10 @@ import numpy as np
 
 from benchmarks.quality import shield
 from benchmarks.robustness.soak import LANE
-from sfkd_jax.paper import draw_film, draw_hostile
+from sfkd_jax import report
+from sfkd_jax.report import style
 
+COLOURS = style.ACCENT, style.THIRD, "#8b5fbf", style.SECOND, style.MUTED
 SHOWN = ("worst", "bang-bang", "random", "constant", "full lock")
 LOCKED = 5
 """When the planner of the film goes to full lock [s]."""
@@ -95,14 +97,59 @@ def film(car, seconds, seed):
             road, keys[0]
         )
         cars[name] = np.asarray(lateral)[1:], np.asarray(states)
-    return {
-        "cars": cars,
-        "title": f"{car.plant.name} car on S3",
-        "dt": car.plant.dt,
-        "points": np.asarray(road.path.points),
-        "envs": np.asarray(road.envs),
-        "corridor": bounds["nominal"] + bounds["followed_position"],
-    }
+    colours = style.ACCENT, style.THIRD, style.DEPARTED
+    return report.Film(
+        title=f"{car.plant.name} car on S3",
+        dt=car.plant.dt,
+        points=np.asarray(road.path.points),
+        envs=np.asarray(road.envs),
+        cars=[
+            report.Car(name, colour, *arrays)
+            for (name, arrays), colour in zip(cars.items(), colours, strict=True)
+        ],
+        corridor=bounds["nominal"] + bounds["followed_position"],
+    )
+
+
+def draw(shown):
+    """Hostile planners in the corridor; below them one of them without the shield."""
+    figure = style.canvas(7.2)
+    ratios = {"sharex": True, "height_ratios": [5, 4.2, 1, 1]}
+    panels = inside, lost, friction, wind = figure.subplots(4, 1, **ratios)
+    dt, edge = shown["dt"], shown["width"] + shown["tube"]
+    time = dt * np.arange(1, len(shown["envs"]) + 1)
+    for (name, lateral), color in zip(shown["kept"].items(), COLOURS, strict=True):
+        inside.plot(time, lateral.T, color=color, linewidth=0.7, zorder=3)
+        inside.plot([], [], color=color, label=name)
+    inside.set(ylim=(-1.25 * edge, 1.25 * edge))
+    inside.set_title("With the shield, every planner hostile", pad=22)
+    for onset, held, free in zip(
+        shown["onset"], shown["held"], shown["free"], strict=True
+    ):
+        gone = np.flatnonzero(~(np.abs(free) < 3 * shown["lane"]))
+        end = gone[0] + 1 if len(gone) else len(free)
+        look = {"color": style.DEPARTED, "linewidth": 1.0}
+        lost.plot(time[onset:end], free[onset:end], **look)
+        lost.plot(time[onset:], held[onset:], color=style.ACCENT, linewidth=0.7)
+    lost.plot([], [], color=style.DEPARTED, label="without the shield")
+    lost.plot([], [], color=style.ACCENT, label="with the shield")
+    for side in (-shown["lane"], shown["lane"]):
+        lost.axhline(side, color=style.DARK, linestyle="--", linewidth=1.2)
+    lost.set(ylim=(-2.2 * shown["lane"], 2.2 * shown["lane"]))
+    title = f"{shown['name'].capitalize()} from one moment on; dashed: leaves its lane"
+    lost.set_title(title, pad=22)
+    for axes in (inside, lost):
+        style.draw_corridor(axes, edge)
+        axes.set_ylabel("lateral error [m]")
+        axes.legend(loc="lower left", bbox_to_anchor=(0.0, 1.0), ncols=5)
+    style.draw_conditions(friction, wind, shown["envs"], dt)
+    for axes in panels:
+        axes.grid(visible=False, axis="x")
+        for switch in style.switches(shown["envs"]):
+            axes.axvline(switch * dt, **style.SWITCH)
+    wind.set(xlabel="time [s]", xlim=(0.0, time[-1]))
+    figure.align_ylabels()
+    return figure
 
 
 def main():
@@ -124,10 +171,11 @@ def main():
         "--film", type=Path, metavar="GIF", help="make this, and no figure"
     )
     args = parser.parse_args()
-    draw, path, shown = (
-        (draw_film, args.film, film) if args.film else (draw_hostile, args.out, drives)
-    )
-    print(draw(path, **shown(shield.load(args.run), args.seconds, args.seed)))
+    given = shield.load(args.run), args.seconds, args.seed
+    if args.film:
+        print(report.write_film(film(*given), args.film, every=1))
+    else:
+        print(style.save(args.out, draw, drives(*given)))
 
 
 if __name__ == "__main__":

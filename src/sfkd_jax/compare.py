@@ -13,7 +13,7 @@ from sfkd_jax.experiment import grid
 from sfkd_jax.experiment.command import command_line, compose, hydra_command
 from sfkd_jax.experiment.comparing import Comparison
 from sfkd_jax.experiment.options import Settings
-from sfkd_jax.paper import write_results_page
+from sfkd_jax.report import write_results_page
 from sfkd_jax.settings import plain, replace
 
 

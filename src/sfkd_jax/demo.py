@@ -11,8 +11,8 @@ from sfkd_jax.evaluation.metrics import text_table
 from sfkd_jax.experiment import data, evaluating, grid
 from sfkd_jax.experiment.command import hydra_command
 from sfkd_jax.experiment.options import Settings
-from sfkd_jax.paper import animate
 from sfkd_jax.plants import Vehicle
+from sfkd_jax.report import film_of, of_rows
 from sfkd_jax.settings import plain, replace
 
 SHIPPED = Path(__file__).with_name("pretrained")
@@ -58,7 +58,8 @@ def run(settings: Settings) -> dict[str, Any]:
         store.write_json(results / "results.json", document)
         for line in text_table(rows, *PRINTED):
             store.print_message(line)
-        film = animate(directory, rows, episodes.name, corridor=_half_width(trained))
+        path = directory / f"{results.name}.gif"
+        film = film_of(path, of_rows(directory, rows), _half_width(trained))
     store.print_message(
         f"animation: {film}; {time.perf_counter() - began:.0f} s in all"
     )

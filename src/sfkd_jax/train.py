@@ -11,9 +11,8 @@ from sfkd_jax.experiment import runs, stages
 from sfkd_jax.experiment.command import command_line, hydra_command
 from sfkd_jax.experiment.evaluating import evaluate_run
 from sfkd_jax.experiment.options import Settings
-from sfkd_jax.paper import beside_the_paper
 from sfkd_jax.plants import check_step
-from sfkd_jax.reporting import write_report
+from sfkd_jax.report import write_report
 
 
 def run(settings: Settings) -> dict[str, Any]:
@@ -49,7 +48,7 @@ def _run_stages(settings: Settings) -> dict[str, Any]:
             "vehicle.step=package.module:function drives it"
         )
     with store.as_artefact_error(run_dir):
-        pages = write_report(run_dir, studies=beside_the_paper)
+        pages = write_report(run_dir)
     store.print_message(f"report: {pages['report']}")
     return about | {
         "certificate": str(stages.certificate_path(run_dir)),

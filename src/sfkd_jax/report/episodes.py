@@ -1,0 +1,102 @@
+"""Stored episodes of rows: those of a run, and those of the cells of a comparison."""
+
+from __future__ import annotations
+
+from pathlib import Path, PurePath
+from typing import Any, NamedTuple
+
+import numpy as np
+from jaxtyping import Float
+
+from sfkd_jax import store
+from sfkd_jax.evaluation import SHARED, parse_episode_name
+from sfkd_jax.evaluation.metrics import Row
+from sfkd_jax.report.rows import name_of
+from sfkd_jax.report.style import family, rank, switches
+
+CELL = "cell"
+
+
+class Episodes(NamedTuple):
+    """The stored episodes of a row.
+
+    Attributes:
+        row: its identity at least.
+        dt: sampling period [s].
+        lateral: signed deviation of x_1 … x_T from the path [m], left positive.
+        states: x_0 … x_T of the first episode, beginning with x, y, yaw.
+        envs: friction and wind [m/s] at every step of the first episode.
+        path: x, y, yaw, curvature along the road of the first episode.
+    """
+
+    row: Row
+    dt: float
+    lateral: Float[np.ndarray, "episode time"]
+    states: Float[np.ndarray, "time_plus_1 state"] | None
+    envs: Float[np.ndarray, "time 2"] | None
+    path: Float[np.ndarray, "point column"] | None
+
+    @property
+    def name(self) -> str:
+        """Name of the row."""
+        return name_of(self.row)
+
+    @property
+    def system(self) -> str:
+        """Name of the system, without its coordinates."""
+        return family(str(self.row.get("system")))
+
+
+def of_run(run: Path) -> list[list[Episodes]]:
+    """The episodes of a run, grouped by what may be compared on the same road.
+
+    The group with most switches comes first; empty without a file.
+    """
+    path = run / f"episodes{store.SUFFIX}"
+    arrays = store.read_arrays(path, kind="episodes")[0] if path.exists() else {}
+    dt = float(arrays.pop("dt", 0.1))
+    parts: dict[str, dict[str, np.ndarray]] = {}
+    for name, values in arrays.items():
+        episode, _, part = name.rpartition("/")
+        parts.setdefault(episode, {})[part] = values
+    groups: dict[tuple[Any, ...], list[Episodes]] = {}
+    for name, own in parts.items():
+        if one := _episodes(parse_episode_name(name), dt, own):
+            road = (None if a is None else a.tobytes() for a in (one.envs, one.path))
+            key = (*(one.row.get(column) for column in SHARED), *road)
+            groups.setdefault(key, []).append(one)
+    for group in groups.values():
+        group.sort(key=lambda one: (rank(one.system), one.name))
+    return sorted(groups.values(), key=lambda group: -len(switches(group[0].envs)))
+
+
+def of_rows(directory: Path, rows: list[Row]) -> list[Episodes]:
+    """The episodes of those rows of a comparison whose arrays exist.
+
+    Raises:
+        ArtefactError: arrays are damaged, or a row names some outside of the directory.
+    """
+    found = []
+    for row in rows:
+        name = PurePath(str(row.get("arrays")))
+        if name.is_absolute() or ".." in name.parts:
+            outside = "arrays of a row lie outside this folder"
+            raise store.ArtefactError(f"{directory / 'results.json'}: {outside}")
+        if (directory / name).is_file():
+            arrays = store.read_arrays(directory / name, kind=CELL)[0]
+            one = _episodes(row, float(arrays.get("dt", 0.1)), arrays)
+            found += [one] if one else []
+    return found
+
+
+def _episodes(row: Row, dt: float, arrays: dict[str, np.ndarray]) -> Episodes | None:
+    """The episodes of a row, None without a finite deviation."""
+    lateral = np.asarray(arrays.get("lateral", np.zeros((0, 0))), dtype=float)
+    if not np.any(np.isfinite(lateral)):
+        return None
+    first = {
+        name: np.asarray(values[0], dtype=float)
+        for name, values in arrays.items()
+        if values.ndim > 1 and values.size
+    }
+    return Episodes(row, dt, lateral, *map(first.get, ("states", "envs", "path")))

@@ -1,0 +1,264 @@
+"""The figures of all pages; units stand on the axes, titles say what is drawn."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+from matplotlib.figure import Figure
+from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter
+
+from sfkd_jax.evaluation.formats import dig, is_number, is_pair
+from sfkd_jax.evaluation.metrics import LANE_HALF_WIDTH, Row
+from sfkd_jax.report import style
+from sfkd_jax.report.episodes import Episodes
+from sfkd_jax.report.rows import name_of
+
+_ALWAYS = ("sfkd", "oracle")
+"""Systems that every panel shows."""
+_FEW = 6
+"""So many systems fit into one panel."""
+
+
+def first_episode(
+    group: list[Episodes], corridor: float | None = None, seconds: float = 15.0
+) -> Figure:
+    """The road from above; below it lateral errors, friction and wind over time.
+
+    Args:
+        group: of one road.
+        corridor: certified half width [m].
+        seconds: that are drawn.
+    """
+    first, panels = group[0], _panels(group)
+    last = min(round(seconds / first.dt), *(one.lateral.shape[1] for one in group))
+    road, envs = first.path is not None and first.states is not None, first.envs
+    changes = [step for step in style.switches(envs) if step < last]
+    heights = [1.5] * road + [2.2] * len(panels) + [0.7, 0.7] * (envs is not None)
+    figure = style.canvas(0.8 + sum(heights))
+    axes = [*figure.subplots(len(heights), height_ratios=heights, squeeze=False)[:, 0]]
+    if road:
+        _draw_road(axes.pop(0), group, changes, last)
+    for panel, (title, members) in zip(axes, panels.items(), strict=False):
+        panel.set_title(title)
+        _draw_errors(panel, members, last, corridor)
+    if envs is not None:
+        style.draw_conditions(axes[-2], axes[-1], envs[:last], first.dt)
+    for panel in axes:
+        panel.set(xlim=(0.0, last * first.dt))
+        panel.grid(visible=False, axis="x")
+        panel.tick_params(labelbottom=panel is axes[-1])
+        for step in changes:
+            panel.axvline(step * first.dt, **style.SWITCH)
+    axes[-1].set_xlabel("time [s]")
+    figure.align_ylabels(axes)
+    return figure
+
+
+def _panels(group: list[Episodes]) -> dict[str, list[Episodes]]:
+    """The systems of every panel, by its title; a small group is one panel."""
+    title = "Lateral error in the first episode"
+    if len(group) <= _FEW:
+        return {title: group}
+    kinds = "SFKD and its parts", "friction and wind observed", "neither observed"
+    panels: dict[str, list[Episodes]] = {f"{title}: {kind}": [] for kind in kinds}
+    for one in group:
+        blind = 2 if one.row.get("env") == "none" else 1
+        own = 0 if one.system.startswith("sfkd") else blind
+        for number, members in enumerate(panels.values()):
+            if number == own or one.system in _ALWAYS:
+                members.append(one)
+    return {name: members for name, members in panels.items() if members}
+
+
+def _draw_road(axes: Any, group: list[Episodes], changes: list[int], last: int) -> None:
+    """The path and the cars in true scale, with dots where conditions switch."""
+    path, own = np.asarray(group[0].path), np.asarray(group[0].states)[: last + 1, :2]
+    gone = np.linalg.norm(np.diff(own, axis=0), axis=1).sum()
+    arc = np.linalg.norm(np.diff(path[:, :2], axis=0), axis=1).cumsum()
+    ahead = path[: int(np.searchsorted(arc, gone)) + 2, :2]
+    # Turned so that the road runs from left to right: a wide figure wastes no height.
+    chord = ahead[-1] - ahead[0]
+    turn = style.turn_by(np.arctan2(chord[1], chord[0]))
+    look: dict[str, Any] = {"color": style.ROAD, "linewidth": 6}
+    axes.plot(*turn @ (ahead - path[0, :2]).T, **look)
+    for one in group:
+        if one.states is not None and (one.system in _ALWAYS or one is group[0]):
+            points = turn @ (one.states[: last + 1, :2] - path[0, :2]).T
+            axes.plot(*points, **style.line(one.system) | {"linewidth": 1.1})
+    marks = turn @ (own[changes] - path[0, :2]).T
+    axes.plot(*marks, "o", color=style.MUTED, markersize=4, zorder=6)
+    axes.set(xlabel="x [m]", ylabel="y [m]", aspect="equal", adjustable="datalim")
+    axes.set_title("The road from above; dots: friction or wind switch")
+
+
+def _draw_errors(
+    axes: Any, members: list[Episodes], last: int, corridor: float | None
+) -> None:
+    """Lateral error over time."""
+    axes.axhline(0.0, color=style.AXIS, linewidth=0.8)
+    peaks, always = [], [1e-3, corridor or 0.0]
+    for one in members:
+        values = one.lateral[0, :last]
+        time = one.dt * np.arange(1, len(values) + 1)
+        axes.plot(time, values, **style.line(one.system, one.name))
+        peaks.append(float(np.nanmax(np.abs(values), initial=0.0)))
+        always += peaks[-1:] if one.system in _ALWAYS else []
+    if corridor:
+        style.draw_corridor(axes, corridor)
+    # Of the others a bad one may leave the frame, lest it flatten the rest.
+    most = min(float(np.quantile(peaks, 0.85, method="higher")), LANE_HALF_WIDTH)
+    reach = 1.15 * max(most, *always)
+    axes.set(ylim=(-reach, reach), ylabel="lateral error [m]")
+    axes.legend(loc="center left", bbox_to_anchor=(1.0, 0.5), handlelength=1.8)
+
+
+def all_episodes(one: Episodes, corridor: float | None = None) -> Figure:
+    """Lateral error of a system in every stored episode."""
+    figure = style.canvas(3.0)
+    axes = figure.subplots()
+    time = one.dt * np.arange(1, one.lateral.shape[1] + 1)
+    axes.plot(time, one.lateral.T, color=style.DARK, linewidth=0.6, zorder=3)
+    if corridor:
+        style.draw_corridor(axes, corridor)
+    finite = np.abs(one.lateral[np.isfinite(one.lateral)])
+    reach = 1.25 * max(corridor or 0.0, float(np.max(finite, initial=1e-3)))
+    axes.set(xlim=(0.0, time[-1]), ylim=(-reach, reach))
+    axes.set(xlabel="time [s]", ylabel="lateral error [m]")
+    axes.set_title(f"Lateral error of {style.literal(one.name)}, all episodes")
+    return figure
+
+
+def open_loop(errors: dict[str, Any], radii: list[Any]) -> Figure:
+    """RMSE of prediction without feedback by time ahead: position, yaw, speed.
+
+    Args:
+        errors: open_loop.json.
+        radii: certified position tube [m], by step; empty without one.
+    """
+    figure = style.canvas(4.0)
+    grid = figure.add_gridspec(2, 2, width_ratios=[1.45, 1])
+    places = grid[:, 0], grid[0, 1], grid[1, 1]
+    position, yaw, speed = panels = [figure.add_subplot(one) for one in places]
+    known = is_number(errors.get("dt"))
+    ahead = np.asarray(errors["steps"], float) * (errors["dt"] if known else 1.0)
+    key = "position_rmse_m"
+    curves = {"model": errors.get(key), "certified tube": radii}
+    for name, record in (errors.get("baselines") or {}).items():
+        curves[name.replace("_", " ")] = dig(record, key)
+    colours = style.ACCENT, style.DARK, "#d55e00", style.THIRD, style.SECOND, "#cc79a7"
+    dashes = "-", ":", "--", "-.", (0, (5, 1, 1, 1)), (0, (1, 1))
+    for (name, values), color, dash in zip(
+        curves.items(), colours, dashes, strict=False
+    ):
+        if values:
+            shown = _numbers(values, len(ahead))
+            position.plot(ahead, shown, label=name, color=color, linestyle=dash)
+    for axes, name in ((yaw, "yaw_rmse_rad"), (speed, "speed_rmse_m_per_s")):
+        axes.plot(ahead, _numbers(errors.get(name), len(ahead)), color=style.ACCENT)
+        axes.set_ylim(bottom=0.0)
+    for axes, name in zip(
+        panels, ("position [m]", "yaw [rad]", "speed [m/s]"), strict=True
+    ):
+        axes.set(ylabel=f"error of {name}", xlim=(0, ahead[-1]))
+        axes.set_xlabel("time ahead [s]" if known else "steps ahead")
+    _plain_log(position.yaxis, position.set_yscale)
+    style.legend(figure, position)
+    figure.align_ylabels(panels[1:])
+    return figure
+
+
+def learning(lines: list[dict[str, Any]]) -> Figure:
+    """Loss by optimisation step, on training windows and on validation runs."""
+    figure = style.canvas(2.8)
+    axes = figure.subplots()
+    for name, color in (("loss", style.SECOND), ("validation_loss", style.ACCENT)):
+        known = [line for line in lines if is_number(line.get(name)) and "step" in line]
+        pairs = np.array([(line["step"], line[name]) for line in known]).reshape(-1, 2)
+        axes.plot(*pairs.T, label=name.replace("_", " "), color=color, marker=".")
+    axes.set(yscale="log", xlabel="optimisation step", ylabel="loss [-]")
+    axes.legend(ncols=2)
+    return figure
+
+
+def rmse_chart(groups: list[list[Row]]) -> Figure:
+    """Mean lateral RMSE with its 95 % interval: a panel for vehicle and scenario."""
+    names = list(dict.fromkeys(name_of(row) for rows in groups for row in rows))
+    columns = min(3, len(groups))
+    deep = -(-len(groups) // columns)
+    figure = style.canvas(0.6 + deep * (0.7 + 0.2 * len(names)))
+    panels = figure.subplots(deep, columns, sharey=True, squeeze=False)
+    for axes, rows in zip(panels.flat, groups, strict=False):
+        for row in rows:
+            mean, ends = (dig(row, "rmse_m", key) for key in ("mean", "ci95"))
+            if is_number(mean):
+                height, look = names.index(name_of(row)), style.line(str(row["system"]))
+                # On a logarithmic axis an interval that reaches 0 ends at the edge.
+                low, high = ends if is_pair(ends) else (mean, mean)
+                span = [1e3 * max(low, 0.3 * mean), 1e3 * high]
+                axes.plot(span, [height] * 2, color=look["color"], linewidth=1.6)
+                axes.plot(1e3 * mean, height, "o", color=look["color"], markersize=4.5)
+        where = style.scenario_label(str(rows[0].get("scenario")))
+        words = f"{where}, {rows[0].get('vehicle')}"
+        axes.set_title(style.literal(words), fontsize=9.5)
+        axes.tick_params(labelsize=8.5)
+        _plain_log(axes.xaxis, axes.set_xscale)
+    for axes in panels.flat[len(groups) :]:
+        axes.set_axis_off()
+    panels[0, 0].set_yticks(range(len(names)), [style.literal(n) for n in names])
+    panels[0, 0].set_ylim(len(names) - 0.4, -0.6)
+    figure.supxlabel("lateral RMSE [mm], mean and 95 % interval", fontsize=10)
+    return figure
+
+
+def side_forces(rows: list[Row]) -> Figure:
+    """RMSE against the largest unmeasured side force, one line per system.
+
+    Args:
+        rows: that may be compared, each with `disturbed`.
+    """
+    figure = style.canvas(4.0)
+    axes = figure.subplots()
+    for row in rows:
+        runs = [
+            one for one in row["disturbed"] if is_number(dig(one, "rmse_m", "mean"))
+        ]
+        points = [(one["force_n"], 1e3 * one["rmse_m"]["mean"]) for one in runs]
+        look = style.line(str(row.get("system")), name_of(row))
+        # A system with and without e has one colour; hollow marks do not observe e.
+        look |= {"markerfacecolor": "white"} if row.get("env") == "none" else {}
+        axes.plot(*np.array(points).reshape(-1, 2).T, "o", markersize=4, **look)
+    axes.set(xlabel="largest unmeasured side force [N]", ylabel="lateral RMSE [mm]")
+    _plain_log(axes.yaxis, axes.set_yscale)
+    style.legend(figure, axes)
+    return figure
+
+
+def against_setting(name: str, rows: list[tuple[float, Row]]) -> Figure:
+    """RMSE with its 95 % interval against a setting in which runs differ."""
+    figure = style.canvas(3.2)
+    axes = figure.subplots()
+    for value, row in rows:
+        mean, ends = (dig(row, "rmse_m", key) for key in ("mean", "ci95"))
+        if is_number(mean):
+            axes.plot(value, 1e3 * mean, "o", color=style.ACCENT)
+            span = [1e3 * end for end in (ends if is_pair(ends) else [mean, mean])]
+            axes.plot([value] * 2, span, color=style.ACCENT)
+    axes.set(xlabel=style.literal(name), ylabel="lateral RMSE [mm], 95 % interval")
+    axes.set_ylim(bottom=0.0)
+    return figure
+
+
+def _numbers(values: Any, count: int) -> np.ndarray:
+    """A list from JSON as `count` floats, with NaN for null and for what is absent."""
+    row = [float("nan") if value is None else float(value) for value in values or []]
+    return np.array((row + [float("nan")] * count)[:count], dtype=float)
+
+
+def _plain_log(axis: Any, set_scale: Any) -> None:
+    """Make an axis logarithmic, with plain numbers at few ticks."""
+    set_scale("log")
+    low, high = axis.get_view_interval()
+    axis.set_major_locator(LogLocator(subs=(1, 2, 5) if high < 50 * low else (1,)))
+    axis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}"))
+    axis.set_minor_formatter(NullFormatter())

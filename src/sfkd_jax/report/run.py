@@ -1,0 +1,257 @@
+"""The page of a run: what its files say, as tables, figures and a film."""
+
+from __future__ import annotations
+
+from importlib import resources
+from pathlib import Path
+from typing import Any
+
+from sfkd_jax.evaluation import SHARED, formats
+from sfkd_jax.evaluation.formats import DASH, dig, is_number, is_pair, plain, short
+from sfkd_jax.report import figures, style
+from sfkd_jax.report.episodes import Episodes, of_run
+from sfkd_jax.report.film import film_of
+from sfkd_jax.report.pages import Page, Part, Picture, Section, Text, write_page
+from sfkd_jax.report.rows import (
+    Table,
+    amount,
+    grouped,
+    metric_tables,
+    model_of,
+    name_of,
+    record_table,
+    title_of,
+)
+from sfkd_jax.store import (
+    SUFFIX,
+    ArtefactError,
+    as_artefact_error,
+    read_json,
+    read_jsonl,
+    read_manifest,
+    writing,
+)
+
+MADE_BY = {
+    "results.json": "evaluate",
+    "certificate.json": "certify",
+    "open_loop.json": "train",
+}
+"""File of a run -> the command that makes it."""
+PROOF = (
+    "Proved: recomputed from the stored weights, for every state, command and "
+    "environment in the boxes. Measured: a quantile over runs that training never saw, "
+    "promised for further runs under the same conditions. Outside the boxes nothing is "
+    "claimed."
+)
+_CAR = ["speed [m/s]", "lateral speed [m/s]", "yaw rate [rad/s]", "steering [rad]"]
+_BODY = {
+    "state": _CAR,
+    "control": ["steering [rad]", "acceleration [m/s²] or speed [m/s]"],
+    "env": ["friction [-]", "side wind [m/s]"],
+}
+_PATH = _BODY | {
+    "state": ["lateral error [m]", "heading error [rad]", *_CAR],
+    "control": [
+        "steering added [rad]",
+        "acceleration added [m/s²]",
+        "curvature [1/m]",
+        "reference speed [m/s]",
+    ],
+}
+"""Axes of the boxes of a certificate, in the frame of the body and of a path."""
+
+
+def write_report(run_dir: Path) -> dict[str, Any]:
+    """Write `run_dir/report/`: index.html, report.md, figures and a film.
+
+    Reads policy.safetensors, metrics.jsonl, open_loop.json, certificate.json, results.json and
+    the episodes of a run and recomputes none of their numbers; the same inputs give the
+    same bytes.
+
+    Args:
+        run_dir: of a run. All but policy.safetensors may be missing.
+
+    Returns:
+        `report`: path of the page. `figures`: paths of its images.
+
+    Raises:
+        ArtefactError: no policy.safetensors; a file that is not JSON, or whose content does
+            not fit on a page; or the disk refuses the page.
+    """
+    home = run_dir / "report"
+    with writing(home):
+        images = empty_folder(home / "figures")
+        page = _page(run_dir, images)
+        return write_page(page, home / "index.html", home / "report.md")
+
+
+def read_optional(path: Path) -> dict[str, Any]:
+    """The JSON object in a file, empty without a file."""
+    return read_json(path) if path.exists() else {}
+
+
+def read_policy(run: Path) -> dict[str, Any]:
+    """The manifest of the weights of a run, empty without weights."""
+    path = run / f"policy{SUFFIX}"
+    return read_manifest(path, kind="policy") if path.exists() else {}
+
+
+def read_certificate(run: Path) -> dict[str, Any]:
+    """The certificate of a run; one about other weights is not valid."""
+    certificate = read_optional(run / "certificate.json")
+    own = read_policy(run).get("sha256")
+    named = certificate.get("weights_sha256")
+    if own and named and own != named:
+        reason = "the certificate in this run is about other weights"
+        return {"valid": False, "reason": reason}
+    return certificate
+
+
+def holds(certificate: dict[str, Any]) -> bool:
+    """Whether a certificate is valid, with a contraction factor below one."""
+    alpha: Any = certificate.get("alpha")
+    return certificate.get("valid") is True and is_number(alpha) and alpha < 1
+
+
+def empty_folder(folder: Path) -> Path:
+    """Make a folder for images, without those of an earlier page."""
+    folder.mkdir(parents=True, exist_ok=True)
+    for stale in (*folder.glob("*.png"), *folder.glob("*.gif")):
+        stale.unlink()
+    return folder
+
+
+def made_with(config: dict[str, Any], versions: Any) -> list[Section]:
+    """The command, the settings and the versions that made something, folded."""
+    command = config.get("command")
+    parts: list[Part] = [Text(command, code=True)] if isinstance(command, str) else []
+    parts.append(record_table("Setting", config, "value"))
+    parts.append(record_table("Package", versions or {}, "version"))
+    return [Section("Command, settings and versions", parts, folded=True)]
+
+
+def _page(run_dir: Path, images: Path) -> Page:
+    """All sections of the page; a file whose content does not fit is named."""
+    policy = read_policy(run_dir)
+    if not policy:
+        makes = "python -m sfkd_jax.train makes a run"
+        raise ArtefactError(f"{run_dir / 'policy'}{SUFFIX} is missing: {makes}")
+    results = read_optional(run_dir / "results.json")
+    settings = policy.get("config") or {}
+    certificate, system = read_certificate(run_dir), model_of(settings)
+    proof = certificate if holds(certificate) else {}
+    half = dig(proof, "corridor", "corridor_m")
+    missing = [
+        Text(f"{name} is missing: python -m sfkd_jax.{command} makes it.")
+        for name, command in MADE_BY.items()
+        if not (run_dir / name).exists()
+    ]
+    sections = [Section("", [*missing])]
+    for title, file, make in (
+        ("Closed loop", "results.json", lambda: _scores(results)),
+        (
+            "Episodes",
+            f"episodes{SUFFIX}",
+            lambda: _driven(run_dir, system, half, images),
+        ),
+        ("Certificate", "certificate.json", lambda: _certified(certificate)),
+        ("Open loop", "open_loop.json", lambda: _predicted(run_dir, proof, images)),
+        ("Training", "metrics.jsonl", lambda: _learned(run_dir, images)),
+    ):
+        with as_artefact_error(run_dir / file, ValueError):
+            sections.append(Section(title, make()))
+    used = settings | {"command": dig(results, "config", "command")}
+    sections += made_with(used, policy.get("versions") or results.get("versions"))
+    experiment = plain(settings.get("experiment") or "unnamed run")
+    title = f"{style.label(system)}, {experiment}, seed {plain(settings.get('seed'))}"
+    return Page(title, sections)
+
+
+def _scores(results: dict[str, Any]) -> list[Part]:
+    """The metrics of all systems: tables for each group that may be compared."""
+    parts: list[Part] = []
+    for group in grouped(results.get("rows") or [], SHARED):
+        parts.append(Text(f"{title_of(group, SHARED)}: {amount(group)}"))
+        parts += metric_tables([(name_of(row), row) for row in group])
+    return parts
+
+
+def _driven(run_dir: Path, system: str, half: Any, images: Path) -> list[Part]:
+    """Figures of every group of episodes, and a film of the first one."""
+    parts: list[Part] = []
+    corridor = float(half) if is_number(half) else None
+    for number, group in enumerate(of_run(run_dir), 1):
+        title = title_of([group[0].row], SHARED)
+        path = style.save(
+            images / f"first_{number}.png", figures.first_episode, group, corridor
+        )
+        parts += [Text(f"{title}."), Picture(path, f"First episode: {title}")]
+        for one in _of_system(group, system):
+            path = images / f"all_{number}.png"
+            style.save(path, figures.all_episodes, one, corridor)
+            parts.append(Picture(path, f"All episodes: {title}"))
+        film = film_of(images / "film.gif", group, corridor) if number == 1 else None
+        parts += [Picture(film, f"Film: {title}")] if film else []
+    return parts
+
+
+def _of_system(group: list[Episodes], system: str) -> list[Episodes]:
+    """The first row of a system, if it has several episodes."""
+    own = [one for one in group if one.row.get("system") == system]
+    return [one for one in own[:1] if len(one.lateral) > 1]
+
+
+def _certified(record: dict[str, Any]) -> list[Part]:
+    """What holds and on what it rests, then the boxes outside of which it does not."""
+    if not record:
+        return []
+    if not holds(record):
+        reason = plain(record.get("reason") or "the file gives no reason")
+        return [Text(f"No contraction is certified for these weights: {reason}.")]
+    file = resources.files("sfkd_jax.report") / "templates" / "certificate.csv"
+    rows = []
+    for line in file.read_text("utf-8").splitlines():
+        name, place, write, basis = line.split(";")
+        shown = getattr(formats, write)(dig(record, *place.split(".")))
+        rows += [(name, [shown, basis])] if DASH not in shown else []
+    columns = [("", "value"), ("", "rests on")]
+    boxes = []
+    for box, known in (_PATH if record.get("corridor") else _BODY).items():
+        corners = dig(record, "boxes", box)
+        sides = zip(*corners, strict=False) if is_pair_of_lists(corners) else []
+        # Boxes of logged data name their own axes.
+        names = dig(record, "boxes", "names", box) or known
+        for name, side in zip(names, sides, strict=False):
+            boxes += [(f"{box}: {name}", [*map(short, side)])] if is_pair(side) else []
+    parts: list[Part] = [Text(PROOF), Table("Quantity", columns, rows, prose=True)]
+    heads = [("", "from"), ("", "to")]
+    return [*parts, Table("Box", heads, boxes)] if boxes else parts
+
+
+def is_pair_of_lists(value: Any) -> bool:
+    """Whether a JSON value is a list of two lists."""
+    lists = isinstance(value, list) and all(isinstance(one, list) for one in value)
+    return lists and len(value) == 2
+
+
+def _predicted(run_dir: Path, proof: dict[str, Any], images: Path) -> list[Part]:
+    """Errors of predictions by time ahead, beside naive predictors."""
+    errors = read_optional(run_dir / "open_loop.json")
+    if not errors.get("steps"):
+        return []
+    radii = dig(proof, "tube", "physical", "position_m")
+    path = style.save(images / "open_loop.png", figures.open_loop, errors, radii or [])
+    count = plain(errors.get("trajectories"))
+    words = f"{count} trajectories that training never saw."
+    return [Picture(path, "Prediction error by time ahead"), Text(words)]
+
+
+def _learned(run_dir: Path, images: Path) -> list[Part]:
+    """The loss by optimisation step."""
+    log = run_dir / "metrics.jsonl"
+    lines = read_jsonl(log) if log.exists() else []
+    if not lines:
+        return []
+    path = style.save(images / "learning.png", figures.learning, lines)
+    return [Picture(path, "Loss by optimisation step")]

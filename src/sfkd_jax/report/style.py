@@ -1,0 +1,212 @@
+"""The one style of every figure: colours, names, lines, and what many figures draw."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import matplotlib
+import numpy as np
+from jaxtyping import Float
+from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.figure import Figure
+from matplotlib.ticker import MaxNLocator
+
+ACCENT, SECOND, THIRD, MUTED = "#0b57b0", "#e8a33d", "#009e73", "#6b7280"
+DARK, SOFT, AXIS, ROAD = "#30363d", "#57606a", "#9aa1ab", "#d5dae1"
+DEPARTED = "#c2410c"
+"""Colour of a car that leaves its lane."""
+BAND: dict[str, Any] = dict(fc=ACCENT, alpha=0.16, linewidth=0, zorder=0.5)
+EDGE: dict[str, Any] = dict(color=ACCENT, linewidth=1.0, zorder=2)
+"""Of a certified corridor."""
+SWITCH: dict[str, Any] = dict(color=MUTED, ls=(0, (4, 3)), linewidth=0.9, zorder=1)
+"""Line at a switch of the environment, or at a level."""
+WIDTH = 6.9
+"""Of every figure [in]: text of 10 pt stays legible at the width of a phone."""
+RC: Any = {
+    "axes.axisbelow": True,
+    "axes.edgecolor": AXIS,
+    "axes.grid": True,
+    "axes.labelcolor": DARK,
+    "axes.linewidth": 0.7,
+    "axes.spines.right": False,
+    "axes.spines.top": False,
+    "axes.titlelocation": "left",
+    "axes.titlesize": 10.5,
+    "axes.titleweight": "bold",
+    "figure.constrained_layout.h_pad": 0.09,
+    "figure.constrained_layout.w_pad": 0.1,
+    "font.size": 10,
+    "grid.color": "#e3e6ea",
+    "grid.linewidth": 0.6,
+    "legend.fontsize": 9,
+    "legend.frameon": False,
+    "savefig.dpi": 150,
+    "xtick.color": AXIS,
+    "xtick.labelcolor": DARK,
+    "ytick.color": AXIS,
+    "ytick.labelcolor": DARK,
+}
+"""Settings of matplotlib beyond its defaults."""
+
+
+class Look(NamedTuple):
+    """Label, colour, dashes (on, off, …; none for a solid line), width of a line."""
+
+    label: str
+    colour: str
+    dashes: tuple[float, ...] = ()
+    width: float = 1.3
+
+
+_PART, _RIVAL = (4, 1.5), (5, 1, 1, 1)
+# The colours are safe for colour-blind readers (after Okabe and Ito, and Tol), and
+# dashes tell apart what colours alone do not.
+SYSTEMS = {
+    "sfkd": Look("SFKD", ACCENT, width=2.0),
+    "sfkd_no_fiber": Look("SFKD − fiber", "#5b9bd5", _PART),
+    "sfkd_no_transport": Look("SFKD − transport", "#7fb2a8", _PART),
+    "sfkd_no_residual": Look("SFKD − residual", "#8b7fc7", _PART),
+    "sfkd_no_contraction": Look("SFKD − contraction", "#4b3f8f", (1.2, 1.2)),
+    "sfkd_soft": Look("SFKD, soft hinge", "#2f7f9e", (1.2, 1.2)),
+    "sfkd_segment": Look("SFKD, segment frame", "#9ab8d3", (1.2, 1.2)),
+    "koopman_mpc": Look("Koopman MPC", "#882255", _RIVAL),
+    "neural_ode": Look("Neural ODE", THIRD, _RIVAL),
+    "icode": Look("ICODE", "#56b4e9", _RIVAL),
+    "icode_extrinsic": Look("ICODE, f(s, u) + G(s, u) e", "#2b83ba", (3, 1)),
+    "control_synth": Look("ControlSynth", "#cc79a7", _RIVAL),
+    "icode_mppi": Look("ICODE-MPPI", "#d55e00", _RIVAL),
+    "icode_mppi_one_step": Look("ICODE-MPPI, one step", "#8c510a", (1, 1)),
+    "icode_mppi_reads_env": Look("ICODE-MPPI, reads e", "#b8860b", (3, 1)),
+    "icode_mppi_extrinsic": Look(
+        "ICODE-MPPI, f(s, u) + G(s, u) e", "#a63603", (1, 1, 3, 1)
+    ),
+    "r2dn": Look("R2DN", "#999933", _RIVAL),
+    "nominal": Look("Nominal", SECOND, width=1.4),
+    "oracle": Look("Oracle", "#3c3c3c", (3, 1.2), 1.4),
+    "law": Look("Law alone", "#a0522d", (1.5, 1)),
+}
+"""Name in the artefacts -> its look, in the order of tables and legends."""
+
+
+def family(system: str) -> str:
+    """The name of a system without its coordinates."""
+    return system.replace("_path", "")
+
+
+def rank(system: str) -> tuple[int, str]:
+    """Sort key for the order of every table; unknown systems come last."""
+    order, name = [*SYSTEMS], family(system)
+    return (order.index(name) if name in order else len(order), system)
+
+
+def label(system: str) -> str:
+    """The label of a system; an unknown one is its own label."""
+    return SYSTEMS.get(family(system), Look(system, MUTED)).label
+
+
+def scenario_label(name: str) -> str:
+    """The label of a scenario: s3 is S3, other names are unchanged."""
+    return name.upper() if re.fullmatch(r"s\d+", name) else name
+
+
+def file_stem(*words: str) -> str:
+    """Words as part of a file name."""
+    return re.sub(r"\W", "_", "_".join(filter(None, words)))
+
+
+def literal(text: str) -> str:
+    """Escape text that matplotlib would read as a formula."""
+    return text.replace("$", r"\$")
+
+
+def line(system: str, name: str | None = None) -> dict[str, Any]:
+    """Keyword arguments of the line of a system, labelled with a name or its own."""
+    look = SYSTEMS.get(family(system), Look(system, MUTED, (1, 1), 1.2))
+    return {
+        "label": literal(name or look.label),
+        "color": look.colour,
+        "linestyle": (0, look.dashes) if look.dashes else "-",
+        "linewidth": look.width,
+        "zorder": {"sfkd": 5, "oracle": 4}.get(family(system), 3),
+    }
+
+
+def canvas(height: float) -> Figure:
+    """An empty figure, WIDTH x `height` [in], that no global state refers to."""
+    figure = Figure(figsize=(WIDTH, height), layout="constrained")
+    FigureCanvasAgg(figure)
+    return figure
+
+
+def legend(figure: Figure, axes: Any) -> None:
+    """Put one legend above the whole figure, which grows by the rows of the legend."""
+    handles, labels = axes.get_legend_handles_labels()
+    # Long names take the room of a column.
+    columns = 3 if any(len(one) > 20 for one in labels) else 4
+    columns = min(columns, max(1, len(labels)))
+    figure.legend(handles, labels, loc="outside upper left", ncols=columns)
+    figure.set_figheight(figure.get_figheight() + 0.2 * ((len(labels) - 1) // columns))
+
+
+def draw_corridor(axes: Any, half_width: float) -> None:
+    """Shade a certified corridor along the whole of a time axis, and name it."""
+    axes.axhspan(-half_width, half_width, **BAND)
+    for side in (-half_width, half_width):
+        axes.axhline(side, **EDGE)
+    # Behind the curves, whose peaks it would hide.
+    look = {"va": "top", "ha": "right", "color": ACCENT, "zorder": 1.5}
+    words = f"certified corridor ± {half_width:.3f} m"
+    across = axes.get_yaxis_transform()
+    axes.text(0.99, -1.04 * half_width, words, fontsize=8.5, transform=across, **look)
+
+
+def draw_conditions(
+    friction: Any, wind: Any, envs: Float[np.ndarray, "time 2"], dt: float
+) -> None:
+    """Draw friction and wind over time, each on its own axes."""
+    time = dt * np.arange(len(envs) + 1)
+    for axes, values in zip((friction, wind), envs.T, strict=True):
+        fill = {"baseline": 0.0, "fill": True, "color": "#b9c6d6", "linewidth": 0.0}
+        axes.stairs(values, time, **fill)
+        axes.stairs(values, time, baseline=None, color="#4a5a6d", linewidth=1.1)
+    friction.set(ylim=(0.0, 1.0), yticks=[0.0, 0.5, 1.0], ylabel="friction\n[-]")
+    peak = max(1.0, float(np.max(np.abs(envs[:, 1]))))
+    wind.set(ylim=(-1.15 * peak, 1.15 * peak), ylabel="side wind\n[m/s]")
+    wind.yaxis.set_major_locator(MaxNLocator(nbins=2, symmetric=True))
+
+
+def switches(envs: Float[np.ndarray, "time 2"] | None) -> list[int]:
+    """Steps at which friction jumps, or wind jumps between two steady levels.
+
+    The ramp of a gust is no jump.
+    """
+    if envs is None or len(envs) < 2:
+        return []
+    friction, wind = np.abs(np.diff(envs, axis=0)).T
+    steady = np.pad(wind, 1) < 1e-3
+    jump = (friction > 0.02) | ((wind > 0.5) & steady[:-2] & steady[2:])
+    return [int(step) + 1 for step in np.flatnonzero(jump)]
+
+
+def turn_by(yaw: float | np.floating) -> Float[np.ndarray, "2 2"]:
+    """The rotation into a frame with this yaw."""
+    return np.array([[np.cos(yaw), np.sin(yaw)], [-np.sin(yaw), np.cos(yaw)]])
+
+
+def shade(friction: float) -> tuple[float, float, float]:
+    """Background colour: white for a dry road, blue grey for a slippery one."""
+    depth = float(np.clip((0.9 - friction) / 0.6, 0.0, 1.0))
+    return 1.0 - 0.14 * depth, 1.0 - 0.10 * depth, 1.0 - 0.05 * depth
+
+
+def save(path: Path, draw: Callable[..., Figure], *inputs: Any) -> Path:
+    """Draw in the common style and write a PNG that depends on the inputs alone."""
+    with matplotlib.rc_context():
+        # Not what the user has set: the same inputs give the same bytes.
+        matplotlib.rcdefaults()
+        matplotlib.rcParams.update(RC)
+        draw(*inputs).savefig(path, format="png", metadata={"Software": None})
+    return path

@@ -1,0 +1,511 @@
+"""The pages of a run, of a comparison and of a sweep."""
+
+import importlib
+import json
+import re
+from html.parser import HTMLParser
+from pathlib import Path
+
+import matplotlib
+import numpy as np
+import pages_of_runs as made
+import pytest
+from PIL import Image
+
+from sfkd_jax import report
+from sfkd_jax.evaluation.formats import DASH
+from sfkd_jax.evaluation.metrics import METRICS, Metric
+from sfkd_jax.report import figures, rows, style
+from sfkd_jax.report.episodes import of_rows, of_run
+from sfkd_jax.report.film import LANE, MAX_BYTES, Car, Film, write_film
+from sfkd_jax.report.pages import to_latex
+from sfkd_jax.store import ArtefactError
+
+RUN = importlib.import_module("sfkd_jax.report.run")
+
+
+@pytest.fixture(scope="module")
+def run_page(tmp_path_factory):
+    run = made.write_run(tmp_path_factory.mktemp("run"))
+    report.write_report(run)
+    return run / "report"
+
+
+@pytest.fixture(scope="module")
+def comparison_page(tmp_path_factory):
+    directory = made.write_comparison(tmp_path_factory.mktemp("comparison"))
+    report.write_results_page(directory)
+    return directory / "report"
+
+
+def sweep(root, **changes):
+    for seed in range(3):
+        settings = {"seed": 0, "model": {"system": "sfkd", "rho": 0.9 + seed / 100}}
+        made.write_run(
+            root / f"a/seed={seed}", episodes=False, settings=settings, **changes
+        )
+    return report.write_comparison(root, "a/seed=*", "page")
+
+
+class Sources(HTMLParser):
+    """What a page refers to."""
+
+    def __init__(self, page):
+        super().__init__()
+        self.found, self.alt, self.tags = [], [], []
+        self.feed(page)
+
+    def handle_starttag(self, tag, attrs):
+        given = dict(attrs)
+        self.tags.append(tag)
+        self.found += [given[name] for name in ("src", "href") if name in given]
+        self.alt += [given["alt"]] if "alt" in given else []
+
+
+# ---- every page
+
+
+def test_pages_refer_to_themselves_and_to_films_beside_them(run_page, comparison_page):
+    for home in (run_page, comparison_page):
+        sources = Sources((home / "index.html").read_text())
+        linked = [one for one in sources.found if not one.startswith("data:image/png;")]
+        assert linked
+        for name in linked:
+            assert re.fullmatch(r"figures/film(_\d)?\.gif", name)
+            assert (home / name).exists()
+        assert all(sources.alt)
+        assert "script" not in sources.tags
+
+
+def test_markdown_links_every_figure(run_page, comparison_page):
+    for file in (run_page / "report.md", comparison_page / "results.md"):
+        links = re.findall(r"\]\((.*?)\)", file.read_text())
+        assert {file.parent / one for one in links} == {*file.parent.glob("figures/*")}
+
+
+def test_the_same_files_give_the_same_bytes_whatever_the_user_set(tmp_path, run_page):
+    again = made.write_run(tmp_path / "run")
+    with matplotlib.rc_context({"axes.grid": False, "font.size": 3}):
+        report.write_report(again)
+    for old in run_page.rglob("*.*"):
+        assert (again / "report" / old.relative_to(run_page)).read_bytes() == (
+            old.read_bytes()
+        ), old.name
+
+
+def test_images_of_an_earlier_page_go(tmp_path):
+    run = made.write_run(tmp_path, episodes=False)
+    stale = run / "report" / "figures" / "old.png"
+    stale.parent.mkdir(parents=True)
+    stale.touch()
+    report.write_report(run)
+    assert not stale.exists()
+
+
+def test_a_new_metric_is_on_every_page(tmp_path, monkeypatch):
+    """It has a table of its own, of which no page has heard."""
+    new = Metric(
+        "novelty", "Novelty", "kg", "a new table", lambda value: f"{value} new"
+    )
+    monkeypatch.setattr(rows, "METRICS", (*METRICS, new))
+    own = [made.row("sfkd", novelty=7), made.row("oracle", novelty=8)]
+    run = made.write_run(tmp_path / "run", episodes=False, results={"rows": own})
+    compared = made.write_comparison(tmp_path / "compared", episodes=False, rows=own)
+    report.write_report(run)
+    report.write_results_page(compared)
+    sweep(tmp_path, results={"rows": own})
+    for page in ("run/report", "compared/report", "page/comparison"):
+        text = (tmp_path / page / "index.html").read_text()
+        assert "Novelty [kg]" in text
+        assert "7 new" in text
+
+
+@pytest.mark.parametrize("metric", rows.shown_metrics(), ids=lambda one: one.name)
+def test_every_metric_of_the_table_is_on_the_page_of_a_run(metric):
+    values = {"mean": 0.1, "std": 0.2, "ci95": [0.1, 0.2], "median": 0.1, "p95": 0.1}
+    full = made.row("sfkd") | {
+        "rmse_m": values, "rmse_after_switch_m": 0.1, "departures": 1, "ess": 7.0,
+        "violation": {"v0": 0.1, "v1": 0.1, "v1_radius_m": 1.0, "v1_tube": "certified",
+                      "v1_conformal": 0.1, "v1_conformal_radius_m": 1.0, "v2": 0.1},
+        "difference_to_sfkd": values, "ratio_to_oracle": 1.0, "params": 5, "alpha": 0.9,
+        "unhealthy_steps": 0.1, "breach_steps": 0.1, "box_exit_steps": 0.1,
+        "act_ms": {"p50": 1.0, "p99": 2.0},
+        "open_loop_rmse_m": {"1": 0.1, "5": 0.1, "10": 0.1, "20": 0.1},
+    }  # fmt: skip
+    if metric.text(full) == DASH:
+        pytest.skip("a metric that this row does not have")
+    heads = [n for t in rows.metric_tables([("a", full)]) for _, n in t.columns]
+    assert metric.head() in heads
+
+
+HOSTILE = "<b>$\\frac|*a*_[x](y)</b>"
+
+
+def test_hostile_names_are_text_on_every_page(tmp_path):
+    odd = made.row("sfkd") | {
+        "system": HOSTILE,
+        "vehicle": HOSTILE,
+        "scenario": HOSTILE,
+    }
+    settings = {"experiment": HOSTILE, "model": {"system": HOSTILE}}
+    run = made.write_run(
+        tmp_path / "run",
+        episodes=False,
+        policy={"config": settings},
+        results={"rows": [odd]},
+    )
+    compared = made.write_comparison(
+        tmp_path / "compared", episodes=False, rows=[odd], name=HOSTILE
+    )
+    report.write_report(run)
+    report.write_results_page(compared)
+    for page in (run / "report/index.html", compared / "report/index.html"):
+        assert "<b>" not in page.read_text()
+        assert "&lt;b&gt;" in page.read_text()
+    for page in (run / "report/report.md", compared / "report/results.md"):
+        assert "<b>" not in page.read_text()
+        assert "[x](" not in page.read_text()
+    table = (compared / "report/table1.tex").read_text()
+    assert r"$<$b$>$\$\textbackslash{}frac" in table
+
+
+@pytest.mark.parametrize("value", [None, 1e308, 5e-324, 0.0, -0.1, "x"])
+def test_enemy_numbers_become_dashes_or_numbers(tmp_path, value):
+    spread = {"mean": value, "std": value, "ci95": [value, value]}
+    odd = made.row("sfkd", rmse_m=spread, max_deviation_m=value, act_ms={"p50": value})
+    run = made.write_run(tmp_path / "r", episodes=False, results={"rows": [odd]})
+    report.write_report(run)
+    compared = made.write_comparison(
+        tmp_path / "c", episodes=False, rows=[odd, made.row("oracle")]
+    )
+    report.write_results_page(compared)
+    for page in (run, compared):
+        text = (page / "report/index.html").read_text()
+        assert not re.search(r"<td>[^<]*\b(nan|inf)\b", text)
+
+
+# ---- the page of a run
+
+
+def test_the_certificate_is_in_words_and_numbers_that_never_round_down(run_page):
+    text = (run_page / "report.md").read_text()
+    for cell in (
+        "| Contraction of one step, α | 0.9321 | proved |",
+        "| 0.1431 | measured |",
+        "| One-step error d̄ \\[latent\\] | 0.0123 | measured |",
+        "| Asymptotic bound d̄ / (1 − α) \\[latent\\] | 0.1812 | proved from d̄ |",
+        "| env: side wind \\[m/s\\] | −8 | 8 |",
+        "| 8 to 10.5 |",
+    ):
+        assert cell in text
+    assert RUN.PROOF in text.replace("\\", "")
+
+
+@pytest.mark.parametrize(
+    ("change", "reason"),
+    [
+        ({"valid": False, "reason": "ρ is 1.2"}, "ρ is 1.2"),
+        ({"alpha": 1.0}, "no reason"),
+        ({"weights_sha256": "cd" * 32}, "other weights"),
+    ],
+)
+def test_what_is_not_certified_is_said(tmp_path, change, reason):
+    run = made.write_run(
+        tmp_path, episodes=False, certificate=made.certificate(**change)
+    )
+    report.write_report(run)
+    text = (run / "report" / "report.md").read_text()
+    assert "No contraction is certified" in text
+    assert reason in text
+    assert "0.1431" not in text
+
+
+def test_a_page_of_a_new_run_names_the_commands_that_come_next(tmp_path):
+    run = made.write_run(
+        tmp_path, episodes=False, results=None, certificate=None, open_loop=None
+    )
+    report.write_report(run)
+    text = (run / "report" / "report.md").read_text()
+    for command in ("evaluate", "certify", "train"):
+        assert f"python -m sfkd\\_jax.{command} makes it" in text
+
+
+def test_a_folder_without_a_policy_is_one_line(tmp_path):
+    with pytest.raises(ArtefactError, match=r"policy\.safetensors is missing"):
+        report.write_report(tmp_path)
+
+
+def test_a_file_that_does_not_fit_is_named(tmp_path):
+    run = made.write_run(tmp_path, episodes=False, open_loop={"steps": ["one"]})
+    with pytest.raises(ArtefactError, match=r"open_loop\.json"):
+        report.write_report(run)
+
+
+def test_a_disk_that_refuses_a_page_is_one_line(tmp_path):
+    run = made.write_run(tmp_path, episodes=False)
+    (run / "report").write_text("a file")
+    with pytest.raises(ArtefactError, match="report"):
+        report.write_report(run)
+
+
+@pytest.mark.parametrize("wrong", ["word", [1], {"a": 1}, 7])
+def test_rows_that_are_none_are_refused_by_the_name_of_their_file(tmp_path, wrong):
+    run = made.write_run(tmp_path, episodes=False, results={"rows": wrong})
+    with pytest.raises(ArtefactError, match=r"results\.json: malformed"):
+        report.write_report(run)
+
+
+def test_a_row_cannot_name_arrays_outside_its_folder(tmp_path):
+    own = [made.row("sfkd", arrays="../outside.safetensors")]
+    directory = made.write_comparison(tmp_path, episodes=False, rows=own)
+    with pytest.raises(ArtefactError, match="outside this folder"):
+        report.write_results_page(directory)
+
+
+def test_the_settings_and_the_command_are_on_the_page(run_page):
+    text = (run_page / "index.html").read_text()
+    assert "<pre>python -m sfkd_jax.train</pre>" in text
+    assert "<details>" in text
+
+
+# ---- figures and films
+
+
+def groups(tmp_path, **lateral):
+    (group,) = of_run(made.write_run(tmp_path))
+    return [one._replace(**lateral) for one in group]
+
+
+def test_the_first_episode_shows_errors_conditions_and_the_whole_corridor(tmp_path):
+    figure = figures.first_episode(groups(tmp_path), corridor=0.5)
+    road, errors, friction, wind = figure.axes
+    assert [axes.get_ylabel() for axes in figure.axes] == [
+        "y [m]", "lateral error [m]", "friction\n[-]", "side wind\n[m/s]",
+    ]  # fmt: skip
+    assert road.get_aspect() == 1.0
+    low, high = errors.get_ylim()
+    assert low <= -0.5
+    assert high >= 0.5
+    assert wind.get_xlim() == (0.0, made.STEPS * made.DT)
+    assert friction.get_ylim() == (0.0, 1.0)
+    assert any("0.500 m" in text.get_text() for text in errors.texts)
+
+
+def test_a_system_that_leaves_the_road_does_not_flatten_the_others(tmp_path):
+    figure = figures.first_episode(
+        [one._replace(lateral=100 * one.lateral) if one.system == "nominal" else one
+         for one in groups(tmp_path)]
+    )  # fmt: skip
+    assert figure.axes[1].get_ylim()[1] < 3.0
+
+
+def test_many_systems_are_drawn_by_family_each_with_sfkd_and_oracle(tmp_path):
+    directory = made.write_comparison(tmp_path)
+    found = json.loads((directory / "results.json").read_text())["rows"]
+    here = [r for r in found if (r["scenario"], r["vehicle"]) == ("s3", "kinematic")]
+    figure = figures.first_episode(of_rows(directory, here))
+    legends = [axes.get_legend() for axes in figure.axes if axes.get_legend()]
+    assert len(legends) == 3
+    for legend in legends:
+        assert {"SFKD", "Oracle"} <= {text.get_text() for text in legend.get_texts()}
+
+
+def test_figures_of_states_that_are_not_finite(tmp_path):
+    group = groups(tmp_path)
+    broken = group[0].lateral.copy()
+    broken[:, 40:] = np.nan
+    group[0] = group[0]._replace(lateral=broken)
+    style.save(tmp_path / "a.png", figures.first_episode, group)
+    style.save(tmp_path / "b.png", figures.all_episodes, group[0])
+
+
+def test_open_loop_errors_are_beside_naive_ones_and_below_the_tube():
+    errors = {"steps": [1, 2, 3], "dt": 0.1, "position_rmse_m": [0.1, 0.2, 0.4],
+              "baselines": {"constant_turn": {"position_rmse_m": [0.2, 0.4, None]}}}  # fmt: skip
+    figure = figures.open_loop(errors, [1.0, 2.0, 3.0])
+    lines = {one.get_label(): one.get_ydata() for one in figure.axes[0].get_lines()}
+    assert [*lines] == ["model", "certified tube", "constant turn"]
+    np.testing.assert_array_equal(lines["model"], [0.1, 0.2, 0.4])
+    assert np.isnan(lines["constant turn"][2])
+
+
+def test_systems_look_different():
+    looks = [(look.colour, look.dashes) for look in style.SYSTEMS.values()]
+    assert len(set(looks)) == len(looks)
+    labels = [look.label for look in style.SYSTEMS.values()]
+    assert len(set(labels)) == len(labels)
+
+
+def film(size, corridor=None, cars=1):
+    one = made.arrays(size)
+    car = Car("car", style.ACCENT, one["lateral"][0], one["states"][0])
+    road = one["path"][0], one["envs"][0]
+    return Film("S3", made.DT, *road, [car] * cars, corridor)
+
+
+def test_a_film_runs_in_real_time_and_is_small(tmp_path):
+    path = write_film(film(0.05, 0.1), tmp_path / "a.gif", seconds=2.0)
+    with Image.open(path) as image:
+        assert image.n_frames == 10
+        assert image.info["duration"] == 200
+        assert image.info["loop"] == 0
+    assert path.stat().st_size < MAX_BYTES
+
+
+def test_a_film_drops_frames_until_it_is_small_enough(tmp_path, monkeypatch):
+    monkeypatch.setattr("sfkd_jax.report.film.MAX_BYTES", 1)
+    path = write_film(film(0.05), tmp_path / "a.gif", seconds=2.0)
+    with Image.open(path) as image:
+        assert image.n_frames == 2
+
+
+def test_the_scale_of_a_film_shows_the_corridor_and_cars_in_their_lane():
+    assert film(0.05, 0.1).reach == 0.1
+    assert film(0.3, 0.1).reach == pytest.approx(0.3, rel=1e-2)
+    assert film(5.0, 0.1).reach == 0.1
+    assert film(5.0).reach == LANE
+
+
+def test_a_car_leaves_its_lane_at_the_first_value_outside_or_not_finite():
+    car = film(2.0).cars[0]
+    assert car.left == int(np.flatnonzero(np.abs(car.lateral) > LANE)[0])
+    lateral = np.array([0.0, np.nan, 0.0])
+    assert car._replace(lateral=lateral).left == 1
+    assert car._replace(lateral=0 * lateral[:1]).left == 1
+
+
+def test_a_film_of_cars_that_leave_or_break(tmp_path):
+    broken = film(2.0, cars=2)
+    states = broken.cars[0].states.copy()
+    states[10:] = np.nan
+    lateral = np.where(np.arange(made.STEPS) < 9, 0.0, np.nan)
+    cars = [broken.cars[0], broken.cars[1]._replace(states=states, lateral=lateral)]
+    write_film(broken._replace(cars=cars), tmp_path / "a.gif", seconds=2.0)
+
+
+# ---- the page of a comparison
+
+
+def test_rows_that_do_not_sample_are_compared_with_every_search():
+    plain = [made.row("sfkd", sampling="plain"), made.row("oracle", sampling="plain")]
+    around = [made.row("sfkd"), made.row("oracle")]
+    program = made.row("koopman_mpc")
+    made_of = rows.grouped([*plain, program, *around], ("inner_loop", "sampling"))
+    names = [[rows.name_of(row) for row in group] for group in made_of]
+    assert names == [["SFKD", "Koopman MPC (e)", "Oracle"]] * 2
+    assert [group[0]["sampling"] for group in made_of] == ["feedback", "plain"]
+    assert rows.grouped([program], ("sampling",)) == [[program]]
+
+
+def test_the_table_has_a_column_for_every_vehicle_and_scenario(comparison_page):
+    lines = (comparison_page / "results.md").read_text().splitlines()
+    head = next(line for line in lines if line.startswith("| System"))
+    assert head == "| System | dynamic S1 | dynamic S3 | kinematic S1 | kinematic S3 |"
+    sfkd = next(line for line in lines if line.startswith("| **SFKD**"))
+    assert sfkd.count("**20.0 (18.0 to 22.0)**") == 2
+
+
+@pytest.mark.parametrize(
+    ("record", "side"),
+    [
+        ({"mean": 1.0, "ci95": [0.5, 1.5], "p_holm": 0.049}, 1),
+        ({"mean": -1.0, "ci95": [-1.5, -0.5], "p_holm": 0.049}, -1),
+        ({"mean": 1.0, "ci95": [0.5, 1.5], "p_holm": 0.05}, 0),
+        ({"mean": -1.0, "ci95": [-1.5, -0.5]}, -1),
+        ({"mean": 1.0, "ci95": [-0.5, 1.5]}, 0),
+        ({"mean": float("nan"), "ci95": [0.5, 1.5]}, 0),
+        (None, 0),
+    ],
+)
+def test_a_mark_needs_a_corrected_p_value(record, side):
+    assert rows.side(record) == side
+    cell = rows.rmse_cell(made.row("oracle", difference_to_sfkd=record))
+    assert cell.endswith({1: ") *", -1: ") †", 0: ")"}[side])
+
+
+def test_variations_of_the_protocol_are_tables_of_their_own(tmp_path):
+    late = made.row("sfkd", variation="e late")
+    directory = made.write_comparison(
+        tmp_path, episodes=False, rows=[made.row("sfkd"), late]
+    )
+    report.write_results_page(directory)
+    text = (directory / "report" / "results.md").read_text()
+    assert "## Sampling around a feedback law\n" in text
+    assert "## Sampling around a feedback law, e late\n" in text
+
+
+def test_printed_numbers_are_beside_ours():
+    options = {
+        "paper": {
+            "columns": ["rmse_s3_m", "rmse_s3_std", "violation_rate"],
+            "sfkd": [0.120, 0.018, 0.03],
+            "nominal": [0.174, 0.025, 0.29],
+        }
+    }
+    own = [made.row("sfkd"), made.row("nominal", "none"), made.row("oracle")]
+    table = rows.printed_table(own, options)
+    assert table is not None
+    assert table.rows == [
+        ("SFKD", ["20.0", "120.0", "10.0", "3.0"]),
+        ("Nominal", ["120.0", "174.0", "10.0", "29.0"]),
+    ]
+    assert [name for _, name in table.columns] == ["ours", "paper"] * 2
+    assert rows.printed_table(own, {}) is None
+
+
+def test_latex_has_a_cell_for_every_column_and_balanced_braces(comparison_page):
+    table = (comparison_page / "table1.tex").read_text()
+    assert table.count("{") == table.count("}")
+    body = re.search(r"\\midrule\n(.*)\\bottomrule", table, re.S)
+    assert body is not None
+    lines = body[1].strip().splitlines()
+    assert len(lines) == len(made.RMSE)
+    assert {line.count("&") for line in lines} == {4}
+    assert r"\multicolumn{2}{c}{kinematic}" in table
+    assert to_latex([]).count("tabular") == 0
+
+
+def test_figure_2_has_a_line_for_every_system_under_forces():
+    forces = [{"force_n": n, "rmse_m": {"mean": 0.1 + n / 1e4}} for n in (0.0, 500.0)]
+    lost = [*forces, {"force_n": 1000.0, "rmse_m": {"mean": float("nan")}}]
+    own = [made.row("sfkd", disturbed=forces), made.row("oracle", disturbed=lost)]
+    (axes,) = figures.side_forces(own).axes
+    assert [line.get_label() for line in axes.get_lines()] == ["SFKD", "Oracle"]
+    for line in axes.get_lines():
+        np.testing.assert_allclose(line.get_ydata(), [100.0, 150.0])
+
+
+def test_failed_rows_are_on_the_page(tmp_path):
+    directory = made.write_comparison(tmp_path, episodes=False)
+    document = json.loads((directory / "results.json").read_text())
+    document["failed"] = {"kinematic/icode": "diverged at step 7"}
+    (directory / "results.json").write_text(json.dumps(document))
+    report.write_results_page(directory)
+    assert "diverged at step 7" in (directory / "report/results.md").read_text()
+
+
+# ---- the page of a sweep
+
+
+def test_a_sweep_shows_the_settings_that_differ_and_every_run(tmp_path):
+    pages = sweep(tmp_path)
+    text = Path(pages["report"]).with_name("report.md").read_text()
+    assert "| Run | model.rho |" in text
+    assert "| seed |" not in text
+    assert text.count("a/seed=2") > 3
+    assert len(pages["figures"]) == 1
+    records = json.loads(Path(pages["comparison"]).read_text())["rows"]
+    assert [record["settings"]["model.rho"] for record in records] == [0.9, 0.91, 0.92]
+
+
+def test_runs_that_were_not_driven_still_have_predictions_and_a_rate(tmp_path):
+    refused = made.certificate(valid=False, alpha=None, reason="too large a gain")
+    pages = sweep(tmp_path, results=None, certificate=refused)
+    text = Path(pages["report"]).with_name("report.md").read_text()
+    assert "too large a gain" in text
+    assert "20 steps ahead" in text
+
+
+def test_a_pattern_without_a_run_is_refused(tmp_path):
+    with pytest.raises(ValueError, match="no run below"):
+        report.write_comparison(tmp_path, "none/*", "page")
