@@ -65,9 +65,8 @@ _PATH = _BODY | {
 def write_report(run_dir: Path) -> dict[str, Any]:
     """Write `run_dir/report/`: index.html, report.md, figures and a film.
 
-    Reads policy.safetensors, metrics.jsonl, open_loop.json, certificate.json, results.json and
-    the episodes of a run and recomputes none of their numbers; the same inputs give the
-    same bytes.
+    Reads the files of a run and recomputes none of their numbers; the same inputs give
+    the same bytes.
 
     Args:
         run_dir: of a run. All but policy.safetensors may be missing.
@@ -76,8 +75,8 @@ def write_report(run_dir: Path) -> dict[str, Any]:
         `report`: path of the page. `figures`: paths of its images.
 
     Raises:
-        ArtefactError: no policy.safetensors; a file that is not JSON, or whose content does
-            not fit on a page; or the disk refuses the page.
+        ArtefactError: no policy.safetensors; a file that cannot be read, or does not
+            fit on a page; or the disk refuses the page.
     """
     home = run_dir / "report"
     with writing(home):
