@@ -2,46 +2,28 @@
 
 from __future__ import annotations
 
-from typing import Any
+from dataclasses import dataclass
 
 import jax
 import jax.numpy as jnp
 
-from sfkd_jax.control.planners._noise import noise_sampler
-from sfkd_jax.control.planners._planner import planner
+from sfkd_jax.control._factory import factory
+from sfkd_jax.control.planners._mppi import SamplingPlanner
 from sfkd_jax.control.planners._plans import (
     Evaluate,
     Plan,
     PlannerState,
-    Samples,
     SearchResult,
     candidate_plans,
     replace_nonfinite,
-    weighted_mean_and_std,
 )
 from sfkd_jax.control.planners._weights import keep_constraints
-from sfkd_jax.control.tasks._task import Task
-from sfkd_jax.ranges import AtLeastTwo, UnitInterval
-from sfkd_jax.types import Controller, Key
+from sfkd_jax.types import Key
 
 
-def cem(
-    task: Task,
-    *,
-    horizon: AtLeastTwo = 20,
-    num_samples: int = 500,
-    elites: int = 50,
-    iterations: int = 3,
-    smallest_scale: float = 0.05,
-    noise: str = "ar1",
-    noise_correlation: UnitInterval = 0.8,
-    noise_exponent: float = 2.0,
-    noise_knots: AtLeastTwo = 5,
-    halton: bool = False,
-    info_level: str = "plan",
-    **options: Any,
-) -> Controller:
-    """Return the cross-entropy controller of a task.
+@dataclass(frozen=True, eq=False, kw_only=True)
+class Cem(SamplingPlanner):
+    """The cross-entropy method.
 
         ν ← mean of the elites,   σ_k ← max(their standard deviation at step k, σ_min)
 
@@ -49,71 +31,68 @@ def cem(
     to them. Sample 0 is the current mean, so the best cost never increases between
     iterations. A rollout that is not finite is never an elite.
 
-    Args:
-        task: the planning problem.
-        horizon: T, number of steps.
-        num_samples: per iteration.
+    Attributes:
         elites: number of samples kept.
-        iterations: per control step.
         smallest_scale: σ_min relative to noise_std; σ is reset to noise_std at every
             control step.
-        noise: kind of noise, see `noise_sampler`.
-        noise_correlation: see `noise_sampler`.
-        noise_exponent: see `noise_sampler`.
-        noise_knots: see `noise_sampler`.
-        halton: see `noise_sampler`.
-        info_level: see `planner`.
-        options: of `planner`.
-
-    Raises:
-        ValueError: a setting is out of its range.
 
     Source: Rubinstein (1999); correlated noise as in Pinneri et al. (2020), iCEM.
     """
-    if not 1 <= elites <= num_samples or iterations < 1:
-        raise ValueError(
-            "elites must lie in [1, num_samples], "
-            f"got {elites} of {num_samples}, {iterations} iterations"
-        )
-    draw = noise_sampler(
-        noise,
-        horizon=horizon,
-        correlation=noise_correlation,
-        exponent=noise_exponent,
-        knots=noise_knots,
-        halton=halton,
-    )
 
-    def search(key: Key, state: PlannerState, evaluate: Evaluate) -> SearchResult:
+    num_samples: int = 500
+    iterations: int = 3
+    elites: int = 50
+    smallest_scale: float = 0.05
+
+    def __post_init__(self) -> None:
+        """Raise a ValueError that names a setting out of its range."""
+        super().__post_init__()
+        if not 1 <= self.elites <= self.num_samples:
+            raise ValueError(
+                "elites must lie in [1, num_samples], "
+                f"got {self.elites} of {self.num_samples}"
+            )
+
+    def search(self, key: Key, state: PlannerState, evaluate: Evaluate) -> SearchResult:
+        """Return the mean of the elites of the last iteration."""
         std = state.tuning.noise_std
 
         def improve(
             carry: tuple[Plan, Plan], key: Key
         ) -> tuple[tuple[Plan, Plan], SearchResult]:
             plan, scale = carry
-            noise = draw(key, num_samples, std) * scale[:, None]
+            noise = self.draw(key, self.num_samples, std) * scale[:, None]
             evaluated = evaluate(candidate_plans(plan, noise, state))
             costs, best = replace_nonfinite(evaluated.costs, jnp.inf), None
             if evaluated.violations is not None:
                 costs, _ = keep_constraints(costs, evaluated.violations)
                 best = evaluated.perturbations[:, jnp.argmin(costs)]
-            negated, chosen = jax.lax.top_k(-costs, elites)
+            negated, chosen = jax.lax.top_k(-costs, self.elites)
+            # Fewer finite rollouts than elites: only those count.
             counts = jnp.isfinite(negated).astype(float)
-            weights = counts / jnp.maximum(jnp.sum(counts), 1.0)
-            mean, spread = weighted_mean_and_std(
-                weights, replace_nonfinite(evaluated.perturbations, 0.0)[:, chosen]
+            size = jnp.sum(counts)
+            weights = counts / jnp.maximum(size, 1.0)
+            elite = replace_nonfinite(evaluated.perturbations, 0.0)[:, chosen]
+            mean = jnp.einsum("m,tmc->tc", weights, elite)
+            squares = (elite - mean[:, None]) ** 2
+            spread = jnp.sqrt(jnp.einsum("m,tmc->tc", weights, squares))
+            kept = jnp.zeros_like(costs).at[chosen].set(weights)
+            result = SearchResult(
+                plan=mean,
+                usable=size > 0,
+                cost=-negated[0],
+                effective_samples=size,
+                samples=self._reported(evaluated, kept),
+                best=best,
             )
-            scale = jnp.maximum(spread / std[None], smallest_scale)
-            usable, size = jnp.any(counts > 0), jnp.sum(counts)
-            samples = None
-            if info_level == "samples":
-                kept = jnp.zeros_like(costs).at[chosen].set(weights)
-                samples = Samples(evaluated, kept)
-            result = SearchResult(mean, usable, -negated[0], size, samples, best)
+            scale = jnp.maximum(spread / std[None], self.smallest_scale)
             return (mean, scale), result
 
         start = (state.plan, jnp.ones_like(state.plan))
-        _, results = jax.lax.scan(improve, start, jax.random.split(key, iterations))
+        keys = jax.random.split(key, self.iterations)
+        _, results = jax.lax.scan(improve, start, keys)
         return jax.tree.map(lambda leaf: leaf[-1], results)
 
-    return planner(task, search, horizon=horizon, info_level=info_level, **options)
+
+cem = factory(Cem, Cem.controller)
+"""(task, settings of `Cem`) -> `Controller`."""

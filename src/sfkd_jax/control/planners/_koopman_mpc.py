@@ -3,20 +3,23 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from functools import partial
+from dataclasses import KW_ONLY, dataclass
 from typing import NamedTuple
 
+import jax
 import jax.numpy as jnp
+from jax.scipy.linalg import cho_factor, cho_solve
 from jaxtyping import Array, Bool, Float
 
+from sfkd_jax.control._factory import factory
 from sfkd_jax.control.laws._path_errors import path_errors, reference_curvature
-from sfkd_jax.control.planners._box_qp import box_qp
-from sfkd_jax.control.planners._condensed import condense, condensed_cost, to_world
 from sfkd_jax.control.planners._plans import all_finite, clip_environment, shift
 from sfkd_jax.control.tasks._path_tracking import check_path
 from sfkd_jax.control.tasks._task import PlanningStart
+from sfkd_jax.geometry import between, compose
 from sfkd_jax.ranges import AtLeastTwo
 from sfkd_jax.types import (
+    BODY,
     POSE,
     Control,
     Controller,
@@ -28,9 +31,12 @@ from sfkd_jax.types import (
     Model,
     Params,
     Reference,
+    Scalar,
     State,
 )
 
+HALVINGS = 12
+"""Number of step lengths 1, 1/2, … tried along the projected Newton direction."""
 REGULARISATION = 1e-7
 """Fraction of the largest diagonal entry of H that is added to its diagonal, so that H
 is positive definite in float32.
@@ -51,41 +57,9 @@ class KoopmanMpcState(NamedTuple):
     started: Bool[Array, ""]
 
 
-class _Settings(NamedTuple):
-    """Settings of `koopman_mpc` as its functions need them."""
-
-    model: Model
-    linear: Callable[[Fiber], LinearPredictor]
-    dt: float
-    low: Control
-    high: Control
-    horizon: int
-    iterations: int
-    weights: Float[Array, " term"]
-    step_weights: Float[Array, " horizon"]
-    env_low: tuple[float, ...] | None
-    env_high: tuple[float, ...] | None
-
-
-def koopman_mpc(
-    model: Model,
-    *,
-    dt: float,
-    control_low: tuple[float, ...],
-    control_high: tuple[float, ...],
-    speed_loop: bool = False,
-    horizon: AtLeastTwo = 20,
-    iterations: int = 12,
-    lateral: float = 200.0,
-    course: float = 20.0,
-    speed: float = 1.0,
-    steering_rate: float = 5.0,
-    effort: float = 0.02,
-    terminal_weight: float = 1.0,
-    env_low: tuple[float, ...] | None = None,
-    env_high: tuple[float, ...] | None = None,
-) -> Controller:
-    """Return the condensed linear MPC of a lifted state, under `tracking_cost`.
+@dataclass(frozen=True, eq=False)
+class KoopmanMpc:
+    """The condensed linear MPC of a lifted state, under `tracking_cost`.
 
         min_u Σ_k q_y e_y² + q_c (Δe_y / v dt)² + q_v e_v² + q_δ̇ (Δδ / dt)² + q_a a²
         subject to   low ≤ u_k ≤ high,   z_0 = lift(e_y, e_ψ, s),
@@ -100,7 +74,7 @@ def koopman_mpc(
     reference or solution is not finite, the controller continues the last plan and
     `info["healthy"]` is False.
 
-    Args:
+    Attributes:
         model: with `structure.linear`.
         dt: sampling period [s].
         control_low: lower control limits.
@@ -118,100 +92,318 @@ def koopman_mpc(
         env_low: lower end of the environment box; an environment outside is clipped.
         env_high: upper end of the environment box.
 
-    Returns:
-        A `Controller`; `info` has `cost` and `mean_cost` (both of the plan),
-        `effective_samples` (NaN), `healthy`, `env_inside`, `predicted_states` (horizon,
-        state), and the `residual` of the QP.
-
     Raises:
         ValueError: the model has no linear predictor.
 
     Source: Korda and Mezić (2018), section 4.
     """
-    linear = model.structure.linear
-    if linear is None:
+
+    model: Model
+    _: KW_ONLY
+    dt: float
+    control_low: tuple[float, ...]
+    control_high: tuple[float, ...]
+    speed_loop: bool = False
+    horizon: AtLeastTwo = 20
+    iterations: int = 12
+    lateral: float = 200.0
+    course: float = 20.0
+    speed: float = 1.0
+    steering_rate: float = 5.0
+    effort: float = 0.02
+    terminal_weight: float = 1.0
+    env_low: tuple[float, ...] | None = None
+    env_high: tuple[float, ...] | None = None
+
+    def __post_init__(self) -> None:
+        """Raise a ValueError for a model without a linear predictor."""
+        _ = self._linear
+
+    @property
+    def _linear(self) -> Callable[[Fiber], LinearPredictor]:
+        if (linear := self.model.structure.linear) is not None:
+            return linear
         raise ValueError(
             "koopman_mpc needs a model that is linear in a lift (Structure.linear)"
         )
-    settings = _Settings(
-        model=model,
-        linear=linear,
-        dt=dt,
-        low=jnp.asarray(control_low),
-        high=jnp.asarray(control_high),
-        horizon=horizon,
-        iterations=iterations,
-        weights=jnp.asarray(
-            [lateral, course, speed, steering_rate, 0.0 if speed_loop else effort]
-        ),
-        step_weights=jnp.ones(horizon).at[-1].add(terminal_weight),
-        env_low=env_low,
-        env_high=env_high,
+
+    def controller(self) -> Controller:
+        """Return the planner as two functions."""
+        return Controller(self.init, self.act)
+
+    def init(self, key: Key) -> KoopmanMpcState:
+        """Return the state before the first control step: a plan of zeros."""
+        del key  # nothing is random
+        channels = len(self.control_low)
+        return KoopmanMpcState(
+            plan=jnp.zeros((self.horizon, channels)),
+            previous=jnp.zeros(channels),
+            started=jnp.asarray(False),
+        )
+
+    def act(
+        self,
+        params: Params,
+        state: KoopmanMpcState,
+        observation: State,
+        env: Environment,
+        reference: Reference,
+    ) -> tuple[Control, KoopmanMpcState, ControllerInfo]:
+        """Return the control of one step; `info` has the `residual` of the QP too."""
+        horizon = self.horizon
+        low, high = jnp.asarray(self.control_low), jnp.asarray(self.control_high)
+        check_path(observation, env, reference, horizon)
+        clean = all_finite((observation, env, reference))
+        inside = clip_environment(env, self.env_low, self.env_high)
+        curvature = reference_curvature(reference)
+        errors = path_errors(observation, reference[0], curvature[0])
+        start = observation.at[POSE].set(
+            jnp.stack([jnp.zeros(()), errors.lateral, errors.heading])
+        )
+        predictor = self._linear(self.model.fiber(params, inside))
+        effort = 0.0 if self.speed_loop else self.effort
+        weights = jnp.asarray(
+            [self.lateral, self.course, self.speed, self.steering_rate, effort]
+        )
+        prediction = condense(predictor, start, curvature)
+        cost = condensed_cost(
+            prediction,
+            start,
+            reference[:, 3],
+            PlanningStart(state.previous, state.started),
+            weights=weights,
+            step_weights=jnp.ones(horizon).at[-1].add(self.terminal_weight),
+            dt=self.dt,
+        )
+        H = 2 * cost.gains.T @ (cost.weights[:, None] * cost.gains)
+        H = H + REGULARISATION * jnp.max(jnp.diagonal(H)) * jnp.eye(H.shape[0])
+        f = 2 * cost.gains.T @ (cost.weights * cost.offsets)
+        box = jnp.tile(low, horizon), jnp.tile(high, horizon)
+        solution = box_qp(H, f, *box, state.plan.ravel(), iterations=self.iterations)
+        rows = cost.gains @ solution.primal + cost.offsets
+        total = jnp.sum(cost.weights * rows**2)
+        healthy = clean & jnp.isfinite(total)
+
+        plan = jnp.where(healthy, solution.primal.reshape(horizon, -1), state.plan)
+        control = jnp.clip(plan[0], low, high)
+        predicted = prediction.free + prediction.gain @ plan.ravel()
+        info: ControllerInfo = {
+            "cost": total,
+            "mean_cost": total,
+            "effective_samples": jnp.asarray(jnp.nan),
+            "healthy": healthy,
+            "env_inside": jnp.all(inside == env),
+            "predicted_states": to_world(predicted, observation, reference, curvature),
+            "residual": solution.residual,
+        }
+        after = KoopmanMpcState(
+            shift(plan, jnp.ones(())), control, state.started | healthy
+        )
+        return control, after, info
+
+
+class Prediction(NamedTuple):
+    """The condensed prediction x_k = free_k + (gain u)_k, k = 1 … T.
+
+    Attributes:
+        free: response without control.
+        gain: response to the stacked controls u_0 … u_{T-1}.
+    """
+
+    free: Float[Array, "horizon state"]
+    gain: Float[Array, "horizon state inputs"]
+
+
+class LeastSquares(NamedTuple):
+    """The cost Σ_i w_i (g_iᵀ u + o_i)² of the stacked controls u.
+
+    Attributes:
+        gains: g_i.
+        offsets: o_i.
+        weights: w_i.
+    """
+
+    gains: Float[Array, "row inputs"]
+    offsets: Float[Array, " row"]
+    weights: Float[Array, " row"]
+
+
+def condensed_cost(
+    prediction: Prediction,
+    start: State,
+    speeds: Float[Array, " horizon"],
+    previous: PlanningStart,
+    *,
+    weights: Float[Array, " term"],
+    step_weights: Float[Array, " horizon"],
+    dt: float,
+) -> LeastSquares:
+    """Return `tracking_cost` as squares of affine functions of the stacked controls.
+
+    Args:
+        prediction: of the states along the path.
+        start: state along the path now.
+        speeds: of the reference [m/s].
+        previous: control, from which the first steering rate counts.
+        weights: of lateral error, course, speed, steering rate and effort.
+        step_weights: factor on all weights of each step.
+        dt: sampling period [s].
+    """
+    horizon = speeds.shape[0]
+    channels = jnp.eye(2 * horizon).reshape(horizon, 2, 2 * horizon)
+    steering, drive = channels[:, 0], channels[:, 1]
+    side, side_free = prediction.gain[:, 1], prediction.free[:, 1]
+    travelled = speeds * dt + 1e-3
+    gains = (
+        side,
+        jnp.diff(side, axis=0, prepend=0.0) / travelled[:, None],
+        prediction.gain[:, 3],
+        jnp.diff(steering, axis=0, prepend=0.0) / dt,
+        drive,
     )
-    return Controller(partial(_init, settings), partial(_act, settings))
-
-
-def _init(settings: _Settings, key: Key) -> KoopmanMpcState:
-    """The state before the first control step: a plan of zeros."""
-    del key  # nothing is random
-    low = settings.low
-    return KoopmanMpcState(
-        plan=jnp.zeros((settings.horizon, low.shape[0])),
-        previous=jnp.zeros_like(low),
-        started=jnp.asarray(False),
+    offsets = (
+        side_free,
+        jnp.diff(side_free, prepend=start[1]) / travelled,
+        prediction.free[:, 3] - speeds,
+        jnp.zeros(horizon).at[0].set(-previous.control[0] / dt),
+        jnp.zeros(horizon),
+    )
+    # Before the first control there is no steering rate.
+    charged = (weights[:, None] * step_weights).at[3, 0].multiply(previous.known)
+    return LeastSquares(
+        jnp.concatenate(gains), jnp.concatenate(offsets), charged.ravel()
     )
 
 
-def _act(
-    settings: _Settings,
-    params: Params,
-    state: KoopmanMpcState,
+def _curvature_of_steps(
+    curvature: Float[Array, " horizon"],
+) -> Float[Array, " horizon"]:
+    """Mean curvature of each step; the first step has that of the first point."""
+    return jnp.concatenate([curvature[:1], 0.5 * (curvature[1:] + curvature[:-1])])
+
+
+def condense(
+    predictor: LinearPredictor, start: State, curvature: Float[Array, " horizon"]
+) -> Prediction:
+    """Eliminate the lifted state: free response and Toeplitz matrix of C Aᵏ B.
+
+    Args:
+        predictor: of the environment.
+        start: state along the path now.
+        curvature: of the path at each reference point [1/m].
+    """
+    horizon = curvature.shape[0]
+
+    def respond(
+        carry: tuple[Array, Array], kappa: Scalar
+    ) -> tuple[tuple[Array, Array], tuple[Array, Array]]:
+        z, impulse = carry
+        z = predictor.A @ z + predictor.d * kappa + predictor.c
+        return (z, predictor.A @ impulse), (
+            predictor.C @ z + predictor.o,
+            predictor.C @ impulse,
+        )
+
+    _, (free, impulses) = jax.lax.scan(
+        respond, (predictor.lift(start), predictor.B), _curvature_of_steps(curvature)
+    )
+    lag = jnp.arange(horizon)[:, None] - jnp.arange(horizon)
+    gain = jnp.where((lag >= 0)[:, :, None, None], impulses[jnp.maximum(lag, 0)], 0.0)
+    return Prediction(
+        free, gain.transpose(0, 2, 1, 3).reshape(horizon, start.shape[0], -1)
+    )
+
+
+def to_world(
+    along_path: Float[Array, "horizon state"],
     observation: State,
-    env: Environment,
     reference: Reference,
-) -> tuple[Control, KoopmanMpcState, ControllerInfo]:
-    """One control step."""
-    model, horizon = settings.model, settings.horizon
-    low, high = settings.low, settings.high
-    check_path(observation, env, reference, horizon)
-    clean = all_finite((observation, env, reference))
-    inside = clip_environment(env, settings.env_low, settings.env_high)
-    curvature = reference_curvature(reference)
-    errors = path_errors(observation, reference[0], curvature[0])
-    start = observation.at[POSE].set(
-        jnp.stack([jnp.zeros(()), errors.lateral, errors.heading])
-    )
-    predictor = settings.linear(model.fiber(params, inside))
-    prediction = condense(predictor, start, curvature)
-    cost = condensed_cost(
-        prediction,
-        start,
-        reference[:, 3],
-        PlanningStart(state.previous, state.started),
-        weights=settings.weights,
-        step_weights=settings.step_weights,
-        dt=settings.dt,
-    )
-    H = 2 * cost.gains.T @ (cost.weights[:, None] * cost.gains)
-    H = H + REGULARISATION * jnp.max(jnp.diagonal(H)) * jnp.eye(H.shape[0])
-    f = 2 * cost.gains.T @ (cost.weights * cost.offsets)
-    box = jnp.tile(low, horizon), jnp.tile(high, horizon)
-    solution = box_qp(H, f, *box, state.plan.ravel(), iterations=settings.iterations)
-    rows = cost.gains @ solution.primal + cost.offsets
-    total = jnp.sum(cost.weights * rows**2)
-    healthy = clean & jnp.isfinite(total)
+    curvature: Float[Array, " horizon"],
+) -> Float[Array, "horizon state"]:
+    """Map predictions to the world by the circle that touches each reference point.
 
-    plan = jnp.where(healthy, solution.primal.reshape(horizon, -1), state.plan)
-    control = jnp.clip(plan[0], low, high)
-    predicted = prediction.free + prediction.gain @ plan.ravel()
-    info: ControllerInfo = {
-        "cost": total,
-        "mean_cost": total,
-        "effective_samples": jnp.asarray(jnp.nan),
-        "healthy": healthy,
-        "env_inside": jnp.all(inside == env),
-        "predicted_states": to_world(predicted, observation, reference, curvature),
-        "residual": solution.residual,
-    }
-    after = KoopmanMpcState(shift(plan, jnp.ones(())), control, state.started | healthy)
-    return control, after, info
+    Args:
+        along_path: progress, lateral distance, relative yaw and body state.
+        observation: state in the world now.
+        reference: x, y, yaw, speed of each step.
+        curvature: of the path at each reference point [1/m].
+    """
+    behind = between(reference[0, POSE], observation[POSE])[0]
+    steps = jnp.hypot(*jnp.diff(reference[:, :2], axis=0).T)
+    passed = jnp.concatenate([jnp.zeros(1), jnp.cumsum(steps)])
+
+    def one_step(
+        state: State, point: Float[Array, " 4"], kappa: Scalar, travelled: Scalar
+    ) -> State:
+        ahead = behind + state[0] - travelled
+        foot = jnp.stack([ahead, 0.5 * kappa * ahead**2, kappa * ahead])
+        aside = jnp.stack([jnp.zeros(()), state[1], state[2]])
+        return jnp.concatenate([compose(point[:3], compose(foot, aside)), state[BODY]])
+
+    return jax.vmap(one_step)(along_path, reference, curvature, passed)
+
+
+class BoxSolution(NamedTuple):
+    """The solution of a box-constrained quadratic program.
+
+    Attributes:
+        primal: x, inside the box.
+        residual: max_i |x − clip(x − ∇ / diag H)|_i in units of x; 0 at the optimum.
+    """
+
+    primal: Float[Array, " n"]
+    residual: Scalar
+
+
+def box_qp(
+    H: Float[Array, "n n"],
+    f: Float[Array, " n"],
+    low: Float[Array, " n"],
+    high: Float[Array, " n"],
+    start: Float[Array, " n"],
+    *,
+    iterations: int = 12,
+) -> BoxSolution:
+    """Minimise ½ xᵀ H x + fᵀ x subject to low ≤ x ≤ high, for H > 0.
+
+        x_f ← clip(x_f − 2⁻ʲ H_ff⁻¹ ∇_f)
+
+    The active set holds the entries at a bound where descent points outward; the free
+    entries f take a Newton step of the reduced problem, with the j of the lowest cost.
+    The solution is exact one step after the active set is right, so a good warm start
+    needs one iteration. The cost never increases, and a step that is not finite is not
+    taken.
+
+    Args:
+        H: Hessian of the cost, positive definite.
+        f: linear term of the cost.
+        low: lower bounds.
+        high: upper bounds, high ≥ low.
+        start: initial guess, clipped to the box.
+        iterations: fixed number; each is one Cholesky factorisation.
+
+    Source: Bertsekas (1982); Tassa, Mansard and Todorov (2014), section III.
+    """
+    lengths = 0.5 ** jnp.arange(HALVINGS)[:, None]
+    diagonal = jnp.diagonal(H)
+
+    def improve(x: Float[Array, " n"], _: None) -> tuple[Float[Array, " n"], None]:
+        slope = H @ x + f
+        active = ((x <= low) & (slope > 0)) | ((x >= high) & (slope < 0))
+        reduced = jnp.where(active[:, None] | active, jnp.diag(diagonal), H)
+        newton = -cho_solve(cho_factor(reduced), jnp.where(active, 0.0, slope))
+        candidates = jnp.clip(x + lengths * newton, low, high)
+        moves = candidates - x
+        change = moves @ slope + 0.5 * jnp.sum((moves @ H) * moves, axis=1)
+        change = jnp.where(jnp.isfinite(change), change, jnp.inf)
+        best = jnp.argmin(change)
+        return jnp.where(change[best] < 0, candidates[best], x), None
+
+    x, _ = jax.lax.scan(improve, jnp.clip(start, low, high), length=iterations)
+    return BoxSolution(
+        x, jnp.max(jnp.abs(x - jnp.clip(x - (H @ x + f) / diagonal, low, high)))
+    )
+
+
+koopman_mpc = factory(KoopmanMpc, KoopmanMpc.controller)
+"""(model, settings of `KoopmanMpc`) -> `Controller`."""

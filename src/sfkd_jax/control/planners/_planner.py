@@ -1,48 +1,48 @@
-"""The receding-horizon controller of a task and a search."""
+"""The control step that all planners share: warm start, search, limits, fallback."""
 
 from __future__ import annotations
 
-from functools import partial
+import functools
+from collections.abc import Callable
+from dataclasses import KW_ONLY, dataclass
+from typing import Any
 
 import jax
 import jax.numpy as jnp
+from jaxtyping import Array
 
-from sfkd_jax.control.planners._control_step import (
-    StepSettings,
-    control_step,
-    initial_state,
+from sfkd_jax.control.planners._gains import Gains, feedback_gains
+from sfkd_jax.control.planners._plans import (
+    Evaluate,
+    Evaluated,
+    Plan,
+    PlannerState,
+    Samples,
+    SearchResult,
+    Tuning,
+    all_finite,
+    catch_up,
+    clip_environment,
+    replace_nonfinite,
+    shift,
 )
-from sfkd_jax.control.planners._plans import INFO_LEVELS, Search, Tuning
-from sfkd_jax.control.planners._risk import risk_measure
-from sfkd_jax.control.planners._smoothing import plan_smoother
-from sfkd_jax.control.tasks._task import Task
+from sfkd_jax.control.planners._rollouts import RiskMeasure, Rollouts, risk_measure
+from sfkd_jax.control.planners._smoothing import Smoother, plan_smoother
+from sfkd_jax.control.tasks._task import PlanningStart, StepIndex, Task
 from sfkd_jax.ranges import AtLeastTwo, NonNegativeInt, Positive, PositiveFraction
-from sfkd_jax.types import Controller
+from sfkd_jax.types import Control, Controller, ControllerInfo, Key, Params, Scalar
+
+INFO_LEVELS = ("plan", "samples")
+"""What a planner reports: the chosen plan, or all candidates as well."""
+TASK_STREAM = 31324
+"""Folded into the key of a control step for the task's own noise."""
+KEY_KINDS = {2: "threefry2x32", 4: "rbg"}
+"""Implementations of random keys by the number of words of their data."""
 
 
-def planner(
-    task: Task,
-    search: Search,
-    *,
-    horizon: AtLeastTwo = 20,
-    temperature: Positive = 5.0,
-    effective_samples: float = 0.0,
-    noise_std: tuple[Positive, ...] = (0.02, 0.3),
-    num_proposals: NonNegativeInt = 0,
-    smoothing_window: NonNegativeInt = 0,
-    smoothing_order: NonNegativeInt = 2,
-    risk: str = "mean",
-    risk_level: PositiveFraction = 0.25,
-    chunk: NonNegativeInt = 0,
-    unroll: int = 2,
-    sharding: jax.sharding.Sharding | None = None,
-    env_low: tuple[float, ...] | None = None,
-    env_high: tuple[float, ...] | None = None,
-    several: bool | None = None,
-    info_level: str = "plan",
-    gain_samples: NonNegativeInt = 0,
-) -> Controller:
-    """Return the receding-horizon controller of a task and a search for its best plan.
+@dataclass(frozen=True, eq=False)
+class Planner:
+    """The receding-horizon controller of a task; a subclass searches for its best plan.
 
     Each control step shifts the plan, searches around it, smooths the result, rolls it
     out within the limits, and keeps the perturbations that the limits allowed. The
@@ -56,22 +56,17 @@ def planner(
     of a plan is then the `risk` of its trajectories over them, and `info` describes
     the chosen plan in the first one.
 
-    Args:
+    Attributes:
         task: the planning problem.
-        search: the algorithm; see `mppi`, `cem` and `gradient_planner`, which call
-            this function.
         horizon: T, number of steps.
-        temperature: initial value in `Tuning`.
-        effective_samples: initial value in `Tuning`.
-        noise_std: initial value in `Tuning`.
+        noise_std: scale of a perturbation, one entry a control; initial value in
+            `Tuning`.
         num_proposals: number of user-defined plans in the state; they are zeros (the
             law alone) until replaced.
         smoothing_window: of the Savitzky-Golay filter, see `plan_smoother`; 0 for none.
         smoothing_order: of the filter's polynomial.
         risk: "mean", "worst" or "cvar", over the environments.
         risk_level: fraction of the largest costs that "cvar" averages.
-        chunk: number of samples rolled out at a time, to bound the memory; 0 for all
-            at once.
         unroll: number of steps of a rollout that are compiled as one, which saves time
             where steps are short; the plan is the same up to rounding.
         sharding: of the samples over devices, for plans of shape (horizon, sample,
@@ -84,68 +79,261 @@ def planner(
         info_level: "plan", or "samples" to report every candidate as well.
         gain_samples: number of samples, those with the largest weights, from which the
             feedback gains of the plan are computed, see `between_plans`; 0 for none.
-
-    Returns:
-        A `Controller`; `info` has `cost` (lowest), `mean_cost` (of the chosen plan),
-        `effective_samples`, `healthy`, `env_inside` and `predicted_states` (horizon,
-        state) of the chosen plan. With `info_level="samples"` it has `sample_costs`,
-        `sample_weights`, `sample_plans` (perturbations) and `sample_states` too, with
-        `gain_samples` `gains` (control, state), zero where `healthy` is False, for a
-        `constrained` task `violation` of the chosen plan and `constraints_kept`.
-
-    Raises:
-        ValueError: `noise_std` does not fit the task, the horizon or the temperature
-            is not positive, the risk is unknown, the filter does not fit the horizon,
-            `unroll` is not positive, `gain_samples` is negative, or gains are wanted of
-            a smoothed plan.
     """
-    if horizon < 1:
-        raise ValueError(f"horizon must be at least 1, got {horizon}")
-    if info_level not in INFO_LEVELS:
-        raise ValueError(
-            f"info_level must be one of {', '.join(INFO_LEVELS)}, got {info_level!r}"
-        )
-    if not temperature > 0:
-        raise ValueError(f"temperature must be positive, got {temperature}")
-    if len(noise_std) != task.low.shape[0] or not all(std > 0 for std in noise_std):
-        raise ValueError(
-            f"noise_std needs {task.low.shape[0]} positive numbers, got {noise_std}"
-        )
-    if unroll < 1:
-        raise ValueError(f"unroll must be at least 1, got {unroll}")
-    if gain_samples < 0:
-        raise ValueError(f"gain_samples must not be negative, got {gain_samples}")
-    if gain_samples and smoothing_window:
-        raise ValueError("gain_samples and smoothing_window exclude each other")
-    settings = StepSettings(
-        task=task,
-        search=search,
-        horizon=horizon,
-        num_proposals=num_proposals,
-        smooth=plan_smoother(
-            horizon=horizon, window=smoothing_window, order=smoothing_order
-        ),
-        smoothing_window=smoothing_window,
-        risk=risk_measure(risk, risk_level),
-        chunk=chunk,
-        unroll=unroll,
-        sharding=sharding,
-        env_low=env_low,
-        env_high=env_high,
-        several=several,
-        reports_samples=info_level == "samples",
-        gain_samples=gain_samples,
-        tuning=Tuning(
-            temperature=jnp.asarray(temperature, dtype=float),
-            effective_samples=jnp.asarray(effective_samples, dtype=float),
-            noise_std=jnp.asarray(noise_std, dtype=float),
+
+    task: Task
+    _: KW_ONLY
+    horizon: AtLeastTwo = 20
+    noise_std: tuple[Positive, ...] = (0.02, 0.3)
+    num_proposals: NonNegativeInt = 0
+    smoothing_window: NonNegativeInt = 0
+    smoothing_order: NonNegativeInt = 2
+    risk: str = "mean"
+    risk_level: PositiveFraction = 0.25
+    unroll: int = 2
+    sharding: jax.sharding.Sharding | None = None
+    env_low: tuple[float, ...] | None = None
+    env_high: tuple[float, ...] | None = None
+    several: bool | None = None
+    info_level: str = "plan"
+    gain_samples: NonNegativeInt = 0
+
+    def __post_init__(self) -> None:
+        """Raise a ValueError that names a setting out of its range."""
+        channels, std = self.task.low.shape[0], self.noise_std
+        if self.horizon < 1:
+            raise ValueError(f"horizon must be at least 1, got {self.horizon}")
+        if len(std) != channels or not all(entry > 0 for entry in std):
+            raise ValueError(f"noise_std needs {channels} positive numbers, got {std}")
+        if self.unroll < 1:
+            raise ValueError(f"unroll must be at least 1, got {self.unroll}")
+        if self.info_level not in INFO_LEVELS:
+            raise ValueError(
+                f"info_level must be one of {', '.join(INFO_LEVELS)}, "
+                f"got {self.info_level!r}"
+            )
+        if self.gain_samples < 0:
+            raise ValueError(
+                f"gain_samples must not be negative, got {self.gain_samples}"
+            )
+        if self.gain_samples and self.smoothing_window:
+            raise ValueError("gain_samples and smoothing_window exclude each other")
+        _ = self._risk, self._smooth  # both raise for settings out of range
+
+    def search(self, key: Key, state: PlannerState, evaluate: Evaluate) -> SearchResult:
+        """Return the best plan near `state.plan`; what a subclass defines.
+
+        Args:
+            key: consumed.
+            state: with the shifted plan, proposals and tuning.
+            evaluate: rolls out plans of shape (horizon, sample, control).
+        """
+        raise NotImplementedError
+
+    def init(self, key: Key) -> PlannerState:
+        """Return the state before the first step: a plan of zeros, the law alone.
+
+        No two entries share a buffer, so that the state can be donated.
+        """
+        task, channels = self.task, self.task.low.shape[0]
+        real = functools.partial(jnp.array, dtype=float)
+        tuning = Tuning(
+            temperature=jnp.ones(()),
+            effective_samples=jnp.zeros(()),
+            noise_std=real(self.noise_std),
             elapsed=jnp.ones(()),
-            cost=jax.tree.map(
-                lambda weight: jnp.asarray(weight, dtype=float), task.weights
-            ),
-            constraints=jax.tree.map(
-                lambda value: jnp.asarray(value, dtype=float), task.constraint_data
-            ),
-        ),
+            cost=jax.tree.map(real, task.weights),
+            constraints=jax.tree.map(real, task.constraint_data),
+        )
+        return PlannerState(
+            plan=jnp.zeros((self.horizon, channels)),
+            controls=jnp.zeros((self.horizon, channels)),
+            previous=jnp.zeros(channels),
+            started=jnp.asarray(False),
+            key=jax.random.key_data(key),
+            past=jnp.zeros((self.smoothing_window // 2, channels)),
+            proposals=jnp.zeros((self.num_proposals, self.horizon, channels)),
+            tuning=tuning,
+        )
+
+    def act(
+        self,
+        params: Params,
+        state: PlannerState,
+        observation: Any,
+        env: Any,
+        reference: Any,
+    ) -> tuple[Control, PlannerState, ControllerInfo]:
+        """Return the control of one step, the next state and `ControllerInfo`."""
+        task, several = self.task, self._is_several(env)
+        task.check(observation, env, reference, self.horizon)
+        clean = all_finite((observation, env, reference))
+        inside = clip_environment(env, self.env_low, self.env_high)
+        key = jax.random.wrap_key_data(state.key, impl=KEY_KINDS[state.key.shape[0]])
+        search_key, next_key = jax.random.split(key)
+        task_key = jax.random.fold_in(key, TASK_STREAM)
+        elapsed, state = catch_up(state)
+
+        # Everything that all samples share is computed once, outside the rollouts.
+        prepare = task.prepare
+        start = PlanningStart(state.previous, state.started, task_key)
+        if several:
+            count = jax.tree.leaves(env)[0].shape[0]
+            start = start._replace(key=jax.random.split(task_key, count))
+            shared = jax.tree.map(lambda _: None, start)
+            axes = (None, None, 0, None, shared._replace(key=0))
+            prepare = jax.vmap(prepare, in_axes=axes)
+        setup = prepare(params, observation, inside, reference, start)
+        risk = self._risk if several else None
+        evaluate = Rollouts(task, state.tuning, setup, risk, self.unroll, self.sharding)
+
+        proposed = state
+        if setup.proposals is not None:  # the task's, beside the user's
+            suggested = setup.proposals[0] if several else setup.proposals
+            proposals = jnp.concatenate([state.proposals, suggested])
+            proposed = state._replace(proposals=proposals)
+        result = self.search(search_key, proposed, evaluate)
+        plan = self._smooth(state.past, result.plan)
+        rollout = evaluate(plan[:, None]).only()
+        if task.constraint is not None:
+            plan, rollout, result = _keep_constraints(evaluate, plan, rollout, result)
+        if self.smoothing_window:  # a smoothed plan can exceed the limits again
+            plan = replace_nonfinite(rollout.perturbations, 0.0)
+
+        # Otherwise the last healthy plan continues: it was shifted, its end is held.
+        healthy = clean & result.usable & jnp.isfinite(rollout.costs)
+        plan = jnp.where(healthy, plan, state.plan)
+        controls = jnp.where(healthy, rollout.controls, state.controls)
+        control = jnp.clip(controls[0], task.low, task.high)
+        info: ControllerInfo = {
+            "cost": result.cost,
+            "mean_cost": rollout.costs,
+            "effective_samples": result.effective_samples,
+            "healthy": healthy,
+            "env_inside": jnp.all(inside == env) if self.env_low else jnp.asarray(True),
+            "predicted_states": rollout.states,
+        }
+        if rollout.violations is not None:
+            info["violation"] = rollout.violations
+            info["constraints_kept"] = rollout.violations <= 0.0
+        if self.info_level == "samples" and result.samples is not None:
+            evaluated = result.samples.evaluated
+            info["sample_costs"] = evaluated.costs
+            info["sample_weights"] = result.samples.weights
+            info["sample_plans"] = evaluated.perturbations
+            info["sample_states"] = evaluated.states
+        if self.gain_samples:
+            gains = self._gains(
+                evaluate,
+                lambda moved: prepare(params, moved, inside, reference, start).start,
+                observation,
+                result,
+            )
+            info["gains"] = jnp.where(healthy, gains, 0.0)
+        elapsed = jnp.minimum(elapsed, 1.0)
+        after = state._replace(
+            plan=shift(plan, elapsed),
+            controls=shift(controls, elapsed),
+            previous=control,
+            started=state.started | healthy,
+            key=jax.random.key_data(next_key),
+            past=jnp.concatenate([state.past, plan[:1]])[1:],
+            tuning=state.tuning._replace(elapsed=jnp.ones_like(state.tuning.elapsed)),
+        )
+        return control, after, info
+
+    def controller(self) -> Controller:
+        """Return the planner as two functions."""
+        return Controller(self.init, self.act)
+
+    @functools.cached_property
+    def _risk(self) -> RiskMeasure:
+        return risk_measure(self.risk, self.risk_level)
+
+    @functools.cached_property
+    def _smooth(self) -> Smoother:
+        return plan_smoother(
+            horizon=self.horizon,
+            window=self.smoothing_window,
+            order=self.smoothing_order,
+        )
+
+    def _is_several(self, env: Any) -> bool:
+        """Whether an environment is several that are equally likely."""
+        if self.several is not None:
+            return self.several
+        return getattr(env, "ndim", 0) == 2
+
+    def _reported(
+        self,
+        evaluated: Evaluated,
+        weights: Array,
+        temperature: Scalar | None = None,
+    ) -> Samples | None:
+        """The candidates of a search, if anything reads them."""
+        if self.info_level == "samples" or self.gain_samples:
+            return Samples(evaluated, weights, temperature)
+        return None
+
+    def _gains(
+        self,
+        rollouts: Rollouts,
+        start_of: Callable[[Array], Any],
+        observation: Array,
+        result: SearchResult,
+    ) -> Gains:
+        """The feedback gains of the plan that a search chose; see `feedback_gains`."""
+        assert result.samples is not None
+        setup, several = rollouts.setup, rollouts.risk is not None
+
+        def evaluate(start: Any, plans: Array) -> Evaluated:
+            moved = setup._replace(start=start)
+            return Rollouts(
+                self.task, rollouts.tuning, moved, rollouts.risk, self.unroll
+            )(plans)
+
+        def control_of(start: Any, perturbation: Control) -> Control:
+            context, targets = setup.context, setup.targets
+            if several:  # the first environment, as for the controls of a plan
+                context, start, targets = jax.tree.map(
+                    lambda leaf: leaf[0], (context, start, targets)
+                )
+            target = jax.tree.map(lambda leaf: leaf[0], targets)
+            at = StepIndex(jnp.zeros((), int), jnp.zeros(()))
+            weights = rollouts.tuning.cost
+            step = self.task.step(weights, context, start, perturbation, target, at)
+            return step.control
+
+        return feedback_gains(
+            result.samples,
+            start_of,
+            evaluate,
+            control_of,
+            observation,
+            result.plan,
+            self.gain_samples,
+        )
+
+
+def _keep_constraints(
+    evaluate: Evaluate, plan: Plan, rollout: Evaluated, result: SearchResult
+) -> tuple[Plan, Evaluated, SearchResult]:
+    """The chosen plan, or the best candidate where that violates less.
+
+    The mean of plans that pass an obstacle on both sides hits it. The gains of a single
+    candidate are those of the task's feedback law alone, as at an infinite temperature.
+    """
+    best, samples = result.best, result.samples
+    if best is None:
+        raise ValueError("constraints need a search that ranks by them: mppi or cem")
+    other = evaluate(best[:, None]).only()
+    assert other.violations is not None
+    assert rollout.violations is not None
+    instead = other.violations < rollout.violations
+    plan, rollout = jax.tree.map(
+        lambda a, b: jnp.where(instead, b, a), (plan, rollout), (best, other)
     )
-    return Controller(partial(initial_state, settings), partial(control_step, settings))
+    if samples is not None and samples.temperature is not None:
+        temperature = jnp.where(instead, jnp.inf, samples.temperature)
+        samples = samples._replace(temperature=temperature)
+    return plan, rollout, result._replace(plan=plan, samples=samples)

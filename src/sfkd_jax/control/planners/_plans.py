@@ -1,16 +1,16 @@
-"""The state and the search interface of planners, and operations on plans."""
+"""The state of a planner, what a search is given and returns, operations on plans."""
 
 from __future__ import annotations
 
 from collections.abc import Callable
 from functools import partial
-from typing import Any, NamedTuple, TypeAlias, cast
+from typing import Any, NamedTuple, TypeAlias
 
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, UInt32
 
-from sfkd_jax.types import Control, ControllerInfo, Key, Scalar
+from sfkd_jax.types import Control, Scalar
 
 Plan: TypeAlias = Float[Array, "horizon control"]
 Plans: TypeAlias = Float[Array, "horizon sample control"]
@@ -68,6 +68,71 @@ class PlannerState(NamedTuple):
     tuning: Tuning
 
 
+class Evaluated(NamedTuple):
+    """What the rollouts of plans came to, in one environment or in several.
+
+    Attributes:
+        costs: of the whole rollouts; of several environments, the risk over them.
+        controls: applied, within the limits; of several environments, in the first.
+        perturbations: that the limits allowed; of several environments, their mean.
+        states: predicted, (horizon, sample, …); of several environments, in the first.
+        violations: the largest of a constraint over the horizon and the environments,
+            not below 0; None without constraints.
+    """
+
+    costs: Float[Array, " sample"]
+    controls: Plans
+    perturbations: Plans
+    states: Any
+    violations: Float[Array, " sample"] | None = None
+
+    def only(self) -> Evaluated:
+        """Return the rollout of a single plan, without the axis of the samples."""
+        controls, perturbations, states = jax.tree.map(
+            lambda leaf: leaf[:, 0], (self.controls, self.perturbations, self.states)
+        )
+        violation = None if self.violations is None else self.violations[0]
+        return Evaluated(self.costs[0], controls, perturbations, states, violation)
+
+
+Evaluate: TypeAlias = Callable[[Plans], Evaluated]
+"""Rolls out plans."""
+
+
+class Samples(NamedTuple):
+    """The candidates of the last iteration of a search.
+
+    Attributes:
+        evaluated: costs, perturbations and states.
+        weights: in the chosen plan.
+        temperature: λ of the weights; None if they do not depend smoothly on the costs.
+    """
+
+    evaluated: Evaluated
+    weights: Float[Array, " sample"]
+    temperature: Scalar | None = None
+
+
+class SearchResult(NamedTuple):
+    """The outcome of a search.
+
+    Attributes:
+        plan: the chosen plan.
+        usable: whether any rollout had a finite cost.
+        cost: the lowest cost of all samples.
+        effective_samples: 1 / Σ w² of the sample weights.
+        samples: the candidates, for a planner that reports them.
+        best: the best single candidate, for a task with constraints.
+    """
+
+    plan: Plan
+    usable: Bool[Array, ""]
+    cost: Scalar
+    effective_samples: Scalar
+    samples: Samples | None = None
+    best: Plan | None = None
+
+
 def tuned(state: PlannerState, **changes: Any) -> PlannerState:
     """Return the state with other entries of `Tuning`, of the types that it has.
 
@@ -106,78 +171,6 @@ def _of_type(name: str, before: Array, value: Any) -> Array:
     return after
 
 
-class Evaluated(NamedTuple):
-    """What the rollouts of plans came to.
-
-    Attributes:
-        costs: of the whole rollouts; of several environments, the risk over them.
-        perturbations: that the limits allowed; of several environments, their mean.
-        states: predicted, (horizon, sample, …); of several environments, in the first.
-        violations: the largest of a constraint over the horizon and the environments,
-            not below 0; None without constraints.
-    """
-
-    costs: Float[Array, " sample"]
-    perturbations: Plans
-    states: Any
-    violations: Float[Array, " sample"] | None = None
-
-
-class Samples(NamedTuple):
-    """The candidates of the last iteration of a search.
-
-    Attributes:
-        evaluated: costs, perturbations and states.
-        weights: in the chosen plan.
-        temperature: λ of the weights; None if they do not depend smoothly on the costs.
-    """
-
-    evaluated: Evaluated
-    weights: Float[Array, " sample"]
-    temperature: Scalar | None = None
-
-
-class SearchResult(NamedTuple):
-    """The outcome of a search.
-
-    Attributes:
-        plan: the chosen plan.
-        usable: whether any rollout had a finite cost.
-        cost: the lowest cost of all samples.
-        effective_samples: 1 / Σ w² of the sample weights.
-        samples: the candidates, for a planner that reports them.
-        best: the best single candidate, for a task with constraints.
-    """
-
-    plan: Plan
-    usable: Bool[Array, ""]
-    cost: Scalar
-    effective_samples: Scalar
-    samples: Samples | None = None
-    best: Plan | None = None
-
-
-INFO_LEVELS = ("plan", "samples")
-"""What a planner reports: the chosen plan, or all candidates as well."""
-Evaluate: TypeAlias = Callable[[Plans], Evaluated]
-"""Rolls out plans."""
-Search: TypeAlias = Callable[[Key, PlannerState, Evaluate], SearchResult]
-
-
-def about_samples(samples: Samples | None) -> ControllerInfo:
-    """Return the entries of `info` about all candidates, if they are reported."""
-    if samples is None:
-        return cast(ControllerInfo, {})
-    evaluated = samples.evaluated
-    about = {
-        "sample_costs": evaluated.costs,
-        "sample_weights": samples.weights,
-        "sample_plans": evaluated.perturbations,
-        "sample_states": evaluated.states,
-    }
-    return cast(ControllerInfo, about)
-
-
 def candidate_plans(
     plan: Plan, noise: Plans, state: PlannerState
 ) -> Float[Array, "horizon candidate control"]:
@@ -185,16 +178,6 @@ def candidate_plans(
     return jnp.concatenate(
         [plan[:, None] + noise.at[:, 0].set(0.0), state.proposals.swapaxes(0, 1)],
         axis=1,
-    )
-
-
-def weighted_mean_and_std(
-    weights: Float[Array, " sample"], plans: Plans
-) -> tuple[Plan, Plan]:
-    """Return mean and standard deviation over the samples, step by step."""
-    mean = jnp.einsum("m,tmc->tc", weights, plans)
-    return mean, jnp.sqrt(
-        jnp.einsum("m,tmc->tc", weights, (plans - mean[:, None]) ** 2)
     )
 
 
@@ -216,15 +199,6 @@ def shift(plan: Plan, elapsed: Scalar) -> Plan:
     return plan[index] + (times - whole)[:, None] * (after - plan[index])
 
 
-def all_finite(tree: Any) -> Bool[Array, ""]:
-    """Whether every real or complex entry of every leaf is finite."""
-    leaves = [jnp.asarray(leaf) for leaf in jax.tree.leaves(tree)]
-    real = [leaf for leaf in leaves if jnp.issubdtype(leaf.dtype, jnp.inexact)]
-    return jnp.all(
-        jnp.stack([jnp.asarray(True), *(jnp.all(jnp.isfinite(leaf)) for leaf in real)])
-    )
-
-
 def catch_up(state: PlannerState) -> tuple[Scalar, PlannerState]:
     """Shift the plan of a late call; return the elapsed periods as well.
 
@@ -236,6 +210,15 @@ def catch_up(state: PlannerState) -> tuple[Scalar, PlannerState]:
     late = jnp.maximum(elapsed - 1.0, 0.0)
     return elapsed, state._replace(
         plan=shift(state.plan, late), controls=shift(state.controls, late)
+    )
+
+
+def all_finite(tree: Any) -> Bool[Array, ""]:
+    """Whether every real or complex entry of every leaf is finite."""
+    leaves = [jnp.asarray(leaf) for leaf in jax.tree.leaves(tree)]
+    real = [leaf for leaf in leaves if jnp.issubdtype(leaf.dtype, jnp.inexact)]
+    return jnp.all(
+        jnp.stack([jnp.asarray(True), *(jnp.all(jnp.isfinite(leaf)) for leaf in real)])
     )
 
 

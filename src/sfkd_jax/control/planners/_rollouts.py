@@ -1,150 +1,82 @@
-"""Rollouts of many plans, in one environment or in several."""
+"""Rollouts of many plans, in one environment or as a risk over several."""
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
+from dataclasses import dataclass
 from functools import partial
-from typing import Any, NamedTuple, TypeAlias
+from typing import Any, TypeAlias
 
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from sfkd_jax.control.planners._plans import Evaluate, Evaluated, Plan, Plans, Tuning
-from sfkd_jax.control.planners._risk import RiskMeasure
+from sfkd_jax.control.planners._plans import Evaluated, Plans, Tuning
 from sfkd_jax.control.tasks._task import RolloutSetup, StepIndex, Task
 from sfkd_jax.types import Scalar
 
-
-class Rollouts(NamedTuple):
-    """Rollouts of many plans.
-
-    Attributes:
-        costs: of the whole rollouts.
-        controls: applied, within the limits.
-        perturbations: that the limits allowed.
-        states: predicted, (*particle, horizon, sample, …) of every leaf.
-        violations: largest of a constraint, not below 0; None without constraints.
-    """
-
-    costs: Float[Array, "*particle sample"]
-    controls: Float[Array, "*particle horizon sample control"]
-    perturbations: Float[Array, "*particle horizon sample control"]
-    states: Any
-    violations: Float[Array, "*particle sample"] | None = None
+RiskMeasure: TypeAlias = Callable[
+    [Float[Array, "particle sample"]], Float[Array, " sample"]
+]
 
 
-class PlanRollout(NamedTuple):
-    """The rollout of one plan; of several environments, in the first one.
+@dataclass(frozen=True, eq=False)
+class Rollouts:
+    """Rolls out plans from what a task evaluated once in a control step.
 
     Attributes:
-        cost: of the whole rollout; of several environments, the risk over them.
-        controls: applied, within the limits.
-        perturbations: that the limits allowed.
-        states: predicted, (horizon, …) of every leaf.
-        violation: largest of a constraint; None without constraints.
-    """
-
-    cost: Scalar
-    controls: Plan
-    perturbations: Plan
-    states: Any
-    violation: Scalar | None = None
-
-
-RollOut: TypeAlias = Callable[[Plans], Rollouts]
-
-
-def rollout_function(
-    task: Task,
-    tuning: Tuning,
-    setup: RolloutSetup,
-    *,
-    several: bool,
-    unroll: int,
-) -> RollOut:
-    """Return the function that rolls out plans.
-
-    Args:
         task: the planning problem.
         tuning: weights of its cost, data of its constraints.
-        setup: of this control step.
-        several: whether `setup` has a leading axis of environments.
-        unroll: number of steps that are compiled as one.
-    """
-    roll_out = partial(_roll_out, task, tuning, unroll)
-    if several:
-        roll_out = jax.vmap(roll_out, in_axes=(0, None))
-    return partial(roll_out, setup)
-
-
-def evaluate_function(
-    roll_out: RollOut,
-    risk: RiskMeasure | None,
-    *,
-    chunk: int,
-    sharding: jax.sharding.Sharding | None,
-) -> Evaluate:
-    """Return the function that a search calls to evaluate plans.
-
-    Args:
-        roll_out: see `rollout_function`.
+        setup: of this control step; with a risk, every leaf has a leading axis of
+            environments.
         risk: reduces the costs over several environments; None for one environment.
-        chunk: number of samples rolled out at a time; 0 for all at once.
+        unroll: number of steps that are compiled as one.
         sharding: of the samples over devices, or None.
     """
 
-    def evaluate(plans: Plans) -> Evaluated:
+    task: Task
+    tuning: Tuning
+    setup: RolloutSetup
+    risk: RiskMeasure | None = None
+    unroll: int = 2
+    sharding: jax.sharding.Sharding | None = None
+
+    def __call__(self, plans: Plans) -> Evaluated:
+        """Return costs, controls and predicted states of plans."""
         # A single plan cannot be split over devices.
-        if sharding is not None and plans.shape[1] > 1:
-            plans = jax.lax.with_sharding_constraint(plans, sharding)
-        rollouts = _in_chunks(roll_out, plans, chunk)
-        costs, _, perturbations, states, violations = rollouts
-        if risk is None:
-            return Evaluated(costs, perturbations, states, violations)
-        first = jax.tree.map(lambda leaf: leaf[0], states)
-        mean = jnp.mean(perturbations, axis=0)
-        return Evaluated(risk(costs), mean, first, _worst(violations))
-
-    return evaluate
-
-
-def roll_out_plan(
-    roll_out: RollOut, risk: RiskMeasure | None, plan: Plan
-) -> PlanRollout:
-    """Roll out one plan; `risk` as in `evaluate_function`."""
-    costs, controls, perturbations, states, violations = roll_out(plan[:, None])
-    first = (slice(None), 0) if risk is None else (0, slice(None), 0)
-    trajectories = (controls, perturbations, states)
-    controls, perturbations, states = jax.tree.map(
-        lambda leaf: leaf[first], trajectories
-    )
-    if risk is not None:
-        costs, violations = risk(costs), _worst(violations)
-    violation = None if violations is None else violations[0]
-    return PlanRollout(costs[0], controls, perturbations, states, violation)
-
-
-def _worst(violations: Array | None) -> Float[Array, " sample"] | None:
-    """The largest violation over several environments."""
-    return None if violations is None else jnp.max(violations, axis=0)
+        if self.sharding is not None and plans.shape[1] > 1:
+            plans = jax.lax.with_sharding_constraint(plans, self.sharding)
+        roll_out = partial(_roll_out, self.task, self.tuning, self.unroll)
+        if self.risk is None:
+            return roll_out(self.setup, plans)
+        each = jax.vmap(roll_out, in_axes=(0, None))(self.setup, plans)
+        controls, states = jax.tree.map(
+            lambda leaf: leaf[0], (each.controls, each.states)
+        )
+        return Evaluated(
+            costs=self.risk(each.costs),
+            controls=controls,
+            perturbations=jnp.mean(each.perturbations, axis=0),
+            states=states,
+            violations=None
+            if each.violations is None
+            else jnp.max(each.violations, axis=0),
+        )
 
 
 def _roll_out(
     task: Task, tuning: Tuning, unroll: int, setup: RolloutSetup, plans: Plans
-) -> Rollouts:
+) -> Evaluated:
     """Roll out all plans in one environment, in one scan over the horizon."""
     horizon, count = plans.shape[:2]
     numbers = jnp.arange(horizon)
     places = StepIndex(numbers, (numbers == horizon - 1).astype(plans.dtype))
+    inputs = (plans, setup.targets, places)
     step = jax.vmap(
         partial(task.step, tuning.cost, setup.context), in_axes=(0, 0, None, None)
     )
     violate = jax.vmap(partial(_violation, task, tuning), in_axes=(0, 0, None, None))
-    start = jax.tree.map(
-        lambda leaf: jnp.broadcast_to(leaf, (count, *jnp.shape(leaf))), setup.start
-    )
-    first = jax.tree.map(lambda leaf: leaf[0], (plans, setup.targets, places))
 
     def body(carry: Any, inputs: Any) -> Any:
         costs, samples, worst = carry
@@ -152,23 +84,21 @@ def _roll_out(
         if worst is not None:
             now = violate(after.state, after.control, *inputs[1:])
             worst = jnp.maximum(worst, now)
-        return (costs + after.cost, after.sample, worst), (
-            after.control,
-            after.perturbation,
-            after.state,
-        )
+        along = after.control, after.perturbation, after.state
+        return (costs + after.cost, after.sample, worst), along
 
     none = jnp.zeros(count, plans.dtype)
-    carry = _as_returned(
-        lambda carry: body(carry, first)[0],
-        (none, start, None if task.constraint is None else none),
+    start = jax.tree.map(
+        lambda leaf: jnp.broadcast_to(leaf, (count, *jnp.shape(leaf))), setup.start
     )
-    inputs = (plans, setup.targets, places)
-    # A single plan gains nothing from it.
+    carry = (none, start, None if task.constraint is None else none)
+    first = jax.tree.map(lambda leaf: leaf[0], inputs)
+    carry = _as_returned(lambda carry: body(carry, first)[0], carry)
+    # A single plan gains nothing from unrolling.
     (costs, _, worst), (controls, perturbations, states) = jax.lax.scan(
         body, carry, inputs, unroll=unroll if count > 1 else 1
     )
-    return Rollouts(costs, controls, perturbations, states, worst)
+    return Evaluated(costs, controls, perturbations, states, worst)
 
 
 def _violation(
@@ -178,6 +108,7 @@ def _violation(
     assert task.constraint is not None
     all_of_them = task.constraint(tuning.constraints, state, control, target, at)
     largest = jnp.max(all_of_them)
+    # NaN compares as kept, so it must not get through.
     return jnp.where(jnp.isnan(largest), jnp.inf, largest)
 
 
@@ -199,29 +130,35 @@ def _as_type(leaf: Array, like: jax.ShapeDtypeStruct) -> Array:
     return leaf if leaf.dtype == like.dtype else leaf.astype(like.dtype)
 
 
-def _in_chunks(roll_out: RollOut, plans: Plans, chunk: int) -> Rollouts:
-    """Roll out all plans, `chunk` at a time, to bound the memory."""
-    horizon, count, channels = plans.shape
-    if not chunk or chunk >= count:
-        return roll_out(plans)
-    parts = (
-        jnp.pad(plans, ((0, 0), (0, -count % chunk), (0, 0)))
-        .reshape(horizon, -1, chunk, channels)
-        .swapaxes(0, 1)
-    )
-    rollouts = jax.lax.map(roll_out, parts)
-    particles = rollouts.costs.ndim - 2
+RISKS = ("mean", "worst", "cvar")
 
-    def join(leaf: Array, axis: int) -> Array:
-        """Join the chunks along the axis of the samples."""
-        leaf = jnp.moveaxis(leaf, 0, axis)
-        shape = (*leaf.shape[:axis], -1, *leaf.shape[axis + 2 :])
-        return jax.lax.slice_in_dim(leaf.reshape(shape), 0, count, axis=axis)
 
-    controls, perturbations, states = jax.tree.map(
-        partial(join, axis=particles + 1), rollouts[1:4]
-    )
-    costs, violations = jax.tree.map(
-        partial(join, axis=particles), (rollouts.costs, rollouts.violations)
-    )
-    return Rollouts(costs, controls, perturbations, states, violations)
+def risk_measure(name: str, level: float) -> RiskMeasure:
+    """Return the function that reduces the costs of whole trajectories to one per plan.
+
+        mean_p J_p,   max_p J_p,   CVaR = mean of the ⌈level · P⌉ largest J_p
+
+    The measure applies to whole trajectories, so one environment is the worst case
+    over the entire horizon.
+
+    Args:
+        name: "mean", "worst" or "cvar".
+        level: fraction of the largest costs that CVaR averages, in (0, 1].
+
+    Raises:
+        ValueError: the name is unknown, or the level is outside (0, 1].
+    """
+    if name not in RISKS:
+        raise ValueError(f"risk must be one of {', '.join(RISKS)}, got {name!r}")
+    if not 0 < level <= 1:
+        raise ValueError(f"risk_level must lie in (0, 1], got {level}")
+
+    def cvar(costs: Float[Array, "particle sample"]) -> Float[Array, " sample"]:
+        count = math.ceil(level * costs.shape[0])
+        return jnp.mean(jax.lax.top_k(costs.T, count)[0], axis=1)
+
+    return {
+        "mean": lambda costs: jnp.mean(costs, axis=0),
+        "worst": lambda costs: jnp.max(costs, axis=0),
+        "cvar": cvar,
+    }[name]

@@ -16,6 +16,57 @@ DECADES = (-12.0, 4.0)
 """The temperature is searched between 10^-12 and 10^4 times the range of the costs. The
 lower end is that small because a single outlier widens the range.
 """
+FEW = 10.0
+"""Effective samples where every sample violates a constraint."""
+
+
+class Weighted(NamedTuple):
+    """Weights of samples.
+
+    Attributes:
+        weights: that sum to 1.
+        usable: whether any cost is finite.
+        temperature: λ by which the weights follow from the costs; infinite where they
+            follow from violations.
+        size: effective number of samples.
+        best: index of the best sample.
+    """
+
+    weights: Float[Array, " sample"]
+    usable: Bool[Array, ""]
+    temperature: Scalar
+    size: Scalar
+    best: Int[Array, ""]
+
+
+def weigh(
+    costs: Float[Array, " sample"],
+    violations: Float[Array, " sample"] | None,
+    tuning: Tuning,
+    *,
+    solve: bool,
+) -> Weighted:
+    """Weigh samples by their costs, under constraints by `keep_constraints`.
+
+    Args:
+        costs: of the samples.
+        violations: of the constraints; None without any.
+        tuning: λ and the wanted number of effective samples.
+        solve: whether λ follows from that number.
+    """
+    temperature, any_kept = tuning.temperature, None
+    if violations is not None:
+        costs, any_kept = keep_constraints(costs, violations)
+    if solve:
+        temperature = temperature_for_sample_size(costs, tuning.effective_samples)
+    scale = temperature
+    if any_kept is not None:  # violations are in other units than costs
+        few = temperature_for_sample_size(costs, jnp.asarray(FEW))
+        scale = jnp.where(any_kept, temperature, few)
+        temperature = jnp.where(any_kept, temperature, jnp.inf)
+    weights, usable = softmin(costs, scale)
+    size = effective_sample_size(weights)
+    return Weighted(weights, usable, temperature, size, jnp.argmin(costs))
 
 
 def softmin(
@@ -32,10 +83,6 @@ def softmin(
     scaled = jnp.where(finite, costs, 0.0) / jnp.where(positive, temperature, 1.0)
     scores = jnp.where(usable, jnp.where(finite, -scaled, -jnp.inf), 0.0)
     return jax.nn.softmax(scores), usable
-
-
-FEW = 10.0
-"""Effective samples where every sample violates a constraint."""
 
 
 def keep_constraints(
@@ -115,52 +162,3 @@ def _(
     inside = (jnp.abs(reached - wanted) < 1e-2 * wanted) & (slope > 0)
     change = (tangents[1] - by_costs) / jnp.where(inside, slope, 1.0)
     return temperature, jnp.where(inside, change, 0.0)
-
-
-class Weighted(NamedTuple):
-    """Weights of samples.
-
-    Attributes:
-        weights: that sum to 1.
-        usable: whether any cost is finite.
-        temperature: λ by which the weights follow from the costs; infinite where they
-            follow from violations.
-        size: effective number of samples.
-        best: index of the best sample.
-    """
-
-    weights: Float[Array, " sample"]
-    usable: Bool[Array, ""]
-    temperature: Scalar
-    size: Scalar
-    best: Int[Array, ""]
-
-
-def weigh(
-    costs: Float[Array, " sample"],
-    violations: Float[Array, " sample"] | None,
-    tuning: Tuning,
-    *,
-    solve: bool,
-) -> Weighted:
-    """Weigh samples by their costs, under constraints by `keep_constraints`.
-
-    Args:
-        costs: of the samples.
-        violations: of the constraints; None without any.
-        tuning: λ and the wanted number of effective samples.
-        solve: whether λ follows from that number.
-    """
-    temperature, any_kept = tuning.temperature, None
-    if violations is not None:
-        costs, any_kept = keep_constraints(costs, violations)
-    if solve:
-        temperature = temperature_for_sample_size(costs, tuning.effective_samples)
-    scale = temperature
-    if any_kept is not None:  # violations are in other units than costs
-        few = temperature_for_sample_size(costs, jnp.asarray(FEW))
-        scale = jnp.where(any_kept, temperature, few)
-        temperature = jnp.where(any_kept, temperature, jnp.inf)
-    weights, usable = softmin(costs, scale)
-    size = effective_sample_size(weights)
-    return Weighted(weights, usable, temperature, size, jnp.argmin(costs))

@@ -17,8 +17,7 @@ from sfkd_jax.control.laws._model_law import SteadyTurn
 from sfkd_jax.control.laws._path_errors import PathErrors
 from sfkd_jax.control.laws._path_law import PathLaw, turn_control
 from sfkd_jax.control.planners._plans import all_finite
-from sfkd_jax.control.tasks._costs import Cost, StageInputs
-from sfkd_jax.control.tasks._path_tracking import check_path
+from sfkd_jax.control.tasks._path_tracking import Cost, StageInputs, check_path
 from sfkd_jax.control.tasks._task import (
     Limiter,
     PlanningStart,

@@ -2,13 +2,16 @@
 
 from __future__ import annotations
 
-from functools import partial
+from collections.abc import Callable, Mapping
+from dataclasses import KW_ONLY, dataclass
+from functools import cached_property
 from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
+from sfkd_jax.control._factory import factory
 from sfkd_jax.control.laws._model_law import ModelLaw, SteadyTurn
 from sfkd_jax.control.laws._path_errors import (
     FeedbackLaw,
@@ -16,7 +19,6 @@ from sfkd_jax.control.laws._path_errors import (
     path_errors,
     reference_curvature,
 )
-from sfkd_jax.control.tasks._costs import Cost, StageInputs
 from sfkd_jax.control.tasks._task import (
     Actuator,
     Environments,
@@ -30,7 +32,95 @@ from sfkd_jax.control.tasks._task import (
 )
 from sfkd_jax.ranges import Positive
 from sfkd_jax.rollout import fold
-from sfkd_jax.types import Control, Environment, Model, Params, Reference, State
+from sfkd_jax.types import (
+    Control,
+    Environment,
+    Model,
+    Params,
+    Reference,
+    Scalar,
+    State,
+)
+
+
+class StageInputs(NamedTuple):
+    """Arguments of a stage cost at one step of one rollout.
+
+    Attributes:
+        errors: path errors after the step.
+        errors_before: path errors before the step.
+        control: applied in the step.
+        control_before: applied in the step before.
+        speed: of the reference [m/s].
+    """
+
+    errors: PathErrors
+    errors_before: PathErrors
+    control: Control
+    control_before: Control
+    speed: Scalar
+
+
+class Cost(NamedTuple):
+    """A stage cost whose weights are data: changing them does not recompile anything.
+
+    Attributes:
+        weights: a pytree of numbers.
+        stage: (weights, `StageInputs`) -> cost of one step.
+    """
+
+    weights: Any
+    stage: Callable[[Any, StageInputs], Scalar]
+
+
+def tracking_cost(
+    *,
+    dt: float,
+    lateral: float = 200.0,
+    course: float = 20.0,
+    speed: float = 1.0,
+    steering_rate: float = 5.0,
+    effort: float = 0.02,
+    speed_loop: bool = False,
+) -> Cost:
+    """Return the quadratic path-tracking cost, its weights under the argument names.
+
+        ℓ = q_y e_y² + q_c (Δe_y / v dt)² + q_v e_v² + q_δ̇ (Δδ / dt)² + q_a a²
+
+    The course error Δe_y / (v dt) is the direction of travel relative to the path. A
+    vehicle that crabs in a side wind or through a bend then aligns its direction of
+    travel with the path, not its body heading.
+
+    Args:
+        dt: sampling period [s].
+        lateral: q_y [1/m²].
+        course: q_c [1/rad²].
+        speed: q_v [s²/m²].
+        steering_rate: q_δ̇ [s²/rad²].
+        effort: q_a, on the acceleration [s⁴/m²]; ignored with a speed loop.
+        speed_loop: whether the second control is a speed command.
+    """
+    weights = {
+        "lateral": lateral,
+        "course": course,
+        "speed": speed,
+        "steering_rate": steering_rate,
+        "effort": effort,
+    }
+
+    def stage(weights: Mapping[str, Any], inputs: StageInputs) -> Scalar:
+        errors, before = inputs.errors, inputs.errors_before
+        travelled = inputs.speed * dt + 1e-3
+        angle = (errors.lateral - before.lateral) / travelled
+        rate = (inputs.control[0] - inputs.control_before[0]) / dt
+        total = weights["lateral"] * errors.lateral**2 + weights["course"] * angle**2
+        total = total + weights["speed"] * errors.speed**2
+        total = total + weights["steering_rate"] * rate**2
+        return (
+            total if speed_loop else total + weights["effort"] * inputs.control[1] ** 2
+        )
+
+    return Cost(weights, stage)
 
 
 class PathSample(NamedTuple):
@@ -65,41 +155,14 @@ class PathTarget(NamedTuple):
     turn: Any
 
 
-class _Problem(NamedTuple):
-    """Settings of `path_tracking` as its functions need them."""
-
-    model: Model
-    cost: Cost
-    law: FeedbackLaw | ModelLaw
-    limit: Limiter
-    low: Control
-    high: Control
-    terminal_weight: float
-    latent_weight: float
-    actuator: Actuator | None
-    ancillary: ModelLaw | None
-
-
-def path_tracking(
-    model: Model,
-    cost: Cost,
-    law: FeedbackLaw | ModelLaw,
-    *,
-    dt: float,
-    control_low: tuple[float, ...],
-    control_high: tuple[float, ...],
-    control_rate: tuple[Positive, ...] | None = None,
-    terminal_weight: float = 1.0,
-    latent_weight: float = 0.0,
-    actuator: Actuator | None = None,
-    ancillary: ModelLaw | None = None,
-) -> Task:
-    """Return the task of tracking a path around a feedback law on the predicted state.
+@dataclass(frozen=True, eq=False)
+class PathTracking:
+    """The task of tracking a path around a feedback law on the predicted state.
 
         u_k = limit(clip(u_ff(κ_k) + K ξ_k) + ν_k)
         J = Σ_k ℓ(x_k, u_k) + λ_z |z_k − z_k^ref|² + w_T ℓ(x_T, u_T)
 
-    Args:
+    Attributes:
         model: rolled out; `fiber` and `encode` are evaluated once per control step,
             outside the scan over the horizon.
         cost: ℓ, see `tracking_cost`.
@@ -120,124 +183,143 @@ def path_tracking(
 
     Source: for the ancillary law, Trevisan and Alonso-Mora (2024), Biased-MPPI.
     """
-    limit = actuator_limits(control_low, control_high, control_rate, dt)
-    low, high = (
-        jnp.asarray(control_low, dtype=float),
-        jnp.asarray(control_high, dtype=float),
-    )
-    problem = _Problem(
-        model=model,
-        cost=cost,
-        law=law,
-        limit=limit,
-        low=low,
-        high=high,
-        terminal_weight=terminal_weight,
-        latent_weight=latent_weight,
-        actuator=actuator,
-        ancillary=ancillary,
-    )
-    prepare, step = partial(_prepare, problem), partial(_step, problem)
-    return Task(low, high, cost.weights, prepare, step, check_path)
 
+    model: Model
+    cost: Cost
+    law: FeedbackLaw | ModelLaw
+    _: KW_ONLY
+    dt: float
+    control_low: tuple[float, ...]
+    control_high: tuple[float, ...]
+    control_rate: tuple[Positive, ...] | None = None
+    terminal_weight: float = 1.0
+    latent_weight: float = 0.0
+    actuator: Actuator | None = None
+    ancillary: ModelLaw | None = None
 
-def _prepare(
-    problem: _Problem,
-    params: Params,
-    observation: State,
-    env: Environment,
-    reference: Reference,
-    previous: PlanningStart,
-) -> RolloutSetup:
-    """Evaluate fibre, encoder, law and targets once per control step."""
-    model, law = problem.model, problem.law
-    # Many rollouts share this fibre; folding parameters that are folded is free.
-    fiber = model.fiber(fold(model, params), env)
-    curvature = reference_curvature(reference)
-    goals = jax.vmap(lambda point: model.encode(fiber, _on_path(observation, point)))(
-        reference
-    )
-    errors = path_errors(observation, reference[0], curvature[0])
-    turns = None
-    if isinstance(law, ModelLaw):
-        turns = law.prepare(model, fiber, observation, reference, curvature)
-    targets = PathTarget(reference, curvature, goals, turns)
-    first = jax.tree.map(lambda leaf: leaf[0], targets)
-    law_control = _law_control(problem, observation, first)
-    before = jnp.where(previous.known, previous.control, law_control)
-    if problem.actuator is not None:
-        before = problem.actuator(observation)
-    latent = model.encode(fiber, observation)
-    start = PathSample(latent, model.decode(fiber, latent), errors, before)
-    proposals = None
-    if (ancillary := problem.ancillary) is not None:
-        turns = ancillary.prepare(model, fiber, observation, reference, curvature)
-        proposals = _ancillary_plan(problem, ancillary, fiber, start, targets, turns)
-    return RolloutSetup(fiber, start, targets, proposals)
+    def __post_init__(self) -> None:
+        """Raise a ValueError for inconsistent limits."""
+        _ = self.limit
 
+    def task(self) -> Task:
+        """Return the planning problem as functions."""
+        low, high = self.box()
+        return Task(low, high, self.cost.weights, self.prepare, self.step, check_path)
 
-def _step(
-    problem: _Problem,
-    weights: Any,
-    fiber: Any,
-    before: PathSample,
-    nu: Control,
-    target: PathTarget,
-    at: StepIndex,
-) -> StepResult:
-    """One step of one rollout: law plus perturbation, limits, model, cost."""
-    model, point = problem.model, target.point
-    law_control = _law_control(problem, before.state, target)
-    control = problem.limit(law_control + nu, before.control)
-    latent = model.step(fiber, before.latent, control)
-    after = model.decode(fiber, latent)
-    errors = path_errors(after, point, target.curvature)
-    inputs = StageInputs(errors, before.errors, control, before.control, point[3])
-    cost = problem.cost.stage(weights, inputs)
-    if problem.latent_weight:
-        cost = cost + problem.latent_weight * jnp.sum(
-            (model.vector(latent) - model.vector(target.goal)) ** 2
+    def box(self) -> tuple[Control, Control]:
+        """Return the lower and upper control limits."""
+        return (
+            jnp.asarray(self.control_low, dtype=float),
+            jnp.asarray(self.control_high, dtype=float),
         )
-    cost = cost * (1.0 + problem.terminal_weight * at.last)
-    sample = PathSample(latent, after, errors, control)
-    return StepResult(sample, cost, control, control - law_control, after)
+
+    @cached_property
+    def limit(self) -> Limiter:
+        """The projection onto the limits of the actuators."""
+        return actuator_limits(
+            self.control_low, self.control_high, self.control_rate, self.dt
+        )
+
+    def prepare(
+        self,
+        params: Params,
+        observation: State,
+        env: Environment,
+        reference: Reference,
+        previous: PlanningStart,
+    ) -> RolloutSetup:
+        """Return fibre, start, law and targets, evaluated once per control step."""
+        model, law = self.model, self.law
+        # Many rollouts share this fibre; folding parameters that are folded is free.
+        fiber = model.fiber(fold(model, params), env)
+        curvature = reference_curvature(reference)
+        goals = jax.vmap(
+            lambda point: model.encode(fiber, _on_path(observation, point))
+        )(reference)
+        errors = path_errors(observation, reference[0], curvature[0])
+        turns = None
+        if isinstance(law, ModelLaw):
+            turns = law.prepare(model, fiber, observation, reference, curvature)
+        targets = PathTarget(reference, curvature, goals, turns)
+        first = jax.tree.map(lambda leaf: leaf[0], targets)
+        law_control = self._law_control(observation, first)
+        before = jnp.where(previous.known, previous.control, law_control)
+        if self.actuator is not None:
+            before = self.actuator(observation)
+        latent = model.encode(fiber, observation)
+        start = PathSample(latent, model.decode(fiber, latent), errors, before)
+        proposals = None
+        if (ancillary := self.ancillary) is not None:
+            turns = ancillary.prepare(model, fiber, observation, reference, curvature)
+            proposals = self._ancillary_plan(ancillary, fiber, start, targets, turns)
+        return RolloutSetup(fiber, start, targets, proposals)
+
+    def step(
+        self,
+        weights: Any,
+        fiber: Any,
+        before: PathSample,
+        nu: Control,
+        target: PathTarget,
+        at: StepIndex,
+    ) -> StepResult:
+        """Return one step of one rollout: law, perturbation, limits, model, cost."""
+        model, point = self.model, target.point
+        law_control = self._law_control(before.state, target)
+        control = self.limit(law_control + nu, before.control)
+        latent = model.step(fiber, before.latent, control)
+        after = model.decode(fiber, latent)
+        errors = path_errors(after, point, target.curvature)
+        inputs = StageInputs(errors, before.errors, control, before.control, point[3])
+        cost = self.cost.stage(weights, inputs)
+        if self.latent_weight:
+            cost = cost + self.latent_weight * jnp.sum(
+                (model.vector(latent) - model.vector(target.goal)) ** 2
+            )
+        cost = cost * (1.0 + self.terminal_weight * at.last)
+        sample = PathSample(latent, after, errors, control)
+        return StepResult(sample, cost, control, control - law_control, after)
+
+    def _law_control(self, state: State, target: PathTarget) -> Control:
+        """The control of the law, clipped to the limits.
+
+        Without the clip, a perturbation would compensate for what the law requests
+        beyond the limits. After a far-off observation that is thousands of radians, and
+        it would stay in the plan when the observations are right again.
+        """
+        point, curvature, law = target.point, target.curvature, self.law
+        if isinstance(law, ModelLaw):
+            control = law.control(target.turn, state, point, curvature)
+        else:
+            control = law(path_errors(state, point, curvature), curvature, point[3])
+        return jnp.clip(control, *self.box())
+
+    def _ancillary_plan(
+        self,
+        ancillary: ModelLaw,
+        fiber: Any,
+        start: PathSample,
+        targets: PathTarget,
+        turns: SteadyTurn,
+    ) -> Float[Array, "1 horizon control"]:
+        """What the ancillary law adds to the law along the horizon."""
+        weights = self.cost.weights
+
+        def follow(before: PathSample, inputs: Any) -> tuple[PathSample, Control]:
+            target, turn = inputs
+            control = ancillary.control(
+                turn, before.state, target.point, target.curvature
+            )
+            nu = control - self._law_control(before.state, target)
+            anywhere = StepIndex(jnp.zeros((), int), jnp.zeros(()))
+            after = self.step(weights, fiber, before, nu, target, anywhere)
+            return after.sample, after.perturbation
+
+        return jax.lax.scan(follow, start, (targets, turns))[1][None]
 
 
-def _law_control(problem: _Problem, state: State, target: PathTarget) -> Control:
-    """The control of the law, clipped to the limits.
-
-    Without the clip, a perturbation would compensate for what the law requests beyond
-    the limits. After a far-off observation that is thousands of radians, and it would
-    stay in the plan when the observations are right again.
-    """
-    point, curvature, law = target.point, target.curvature, problem.law
-    if isinstance(law, ModelLaw):
-        control = law.control(target.turn, state, point, curvature)
-    else:
-        control = law(path_errors(state, point, curvature), curvature, point[3])
-    return jnp.clip(control, problem.low, problem.high)
-
-
-def _ancillary_plan(
-    problem: _Problem,
-    ancillary: ModelLaw,
-    fiber: Any,
-    start: PathSample,
-    targets: PathTarget,
-    turns: SteadyTurn,
-) -> Float[Array, "1 horizon control"]:
-    """What the ancillary law does along the horizon, as perturbations of the law."""
-    weights = problem.cost.weights
-
-    def follow(before: PathSample, inputs: Any) -> tuple[PathSample, Control]:
-        target, turn = inputs
-        control = ancillary.control(turn, before.state, target.point, target.curvature)
-        nu = control - _law_control(problem, before.state, target)
-        anywhere = StepIndex(jnp.zeros((), int), jnp.zeros(()))
-        after = _step(problem, weights, fiber, before, nu, target, anywhere)
-        return after.sample, after.perturbation
-
-    return jax.lax.scan(follow, start, (targets, turns))[1][None]
+path_tracking = factory(PathTracking, PathTracking.task)
+"""(model, cost, law, settings of `PathTracking`) -> `Task`."""
 
 
 def _on_path(state: State, point: Float[Array, " 4"]) -> State:

@@ -1,0 +1,30 @@
+"""A factory with the arguments of a dataclass, so that they are stated once."""
+
+from __future__ import annotations
+
+import functools
+import typing
+from collections.abc import Callable
+from typing import ParamSpec, TypeVar
+
+P = ParamSpec("P")
+S = TypeVar("S")
+R = TypeVar("R")
+
+
+def factory(settings: Callable[P, S], make: Callable[[S], R]) -> Callable[P, R]:
+    """Return a function with the arguments of a dataclass, for editors and settings.
+
+    Args:
+        settings: a dataclass, which checks its fields in `__post_init__`.
+        make: (object of it) -> what the function returns.
+    """
+
+    @functools.wraps(settings, updated=())
+    def build(*args: P.args, **options: P.kwargs) -> R:
+        return make(settings(*args, **options))
+
+    # `wraps` copies the annotations of the class itself, not those it inherits.
+    hints = typing.get_type_hints(settings, include_extras=True)
+    build.__annotations__ = hints
+    return build
