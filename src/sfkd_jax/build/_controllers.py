@@ -26,20 +26,16 @@ class Planner(NamedTuple):
     """A planner, and whose arguments are its settings.
 
     Attributes:
-        factories: their keyword-only arguments are the settings `controller.NAME`.
+        factory: its keyword-only arguments are the settings `controller.NAME`.
         given: of these arguments, those that are decided elsewhere.
         samples: whether it searches around a law (`controller.sampling`).
     """
 
-    factories: tuple[Callable[..., Controller], ...]
+    factory: Callable[..., Controller]
     given: tuple[str, ...] = ()
     samples: bool = True
 
 
-_IN_PROGRAMS = ("several", "info_level", "sharding", "unroll")
-"""Of programs that build their own planner."""
-_WEIGHTS = ("effective_samples", "temperature")
-"""Of the weighted mean, which only MPPI takes."""
 _COST = (
     "lateral",
     "course",
@@ -50,14 +46,16 @@ _COST = (
 )
 """Of the cost, which all planners share."""
 PLANNERS = {
-    "mppi": Planner((control.mppi, control.planner), _IN_PROGRAMS),
-    "cem": Planner((control.cem, control.planner), (*_IN_PROGRAMS, *_WEIGHTS)),
-    "gradient": Planner(
-        (control.gradient_planner, control.planner), (*_IN_PROGRAMS, *_WEIGHTS)
-    ),
-    "koopman_mpc": Planner((control.koopman_mpc,), _COST, samples=False),
+    "mppi": Planner(control.mppi),
+    "cem": Planner(control.cem),
+    "gradient": Planner(control.gradient_planner),
+    "koopman_mpc": Planner(control.koopman_mpc, given=_COST, samples=False),
 }
-"""Planners by the name under which a controller's settings hold their own."""
+"""Planners by the name under which a controller's settings hold their own. A new one is
+an entry here and a file in `conf/controller`.
+"""
+_IN_PROGRAMS = ("several", "info_level", "sharding", "unroll")
+"""Arguments of planners for programs that build their own."""
 _BY_PLANT = (
     "dt",
     "wheelbase",
@@ -136,9 +134,9 @@ class SearchSettings(ControllerSettings):
 
 def _controller_schema(name: str, planner: Planner) -> type:
     """One dataclass a planner: its own settings, and those of what is around it."""
-    skip, given = (*_BY_PLANT, *planner.given), _BY_PLANT
+    skip, given = (*_BY_PLANT, *_IN_PROGRAMS, *planner.given), _BY_PLANT
     parts: dict[str, Any] = {
-        name: schema("Planner", None, *planner.factories, skip=skip, entries=_CHANNELS),
+        name: schema("Planner", None, planner.factory, skip=skip, entries=_CHANNELS),
         "cost": schema("Cost", None, control.tracking_cost, skip=given),
     }
     # A quadratic program has no rate limits and no latent states in its task.
@@ -299,8 +297,8 @@ def _searching(
             ancillary=model_law if settings.ancillary else None,
             **arguments(settings.task, control.path_tracking),
         )
-    factories = PLANNERS[settings.planner].factories
-    return factories[0](task, **box, **arguments(settings.own, *factories))
+    factory = PLANNERS[settings.planner].factory
+    return factory(task, **box, **arguments(settings.own, factory))
 
 
 def _koopman_mpc(
