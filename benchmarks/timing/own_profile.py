@@ -13,7 +13,7 @@ import jax.numpy as jnp
 from benchmarks import harness
 from benchmarks.timing import own_model
 from sfkd_jax import control
-from sfkd_jax.control.planners._rollouts import rollout_function
+from sfkd_jax.control.planners._rollouts import Rollouts
 
 SMALL = "[2]"
 
@@ -42,7 +42,7 @@ def rollouts_of(task):
 
     @jax.jit
     def roll_out(setup, plans):
-        rollouts = rollout_function(task, tuning, setup, several=False, unroll=2)(plans)
+        rollouts = Rollouts(task, tuning, setup)(plans)
         return rollouts.costs, rollouts.states[-1]
 
     return roll_out

@@ -1,4 +1,4 @@
-"""The search for a planner's settings over a batch of tasks, and all candidates."""
+"""The search for a planner's settings over a batch of tasks."""
 
 import jax
 import jax.numpy as jnp
@@ -84,45 +84,3 @@ def test_what_cannot_be_searched_is_one_line(wrong):
         control.autotune(
             planner(), lambda s, t: 0.0, STARTS, key=jax.random.key(0), **wrong
         )
-
-
-@pytest.mark.parametrize(
-    "build",
-    [
-        planner,
-        lambda **more: control.cem(
-            TASK, num_samples=64, elites=8, horizon=HORIZON, noise_std=(0.5,), **more
-        ),
-        lambda **more: control.gradient_planner(
-            TASK, horizon=HORIZON, noise_std=(0.5,), **more
-        ),
-    ],
-)
-def test_candidates_are_reported_on_request_and_explain_the_plan(build):
-    """Their weighted mean is the plan that is rolled out, and their states follow from
-    their controls.
-    """
-    controller = build(info_level="samples")
-    state, x = controller.init(jax.random.key(1)), jnp.asarray([1.0])
-    _, _, info = jax.jit(controller.act)({}, state, x, NOTHING, ())
-    weights, plans = info["sample_weights"], info["sample_plans"]
-    assert float(jnp.sum(weights)) == pytest.approx(1.0, rel=1e-5)
-    np.testing.assert_allclose(
-        x + jnp.cumsum(plans, axis=0), info["sample_states"], atol=1e-5
-    )
-    np.testing.assert_allclose(
-        jnp.sum(info["sample_states"] ** 2, axis=(0, 2)),
-        info["sample_costs"],
-        rtol=1e-4,
-    )
-    mean = jnp.einsum("m,tmc->tc", weights, plans)
-    np.testing.assert_allclose(
-        x + jnp.cumsum(mean, axis=0), info["predicted_states"], atol=1e-5
-    )
-    plain = build()
-    assert "sample_costs" not in plain.act({}, state, x, NOTHING, ())[2]
-
-
-def test_another_level_is_refused_with_the_choices():
-    with pytest.raises(ValueError, match="must be one of plan, samples, got 'all'"):
-        planner(info_level="all")

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from helpers import jit
 
-from sfkd_jax.control import box_qp
+from sfkd_jax.control.planners._koopman_mpc import box_qp
 
 SIZE = 24
 

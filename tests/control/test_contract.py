@@ -66,20 +66,16 @@ def mppi(law, **settings):
 def registered(name):
     """A planner as it is registered, with small settings and slew limits."""
     planner = build.PLANNERS[name]
-    known = {
-        argument
-        for factory in planner.factories
-        for argument in signature(factory).parameters
-    }
+    known = signature(planner.factory).parameters
     settings = {
+        "name": name,
         "planner": name,
         name: {key: value for key, value in SMALL.items() if key in known},
-        "sampling": "feedback",
-        "ancillary": False,
-        "feedback": {},
-        "cost": {},
-        "task": {"terminal_weight": 1.0, "control_rate": (0.5, 20.0)},
+        "task": {"terminal_weight": 1.0},
     }
+    if planner.samples:
+        settings |= {"sampling": "feedback"}
+        settings["task"] |= {"control_rate": (0.5, 20.0)}
     model, params = model_and_params("nominal" if planner.samples else "koopman_mpc")
     return build.build_controller(settings, model, PLANT, **BOX), params
 
@@ -191,9 +187,6 @@ DETERMINISTIC = ("gradient", "koopman_mpc")
 """Those whose plan does not depend on the key."""
 
 every = pytest.mark.parametrize("name", BUILDERS)
-every_but_mppi = pytest.mark.parametrize(
-    "name", [name for name in BUILDERS if name != "mppi"]
-)
 every_sampling = pytest.mark.parametrize(
     "name", [name for name in BUILDERS if name not in DETERMINISTIC]
 )
@@ -306,7 +299,7 @@ def test_an_input_that_is_not_finite_is_reported_and_the_next_clean_step_recover
     assert np.all(np.isfinite(np.asarray(info["predicted_states"])[:7][healthy]))
 
 
-@every_but_mppi
+@every
 def test_compiling_does_not_change_the_action(name):
     controller, params, _, _ = compiled(name)
     alone = controller.act(
@@ -317,7 +310,7 @@ def test_compiling_does_not_change_the_action(name):
     assert same(act_once(name), alone, rtol=1e-4, atol=1e-5)
 
 
-@every_but_mppi
+@every
 def test_a_batch_of_controllers_acts_as_each_one_alone(name):
     controller, params, act, _ = compiled(name)
     inputs = [

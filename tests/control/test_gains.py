@@ -152,18 +152,6 @@ def test_gains_are_reported_on_request_alone_and_change_no_plan():
     np.testing.assert_array_equal(without[0], with_gains[0])
 
 
-@pytest.mark.parametrize(
-    "build",
-    [
-        lambda: control.mppi(LQ, noise_std=(1.0,), gain_samples=8, smoothing_window=5),
-        lambda: control.mppi(LQ, noise_std=(1.0,), gain_samples=-1),
-    ],
-)
-def test_what_has_no_gains_is_refused(build):
-    with pytest.raises(ValueError, match=r"gain_samples"):
-        build()
-
-
 @pytest.mark.parametrize("kind", [control.cem, control.gradient_planner])
 def test_a_search_without_a_temperature_is_refused(kind):
     planned = kind(LQ, horizon=6, noise_std=(1.0,), gain_samples=8)

@@ -13,6 +13,7 @@ from sfkd_jax import control, evaluation, models, plants, scenarios
 from sfkd_jax import data as datasets
 from sfkd_jax.control import StageInputs
 from sfkd_jax.control.planners import _koopman_mpc
+from sfkd_jax.control.planners._koopman_mpc import box_qp
 
 PLANT = plants.kinematic()
 LIMITS = {
@@ -103,7 +104,7 @@ def test_the_condensed_problem_is_solved_as_by_a_convex_solver(step):
     cvxpy.Problem(
         cvxpy.Minimize(0.5 * cvxpy.quad_form(x, cvxpy.psd_wrap(H)) + f @ x), bounds
     ).solve(cvxpy.CLARABEL)
-    solution = control.box_qp(
+    solution = box_qp(
         *(jnp.asarray(part, jnp.float32) for part in (H, f, low, high, start))
     )
     costs = [
@@ -121,12 +122,9 @@ def test_the_plan_before_is_a_start_that_saves_iterations():
     H, f, low, high, warm = (
         jnp.asarray(part, jnp.float32) for part in quadratic_programs()[0]
     )
-    again = control.box_qp(
-        H, f, low, high, control.box_qp(H, f, low, high, warm).primal, iterations=0
-    )
+    again = box_qp(H, f, low, high, box_qp(H, f, low, high, warm).primal, iterations=0)
     left = [
-        float(control.box_qp(H, f, low, high, warm, iterations=n).residual)
-        for n in range(3)
+        float(box_qp(H, f, low, high, warm, iterations=n).residual) for n in range(3)
     ]
     assert float(again.residual) < 1e-3 < min(left)
 
