@@ -65,6 +65,7 @@ def brax_plant(env: Env, *, parameters: tuple[str, ...] = ("gravity",)) -> BraxP
     _check(inner, parameters)
     assert isinstance(inner, PipelineEnv)
     system, coordinates = inner.sys, inner.sys.q_size()
+    # The environment acts once per several steps of the physics.
     frames = round(float(inner.dt) / float(system.opt.timestep))
 
     def step(state: State, control: Control, env: Environment) -> State:

@@ -135,6 +135,7 @@ class _HostCar(NamedTuple):
         lost = [math.nan] * len(state)
         if not (all(map(math.isfinite, state)) and state[3] > SLOWEST):
             return lost
+        # In double precision: a wheel settles a hundred times faster than dt.
         flow = self.rates(control, env)
         start = np.asarray(to_commonroad(self.equations, state, self.car))
 

@@ -118,6 +118,7 @@ class GymnasiumVehicle(gymnasium.Env):
             return None
         if self._view is None:
             raise gymnasium.error.ResetNeeded("call reset before render")
+        # A window is drawn in `step`, as gymnasium asks for.
         if self.render_mode == "human":
             return None
         self._draw(self._view)

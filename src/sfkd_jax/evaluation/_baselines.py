@@ -75,6 +75,7 @@ def baselines(
         ),
         "kinematic_bicycle": partial(_simulate, nominal),
     }
+    # Controls along a path are perturbations of a law: no bicycle explains them.
     if not along_path:
         fitted = bicycle_step(fit_bicycle(train, dt=dt), dt=dt)
         predictors["fitted_bicycle"] = partial(_simulate, fitted)
@@ -94,9 +95,11 @@ def fit_bicycle(train: Trajectory, *, dt: float) -> FittedBicycle:
     states = np.asarray(train.states, dtype=np.float64)[..., :4]
     before, after = (part.reshape(-1, 4) for part in (states[:, :-1], states[:, 1:]))
     controls = np.asarray(train.controls, dtype=np.float64).reshape(-1, 2)
+    # Logs may hold a steering command in other units than radians.
     is_angle = bool(np.abs(controls[:, 0]).max() < STEEP)
     steering = np.tan(controls[:, 0]) if is_angle else controls[:, 0]
     ones, speed = np.ones(len(before)), 0.5 * (before[:, 3] + after[:, 3])
+    # A step turns by less than half a turn, so the difference is wrapped.
     turned = np.mod(after[:, 2] - before[:, 2] + np.pi, 2 * np.pi) - np.pi
     course = before[:, 2] + 0.5 * turned
     moved = after[:, :2] - before[:, :2]

@@ -87,6 +87,7 @@ def simulate(
             not used; () for none.
         record: more signals of every step, by name, besides those of the metrics.
     """
+    # Sensors have their own stream: two systems meet the same noise.
     planner_key, noise_key = jax.random.split(key)
     wanted = SIGNALS | dict(record or {})
     spread = _noise_levels(observation_noise, scenario.initial_state)
@@ -97,6 +98,7 @@ def simulate(
     ) -> tuple[Any, Any]:
         state, progress, memory = carry
         env, observed_env, sensor_key = inputs
+        # Noise reaches the controller, never the truth or the scores.
         observation = state + spread * jax.random.normal(sensor_key, state.shape)
         reference = reference_window(
             scenario.path, progress, scenario.speed, dt=dt, horizon=horizon
@@ -105,6 +107,7 @@ def simulate(
             params, memory, observation, observed_env, reference
         )
         state = plant(state, control, env)
+        # The guess moves on at the reference speed, so a loop does not catch it.
         progress, lateral = project(
             scenario.path, state[:2], progress + scenario.speed * dt
         )

@@ -183,6 +183,7 @@ def attack_corridor(
 def _drive(roads: _Roads, genes: dict[str, Array], *, length: int, held: int) -> Drives:
     """Inputs of one drive from its genes."""
     nu = (
+        # Saturates: the worst ν are mostly at the limits.
         jnp.repeat(jnp.tanh(2.0 * genes["nu"]), BLOCK, axis=0)[:length]
         * roads.perturbation
     )
@@ -192,6 +193,7 @@ def _drive(roads: _Roads, genes: dict[str, Array], *, length: int, held: int) ->
     speed = roads.speed[0] + (roads.speed[1] - roads.speed[0]) * fast
     shortest, longest = roads.wavelengths
     wavelength = shortest + (longest - shortest) * wave
+    # Fast roads are gentle, as in the conditions of the corridor.
     peak = jnp.minimum(roads.peak_curvature, roads.lateral_acceleration / speed**2)
     along = jnp.arange(length) * speed * roads.dt
     bend = jnp.clip(
@@ -231,6 +233,7 @@ def _generation(
     best = order[: max(2, int(ELITE * search.population))]
     elite = jax.tree.map(lambda leaf: leaf[best], genes)
     mean = jax.tree.map(lambda leaf: jnp.mean(leaf, axis=0), elite)
+    # A floor under the spread: a search that has converged stops finding.
     spread = jax.tree.map(lambda leaf: jnp.std(leaf, axis=0) + 0.1, elite)
     worst = best[: search.keep]
     return (mean, spread), jax.tree.map(lambda leaf: leaf[worst], (drives, outcome))
@@ -239,6 +242,7 @@ def _generation(
 def _score(aim: str, outcome: Outcome, tube: Tube) -> Array:
     """What an aim maximises; drives outside the hypothesis rank last for "within"."""
     if aim == "within":
+        # Outside the hypothesis nothing is claimed; nearer to it ranks higher.
         return jnp.where(
             outcome.radius <= tube.bound, outcome.distance, -outcome.radius
         )

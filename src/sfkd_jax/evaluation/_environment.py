@@ -44,11 +44,13 @@ def observed_environment(
         bias: of the same.
     """
     steps = round(delay_s / dt)
+    # Until something arrives, a sensor shows what it showed before the start.
     delayed = jnp.concatenate([jnp.tile(envs[:1], (steps, 1)), envs])[: envs.shape[0]]
     white = jnp.asarray(noise) * jax.random.normal(
         jax.random.fold_in(key, SENSOR_STREAM), envs.shape
     )
     observed = delayed + jnp.asarray(bias) + white
+    # A perfect sensor passes e on as it is, bit for bit, and below 0.05 too.
     faulty = steps or any(noise) or any(bias)
     return observed.at[:, 0].max(LEAST_FRICTION) if faulty else envs
 

@@ -92,6 +92,7 @@ def _world_gaps(
     predicted: Float[Array, "horizon state"], true: Float[Array, "horizon state"]
 ) -> Float[Array, "horizon 4"]:
     """Errors along and across the true heading, of yaw and of speed."""
+    # In the true heading, so that along and across mean the same everywhere.
     position = jax.vmap(rotate)(-true[:, 2], predicted[:, :2] - true[:, :2])
     yaw = wrap_angle(predicted[:, 2] - true[:, 2])
     return jnp.column_stack([position, yaw, predicted[:, 3] - true[:, 3]])

@@ -134,12 +134,14 @@ def compare(rows: list[dict[str, Any]], *, missing: int = 0) -> list[dict[str, A
     """
     for entry in rows:
         same = [other for other in rows if _episodes(other) == _episodes(entry)]
+        # Of several rows of a system, the one that searches like this row.
         same.sort(key=lambda other, entry=entry: _search(other) != _search(entry))
         for systems, name, measure in _COMPARISONS:
             other = next((other for other in same if other["system"] in systems), None)
             if other is None or (systems == _SFKD and other is entry):
                 continue
             entry[name] = measure(_by_seed(entry), _by_seed(other))
+    # One family: every difference that a reader could pick from the table.
     family = [entry["difference_to_sfkd"] for entry in rows if _has_p(entry)]
     adjusted = holm([one["p"] for one in family], not_made=missing)
     for record, p in zip(family, adjusted, strict=True):
@@ -210,6 +212,7 @@ def _mean(values: list[Any]) -> Any:
     A leaf that is not a number stays where all agree and is None otherwise.
     """
     first = values[0]
+    # A mean over some of the seeds would not be that of the row.
     if any(value is None for value in values):
         return None
     if isinstance(first, dict):

@@ -103,6 +103,7 @@ def p_value(values: Float[np.ndarray, "*seed episode"]) -> float | None:
     spread = _spread(values)
     if spread is None or not np.isfinite([spread.mean, spread.error]).all():
         return None
+    # All values equal: either exactly the same, or told apart without doubt.
     if spread.error == 0.0:
         return 0.0 if spread.mean else 1.0
     t = abs(spread.mean) / spread.error
@@ -130,6 +131,7 @@ def holm(p_values: list[float], *, not_made: int = 0) -> list[float]:
     """
     order = np.argsort(p_values)
     factors = not_made + np.arange(len(p_values), 0, -1)
+    # Adjusted p-values keep the order of the raw ones.
     raised = np.maximum.accumulate(np.asarray(p_values)[order] * factors)
     adjusted = np.empty(len(p_values))
     adjusted[order] = np.minimum(raised, 1.0)
@@ -163,6 +165,7 @@ def paired_difference(
     """
     both = [np.atleast_2d(np.asarray(part)) for part in (values, reference)]
     count = min(len(part) for part in both)
+    # Pairs by the order of seeds; a single training is compared with every other.
     first, second = (part[:count] if count > 1 else part for part in both)
     difference = first - second
     mean, interval = mean_interval(difference)
@@ -176,12 +179,14 @@ def _spread(values: Float[np.ndarray, "*seed episode"]) -> Spread | None:
     mean = float(np.mean(table))
     if table.size == 1:
         return None
+    # One training says nothing about others: this is the t of episodes alone.
     if min(trainings, episodes) == 1:
         error = float(np.std(table, ddof=1) / np.sqrt(table.size))
         freedom = table.size - 1
         return Spread(mean, error, float(episodes == 1), (freedom, freedom))
     freedom = trainings - 1, episodes - 1
     of_trainings, of_episodes, of_rest = mean_squares(table)
+    # An estimate of a variance may be negative; the larger parts bound it from below.
     total = max(of_trainings + of_episodes - of_rest, of_trainings, of_episodes)
     share = max(of_trainings - of_rest, 0.0) / total if total > 0 else 0.0
     return Spread(mean, float(np.sqrt(total / table.size)), float(share), freedom)

@@ -111,6 +111,7 @@ def tube_violations(
     NaN counts as outside.
     """
     radii = np.stack([np.asarray(tube[kind]) for kind in KINDS], axis=1)
+    # NaN compares false, so it counts as outside.
     inside = np.all(np.asarray(errors) <= radii, axis=(1, 2, 3))
     return int(np.sum(~inside)), len(inside)
 
@@ -125,8 +126,10 @@ def theorem_violations(
 
     The theorem excludes such steps.
     """
+    # The theorem speaks of the steps before the first defect above d̄ only.
     applies = np.logical_and.accumulate(np.asarray(defects) <= d_bar, axis=2)
     relative, absolute = ROUNDING
+    # Negated, so that NaN counts as beyond.
     beyond = ~(
         np.asarray(latent_errors) <= np.asarray(latent) * (1 + relative) + absolute
     )
@@ -175,6 +178,7 @@ def violations(predicted: Predictions | None, claims: ClaimedBounds) -> dict[str
         name: tube and float(np.mean(tube["position_m"]))
         for name, tube in tubes.items()
     }
+    # A proved tube comes first; a measured one stands in where there is none.
     kind = next((name for name, tube in tubes.items() if tube), None)
     claimed = (
         predicted and predicted.latent_errors,

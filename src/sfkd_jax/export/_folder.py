@@ -61,6 +61,7 @@ def write_controller(
             f"export.platforms must be some of {', '.join(PLATFORMS)}, "
             f"got {list(platforms)}"
         )
+    # Everything that can refuse comes before the first file is written.
     flat = flat_programs(trained)
     programs = {name: getattr(flat, name) for name in FILES}
     modules = {
@@ -72,6 +73,7 @@ def write_controller(
         name: lower(program.function, program, platforms)
         for name, program in programs.items()
     }
+    # First the manifest goes: a folder half written is none.
     for stale in (MANIFEST, CERTIFICATE, *(f"{stem}.vmfb" for stem in FILES.values())):
         (folder / stale).unlink(missing_ok=True)
     stored = policy.save(

@@ -80,6 +80,7 @@ def flat_programs(policy: Policy) -> Programs:
     key, state, *measured = example_inputs(policy)
     implementation = str(jax.random.key_impl(jax.random.key(0)))
     wrap = partial(jax.random.wrap_key_data, impl=implementation)
+    # Flat and named: other programs know neither pytrees nor keys.
     template, structure = jax.tree.flatten(state)
 
     def init(key_data: Array) -> tuple[Array, ...]:

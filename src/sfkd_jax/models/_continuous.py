@@ -91,6 +91,7 @@ def continuous(
             f"model.solver must be one of {', '.join(SOLVERS)}, got {solver!r}"
         )
     pose = has_pose(frame)
+    # Known dynamics bring their own mean motion; learned rates start from the data's.
     drift = jnp.asarray(space.increment_mean) if known is None else jnp.zeros(3)
 
     def scaled_fiber(params: Params, env: Environment) -> Fiber:
@@ -100,7 +101,9 @@ def continuous(
         rate = rates(at, scaled_body(space, state), scaled_control(space, control))
         if not pose:
             return jnp.concatenate([jnp.zeros(3), space.body_scale * rate[3:]])
+        # Increments over dt are the units in which the data are of size 1.
         twist = (drift + space.increment_scale * rate[:3]) / dt
+        # Rates in the body frame, turned at every stage: equivariant to all orders.
         change = jnp.concatenate(
             [rotate(state[2], twist[:2]), twist[2:], space.body_scale * rate[3:]]
         )
@@ -125,6 +128,7 @@ def _solver_step(
 ) -> State:
     """One step of RK4 or Euler, control and environment held."""
     k1 = derivative(state)
+    # What the authors of ICODE use; with learned increments it loses nothing.
     if solver == "euler":
         return state + dt * k1
     k2 = derivative(state + 0.5 * dt * k1)
@@ -153,6 +157,7 @@ def mlp(
         for width, σ in zip(hidden, activations, strict=True)
         for part in (nn.Dense(width), σ)
     ]
+    # Near 0 at the start: an untrained model stands still instead of diverging.
     small = nn.initializers.variance_scaling(last**2, "fan_in", "truncated_normal")
     return nn.Sequential([*layers, nn.Dense(outputs, kernel_init=small)])
 

@@ -146,6 +146,7 @@ def control_synth(
     def rates(
         fiber: ControlSynthFiber, body: Float[Array, " body"], control: Control
     ) -> Float[Array, " rates"]:
+        # Inputs are only added, or the contraction would depend on them.
         read = jnp.concatenate([control, fiber.env])
         added = cast(jax.Array, inputs.apply({"params": fiber.inputs}, read))
         return jnp.concatenate([fiber.twist(body), fiber.change(body)]) + added
@@ -195,13 +196,16 @@ def contracting(free: Params, rate: float, declared: Declared) -> Incremental:
     entries = jnp.tanh(free["T"])  # so that the metric stays well conditioned
     T = jnp.tril(entries, -1) + jnp.diag(jnp.exp(jnp.diag(entries)))
     T_inverse, P = jnp.linalg.inv(T), T.T @ T
+    # Multipliers as exponentials: positive without a constraint.
     roots = GAIN * hidden**-0.5 * jnp.exp(0.5 * free["log_multipliers"])
     B, W = hidden**-0.5 * free["B"], GAIN * hidden**-0.5 * free["W"]
     A = B - W.T
     linear = free["Y"] - free["Y"].T - 0.25 * B @ B.T - 0.5 * free["X"] @ free["X"].T
     norms = jnp.stack([jnp.linalg.norm(part) for part in (linear, A, W)])
+    # How much rounding may disturb the inequality, from norms alone.
     size = rate + jnp.sum(norms) + jnp.sum(norms[1:] ** 2)
     slack = ROUNDING * jnp.sum(T**2) * jnp.sum(T_inverse**2) * size
+    # The margin is no design variable: gradients through it only add noise.
     linear -= (rate + jax.lax.stop_gradient(slack)) * jnp.eye(body)
     return Incremental(
         linear=T_inverse @ linear @ T,

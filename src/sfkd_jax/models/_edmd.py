@@ -145,6 +145,7 @@ class Lift:
         states, inputs, bend, rest = jnp.split(
             linear, (self.size - 1, self.columns - 2, self.columns - 1), axis=1
         )
+        # No column for the progress: where on the path a car is does not matter.
         A = jnp.concatenate([jnp.zeros((self.rank, 1)), states, of_functions.T], axis=1)
         B = inputs / self.space.control_scale
         c = rest[:, 0] - B @ self.space.control_mean
@@ -162,6 +163,7 @@ def thin_plate(
 ) -> Float[Array, " function"]:
     """Return r² log r of the distances r to every centre; 0 at r = 0."""
     squares = jnp.sum((point - centres) ** 2, axis=1)
+    # Both branches need a finite logarithm, or the gradient at a centre is NaN.
     positive = squares > 0
     return jnp.where(
         positive, 0.5 * squares * jnp.log(jnp.where(positive, squares, 1.0)), 0.0
@@ -217,6 +219,7 @@ def identify(
             )
         )
 
+    # By free prediction over a horizon, which is what a controller uses.
     errors = jax.lax.map(error, fits)
     return {
         "centres": centres,
@@ -246,6 +249,7 @@ def _pairs(
     ends = jnp.stack([train.states[:, :-1], train.states[:, 1:]], axis=2).reshape(
         -1, 2, lift.size
     )
+    # Drawn over all runs: neighbours in time are nearly the same pair.
     chosen = jax.random.permutation(choice_key, ends.shape[0])[:most]
     controls, envs = (
         leaf.reshape(ends.shape[0], -1)[chosen] for leaf in (train.controls, train.envs)
@@ -268,6 +272,7 @@ def _prediction_error(
     """Mean square error of a prediction relative to a circle close to the window."""
     steps = jnp.hypot(*jnp.diff(window.states[:, :2], axis=0).T)
     turned = jax.vmap(between)(window.states[:-1, POSE], window.states[1:, POSE])[:, 2]
+    # The circle that the car really drove; a controller sees paths close to it.
     bend = jnp.sum(turned) / jnp.maximum(jnp.sum(steps), 1.0)
     kappa = jnp.clip(bend + change, -lift.curvature_range, lift.curvature_range)
     paths = along_circle(window.states, offset, kappa)
@@ -301,6 +306,7 @@ def along_circle(
         (s, e_y, e_ψ, body state) at every time: exact, and finite up to the centre of
         the circle.
     """
+    # A straight path is a circle so large that float32 sees no difference.
     kappa = jnp.where(jnp.abs(curvature) < STRAIGHT, STRAIGHT, curvature)
     tangent = states[0, POSE].at[2].add(-offset[1])
     foot = compose(tangent, jnp.stack([jnp.zeros(()), -offset[0], jnp.zeros(())]))
@@ -346,7 +352,9 @@ def _factorised(
 ) -> tuple[Float[Array, "rows columns"], Float[Array, " p"]]:
     """The first p rows, at most, of R in [X D⁻¹, Y] = Q R, and the diagonal of D."""
     spread = jnp.sqrt(jnp.mean(inputs**2, axis=0))
+    # A column of zeros has no unit; any will do.
     spread = jnp.where(spread > 0, spread, 1.0)
+    # Not X'X, whose condition is the square of that of X.
     triangle = jnp.linalg.qr(
         jnp.concatenate([inputs / spread, targets], axis=1), mode="r"
     )

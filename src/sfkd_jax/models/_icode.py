@@ -73,6 +73,7 @@ def affine_rates(
         "control": jnp.zeros_like(space.control_mean),
         "env": jnp.zeros_like(space.env_mean),
     }
+    # Only what enters affinely is multiplied by G; the rest is read by both networks.
     driving = ("control", "env") if affine_in == "both" else (affine_in,)
     reading = tuple(name for name in zeros if name not in driving)
 
@@ -82,6 +83,7 @@ def affine_rates(
     start = joined(reading, zeros)
     inputs = joined(driving, zeros).shape[0]
     outputs = 3 + space.body_mean.shape[0]
+    # Two networks, as published, rather than one with two heads.
     f = mlp(hidden, outputs, activations, last=last)
     G = mlp(hidden, outputs * inputs, activations, last=last)
 
@@ -196,6 +198,7 @@ def icode_mppi(
     )
 
     def known(fiber: Conditioned, state: State, control: Control) -> State:
+        # Back in physical units: the known dynamics know no scales.
         return nominal(state, control, space.env_mean + space.env_scale * fiber.env)
 
     return continuous(

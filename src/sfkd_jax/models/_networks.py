@@ -102,8 +102,10 @@ class Sandwich(nn.Module):
         sizes = (self.inputs, *self.hidden, self.outputs)
         spread = nn.initializers.lecun_normal()
         matrices, multipliers = [], []
+        # `left` carries A_{k-1}' Ψ_{k-1} on; √γ goes in at either end.
         left = jnp.sqrt(gamma) * jnp.eye(self.inputs)
         for k, (before, after) in enumerate(pairwise(sizes)):
+            # Where the Cayley transform is orthogonal in float32, see CAYLEY_RANGE.
             square = bounded(
                 self.param(f"square_{k}", spread, (after, after)), CAYLEY_RANGE
             )
@@ -111,6 +113,7 @@ class Sandwich(nn.Module):
                 self.param(f"tall_{k}", spread, (before, after)), CAYLEY_RANGE
             )
             A, B = cayley(square, tall)
+            # The last layer has no slope after it, so no Ψ and no factor √2.
             if k == len(self.hidden):
                 matrices.append(jnp.sqrt(gamma) * B @ left)
                 break
@@ -170,6 +173,7 @@ class Encoder(nn.Module):
         self, body: Float[Array, " inputs"], embedding: Float[Array, " embedding"]
     ) -> Array:
         """Return z before rotation, shape (rank,)."""
+        # e enters through its embedding, so that the lift may differ by environment.
         hidden = nn.tanh(nn.Dense(self.hidden)(jnp.concatenate([body, embedding])))
         z = nn.Dense(self.rank)(hidden)
         return z + nn.Dense(self.rank, use_bias=False)(body) if self.linear else z
@@ -190,6 +194,7 @@ def gram_bound(
     """
     scale = _frobenius(matrix)
     gram = matrix / scale
+    # Scales are kept as logarithms: a norm to the power 2^k leaves float32.
     log_norm = jnp.log(scale)
     power = 1.0
     for _ in range(iterations):
@@ -208,6 +213,7 @@ def bounded(
 
     A matrix with a Gram bound below ρ is returned as it is, up to the margin.
     """
+    # Both margins: the bound is above the norm, and the result below ρ, once rounded.
     norm = gram_bound(matrix) * (1.0 + FLOAT32_MARGIN)
     return matrix * (bound * (1.0 - FLOAT32_MARGIN) / jnp.maximum(bound, norm))
 
@@ -266,4 +272,5 @@ def scaled_env(space: Space, env: Environment, environment: bool) -> Environment
     Inside the box E every entry lies in [-1, 1].
     """
     scaled = (env - space.env_mean) / space.env_scale
+    # Zeros, not nothing: the blind ablation has networks of the same size.
     return scaled if environment else jnp.zeros_like(scaled)

@@ -45,9 +45,11 @@ def own(
             returns a state of another shape.
     """
     function = imported(factory, SETTING)
+    # Somebody else's code may raise anything; a command prints one line.
     with _one_line(factory):
         takes = inspect.signature(function).parameters
         offered = {"dt": dt, "nominal": nominal, "environment": environment}
+        # Only what it asks for: a factory need not know our names.
         given = {name: value for name, value in offered.items() if name in takes}
         model = function(space, **given, **(options or {}))
     if not isinstance(model, Model):
@@ -57,6 +59,7 @@ def own(
         )
     with _one_line(factory):
         _check_shapes(model, space)
+    # A factory that does not know the switch is made blind from outside.
     if environment or "environment" in takes:
         return model
 

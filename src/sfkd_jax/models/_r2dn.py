@@ -156,7 +156,9 @@ def contracting(
 
     [Ã B̃₁; C̃₁ 0] = [A B₁; C₁ 0] / max(1, Gram bound of [A B₁; C₁ 0]).
     """
+    # No direct term: φ may not feed its own input within a step.
     zeros = jnp.zeros((C1.shape[0], B1.shape[1]))
+    # One bound for the whole block is less conservative than one for each part.
     block = bounded(jnp.block([[A, B1], [C1, zeros]]), 1.0)
     rows, columns = A.shape
     return (
@@ -314,9 +316,11 @@ class _R2dn:
         """Advance z and the pose by one sampling period."""
         space = self.space
         u = scaled_control(space, control)
+        # The feedback holds C₁, φ and B₁ as one network, as it is certified.
         z = fiber.A @ latent.z + apply(
             fiber.feedback, fiber.feedback_biases.at(u), latent.z
         )
+        # Path coordinates have no pose; the entry stays what it was.
         if not self.weights.pose:
             return PosedLatent(latent.pose, z)
         motion = apply(fiber.decoder, fiber.decoder_biases.at(u), latent.z)
@@ -340,6 +344,7 @@ class _R2dn:
     def explicit(self, params: Params) -> Explicit:
         """Return the weights that a certificate is about."""
         shared, space = self.shared(params), self.space
+        # In physical units, as for SFKD.
         decoder = shared.decoder.matrices
         if self.weights.pose:
             decoder = (

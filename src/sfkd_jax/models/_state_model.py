@@ -56,6 +56,7 @@ def state_model(
 
     def encode(fiber: Fiber, state: State) -> State:
         del fiber
+        # Broadcasting would accept a state of another plant silently.
         if state_size is not None and state.shape != (state_size,):
             raise ValueError(
                 f"state must have shape ({state_size},), got {state.shape}"

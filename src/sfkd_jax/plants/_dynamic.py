@@ -88,7 +88,9 @@ def dynamic(
         grip = env[0] * GRAVITY
         cos, sin = jnp.cos(steering), jnp.sin(steering)
         drive = _acceleration(control, speed, grip)
+        # Load moves to the front under braking, which turns a sliding car in.
         front_mass = mass * (rear_length - height * drive / GRAVITY) / length
+        # What driving and braking use of the friction circle is missing for turning.
         lateral_grip = jnp.sqrt(grip**2 - drive**2)
         wind = _rolling(speed, creep_speed) * side_force(env[1], wind_force=wind_force)
 

@@ -71,7 +71,9 @@ def equivalent_wind(
         force: F [N].
         wind_force: c_w [N s²/m²].
     """
+    # Forces add, winds do not: the law is a signed square.
     total = side_force(wind, wind_force=wind_force) + force
+    # Exactly the same wind without a force, so that not a bit of an episode changes.
     return jnp.where(
         force == 0.0, wind, jnp.sign(total) * jnp.sqrt(jnp.abs(total) / wind_force)
     )
@@ -84,6 +86,7 @@ def resistance(
 
     ρ C_d A v²/(2m) + c_rr g tanh(v / 0.2 m/s)
     """
+    # The tanh makes rolling resistance vanish smoothly at rest.
     return drag * speed**2 / mass + rolling * GRAVITY * jnp.tanh(speed / 0.2)
 
 
@@ -143,6 +146,7 @@ def forward_rk4(derivative: Step, *, dt: float, substeps: int = 1) -> Step:
     """
 
     def forwards(state: State) -> State:
+        # Brakes stop a car; they do not reverse it.
         return jnp.where((jnp.arange(state.shape[0]) == 3) & (state < 0.0), 0.0, state)
 
     def held(state: State, control: Control, env: Environment) -> State:
@@ -177,6 +181,7 @@ def with_speed_loop(vehicle: Vehicle, *, gain: float = 1.0) -> Vehicle:
 
     def close(step: Step) -> Step:
         def closed(state: State, control: Control, env: Environment) -> State:
+            # Within the limits of the actuator: the loop asks for what it can give.
             acceleration = jnp.clip(gain * (control[1] - state[3]), low, high)
             return step(state, control.at[1].set(acceleration), env)
 
@@ -217,6 +222,7 @@ def along_path(
         raise ValueError(
             "a path-following loop needs vehicle.control_low and vehicle.control_high"
         )
+    # The loop clips what the law and ν ask for together, as the car does.
     limits = (vehicle.control_low, vehicle.control_high)
     step = closed_loop(vehicle.step, law, *limits)
 

@@ -71,6 +71,7 @@ def wet_road(
     high = jax.random.uniform(before_key, (), minval=before[0], maxval=before[1])
     low = jax.random.uniform(after_key, (), minval=after[0], maxval=after[1])
     when = jax.random.uniform(time_key, (), minval=drop_time[0], maxval=drop_time[1])
+    # A hair early: k dt may round to just below the time of the drop.
     friction = jnp.where(jnp.arange(steps) * dt < when - 1e-6, high, low)
     return jnp.stack(
         [friction, gusts(gust_key, steps=steps, dt=dt, peak=peak_wind)], axis=1
@@ -90,6 +91,7 @@ def switching_road(key: Key, *, steps: int, dt: float, period: float = 3.0) -> S
     sides = jax.random.rademacher(key, (visits,), dtype=float)
     levels = jnp.asarray(SWITCH_LEVELS)[jnp.arange(visits) % len(SWITCH_LEVELS)]
     levels = levels.at[:, 1].multiply(sides)
+    # The same hair, so that a period has the same number of steps each time.
     visit = jnp.floor(jnp.arange(steps) * dt / period + 1e-6).astype(int)
     return levels[visit]
 
@@ -107,6 +109,7 @@ def random_side_forces(
         hold: duration of a level [s].
     """
     each = round(hold / dt)
+    # Shares of F: the same pushes at every size.
     levels = jax.random.uniform(key, (-(-steps // each),), minval=-1.0)
     return largest * jnp.repeat(levels, each)[:steps]
 
@@ -131,6 +134,7 @@ def gusts(
         ramp: duration of a ramp [s].
     """
     level_key, hold_key = jax.random.split(key)
+    # Enough for the shortest holds; what is beyond the end is not used.
     count = int(steps * dt / hold[0]) + 2
     levels = jax.random.uniform(level_key, (count + 1,), minval=-peak, maxval=peak)
     starts = jnp.cumsum(
@@ -192,6 +196,7 @@ def random_switching(
 
 def _from_box(key: Key, low: Corner, high: Corner) -> Float[Array, " environment"]:
     """A point of a box; each entry is at an end of its range with probability 1/3."""
+    # A wider range, clipped: the ends, where models are worst, are drawn often.
     share = jnp.clip(
         jax.random.uniform(key, (len(low),), minval=-0.25, maxval=1.25), 0.0, 1.0
     )

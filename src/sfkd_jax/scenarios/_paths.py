@@ -71,6 +71,7 @@ def smooth_path(
     curvature = jnp.sum(amplitudes * jnp.sin(2 * jnp.pi * s / waves + phases), axis=0)
     blend = jnp.clip(s / run_up, 0.0, 1.0)
     curvature = curvature * blend**2 * (3.0 - 2.0 * blend)
+    # After the blend, so that the peak is reached on the path that is driven.
     curvature = curvature * peak_curvature / jnp.max(jnp.abs(curvature))
     return path_from_curvature(curvature, spacing=spacing)
 
@@ -107,6 +108,7 @@ def path_from_curvature(curvature: Float[Array, " point"], *, spacing: float) ->
     """
     yaw_steps = 0.5 * (curvature[1:] + curvature[:-1]) * spacing
     yaw = jnp.concatenate([jnp.zeros(1), jnp.cumsum(yaw_steps)])
+    # The chord of an arc points along the yaw of its middle.
     middle = yaw[:-1] + 0.5 * yaw_steps
     x = jnp.concatenate([jnp.zeros(1), jnp.cumsum(jnp.cos(middle))]) * spacing
     y = jnp.concatenate([jnp.zeros(1), jnp.cumsum(jnp.sin(middle))]) * spacing
@@ -141,6 +143,7 @@ def path_through(points: Float[Array, "point 2"], *, spacing: float = SPACING) -
     s = jnp.arange(count) * spacing
     x, y = (jnp.interp(s, along, points[:, axis]) for axis in (0, 1))
     along_x, along_y = jnp.asarray(jnp.gradient(x)), jnp.asarray(jnp.gradient(y))
+    # Unwrapped: the curvature is its slope, which must not jump by 2π.
     yaw = jnp.unwrap(jnp.arctan2(along_y, along_x))
     curvature = jnp.asarray(jnp.gradient(yaw)) / spacing
     return Path(jnp.stack([x, y, yaw, curvature], axis=1), jnp.asarray(spacing))
@@ -171,9 +174,11 @@ def project(
     Newton steps from `s_guess`; left of the path the distance is positive.
     """
     s = s_guess
+    # Few steps suffice, since the guess is the last foot point moved on.
     for _ in range(3):
         point = point_at(path, s)
         along, left = _offsets(point, position)
+        # Near the centre of a curve the Newton step would divide by 0.
         s = s + along / jnp.maximum(1.0 - point[3] * left, 0.2)
     return s, _offsets(point_at(path, s), position)[1]
 

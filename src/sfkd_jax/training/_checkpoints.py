@@ -47,6 +47,7 @@ class Checkpoints:
         Raises:
             OSError: it cannot be written; the previous states remain.
         """
+        # A run interrupted right after a save would write the same state again.
         if step in self._manager.all_steps():
             return
         metrics, logger = (
@@ -88,6 +89,7 @@ class Checkpoints:
         Raises:
             OSError: there are states, and none can be read.
         """
+        # From the newest on: a damaged state costs the steps since the one before.
         steps = sorted(self._manager.all_steps(), reverse=True)
         for step in steps:
             try:

@@ -96,6 +96,7 @@ def fit(
             "training.steps and save_every must be multiples of "
             f"log_every = {log_every}"
         )
+    # Batches have a stream of their own: a resumed run draws the same ones.
     init_key, data_key = jax.random.split(key)
     transform, schedule = _optimizer(steps, learning_rate, clip_norm)
     params = jax.jit(model.init)(init_key)
@@ -103,6 +104,7 @@ def fit(
     checkpoints = Checkpoints(directory / "checkpoints")
     try:
         state = checkpoints.resume(state)
+        # 0 for a new run, whose state `resume` returned as it was.
         start = int(state.step)
         log = open_log(directory / "metrics.jsonl", resumed_at=start)
         advance = _chunk(loss, transform, draw, length=log_every)

@@ -34,6 +34,7 @@ benchmark's speed.
 
 def power_mean(values: Float[Array, "*shape"], power: int = 8) -> Scalar:
     """Return (mean |x|^p)^(1/p), a smooth maximum that does not overflow in float32."""
+    # Powers of ratios at most 1; the largest value itself carries no gradient.
     largest = jax.lax.stop_gradient(jnp.max(values))
     return largest * jnp.mean((values / largest) ** power) ** (1.0 / power)
 
@@ -133,11 +134,13 @@ def multi_step_loss(
     }
 
     def loss(params: Params, batch: Trajectory) -> tuple[Scalar, dict[str, Scalar]]:
+        # The e of another window: transport is trained between unlike environments.
         others = jnp.roll(batch.envs[:, -1], 1, axis=0)
         parts = jax.vmap(window, in_axes=(None, 0, 0))(params, batch, others)
         gaps = parts.pop("gap", None)
         parts = {name: jnp.mean(part) for name, part in parts.items()}
         start = jnp.zeros(())
+        # After the mean over windows: a tube belongs to the batch, not to one of them.
         if gaps is not None:
             radii = _tube_radii(model, params, gaps, len(tube))
             start = jnp.sum(
@@ -164,9 +167,11 @@ def _window_parts(
     """The parts of the loss of one window; `other` is another window's environment."""
     predicted, _, along = rollout(model, params, data)
     errors = state_errors(predicted, data.states[1:])
+    # Errors grow about linearly; without this the far steps would decide alone.
     steps = 1.0 + growth * jnp.arange(errors.shape[0])
     weighted = (errors * units / 0.01 / steps[:, None]) ** 2
     gap, single = defects(model, params, data, along)
+    # In millimetres: a slip of one a step hides in the sums over a window.
     near = state_errors(single, data.states[1:]) * units / 0.001
     fiber = jax.tree.map(lambda leaf: leaf[0], along[0])
     there = model.fiber(params, other)
@@ -183,6 +188,7 @@ def _window_parts(
         "transport": jnp.sum(moved**2) / 1e-4,
     }
     if with_gap:
+        # Away from 0, where the root has no gradient.
         parts["gap"] = jnp.sqrt(jnp.sum(gap**2, axis=1) + 1e-16)
     if model.fitting.penalty is not None:
         parts["penalty"] = model.fitting.penalty(fiber, here, data.controls[0])

@@ -90,6 +90,7 @@ class Learned(nn.Module):
         self.mixture_head = nn.Dense(self.vertices, kernel_init=SMALL)
         self.input_head = nn.Dense(self.rank * self.control)
         self.tangent_head = nn.Dense(self.rank // 2, kernel_init=SMALL)
+        # Weights of networks do not depend on e, only biases do: one bound for all e.
         if self.kind.network is not None:
             self.residual_weights = self.kind.network(
                 self.rank, self.residual_hidden, self.rank
@@ -127,6 +128,7 @@ class Learned(nn.Module):
     def rate(self) -> Scalar:
         """Return α = ρ + β, or less if it is learned."""
         most = jnp.asarray(self.rho + self.beta)
+        # Without a joint budget α is a sum of two bounds that are given.
         if not (self.joint and self.learn_alpha):
             return most
         return LOWEST_RATE + (most - LOWEST_RATE) * nn.sigmoid(self.alpha_logit)
@@ -147,6 +149,7 @@ class Learned(nn.Module):
                 residual = self.residual_weights(self.beta)
         decoder = Weights()
         if self.pose:
+            # The decoder feeds nothing back, so that its bound may be learned.
             decoder = self.decoder_weights(jnp.exp(self.log_decoder_bound))
         return SharedWeights(
             vertices,
@@ -170,8 +173,10 @@ class Learned(nn.Module):
             )
         if self.forcing_hidden:
             forcing = self._biases(self.forcing_head(embedding), (self.forcing_hidden,))
+        # Evaluated in any case, so that the ablation has the same parameters.
         tangents = self.tangent_head(embedding)
         return PerEnvironment(
+            # On the simplex by construction: a mixture of contractions contracts.
             mixture=nn.softmax(self.mixture_head(embedding)),
             B=self.input_head(embedding).reshape(self.rank, self.control),
             residual=residual,
@@ -205,5 +210,6 @@ def _near_identity(
     key: Array, shape: tuple[int, ...], dtype: jnp.dtype = jnp.float32
 ) -> Array:
     """Initial operators: I plus a little noise, which is slow dynamics."""
+    # Slow dynamics: in a sampling period of 0.1 s a car changes little.
     noise = jax.random.normal(key, shape, dtype) * (0.1 / shape[-1] ** 0.5)
     return jnp.eye(shape[-1], dtype=dtype) + noise

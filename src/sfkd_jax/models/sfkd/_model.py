@@ -165,11 +165,13 @@ class Sfkd:
         self, fiber: SfkdFiber, latent: PosedLatent, state: State
     ) -> PosedLatent:
         """Return the latent of a state, in the frame of `latent`."""
+        # Of the frames only the segment's has the pose in z, relative to its start.
         return self._lift(fiber, latent.pose if self.segment else state[POSE], state)
 
     def _lift(self, fiber: SfkdFiber, at: Pose, state: State) -> PosedLatent:
         """The latent of a state in the frame of a pose."""
         inputs = scaled_body(self.space, state)
+        # The paper's literal reading: the pose is one more input of the lift.
         if self.segment:
             motion = between(at, state[POSE]) / self.pose_scale
             inputs = jnp.concatenate([motion, inputs])
@@ -181,10 +183,12 @@ class Sfkd:
     ) -> PosedLatent:
         """Advance z and the pose by one sampling period."""
         space, local = self.space, fiber.local
+        # Every function of u and e is a bias, which no Lipschitz bound in z sees.
         u = scaled_control(space, control)
         z = fiber.A @ latent.z + local.B @ u
         if fiber.forcing:
             z = z + fiber.forcing[0] @ jnp.tanh(local.forcing.at(u)[0])
+        # Decided by the shape of the weights, that is, when the program is traced.
         if fiber.residual:
             z = z + apply(fiber.residual, local.residual.at(u), latent.z)
         if self.segment or not fiber.decoder:
@@ -198,6 +202,7 @@ class Sfkd:
         """Return the state of a latent."""
         pose, space = latent.pose, self.space
         if self.segment:
+            # A read-out of a state, so without the control of a step.
             offset = apply(fiber.decoder, fiber.local.decoder.offsets, latent.z)
             pose = compose(pose, self.pose_scale * offset)
         scaled = fiber.readout @ latent.z + fiber.centre
@@ -207,6 +212,7 @@ class Sfkd:
         self, fiber: SfkdFiber, fiber_next: SfkdFiber, latent: PosedLatent
     ) -> PosedLatent:
         """Carry z from the fiber of e to that of e', T(e → e') z = Q(e') Q(e)' z."""
+        # There and back through the common coordinates: a cocycle without a matrix.
         unrotated = rotate_planes(-fiber.local.tangents, latent.z)
         return latent._replace(z=rotate_planes(fiber_next.local.tangents, unrotated))
 
@@ -215,6 +221,7 @@ class Sfkd:
         shared, learned = self.shared(params), self.learned
         decoder = shared.decoder.matrices
         if learned.pose:
+            # In physical units, so that a certificate needs no scales of the model.
             decoder = (*decoder[:-1], self.pose_scale[:, None] * decoder[-1])
         return Explicit(
             operators=Polytope(shared.vertices),
@@ -233,6 +240,7 @@ class Sfkd:
         biases: Biases = fiber.local.residual
         at = biases.at(scaled_control(self.space, control))
         jacobian = jax.jacobian(lambda z: apply(fiber.residual, at, z))(latent.z)
+        # As the paper has it: a penalty at sampled points, which proves nothing.
         excess = jnp.linalg.norm(jacobian, 2) - self.learned.beta
         return self.soft_penalty * jnp.maximum(0.0, excess) ** 2
 
@@ -309,6 +317,7 @@ def sfkd(
             raise ValueError(
                 f"model.{setting} must be one of {', '.join(known)}, got {value!r}"
             )
+    # The one look-up: everything below asks the kind, never its name.
     kind = RESIDUALS[residual]
     joint = kind.shares_budget(budget)
     _check_bounds(rank, rho, beta, learn_alpha, joint)
@@ -346,7 +355,9 @@ def sfkd(
         shared=functions.shared,
         fitting=Fitting(penalty=functions.hinge if soft_penalty else None),
         structure=Structure(
-            explicit=functions.explicit, rate=functions.rate if kind.bounded else None
+            # A free residual may contract, but only a certificate can tell.
+            explicit=functions.explicit,
+            rate=functions.rate if kind.bounded else None,
         ),
         along_path=not learned.pose,
     )

@@ -91,11 +91,14 @@ def share_budget(
     Returns:
         A_j, and the residual with G and α H folded into its last and first weights.
     """
+    # Kept apart from 1, or the factors below would be singular.
     out, into = (bounded(matrix, LARGEST_COUPLING) for matrix in couplings)
     identity = jnp.eye(out.shape[0])
     left = jnp.linalg.cholesky(identity - out @ out.T)
     right = jnp.linalg.cholesky(identity - into.T @ into)
+    # One pair (L, R) for all vertices: the residual is the same for each of them.
     vertices = alpha * left @ separate_budget(operators, 1.0) @ right.T
+    # Folded into the network, so that what is certified is what is multiplied.
     first, *middle, last = network.matrices
     return vertices, Weights(
         (alpha * first @ into, *middle, out @ last), network.multipliers
