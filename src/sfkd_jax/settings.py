@@ -149,8 +149,9 @@ def parse(kind: type[T], values: Values | T, above: str = "") -> T:
             inner: Any = hint
             parsed[entry.name] = parse(inner, values[entry.name], f"{name}.")
         else:
-            check(name, values[entry.name], rule_of(hint))
-            parsed[entry.name] = _as_tuple(values[entry.name])
+            rule = rule_of(hint)
+            check(name, values[entry.name], rule)
+            parsed[entry.name] = _as_tuple(values[entry.name], rule)
     _check_boxes(above, parsed)
     return kind(**parsed)
 
@@ -197,7 +198,7 @@ def did_you_mean(name: str, known: Iterable[str]) -> str:
     return f"; did you mean {' or '.join(similar[:3])}?" if similar else ""
 
 
-def choose(table: Mapping[str, T], name: str | None, what: str) -> T:
+def choose(table: Mapping[str, T], name: Any, what: str) -> T:
     """Return `table[name]`.
 
     Args:
@@ -208,7 +209,7 @@ def choose(table: Mapping[str, T], name: str | None, what: str) -> T:
     Raises:
         ValueError: no such name; the message lists the choices.
     """
-    if name is None or name not in table:
+    if not isinstance(name, str) or name not in table:
         raise ValueError(
             f"unknown {what} {name!r}; choose one of {', '.join(sorted(table))}"
         )
@@ -304,9 +305,13 @@ def is_below(path: str) -> bool:
     return path.isprintable() and "\\" not in path and not {"", ".", ".."} & set(parts)
 
 
-def _as_tuple(value: Any) -> Any:
-    """Lists as tuples, inside lists too; mappings as they are."""
-    return tuple(map(_as_tuple, value)) if isinstance(value, list | tuple) else value
+def _as_tuple(value: Any, rule: Rule) -> Any:
+    """Lists as tuples, also in mappings; what no rule speaks of stays as it is."""
+    if isinstance(value, Mapping):
+        inner = rule.values or Rule()
+        return {key: _as_tuple(entry, inner) for key, entry in value.items()}
+    stated = rule.entries is not None
+    return tuple(value) if stated and isinstance(value, list) else value
 
 
 def _check_boxes(above: str, settings: Values) -> None:

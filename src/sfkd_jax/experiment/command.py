@@ -62,6 +62,8 @@ def hydra_command(run: Run) -> Callable[[], None]:
         try:
             settings = settings_of(composed)
             use_compilation_cache(Path(settings.root))
+            # A trial spends its time on compiling, an experiment on running.
+            jax.config.update("jax_disable_most_optimizations", not settings.optimized)
             document = run(named_for_sweep(settings) if sweeping else settings)
         except KeyboardInterrupt:
             _report("interrupted; the same command continues")

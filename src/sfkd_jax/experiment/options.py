@@ -250,11 +250,19 @@ class ReportSettings:
 
 @dataclass(frozen=True, kw_only=True)
 class Settings:
-    """Everything that a command can be told."""
+    """All settings of a command.
+
+    Attributes:
+        seed: of the initial weights and the training windows.
+        name: of the run.
+        root: directory of all artefacts.
+        optimized: whether programs are compiled well; if not, fast, for trials.
+    """
 
     seed: NonNegativeInt
     name: Directory
     root: str
+    optimized: bool
     vehicle: VehicleSettings
     environment: EnvironmentSettings
     scenario: ScenarioSettings

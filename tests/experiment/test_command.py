@@ -1,0 +1,151 @@
+"""The command line: the program sfkd, errors of one line, sweeps."""
+
+import json
+import subprocess
+import sys
+import textwrap
+import tomllib
+from pathlib import Path
+
+import pytest
+
+from sfkd_jax import __main__ as program
+from sfkd_jax import __version__
+from sfkd_jax.experiment import command
+
+ROOT = Path(__file__).parents[2]
+SCRIPT = """
+    import os
+    from sfkd_jax.certification import CertificateStale, CertificationRefused
+    from sfkd_jax.experiment.command import hydra_command
+
+    FAILS = {
+        1: ValueError("a job that cannot be done"),
+        2: CertificationRefused("not below 1"),
+        3: CertificateStale("other weights"),
+        4: TypeError("a bug"),
+    }
+
+    def run(settings):
+        if settings.seed in FAILS:
+            raise FAILS[settings.seed]
+        return {"objective": (settings.seed - 7.0) ** 2, "run": str(settings.run_dir)}
+
+    if __name__ == "__main__":
+        hydra_command(run)()
+"""
+
+
+@pytest.fixture
+def toy(tmp_path):
+    (tmp_path / "toy.py").write_text(textwrap.dedent(SCRIPT))
+
+    def start(*arguments):
+        return subprocess.run(
+            [sys.executable, "toy.py", *arguments],
+            cwd=tmp_path,
+            capture_output=True,
+            text=True,
+            timeout=300,
+        )
+
+    return start
+
+
+def printed(done):
+    lines = done.stdout.splitlines()
+    return [json.loads(line) for line in lines if line.startswith("{")]
+
+
+def test_the_program_is_installed_under_its_name():
+    project = tomllib.loads((ROOT / "pyproject.toml").read_text("utf-8"))["project"]
+    assert project["scripts"] == {"sfkd": "sfkd_jax.__main__:main"}
+
+
+def test_without_a_command_every_command_of_the_package_is_listed(monkeypatch, capsys):
+    monkeypatch.setattr("sys.argv", ["sfkd"])
+    program.main()
+    lines = capsys.readouterr().out.splitlines()
+    assert lines[0].startswith(f"sfkd_jax {__version__}")
+    for name in program.COMMANDS:
+        (line,) = [line for line in lines if line.split()[:1] == [name]]
+        assert line.endswith(".")
+    files = (ROOT / "src" / "sfkd_jax").glob("*.py")
+    commands = {file.stem for file in files if "hydra_command(run)" in file.read_text()}
+    assert commands <= {*program.COMMANDS, "__main__"}
+
+
+def test_an_unknown_command_is_one_line(monkeypatch):
+    monkeypatch.setattr("sys.argv", ["sfkd", "trian"])
+    with pytest.raises(SystemExit, match=r"unknown command trian; did you mean train?"):
+        program.main()
+
+
+@pytest.mark.parametrize(
+    ("argument", "status", "line"),
+    [
+        ("seed=1", 1, "sfkd_jax: a job that cannot be done"),
+        ("seed=2", 2, "sfkd_jax: refused: not below 1"),
+        ("seed=3", 3, "sfkd_jax: stale: other weights"),
+        ("training.batch=0", 1, "sfkd_jax: training.batch must be in [1, inf), got 0"),
+    ],
+)
+def test_an_expected_error_is_one_line_and_an_exit_code(toy, argument, status, line):
+    done = toy(argument)
+    assert done.returncode == status
+    assert done.stderr.strip().splitlines() == [line]
+    assert printed(done) == []
+
+
+def test_a_failed_job_of_a_sweep_does_not_lose_the_results_of_the_others(toy):
+    done = toy("-m", "+experiment=smoke", "training.steps=75,150", "seed=0,1,4,5")
+    assert done.returncode == 1
+    runs = [document["run"] for document in printed(done)]
+    assert len(set(runs)) == len(runs) == 4
+    assert {Path(run).name for run in runs} == {"seed=0", "seed=5"}
+    assert {Path(run).parts[2] for run in runs} == {
+        "training.steps=75",
+        "training.steps=150",
+    }
+    assert "a job that cannot be done" in done.stderr
+    assert "a bug" in done.stderr
+
+
+def test_jobs_of_a_sweep_that_differ_in_lists_have_names_that_can_be_read_back(toy):
+    done = toy("-m", "model.residual_hidden=[8,8],[16]", "scenario=s1,s3")
+    runs = [document["run"] for document in printed(done)]
+    assert len(runs) == 4
+    assert len(set(runs)) == 2  # a scenario changes no weights
+    assert not any(character in run for run in runs for character in "[]'\" ")
+
+
+def test_a_study_searches_and_a_failed_trial_does_not_end_it(toy):
+    pytest.importorskip("hydra_plugins.hydra_optuna_sweeper")
+    done = toy(
+        "-m",
+        "+experiment=tune",
+        "hydra.sweeper.n_trials=4",
+        "hydra.sweeper.storage=null",
+        "~hydra.sweeper.params",
+        "+hydra.sweeper.params.seed=choice(1,5,6)",
+    )
+    assert done.returncode == 0, done.stderr[-2000:]
+    assert printed(done)
+
+
+def test_compiled_programs_are_kept_below_the_root_unless_the_user_says_where(
+    tmp_path, monkeypatch
+):
+    chosen = {}
+    monkeypatch.setattr(command.jax.config, "update", chosen.__setitem__)
+    for variable in ("DIR", "MIN_COMPILE_TIME_SECS", "MIN_ENTRY_SIZE_BYTES"):
+        name = "JAX_COMPILATION_CACHE_DIR"
+        if variable != "DIR":
+            name = f"JAX_PERSISTENT_CACHE_{variable}"
+        monkeypatch.delenv(name, raising=False)
+    command.use_compilation_cache(tmp_path)
+    assert chosen["jax_compilation_cache_dir"] == str(tmp_path / "compiled")
+    chosen.clear()
+    monkeypatch.setenv("JAX_COMPILATION_CACHE_DIR", "/elsewhere")
+    command.use_compilation_cache(tmp_path)
+    assert "jax_compilation_cache_dir" not in chosen

@@ -1,0 +1,207 @@
+"""A wrong value of any setting of any option is refused in one line that names it."""
+
+import copy
+import math
+import random
+from typing import Annotated
+
+import pytest
+from composing import composed, plain_settings, settings
+from omegaconf import OmegaConf
+
+from sfkd_jax import build
+from sfkd_jax.experiment import stages
+from sfkd_jax.experiment.options import hydra_schemas, parse_settings
+from sfkd_jax.ranges import Bounds, Interval, Positive, Span
+from sfkd_jax.settings import arguments, did_you_mean, parse, plain, replace, schema
+
+OPTIONS = (
+    *(f"model={name}" for name in build.MODELS if name != "own"),
+    *(f"controller={name}" for name in build.PLANNERS),
+    "vehicle=dynamic",
+    "dataset=path",
+)
+SIGNED = ("wind_lever", "control_low", "control_high", "low", "high", "bias")
+"""Settings whose numbers may be negative."""
+SAMPLE = 160
+
+
+def factory(model, *, size: int = 3, gain: Positive, span: Span = (1.0, 2.0)):
+    return model, size, gain, span
+
+
+def other(*, low: Bounds = (), high: Bounds = (), gain: int = 7):
+    return low, high, gain
+
+
+def test_a_schema_has_the_keyword_arguments_and_the_first_factory_defines_a_name():
+    kind = schema("Kind", None, factory, other, skip=("size",))
+    made = parse(kind, {"gain": 2.0, "span": [1, 4]})
+    assert plain(made) == {"gain": 2.0, "span": [1, 4], "low": [], "high": []}
+    assert made.span == (1, 4)
+    assert arguments(made, factory) == {"gain": 2.0, "span": (1, 4)}
+    assert parse(kind, made) is made
+    assert replace(made, gain=3.0).gain == 3.0
+    with pytest.raises(AttributeError):
+        made.gain = 3.0
+
+
+@pytest.mark.parametrize(
+    ("values", "says"),
+    [
+        ({}, "of.gain must be set"),
+        ({"gain": 0.0}, r"of.gain must be in \(0, inf\), got 0.0"),
+        ({"gain": math.nan}, r"of.gain must be in \(0, inf\), got nan"),
+        ({"gain": 1e39}, r"of.gain must be in \(0, inf\)"),
+        ({"gain": True}, "of.gain must be a number, got True"),
+        ({"gain": None}, "of.gain must be set, got None"),
+        ({"gain": 1.0, "span": [2.0]}, "of.span must be 2 entries"),
+        ({"gain": 1.0, "span": [2.0, 1.0]}, "of.span must be in rising order"),
+        ({"gain": 1.0, "size": 2.5}, "of.size must be a whole number"),
+        ({"gain": 1.0, "sise": 2}, "unknown setting of.sise; did you mean of.size?"),
+        ({"gain": 1.0, "low": [2.0], "high": [1.0]}, "of.low must not lie above"),
+        ({"gain": 1.0, "low": [2.0]}, "of.low must not|of.low and"),
+        ([], "of must be settings by name"),
+    ],
+)
+def test_the_line_says_what_a_setting_must_be_and_what_it_is(values, says):
+    if isinstance(values, dict) and values.keys() == {"gain", "low"}:
+        values = values | {"high": [3.0, 4.0]}
+    with pytest.raises(ValueError, match=says) as refused:
+        parse(schema("Kind", None, factory, other), values, "of.")
+    assert "\n" not in str(refused.value)
+
+
+def test_the_closest_name_is_suggested():
+    known = ["training.steps", "dataset.steps", "seed", "controller.mppi.horizon"]
+    assert did_you_mean("sead", known) == "; did you mean seed?"
+    wanted = "; did you mean training.steps or dataset.steps?"
+    assert did_you_mean("stepps", known) == wanted
+    assert did_you_mean("xyz", known) == ""
+
+
+def leaves(values, above=""):
+    for key, value in values.items():
+        if isinstance(value, dict):
+            yield from leaves(value, f"{above}{key}.")
+        else:
+            yield f"{above}{key}", value
+
+
+def impossible(name, value):
+    """Values that a setting cannot have, whatever its annotation states."""
+    sample = value[0] if isinstance(value, list) and value else value
+    if value == []:
+        return ["word", [math.nan], [{"a": 1}]]
+    if isinstance(value, bool):
+        return ["perhaps", 2.5, [True], None]
+    if isinstance(sample, str):
+        return [[], ["a"], None] if not isinstance(value, list) else [[""], 7]
+    numbers = ["many", math.nan, math.inf, -math.inf, 1e39, {"a": 1}]
+    numbers += [] if name.split(".")[-1] in SIGNED else [-1]
+    numbers += [2.5, 10**12] if isinstance(sample, int) else []
+    if isinstance(value, list):
+        return [[number] * len(value) for number in numbers] + [7, "word"]
+    return [*numbers, []]
+
+
+def test_settings_of_the_wrong_type_or_size_are_refused_in_one_line_that_names_them():
+    cases = []
+    for option in OPTIONS:
+        for name, value in leaves(plain_settings(option)):
+            group = name.partition(".")[0]
+            if group in ("comparison", "report") or value is None:
+                continue
+            cases += [(option, name, wrong) for wrong in impossible(name, value)]
+    accepted, odd = [], []
+    for option, name, wrong in random.Random(0).sample(cases, SAMPLE):
+        values = copy.deepcopy(plain_settings(option))
+        *above, last = name.split(".")
+        inner = values
+        for key in above:
+            inner = inner[key]
+        inner[last] = wrong
+        try:
+            parse_settings(values)
+            accepted.append((name, wrong))
+        except ValueError as reason:
+            line = str(reason)
+            named = last in line or last in ("name", "planner")
+            odd += [] if named and "\n" not in line else [(name, wrong, line)]
+    assert accepted == []
+    assert odd == []
+
+
+def use(option, name, value):
+    """What `train` does before anything is made."""
+    values = copy.deepcopy(plain_settings(option))
+    OmegaConf.update(node := OmegaConf.create(values), name, value, merge=False)
+    chosen = parse_settings(OmegaConf.to_container(node))
+    plant = build.build_vehicle(chosen.vehicle)
+    build.build_scenario(chosen.scenario, plant, duration=10.0)
+    stages.check_settings(chosen, plant)
+
+
+@pytest.mark.parametrize(
+    ("name", "value"),
+    [
+        ("vehicle.name", "boat"),
+        ("vehicle.inner_loop", "torque"),
+        ("scenario.name", "s9"),
+        ("model.name", "sfdk"),
+        ("model.frame", "boddy"),
+        ("model.residual", "some"),
+        ("controller.planner", "mpppi"),
+        ("controller.sampling", "none"),
+        ("controller.mppi.noise", "brown"),
+        ("controller.mppi.risk", "most"),
+        ("certification.mode", "both"),
+        ("evaluation.systems", ["self", "oracel"]),
+        ("environment.source", "guessed"),
+        ("dataset.shares", [0.5, 0.5, 0.5, 0.5]),
+        ("training.window", 51),
+        ("model.rank", 7),
+        ("controller.mppi.smoothing_window", 4),
+        ("dataset.speed", [13.0, 7.0]),
+    ],
+)
+def test_what_nothing_can_use_is_refused_before_anything_is_made(name, value):
+    """An unknown choice, or a value that contradicts the other settings."""
+    says = (
+        f"{name.split('.')[-1]}|{value}"
+        if isinstance(value, str)
+        else name.split(".")[-1]
+    )
+    with pytest.raises(ValueError, match=says) as refused:
+        use("seed=0", name, value)
+    assert "\n" not in str(refused.value)
+
+
+@pytest.mark.parametrize("name", ["../x", "a/../b", "/tmp/x", "a//b", "a\\b", "a\0b"])
+@pytest.mark.parametrize("setting", ["name", "model.system", "comparison.policies"])
+def test_a_run_stays_below_the_root(setting, name):
+    with pytest.raises(ValueError, match=f"{setting} must be a path below root"):
+        use("seed=0", setting, name)
+
+
+def test_names_with_folders_and_settings_in_them_are_names():
+    for name in ("smoke", "a/b", "a=0.003,b=1", "Läufe 2", "a..b", ".a"):
+        assert replace(settings(), name=name).name == name
+
+
+def test_the_keys_of_a_comparison_are_names_of_files():
+    with pytest.raises(ValueError, match=r"names of files, got '../x'"):
+        use("seed=0", "comparison.rows", {"../x": "seed=1"})
+
+
+def test_every_interval_says_something():
+    """An annotation that states the default of its kind would say nothing."""
+    kind = schema("Kind", None, factory)
+    assert kind.__annotations__["gain"] == Annotated[float, Interval("(0, inf)")]
+    assert {"schema", "path_schema", "files_schema"} == set(hydra_schemas()["dataset"])
+
+
+def test_plain_settings_come_back_as_the_same_objects():
+    for option in OPTIONS:
+        assert parse_settings(plain_settings(option)) == settings(option)
+        assert composed(option).seed == 0
