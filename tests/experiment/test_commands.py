@@ -3,6 +3,7 @@ artefacts intact.
 """
 
 import json
+import os
 import shutil
 import subprocess
 import sys
@@ -20,9 +21,12 @@ from sfkd_jax import store
 def smoke(tmp_path_factory):
     """One smoke run from nothing; tests that change it copy it first."""
     directory = tmp_path_factory.mktemp("run")
-    return directory, last_line(
-        run_command("train", "+experiment=smoke", cwd=directory)
-    )
+    hidden = pytest.MonkeyPatch()
+    for name in [name for name in os.environ if "JAX_" in name]:
+        hidden.delenv(name)  # so that programs are kept below the root
+    done = run_command("train", "+experiment=smoke", cwd=directory)
+    hidden.undo()
+    return directory, last_line(done)
 
 
 @pytest.fixture
@@ -128,14 +132,6 @@ def test_rows_count_violations_and_the_theorem_is_never_one(smoke):
     assert rows["sfkd"]["violation"]["v1_tube"] == "certified"
     assert rows["nominal"]["violation"]["v0"] is None
     assert rows["nominal"]["violation"]["v1_tube"] == "conformal"
-
-
-def test_the_same_command_again_trains_nothing_and_ends_the_same(smoke):
-    directory, before = smoke
-    weights = (directory / before["run"] / "policy.safetensors").read_bytes()
-    again = last_line(run_command("train", "+experiment=smoke", cwd=directory))
-    assert (directory / again["run"] / "policy.safetensors").read_bytes() == weights
-    assert again["open_loop_rmse_m"] == before["open_loop_rmse_m"]
 
 
 def test_other_settings_in_the_same_run_directory_are_refused(smoke):
@@ -261,31 +257,8 @@ def test_without_systems_a_model_is_trained_alone_and_scored_for_a_search(smoke)
     assert "certificate" not in done
 
 
-@pytest.mark.parametrize(
-    ("arguments", "says"),
-    [
-        (("+experiment=s9",), "smoke"),
-        (("+experiment=smoke", "model=sfdk"), "sfkd_soft"),
-        (("+experiment=smoke", "evaluation.systems=[oracel]"), "oracle"),
-        (("+experiment=smoke", "evaluation.systems=[]"), "nothing to evaluate"),
-        (("+experiment=smoke", "model.frame=boddy", "name=bad"), "segment"),
-        (("+experiment=smoke", "training.window=80", "name=bad"), "80"),
-        (("+experiment=smoke", "dataset.shares=[0.5,0.5,0.5,0.5]"), "shares"),
-        (
-            ("+experiment=smoke", "training.batch=0"),
-            "training.batch must be in [1, inf), got 0",
-        ),
-    ],
-)
-def test_bad_input_gives_one_line_with_the_choices(smoke, arguments, says):
-    name = "evaluate" if "systems" in arguments[-1] else "train"
-    done = run_command(name, *arguments, cwd=smoke[0], code=1)
-    assert says in done.stderr
-    assert len(done.stderr.strip().splitlines()) == 1
-
-
 def test_the_example_in_the_readme_runs_with_a_policy_of_its_first_command():
-    root = Path(__file__).parents[1]
+    root = Path(__file__).parents[2]
     program = (
         (root / "README.md").read_text("utf-8").split("```python\n")[1].split("```")[0]
     )
@@ -296,3 +269,59 @@ def test_the_example_in_the_readme_runs_with_a_policy_of_its_first_command():
         [sys.executable, "-c", program], capture_output=True, text=True
     )
     assert done.returncode == 0, done.stderr
+
+
+COUNTED = """
+    import json, sys, jax
+    from sfkd_jax import train
+    from sfkd_jax.experiment.command import hydra_command
+
+    events = {}
+    def count(event, **_):
+        name = event.rpartition("/")[2]
+        events[name] = events.get(name, 0) + 1
+
+    jax.monitoring.register_event_listener(count)
+    hydra_command(train.run)()
+    print(json.dumps({key: events.get(key, 0) for key in ("cache_hits", "cache_misses")}))
+"""
+
+
+def test_the_same_command_again_trains_nothing_and_another_run_compiles_nothing(smoke):
+    """Programs are kept below the root, so a second training of a kind only runs."""
+    directory, before = smoke
+    weights = (directory / before["run"] / "policy.safetensors").read_bytes()
+    again = last_line(run_command("train", "+experiment=smoke", cwd=directory))
+    kept = directory / again["run"] / "policy.safetensors"
+    assert kept.read_bytes() == weights
+    assert again["open_loop_rmse_m"] == before["open_loop_rmse_m"]
+    hidden = {name: os.environ[name] for name in os.environ if "JAX_" not in name}
+    done = subprocess.run(
+        [sys.executable, "-c", textwrap.dedent(COUNTED), "+experiment=smoke", "seed=1"],
+        cwd=directory,
+        env=hidden,
+        capture_output=True,
+        text=True,
+    )
+    assert done.returncode == 0, done.stderr[-2000:]
+    counted = last_line(done)
+    assert counted["cache_hits"] > 50
+    assert counted["cache_misses"] <= 5
+
+
+@pytest.mark.parametrize(
+    ("arguments", "says"),
+    [
+        (("evaluation.systems=[oracel]",), "oracle"),
+        (("evaluation.systems=[]",), "nothing to evaluate"),
+        (("model.frame=boddy", "name=bad"), "segment"),
+        (("training.window=80", "name=bad"), "80"),
+        (("dataset.shares=[0.5,0.5,0.5,0.5]",), "shares"),
+        (("training.batch=0",), "training.batch must be in [1, inf), got 0"),
+    ],
+)
+def test_bad_input_gives_one_line_with_the_choices(smoke, arguments, says):
+    name = "evaluate" if "systems" in arguments[-1] else "train"
+    done = run_command(name, "+experiment=smoke", *arguments, cwd=smoke[0], code=1)
+    assert says in done.stderr
+    assert len(done.stderr.strip().splitlines()) == 1

@@ -1,0 +1,284 @@
+"""The cells of a comparison: which there are, when they are done, what is collected."""
+
+import json
+from functools import cache
+from pathlib import Path
+
+import numpy as np
+import pytest
+from composing import settings
+from helpers import last_line, run_command
+
+from sfkd_jax.experiment import grid
+from sfkd_jax.experiment.provenance import source_hash
+from sfkd_jax.settings import replace
+from sfkd_jax.store import write_json
+
+LEVELS = {"sfkd": 1.0, "icode": 3.0}
+"""Error of the first episode of two rows [m]."""
+
+
+@cache
+def plan():
+    return replace(
+        settings().comparison,
+        vehicles=["kinematic", "dynamic"],
+        seeds=[0, 1],
+        controllers={"mppi": ["s1", "s2"], "mppi_plain": ["s1"]},
+        own_controllers={"program": {"mppi": "koopman_mpc", "mppi_plain": None}},
+        rows={"ours": "model=sfkd", "program": "model=koopman_mpc seed=3"},
+        variations={"as it is": None, "late": "environment.sensor.delay_s=0.5"},
+        policies="table",
+    )
+
+
+def cells(**changes):
+    return grid.list_cells(replace(plan(), **changes))
+
+
+def test_every_row_has_every_scenario_under_each_of_its_controllers():
+    found = cells()
+    assert len(found) == len(set(found)) == 2 * 2 * 2 * (3 + 2)
+    assert {c.controller for c in found if c.label == "program"} == {"koopman_mpc"}
+    assert {c.scenario for c in found if c.controller == "mppi_plain"} == {"s1"}
+    groups = grid.group_cells(found)
+    assert [cell for group in groups for cell in group] == found
+    assert len(groups) == 2 * 2 * (2 + 1)
+
+
+@pytest.mark.parametrize("name", ["untrained", "trained_once"])
+def test_a_row_that_is_not_trained_again_has_the_first_seed_alone(name):
+    found = cells(**{name: ["ours"]})
+    assert {cell.seed for cell in found if cell.label == "ours"} == {0}
+    assert {cell.seed for cell in found if cell.label == "program"} == {0, 1}
+
+
+@pytest.mark.parametrize(
+    ("changes", "says"),
+    [
+        ({"only": ["iocde"]}, "unknown comparison.only iocde; choose of ours, program"),
+        ({"untrained": ["us"]}, "unknown comparison.untrained us"),
+        ({"seeds": [0, 0]}, r"comparison.seeds=\[0, 0\] repeats"),
+    ],
+)
+def test_a_plan_that_contradicts_itself_is_refused(changes, says):
+    with pytest.raises(ValueError, match=says):
+        cells(**changes)
+
+
+def test_a_cell_composes_its_row_what_was_tuned_and_its_variation():
+    tuned = replace(plan(), tuned={"dynamic": {"program": "model.functions=9"}})
+    cell = grid.Cell("dynamic", "program", 1, "koopman_mpc", "late", "s2")
+    assert grid.overrides(cell, tuned) == [
+        "vehicle=dynamic",
+        "scenario=s2",
+        "controller=koopman_mpc",
+        "seed=1",
+        "model=koopman_mpc",
+        "seed=3",
+        "model.functions=9",
+        "environment.sensor.delay_s=0.5",
+    ]
+    assert grid.overrides(cell._replace(vehicle="kinematic"), tuned)[-2:] == [
+        "seed=3",
+        "environment.sensor.delay_s=0.5",
+    ]
+
+
+def test_a_variation_that_retrains_has_a_policy_of_its_own():
+    cell = grid.Cell("dynamic", "ours", 1, "mppi", "10 % of the data", "s2")
+    usual = grid.policy_name(cell, plan(), retrained=False)
+    assert usual == "table/dynamic/ours"
+    other = grid.policy_name(cell, plan(), retrained=True)
+    assert other == "table/dynamic/ours/10_%_of_the_data"
+
+
+def test_every_row_belongs_to_exactly_one_share():
+    """Two controllers of one row share its policy: no two processes may train it."""
+    groups = grid.group_cells(cells())
+    parts = [grid.take_share(groups, (k, 3)) for k in range(3)]
+    assert sorted(group for part in parts for group in part) == sorted(groups)
+    policies = [row for part in parts for row in {group[0][:3] for group in part}]
+    assert len(policies) == len(set(policies))
+    assert grid.take_share(groups, None) == groups
+    with pytest.raises(ValueError, match=r"comparison\.share"):
+        grid.take_share(groups, (3, 3))
+
+
+def rows_file(path):
+    return Path(f"{path}.row.json")
+
+
+def test_a_cell_is_done_only_with_its_own_settings_and_undamaged(tmp_path):
+    path, chosen = grid.cell_path(cells()[0], tmp_path), settings()
+    assert not grid.is_done(path, chosen)
+    made = grid.settings_hash(chosen)
+    path.parent.mkdir(parents=True)
+    write_json(rows_file(path), {"row": {}, "made_with": made})
+    assert grid.is_done(path, chosen)
+    assert not grid.is_done(path, settings("evaluation.episodes=9"))
+    assert not grid.is_done(path, settings("environment.sensor.delay_s=0.5"))
+    assert not grid.is_done(path, settings("training.steps=50"))
+    rows_file(path).write_bytes(rows_file(path).read_bytes()[:-5])
+    assert not grid.is_done(path, chosen)
+
+
+def test_cells_that_differ_in_what_is_observed_share_a_compiled_evaluation():
+    def key(*overrides):
+        return grid.compilation_key(settings(*overrides))
+
+    assert key() == key("environment.sensor.delay_s=0.5") == key("scenario=s1")
+    assert key() != key("environment.high=[0.8,8.0]")
+    assert key() != key("controller.mppi.num_samples=7")
+
+
+def row(system, level, seed):
+    episodes = [level, 2 * level]
+    return {
+        "system": system,
+        "scenario": "s1",
+        "vehicle": "kinematic",
+        "sampling": "feedback",
+        "variation": None,
+        "max_deviation_m": level,
+        "departures": 0,
+        "ratio_to_oracle": None,
+        "difference_to_sfkd": None,
+        "seeds": [seed],
+        "rmse_episodes_m": episodes,
+        "rmse_m": {"mean": np.mean(episodes)},
+    }
+
+
+def keep(tmp_path, cell, entry, made):
+    """A stored cell, made with these settings."""
+    path = grid.cell_path(cell, tmp_path)
+    path.parent.mkdir(parents=True, exist_ok=True)
+    write_json(rows_file(path), {"row": entry, "made_with": grid.settings_hash(made)})
+
+
+def collected(tmp_path, entries, missing=(), changes=()):
+    """System -> row of a comparison on S1; `changes` are of the settings of icode."""
+
+    def compose(cell):
+        return settings(*(changes if cell.label == "icode" else ()))
+
+    listed = []
+    for label in [*entries, *missing]:
+        listed.append(grid.Cell("kinematic", label, 0, "mppi", "as it is", "s1"))
+        if label in entries:
+            keep(tmp_path, listed[-1], entries[label], compose(listed[-1]))
+    rows = grid.collect_rows(listed, tmp_path, compose)
+    return {entry["system"]: entry for entry in rows}
+
+
+@pytest.mark.parametrize("seeds", [1, 2])
+def test_collecting_pools_the_seeds_and_compares_what_is_there(tmp_path, seeds):
+    wanted = cells(
+        rows={"sfkd": None, "icode": None, "missing": None},
+        own_controllers={},
+        vehicles=["kinematic"],
+        seeds=list(range(seeds)),
+        variations={"as it is": None},
+        controllers={"mppi": ["s1"]},
+    )
+    for cell in wanted:
+        if cell.label != "missing":
+            entry = row(cell.label, LEVELS[cell.label], cell.seed)
+            keep(tmp_path, cell, entry, settings())
+    rows = grid.collect_rows(wanted, tmp_path, lambda cell: settings())
+    found = {entry["system"]: entry for entry in rows}
+    assert set(found) == {"sfkd", "icode"}
+    assert found["icode"]["seeds"] == list(range(seeds))
+    assert len(found["icode"]["rmse_episodes_m"]) == 2 * seeds
+    assert found["icode"]["difference_to_sfkd"]["mean"] == pytest.approx(3.0)
+
+
+def test_a_row_that_was_made_with_other_settings_or_code_is_announced(tmp_path, capsys):
+    listed = [
+        grid.Cell("kinematic", label, 0, "mppi", "as it is", "s1")
+        for label in ("sfkd", "icode", "nominal")
+    ]
+    sources = (source_hash(), source_hash(), "another")
+    for cell, source in zip(listed, sources, strict=True):
+        made = settings("seed=9") if cell.label == "icode" else settings()
+        entry = row(cell.label, 1.0, 0) | {"provenance": {"source": source}}
+        keep(tmp_path, cell, entry, made)
+    rows = grid.collect_rows(listed, tmp_path, lambda cell: settings())
+    assert {entry["system"] for entry in rows} == {"sfkd", "nominal"}
+    said = capsys.readouterr().err
+    assert "1 cells were made with other settings" in said
+    assert "icode-seed=0" in said
+    assert "1 cells were made by other code" in said
+
+
+@pytest.mark.parametrize(
+    ("changes", "are_paired"),
+    [
+        ((), True),
+        (("model=icode",), True),
+        (("scenario.speed=5.0",), False),
+        (("vehicle.mass=1000.0",), False),
+        (("evaluation.seed=2",), False),
+    ],
+)
+def test_rows_that_met_other_roads_are_not_paired(tmp_path, changes, are_paired):
+    entries = {label: row(label, level, 0) for label, level in LEVELS.items()}
+    found = collected(tmp_path, entries, changes=changes)
+    assert (found["icode"]["difference_to_sfkd"] is not None) == are_paired
+
+
+def test_an_unfinished_comparison_marks_no_more_than_the_finished_one(tmp_path):
+    """Rows that are still to be driven count in Holm's correction."""
+    entries = {label: row(label, level, 0) for label, level in LEVELS.items()}
+    for number, entry in enumerate(entries.values()):
+        entry["rmse_episodes_m"] = [1.0 + number, 1.1 + number, 1.3 + 1.1 * number]
+    alone = collected(tmp_path / "a", entries)["icode"]["difference_to_sfkd"]
+    more = collected(tmp_path / "b", entries, [f"row{k}" for k in range(9)])
+    beside = more["icode"]["difference_to_sfkd"]
+    assert beside["p"] == alone["p"] < 0.01
+    assert alone["p_holm"] == pytest.approx(alone["p"])
+    assert beside["p_holm"] == pytest.approx(10 * alone["p"])
+
+
+def test_an_error_that_is_not_finite_is_shown_and_does_not_hide_other_rows(tmp_path):
+    entries = {label: row(label, level, 0) for label, level in LEVELS.items()}
+    entries["icode"]["rmse_episodes_m"] = [3.0, None]  # as NaN is stored
+    found = collected(tmp_path, entries)
+    assert found["sfkd"]["rmse_episodes_m"] == [1.0, 2.0]
+    assert np.isnan(found["icode"]["difference_to_sfkd"]["mean"])
+    assert "p_holm" not in found["icode"]["difference_to_sfkd"]
+
+
+def test_compare_drives_every_row_names_those_that_fail_and_goes_on(tmp_path):
+    small = ("training.steps=75", "training.save_every=75", "dataset.segments=200")
+    asked = (
+        "+experiment=smoke",
+        "evaluation.systems=[self]",
+        "+comparison.rows.wrong='training.step=3'",
+        "+comparison.rows.unknown='certification.mode=boxes'",
+        "name=table",
+        *small,
+    )
+    done = run_command("compare", *asked, cwd=tmp_path)
+    first = last_line(done)
+    document = json.loads((tmp_path / first["results"]).read_text())
+    rows = {entry["system"]: entry for entry in document["rows"]}
+    assert set(rows) == {"oracle", "sfkd"}
+    assert rows["oracle"]["difference_to_sfkd"]["mean"] < 0
+    assert set(rows["sfkd"]["open_loop_rmse_m"]) == {"1", "5", "10", "20"}
+    assert len(document["failed"]) == first["failed"] == 2
+    assert "row wrong: " in done.stderr
+    assert "certification.mode" in done.stderr
+    stored = tmp_path / "runs/table/cells"
+    before = {file: file.read_bytes() for file in stored.rglob("*.row.json")}
+    (victim,) = (file for file in before if "oracle" in file.name)
+    victim.write_bytes(before[victim][:-9])
+    again = run_command("compare", *asked, cwd=tmp_path)
+    assert "training sfkd" not in again.stderr
+    after = {file: file.read_bytes() for file in stored.rglob("*.row.json")}
+    remade, first_made = (json.loads(kept.pop(victim)) for kept in (after, before))
+    assert after == before
+    for document in (remade, first_made):
+        assert document["row"].pop("provenance")["source"]
+    assert remade == first_made

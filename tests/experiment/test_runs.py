@@ -1,0 +1,151 @@
+"""Run directories, data sets and certificates: what is kept, and what is refused."""
+
+import json
+
+import numpy as np
+import pytest
+from composing import settings
+from helpers import dataset, last_line, run_command
+
+from sfkd_jax import build, certify
+from sfkd_jax import data as datasets
+from sfkd_jax.experiment import data, runs, stages
+from sfkd_jax.settings import replace
+from sfkd_jax.store import ArtefactError, write_json
+
+
+@pytest.mark.parametrize("name", ["[a]", "trial=[1,2]"])
+def test_a_path_that_checkpoints_cannot_be_read_from_is_refused_at_once(tmp_path, name):
+    with pytest.raises(ValueError, match=r"cannot be read back from a path with \[ \]"):
+        runs.claim(replace(settings(), root=str(tmp_path), name=name))
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_a_run_that_kept_nothing_does_not_block_its_correction(tmp_path):
+    """A first attempt with a mistake records its settings before it fails."""
+    first = replace(settings(), root=str(tmp_path), name="a=0.1,b=c d")
+    second = replace(first, training=replace(first.training, steps=25))
+    runs.claim(first)
+    runs.claim(second)
+    recorded = second.run_dir / "settings.json"
+    assert json.loads(recorded.read_text())["training"]["steps"] == 25
+    (recorded.parent / "checkpoints" / "25").mkdir(parents=True)
+    runs.claim(second)
+    with pytest.raises(ArtefactError, match=r"training.steps was 25, is now 4000"):
+        runs.claim(first)
+
+
+def test_a_sensor_changes_no_weights_and_the_box_of_e_does():
+    def identity(*overrides):
+        return runs.identity(settings(*overrides))
+
+    assert identity("environment.sensor.delay_s=0.5") == identity()
+    assert identity("environment.high=[0.8,8.0]") != identity()
+
+
+def test_a_data_set_comes_back_with_the_scenario_of_every_segment(tmp_path):
+    source = data.source_of(settings(f"root={tmp_path}"))
+    made = dataset(count=20, steps=8)
+    data.write(source, made)
+    stored, _ = data.read(source)
+    for part, labels in made.scenarios.items():
+        np.testing.assert_array_equal(stored.scenarios[part], labels)
+        assert len(labels) == len(getattr(stored, part).controls)
+
+
+def test_coverage_is_measured_on_the_segments_of_each_scenario(monkeypatch):
+    monkeypatch.setattr(data, "_switching", lambda source, segments: "runs of S3")
+    made = dataset(count=20, steps=8)
+    labels = np.arange(len(made.test.controls)) % len(datasets.SCENARIOS)
+    made = made._replace(scenarios={"test": labels})
+    parts = data.held_out_parts(data.source_of(settings()), made)
+    assert set(parts) == {"test", "s3", *np.take(datasets.SCENARIOS, np.unique(labels))}
+    for code, name in enumerate(datasets.SCENARIOS):
+        if name in parts:
+            np.testing.assert_array_equal(
+                parts[name].states, np.asarray(made.test.states)[labels == code]
+            )
+
+
+@pytest.fixture
+def certified(monkeypatch, tmp_path):
+    """How often a policy is certified where a certificate records some settings."""
+    made = []
+    monkeypatch.setattr(stages, "certify_policy", made.append)
+    monkeypatch.setattr(stages, "ensure_policy", lambda settings: None)
+
+    def count(recorded, *overrides):
+        first = settings(f"root={tmp_path}", *recorded)
+        first.run_dir.mkdir(parents=True, exist_ok=True)
+        (first.run_dir / "policy.safetensors").touch()
+        document = {"valid": True, "certification": stages._asked_for(first)}
+        write_json(first.run_dir / "certificate.json", document)
+        made.clear()
+        stages.ensure_certificate(settings(f"root={tmp_path}", *overrides))
+        return len(made)
+
+    return count
+
+
+def test_a_certificate_with_the_same_settings_is_kept(certified):
+    assert certified(()) == certified((), "certification.renew=true") == 0
+
+
+@pytest.mark.parametrize("change", ["level=0.8", "corridor.drives=99"])
+def test_one_with_other_settings_is_made_again(certified, change):
+    """Otherwise cells would be driven with it and filed under the new settings."""
+    assert certified((), f"certification.{change}") == 1
+
+
+def test_certify_announces_the_training_that_it_starts(monkeypatch, capsys, tmp_path):
+    def stop(settings):
+        raise ValueError("training begins")
+
+    monkeypatch.setattr(stages, "ensure_policy", stop)
+    with pytest.raises(ValueError, match="training begins"):
+        certify.run(settings("+experiment=s3", f"root={tmp_path}"))
+    (line,) = capsys.readouterr().err.splitlines()
+    assert "s3/sfkd_path/seed=0 holds no trained policy" in line
+    assert "at most 4000 steps, about 4 min on two cores" in line
+
+
+ALONG = ("+experiment=s3",)
+PATH_MODELS = {
+    "sfkd": ("model=sfkd_path",),
+    "free": ("model=sfkd_path", "model.residual=free", "model.learn_alpha=false"),
+    "neural_ode": ("model=neural_ode", "model.frame=path", "training=state_model"),
+    "r2dn": ("model=r2dn", "model.frame=path"),
+}
+
+
+def check(*overrides):
+    chosen = settings(*ALONG, *overrides)
+    stages.check_settings(chosen, build.build_vehicle(chosen.vehicle))
+
+
+@pytest.mark.parametrize("name", PATH_MODELS)
+def test_every_path_model_builds_with_its_planner(name):
+    check(*PATH_MODELS[name])
+
+
+def test_path_coordinates_for_data_and_model_or_for_neither():
+    for overrides in (("dataset=standard",), ("model=sfkd", "controller=mppi")):
+        with pytest.raises(ValueError, match="go together"):
+            check(*overrides)
+
+
+def test_the_system_law_exists_in_path_coordinates_only():
+    check("evaluation.systems=[law]")
+    body = ("dataset=standard", "model=sfkd", "controller=mppi")
+    with pytest.raises(ValueError, match=r"evaluation\.systems entry 'law'"):
+        check(*body, "evaluation.systems=[law]")
+
+
+def test_a_sweep_of_data_sets_makes_each(tmp_path):
+    done = run_command(
+        "generate",
+        *("-m", "+experiment=smoke", "dataset.segments=40", "dataset.seed=0,1"),
+        cwd=tmp_path,
+    )
+    assert last_line(done)["segments"] == 40
+    assert len(list((tmp_path / "runs/datasets").iterdir())) == 2
