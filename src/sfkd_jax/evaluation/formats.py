@@ -87,12 +87,6 @@ def interval(bounds: Any, digits: int = 3) -> str:
     return f"{number(bounds[0], digits)} to {number(bounds[1], digits)}"
 
 
-def short_range(bounds: Any) -> str:
-    """Two numbers to three significant digits as "low to high"."""
-    low, high = bounds if isinstance(bounds, list) and len(bounds) == 2 else (None,) * 2
-    return f"{short(low)} to {short(high)}"
-
-
 def share(value: Any) -> str:
     """A share in percent to four significant digits, with its unit."""
     return f"{short(100 * value, 4)} %" if is_number(value) else DASH
