@@ -90,13 +90,6 @@ def test_the_fitted_bicycle_errs_least_on_the_plant():
     assert rmse["fitted_bicycle"] < 0.8 * rmse["constant_velocity"]
 
 
-def test_the_nominal_plant_is_predicted_by_its_own_bicycle():
-    controls = jnp.tile(jnp.asarray([0.05, 0.3]), (STEPS, 1))
-    driven = rolled(PLANT.nominal, jnp.asarray([0.0, 0.0, 0.0, 8.0]), controls)
-    rmse = errors(dataset().train, driven)["kinematic_bicycle"]
-    np.testing.assert_allclose(rmse, np.zeros((HORIZON, 4)), atol=1e-4)
-
-
 def test_controls_that_are_no_angles_are_fitted_linearly():
     """A robot whose first control is its curvature in 1/km."""
 

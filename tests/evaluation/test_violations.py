@@ -21,7 +21,7 @@ from sfkd_jax.evaluation import (
     tube_violations,
     violations,
 )
-from sfkd_jax.rollout import fibers_along, rollout, sliding_windows, window_errors
+from sfkd_jax.rollout import fibers_along, sliding_windows, window_errors
 from sfkd_jax.types import Controller, Trajectory
 
 DT = 0.1
@@ -85,31 +85,6 @@ def test_errors_of_a_constant_drift_are_its_multiples_and_yaw_is_wrapped():
         [0.5 * steps, np.minimum(steps, 2 * np.pi - steps), 0.5 * steps], axis=1
     )
     np.testing.assert_allclose(errors, np.broadcast_to(expected, (3, 4, 3)), rtol=1e-5)
-
-
-def test_the_errors_of_a_window_are_those_of_the_rollout_from_its_true_state():
-    one = at(driven(), 1)
-    model, params = model_and_params("nominal")
-    errors = jit(partial(window_errors, model, params, horizon=6, stride=3))(one)
-    part = Trajectory(one.states[3:10], one.controls[3:9], one.envs[3:9])
-    gap = jit(lambda part: rollout(model, params, part)[0])(part) - part.states[1:]
-    np.testing.assert_allclose(
-        errors[1, :, 0], jnp.hypot(gap[:, 0], gap[:, 1]), rtol=1e-4
-    )
-    np.testing.assert_allclose(errors[1, :, 2], jnp.abs(gap[:, 3]), atol=1e-5)
-
-
-def test_drives_are_cut_into_segments_and_the_rest_is_left_out():
-    result = predicted(
-        drifting(0.1, 0, 0, 0), {}, still(count=3, steps=23), length=10, horizon=4
-    )
-    assert result.errors.shape == (
-        6,
-        2,
-        4,
-        3,
-    )  # 3 drives of 2 segments, windows from 0 and 5
-    assert result.latent_errors.shape == result.defects.shape == (6, 2, 4)
 
 
 # --- counting --------------------------------------------------------------------------------------------------------

@@ -53,11 +53,6 @@ def test_transport_is_an_isometry_with_inverse_and_a_cocycle(name, scale):
     assert np.abs(results["there"] - LATENTS).max() > 1e-3  # and it does turn something
 
 
-@pytest.mark.parametrize("name", ["no_transport", "no_fiber"])
-def test_without_transport_a_switch_leaves_the_latent_alone(name):
-    np.testing.assert_allclose(transported(name)["there"], LATENTS, rtol=0, atol=1e-5)
-
-
 def test_a_plane_turns_by_twice_the_arctangent():
     angles = np.linspace(-3.0, 3.0, 7)
     tangents = np.tan(angles / 2).astype(np.float32)

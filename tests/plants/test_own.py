@@ -62,18 +62,6 @@ def test_a_missing_step_is_reported_when_it_is_needed_and_not_before(
     assert message in str(caught.value)
 
 
-def test_a_step_of_another_size_is_refused_by_its_shapes():
-    names = ("p_x", "p_y", "yaw", "v")
-    plant = plants.own(
-        state_names=names, step=lambda x, u, e: jnp.append(x, u[0]), **LIMITS
-    )
-    with pytest.raises(
-        ValueError,
-        match=r"the step of vehicle own returns \(5,\), vehicle.state_names has 4 names",
-    ):
-        plants.check_step(plant)
-
-
 def test_a_step_that_fails_is_reported_with_the_sizes_it_was_given():
     def step(x, u, e):
         p_x, p_y, yaw, v, rate = x

@@ -62,18 +62,6 @@ def test_steady_cornering_has_the_radius_and_the_understeer_gradient_of_the_line
     assert intercept == pytest.approx(LENGTH, rel=1e-3)
 
 
-@pytest.mark.parametrize("friction", [0.3, 0.9])
-def test_a_light_side_wind_turns_a_car_by_the_formula_of_the_linear_single_track(
-    coasting, friction, hold
-):
-    wind, speed = 0.3, 15.0
-    front, rear = axle_stiffness(coasting, friction)
-    push = ((REAR + LEVER) / front - (FRONT - LEVER) / rear) / LENGTH * 10.0 * wind**2
-    states = hold(coasting, speed, (0.0, 0.0), (friction, wind), 6.0)
-    expected = push / (LENGTH + understeer(front, rear) * speed**2)
-    assert float(final_curvature(states)) == pytest.approx(expected, rel=1e-3)
-
-
 def test_no_command_takes_more_from_the_tyres_than_friction_times_load(coasting, sweep):
     drawn = sweep(coasting, 20_000, overdrive=3.0)
     states = drawn.states.at[:, 3].max(3.0)

@@ -59,13 +59,6 @@ def test_constant_curvature_makes_a_circle_of_exactly_that_radius(side):
     np.testing.assert_allclose(between[:, 2], side * s / RADIUS, atol=1e-4)
 
 
-def test_zero_curvature_makes_a_straight_line():
-    path = INTEGRATE(np.zeros(700, np.float32))
-    points = POINTS(path, np.float32([0.0, 0.3, 7.77, 24.5]))
-    np.testing.assert_allclose(points[:, 0], [0.0, 0.3, 7.77, 24.5], rtol=1e-6)
-    np.testing.assert_array_equal(points[:, 1:], np.zeros((4, 3)))
-
-
 def test_a_path_starts_at_the_origin_along_x_and_without_curvature(road):
     np.testing.assert_array_equal(road.points[0], np.zeros(4))
 
@@ -115,14 +108,6 @@ def test_projection_returns_the_distance_and_the_arc_length_of_a_point(
     arc_length, lateral = PROJECT(road, left_of(road, s, offset), guess)
     np.testing.assert_allclose(lateral, offset, atol=2e-3)
     np.testing.assert_allclose(arc_length, s, atol=5e-3)
-
-
-def test_left_of_the_path_is_positive(circle):
-    arc_length, lateral = PROJECT(
-        circle, np.float32([[0.0, 1.0], [0.0, -2.0]]), np.zeros(2, np.float32)
-    )
-    np.testing.assert_allclose(lateral, [1.0, -2.0], atol=1e-5)
-    np.testing.assert_allclose(arc_length, [0.0, 0.0], atol=1e-5)
 
 
 def test_projection_stays_finite_far_from_the_path_and_at_the_centre_of_a_circle(
@@ -186,16 +171,6 @@ def test_a_path_through_positions_on_a_circle_has_its_curvature_and_runs_through
         np.testing.assert_allclose(
             scenarios.point_at(path, jnp.asarray(s))[:3], expected, atol=5e-3
         )
-
-
-def test_a_path_keeps_turning_beyond_half_a_turn():
-    angle = np.linspace(0.0, 6.0, 600)
-    points = jnp.asarray(
-        np.column_stack([10 * np.cos(angle), 10 * np.sin(angle)]), dtype=jnp.float32
-    )
-    yaw = np.asarray(scenarios.path_through(points).points)[:, 2]
-    assert np.all(np.abs(np.diff(yaw)) < 0.1)
-    assert abs((yaw[-1] - yaw[0]) - 6.0) < 0.1
 
 
 @pytest.mark.parametrize(
