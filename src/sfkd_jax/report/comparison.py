@@ -5,48 +5,17 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Any
 
+from sfkd_jax import store
 from sfkd_jax.evaluation import SHARED
 from sfkd_jax.evaluation.formats import dig, is_number, plain
 from sfkd_jax.evaluation.metrics import Row
-from sfkd_jax.report import figures, style
+from sfkd_jax.report import figures, pages, style
+from sfkd_jax.report import rows as tables
+from sfkd_jax.report import run as runs
 from sfkd_jax.report.episodes import of_rows
 from sfkd_jax.report.film import film_of
-from sfkd_jax.report.pages import (
-    Page,
-    Part,
-    Picture,
-    Section,
-    Text,
-    to_latex,
-    write_page,
-)
-from sfkd_jax.report.rows import (
-    MARKS,
-    amount,
-    cross_table,
-    grouped,
-    metric_tables,
-    model_of,
-    printed_table,
-    record_table,
-    rmse_cell,
-    row_of,
-    shown_metrics,
-    title_of,
-)
-from sfkd_jax.report.run import (
-    empty_folder,
-    made_with,
-    read_certificate,
-    read_optional,
-)
-from sfkd_jax.store import (
-    as_artefact_error,
-    read_json,
-    write_bytes,
-    write_json,
-    writing,
-)
+from sfkd_jax.report.pages import Page, Part, Picture, Section, Text
+from sfkd_jax.report.rows import cross_table, grouped, record_table, title_of
 
 _TABLE = ("inner_loop", "sampling", "variation")
 """Rows of one table share these; its columns are vehicles and scenarios."""
@@ -69,17 +38,17 @@ def write_results_page(directory: Path) -> dict[str, Any]:
             arrays of a row are damaged; or the page cannot be written.
     """
     source, home = directory / "results.json", directory / "report"
-    with writing(home), as_artefact_error(source, ValueError):
-        results = read_json(source, keys=("rows",))
-        images = empty_folder(home / "figures")
+    with store.writing(home), store.as_artefact_error(source, ValueError):
+        results = store.read_json(source, keys=("rows",))
+        images = runs.empty_folder(home / "figures")
         page = _results(results, directory, images)
-        tables = [
-            (f"{title_of(group, _TABLE)}. {MARKS}", table)
+        captions = [
+            (f"{title_of(group, _TABLE)}. {tables.MARKS}", table)
             for group in grouped(results["rows"], _TABLE)
-            if (table := cross_table(group, rmse_cell))
+            if (table := cross_table(group, tables.rmse_cell))
         ]
-        write_bytes(home / "table1.tex", to_latex(tables).encode())
-        return write_page(page, home / "index.html", home / "results.md")
+        store.write_bytes(home / "table1.tex", pages.to_latex(captions).encode())
+        return pages.write_page(page, home / "index.html", home / "results.md")
 
 
 def write_comparison(root: Path, pattern: str, name: str) -> dict[str, Any]:
@@ -102,16 +71,16 @@ def write_comparison(root: Path, pattern: str, name: str) -> dict[str, Any]:
         ArtefactError: a file that is not JSON, or the disk refuses the page.
     """
     home = root / name / "comparison"
-    with writing(home):
+    with store.writing(home):
         found = sorted(path.parent for path in root.glob(f"{pattern}/settings.json"))
         if not found:
             raise ValueError(f"no run below {root} matches {pattern}")
         records = [_record(run, root) for run in found]
-        images = empty_folder(home / "figures")
+        images = runs.empty_folder(home / "figures")
         page = Page(f"Comparison of runs: {name}", _sweep(records, images))
         path = home / "comparison.json"
-        write_json(path, {"pattern": pattern, "rows": records})
-        written = write_page(page, home / "index.html", home / "report.md")
+        store.write_json(path, {"pattern": pattern, "rows": records})
+        written = pages.write_page(page, home / "index.html", home / "report.md")
         return written | {"comparison": str(path)}
 
 
@@ -120,18 +89,18 @@ def _results(results: dict[str, Any], directory: Path, images: Path) -> Page:
     rows: list[Row] = results["rows"]
     config = results.get("config") or {}
     options = config.get("comparison") or {}
-    first: list[Part] = [Text(MARKS), Text(amount(rows))]
+    first: list[Part] = [Text(tables.MARKS), Text(tables.amount(rows))]
     if isinstance(failed := results.get("failed"), dict) and failed:
         first.append(record_table("Failed", failed, "reason"))
     sections, metrics = [Section("", first)], []
     for number, group in enumerate(grouped(rows, _TABLE), 1):
-        title, table = title_of(group, _TABLE), cross_table(group, rmse_cell)
+        title, table = title_of(group, _TABLE), cross_table(group, tables.rmse_cell)
         parts: list[Part] = [table] if table else []
         panels = grouped(group, ("vehicle", "scenario"))
         path = style.save(images / f"rmse_{number}.png", figures.rmse_chart, panels)
         parts.append(Picture(path, f"RMSE of every row: {title}"))
         sections.append(Section(title, parts))
-        for metric in shown_metrics():
+        for metric in tables.shown_metrics():
             if table := cross_table(group, metric.text):
                 metrics.append(
                     Section(f"{metric.head()}: {title}", [table], folded=True)
@@ -139,15 +108,12 @@ def _results(results: dict[str, Any], directory: Path, images: Path) -> Page:
     for number, group in enumerate(grouped(rows, _FIGURE), 1):
         title, stem = title_of(group, _FIGURE), f"{number}"
         parts = _drawn(group, directory, images, title, stem)
-        if table := printed_table(group, options):
+        if table := tables.printed_table(group, options):
             parts += [Text("Beside the paper, which uses another simulator."), table]
         sections.append(Section(title, parts))
-    hidden = ("paper", "page")
-    shown = {key: value for key, value in options.items() if key not in hidden}
-    sections += [
-        *metrics,
-        *made_with(config | {"comparison": shown}, results.get("versions")),
-    ]
+    # The printed numbers are beside ours already.
+    config |= {"comparison": {k: v for k, v in options.items() if k != "paper"}}
+    sections += [*metrics, *runs.made_with(config, results.get("versions"))]
     return Page(plain(config.get("name") or "Comparison"), sections)
 
 
@@ -174,16 +140,20 @@ def _drawn(
 
 def _record(run: Path, root: Path) -> dict[str, Any]:
     """The settings of a run, and the rows of its system."""
-    settings, certificate = read_json(run / "settings.json"), read_certificate(run)
-    errors = read_optional(run / "open_loop.json")
-    with as_artefact_error(run / "results.json", ValueError):
-        rows = read_optional(run / "results.json").get("rows") or []
-        own = [row_of(group, model_of(settings)) for group in grouped(rows, SHARED)]
-    # A run that was not driven still has its predictions and its certificate.
-    ahead = zip(
-        errors.get("steps") or [], errors.get("position_rmse_m") or [], strict=False
+    settings, certificate = (
+        store.read_json(run / "settings.json"),
+        runs.read_certificate(run),
     )
-    about = {"open_loop_rmse_m": {str(step): error for step, error in ahead}}
+    errors = runs.read_optional(run / "open_loop.json")
+    with store.as_artefact_error(run / "results.json", ValueError):
+        rows = runs.read_optional(run / "results.json").get("rows") or []
+        own = [
+            tables.row_of(group, tables.model_of(settings))
+            for group in grouped(rows, SHARED)
+        ]
+    # A run that was not driven still has its predictions and its certificate.
+    ahead = [errors.get(key) or [] for key in ("steps", "position_rmse_m")]
+    about = {"open_loop_rmse_m": dict(zip(map(str, ahead[0]), ahead[1], strict=False))}
     about |= {"alpha": certificate.get("alpha"), "scenario": "not driven"}
     return {
         "run": str(run.relative_to(root)),
@@ -212,9 +182,8 @@ def _sweep(records: list[dict[str, Any]], images: Path) -> list[Section]:
     cells = {run: own if own[1:] else plain(*own) for run, own in cells.items() if own}
     refused = {one["run"]: one["refused"] for one in records if one["refused"]}
     parts: list[Part] = [record_table("Run", cells, *differing)]
-    parts += (
-        [record_table("Without a certificate", refused, "reason")] if refused else []
-    )
+    if refused:
+        parts.append(record_table("Without a certificate", refused, "reason"))
     numeric = [name for name in differing if all(map(is_number, columns[name]))]
     for name in numeric[:1]:
         rows = [(one["settings"][name], one["rows"][-1]) for one in records]
@@ -226,5 +195,5 @@ def _sweep(records: list[dict[str, Any]], images: Path) -> list[Section]:
         for row in one["rows"]:
             places.setdefault(title_of([row], SHARED), []).append((one["run"], row))
     for title, group in places.items():
-        sections.append(Section(title, [*metric_tables(group, "Run")]))
+        sections.append(Section(title, [*tables.metric_tables(group, "Run")]))
     return sections

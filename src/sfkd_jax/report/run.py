@@ -6,31 +6,15 @@ from importlib import resources
 from pathlib import Path
 from typing import Any
 
+from sfkd_jax import store
 from sfkd_jax.evaluation import SHARED, formats
 from sfkd_jax.evaluation.formats import DASH, dig, is_number, is_pair, plain, short
 from sfkd_jax.report import figures, style
-from sfkd_jax.report.episodes import Episodes, of_run
+from sfkd_jax.report import rows as tables
+from sfkd_jax.report.episodes import of_run
 from sfkd_jax.report.film import film_of
 from sfkd_jax.report.pages import Page, Part, Picture, Section, Text, write_page
-from sfkd_jax.report.rows import (
-    Table,
-    amount,
-    grouped,
-    metric_tables,
-    model_of,
-    name_of,
-    record_table,
-    title_of,
-)
-from sfkd_jax.store import (
-    SUFFIX,
-    ArtefactError,
-    as_artefact_error,
-    read_json,
-    read_jsonl,
-    read_manifest,
-    writing,
-)
+from sfkd_jax.report.rows import Table, record_table, title_of
 
 MADE_BY = {
     "results.json": "evaluate",
@@ -79,7 +63,7 @@ def write_report(run_dir: Path) -> dict[str, Any]:
             fit on a page; or the disk refuses the page.
     """
     home = run_dir / "report"
-    with writing(home):
+    with store.writing(home):
         images = empty_folder(home / "figures")
         page = _page(run_dir, images)
         return write_page(page, home / "index.html", home / "report.md")
@@ -87,13 +71,13 @@ def write_report(run_dir: Path) -> dict[str, Any]:
 
 def read_optional(path: Path) -> dict[str, Any]:
     """The JSON object in a file, empty without a file."""
-    return read_json(path) if path.exists() else {}
+    return store.read_json(path) if path.exists() else {}
 
 
 def read_policy(run: Path) -> dict[str, Any]:
     """The manifest of the weights of a run, empty without weights."""
-    path = run / f"policy{SUFFIX}"
-    return read_manifest(path, kind="policy") if path.exists() else {}
+    path = run / f"policy{store.SUFFIX}"
+    return store.read_manifest(path, kind="policy") if path.exists() else {}
 
 
 def read_certificate(run: Path) -> dict[str, Any]:
@@ -135,10 +119,12 @@ def _page(run_dir: Path, images: Path) -> Page:
     policy = read_policy(run_dir)
     if not policy:
         makes = "python -m sfkd_jax.train makes a run"
-        raise ArtefactError(f"{run_dir / 'policy'}{SUFFIX} is missing: {makes}")
+        raise store.ArtefactError(
+            f"{run_dir / 'policy'}{store.SUFFIX} is missing: {makes}"
+        )
     results = read_optional(run_dir / "results.json")
     settings = policy.get("config") or {}
-    certificate, system = read_certificate(run_dir), model_of(settings)
+    certificate, system = read_certificate(run_dir), tables.model_of(settings)
     proof = certificate if holds(certificate) else {}
     half = dig(proof, "corridor", "corridor_m")
     missing = [
@@ -151,14 +137,14 @@ def _page(run_dir: Path, images: Path) -> Page:
         ("Closed loop", "results.json", lambda: _scores(results)),
         (
             "Episodes",
-            f"episodes{SUFFIX}",
+            f"episodes{store.SUFFIX}",
             lambda: _driven(run_dir, system, half, images),
         ),
         ("Certificate", "certificate.json", lambda: _certified(certificate)),
         ("Open loop", "open_loop.json", lambda: _predicted(run_dir, proof, images)),
         ("Training", "metrics.jsonl", lambda: _learned(run_dir, images)),
     ):
-        with as_artefact_error(run_dir / file, ValueError):
+        with store.as_artefact_error(run_dir / file, ValueError):
             sections.append(Section(title, make()))
     used = settings | {"command": dig(results, "config", "command")}
     sections += made_with(used, policy.get("versions") or results.get("versions"))
@@ -170,9 +156,9 @@ def _page(run_dir: Path, images: Path) -> Page:
 def _scores(results: dict[str, Any]) -> list[Part]:
     """The metrics of all systems: tables for each group that may be compared."""
     parts: list[Part] = []
-    for group in grouped(results.get("rows") or [], SHARED):
-        parts.append(Text(f"{title_of(group, SHARED)}: {amount(group)}"))
-        parts += metric_tables([(name_of(row), row) for row in group])
+    for group in tables.grouped(results.get("rows") or [], SHARED):
+        parts.append(Text(f"{title_of(group, SHARED)}: {tables.amount(group)}"))
+        parts += tables.metric_tables([(tables.name_of(row), row) for row in group])
     return parts
 
 
@@ -186,19 +172,14 @@ def _driven(run_dir: Path, system: str, half: Any, images: Path) -> list[Part]:
             images / f"first_{number}.png", figures.first_episode, group, corridor
         )
         parts += [Text(f"{title}."), Picture(path, f"First episode: {title}")]
-        for one in _of_system(group, system):
+        own = [one for one in group if one.row.get("system") == system]
+        if own and len(own[0].lateral) > 1:
             path = images / f"all_{number}.png"
-            style.save(path, figures.all_episodes, one, corridor)
+            style.save(path, figures.all_episodes, own[0], corridor)
             parts.append(Picture(path, f"All episodes: {title}"))
         film = film_of(images / "film.gif", group, corridor) if number == 1 else None
         parts += [Picture(film, f"Film: {title}")] if film else []
     return parts
-
-
-def _of_system(group: list[Episodes], system: str) -> list[Episodes]:
-    """The first row of a system, if it has several episodes."""
-    own = [one for one in group if one.row.get("system") == system]
-    return [one for one in own[:1] if len(one.lateral) > 1]
 
 
 def _certified(record: dict[str, Any]) -> list[Part]:
@@ -217,21 +198,13 @@ def _certified(record: dict[str, Any]) -> list[Part]:
     columns = [("", "value"), ("", "rests on")]
     boxes = []
     for box, known in (_PATH if record.get("corridor") else _BODY).items():
-        corners = dig(record, "boxes", box)
-        sides = zip(*corners, strict=False) if is_pair_of_lists(corners) else []
         # Boxes of logged data name their own axes.
-        names = dig(record, "boxes", "names", box) or known
-        for name, side in zip(names, sides, strict=False):
+        for axis, name in enumerate(dig(record, "boxes", "names", box) or known):
+            side = [dig(record, "boxes", box, end, str(axis)) for end in "01"]
             boxes += [(f"{box}: {name}", [*map(short, side)])] if is_pair(side) else []
     parts: list[Part] = [Text(PROOF), Table("Quantity", columns, rows, prose=True)]
     heads = [("", "from"), ("", "to")]
     return [*parts, Table("Box", heads, boxes)] if boxes else parts
-
-
-def is_pair_of_lists(value: Any) -> bool:
-    """Whether a JSON value is a list of two lists."""
-    lists = isinstance(value, list) and all(isinstance(one, list) for one in value)
-    return lists and len(value) == 2
 
 
 def _predicted(run_dir: Path, proof: dict[str, Any], images: Path) -> list[Part]:
@@ -249,7 +222,7 @@ def _predicted(run_dir: Path, proof: dict[str, Any], images: Path) -> list[Part]
 def _learned(run_dir: Path, images: Path) -> list[Part]:
     """The loss by optimisation step."""
     log = run_dir / "metrics.jsonl"
-    lines = read_jsonl(log) if log.exists() else []
+    lines = store.read_jsonl(log) if log.exists() else []
     if not lines:
         return []
     path = style.save(images / "learning.png", figures.learning, lines)
