@@ -107,7 +107,8 @@ def _draw_errors(
     if corridor:
         style.draw_corridor(axes, corridor)
     # Of the others a bad one may leave the frame, lest it flatten the rest.
-    most = min(float(np.quantile(peaks, 0.85, method="higher")), LANE_HALF_WIDTH)
+    most = 3 * corridor if corridor else LANE_HALF_WIDTH
+    most = min(float(np.quantile(peaks, 0.85, method="higher")), most)
     reach = 1.15 * max(most, *always)
     axes.set(ylim=(-reach, reach), ylabel="lateral error [m]")
     axes.legend(loc="center left", bbox_to_anchor=(1.0, 0.5), handlelength=1.8)

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import base64
 import re
-from collections.abc import Iterator
 from pathlib import Path
 from typing import NamedTuple, TypeAlias
 
@@ -45,16 +44,6 @@ class Page(NamedTuple):
     title: str
     sections: list[Section]
 
-    @property
-    def shown(self) -> list[Section]:
-        """The sections with parts."""
-        return [section for section in self.sections if section.parts]
-
-    def parts(self) -> Iterator[Part]:
-        """All parts in their order."""
-        for section in self.shown:
-            yield from section.parts
-
 
 def write_page(page: Page, html: Path, markdown: Path) -> dict[str, object]:
     """Write a page, and return where it and its images are.
@@ -65,17 +54,14 @@ def write_page(page: Page, html: Path, markdown: Path) -> dict[str, object]:
     for path in (html, markdown):
         template = _ENVIRONMENT.get_template(f"page{path.suffix}")
         write_bytes(path, template.render(page=page, home=path.parent).encode())
-    pictures = [str(part.path) for part in page.parts() if isinstance(part, Picture)]
+    parts = [part for section in page.sections for part in section.parts]
+    pictures = [str(part.path) for part in parts if isinstance(part, Picture)]
     return {"report": str(html), "figures": pictures}
 
 
 def to_latex(captions: list[tuple[str, Table]]) -> str:
     """Tables with their captions as floats for booktabs."""
     return _ENVIRONMENT.get_template("tables.tex").render(tables=captions)
-
-
-def _kind(part: Part) -> str:
-    return type(part).__name__
 
 
 def _source(path: Path, home: Path) -> str:
@@ -118,4 +104,4 @@ _ENVIRONMENT = Environment(
     trim_blocks=True,
     lstrip_blocks=True,
 )
-_ENVIRONMENT.filters |= {"kind": _kind, "source": _source, "plain": _plain, "tex": _tex}
+_ENVIRONMENT.filters |= {"source": _source, "plain": _plain, "tex": _tex}

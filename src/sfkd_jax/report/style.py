@@ -112,11 +112,6 @@ def scenario_label(name: str) -> str:
     return name.upper() if re.fullmatch(r"s\d+", name) else name
 
 
-def file_stem(*words: str) -> str:
-    """Words as part of a file name."""
-    return re.sub(r"\W", "_", "_".join(filter(None, words)))
-
-
 def literal(text: str) -> str:
     """Escape text that matplotlib would read as a formula."""
     return text.replace("$", r"\$")
