@@ -9,7 +9,14 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from sfkd_jax.geometry import HEADING, LATERAL, PATH_SPEED, between, wrap_angle
+from sfkd_jax.geometry import (
+    HEADING,
+    LATERAL,
+    PATH_SPEED,
+    between,
+    rotate,
+    wrap_angle,
+)
 from sfkd_jax.types import (
     BODY,
     POSE,
@@ -238,6 +245,19 @@ def prediction_errors(
     return jnp.column_stack(
         [jnp.linalg.norm(kind, axis=1) for kind in (position, wrap_angle(yaw), body)]
     )
+
+
+def state_errors(
+    predicted: Float[Array, "time state"], true: Float[Array, "time state"]
+) -> Float[Array, "time state"]:
+    """Return predicted minus true states.
+
+    Position along and across the true heading [m], yaw wrapped [rad], body state.
+    """
+    # In the true heading, so that along and across mean the same everywhere.
+    position = jax.vmap(rotate)(-true[:, 2], predicted[:, :2] - true[:, :2])
+    yaw = wrap_angle(predicted[:, 2:3] - true[:, 2:3])
+    return jnp.concatenate([position, yaw, predicted[:, BODY] - true[:, BODY]], axis=1)
 
 
 def _kinds_along_path(gap: Float[Array, "*batch state"]) -> tuple[Array, Array, Array]:

@@ -9,8 +9,8 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from sfkd_jax.geometry import HEADING, LATERAL, PATH_SPEED, rotate, wrap_angle
-from sfkd_jax.rollout import in_batches, rollout, sliding_windows
+from sfkd_jax.geometry import HEADING, LATERAL, PATH_SPEED, wrap_angle
+from sfkd_jax.rollout import in_batches, rollout, sliding_windows, state_errors
 from sfkd_jax.types import BODY, Model, Params, Trajectory
 
 
@@ -65,10 +65,12 @@ def prediction_rmse(
     pieces = jax.tree.map(
         lambda leaf: leaf.reshape(-1, *leaf.shape[2:]), cut(trajectories)
     )
-    gaps = _path_gaps if along_path else _world_gaps
 
     def squares(piece: Trajectory) -> Float[Array, "horizon 4"]:
-        return gaps(predict(piece), piece.states[1:]) ** 2
+        predicted, true = predict(piece), piece.states[1:]
+        if along_path:
+            return _path_gaps(predicted, true) ** 2
+        return state_errors(predicted, true)[:, :4] ** 2
 
     return jnp.sqrt(jnp.mean(in_batches(squares, pieces, size=128), axis=0))
 
@@ -86,13 +88,3 @@ def _path_gaps(
             gap[:, PATH_SPEED],
         ]
     )
-
-
-def _world_gaps(
-    predicted: Float[Array, "horizon state"], true: Float[Array, "horizon state"]
-) -> Float[Array, "horizon 4"]:
-    """Errors along and across the true heading, of yaw and of speed."""
-    # In the true heading, so that along and across mean the same everywhere.
-    position = jax.vmap(rotate)(-true[:, 2], predicted[:, :2] - true[:, :2])
-    yaw = wrap_angle(predicted[:, 2] - true[:, 2])
-    return jnp.column_stack([position, yaw, predicted[:, 3] - true[:, 3]])

@@ -130,10 +130,15 @@ def fit(
                 # A state between two checkpoints is saved to resume from, but never
                 # selected as the best: an uninterrupted run does not have it.
                 score = record["validation_loss"] if saves else math.inf
-                if saves or requested:
+                # Looked at once, so that a signal from here on finds the next state.
+                stop = bool(requested)
+                if saves or stop:
                     checkpoints.save(done, state, validation_loss=score)
-                if requested:
-                    raise KeyboardInterrupt
+                if stop:
+                    break
+        # Also for a signal during the last step: what follows shall not begin.
+        if requested:
+            raise KeyboardInterrupt
         best = checkpoints.best_step() or steps
         return checkpoints.restore(best, state).params, best
     finally:

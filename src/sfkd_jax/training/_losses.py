@@ -10,9 +10,9 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from sfkd_jax.geometry import HEADING, LATERAL, rotate, wrap_angle
+from sfkd_jax.geometry import HEADING, LATERAL
 from sfkd_jax.ranges import Numbers
-from sfkd_jax.rollout import defects, rollout
+from sfkd_jax.rollout import defects, rollout, state_errors
 from sfkd_jax.types import (
     BODY,
     Environment,
@@ -37,18 +37,6 @@ def power_mean(values: Float[Array, "*shape"], power: int = 8) -> Scalar:
     # Powers of ratios at most 1; the largest value itself carries no gradient.
     largest = jax.lax.stop_gradient(jnp.max(values))
     return largest * jnp.mean((values / largest) ** power) ** (1.0 / power)
-
-
-def state_errors(
-    predicted: Float[Array, "time state"], true: Float[Array, "time state"]
-) -> Float[Array, "time state"]:
-    """Return predicted minus true states.
-
-    Position along and across the true heading [m], yaw wrapped [rad], body state.
-    """
-    position = jax.vmap(rotate)(-true[:, 2], predicted[:, :2] - true[:, :2])
-    yaw = wrap_angle(predicted[:, 2:3] - true[:, 2:3])
-    return jnp.concatenate([position, yaw, predicted[:, BODY] - true[:, BODY]], axis=1)
 
 
 def error_units(model: Model, space: Space) -> Float[Array, " state"]:
