@@ -18,7 +18,11 @@ VEHICLES = sorted(entry.name for entry in demo.SHIPPED.iterdir())
 
 def test_the_demo_drives_without_training_and_draws_an_animation(tmp_path):
     done = run_command(
-        "demo", "controller=mppi_tiny", "demo.episode_s=9.0", cwd=tmp_path
+        "demo",
+        "+experiment=s3_body",
+        "controller=mppi_tiny",
+        "demo.episode_s=9.0",
+        cwd=tmp_path,
     )
     document = last_line(done)
     assert set(document) == {"animation", "rows", "results"}
@@ -37,7 +41,6 @@ def test_the_demo_drives_without_training_and_draws_an_animation(tmp_path):
 def test_in_path_coordinates_the_demo_stays_in_the_corridor_of_its_policy(tmp_path):
     done = run_command(
         "demo",
-        "+experiment=s3",
         "demo.episode_s=9.0",
         "controller.mppi.num_samples=30",
         cwd=tmp_path,

@@ -157,7 +157,7 @@ def test_a_step_of_the_wrong_shape_is_one_line(tmp_path, monkeypatch):
     monkeypatch.syspath_prepend(tmp_path)
     limits = ("vehicle.control_low=[-0.4,-3.0]", "vehicle.control_high=[0.4,2.0]")
     own = settings(
-        "dataset=tiny", "vehicle=own", "vehicle.step=short_step:step", *limits
+        "+experiment=smoke", "vehicle=own", "vehicle.step=short_step:step", *limits
     )
     with pytest.raises(ValueError, match=r"^the step of vehicle own [^\n]*$"):
         data.ensure_dataset(data.source_of(own))
