@@ -61,7 +61,7 @@ def test_in_path_coordinates_the_demo_stays_in_the_corridor_of_its_policy(tmp_pa
 
 @pytest.mark.parametrize(
     "other",
-    ["vehicle.inner_loop=speed", "vehicle.mass=900.0", "vehicle.name=hovercraft"],
+    ["vehicle.inner_loop=speed", "vehicle.mass=900.0", "vehicle=own"],
 )
 def test_a_vehicle_without_a_shipped_policy_is_refused_at_once(tmp_path, other):
     done = run_command("demo", other, cwd=tmp_path, code=1)
