@@ -118,7 +118,6 @@ def learn(data: Dataset, steps: int, horizon: int):
         "boxes": {"env": (LOW, HIGH)},
         "horizon": horizon,
         "level": 0.9,
-        "monitor_level": 0.9,
     }
     proof = certification.issue(model, params, **splits, **options, attack_starts=0)
     certification.verify(

@@ -4,49 +4,69 @@ The policy is untrained, because the claims do not depend on training.
 """
 
 import copy
+from types import SimpleNamespace
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 import pytest
-from helpers import any_law
-from test_path_policy import saved, settings
+from helpers import TINY, any_law, path_space
 
-from sfkd_jax import build, policy
 from sfkd_jax import data as datasets
+from sfkd_jax import models
 from sfkd_jax.certification import (
     CertificationRefused,
     issue,
     output_metrics_from,
     verify_document,
 )
-from sfkd_jax.corridor import certify_corridor, corridor_by_speed, fastest_speeds
-from sfkd_jax.plants import along_path, kinematic
-from sfkd_jax.types import Trajectory
+from sfkd_jax.certification.corridor import (
+    certify_corridor,
+    closed_loop,
+    corridor_by_speed,
+    fastest_speeds,
+)
+from sfkd_jax.plants import kinematic
 
 DRIVEN = {"env_low": (0.3, -8.0), "env_high": (0.9, 8.0)}
-SMALL = {"drives": 24, "duration": 4.0, "attack_steps": 3000}
+SMALL = {"runs": 24, "duration": 4.0, "attack_steps": 3000}
 
 
 @pytest.fixture(scope="module")
-def trained(tmp_path_factory):
-    run_dir = tmp_path_factory.mktemp("policy")
-    saved(run_dir, law=any_law())
-    return policy.restore(run_dir)
+def trained():
+    options = TINY | {"frame": "path", "transport": False, "budget": "joint"}
+    model = models.sfkd(path_space(), **options)
+    params = model.init(jax.random.key(0))
+    return SimpleNamespace(model=model, params=params, law=any_law(), sha256="0" * 64)
 
 
 @pytest.fixture(scope="module")
-def config():
-    return settings("certification.level=0.9", "certification.attack_starts=1")
+def loop(trained):
+    return closed_loop(
+        kinematic(), trained.model, trained.params, trained.law, (0.015, 0.015, 0.002)
+    )
+
+
+DATA = DRIVEN | {
+    "seed": 0,
+    "speed": (8.0, 10.5),
+    "peak_curvature": 0.02,
+    "wavelengths": (50.0, 200.0),
+    "lateral_acceleration": 2.0,
+    "steering_excitation": (0.002, 0.025),
+    "speed_excitation": (0.05, 0.6),
+}
+
+
+def corridor_of(loop, outputs):
+    return certify_corridor(loop, output_metrics_from(outputs), DATA, 0.9, **SMALL)
 
 
 @pytest.fixture(scope="module")
-def document(trained, config):
-    """As `certify` makes it, with fewer and shorter drives."""
-    loop = along_path(kinematic(), trained.law)
+def document(trained, loop):
+    """As `certify` makes it, with fewer and shorter runs."""
     make = jax.jit(
         lambda key: datasets.generate_along_path(
-            loop, key, segments=120, steps=20, **DRIVEN
+            loop.plant, key, segments=120, steps=20, **DRIVEN
         )
     )
     driven = make(jax.random.key(1))
@@ -61,7 +81,7 @@ def document(trained, config):
         "env": [list(side) for side in DRIVEN.values()],
     }
     boxes["control"] = [[-0.03, -1.0, -0.02, 8.0], [0.03, 1.0, 0.02, 10.5]]
-    options = {"level": 0.9, "monitor_level": 0.9, "attack_starts": 0}
+    options = {"level": 0.9, "attack_starts": 0}
     result = issue(
         trained.model,
         trained.params,
@@ -70,9 +90,7 @@ def document(trained, config):
         boxes=boxes,
         **options,
     )
-    result["corridor"] = certify_corridor(
-        config, trained, output_metrics_from(result["outputs"]), **SMALL
-    )
+    result["corridor"] = corridor_of(loop, result["outputs"])
     return result | {"policy_sha256": trained.sha256}
 
 
@@ -87,11 +105,6 @@ def test_the_document_verifies_and_a_changed_one_does_not(document, trained):
     for part, name, value in (
         ("corridor", "corridor_m", 0.01),
         ("corridor", "coverage", 1.5),
-        (
-            "corridor",
-            "fixed_points",
-            document["corridor"]["fixed_points"] | {"push": 0.0},
-        ),
         ("outputs", "position", document["outputs"]["yaw"]),
     ):
         changed = copy.deepcopy(document)
@@ -107,39 +120,21 @@ def test_the_document_verifies_and_a_changed_one_does_not(document, trained):
 def test_what_is_claimed_is_one_sum_of_what_is_calibrated(document):
     result = document["corridor"]
     assert result["corridor_m"] == pytest.approx(
-        result["bounds"]["nominal"] + result["bounds"]["followed_position"]
+        result["bounds"]["nominal"] + result["bounds"]["vehicle_to_nominal_position"]
     )
     assert (
-        result["bounds"]["followed_position"] <= result["bounds"]["for_ever_position"]
+        result["bounds"]["vehicle_to_nominal_position"]
+        <= result["bounds"]["asymptotic_position"]
     )
     assert 0.6 <= result["coverage"] <= 1.0
-    assert result["drives"] == SMALL["drives"]
+    assert result["runs"] == SMALL["runs"]
     assert result["attack"]["over_tube"] <= 1.0
 
 
-def test_without_a_copy_the_corridor_is_wider_and_no_drive_of_the_class_leaves_it(
-    document,
-):
-    result, part = document["corridor"], document["corridor"]["fixed_points"]
-    between, after = part["corridor_m"], part["after_switch_m"]
-    assert (
-        result["bounds"]["for_ever_position"]
-        < between["law"]
-        < between["planner"]
-        < after["planner"]
-    )
-    assert after["law"] - between["law"] == pytest.approx(
-        after["planner"] - between["planner"]
-    )
-    assert result["seen"]["lateral_m"] < part["after_switch_m"]["planner"]
-    assert part["steps_between_switches"] == 30
-    assert part["points"] == 3 * 3 * SMALL["drives"] * 2 * 25
-
-
-def test_every_friction_and_speed_gets_a_corridor_of_its_own(document, trained):
+def test_every_friction_and_speed_gets_a_corridor_of_its_own(document, loop):
     frictions, speeds = [0.3, 0.9], [8.0, 10.5]
     result = corridor_by_speed(
-        trained, document, frictions=frictions, speeds=speeds, drives=24
+        loop, document, frictions=frictions, speeds=speeds, runs=24
     )
     cells = result["cells"]
     assert [(cell["friction"], cell["speed"]) for cell in cells] == [
@@ -151,19 +146,19 @@ def test_every_friction_and_speed_gets_a_corridor_of_its_own(document, trained):
     for cell in cells:
         assert cell["corridor_m"] == pytest.approx(cell["nominal_m"] + cell["tube_m"])
         assert cell["lateral_m"] > 0.0
-        assert cell["coverage_drives"] == 24
+        assert cell["coverage_runs"] == 24
     assert len({cell["corridor_m"] for cell in cells}) == 4
     assert result["coverage"] == pytest.approx(
         np.mean([cell["coverage"] for cell in cells])
     )
     assert result["coverage_ci95"][1] - result["coverage_ci95"][0] < 0.25
     alone = corridor_by_speed(
-        trained, document, frictions=frictions[:1], speeds=speeds[:1], drives=24
+        loop, document, frictions=frictions[:1], speeds=speeds[:1], runs=24
     )
     assert alone["cells"] == cells[:1]
 
 
-def test_speeds_and_frictions_outside_the_box_are_refused(document, trained):
+def test_speeds_and_frictions_outside_the_box_are_refused(document, loop):
     for name, values in (
         ("friction", {"frictions": [0.2], "speeds": [9.0]}),
         ("speed", {"frictions": [0.3], "speeds": [11.0]}),
@@ -171,7 +166,7 @@ def test_speeds_and_frictions_outside_the_box_are_refused(document, trained):
         with pytest.raises(
             ValueError, match=f"{name} .* is outside the certified range"
         ):
-            corridor_by_speed(trained, document, **values)
+            corridor_by_speed(loop, document, **values)
 
 
 def test_the_fastest_speed_is_one_below_which_every_corridor_fits():
@@ -196,109 +191,11 @@ def test_the_fastest_speed_is_one_below_which_every_corridor_fits():
     assert fastest_speeds(cells, 0.1) == dict.fromkeys(widths)
 
 
-def test_the_same_seed_gives_the_same_corridor(document, trained, config):
-    again = certify_corridor(
-        config, trained, output_metrics_from(document["outputs"]), **SMALL
-    )
+def test_the_same_seed_gives_the_same_corridor(document, loop):
+    again = corridor_of(loop, document["outputs"])
     assert {**again, "seconds": 0.0} == {**document["corridor"], "seconds": 0.0}
 
 
-def test_a_policy_without_a_law_has_no_corridor(trained, config, document):
+def test_a_policy_without_a_law_has_no_corridor(trained):
     with pytest.raises(ValueError, match="with its law"):
-        certify_corridor(
-            config,
-            trained._replace(law=None),
-            output_metrics_from(document["outputs"]),
-            **SMALL,
-        )
-
-
-def test_a_controller_with_a_corridor_is_shielded_if_shield_is_set(
-    document, trained, config
-):
-    """And then a request beyond its limits is cut, the copy reported, and both are off
-    without `shield`.
-    """
-    plant = kinematic()
-    reference = jnp.column_stack(
-        [jnp.arange(1, 21.0), jnp.zeros(20), jnp.zeros(20), jnp.full(20, 9.0)]
-    )
-    state = jnp.asarray([0.0, 0.0, 0.0, 9.0])
-    for shield in (True, False):
-        chosen = config["controller"] | {"shield": shield}
-        chosen["mppi"] = chosen["mppi"] | {"num_samples": 4}
-        built = build.build_controller(
-            chosen,
-            trained.model,
-            plant,
-            certificate=document,
-            law=trained.law,
-            **DRIVEN,
-        )
-        _, _, info = jax.jit(built.act)(
-            trained.params,
-            built.init(jax.random.key(0)),
-            state,
-            jnp.asarray([0.6, 0.0]),
-            reference,
-        )
-        assert ("corridor" in info) == shield
-        if shield:
-            assert info["corridor"] == pytest.approx(
-                document["corridor"]["corridor_m"], rel=1e-5
-            )
-            assert not info["outside_box"]
-
-
-def test_what_sensors_add_is_no_part_of_the_recorded_perturbation(trained):
-    """The recorded ν of a drive with sensors is the requested one, though the car moves
-    differently.
-    """
-    loop = along_path(kinematic(), trained.law)
-    config = {
-        "drives": 2,
-        "steps": 30,
-        "offset": (0.0, 0.0, 0.0),
-        "burn_in": 0,
-        **DRIVEN,
-    }
-
-    def noisy(key, state, inputs, env):
-        del state, inputs, env
-        return jnp.asarray([0.01, 0.0]) * jax.random.normal(key, (2,))
-
-    plain, seen = (
-        jax.jit(
-            lambda key, hook=hook: datasets.drive_switching(
-                loop, key, sensors=hook, **config
-            )
-        )(jax.random.key(4))
-        for hook in (None, noisy)
-    )
-    assert isinstance(plain, Trajectory)
-    np.testing.assert_allclose(plain.controls, seen.controls, rtol=1e-5)
-    assert float(jnp.max(jnp.abs(plain.states - seen.states))) > 1e-3
-    np.testing.assert_array_equal(plain.states[:, 0, 3:5], np.zeros((2, 2)))
-
-
-def test_a_filter_of_a_drive_sees_it_whole_and_its_answer_is_what_is_driven(trained):
-    loop = along_path(kinematic(), trained.law)
-    config = {"drives": 2, "steps": 30, "burn_in": 0, **DRIVEN}
-
-    def halve(start, inputs, envs):
-        assert (start.shape, inputs.shape, envs.shape) == ((6,), (30, 4), (30, 2))
-        return inputs.at[:, :2].multiply(0.5)
-
-    plain, cut = (
-        jax.jit(
-            lambda key, hook=hook: datasets.drive_switching(
-                loop, key, safety_filter=hook, **config
-            )
-        )(jax.random.key(5))
-        for hook in (None, halve)
-    )
-    np.testing.assert_allclose(
-        cut.controls[..., :2], 0.5 * plain.controls[..., :2], rtol=1e-6
-    )
-    again = jax.vmap(jax.vmap(loop.step))(cut.states[:, :-1], cut.controls, cut.envs)
-    np.testing.assert_allclose(again, cut.states[:, 1:], atol=1e-5)
+        closed_loop(kinematic(), trained.model, trained.params, None, ())

@@ -42,7 +42,7 @@ def document(**changes):
     }
     step = {"with": {"median_ms": 4.5}, "without": {"median_ms": 4.0}, "added_ms": 0.5}
     car = {
-        "bounds": {"nominal": 0.0781, "followed_position": 0.064},
+        "bounds": {"nominal": 0.0781, "vehicle_to_nominal_position": 0.064},
         "scripts": scripts,
         "step": step,
     }

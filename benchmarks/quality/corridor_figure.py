@@ -61,7 +61,7 @@ def drives(car, seconds, seed):
         "dt": car.plant.dt,
         "envs": np.asarray(road.envs),
         "width": bounds["nominal"],
-        "tube": bounds["followed_position"],
+        "tube": bounds["vehicle_to_nominal_position"],
         "lane": LANE,
         "kept": {
             name: lateral[EACH * row : EACH * (row + 1)]
@@ -107,7 +107,7 @@ def film(car, seconds, seed):
             report.Car(name, colour, *arrays)
             for (name, arrays), colour in zip(cars.items(), colours, strict=True)
         ],
-        corridor=bounds["nominal"] + bounds["followed_position"],
+        corridor=bounds["nominal"] + bounds["vehicle_to_nominal_position"],
     )
 
 

@@ -52,7 +52,7 @@ class Car(NamedTuple):
     @property
     def sensors(self):
         """Standard deviation of every entry of the state."""
-        noise = self.certificate["corridor"]["class"]["sensor_noise"]
+        noise = self.certificate["corridor"]["conditions"]["sensor_noise"]
         return jnp.asarray(noise[: len(self.plant.state_names)])
 
 
@@ -215,7 +215,7 @@ def summary(lateral, message, bounds):
     if not message:
         return result
     separate = np.abs(lateral[:, :-1] - message["copy"])
-    width, tube = bounds["nominal"], bounds["followed_position"]
+    width, tube = bounds["nominal"], bounds["vehicle_to_nominal_position"]
     result |= {
         "copy_m": float(np.max(np.abs(message["copy"]))),
         "distance_m": float(np.max(separate)),

@@ -23,7 +23,7 @@ def table(document):
     for name, car in document["cars"].items():
         bounds = car["bounds"]
         lines += [
-            f"{name}: W = {bounds['nominal']:.3f} m, tube {bounds['followed_position']:.3f} m",
+            f"{name}: W = {bounds['nominal']:.3f} m, tube {bounds['vehicle_to_nominal_position']:.3f} m",
             "",
         ]
         lines += [_row(head), _row(["---"] * len(head))]

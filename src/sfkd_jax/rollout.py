@@ -24,7 +24,6 @@ from sfkd_jax.types import (
     Environment,
     Explicit,
     Fiber,
-    Incremental,
     Key,
     Latent,
     Model,
@@ -144,7 +143,7 @@ def _structure(structure: Structure) -> Structure:
     """What is known of the weights, which an offset does not change."""
     explicit, rate = structure.explicit, structure.rate
 
-    def explicit_of(params: Offset) -> Explicit | Incremental:
+    def explicit_of(params: Offset) -> Explicit:
         assert explicit is not None
         return explicit(params.params)
 

@@ -61,20 +61,6 @@ class Polytope(NamedTuple):
     vertices: Float[Array, "vertex rank rank"]
 
 
-class Hypernetwork(NamedTuple):
-    """A(e) is the output of a tanh network of e, row by row.
-
-        vec A(e) = V_L tanh(… tanh(V_1 e + c_1) …) + c_L
-
-    Attributes:
-        weights: V_1 … V_L, each (out, in).
-        biases: c_1 … c_L.
-    """
-
-    weights: tuple[Float[Array, "_ _"], ...]
-    biases: tuple[Float[Array, " _"], ...]
-
-
 class Samples(NamedTuple):
     """A(e) at sampled environments only, (sample, rank, rank): evidence, no proof."""
 
@@ -113,35 +99,12 @@ class Explicit(NamedTuple):
         declared: the activation and the kind of transport.
     """
 
-    operators: Polytope | Hypernetwork | Samples
+    operators: Polytope | Samples
     residual: tuple[Float[Array, "_ _"], ...]
     residual_multipliers: tuple[Float[Array, " _"], ...]
     decoder: tuple[Float[Array, "_ _"], ...]
     decoder_multipliers: tuple[Float[Array, " _"], ...]
     readout: Float[Array, "body rank"]
-    declared: Declared
-
-
-class Incremental(NamedTuple):
-    """The state equation of a continuous-time model and a witness that it contracts.
-
-    ds/dt = A_0 s + A σ(W s + c) + g(u, e) in scaled units of s, per second; σ entry by
-    entry with slopes in [0, 1].
-
-    Attributes:
-        linear: A_0.
-        outer: A = [A_1 … A_M].
-        inner: W = [W_1; …; W_M].
-        metric: P, symmetric, proposed.
-        multipliers: λ of the diagonal Λ, proposed.
-        declared: the activation and the kind of transport.
-    """
-
-    linear: Float[Array, "body body"]
-    outer: Float[Array, "body hidden"]
-    inner: Float[Array, "hidden body"]
-    metric: Float[Array, "body body"]
-    multipliers: Float[Array, " hidden"]
     declared: Declared
 
 
@@ -179,12 +142,12 @@ class Structure(NamedTuple):
     """What is known of a model by construction; None where nothing is.
 
     Attributes:
-        explicit: params -> `Explicit`, `Incremental` in continuous time, or None.
+        explicit: params -> `Explicit`, or None.
         rate: params -> α, the contraction rate of `step`, or None if there is none.
         linear: fiber -> `LinearPredictor`, or None.
     """
 
-    explicit: Callable[[Params], Explicit | Incremental] | None = None
+    explicit: Callable[[Params], Explicit] | None = None
     rate: Callable[[Params], Scalar] | None = None
     linear: Callable[[Fiber], LinearPredictor] | None = None
 

@@ -1,6 +1,5 @@
 """Certificates of real weights: their constants, attacks and verification."""
 
-import dataclasses
 import json
 
 import jax
@@ -64,22 +63,6 @@ def test_the_constants_are_those_of_the_exported_weights():
     assert exact <= proved.rho <= exact * (1 + 1.1e-6)
     readout = np.linalg.norm(weights.readout, 2)
     assert readout <= proved.lipschitz["body"] <= readout * (1 + 1.1e-6)
-
-
-@pytest.mark.parametrize("name", ["sfkd", "segment"])
-@pytest.mark.parametrize("scale", [1.0, 3.0])
-def test_the_decoders_constants_bound_it_under_attack(name, scale):
-    weights, proved = explicit(name, scale), certified(name, scale).lipschitz
-    for part, rows in (
-        ("position", slice(0, 2)),
-        ("yaw", slice(2, 3)),
-        ("decoder", slice(0, 3)),
-    ):
-        attack = steepest_pattern((*weights.decoder[:-1], weights.decoder[-1][rows]))
-        assert attack <= proved[part] * (1 + 1e-12)
-        assert proved[part] < 1.25 * attack
-    assert max(proved["position"], proved["yaw"]) <= 1.05 * proved["decoder"]
-    assert proved["decoder"] <= 1.05 * np.hypot(proved["position"], proved["yaw"])
 
 
 def test_the_decoders_constants_bound_what_a_step_emits():
@@ -149,21 +132,10 @@ def test_weights_that_are_not_numbers_are_refused(leaf, value):
         certify(model, with_networks(params, **{leaf: spoiled}), BOX)
 
 
-@pytest.mark.parametrize("part", ["residual_weights", "decoder_weights"])
-def test_a_nan_anywhere_in_a_bounded_network_is_refused(part):
-    model, params = model_and_params("sfkd")
-    for leaf, value in params["networks"][part].items():
-        spoiled = np.array(value)
-        spoiled.flat[-1] = np.nan
-        network = params["networks"][part] | {leaf: spoiled}
-        with pytest.raises(CertificationRefused, match="not finite"):
-            certify(model, with_networks(params, **{part: network}), BOX)
-
-
 def test_a_rate_that_does_not_contract_is_refused_with_the_rate():
     _, params = model_and_params("sfkd")
     with pytest.raises(CertificationRefused, match=r"alpha = 1\.0.* is not below 1"):
-        certify(tiny(rho=0.95, beta=0.1), params, BOX, mode="separate", attack_starts=0)
+        certify(tiny(rho=1.04, beta=0.1), params, BOX, attack_starts=0)
 
 
 @pytest.mark.filterwarnings("ignore:invalid value")
@@ -193,53 +165,6 @@ def test_a_certificate_passes_its_own_check_also_after_a_walk_through_json(name)
     verify(restored, params, model=model)
 
 
-CLAIMS = ("alpha", "alpha_separate", "alpha_joint", "rho", "beta", "kappa")
-
-
-@pytest.mark.parametrize("claim", CLAIMS)
-def test_no_claim_can_be_made_smaller_by_hand(claim):
-    model, params = model_and_params("sfkd")
-    forged = dataclasses.replace(
-        certified("sfkd"), **{claim: 0.99 * getattr(certified("sfkd"), claim)}
-    )
-    with pytest.raises(CertificationRefused, match="does not follow"):
-        verify(forged, params, model=model)
-
-
-@pytest.mark.parametrize("part", ["body", "position", "yaw", "decoder"])
-def test_no_constant_of_the_decoder_can_be_made_smaller_by_hand(part):
-    model, params = model_and_params("sfkd")
-    constants = certified("sfkd").lipschitz
-    forged = dataclasses.replace(
-        certified("sfkd"), lipschitz=constants | {part: 0.9 * constants[part]}
-    )
-    with pytest.raises(CertificationRefused, match=f"{part} does not follow"):
-        verify(forged, params, model=model)
-
-
-@pytest.mark.parametrize("witness", ["residual", "joint", "decoder"])
-@pytest.mark.parametrize("factor", [0.5, -1.0, float("nan")])
-def test_a_spoiled_witness_is_no_witness(witness, factor):
-    model, params = model_and_params("sfkd")
-    spoiled = jax.tree.map(
-        lambda entry: factor * entry, certified("sfkd").witnesses[witness]
-    )
-    forged = dataclasses.replace(
-        certified("sfkd"), witnesses=certified("sfkd").witnesses | {witness: spoiled}
-    )
-    with pytest.raises(CertificationRefused, match="does not follow"):
-        verify(forged, params, model=model)
-
-
-def test_a_certificate_with_all_its_claims_scaled_together_is_no_certificate():
-    model, params = model_and_params("sfkd")
-    proved = certified("sfkd")
-    scaled = {name: 0.99 * getattr(proved, name) for name in CLAIMS[:-1]}
-    scaled["alpha_separate"] = scaled["rho"] + scaled["beta"]
-    with pytest.raises(CertificationRefused, match="does not follow"):
-        verify(dataclasses.replace(proved, **scaled), params, model=model)
-
-
 def test_a_certificate_does_not_cover_other_weights():
     model, params = model_and_params("sfkd")
     for leaf in ("operators", "centre"):
@@ -248,34 +173,3 @@ def test_a_certificate_does_not_cover_other_weights():
         )
         with pytest.raises(CertificateStale):
             verify(certified("sfkd"), changed, model=model)
-
-
-def test_what_is_not_a_certificate_is_named():
-    with pytest.raises(CertificationRefused, match="not a certificate: mode, scope"):
-        Certificate.from_document({"valid": True, "alpha": 0.5})
-
-
-@pytest.mark.parametrize("settings", [{"mode": "grid"}, {"metric": np.eye(8)}])
-def test_a_mode_that_does_not_exist_is_an_error(settings):
-    with pytest.raises(ValueError, match="mode must be one of joint, separate"):
-        certify(*model_and_params("sfkd"), BOX, **settings)
-
-
-@pytest.mark.parametrize(
-    "changes",
-    [
-        {"joint": [[]]},
-        {"joint": None},
-        {"residual": "none"},
-        {"residual": [[1.0]]},
-        {"metric": [[1.0]]},
-        {"yaw": None},
-    ],
-)
-def test_witnesses_of_another_shape_are_refused(changes):
-    model, params = model_and_params("sfkd")
-    forged = dataclasses.replace(
-        certified("sfkd"), witnesses=certified("sfkd").witnesses | changes
-    )
-    with pytest.raises(CertificationRefused, match=r"malformed|does not follow"):
-        verify(forged, params, model=model)

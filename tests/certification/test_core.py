@@ -63,15 +63,6 @@ def test_the_verdict_does_not_depend_on_the_unit(scale):
 
 
 @pytest.mark.filterwarnings("ignore:invalid value")
-def test_uncertainty_is_part_of_the_claim():
-    matrix = with_eigenvalues([0.5, 0.7, 1.0])
-    assert is_positive_definite(matrix, error=0.499)
-    assert not is_positive_definite(matrix, error=0.5)
-    assert not is_positive_definite(matrix, error=0.501)
-    assert not is_positive_definite(matrix, error=np.inf)
-
-
-@pytest.mark.filterwarnings("ignore:invalid value")
 def test_an_uncertainty_that_is_not_a_number_is_refused():
     assert not is_positive_definite(np.eye(3), error=np.nan)
 
@@ -114,34 +105,10 @@ def test_the_norm_bound_of_known_matrices_is_tight_from_above():
         assert exact * (1 - 1e-15) <= norm_upper(matrix) <= exact * (1 + 1e-9)
 
 
-def test_the_norm_bound_is_never_below_what_a_vector_shows():
-    random = np.random.default_rng(1)
-    for size in (2, 8, 24):
-        for _ in range(20):
-            matrix = random.standard_normal((size, size)) * 10.0 ** random.integers(
-                -6, 6, (size, 1)
-            )
-            _, values, right = np.linalg.svd(matrix)
-            shown = np.linalg.norm(
-                matrix.astype(np.longdouble) @ right[0].astype(np.longdouble)
-            )
-            shown /= np.linalg.norm(right[0].astype(np.longdouble))
-            assert shown <= norm_upper(matrix) <= values[0] * (1 + 1e-9)
-
-
 def test_the_norm_bound_of_nothing_is_nothing_and_of_nonsense_is_infinite():
     assert norm_upper(np.zeros((4, 3))) == 0.0
     for spoiled in (np.nan, np.inf):
         assert norm_upper(np.diag([1.0, spoiled])) == np.inf
-
-
-def test_the_norm_bound_of_a_float32_matrix_is_not_below_its_norm():
-    random = np.random.default_rng(0)
-    matrices = [random.standard_normal((16, 16)).astype(np.float32) for _ in range(100)]
-    assert all(
-        norm_upper(matrix) >= np.linalg.norm(matrix.astype(np.float64), 2)
-        for matrix in matrices
-    )
 
 
 WEIGHTS = [2.0 * rotation(6, 1), 0.5 * rotation(6, 2), 3.0 * rotation(6, 3)]
@@ -175,12 +142,6 @@ def test_other_multipliers_prove_nothing(spoil):
     assert not check_witness(WEIGHTS, spoil(*MULTIPLIERS), TRUE * (1 + 1e-6))
 
 
-def test_too_few_or_too_many_multipliers_prove_nothing():
-    assert not check_witness(WEIGHTS, MULTIPLIERS[:1], 1e6)
-    assert not check_witness(WEIGHTS, [*MULTIPLIERS, MULTIPLIERS[0]], 1e6)
-    assert not check_witness(WEIGHTS, [], 1e6)
-
-
 @pytest.mark.parametrize("layer", range(3))
 @pytest.mark.parametrize("spoiled", [np.nan, np.inf])
 def test_weights_that_are_not_finite_prove_nothing(layer, spoiled):
@@ -196,24 +157,6 @@ def test_a_bound_that_says_nothing_is_not_proved(bound):
 
 def test_a_negative_bound_is_not_proved():
     assert not check_witness(WEIGHTS, MULTIPLIERS, -2 * TRUE)
-
-
-def test_a_network_of_a_single_layer_has_the_norm_of_its_matrix():
-    assert check_witness([np.diag([5.0, 1.0])], [], 5.0 + 1e-6)
-    assert not check_witness([np.diag([5.0, 1.0])], [], 4.9)
-
-
-def test_layers_of_different_widths_fit_together():
-    random = np.random.default_rng(4)
-    weights = [random.standard_normal(shape) for shape in ((5, 3), (7, 5), (2, 7))]
-    norms = [np.linalg.norm(matrix, 2) for matrix in weights]
-    multipliers = [np.full(5, (norms[2] * norms[1]) ** 2), np.full(7, norms[2] ** 2)]
-    assert check_witness(weights, multipliers, np.prod(norms) * (1 + 1e-9))
-    assert not check_witness(
-        weights,
-        multipliers,
-        0.99 * np.linalg.norm(weights[2] @ weights[1] @ weights[0], 2),
-    )
 
 
 # --- nothing that LAPACK, the processor or an enemy does is believed ------------------
@@ -269,18 +212,6 @@ def test_whatever_a_factorisation_returns_an_indefinite_matrix_is_refused(
 ):
     monkeypatch.setattr(np.linalg, "cholesky", LIES[lie])
     assert not is_positive_definite(INDEFINITE[matrix])
-
-
-def test_a_factor_that_is_a_little_wrong_proves_nothing(monkeypatch):
-    """By more than the shift allows, which is about 1e-14 of the trace."""
-    matrix, true = with_eigenvalues([0.3, 0.7, 1.0]), np.linalg.cholesky
-    for wrong, accepted in ((1e-16, True), (1e-12, False), (1e-6, False)):
-        monkeypatch.setattr(
-            np.linalg,
-            "cholesky",
-            lambda shifted, wrong=wrong: true(shifted) * (1 + wrong),
-        )
-        assert is_positive_definite(matrix) == accepted
 
 
 def test_nothing_is_proved_on_a_processor_that_flushes_denormal_numbers(monkeypatch):

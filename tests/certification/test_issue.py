@@ -18,7 +18,7 @@ def certificate():
     return made("sfkd")
 
 
-FAST = {"level": 0.9, "horizon": 10, "monitor_level": 0.9, "attack_starts": 0}
+FAST = {"level": 0.9, "horizon": 10, "attack_starts": 0}
 
 
 def made(name, **settings):
@@ -36,13 +36,12 @@ def test_a_certificate_has_the_documented_keys(certificate):
     assert set(certificate) >= {
         *(
             "valid",
-            "mode",
             "scope",
             "alpha",
             "alpha_separate",
             "rho",
             "beta",
-            "kappa",
+            "lyapunov",
             "decoder_lipschitz",
         ),
         *(
@@ -89,13 +88,6 @@ def test_the_tubes_of_a_certificate_grow_to_the_ultimate_bound(certificate):
         assert len(radii) == 10
         assert np.all(np.diff(radii) > 0)
         assert np.all(np.isfinite(radii))
-
-
-def test_a_higher_level_gives_a_wider_tube(certificate):
-    wider = made("sfkd", level=0.96)
-    assert wider["d_bar"]["value"] > certificate["d_bar"]["value"]
-    assert wider["d_bar"]["coverage"] >= certificate["d_bar"]["coverage"]
-    assert wider["alpha"] == certificate["alpha"]  # proved, not measured
 
 
 def test_too_few_calibration_trajectories_are_refused():

@@ -90,28 +90,11 @@ def test_the_bound_of_a_network_with_a_known_constant_is_tight_from_above(name):
     )
 
 
-@pytest.mark.parametrize("name", EXACT)
-def test_the_known_constant_is_reached_by_some_slopes(name):
-    weights, _, exact = EXACT[name]
-    assert abs(steepest_pattern(weights, starts=1) - exact) <= 1e-9 * exact
-
-
 @pytest.mark.parametrize("factor", [0.3, 3.9])
 def test_multipliers_off_by_a_common_factor_cost_little(factor):
     weights, multipliers, exact = EXACT["orthogonal"]
     bound = lipschitz_upper(weights, [factor * part for part in multipliers])
     assert exact * (1 - 1e-14) <= bound <= exact * 1.01
-
-
-@pytest.mark.parametrize("name", EXACT)
-def test_no_multipliers_however_chosen_prove_less_than_the_constant(name):
-    weights, multipliers, exact = EXACT[name]
-    random = np.random.default_rng(0)
-    for _ in range(10):
-        guessed = [
-            part * np.exp(random.normal(0.0, 0.3, len(part))) for part in multipliers
-        ]
-        assert lipschitz_upper(weights, guessed) >= exact * (1 - 1e-14)
 
 
 def test_useless_multipliers_prove_nothing():
@@ -122,13 +105,6 @@ def test_useless_multipliers_prove_nothing():
         )
     assert lipschitz_upper(weights, multipliers[:1]) == np.inf
     assert lipschitz_upper(weights, []) == np.inf
-
-
-@pytest.mark.parametrize("layer", range(3))
-def test_weights_that_are_not_numbers_have_no_bound(layer):
-    weights = [matrix.copy() for matrix in EXACT["orthogonal"][0]]
-    weights[layer][0, 0] = np.nan
-    assert lipschitz_upper(weights, EXACT["orthogonal"][1]) == np.inf
 
 
 @pytest.mark.parametrize("scale", [1.0, 3.0])
@@ -338,11 +314,3 @@ def test_every_mutant_of_the_lipschitz_bound_is_caught_and_the_reference_is_not(
 ):
     verdicts = passed(LIPSCHITZ[certifier], NETWORKS)
     assert all(verdicts.values()) == (certifier == "reference"), verdicts
-
-
-def test_the_checks_do_not_condemn_another_sound_certifier():
-    """A plain eigenvalue check on a safe grid is sound here too: the suite tests
-    soundness, not one way to it.
-    """
-    verdicts = passed(lambda *network: 1.01 * unchecked(*network, witness), NETWORKS)
-    assert all(verdicts.values()), verdicts

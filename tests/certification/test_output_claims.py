@@ -1,37 +1,22 @@
-"""Metrics of outputs of tiny networks: honest ones hold, forged ones are refused.
-
-`benchmarks/robustness/mutants.py` runs these tests against mutants of
-`_output_metrics`.
-"""
+"""Metrics of outputs of tiny networks: honest ones hold, forged ones are refused."""
 
 import json
 
 import numpy as np
 import pytest
-from networks import HYPERNETWORK, NETWORK, ROOT, rotation
+from networks import NETWORK, ROOT, TURNED, rotation
 
-from sfkd_jax.certification import OutputMetric, _core, _output_metrics
+from sfkd_jax.certification import OutputMetric, _claims, _core
 from sfkd_jax.certification._claims import Refuted, readouts
-from sfkd_jax.certification._metric_search import _accepted
+from sfkd_jax.certification._metrics import _accepted
 from sfkd_jax.types import Declared, Polytope
 
-VERTICES = np.stack(
-    [
-        np.linalg.solve(ROOT, rate * rotation(3, k) @ ROOT)
-        for k, rate in enumerate((0.3, 0.5, 0.4))
-    ]
-)
-WEIGHTS = NETWORK._replace(
-    operators=Polytope(VERTICES),
-    decoder=(),
-    decoder_multipliers=(),
-    readout=rotation(3, 9) * np.asarray([[0.5], [2.0], [1.0]]),
-    declared=Declared("tanh", "identity", 2),
-)
+WEIGHTS = TURNED
+VERTICES = TURNED.operators.vertices
 JOINT = [[np.full(4, 1.2 + 0.1 * k)] for k in range(3)]
 HONEST = {
     name: _accepted(WEIGHTS, readouts(WEIGHTS)[name], ROOT @ ROOT, JOINT)
-    for name in _output_metrics.OUTPUTS
+    for name in _claims.OUTPUTS
 }
 """Found before anything is changed, so that a changed check cannot agree with a changed
 search.
@@ -41,7 +26,7 @@ every_output = pytest.mark.parametrize("name", HONEST)
 
 def require(name, claim, weights=WEIGHTS):
     """Past the types, which test runs check."""
-    check = _output_metrics.require_output_metric
+    check = _claims.require_output_metric
     getattr(check, "__wrapped__", check)(name, claim, weights)
 
 
@@ -158,12 +143,6 @@ def test_what_may_have_a_metric_is_a_polytope_without_transport_and_decoder():
         "position",
         claim,
         ": this model has no",
-        WEIGHTS._replace(operators=HYPERNETWORK),
-    )
-    refuted(
-        "position",
-        claim,
-        ": this model has no",
         WEIGHTS._replace(decoder=NETWORK.decoder),
     )
     refuted("body", claim, ": this model has no")
@@ -173,12 +152,12 @@ def test_what_is_read_is_bounded_with_its_rounding(monkeypatch):
     """b² P − C'C to the bit of its symmetry, and every term of what it loses."""
     calls = []
     monkeypatch.setattr(
-        _output_metrics,
+        _claims,
         "is_positive_definite",
         lambda *given: bool(calls.append(given)) or True,
     )
     rows, metric, bound = rotation(3, 4)[:2] / 3, ROOT @ ROOT, 0.7
-    assert _output_metrics.reads_within(rows, bound, metric)
+    assert _claims.reads_within(rows, bound, metric)
     ((matrix, error),) = calls
     np.testing.assert_allclose(
         matrix, 0.49 * metric - rows.T @ rows, rtol=1e-14, atol=1e-15
@@ -194,6 +173,6 @@ def test_what_is_read_is_bounded_with_its_rounding(monkeypatch):
 
 def test_nothing_is_warned_of(recwarn):
     """Overflow and NaN are refused by comparisons."""
-    assert not _output_metrics.reads_within(np.ones((1, 3)), 1e300, ROOT)
-    assert not _output_metrics.reads_within(np.full((1, 3), np.inf), 1.0, ROOT)
+    assert not _claims.reads_within(np.ones((1, 3)), 1e300, ROOT)
+    assert not _claims.reads_within(np.full((1, 3), np.inf), 1.0, ROOT)
     assert len(recwarn) == 0

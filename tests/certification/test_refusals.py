@@ -8,18 +8,15 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from helpers import ENV_HIGH, ENV_LOW, TINY, certified, model_and_params, space, tiny
+from helpers import ENV_HIGH, ENV_LOW, certified, model_and_params
 
-from sfkd_jax import models
 from sfkd_jax.certification import (
     CertificateContradicted,
     CertificationRefused,
     attack_transport,
     certify,
-    solve_metric,
-    verify,
 )
-from sfkd_jax.types import Hypernetwork, Polytope, Samples
+from sfkd_jax.types import Polytope, Samples
 
 BOX = (ENV_LOW, ENV_HIGH)
 
@@ -148,77 +145,8 @@ def test_operators_that_are_stable_for_every_environment_and_not_under_switching
         )
         < 1e-6
     )
-    for settings in ({}, {"mode": "separate"}):
-        with pytest.raises(CertificationRefused, match=r"alpha = 2\.0"):
-            certify(
-                declaring(model, operators=operators),
-                params,
-                BOX,
-                attack_starts=0,
-                **settings,
-            )
-
-
-def test_a_metric_certifies_what_the_identity_cannot_and_only_without_transport():
-    root = np.diag(np.geomspace(1.0, 4.0, 8))
-    turn = np.linalg.qr(np.random.default_rng(0).standard_normal((8, 8)))[0]
-    operators = Polytope(
-        jnp.asarray(
-            np.stack([np.linalg.solve(root, 0.7 * q @ root) for q in (turn, turn.T)])
-        )
-    )
-    _, params = model_and_params("sfkd")
-    still, turning = (
-        declaring(tiny(name, beta=0.02), operators=operators)
-        for name in ("no_transport", "sfkd")
-    )
-    metric = solve_metric(
-        [np.asarray(vertex, dtype=np.float64) for vertex in operators.vertices], 0.75
-    )
-    with pytest.raises(CertificationRefused, match="is not below 1"):
-        certify(still, params, BOX, mode="separate", attack_starts=0)
-    proved = certify(
-        still, params, BOX, mode="separate", metric=metric, attack_starts=0
-    )
-    assert 0.7 <= proved.rho <= 0.7501
-    assert proved.kappa <= 16.2
-    assert proved.alpha == proved.rho + proved.beta * proved.kappa**0.5 < 1
-    verify(proved, params, model=still)
-    with pytest.raises(CertificationRefused, match="a metric needs"):
-        certify(turning, params, BOX, mode="separate", metric=metric)
-    for spoiled in (-metric, np.nan * metric, np.eye(8), metric[:4, :4]):
-        with pytest.raises(CertificationRefused):
-            certify(
-                still, params, BOX, mode="separate", metric=spoiled, attack_starts=0
-            )
-
-
-def hypernetwork(gain):
-    """A(e) = 0.3 I + gain-sized motion, as a tanh network of the environment."""
-    random = np.random.default_rng(0)
-    first = random.standard_normal((6, 2)) * np.asarray([3.0, 0.12])
-    last = gain * random.standard_normal((64, 6)) / 10
-    return Hypernetwork(
-        (jnp.asarray(first), jnp.asarray(last)),
-        (jnp.asarray([-1.8] * 6), jnp.asarray(0.3 * np.eye(8).ravel())),
-    )
-
-
-def test_a_hypernetwork_is_certified_by_branch_and_bound_and_refused_when_it_is_too_long():
-    model, params = model_and_params("sfkd")
-    proved = certify(
-        declaring(model, operators=hypernetwork(0.3)), params, BOX, attack_starts=0
-    )
-    assert "branch and bound" in proved.scope
-    assert 0.3 < proved.rho < 0.9
-    # Cells widen the joint inequality and the sum of norms by different amounts:
-    # neither need be the smaller here.
-    assert proved.alpha == min(proved.alpha_joint, proved.alpha_separate)
-    verify(proved, params, model=declaring(model, operators=hypernetwork(0.3)))
-    with pytest.raises(CertificationRefused, match="is not below 1"):
-        certify(
-            declaring(model, operators=hypernetwork(3.0)), params, BOX, attack_starts=0
-        )
+    with pytest.raises(CertificationRefused, match=r"alpha = 2\.0"):
+        certify(declaring(model, operators=operators), params, BOX, attack_starts=0)
 
 
 @pytest.mark.parametrize(
@@ -289,14 +217,4 @@ def _distance(z, other, controls, envs, later):
     each = jax.vmap(moved)
     return jnp.linalg.norm(
         each(z, controls, envs, later) - each(other, controls, envs, later), axis=1
-    )
-
-
-@pytest.mark.parametrize("entries", [1, 3])
-def test_attacks_take_environments_of_any_size(entries):
-    sizes = {"env_mean": jnp.zeros(entries), "env_scale": jnp.ones(entries)}
-    model = models.sfkd(space()._replace(**sizes), **TINY)
-    params, box = model.init(jax.random.key(0)), ((-1.0,) * entries, (1.0,) * entries)
-    assert attack_transport(model, params, box, jax.random.key(1)) == pytest.approx(
-        1.0, abs=1e-5
     )

@@ -9,7 +9,7 @@ import pytest
 from helpers import ENV_HIGH, ENV_LOW, any_law, certified, jit, model_and_params
 
 from sfkd_jax import build, certification, control, models, plants
-from sfkd_jax.certification._exported import exported
+from sfkd_jax.certification._weights import exported
 from sfkd_jax.control.wrappers import _estimator as estimator
 from sfkd_jax.control.wrappers._adaptation import _compensation
 from sfkd_jax.geometry import path_state

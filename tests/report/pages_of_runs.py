@@ -70,7 +70,7 @@ def certificate(**more):
     radii = [0.0123 * (1 - 0.93207**k) / (1 - 0.93207) for k in range(1, 21)]
     corridor = {
         "corridor_m": 0.14301, "level": 0.95, "coverage": 0.99, "coverage_ci95": [0.96, 1.0],
-        "drives": 150, "class": {"speed": [8.0, 10.5], "duration_s": 60.0},
+        "runs": 150, "conditions": {"speed": [8.0, 10.5], "duration_s": 60.0},
     }  # fmt: skip
     return {
         "valid": True, "reason": None, "alpha": 0.93207, "weights_sha256": "ab" * 32,

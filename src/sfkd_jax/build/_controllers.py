@@ -341,7 +341,7 @@ def in_corridor(
         certificate: with a corridor.
     """
     corridor, boxes = certificate["corridor"], certificate["boxes"]
-    bounds, sensors = corridor["bounds"], corridor["class"]["sensor_noise"]
+    bounds, sensors = corridor["bounds"], corridor["conditions"]["sensor_noise"]
     low = tuple(edge - ROAD_MARGIN * abs(edge) for edge in boxes["control"][0][2:])
     high = tuple(edge + ROAD_MARGIN * abs(edge) for edge in boxes["control"][1][2:])
     allowance = ALLOWANCE * max(sensors[:2], default=0.0)
@@ -355,7 +355,7 @@ def in_corridor(
         model=model,
         law=law,
         width=bounds["nominal"],
-        tube=bounds["followed_position"],
+        tube=bounds["vehicle_to_nominal_position"],
         horizon=corridor["shield_horizon"],
         noise_allowance=allowance,
         control=(plant.control_low, plant.control_high),

@@ -11,9 +11,67 @@ import jax.numpy as jnp
 import numpy as np
 from scipy.optimize import minimize
 
+from sfkd_jax.certification._claims import Box, Claims, decoders
 from sfkd_jax.certification._core import Matrix, Vector
-from sfkd_jax.certification._environments import Box
+from sfkd_jax.certification._weights import CertificationRefused, Exported, one_thread
+from sfkd_jax.rollout import fold
 from sfkd_jax.types import POSE, Key, Model, Params
+
+FLOAT32 = 1e-5
+"""Relative excess over a bound that float32 rounding of the attacked model explains."""
+
+
+class CertificateContradicted(CertificationRefused):
+    """An attack exceeds a proved bound, which is a fault of the code, never of data.
+
+    Either this package is wrong or what the model declares about itself.
+    """
+
+
+def attack_claims(
+    model: Model,
+    params: Params,
+    weights: Exported,
+    claims: Claims,
+    box: Box,
+    starts: int,
+    seed: int,
+) -> dict[str, float]:
+    """Run all attacks and return the lower bounds that they reach, by name.
+
+    Raises:
+        CertificateContradicted: a lower bound exceeds the proved bound.
+    """
+    limits, reached = limits_of(claims, weights), {}
+    networks = {"residual": weights.residual, **decoders(weights)}
+    with one_thread():
+        for name, network in networks.items():
+            if network:
+                reached[f"{name}_slopes"] = attack_slopes(network, seed=seed)
+        reached["step_slopes"] = max(
+            attack_slopes(weights.residual, vertex, starts=8)
+            for vertex in weights.operators.vertices
+        )
+    if starts:
+        step_key, transport_key, decoder_key = jax.random.split(jax.random.key(seed), 3)
+        folded = jax.jit(partial(fold, model))(params)
+        reached["transport"] = attack_transport(model, folded, box, transport_key)
+        reached |= attack_decoder(model, folded, box, decoder_key, starts=starts)
+        reached["step"] = attack_step(model, folded, box, step_key, starts=starts)
+    for name, value in reached.items():
+        if not value <= limits[name] * (1 + FLOAT32):
+            raise CertificateContradicted(
+                f"INTERNAL ERROR: the attack on the {name} reaches {value:.6f}, "
+                f"above the bound {limits[name]:.6f}"
+            )
+    return reached
+
+
+def limits_of(claims: Claims, weights: Exported) -> dict[str, float]:
+    """Return the proved bound behind each attack, by name of the attack."""
+    limits = {"residual_slopes": claims.beta, "transport": 1.0, **claims.lipschitz}
+    limits |= {f"{name}_slopes": claims.lipschitz[name] for name in decoders(weights)}
+    return limits | {"step": claims.alpha, "step_slopes": claims.alpha}
 
 
 def attack_slopes(
@@ -61,14 +119,29 @@ def attack_slopes(
     return best
 
 
+def _chain(weights: Sequence[Matrix], slopes: Sequence[Vector]) -> Matrix:
+    """Return W_L D_{L-1} … D_1 W_1."""
+    chained = np.asarray(weights[0])
+    for slope, weight in zip(slopes, weights[1:], strict=True):
+        chained = weight @ (slope[:, None] * chained)
+    return chained
+
+
+def _best_layer(
+    weights: Sequence[Matrix], slopes: Sequence[Vector], base: Matrix, layer: int
+) -> Vector:
+    """Slopes of one layer that maximise u'(A + …)v for the current top pair (u, v)."""
+    left, _, right = np.linalg.svd(base + _chain(weights, slopes))
+    before = _chain(weights[: layer + 1], slopes[:layer]) @ right[0]
+    after = left[:, 0] @ _chain(
+        [np.eye(len(slopes[layer])), *weights[layer + 1 :]],
+        [np.ones(len(slopes[layer])), *slopes[layer + 1 :]],
+    )
+    return (before * after > 0).astype(float)
+
+
 def attack_step(
-    model: Model,
-    params: Params,
-    box: Box,
-    key: Key,
-    *,
-    starts: int = 12,
-    iterations: int = 120,
+    model: Model, params: Params, box: Box, key: Key, *, starts: int = 12
 ) -> float:
     """Maximise ||∂(T(e → e') F(z, u, e))/∂z||_2 of the float32 model by ascent.
 
@@ -82,7 +155,6 @@ def attack_step(
         box: lower and upper corner of E.
         key: for the starting points.
         starts: number of starting points.
-        iterations: L-BFGS-B iterations from each of them.
     """
     inject, *_ = _coordinates(model, params, len(box[0]))
 
@@ -92,19 +164,12 @@ def attack_step(
             model.transport(fiber, fiber_next, model.step(fiber, inject(z), control))
         )
 
-    options = {"starts": starts, "iterations": iterations}
-    jacobians = _steepest(step, model, params, box, key, **options)
+    jacobians = _steepest(step, model, params, box, key, starts=starts, iterations=120)
     return max(float(np.linalg.norm(jacobian, 2)) for jacobian in jacobians)
 
 
 def attack_decoder(
-    model: Model,
-    params: Params,
-    box: Box,
-    key: Key,
-    *,
-    starts: int = 12,
-    iterations: int = 60,
+    model: Model, params: Params, box: Box, key: Key, *, starts: int = 12
 ) -> dict[str, float]:
     """Maximise ||∂/∂z||_2 of each output of the float32 model, as `attack_step`.
 
@@ -118,7 +183,6 @@ def attack_decoder(
         box: lower and upper corner of E.
         key: for the starting points.
         starts: number of starting points.
-        iterations: L-BFGS-B iterations from each of them.
     """
     inject, *_ = _coordinates(model, params, len(box[0]))
 
@@ -129,15 +193,13 @@ def attack_decoder(
         after = model.decode(fiber, model.step(fiber, latent, control))
         return jnp.concatenate([after[POSE], model.decode(fiber, latent)])
 
-    options = {"starts": starts, "iterations": iterations}
-    jacobians = _steepest(outputs, model, params, box, key, **options)
+    ends = _steepest(outputs, model, params, box, key, starts=starts, iterations=60)
     if model.along_path:  # decoded from z: e_y, e_ψ, then the vehicle's own state
         parts = {"position": slice(6, 7), "yaw": slice(7, 8), "body": slice(8, None)}
-        return _largest_norms(jacobians, parts)
-    poses = [part for jacobian in jacobians for part in (jacobian[:3], jacobian[3:6])]
+        return _largest_norms(ends, parts)
+    poses = [part for jacobian in ends for part in (jacobian[:3], jacobian[3:6])]
     parts = {"position": slice(0, 2), "yaw": slice(2, 3), "decoder": slice(0, 3)}
-    body = _largest_norms(jacobians, {"body": slice(6, None)})
-    return _largest_norms(poses, parts) | body
+    return _largest_norms(poses, parts) | _largest_norms(ends, {"body": slice(6, None)})
 
 
 def _largest_norms(
@@ -176,20 +238,20 @@ def _steepest(
             jnp.log(jnp.sum(direction**2)) - jnp.log(jnp.sum(gain**2) + 1e-30)
         )
 
-    objective = jax.jit(jax.value_and_grad(loss, argnums=1))
+    with_gradient = jax.jit(jax.value_and_grad(loss, argnums=1))
     jacobian = jax.jit(
         lambda params, point: jax.jacfwd(at, argnums=1)(
             params, point[:rank], point[rank:inputs]
         )
     )
+
+    def objective(flat: Vector) -> tuple[float, Vector]:
+        value, gradient = with_gradient(params, jnp.asarray(flat, jnp.float32))
+        return float(value), np.nan_to_num(np.asarray(gradient, dtype=np.float64))
+
     limits = [(None, None)] * (inputs + rank)
     limits[envs] = 2 * list(zip(low, high, strict=True))
-    search = {
-        "method": "L-BFGS-B",
-        "jac": True,
-        "bounds": limits,
-        "options": {"maxiter": iterations},
-    }
+    search = {"method": "L-BFGS-B", "jac": True, "bounds": limits}
     jacobians = []
     for number, start_key in enumerate(jax.random.split(key, starts)):
         draw = jax.random.normal(start_key, (inputs + rank,))
@@ -198,8 +260,8 @@ def _steepest(
         start[: rank + controls] *= 10.0 ** (number % 4 - 2)
         share = np.arctan(start[envs]) / np.pi + 0.5
         start[envs] = np.tile(low, 2) + share * np.tile(high - low, 2)
-        solution = minimize(_float64(partial(objective, params)), start, **search)
-        steepest = jacobian(params, jnp.asarray(solution.x, jnp.float32))
+        end = minimize(objective, start, options={"maxiter": iterations}, **search).x
+        steepest = jacobian(params, jnp.asarray(end, jnp.float32))
         jacobians.append(np.asarray(steepest, dtype=np.float64))
     return jacobians
 
@@ -231,27 +293,6 @@ def attack_transport(
     return float(np.max(norms))
 
 
-def _chain(weights: Sequence[Matrix], slopes: Sequence[Vector]) -> Matrix:
-    """Return W_L D_{L-1} … D_1 W_1."""
-    chained = np.asarray(weights[0])
-    for slope, weight in zip(slopes, weights[1:], strict=True):
-        chained = weight @ (slope[:, None] * chained)
-    return chained
-
-
-def _best_layer(
-    weights: Sequence[Matrix], slopes: Sequence[Vector], base: Matrix, layer: int
-) -> Vector:
-    """Slopes of one layer that maximise u'(A + …)v for the current top pair (u, v)."""
-    left, _, right = np.linalg.svd(base + _chain(weights, slopes))
-    before = _chain(weights[: layer + 1], slopes[:layer]) @ right[0]
-    after = left[:, 0] @ _chain(
-        [np.eye(len(slopes[layer])), *weights[layer + 1 :]],
-        [np.ones(len(slopes[layer])), *slopes[layer + 1 :]],
-    )
-    return (before * after > 0).astype(float)
-
-
 def _coordinates(
     model: Model, params: Params, entries: int
 ) -> tuple[Callable[[Any], Any], int, int]:
@@ -278,15 +319,3 @@ def _coordinates(
         z.shape[0],
         weights.declared.controls,
     )
-
-
-def _float64(
-    objective: Callable[[Any], tuple[Any, Any]],
-) -> Callable[[Vector], tuple[float, Vector]]:
-    """Wrap a jitted float32 objective for scipy."""
-
-    def call(flat: Vector) -> tuple[float, Vector]:
-        value, gradient = objective(jnp.asarray(flat, jnp.float32))
-        return float(value), np.nan_to_num(np.asarray(gradient, dtype=np.float64))
-
-    return call

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 from functools import partial
-from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -15,18 +14,6 @@ from scipy.special import betaincinv
 from sfkd_jax.rollout import fibers_along, step_disturbances
 from sfkd_jax.types import Model, Params, Trajectory
 
-
-class Disturbance(NamedTuple):
-    """Largest one-step disturbances of trajectories.
-
-    Attributes:
-        scores: by trajectory and kind: latent |d_k|, position of the pose increment
-            [m], its yaw [rad], body state (2-norm in its own units).
-    """
-
-    scores: Float[np.ndarray, "trajectory 4"]
-
-
 KINDS = ("latent", "position", "yaw", "body")
 ROUNDING = 1e-9
 """Far above the rounding error of a share times a count."""
@@ -34,12 +21,22 @@ CHUNK = 50
 """Trajectories in a batch."""
 
 
-def disturbances(model: Model, params: Params, trajectories: Trajectory) -> Disturbance:
-    """Return the largest one-step disturbances of each trajectory.
+def disturbances(
+    model: Model, params: Params, trajectories: Trajectory
+) -> Float[np.ndarray, "trajectory 4"]:
+    """Return the largest one-step disturbances of each trajectory, by `KINDS`.
 
-    Every step starts at the true state. Transport defects and switches of e count.
+    Latent |d_k|, position of the pose increment [m], its yaw [rad], and body state
+    (2-norm in its own units). Every step starts at the true state. Transport defects
+    and switches of e count.
+
+    Args:
+        model: any model.
+        params: its weights.
+        trajectories: a batch.
     """
     count = trajectories.controls.shape[0]
+    # The last batch is filled up, so that one program serves all batches
     filled = jax.tree.map(
         lambda leaf: leaf[jnp.arange(-(-count // CHUNK) * CHUNK) % count], trajectories
     )
@@ -50,14 +47,14 @@ def disturbances(model: Model, params: Params, trajectories: Trajectory) -> Dist
     scores = np.concatenate(
         [np.asarray(_largest(model, params, part), dtype=np.float64) for part in parts]
     )
-    return Disturbance(scores[:count])
+    return scores[:count]
 
 
 @partial(jax.jit, static_argnums=0)
 def _largest(
     model: Model, params: Params, trajectories: Trajectory
 ) -> Float[Array, "trajectory 4"]:
-    """`disturbances` of one batch of fixed size, so that it is compiled once."""
+    """`disturbances` of one batch of fixed size."""
 
     def one(trajectory: Trajectory) -> Float[Array, " 4"]:
         fibers, later = fibers_along(model, params, trajectory)
@@ -85,6 +82,10 @@ def conformal_quantile(scores: Float[np.ndarray, " trajectory"], level: float) -
 
     A new, exchangeable score exceeds it with probability at most 1 − level.
 
+    Args:
+        scores: of calibration trajectories or runs.
+        level: 1 − δ.
+
     Raises:
         ValueError: too few scores for the level, a level outside (0, 1), or scores that
             are not finite.
@@ -105,50 +106,37 @@ def supports(count: int, level: float) -> bool:
     return math.ceil((count + 1) * level) <= count
 
 
-def monitor_units(reference: Disturbance) -> Float[np.ndarray, " 4"]:
-    """Return the 95 % quantile of each kind as its unit.
+def tube_units(
+    reference: Float[np.ndarray, "trajectory kind"], *, level: float
+) -> Float[np.ndarray, " kind"]:
+    """Return units in which the first kind decides the conformal score.
+
+    Its unit is its quantile at `level`; the other kinds exceed their units a tenth as
+    often. A tube multiplies the latent bound by up to 1/(1 − α) and adds the others
+    once, so these units make it tighter than equal quantiles do.
 
     Args:
-        reference: disturbances of a split other than the one for calibration.
-    """
-    return _quantiles(reference, np.full(len(KINDS), 0.95))
-
-
-def tube_units(reference: Disturbance, *, level: float) -> Float[np.ndarray, " 4"]:
-    """Return units in which the latent kind decides the conformal score.
-
-    The latent unit is its quantile at `level`; the other kinds exceed their units a
-    tenth as often. A tube multiplies the latent bound by up to 1/(1 − α) and adds the
-    others once, so these units make it tighter than equal quantiles do.
-
-    Args:
-        reference: disturbances of a split other than the one for calibration.
+        reference: scores of a split other than the one for calibration.
         level: of the conformal bounds.
-    """
-    return _quantiles(
-        reference,
-        np.where(np.asarray(KINDS) == "latent", level, 1.0 - 0.1 * (1.0 - level)),
-    )
-
-
-def _quantiles(
-    reference: Disturbance, shares: Float[np.ndarray, " 4"]
-) -> Float[np.ndarray, " 4"]:
-    """Return a quantile of each kind, or 1 for a kind that is always 0.
 
     Raises:
         ValueError: scores that are not finite.
     """
-    if not np.all(np.isfinite(reference.scores)):
+    if not np.all(np.isfinite(reference)):
         raise ValueError("residuals are not finite")
-    kinds = zip(reference.scores.T, shares, strict=True)
+    shares = [level, *[1.0 - 0.1 * (1.0 - level)] * (reference.shape[1] - 1)]
+    kinds = zip(reference.T, shares, strict=True)
     quantiles = np.asarray([np.quantile(kind, share) for kind, share in kinds])
+    # A kind that is always 0 needs no unit
     return np.where(quantiles > 0, quantiles, 1.0)
 
 
 def conformal_bounds(
-    units: Float[np.ndarray, " 4"], calibration: Disturbance, *, level: float
-) -> Float[np.ndarray, " 4"]:
+    units: Float[np.ndarray, " kind"],
+    calibration: Float[np.ndarray, "trajectory kind"],
+    *,
+    level: float,
+) -> Float[np.ndarray, " kind"]:
     """Return joint bounds on all kinds over a whole new trajectory (split-conformal).
 
     They hold with probability at least `level`. The score of a trajectory is its
@@ -156,31 +144,48 @@ def conformal_bounds(
 
     Args:
         units: of each kind, from a split other than `calibration`.
-        calibration: disturbances of the calibration split.
+        calibration: scores of the calibration split.
         level: 1 − δ.
 
     Raises:
         ValueError: too few trajectories for the level, or scores that are not finite.
     """
-    return units * conformal_quantile(np.max(calibration.scores / units, axis=1), level)
+    return units * conformal_quantile(np.max(calibration / units, axis=1), level)
 
 
-def coverage(bounds: Float[np.ndarray, " 4"], held_out: Disturbance) -> float:
-    """Return the share of held-out trajectories within all four bounds."""
-    return float(np.mean(np.all(held_out.scores <= bounds, axis=1)))
+def coverage(
+    bounds: Float[np.ndarray, " kind"],
+    held_out: Float[np.ndarray, "trajectory kind"],
+    runs: int | None = None,
+) -> dict[str, object]:
+    """Return the share of held-out trajectories within all bounds, and its interval.
+
+    Args:
+        bounds: on each kind.
+        held_out: scores of independent trajectories.
+        runs: number of independent runs that they were cut from; by default every
+            trajectory is one.
+    """
+    count, share = len(held_out), float(np.mean(np.all(held_out <= bounds, axis=1)))
+    return {
+        "coverage": share,
+        "coverage_ci95": coverage_interval(share, runs or count),
+        "coverage_trajectories": count,
+        "coverage_runs": runs or count,
+    }
 
 
-def coverage_interval(share: float, drives: int) -> list[float]:
+def coverage_interval(share: float, runs: int) -> list[float]:
     """Return the 95 % Clopper-Pearson interval of a coverage.
 
     If the share lies between two counts, the interval covers those of both.
 
     Args:
         share: of trajectories that were covered.
-        drives: number of independent drives that the trajectories were cut from.
+        runs: number of independent runs that the trajectories were cut from.
     """
-    counts = math.floor(share * drives + ROUNDING), math.ceil(share * drives - ROUNDING)
-    return [clopper_pearson(count, drives)[side] for side, count in enumerate(counts)]
+    counts = math.floor(share * runs + ROUNDING), math.ceil(share * runs - ROUNDING)
+    return [clopper_pearson(count, runs)[side] for side, count in enumerate(counts)]
 
 
 def clopper_pearson(

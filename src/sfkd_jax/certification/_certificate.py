@@ -4,26 +4,29 @@ from __future__ import annotations
 
 import dataclasses
 import time
+from collections.abc import Mapping
 from importlib.metadata import version
 from typing import Any
 
 import numpy as np
 
-from sfkd_jax.certification._attack_all import FLOAT32, attack_all, limits_of
-from sfkd_jax.certification._claims import Claims, Refuted, require_claims
-from sfkd_jax.certification._core import Matrix
-from sfkd_jax.certification._environments import Box
-from sfkd_jax.certification._exported import (
+from sfkd_jax.certification._attack import (
+    FLOAT32,
+    attack_claims,
+    attack_slopes,
+    limits_of,
+)
+from sfkd_jax.certification._claims import Box, Claims, Refuted, require_claims
+from sfkd_jax.certification._search import joint_bound, prove, residual_bound
+from sfkd_jax.certification._weights import (
     CertificationRefused,
     Exported,
     exported,
     fingerprint,
     one_thread,
 )
-from sfkd_jax.certification._proofs import prove
 from sfkd_jax.types import Model, Params
 
-MODES = ("joint", "separate")
 MALFORMED = (
     LookupError,
     TypeError,
@@ -45,23 +48,21 @@ class CertificateStale(Exception):
 
 @dataclasses.dataclass(frozen=True)
 class Certificate:
-    """Proved constants with their witnesses.
+    """Proved constants in the 2-norm with their witnesses.
 
     Attributes:
-        mode: "joint" or "separate".
         scope: the environments, and how all of them are covered.
-        alpha: contraction factor of a step, |F(z) − F(z')|_P ≤ α |z − z'|_P for all z,
-            z', u and all e of the scope.
-        alpha_separate: ρ + β √κ.
-        alpha_joint: of z ↦ A(e) z + r(z; u, e) as one map, or None.
-        rho: sup_e ||A(e)||_P.
+        alpha: contraction factor of a step, |F(z) − F(z')| ≤ α |z − z'| for all z, z',
+            u and all e of the scope: the smaller of the next two.
+        alpha_separate: ρ + β.
+        alpha_joint: of z ↦ A(e) z + r(z; u, e) as one map.
+        rho: sup_e ||A(e)||.
         beta: Lipschitz constant of r in z.
-        kappa: condition number of P, 1 for P = I.
         lipschitz: Lipschitz constants of the decoder's outputs "position" [m], "yaw"
             [rad], both ("decoder") and of "body".
         transport_lipschitz: Lipschitz constant of T(e → e').
         env_box: [low, high].
-        witnesses: multipliers (and P) of all proofs; `verify` needs no search.
+        witnesses: multipliers of all proofs; `verify` needs no search.
         params_sha256: hash of the weights.
         precision: how float arithmetic is accounted for.
         attack: largest contraction factor reached by an attack on the float32 model.
@@ -71,14 +72,12 @@ class Certificate:
         seconds: duration of the proof and the attacks.
     """
 
-    mode: str
     scope: str
     alpha: float
     alpha_separate: float
-    alpha_joint: float | None
+    alpha_joint: float
     rho: float
     beta: float
-    kappa: float
     lipschitz: dict[str, float]
     transport_lipschitz: float
     env_box: list[list[float]]
@@ -96,7 +95,7 @@ class Certificate:
         return dataclasses.asdict(self)
 
     @classmethod
-    def from_document(cls, document: dict[str, Any]) -> Certificate:
+    def from_document(cls, document: Mapping[str, Any]) -> Certificate:
         """Read a certificate from JSON values; other keys are ignored.
 
         Raises:
@@ -116,9 +115,7 @@ def certify(
     params: Params,
     env_box: Box,
     *,
-    mode: str = "joint",
     margin: float = 1e-4,
-    metric: Matrix | None = None,
     attack_starts: int = 6,
     seed: int = 0,
 ) -> Certificate:
@@ -128,10 +125,7 @@ def certify(
         model: a model with `explicit`.
         params: its weights as exported.
         env_box: lower and upper corner of E.
-        mode: "joint" bounds A(e) z + r(z; u, e) as one map; "separate" only ρ + β.
         margin: α must be at most 1 − margin.
-        metric: P of a proposed common Lyapunov function for the separate mode; ρ and κ
-            are recomputed.
         attack_starts: starting points of the ascent on the float32 model; with 0 there
             is no ascent and tightness is None.
         seed: of the attacks.
@@ -139,36 +133,30 @@ def certify(
     Raises:
         CertificationRefused: the model cannot be certified; gives the reason.
         CertificateContradicted: an attack exceeds a proved bound.
-        ValueError: unknown mode, a metric in joint mode, or an invalid box.
+        ValueError: an invalid box.
     """
     began = time.perf_counter()
     corners = np.asarray(env_box, dtype=np.float64)
     if corners.ndim != 2 or len(corners) != 2 or not np.all(corners[0] <= corners[1]):
         raise ValueError(f"env_box must be a lower and an upper corner, got {env_box}")
-    if mode not in MODES or (metric is not None and mode == "joint"):
-        raise ValueError(
-            f"mode must be one of {', '.join(MODES)}, and separate with a metric; "
-            f"got {mode!r}"
-        )
     weights = exported(model, params)
     try:
         with one_thread():
-            claims = prove(weights, env_box, joint=mode == "joint", metric=metric)
+            claims = prove(weights)
     except Refuted as reason:
         raise CertificationRefused(str(reason)) from None
     if not claims.alpha <= 1.0 - margin:  # refuses NaN as well
         raise CertificationRefused(
             f"alpha = {claims.alpha:.6f} (rho {claims.rho:.6f}, "
-            f"beta {claims.beta:.6f}, kappa {claims.kappa:.3g}) "
-            f"is not below 1 by the margin {margin:g}"
+            f"beta {claims.beta:.6f}) is not below 1 by the margin {margin:g}"
         )
-    attacks = attack_all(model, params, weights, claims, env_box, attack_starts, seed)
+    box = corners.tolist()
+    attacks = attack_claims(model, params, weights, claims, box, attack_starts, seed)
     attack = attacks.get("step")
     return Certificate(
-        mode=mode,
         **claims._asdict(),
         transport_lipschitz=1.0,
-        env_box=corners.tolist(),
+        env_box=box,
         params_sha256=fingerprint(params),
         precision=PRECISION,
         attack=attack,
@@ -229,11 +217,6 @@ def _require_consistent(
             f"alpha = {claims.alpha} is not below 1, "
             "or the transport is not nonexpansive"
         )
-    joint = certificate.mode == "joint"
-    if certificate.mode not in MODES or joint != (claims.alpha_joint is not None):
-        raise Refuted(
-            f"mode {certificate.mode!r} does not fit alpha_joint = {claims.alpha_joint}"
-        )
     if certificate.precision != PRECISION:
         raise Refuted("precision is not what is covered")
     limits = limits_of(claims, weights)
@@ -247,3 +230,34 @@ def _require_consistent(
     tightness = claims.alpha / step if step else None
     if certificate.attack != step or certificate.tightness != tightness:
         raise Refuted("attack or tightness does not follow from the attacks")
+
+
+def contraction_metrics(model: Model, params: Params) -> dict[str, float]:
+    """Return a quick estimate of α for the log of a training run; no certificate.
+
+    Args:
+        model: any model.
+        params: its weights as exported.
+
+    Returns:
+        "alpha", "alpha_separate" and "tightness" (α over the largest factor that an
+        attack on the slopes reaches); empty if nothing can be proved.
+    """
+    try:
+        weights = exported(model, params)
+    except CertificationRefused:
+        return {}
+    vertices = weights.operators.vertices
+    with one_thread():
+        rho = max(float(np.linalg.norm(vertex, 2)) for vertex in vertices)
+        separate = rho + residual_bound(weights)
+        joint, _ = joint_bound(weights, weights.residual_multipliers, iterations=15)
+        slopes = max(
+            attack_slopes(weights.residual, vertex, starts=4) for vertex in vertices
+        )
+    values = {
+        "alpha": min(joint, separate),
+        "alpha_separate": separate,
+        "tightness": min(joint, separate) / slopes,
+    }
+    return {name: value for name, value in values.items() if np.isfinite(value)}

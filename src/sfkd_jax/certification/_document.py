@@ -1,43 +1,233 @@
-"""Verification of certificate.json: proofs from their witnesses, and all arithmetic."""
+"""The certificate document of a policy: issued, and verified from its witnesses."""
 
 from __future__ import annotations
 
+import time
 from collections.abc import Mapping
-from typing import Any
+from functools import partial
+from typing import Annotated, Any
 
+import jax
 import numpy as np
 
-from sfkd_jax.certification._calibration import KINDS, coverage_interval, supports
+from sfkd_jax.certification._calibration import (
+    KINDS,
+    conformal_bounds,
+    coverage,
+    coverage_interval,
+    disturbances,
+    supports,
+    tube_units,
+)
 from sfkd_jax.certification._certificate import (
     MALFORMED,
     Certificate,
     CertificateStale,
+    certify,
     verify,
 )
-from sfkd_jax.certification._claims import Refuted
-from sfkd_jax.certification._corridor_claims import require_corridor
-from sfkd_jax.certification._exported import (
+from sfkd_jax.certification._claims import (
+    OUTPUTS,
+    LyapunovClaim,
+    OutputMetric,
+    Refuted,
+    require_lyapunov,
+    require_output_metric,
+)
+from sfkd_jax.certification._corridor import (
+    numbers,
+    require_corridor,
+    require_coverage,
+    require_equal,
+)
+from sfkd_jax.certification._lyapunov import prove_lyapunov
+from sfkd_jax.certification._tubes import (
+    FORMS,
+    latent_tube,
+    output_tubes,
+    path_tube,
+    physical_tube,
+    ultimate_tube,
+)
+from sfkd_jax.certification._weights import (
     CertificationRefused,
     Exported,
     exported,
     one_thread,
 )
-from sfkd_jax.certification._output_metrics import (
-    OUTPUTS,
-    OutputMetric,
-    require_output_metric,
-)
-from sfkd_jax.certification._output_tubes import FORMS
-from sfkd_jax.certification._tube import (
-    latent_tube,
-    path_tube,
-    physical_tube,
-    ultimate_tube,
-)
-from sfkd_jax.types import Model, Params
+from sfkd_jax.ranges import Fraction, Interval, NonNegativeInt
+from sfkd_jax.rollout import fold
+from sfkd_jax.types import Model, Params, Trajectory
 
-REPEATED = 1e-9
-"""Relative tolerance of recomputed values, for another order of summation."""
+
+def issue(
+    model: Model,
+    params: Params,
+    *,
+    validation: Trajectory,
+    calibration: Trajectory,
+    held_out: Mapping[str, Trajectory],
+    boxes: Mapping[str, Any],
+    runs: Mapping[str, int] | None = None,
+    horizon: int = 20,
+    level: Fraction = 0.95,
+    margin: Annotated[float, Interval("[0, 1)")] = 1e-4,
+    attack_starts: NonNegativeInt = 6,
+) -> dict[str, Any]:
+    """Certify a policy and return the certificate with its tubes as a document.
+
+    Args:
+        model: the model to certify.
+        params: its weights as exported.
+        validation: trajectories that fix the units of the scores.
+        calibration: trajectories that set d̄.
+        held_out: trajectories by name, on which coverage is counted; "test" is
+            exchangeable with `calibration`.
+        boxes: domain of s, u and e of the measurements; nothing is claimed outside.
+        runs: number of independent runs that the trajectories of "calibration" and
+            "test" were cut from; by default every trajectory is one. Guarantees are
+            about new runs only if there are enough of them.
+        horizon: of the tubes [steps].
+        level: 1 − δ of the conformal bounds.
+        margin: as in `certify`.
+        attack_starts: as in `certify`.
+
+    Raises:
+        CertificationRefused: the model cannot be certified; gives the reason.
+    """
+    began = time.perf_counter()
+    certificate = certify(
+        model, params, boxes["env"], margin=margin, attack_starts=attack_starts
+    )
+    weights = exported(model, params)
+    function, lyapunov = _lyapunov(weights)
+    folded = jax.jit(partial(fold, model))(params)
+    parts = {"validation": validation, "calibration": calibration}
+    try:
+        measured = _measure(model, folded, **parts, held_out=held_out, level=level)
+        if runs is not None:
+            measured = _counted_by_run(measured, runs)
+        outputs = output_tubes(
+            model,
+            folded,
+            weights,
+            **parts,
+            test=held_out["test"],
+            level=level,
+            lyapunov=function,
+        )
+    except ValueError as reason:
+        raise CertificationRefused(str(reason)) from None
+    return (
+        {"valid": True}
+        | certificate.document()
+        | {
+            "lyapunov": lyapunov,
+            "decoder_lipschitz": certificate.lipschitz.get("decoder"),
+            "d_bar": measured,
+            "tube": _tubes(model, certificate, measured, calibration, horizon),
+            "outputs": outputs,
+            "boxes": dict(boxes),
+            "seconds_proof": certificate.seconds,
+            "seconds": time.perf_counter() - began,
+        }
+    )
+
+
+def _lyapunov(weights: Exported) -> tuple[LyapunovClaim | None, dict[str, Any]]:
+    """A common Lyapunov function and its part of the document, or the reason for none.
+
+    Nothing else depends on it, so that a missing solver does not stop the rest.
+    """
+    try:
+        with one_thread():
+            function = prove_lyapunov(weights)
+    except Refuted as reason:
+        return None, {"reason": str(reason)}
+    return function, function.document()
+
+
+def _measure(
+    model: Model,
+    params: Params,
+    validation: Trajectory,
+    calibration: Trajectory,
+    held_out: Mapping[str, Trajectory],
+    level: float,
+) -> dict[str, Any]:
+    """One-step bounds at `level` for whole trajectories, and their coverage."""
+    reference = disturbances(model, params, validation)
+    scores = disturbances(model, params, calibration)
+    bounds = conformal_bounds(tube_units(reference, level=level), scores, level=level)
+    shares = {
+        name: coverage(bounds, disturbances(model, params, part))
+        for name, part in held_out.items()
+    }
+    one_step = dict(zip(KINDS, bounds.tolist(), strict=True))
+    return {
+        "value": one_step["latent"],
+        "level": level,
+        "trajectories": len(scores),
+        "runs": len(scores),
+        "holds_for": "new runs like these",
+        **shares.pop("test"),
+        "by_scenario": shares,
+        "one_step": one_step,
+        "validation": float(np.quantile(reference[:, 0], level)),
+    }
+
+
+def _counted_by_run(
+    measured: dict[str, Any], runs: Mapping[str, int]
+) -> dict[str, Any]:
+    """The same bounds of trajectories that were cut from fewer, independent runs."""
+    independent = runs.get("calibration", measured["runs"])
+    tested = runs.get("test", measured["coverage_runs"])
+    if not supports(independent, measured["level"]):
+        measured["holds_for"] = f"further segments of the same {independent} runs"
+    interval = coverage_interval(measured["coverage"], tested)
+    return measured | {
+        "runs": independent,
+        "coverage_runs": tested,
+        "coverage_ci95": interval,
+    }
+
+
+def _tubes(
+    model: Model,
+    certificate: Certificate,
+    measured: Mapping[str, Any],
+    calibration: Trajectory,
+    horizon: int,
+) -> dict[str, Any]:
+    """Tubes up to the horizon and their limit, from α, L and the one-step bounds."""
+    latent = latent_tube(certificate.alpha, measured["value"], horizon)
+    ultimate = measured["value"] / (1 - certificate.alpha)
+    constants = {
+        "alpha": certificate.alpha,
+        "lipschitz": certificate.lipschitz,
+        "residual": measured["one_step"],
+    }
+    largest, limit = None, None
+    if model.along_path:
+        physical = path_tube(latent, **constants)
+        limit = ultimate_tube(ultimate, **constants)
+    else:
+        positions = np.asarray(calibration.states, dtype=np.float64)[..., :2]
+        largest = float(np.max(np.linalg.norm(np.diff(positions, axis=-2), axis=-1)))
+        physical = physical_tube(latent, **constants, largest_increment=largest)
+    return {
+        "latent": latent.tolist(),
+        "physical": physical,
+        "ultimate": ultimate,
+        "asymptotic": limit,
+        "largest_increment_m": largest,
+    }
+
+
+def output_metrics_from(outputs: Mapping[str, Any]) -> dict[str, OutputMetric]:
+    """Read the proved metric of every output from a document."""
+    return {name: OutputMetric.from_document(part) for name, part in outputs.items()}
 
 
 def verify_document(
@@ -63,14 +253,16 @@ def verify_document(
         raise CertificationRefused(str(document.get("reason")))
     if document.get("policy_sha256") != policy_sha256:
         raise CertificateStale("the certificate is about other weights or settings")
-    proof = Certificate.from_document(dict(document))
+    proof = Certificate.from_document(document)
     weights = exported(model, params)
     verify(proof, params, model=model, weights=weights)
     try:
         _require_boxes(document["boxes"], proof)
-        _require_statistics(document["d_bar"], document["monitor"])
+        _require_statistics(document["d_bar"])
         _require_tubes(document["tube"], proof, document["d_bar"])
-        _require_outputs(document, weights)
+        with one_thread():
+            require_lyapunov(document["lyapunov"], weights)
+            _require_outputs(document, weights)
         if document["decoder_lipschitz"] != proof.lipschitz.get("decoder"):
             raise Refuted("decoder_lipschitz is not that of lipschitz")
     except Refuted as reason:
@@ -84,7 +276,7 @@ def verify_document(
 def _require_boxes(boxes: Mapping[str, Any], proof: Certificate) -> None:
     """Check that the boxes of body state, control and e are finite and not reversed."""
     for name in ("state", "control", "env"):
-        corners = _numbers(f"boxes.{name}", boxes[name])
+        corners = numbers(f"boxes.{name}", boxes[name])
         pair = corners.ndim == 2 and len(corners) == 2
         if not pair or not np.all(corners[0] <= corners[1]):
             raise Refuted(f"boxes.{name} is not a lower and an upper corner")
@@ -95,42 +287,24 @@ def _require_boxes(boxes: Mapping[str, Any], proof: Certificate) -> None:
         raise Refuted("boxes.env is not the box that was certified")
 
 
-def _require_statistics(d_bar: Mapping[str, Any], monitor: Mapping[str, Any]) -> None:
-    """Check measured bounds, levels, counts, coverages and their intervals."""
-    one_step = _numbers("d_bar.one_step", [d_bar["one_step"][kind] for kind in KINDS])
-    bounds = _numbers("monitor.bounds", monitor["bounds"])
-    complete = bounds.shape == (len(KINDS),)
-    if not complete or not np.all(bounds > 0) or not np.all(one_step >= 0):
-        raise Refuted("measured bounds must be four numbers above 0")
-    _require_equal("d_bar.value", d_bar["value"], d_bar["one_step"]["latent"])
-    levels = {"d_bar.level": d_bar["level"], "monitor.level": monitor["level"]}
-    trajectories, drives = d_bar["trajectories"], d_bar["drives"]
-    for name, level in levels.items():
-        if not 0 < level < 1 or not supports(trajectories, level):
-            raise Refuted(
-                f"{name} = {level!r} is not possible with {trajectories!r} trajectories"
-            )
-    if not 1 <= drives <= trajectories:
+def _require_statistics(d_bar: Mapping[str, Any]) -> None:
+    """Check measured bounds, level, counts, coverages and their intervals."""
+    one_step = numbers("d_bar.one_step", [d_bar["one_step"][kind] for kind in KINDS])
+    if not np.all(one_step >= 0):
+        raise Refuted("d_bar.one_step must be four numbers, none below 0")
+    require_equal("d_bar.value", d_bar["value"], d_bar["one_step"]["latent"])
+    trajectories, runs, level = d_bar["trajectories"], d_bar["runs"], d_bar["level"]
+    if not 0 < level < 1 or not supports(trajectories, level):
         raise Refuted(
-            f"d_bar.drives = {drives!r} does not fit {trajectories!r} trajectories"
+            f"d_bar.level = {level!r} is not possible "
+            f"with {trajectories!r} trajectories"
+        )
+    if not 1 <= runs <= trajectories:
+        raise Refuted(
+            f"d_bar.runs = {runs!r} does not fit {trajectories!r} trajectories"
         )
     for name, part in {"d_bar": d_bar, **d_bar["by_scenario"]}.items():
-        _require_coverage(name, part)
-
-
-def _require_coverage(name: str, part: Mapping[str, Any]) -> None:
-    """Check that a coverage is a count of trajectories, and its interval."""
-    count, drives = part["coverage_trajectories"], part["coverage_drives"]
-    share = part["coverage"]
-    inside = round(share * count)
-    if not 0 <= inside <= count or not 1 <= drives <= count:
-        raise Refuted(
-            f"{name}: a coverage of {share!r} is not possible with {count!r} "
-            f"trajectories of {drives!r} drives"
-        )
-    _require_equal(f"{name}: coverage", share, inside / count)
-    ends = coverage_interval(share, drives)
-    _require_equal(f"{name}: coverage_ci95", part["coverage_ci95"], ends)
+        require_coverage(name, part)
 
 
 def _require_tubes(
@@ -138,29 +312,30 @@ def _require_tubes(
 ) -> None:
     """Check R_k, its limit, and the radii in metres and radians."""
     latent = latent_tube(proof.alpha, d_bar["value"], len(tube["latent"]))
-    _require_equal("tube.latent", tube["latent"], latent)
+    require_equal("tube.latent", tube["latent"], latent)
     ultimate = d_bar["value"] / (1 - proof.alpha)
-    _require_equal("tube.ultimate", tube["ultimate"], ultimate)
+    require_equal("tube.ultimate", tube["ultimate"], ultimate)
     constants = {
         "alpha": proof.alpha,
         "lipschitz": proof.lipschitz,
         "residual": d_bar["one_step"],
     }
+    # With a decoder of increments the pose drifts: no limit, and the step length counts
     if "decoder" in proof.lipschitz:
-        stated = _numbers("tube.largest_increment_m", tube["largest_increment_m"])
+        stated = numbers("tube.largest_increment_m", tube["largest_increment_m"])
         largest, limit = float(stated), None
         physical = physical_tube(latent, **constants, largest_increment=abs(largest))
     else:
         largest, limit = 0.0, ultimate_tube(ultimate, **constants)
         physical = path_tube(latent, **constants)
     complete = set(tube["physical"]) == set(physical)
-    limited = (tube["for_ever"] is None) == (limit is None)
+    limited = (tube["asymptotic"] is None) == (limit is None)
     if largest < 0 or not complete or not limited:
         raise Refuted("tube is not of position, yaw and body state")
     for name, radius in (limit or {}).items():
-        _require_equal(f"tube.for_ever.{name}", tube["for_ever"][name], radius)
+        require_equal(f"tube.asymptotic.{name}", tube["asymptotic"][name], radius)
     for name, radii in physical.items():
-        _require_equal(f"tube.physical.{name}", tube["physical"][name], radii)
+        require_equal(f"tube.physical.{name}", tube["physical"][name], radii)
 
 
 def _require_outputs(document: Mapping[str, Any], weights: Exported) -> None:
@@ -170,35 +345,19 @@ def _require_outputs(document: Mapping[str, Any], weights: Exported) -> None:
         actual = ", ".join(map(str, outputs))
         raise Refuted(f"outputs must be {' and '.join(OUTPUTS)}, got {actual}")
     for name, part in outputs.items():
-        with one_thread():
-            require_output_metric(name, OutputMetric.from_document(part), weights)
+        require_output_metric(name, OutputMetric.from_document(part), weights)
+        runs = part["coverage_runs"]
         for form in FORMS:
-            if not _numbers(f"outputs.{name}.tube", part["tube"][form]) > 0:
+            if not numbers(f"outputs.{name}.tube", part["tube"][form]) > 0:
                 raise Refuted(f"outputs.{name}.tube.{form} is not a radius")
-            share, drives = part["coverage"][form], part["coverage_drives"]
-            counted = round(share * drives) / drives
-            _require_equal(f"outputs.{name}: coverage", share, counted)
-            stated, ends = part["coverage_ci95"][form], coverage_interval(share, drives)
-            _require_equal(f"outputs.{name}: coverage_ci95", stated, ends)
+            counted = {
+                "coverage": part["coverage"][form],
+                "coverage_ci95": part["coverage_ci95"][form],
+                "coverage_trajectories": runs,
+                "coverage_runs": runs,
+            }
+            require_coverage(f"outputs.{name}", counted)
     if corridor is not None:
         if not outputs:
             raise Refuted("a corridor needs a metric of every output")
-        require_corridor(corridor, outputs["position"])
-
-
-def _numbers(name: str, values: Any) -> np.ndarray:
-    """Return a part of the document as an array of finite numbers."""
-    array = np.asarray(values)
-    if array.dtype.kind not in "if" or not np.all(np.isfinite(array)):
-        raise Refuted(f"{name} must be finite numbers")
-    return array
-
-
-def _require_equal(name: str, stated: Any, derived: Any) -> None:
-    """Check a stated value against the derived one."""
-    expected = np.asarray(derived, dtype=np.float64)
-    actual = _numbers(name, stated)
-    if actual.shape != expected.shape or not np.all(
-        np.abs(actual - expected) <= REPEATED * np.abs(expected)
-    ):
-        raise Refuted(f"{name} does not follow from the rest of the document")
+        require_corridor(corridor)

@@ -355,24 +355,17 @@ def _switching(source: Source, segments: int) -> Trajectory:
 def check_calibration_size(
     dataset: Dataset, certification: CertificationSettings
 ) -> None:
-    """Check before training that the calibration part supports the levels.
+    """Check before training that the calibration part supports the level.
 
     Raises:
-        ValueError: naming the settings, and the largest levels that are possible.
+        ValueError: naming the setting, and the largest level that is possible.
     """
     count = dataset.calibration.controls.shape[0]
-    levels = {
-        "level": certification.level,
-        "monitor_level": certification.monitor_level,
-    }
-    too_high = [
-        name for name, level in levels.items() if math.ceil((count + 1) * level) > count
-    ]
-    if too_high:
-        given = " ".join(f"certification.{name}={levels[name]:g}" for name in too_high)
+    level = certification.level
+    if math.ceil((count + 1) * level) > count:
         highest = math.floor(100 * count / (count + 1)) / 100
-        possible = " ".join(f"certification.{name}={highest:g}" for name in too_high)
         raise ValueError(
-            f"{count} calibration segments are too few for {given}: "
-            f"record more, or pass {possible}"
+            f"{count} calibration segments are too few for "
+            f"certification.level={level:g}: "
+            f"record more, or pass certification.level={highest:g}"
         )

@@ -13,7 +13,7 @@ import numpy as np
 
 from sfkd_jax import build, evaluation, policy, store
 from sfkd_jax.build import System
-from sfkd_jax.certification import conformal_tube, latent_tube
+from sfkd_jax.certification import latent_tube
 from sfkd_jax.control import PathLaw
 from sfkd_jax.data import Dataset, to_path
 from sfkd_jax.experiment import data, runs, stages
@@ -350,20 +350,6 @@ def _claims(
     claims = evaluation.ClaimedBounds(
         level=level, threshold=settings.evaluation.threshold_m
     )
-    if dataset is not None:
-        try:
-            tube = conformal_tube(
-                system.model,
-                system.params,
-                validation=dataset.validation,
-                calibration=dataset.calibration,
-                level=level,
-                horizon=horizon,
-                stride=evaluation.STRIDE,
-            )
-            claims = claims._replace(conformal=tube)
-        except ValueError as reason:
-            store.print_message(f"  no conformal tube: {reason}")
     proof = system.certificate
     if proof is None:
         return claims

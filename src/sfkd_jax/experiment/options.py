@@ -19,7 +19,7 @@ from sfkd_jax.build import (
     VehicleSettings,
 )
 from sfkd_jax.certification import issue
-from sfkd_jax.corridor import certify_corridor
+from sfkd_jax.certification.corridor import certify_corridor
 from sfkd_jax.ranges import (
     Bounds,
     Entries,
@@ -147,18 +147,14 @@ class CertificationSettings(Kinds):
 
     Attributes:
         renew: whether `certify` replaces a certificate of other weights.
-        mode: of the proof.
         horizon: of the tubes [steps].
         level: of the tubes.
-        monitor_level: of the one-step bounds.
         corridor: arguments of `certify_corridor`.
     """
 
     renew: bool = False
-    mode: str = "joint"
     horizon: int = 20
     level: Fraction = 0.95
-    monitor_level: Fraction = 0.99
     corridor: Any = None
 
     @classmethod
@@ -343,8 +339,7 @@ _MEASURED = (
     "calibration",
     "held_out",
     "boxes",
-    "drives",
-    "sensor_noise",
+    "runs",
 )
 _CERTIFICATION: type = schema(
     "Certification",

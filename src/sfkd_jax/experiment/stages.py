@@ -14,16 +14,13 @@ import numpy as np
 
 from sfkd_jax import build, policy, store
 from sfkd_jax.certification import (
-    MODES,
     CertificationRefused,
-    certify_incremental,
     contraction_metrics,
-    is_incremental,
     issue,
     output_metrics_from,
 )
+from sfkd_jax.certification.corridor import certify_corridor, closed_loop
 from sfkd_jax.control import PathLaw
-from sfkd_jax.corridor import certify_corridor
 from sfkd_jax.data import (
     SCENARIOS,
     Dataset,
@@ -46,8 +43,6 @@ from sfkd_jax.types import Key, Model, Params, Space, Trajectory
 
 SCORED_SCENARIOS = ("s1", "s2")
 """Of the validation runs that trainings are compared on: S3 stays unseen."""
-INCREMENTAL = "incremental.json"
-"""File for the rate of a continuous flow, which has no tubes and no monitor bounds."""
 
 
 def check_settings(settings: Settings, plant: Vehicle) -> None:
@@ -69,7 +64,6 @@ def check_settings(settings: Settings, plant: Vehicle) -> None:
             f"training.window={window} does not fit segments "
             f"of dataset.steps={options.steps}"
         )
-    choose(dict.fromkeys(MODES), settings.certification.mode, "certification.mode")
     source = source_of(settings)
     sizes = _sizes(source, plant)
     law = _zero_law(sizes) if source.along_path else None
@@ -272,8 +266,7 @@ def _validation_score(
 
 def certificate_path(run_dir: Path) -> Path:
     """Return the path of the certificate of a run, whether or not it exists."""
-    incremental = run_dir / INCREMENTAL
-    return incremental if incremental.exists() else run_dir / policy.CERTIFICATE
+    return run_dir / policy.CERTIFICATE
 
 
 def certify_policy(settings: Settings) -> dict[str, Any]:
@@ -283,13 +276,8 @@ def certify_policy(settings: Settings) -> dict[str, Any]:
     """
     began, run_dir = time.perf_counter(), settings.run_dir
     trained = ensure_policy(settings)
-    incremental = is_incremental(trained.model, trained.params)
     try:
-        document = (
-            certify_incremental(trained.model, trained.params, dt=trained.vehicle.dt)
-            if incremental
-            else _certify_tubes(settings, trained)
-        )
+        document = _certify_tubes(settings, trained)
     except CertificationRefused as reason:
         document = {"valid": False, "reason": str(reason)}
     versions = store.versions() | document.get("versions", {})
@@ -300,11 +288,10 @@ def certify_policy(settings: Settings) -> dict[str, Any]:
         "versions": versions,
     }
     document["seconds"] = time.perf_counter() - began
-    names = (INCREMENTAL, policy.CERTIFICATE)
-    written, stale = names if incremental else reversed(names)
-    (run_dir / stale).unlink(missing_ok=True)
-    store.write_json(run_dir / written, document)
+    store.write_json(certificate_path(run_dir), document)
     store.print_message(f"certificate: {_verdict(document)}")
+    if reason := document.get("lyapunov", {}).get("reason"):
+        store.print_message(f"certificate: {reason}")
     return document
 
 
@@ -330,9 +317,8 @@ def _certify_tubes(settings: Settings, trained: policy.TrainedModel) -> dict[str
     source, options = source_of(settings), settings.certification
     dataset, _ = data.ensure_dataset(source)
     boxes: dict[str, Any] = data.boxes(dataset)
-    noise = settings.evaluation.observation_noise
-    if source.logs:  # the noise of the sensors is already in the logs
-        boxes, noise = boxes | {"names": source.columns}, ()
+    if source.logs:
+        boxes |= {"names": source.columns}
     document = issue(
         trained.model,
         trained.params,
@@ -340,20 +326,22 @@ def _certify_tubes(settings: Settings, trained: policy.TrainedModel) -> dict[str
         calibration=dataset.calibration,
         held_out=data.held_out_parts(source, dataset),
         boxes=boxes,
-        drives=dataset.drives,
-        sensor_noise=noise,
+        runs=dataset.drives,
         **arguments(options, issue),
     )
     if document["outputs"] and source.logs is None:
+        loop = closed_loop(
+            build.build_vehicle(settings.vehicle),
+            trained.model,
+            trained.params,
+            trained.law,
+            settings.evaluation.observation_noise,
+        )
         document["corridor"] = certify_corridor(
-            {
-                "vehicle": settings.vehicle,
-                "dataset": plain(settings.dataset) | settings.environment.box,
-                "evaluation": {"observation_noise": noise},
-                "certification": {"level": options.level},
-            },
-            trained,
+            loop,
             output_metrics_from(document["outputs"]),
+            plain(settings.dataset) | settings.environment.box,
+            options.level,
             **arguments(options.corridor, certify_corridor),
         )
     return document

@@ -13,14 +13,11 @@ from sfkd_jax.models._continuous import continuous, mlp
 from sfkd_jax.ranges import Positive
 from sfkd_jax.types import (
     Control,
-    Declared,
     Environment,
-    Incremental,
     Key,
     Model,
     Params,
     Space,
-    Structure,
 )
 
 GAIN = 0.3
@@ -53,6 +50,26 @@ class Synthesis(NamedTuple):
         return self.linear @ body + self.outer @ jnp.tanh(
             self.inner @ body + self.offsets
         )
+
+
+class Contracting(NamedTuple):
+    """The state equation and what proves that it contracts, see `control_synth`.
+
+    ds/dt = A_0 s + A σ(W s + c) + g(u, e) in scaled units of s, per second.
+
+    Attributes:
+        linear: A_0.
+        outer: A = [A_1 … A_M].
+        inner: W = [W_1; …; W_M].
+        metric: P.
+        multipliers: λ of the diagonal Λ.
+    """
+
+    linear: Float[Array, "body body"]
+    outer: Float[Array, "body hidden"]
+    inner: Float[Array, "hidden body"]
+    metric: Float[Array, "body body"]
+    multipliers: Float[Array, " hidden"]
 
 
 class ControlSynthFiber(NamedTuple):
@@ -131,11 +148,8 @@ def control_synth(
         read = jnp.zeros(control + space.env_mean.shape[0])
         return _initial(key, body, networks * width, inputs, read)
 
-    def explicit(params: Params) -> Incremental:
-        return contracting(params["free"], rate, Declared("tanh", "identity", control))
-
     def fiber(params: Params, env: Environment) -> ControlSynthFiber:
-        flow = explicit(params)
+        flow = contracting(params["free"], rate)
         change = Synthesis(
             flow.linear, flow.outer, flow.inner, params["free"]["offsets"]
         )
@@ -158,7 +172,6 @@ def control_synth(
         fiber=fiber,
         rates=rates,
         environment=environment,
-        structure=Structure(explicit=explicit),
     )
 
 
@@ -187,7 +200,7 @@ def _initial(
     }
 
 
-def contracting(free: Params, rate: float, declared: Declared) -> Incremental:
+def contracting(free: Params, rate: float) -> Contracting:
     """Map free matrices to a state equation that contracts at `rate` [1/s].
 
     See `control_synth` for the parametrisation.
@@ -207,11 +220,10 @@ def contracting(free: Params, rate: float, declared: Declared) -> Incremental:
     slack = ROUNDING * jnp.sum(T**2) * jnp.sum(T_inverse**2) * size
     # The margin is no design variable: gradients through it only add noise.
     linear -= (rate + jax.lax.stop_gradient(slack)) * jnp.eye(body)
-    return Incremental(
+    return Contracting(
         linear=T_inverse @ linear @ T,
         outer=T_inverse @ A * roots,
         inner=W @ T / roots[:, None],
         metric=0.5 * (P + P.T),
         multipliers=roots**2,
-        declared=declared,
     )

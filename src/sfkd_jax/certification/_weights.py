@@ -12,7 +12,7 @@ import numpy as np
 from threadpoolctl import ThreadpoolController
 
 from sfkd_jax.rollout import unfold
-from sfkd_jax.types import Incremental, Model, Params, Samples
+from sfkd_jax.types import Model, Params, Samples
 
 ACTIVATIONS = ("tanh", "relu", "sigmoid", "softplus", "elu")
 """Activations with slopes in [0, 1] everywhere, which excludes gelu and silu."""
@@ -20,7 +20,7 @@ TRANSPORTS = ("identity", "rotation")
 COMPILER_OPTIONS = {"xla_backend_optimization_level": 1}
 """Less optimisation, since full optimisation compiles longer than it saves here."""
 Exported: TypeAlias = Any
-"""An `Explicit` (or an `Incremental`) whose leaves are float64 numpy arrays."""
+"""An `Explicit` whose leaves are float64 numpy arrays."""
 
 
 class CertificationRefused(Exception):
@@ -30,37 +30,13 @@ class CertificationRefused(Exception):
 def exported(model: Model, params: Params) -> Exported:
     """Return the explicit weights in float64, checked to be certifiable.
 
+    Args:
+        model: any model.
+        params: its weights.
+
     Raises:
         CertificationRefused: no explicit weights, weights that are not finite, sampled
-            operators only, an unknown activation or transport, or a continuous flow.
-    """
-    weights = explicit_weights(model, params)
-    if isinstance(weights, Incremental):
-        raise CertificationRefused(
-            "only the rate of a continuous flow can be proved; "
-            "no tube of its steps follows"
-        )
-    require_finite(weights)
-    if isinstance(weights.operators, Samples):
-        count = len(weights.operators.operators)
-        raise CertificationRefused(
-            f"grid-only evidence: {count} sampled environments "
-            "prove nothing about those in between"
-        )
-    require_slopes(weights)
-    if weights.declared.transport not in TRANSPORTS:
-        raise CertificationRefused(
-            f"the transport {weights.declared.transport!r} "
-            "is not known to be nonexpansive"
-        )
-    return weights
-
-
-def explicit_weights(model: Model, params: Params) -> Exported:
-    """Return the explicit weights in float64, unchecked.
-
-    Raises:
-        CertificationRefused: the model has none.
+            operators only, or an unknown activation or transport.
     """
     if model.structure.explicit is None:
         raise CertificationRefused("this model exposes no explicit weights to certify")
@@ -69,7 +45,26 @@ def explicit_weights(model: Model, params: Params) -> Exported:
     # machine do not survive: evaluated on the host, or else in full precision.
     with jax.default_device(_host()), jax.default_matmul_precision("float32"):
         weights = evaluate(jax.tree.map(np.asarray, unfold(params)))
-    return jax.tree.map(lambda leaf: np.asarray(leaf, dtype=np.float64), weights)
+    weights = jax.tree.map(lambda leaf: np.asarray(leaf, dtype=np.float64), weights)
+    if not all(np.all(np.isfinite(leaf)) for leaf in jax.tree.leaves(weights)):
+        raise CertificationRefused("the weights are not finite")
+    if isinstance(weights.operators, Samples):
+        count = len(weights.operators.operators)
+        raise CertificationRefused(
+            f"grid-only evidence: {count} sampled environments "
+            "prove nothing about those in between"
+        )
+    if weights.declared.activation not in ACTIVATIONS:
+        raise CertificationRefused(
+            f"slopes of the activation {weights.declared.activation!r} "
+            "are not known in [0, 1]"
+        )
+    if weights.declared.transport not in TRANSPORTS:
+        raise CertificationRefused(
+            f"the transport {weights.declared.transport!r} "
+            "is not known to be nonexpansive"
+        )
+    return weights
 
 
 def _host() -> jax.Device | None:
@@ -78,21 +73,6 @@ def _host() -> jax.Device | None:
         return jax.local_devices(backend="cpu")[0]
     except RuntimeError:  # JAX_PLATFORMS names accelerators only
         return None
-
-
-def require_finite(weights: Exported) -> None:
-    """Refuse weights that are not finite."""
-    if not all(np.all(np.isfinite(leaf)) for leaf in jax.tree.leaves(weights)):
-        raise CertificationRefused("the weights are not finite")
-
-
-def require_slopes(weights: Exported) -> None:
-    """Refuse an activation whose slopes may lie outside [0, 1]."""
-    if weights.declared.activation not in ACTIVATIONS:
-        raise CertificationRefused(
-            f"slopes of the activation {weights.declared.activation!r} "
-            "are not known in [0, 1]"
-        )
 
 
 def fingerprint(params: Params) -> str:

@@ -14,25 +14,30 @@ from jaxtyping import Array, Float
 from scipy.linalg import cho_solve, eigh
 from scipy.optimize import minimize
 
-from sfkd_jax.certification._claims import COMPILATION_SLACK, Refuted
+from sfkd_jax.certification._claims import (
+    COMPILATION_SLACK,
+    OutputMetric,
+    Refuted,
+    reads_within,
+)
 from sfkd_jax.certification._core import Matrix, Vector, check_vertices, witness_matrix
-from sfkd_jax.certification._exported import Exported
-from sfkd_jax.certification._output_metrics import OutputMetric, reads_within
+from sfkd_jax.certification._weights import Exported
 
 SHARPNESS = ((16, 40), (64, 60), (256, 100))
 """Exponents of the p-norms that smooth a maximum, with L-BFGS iterations for each."""
 INFEASIBLE = 1e3
 """Value of the logarithmic objective where nothing is proved."""
 SLACKS = (1e-9, 1e-7, 1e-5, 1e-3)
-DRIVES = 8
-"""Exponent of the power mean over drives, a smooth stand-in for a high quantile."""
+RUNS = 8
+"""Exponent of the power mean over runs, a smooth stand-in for a high quantile."""
 
 
 def propose_metric(
     weights: Exported,
     rows: Matrix,
-    gaps: Float[np.ndarray, "drive worst rank"],
+    gaps: Float[np.ndarray, "run worst rank"],
     start: Sequence[Vector],
+    metric: Matrix | None = None,
 ) -> OutputMetric:
     """Minimise |C|_{P⁻¹} q(|d|_P) / (1 − α_P) over metrics P.
 
@@ -42,10 +47,12 @@ def propose_metric(
     differentiable.
 
     Args:
-        weights: explicit, float64, with a polytope of operators.
+        weights: explicit, float64.
         rows: C, (output, rank).
-        gaps: d of the worst steps of every drive, not of the calibration split.
+        gaps: d of the worst steps of every run, not of the calibration split.
         start: initial multipliers, equal at all vertices.
+        metric: the Lyapunov matrix of the operators; the search starts there if that
+            is better than I.
 
     Returns:
         The metric with the smallest constants that the trusted core accepts.
@@ -56,22 +63,27 @@ def propose_metric(
     vertices, rank = weights.operators.vertices, weights.operators.vertices.shape[-1]
     logs = [np.log(np.concatenate(start))] * len(vertices) if start else [np.zeros(0)]
     lower = np.tril_indices(rank)
-    flat = np.concatenate([np.eye(rank)[lower], *logs])
+    begins = [np.eye(rank)]
+    if metric is not None:
+        begins.append(np.linalg.cholesky(metric * (rank / np.trace(metric))))
+    candidates = [np.concatenate([begin[lower], *logs]) for begin in begins]
     with jax.enable_x64(True):
         objective = _objective(weights, rows, gaps)
+        first = partial(objective, SHARPNESS[0][0])
+        flat = min(candidates, key=lambda candidate: first(candidate)[0])
         for sharpness, iterations in SHARPNESS:
             options = {"maxiter": iterations, "maxcor": 20}
             search = {"jac": True, "method": "L-BFGS-B", "options": options}
             flat = minimize(partial(objective, sharpness), flat, **search).x
     factor = np.zeros((rank, rank))
     factor[lower] = flat[: len(lower[0])]
-    metric = factor @ factor.T
-    scale = 2.0 / (np.trace(metric) / rank + np.max(np.abs(metric)))
-    metric *= scale
+    found = factor @ factor.T
+    scale = 2.0 / (np.trace(found) / rank + np.max(np.abs(found)))
+    found *= scale
     widths = np.cumsum([len(part) for part in start])[:-1]
     logs = flat[len(lower[0]) :].reshape(len(vertices), -1)
     joint = [np.split(scale * np.exp(part), widths) if start else [] for part in logs]
-    return _accepted(weights, rows, 0.5 * (metric + metric.T), joint)
+    return _accepted(weights, rows, 0.5 * (found + found.T), joint)
 
 
 def _accepted(
@@ -131,14 +143,15 @@ def _objective(
         solved = jax.scipy.linalg.solve_triangular(factor, read, lower=True)
         gain = jnp.linalg.norm(solved)
         sizes = jnp.linalg.norm(disturbed @ factor, axis=-1)
-        worst = jax.vmap(lambda drive: _power_mean(drive, 32.0, mean=False))(sizes)
-        radius = jnp.log(gain * _power_mean(worst, DRIVES, mean=True))
+        worst = jax.vmap(lambda run: _power_mean(run, 32.0, mean=False))(sizes)
+        radius = jnp.log(gain * _power_mean(worst, RUNS, mean=True))
         return radius - jnp.log(1.0 - alpha)
 
     with_gradient = jax.jit(jax.value_and_grad(value))
 
     def call(sharpness: int, flat: Vector) -> tuple[float, Vector]:
         loss, gradient = with_gradient(jnp.asarray(flat), jnp.asarray(float(sharpness)))
+        # NaN of the Cholesky factor: outside the cone nothing is proved
         if not (np.isfinite(loss) and np.all(np.isfinite(gradient))):
             return INFEASIBLE, np.zeros_like(flat)
         return float(loss), np.asarray(gradient)

@@ -1,14 +1,23 @@
-"""Search for multipliers; only the trusted core decides which bound they prove."""
+"""Search for multipliers and constants; only the trusted core decides what holds."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 from itertools import pairwise
+from typing import Any
 
 import numpy as np
 from scipy.linalg import cho_solve
 from scipy.optimize import minimize
 
+from sfkd_jax.certification._claims import (
+    COMPILATION_SLACK,
+    Claims,
+    Refuted,
+    decoders,
+    hull_scope,
+    readouts,
+)
 from sfkd_jax.certification._core import (
     Matrix,
     Vector,
@@ -16,6 +25,7 @@ from sfkd_jax.certification._core import (
     norm_upper,
     witness_matrix,
 )
+from sfkd_jax.certification._weights import Exported
 
 SCALES = np.geomspace(0.25, 4.0, 33)
 SLACKS = (1e-9, 1e-7, 1e-5, 1e-3)
@@ -23,6 +33,86 @@ SHARPNESS = (8, 64, 512)
 """Exponents of the p-norm that smooths the largest eigenvalue, one L-BFGS run each."""
 INFEASIBLE = 1e3
 """Value of the logarithmic objective where the multipliers prove nothing."""
+
+
+def prove(weights: Exported) -> Claims:
+    """Search for the smallest constants that the core accepts.
+
+    Args:
+        weights: explicit, float64, finite.
+
+    Raises:
+        Refuted: no finite bound was found.
+    """
+    bound, start = _best_multipliers(weights.residual, weights.residual_multipliers)
+    beta = COMPILATION_SLACK * bound
+    if not np.isfinite(beta):
+        raise Refuted("no multipliers prove a Lipschitz bound of the residual")
+    witnesses: dict[str, Any] = {"residual": start}
+    norms = [norm_upper(vertex) for vertex in weights.operators.vertices]
+    rho = COMPILATION_SLACK * max(norms)
+    alpha_joint, witnesses["joint"] = joint_bound(weights, start)
+    lipschitz = {
+        name: COMPILATION_SLACK * norm_upper(rows)
+        for name, rows in readouts(weights).items()
+    }
+    for name, network in decoders(weights).items():
+        bound, witnesses[name] = _best_multipliers(network, weights.decoder_multipliers)
+        lipschitz[name] = COMPILATION_SLACK * bound
+    if not np.all(np.isfinite(list(lipschitz.values()))):
+        raise Refuted("no multipliers prove a Lipschitz bound of the decoder")
+    separate = rho + beta
+    return Claims(
+        scope=hull_scope(weights),
+        alpha=min(separate, alpha_joint),
+        alpha_separate=separate,
+        alpha_joint=alpha_joint,
+        rho=rho,
+        beta=beta,
+        lipschitz=lipschitz,
+        witnesses={name: _listed(value) for name, value in witnesses.items()},
+    )
+
+
+def residual_bound(weights: Exported) -> float:
+    """Return β with the multipliers of the model, without a search."""
+    if not weights.residual:
+        return 0.0
+    return rescaled(weights.residual, weights.residual_multipliers)[0]
+
+
+def joint_bound(
+    weights: Exported, start: Sequence[Vector], *, iterations: int = 150
+) -> tuple[float, list[Sequence[Vector]]]:
+    """Return α of z ↦ A z + r(z) as one map, and multipliers for each vertex.
+
+    The vertices are searched one after another, each from the answer of the last.
+
+    Args:
+        weights: explicit, float64, finite.
+        start: initial multipliers.
+        iterations: as in `propose_multipliers`.
+    """
+    bounds, witnesses = [], []
+    for vertex in weights.operators.vertices:
+        start = propose_multipliers(
+            weights.residual, start, vertex, iterations=iterations
+        )
+        bound, start = rescaled(weights.residual, start, vertex)
+        bounds.append(bound)
+        witnesses.append(start)
+    return COMPILATION_SLACK * max(bounds), witnesses
+
+
+def _best_multipliers(
+    weights: Sequence[Matrix], start: Sequence[Vector]
+) -> tuple[float, list[Vector]]:
+    """Return the better bound of the model's multipliers and those from L-BFGS."""
+    if len(weights) < 2 or not np.any(weights[-1]):
+        return (norm_upper(weights[-1]) if weights else 0.0), []
+    given = rescaled(weights, start) if start else (float("inf"), [])
+    proposed = rescaled(weights, propose_multipliers(weights, start))
+    return min(given, proposed, key=lambda pair: pair[0])
 
 
 def lipschitz_upper(
@@ -58,32 +148,17 @@ def rescaled(
     best: tuple[float, list[Vector]] = (float("inf"), [])
     for scale in SCALES:
         scaled = [scale * np.asarray(part, dtype=np.float64) for part in multipliers]
-        bound = smallest_bound(weights, scaled, linear, below=best[0])
-        if bound < best[0]:
-            best = bound, scaled
+        eigenvalues, *_ = _reduced(weights, scaled, linear)
+        guess = float(np.sqrt(np.max(eigenvalues)))
+        for slack in SLACKS:
+            bound = guess * (1 + slack)
+            if not bound < best[0]:
+                break
+            # The eigenvalue is not rigorous, the core is
+            if check_witness(weights, scaled, bound, linear):
+                best = bound, scaled
+                break
     return best
-
-
-def smallest_bound(
-    weights: Sequence[Matrix],
-    multipliers: Sequence[Vector],
-    linear: Matrix | None = None,
-    *,
-    below: float = np.inf,
-) -> float:
-    """Return the smallest bound that the core accepts from exactly these multipliers.
-
-    Returns infinity if there is none below `below`.
-    """
-    eigenvalues, *_ = _reduced(weights, multipliers, linear)
-    guess = float(np.sqrt(np.max(eigenvalues)))
-    for slack in SLACKS:
-        bound = guess * (1 + slack)
-        if not bound < below:
-            break
-        if check_witness(weights, multipliers, bound, linear):
-            return bound
-    return float("inf")
 
 
 def propose_multipliers(
@@ -108,6 +183,9 @@ def propose_multipliers(
     weights = [np.asarray(weight, dtype=np.float64) for weight in weights]
     if len(weights) < 2 or not all(np.all(np.isfinite(part)) for part in weights):
         return []
+    # A network that emits a constant needs none; the search would drive them to zero
+    if not np.any(weights[-1]):
+        return _starting_point(weights, (), linear)
     begin = _starting_point(weights, start, linear)
     widths = np.cumsum([len(part) for part in begin])[:-1]
     best = rescaled(weights, begin, linear)
@@ -143,7 +221,7 @@ def _starting_point(
     positive = begin and all(np.all(part > 0) for part in begin)
     if positive and np.isfinite(rescaled(weights, begin, linear)[0]):
         return begin
-    squares = [np.linalg.norm(weight, 2) ** 2 + 1e-12 for weight in weights]
+    squares = [max(float(np.linalg.norm(weight, 2)) ** 2, 1e-6) for weight in weights]
     return [
         np.full(len(weights[k]), 1.001 * np.prod(squares[k + 1 :]))
         for k in range(len(weights) - 1)
@@ -168,3 +246,10 @@ def _reduced(
     schur = coupling.T @ hidden - matrix[:inputs, :inputs]
     eigenvalues, vectors = np.linalg.eigh(0.5 * (schur + schur.T))
     return eigenvalues, vectors, np.split(-hidden @ vectors, widths[:-1])
+
+
+def _listed(witness: Any) -> Any:
+    """Return a witness as nested lists of floats for JSON."""
+    if isinstance(witness, (list, tuple)):
+        return [_listed(part) for part in witness]
+    return np.asarray(witness, dtype=np.float64).tolist()
