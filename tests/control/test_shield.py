@@ -539,10 +539,10 @@ def test_an_environment_of_another_size_is_refused():
 def test_the_box_of_a_certificate_holds_its_corridor(monkeypatch):
     """A data set on one side of the path must not put the other side outside."""
     corridor = {
-        "bounds": {"nominal": 0.08, "followed_position": 0.06},
+        "bounds": {"nominal": 0.08, "vehicle_to_nominal_position": 0.06},
         "corridor_m": 0.14,
         "shield_horizon": 20,
-        "class": {"sensor_noise": [0.01, 0.01, 0.002]},
+        "conditions": {"sensor_noise": [0.01, 0.01, 0.002]},
     }
     boxes = {
         "state": [[-0.05, -0.1, 7.0], [0.4, 0.1, 11.0]],
