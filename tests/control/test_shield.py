@@ -6,13 +6,13 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from helpers import TINY, any_law, jit, path_space, same, tiny
+from helpers import any_law, jit, tiny
 
-from sfkd_jax import build, control, models
+from sfkd_jax import build, control
 from sfkd_jax.control import Conditions, along_reference, safety_filter
 from sfkd_jax.geometry import path_state, vehicle_state
 from sfkd_jax.plants import kinematic
-from sfkd_jax.rollout import fold, unfold
+from sfkd_jax.rollout import unfold
 from sfkd_jax.types import BODY, Controller, Model
 
 LAW = any_law()
@@ -85,12 +85,10 @@ def about(xi, preview):
 
 
 def scripted():
-    """A planner that adds params[k], or params["script"][k], to the law at step k."""
+    """A planner that adds params[k] to the law at step k."""
 
     def act(params, k, xi, env, preview):
-        params = unfold(params)
-        script = params["script"] if isinstance(params, dict) else params
-        wanted = LAW(xi, *preview.road[0], env) + script[k]
+        wanted = LAW(xi, *preview.road[0], env) + unfold(params)[k]
         return wanted, k + 1, about(xi, preview)
 
     return Controller(lambda key: jnp.zeros((), jnp.int32), act)
@@ -459,44 +457,6 @@ def test_where_law_and_planner_are_at_the_same_limit_nothing_was_asked_for():
     )
     np.testing.assert_array_equal(info["perturbation"][0], 0.0)
     assert float(info["intervention"]) == 0.0
-
-
-def test_it_is_exported_in_a_scan_and_does_as_call_by_call():
-    """A tiny SFKD at its initial parameters, with a switch of e and an e that is not
-    finite.
-    """
-    model = models.sfkd(path_space(), **TINY | {"budget": "joint"}, frame="path")
-    params = jit(lambda key: fold(model, model.init(key)))(jax.random.key(0))
-    controller = filtered(model=model, width=0.5, tube=0.3)
-    envs = jnp.asarray([[0.6, 2.0], [0.6, 2.0], [0.4, -5.0], [jnp.nan, 0.0]])
-    xi, reference = (
-        vehicle_state(jnp.asarray([0.2, 0.01, SPEED])),
-        circle(0.003, horizon=6),
-    )
-    script = jnp.asarray(scripts()["random"][:4], dtype=float)
-
-    def step(memory, env):
-        given = params._replace(weights=params.weights | {"script": script})
-        action, memory, info = controller.act(given, memory, xi, env, reference)
-        return memory, (action, info)
-
-    def run(envs):
-        return jax.lax.scan(step, controller.init(jax.random.key(1)), envs)[1]
-
-    exported = jax.export.export(jax.jit(run))(envs).serialize()
-    scanned = jax.export.deserialize(exported).call(envs)
-    memory, called, call = controller.init(jax.random.key(1)), [], jit(step)
-    for env in envs:
-        memory, out = call(memory, env)
-        called.append(out)
-    assert same(
-        scanned,
-        jax.tree.map(lambda *leaves: jnp.stack(leaves), *called),
-        rtol=1e-4,
-        atol=1e-4,
-    )
-    assert np.all(np.isfinite(scanned[1]["margin"]))
-    assert call._cache_size() == 1
 
 
 @pytest.mark.parametrize(

@@ -50,18 +50,20 @@ def path_errors(
     return PathErrors(lateral, heading, state[3] - point[3])
 
 
-def reference_curvature(reference: Reference) -> Float[Array, " horizon"]:
-    """Return κ [1/m] at each reference point, from its neighbours.
-
-    Between two points κ is the change of yaw over the distance, or 0 where they
-    coincide; at a point it is the mean of both sides.
-    """
+def curvature_between(reference: Reference) -> Float[Array, " gap"]:
+    """Return κ [1/m] between reference points: the change of yaw over the distance."""
     steps = jnp.diff(reference, axis=0)
     distance = jnp.hypot(steps[:, 0], steps[:, 1])
+    # Points that coincide, as where a car waits, have no direction to turn from.
     moved = distance > 1e-3
-    between = jnp.where(
+    return jnp.where(
         moved, wrap_angle(steps[:, 2]) / jnp.where(moved, distance, 1.0), 0.0
     )
+
+
+def reference_curvature(reference: Reference) -> Float[Array, " horizon"]:
+    """Return κ [1/m] at each reference point, the mean of both sides."""
+    between = curvature_between(reference)
     ends = jnp.concatenate([between[:1], between, between[-1:]])
     return 0.5 * (ends[1:] + ends[:-1])
 

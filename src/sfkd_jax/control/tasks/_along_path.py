@@ -14,7 +14,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
 from sfkd_jax.control.laws._model_law import SteadyTurn
-from sfkd_jax.control.laws._path_errors import PathErrors
+from sfkd_jax.control.laws._path_errors import PathErrors, curvature_between
 from sfkd_jax.control.laws._path_law import PathLaw, turn_control
 from sfkd_jax.control.planners._plans import all_finite
 from sfkd_jax.control.tasks._path_tracking import Cost, StageInputs, check_path
@@ -35,7 +35,6 @@ from sfkd_jax.geometry import (
     between,
     circle_errors,
     path_state,
-    wrap_angle,
 )
 from sfkd_jax.rollout import fold
 from sfkd_jax.types import (
@@ -76,18 +75,12 @@ class AlongReferenceState(NamedTuple):
 
 
 def curvature_ahead(reference: Reference) -> Float[Array, " horizon"]:
-    """Return κ [1/m] over the step to each reference point; 0 where points coincide.
+    """Return κ [1/m] over the step to each reference point.
 
-    Between points it is the change of yaw over the distance. The first step begins at
-    the vehicle, where there is no reference point: its curvature is extrapolated
-    linearly from the next two.
+    The first step begins at the vehicle, where there is no reference point: its
+    curvature is extrapolated linearly from the next two.
     """
-    steps = jnp.diff(reference, axis=0)
-    distance = jnp.hypot(steps[:, 0], steps[:, 1])
-    moved = distance > 1e-3
-    turns = jnp.where(
-        moved, wrap_angle(steps[:, 2]) / jnp.where(moved, distance, 1.0), 0.0
-    )
+    turns = curvature_between(reference)
     first = 2.0 * turns[0] - turns[min(1, turns.shape[0] - 1)]
     return jnp.concatenate([first[None], turns])
 

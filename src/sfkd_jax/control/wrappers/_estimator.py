@@ -379,8 +379,8 @@ class Estimator:
         """
         size = self.sensors.shape[0]
         causes, variance = belief.bank.mean()[size:], belief.bank.variance()[size:]
-        share = 1.0 - shrinkage * variance[FORCE] / (causes[FORCE] ** 2 + 1e-9)
-        return causes.at[FORCE].multiply(jnp.maximum(share, 0.0))
+        kept = 1.0 - shrinkage * variance[FORCE] / (causes[FORCE] ** 2 + 1e-9)
+        return causes.at[FORCE].multiply(jnp.maximum(kept, 0.0))
 
     def _advanced(self, params: Params, belief: Belief) -> Bank:
         """The bank one step later, without a measurement."""

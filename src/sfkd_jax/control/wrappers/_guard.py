@@ -45,7 +45,7 @@ class FilterResult(NamedTuple):
 
     Attributes:
         nu: the perturbation of the law to apply, (2,).
-        latent: of the nominal copy one step later.
+        latent: of the nominal model one step later.
         scale: s, of the request clipped to its limit; 0 while steering back.
         margin: width − max |ê_y| over the predicted steps [m]; −inf if not finite.
         feasible: whether the margin is at least 0.
@@ -68,7 +68,7 @@ def safety_filter(
     *,
     width: float,
 ) -> FilterResult:
-    """Scale a request so that the law alone then keeps the copy in its corridor.
+    """Scale a request so that the law alone then keeps the nominal model inside.
 
         ẑ_1 = F(ẑ_0; (s ν, κ_0, v_0), e),   ẑ_{k+1} = F(ẑ_k; (0, κ_k, v_k), e)
         margin(s) = width − max_k |ê_y,k|
@@ -83,7 +83,7 @@ def safety_filter(
     Args:
         model: of the closed loop along a path.
         fiber: of e.
-        latent: ẑ_0, of the nominal copy now.
+        latent: ẑ_0, of the nominal model now.
         request: ν [rad, control unit]; a request that is not finite counts as 0.
         preview: κ_k [1/m] and v_k [m/s] over the next steps.
         limit: largest |ν|, entry by entry; the request is clipped to it.

@@ -64,13 +64,13 @@ class OnlineTube:
 
         r_h ← r_h exp(γ (1{|e_y − ê_{y,h}| > r_h} − (1 − level)))
 
-    so that in N steps, whatever happens, the share of misses differs from 1 − level by
-    at most |log(r_N / r_0)| / (γ N). Nothing is assumed about the drive, and nothing is
-    proved about a single step. Errors are those of the measured position.
+    so that in N steps, whatever happens, the fraction of misses differs from 1 − level
+    by at most |log(r_N / r_0)| / (γ N). Nothing is assumed about the run, and nothing
+    is proved about a single step. Errors are those of the measured position.
 
     The online corridor is max_h |ê_{y,h}| + r_h. While it exceeds `lane`, the reference
     speed falls; otherwise it rises, so much slower that the speed settles where the
-    corridor fits in a share `level` of the steps. Both are gentle: hard braking would
+    corridor fits in a fraction `level` of the steps. Both are gentle: hard braking would
     take the grip that the tyres need to stay on the path.
 
     With a finite `grip`, a turn ahead is taken at a lateral acceleration at which the
