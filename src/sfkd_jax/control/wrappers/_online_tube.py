@@ -70,8 +70,8 @@ class OnlineTube:
 
     The online corridor is max_h |ê_{y,h}| + r_h. While it exceeds `lane`, the reference
     speed falls; otherwise it rises, so much slower that the speed settles where the
-    corridor fits in a fraction `level` of the steps. Both are gentle: hard braking would
-    take the grip that the tyres need to stay on the path.
+    corridor fits in a fraction `level` of the steps. Both are gentle: hard braking
+    would take the grip that the tyres need to stay on the path.
 
     With a finite `grip`, a turn ahead is taken at a lateral acceleration at which the
     corridor has fitted before, whatever friction is measured. Nothing but a turn shows
