@@ -34,7 +34,12 @@ def main() -> None:
         print(VERSION)
     elif command in COMMANDS:
         # The imports take seconds; the list above is quick.
-        hydra_command = import_module("sfkd_jax.experiment.command").hydra_command
+        try:
+            hydra_command = import_module("sfkd_jax.experiment.command").hydra_command
+        except ModuleNotFoundError as reason:
+            # A package that only loads policies is installed without these.
+            advice = 'pip install "sfkd-jax[train]"'
+            sys.exit(f"sfkd_jax: {command} needs {reason.name}: {advice}")
         sys.argv = [f"sfkd {command}", *rest]
         hydra_command(import_module(_module(command)).run)()
     else:

@@ -111,7 +111,7 @@ def test_parquet_without_its_package_names_the_extra(tmp_path, monkeypatch):
     monkeypatch.setitem(sys.modules, "pyarrow", None)
     (tmp_path / "a.parquet").write_bytes(b"PAR1")
     assert refusal(tmp_path).endswith(
-        'a.parquet: parquet files need pyarrow: pip install "sfkd-jax[parquet]"'
+        'a.parquet: parquet files need pyarrow: pip install "sfkd-jax[train]"'
     )
 
 

@@ -175,7 +175,7 @@ def read_parquet(file: Path) -> Table:
         from pyarrow import parquet  # pyright: ignore[reportMissingImports]
     except ImportError:
         raise ValueError(
-            f'{file}: parquet files need pyarrow: pip install "sfkd-jax[parquet]"'
+            f'{file}: parquet files need pyarrow: pip install "sfkd-jax[train]"'
         ) from None
     with open_regular(file) as stream:
         try:

@@ -1,0 +1,72 @@
+"""A wheel without the extras loads a policy: the packages of `train` are not needed."""
+
+import subprocess
+import sys
+import zipfile
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).parents[1]
+PROGRAM = """
+import importlib.abc, sys
+
+class Blocked(importlib.abc.MetaPathFinder):
+    names = set(sys.argv[2].split(","))
+    def find_spec(self, name, path=None, target=None):
+        if name.split(".")[0] in self.names:
+            raise ModuleNotFoundError(name, name=name)
+
+sys.meta_path.insert(0, Blocked())
+sys.path.insert(0, sys.argv[1])
+import sfkd_jax.control
+import jax, jax.numpy as jnp
+assert sfkd_jax.__file__.startswith(sys.argv[1]), sfkd_jax.__file__
+policy = sfkd_jax.load(sys.argv[1] + "/sfkd_jax/pretrained/kinematic")
+assert policy.certificate["valid"]
+steps = jnp.arange(1.0, 21.0)
+reference = jnp.stack([steps, 0 * steps, 0 * steps, 0 * steps + 10.0], axis=1)
+memory = policy.controller.init(jax.random.key(0))
+state, env = jnp.array([0.0, 0.3, 0.0, 10.0]), jnp.array([0.6, 0.0])
+control, _, info = jax.jit(policy.controller.act)(
+    policy.params, memory, state, env, reference
+)
+assert bool(info["healthy"]), info
+from sfkd_jax.__main__ import main
+sys.argv = ["sfkd", "train"]
+main()
+"""
+TRAIN = (
+    "cvxpy,clarabel,filelock,hydra,omegaconf,jinja2,matplotlib,pandas,pint,pyarrow,"
+    "threadpoolctl,brax,gymnasium,pytest,yapf"
+)
+"""What flax itself imports or requires (optax, orbax, rich) is there."""
+
+
+@pytest.fixture(scope="module")
+def unpacked(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("wheel")
+    command = [sys.executable, "-m", "pip", "wheel", "-q", "--no-deps"]
+    command += ["--no-build-isolation", "-w", str(folder), str(ROOT)]
+    built = subprocess.run(command, capture_output=True, text=True)
+    if "hatchling" in built.stderr:
+        pytest.skip("hatchling is not installed, and nothing is downloaded here")
+    assert built.returncode == 0, built.stderr
+    (wheel,) = folder.glob("*.whl")
+    with zipfile.ZipFile(wheel) as archive:
+        archive.extractall(folder / "site")
+    return folder / "site"
+
+
+def test_a_policy_acts_and_a_command_says_what_it_lacks(unpacked):
+    done = subprocess.run(
+        [sys.executable, "-P", "-c", PROGRAM, str(unpacked), TRAIN],
+        capture_output=True,
+        text=True,
+        cwd=unpacked,
+        env={"PATH": "", "PYTHONPATH": ""},
+    )
+    lines = done.stderr.strip().splitlines()
+    assert lines, done
+    assert lines[-1].startswith("sfkd_jax: train needs "), done.stderr
+    assert lines[-1].endswith('pip install "sfkd-jax[train]"')
