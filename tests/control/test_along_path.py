@@ -11,8 +11,9 @@ from helpers import any_law, tiny
 
 import sfkd_jax
 from sfkd_jax import build, control, plants
-from sfkd_jax.control import curvature_ahead, path_coordinates, turn_control
+from sfkd_jax.control.laws._path_law import turn_control
 from sfkd_jax.control.tasks import _along_path
+from sfkd_jax.control.tasks._along_path import curvature_ahead, path_coordinates
 from sfkd_jax.geometry import compose
 from sfkd_jax.scenarios import path_from_curvature, reference_window
 

@@ -167,27 +167,3 @@ def test_every_term_of_the_cost_is_the_square_it_states(change, expected):
 
 def test_a_speed_command_costs_no_effort():
     assert float(charge(stage(acceleration=9.0), speed_loop=True)) == 0.0
-
-
-@pytest.mark.parametrize("correlation", [0.0, 0.8])
-def test_correlated_noise_has_the_stated_spread_at_every_step_and_the_stated_correlation(
-    correlation,
-):
-    count, std = 4000, np.asarray([0.02, 0.3])
-    noise = np.asarray(
-        control.correlated_noise(
-            jax.random.key(0),
-            num_samples=count,
-            horizon=15,
-            std=jnp.asarray(std),
-            correlation=correlation,
-        )
-    )
-    assert noise.shape == (15, count, 2)
-    tight = 4 / np.sqrt(2 * count)
-    assert np.all(np.abs(noise.std(axis=1) / std - 1) < tight)
-    assert np.all(np.abs(noise.mean(axis=1) / std) < 4 / np.sqrt(count))
-    for lag in (1, 3):
-        relative = (noise[lag:] * noise[:-lag]).mean(axis=(0, 1)) / std**2
-        assert np.all(np.abs(relative - correlation**lag) < 0.03)
-    assert abs((noise[..., 0] * noise[..., 1]).mean() / std.prod()) < 0.03
