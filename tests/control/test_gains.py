@@ -164,7 +164,7 @@ def test_between_plans_a_control_follows_the_gains_within_the_limits():
     given = {
         "planned_from": jnp.asarray([0.0, 3.1]),
         "predicted": jnp.asarray([1.0, -3.1]),
-        "share": 0.5,
+        "fraction": 0.5,
         "control_low": (-1.0,),
         "control_high": (1.0,),
         "angles": (1,),

@@ -206,15 +206,6 @@ def test_predictions_are_told_in_the_world():
         assert np.max(np.linalg.norm(gap, axis=1)) < 0.04
 
 
-def test_predicted_states_lie_on_the_reference_when_the_car_does():
-    on_path = jnp.asarray([0.0, 0.0, 0.0, 10.0])
-    _, _, info = act(on_path, reference=BEND)
-    assert info["predicted_states"].shape == (HORIZON, 4)
-    gap = np.asarray(info["predicted_states"])[:, :3] - BEND[:, :3]
-    assert np.max(np.hypot(gap[:, 0], gap[:, 1])) < 0.3
-    assert np.max(np.abs(gap[:, 2])) < 0.1
-
-
 @pytest.mark.parametrize("scale", [1.0, 30.0, 1e4])
 def test_controls_stay_in_their_box_however_far_the_car_is_off(scale):
     state = None
@@ -223,15 +214,6 @@ def test_controls_stay_in_their_box_however_far_the_car_is_off(scale):
         assert np.all((action >= LOW) & (action <= HIGH))
         assert np.all((state.plan >= LOW) & (state.plan <= HIGH))
         assert bool(info["healthy"])
-
-
-def test_compiling_changes_nothing():
-    model, params = koopman()
-    controller = control.koopman_mpc(model, horizon=HORIZON, **LIMITS)
-    plain = controller.act(
-        params, controller.init(jax.random.key(0)), OFFSET, ENV, BEND
-    )
-    assert same(plain, act(), rtol=1e-3, atol=1e-3)
 
 
 @pytest.mark.parametrize("broken", ["observation", "env", "reference"])
@@ -254,13 +236,6 @@ def test_what_cannot_be_read_continues_the_plan_and_the_next_clean_step_recovers
         atol=0,
     )
     assert bool(act(state=held)[2]["healthy"])
-
-
-def test_a_first_observation_that_cannot_be_read_gives_a_finite_control():
-    action, state, info = act(jnp.full(4, jnp.nan))
-    assert not bool(info["healthy"])
-    assert not bool(state.started)
-    assert np.all(np.isfinite(action))
 
 
 def test_the_first_steering_rate_counts_from_the_control_applied_last_if_there_was_one():
@@ -298,3 +273,110 @@ def test_a_predictor_that_knows_nothing_keeps_a_finite_plan():
 def test_a_model_that_is_not_linear_in_a_lift_is_refused():
     with pytest.raises(ValueError, match="linear"):
         control.koopman_mpc(model_and_params("oracle")[0], **LIMITS)
+
+
+# ---- the quadratic program
+
+SIZE = 24
+
+
+def problem(seed, condition=1e3):
+    """A random strictly convex cost; about half of its free minimum is outside the box."""
+    random = np.random.default_rng(seed)
+    axes, _ = np.linalg.qr(random.standard_normal((SIZE, SIZE)))
+    H = (axes * np.geomspace(1.0, condition, SIZE)) @ axes.T
+    low, high = -random.uniform(0.1, 1.0, SIZE), random.uniform(0.1, 1.0, SIZE)
+    return tuple(
+        np.float32(part) for part in (H, -H @ random.standard_normal(SIZE), low, high)
+    )
+
+
+def cost(H, f, x):
+    H, f, x = (np.asarray(part, np.float64) for part in (H, f, x))
+    return 0.5 * x @ H @ x + f @ x
+
+
+def by_clarabel(H, f, low, high):
+    """The minimum, by an interior point method in float64."""
+    x = cvxpy.Variable(len(f))
+    H = np.asarray(H, np.float64)
+    objective = 0.5 * cvxpy.quad_form(x, cvxpy.psd_wrap(0.5 * (H + H.T))) + f @ x
+    cvxpy.Problem(cvxpy.Minimize(objective), [x >= low, x <= high]).solve(
+        solver=cvxpy.CLARABEL
+    )
+    return x.value
+
+
+SOLVERS = {n: jit(partial(box_qp, iterations=n)) for n in (*range(9), 12)}
+
+
+@pytest.mark.parametrize("seed", range(4))
+@pytest.mark.parametrize("condition", [10.0, 1e5])
+def test_the_cost_is_that_of_a_convex_solver(seed, condition):
+    H, f, low, high = problem(seed, condition)
+    solution = SOLVERS[12](H, f, low, high, np.zeros(SIZE, np.float32))
+    best = cost(H, f, by_clarabel(H, f, low, high))
+    assert 0 < np.sum((solution.primal == low) | (solution.primal == high)) < SIZE
+    assert abs(cost(H, f, solution.primal) - best) <= 1e-4 * abs(best)
+    assert float(solution.residual) < 1e-4
+
+
+def test_independent_entries_are_clipped():
+    diagonal, f = np.float32([1.0, 4.0, 100.0]), np.float32([-0.5, 8.0, -300.0])
+    solution = SOLVERS[1](
+        np.diag(diagonal),
+        f,
+        -np.ones(3, np.float32),
+        np.ones(3, np.float32),
+        np.zeros(3, np.float32),
+    )
+    np.testing.assert_allclose(
+        solution.primal, np.clip(-f / diagonal, -1, 1), atol=1e-6
+    )
+    assert float(solution.residual) < 1e-6
+
+
+def test_without_active_bounds_one_iteration_solves():
+    H, f, _, _ = problem(0)
+    wide = np.full(SIZE, 1e3, np.float32)
+    solution = SOLVERS[1](H, f, -wide, wide, np.zeros(SIZE, np.float32))
+    np.testing.assert_allclose(
+        solution.primal, -np.linalg.solve(np.float64(H), f), atol=1e-4
+    )
+
+
+def iterations_needed(data, start):
+    return next(n for n in range(9) if float(SOLVERS[n](*data, start).residual) < 1e-4)
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_a_warm_start_needs_fewer_iterations(seed):
+    data = problem(seed)
+    H, f, low, high = data
+    near = SOLVERS[12](
+        H, np.float32(1.02 * f), low, high, np.zeros(SIZE, np.float32)
+    ).primal
+    cold, warm = (
+        iterations_needed(data, start) for start in (np.zeros(SIZE, np.float32), near)
+    )
+    assert warm < cold
+    assert iterations_needed(data, SOLVERS[12](H, f, low, high, near).primal) == 0
+
+
+def test_the_cost_never_rises_and_the_box_is_never_left():
+    H, f, low, high = problem(5, condition=1e5)
+    start = np.full(SIZE, 7.0, np.float32)  # outside
+    solutions = [SOLVERS[n](H, f, low, high, start).primal for n in range(9)]
+    assert all(np.all((low <= x) & (x <= high)) for x in solutions)
+    costs = np.asarray([cost(H, f, x) for x in solutions])
+    assert np.all(np.diff(costs) <= 1e-6 * np.abs(costs[:-1]))
+
+
+@pytest.mark.parametrize("part", [0, 1])
+def test_what_is_not_finite_leaves_the_start(part):
+    data = [np.array(entry) for entry in problem(1)]
+    start = 0.5 * data[3]
+    data[part].flat[0] = np.nan
+    solution = SOLVERS[12](*data, start)
+    np.testing.assert_array_equal(solution.primal, start)
+    assert not float(solution.residual) < 1e-4

@@ -168,14 +168,6 @@ def test_controls_stay_inside_their_bounds_however_large_the_noise(std, law):
         assert bool(info["healthy"])
 
 
-def test_successive_steps_draw_fresh_noise():
-    _, state, _ = act_once()
-    rewound = state._replace(key=jax.random.key_data(jax.random.key(0)))
-    assert not np.array_equal(
-        act_once(state=state)[1].plan, act_once(state=rewound)[1].plan
-    )
-
-
 @pytest.mark.parametrize("entry", range(4))
 @pytest.mark.parametrize("value", [np.nan, np.inf])
 def test_a_broken_observation_continues_the_last_clean_plan_and_the_next_clean_step_recovers(

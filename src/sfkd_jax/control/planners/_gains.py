@@ -3,28 +3,27 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import replace
 from typing import Any
 
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from sfkd_jax.control.planners._plans import Evaluated, Plan, Plans, Samples
+from sfkd_jax.control.planners._plans import SearchResult
+from sfkd_jax.control.planners._rollouts import Rollouts
+from sfkd_jax.control.tasks._task import StepIndex
 from sfkd_jax.geometry import wrap_angle
 from sfkd_jax.types import Control, Scalar
 
-EvaluateFrom = Callable[[Any, Plans], Evaluated]
-"""(start of the rollouts, plans) -> `Evaluated`."""
 Gains = Float[Array, "control state"]
 
 
 def feedback_gains(
-    samples: Samples,
+    rollouts: Rollouts,
     start_of: Callable[[Array], Any],
-    evaluate: EvaluateFrom,
-    control_of: Callable[[Any, Control], Control],
     observation: Float[Array, " state"],
-    plan: Plan,
+    result: SearchResult,
     count: int,
 ) -> Gains:
     """Return du/dx of the first control of a weighted plan.
@@ -35,13 +34,11 @@ def feedback_gains(
     samples are held fixed.
 
     Args:
-        samples: of the last iteration.
+        rollouts: of this control step.
         start_of: observation -> start of the rollouts; differentiated forwards, because
             tasks prepare a step with loops that have no reverse derivative.
-        evaluate: see `EvaluateFrom`.
-        control_of: (start, perturbation) -> control applied in the first step.
         observation: x.
-        plan: the chosen one, ν.
+        result: the chosen plan ν, and the samples of the last iteration.
         count: number of samples whose costs are differentiated, those with the largest
             weights.
 
@@ -50,19 +47,37 @@ def feedback_gains(
 
     Source: F-MPPI, Belvedere et al., RA-L 2026.
     """
-    if samples.temperature is None:
+    samples = result.samples
+    if samples is None or samples.temperature is None:
         raise ValueError("gain_samples needs a search with a temperature, see `mppi`")
     kept = min(count, samples.weights.shape[0])
     weights, chosen = jax.lax.top_k(samples.weights, kept)
     weights = weights / jnp.maximum(jnp.sum(weights), jnp.finfo(weights.dtype).tiny)
     plans = samples.evaluated.perturbations[:, chosen]
     away = plans[0] - weights @ plans[0]
+    setup, tuning = rollouts.setup, rollouts.tuning
+
+    def costs_from(start: Any) -> Float[Array, " sample"]:
+        moved = replace(rollouts, setup=setup._replace(start=start), sharding=None)
+        return moved(plans).costs
+
+    def control_of(start: Any, perturbation: Control) -> Control:
+        context, targets = setup.context, setup.targets
+        if rollouts.risk is not None:  # the first of several environments
+            context, start, targets = jax.tree.map(
+                lambda leaf: leaf[0], (context, start, targets)
+            )
+        target = jax.tree.map(lambda leaf: leaf[0], targets)
+        at = StepIndex(jnp.zeros((), int), jnp.zeros(()))
+        step = rollouts.task.step
+        return step(tuning.cost, context, start, perturbation, target, at).control
+
     start = start_of(observation)
     by_start = jax.jacfwd(start_of)(observation)
-    _, pull_back = jax.vjp(lambda start: evaluate(start, plans).costs, start)
+    _, pull_back = jax.vjp(costs_from, start)
     seeds = -(weights[:, None] * away / samples.temperature).T
     by_search = jax.vmap(lambda seed: _along(pull_back(seed)[0], by_start))(seeds)
-    direct = jax.jacrev(control_of, argnums=(0, 1))(start, plan[0])
+    direct = jax.jacrev(control_of, argnums=(0, 1))(start, result.plan[0])
     by_law = jax.vmap(lambda row: _along(row, by_start))(direct[0])
     return by_law + direct[1] @ by_search
 
@@ -82,7 +97,7 @@ def between_plans(
     predicted: Float[Array, " state"],
     observation: Float[Array, " state"],
     *,
-    share: Scalar | float,
+    fraction: Scalar | float,
     control_low: tuple[float, ...],
     control_high: tuple[float, ...],
     angles: tuple[int, ...] = (),
@@ -97,7 +112,7 @@ def between_plans(
         planned_from: the observation of the last plan.
         predicted: the state one period later, `info["predicted_states"][0]`.
         observation: x, now.
-        share: of the period that has passed, in [0, 1].
+        fraction: of the period that has passed, in [0, 1].
         control_low: lower control limits.
         control_high: upper control limits.
         angles: entries of the state that are angles; differences are wrapped.
@@ -109,7 +124,7 @@ def between_plans(
         return gap.at[which].set(wrap_angle(gap[which]))
 
     moved = difference(observation, planned_from)
-    expected = share * difference(predicted, planned_from)
+    expected = fraction * difference(predicted, planned_from)
     wanted = control + gains @ difference(moved, expected)
     usable = jnp.where(jnp.all(jnp.isfinite(wanted)), wanted, control)
     return jnp.clip(usable, jnp.asarray(control_low), jnp.asarray(control_high))

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import functools
-from collections.abc import Callable
 from dataclasses import KW_ONLY, dataclass
 from typing import Any
 
@@ -11,7 +10,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array
 
-from sfkd_jax.control.planners._gains import Gains, feedback_gains
+from sfkd_jax.control.planners._gains import feedback_gains
 from sfkd_jax.control.planners._plans import (
     Evaluate,
     Evaluated,
@@ -28,7 +27,7 @@ from sfkd_jax.control.planners._plans import (
 )
 from sfkd_jax.control.planners._rollouts import RiskMeasure, Rollouts, risk_measure
 from sfkd_jax.control.planners._smoothing import Smoother, plan_smoother
-from sfkd_jax.control.tasks._task import PlanningStart, StepIndex, Task
+from sfkd_jax.control.tasks._task import PlanningStart, Task
 from sfkd_jax.ranges import AtLeastTwo, NonNegativeInt, Positive, PositiveFraction
 from sfkd_jax.types import Control, Controller, ControllerInfo, Key, Params, Scalar
 
@@ -223,11 +222,12 @@ class Planner:
             info["sample_plans"] = evaluated.perturbations
             info["sample_states"] = evaluated.states
         if self.gain_samples:
-            gains = self._gains(
+            gains = feedback_gains(
                 evaluate,
                 lambda moved: prepare(params, moved, inside, reference, start).start,
                 observation,
                 result,
+                self.gain_samples,
             )
             info["gains"] = jnp.where(healthy, gains, 0.0)
         elapsed = jnp.minimum(elapsed, 1.0)
@@ -274,45 +274,6 @@ class Planner:
         if self.info_level == "samples" or self.gain_samples:
             return Samples(evaluated, weights, temperature)
         return None
-
-    def _gains(
-        self,
-        rollouts: Rollouts,
-        start_of: Callable[[Array], Any],
-        observation: Array,
-        result: SearchResult,
-    ) -> Gains:
-        """The feedback gains of the plan that a search chose; see `feedback_gains`."""
-        assert result.samples is not None
-        setup, several = rollouts.setup, rollouts.risk is not None
-
-        def evaluate(start: Any, plans: Array) -> Evaluated:
-            moved = setup._replace(start=start)
-            return Rollouts(
-                self.task, rollouts.tuning, moved, rollouts.risk, self.unroll
-            )(plans)
-
-        def control_of(start: Any, perturbation: Control) -> Control:
-            context, targets = setup.context, setup.targets
-            if several:  # the first environment, as for the controls of a plan
-                context, start, targets = jax.tree.map(
-                    lambda leaf: leaf[0], (context, start, targets)
-                )
-            target = jax.tree.map(lambda leaf: leaf[0], targets)
-            at = StepIndex(jnp.zeros((), int), jnp.zeros(()))
-            weights = rollouts.tuning.cost
-            step = self.task.step(weights, context, start, perturbation, target, at)
-            return step.control
-
-        return feedback_gains(
-            result.samples,
-            start_of,
-            evaluate,
-            control_of,
-            observation,
-            result.plan,
-            self.gain_samples,
-        )
 
 
 def _keep_constraints(
