@@ -2,6 +2,8 @@
 states and types, several devices.
 """
 
+import dataclasses
+import inspect
 import os
 import subprocess
 import sys
@@ -151,6 +153,34 @@ def test_limits_hold_exactly_from_the_measured_actuator_on(search, window):
     assert np.all(np.abs(np.diff(controls, axis=0)) <= 3.0 * DT + 1e-6)
     if search == "gradient":  # the others average; the state is far off
         np.testing.assert_allclose(action, 0.5 - 3.0 * DT, atol=1e-6)
+
+
+@dataclasses.dataclass(frozen=True, eq=False, kw_only=True)
+class Random(control.Planner):
+    """A planner as a user writes it: the best of some plans."""
+
+    tries: int = 8
+
+    def search(self, key, state, evaluate):
+        shape = (self.horizon, self.tries, 1)
+        plans = state.plan[:, None] + jax.random.normal(key, shape).at[:, 0].set(0.0)
+        evaluated = evaluate(plans)
+        best = jnp.argmin(evaluated.costs)
+        lowest = evaluated.costs[best]
+        plan = evaluated.perturbations[:, best]
+        return control.SearchResult(plan, jnp.isfinite(lowest), lowest, jnp.ones(()))
+
+
+def test_a_planner_of_ones_own_is_a_search_and_has_all_settings_of_planners():
+    mine = control.factory(Random, Random.controller)
+    arguments = inspect.signature(mine).parameters
+    assert {"tries", "horizon", "noise_std", "risk"} <= set(arguments)
+    planner = mine(double_integrator(), tries=32, **FEW)
+    held = tuned(planner.init(jax.random.key(0)), elapsed=0.0)
+    _, state, first = act(planner, held)
+    _, state, later = act(planner, tuned(state, elapsed=0.0))
+    assert bool(later["healthy"])
+    assert later["cost"] <= first["cost"] * (1 + 1e-5)
 
 
 # ---- what is data

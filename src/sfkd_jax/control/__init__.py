@@ -1,5 +1,6 @@
 """Controllers: tasks, planners, feedback laws and wrappers, for any dynamics."""
 
+from sfkd_jax.control._factory import factory
 from sfkd_jax.control.laws._model_law import ModelLaw
 from sfkd_jax.control.laws._path_errors import (
     FeedbackLaw,
@@ -81,6 +82,7 @@ __all__ += [
     "autotune",
     "between_plans",
     "cem",
+    "factory",
     "gradient_planner",
     "koopman_mpc",
     "mppi",

@@ -51,6 +51,9 @@ class Planner:
     the observation, environment or reference is not, the controller continues the last
     healthy plan and `info["healthy"]` is False.
 
+    A planner of your own is a subclass with `search`, and `factory(Mine,
+    Mine.controller)` its factory; an entry in `build.PLANNERS` gives it settings.
+
     An environment of shape (particle, ne) holds equally likely environments. The cost
     of a plan is then the `risk` of its trajectories over them, and `info` describes
     the chosen plan in the first one.
