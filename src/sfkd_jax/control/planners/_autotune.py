@@ -82,9 +82,11 @@ def autotune(
             return drive(scaled(controller.init(key), factors), task)
 
         mean = jnp.mean(jax.vmap(one)(keys, batch))
+        # Settings that break an episode never win.
         return jnp.where(jnp.isfinite(mean), mean, jnp.inf)
 
     evaluate = jax.vmap(cost_of)
+    # The unchanged settings come first, so ties keep them.
     steps = itertools.product((0.0, -1.0, 1.0), repeat=len(entries))
     directions = jnp.asarray(list(steps))
     best, tried, costs = jnp.ones(len(entries)), [], []

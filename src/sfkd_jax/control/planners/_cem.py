@@ -61,6 +61,7 @@ class Cem(SamplingPlanner):
             carry: tuple[Plan, Plan], key: Key
         ) -> tuple[tuple[Plan, Plan], SearchResult]:
             plan, scale = carry
+            # Narrower with every iteration, per step and control.
             noise = self.draw(key, self.num_samples, std) * scale[:, None]
             evaluated = evaluate(candidate_plans(plan, noise, state))
             costs, best = replace_nonfinite(evaluated.costs, jnp.inf), None
@@ -85,6 +86,7 @@ class Cem(SamplingPlanner):
                 samples=self._reported(evaluated, kept),
                 best=best,
             )
+            # A spread of zero could never grow again.
             scale = jnp.maximum(spread / std[None], self.smallest_scale)
             return (mean, scale), result
 

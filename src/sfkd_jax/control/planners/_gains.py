@@ -52,12 +52,14 @@ def feedback_gains(
         raise ValueError("gain_samples needs a search with a temperature, see `mppi`")
     kept = min(count, samples.weights.shape[0])
     weights, chosen = jax.lax.top_k(samples.weights, kept)
+    # The heaviest samples stand for all: renormalise.
     weights = weights / jnp.maximum(jnp.sum(weights), jnp.finfo(weights.dtype).tiny)
     plans = samples.evaluated.perturbations[:, chosen]
     away = plans[0] - weights @ plans[0]
     setup, tuning = rollouts.setup, rollouts.tuning
 
     def costs_from(start: Any) -> Float[Array, " sample"]:
+        # A few samples are not worth spreading over devices.
         moved = replace(rollouts, setup=setup._replace(start=start), sharding=None)
         return moved(plans).costs
 
@@ -126,5 +128,6 @@ def between_plans(
     moved = difference(observation, planned_from)
     expected = fraction * difference(predicted, planned_from)
     wanted = control + gains @ difference(moved, expected)
+    # A reading that is not finite leaves the planned control.
     usable = jnp.where(jnp.all(jnp.isfinite(wanted)), wanted, control)
     return jnp.clip(usable, jnp.asarray(control_low), jnp.asarray(control_high))

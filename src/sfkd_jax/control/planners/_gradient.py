@@ -83,11 +83,13 @@ class GradientPlanner(Planner):
             slope = replace_nonfinite(jax.grad(cost_of)(plan), 0.0)
             downhill = -slope * std[None]  # in units of std
             size = jnp.sqrt(jnp.mean(downhill**2))
+            # Of unit size, so that a step length means the same for every cost.
             direction = downhill / jnp.where(size > 0, size, 1.0) * std[None]
             return best_of(plan[:, None] + sizes[None, :, None] * direction[:, None])
 
         plan = state.plan
         if state.proposals.shape[0]:
+            # They may lie in another valley: compare before descending.
             proposals = state.proposals.swapaxes(0, 1)
             plan, _ = best_of(jnp.concatenate([plan[:, None], proposals], axis=1))
         _, results = jax.lax.scan(descend, plan, None, length=self.iterations)

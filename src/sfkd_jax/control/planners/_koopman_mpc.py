@@ -157,6 +157,7 @@ class KoopmanMpc:
         inside = clip_environment(env, self.env_low, self.env_high)
         curvature = reference_curvature(reference)
         errors = path_errors(observation, reference[0], curvature[0])
+        # Progress counts from here: the predictor knows the path by its curvature only.
         start = observation.at[POSE].set(
             jnp.stack([jnp.zeros(()), errors.lateral, errors.heading])
         )
@@ -176,12 +177,14 @@ class KoopmanMpc:
             dt=self.dt,
         )
         H = 2 * cost.gains.T @ (cost.weights[:, None] * cost.gains)
+        # A predictor that ignores a control leaves a zero row.
         H = H + REGULARISATION * jnp.max(jnp.diagonal(H)) * jnp.eye(H.shape[0])
         f = 2 * cost.gains.T @ (cost.weights * cost.offsets)
         box = jnp.tile(low, horizon), jnp.tile(high, horizon)
         solution = box_qp(H, f, *box, state.plan.ravel(), iterations=self.iterations)
         rows = cost.gains @ solution.primal + cost.offsets
         total = jnp.sum(cost.weights * rows**2)
+        # A solution that did not converge is still inside the box, and used.
         healthy = clean & jnp.isfinite(total)
 
         plan = jnp.where(healthy, solution.primal.reshape(horizon, -1), state.plan)
@@ -308,6 +311,7 @@ def condense(
         respond, (predictor.lift(start), predictor.B), _curvature_of_steps(curvature)
     )
     lag = jnp.arange(horizon)[:, None] - jnp.arange(horizon)
+    # A control acts on later states only.
     gain = jnp.where((lag >= 0)[:, :, None, None], impulses[jnp.maximum(lag, 0)], 0.0)
     return Prediction(
         free, gain.transpose(0, 2, 1, 3).reshape(horizon, start.shape[0], -1)
@@ -389,12 +393,15 @@ def box_qp(
 
     def improve(x: Float[Array, " n"], _: None) -> tuple[Float[Array, " n"], None]:
         slope = H @ x + f
+        # At a bound, with descent pointing outward: such an entry stays.
         active = ((x <= low) & (slope > 0)) | ((x >= high) & (slope < 0))
+        # Their rows become diagonal: the factorisation keeps one shape.
         reduced = jnp.where(active[:, None] | active, jnp.diag(diagonal), H)
         newton = -cho_solve(cho_factor(reduced), jnp.where(active, 0.0, slope))
         candidates = jnp.clip(x + lengths * newton, low, high)
         moves = candidates - x
         change = moves @ slope + 0.5 * jnp.sum((moves @ H) * moves, axis=1)
+        # A step that is not finite is the worst of all.
         change = jnp.where(jnp.isfinite(change), change, jnp.inf)
         best = jnp.argmin(change)
         return jnp.where(change[best] < 0, candidates[best], x), None

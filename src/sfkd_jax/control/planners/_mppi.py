@@ -134,6 +134,7 @@ class Mppi(SamplingPlanner):
                 else evaluated.perturbations[:, chosen.best],
             )
 
+        # Splitting the key would change the plans of a single iteration.
         if self.iterations == 1:
             return improve(state.plan, key)[1]
         keys = jax.random.split(key, self.iterations)

@@ -54,6 +54,7 @@ def noise_sampler(
         raise ValueError(f"noise_exponent must be at least 0, got {exponent}")
     if kind in ("rbf", "spline") and not 2 <= knots <= horizon:
         raise ValueError(f"noise_knots must lie in [2, {horizon}], got {knots}")
+    # Its recursion needs no T x T factor.
     if kind == "ar1":
         return partial(_autoregressive, horizon, correlation)
     if kind == "white":
@@ -61,6 +62,7 @@ def noise_sampler(
     factor = _coloured(horizon, exponent) if kind == "coloured" else None
     if factor is None:
         factor = _bumps(horizon, knots) if kind == "rbf" else _spline(horizon, knots)
+    # Rows of unit length: the same spread at every step.
     return partial(_correlated, factor / np.linalg.norm(factor, axis=1, keepdims=True))
 
 
@@ -120,6 +122,7 @@ def _coloured(horizon: int, exponent: float) -> Float[np.ndarray, "horizon horiz
         power / np.sum(power)
     )
     table = covariance[np.abs(lags[:, None] - lags[None])]
+    # The spectrum is truncated, so the covariance may be singular by rounding.
     return np.linalg.cholesky(table + 1e-5 * np.eye(horizon))
 
 
@@ -130,6 +133,7 @@ def _spline(horizon: int, knots: int) -> Float[np.ndarray, "horizon knots"]:
     """
     times = np.arange(horizon) * (knots - 1.0) / (horizon - 1.0)
     order = min(4, knots)
+    # The four knots around a time; at the ends, the first or last four.
     left = np.clip(np.floor(times).astype(int) - (order - 1) // 2, 0, knots - order)
     factor = np.zeros((horizon, knots))
     for step, (time, first) in enumerate(zip(times, left, strict=True)):

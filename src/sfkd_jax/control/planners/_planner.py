@@ -169,17 +169,21 @@ class Planner:
         """Return the control of one step, the next state and `ControllerInfo`."""
         task, several = self.task, self._is_several(env)
         task.check(observation, env, reference, self.horizon)
+        # What is not finite must be noticed even where neither model nor cost reads it.
         clean = all_finite((observation, env, reference))
         inside = clip_environment(env, self.env_low, self.env_high)
         key = jax.random.wrap_key_data(state.key, impl=KEY_KINDS[state.key.shape[0]])
+        # The task has a stream of its own: a search that draws more does not change it.
         search_key, next_key = jax.random.split(key)
         task_key = jax.random.fold_in(key, TASK_STREAM)
+        # The stored plan begins one period after the last call; this call may be later.
         elapsed, state = catch_up(state)
 
         # Everything that all samples share is computed once, outside the rollouts.
         prepare = task.prepare
         start = PlanningStart(state.previous, state.started, task_key)
         if several:
+            # Particles differ in e and in the noise of the dynamics, not in the start.
             count = jax.tree.leaves(env)[0].shape[0]
             start = start._replace(key=jax.random.split(task_key, count))
             shared = jax.tree.map(lambda _: None, start)
@@ -194,8 +198,10 @@ class Planner:
             suggested = setup.proposals[0] if several else setup.proposals
             proposals = jnp.concatenate([state.proposals, suggested])
             proposed = state._replace(proposals=proposals)
+        # The search sees rollouts alone, so it works for any task.
         result = self.search(search_key, proposed, evaluate)
         plan = self._smooth(state.past, result.plan)
+        # The chosen plan is new (a mean, smoothed): its cost is known from its rollout.
         rollout = evaluate(plan[:, None]).only()
         if task.constraint is not None:
             plan, rollout, result = _keep_constraints(evaluate, plan, rollout, result)
@@ -206,6 +212,7 @@ class Planner:
         healthy = clean & result.usable & jnp.isfinite(rollout.costs)
         plan = jnp.where(healthy, plan, state.plan)
         controls = jnp.where(healthy, rollout.controls, state.controls)
+        # Zeros, the controls before the first plan, may lie outside the box.
         control = jnp.clip(controls[0], task.low, task.high)
         info: ControllerInfo = {
             "cost": result.cost,
@@ -233,6 +240,7 @@ class Planner:
                 self.gain_samples,
             )
             info["gains"] = jnp.where(healthy, gains, 0.0)
+        # Further delay is made up for by the next call.
         elapsed = jnp.minimum(elapsed, 1.0)
         after = state._replace(
             plan=shift(plan, elapsed),
@@ -265,6 +273,7 @@ class Planner:
         """Whether an environment is several that are equally likely."""
         if self.several is not None:
             return self.several
+        # A matrix is rows of environments; other trees need `several`.
         return getattr(env, "ndim", 0) == 2
 
     def _reported(

@@ -156,6 +156,7 @@ def tuned(state: PlannerState, **changes: Any) -> PlannerState:
                 raise ValueError(
                     f"the cost has no weights {', '.join(sorted(unknown))}"
                 )
+            # Weights that are not named keep their values.
             value = before[name] | value
         before[name] = jax.tree.map(partial(_of_type, name), before[name], value)
     return state._replace(tuning=Tuning(**before))

@@ -51,6 +51,7 @@ class Rollouts:
         if self.risk is None:
             return roll_out(self.setup, plans)
         each = jax.vmap(roll_out, in_axes=(0, None))(self.setup, plans)
+        # One of them is shown; the environments are exchangeable.
         controls, states = jax.tree.map(
             lambda leaf: leaf[0], (each.controls, each.states)
         )
@@ -93,6 +94,7 @@ def _roll_out(
     )
     carry = (none, start, None if task.constraint is None else none)
     first = jax.tree.map(lambda leaf: leaf[0], inputs)
+    # lax.scan wants a carry whose types do not change.
     carry = _as_returned(lambda carry: body(carry, first)[0], carry)
     # A single plan gains nothing from unrolling.
     (costs, _, worst), (controls, perturbations, states) = jax.lax.scan(

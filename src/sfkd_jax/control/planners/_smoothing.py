@@ -51,6 +51,7 @@ def plan_smoother(*, horizon: int, window: int, order: int) -> Smoother:
             f"smoothing_window {window} needs a horizon of at least {half + 1}, "
             f"got {horizon}"
         )
+    # Scaled to [-1, 1]: powers of large integers would be ill-conditioned.
     basis, _ = np.linalg.qr(np.vander(np.arange(-half, half + 1) / half, order + 1))
     fit = basis @ basis.T
     rows = np.zeros((horizon, half + horizon))

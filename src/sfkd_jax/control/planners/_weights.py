@@ -57,10 +57,12 @@ def weigh(
     temperature, any_kept = tuning.temperature, None
     if violations is not None:
         costs, any_kept = keep_constraints(costs, violations)
+    # λ on the cost scale of this very step: robust where costs vary by decades.
     if solve:
         temperature = temperature_for_sample_size(costs, tuning.effective_samples)
     scale = temperature
     if any_kept is not None:  # violations are in other units than costs
+        # No sample keeps all: average the least violated ones, sharply.
         few = temperature_for_sample_size(costs, jnp.asarray(FEW))
         scale = jnp.where(any_kept, temperature, few)
         temperature = jnp.where(any_kept, temperature, jnp.inf)
@@ -98,6 +100,7 @@ def keep_constraints(
         costs: of the samples.
         violations: largest of each sample, not below 0.
     """
+    # A rollout that is not finite keeps nothing, whatever its violation says.
     kept = (violations <= 0.0) & jnp.isfinite(costs)
     any_kept = jnp.any(kept)
     violations = jnp.where(jnp.isfinite(costs), violations, jnp.inf)
@@ -129,6 +132,7 @@ def temperature_for_sample_size(
     lowest = jnp.min(jnp.where(finite, costs, jnp.inf))
     highest = jnp.max(jnp.where(finite, costs, -jnp.inf))
     spread = highest - lowest
+    # All costs equal, or none finite: any positive scale will do.
     spread = jnp.where(jnp.isfinite(spread) & (spread > 0), spread, 1.0)
     # In [0, 1], whatever the units of cost.
     scaled = jnp.where(finite, (costs - lowest) / spread, jnp.inf)
@@ -139,6 +143,7 @@ def temperature_for_sample_size(
         few = effective_sample_size(softmin(scaled, jnp.exp(middle))[0]) < wanted
         return jnp.where(few, middle, low), jnp.where(few, high, middle)
 
+    # A fixed number of steps has a fixed cost, and compiles to a loop.
     ends = jnp.log(10.0) * jnp.asarray(DECADES)
     low, high = jax.lax.fori_loop(0, BISECTIONS, narrow, (ends[0], ends[1]))
     return spread * jnp.exp(0.5 * (low + high))
@@ -159,6 +164,7 @@ def _(
     _, slope = jax.jvp(
         size, (costs, temperature), (jnp.zeros_like(costs), unchanged + 1.0)
     )
+    # At an end of the bracket the equation does not hold: no derivative.
     inside = (jnp.abs(reached - wanted) < 1e-2 * wanted) & (slope > 0)
     change = (tangents[1] - by_costs) / jnp.where(inside, slope, 1.0)
     return temperature, jnp.where(inside, change, 0.0)

@@ -70,6 +70,7 @@ def outside_boxes(
     local = jnp.stack(
         [cos * away[:, 0] + sin * away[:, 1], cos * away[:, 1] - sin * away[:, 0]], 1
     )
+    # Outside: distance to the nearest corner or side; inside: to the nearest side.
     beyond = jnp.abs(local) - 0.5 * boxes[:, 3:]
     outside = jnp.sqrt(jnp.sum(jnp.maximum(beyond, 0.0) ** 2, axis=1) + 1e-12)
     return margin - (outside + jnp.minimum(jnp.max(beyond, axis=1), 0.0))

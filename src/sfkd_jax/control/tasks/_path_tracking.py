@@ -110,6 +110,7 @@ def tracking_cost(
 
     def stage(weights: Mapping[str, Any], inputs: StageInputs) -> Scalar:
         errors, before = inputs.errors, inputs.errors_before
+        # Finite at standstill.
         travelled = inputs.speed * dt + 1e-3
         angle = (errors.lateral - before.lateral) / travelled
         rate = (inputs.control[0] - inputs.control_before[0]) / dt
@@ -243,8 +244,10 @@ class PathTracking:
         targets = PathTarget(reference, curvature, goals, turns)
         first = jax.tree.map(lambda leaf: leaf[0], targets)
         law_control = self._law_control(observation, first)
+        # At the first step no control is known: assume that the law has driven.
         before = jnp.where(previous.known, previous.control, law_control)
         if self.actuator is not None:
+            # What is measured is better than what was commanded.
             before = self.actuator(observation)
         latent = model.encode(fiber, observation)
         start = PathSample(latent, model.decode(fiber, latent), errors, before)
@@ -272,6 +275,7 @@ class PathTracking:
         errors = path_errors(after, point, target.curvature)
         inputs = StageInputs(errors, before.errors, control, before.control, point[3])
         cost = self.cost.stage(weights, inputs)
+        # Otherwise the goal is not even computed.
         if self.latent_weight:
             cost = cost + self.latent_weight * jnp.sum(
                 (model.vector(latent) - model.vector(target.goal)) ** 2

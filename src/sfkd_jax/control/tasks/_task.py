@@ -262,8 +262,10 @@ class _FreeTask:
         start: PlanningStart,
     ) -> RolloutSetup:
         """Return the first sample and what all samples share."""
+        # Before the first control, slew limits count from rest.
         before = jnp.where(start.known, start.control, self.initial)
         if self.actuator is not None:
+            # What is measured is better than what was commanded.
             before = self.actuator(observation)
         first = FreeSample(jax.tree.map(jnp.asarray, observation), before)
         return RolloutSetup(_Context(params, env, start.key), first, reference)
@@ -280,6 +282,7 @@ class _FreeTask:
         """Return one step of one rollout: limits, state equation, cost."""
         extras = context._asdict() | {"step": at.number}
         if context.key is not None:
+            # One key a step for all samples: plans are compared under equal noise.
             extras["key"] = jax.random.fold_in(context.key, at.number)
         control = self.limit(nu, before.control)
         params, env = context.params, context.env
@@ -308,6 +311,7 @@ def _with_extras(function: Callable[..., Any]) -> Callable[..., Any]:
 
 def _is_extra(names: Mapping[str, inspect.Parameter], name: str) -> bool:
     """Whether a parameter of this name can only be an extra."""
+    # Positional names are the caller's own; `env` may be the fourth argument.
     return name in names and names[name].kind is inspect.Parameter.KEYWORD_ONLY
 
 
