@@ -274,7 +274,7 @@ def test_the_manifest_lists_the_inputs_of_programs_and_what_they_were_made_from(
     assert act["outputs"][0]["name"] == "control"
     states = [leaf for leaf in act["outputs"] if leaf["name"].startswith("state.")]
     assert states == act["inputs"][:-3] == manifest["programs"]["init"]["outputs"]
-    assert {"name": "state.inner.key", "shape": [2], "dtype": "uint32"} in states
+    assert {"name": "state.key", "shape": [2], "dtype": "uint32"} in states
     assert (
         manifest["weights_sha256"] == policy.restore(requested.run_dir).weights_sha256
     )

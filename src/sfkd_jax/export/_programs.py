@@ -70,7 +70,7 @@ def example_inputs(policy: Policy) -> tuple[Any, ...]:
 def flat_programs(policy: Policy) -> Programs:
     """Return the controller of a policy as programs, with folded weights inside.
 
-    Names are paths, such as `state.inner.plan` and `info.cost`. Keys are passed as
+    Names are paths, such as `state.plan` and `info.cost`. Keys are passed as
     their uint32 data.
 
     Raises:
