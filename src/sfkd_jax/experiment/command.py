@@ -78,6 +78,10 @@ def hydra_command(run: Run) -> Callable[[], None]:
             if sweeping:  # an exit would end the jobs that follow
                 raise
             sys.exit(code)
+        except Exception as reason:
+            if sweeping:  # Hydra shows the first failure alone
+                _report(f"{type(reason).__name__}: {reason}")
+            raise
         print(json.dumps(document), flush=True)
         return document.get("objective")
 
