@@ -126,8 +126,7 @@ def test_a_study_searches_and_a_failed_trial_does_not_end_it(toy):
         "+experiment=tune",
         "hydra.sweeper.n_trials=4",
         "hydra.sweeper.storage=null",
-        "~hydra.sweeper.params",
-        "+hydra.sweeper.params.seed=choice(1,5,6)",
+        "seed=choice(1,5,6)",
     )
     assert done.returncode == 0, done.stderr[-2000:]
     assert printed(done)
