@@ -4,13 +4,32 @@ python -m benchmarks.pages    writes every block `<!-- NAME -->` … `<!-- end -
 """
 
 import json
+import re
 from pathlib import Path
 
-from benchmarks.markdown import filled, table
+import numpy as np
+
+from experiments import results
+from experiments.results import markdown as table
 
 ROOT = Path(__file__).parents[1]
 PRETRAINED = ROOT / "src" / "sfkd_jax" / "pretrained"
 CARS = ("dynamic", "kinematic")
+
+
+def filled(page, made):
+    """A page with tables between <!-- NAME --> and the next <!-- end -->.
+
+    Raises:
+        SystemExit: a table has no place in the page, or several.
+    """
+    for name, text in made.items():
+        pattern = re.compile(rf"<!-- {name} -->\n.*?<!-- end -->", re.DOTALL)
+        place = f"<!-- {name} -->\n{text}\n<!-- end -->"
+        page, count = pattern.subn(lambda _, place=place: place, page)
+        if count != 1:
+            raise SystemExit(f"{count} places for the table {name!r}, not 1")
+    return page
 
 
 def read(name):
@@ -62,7 +81,7 @@ def corridor():
 
 def shield():
     """Hostile planners inside the filter, and without it."""
-    cars = read("benchmarks/quality/shield.json")["cars"]
+    cars = read("benchmarks/shield.json")["cars"]
     kinds = ("worst", "bang-bang", "random", "NaN", "full lock")
 
     def cells(car, kind):
@@ -111,8 +130,9 @@ def timing():
 
 def adaptation():
     """Errors with causes that nobody measures, dynamic car."""
-    cases = {
-        car: read(f"benchmarks/quality/adaptation_{car}.json")["cases"] for car in CARS
+    rows = read("benchmarks/adaptation.json")["rows"]
+    errors = {
+        (row["car"], row["case"], row["row"]): np.mean(row["rmse_mm"]) for row in rows
     }
     kinds = (
         "force, 3 s",
@@ -124,10 +144,50 @@ def adaptation():
     systems = ("oracle that knows", "SFKD", "SFKD, adaptive")
 
     def cell(car, kind):
-        return "; ".join(f"{cases[car][kind][name]['rmse_mm']:.1f}" for name in systems)
+        return "; ".join(f"{errors[car, kind, name]:.1f}" for name in systems)
 
     head = ["lateral RMSE [mm]: knows the cause; SFKD; SFKD, adaptive", *CARS]
     return table(head, [[kind, *(cell(car, kind) for car in CARS)] for kind in kinds])
+
+
+def peers():
+    """One control step beside other libraries, on one problem."""
+    rows = read("benchmarks/timing.json")["rows"]
+    ours = rows[0]["best_ms"]
+    return table(
+        ["1500 samples x 20 steps, two cores", "best [ms]", "median [ms]", "over ours"],
+        [
+            [
+                row["contender"],
+                f"{row['best_ms']:.1f}",
+                f"{row['median_ms']:.1f}",
+                f"{row['best_ms'] / ours:.2f}",
+            ]
+            for row in rows
+        ],
+    )
+
+
+def samples():
+    """The shipped path policies with 1500 and with 300 samples."""
+    rows = read("benchmarks/samples.json")["rows"]
+    mean = {
+        (row["policy"], row["scenario"], row["samples"]): np.mean(row["rmse_mm"])
+        for row in rows
+    }
+    lines = [
+        [
+            name.upper(),
+            *(
+                f"{mean[f'{car}_path', name, n]:.1f}"
+                for car in CARS
+                for n in (1500, 300)
+            ),
+        ]
+        for name in ("s1", "s2", "s3")
+    ]
+    heads = [f"{car}, {n}" for car in CARS for n in (1500, 300)]
+    return table(["lateral RMSE [mm]", *heads], lines)
 
 
 BLOCKS = {
@@ -135,6 +195,7 @@ BLOCKS = {
     "docs/corridor.md": {"corridor": corridor, "shield": shield},
     "docs/planner.md": {"timing": timing},
     "docs/adaptation.md": {"adaptation": adaptation},
+    "docs/results.md": results.TABLES | {"peers": peers},
 }
 
 

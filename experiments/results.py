@@ -1,7 +1,7 @@
 """Results in the repository: one JSON a benchmark, one line a row, and the tables of docs/results.md.
 
-    python -m experiments.results                       write the tables again
-    python -m experiments.results benchmark RUN         take runs/RUN/results.json first
+    python -m experiments.results benchmark [RUN]    takes runs/RUN/results.json
+    python -m benchmarks.pages                       writes the tables
 
 A row keeps the lateral RMSE of every episode of every training, from which intervals are
 computed here; Holm's correction needs the whole comparison and was made by `compare`.
@@ -10,6 +10,7 @@ computed here; Holm's correction needs the whole comparison and was made by `com
 import argparse
 import json
 import re
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -19,7 +20,6 @@ from sfkd_jax import evaluation
 
 HOME = Path(__file__).parent
 TABLE1 = HOME.parent / "conf" / "comparison" / "table1.yaml"
-PAGE = HOME.parent / "docs" / "results.md"
 BENCHMARKS = ("benchmark", "benchmark_path", "table1", "figure2", "corridor")
 VEHICLES = {
     "kinematic": "kinematic",
@@ -141,10 +141,11 @@ def cell(row, reference):
     return f"{mean:.1f} ({low:.1f} to {high:.1f}){mark}"
 
 
-def table(heads, rows):
-    """A table in Markdown."""
+def markdown(heads, rows):
+    """A table in Markdown; a bar in a cell does not end it."""
     lines = [heads, ["---"] * len(heads), *rows]
-    return "\n".join(f"| {' | '.join(map(str, cells))} |" for cells in lines)
+    escaped = ([str(cell).replace("|", "\\|") for cell in line] for line in lines)
+    return "\n".join(f"| {' | '.join(cells)} |" for cells in escaped)
 
 
 def benchmark_table(name, scenarios, controllers):
@@ -160,7 +161,7 @@ def benchmark_table(name, scenarios, controllers):
             learned = driven["kinematic"]["parameters"] is not None
             trainings = min(len(row["seeds"]) for row in driven.values())
             lines.append([title, *cells, trainings if learned else "–"])
-    return table(["lateral RMSE [mm]", *VEHICLES.values(), "trainings"], lines)
+    return markdown(["lateral RMSE [mm]", *VEHICLES.values(), "trainings"], lines)
 
 
 def paper_table():
@@ -179,46 +180,30 @@ def paper_table():
             cells += [f"{mean:.1f}", shown]
         lines.append([LABELS[label], *cells])
     heads = ["lateral RMSE [mm]", "S2, here", "S2, paper", "S3, here", "S3, paper"]
-    return table(heads, lines)
+    return markdown(heads, lines)
 
 
-def tables():
-    """Marker in docs/results.md -> its table."""
-    around_feedback = ("mppi", "koopman_mpc")
-    along_path = ("mppi_path_300",)
-    path_scenarios = ("s2", "s3")
-    return {
-        "body": benchmark_table("benchmark", ("s3",), around_feedback),
-        "path": benchmark_table("benchmark_path", path_scenarios, along_path),
-        "paper": paper_table(),
-    }
-
-
-def filled(page):
-    """The page with its tables between <!-- NAME --> and <!-- end -->."""
-    for name, text in tables().items():
-        place = re.compile(rf"<!-- {name} -->\n.*?<!-- end -->", re.DOTALL)
-        page, count = place.subn(
-            lambda _, t=text, n=name: f"<!-- {n} -->\n{t}\n<!-- end -->", page
-        )
-        if count != 1:
-            raise SystemExit(f"{PAGE}: {count} places for the table {name!r}, not 1")
-    return page
+TABLES = {
+    "body": partial(benchmark_table, "benchmark", ("s3",), ("mppi", "koopman_mpc")),
+    "path": partial(
+        benchmark_table, "benchmark_path", ("s2", "s3"), ("mppi_path_300",)
+    ),
+    "paper": paper_table,
+}
+"""Place in docs/results.md -> its table."""
 
 
 def main():
-    """Take the results of a comparison, if one is named; write the page."""
+    """Take the results of a comparison."""
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
-    parser.add_argument("name", nargs="?", choices=BENCHMARKS)
+    parser.add_argument("name", choices=BENCHMARKS)
     parser.add_argument("run", nargs="?", help="folder below runs/; the same name")
     given = parser.parse_args()
-    if given.name:
-        folder = HOME.parent / "runs" / (given.run or given.name)
-        results = json.loads((folder / "results.json").read_text("utf-8"))
-        write(given.name, condense(results))
-    PAGE.write_text(filled(PAGE.read_text("utf-8")), "utf-8")
+    folder = HOME.parent / "runs" / (given.run or given.name)
+    results = json.loads((folder / "results.json").read_text("utf-8"))
+    write(given.name, condense(results))
 
 
 if __name__ == "__main__":

@@ -1,1 +1,0 @@
-"""How well plans, laws and corridors do."""

@@ -1,1 +1,0 @@
-"""Faults, kills, hostile files and mutants."""

@@ -1,0 +1,337 @@
+"""One control step of this library beside others, on one problem with the same weights.
+
+    python -m benchmarks.timing [--rounds 3 --steps 40 --only NAME ...]
+
+z⁺ = A z + B u + W₃ tanh(W₂ tanh(W₁ [z; u] + b₁) + b₂), y = D₃ tanh(D₂ tanh(D₁ z)),
+cost |y − y_ref|² + 0.01 |u|²; 1500 samples, 20 steps. Every contender has a process of its
+own, in turn; a library that does not import is named and left out. Writes
+benchmarks/timing.json.
+"""
+
+import argparse
+import json
+import os
+import platform
+import statistics
+import subprocess
+import sys
+import time
+from functools import partial
+from importlib import metadata
+from pathlib import Path
+
+import numpy as np
+
+HOME = Path(__file__).parent
+RANK, CONTROLS, OUTPUTS, WIDTH = 32, 2, 4, 64
+NOISE, TEMPERATURE, EFFORT = 0.4, 1.0, 0.01
+LOW, HIGH = -2.0, 2.0
+SAMPLES, HORIZON, WARM_UP = 1500, 20, 9
+TARGET = np.zeros(OUTPUTS, np.float32)
+PACKAGES = ("jax", "torch", "pytorch_mppi", "jax_mppi", "evosax")
+
+
+def weights():
+    """The same for all contenders."""
+    random = np.random.default_rng(0)
+
+    def layer(out, size, scale=1.0):
+        drawn = scale * random.normal(size=(out, size)) / np.sqrt(size)
+        return drawn.astype(np.float32)
+
+    rotation, _ = np.linalg.qr(random.normal(size=(RANK, RANK)))
+    return {
+        "A": (0.97 * rotation).astype(np.float32),
+        "B": layer(RANK, CONTROLS, 0.3),
+        "W1": layer(WIDTH, RANK + CONTROLS),
+        "b1": np.zeros(WIDTH, np.float32),
+        "W2": layer(WIDTH, WIDTH),
+        "b2": np.zeros(WIDTH, np.float32),
+        "W3": layer(RANK, WIDTH, 0.05),
+        "D1": layer(WIDTH, RANK),
+        "D2": layer(WIDTH, WIDTH),
+        "D3": layer(OUTPUTS, WIDTH),
+    }
+
+
+def advance(xp, w, z, u):
+    """z⁺ of one sample, or of samples as rows; xp is jax.numpy or torch."""
+    hidden = xp.tanh(xp.concatenate((z, u), -1) @ w["W1"].T + w["b1"])
+    residual = xp.tanh(hidden @ w["W2"].T + w["b2"]) @ w["W3"].T
+    return z @ w["A"].T + u @ w["B"].T + residual
+
+
+def charge(xp, w, z, u, target):
+    """The cost of arriving at z by u, likewise."""
+    y = xp.tanh(xp.tanh(z @ w["D1"].T) @ w["D2"].T) @ w["D3"].T
+    return xp.sum((y - target) ** 2, -1) + EFFORT * xp.sum(u**2, -1)
+
+
+def start():
+    """The latent state at the first step."""
+    return np.random.default_rng(1).normal(size=RANK).astype(np.float32)
+
+
+def on_device():
+    """The weights as jax arrays."""
+    import jax.numpy as jnp
+
+    return {name: jnp.asarray(value) for name, value in weights().items()}
+
+
+def stepping(act, first):
+    """`act(memory, z, target) -> u, memory`, jitted, with its memory kept."""
+    import jax
+
+    jitted, memory = jax.jit(act), [first]
+
+    def step(z, target):
+        u, memory[0] = jitted(memory[0], z, target)
+        return np.asarray(u)
+
+    return step
+
+
+def sfkd_jax():
+    """This library: white noise and a fixed temperature, as the others have them."""
+    import jax
+    import jax.numpy as jnp
+
+    from sfkd_jax import control
+
+    w = on_device()
+
+    def dynamics(w, z, u, env):
+        return advance(jnp, w, z, u)
+
+    def stage(_, z, u, before, target):
+        return charge(jnp, w, z, u, target)
+
+    task = control.free_task(
+        dynamics,
+        stage,
+        control_low=(LOW,) * CONTROLS,
+        control_high=(HIGH,) * CONTROLS,
+    )
+    controller = control.mppi(
+        task,
+        num_samples=SAMPLES,
+        horizon=HORIZON,
+        noise="white",
+        noise_std=(NOISE,) * CONTROLS,
+        temperature=TEMPERATURE,
+        unroll=4,
+    )
+
+    def act(memory, z, target):
+        targets = jnp.tile(target, (HORIZON, 1))
+        u, memory, _ = controller.act(w, memory, z, jnp.zeros(0), targets)
+        return u, memory
+
+    return stepping(act, controller.init(jax.random.key(0)))
+
+
+def plain_jax():
+    """What a user would write by hand: one scan, softmax, shift."""
+    import jax
+    import jax.numpy as jnp
+
+    w = on_device()
+
+    def act(memory, z, target):
+        key, plan = memory
+        key, draw = jax.random.split(key)
+        noise = NOISE * jax.random.normal(draw, (HORIZON, SAMPLES, CONTROLS))
+        plans = jnp.clip(plan[:, None] + noise, LOW, HIGH)
+
+        def body(carry, controls):
+            costs, states = carry
+            states = advance(jnp, w, states, controls)
+            return (costs + charge(jnp, w, states, controls, target), states), None
+
+        first = jnp.zeros(SAMPLES), jnp.tile(z, (SAMPLES, 1))
+        (costs, _), _ = jax.lax.scan(body, first, plans)
+        plan = jnp.einsum("m,tmc->tc", jax.nn.softmax(-costs / TEMPERATURE), plans)
+        return plan[0], (key, jnp.concatenate([plan[1:], plan[-1:]]))
+
+    return stepping(act, (jax.random.key(0), jnp.zeros((HORIZON, CONTROLS))))
+
+
+def jax_mppi():
+    """jax_mppi inside one jit; it charges z_t where the others charge z_{t+1}."""
+    import jax
+    import jax.numpy as jnp
+    from jax_mppi import mppi
+
+    w, ones = on_device(), jnp.ones(CONTROLS)
+    config, first = mppi.create(
+        RANK,
+        CONTROLS,
+        NOISE**2 * jnp.diag(ones),
+        num_samples=SAMPLES,
+        horizon=HORIZON,
+        lambda_=TEMPERATURE,
+        u_min=LOW * ones,
+        u_max=HIGH * ones,
+        key=jax.random.PRNGKey(0),
+    )
+
+    def act(memory, z, target):
+        def cost(z, u):
+            return charge(jnp, w, z, u, target)
+
+        return mppi.command(config, memory, z, partial(advance, jnp, w), cost)
+
+    return stepping(act, first)
+
+
+def evosax_cma_es():
+    """evosax, one generation of CMA-ES a step, started anew around the shifted plan."""
+    import jax
+    import jax.numpy as jnp
+    from evosax.algorithms import CMA_ES
+
+    w, plan = on_device(), jnp.zeros((HORIZON, CONTROLS))
+    strategy = CMA_ES(population_size=SAMPLES, solution=plan)
+    params = strategy.default_params.replace(std_init=NOISE)
+
+    def rollout(z, target, controls):
+        def body(z, u):
+            z = advance(jnp, w, z, u)
+            return z, charge(jnp, w, z, u, target)
+
+        return jnp.sum(jax.lax.scan(body, z, controls)[1])
+
+    def act(memory, z, target):
+        key, plan = memory
+        key, begin, ask, tell = jax.random.split(key, 4)
+        plans, state = strategy.ask(ask, strategy.init(begin, plan, params), params)
+        plans = jnp.clip(plans, LOW, HIGH)
+        costs = jax.vmap(partial(rollout, z, target))(plans)
+        state, _ = strategy.tell(tell, plans, costs, state, params)
+        plan = jnp.clip(strategy.get_mean(state), LOW, HIGH)
+        return plan[0], (key, jnp.concatenate([plan[1:], plan[-1:]]))
+
+    return stepping(act, (jax.random.key(0), plan))
+
+
+def pytorch_mppi():
+    """pytorch-mppi, eager, float32."""
+    import pytorch_mppi as library
+    import torch
+
+    torch.manual_seed(0)
+    w = {name: torch.as_tensor(value) for name, value in weights().items()}
+    aim, ones = [None], torch.ones(CONTROLS)
+    planner = library.MPPI(
+        partial(advance, torch, w),
+        lambda z, u: charge(torch, w, z, u, aim[0]),
+        RANK,
+        noise_sigma=NOISE**2 * torch.diag(ones),
+        num_samples=SAMPLES,
+        horizon=HORIZON,
+        lambda_=TEMPERATURE,
+        u_min=LOW * ones,
+        u_max=HIGH * ones,
+        U_init=torch.zeros(HORIZON, CONTROLS),
+    )
+
+    def step(z, target):
+        aim[0] = torch.as_tensor(target)
+        return planner.command(torch.as_tensor(z)).numpy()
+
+    return step
+
+
+CONTENDERS = {
+    build.__name__: build
+    for build in (sfkd_jax, plain_jax, jax_mppi, evosax_cma_es, pytorch_mppi)
+}
+
+
+def measure(name, steps):
+    """Seconds to the first answer, then the time of every warm step [ms]."""
+    began = time.perf_counter()
+    step, z = CONTENDERS[name](), start()
+    step(z, TARGET)
+    first, times = time.perf_counter() - began, []
+    for number in range(WARM_UP + steps):
+        began = time.perf_counter()
+        step(z, TARGET)
+        if number >= WARM_UP:
+            times.append(1e3 * (time.perf_counter() - began))
+    return {"first_s": first, "times_ms": times}
+
+
+def in_own_process(name, steps):
+    """`measure` in a new process; {"error": its last line} if it fails."""
+    command = [sys.executable, "-m", "benchmarks.timing", "--measure", name]
+    command += ["--steps", str(steps)]
+    done = subprocess.run(
+        command, cwd=HOME.parent, capture_output=True, text=True, check=False
+    )
+    if done.returncode:
+        return {"error": (done.stderr.strip().splitlines() or ["no output"])[-1]}
+    return json.loads(done.stdout.splitlines()[-1])
+
+
+def versions():
+    """Of the packages that are installed."""
+    found = {}
+    for name in PACKAGES:
+        try:
+            found[name] = metadata.version(name)
+        except metadata.PackageNotFoundError:
+            continue
+    return found
+
+
+def main():
+    """Parse, run, write."""
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument("--rounds", type=int, default=3)
+    parser.add_argument("--steps", type=int, default=40)
+    parser.add_argument("--only", nargs="*", default=[*CONTENDERS], choices=CONTENDERS)
+    parser.add_argument("--measure", choices=CONTENDERS, help=argparse.SUPPRESS)
+    given = parser.parse_args()
+    if given.measure:
+        print(json.dumps(measure(given.measure, given.steps)))
+        return
+    # Another job beside a benchmark spoils its times: the load says whether there was.
+    load, rounds = os.getloadavg()[0], {name: [] for name in given.only}
+    for _ in range(given.rounds):
+        for name in given.only:
+            rounds[name].append(in_own_process(name, given.steps))
+    rows, left_out = [], {}
+    for name, found in rounds.items():
+        if errors := [one["error"] for one in found if "error" in one]:
+            left_out[name] = errors[0]
+            continue
+        medians = [statistics.median(one["times_ms"]) for one in found]
+        every = np.concatenate([one["times_ms"] for one in found])
+        rows.append(
+            {
+                "contender": name,
+                "best_ms": round(min(medians), 2),
+                "median_ms": round(statistics.median(medians), 2),
+                "p99_ms": round(float(np.quantile(every, 0.99)), 2),
+                "first_s": round(statistics.median(one["first_s"] for one in found), 2),
+            }
+        )
+        print(rows[-1])
+    print(left_out)
+    document = {
+        "cores": len(os.sched_getaffinity(0)),
+        "processor": platform.machine(),
+        "load": load,
+        "versions": versions(),
+        "left_out": left_out,
+        "rows": rows,
+    }
+    (HOME / "timing.json").write_text(json.dumps(document, indent=1) + "\n", "utf-8")
+
+
+if __name__ == "__main__":
+    main()

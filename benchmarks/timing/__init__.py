@@ -1,1 +1,0 @@
-"""Times of control steps, episodes and compilations."""
