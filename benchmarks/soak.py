@@ -136,7 +136,7 @@ def main():
         "controls_outside_limits": outside,
         "state_entries_not_finite_after_a_fault": left,
         "compilations": act._cache_size(),
-        "resident_mb": [round(one, 1) for one in (resident[0], resident[-1])],
+        "resident_mb": [round(one, 1) for one in resident],
         "put_back": put_back,
         "median_distance_m": round(float(np.median(np.abs(lateral))), 4),
     }
