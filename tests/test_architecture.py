@@ -22,28 +22,30 @@ PACKAGE = SRC.name
 CORE = {"types", "geometry", "rollout", "ranges"}
 COMMANDS = {"generate", "train", "certify", "evaluate", "compare", "doctor", "demo"}
 """Modules that are commands alone; `export` and `report` are packages that run."""
-PLANT = CORE | {"plants"}
-LEARNED = PLANT | {"scenarios", "data", "models", "control", "store"}
+PLANT = CORE | {"plants", "scenarios"}
+PARTS = PLANT | {"control", "data"}
 ARROWS = {
     "types": set(),
     "ranges": set(),
-    "geometry": CORE,
-    "rollout": CORE,
+    "geometry": {"types"},
+    "rollout": {"types", "geometry"},
+    "settings": {"ranges"},
     "store": set(),
     "plants": CORE,
+    "scenarios": CORE,
     "models": CORE,
     "control": CORE,
     "training": CORE | {"store"},
-    "scenarios": PLANT,
-    "data": PLANT | {"scenarios", "store"},
-    "evaluation": PLANT | {"scenarios"},
-    "certification": LEARNED | {"evaluation"},
-    "policy": LEARNED | {"certification", "experiment"},
-    "adapters": PLANT | {"scenarios", "experiment"},
-    "report": {"store", "evaluation"},
-    "__init__": {"store", "export", "policy"},
+    "data": PLANT | {"store"},
+    "evaluation": PLANT,
+    "certification": PARTS | {"evaluation"},
+    "build": PARTS | {"models", "settings"},
+    "policy": PARTS | {"build", "certification", "store"},
+    "export": CORE | {"build", "policy", "settings", "store"},
+    "adapters": PLANT | {"build"},
+    "report": {"evaluation", "store"},
+    "__init__": {"export", "policy", "store"},
 }
-ARROWS |= {"export": CORE | {"store", "policy", "experiment"}}
 ARROWS |= {"experiment": set(ARROWS)}
 ARROWS |= {name: set(ARROWS) for name in COMMANDS | {"__main__"}}
 
@@ -52,16 +54,16 @@ COMMAND_LINE = {"hydra", "omegaconf", "numpy"}
 THIRD_PARTY = {
     "store": {"numpy", "filelock", "safetensors"},
     "data": {"numpy", "pyarrow", "pint"},
-    "models": {"flax", "numpy"},
+    "models": {"flax"},
     "control": {"numpy"},
-    "training": {"optax", "orbax", "numpy"},
+    "training": {"optax", "orbax"},
     "certification": {"numpy", "scipy", "threadpoolctl", "cvxpy", "clarabel"},
     "evaluation": {"numpy", "scipy"},
     "report": {"numpy", "matplotlib", "PIL", "jinja2"},
     "policy": {"numpy"},
     "adapters": {"brax", "gymnasium", "matplotlib", "numpy", "scipy", "vehiclemodels"},
-    "export": {"numpy", "iree", "hydra", "omegaconf"},
-    "experiment": COMMAND_LINE | {"submitit"},
+    "export": {"numpy", "iree"},
+    "experiment": COMMAND_LINE,
 } | {command: COMMAND_LINE for command in COMMANDS | {"__main__"}}
 HEAVY = {
     "hydra",

@@ -66,7 +66,7 @@ def exported(model: Model, params: Params) -> Exported:
     return weights
 
 
-def _host() -> jax.Device | None:
+def _host() -> Any:
     """Return the processor as a device; None if the process may not use it."""
     try:
         return jax.local_devices(backend="cpu")[0]
