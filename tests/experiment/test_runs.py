@@ -91,7 +91,7 @@ def test_a_certificate_with_the_same_settings_is_kept(certified):
     assert certified(()) == certified((), "certification.renew=true") == 0
 
 
-@pytest.mark.parametrize("change", ["level=0.8", "corridor.drives=99"])
+@pytest.mark.parametrize("change", ["level=0.8", "corridor.runs=99"])
 def test_one_with_other_settings_is_made_again(certified, change):
     """Otherwise cells would be driven with it and filed under the new settings."""
     assert certified((), f"certification.{change}") == 1
