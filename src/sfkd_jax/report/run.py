@@ -28,6 +28,15 @@ PROOF = (
     "promised for further runs under the same conditions. Outside the boxes nothing is "
     "claimed."
 )
+_WRITERS = {
+    "interval": formats.interval,
+    "plain": plain,
+    "range": lambda ends: " to ".join(map(short, ends or [None])),
+    "share": formats.share,
+    "short": short,
+    "upper": formats.upper,
+}
+"""How templates/certificate.csv says that a value is written."""
 _CAR = ["speed [m/s]", "lateral speed [m/s]", "yaw rate [rad/s]", "steering [rad]"]
 _BODY = {
     "state": _CAR,
@@ -193,7 +202,7 @@ def _certified(record: dict[str, Any]) -> list[Part]:
     rows = []
     for line in file.read_text("utf-8").splitlines():
         name, place, write, basis = line.split(";")
-        shown = getattr(formats, write)(dig(record, *place.split(".")))
+        shown = _WRITERS[write](dig(record, *place.split(".")))
         rows += [(name, [shown, basis])] if DASH not in shown else []
     columns = [("", "value"), ("", "rests on")]
     boxes = []
