@@ -168,28 +168,6 @@ def peers():
     )
 
 
-def samples():
-    """The shipped path policies with 1500 and with 300 samples."""
-    rows = read("benchmarks/samples.json")["rows"]
-    mean = {
-        (row["policy"], row["scenario"], row["samples"]): np.mean(row["rmse_mm"])
-        for row in rows
-    }
-    lines = [
-        [
-            name.upper(),
-            *(
-                f"{mean[f'{car}_path', name, n]:.1f}"
-                for car in CARS
-                for n in (1500, 300)
-            ),
-        ]
-        for name in ("s1", "s2", "s3")
-    ]
-    heads = [f"{car}, {n}" for car in CARS for n in (1500, 300)]
-    return table(["lateral RMSE [mm]", *heads], lines)
-
-
 BLOCKS = {
     "README.md": {"corridor": corridor},
     "docs/corridor.md": {"corridor": corridor, "shield": shield},

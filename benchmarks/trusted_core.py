@@ -1,7 +1,7 @@
 """Search for a false claim that the trusted core accepts, with exact arithmetic.
 
-    python -m benchmarks.robustness.trusted_core [--cases 200000 --seed 1]
-        [--out benchmarks/robustness/trusted_core.json]
+    python -m benchmarks.trusted_core [--cases 200000 --seed 1]
+        [--out benchmarks.trusted_core.json]
 
 Half of the cases are hostile matrices with a tolerated error, half are networks with
 multipliers, a bound, A and P. The search stops at the first case that is accepted and
@@ -15,7 +15,7 @@ import time
 from pathlib import Path
 
 HERE = Path(__file__).resolve().parent
-sys.path.append(str(HERE.parents[1] / "tests"))
+sys.path.append(str(HERE.parent / "tests"))
 
 from exact import search  # noqa: E402  the tests run the same search with fewer cases
 
