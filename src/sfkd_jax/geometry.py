@@ -20,6 +20,7 @@ from sfkd_jax.types import BODY, POSE, Control, Environment, Pose, Scalar, State
 
 def wrap_angle(angle: Float[Array, "*shape"]) -> Float[Array, "*shape"]:
     """Return the same angle in [-π, π], with gradient 1."""
+    # round has derivative 0 everywhere: differences of angles stay differentiable.
     return angle - 2 * jnp.pi * jnp.round(angle / (2 * jnp.pi))
 
 
@@ -34,6 +35,7 @@ def compose(
 ) -> Float[Array, " 3"]:
     """Return g ∘ Δ, the pose after a motion Δ in the frame of g; yaw is not wrapped."""
     position = pose[:2] + rotate(pose[2], increment[:2])
+    # Unwrapped, so that the yaw of a run is continuous.
     return jnp.concatenate([position, pose[2:] + increment[2:]])
 
 
@@ -41,6 +43,7 @@ def between(
     pose: Float[Array, " 3"], pose_next: Float[Array, " 3"]
 ) -> Float[Array, " 3"]:
     """Return g⁻¹ ∘ g', the motion from g to g' in the frame of g, yaw wrapped."""
+    # Differences before the rotation: far from the origin float32 loses less.
     position = rotate(-pose[2], pose_next[:2] - pose[:2])
     return jnp.concatenate([position, wrap_angle(pose_next[2:] - pose[2:])])
 
@@ -78,8 +81,11 @@ def circle_errors(pose: Pose, curvature: Scalar) -> tuple[Scalar, Scalar]:
     """
     x, y, yaw = pose[0], pose[1], pose[2]
     q = curvature * (x**2 + y**2) - 2.0 * y
+    # 1 + κ q is the squared distance to the centre in radii;
+    # limited before the root, whose gradient at 0 is infinite.
     scale = jnp.sqrt(jnp.maximum(1.0 + curvature * q, SMALLEST_SCALE**2))
     turned = jnp.arctan2(curvature * x, 1.0 - curvature * y)
+    # Division by at least 1 + 0.2: the conjugate form has no cancellation at κ → 0.
     return -q / (1.0 + scale), wrap_angle(yaw - turned)
 
 
@@ -87,6 +93,7 @@ def is_valid(
     lateral: Float[Array, "*shape"], curvature: Float[Array, "*shape"]
 ) -> Bool[Array, "*shape"]:
     """Whether path coordinates are meaningful: 1 − κ e_y > 0.2; False for NaN."""
+    # A comparison with NaN is False, so that an unknown position is never valid.
     return 1.0 - curvature * lateral > SMALLEST_SCALE
 
 
@@ -113,6 +120,7 @@ def path_step(
         coordinates: PathState, control: Control, curvature: Scalar, env: Environment
     ) -> PathState:
         after = step(vehicle_state(coordinates), control, env)
+        # From the old foot point, through which the circle goes: the errors stay exact.
         lateral, heading = circle_errors(after[POSE], curvature)
         return jnp.concatenate([jnp.stack([lateral, heading]), after[BODY]])
 
@@ -138,6 +146,7 @@ def closed_loop(
     def closed(state: State, inputs: Control, env: Environment) -> State:
         curvature = inputs[CURVATURE]
         wanted = law(state[BODY], curvature, inputs[REFERENCE_SPEED], env)
+        # Clipped after the perturbation is added: the actuator limits their sum.
         control = jnp.clip(wanted + inputs[PERTURBATION], bottom, top)
         return path_state(along(state[BODY], control, curvature, env))
 

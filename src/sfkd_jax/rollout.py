@@ -59,6 +59,7 @@ def fold(model: Model, params: Params) -> Params:
     Returns:
         `Folded`, or the parameters themselves if the model has nothing to share.
     """
+    # Folding twice would wrap the weights twice, and `unfold` removes one layer.
     if model.shared is None or isinstance(params, Folded):
         return params
     return Folded(params, model.shared(params))
@@ -103,13 +104,16 @@ def with_offset(model: Model) -> Model:
     """
 
     def init(key: Key) -> Offset:
+        # A scalar 0 broadcasts over any control, whose size is not known here.
         return Offset(model.init(key), jnp.zeros(()), None)
 
     def fiber(params: Offset, env: Environment) -> OffsetFiber:
+        # After the model's own fiber: δ and b are no functions of e.
         return OffsetFiber(model.fiber(params.params, env), *params[1:])
 
     def step(fiber: OffsetFiber, latent: Latent, control: Control) -> Latent:
         after = model.step(fiber.fiber, latent, control + fiber.inputs)
+        # None, not zeros: a model without a latent shift pays nothing for it.
         if fiber.latent is None:
             return after
         return jax.tree.map(jnp.add, after, fiber.latent)
@@ -134,6 +138,7 @@ def with_offset(model: Model) -> Model:
         decode=decode,
         transport=transport,
         observe=observe,
+        # Folding is for the parameters inside, see `Offset.params`.
         shared=None,
         structure=_structure(model.structure),
     )
@@ -144,6 +149,7 @@ def _structure(structure: Structure) -> Structure:
     explicit, rate = structure.explicit, structure.rate
 
     def explicit_of(params: Offset) -> Explicit:
+        # `explicit and …` below makes this function only where it is set.
         assert explicit is not None
         return explicit(params.params)
 
@@ -158,6 +164,7 @@ def fibers_along(
 ) -> tuple[Fiber, Fiber]:
     """Return the fibers of e_0 … e_{T-1} and of e_1 … e_{T-1}, e_{T-1}."""
     fibers = jax.vmap(model.fiber, in_axes=(None, 0))(params, trajectory.envs)
+    # After the last step no further e is known: it is taken to stay.
     later = jax.tree.map(lambda leaf: jnp.concatenate([leaf[1:], leaf[-1:]]), fibers)
     return fibers, later
 
@@ -167,14 +174,17 @@ def rollout(
 ) -> tuple[Float[Array, "time state"], Latent, tuple[Fiber, Fiber]]:
     """Predict x_1 … x_T from x_0, u and e; return the latents and fibers as well."""
     fibers, later = fibers_along(model, params, trajectory)
+    # In the first environment, in which the first step is taken.
     start = model.encode(_at(fibers, 0), trajectory.states[0])
 
     def step(latent: Latent, inputs: Any) -> tuple[Latent, Latent]:
         fiber, fiber_next, control = inputs
+        # First the step under e, then transport to e': z belongs to the next fiber.
         latent = model.transport(fiber, fiber_next, model.step(fiber, latent, control))
         return latent, latent
 
     _, latents = jax.lax.scan(step, start, (fibers, later, trajectory.controls))
+    # In the later fibers, to which transport has carried the latents.
     return jax.vmap(model.decode)(later, latents), latents, (fibers, later)
 
 
@@ -189,12 +199,14 @@ def sliding_windows(trajectory: Trajectory, *, horizon: int, stride: int) -> Tra
     Raises:
         ValueError: the horizon does not fit the trajectory.
     """
+    # Controls count steps; there is one state more.
     steps = trajectory.controls.shape[0]
     if horizon > steps:
         raise ValueError(
             f"a horizon of {horizon} steps does not fit trajectories of {steps} steps"
         )
     starts = jnp.arange(0, steps - horizon + 1, stride)
+    # One state more than steps: a window ends with the state after its last control.
     states = trajectory.states[starts[:, None] + jnp.arange(horizon + 1)]
     inside = starts[:, None] + jnp.arange(horizon)
     return Trajectory(states, trajectory.controls[inside], trajectory.envs[inside])
@@ -235,6 +247,7 @@ def prediction_errors(
     Along a path: |e_y| [m], |e_ψ| [rad], 2-norm of the vehicle's own body state.
     """
     gap = predicted - window.states[1:]
+    # The pose of a path state is 0 throughout and would count as a perfect prediction.
     kinds = (
         _kinds_along_path(gap)
         if along_path
@@ -255,6 +268,7 @@ def state_errors(
     """
     # In the true heading, so that along and across mean the same everywhere.
     position = jax.vmap(rotate)(-true[:, 2], predicted[:, :2] - true[:, :2])
+    # Wrapped: a car that has turned around is not 2π away from itself.
     yaw = wrap_angle(predicted[:, 2:3] - true[:, 2:3])
     return jnp.concatenate([position, yaw, predicted[:, BODY] - true[:, BODY]], axis=1)
 
@@ -273,6 +287,7 @@ def in_batches(function: Callable[[Any], Any], items: Any, *, size: int) -> Any:
     """
     count = jax.tree.leaves(items)[0].shape[0]
     size = min(size, count)
+    # Padding repeats the first items: real data, so that no NaN appears in it.
     rows = (jnp.arange(-(-count // size) * size) % count).reshape(-1, size)
     results = jax.lax.map(
         lambda chosen: jax.vmap(function)(
@@ -280,6 +295,7 @@ def in_batches(function: Callable[[Any], Any], items: Any, *, size: int) -> Any:
         ),
         rows,
     )
+    # Padding is at the end, since rows run through the items in order.
     return jax.tree.map(lambda leaf: leaf.reshape(-1, *leaf.shape[2:])[:count], results)
 
 
@@ -302,11 +318,13 @@ def defects(
         along: the result of `fibers_along`, if it is available.
     """
     fibers, later = along or fibers_along(model, params, trajectory)
+    # One frame for all times, or z of the segment frame could not be compared.
     origin = model.encode(_at(fibers, 0), trajectory.states[0])
     observe = jax.vmap(model.observe, in_axes=(0, None, 0))
     now = observe(fibers, origin, trajectory.states[:-1])
     expected = jax.vmap(model.step)(fibers, now, trajectory.controls)
     expected = jax.vmap(model.transport)(fibers, later, expected)
+    # Under the next environment, to which `expected` was transported.
     after = observe(later, origin, trajectory.states[1:])
     gap = jax.vmap(model.vector)(after) - jax.vmap(model.vector)(expected)
     return gap, jax.vmap(model.decode)(later, expected)
@@ -344,8 +362,10 @@ def step_disturbances(
     gap = model.vector(model.observe(fiber_next, origin, after)) - model.vector(
         expected
     )
+    # As motions of one step: each turns far less than π, so no wrap spoils it.
     motion = between(before[POSE], predicted[POSE]) - between(before[POSE], after[POSE])
     kinds = (motion[:2], motion[2:], predicted[BODY] - after[BODY])
+    # Path states have no pose: all their errors are in the body.
     if model.along_path:
         kinds = _kinds_along_path(predicted - after)
     return jnp.stack([jnp.linalg.norm(kind) for kind in (gap, *kinds)])

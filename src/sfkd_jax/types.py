@@ -67,6 +67,7 @@ class Samples(NamedTuple):
     operators: Float[Array, "sample rank rank"]
 
 
+# Static: strings are no arrays, and a new value must compile a new program.
 @jax.tree_util.register_static
 @dataclass(frozen=True)
 class Declared:

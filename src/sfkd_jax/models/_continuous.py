@@ -86,6 +86,7 @@ def continuous(
     Raises:
         ValueError: an unknown solver; a state of the wrong length, when it is encoded.
     """
+    # Checked by name here: `_solver_step` would take any unknown solver for RK4.
     if solver not in SOLVERS:
         raise ValueError(
             f"model.solver must be one of {', '.join(SOLVERS)}, got {solver!r}"
@@ -99,6 +100,7 @@ def continuous(
 
     def derivative(at: Fiber, state: State, control: Control) -> State:
         rate = rates(at, scaled_body(space, state), scaled_control(space, control))
+        # The first three entries of a path state are no pose: they stay 0.
         if not pose:
             return jnp.concatenate([jnp.zeros(3), space.body_scale * rate[3:]])
         # Increments over dt are the units in which the data are of size 1.
@@ -131,6 +133,7 @@ def _solver_step(
     # What the authors of ICODE use; with learned increments it loses nothing.
     if solver == "euler":
         return state + dt * k1
+    # Classical Runge-Kutta: error O(dt⁴), which Euler on known dynamics has not.
     k2 = derivative(state + 0.5 * dt * k1)
     k3 = derivative(state + 0.5 * dt * k2)
     k4 = derivative(state + dt * k3)
@@ -187,6 +190,7 @@ def neural_ode(
     """
     body = space.body_mean.shape[0]
     inputs = body + space.control_mean.shape[0] + space.env_mean.shape[0]
+    # W_L starts at a tenth of its usual size: the first rollouts stay near the data.
     network = mlp(hidden, 3 + body, (nn.tanh,) * len(hidden), last=0.1)
 
     def init(key: Key) -> Params:
@@ -195,6 +199,8 @@ def neural_ode(
     def rates(
         fiber: Conditioned, body: Float[Array, " body"], control: Control
     ) -> Float[Array, " rates"]:
+        # e is an input like any other: nothing of
+        # the network is fixed by the environment.
         read = jnp.concatenate([body, control, fiber.env])
         return cast(jax.Array, network.apply({"params": fiber.params}, read))
 

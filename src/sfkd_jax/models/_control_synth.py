@@ -139,9 +139,11 @@ def control_synth(
             "model.networks and model.width must be at least 1, "
             f"got {networks} and {width}"
         )
+    # With γ = 0 nothing contracts; the negated comparison refuses NaN as well.
     if not 0.0 < rate < float("inf"):
         raise ValueError(f"model.rate must be positive, got {rate}")
     body, control = space.body_mean.shape[0], space.control_mean.shape[0]
+    # A network of u and e alone: it adds the same to any two solutions.
     inputs = mlp(input_hidden, 3 + body, (nn.tanh,) * len(input_hidden), last=0.1)
 
     def init(key: Key) -> Params:
@@ -150,6 +152,7 @@ def control_synth(
 
     def fiber(params: Params, env: Environment) -> ControlSynthFiber:
         flow = contracting(params["free"], rate)
+        # Offsets may be free: they are outside the matrix inequality.
         change = Synthesis(
             flow.linear, flow.outer, flow.inner, params["free"]["offsets"]
         )
@@ -182,9 +185,12 @@ def _initial(
     keys = jax.random.split(key, 6)
     return {
         "free": {
+            # Small: the proof costs −¼ BB', which damps the state from the start.
             "B": 0.1 * jax.random.normal(keys[0], (body, hidden)),
             "W": jax.random.normal(keys[1], (hidden, body)),
+            # Not X = 0, where the gradient of XX' vanishes and X would stay.
             "X": 0.1 * jnp.eye(body),
+            # tanh 0 = 0 below the diagonal, exp 0 = 1 on it: P = I at the start.
             "Y": jnp.zeros((body, body)),
             "T": jnp.zeros((body, body)),
             "log_multipliers": jnp.zeros(hidden),
@@ -194,6 +200,7 @@ def _initial(
             "linear": jnp.zeros((3, body)),
             "outer": 0.1 * hidden**-0.5 * jax.random.normal(keys[3], (3, hidden)),
             "inner": jax.random.normal(keys[4], (hidden, body)),
+            # Spread over the range, or all hidden units would bend at the same state.
             "offsets": jnp.linspace(-1.0, 1.0, hidden),
         },
         "inputs": inputs.init(keys[5], read)["params"],
@@ -211,8 +218,10 @@ def contracting(free: Params, rate: float) -> Contracting:
     T_inverse, P = jnp.linalg.inv(T), T.T @ T
     # Multipliers as exponentials: positive without a constraint.
     roots = GAIN * hidden**-0.5 * jnp.exp(0.5 * free["log_multipliers"])
+    # Scaled by the width, so that norms do not grow with the number of units.
     B, W = hidden**-0.5 * free["B"], GAIN * hidden**-0.5 * free["W"]
     A = B - W.T
+    # The skew part turns without growth: it cancels in the symmetric inequality.
     linear = free["Y"] - free["Y"].T - 0.25 * B @ B.T - 0.5 * free["X"] @ free["X"].T
     norms = jnp.stack([jnp.linalg.norm(part) for part in (linear, A, W)])
     # How much rounding may disturb the inequality, from norms alone.
@@ -221,9 +230,11 @@ def contracting(free: Params, rate: float) -> Contracting:
     # The margin is no design variable: gradients through it only add noise.
     linear -= (rate + jax.lax.stop_gradient(slack)) * jnp.eye(body)
     return Contracting(
+        # Undo the congruence with T: the proof is in coordinates T s, the model in s.
         linear=T_inverse @ linear @ T,
         outer=T_inverse @ A * roots,
         inner=W @ T / roots[:, None],
+        # Symmetric up to rounding only; an eigenvalue check would read one triangle.
         metric=0.5 * (P + P.T),
         multipliers=roots**2,
     )

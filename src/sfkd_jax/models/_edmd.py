@@ -102,6 +102,7 @@ class Lift:
     def monomials(self) -> list[tuple[int, ...]]:
         """The entries of e in each monomial; the first is the empty product, 1."""
         entries = range(self.space.env_mean.shape[0])
+        # With replacement but unordered: e_1 e_2 twice would give equal regressors.
         return [
             term
             for degree in range(self.degree + 1)
@@ -113,6 +114,7 @@ class Lift:
     ) -> Float[Array, " rank"]:
         """Return z of a state along the path, which is in physical units."""
         scaled = (path - self.centre) / self.scale
+        # Of ξ alone: the progress is unbounded and must not enter the radial functions.
         return jnp.concatenate([scaled, thin_plate(scaled[1:], centres)])
 
     def features(self, env: Environment) -> Float[Array, " monomial"]:
@@ -133,6 +135,7 @@ class Lift:
         inputs = scaled_control(self.space, control)
         rest = jnp.stack([kappa / self.curvature_range, jnp.ones(())])
         linear = jnp.concatenate([z[1 : self.size], inputs, rest])
+        # ξ is read off z: one code for the regression and for predictions in z.
         return jnp.concatenate(
             [z[self.size :], jnp.outer(self.features(env), linear).ravel()]
         )
@@ -147,9 +150,11 @@ class Lift:
         )
         # No column for the progress: where on the path a car is does not matter.
         A = jnp.concatenate([jnp.zeros((self.rank, 1)), states, of_functions.T], axis=1)
+        # Scales of u folded in, so that a controller multiplies physical controls.
         B = inputs / self.space.control_scale
         c = rest[:, 0] - B @ self.space.control_mean
         return KoopmanFiber(
+            # The regression is of the increment z⁺ − z; the identity makes it z⁺.
             jnp.eye(self.rank) + A,
             B,
             bend[:, 0] / self.curvature_range,
@@ -196,13 +201,16 @@ def identify(
         transitions: largest number of pairs.
         horizon: of the validation predictions, steps.
     """
+    # A key each: the centres do not change with the number of pairs.
     centre_key, pair_key, circle_key = jax.random.split(key, 3)
     centres = random_centres(lift, centre_key)
+    # All ridges share one factorisation of the pairs, the expensive part.
     fits = ridge_regression(
         *_pairs(lift, train, centres, pair_key, transitions), jnp.asarray(ridges)
     )
     count, steps = validation.controls.shape[:2]
     length = min(horizon, steps)
+    # From the first step on: the offset of a circle refers to the first state.
     states, *inputs = validation
     windows = Trajectory(
         states[:, : length + 1], *(leaf[:, :length] for leaf in inputs)
@@ -223,6 +231,7 @@ def identify(
     errors = jax.lax.map(error, fits)
     return {
         "centres": centres,
+        # A prediction that diverged has a NaN or inf, and argmin would choose a NaN.
         "weights": fits[jnp.argmin(jnp.where(jnp.isfinite(errors), errors, jnp.inf))],
     }
 
@@ -246,11 +255,13 @@ def _pairs(
 ) -> tuple[Float[Array, "sample regressor"], Float[Array, "sample rank"]]:
     """Regressors and increments of the lift, one row per transition."""
     choice_key, circle_key = jax.random.split(key)
+    # Paired before the shuffle: a pair must not mix two runs or two times.
     ends = jnp.stack([train.states[:, :-1], train.states[:, 1:]], axis=2).reshape(
         -1, 2, lift.size
     )
     # Drawn over all runs: neighbours in time are nearly the same pair.
     chosen = jax.random.permutation(choice_key, ends.shape[0])[:most]
+    # The same permutation, so that each pair keeps its own control and environment.
     controls, envs = (
         leaf.reshape(ends.shape[0], -1)[chosen] for leaf in (train.controls, train.envs)
     )
@@ -273,17 +284,21 @@ def _prediction_error(
     steps = jnp.hypot(*jnp.diff(window.states[:, :2], axis=0).T)
     turned = jax.vmap(between)(window.states[:-1, POSE], window.states[1:, POSE])[:, 2]
     # The circle that the car really drove; a controller sees paths close to it.
+    # At least 1 m, or a car that stands would have an infinite curvature.
     bend = jnp.sum(turned) / jnp.maximum(jnp.sum(steps), 1.0)
     kappa = jnp.clip(bend + change, -lift.curvature_range, lift.curvature_range)
     paths = along_circle(window.states, offset, kappa)
 
     def advance(z: Array, inputs: tuple[Control, Environment]) -> tuple[Array, Array]:
+        # Never lifted again: a controller propagates
+        # z, and this error is what it meets.
         z = z + lift.regressors(z, *inputs, kappa) @ params["weights"]
         return z, z[1 : lift.size]
 
     _, predicted = jax.lax.scan(
         advance, lift(params["centres"], paths[0]), (window.controls, window.envs)
     )
+    # Without the progress: it is of metres, and no feedback looks at it.
     return jnp.mean((predicted - ((paths - lift.centre) / lift.scale)[1:, 1:]) ** 2)
 
 
@@ -308,6 +323,8 @@ def along_circle(
     """
     # A straight path is a circle so large that float32 sees no difference.
     kappa = jnp.where(jnp.abs(curvature) < STRAIGHT, STRAIGHT, curvature)
+    # Heading of the path first, then a step
+    # across it: e_y is measured along its normal.
     tangent = states[0, POSE].at[2].add(-offset[1])
     foot = compose(tangent, jnp.stack([jnp.zeros(()), -offset[0], jnp.zeros(())]))
 
@@ -315,8 +332,11 @@ def along_circle(
         x, y, yaw = between(foot, state[POSE])
         across, along = 1.0 - kappa * y, kappa * x
         turned = jnp.arctan2(along, across)
+        # Not the radius minus a distance: two large numbers that cancel in float32.
         left = (2.0 * y - kappa * (x**2 + y**2)) / (1.0 + jnp.hypot(along, across))
         return jnp.concatenate(
+            # An arc of the angle, exact for large
+            # turns, where a chord would be too short.
             [jnp.stack([turned / kappa, left, wrap_angle(yaw - turned)]), state[BODY]]
         )
 
@@ -344,6 +364,7 @@ def ridge_regression(
         upper, right = _ridged(triangle, inputs.shape[1], ridge * inputs.shape[0])
         return solve_triangular(upper, right) / spread[:, None]
 
+    # One ridge at a time: a vmap would hold every factorisation in memory.
     return jax.lax.map(solve, ridges)
 
 
@@ -371,5 +392,6 @@ def _ridged(
     stacked = jnp.concatenate(
         [triangle[:, :columns], jnp.sqrt(ridge) * jnp.eye(columns)]
     )
+    # √ridge D appended as rows: the penalty without ever forming X'X.
     orthogonal, upper = jnp.linalg.qr(stacked)
     return upper, orthogonal[: triangle.shape[0]].T @ triangle[:, columns:]

@@ -22,9 +22,11 @@ def softplus(x: Float[Array, "*shape"]) -> Float[Array, "*shape"]:
     t = exp −|x| in (0, 1], log(1 + t) = 2 artanh(t / (2 + t)), whose argument is at
     most 1/3: seven terms of the series leave 2e-8, less than float32 resolves.
     """
+    # exp of −|x| cannot overflow; exp of x would above 88 in float32.
     t = jnp.exp(-jnp.abs(x))
     s = t / (2.0 + t)
     series = jnp.full_like(s, 1 / 13)
+    # Horner from the smallest term on: no powers, little rounding.
     for odd in (11, 9, 7, 5, 3, 1):
         series = 1 / odd + s * s * series
     return jnp.maximum(x, 0.0) + 2.0 * s * series
@@ -32,6 +34,7 @@ def softplus(x: Float[Array, "*shape"]) -> Float[Array, "*shape"]:
 
 @softplus.defjvp
 def _(primals: tuple[Array], tangents: tuple[Array]) -> tuple[Array, Array]:
+    # The exact derivative, cheaper and more accurate than that of the series.
     return softplus(*primals), nn.sigmoid(*primals) * tangents[0]
 
 
@@ -88,6 +91,7 @@ def affine_rates(
     G = mlp(hidden, outputs * inputs, activations, last=last)
 
     def init(key: Key) -> Params:
+        # A key each: with one, the weights of f and G would start correlated.
         f_key, G_key = jax.random.split(key)
         return {
             "f": f.init(f_key, start)["params"],
@@ -103,6 +107,7 @@ def affine_rates(
         gain = cast(jax.Array, G.apply({"params": fiber.params["G"]}, read)).reshape(
             outputs, inputs
         )
+        # Driving inputs enter here alone, hence affinely by construction.
         return free + gain @ joined(driving, parts)
 
     return init, rates
@@ -142,8 +147,10 @@ def icode(
 
     Source: Li et al., arXiv 2411.13914.
     """
+    # Without a hidden layer f and G would be linear, another model than the published.
     if layers < 1:
         raise ValueError(f"model.layers must be at least 1, got {layers}")
+    # A tanh first, as published: it bounds what the unbounded softplus layers read.
     activations = (nn.tanh, *(softplus,) * (layers - 1))
     init, rates = affine_rates(
         space, (width,) * layers, activations, last=0.1, affine_in=affine_in
@@ -193,6 +200,7 @@ def icode_mppi(
 
     Source: Song et al., arXiv 2605.03260, eqs. 10 and 11.
     """
+    # 1e-3, not 0.1: the known dynamics are good already, and noise would spoil them.
     init, rates = affine_rates(
         space, hidden, (softplus,) * len(hidden), last=1e-3, affine_in=affine_in
     )

@@ -77,6 +77,7 @@ def koopman(
 
     Source: Korda and Mezić (2018), sections 4 to 6, and the authors' code.
     """
+    # Degree 0 leaves the monomial 1 alone: one (A, B) for all e, as in the original.
     degree = environment_degree if environment else 0
     lift = Lift(space, functions, degree, lateral_range, heading_range, curvature_range)
     regressors = functions + len(lift.monomials) * lift.columns
@@ -86,23 +87,27 @@ def koopman(
     def init(key: Key) -> Params:
         return {
             "centres": random_centres(lift, key),
+            # Zero increments: before `identify` the model predicts that nothing moves.
             "weights": jnp.zeros((regressors, lift.rank)),
         }
 
     def observe(
         fiber: KoopmanFiber, latent: KoopmanLatent, state: State
     ) -> KoopmanLatent:
+        # Along the straight path that the rollout began on, hence in its frame.
         path = state.at[POSE].set(between(latent.frame, state[POSE]))
         return latent._replace(z=lift(fiber.centres, path))
 
     def encode(fiber: KoopmanFiber, state: State) -> KoopmanLatent:
         if state.shape != (lift.size,):
             raise ValueError(f"state must have shape ({lift.size},), got {state.shape}")
+        # The frame takes the pose, so that the path begins where the car is.
         return KoopmanLatent(state[POSE], lift(fiber.centres, state.at[POSE].set(0.0)))
 
     def step(
         fiber: KoopmanFiber, latent: KoopmanLatent, control: Control
     ) -> KoopmanLatent:
+        # No d κ: the path of a model without a path is straight, κ = 0.
         return latent._replace(z=fiber.A @ latent.z + fiber.B @ control + fiber.c)
 
     def decode(fiber: KoopmanFiber, latent: KoopmanLatent) -> State:
@@ -110,6 +115,7 @@ def koopman(
         return path.at[POSE].set(compose(latent.frame, path[POSE]))
 
     def linear(fiber: KoopmanFiber) -> LinearPredictor:
+        # The state is the first part of z, so that the read-out is exact.
         readout = jnp.eye(lift.size, lift.rank) * lift.scale[:, None]
         up = partial(lift, fiber.centres)
         return LinearPredictor(
@@ -122,8 +128,10 @@ def koopman(
         encode=encode,
         step=step,
         decode=decode,
+        # All environments share the lift, thus z means the same in each of them.
         transport=lambda fiber, fiber_next, latent: latent,
         observe=observe,
+        # Without the progress, which no other entry of z depends on.
         vector=lambda latent: latent.z[1 : lift.size],
         fitting=Fitting(identify=partial(identify, lift, **options)),
         structure=Structure(linear=linear),

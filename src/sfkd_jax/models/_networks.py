@@ -98,6 +98,7 @@ class Sandwich(nn.Module):
     @nn.compact
     def __call__(self, bound: Scalar | float) -> Weights:
         """Return explicit weights for the Lipschitz bound γ."""
+        # A little less than asked for: rounding in the products may add to the norm.
         gamma = jnp.asarray(bound) * (1.0 - FLOAT32_MARGIN)
         sizes = (self.inputs, *self.hidden, self.outputs)
         spread = nn.initializers.lecun_normal()
@@ -142,6 +143,8 @@ class Free(nn.Module):
     @nn.compact
     def __call__(self, bound: Scalar | float) -> Weights:
         """Return plain weights; the bound is ignored."""
+        # The same signature as `Sandwich`, so that
+        # the ablation exchanges the class alone.
         del bound
         sizes = pairwise((self.inputs, *self.hidden, self.outputs))
         spread = nn.initializers.lecun_normal()
@@ -175,6 +178,8 @@ class Encoder(nn.Module):
         """Return z before rotation, shape (rank,)."""
         # e enters through its embedding, so that the lift may differ by environment.
         hidden = nn.tanh(nn.Dense(self.hidden)(jnp.concatenate([body, embedding])))
+        # Not one layer on [s; hidden]: the ablation
+        # drops W_0 s and leaves the rest as it is.
         z = nn.Dense(self.rank)(hidden)
         return z + nn.Dense(self.rank, use_bias=False)(body) if self.linear else z
 
@@ -193,12 +198,14 @@ def gram_bound(
         iterations: k.
     """
     scale = _frobenius(matrix)
+    # Unit norm first: squaring very large or small entries leaves float32.
     gram = matrix / scale
     # Scales are kept as logarithms: a norm to the power 2^k leaves float32.
     log_norm = jnp.log(scale)
     power = 1.0
     for _ in range(iterations):
         gram = gram.T @ gram
+        # A Gram step squares the norm, so each later scale counts half as much.
         power /= 2.0
         scale = _frobenius(gram)
         gram = gram / scale
@@ -215,6 +222,7 @@ def bounded(
     """
     # Both margins: the bound is above the norm, and the result below ρ, once rounded.
     norm = gram_bound(matrix) * (1.0 + FLOAT32_MARGIN)
+    # The maximum leaves matrices inside the bound alone: there training is free.
     return matrix * (bound * (1.0 - FLOAT32_MARGIN) / jnp.maximum(bound, norm))
 
 
@@ -231,6 +239,7 @@ def cayley(
     Z = X − X' + Y'Y,   A' = (I − Z)(I + Z)⁻¹,   B' = −2 Y (I + Z)⁻¹
     """
     identity = jnp.eye(square.shape[0])
+    # Skew plus positive semidefinite: I + Z is invertible for every X and Y.
     Z = square - square.T + tall.T @ tall
     inverse = jnp.linalg.inv(identity + Z)
     return ((identity - Z) @ inverse).T, (-2.0 * tall @ inverse).T

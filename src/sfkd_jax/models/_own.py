@@ -65,6 +65,7 @@ def own(
 
     def fiber(params: Params, env: Environment) -> Fiber:
         del env
+        # The centre of E, not 0, which may be no environment at all (friction 0).
         return model.fiber(params, space.env_mean)
 
     return model._replace(fiber=fiber)
@@ -76,6 +77,7 @@ def _one_line(factory: str) -> Iterator[None]:
     try:
         yield
     except Exception as reason:
+        # The first line alone: messages of jax run over pages.
         first = next(iter(str(reason).splitlines()), "")
         kind = type(reason).__name__
         raise ValueError(f"{SETTING}={factory}: {kind}: {first}") from reason
@@ -91,6 +93,7 @@ def _check_shapes(model: Model, space: Space) -> None:
         latent = model.step(fiber, model.encode(fiber, state), control)
         return model.decode(fiber, latent)
 
+    # On shapes only: nothing is compiled, whatever a step costs.
     after = jax.eval_shape(one_step, jax.random.key(0))
     if after.shape != state.shape:
         raise ValueError(f"a step makes a state of {state.shape} one of {after.shape}")

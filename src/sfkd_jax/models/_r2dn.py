@@ -101,16 +101,20 @@ class Interconnection(nn.Module):
         """Return the explicit weights."""
         square = (self.rank, self.rank)
         A, B1, C1 = contracting(
+            # The identity: slow dynamics, for a car changes little in 0.1 s.
             self.param("A", lambda key, shape: jnp.eye(*shape), square),
             self.param("B1", SMALL, square),
             self.param("C1", SMALL, square),
             self.alpha,
         )
+        # Bound 1: gains belong to B₁ and C₁, which the block above already bounds.
         phi = Sandwich(self.rank, self.hidden, self.rank, name="phi")(1.0)
         first, *middle, last = phi.matrices
         decoder, decoder_inputs = self._decoder() if self.pose else (Weights(), None)
         return R2dnWeights(
             A=A,
+            # C₁ and B₁ folded in: the certificate is
+            # about the very matrices of the step.
             feedback=Weights((first @ C1, *middle, B1 @ last), phi.multipliers),
             feedback_inputs=self._affine(
                 "feedback", sum(self.hidden) + self.rank, SMALL
@@ -128,6 +132,7 @@ class Interconnection(nn.Module):
 
     def _decoder(self) -> tuple[Weights, Affine]:
         """Weights and biases of the decoder of the pose increment."""
+        # An exponential is positive, and a free bound then changes by factors.
         bound = jnp.exp(
             self.param("log_decoder_bound", nn.initializers.constant(1.0), ())
         )
@@ -161,6 +166,7 @@ def contracting(
     # One bound for the whole block is less conservative than one for each part.
     block = bounded(jnp.block([[A, B1], [C1, zeros]]), 1.0)
     rows, columns = A.shape
+    # No α at B₁: the inequality has α² at |Δz|² and 1 at |Δw|².
     return (
         alpha * block[:rows, :columns],
         block[:rows, columns:],
@@ -241,6 +247,7 @@ def r2dn(
         encode=functions.encode,
         step=functions.step,
         decode=functions.decode,
+        # The lift of a state varies with e, but z is not rotated: its metric is common.
         transport=lambda fiber, fiber_next, latent: latent,
         observe=lambda fiber, latent, state: functions.encode(fiber, state),
         vector=lambda latent: latent.z,
@@ -280,6 +287,7 @@ class _R2dn:
 
     def shared(self, params: Params) -> R2dnWeights:
         """Return the explicit weights, as they are if folded."""
+        # Bounded once before driving, not again at every control step.
         if isinstance(params, Folded):
             return params.shared
         return cast(R2dnWeights, self.weights.apply({"params": params["weights"]}))
@@ -301,6 +309,7 @@ class _R2dn:
             readout=shared.readout,
             centre=shared.centre,
             env=scaled,
+            # Not shared: nothing in the encoder is bounded, so nothing is precomputed.
             encoder=unfold(params)["encoder"],
         )
 
@@ -323,6 +332,7 @@ class _R2dn:
         # Path coordinates have no pose; the entry stays what it was.
         if not self.weights.pose:
             return PosedLatent(latent.pose, z)
+        # From z before the step, together with u: the motion during the period.
         motion = apply(fiber.decoder, fiber.decoder_biases.at(u), latent.z)
         return PosedLatent(
             compose(latent.pose, space.increment_mean + space.increment_scale * motion),
@@ -338,6 +348,7 @@ class _R2dn:
 
     def rate(self, params: Params) -> Scalar:
         """Return α, the same for all parameters."""
+        # By construction, not learned: no parameter can change it.
         del params
         return jnp.asarray(self.weights.alpha)
 
@@ -352,6 +363,7 @@ class _R2dn:
                 jnp.asarray(space.increment_scale)[:, None] * decoder[-1],
             )
         return Explicit(
+            # One vertex: e shifts biases only, so that A is the same for all e.
             operators=Polytope(shared.A[None]),
             residual=shared.feedback.matrices,
             residual_multipliers=shared.feedback.multipliers,
@@ -369,9 +381,11 @@ def _biases(
     if inputs is None:
         return Biases()
     widths = [matrix.shape[0] for matrix in matrices]
+    # Inner edges only, as `split` wants them.
     edges = [sum(widths[: k + 1]) for k in range(len(widths) - 1)]
     controls = inputs.gain.shape[0] - env.shape[0]
     gains = jnp.split(inputs.gain[:controls].T, edges)
+    # e is constant along a rollout: its product is paid once, not every step.
     offsets = jnp.split(env @ inputs.gain[controls:] + inputs.offset, edges)
     return Biases(tuple(gains), tuple(offsets))
 
@@ -382,6 +396,7 @@ def _check(
     """Raise ValueError for invalid settings."""
     if rank < 1:
         raise ValueError(f"model.rank must be at least 1, got {rank}")
+    # α = 1 would prove nothing, and a tube divides by 1 − α.
     if not 0.0 < alpha < 1.0:
         raise ValueError(f"model.alpha must lie in (0, 1), got {alpha}")
     if not hidden or not decoder_hidden:

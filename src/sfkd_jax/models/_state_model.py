@@ -69,6 +69,7 @@ def state_model(
         encode=encode,
         step=step,
         decode=lambda fiber, state: state,
+        # The state means the same in every environment, so nothing is to be carried.
         transport=lambda fiber, fiber_next, state: state,
         observe=lambda fiber, latent, state: encode(fiber, state),
         vector=vector,
@@ -94,7 +95,9 @@ def physics(
         along_path: whether x and u are those of `geometry`.
     """
     return state_model(
+        # Nothing to learn; an empty tree passes through stores and optimisers.
         init=lambda key: {},
+        # Distorted once per environment, so that a mismatch costs nothing in a step.
         fiber=lambda params, env: distort(env),
         step=lambda env, state, control: step(state, control, env),
         along_path=along_path,

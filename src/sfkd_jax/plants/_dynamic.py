@@ -84,6 +84,7 @@ def dynamic(
     bicycle = nominal_derivative(length, rear_length)
 
     def derivative(state: State, control: Control, env: Environment) -> State:
+        # In the order of `state_names` below.
         yaw, speed, side_speed, yaw_rate, steering = (state[k] for k in range(2, 7))
         grip = env[0] * GRAVITY
         cos, sin = jnp.cos(steering), jnp.sin(steering)
@@ -91,15 +92,18 @@ def dynamic(
         # Load moves to the front under braking, which turns a sliding car in.
         front_mass = mass * (rear_length - height * drive / GRAVITY) / length
         # What driving and braking use of the friction circle is missing for turning.
+        # Real because `BRAKING_SHARE` is below 1: |drive| never reaches the grip.
         lateral_grip = jnp.sqrt(grip**2 - drive**2)
         wind = _rolling(speed, creep_speed) * side_force(env[1], wind_force=wind_force)
 
         front_side = side_speed + front_length * yaw_rate
+        # Velocity of the front axle in the frame of the steered wheel.
         front_slip = _slip(
             speed * cos + front_side * sin, front_side * cos - speed * sin, creep_speed
         )
         rear_slip = _slip(speed, side_speed - rear_length * yaw_rate, creep_speed)
         front = _brush(front_slip, front_stiffness, front_mass * lateral_grip)
+        # What the front axle carries the rear one does not: the total is m g.
         rear = _brush(rear_slip, rear_stiffness, (mass - front_mass) * lateral_grip)
         forward = front_mass * drive * cos + (mass - front_mass) * drive - front * sin
         sideways = front_mass * drive * sin + front * cos
@@ -110,11 +114,14 @@ def dynamic(
                 speed * jnp.cos(yaw) - side_speed * jnp.sin(yaw),
                 speed * jnp.sin(yaw) + side_speed * jnp.cos(yaw),
                 yaw_rate,
+                # Rotating frame: v̇ has the term + v_y ω, and v̇_y below − v ω.
                 forward / mass + side_speed * yaw_rate - slowed,
                 (sideways + rear + wind) / mass - speed * yaw_rate,
                 (front_length * sideways - rear_length * rear + wind_lever * wind)
                 / yaw_inertia,
                 steering_rate
+                # tanh limits the rate of the actuator
+                # smoothly; a clip would have no gradient.
                 * jnp.tanh((control[0] - steering) / (steering_lag * steering_rate)),
             ]
         )
@@ -126,6 +133,7 @@ def dynamic(
         state_names=("p_x", "p_y", "yaw", "v", "v_y", "yaw_rate", "steering"),
         step=forward_rk4(derivative, dt=dt, substeps=substeps),
         derivative=derivative,
+        # The textbook model knows no tyres: it follows the command at once.
         nominal=_quasi_steady(forward_rk4(bicycle, dt=dt), length, rear_length),
         nominal_derivative=_padded(bicycle),
         control_low=(-STEERING_LIMIT, ACCELERATION_RANGE[0]),
@@ -138,13 +146,16 @@ def _acceleration(
     control: Control, speed: Float[Array, ""], grip: Float[Array, ""]
 ) -> Float[Array, ""]:
     """a_x [m/s²]: the commanded one within the grip; braking fades at standstill."""
+    # tanh instead of a clip: a planner has a gradient beyond the limit of grip.
     drive = BRAKING_SHARE * grip * jnp.tanh(control[1] / (BRAKING_SHARE * grip))
+    # Only braking fades: a car at rest must be able to start.
     return jnp.maximum(drive, 0.0) + jnp.minimum(drive, 0.0) * jnp.tanh(speed / 0.2)
 
 
 def _rolling(speed: Float[Array, ""], creep_speed: float) -> Float[Array, ""]:
     """Share of the wind that moves the car: 0 at standstill, 1 above creep_speed."""
     share = jnp.clip(jnp.abs(speed) / creep_speed, 0.0, 1.0)
+    # Smoothstep: its slope is 0 at both ends, so that the wind fades without a kink.
     return share**2 * (3.0 - 2.0 * share)
 
 
@@ -155,6 +166,7 @@ def _slip(
 
     Below v_0, |v| becomes (v² + v_0²)/(2 v_0) ≥ v_0/2, continuously differentiable.
     """
+    # min and max join two formulas whose values and slopes agree at v_0.
     below = jnp.minimum(jnp.abs(along), creep_speed)
     beyond = jnp.maximum(jnp.abs(along), creep_speed) - creep_speed
     return across / ((below**2 + creep_speed**2) / (2.0 * creep_speed) + beyond)
@@ -167,6 +179,7 @@ def _brush(
 
     θ = C t / (3 F_max), clipped to [-1, 1].
     """
+    # At ±1 the cubic has slope 0: sliding tyres give the limit, whatever the slip.
     bristle = jnp.clip(stiffness * slip / (3.0 * limit), -1.0, 1.0)
     return -limit * bristle * (3.0 - 3.0 * jnp.abs(bristle) + bristle**2)
 
@@ -176,6 +189,7 @@ def _quasi_steady(bicycle: Step, length: float, rear_length: float) -> Step:
 
     def step(state: State, control: Control, env: Environment) -> State:
         after = bicycle(state[:4], control, env)
+        # Of the new speed: the states are those at the end of the period.
         yaw_rate = after[3] * jnp.tan(control[0]) / length
         return jnp.concatenate(
             [after, jnp.stack([rear_length * yaw_rate, yaw_rate, control[0]])]

@@ -24,7 +24,9 @@ from sfkd_jax.types import Control, Environment, State
 
 def _tanhc(x: Float[Array, ""]) -> Float[Array, ""]:
     """tanh(x) / x for x ≥ 0, finite at 0 with its gradient."""
+    # Below 1e-3 the next term, x⁴, is under what float32 resolves beside 1.
     small = x < 1e-3
+    # Both branches are differentiated: a division by 0 would give NaN in either.
     safe = jnp.where(small, 1.0, x)
     return jnp.where(small, 1.0 - x**2 / 3.0, jnp.tanh(safe) / safe)
 
@@ -84,6 +86,7 @@ def kinematic(
         yaw, speed = state[2], state[3]
         steering, acceleration = control[0], control[1]
         friction, wind = env[0], env[1]
+        # At μ = 1 the stiffnesses are those given: friction then only limits forces.
         grip = friction if stiffness_by_friction else 1.0
         front, rear = front_stiffness * grip, rear_stiffness * grip
         force = side_force(wind, wind_force=wind_force)
@@ -92,11 +95,16 @@ def kinematic(
             (rear_length + wind_lever) / front - (front_length - wind_lever) / rear
         ) / length
         demand = (jnp.tan(steering) + push * force) / (length + understeer * speed**2)
+        # At least a twentieth of the grip, or strong
+        # wind would make the radius negative.
         limit = jnp.maximum(
             friction * GRAVITY - jnp.abs(force) / mass, 0.05 * friction * GRAVITY
         )
+        # The root has no gradient at 0, where a car coasts straight on.
         norm = jnp.sqrt(acceleration**2 + (speed**2 * demand) ** 2 + 1e-12)
         scale = _tanhc(norm / limit)
+        # Steering and acceleration shrink by one
+        # factor: the direction of the demand stays.
         curvature = scale * demand
         rear_force = (
             front_length * mass * speed**2 * curvature
@@ -138,4 +146,5 @@ def kinematic_stiff(**settings: Any) -> Vehicle:
     Args:
         settings: of `kinematic`, stiffnesses in N/rad.
     """
+    # `wraps` hands on the annotations, so that settings keep the ranges of `kinematic`.
     return kinematic(**settings, stiffness_by_friction=False)

@@ -54,19 +54,24 @@ def own(
             f"got {', '.join(state_names) or 'none'}"
         )
     sizes = {len(control_low), len(control_high)}
+    # Without a step the limits may come later, from the logs.
     if sizes != {2} and (sizes != {0} or step is not None):
         raise ValueError(
             "vehicle.control_low and vehicle.control_high must be two numbers each, "
             "as in [-0.4,-3.0]"
         )
+    # The centre of mass in the middle: logs do not tell where it is.
     bicycle = nominal_derivative(wheelbase, 0.5 * wheelbase)
+    # Fails when it is called: learning and planning do not simulate.
     simulate = _no_step if step is None else step
 
     def derivative(state: State, control: Control, env: Environment) -> State:
+        # A difference quotient: the user gave a step, and its rate is all there is.
         return (simulate(state, control, env) - state) / dt
 
     def padded(state: State, control: Control, env: Environment) -> State:
         return jnp.concatenate(
+            # States beyond the bicycle stay constant, for nothing is known of them.
             [bicycle(state[:4], control, env), jnp.zeros(len(state_names) - 4)]
         )
 
@@ -104,6 +109,8 @@ def step_named(name: str) -> Step:
     """
 
     def step(state: State, control: Control, env: Environment) -> State:
+        # Imported at the call: a plant may be
+        # described where its code is not installed.
         try:
             function = imported(name, "vehicle.step")
         except ValueError as reason:
@@ -122,6 +129,7 @@ def check_step(plant: Vehicle) -> None:
     sizes = (len(plant.state_names), 2, 2)
     try:
         after = jax.eval_shape(plant.step, *(jnp.zeros(size) for size in sizes))
+    # Its message names the setting already; the one below would hide it.
     except _MissingStep:
         raise
     except Exception as reason:  # a function of the user raises anything

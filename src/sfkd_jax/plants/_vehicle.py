@@ -58,6 +58,7 @@ class Vehicle(NamedTuple):
 
 def side_force(wind: Float[Array, ""], *, wind_force: float) -> Float[Array, ""]:
     """Return the lateral force of a side wind on the body, F = c_w w|w| [N]."""
+    # w|w|, not w²: wind from the other side pushes the other way.
     return wind_force * wind * jnp.abs(wind)
 
 
@@ -99,7 +100,9 @@ def nominal_derivative(length: float, rear_length: float) -> Step:
     def derivative(state: State, control: Control, env: Environment) -> State:
         del env
         yaw, speed = state[2], state[3]
+        # Without slip both wheels turn about one centre: κ = tan δ / L.
         curvature = jnp.tan(control[0]) / length
+        # β ≈ l_r κ for small angles: the centre of mass moves at this angle to the car.
         course = yaw + rear_length * curvature
         return jnp.stack(
             [
@@ -131,6 +134,7 @@ def rk4(derivative: Step, *, dt: float, substeps: int = 1) -> Step:
             k4 = derivative(x + h * k3, control, env)
             return x + h / 6.0 * (k1 + 2.0 * k2 + 2.0 * k3 + k4), None
 
+        # Unrolled: a loop of a few substeps would cost more than it computes.
         return jax.lax.scan(
             substep, jnp.asarray(state), None, length=substeps, unroll=True
         )[0]
@@ -147,9 +151,11 @@ def forward_rk4(derivative: Step, *, dt: float, substeps: int = 1) -> Step:
 
     def forwards(state: State) -> State:
         # Brakes stop a car; they do not reverse it.
+        # Entry 3 is the speed of every plant; v_y and others may be negative.
         return jnp.where((jnp.arange(state.shape[0]) == 3) & (state < 0.0), 0.0, state)
 
     def held(state: State, control: Control, env: Environment) -> State:
+        # Also within the stages: a stage at v < 0 would drive the position backwards.
         return derivative(forwards(state), control, env)
 
     integrate = rk4(held, dt=dt, substeps=substeps)
@@ -177,6 +183,7 @@ def with_speed_loop(vehicle: Vehicle, *, gain: float = 1.0) -> Vehicle:
             "vehicle.inner_loop=speed needs limits of the acceleration; "
             "of speed commands: speed_loop=true"
         )
+    # Limits of the acceleration, before the entries become those of a speed.
     low, high = vehicle.control_low[1], vehicle.control_high[1]
 
     def close(step: Step) -> Step:
@@ -187,6 +194,7 @@ def with_speed_loop(vehicle: Vehicle, *, gain: float = 1.0) -> Vehicle:
 
         return closed
 
+    # `derivative` stays: it is the plant before any wrapper, for its own model.
     return vehicle._replace(
         step=close(vehicle.step),
         nominal=close(vehicle.nominal),
@@ -227,6 +235,7 @@ def along_path(
     step = closed_loop(vehicle.step, law, *limits)
 
     def derivative(state: State, control: Control, env: Environment) -> State:
+        # A difference quotient: the loop is defined by its step, with the control held.
         return (step(state, control, env) - state) / vehicle.dt
 
     nominal = closed_loop(vehicle.nominal, law, *limits)
@@ -240,6 +249,7 @@ def along_path(
         derivative=derivative,
         nominal=nominal,
         nominal_derivative=nominal_derivative,
+        # Limits of w as boxes to draw from; the loop itself clips only the control.
         control_low=(
             *(-largest for largest in perturbation),
             -STEEPEST,

@@ -37,10 +37,12 @@ def steady_road(key: Key, *, steps: int, friction: Range, wind: Range) -> Schedu
         friction: range [-].
         wind: range of the wind speed [m/s].
     """
+    # Friction, strength and side apart: a wider range of one leaves the others.
     friction_key, wind_key, side_key = jax.random.split(key, 3)
     level = jax.random.uniform(friction_key, (), minval=friction[0], maxval=friction[1])
     strength = jax.random.uniform(wind_key, (), minval=wind[0], maxval=wind[1])
     pair = jnp.stack(
+        # A sign drawn apart from the strength: a range that excludes 0 stays excluded.
         [level, strength * jax.random.rademacher(side_key, (), dtype=float)]
     )
     return jnp.tile(pair, (steps, 1))
@@ -87,9 +89,11 @@ def switching_road(key: Key, *, steps: int, dt: float, period: float = 3.0) -> S
         dt: sampling period [s].
         period: between two switches [s].
     """
+    # One visit more, for the rest of a period at the end.
     visits = int(steps * dt / period) + 1
     sides = jax.random.rademacher(key, (visits,), dtype=float)
     levels = jnp.asarray(SWITCH_LEVELS)[jnp.arange(visits) % len(SWITCH_LEVELS)]
+    # Friction is the first column and has no side.
     levels = levels.at[:, 1].multiply(sides)
     # The same hair, so that a period has the same number of steps each time.
     visit = jnp.floor(jnp.arange(steps) * dt / period + 1e-6).astype(int)
@@ -108,6 +112,7 @@ def random_side_forces(
         largest: F [N].
         hold: duration of a level [s].
     """
+    # In whole steps: a force that changed within a step would not be held by it.
     each = round(hold / dt)
     # Shares of F: the same pushes at every size.
     levels = jax.random.uniform(key, (-(-steps // each),), minval=-1.0)
@@ -142,8 +147,10 @@ def gusts(
     )
     time = jnp.arange(steps) * dt
     gust = jnp.searchsorted(starts, time, side="right")
+    # Before the first ramp the level is that of gust 0, as if its ramp were over.
     since = time - jnp.where(gust > 0, starts[gust - 1], -ramp)
     blend = 0.5 - 0.5 * jnp.cos(jnp.pi * jnp.clip(since / ramp, 0.0, 1.0))
+    # Gust 0 has none before it, and a negative index would wrap to the last.
     before = levels[jnp.maximum(gust - 1, 0)]
     return before + (levels[gust] - before) * blend
 
@@ -184,6 +191,7 @@ def random_switching(
         dwell: range of the time that each is held [s].
     """
     level_key, hold_key = jax.random.split(key)
+    # One level more than the shortest dwells need.
     count = int(steps * dt / dwell[0]) + 2
     levels = jax.vmap(lambda key: _from_box(key, low, high))(
         jax.random.split(level_key, count)

@@ -63,6 +63,7 @@ def smooth_path(
     """
     amplitude_key, wavelength_key, phase_key = jax.random.split(key, 3)
     s = jnp.arange(int(length / spacing) + 2) * spacing
+    # At least 0.3, or one sinusoid could be left alone.
     amplitudes = jax.random.uniform(amplitude_key, (3, 1), minval=0.3, maxval=1.0)
     waves = jax.random.uniform(
         wavelength_key, (3, 1), minval=wavelengths[0], maxval=wavelengths[1]
@@ -70,6 +71,7 @@ def smooth_path(
     phases = jax.random.uniform(phase_key, (3, 1), maxval=2 * jnp.pi)
     curvature = jnp.sum(amplitudes * jnp.sin(2 * jnp.pi * s / waves + phases), axis=0)
     blend = jnp.clip(s / run_up, 0.0, 1.0)
+    # Smoothstep: the curvature and its slope start at 0, as does the steering.
     curvature = curvature * blend**2 * (3.0 - 2.0 * blend)
     # After the blend, so that the peak is reached on the path that is driven.
     curvature = curvature * peak_curvature / jnp.max(jnp.abs(curvature))
@@ -94,8 +96,10 @@ def double_lane_change(key: Key, length: float) -> Path:
     def change(begin: float, over: float, towards: float) -> Float[Array, " point"]:
         share = jnp.clip((s - begin) / over, 0.0, 1.0)
         largest = 2.0 * LANE / over
+        # Derivative of θ sin²(π s/ℓ): curvature is the slope of the heading.
         return towards * largest * jnp.pi / over * jnp.sin(2.0 * jnp.pi * share)
 
+    # The change back is the mirror image, so that the car returns to its lane.
     curvature = change(0.0, first, 1.0) + change(first + middle, last, -1.0)
     side = jax.random.rademacher(side_key, (), dtype=float)
     return path_from_curvature(side * curvature, spacing=SPACING)
@@ -109,6 +113,7 @@ def path_from_curvature(curvature: Float[Array, " point"], *, spacing: float) ->
     yaw_steps = 0.5 * (curvature[1:] + curvature[:-1]) * spacing
     yaw = jnp.concatenate([jnp.zeros(1), jnp.cumsum(yaw_steps)])
     # The chord of an arc points along the yaw of its middle.
+    # The midpoint rule: errors of O(h³) per sample instead of O(h²).
     middle = yaw[:-1] + 0.5 * yaw_steps
     x = jnp.concatenate([jnp.zeros(1), jnp.cumsum(jnp.cos(middle))]) * spacing
     y = jnp.concatenate([jnp.zeros(1), jnp.cumsum(jnp.sin(middle))]) * spacing
@@ -131,10 +136,12 @@ def path_through(points: Float[Array, "point 2"], *, spacing: float = SPACING) -
             two consecutive positions that coincide.
     """
     steps = jnp.linalg.norm(jnp.diff(points, axis=0), axis=1)
+    # `bool` needs concrete arrays: a path is made before a program is traced.
     if not bool(jnp.all(jnp.isfinite(points)) & jnp.all(steps > 0)):
         raise ValueError("a path needs finite positions, no two in a row the same")
     along = jnp.concatenate([jnp.zeros(1), jnp.cumsum(steps)])
     count = int(along[-1] / spacing) + 1
+    # Central differences of a curvature take three samples.
     if count < 3:
         raise ValueError(
             f"a path of {float(along[-1]):.3g} m has too few samples "
@@ -157,9 +164,11 @@ def point_at(path: Path, s: Scalar) -> Float[Array, " 4"]:
     last = path.points.shape[0] - 2
     index = jnp.clip(jnp.floor(s / path.spacing).astype(int), 0, last)
     start, end = path.points[index], path.points[index + 1]
+    # Clipped: beyond its ends a path stays at its last point.
     ahead = jnp.clip(s - index * path.spacing, 0.0, path.spacing)
     slope = (end[3] - start[3]) / path.spacing
     yaw = start[2] + start[3] * ahead + 0.5 * slope * ahead**2
+    # The chord points along the yaw at half the way, as in `path_from_curvature`.
     middle = start[2] + 0.5 * start[3] * ahead + 0.125 * slope * ahead**2
     x = start[0] + ahead * jnp.cos(middle)
     y = start[1] + ahead * jnp.sin(middle)
@@ -187,8 +196,10 @@ def reference_window(
     path: Path, s: Scalar, speed: Scalar, *, dt: float, horizon: int
 ) -> Reference:
     """Return the next points at a constant speed: x, y, yaw, speed, (horizon, 4)."""
+    # From one step ahead on: the present state cannot be changed any more.
     ahead = s + speed * dt * jnp.arange(1, horizon + 1)
     points = jax.vmap(point_at, in_axes=(None, 0))(path, ahead)
+    # The fourth column of a reference is the speed, where a path has its curvature.
     return points.at[:, 3].set(speed)
 
 

@@ -109,6 +109,7 @@ def scenario(
     """
     if name not in ROADS:
         raise ValueError(f"unknown scenario {name!r}; choose one of {', '.join(ROADS)}")
+    # round: duration / dt may fall just below the whole number of steps.
     road, steps = ROADS[name], round(duration / dt)
     # Longer than the distance by a tenth and a horizon: no plan meets its end.
     length = speed * duration * 1.1 + 50.0
@@ -145,9 +146,12 @@ def family(
     """
 
     def sample(key: Key) -> Scenario:
+        # A key each: other conditions leave the path of an episode as it is.
         path_key, condition_key = jax.random.split(key)
         start = jnp.zeros(state_size).at[3].set(speed)
         envs = conditions(condition_key)
+        # The controller observes the truth here;
+        # a measurement error replaces this field.
         return Scenario(start, envs, envs, paths(path_key), jnp.asarray(speed))
 
     return sample

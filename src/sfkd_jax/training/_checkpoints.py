@@ -27,6 +27,7 @@ class Checkpoints:
         def metric(metrics: dict[str, float]) -> float:
             return metrics["validation_loss"]
 
+        # Both: the best is the result, the latest is what a resumed run starts from.
         best = managers.BestN(get_metric_fn=metric, reverse=True, n=1)
         options = ocp.CheckpointManagerOptions(
             preservation_policy=managers.AnyPreservationPolicy(
@@ -34,11 +35,15 @@ class Checkpoints:
             ),
             best_fn=metric,
             best_mode="min",
+            # Left by a process that was killed while it saved.
             cleanup_tmp_directories=True,
+            # Synchronous: once `save` returns, a signal may end the process.
             enable_async_checkpointing=False,
         )
         self._manager = ocp.CheckpointManager(
-            Path(directory).resolve(), options=options
+            # Absolute, since a command may change its working directory.
+            Path(directory).resolve(),
+            options=options,
         )
 
     def save(self, step: int, state: Any, *, validation_loss: float) -> None:
@@ -79,6 +84,7 @@ class Checkpoints:
         losses = {
             step: score["validation_loss"] for step, score in scores.items() if score
         }
+        # States saved on a signal have the score inf: min prefers any validated one.
         return min(losses, key=lambda step: losses[step]) if losses else None
 
     def resume(self, like: Any) -> Any:
@@ -114,6 +120,7 @@ class Checkpoints:
 
     def restore(self, step: int, like: Any) -> Any:
         """Return the state saved at `step`, with the structure and types of `like`."""
+        # Shapes and types of `like`, so that a restored state fits the compiled step.
         abstract = jax.tree.map(ocp.utils.to_shape_dtype_struct, like)
         return self._manager.restore(step, args=ocp.args.StandardRestore(abstract))
 

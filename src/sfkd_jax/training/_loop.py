@@ -99,6 +99,7 @@ def fit(
     # Batches have a stream of their own: a resumed run draws the same ones.
     init_key, data_key = jax.random.split(key)
     transform, schedule = _optimizer(steps, learning_rate, clip_norm)
+    # Compiled, since initialisers op by op take seconds for many small matrices.
     params = jax.jit(model.init)(init_key)
     state = TrainState(jnp.zeros((), jnp.int32), params, transform.init(params))
     checkpoints = Checkpoints(directory / "checkpoints")
@@ -119,6 +120,7 @@ def fit(
                     "seconds": time.perf_counter() - began,
                 }
                 saves = done % save_every == 0 or done == steps
+                # Only where a state is saved: it is there to choose between states.
                 if saves:
                     total, parts = validate(state.params, held_out)
                     record["validation_loss"] = float(total)
@@ -141,6 +143,7 @@ def fit(
             raise KeyboardInterrupt
         best = checkpoints.best_step() or steps
         return checkpoints.restore(best, state).params, best
+    # Also after an error: the caller may open the directory again to resume.
     finally:
         checkpoints.close()
 
@@ -149,10 +152,12 @@ def _optimizer(
     steps: int, learning_rate: float, clip_norm: float
 ) -> tuple[optax.GradientTransformation, optax.Schedule]:
     """Adam with linear warm-up and cosine decay, and its learning rate schedule."""
+    # A tenth of a short run, which would end before its largest rate otherwise.
     rise = min(WARM_UP, max(steps // 10, 1))
     schedule = optax.warmup_cosine_decay_schedule(
         0.0, learning_rate, rise, max(steps, rise + 1), learning_rate * FINAL_RATE
     )
+    # Before Adam: one exploding batch would spoil its moments for long.
     clip = optax.clip_by_global_norm(clip_norm)
     return optax.chain(clip, optax.adam(schedule)), schedule
 
@@ -169,6 +174,8 @@ def _chunk(
         state: TrainState, data: Trajectory, key: Key
     ) -> tuple[TrainState, dict[str, jax.Array]]:
         def step(state: TrainState, _: None) -> tuple[TrainState, dict[str, jax.Array]]:
+            # From the step, not from a carried key:
+            # a resumed run draws the same batches.
             batch = draw(data, jax.random.fold_in(key, state.step))
             (total, parts), grads = gradient(state.params, batch)
             updates, memory = transform.update(grads, state.optimizer, state.params)
@@ -181,6 +188,7 @@ def _chunk(
                 **parts,
             }
 
+        # Many steps in one program: dispatching each would take longer than the step.
         state, records = jax.lax.scan(step, state, length=length)
         return state, jax.tree.map(jnp.mean, records)
 
@@ -191,6 +199,7 @@ def _require_finite(
     record: dict[str, float], step: int, checkpoints: Checkpoints
 ) -> None:
     """Raise TrainingStopped if any entry of a record is not finite."""
+    # Every entry, also those of `inspect`: a NaN there means bad parameters as well.
     if not all(math.isfinite(value) for value in record.values()):
         raise TrainingStopped(
             f"non-finite loss near step {step}; "
@@ -214,7 +223,9 @@ def _requests() -> Iterator[list[int]]:
     taken = {
         number: handler
         for number, handler in usual.items()
+        # Python installs handlers from the main thread only.
         if threading.current_thread() is threading.main_thread()
+        # Another handler is the launcher's or the notebook's, which knows better.
         and signal.getsignal(number) == handler
     }
 
@@ -266,6 +277,7 @@ def append(path: Path, record: dict[str, float], *, steps: int) -> None:
     """
     step = int(record["step"])
     try:
+        # Opened for each line: whatever ends the process, whole lines are on disk.
         with path.open("a") as file:
             file.write(json.dumps(record) + "\n")
     except OSError as reason:

@@ -46,6 +46,7 @@ def error_units(model: Model, space: Space) -> Float[Array, " state"]:
     entry. Along a path, e_y and e_ψ are position and yaw; the other entries do not
     affect the position directly and count 0.05 m.
     """
+    # Yaw rate, slip and steering move the car along a path only in later steps.
     others = (0.05 if model.along_path else 0.2) / jnp.asarray(space.body_scale)
     if model.along_path:
         others = others.at[LATERAL].set(1.0).at[HEADING].set(YAW_LENGTH)
@@ -101,6 +102,7 @@ def multi_step_loss(
             body state.
     """
     structure = model.structure
+    # The infinite-horizon radius divides by 1 − α, so α must be known in training.
     if tube and (structure.rate is None or structure.explicit is None):
         raise ValueError(
             "training.loss.tube needs a model that contracts by construction: "
@@ -134,6 +136,7 @@ def multi_step_loss(
             start = jnp.sum(
                 jnp.asarray(tube) * (radii * units[BODY][: len(tube)] / 0.01) ** 2
             )
+        # A part without a weight here, the penalty, has brought its own.
         total = sum(
             (weights.get(name, 1.0) * part for name, part in parts.items()), start
         )
@@ -153,6 +156,7 @@ def _window_parts(
     other: Environment,
 ) -> dict[str, Array]:
     """The parts of the loss of one window; `other` is another window's environment."""
+    # One rollout for both errors: `along` are the fibers that `defects` needs.
     predicted, _, along = rollout(model, params, data)
     errors = state_errors(predicted, data.states[1:])
     # Errors grow about linearly; without this the far steps would decide alone.
@@ -161,6 +165,7 @@ def _window_parts(
     gap, single = defects(model, params, data, along)
     # In millimetres: a slip of one a step hides in the sums over a window.
     near = state_errors(single, data.states[1:]) * units / 0.001
+    # That of the first step: the regularisers below are about the first state.
     fiber = jax.tree.map(lambda leaf: leaf[0], along[0])
     there = model.fiber(params, other)
     here = model.encode(fiber, data.states[0])

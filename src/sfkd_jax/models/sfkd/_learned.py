@@ -87,6 +87,7 @@ class Learned(nn.Module):
         self.psi = nn.Sequential(
             [part for layer in layers for part in (layer, nn.tanh)]
         )
+        # Small heads: e has little influence until the data ask for it.
         self.mixture_head = nn.Dense(self.vertices, kernel_init=SMALL)
         self.input_head = nn.Dense(self.rank * self.control)
         self.tangent_head = nn.Dense(self.rank // 2, kernel_init=SMALL)
@@ -99,6 +100,7 @@ class Learned(nn.Module):
                 self._bias_size(self.residual_hidden, self.rank), kernel_init=SMALL
             )
         if self.pose:
+            # Three outputs, the increment of the pose, whatever the body state has.
             self.decoder_weights = Sandwich(self.rank, self.decoder_hidden, 3)
             self.decoder_head = nn.Dense(self._bias_size(self.decoder_hidden, 3))
             self.log_decoder_bound = self.param(
@@ -107,7 +109,10 @@ class Learned(nn.Module):
         if self.forcing_hidden:
             self.forcing_head = nn.Dense(self.forcing_hidden * (self.control + 1))
             self.forcing_weights = self.param(
-                "forcing", nn.initializers.zeros, (self.rank, self.forcing_hidden)
+                # Zeros: the extension begins as the model without it.
+                "forcing",
+                nn.initializers.zeros,
+                (self.rank, self.forcing_hidden),
             )
         # Flax numbers the keys of `param` by call: another order draws other weights.
         square = (self.rank, self.rank)
@@ -131,6 +136,7 @@ class Learned(nn.Module):
         # Without a joint budget α is a sum of two bounds that are given.
         if not (self.joint and self.learn_alpha):
             return most
+        # A sigmoid between fixed ends: no step of the optimiser leaves them.
         return LOWEST_RATE + (most - LOWEST_RATE) * nn.sigmoid(self.alpha_logit)
 
     def __call__(self, env: Array) -> tuple[SharedWeights, PerEnvironment]:
@@ -140,6 +146,7 @@ class Learned(nn.Module):
     def shared(self) -> SharedWeights:
         """Return the weights that do not depend on e, with every bound enforced."""
         if self.joint:
+            # φ bounded by 1: the couplings carry its gain, or α would count twice.
             vertices, residual = share_budget(
                 self.operators, self.couplings, self.residual_weights(1.0), self.rate()
             )
@@ -156,6 +163,7 @@ class Learned(nn.Module):
             residual,
             decoder,
             forcing=(self.forcing_weights,) if self.forcing_hidden else (),
+            # Norm at most 1 in scaled units: a ball in z bounds the body state.
             readout=bounded(self.readout, 1.0),
             centre=self.centre,
         )
@@ -187,6 +195,7 @@ class Learned(nn.Module):
         )
 
     def _bias_size(self, hidden: Sequence[int], outputs: int) -> int:
+        # (control + 1) per unit: a gain for each control and an offset.
         return (sum(hidden) + outputs) * (self.control + 1)
 
     def _biases(self, flat: Array, widths: Sequence[int]) -> Biases:

@@ -63,6 +63,7 @@ class Mixture(NamedTuple):
 
     def __matmul__(self, z: Float[Array, " rank"]) -> Float[Array, " rank"]:
         """Return A(e) z."""
+        # Vertices first: products with vectors only, never a matrix for this e.
         return self.weights @ (self.vertices @ z)
 
     def summed(self) -> Float[Array, "rank rank"]:
@@ -106,6 +107,7 @@ class Sfkd:
     @property
     def pose_scale(self) -> Float[Array, " 3"]:
         """Units of what the decoder predicts: a step's motion, or a segment's."""
+        # A segment sums up about that many increments.
         scale = jnp.asarray(self.space.increment_scale)
         return scale * SEGMENT_STEPS if self.segment else scale
 
@@ -115,6 +117,7 @@ class Sfkd:
         body = self.learned.body
         inputs = jnp.zeros(body + 3 if self.segment else body)
         env = jnp.zeros(self.space.env_mean.shape[0])
+        # ψ(e) has another size than e, and the encoder reads ψ(e).
         embedding = jnp.zeros(self.learned.embedding)
         return {
             "networks": self.learned.init(network_key, env)["params"],
@@ -176,6 +179,7 @@ class Sfkd:
             motion = between(at, state[POSE]) / self.pose_scale
             inputs = jnp.concatenate([motion, inputs])
         z = self.encoder.apply({"params": fiber.encoder}, inputs, fiber.local.embedding)
+        # Rotated after the lift, so that z of two environments differ by an isometry.
         return PosedLatent(at, rotate_planes(fiber.local.tangents, cast(jax.Array, z)))
 
     def step(
@@ -194,7 +198,9 @@ class Sfkd:
         if self.segment or not fiber.decoder:
             # The pose is part of z, or there is none: that of the start stays.
             return PosedLatent(latent.pose, z)
+        # From z before the step: the motion during the period starts there.
         motion = apply(fiber.decoder, local.decoder.at(u), latent.z)
+        # Mean plus scale: an output of 0 is the average motion of the data.
         motion = space.increment_mean + self.pose_scale * motion
         return PosedLatent(compose(latent.pose, motion), z)
 
@@ -224,6 +230,7 @@ class Sfkd:
             # In physical units, so that a certificate needs no scales of the model.
             decoder = (*decoder[:-1], self.pose_scale[:, None] * decoder[-1])
         return Explicit(
+            # The vertices, not a mixture: what holds at each of them holds for every e.
             operators=Polytope(shared.vertices),
             residual=shared.residual.matrices,
             residual_multipliers=shared.residual.multipliers,
@@ -319,6 +326,7 @@ def sfkd(
             )
     # The one look-up: everything below asks the kind, never its name.
     kind = RESIDUALS[residual]
+    # A free residual has no bound that could be shared.
     joint = kind.shares_budget(budget)
     _check_bounds(rank, rho, beta, learn_alpha, joint)
     if soft_penalty and kind.network is None:
@@ -336,6 +344,7 @@ def sfkd(
         kind=kind,
         joint=joint,
         transport=transport,
+        # Along a path the offsets are part of s, and there is no pose to decode.
         pose=frame != "path",
         learn_alpha=learn_alpha,
         forcing_hidden=forcing_hidden,
@@ -367,12 +376,14 @@ def _check_bounds(
     rank: int, rho: float, beta: float, learn_alpha: bool, joint: bool
 ) -> None:
     """Raise ValueError for a rank or bounds that no such model has."""
+    # Planes are pairs of coordinates; of an odd number one would be left over.
     if rank < 2 or rank % 2:
         raise ValueError(f"model.rank must be even and at least 2, got {rank}")
     if min(rho, beta) <= 0.0 or max(rho, beta) >= 1.0:
         raise ValueError(
             f"model.rho and model.beta must lie in (0, 1), got {rho} and {beta}"
         )
+    # A separate budget has α = ρ + β, with nothing to learn.
     if learn_alpha and not joint:
         raise ValueError(
             "model.learn_alpha needs model.residual=sandwich and model.budget=joint"
@@ -400,6 +411,7 @@ def rotate_planes(
         z: of even length.
     """
     first, second = jnp.split(z, 2)
+    # Rational in t: no trigonometry, and c² + s² = 1 up to rounding.
     scale = 1.0 / (1.0 + tangents**2)
     cosine, sine = (1.0 - tangents**2) * scale, 2.0 * tangents * scale
     return jnp.concatenate(

@@ -48,6 +48,7 @@ class Residual(NamedTuple):
 
     def shares_budget(self, budget: str) -> bool:
         """Whether operators and residual are bounded as one map."""
+        # A network without a bound cannot share one with the operators.
         return budget == "joint" and self.bounded and self.network is not None
 
 
@@ -62,6 +63,7 @@ def separate_budget(
     operators: Float[Array, "vertex rank rank"], rho: float
 ) -> Float[Array, "vertex rank rank"]:
     """Return A_j with ||A_j||_2 ≤ ρ, whatever the residual is."""
+    # Each vertex for itself: a mixture is then below ρ by convexity.
     return jax.vmap(lambda matrix: bounded(matrix, rho))(operators)
 
 
@@ -93,6 +95,7 @@ def share_budget(
     """
     # Kept apart from 1, or the factors below would be singular.
     out, into = (bounded(matrix, LARGEST_COUPLING) for matrix in couplings)
+    # Cholesky factors instead of square roots: any L with L L' = I − G G' serves.
     identity = jnp.eye(out.shape[0])
     left = jnp.linalg.cholesky(identity - out @ out.T)
     right = jnp.linalg.cholesky(identity - into.T @ into)
@@ -101,5 +104,7 @@ def share_budget(
     # Folded into the network, so that what is certified is what is multiplied.
     first, *middle, last = network.matrices
     return vertices, Weights(
-        (alpha * first @ into, *middle, out @ last), network.multipliers
+        # α at the input alone: at both ends it would count twice.
+        (alpha * first @ into, *middle, out @ last),
+        network.multipliers,
     )
