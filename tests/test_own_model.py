@@ -4,7 +4,6 @@ import json
 import sys
 from pathlib import Path
 
-import jax
 import jax.numpy as jnp
 import pytest
 from helpers import last_line, run_command
@@ -106,16 +105,6 @@ def test_a_factory_that_makes_no_model_is_one_line(
     with pytest.raises(ValueError, match=says) as refusal:
         named(monkeypatch, tmp_path, source, **settings)
     assert "\n" not in str(refusal.value)
-
-
-def test_the_model_of_the_example_steps_the_nominal_bicycle_before_it_is_trained(
-    monkeypatch, tmp_path
-):
-    factory = named(monkeypatch, tmp_path, EXAMPLE.replace("corrected_bicycle", "make"))
-    params = factory.init(jax.random.key(0))
-    state = jnp.arange(4.0)
-    fiber = factory.fiber(params, jnp.ones(2))
-    assert bool(jnp.all(factory.step(fiber, state, jnp.ones(2)) == state))
 
 
 @pytest.mark.parametrize("factory", ["os:system", "importlib.util:find_spec"])

@@ -2,7 +2,6 @@
 model.
 """
 
-import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
@@ -47,39 +46,6 @@ def test_fibers_are_those_of_each_step_and_of_the_one_after(one):
     np.testing.assert_array_equal(now, one.envs)
     np.testing.assert_array_equal(later[:-1], one.envs[1:])
     np.testing.assert_array_equal(later[-1], one.envs[-1])
-
-
-@pytest.mark.parametrize("name", ["sfkd", "segment"])
-def test_the_first_prediction_is_the_one_step_prediction(one, name):
-    states, _, _ = run(rollout, name, one)
-    _, predicted = run(defects, name, one)
-    np.testing.assert_allclose(states[0], predicted[0], atol=1e-5)
-
-
-@pytest.mark.parametrize("name", ["sfkd", "segment"])
-def test_a_trajectory_that_the_model_made_itself_has_no_defect_where_the_encoder_inverts_the_decoder(
-    one, name
-):
-    """d_k compares latents: with the rollout's own latents instead of the
-    encoder's, nothing is left.
-    """
-    model, params = model_and_params(name)
-
-    @jit
-    def gap(params, data):
-        _, latents, (fibers, later) = rollout(model, params, data)
-        start = model.encode(at(fibers, 0), data.states[0])
-        before = jax.tree.map(
-            lambda first, rest: jnp.concatenate([first[None], rest[:-1]]),
-            start,
-            latents,
-        )
-        after = jax.vmap(model.transport)(
-            fibers, later, jax.vmap(model.step)(fibers, before, data.controls)
-        )
-        return model.vector(jax.tree.map(jnp.subtract, after, latents))
-
-    assert float(jnp.max(jnp.abs(gap(params, one)))) < 1e-6
 
 
 @pytest.mark.parametrize("name", ["sfkd", "no_transport"])

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from helpers import jit
 
-from sfkd_jax.geometry import between, compose, rotate, wrap_angle
+from sfkd_jax.geometry import between, compose, wrap_angle
 
 RANDOM = np.random.default_rng(0)
 POSES = RANDOM.uniform(-5.0, 5.0, (50, 3)).astype(np.float32)
@@ -34,17 +34,6 @@ def test_between_is_the_product_with_the_inverse_matrix():
         np.testing.assert_allclose(
             matrix(step), np.linalg.inv(matrix(pose)) @ matrix(other), atol=2e-5
         )
-
-
-def test_between_undoes_composition():
-    moved = COMPOSE(POSES, STEPS)
-    np.testing.assert_allclose(BETWEEN(POSES, moved), STEPS, atol=1e-5)
-
-
-def test_composition_is_associative():
-    left = COMPOSE(COMPOSE(POSES, STEPS), STEPS[::-1])
-    right = COMPOSE(POSES, COMPOSE(STEPS, STEPS[::-1]))
-    np.testing.assert_allclose(left, right, atol=2e-5)
 
 
 def test_between_does_not_depend_on_the_frame_of_the_world():
@@ -77,14 +66,3 @@ def test_wrapped_angles_lie_within_half_a_turn():
 def test_the_gradient_of_wrapping_is_one():
     angles = jnp.asarray([-9.0, -np.pi + 0.01, 0.0, 2.0, 8.0])
     np.testing.assert_array_equal(jax.vmap(jax.grad(wrap_angle))(angles), jnp.ones(5))
-
-
-def test_rotation_keeps_length_and_turns_by_the_angle():
-    np.testing.assert_allclose(
-        rotate(jnp.asarray(jnp.pi / 2), jnp.asarray([1.0, 0.0])), [0.0, 1.0], atol=1e-6
-    )
-    np.testing.assert_allclose(
-        jnp.linalg.norm(rotate(jnp.asarray(0.7), jnp.asarray([3.0, 4.0]))),
-        5.0,
-        rtol=1e-6,
-    )

@@ -15,7 +15,6 @@ from helpers import refusal_of
 from sfkd_jax import evaluation, store
 from sfkd_jax.experiment import runs
 from sfkd_jax.report.episodes import of_run
-from sfkd_jax.report.rows import grouped, title_of
 from sfkd_jax.store import DirectoryLocked, locked
 
 ROW = {
@@ -164,30 +163,6 @@ def test_two_processes_20_ms_after_each_other_lose_no_row_and_no_episode(tmp_pat
     for row in rows:
         value = 10 * int(row["system"][-1]) + int(row["scenario"][4:])
         assert np.all(arrays[f"{evaluation.episode_name(row)}/lateral"] == value)
-
-
-def test_three_planners_in_one_directory_keep_three_rows_with_their_episodes(tmp_path):
-    rows = [
-        ROW | {"controller": name, "planner": name}
-        for name in ("mppi", "cem", "gradient")
-    ]
-    for value, row in enumerate(rows, 1):
-        keep(tmp_path, row, value)
-    retained, arrays = stored(tmp_path)
-    assert [row["planner"] for row in retained] == ["mppi", "cem", "gradient"]
-    for value, row in enumerate(retained, 1):
-        for part in ("lateral", "states", "controls", "envs", "path"):
-            assert np.all(arrays[f"{evaluation.episode_name(row)}/{part}"] == value)
-    groups = of_run(tmp_path)
-    drawn = {one.lateral[0, 0]: one.row["planner"] for (one,) in groups}
-    assert drawn == {1: "mppi", 2: "cem", 3: "gradient"}
-    blocks = grouped(retained, evaluation.SHARED)
-    assert [len(block) for block in blocks] == [1, 1, 1]
-    assert len({title_of(block, evaluation.SHARED) for block in blocks}) == 3
-    keep(tmp_path, rows[1], 7.0)
-    retained, arrays = stored(tmp_path)
-    assert len(retained) == 3
-    assert np.all(arrays[f"{evaluation.episode_name(rows[1])}/lateral"] == 7.0)
 
 
 @pytest.mark.parametrize("name", list(ROW))

@@ -1,10 +1,7 @@
 """Forged or stale certificates of a policy are refused in one line."""
 
-import copy
-import json
 import math
 import shutil
-import warnings
 from functools import cache
 
 import jax
@@ -78,24 +75,6 @@ def test_no_proved_constant_can_be_made_smaller(claim):
             check(put(honest(), claim, factor * entry_at(honest(), claim)))
 
 
-@pytest.mark.parametrize("claim", ["beta", "rho", "lipschitz.position"])
-def test_a_constant_that_is_larger_than_proved_does_not_go_unnoticed_where_others_follow_from_it(
-    claim,
-):
-    with pytest.raises(CertificationRefused):
-        check(put(honest(), claim, 1.01 * entry_at(honest(), claim)))
-
-
-def test_constants_of_networks_that_there_are_not_are_refused():
-    forged = copy.deepcopy(honest())
-    forged["lipschitz"]["height"] = 7.0
-    with pytest.raises(CertificationRefused, match="lipschitz must be of"):
-        check(forged)
-    del forged["lipschitz"]["height"], forged["lipschitz"]["yaw"]
-    with pytest.raises(CertificationRefused, match="lipschitz must be of"):
-        check(forged)
-
-
 DERIVED = (
     *(
         "tube.latent.0",
@@ -155,25 +134,6 @@ def test_what_is_arithmetic_is_computed_again(plant, number):
     for forged in (0.9 * value, (1 + 3e-9) * value, math.nan, "many"):
         with pytest.raises(CertificationRefused):
             check(put(honest(plant), number, forged), plant)
-
-
-@pytest.mark.parametrize("name", ["position", "yaw"])
-@pytest.mark.parametrize("constant", ["alpha", "lipschitz"])
-def test_no_constant_of_an_output_can_be_made_smaller(name, constant):
-    path = f"outputs.{name}.{constant}"
-    value = entry_at(honest("dynamic_path"), path)
-    for forged in ((1 - 1e-5) * value, math.nan, math.inf, 1e-320):
-        with pytest.raises(CertificationRefused):
-            check(put(honest("dynamic_path"), path, forged), "dynamic_path")
-
-
-@pytest.mark.parametrize("constant", ["rho", "condition", "alpha"])
-def test_no_constant_of_the_theorem_can_be_made_smaller(constant):
-    path = f"lyapunov.{constant}"
-    value = entry_at(honest("dynamic_path"), path)
-    for forged in ((1 - 1e-5) * value, math.nan, math.inf, -value):
-        with pytest.raises(CertificationRefused, match="lyapunov"):
-            check(put(honest("dynamic_path"), path, forged), "dynamic_path")
 
 
 def test_a_corridor_needs_the_metrics_of_its_outputs():
@@ -304,25 +264,10 @@ def test_a_setting_that_changed_leaves_nothing_certified_and_says_so(
     assert loaded.certificate is None
 
 
-def test_a_certificate_is_loaded_without_a_word(copied):
-    with warnings.catch_warnings():
-        warnings.simplefilter("error")
-        assert policy.load(copied).certificate["valid"]
-
-
 def test_a_forged_certificate_is_an_error_that_names_the_file(copied):
     forged = put(honest(), "alpha", 0.5)
     store.write_json(copied / "certificate.json", forged)
     assert "certificate.json: " in refusal_of(lambda: policy.load(copied))
-
-
-def test_a_refusal_is_told_with_its_reason(copied):
-    store.write_json(
-        copied / "certificate.json",
-        {"valid": False, "reason": "alpha = 2.0 is not below 1"},
-    )
-    with pytest.warns(UserWarning, match="refused: alpha = 2.0 is not below 1"):
-        policy.load(copied)
 
 
 # --- weights --------------------------------------------------------------------------
@@ -357,24 +302,6 @@ def test_weights_that_do_not_fit_the_model_are_refused_in_one_line(
     line = refusal_of(lambda: policy.load(copied))
     assert message in line
     assert "policy.safetensors" in line
-
-
-def test_weights_that_the_model_does_not_have_are_refused(copied):
-    arrays, manifest = store.read_arrays(
-        copied / "policy.safetensors", kind=policy.KIND
-    )
-    arrays["networks/extra"] = np.zeros(3, np.float32)
-    store.write_arrays(
-        copied / "policy.safetensors",
-        arrays,
-        kind=policy.KIND,
-        config=manifest["config"],
-    )
-    assert "holds weights networks/extra" in refusal_of(lambda: policy.load(copied))
-
-
-def test_a_document_survives_a_walk_through_json_unchanged():
-    check(json.loads(json.dumps(honest())))
 
 
 def test_a_certificate_of_one_policy_is_stale_beside_another():

@@ -4,9 +4,9 @@ import json
 
 import numpy as np
 import pytest
-from networks import NETWORK, ROOT, TURNED, rotation
+from networks import NETWORK, ROOT, TURNED
 
-from sfkd_jax.certification import OutputMetric, _claims, _core
+from sfkd_jax.certification import OutputMetric, _claims
 from sfkd_jax.certification._claims import Refuted, readouts
 from sfkd_jax.certification._metrics import _accepted
 from sfkd_jax.types import Declared, Polytope
@@ -146,33 +146,3 @@ def test_what_may_have_a_metric_is_a_polytope_without_transport_and_decoder():
         WEIGHTS._replace(decoder=NETWORK.decoder),
     )
     refuted("body", claim, ": this model has no")
-
-
-def test_what_is_read_is_bounded_with_its_rounding(monkeypatch):
-    """b² P − C'C to the bit of its symmetry, and every term of what it loses."""
-    calls = []
-    monkeypatch.setattr(
-        _claims,
-        "is_positive_definite",
-        lambda *given: bool(calls.append(given)) or True,
-    )
-    rows, metric, bound = rotation(3, 4)[:2] / 3, ROOT @ ROOT, 0.7
-    assert _claims.reads_within(rows, bound, metric)
-    ((matrix, error),) = calls
-    np.testing.assert_allclose(
-        matrix, 0.49 * metric - rows.T @ rows, rtol=1e-14, atol=1e-15
-    )
-    np.testing.assert_array_equal(matrix, matrix.T)
-    lost = (
-        4 * _core.UNIT * (np.linalg.norm(0.49 * metric) + np.linalg.norm(rows.T @ rows))
-    )
-    assert error == pytest.approx(
-        lost + _core.product(rows.T, rows)[1], rel=1e-12, abs=0.0
-    )
-
-
-def test_nothing_is_warned_of(recwarn):
-    """Overflow and NaN are refused by comparisons."""
-    assert not _claims.reads_within(np.ones((1, 3)), 1e300, ROOT)
-    assert not _claims.reads_within(np.full((1, 3), np.inf), 1.0, ROOT)
-    assert len(recwarn) == 0

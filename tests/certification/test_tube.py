@@ -23,13 +23,6 @@ def test_the_latent_tube_is_the_closed_formula(alpha, d_bar, initial):
     )
 
 
-def test_the_latent_tube_grows_to_its_ultimate_bound_and_never_beyond():
-    tube = latent_tube(0.8, 0.5, 200)
-    assert np.all(np.diff(tube) >= 0)
-    assert np.all(tube <= 2.5 + 1e-12)
-    np.testing.assert_allclose(tube[-1], 0.5 / (1 - 0.8), rtol=1e-12)
-
-
 def test_the_bound_is_reached_by_a_scalar_system_so_nothing_smaller_holds():
     error, errors = 0.0, []
     for _ in range(30):

@@ -332,27 +332,6 @@ def test_a_force_beyond_the_box_is_balanced_without_a_lateral_error():
     assert abs(float(settle(offset.inputs))) < 0.1 * unbalanced
 
 
-@pytest.mark.parametrize("broken", ["observation", "env", "reference"])
-def test_an_input_that_is_not_finite_leaves_a_finite_control_and_belief(broken):
-    controller = adaptive()
-    act = jit(controller.act)
-    good = {
-        "observation": jnp.asarray([0.0, 0.1, 0.0, 10.0]),
-        "env": jnp.asarray([0.7, 0.0]),
-        "reference": road(0.0),
-    }
-    bad = good | {broken: jnp.full_like(good[broken], jnp.nan)}
-    state = controller.init(jax.random.key(0))
-    for inputs in (bad, good, bad, good):
-        action, state, info = act({}, state, *inputs.values())
-        assert info["healthy"] == (inputs is good)
-        assert all(
-            np.isfinite(leaf).all() for leaf in jax.tree.leaves(state.inner.belief.bank)
-        )
-        if inputs is good:
-            assert np.isfinite(action).all()
-
-
 def test_the_belief_can_be_saved_and_resumed():
     _, belief = drive(force=0.5)
     last = jax.tree.map(lambda leaf: jnp.asarray(leaf[-1]), belief)

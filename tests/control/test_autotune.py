@@ -3,7 +3,6 @@
 import jax
 import jax.numpy as jnp
 import numpy as np
-import pytest
 
 from sfkd_jax import control
 
@@ -74,13 +73,3 @@ def test_a_cost_that_is_not_finite_never_wins():
     assert bool(jnp.isfinite(found.cost))
     assert float(found.tuning.noise_std[0]) < 0.011
     assert bool(jnp.isinf(found.costs).any())
-
-
-@pytest.mark.parametrize(
-    "wrong", [{"entries": ("horizon",)}, {"rounds": 0}, {"span": 1.0}]
-)
-def test_what_cannot_be_searched_is_one_line(wrong):
-    with pytest.raises(ValueError, match="entries must be of temperature"):
-        control.autotune(
-            planner(), lambda s, t: 0.0, STARTS, key=jax.random.key(0), **wrong
-        )

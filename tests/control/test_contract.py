@@ -23,7 +23,7 @@ from helpers import (
 )
 from jaxtyping import jaxtyped
 
-from sfkd_jax import build, control, evaluation, models, plants, scenarios
+from sfkd_jax import build, control, models, plants
 from sfkd_jax.rollout import fold, with_offset
 from sfkd_jax.types import ControllerInfo
 
@@ -254,35 +254,6 @@ def test_the_state_keeps_its_structure_shapes_and_types(name):
 
 
 @every
-def test_an_episode_finds_in_info_what_it_records(name):
-    """`simulate` reads them by name; only shapes are computed."""
-    controller, params = BUILDERS[name]()
-    road = scenarios.Scenario(
-        jnp.asarray(OFFSET),
-        *[jnp.tile(jnp.asarray(ENV), (7, 1))] * 2,
-        scenarios.path_from_curvature(jnp.zeros(40), spacing=0.5),
-        jnp.asarray(10.0),
-    )
-    simulate = partial(
-        evaluation.simulate,
-        PLANT.step,
-        controller,
-        params,
-        dt=PLANT.dt,
-        horizon=HORIZON,
-    )
-    episode = jax.eval_shape(simulate, road, jax.random.key(0))
-    assert episode.controls.shape == (7, 2)
-    for field in (
-        "effective_samples",
-        "healthy",
-        "prediction_error",
-    ):
-        assert getattr(episode, field).shape == (7,)
-    assert all(getattr(episode, flag).dtype == bool for flag in ("healthy",))
-
-
-@every
 def test_controls_are_finite_and_within_the_limits_whatever_is_seen(name):
     controls, info, _ = drive(name)
     low, high = np.float32(PLANT.control_low), np.float32(PLANT.control_high)
@@ -297,17 +268,6 @@ def test_an_input_that_is_not_finite_is_reported_and_the_next_clean_step_recover
     healthy = np.asarray(info["healthy"])[:7]
     assert set(np.flatnonzero(~healthy)) == set(BLACKOUTS.values())
     assert np.all(np.isfinite(np.asarray(info["predicted_states"])[:7][healthy]))
-
-
-@every
-def test_compiling_does_not_change_the_action(name):
-    controller, params, _, _ = compiled(name)
-    alone = controller.act(
-        params,
-        controller.init(jax.random.key(0)),
-        *map(jnp.asarray, (OFFSET, ENV, REFERENCE)),
-    )
-    assert same(act_once(name), alone, rtol=1e-4, atol=1e-5)
 
 
 @every
@@ -350,11 +310,6 @@ def test_it_is_traced_once_while_state_observation_environment_reference_and_key
                 reference,
             )
     assert len(traces) == 1
-
-
-@every
-def test_the_same_key_makes_the_same_plan(name):
-    assert same(act_once(name, 1), act_once(name, 1), rtol=0, atol=0)
 
 
 @every_sampling

@@ -65,17 +65,6 @@ def test_it_acts_as_the_planner_alone_would_from_that_state():
     np.testing.assert_allclose(actions[0], expected, atol=1e-6)
 
 
-def test_an_observation_that_cannot_be_read_is_reported_and_the_next_clean_one_recovers():
-    controller = control.delay_compensated(planner(), MODEL, delay=DELAY)
-    act, state = jit(controller.act), controller.init(jax.random.key(0))
-    seen = []
-    for observation in (START, START * jnp.nan, START):
-        action, state, info = act({}, state, observation, ENV, straight(HORIZON))
-        assert np.all(np.isfinite(action))
-        seen.append(bool(info["healthy"]))
-    assert seen == [True, False, True]
-
-
 def test_a_delay_below_one_period_is_refused():
     with pytest.raises(ValueError, match="delay must be at least 1"):
         control.delay_compensated(planner(), MODEL, delay=0)

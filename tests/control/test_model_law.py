@@ -7,7 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 import scipy.linalg
-from helpers import jit, model_and_params, straight
+from helpers import jit, straight
 
 from sfkd_jax import control, models, plants
 from sfkd_jax.control.laws._model_law import _along_circle, solve
@@ -119,16 +119,6 @@ def test_a_planner_around_it_needs_no_samples_to_stay_near_the_path_in_side_wind
     assert aside["model"] < 0.2 * aside["textbook"]
 
 
-@pytest.mark.parametrize("name", ["sfkd", "nominal"])
-def test_a_learned_model_has_a_law_too(name):
-    model, params = model_and_params(name)
-    turn = LAW.prepare(
-        model, model.fiber(params, ENV), jnp.zeros(4), straight(3), CURVATURE
-    )
-    assert turn.gain.shape == (3, 2, 3)
-    assert all(np.all(np.isfinite(part)) for part in turn)
-
-
 @pytest.mark.parametrize("size", [1, 3, 7])
 def test_elimination_solves_what_needs_pivots(size):
     random = np.random.default_rng(size)
@@ -178,22 +168,3 @@ def test_as_an_ancillary_it_is_one_more_sample_of_a_planner_around_another_law()
     assert ours < theirs
     assert both == pytest.approx(ours, rel=1e-4)
     np.testing.assert_allclose(chosen, steered, atol=1e-3)
-
-
-def test_over_several_environments_the_ancillary_plan_is_that_of_the_first():
-    plant, model = PLANTS["kinematic"], models.physics(PLANTS["kinematic"].step)
-    limits = {"control_low": plant.control_low, "control_high": plant.control_high}
-    law, state = (
-        control.path_feedback(wheelbase=plant.wheelbase),
-        jnp.asarray([0.0, 0.3, 0.05, 10.0]),
-    )
-    task = control.path_tracking(
-        model, control.tracking_cost(dt=0.1), law, dt=0.1, ancillary=LAW, **limits
-    )
-    planner = control.mppi(
-        task, num_samples=1, temperature=1e-3, horizon=8, noise_std=(1e-6, 1e-6)
-    )
-    start, act = planner.init(jax.random.key(0)), jit(planner.act)
-    alone, _, _ = act({}, start, state, ENV, straight(8))
-    twice, _, _ = act({}, start, state, jnp.stack([ENV, ENV]), straight(8))
-    np.testing.assert_allclose(twice, alone, atol=1e-4)

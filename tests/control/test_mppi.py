@@ -133,21 +133,6 @@ def test_the_first_steering_rate_counts_from_the_control_that_was_applied_last()
     )
 
 
-def test_as_the_temperature_rises_every_sample_counts_the_same():
-    _, _, info = act_once(temperature=1e9)
-    np.testing.assert_allclose(info["effective_samples"], 64.0, rtol=1e-3)
-
-
-def test_the_plan_carried_over_is_shifted_by_one_step():
-    _, state, info = act_once(noise_std=(1e-9, 1e-9))
-    np.testing.assert_array_equal(state.plan[-1], state.plan[-2])
-    step = jit(PLANT.step)
-    stepped = step(OFFSET, state.previous, ENV)
-    np.testing.assert_allclose(info["predicted_states"][0], stepped, atol=1e-5)
-    then = step(stepped, state.controls[0], ENV)
-    np.testing.assert_allclose(info["predicted_states"][1], then, atol=1e-5)
-
-
 @pytest.mark.parametrize(
     ("std", "law"), [(1e3, FEEDBACK), (1e30, control.no_feedback())]
 )
@@ -202,14 +187,6 @@ def test_what_is_not_finite_is_noticed_even_where_the_model_does_not_look(broken
     assert not bool(info["healthy"])
     assert np.all(np.isfinite(action))
     assert finite(state)
-
-
-def test_a_broken_first_observation_gives_a_finite_control_inside_the_bounds():
-    action, state, info = act_once(observation=np.full(4, np.nan, np.float32))
-    assert not bool(info["healthy"])
-    assert np.all(np.isfinite(action))
-    assert finite(state)
-    assert bool(act_once(state=state)[2]["healthy"])
 
 
 @pytest.mark.parametrize("law", [FEEDBACK, control.ModelLaw(dt=0.1)])

@@ -110,18 +110,6 @@ def test_a_turn_is_taken_at_a_lateral_acceleration_that_fitted_before():
     np.testing.assert_array_equal(lost["grip"][:300], info["grip"][:300])
 
 
-def test_on_a_straight_no_grip_is_needed_and_none_is_shown():
-    info = follow(np.zeros(STEPS), lane=0.5, grip=0.1)
-    np.testing.assert_array_equal(info["speed_factor"], 1.0)
-    np.testing.assert_allclose(info["grip"], 0.1)
-
-
-def test_without_a_lane_the_reference_passes_unchanged():
-    info = follow(ADVERSARIES["shift"], lane=None)
-    np.testing.assert_array_equal(info["speed_factor"], 1.0)
-    np.testing.assert_array_equal(info["asked"], 10.0)
-
-
 def test_measurements_that_are_not_finite_change_no_radius():
     laterals = ADVERSARIES["noise"].copy()
     laterals[100:110] = np.nan

@@ -72,11 +72,6 @@ def test_path_errors_do_not_depend_on_where_the_world_puts_its_origin():
     np.testing.assert_allclose(np.stack(here), np.stack(there), atol=2e-5)
 
 
-def test_heading_errors_are_wrapped():
-    errors = errors_at(np.asarray([[0.0, 0.0, 2 * np.pi + 0.1, 9.0]]))
-    np.testing.assert_allclose(errors.heading, [0.1], atol=1e-5)
-
-
 def test_the_curvature_of_a_reference_is_that_of_its_circle():
     window = on_circle(np.arange(1.0, 9.0)).astype(np.float32)
     curvature = jit(control.reference_curvature)(window)
@@ -114,15 +109,6 @@ def test_the_law_steers_and_brakes_against_its_errors():
     np.testing.assert_allclose(
         commanded(off, scalar(0.0), scalar(9.0))[1], 8.0, rtol=1e-6
     )
-
-
-def test_no_feedback_ignores_every_error():
-    off = PathErrors(scalar(1.0), scalar(0.1), scalar(0.5))
-    np.testing.assert_array_equal(
-        control.no_feedback()(off, scalar(0.1), scalar(9.0)), [0.0, 0.0]
-    )
-    commanded = control.no_feedback(speed_loop=True)(off, scalar(0.1), scalar(9.0))
-    np.testing.assert_array_equal(commanded, [0.0, 9.0])
 
 
 def stage(
@@ -163,7 +149,3 @@ def test_the_cost_is_zero_on_the_path_whatever_the_body_heading():
 )
 def test_every_term_of_the_cost_is_the_square_it_states(change, expected):
     np.testing.assert_allclose(charge(stage(**change)), expected, rtol=1e-4)
-
-
-def test_a_speed_command_costs_no_effort():
-    assert float(charge(stage(acceleration=9.0), speed_loop=True)) == 0.0

@@ -139,10 +139,3 @@ def test_a_law_derived_again_is_that_of_the_shipped_policy(name):
     for row, tolerance in ((0, 3e-4), (1, 1e-2)):
         table = stored.law.gain[:, :, ::3, ::3, row]
         np.testing.assert_allclose(law.gain[..., row, :], table, atol=tolerance)
-
-
-def test_invalid_axes_are_refused():
-    with pytest.raises(ValueError, match="odd number of accelerations"):
-        derive_path_law(
-            PLANTS["kinematic"].step, coordinates=3, points=(4, 2, 2), **BOX
-        )

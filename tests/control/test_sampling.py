@@ -179,8 +179,3 @@ def test_only_a_polynomial_that_continues_the_past_stays_what_it_is(
     assert change(kept, kept[:half]) < 1e-5
     assert change(bent, bent[:half]) > 1e-3
     assert change(kept, np.zeros((half, 1))) > 1e-2
-
-
-def test_a_plan_without_a_filter_is_the_same_array():
-    plan = jnp.ones((4, 2))
-    assert plan_smoother(horizon=4, window=0, order=2)(plan[:0], plan) is plan

@@ -429,36 +429,6 @@ def test_before_anything_is_seen_the_planner_passes_within_the_limits():
     assert bool(after.inner.nominal.started & info["shield_healthy"])
 
 
-def test_without_a_reference_the_last_preview_is_driven_on():
-    """On a circle, where the previewed curvature is the actual one."""
-    controller = filtered()
-    act, memory = jit(controller.act), controller.init(jax.random.key(0))
-    xi, reference = vehicle_state(jnp.asarray([0.1, 0.0, SPEED])), circle(0.01)
-    _, memory, _ = act(jnp.zeros((9, 2)), memory, xi, ENV, reference)
-    ahead = memory.inner.nominal.road
-    action, memory, info = act(jnp.zeros((9, 2)), memory, xi, ENV, reference * jnp.nan)
-    np.testing.assert_allclose(memory.inner.nominal.road, ahead, atol=1e-5)
-    np.testing.assert_allclose(
-        action,
-        LAW(info["nominal_state"], jnp.asarray(0.01), jnp.asarray(SPEED), ENV),
-        atol=1e-5,
-    )
-    assert bool(info["dead_reckoning"])
-
-
-def test_where_law_and_planner_are_at_the_same_limit_nothing_was_asked_for():
-    """The clipped law gives the limit; the nominal model, whose law is clipped alike, gets no
-    perturbation.
-    """
-    controller = filtered(control=(LOW, (0.05, 5.0)), width=5.0)
-    start = vehicle_state(jnp.asarray([-3.0, -0.2, SPEED]))
-    _, _, info = jit(controller.act)(
-        jnp.zeros((9, 2)), controller.init(jax.random.key(0)), start, ENV, circle()
-    )
-    np.testing.assert_array_equal(info["perturbation"][0], 0.0)
-    assert float(info["intervention"]) == 0.0
-
-
 @pytest.mark.parametrize(
     ("changes", "line"),
     [
@@ -486,14 +456,6 @@ def test_invalid_settings_are_refused_in_one_line(changes, line):
     with pytest.raises(ValueError, match=line) as refusal:
         filtered(**changes)
     assert "\n" not in str(refusal.value)
-
-
-def test_an_environment_of_another_size_is_refused():
-    controller = filtered()
-    memory = controller.init(jax.random.key(0))
-    xi = vehicle_state(jnp.asarray([0.0, 0.0, SPEED]))
-    with pytest.raises(ValueError, match=r"env must have shape \(2,\), got \(3,\)"):
-        controller.act(jnp.zeros((9, 2)), memory, xi, jnp.zeros(3), circle())
 
 
 def test_the_box_of_a_certificate_holds_its_corridor(monkeypatch):

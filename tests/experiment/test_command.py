@@ -4,14 +4,12 @@ import json
 import subprocess
 import sys
 import textwrap
-import tomllib
 from pathlib import Path
 
 import pytest
 
 from sfkd_jax import __main__ as program
 from sfkd_jax import __version__
-from sfkd_jax.experiment import command
 
 ROOT = Path(__file__).parents[2]
 SCRIPT = """
@@ -55,11 +53,6 @@ def toy(tmp_path):
 def printed(done):
     lines = done.stdout.splitlines()
     return [json.loads(line) for line in lines if line.startswith("{")]
-
-
-def test_the_program_is_installed_under_its_name():
-    project = tomllib.loads((ROOT / "pyproject.toml").read_text("utf-8"))["project"]
-    assert project["scripts"] == {"sfkd": "sfkd_jax.__main__:main"}
 
 
 def test_without_a_command_every_command_of_the_package_is_listed(monkeypatch, capsys):
@@ -130,21 +123,3 @@ def test_a_study_searches_and_a_failed_trial_does_not_end_it(toy):
     )
     assert done.returncode == 0, done.stderr[-2000:]
     assert printed(done)
-
-
-def test_compiled_programs_are_kept_below_the_root_unless_the_user_says_where(
-    tmp_path, monkeypatch
-):
-    chosen = {}
-    monkeypatch.setattr(command.jax.config, "update", chosen.__setitem__)
-    for variable in ("DIR", "MIN_COMPILE_TIME_SECS", "MIN_ENTRY_SIZE_BYTES"):
-        name = "JAX_COMPILATION_CACHE_DIR"
-        if variable != "DIR":
-            name = f"JAX_PERSISTENT_CACHE_{variable}"
-        monkeypatch.delenv(name, raising=False)
-    command.use_compilation_cache(tmp_path)
-    assert chosen["jax_compilation_cache_dir"] == str(tmp_path / "compiled")
-    chosen.clear()
-    monkeypatch.setenv("JAX_COMPILATION_CACHE_DIR", "/elsewhere")
-    command.use_compilation_cache(tmp_path)
-    assert "jax_compilation_cache_dir" not in chosen

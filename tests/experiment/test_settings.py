@@ -184,16 +184,6 @@ def test_a_run_stays_below_the_root(setting, name):
         use("seed=0", setting, name)
 
 
-def test_names_with_folders_and_settings_in_them_are_names():
-    for name in ("smoke", "a/b", "a=0.003,b=1", "Läufe 2", "a..b", ".a"):
-        assert replace(settings(), name=name).name == name
-
-
-def test_the_keys_of_a_comparison_are_names_of_files():
-    with pytest.raises(ValueError, match=r"names of files, got '../x'"):
-        use("seed=0", "comparison.rows", {"../x": "seed=1"})
-
-
 def test_every_interval_says_something():
     """An annotation that states the default of its kind would say nothing."""
     kind = schema("Kind", None, factory)

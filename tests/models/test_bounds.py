@@ -13,7 +13,6 @@ from helpers import (
     explicit,
     jit,
     model_and_params,
-    space,
     steepest_pattern,
 )
 
@@ -263,11 +262,6 @@ def test_the_sandwich_bound_survives_ill_conditioned_weights():
         ]
         worst = max(worst, steepest_pattern(made, starts=2))
     assert worst <= BETA
-
-
-def test_the_body_read_out_is_short_in_scaled_units():
-    weights = explicit("sfkd", 100.0)
-    assert spectral(weights.readout / np.asarray(space().body_scale)[:, None]) <= 1.0
 
 
 @pytest.mark.parametrize("name", HARD)

@@ -114,34 +114,6 @@ def test_the_step_is_the_exact_flow_of_a_linear_model_to_the_fourth_order():
     np.testing.assert_allclose([coarse[2], fine[2]], 0.0, atol=1e-12)
 
 
-def test_the_rates_are_increments_over_a_period_in_units_of_the_data():
-    scales = space()
-    rates = lambda fiber, s, u: jnp.asarray([0.5, -1.0, 0.0, 2.0])
-    model = continuous(
-        scales, dt=0.2, init=lambda key: {}, fiber=Conditioned, rates=rates
-    )
-    moved = stepped(model, {}, jnp.asarray([0.0, 0.0, np.pi / 2, 10.0]))
-    np.testing.assert_allclose(
-        moved, [0.05, 1.15, np.pi / 2, 10.0 + 0.2 * 2.0 * 4.0], atol=1e-5
-    )
-    np.testing.assert_allclose(model.vector(jnp.asarray([1.0, 2.0, 3.0, 18.0])), [2.0])
-
-
-@pytest.mark.parametrize("body", PLANTS)
-@pytest.mark.parametrize("name", LEARNED)
-def test_sizes_follow_the_space_and_wrong_ones_are_refused(name, body):
-    model = small(name, body)
-    params = model.init(jax.random.key(0))
-    state = stepped(model, params, STATES[body])
-    assert state.shape == (3 + body,)
-    assert model.vector(state).shape == (body,)
-    assert np.all(np.isfinite(state))
-    with pytest.raises(
-        ValueError, match=rf"state must have shape \({3 + body},\), got \(9,\)"
-    ):
-        model.encode(model.fiber(params, ENV), jnp.zeros(9))
-
-
 @pytest.mark.usefixtures("x64")
 @pytest.mark.parametrize("name", LEARNED)
 def test_only_the_input_affine_models_are_affine_in_control_and_environment_together(

@@ -19,7 +19,6 @@ from helpers import (
     model_and_params,
     same,
     space,
-    tiny,
 )
 
 from sfkd_jax import models, store
@@ -69,15 +68,6 @@ def one():
     return at(driven(), 0)
 
 
-@pytest.mark.parametrize("name", EVERY)
-def test_other_parameters_and_environments_do_not_compile_again(name, one):
-    _, params = model_and_params(name)
-    run(name, one)
-    halved = jax.tree.map(lambda leaf: 0.5 * leaf, params)
-    chained(name)(halved, one._replace(envs=one.envs[::-1]))
-    assert chained(name)._cache_size() == 1
-
-
 def test_every_registered_model_is_tested_here():
     assert {"sfkd", *OTHERS} == set(models.FACTORIES)
     kinds = {variant.get("residual", "sandwich") for variant in VARIANTS.values()}
@@ -98,26 +88,6 @@ def test_the_pose_that_was_encoded_is_decoded_unchanged(name, one):
     np.testing.assert_array_equal(run(name, one)["start"][POSE], one.states[0, POSE])
 
 
-@pytest.mark.parametrize("body", [1, 4])
-def test_sizes_follow_the_space(body):
-    model = tiny(body=body)
-
-    def encoded(key, state, env, control):
-        params = model.init(key)
-        fiber = model.fiber(params, env)
-        latent = model.step(fiber, model.encode(fiber, state), control)
-        return (
-            model.vector(latent),
-            model.decode(fiber, latent),
-            model.structure.explicit(params).readout,
-        )
-
-    two = jax.ShapeDtypeStruct((2,), jnp.float32)
-    state = jax.ShapeDtypeStruct((3 + body,), jnp.float32)
-    z, decoded, readout = jax.eval_shape(encoded, jax.random.key(0), state, two, two)
-    assert (z.shape, decoded.shape, readout.shape) == ((8,), (3 + body,), (body, 8))
-
-
 @pytest.mark.parametrize("name", LEARNED)
 def test_parameters_are_nested_dicts_of_float32_arrays_that_can_be_stored(
     name, tmp_path
@@ -132,16 +102,6 @@ def test_parameters_are_nested_dicts_of_float32_arrays_that_can_be_stored(
     store.write_arrays(file, flat, kind="weights", config={})
     read, _ = store.read_arrays(file, kind="weights")
     assert same(unflatten_dict(read, sep="/"), params, rtol=0, atol=0)
-
-
-def test_initial_parameters_depend_on_the_key_alone():
-    init = jit(tiny().init)
-    first, again, other = (init(jax.random.key(seed)) for seed in (1, 1, 2))
-    assert same(first, again, rtol=0, atol=0)
-    assert all(np.all(np.isfinite(leaf)) for leaf in jax.tree.leaves(first))
-    assert not np.array_equal(
-        first["networks"]["operators"], other["networks"]["operators"]
-    )
 
 
 @pytest.mark.parametrize("name", LEARNED)
@@ -299,27 +259,6 @@ def test_folded_parameters_are_the_same_model_and_the_same_claim(name, one):
             rtol=1e-6,
             atol=1e-6,
         )
-
-
-def test_no_gradient_of_training_passes_through_a_matrix_for_every_environment():
-    """Such a gradient took half of a training step; folded parameters, which are made
-    for driving, have it.
-    """
-    model, params = model_and_params("sfkd")
-    data = driven()
-    count, steps = data.controls.shape[:2]
-
-    def miss(given):
-        predicted = jax.vmap(lambda one: rollout(model, given, one)[0])(data)
-        return jnp.sum((predicted - data.states[:, 1:]) ** 2)
-
-    program = [
-        str(jax.make_jaxpr(jax.grad(miss))(given))
-        for given in (params, jit(partial(fold, model))(params))
-    ]
-    raw, folded = (f"f32[{count},{steps},8,8]" in text for text in program)
-    assert folded
-    assert not raw
 
 
 @pytest.mark.parametrize("name", ["sfkd", "r2dn"])

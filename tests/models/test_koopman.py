@@ -1,18 +1,18 @@
 """EDMD: coordinates along circles, the regression, and plants that it recovers exactly."""
 
-from functools import cache, partial
+from functools import cache
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from helpers import at, dataset, jit, same, space
+from helpers import at, dataset, jit, space
 
 from sfkd_jax import data as datasets
 from sfkd_jax import models
-from sfkd_jax.geometry import between, compose
-from sfkd_jax.models._edmd import Lift, along_circle, ridge_regression, thin_plate
-from sfkd_jax.rollout import defects, rollout
+from sfkd_jax.geometry import compose
+from sfkd_jax.models._edmd import Lift, along_circle, ridge_regression
+from sfkd_jax.rollout import defects
 from sfkd_jax.types import POSE, Trajectory
 
 F = np.float32([[0.9, 0.1], [-0.2, 0.7]])
@@ -103,15 +103,6 @@ def test_states_along_a_circle_have_the_coordinates_they_were_made_with(curvatur
     )
     np.testing.assert_allclose(
         seen, np.stack([progress, left, heading, np.full(3, 9.0)], axis=1), atol=2e-5
-    )
-
-
-def test_thin_plate_is_r_squared_log_r():
-    centres = np.float32([[0.0, 0.0], [3.0, 4.0], [0.0, 1.0]])
-    values = thin_plate(jnp.zeros(2), jnp.asarray(centres))
-    np.testing.assert_allclose(values, [0.0, 25 * np.log(5.0), 0.0], atol=1e-5)
-    assert np.all(
-        np.isfinite(jax.jacobian(thin_plate)(jnp.zeros(2), jnp.asarray(centres)))
     )
 
 
@@ -229,53 +220,6 @@ def test_driving_is_predicted_far_better_than_by_no_change(environment):
     assert np.all(errors < 0.25 * zero)  # e_y, e_ψ, v
 
 
-def test_seeing_the_environment_helps():
-    aware, blind = (
-        np.sqrt(
-            np.mean(
-                np.square(
-                    jit(jax.vmap(partial(rollout_gap, model), in_axes=(None, 0)))(
-                        params, dataset().test
-                    )
-                )
-            )
-        )
-        for model, params in (driving(True), driving(False))
-    )
-    assert aware < 0.8 * blind
-
-
-def rollout_gap(model, params, drive):
-    """Lateral error of a free prediction over a second, in the frame of its start."""
-    window = Trajectory(drive.states[:11], drive.controls[:10], drive.envs[:10])
-    predicted, _, _ = rollout(model, params, window)
-    origin = window.states[0, POSE]
-    return jax.vmap(
-        lambda a, b: between(origin, a[POSE])[1] - between(origin, b[POSE])[1]
-    )(predicted, window.states[1:])
-
-
-def test_a_model_that_does_not_see_the_environment_is_the_pooled_original():
-    model, params = driving(False)
-    here, there = (
-        model.fiber(params, jnp.asarray(env)) for env in ([0.3, 8.0], [0.9, -2.0])
-    )
-    assert same(here, there, rtol=0, atol=0)
-    assert params["weights"].shape == (30 + 3 + 2 + 2, 4 + 30)
-
-
-def test_the_ridge_that_predicts_best_is_chosen():
-    """One of the two is far too large; their order does not matter."""
-    for ridges in ((1e-5, 1e3), (1e3, 1e-5)):
-        model = models.koopman(two_body_space(), functions=4, ridges=ridges)
-        linear = model.structure.linear(
-            model.fiber(
-                identified(model, parked(linear_change)), jnp.asarray([0.6, 0.0])
-            )
-        )
-        np.testing.assert_allclose((linear.C @ linear.B)[3:], G, atol=0.02)
-
-
 def test_the_model_and_its_linear_predictor_are_one_on_a_straight_path():
     model, params = driving()
     drive = at(dataset().test, 0)
@@ -295,16 +239,3 @@ def test_the_model_and_its_linear_predictor_are_one_on_a_straight_path():
 
     one, other = both(params, drive.states[5], drive.controls[5], drive.envs[5])
     np.testing.assert_allclose(one, other, atol=1e-5)
-
-
-def test_a_path_that_bends_left_turns_the_car_right_against_it():
-    """For a step of 1 m the heading error decreases by about the turn of the path."""
-    model, params = driving()
-    linear = model.structure.linear(model.fiber(params, jnp.asarray([0.7, 0.0])))
-    np.testing.assert_allclose((linear.C @ linear.d)[2], -1.0, atol=0.1)
-
-
-def test_a_state_of_another_plant_is_refused():
-    model, params = driving()
-    with pytest.raises(ValueError, match=r"\(4,\), got \(7,\)"):
-        model.encode(model.fiber(params, jnp.zeros(2)), jnp.zeros(7))

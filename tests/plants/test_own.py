@@ -62,19 +62,6 @@ def test_a_missing_step_is_reported_when_it_is_needed_and_not_before(
     assert message in str(caught.value)
 
 
-def test_a_step_that_fails_is_reported_with_the_sizes_it_was_given():
-    def step(x, u, e):
-        p_x, p_y, yaw, v, rate = x
-        return jnp.stack([p_x, p_y, yaw, v, rate])
-
-    plant = plants.own(step=step, **LIMITS)
-    with pytest.raises(
-        ValueError,
-        match=r"fails on 4 states \(vehicle.state_names\), .*: not enough values to unpack",
-    ):
-        plants.check_step(plant)
-
-
 def test_a_robot_known_from_logs_alone_is_not_driven():
     plant = plants.own(state_names=NAMES)
     assert not plant.simulated
@@ -82,31 +69,6 @@ def test_a_robot_known_from_logs_alone_is_not_driven():
         ValueError, match="known from logs alone, so it cannot be simulated"
     ):
         plants.check_step(plant)
-
-
-@pytest.mark.parametrize(
-    ("settings", "message"),
-    [
-        (
-            {"state_names": ("p_x", "p_y", "yaw")},
-            "state_names must be p_x, p_y, yaw, v",
-        ),
-        ({"control_low": (-1.0,), "control_high": (1.0,)}, "two numbers each"),
-        ({"control_low": (-1.0, -2.0)}, "two numbers each"),
-        ({"step": lambda x, u, e: x}, "two numbers each"),
-    ],
-)
-def test_invalid_settings_are_refused(settings, message):
-    with pytest.raises(ValueError, match=message):
-        plants.own(**settings)
-
-
-def test_a_speed_loop_needs_limits_and_an_acceleration():
-    for plant in (plants.own(), plants.own(speed_loop=True, **LIMITS)):
-        with pytest.raises(
-            ValueError, match="inner_loop=speed needs limits of the acceleration"
-        ):
-            plants.with_speed_loop(plant)
 
 
 def test_its_nominal_model_is_the_bicycle_and_leaves_further_states_alone():

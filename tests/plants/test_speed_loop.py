@@ -44,12 +44,3 @@ def test_the_loop_asks_for_what_the_actuator_can_give(
     )
     opened = getattr(vehicle, which)(state, jnp.array([steering, acceleration]), env)
     np.testing.assert_allclose(closed, opened, rtol=0, atol=1e-12)
-
-
-def test_the_wrapper_changes_the_meaning_of_one_control_and_nothing_else(vehicle):
-    closed = with_speed_loop(vehicle)
-    assert closed.speed_loop
-    assert not vehicle.speed_loop
-    assert (closed.control_low, closed.control_high) == ((-0.5, 0.0), (0.5, 25.0))
-    unchanged = ("name", "dt", "wheelbase", "state_names", "derivative")
-    assert all(getattr(closed, name) is getattr(vehicle, name) for name in unchanged)

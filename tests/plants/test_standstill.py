@@ -51,8 +51,3 @@ def test_a_car_launches_from_rest_along_the_kinematic_curve(vehicle, hold):
     np.testing.assert_allclose(
         turned / gone, np.tan(steering) / vehicle.wheelbase, rtol=0.06
     )
-
-
-def test_wheels_turned_at_rest_move_nothing(vehicle, hold):
-    states = hold(vehicle, 0.0, (0.5, 0.0), (0.9, 8.0), 2.0)
-    assert (states[:, :6] == 0).all()

@@ -14,7 +14,7 @@ from sfkd_jax import models, plants
 from sfkd_jax.data import generate_along_path, measure_space, random_windows, split
 from sfkd_jax.rollout import defects
 from sfkd_jax.training import multi_step_loss
-from sfkd_jax.training._losses import error_units, power_mean
+from sfkd_jax.training._losses import power_mean
 
 LOW, HIGH = (0.3, -8.0), (0.9, 8.0)
 
@@ -56,13 +56,6 @@ def test_the_tube_in_the_loss_is_the_read_out_times_the_defect_over_what_contrac
     np.testing.assert_allclose(
         total - without, 0.5 * (float(parts["tube"]) / 0.01) ** 2, rtol=1e-3
     )
-
-
-def test_lateral_error_and_heading_count_as_position_and_yaw(learned):
-    model, space = learned[:2]
-    units = error_units(model, space)
-    np.testing.assert_allclose(units[3:5], (1.0, 5.0))
-    np.testing.assert_allclose(units[5], 0.05 / space.body_scale[2])
 
 
 def test_alpha_follows_the_loss_and_stays_below_its_largest(learned):
