@@ -117,20 +117,6 @@ def test_the_document_verifies_and_a_changed_one_does_not(document, trained):
         check(without, trained)
 
 
-def test_what_is_claimed_is_one_sum_of_what_is_calibrated(document):
-    result = document["corridor"]
-    assert result["corridor_m"] == pytest.approx(
-        result["bounds"]["nominal"] + result["bounds"]["vehicle_to_nominal_position"]
-    )
-    assert (
-        result["bounds"]["vehicle_to_nominal_position"]
-        <= result["bounds"]["asymptotic_position"]
-    )
-    assert 0.6 <= result["coverage"] <= 1.0
-    assert result["runs"] == SMALL["runs"]
-    assert result["attack"]["over_tube"] <= 1.0
-
-
 def test_every_friction_and_speed_gets_a_corridor_of_its_own(document, loop):
     frictions, speeds = [0.3, 0.9], [8.0, 10.5]
     result = corridor_by_speed(
@@ -189,13 +175,3 @@ def test_the_fastest_speed_is_one_below_which_every_corridor_fits():
         0.9: 10.0,
     }
     assert fastest_speeds(cells, 0.1) == dict.fromkeys(widths)
-
-
-def test_the_same_seed_gives_the_same_corridor(document, loop):
-    again = corridor_of(loop, document["outputs"])
-    assert {**again, "seconds": 0.0} == {**document["corridor"], "seconds": 0.0}
-
-
-def test_a_policy_without_a_law_has_no_corridor(trained):
-    with pytest.raises(ValueError, match="with its law"):
-        closed_loop(kinematic(), trained.model, trained.params, None, ())

@@ -22,24 +22,28 @@ def test_the_pendulum_ends_upright(monkeypatch):
     assert example("mppi_own_dynamics", monkeypatch)["main"](samples=128) > 0.95
 
 
+@pytest.mark.exhaustive
 def test_the_pole_on_the_cart_ends_upright(monkeypatch, tmp_path):
     figure = tmp_path / "cartpole.png"
     assert example("cartpole", monkeypatch)["main"](samples=256, figure=figure) > 0.95
     assert figure.stat().st_size > 10_000
 
 
+@pytest.mark.exhaustive
 def test_the_quadrotor_passes_the_window(monkeypatch):
     distance, depth = example("quadrotor_window", monkeypatch)["main"](samples=512)
     assert distance < 0.3
     assert depth <= 1e-5
 
 
+@pytest.mark.exhaustive
 def test_a_fleet_arrives_and_touches_no_pillar(monkeypatch):
     left, gap = example("fleet", monkeypatch)["main"](count=16, samples=128)
     assert left < 0.5
     assert gap >= -1e-5
 
 
+@pytest.mark.exhaustive
 def test_a_lap_is_driven_within_the_track_and_the_grip(monkeypatch):
     sizes = {"samples": 192, "seconds": 29.0}
     lap, slip, depth = example("racing_line", monkeypatch)["main"](**sizes)
@@ -48,6 +52,7 @@ def test_a_lap_is_driven_within_the_track_and_the_grip(monkeypatch):
     assert depth <= 1e-5
 
 
+@pytest.mark.exhaustive
 def test_a_learned_residual_keeps_the_boat_off_the_rocks(monkeypatch):
     results = example("dubins_residual", monkeypatch)["main"](samples=256)
     (left, gap), (nominal_left, nominal_gap) = results["learned"], results["nominal"]

@@ -21,7 +21,7 @@ def test_the_page_shows_the_cells_of_the_notebook():
     assert blocks == CELLS
 
 
-@pytest.mark.slow
+@pytest.mark.exhaustive
 def test_the_notebook_drives_inside_the_corridor_and_certifies_a_model(capsys):
     names = {}
     with mpl.rc_context({"backend": "Agg"}):

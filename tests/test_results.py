@@ -7,7 +7,6 @@ import numpy as np
 import pytest
 
 from experiments import results
-from sfkd_jax import evaluation
 
 PAGE = (results.HOME.parent / "docs" / "results.md").read_text("utf-8")
 PRETRAINED = results.HOME.parent / "src" / "sfkd_jax" / "pretrained"
@@ -88,30 +87,3 @@ def test_adapting_on_cars_that_no_model_has_seen():
     ]
     assert np.round([min(ratios), max(ratios)], 2).tolist() == [0.23, 0.34]
     assert "0.23 to 0.34 times" in PAGE
-
-
-def test_results_of_compare_become_short_rows():
-    driven = {
-        "system": "sfkd_path",
-        "vehicle": "dynamic",
-        "scenario": "s3",
-        "controller": "mppi",
-        "sampling": "plain",
-        "seeds": [0, 1],
-        "params": 10,
-        "alpha": 0.9,
-        "rmse_episodes_m": [0.001, 0.002, 0.003, 0.004],
-        "max_deviation_m": 0.0123,
-        "smoothness_rad_per_s": 0.05,
-        "departures": 0,
-        "difference_to_sfkd": None,
-        "episode_s": 30.0,
-    }
-    document = results.condense({"rows": [driven], "config": {}})
-    (short,) = document["rows"]
-    assert short["row"] == "sfkd"
-    assert short["controller"] == "mppi_plain"
-    assert short["rmse_mm"] == [[1.0, 2.0], [3.0, 4.0]]
-    mean, interval = evaluation.mean_interval(np.asarray(short["rmse_mm"]))
-    assert mean == 2.5
-    assert interval[0] < 2.5 < interval[1]

@@ -10,11 +10,9 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from helpers import refusal_of
 
 from sfkd_jax import evaluation, store
 from sfkd_jax.experiment import runs
-from sfkd_jax.report.episodes import of_run
 from sfkd_jax.store import DirectoryLocked, locked
 
 ROW = {
@@ -122,16 +120,6 @@ def test_a_lock_is_reentrant_in_its_process(tmp_path):
     assert started(HOLD, tmp_path, 0).wait() == 0
 
 
-def test_a_directory_that_cannot_be_made_is_one_line(tmp_path):
-    (tmp_path / "file").touch()
-
-    def take():
-        with locked(tmp_path / "file" / "run"):
-            pass
-
-    assert str(tmp_path / "file" / "run") in refusal_of(take)
-
-
 # ---- rows and episodes
 
 
@@ -177,15 +165,3 @@ def test_rows_that_differ_in_one_part_of_their_identity_are_two(name):
         if value is not None
     }
     assert evaluation.parse_episode_name(evaluation.episode_name(other)) == known
-
-
-def test_drives_on_other_roads_are_other_scenes(tmp_path):
-    """As when the rest of the systems are driven again with more episodes."""
-    keep(tmp_path, ROW | {"system": "nominal", "env": "none"}, 1.0)
-    keep(tmp_path, ROW | {"system": "oracle"}, 1.0)
-    keep(tmp_path, ROW, 2.0)
-    groups = of_run(tmp_path)
-    assert sorted([one.system for one in group] for group in groups) == [
-        ["nominal", "oracle"],
-        ["sfkd"],
-    ]

@@ -70,16 +70,6 @@ def test_conformal_bounds_cover_a_new_trajectory_as_often_as_they_say(level, cou
     assert level - 1e-12 <= exact <= level + 1 / (count + 1)
 
 
-def test_conformal_bounds_are_a_calibration_score_in_the_units_of_the_reference():
-    random = np.random.default_rng(1)
-    reference, calibration = scores(random, 50), scores(random, 40)
-    bounds = conformal_bounds(tube_units(reference, level=0.95), calibration, level=0.9)
-    units = tube_units(reference, level=0.95)
-    np.testing.assert_allclose(bounds / units, np.full(4, bounds[0] / units[0]))
-    inside = np.sum(np.all(calibration <= bounds * (1 + 1e-12), axis=1))
-    assert inside == np.ceil(41 * 0.9)
-
-
 @pytest.mark.parametrize(("count", "level"), [(18, 0.95), (8, 0.9), (98, 0.99)])
 def test_too_few_trajectories_for_the_level_are_refused(count, level):
     random = np.random.default_rng(0)

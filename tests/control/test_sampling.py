@@ -98,12 +98,6 @@ def test_as_many_samples_count_as_are_wanted_whatever_the_scale_of_the_cost(
     np.testing.assert_allclose(effective_sample_size(weights), wanted, rtol=0.05)
 
 
-def test_weights_of_two_costs_are_the_logistic_function_and_do_not_see_an_offset():
-    for offset in (0.0, 1e4):
-        weights, _ = softmin(jnp.asarray([0.0, 1.0]) + offset, jnp.asarray(0.5))
-        np.testing.assert_allclose(weights[1], 1 / (1 + np.exp(2.0)), rtol=1e-3)
-
-
 def test_more_than_there_are_gives_all_and_bad_ones_never_count():
     costs = jnp.asarray([1.0, 2.0, jnp.nan, jnp.inf, 3.0])
     temperature = temperature_for_sample_size(costs, jnp.asarray(5.0))

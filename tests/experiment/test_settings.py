@@ -3,7 +3,6 @@
 import copy
 import math
 import random
-from typing import Annotated
 
 import pytest
 from composing import composed, plain_settings, settings
@@ -11,9 +10,9 @@ from omegaconf import OmegaConf
 
 from sfkd_jax import build
 from sfkd_jax.experiment import stages
-from sfkd_jax.experiment.options import hydra_schemas, parse_settings
-from sfkd_jax.ranges import Bounds, Interval, Positive, Span
-from sfkd_jax.settings import arguments, did_you_mean, parse, plain, replace, schema
+from sfkd_jax.experiment.options import parse_settings
+from sfkd_jax.ranges import Bounds, Positive, Span
+from sfkd_jax.settings import arguments, parse, plain, replace, schema
 
 OPTIONS = (
     *(f"model={name}" for name in build.MODELS if name != "own"),
@@ -70,14 +69,6 @@ def test_the_line_says_what_a_setting_must_be_and_what_it_is(values, says):
     with pytest.raises(ValueError, match=says) as refused:
         parse(schema("Kind", None, factory, other), values, "of.")
     assert "\n" not in str(refused.value)
-
-
-def test_the_closest_name_is_suggested():
-    known = ["training.steps", "dataset.steps", "seed", "controller.mppi.horizon"]
-    assert did_you_mean("sead", known) == "; did you mean seed?"
-    wanted = "; did you mean training.steps or dataset.steps?"
-    assert did_you_mean("stepps", known) == wanted
-    assert did_you_mean("xyz", known) == ""
 
 
 def leaves(values, above=""):
@@ -182,13 +173,6 @@ def test_what_nothing_can_use_is_refused_before_anything_is_made(name, value):
 def test_a_run_stays_below_the_root(setting, name):
     with pytest.raises(ValueError, match=f"{setting} must be a path below root"):
         use("seed=0", setting, name)
-
-
-def test_every_interval_says_something():
-    """An annotation that states the default of its kind would say nothing."""
-    kind = schema("Kind", None, factory)
-    assert kind.__annotations__["gain"] == Annotated[float, Interval("(0, inf)")]
-    assert {"schema", "path_schema", "files_schema"} == set(hydra_schemas()["dataset"])
 
 
 def test_plain_settings_come_back_as_the_same_objects():

@@ -40,15 +40,6 @@ def test_the_block_matrix_of_every_vertex_has_norm_at_most_one(
         assert np.linalg.norm(block, 2) <= 1.0 + 1e-6
 
 
-def test_a_residual_that_is_used_nowhere_leaves_the_operator_all_of_it():
-    vertices, out, into = shared(1e4, 0.0)
-    np.testing.assert_allclose(
-        np.linalg.norm(vertices, 2, axis=(1, 2)), ALPHA, rtol=0.03
-    )
-    assert not out.any()
-    assert not into.any()
-
-
 def test_where_the_residual_takes_a_direction_the_operator_has_none_of_it_and_keeps_the_others():
     """G = H = e_1 e_1' (nearly): the first direction may have gain α through φ, or
     through A, never both.

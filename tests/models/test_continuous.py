@@ -12,8 +12,8 @@ from helpers import jit, space
 
 from sfkd_jax import models, plants
 from sfkd_jax.geometry import compose
-from sfkd_jax.models._continuous import Conditioned, continuous
-from sfkd_jax.models._icode import affine_rates, softplus
+from sfkd_jax.models._continuous import continuous
+from sfkd_jax.models._icode import softplus
 from sfkd_jax.types import BODY, POSE
 
 LEARNED = ("neural_ode", "icode", "icode_mppi")
@@ -145,32 +145,6 @@ def test_only_the_input_affine_models_are_affine_in_control_and_environment_toge
     assert (second > 1e-2) if name == "neural_ode" else (second < 1e-4)
 
 
-@pytest.mark.usefixtures("x64")
-def test_the_learned_rates_are_exactly_affine_in_all_inputs():
-    _, rates = affine_rates(
-        space(), (8, 8, 8), (jnp.tanh, jax.nn.softplus, jax.nn.softplus), last=1.0
-    )
-    params = drawn("icode")
-    body, way = (
-        jnp.asarray([0.3]),
-        jnp.asarray(np.random.default_rng(0).standard_normal(4)),
-    )
-
-    def along(t):
-        return rates(Conditioned(params, t * way[2:]), body, t * way[:2])
-
-    np.testing.assert_allclose(
-        along(3.0) - along(0.0), 3.0 * (along(1.0) - along(0.0)), rtol=1e-12, atol=1e-14
-    )
-    gain = jax.jacobian(
-        lambda inputs: rates(Conditioned(params, inputs[2:]), body, inputs[:2])
-    )(jnp.zeros(4))
-    np.testing.assert_allclose(
-        along(1.0) - along(0.0), gain @ way, rtol=1e-12, atol=1e-14
-    )
-    assert np.linalg.matrix_rank(gain) == 4
-
-
 def test_the_quick_softplus_is_as_exact_as_float32_and_rises_by_the_sigmoid():
     x = np.concatenate([np.linspace(-80.0, 80.0, 20_001), [0.0, -1e-30, 1e4]]).astype(
         np.float32
@@ -181,27 +155,6 @@ def test_the_quick_softplus_is_as_exact_as_float32_and_rises_by_the_sigmoid():
         jax.vmap(jax.grad(softplus))(jnp.asarray(x)), scipy.special.expit(x), rtol=4e-7
     )
     assert np.isnan(softplus(jnp.asarray(jnp.nan)))
-
-
-@pytest.mark.parametrize("affine_in", ["both", "env", "control"])
-def test_rates_are_affine_in_the_inputs_that_are_named_and_in_no_other(affine_in):
-    init, rates = affine_rates(
-        space(), (8,), (jnp.tanh,), last=1.0, affine_in=affine_in
-    )
-    params, body = init(jax.random.key(0)), jnp.asarray([0.3])
-    inputs = {"control": jnp.asarray([0.7, -0.4]), "env": jnp.asarray([0.5, 0.6])}
-
-    def at(t, moved):
-        scaled = {name: (t if name in moved else 1.0) * inputs[name] for name in inputs}
-        return rates(Conditioned(params, scaled["env"]), body, scaled["control"])
-
-    for moved in (("control",), ("env",), ("control", "env")):
-        affine = np.allclose(
-            at(3.0, moved) - at(0.0, moved),
-            3 * at(1.0, moved) - 3 * at(0.0, moved),
-            rtol=1e-4,
-        )
-        assert affine == (affine_in == "both" or moved == (affine_in,))
 
 
 @pytest.mark.usefixtures("x64")

@@ -198,24 +198,6 @@ def test_what_is_certified_is_what_is_multiplied_by(name, one):
     )
 
 
-@pytest.mark.parametrize(
-    ("setting", "value"),
-    [
-        ("frame", "world"),
-        ("residual", "soft"),
-        ("rank", 7),
-        ("rank", 0),
-        ("rho", 1.0),
-        ("rho", 0.0),
-        ("beta", -0.1),
-        ("beta", 1.5),
-    ],
-)
-def test_invalid_settings_are_refused_by_name(setting, value):
-    with pytest.raises(ValueError, match=rf"model\.{setting}.*{value}"):
-        models.sfkd(space(), **TINY | {setting: value})
-
-
 def test_only_the_soft_variant_has_a_penalty_and_it_is_the_hinge_on_the_jacobian(one):
     assert [
         name

@@ -53,17 +53,6 @@ def test_transport_is_an_isometry_with_inverse_and_a_cocycle(name, scale):
     assert np.abs(results["there"] - LATENTS).max() > 1e-3  # and it does turn something
 
 
-def test_a_plane_turns_by_twice_the_arctangent():
-    angles = np.linspace(-3.0, 3.0, 7)
-    tangents = np.tan(angles / 2).astype(np.float32)
-    turned = jit(rotate_planes)(
-        tangents, np.concatenate([np.ones(7), np.zeros(7)]).astype(np.float32)
-    )
-    np.testing.assert_allclose(
-        turned, np.concatenate([np.cos(angles), np.sin(angles)]), atol=1e-5
-    )
-
-
 def test_rotation_is_the_cayley_transform_of_a_skew_matrix():
     tangents = RANDOM.standard_normal(4)
     skew = np.kron(np.asarray([[0.0, -1.0], [1.0, 0.0]]), np.diag(tangents))

@@ -92,14 +92,6 @@ def test_a_small_steering_step_is_a_first_order_lag(dynamic_plant, hold):
     )
 
 
-def test_a_large_steering_step_is_limited_in_rate(dynamic_plant, hold):
-    states = hold(dynamic_plant(), 10.0, (0.5, 0.0), (0.9, 0.0), 2.5)
-    steps = jnp.diff(states[:, 6])
-    assert steps.max() <= 0.05
-    assert steps[0] > 0.049
-    assert float(states[-1, 6]) == pytest.approx(0.5, abs=1e-3)
-
-
 @pytest.mark.parametrize("acceleration", [-4.0, 0.0, 2.0])
 def test_a_sliding_car_is_turned_by_the_load_that_braking_moves_forward(
     dynamic_plant, acceleration

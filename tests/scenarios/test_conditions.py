@@ -34,13 +34,6 @@ def s2():
     return many(wet_road, steps=STEPS, dt=DT)
 
 
-def test_s1_is_constant_and_calm():
-    envs = many(uniform_road, steps=20)
-    np.testing.assert_array_equal(
-        envs, np.broadcast_to(np.float32([0.9, 0.0]), envs.shape)
-    )
-
-
 def test_s1_with_a_range_draws_one_level_an_episode_evenly():
     envs = many(
         uniform_road,
@@ -93,13 +86,6 @@ def test_s3_visits_a_b_c_b_a_for_exactly_three_seconds_each(s3):
     np.testing.assert_array_equal(
         np.abs(s3[..., 1]), np.broadcast_to(wind, s3.shape[:2])
     )
-
-
-@pytest.mark.parametrize(("dt", "steps"), [(0.02, 3000), (0.05, 1200), (0.1, 3000)])
-def test_s3_keeps_its_period_over_long_episodes_and_fine_sampling(dt, steps):
-    friction = many(switching_road, keys=KEYS[:1], steps=steps, dt=dt)[0, :, 0]
-    visit = np.arange(steps) // round(3 / dt)
-    np.testing.assert_array_equal(friction, np.float32([0.9, 0.6, 0.3, 0.6])[visit % 4])
 
 
 def test_s3_holds_the_side_of_the_wind_for_a_visit_and_draws_it_anew_for_the_next(s3):

@@ -59,18 +59,6 @@ def test_constant_curvature_makes_a_circle_of_exactly_that_radius(side):
     np.testing.assert_allclose(between[:, 2], side * s / RADIUS, atol=1e-4)
 
 
-def test_points_between_samples_join_the_samples_without_a_jump(road):
-    s = 0.5 * np.arange(1, 500, dtype=np.float32)
-    before, at, after = (
-        np.asarray(POINTS(road, s + shift)) for shift in np.float32([-1e-3, 0.0, 1e-3])
-    )
-    np.testing.assert_allclose(
-        after[:, :2], before[:, :2], atol=2.5e-3
-    )  # 2 mm of travel and float32 at 300 m
-    np.testing.assert_allclose(after[:, 2:], before[:, 2:], atol=2e-4)
-    np.testing.assert_allclose(at[:, :2], np.asarray(road.points)[1:500, :2], atol=1e-3)
-
-
 def test_points_between_samples_agree_with_integration_on_a_ten_times_finer_grid(road):
     curvature = np.asarray(road.points, dtype=np.float64)[:, 3]
     s = np.arange(len(curvature)) * 0.5

@@ -60,40 +60,29 @@ def lines(directory):
     ]
 
 
-def test_training_goes_on_from_parameters_that_init_returns(task, tmp_path):
-    """A parabola instead of a model's loss: ten small steps from `init` approach its
-    minimum.
-    """
-    model, _, data = task
-
-    def parabola(params, batch):
-        return (params - 3.0) ** 2, {"prediction": (params - 3.0) ** 2}
-
-    given = model._replace(init=lambda key: jnp.asarray(2.0)), parabola, data
-    reached, _ = train(given, tmp_path, steps=10, save_every=10, learning_rate=1e-3)
-    assert 2.0 < float(reached) <= 2.0 + 10 * 1.1e-3
+@pytest.fixture(scope="module")
+def unbroken(task, tmp_path_factory):
+    """The directory, the weights and the best step of a run that nothing stops."""
+    directory = tmp_path_factory.mktemp("unbroken")
+    return directory, *train(task, directory)
 
 
-def test_the_loss_falls_and_every_step_is_logged(task, tmp_path):
-    train(task, tmp_path)
-    logged = lines(tmp_path)
+def test_the_loss_falls_and_every_step_is_logged(unbroken):
+    logged = lines(unbroken[0])
     assert [line["step"] for line in logged] == [10, 20, 30, 40]
     assert logged[-1]["loss"] < 0.8 * logged[0]["loss"]
     assert "validation_loss" in logged[1]
 
 
-def test_the_same_key_gives_the_same_weights_and_another_key_others(task, tmp_path):
-    first, _ = train(task, tmp_path / "a")
-    again, _ = train(task, tmp_path / "b")
-    other, _ = train(task, tmp_path / "c", seed=4)
-    assert same(first, again)
-    assert not same(first, other)
+def test_another_key_gives_other_weights(task, tmp_path, unbroken):
+    other, _ = train(task, tmp_path, seed=4)
+    assert not same(unbroken[1], other)
 
 
 def test_an_interrupted_run_ends_bit_identical_to_an_unbroken_one(
-    task, tmp_path, monkeypatch
+    task, tmp_path, monkeypatch, unbroken
 ):
-    unbroken, best = train(task, tmp_path / "unbroken")
+    _, weights, best = unbroken
     saves = []
     save = Checkpoints.save
 
@@ -108,7 +97,7 @@ def test_an_interrupted_run_ends_bit_identical_to_an_unbroken_one(
     monkeypatch.undo()
     resumed, best_again = train(task, tmp_path / "broken")
     assert saves == [20]
-    assert same(unbroken, resumed)
+    assert same(weights, resumed)
     assert best == best_again
     assert [line["step"] for line in lines(tmp_path / "broken")] == [10, 20, 30, 40]
 
@@ -198,9 +187,9 @@ fit(model, loss, draw, data.train, held_out, key, directory, steps=40, log_every
 """
 
 
-@pytest.mark.slow
+@pytest.mark.exhaustive
 def test_kill_9_at_random_moments_loses_nothing(task, tmp_path):
-    unbroken, _ = train(task, tmp_path / "unbroken", save_every=10)
+    weights, _ = train(task, tmp_path / "unbroken", save_every=10)
     random, directory = np.random.default_rng(0), tmp_path / "killed"
     for _ in range(4):
         worker = subprocess.Popen(
@@ -223,5 +212,5 @@ def test_kill_9_at_random_moments_loses_nothing(task, tmp_path):
         worker.send_signal(signal.SIGKILL)
         worker.wait()
     resumed, _ = train(task, directory, save_every=10)
-    assert same(unbroken, resumed)
+    assert same(weights, resumed)
     assert [line["step"] for line in lines(directory)] == [10, 20, 30, 40]
