@@ -42,6 +42,7 @@ def attack_claims(
     Raises:
         CertificateContradicted: a lower bound exceeds the proved bound.
     """
+    # Limits before the search: a proof that states none is an error at once.
     limits, reached = limits_of(claims, weights), {}
     networks = {"residual": weights.residual, **decoders(weights)}
     with one_thread():
@@ -49,16 +50,22 @@ def attack_claims(
             if network:
                 reached[f"{name}_slopes"] = attack_slopes(network, seed=seed)
         reached["step_slopes"] = max(
+            # Every vertex: the largest slope of the
+            # hull is at one of them, by convexity.
             attack_slopes(weights.residual, vertex, starts=8)
             for vertex in weights.operators.vertices
         )
     if starts:
+        # A key each, so that one attack's number
+        # of starts leaves the others as they are.
         step_key, transport_key, decoder_key = jax.random.split(jax.random.key(seed), 3)
+        # Folded once: each of many thousand steps would bound the weights again.
         folded = jax.jit(partial(fold, model))(params)
         reached["transport"] = attack_transport(model, folded, box, transport_key)
         reached |= attack_decoder(model, folded, box, decoder_key, starts=starts)
         reached["step"] = attack_step(model, folded, box, step_key, starts=starts)
     for name, value in reached.items():
+        # `not <=` instead of `>`: a NaN contradicts the bound as well.
         if not value <= limits[name] * (1 + FLOAT32):
             raise CertificateContradicted(
                 f"INTERNAL ERROR: the attack on the {name} reaches {value:.6f}, "
@@ -95,6 +102,7 @@ def attack_slopes(
     """
     random, best = np.random.default_rng(seed), 0.0
     if not weights:
+        # Without a network the operator alone is the map, and there are no slopes.
         return float(np.linalg.norm(np.asarray(linear), 2))
     base = (
         np.zeros((weights[-1].shape[0], weights[0].shape[1]))
@@ -102,9 +110,11 @@ def attack_slopes(
         else np.asarray(linear)
     )
     for start in range(starts):
+        # All slopes 1 is the linearisation at the origin, often close to the worst.
         share = 1.0 if start == 0 else random.uniform(0.2, 1.0)
         slopes = [
             (random.uniform(size=len(weight)) < share).astype(float)
+            # Slopes are 0 or 1 from the start: by convexity the maximum is at a corner.
             for weight in weights[:-1]
         ]
         value = 0.0
@@ -112,6 +122,8 @@ def attack_slopes(
             for k in range(len(slopes)):
                 slopes[k] = _best_layer(weights, slopes, base, k)
             after = float(np.linalg.norm(base + _chain(weights, slopes), 2))
+            # Coordinate ascent never decreases, so
+            # that this ends; below 1e-12 is rounding.
             if after <= value * (1 + 1e-12):
                 break
             value = after
@@ -132,6 +144,8 @@ def _best_layer(
 ) -> Vector:
     """Slopes of one layer that maximise u'(A + …)v for the current top pair (u, v)."""
     left, _, right = np.linalg.svd(base + _chain(weights, slopes))
+    # With the pair (u, v) fixed the gain is a
+    # sum over units: each chooses its own sign.
     before = _chain(weights[: layer + 1], slopes[:layer]) @ right[0]
     after = left[:, 0] @ _chain(
         [np.eye(len(slopes[layer])), *weights[layer + 1 :]],
@@ -165,6 +179,7 @@ def attack_step(
         )
 
     jacobians = _steepest(step, model, params, box, key, starts=starts, iterations=120)
+    # The exact norm at the end, not the value of the ascent along one direction.
     return max(float(np.linalg.norm(jacobian, 2)) for jacobian in jacobians)
 
 
@@ -190,6 +205,8 @@ def attack_decoder(
         del later
         fiber = model.fiber(params, env)
         latent = inject(z)  # at the origin, so that an increment is a pose
+        # The step's pose and the decoding of z: the
+        # two places where a pose may come from.
         after = model.decode(fiber, model.step(fiber, latent, control))
         return jnp.concatenate([after[POSE], model.decode(fiber, latent)])
 
@@ -198,6 +215,7 @@ def attack_decoder(
         parts = {"position": slice(6, 7), "yaw": slice(7, 8), "body": slice(8, None)}
         return _largest_norms(ends, parts)
     poses = [part for jacobian in ends for part in (jacobian[:3], jacobian[3:6])]
+    # Rows 0-2: the pose after a step; 3-5: that of decoding, constant unless in z.
     parts = {"position": slice(0, 2), "yaw": slice(2, 3), "decoder": slice(0, 3)}
     return _largest_norms(poses, parts) | _largest_norms(ends, {"body": slice(6, None)})
 
@@ -231,10 +249,12 @@ def _steepest(
     def at(params: Params, z: Any, rest: Any) -> Any:
         return function(params, z, *jnp.split(rest, [controls, controls + len(low)]))
 
+    # The ascent is over the direction as well: no singular vectors, a smooth objective.
     def loss(params: Params, point: Any) -> Any:
         z, rest, direction = point[:rank], point[rank:inputs], point[inputs:]
         _, gain = jax.jvp(lambda z: at(params, z, rest), (z,), (direction,))
         return 0.5 * (
+            # A logarithm: far from the maximum slopes differ by orders of magnitude.
             jnp.log(jnp.sum(direction**2)) - jnp.log(jnp.sum(gain**2) + 1e-30)
         )
 
@@ -247,9 +267,12 @@ def _steepest(
 
     def objective(flat: Vector) -> tuple[float, Vector]:
         value, gradient = with_gradient(params, jnp.asarray(flat, jnp.float32))
+        # scipy works in float64; a NaN would end the
+        # search, a zero gradient only this start.
         return float(value), np.nan_to_num(np.asarray(gradient, dtype=np.float64))
 
     limits = [(None, None)] * (inputs + rank)
+    # Only e is bounded by a box: z and u are free, as in the certificate.
     limits[envs] = 2 * list(zip(low, high, strict=True))
     search = {"method": "L-BFGS-B", "jac": True, "bounds": limits}
     jacobians = []
@@ -258,6 +281,7 @@ def _steepest(
         start = np.asarray(draw, dtype=np.float64)
         # slopes are steep at small latents and saturated at large ones
         start[: rank + controls] *= 10.0 ** (number % 4 - 2)
+        # arctan maps a normal number into (0, 1), so that starts are inside the box.
         share = np.arctan(start[envs]) / np.pi + 0.5
         start[envs] = np.tile(low, 2) + share * np.tile(high - low, 2)
         end = minimize(objective, start, options={"maxiter": iterations}, **search).x
@@ -286,6 +310,7 @@ def attack_transport(
         before, after = (model.fiber(params, env) for env in pair)
         return jax.jacfwd(
             lambda z: model.vector(model.transport(before, after, inject(z)))
+            # T is linear in z, hence its Jacobian is the same everywhere, also at 0.
         )(jnp.zeros(rank))
 
     matrices = jax.jit(jax.vmap(matrix, in_axes=(None, 0)))(params, draws)
@@ -306,6 +331,7 @@ def _coordinates(
         entries: size of e.
     """
     assert model.structure.explicit is not None
+    # Shapes only: no weights are computed to learn sizes.
     weights = jax.eval_shape(model.structure.explicit, params)
     state = jax.ShapeDtypeStruct((3 + weights.readout.shape[0],), jnp.float32)
     env = jax.ShapeDtypeStruct((entries,), jnp.float32)
@@ -313,6 +339,7 @@ def _coordinates(
         lambda env, state: model.encode(model.fiber(params, env), state), env, state
     )
     origin = jax.tree.map(lambda leaf: jnp.zeros(leaf.shape, leaf.dtype), shapes)
+    # `vector` is linear, so that its transpose writes z and leaves the pose at 0.
     z, back = jax.vjp(model.vector, origin)
     return (
         lambda z: jax.tree.map(jnp.add, origin, back(z)[0]),

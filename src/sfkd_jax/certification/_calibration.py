@@ -58,6 +58,7 @@ def _largest(
 
     def one(trajectory: Trajectory) -> Float[Array, " 4"]:
         fibers, later = fibers_along(model, params, trajectory)
+        # One frame for the whole trajectory, in which z of all steps are comparable.
         origin = model.encode(
             jax.tree.map(lambda leaf: leaf[0], fibers), trajectory.states[0]
         )
@@ -72,6 +73,7 @@ def _largest(
             trajectory.controls,
             trajectory.states[1:],
         )
+        # The largest over time: a bound is about whole trajectories, not about steps.
         return jnp.max(kinds, axis=0)
 
     return jax.vmap(one)(trajectories)
@@ -92,12 +94,14 @@ def conformal_quantile(scores: Float[np.ndarray, " trajectory"], level: float) -
     """
     if not 0 < level < 1:
         raise ValueError(f"a level must lie between 0 and 1, got {level}")
+    # An infinite score would be sorted last and silently dropped from the quantile.
     if not np.all(np.isfinite(scores)):
         raise ValueError("residuals are not finite")
     if not supports(len(scores), level):
         raise ValueError(
             f"{len(scores)} calibration trajectories are too few for level {level}"
         )
+    # (n + 1): the new trajectory counts as one of the exchangeable ones.
     return float(np.sort(scores)[math.ceil((len(scores) + 1) * level) - 1])
 
 
@@ -124,6 +128,7 @@ def tube_units(
     """
     if not np.all(np.isfinite(reference)):
         raise ValueError("residuals are not finite")
+    # The other kinds share a tenth of the exceedances: the first kind decides.
     shares = [level, *[1.0 - 0.1 * (1.0 - level)] * (reference.shape[1] - 1)]
     kinds = zip(reference.T, shares, strict=True)
     quantiles = np.asarray([np.quantile(kind, share) for kind, share in kinds])
@@ -150,6 +155,7 @@ def conformal_bounds(
     Raises:
         ValueError: too few trajectories for the level, or scores that are not finite.
     """
+    # The largest kind of each trajectory in common units: one score, a joint bound.
     return units * conformal_quantile(np.max(calibration / units, axis=1), level)
 
 
@@ -169,6 +175,7 @@ def coverage(
     count, share = len(held_out), float(np.mean(np.all(held_out <= bounds, axis=1)))
     return {
         "coverage": share,
+        # Segments of one run are dependent: the interval is of independent runs.
         "coverage_ci95": coverage_interval(share, runs or count),
         "coverage_trajectories": count,
         "coverage_runs": runs or count,
@@ -184,6 +191,7 @@ def coverage_interval(share: float, runs: int) -> list[float]:
         share: of trajectories that were covered.
         runs: number of independent runs that the trajectories were cut from.
     """
+    # Both sides rounded outwards: the interval is wider than either count's.
     counts = math.floor(share * runs + ROUNDING), math.ceil(share * runs - ROUNDING)
     return [clopper_pearson(count, runs)[side] for side, count in enumerate(counts)]
 
@@ -193,6 +201,7 @@ def clopper_pearson(
 ) -> tuple[float, float]:
     """Return the exact interval of a binomial share (Clopper and Pearson, 1934)."""
     tail, failures = 0.5 * (1.0 - level), trials - successes
+    # With no success the lower end is 0 exactly, where betaincinv is undefined.
     low = betaincinv(successes, failures + 1, tail) if successes else 0.0
     high = betaincinv(successes + 1, failures, 1.0 - tail) if failures else 1.0
     return float(low), float(high)

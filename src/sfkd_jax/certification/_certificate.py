@@ -102,6 +102,7 @@ class Certificate:
             CertificationRefused: a key is missing.
         """
         names = [field.name for field in dataclasses.fields(cls)]
+        # Read by name: a document may have more keys, such as tubes.
         missing = [name for name in names if name not in document]
         if missing:
             raise CertificationRefused(
@@ -139,6 +140,7 @@ def certify(
     corners = np.asarray(env_box, dtype=np.float64)
     if corners.ndim != 2 or len(corners) != 2 or not np.all(corners[0] <= corners[1]):
         raise ValueError(f"env_box must be a lower and an upper corner, got {env_box}")
+    # In float64 and on the host, before anything is searched.
     weights = exported(model, params)
     try:
         with one_thread():
@@ -151,12 +153,15 @@ def certify(
             f"beta {claims.beta:.6f}) is not below 1 by the margin {margin:g}"
         )
     box = corners.tolist()
+    # After the proof: an attack that exceeds it is a fault of the code, see there.
     attacks = attack_claims(model, params, weights, claims, box, attack_starts, seed)
     attack = attacks.get("step")
     return Certificate(
         **claims._asdict(),
         transport_lipschitz=1.0,
         env_box=box,
+        # Of the parameters as they are stored: what
+        # a reader of the policy can recompute.
         params_sha256=fingerprint(params),
         precision=PRECISION,
         attack=attack,
@@ -188,13 +193,16 @@ def verify(
         CertificateStale: it is about other weights.
         CertificationRefused: a claim does not follow from its witness.
     """
+    # First the hash: a proof about other weights need not be read at all.
     if fingerprint(params) != certificate.params_sha256:
         raise CertificateStale("the certificate is about other weights")
     weights = exported(model, params) if weights is None else weights
+    # The proved part alone; attacks and times are compared afterwards.
     claims = Claims(**{name: getattr(certificate, name) for name in Claims._fields})
     try:
         with one_thread():
             require_claims(claims, weights, certificate.env_box)
+        # Outside: it compares numbers, and no matrix is touched.
         _require_consistent(certificate, claims, weights)
     except Refuted as reason:
         raise CertificationRefused(str(reason)) from None
@@ -217,10 +225,12 @@ def _require_consistent(
             f"alpha = {claims.alpha} is not below 1, "
             "or the transport is not nonexpansive"
         )
+    # A text that promises more than the checks below cover must not pass.
     if certificate.precision != PRECISION:
         raise Refuted("precision is not what is covered")
     limits = limits_of(claims, weights)
     for name, value in certificate.attacks.items():
+        # A stated attack above the proved bound would contradict the document itself.
         if name not in limits or not 0 <= value <= limits[name] * (1 + FLOAT32):
             raise Refuted(
                 f"the attack {name} = {value!r} "
@@ -245,12 +255,14 @@ def contraction_metrics(model: Model, params: Params) -> dict[str, float]:
     """
     try:
         weights = exported(model, params)
+    # A model without explicit weights trains like any other, just without this log.
     except CertificationRefused:
         return {}
     vertices = weights.operators.vertices
     with one_thread():
         rho = max(float(np.linalg.norm(vertex, 2)) for vertex in vertices)
         separate = rho + residual_bound(weights)
+        # Few iterations: an estimate at every checkpoint, not the certificate.
         joint, _ = joint_bound(weights, weights.residual_multipliers, iterations=15)
         slopes = max(
             attack_slopes(weights.residual, vertex, starts=4) for vertex in vertices
@@ -260,4 +272,5 @@ def contraction_metrics(model: Model, params: Params) -> dict[str, float]:
         "alpha_separate": separate,
         "tightness": min(joint, separate) / slopes,
     }
+    # JSON has no infinity: what is not proved is absent.
     return {name: value for name, value in values.items() if np.isfinite(value)}

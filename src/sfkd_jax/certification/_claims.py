@@ -61,6 +61,7 @@ def require_claims(claims: Claims, weights: Exported, box: Box) -> None:
         if not (isinstance(value, int | float) and 0 <= value < math.inf):
             raise Refuted(f"{name} is not a bound: {value!r}")
     linear, networks = readouts(weights), decoders(weights)
+    # Exactly these outputs: a missing one would be unbounded, another one meaningless.
     if set(claims.lipschitz) != {*linear, *networks}:
         expected = ", ".join((*linear, *networks))
         actual = ", ".join(map(str, claims.lipschitz))
@@ -68,6 +69,7 @@ def require_claims(claims: Claims, weights: Exported, box: Box) -> None:
     _require_box(box)
     witnesses = {name: _arrays(value) for name, value in claims.witnesses.items()}
     vertices = list(weights.operators.vertices)
+    # Operators alone, without a network: no multipliers at any vertex.
     none = [()] * len(vertices)
     checks = {
         "beta": _bounded(weights.residual, witnesses["residual"], claims.beta),
@@ -76,11 +78,13 @@ def require_claims(claims: Claims, weights: Exported, box: Box) -> None:
         "alpha_joint": check_vertices(
             weights.residual, witnesses["joint"], claims.alpha_joint, vertices
         ),
+        # Equal, not at most: these two are arithmetic on the numbers that were proved.
         "alpha_separate": claims.alpha_separate == claims.rho + claims.beta,
         "alpha": claims.alpha == min(claims.alpha_separate, claims.alpha_joint),
     }
     for name, rows in linear.items():
         bound = claims.lipschitz[name]
+        # A read-out of zeros has the constant 0, which no strict inequality proves.
         checks[name] = not np.any(rows) or check_witness((), (), bound, rows)
     for name, network in networks.items():
         checks[name] = _bounded(network, witnesses[name], claims.lipschitz[name])
@@ -92,6 +96,7 @@ def require_claims(claims: Claims, weights: Exported, box: Box) -> None:
 def _require_box(box: Box) -> None:
     """Refuse a box that is not finite, or reversed."""
     corners = np.asarray(box, dtype=np.float64)
+    # Finite: an infinite box would promise what no attack has looked at.
     pair = corners.ndim == 2 and len(corners) == 2 and np.all(np.isfinite(corners))
     if not pair or not np.all(corners[0] <= corners[1]):
         raise Refuted(f"env_box must be a lower and an upper corner, got {box!r}")
@@ -103,6 +108,7 @@ def _bounded(
     """Return whether a network respects a bound; an absent one is constant."""
     return (
         not weights
+        # W_L = 0 makes a constant whatever the hidden layers are, and needs no witness.
         or not np.any(weights[-1])
         or check_witness(weights, multipliers, bound)
     )
@@ -135,6 +141,8 @@ def decoders(weights: Exported) -> dict[str, list[Matrix]]:
         return {}
     *hidden, last = weights.decoder
     return {
+        # Rows of the last layer: each output is a
+        # network of its own with the same layers.
         "position": [*hidden, last[:2]],
         "yaw": [*hidden, last[2:]],
         "decoder": [*hidden, last],
@@ -145,6 +153,7 @@ def _arrays(witness: Any) -> Any:
     """Convert multipliers from JSON: vectors, or a list of vectors at each vertex."""
     if witness and all(isinstance(part, list) for part in witness):
         entries = [entry for part in witness for entry in part]
+        # Lists in lists in lists: the multipliers of each vertex, one level deeper.
         if all(isinstance(entry, list) for entry in entries):
             return [_arrays(part) for part in witness]
     return [np.asarray(part, dtype=np.float64) for part in witness]
@@ -220,6 +229,7 @@ def require_output_metric(name: str, claim: OutputMetric, weights: Exported) -> 
     Raises:
         Refuted: names the constant that does not follow.
     """
+    # With a decoder the pose is no output of z, and no metric is about it.
     if name not in OUTPUTS or not keeps_metrics(weights) or weights.decoder:
         raise Refuted(f"outputs.{name}: this model has no metric of an output")
     for constant in ("alpha", "lipschitz"):
@@ -227,6 +237,7 @@ def require_output_metric(name: str, claim: OutputMetric, weights: Exported) -> 
         if not (isinstance(value, float) and 0 < value < math.inf):
             raise Refuted(f"outputs.{name}.{constant} is not a bound: {value!r}")
     vertices = weights.operators.vertices
+    # Sizes first: the core multiplies matrices and would raise on others.
     if claim.metric.shape != vertices.shape[1:] or len(claim.joint) != len(vertices):
         raise Refuted(f"outputs.{name}.witness is of another size than the weights")
     if not claim.alpha < 1.0 or not check_vertices(
@@ -242,7 +253,9 @@ def reads_within(rows: Matrix, bound: float, metric: Matrix) -> bool:
     """Check that |C z| < b |z|_P for every z ≠ 0, that is b² P − C'C > 0."""
     squared, rounding = product(rows.T, rows)
     scaled = np.square(bound) * metric
+    # Exactly symmetric, which the Cholesky factorisation takes for granted.
     matrix = scaled - 0.5 * (squared + squared.T)
+    # Rounding of the product plus that of scaling and of the difference.
     error = rounding + 4 * UNIT * (frobenius(scaled) + frobenius(squared))
     return is_positive_definite(matrix, error)
 
@@ -274,6 +287,7 @@ class LyapunovClaim(NamedTuple):
 
     def document(self) -> dict[str, Any]:
         """Return the claim as JSON values."""
+        # c_1 = c_2 = √κ: from |z|_P to |z| and back costs the root of the condition.
         constant = math.sqrt(self.condition)
         return {
             "rho": self.rho,
@@ -295,6 +309,7 @@ def require_lyapunov(part: Mapping[str, Any], weights: Exported) -> None:
     Raises:
         Refuted: names what does not follow.
     """
+    # A reason and nothing else: a document cannot hide a false claim beside one.
     if isinstance(part.get("reason"), str) and len(part) == 1:
         return
     witness = read_witness(part["witness"])
@@ -310,5 +325,6 @@ def require_lyapunov(part: Mapping[str, Any], weights: Exported) -> None:
         weights.residual, claim.joint, claim.alpha, vertices, claim.metric
     ):
         raise Refuted("lyapunov: alpha does not follow from its witness")
+    # Compared as a whole, so that no further key can state an unproved constant.
     if dict(part) != claim.document() | {"witness": part["witness"]}:
         raise Refuted("lyapunov: c_1 or c_2 is not the root of the condition")

@@ -87,6 +87,7 @@ def calibrate_corridor(
     Raises:
         ValueError: too few runs for the level, or scores that are not finite.
     """
+    # Units of another split: scores in units of their own would not be exchangeable.
     units = tube_units(_joint(reference), level=level)
     joint = conformal_bounds(units, _joint(scores), level=level)
     alone = {
@@ -129,6 +130,7 @@ def require_corridor(corridor: Mapping[str, Any]) -> None:
         raise Refuted(
             "corridor.bounds must be positive numbers, one for each measured quantity"
         )
+    # Car to nominal model plus nominal model to path: the triangle inequality.
     expected = bounds["nominal"] + bounds["vehicle_to_nominal_position"]
     if not np.isclose(corridor["corridor_m"], expected, rtol=1e-9, atol=0.0):
         raise Refuted(
@@ -137,6 +139,7 @@ def require_corridor(corridor: Mapping[str, Any]) -> None:
     runs, level = corridor["runs"], corridor["level"]
     if not (isinstance(runs, int) and 0 < level < 1 and supports(runs, level)):
         raise Refuted(f"corridor.level = {level!r} is not possible with {runs!r} runs")
+    # The attack kept disturbances in their bound: leaving would refute the proof.
     if not corridor["attack"]["over_tube"] <= 1.0:
         raise Refuted(
             "corridor.attack left the tube with disturbances within their bound"
@@ -154,6 +157,7 @@ def require_coverage(name: str, part: Mapping[str, Any]) -> None:
     count, runs = part["coverage_trajectories"], part["coverage_runs"]
     share = part["coverage"]
     inside = round(share * count)
+    # A share must be a count over the number of trajectories, within rounding.
     if not 0 <= inside <= count or not 1 <= runs <= count:
         raise Refuted(
             f"{name}: a coverage of {share!r} is not possible with {count!r} "
@@ -171,6 +175,7 @@ def numbers(name: str, values: Any) -> np.ndarray:
         Refuted: it is none.
     """
     array = np.asarray(values)
+    # Booleans and strings are refused by the kind, before they compare as numbers.
     if array.dtype.kind not in "if" or not np.all(np.isfinite(array)):
         raise Refuted(f"{name} must be finite numbers")
     return array
@@ -189,6 +194,8 @@ def require_equal(name: str, stated: Any, derived: Any) -> None:
     expected = np.asarray(derived, dtype=np.float64)
     actual = numbers(name, stated)
     if actual.shape != expected.shape or not np.all(
+        # Relative to the derived value, which an
+        # attacker of the document cannot choose.
         np.abs(actual - expected) <= REPEATED * np.abs(expected)
     ):
         raise Refuted(f"{name} does not follow from the rest of the document")

@@ -96,11 +96,13 @@ def issue(
         CertificationRefused: the model cannot be certified; gives the reason.
     """
     began = time.perf_counter()
+    # First the proof: where it refuses, nothing need be measured.
     certificate = certify(
         model, params, boxes["env"], margin=margin, attack_starts=attack_starts
     )
     weights = exported(model, params)
     function, lyapunov = _lyapunov(weights)
+    # Folded for measurements alone: the proof is about the stored weights.
     folded = jax.jit(partial(fold, model))(params)
     parts = {"validation": validation, "calibration": calibration}
     try:
@@ -158,6 +160,7 @@ def _measure(
     """One-step bounds at `level` for whole trajectories, and their coverage."""
     reference = disturbances(model, params, validation)
     scores = disturbances(model, params, calibration)
+    # Units from validation, or the scores of calibration would not be exchangeable.
     bounds = conformal_bounds(tube_units(reference, level=level), scores, level=level)
     shares = {
         name: coverage(bounds, disturbances(model, params, part))
@@ -169,6 +172,7 @@ def _measure(
         "level": level,
         "trajectories": len(scores),
         "runs": len(scores),
+        # True for one segment a run; `_counted_by_run` says less where it is not.
         "holds_for": "new runs like these",
         **shares.pop("test"),
         "by_scenario": shares,
@@ -183,6 +187,7 @@ def _counted_by_run(
     """The same bounds of trajectories that were cut from fewer, independent runs."""
     independent = runs.get("calibration", measured["runs"])
     tested = runs.get("test", measured["coverage_runs"])
+    # Too few runs: the bound is then about these runs, and the text says so.
     if not supports(independent, measured["level"]):
         measured["holds_for"] = f"further segments of the same {independent} runs"
     interval = coverage_interval(measured["coverage"], tested)
@@ -202,6 +207,7 @@ def _tubes(
 ) -> dict[str, Any]:
     """Tubes up to the horizon and their limit, from α, L and the one-step bounds."""
     latent = latent_tube(certificate.alpha, measured["value"], horizon)
+    # R_k → d̄ / (1 − α), the fixed point of R ↦ α R + d̄.
     ultimate = measured["value"] / (1 - certificate.alpha)
     constants = {
         "alpha": certificate.alpha,
@@ -209,10 +215,13 @@ def _tubes(
         "residual": measured["one_step"],
     }
     largest, limit = None, None
+    # Without increments nothing accumulates, so that only here there is a limit.
     if model.along_path:
         physical = path_tube(latent, **constants)
         limit = ultimate_tube(ultimate, **constants)
     else:
+        # The longest step seen: an error of yaw moves
+        # the car by at most that times the angle.
         positions = np.asarray(calibration.states, dtype=np.float64)[..., :2]
         largest = float(np.max(np.linalg.norm(np.diff(positions, axis=-2), axis=-1)))
         physical = physical_tube(latent, **constants, largest_increment=largest)
@@ -249,14 +258,17 @@ def verify_document(
         CertificateStale: it is about other weights or settings.
         CertificationRefused: it does not hold; gives the reason.
     """
+    # `is not True`: a text "false" or a number must not pass for a valid certificate.
     if document.get("valid") is not True:
         raise CertificationRefused(str(document.get("reason")))
+    # Also the settings: the same weights under another controller are another policy.
     if document.get("policy_sha256") != policy_sha256:
         raise CertificateStale("the certificate is about other weights or settings")
     proof = Certificate.from_document(document)
     weights = exported(model, params)
     verify(proof, params, model=model, weights=weights)
     try:
+        # After the proof: everything below is arithmetic on constants that hold.
         _require_boxes(document["boxes"], proof)
         _require_statistics(document["d_bar"])
         _require_tubes(document["tube"], proof, document["d_bar"])
@@ -278,6 +290,7 @@ def _require_boxes(boxes: Mapping[str, Any], proof: Certificate) -> None:
     for name in ("state", "control", "env"):
         corners = numbers(f"boxes.{name}", boxes[name])
         pair = corners.ndim == 2 and len(corners) == 2
+        # Equal corners are allowed: a condition may be constant.
         if not pair or not np.all(corners[0] <= corners[1]):
             raise Refuted(f"boxes.{name} is not a lower and an upper corner")
     stated, certified = (
@@ -292,6 +305,7 @@ def _require_statistics(d_bar: Mapping[str, Any]) -> None:
     one_step = numbers("d_bar.one_step", [d_bar["one_step"][kind] for kind in KINDS])
     if not np.all(one_step >= 0):
         raise Refuted("d_bar.one_step must be four numbers, none below 0")
+    # `value` repeats the latent bound; with two, it would be open which a tube uses.
     require_equal("d_bar.value", d_bar["value"], d_bar["one_step"]["latent"])
     trajectories, runs, level = d_bar["trajectories"], d_bar["runs"], d_bar["level"]
     if not 0 < level < 1 or not supports(trajectories, level):
@@ -328,6 +342,7 @@ def _require_tubes(
     else:
         largest, limit = 0.0, ultimate_tube(ultimate, **constants)
         physical = path_tube(latent, **constants)
+    # All outputs: a radius that is left out here would be checked nowhere.
     complete = set(tube["physical"]) == set(physical)
     limited = (tube["asymptotic"] is None) == (limit is None)
     if largest < 0 or not complete or not limited:
@@ -341,6 +356,7 @@ def _require_tubes(
 def _require_outputs(document: Mapping[str, Any], weights: Exported) -> None:
     """Check output metrics from their witnesses, and the arithmetic of the corridor."""
     outputs, corridor = document.get("outputs", {}), document.get("corridor")
+    # All or none: a corridor needs both metrics.
     if outputs and set(outputs) != set(OUTPUTS):
         actual = ", ".join(map(str, outputs))
         raise Refuted(f"outputs must be {' and '.join(OUTPUTS)}, got {actual}")

@@ -45,13 +45,16 @@ def prove_lyapunov(weights: Exported) -> LyapunovClaim:
         Refuted: no solver is installed, the model admits no metric but I, or no answer
             was accepted; gives the reason.
     """
+    # A rotation on a switch of e keeps no ellipsoid, only the ball.
     if not keeps_metrics(weights):
         raise Refuted(
             "P = I is the only metric that the transport keeps: c_1 = c_2 = 1"
         )
     vertices = list(weights.operators.vertices)
     norm = max(np.linalg.norm(vertex, 2) for vertex in vertices)
+    # No P gives a rate below a spectral radius, by which the search is bounded.
     radius = max(np.max(np.abs(np.linalg.eigvals(vertex))) for vertex in vertices)
+    # From the smallest rate up: the first accepted one has the best rate.
     for share in SHARES:
         rate = float(radius + share * (norm - radius))
         metric = solve_metric(vertices, rate)
@@ -72,6 +75,7 @@ def accepted(metric: Matrix, weights: Exported) -> LyapunovClaim | None:
     metric, vertices = np.asarray(metric, dtype=np.float64), weights.operators.vertices
     if metric.shape != vertices.shape[1:] or not np.all(np.isfinite(metric)):
         return None
+    # Symmetric before eigenvalues, which read one triangle only.
     metric = 0.5 * (metric + metric.T)
     values = np.linalg.eigvalsh(metric)
     if not 0 < values[0] <= values[-1] < np.inf:
@@ -80,6 +84,7 @@ def accepted(metric: Matrix, weights: Exported) -> LyapunovClaim | None:
     step, listed = _in_coordinates(weights, metric), list(vertices)
     rate = max(np.linalg.norm(vertex, 2) for vertex in step.operators.vertices)
     alpha, joint = joint_bound(step, weights.residual_multipliers)
+    # Rounding decides how little slack the core accepts; the smallest is kept.
     for slack in SLACKS:
         claim = LyapunovClaim(
             rho=float(COMPILATION_SLACK * rate * (1 + slack)),
@@ -103,6 +108,7 @@ def _in_coordinates(weights: Exported, metric: Matrix) -> Exported:
     """The step in coordinates L'z with P = L L', in which |·|_P is the 2-norm."""
     root = np.linalg.cholesky(metric).T
     back = np.linalg.inv(root)
+    # The first weights read z and the last write it; hidden layers stay as they are.
     residual = [*weights.residual]
     if residual:
         residual[0] = residual[0] @ back
@@ -140,9 +146,12 @@ def solve_metric(
         raise Refuted(MISSING)
     size = operators[0].shape[0]
     metric, condition = cp.Variable((size, size), symmetric=True), cp.Variable()
+    # I ⪯ P fixes the scale, which is free otherwise, and makes κ the condition.
     bounds: list[Any] = [metric >> np.eye(size), condition * np.eye(size) - metric >> 0]
     decreases = [
-        (rate * (1 - MARGIN)) ** 2 * metric - a.T @ metric @ a >> 0 for a in operators
+        # A little tighter than claimed, since solvers meet constraints only nearly.
+        (rate * (1 - MARGIN)) ** 2 * metric - a.T @ metric @ a >> 0
+        for a in operators
     ]
     problem = cp.Problem(cp.Minimize(condition), bounds + decreases)
     try:

@@ -61,16 +61,20 @@ def propose_metric(
         Refuted: no α below 1 was found.
     """
     vertices, rank = weights.operators.vertices, weights.operators.vertices.shape[-1]
+    # Logarithms: multipliers stay positive in an unconstrained search.
     logs = [np.log(np.concatenate(start))] * len(vertices) if start else [np.zeros(0)]
     lower = np.tril_indices(rank)
     begins = [np.eye(rank)]
+    # Scaled to the trace of I: both starts have entries of the same size.
     if metric is not None:
         begins.append(np.linalg.cholesky(metric * (rank / np.trace(metric))))
     candidates = [np.concatenate([begin[lower], *logs]) for begin in begins]
+    # float64 for the search: near α = 1 float32 could not tell the metrics apart.
     with jax.enable_x64(True):
         objective = _objective(weights, rows, gaps)
         first = partial(objective, SHARPNESS[0][0])
         flat = min(candidates, key=lambda candidate: first(candidate)[0])
+        # From smooth to sharp: a sharp maximum alone would stop at its first kink.
         for sharpness, iterations in SHARPNESS:
             options = {"maxiter": iterations, "maxcor": 20}
             search = {"jac": True, "method": "L-BFGS-B", "options": options}
@@ -78,10 +82,12 @@ def propose_metric(
     factor = np.zeros((rank, rank))
     factor[lower] = flat[: len(lower[0])]
     found = factor @ factor.T
+    # The scale is free: entries of about 1 keep the core's rounding errors small.
     scale = 2.0 / (np.trace(found) / rank + np.max(np.abs(found)))
     found *= scale
     widths = np.cumsum([len(part) for part in start])[:-1]
     logs = flat[len(lower[0]) :].reshape(len(vertices), -1)
+    # P and multipliers scale together, or the matrix inequality would be another.
     joint = [np.split(scale * np.exp(part), widths) if start else [] for part in logs]
     return _accepted(weights, rows, 0.5 * (found + found.T), joint)
 
@@ -99,11 +105,13 @@ def _accepted(
         _rate(weights.residual, part, vertex, metric)
         for part, vertex in zip(joint, vertices, strict=True)
     )
+    # |c|² in the metric P⁻¹, without the inverse of an ill-conditioned P.
     squared = rows @ np.linalg.solve(metric, rows.T)
     gain = float(np.sqrt(np.max(np.linalg.eigvalsh(squared))))
     for slack in SLACKS:
         alpha = float(COMPILATION_SLACK * rate * (1 + slack))
         lipschitz = float(COMPILATION_SLACK * gain * (1 + slack))
+        # The core decides; the eigenvalues above are rounded.
         proved = check_vertices(weights.residual, joint, alpha, vertices, metric)
         if proved and alpha < 1.0 and reads_within(rows, lipschitz, metric):
             return OutputMetric(alpha, lipschitz, metric, joint)
@@ -121,6 +129,7 @@ def _rate(
         hidden = cho_solve((root, True), matrix[rank:, :rank])
         schur = matrix[rank:, :rank].T @ hidden - matrix[:rank, :rank]
         return float(np.sqrt(eigh(schur, metric, eigvals_only=True)[-1]))
+    # Multipliers outside the cone: the hidden block is not positive definite.
     except (np.linalg.LinAlgError, ValueError):
         return float("inf")
 
@@ -135,14 +144,17 @@ def _objective(
     read, disturbed = jnp.asarray(rows.T), jnp.asarray(gaps)
 
     def value(flat: Array, sharpness: Array) -> Array:
+        # L itself, not P: any L gives P = L L' ⪰ 0 without a constraint.
         factor = jnp.zeros((rank, rank)).at[lower].set(flat[: len(lower[0])])
         logs = flat[len(lower[0]) :].reshape(len(operators), hidden)
         each = jax.vmap(partial(_squares, weights.residual, factor))
+        # Away from 0: the root below has no gradient there.
         squares = jnp.maximum(each(jnp.exp(logs), operators), 1e-12).reshape(-1)
         alpha = jnp.sqrt(_power_mean(squares, sharpness, mean=False))
         solved = jax.scipy.linalg.solve_triangular(factor, read, lower=True)
         gain = jnp.linalg.norm(solved)
         sizes = jnp.linalg.norm(disturbed @ factor, axis=-1)
+        # A smooth maximum over the worst steps of a run, sharp enough for five values.
         worst = jax.vmap(lambda run: _power_mean(run, 32.0, mean=False))(sizes)
         radius = jnp.log(gain * _power_mean(worst, RUNS, mean=True))
         return radius - jnp.log(1.0 - alpha)
@@ -166,6 +178,7 @@ def _squares(
     inverse = jax.scipy.linalg.solve_triangular(
         factor, jnp.eye(len(factor)), lower=True
     )
+    # L' A L'⁻¹: in these coordinates |·|_P is the 2-norm.
     linear = factor.T @ operator @ inverse.T
     if not weights:
         return jnp.linalg.eigvalsh(linear.T @ linear)
@@ -186,6 +199,7 @@ def _squares(
 
 def _power_mean(values: Array, power: Any, *, mean: bool) -> Array:
     """Return (Σ x^p)^(1/p) for x > 0, with `mean` that of the mean."""
+    # Ratios at most 1: a large exponent cannot overflow, and one of them is 1.
     largest = jax.lax.stop_gradient(jnp.max(values))
     total = jnp.sum((values / largest) ** power)
     return largest * (total / len(values) if mean else total) ** (1.0 / power)

@@ -45,6 +45,7 @@ def prove(weights: Exported) -> Claims:
         Refuted: no finite bound was found.
     """
     bound, start = _best_multipliers(weights.residual, weights.residual_multipliers)
+    # Another compilation may round the weights differently: the bound covers both.
     beta = COMPILATION_SLACK * bound
     if not np.isfinite(beta):
         raise Refuted("no multipliers prove a Lipschitz bound of the residual")
@@ -61,6 +62,7 @@ def prove(weights: Exported) -> Claims:
         lipschitz[name] = COMPILATION_SLACK * bound
     if not np.all(np.isfinite(list(lipschitz.values()))):
         raise Refuted("no multipliers prove a Lipschitz bound of the decoder")
+    # The sum needs no search of its own, and is the fallback of the joint bound.
     separate = rho + beta
     return Claims(
         scope=hull_scope(weights),
@@ -95,12 +97,15 @@ def joint_bound(
     """
     bounds, witnesses = [], []
     for vertex in weights.operators.vertices:
+        # From the answer of the last vertex:
+        # operators are alike, and so are multipliers.
         start = propose_multipliers(
             weights.residual, start, vertex, iterations=iterations
         )
         bound, start = rescaled(weights.residual, start, vertex)
         bounds.append(bound)
         witnesses.append(start)
+    # The worst vertex decides: e may be at any of them.
     return COMPILATION_SLACK * max(bounds), witnesses
 
 
@@ -108,8 +113,10 @@ def _best_multipliers(
     weights: Sequence[Matrix], start: Sequence[Vector]
 ) -> tuple[float, list[Vector]]:
     """Return the better bound of the model's multipliers and those from L-BFGS."""
+    # One layer is linear: its norm is exact, and there are no slopes.
     if len(weights) < 2 or not np.any(weights[-1]):
         return (norm_upper(weights[-1]) if weights else 0.0), []
+    # The model's own multipliers prove its design bound, which L-BFGS may miss.
     given = rescaled(weights, start) if start else (float("inf"), [])
     proposed = rescaled(weights, propose_multipliers(weights, start))
     return min(given, proposed, key=lambda pair: pair[0])
@@ -142,16 +149,19 @@ def rescaled(
             for part in (*weights, linear)
             if part is not None
         ]
+        # Widened by the rounding of the sum itself, which `norm_upper` does not see.
         return norm_upper(sum(parts[1:], parts[0])) * (1 + (len(parts) - 1) * 1e-12), []
     if len(multipliers) != len(weights) - 1:
         return float("inf"), []
     best: tuple[float, list[Vector]] = (float("inf"), [])
+    # The bound is not invariant to a common factor of the multipliers.
     for scale in SCALES:
         scaled = [scale * np.asarray(part, dtype=np.float64) for part in multipliers]
         eigenvalues, *_ = _reduced(weights, scaled, linear)
         guess = float(np.sqrt(np.max(eigenvalues)))
         for slack in SLACKS:
             bound = guess * (1 + slack)
+            # Not better than the best so far: more slack only makes it worse.
             if not bound < best[0]:
                 break
             # The eigenvalue is not rigorous, the core is
@@ -189,6 +199,7 @@ def propose_multipliers(
     begin = _starting_point(weights, start, linear)
     widths = np.cumsum([len(part) for part in begin])[:-1]
     best = rescaled(weights, begin, linear)
+    # From the factor that proves most: the search begins where something is proved.
     logs = np.log(np.concatenate(best[1] or begin))
 
     def objective(logs: Vector, sharpness: int) -> tuple[float, Vector]:
@@ -197,16 +208,19 @@ def propose_multipliers(
         if not np.all(np.isfinite(eigenvalues)):
             return INFEASIBLE, np.zeros_like(logs)
         largest = eigenvalues[-1]
+        # Eigenvalues below 0 count nothing in a p-norm; a power of them would be NaN.
         powers = np.maximum(eigenvalues / largest, 0.0) ** (sharpness - 1)
         total = np.sum(powers * eigenvalues / largest)
         gradient = []
         for k, (before, here) in enumerate(pairwise([vectors, *hidden])):
             each = -2.0 * here * (here - weights[k] @ before)
+            # Chain rule through the exponential: dλ = λ d log λ.
             gradient.append(multipliers[k] * (each @ powers) / (largest * total))
         value = 0.5 * (np.log(largest) + np.log(total) / sharpness)
         return value, 0.5 * np.concatenate(gradient)
 
     options = {"maxiter": iterations, "maxcor": 30}
+    # Smooth first: a sharp p-norm has a gradient of the top vector alone.
     for sharpness in SHARPNESS:
         search = {"args": (sharpness,), "method": "L-BFGS-B", "options": options}
         logs = minimize(objective, logs, jac=True, **search).x
@@ -223,6 +237,7 @@ def _starting_point(
         return begin
     squares = [max(float(np.linalg.norm(weight, 2)) ** 2, 1e-6) for weight in weights]
     return [
+        # A thousandth above the product of norms, so that the inequality is strict.
         np.full(len(weights[k]), 1.001 * np.prod(squares[k + 1 :]))
         for k in range(len(weights) - 1)
     ]
@@ -244,6 +259,7 @@ def _reduced(
     except np.linalg.LinAlgError:
         return infeasible
     schur = coupling.T @ hidden - matrix[:inputs, :inputs]
+    # Rounding makes the Schur complement slightly asymmetric.
     eigenvalues, vectors = np.linalg.eigh(0.5 * (schur + schur.T))
     return eigenvalues, vectors, np.split(-hidden @ vectors, widths[:-1])
 

@@ -50,6 +50,7 @@ def latent_tube(
         initial: |e_0|.
     """
     radii, radius = [], initial
+    # The recursion instead of the closed form, which divides by 1 − α.
     for _ in range(horizon):
         radius = alpha * radius + d_bar
         radii.append(radius)
@@ -76,6 +77,7 @@ def path_tube(
         residual: ε, one-step errors of the outputs at the true latent, by the same
             names.
     """
+    # R_0 = 0: a prediction starts at the observed state.
     before = np.concatenate([[0.0], latent[:-1]])
     kinds = {"position_m": "position", "yaw_rad": "yaw", "body": "body"}
     return {
@@ -100,6 +102,7 @@ def ultimate_tube(
         residual: ε, one-step errors of the outputs at the true latent, by the same
             names.
     """
+    # Two entries: `path_tube` reads the one before, and both are the limit.
     limits = np.asarray([ultimate, ultimate])
     radii = path_tube(limits, alpha=alpha, lipschitz=lipschitz, residual=residual)
     return {name: values[-1] for name, values in radii.items()}
@@ -132,6 +135,7 @@ def physical_tube(
     """
     before = np.concatenate([[0.0], latent[:-1]])
     yaw = np.cumsum(lipschitz["yaw"] * before + residual["yaw"])
+    # An error of yaw moves only the increments that come after it.
     turned = np.concatenate([[0.0], yaw[:-1]])
     increments = lipschitz["position"] * before + residual["position"]
     position = np.cumsum(increments + largest_increment * turned)
@@ -188,6 +192,7 @@ def _residuals(model: Model, params: Params, runs: Trajectory) -> tuple[Array, A
 
     def one(run: Trajectory) -> tuple[Array, Array]:
         gap, predicted = defects(model, params, run)
+        # Path states have their outputs in the body, without a pose.
         miss = (predicted - run.states[1:])[:, BODY]
         return gap, jnp.abs(miss[:, jnp.asarray([LATERAL, HEADING])])
 
@@ -212,14 +217,17 @@ def radii(
         claim: its proved metric.
         initial: |z_0 − ẑ_0|_P; 0 if the nominal model starts at the state of the car.
     """
+    # |d|_P is the 2-norm of d'L with P = L L'.
     sizes = np.linalg.norm(measured.gaps @ np.linalg.cholesky(claim.metric), axis=-1)
     misses = measured.outputs[..., OUTPUTS.index(name)]
     radius = np.broadcast_to(np.asarray(initial, dtype=np.float64), sizes.shape[:1])
     farthest = np.zeros(len(sizes))
+    # The output error is read before the radius takes in this step's disturbance.
     for step in range(sizes.shape[1]):
         distance = claim.lipschitz * claim.alpha * radius + misses[:, step]
         farthest = np.maximum(farthest, distance)
         radius = claim.alpha * radius + sizes[:, step]
+    # A start outside the limit shrinks towards it: the larger of both bounds all k.
     ultimate = np.maximum(initial, np.max(sizes, axis=1) / (1.0 - claim.alpha))
     asymptotic = claim.lipschitz * claim.alpha * ultimate + np.max(misses, axis=1)
     return Radii(asymptotic, farthest)
@@ -253,6 +261,7 @@ def output_tubes(
     """
     if not (model.along_path and keeps_metrics(weights)):
         return {}
+    # Three splits: the metric is chosen on one, or its bound would be optimistic.
     reference, measured, unseen = (
         residuals(model, params, part) for part in (validation, calibration, test)
     )
@@ -268,6 +277,7 @@ def output_tubes(
                     weights.residual_multipliers,
                     lyapunov and lyapunov.metric,
                 )
+        # Both outputs or none: a corridor needs position and heading.
         except Refuted:
             return {}
         calibrated, held_out = (
@@ -292,5 +302,6 @@ def output_tubes(
 def _worst_gaps(measured: Residuals, count: int) -> Float[np.ndarray, "run worst rank"]:
     """Return d of the `count` steps of every run with the largest |d|."""
     sizes = np.linalg.norm(measured.gaps, axis=-1)
+    # The worst steps alone decide the radius, and the search takes few of them.
     order = np.argsort(sizes, axis=1)[:, -count:]
     return np.take_along_axis(measured.gaps, order[..., None], axis=1)

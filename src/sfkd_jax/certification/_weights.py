@@ -44,9 +44,11 @@ def exported(model: Model, params: Params) -> Exported:
     # machine do not survive: evaluated on the host, or else in full precision.
     with jax.default_device(_host()), jax.default_matmul_precision("float32"):
         weights = evaluate(jax.tree.map(np.asarray, unfold(params)))
+    # float32 numbers are float64 numbers exactly: nothing is rounded here.
     weights = jax.tree.map(lambda leaf: np.asarray(leaf, dtype=np.float64), weights)
     if not all(np.all(np.isfinite(leaf)) for leaf in jax.tree.leaves(weights)):
         raise CertificationRefused("the weights are not finite")
+    # A(e) between two samples is unknown, however dense they are.
     if isinstance(weights.operators, Samples):
         count = len(weights.operators.operators)
         raise CertificationRefused(
@@ -77,6 +79,7 @@ def _host() -> Any:
 def fingerprint(params: Params) -> str:
     """Return the SHA-256 of all weights with their names, types and shapes."""
     digest = hashlib.sha256()
+    # With names and shapes: two trees of the same bytes are not the same weights.
     for path, leaf in jax.tree_util.tree_flatten_with_path(unfold(params))[0]:
         array = np.asarray(leaf)
         digest.update(

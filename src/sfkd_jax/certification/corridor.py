@@ -109,6 +109,7 @@ def closed_loop(
     Raises:
         ValueError: the policy has no law.
     """
+    # Without a law there is no closed loop whose corridor could be stated.
     if law is None:
         raise ValueError(
             "a corridor needs a policy in path coordinates, with its law: "
@@ -156,6 +157,7 @@ def certify_corridor(
     roads = {name: data[name] for name in ROADS}
     box = {name: data[name] for name in ("env_low", "env_high")}
     excited = roads | {name: data[name] for name in EXCITATION}
+    # A stream of its own: the data set's runs must not reappear in its certificate.
     *run_keys, sensor_key, attack_key = jax.random.split(
         jax.random.fold_in(jax.random.key(data["seed"]), STREAM), 6
     )
@@ -174,6 +176,7 @@ def certify_corridor(
     ]
     units, calibration, test, s3 = (part.scores for part in measured)
     bounds = calibrate_corridor(units, calibration, level=level)
+    # The shortest dwell: an attack switches as often as the conditions allow.
     searching = box | roads | {"dwell": dwell[0], "steps": attack_steps}
     lateral, nominal = measured[2].lateral, measured[2].nominal
     conditions = {
@@ -190,6 +193,7 @@ def certify_corridor(
         "bounds": bounds,
         "corridor_m": bounds["nominal"] + bounds["vehicle_to_nominal_position"],
         **corridor_coverage(bounds, test),
+        # S3 does not meet the conditions: reported beside the claim, never in it.
         "by_scenario": {"s3": corridor_coverage(bounds, s3)},
         "seen": {
             "distance_m": float(np.max(np.abs(lateral - nominal))),
@@ -228,6 +232,7 @@ def _attack(
 
     def shielded(run: Any) -> Outcome:
         length = len(run.inputs)
+        # The last inputs repeated: a preview at the end of a run has nothing further.
         ahead = jnp.minimum(
             jnp.arange(length)[:, None] + jnp.arange(horizon), length - 1
         )
@@ -330,6 +335,7 @@ def _simulate_nominal(
     def gap(state: State, env: Environment, key: Key) -> jax.Array:
         fiber = model.fiber(loop.params, env)
         measured = state + spread * jax.random.normal(key, state.shape)
+        # The nominal model starts at what sensors show, the car at the truth.
         return model.vector(model.encode(fiber, measured)) - model.vector(
             model.encode(fiber, state)
         )
@@ -346,6 +352,7 @@ def _sensor_effect(
     coordinates, road = state[BODY], inputs[PERTURBATION.stop :]
     spread = _spread(loop.noise, state.shape[-1])[BODY]
     measured = coordinates + spread * jax.random.normal(key, coordinates.shape)
+    # A law is a known function: reading ξ + n acts like a perturbation of ν.
     return loop.law(measured, road[0], road[1], env) - loop.law(
         coordinates, road[0], road[1], env
     )
@@ -409,6 +416,8 @@ def corridor_by_speed(
     @jax.jit
     def simulate(key: Key, friction: Scalar, speed: Scalar) -> Trajectory:
         constant: dict[str, Any] = {
+            # Equal corners in this entry alone: a cell
+            # has one friction, and wind switches.
             side: jnp.asarray(corner).at[FRICTION].set(friction)
             for side, corner in (("env_low", low), ("env_high", high))
         }
@@ -419,7 +428,9 @@ def corridor_by_speed(
     for friction in frictions:
         for speed in speeds:
             keys = jax.random.split(
-                jax.random.fold_in(jax.random.key(seed), len(cells)), (PARTS, 2)
+                # By number of the cell: its runs stay when further cells are asked for.
+                jax.random.fold_in(jax.random.key(seed), len(cells)),
+                (PARTS, 2),
             )
             parts = [
                 measure(simulate(run_key, friction, speed), key)
