@@ -95,6 +95,7 @@ class ControllerSettings(Kinds):
         """Return the dataclass of the planner of this name."""
         name = values.get("planner", "mppi")
         kind = choose(CONTROLLER_SETTINGS, name, "controller.planner")
+        # No defaults here: a run states the settings of the planner that it uses.
         if name not in values:
             raise ValueError(
                 f"controller.planner={name} needs the settings controller.{name}; "
@@ -207,6 +208,7 @@ def build_controller(
             coordinates.
     """
     settings = parse(ControllerSettings, settings, "controller.")
+    # A vehicle of logs has no limits before its logs are read.
     if not plant.control_low:
         raise ValueError(
             "a controller needs vehicle.control_low and vehicle.control_high, "
@@ -216,6 +218,7 @@ def build_controller(
         "env_low": None if env_low is None else tuple(map(float, env_low)),
         "env_high": None if env_high is None else tuple(map(float, env_high)),
     }
+    # A quadratic program samples nothing: no law, shield or adaptation around it.
     searches = settings if isinstance(settings, SearchSettings) else None
     adaptive |= searches is not None and searches.adaptive
     if model.along_path:
@@ -226,6 +229,7 @@ def build_controller(
         # Whoever estimates e learns the unmeasured forces with the same filter.
         estimates = env_source == "estimated"
         adaptive |= estimates
+        # The planner sees the offset; the estimator needs the model as it was learned.
         planned = with_offset(model) if adaptive else model
         along = _along(searches, planned, plant, box, law, certificate)
         if adaptive:
@@ -314,6 +318,7 @@ def _koopman_mpc(
         control_low=plant.control_low,
         control_high=plant.control_high,
         speed_loop=plant.speed_loop,
+        # Of the task's settings a quadratic program has the terminal weight alone.
         terminal_weight=settings.task.terminal_weight,
         **box,
         **arguments(settings.cost, control.tracking_cost),
@@ -342,8 +347,10 @@ def in_corridor(
     """
     corridor, boxes = certificate["corridor"], certificate["boxes"]
     bounds, sensors = corridor["bounds"], corridor["conditions"]["sensor_noise"]
+    # [2:] are κ and v_ref; ν has its limits in the law.
     low = tuple(edge - ROAD_MARGIN * abs(edge) for edge in boxes["control"][0][2:])
     high = tuple(edge + ROAD_MARGIN * abs(edge) for edge in boxes["control"][1][2:])
+    # The larger entry of a position: which one is lateral depends on the road.
     allowance = ALLOWANCE * max(sensors[:2], default=0.0)
     edge = corridor["corridor_m"] + allowance
     state_low, state_high = (list(side) for side in boxes["state"])
@@ -377,6 +384,7 @@ def _along(
 ) -> Controller:
     """Return the planner along a path, with its shield if it has one."""
     planner = _searching(settings, model, plant, box, law)
+    # A shield needs a certified corridor; without one the planner drives alone.
     if certificate and certificate.get("corridor") and settings.shield:
         return in_corridor(planner, model, plant, law, certificate)
     return planner
@@ -392,6 +400,7 @@ def _adaptive(
     estimate_env: bool,
 ) -> Controller:
     """Return the controller along a path with adaptation, still along a path."""
+    # The filter relates forces to the largest one in E, which the box defines.
     if None in box.values():
         raise ValueError("adaptation needs environment.low and environment.high")
     return control.Adaptation(

@@ -176,6 +176,7 @@ def build_model(
     settings = parse(ModelSettings, settings, "model.")
     factory = MODELS[settings.name]
     known = {"dt": plant.dt, "nominal": plant.nominal_derivative}
+    # By signature: a factory takes what prior knowledge it names, and no more.
     taken = inspect.signature(factory).parameters
     prior = {name: value for name, value in known.items() if name in taken}
     return factory(space, **prior, **arguments(settings, factory))
@@ -194,6 +195,7 @@ def check_imported(settings: Any) -> None:
     module = str(factory).partition(":")[0]
     if factory is None:
         return
+    # A stored name must not reach os.system: Python's own modules are always loaded.
     if module.partition(".")[0] in sys.stdlib_module_names:
         raise ValueError(f"its model is {factory}, which is no model but Python's own")
     if module not in sys.modules:
@@ -212,6 +214,7 @@ def space_to_settings(space: Space) -> dict[str, list[float]]:
 
 def space_from_settings(settings: Values) -> Space:
     """Return the scales that a manifest holds."""
+    # JSON has decimals: as float32 they are the bits that the model was trained with.
     arrays = (jnp.asarray(settings[name], dtype="float32") for name in Space._fields)
     return Space(*arrays)
 

@@ -55,6 +55,7 @@ def hydra_command(run: Run) -> Callable[[], None]:
     a sweep returns the document's "objective" to the sweeper; one that fails raises,
     which Hydra reports after all other jobs.
     """
+    # Before Hydra composes, since it checks options against these schemas.
     register()
 
     def main(composed: DictConfig) -> Any:
@@ -130,6 +131,7 @@ def command_line(name: str) -> str | None:
     typed = [
         word
         for word in HydraConfig.get().overrides.task
+        # A path of this machine means nothing to whoever repeats the command.
         if not word.startswith("root=")
     ]
     return " ".join(["python -m", f"sfkd_jax.{name}", shlex.join(typed)]).strip()
@@ -152,6 +154,7 @@ def use_compilation_cache(root: Path) -> None:
         ),
     }
     for variable, (option, value) in defaults.items():
+        # What the user has set in the environment wins.
         if variable not in os.environ:
             jax.config.update(option, value)
 
@@ -170,8 +173,10 @@ def named_for_sweep(settings: Settings) -> Settings:
     ]
     if not overrides:
         return settings
+    # Sorted: the order in which options were typed does not make another run.
     varied = ",".join(sorted(overrides))
     name = "-".join(re.findall(r"[\w.+=,-]+", varied, re.ASCII))
+    # A name that was cleaned or cut needs its digest, or two jobs might share it.
     if name != varied or len(name) > LONGEST_NAME:
         digest = hashlib.sha256(varied.encode()).hexdigest()[:8]
         name = f"{name[:LONGEST_NAME]}-{digest}"

@@ -42,6 +42,7 @@ class Comparison:
         self.cells = grid.list_cells(settings.comparison)
         self.failed: dict[str, str] = {}
         self._options: ComparisonSettings = settings.comparison
+        # Composed once: every cell is asked for its settings several times.
         self._compose = functools.cache(compose_cell)
         self._episodes: dict[str, evaluating.EpisodeSet] = {}
 
@@ -104,6 +105,7 @@ class Comparison:
         for cell, settings, _ in self._pending(group):
             plant = build.build_vehicle(settings.vehicle)
             self._make_episodes(settings, plant)
+            # One check a program: cells that differ in scenario alone build the same.
             key = grid.compilation_key(settings)
             if "self" in settings.evaluation.systems and key not in checked:
                 checked.add(key)
@@ -124,6 +126,7 @@ class Comparison:
             plant = build.build_vehicle(settings.vehicle)
             episodes = self._make_episodes(settings, plant)
             key = grid.compilation_key(run_settings)
+            # Compiled once for all scenarios and variations that share a program.
             if key not in evaluations:
                 evaluations[key] = _compile(run_settings, plant)
             result = evaluations[key](episodes)
@@ -144,6 +147,8 @@ class Comparison:
     def _run_settings(self, cell: Cell) -> Settings:
         """The settings of a cell, under the name of the run of its policy."""
         settings = self._compose(cell)
+        # The first variation is the usual protocol;
+        # those that train alike reuse its policy.
         usual = cell._replace(variation=next(iter(self._options.variations)))
         retrained = runs.identity(settings) != runs.identity(self._compose(usual))
         name = grid.policy_name(cell, self._options, retrained=retrained)
@@ -153,6 +158,7 @@ class Comparison:
         self, settings: Settings, plant: Vehicle
     ) -> evaluating.EpisodeSet:
         """The episodes of a cell; rows that are compared share them."""
+        # Not the controller: rows are paired because they meet the same episodes.
         parts = (settings.vehicle, settings.scenario, settings.environment)
         key = store.sha256(plain([*parts, settings.evaluation]))
         if key not in self._episodes:

@@ -84,6 +84,8 @@ class Source(NamedTuple):
         """The settings as plain values, with the contents of logs for their path."""
         options = plain(self.dataset)
         if self.logs:
+            # Contents instead of the path: the same
+            # logs elsewhere make the same data set.
             options["contents"] = fingerprint(options.pop("path"))
             options["environment_known"] = self.knows_env
         box = plain({"low": self.environment.low, "high": self.environment.high})
@@ -123,10 +125,12 @@ def ensure_dataset(source: Source) -> tuple[Dataset, str]:
     path = source.path
     if not path.is_file():
         with store.locked(path.parent, wait=True):  # other runs share the data set
+            # Another run may have made it while this one waited for the lock.
             if not path.is_file():
                 logs = source.logs
                 made = _read_logs(source, logs) if logs else _simulate(source)
                 write(source, made)
+    # Read back even if just made: every run trains on what is stored.
     return read(source)
 
 
@@ -139,6 +143,7 @@ def _simulate(source: Source) -> Dataset:
     check_step(build.build_vehicle(source.vehicle))
     options, box = source.dataset, source.environment
     assert isinstance(options, SimulatedSettings)
+    # A key each: other shares of the split leave the trajectories as they are.
     drive_key, split_key = jax.random.split(jax.random.key(options.seed))
     store.print_message(f"generating {options.segments} segments")
     trajectories = jax.jit(_generator(source))(drive_key)
@@ -246,6 +251,7 @@ def read(source: Source) -> tuple[Dataset, str]:
             scenarios = {
                 part: jnp.asarray(arrays[f"{part}/scenario"]) for part in PARTS
             }
+    # Over all parts: E does not depend on how they were split.
     envs = np.concatenate([np.asarray(part.envs) for part in parts])
     low, high = environment_box(envs, *source.environment.box.values())
     counts = arrays.get("drives")
@@ -349,6 +355,7 @@ def _switching(source: Source, segments: int) -> Trajectory:
     """Simulate runs under S3; cached for rows of a comparison."""
     simulate = jax.jit(_generator(source, switching=True, segments=segments))
     seed = jax.random.key(source.dataset.seed)
+    # A stream of its own: S3 must not repeat what the training data drew.
     return simulate(jax.random.fold_in(seed, SWITCHING))
 
 
@@ -362,7 +369,9 @@ def check_calibration_size(
     """
     count = dataset.calibration.controls.shape[0]
     level = certification.level
+    # As `conformal_quantile` will ask, but before the training.
     if math.ceil((count + 1) * level) > count:
+        # Rounded down, so that the proposed level is accepted.
         highest = math.floor(100 * count / (count + 1)) / 100
         raise ValueError(
             f"{count} calibration segments are too few for "

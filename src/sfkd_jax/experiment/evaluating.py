@@ -77,6 +77,7 @@ def make_episodes(settings: Settings, plant: Vehicle) -> EpisodeSet:
         observed = jax.vmap(observe)(scenarios.envs, sensor_keys)
         return scenarios._replace(observed_envs=observed)
 
+    # Two streams: other settings of the sensors leave the roads as they are.
     keys = jax.vmap(partial(jax.random.split, num=protocol.episodes))(
         jax.random.split(jax.random.key(protocol.seed))
     )
@@ -129,6 +130,7 @@ def policy_system(settings: Settings) -> System:
     if certificate is None:
         store.print_message(f"nothing is certified: {reason}")
     reads_env = trained.settings["model"]["environment"]
+    # A policy that reads no e is given no estimate of it either.
     env_source = settings.environment.source if reads_env else "none"
     return System(trained.model, trained.params, env_source, certificate, trained.law)
 
@@ -165,6 +167,7 @@ class SystemEvaluation:
         self._protocol, self._plant = settings.evaluation, plant
         self._times: list[tuple[float, float] | None] = []
         box: Any = settings.environment.box
+        # Of logs the box is measured: their settings have none.
         if dataset is not None:
             box = dict(zip(box, (dataset.env_low, dataset.env_high), strict=True))
         self.controller = build.build_controller(
@@ -188,6 +191,7 @@ class SystemEvaluation:
     def __call__(self, episodes: EpisodeSet) -> SystemResult:
         """Simulate and score one set of episodes, without and with side forces."""
         episode, scores, violation = self._scored(episodes, 0.0)
+        # Timed once: a control step takes equally long on every scenario.
         if not self._times:
             self._times.append(self._act_ms(episodes))
         about = {"scenario": episodes.name, "variation": episodes.variation}
@@ -198,6 +202,7 @@ class SystemEvaluation:
             violation,
         )
         if self._protocol.side_forces:
+            # Without a force the episodes are those above, and are not simulated again.
             row["disturbed"] = [
                 evaluation.disturbed(
                     force,
@@ -237,6 +242,7 @@ class SystemEvaluation:
             envs = jax.jit(jax.vmap(disturb))(scenarios.envs, episodes.keys)
             scenarios = scenarios._replace(envs=envs)
         episode = self._simulate(scenarios, episodes.keys)
+        # Scored against e without the force, which no model knows.
         return episode, *self._score(episode, episodes.scenarios)
 
     def _act_ms(self, episodes: EpisodeSet) -> tuple[float, float] | None:
@@ -254,6 +260,7 @@ class SystemEvaluation:
             start = time.perf_counter()
             _, state, _ = jax.block_until_ready(act(self.params, state, *observed))
             times.append(1e3 * (time.perf_counter() - start))
+        # The first steps compile the program and fill the caches.
         times = times[WARM_UP:]
         return float(np.median(times)), float(np.quantile(times, 0.99))
 

@@ -68,6 +68,7 @@ def list_cells(comparison: ComparisonSettings) -> list[Cell]:
     first_seed_only = {*comparison.untrained, *comparison.trained_once}
     cells = []
     for seed, vehicle, label in itertools.product(seeds, comparison.vehicles, labels):
+        # Untrained rows have no seed; those trained once are rows of the first alone.
         if label in first_seed_only and seed != seeds[0]:
             continue
         for common, scenarios in comparison.controllers.items():
@@ -106,6 +107,7 @@ def take_share(
         raise ValueError(
             f"comparison.share must be [k, n] with 0 <= k < n, got {list(share)}"
         )
+    # In order of appearance, so that every process counts the rows alike.
     rows = list(dict.fromkeys(group[0][:3] for group in groups))
     return [group for group in groups if rows.index(group[0][:3]) % count == first]
 
@@ -193,6 +195,7 @@ def is_done(path: Path, settings: Settings) -> bool:
     try:
         document = store.read_json(_row_file(path), keys=("row",))
         return document["made_with"] == settings_hash(settings)
+    # Damaged, missing or unfinished: the cell is evaluated again.
     except (store.ArtefactError, OSError, KeyError):
         return False
 
@@ -229,6 +232,7 @@ def write_cell(
         "provenance": provenance(),
     }
     document = {"row": row, "made_with": settings_hash(settings)}
+    # The row last: its file is what marks a cell as done.
     store.write_json(_row_file(path), document)
     return row
 
@@ -257,6 +261,7 @@ def collect_rows(
             others.append(path)
             continue
         row = document["row"] | {"drives": episodes_hash(settings)}
+        # Seeds of a row are pooled under one key.
         pooled.setdefault(cell._replace(seed=0), []).append(row)
         if row.get("provenance", {}).get("source") != source_hash():
             by_other_code.append(path)

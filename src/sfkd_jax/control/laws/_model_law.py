@@ -63,6 +63,7 @@ class Linearised(NamedTuple):
     def is_steady(self) -> Bool[Array, "*turn"]:
         """Whether Newton's method has found a steady turn; False for NaN."""
         finite = jnp.all(jnp.isfinite(self.both), axis=-1)
+        # A NaN residual compares as False, so that a diverged turn is never steady.
         return finite & (self.residual < RESIDUAL_TOLERANCE)
 
 
@@ -72,6 +73,8 @@ def by_differentiation(
     """Return value and Jacobian in forward mode, with one copy of the function."""
 
     def twice(point: Array) -> tuple[Array, Array]:
+        # The value beside the Jacobian: calling
+        # `function` twice would compile it twice.
         value = function(point)
         return value, value
 
@@ -86,6 +89,7 @@ def by_differences(
 
     The function need not be differentiable: a simulator on the host will do.
     """
+    # 3e-3 balances the rounding of float32 against the curvature of the step.
     offsets = DIFFERENCE_STEP * jnp.eye(at.shape[0])
     values = jax.vmap(function)(
         at + jnp.concatenate([jnp.zeros((1, at.shape[0])), offsets, -offsets])
@@ -113,6 +117,7 @@ def steady_turn(
         steps: of Newton's method.
     """
     size = start.shape[0] - 2
+    # e_y and v are given: the car is on its path, at the reference speed.
     free = jnp.asarray([1, *range(3, size + 2)])
 
     def newton(_: Any, carry: tuple[Array, Linearised]) -> tuple[Array, Linearised]:
@@ -120,6 +125,7 @@ def steady_turn(
         both = start.at[free].set(unknown)
         after, slopes = derivative(moved, both)
         gap = after - both[:size]
+        # Square: two unknown controls take the places of the two fixed coordinates.
         matrix = (slopes - jnp.eye(size, size + 2))[:, free]
         better = unknown - solve(matrix, gap[:, None])[:, 0]
         return better, Linearised(both, slopes, jnp.max(jnp.abs(gap)))
@@ -145,6 +151,7 @@ def riccati_gain(
     A, B = jnp.split(slopes, [slopes.shape[0]], axis=1)
 
     def best(value: Array) -> Array:
+        # R > 0 keeps the matrix invertible, also where a control has no effect.
         return solve(R + B.T @ value @ B, B.T @ value @ A)
 
     def before(_: Any, value: Array) -> Array:
@@ -211,13 +218,16 @@ class ModelLaw(NamedTuple):
         def turn(kappa: Scalar, speed: Scalar) -> Linearised:
             return steady_turn(
                 lambda both: step(both[:size], both[size:], kappa, speed),
+                # Newton starts from straight driving at the reference speed.
                 jnp.zeros(size + 2).at[2].set(speed),
                 by_differentiation,
                 steps=NEWTON,
             )
 
         both = jax.vmap(jax.vmap(turn), in_axes=(0, None))(
-            jnp.stack([curvature, 0.0 * curvature]), reference[:, 3]
+            # Straight driving in the same batch: what is chosen where a turn fails.
+            jnp.stack([curvature, 0.0 * curvature]),
+            reference[:, 3],
         )
         # A circle that the tyres cannot hold has no steady turn: drive straight.
         valid = both.is_steady()[0]
@@ -253,6 +263,7 @@ class ModelLaw(NamedTuple):
         now = jnp.concatenate(
             [jnp.stack([errors.lateral, errors.heading]), state[BODY]]
         )
+        # Relative to ξ*, not to 0: in side wind a car on its path has a heading error.
         return turn.control - turn.gain @ (now - turn.state)
 
 
@@ -297,6 +308,7 @@ def solve(
     indices = jnp.arange(size)
 
     def eliminate(column: Array, rows: Array) -> Array:
+        # Rows above the column are done; −1 keeps them from being chosen as pivots.
         candidates = jnp.where(indices < column, -1.0, jnp.abs(rows[:, column]))
         pivot = jnp.argmax(candidates)
         order = indices.at[column].set(pivot).at[pivot].set(column)

@@ -45,6 +45,7 @@ def path_errors(
     dx, dy = state[0] - point[0], state[1] - point[1]
     c, s = jnp.cos(point[2]), jnp.sin(point[2])
     along = c * dx + s * dy
+    # The path bends away from its tangent by κ/2 · along².
     lateral = c * dy - s * dx - 0.5 * curvature * along**2
     heading = wrap_angle(state[2] - point[2] - curvature * along)
     return PathErrors(lateral, heading, state[3] - point[3])
@@ -90,6 +91,7 @@ def path_feedback(
     """
 
     def law(errors: PathErrors, curvature: Scalar, speed: Scalar) -> Control:
+        # Feed-forward of the bicycle without slip; feedback makes up for the rest.
         steering = (
             jnp.arctan(wheelbase * curvature)
             - lateral_gain * errors.lateral

@@ -68,6 +68,7 @@ class PathLaw(NamedTuple):
             speed: reference speed [m/s]; it is also the speed of the steady turn.
             env: e.
         """
+        # Over v² κ: the limit of the tyres is the same at every speed of the table.
         at = jnp.concatenate([jnp.stack([curvature * speed**2, speed]), env])
         counts = self.control.shape[:-1]
         rows, weights = _corners(at, self.low, self.high, counts)
@@ -101,7 +102,9 @@ def _corners(
 ) -> tuple[Int[Array, " corner"], Float[Array, " corner"]]:
     """Flat indices and weights of the grid points for multilinear interpolation."""
     last = jnp.asarray(counts) - 1
+    # Clipped: outside the axes the turn at their ends, never an extrapolated gain.
     position = jnp.clip((at - low) / (high - low), 0.0, 1.0) * last
+    # At most the last but one, so that an upper neighbour exists at the end.
     index = jnp.minimum(jnp.floor(position).astype(int), last - 1)
     beyond = position - index
     sides = jnp.asarray(list(product((0, 1), repeat=len(counts))))
@@ -198,6 +201,7 @@ def derive_path_law(
         curvature=curvature,
         drive=drive,
     )
+    # In batches: a vmap over the whole grid would hold all its Newton iterations.
     tables = jax.lax.map(row, grid, batch_size=64)
     state, control, gain = (
         jnp.moveaxis(table, 0, 1).reshape(*counts, *table.shape[2:]) for table in tables
@@ -232,6 +236,7 @@ def _row(
         return lambda both: step(both[:size], both[size:], kappa, condition[1:])
 
     def next_turn(known: Array, kappa: Scalar) -> tuple[Array, Array]:
+        # Both are given by the point of the table, hence set anew for each turn.
         start = known.at[LATERAL].set(0.0).at[PATH_SPEED].set(condition[0])
         found = steady_turn(moved(kappa), start, by_differences, steps=NEWTON)
         # Too fast for the friction: the turn of the next smaller curvature stays.
@@ -244,8 +249,10 @@ def _row(
         return jax.lax.scan(next_turn, straight, side * curvatures[middle:])[1]
 
     left, right = jax.vmap(outward)(jnp.asarray([-1.0, 1.0]))
+    # Driving straight is in both halves and counts once.
     turns = jnp.concatenate([left[:0:-1], right])
     slopes = jnp.asarray(jnp.gradient(turns[:, -2], curvatures[1] - curvatures[0]))
+    # A diverging slope would make the weight of the steering vanish.
     slopes = jnp.clip(slopes, *(limit * slopes[middle] for limit in STEERING_SLOPES))
     control_weights = jax.vmap(jnp.diag)(
         jnp.stack([curvature / slopes**2, jnp.full(points, drive)], axis=1)

@@ -67,6 +67,7 @@ def autotune(
             f"span larger than 1, got {', '.join(entries)}, {rounds} and {span}"
         )
     count = jax.tree.leaves(batch)[0].shape[0]
+    # The same keys for every trial: differences are of the settings, not of luck.
     keys = jax.random.split(key, count)
     initial = controller.init(keys[0]).tuning._asdict()
 
@@ -91,6 +92,7 @@ def autotune(
     directions = jnp.asarray(list(steps))
     best, tried, costs = jnp.ones(len(entries)), [], []
     for number in range(rounds):
+        # The logarithm of the span halves with every round: coarse first, then fine.
         trials = best[None] * span ** (directions / 2.0**number)
         tried.append(trials)
         costs.append(evaluate(trials))

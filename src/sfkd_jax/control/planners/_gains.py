@@ -76,6 +76,7 @@ def feedback_gains(
 
     start = start_of(observation)
     by_start = jax.jacfwd(start_of)(observation)
+    # Reverse mode: one pass for each control, however many numbers the start has.
     _, pull_back = jax.vjp(costs_from, start)
     seeds = -(weights[:, None] * away / samples.temperature).T
     by_search = jax.vmap(lambda seed: _along(pull_back(seed)[0], by_start))(seeds)

@@ -256,6 +256,7 @@ def condensed_cost(
     channels = jnp.eye(2 * horizon).reshape(horizon, 2, 2 * horizon)
     steering, drive = channels[:, 0], channels[:, 1]
     side, side_free = prediction.gain[:, 1], prediction.free[:, 1]
+    # A millimetre more: finite at standstill, as in `tracking_cost`.
     travelled = speeds * dt + 1e-3
     gains = (
         side,
@@ -388,6 +389,7 @@ def box_qp(
 
     Source: Bertsekas (1982); Tassa, Mansard and Todorov (2014), section III.
     """
+    # All lengths as one batch: a search that stops early has no fixed duration.
     lengths = 0.5 ** jnp.arange(HALVINGS)[:, None]
     diagonal = jnp.diagonal(H)
 
@@ -400,6 +402,7 @@ def box_qp(
         newton = -cho_solve(cho_factor(reduced), jnp.where(active, 0.0, slope))
         candidates = jnp.clip(x + lengths * newton, low, high)
         moves = candidates - x
+        # Exact for a quadratic: no difference of two large costs.
         change = moves @ slope + 0.5 * jnp.sum((moves @ H) * moves, axis=1)
         # A step that is not finite is the worst of all.
         change = jnp.where(jnp.isfinite(change), change, jnp.inf)

@@ -82,6 +82,7 @@ def _autoregressive(
         now = correlation * before + fresh * new
         return now, now
 
+    # From the first white value: it has the stationary variance already.
     _, rest = jax.lax.scan(step, white[0], white[1:])
     return jnp.concatenate([white[:1], rest])
 

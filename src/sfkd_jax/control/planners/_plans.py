@@ -176,6 +176,7 @@ def candidate_plans(
     plan: Plan, noise: Plans, state: PlannerState
 ) -> Float[Array, "horizon candidate control"]:
     """Return the plan itself, its perturbed copies, and the user's proposals."""
+    # Sample 0 without noise: the plan itself is always among the candidates.
     return jnp.concatenate(
         [plan[:, None] + noise.at[:, 0].set(0.0), state.proposals.swapaxes(0, 1)],
         axis=1,

@@ -60,6 +60,7 @@ class Rollouts:
             controls=controls,
             perturbations=jnp.mean(each.perturbations, axis=0),
             states=states,
+            # The worst of the environments: a constraint must hold in all of them.
             violations=None
             if each.violations is None
             else jnp.max(each.violations, axis=0),

@@ -53,6 +53,7 @@ def plan_smoother(*, horizon: int, window: int, order: int) -> Smoother:
         )
     # Scaled to [-1, 1]: powers of large integers would be ill-conditioned.
     basis, _ = np.linalg.qr(np.vander(np.arange(-half, half + 1) / half, order + 1))
+    # A projection: polynomials up to the order pass unchanged.
     fit = basis @ basis.T
     rows = np.zeros((horizon, half + horizon))
     for step in range(horizon):

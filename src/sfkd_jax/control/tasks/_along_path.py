@@ -115,6 +115,7 @@ def along_reference(controller: Controller, *, coordinates: int) -> Controller:
     """
 
     def init(key: Key) -> AlongReferenceState:
+        # NaN equals nothing, so that the first observation is never a repetition.
         unknown = jnp.full(coordinates + 1, jnp.nan, dtype=float)
         return AlongReferenceState(controller.init(key), unknown)
 
@@ -268,6 +269,7 @@ class _Following:
         law_control = turn_control(target.turn, before.coordinates)
         nu = jnp.clip(nu, -self.law.perturbation, self.law.perturbation)
         control = self.limit(law_control + nu, before.control)
+        # What the limits left of ν: the model was learned on what really acted.
         effective = control - law_control
         inputs = jnp.concatenate([effective, target.road])
         latent = self.model.step(fiber, before.latent, inputs)

@@ -185,6 +185,7 @@ class Adaptation:
     def init(self, key: Key) -> AdaptiveState:
         """Return the state before the first control step."""
         noise, _ = self._noise
+        # A wide prior where e is unknown; elsewhere the force is only what e misses.
         force = 1.0 if self.estimate_env else 0.1
         prior = jnp.asarray([*noise, force, *self.slow_prior], dtype=float) ** 2
         count = self._estimator().frictions.shape[0]
@@ -215,6 +216,7 @@ class Adaptation:
         estimator, before = self._estimator(), state.belief
         loop = estimator.loop
         weights = _checksum(params)
+        # 0 stands for "no step yet", and a checksum is never 0.
         changed = (state.weights != 0) & (weights != state.weights)
         params = fold(self.model, params)
         clean = all_finite((coordinates, preview.road))
@@ -337,6 +339,7 @@ def _compensation(
         return model.decode(fiber, after)[BODY]
 
     A, B = jax.jacfwd(advance, (0, 1))(coordinates, jnp.zeros(2))
+    # Unknown are steering and drive in place of e_y and v, which stay at 0.
     equations = jnp.eye(size) - A
     equations = equations.at[:, LATERAL].set(-B[:, 0]).at[:, PATH_SPEED].set(-B[:, 1])
     steering = jnp.linalg.solve(equations, shifted)[LATERAL]
@@ -363,5 +366,6 @@ def _checksum(params: Params) -> UInt32[Array, ""]:
         index = jnp.arange(bits.size, dtype=jnp.uint32)
         mixed = bits.ravel() + jnp.uint32(0x9E3779B9) * index
         mixed = (mixed ^ (mixed >> 16)) * jnp.uint32(0x85EBCA6B)
+        # 31 is odd: multiplication loses no bit of what came before.
         total = 31 * total + jnp.sum(mixed ^ (mixed >> 13), dtype=jnp.uint32)
     return jnp.maximum(total, 1)

@@ -81,6 +81,7 @@ def delay_compensated(
         def predict(latent: Any, control: Control) -> tuple[Any, None]:
             return model.step(fiber, latent, control), None
 
+        # From the oldest on, in the order in which the actuators will apply them.
         latent, _ = jax.lax.scan(predict, model.encode(fiber, observation), state.sent)
         arrival = model.decode(fiber, latent)
         control, inner, info = controller.act(

@@ -79,6 +79,7 @@ def mixed(bank: Bank, transition: Float[Array, "filter filter"]) -> Bank:
     """
     joint = transition * bank.probabilities[:, None]
     expected = joint.sum(axis=0)
+    # No division by 0: every entry of Π is positive, hence every entry of c.
     weights = joint / expected
     means = weights.T @ bank.means
     gaps = bank.means[:, None] - means[None]
@@ -130,6 +131,7 @@ def corrected(
         covariances += variances[entry] * gain[:, :, None] * gain[:, None, :]
         surprise = surprise - 0.5 * innovation**2 / variance
         fit = fit - 0.5 * jnp.log(variance)
+    # A filter of NaN counts as impossible, or it would make all probabilities NaN.
     fit = jnp.where(jnp.isfinite(surprise), fit + surprise, -jnp.inf)
     relative = jnp.exp(fit - jnp.max(fit)) + LEAST_LIKELIHOOD
     weights = bank.probabilities * relative
@@ -149,6 +151,7 @@ def transition_matrix(
         drift: standard deviation over one step.
         dwell: mean number of steps between jumps.
     """
+    # At most 1/3, so that every entry of the diagonal stays positive.
     rate = min(0.5 * (drift * (points - 1) / (high - low)) ** 2, 1.0 / 3.0)
     neighbours = rate * (jnp.eye(points, k=1) + jnp.eye(points, k=-1))
     diffusion = neighbours + jnp.diag(1.0 - neighbours.sum(axis=1))
@@ -273,6 +276,7 @@ class Loop(NamedTuple):
 
         vector = jnp.concatenate([xi, causes])
         jacobian = jax.jacfwd(advance)(vector)
+        # By differences: the root in `with_force` has no derivative at 0.
         jacobian = jacobian.at[:, at + FORCE].set(slope)
         in_turns = road[0] / TIGHTEST * slope
         jacobian = jacobian.at[:, at + TURN_FORCE].set(in_turns)
