@@ -96,6 +96,7 @@ def save(
         The manifest; `sha256` is the hash of weights and law, `content_sha256` that of
         weights, law and all settings.
     """
+    # Beside the weights: the hash that certificates refer to then covers the law.
     tree = params if law is None else params | {LAW: law_to_arrays(law)}
     return store.write_arrays(
         path, _by_path(tree), kind=KIND, config=settings, made_from=made_from
@@ -116,6 +117,7 @@ def restore(path: str | Path) -> TrainedModel:
     file = _file(path)
     arrays, manifest = store.read_arrays(file, kind=KIND)
     settings = manifest["config"]
+    # Before anything is built: building imports and calls what the settings name.
     with store.as_artefact_error(file, ValueError):
         build.check_imported(settings)
     version = str(manifest.get("versions", {}).get("sfkd_jax", "unknown"))
@@ -124,6 +126,7 @@ def restore(path: str | Path) -> TrainedModel:
         plant, model = _build(json.dumps(parts))
     law = None
     if model.along_path:
+        # What is left without the law are the weights, compared name by name below.
         names = [name for name in arrays if name.startswith(f"{LAW}/")]
         law = _law(file, {name: arrays.pop(name) for name in names})
     params = _weights(file, arrays, model)
@@ -232,6 +235,7 @@ def read_certificate(
     except certification.CertificationRefused as reason:
         raise store.ArtefactError(f"{file}: {reason}") from None
     space, boxes = trained.settings["space"], document["boxes"]
+    # A box of another size would broadcast over the state unnoticed.
     for name, part in BOXES.items():
         if len(boxes[name][0]) != len(space[f"{part}_mean"]):
             raise store.ArtefactError(
@@ -278,6 +282,7 @@ def _weights(file: Path, arrays: Mapping[str, np.ndarray], model: Model) -> Para
         # Settings of a wrong type fail only here.
         shapes = jax.eval_shape(model.init, jax.random.key(0))
     expected = _by_path(shapes)
+    # Both ways: a weight too many is another model as well.
     if wrong := sorted(expected.keys() ^ arrays.keys()):
         verb = "lacks" if wrong[0] in expected else "holds"
         raise store.ArtefactError(
@@ -292,6 +297,7 @@ def _weights(file: Path, arrays: Mapping[str, np.ndarray], model: Model) -> Para
             )
         if not np.all(np.isfinite(leaf)):
             raise store.ArtefactError(f"{file}: weights {name} are not finite")
+    # In the order of the tree, whatever that of the file is.
     leaves = [jnp.asarray(arrays[name]) for name in expected]
     return jax.tree.unflatten(jax.tree.structure(shapes), leaves)
 

@@ -112,6 +112,8 @@ def _arguments(factory: Callable[..., Any]) -> dict[str, Any]:
     return {
         name: parameter.default
         for name, parameter in inspect.signature(factory).parameters.items()
+        # A NamedTuple takes its fields by position,
+        # a factory its settings by name alone.
         if inspect.isclass(factory) or parameter.kind is parameter.KEYWORD_ONLY
     }
 
@@ -135,6 +137,7 @@ def parse(kind: type[T], values: Values | T, above: str = "") -> T:
     if issubclass(kind, Kinds):
         kind = kind.kind_of(values)
     declared = hints_of(kind)
+    # Names first: a misspelt one would silently leave the setting at its default.
     for name in values:
         if name not in declared:
             hint = did_you_mean(f"{above}{name}", list(names_of(kind, above)))
@@ -152,6 +155,7 @@ def parse(kind: type[T], values: Values | T, above: str = "") -> T:
             rule = rule_of(hint)
             check(name, values[entry.name], rule)
             parsed[entry.name] = _as_tuple(values[entry.name], rule)
+    # Pairs last: both ends have to be lists of numbers before they are compared.
     _check_boxes(above, parsed)
     return kind(**parsed)
 
@@ -247,6 +251,7 @@ def rule_of(hint: Any) -> Rule:
         return _annotated(rule_of(parts[0]), parts[1:])
     if origin in (typing.Union, types.UnionType):
         kinds = [kind for kind in parts if kind is not types.NoneType]
+        # A union of several kinds states nothing that one rule could check.
         rule = rule_of(kinds[0]) if len(kinds) == 1 else Rule()
         return rule._replace(nullable=len(kinds) < len(parts))
     if origin is tuple:
@@ -310,6 +315,7 @@ def _as_tuple(value: Any, rule: Rule) -> Any:
     if isinstance(value, Mapping):
         inner = rule.values or Rule()
         return {key: _as_tuple(entry, inner) for key, entry in value.items()}
+    # Tuples can be hashed, and nobody who is given settings can change them.
     stated = rule.entries is not None
     return tuple(value) if stated and isinstance(value, list) else value
 
@@ -363,6 +369,7 @@ def _wrong_size(value: Any, wanted: Entries | None) -> str | None:
 
 def _is(value: Any, kind: type) -> bool:
     """Return whether a value is of a kind; ints are floats too, bools are neither."""
+    # bool is a subclass of int: without this `true` would pass for the number 1.
     if isinstance(value, bool) or kind is bool:
         return isinstance(value, bool) and kind is bool
     return isinstance(value, int | float if kind is float else kind)

@@ -23,7 +23,9 @@ def source_hash() -> str:
     They are hashed as they are at the first call.
     """
     digest = hashlib.sha256()
+    # Sorted, since file systems list files in any order.
     for file in sorted(PACKAGE.rglob("*.py")):
+        # The zero byte keeps a path and what follows from running together.
         digest.update(file.relative_to(PACKAGE).as_posix().encode() + b"\0")
         digest.update(hashlib.sha256(file.read_bytes()).digest())
     return digest.hexdigest()

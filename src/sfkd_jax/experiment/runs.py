@@ -64,6 +64,7 @@ def claim(settings: Settings) -> None:
         changed = store.differences(store.read_json(path), wanted)
         if not changed:
             return
+        # Without weights the recorded settings made nothing that could be mistaken.
         if _has_weights(path.parent):
             raise store.ArtefactError(
                 f"{path.parent} was made with other settings "
@@ -95,6 +96,7 @@ def policy_settings(settings: Settings, dataset: Dataset) -> dict[str, Any]:
     }
     if source_of(settings).logs is None:
         return recorded
+    # Of logs E is measured, and whoever loads the policy has no logs.
     box = {"low": dataset.env_low.tolist(), "high": dataset.env_high.tolist()}
     vehicle = recorded["vehicle"]
     if vehicle["name"] == "own" and not vehicle["control_low"]:
@@ -139,9 +141,11 @@ def write_results(
         The path of results.json.
     """
     about = {name: config[name] for name in ("vehicle", "controller", "evaluation")}
+    # Read and written under one lock, or rows of another process would be lost.
     with store.locked(run_dir, wait=True):
         earlier, old = read_results(run_dir)
         added = {name: np.asarray(array) for name, array in arrays.items()}
+        # Arrays first: a row that is listed then has its episodes.
         store.write_arrays(
             run_dir / "episodes.safetensors", old | added, kind=EPISODES, config=about
         )

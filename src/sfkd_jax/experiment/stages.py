@@ -90,6 +90,7 @@ def check_settings(settings: Settings, plant: Vehicle) -> None:
         env_low=unit["env"][0],
         env_high=unit["env"][1],
         law=law,
+        # Without a corridor: checked is only that everything can be built.
         certificate={"boxes": unit},
         env_source=settings.environment.source,
     )
@@ -99,6 +100,7 @@ def _sizes(source: Source, plant: Vehicle) -> dict[str, int]:
     """Sizes of body state, control and environment that the model reads."""
     env = len(source.logs.columns.environment) if source.logs else 0
     state = len(plant.state_names) - 3
+    # e_y and e_ψ in place of the pose; w = (ν, κ, v_ref) has four entries.
     if source.along_path:
         return {"state": state + 2, "control": 4, "env": 2}
     return {"state": state, "control": 2, "env": env or 2}
@@ -106,6 +108,7 @@ def _sizes(source: Source, plant: Vehicle) -> dict[str, int]:
 
 def _zero_law(sizes: Mapping[str, int]) -> PathLaw:
     """A law whose output is zero."""
+    # Two points an axis, the fewest that can be interpolated.
     axes, corners = 2 + sizes["env"], (2,) * (2 + sizes["env"])
     shapes = (sizes["state"],), (2,), (2, sizes["state"])
     tables = (np.zeros((*corners, *shape), np.float32) for shape in shapes)
@@ -122,16 +125,20 @@ def ensure_policy(settings: Settings) -> policy.TrainedModel:
         ValueError: the logs are too few for the levels of the certificate.
     """
     run_dir, source = settings.run_dir, source_of(settings)
+    # Before the lock and the data: a missing module ends the command at once.
     if factory := getattr(settings.model, "factory", None):
         imported(factory, "model.factory")
     if not (run_dir / "policy.safetensors").is_file():
+        # Whether logs are too few for the level is known before the training.
         if source.logs:
             dataset, _ = data.ensure_dataset(source)
             data.check_calibration_size(dataset, settings.certification)
         with store.locked(run_dir):
             runs.claim(settings)
+            # Once more under the lock, where nobody else can be writing.
             if not (run_dir / "policy.safetensors").is_file():
                 _train(settings, *data.ensure_dataset(source))
+    # Also of a policy that exists: it must have been made with these settings.
     runs.claim(settings)
     return policy.restore(run_dir)
 
@@ -147,6 +154,7 @@ def _train(settings: Settings, dataset: Dataset, data_hash: str) -> None:
     run_dir, options = settings.run_dir, settings.training
     source, horizon = source_of(settings), settings.training.window
     recorded = runs.policy_settings(settings, dataset)
+    # After the settings are recorded, whose boxes are those of all data.
     dataset = dataset._replace(train=first_share(dataset.train, options.data_share))
     space = measure_space(dataset)
     plant = build.build_vehicle(settings.vehicle)
@@ -187,6 +195,7 @@ def _fit(
     """Fit a model by gradient descent; return the best weights and their step."""
     loss = multi_step_loss(model, space, **arguments(options.loss, multi_step_loss))
     draw = partial(random_windows, batch=options.batch, length=options.window)
+    # Fixed windows: validation losses at different steps are comparable.
     held_out = spread_windows(dataset.validation, length=options.window)
     return fit(
         model,
@@ -280,6 +289,7 @@ def certify_policy(settings: Settings) -> dict[str, Any]:
         document = _certify_tubes(settings, trained)
     except CertificationRefused as reason:
         document = {"valid": False, "reason": str(reason)}
+    # The proof's own versions win: they are of the libraries that computed it.
     versions = store.versions() | document.get("versions", {})
     document |= {
         "weights_sha256": trained.weights_sha256,
@@ -298,6 +308,7 @@ def certify_policy(settings: Settings) -> dict[str, Any]:
 def _asked_for(settings: Settings) -> dict[str, Any]:
     """The settings of the certification that a certificate records."""
     asked = plain(settings.certification)
+    # `renew` says what to do, not what is claimed.
     return {name: value for name, value in asked.items() if name != "renew"}
 
 
@@ -329,6 +340,7 @@ def _certify_tubes(settings: Settings, trained: policy.TrainedModel) -> dict[str
         runs=dataset.drives,
         **arguments(options, issue),
     )
+    # Logs have no plant to drive: a corridor needs runs under known conditions.
     if document["outputs"] and source.logs is None:
         loop = closed_loop(
             build.build_vehicle(settings.vehicle),
@@ -354,10 +366,12 @@ def ensure_certificate(settings: Settings) -> None:
     """
     run_dir = settings.run_dir
     if (run_dir / "policy.safetensors").is_file() and _is_certified(settings):
+        # Called all the same: it checks that the policy has these settings.
         ensure_policy(settings)
         return
     with store.locked(run_dir, wait=True):  # another process may be training it
         ensure_policy(settings)
+        # Once more: whoever held the lock may have certified it.
         if not _is_certified(settings):
             certify_policy(settings)
 

@@ -72,6 +72,7 @@ def write_comparison(root: Path, pattern: str, name: str) -> dict[str, Any]:
     """
     home = root / name / "comparison"
     with store.writing(home):
+        # Sorted, so that the same runs make the same page on every file system.
         found = sorted(path.parent for path in root.glob(f"{pattern}/settings.json"))
         if not found:
             raise ValueError(f"no run below {root} matches {pattern}")
@@ -94,6 +95,7 @@ def _results(results: dict[str, Any], directory: Path, images: Path) -> Page:
         first.append(record_table("Failed", failed, "reason"))
     sections, metrics = [Section("", first)], []
     for number, group in enumerate(grouped(rows, _TABLE), 1):
+        # One table over all vehicles and scenarios: a group shares all that is left.
         title, table = title_of(group, _TABLE), cross_table(group, tables.rmse_cell)
         parts: list[Part] = [table] if table else []
         panels = grouped(group, ("vehicle", "scenario"))
@@ -177,6 +179,7 @@ def _sweep(records: list[dict[str, Any]], images: Path) -> list[Section]:
     settings = {one["run"]: one["settings"] for one in records}
     names = dict.fromkeys(name for own in settings.values() for name in own)
     columns = {name: [own.get(name) for own in settings.values()] for name in names}
+    # As shown: a setting that reads alike in all runs does not differ.
     differing = [n for n, own in columns.items() if len(set(map(plain, own))) > 1]
     cells = {run: [own.get(n) for n in differing] for run, own in settings.items()}
     cells = {run: own if own[1:] else plain(*own) for run, own in cells.items() if own}
@@ -184,6 +187,7 @@ def _sweep(records: list[dict[str, Any]], images: Path) -> list[Section]:
     parts: list[Part] = [record_table("Run", cells, *differing)]
     if refused:
         parts.append(record_table("Without a certificate", refused, "reason"))
+    # A figure needs an axis of numbers; the first such setting is the swept one.
     numeric = [name for name in differing if all(map(is_number, columns[name]))]
     for name in numeric[:1]:
         rows = [(one["settings"][name], one["rows"][-1]) for one in records]

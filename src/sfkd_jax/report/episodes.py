@@ -62,6 +62,7 @@ def of_run(run: Path) -> list[list[Episodes]]:
     groups: dict[tuple[Any, ...], list[Episodes]] = {}
     for name, own in parts.items():
         if one := _episodes(parse_episode_name(name), dt, own):
+            # By content: rows met the same road only if every byte of it is equal.
             road = (None if a is None else a.tobytes() for a in (one.envs, one.path))
             key = (*(one.row.get(column) for column in SHARED), *road)
             groups.setdefault(key, []).append(one)
@@ -79,6 +80,7 @@ def of_rows(directory: Path, rows: list[Row]) -> list[Episodes]:
     found = []
     for row in rows:
         name = PurePath(str(row.get("arrays")))
+        # A row of somebody else's file must not make us read files elsewhere.
         if name.is_absolute() or ".." in name.parts:
             outside = "arrays of a row lie outside this folder"
             raise store.ArtefactError(f"{directory / 'results.json'}: {outside}")
@@ -92,6 +94,7 @@ def of_rows(directory: Path, rows: list[Row]) -> list[Episodes]:
 def _episodes(row: Row, dt: float, arrays: dict[str, np.ndarray]) -> Episodes | None:
     """The episodes of a row, None without a finite deviation."""
     lateral = np.asarray(arrays.get("lateral", np.zeros((0, 0))), dtype=float)
+    # All NaN, as of a run that diverged at once: there is nothing to draw.
     if not np.any(np.isfinite(lateral)):
         return None
     first = {

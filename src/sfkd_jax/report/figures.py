@@ -31,6 +31,7 @@ def first_episode(
         seconds: that are drawn.
     """
     first, panels = group[0], _panels(group)
+    # As long as the shortest run: all lines end at the same time.
     last = min(round(seconds / first.dt), *(one.lateral.shape[1] for one in group))
     road, envs = first.path is not None and first.states is not None, first.envs
     changes = [step for step in style.switches(envs) if step < last]
@@ -58,6 +59,7 @@ def first_episode(
 def _panels(group: list[Episodes]) -> dict[str, list[Episodes]]:
     """The systems of every panel, by its title; a small group is one panel."""
     title = "Lateral error in the first episode"
+    # Many lines in one panel hide each other: by what they observe instead.
     if len(group) <= _FEW:
         return {title: group}
     kinds = "SFKD and its parts", "friction and wind observed", "neither observed"
@@ -76,6 +78,7 @@ def _draw_road(axes: Any, group: list[Episodes], changes: list[int], last: int) 
     path, own = np.asarray(group[0].path), np.asarray(group[0].states)[: last + 1, :2]
     gone = np.linalg.norm(np.diff(own, axis=0), axis=1).sum()
     arc = np.linalg.norm(np.diff(path[:, :2], axis=0), axis=1).cumsum()
+    # Only the road that was driven: the rest of a long path would shrink it.
     ahead = path[: int(np.searchsorted(arc, gone)) + 2, :2]
     # Turned so that the road runs from left to right: a wide figure wastes no height.
     chord = ahead[-1] - ahead[0]
@@ -88,6 +91,7 @@ def _draw_road(axes: Any, group: list[Episodes], changes: list[int], last: int) 
             axes.plot(*points, **style.line(one.system) | {"linewidth": 1.1})
     marks = turn @ (own[changes] - path[0, :2]).T
     axes.plot(*marks, "o", color=style.MUTED, markersize=4, zorder=6)
+    # True scale: an unequal one would show turns that are none.
     axes.set(xlabel="x [m]", ylabel="y [m]", aspect="equal", adjustable="datalim")
     axes.set_title("The road from above; dots: friction or wind switch")
 
@@ -108,6 +112,7 @@ def _draw_errors(
         style.draw_corridor(axes, corridor)
     # Of the others a bad one may leave the frame, lest it flatten the rest.
     most = 3 * corridor if corridor else LANE_HALF_WIDTH
+    # A quantile of the peaks, so that one bad run does not set the scale.
     most = min(float(np.quantile(peaks, 0.85, method="higher")), most)
     reach = 1.15 * max(most, *always)
     axes.set(ylim=(-reach, reach), ylabel="lateral error [m]")
@@ -123,6 +128,7 @@ def all_episodes(one: Episodes, corridor: float | None = None) -> Figure:
     if corridor:
         style.draw_corridor(axes, corridor)
     finite = np.abs(one.lateral[np.isfinite(one.lateral)])
+    # Away from 0, where the axis would have no height.
     reach = 1.25 * max(corridor or 0.0, float(np.max(finite, initial=1e-3)))
     axes.set(xlim=(0.0, time[-1]), ylim=(-reach, reach))
     axes.set(xlabel="time [s]", ylabel="lateral error [m]")
@@ -206,6 +212,7 @@ def rmse_chart(groups: list[list[Row]]) -> Figure:
         _plain_log(axes.xaxis, axes.set_xscale)
     for axes in panels.flat[len(groups) :]:
         axes.set_axis_off()
+    # Shared by all panels, so that a row has the same height in each of them.
     panels[0, 0].set_yticks(range(len(names)), [style.literal(n) for n in names])
     panels[0, 0].set_ylim(len(names) - 0.4, -0.6)
     figure.supxlabel("lateral RMSE [mm], mean and 95 % interval", fontsize=10)

@@ -49,6 +49,7 @@ class Car(NamedTuple):
     def left(self) -> int:
         """First step at which it is outside of its lane, or not finite."""
         inside = np.abs(self.lateral) <= LANE
+        # A comparison with NaN is False: a car that is not finite is outside as well.
         return int(np.argmin(np.append(inside, False)))
 
 
@@ -124,6 +125,7 @@ def write_film(
     """
     last = min([round(seconds / film.dt), *(len(car.lateral) for car in film.cars)])
     cars = [car._replace(lateral=car.lateral[:last]) for car in film.cars]
+    # Fewer frames, not fewer colours: cars are told apart by colour.
     for stride in (every, 2 * every, 5 * every):
         _write(film._replace(cars=cars), range(0, last, stride), path)
         if path.stat().st_size <= MAX_BYTES:
@@ -132,11 +134,13 @@ def write_film(
 
 
 def _write(film: Film, steps: range, path: Path) -> None:
+    # Defaults: a user's style file would move axes that are placed by hand.
     with matplotlib.rc_context():
         matplotlib.rcdefaults()
         tall = 0.123 * _SPACING * len(film.cars)
         height = tall + 2.1
         figure = style.canvas(height)
+        # No layout engine: axes that shift between frames would make the film shake.
         figure.set_layout_engine("none")
         figure.set(figwidth=6.0, dpi=90)
         above = figure.add_axes(
@@ -167,6 +171,7 @@ def _image(figure: Any) -> Image.Image:
 def _draw_road(axes: Any, film: Film, nearest: list[np.ndarray], step: int) -> None:
     """Every car on its copy of the road, seen from the first car after a step."""
     now, path, centre = step + 1, film.points, int(nearest[0][step + 1])
+    # The same factor for all cars, or their deviations could not be compared.
     factor = int(np.clip(_HALF / film.reach, 1, _MOST))
     turn = style.turn_by(path[centre, 2])
     visible = path[max(centre - 120, 0) : centre + 160]
@@ -252,6 +257,7 @@ def _nearest(
     """
     near = np.zeros(len(positions), dtype=int)
     for step, position in enumerate(positions):
+        # A few steps back as well, since the closest point may jitter.
         start = max(int(near[step - 1]) - 5, 0) if step else 0
         gap = np.sum((path[start : start + 60, :2] - position) ** 2, axis=1)
         # A car whose state is not finite stays where it was.

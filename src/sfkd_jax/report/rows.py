@@ -71,6 +71,7 @@ def name_of(row: Row) -> str:
     if env == "estimated":
         return f"{shown} (e estimated)"
     in_name = env == "measured" and shown.endswith(" e")  # as in "reads e"
+    # Where the name or the kind of system says it, brackets would only repeat it.
     if in_name or system in NO_MODEL or system.startswith("sfkd"):
         return shown
     return shown + {"measured": " (e)", "none": " (no e)"}.get(env, "")
@@ -90,6 +91,7 @@ def grouped(rows: Iterable[Row], columns: Iterable[str]) -> list[list[Row]]:
         return tuple(str(identity(row)[name]) for name in columns)
 
     def fits(row: Row, wanted: tuple[str, ...]) -> bool:
+        # A reference system without a search is comparable under any controller.
         search = () if row.get("sampling") else ("controller", "planner", "sampling")
         pairs = zip(columns, key(row), wanted, strict=True)
         return all(own == one or name in search for name, own, one in pairs)
@@ -158,6 +160,7 @@ def metric_tables(group: list[tuple[str, Row]], corner: str = "System") -> list[
     """All metrics of named rows that any has: one table for each `Metric.table`."""
     kinds: dict[str, list[Metric]] = {}
     for metric in shown_metrics():
+        # A metric that no row has would be a column of dashes.
         if any(metric.text(row) != DASH for _, row in group):
             kinds.setdefault(metric.table, []).append(metric)
     return [
@@ -175,6 +178,7 @@ def cross_table(group: list[Row], show: Callable[[Row], str]) -> Table | None:
     cells: dict[str, dict[tuple[str, str], str]] = {}
     for row in group:
         where = str(row.get("vehicle")), str(row.get("scenario"))
+        # The first row of a place stays: later ones vary what the table does not show.
         cells.setdefault(name_of(row), {}).setdefault(where, show(row))
     places = sorted({where for row in cells.values() for where in row})
     columns = [(vehicle, scenario_label(scenario)) for vehicle, scenario in places]
@@ -222,6 +226,7 @@ def printed_table(rows: list[Row], options: dict[str, Any]) -> Table | None:
     table: dict[str, list[str]] = {}
     for row in rows:
         printed = paper.get(family(str(row.get("system"))))
+        # A system that the paper does not print has no line in this table.
         if printed and names:
             quoted = dict(zip(paper["columns"], printed, strict=False))
             own = {str(r["scenario"]): r for r in rows if name_of(r) == name_of(row)}

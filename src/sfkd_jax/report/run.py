@@ -94,6 +94,7 @@ def read_certificate(run: Path) -> dict[str, Any]:
     certificate = read_optional(run / "certificate.json")
     own = read_policy(run).get("sha256")
     named = certificate.get("weights_sha256")
+    # Valid for other weights is not valid here: the page must not show it.
     if own and named and own != named:
         reason = "the certificate in this run is about other weights"
         return {"valid": False, "reason": reason}
@@ -109,6 +110,7 @@ def holds(certificate: dict[str, Any]) -> bool:
 def empty_folder(folder: Path) -> Path:
     """Make a folder for images, without those of an earlier page."""
     folder.mkdir(parents=True, exist_ok=True)
+    # An earlier page may have had more figures, which would stay among the new ones.
     for stale in (*folder.glob("*.png"), *folder.glob("*.gif")):
         stale.unlink()
     return folder
@@ -134,6 +136,7 @@ def _page(run_dir: Path, images: Path) -> Page:
     results = read_optional(run_dir / "results.json")
     settings = policy.get("config") or {}
     certificate, system = read_certificate(run_dir), tables.model_of(settings)
+    # Numbers of a certificate that does not hold are nowhere drawn.
     proof = certificate if holds(certificate) else {}
     half = dig(proof, "corridor", "corridor_m")
     missing = [
