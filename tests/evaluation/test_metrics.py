@@ -6,9 +6,8 @@ import math
 import jax
 import numpy as np
 import pytest
-from test_scores import CALM, DT, STEPS, about, episode
 
-from sfkd_jax.evaluation import pool, row, score
+from sfkd_jax.evaluation import Episode, pool, row, score
 from sfkd_jax.evaluation.formats import DASH
 from sfkd_jax.evaluation.metrics import (
     BY_NAME,
@@ -19,6 +18,9 @@ from sfkd_jax.evaluation.metrics import (
     text_table,
 )
 
+DT, STEPS = 0.1, 200
+TIME = np.arange(1, STEPS + 1) * DT
+CALM = np.broadcast_to([0.9, 0.0], (1, STEPS, 2))
 MEASURED = [metric for metric in METRICS if metric.measure]
 SHOWN = [metric for metric in METRICS if metric.label]
 LEVELS = (0.1, 0.2, 0.6, 0.9)
@@ -36,27 +38,118 @@ EXPECTED = {
 }
 
 
+def episode(lateral, steering=0.0, states=None, ess=1.0, healthy=True):
+    """One episode as a batch, with what matters given and the rest at rest."""
+    steps = len(lateral)
+    controls = np.zeros((1, steps, 2))
+    controls[0, :, 0] = steering
+    return Episode(
+        states=np.zeros((1, steps + 1, 4)) if states is None else states[None],
+        controls=controls,
+        lateral=np.asarray(lateral, dtype=float)[None],
+        progress=np.zeros((1, steps)),
+        assumed_envs=np.zeros((1, steps, 2)),
+        signals={
+            "effective_samples": np.full((1, steps), ess),
+            "healthy": np.full((1, steps), healthy),
+        },
+    )
+
+
+def switching(steps=STEPS, when=100, channel=0, to=0.3):
+    envs = np.array(np.broadcast_to([0.9, 0.0], (1, steps, 2)))
+    envs[0, when:, channel] = to
+    return envs
+
+
+def measured(name, lateral, envs=CALM, **changes):
+    """A metric of one episode."""
+    return score(episode(lateral, **changes), envs, dt=DT)[name][0]
+
+
+def test_a_sinusoid_has_the_rmse_of_a_sinusoid():
+    """Over whole periods: amplitude / √2."""
+    lateral = 0.3 * np.sin(2 * np.pi * TIME / 3.0)
+    assert measured("rmse_m", lateral) == pytest.approx(0.3 / np.sqrt(2), rel=1e-12)
+    assert measured("max_deviation_m", lateral) == pytest.approx(0.3, rel=0.01)
+
+
+def test_the_first_two_seconds_do_not_count():
+    lateral = np.where(TIME <= 2.0 + 1e-9, 5.0, 0.1)
+    assert measured("rmse_m", lateral) == pytest.approx(0.1, rel=1e-12)
+    assert not measured("departures", lateral)
+    late = np.where(TIME <= 2.1 + 1e-9, 5.0, 0.1)
+    assert measured("max_deviation_m", late) == 5.0
+    switched = measured("rmse_after_switch_m", lateral, switching(when=10))
+    assert switched == pytest.approx(0.1)
+
+
+def test_exactly_the_three_seconds_after_a_switch_are_scored_apart():
+    """e_100 is the first after the switch; what it does is seen in the deviation of
+    x_101, which is lateral[100].
+    """
+    lateral = np.zeros(STEPS)
+    lateral[100:130] = 0.2
+    lateral[99] = lateral[130] = 7.0
+    rmse = measured("rmse_after_switch_m", lateral, switching())
+    assert rmse == pytest.approx(0.2, rel=1e-12)
+    lateral[129] = 0.0
+    assert measured("rmse_after_switch_m", lateral, switching()) < 0.2
+    short = np.full(25, 0.2), switching(steps=25, when=15)
+    assert measured("rmse_after_switch_m", *short) == pytest.approx(0.2)
+
+
+@pytest.mark.parametrize(
+    ("channel", "to", "counts"),
+    [(0, 0.3, True), (0, 0.88, False), (1, -8.0, True), (1, 5.0, False)],
+)
+def test_a_switch_is_a_jump_of_friction_or_wind(channel, to, counts):
+    envs = switching(channel=channel, to=to)
+    rmse = measured("rmse_after_switch_m", np.ones(STEPS), envs)
+    assert np.isnan(rmse) != counts
+
+
+@pytest.mark.parametrize(
+    ("steering", "rate"),
+    [(0.05 * TIME, 0.05), (0.01 * (np.arange(STEPS) % 2), 0.1), (0.3, 0.0)],
+)
+def test_smoothness_is_the_mean_steering_rate(steering, rate):
+    smoothness = measured("smoothness_rad_per_s", np.zeros(STEPS), steering=steering)
+    assert smoothness == pytest.approx(rate, rel=1e-9)
+
+
+@pytest.mark.parametrize(
+    ("deviation", "departed"),
+    [(0.84, False), (-0.84, False), (0.86, True), (-3.0, True), (np.nan, True)],
+)
+def test_a_car_departs_when_its_side_leaves_the_lane(deviation, departed):
+    """A lane of 3.5 m and a car of 1.8 m leave 0.85 m to either side."""
+    lateral = np.where(np.arange(STEPS) == 150, deviation, 0.0)
+    assert measured("departures", lateral) == departed
+
+
+@pytest.mark.parametrize("when", [0, 5, STEPS])
+def test_a_state_that_is_not_finite_is_a_departure_whenever_it_happens(when):
+    states = np.zeros((STEPS + 1, 4))
+    states[when, 3] = np.nan
+    assert measured("departures", np.zeros(STEPS), states=states)
+
+
 def batch():
     """Four constant deviations; all but the first meet a switch of friction."""
-    time, index = np.arange(1, STEPS + 1) * DT, np.arange(STEPS)
     parts, envs = [], np.repeat(CALM, len(LEVELS), axis=0)
     for number, level in enumerate(LEVELS):
-        flagged = index < round(level * STEPS)
-        part = episode(
-            np.full(STEPS, level),
-            steering=0.1 * level * time,
-            ess=np.full(STEPS, 100.0 * level),
-            healthy=~flagged,
-        )
-        parts.append(part)
+        healthy = np.arange(STEPS) >= round(level * STEPS)
+        signals = {"ess": 100.0 * level, "healthy": healthy}
+        steering = 0.1 * level * TIME
+        parts.append(episode(np.full(STEPS, level), steering=steering, **signals))
         envs[number, 100:, 0] = 0.3 if number else 0.9
-    joined = jax.tree.map(lambda *leaves: np.concatenate(leaves), *parts)
-    return joined, envs
+    return jax.tree.map(lambda *leaves: np.concatenate(leaves), *parts), envs
 
 
 def made(seed=0):
-    scores = score(*batch(), dt=DT)
-    return row(scores, about("sfkd", seeds=[seed]), (1.5, 2.5), {})
+    about = {"system": "sfkd", "scenario": "s3", "seeds": [seed]}
+    return row(score(*batch(), dt=DT), about, (1.5, 2.5), {})
 
 
 def mean_of(value):
@@ -64,14 +157,16 @@ def mean_of(value):
 
 
 @pytest.mark.parametrize("metric", MEASURED, ids=lambda metric: metric.name)
-def test_a_metric_measures_episodes_one_by_one_and_pools_to_json(metric):
+def test_a_metric_measures_episodes_one_by_one_by_the_signals_it_names(metric):
     joined, envs = batch()
     values = score(joined, envs, dt=DT)[metric.name]
     assert values.shape == (len(LEVELS),)
     for k, value in enumerate(values):
         alone = jax.tree.map(lambda leaf, k=k: leaf[k : k + 1], joined)
-        own = score(alone, envs[k : k + 1], dt=DT)[metric.name]
-        np.testing.assert_array_equal(own, [value])
+        parts = {one: getattr(alone, one) for one in ("lateral", "states", "controls")}
+        named = {name: alone.signals[name] for name in metric.records}
+        run = Recording(dt=DT, envs=envs[k : k + 1], signals=named, **parts)
+        np.testing.assert_array_equal(metric.measure(run), [value])
     for entry in (made(), pool([made(0), made(1)])):
         json.dumps(entry[metric.name], allow_nan=False)
 
@@ -80,40 +175,24 @@ def test_a_metric_measures_episodes_one_by_one_and_pools_to_json(metric):
 def test_a_metric_of_known_episodes_is_exact_and_pools_as_stated(name):
     metric = BY_NAME[name]
     per_episode, of_row, of_seeds = EXPECTED[name]
-    np.testing.assert_allclose(
-        score(*batch(), dt=DT)[metric.name], per_episode, rtol=1e-12
-    )
+    pooled, values = pool([made(0), made(1)]), score(*batch(), dt=DT)[name]
+    np.testing.assert_allclose(values, per_episode, rtol=1e-12)
     np.testing.assert_allclose(mean_of(metric.value(made())), of_row, rtol=1e-12)
-    pooled = pool([made(0), made(1)])
     np.testing.assert_allclose(mean_of(metric.value(pooled)), of_seeds, rtol=1e-12)
-    assert pool([made()]) == made()
 
 
 @pytest.mark.parametrize("metric", SHOWN, ids=lambda metric: metric.name)
-@pytest.mark.parametrize(
-    "value", [None, math.nan, math.inf, "text", [], [None, 1.0], {}, {"mean": None}]
-)
-def test_what_is_no_number_is_written_as_a_dash(metric, value):
-    assert metric.write(value) == DASH
-    keys = metric.name.split(".")
-    record = {"v1_tube": "certified"} if keys[0] == "violation" else {}
-    nested = {keys[0]: record | {keys[-1]: value}} if keys[1:] else {keys[0]: value}
-    for mm in (False, True):
-        assert metric.text(nested, mm=mm) == DASH
-        assert metric.text({}, mm=mm) == DASH
-
-
-@pytest.mark.parametrize("metric", SHOWN, ids=lambda metric: metric.name)
-def test_a_shown_metric_has_a_label_of_its_own_and_a_table(metric):
-    assert metric.table
+def test_a_shown_metric_has_a_table_and_writes_what_is_no_number_as_a_dash(metric):
     assert metric in in_table(metric.table)
     assert [one.label for one in METRICS].count(metric.label) == 1
     assert metric.head() == metric.label + (f" [{metric.unit}]" if metric.unit else "")
-    written = metric.write([0.25, 0.5] if metric.name.endswith("ci95") else 0.25)
-    assert written not in (DASH, "")
-    if metric.mm is not None:
-        assert metric.unit == "m"
-        assert metric.head(mm=True).endswith("[mm]")
+    assert metric.write([0.25, 0.5] if metric.name.endswith("ci95") else 0.25) != DASH
+    assert metric.mm is None or metric.head(mm=True).endswith("[mm]")
+    key, *rest = metric.name.split(".")
+    for value in (None, math.nan, math.inf, "text", [], [None, 1.0], {}):
+        assert metric.write(value) == DASH
+        record = {"v1_tube": "certified", rest[0]: value} if rest else value
+        assert metric.text({key: record}, mm=True) == DASH
 
 
 def test_names_are_unique_and_measured_metrics_can_be_pooled():
@@ -141,21 +220,20 @@ def test_a_metric_is_written_with_its_digits(name, record, text, in_mm):
 
 
 def test_a_claim_is_read_for_the_tube_it_is_about():
-    certified, conformal = (
-        BY_NAME["violation.v1"],
-        BY_NAME["violation.v1_conformal"],
-    )
+    certified, conformal = BY_NAME["violation.v1"], BY_NAME["violation.v1_conformal"]
     own = {"v1": 0.1, "v1_tube": "certified", "v1_conformal": 0.2}
     in_use = {"v1": 0.3, "v1_tube": "conformal", "v1_conformal": 0.3}
-    assert certified.value({"violation": own}) == 0.1
-    assert conformal.value({"violation": own}) == 0.2
-    assert certified.value({"violation": in_use}) is None
-    assert conformal.value({"violation": in_use}) == 0.3
+    values = [
+        one.value({"violation": v})
+        for one in (certified, conformal)
+        for v in (own, in_use)
+    ]
+    assert values == [0.1, None, 0.2, 0.3]
 
 
 def test_a_new_metric_takes_one_entry(monkeypatch):
-    def largest_steering(drive):
-        return np.max(np.abs(drive.controls[..., 0]), axis=1)
+    def largest_steering(run):
+        return np.max(np.abs(run.controls[..., 0]), axis=1)
 
     new = Metric(
         "largest_steering_rad",
@@ -179,18 +257,6 @@ def test_a_printed_table_is_aligned_and_in_millimetres():
     ]
     head, *lines = text_table(rows, "rmse_m", "max_deviation_m")
     assert head.split("   ")[-1] == "Largest deviation [mm]"
-    assert [line.split() for line in lines] == [
-        ["sfkd", "34.2", "137"],
-        ["nominal", "120.0", DASH],
-    ]
+    words = [line.split() for line in lines]
+    assert words == [["sfkd", "34.2", "137"], ["nominal", "120.0", DASH]]
     assert len({len(line) for line in (head, *lines)}) == 1
-
-
-@pytest.mark.parametrize("metric", MEASURED, ids=lambda metric: metric.name)
-def test_a_metric_names_the_signals_that_it_needs(metric):
-    """Then an entry of the table is all that a new metric takes."""
-    joined, envs = batch()
-    fields = {name: getattr(joined, name) for name in ("lateral", "states", "controls")}
-    named = {name: joined.signals[name] for name in metric.records}
-    alone = metric.measure(Recording(dt=DT, envs=envs, **fields, signals=named))
-    np.testing.assert_array_equal(alone, score(joined, envs, dt=DT)[metric.name])

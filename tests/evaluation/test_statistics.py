@@ -7,15 +7,15 @@ from scipy import stats
 from sfkd_jax.evaluation import (
     holm,
     mean_interval,
-    mean_squares,
     p_value,
     paired_difference,
+    summary,
 )
 
 DRAWS = 2000
-SIZES = [(3, 16), (3, 12), (5, 16), (10, 200)]
+SIZES = [(3, 16), (5, 16), (10, 200)]
 """Trainings and episodes of the benchmarks."""
-DEVIATIONS = [(0.0, 1.0, 0.3), (0.3, 1.0, 0.5), (1.0, 1.0, 1.0), (1.0, 0.3, 0.3)]
+DEVIATIONS = [(0.0, 1.0, 0.3), (0.3, 1.0, 0.5), (1.0, 0.3, 0.3)]
 """Of trainings, episodes and the rest."""
 HARDEST = (0.36, 0.0, 0.59)
 """Trainings vary, and their variance is seldom seen beside that of the rest."""
@@ -44,39 +44,31 @@ def test_the_interval_covers_the_mean_of_all_trainings_and_episodes(size, deviat
     assert 0.927 <= coverage(crossed(random, size, deviations)) <= 0.983
 
 
-def test_the_coverage_where_it_is_least():
-    """91.5 % over 20 000 draws."""
+def test_the_coverage_where_it_is_least_and_of_a_skewed_error():
+    """91.5 % over 20 000 draws; errors of kinematic S3 have a log deviation of 0.5."""
     tables = crossed(np.random.default_rng(2), (3, 16), HARDEST)
     assert 0.895 <= coverage(tables) <= 0.935
-
-
-def test_the_coverage_of_a_skewed_error():
-    """Errors as those of kinematic S3, whose logarithms have a deviation of 0.5."""
     random = np.random.default_rng(3)
     tables = np.exp(0.5 * random.standard_normal((5 * DRAWS, 1, 16)))
     assert 0.915 <= coverage(tables - np.exp(0.125)) <= 0.94
 
 
-@pytest.mark.parametrize("size", [(3, 16), (10, 200)])
-def test_episodes_of_one_training_are_not_that_many_trials(size):
-    random = np.random.default_rng(6)
-    tables = crossed(random, size, (1.0, 0.3, 0.3), 200)
+def test_episodes_of_one_training_are_not_that_many_trials():
+    tables = crossed(np.random.default_rng(6), (3, 16), (1.0, 0.3, 0.3), 200)
     assert coverage(tables.reshape(200, -1)) < 0.75 < coverage(tables)
 
 
-def test_one_training_has_the_t_interval_of_its_episodes():
+@pytest.mark.parametrize("shape", [(12,), (1, 12), (12, 1)])
+def test_a_single_training_or_episode_has_the_t_interval_and_test_of_the_others(shape):
     values = np.random.default_rng(7).standard_exponential(12)
     ends = stats.t.interval(0.95, 11, values.mean(), stats.sem(values))
-    for shaped in (values, values[None]):
-        mean, interval = mean_interval(shaped)
-        assert mean == pytest.approx(values.mean())
-        np.testing.assert_allclose(interval, ends)
-
-
-def test_many_trainings_of_one_episode_have_their_t_interval():
-    values = np.random.default_rng(8).standard_normal((9, 1))
-    ends = stats.t.interval(0.95, 8, values.mean(), stats.sem(values[:, 0]))
-    np.testing.assert_allclose(mean_interval(values)[1], ends)
+    mean, interval = mean_interval(values.reshape(shape))
+    assert mean == pytest.approx(values.mean())
+    np.testing.assert_allclose(interval, ends)
+    for other in (0.5, 1.0, 5.0):
+        expected = stats.ttest_1samp(values, other).pvalue
+        p = p_value(values.reshape(shape) - other)
+        assert p == pytest.approx(expected, rel=1e-6)
 
 
 def test_the_p_value_is_the_level_at_which_the_interval_touches_zero():
@@ -89,35 +81,22 @@ def test_the_p_value_is_the_level_at_which_the_interval_touches_zero():
         assert p_value(table + 1e6) == 0.0
 
 
-def test_the_p_value_of_one_training_is_that_of_a_t_test_over_episodes():
-    values = np.random.default_rng(9).standard_exponential(16)
-    for mean in (0.5, 1.0, 5.0):
-        expected = stats.ttest_1samp(values, mean).pvalue
-        assert p_value(values - mean) == pytest.approx(expected, rel=1e-6)
-    assert p_value(np.ones(16)) == 0.0
-
-
-def told_apart(deviations, level):
-    """Share of simulated pairs of equal rows with a p below a level."""
+@pytest.mark.parametrize(
+    ("deviations", "least", "most"),
+    [(DEVIATIONS[1], 0, 0.012), (HARDEST, 0.018, 0.032)],
+)
+def test_equal_rows_are_seldom_told_apart(deviations, least, most):
+    """At the level of Holm's first step in a family of 20, as the docstring has it."""
     tables = crossed(np.random.default_rng(12), (3, 16), deviations, 5 * DRAWS)
-    return np.mean([p_value(table) < level for table in tables])
-
-
-@pytest.mark.parametrize("deviations", DEVIATIONS)
-def test_equal_rows_are_seldom_told_apart(deviations):
-    """At the level that Holm's first step has in a family of 20."""
-    assert told_apart(deviations, 0.05 / 20) <= 0.012
-
-
-def test_where_equal_rows_are_told_apart_most_often():
-    """Where the trainings vary and often do not show it; the docstring has the share."""
-    assert 0.018 <= told_apart(HARDEST, 0.05 / 20) <= 0.032
+    assert least <= np.mean([p_value(table) < 0.05 / 20 for table in tables]) <= most
 
 
 def test_what_cannot_be_tested_has_neither_interval_nor_p():
     assert mean_interval(np.asarray([2.0])) == (2.0, None)
+    assert summary(np.asarray([0.3]))["std"] is None
     assert p_value(np.asarray([2.0])) is None
     assert p_value(np.asarray([1.0, np.nan])) is None
+    assert p_value(np.ones(16)) == 0.0
 
 
 def test_holm_raises_p_values_in_order_and_never_above_one():
@@ -127,13 +106,6 @@ def test_holm_raises_p_values_in_order_and_never_above_one():
     assert holm([0.01, 0.04], not_made=3) == holm([0.01, 0.04, 1.0, 1.0, 1.0])[:2]
     assert holm([]) == []
     assert holm([0.6, 0.7]) == [1.0, 1.0]
-
-
-def test_holm_keeps_a_family_without_differences_free_of_findings():
-    """At least 95 % of families of 20 true null hypotheses have no rejection."""
-    random = np.random.default_rng(10)
-    clean = [min(holm(random.uniform(size=20).tolist())) >= 0.05 for _ in range(DRAWS)]
-    assert np.mean(clean) >= 0.935
 
 
 def test_pairing_sees_a_small_difference_that_separate_intervals_hide():
@@ -146,14 +118,9 @@ def test_pairing_sees_a_small_difference_that_separate_intervals_hide():
     assert paired["p"] < 1e-6
     ours_alone, theirs_alone = mean_interval(ours)[1], mean_interval(theirs)[1]
     assert ours_alone[1] > theirs_alone[0]  # unpaired: they overlap
-    assert np.ptp(paired["ci95"]) < 0.1 * np.ptp(ours_alone)
-
-
-def test_a_constant_gain_is_certain_when_paired():
-    values = np.random.default_rng(4).standard_exponential(20)
-    paired = paired_difference(values + 0.125, values)
-    np.testing.assert_allclose(paired["ci95"], [0.125, 0.125], atol=1e-12)
-    assert paired_difference(values, values)["p"] == 1.0
+    constant = paired_difference(ours + 0.125, ours)
+    np.testing.assert_allclose(constant["ci95"], [0.125, 0.125], atol=1e-12)
+    assert paired_difference(ours, ours)["p"] == 1.0
 
 
 def test_trainings_that_the_other_row_lacks_do_not_count_and_one_is_compared_with_all():
@@ -166,10 +133,11 @@ def test_trainings_that_the_other_row_lacks_do_not_count_and_one_is_compared_wit
     )
 
 
-def test_mean_squares_have_the_expectations_of_their_variances():
-    random = np.random.default_rng(11)
-    tables = crossed(random, (3, 16), (0.5, 1.0, 0.7))
-    means = np.mean([mean_squares(table) for table in tables], axis=0)
-    rest = 0.7**2
-    expected = 16 * 0.5**2 + rest, 3 * 1.0**2 + rest, rest
-    np.testing.assert_allclose(means, expected, rtol=0.07)
+def test_a_summary_holds_what_it_says():
+    values = np.random.default_rng(0).normal(3.0, 2.0, 400)
+    result = summary(values)
+    quantiles = np.quantile(values, [0.5, 0.95, 1.0])
+    expected = [values.mean(), values.std(ddof=1), *quantiles]
+    names = ("mean", "std", "median", "p95", "worst")
+    np.testing.assert_allclose([result[name] for name in names], expected)
+    assert result["ci95"] == mean_interval(values)[1]

@@ -30,7 +30,7 @@ from sfkd_jax.certification._document import output_metrics_from
 from sfkd_jax.certification._tubes import residuals
 from sfkd_jax.control import PathLaw, safety_filter
 from sfkd_jax.data import drive_switching, generate_s3_along_path
-from sfkd_jax.evaluation import Outcome, Tube, attack_corridor, outcome_of
+from sfkd_jax.evaluation import CorridorAttack, Outcome, Tube, outcome_of
 from sfkd_jax.geometry import LATERAL, PERTURBATION
 from sfkd_jax.plants import Vehicle, along_path
 from sfkd_jax.ranges import Interval, Span
@@ -225,9 +225,7 @@ def _attack(
     width, bound = bounds["nominal"], bounds["vehicle_to_nominal_position"]
     factor = jnp.asarray(np.linalg.cholesky(claim.metric), dtype=float)
     tube = Tube(claim.alpha, claim.lipschitz, factor, bound)
-    search = partial(
-        attack_corridor, loop.plant, model, tube=tube, perturbation=limit, **options
-    )
+    search = CorridorAttack(loop.plant, model, tube, perturbation=limit, **options)
     found = jax.jit(search)(params, key)
 
     def shielded(run: Any) -> Outcome:
@@ -247,7 +245,7 @@ def _attack(
 
         return outcome_of(loop.plant, model, params, tube, run, apply_filter)
 
-    held = jax.jit(jax.vmap(jax.vmap(shielded)))(found.drives)
+    held = jax.jit(jax.vmap(jax.vmap(shielded)))(found.runs)
     # The corridor is claimed only while the disturbances keep their bound
     within = np.asarray(held.radius) <= bound
     worst = {

@@ -1,25 +1,21 @@
 """Closed-loop and open-loop evaluation: episodes, scores and their statistics."""
 
-from sfkd_jax.evaluation._baselines import baselines as baselines
-from sfkd_jax.evaluation._baselines import bicycle_step as bicycle_step
-from sfkd_jax.evaluation._baselines import fit_bicycle as fit_bicycle
 from sfkd_jax.evaluation._closed_loop import Episode as Episode
-from sfkd_jax.evaluation._closed_loop import first_reference as first_reference
-from sfkd_jax.evaluation._closed_loop import over_episodes as over_episodes
-from sfkd_jax.evaluation._closed_loop import simulate as simulate
-from sfkd_jax.evaluation._corridor_attack import AIMS as AIMS
-from sfkd_jax.evaluation._corridor_attack import Outcome as Outcome
-from sfkd_jax.evaluation._corridor_attack import Tube as Tube
-from sfkd_jax.evaluation._corridor_attack import attack_corridor as attack_corridor
-from sfkd_jax.evaluation._corridor_attack import outcome_of as outcome_of
-from sfkd_jax.evaluation._environment import (
+from sfkd_jax.evaluation._closed_loop import (
     disturbed_environment as disturbed_environment,
 )
-from sfkd_jax.evaluation._environment import (
+from sfkd_jax.evaluation._closed_loop import first_reference as first_reference
+from sfkd_jax.evaluation._closed_loop import (
     observed_environment as observed_environment,
 )
+from sfkd_jax.evaluation._closed_loop import over_episodes as over_episodes
+from sfkd_jax.evaluation._closed_loop import simulate as simulate
+from sfkd_jax.evaluation._corridor_attack import CorridorAttack as CorridorAttack
+from sfkd_jax.evaluation._corridor_attack import Outcome as Outcome
+from sfkd_jax.evaluation._corridor_attack import Tube as Tube
+from sfkd_jax.evaluation._corridor_attack import outcome_of as outcome_of
+from sfkd_jax.evaluation._open_loop import baselines as baselines
 from sfkd_jax.evaluation._open_loop import open_loop as open_loop
-from sfkd_jax.evaluation._rows import IDENTITY as IDENTITY
 from sfkd_jax.evaluation._rows import ROAD as ROAD
 from sfkd_jax.evaluation._rows import SHARED as SHARED
 from sfkd_jax.evaluation._rows import Scores as Scores
@@ -34,15 +30,12 @@ from sfkd_jax.evaluation._rows import row as row
 from sfkd_jax.evaluation._rows import score as score
 from sfkd_jax.evaluation._statistics import holm as holm
 from sfkd_jax.evaluation._statistics import mean_interval as mean_interval
-from sfkd_jax.evaluation._statistics import mean_squares as mean_squares
 from sfkd_jax.evaluation._statistics import p_value as p_value
 from sfkd_jax.evaluation._statistics import paired_difference as paired_difference
 from sfkd_jax.evaluation._statistics import summary as summary
-from sfkd_jax.evaluation._violations import STRIDE as STRIDE
 from sfkd_jax.evaluation._violations import ClaimedBounds as ClaimedBounds
 from sfkd_jax.evaluation._violations import Predictions as Predictions
 from sfkd_jax.evaluation._violations import predictions as predictions
-from sfkd_jax.evaluation._violations import theorem_reach as theorem_reach
 from sfkd_jax.evaluation._violations import theorem_violations as theorem_violations
 from sfkd_jax.evaluation._violations import threshold_violations as threshold_violations
 from sfkd_jax.evaluation._violations import tube_violations as tube_violations

@@ -1,8 +1,9 @@
-"""Simulate closed-loop episodes: plant, controller and scenario in one scan."""
+"""Closed-loop episodes in one scan, with imperfect sensors and unmeasured forces."""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
+from functools import partial
 from typing import Any, NamedTuple, TypeVar
 
 import jax
@@ -10,8 +11,24 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from sfkd_jax.evaluation.metrics import SIGNALS, Signal
-from sfkd_jax.scenarios import Scenario, project, reference_window
+from sfkd_jax.plants import Vehicle, equivalent_wind
+from sfkd_jax.ranges import Real
+from sfkd_jax.scenarios import (
+    Scenario,
+    project,
+    random_side_forces,
+    reference_window,
+)
 from sfkd_jax.types import Controller, Key, Params, Scalar, State, Step
+
+FORCE_STREAM = 2
+SENSOR_STREAM = 3
+"""Folded into an episode's key; `split` gives the planner and the state sensors the
+streams 0 and 1.
+"""
+LEAST_FRICTION = 0.05
+
+Result = TypeVar("Result")
 
 
 class Episode(NamedTuple):
@@ -36,9 +53,6 @@ class Episode(NamedTuple):
     signals: dict[str, Any]
 
 
-Result = TypeVar("Result")
-
-
 def over_episodes(run: Callable[..., Result]) -> Callable[..., Result]:
     """Return the function that runs every episode of a batch.
 
@@ -48,9 +62,6 @@ def over_episodes(run: Callable[..., Result]) -> Callable[..., Result]:
 
     Args:
         run: one episode, such as `simulate` with its first arguments bound.
-
-    Returns:
-        A function of the same arguments with a leading axis of episodes.
     """
     if jax.default_backend() != "cpu" or len(jax.devices()) > 1:
         return jax.vmap(run)
@@ -90,7 +101,9 @@ def simulate(
     # Sensors have their own stream: two systems meet the same noise.
     planner_key, noise_key = jax.random.split(key)
     wanted = SIGNALS | dict(record or {})
-    spread = _noise_levels(observation_noise, scenario.initial_state)
+    known = jnp.asarray(observation_noise, dtype=float)[: len(scenario.initial_state)]
+    # A state that no level is given for is observed as it is.
+    spread = jnp.zeros_like(scenario.initial_state).at[: len(known)].set(known)
     noise_keys = jax.random.split(noise_key, scenario.envs.shape[0])
 
     def step(
@@ -122,12 +135,6 @@ def simulate(
     return Episode(jnp.concatenate([scenario.initial_state[None], states]), *rest)
 
 
-def _noise_levels(observation_noise: tuple[float, ...], state: State) -> State:
-    """Standard deviation of every state's sensor; 0 where none is given."""
-    known = jnp.asarray(observation_noise, dtype=float)[: state.shape[0]]
-    return jnp.zeros_like(state).at[: known.shape[0]].set(known)
-
-
 def first_reference(
     scenario: Scenario, *, horizon: int, dt: float
 ) -> Float[Array, "horizon 4"]:
@@ -135,3 +142,71 @@ def first_reference(
     return reference_window(
         scenario.path, jnp.zeros(()), scenario.speed, dt=dt, horizon=horizon
     )
+
+
+def observed_environment(
+    envs: Float[Array, "time 2"],
+    key: Key,
+    *,
+    dt: float,
+    delay_s: float = 0.0,
+    noise: tuple[float, float] = (0.0, 0.0),
+    bias: tuple[Real, Real] = (0.0, 0.0),
+) -> Float[Array, "time 2"]:
+    """Return ê_k = e_{k−d} + b + n_k: delayed, biased, with white noise.
+
+    Until the first delayed value arrives, the first value of the episode is observed.
+    Observed friction is at least 0.05.
+
+    Args:
+        envs: the true environment.
+        key: of the episode, not consumed: its other streams stay what they are.
+        dt: sampling period [s].
+        delay_s: d in seconds.
+        noise: standard deviations of friction [-] and wind [m/s].
+        bias: of the same.
+    """
+    steps = round(delay_s / dt)
+    # Until something arrives, a sensor shows what it showed before the start.
+    delayed = jnp.concatenate([jnp.tile(envs[:1], (steps, 1)), envs])[: envs.shape[0]]
+    white = jnp.asarray(noise) * jax.random.normal(
+        jax.random.fold_in(key, SENSOR_STREAM), envs.shape
+    )
+    observed = delayed + jnp.asarray(bias) + white
+    # A perfect sensor passes e on as it is, bit for bit, and below 0.05 too.
+    faulty = steps or any(noise) or any(bias)
+    return observed.at[:, 0].max(LEAST_FRICTION) if faulty else envs
+
+
+def disturbed_environment(
+    plant: Vehicle,
+    envs: Float[Array, "time 2"],
+    key: Key,
+    *,
+    largest: float | Float[Array, ""],
+) -> Float[Array, "time 2"]:
+    """Return the environment with random side forces, expressed as additional wind.
+
+    Args:
+        plant: whose wind force it is.
+        envs: the environment without these forces.
+        key: of the episode, not consumed: its other streams stay what they are.
+        largest: F, forces lie in [-F, F] [N].
+
+    Raises:
+        ValueError: a plant on which wind has no force.
+    """
+    if not plant.wind_force:
+        raise ValueError(
+            "evaluation.side_forces act through the wind, but vehicle.wind_force is 0"
+        )
+    force = random_side_forces(
+        jax.random.fold_in(key, FORCE_STREAM),
+        steps=envs.shape[0],
+        dt=plant.dt,
+        largest=largest,
+    )
+    wind = jax.vmap(partial(equivalent_wind, wind_force=plant.wind_force))(
+        envs[:, 1], force
+    )
+    return envs.at[:, 1].set(wind)

@@ -1,9 +1,9 @@
-"""Search for the worst drives along a corridor by the cross-entropy method."""
+"""Search for the worst runs along a corridor by the cross-entropy method."""
 
 from __future__ import annotations
 
 from collections.abc import Callable
-from functools import partial
+from dataclasses import dataclass
 from typing import Any, NamedTuple
 
 import jax
@@ -18,23 +18,25 @@ BLOCK = 5
 """Steps for which the attack holds ν."""
 GENERATIONS = 10
 AIMS = ("lateral", "distance", "within")
-"""Far from the path; far from the copy; far from the copy while the tube's hypothesis
-holds.
+"""Far from the path; far from the nominal model; far from it while the tube's
+hypothesis holds.
 """
 ELITE = 0.1
-"""Share of a generation that the next one is drawn around."""
+"""Part of a generation that the next one is drawn around."""
+
+Genes = dict[str, Array]
 
 
-class Drives(NamedTuple):
-    """Inputs of drives.
+class Runs(NamedTuple):
+    """Inputs of runs.
 
     Attributes:
-        inputs: w, (drive, time, 4).
-        envs: e, (drive, time, environment).
+        inputs: w, (run, time, 4).
+        envs: e, (run, time, environment).
     """
 
-    inputs: Float[Array, "drive time 4"]
-    envs: Float[Array, "drive time environment"]
+    inputs: Float[Array, "run time 4"]
+    envs: Float[Array, "run time environment"]
 
 
 class Tube(NamedTuple):
@@ -56,191 +58,149 @@ class Tube(NamedTuple):
 
 
 class Outcome(NamedTuple):
-    """Largest values of a drive, (drive,).
+    """Largest values over a run, (run,).
 
     Attributes:
         lateral: |e_y| [m].
-        distance: |e_y − ê_y| from a copy with the same inputs [m].
-        radius: of the tube, from the disturbances of this drive [m].
+        distance: |e_y − ê_y| from the nominal model with the same inputs [m].
+        radius: of the tube, from the disturbances of this run [m].
     """
 
-    lateral: Float[Array, " drive"]
-    distance: Float[Array, " drive"]
-    radius: Float[Array, " drive"]
+    lateral: Float[Array, " run"]
+    distance: Float[Array, " run"]
+    radius: Float[Array, " run"]
 
 
-class WorstDrives(NamedTuple):
-    """The worst drives of each aim, (aim, drive, …), see `AIMS`."""
+class WorstRuns(NamedTuple):
+    """The worst runs of each aim, (aim, run, …), see `AIMS`."""
 
-    drives: Drives
+    runs: Runs
     outcome: Outcome
 
 
-class _Roads(NamedTuple):
-    """Ranges of roads and environments, as in `attack_corridor`."""
+@dataclass(frozen=True, eq=False)
+class CorridorAttack:
+    """A search for the worst runs, with a third of the steps for each of `AIMS`.
 
-    dt: float
-    env_low: Float[Array, " environment"]
-    env_high: Float[Array, " environment"]
+    ν is held for `BLOCK` steps within ±`perturbation`, e for the dwell time anywhere in
+    its box, the road is a sinusoid of any wavelength and phase within the conditions
+    at a constant speed. The result is a lower bound of the worst case.
+
+    Attributes:
+        loop: the true plant along a path.
+        model: the nominal model.
+        tube: that is claimed.
+        env_low: lower corner of the box of e.
+        env_high: upper corner of the box of e.
+        perturbation: largest |ν|.
+        speed: range [m/s].
+        peak_curvature: of the roads [1/m].
+        wavelengths: range, of the roads [m].
+        lateral_acceleration: largest on the roads [m/s²].
+        dwell: least time between switches of e [s].
+        steps: in all.
+        length: of a run, in steps.
+        keep: worst runs returned per aim.
+    """
+
+    loop: Vehicle
+    model: Model
+    tube: Tube
+    env_low: tuple[float, ...]
+    env_high: tuple[float, ...]
     perturbation: Float[Array, " 2"]
     speed: tuple[float, float]
     peak_curvature: float
     wavelengths: tuple[float, float]
     lateral_acceleration: float
+    dwell: float
+    steps: int
+    length: int = 200
+    keep: int = 20
 
+    def __call__(self, params: Params, key: Key) -> WorstRuns:
+        """Search with the folded parameters of the nominal model."""
+        keys = jax.random.split(key, len(AIMS))
+        worst = [self._worst(params, *of) for of in zip(AIMS, keys, strict=True)]
+        return WorstRuns(*jax.tree.map(lambda *leaves: jnp.stack(leaves), *worst))
 
-class _Search(NamedTuple):
-    """The settings of one search.
+    @property
+    def _held(self) -> int:
+        """Steps between switches of e."""
+        return max(1, round(self.dwell / self.loop.dt))
 
-    Attributes:
-        tube: that is attacked.
-        shapes: of the genes by name.
-        population: drives per generation.
-        keep: worst drives kept per generation.
-        drive: genes -> inputs of a drive.
-        outcome: a batch of drives -> their outcomes.
-    """
-
-    tube: Tube
-    shapes: dict[str, tuple[int, ...]]
-    population: int
-    keep: int
-    drive: Callable[[dict[str, Array]], Drives]
-    outcome: Callable[[Drives], Outcome]
-
-
-def attack_corridor(
-    loop: Vehicle,
-    model: Model,
-    params: Params,
-    key: Key,
-    tube: Tube,
-    *,
-    env_low: tuple[float, ...],
-    env_high: tuple[float, ...],
-    perturbation: Float[Array, " 2"],
-    speed: tuple[float, float],
-    peak_curvature: float,
-    wavelengths: tuple[float, float],
-    lateral_acceleration: float,
-    dwell: float,
-    steps: int = 1_000_000,
-    length: int = 200,
-    keep: int = 20,
-) -> WorstDrives:
-    """Search for the worst drives, with a third of the steps for each of `AIMS`.
-
-    ν is held for `BLOCK` steps within ±`perturbation`, e for the dwell time anywhere in
-    E, the road is a sinusoid of any wavelength and phase of the class at a constant
-    speed. The result is a lower bound of the worst case.
-
-    Args:
-        loop: the true plant along a path.
-        model: of the copy.
-        params: of the copy, folded.
-        key: consumed.
-        tube: that is claimed.
-        env_low: lower corner of E.
-        env_high: upper corner of E.
-        perturbation: largest |ν|.
-        speed: range, see `datasets.drive_along_path`.
-        peak_curvature: of the roads.
-        wavelengths: of the roads.
-        lateral_acceleration: largest on the roads.
-        dwell: least time between switches [s].
-        steps: in all.
-        length: of a drive.
-        keep: worst drives returned per aim.
-    """
-    held = max(1, round(dwell / loop.dt))
-    roads = _Roads(
-        dt=loop.dt,
-        env_low=jnp.asarray(env_low),
-        env_high=jnp.asarray(env_high),
-        perturbation=perturbation,
-        speed=speed,
-        peak_curvature=peak_curvature,
-        wavelengths=wavelengths,
-        lateral_acceleration=lateral_acceleration,
-    )
-    search = _Search(
-        tube=tube,
-        shapes={
-            "nu": (-(-length // BLOCK), 2),
-            "env": (-(-length // held), len(env_low)),
+    @property
+    def _shapes(self) -> dict[str, tuple[int, ...]]:
+        """Shapes of the genes of a run."""
+        return {
+            "nu": (-(-self.length // BLOCK), 2),
+            "env": (-(-self.length // self._held), len(self.env_low)),
             "road": (4,),
-        },
-        population=max(keep, steps // (len(AIMS) * GENERATIONS * length)),
-        keep=keep,
-        drive=partial(_drive, roads, length=length, held=held),
-        outcome=jax.vmap(partial(outcome_of, loop, model, params, tube)),
-    )
-    keys = jax.random.split(key, len(AIMS))
-    worst = [_attack(search, aim, k) for aim, k in zip(AIMS, keys, strict=True)]
-    return WorstDrives(*jax.tree.map(lambda *leaves: jnp.stack(leaves), *worst))
+        }
 
-
-def _drive(roads: _Roads, genes: dict[str, Array], *, length: int, held: int) -> Drives:
-    """Inputs of one drive from its genes."""
-    nu = (
-        # Saturates: the worst ν are mostly at the limits.
-        jnp.repeat(jnp.tanh(2.0 * genes["nu"]), BLOCK, axis=0)[:length]
-        * roads.perturbation
-    )
-    low, high = roads.env_low, roads.env_high
-    envs = low + (high - low) * jnp.repeat(_share(genes["env"]), held, axis=0)[:length]
-    fast, wave, phase, tight = _share(genes["road"])
-    speed = roads.speed[0] + (roads.speed[1] - roads.speed[0]) * fast
-    shortest, longest = roads.wavelengths
-    wavelength = shortest + (longest - shortest) * wave
-    # Fast roads are gentle, as in the conditions of the corridor.
-    peak = jnp.minimum(roads.peak_curvature, roads.lateral_acceleration / speed**2)
-    along = jnp.arange(length) * speed * roads.dt
-    bend = jnp.clip(
-        (1.0 + tight) * jnp.sin(2 * jnp.pi * (along / wavelength + phase)), -1.0, 1.0
-    )
-    return Drives(jnp.column_stack([nu, peak * bend, jnp.full(length, speed)]), envs)
-
-
-def _attack(search: _Search, aim: str, key: Key) -> tuple[Drives, Outcome]:
-    """The worst drives of one aim over all generations."""
-    mean = {name: jnp.zeros(shape) for name, shape in search.shapes.items()}
-    start = mean, jax.tree.map(jnp.ones_like, mean)
-    keys = jax.random.split(key, GENERATIONS)
-    _, drives = jax.lax.scan(partial(_generation, search, aim), start, keys)
-    drives = jax.tree.map(lambda leaf: leaf.reshape(-1, *leaf.shape[2:]), drives)
-    worst = jnp.argsort(-_score(aim, drives[1], search.tube))[: search.keep]
-    return jax.tree.map(lambda leaf: leaf[worst], drives)
-
-
-def _generation(
-    search: _Search, aim: str, carry: Any, key: Key
-) -> tuple[Any, tuple[Drives, Outcome]]:
-    """Draw a generation and return the next distribution and the worst drives."""
-    mean, spread = carry
-    genes = {
-        name: mean[name]
-        + spread[name] * jax.random.normal(part, (search.population, *shape))
-        for part, (name, shape) in zip(
-            jax.random.split(key, len(search.shapes)),
-            search.shapes.items(),
-            strict=True,
+    def _run(self, genes: Genes) -> Runs:
+        """Inputs of one run from its genes."""
+        length = self.length
+        nu = (
+            # Saturates: the worst ν are mostly at the limits.
+            jnp.repeat(jnp.tanh(2.0 * genes["nu"]), BLOCK, axis=0)[:length]
+            * self.perturbation
         )
-    }
-    drives = jax.vmap(search.drive)(genes)
-    outcome = search.outcome(drives)
-    order = jnp.argsort(-_score(aim, outcome, search.tube))
-    best = order[: max(2, int(ELITE * search.population))]
-    elite = jax.tree.map(lambda leaf: leaf[best], genes)
-    mean = jax.tree.map(lambda leaf: jnp.mean(leaf, axis=0), elite)
-    # A floor under the spread: a search that has converged stops finding.
-    spread = jax.tree.map(lambda leaf: jnp.std(leaf, axis=0) + 0.1, elite)
-    worst = best[: search.keep]
-    return (mean, spread), jax.tree.map(lambda leaf: leaf[worst], (drives, outcome))
+        low, high = jnp.asarray(self.env_low), jnp.asarray(self.env_high)
+        env = jnp.repeat(_unit(genes["env"]), self._held, axis=0)[:length]
+        fast, wave, phase, tight = _unit(genes["road"])
+        speed = self.speed[0] + (self.speed[1] - self.speed[0]) * fast
+        shortest, longest = self.wavelengths
+        wavelength = shortest + (longest - shortest) * wave
+        # Fast roads are gentle, as in the conditions of the corridor.
+        peak = jnp.minimum(self.peak_curvature, self.lateral_acceleration / speed**2)
+        along = jnp.arange(length) * speed * self.loop.dt
+        sine = jnp.sin(2 * jnp.pi * (along / wavelength + phase))
+        # Clipped: a road that is tight throughout, not only at its peaks.
+        bend = jnp.clip((1.0 + tight) * sine, -1.0, 1.0)
+        inputs = jnp.column_stack([nu, peak * bend, jnp.full(length, speed)])
+        return Runs(inputs, low + (high - low) * env)
+
+    def _worst(self, params: Params, aim: str, key: Key) -> tuple[Runs, Outcome]:
+        """The worst runs of one aim over all generations."""
+        population = max(
+            self.keep, self.steps // (len(AIMS) * GENERATIONS * self.length)
+        )
+
+        def outcome(runs: Runs) -> Outcome:
+            return outcome_of(self.loop, self.model, params, self.tube, runs)
+
+        def generation(
+            carry: tuple[Genes, Genes], key: Key
+        ) -> tuple[Any, tuple[Runs, Outcome]]:
+            mean, spread = carry
+            keys = jax.random.split(key, len(self._shapes))
+            genes = {
+                name: mean[name]
+                + spread[name] * jax.random.normal(part, (population, *shape))
+                for part, (name, shape) in zip(keys, self._shapes.items(), strict=True)
+            }
+            runs = jax.vmap(self._run)(genes)
+            found = runs, jax.vmap(outcome)(runs)
+            best = jnp.argsort(-_score(aim, found[1], self.tube))
+            best = best[: max(2, int(ELITE * population))]
+            elite = jax.tree.map(lambda leaf: leaf[best], genes)
+            mean = jax.tree.map(lambda leaf: jnp.mean(leaf, axis=0), elite)
+            # A floor under the spread: a search that has converged stops finding.
+            spread = jax.tree.map(lambda leaf: jnp.std(leaf, axis=0) + 0.1, elite)
+            worst = best[: self.keep]
+            return (mean, spread), jax.tree.map(lambda leaf: leaf[worst], found)
+
+        mean = {name: jnp.zeros(shape) for name, shape in self._shapes.items()}
+        start = mean, jax.tree.map(jnp.ones_like, mean)
+        _, runs = jax.lax.scan(generation, start, jax.random.split(key, GENERATIONS))
+        runs = jax.tree.map(lambda leaf: leaf.reshape(-1, *leaf.shape[2:]), runs)
+        worst = jnp.argsort(-_score(aim, runs[1], self.tube))[: self.keep]
+        return jax.tree.map(lambda leaf: leaf[worst], runs)
 
 
 def _score(aim: str, outcome: Outcome, tube: Tube) -> Array:
-    """What an aim maximises; drives outside the hypothesis rank last for "within"."""
+    """What an aim maximises; runs outside the hypothesis rank last for "within"."""
     if aim == "within":
         # Outside the hypothesis nothing is claimed; nearer to it ranks higher.
         return jnp.where(
@@ -254,25 +214,24 @@ def outcome_of(
     model: Model,
     params: Params,
     tube: Tube,
-    drives: Drives,
+    run: Runs,
     safety_filter: Callable[..., Any] | None = None,
 ) -> Outcome:
-    """Return the outcome of one drive of the plant beside its copy; callers vmap.
+    """Return the outcome of one run of plant and nominal model; callers vmap.
 
     Both start on the path.
 
     Args:
         loop: the plant.
-        model: of the copy.
-        params: of the copy, folded.
+        model: the nominal model.
+        params: of the model, folded.
         tube: of e_y.
-        drives: inputs of one drive.
+        run: inputs of one run.
         safety_filter: (fiber, latent, ν, index) -> ν, or None for none.
     """
-    start = path_state(
-        jnp.zeros(len(loop.state_names) - 3).at[2].set(drives.inputs[0, 3])
-    )
-    latent = model.encode(model.fiber(params, drives.envs[0]), start)
+    rest = jnp.zeros(len(loop.state_names) - 3)
+    start = path_state(rest.at[2].set(run.inputs[0, 3]))
+    latent = model.encode(model.fiber(params, run.envs[0]), start)
 
     def step(
         carry: Any, given: tuple[Array, Environment, Array]
@@ -285,19 +244,19 @@ def outcome_of(
         expected = model.step(fiber, model.encode(fiber, state), inputs)
         state, latent = loop.step(state, inputs, env), model.step(fiber, latent, inputs)
         decoded = model.decode(fiber, latent), model.decode(fiber, expected)
-        true, copy, predicted = (x[BODY][LATERAL] for x in (state, *decoded))
+        true, nominal, predicted = (x[BODY][LATERAL] for x in (state, *decoded))
+        # The tube holds before its radius grows by the disturbance of this step.
         radius = tube.lipschitz * tube.alpha * error + jnp.abs(true - predicted)
         gap = model.vector(model.encode(fiber, state)) - model.vector(expected)
         error = tube.alpha * error + jnp.linalg.norm(gap @ tube.factor)
-        return (state, latent, error), Outcome(
-            jnp.abs(true), jnp.abs(true - copy), radius
-        )
+        values = Outcome(jnp.abs(true), jnp.abs(true - nominal), radius)
+        return (state, latent, error), values
 
-    given = (drives.inputs, drives.envs, jnp.arange(len(drives.inputs)))
+    given = (run.inputs, run.envs, jnp.arange(len(run.inputs)))
     _, outcomes = jax.lax.scan(step, (start, latent, jnp.zeros(())), given)
     return jax.tree.map(jnp.max, outcomes)
 
 
-def _share(gene: Array) -> Array:
+def _unit(gene: Array) -> Array:
     """Map a gene to [0, 1]; both ends are reached."""
     return jnp.clip(0.5 + 0.5 * gene, 0.0, 1.0)

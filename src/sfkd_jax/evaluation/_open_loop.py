@@ -1,17 +1,44 @@
-"""Open-loop prediction errors by horizon on held-out trajectories."""
+"""Open-loop prediction errors by horizon, of models and of naive predictors."""
 
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import dataclass
 from functools import partial
+from typing import Any, TypeAlias
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Float
 
-from sfkd_jax.geometry import HEADING, LATERAL, PATH_SPEED, wrap_angle
+from sfkd_jax.geometry import (
+    CURVATURE,
+    HEADING,
+    LATERAL,
+    PATH_SPEED,
+    path_step,
+    wrap_angle,
+)
+from sfkd_jax.geometry import path_state as as_path_state
 from sfkd_jax.rollout import in_batches, rollout, sliding_windows, state_errors
-from sfkd_jax.types import BODY, Model, Params, Trajectory
+from sfkd_jax.types import (
+    BODY,
+    Control,
+    Environment,
+    Model,
+    Params,
+    Scalar,
+    State,
+    Step,
+    Trajectory,
+)
+
+STEEP = 1.4
+"""Largest steering angle [rad]; larger numbers are no angles."""
+
+Predictor: TypeAlias = Callable[[Trajectory], Float[Array, "horizon state"]]
+"""Window of a trajectory -> its states after the first, predicted."""
 
 
 def open_loop(
@@ -34,57 +61,186 @@ def open_loop(
     Raises:
         ValueError: the horizon does not fit the trajectories.
     """
-    return prediction_rmse(
-        lambda window: rollout(model, params, window)[0],
-        trajectories,
-        horizon=horizon,
-        along_path=model.along_path,
+
+    def predict(window: Trajectory) -> Float[Array, "horizon state"]:
+        return rollout(model, params, window)[0]
+
+    return _prediction_rmse(
+        predict, trajectories, horizon=horizon, along_path=model.along_path
     )
 
 
-def prediction_rmse(
-    predict: Callable[[Trajectory], Float[Array, "horizon state"]],
-    trajectories: Trajectory,
-    *,
-    horizon: int,
-    along_path: bool,
+def _prediction_rmse(
+    predict: Predictor, trajectories: Trajectory, *, horizon: int, along_path: bool
 ) -> Float[Array, "horizon 4"]:
-    """Return the RMSE of any predictor, as `open_loop` does.
+    """The RMSE of any predictor; `along_path`: states are those of `path_step`."""
+    cut = jax.vmap(partial(sliding_windows, horizon=horizon, stride=horizon))
+    windows = jax.tree.map(
+        lambda leaf: leaf.reshape(-1, *leaf.shape[2:]), cut(trajectories)
+    )
+
+    def squares(window: Trajectory) -> Float[Array, "horizon 4"]:
+        predicted, true = predict(window), window.states[1:]
+        if not along_path:
+            return state_errors(predicted, true)[:, :4] ** 2
+        gap = (predicted - true)[:, BODY]
+        # Along a path nothing is predicted of the way along it.
+        still, yaw = jnp.zeros(gap.shape[0]), wrap_angle(gap[:, HEADING])
+        columns = [still, gap[:, LATERAL], yaw, gap[:, PATH_SPEED]]
+        return jnp.column_stack(columns) ** 2
+
+    return jnp.sqrt(jnp.mean(in_batches(squares, windows, size=128), axis=0))
+
+
+@dataclass(frozen=True, eq=False)
+class FittedBicycle:
+    """A kinematic bicycle with parameters fitted to data.
+
+        v̇ = a_0 + a_1 u_2 + a_2 v,   κ = k_0 + k_1 tan δ,   ψ̇ = v κ,
+        ṗ = v (cos(ψ + β), sin(ψ + β)),   β = b_0 + b_1 κ
+
+    Attributes:
+        acceleration: (a_0, a_1, a_2).
+        curvature: (k_0, k_1); 1/k_1 is the wheelbase [m].
+        slip: (b_0, b_1); b_1 is the distance of the position from the rear axle [m].
+        is_angle: whether u_1 is a steering angle δ; otherwise it replaces tan δ.
+        dt: sampling period [s].
+    """
+
+    acceleration: Float[np.ndarray, " 3"]
+    curvature: Float[np.ndarray, " 2"]
+    slip: Float[np.ndarray, " 2"]
+    is_angle: bool
+    dt: float
+
+    @classmethod
+    def fit(cls, train: Trajectory, *, dt: float) -> FittedBicycle:
+        """Fit by least squares to the single steps of a batch of trajectories."""
+        states = np.asarray(train.states, dtype=np.float64)[..., :4]
+        before, after = (
+            part.reshape(-1, 4) for part in (states[:, :-1], states[:, 1:])
+        )
+        controls = np.asarray(train.controls, dtype=np.float64).reshape(-1, 2)
+        # Logs may hold a steering command in other units than radians.
+        is_angle = bool(np.abs(controls[:, 0]).max() < STEEP)
+        steering = np.tan(controls[:, 0]) if is_angle else controls[:, 0]
+        ones, speed = np.ones(len(before)), 0.5 * (before[:, 3] + after[:, 3])
+        # A step turns by less than half a turn, so the difference is wrapped.
+        turned = np.mod(after[:, 2] - before[:, 2] + np.pi, 2 * np.pi) - np.pi
+        course = before[:, 2] + 0.5 * turned
+        moved = after[:, :2] - before[:, :2]
+        across = -np.sin(course) * moved[:, 0] + np.cos(course) * moved[:, 1]
+
+        def regress(features: list[Any], target: Any) -> np.ndarray:
+            return np.linalg.lstsq(np.column_stack(features), target, rcond=None)[0]
+
+        acceleration = regress(
+            [ones, controls[:, 1], before[:, 3]], (after[:, 3] - before[:, 3]) / dt
+        )
+        curvature = regress([speed, speed * steering], turned / dt)
+        kappa = curvature[0] + curvature[1] * steering
+        slip = regress([speed, speed * kappa], across / dt)
+        return cls(acceleration, curvature, slip, is_angle, dt)
+
+    def step(self, state: State, control: Control, env: Environment) -> State:
+        """The midpoint rule; states beyond the speed are left as they are."""
+        del env
+        a, k, b = map(jnp.asarray, (self.acceleration, self.curvature, self.slip))
+        steering = jnp.tan(control[0]) if self.is_angle else control[0]
+        change = self.dt * (a[0] + a[1] * control[1] + a[2] * state[3])
+        curvature = k[0] + k[1] * steering
+        length = self.dt * (state[3] + 0.5 * change)
+        turned = length * curvature
+        course = state[2] + 0.5 * turned + b[0] + b[1] * curvature
+        x, y = length * jnp.cos(course), length * jnp.sin(course)
+        return state.at[:4].add(jnp.stack([x, y, turned, change]))
+
+
+def baselines(
+    train: Trajectory,
+    *,
+    nominal: Step,
+    dt: float,
+    horizon: int,
+    along_path: bool = False,
+) -> dict[str, Callable[[Trajectory], Float[Array, "horizon 4"]]]:
+    """Return naive predictors as trajectories -> RMSE on the windows of `open_loop`.
+
+    "constant_velocity" keeps course and speed, "constant_turn" also the yaw rate,
+    measured over the first step. "kinematic_bicycle" is the nominal model,
+    "fitted_bicycle" one with parameters fitted to the training data (not in path
+    coordinates, where controls are perturbations of a law).
 
     Args:
-        predict: window -> predicted x_1 … x_horizon; the window's first state, controls
-            and environments are known.
-        trajectories: held out from training.
+        train: for the fit.
+        nominal: step of the kinematic bicycle on these states and controls.
+        dt: sampling period [s].
         horizon: steps.
-        along_path: whether states are those of `path_frame`.
+        along_path: whether states are those of `path_step`.
 
     Raises:
         ValueError: the horizon does not fit the trajectories.
     """
-    cut = jax.vmap(partial(sliding_windows, horizon=horizon, stride=horizon))
-    pieces = jax.tree.map(
-        lambda leaf: leaf.reshape(-1, *leaf.shape[2:]), cut(trajectories)
-    )
+    turn = partial(_hold_yaw_rate, dt=dt, along_path=along_path)
+    predictors: dict[str, Predictor] = {
+        "constant_velocity": partial(turn, measured=False),
+        "constant_turn": partial(turn, measured=True),
+        "kinematic_bicycle": partial(_simulate, nominal),
+    }
+    # Controls along a path are perturbations of a law: no bicycle explains them.
+    if not along_path:
+        fitted = FittedBicycle.fit(train, dt=dt)
+        predictors["fitted_bicycle"] = partial(_simulate, fitted.step)
+    return {
+        name: partial(_prediction_rmse, predict, horizon=horizon, along_path=along_path)
+        for name, predict in predictors.items()
+    }
 
-    def squares(piece: Trajectory) -> Float[Array, "horizon 4"]:
-        predicted, true = predict(piece), piece.states[1:]
-        if along_path:
-            return _path_gaps(predicted, true) ** 2
-        return state_errors(predicted, true)[:, :4] ** 2
 
-    return jnp.sqrt(jnp.mean(in_batches(squares, pieces, size=128), axis=0))
+def _simulate(step: Step, window: Trajectory) -> Float[Array, "horizon state"]:
+    """States of a step function from the first state of a window on."""
+
+    def advance(
+        state: State, given: tuple[Control, Environment]
+    ) -> tuple[State, State]:
+        after = step(state, *given)
+        return after, after
+
+    return jax.lax.scan(advance, window.states[0], (window.controls, window.envs))[1]
 
 
-def _path_gaps(
-    predicted: Float[Array, "horizon state"], true: Float[Array, "horizon state"]
-) -> Float[Array, "horizon 4"]:
-    """Errors in path coordinates: 0, e_y, e_ψ and speed."""
-    gap = (predicted - true)[:, BODY]
-    return jnp.column_stack(
-        [
-            jnp.zeros(gap.shape[0]),
-            gap[:, LATERAL],
-            wrap_angle(gap[:, HEADING]),
-            gap[:, PATH_SPEED],
-        ]
-    )
+def _hold_yaw_rate(
+    window: Trajectory, *, dt: float, along_path: bool, measured: bool
+) -> Float[Array, "horizon state"]:
+    """States at constant speed on a circle, or straight on where nothing is measured.
+
+    The yaw rate takes the place of the first control; along a path the curvature stays
+    that of the controls.
+    """
+
+    def turn(state: State, control: Control, env: Environment) -> State:
+        del env
+        half = 0.5 * control[0] * dt
+        length, course = state[3] * dt * jnp.sinc(half / jnp.pi), state[2] + half
+        move = [length * jnp.cos(course), length * jnp.sin(course), 2.0 * half]
+        return state.at[:3].add(jnp.stack(move))
+
+    follow = path_step(turn)
+
+    def turn_along_path(state: State, control: Control, env: Environment) -> State:
+        return as_path_state(follow(state[BODY], control, control[CURVATURE], env))
+
+    yaw_rate = _first_yaw_rate(window, dt=dt, along_path=along_path)
+    held = jnp.full_like(window.controls[:, :1], yaw_rate if measured else 0.0)
+    controls = jnp.concatenate([held, window.controls[:, 1:]], axis=1)
+    step = turn_along_path if along_path else turn
+    return _simulate(step, window._replace(controls=controls))
+
+
+def _first_yaw_rate(window: Trajectory, *, dt: float, along_path: bool) -> Scalar:
+    """Mean yaw rate of the first step of a window [rad/s]."""
+    before, after = window.states[0], window.states[1]
+    if not along_path:
+        return wrap_angle(after[2] - before[2]) / dt
+    turned = wrap_angle(after[BODY][HEADING] - before[BODY][HEADING]) / dt
+    return turned + window.controls[0, CURVATURE] * before[BODY][PATH_SPEED]

@@ -37,8 +37,7 @@ same identity.
 ROAD = ("envs", "path")
 """Arrays that describe the environment and the path of an episode."""
 SHARED = tuple(name for name in IDENTITY if name not in ("system", "env"))
-"""Columns that systems must share to be compared."""
-
+"""Columns that are equal in rows that are compared."""
 
 Scores: TypeAlias = dict[str, PerEpisode]
 """Numbers per episode by the name of their metric."""
@@ -80,49 +79,54 @@ def row(
         act_ms: median and 99 % quantile of one control step.
         violation: from `violations`.
     """
-    pooled = _pooled(scores)
-    given = {
+    values = _pooled(scores) | {
         "violation": violation,
         "act_ms": None if act_ms is None else {"p50": act_ms[0], "p99": act_ms[1]},
-        "ratio_to_oracle": None,
-        "difference_to_sfkd": None,
+        **dict.fromkeys(_COMPARISONS),
     }
     keys = dict.fromkeys(metric.name.split(".")[0] for metric in METRICS)
-    values = pooled | given
     return about | {key: values[key] for key in keys if key in values}
 
 
 def _pooled(scores: Scores) -> Row:
     """The values of all metrics that are measured on episodes."""
-    return {
-        metric.name: metric.pool(scores[metric.name])
-        for metric in METRICS
-        if metric.pool
-    }
+    return {one.name: one.pool(scores[one.name]) for one in METRICS if one.pool}
 
 
 def disturbed(
     force: float, scores: Scores, violation: dict[str, Any]
 ) -> dict[str, Any]:
-    """The part of a row that is also measured under unmeasured side forces.
+    """The part of a row that is also measured under unmeasured side forces up to F [N].
 
     Args:
-        force: largest force to either side [N].
+        force: F.
         scores: per episode.
         violation: from `violations`.
     """
     pooled = _pooled(scores)
-    claims = {name: violation[name] for name in ("v0", "v1", "v1_conformal", "v2")}
     return {
         "force_n": force,
         "rmse_m": pooled["rmse_m"],
-        **claims,
+        **{name: violation[name] for name in ("v0", "v1", "v1_conformal", "v2")},
         "departures": pooled["departures"],
     }
 
 
-def compare(rows: list[dict[str, Any]], *, missing: int = 0) -> list[dict[str, Any]]:
-    """Add comparisons of systems that drove the same episodes with the same sampling.
+def _ratio(values: np.ndarray, reference: np.ndarray) -> float:
+    return float(np.mean(values) / np.mean(reference))
+
+
+_SFKD = ("sfkd", "sfkd_path")
+"""In the frame of the body and in that of a path; one sampling has one frame."""
+_COMPARISONS: dict[str, Any] = {
+    "ratio_to_oracle": (("oracle",), _ratio),
+    "difference_to_sfkd": (_SFKD, paired_difference),
+}
+"""Column -> the systems that a row is compared with, and how."""
+
+
+def compare(rows: list[Row], *, missing: int = 0) -> list[Row]:
+    """Add comparisons of systems on the same episodes with the same sampling.
 
     A row without sampling (a quadratic program) is compared with rows that sample
     around feedback. Of several rows of a system, the one with the same controller and
@@ -136,55 +140,38 @@ def compare(rows: list[dict[str, Any]], *, missing: int = 0) -> list[dict[str, A
         same = [other for other in rows if _episodes(other) == _episodes(entry)]
         # Of several rows of a system, the one that searches like this row.
         same.sort(key=lambda other, entry=entry: _search(other) != _search(entry))
-        for systems, name, measure in _COMPARISONS:
-            other = next((other for other in same if other["system"] in systems), None)
+        for name, (systems, measure) in _COMPARISONS.items():
+            other = next((one for one in same if one["system"] in systems), None)
             if other is None or (systems == _SFKD and other is entry):
                 continue
             entry[name] = measure(_by_seed(entry), _by_seed(other))
     # One family: every difference that a reader could pick from the table.
-    family = [entry["difference_to_sfkd"] for entry in rows if _has_p(entry)]
+    differences = [entry.get("difference_to_sfkd") or {} for entry in rows]
+    family = [one for one in differences if one.get("p") is not None]
     adjusted = holm([one["p"] for one in family], not_made=missing)
     for record, p in zip(family, adjusted, strict=True):
         record["p_holm"] = p
     return rows
 
 
-def _has_p(entry: dict[str, Any]) -> bool:
-    """Whether a row was tested against SFKD."""
-    return (entry.get("difference_to_sfkd") or {}).get("p") is not None
-
-
-def _episodes(entry: dict[str, Any]) -> tuple[Any, ...]:
+def _episodes(entry: Row) -> tuple[Any, ...]:
     """Key of the episodes of a row; rows with equal keys are paired."""
-    names = ("scenario", "vehicle", "variation")
     return (
-        *(entry[name] for name in names),
+        *(entry[name] for name in ("scenario", "vehicle", "variation")),
         entry["sampling"] or "feedback",
         entry.get("drives"),
         _by_seed(entry).shape[1],
     )
 
 
-def _search(entry: dict[str, Any]) -> tuple[Any, ...]:
+def _search(entry: Row) -> tuple[Any, ...]:
     """Controller and planner of a row."""
     return entry.get("controller"), entry.get("planner")
 
 
-def _by_seed(entry: dict[str, Any]) -> np.ndarray:
+def _by_seed(entry: Row) -> np.ndarray:
     """RMSE, one line per training seed, one column per episode."""
     return as_numbers(entry["rmse_episodes_m"]).reshape(len(entry["seeds"]), -1)
-
-
-def _ratio(values: np.ndarray, reference: np.ndarray) -> float:
-    return float(np.mean(values) / np.mean(reference))
-
-
-_SFKD = ("sfkd", "sfkd_path")
-"""In the frame of the body and in that of a path; one sampling has one frame."""
-_COMPARISONS = (
-    (("oracle",), "ratio_to_oracle", _ratio),
-    (_SFKD, "difference_to_sfkd", paired_difference),
-)
 
 
 def pool(rows: list[Row]) -> Row:
@@ -224,10 +211,8 @@ def _mean(values: list[Any]) -> Any:
 
 def identity(row: Mapping[str, Any]) -> dict[str, str | None]:
     """Return the identity of a row."""
-    columns = {name: row.get(name) for name in IDENTITY}
-    return {
-        name: None if value is None else str(value) for name, value in columns.items()
-    }
+    columns = ((name, row.get(name)) for name in IDENTITY)
+    return {name: None if value is None else str(value) for name, value in columns}
 
 
 def merge(

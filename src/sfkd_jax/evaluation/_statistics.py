@@ -45,9 +45,8 @@ def mean_interval(
 ) -> tuple[float, list[float] | None]:
     """Return the mean and its 95 % interval, None if there is one value.
 
-    Training i is a_i better and episode j is b_j easier than the mean, both drawn anew
-    in a repetition: x_ij = m + a_i + b_j + c_ij. With the mean squares M_a, M_b, M_c of
-    a two-way analysis of variance,
+    Trainings and episodes are drawn anew in a repetition: x_ij = m + a_i + b_j + c_ij.
+    With the mean squares M_a, M_b, M_c of a two-way analysis of variance,
 
         var m = max(M_a + M_b − M_c, M_a, M_b) / (number of entries),
 
@@ -69,27 +68,6 @@ def mean_interval(
         return float(np.mean(values)), None
     half = spread.quantile(1.0 - LEVEL) * spread.error
     return spread.mean, [spread.mean - half, spread.mean + half]
-
-
-def mean_squares(
-    values: Float[np.ndarray, "seed episode"],
-) -> tuple[float, float, float]:
-    """Return M_a, M_b, M_c of a two-way analysis of variance without replication.
-
-    Their expectations are E σ_a² + σ_c², T σ_b² + σ_c² and σ_c², with T trainings and E
-    episodes.
-
-    Args:
-        values: at least two trainings and two episodes.
-    """
-    trainings, episodes = values.shape
-    by_training, by_episode = values.mean(axis=1), values.mean(axis=0)
-    rest = values - by_training[:, None] - by_episode + values.mean()
-    return (
-        float(episodes * np.var(by_training, ddof=1)),
-        float(trainings * np.var(by_episode, ddof=1)),
-        float(np.sum(rest**2) / ((trainings - 1) * (episodes - 1))),
-    )
 
 
 def p_value(values: Float[np.ndarray, "*seed episode"]) -> float | None:
@@ -157,9 +135,6 @@ def paired_difference(
 ) -> dict[str, Any]:
     """Return mean, interval and p of values − reference over equal episodes.
 
-    Both are about other trainings and other episodes; of a single training, about other
-    episodes alone.
-
     Of two numbers of trainings the smaller counts; a single one is compared with each
     of the others.
     """
@@ -185,7 +160,11 @@ def _spread(values: Float[np.ndarray, "*seed episode"]) -> Spread | None:
         freedom = table.size - 1
         return Spread(mean, error, float(episodes == 1), (freedom, freedom))
     freedom = trainings - 1, episodes - 1
-    of_trainings, of_episodes, of_rest = mean_squares(table)
+    by_training, by_episode = table.mean(axis=1), table.mean(axis=0)
+    rest = table - by_training[:, None] - by_episode + table.mean()
+    of_trainings = episodes * np.var(by_training, ddof=1)
+    of_episodes = trainings * np.var(by_episode, ddof=1)
+    of_rest = np.sum(rest**2) / (freedom[0] * freedom[1])
     # An estimate of a variance may be negative; the larger parts bound it from below.
     total = max(of_trainings + of_episodes - of_rest, of_trainings, of_episodes)
     share = max(of_trainings - of_rest, 0.0) / total if total > 0 else 0.0

@@ -105,15 +105,11 @@ def _along_window(model: Model, params: Params, window: Trajectory) -> Predictio
 
 def tube_violations(
     errors: Float[np.ndarray, "segment window horizon 3"], tube: Tube
-) -> tuple[int, int]:
-    """Return V1: the number of segments that leave the tube anywhere, and their total.
-
-    NaN counts as outside.
-    """
+) -> float:
+    """Return V1: the part of the segments that leave the tube anywhere."""
     radii = np.stack([np.asarray(tube[kind]) for kind in KINDS], axis=1)
-    # NaN compares false, so it counts as outside.
-    inside = np.all(np.asarray(errors) <= radii, axis=(1, 2, 3))
-    return int(np.sum(~inside)), len(inside)
+    # Negated, so that NaN counts as outside.
+    return float(np.mean(~np.all(np.asarray(errors) <= radii, axis=(1, 2, 3))))
 
 
 def theorem_violations(
@@ -121,46 +117,31 @@ def theorem_violations(
     defects: Float[np.ndarray, "segment window horizon"],
     latent: Float[np.ndarray, " horizon"],
     d_bar: float,
-) -> tuple[int, int]:
-    """Return V0: steps with |e_k| > R_k though |d_1| … |d_k| ≤ d̄, and the total.
+) -> tuple[float | None, list[float | None]]:
+    """Return V0 and the largest |e_k| / R_k of every k, where |d_1| … |d_k| ≤ d̄.
 
-    The theorem excludes such steps.
+    V0 is the part of these steps with |e_k| > R_k, which the theorem excludes. It is 0
+    for any bound that is loose enough; the ratio, at most 1, shows how tight the bound
+    is, so it changes when α, d̄ or the model is not as claimed. Both are None where no
+    step has such small defects.
     """
     # The theorem speaks of the steps before the first defect above d̄ only.
     applies = np.logical_and.accumulate(np.asarray(defects) <= d_bar, axis=2)
+    latent_errors, latent = np.asarray(latent_errors), np.asarray(latent)
     relative, absolute = ROUNDING
     # Negated, so that NaN counts as beyond.
-    beyond = ~(
-        np.asarray(latent_errors) <= np.asarray(latent) * (1 + relative) + absolute
-    )
-    return int(np.sum(applies & beyond)), int(np.sum(applies))
-
-
-def theorem_reach(
-    latent_errors: Float[np.ndarray, "segment window horizon"],
-    defects: Float[np.ndarray, "segment window horizon"],
-    latent: Float[np.ndarray, " horizon"],
-    d_bar: float,
-) -> list[float | None]:
-    """Return the largest |e_k| / R_k of every k where |d_1| … |d_k| ≤ d̄, else None.
-
-    At most 1 by the theorem. V0 is 0 for any bound that is loose enough; this ratio
-    shows how tight the bound is, so it changes when α, d̄ or the model is not as
-    claimed.
-    """
-    applies = np.logical_and.accumulate(np.asarray(defects) <= d_bar, axis=2)
-    shares = np.where(
-        applies, np.asarray(latent_errors) / np.asarray(latent), -np.inf
-    ).max(axis=(0, 1))
-    return [float(share) if np.isfinite(share) else None for share in shares]
+    beyond = ~(latent_errors <= latent * (1 + relative) + absolute)
+    count = int(np.sum(applies))
+    rate = int(np.sum(applies & beyond)) / count if count else None
+    ratios = np.where(applies, latent_errors / latent, -np.inf).max(axis=(0, 1))
+    return rate, [float(ratio) if np.isfinite(ratio) else None for ratio in ratios]
 
 
 def threshold_violations(
     errors: Float[np.ndarray, "segment window horizon 3"], threshold: float
-) -> tuple[int, int]:
-    """Return V2: the number of windows with an error above δ*, and their total."""
-    inside = np.all(np.asarray(errors)[..., 0] <= threshold, axis=2)
-    return int(np.sum(~inside)), inside.size
+) -> float:
+    """Return V2: the part of the windows with a position error above δ*."""
+    return float(np.mean(~np.all(np.asarray(errors)[..., 0] <= threshold, axis=2)))
 
 
 def violations(predicted: Predictions | None, claims: ClaimedBounds) -> dict[str, Any]:
@@ -170,52 +151,33 @@ def violations(predicted: Predictions | None, claims: ClaimedBounds) -> dict[str
     the conformal tube (`v1_tube` names it).
     """
     tubes = {"certified": claims.certified, "conformal": claims.conformal}
-    shares = {
-        name: _share(tube_violations, predicted and predicted.errors, tube)
-        for name, tube in tubes.items()
-    }
-    radii = {
-        name: tube and float(np.mean(tube["position_m"]))
-        for name, tube in tubes.items()
-    }
+    radii = {name: t and float(np.mean(t["position_m"])) for name, t in tubes.items()}
+    v0, ratios, v2, error = None, None, None, None
+    v1: dict[str | None, float | None] = dict.fromkeys(tubes)
+    if predicted is not None:
+        errors = np.asarray(predicted.errors)
+        v1 |= {name: tube_violations(errors, t) for name, t in tubes.items() if t}
+        if claims.latent is not None and claims.d_bar is not None:
+            seen, gaps = map(np.asarray, (predicted.latent_errors, predicted.defects))
+            v0, ratios = theorem_violations(seen, gaps, claims.latent, claims.d_bar)
+        if claims.threshold is not None:
+            v2 = threshold_violations(errors, claims.threshold)
+        worst = np.max(errors[..., 0], axis=2)
+        p95 = float(np.quantile(worst, 0.95))
+        error = {"median": float(np.median(worst)), "p95": p95}
     # A proved tube comes first; a measured one stands in where there is none.
     kind = next((name for name, tube in tubes.items() if tube), None)
-    claimed = (
-        predicted and predicted.latent_errors,
-        predicted and predicted.defects,
-        claims.latent,
-        claims.d_bar,
-    )
     return {
-        "v0": _share(theorem_violations, *claimed),
-        "v0_reach": _unless_missing(theorem_reach, *claimed),
-        "v1": shares[kind] if kind else None,
+        "v0": v0,
+        "v0_reach": ratios,
+        "v1": v1.get(kind),
         "v1_tube": kind,
         "v1_radius_m": radii[kind] if kind else None,
-        "v1_conformal": shares["conformal"],
+        "v1_conformal": v1["conformal"],
         "v1_conformal_radius_m": radii["conformal"],
         "v1_level": claims.level,
-        "v2": _share(
-            threshold_violations, predicted and predicted.errors, claims.threshold
-        ),
+        "v2": v2,
         "v2_threshold_m": claims.threshold,
-        "window_error_m": predicted
-        and _quantiles(np.max(predicted.errors[..., 0], axis=2)),
+        "window_error_m": error,
         "segments": predicted and len(predicted.errors),
     }
-
-
-def _share(count: Any, *inputs: Any) -> float | None:
-    """A count over its total; None if an input is missing or the total is 0."""
-    counted = _unless_missing(count, *inputs)
-    return counted[0] / counted[1] if counted and counted[1] else None
-
-
-def _unless_missing(measure: Any, *inputs: Any) -> Any:
-    """A measure, or None if any input is missing."""
-    return None if any(value is None for value in inputs) else measure(*inputs)
-
-
-def _quantiles(errors: Float[np.ndarray, "segment window"]) -> dict[str, float]:
-    """Median and 95 % quantile."""
-    return {"median": float(np.median(errors)), "p95": float(np.quantile(errors, 0.95))}

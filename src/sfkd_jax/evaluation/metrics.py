@@ -104,11 +104,9 @@ class Metric(NamedTuple):
     def text(self, row: Row, *, mm: bool = False) -> str:
         """The value of a row as text, lengths in millimetres with `mm`."""
         value = self.value(row)
-        return (
-            millimetres(value, self.mm)
-            if mm and self.mm is not None
-            else (self.write(value))
-        )
+        if mm and self.mm is not None:
+            return millimetres(value, self.mm)
+        return self.write(value)
 
     def head(self, *, mm: bool = False) -> str:
         """Label and unit, as the head of a column."""
@@ -131,21 +129,16 @@ def _max_deviation(run: Recording) -> np.ndarray:
 
 def _rmse_after_switch(run: Recording) -> np.ndarray:
     """RMSE within AFTER_SWITCH of a switch; NaN for an episode without a switch."""
-    after = _after_switch(run.envs, round(AFTER_SWITCH / run.dt))
+    jumps = np.any(np.abs(np.diff(run.envs, axis=1)) > np.asarray(SWITCH), axis=2)
+    # The first e of an episode is no switch.
+    jumps = np.concatenate([np.zeros((len(run.envs), 1), bool), jumps], axis=1)
+    after = np.zeros_like(jumps)
+    for lag in range(min(round(AFTER_SWITCH / run.dt), jumps.shape[1])):
+        after[:, lag:] |= jumps[:, : jumps.shape[1] - lag]
     after[:, : round(SETTLING / run.dt)] = False
     squares = np.where(after, run.lateral**2, 0.0).sum(axis=1)
     counts = after.sum(axis=1)
     return np.where(counts > 0, np.sqrt(squares / np.maximum(counts, 1)), np.nan)
-
-
-def _after_switch(envs: np.ndarray, steps: int) -> np.ndarray:
-    """Which steps lie within `steps` of a switch of e, (episode, time)."""
-    jumps = np.any(np.abs(np.diff(envs, axis=1)) > np.asarray(SWITCH), axis=2)
-    jumps = np.concatenate([np.zeros((len(envs), 1), bool), jumps], axis=1)
-    mask = np.zeros_like(jumps)
-    for lag in range(min(steps, jumps.shape[1])):
-        mask[:, lag:] |= jumps[:, : jumps.shape[1] - lag]
-    return mask
 
 
 def _steering_rate(run: Recording) -> np.ndarray:
@@ -171,10 +164,6 @@ def _mean_known(values: np.ndarray) -> float | None:
 
 def _median(values: np.ndarray) -> float | None:
     return None if np.any(np.isnan(values)) else float(np.median(values))
-
-
-def _each(values: np.ndarray) -> list[float]:
-    return [float(value) for value in values]
 
 
 def as_numbers(values: list[float | None]) -> np.ndarray:
@@ -210,7 +199,7 @@ METRICS: tuple[Metric, ...] = (
     Metric("rmse_m.ci95", "95 % interval", "m", "tracking", interval),
     Metric("rmse_m.median", "Median", "m", "spread", number, 1),
     Metric("rmse_m.p95", "95th percentile", "m", "spread", number, 1),
-    Metric("rmse_episodes_m", measure=_rmse, pool=_each,
+    Metric("rmse_episodes_m", measure=_rmse, pool=np.ndarray.tolist,
            pool_seeds=lambda rows: [x for one in _of_trainings(rows) for x in one]),
     Metric("rmse_trainings_m",
            pool_seeds=lambda rows: [float(np.mean(x)) for x in _of_trainings(rows)]),
@@ -259,8 +248,6 @@ METRICS: tuple[Metric, ...] = (
 
 BY_NAME: dict[str, Metric] = {metric.name: metric for metric in METRICS}
 """The same by JSON key."""
-
-
 SIGNALS: dict[str, Signal] = {
     name: signal for metric in METRICS for name, signal in metric.records.items()
 }
@@ -276,8 +263,9 @@ def text_table(rows: list[Row], *names: str) -> list[str]:
     """Metrics of rows as the lines of a table, lengths in millimetres."""
     metrics = [BY_NAME[name] for name in names]
     cells = [["system", *(metric.head(mm=True) for metric in metrics)]]
-    for row in rows:
-        cells.append([row["system"], *(one.text(row, mm=True) for one in metrics)])
+    cells += [
+        [row["system"], *(one.text(row, mm=True) for one in metrics)] for row in rows
+    ]
     widths = [max(map(len, column)) for column in zip(*cells, strict=True)]
     return [
         "   ".join(cell.rjust(width) for cell, width in zip(line, widths, strict=True))

@@ -1,0 +1,254 @@
+"""Whole episodes: repeatable, paired, and ordered as they must be; what sensors make of
+the environment, and forces that nobody measures.
+"""
+
+from functools import cache, partial
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from helpers import at, jit, same
+
+from sfkd_jax import control, evaluation, models, plants, scenarios
+from sfkd_jax.evaluation import _closed_loop, disturbed_environment
+from sfkd_jax.evaluation.metrics import SIGNALS
+from sfkd_jax.types import Controller
+
+PLANT, DYNAMIC = plants.kinematic(), plants.dynamic()
+DT, HORIZON, STEPS = 0.1, 12, 100
+SENSORS = (0.02, 0.02, 0.005, 0.05)
+
+
+@cache
+def roads(count=2):
+    family = scenarios.scenario(name="s3", duration=STEPS * DT, state_size=4, dt=DT)
+    return jit(jax.vmap(family))(jax.random.split(jax.random.key(0), count))
+
+
+def one_episode(step, noise=SENSORS):
+    """An episode with a planner over a one-step function."""
+    task = control.path_tracking(
+        models.physics(step),
+        control.tracking_cost(dt=DT),
+        control.path_feedback(wheelbase=PLANT.wheelbase),
+        dt=DT,
+        control_low=PLANT.control_low,
+        control_high=PLANT.control_high,
+    )
+    return partial(
+        evaluation.simulate,
+        PLANT.step,
+        control.mppi(task, num_samples=96, horizon=HORIZON),
+        {},
+        dt=DT,
+        horizon=HORIZON,
+        observation_noise=noise,
+        record={"expected": lambda info: info["predicted_states"][0, :2]},
+    )
+
+
+@cache
+def several(step, noise=SENSORS):
+    """Several episodes, compiled once."""
+    return jit(evaluation.over_episodes(one_episode(step, noise)))
+
+
+@cache
+def episodes(step, noise=SENSORS, seed=1):
+    return several(step, noise)(roads(), jax.random.split(jax.random.key(seed), 2))
+
+
+def missed_by(batch):
+    """Distance of the next position from where the plan had it [m]."""
+    gap = batch.signals["expected"] - batch.states[..., 1:, :2]
+    return np.linalg.norm(gap, axis=-1)
+
+
+def test_an_episode_has_the_documented_shapes_and_the_states_of_the_plant():
+    batch, one = episodes(PLANT.step), at(episodes(PLANT.step), 0)
+    assert one.states.shape == (STEPS + 1, 4)
+    assert one.controls.shape == one.assumed_envs.shape == (STEPS, 2)
+    assert set(one.signals) == {*SIGNALS, "expected"}
+    per_step = (one.lateral, one.progress, *(one.signals[name] for name in SIGNALS))
+    assert all(leaf.shape == (STEPS,) for leaf in per_step)
+    step = jit(jax.vmap(jax.vmap(PLANT.step)))
+    expected = step(batch.states[:, :-1], batch.controls, roads().envs)
+    np.testing.assert_allclose(batch.states[:, 1:], expected, atol=2e-5)
+
+
+def test_episodes_one_by_one_are_those_driven_at_once():
+    at_once = jit(jax.vmap(one_episode(PLANT.step)))
+    keys = jax.random.split(jax.random.key(1), 2)
+    expected = episodes(PLANT.step).states
+    np.testing.assert_allclose(at_once(roads(), keys).states, expected, atol=1e-4)
+
+
+def test_lateral_deviation_and_progress_are_those_of_the_path():
+    one, road = at(episodes(PLANT.step), 0), at(roads(), 0)
+    points = np.asarray(
+        jit(jax.vmap(scenarios.point_at, in_axes=(None, 0)))(road.path, one.progress)
+    )
+    normals = np.stack([-np.sin(points[:, 2]), np.cos(points[:, 2])], axis=1)
+    placed = points[:, :2] + np.asarray(one.lateral)[:, None] * normals
+    np.testing.assert_allclose(placed, np.asarray(one.states)[1:, :2], atol=2e-3)
+    assert np.all(np.diff(one.progress) > 0.5)
+    window = jit(partial(evaluation.first_reference, horizon=4, dt=DT))(road)
+    np.testing.assert_allclose(window[:, 0], [1.0, 2.0, 3.0, 4.0], atol=1e-3)
+    np.testing.assert_array_equal(window[:, 3], np.full(4, 10.0))
+
+
+def test_the_oracle_drives_better_than_the_nominal_model_and_predicts_exactly():
+    scores = [
+        evaluation.score(episodes(step), np.asarray(roads().envs), dt=DT)
+        for step in (PLANT.step, PLANT.nominal)
+    ]
+    assert np.all(scores[0]["rmse_m"] < scores[1]["rmse_m"])
+    assert np.all(scores[0]["rmse_m"] < 0.1)
+    assert not np.any(scores[0]["departures"])
+    assert missed_by(episodes(PLANT.step, noise=())).max() < 1e-4
+    assert missed_by(episodes(PLANT.nominal)).max() > 1e-2
+
+
+def test_the_same_key_makes_the_same_episode_and_another_key_another():
+    again = several(PLANT.step)(roads(), jax.random.split(jax.random.key(1), 2))
+    assert same(episodes(PLANT.step), again, rtol=0, atol=0)
+    assert not np.array_equal(again.controls, episodes(PLANT.step, seed=2).controls)
+
+
+def still(gain=1.0, planner_draws=1):
+    """An episode of a plant that stands, whose controls are gain times what is
+    observed: x_0 plus the noise.
+    """
+
+    def act(params, state, observation, env, reference):
+        info = {"effective_samples": env[1], "healthy": jnp.asarray(True)}
+        for _ in range(planner_draws):
+            state, _ = jax.random.split(state)
+        return gain * observation[:2], state, info
+
+    return partial(
+        evaluation.simulate,
+        lambda state, action, env: state,
+        Controller(lambda key: key, act),
+        {},
+        dt=DT,
+        horizon=3,
+    )
+
+
+def test_two_systems_meet_the_same_sensor_noise_whatever_they_do_with_their_own_key():
+    road, key = at(roads(), 0), jax.random.key(5)
+    noisy = {"observation_noise": SENSORS}
+    first = jit(partial(still(1.0, 0), **noisy))(road, key)
+    second = jit(partial(still(2.0, 3), **noisy))(road, key)
+    np.testing.assert_allclose(first.controls, second.controls / 2.0, rtol=1e-6)
+    seen = np.asarray(first.controls)
+    np.testing.assert_allclose(seen.std(axis=0), SENSORS[:2], rtol=0.3)
+    assert abs(np.mean(seen[1:, 0] * seen[:-1, 0])) < 0.3 * SENSORS[0] ** 2  # white
+    # The noise reaches the controller and not the truth.
+    truth = np.broadcast_to(road.initial_state, (STEPS + 1, 4))
+    np.testing.assert_array_equal(first.states, truth)
+    quiet = jit(still())(road, key)
+    np.testing.assert_array_equal(quiet.controls, np.zeros((STEPS, 2)))
+
+
+def test_no_key_is_used_twice_and_pushes_have_a_stream_of_their_own():
+    road, key = at(roads(), 0), jax.random.key(4)
+    stream = jax.random.fold_in(key, _closed_loop.FORCE_STREAM)
+    streams = [jax.random.key_data(k) for k in (stream, *jax.random.split(key))]
+    assert len({tuple(np.asarray(data)) for data in streams}) == 3
+    with jax.debug_key_reuse(True):
+        envs = disturbed_environment(PLANT, road.envs, key, largest=100.0)
+        run = jax.jit(partial(still(), observation_noise=SENSORS))
+        run(road._replace(envs=envs), key)
+
+
+# --- sensors of the environment ------------------------------------------------------
+
+ENVS = jnp.stack([jnp.linspace(0.9, 0.3, 300), jnp.linspace(-8.0, 8.0, 300)], axis=1)
+OBSERVE = partial(evaluation.observed_environment, ENVS, dt=DT)
+
+
+def test_a_perfect_sensor_observes_the_truth_to_the_last_bit(key):
+    np.testing.assert_array_equal(OBSERVE(key), ENVS)
+
+
+@pytest.mark.parametrize("steps", [1, 40])
+def test_a_delay_shifts_the_truth_and_repeats_its_first_value(key, steps):
+    observed = OBSERVE(key, delay_s=0.1 * steps)
+    np.testing.assert_array_equal(observed[steps:], ENVS[:-steps])
+    np.testing.assert_array_equal(observed[:steps], jnp.tile(ENVS[:1], (steps, 1)))
+
+
+def test_a_bias_is_added_and_friction_stays_positive(key):
+    biased = OBSERVE(key, bias=(0.1, -2.0))
+    np.testing.assert_allclose(biased, ENVS + jnp.asarray([0.1, -2.0]), rtol=1e-6)
+    assert float(OBSERVE(key, bias=(-0.9, 0.0))[:, 0].min()) == pytest.approx(0.05)
+
+
+def test_noise_has_the_configured_spread_and_differs_between_episodes(key):
+    observe = jax.vmap(lambda episode: OBSERVE(episode, noise=(0.02, 1.0)))
+    errors = observe(jax.random.split(key, 200)) - ENVS
+    np.testing.assert_allclose(errors.std(axis=(0, 1)), [0.02, 1.0], rtol=0.02)
+    np.testing.assert_allclose(errors.mean(axis=(0, 1)), [0.0, 0.0], atol=0.015)
+    assert not np.allclose(errors[0], errors[1])
+
+
+# --- forces that nobody measures -----------------------------------------------------
+
+
+@pytest.mark.parametrize("plant", [PLANT, DYNAMIC], ids=lambda plant: plant.name)
+@pytest.mark.parametrize(
+    ("wind", "force"), [(0.0, 250.0), (-8.0, 1000.0), (3.0, -900.0)]
+)
+def test_a_push_is_the_wind_that_pushes_as_hard(plant, wind, force):
+    felt = plants.equivalent_wind(
+        jnp.asarray(wind), jnp.asarray(force), wind_force=plant.wind_force
+    )
+    pushed = plant.wind_force * felt * abs(felt)
+    expected = plant.wind_force * wind * abs(wind) + force
+    np.testing.assert_allclose(pushed, expected, rtol=1e-5, atol=1e-3)
+
+
+def test_a_push_accelerates_the_dynamic_plant_by_force_over_mass_and_turns_it():
+    state = jnp.asarray([0.0, 0.0, 0.3, 10.0, 0.1, 0.05, 0.02])
+    calm, force = jnp.asarray(4.0), 600.0
+    felt = plants.equivalent_wind(
+        calm, jnp.asarray(force), wind_force=DYNAMIC.wind_force
+    )
+    pushed, alone = (
+        DYNAMIC.derivative(
+            state, jnp.asarray([0.03, 0.5]), jnp.stack([jnp.asarray(0.5), wind])
+        )
+        for wind in (felt, calm)
+    )
+    expected = [0, 0, 0, 0, force / 1500, 0.4 * force / 2500, 0]
+    np.testing.assert_allclose(pushed - alone, expected, atol=2e-5)
+
+
+def test_a_push_moves_the_car_and_is_not_observed_and_none_changes_no_bit():
+    road, key = at(roads(), 0), jax.random.key(3)
+    run = jit(partial(one_episode(PLANT.step), record={"wind": lambda info: 0.0}))
+
+    def pushed(largest):
+        envs = disturbed_environment(PLANT, road.envs, key, largest=largest)
+        return run(road._replace(envs=envs), key)
+
+    alone, hard = run(road, key), pushed(800.0)
+    assert same(alone, pushed(0.0), rtol=0, atol=0)
+    assert float(jnp.max(jnp.abs(hard.lateral - alone.lateral))) > 0.02
+    np.testing.assert_array_equal(hard.assumed_envs, road.observed_envs)
+
+
+def test_pushes_are_redrawn_every_second_evenly_within_their_bound_and_grow_with_it():
+    pushes = partial(scenarios.random_side_forces, jax.random.key(1), dt=DT)
+    force = np.asarray(pushes(steps=20005, largest=300.0))
+    assert len(force) == 20005
+    levels = force[:20000].reshape(-1, 10)
+    assert np.all(levels == levels[:, :1])
+    assert len(np.unique(levels[:, 0])) == 2000
+    assert np.max(np.abs(force)) <= 300.0
+    quantiles = np.quantile(force, [0.1, 0.5, 0.9])
+    np.testing.assert_allclose(quantiles, [-240.0, 0.0, 240.0], atol=20.0)
+    np.testing.assert_allclose(pushes(steps=20005, largest=600.0), 2 * force, rtol=1e-6)
