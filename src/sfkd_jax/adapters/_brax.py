@@ -1,19 +1,40 @@
-"""The vehicles and scenarios as a brax environment."""
+"""Our vehicles as a brax environment, and brax systems as plants."""
 
 from __future__ import annotations
 
-from typing import Any
+from collections.abc import Callable
+from operator import attrgetter
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
 from brax import envs
-from brax.envs.base import Env, State
+from brax.envs.base import Env, PipelineEnv
+from brax.envs.base import State as BraxState
+from brax.generalized import pipeline
+from jaxtyping import Array, Float
 
-from sfkd_jax.adapters._task import MEASURES, DrivingTask, tracking_task
-from sfkd_jax.types import Control, Environment, Reference
-from sfkd_jax.types import State as VehicleState
+from sfkd_jax.adapters._task import MEASURES, tracking_task
+from sfkd_jax.types import (
+    BODY,
+    Control,
+    Environment,
+    Key,
+    Reference,
+    State,
+    Step,
+    Trajectory,
+)
 
 NAME = "sfkd_vehicle"
+SCALED = {
+    "gravity": ("gravity", "opt.gravity"),
+    "damping": ("dof.damping",),
+    "motor": ("actuator.gear",),
+}
+"""Parameters that entries of e may scale, and their fields in a system; damping is the
+viscous friction of all joints.
+"""
 
 
 def register_brax(name: str = NAME) -> None:
@@ -30,69 +51,226 @@ class BraxVehicle(Env):
     the car left the lane or the road ended; `info["time_out"]` is 1 in the second case
     only, as PPO's `bootstrap_on_timeout` expects.
 
+    Attributes:
+        task: the pure functions behind the environment.
+
     Raises:
         ValueError: as `tracking_task`.
     """
 
     def __init__(self, **settings: Any) -> None:
-        self._task = tracking_task(**settings)
+        self.task = tracking_task(**settings)
 
-    def reset(self, rng: jax.Array) -> State:
+    def reset(self, rng: jax.Array) -> BraxState:
         """Start an episode on a new road; `rng` is a typed key or two integers."""
         typed = jnp.issubdtype(rng.dtype, jax.dtypes.prng_key)
-        road, moment = self._task.reset(rng if typed else jax.random.wrap_key_data(rng))
+        road, moment = self.task.reset(rng if typed else jax.random.wrap_key_data(rng))
         zero = jnp.zeros(())
         metrics = dict.fromkeys(MEASURES, zero)
         info = {"road": road, "time_out": zero}
-        observation = self._task.observe(road, moment)
-        return State(moment, observation, zero, zero, metrics, info)  # pyright: ignore
+        observation = self.task.observe(road, moment)
+        return BraxState(moment, observation, zero, zero, metrics, info)  # pyright: ignore
 
-    def step(self, state: State, action: jax.Array) -> State:
+    def step(self, state: BraxState, action: jax.Array) -> BraxState:
         """Simulate one sampling period; keep other entries of `metrics` and `info`."""
         road = state.info["road"]
-        moment, outcome = self._task.step(road, state.pipeline_state, action)  # pyright: ignore
-        done, time_out = (
-            (outcome.left | outcome.over).astype(float),
-            outcome.over.astype(float),
-        )
+        moment, outcome = self.task.step(road, state.pipeline_state, action)  # pyright: ignore
+        ended, time_out = outcome.left | outcome.over, outcome.over.astype(float)
         return state.replace(  # pyright: ignore[reportAttributeAccessIssue]
             pipeline_state=moment,
-            obs=self._task.observe(road, moment),
+            obs=self.task.observe(road, moment),
             reward=outcome.reward,
-            done=done,
+            done=ended.astype(float),
             metrics={**state.metrics, **outcome.measures},
             info={**state.info, "time_out": time_out},
         )
 
-    def situation(self, state: State) -> tuple[VehicleState, Environment, Reference]:
+    def situation(self, state: BraxState) -> tuple[State, Environment, Reference]:
         """Return state, environment and reference, as `Controller.act` takes them."""
-        return self._task.situation(state.info["road"], state.pipeline_state)  # pyright: ignore
+        return self.task.situation(state.info["road"], state.pipeline_state)  # pyright: ignore
 
     def action(self, control: Control) -> Control:
         """Return the action of a control in physical units."""
-        return self._task.action(control)
-
-    @property
-    def task(self) -> DrivingTask:
-        """The pure functions behind the environment."""
-        return self._task
+        return self.task.action(control)
 
     @property
     def dt(self) -> float:
         """Sampling period [s]."""
-        return self._task.plant.dt
+        return self.task.plant.dt
 
     @property
     def observation_size(self) -> int:
         """Length of the observation."""
-        return self._task.observation_size
+        return self.task.observation_size
 
     @property
     def action_size(self) -> int:
         """Length of the action."""
-        return self._task.action_size
+        return self.task.action_size
 
     @property
     def backend(self) -> str:
         """Name of the physics, which is not brax's."""
         return "sfkd_jax"
+
+
+class BraxPlant(NamedTuple):
+    """A brax system with physical parameters scaled by e; x = (0, 0, 0, q, q̇).
+
+    The system has no pose in the plane: the first three entries of its state are 0.
+
+    Attributes:
+        dt: sampling period [s].
+        state_names: pose first.
+        control_low: lower limits of the motors.
+        control_high: upper limits of the motors.
+        parameters: that the entries of e scale; 1 leaves the system unchanged.
+        step: (x, u, e) -> x one sampling period later, u in the units of the motors.
+        start: key -> x at the start of an episode of the environment.
+    """
+
+    dt: float
+    state_names: tuple[str, ...]
+    control_low: tuple[float, ...]
+    control_high: tuple[float, ...]
+    parameters: tuple[str, ...]
+    step: Step
+    start: Callable[[Key], State]
+
+
+def brax_plant(env: Env, *, parameters: tuple[str, ...] = ("gravity",)) -> BraxPlant:
+    """Return x⁺ = (0, q⁺, q̇⁺) with (q⁺, q̇⁺) from brax's own physics scaled by e.
+
+    Args:
+        env: from `brax.envs.get_environment(name, backend="generalized")`; wrappers are
+            removed.
+        parameters: that the entries of e scale, of "gravity", "damping", "motor".
+
+    Raises:
+        ValueError: an unknown or repeated parameter, an environment without a brax
+            system, or a backend other than "generalized", where (q, q̇) is the whole
+            state.
+    """
+    inner = env.unwrapped
+    if not isinstance(inner, PipelineEnv):
+        raise ValueError(f"{type(inner).__name__} has no brax system to step")
+    if inner.backend != "generalized":
+        raise ValueError(
+            'backend must be "generalized", where (q, q̇) is the whole state, '
+            f"got {inner.backend!r}"
+        )
+    unknown = [name for name in parameters if name not in SCALED]
+    if unknown or len(set(parameters)) != len(parameters):
+        raise ValueError(
+            f"parameters must be different ones of {', '.join(SCALED)}, "
+            f"got {parameters}"
+        )
+    system, coordinates = inner.sys, inner.sys.q_size()
+    # The environment acts once per several steps of the physics.
+    frames = round(float(inner.dt) / float(system.opt.timestep))
+
+    def step(state: State, control: Control, env: Environment) -> State:
+        factors = {
+            field: factor
+            for name, factor in zip(parameters, env, strict=True)
+            for field in SCALED[name]
+        }
+        changed: Any = system.tree_replace(
+            {f: factor * attrgetter(f)(system) for f, factor in factors.items()}
+        )
+        body = state[BODY]
+        moment = pipeline.init(changed, body[:coordinates], body[coordinates:])
+
+        def frame(moment: Any, _: None) -> tuple[Any, None]:
+            return pipeline.step(changed, moment, control), None
+
+        moment, _ = jax.lax.scan(frame, moment, None, length=frames)
+        return _state(moment)
+
+    def start(key: Key) -> State:
+        return _state(inner.reset(key).pipeline_state)
+
+    limits = jnp.asarray(system.actuator.ctrl_range).T.tolist()
+    names = [f"q_{k}" for k in range(coordinates)] + [
+        f"qd_{k}" for k in range(system.qd_size())
+    ]
+    return BraxPlant(
+        dt=float(inner.dt),
+        state_names=("p_x", "p_y", "yaw", *names),
+        control_low=tuple(limits[0]),
+        control_high=tuple(limits[1]),
+        parameters=parameters,
+        step=step,
+        start=start,
+    )
+
+
+def collect(
+    plant: BraxPlant,
+    key: Key,
+    *,
+    trajectories: int,
+    steps: int,
+    env_low: tuple[float, ...],
+    env_high: tuple[float, ...],
+    excitation: float = 0.3,
+    memory: float = 0.85,
+) -> Trajectory:
+    """Collect trajectories under random controls, each with its own e from a box.
+
+    u_k = clip(centre + half range · n_k), n_{k+1} = ϱ n_k + √(1 − ϱ²) σ w_k, w white
+    and n_0 = σ w.
+
+    Args:
+        plant: to simulate.
+        key: consumed.
+        trajectories: their number.
+        steps: of a trajectory.
+        env_low: lower corner of the box of e, one entry per parameter.
+        env_high: upper corner of the box.
+        excitation: σ, spread of the controls relative to half their range.
+        memory: ϱ.
+
+    Returns:
+        A batch of trajectories, states (trajectory, steps + 1, state).
+
+    Raises:
+        ValueError: a box whose corners do not have one entry per parameter.
+    """
+    for name, corner in (("env_low", env_low), ("env_high", env_high)):
+        if len(corner) != len(plant.parameters):
+            raise ValueError(
+                f"{name} must have an entry for each of "
+                f"{', '.join(plant.parameters)}, got {corner}"
+            )
+    low, high = jnp.asarray(plant.control_low), jnp.asarray(plant.control_high)
+
+    def one(key: Key) -> Trajectory:
+        start_key, env_key, noise_key = jax.random.split(key, 3)
+        corners = jnp.asarray(env_low), jnp.asarray(env_high)
+        env = jax.random.uniform(env_key, (len(env_low),), float, *corners)
+        fresh = excitation * jax.random.normal(noise_key, (steps, low.shape[0]))
+
+        def advance(
+            carry: tuple[State, Array], white: Float[Array, " control"]
+        ) -> tuple[Any, Any]:
+            state, noise = carry
+            wanted = 0.5 * (low + high) + 0.5 * (high - low) * noise
+            control = jnp.clip(wanted, low, high)
+            after = plant.step(state, control, env)
+            noise = memory * noise + jnp.sqrt(1.0 - memory**2) * white
+            return (after, noise), (after, control)
+
+        initial = plant.start(start_key)
+        _, (states, controls) = jax.lax.scan(
+            advance, (initial, fresh[0]), jnp.roll(fresh, -1, axis=0)
+        )
+        states = jnp.concatenate([initial[None], states])
+        return Trajectory(states, controls, jnp.tile(env, (steps, 1)))
+
+    return jax.vmap(one)(jax.random.split(key, trajectories))
+
+
+def _state(moment: Any) -> State:
+    """(0, 0, 0, q, q̇) of a state of brax."""
+    return jnp.concatenate([jnp.zeros(3), moment.q, moment.qd])

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
 from typing import Any, NamedTuple, TypeAlias
 
 import jax
@@ -11,19 +12,12 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 from scipy.integrate import solve_ivp
+from vehiclemodels.init_mb import init_mb
+from vehiclemodels.init_std import init_std
+from vehiclemodels.vehicle_dynamics_mb import vehicle_dynamics_mb
+from vehiclemodels.vehicle_dynamics_std import vehicle_dynamics_std
+from vehiclemodels.vehicle_parameters import setup_vehicle_parameters
 
-from sfkd_jax.adapters._commonroad_equations import (
-    CARS,
-    MODELS,
-    OBSERVED,
-    Equations,
-    Numbers,
-    car_numbered,
-    from_commonroad,
-    rates,
-    to_commonroad,
-    with_friction,
-)
 from sfkd_jax.plants import Vehicle, dynamic
 from sfkd_jax.types import Control, Controller, Environment, State, Step
 
@@ -32,9 +26,63 @@ ACCURACY: dict[str, Any] = {"method": "RK23", "rtol": 1e-5, "atol": 1e-7}
 """An explicit method, although slip settles within I_w v / (R_w² K_x), 1 ms at 10 m/s:
 implicit steps fail at a locked wheel.
 """
+CARS = (1, 2, 3)
+"""CommonRoad's numbers of the Ford Escort, the BMW 320i and the VW Vanagon."""
+OBSERVED = 7
+"""Number of leading states, in the order of `plants.dynamic`."""
 
+Numbers: TypeAlias = Sequence[float]
+Car: TypeAlias = Any
+"""CommonRoad's VehicleParameters, whose fields are all declared optional."""
 HostStep: TypeAlias = Callable[[Numbers, Numbers, Numbers], list[float]]
-Rates: TypeAlias = Callable[[list[float]], list[float]]
+
+
+class Equations(NamedTuple):
+    """One of CommonRoad's models, x = (p_x, p_y, δ, |v| or v_x, yaw, yaw rate, …).
+
+    Attributes:
+        rates: (x, (steering rate, acceleration), car) -> dx/dt.
+        settled: ((p_x, p_y, δ, |v|, yaw, yaw rate, slip angle), car) -> x with rolling
+            wheels and springs at rest.
+        seven: x -> the states of `plants.dynamic`.
+        rest: indices of the other entries of x.
+        wheels: indices of wheel speeds.
+        force_rates: (x, side force [N], car) -> what a force at the centre of mass adds
+            to dx/dt, by index.
+    """
+
+    rates: Callable[[list[float], list[float], Car], list[float]]
+    settled: Callable[[list[float], Car], list[float]]
+    seven: Callable[[Numbers], list[float]]
+    rest: tuple[int, ...]
+    wheels: tuple[int, ...]
+    force_rates: Callable[[Numbers, float, Car], dict[int, float]]
+
+
+def _drift_seven(x: Numbers) -> list[float]:
+    return [x[0], x[1], x[4], x[3] * math.cos(x[6]), x[3] * math.sin(x[6]), x[5], x[2]]
+
+
+def _drift_force_rates(x: Numbers, force: float, car: Car) -> dict[int, float]:
+    """m d|v|/dt has F sin β, m |v| dβ/dt has F cos β."""
+    across = force / (car.m * x[3]) * math.cos(x[6])
+    return {3: force / car.m * math.sin(x[6]), 6: across}
+
+
+MODELS = {
+    "std": Equations(
+        vehicle_dynamics_std, init_std, _drift_seven, (7, 8), (7, 8), _drift_force_rates
+    ),
+    "mb": Equations(
+        vehicle_dynamics_mb,
+        init_mb,
+        lambda x: [x[index] for index in (0, 1, 4, 3, 10, 5, 2)],
+        (*range(6, 10), *range(11, 29)),
+        (23, 24, 25, 26),
+        # On the sprung mass; the axles follow through their joints.
+        lambda x, force, car: {10: force / car.m_s},
+    ),
+}
 
 
 def commonroad_vehicle(
@@ -49,7 +97,7 @@ def commonroad_vehicle(
     """Return a car of CommonRoad as a plant.
 
     x = (p_x, p_y, yaw, v, v_y, yaw rate, δ | hidden), the first seven as in
-    `vehicle.dynamic`, p at the centre of mass. Hidden states are wheel speeds, and of
+    `plants.dynamic`, p at the centre of mass. Hidden states are wheel speeds, and of
     the multi-body car also roll, pitch, heave and the axles, relative to freely rolling
     wheels and springs at rest: a start with zeros there is in equilibrium.
 
@@ -79,8 +127,15 @@ def commonroad_vehicle(
 
     Source: Althoff and Würsching, CommonRoad: Vehicle Models.
     """
-    _check(model, car, dt, steering_lag)
-    dry = car_numbered(car)
+    if model not in MODELS:
+        raise ValueError(f"unknown model {model!r}; choose one of {', '.join(MODELS)}")
+    if car not in CARS:
+        raise ValueError(f"car must be one of {', '.join(map(str, CARS))}, got {car}")
+    if not (dt > 0 and steering_lag > 0):
+        raise ValueError(
+            f"dt and steering_lag must be positive, got {dt} and {steering_lag}"
+        )
+    dry: Car = setup_vehicle_parameters(car)
     host = _HostCar(MODELS[model], dry, dt, steering_lag, wind_force, wind_lever)
     bicycle = dynamic(
         dt=dt, wind_force=wind_force, front_length=dry.a, rear_length=dry.b
@@ -98,7 +153,8 @@ def commonroad_vehicle(
     )
 
 
-class _HostCar(NamedTuple):
+@dataclass(frozen=True)
+class _HostCar:
     """A car whose equations run on the host.
 
     Attributes:
@@ -111,24 +167,32 @@ class _HostCar(NamedTuple):
     """
 
     equations: Equations
-    car: Any
+    car: Car
     dt: float
     steering_lag: float
     wind_force: float
     wind_lever: float
 
-    def rates(self, control: Numbers, env: Numbers) -> Rates:
+    def flow(
+        self, control: Numbers, env: Numbers
+    ) -> Callable[[np.ndarray], list[float]]:
         """Return x -> dx/dt in CommonRoad's coordinates."""
-        car = with_friction(self.car, env[0])
+        tire = self.car.tire
+        # Friction limits the forces of the tyres, at the same stiffness.
+        p_dx1 = tire.p_dx1 * env[0] / tire.p_dy1
+        car = replace(self.car, tire=replace(tire, p_dy1=env[0], p_dx1=p_dx1))
         force = self.wind_force * env[1] * abs(env[1])
-        return lambda x: rates(
-            self.equations,
-            x,
-            [(control[0] - x[2]) / self.steering_lag, control[1]],
-            car,
-            force=force,
-            lever=self.wind_lever,
-        )
+
+        def rates(moment: np.ndarray) -> list[float]:
+            x = moment.tolist()
+            inputs = [(control[0] - x[2]) / self.steering_lag, control[1]]
+            result = self.equations.rates(x, inputs, car)
+            for index, change in self.equations.force_rates(x, force, car).items():
+                result[index] += change
+            result[5] += self.wind_lever * force / car.I_z
+            return [float(change) for change in result]
+
+        return rates
 
     def step(self, state: Numbers, control: Numbers, env: Numbers) -> list[float]:
         """Return the state one sampling period later, NaN where equations end."""
@@ -136,8 +200,7 @@ class _HostCar(NamedTuple):
         if not (all(map(math.isfinite, state)) and state[3] > SLOWEST):
             return lost
         # In double precision: a wheel settles a hundred times faster than dt.
-        flow = self.rates(control, env)
-        start = np.asarray(to_commonroad(self.equations, state, self.car))
+        flow = self.flow(control, env)
 
         def too_slow(time: float, x: Any) -> float:
             del time
@@ -146,9 +209,9 @@ class _HostCar(NamedTuple):
         too_slow.terminal = True  # type: ignore[attr-defined]
         try:
             solution = solve_ivp(
-                lambda time, x: flow(x.tolist()),
+                lambda time, x: flow(x),
                 (0.0, self.dt),
-                start,
+                self.to_commonroad(state),
                 events=too_slow,
                 **ACCURACY,
             )
@@ -156,19 +219,43 @@ class _HostCar(NamedTuple):
         # rolls backwards.
         except ArithmeticError:
             return lost
-        if solution.status != 0:
-            return lost
-        return from_commonroad(self.equations, solution.y[:, -1].tolist(), self.car)
+        return lost if solution.status != 0 else self.from_commonroad(solution.y[:, -1])
 
     def derivative(self, state: Numbers, control: Numbers, env: Numbers) -> list[float]:
         """Return dx/dt by a central difference along the flow."""
-        x = np.asarray(to_commonroad(self.equations, state, self.car))
-        little = 1e-6 * np.asarray(self.rates(control, env)(x.tolist()))
+        x = self.to_commonroad(state)
+        little = 1e-6 * np.asarray(self.flow(control, env)(x))
         ahead, behind = (
-            np.asarray(from_commonroad(self.equations, y.tolist(), self.car))
-            for y in (x + little, x - little)
+            np.asarray(self.from_commonroad(y)) for y in (x + little, x - little)
         )
         return ((ahead - behind) / 2e-6).tolist()
+
+    def to_commonroad(self, state: Numbers) -> np.ndarray:
+        """Return CommonRoad's x of a state; hidden states are added to the settled x.
+
+        CommonRoad leaves a locked wheel with a speed just below 0, from which it never
+        turns again; here the speed becomes 0.
+        """
+        x = self._settled(state)
+        for index, hidden in zip(self.equations.rest, state[OBSERVED:], strict=True):
+            x[index] += hidden
+        for index in self.equations.wheels:
+            x[index] = max(x[index], 0.0)
+        return np.asarray(x)
+
+    def from_commonroad(self, moment: np.ndarray) -> list[float]:
+        """Return the state of CommonRoad's x."""
+        x = moment.tolist()
+        seven = self.equations.seven(x)
+        settled = self._settled(seven)
+        return [*seven, *(x[k] - settled[k] for k in self.equations.rest)]
+
+    def _settled(self, state: Numbers) -> list[float]:
+        """CommonRoad's x of the first seven states, with all others at rest."""
+        x, y, yaw, along, across, yaw_rate, steering = state[:OBSERVED]
+        speed, slip = math.hypot(along, across), math.atan2(across, along)
+        core = [x, y, steering, speed, yaw, yaw_rate, slip]
+        return self.equations.settled(core, self.car)
 
 
 def commonroad_observation(
@@ -209,18 +296,6 @@ def commonroad_controller(
         )
 
     return controller._replace(act=act)
-
-
-def _check(model: str, car: int, dt: float, steering_lag: float) -> None:
-    """Check model, car and times."""
-    if model not in MODELS:
-        raise ValueError(f"unknown model {model!r}; choose one of {', '.join(MODELS)}")
-    if car not in CARS:
-        raise ValueError(f"car must be one of {', '.join(map(str, CARS))}, got {car}")
-    if not (dt > 0 and steering_lag > 0):
-        raise ValueError(
-            f"dt and steering_lag must be positive, got {dt} and {steering_lag}"
-        )
 
 
 def _on_host(function: HostStep) -> Step:

@@ -2,18 +2,15 @@
 
 from __future__ import annotations
 
-from functools import partial
 from typing import Any
 
 import gymnasium
 import jax
 import numpy as np
-from jaxtyping import Array, Float
 
 from sfkd_jax.adapters._drawing import RoadView
-from sfkd_jax.adapters._task import DrivingTask, Moment, Transition, tracking_task
+from sfkd_jax.adapters._task import Moment, tracking_task
 from sfkd_jax.scenarios import Scenario, point_at
-from sfkd_jax.types import Control, Key
 
 NAME = "sfkd_jax/Vehicle-v0"
 MODES = ("human", "rgb_array")
@@ -61,23 +58,28 @@ class GymnasiumVehicle(gymnasium.Env):
         )
         self._now: tuple[Scenario, Moment] | None = None
         self._view: RoadView | None = None
-        self._start = jax.jit(partial(_start, task))
-        self._advance = jax.jit(partial(_advance, task))
-        self._foot = jax.jit(_foot)
+        self._observe = jax.jit(task.observe)
+        self._start = jax.jit(task.reset)
+        self._advance = jax.jit(task.step)
+        self._foot = jax.jit(
+            lambda road, moment: point_at(road.path, moment.progress)[:2]
+        )
 
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
     ) -> tuple[np.ndarray, dict[str, Any]]:
         """Start an episode on a new road; there are no options."""
         super().reset(seed=seed, options=options)
-        road, moment, observation = self._start(
-            jax.random.key(int(self.np_random.integers(2**31)))
-        )
-        self._now = road, moment
+        seed = int(self.np_random.integers(2**31))
+        road, _ = self._now = self._start(jax.random.key(seed))
         if self.render_mode is not None:
-            self._new_view().start(np.asarray(road.path.points))
+            if self._view is None:
+                human = self.render_mode == "human"
+                task = self._task
+                self._view = RoadView(dt=task.plant.dt, lane=task.lane, human=human)
+            self._view.start(np.asarray(road.path.points))
             self._follow()
-        return self._bounded(observation), {}
+        return self._observation(), {}
 
     def step(
         self, action: np.ndarray
@@ -90,15 +92,14 @@ class GymnasiumVehicle(gymnasium.Env):
         if self._now is None:
             raise gymnasium.error.ResetNeeded("call reset before step")
         road, moment = self._now
-        moment, outcome, observation = self._advance(
-            road, moment, np.asarray(action, dtype=np.float32)
-        )
+        action = np.asarray(action, dtype=np.float32)
+        moment, outcome = self._advance(road, moment, action)
         self._now = road, moment
         if self.render_mode is not None:
             self._follow()
         info = {name: float(value) for name, value in outcome.measures.items()}
         return (
-            self._bounded(observation),
+            self._observation(),
             float(outcome.reward),
             bool(outcome.left),
             bool(outcome.over),
@@ -130,20 +131,11 @@ class GymnasiumVehicle(gymnasium.Env):
             self._view.close()
             self._view = None
 
-    def _bounded(self, observation: Float[Array, " observation"]) -> np.ndarray:
-        """An observation within its bounds, from which rounding may take it."""
+    def _observation(self) -> np.ndarray:
+        """The observation within its bounds, from which rounding may take it."""
+        assert self._now is not None
         space: Any = self.observation_space
-        return np.clip(np.array(observation), space.low, space.high)
-
-    def _new_view(self) -> RoadView:
-        """The view, made at the first reset."""
-        if self._view is None:
-            self._view = RoadView(
-                dt=self._task.plant.dt,
-                lane=self._task.lane,
-                human=self.render_mode == "human",
-            )
-        return self._view
+        return np.clip(np.array(self._observe(*self._now)), space.low, space.high)
 
     def _follow(self) -> None:
         """Extend the driven line; a window is drawn at once, an image on demand."""
@@ -164,24 +156,3 @@ class GymnasiumVehicle(gymnasium.Env):
             f"deviation {float(moment.lateral):+.2f} m"
         )
         view.draw(state, np.asarray(self._foot(road, moment)), title)
-
-
-def _start(
-    task: DrivingTask, key: Key
-) -> tuple[Scenario, Moment, Float[Array, " observation"]]:
-    """A new episode and its first observation."""
-    road, moment = task.reset(key)
-    return road, moment, task.observe(road, moment)
-
-
-def _advance(
-    task: DrivingTask, road: Scenario, moment: Moment, action: Control
-) -> tuple[Moment, Transition, Float[Array, " observation"]]:
-    """One step and its observation."""
-    moment, outcome = task.step(road, moment, action)
-    return moment, outcome, task.observe(road, moment)
-
-
-def _foot(road: Scenario, moment: Moment) -> Float[Array, " 2"]:
-    """The closest point of the path [m]."""
-    return point_at(road.path, moment.progress)[:2]

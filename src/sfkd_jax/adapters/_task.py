@@ -25,7 +25,7 @@ from sfkd_jax.types import (
     State,
 )
 
-MEASURES = ("lateral", "speed_error", "steering_rate")
+MEASURES: tuple[str, ...] = ("lateral", "speed_error", "steering_rate")
 
 
 class Moment(NamedTuple):
@@ -154,11 +154,8 @@ class DrivingTask:
         guess = moment.progress + after[3] * plant.dt
         progress, offset = project(road.path, after[:2], guess)
         reached = Moment(after, progress, offset, applied, moment.count + 1)
-        sound = jnp.all(
-            jnp.isfinite(
-                jnp.concatenate([after, applied, jnp.stack([progress, offset])])
-            )
-        )
+        parts = [after, applied, jnp.stack([progress, offset])]
+        sound = jnp.all(jnp.isfinite(jnp.concatenate(parts)))
         # A state that is not finite ends the episode; what is observed is the last one.
         kept: Moment = jax.tree.map(
             lambda new, old: jnp.where(sound, new, old), reached, moment
@@ -180,10 +177,8 @@ class DrivingTask:
             + self.speed * missed**2
             + self.steering_rate * turned**2
         )
-        values = (kept.lateral, missed, turned)
-        measures = {
-            name: jnp.abs(value) for name, value in zip(MEASURES, values, strict=True)
-        }
+        values = map(jnp.abs, (kept.lateral, missed, turned))
+        measures = dict(zip(MEASURES, values, strict=True))
         reward = -cost - self.leaving * left
         return Transition(reward, left, ~left & ended, measures)
 
@@ -256,21 +251,14 @@ def tracking_task(
         ValueError: an unknown name, a size, width or duration that is not positive, or
             a negative weight.
     """
-    for name, weight in (
-        ("lateral", lateral),
-        ("speed", speed),
-        ("steering_rate", steering_rate),
-        ("leaving", leaving),
-    ):
+    weights = (lateral, speed, steering_rate, leaving)
+    names = ("lateral", "speed", "steering_rate", "leaving")
+    for name, weight in zip(names, weights, strict=True):
         if not (math.isfinite(weight) and weight >= 0):
             raise ValueError(f"{name} must be finite and at least 0, got {weight}")
-    plant = (
-        vehicle
-        if isinstance(vehicle, Vehicle)
-        else build.build_vehicle(
-            {"name": vehicle, "inner_loop": inner_loop, "speed_gain": 1.0}
-        )
-    )
+    named = {"name": vehicle, "inner_loop": inner_loop, "speed_gain": 1.0}
+    own = isinstance(vehicle, Vehicle)
+    plant = vehicle if own else build.build_vehicle(named)
     if not (math.isfinite(duration) and duration >= plant.dt):
         raise ValueError(
             f"duration must be finite and at least one step of {plant.dt} s, "
@@ -280,14 +268,10 @@ def tracking_task(
         raise ValueError(f"preview must be a whole number of at least 1, got {preview}")
     if not lane > 0:
         raise ValueError(f"lane must be positive, got {lane}")
-    family = (
-        build.build_scenario({"name": scenario}, plant, duration=duration)
-        if isinstance(scenario, str)
-        else scenario
-    )
-    task = DrivingTask(
-        plant, family, preview, lane, lateral, speed, steering_rate, leaving
-    )
+    family = scenario
+    if isinstance(family, str):
+        family = build.build_scenario({"name": family}, plant, duration=duration)
+    task = DrivingTask(plant, family, preview, lane, *weights)
     _ = task.steps  # refuses a family that is for another plant
     return task
 

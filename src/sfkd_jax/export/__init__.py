@@ -2,9 +2,6 @@
 
 from sfkd_jax.export._folder import PLATFORMS as PLATFORMS
 from sfkd_jax.export._folder import write_controller as write_controller
-from sfkd_jax.export._iree import fold_constants as fold_constants
-from sfkd_jax.export._programs import Leaf as Leaf
-from sfkd_jax.export._programs import Program as Program
-from sfkd_jax.export._programs import Programs as Programs
 from sfkd_jax.export._programs import flat_programs as flat_programs
+from sfkd_jax.export._programs import fold_constants as fold_constants
 from sfkd_jax.export._programs import warm_up as warm_up

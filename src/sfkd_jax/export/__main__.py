@@ -54,12 +54,9 @@ def _write(settings: Settings) -> dict[str, Any]:
         f"exported: {folder}; python {folder / 'run_controller.py'} "
         "runs it without sfkd_jax"
     )
-    files = {
-        "blob": "controller.stablehlo",
-        "manifest": "controller.json",
-        "policy": "policy.safetensors",
-    }
-    return {key: str(folder / name) for key, name in files.items()}
+    files = ("controller.stablehlo", "controller.json", "policy.safetensors")
+    names = ("blob", "manifest", "policy")
+    return {key: str(folder / file) for key, file in zip(names, files, strict=True)}
 
 
 if __name__ == "__main__":

@@ -12,10 +12,8 @@ import jax
 import numpy as np
 
 from sfkd_jax import build, policy, store
-from sfkd_jax.export._iree import compile_iree
-from sfkd_jax.export._programs import Leaf, flat_programs, lower
+from sfkd_jax.export._programs import compile_iree, flat_programs
 from sfkd_jax.ranges import Names
-from sfkd_jax.types import Params
 
 FORMAT = 2
 """Version of the manifest and of the order of arguments; run_controller.py reads no
@@ -23,11 +21,8 @@ other version.
 """
 PLATFORMS = ("cpu", "cuda", "rocm", "tpu")
 FILES = {"act": "controller", "init": "initial_state"}
-MANIFEST, CERTIFICATE, SCRIPT = (
-    "controller.json",
-    "certificate.json",
-    "run_controller.py",
-)
+MANIFEST, CERTIFICATE = "controller.json", "certificate.json"
+SCRIPT = "run_controller.py"
 
 
 def write_controller(
@@ -69,10 +64,7 @@ def write_controller(
         for name, program in programs.items()
         if iree
     }
-    exported = {
-        name: lower(program.function, program, platforms)
-        for name, program in programs.items()
-    }
+    exported = {name: one.lower(*platforms) for name, one in programs.items()}
     # First the manifest goes: a folder half written is none.
     for stale in (MANIFEST, CERTIFICATE, *(f"{stem}.vmfb" for stem in FILES.values())):
         (folder / stale).unlink(missing_ok=True)
@@ -93,7 +85,10 @@ def write_controller(
             name: _write(
                 folder / f"{FILES[name]}.stablehlo", bytes(exported[name].serialize())
             )
-            | {"inputs": _listed(program.inputs), "outputs": _listed(program.outputs)}
+            | {
+                "inputs": [leaf._asdict() for leaf in program.inputs],
+                "outputs": [leaf._asdict() for leaf in program.outputs],
+            }
             for name, program in programs.items()
         },
         "iree": {
@@ -105,7 +100,7 @@ def write_controller(
         "weights_sha256": stored["sha256"],
         "certificate_sha256": _certificate(trained, folder, stored["content_sha256"]),
         **_vehicle(trained),
-        "parameters": _count(trained.weights),
+        "parameters": sum(np.size(leaf) for leaf in jax.tree.leaves(trained.weights)),
         "settings": trained.settings,
         "versions": store.versions(),
     }
@@ -124,10 +119,6 @@ def _write(path: Path, content: bytes) -> dict[str, Any]:
         "bytes": len(content),
         "sha256": hashlib.sha256(content).hexdigest(),
     }
-
-
-def _listed(leaves: tuple[Leaf, ...]) -> list[dict[str, Any]]:
-    return [leaf._asdict() for leaf in leaves]
 
 
 def _certificate(
@@ -164,8 +155,3 @@ def _vehicle(trained: policy.Policy) -> dict[str, Any]:
         "environment": {"names": ["friction [-]", "lateral wind [m/s]"], **box},
         "reference": ["x [m]", "y [m]", "yaw [rad]", "speed [m/s]"],
     }
-
-
-def _count(params: Params) -> int:
-    """Return the number of weights."""
-    return sum(int(np.size(leaf)) for leaf in jax.tree.leaves(params))

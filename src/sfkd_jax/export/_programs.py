@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import contextmanager, nullcontext
+from contextlib import contextmanager
 from functools import partial
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -12,17 +12,11 @@ import jax
 import jax.export
 import jax.numpy as jnp
 from jax.experimental.compilation_cache import compilation_cache
+from jax.extend.core import ClosedJaxpr, Literal, Var, jaxpr_as_fun
 from jaxtyping import Array
 
 from sfkd_jax import build
 from sfkd_jax.policy import Policy
-
-CACHE_SETTINGS = {
-    "jax_enable_compilation_cache": True,
-    "jax_persistent_cache_min_compile_time_secs": 0.0,
-    "jax_persistent_cache_min_entry_size_bytes": -1,
-}
-"""Cache every compilation, however short and small."""
 
 
 class Leaf(NamedTuple):
@@ -36,9 +30,26 @@ class Leaf(NamedTuple):
 class Program(NamedTuple):
     """A function of flat arrays, with its inputs and outputs in order."""
 
-    function: Callable[..., tuple[Array, ...]]
+    function: Callable[..., Sequence[Array]]
     inputs: tuple[Leaf, ...]
     outputs: tuple[Leaf, ...]
+
+    @property
+    def shapes(self) -> tuple[jax.ShapeDtypeStruct, ...]:
+        """Of the inputs."""
+        return tuple(
+            jax.ShapeDtypeStruct(leaf.shape, leaf.dtype) for leaf in self.inputs
+        )
+
+    def lower(self, *platforms: str) -> jax.export.Exported:
+        """Return the program as StableHLO for platforms, including unused arguments.
+
+        Source locations are left out: they contain paths of this machine and would make
+        the result depend on it.
+        """
+        with _jax_settings({"jax_traceback_in_locations_limit": 0}):
+            function = jax.jit(self.function, keep_unused=True)
+            return jax.export.export(function, platforms=platforms)(*self.shapes)
 
 
 class Programs(NamedTuple):
@@ -56,8 +67,8 @@ class Programs(NamedTuple):
     key_implementation: str
 
 
-def example_inputs(policy: Policy) -> tuple[Any, ...]:
-    """Return the shapes of key, controller state, observation, env and reference."""
+def _example_inputs(policy: Policy) -> tuple[Any, ...]:
+    """The shapes of key, controller state, observation, env and reference."""
     key = jax.eval_shape(partial(jax.random.key, 0))
     settings = policy.settings
     plant = build.build_vehicle(settings["vehicle"])
@@ -77,7 +88,7 @@ def flat_programs(policy: Policy) -> Programs:
         ValueError: the controller's state changes its structure, shapes or dtypes from
             step to step.
     """
-    key, state, *measured = example_inputs(policy)
+    key, state, *measured = _example_inputs(policy)
     implementation = str(jax.random.key_impl(jax.random.key(0)))
     wrap = partial(jax.random.wrap_key_data, impl=implementation)
     # Flat and named: other programs know neither pytrees nor keys.
@@ -86,72 +97,34 @@ def flat_programs(policy: Policy) -> Programs:
     def init(key_data: Array) -> tuple[Array, ...]:
         return tuple(_unpack(policy.controller.init(wrap(key_data))))
 
-    def pack(leaves: Sequence[Array]) -> Any:
-        wrapped = [
-            wrap(leaf) if _is_key(like) else leaf
-            for like, leaf in zip(template, leaves, strict=True)
-        ]
-        return jax.tree.unflatten(structure, wrapped)
-
     def act(*leaves: Array) -> tuple[Array, ...]:
         *before, observation, env, reference = leaves
+        before = [
+            wrap(leaf) if _is_key(like) else leaf
+            for like, leaf in zip(template, before, strict=True)
+        ]
         # Without the barrier XLA evaluates functions of the weights at compile time and
         # rounds differently.
         params = jax.lax.optimization_barrier(policy.params)
         control, after, info = policy.controller.act(
-            params, pack(before), observation, env, reference
+            params, jax.tree.unflatten(structure, before), observation, env, reference
         )
         return control, *_unpack(after), *jax.tree.leaves(info)
 
     control, after, info = jax.eval_shape(
         policy.controller.act, policy.params, state, *measured
     )
-    if (
-        _named("state", after) != _named("state", state)
-        or jax.tree.structure(after) != structure
-    ):
+    states = _named("state", state)
+    if _named("state", after) != states or jax.tree.structure(after) != structure:
         raise ValueError(
             "cannot export a controller whose state changes its structure, "
             "shapes or dtypes"
         )
-    arguments = zip(("observation", "env", "reference"), measured, strict=True)
-    inputs = _named("state", state) + tuple(
-        _leaf(name, value) for name, value in arguments
-    )
-    outputs = (
-        _leaf("control", control),
-        *_named("state", after),
-        *_named("info", info),
-    )
-    initial = Program(init, (_leaf("key", key),), _named("state", state))
+    names = ("observation", "env", "reference")
+    inputs = (*states, *map(_leaf, names, measured))
+    outputs = (_leaf("control", control), *states, *_named("info", info))
+    initial = Program(init, (_leaf("key", key),), states)
     return Programs(initial, Program(act, inputs, outputs), implementation)
-
-
-def input_shapes(program: Program) -> tuple[jax.ShapeDtypeStruct, ...]:
-    """Return the shapes of a program's inputs."""
-    return tuple(
-        jax.ShapeDtypeStruct(leaf.shape, leaf.dtype) for leaf in program.inputs
-    )
-
-
-def lower(
-    function: Callable[..., Any], program: Program, platforms: tuple[str, ...]
-) -> jax.export.Exported:
-    """Return a function of a program's inputs as StableHLO, including unused arguments.
-
-    Source locations are left out: they contain paths of this machine and would make the
-    result depend on it.
-
-    Args:
-        function: to lower.
-        program: for its inputs.
-        platforms: to lower for.
-    """
-    with jax_settings({"jax_traceback_in_locations_limit": 0}):
-        export = jax.export.export(
-            jax.jit(function, keep_unused=True), platforms=platforms
-        )
-        return export(*input_shapes(program))
 
 
 def _is_key(leaf: Any) -> bool:
@@ -174,14 +147,81 @@ def _leaf(name: str, value: Any) -> Leaf:
 
 def _named(root: str, tree: Any) -> tuple[Leaf, ...]:
     """Return the leaves of a tree by dotted path."""
-    paths = jax.tree_util.tree_leaves_with_path(tree)
-    names = (
-        f"{root}.{jax.tree_util.keystr(path, simple=True, separator='.')}"
-        for path, _ in paths
-    )
-    return tuple(
-        _leaf(name, leaf) for name, (_, leaf) in zip(names, paths, strict=True)
-    )
+    name = partial(jax.tree_util.keystr, simple=True, separator=".")
+    pairs = jax.tree_util.tree_leaves_with_path(tree)
+    return tuple(_leaf(f"{root}.{name(path)}", leaf) for path, leaf in pairs)
+
+
+def fold_constants(program: Program) -> Program:
+    """Return the same program with all operations on constants replaced by results.
+
+    IREE has no LAPACK and cannot compile factorisations. With folded parameters one
+    model still has factorisations of its weights: ControlSynth, for the inverse of its
+    metric's factor. Factorisations in every control step remain: those of the quadratic
+    program of `koopman_mpc` and the eigenvectors of `curvature`. The rounding differs
+    from that of a single program.
+    """
+    closed = jax.make_jaxpr(program.function)(*program.shapes)
+    jaxpr = closed.jaxpr
+    known, ahead, rest = set(jaxpr.constvars), [], []
+    for equation in jaxpr.eqns:
+        # An effect, such as a print, belongs to every step.
+        constant = not equation.effects and all(
+            isinstance(atom, Literal) or atom in known for atom in equation.invars
+        )
+        (ahead if constant else rest).append(equation)
+        known |= set(equation.outvars) if constant else set()
+    wanted = [atom for equation in rest for atom in equation.invars]
+    wanted += list(jaxpr.outvars)
+    border: Any = [
+        atom
+        for atom in dict.fromkeys(x for x in wanted if isinstance(x, Var))
+        if atom in known
+    ]
+    names = jaxpr.debug_info.with_unknown_names()
+    first = jaxpr.replace(invars=[], outvars=border, eqns=ahead, debug_info=names)
+    values = jax.jit(jaxpr_as_fun(ClosedJaxpr(first, closed.consts)))()
+    second = jaxpr.replace(constvars=border, eqns=rest, debug_info=names)
+    remaining = jaxpr_as_fun(ClosedJaxpr(second, values))
+
+    def main(*leaves: Array) -> Sequence[Array]:
+        return remaining(*leaves)
+
+    return program._replace(function=main)
+
+
+def compile_iree(program: Program, *, flags: Sequence[str] = ()) -> bytes:
+    """Return an IREE module (.vmfb) for CPUs, with the function `main`.
+
+    Arguments and results are those of the manifest.
+
+    Args:
+        program: to compile.
+        flags: for iree-compile, such as the processor or the target triple.
+
+    Raises:
+        ValueError: IREE is not installed, or does not compile this program; with its
+            first error.
+    """
+    try:
+        from iree import compiler  # pyright: ignore[reportMissingImports]
+    except ImportError:
+        raise ValueError(
+            "export.iree=true needs IREE: pip install 'sfkd-jax[cpp]'"
+        ) from None
+    text = fold_constants(program).lower("cpu").mlir_module()
+    try:
+        return compiler.compile_str(
+            text,
+            input_type="stablehlo",
+            target_backends=["llvm-cpu"],
+            extra_args=list(flags),
+        )
+    except compiler.CompilerToolError as error:
+        message = str(error).partition("Diagnostics:\n")[2] or str(error)
+        raise ValueError(
+            f"iree-compile failed: {message.splitlines()[0][:300]}"
+        ) from error
 
 
 def warm_up(policy: Policy, *, cache: str | Path | None = None) -> jax.stages.Compiled:
@@ -204,45 +244,36 @@ def warm_up(policy: Policy, *, cache: str | Path | None = None) -> jax.stages.Co
     Returns:
         The compiled function, for float32 arrays of the policy's shapes only.
     """
-    _, state, *measured = example_inputs(policy)
+    _, state, *measured = _example_inputs(policy)
 
     # A new function: jax would not compile and cache one again that has run.
     def act(*arguments: Any) -> Any:
         return policy.controller.act(*arguments)
 
     lowered = jax.jit(act).lower(policy.params, state, *measured)
-    with (
-        nullcontext()
-        if cache is None
-        else _persistent_cache(Path(cache).expanduser().resolve())
-    ):
+    if cache is None:
         return lowered.compile()
-
-
-@contextmanager
-def _persistent_cache(directory: Path) -> Iterator[None]:
-    """Use jax's compilation cache in `directory`, and restore the former one.
-
-    The cache is reset, since an open one ignores changed settings.
-    """
+    # Every compilation is kept, however short and small.
+    settings = {
+        "jax_enable_compilation_cache": True,
+        "jax_persistent_cache_min_compile_time_secs": 0.0,
+        "jax_persistent_cache_min_entry_size_bytes": -1,
+        "jax_compilation_cache_dir": str(Path(cache).expanduser().resolve()),
+    }
     try:
-        with jax_settings(
-            CACHE_SETTINGS | {"jax_compilation_cache_dir": str(directory)}
-        ):
+        with _jax_settings(settings):
+            # An open cache ignores changed settings.
             compilation_cache.reset_cache()
-            yield
+            return lowered.compile()
     finally:
         compilation_cache.reset_cache()
 
 
 @contextmanager
-def jax_settings(values: Mapping[str, object]) -> Iterator[None]:
-    """Set settings of jax and restore them afterwards.
+def _jax_settings(values: Mapping[str, object]) -> Iterator[None]:
+    """Set settings of jax by name, and restore them afterwards.
 
     Other threads should not trace or compile meanwhile.
-
-    Args:
-        values: by their names in `jax.config`.
     """
     before = {name: getattr(jax.config, name) for name in values}
     try:

@@ -48,6 +48,13 @@ MALFORMED = (
 class ExportError(Exception):
     """A file of the export cannot be used; one line with its name and the reason."""
 
+    def __init__(self, path: Path, reason: object) -> None:
+        """Shorten to one printable line."""
+        words = " ".join(f"{path}: {reason}".split())
+        # A file may put anything into its message, also what moves a cursor.
+        line = "".join(x if x.isprintable() else " " for x in words)
+        super().__init__(line[:500])
+
 
 class ExportedController:
     """An exported controller, checked and compiled when it is constructed.
@@ -74,16 +81,11 @@ class ExportedController:
                 _compiled(path.parent, self.manifest, name) for name in ("init", "act")
             )
             key, first = self._key(0), self.manifest["programs"]["init"]["inputs"][0]
-            if (
-                not isinstance(self.manifest["key_implementation"], str)
-                or key.shape != tuple(first["shape"])
-                or str(key.dtype) != first["dtype"]
-            ):
+            if (key.shape, str(key.dtype)) != (tuple(first["shape"]), first["dtype"]):
                 raise ValueError("key_implementation")
         except MALFORMED as error:
-            raise ExportError(
-                _line(f"{path}: malformed, {type(error).__name__}: {error}")
-            ) from None
+            reason = f"malformed, {type(error).__name__}: {error}"
+            raise ExportError(path, reason) from None
 
     def init(self, seed: int = 0) -> dict[str, jax.Array]:
         """Return the state before the first step; `seed` determines all samples."""
@@ -124,18 +126,14 @@ class ExportedController:
                     f"{leaf['name']} must have shape {tuple(leaf['shape'])}, "
                     f"got {value.shape}"
                 )
-        outputs = self._act(*given.values())
-        return (
-            outputs[0],
-            self._named("act", "state", outputs),
-            self._named("act", "info", outputs),
-        )
+        values = self._act(*given.values())
+        state, info = (self._named("act", root, values) for root in ("state", "info"))
+        return values[0], state, info
 
     def _key(self, seed: int) -> jax.Array:
         """Return the data of a random key."""
-        return jax.random.key_data(
-            jax.random.key(seed, impl=self.manifest["key_implementation"])
-        )
+        implementation = str(self.manifest["key_implementation"])
+        return jax.random.key_data(jax.random.key(seed, impl=implementation))
 
     def _named(self, program: str, root: str, values: Any) -> dict[str, jax.Array]:
         """Return the outputs below `root` by name, without the prefix."""
@@ -153,63 +151,46 @@ def _manifest(path: Path) -> dict[str, Any]:
     try:
         manifest = json.loads(_content(path, MAX_BYTES).decode())
         if not isinstance(manifest, dict) or manifest.get("kind") != "controller":
-            raise ExportError(f"{path}: not the manifest of a controller")
-        if manifest.get("format") != FORMAT:
-            raise ExportError(
-                _line(
-                    f"{path}: is of format {manifest.get('format')}, "
-                    f"this file reads {FORMAT}"
-                )
-            )
+            raise ExportError(path, "not the manifest of a controller")
+        version = manifest.get("format")
+        if version != FORMAT:
+            raise ExportError(path, f"is of format {version}, this file reads {FORMAT}")
         hashed = {name: value for name, value in manifest.items() if name != "sha256"}
-        digest = hashlib.sha256(
-            json.dumps(hashed, sort_keys=True, allow_nan=False).encode()
-        ).hexdigest()
+        text = json.dumps(hashed, sort_keys=True, allow_nan=False)
     except (ValueError, RecursionError):
-        raise ExportError(f"{path}: truncated or not JSON") from None
-    if digest != manifest.get("sha256"):
-        raise ExportError(f"{path}: changed, its sha256 is not that of its content")
+        raise ExportError(path, "truncated or not JSON") from None
+    if hashlib.sha256(text.encode()).hexdigest() != manifest.get("sha256"):
+        raise ExportError(path, "changed, its sha256 is not that of its content")
     return manifest
 
 
 def _compiled(folder: Path, manifest: dict[str, Any], name: str) -> Any:
     """Return a program of the export, compiled for the default device."""
     program = manifest["programs"][name]
+    # A manifest must not name files elsewhere.
     if Path(program["file"]).name != program["file"] or program["file"] in ("", ".."):
-        raise ValueError(
-            f"{program['file']!r} is not the name of a file in this folder"
-        )
-    path = folder / program["file"]
-    content = _content(path, int(program["bytes"]))
-    if len(content) < program["bytes"]:
+        raise ValueError(f"{program['file']!r} is no name of a file in this folder")
+    path, size = folder / program["file"], int(program["bytes"])
+    content = _content(path, size)
+    if len(content) < size:
+        raise ExportError(path, f"truncated, {len(content)} of {size} bytes")
+    digest, recorded = hashlib.sha256(content).hexdigest(), program["sha256"]
+    if digest != recorded:
         raise ExportError(
-            f"{path}: truncated, {len(content)} of {program['bytes']} bytes"
-        )
-    digest = hashlib.sha256(content).hexdigest()
-    if digest != program["sha256"]:
-        raise ExportError(
-            f"{path}: changed, sha256 {digest[:12]}, recorded {program['sha256'][:12]}"
+            path, f"changed, sha256 {digest[:12]}, recorded {recorded[:12]}"
         )
     try:
         exported = jax.export.deserialize(bytearray(content))
-        inputs = [
-            jax.ShapeDtypeStruct(value.shape, value.dtype)
-            for value in exported.in_avals
-        ]
+        inputs = [jax.ShapeDtypeStruct(x.shape, x.dtype) for x in exported.in_avals]
         compiled = jax.jit(exported.call).lower(*inputs).compile()
     except Exception as error:  # a blob of another version raises nearly anything
         written = f"written by jax {manifest['jax']}, refused by {jax.__version__}"
-        raise ExportError(_line(f"{path}: {written}: {error}")) from None
-    for side, values in (
-        ("inputs", exported.in_avals),
-        ("outputs", exported.out_avals),
-    ):
-        listed = [
-            (type(leaf["name"]), tuple(leaf["shape"]), leaf["dtype"])
-            for leaf in program[side]
-        ]
-        if listed != [(str, value.shape, str(value.dtype)) for value in values]:
-            raise ExportError(f"{path}: has other {side} than its manifest")
+        raise ExportError(path, f"{written}: {error}") from None
+    sides = {"inputs": exported.in_avals, "outputs": exported.out_avals}
+    for side, values in sides.items():
+        listed = [(tuple(leaf["shape"]), leaf["dtype"]) for leaf in program[side]]
+        if listed != [(value.shape, str(value.dtype)) for value in values]:
+            raise ExportError(path, f"has other {side} than its manifest")
     return compiled
 
 
@@ -218,24 +199,17 @@ def _content(path: Path, most: int) -> bytes:
     try:
         # Opening anything else, such as a pipe, could wait for ever.
         if path.exists() and not path.is_file():
-            raise ExportError(f"{path}: not a regular file")
+            raise ExportError(path, "not a regular file")
         if (size := path.stat().st_size) > most:
-            raise ExportError(f"{path}: {size} bytes, at most {most} belong to it")
+            raise ExportError(path, f"{size} bytes, at most {most} belong to it")
         return path.read_bytes()
     except (OSError, ValueError) as error:  # ValueError: an impossible file name
         reason = getattr(error, "strerror", None) or error
-        raise ExportError(_line(f"{path}: {reason}")) from None
-
-
-def _line(text: str) -> str:
-    """Shorten a message to one printable line."""
-    return "".join(
-        letter if letter.isprintable() else " " for letter in " ".join(text.split())
-    )[:500]
+        raise ExportError(path, reason) from None
 
 
 def main() -> None:
-    """Step the controller at a fixed observation and print its controls."""
+    """Step the controller beside a straight road and print its controls."""
     parser = argparse.ArgumentParser(
         description="Check an exported controller and step it on a straight road."
     )
@@ -245,24 +219,18 @@ def main() -> None:
     arguments = parser.parse_args()
     try:
         controller = ExportedController(arguments.folder)
-        observation, env, reference = _straight(controller.manifest)
+        measured = _straight(controller.manifest)
         names = [entry["name"] for entry in controller.manifest["controls"]]
-    except ExportError as reason:
-        sys.exit(f"run_controller: {reason}")
-    except MALFORMED as reason:
-        message = f"malformed, {type(reason).__name__}: {reason}"
-        sys.exit(_line(f"run_controller: {arguments.folder}: {message}"))
+    except (ExportError, *MALFORMED) as reason:
+        sys.exit(f"run_controller: {type(reason).__name__}: {reason}")
     state, controls, times = controller.init(arguments.seed), [], []
     for _ in range(arguments.steps):
         began = time.perf_counter()
-        control, state, _ = controller.act(state, observation, env, reference)
+        control, state, _ = controller.act(state, *measured)
         controls.append(np.asarray(control).tolist())
         times.append(1e3 * (time.perf_counter() - began))
-    print(
-        json.dumps(
-            {"names": names, "controls": controls, "median_ms": float(np.median(times))}
-        )
-    )
+    result = {"names": names, "controls": controls}
+    print(json.dumps(result | {"median_ms": float(np.median(times))}))
 
 
 def _straight(manifest: dict[str, Any]) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
@@ -270,15 +238,11 @@ def _straight(manifest: dict[str, Any]) -> tuple[np.ndarray, np.ndarray, np.ndar
     *_, observed, _, ahead = manifest["programs"]["act"]["inputs"]
     speed, observation = 10.0, np.zeros(observed["shape"])
     observation[1], observation[3] = 0.3, speed
-    reference = np.zeros(ahead["shape"])
-    reference[:, 0] = (
-        speed * manifest["sampling_period_s"] * np.arange(1, len(reference) + 1)
-    )
+    reference, dt = np.zeros(ahead["shape"]), manifest["sampling_period_s"]
+    reference[:, 0] = speed * dt * np.arange(1, len(reference) + 1)
     reference[:, 3] = speed
-    env = np.mean(
-        [manifest["environment"]["low"], manifest["environment"]["high"]], axis=0
-    )
-    return observation, env, reference
+    box = manifest["environment"]
+    return observation, np.mean([box["low"], box["high"]], axis=0), reference
 
 
 if __name__ == "__main__":
