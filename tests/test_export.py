@@ -87,7 +87,7 @@ def loaded(exported):
 @pytest.fixture
 def spoiled(exported, tmp_path):
     """The root of all runs, to spoil."""
-    return Path(shutil.copytree(exported[0]["root"], tmp_path / "runs"))
+    return Path(shutil.copytree(exported[0].root, tmp_path / "runs"))
 
 
 @pytest.fixture
