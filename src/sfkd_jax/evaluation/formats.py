@@ -57,6 +57,11 @@ def upper(value: Any, digits: int = 4) -> str:
     return short(float(rounded), digits)
 
 
+def bound(value: Any) -> str:
+    """An upper bound, or the text that stands for it."""
+    return upper(value) if is_number(value) else plain(value)
+
+
 def millimetres(value: Any, digits: int = 1) -> str:
     """A length in m, or the mean of a record of lengths, as millimetres."""
     value = dig(value, "mean") if isinstance(value, dict) else value
@@ -77,6 +82,11 @@ def interval(bounds: Any, digits: int = 3) -> str:
     if not is_pair(bounds):
         return DASH
     return f"{number(bounds[0], digits)} to {number(bounds[1], digits)}"
+
+
+def share(value: Any) -> str:
+    """A share in percent to four significant digits, with its unit."""
+    return f"{short(100 * value, 4)} %" if is_number(value) else DASH
 
 
 def mean_std(record: Any, digits: int = 3) -> str:
