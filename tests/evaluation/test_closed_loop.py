@@ -77,13 +77,6 @@ def test_an_episode_has_the_documented_shapes_and_the_states_of_the_plant():
     np.testing.assert_allclose(batch.states[:, 1:], expected, atol=2e-5)
 
 
-def test_episodes_one_by_one_are_those_driven_at_once():
-    at_once = jit(jax.vmap(one_episode(PLANT.step)))
-    keys = jax.random.split(jax.random.key(1), 2)
-    expected = episodes(PLANT.step).states
-    np.testing.assert_allclose(at_once(roads(), keys).states, expected, atol=1e-4)
-
-
 def test_lateral_deviation_and_progress_are_those_of_the_path():
     one, road = at(episodes(PLANT.step), 0), at(roads(), 0)
     points = np.asarray(
@@ -209,22 +202,6 @@ def test_a_push_is_the_wind_that_pushes_as_hard(plant, wind, force):
     pushed = plant.wind_force * felt * abs(felt)
     expected = plant.wind_force * wind * abs(wind) + force
     np.testing.assert_allclose(pushed, expected, rtol=1e-5, atol=1e-3)
-
-
-def test_a_push_accelerates_the_dynamic_plant_by_force_over_mass_and_turns_it():
-    state = jnp.asarray([0.0, 0.0, 0.3, 10.0, 0.1, 0.05, 0.02])
-    calm, force = jnp.asarray(4.0), 600.0
-    felt = plants.equivalent_wind(
-        calm, jnp.asarray(force), wind_force=DYNAMIC.wind_force
-    )
-    pushed, alone = (
-        DYNAMIC.derivative(
-            state, jnp.asarray([0.03, 0.5]), jnp.stack([jnp.asarray(0.5), wind])
-        )
-        for wind in (felt, calm)
-    )
-    expected = [0, 0, 0, 0, force / 1500, 0.4 * force / 2500, 0]
-    np.testing.assert_allclose(pushed - alone, expected, atol=2e-5)
 
 
 def test_a_push_moves_the_car_and_is_not_observed_and_none_changes_no_bit():

@@ -46,6 +46,7 @@ _LAZY = {
 
 def __getattr__(name: str) -> Any:
     """Import an adapter on first use; without its package, name the extra."""
+    # Lazy: without brax the gymnasium adapter works, and the other way round.
     if name not in _LAZY:
         raise AttributeError(f"module 'sfkd_jax.adapters' has no attribute {name!r}")
     file = _LAZY[name]

@@ -63,6 +63,7 @@ class BraxVehicle(Env):
 
     def reset(self, rng: jax.Array) -> BraxState:
         """Start an episode on a new road; `rng` is a typed key or two integers."""
+        # brax still passes keys as integers.
         typed = jnp.issubdtype(rng.dtype, jax.dtypes.prng_key)
         road, moment = self.task.reset(rng if typed else jax.random.wrap_key_data(rng))
         zero = jnp.zeros(())
@@ -175,6 +176,7 @@ def brax_plant(env: Env, *, parameters: tuple[str, ...] = ("gravity",)) -> BraxP
             for name, factor in zip(parameters, env, strict=True)
             for field in SCALED[name]
         }
+        # The same system with scaled fields; nothing is compiled anew for another e.
         changed: Any = system.tree_replace(
             {f: factor * attrgetter(f)(system) for f, factor in factors.items()}
         )
@@ -191,6 +193,7 @@ def brax_plant(env: Env, *, parameters: tuple[str, ...] = ("gravity",)) -> BraxP
         return _state(inner.reset(key).pipeline_state)
 
     limits = jnp.asarray(system.actuator.ctrl_range).T.tolist()
+    # The pose stays first, where every model expects it.
     names = [f"q_{k}" for k in range(coordinates)] + [
         f"qd_{k}" for k in range(system.qd_size())
     ]
@@ -249,6 +252,7 @@ def collect(
         start_key, env_key, noise_key = jax.random.split(key, 3)
         corners = jnp.asarray(env_low), jnp.asarray(env_high)
         env = jax.random.uniform(env_key, (len(env_low),), float, *corners)
+        # White noise through a low pass: motors are pushed for longer than a step.
         fresh = excitation * jax.random.normal(noise_key, (steps, low.shape[0]))
 
         def advance(

@@ -137,6 +137,7 @@ def commonroad_vehicle(
         )
     dry: Car = setup_vehicle_parameters(car)
     host = _HostCar(MODELS[model], dry, dt, steering_lag, wind_force, wind_lever)
+    # The nominal model is that of our dynamic car with these axle distances.
     bicycle = dynamic(
         dt=dt, wind_force=wind_force, front_length=dry.a, rear_length=dry.b
     )
@@ -186,7 +187,8 @@ class _HostCar:
         def rates(moment: np.ndarray) -> list[float]:
             x = moment.tolist()
             inputs = [(control[0] - x[2]) / self.steering_lag, control[1]]
-            result = self.equations.rates(x, inputs, car)
+            # A copy: CommonRoad stops locked wheels in the list that it is given.
+            result = self.equations.rates(list(x), inputs, car)
             for index, change in self.equations.force_rates(x, force, car).items():
                 result[index] += change
             result[5] += self.wind_lever * force / car.I_z
@@ -255,7 +257,8 @@ class _HostCar:
         x, y, yaw, along, across, yaw_rate, steering = state[:OBSERVED]
         speed, slip = math.hypot(along, across), math.atan2(across, along)
         core = [x, y, steering, speed, yaw, yaw_rate, slip]
-        return self.equations.settled(core, self.car)
+        # CommonRoad writes some of them as integers.
+        return list(map(float, self.equations.settled(core, self.car)))
 
 
 def commonroad_observation(
@@ -308,6 +311,7 @@ def _on_host(function: HostStep) -> Step:
         )
 
     def step(state: State, control: Control, env: Environment) -> State:
+        # One car after the other: the equations take lists of numbers.
         shape = jax.ShapeDtypeStruct(state.shape, state.dtype)
         return jax.pure_callback(
             call, shape, state, control, env, vmap_method="sequential"

@@ -36,6 +36,7 @@ class RoadView:
             )
 
             self._figure = pyplot.figure(figsize=SIZE, dpi=100)
+            # A figure without a screen must not wait for events.
             known = backend_registry.list_builtin(BackendFilter.INTERACTIVE)
             backend = get_backend().lower()
             self._interactive = backend in {name.lower() for name in known}
@@ -45,12 +46,14 @@ class RoadView:
             from matplotlib.backends.backend_agg import FigureCanvasAgg
 
             self._figure = Figure(figsize=SIZE, dpi=100)
+            # Not by pyplot, which would keep every figure that is made.
             FigureCanvasAgg(self._figure)
         self._human = human
         self._make_artists()
 
     def _make_artists(self) -> None:
         """Lines and shapes that every frame moves."""
+        # Made once and moved: drawing axes anew for every frame is slow.
         axes = self._axes = self._figure.add_subplot()
         axes.set_aspect("equal")
         axes.set_xlabel("x [m]")
@@ -91,6 +94,7 @@ class RoadView:
             title: of the frame.
         """
         self._driven.set_data(*np.stack(self._trail).T)
+        # From the path to the car, so that its length is the deviation.
         self._deviation.set_data(*np.stack([foot, state[:2]]).T)
         self._car.set_xy(_corners(state))
         self._axes.set_xlim(state[0] - VIEW, state[0] + VIEW)

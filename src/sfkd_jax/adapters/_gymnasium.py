@@ -18,6 +18,7 @@ MODES = ("human", "rgb_array")
 
 def register_gymnasium() -> None:
     """Make `gymnasium.make("sfkd_jax/Vehicle-v0", …)` build a `GymnasiumVehicle`."""
+    # A second registration would warn.
     if NAME not in gymnasium.registry:
         gymnasium.register(id=NAME, entry_point="sfkd_jax.adapters:GymnasiumVehicle")
 
@@ -70,6 +71,7 @@ class GymnasiumVehicle(gymnasium.Env):
     ) -> tuple[np.ndarray, dict[str, Any]]:
         """Start an episode on a new road; there are no options."""
         super().reset(seed=seed, options=options)
+        # gymnasium's generator decides, as its contract on seeds asks for.
         seed = int(self.np_random.integers(2**31))
         road, _ = self._now = self._start(jax.random.key(seed))
         if self.render_mode is not None:

@@ -112,6 +112,7 @@ class DrivingTask:
     def observation_high(self) -> tuple[float, ...]:
         """Largest observation: of angles and actions, else ∞."""
         inf, body = math.inf, len(self.plant.state_names) - 3
+        # Angles are wrapped and actions clipped; nothing else has a limit.
         errors, points = (inf, math.pi), (inf, inf, math.pi, inf) * self.preview
         return (*errors, *[inf] * body, *[1.0] * self.action_size, inf, inf, *points)
 
@@ -141,6 +142,7 @@ class DrivingTask:
         """Draw a new road, with the car at its start."""
         road = self.family(key)
         progress, offset = project(road.path, road.initial_state[:2], jnp.zeros(()))
+        # As if the last control had been 0: the first steering rate counts from it.
         still = jnp.zeros(self.action_size)
         count = jnp.zeros((), dtype=jnp.int32)
         return road, Moment(road.initial_state, progress, offset, still, count)
@@ -151,6 +153,7 @@ class DrivingTask:
         """Simulate one sampling period with an action in [-1, 1]."""
         plant, applied = self.plant, self.control(action)
         after = plant.step(moment.state, applied, _at(road.envs, moment))
+        # The guess moves on with the car, so a path that crosses itself is no trap.
         guess = moment.progress + after[3] * plant.dt
         progress, offset = project(road.path, after[:2], guess)
         reached = Moment(after, progress, offset, applied, moment.count + 1)
@@ -166,9 +169,11 @@ class DrivingTask:
         self, road: Scenario, before: Moment, kept: Moment, sound: Bool[Array, ""]
     ) -> Transition:
         """Reward, end and measures of a step."""
+        # Facing backwards is leaving too: the other errors would not show it.
         backwards = jnp.abs(_heading(road, kept)) > 0.5 * jnp.pi
         left = ~sound | (jnp.abs(kept.lateral) > self.lane) | backwards
         length = (road.path.points.shape[0] - 1) * road.path.spacing
+        # Time or road, whichever ends first.
         ended = (kept.count >= road.envs.shape[0]) | (kept.progress >= length)
         missed = kept.state[3] - road.speed
         turned = (kept.control[0] - before.control[0]) / self.plant.dt
@@ -180,6 +185,7 @@ class DrivingTask:
         values = map(jnp.abs, (kept.lateral, missed, turned))
         measures = dict(zip(MEASURES, values, strict=True))
         reward = -cost - self.leaving * left
+        # Leaving at the last step is a failure, no end in time.
         return Transition(reward, left, ~left & ended, measures)
 
     def situation(
@@ -198,6 +204,7 @@ class DrivingTask:
     def observe(self, road: Scenario, moment: Moment) -> Float[Array, " observation"]:
         """Return the observation, as `tracking_task` describes it."""
         state, env, reference = self.situation(road, moment)
+        # In the frame of the car: a policy need not know where it is in the world.
         ahead = jax.vmap(between, in_axes=(None, 0))(state[POSE], reference[:, :3])
         points = jnp.concatenate([ahead, reference[:, 3:]], axis=1).ravel()
         errors = jnp.stack([moment.lateral, _heading(road, moment)])

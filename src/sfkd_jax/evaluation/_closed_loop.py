@@ -119,11 +119,13 @@ def simulate(
         control, memory, info = controller.act(
             params, memory, observation, observed_env, reference
         )
+        # The plant is in e, whatever the controller observed of it.
         state = plant(state, control, env)
         # The guess moves on at the reference speed, so a loop does not catch it.
         progress, lateral = project(
             scenario.path, state[:2], progress + scenario.speed * dt
         )
+        # An estimator reports what it planned with; others plan with what they see.
         assumed = info.get("env_estimate", observed_env)
         signals = {name: signal(info) for name, signal in wanted.items()}
         recorded = (state, control, lateral, progress, assumed, signals)
@@ -200,6 +202,7 @@ def disturbed_environment(
         raise ValueError(
             "evaluation.side_forces act through the wind, but vehicle.wind_force is 0"
         )
+    # A force is passed on as wind: plants have no other input from the side.
     force = random_side_forces(
         jax.random.fold_in(key, FORCE_STREAM),
         steps=envs.shape[0],

@@ -21,6 +21,10 @@ AIMS = ("lateral", "distance", "within")
 """Far from the path; far from the nominal model; far from it while the tube's
 hypothesis holds.
 """
+LENGTH = 200
+"""Of a run, in steps."""
+KEEP = 20
+"""Worst runs returned per aim."""
 ELITE = 0.1
 """Part of a generation that the next one is drawn around."""
 
@@ -99,8 +103,6 @@ class CorridorAttack:
         lateral_acceleration: largest on the roads [m/s²].
         dwell: least time between switches of e [s].
         steps: in all.
-        length: of a run, in steps.
-        keep: worst runs returned per aim.
     """
 
     loop: Vehicle
@@ -115,8 +117,6 @@ class CorridorAttack:
     lateral_acceleration: float
     dwell: float
     steps: int
-    length: int = 200
-    keep: int = 20
 
     def __call__(self, params: Params, key: Key) -> WorstRuns:
         """Search with the folded parameters of the nominal model."""
@@ -133,39 +133,37 @@ class CorridorAttack:
     def _shapes(self) -> dict[str, tuple[int, ...]]:
         """Shapes of the genes of a run."""
         return {
-            "nu": (-(-self.length // BLOCK), 2),
-            "env": (-(-self.length // self._held), len(self.env_low)),
+            "nu": (-(-LENGTH // BLOCK), 2),
+            "env": (-(-LENGTH // self._held), len(self.env_low)),
             "road": (4,),
         }
 
     def _run(self, genes: Genes) -> Runs:
         """Inputs of one run from its genes."""
-        length = self.length
         nu = (
             # Saturates: the worst ν are mostly at the limits.
-            jnp.repeat(jnp.tanh(2.0 * genes["nu"]), BLOCK, axis=0)[:length]
+            jnp.repeat(jnp.tanh(2.0 * genes["nu"]), BLOCK, axis=0)[:LENGTH]
             * self.perturbation
         )
         low, high = jnp.asarray(self.env_low), jnp.asarray(self.env_high)
-        env = jnp.repeat(_unit(genes["env"]), self._held, axis=0)[:length]
+        env = jnp.repeat(_unit(genes["env"]), self._held, axis=0)[:LENGTH]
         fast, wave, phase, tight = _unit(genes["road"])
         speed = self.speed[0] + (self.speed[1] - self.speed[0]) * fast
         shortest, longest = self.wavelengths
         wavelength = shortest + (longest - shortest) * wave
         # Fast roads are gentle, as in the conditions of the corridor.
         peak = jnp.minimum(self.peak_curvature, self.lateral_acceleration / speed**2)
-        along = jnp.arange(length) * speed * self.loop.dt
+        along = jnp.arange(LENGTH) * speed * self.loop.dt
         sine = jnp.sin(2 * jnp.pi * (along / wavelength + phase))
         # Clipped: a road that is tight throughout, not only at its peaks.
         bend = jnp.clip((1.0 + tight) * sine, -1.0, 1.0)
-        inputs = jnp.column_stack([nu, peak * bend, jnp.full(length, speed)])
+        inputs = jnp.column_stack([nu, peak * bend, jnp.full(LENGTH, speed)])
         return Runs(inputs, low + (high - low) * env)
 
     def _worst(self, params: Params, aim: str, key: Key) -> tuple[Runs, Outcome]:
         """The worst runs of one aim over all generations."""
-        population = max(
-            self.keep, self.steps // (len(AIMS) * GENERATIONS * self.length)
-        )
+        # However few steps are given, as many runs as are asked for.
+        population = max(KEEP, self.steps // (len(AIMS) * GENERATIONS * LENGTH))
 
         def outcome(runs: Runs) -> Outcome:
             return outcome_of(self.loop, self.model, params, self.tube, runs)
@@ -188,14 +186,15 @@ class CorridorAttack:
             mean = jax.tree.map(lambda leaf: jnp.mean(leaf, axis=0), elite)
             # A floor under the spread: a search that has converged stops finding.
             spread = jax.tree.map(lambda leaf: jnp.std(leaf, axis=0) + 0.1, elite)
-            worst = best[: self.keep]
+            worst = best[:KEEP]
             return (mean, spread), jax.tree.map(lambda leaf: leaf[worst], found)
 
         mean = {name: jnp.zeros(shape) for name, shape in self._shapes.items()}
         start = mean, jax.tree.map(jnp.ones_like, mean)
+        # The worst of all generations: the last one need not have it.
         _, runs = jax.lax.scan(generation, start, jax.random.split(key, GENERATIONS))
         runs = jax.tree.map(lambda leaf: leaf.reshape(-1, *leaf.shape[2:]), runs)
-        worst = jnp.argsort(-_score(aim, runs[1], self.tube))[: self.keep]
+        worst = jnp.argsort(-_score(aim, runs[1], self.tube))[:KEEP]
         return jax.tree.map(lambda leaf: leaf[worst], runs)
 
 
@@ -239,6 +238,7 @@ def outcome_of(
         state, latent, error = carry
         inputs, env, index = given
         fiber = model.fiber(params, env)
+        # The filter sees the nominal model, as in the controller.
         if safety_filter is not None:
             inputs = inputs.at[:2].set(safety_filter(fiber, latent, inputs[:2], index))
         expected = model.step(fiber, model.encode(fiber, state), inputs)

@@ -134,6 +134,7 @@ class FittedBicycle:
         def regress(features: list[Any], target: Any) -> np.ndarray:
             return np.linalg.lstsq(np.column_stack(features), target, rcond=None)[0]
 
+        # Three linear regressions in a row: curvature enters that of the slip.
         acceleration = regress(
             [ones, controls[:, 1], before[:, 3]], (after[:, 3] - before[:, 3]) / dt
         )
@@ -182,6 +183,7 @@ def baselines(
         ValueError: the horizon does not fit the trajectories.
     """
     turn = partial(_hold_yaw_rate, dt=dt, along_path=along_path)
+    # Ordered by what they know: nothing, the yaw rate, the bicycle, the data.
     predictors: dict[str, Predictor] = {
         "constant_velocity": partial(turn, measured=False),
         "constant_turn": partial(turn, measured=True),
@@ -230,6 +232,7 @@ def _hold_yaw_rate(
     def turn_along_path(state: State, control: Control, env: Environment) -> State:
         return as_path_state(follow(state[BODY], control, control[CURVATURE], env))
 
+    # Measured over the first step, which is therefore predicted with hindsight.
     yaw_rate = _first_yaw_rate(window, dt=dt, along_path=along_path)
     held = jnp.full_like(window.controls[:, :1], yaw_rate if measured else 0.0)
     controls = jnp.concatenate([held, window.controls[:, 1:]], axis=1)
@@ -242,5 +245,6 @@ def _first_yaw_rate(window: Trajectory, *, dt: float, along_path: bool) -> Scala
     before, after = window.states[0], window.states[1]
     if not along_path:
         return wrap_angle(after[2] - before[2]) / dt
+    # Relative to the path, which turns as well.
     turned = wrap_angle(after[BODY][HEADING] - before[BODY][HEADING]) / dt
     return turned + window.controls[0, CURVATURE] * before[BODY][PATH_SPEED]

@@ -84,6 +84,7 @@ def row(
         "act_ms": None if act_ms is None else {"p50": act_ms[0], "p99": act_ms[1]},
         **dict.fromkeys(_COMPARISONS),
     }
+    # In the order of the table; a metric `a.b` is in the record a.
     keys = dict.fromkeys(metric.name.split(".")[0] for metric in METRICS)
     return about | {key: values[key] for key in keys if key in values}
 
@@ -142,6 +143,7 @@ def compare(rows: list[Row], *, missing: int = 0) -> list[Row]:
         same.sort(key=lambda other, entry=entry: _search(other) != _search(entry))
         for name, (systems, measure) in _COMPARISONS.items():
             other = next((one for one in same if one["system"] in systems), None)
+            # SFKD has no difference to itself; the oracle's ratio to itself is 1.
             if other is None or (systems == _SFKD and other is entry):
                 continue
             entry[name] = measure(_by_seed(entry), _by_seed(other))
@@ -158,6 +160,7 @@ def _episodes(entry: Row) -> tuple[Any, ...]:
     """Key of the episodes of a row; rows with equal keys are paired."""
     return (
         *(entry[name] for name in ("scenario", "vehicle", "variation")),
+        # A quadratic program has no sampling; it starts from feedback too.
         entry["sampling"] or "feedback",
         entry.get("drives"),
         _by_seed(entry).shape[1],
@@ -186,6 +189,7 @@ def pool(rows: list[Row]) -> Row:
     if not rest:
         return first
     pooled = {one.name: one.pool_seeds(rows) for one in METRICS if one.pool_seeds}
+    # What is named pools otherwise than by the mean, so it comes last.
     return _mean(rows) | {
         "arrays": first.get("arrays"),
         "seeds": [seed for entry in rows for seed in entry["seeds"]],
@@ -219,6 +223,7 @@ def merge(
     old: Iterable[Mapping[str, Any]], new: Iterable[Mapping[str, Any]]
 ) -> list[Any]:
     """Return old and new rows; a new row replaces the old row of the same identity."""
+    # Twice over: an iterator would be empty the second time.
     fresh = list(new)
     replaced = [identity(row) for row in fresh]
     return [row for row in old if identity(row) not in replaced] + fresh

@@ -142,6 +142,7 @@ def paired_difference(
     count = min(len(part) for part in both)
     # Pairs by the order of seeds; a single training is compared with every other.
     first, second = (part[:count] if count > 1 else part for part in both)
+    # Equal episodes cancel what makes an episode hard for both.
     difference = first - second
     mean, interval = mean_interval(difference)
     return {"mean": mean, "ci95": interval, "p": p_value(difference)}

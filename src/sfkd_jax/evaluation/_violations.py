@@ -81,6 +81,7 @@ def predictions(
         ValueError: runs shorter than a segment, or segments shorter than the horizon.
     """
     cut = jax.vmap(partial(sliding_windows, horizon=length, stride=length))
+    # V1 counts segments, because calibration did.
     segments = jax.tree.map(lambda leaf: leaf.reshape(-1, *leaf.shape[2:]), cut(runs))
 
     def one(segment: Trajectory) -> Predictions:
@@ -95,6 +96,7 @@ def _along_window(model: Model, params: Params, window: Trajectory) -> Predictio
     predicted, latents, along = rollout(model, params, window)
     gaps, _ = defects(model, params, window, along)
     seen = jax.vmap(model.observe)(along[1], latents, window.states[1:])
+    # The true latent is read at the true state, as the theorem has it.
     gone = jax.vmap(model.vector)(seen) - jax.vmap(model.vector)(latents)
     return Predictions(
         errors=prediction_errors(predicted, window, along_path=model.along_path),

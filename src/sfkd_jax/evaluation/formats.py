@@ -22,6 +22,7 @@ def dig(record: Any, *keys: str) -> Any:
 
 def is_number(value: Any) -> bool:
     """Whether a JSON value is a finite number."""
+    # True is an int in Python and no number here.
     real = isinstance(value, int | float) and not isinstance(value, bool)
     return real and math.isfinite(value)
 
@@ -52,14 +53,10 @@ def upper(value: Any, digits: int = 4) -> str:
         return DASH
     exact = Decimal(repr(float(value)))
     rounded = Context(prec=digits, rounding=ROUND_CEILING).create_decimal(exact)
+    # α = 0.99999 is a claim, 1 is none.
     if exact < 1 <= rounded and digits < 15:
         return upper(value, digits + 1)
     return short(float(rounded), digits)
-
-
-def bound(value: Any) -> str:
-    """An upper bound, or the text that stands for it."""
-    return upper(value) if is_number(value) else plain(value)
 
 
 def millimetres(value: Any, digits: int = 1) -> str:
@@ -74,6 +71,7 @@ def percent(share: Any) -> str:
         return DASH
     if share == 0:
         return "0"
+    # Rounded to 0 it would read as if it never happened.
     return "< 0.1" if 0 < share < 5e-4 else number(100 * share, 1)
 
 
@@ -100,6 +98,7 @@ def plain(value: Any) -> str:
     match value:
         case None:
             return DASH
+        # Before int: bool is one.
         case bool():
             return "yes" if value else "no"
         case int() | float():

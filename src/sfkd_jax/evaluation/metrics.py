@@ -110,6 +110,7 @@ class Metric(NamedTuple):
 
     def head(self, *, mm: bool = False) -> str:
         """Label and unit, as the head of a column."""
+        # Only lengths have decimals as millimetres.
         unit = "mm" if mm and self.mm is not None else self.unit
         return f"{self.label} [{unit}]" if unit else self.label
 
@@ -135,6 +136,7 @@ def _rmse_after_switch(run: Recording) -> np.ndarray:
     after = np.zeros_like(jumps)
     for lag in range(min(round(AFTER_SWITCH / run.dt), jumps.shape[1])):
         after[:, lag:] |= jumps[:, : jumps.shape[1] - lag]
+    # A switch during settling is scored from the end of settling on.
     after[:, : round(SETTLING / run.dt)] = False
     squares = np.where(after, run.lateral**2, 0.0).sum(axis=1)
     counts = after.sum(axis=1)
@@ -148,7 +150,9 @@ def _steering_rate(run: Recording) -> np.ndarray:
 
 def _departed(run: Recording) -> np.ndarray:
     """Whether the car left its lane or a state is not finite."""
+    # All states, also those of the start: NaN is never a stay in the lane.
     finite = np.all(np.isfinite(run.states), axis=(1, 2))
+    # The side of the car counts, not its centre.
     stays = _max_deviation(run) + VEHICLE_HALF_WIDTH <= LANE_HALF_WIDTH
     return ~finite | ~stays
 
@@ -163,6 +167,7 @@ def _mean_known(values: np.ndarray) -> float | None:
 
 
 def _median(values: np.ndarray) -> float | None:
+    # Of unknown numbers no median is known.
     return None if np.any(np.isnan(values)) else float(np.median(values))
 
 

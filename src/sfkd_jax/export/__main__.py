@@ -36,11 +36,13 @@ def _write(settings: Settings) -> dict[str, Any]:
     run_dir = settings.run_dir
     runs.claim(settings)
     manifest = store.read_manifest(run_dir / "policy.safetensors", kind=policy.KIND)
+    # The weights of the run, the controller of this command.
     trained = policy.load(
         run_dir,
         controller=plain(settings.controller),
         env_source=settings.environment.source,
     )
+    # Not refused: a controller without a certificate drives as well.
     if trained.certificate is None:
         store.print_message("exported without a certificate")
     folder = run_dir / FOLDER

@@ -68,6 +68,7 @@ def write_controller(
     # First the manifest goes: a folder half written is none.
     for stale in (MANIFEST, CERTIFICATE, *(f"{stem}.vmfb" for stem in FILES.values())):
         (folder / stale).unlink(missing_ok=True)
+    # The policy too, so that `load` reads an export as it reads a run.
     stored = policy.save(
         folder / "policy.safetensors",
         trained.weights,
@@ -106,6 +107,7 @@ def write_controller(
     }
     script = resources.files("sfkd_jax.export").joinpath(f"_{SCRIPT}").read_bytes()
     store.write_bytes(folder / SCRIPT, script)
+    # Last: a folder with a manifest is whole.
     manifest["sha256"] = store.sha256(manifest)
     store.write_json(folder / MANIFEST, manifest)
     return manifest
@@ -140,6 +142,7 @@ def _vehicle(trained: policy.Policy) -> dict[str, Any]:
     """Names, units and limits of controls, observation, environment and reference."""
     settings = trained.settings
     plant = build.build_vehicle(settings["vehicle"])
+    # With a speed loop the second control is what the loop is given.
     drive = "speed command [m/s]" if plant.speed_loop else "acceleration [m/s^2]"
     limits = zip(
         ("steering [rad]", drive), plant.control_low, plant.control_high, strict=True

@@ -115,6 +115,7 @@ def flat_programs(policy: Policy) -> Programs:
         policy.controller.act, policy.params, state, *measured
     )
     states = _named("state", state)
+    # Programs have fixed shapes, so a state must come out as it went in.
     if _named("state", after) != states or jax.tree.structure(after) != structure:
         raise ValueError(
             "cannot export a controller whose state changes its structure, "

@@ -80,6 +80,7 @@ class ExportedController:
             self._init, self._act = (
                 _compiled(path.parent, self.manifest, name) for name in ("init", "act")
             )
+            # Keys are data here: another implementation would be another shape.
             key, first = self._key(0), self.manifest["programs"]["init"]["inputs"][0]
             if (key.shape, str(key.dtype)) != (tuple(first["shape"]), first["dtype"]):
                 raise ValueError("key_implementation")
@@ -116,6 +117,7 @@ class ExportedController:
             for name, value in measured.items()
         }
         expected = self.manifest["programs"]["act"]["inputs"]
+        # By name and order: two states may have the same shapes.
         if list(given) != [leaf["name"] for leaf in expected]:
             raise ValueError(
                 "state must be what init or the last act of this controller returned"
@@ -224,6 +226,7 @@ def main() -> None:
     except (ExportError, *MALFORMED) as reason:
         sys.exit(f"run_controller: {type(reason).__name__}: {reason}")
     state, controls, times = controller.init(arguments.seed), [], []
+    # The car stands still: what is checked is the program, not the driving.
     for _ in range(arguments.steps):
         began = time.perf_counter()
         control, state, _ = controller.act(state, *measured)
