@@ -77,15 +77,6 @@ def test_logged_drives_become_a_certified_model_that_plans(monkeypatch):
     assert abs(result["first_control"]) <= 1.0
 
 
-def test_logged_drives_are_read_from_a_file_of_ones_own(monkeypatch, tmp_path):
-    module = example("own_data", monkeypatch)
-    path = tmp_path / "mine.npz"
-    module["log_some_drives"](path, 40)
-    data = module["read"](path)
-    assert data.train.states.shape == (24, 51, 5)
-    assert data.env_low.shape == (2,)
-
-
 @pytest.mark.exhaustive
 def test_the_brax_pendulum_is_learned_certified_and_driven(monkeypatch, capsys):
     """In two seconds a pole left alone lies. So short a training gives a certificate,

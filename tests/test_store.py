@@ -1,6 +1,5 @@
 """Files come back as they were written, or are refused in one line that names them."""
 
-import hashlib
 import json
 import os
 import random
@@ -341,24 +340,3 @@ def test_two_writers_and_a_reader_of_one_path_do_not_disturb_each_other(path):
     assert (first.returncode, second.returncode) == (0, 0)
     assert version(path) == 39
     assert names(path.parent) == [path.name]
-
-
-# ---- provenance
-
-
-def test_the_source_hash_is_that_of_paths_and_contents(tmp_path, monkeypatch):
-    from sfkd_jax.experiment import provenance
-
-    def hashed(**files):
-        for name, text in files.items():
-            (tmp_path / f"{name}.py").write_text(text)
-        provenance.source_hash.cache_clear()
-        return provenance.source_hash()
-
-    monkeypatch.setattr(provenance, "PACKAGE", tmp_path)
-    first = hashed(a="x = 1\n", b="")
-    digest = hashlib.sha256()
-    for name, text in (("a.py", b"x = 1\n"), ("b.py", b"")):
-        digest.update(name.encode() + b"\0" + hashlib.sha256(text).digest())
-    assert first == digest.hexdigest() != hashed(a="x = 2\n")
-    provenance.source_hash.cache_clear()

@@ -151,18 +151,6 @@ def test_logs_with_units_jumps_and_standstill_become_a_data_set(
     assert np.abs(turned).max() < 0.37
 
 
-def test_a_step_of_the_wrong_shape_is_one_line(tmp_path, monkeypatch):
-    (tmp_path / "short_step.py").write_text("def step(x, u, e):\n    return x[:3]\n")
-    monkeypatch.chdir(tmp_path)
-    monkeypatch.syspath_prepend(tmp_path)
-    limits = ("vehicle.control_low=[-0.4,-3.0]", "vehicle.control_high=[0.4,2.0]")
-    own = settings(
-        "+experiment=smoke", "vehicle=own", "vehicle.step=short_step:step", *limits
-    )
-    with pytest.raises(ValueError, match=r"^the step of vehicle own [^\n]*$"):
-        data.ensure_dataset(data.source_of(own))
-
-
 def test_what_logs_cannot_support_is_refused_before_a_run_is_begun(logs, monkeypatch):
     monkeypatch.chdir(logs.parent)
     options = settings(*SMALL, "name=other", "certification.level=0.99")

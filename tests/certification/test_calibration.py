@@ -1,14 +1,11 @@
 """Measured bounds: intervals of shares, conformal bounds, disturbances."""
 
-import inspect
-
 import jax.numpy as jnp
 import numpy as np
 import pytest
 from helpers import driven, model_and_params
 
 from sfkd_jax.certification import (
-    _calibration,
     clopper_pearson,
     conformal_bounds,
     coverage,
@@ -16,7 +13,6 @@ from sfkd_jax.certification import (
     disturbances,
     tube_units,
 )
-from sfkd_jax.types import Trajectory
 
 
 @pytest.mark.parametrize(
@@ -125,26 +121,6 @@ def test_coverage_counts_trajectories_inside_all_bounds():
     )
     assert coverage(np.ones(4), held_out)["coverage"] == 0.5
     assert coverage(np.ones(4), held_out, 2)["coverage_runs"] == 2
-
-
-@pytest.mark.parametrize("count", [1, 49, 50, 51, 120])
-def test_a_split_of_any_length_is_measured_in_batches_of_one_size(monkeypatch, count):
-    """Every trajectory once and in order; what fills the last batch is dropped."""
-    batches = []
-
-    def largest(model, params, part):
-        batches.append(part)
-        return part.controls[:, 0, :1] * np.ones(4)
-
-    monkeypatch.setattr(_calibration, "_largest", largest)
-    each = np.arange(count, dtype=np.float32)[:, None, None]
-    data = Trajectory(
-        *(jnp.asarray(each + np.zeros(shape)) for shape in ((4, 5), (3, 2), (3, 2)))
-    )
-    actual = inspect.unwrap(disturbances)(None, None, data)
-    np.testing.assert_array_equal(actual, each[:, :, 0] * np.ones(4))
-    assert len(batches) == -(-count // _calibration.CHUNK)
-    assert {len(leaf) for part in batches for leaf in part} == {_calibration.CHUNK}
 
 
 def test_the_true_plant_has_no_disturbance():

@@ -66,10 +66,6 @@ FORGED = {
         "corridor_m",
         lambda c: c.update(corridor_m=(1 - 1e-6) * c["corridor_m"]),
     ),
-    "a difference": (
-        "corridor_m",
-        lambda c: c.update(corridor_m=c["bounds"]["nominal"]),
-    ),
     "a bound": (
         "corridor_m",
         lambda c: c["bounds"].update(vehicle_to_nominal_position=0.01),
@@ -79,33 +75,17 @@ FORGED = {
         "bounds",
         lambda c: c["bounds"].update(asymptotic_yaw=float("inf")),
     ),
-    "a bound of 0": ("bounds", lambda c: c["bounds"].update(asymptotic_yaw=0.0)),
-    "a bound below 0": (
-        "bounds",
-        lambda c: c["bounds"].update(vehicle_to_nominal_yaw=-0.5),
-    ),
     "a bound that there is not": ("bounds", lambda c: c["bounds"].update(more=1.0)),
     "a bound left out": ("bounds", lambda c: c["bounds"].pop("asymptotic_yaw")),
-    "a bound by another name": (
-        "bounds",
-        lambda c: c["bounds"].update(yaw=c["bounds"].pop("asymptotic_yaw")),
-    ),
     "too few drives": ("level", lambda c: c.update(runs=8)),
     "no drives": ("level", lambda c: c.update(runs=0)),
-    "drives that are no count": ("level", lambda c: c.update(runs=60.0)),
     "a level of 1": ("level", lambda c: c.update(level=1.0)),
     "a level of 0": ("level", lambda c: c.update(level=0.0)),
-    "a level below 0": ("level", lambda c: c.update(level=-0.5)),
     "a coverage between two counts": (
         "corridor: coverage",
         lambda c: counted(c, coverage=c["coverage"] - 0.001),
     ),
     "a coverage above 1": ("corridor: a coverage", lambda c: c.update(coverage=1.5)),
-    "a coverage below 0": ("corridor: a coverage", lambda c: c.update(coverage=-0.5)),
-    "another number of trajectories": (
-        "corridor: coverage",
-        lambda c: counted(c, coverage_trajectories=201),
-    ),
     "another number of drives": (
         "corridor: coverage",
         lambda c: c.update(coverage_runs=100),
@@ -121,10 +101,6 @@ FORGED = {
     "an attack just beyond the tube": (
         "attack",
         lambda c: c["attack"].update(over_tube=1.0 + 1e-12),
-    ),
-    "an attack far beyond the tube": (
-        "attack",
-        lambda c: c["attack"].update(over_tube=1.9),
     ),
     "an attack that is no number": (
         "attack",

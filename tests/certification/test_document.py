@@ -169,21 +169,6 @@ def test_what_does_not_go_together_is_refused(path, value):
         check(put(honest(), path, value))
 
 
-def test_a_document_that_lacks_anything_is_refused():
-    spare = {
-        "seconds",
-        "seconds_proof",
-        "versions",
-        "weights_sha256",
-    }  # needed by readers of the page
-    for key in honest():
-        lacking = {name: value for name, value in honest().items() if name != key}
-        if key in spare:
-            continue
-        with pytest.raises((CertificationRefused, CertificateStale)):
-            check(lacking)
-
-
 # --- bound to everything that model and controller compute with -----------------------
 
 

@@ -41,7 +41,7 @@ def declaring(model, **changes):
     return model._replace(structure=model.structure._replace(explicit=explicit))
 
 
-@pytest.mark.parametrize("activation", ["gelu", "silu", "leaky gelu", "sin", ""])
+@pytest.mark.parametrize("activation", ["gelu", ""])
 def test_an_activation_whose_slopes_are_not_known_is_refused(activation):
     model, params = model_and_params("sfkd")
     with pytest.raises(CertificationRefused, match="slopes of the activation"):
@@ -55,14 +55,6 @@ def test_evidence_on_a_grid_is_refused_by_name():
         CertificationRefused, match="grid-only evidence: 49 sampled environments"
     ):
         certify(declaring(model, operators=operators), params, BOX)
-
-
-def test_a_transport_of_unknown_kind_is_refused():
-    model, params = model_and_params("sfkd")
-    with pytest.raises(
-        CertificationRefused, match="transport 'learned matrix' is not known"
-    ):
-        certify(declaring(model, transport="learned matrix"), params, BOX)
 
 
 def test_a_transport_that_stretches_is_found_out():
@@ -155,11 +147,6 @@ def test_the_attack_comes_close_to_the_certificate_and_stays_below(name):
     proved = certify(*at_the_limit(name), BOX, attack_starts=4)
     assert 1.0 <= proved.tightness <= 1.04
     assert proved.attacks["residual_slopes"] > proved.beta / 1.15
-
-
-def test_the_attack_reaches_the_factor_of_a_linear_map():
-    proved = certify(*at_the_limit("no_residual"), BOX, attack_starts=1)
-    assert proved.attack == pytest.approx(proved.rho, rel=2e-6)
 
 
 def test_the_served_transport_is_an_isometry():

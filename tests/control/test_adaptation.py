@@ -199,8 +199,8 @@ def test_mixing_keeps_mean_and_total_variance():
     np.testing.assert_allclose(after.variance(), before.variance(), rtol=1e-5)
 
 
-@pytest.mark.parametrize("force", [-0.6, 0.4])
-def test_a_constant_side_force_is_found(force):
+def test_a_constant_side_force_is_found():
+    force = -0.6
     info, _ = drive(force=force, shrinkage=0.0)
     causes = info["causes"][-20:]
     np.testing.assert_allclose(causes[:, estimator.FORCE], force, atol=0.05)
@@ -255,38 +255,42 @@ def test_hostile_measurements_leave_finite_bounded_estimates():
     np.testing.assert_allclose(belief.bank.probabilities.sum(axis=-1), 1.0, atol=1e-4)
 
 
+WEIGHTS = {"a": jnp.asarray([1.0, 2.0, 3.0]), "b": jnp.asarray([[-0.0, 1e-40]])}
+INPUTS = (jnp.asarray([0.0, 0.0, 0.0, 10.0]), jnp.asarray([0.7, 0.0]), road(0.0))
+
+
+@cache
+def acting():
+    """A first state, and the step, compiled once."""
+    controller = adaptive()
+    return controller.init(jax.random.key(0)), jit(controller.act)
+
+
 def test_changed_weights_are_noticed():
     """One bit of one weight is enough; two weights that swap are noticed as well."""
-    controller = adaptive()
-    act = jit(controller.act)
-    inputs = jnp.asarray([0.0, 0.0, 0.0, 10.0]), jnp.asarray([0.7, 0.0]), road(0.0)
-    weights = {"a": jnp.asarray([1.0, 2.0, 3.0]), "b": jnp.asarray([[-0.0, 1e-40]])}
-    state = controller.init(jax.random.key(0))
+    state, act = acting()
     for _ in range(2):
-        _, state, info = act(weights, state, *inputs)
+        _, state, info = act(WEIGHTS, state, *INPUTS)
         assert not info["weights_changed"]
     for change in (
-        {"a": jnp.nextafter(weights["a"], 9.0)},
-        {"a": weights["a"][::-1]},
-        {"b": -weights["b"]},
-        {"b": weights["b"].at[0, 1].set(jnp.nan)},
+        {"a": jnp.nextafter(WEIGHTS["a"], 9.0)},
+        {"a": WEIGHTS["a"][::-1]},
+        {"b": -WEIGHTS["b"]},
+        {"b": WEIGHTS["b"].at[0, 1].set(jnp.nan)},
     ):
-        _, _, info = act(weights | change, state, *inputs)
+        _, _, info = act(WEIGHTS | change, state, *INPUTS)
         assert info["weights_changed"]
         assert not info["healthy"]
 
 
 def test_causes_that_predict_worse_than_none_are_not_used():
     """The scores of the last seconds decide."""
-    controller = adaptive()
-    state = controller.init(jax.random.key(0))
+    state, act = acting()
     belief = state.inner.belief._replace(
         scores=jnp.asarray([2.0, 1.0]), started=jnp.asarray(True)
     )
     state = state._replace(inner=state.inner._replace(belief=belief))
-    act = jit(controller.act)
-    inputs = jnp.asarray([0.0, 0.0, 0.0, 10.0]), jnp.asarray([0.7, 0.0]), road(0.0)
-    _, _, info = act({}, state, *inputs)
+    _, _, info = act(WEIGHTS, state, *INPUTS)
     assert not info["adapting"]
     np.testing.assert_array_equal(info["causes"], 0.0)
 
@@ -321,14 +325,10 @@ def test_a_force_beyond_the_box_is_balanced_without_a_lateral_error():
 def test_the_belief_can_be_saved_and_resumed():
     _, belief = drive(force=0.5)
     last = jax.tree.map(lambda leaf: jnp.asarray(leaf[-1]), belief)
-    controller = adaptive()
-    fresh = controller.init(jax.random.key(0))
+    fresh, act = acting()
     fresh = fresh._replace(inner=fresh.inner._replace(belief=last))
-    coordinates = last.bank.mean()[:3]
-    seen = jnp.concatenate([jnp.asarray([120.0]), coordinates])
-    _, _, info = jit(controller.act)(
-        {}, fresh, seen, jnp.asarray([0.7, 0.0]), road(120.0)
-    )
+    seen = jnp.concatenate([jnp.asarray([120.0]), last.bank.mean()[:3]])
+    _, _, info = act(WEIGHTS, fresh, seen, INPUTS[1], road(120.0))
     np.testing.assert_allclose(info["causes"][0], 0.5, atol=0.15)
 
 

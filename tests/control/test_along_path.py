@@ -122,6 +122,7 @@ def test_a_model_of_the_world_is_refused():
         make(tiny())
 
 
+@pytest.mark.exhaustive
 def test_a_step_of_the_adaptive_policy_projects_once_and_never_back(monkeypatch):
     """Planner, shield, estimator and tube work on the same ξ."""
     calls = []

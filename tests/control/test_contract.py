@@ -270,7 +270,7 @@ def test_an_input_that_is_not_finite_is_reported_and_the_next_clean_step_recover
     assert np.all(np.isfinite(np.asarray(info["predicted_states"])[:7][healthy]))
 
 
-@every
+@pytest.mark.parametrize("name", PLANNERS | WRAPPERS)
 def test_a_batch_of_controllers_acts_as_each_one_alone(name):
     controller, params, act, _ = compiled(name)
     inputs = [

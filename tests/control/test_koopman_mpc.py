@@ -7,7 +7,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from helpers import dataset, jit, model_and_params, same, straight
+from helpers import dataset, jit, model_and_params
 
 from sfkd_jax import control, evaluation, models, plants, scenarios
 from sfkd_jax import data as datasets
@@ -170,66 +170,12 @@ def test_a_car_beside_a_straight_path_comes_back_to_it():
     np.testing.assert_allclose(episode.states[-1, 3], 10.0, atol=0.3)
 
 
-@pytest.mark.parametrize("curvature", [-0.015])
-def test_a_constant_curvature_is_followed(curvature):
-    episode = drive(curvature, 0.0)
-    assert np.max(np.abs(episode.lateral)) < 0.1
-    assert np.all(episode.signals["healthy"])
-
-
 def test_predictions_are_told_in_the_world():
     """One step ahead the car is where it was predicted, on a bend and beside the path."""
     for curvature, offset in ((-0.015, 0.0), (0.0, 0.5)):
         episode = drive(curvature, offset)
         gap = episode.signals["expected"] - episode.states[1:, :2]
         assert np.max(np.linalg.norm(gap, axis=1)) < 0.04
-
-
-@pytest.mark.parametrize(
-    ("broken", "value"), [("observation", np.inf), ("env", np.nan)]
-)
-def test_what_cannot_be_read_continues_the_plan_and_the_next_clean_step_recovers(
-    broken, value
-):
-    _, clean, _ = act()
-    inputs = {"observation": OFFSET, "env": ENV, "reference": BEND}
-    inputs[broken] = inputs[broken].at[..., -1].set(value)
-    action, held, info = act(state=clean, **inputs)
-    assert not bool(info["healthy"])
-    np.testing.assert_array_equal(action, clean.plan[0])
-    np.testing.assert_array_equal(held.plan[:-1], clean.plan[1:])
-    np.testing.assert_array_equal(held.previous, clean.plan[0])
-    assert same(
-        act(state=held)[0],
-        act(state=clean._replace(plan=held.plan, previous=held.previous))[0],
-        rtol=0,
-        atol=0,
-    )
-    assert bool(act(state=held)[2]["healthy"])
-
-
-def test_the_first_steering_rate_counts_from_the_control_applied_last_if_there_was_one():
-    on_path = jnp.asarray([0.0, 0.0, 0.0, 10.0])
-    fresh = compiled()[0].init(jax.random.key(0))
-    turned = fresh._replace(previous=jnp.asarray([0.2, 0.0]))
-    assert same(act(on_path, state=turned), act(on_path, state=fresh), rtol=0, atol=0)
-    started = [
-        act(on_path, state=s._replace(started=jnp.asarray(True)))
-        for s in (fresh, turned)
-    ]
-    assert started[1][0][0] > started[0][0][0] + 0.02
-
-
-def test_a_predictor_that_knows_nothing_keeps_a_finite_plan():
-    """With initial parameters no control has any effect, so the best control is none."""
-    model = models.koopman(datasets.measure_space(dataset()), functions=4)
-    controller = control.koopman_mpc(model, horizon=HORIZON, speed_loop=True, **LIMITS)
-    params = model.init(jax.random.key(0))
-    action, _, info = jit(controller.act)(
-        params, controller.init(jax.random.key(0)), OFFSET, ENV, straight(HORIZON)
-    )
-    np.testing.assert_allclose(action, 0.0, atol=1e-6)
-    assert bool(info["healthy"])
 
 
 def test_a_model_that_is_not_linear_in_a_lift_is_refused():

@@ -79,46 +79,6 @@ def test_the_gain_is_that_of_the_riccati_equation_and_stabilises(name):
     assert np.max(np.abs(np.linalg.eigvals(A - B @ np.asarray(turn.gain[0])))) < 1.0
 
 
-def test_a_turn_that_no_tyre_can_hold_falls_back_to_driving_straight():
-    tight, _ = turns("dynamic", bend=20.0)
-    plain, _ = turns("dynamic")
-    assert np.all(np.isfinite(jnp.concatenate([tight.state, tight.control], axis=1)))
-    np.testing.assert_allclose(tight.control[1], plain.control[0], atol=1e-4)
-    assert np.all(np.isfinite(tight.gain))
-
-
-def test_a_planner_around_it_needs_no_samples_to_stay_near_the_path_in_side_wind():
-    """The law alone (a plan of zeros) against the hand-made law, in a steady crosswind
-    on a straight road.
-    """
-    plant, model = PLANTS["kinematic"], models.physics(PLANTS["kinematic"].step)
-    limits = {"control_low": plant.control_low, "control_high": plant.control_high}
-    aside = {}
-    for name, law in (
-        ("model", LAW),
-        ("textbook", control.path_feedback(wheelbase=plant.wheelbase)),
-    ):
-        task = control.path_tracking(
-            model, control.tracking_cost(dt=0.1), law, dt=0.1, **limits
-        )
-        planner = control.mppi(task, num_samples=1, horizon=5, noise_std=(1e-6, 1e-6))
-
-        @jit
-        def drive(key, planner=planner):
-            def step(carry, _):
-                state, memory = carry
-                reference = straight(5).at[:, 0].add(state[0])
-                action, memory, _ = planner.act({}, memory, state, ENV, reference)
-                return (plant.step(state, action, ENV), memory), state[1]
-
-            start = (jnp.asarray([0.0, 0.3, 0.0, 10.0]), planner.init(key))
-            return jax.lax.scan(step, start, None, length=80)[1]
-
-        aside[name] = np.max(np.abs(np.asarray(drive(jax.random.key(0)))[60:]))
-    assert aside["model"] < 0.01
-    assert aside["model"] < 0.2 * aside["textbook"]
-
-
 @pytest.mark.parametrize("size", [1, 3, 7])
 def test_elimination_solves_what_needs_pivots(size):
     random = np.random.default_rng(size)

@@ -89,35 +89,6 @@ def test_a_law_survives_being_stored(derived):
     np.testing.assert_array_equal(again(*given), law(*given))
 
 
-def test_a_step_without_a_derivative_will_do():
-    """A plant on the host, like CommonRoad's vehicles: the kinematic bicycle in numpy."""
-
-    def euler(x, u, e):
-        del e
-        return np.stack(
-            [x[3] * np.cos(x[2]), x[3] * np.sin(x[2]), x[3] * np.tan(u[0]) / 2.7, u[1]]
-        ).astype(x.dtype)
-
-    def on_host(state, action, env):
-        shape = jax.ShapeDtypeStruct(state.shape, state.dtype)
-        rates = jax.pure_callback(
-            lambda *now: euler(*map(np.asarray, now)),
-            shape,
-            state,
-            action,
-            env,
-            vmap_method="sequential",
-        )
-        return state + 0.1 * rates
-
-    law = derive_path_law(on_host, coordinates=3, points=(3, 2, 2), **BOX)
-    turn = law.turn(jnp.asarray(2.2 / 64), jnp.asarray(8.0), jnp.asarray([0.3, 8.0]))
-    np.testing.assert_allclose(
-        turn.control, (np.arctan(2.7 * 2.2 / 64), 0.0), atol=1e-3
-    )
-    assert np.all(np.asarray(turn.gain[0, :2]) > 0.05)
-
-
 @pytest.mark.exhaustive
 @pytest.mark.parametrize("name", PLANTS)
 def test_a_law_derived_again_is_that_of_the_shipped_policy(name):

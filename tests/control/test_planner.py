@@ -439,12 +439,6 @@ def test_limits_may_be_one_number_infinite_or_missing(limits, reached):
     assert u < -1.5 if reached is None else u == pytest.approx(reached, abs=0.01)
 
 
-@pytest.mark.parametrize("unroll", [100])
-def test_steps_that_are_compiled_together_change_no_plan(unroll):
-    plans = [plan_for("mppi", steps=1, unroll=n)[0].plan for n in (2, unroll)]
-    np.testing.assert_allclose(*plans, atol=1e-5)
-
-
 @every
 def test_candidates_are_reported_on_request_and_explain_the_plan(search):
     """Their weighted mean is the plan that is rolled out."""

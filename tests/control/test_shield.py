@@ -183,6 +183,8 @@ def test_car_and_nominal_model_stay_in_their_corridors_whatever_is_planned(name)
         info["bound_exceeded"] | info["outside_box"] | info["dead_reckoning"]
     )
     np.testing.assert_allclose(info["corridor"], WIDTH + TUBE, rtol=1e-6)
+    if name == "nan":  # the tube is not far too wide
+        assert abs(xi[-1, 0] - info["nominal_state"][-1, 0]) > 0.99 * TUBE
     # The preview is constant, so the filter has already predicted the law's next steps.
     assert np.all(info["feasible"])
     assert np.all(info["margin"] >= 0.0)
@@ -197,12 +199,6 @@ def test_without_the_filter_the_same_planner_leaves_the_corridor(name):
     )
     assert np.max(np.abs(xi[:, 0])) > 1.5 * (WIDTH + TUBE)
     assert attacked()[name][2]["interventions"][-1] > 10
-
-
-def test_the_worst_disturbance_reaches_the_tube():
-    """Otherwise a tube that is far too wide would pass the test above."""
-    xi, _, info = attacked()["nan"]
-    assert abs(xi[-1, 0] - info["nominal_state"][-1, 0]) > 0.99 * TUBE
 
 
 def test_who_asks_for_little_is_left_alone():

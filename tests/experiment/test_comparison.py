@@ -53,19 +53,6 @@ def test_a_row_that_is_not_trained_again_has_the_first_seed_alone(name):
     assert {cell.seed for cell in found if cell.label == "program"} == {0, 1}
 
 
-@pytest.mark.parametrize(
-    ("changes", "says"),
-    [
-        ({"only": ["iocde"]}, "unknown comparison.only iocde; choose of ours, program"),
-        ({"untrained": ["us"]}, "unknown comparison.untrained us"),
-        ({"seeds": [0, 0]}, r"comparison.seeds=\[0, 0\] repeats"),
-    ],
-)
-def test_a_plan_that_contradicts_itself_is_refused(changes, says):
-    with pytest.raises(ValueError, match=says):
-        cells(**changes)
-
-
 def test_a_cell_composes_its_row_what_was_tuned_and_its_variation():
     tuned = replace(plan(), tuned={"dynamic": {"program": "model.functions=9"}})
     cell = grid.Cell("dynamic", "program", 1, "koopman_mpc", "late", "s2")

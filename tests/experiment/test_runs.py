@@ -8,7 +8,6 @@ from composing import settings
 from helpers import dataset, last_line, run_command
 
 from sfkd_jax import build
-from sfkd_jax import data as datasets
 from sfkd_jax.experiment import data, runs, stages
 from sfkd_jax.settings import replace
 from sfkd_jax.store import ArtefactError, write_json
@@ -35,14 +34,6 @@ def test_a_run_that_kept_nothing_does_not_block_its_correction(tmp_path):
         runs.claim(first)
 
 
-def test_a_sensor_changes_no_weights_and_the_box_of_e_does():
-    def identity(*overrides):
-        return runs.identity(settings(*overrides))
-
-    assert identity("environment.sensor.delay_s=0.5") == identity()
-    assert identity("environment.high=[0.8,8.0]") != identity()
-
-
 def test_a_data_set_comes_back_with_the_scenario_of_every_segment(tmp_path):
     source = data.source_of(settings(f"root={tmp_path}"))
     made = dataset(count=20, steps=8)
@@ -51,20 +42,6 @@ def test_a_data_set_comes_back_with_the_scenario_of_every_segment(tmp_path):
     for part, labels in made.scenarios.items():
         np.testing.assert_array_equal(stored.scenarios[part], labels)
         assert len(labels) == len(getattr(stored, part).controls)
-
-
-def test_coverage_is_measured_on_the_segments_of_each_scenario(monkeypatch):
-    monkeypatch.setattr(data, "_switching", lambda source, segments: "runs of S3")
-    made = dataset(count=20, steps=8)
-    labels = np.arange(len(made.test.controls)) % len(datasets.SCENARIOS)
-    made = made._replace(scenarios={"test": labels})
-    parts = data.held_out_parts(data.source_of(settings()), made)
-    assert set(parts) == {"test", "s3", *np.take(datasets.SCENARIOS, np.unique(labels))}
-    for code, name in enumerate(datasets.SCENARIOS):
-        if name in parts:
-            np.testing.assert_array_equal(
-                parts[name].states, np.asarray(made.test.states)[labels == code]
-            )
 
 
 @pytest.fixture

@@ -62,15 +62,6 @@ def test_a_missing_step_is_reported_when_it_is_needed_and_not_before(
     assert message in str(caught.value)
 
 
-def test_a_robot_known_from_logs_alone_is_not_driven():
-    plant = plants.own(state_names=NAMES)
-    assert not plant.simulated
-    with pytest.raises(
-        ValueError, match="known from logs alone, so it cannot be simulated"
-    ):
-        plants.check_step(plant)
-
-
 def test_its_nominal_model_is_the_bicycle_and_leaves_further_states_alone():
     plant = plants.own(dt=0.01, wheelbase=1.0, state_names=NAMES)
     state, control = jnp.asarray([0.0, 0.0, 0.0, 2.0, 0.7]), jnp.asarray([0.1, 0.0])

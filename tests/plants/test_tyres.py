@@ -88,16 +88,6 @@ def test_saturated_cornering_is_proportional_to_friction(coasting, hold):
     assert drawn[0.9] / drawn[0.3] == pytest.approx(3.0, rel=0.1)
 
 
-def test_a_gentle_curve_is_the_same_curve_on_every_friction_up_to_a_tenth(
-    vehicle, hold
-):
-    ends = [
-        hold(vehicle, 4.0, (0.02, 0.0), (friction, 0.0), 3.0)[-1]
-        for friction in (0.3, 0.9)
-    ]
-    assert abs(ends[0][2] / ends[1][2] - 1.0) < 0.1
-
-
 @pytest.mark.parametrize("acceleration", [-6.0, 3.0])
 def test_what_is_used_for_driving_and_braking_is_missing_for_turning(
     coasting, acceleration

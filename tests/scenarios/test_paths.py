@@ -107,14 +107,6 @@ def test_the_peak_curvature_is_reached_and_not_exceeded(peak):
     )
 
 
-def test_the_curvature_is_smooth_at_the_shortest_wavelength(road):
-    """|κ'| ≤ 2π Σ|aᵢ| / λ_min, and three amplitudes add up to three peaks at most; the
-    blend adds little.
-    """
-    slope = np.abs(np.diff(np.asarray(road.points)[:, 3])) / 0.5
-    assert slope.max() < 3 * 0.03 * 2 * np.pi / 50.0 + 1.5 * 0.03 / 20.0
-
-
 def test_the_reference_window_holds_the_next_points_at_the_given_speed(circle):
     window = jit(partial(reference_window, dt=0.1, horizon=5))(
         circle, jnp.asarray(3.0), jnp.asarray(8.0)

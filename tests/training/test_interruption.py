@@ -1,7 +1,5 @@
 """SIGINT and SIGTERM during training: a checkpoint at once, and the same final weights."""
 
-import json
-import os
 import signal
 import subprocess
 import sys
@@ -11,14 +9,12 @@ from pathlib import Path
 
 import jax
 import numpy as np
-import pytest
-from helpers import TINY, dataset, largest_file
+from helpers import TINY, dataset
 
 from sfkd_jax import store
 from sfkd_jax.data import measure_space, random_windows, spread_windows
 from sfkd_jax.models import sfkd
 from sfkd_jax.training import Checkpoints, fit, multi_step_loss
-from sfkd_jax.training._loop import open_log
 
 WORKER = """
 import os, sys
@@ -122,43 +118,3 @@ def test_an_interrupted_command_prints_one_line_and_exits_130(tmp_path):
     )
     assert done.returncode == 130
     assert done.stderr == "sfkd_jax: interrupted; the same command continues\n"
-
-
-DAMAGE = {
-    "a flipped bit that makes a byte undecodable": lambda line: (
-        line[:8] + bytes([line[8] | 0x80]) + line[9:]
-    ),
-    "a broken line": lambda line: line[: len(line) // 2] + b"\n",
-    "a name that changed": lambda line: line.replace(b"step", b"stfp"),
-    "no object": lambda line: b"7\n",
-}
-
-
-@pytest.mark.parametrize("damage", list(DAMAGE))
-def test_a_damaged_line_is_reported_with_its_number_and_the_others_stay(
-    tmp_path, capfd, damage
-):
-    log = tmp_path / "metrics.jsonl"
-    whole = [
-        json.dumps({"loss": 1.0, "step": step}).encode() + b"\n"
-        for step in (10, 20, 30, 40)
-    ]
-    log.write_bytes(whole[0] + DAMAGE[damage](whole[1]) + whole[2] + whole[3])
-    open_log(log, resumed_at=30)
-    assert log.read_bytes() == whole[0] + whole[2]
-    (line,) = capfd.readouterr().err.splitlines()
-    assert line.startswith(f"{log}: line 2 ")
-    assert line.endswith("left out, the other lines stay")
-
-
-def test_a_log_that_cannot_be_rewritten_stays_and_is_one_line(tmp_path):
-    log = tmp_path / "metrics.jsonl"
-    text = json.dumps({"loss": 1.0, "step": 10}) + "\n"
-    log.write_text(text)
-    with (
-        largest_file(5),
-        pytest.raises(store.ArtefactError, match="File too large"),
-    ):
-        open_log(log, resumed_at=30)
-    assert log.read_text() == text
-    assert os.listdir(tmp_path) == ["metrics.jsonl"]
