@@ -45,10 +45,6 @@ def test_a_step_is_named_in_the_settings_and_is_the_function_itself(monkeypatch)
             "nowhere.at_all:step",
             "vehicle.step=nowhere.at_all:step: No module named 'nowhere'; name it as",
         ),
-        (
-            "own_vehicle:leap",
-            "vehicle.step=own_vehicle:leap: module 'own_vehicle' has no attribute 'leap'; name it as",
-        ),
         ("own_vehicle", "name it as package.module:function"),
     ],
 )
