@@ -122,35 +122,6 @@ def test_logs_are_stored_with_their_coverage_and_only_test_drives_are_held_out(
     assert 4.0 <= covered["state"]["v"]["low"] < covered["state"]["v"]["high"] <= 6.0
 
 
-def test_logs_with_units_jumps_and_standstill_become_a_data_set(
-    logs, tmp_path, monkeypatch, capsys
-):
-    monkeypatch.chdir(tmp_path)
-    (tmp_path / "logs").mkdir()
-    for k in range(8):
-        columns = drive(seconds=12.0, phase=0.8 * k)
-        columns["yaw_rate (deg/s)"] = np.rad2deg(
-            np.gradient(columns["yaw"], columns["t"])
-        )
-        columns["p_x"] = columns["p_x"] + 50.0 * (columns["t"] > 5.95)
-        columns["v"] = np.where(columns["t"] > 9.95, 0.0, columns["v"])
-        columns["v [km/h]"] = 3.6 * columns.pop("v")
-        write_csv(tmp_path / "logs" / f"{k}.csv", columns)
-    with pytest.raises(ValueError, match=r"positions move|jump"):
-        data.ensure_dataset(data.source_of(settings(*SMALL)))
-    cut = ("dataset.split_at_jumps=true", "dataset.min_speed=0.5")
-    dataset, _ = data.ensure_dataset(data.source_of(settings(*SMALL, *cut)))
-    lines = capsys.readouterr().err
-    assert "v [km/h] to m/s" in lines
-    assert "jump 50" in lines
-    assert "dropped by dataset.min_speed=0.5" in lines
-    # 6 s before the jump are 5 segments of 1 s, 3.9 s behind it are 3.
-    assert sum(len(part.states) for part in dataset[:4]) == 8 * (5 + 3)
-    assert dataset.scenarios is None
-    turned = np.asarray(dataset.train.states)[..., 4]
-    assert np.abs(turned).max() < 0.37
-
-
 def test_what_logs_cannot_support_is_refused_before_a_run_is_begun(logs, monkeypatch):
     monkeypatch.chdir(logs.parent)
     options = settings(*SMALL, "name=other", "certification.level=0.99")

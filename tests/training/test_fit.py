@@ -1,6 +1,7 @@
 """The loss decreases; a run survives a kill, is reproducible, and stops at NaN."""
 
 import json
+import shutil
 import signal
 import subprocess
 import sys
@@ -72,11 +73,6 @@ def test_the_loss_falls_and_every_step_is_logged(unbroken):
     assert [line["step"] for line in logged] == [10, 20, 30, 40]
     assert logged[-1]["loss"] < 0.8 * logged[0]["loss"]
     assert "validation_loss" in logged[1]
-
-
-def test_another_key_gives_other_weights(task, tmp_path, unbroken):
-    other, _ = train(task, tmp_path, seed=4)
-    assert not same(unbroken[1], other)
 
 
 def test_an_interrupted_run_ends_bit_identical_to_an_unbroken_one(
@@ -154,16 +150,18 @@ def test_a_log_on_a_full_disk_is_one_line_and_keeps_its_lines(tmp_path):
     assert [line["step"] for line in lines(tmp_path)] == [10, 20]
 
 
-def test_a_loss_that_is_not_finite_stops_with_the_last_good_checkpoint(task, tmp_path):
+def test_a_loss_that_is_not_finite_stops_with_the_last_good_checkpoint(
+    task, tmp_path, unbroken
+):
     model, loss, data = task
     poisoned = data._replace(
         train=data.train._replace(states=data.train.states.at[..., 3].set(jnp.nan))
     )
-    train(task, tmp_path, steps=20)
-    with pytest.raises(TrainingStopped, match="last good checkpoint is step 20"):
-        train((model, loss, poisoned), tmp_path)
-    checkpoints = Checkpoints(tmp_path / "checkpoints")
-    assert checkpoints.latest_step() == 20
+    directory = shutil.copytree(unbroken[0], tmp_path / "run")
+    with pytest.raises(TrainingStopped, match="last good checkpoint is step 40"):
+        train((model, loss, poisoned), directory, steps=80)
+    checkpoints = Checkpoints(directory / "checkpoints")
+    assert checkpoints.latest_step() == 40
     checkpoints.close()
 
 
