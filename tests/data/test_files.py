@@ -10,7 +10,7 @@ import pytest
 from recorded import NAMES, STATE, drive, write_csv, write_npz
 
 from sfkd_jax import data as datasets
-from sfkd_jax.data import Columns, _assignment
+from sfkd_jax.data import Columns, _resampling
 
 DT, STEPS = 0.1, 10
 
@@ -362,10 +362,6 @@ TEXTS = {
         ",".join(NAMES) + "\n" + "0," * 8 + "off\n",
         ", line 2: wind is 'off', not a number",
     ),
-    "decimal comma": (
-        ";".join(NAMES) + "\n" + "0,5;" * 8 + "0\n",
-        ", line 2: t is '0,5', not a number",
-    ),
 }
 
 
@@ -376,8 +372,47 @@ def test_a_malformed_csv_is_one_line_with_its_place(tmp_path, kind):
     assert refusal(tmp_path / "a.csv") == f"{tmp_path / 'a.csv'}{message}"
 
 
+def with_commas(text):
+    return text.replace(",", ";").replace(".", ",")
+
+
+RECORDERS = {
+    "a mark": lambda text: text.encode("utf-8-sig"),
+    "UTF-16": lambda text: text.encode("utf-16"),
+    "Windows-1252": lambda text: text.replace("yaw", "yaw_°").encode("cp1252"),
+    "decimal commas": lambda text: with_commas(text).encode(),
+    "line ends of Windows": lambda text: text.replace("\n", "\r\n").encode(),
+    "a preamble": lambda text: f"Recorder 3.1\nrun 7, dry\n\n{text}".encode(),
+    "a header of numpy": lambda text: f"# {text}".encode(),
+    "comments": lambda text: f"# made by us\n{text}# the end\n\n".encode(),
+    "units": lambda text: text.replace(
+        "\n", f"\ns,m,m,rad,m/s{',-' * 4}\n", 1
+    ).encode(),
+}
+
+
+@pytest.mark.parametrize("kind", RECORDERS)
+def test_a_drive_comes_back_from_what_recorders_write(tmp_path, kind):
+    columns = drive()
+    text = (tmp_path / "a.csv", write_csv(tmp_path / "a.csv", columns))[0].read_text()
+    (tmp_path / "a.csv").write_bytes(RECORDERS[kind](text))
+    yaw = "yaw_°" if kind == "Windows-1252" else "yaw"
+    logged, _ = read(tmp_path, Columns(state=("p_x", "p_y", yaw, "v")))
+    assert same_segments(together(logged.dataset), expected(columns))
+
+
+def test_lines_are_counted_as_an_editor_counts_them(tmp_path):
+    head = f"Recorder 3.1\n\n# dry\n{';'.join(NAMES)}\n"
+    body = "0,5;" * 8 + "0,5\n# pause\n" + "1,5;" * 8 + "off\n"
+    (tmp_path / "a.csv").write_text(head + body)
+    assert refusal(tmp_path).endswith("line 7: wind is 'off', not a number")
+
+
 ARRAYS = {
-    "objects": ({"t": np.array([None, 1])}, "a.npz: holds pickled objects, refused"),
+    "objects": (
+        {"t": np.array([None, 1])},
+        "a.npz: not a readable npz file (Object arrays",
+    ),
     "shapes": ({"t": np.zeros(3), "p_x": np.zeros(4)}, "p_x has shape (4,), t (3,)"),
     "x alone": (
         {"x": np.zeros((2, 5, 4)), "u": np.zeros((2, 5, 2)), "e": np.zeros((2, 4, 2))},
@@ -509,7 +544,7 @@ def test_the_box_of_environments_is_what_logs_reach_or_what_is_asked(tmp_path):
 
 
 def assign(drives, shares=(0.6, 0.1, 0.2, 0.1), seed=0):
-    return _assignment.assign_parts(np.asarray(drives), shares=shares, seed=seed)
+    return _resampling.assign_parts(np.asarray(drives), shares=shares, seed=seed)
 
 
 @pytest.mark.parametrize("drives", [20, 50, 200])

@@ -1,9 +1,9 @@
-"""Check a recorded drive row by row: finite numbers, rising time, jumps, sampling."""
+"""Check recorded drives row by row, and cut them where they jump or stand."""
 
 from __future__ import annotations
 
 from collections.abc import Iterator
-from typing import NamedTuple
+from typing import NamedTuple, TypeAlias
 
 import numpy as np
 from jaxtyping import Bool, Float
@@ -45,6 +45,10 @@ class Motion(NamedTuple):
     gaps: Bool[np.ndarray, " step"]
     moved: Float[np.ndarray, " step"]
     integrated: Float[np.ndarray, " step"]
+
+
+Cut: TypeAlias = tuple[Log, list[Finding]]
+"""A drive after cutting, and a line about every kind of cut."""
 
 
 def channels(log: Log, columns: Columns) -> dict[str, Float[np.ndarray, " time"]]:
@@ -219,3 +223,50 @@ def _first(log: Log, bad: Bool[np.ndarray, " time"], shift: int = 0) -> str:
 def more(bad: Bool[np.ndarray, " time"]) -> str:
     """Return how many rows there are like the first, for messages."""
     return f" ({int(bad.sum())} rows like this)" if bad.sum() > 1 else ""
+
+
+def drop_slow_rows(log: Log, columns: Columns, *, min_speed: float) -> Cut:
+    """Drop rows slower than `min_speed` [m/s] and cut the drive there."""
+    slow = np.abs(log.states[:, 3]) < min_speed
+    if not slow.any():
+        return log, []
+    k = int(slow.argmax())
+    line = (
+        f"{log.at(k)}: {columns.state[3]} is {log.states[k, 3]:.3g} m/s, "
+        f"dropped by dataset.min_speed={min_speed:g}; the drive is cut there"
+    )
+    return log.select(~slow), [Finding(line + more(slow), refused=False)]
+
+
+def cut_at_jumps(log: Log, columns: Columns, *, dt: float, gap: float) -> Cut:
+    """Cut a drive where time goes back and where position or yaw jump.
+
+    Stale positions jump at every update: such a drive is left as it is.
+
+    Args:
+        log: rows that are finite.
+        columns: their names.
+        dt: of the model [s].
+        gap: see `motion`.
+    """
+    findings = []
+    if (back := backwards(log)).any():
+        findings.append(_cut_there(describe_backwards(log, columns, back)))
+        log = log.cut(back)
+    if not log.joined.any():
+        return log, findings
+    steps = motion(log, dt=dt, gap=gap)
+    if stale_steps(log, steps).any():
+        return log, findings
+    if (jumps := position_jumps(log, steps)).any():
+        findings.append(_cut_there(describe_jump(log, columns, steps, jumps)))
+        log = log.cut(jumps)
+    if log.joined.any() and (turns := yaw_jumps(log, steps)).any():
+        findings.append(_cut_there(describe_turn(log, columns, turns)))
+        log = log.cut(turns)
+    return log, findings
+
+
+def _cut_there(description: str) -> Finding:
+    """A warning that a drive is cut."""
+    return Finding(f"{description}; the drive is cut there", refused=False)

@@ -3,22 +3,36 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from dataclasses import dataclass
 from typing import NamedTuple
 
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int
 
-from sfkd_jax.data._assignment import Assignment, assign_parts
-from sfkd_jax.data._checks import Finding, check_finite, check_motion, check_time
-from sfkd_jax.data._cleaning import cut_at_jumps, drop_slow_rows
-from sfkd_jax.data._coverage import coverage, coverage_lines
-from sfkd_jax.data._logs import Columns, Log
-from sfkd_jax.data._plausible import check_steering, check_units
-from sfkd_jax.data._ranges import Bounds, check_ranges
-from sfkd_jax.data._reading import read_logs
-from sfkd_jax.data._resampling import Segments, pieces, segments
-from sfkd_jax.data._splits import PARTS, Dataset
+from sfkd_jax.data._checks import (
+    Finding,
+    check_finite,
+    check_motion,
+    check_time,
+    cut_at_jumps,
+    drop_slow_rows,
+)
+from sfkd_jax.data._logs import Columns, Log, read_logs
+from sfkd_jax.data._plausible import (
+    Bounds,
+    check_ranges,
+    check_steering,
+    check_units,
+)
+from sfkd_jax.data._resampling import (
+    Assignment,
+    Segments,
+    assign_parts,
+    pieces,
+    segments,
+)
+from sfkd_jax.data._splits import PARTS, Dataset, coverage, coverage_lines
 from sfkd_jax.ranges import Fraction, NonNegativeInt, Positive, Real
 from sfkd_jax.types import BODY, Trajectory
 
@@ -42,7 +56,8 @@ class LoggedDataset(NamedTuple):
     coverage: dict[str, dict[str, dict[str, float]]]
 
 
-class _Options(NamedTuple):
+@dataclass(frozen=True)
+class _Options:
     """How each drive is checked and cut, as in `from_logs`."""
 
     dt: float

@@ -1,4 +1,4 @@
-"""Generate training segments of S1 and S2 with persistently excited controls."""
+"""Generate segments in world coordinates with persistently excited controls."""
 
 from __future__ import annotations
 
@@ -30,6 +30,8 @@ Driver: TypeAlias = Callable[
     [State, Float[Array, "horizon 4"]], Float[Array, " control"]
 ]
 
+Conditions: TypeAlias = Callable[[Key], Float[Array, "time environment"]]
+
 BURN_IN = 10
 """Steps simulated before a segment starts, so that slip, yaw rate and steering have
 settled.
@@ -40,6 +42,51 @@ ROADS = partial(
 """Paths for training: other wavelengths and a wider range of curvature than those of
 the benchmark.
 """
+
+WET = {"before": (0.55, 0.9), "after": (0.3, 0.5)}
+"""Friction of a wet road in the data, before and after it drops."""
+
+
+def benchmark_roads(
+    steps: int, dt: float, *, fixed_levels: bool = False
+) -> dict[str, Conditions]:
+    """Return schedules of S1 and S2; friction drops at a random time of the segment.
+
+    Args:
+        steps: of a segment.
+        dt: [s].
+        fixed_levels: use the levels of the benchmark only, instead of ranges around
+            them.
+    """
+    dry: dict[str, Any] = {} if fixed_levels else {"friction": (0.3, 0.9)}
+    wet: dict[str, Any] = {} if fixed_levels else WET
+    return {
+        "s1": partial(uniform_road, steps=steps, **dry),
+        "s2": partial(wet_road, steps=steps, dt=dt, drop_time=(0.0, steps * dt), **wet),
+    }
+
+
+def from_switching(steps: int, dt: float) -> Conditions:
+    """Return the schedule of S3, from a random time of it."""
+
+    def conditions(key: Key) -> Float[Array, "time 2"]:
+        road_key, moment_key = jax.random.split(key)
+        schedule = switching_road(road_key, steps=4 * steps, dt=dt)
+        return jax.lax.dynamic_slice_in_dim(
+            schedule, jax.random.randint(moment_key, (), 0, 3 * steps), steps
+        )
+
+    return conditions
+
+
+def log_uniform(
+    key: Key, limits: Float[Array, "channel 2"]
+) -> Float[Array, " channel"]:
+    """Draw one number per channel, uniform in its logarithm."""
+    logs = jnp.log(limits)
+    return jnp.exp(
+        jax.random.uniform(key, limits.shape[:1], minval=logs[:, 0], maxval=logs[:, 1])
+    )
 
 
 def generate(
@@ -77,7 +124,7 @@ def generate(
         those of `segment_scenarios`.
     """
     halves, counts = [], _counts(segments).values()
-    schedules = _conditions(steps, vehicle.dt, fixed_levels)
+    schedules = benchmark_roads(steps, vehicle.dt, fixed_levels=fixed_levels).values()
     for index, (conditions, count) in enumerate(zip(schedules, counts, strict=True)):
         drive = partial(_segment, vehicle, driver, conditions, steps, speed)
         drive = partial(drive, jnp.asarray([steering_excitation, speed_excitation]))
@@ -121,38 +168,10 @@ def generate_switching(
         steering_excitation: as for `generate`.
         speed_excitation: as for `generate`.
     """
-
-    def conditions(key: Key) -> Float[Array, "time 2"]:
-        road_key, moment_key = jax.random.split(key)
-        schedule = switching_road(road_key, steps=4 * steps, dt=vehicle.dt)
-        return jax.lax.dynamic_slice_in_dim(
-            schedule, jax.random.randint(moment_key, (), 0, 3 * steps), steps
-        )
-
+    conditions = from_switching(steps, vehicle.dt)
     drive = partial(_segment, vehicle, driver, conditions, steps, speed)
     drive = partial(drive, jnp.asarray([steering_excitation, speed_excitation]))
     return jax.lax.map(drive, jax.random.split(key, segments), batch_size=500)
-
-
-def _conditions(steps: int, dt: float, fixed: bool) -> list[Callable[[Key], Array]]:
-    """Schedules of S1 and S2; friction drops at a random time of the segment."""
-    during = (0.0, steps * dt)
-    if fixed:
-        return [
-            partial(uniform_road, steps=steps),
-            partial(wet_road, steps=steps, dt=dt, drop_time=during),
-        ]
-    return [
-        partial(uniform_road, steps=steps, friction=(0.3, 0.9)),
-        partial(
-            wet_road,
-            steps=steps,
-            dt=dt,
-            before=(0.55, 0.9),
-            after=(0.3, 0.5),
-            drop_time=during,
-        ),
-    ]
 
 
 def _segment(
@@ -178,10 +197,7 @@ def _segment(
         state_size=len(vehicle.state_names),
     )
     scenario: Scenario = sample(road_key)._replace(speed=speed)
-    logs = jnp.log(excitation)
-    spread = jnp.exp(
-        jax.random.uniform(spread_key, (2,), minval=logs[:, 0], maxval=logs[:, 1])
-    )
+    spread = log_uniform(spread_key, excitation)
     offset = jax.random.uniform(start_key, (), minval=-1.0, maxval=1.0)
     initial = scenario.initial_state.at[3].set(speed + offset)
     envs = jnp.concatenate([jnp.tile(scenario.envs[:1], (BURN_IN, 1)), scenario.envs])

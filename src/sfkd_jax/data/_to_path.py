@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Float
+from jaxtyping import Array, Bool, Float
 
 from sfkd_jax.geometry import PathFeedback, is_valid, path_state, wrap_angle
 from sfkd_jax.scenarios import Path, path_through, point_at, project
@@ -61,25 +61,41 @@ def logged_path(positions: Float[Array, "point 2"], *, spacing: float = 0.5) -> 
     return path
 
 
+def check_on_path(trajectories: Trajectory) -> None:
+    """Refuse drives that left their path.
+
+    Raises:
+        ValueError: the number of drives with 1 − κ e_y ≤ 0.2 or states that are not
+            finite.
+    """
+    valid = _stays_on_path(trajectories)
+    if not bool(jnp.all(valid)):
+        raise ValueError(
+            f"{int(jnp.sum(~valid))} of {valid.size} drives left their path "
+            "(1 - kappa e_y <= 0.2): dataset.law does not stabilise the car"
+        )
+
+
 def check_logged(trajectories: Trajectory, names: tuple[str, ...]) -> None:
     """Refuse drives whose path coordinates are invalid, by name.
 
     Raises:
         ValueError: the first drive with 1 − κ e_y ≤ 0.2 or states that are not finite.
     """
-    lateral, curvature = (
-        trajectories.states[:, :-1, BODY.start],
-        trajectories.controls[..., 2],
-    )
-    sound = jnp.all(is_valid(lateral, curvature), axis=1) & jnp.all(
-        jnp.isfinite(trajectories.states), axis=(1, 2)
-    )
-    for name, good in zip(names, sound.tolist(), strict=True):
-        if not good:
+    for name, valid in zip(names, _stays_on_path(trajectories).tolist(), strict=True):
+        if not valid:
             raise ValueError(
                 f"{name}: 1 - kappa e_y falls to 0.2 or below, or the path is lost: "
                 "is it the one followed?"
             )
+
+
+def _stays_on_path(trajectories: Trajectory) -> Bool[Array, " drive"]:
+    """Whether path coordinates are valid and finite throughout."""
+    lateral = trajectories.states[..., :-1, BODY.start]
+    valid = is_valid(lateral, trajectories.controls[..., 2])
+    finite = jnp.isfinite(trajectories.states)
+    return jnp.all(valid, axis=-1) & jnp.all(finite, axis=(-2, -1))
 
 
 def _feet(

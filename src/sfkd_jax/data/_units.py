@@ -2,86 +2,53 @@
 
 from __future__ import annotations
 
-import math
 import re
 from collections.abc import Iterable
-from typing import NamedTuple
+from functools import cache
+from typing import Any, NamedTuple
 
-UNITS: dict[str, dict[str, float]] = {
-    "time": {
-        "s": 1.0,
-        "sec": 1.0,
-        "ms": 1e-3,
-        "us": 1e-6,
-        "µs": 1e-6,
-        "ns": 1e-9,
-        "min": 60.0,
-        "h": 3600.0,
-    },
-    "length": {
-        "m": 1.0,
-        "km": 1e3,
-        "cm": 1e-2,
-        "mm": 1e-3,
-        "ft": 0.3048,
-        "in": 0.0254,
-        "mi": 1609.344,
-    },
-    "angle": {
-        "rad": 1.0,
-        "mrad": 1e-3,
-        "deg": math.pi / 180,
-        "degrees": math.pi / 180,
-        "°": math.pi / 180,
-    },
-    "speed": {
-        "m/s": 1.0,
-        "km/h": 1 / 3.6,
-        "kph": 1 / 3.6,
-        "kmh": 1 / 3.6,
-        "cm/s": 1e-2,
-        "mm/s": 1e-3,
-        "mph": 0.44704,
-        "ft/s": 0.3048,
-        "kn": 1852 / 3600,
-    },
-    "angular rate": {
-        "rad/s": 1.0,
-        "mrad/s": 1e-3,
-        "deg/s": math.pi / 180,
-        "°/s": math.pi / 180,
-        "rpm": math.pi / 30,
-    },
-    "acceleration": {
-        "m/s²": 1.0,
-        "m/s^2": 1.0,
-        "m/s2": 1.0,
-        "g": 9.80665,
-        "ft/s²": 0.3048,
-        "ft/s^2": 0.3048,
-    },
-    "curvature": {"1/m": 1.0, "1/km": 1e-3},
-    "force": {"N": 1.0, "kN": 1e3},
-    "torque": {"Nm": 1.0, "N m": 1.0, "kNm": 1e3},
-    "voltage": {"V": 1.0, "mV": 1e-3},
-    "current": {"A": 1.0, "mA": 1e-3},
-    "pressure": {"Pa": 1.0, "kPa": 1e3, "bar": 1e5},
-    "ratio": {"-": 1.0, "1": 1.0, "%": 1e-2},
+DIMENSIONS = {
+    "time": "s",
+    "length": "m",
+    "angle": "rad",
+    "speed": "m/s",
+    "angular rate": "rad/s",
+    "acceleration": "m/s²",
+    "curvature": "1/m",
+    "force": "N",
+    "torque": "Nm",
+    "voltage": "V",
+    "current": "A",
+    "pressure": "Pa",
+    "ratio": "-",
 }
-"""Units by dimension, each with its factor to the SI unit, which comes first."""
+"""Symbols of SI units by dimension. Other dimensions are unknown: no car logs them, and
+pint takes many a remark in brackets for a unit (mu: milli unified atomic mass).
+"""
+SPELLINGS = {
+    "-": "dimensionless",
+    "1": "dimensionless",
+    "g": "standard_gravity",
+    "G": "standard_gravity",
+    "kmh": "km/h",
+    "Nm": "N*m",
+    "kNm": "kN*m",
+}
+"""Spellings in logs that pint does not know, or takes for something else."""
+_TERM = r"[A-Za-zµμ°%]+(?:\^?[1-4]|[²³])?"
+WRITTEN = re.compile(rf"(?:1|{_TERM})(?:\s*[ */·]\s*{_TERM})*")
+"""What is shown to pint, which computes whatever is written: 9**9**9 takes for ever."""
 
 
 class Unit(NamedTuple):
     """A known unit.
 
     Attributes:
-        dimension: of `UNITS`.
-        symbol: of its SI unit.
-        factor: to SI.
+        dimension: of `DIMENSIONS`.
+        factor: to its SI unit.
     """
 
     dimension: str
-    symbol: str
     factor: float
 
 
@@ -99,6 +66,52 @@ class Match(NamedTuple):
     conversion: str | None = None
 
 
+@cache
+def _registry() -> tuple[Any, dict[str, str]]:
+    """Pint's units, and the dimension of every SI unit in base units.
+
+    Raises:
+        ValueError: pint is not installed.
+    """
+    try:
+        import pint
+    except ImportError:
+        raise ValueError(
+            'units in column names need pint: pip install "sfkd-jax[train]"'
+        ) from None
+    units = pint.UnitRegistry()
+    bases = {
+        _base(units, SPELLINGS.get(symbol, symbol))[1]: name
+        for name, symbol in DIMENSIONS.items()
+    }
+    return units, bases
+
+
+def _base(units: Any, written: str) -> tuple[float, str]:
+    """The factor of a unit to base units, and these."""
+    factor, base = units.get_base_units(units.parse_units(written))
+    return float(factor), str(base)
+
+
+@cache
+def find_unit(symbol: str) -> Unit | None:
+    """Look a unit up by its symbol, as written or in small letters."""
+    for spelling in (symbol, symbol.lower()):
+        written = SPELLINGS.get(spelling, spelling)
+        if not WRITTEN.fullmatch(written) and written != "standard_gravity":
+            continue
+        # m/s2 means m/s^2.
+        power = re.sub(r"(?<=[A-Za-z])([1-4])", r"^\1", written).replace("·", "*")
+        units, bases = _registry()
+        try:
+            factor, base = _base(units, power)
+        except Exception:  # of pint's parser, nearly anything
+            continue
+        if base in bases:
+            return Unit(bases[base], factor)
+    return None
+
+
 def split_unit(header: str) -> tuple[str, str] | None:
     """Split "x(m)" or "x [m]" into name and unit; None without a unit."""
     parts = re.fullmatch(r"(.*?\S)\s*(?:\(([^()]*)\)|\[([^\[\]]*)\])", header.strip())
@@ -108,13 +121,30 @@ def split_unit(header: str) -> tuple[str, str] | None:
     return name, (round_ if square is None else square).strip()
 
 
-def find_unit(symbol: str) -> Unit | None:
-    """Look a unit up by its symbol, as written or in small letters."""
-    for spelling in (symbol, symbol.lower()):
-        for dimension, units in UNITS.items():
-            if spelling in units:
-                return Unit(dimension, next(iter(units)), units[spelling])
-    return None
+def name_of(header: str) -> str:
+    """Return the name of a column without its unit."""
+    return (split_unit(header) or (header,))[0]
+
+
+def with_unit_row(names: list[str], cells: list[str]) -> list[str] | None:
+    """Return names with the units of the line below them; None if it has no units.
+
+    Args:
+        names: of the columns.
+        cells: of the first line below.
+    """
+    symbols = [cell.strip("()[] ") for cell in cells]
+    # A row of data has numbers; "1" and "-" alone do not make a line of units.
+    if len(cells) != len(names) or any(symbol[:1].isdigit() for symbol in symbols):
+        return None
+    if not all(symbol == "" or find_unit(symbol) for symbol in symbols):
+        return None
+    if not any(symbol.strip("-") for symbol in symbols):
+        return None
+    return [
+        f"{name} [{symbol}]" if symbol and not split_unit(name) else name
+        for name, symbol in zip(names, symbols, strict=True)
+    ]
 
 
 def find_column(
@@ -128,7 +158,7 @@ def find_column(
     Args:
         name: as configured.
         headers: of the file.
-        dimension: of `UNITS` that the column must have; None for any.
+        dimension: of `DIMENSIONS` that the column must have; None for any.
 
     Returns:
         The match, or None where there is no such column.
@@ -140,32 +170,24 @@ def find_column(
     if name in headers:
         split = split_unit(name)
         unit = split and find_unit(split[1])
-        if split is None or unit is None:
-            return Match(name)
-        return _converted(name, split[1], unit, dimension)
-    symbols = {
-        header: split[1]
-        for header in headers
-        if (split := split_unit(header)) and split[0] == name
-    }
-    fitting = list(symbols)
+        return _converted(name, unit, dimension) if unit else Match(name)
+    fitting = [one for one in headers if name_of(one) == name != one.strip()]
     if not fitting:
         return None
     if len(fitting) > 1:
         raise ValueError(
             f"columns {' and '.join(fitting)} both fit {name}; configure one in full"
         )
-    symbol = symbols[fitting[0]]
-    unit = find_unit(symbol)
-    if unit is None:
+    symbol = (split_unit(fitting[0]) or ("", ""))[1]
+    if (unit := find_unit(symbol)) is None:
         raise ValueError(
             f"unknown unit {symbol!r} of column {fitting[0]}; "
             "configure the name in full to read it without a conversion"
         )
-    return _converted(fitting[0], symbol, unit, dimension)
+    return _converted(fitting[0], unit, dimension)
 
 
-def _converted(header: str, symbol: str, unit: Unit, dimension: str | None) -> Match:
+def _converted(header: str, unit: Unit, dimension: str | None) -> Match:
     """A match with its conversion to SI.
 
     Raises:
@@ -177,5 +199,5 @@ def _converted(header: str, symbol: str, unit: Unit, dimension: str | None) -> M
         )
     if unit.factor == 1.0:
         return Match(header)
-    conversion = f"{header} to {unit.symbol} (x {unit.factor:.6g})"
+    conversion = f"{header} to {DIMENSIONS[unit.dimension]} (x {unit.factor:.6g})"
     return Match(header, unit.factor, conversion)
