@@ -220,15 +220,12 @@ def test_a_claim_is_read_for_the_tube_it_is_about():
 
 
 def test_a_new_metric_takes_one_entry(monkeypatch):
-    def largest_steering(run):
-        return np.max(np.abs(run.controls[..., 0]), axis=1)
-
     new = Metric(
         "largest_steering_rad",
         "Largest steering",
         "rad",
         "tracking",
-        measure=largest_steering,
+        measure=lambda run: np.max(np.abs(run.controls[..., 0]), axis=1),
         pool=lambda values: float(np.max(values)),
     )
     for module in ("metrics", "_rows"):

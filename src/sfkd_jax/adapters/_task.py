@@ -65,17 +65,9 @@ class Transition(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class DrivingTask:
-    """Path following for one car, see `tracking_task`; callers vmap.
+    """Path following for one car, made by `tracking_task`; callers vmap.
 
-    Attributes:
-        plant: that is simulated.
-        family: of roads.
-        preview: number of points ahead.
-        lane: half width [m].
-        lateral: q_y [1/m²].
-        speed: q_v [s²/m²].
-        steering_rate: q_δ̇ [s²/rad²].
-        leaving: charged once [-].
+    The fields are the arguments of that function.
     """
 
     plant: Vehicle
