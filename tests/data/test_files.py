@@ -6,7 +6,9 @@ import re
 import sys
 
 import numpy as np
+import pyarrow
 import pytest
+from pyarrow import parquet
 from recorded import NAMES, STATE, drive, write_csv, write_npz
 
 from sfkd_jax import data as datasets
@@ -74,14 +76,6 @@ def test_a_drive_comes_back_from_csv_to_the_last_bit(tmp_path, separator):
     assert same_segments(together(read(tmp_path)[0].dataset), expected(columns))
 
 
-def test_a_drive_comes_back_from_npz_to_the_last_bit(tmp_path):
-    columns = drive()
-    write_npz(tmp_path / "a.npz", columns | {"camera": np.zeros((3, 4))})
-    assert same_segments(
-        together(read(tmp_path / "a.npz")[0].dataset), expected(columns)
-    )
-
-
 def test_whole_drives_as_x_u_e_come_back_to_the_last_bit(tmp_path):
     drives = [drive(seconds=1.0, phase=0.3 * k) for k in range(12)]
     x, u, e = (
@@ -99,12 +93,14 @@ def test_whole_drives_as_x_u_e_come_back_to_the_last_bit(tmp_path):
     assert not [line for line in lines if "too few drives" in line]
 
 
-def test_a_drive_comes_back_from_parquet_to_the_last_bit(tmp_path):
-    pyarrow = pytest.importorskip("pyarrow")
-    parquet = pytest.importorskip("pyarrow.parquet")
-    columns = drive()
-    parquet.write_table(pyarrow.table(columns), tmp_path / "a.parquet")
-    assert same_segments(together(read(tmp_path)[0].dataset), expected(columns))
+@pytest.mark.parametrize("kind", ["npz", "parquet"])
+def test_a_drive_comes_back_from_columns_to_the_last_bit(tmp_path, kind):
+    columns, path = drive(), tmp_path / f"a.{kind}"
+    if kind == "npz":
+        write_npz(path, columns | {"camera": np.zeros((3, 4))})
+    else:
+        parquet.write_table(pyarrow.table(columns), path)
+    assert same_segments(together(read(path)[0].dataset), expected(columns))
 
 
 def test_parquet_without_its_package_names_the_extra(tmp_path, monkeypatch):
@@ -257,13 +253,7 @@ def stale(columns):
 
 WRONG = {
     "nan": (change("yaw", 7, np.nan), ", line 9: yaw is nan"),
-    "many nan": (
-        change("v", slice(3, 6), np.nan),
-        ", line 5: v is nan (3 rows like this)",
-    ),
     "infinite": (change("steering", 100, np.inf), ", line 102: steering is inf"),
-    "nan in e": (change("wind", 0, np.nan), ", line 2: wind is nan"),
-    "nan in t": (change("t", 4, np.nan), ", line 6: t is nan"),
     "time back": (
         change("t", 50, 4.8),
         ", line 52: t goes back from 4.9 to 4.8; two drives in one file? dataset.columns.drive",
@@ -277,10 +267,6 @@ WRONG = {
     "compass": (
         scale("yaw", lambda yaw: np.pi / 2 - yaw),
         "yaw is probably a compass heading (from north, clockwise)",
-    ),
-    "reversed": (
-        scale("yaw", lambda yaw: yaw + np.pi),
-        "v is probably of the wrong sign",
     ),
     "km/h": (
         scale("v", lambda v: 3.6 * v),
@@ -344,7 +330,6 @@ def test_what_cannot_be_right_is_one_line_with_its_place(tmp_path, kind):
 
 TEXTS = {
     "empty": ("", ": the file is empty"),
-    "header only": (",".join(NAMES) + "\n", ": no rows below the header"),
     "no header": (
         "0,1,2\n1,2,3\n",
         ", line 1: numbers where the names of the columns should be",

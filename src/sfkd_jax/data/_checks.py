@@ -47,6 +47,9 @@ class Motion(NamedTuple):
     integrated: Float[np.ndarray, " step"]
 
 
+CUT_THERE = "; the drive is cut there"
+Jumps: TypeAlias = tuple[Bool[np.ndarray, " step"], str]
+"""The steps that jump, and a line about the first of them."""
 Cut: TypeAlias = tuple[Log, list[Finding]]
 """A drive after cutting, and a line about every kind of cut."""
 
@@ -135,10 +138,10 @@ def check_motion(
             f"log positions as often as {columns.time}, or leave rows out"
         )
         return
-    if (jumps := position_jumps(log, steps)).any():
-        yield Finding(describe_jump(log, columns, steps, jumps))
-    if (turns := yaw_jumps(log, steps)).any():
-        yield Finding(describe_turn(log, columns, turns))
+    for find in (_position_jumps, _yaw_jumps):
+        jumps, line = find(log, columns, steps)
+        if jumps.any():
+            yield Finding(line)
 
 
 def _check_sampling(log: Log, steps: Motion, dt: float) -> Iterator[Finding]:
@@ -175,44 +178,27 @@ def stale_steps(log: Log, steps: Motion) -> Bool[np.ndarray, " step"]:
     return stale if many else np.zeros_like(stale)
 
 
-def position_jumps(log: Log, steps: Motion) -> Bool[np.ndarray, " step"]:
-    """Return steps much longer than the speed explains."""
+def _position_jumps(log: Log, columns: Columns, steps: Motion) -> Jumps:
+    """Steps much longer than the speed explains."""
     moved, integrated = steps.moved, steps.integrated
     spread = 1.4826 * np.median(np.abs(moved - integrated)[log.joined])
     jumps = moved - integrated > integrated + 15.0 * spread + 1e-6
-    return jumps & ~steps.gaps & log.joined
-
-
-def yaw_jumps(log: Log, steps: Motion) -> Bool[np.ndarray, " step"]:
-    """Return steps that turn much more than the others, between rows near in time."""
-    turned = _turned(log)
-    usual = float(np.median(turned[log.joined]))
-    return ~steps.gaps & log.joined & (turned > max(1.0, 10.0 * usual))
-
-
-def describe_jump(
-    log: Log, columns: Columns, steps: Motion, jumps: Bool[np.ndarray, " step"]
-) -> str:
-    """Describe the first jump of position."""
+    jumps &= ~steps.gaps & log.joined
     k = int(jumps.argmax())
-    return (
+    return jumps, (
         f"{log.at(k + 1)}: {columns.state[0]}, {columns.state[1]} "
-        f"jump {steps.moved[k]:.3g} m at {log.states[k, 3]:.3g} m/s{more(jumps)}"
+        f"jump {moved[k]:.3g} m at {log.states[k, 3]:.3g} m/s{more(jumps)}"
     )
 
 
-def describe_turn(log: Log, columns: Columns, jumps: Bool[np.ndarray, " step"]) -> str:
-    """Describe the first jump of yaw."""
+def _yaw_jumps(log: Log, columns: Columns, steps: Motion) -> Jumps:
+    """Steps that turn much more than the others, between rows near in time."""
+    turned = np.abs(np.diff(np.unwrap(log.states[:, 2])))
+    usual = float(np.median(turned[log.joined]))
+    jumps = ~steps.gaps & log.joined & (turned > max(1.0, 10.0 * usual))
     k = int(jumps.argmax())
-    return (
-        f"{log.at(k + 1)}: {columns.state[2]} jumps by "
-        f"{_turned(log)[k]:.3g} rad{more(jumps)}"
-    )
-
-
-def _turned(log: Log) -> Float[np.ndarray, " step"]:
-    """Angle between the yaws of neighbouring rows [rad]."""
-    return np.abs(np.diff(np.unwrap(log.states[:, 2])))
+    line = f"{log.at(k + 1)}: {columns.state[2]} jumps by {turned[k]:.3g} rad"
+    return jumps, line + more(jumps)
 
 
 def _first(log: Log, bad: Bool[np.ndarray, " time"], shift: int = 0) -> str:
@@ -251,22 +237,19 @@ def cut_at_jumps(log: Log, columns: Columns, *, dt: float, gap: float) -> Cut:
     """
     findings = []
     if (back := backwards(log)).any():
-        findings.append(_cut_there(describe_backwards(log, columns, back)))
+        line = describe_backwards(log, columns, back)
+        findings.append(Finding(line + CUT_THERE, refused=False))
         log = log.cut(back)
     if not log.joined.any():
         return log, findings
     steps = motion(log, dt=dt, gap=gap)
     if stale_steps(log, steps).any():
         return log, findings
-    if (jumps := position_jumps(log, steps)).any():
-        findings.append(_cut_there(describe_jump(log, columns, steps, jumps)))
-        log = log.cut(jumps)
-    if log.joined.any() and (turns := yaw_jumps(log, steps)).any():
-        findings.append(_cut_there(describe_turn(log, columns, turns)))
-        log = log.cut(turns)
+    for find in (_position_jumps, _yaw_jumps):
+        if not log.joined.any():  # the cuts have left single rows
+            break
+        jumps, line = find(log, columns, steps)
+        if jumps.any():
+            findings.append(Finding(line + CUT_THERE, refused=False))
+            log = log.cut(jumps)
     return log, findings
-
-
-def _cut_there(description: str) -> Finding:
-    """A warning that a drive is cut."""
-    return Finding(f"{description}; the drive is cut there", refused=False)

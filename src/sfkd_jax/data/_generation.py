@@ -124,10 +124,10 @@ def generate(
         those of `segment_scenarios`.
     """
     halves, counts = [], _counts(segments).values()
+    excitation = jnp.asarray([steering_excitation, speed_excitation])
     schedules = benchmark_roads(steps, vehicle.dt, fixed_levels=fixed_levels).values()
     for index, (conditions, count) in enumerate(zip(schedules, counts, strict=True)):
-        drive = partial(_segment, vehicle, driver, conditions, steps, speed)
-        drive = partial(drive, jnp.asarray([steering_excitation, speed_excitation]))
+        drive = partial(_segment, vehicle, driver, conditions, steps, speed, excitation)
         keys = jax.random.split(jax.random.fold_in(key, index), count)
         halves.append(jax.lax.map(drive, keys, batch_size=500))
     return jax.tree.map(lambda a, b: jnp.concatenate([a, b]), *halves)
