@@ -1,8 +1,5 @@
 """The doctor names what works and why something does not, and writes nothing."""
 
-import tomllib
-from pathlib import Path
-
 from helpers import last_line, run_command
 
 from sfkd_jax import doctor
@@ -31,10 +28,3 @@ def test_an_extra_that_is_missing_or_broken_is_named_with_its_reason(
         doctor._extra(("brokenextra",))
         == "brokenextra does not load: its library is of another version"
     )
-
-
-def test_the_extras_are_those_of_the_package():
-    project = tomllib.loads((Path(__file__).parents[1] / "pyproject.toml").read_text())[
-        "project"
-    ]
-    assert set(doctor.EXTRAS) == set(project["optional-dependencies"]) - {"dev"}

@@ -89,8 +89,3 @@ def test_the_loop_in_path_coordinates_agrees_with_the_drive_in_the_world(
         np.testing.assert_allclose(along[BODY][0], lateral, atol=2e-4)
     np.testing.assert_allclose(along[BODY][2:], world[3:], atol=2e-4)
     assert not np.any(np.asarray(along[:3]))
-
-
-def test_a_vehicle_without_limits_has_no_closed_loop():
-    with pytest.raises(ValueError, match="control_low"):
-        plants.along_path(plants.own(), lambda xi, kappa, speed, env: jnp.zeros(2))

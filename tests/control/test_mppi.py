@@ -96,21 +96,6 @@ def test_as_the_temperature_falls_the_plan_becomes_the_best_samples():
     np.testing.assert_allclose(state.previous, plans[0, best], atol=1e-6)
 
 
-def test_the_first_steering_rate_counts_from_the_control_that_was_applied_last():
-    on_path = np.float32([0.0, 0.0, 0.0, 10.0])
-    quiet = {"observation": on_path, "noise_std": (1e-9, 1e-9)}
-    _, state, _ = act_once("nominal", **quiet)
-    turned = state._replace(previous=jnp.asarray([0.1, 0.0]))
-    np.testing.assert_allclose(
-        act_once("nominal", state=state, **quiet)[2]["mean_cost"], 0.0, atol=1e-6
-    )
-    np.testing.assert_allclose(
-        act_once("nominal", state=turned, **quiet)[2]["mean_cost"],
-        5 * (0.1 / 0.1) ** 2,
-        rtol=1e-4,
-    )
-
-
 @pytest.mark.parametrize(
     ("std", "law"), [(1e3, FEEDBACK), (1e30, control.no_feedback())]
 )
