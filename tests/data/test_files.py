@@ -388,7 +388,7 @@ def test_a_drive_comes_back_from_what_recorders_write(tmp_path, kind):
 
 def test_lines_are_counted_as_an_editor_counts_them(tmp_path):
     head = f"Recorder 3.1\n\n# dry\n{';'.join(NAMES)}\n"
-    body = "0,5;" * 8 + "0,5\n# pause\n" + "1,5;" * 8 + "off\n"
+    body = "0;" * 8 + "0\n# pause\n" + "1,5;" * 8 + "off\n"
     (tmp_path / "a.csv").write_text(head + body)
     assert refusal(tmp_path).endswith("line 7: wind is 'off', not a number")
 

@@ -182,8 +182,10 @@ def read_csv(file: Path, time: str) -> Table:
     body = [lines[k] for k in kept]
     if between == " ":
         body = [" ".join(line.split()) for line in body]
-    comma = between != "," and re.search(r"\d,\d", body[0])
-    content = "\n".join([*body, ""]).encode()
+    text = "\n".join([*body, ""])
+    # The first rows may hold whole numbers only, so every line is looked at.
+    comma = between != "," and re.search(rf"(?:^|{between}) *-?\d+,\d", text, re.M)
+    content = text.encode()
     odd: list[Any] = []
 
     def skip(row: Any) -> str:
