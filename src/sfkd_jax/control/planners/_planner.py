@@ -4,11 +4,11 @@ from __future__ import annotations
 
 import functools
 from dataclasses import KW_ONLY, dataclass
-from typing import Any
+from typing import Any, cast
 
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array
+from jaxtyping import Array, Bool
 
 from sfkd_jax.control.planners._gains import feedback_gains
 from sfkd_jax.control.planners._plans import (
@@ -214,23 +214,10 @@ class Planner:
         controls = jnp.where(healthy, rollout.controls, state.controls)
         # Zeros, the controls before the first plan, may lie outside the box.
         control = jnp.clip(controls[0], task.low, task.high)
-        info: ControllerInfo = {
-            "cost": result.cost,
-            "mean_cost": rollout.costs,
-            "effective_samples": result.effective_samples,
-            "healthy": healthy,
-            "env_inside": jnp.all(inside == env) if self.env_low else jnp.asarray(True),
-            "predicted_states": rollout.states,
-        }
-        if rollout.violations is not None:
-            info["violation"] = rollout.violations
-            info["constraints_kept"] = rollout.violations <= 0.0
-        if self.info_level == "samples" and result.samples is not None:
-            evaluated = result.samples.evaluated
-            info["sample_costs"] = evaluated.costs
-            info["sample_weights"] = result.samples.weights
-            info["sample_plans"] = evaluated.perturbations
-            info["sample_states"] = evaluated.states
+        info = self._info(result, rollout, healthy)
+        info["env_inside"] = (
+            jnp.all(inside == env) if self.env_low else jnp.asarray(True)
+        )
         if self.gain_samples:
             gains = feedback_gains(
                 evaluate,
@@ -252,6 +239,28 @@ class Planner:
             tuning=state.tuning._replace(elapsed=jnp.ones_like(state.tuning.elapsed)),
         )
         return control, after, info
+
+    def _info(
+        self, result: SearchResult, rollout: Evaluated, healthy: Bool[Array, ""]
+    ) -> ControllerInfo:
+        """What is reported of a search and of its plan, `env_inside` excepted."""
+        info: dict[str, Any] = {
+            "cost": result.cost,
+            "mean_cost": rollout.costs,
+            "effective_samples": result.effective_samples,
+            "healthy": healthy,
+            "predicted_states": rollout.states,
+        }
+        if rollout.violations is not None:
+            info["violation"] = rollout.violations
+            info["constraints_kept"] = rollout.violations <= 0.0
+        if self.info_level == "samples" and result.samples is not None:
+            evaluated = result.samples.evaluated
+            info["sample_costs"] = evaluated.costs
+            info["sample_weights"] = result.samples.weights
+            info["sample_plans"] = evaluated.perturbations
+            info["sample_states"] = evaluated.states
+        return cast(ControllerInfo, info)
 
     def controller(self) -> Controller:
         """Return the planner as two functions."""
