@@ -28,10 +28,9 @@ CORE = (
     "matplotlib",
 )
 EXTRAS = {
-    "certify": ("cvxpy", "clarabel"),
+    "train": ("hydra", "orbax.checkpoint", "cvxpy", "clarabel", "pyarrow", "pint"),
     "brax": ("brax",),
     "gym": ("gymnasium",),
-    "parquet": ("pyarrow",),
     "docs": ("mkdocs", "material", "mkdocstrings"),
     "plants": ("vehiclemodels",),
     "cpp": ("iree.compiler", "iree.runtime"),
