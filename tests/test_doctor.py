@@ -10,8 +10,8 @@ def test_it_reports_the_installation_and_writes_nothing(tmp_path):
     document = last_line(done)
     assert set(document) == {"versions", "devices", "extras", "advice", "seconds"}
     assert {"python", "jax", "flax", "sfkd_jax"} <= set(document["versions"])
-    assert "certify" in document["extras"]
-    assert "extra certify: works" in done.stdout
+    assert "train" in document["extras"]
+    assert "extra train: works" in done.stdout
     assert list(tmp_path.iterdir()) == []
 
 
