@@ -184,7 +184,7 @@ def test_a_shown_metric_has_a_table_and_writes_what_is_no_number_as_a_dash(metri
     key, *rest = metric.name.split(".")
     for value in (None, math.nan, math.inf, "text", [], [None, 1.0], {}):
         assert metric.write(value) == DASH
-        record = {"v1_tube": "certified", rest[0]: value} if rest else value
+        record = {rest[0]: value} if rest else value
         assert metric.text({key: record}, mm=True) == DASH
 
 
@@ -205,18 +205,6 @@ def test_a_metric_is_written_with_its_digits(name, record, text, in_mm):
     metric = BY_NAME[name]
     assert metric.text(record) == text
     assert metric.text(record, mm=True) == (in_mm or text)
-
-
-def test_a_claim_is_read_for_the_tube_it_is_about():
-    certified, conformal = BY_NAME["violation.v1"], BY_NAME["violation.v1_conformal"]
-    own = {"v1": 0.1, "v1_tube": "certified", "v1_conformal": 0.2}
-    in_use = {"v1": 0.3, "v1_tube": "conformal", "v1_conformal": 0.3}
-    values = [
-        one.value({"violation": v})
-        for one in (certified, conformal)
-        for v in (own, in_use)
-    ]
-    assert values == [0.1, None, 0.2, 0.3]
 
 
 def test_a_new_metric_takes_one_entry(monkeypatch):

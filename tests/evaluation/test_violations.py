@@ -188,29 +188,25 @@ def test_the_record_names_its_tube_and_is_null_where_nothing_is_claimed():
     errors[0, 0, 3, 0] = 1.5
     result = Predictions(errors, np.full((4, 1, 4), 0.3), np.full((4, 1, 4), 0.1))
     everything = ClaimedBounds(
-        tube(2.0), tube(1.0), 0.95, np.asarray([0.2, 0.4, 0.4, 0.4]), 0.1, 1.4
+        tube(2.0), 0.95, np.asarray([0.2, 0.4, 0.4, 0.4]), 0.1, 1.4
     )
     measured = {
         "v0": 0.25,
         "v0_reach": pytest.approx([1.5, 0.75, 0.75, 0.75]),
         "v1": 0.0,
-        "v1_conformal": 0.25,
         "v2": 0.25,
         "segments": 4,
         "window_error_m": {"median": 0.0, "p95": pytest.approx(0.85 * 1.5)},
     }
     claimed = {
-        "v1_tube": "certified",
         "v1_radius_m": 2.0,
-        "v1_conformal_radius_m": 1.0,
         "v1_level": 0.95,
         "v2_threshold_m": 1.4,
     }
     assert violations(result, everything) == measured | claimed
     assert violations(None, everything) == dict.fromkeys(measured) | claimed
-    conformal = violations(result, ClaimedBounds(conformal=tube(1.0), level=0.95))
-    names = ("v0", "v1", "v1_tube", "v2")
-    assert [conformal[name] for name in names] == [None, 0.25, "conformal", None]
+    narrow = violations(result, ClaimedBounds(tube(1.0), level=0.95))
+    assert [narrow[name] for name in ("v0", "v1", "v2")] == [None, 0.25, None]
     nothing = violations(result, ClaimedBounds())
     known = {name for name, value in nothing.items() if value is not None}
     assert known == {"segments", "window_error_m"}

@@ -108,7 +108,7 @@ def disturbed(
     return {
         "force_n": force,
         "rmse_m": pooled["rmse_m"],
-        **{name: violation[name] for name in ("v0", "v1", "v1_conformal", "v2")},
+        **{name: violation[name] for name in ("v0", "v1", "v2")},
         "departures": pooled["departures"],
     }
 

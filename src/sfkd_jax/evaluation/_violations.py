@@ -50,15 +50,13 @@ class ClaimedBounds(NamedTuple):
 
     Attributes:
         certified: tube of a certificate, radii by `KINDS`, each (horizon,).
-        conformal: tube of calibration runs, in the same form.
-        level: 1 − δ of both.
+        level: 1 − δ.
         latent: R_1 … R_T of a certificate.
         d_bar: the one-step bound that the certificate assumes.
         threshold: δ*, one position error for all models [m].
     """
 
     certified: Tube | None = None
-    conformal: Tube | None = None
     level: float | None = None
     latent: Float[np.ndarray, " horizon"] | None = None
     d_bar: float | None = None
@@ -149,16 +147,13 @@ def threshold_violations(
 def violations(predicted: Predictions | None, claims: ClaimedBounds) -> dict[str, Any]:
     """Return the violation rates V0, V1, V2 and tube radii as results.json has them.
 
-    A rate without a claim is null. V1 is of the certified tube if there is one, else of
-    the conformal tube (`v1_tube` names it).
+    A rate without a claim is null.
     """
-    tubes = {"certified": claims.certified, "conformal": claims.conformal}
-    radii = {name: t and float(np.mean(t["position_m"])) for name, t in tubes.items()}
-    v0, ratios, v2, error = None, None, None, None
-    v1: dict[str | None, float | None] = dict.fromkeys(tubes)
+    tube = claims.certified
+    v0, ratios, v1, v2, error = None, None, None, None, None
     if predicted is not None:
         errors = np.asarray(predicted.errors)
-        v1 |= {name: tube_violations(errors, t) for name, t in tubes.items() if t}
+        v1 = tube_violations(errors, tube) if tube else None
         if claims.latent is not None and claims.d_bar is not None:
             seen, gaps = map(np.asarray, (predicted.latent_errors, predicted.defects))
             v0, ratios = theorem_violations(seen, gaps, claims.latent, claims.d_bar)
@@ -167,16 +162,11 @@ def violations(predicted: Predictions | None, claims: ClaimedBounds) -> dict[str
         worst = np.max(errors[..., 0], axis=2)
         p95 = float(np.quantile(worst, 0.95))
         error = {"median": float(np.median(worst)), "p95": p95}
-    # A proved tube comes first; a measured one stands in where there is none.
-    kind = next((name for name, tube in tubes.items() if tube), None)
     return {
         "v0": v0,
         "v0_reach": ratios,
-        "v1": v1.get(kind),
-        "v1_tube": kind,
-        "v1_radius_m": radii[kind] if kind else None,
-        "v1_conformal": v1["conformal"],
-        "v1_conformal_radius_m": radii["conformal"],
+        "v1": v1,
+        "v1_radius_m": float(np.mean(tube["position_m"])) if tube else None,
         "v1_level": claims.level,
         "v2": v2,
         "v2_threshold_m": claims.threshold,

@@ -181,16 +181,6 @@ def _of_trainings(rows: list[Row]) -> list[list[float]]:
     return [as_numbers(row["rmse_episodes_m"]).tolist() for row in rows]
 
 
-def _certified(key: str) -> Callable[[Row], Any]:
-    """Read an entry about the tube in use, None unless that one is certified."""
-
-    def read(row: Row) -> Any:
-        record = dig(row, "violation")
-        return dig(record, key) if dig(record, "v1_tube") == "certified" else None
-
-    return read
-
-
 def _ahead(steps: int) -> Metric:
     """Position error of open-loop predictions."""
     label = f"{steps} step{'s' * (steps > 1)} ahead"
@@ -217,13 +207,8 @@ METRICS: tuple[Metric, ...] = (
     Metric("smoothness_rad_per_s", "Steering rate", "rad/s", "tracking",
            measure=_steering_rate, pool=_mean),
     Metric("violation.v0", "V0, theorem", "%", "claims", percent),
-    Metric("violation.v1", "V1, certified tube", "%", "claims", percent,
-           read=_certified("v1")),
-    Metric("violation.v1_radius_m", "Radius of the certified tube", "m", "claims",
-           read=_certified("v1_radius_m")),
-    Metric("violation.v1_conformal", "V1, conformal tube", "%", "claims", percent),
-    Metric("violation.v1_conformal_radius_m", "Radius of the conformal tube", "m",
-           "claims"),
+    Metric("violation.v1", "V1, certified tube", "%", "claims", percent),
+    Metric("violation.v1_radius_m", "Radius of the certified tube", "m", "claims"),
     Metric("violation.v2", "V2, threshold", "%", "claims", percent),
     Metric("departures", "Left the lane", "", "spread", short, None, _departed,
            lambda values: int(np.sum(values)),

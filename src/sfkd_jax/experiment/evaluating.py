@@ -161,8 +161,7 @@ class SystemEvaluation:
             plant: the truth.
             name: of the system.
             system: to evaluate.
-            dataset: its calibration part gives the conformal tube and its test part the
-                open-loop error; without it there is neither.
+            dataset: its test part gives the open-loop error, or None for none.
         """
         self._protocol, self._plant = settings.evaluation, plant
         self._times: list[tuple[float, float] | None] = []
@@ -186,7 +185,7 @@ class SystemEvaluation:
         self._columns["open_loop_rmse_m"] = _open_loop(settings, system, dataset)
         self._horizon = settings.controller.horizon
         self._simulate = jax.jit(evaluation.over_episodes(self._episode))
-        self._score = _scorer(settings, system, dataset, plant.dt)
+        self._score = _scorer(settings, system, plant.dt)
 
     def __call__(self, episodes: EpisodeSet) -> SystemResult:
         """Simulate and score one set of episodes, without and with side forces."""
@@ -304,19 +303,16 @@ def _open_loop(
     }
 
 
-def _scorer(
-    settings: Settings, system: System, dataset: Dataset | None, dt: float
-) -> Scorer:
+def _scorer(settings: Settings, system: System, dt: float) -> Scorer:
     """Return the function that scores a batch of episodes of one system.
 
     Args:
         settings: of the run.
         system: its parameters folded.
-        dataset: for the conformal tube, or None for none.
         dt: sampling period [s].
     """
     length, horizon = settings.dataset.steps, settings.certification.horizon
-    claims = _claims(settings, system, dataset)
+    claims = _claims(settings, system)
 
     @jax.jit
     def predict(params: Params, seen: Trajectory, scenarios: Scenario) -> Any:
@@ -348,10 +344,8 @@ def _model_coordinates(
     return to_path(episode, scenario.path, law, speeds)
 
 
-def _claims(
-    settings: Settings, system: System, dataset: Dataset | None
-) -> evaluation.ClaimedBounds:
-    """Claims about a system's predictions, of its certificate and of calibration."""
+def _claims(settings: Settings, system: System) -> evaluation.ClaimedBounds:
+    """Claims about a system's predictions, of its certificate."""
     options = settings.certification
     level, horizon = options.level, options.horizon
     claims = evaluation.ClaimedBounds(
