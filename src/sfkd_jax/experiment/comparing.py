@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import functools
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Any, TypeAlias
+from typing import Any
 
 from jax.errors import JaxRuntimeError
 
@@ -18,8 +18,6 @@ from sfkd_jax.experiment.options import ComparisonSettings, Settings
 from sfkd_jax.plants import Vehicle
 from sfkd_jax.settings import plain, replace
 from sfkd_jax.training import TrainingStopped
-
-MakeEpisodes: TypeAlias = Callable[[Settings, Vehicle], evaluating.EpisodeSet]
 
 
 class Comparison:

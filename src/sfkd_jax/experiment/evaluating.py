@@ -53,7 +53,6 @@ class SystemResult(NamedTuple):
     arrays: dict[str, np.ndarray]
 
 
-Evaluator: TypeAlias = Callable[[EpisodeSet], SystemResult]
 Scored: TypeAlias = tuple[evaluation.Scores, dict[str, Any]]
 Scorer: TypeAlias = Callable[[evaluation.Episode, Scenario], Scored]
 """(episodes, their scenarios) -> scores, and the rates of violations."""

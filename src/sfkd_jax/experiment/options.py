@@ -7,9 +7,7 @@ from dataclasses import MISSING, dataclass, field, fields, is_dataclass, make_da
 from pathlib import Path
 from typing import Annotated, Any
 
-from sfkd_jax import build, evaluation, training
-from sfkd_jax import data as datasets
-from sfkd_jax import export as exporting
+from sfkd_jax import build, data, evaluation, export, training
 from sfkd_jax.build import (
     ControllerSettings,
     Directory,
@@ -311,20 +309,20 @@ _ENVIRONMENT: type = schema(
 _BOX = ("env_low", "env_high")
 _LOGGED = ("dt", "wheelbase", "limits", "needs_environment", "report", *_BOX)
 _DATASETS: dict[str, type] = {
-    "schema": schema("Dataset", SimulatedSettings, datasets.generate),
+    "schema": schema("Dataset", SimulatedSettings, data.generate),
     "path_schema": schema(
         "PathDataset",
         AlongPathSettings,
-        datasets.generate_along_path,
+        data.generate_along_path,
         skip=_BOX,
         law=LawSettings.kind_of({}),
     ),
     "files_schema": schema(
         "Logs",
         LogSettings,
-        datasets.from_logs,
+        data.from_logs,
         skip=_LOGGED,
-        columns=schema("Columns", None, datasets.Columns),
+        columns=schema("Columns", None, data.Columns),
     ),
 }
 _TRAINING: type = schema(
@@ -349,7 +347,7 @@ _CERTIFICATION: type = schema(
     corridor=schema("Corridor", None, certify_corridor),
 )
 _EXPORT: type = schema(
-    "Export", ExportSettings, exporting.write_controller, skip=("made_from",)
+    "Export", ExportSettings, export.write_controller, skip=("made_from",)
 )
 
 

@@ -16,8 +16,6 @@ from matplotlib.ticker import MaxNLocator
 
 ACCENT, SECOND, THIRD, MUTED = "#0b57b0", "#e8a33d", "#009e73", "#6b7280"
 DARK, SOFT, AXIS, ROAD = "#30363d", "#57606a", "#9aa1ab", "#d5dae1"
-DEPARTED = "#c2410c"
-"""Colour of a car that leaves its lane."""
 BAND: dict[str, Any] = dict(fc=ACCENT, alpha=0.16, linewidth=0, zorder=0.5)
 EDGE: dict[str, Any] = dict(color=ACCENT, linewidth=1.0, zorder=2)
 """Of a certified corridor."""
