@@ -114,7 +114,8 @@ def _draw_errors(
     most = 3 * corridor if corridor else LANE_HALF_WIDTH
     # A quantile of the peaks, so that one bad run does not set the scale.
     most = min(float(np.quantile(peaks, 0.85, method="higher")), most)
-    reach = 1.15 * max(most, *always)
+    # Room for the corridor's name below its edge.
+    reach = 1.3 * max(most, *always)
     axes.set(ylim=(-reach, reach), ylabel="lateral error [m]")
     axes.legend(loc="center left", bbox_to_anchor=(1.0, 0.5), handlelength=1.8)
 
@@ -129,7 +130,7 @@ def all_episodes(one: Episodes, corridor: float | None = None) -> Figure:
         style.draw_corridor(axes, corridor)
     finite = np.abs(one.lateral[np.isfinite(one.lateral)])
     # Away from 0, where the axis would have no height.
-    reach = 1.25 * max(corridor or 0.0, float(np.max(finite, initial=1e-3)))
+    reach = 1.3 * max(corridor or 0.0, float(np.max(finite, initial=1e-3)))
     axes.set(xlim=(0.0, time[-1]), ylim=(-reach, reach))
     axes.set(xlabel="time [s]", ylabel="lateral error [m]")
     axes.set_title(f"Lateral error of {style.literal(one.name)}, all episodes")
