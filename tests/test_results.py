@@ -87,3 +87,48 @@ def test_adapting_on_cars_that_no_model_has_seen():
     ]
     assert np.round([min(ratios), max(ratios)], 2).tolist() == [0.23, 0.34]
     assert "0.23 to 0.34 times" in PAGE
+
+
+def test_what_the_bound_costs_in_the_body_frame():
+    """The first page: up to 4.5 mm behind the oracle, of 8.3, and most rivals better."""
+    rows = results.of_scenario("benchmark", "s2", ("mppi", "koopman_mpc"))
+    error = {
+        label: np.mean(cars["dynamic"]["rmse_mm"])
+        for label, cars in rows.items()
+        if "dynamic" in cars
+    }
+    assert round(error["oracle"], 1) == 8.3
+    assert round(error["sfkd"] - error["oracle"], 1) == 4.5
+    rivals = [
+        error[label] for label in error if label not in ("oracle", "nominal", "sfkd")
+    ]
+    assert sum(one < error["sfkd"] for one in rivals) > len(rivals) / 2
+
+
+def test_what_adaptation_brings():
+    """The sentences of docs/adaptation.md."""
+    file = results.HOME.parent / "benchmarks" / "adaptation.json"
+    rows = json.loads(file.read_text("utf-8"))["rows"]
+    found = {(one["car"], one["case"], one["row"]): one for one in rows}
+
+    def ratio(car, case):
+        knows, ours = (
+            np.mean(np.square(found[car, case, label]["rmse_mm"])) ** 0.5
+            for label in ("oracle that knows", "SFKD, adaptive")
+        )
+        return ours / knows
+
+    for car in ("dynamic", "kinematic"):
+        knows, blind, ours = (
+            np.mean(np.square(found[car, "force, 3 s", label]["rmse_mm"])) ** 0.5
+            for label in ("oracle that knows", "SFKD", "SFKD, adaptive")
+        )
+        assert (blind - ours) / (blind - knows) > 0.8
+    for case in ("mass + 30 %", "steering + 1 degree", "wheelbase + 5 %"):
+        assert ratio("dynamic", case) < 1.205
+    assert round(ratio("dynamic", "stiffness - 30 %"), 2) == 1.25
+    assert round(ratio("dynamic", "e not measured"), 1) == 1.2
+    assert 2.0 < ratio("kinematic", "e not measured") < 2.2
+    wrong = "friction 0.2, told 0.9, 12 m/s"
+    assert found["dynamic", wrong, "SFKD, adaptive, cautious"]["left_the_lane"] == 0
+    assert found["dynamic", wrong, "SFKD, adaptive"]["left_the_lane"] == 24
