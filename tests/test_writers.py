@@ -95,8 +95,7 @@ def test_kill_9_frees_a_directory(tmp_path):
     holder.send_signal(signal.SIGKILL)
     holder.wait()
     with locked(tmp_path):
-        assert store.read_json(tmp_path / ".lock.json")["pid"] != holder.pid
-    assert not (tmp_path / ".lock.json").exists()
+        assert f"process {holder.pid} " not in (tmp_path / store.HOLDER).read_text()
 
 
 def test_a_waiting_process_prints_a_message_and_gets_the_lock(tmp_path, capfd):

@@ -6,9 +6,7 @@ atomically, so a writer that is killed leaves the old file or the new one.
 
 from __future__ import annotations
 
-import glob
 import hashlib
-import io
 import json
 import math
 import os
@@ -18,13 +16,12 @@ import shlex
 import socket
 import stat
 import sys
-import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
 from datetime import UTC, datetime
 from importlib import import_module, metadata
 from pathlib import Path
-from typing import Any, NoReturn
+from typing import Any, BinaryIO
 
 import numpy as np
 from safetensors import SafetensorError, safe_open
@@ -37,15 +34,11 @@ MAX_BYTES = 1 << 24
 """Size of a document; the largest of this package has 0.6 MB. Parsed JSON takes up to
 35 times as much memory.
 """
-MAX_DEPTH = 64
-"""Levels of a JSON document; those of this package have at most 7."""
 MAX_LINE = 400
 """Characters of a message, which may quote the file that it is about."""
-LOCK, HOLDER = ".lock", ".lock.json"
+LOCK, HOLDER = ".lock", ".lock.holder"
 GRACE_S = 2.0
 """Time to wait for a writer that is about to finish [s]."""
-ABANDONED_S = 3600.0
-"""Age of the hidden file of a killed writer from which the next writer removes it."""
 
 
 class ArtefactError(Exception):
@@ -70,34 +63,23 @@ def one_line(text: object) -> str:
 
 
 @contextmanager
-def writing(path: Path) -> Iterator[None]:
-    """Turn an OSError while files are written into an ArtefactError.
+def as_artefact_error(
+    path: Path, *also: type[Exception], advice: str = ""
+) -> Iterator[None]:
+    """Turn exceptions about a file or its content into an ArtefactError.
 
     Args:
-        path: to blame if the exception names no file.
+        path: of the file; an OSError that names another file is about that one.
+        also: exceptions to convert besides OSError, missing keys and wrong types.
+        advice: appended to the message about content.
     """
+    usual = (KeyError, TypeError, IndexError, AttributeError, OverflowError)
     try:
         yield
     except OSError as reason:
         named = Path(os.fsdecode(reason.filename)) if reason.filename else path
         raise failure(named, reason) from reason
-
-
-@contextmanager
-def as_artefact_error(
-    path: Path, *also: type[Exception], advice: str = ""
-) -> Iterator[None]:
-    """Turn exceptions about the content of a file into an ArtefactError.
-
-    Args:
-        path: of the file.
-        also: exceptions to convert besides those of missing keys and wrong types.
-        advice: appended to the message.
-    """
-    usual = (KeyError, TypeError, IndexError, AttributeError, OverflowError)
-    try:
-        yield
-    except (*usual, *also) as reason:
+    except (*usual, RecursionError, *also) as reason:
         message = f"malformed, {type(reason).__name__}: {reason}"
         raise failure(path, f"{message}; {advice}" if advice else message) from reason
 
@@ -110,25 +92,17 @@ def print_message(message: str) -> None:
 # ---- content
 
 
-def sha256(data: Mapping[str, Any] | Sequence[Any]) -> str:
-    """Hash the content, independent of its order and memory layout.
+def sha256(document: Any) -> str:
+    """Hash the JSON that a value would become, whatever the order of its keys."""
+    text = json.dumps(plain(document), sort_keys=True)
+    return hashlib.sha256(text.encode()).hexdigest()
 
-    The hash of a flat dict of arrays covers names, dtypes, shapes and values; that of
-    anything else covers the JSON that it would become.
-    """
-    if not (
-        isinstance(data, Mapping)
-        and data
-        and all(
-            hasattr(value, "__array__") and not isinstance(value, np.generic)
-            for value in data.values()
-        )
-    ):
-        text = json.dumps(plain(data), sort_keys=True)
-        return hashlib.sha256(text.encode()).hexdigest()
+
+def sha256_of_arrays(arrays: Mapping[str, Any]) -> str:
+    """Hash names, dtypes, shapes and values, whatever their order and layout."""
     digest = hashlib.sha256()
-    for name in sorted(data):
-        array = np.asarray(data[name])
+    for name in sorted(arrays):
+        array = np.asarray(arrays[name])
         digest.update(json.dumps([name, array.dtype.str, array.shape]).encode())
         digest.update(np.ascontiguousarray(array).reshape(-1).view(np.uint8).data)
     return digest.hexdigest()
@@ -180,32 +154,19 @@ def plain(value: Any) -> Any:
 # ---- bytes
 
 
-def open_regular(path: Path) -> io.FileIO:
-    """Open a regular file for reading, or raise an ArtefactError.
-
-    A pipe, a socket or a device is refused without waiting for it.
-    """
-    try:
-        number = os.open(path, os.O_RDONLY | os.O_NONBLOCK | os.O_NOCTTY | os.O_CLOEXEC)
-    except FileNotFoundError:
-        raise failure(path, "missing") from None
-    except (OSError, ValueError) as error:  # ValueError: an impossible file name
-        raise failure(path, error) from error
-    mode = os.fstat(number).st_mode
-    if stat.S_ISREG(mode):
-        return io.FileIO(number)
-    os.close(number)
-    folder = stat.S_ISDIR(mode)
-    raise failure(path, "Is a directory" if folder else "not a regular file")
+def open_regular(path: Path) -> BinaryIO:
+    """Open a regular file for reading, or raise an ArtefactError."""
+    with as_artefact_error(path, ValueError):  # ValueError: an impossible file name
+        # Opening a pipe would wait for its writer, and a device may have no end.
+        if not stat.S_ISREG(path.stat().st_mode):
+            raise failure(path, "not a regular file")
+        return path.open("rb")
 
 
 def read_bytes(path: Path) -> bytes:
     """Return the content of `path`, of at most MAX_BYTES, or raise an ArtefactError."""
-    with open_regular(path) as file, io.BufferedReader(file) as buffered:
-        try:
-            content = buffered.read(MAX_BYTES + 1)
-        except OSError as error:
-            raise failure(path, error) from error
+    with as_artefact_error(path), open_regular(path) as file:
+        content = file.read(MAX_BYTES + 1)
     if len(content) > MAX_BYTES:
         raise failure(path, f"larger than {MAX_BYTES >> 20} MiB")
     return content
@@ -218,23 +179,20 @@ def write_bytes(path: Path, content: bytes) -> None:
         ArtefactError: the disk is full or not writable; an earlier file stays as it
             was.
     """
-    part = path.with_name(f".{path.name}.{os.getpid()}-{secrets.token_hex(4)}.part")
+    part = path.with_name(f".{path.name}.{secrets.token_hex(8)}.part")
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
-        for left in path.parent.glob(f".{glob.escape(path.name)}.*.part"):
-            with suppress(FileNotFoundError):  # another writer was faster
-                if time.time() - left.stat().st_mtime > ABANDONED_S:
-                    left.unlink()
-        try:
-            with part.open("xb") as file:
-                file.write(content)
-                file.flush()
-                os.fsync(file.fileno())
-            os.replace(part, path)
-        finally:
-            part.unlink(missing_ok=True)
+        with part.open("xb") as file:
+            file.write(content)
+            file.flush()
+            # On the disk before the name is: a crash must not leave half a file.
+            os.fsync(file.fileno())
+        os.replace(part, path)
     except OSError as error:
         raise failure(path, error) from error
+    finally:
+        with suppress(OSError):
+            part.unlink(missing_ok=True)
 
 
 # ---- arrays
@@ -274,14 +232,19 @@ def write_arrays(
             raise failure(path, f"not written, {name} is of dtype {array.dtype}")
         # The library writes memory as it lies: rows first, in the machine's byte order.
         stored[name] = np.asarray(array, array.dtype.newbyteorder("="), order="C")
-    manifest = {"kind": kind, "format": FORMAT, "sha256": sha256(stored)}
-    settings = json.loads(encode(path, config))
-    manifest |= {"config": settings, "made_from": made_from or {}}
-    manifest["content_sha256"] = content_hash(manifest)
-    manifest["versions"] = versions()
-    manifest["created"] = datetime.now(UTC).isoformat(timespec="seconds")
-    # One entry: safetensors writes several in an order that changes.
-    text = encode(path, manifest).decode()
+    manifest = {
+        "kind": kind,
+        "format": FORMAT,
+        "sha256": sha256_of_arrays(stored),
+        "config": plain(config),
+        "made_from": made_from or {},
+        "versions": versions(),
+        "created": datetime.now(UTC).isoformat(timespec="seconds"),
+    }
+    with as_artefact_error(path, ValueError, advice="not written"):
+        manifest["content_sha256"] = content_hash(manifest)
+        # One entry: safetensors writes several in an order that changes.
+        text = json.dumps(manifest)
     write_bytes(path, save(stored, {"manifest": text}))
     return manifest
 
@@ -303,17 +266,14 @@ def read_arrays(
     """
     with _opened(path) as file:
         manifest = _manifest(path, kind, file)
-        if config is not None and (
-            changed := differences(manifest["config"], plain(config))
-        ):
+        changed = [] if config is None else differences(manifest["config"], config)
+        if changed:
             more = f" and {len(changed) - 3} more" if changed[3:] else ""
             listed = "; ".join(changed[:3]) + more
             raise failure(path, f"made with other settings: {listed}")
         arrays = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118
-    actual, recorded = sha256(arrays), manifest["sha256"]
-    if actual != recorded:
-        message = f"sha256 {actual[:12]}, recorded {recorded[:12]}"
-        raise failure(path, f"its arrays do not match its manifest: {message}")
+    if sha256_of_arrays(arrays) != manifest["sha256"]:
+        raise failure(path, "its arrays do not match the sha256 of its manifest")
     return arrays, manifest
 
 
@@ -327,34 +287,29 @@ def read_manifest(path: Path, *, kind: str) -> dict[str, Any]:
 def _opened(path: Path) -> Iterator[Any]:
     """Open a safetensors file; what the library raises becomes an ArtefactError."""
     open_regular(path).close()  # a pipe would block the library
-    try:
-        with safe_open(path, framework="numpy") as file:
-            yield file
-    except (SafetensorError, OSError, ValueError, TypeError, AttributeError) as reason:
-        raise failure(path, f"truncated, damaged or foreign ({reason})") from reason
+    advice = "the file is truncated, damaged or foreign"
+    with (
+        as_artefact_error(path, SafetensorError, ValueError, advice=advice),
+        safe_open(path, framework="numpy") as file,
+    ):
+        yield file
 
 
 def _manifest(path: Path, kind: str, file: Any) -> dict[str, Any]:
     """Return the manifest of an open file, checked without its arrays."""
-    text = (file.metadata() or {}).get("manifest")
-    if text is None or len(text) > MAX_BYTES:
+    text = (file.metadata() or {}).get("manifest", "")
+    if not 0 < len(text) <= MAX_BYTES:
         raise failure(path, "foreign, it has no manifest of sfkd_jax")
-    manifest = decode(path, text.encode(), where="its manifest is ")
-    hashes = ("sha256", "content_sha256")
-    if absent := [key for key in ("kind", "format", *hashes) if key not in manifest]:
-        raise failure(path, f"its manifest lacks {', '.join(absent)}")
-    if manifest["kind"] != kind:
-        raise failure(path, f"is of kind {manifest['kind']}, not {kind}")
-    if manifest["format"] != FORMAT:
-        found = f"is of format {manifest['format']}"
-        raise failure(path, f"{found}, this version reads {FORMAT}")
-    for name in ("config", "made_from", "versions"):
-        if not isinstance(manifest.get(name), dict):
-            raise failure(path, f"its manifest is malformed, {name}")
-    if not isinstance(manifest["sha256"], str) or (
-        content_hash(manifest) != manifest["content_sha256"]
-    ):
-        raise failure(path, "its settings were changed since it was written")
+    manifest = _decode(path, text.encode(), where="its manifest is ")
+    with as_artefact_error(path):
+        for name, wanted in (("kind", kind), ("format", FORMAT)):
+            if manifest[name] != wanted:
+                raise failure(path, f"is of {name} {manifest[name]}, not {wanted}")
+        for name in ("config", "made_from", "versions"):
+            if not isinstance(manifest[name], dict):
+                raise failure(path, f"its manifest is malformed, {name}")
+        if content_hash(manifest) != manifest["content_sha256"]:
+            raise failure(path, "its settings were changed since it was written")
     return manifest
 
 
@@ -368,7 +323,9 @@ def write_json(path: Path, document: Mapping[str, Any]) -> None:
         ArtefactError: the disk is full or not writable (an earlier file stays as it
             was), or a value is not JSON.
     """
-    write_bytes(path, encode(path, document, indent=2))
+    with as_artefact_error(path, ValueError, advice="not written"):
+        text = json.dumps(plain(document), indent=2)
+    write_bytes(path, text.encode())
 
 
 def read_json(path: Path, *, keys: Sequence[str] = ()) -> dict[str, Any]:
@@ -376,68 +333,33 @@ def read_json(path: Path, *, keys: Sequence[str] = ()) -> dict[str, Any]:
 
     Raises:
         ArtefactError: the file is missing, no regular file, larger than MAX_BYTES,
-            truncated, not strictly JSON (see `decode`), or lacks one of `keys`.
+            truncated, not JSON (which has no NaN or infinities), or lacks one of
+            `keys`.
     """
-    document = decode(path, read_bytes(path))
-    if absent := [key for key in keys if key not in document]:
-        raise failure(path, f"lacks {', '.join(absent)}")
-    return document
+    return _decode(path, read_bytes(path), keys=keys)
 
 
-def encode(
-    path: Path, document: Mapping[str, Any], *, indent: int | None = None
-) -> bytes:
-    """Return `document` as JSON, or raise an ArtefactError about `path`."""
+def _decode(
+    path: Path, text: bytes, *, where: str = "", keys: Sequence[str] = ()
+) -> dict[str, Any]:
+    """Return the JSON object in `text`, or raise an ArtefactError about `path`."""
     try:
-        return json.dumps(plain(document), indent=indent, allow_nan=False).encode()
-    except (TypeError, ValueError, RecursionError) as error:
-        raise failure(path, f"not written, {error}") from error
-
-
-def decode(path: Path, text: bytes, *, where: str = "") -> dict[str, Any]:
-    """Return the JSON object in `text`, or raise an ArtefactError about `path`.
-
-    Refused is what two parsers could read differently: a key twice in one object, NaN
-    and infinities (also numbers that overflow), integers beyond 64 bits, half of a
-    surrogate pair; and more levels than MAX_DEPTH, so that readers may recurse.
-    """
-    try:
-        document = json.loads(
-            text.decode("utf-8-sig"), parse_constant=_refuse, object_pairs_hook=_object
-        )
-        _check_values(document)
-        json.dumps(document, ensure_ascii=False).encode()  # refuses lone surrogates
+        content = text.decode("utf-8-sig")
+        document = json.loads(content, parse_float=_finite, parse_constant=_finite)
     except (ValueError, RecursionError) as error:
         raise failure(path, f"{where}truncated or not JSON ({error})") from error
     if not isinstance(document, dict):
         raise failure(path, f"{where}not a JSON object")
+    if absent := [key for key in keys if key not in document]:
+        raise failure(path, f"{where}lacks {', '.join(absent)}")
     return document
 
 
-def _refuse(constant: str) -> NoReturn:
-    raise ValueError(f"{constant} is not JSON")
-
-
-def _object(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
-    document = dict(pairs)
-    if len(document) < len(pairs):
-        names = [name for name, _ in pairs]
-        twice = next(name for name in names if names.count(name) > 1)
-        raise ValueError(f"the key {twice[:60]!r} occurs twice in one object")
-    return document
-
-
-def _check_values(value: Any, levels: int = MAX_DEPTH) -> None:
-    """Refuse numbers that do not fit into 64 bits, and deep documents."""
-    if isinstance(value, dict | list):
-        if not levels:
-            raise ValueError(f"more than {MAX_DEPTH} levels")
-        for item in value.values() if isinstance(value, dict) else value:
-            _check_values(item, levels - 1)
-    elif isinstance(value, float) and not math.isfinite(value):
-        raise ValueError("a number is larger than float64 holds")
-    elif isinstance(value, int) and not -(2**63) <= value < 2**64:
-        raise ValueError("an integer does not fit into 64 bits")
+def _finite(text: str) -> float:
+    """Return a number; NaN, Infinity and 1e999 are none that JSON can hold."""
+    if not math.isfinite(number := float(text)):
+        raise ValueError(f"{text} is not finite")
+    return number
 
 
 def read_jsonl(path: Path, *, keys: Sequence[str] = ()) -> list[dict[str, Any]]:
@@ -450,15 +372,11 @@ def read_jsonl(path: Path, *, keys: Sequence[str] = ()) -> list[dict[str, Any]]:
         ArtefactError: the file is missing, no regular file or too large.
     """
     records = []
-    for number, line in enumerate(io.BytesIO(read_bytes(path)), 1):
+    for number, line in enumerate(read_bytes(path).split(b"\n")[:-1], 1):
         try:
-            record = decode(path, line, where=f"line {number} ")
-            if absent := [key for key in keys if key not in record]:
-                raise failure(path, f"line {number} lacks {', '.join(absent)}")
-            records.append(record)
+            records.append(_decode(path, line, where=f"line {number} ", keys=keys))
         except ArtefactError as reason:
-            if line.endswith(b"\n") and line.strip():
-                print_message(f"{reason}; left out, the other lines stay")
+            print_message(f"{reason}; left out, the other lines stay")
     return records
 
 
@@ -467,8 +385,8 @@ def truncate_jsonl(
 ) -> None:
     """Replace `path` by the records to keep; a missing file stays missing."""
     if path.exists():
-        records = filter(keep, read_jsonl(path, keys=keys))
-        write_bytes(path, b"".join(encode(path, record) + b"\n" for record in records))
+        kept = filter(keep, read_jsonl(path, keys=keys))
+        write_bytes(path, "".join(f"{json.dumps(one)}\n" for one in kept).encode())
 
 
 # ---- locks
@@ -492,43 +410,31 @@ def locked(directory: Path, *, wait: bool = False) -> Iterator[None]:
     from filelock import FileLock, Timeout  # only writers need it
 
     holder = directory / HOLDER
-    try:
+    with as_artefact_error(directory / LOCK):
         directory.mkdir(parents=True, exist_ok=True)
         lock = FileLock(directory.resolve() / LOCK, is_singleton=True)
         try:
             lock.acquire(timeout=GRACE_S)
         except Timeout:
-            message = f"{directory}: {_who(directory)} is writing there"
+            known = holder.is_file()
+            who = holder.read_text(errors="replace") if known else "another process"
+            message = f"{directory}: {one_line(who)} is writing there"
             if not wait:
                 advice = "try again when it has ended"
                 raise DirectoryLocked(f"{message}; {advice}") from None
             print_message(f"waiting: {message}")
             lock.acquire()
-    except OSError as reason:
-        raise failure(directory / LOCK, reason) from reason
     try:
+        # Of nested locks the outermost says who holds it. The record of an earlier
+        # holder may stay: it is read only while somebody holds the lock.
         if lock.lock_counter == 1:
-            command = shlex.join(["python", *sys.orig_argv[1:]])
+            command = shlex.join(["python", *sys.orig_argv[1:]])[:200]
             since = datetime.now(UTC).isoformat(sep=" ", timespec="seconds")
-            me = {"pid": os.getpid(), "host": socket.gethostname()}
-            write_json(holder, me | {"command": command, "since": since})
+            process = f"process {os.getpid()} on {socket.gethostname()}"
+            write_bytes(holder, f"{process} ({command}, since {since})".encode())
         yield
     finally:
-        if lock.lock_counter == 1:
-            with suppress(OSError):
-                holder.unlink(missing_ok=True)
         lock.release()
-
-
-def _who(directory: Path) -> str:
-    """Describe the process that holds a directory, if its record can be read."""
-    try:
-        record = read_json(directory / HOLDER, keys=("pid", "host", "command", "since"))
-    except ArtefactError:
-        return "another process"
-    command = " ".join(str(record["command"]).split())[:200]
-    process = f"process {record['pid']} on {record['host']}"
-    return f"{process} ({command}, since {record['since']})"
 
 
 # ---- provenance

@@ -38,7 +38,7 @@ def write_results_page(directory: Path) -> dict[str, Any]:
             arrays of a row are damaged; or the page cannot be written.
     """
     source, home = directory / "results.json", directory / "report"
-    with store.writing(home), store.as_artefact_error(source, ValueError):
+    with store.as_artefact_error(source, ValueError):
         results = store.read_json(source, keys=("rows",))
         images = runs.empty_folder(home / "figures")
         page = _results(results, directory, images)
@@ -71,7 +71,7 @@ def write_comparison(root: Path, pattern: str, name: str) -> dict[str, Any]:
         ArtefactError: a file that is not JSON, or the disk refuses the page.
     """
     home = root / name / "comparison"
-    with store.writing(home):
+    with store.as_artefact_error(home):
         # Sorted, so that the same runs make the same page on every file system.
         found = sorted(path.parent for path in root.glob(f"{pattern}/settings.json"))
         if not found:

@@ -72,7 +72,7 @@ def write_report(run_dir: Path) -> dict[str, Any]:
             fit on a page; or the disk refuses the page.
     """
     home = run_dir / "report"
-    with store.writing(home):
+    with store.as_artefact_error(home):
         images = empty_folder(home / "figures")
         page = _page(run_dir, images)
         return write_page(page, home / "index.html", home / "report.md")
