@@ -1,14 +1,19 @@
-"""The one writer of films: cars on copies of a road above, their deviation below."""
+"""The film of a group of episodes: cars on copies of a road, their deviation below."""
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+from dataclasses import dataclass
+from functools import cached_property
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import matplotlib
 import numpy as np
 from jaxtyping import Float
-from matplotlib.patches import Polygon
+from matplotlib.lines import Line2D
+from matplotlib.patches import FancyArrowPatch, Polygon, Rectangle
+from matplotlib.text import Text
 from PIL import Image
 
 from sfkd_jax.evaluation.metrics import LANE_HALF_WIDTH, VEHICLE_HALF_WIDTH
@@ -16,8 +21,8 @@ from sfkd_jax.report import style
 from sfkd_jax.report.episodes import Episodes
 from sfkd_jax.report.rows import NO_MODEL
 
-MAX_BYTES = 2_000_000
-SECONDS = 13.5
+SECONDS, EVERY = 13.5, 2
+"""Of the episode that are shown; steps that a frame lasts."""
 LANE = LANE_HALF_WIDTH - VEHICLE_HALF_WIDTH
 """Deviation at which a car leaves its lane [m]."""
 _HALF, _SPACING = 3.4, 7.6
@@ -30,62 +35,15 @@ _CAR = np.array([[2.4, 1.8, -2.2, -2.2, 1.8], [0.0, 0.85, 0.85, -0.85, -0.85]])
 """Corners of a car in its frame [m]."""
 
 
-class Car(NamedTuple):
-    """A car in a film.
-
-    Attributes:
-        name: beside the car.
-        colour: of the car.
-        lateral: signed deviation of x_1 … x_T [m], left positive.
-        states: x_0 … x_T, beginning with x, y, yaw.
-    """
-
-    name: str
-    colour: str
-    lateral: Float[np.ndarray, " time"]
-    states: Float[np.ndarray, "time_plus_1 state"]
-
-    @property
-    def left(self) -> int:
-        """First step at which it is outside of its lane, or not finite."""
-        inside = np.abs(self.lateral) <= LANE
-        # A comparison with NaN is False: a car that is not finite is outside as well.
-        return int(np.argmin(np.append(inside, False)))
-
-
-class Film(NamedTuple):
-    """Episodes on one road.
-
-    Attributes:
-        title: above the road.
-        dt: sampling period [s].
-        points: x, y, yaw, curvature along the road.
-        envs: friction and wind [m/s] at every step.
-        cars: the camera follows the first one.
-        corridor: certified half width [m].
-    """
-
-    title: str
-    dt: float
-    points: Float[np.ndarray, "point column"]
-    envs: Float[np.ndarray, "time 2"] | None
-    cars: list[Car]
-    corridor: float | None = None
-
-    @property
-    def reach(self) -> float:
-        """Largest deviation of the corridor and of the cars in their lanes [m]."""
-        peaks = [float(np.max(np.abs(car.lateral))) for car in self.cars]
-        # A car that leaves its lane would make all others look motionless.
-        return (
-            max([self.corridor or 0.0, *(one for one in peaks if one <= LANE)]) or LANE
-        )
-
-
 def film_of(
     path: Path, group: list[Episodes], corridor: float | None = None
 ) -> Path | None:
-    """Write a GIF of SFKD, nominal and one other learned system.
+    """Write a GIF of SFKD, nominal and one other learned system, in real time.
+
+    Args:
+        path: of the file.
+        group: of one road.
+        corridor: certified half width [m].
 
     Returns:
         The file; None if no row has states and a path.
@@ -101,151 +59,175 @@ def film_of(
     chosen = [kind[0] for kind in kinds if kind] or whole[:1]
     if not chosen:
         return None
-    first = chosen[0]
-    title = style.scenario_label(str(first.row.get("scenario")))
-    cars = [
-        Car(one.name, style.line(one.system)["color"], one.lateral[0], states)
-        for one in chosen
-        if (states := one.states) is not None
-    ]
-    points = np.asarray(first.path)
-    return write_film(Film(title, first.dt, points, first.envs, cars, corridor), path)
-
-
-def write_film(
-    film: Film, path: Path, seconds: float = SECONDS, every: int = 2
-) -> Path:
-    """Write a GIF in real time, with fewer frames if it exceeds MAX_BYTES.
-
-    Args:
-        film: to write.
-        path: of the file.
-        seconds: of the episode that are shown.
-        every: how many steps a frame lasts.
-    """
-    last = min([round(seconds / film.dt), *(len(car.lateral) for car in film.cars)])
-    cars = [car._replace(lateral=car.lateral[:last]) for car in film.cars]
-    # Fewer frames, not fewer colours: cars are told apart by colour.
-    for stride in (every, 2 * every, 5 * every):
-        _write(film._replace(cars=cars), range(0, last, stride), path)
-        if path.stat().st_size <= MAX_BYTES:
-            break
-    return path
-
-
-def _write(film: Film, steps: range, path: Path) -> None:
+    dt, length = chosen[0].dt, min(one.lateral.shape[1] for one in chosen)
+    film = Film(chosen, min(round(SECONDS / dt), length), corridor)
     # Defaults: a user's style file would move axes that are placed by hand.
     with matplotlib.rc_context():
         matplotlib.rcdefaults()
-        tall = 0.123 * _SPACING * len(film.cars)
+        frames = [*film.frames()]
+    # One palette for all: half the bytes, and no flicker. Some frames hold all colours.
+    some = [np.asarray(one)[::2, ::2] for one in frames[:: 1 + len(frames) // 4]]
+    palette = Image.fromarray(np.vstack(some)).quantize(colors=_COLOURS, kmeans=1)
+    first, *rest = [one.quantize(palette=palette, dither=0) for one in frames]
+    pause = round(1e3 * EVERY * dt)
+    first.save(path, save_all=True, append_images=rest, duration=pause, loop=0)
+    return path
+
+
+@dataclass(frozen=True, eq=False)
+class Film:
+    """Episodes on one road.
+
+    Attributes:
+        cars: with states and a path; the camera follows the first one.
+        last: steps that are shown.
+        corridor: certified half width [m].
+    """
+
+    cars: list[Episodes]
+    last: int
+    corridor: float | None = None
+
+    @cached_property
+    def deviations(self) -> list[Float[np.ndarray, " time"]]:
+        """Signed deviation of every car [m], left positive."""
+        return [car.lateral[0, : self.last] for car in self.cars]
+
+    @cached_property
+    def left(self) -> list[int]:
+        """First step at which each car is outside of its lane, or not finite."""
+        inside = [np.abs(one) <= LANE for one in self.deviations]
+        # A comparison with NaN is False: a car that is not finite is outside as well.
+        return [int(np.argmin(np.append(one, False))) for one in inside]
+
+    @cached_property
+    def largest(self) -> float:
+        """Largest deviation of the corridor and of the cars in their lanes [m]."""
+        peaks = [float(np.max(np.abs(one))) for one in self.deviations]
+        # A car that leaves its lane would make all others look motionless.
+        shown = [self.corridor or 0.0, *(one for one in peaks if one <= LANE)]
+        return max(shown) or LANE
+
+    @cached_property
+    def factor(self) -> int:
+        """Widening of deviations; the same for all cars, so that they compare."""
+        return int(np.clip(_HALF / self.largest, 1, _MOST))
+
+    def frames(self) -> Iterator[Image.Image]:
+        """The frames, each drawn over what is the same in all of them."""
+        tall = 0.123 * _SPACING * len(self.cars)
         height = tall + 2.1
         figure = style.canvas(height)
         # No layout engine: axes that shift between frames would make the film shake.
         figure.set_layout_engine("none")
         figure.set(figwidth=6.0, dpi=90)
-        above = figure.add_axes(
-            (0.125, 1 - (tall + 0.29) / height, 0.86, tall / height)
-        )
-        below = figure.add_axes((0.125, 0.49 / height, 0.86, 1.16 / height))
-        nearest = [_nearest(car.states[:, :2], film.points) for car in film.cars]
-        frames = []
-        for step in steps:
-            above.clear()
-            below.clear()
-            _draw_road(above, film, nearest, step)
-            _draw_strip(below, film, step, steps.stop)
-            frames.append(_image(figure))
-    # One palette for all frames: half the bytes, and no flicker.
-    palette = frames[-1].quantize(colors=_COLOURS, kmeans=1)
-    first, *rest = [one.quantize(palette=palette, dither=0) for one in frames]
-    pause = round(1e3 * steps.step * film.dt)
-    first.save(path, save_all=True, append_images=rest, duration=pause, loop=0)
+        road = figure.add_axes((0.125, 1 - (tall + 0.29) / height, 0.86, tall / height))
+        errors = figure.add_axes((0.125, 0.49 / height, 0.86, 1.16 / height))
+        self._draw_axes(road, errors)
+        canvas: Any = figure.canvas
+        canvas.draw()
+        background = canvas.copy_from_bbox(figure.bbox)
+        points = np.asarray(self.cars[0].path)
+        near = [_nearest(np.asarray(one.states)[:, :2], points) for one in self.cars]
+        for step in range(0, self.last, EVERY):
+            canvas.restore_region(background)
+            self._draw_road(road, points, near, step)
+            self._draw_errors(errors, step)
+            yield Image.fromarray(np.array(canvas.buffer_rgba())[..., :3])
 
+    def _draw_axes(self, road: Any, errors: Any) -> None:
+        """What no frame changes: scales, corridor, dashes at switches."""
+        bottom = -_SPACING * (len(self.cars) - 0.5)
+        road.set(xlim=(-_BEHIND, _AHEAD), ylim=(bottom, 0.5 * _SPACING))
+        road.set(aspect="equal")
+        road.set_axis_off()
+        words = style.scenario_label(str(self.cars[0].row.get("scenario")))
+        words = f"{style.literal(words)}, deviations × {self.factor}"
+        road.set_title(words, fontsize=9.5, loc="right", pad=4)
+        dt, high = self.cars[0].dt, 1.5 * self.largest
+        if self.corridor:
+            style.draw_corridor(errors, self.corridor)
+        for switch in style.switches(self.cars[0].envs):
+            errors.axvline(switch * dt, **style.SWITCH)
+        errors.axhline(0.0, color=style.AXIS, linewidth=0.8)
+        errors.set(xlim=(0.0, self.last * dt), ylim=(-high, high))
+        errors.set_xlabel("time [s]", labelpad=1)
+        errors.set_ylabel("deviation [m]")
+        errors.spines[["top", "right"]].set_visible(False)
 
-def _image(figure: Any) -> Image.Image:
-    """The pixels of a figure."""
-    figure.canvas.draw()
-    return Image.fromarray(np.array(figure.canvas.buffer_rgba())[..., :3])
+    def _draw_errors(self, axes: Any, step: int) -> None:
+        """Deviations up to a step."""
+        dt = self.cars[0].dt
+        time = dt * np.arange(1, step + 2)
+        for car, values in zip(self.cars, self.deviations, strict=True):
+            color = style.line(car.system)["color"]
+            _put(axes, Line2D(time, values[: step + 1], color=color, linewidth=1.8))
+        now = Line2D([time[-1]] * 2, axes.get_ylim(), color=style.SOFT, linewidth=0.8)
+        _put(axes, now)
 
+    def _draw_road(self, axes: Any, path: Any, near: list[Any], step: int) -> None:
+        """Every car on its copy of the road, seen from the first car after a step."""
+        envs, whole = self.cars[0].envs, {"transform": axes.transAxes}
+        friction, wind = (0.9, 0.0) if envs is None else envs[min(step, len(envs) - 1)]
+        _put(axes, Rectangle((0, 0), 1, 1, fc=style.shade(friction), **whole))
+        for number in range(len(self.cars)):
+            self._draw_car(axes, path, near, step + 1, number)
+        _put(axes, Rectangle((0, 0), 1, 1, fill=False, clip_on=False, **whole))
+        if envs is not None:
+            words = f"friction {friction:.2g}, wind {round(wind):+d} m/s"
+            _put(axes, Text(0, 1.02, words, fontsize=9.5, clip_on=False, **whole))
+        if abs(wind) > 0.1:
+            middle = float(np.mean(axes.get_ylim()))
+            ends = [(0.93 * _AHEAD, middle + half * wind) for half in (-0.5, 0.5)]
+            arrow = {"arrowstyle": "-|>", "color": style.DARK, "lw": 2.5}
+            _put(axes, FancyArrowPatch(*ends, mutation_scale=10, **arrow))
 
-def _draw_road(axes: Any, film: Film, nearest: list[np.ndarray], step: int) -> None:
-    """Every car on its copy of the road, seen from the first car after a step."""
-    now, path, centre = step + 1, film.points, int(nearest[0][step + 1])
-    # The same factor for all cars, or their deviations could not be compared.
-    factor = int(np.clip(_HALF / film.reach, 1, _MOST))
-    turn = style.turn_by(path[centre, 2])
-    visible = path[max(centre - 120, 0) : centre + 160]
-    bottom = -_SPACING * (len(film.cars) - 0.5)
-    for number, (car, near) in enumerate(zip(film.cars, nearest, strict=True)):
+    def _draw_car(
+        self, axes: Any, path: Any, near: list[Any], now: int, number: int
+    ) -> None:
+        """One car on its copy of the road, its trail and its name."""
+        car, lateral, own = self.cars[number], self.deviations[number], near[number]
+        centre, states = path[near[0][now]], np.asarray(car.states)
+        turn, color = style.turn_by(centre[2]), style.line(car.system)["color"]
         shift = np.array([[0.0], [-_SPACING * number]])
 
-        def seen(points: Any, offset: Any, shift: Any = shift) -> np.ndarray:
+        def seen(points: Any, offset: Any) -> np.ndarray:
             """Positions to the left of path points on this copy, (2, point)."""
             left = np.stack([-np.sin(points[:, 2]), np.cos(points[:, 2])])
-            origin = path[centre, :2, None]
-            return turn @ (points[:, :2].T + offset * left - origin) + shift
+            return turn @ (points[:, :2].T + offset * left - centre[:2, None]) + shift
 
+        around = path[max(int(near[0][now]) - 120, 0) : int(near[0][now]) + 160]
         for side, dashes in ((-_HALF, "-"), (0.0, (0, (6, 5))), (_HALF, "-")):
-            axes.plot(
-                *seen(visible, side), color="#aab1ba", lw=1.2, ls=dashes, zorder=2
-            )
-        if film.corridor:
-            half = factor * film.corridor
-            upper, lower = seen(visible, half), seen(visible, -half)
-            axes.add_patch(Polygon(np.hstack([upper, lower[:, ::-1]]).T, **style.BAND))
-            for edge in (upper, lower):
-                axes.plot(*edge, **style.EDGE)
+            look: dict[str, Any] = {"color": "#aab1ba", "lw": 1.2, "ls": dashes}
+            _put(axes, Line2D(*seen(around, side), **look))
+        if self.corridor:
+            edges = [
+                seen(around, side * self.factor * self.corridor) for side in (1, -1)
+            ]
+            area = np.hstack([edges[0], edges[1][:, ::-1]]).T
+            _put(axes, Polygon(area, **style.BAND))
+            for edge in edges:
+                _put(axes, Line2D(*edge, **style.EDGE))
         # A car off its lane stays at the edge of its copy: beyond is another one's.
-        offset = np.append(0.0, car.lateral[:now])
-        offset = np.clip(
-            factor * np.nan_to_num(offset), -0.5 * _SPACING, 0.5 * _SPACING
-        )
+        offset = self.factor * np.nan_to_num(np.append(0.0, lateral[:now]))
+        offset = np.clip(offset, -0.5 * _SPACING, 0.5 * _SPACING)
         recent = slice(max(now - _TRAIL, 0), now + 1)
-        points = seen(path[near[recent]], offset[recent])
-        axes.plot(*points, color=car.colour, linewidth=1.8, zorder=4)
-        body = style.turn_by(path[centre, 2] - car.states[now, 2]) @ _CAR
-        look: dict[str, Any] = {"fc": car.colour, "ec": style.DARK, "zorder": 6}
-        axes.add_patch(Polygon((body + points[:, -1:]).T, **look))
-        words = f"{car.name}, left its lane at {(car.left + 1) * film.dt:.1f} s"
-        words = style.literal(words if now > car.left else car.name)
-        look = {"color": car.colour, "fontweight": "bold", "zorder": 8, "va": "center"}
+        trail = seen(path[own[recent]], offset[recent])
+        _put(axes, Line2D(*trail, color=color, linewidth=1.8))
+        body = style.turn_by(centre[2] - states[now, 2]) @ _CAR + trail[:, -1:]
+        _put(axes, Polygon(body.T, fc=color, ec=style.DARK))
+        gone = f", left its lane at {(self.left[number] + 1) * car.dt:.1f} s"
+        words = style.literal(car.name) + gone * (now > self.left[number])
+        look = {"color": color, "fontweight": "bold", "fontsize": 9.5, "va": "center"}
         look["bbox"] = {"fc": "white", "ec": "none", "alpha": 0.75, "pad": 1.5}
-        axes.text(4.5, shift[1, 0] - 2.3, words, fontsize=9.5, **look)
-    axes.set(xlim=(-_BEHIND, _AHEAD), ylim=(bottom, 0.5 * _SPACING), aspect="equal")
-    axes.set(xticks=[], yticks=[])
-    title = f"{style.literal(film.title)}, deviations × {factor}"
-    axes.set_title(title, fontsize=9.5, loc="right", pad=4)
-    if film.envs is not None:
-        friction, wind = film.envs[min(step, len(film.envs) - 1)]
-        axes.set_facecolor(style.shade(friction))
-        words = f"friction {friction:.2g}, wind {wind:+.0f} m/s"
-        axes.set_title(words, fontsize=9.5, loc="left", pad=4)
-        middle = 0.5 * (bottom + 0.5 * _SPACING)
-        tip, tail = ((0.93 * _AHEAD, middle + half * wind) for half in (0.5, -0.5))
-        arrow = {
-            "arrowstyle": "-|>",
-            "color": style.DARK,
-            "lw": 2.5 * (abs(wind) > 0.1),
-        }
-        axes.annotate("", tip, tail, arrowprops=arrow, zorder=9)
+        _put(axes, Text(4.5, shift[1, 0] - 2.3, words, **look))
 
 
-def _draw_strip(axes: Any, film: Film, step: int, last: int) -> None:
-    """Deviation up to a step over time, with dashes where friction or wind switch."""
-    if film.corridor:
-        style.draw_corridor(axes, film.corridor)
-    for switch in style.switches(film.envs):
-        axes.axvline(switch * film.dt, **style.SWITCH)
-    axes.axhline(0.0, color=style.AXIS, linewidth=0.8)
-    for car in film.cars:
-        values = car.lateral[: step + 1]
-        time = film.dt * np.arange(1, len(values) + 1)
-        axes.plot(time, values, color=car.colour, linewidth=1.8)
-    axes.axvline((step + 1) * film.dt, color=style.SOFT, linewidth=0.8)
-    axes.set(xlim=(0.0, last * film.dt), ylim=(-1.5 * film.reach, 1.5 * film.reach))
-    axes.set_xlabel("time [s]", labelpad=1)
-    axes.set_ylabel("deviation [m]")
-    axes.spines[["top", "right"]].set_visible(False)
+def _put(axes: Any, artist: Any) -> None:
+    """Draw something over what the axes already show, without keeping it."""
+    axes.add_artist(artist)
+    axes.draw_artist(artist)
+    artist.remove()
 
 
 def _nearest(
