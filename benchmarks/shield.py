@@ -18,8 +18,7 @@ import numpy as np
 
 import sfkd_jax
 from sfkd_jax import build, evaluation, policy, scenarios, store
-from sfkd_jax.control.tasks._along_path import curvature_ahead, path_coordinates
-from sfkd_jax.geometry import LATERAL
+from sfkd_jax.geometry import LATERAL, curvature_ahead, path_coordinates
 from sfkd_jax.rollout import fold
 from sfkd_jax.types import Controller
 

@@ -15,7 +15,17 @@ from typing import TypeAlias
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
-from sfkd_jax.types import BODY, POSE, Control, Environment, Pose, Scalar, State, Step
+from sfkd_jax.types import (
+    BODY,
+    POSE,
+    Control,
+    Environment,
+    Pose,
+    Reference,
+    Scalar,
+    State,
+    Step,
+)
 
 
 def wrap_angle(angle: Float[Array, "*shape"]) -> Float[Array, "*shape"]:
@@ -95,6 +105,48 @@ def is_valid(
     """Whether path coordinates are meaningful: 1 − κ e_y > 0.2; False for NaN."""
     # A comparison with NaN is False, so that an unknown position is never valid.
     return 1.0 - curvature * lateral > SMALLEST_SCALE
+
+
+def path_coordinates(
+    state: State, point: Float[Array, " 4"], curvature: Scalar
+) -> PathState:
+    """Return ξ of a world state, relative to the circle through a reference point.
+
+    Args:
+        state: pose and body state.
+        point: x, y, yaw, speed of the reference.
+        curvature: of the circle [1/m].
+    """
+    lateral, heading = circle_errors(between(point[POSE], state[POSE]), curvature)
+    return jnp.concatenate([jnp.stack([lateral, heading]), state[BODY]])
+
+
+def curvature_between(reference: Reference) -> Float[Array, " gap"]:
+    """Return κ [1/m] between reference points: the change of yaw over the distance."""
+    steps = jnp.diff(reference, axis=0)
+    distance = jnp.hypot(steps[:, 0], steps[:, 1])
+    # Points that coincide, as where a car waits, have no direction to turn from.
+    moved = distance > 1e-3
+    turned = wrap_angle(steps[:, 2])
+    return jnp.where(moved, turned / jnp.where(moved, distance, 1.0), 0.0)
+
+
+def reference_curvature(reference: Reference) -> Float[Array, " horizon"]:
+    """Return κ [1/m] at each reference point, the mean of both sides."""
+    gaps = curvature_between(reference)
+    ends = jnp.concatenate([gaps[:1], gaps, gaps[-1:]])
+    return 0.5 * (ends[1:] + ends[:-1])
+
+
+def curvature_ahead(reference: Reference) -> Float[Array, " horizon"]:
+    """Return κ [1/m] over the step to each reference point.
+
+    The first step begins at the vehicle, where there is no reference point: its
+    curvature is extrapolated linearly from the next two.
+    """
+    gaps = curvature_between(reference)
+    first = 2.0 * gaps[0] - gaps[min(1, gaps.shape[0] - 1)]
+    return jnp.concatenate([first[None], gaps])
 
 
 def path_state(coordinates: PathState) -> State:

@@ -14,7 +14,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from sfkd_jax import build, store
-from sfkd_jax.control import PathLaw, law_from_arrays, law_to_arrays
+from sfkd_jax.control import PathLaw, law_from_arrays
 from sfkd_jax.plants import Vehicle
 from sfkd_jax.rollout import fold, unfold
 from sfkd_jax.types import Controller, Model, Params
@@ -97,7 +97,7 @@ def save(
         weights, law and all settings.
     """
     # Beside the weights: the hash that certificates refer to then covers the law.
-    tree = params if law is None else params | {LAW: law_to_arrays(law)}
+    tree = params if law is None else params | {LAW: law._asdict()}
     return store.write_arrays(
         path, _by_path(tree), kind=KIND, config=settings, made_from=made_from
     )

@@ -11,10 +11,8 @@ from helpers import any_law, tiny
 
 import sfkd_jax
 from sfkd_jax import build, control, plants
-from sfkd_jax.control.laws._path_law import turn_control
 from sfkd_jax.control.tasks import _along_path
-from sfkd_jax.control.tasks._along_path import curvature_ahead, path_coordinates
-from sfkd_jax.geometry import compose
+from sfkd_jax.geometry import compose, curvature_ahead, path_coordinates
 from sfkd_jax.scenarios import path_from_curvature, reference_window
 
 PLANT = plants.kinematic()
@@ -70,7 +68,7 @@ def test_without_samples_the_law_alone_drives():
     curvature = curvature_ahead(reference)[0]
     xi = path_coordinates(state, reference[0], curvature)
     np.testing.assert_allclose(
-        action, turn_control(LAW.turn(curvature, jnp.asarray(9.0), ENV), xi), atol=1e-6
+        action, LAW(xi, curvature, jnp.asarray(9.0), ENV), atol=1e-6
     )
     assert bool(info["healthy"])
 
@@ -86,7 +84,7 @@ def test_what_is_added_to_the_law_stays_within_its_bounds():
     action, after, _ = jax.jit(controller.act)({}, loud, state, ENV, reference)
     curvature = curvature_ahead(reference)[0]
     xi = path_coordinates(state, reference[0], curvature)
-    added = action - turn_control(LAW.turn(curvature, jnp.asarray(9.0), ENV), xi)
+    added = action - LAW(xi, curvature, jnp.asarray(9.0), ENV)
     assert np.all(np.abs(added) <= LAW.perturbation + 1e-6)
     assert np.all(np.abs(after.inner.plan) <= LAW.perturbation + 1e-6)
 

@@ -10,9 +10,10 @@ import scipy.linalg
 from helpers import jit, straight
 
 from sfkd_jax import control, models, plants
-from sfkd_jax.control.laws._model_law import _along_circle, solve
+from sfkd_jax.control.laws._steady_turn import solve
+from sfkd_jax.geometry import path_step
 
-LAW = control.ModelLaw(dt=0.1)
+LAW = control.ModelLaw()
 PLANTS = {"kinematic": plants.kinematic(), "dynamic": plants.dynamic()}
 ENV = jnp.asarray([0.6, 5.0])
 CURVATURE = jnp.asarray([0.0, 0.01, -0.02])
@@ -29,9 +30,8 @@ def turns(name, bend=1.0):
         fiber = model.fiber({}, env)
         return LAW.prepare(model, fiber, jnp.zeros(size), straight(3), curvature)
 
-    step = jit(
-        lambda *inputs: _along_circle(model, model.fiber({}, ENV), size, 0.1)(*inputs)
-    )
+    along = path_step(plant.step)
+    step = jit(lambda xi, control, kappa: along(xi, control, kappa, ENV))
     return prepared(ENV, bend * CURVATURE), step
 
 
@@ -39,7 +39,7 @@ def turns(name, bend=1.0):
 def test_a_steady_turn_stays_what_it_is_on_the_path_at_the_reference_speed(name):
     turn, step = turns(name)
     for k, kappa in enumerate(CURVATURE):
-        after = step(turn.state[k], turn.control[k], kappa, jnp.asarray(10.0))
+        after = step(turn.state[k], turn.control[k], kappa)
         np.testing.assert_allclose(after, turn.state[k], atol=2e-3)
         np.testing.assert_allclose(
             np.asarray(turn.state[k])[[0, 2]], [0.0, 10.0], atol=1e-6
@@ -66,7 +66,7 @@ def test_the_textbook_bicycle_turns_as_its_geometry_requires():
 @pytest.mark.parametrize("name", PLANTS)
 def test_the_gain_is_that_of_the_riccati_equation_and_stabilises(name):
     turn, step = turns(name)
-    at = (turn.state[0], turn.control[0], CURVATURE[0], jnp.asarray(10.0))
+    at = (turn.state[0], turn.control[0], CURVATURE[0])
     A, B = (
         np.asarray(part, dtype=float) for part in jax.jacfwd(step, argnums=(0, 1))(*at)
     )

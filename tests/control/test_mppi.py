@@ -151,7 +151,7 @@ def test_what_is_not_finite_is_noticed_even_where_the_model_does_not_look(broken
     assert finite(state)
 
 
-@pytest.mark.parametrize("law", [control.ModelLaw(dt=0.1)])
+@pytest.mark.parametrize("law", [control.ModelLaw()])
 def test_a_reading_far_off_leaves_no_more_in_the_plan_than_the_actuators_can_do(law):
     """The law requests thousands of radians; a perturbation that compensates for them
     would persist.

@@ -10,7 +10,7 @@ import pytest
 
 import sfkd_jax
 from sfkd_jax import plants, policy
-from sfkd_jax.control import derive_path_law, law_from_arrays, law_to_arrays
+from sfkd_jax.control import derive_path_law, law_from_arrays
 from sfkd_jax.geometry import path_state, path_step
 from sfkd_jax.types import BODY
 
@@ -78,7 +78,7 @@ def test_the_loop_contracts_alike_where_tyres_give_little(derived):
 
 def test_a_law_survives_being_stored(derived):
     law = derived[1]
-    flat = {name: np.asarray(leaf) for name, leaf in law_to_arrays(law).items()}
+    flat = {name: np.asarray(leaf) for name, leaf in law._asdict().items()}
     again = law_from_arrays(flat)
     given = (
         jnp.full(law.state.shape[-1], 0.1),

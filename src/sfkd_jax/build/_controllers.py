@@ -281,9 +281,7 @@ def _searching(
         options = arguments(settings.task, control.following_law)
         task = control.following_law(model, cost, law, **limits, **options)
     else:
-        model_law = control.ModelLaw(
-            dt=plant.dt, **arguments(settings.model_law, control.ModelLaw)
-        )
+        model_law = control.ModelLaw(**arguments(settings.model_law, control.ModelLaw))
         laws = {
             "feedback": control.path_feedback(
                 wheelbase=plant.wheelbase,

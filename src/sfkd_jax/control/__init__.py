@@ -1,20 +1,18 @@
 """Controllers: tasks, planners, feedback laws and wrappers, for any dynamics."""
 
 from sfkd_jax.control._factory import factory
-from sfkd_jax.control.laws._model_law import ModelLaw
-from sfkd_jax.control.laws._path_errors import (
+from sfkd_jax.control.laws._feedback import (
     FeedbackLaw,
+    ModelLaw,
     PathErrors,
     no_feedback,
     path_errors,
     path_feedback,
-    reference_curvature,
 )
 from sfkd_jax.control.laws._path_law import (
     PathLaw,
     derive_path_law,
     law_from_arrays,
-    law_to_arrays,
 )
 from sfkd_jax.control.planners._autotune import autotune
 from sfkd_jax.control.planners._cem import cem
@@ -55,6 +53,7 @@ from sfkd_jax.control.wrappers._guard import (
     safety_filter,
 )
 from sfkd_jax.control.wrappers._online_tube import OnlineTube
+from sfkd_jax.geometry import reference_curvature
 
 # tasks
 __all__ = [
@@ -97,7 +96,6 @@ __all__ += [
     "PathLaw",
     "derive_path_law",
     "law_from_arrays",
-    "law_to_arrays",
     "no_feedback",
     "path_errors",
     "path_feedback",

@@ -13,7 +13,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from sfkd_jax import build, store
-from sfkd_jax.control import PathLaw, law_from_arrays, law_to_arrays
+from sfkd_jax.control import PathLaw, law_from_arrays
 from sfkd_jax.data import (
     SCENARIOS,
     Columns,
@@ -283,7 +283,7 @@ def ensure_law(source: Source) -> PathLaw | None:
         path.parent.mkdir(parents=True, exist_ok=True)
         plain_arrays = {
             name: np.asarray(array)
-            for name, array in law_to_arrays(jax.jit(derive)()).items()
+            for name, array in jax.jit(derive)()._asdict().items()
         }
         store.write_arrays(path, plain_arrays, kind=LAW, config=source.config)
     arrays, _ = store.read_arrays(path, kind=LAW, config=source.config)

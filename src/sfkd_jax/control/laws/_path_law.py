@@ -12,12 +12,11 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, Int
 
-from sfkd_jax.control.laws._model_law import (
+from sfkd_jax.control.laws._steady_turn import (
     SteadyTurn,
     by_differences,
     riccati_gain,
     steady_turn,
-    weights_of,
 )
 from sfkd_jax.geometry import LATERAL, PATH_SPEED, PathState, path_step
 from sfkd_jax.ranges import AtLeastTwo, Positive, Span
@@ -86,12 +85,7 @@ class PathLaw(NamedTuple):
         self, coordinates: PathState, curvature: Scalar, speed: Scalar, env: Environment
     ) -> Control:
         """Return u, without any limit."""
-        return turn_control(self.turn(curvature, speed, env), coordinates)
-
-
-def turn_control(turn: SteadyTurn, coordinates: PathState) -> Control:
-    """Return the control u* − K (ξ − ξ*)."""
-    return turn.control - turn.gain @ (coordinates - turn.state)
+        return self.turn(curvature, speed, env).feedback(coordinates)
 
 
 def _corners(
@@ -113,13 +107,8 @@ def _corners(
     return (index + sides) @ strides, weights
 
 
-def law_to_arrays(law: PathLaw) -> dict[str, Array]:
-    """Return the law as a dictionary of arrays, for storage."""
-    return law._asdict()
-
-
 def law_from_arrays(arrays: Mapping[str, Any]) -> PathLaw:
-    """Return the law from a dictionary of arrays.
+    """Return the law from a dictionary of arrays, such as `law._asdict()`.
 
     Raises:
         KeyError: an array is missing.
@@ -190,19 +179,16 @@ def derive_path_law(
             f"got {low}, {high}, {counts}"
         )
     axes = [jnp.linspace(a, b, n) for a, b, n in zip(low, high, counts, strict=True)]
-    grid = jnp.stack(jnp.meshgrid(*axes[1:], indexing="ij"), axis=-1).reshape(
-        -1, len(axes) - 1
-    )
-    row = partial(
-        _row,
-        path_step(step),
-        accelerations=axes[0],
-        state_weights=weights_of(coordinates, lateral, heading, velocity),
-        curvature=curvature,
-        drive=drive,
-    )
+    grid = jnp.stack(jnp.meshgrid(*axes[1:], indexing="ij"), axis=-1)
+
+    def gain_of(slopes: Array, bend: Scalar) -> Array:
+        # `bend` is d steering / d curvature: what the steering is worth on this turn.
+        controls = jnp.stack([curvature / bend**2, jnp.asarray(drive)])
+        return riccati_gain(slopes, (lateral, heading, velocity), controls)
+
+    row = partial(_row, path_step(step), gain_of, coordinates, axes[0])
     # In batches: a vmap over the whole grid would hold all its Newton iterations.
-    tables = jax.lax.map(row, grid, batch_size=64)
+    tables = jax.lax.map(row, grid.reshape(-1, len(axes) - 1), batch_size=64)
     state, control, gain = (
         jnp.moveaxis(table, 0, 1).reshape(*counts, *table.shape[2:]) for table in tables
     )
@@ -212,25 +198,13 @@ def derive_path_law(
 
 def _row(
     step: PathStep,
-    condition: Array,
-    *,
+    gain_of: Callable[[Array, Scalar], Array],
+    size: int,
     accelerations: Array,
-    state_weights: Array,
-    curvature: float,
-    drive: float,
+    condition: Array,
 ) -> tuple[Array, Array, Array]:
-    """Steady states, controls and gains over all accelerations.
-
-    Args:
-        step: in path coordinates.
-        condition: v_ref and e.
-        accelerations: v_ref² κ, symmetric about 0.
-        state_weights: of the Riccati equation.
-        curvature: weight of the steering.
-        drive: weight of the second control.
-    """
-    points, size = accelerations.shape[0], state_weights.shape[0]
-    middle, curvatures = points // 2, accelerations / condition[0] ** 2
+    """Steady states, controls and gains over all v_ref² κ, at one (v_ref, e)."""
+    middle, curvatures = len(accelerations) // 2, accelerations / condition[0] ** 2
 
     def moved(kappa: Scalar) -> Callable[[Array], Array]:
         return lambda both: step(both[:size], both[size:], kappa, condition[1:])
@@ -240,7 +214,7 @@ def _row(
         start = known.at[LATERAL].set(0.0).at[PATH_SPEED].set(condition[0])
         found = steady_turn(moved(kappa), start, by_differences, steps=NEWTON)
         # Too fast for the friction: the turn of the next smaller curvature stays.
-        turn = jnp.where(found.is_steady(), found.both, known)
+        turn = jnp.where(found.steady, found.both, known)
         return turn, turn
 
     def outward(side: Scalar) -> Array:
@@ -251,16 +225,12 @@ def _row(
     left, right = jax.vmap(outward)(jnp.asarray([-1.0, 1.0]))
     # Driving straight is in both halves and counts once.
     turns = jnp.concatenate([left[:0:-1], right])
-    slopes = jnp.asarray(jnp.gradient(turns[:, -2], curvatures[1] - curvatures[0]))
+    bends = jnp.asarray(jnp.gradient(turns[:, -2], curvatures[1] - curvatures[0]))
     # A diverging slope would make the weight of the steering vanish.
-    slopes = jnp.clip(slopes, *(limit * slopes[middle] for limit in STEERING_SLOPES))
-    control_weights = jax.vmap(jnp.diag)(
-        jnp.stack([curvature / slopes**2, jnp.full(points, drive)], axis=1)
-    )
+    bends = jnp.clip(bends, *(limit * bends[middle] for limit in STEERING_SLOPES))
 
-    def gain(kappa: Scalar, turn: Array, weights: Array) -> Array:
-        _, linear = by_differences(moved(kappa), turn)
-        return riccati_gain(linear, state_weights, weights)
+    def gain(kappa: Scalar, turn: Array, bend: Scalar) -> Array:
+        return gain_of(by_differences(moved(kappa), turn)[1], bend)
 
-    gains = jax.vmap(gain)(curvatures, turns, control_weights)
+    gains = jax.vmap(gain)(curvatures, turns, bends)
     return turns[:, :-2], turns[:, -2:], gains

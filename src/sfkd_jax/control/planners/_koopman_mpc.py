@@ -12,11 +12,11 @@ from jax.scipy.linalg import cho_factor, cho_solve
 from jaxtyping import Array, Bool, Float
 
 from sfkd_jax.control._factory import factory
-from sfkd_jax.control.laws._path_errors import path_errors, reference_curvature
+from sfkd_jax.control.laws._feedback import path_errors
 from sfkd_jax.control.planners._plans import all_finite, clip_environment, shift
 from sfkd_jax.control.tasks._path_tracking import check_path
 from sfkd_jax.control.tasks._task import PlanningStart
-from sfkd_jax.geometry import between, compose
+from sfkd_jax.geometry import between, compose, reference_curvature
 from sfkd_jax.ranges import AtLeastTwo
 from sfkd_jax.types import (
     BODY,

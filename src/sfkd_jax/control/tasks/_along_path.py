@@ -6,16 +6,18 @@ is a `Preview`. `along_reference` turns it into one that sees poses in the world
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import KW_ONLY, dataclass
+from functools import cached_property
 from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
-from sfkd_jax.control.laws._model_law import SteadyTurn
-from sfkd_jax.control.laws._path_errors import PathErrors, curvature_between
-from sfkd_jax.control.laws._path_law import PathLaw, turn_control
+from sfkd_jax.control._factory import factory
+from sfkd_jax.control.laws._feedback import PathErrors
+from sfkd_jax.control.laws._path_law import PathLaw
+from sfkd_jax.control.laws._steady_turn import SteadyTurn
 from sfkd_jax.control.planners._plans import all_finite
 from sfkd_jax.control.tasks._path_tracking import Cost, StageInputs, check_path
 from sfkd_jax.control.tasks._task import (
@@ -32,14 +34,14 @@ from sfkd_jax.geometry import (
     LATERAL,
     PATH_SPEED,
     PathState,
-    between,
-    circle_errors,
+    curvature_ahead,
+    path_coordinates,
     path_state,
 )
+from sfkd_jax.ranges import Positive
 from sfkd_jax.rollout import fold
 from sfkd_jax.types import (
     BODY,
-    POSE,
     Control,
     Controller,
     ControllerInfo,
@@ -48,7 +50,6 @@ from sfkd_jax.types import (
     Model,
     Params,
     Reference,
-    Scalar,
     State,
 )
 
@@ -74,58 +75,44 @@ class AlongReferenceState(NamedTuple):
     observation: State
 
 
-def curvature_ahead(reference: Reference) -> Float[Array, " horizon"]:
-    """Return κ [1/m] over the step to each reference point.
-
-    The first step begins at the vehicle, where there is no reference point: its
-    curvature is extrapolated linearly from the next two.
-    """
-    turns = curvature_between(reference)
-    first = 2.0 * turns[0] - turns[min(1, turns.shape[0] - 1)]
-    return jnp.concatenate([first[None], turns])
-
-
-def path_coordinates(
-    state: State, point: Float[Array, " 4"], curvature: Scalar
-) -> PathState:
-    """Return ξ of a world state, relative to the circle through a reference point.
-
-    Args:
-        state: pose and body state.
-        point: x, y, yaw, speed of the reference.
-        curvature: of the circle [1/m].
-    """
-    lateral, heading = circle_errors(between(point[POSE], state[POSE]), curvature)
-    return jnp.concatenate([jnp.stack([lateral, heading]), state[BODY]])
-
-
-def along_reference(controller: Controller, *, coordinates: int) -> Controller:
-    """Return a controller in the world from one along a path.
+@dataclass(frozen=True, eq=False)
+class AlongReference:
+    """A controller in the world from one along a path.
 
     The only place where a state is projected, once per control step. Predicted states
     are mapped back beside the reference points.
 
-    Args:
-        controller: `act` takes ξ and a `Preview` in place of observation and reference.
+    Attributes:
+        inner: `act` takes ξ and a `Preview` in place of observation and reference.
         coordinates: size of ξ.
 
-    Returns:
-        A `Controller` of poses in the world; `info` gains `path_state` (ξ, NaN where
-        observation or reference are not finite) and `planned_path` (predicted ξ).
+    `info` gains `path_state` (ξ, NaN where observation or reference are not finite) and
+        `planned_path` (predicted ξ).
     """
 
-    def init(key: Key) -> AlongReferenceState:
+    inner: Controller
+    _: KW_ONLY
+    coordinates: int
+
+    def controller(self) -> Controller:
+        """Return the controller of poses in the world."""
+        return Controller(self.init, self.act)
+
+    def init(self, key: Key) -> AlongReferenceState:
+        """Return the state before the first control step."""
         # NaN equals nothing, so that the first observation is never a repetition.
-        unknown = jnp.full(coordinates + 1, jnp.nan, dtype=float)
-        return AlongReferenceState(controller.init(key), unknown)
+        unknown = jnp.full(self.coordinates + 1, jnp.nan, dtype=float)
+        return AlongReferenceState(self.inner.init(key), unknown)
 
     def act(
+        self,
         params: Params,
         state: AlongReferenceState,
         observation: State,
         env: Environment,
         reference: Reference,
     ) -> tuple[Control, AlongReferenceState, ControllerInfo]:
+        """Take one control step."""
         check_path(observation, env, reference, reference.shape[0])
         curvature = curvature_ahead(reference)
         xi = path_coordinates(observation, reference[0], curvature[0])
@@ -135,10 +122,8 @@ def along_reference(controller: Controller, *, coordinates: int) -> Controller:
         readable = all_finite(reference)
         road = jnp.where(readable, road, jnp.nan)
         xi = jnp.where(readable & all_finite(observation), xi, jnp.nan)
-        repeated = jnp.all(observation == state.observation)
-        control, inner, info = controller.act(
-            params, state.inner, xi, env, Preview(road, repeated)
-        )
+        preview = Preview(road, jnp.all(observation == state.observation))
+        control, inner, info = self.inner.act(params, state.inner, xi, env, preview)
         planned = info["predicted_states"]
         info = info.copy()
         info["path_state"], info["planned_path"] = xi, planned
@@ -148,7 +133,9 @@ def along_reference(controller: Controller, *, coordinates: int) -> Controller:
             info["sample_states"] = jax.vmap(samples)(info["sample_states"], reference)
         return control, AlongReferenceState(inner, observation), info
 
-    return Controller(init, act)
+
+along_reference = factory(AlongReference, AlongReference.controller)
+"""(controller along a path, coordinates=size of ξ) -> `Controller` in the world."""
 
 
 def _in_world(coordinates: PathState, point: Float[Array, " 4"]) -> State:
@@ -174,18 +161,9 @@ class AlongTarget(NamedTuple):
     turn: SteadyTurn
 
 
-def following_law(
-    model: Model,
-    cost: Cost,
-    law: PathLaw,
-    *,
-    dt: float,
-    control_low: tuple[float, ...],
-    control_high: tuple[float, ...],
-    control_rate: tuple[float, ...] | None = None,
-    terminal_weight: float = 1.0,
-) -> Task:
-    """Return the task of following a path with a model of the closed loop.
+@dataclass(frozen=True, eq=False)
+class FollowingLaw:
+    """The task of following a path with a model of the closed loop.
 
         ξ_{k+1} = F(ξ_k, (ν_k, κ_k, v_k); e),   u_k = limit(law(ξ_k; κ_k, v_k, e) + ν_k)
         J = Σ_k ℓ(ξ_{k+1}, u_k) + w_T ℓ(ξ_T, u_{T-1})
@@ -194,7 +172,7 @@ def following_law(
     along a path, see `along_reference`; its predicted states are ξ. |ν| stays within
     `law.perturbation`, as it did in the training data.
 
-    Args:
+    Attributes:
         model: of the closed loop, with `along_path`.
         cost: ℓ, see `tracking_cost`.
         law: the one that the model was learned around.
@@ -208,31 +186,41 @@ def following_law(
         ValueError: the model is not in path coordinates, or the limits are
             inconsistent, see `actuator_limits`.
     """
-    if not model.along_path:
-        raise ValueError(
-            "controller.sampling=law needs a model in path coordinates: "
-            "model.frame=path"
-        )
-    limit = actuator_limits(control_low, control_high, control_rate, dt)
-    low, high = (
-        jnp.asarray(control_low, dtype=float),
-        jnp.asarray(control_high, dtype=float),
-    )
-    following = _Following(model, cost, law, limit, low, high, terminal_weight)
-    return Task(low, high, cost.weights, following.prepare, following.step, _check)
-
-
-@dataclass(frozen=True)
-class _Following:
-    """The functions of `following_law`."""
 
     model: Model
     cost: Cost
     law: PathLaw
-    limit: Limiter
-    low: Control
-    high: Control
-    terminal_weight: float
+    _: KW_ONLY
+    dt: float
+    control_low: tuple[float, ...]
+    control_high: tuple[float, ...]
+    control_rate: tuple[Positive, ...] | None = None
+    terminal_weight: float = 1.0
+
+    def __post_init__(self) -> None:
+        if not self.model.along_path:
+            raise ValueError(
+                "controller.sampling=law needs a model in path coordinates: "
+                "model.frame=path"
+            )
+        _ = self.limit
+
+    def task(self) -> Task:
+        """Return the planning problem as functions."""
+        low, high = self.box()
+        return Task(low, high, self.cost.weights, self.prepare, self.step, _check)
+
+    def box(self) -> tuple[Control, Control]:
+        """Return the lower and upper control limits."""
+        low, high = self.control_low, self.control_high
+        return jnp.asarray(low, dtype=float), jnp.asarray(high, dtype=float)
+
+    @cached_property
+    def limit(self) -> Limiter:
+        """The projection onto the limits of the actuators."""
+        return actuator_limits(
+            self.control_low, self.control_high, self.control_rate, self.dt
+        )
 
     def prepare(
         self,
@@ -242,13 +230,13 @@ class _Following:
         preview: Preview,
         previous: PlanningStart,
     ) -> RolloutSetup:
-        """Evaluate fibre, encoder and law once per control step."""
+        """Return fibre, start, law and targets, evaluated once per control step."""
         fiber = self.model.fiber(fold(self.model, params), env)
         turns = jax.vmap(self.law.turn, in_axes=(0, 0, None))(
             preview.road[:, 0], preview.road[:, 1], env
         )
         first = jax.tree.map(lambda leaf: leaf[0], turns)
-        law_control = jnp.clip(turn_control(first, coordinates), self.low, self.high)
+        law_control = jnp.clip(first.feedback(coordinates), *self.box())
         # Before the first step no control was applied: slew limits count from the law.
         before = jnp.where(previous.known, previous.control, law_control)
         latent = self.model.encode(fiber, path_state(coordinates))
@@ -264,9 +252,9 @@ class _Following:
         target: AlongTarget,
         at: StepIndex,
     ) -> StepResult:
-        """One step of one rollout: law plus perturbation, limits, model, cost."""
+        """Return one step of one rollout: law, perturbation, limits, model, cost."""
         speed = target.road[1]
-        law_control = turn_control(target.turn, before.coordinates)
+        law_control = target.turn.feedback(before.coordinates)
         nu = jnp.clip(nu, -self.law.perturbation, self.law.perturbation)
         control = self.limit(law_control + nu, before.control)
         # What the limits left of ν: the model was learned on what really acted.
@@ -274,8 +262,10 @@ class _Following:
         inputs = jnp.concatenate([effective, target.road])
         latent = self.model.step(fiber, before.latent, inputs)
         coordinates = self.model.decode(fiber, latent)[BODY]
-        errors = _errors(coordinates, speed)
-        errors_before = _errors(before.coordinates, speed)
+        errors, errors_before = (
+            PathErrors(xi[LATERAL], xi[HEADING], xi[PATH_SPEED] - speed)
+            for xi in (coordinates, before.coordinates)
+        )
         stage = StageInputs(errors, errors_before, control, before.control, speed)
         cost = self.cost.stage(weights, stage)
         cost = cost * (1.0 + self.terminal_weight * at.last)
@@ -283,24 +273,16 @@ class _Following:
         return StepResult(sample, cost, control, effective, coordinates)
 
 
-def _errors(coordinates: PathState, speed: Scalar) -> PathErrors:
-    """Path coordinates as the errors that a stage cost takes."""
-    return PathErrors(
-        coordinates[LATERAL], coordinates[HEADING], coordinates[PATH_SPEED] - speed
-    )
+following_law = factory(FollowingLaw, FollowingLaw.task)
+"""(model, cost, law, settings of `FollowingLaw`) -> `Task`."""
 
 
 def _check(coordinates: Any, env: Any, preview: Any, horizon: int) -> None:
-    """Raise a ValueError that names an argument of the wrong shape."""
+    """Raise a ValueError if there is no preview of this horizon."""
     if not isinstance(preview, Preview):
         raise ValueError(
             "a planner along a path takes ξ and a `Preview`; "
             "`along_reference` makes them of poses in the world"
-        )
-    if coordinates.ndim != 1 or env.ndim not in (1, 2):
-        raise ValueError(
-            "ξ must have shape (coordinate,) and env (ne,), or (particle, ne), "
-            f"got {coordinates.shape} and {env.shape}"
         )
     if preview.road.shape != (horizon, 2):
         raise ValueError(

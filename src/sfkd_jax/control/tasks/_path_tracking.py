@@ -12,13 +12,13 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from sfkd_jax.control._factory import factory
-from sfkd_jax.control.laws._model_law import ModelLaw, SteadyTurn
-from sfkd_jax.control.laws._path_errors import (
+from sfkd_jax.control.laws._feedback import (
     FeedbackLaw,
+    ModelLaw,
     PathErrors,
     path_errors,
-    reference_curvature,
 )
+from sfkd_jax.control.laws._steady_turn import SteadyTurn
 from sfkd_jax.control.tasks._task import (
     Actuator,
     Environments,
@@ -30,6 +30,7 @@ from sfkd_jax.control.tasks._task import (
     Task,
     actuator_limits,
 )
+from sfkd_jax.geometry import reference_curvature
 from sfkd_jax.ranges import Positive
 from sfkd_jax.rollout import fold
 from sfkd_jax.types import (

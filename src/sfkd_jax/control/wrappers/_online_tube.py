@@ -10,8 +10,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
 from sfkd_jax.control.planners._plans import all_finite
-from sfkd_jax.control.tasks._along_path import curvature_ahead
-from sfkd_jax.geometry import LATERAL, between, compose, wrap_angle
+from sfkd_jax.geometry import LATERAL, between, compose, curvature_ahead, wrap_angle
 from sfkd_jax.ranges import Fraction, Positive
 from sfkd_jax.types import (
     POSE,

@@ -1,0 +1,211 @@
+"""Feedback laws on the errors from a reference path: by hand, or from a model."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import NamedTuple, TypeAlias
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+from sfkd_jax.control.laws._steady_turn import (
+    Linearised,
+    SteadyTurn,
+    by_differentiation,
+    riccati_gain,
+    steady_turn,
+)
+from sfkd_jax.geometry import path_step, wrap_angle
+from sfkd_jax.ranges import Positive
+from sfkd_jax.types import BODY, Control, Fiber, Model, Reference, Scalar, State
+
+NEWTON = 4
+"""Newton steps to a steady turn from straight driving. For the benchmark's vehicles
+that reaches the accuracy of float32.
+"""
+
+
+class PathErrors(NamedTuple):
+    """Errors of a state relative to one reference point.
+
+    Attributes:
+        lateral: distance left of the path [m].
+        heading: yaw relative to the path [rad].
+        speed: relative to the reference [m/s].
+    """
+
+    lateral: Scalar
+    heading: Scalar
+    speed: Scalar
+
+
+FeedbackLaw: TypeAlias = Callable[[PathErrors, Scalar, Scalar], Control]
+"""(path errors, curvature [1/m], reference speed [m/s]) -> control."""
+
+
+def path_errors(
+    state: State, point: Float[Array, " 4"], curvature: Scalar
+) -> PathErrors:
+    """Return the errors relative to the circle that touches the path at `point`.
+
+    They are exact to second order in the distance along the circle, and cheaper than
+    `geometry.circle_errors`: a planner needs them thousands of times a step.
+
+    Args:
+        state: p_x, p_y, yaw, v, ….
+        point: x, y, yaw, speed of the reference.
+        curvature: of the path at `point` [1/m].
+    """
+    dx, dy = state[0] - point[0], state[1] - point[1]
+    c, s = jnp.cos(point[2]), jnp.sin(point[2])
+    along = c * dx + s * dy
+    # The path bends away from its tangent by κ/2 · along².
+    lateral = c * dy - s * dx - 0.5 * curvature * along**2
+    heading = wrap_angle(state[2] - point[2] - curvature * along)
+    return PathErrors(lateral, heading, state[3] - point[3])
+
+
+def path_feedback(
+    *,
+    wheelbase: float,
+    lateral_gain: float = 0.03,
+    heading_gain: float = 0.4,
+    speed_gain: float = 1.0,
+    speed_loop: bool = False,
+) -> FeedbackLaw:
+    """Return the path-following law u = u_ff(κ) + K ξ.
+
+        δ = atan(L κ) − k_y e_y − k_ψ e_ψ
+        a = −k_v e_v,   or the speed command v_ref − k_v e_v
+
+    Args:
+        wheelbase: L [m].
+        lateral_gain: k_y [rad/m].
+        heading_gain: k_ψ [-].
+        speed_gain: k_v [1/s], or [-] with a speed loop.
+        speed_loop: whether the second control is a speed command.
+    """
+
+    def law(errors: PathErrors, curvature: Scalar, speed: Scalar) -> Control:
+        # Feed-forward of the bicycle without slip; feedback makes up for the rest.
+        steering = (
+            jnp.arctan(wheelbase * curvature)
+            - lateral_gain * errors.lateral
+            - heading_gain * errors.heading
+        )
+        correction = -speed_gain * errors.speed
+        return jnp.stack([steering, correction + speed if speed_loop else correction])
+
+    return law
+
+
+def no_feedback(*, speed_loop: bool = False) -> FeedbackLaw:
+    """Return the law u = 0, or the reference speed: sampling without feedback."""
+
+    def law(errors: PathErrors, curvature: Scalar, speed: Scalar) -> Control:
+        del errors, curvature
+        zero = jnp.zeros_like(speed)
+        return jnp.stack([zero, speed if speed_loop else zero])
+
+    return law
+
+
+class ModelLaw(NamedTuple):
+    """A feedback law around the steady turns of a model, with its Riccati gains.
+
+        u = u*(κ, v, e) − K(e) (ξ − ξ*(κ, v, e)),   ξ* = F(ξ*, u*; κ, e)
+
+    F is one step of the model in coordinates along a circle of curvature κ. ξ* has no
+    lateral error and the reference speed; K solves the Riccati equation of F linearised
+    there, with the weights below. In side wind ξ* crabs, on a slippery road u* steers
+    more: what the model knows of e becomes feed-forward, and a planner samples only the
+    rest. If Newton's method does not converge (the circle is too fast for the
+    friction), the law is that of straight driving, gain included.
+
+    Attributes:
+        lateral: weight in the Riccati equation [1/m²].
+        heading: weight [1/rad²].
+        speed: weight [s²/m²]; the weights of further body states are zero.
+        steering: weight [1/rad²].
+        drive: weight, per control unit².
+    """
+
+    lateral: float = 1.0
+    heading: float = 1.0
+    speed: float = 1.0
+    steering: Positive = 20.0
+    drive: Positive = 0.5
+
+    def prepare(
+        self,
+        model: Model,
+        fiber: Fiber,
+        like: State,
+        reference: Reference,
+        curvature: Array,
+    ) -> SteadyTurn:
+        """Return the steady turns at every point of a reference.
+
+        Args:
+            model: any model of world states.
+            fiber: of the environment.
+            like: a state, for its size.
+            reference: x, y, yaw, speed of each step.
+            curvature: of the path at each point [1/m].
+        """
+        size = like.shape[0] - 1
+
+        def step(state: State, control: Control, fiber: Fiber) -> State:
+            latent = model.step(fiber, model.encode(fiber, state), control)
+            return model.decode(fiber, latent)
+
+        along = path_step(step)
+
+        def turn(kappa: Scalar, speed: Scalar) -> Linearised:
+            return steady_turn(
+                lambda both: along(both[:size], both[size:], kappa, fiber),
+                # Newton starts from straight driving at the reference speed.
+                jnp.zeros(size + 2).at[2].set(speed),
+                by_differentiation,
+                steps=NEWTON,
+            )
+
+        both = jax.vmap(jax.vmap(turn), in_axes=(0, None))(
+            # Straight driving in the same batch: what is chosen where a turn fails.
+            jnp.stack([curvature, 0.0 * curvature]),
+            reference[:, 3],
+        )
+        # A circle that the tyres cannot hold has no steady turn: drive straight.
+        valid = both.steady[0]
+        chosen = jax.tree.map(lambda part: jax.vmap(jnp.where)(valid, *part), both)
+        # One gain, of the first step: it varies little over a horizon, and the Riccati
+        # recursion is the most expensive part.
+        gain = riccati_gain(
+            chosen.slopes[0],
+            (self.lateral, self.heading, self.speed),
+            jnp.asarray([self.steering, self.drive]),
+        )
+        state, control = jnp.split(chosen.both, [size], axis=1)
+        return SteadyTurn(
+            state, control, jnp.broadcast_to(gain, (*control.shape, size))
+        )
+
+    def control(
+        self,
+        turn: SteadyTurn,
+        state: State,
+        point: Float[Array, " 4"],
+        curvature: Scalar,
+    ) -> Control:
+        """Return the control at one step of the reference.
+
+        Args:
+            turn: steady turn of the step.
+            state: in the world.
+            point: x, y, yaw, speed of the reference.
+            curvature: of the path at `point` [1/m].
+        """
+        errors = path_errors(state, point, curvature)
+        pose = jnp.stack([errors.lateral, errors.heading])
+        return turn.feedback(jnp.concatenate([pose, state[BODY]]))
