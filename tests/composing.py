@@ -4,14 +4,14 @@ from functools import cache
 
 from hydra import compose, initialize_config_dir
 
-from sfkd_jax.experiment import command
+from sfkd_jax.experiment import command, options
 from sfkd_jax.settings import plain
 
 
 @cache
 def composed(*overrides):
     """The configuration before it is checked."""
-    command.register()
+    options.register()
     with initialize_config_dir(command.conf_path(), version_base="1.3"):
         return compose("config", overrides=list(overrides))
 

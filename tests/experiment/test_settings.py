@@ -34,7 +34,7 @@ def other(*, low: Bounds = (), high: Bounds = (), gain: int = 7):
 
 
 def test_a_schema_has_the_keyword_arguments_and_the_first_factory_defines_a_name():
-    kind = schema("Kind", None, factory, other, skip=("size",))
+    kind = schema("Kind", object, factory, other, skip=("size",))
     made = parse(kind, {"gain": 2.0, "span": [1, 4]})
     assert plain(made) == {"gain": 2.0, "span": [1, 4], "low": [], "high": []}
     assert made.span == (1, 4)
@@ -59,7 +59,7 @@ def test_a_schema_has_the_keyword_arguments_and_the_first_factory_defines_a_name
         ({"gain": 1.0, "size": 2.5}, "of.size must be a whole number"),
         ({"gain": 1.0, "sise": 2}, "unknown setting of.sise; did you mean of.size?"),
         ({"gain": 1.0, "low": [2.0], "high": [1.0]}, "of.low must not lie above"),
-        ({"gain": 1.0, "low": [2.0]}, "of.low must not|of.low and"),
+        ({"gain": 1.0, "low": [2.0]}, "of.low must not"),
         ([], "of must be settings by name"),
     ],
 )
@@ -67,7 +67,7 @@ def test_the_line_says_what_a_setting_must_be_and_what_it_is(values, says):
     if isinstance(values, dict) and values.keys() == {"gain", "low"}:
         values = values | {"high": [3.0, 4.0]}
     with pytest.raises(ValueError, match=says) as refused:
-        parse(schema("Kind", None, factory, other), values, "of.")
+        parse(schema("Kind", object, factory, other), values, "of.")
     assert "\n" not in str(refused.value)
 
 

@@ -3,34 +3,316 @@
 Every function takes an object of settings, or plain values that are parsed into one.
 """
 
+from __future__ import annotations
+
+import inspect
+import sys
+from collections.abc import Callable, Mapping, Sequence
+from functools import partial
+from typing import Annotated, Any, NamedTuple
+
+import jax.numpy as jnp
+
+from sfkd_jax import control, models, plants, scenarios
 from sfkd_jax.build._controllers import CONTROLLER_SETTINGS as CONTROLLER_SETTINGS
 from sfkd_jax.build._controllers import ENV_SOURCES as ENV_SOURCES
 from sfkd_jax.build._controllers import PLANNERS as PLANNERS
 from sfkd_jax.build._controllers import ControllerSettings as ControllerSettings
 from sfkd_jax.build._controllers import Planner as Planner
-from sfkd_jax.build._controllers import SearchSettings as SearchSettings
 from sfkd_jax.build._controllers import build_controller as build_controller
 from sfkd_jax.build._controllers import controller_horizon as controller_horizon
 from sfkd_jax.build._controllers import in_corridor as in_corridor
-from sfkd_jax.build._plants import INNER_LOOPS as INNER_LOOPS
-from sfkd_jax.build._plants import MODEL_SETTINGS as MODEL_SETTINGS
-from sfkd_jax.build._plants import MODELS as MODELS
-from sfkd_jax.build._plants import PLANTS as PLANTS
-from sfkd_jax.build._plants import SCENARIO as SCENARIO
-from sfkd_jax.build._plants import VEHICLES as VEHICLES
-from sfkd_jax.build._plants import Directory as Directory
-from sfkd_jax.build._plants import LawSettings as LawSettings
-from sfkd_jax.build._plants import ModelSettings as ModelSettings
-from sfkd_jax.build._plants import ScenarioSettings as ScenarioSettings
-from sfkd_jax.build._plants import System as System
-from sfkd_jax.build._plants import VehicleSettings as VehicleSettings
-from sfkd_jax.build._plants import build_driver as build_driver
-from sfkd_jax.build._plants import build_law as build_law
-from sfkd_jax.build._plants import build_loop as build_loop
-from sfkd_jax.build._plants import build_model as build_model
-from sfkd_jax.build._plants import build_scenario as build_scenario
-from sfkd_jax.build._plants import build_vehicle as build_vehicle
-from sfkd_jax.build._plants import check_imported as check_imported
-from sfkd_jax.build._plants import reference_systems as reference_systems
-from sfkd_jax.build._plants import space_from_settings as space_from_settings
-from sfkd_jax.build._plants import space_to_settings as space_to_settings
+from sfkd_jax.data import Driver
+from sfkd_jax.ranges import Positive
+from sfkd_jax.settings import (
+    BelowRoot,
+    OneOf,
+    Values,
+    arguments,
+    choose,
+    parse,
+    schema,
+    takes,
+)
+from sfkd_jax.types import (
+    Control,
+    Environment,
+    Model,
+    Reference,
+    Space,
+    State,
+)
+
+PLANTS = {
+    "kinematic": plants.kinematic,
+    "kinematic_stiff": plants.kinematic_stiff,
+    "dynamic": plants.dynamic,
+    "own": plants.own,
+}
+MODELS = models.FACTORIES | {"own": models.own}
+"""Models of settings: those of the package, and one from outside by name."""
+Directory = Annotated[str, BelowRoot()]
+
+
+@takes()
+class VehicleSettings:
+    """A vehicle with its inner loop; the other fields are arguments of its factory."""
+
+    name: str
+    dt: Positive = 0.1
+    inner_loop: Annotated[str, OneOf(("none", "speed"))] = "none"
+    speed_gain: Positive = 1.0
+
+    @classmethod
+    def kind_of(cls, values: Values) -> type[VehicleSettings]:
+        """Return the dataclass of the vehicle of this name."""
+        return choose(VEHICLES, values.get("name"), "vehicle")
+
+
+@takes()
+class OwnVehicleSettings(VehicleSettings):
+    """An own vehicle, with its step as package.module:function."""
+
+    step: str | None = None
+
+
+VEHICLES = {
+    name: schema(
+        "Vehicle",
+        OwnVehicleSettings if name == "own" else VehicleSettings,
+        plant,
+        skip=("stiffness_by_friction",),
+    )
+    for name, plant in PLANTS.items()
+}
+
+
+def build_vehicle(settings: VehicleSettings | Values) -> plants.Vehicle:
+    """Return the vehicle of the settings, with its inner loop.
+
+    Raises:
+        ValueError: a setting out of its range, or a step that does not exist.
+    """
+    settings = parse(VehicleSettings, settings, "vehicle.")
+    factory: Callable[..., plants.Vehicle] = PLANTS[settings.name]
+    options = arguments(settings, factory)
+    if options.get("step") is not None:
+        options["step"] = plants.step_named(options["step"])
+    plant = factory(**options)
+    # Only the speed loop changes what the second control means.
+    return (
+        plants.with_speed_loop(plant, gain=settings.speed_gain)
+        if settings.inner_loop == "speed"
+        else plant
+    )
+
+
+@takes(scenarios.scenario, skip=("state_size", "dt", "duration"))
+class ScenarioSettings:
+    """Friction, wind and road, as arguments of `scenario`."""
+
+    name: str
+
+
+def build_scenario(
+    settings: ScenarioSettings | Values, plant: plants.Vehicle, *, duration: float
+) -> scenarios.Family:
+    """Return the scenario family of the settings.
+
+    Args:
+        settings: the name of the family and its arguments.
+        plant: the vehicle that will drive.
+        duration: of an episode [s].
+    """
+    settings = parse(ScenarioSettings, settings, "scenario.")
+    return scenarios.scenario(
+        **arguments(settings, scenarios.scenario),
+        duration=duration,
+        state_size=len(plant.state_names),
+        dt=plant.dt,
+    )
+
+
+@takes()
+class ModelSettings:
+    """A model; the other fields are arguments of its factory.
+
+    Attributes:
+        name: of the factory.
+        system: name of its runs and rows.
+        environment: whether the model reads e.
+    """
+
+    name: str
+    system: Directory
+    environment: bool = True
+
+    @classmethod
+    def kind_of(cls, values: Values) -> type[ModelSettings]:
+        """Return the dataclass of the model of this name."""
+        return choose(MODEL_SETTINGS, values.get("name"), "model")
+
+
+MODEL_SETTINGS = {
+    name: schema("Model", ModelSettings, factory, skip=("dt", "nominal"))
+    for name, factory in MODELS.items()
+}
+
+
+def build_model(
+    settings: ModelSettings | Values, space: Space, plant: plants.Vehicle
+) -> Model:
+    """Return the model of the settings.
+
+    Models with prior knowledge take it from the vehicle: the sampling period and the
+    derivative of the nominal bicycle.
+
+    Args:
+        settings: the name of the factory and its arguments.
+        space: scales of states, controls and environments.
+        plant: the vehicle to be modelled.
+
+    Raises:
+        ValueError: an unknown model, or arguments that its factory refuses.
+    """
+    settings = parse(ModelSettings, settings, "model.")
+    factory = MODELS[settings.name]
+    known = {"dt": plant.dt, "nominal": plant.nominal_derivative}
+    # By signature: a factory takes what prior knowledge it names, and no more.
+    taken = inspect.signature(factory).parameters
+    prior = {name: value for name, value in known.items() if name in taken}
+    return factory(space, **prior, **arguments(settings, factory))
+
+
+def check_imported(settings: Any) -> None:
+    """Check that the code that stored settings name was imported by the caller.
+
+    Modules of the standard library are imported by anybody, and no models.
+
+    Raises:
+        ValueError: `model.factory` is of a module that is not imported, or of Python.
+    """
+    model = settings.get("model") if isinstance(settings, Mapping) else None
+    factory = model.get("factory") if isinstance(model, Mapping) else None
+    module = str(factory).partition(":")[0]
+    if factory is None:
+        return
+    # A stored name must not reach os.system: Python's own modules are always loaded.
+    if module.partition(".")[0] in sys.stdlib_module_names:
+        raise ValueError(f"its model is {factory}, which is no model but Python's own")
+    if module not in sys.modules:
+        raise ValueError(
+            f"its model is {factory}: import {module} first, if you trust it"
+        )
+
+
+def space_to_settings(space: Space) -> dict[str, list[float]]:
+    """Return scales as plain lists, for a manifest."""
+    return {
+        name: [float(entry) for entry in value]
+        for name, value in space._asdict().items()
+    }
+
+
+def space_from_settings(settings: Values) -> Space:
+    """Return the scales that a manifest holds."""
+    # JSON has decimals: as float32 they are the bits that the model was trained with.
+    arrays = (jnp.asarray(settings[name], dtype="float32") for name in Space._fields)
+    return Space(*arrays)
+
+
+def build_driver(plant: plants.Vehicle) -> Driver:
+    """Return the path-following law that drives while data are collected."""
+    law = control.path_feedback(wheelbase=plant.wheelbase, speed_loop=plant.speed_loop)
+
+    def driver(state: State, reference: Reference) -> Control:
+        curvature = control.reference_curvature(reference)[0]
+        errors = control.path_errors(state, reference[0], curvature)
+        return law(errors, curvature, reference[0, 3])
+
+    return driver
+
+
+@takes(control.derive_path_law, skip=("coordinates", "env_low", "env_high"))
+class LawSettings:
+    """The law of path coordinates, as arguments of `derive_path_law`."""
+
+
+def build_law(
+    settings: LawSettings | Values,
+    plant: plants.Vehicle,
+    *,
+    env_low: Sequence[float],
+    env_high: Sequence[float],
+) -> control.PathLaw:
+    """Derive the law of path coordinates from the vehicle's step, for e in E."""
+    settings = parse(LawSettings, settings, "dataset.law.")
+    return control.derive_path_law(
+        plant.step,
+        coordinates=len(plant.state_names) - 1,
+        env_low=tuple(map(float, env_low)),
+        env_high=tuple(map(float, env_high)),
+        **arguments(settings, control.derive_path_law),
+    )
+
+
+def build_loop(plant: plants.Vehicle, law: control.PathLaw) -> plants.Vehicle:
+    """Return the closed loop of plant and law, in the coordinates of `path_frame`."""
+    steering, drive = (float(largest) for largest in law.perturbation)
+    return plants.along_path(plant, law, perturbation=(steering, drive))
+
+
+class System(NamedTuple):
+    """A system that is evaluated: a row of a table.
+
+    Attributes:
+        model: that the controller predicts with.
+        params: of the model.
+        env_source: where its environment comes from, see `ENV_SOURCES`.
+        certificate: verified, or None.
+        law: that a model in path coordinates was learned around, or None.
+    """
+
+    model: Model
+    params: Any
+    env_source: str
+    certificate: Mapping[str, Any] | None = None
+    law: control.PathLaw | None = None
+
+
+def reference_systems(
+    plant: plants.Vehicle, law: control.PathLaw | None = None
+) -> dict[str, System]:
+    """Return the systems that need no learning, by name.
+
+    "nominal" predicts with the bicycle, "oracle" with the true plant, and "oracle_…"
+    with the true plant under a wrong environment. With a law they describe its closed
+    loop, in path coordinates; "law" is then the oracle once more, for a planner without
+    samples (`num_samples=1`), so that the law drives alone.
+
+    Args:
+        plant: the true vehicle.
+        law: of path coordinates, or None.
+    """
+
+    def biased(entry: int, factor: float) -> Callable[[Environment], Environment]:
+        return lambda env: env.at[entry].multiply(factor)
+
+    along = law is not None
+    plant = plant if law is None else build_loop(plant, law)
+    oracle = partial(models.physics, plant.step, along_path=along)
+    rows = {
+        "nominal": System(models.physics(plant.nominal, along_path=along), {}, "none"),
+        "oracle": System(oracle(), {}, "measured"),
+    }
+    if along:
+        rows["law"] = rows["oracle"]
+    distortions = {
+        "friction_x0.7": (0, 0.7),
+        "friction_x1.3": (0, 1.3),
+        "wind_x0": (1, 0.0),
+        "wind_x2": (1, 2.0),
+    }
+    for name, change in distortions.items():
+        rows[f"oracle_{name}"] = System(oracle(distort=biased(*change)), {}, "measured")
+    return {name: row._replace(law=law) for name, row in rows.items()}

@@ -3,13 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
 from typing import Any, NamedTuple
 
 from sfkd_jax import control, plants
 from sfkd_jax.geometry import LATERAL
 from sfkd_jax.rollout import with_offset
-from sfkd_jax.settings import Kinds, Values, arguments, choose, parse, schema
+from sfkd_jax.settings import Values, arguments, choose, parse, schema, takes
 from sfkd_jax.types import Controller, Model
 
 ENV_SOURCES = ("measured", "estimated", "none")
@@ -20,6 +19,8 @@ computed from its points.
 """
 ALLOWANCE = 3.0
 """Standard deviations of a measured position by which the tube is enlarged."""
+Corner = Sequence[float] | None
+"""Lower or upper ends of the environment box E, if they are known."""
 
 
 class Planner(NamedTuple):
@@ -27,52 +28,34 @@ class Planner(NamedTuple):
 
     Attributes:
         factory: its keyword-only arguments are the settings `controller.NAME`.
-        given: of these arguments, those that are decided elsewhere.
         samples: whether it searches around a law (`controller.sampling`).
     """
 
     factory: Callable[..., Controller]
-    given: tuple[str, ...] = ()
     samples: bool = True
 
 
-_COST = (
-    "lateral",
-    "course",
-    "speed",
-    "steering_rate",
-    "effort",
-    "terminal_weight",
-)
-"""Of the cost, which all planners share."""
 PLANNERS = {
     "mppi": Planner(control.mppi),
     "cem": Planner(control.cem),
     "gradient": Planner(control.gradient_planner),
-    "koopman_mpc": Planner(control.koopman_mpc, given=_COST, samples=False),
+    "koopman_mpc": Planner(control.koopman_mpc, samples=False),
 }
 """Planners by the name under which a controller's settings hold their own. A new one is
 an entry here and a file in `conf/controller`.
 """
-_IN_PROGRAMS = ("several", "info_level", "sharding", "unroll")
-"""Arguments of planners for programs that build their own."""
-_BY_PLANT = (
-    "dt",
-    "wheelbase",
-    "speed_loop",
-    "control_low",
-    "control_high",
-    "env_low",
-    "env_high",
-    "actuator",
+_DECIDED = (
+    *("dt", "wheelbase", "speed_loop", "control_low", "control_high", "actuator"),
+    *("env_low", "env_high", "estimate_env", "inner", "model", "law", "ancillary"),
+    *("several", "info_level", "sharding", "unroll"),
 )
-"""Arguments of controllers that the vehicle and the environment decide."""
-_CHANNELS = {"noise_std": 2, "control_rate": 2}
-"""One entry for each of the two controls."""
+"""Arguments of controllers that vehicle, environment and model decide, and those for
+programs that build their own.
+"""
 
 
-@dataclass(frozen=True, kw_only=True)
-class ControllerSettings(Kinds):
+@takes()
+class ControllerSettings:
     """A planner under a cost.
 
     Attributes:
@@ -91,7 +74,7 @@ class ControllerSettings(Kinds):
     task: Any = None
 
     @classmethod
-    def kind_of(cls, values: Values) -> type:
+    def kind_of(cls, values: Values) -> type[ControllerSettings]:
         """Return the dataclass of the planner of this name."""
         name = values.get("planner", "mppi")
         kind = choose(CONTROLLER_SETTINGS, name, "controller.planner")
@@ -114,7 +97,7 @@ class ControllerSettings(Kinds):
         return self.own.horizon
 
 
-@dataclass(frozen=True, kw_only=True)
+@takes()
 class SearchSettings(ControllerSettings):
     """A planner that searches around a law, and what is built around it.
 
@@ -133,38 +116,37 @@ class SearchSettings(ControllerSettings):
     online_tube: Any = None
 
 
-def _controller_schema(name: str, planner: Planner) -> type:
+def _controller_schema(name: str, planner: Planner) -> type[ControllerSettings]:
     """One dataclass a planner: its own settings, and those of what is around it."""
-    skip, given = (*_BY_PLANT, *_IN_PROGRAMS, *planner.given), _BY_PLANT
-    parts: dict[str, Any] = {
-        name: schema("Planner", None, planner.factory, skip=skip, entries=_CHANNELS),
-        "cost": schema("Cost", None, control.tracking_cost, skip=given),
+    factories: dict[str, Callable[..., Any]] = {
+        "cost": control.tracking_cost,
+        "task": control.path_tracking,
     }
+    base = ControllerSettings
     # A quadratic program has no rate limits and no latent states in its task.
-    unused = () if planner.samples else ("control_rate", "latent_weight")
-    parts["task"] = schema(
-        "Task",
-        None,
-        control.path_tracking,
-        skip=(*given, "ancillary", *unused),
-        entries=_CHANNELS,
-    )
-    if not planner.samples:
-        return schema("Controller", ControllerSettings, **parts)
-    wrappers = {
-        "feedback": (control.path_feedback, ()),
-        "model_law": (control.ModelLaw, ()),
-        "adaptation": (control.Adaptation, ("inner", "model", "law", "estimate_env")),
-        "online_tube": (control.OnlineTube, ("inner", "horizon")),
+    skip = (*_DECIDED, "control_rate", "latent_weight")
+    if planner.samples:
+        base, skip = SearchSettings, _DECIDED
+        factories |= {
+            "feedback": control.path_feedback,
+            "model_law": control.ModelLaw,
+            "adaptation": control.Adaptation,
+            "online_tube": control.OnlineTube,
+        }
+    parts: dict[str, Any] = {
+        part: schema(part.title(), object, factory, skip=(*skip, "horizon"))
+        for part, factory in factories.items()
     }
-    parts |= {
-        part: schema(part.title(), None, factory, skip=(*given, *decided))
-        for part, (factory, decided) in wrappers.items()
+    # What cost and task state is not stated by the planner once more.
+    shared = {
+        *arguments(parts["cost"], control.tracking_cost),
+        *arguments(parts["task"], control.path_tracking),
     }
-    return schema("Controller", SearchSettings, **parts)
+    own = schema("Planner", object, planner.factory, skip=(*_DECIDED, *shared))
+    return schema("Controller", base, **{name: own}, **parts)
 
 
-CONTROLLER_SETTINGS: dict[str, type] = {
+CONTROLLER_SETTINGS = {
     name: _controller_schema(name, planner) for name, planner in PLANNERS.items()
 }
 
@@ -179,8 +161,8 @@ def build_controller(
     model: Model,
     plant: plants.Vehicle,
     *,
-    env_low: Sequence[float] | None = None,
-    env_high: Sequence[float] | None = None,
+    env_low: Corner = None,
+    env_high: Corner = None,
     certificate: Mapping[str, Any] | None = None,
     env_source: str = "measured",
     law: control.PathLaw | None = None,
@@ -214,103 +196,104 @@ def build_controller(
             "a controller needs vehicle.control_low and vehicle.control_high, "
             "as in [-0.4,-3.0]"
         )
+    limits = {"control_low": plant.control_low, "control_high": plant.control_high}
     box = {
         "env_low": None if env_low is None else tuple(map(float, env_low)),
         "env_high": None if env_high is None else tuple(map(float, env_high)),
     }
+    # Whoever estimates e learns the unmeasured forces with the same filter.
+    estimates = env_source == "estimated"
     # A quadratic program samples nothing: no law, shield or adaptation around it.
     searches = settings if isinstance(settings, SearchSettings) else None
-    adaptive |= searches is not None and searches.adaptive
-    if model.along_path:
-        if searches is None or searches.sampling != "law" or law is None:
-            raise ValueError(
-                "a model in path coordinates needs controller.sampling=law and its law"
-            )
-        # Whoever estimates e learns the unmeasured forces with the same filter.
-        estimates = env_source == "estimated"
-        adaptive |= estimates
-        # The planner sees the offset; the estimator needs the model as it was learned.
-        planned = with_offset(model) if adaptive else model
-        along = _along(searches, planned, plant, box, law, certificate)
+    adaptive |= estimates or (searches is not None and searches.adaptive)
+    if not model.along_path:
         if adaptive:
-            along = _adaptive(searches, along, model, plant, box, law, estimates)
-        size = law.gain.shape[-1]
-        # Here and nowhere else observation and reference become ξ and preview.
-        controller = control.along_reference(along, coordinates=size)
-        if not adaptive:
-            return controller
-        options = arguments(searches.online_tube, control.OnlineTube)
-        tube = control.OnlineTube(inner=controller, horizon=searches.horizon, **options)
-        return tube.controller()
-    if env_source == "estimated":
+            raise ValueError(
+                "adaptation and environment.source=estimated need a model "
+                "in path coordinates: model.frame=path"
+            )
+        task = None if searches is None else _task(searches, model, plant)
+        return _planner(settings, task, model, plant, box)
+    if searches is None or searches.sampling != "law" or law is None:
         raise ValueError(
-            "environment.source=estimated needs a model in path coordinates: "
-            "model.frame=path"
+            "a model in path coordinates needs controller.sampling=law and its law"
         )
+    # The planner sees the offset; the estimator needs the model as it was learned.
+    planned = with_offset(model) if adaptive else model
+    task = control.following_law(
+        planned,
+        _cost(settings, plant),
+        law,
+        dt=plant.dt,
+        **limits,
+        **arguments(settings.task, control.following_law),
+    )
+    along = _planner(settings, task, planned, plant, box)
+    # A shield needs a certified corridor; without one the planner drives alone.
+    if certificate and certificate.get("corridor") and searches.shield:
+        along = in_corridor(along, planned, plant, law, certificate)
     if adaptive:
-        raise ValueError("adaptation needs a model in path coordinates")
-    if searches is None:
-        return _koopman_mpc(settings, model, plant, box)
-    return _searching(searches, model, plant, box, None)
+        # The filter relates forces to the largest one in E, which the box defines.
+        if None in box.values():
+            raise ValueError("adaptation needs environment.low and environment.high")
+        around: Any = {"inner": along, "model": model, "law": law, **limits, **box}
+        options = arguments(searches.adaptation, control.Adaptation)
+        adaptation = control.Adaptation(**around, estimate_env=estimates, **options)
+        along = adaptation.controller()
+    # Here and nowhere else observation and reference become ξ and preview.
+    controller = control.along_reference(along, coordinates=law.gain.shape[-1])
+    if not adaptive:
+        return controller
+    options = arguments(searches.online_tube, control.OnlineTube)
+    tube = control.OnlineTube(inner=controller, horizon=searches.horizon, **options)
+    return tube.controller()
 
 
-def _searching(
-    settings: SearchSettings,
-    model: Model,
-    plant: plants.Vehicle,
-    box: Mapping[str, Any],
-    law: control.PathLaw | None,
-) -> Controller:
-    """Return a planner that searches around a feedback law.
-
-    The law is the path-following one (`sampling: feedback`), that of the model
-    (`sampling: model`) or none (`sampling: plain`). In path coordinates it is the law
-    of the policy, which the model contains (`sampling: law`).
-    """
-    cost = control.tracking_cost(
+def _cost(settings: ControllerSettings, plant: plants.Vehicle) -> control.Cost:
+    return control.tracking_cost(
         dt=plant.dt,
         speed_loop=plant.speed_loop,
         **arguments(settings.cost, control.tracking_cost),
     )
-    limits = {
-        "dt": plant.dt,
-        "control_low": plant.control_low,
-        "control_high": plant.control_high,
-    }
-    if law is not None:
-        options = arguments(settings.task, control.following_law)
-        task = control.following_law(model, cost, law, **limits, **options)
-    else:
-        model_law = control.ModelLaw(**arguments(settings.model_law, control.ModelLaw))
-        laws = {
-            "feedback": control.path_feedback(
-                wheelbase=plant.wheelbase,
-                speed_loop=plant.speed_loop,
-                **arguments(settings.feedback, control.path_feedback),
-            ),
-            "model": model_law,
-            "plain": control.no_feedback(speed_loop=plant.speed_loop),
-        }
-        task = control.path_tracking(
-            model,
-            cost,
-            choose(laws, settings.sampling, "controller.sampling"),
-            **limits,
-            ancillary=model_law if settings.ancillary else None,
-            **arguments(settings.task, control.path_tracking),
-        )
-    factory = PLANNERS[settings.planner].factory
-    return factory(task, **box, **arguments(settings.own, factory))
 
 
-def _koopman_mpc(
+def _task(
+    settings: SearchSettings, model: Model, plant: plants.Vehicle
+) -> control.Task:
+    """Return the task of tracking a path around the law that `sampling` names."""
+    model_law = control.ModelLaw(**arguments(settings.model_law, control.ModelLaw))
+    feedback = control.path_feedback(
+        wheelbase=plant.wheelbase,
+        speed_loop=plant.speed_loop,
+        **arguments(settings.feedback, control.path_feedback),
+    )
+    plain = control.no_feedback(speed_loop=plant.speed_loop)
+    laws = {"feedback": feedback, "model": model_law, "plain": plain}
+    return control.path_tracking(
+        model,
+        _cost(settings, plant),
+        choose(laws, settings.sampling, "controller.sampling"),
+        dt=plant.dt,
+        control_low=plant.control_low,
+        control_high=plant.control_high,
+        ancillary=model_law if settings.ancillary else None,
+        **arguments(settings.task, control.path_tracking),
+    )
+
+
+def _planner(
     settings: ControllerSettings,
+    task: control.Task | None,
     model: Model,
     plant: plants.Vehicle,
     box: Mapping[str, Any],
 ) -> Controller:
-    """Return a quadratic program over a linear predictor, with the planners' cost."""
-    return control.koopman_mpc(
+    """Return the planner itself; without a task it is a quadratic program."""
+    factory = PLANNERS[settings.planner].factory
+    options = {**box, **arguments(settings.own, factory)}
+    if task is not None:
+        return factory(task, **options)
+    return factory(
         model,
         dt=plant.dt,
         control_low=plant.control_low,
@@ -318,9 +301,8 @@ def _koopman_mpc(
         speed_loop=plant.speed_loop,
         # Of the task's settings a quadratic program has the terminal weight alone.
         terminal_weight=settings.task.terminal_weight,
-        **box,
         **arguments(settings.cost, control.tracking_cost),
-        **arguments(settings.own, control.koopman_mpc),
+        **options,
     )
 
 
@@ -369,45 +351,4 @@ def in_corridor(
             state=(tuple(state_low), tuple(state_high)),
             road=(low, high),
         ),
-    ).controller()
-
-
-def _along(
-    settings: SearchSettings,
-    model: Model,
-    plant: plants.Vehicle,
-    box: Mapping[str, Any],
-    law: control.PathLaw,
-    certificate: Mapping[str, Any] | None,
-) -> Controller:
-    """Return the planner along a path, with its shield if it has one."""
-    planner = _searching(settings, model, plant, box, law)
-    # A shield needs a certified corridor; without one the planner drives alone.
-    if certificate and certificate.get("corridor") and settings.shield:
-        return in_corridor(planner, model, plant, law, certificate)
-    return planner
-
-
-def _adaptive(
-    settings: SearchSettings,
-    inner: Controller,
-    model: Model,
-    plant: plants.Vehicle,
-    box: Mapping[str, Any],
-    law: control.PathLaw,
-    estimate_env: bool,
-) -> Controller:
-    """Return the controller along a path with adaptation, still along a path."""
-    # The filter relates forces to the largest one in E, which the box defines.
-    if None in box.values():
-        raise ValueError("adaptation needs environment.low and environment.high")
-    return control.Adaptation(
-        inner=inner,
-        model=model,
-        law=law,
-        control_low=plant.control_low,
-        control_high=plant.control_high,
-        **box,
-        estimate_env=estimate_env,
-        **arguments(settings.adaptation, control.Adaptation),
     ).controller()

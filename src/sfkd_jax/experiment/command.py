@@ -14,14 +14,13 @@ from typing import Any
 
 import hydra
 import jax
-from hydra.core.config_store import ConfigStore
 from hydra.core.hydra_config import HydraConfig
 from hydra.types import RunMode
 from omegaconf import DictConfig, OmegaConf
 
 from sfkd_jax import training
 from sfkd_jax.certification import CertificateStale, CertificationRefused
-from sfkd_jax.experiment.options import Settings, hydra_schemas, parse_settings
+from sfkd_jax.experiment.options import Settings, parse_settings, register
 from sfkd_jax.experiment.runs import IDENTITY
 from sfkd_jax.settings import replace
 from sfkd_jax.store import ArtefactError
@@ -99,13 +98,6 @@ def conf_path() -> str:
         checkout / "pyproject.toml"
     ).exists()
     return str(checkout / "conf" if inside else package / "conf")
-
-
-def register() -> None:
-    """Put the schemas into Hydra's store."""
-    for group, nodes in hydra_schemas().items():
-        for name, node in nodes.items():
-            ConfigStore.instance().store(group=group, name=name, node=node)
 
 
 def settings_of(composed: DictConfig) -> Settings:

@@ -1,11 +1,13 @@
-"""The settings of a run: one dataclass a group, and their schemas for Hydra."""
+"""The settings of a run: one dataclass a group, which Hydra takes as its schemas."""
 
 from __future__ import annotations
 
-import typing
-from dataclasses import MISSING, dataclass, field, fields, is_dataclass, make_dataclass
+from dataclasses import field
 from pathlib import Path
 from typing import Annotated, Any
+
+from hydra.core.config_store import ConfigStore
+from omegaconf import DictConfig, OmegaConf
 
 from sfkd_jax import build, data, evaluation, export, training
 from sfkd_jax.build import (
@@ -29,24 +31,17 @@ from sfkd_jax.ranges import (
     Positive,
     PositiveFraction,
 )
-from sfkd_jax.settings import (
-    FileNames,
-    Kinds,
-    Values,
-    hints_of,
-    parse,
-    plain,
-    replace,
-    schema,
-)
+from sfkd_jax.settings import FileNames, OneOf, Values, parse, replace, schema, takes
 
 Overrides = Annotated[dict[str, str | None], FileNames()]
 Seconds = Annotated[float, Interval("(2, inf)")]
 """Of an episode; the first two seconds are not scored."""
+_BOX = ("env_low", "env_high")
+Segments = Annotated[int, Interval("[4, inf)")]
 
 
-@dataclass(frozen=True, kw_only=True)
-class EnvironmentSettings(Kinds):
+@takes(sensor=schema("Sensor", object, evaluation.observed_environment, skip=("dt",)))
+class EnvironmentSettings:
     """What surrounds the vehicle: e in its box, and how a controller learns of it.
 
     Attributes:
@@ -56,15 +51,10 @@ class EnvironmentSettings(Kinds):
         sensor: delay, noise and bias of a measured e.
     """
 
+    sensor: Any
     low: Bounds | None = None
     high: Bounds | None = None
-    source: str = "measured"
-    sensor: Any = None
-
-    @classmethod
-    def kind_of(cls, values: Values) -> type:
-        """Return the one dataclass."""
-        return _ENVIRONMENT
+    source: Annotated[str, OneOf(build.ENV_SOURCES)] = "measured"
 
     @property
     def box(self) -> dict[str, tuple[float, ...] | None]:
@@ -72,8 +62,8 @@ class EnvironmentSettings(Kinds):
         return {"env_low": self.low, "env_high": self.high}
 
 
-@dataclass(frozen=True, kw_only=True)
-class DatasetSettings(Kinds):
+@takes()
+class DatasetSettings:
     """Where the data come from, and how they are split.
 
     Attributes:
@@ -87,37 +77,46 @@ class DatasetSettings(Kinds):
     steps: int = 50
 
     @classmethod
-    def kind_of(cls, values: Values) -> type:
+    def kind_of(cls, values: Values) -> type[DatasetSettings]:
         """Return the dataclass of logs, of path coordinates or of the world."""
         if "path" in values:
-            return _DATASETS["files_schema"]
-        return _DATASETS["path_schema" if "law" in values else "schema"]
+            return LogSettings
+        return AlongPathSettings if "law" in values else SimulatedSettings
 
 
-@dataclass(frozen=True, kw_only=True)
+@takes(data.generate)
 class SimulatedSettings(DatasetSettings):
     """Simulated data; the other fields are arguments of the generator."""
 
-    segments: Annotated[int, Interval("[4, inf)")] = 8000
+    segments: Segments = 8000
 
 
-@dataclass(frozen=True, kw_only=True)
-class AlongPathSettings(SimulatedSettings):
+@takes(data.generate_along_path, skip=_BOX, law=LawSettings)
+class AlongPathSettings(DatasetSettings):
     """Simulated data in path coordinates, around a law."""
 
-    law: LawSettings = None  # pyright: ignore
+    law: LawSettings
+    segments: Segments = 8000
 
 
-@dataclass(frozen=True, kw_only=True)
+@takes(
+    data.from_logs,
+    skip=("dt", "wheelbase", "limits", "needs_environment", "report", *_BOX),
+    columns=schema("Columns", object, data.Columns),
+)
 class LogSettings(DatasetSettings):
     """Recorded logs; the other fields are arguments of `data.from_logs`."""
 
     path: str
-    columns: Any = None
+    columns: Any
 
 
-@dataclass(frozen=True, kw_only=True)
-class TrainingSettings(Kinds):
+@takes(
+    training.fit,
+    skip=("inspect",),
+    loss=schema("Loss", object, training.multi_step_loss),
+)
+class TrainingSettings:
     """How a model is trained; the other fields are arguments of `training.fit`.
 
     Attributes:
@@ -127,20 +126,19 @@ class TrainingSettings(Kinds):
         loss: weights of `training.multi_step_loss`.
     """
 
+    loss: Any
     batch: int = 128
     window: int = 20
     data_share: PositiveFraction = 1.0
     steps: int = 4000
-    loss: Any = None
-
-    @classmethod
-    def kind_of(cls, values: Values) -> type:
-        """Return the one dataclass."""
-        return _TRAINING
 
 
-@dataclass(frozen=True, kw_only=True)
-class CertificationSettings(Kinds):
+@takes(
+    issue,
+    skip=("validation", "calibration", "held_out", "boxes", "runs"),
+    corridor=schema("Corridor", object, certify_corridor),
+)
+class CertificationSettings:
     """What is proved and measured; the other fields are arguments of `issue`.
 
     Attributes:
@@ -150,25 +148,20 @@ class CertificationSettings(Kinds):
         corridor: arguments of `certify_corridor`.
     """
 
+    corridor: Any
     renew: bool = False
     horizon: int = 20
     level: Fraction = 0.95
-    corridor: Any = None
-
-    @classmethod
-    def kind_of(cls, values: Values) -> type:
-        """Return the one dataclass."""
-        return _CERTIFICATION
 
 
-@dataclass(frozen=True, kw_only=True)
+@takes()
 class EvaluationSettings:
     """Episodes, systems and sensors of the closed loop.
 
     Attributes:
         episodes: per system.
         episode_s: [s].
-        seed: of roads, environments, sensor noise and samplers.
+        seed: of roads, sensors and samplers.
         systems: "self" and reference systems; none: `train` trains alone.
         observation_noise: standard deviations of p_x, p_y [m], yaw [rad], v, v_y [m/s],
             yaw rate [rad/s], steering [rad]; by default of a satellite and inertial
@@ -183,11 +176,7 @@ class EvaluationSettings:
     episodes: int = 8
     episode_s: Seconds = 60.0
     seed: NonNegativeInt = 2026
-    systems: Annotated[tuple[str, ...], Entries(least=0)] = (
-        "self",
-        "nominal",
-        "oracle",
-    )
+    systems: Names = ("self", "nominal", "oracle")
     observation_noise: Numbers = (0.015, 0.015, 0.002, 0.03, 0.02, 0.002, 0.001)
     timed_steps: NonNegativeInt = 50
     side_forces: Numbers = ()
@@ -195,38 +184,55 @@ class EvaluationSettings:
     variation: str | None = None
 
 
-@dataclass(frozen=True, kw_only=True)
+@takes()
 class ComparisonSettings:
-    """The rows and columns of `compare`; conf/comparison/none.yaml explains each."""
+    """The rows and columns of `compare`.
+
+    Attributes:
+        policies: the name that trained rows have.
+        vehicles: options of the group.
+        seeds: of the trainings.
+        controllers: controller -> scenarios.
+        own_controllers: row -> controller -> what this row has instead, or None.
+        rows: label -> overrides.
+        untrained: labels of rows that train nothing: the first seed only.
+        trained_once: labels of rows that are trained from the first seed only.
+        tuned: vehicle -> label -> more overrides.
+        only: labels of rows; empty: all.
+        drive: False: only collect and draw stored rows.
+        share: [k, n]: evaluate every n-th row from the k-th on, collect nothing.
+        variations: of the protocol -> overrides.
+        paper: what the paper prints.
+        page: arguments of its page.
+    """
 
     policies: Directory
-    vehicles: Names
-    seeds: Annotated[tuple[NonNegativeInt, ...], Entries(least=0)]
-    only: Names
-    untrained: Names
-    trained_once: Names
-    rows: Overrides
-    tuned: dict[str, dict[str, str]]
-    variations: Overrides
-    paper: dict[str, Any]
-    page: dict[str, Any]
-    controllers: dict[str, Names]
-    own_controllers: Annotated[dict[str, dict[str, str | None]], FileNames()]
+    vehicles: Names = ()
+    seeds: Annotated[tuple[NonNegativeInt, ...], Entries(least=0)] = (0,)
+    controllers: dict[str, Annotated[list[str], Entries(least=0)]] = field(
+        default_factory=dict
+    )
+    own_controllers: Annotated[dict[str, dict[str, str | None]], FileNames()] = field(
+        default_factory=dict
+    )
+    rows: Overrides = field(default_factory=dict)
+    untrained: Names = ()
+    trained_once: Names = ()
+    tuned: dict[str, dict[str, str]] = field(default_factory=dict)
+    only: Names = ()
     drive: bool = True
     share: tuple[NonNegativeInt, NonNegativeInt] | None = None
+    variations: Overrides = field(default_factory=dict)
+    paper: dict[str, Any] = field(default_factory=dict)
+    page: dict[str, Any] = field(default_factory=dict)
 
 
-@dataclass(frozen=True, kw_only=True)
-class ExportSettings(Kinds):
+@takes(export.write_controller, skip=("made_from",))
+class ExportSettings:
     """Arguments of `export.write_controller`."""
 
-    @classmethod
-    def kind_of(cls, values: Values) -> type:
-        """Return the one dataclass."""
-        return _EXPORT
 
-
-@dataclass(frozen=True, kw_only=True)
+@takes()
 class DemoSettings:
     """Episodes of `demo`."""
 
@@ -235,14 +241,14 @@ class DemoSettings:
     timed_steps: NonNegativeInt
 
 
-@dataclass(frozen=True, kw_only=True)
+@takes()
 class ReportSettings:
     """What `report` compares: a pattern of run directories, or None."""
 
     compare: str | None
 
 
-@dataclass(frozen=True, kw_only=True)
+@takes()
 class Settings:
     """All settings of a command.
 
@@ -281,17 +287,11 @@ def parse_settings(values: Values) -> Settings:
     """Return checked settings; with `environment.source=none` the model reads no e.
 
     Raises:
-        ValueError: a setting that does not exist or is out of its range, an unknown
-            source, or an estimate of an environment that the model does not read.
+        ValueError: a setting that does not exist or is out of its range, or an estimate
+            of an environment that the model does not read.
     """
     settings = parse(Settings, values)
-    source = settings.environment.source
-    if source not in build.ENV_SOURCES:
-        raise ValueError(
-            f"unknown environment.source {source!r}; "
-            f"choose one of {', '.join(build.ENV_SOURCES)}"
-        )
-    reads = settings.model.environment
+    source, reads = settings.environment.source, settings.model.environment
     if source == "estimated" and not reads:
         raise ValueError(
             "environment.source=estimated needs a model that reads the environment; "
@@ -301,110 +301,39 @@ def parse_settings(values: Values) -> Settings:
     return replace(settings, model=model)
 
 
-_ENVIRONMENT: type = schema(
-    "Environment",
-    EnvironmentSettings,
-    sensor=schema("Sensor", None, evaluation.observed_environment, skip=("dt",)),
-)
-_BOX = ("env_low", "env_high")
-_LOGGED = ("dt", "wheelbase", "limits", "needs_environment", "report", *_BOX)
-_DATASETS: dict[str, type] = {
-    "schema": schema("Dataset", SimulatedSettings, data.generate),
-    "path_schema": schema(
-        "PathDataset",
-        AlongPathSettings,
-        data.generate_along_path,
-        skip=_BOX,
-        law=LawSettings.kind_of({}),
-    ),
-    "files_schema": schema(
-        "Logs",
-        LogSettings,
-        data.from_logs,
-        skip=_LOGGED,
-        columns=schema("Columns", None, data.Columns),
-    ),
-}
-_TRAINING: type = schema(
-    "Training",
-    TrainingSettings,
-    training.fit,
-    skip=("inspect",),
-    loss=schema("Loss", None, training.multi_step_loss),
-)
-_MEASURED = (
-    "validation",
-    "calibration",
-    "held_out",
-    "boxes",
-    "runs",
-)
-_CERTIFICATION: type = schema(
-    "Certification",
-    CertificationSettings,
-    issue,
-    skip=_MEASURED,
-    corridor=schema("Corridor", None, certify_corridor),
-)
-_EXPORT: type = schema(
-    "Export", ExportSettings, export.write_controller, skip=("made_from",)
-)
-
-
-def hydra_schemas() -> dict[str, dict[str, type]]:
-    """Return the schemas of every group by their names in Hydra's store."""
-    kinds: dict[str, dict[str, type]] = {
+def register() -> None:
+    """Put the dataclasses of all groups into Hydra's store, as schemas."""
+    groups: dict[str, dict[str, type]] = {
         "vehicle": {f"{name}_schema": kind for name, kind in build.VEHICLES.items()},
-        "environment": {"schema": _ENVIRONMENT},
-        "scenario": {"schema": build.SCENARIO},
-        "dataset": _DATASETS,
         "model": {
             f"{name}_schema": kind for name, kind in build.MODEL_SETTINGS.items()
         },
         "controller": {
             f"{name}_schema": kind for name, kind in build.CONTROLLER_SETTINGS.items()
         },
-        "training": {"schema": _TRAINING},
-        "certification": {"schema": _CERTIFICATION},
+        "dataset": {
+            "schema": SimulatedSettings,
+            "path_schema": AlongPathSettings,
+            "files_schema": LogSettings,
+        },
+        "environment": {"schema": EnvironmentSettings},
+        "scenario": {"schema": ScenarioSettings},
+        "training": {"schema": TrainingSettings},
+        "certification": {"schema": CertificationSettings},
         "evaluation": {"schema": EvaluationSettings},
         "comparison": {"schema": ComparisonSettings},
-        "export": {"schema": _EXPORT},
+        "export": {"schema": ExportSettings},
     }
-    return {
-        group: {name: _for_hydra(kind) for name, kind in nodes.items()}
-        for group, nodes in kinds.items()
-    }
+    for group, kinds in groups.items():
+        for name, kind in kinds.items():
+            node = _writable(OmegaConf.structured(kind))
+            ConfigStore.instance().store(group=group, name=name, node=node)
 
 
-def _for_hydra(kind: type) -> type:
-    """Return a dataclass of the types that OmegaConf knows; what is unset is ???."""
-    declared, entries = hints_of(kind), []
-    for entry in fields(typing.cast(Any, kind)):
-        hint, default = declared[entry.name], entry.default
-        if entry.default_factory is not MISSING:
-            default = entry.default_factory()
-        if is_dataclass(default):  # a group inside the group
-            inner = _for_hydra(type(default))
-            about: Any = field(default_factory=inner)
-            hint = inner
-        elif default is MISSING:
-            hint, about = _plain_type(hint), field(default="???")
-        else:
-            value = plain(default)
-            about = field(default_factory=lambda value=value: value)
-            hint = _plain_type(hint)
-        entries.append((entry.name, hint, about))
-    return make_dataclass(kind.__name__, entries)
-
-
-def _plain_type(hint: Any) -> Any:
-    """Return a type that OmegaConf knows: tuple[float, ...] becomes list[float]."""
-    origin, parts = typing.get_origin(hint), typing.get_args(hint)
-    if origin is typing.Annotated:
-        return _plain_type(parts[0])
-    if origin is tuple:
-        return list[_plain_type(parts[0])]
-    if origin is dict:
-        return dict[str, _plain_type(parts[1])]
-    simple = hint in (bool, int, float, str) or hint is Any
-    return hint if simple else Any
+def _writable(node: Any) -> Any:
+    """Let Hydra write options into what OmegaConf made of a frozen dataclass."""
+    OmegaConf.set_readonly(node, None)
+    for inner in map(node._get_node, node):
+        if isinstance(inner, DictConfig):
+            _writable(inner)
+    return node
