@@ -1,5 +1,6 @@
 """Networks small enough to be certified by numpy alone, and what is proved of them."""
 
+from dataclasses import replace
 from functools import cache
 
 import numpy as np
@@ -62,4 +63,4 @@ def consistent(claims):
     """With everything that is computed from other constants computed again."""
     separate = claims.rho + claims.beta
     alpha = min(separate, claims.alpha_joint)
-    return claims._replace(alpha_separate=separate, alpha=alpha)
+    return replace(claims, alpha_separate=separate, alpha=alpha)

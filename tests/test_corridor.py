@@ -13,18 +13,8 @@ from helpers import TINY, any_law, path_space
 
 from sfkd_jax import data as datasets
 from sfkd_jax import models
-from sfkd_jax.certification import (
-    CertificationRefused,
-    issue,
-    output_metrics_from,
-    verify_document,
-)
-from sfkd_jax.certification.corridor import (
-    certify_corridor,
-    closed_loop,
-    corridor_by_speed,
-    fastest_speeds,
-)
+from sfkd_jax.certification import CertificationRefused, issue, verify_document
+from sfkd_jax.certification.corridor import certify_corridor, closed_loop
 from sfkd_jax.plants import kinematic
 
 DRIVEN = {"env_low": (0.3, -8.0), "env_high": (0.9, 8.0)}
@@ -57,10 +47,6 @@ DATA = DRIVEN | {
 }
 
 
-def corridor_of(loop, outputs):
-    return certify_corridor(loop, output_metrics_from(outputs), DATA, 0.9, **SMALL)
-
-
 @pytest.fixture(scope="module")
 def document(trained, loop):
     """As `certify` makes it, with fewer and shorter runs."""
@@ -90,7 +76,7 @@ def document(trained, loop):
         boxes=boxes,
         **options,
     )
-    result["corridor"] = corridor_of(loop, result["outputs"])
+    result["corridor"] = certify_corridor(loop, result["outputs"], DATA, 0.9, **SMALL)
     return result | {"policy_sha256": trained.sha256}
 
 
@@ -115,59 +101,3 @@ def test_the_document_verifies_and_a_changed_one_does_not(document, trained):
     without["outputs"] = {}
     with pytest.raises(CertificationRefused, match="needs a metric"):
         check(without, trained)
-
-
-def test_every_friction_and_speed_gets_a_corridor_of_its_own(document, loop):
-    frictions, speeds = [0.3, 0.9], [8.0, 10.5]
-    result = corridor_by_speed(
-        loop, document, frictions=frictions, speeds=speeds, runs=24
-    )
-    cells = result["cells"]
-    assert [(cell["friction"], cell["speed"]) for cell in cells] == [
-        (f, v) for f in frictions for v in speeds
-    ]
-    assert [cell["curvature"] for cell in cells] == pytest.approx(
-        [0.02, 2.0 / 10.5**2] * 2
-    )
-    for cell in cells:
-        assert cell["corridor_m"] == pytest.approx(cell["nominal_m"] + cell["tube_m"])
-        assert cell["lateral_m"] > 0.0
-        assert cell["coverage_runs"] == 24
-    assert len({cell["corridor_m"] for cell in cells}) == 4
-    assert result["coverage"] == pytest.approx(
-        np.mean([cell["coverage"] for cell in cells])
-    )
-    assert result["coverage_ci95"][1] - result["coverage_ci95"][0] < 0.25
-
-
-def test_speeds_and_frictions_outside_the_box_are_refused(document, loop):
-    for name, values in (
-        ("friction", {"frictions": [0.2], "speeds": [9.0]}),
-        ("speed", {"frictions": [0.3], "speeds": [11.0]}),
-    ):
-        with pytest.raises(
-            ValueError, match=f"{name} .* is outside the certified range"
-        ):
-            corridor_by_speed(loop, document, **values)
-
-
-def test_the_fastest_speed_is_one_below_which_every_corridor_fits():
-    """Also where a faster one fits again by chance, and where none does."""
-    widths = {
-        0.3: (0.6, 0.4, 0.4),
-        0.6: (0.4, 0.6, 0.4),
-        0.9: (0.5, 0.4, 0.5),
-        0.75: (0.4, 0.4, float("nan")),
-    }
-    cells = [
-        {"friction": friction, "speed": speed, "corridor_m": width}
-        for friction, row in widths.items()
-        for speed, width in zip((8.0, 9.0, 10.0), row, strict=True)
-    ]
-    assert fastest_speeds(cells[::-1], 0.5) == {
-        0.3: None,
-        0.6: 8.0,
-        0.75: 9.0,
-        0.9: 10.0,
-    }
-    assert fastest_speeds(cells, 0.1) == dict.fromkeys(widths)

@@ -4,11 +4,9 @@ import numpy as np
 import pytest
 from helpers import certified, explicit
 
-from sfkd_jax.certification import (
-    attack_slopes,
-    lipschitz_upper,
-    propose_multipliers,
-)
+from sfkd_jax.certification import lipschitz_upper
+from sfkd_jax.certification._attack import attack_slopes
+from sfkd_jax.certification._search import propose_multipliers
 
 SIZE = 6
 RANDOM = np.random.default_rng(0)

@@ -7,15 +7,9 @@ import numpy as np
 import pytest
 from networks import NETWORK, TURNED, rotation
 
-from sfkd_jax.certification import (
-    LyapunovClaim,
-    check_metric,
-    prove_lyapunov,
-    solve_metric,
-)
-from sfkd_jax.certification import _lyapunov as lyapunov
-from sfkd_jax.certification._claims import Refuted, require_lyapunov
-from sfkd_jax.certification._document import _lyapunov as part_of
+from sfkd_jax.certification import CertificationRefused, _metrics, check_metric
+from sfkd_jax.certification._claims import require_lyapunov
+from sfkd_jax.certification._metrics import prove_lyapunov, solve_metric
 
 SIZE = 6
 
@@ -56,7 +50,7 @@ def test_operators_that_are_stable_one_by_one_have_no_common_lyapunov_matrix():
     switched = np.zeros((2, 3, 3))
     switched[0, 0, 1] = switched[1, 1, 0] = 2.0
     weights = TURNED._replace(operators=TURNED.operators._replace(vertices=switched))
-    with pytest.raises(Refuted, match="no common Lyapunov matrix"):
+    with pytest.raises(CertificationRefused, match="no common Lyapunov matrix"):
         prove_lyapunov(weights)
 
 
@@ -110,23 +104,23 @@ LIES = {
 @pytest.mark.parametrize("lie", LIES)
 def test_a_broken_answer_is_refused_whatever_the_solver_calls_it(lie, monkeypatch):
     monkeypatch.setattr(
-        lyapunov, "solve_metric", lambda *_, lied=LIES[lie]: lied(TRUE_METRIC)
+        _metrics, "solve_metric", lambda *_, lied=LIES[lie]: lied(TRUE_METRIC)
     )
-    with pytest.raises(Refuted, match="that the core accepts"):
+    with pytest.raises(CertificationRefused, match="that the core accepts"):
         prove_lyapunov(TURNED)
 
 
 TRUE_METRIC = np.diag([1.0, 4.0, 9.0])
 
 
-@pytest.mark.parametrize("scale", [1e-8, 1.0, 1e8])
-@pytest.mark.parametrize("moved", [0.0, 1e-7, 1e-2])
+@pytest.mark.parametrize("scale", [1e-8, 1e8])
+@pytest.mark.parametrize("moved", [0.0, 1e-2])
 def test_an_answer_slightly_off_or_of_any_scale_gets_the_constants_that_it_has(
     scale, moved, monkeypatch
 ):
     """Its own rate and condition are recomputed; what the solver says is not asked."""
     answer = scale * (TRUE_METRIC + moved * (np.ones((3, 3)) - np.eye(3)))
-    monkeypatch.setattr(lyapunov, "solve_metric", lambda *_: answer)
+    monkeypatch.setattr(_metrics, "solve_metric", lambda *_: answer)
     found = prove_lyapunov(TURNED)
     assert found.condition >= np.linalg.cond(answer) * (1 - 1e-12)
     root = np.linalg.cholesky(answer).T
@@ -136,10 +130,6 @@ def test_an_answer_slightly_off_or_of_any_scale_gets_the_constants_that_it_has(
     )
     assert exact <= found.rho <= exact * (1 + 1e-5)
     require_lyapunov(json.loads(json.dumps(found.document())), TURNED)
-
-
-def changed(part, **changes):
-    return part | changes
 
 
 def scaled(part, scale):
@@ -178,7 +168,7 @@ FORGED = {
 
 @pytest.mark.parametrize("name", FORGED)
 def test_a_forged_claim_is_refused(name, part):
-    with pytest.raises((Refuted, ValueError, TypeError)):
+    with pytest.raises((CertificationRefused, ValueError, TypeError)):
         require_lyapunov(FORGED[name](part), TURNED)
 
 
@@ -188,34 +178,30 @@ def test_a_claim_is_about_these_operators_and_about_latents_that_keep_their_metr
     longer = np.array(TURNED.operators.vertices)
     longer[1] *= 1.001
     other = TURNED._replace(operators=TURNED.operators._replace(vertices=longer))
-    with pytest.raises(Refuted, match="does not follow from its witness"):
+    with pytest.raises(CertificationRefused, match="does not follow from its witness"):
         require_lyapunov(part, other)
     turning = TURNED._replace(declared=NETWORK.declared)
-    with pytest.raises(Refuted, match="not a claim about these operators"):
+    with pytest.raises(CertificationRefused, match="not a claim about these operators"):
         require_lyapunov(part, turning)
-    claim, reason = part_of(turning)
-    assert claim is None
-    assert "the transport keeps" in reason["reason"]
-    require_lyapunov(reason, turning)
+    with pytest.raises(CertificationRefused, match="the transport keeps"):
+        prove_lyapunov(turning)
+    require_lyapunov({"reason": "any"}, turning)
     for wrong in ({"reason": 3}, {"reason": None}, {}):
-        with pytest.raises((Refuted, KeyError)):
+        with pytest.raises((CertificationRefused, KeyError)):
             require_lyapunov(wrong, turning)
 
 
-def test_without_a_solver_the_reason_is_one_line_and_nothing_else_changes(monkeypatch):
+def test_without_a_solver_the_reason_is_one_line(monkeypatch):
     monkeypatch.setitem(sys.modules, "cvxpy", None)
-    claim, reason = part_of(TURNED)
-    assert claim is None
-    assert reason == {"reason": lyapunov.MISSING}
-    assert "\n" not in lyapunov.MISSING
-    assert "cvxpy" in lyapunov.MISSING
-    require_lyapunov(reason, TURNED)
+    with pytest.raises(CertificationRefused) as reason:
+        prove_lyapunov(TURNED)
+    assert "cvxpy" in str(reason.value)
+    assert "\n" not in str(reason.value)
 
 
 def test_a_residual_of_a_single_layer_and_none_have_claims_too():
     for residual in ((0.1 * rotation(3, 3),), ()):
         weights = TURNED._replace(residual=residual, residual_multipliers=())
         found = prove_lyapunov(weights)
-        assert isinstance(found, LyapunovClaim)
         require_lyapunov(json.loads(json.dumps(found.document())), weights)
         assert found.alpha <= 1.0

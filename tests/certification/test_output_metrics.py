@@ -9,10 +9,11 @@ import pytest
 from helpers import ENV_HIGH, ENV_LOW, TINY, path_space
 
 from sfkd_jax import models
-from sfkd_jax.certification import OUTPUTS, OutputMetric, prove_lyapunov
-from sfkd_jax.certification._claims import readouts, require_output_metric
+from sfkd_jax.certification import OutputMetric
+from sfkd_jax.certification._claims import OUTPUTS, readouts, require_output_metric
+from sfkd_jax.certification._measured import Residuals, residuals
 from sfkd_jax.certification._metrics import propose_metric
-from sfkd_jax.certification._tubes import Residuals, _worst_gaps, radii, residuals
+from sfkd_jax.certification._tubes import radii, worst_gaps
 from sfkd_jax.certification._weights import exported
 from sfkd_jax.rollout import fold, rollout
 from sfkd_jax.types import Trajectory
@@ -74,10 +75,8 @@ def measured():
 
 
 @cache
-def proposed(name="position", metric=None):
-    rows, worst = readouts(weights())[name], _worst_gaps(measured(), 5)
-    start = prove_lyapunov(weights()).metric if metric == "lyapunov" else None
-    return propose_metric(weights(), rows, worst, weights().residual_multipliers, start)
+def proposed(name="position"):
+    return propose_metric(weights(), readouts(weights())[name], worst_gaps(measured()))
 
 
 @pytest.mark.parametrize("name", OUTPUTS)
@@ -148,7 +147,7 @@ def test_radii_of_one_dimension_are_the_sums_that_they_are():
     """
     claim = OutputMetric(0.5, 2.0, np.eye(1), [[]])
     steps = np.asarray([1.0, 0.0, -1.0, 0.0]).reshape(1, 4, 1)
-    misses = np.asarray([0.1, 0.0, 0.0, 0.3]).reshape(1, 4, 1) * np.ones((1, 1, 2))
+    misses = np.asarray([0.1, 0.0, 0.0, 0.3]).reshape(1, 4, 1) * np.ones((1, 1, 3))
     bounds = radii(Residuals(steps, misses), "position", claim)
     assert bounds.vehicle_to_nominal == pytest.approx(1.25 + 0.3)
     assert bounds.asymptotic == pytest.approx(2.0 + 0.3)

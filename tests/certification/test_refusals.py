@@ -13,7 +13,6 @@ from helpers import ENV_HIGH, ENV_LOW, certified, model_and_params
 from sfkd_jax.certification import (
     CertificateContradicted,
     CertificationRefused,
-    attack_transport,
     certify,
 )
 from sfkd_jax.types import Polytope, Samples
@@ -82,16 +81,6 @@ def at_the_limit(name):
     }
 
 
-def skipping(model):
-    """Adds z to what it declares."""
-
-    def step(fiber, latent, control):
-        after = model.step(fiber, latent, control)
-        return after._replace(z=after.z + 0.5 * latent.z)
-
-    return model._replace(step=step)
-
-
 def modulated(model):
     """FiLM: the environment scales what the residual and the operator emit, which no
     bias does.
@@ -104,11 +93,10 @@ def modulated(model):
     return model._replace(step=step)
 
 
-@pytest.mark.parametrize("liar", [skipping, modulated])
-def test_a_step_that_is_not_what_it_declares_is_contradicted_by_the_attack(liar):
+def test_a_step_that_is_not_what_it_declares_is_contradicted_by_the_attack():
     model, params = at_the_limit("sfkd")
     with pytest.raises(CertificateContradicted, match="the attack on the step reaches"):
-        certify(liar(model), params, BOX, attack_starts=1)
+        certify(modulated(model), params, BOX, attack_starts=1)
 
 
 def pair_stable_one_by_one(size=8):
@@ -134,24 +122,20 @@ def test_operators_that_are_stable_for_every_environment_and_not_under_switching
 @pytest.mark.parametrize(
     "box", [(ENV_HIGH, ENV_LOW), (ENV_LOW,), (0.3, 0.9), ((np.nan, -8.0), ENV_HIGH)]
 )
-def test_a_box_that_is_none_is_an_error(box):
-    with pytest.raises(ValueError, match="env_box must be a lower and an upper corner"):
+def test_a_box_that_is_none_is_refused(box):
+    with pytest.raises(CertificationRefused, match="env_box must be a lower and"):
         certify(*model_and_params("sfkd"), box)
 
 
 # --- attacks --------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("name", ["sfkd", "segment"])
-def test_the_attack_comes_close_to_the_certificate_and_stays_below(name):
-    proved = certify(*at_the_limit(name), BOX, attack_starts=4)
+def test_the_attack_comes_close_to_the_certificate_and_stays_below():
+    proved = certify(*at_the_limit("sfkd"), BOX, attack_starts=4)
     assert 1.0 <= proved.tightness <= 1.04
     assert proved.attacks["residual_slopes"] > proved.beta / 1.15
-
-
-def test_the_served_transport_is_an_isometry():
-    reached = attack_transport(*model_and_params("sfkd"), BOX, jax.random.key(0))
-    assert reached == pytest.approx(1.0, abs=1e-6)
+    # An isometry, as served.
+    assert proved.attacks["transport"] == pytest.approx(1.0, abs=1e-6)
 
 
 @hypothesis.settings(max_examples=40, deadline=None, derandomize=True)

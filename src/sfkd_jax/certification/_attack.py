@@ -11,14 +11,20 @@ import jax.numpy as jnp
 import numpy as np
 from scipy.optimize import minimize
 
-from sfkd_jax.certification._claims import Box, Claims, decoders
+from sfkd_jax.certification._claims import (
+    FLOAT32,
+    Box,
+    Claims,
+    attack_limits,
+    decoders,
+)
 from sfkd_jax.certification._core import Matrix, Vector
 from sfkd_jax.certification._weights import CertificationRefused, Exported, one_thread
 from sfkd_jax.rollout import fold
 from sfkd_jax.types import POSE, Key, Model, Params
 
-FLOAT32 = 1e-5
-"""Relative excess over a bound that float32 rounding of the attacked model explains."""
+PAIRS = 256
+"""Random pairs (e, e') between which the transport is differentiated."""
 
 
 class CertificateContradicted(CertificationRefused):
@@ -35,7 +41,6 @@ def attack_claims(
     claims: Claims,
     box: Box,
     starts: int,
-    seed: int,
 ) -> dict[str, float]:
     """Run all attacks and return the lower bounds that they reach, by name.
 
@@ -43,27 +48,21 @@ def attack_claims(
         CertificateContradicted: a lower bound exceeds the proved bound.
     """
     # Limits before the search: a proof that states none is an error at once.
-    limits, reached = limits_of(claims, weights), {}
+    limits, reached = attack_limits(claims, weights), {}
     networks = {"residual": weights.residual, **decoders(weights)}
     with one_thread():
         for name, network in networks.items():
             if network:
-                reached[f"{name}_slopes"] = attack_slopes(network, seed=seed)
+                reached[f"{name}_slopes"] = attack_slopes(network)
         reached["step_slopes"] = max(
-            # Every vertex: the largest slope of the
-            # hull is at one of them, by convexity.
+            # Every vertex: by convexity the largest slope of the hull is at one.
             attack_slopes(weights.residual, vertex, starts=8)
             for vertex in weights.operators.vertices
         )
     if starts:
-        # A key each, so that one attack's number
-        # of starts leaves the others as they are.
-        step_key, transport_key, decoder_key = jax.random.split(jax.random.key(seed), 3)
         # Folded once: each of many thousand steps would bound the weights again.
         folded = jax.jit(partial(fold, model))(params)
-        reached["transport"] = attack_transport(model, folded, box, transport_key)
-        reached |= attack_decoder(model, folded, box, decoder_key, starts=starts)
-        reached["step"] = attack_step(model, folded, box, step_key, starts=starts)
+        reached |= attack_model(model, folded, box, starts=starts)
     for name, value in reached.items():
         # `not <=` instead of `>`: a NaN contradicts the bound as well.
         if not value <= limits[name] * (1 + FLOAT32):
@@ -74,19 +73,8 @@ def attack_claims(
     return reached
 
 
-def limits_of(claims: Claims, weights: Exported) -> dict[str, float]:
-    """Return the proved bound behind each attack, by name of the attack."""
-    limits = {"residual_slopes": claims.beta, "transport": 1.0, **claims.lipschitz}
-    limits |= {f"{name}_slopes": claims.lipschitz[name] for name in decoders(weights)}
-    return limits | {"step": claims.alpha, "step_slopes": claims.alpha}
-
-
 def attack_slopes(
-    weights: Sequence[Matrix],
-    linear: Matrix | None = None,
-    *,
-    starts: int = 24,
-    seed: int = 0,
+    weights: Sequence[Matrix], linear: Matrix | None = None, *, starts: int = 24
 ) -> float:
     """Maximise ||A + W_L D_{L-1} W_{L-1} … D_1 W_1||_2 over slopes D_k in [0, 1].
 
@@ -98,17 +86,12 @@ def attack_slopes(
         weights: W_1 … W_L, or an empty list.
         linear: A.
         starts: number of starting points; the first has all slopes 1.
-        seed: of the random starting points.
     """
-    random, best = np.random.default_rng(seed), 0.0
+    # Without a network the operator alone is the map, and there are no slopes.
     if not weights:
-        # Without a network the operator alone is the map, and there are no slopes.
         return float(np.linalg.norm(np.asarray(linear), 2))
-    base = (
-        np.zeros((weights[-1].shape[0], weights[0].shape[1]))
-        if linear is None
-        else np.asarray(linear)
-    )
+    random, best = np.random.default_rng(0), 0.0
+    base = 0.0 if linear is None else np.asarray(linear)
     for start in range(starts):
         # All slopes 1 is the linearisation at the origin, often close to the worst.
         share = 1.0 if start == 0 else random.uniform(0.2, 1.0)
@@ -122,8 +105,7 @@ def attack_slopes(
             for k in range(len(slopes)):
                 slopes[k] = _best_layer(weights, slopes, base, k)
             after = float(np.linalg.norm(base + _chain(weights, slopes), 2))
-            # Coordinate ascent never decreases, so
-            # that this ends; below 1e-12 is rounding.
+            # Coordinate ascent never decreases, so this ends; 1e-12 is rounding.
             if after <= value * (1 + 1e-12):
                 break
             value = after
@@ -140,108 +122,103 @@ def _chain(weights: Sequence[Matrix], slopes: Sequence[Vector]) -> Matrix:
 
 
 def _best_layer(
-    weights: Sequence[Matrix], slopes: Sequence[Vector], base: Matrix, layer: int
+    weights: Sequence[Matrix], slopes: Sequence[Vector], base: Any, layer: int
 ) -> Vector:
     """Slopes of one layer that maximise u'(A + …)v for the current top pair (u, v)."""
     left, _, right = np.linalg.svd(base + _chain(weights, slopes))
-    # With the pair (u, v) fixed the gain is a
-    # sum over units: each chooses its own sign.
+    # With (u, v) fixed the gain is a sum over units: each chooses its own sign.
     before = _chain(weights[: layer + 1], slopes[:layer]) @ right[0]
-    after = left[:, 0] @ _chain(
-        [np.eye(len(slopes[layer])), *weights[layer + 1 :]],
-        [np.ones(len(slopes[layer])), *slopes[layer + 1 :]],
-    )
+    after = left[:, 0]
+    for k in range(len(slopes), layer, -1):
+        after = after @ weights[k]
+        after = after * slopes[k - 1] if k - 1 > layer else after
     return (before * after > 0).astype(float)
 
 
-def attack_step(
-    model: Model, params: Params, box: Box, key: Key, *, starts: int = 12
-) -> float:
-    """Maximise ||∂(T(e → e') F(z, u, e))/∂z||_2 of the float32 model by ascent.
+def attack_model(
+    model: Model, params: Params, box: Box, *, starts: int
+) -> dict[str, float]:
+    """Maximise the slopes in z of the float32 model by ascent, and return their norms.
 
-    F is `model.step`, T is `model.transport`. e and e' stay in the box; z and u are
-    free, as in the certificate. The ascent maximises |J v|²/|v|² over z, u, e, e' and
-    the direction v; the value returned is the 2-norm of J.
+    "step" is ||∂(T(e → e') F(z, u, e))/∂z||_2 with F = `model.step` and T =
+    `model.transport`; "transport" that of T alone, over random pairs (e, e'). Outputs
+    are the pose increment of a step and, if the pose is part of the latent, of
+    decoding: "position" [m], "yaw" [rad] and "decoder" (both); and the body state,
+    "body". e and e' stay in the box; z and u are free, as in the certificate.
 
     Args:
         model: a model with `explicit`.
-        params: its weights.
+        params: its weights, folded or not.
         box: lower and upper corner of E.
-        key: for the starting points.
-        starts: number of starting points.
+        starts: number of starting points of each ascent.
     """
-    inject, *_ = _coordinates(model, params, len(box[0]))
+    inject, *sizes = _coordinates(model, params, len(box[0]))
+    # A key each: the number of starts of one attack leaves the others as they are.
+    step_key, transport_key, output_key = jax.random.split(jax.random.key(0), 3)
 
     def step(params: Params, z: Any, control: Any, env: Any, later: Any) -> Any:
         fiber, fiber_next = model.fiber(params, env), model.fiber(params, later)
-        return model.vector(
-            model.transport(fiber, fiber_next, model.step(fiber, inject(z), control))
-        )
-
-    jacobians = _steepest(step, model, params, box, key, starts=starts, iterations=120)
-    # The exact norm at the end, not the value of the ascent along one direction.
-    return max(float(np.linalg.norm(jacobian, 2)) for jacobian in jacobians)
-
-
-def attack_decoder(
-    model: Model, params: Params, box: Box, key: Key, *, starts: int = 12
-) -> dict[str, float]:
-    """Maximise ||∂/∂z||_2 of each output of the float32 model, as `attack_step`.
-
-    Outputs are the pose increment of a step and, if the pose is part of the latent, of
-    decoding: "position" [m], "yaw" [rad] and "decoder" (both); and the body state,
-    "body".
-
-    Args:
-        model: a model with `explicit`.
-        params: its weights.
-        box: lower and upper corner of E.
-        key: for the starting points.
-        starts: number of starting points.
-    """
-    inject, *_ = _coordinates(model, params, len(box[0]))
+        after = model.step(fiber, inject(z), control)
+        return model.vector(model.transport(fiber, fiber_next, after))
 
     def outputs(params: Params, z: Any, control: Any, env: Any, later: Any) -> Any:
         del later
         fiber = model.fiber(params, env)
         latent = inject(z)  # at the origin, so that an increment is a pose
-        # The step's pose and the decoding of z: the
-        # two places where a pose may come from.
+        # The step's pose and the decoding of z: two places where a pose may come from.
         after = model.decode(fiber, model.step(fiber, latent, control))
         return jnp.concatenate([after[POSE], model.decode(fiber, latent)])
 
-    ends = _steepest(outputs, model, params, box, key, starts=starts, iterations=60)
+    def transport(params: Params, pair: Any) -> Any:
+        before, after = (model.fiber(params, env) for env in pair)
+        return jax.jacfwd(
+            lambda z: model.vector(model.transport(before, after, inject(z)))
+            # T is linear in z, hence its Jacobian is the same everywhere, also at 0.
+        )(jnp.zeros(sizes[0]))
+
+    steepest = partial(_steepest, params=params, sizes=sizes, box=box, starts=starts)
+    low, high = (jnp.asarray(side, dtype=jnp.float32) for side in box)
+    pairs = jax.random.uniform(
+        transport_key, (PAIRS, 2, len(low)), minval=low, maxval=high
+    )
+    carried = jax.jit(jax.vmap(transport, in_axes=(None, 0)))(params, pairs)
+    ends = steepest(outputs, key=output_key, iterations=60)
     if model.along_path:  # decoded from z: e_y, e_ψ, then the vehicle's own state
-        parts = {"position": slice(6, 7), "yaw": slice(7, 8), "body": slice(8, None)}
-        return _largest_norms(ends, parts)
-    poses = [part for jacobian in ends for part in (jacobian[:3], jacobian[3:6])]
-    # Rows 0-2: the pose after a step; 3-5: that of decoding, constant unless in z.
-    parts = {"position": slice(0, 2), "yaw": slice(2, 3), "decoder": slice(0, 3)}
-    return _largest_norms(poses, parts) | _largest_norms(ends, {"body": slice(6, None)})
-
-
-def _largest_norms(
-    jacobians: Sequence[Matrix], parts: dict[str, slice]
-) -> dict[str, float]:
-    """Largest 2-norm of some rows, by name of these rows."""
-    return {
-        name: max(float(np.linalg.norm(jacobian[rows], 2)) for jacobian in jacobians)
-        for name, rows in parts.items()
+        poses, parts = ends, {"position": slice(6, 7), "yaw": slice(7, 8)}
+    else:
+        # Rows 0-2: the pose after a step; 3-5: that of decoding, constant unless in z.
+        poses = [part for jacobian in ends for part in (jacobian[:3], jacobian[3:6])]
+        parts = {"position": slice(0, 2), "yaw": slice(2, 3), "decoder": slice(0, 3)}
+    reached = {name: _largest_norm(poses, rows) for name, rows in parts.items()}
+    body = slice(8 if model.along_path else 6, None)
+    # Exact norms at the end, not the values of the ascent along one direction.
+    return reached | {
+        "body": _largest_norm(ends, body),
+        "transport": _largest_norm(np.asarray(carried, dtype=np.float64)),
+        "step": _largest_norm(steepest(step, key=step_key, iterations=120)),
     }
+
+
+def _largest_norm(jacobians: Any, rows: slice = slice(None)) -> float:
+    """Largest 2-norm of these rows."""
+    return max(float(np.linalg.norm(jacobian[rows], 2)) for jacobian in jacobians)
 
 
 def _steepest(
     function: Callable[..., Any],
-    model: Model,
+    *,
     params: Params,
+    sizes: Sequence[int],
     box: Box,
     key: Key,
-    *,
     starts: int,
     iterations: int,
 ) -> list[Matrix]:
-    """∂/∂z of `function(params, z, u, e, e')` at the end of each ascent."""
-    _, rank, controls = _coordinates(model, params, len(box[0]))
+    """∂/∂z of `function(params, z, u, e, e')` at the end of each ascent.
+
+    The ascent maximises |J v|²/|v|² over z, u, e, e' and the direction v.
+    """
+    rank, controls = sizes
     low, high = (np.asarray(side, dtype=np.float64) for side in box)
     inputs = rank + controls + 2 * len(low)
     envs = slice(rank + controls, inputs)
@@ -267,8 +244,7 @@ def _steepest(
 
     def objective(flat: Vector) -> tuple[float, Vector]:
         value, gradient = with_gradient(params, jnp.asarray(flat, jnp.float32))
-        # scipy works in float64; a NaN would end the
-        # search, a zero gradient only this start.
+        # scipy works in float64; a NaN would end the search, a zero gradient this start
         return float(value), np.nan_to_num(np.asarray(gradient, dtype=np.float64))
 
     limits = [(None, None)] * (inputs + rank)
@@ -288,34 +264,6 @@ def _steepest(
         steepest = jacobian(params, jnp.asarray(end, jnp.float32))
         jacobians.append(np.asarray(steepest, dtype=np.float64))
     return jacobians
-
-
-def attack_transport(
-    model: Model, params: Params, box: Box, key: Key, *, samples: int = 256
-) -> float:
-    """Largest ||∂T(e → e') z/∂z||_2 over random pairs (e, e'); T is linear in z.
-
-    Args:
-        model: a model with `explicit`.
-        params: its weights.
-        box: lower and upper corner of E.
-        key: for the pairs.
-        samples: number of pairs.
-    """
-    inject, rank, _ = _coordinates(model, params, len(box[0]))
-    low, high = (jnp.asarray(side, dtype=jnp.float32) for side in box)
-    draws = jax.random.uniform(key, (samples, 2, low.shape[0]), minval=low, maxval=high)
-
-    def matrix(params: Params, pair: Any) -> Any:
-        before, after = (model.fiber(params, env) for env in pair)
-        return jax.jacfwd(
-            lambda z: model.vector(model.transport(before, after, inject(z)))
-            # T is linear in z, hence its Jacobian is the same everywhere, also at 0.
-        )(jnp.zeros(rank))
-
-    matrices = jax.jit(jax.vmap(matrix, in_axes=(None, 0)))(params, draws)
-    norms = np.linalg.norm(np.asarray(matrices, dtype=np.float64), 2, axis=(1, 2))
-    return float(np.max(norms))
 
 
 def _coordinates(

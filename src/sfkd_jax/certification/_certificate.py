@@ -1,68 +1,53 @@
-"""Certificates of contraction for all z, u and e: proof and verification."""
+"""Certificates of contraction for all z, u and e, and the document of a policy."""
 
 from __future__ import annotations
 
 import dataclasses
 import time
 from collections.abc import Mapping
+from functools import partial
 from importlib.metadata import version
-from typing import Any
+from typing import Annotated, Any
 
+import jax
 import numpy as np
 
-from sfkd_jax.certification._attack import (
-    FLOAT32,
-    attack_claims,
-    attack_slopes,
-    limits_of,
+from sfkd_jax.certification._attack import attack_claims, attack_slopes
+from sfkd_jax.certification._claims import Box, Claims, keeps_metrics, require_box
+from sfkd_jax.certification._measured import (
+    KINDS,
+    Residuals,
+    conformal_bounds,
+    coverage,
+    residuals,
+    supports,
 )
-from sfkd_jax.certification._claims import Box, Claims, Refuted, require_claims
-from sfkd_jax.certification._search import joint_bound, prove, residual_bound
+from sfkd_jax.certification._metrics import prove_lyapunov
+from sfkd_jax.certification._search import joint_bound, lipschitz_upper, prove
+from sfkd_jax.certification._tubes import output_tubes, tubes
 from sfkd_jax.certification._weights import (
     CertificationRefused,
-    Exported,
     exported,
     fingerprint,
     one_thread,
 )
-from sfkd_jax.types import Model, Params
+from sfkd_jax.ranges import Fraction, Interval, NonNegativeInt
+from sfkd_jax.rollout import fold
+from sfkd_jax.types import Model, Params, Trajectory
 
-MALFORMED = (
-    LookupError,
-    TypeError,
-    ValueError,
-    ArithmeticError,
-    AttributeError,
-    RecursionError,
-)
-"""Errors that Python raises on a document with values of unexpected types."""
 PRECISION = (
     "bounds on the float32 weights as real numbers, checked in float64; "
     "float32 rounding of a step counts as d"
 )
 
 
-class CertificateStale(Exception):
-    """The certificate is about other weights."""
-
-
-@dataclasses.dataclass(frozen=True)
-class Certificate:
-    """Proved constants in the 2-norm with their witnesses.
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class Certificate(Claims):
+    """Proved constants with their witnesses, and how far attacks came.
 
     Attributes:
-        scope: the environments, and how all of them are covered.
-        alpha: contraction factor of a step, |F(z) − F(z')| ≤ α |z − z'| for all z, z',
-            u and all e of the scope: the smaller of the next two.
-        alpha_separate: ρ + β.
-        alpha_joint: of z ↦ A(e) z + r(z; u, e) as one map.
-        rho: sup_e ||A(e)||.
-        beta: Lipschitz constant of r in z.
-        lipschitz: Lipschitz constants of the decoder's outputs "position" [m], "yaw"
-            [rad], both ("decoder") and of "body".
         transport_lipschitz: Lipschitz constant of T(e → e').
         env_box: [low, high].
-        witnesses: multipliers of all proofs; `verify` needs no search.
         params_sha256: hash of the weights.
         precision: how float arithmetic is accounted for.
         attack: largest contraction factor reached by an attack on the float32 model.
@@ -72,16 +57,8 @@ class Certificate:
         seconds: duration of the proof and the attacks.
     """
 
-    scope: str
-    alpha: float
-    alpha_separate: float
-    alpha_joint: float
-    rho: float
-    beta: float
-    lipschitz: dict[str, float]
     transport_lipschitz: float
     env_box: list[list[float]]
-    witnesses: dict[str, Any]
     params_sha256: str
     precision: str
     attack: float | None
@@ -118,7 +95,6 @@ def certify(
     *,
     margin: float = 1e-4,
     attack_starts: int = 6,
-    seed: int = 0,
 ) -> Certificate:
     """Prove a contraction factor for all z, u and e, and attack all proved bounds.
 
@@ -129,39 +105,30 @@ def certify(
         margin: α must be at most 1 − margin.
         attack_starts: starting points of the ascent on the float32 model; with 0 there
             is no ascent and tightness is None.
-        seed: of the attacks.
 
     Raises:
         CertificationRefused: the model cannot be certified; gives the reason.
         CertificateContradicted: an attack exceeds a proved bound.
-        ValueError: an invalid box.
     """
     began = time.perf_counter()
-    corners = np.asarray(env_box, dtype=np.float64)
-    if corners.ndim != 2 or len(corners) != 2 or not np.all(corners[0] <= corners[1]):
-        raise ValueError(f"env_box must be a lower and an upper corner, got {env_box}")
+    box = require_box("env_box", env_box).astype(float).tolist()
     # In float64 and on the host, before anything is searched.
     weights = exported(model, params)
-    try:
-        with one_thread():
-            claims = prove(weights)
-    except Refuted as reason:
-        raise CertificationRefused(str(reason)) from None
+    with one_thread():
+        claims = prove(weights)
     if not claims.alpha <= 1.0 - margin:  # refuses NaN as well
         raise CertificationRefused(
             f"alpha = {claims.alpha:.6f} (rho {claims.rho:.6f}, "
             f"beta {claims.beta:.6f}) is not below 1 by the margin {margin:g}"
         )
-    box = corners.tolist()
     # After the proof: an attack that exceeds it is a fault of the code, see there.
-    attacks = attack_claims(model, params, weights, claims, box, attack_starts, seed)
+    attacks = attack_claims(model, params, weights, claims, box, attack_starts)
     attack = attacks.get("step")
     return Certificate(
-        **claims._asdict(),
+        **vars(claims),
         transport_lipschitz=1.0,
         env_box=box,
-        # Of the parameters as they are stored: what
-        # a reader of the policy can recompute.
+        # Of the parameters as they are stored: what a reader of the policy recomputes.
         params_sha256=fingerprint(params),
         precision=PRECISION,
         attack=attack,
@@ -170,76 +137,6 @@ def certify(
         versions={name: version(name) for name in ("jax", "numpy", "scipy")},
         seconds=time.perf_counter() - began,
     )
-
-
-def verify(
-    certificate: Certificate,
-    params: Params,
-    *,
-    model: Model,
-    weights: Exported | None = None,
-) -> None:
-    """Check a certificate against weights without any search.
-
-    Takes milliseconds once `model.structure.explicit` is compiled.
-
-    Args:
-        certificate: from an untrusted source.
-        params: the weights.
-        model: provides `explicit`.
-        weights: explicit weights of `params`, if already computed.
-
-    Raises:
-        CertificateStale: it is about other weights.
-        CertificationRefused: a claim does not follow from its witness.
-    """
-    # First the hash: a proof about other weights need not be read at all.
-    if fingerprint(params) != certificate.params_sha256:
-        raise CertificateStale("the certificate is about other weights")
-    weights = exported(model, params) if weights is None else weights
-    # The proved part alone; attacks and times are compared afterwards.
-    claims = Claims(**{name: getattr(certificate, name) for name in Claims._fields})
-    try:
-        with one_thread():
-            require_claims(claims, weights, certificate.env_box)
-        # Outside: it compares numbers, and no matrix is touched.
-        _require_consistent(certificate, claims, weights)
-    except Refuted as reason:
-        raise CertificationRefused(str(reason)) from None
-    except MALFORMED as reason:
-        raise CertificationRefused(
-            f"the certificate is malformed: {' '.join(str(reason).split())}"
-        ) from None
-
-
-def _require_consistent(
-    certificate: Certificate, claims: Claims, weights: Exported
-) -> None:
-    """Check that the parts of a certificate agree with each other.
-
-    Raises:
-        Refuted: names the first part that does not.
-    """
-    if not claims.alpha < 1.0 or certificate.transport_lipschitz != 1.0:
-        raise Refuted(
-            f"alpha = {claims.alpha} is not below 1, "
-            "or the transport is not nonexpansive"
-        )
-    # A text that promises more than the checks below cover must not pass.
-    if certificate.precision != PRECISION:
-        raise Refuted("precision is not what is covered")
-    limits = limits_of(claims, weights)
-    for name, value in certificate.attacks.items():
-        # A stated attack above the proved bound would contradict the document itself.
-        if name not in limits or not 0 <= value <= limits[name] * (1 + FLOAT32):
-            raise Refuted(
-                f"the attack {name} = {value!r} "
-                f"contradicts the bound {limits.get(name)}"
-            )
-    step = certificate.attacks.get("step")
-    tightness = claims.alpha / step if step else None
-    if certificate.attack != step or certificate.tightness != tightness:
-        raise Refuted("attack or tightness does not follow from the attacks")
 
 
 def contraction_metrics(model: Model, params: Params) -> dict[str, float]:
@@ -258,19 +155,137 @@ def contraction_metrics(model: Model, params: Params) -> dict[str, float]:
     # A model without explicit weights trains like any other, just without this log.
     except CertificationRefused:
         return {}
-    vertices = weights.operators.vertices
+    vertices, multipliers = weights.operators.vertices, weights.residual_multipliers
+    residual = weights.residual
     with one_thread():
-        rho = max(float(np.linalg.norm(vertex, 2)) for vertex in vertices)
-        separate = rho + residual_bound(weights)
+        separate = max(float(np.linalg.norm(vertex, 2)) for vertex in vertices)
+        separate += lipschitz_upper(residual, multipliers) if residual else 0.0
         # Few iterations: an estimate at every checkpoint, not the certificate.
-        joint, _ = joint_bound(weights, weights.residual_multipliers, iterations=15)
-        slopes = max(
-            attack_slopes(weights.residual, vertex, starts=4) for vertex in vertices
-        )
-    values = {
-        "alpha": min(joint, separate),
-        "alpha_separate": separate,
-        "tightness": min(joint, separate) / slopes,
-    }
+        joint, _ = joint_bound(weights, multipliers, iterations=15)
+        slopes = max(attack_slopes(residual, vertex, starts=4) for vertex in vertices)
+    alpha = min(joint, separate)
+    values = {"alpha": alpha, "alpha_separate": separate, "tightness": alpha / slopes}
     # JSON has no infinity: what is not proved is absent.
     return {name: value for name, value in values.items() if np.isfinite(value)}
+
+
+def issue(
+    model: Model,
+    params: Params,
+    *,
+    validation: Trajectory,
+    calibration: Trajectory,
+    held_out: Mapping[str, Trajectory],
+    boxes: Mapping[str, Any],
+    runs: Mapping[str, int] | None = None,
+    horizon: int = 20,
+    level: Fraction = 0.95,
+    margin: Annotated[float, Interval("[0, 1)")] = 1e-4,
+    attack_starts: NonNegativeInt = 6,
+) -> dict[str, Any]:
+    """Certify a policy and return the certificate with its tubes as a document.
+
+    Args:
+        model: the model to certify.
+        params: its weights as exported.
+        validation: trajectories that fix the units of the scores.
+        calibration: trajectories that set d̄.
+        held_out: trajectories by name, on which coverage is counted; "test" is
+            exchangeable with `calibration`.
+        boxes: domain of s, u and e of the measurements; nothing is claimed outside.
+        runs: number of independent runs that the trajectories of "calibration" and
+            "test" were cut from; by default every trajectory is one. Guarantees are
+            about new runs only if there are enough of them.
+        horizon: of the tubes [steps].
+        level: 1 − δ of the conformal bounds.
+        margin: α must be at most 1 − margin.
+        attack_starts: starting points of the attack on the float32 model.
+
+    Raises:
+        CertificationRefused: the model cannot be certified; gives the reason.
+    """
+    began = time.perf_counter()
+    # First the proof: where it refuses, nothing need be measured.
+    certificate = certify(
+        model, params, boxes["env"], margin=margin, attack_starts=attack_starts
+    )
+    weights, start = exported(model, params), None
+    try:
+        with one_thread():
+            claim = prove_lyapunov(weights)
+        lyapunov, start = claim.document(), claim.metric
+    # Nothing else depends on it, so that a missing solver does not stop the rest.
+    except CertificationRefused as reason:
+        lyapunov = {"reason": str(reason)}
+    # Folded for measurements alone: the proof is about the stored weights.
+    measure = partial(residuals, model, jax.jit(partial(fold, model))(params))
+    reference, scores = measure(validation), measure(calibration)
+    unseen = {name: measure(part) for name, part in held_out.items()}
+    outputs, largest = {}, None
+    try:
+        d_bar = _one_step_bounds(reference, scores, unseen, level, runs or {})
+        if model.along_path and keeps_metrics(weights):
+            outputs = output_tubes(
+                weights, reference, scores, unseen["test"], level=level, start=start
+            )
+    except ValueError as reason:
+        raise CertificationRefused(str(reason)) from None
+    if not model.along_path:
+        # The longest step seen: an error of yaw moves the car by at most that times
+        # the angle.
+        moves = np.diff(np.asarray(calibration.states, np.float64)[..., :2], axis=-2)
+        largest = float(np.max(np.linalg.norm(moves, axis=-1)))
+    tube = tubes(
+        alpha=certificate.alpha,
+        lipschitz=certificate.lipschitz,
+        one_step=d_bar["one_step"],
+        horizon=horizon,
+        largest_increment=largest,
+    )
+    return certificate.document() | {
+        "valid": True,
+        "lyapunov": lyapunov,
+        "decoder_lipschitz": certificate.lipschitz.get("decoder"),
+        "d_bar": d_bar,
+        "tube": tube,
+        "outputs": outputs,
+        "boxes": dict(boxes),
+        "seconds_proof": certificate.seconds,
+        "seconds": time.perf_counter() - began,
+    }
+
+
+def _one_step_bounds(
+    reference: Residuals,
+    measured: Residuals,
+    unseen: Mapping[str, Residuals],
+    level: float,
+    runs: Mapping[str, int],
+) -> dict[str, Any]:
+    """Bounds at `level` for whole trajectories, and their coverage."""
+    units, scores = reference.largest(), measured.largest()
+    # Units from validation, or the scores of calibration would not be exchangeable.
+    bounds = conformal_bounds(units, scores, level=level)
+    shares = {
+        # Only of the test part it is known how many runs it was cut from.
+        name: coverage(
+            bounds, part.largest(), runs.get("test") if name == "test" else None
+        )
+        for name, part in unseen.items()
+    }
+    one_step = dict(zip(KINDS, bounds.tolist(), strict=True))
+    independent, holds_for = runs.get("calibration", len(scores)), "new runs like these"
+    # Too few runs: the bound is then about these runs, and the text says so.
+    if not supports(independent, level):
+        holds_for = f"further segments of the same {independent} runs"
+    return {
+        "value": one_step["latent"],
+        "level": level,
+        "trajectories": len(scores),
+        "runs": independent,
+        "holds_for": holds_for,
+        **shares.pop("test"),
+        "by_scenario": shares,
+        "one_step": one_step,
+        "validation": float(np.quantile(units[:, 0], level)),
+    }

@@ -4,8 +4,10 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 from typing import Any, NamedTuple, TypeAlias
 
+import jax
 import numpy as np
 
 from sfkd_jax.certification._core import (
@@ -19,7 +21,7 @@ from sfkd_jax.certification._core import (
     is_positive_definite,
     product,
 )
-from sfkd_jax.certification._weights import Exported
+from sfkd_jax.certification._weights import CertificationRefused, Exported
 
 COMPILATION_SLACK = 1.0 + 1e-6
 """Slack for rounding: another compilation of the same model may serve explicit weights
@@ -27,16 +29,29 @@ that differ relatively by about 1.5e-7 (measured).
 """
 OUTPUTS = ("position", "yaw")
 """Outputs with a metric of their own: e_y [m] and e_ψ [rad]."""
+FLOAT32 = 1e-5
+"""Relative excess over a bound that float32 rounding of an attacked model explains."""
+CONSTANTS = ("alpha", "alpha_separate", "alpha_joint", "rho", "beta")
 Box: TypeAlias = Sequence[Any]
 """Lower and upper corner of a box of environments."""
 
 
-class Refuted(Exception):
-    """A claim is not proved; the message names it."""
+@dataclass(frozen=True, kw_only=True)
+class Claims:
+    """Constants proved in the 2-norm, with their witnesses.
 
-
-class Claims(NamedTuple):
-    """The proved part of a certificate; attributes as in `Certificate`."""
+    Attributes:
+        scope: the environments, and how all of them are covered.
+        alpha: contraction factor of a step, |F(z) − F(z')| ≤ α |z − z'| for all z, z',
+            u and all e of the scope: the smaller of the next two.
+        alpha_separate: ρ + β.
+        alpha_joint: of z ↦ A(e) z + r(z; u, e) as one map.
+        rho: sup_e ||A(e)||.
+        beta: Lipschitz constant of r in z.
+        lipschitz: Lipschitz constants of the decoder's outputs "position" [m], "yaw"
+            [rad], both ("decoder") and of "body".
+        witnesses: multipliers of all proofs; a check needs no search.
+    """
 
     scope: str
     alpha: float
@@ -52,31 +67,31 @@ def require_claims(claims: Claims, weights: Exported, box: Box) -> None:
     """Check every claim in the 2-norm from its witness.
 
     Raises:
-        Refuted: names the first claim that does not follow.
+        CertificationRefused: names the first claim that does not follow.
     """
-    names = ("alpha", "alpha_separate", "alpha_joint", "rho", "beta")
-    constants = {name: getattr(claims, name) for name in names} | claims.lipschitz
+    constants = {name: getattr(claims, name) for name in CONSTANTS} | claims.lipschitz
     for name, value in constants.items():
         # NaN compares false, so it is refused here as well
         if not (isinstance(value, int | float) and 0 <= value < math.inf):
-            raise Refuted(f"{name} is not a bound: {value!r}")
+            raise CertificationRefused(f"{name} is not a bound: {value!r}")
     linear, networks = readouts(weights), decoders(weights)
     # Exactly these outputs: a missing one would be unbounded, another one meaningless.
     if set(claims.lipschitz) != {*linear, *networks}:
         expected = ", ".join((*linear, *networks))
         actual = ", ".join(map(str, claims.lipschitz))
-        raise Refuted(f"lipschitz must be of {expected}, got {actual}")
-    _require_box(box)
-    witnesses = {name: _arrays(value) for name, value in claims.witnesses.items()}
-    vertices = list(weights.operators.vertices)
+        raise CertificationRefused(f"lipschitz must be of {expected}, got {actual}")
+    require_box("env_box", box)
+    witness, vertices = claims.witnesses, list(weights.operators.vertices)
+    residual = vectors(witness["residual"])
+    joint = [vectors(each) for each in witness["joint"]]
     # Operators alone, without a network: no multipliers at any vertex.
     none = [()] * len(vertices)
     checks = {
-        "beta": _bounded(weights.residual, witnesses["residual"], claims.beta),
+        "beta": _bounded(weights.residual, residual, claims.beta),
         "rho": check_vertices((), none, claims.rho, vertices),
         "scope": claims.scope == hull_scope(weights),
         "alpha_joint": check_vertices(
-            weights.residual, witnesses["joint"], claims.alpha_joint, vertices
+            weights.residual, joint, claims.alpha_joint, vertices
         ),
         # Equal, not at most: these two are arithmetic on the numbers that were proved.
         "alpha_separate": claims.alpha_separate == claims.rho + claims.beta,
@@ -87,19 +102,24 @@ def require_claims(claims: Claims, weights: Exported, box: Box) -> None:
         # A read-out of zeros has the constant 0, which no strict inequality proves.
         checks[name] = not np.any(rows) or check_witness((), (), bound, rows)
     for name, network in networks.items():
-        checks[name] = _bounded(network, witnesses[name], claims.lipschitz[name])
+        checks[name] = _bounded(network, vectors(witness[name]), claims.lipschitz[name])
     for name, holds in checks.items():
         if not holds:
-            raise Refuted(f"{name} does not follow from its witness")
+            raise CertificationRefused(f"{name} does not follow from its witness")
 
 
-def _require_box(box: Box) -> None:
-    """Refuse a box that is not finite, or reversed."""
-    corners = np.asarray(box, dtype=np.float64)
-    # Finite: an infinite box would promise what no attack has looked at.
-    pair = corners.ndim == 2 and len(corners) == 2 and np.all(np.isfinite(corners))
-    if not pair or not np.all(corners[0] <= corners[1]):
-        raise Refuted(f"env_box must be a lower and an upper corner, got {box!r}")
+def require_box(name: str, box: Box) -> np.ndarray:
+    """Return the corners of a box; refuse one that is not finite, or reversed."""
+    corners = np.asarray(box)
+    pair = corners.dtype.kind in "if" and corners.ndim == 2 and len(corners) == 2
+    # Finite: an infinite box would promise what no attack has looked at. Equal corners
+    # are allowed, since a condition may be constant.
+    finite = pair and np.all(np.isfinite(corners))
+    if not finite or not np.all(corners[0] <= corners[1]):
+        raise CertificationRefused(
+            f"{name} must be a lower and an upper corner, got {box!r}"
+        )
+    return corners
 
 
 def _bounded(
@@ -126,13 +146,10 @@ def readouts(weights: Exported) -> dict[str, Matrix]:
     With a decoder for the pose: the body state. Without one (along a path): e_y [m],
     e_ψ [rad], and the rest of the body state.
     """
+    rows = weights.readout
     if weights.decoder:
-        return {"body": weights.readout}
-    return {
-        "position": weights.readout[:1],
-        "yaw": weights.readout[1:2],
-        "body": weights.readout[2:],
-    }
+        return {"body": rows}
+    return {"position": rows[:1], "yaw": rows[1:2], "body": rows[2:]}
 
 
 def decoders(weights: Exported) -> dict[str, list[Matrix]]:
@@ -140,38 +157,26 @@ def decoders(weights: Exported) -> dict[str, list[Matrix]]:
     if not weights.decoder:
         return {}
     *hidden, last = weights.decoder
-    return {
-        # Rows of the last layer: each output is a
-        # network of its own with the same layers.
-        "position": [*hidden, last[:2]],
-        "yaw": [*hidden, last[2:]],
-        "decoder": [*hidden, last],
-    }
+    # Rows of the last layer: each output is a network of its own with the same layers.
+    parts = {"position": last[:2], "yaw": last[2:], "decoder": last}
+    return {name: [*hidden, rows] for name, rows in parts.items()}
 
 
-def _arrays(witness: Any) -> Any:
-    """Convert multipliers from JSON: vectors, or a list of vectors at each vertex."""
-    if witness and all(isinstance(part, list) for part in witness):
-        entries = [entry for part in witness for entry in part]
-        # Lists in lists in lists: the multipliers of each vertex, one level deeper.
-        if all(isinstance(entry, list) for entry in entries):
-            return [_arrays(part) for part in witness]
+def attack_limits(claims: Claims, weights: Exported) -> dict[str, float]:
+    """Return the proved bound behind each attack, by name of the attack."""
+    limits = {"residual_slopes": claims.beta, "transport": 1.0, **claims.lipschitz}
+    limits |= {f"{name}_slopes": claims.lipschitz[name] for name in decoders(weights)}
+    return limits | {"step": claims.alpha, "step_slopes": claims.alpha}
+
+
+def vectors(witness: Any) -> list[Vector]:
+    """Read the multipliers of one network from JSON values."""
     return [np.asarray(part, dtype=np.float64) for part in witness]
 
 
-def witness_document(metric: Matrix, joint: list[list[Vector]]) -> dict[str, Any]:
-    """Return P and the multipliers of every vertex as JSON values."""
-    listed = [[part.tolist() for part in vertex] for vertex in joint]
-    return {"metric": metric.tolist(), "joint": listed}
-
-
-def read_witness(witness: Mapping[str, Any]) -> tuple[Matrix, list[list[Vector]]]:
-    """Read P and the multipliers of every vertex from JSON values."""
-    joint = [
-        [np.asarray(part, dtype=np.float64) for part in vertex]
-        for vertex in witness["joint"]
-    ]
-    return np.asarray(witness["metric"], dtype=np.float64), joint
+def listed(witness: Any) -> Any:
+    """Return arrays in nested lists as JSON values."""
+    return jax.tree.map(lambda part: np.asarray(part, np.float64).tolist(), witness)
 
 
 class OutputMetric(NamedTuple):
@@ -196,11 +201,9 @@ class OutputMetric(NamedTuple):
 
     def document(self) -> dict[str, Any]:
         """Return the claim as JSON values."""
-        return {
-            "alpha": self.alpha,
-            "lipschitz": self.lipschitz,
-            "witness": witness_document(self.metric, self.joint),
-        }
+        witness = {"metric": self.metric, "joint": self.joint}
+        constants = {"alpha": self.alpha, "lipschitz": self.lipschitz}
+        return constants | {"witness": listed(witness)}
 
     @classmethod
     def from_document(cls, document: Mapping[str, Any]) -> OutputMetric:
@@ -211,8 +214,14 @@ class OutputMetric(NamedTuple):
             TypeError: a value is of another type.
             ValueError: a value is not a number, or an array is ragged.
         """
-        witness = read_witness(document["witness"])
+        witness = _metric_witness(document["witness"])
         return cls(document["alpha"], document["lipschitz"], *witness)
+
+
+def _metric_witness(witness: Mapping[str, Any]) -> tuple[Matrix, list[list[Vector]]]:
+    """Read P and the multipliers of every vertex from JSON values."""
+    joint = [vectors(each) for each in witness["joint"]]
+    return np.asarray(witness["metric"], dtype=np.float64), joint
 
 
 def keeps_metrics(weights: Exported) -> bool:
@@ -227,25 +236,42 @@ def require_output_metric(name: str, claim: OutputMetric, weights: Exported) -> 
     """Check both constants from P and the multipliers, without a search.
 
     Raises:
-        Refuted: names the constant that does not follow.
+        CertificationRefused: names the constant that does not follow.
     """
     # With a decoder the pose is no output of z, and no metric is about it.
     if name not in OUTPUTS or not keeps_metrics(weights) or weights.decoder:
-        raise Refuted(f"outputs.{name}: this model has no metric of an output")
+        raise CertificationRefused(f"outputs.{name}: this model has no such metric")
     for constant in ("alpha", "lipschitz"):
         value = getattr(claim, constant)
         if not (isinstance(value, float) and 0 < value < math.inf):
-            raise Refuted(f"outputs.{name}.{constant} is not a bound: {value!r}")
+            raise CertificationRefused(
+                f"outputs.{name}.{constant} is not a bound: {value!r}"
+            )
     vertices = weights.operators.vertices
     # Sizes first: the core multiplies matrices and would raise on others.
-    if claim.metric.shape != vertices.shape[1:] or len(claim.joint) != len(vertices):
-        raise Refuted(f"outputs.{name}.witness is of another size than the weights")
-    if not claim.alpha < 1.0 or not check_vertices(
-        weights.residual, claim.joint, claim.alpha, list(vertices), claim.metric
-    ):
-        raise Refuted(f"outputs.{name}.alpha does not follow from its witness")
-    if not reads_within(readouts(weights)[name], claim.lipschitz, claim.metric):
-        raise Refuted(f"outputs.{name}.lipschitz does not follow from its witness")
+    if claim.metric.shape != vertices.shape[1:]:
+        raise CertificationRefused(
+            f"outputs.{name}.witness is of another size than the weights"
+        )
+    checks = {
+        "alpha": claim.alpha < 1.0 and contracts(claim, weights),
+        "lipschitz": reads_within(
+            readouts(weights)[name], claim.lipschitz, claim.metric
+        ),
+    }
+    for constant, holds in checks.items():
+        if not holds:
+            raise CertificationRefused(
+                f"outputs.{name}.{constant} does not follow from its witness"
+            )
+
+
+def contracts(claim: OutputMetric | LyapunovClaim, weights: Exported) -> bool:
+    """Check |F(z) − F(z')|_P ≤ α |z − z'|_P at every vertex, by the trusted core."""
+    vertices = list(weights.operators.vertices)
+    return check_vertices(
+        weights.residual, claim.joint, claim.alpha, vertices, claim.metric
+    )
 
 
 @np.errstate(over="ignore", invalid="ignore")  # the core refuses NaN and infinity
@@ -295,7 +321,7 @@ class LyapunovClaim(NamedTuple):
             "alpha": self.alpha,
             "c_1": constant,
             "c_2": constant,
-            "witness": witness_document(self.metric, self.joint),
+            "witness": listed({"metric": self.metric, "joint": self.joint}),
         }
 
 
@@ -307,24 +333,28 @@ def require_lyapunov(part: Mapping[str, Any], weights: Exported) -> None:
         weights: explicit weights.
 
     Raises:
-        Refuted: names what does not follow.
+        CertificationRefused: names what does not follow.
     """
     # A reason and nothing else: a document cannot hide a false claim beside one.
     if isinstance(part.get("reason"), str) and len(part) == 1:
         return
-    witness = read_witness(part["witness"])
+    witness = _metric_witness(part["witness"])
     claim = LyapunovClaim(part["rho"], part["condition"], part["alpha"], *witness)
     vertices = list(weights.operators.vertices)
     constants = all(isinstance(value, float) for value in claim[:3])
     fits = claim.metric.shape == vertices[0].shape
     if not (keeps_metrics(weights) and constants and fits):
-        raise Refuted("lyapunov is not a claim about these operators")
-    if not check_metric(claim.metric, vertices, claim.rho, claim.condition):
-        raise Refuted("lyapunov: rho or condition does not follow from its witness")
-    if not check_vertices(
-        weights.residual, claim.joint, claim.alpha, vertices, claim.metric
-    ):
-        raise Refuted("lyapunov: alpha does not follow from its witness")
-    # Compared as a whole, so that no further key can state an unproved constant.
-    if dict(part) != claim.document() | {"witness": part["witness"]}:
-        raise Refuted("lyapunov: c_1 or c_2 is not the root of the condition")
+        raise CertificationRefused("lyapunov is not a claim about these operators")
+    checks = {
+        "rho or condition": check_metric(
+            claim.metric, vertices, claim.rho, claim.condition
+        ),
+        "alpha": contracts(claim, weights),
+        # Compared as a whole, so that no further key can state an unproved constant.
+        "c_1 or c_2": dict(part) == claim.document() | {"witness": part["witness"]},
+    }
+    for name, holds in checks.items():
+        if not holds:
+            raise CertificationRefused(
+                f"lyapunov: {name} does not follow from its witness"
+            )

@@ -1,7 +1,12 @@
-"""Search for the metric of an output in float64 by L-BFGS, without a proof."""
+"""Search for metrics P, without a proof: of all operators together, and of an output.
+
+The paper's semidefinite program (cvxpy with clarabel) proposes a common Lyapunov matrix
+of least condition, L-BFGS a metric for each output. The trusted core decides.
+"""
 
 from __future__ import annotations
 
+import warnings
 from collections.abc import Callable, Sequence
 from functools import partial
 from itertools import pairwise
@@ -11,33 +16,155 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
-from scipy.linalg import cho_solve, eigh
 from scipy.optimize import minimize
 
 from sfkd_jax.certification._claims import (
     COMPILATION_SLACK,
+    LyapunovClaim,
     OutputMetric,
-    Refuted,
+    contracts,
+    keeps_metrics,
     reads_within,
 )
-from sfkd_jax.certification._core import Matrix, Vector, check_vertices, witness_matrix
-from sfkd_jax.certification._weights import Exported
+from sfkd_jax.certification._core import Matrix, Vector, check_metric
+from sfkd_jax.certification._search import INFEASIBLE, SLACKS, joint_bound, reduced
+from sfkd_jax.certification._weights import CertificationRefused, Exported
+from sfkd_jax.types import Polytope
 
+MARGIN = 1e-6
+"""Relative tightening of constraints, which solvers may violate slightly."""
+SHARES = (0.5, 0.75, 0.9)
+"""Rates that are tried, between the largest spectral radius of a vertex (0), below
+which there is no P, and the largest 2-norm (1), at which P = I.
+"""
+MISSING = (
+    "no Lyapunov matrix: cvxpy or clarabel is not installed "
+    "(pip install 'sfkd_jax[certify]')"
+)
 SHARPNESS = ((16, 40), (64, 60), (256, 100))
 """Exponents of the p-norms that smooth a maximum, with L-BFGS iterations for each."""
-INFEASIBLE = 1e3
-"""Value of the logarithmic objective where nothing is proved."""
-SLACKS = (1e-9, 1e-7, 1e-5, 1e-3)
 RUNS = 8
 """Exponent of the power mean over runs, a smooth stand-in for a high quantile."""
+
+
+def prove_lyapunov(weights: Exported) -> LyapunovClaim:
+    """Solve the program at the smallest of the `SHARES` that has an accepted answer.
+
+    Args:
+        weights: explicit, float64, finite.
+
+    Raises:
+        CertificationRefused: no solver is installed, the model admits no metric but I,
+            or no answer was accepted; gives the reason.
+    """
+    # A rotation on a switch of e keeps no ellipsoid, only the ball.
+    if not keeps_metrics(weights):
+        raise CertificationRefused(
+            "P = I is the only metric that the transport keeps: c_1 = c_2 = 1"
+        )
+    vertices = list(weights.operators.vertices)
+    norm = max(np.linalg.norm(vertex, 2) for vertex in vertices)
+    # No P gives a rate below a spectral radius, by which the search is bounded.
+    radius = max(np.max(np.abs(np.linalg.eigvals(vertex))) for vertex in vertices)
+    # From the smallest rate up: the first accepted one has the best rate.
+    for share in SHARES:
+        metric = solve_metric(vertices, float(radius + share * (norm - radius)))
+        # A solver that reports success may still have violated a constraint
+        if metric is not None and (claim := _accepted_lyapunov(metric, weights)):
+            return claim
+    raise CertificationRefused(
+        "the solver found no common Lyapunov matrix that the core accepts"
+    )
+
+
+def solve_metric(operators: Sequence[Matrix], rate: float) -> Matrix | None:
+    """Return a common Lyapunov matrix of the smallest condition number by cvxpy.
+
+    Minimise κ over I ⪯ P ⪯ κ I such that A' P A ⪯ ρ² P for every operator A.
+
+    Args:
+        operators: the vertices.
+        rate: ρ.
+
+    Returns:
+        P, symmetric, or None if the solver returns no values. Its status is ignored.
+
+    Raises:
+        CertificationRefused: cvxpy or the solver is not installed.
+    """
+    try:
+        import cvxpy as cp  # an optional dependency
+    except ImportError:
+        raise CertificationRefused(MISSING) from None
+    if "CLARABEL" not in cp.installed_solvers():
+        raise CertificationRefused(MISSING)
+    identity = np.eye(len(operators[0]))
+    metric, condition = cp.Variable(identity.shape, symmetric=True), cp.Variable()
+    # I ⪯ P fixes the scale, which is free otherwise, and makes κ the condition.
+    bounds: list[Any] = [metric >> identity, condition * identity - metric >> 0]
+    decreases = [
+        # A little tighter than claimed, since solvers meet constraints only nearly.
+        (rate * (1 - MARGIN)) ** 2 * metric - a.T @ metric @ a >> 0
+        for a in operators
+    ]
+    problem = cp.Problem(cp.Minimize(condition), bounds + decreases)
+    try:
+        with warnings.catch_warnings():
+            # An inaccurate answer is judged by the core, not by a warning
+            warnings.simplefilter("ignore")
+            problem.solve(solver="CLARABEL")
+    except (cp.SolverError, ValueError, ArithmeticError):
+        return None
+    return None if metric.value is None else np.asarray(metric.value, np.float64)
+
+
+def _accepted_lyapunov(metric: Matrix, weights: Exported) -> LyapunovClaim | None:
+    """The smallest constants of a proposed P that the core accepts, or None."""
+    metric, vertices = np.asarray(metric, dtype=np.float64), weights.operators.vertices
+    if metric.shape != vertices.shape[1:] or not np.all(np.isfinite(metric)):
+        return None
+    # Symmetric before eigenvalues, which read one triangle only.
+    metric = 0.5 * (metric + metric.T)
+    values = np.linalg.eigvalsh(metric)
+    if not 0 < values[0] <= values[-1] < np.inf:
+        return None
+    metric /= values[0]  # scale is free, and λ_min = 1 is far from under- and overflow
+    step = _in_coordinates(weights, metric)
+    rate = max(np.linalg.norm(vertex, 2) for vertex in step.operators.vertices)
+    alpha, joint = joint_bound(step, weights.residual_multipliers)
+    # Rounding decides how little slack the core accepts; the smallest is kept.
+    for slack in SLACKS:
+        claim = LyapunovClaim(
+            rho=float(COMPILATION_SLACK * rate * (1 + slack)),
+            condition=float(values[-1] / values[0] * (1 + slack)),
+            alpha=float(alpha * (1 + slack)),
+            metric=metric,
+            joint=joint,
+        )
+        holds = check_metric(metric, list(vertices), claim.rho, claim.condition)
+        if claim.rho < 1.0 and holds and contracts(claim, weights):
+            return claim
+    return None
+
+
+def _in_coordinates(weights: Exported, metric: Matrix) -> Exported:
+    """The step in coordinates L'z with P = L L', in which |·|_P is the 2-norm."""
+    root = np.linalg.cholesky(metric).T
+    back = np.linalg.inv(root)
+    # The first weights read z and the last write it; hidden layers stay as they are.
+    residual = [*weights.residual]
+    if residual:
+        residual[0] = residual[0] @ back
+        residual[-1] = root @ residual[-1]
+    vertices = root @ weights.operators.vertices @ back
+    return weights._replace(operators=Polytope(vertices), residual=tuple(residual))
 
 
 def propose_metric(
     weights: Exported,
     rows: Matrix,
     gaps: Float[np.ndarray, "run worst rank"],
-    start: Sequence[Vector],
-    metric: Matrix | None = None,
+    start: Matrix | None = None,
 ) -> OutputMetric:
     """Minimise |C|_{P⁻¹} q(|d|_P) / (1 − α_P) over metrics P.
 
@@ -50,24 +177,24 @@ def propose_metric(
         weights: explicit, float64.
         rows: C, (output, rank).
         gaps: d of the worst steps of every run, not of the calibration split.
-        start: initial multipliers, equal at all vertices.
-        metric: the Lyapunov matrix of the operators; the search starts there if that
+        start: the Lyapunov matrix of the operators; the search starts there if that
             is better than I.
 
     Returns:
         The metric with the smallest constants that the trusted core accepts.
 
     Raises:
-        Refuted: no α below 1 was found.
+        CertificationRefused: no α below 1 was found.
     """
     vertices, rank = weights.operators.vertices, weights.operators.vertices.shape[-1]
+    multipliers = weights.residual_multipliers
     # Logarithms: multipliers stay positive in an unconstrained search.
-    logs = [np.log(np.concatenate(start))] * len(vertices) if start else [np.zeros(0)]
+    logs = [np.log(np.concatenate([*multipliers, []]))] * len(vertices)
     lower = np.tril_indices(rank)
     begins = [np.eye(rank)]
     # Scaled to the trace of I: both starts have entries of the same size.
-    if metric is not None:
-        begins.append(np.linalg.cholesky(metric * (rank / np.trace(metric))))
+    if start is not None:
+        begins.append(np.linalg.cholesky(start * (rank / np.trace(start))))
     candidates = [np.concatenate([begin[lower], *logs]) for begin in begins]
     # float64 for the search: near α = 1 float32 could not tell the metrics apart.
     with jax.enable_x64(True):
@@ -85,84 +212,51 @@ def propose_metric(
     # The scale is free: entries of about 1 keep the core's rounding errors small.
     scale = 2.0 / (np.trace(found) / rank + np.max(np.abs(found)))
     found *= scale
-    widths = np.cumsum([len(part) for part in start])[:-1]
-    logs = flat[len(lower[0]) :].reshape(len(vertices), -1)
+    widths = np.cumsum([len(part) for part in multipliers], dtype=int)[:-1]
+    each = flat[len(lower[0]) :].reshape(len(vertices), -1)
     # P and multipliers scale together, or the matrix inequality would be another.
-    joint = [np.split(scale * np.exp(part), widths) if start else [] for part in logs]
-    return _accepted(weights, rows, 0.5 * (found + found.T), joint)
+    joint = [
+        np.split(scale * np.exp(part), widths) if multipliers else [] for part in each
+    ]
+    return accepted_metric(weights, rows, 0.5 * (found + found.T), joint)
 
 
-def _accepted(
+def accepted_metric(
     weights: Exported, rows: Matrix, metric: Matrix, joint: list[list[Vector]]
 ) -> OutputMetric:
     """Return the smallest constants that the core accepts in this metric.
 
     Raises:
-        Refuted: there are none.
+        CertificationRefused: there are none.
     """
-    vertices = list(weights.operators.vertices)
-    rate = max(
-        _rate(weights.residual, part, vertex, metric)
-        for part, vertex in zip(joint, vertices, strict=True)
-    )
+    refusal = CertificationRefused("no metric below 1 was found for this output")
+    try:
+        step = _in_coordinates(weights, metric)
+    except np.linalg.LinAlgError:  # not positive definite
+        raise refusal from None
+    pairs = zip(joint, step.operators.vertices, strict=True)
+    squares = [reduced(step.residual, *pair)[0][-1] for pair in pairs]
     # |c|² in the metric P⁻¹, without the inverse of an ill-conditioned P.
     squared = rows @ np.linalg.solve(metric, rows.T)
-    gain = float(np.sqrt(np.max(np.linalg.eigvalsh(squared))))
+    sizes = np.sqrt([max(squares), np.max(np.linalg.eigvalsh(squared))])
     for slack in SLACKS:
-        alpha = float(COMPILATION_SLACK * rate * (1 + slack))
-        lipschitz = float(COMPILATION_SLACK * gain * (1 + slack))
+        alpha, lipschitz = map(float, COMPILATION_SLACK * sizes * (1 + slack))
+        claim = OutputMetric(alpha, lipschitz, metric, joint)
         # The core decides; the eigenvalues above are rounded.
-        proved = check_vertices(weights.residual, joint, alpha, vertices, metric)
-        if proved and alpha < 1.0 and reads_within(rows, lipschitz, metric):
-            return OutputMetric(alpha, lipschitz, metric, joint)
-    raise Refuted("no metric below 1 was found for this output")
-
-
-def _rate(
-    weights: Sequence[Matrix], joint: list[Vector], vertex: Matrix, metric: Matrix
-) -> float:
-    """α in this metric, not rigorous; infinity if the multipliers prove nothing."""
-    matrix, _ = witness_matrix(weights, joint, 0.0, vertex, metric)
-    rank = len(metric)
-    try:
-        root = np.linalg.cholesky(matrix[rank:, rank:])
-        hidden = cho_solve((root, True), matrix[rank:, :rank])
-        schur = matrix[rank:, :rank].T @ hidden - matrix[:rank, :rank]
-        return float(np.sqrt(eigh(schur, metric, eigvals_only=True)[-1]))
-    # Multipliers outside the cone: the hidden block is not positive definite.
-    except (np.linalg.LinAlgError, ValueError):
-        return float("inf")
+        reads = reads_within(rows, lipschitz, metric)
+        if alpha < 1.0 and reads and contracts(claim, weights):
+            return claim
+    raise refusal
 
 
 def _objective(
     weights: Exported, rows: Matrix, gaps: Any
 ) -> Callable[..., tuple[float, Vector]]:
     """Return (sharpness, flat (L, log λ)) ↦ (log radius, gradient) for scipy."""
-    operators = jnp.asarray(weights.operators.vertices)
-    rank, hidden = operators.shape[-1], sum(len(part) for part in weights.residual[:-1])
-    lower = jnp.tril_indices(rank)
-    read, disturbed = jnp.asarray(rows.T), jnp.asarray(gaps)
-
-    def value(flat: Array, sharpness: Array) -> Array:
-        # L itself, not P: any L gives P = L L' ⪰ 0 without a constraint.
-        factor = jnp.zeros((rank, rank)).at[lower].set(flat[: len(lower[0])])
-        logs = flat[len(lower[0]) :].reshape(len(operators), hidden)
-        each = jax.vmap(partial(_squares, weights.residual, factor))
-        # Away from 0: the root below has no gradient there.
-        squares = jnp.maximum(each(jnp.exp(logs), operators), 1e-12).reshape(-1)
-        alpha = jnp.sqrt(_power_mean(squares, sharpness, mean=False))
-        solved = jax.scipy.linalg.solve_triangular(factor, read, lower=True)
-        gain = jnp.linalg.norm(solved)
-        sizes = jnp.linalg.norm(disturbed @ factor, axis=-1)
-        # A smooth maximum over the worst steps of a run, sharp enough for five values.
-        worst = jax.vmap(lambda run: _power_mean(run, 32.0, mean=False))(sizes)
-        radius = jnp.log(gain * _power_mean(worst, RUNS, mean=True))
-        return radius - jnp.log(1.0 - alpha)
-
-    with_gradient = jax.jit(jax.value_and_grad(value))
+    given = weights.operators.vertices, weights.residual, rows.T, gaps
 
     def call(sharpness: int, flat: Vector) -> tuple[float, Vector]:
-        loss, gradient = with_gradient(jnp.asarray(flat), jnp.asarray(float(sharpness)))
+        loss, gradient = _log_radius(flat, float(sharpness), *given)
         # NaN of the Cholesky factor: outside the cone nothing is proved
         if not (np.isfinite(loss) and np.all(np.isfinite(gradient))):
             return INFEASIBLE, np.zeros_like(flat)
@@ -171,8 +265,31 @@ def _objective(
     return call
 
 
+@jax.jit  # one program for all outputs of a model
+@jax.value_and_grad
+def _log_radius(
+    flat: Array, sharpness: Array, operators: Array, weights: Any, read: Any, gaps: Any
+) -> Array:
+    """Logarithm of what `propose_metric` minimises, smoothed, of (L, log λ)."""
+    rank, lower = operators.shape[-1], np.tril_indices(operators.shape[-1])
+    # L itself, not P: any L gives P = L L' ⪰ 0 without a constraint.
+    factor = jnp.zeros((rank, rank)).at[lower].set(flat[: len(lower[0])])
+    logs = flat[len(lower[0]) :].reshape(len(operators), -1)
+    each = jax.vmap(partial(_squares, weights, factor))
+    # Away from 0: the root below has no gradient there.
+    squares = jnp.maximum(each(jnp.exp(logs), operators), 1e-12).reshape(-1)
+    alpha = jnp.sqrt(_power_mean(squares, sharpness, mean=False))
+    solved = jax.scipy.linalg.solve_triangular(factor, read, lower=True)
+    gain = jnp.linalg.norm(solved)
+    sizes = jnp.linalg.norm(gaps @ factor, axis=-1)
+    # A smooth maximum over the worst steps of a run, sharp enough for five values.
+    worst = jax.vmap(lambda run: _power_mean(run, 32.0, mean=False))(sizes)
+    radius = jnp.log(gain * _power_mean(worst, RUNS, mean=True))
+    return radius - jnp.log(1.0 - alpha)
+
+
 def _squares(
-    weights: Sequence[Matrix], factor: Array, multipliers: Array, operator: Array
+    weights: Sequence[Array], factor: Array, multipliers: Array, operator: Array
 ) -> Array:
     """Eigenvalues of A'A + X H⁻¹ X' in coordinates L'z; NaN if nothing is proved."""
     inverse = jax.scipy.linalg.solve_triangular(

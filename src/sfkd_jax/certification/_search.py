@@ -13,9 +13,9 @@ from scipy.optimize import minimize
 from sfkd_jax.certification._claims import (
     COMPILATION_SLACK,
     Claims,
-    Refuted,
     decoders,
     hull_scope,
+    listed,
     readouts,
 )
 from sfkd_jax.certification._core import (
@@ -25,7 +25,7 @@ from sfkd_jax.certification._core import (
     norm_upper,
     witness_matrix,
 )
-from sfkd_jax.certification._weights import Exported
+from sfkd_jax.certification._weights import CertificationRefused, Exported
 
 SCALES = np.geomspace(0.25, 4.0, 33)
 SLACKS = (1e-9, 1e-7, 1e-5, 1e-3)
@@ -42,13 +42,15 @@ def prove(weights: Exported) -> Claims:
         weights: explicit, float64, finite.
 
     Raises:
-        Refuted: no finite bound was found.
+        CertificationRefused: no finite bound was found.
     """
     bound, start = _best_multipliers(weights.residual, weights.residual_multipliers)
     # Another compilation may round the weights differently: the bound covers both.
     beta = COMPILATION_SLACK * bound
     if not np.isfinite(beta):
-        raise Refuted("no multipliers prove a Lipschitz bound of the residual")
+        raise CertificationRefused(
+            "no multipliers prove a Lipschitz bound of the residual"
+        )
     witnesses: dict[str, Any] = {"residual": start}
     norms = [norm_upper(vertex) for vertex in weights.operators.vertices]
     rho = COMPILATION_SLACK * max(norms)
@@ -61,7 +63,9 @@ def prove(weights: Exported) -> Claims:
         bound, witnesses[name] = _best_multipliers(network, weights.decoder_multipliers)
         lipschitz[name] = COMPILATION_SLACK * bound
     if not np.all(np.isfinite(list(lipschitz.values()))):
-        raise Refuted("no multipliers prove a Lipschitz bound of the decoder")
+        raise CertificationRefused(
+            "no multipliers prove a Lipschitz bound of the decoder"
+        )
     # The sum needs no search of its own, and is the fallback of the joint bound.
     separate = rho + beta
     return Claims(
@@ -72,20 +76,13 @@ def prove(weights: Exported) -> Claims:
         rho=rho,
         beta=beta,
         lipschitz=lipschitz,
-        witnesses={name: _listed(value) for name, value in witnesses.items()},
+        witnesses=listed(witnesses),
     )
-
-
-def residual_bound(weights: Exported) -> float:
-    """Return β with the multipliers of the model, without a search."""
-    if not weights.residual:
-        return 0.0
-    return rescaled(weights.residual, weights.residual_multipliers)[0]
 
 
 def joint_bound(
     weights: Exported, start: Sequence[Vector], *, iterations: int = 150
-) -> tuple[float, list[Sequence[Vector]]]:
+) -> tuple[float, list[list[Vector]]]:
     """Return α of z ↦ A z + r(z) as one map, and multipliers for each vertex.
 
     The vertices are searched one after another, each from the answer of the last.
@@ -97,14 +94,14 @@ def joint_bound(
     """
     bounds, witnesses = [], []
     for vertex in weights.operators.vertices:
-        # From the answer of the last vertex:
-        # operators are alike, and so are multipliers.
+        # From the answer of the last vertex: operators and multipliers are alike.
         start = propose_multipliers(
             weights.residual, start, vertex, iterations=iterations
         )
-        bound, start = rescaled(weights.residual, start, vertex)
+        bound, witness = rescaled(weights.residual, start, vertex)
         bounds.append(bound)
-        witnesses.append(start)
+        witnesses.append(witness)
+        start = witness
     # The worst vertex decides: e may be at any of them.
     return COMPILATION_SLACK * max(bounds), witnesses
 
@@ -157,7 +154,7 @@ def rescaled(
     # The bound is not invariant to a common factor of the multipliers.
     for scale in SCALES:
         scaled = [scale * np.asarray(part, dtype=np.float64) for part in multipliers]
-        eigenvalues, *_ = _reduced(weights, scaled, linear)
+        eigenvalues, *_ = reduced(weights, scaled, linear)
         guess = float(np.sqrt(np.max(eigenvalues)))
         for slack in SLACKS:
             bound = guess * (1 + slack)
@@ -204,7 +201,7 @@ def propose_multipliers(
 
     def objective(logs: Vector, sharpness: int) -> tuple[float, Vector]:
         multipliers = np.split(np.exp(logs), widths)
-        eigenvalues, vectors, hidden = _reduced(weights, multipliers, linear)
+        eigenvalues, vectors, hidden = reduced(weights, multipliers, linear)
         if not np.all(np.isfinite(eigenvalues)):
             return INFEASIBLE, np.zeros_like(logs)
         largest = eigenvalues[-1]
@@ -243,13 +240,13 @@ def _starting_point(
     ]
 
 
-def _reduced(
+def reduced(
     weights: Sequence[Matrix], multipliers: Sequence[Vector], linear: Matrix | None
 ) -> tuple[Vector, Matrix, list[Matrix]]:
-    """Eigenvalues (ascending) and vectors of C'S⁻¹C − K, and y; not rigorous."""
+    """Return eigenvalues (ascending) and vectors of C'S⁻¹C − K, and y; not rigorous."""
     matrix, _ = witness_matrix(weights, multipliers, 0.0, linear)
-    widths = np.cumsum([len(part) for part in multipliers])
-    inputs = len(matrix) - widths[-1]
+    widths = np.cumsum([len(part) for part in multipliers], dtype=int)
+    inputs = len(matrix) - sum(len(part) for part in multipliers)
     coupling, lower = matrix[inputs:, :inputs], matrix[inputs:, inputs:]
     infeasible = np.full(inputs, np.inf), np.eye(inputs), []
     if not np.all(np.isfinite(matrix)):
@@ -262,10 +259,3 @@ def _reduced(
     # Rounding makes the Schur complement slightly asymmetric.
     eigenvalues, vectors = np.linalg.eigh(0.5 * (schur + schur.T))
     return eigenvalues, vectors, np.split(-hidden @ vectors, widths[:-1])
-
-
-def _listed(witness: Any) -> Any:
-    """Return a witness as nested lists of floats for JSON."""
-    if isinstance(witness, (list, tuple)):
-        return [_listed(part) for part in witness]
-    return np.asarray(witness, dtype=np.float64).tolist()

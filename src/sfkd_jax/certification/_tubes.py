@@ -3,37 +3,28 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from functools import partial
 from typing import Any, NamedTuple
 
-import jax
-import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float
+from jaxtyping import Float
 
-from sfkd_jax.certification._calibration import conformal_quantile, coverage_interval
-from sfkd_jax.certification._claims import (
-    OUTPUTS,
-    LyapunovClaim,
-    OutputMetric,
-    Refuted,
-    keeps_metrics,
-    readouts,
+from sfkd_jax.certification._claims import OUTPUTS, OutputMetric, readouts
+from sfkd_jax.certification._measured import (
+    Residuals,
+    conformal_bounds,
+    conformal_quantile,
+    coverage,
+    coverage_interval,
 )
 from sfkd_jax.certification._metrics import propose_metric
-from sfkd_jax.certification._weights import Exported, one_thread
-from sfkd_jax.geometry import HEADING, LATERAL
-from sfkd_jax.rollout import defects, in_batches
-from sfkd_jax.types import BODY, Model, Params, Trajectory
+from sfkd_jax.certification._weights import (
+    CertificationRefused,
+    Exported,
+    one_thread,
+)
 
-BATCH = 50
-"""Runs in a batch."""
 WORST = 5
 """Steps of every validation run that a metric is optimised for."""
-FORMS = ("asymptotic", "vehicle_to_nominal")
-"""Bounds on |y − ŷ| of an output, from the largest disturbance alone, and from the
-sequence of all disturbances of a run.
-"""
 
 
 def latent_tube(
@@ -57,106 +48,86 @@ def latent_tube(
     return np.asarray(radii)
 
 
-def path_tube(
-    latent: Float[np.ndarray, " horizon"],
-    *,
-    alpha: float,
-    lipschitz: Mapping[str, float],
-    residual: Mapping[str, float],
-) -> dict[str, list[float]]:
-    """Return radii of e_y [m], e_ψ [rad] and body state along a path for an exact z_0.
-
-        |e_i,k| ≤ L_i α R_{k−1} + ε_i,   k = 1 … T
-
-    Position and heading are decoded from z, so no error accumulates over the horizon.
-
-    Args:
-        latent: R_1 … R_T.
-        alpha: contraction factor.
-        lipschitz: L of the outputs, by "position", "yaw", "body".
-        residual: ε, one-step errors of the outputs at the true latent, by the same
-            names.
-    """
-    # R_0 = 0: a prediction starts at the observed state.
-    before = np.concatenate([[0.0], latent[:-1]])
-    kinds = {"position_m": "position", "yaw_rad": "yaw", "body": "body"}
-    return {
-        name: (lipschitz[kind] * alpha * before + residual[kind]).tolist()
-        for name, kind in kinds.items()
-    }
-
-
-def ultimate_tube(
-    ultimate: float,
-    *,
-    alpha: float,
-    lipschitz: Mapping[str, float],
-    residual: Mapping[str, float],
-) -> dict[str, float]:
-    """Return the radii of `path_tube` for an infinite horizon.
-
-    Args:
-        ultimate: d̄/(1 − α), the limit of R_k.
-        alpha: contraction factor.
-        lipschitz: L of the outputs, by "position", "yaw", "body".
-        residual: ε, one-step errors of the outputs at the true latent, by the same
-            names.
-    """
-    # Two entries: `path_tube` reads the one before, and both are the limit.
-    limits = np.asarray([ultimate, ultimate])
-    radii = path_tube(limits, alpha=alpha, lipschitz=lipschitz, residual=residual)
-    return {name: values[-1] for name, values in radii.items()}
-
-
 def physical_tube(
     latent: Float[np.ndarray, " horizon"],
     *,
     alpha: float,
     lipschitz: Mapping[str, float],
     residual: Mapping[str, float],
-    largest_increment: float,
+    largest_increment: float | None,
 ) -> dict[str, list[float]]:
     """Return radii of position [m], yaw [rad] and body state for an exact z_0.
 
-    The pose is a sum of increments on SE(2), so its error is bounded by finite sums and
-    not by a contraction. For k = 1 … T and sums over j = 0 … k − 1,
+    Along a path all are decoded from z, so that no error accumulates:
+
+        |e_i,k| ≤ L_i α R_{k−1} + ε_i,   k = 1 … T
+
+    Otherwise the pose is a sum of increments on SE(2), and its error is bounded by
+    finite sums over j = 0 … k − 1 instead:
 
         |e_yaw,k| ≤ Σ_j (L_yaw R_j + ε_yaw)
         |e_p,k|   ≤ Σ_j (L_p R_j + ε_p + |dp| |e_yaw,j|)
-        |e_s,k|   ≤ L_s α R_{k−1} + ε_s
 
     Args:
         latent: R_1 … R_T.
         alpha: contraction factor.
-        lipschitz: L of the decoder's outputs, by "position", "yaw", "body".
-        residual: ε, one-step errors of the decoder at the true latent, by the same
-            names.
-        largest_increment: |dp|, the longest step [m].
+        lipschitz: L of the outputs, by "position", "yaw", "body".
+        residual: ε, one-step errors at the true latent, by the same names.
+        largest_increment: |dp|, the longest step [m]; None along a path.
     """
+    # R_0 = 0: a prediction starts at the observed state.
     before = np.concatenate([[0.0], latent[:-1]])
-    yaw = np.cumsum(lipschitz["yaw"] * before + residual["yaw"])
-    # An error of yaw moves only the increments that come after it.
-    turned = np.concatenate([[0.0], yaw[:-1]])
-    increments = lipschitz["position"] * before + residual["position"]
-    position = np.cumsum(increments + largest_increment * turned)
-    body = lipschitz["body"] * alpha * before + residual["body"]
-    return {
-        "position_m": position.tolist(),
-        "yaw_rad": yaw.tolist(),
-        "body": body.tolist(),
-    }
+    position, yaw, body = (
+        lipschitz[kind] * alpha * before + residual[kind]
+        for kind in ("position", "yaw", "body")
+    )
+    if largest_increment is not None:
+        yaw = np.cumsum(lipschitz["yaw"] * before + residual["yaw"])
+        # An error of yaw moves only the increments that come after it.
+        turned = np.concatenate([[0.0], yaw[:-1]])
+        increments = lipschitz["position"] * before + residual["position"]
+        position = np.cumsum(increments + largest_increment * turned)
+    radii = {"position_m": position, "yaw_rad": yaw, "body": body}
+    return {name: radius.tolist() for name, radius in radii.items()}
 
 
-class Residuals(NamedTuple):
-    """One-step prediction errors of every step of a run, (run, time, …).
+def tubes(
+    *,
+    alpha: float,
+    lipschitz: Mapping[str, float],
+    one_step: Mapping[str, float],
+    horizon: int,
+    largest_increment: float | None,
+) -> dict[str, Any]:
+    """Return the tubes of a document: up to the horizon, and their limit.
 
-    Attributes:
-        gaps: d_k in latent coordinates.
-        outputs: |y_{k+1} − C F(z_k)| of e_y [m] and e_ψ [rad].
+    Args:
+        alpha: α.
+        lipschitz: L of the outputs.
+        one_step: measured bounds, by "latent", "position", "yaw" and "body".
+        horizon: T [steps].
+        largest_increment: as in `physical_tube`.
     """
-
-    gaps: Float[np.ndarray, "run time rank"]
-    outputs: Float[np.ndarray, "run time output"]
+    latent = latent_tube(alpha, one_step["latent"], horizon)
+    # R_k → d̄ / (1 − α), the fixed point of R ↦ α R + d̄.
+    ultimate, limit = one_step["latent"] / (1 - alpha), None
+    constants: dict[str, Any] = {
+        "alpha": alpha,
+        "lipschitz": lipschitz,
+        "residual": one_step,
+        "largest_increment": largest_increment,
+    }
+    # With increments the pose drifts; without them there is a limit of every radius.
+    if largest_increment is None:
+        both = physical_tube(np.full(2, ultimate), **constants)
+        limit = {name: radius[-1] for name, radius in both.items()}
+    return {
+        "latent": latent.tolist(),
+        "physical": physical_tube(latent, **constants),
+        "ultimate": ultimate,
+        "asymptotic": limit,
+        "largest_increment_m": largest_increment,
+    }
 
 
 class Radii(NamedTuple):
@@ -172,31 +143,7 @@ class Radii(NamedTuple):
     vehicle_to_nominal: Float[np.ndarray, " run"]
 
 
-def residuals(model: Model, params: Params, runs: Trajectory) -> Residuals:
-    """Measure the error of every step from its true state, including switches of e.
-
-    Args:
-        model: a model along a path.
-        params: folded parameters.
-        runs: a batch of trajectories.
-    """
-    gaps, outputs = _residuals(model, params, runs)
-    return Residuals(
-        np.asarray(gaps, dtype=np.float64), np.asarray(outputs, dtype=np.float64)
-    )
-
-
-@partial(jax.jit, static_argnums=0)
-def _residuals(model: Model, params: Params, runs: Trajectory) -> tuple[Array, Array]:
-    """`residuals` on the device."""
-
-    def one(run: Trajectory) -> tuple[Array, Array]:
-        gap, predicted = defects(model, params, run)
-        # Path states have their outputs in the body, without a pose.
-        miss = (predicted - run.states[1:])[:, BODY]
-        return gap, jnp.abs(miss[:, jnp.asarray([LATERAL, HEADING])])
-
-    return in_batches(one, runs, size=BATCH)
+FORMS = Radii._fields
 
 
 def radii(
@@ -234,74 +181,125 @@ def radii(
 
 
 def output_tubes(
-    model: Model,
-    params: Params,
     weights: Exported,
+    validation: Residuals,
+    calibration: Residuals,
+    test: Residuals,
     *,
-    validation: Trajectory,
-    calibration: Trajectory,
-    test: Trajectory,
     level: float,
-    lyapunov: LyapunovClaim | None = None,
+    start: np.ndarray | None = None,
 ) -> dict[str, dict[str, Any]]:
     """Prove a metric for each of `OUTPUTS` and calibrate a bound on |y − ŷ| with it.
 
     Args:
-        model: any model.
-        params: folded parameters.
-        weights: explicit weights of the same model.
-        validation: runs that the metric is optimised for.
-        calibration: runs that set the bounds.
-        test: runs on which coverage is counted.
+        weights: explicit weights of a model whose metrics last.
+        validation: of the runs that the metric is optimised for.
+        calibration: of the runs that set the bounds.
+        test: of the runs on which coverage is counted.
         level: of each bound, for a whole new run.
-        lyapunov: common Lyapunov function of the operators, to start from.
+        start: common Lyapunov matrix of the operators, to start from.
 
     Returns:
-        α, L, their witness and the tube by output; empty if the model has no metrics.
+        α, L, their witness and the tube by output; empty if there is no metric for one.
     """
-    if not (model.along_path and keeps_metrics(weights)):
-        return {}
-    # Three splits: the metric is chosen on one, or its bound would be optimistic.
-    reference, measured, unseen = (
-        residuals(model, params, part) for part in (validation, calibration, test)
-    )
-    worst = _worst_gaps(reference, WORST)
     documents = {}
     for name in OUTPUTS:
+        rows, gaps = readouts(weights)[name], worst_gaps(validation)
         try:
             with one_thread():
-                claim = propose_metric(
-                    weights,
-                    readouts(weights)[name],
-                    worst,
-                    weights.residual_multipliers,
-                    lyapunov and lyapunov.metric,
-                )
+                claim = propose_metric(weights, rows, gaps, start)
         # Both outputs or none: a corridor needs position and heading.
-        except Refuted:
+        except CertificationRefused:
             return {}
-        calibrated, held_out = (
-            radii(part, name, claim)._asdict() for part in (measured, unseen)
-        )
-        bounds = {form: conformal_quantile(calibrated[form], level) for form in FORMS}
-        shares = {
-            form: float(np.mean(held_out[form] <= bounds[form])) for form in FORMS
-        }
-        count = len(unseen.gaps)
-        documents[name] = claim.document() | {
-            "tube": bounds,
-            "coverage": shares,
-            "coverage_ci95": {
-                form: coverage_interval(shares[form], count) for form in FORMS
-            },
-            "coverage_runs": count,
-        }
+        scores, unseen = (radii(part, name, claim) for part in (calibration, test))
+        bounds = [conformal_quantile(part, level) for part in scores]
+        pairs = zip(unseen, bounds, strict=True)
+        shares = [float(np.mean(part <= bound)) for part, bound in pairs]
+        count = len(test.gaps)
+        intervals = [coverage_interval(share, count) for share in shares]
+        columns = {"tube": bounds, "coverage": shares, "coverage_ci95": intervals}
+        documents[name] = claim.document() | {"coverage_runs": count}
+        for column, values in columns.items():
+            documents[name][column] = dict(zip(FORMS, values, strict=True))
     return documents
 
 
-def _worst_gaps(measured: Residuals, count: int) -> Float[np.ndarray, "run worst rank"]:
-    """Return d of the `count` steps of every run with the largest |d|."""
+def worst_gaps(measured: Residuals) -> Float[np.ndarray, "run worst rank"]:
+    """Return d of the `WORST` steps of every run with the largest |d|."""
     sizes = np.linalg.norm(measured.gaps, axis=-1)
     # The worst steps alone decide the radius, and the search takes few of them.
-    order = np.argsort(sizes, axis=1)[:, -count:]
+    order = np.argsort(sizes, axis=1)[:, -WORST:]
     return np.take_along_axis(measured.gaps, order[..., None], axis=1)
+
+
+JOINT = ("vehicle_to_nominal_position", "vehicle_to_nominal_yaw", "nominal")
+"""Measured bounds of a corridor that hold jointly at the level: distances of vehicle
+and nominal model in e_y [m] and e_ψ [rad], and |ê_y| of the nominal model [m].
+"""
+ALONE = ("asymptotic_position", "asymptotic_yaw")
+"""Bounds from the largest disturbance alone, which hold one by one."""
+
+
+def run_scores(
+    measured: Residuals,
+    claims: Mapping[str, OutputMetric],
+    nominal: Float[np.ndarray, " run"],
+    initial: Mapping[str, Float[np.ndarray, " run"]],
+) -> dict[str, Float[np.ndarray, " run"]]:
+    """Return the smallest bounds that would have held on each run, by name.
+
+    Args:
+        measured: residuals of the runs.
+        claims: proved metric of every output.
+        nominal: largest |ê_y| of the nominal model [m].
+        initial: |z_0 − ẑ_0|_P in the metric of every output.
+    """
+    scores = {"nominal": nominal}
+    for name, claim in claims.items():
+        bounds = radii(measured, name, claim, initial[name])._asdict()
+        scores |= {f"{form}_{name}": bounds[form] for form in FORMS}
+    return scores
+
+
+def calibrate_corridor(
+    reference: Mapping[str, Float[np.ndarray, " other"]],
+    scores: Mapping[str, Float[np.ndarray, " run"]],
+    *,
+    level: float,
+) -> dict[str, float]:
+    """Return split-conformal bounds for a new run, by name.
+
+    The bounds in `JOINT` hold together with probability at least `level`, the others
+    one by one. The lateral tube decides the joint score: heading and nominal corridor
+    exceed their units a tenth as often.
+
+    Args:
+        reference: scores of the runs that fix the units.
+        scores: scores of the calibration runs.
+        level: 1 − δ.
+
+    Raises:
+        ValueError: too few runs for the level, or scores that are not finite.
+    """
+    joint = conformal_bounds(_joint(reference), _joint(scores), level=level)
+    alone = {name: conformal_quantile(scores[name], level) for name in ALONE}
+    return dict(zip(JOINT, joint.tolist(), strict=True)) | alone
+
+
+def corridor_coverage(
+    bounds: Mapping[str, float], scores: Mapping[str, Float[np.ndarray, " run"]]
+) -> dict[str, Any]:
+    """Return the share of runs on which all bounds in `JOINT` held.
+
+    Args:
+        bounds: from `calibrate_corridor`.
+        scores: scores of independent runs.
+    """
+    return coverage(np.asarray([bounds[name] for name in JOINT]), _joint(scores))
+
+
+def _joint(
+    scores: Mapping[str, Float[np.ndarray, " run"]],
+) -> Float[np.ndarray, "run kind"]:
+    """Scores of the quantities in `JOINT`, that of the lateral tube first."""
+    return np.stack([scores[name] for name in JOINT], axis=1)

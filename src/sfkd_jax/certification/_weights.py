@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import hashlib
-from contextlib import AbstractContextManager, nullcontext
+from collections.abc import Iterator
+from contextlib import AbstractContextManager, contextmanager, nullcontext
 from functools import cache
 from typing import Any, TypeAlias
 
@@ -18,12 +19,36 @@ ACTIVATIONS = ("tanh", "relu", "sigmoid", "softplus", "elu")
 TRANSPORTS = ("identity", "rotation")
 COMPILER_OPTIONS = {"xla_backend_optimization_level": 1}
 """Less optimisation, since full optimisation compiles longer than it saves here."""
+MALFORMED = (
+    LookupError,
+    TypeError,
+    ValueError,
+    ArithmeticError,
+    AttributeError,
+    RecursionError,
+)
+"""Errors that Python raises on a document with values of unexpected types."""
 Exported: TypeAlias = Any
 """An `Explicit` whose leaves are float64 numpy arrays."""
 
 
 class CertificationRefused(Exception):
-    """A certificate is refused; the message gives the reason."""
+    """Nothing is certified, or a claim does not hold; the message gives the reason."""
+
+
+class CertificateStale(Exception):
+    """The certificate is about other weights or settings."""
+
+
+@contextmanager
+def well_formed() -> Iterator[None]:
+    """Refuse a document whose values are of unexpected types, in one line."""
+    try:
+        yield
+    except MALFORMED as reason:
+        raise CertificationRefused(
+            f"the certificate is malformed: {' '.join(str(reason).split())}"
+        ) from None
 
 
 def exported(model: Model, params: Params) -> Exported:
@@ -40,9 +65,13 @@ def exported(model: Model, params: Params) -> Exported:
     if model.structure.explicit is None:
         raise CertificationRefused("this model exposes no explicit weights to certify")
     evaluate = jax.jit(model.structure.explicit, compiler_options=COMPILER_OPTIONS)
+    try:
+        host = jax.local_devices(backend="cpu")[0]
+    except RuntimeError:  # JAX_PLATFORMS names accelerators only
+        host = None
     # Accelerators round float32 factors to ten bits, which the witnesses of another
     # machine do not survive: evaluated on the host, or else in full precision.
-    with jax.default_device(_host()), jax.default_matmul_precision("float32"):
+    with jax.default_device(host), jax.default_matmul_precision("float32"):
         weights = evaluate(jax.tree.map(np.asarray, unfold(params)))
     # float32 numbers are float64 numbers exactly: nothing is rounded here.
     weights = jax.tree.map(lambda leaf: np.asarray(leaf, dtype=np.float64), weights)
@@ -50,30 +79,20 @@ def exported(model: Model, params: Params) -> Exported:
         raise CertificationRefused("the weights are not finite")
     # A(e) between two samples is unknown, however dense they are.
     if isinstance(weights.operators, Samples):
-        count = len(weights.operators.operators)
         raise CertificationRefused(
-            f"grid-only evidence: {count} sampled environments "
-            "prove nothing about those in between"
+            f"grid-only evidence: {len(weights.operators.operators)} sampled "
+            "environments prove nothing about those in between"
         )
-    if weights.declared.activation not in ACTIVATIONS:
+    activation, transport = weights.declared.activation, weights.declared.transport
+    if activation not in ACTIVATIONS:
         raise CertificationRefused(
-            f"slopes of the activation {weights.declared.activation!r} "
-            "are not known in [0, 1]"
+            f"slopes of the activation {activation!r} are not known in [0, 1]"
         )
-    if weights.declared.transport not in TRANSPORTS:
+    if transport not in TRANSPORTS:
         raise CertificationRefused(
-            f"the transport {weights.declared.transport!r} "
-            "is not known to be nonexpansive"
+            f"the transport {transport!r} is not known to be nonexpansive"
         )
     return weights
-
-
-def _host() -> Any:
-    """Return the processor as a device; None if the process may not use it."""
-    try:
-        return jax.local_devices(backend="cpu")[0]
-    except RuntimeError:  # JAX_PLATFORMS names accelerators only
-        return None
 
 
 def fingerprint(params: Params) -> str:

@@ -2,13 +2,15 @@
 
 The runs are those of the conditions that a certificate states: e switches in its box
 with at least the dwell time, roads and perturbations ν are those of the data set, and
-the law reads the state through the sensors.
+the law reads the state through the sensors. The bounds are measured on these runs; only
+α, L and P behind them are proved.
 """
 
 from __future__ import annotations
 
 import time
 from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
 from functools import partial
 from typing import Annotated, Any, NamedTuple
 
@@ -18,20 +20,16 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from sfkd_jax.certification._attack import CertificateContradicted
-from sfkd_jax.certification._calibration import coverage_interval
-from sfkd_jax.certification._claims import OUTPUTS, OutputMetric
-from sfkd_jax.certification._corridor import (
-    RunScores,
+from sfkd_jax.certification._claims import OutputMetric
+from sfkd_jax.certification._measured import residuals
+from sfkd_jax.certification._tubes import (
     calibrate_corridor,
     corridor_coverage,
     run_scores,
 )
-from sfkd_jax.certification._document import output_metrics_from
-from sfkd_jax.certification._tubes import residuals
 from sfkd_jax.control import PathLaw, safety_filter
 from sfkd_jax.data import drive_switching, generate_s3_along_path
-from sfkd_jax.evaluation import CorridorAttack, Outcome, Tube, outcome_of
-from sfkd_jax.geometry import LATERAL, PERTURBATION
+from sfkd_jax.geometry import LATERAL, PERTURBATION, path_state
 from sfkd_jax.plants import Vehicle, along_path
 from sfkd_jax.ranges import Interval, Span
 from sfkd_jax.rollout import fold, in_batches, rollout
@@ -42,7 +40,6 @@ from sfkd_jax.types import (
     Key,
     Model,
     Params,
-    Scalar,
     State,
     Trajectory,
 )
@@ -52,10 +49,19 @@ EXCITATION = ("steering_excitation", "speed_excitation")
 BATCH = 20
 STREAM = 4
 """Stream folded into the data set's seed; the data set uses streams 0 to 2."""
-FRICTION = 0
-"""Entry of e that is constant in a cell; the other entries switch in their range."""
-PARTS = 3
-"""Batches of runs: one fixes the units, one calibrates and one tests."""
+BLOCK = 5
+"""Steps for which the attack holds ν."""
+GENERATIONS = 10
+AIMS = ("lateral", "distance", "within")
+"""Far from the path; far from the nominal model; far from it while the tube's
+hypothesis holds.
+"""
+LENGTH = 200
+"""Steps of a run of the attack."""
+KEEP = 20
+"""Worst runs returned per aim."""
+ELITE = 0.1
+"""Part of a generation that the next one is drawn around."""
 
 
 class Loop(NamedTuple):
@@ -74,20 +80,6 @@ class Loop(NamedTuple):
     model: Model
     params: Params
     noise: tuple[float, ...]
-
-
-class MeasuredRuns(NamedTuple):
-    """Measurements of a batch of runs.
-
-    Attributes:
-        lateral: e_y of the car [m].
-        nominal: ê_y of the nominal model [m].
-        scores: corridor bounds that each run needs.
-    """
-
-    lateral: Float[np.ndarray, "run time"]
-    nominal: Float[np.ndarray, "run time"]
-    scores: RunScores
 
 
 def closed_loop(
@@ -123,7 +115,7 @@ def closed_loop(
 
 def certify_corridor(
     loop: Loop,
-    outputs: Mapping[str, OutputMetric],
+    outputs: Mapping[str, Any],
     data: Mapping[str, Any],
     level: float,
     *,
@@ -140,7 +132,7 @@ def certify_corridor(
 
     Args:
         loop: of the policy.
-        outputs: proved metrics.
+        outputs: that part of the document, with a proved metric of each.
         data: of the data set: `ROADS`, `EXCITATION`, env_low, env_high and seed.
         level: 1 − δ.
         runs: number of runs of each part.
@@ -154,31 +146,34 @@ def certify_corridor(
         CertificateContradicted: the attack contradicts a bound.
     """
     began = time.perf_counter()
-    roads = {name: data[name] for name in ROADS}
+    claims = {n: OutputMetric.from_document(part) for n, part in outputs.items()}
     box = {name: data[name] for name in ("env_low", "env_high")}
-    excited = roads | {name: data[name] for name in EXCITATION}
+    excited = {name: data[name] for name in (*ROADS, *EXCITATION)}
     # A stream of its own: the data set's runs must not reappear in its certificate.
     *run_keys, sensor_key, attack_key = jax.random.split(
         jax.random.fold_in(jax.random.key(data["seed"]), STREAM), 6
     )
-    options = run_options(loop, excited, duration)
+    options = excited | {
+        "steps": round(duration / loop.plant.dt),
+        "sensors": partial(_sensor_effect, loop),
+        "offset": (0.0, 0.0, 0.0),
+        "burn_in": 0,
+    }
     switching = partial(
         drive_switching, loop.plant, drives=runs, dwell=dwell, **box, **options
     )
-    held_out = partial(generate_s3_along_path, loop.plant, segments=runs, **options)
-    kinds = (switching, switching, switching, held_out)
-    measure = run_measurement(loop, outputs)
+    unseen = partial(generate_s3_along_path, loop.plant, segments=runs, **options)
+    kinds = (switching, switching, switching, unseen)
+    simulate = jax.jit(partial(_simulate_nominal, loop))
     measured = [
-        measure(jax.jit(kind)(run_key), key)
+        _measure(loop, claims, simulate, jax.jit(kind)(run_key), key)
         for kind, run_key, key in zip(
             kinds, run_keys, jax.random.split(sensor_key, len(kinds)), strict=True
         )
     ]
-    units, calibration, test, s3 = (part.scores for part in measured)
+    units, calibration, test, s3 = (scores for _, _, scores in measured)
     bounds = calibrate_corridor(units, calibration, level=level)
-    # The shortest dwell: an attack switches as often as the conditions allow.
-    searching = box | roads | {"dwell": dwell[0], "steps": attack_steps}
-    lateral, nominal = measured[2].lateral, measured[2].nominal
+    lateral, nominal, _ = measured[2]
     conditions = {
         "env_box": [*box.values()],
         "dwell_s": dwell,
@@ -186,6 +181,10 @@ def certify_corridor(
         "sensor_noise": loop.noise,
         "perturbation": loop.law.perturbation.tolist(),
     }
+    # The shortest dwell: an attack switches as often as the conditions allow.
+    held = max(1, round(dwell[0] / loop.plant.dt))
+    tube = Tube.of(claims["position"], bounds["vehicle_to_nominal_position"])
+    search = _Search(loop, tube, data, held, attack_steps)
     return {
         "conditions": excited | conditions,
         "level": level,
@@ -199,58 +198,317 @@ def certify_corridor(
             "distance_m": float(np.max(np.abs(lateral - nominal))),
             "lateral_m": float(np.max(np.abs(lateral))),
         },
-        "attack": _attack(
-            loop, attack_key, outputs["position"], bounds, searching, horizon
-        ),
+        "attack": _attack(search, attack_key, bounds["nominal"], horizon),
         "shield_horizon": horizon,
         "seconds": time.perf_counter() - began,
     }
 
 
-def _attack(
+def _measure(
     loop: Loop,
+    claims: Mapping[str, OutputMetric],
+    simulate: Callable[..., Any],
+    runs: Trajectory,
     key: Key,
-    claim: OutputMetric,
-    bounds: Mapping[str, float],
-    options: dict[str, Any],
-    horizon: int,
-) -> dict[str, Any]:
-    """Search for the worst runs, without and with the shield.
+) -> tuple[np.ndarray, np.ndarray, dict[str, np.ndarray]]:
+    """e_y of the car and ê_y of the nominal model (run, time), and scores of the runs.
+
+    Args:
+        loop: that was driven.
+        claims: proved metrics.
+        simulate: `_simulate_nominal`, compiled once for all batches of one size.
+        runs: of the car.
+        key: for the sensors.
+    """
+    nominal, gaps = (np.asarray(part, np.float64) for part in simulate(runs, key))
+    initial = {
+        name: np.linalg.norm(gaps @ np.linalg.cholesky(claim.metric), axis=1)
+        for name, claim in claims.items()
+    }
+    errors = residuals(loop.model, loop.params, runs)
+    scores = run_scores(errors, claims, np.max(np.abs(nominal), axis=1), initial)
+    lateral = np.asarray(runs.states, dtype=np.float64)[:, 1:, BODY][..., LATERAL]
+    return lateral, nominal, scores
+
+
+def _simulate_nominal(
+    loop: Loop, runs: Trajectory, key: Key
+) -> tuple[Float[Array, "run time"], Float[Array, "run rank"]]:
+    """Return ê_y of a nominal model that starts at the true state, and z_0 − ẑ_0.
+
+    ẑ_0 is the latent state of a nominal model that starts at the measured state.
+    """
+    model, spread = loop.model, _spread(loop.noise, runs.states.shape[-1])
+
+    def lateral(run: Trajectory) -> Array:
+        return rollout(model, loop.params, run)[0][:, BODY][:, LATERAL]
+
+    def gap(state: State, env: Environment, key: Key) -> Array:
+        fiber = model.fiber(loop.params, env)
+        measured = state + spread * jax.random.normal(key, state.shape)
+        # The nominal model starts at what sensors show, the car at the truth.
+        starts = model.encode(fiber, measured), model.encode(fiber, state)
+        return model.vector(starts[0]) - model.vector(starts[1])
+
+    keys = jax.random.split(key, len(runs.states))
+    gaps = jax.vmap(gap)(runs.states[:, 0], runs.envs[:, 0], keys)
+    return in_batches(lateral, runs, size=BATCH), gaps
+
+
+def _sensor_effect(
+    loop: Loop, key: Key, state: State, inputs: Control, env: Environment
+) -> Array:
+    """Return the change of ν because the law reads ξ through the sensors."""
+    coordinates, road = state[BODY], inputs[PERTURBATION.stop :]
+    spread = _spread(loop.noise, state.shape[-1])[BODY]
+    measured = coordinates + spread * jax.random.normal(key, coordinates.shape)
+    # A law is a known function: reading ξ + n acts like a perturbation of ν.
+    return loop.law(measured, road[0], road[1], env) - loop.law(
+        coordinates, road[0], road[1], env
+    )
+
+
+def _spread(noise: tuple[float, ...], size: int) -> Array:
+    """Standard deviations of a path state from those of the sensors.
+
+    e_y takes that of a position, e_ψ that of yaw, the other coordinates their own.
+    """
+    known = noise[1 : size - 2]
+    return jnp.zeros(size).at[3 : 3 + len(known)].set(jnp.asarray(known))
+
+
+class Runs(NamedTuple):
+    """Inputs of runs.
+
+    Attributes:
+        inputs: w, (run, time, 4).
+        envs: e, (run, time, environment).
+    """
+
+    inputs: Float[Array, "run time 4"]
+    envs: Float[Array, "run time environment"]
+
+
+class Tube(NamedTuple):
+    """The claimed tube |e_y − ê_y| ≤ L α R + ε with R⁺ = α R + |d|_P.
+
+    The radius, the right-hand side, is claimed to stay below a bound.
+
+    Attributes:
+        alpha: α.
+        lipschitz: L.
+        factor: of P = factor factor'.
+        bound: of the radius [m].
+    """
+
+    alpha: float
+    lipschitz: float
+    factor: Float[Array, "rank rank"]
+    bound: float
+
+    @classmethod
+    def of(cls, claim: OutputMetric, bound: float) -> Tube:
+        """Return the tube of a proved metric and a measured bound."""
+        factor = jnp.asarray(np.linalg.cholesky(claim.metric), dtype=float)
+        return cls(claim.alpha, claim.lipschitz, factor, bound)
+
+
+class Outcome(NamedTuple):
+    """Largest values over a run, (run,).
+
+    Attributes:
+        lateral: |e_y| [m].
+        distance: |e_y − ê_y| from the nominal model with the same inputs [m].
+        radius: of the tube, from the disturbances of this run [m].
+    """
+
+    lateral: Float[Array, " run"]
+    distance: Float[Array, " run"]
+    radius: Float[Array, " run"]
+
+
+@dataclass(frozen=True, eq=False)
+class _Search:
+    """Search for the worst runs by the cross-entropy method, a third of it per aim.
+
+    ν is held for `BLOCK` steps within its limits, e for the dwell time anywhere in its
+    box, the road is a sinusoid of any wavelength and phase within the conditions at a
+    constant speed. The result is a lower bound of the worst case.
+
+    Attributes:
+        loop: of the policy.
+        tube: that is claimed.
+        data: of the data set: `ROADS`, env_low and env_high.
+        held: steps between switches of e.
+        steps: in all.
+    """
+
+    loop: Loop
+    tube: Tube
+    data: Mapping[str, Any]
+    held: int
+    steps: int
+
+    def __call__(self, params: Params, key: Key) -> tuple[Runs, Outcome]:
+        """Return the worst runs of each aim, (aim, run, …)."""
+        keys = jax.random.split(key, len(AIMS))
+        worst = [self._worst(params, *of) for of in zip(AIMS, keys, strict=True)]
+        return jax.tree.map(lambda *leaves: jnp.stack(leaves), *worst)
+
+    def _run(self, genes: Float[Array, " gene"]) -> Runs:
+        """Inputs of one run from its genes."""
+        data, sizes = self.data, self._sizes
+        nu, env, road = jnp.split(genes, [sizes[0], sizes[0] + sizes[1]])
+        # Saturates: the worst ν are mostly at the limits.
+        nu = jnp.repeat(jnp.tanh(2.0 * nu).reshape(-1, 2), BLOCK, axis=0)[:LENGTH]
+        low, high = jnp.asarray(data["env_low"]), jnp.asarray(data["env_high"])
+        env = _unit(env).reshape(-1, len(low))
+        env = jnp.repeat(env, self.held, axis=0)[:LENGTH]
+        fast, wave, phase, tight = _unit(road)
+        (slowest, fastest), (shortest, longest) = data["speed"], data["wavelengths"]
+        speed = slowest + (fastest - slowest) * fast
+        wavelength = shortest + (longest - shortest) * wave
+        # Fast roads are gentle, as in the conditions of the corridor.
+        peak = jnp.minimum(
+            data["peak_curvature"], data["lateral_acceleration"] / speed**2
+        )
+        along = jnp.arange(LENGTH) * speed * self.loop.plant.dt
+        sine = jnp.sin(2 * jnp.pi * (along / wavelength + phase))
+        # Clipped: a road that is tight throughout, not only at its peaks.
+        bend = peak * jnp.clip((1.0 + tight) * sine, -1.0, 1.0)
+        nu = nu * self.loop.law.perturbation
+        inputs = jnp.column_stack([nu, bend, jnp.full(LENGTH, speed)])
+        return Runs(inputs, low + (high - low) * env)
+
+    @property
+    def _sizes(self) -> tuple[int, int, int]:
+        """Numbers of genes for ν, e and the road."""
+        switches = -(-LENGTH // self.held)
+        return 2 * -(-LENGTH // BLOCK), switches * len(self.data["env_low"]), 4
+
+    def _worst(self, params: Params, aim: str, key: Key) -> tuple[Runs, Outcome]:
+        """The worst runs of one aim over all generations."""
+        # However few steps are given, as many runs as are asked for.
+        population = max(KEEP, self.steps // (len(AIMS) * GENERATIONS * LENGTH))
+        outcome = partial(outcome_of, self.loop, params, self.tube)
+
+        def generation(carry: tuple[Array, Array], key: Key) -> tuple[Any, Any]:
+            mean, spread = carry
+            noise = jax.random.normal(key, (population, *mean.shape))
+            genes = mean + spread * noise
+            runs = jax.vmap(self._run)(genes)
+            found = runs, jax.vmap(outcome)(runs)
+            best = jnp.argsort(-self._score(aim, found[1]))
+            elite = genes[best[: max(2, int(ELITE * population))]]
+            # A floor under the spread: a search that has converged stops finding.
+            after = jnp.mean(elite, axis=0), jnp.std(elite, axis=0) + 0.1
+            return after, jax.tree.map(lambda leaf: leaf[best[:KEEP]], found)
+
+        start = jnp.zeros(sum(self._sizes)), jnp.ones(sum(self._sizes))
+        # The worst of all generations: the last one need not have it.
+        _, found = jax.lax.scan(generation, start, jax.random.split(key, GENERATIONS))
+        found = jax.tree.map(lambda leaf: leaf.reshape(-1, *leaf.shape[2:]), found)
+        worst = jnp.argsort(-self._score(aim, found[1]))[:KEEP]
+        return jax.tree.map(lambda leaf: leaf[worst], found)
+
+    def _score(self, aim: str, outcome: Outcome) -> Array:
+        """What an aim maximises."""
+        if aim == "within":
+            # Outside the hypothesis nothing is claimed; nearer to it ranks higher.
+            inside = outcome.radius <= self.tube.bound
+            return jnp.where(inside, outcome.distance, -outcome.radius)
+        return getattr(outcome, aim)
+
+
+def _unit(gene: Array) -> Array:
+    """Map a gene to [0, 1]; both ends are reached."""
+    return jnp.clip(0.5 + 0.5 * gene, 0.0, 1.0)
+
+
+def outcome_of(
+    loop: Loop,
+    params: Params,
+    tube: Tube,
+    run: Runs,
+    nu_filter: Callable[..., Any] | None = None,
+) -> Outcome:
+    """Return the outcome of one run of plant and nominal model; callers vmap.
+
+    Both start on the path.
+
+    Args:
+        loop: of the policy.
+        params: of its model, folded.
+        tube: of e_y.
+        run: inputs of one run.
+        nu_filter: (fiber, latent, ν, index) -> ν, or None for none.
+    """
+    model, plant = loop.model, loop.plant
+    rest = jnp.zeros(len(plant.state_names) - 3)
+    start = path_state(rest.at[2].set(run.inputs[0, 3]))
+    latent = model.encode(model.fiber(params, run.envs[0]), start)
+
+    def step(carry: Any, given: tuple[Array, Environment, Array]) -> tuple[Any, Any]:
+        state, latent, error = carry
+        inputs, env, index = given
+        fiber = model.fiber(params, env)
+        # The filter sees the nominal model, as in the controller.
+        if nu_filter is not None:
+            inputs = inputs.at[:2].set(nu_filter(fiber, latent, inputs[:2], index))
+        expected = model.step(fiber, model.encode(fiber, state), inputs)
+        state = plant.step(state, inputs, env)
+        latent = model.step(fiber, latent, inputs)
+        decoded = model.decode(fiber, latent), model.decode(fiber, expected)
+        true, nominal, predicted = (x[BODY][LATERAL] for x in (state, *decoded))
+        # The tube holds before its radius grows by the disturbance of this step.
+        radius = tube.lipschitz * tube.alpha * error + jnp.abs(true - predicted)
+        gap = model.vector(model.encode(fiber, state)) - model.vector(expected)
+        error = tube.alpha * error + jnp.linalg.norm(gap @ tube.factor)
+        values = Outcome(jnp.abs(true), jnp.abs(true - nominal), radius)
+        return (state, latent, error), values
+
+    given = (run.inputs, run.envs, jnp.arange(len(run.inputs)))
+    _, outcomes = jax.lax.scan(step, (start, latent, jnp.zeros(())), given)
+    return jax.tree.map(jnp.max, outcomes)
+
+
+def _attack(search: _Search, key: Key, width: float, horizon: int) -> dict[str, Any]:
+    """Search for the worst runs, and drive them again with the shield.
+
+    Args:
+        search: for the worst runs.
+        key: consumed.
+        width: W, of the nominal corridor [m].
+        horizon: preview of the shield [steps].
 
     Raises:
         CertificateContradicted: a car left its tube while the disturbances stayed
             within their bound, which is impossible.
     """
-    model, params, limit = loop.model, loop.params, loop.law.perturbation
-    width, bound = bounds["nominal"], bounds["vehicle_to_nominal_position"]
-    factor = jnp.asarray(np.linalg.cholesky(claim.metric), dtype=float)
-    tube = Tube(claim.alpha, claim.lipschitz, factor, bound)
-    search = CorridorAttack(loop.plant, model, tube, perturbation=limit, **options)
-    found = jax.jit(search)(params, key)
+    loop, bound = search.loop, search.tube.bound
+    found, outcome = jax.jit(search)(loop.params, key)
 
-    def shielded(run: Any) -> Outcome:
+    def shielded(params: Params, run: Runs) -> Outcome:
         length = len(run.inputs)
         # The last inputs repeated: a preview at the end of a run has nothing further.
-        ahead = jnp.minimum(
-            jnp.arange(length)[:, None] + jnp.arange(horizon), length - 1
-        )
-        roads = run.inputs[ahead, 2:]
+        ahead = jnp.arange(length)[:, None] + jnp.arange(horizon)
+        roads = run.inputs[jnp.minimum(ahead, length - 1), 2:]
 
-        def apply_filter(
-            fiber: Any, latent: Any, wanted: Control, index: Any
-        ) -> Control:
+        def admissible(fiber: Any, latent: Any, wanted: Control, at: Any) -> Control:
+            limit = loop.law.perturbation
             return safety_filter(
-                model, fiber, latent, wanted, roads[index], limit, width=width
+                loop.model, fiber, latent, wanted, roads[at], limit, width=width
             ).nu
 
-        return outcome_of(loop.plant, model, params, tube, run, apply_filter)
+        return outcome_of(loop, params, search.tube, run, admissible)
 
-    held = jax.jit(jax.vmap(jax.vmap(shielded)))(found.runs)
+    each = jax.vmap(jax.vmap(shielded, in_axes=(None, 0)), in_axes=(None, 0))
+    held = jax.jit(each)(loop.params, found)
     # The corridor is claimed only while the disturbances keep their bound
     within = np.asarray(held.radius) <= bound
     worst = {
-        "lateral_m": np.max(found.outcome.lateral),
-        "distance_m": np.max(found.outcome.distance),
+        "lateral_m": np.max(outcome.lateral),
+        "distance_m": np.max(outcome.distance),
         "shielded_lateral_m": np.max(held.lateral),
         "kept_lateral_m": np.max(np.asarray(held.lateral), where=within, initial=0.0),
         "kept_distance_m": np.max(np.asarray(held.distance), where=within, initial=0.0),
@@ -265,231 +523,4 @@ def _attack(
             f"INTERNAL ERROR: {worst['kept_distance_m']:.4f} m from the nominal model, "
             f"and the tube is {bound:.4f} m"
         )
-    return {"steps": options["steps"]} | worst | shares
-
-
-def run_options(
-    loop: Loop, conditions: Mapping[str, Any], duration: float
-) -> dict[str, Any]:
-    """Return the options of `drive_along_path` for the runs of some conditions.
-
-    Args:
-        loop: its law reads the state through the sensors.
-        conditions: entries of `ROADS` and `EXCITATION`.
-        duration: of a run [s].
-    """
-    options = {name: conditions[name] for name in (*ROADS, *EXCITATION)}
-    return options | {
-        "steps": round(duration / loop.plant.dt),
-        "sensors": partial(_sensor_effect, loop),
-        "offset": (0.0, 0.0, 0.0),
-        "burn_in": 0,
-    }
-
-
-def run_measurement(
-    loop: Loop, outputs: Mapping[str, OutputMetric]
-) -> Callable[[Trajectory, Key], MeasuredRuns]:
-    """Return (runs, key for the sensors) -> measurements.
-
-    It is compiled once for all batches of one size.
-
-    Args:
-        loop: that was driven.
-        outputs: proved metrics.
-    """
-    simulate = jax.jit(partial(_simulate_nominal, loop))
-
-    def measure(runs: Trajectory, key: Key) -> MeasuredRuns:
-        nominal, gaps = (
-            np.asarray(part, dtype=np.float64) for part in simulate(runs, key)
-        )
-        initial = {
-            name: np.linalg.norm(
-                gaps @ np.linalg.cholesky(outputs[name].metric), axis=1
-            )
-            for name in OUTPUTS
-        }
-        errors = residuals(loop.model, loop.params, runs)
-        scores = run_scores(errors, outputs, np.max(np.abs(nominal), axis=1), initial)
-        lateral = np.asarray(runs.states, dtype=np.float64)[:, 1:, BODY][..., LATERAL]
-        return MeasuredRuns(lateral, nominal, scores)
-
-    return measure
-
-
-def _simulate_nominal(
-    loop: Loop, runs: Trajectory, key: Key
-) -> tuple[Float[Array, "run time"], Float[Array, "run rank"]]:
-    """Return ê_y of a nominal model that starts at the true state, and z_0 − ẑ_0.
-
-    ẑ_0 is the latent state of a nominal model that starts at the measured state.
-    """
-    model, spread = loop.model, _spread(loop.noise, runs.states.shape[-1])
-
-    def lateral(run: Trajectory) -> jax.Array:
-        return rollout(model, loop.params, run)[0][:, BODY][:, LATERAL]
-
-    def gap(state: State, env: Environment, key: Key) -> jax.Array:
-        fiber = model.fiber(loop.params, env)
-        measured = state + spread * jax.random.normal(key, state.shape)
-        # The nominal model starts at what sensors show, the car at the truth.
-        return model.vector(model.encode(fiber, measured)) - model.vector(
-            model.encode(fiber, state)
-        )
-
-    keys = jax.random.split(key, len(runs.states))
-    gaps = jax.vmap(gap)(runs.states[:, 0], runs.envs[:, 0], keys)
-    return in_batches(lateral, runs, size=BATCH), gaps
-
-
-def _sensor_effect(
-    loop: Loop, key: Key, state: State, inputs: Control, env: Environment
-) -> jax.Array:
-    """Return the change of ν because the law reads ξ through the sensors."""
-    coordinates, road = state[BODY], inputs[PERTURBATION.stop :]
-    spread = _spread(loop.noise, state.shape[-1])[BODY]
-    measured = coordinates + spread * jax.random.normal(key, coordinates.shape)
-    # A law is a known function: reading ξ + n acts like a perturbation of ν.
-    return loop.law(measured, road[0], road[1], env) - loop.law(
-        coordinates, road[0], road[1], env
-    )
-
-
-def _spread(noise: tuple[float, ...], size: int) -> jax.Array:
-    """Standard deviations of a path state from those of the sensors.
-
-    e_y takes that of a position, e_ψ that of yaw, the other coordinates their own.
-    """
-    known = noise[1 : size - 2]
-    return jnp.zeros(size).at[3 : 3 + len(known)].set(jnp.asarray(known))
-
-
-def corridor_by_speed(
-    loop: Loop,
-    certificate: Mapping[str, Any],
-    *,
-    frictions: Sequence[float],
-    speeds: Sequence[float],
-    runs: int = 60,
-    seed: int = 0,
-) -> dict[str, Any]:
-    """Calibrate a corridor for every friction and speed.
-
-    Roads, perturbations ν, sensors, duration, level and switching of the wind are those
-    of the certified conditions. The curvature of a cell's roads is at most `curvature`,
-    which decreases with speed where the conditions limit v² κ.
-
-    Args:
-        loop: of the policy, with the sensors of the conditions.
-        certificate: verified, with a corridor.
-        frictions: inside the certified box [-].
-        speeds: v_ref, inside the certified box [m/s].
-        runs: number of runs of each of three parts in every cell: one fixes the units,
-            one calibrates, one tests.
-        seed: of the runs.
-
-    Returns:
-        `cells`, in the order of frictions and then speeds, each with `corridor_m` =
-        `nominal_m` + `tube_m`, its coverage and `lateral_m`, the largest |e_y| of its
-        test runs; and the `coverage` of all cells.
-
-    Raises:
-        ValueError: a friction or a speed outside the box, or too few runs for the
-            level.
-        KeyError: a certificate without a corridor.
-    """
-    began = time.perf_counter()
-    corridor = certificate["corridor"]
-    about, level = corridor["conditions"], corridor["level"]
-    low, high = (np.asarray(side) for side in about["env_box"])
-    _require_inside("friction", frictions, (low[FRICTION], high[FRICTION]))
-    _require_inside("speed", speeds, about["speed"])
-    measure = run_measurement(loop, output_metrics_from(certificate["outputs"]))
-    options = run_options(loop, about, about["duration_s"]) | {
-        "drives": runs,
-        "dwell": about["dwell_s"],
-    }
-
-    @jax.jit
-    def simulate(key: Key, friction: Scalar, speed: Scalar) -> Trajectory:
-        constant: dict[str, Any] = {
-            # Equal corners in this entry alone: a cell
-            # has one friction, and wind switches.
-            side: jnp.asarray(corner).at[FRICTION].set(friction)
-            for side, corner in (("env_low", low), ("env_high", high))
-        }
-        kwargs: dict[str, Any] = options | constant | {"speed": (speed, speed)}
-        return drive_switching(loop.plant, key, **kwargs)
-
-    cells = []
-    for friction in frictions:
-        for speed in speeds:
-            keys = jax.random.split(
-                # By number of the cell: its runs stay when further cells are asked for.
-                jax.random.fold_in(jax.random.key(seed), len(cells)),
-                (PARTS, 2),
-            )
-            parts = [
-                measure(simulate(run_key, friction, speed), key)
-                for run_key, key in keys
-            ]
-            units, scores, test = (part.scores for part in parts)
-            bounds = calibrate_corridor(units, scores, level=level)
-            tube = bounds["vehicle_to_nominal_position"]
-            cell = {
-                "friction": friction,
-                "speed": speed,
-                "curvature": min(
-                    about["peak_curvature"], about["lateral_acceleration"] / speed**2
-                ),
-                "corridor_m": bounds["nominal"] + tube,
-                "nominal_m": bounds["nominal"],
-                "tube_m": tube,
-                "lateral_m": float(np.max(np.abs(parts[-1].lateral))),
-            }
-            cells.append(cell | corridor_coverage(bounds, test))
-    share = float(np.mean([cell["coverage"] for cell in cells]))
-    return {
-        "level": level,
-        "runs": runs,
-        "duration_s": about["duration_s"],
-        "cells": cells,
-        "coverage": share,
-        "coverage_ci95": coverage_interval(share, runs * len(cells)),
-        "seconds": time.perf_counter() - began,
-    }
-
-
-def fastest_speeds(
-    cells: Sequence[Mapping[str, Any]], clearance: float
-) -> dict[float, float | None]:
-    """Return the largest speed by friction up to which all corridors fit into a lane.
-
-    Args:
-        cells: of `corridor_by_speed`.
-        clearance: between the car and either edge of the lane [m].
-
-    Returns:
-        Speeds of the cells, not interpolated [m/s]; None if not even the lowest fits.
-    """
-    speeds: dict[float, float | None] = {}
-    exceeded = set()
-    for cell in sorted(cells, key=lambda cell: (cell["friction"], cell["speed"])):
-        friction = cell["friction"]
-        speeds.setdefault(friction, None)
-        # A wider corridor at a lower speed counts, even if a faster one fits by chance
-        if not cell["corridor_m"] <= clearance:
-            exceeded.add(friction)
-        elif friction not in exceeded:
-            speeds[friction] = cell["speed"]
-    return speeds
-
-
-def _require_inside(name: str, values: Sequence[float], box: Sequence[float]) -> None:
-    """Refuse values outside the certified box."""
-    if outside := [value for value in values if not box[0] <= value <= box[1]]:
-        raise ValueError(
-            f"{name} {outside[0]:g} is outside the certified range, "
-            f"{box[0]:g} to {box[1]:g}"
-        )
+    return {"steps": search.steps} | worst | shares

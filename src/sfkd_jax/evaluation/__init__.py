@@ -10,10 +10,6 @@ from sfkd_jax.evaluation._closed_loop import (
 )
 from sfkd_jax.evaluation._closed_loop import over_episodes as over_episodes
 from sfkd_jax.evaluation._closed_loop import simulate as simulate
-from sfkd_jax.evaluation._corridor_attack import CorridorAttack as CorridorAttack
-from sfkd_jax.evaluation._corridor_attack import Outcome as Outcome
-from sfkd_jax.evaluation._corridor_attack import Tube as Tube
-from sfkd_jax.evaluation._corridor_attack import outcome_of as outcome_of
 from sfkd_jax.evaluation._open_loop import baselines as baselines
 from sfkd_jax.evaluation._open_loop import open_loop as open_loop
 from sfkd_jax.evaluation._rows import ROAD as ROAD

@@ -13,12 +13,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from sfkd_jax import build, policy, store
-from sfkd_jax.certification import (
-    CertificationRefused,
-    contraction_metrics,
-    issue,
-    output_metrics_from,
-)
+from sfkd_jax.certification import CertificationRefused, contraction_metrics, issue
 from sfkd_jax.certification.corridor import certify_corridor, closed_loop
 from sfkd_jax.control import PathLaw
 from sfkd_jax.data import (
@@ -351,7 +346,7 @@ def _certify_tubes(settings: Settings, trained: policy.TrainedModel) -> dict[str
         )
         document["corridor"] = certify_corridor(
             loop,
-            output_metrics_from(document["outputs"]),
+            document["outputs"],
             plain(settings.dataset) | settings.environment.box,
             options.level,
             **arguments(options.corridor, certify_corridor),

@@ -1,0 +1,206 @@
+"""Measured one-step errors, and split-conformal bounds on what was measured."""
+
+from __future__ import annotations
+
+import math
+from functools import partial
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+from scipy.special import betaincinv
+
+from sfkd_jax.geometry import HEADING, LATERAL, PATH_SPEED, between
+from sfkd_jax.rollout import defects
+from sfkd_jax.types import BODY, POSE, Model, Params, Trajectory
+
+KINDS = ("latent", "position", "yaw", "body")
+ROUNDING = 1e-9
+"""Far above the rounding error of a share times a count."""
+CHUNK = 50
+"""Runs in a batch."""
+
+
+class Residuals(NamedTuple):
+    """One-step prediction errors of every step of a run, (run, time, …).
+
+    Attributes:
+        gaps: d_k in latent coordinates.
+        outputs: 2-norms of the errors of position [m], yaw [rad] and body state; along
+            a path of e_y [m], e_ψ [rad] and the vehicle's own body state.
+    """
+
+    gaps: Float[np.ndarray, "run time rank"]
+    outputs: Float[np.ndarray, "run time 3"]
+
+    def largest(self) -> Float[np.ndarray, "run 4"]:
+        """Return the largest errors of each run, by `KINDS`.
+
+        A bound is about whole runs, not about steps.
+        """
+        sizes = np.linalg.norm(self.gaps, axis=-1)
+        return np.column_stack([np.max(sizes, axis=1), np.max(self.outputs, axis=1)])
+
+
+def residuals(model: Model, params: Params, runs: Trajectory) -> Residuals:
+    """Measure the error of every step from its true state.
+
+    Transport defects and switches of e count.
+
+    Args:
+        model: any model.
+        params: its weights, folded or not.
+        runs: a batch of trajectories.
+    """
+    count = runs.controls.shape[0]
+    # The last batch is filled up, so that one program serves all batches
+    filled = jnp.arange(-(-count // CHUNK) * CHUNK).reshape(-1, CHUNK) % count
+    batches = [
+        _errors(model, params, jax.tree.map(lambda leaf, rows=rows: leaf[rows], runs))
+        for rows in filled
+    ]
+    gaps, outputs = (
+        np.concatenate([np.asarray(part, np.float64) for part in parts])[:count]
+        for parts in zip(*batches, strict=True)
+    )
+    return Residuals(gaps, outputs)
+
+
+@partial(jax.jit, static_argnums=0)
+def _errors(model: Model, params: Params, runs: Trajectory) -> tuple[Array, Array]:
+    """`residuals` of one batch of fixed size."""
+
+    def one(run: Trajectory) -> tuple[Array, Array]:
+        gaps, predicted = defects(model, params, run)
+        before, after = run.states[:-1], run.states[1:]
+        miss = (predicted - after)[:, BODY]
+        if model.along_path:
+            # Path states have their outputs in the body, without a pose.
+            kinds = miss[:, LATERAL, None], miss[:, HEADING, None], miss[:, PATH_SPEED:]
+        else:
+            # As motions of one step: each turns far less than π, so no wrap spoils it.
+            moved = jax.vmap(between)
+            motion = moved(before[:, POSE], predicted[:, POSE])
+            motion -= moved(before[:, POSE], after[:, POSE])
+            kinds = motion[:, :2], motion[:, 2:], miss
+        return gaps, jnp.stack([jnp.linalg.norm(kind, axis=1) for kind in kinds], 1)
+
+    return jax.vmap(one)(runs)
+
+
+def conformal_quantile(scores: Float[np.ndarray, " trajectory"], level: float) -> float:
+    """Return the ⌈(n+1) level⌉-th smallest of n scores.
+
+    A new, exchangeable score exceeds it with probability at most 1 − level.
+
+    Args:
+        scores: of calibration trajectories or runs.
+        level: 1 − δ.
+
+    Raises:
+        ValueError: too few scores for the level, or scores that are not finite.
+    """
+    # An infinite score would be sorted last and silently dropped from the quantile.
+    if not np.all(np.isfinite(scores)):
+        raise ValueError("residuals are not finite")
+    if not supports(len(scores), level):
+        raise ValueError(
+            f"{len(scores)} calibration trajectories are too few for level {level}"
+        )
+    # (n + 1): the new trajectory counts as one of the exchangeable ones.
+    return float(np.sort(scores)[math.ceil((len(scores) + 1) * level) - 1])
+
+
+def supports(count: int, level: float) -> bool:
+    """Whether `count` scores suffice for a conformal quantile: ⌈(n+1) level⌉ ≤ n."""
+    return math.ceil((count + 1) * level) <= count
+
+
+def conformal_bounds(
+    reference: Float[np.ndarray, "other kind"],
+    calibration: Float[np.ndarray, "trajectory kind"],
+    *,
+    level: float,
+) -> Float[np.ndarray, " kind"]:
+    """Return joint bounds on all kinds over a whole new trajectory (split-conformal).
+
+    They hold with probability at least `level`. The score of a trajectory is its
+    largest kind in units; the bound is the ⌈(n+1) level⌉-th smallest score. The unit of
+    the first kind is its quantile at `level`; the other kinds exceed theirs a tenth as
+    often. A tube multiplies the first bound by up to 1/(1 − α) and adds the others
+    once, so these units make it tighter than equal quantiles do.
+
+    Args:
+        reference: scores that fix the units, of a split other than `calibration`.
+        calibration: scores of the calibration split.
+        level: 1 − δ.
+
+    Raises:
+        ValueError: too few trajectories for the level, a level outside (0, 1), or
+            scores that are not finite.
+    """
+    if not 0 < level < 1:
+        raise ValueError(f"a level must lie between 0 and 1, got {level}")
+    if not np.all(np.isfinite(reference)):
+        raise ValueError("residuals are not finite")
+    shares = [level, *[1.0 - 0.1 * (1.0 - level)] * (reference.shape[1] - 1)]
+    kinds = zip(reference.T, shares, strict=True)
+    units = np.asarray([np.quantile(kind, share) for kind, share in kinds])
+    units[units <= 0] = 1.0  # a kind that is always 0 needs no unit
+    # The largest kind of each trajectory in common units: one score, a joint bound.
+    return units * conformal_quantile(np.max(calibration / units, axis=1), level)
+
+
+def coverage(
+    bounds: Float[np.ndarray, " kind"],
+    held_out: Float[np.ndarray, "trajectory kind"],
+    runs: int | None = None,
+) -> dict[str, Any]:
+    """Return the share of held-out trajectories within all bounds, and its interval.
+
+    Args:
+        bounds: on each kind.
+        held_out: scores of independent trajectories.
+        runs: number of independent runs that they were cut from; by default every
+            trajectory is one.
+    """
+    share = float(np.mean(np.all(held_out <= bounds, axis=1)))
+    return counted(share, len(held_out), runs or len(held_out))
+
+
+def counted(share: float, trajectories: int, runs: int) -> dict[str, Any]:
+    """Return a coverage with its 95 % interval and its counts, as the document does."""
+    return {
+        "coverage": share,
+        # Segments of one run are dependent: the interval is of independent runs.
+        "coverage_ci95": coverage_interval(share, runs),
+        "coverage_trajectories": trajectories,
+        "coverage_runs": runs,
+    }
+
+
+def coverage_interval(share: float, runs: int) -> list[float]:
+    """Return the 95 % Clopper-Pearson interval of a coverage.
+
+    If the share lies between two counts, the interval covers those of both.
+
+    Args:
+        share: of trajectories that were covered.
+        runs: number of independent runs that the trajectories were cut from.
+    """
+    # Both sides rounded outwards: the interval is wider than either count's.
+    counts = math.floor(share * runs + ROUNDING), math.ceil(share * runs - ROUNDING)
+    return [clopper_pearson(count, runs)[side] for side, count in enumerate(counts)]
+
+
+def clopper_pearson(
+    successes: int, trials: int, *, level: float = 0.95
+) -> tuple[float, float]:
+    """Return the exact interval of a binomial share (Clopper and Pearson, 1934)."""
+    tail, failures = 0.5 * (1.0 - level), trials - successes
+    # With no success the lower end is 0 exactly, where betaincinv is undefined.
+    low = betaincinv(successes, failures + 1, tail) if successes else 0.0
+    high = betaincinv(successes + 1, failures, 1.0 - tail) if failures else 1.0
+    return float(low), float(high)

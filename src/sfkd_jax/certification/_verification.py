@@ -1,0 +1,277 @@
+"""Verification of certificates from an untrusted source, without any search.
+
+Proved constants are derived again from their witnesses, tubes and sums from the proved
+and the measured constants, coverages from their counts. Measured bounds themselves
+cannot be derived; they are checked to be consistent numbers.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+
+from sfkd_jax.certification._certificate import PRECISION, Certificate
+from sfkd_jax.certification._claims import (
+    FLOAT32,
+    OUTPUTS,
+    OutputMetric,
+    attack_limits,
+    require_box,
+    require_claims,
+    require_lyapunov,
+    require_output_metric,
+)
+from sfkd_jax.certification._measured import KINDS, counted, supports
+from sfkd_jax.certification._tubes import ALONE, FORMS, JOINT, tubes
+from sfkd_jax.certification._weights import (
+    CertificateStale,
+    CertificationRefused,
+    Exported,
+    exported,
+    fingerprint,
+    one_thread,
+    well_formed,
+)
+from sfkd_jax.types import Model, Params
+
+REPEATED = 1e-9
+"""Relative tolerance of recomputed values, for another order of summation."""
+
+
+def verify(
+    certificate: Certificate,
+    params: Params,
+    *,
+    model: Model,
+    weights: Exported | None = None,
+) -> None:
+    """Check a certificate against weights without any search.
+
+    Takes milliseconds once `model.structure.explicit` is compiled.
+
+    Args:
+        certificate: from an untrusted source.
+        params: the weights.
+        model: provides `explicit`.
+        weights: explicit weights of `params`, if already computed.
+
+    Raises:
+        CertificateStale: it is about other weights.
+        CertificationRefused: a claim does not follow from its witness.
+    """
+    # First the hash: a proof about other weights need not be read at all.
+    if fingerprint(params) != certificate.params_sha256:
+        raise CertificateStale("the certificate is about other weights")
+    weights = exported(model, params) if weights is None else weights
+    with well_formed(), one_thread():
+        require_claims(certificate, weights, certificate.env_box)
+        _require_consistent(certificate, weights)
+
+
+def _require_consistent(certificate: Certificate, weights: Exported) -> None:
+    """Check that the parts of a certificate agree with each other."""
+    alpha = certificate.alpha
+    if not alpha < 1.0 or certificate.transport_lipschitz != 1.0:
+        raise CertificationRefused(
+            f"alpha = {alpha} is not below 1, or the transport is not nonexpansive"
+        )
+    # A text that promises more than these checks cover must not pass.
+    if certificate.precision != PRECISION:
+        raise CertificationRefused("precision is not what is covered")
+    limits = attack_limits(certificate, weights)
+    for name, value in certificate.attacks.items():
+        # A stated attack above the proved bound would contradict the document itself.
+        if name not in limits or not 0 <= value <= limits[name] * (1 + FLOAT32):
+            raise CertificationRefused(
+                f"the attack {name} = {value!r} "
+                f"contradicts the bound {limits.get(name)}"
+            )
+    step = certificate.attacks.get("step")
+    tightness = alpha / step if step else None
+    if certificate.attack != step or certificate.tightness != tightness:
+        raise CertificationRefused(
+            "attack or tightness does not follow from the attacks"
+        )
+
+
+def verify_document(
+    document: Mapping[str, Any], params: Params, *, model: Model, policy_sha256: str
+) -> None:
+    """Check a document from an untrusted source against a policy, without any search.
+
+    Args:
+        document: from `issue`, with `policy_sha256`.
+        params: the weights.
+        model: the model that they belong to.
+        policy_sha256: hash of the weights and of all settings of model and controller.
+
+    Raises:
+        CertificateStale: it is about other weights or settings.
+        CertificationRefused: it does not hold; gives the reason.
+    """
+    # `is not True`: a text "false" or a number must not pass for a valid certificate.
+    if document.get("valid") is not True:
+        raise CertificationRefused(str(document.get("reason")))
+    # Also the settings: the same weights under another controller are another policy.
+    if document.get("policy_sha256") != policy_sha256:
+        raise CertificateStale("the certificate is about other weights or settings")
+    proof, weights = Certificate.from_document(document), exported(model, params)
+    verify(proof, params, model=model, weights=weights)
+    # After the proof: everything below is arithmetic on constants that hold.
+    with well_formed():
+        for name in ("state", "control", "env"):
+            require_box(f"boxes.{name}", document["boxes"][name])
+        _require_equal("boxes.env", document["boxes"]["env"], proof.env_box)
+        _require_statistics(document["d_bar"])
+        _require_tubes(document["tube"], proof, document["d_bar"])
+        with one_thread():
+            require_lyapunov(document["lyapunov"], weights)
+            _require_outputs(document.get("outputs", {}), weights)
+        if document["decoder_lipschitz"] != proof.lipschitz.get("decoder"):
+            raise CertificationRefused("decoder_lipschitz is not that of lipschitz")
+        if document.get("corridor") is not None:
+            if not document.get("outputs"):
+                raise CertificationRefused("a corridor needs a metric of every output")
+            require_corridor(document["corridor"])
+
+
+def _require_statistics(d_bar: Mapping[str, Any]) -> None:
+    """Check measured bounds, level, counts, coverages and their intervals."""
+    one_step = _numbers("d_bar.one_step", [d_bar["one_step"][kind] for kind in KINDS])
+    if not np.all(one_step >= 0):
+        raise CertificationRefused("d_bar.one_step must be numbers, none below 0")
+    # `value` repeats the latent bound; with two, it would be open which a tube uses.
+    _require_equal("d_bar.value", d_bar["value"], d_bar["one_step"]["latent"])
+    trajectories, runs, level = d_bar["trajectories"], d_bar["runs"], d_bar["level"]
+    if not 0 < level < 1 or not supports(trajectories, level):
+        raise CertificationRefused(
+            f"d_bar.level = {level!r} is not possible "
+            f"with {trajectories!r} trajectories"
+        )
+    if not 1 <= runs <= trajectories:
+        raise CertificationRefused(
+            f"d_bar.runs = {runs!r} does not fit {trajectories!r} trajectories"
+        )
+    for name, part in {"d_bar": d_bar, **d_bar["by_scenario"]}.items():
+        _require_coverage(name, part)
+
+
+def _require_tubes(
+    tube: Mapping[str, Any], proof: Certificate, d_bar: Mapping[str, Any]
+) -> None:
+    """Check R_k, its limit, and the radii in metres and radians."""
+    largest = None
+    # With a decoder of increments the step length counts; it is measured.
+    if "decoder" in proof.lipschitz:
+        stated = tube["largest_increment_m"]
+        largest = float(_numbers("tube.largest_increment_m", stated))
+        if largest < 0:
+            raise CertificationRefused("tube.largest_increment_m is below 0")
+    derived = tubes(
+        alpha=proof.alpha,
+        lipschitz=proof.lipschitz,
+        one_step=d_bar["one_step"],
+        horizon=len(tube["latent"]),
+        largest_increment=largest,
+    )
+    _require_equal("tube", tube, derived)
+
+
+def _require_outputs(outputs: Mapping[str, Any], weights: Exported) -> None:
+    """Check output metrics from their witnesses, and the coverage of their tubes."""
+    # All or none: a corridor needs both metrics.
+    if outputs and set(outputs) != set(OUTPUTS):
+        actual = ", ".join(map(str, outputs))
+        raise CertificationRefused(
+            f"outputs must be {' and '.join(OUTPUTS)}, got {actual}"
+        )
+    for name, part in outputs.items():
+        require_output_metric(name, OutputMetric.from_document(part), weights)
+        runs = part["coverage_runs"]
+        for form in FORMS:
+            if not _numbers(f"outputs.{name}.tube", part["tube"][form]) > 0:
+                raise CertificationRefused(f"outputs.{name}.tube.{form} is no radius")
+            stated = {key: part[key][form] for key in ("coverage", "coverage_ci95")}
+            counts = {"coverage_trajectories": runs, "coverage_runs": runs}
+            _require_coverage(f"outputs.{name}", stated | counts)
+
+
+def require_corridor(corridor: Mapping[str, Any]) -> None:
+    """Check sums, levels and counts of the document's corridor.
+
+    Args:
+        corridor: that part of the document.
+
+    Raises:
+        CertificationRefused: names the first value that does not follow.
+    """
+    bounds = corridor["bounds"]
+    complete = set(bounds) == {*JOINT, *ALONE}
+    if not complete or not np.all(_numbers("corridor.bounds", [*bounds.values()]) > 0):
+        raise CertificationRefused(
+            "corridor.bounds must be positive numbers, one for each measured quantity"
+        )
+    # Car to nominal model plus nominal model to path: the triangle inequality.
+    width = bounds["nominal"] + bounds["vehicle_to_nominal_position"]
+    _require_equal("corridor.corridor_m", corridor["corridor_m"], width)
+    runs, level = corridor["runs"], corridor["level"]
+    if not (isinstance(runs, int) and 0 < level < 1 and supports(runs, level)):
+        raise CertificationRefused(
+            f"corridor.level = {level!r} is not possible with {runs!r} runs"
+        )
+    # The attack kept disturbances in their bound: leaving would refute the proof.
+    if not corridor["attack"]["over_tube"] <= 1.0:
+        raise CertificationRefused(
+            "corridor.attack left the tube with disturbances within their bound"
+        )
+    for name, part in {"corridor": corridor, **corridor["by_scenario"]}.items():
+        _require_coverage(name, part)
+
+
+def _require_coverage(name: str, part: Mapping[str, Any]) -> None:
+    """Check that a coverage is a count of trajectories, and its interval."""
+    count, runs = part["coverage_trajectories"], part["coverage_runs"]
+    share = part["coverage"]
+    inside = round(share * count)
+    if not 0 <= inside <= count or not 1 <= runs <= count:
+        raise CertificationRefused(
+            f"{name}: a coverage of {share!r} is not possible with {count!r} "
+            f"trajectories of {runs!r} runs"
+        )
+    # A share must be a count over the number of trajectories, within rounding.
+    for key, value in counted(inside / count, count, runs).items():
+        _require_equal(f"{name}: {key}", part[key], value)
+
+
+def _numbers(name: str, values: Any) -> np.ndarray:
+    """Return a part of a document as an array of finite numbers."""
+    array = np.asarray(values)
+    # Booleans and strings are refused by the kind, before they compare as numbers.
+    if array.dtype.kind not in "if" or not np.all(np.isfinite(array)):
+        raise CertificationRefused(f"{name} must be finite numbers")
+    return array
+
+
+def _require_equal(name: str, stated: Any, derived: Any) -> None:
+    """Check a stated value, or all values by the same keys, against the derived ones.
+
+    Raises:
+        CertificationRefused: it is another.
+    """
+    if isinstance(derived, dict) and set(stated) == set(derived):
+        # All keys: a value that is left out here would be checked nowhere.
+        for key, value in derived.items():
+            _require_equal(f"{name}.{key}", stated[key], value)
+        return
+    if derived is None and stated is None:
+        return
+    if not isinstance(derived, dict) and derived is not None:
+        expected, actual = np.asarray(derived, np.float64), _numbers(name, stated)
+        # Relative to the derived value, which an attacker cannot choose.
+        if actual.shape == expected.shape and np.all(
+            np.abs(actual - expected) <= REPEATED * np.abs(expected)
+        ):
+            return
+    raise CertificationRefused(f"{name} does not follow from the rest of the document")
