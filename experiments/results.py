@@ -17,6 +17,7 @@ import numpy as np
 import yaml
 
 from sfkd_jax import evaluation
+from sfkd_jax.report import figures, style
 
 HOME = Path(__file__).parent
 TABLE1 = HOME.parent / "conf" / "comparison" / "table1.yaml"
@@ -181,6 +182,24 @@ def paper_table():
         lines.append([LABELS[label], *cells])
     heads = ["lateral RMSE [mm]", "S2, here", "S2, paper", "S3, here", "S3, paper"]
     return markdown(heads, lines)
+
+
+def draw_figure2():
+    """Draw docs/figures/figure2.png; all rows but those named otherwise observe e."""
+    rows = [
+        {
+            "system": row["row"],
+            "env": "measured",
+            "disturbed": [
+                one | {"rmse_m": {"mean": 1e-3 * one["rmse_mm"]}}
+                for one in row["forces"]
+            ],
+        }
+        for row in read("figure2")["rows"]
+    ]
+    rows.sort(key=lambda row: style.rank(row["system"]))
+    path = HOME.parent / "docs" / "figures" / "figure2.png"
+    style.save(path, figures.side_forces, rows)
 
 
 TABLES = {

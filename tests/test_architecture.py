@@ -59,7 +59,7 @@ THIRD_PARTY = {
     "training": {"optax", "orbax"},
     "certification": {"numpy", "scipy", "threadpoolctl", "cvxpy", "clarabel"},
     "evaluation": {"numpy", "scipy"},
-    "report": {"numpy", "matplotlib", "PIL", "jinja2"},
+    "report": {"numpy", "pandas", "matplotlib", "PIL", "jinja2"},
     "policy": {"numpy"},
     "adapters": {"brax", "gymnasium", "matplotlib", "numpy", "scipy", "vehiclemodels"},
     "export": {"numpy", "iree"},

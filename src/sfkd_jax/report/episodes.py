@@ -11,8 +11,8 @@ from jaxtyping import Float
 from sfkd_jax import store
 from sfkd_jax.evaluation import SHARED, parse_episode_name
 from sfkd_jax.evaluation.metrics import Row
-from sfkd_jax.report.rows import name_of
 from sfkd_jax.report.style import family, rank, switches
+from sfkd_jax.report.tables import name_of
 
 CELL = "cell"
 

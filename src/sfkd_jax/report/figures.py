@@ -12,7 +12,7 @@ from sfkd_jax.evaluation.formats import dig, is_number, is_pair
 from sfkd_jax.evaluation.metrics import LANE_HALF_WIDTH, Row
 from sfkd_jax.report import style
 from sfkd_jax.report.episodes import Episodes
-from sfkd_jax.report.rows import name_of
+from sfkd_jax.report.tables import name_of
 
 _ALWAYS = ("sfkd", "oracle")
 """Systems that every panel shows."""
@@ -213,34 +213,43 @@ def rmse_chart(groups: list[list[Row]]) -> Figure:
         _plain_log(axes.xaxis, axes.set_xscale)
     for axes in panels.flat[len(groups) :]:
         axes.set_axis_off()
-    # Shared by all panels, so that a row has the same height in each of them.
-    panels[0, 0].set_yticks(range(len(names)), [style.literal(n) for n in names])
-    panels[0, 0].set_ylim(len(names) - 0.4, -0.6)
+    _name_rows(panels[0, 0], names)
     figure.supxlabel("lateral RMSE [mm], mean and 95 % interval", fontsize=10)
     return figure
 
 
 def side_forces(rows: list[Row]) -> Figure:
-    """RMSE against the largest unmeasured side force, one line per system.
+    """RMSE of every system under unmeasured side forces; larger dots: larger forces.
 
     Args:
         rows: that may be compared, each with `disturbed`.
     """
-    figure = style.canvas(4.0)
-    axes = figure.subplots()
-    for row in rows:
+    figure = style.canvas(1.1 + 0.24 * len(rows))
+    axes, forces = figure.subplots(), {}
+    for height, row in enumerate(rows):
         runs = [
             one for one in row["disturbed"] if is_number(dig(one, "rmse_m", "mean"))
         ]
-        points = [(one["force_n"], 1e3 * one["rmse_m"]["mean"]) for one in runs]
-        look = style.line(str(row.get("system")), name_of(row))
-        # A system with and without e has one colour; hollow marks do not observe e.
-        look |= {"markerfacecolor": "white"} if row.get("env") == "none" else {}
-        axes.plot(*np.array(points).reshape(-1, 2).T, "o", markersize=4, **look)
-    axes.set(xlabel="largest unmeasured side force [N]", ylabel="lateral RMSE [mm]")
-    _plain_log(axes.yaxis, axes.set_yscale)
+        errors = [1e3 * one["rmse_m"]["mean"] for one in runs]
+        color = style.line(str(row.get("system")))["color"]
+        axes.plot(errors, [height] * len(runs), color=color, linewidth=1.6, alpha=0.5)
+        for one, error in zip(runs, errors, strict=True):
+            force = one["force_n"]
+            forces[force] = size = 10.0 + 0.07 * force
+            axes.scatter(error, height, size, color=color, zorder=3)
+    for force, size in sorted(forces.items()):
+        axes.scatter([], [], size, color=style.MUTED, label=f"{force:g} N")
+    axes.set_xlabel("lateral RMSE [mm] by largest unmeasured side force")
+    _plain_log(axes.xaxis, axes.set_xscale)
+    _name_rows(axes, [name_of(row) for row in rows])
     style.legend(figure, axes)
     return figure
+
+
+def _name_rows(axes: Any, names: list[str]) -> None:
+    """Write the names of rows beside them, the first above."""
+    axes.set_yticks(range(len(names)), [style.literal(name) for name in names])
+    axes.set_ylim(len(names) - 0.4, -0.6)
 
 
 def against_setting(name: str, rows: list[tuple[float, Row]]) -> Figure:

@@ -19,7 +19,7 @@ from PIL import Image
 from sfkd_jax.evaluation.metrics import LANE_HALF_WIDTH, VEHICLE_HALF_WIDTH
 from sfkd_jax.report import style
 from sfkd_jax.report.episodes import Episodes
-from sfkd_jax.report.rows import NO_MODEL
+from sfkd_jax.report.tables import NO_MODEL
 
 SECONDS, EVERY = 13.5, 2
 """Of the episode that are shown; steps that a frame lasts."""
@@ -68,7 +68,9 @@ def film_of(
     # One palette for all: half the bytes, and no flicker. Some frames hold all colours.
     some = [np.asarray(one)[::2, ::2] for one in frames[:: 1 + len(frames) // 4]]
     palette = Image.fromarray(np.vstack(some)).quantize(colors=_COLOURS, kmeans=1)
-    first, *rest = [one.quantize(palette=palette, dither=0) for one in frames]
+    first, *rest = [
+        one.quantize(palette=palette, dither=Image.Dither.NONE) for one in frames
+    ]
     pause = round(1e3 * EVERY * dt)
     first.save(path, save_all=True, append_images=rest, duration=pause, loop=0)
     return path

@@ -1,23 +1,17 @@
-"""A page as a record, and the same page as HTML, Markdown and LaTeX."""
+"""A page of texts, images and tables as HTML and Markdown, and tables as LaTeX."""
 
 from __future__ import annotations
 
 import base64
+import html
 import re
 from pathlib import Path
 from typing import NamedTuple, TypeAlias
 
+import pandas as pd
 from jinja2 import Environment, PackageLoader, StrictUndefined
 
-from sfkd_jax.report.rows import Table
 from sfkd_jax.store import write_bytes
-
-
-class Text(NamedTuple):
-    """A short paragraph, or with `code` a text to copy."""
-
-    text: str
-    code: bool = False
 
 
 class Picture(NamedTuple):
@@ -27,7 +21,7 @@ class Picture(NamedTuple):
     alt: str
 
 
-Part: TypeAlias = Text | Picture | Table
+Part: TypeAlias = str | Picture | pd.DataFrame
 
 
 class Section(NamedTuple):
@@ -38,70 +32,91 @@ class Section(NamedTuple):
     folded: bool = False
 
 
-class Page(NamedTuple):
-    """A page of sections; those without parts are left out."""
-
-    title: str
-    sections: list[Section]
-
-
-def write_page(page: Page, html: Path, markdown: Path) -> dict[str, object]:
-    """Write a page, and return where it and its images are.
+def write_page(title: str, sections: list[Section], home: Path) -> dict[str, object]:
+    """Write home/index.html and home/report.md, return where they and images are.
 
     The HTML has its figures inside, and links films, which are larger; the Markdown
-    links both. Links are relative to the page.
+    links both. Links are relative to the page; sections without parts are left out.
     """
-    for path in (html, markdown):
-        template = _ENVIRONMENT.get_template(f"page{path.suffix}")
-        write_bytes(path, template.render(page=page, home=path.parent).encode())
-    parts = [part for section in page.sections for part in section.parts]
+    sections = [section for section in sections if section.parts]
+    filled = _ENVIRONMENT.get_template("page.html").render(
+        title=title,
+        sections=[
+            section._replace(parts=[_as_html(part, home) for part in section.parts])
+            for section in sections
+        ],
+    )
+    write_bytes(home / "index.html", filled.encode())
+    lines = [f"# {_plain(title)}"]
+    for section in sections:
+        lines += [f"## {_plain(section.title)}"] if section.title else []
+        lines += [_as_markdown(part, home) for part in section.parts]
+    write_bytes(home / "report.md", ("\n\n".join(lines) + "\n").encode())
+    parts = [part for section in sections for part in section.parts]
     pictures = [str(part.path) for part in parts if isinstance(part, Picture)]
-    return {"report": str(html), "figures": pictures}
+    return {"report": str(home / "index.html"), "figures": pictures}
 
 
-def to_latex(captions: list[tuple[str, Table]]) -> str:
-    """Tables with their captions as floats for booktabs."""
-    return _ENVIRONMENT.get_template("tables.tex").render(tables=captions)
+def to_latex(captions: list[tuple[str, pd.DataFrame]]) -> str:
+    """Tables with their captions as floats for booktabs, no wider than the text."""
+    text = "% Needs \\usepackage{booktabs,graphicx}.\n"
+    width = r"\ifdim\width>\linewidth\linewidth\else\width\fi"
+    for caption, frame in captions:
+        words = re.sub(r"([&%$#_{}])", r"\\\1", caption.replace("\\", "/"))
+        columns = "l" + "r" * frame.shape[1]
+        rows = frame.to_latex(
+            escape=True, column_format=columns, multicolumn_format="c"
+        )
+        text += (
+            f"\\begin{{table}}[p]\n\\centering\\footnotesize\n\\caption{{{words}}}\n"
+        )
+        text += f"\\resizebox{{{width}}}{{!}}{{%\n{rows}}}\n\\end{{table}}\n"
+    return text
 
 
-def _source(path: Path, home: Path) -> str:
-    """What an image links: its content, or for a film its place."""
-    if path.suffix == ".gif":
-        return path.relative_to(home).as_posix()
-    data = base64.b64encode(path.read_bytes()).decode("ascii")
-    return f"data:image/{path.suffix.removeprefix('.')};base64,{data}"
+def _as_html(part: Part, home: Path) -> str:
+    """A part of a page as HTML; whatever a table or a text holds is escaped."""
+    if isinstance(part, str):
+        return f"<p>{html.escape(part)}</p>"
+    if isinstance(part, Picture):
+        source = part.path.relative_to(home).as_posix()
+        if part.path.suffix == ".png":
+            data = base64.b64encode(part.path.read_bytes()).decode("ascii")
+            source = f"data:image/png;base64,{data}"
+        return f'<img alt="{html.escape(part.alt)}" src="{source}">'
+    # Numbers stand below each other by their last digit, words begin on the left.
+    kind = "numbers" if _is_numeric(part) else "words"
+    with pd.option_context("display.max_colwidth", None):
+        rows = part.to_html(classes=kind, border=0, escape=True, justify="right")
+    # The row of this project's model is marked.
+    rows = re.sub(r"<tr>(\s*<th>SFKD</th>)", r'<tr class="strong">\1', rows)
+    return f'<div class="scroll">{rows}</div>'
+
+
+def _is_numeric(frame: pd.DataFrame) -> bool:
+    """Whether most cells begin with a digit, a sign or a dash."""
+    return bool(frame.map(lambda cell: cell[:1] in "0123456789−–<").mean().mean() > 0.5)
+
+
+def _as_markdown(part: Part, home: Path) -> str:
+    """A part of a page as Markdown."""
+    if isinstance(part, str):
+        return _plain(part)
+    if isinstance(part, Picture):
+        return f"![{_plain(part.alt)}]({part.path.relative_to(home).as_posix()})"
+    heads = [part.columns.names[-1], *part.columns]
+    titles = [head if isinstance(head, str) else " ".join(head) for head in heads]
+    ruler = [":--", *["--:" if _is_numeric(part) else ":--"] * part.shape[1]]
+    lines = [titles, ruler, *([name, *row] for name, *row in part.itertuples())]
+    return "\n".join(f"| {' | '.join(map(_plain, line))} |" for line in lines)
 
 
 def _plain(text: str) -> str:
     """One line of Markdown without any mark-up from `text`."""
     line = re.sub(r"([\\`*_\[\]|])", r"\\\1", " ".join(text.split()))
-    return line.replace("&", "&amp;").replace("<", "&lt;").replace(">", "&gt;")
-
-
-_TEX = {
-    **{letter: f"\\{letter}" for letter in "&%$#_{}"},
-    "\\": r"\textbackslash{}",
-    "~": r"\textasciitilde{}",
-    "^": r"\textasciicircum{}",
-    "−": "$-$",
-    "±": r"$\pm$",
-    "–": "--",
-    "α": r"$\alpha$",
-    "†": r"\textdagger{}",
-    "<": "$<$",
-    ">": "$>$",
-}
-
-
-def _tex(text: str) -> str:
-    return "".join(_TEX.get(letter, letter) for letter in text)
+    return html.escape(line, quote=False)
 
 
 _ENVIRONMENT = Environment(
-    loader=PackageLoader("sfkd_jax.report"),
-    autoescape=lambda name: (name or "").endswith(".html"),
-    undefined=StrictUndefined,
-    trim_blocks=True,
-    lstrip_blocks=True,
+    loader=PackageLoader("sfkd_jax.report"), autoescape=True, undefined=StrictUndefined
 )
-_ENVIRONMENT.filters |= {"source": _source, "plain": _plain, "tex": _tex}

@@ -9,12 +9,11 @@ from typing import Any
 from sfkd_jax import store
 from sfkd_jax.evaluation import SHARED, formats
 from sfkd_jax.evaluation.formats import DASH, dig, is_number, is_pair, plain, short
-from sfkd_jax.report import figures, style
-from sfkd_jax.report import rows as tables
+from sfkd_jax.report import figures, style, tables
 from sfkd_jax.report.episodes import of_run
 from sfkd_jax.report.film import film_of
-from sfkd_jax.report.pages import Page, Part, Picture, Section, Text, write_page
-from sfkd_jax.report.rows import Table, record_table, title_of
+from sfkd_jax.report.pages import Part, Picture, Section, write_page
+from sfkd_jax.report.tables import record_table, title_of
 
 MADE_BY = {
     "results.json": "evaluate",
@@ -71,11 +70,20 @@ def write_report(run_dir: Path) -> dict[str, Any]:
         ArtefactError: no policy.safetensors; a file that cannot be read, or does not
             fit on a page; or the disk refuses the page.
     """
-    home = run_dir / "report"
+    home, weights = run_dir / "report", run_dir / f"policy{store.SUFFIX}"
     with store.as_artefact_error(home):
+        if not weights.exists():
+            makes = "python -m sfkd_jax.train makes a run"
+            raise store.ArtefactError(f"{weights} is missing: {makes}")
         images = empty_folder(home / "figures")
-        page = _page(run_dir, images)
-        return write_page(page, home / "index.html", home / "report.md")
+        policy = store.read_manifest(weights, kind="policy")
+        settings = policy.get("config") or {}
+        system, experiment = tables.model_of(settings), settings.get("experiment")
+        title = f"{style.label(system)}, {plain(experiment or 'unnamed run')}"
+        sections = _sections(run_dir, policy, system, images)
+        return write_page(
+            f"{title}, seed {plain(settings.get('seed'))}", sections, home
+        )
 
 
 def read_optional(path: Path) -> dict[str, Any]:
@@ -83,17 +91,14 @@ def read_optional(path: Path) -> dict[str, Any]:
     return store.read_json(path) if path.exists() else {}
 
 
-def read_policy(run: Path) -> dict[str, Any]:
-    """The manifest of the weights of a run, empty without weights."""
-    path = run / f"policy{store.SUFFIX}"
-    return store.read_manifest(path, kind="policy") if path.exists() else {}
-
-
 def read_certificate(run: Path) -> dict[str, Any]:
     """The certificate of a run; one about other weights is not valid."""
-    certificate = read_optional(run / "certificate.json")
-    own = read_policy(run).get("sha256")
-    named = certificate.get("weights_sha256")
+    certificate, path = (
+        read_optional(run / "certificate.json"),
+        run / f"policy{store.SUFFIX}",
+    )
+    policy = store.read_manifest(path, kind="policy") if path.exists() else {}
+    own, named = policy.get("sha256"), certificate.get("weights_sha256")
     # Valid for other weights is not valid here: the page must not show it.
     if own and named and own != named:
         reason = "the certificate in this run is about other weights"
@@ -116,74 +121,60 @@ def empty_folder(folder: Path) -> Path:
     return folder
 
 
-def made_with(config: dict[str, Any], versions: Any) -> list[Section]:
+def made_with(config: dict[str, Any], versions: Any) -> Section:
     """The command, the settings and the versions that made something, folded."""
-    command = config.get("command")
-    parts: list[Part] = [Text(command, code=True)] if isinstance(command, str) else []
-    parts.append(record_table("Setting", config, "value"))
+    parts: list[Part] = [record_table("Setting", config, "value")]
     parts.append(record_table("Package", versions or {}, "version"))
-    return [Section("Command, settings and versions", parts, folded=True)]
+    return Section("Command, settings and versions", parts, folded=True)
 
 
-def _page(run_dir: Path, images: Path) -> Page:
+def _sections(
+    run_dir: Path, policy: dict[str, Any], system: str, images: Path
+) -> list[Section]:
     """All sections of the page; a file whose content does not fit is named."""
-    policy = read_policy(run_dir)
-    if not policy:
-        makes = "python -m sfkd_jax.train makes a run"
-        raise store.ArtefactError(
-            f"{run_dir / 'policy'}{store.SUFFIX} is missing: {makes}"
-        )
     results = read_optional(run_dir / "results.json")
-    settings = policy.get("config") or {}
-    certificate, system = read_certificate(run_dir), tables.model_of(settings)
+    certificate = read_certificate(run_dir)
     # Numbers of a certificate that does not hold are nowhere drawn.
     proof = certificate if holds(certificate) else {}
     half = dig(proof, "corridor", "corridor_m")
-    missing = [
-        Text(f"{name} is missing: python -m sfkd_jax.{command} makes it.")
+    missing: list[Part] = [
+        f"{name} is missing: python -m sfkd_jax.{command} makes it."
         for name, command in MADE_BY.items()
         if not (run_dir / name).exists()
     ]
-    sections = [Section("", [*missing])]
+    sections, episodes = [Section("", missing)], f"episodes{store.SUFFIX}"
     for title, file, make in (
         ("Closed loop", "results.json", lambda: _scores(results)),
-        (
-            "Episodes",
-            f"episodes{store.SUFFIX}",
-            lambda: _driven(run_dir, system, half, images),
-        ),
+        ("Episodes", episodes, lambda: _episodes(run_dir, system, half, images)),
         ("Certificate", "certificate.json", lambda: _certified(certificate)),
         ("Open loop", "open_loop.json", lambda: _predicted(run_dir, proof, images)),
         ("Training", "metrics.jsonl", lambda: _learned(run_dir, images)),
     ):
         with store.as_artefact_error(run_dir / file, ValueError):
             sections.append(Section(title, make()))
-    used = settings | {"command": dig(results, "config", "command")}
-    sections += made_with(used, policy.get("versions") or results.get("versions"))
-    experiment = plain(settings.get("experiment") or "unnamed run")
-    title = f"{style.label(system)}, {experiment}, seed {plain(settings.get('seed'))}"
-    return Page(title, sections)
+    command = {"command": dig(results, "config", "command")}
+    versions = policy.get("versions") or results.get("versions")
+    return [*sections, made_with(command | (policy.get("config") or {}), versions)]
 
 
 def _scores(results: dict[str, Any]) -> list[Part]:
     """The metrics of all systems: tables for each group that may be compared."""
     parts: list[Part] = []
     for group in tables.grouped(results.get("rows") or [], SHARED):
-        parts.append(Text(f"{title_of(group, SHARED)}: {tables.amount(group)}"))
+        parts.append(f"{title_of(group, SHARED)}: {tables.amount(group)}")
         parts += tables.metric_tables([(tables.name_of(row), row) for row in group])
     return parts
 
 
-def _driven(run_dir: Path, system: str, half: Any, images: Path) -> list[Part]:
+def _episodes(run_dir: Path, system: str, half: Any, images: Path) -> list[Part]:
     """Figures of every group of episodes, and a film of the first one."""
     parts: list[Part] = []
     corridor = float(half) if is_number(half) else None
     for number, group in enumerate(of_run(run_dir), 1):
         title = title_of([group[0].row], SHARED)
-        path = style.save(
-            images / f"first_{number}.png", figures.first_episode, group, corridor
-        )
-        parts += [Text(f"{title}."), Picture(path, f"First episode: {title}")]
+        path = images / f"first_{number}.png"
+        style.save(path, figures.first_episode, group, corridor)
+        parts += [f"{title}.", Picture(path, f"First episode: {title}")]
         own = [one for one in group if one.row.get("system") == system]
         if own and len(own[0].lateral) > 1:
             path = images / f"all_{number}.png"
@@ -200,23 +191,21 @@ def _certified(record: dict[str, Any]) -> list[Part]:
         return []
     if not holds(record):
         reason = plain(record.get("reason") or "the file gives no reason")
-        return [Text(f"No contraction is certified for these weights: {reason}.")]
+        return [f"No contraction is certified for these weights: {reason}."]
     file = resources.files("sfkd_jax.report") / "templates" / "certificate.csv"
-    rows = []
+    quantities, boxes = {}, {}
     for line in file.read_text("utf-8").splitlines():
         name, place, write, basis = line.split(";")
         shown = _WRITERS[write](dig(record, *place.split(".")))
-        rows += [(name, [shown, basis])] if DASH not in shown else []
-    columns = [("", "value"), ("", "rests on")]
-    boxes = []
+        quantities |= {name: [shown, basis]} if DASH not in shown else {}
     for box, known in (_PATH if record.get("corridor") else _BODY).items():
         # Boxes of logged data name their own axes.
         for axis, name in enumerate(dig(record, "boxes", "names", box) or known):
             side = [dig(record, "boxes", box, end, str(axis)) for end in "01"]
-            boxes += [(f"{box}: {name}", [*map(short, side)])] if is_pair(side) else []
-    parts: list[Part] = [Text(PROOF), Table("Quantity", columns, rows, prose=True)]
-    heads = [("", "from"), ("", "to")]
-    return [*parts, Table("Box", heads, boxes)] if boxes else parts
+            boxes |= {f"{box}: {name}": side} if is_pair(side) else {}
+    parts: list[Part] = [PROOF]
+    parts.append(record_table("Quantity", quantities, "value", "rests on"))
+    return [*parts, record_table("Box", boxes, "from", "to")] if boxes else parts
 
 
 def _predicted(run_dir: Path, proof: dict[str, Any], images: Path) -> list[Part]:
@@ -226,9 +215,8 @@ def _predicted(run_dir: Path, proof: dict[str, Any], images: Path) -> list[Part]
         return []
     radii = dig(proof, "tube", "physical", "position_m")
     path = style.save(images / "open_loop.png", figures.open_loop, errors, radii or [])
-    count = plain(errors.get("trajectories"))
-    words = f"{count} trajectories that training never saw."
-    return [Picture(path, "Prediction error by time ahead"), Text(words)]
+    words = f"{plain(errors.get('trajectories'))} trajectories that training never saw."
+    return [Picture(path, "Prediction error by time ahead"), words]
 
 
 def _learned(run_dir: Path, images: Path) -> list[Part]:
