@@ -8,7 +8,6 @@ from sfkd_jax.evaluation._closed_loop import first_reference as first_reference
 from sfkd_jax.evaluation._closed_loop import (
     observed_environment as observed_environment,
 )
-from sfkd_jax.evaluation._closed_loop import over_episodes as over_episodes
 from sfkd_jax.evaluation._closed_loop import simulate as simulate
 from sfkd_jax.evaluation._open_loop import baselines as baselines
 from sfkd_jax.evaluation._open_loop import open_loop as open_loop

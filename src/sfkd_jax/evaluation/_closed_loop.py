@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from functools import partial
-from typing import Any, NamedTuple, TypeVar
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -28,8 +28,6 @@ streams 0 and 1.
 """
 LEAST_FRICTION = 0.05
 
-Result = TypeVar("Result")
-
 
 class Episode(NamedTuple):
     """One closed-loop episode.
@@ -51,21 +49,6 @@ class Episode(NamedTuple):
     progress: Float[Array, " time"]
     assumed_envs: Float[Array, "time environment"]
     signals: dict[str, Any]
-
-
-def over_episodes(run: Callable[..., Result]) -> Callable[..., Result]:
-    """Return the function that runs every episode of a batch.
-
-    On a single CPU one episode follows the other: the samples of one plan stay in its
-    caches, those of all episodes do not. On accelerators, or several devices, all run
-    at once.
-
-    Args:
-        run: one episode, such as `simulate` with its first arguments bound.
-    """
-    if jax.default_backend() != "cpu" or len(jax.devices()) > 1:
-        return jax.vmap(run)
-    return lambda *batch: jax.lax.map(lambda one: run(*one), batch)
 
 
 def simulate(

@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import os
 import time
 from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
 from functools import partial
 from typing import Any, NamedTuple, TypeAlias
 
@@ -85,14 +87,47 @@ def make_episodes(settings: Settings, plant: Vehicle) -> EpisodeSet:
 
 
 def _shard(batch: Any) -> Any:
-    """Distribute episodes evenly over all devices, if their number allows it."""
+    """Distribute episodes evenly over all accelerators, if their number allows it."""
     devices = jax.devices()
-    if len(devices) == 1 or len(jax.tree.leaves(batch)[0]) % len(devices):
+    if jax.default_backend() == "cpu" or len(jax.tree.leaves(batch)[0]) % len(devices):
         return batch
     mesh = jax.sharding.Mesh(devices, ("episode",))
     return jax.device_put(
         batch, jax.sharding.NamedSharding(mesh, jax.sharding.PartitionSpec("episode"))
     )
+
+
+def _over_episodes(
+    run: Callable[[Scenario, Key], evaluation.Episode],
+) -> Callable[[Scenario, Key], evaluation.Episode]:
+    """Compile the simulation of one episode for a batch of them.
+
+    Accelerators run all at once. On CPUs a core runs one episode after the other: the
+    samples of a plan stay in its caches, and are too few to be divided among cores.
+    """
+    if jax.default_backend() != "cpu":
+        return jax.jit(jax.vmap(run))
+    compiled = jax.jit(run)
+
+    def run_all(scenarios: Scenario, keys: Key) -> evaluation.Episode:
+        count = len(keys)
+        batch = [
+            jax.tree.map(lambda leaf, i=i: leaf[i], (scenarios, keys))
+            for i in range(count)
+        ]
+        # Ahead of the threads, which would compile the same program side by side.
+        program = compiled.lower(*batch[0]).compile()
+        pool = ThreadPoolExecutor(min(count, os.cpu_count() or 1))
+        try:
+            done = list(
+                pool.map(lambda one: jax.block_until_ready(program(*one)), batch)
+            )
+        finally:
+            # Nobody waits for the episodes of an interrupted command.
+            pool.shutdown(wait=False, cancel_futures=True)
+        return jax.tree.map(lambda *leaves: jnp.stack(leaves), *done)
+
+    return run_all
 
 
 def load_systems(settings: Settings, plant: Vehicle) -> dict[str, System]:
@@ -183,7 +218,7 @@ class SystemEvaluation:
         system, self.params = system._replace(params=folded), folded
         self._columns["open_loop_rmse_m"] = _open_loop(settings, system, dataset)
         self._horizon = settings.controller.horizon
-        self._simulate = jax.jit(evaluation.over_episodes(self._episode))
+        self._simulate = _over_episodes(self._episode)
         self._score = _scorer(settings, system, plant.dt)
 
     def __call__(self, episodes: EpisodeSet) -> SystemResult:
