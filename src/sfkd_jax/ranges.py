@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from dataclasses import dataclass
 from importlib import import_module
 from typing import Annotated, Any, TypeAlias
@@ -48,6 +49,13 @@ Names: TypeAlias = Annotated[tuple[str, ...], Entries(least=0)]
 """Any number of names, none included."""
 Bounds: TypeAlias = Annotated[tuple[Real, ...], Entries(least=0)]
 """Lower or upper ends of intervals; none where they are unknown."""
+
+
+def check_choice(setting: str, value: str, known: Iterable[str]) -> None:
+    """Raise ValueError unless the value of a setting is one of the known words."""
+    words = tuple(known)
+    if value not in words:
+        raise ValueError(f"{setting} must be one of {', '.join(words)}, got {value!r}")
 
 
 def imported(name: str, setting: str) -> Any:

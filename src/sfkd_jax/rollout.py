@@ -9,22 +9,11 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from sfkd_jax.geometry import (
-    HEADING,
-    LATERAL,
-    PATH_SPEED,
-    between,
-    rotate,
-    wrap_angle,
-)
+from sfkd_jax.geometry import HEADING, PATH_SPEED, rotate, wrap_angle
 from sfkd_jax.types import (
     BODY,
-    POSE,
     Control,
-    Environment,
-    Explicit,
     Fiber,
-    Key,
     Latent,
     Model,
     Params,
@@ -49,8 +38,8 @@ class Folded(NamedTuple):
 def fold(model: Model, params: Params) -> Params:
     """Evaluate once what every control step would otherwise evaluate again.
 
-    `policy.load` and the evaluation pipeline do this; only a program that controls with
-    parameters it has just trained calls it, and compiles it.
+    `policy.load` does this; a program that controls with parameters it has just trained
+    calls it, and compiles it.
 
     Args:
         model: any model.
@@ -73,21 +62,15 @@ def unfold(params: Params) -> Params:
 class Offset(NamedTuple):
     """Parameters of a model together with a shift of its steps.
 
+    `Model.fiber` of these parameters is an `Offset` as well, of the model's own fiber.
+
     Attributes:
-        params: of the model, folded or not.
+        params: of the model, folded or not; in a fiber, the fiber of the model.
         inputs: added to every control, as a bias of B(e) u and of the residual.
         latent: added to every latent step, a pytree like the latent; None for nothing.
     """
 
-    params: Params
-    inputs: Control
-    latent: Latent | None
-
-
-class OffsetFiber(NamedTuple):
-    """The fiber of the model and the shift."""
-
-    fiber: Fiber
+    params: Any
     inputs: Control
     latent: Latent | None
 
@@ -103,60 +86,45 @@ def with_offset(model: Model) -> Model:
         model: any model; its own parameters stay as they are.
     """
 
-    def init(key: Key) -> Offset:
-        # A scalar 0 broadcasts over any control, whose size is not known here.
-        return Offset(model.init(key), jnp.zeros(()), None)
-
-    def fiber(params: Offset, env: Environment) -> OffsetFiber:
-        # After the model's own fiber: δ and b are no functions of e.
-        return OffsetFiber(model.fiber(params.params, env), *params[1:])
-
-    def step(fiber: OffsetFiber, latent: Latent, control: Control) -> Latent:
-        after = model.step(fiber.fiber, latent, control + fiber.inputs)
+    def step(fiber: Offset, latent: Latent, control: Control) -> Latent:
+        after = model.step(fiber.params, latent, control + fiber.inputs)
         # None, not zeros: a model without a latent shift pays nothing for it.
         if fiber.latent is None:
             return after
         return jax.tree.map(jnp.add, after, fiber.latent)
 
-    def encode(fiber: OffsetFiber, state: State) -> Latent:
-        return model.encode(fiber.fiber, state)
+    def inner(function: Callable[..., Any] | None) -> Any:
+        # Everything else sees the model's own parameters or fiber.
+        return function and (lambda offset, *rest: function(offset.params, *rest))
 
-    def decode(fiber: OffsetFiber, latent: Latent) -> State:
-        return model.decode(fiber.fiber, latent)
-
-    def transport(before: OffsetFiber, after: OffsetFiber, latent: Latent) -> Latent:
-        return model.transport(before.fiber, after.fiber, latent)
-
-    def observe(fiber: OffsetFiber, latent: Latent, state: State) -> Latent:
-        return model.observe(fiber.fiber, latent, state)
-
+    structure = model.structure
     return model._replace(
-        init=init,
-        fiber=fiber,
-        encode=encode,
+        # A scalar 0 broadcasts over any control, whose size is not known here.
+        init=lambda key: Offset(model.init(key), jnp.zeros(()), None),
+        # After the model's own fiber: δ and b are no functions of e.
+        fiber=lambda params, env: params._replace(
+            params=model.fiber(params.params, env)
+        ),
+        encode=inner(model.encode),
         step=step,
-        decode=decode,
-        transport=transport,
-        observe=observe,
+        decode=inner(model.decode),
+        transport=lambda before, after, latent: model.transport(
+            before.params, after.params, latent
+        ),
+        observe=inner(model.observe),
         # Folding is for the parameters inside, see `Offset.params`.
         shared=None,
-        structure=_structure(model.structure),
+        structure=Structure(inner(structure.explicit), inner(structure.rate)),
     )
 
 
-def _structure(structure: Structure) -> Structure:
-    """What is known of the weights, which an offset does not change."""
-    explicit, rate = structure.explicit, structure.rate
-
-    def explicit_of(params: Offset) -> Explicit:
-        # `explicit and …` below makes this function only where it is set.
-        assert explicit is not None
-        return explicit(params.params)
-
-    return Structure(
-        explicit=explicit and explicit_of,
-        rate=rate and (lambda params: rate(params.params)),
-    )
+def runge_kutta(derivative: Callable[[State], State], state: State, dt: float) -> State:
+    """Return the state after dt by one classical Runge-Kutta step, error O(dt⁴)."""
+    k1 = derivative(state)
+    k2 = derivative(state + 0.5 * dt * k1)
+    k3 = derivative(state + 0.5 * dt * k2)
+    k4 = derivative(state + dt * k3)
+    return state + dt / 6.0 * (k1 + 2.0 * k2 + 2.0 * k3 + k4)
 
 
 def fibers_along(
@@ -212,30 +180,6 @@ def sliding_windows(trajectory: Trajectory, *, horizon: int, stride: int) -> Tra
     return Trajectory(states, trajectory.controls[inside], trajectory.envs[inside])
 
 
-def window_errors(
-    model: Model, params: Params, trajectory: Trajectory, *, horizon: int, stride: int
-) -> Float[Array, "window horizon 3"]:
-    """Return `prediction_errors` 1 … horizon steps ahead, for every window.
-
-    Args:
-        model: any model.
-        params: of the model.
-        trajectory: one, states (T + 1, state).
-        horizon: steps of a window.
-        stride: steps between the starts of two windows.
-
-    Raises:
-        ValueError: the horizon does not fit the trajectory.
-    """
-
-    def one(window: Trajectory) -> Float[Array, "horizon 3"]:
-        return prediction_errors(
-            rollout(model, params, window)[0], window, along_path=model.along_path
-        )
-
-    return jax.vmap(one)(sliding_windows(trajectory, horizon=horizon, stride=stride))
-
-
 def prediction_errors(
     predicted: Float[Array, "horizon state"],
     window: Trajectory,
@@ -247,13 +191,10 @@ def prediction_errors(
     Along a path: |e_y| [m], |e_ψ| [rad], 2-norm of the vehicle's own body state.
     """
     gap = predicted - window.states[1:]
+    position, yaw, body = gap[:, :2], gap[:, 2:3], gap[:, BODY]
     # The pose of a path state is 0 throughout and would count as a perfect prediction.
-    kinds = (
-        _kinds_along_path(gap)
-        if along_path
-        else (gap[:, :2], gap[:, 2:3], gap[:, BODY])
-    )
-    position, yaw, body = kinds
+    if along_path:
+        position, yaw, body = jnp.split(body, (HEADING, PATH_SPEED), axis=1)
     return jnp.column_stack(
         [jnp.linalg.norm(kind, axis=1) for kind in (position, wrap_angle(yaw), body)]
     )
@@ -271,12 +212,6 @@ def state_errors(
     # Wrapped: a car that has turned around is not 2π away from itself.
     yaw = wrap_angle(predicted[:, 2:3] - true[:, 2:3])
     return jnp.concatenate([position, yaw, predicted[:, BODY] - true[:, BODY]], axis=1)
-
-
-def _kinds_along_path(gap: Float[Array, "*batch state"]) -> tuple[Array, Array, Array]:
-    """Split path states into e_y, e_ψ (for position and yaw) and the vehicle's body."""
-    xi = gap[..., BODY]
-    return xi[..., LATERAL, None], xi[..., HEADING, None], xi[..., PATH_SPEED:]
 
 
 def in_batches(function: Callable[[Any], Any], items: Any, *, size: int) -> Any:
@@ -328,47 +263,6 @@ def defects(
     after = observe(later, origin, trajectory.states[1:])
     gap = jax.vmap(model.vector)(after) - jax.vmap(model.vector)(expected)
     return gap, jax.vmap(model.decode)(later, expected)
-
-
-def step_disturbances(
-    model: Model,
-    fiber: Fiber,
-    fiber_next: Fiber,
-    origin: Latent,
-    before: State,
-    control: Control,
-    after: State,
-) -> Float[Array, " 4"]:
-    """Return the one-step residuals of latent, position [m], yaw [rad] and body state.
-
-        |z' − ẑ'|, |p(g⁻¹ g') − p(g⁻¹ ĝ')|, |yaw(g⁻¹ g') − yaw(g⁻¹ ĝ')|, |s' − ŝ'|,
-        ẑ' = T(e → e') F(z, u, e)
-
-    Along a path the last three are e_y [m], e_ψ [rad] and the vehicle's own body state.
-
-    Args:
-        model: any model.
-        fiber: of e.
-        fiber_next: of e'.
-        origin: a latent in whose frame z and z' are expressed; `model.encode(fiber,
-            before)` gives a new frame at x.
-        before: x.
-        control: u.
-        after: x'.
-    """
-    now = model.observe(fiber, origin, before)
-    expected = model.transport(fiber, fiber_next, model.step(fiber, now, control))
-    predicted = model.decode(fiber_next, expected)
-    gap = model.vector(model.observe(fiber_next, origin, after)) - model.vector(
-        expected
-    )
-    # As motions of one step: each turns far less than π, so no wrap spoils it.
-    motion = between(before[POSE], predicted[POSE]) - between(before[POSE], after[POSE])
-    kinds = (motion[:2], motion[2:], predicted[BODY] - after[BODY])
-    # Path states have no pose: all their errors are in the body.
-    if model.along_path:
-        kinds = _kinds_along_path(predicted - after)
-    return jnp.stack([jnp.linalg.norm(kind) for kind in (gap, *kinds)])
 
 
 def _at(tree: Any, index: int) -> Any:

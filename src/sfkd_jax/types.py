@@ -11,6 +11,7 @@ from dataclasses import dataclass
 from typing import Any, NamedTuple, Required, TypeAlias, TypedDict
 
 import jax
+import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray
 
 Key: TypeAlias = PRNGKeyArray
@@ -53,6 +54,33 @@ class Space(NamedTuple):
     env_scale: Float[Array, " environment"]
     increment_mean: Float[Array, " 3"]
     increment_scale: Float[Array, " 3"]
+
+    def scaled_body(self, state: State) -> Float[Array, " body"]:
+        """Return the body state in scaled units.
+
+        Raises:
+            ValueError: the state has the wrong length.
+        """
+        size = 3 + self.body_mean.shape[0]
+        # Broadcasting would accept a state of another plant silently.
+        if state.shape != (size,):
+            raise ValueError(f"state must have shape ({size},), got {state.shape}")
+        return (state[BODY] - self.body_mean) / self.body_scale
+
+    def scaled_control(self, control: Control) -> Control:
+        """Return the control in scaled units."""
+        return (control - self.control_mean) / self.control_scale
+
+    def scaled_env(self, env: Environment, used: bool = True) -> Environment:
+        """Return (e − centre) / half width: in the box E every entry is in [-1, 1].
+
+        Args:
+            env: e.
+            used: False for a model that ignores e; zeros then.
+        """
+        scaled = (env - self.env_mean) / self.env_scale
+        # Zeros, not nothing: the blind ablation has networks of the same size.
+        return scaled if used else jnp.zeros_like(scaled)
 
 
 class Polytope(NamedTuple):

@@ -22,6 +22,7 @@ SCRIPT = """
         2: CertificationRefused("not below 1"),
         3: CertificateStale("other weights"),
         4: TypeError("a bug"),
+        99: KeyboardInterrupt(),
     }
 
     def run(settings):
@@ -124,3 +125,9 @@ def test_a_study_searches_and_a_failed_trial_does_not_end_it(toy):
     )
     assert done.returncode == 0, done.stderr[-2000:]
     assert printed(done)
+
+
+def test_an_interrupted_command_prints_one_line_and_exits_130(toy):
+    done = toy("seed=99")
+    assert done.returncode == 130
+    assert done.stderr == "sfkd_jax: interrupted; the same command continues\n"

@@ -1,5 +1,5 @@
 """Hard bounds of SFKD: they hold for every weight, environment, control and latent,
-also under attack.
+also under attack; the joint budget; transport.
 """
 
 import jax
@@ -7,8 +7,11 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from helpers import (
+    ENV_HIGH,
+    ENV_LOW,
     HARD,
     at,
+    certified,
     driven,
     explicit,
     jit,
@@ -16,8 +19,10 @@ from helpers import (
     steepest_pattern,
 )
 
-from sfkd_jax.certification import lipschitz_upper
-from sfkd_jax.models._networks import Sandwich, bounded, cayley, gram_bound
+from sfkd_jax.certification import attack_model, lipschitz_upper
+from sfkd_jax.models._networks import Sandwich, Weights, bounded, cayley, gram_bound
+from sfkd_jax.models.sfkd._model import rotate_planes
+from sfkd_jax.models.sfkd._residual import share_budget
 from sfkd_jax.rollout import fold
 
 RHO, BETA = 0.895, 0.1
@@ -117,60 +122,14 @@ def test_the_operator_is_bounded_for_every_environment_and_every_weight(name, sc
     )  # and the bound is used, not wasted
 
 
-def residual(name, scale):
-    """r(z; u, e) of a model, from its public step: z⁺ − A z − B u in scaled units of u."""
-    model, params = model_and_params(name, scale)
-
-    def value(z, control, env):
-        fiber = model.fiber(params, env)
-        latent = model.encode(fiber, jnp.asarray([0.0, 0.0, 0.0, 10.0]))._replace(z=z)
-        return model.step(fiber, latent, control).z - fiber.A @ z
-
-    return value
-
-
-ATTACK_STARTS, ATTACK_STEPS = 8, 40
-
-
-def attack(name, scale):
-    """Gradient ascent over z, u, e and a direction v on |∂r/∂z v|: the largest value."""
-    value = residual(name, scale)
-
-    def gain(point):
-        z, control, env, direction = point
-        unit = direction / jnp.linalg.norm(direction)
-        return jnp.sqrt(
-            jnp.sum(jax.jvp(lambda z: value(z, control, env), (z,), (unit,))[1] ** 2)
-            + 1e-20
-        )
-
-    def climb(key):
-        keys = jax.random.split(key, 4)
-        start = [
-            jax.random.normal(key, (size,))
-            for key, size in zip(keys, (8, 2, 2, 8), strict=True)
-        ]
-
-        def step(point, _):
-            now, slope = jax.value_and_grad(gain)(point)
-            moved = [
-                x + 0.1 * g / (jnp.linalg.norm(g) + 1e-6)
-                for x, g in zip(point, slope, strict=True)
-            ]
-            return moved, now
-
-        return jnp.max(jax.lax.scan(step, start, length=ATTACK_STEPS)[1])
-
-    return float(
-        jnp.max(
-            jit(jax.vmap(climb))(jax.random.split(jax.random.key(3), ATTACK_STARTS))
-        )
-    )
-
-
 @pytest.mark.parametrize("scale", [1.0, 30.0])
-def test_the_residual_keeps_its_lipschitz_bound_under_attack(scale):
-    assert attack("sfkd", scale) <= BETA
+def test_the_step_keeps_its_factor_under_attack(scale):
+    """Gradient ascent over z, u, e and e' on the slope of the running model."""
+    attacked = attack_model(
+        *model_and_params("sfkd", scale), (ENV_LOW, ENV_HIGH), starts=2
+    )
+    assert attacked["step"] <= (RHO + BETA) * (1 + MARGIN)
+    assert attacked["transport"] <= 1 + MARGIN
 
 
 @pytest.mark.parametrize("scale", [1.0, 30.0])
@@ -230,7 +189,7 @@ def test_the_sandwich_bound_survives_ill_conditioned_weights():
 
 
 @pytest.mark.parametrize("name", HARD)
-@pytest.mark.parametrize("scale", [1.0, 100.0])
+@pytest.mark.parametrize("scale", [100.0])
 def test_two_latents_under_the_same_inputs_approach_at_least_as_fast_as_alpha(
     name, scale
 ):
@@ -260,9 +219,131 @@ def test_two_latents_under_the_same_inputs_approach_at_least_as_fast_as_alpha(
         return first, jax.lax.scan(step, pair, (fibers, later, data.controls))[1]
 
     first, rest = distances(params)
-    scale_of_z = 1e-6 * (
-        1 + scale
-    )  # float32 rounding of latents that grow with the input gain
+    # float32 rounds latents, which grow with the input gain
+    rounding = 1e-6 * (1 + scale)
     allowed = float(first) * (RHO + BETA) ** np.arange(1, len(rest) + 1)
-    assert np.all(np.asarray(rest) <= allowed + scale_of_z)
+    assert np.all(np.asarray(rest) <= allowed + rounding)
     assert float(rest[0]) > 0.05 * float(first)
+
+
+ALPHA, RANK = 0.9, 6
+IDENTITY = Weights((jnp.eye(RANK), jnp.eye(RANK)), (jnp.ones(RANK),))
+
+
+def shared(operator_scale, coupling_scale, seed=0):
+    """A_j, G and H in float64, G and H read off a residual whose network is the
+    identity.
+    """
+    random = np.random.default_rng(seed)
+    operators = operator_scale * random.standard_normal((3, RANK, RANK))
+    couplings = coupling_scale * random.standard_normal((2, RANK, RANK))
+    arrays = [jnp.asarray(part, dtype=jnp.float32) for part in (operators, couplings)]
+    vertices, residual = share_budget(*arrays, IDENTITY, ALPHA)
+    first, last = residual.matrices
+    return tuple(np.asarray(part, dtype=np.float64) for part in (vertices, last, first))
+
+
+@pytest.mark.parametrize("operator_scale", [1e-3, 0.3, 3.0, 1e4])
+@pytest.mark.parametrize("coupling_scale", [1e-3, 0.1, 1.0, 1e4])
+def test_the_block_matrix_of_every_vertex_has_norm_at_most_one(
+    operator_scale, coupling_scale
+):
+    vertices, out, into = shared(operator_scale, coupling_scale)
+    for vertex in vertices:
+        block = np.block(
+            [[vertex / ALPHA, out], [into / ALPHA, np.zeros((RANK, RANK))]]
+        )
+        assert np.linalg.norm(block, 2) <= 1.0 + 1e-6
+
+
+def test_where_the_residual_takes_a_direction_the_operator_has_none_of_it_and_keeps_the_others():
+    """G = H = e_1 e_1' (nearly): the first direction may have gain α through φ, or
+    through A, never both.
+    """
+    projector = np.zeros((RANK, RANK))
+    projector[0, 0] = 1e3
+    couplings = jnp.asarray(np.stack([projector, projector]), dtype=jnp.float32)
+    vertices, residual = share_budget(
+        jnp.eye(RANK)[None] * 1e3, couplings, IDENTITY, ALPHA
+    )
+    vertex = np.asarray(vertices[0])
+    gain = np.asarray(residual.matrices[1] @ residual.matrices[0])[0, 0]
+    assert gain > 0.99 * ALPHA
+    assert abs(vertex[0, 0]) < 0.01
+    np.testing.assert_allclose(np.diag(vertex)[1:], ALPHA, rtol=0.03)
+    assert np.linalg.norm(vertex, 2) + gain > 1.7
+    assert (
+        np.linalg.norm(vertex + gain * np.diag([1.0] + [0.0] * (RANK - 1)), 2)
+        <= ALPHA * 1.001
+    )
+
+
+@pytest.mark.parametrize("scale", [0.3, 1.0, 3.0, 10.0])
+def test_the_certificate_proves_the_budget_from_the_networks_own_multipliers(scale):
+    proved = certified("joint", scale)
+    assert proved.alpha <= 0.995 * (1 + 2e-6)
+    assert proved.alpha_separate > proved.alpha
+
+
+RANDOM = np.random.default_rng(0)
+ENVS = RANDOM.uniform(ENV_LOW, ENV_HIGH, (60, 3, 2)).astype(np.float32)
+LATENTS = (5.0 * RANDOM.standard_normal((60, 8))).astype(np.float32)
+
+
+def transported(name, scale=1.0):
+    """T(e1 → e2), T(e2 → e3) T(e1 → e2), T(e1 → e3), there and back, and T(e1 → e1),
+    all applied to z.
+    """
+    model, params = model_and_params(name, scale)
+
+    def one(envs, z):
+        a, b, c = (model.fiber(params, env) for env in envs)
+        latent = model.encode(a, jnp.asarray([1.0, 2.0, 3.0, 10.0]))._replace(z=z)
+        there = model.transport(a, b, latent)
+        outcome = {
+            "there": there,
+            "on": model.transport(b, c, there),
+            "direct": model.transport(a, c, latent),
+            "back": model.transport(b, a, there),
+            "home": model.transport(a, a, latent),
+        }
+        assert all(part.pose is latent.pose for part in outcome.values())
+        return {way: part.z for way, part in outcome.items()}
+
+    results = jit(jax.vmap(one))(ENVS, LATENTS)
+    return {way: np.asarray(z, dtype=np.float64) for way, z in results.items()}
+
+
+@pytest.mark.parametrize("scale", [1.0, 30.0])
+@pytest.mark.parametrize("name", ["sfkd", "segment"])
+def test_transport_is_an_isometry_with_inverse_and_a_cocycle(name, scale):
+    results = transported(name, scale)
+    close = {"rtol": 0, "atol": 2e-5}
+    np.testing.assert_allclose(
+        np.linalg.norm(results["there"], axis=1),
+        np.linalg.norm(LATENTS, axis=1),
+        rtol=1e-6,
+    )
+    np.testing.assert_allclose(results["home"], LATENTS, **close)
+    np.testing.assert_allclose(results["back"], LATENTS, **close)
+    np.testing.assert_allclose(results["on"], results["direct"], **close)
+    assert np.abs(results["there"] - LATENTS).max() > 1e-3  # and it does turn something
+
+
+def test_rotation_is_the_cayley_transform_of_a_skew_matrix():
+    tangents = RANDOM.standard_normal(4)
+    skew = np.kron(np.asarray([[0.0, -1.0], [1.0, 0.0]]), np.diag(tangents))
+    expected = np.linalg.solve(np.eye(8) - skew, np.eye(8) + skew)
+    columns = jit(jax.vmap(rotate_planes, in_axes=(None, 1), out_axes=1))(
+        tangents.astype(np.float32), np.eye(8, dtype=np.float32)
+    )
+    np.testing.assert_allclose(columns, expected, atol=1e-6)
+    np.testing.assert_allclose(expected @ expected.T, np.eye(8), atol=1e-12)
+
+
+@pytest.mark.parametrize("size", [0.0, 1e-3, 1e3, 1e15])
+def test_rotation_keeps_length_however_large_its_tangents(size):
+    tangents = (size * RANDOM.standard_normal((60, 4))).astype(np.float32)
+    turned = jit(jax.vmap(rotate_planes))(tangents, LATENTS)
+    lengths = np.linalg.norm(np.asarray(turned, np.float64), axis=1)
+    np.testing.assert_allclose(lengths, np.linalg.norm(LATENTS, axis=1), rtol=1e-6)

@@ -12,7 +12,7 @@ from helpers import jit, space
 
 from sfkd_jax import models, plants
 from sfkd_jax.geometry import compose
-from sfkd_jax.models._continuous import continuous
+from sfkd_jax.models._continuous import Rates, continuous
 from sfkd_jax.models._icode import softplus
 from sfkd_jax.types import BODY, POSE
 
@@ -78,13 +78,8 @@ def test_the_step_is_the_exact_flow_of_a_linear_model_to_the_fourth_order():
         rates = lambda fiber, s, u: jnp.concatenate(
             [turning * dt, linear @ s + fiber * u[0] * offset]
         )
-        model = continuous(
-            scales,
-            dt=dt,
-            init=lambda key: {},
-            fiber=lambda params, env: env[1],
-            rates=rates,
-        )
+        given = Rates(lambda key: {}, rates, fiber=lambda params, env: env[1])
+        model = continuous(scales, given, dt=dt)
         state = start
         for _ in range(steps):
             state = stepped(model, {}, state, control)

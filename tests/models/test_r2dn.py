@@ -34,8 +34,8 @@ def drawn(scale, seed=0):
         INIT,
     )
     return params | {
-        "weights": params["weights"]
-        | {"log_decoder_bound": INIT["weights"]["log_decoder_bound"]}
+        "networks": params["networks"]
+        | {"log_decoder_bound": INIT["networks"]["log_decoder_bound"]}
     }
 
 
@@ -49,7 +49,7 @@ def steepest():
     1. The block [1/2 1/√2; 1/√2 0] has the norm 1.
     """
     zeros, axis = (
-        jax.tree.map(jnp.zeros_like, INIT["weights"]),
+        jax.tree.map(jnp.zeros_like, INIT["networks"]),
         jnp.diag(jnp.eye(RANK)[0]),
     )
     phi = zeros["phi"] | {
@@ -58,7 +58,9 @@ def steepest():
     }
     blocks = {"A": 0.5 * axis, "B1": 0.5**0.5 * axis, "C1": 0.5**0.5 * axis, "phi": phi}
     return INIT | {
-        "weights": INIT["weights"] | {"feedback_gain": zeros["feedback_gain"]} | blocks
+        "networks": INIT["networks"]
+        | {"feedback_gain": zeros["feedback_gain"]}
+        | blocks
     }
 
 
@@ -72,7 +74,7 @@ def mutant(layer):
 
     def fiber(params, env):
         fiber = MODEL.fiber(params, env)
-        return fiber._replace(feedback=lengthened(fiber.feedback))
+        return fiber._replace(residual=lengthened(fiber.residual))
 
     def explicit(params):
         weights = MODEL.structure.explicit(params)

@@ -35,21 +35,6 @@ def test_slip_balances_force_and_moment_at_both_axles(car, friction, wind, speed
     )
 
 
-@pytest.mark.parametrize(("friction", "wind"), [(0.9, 0.0), (0.3, 2.0)])
-def test_below_the_limit_the_front_tyre_follows_the_linear_law(friction, wind):
-    steering, speed = 1e-4, 3.0
-    env = jnp.array([friction, wind * 1e-2])
-    rate = kinematic(drag=0.0, rolling=0.0).derivative(
-        jnp.array([0.0, 0.0, 0.0, speed]), jnp.array([steering, 0.0]), env
-    )
-    slip, curvature = np.arctan2(rate[1], rate[0]), rate[2] / speed
-    force = 10.0 * env[1] * abs(env[1])
-    rear = -7.0e4 * friction * (slip - REAR * curvature)
-    front = MASS * speed**2 * curvature - force - rear
-    law = -6.0e4 * friction * (slip + FRONT * curvature - steering)
-    assert float(front) == pytest.approx(float(law), rel=1e-4)
-
-
 def test_the_demand_is_scaled_onto_the_circle_and_keeps_its_direction():
     vehicle, state = kinematic(drag=0.0, rolling=0.0), jnp.array([0.0, 0.0, 0.0, 20.0])
     env = jnp.array([0.4, 0.0])

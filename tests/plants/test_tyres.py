@@ -73,33 +73,6 @@ def test_no_command_takes_more_from_the_tyres_than_friction_times_load(coasting,
     assert used.max() > 0.98
 
 
-def test_saturated_cornering_is_proportional_to_friction(coasting, hold):
-    drawn = {}
-    for friction in (0.3, 0.9):
-        control, env = (0.3, 0.0), (friction, 0.0)
-        states = hold(coasting, 18.0, control, env, 2.0)
-        take = jax.vmap(
-            lambda x, u=control, e=env: tyre_acceleration(
-                coasting, x, jnp.array(u), jnp.array(e)
-            )
-        )
-        drawn[friction] = float(jnp.linalg.norm(take(states), axis=1).max())
-        assert 0.9 * friction * GRAVITY < drawn[friction] <= friction * GRAVITY
-    assert drawn[0.9] / drawn[0.3] == pytest.approx(3.0, rel=0.1)
-
-
-@pytest.mark.parametrize("acceleration", [-6.0, 3.0])
-def test_what_is_used_for_driving_and_braking_is_missing_for_turning(
-    coasting, acceleration
-):
-    state = jnp.array([0.0, 0.0, 0.0, 15.0, 0.0, 0.6, 0.3])[: len(coasting.state_names)]
-    env = jnp.array([0.5, 0.0])
-    turning = tyre_acceleration(coasting, state, jnp.array([0.3, 0.0]), env)
-    both = tyre_acceleration(coasting, state, jnp.array([0.3, acceleration]), env)
-    assert 0.0 < both[1] < 0.99 * turning[1]
-    assert (both[0] - turning[0]) * np.sign(acceleration) > 0.5
-
-
 def test_coasting_down_follows_the_closed_solution_of_drag_and_rolling(vehicle, hold):
     """With v̇ = −b v² − c: v(t) = √(c/b) tan(atan(v_0 √(b/c)) − √(b c) t)."""
     states = hold(vehicle, 20.0, (0.0, 0.0), (0.9, 0.0), 10.0)

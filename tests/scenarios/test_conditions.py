@@ -10,7 +10,6 @@ from helpers import jit
 from sfkd_jax.scenarios import (
     gusts,
     scenario,
-    steady_road,
     switching_road,
     uniform_road,
     wet_road,
@@ -43,15 +42,6 @@ def test_s1_with_a_range_draws_one_level_an_episode_evenly():
     )
     assert np.all(envs == envs[:, :1])
     assert kolmogorov_distance(envs[:, 0, 0], 0.3, 0.9) < 1.63 / np.sqrt(2000)
-
-
-def test_a_steady_road_draws_one_pair_an_episode_evenly_and_both_sides_of_the_wind():
-    keys = jax.random.split(jax.random.key(3), 2000)
-    envs = many(steady_road, steps=5, friction=(0.5, 0.55), wind=(4.0, 8.0), keys=keys)
-    assert np.all(envs == envs[:, :1])
-    assert kolmogorov_distance(envs[:, 0, 0], 0.5, 0.55) < 1.63 / np.sqrt(2000)
-    assert kolmogorov_distance(np.abs(envs[:, 0, 1]), 4.0, 8.0) < 1.63 / np.sqrt(2000)
-    assert abs(np.mean(envs[:, 0, 1] > 0) - 0.5) < 0.05
 
 
 def test_s2_drops_once_and_exactly_at_five_seconds(s2):

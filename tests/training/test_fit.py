@@ -18,18 +18,22 @@ from helpers import TINY, dataset, largest_file
 from sfkd_jax.data import measure_space, random_windows, spread_windows
 from sfkd_jax.models import sfkd
 from sfkd_jax.training import Checkpoints, TrainingStopped, fit, multi_step_loss
-from sfkd_jax.training._loop import append, open_log
 
 OPTIONS = {"steps": 40, "log_every": 10, "save_every": 20}
 DRAW = partial(random_windows, batch=16, length=8)
 
 
-@pytest.fixture(scope="module")
-def task():
+def made():
+    """A model, its loss and its data."""
     data = dataset()
     space = measure_space(data)
     model = sfkd(space, **TINY)
     return model, multi_step_loss(model, space), data
+
+
+@pytest.fixture(scope="module")
+def task():
+    return made()
 
 
 def train(task, directory, seed=3, **changes):
@@ -48,10 +52,7 @@ def train(task, directory, seed=3, **changes):
 
 
 def same(a, b):
-    return all(
-        np.array_equal(x, y)
-        for x, y in zip(jax.tree.leaves(a), jax.tree.leaves(b), strict=True)
-    )
+    return jax.tree.all(jax.tree.map(np.array_equal, a, b))
 
 
 def lines(directory):
@@ -82,8 +83,8 @@ def test_an_interrupted_run_ends_bit_identical_to_an_unbroken_one(
     saves = []
     save = Checkpoints.save
 
-    def save_then_die(self, step, state, *, validation_loss):
-        save(self, step, state, validation_loss=validation_loss)
+    def save_then_die(self, step, state, validation_loss):
+        save(self, step, state, validation_loss)
         saves.append(step)
         raise KeyboardInterrupt
 
@@ -98,10 +99,26 @@ def test_an_interrupted_run_ends_bit_identical_to_an_unbroken_one(
     assert [line["step"] for line in lines(tmp_path / "broken")] == [10, 20, 30, 40]
 
 
+def test_the_score_of_a_window_does_not_depend_on_the_weights(task):
+    """It is the prediction error with the default weights, of each window."""
+    model, loss, data = task
+    params, batch = model.init(jax.random.key(0)), spread_windows(data.test, length=8)
+    other = multi_step_loss(
+        model, measure_space(data), prediction=0.3, growth=2.0, consistency=5.0
+    )
+    total, parts, scores = loss.validate(params, batch)
+    _, changed, again = other.validate(params, batch)
+    np.testing.assert_allclose(scores, again, rtol=1e-6)
+    assert changed["prediction"] < 0.9 * parts["prediction"]
+    expected = parts["prediction"] + parts["one_step"]
+    np.testing.assert_allclose(scores.mean(), expected, rtol=1e-5)
+    assert total > expected
+
+
 def test_latest_and_best_are_both_kept(tmp_path):
     checkpoints = Checkpoints(tmp_path)
     for step, score in ((1, 3.0), (2, 1.0), (3, 2.0), (4, 5.0)):
-        checkpoints.save(step, {"w": jnp.full(3, float(step))}, validation_loss=score)
+        checkpoints.save(step, {"w": jnp.full(3, float(step))}, score)
     assert (checkpoints.latest_step(), checkpoints.best_step()) == (4, 2)
     assert checkpoints.restore(2, {"w": jnp.zeros(3)})["w"][0] == 2.0
     checkpoints.close()
@@ -116,38 +133,23 @@ def test_a_checkpoint_on_a_full_disk_is_one_line_and_leaves_the_one_before(
 ):
     state = {"w": jax.random.normal(jax.random.key(0), (60, 60))}
     checkpoints = Checkpoints(tmp_path)
-    checkpoints.save(1, state, validation_loss=2.0)
+    checkpoints.save(1, state, 2.0)
     with (
         largest_file(size),
         pytest.raises(
             OSError, match=r"step 2 was not saved.*File too large.*goes on"
         ) as caught,
     ):
-        checkpoints.save(2, state, validation_loss=1.0)
+        checkpoints.save(2, state, 1.0)
     assert "\n" not in str(caught.value)
     assert "Traceback" not in capfd.readouterr().err
     checkpoints.close()
     reopened = Checkpoints(tmp_path)
     assert reopened.latest_step() == 1
     assert same(reopened.restore(1, state), state)
-    reopened.save(2, state, validation_loss=1.0)
+    reopened.save(2, state, 1.0)
     assert reopened.latest_step() == 2
     reopened.close()
-
-
-def test_a_log_on_a_full_disk_is_one_line_and_keeps_its_lines(tmp_path):
-    log = open_log(tmp_path / "metrics.jsonl", resumed_at=0)
-    append(log, {"loss": 1.0, "step": 10}, steps=20)
-    with (
-        largest_file(30),
-        pytest.raises(
-            OSError, match=r"step 20 was not logged .File too large.; the same command"
-        ),
-    ):
-        append(log, {"loss": 1.0, "step": 20}, steps=20)
-    open_log(log, resumed_at=10)
-    append(log, {"loss": 1.0, "step": 20}, steps=20)
-    assert [line["step"] for line in lines(tmp_path)] == [10, 20]
 
 
 def test_a_loss_that_is_not_finite_stops_with_the_last_good_checkpoint(
@@ -168,20 +170,9 @@ def test_a_loss_that_is_not_finite_stops_with_the_last_good_checkpoint(
 WORKER = """
 import sys
 sys.path.insert(0, sys.argv[2])
-import jax
-from functools import partial
 from pathlib import Path
-from helpers import TINY, dataset
-from sfkd_jax.data import measure_space, random_windows, spread_windows
-from sfkd_jax.models import sfkd
-from sfkd_jax.training import fit, multi_step_loss
-data = dataset()
-space = measure_space(data)
-model = sfkd(space, **TINY)
-draw = partial(random_windows, batch=16, length=8)
-held_out = spread_windows(data.validation, length=8)
-loss, key, directory = multi_step_loss(model, space), jax.random.key(3), Path(sys.argv[1])
-fit(model, loss, draw, data.train, held_out, key, directory, steps=40, log_every=10, save_every=10)
+from training.test_fit import made, train
+train(made(), Path(sys.argv[1]), save_every=10)
 """
 
 
@@ -190,15 +181,8 @@ def test_kill_9_at_random_moments_loses_nothing(task, tmp_path):
     weights, _ = train(task, tmp_path / "unbroken", save_every=10)
     random, directory = np.random.default_rng(0), tmp_path / "killed"
     for _ in range(4):
-        worker = subprocess.Popen(
-            [
-                sys.executable,
-                "-c",
-                WORKER,
-                str(directory),
-                str(Path(__file__).parents[1]),
-            ]
-        )
+        arguments = [WORKER, str(directory), str(Path(__file__).parents[1])]
+        worker = subprocess.Popen([sys.executable, "-c", *arguments])
         patience = time.monotonic() + 60
         while (
             not (directory / "checkpoints").exists()

@@ -33,7 +33,7 @@ from sfkd_jax.plants import Vehicle
 from sfkd_jax.ranges import imported
 from sfkd_jax.rollout import fold
 from sfkd_jax.settings import arguments, choose, plain
-from sfkd_jax.training import fit, multi_step_loss
+from sfkd_jax.training import Loss, fit, multi_step_loss
 from sfkd_jax.types import Key, Model, Params, Space, Trajectory
 
 SCORED_SCENARIOS = ("s1", "s2")
@@ -154,6 +154,7 @@ def _train(settings: Settings, dataset: Dataset, data_hash: str) -> None:
     space = measure_space(dataset)
     plant = build.build_vehicle(settings.vehicle)
     model = build.build_model(settings.model, space, plant)
+    loss = multi_step_loss(model, space, **arguments(options.loss, multi_step_loss))
     key = jax.random.fold_in(jax.random.key(settings.seed), 0)
     if model.fitting.identify is not None:
         store.print_message(f"identifying {settings.model.system} in {run_dir}")
@@ -163,11 +164,9 @@ def _train(settings: Settings, dataset: Dataset, data_hash: str) -> None:
         store.print_message(
             f"training {settings.model.system}, {options.steps} steps, in {run_dir}"
         )
-        params, best = _fit(options, model, space, dataset, key, run_dir)
+        params, best = _fit(options, model, loss, dataset, key, run_dir)
     document = _open_loop_document(model, params, source, dataset, horizon)
-    document["validation_score"] = _validation_score(
-        model, params, space, dataset, horizon
-    )
+    document["validation_score"] = _validation_score(loss, params, dataset, horizon)
     store.write_json(run_dir / "open_loop.json", document)
     recorded |= {"space": build.space_to_settings(space), "best_step": best}
     policy.save(
@@ -182,13 +181,12 @@ def _train(settings: Settings, dataset: Dataset, data_hash: str) -> None:
 def _fit(
     options: TrainingSettings,
     model: Model,
-    space: Space,
+    loss: Loss,
     dataset: Dataset,
     key: Key,
     run_dir: Path,
 ) -> tuple[Params, int | None]:
     """Fit a model by gradient descent; return the best weights and their step."""
-    loss = multi_step_loss(model, space, **arguments(options.loss, multi_step_loss))
     draw = partial(random_windows, batch=options.batch, length=options.window)
     # Fixed windows: validation losses at different steps are comparable.
     held_out = spread_windows(dataset.validation, length=options.window)
@@ -250,22 +248,22 @@ def _error_columns(errors: jax.Array) -> dict[str, list[float]]:
 
 
 def _validation_score(
-    model: Model, params: Params, space: Space, dataset: Dataset, horizon: int
+    loss: Loss, params: Params, dataset: Dataset, window: int
 ) -> float:
     """Prediction loss on validation runs of S1 and S2, or on all recorded ones.
 
     Its weights are the defaults whatever was trained with, so that trainings with
     different weights can be compared.
     """
-    held_out = dataset.validation
-    if dataset.scenarios is not None:
-        wanted = [SCENARIOS.index(name) for name in SCORED_SCENARIOS]
-        rows = np.isin(dataset.scenarios["validation"], wanted)
-        held_out = jax.tree.map(lambda leaf: leaf[rows], held_out)
-    score = multi_step_loss(
-        model, space, consistency=0.0, reconstruction=0.0, transport=0.0
-    )
-    return float(jax.jit(score)(params, spread_windows(held_out, length=horizon))[0])
+    # The program and the windows of the training's own validation.
+    held_out = spread_windows(dataset.validation, length=window)
+    scores = np.asarray(loss.validate(params, held_out)[2])
+    if dataset.scenarios is None:
+        return float(scores.mean())
+    wanted = [SCENARIOS.index(name) for name in SCORED_SCENARIOS]
+    rows = np.isin(dataset.scenarios["validation"], wanted)
+    # Several windows of every run, of one position in all runs after another.
+    return float(scores.reshape(-1, rows.size)[:, rows].mean())
 
 
 def certificate_path(run_dir: Path) -> Path:

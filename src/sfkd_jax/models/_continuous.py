@@ -11,24 +11,11 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from sfkd_jax.geometry import rotate
-from sfkd_jax.models._networks import (
-    has_pose,
-    scaled_body,
-    scaled_control,
-    scaled_env,
-)
-from sfkd_jax.models._state_model import NO_STRUCTURE, state_model
-from sfkd_jax.types import (
-    Control,
-    Environment,
-    Fiber,
-    Key,
-    Model,
-    Params,
-    Space,
-    State,
-    Structure,
-)
+from sfkd_jax.models._networks import FRAMES
+from sfkd_jax.models._state_model import state_model
+from sfkd_jax.ranges import check_choice
+from sfkd_jax.rollout import runge_kutta
+from sfkd_jax.types import Control, Environment, Fiber, Key, Model, Params, Space, State
 
 SOLVERS = ("rk4", "euler")
 
@@ -45,17 +32,29 @@ class Conditioned(NamedTuple):
     env: Environment
 
 
+class Rates(NamedTuple):
+    """Learned rates.
+
+    Attributes:
+        init: key -> params.
+        at: (fiber, scaled s, scaled u) -> (r_g, r_s), shape (3 + body,); r_s per
+            second.
+        fiber: (params, scaled e) -> all that depends on e alone.
+    """
+
+    init: Callable[[Key], Params]
+    at: Callable[[Fiber, Float[Array, " body"], Control], Float[Array, " rates"]]
+    fiber: Callable[[Params, Environment], Fiber] = Conditioned
+
+
 def continuous(
     space: Space,
+    rates: Rates,
     *,
     dt: float,
-    init: Callable[[Key], Params],
-    fiber: Callable[[Params, Environment], Fiber],
-    rates: Callable[[Fiber, Float[Array, " body"], Control], Float[Array, " rates"]],
     environment: bool = True,
     solver: str = "rk4",
     known: Callable[[Fiber, State, Control], State] | None = None,
-    structure: Structure = NO_STRUCTURE,
     frame: str = "body",
 ) -> Model:
     """Return a model with learned rates and one solver step per sampling period.
@@ -69,37 +68,28 @@ def continuous(
 
     Args:
         space: measured scales; fixes all sizes.
+        rates: learned.
         dt: sampling period [s], the solver's step in training and in use.
-        init: key -> params.
-        fiber: (params, scaled e) -> all that depends on e alone.
-        rates: (fiber, scaled s, scaled u) -> (r_g, r_s), shape (3 + body,); r_s per
-            second.
-        environment: whether e is used; if not, `fiber` is given zeros.
+        environment: whether e is used; if not, the fiber is that of zeros.
         solver: "rk4" or "euler", in training and in use.
         known: (fiber, state, control) -> known dx/dt in the world frame and physical
             units, equivariant under SE(2). The rates are added to it, and m_g is
             omitted.
-        structure: as in `Model`.
         frame: "body", or "path" for path coordinates, which have no pose: r_g is
             ignored.
 
     Raises:
-        ValueError: an unknown solver; a state of the wrong length, when it is encoded.
+        ValueError: an unknown solver or frame; a state of the wrong length, when it is
+            encoded.
     """
-    # Checked by name here: `_solver_step` would take any unknown solver for RK4.
-    if solver not in SOLVERS:
-        raise ValueError(
-            f"model.solver must be one of {', '.join(SOLVERS)}, got {solver!r}"
-        )
-    pose = has_pose(frame)
+    check_choice("model.solver", solver, SOLVERS)
+    check_choice("model.frame", frame, FRAMES)
+    pose = frame == "body"
     # Known dynamics bring their own mean motion; learned rates start from the data's.
     drift = jnp.asarray(space.increment_mean) if known is None else jnp.zeros(3)
 
-    def scaled_fiber(params: Params, env: Environment) -> Fiber:
-        return fiber(params, scaled_env(space, env, environment))
-
     def derivative(at: Fiber, state: State, control: Control) -> State:
-        rate = rates(at, scaled_body(space, state), scaled_control(space, control))
+        rate = rates.at(at, space.scaled_body(state), space.scaled_control(control))
         # The first three entries of a path state are no pose: they stay 0.
         if not pose:
             return jnp.concatenate([jnp.zeros(3), space.body_scale * rate[3:]])
@@ -112,32 +102,22 @@ def continuous(
         return change if known is None else change + known(at, state, control)
 
     def step(at: Fiber, state: State, control: Control) -> State:
-        return _solver_step(lambda x: derivative(at, x, control), state, dt, solver)
+        def rate(x: State) -> State:
+            return derivative(at, x, control)
+
+        # What the authors of ICODE use; with learned increments it loses nothing.
+        if solver == "euler":
+            return state + dt * rate(state)
+        return runge_kutta(rate, state, dt)
 
     return state_model(
-        init,
-        scaled_fiber,
+        rates.init,
+        lambda params, env: rates.fiber(params, space.scaled_env(env, environment)),
         step,
-        vector=lambda state: scaled_body(space, state),
+        vector=space.scaled_body,
         state_size=3 + space.body_mean.shape[0],
-        structure=structure,
         along_path=not pose,
     )
-
-
-def _solver_step(
-    derivative: Callable[[State], State], state: State, dt: float, solver: str
-) -> State:
-    """One step of RK4 or Euler, control and environment held."""
-    k1 = derivative(state)
-    # What the authors of ICODE use; with learned increments it loses nothing.
-    if solver == "euler":
-        return state + dt * k1
-    # Classical Runge-Kutta: error O(dt⁴), which Euler on known dynamics has not.
-    k2 = derivative(state + 0.5 * dt * k1)
-    k3 = derivative(state + 0.5 * dt * k2)
-    k4 = derivative(state + dt * k3)
-    return state + dt / 6.0 * (k1 + 2.0 * k2 + 2.0 * k3 + k4)
 
 
 def mlp(
@@ -204,12 +184,5 @@ def neural_ode(
         read = jnp.concatenate([body, control, fiber.env])
         return cast(jax.Array, network.apply({"params": fiber.params}, read))
 
-    return continuous(
-        space,
-        dt=dt,
-        init=init,
-        fiber=Conditioned,
-        rates=rates,
-        environment=environment,
-        frame=frame,
-    )
+    learned = Rates(init, rates)
+    return continuous(space, learned, dt=dt, environment=environment, frame=frame)

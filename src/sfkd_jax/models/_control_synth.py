@@ -9,16 +9,9 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from sfkd_jax.models._continuous import continuous, mlp
+from sfkd_jax.models._continuous import Rates, continuous, mlp
 from sfkd_jax.ranges import Positive
-from sfkd_jax.types import (
-    Control,
-    Environment,
-    Key,
-    Model,
-    Params,
-    Space,
-)
+from sfkd_jax.types import Control, Environment, Key, Model, Params, Space
 
 GAIN = 0.3
 """Initial size of the networks of the state: their decay is GAIN² per second, slow
@@ -129,19 +122,8 @@ def control_synth(
         input_hidden: widths of the network that holds g and h.
         environment: whether e is used.
 
-    Raises:
-        ValueError: no network, or a rate that is not positive.
-
     Source: Mei, Zheng and Li, NeurIPS 2024, arXiv 2411.02292.
     """
-    if networks < 1 or width < 1:
-        raise ValueError(
-            "model.networks and model.width must be at least 1, "
-            f"got {networks} and {width}"
-        )
-    # With γ = 0 nothing contracts; the negated comparison refuses NaN as well.
-    if not 0.0 < rate < float("inf"):
-        raise ValueError(f"model.rate must be positive, got {rate}")
     body, control = space.body_mean.shape[0], space.control_mean.shape[0]
     # A network of u and e alone: it adds the same to any two solutions.
     inputs = mlp(input_hidden, 3 + body, (nn.tanh,) * len(input_hidden), last=0.1)
@@ -168,14 +150,8 @@ def control_synth(
         added = cast(jax.Array, inputs.apply({"params": fiber.inputs}, read))
         return jnp.concatenate([fiber.twist(body), fiber.change(body)]) + added
 
-    return continuous(
-        space,
-        dt=dt,
-        init=init,
-        fiber=fiber,
-        rates=rates,
-        environment=environment,
-    )
+    learned = Rates(init, rates, fiber)
+    return continuous(space, learned, dt=dt, environment=environment)
 
 
 def _initial(

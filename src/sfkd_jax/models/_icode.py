@@ -10,7 +10,8 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from sfkd_jax.models._continuous import Conditioned, continuous, mlp
+from sfkd_jax.models._continuous import Conditioned, Rates, continuous, mlp
+from sfkd_jax.ranges import check_choice
 from sfkd_jax.types import Control, Key, Model, Params, Space, State, Step
 
 
@@ -48,8 +49,8 @@ def affine_rates(
     *,
     last: float,
     affine_in: str = "both",
-) -> tuple[Callable[[Key], Params], Callable[[Conditioned, Array, Control], Array]]:
-    """Return `init` and `rates` of a model whose rates are affine in its inputs.
+) -> Rates:
+    """Return rates that are affine in their inputs.
 
         "both":     f(s) + G(s) [u; e]
         "env":      f(s, u) + G(s, u) e
@@ -67,10 +68,7 @@ def affine_rates(
     Raises:
         ValueError: another `affine_in`.
     """
-    if affine_in not in AFFINE_IN:
-        raise ValueError(
-            f"model.affine_in must be one of {', '.join(AFFINE_IN)}, got {affine_in!r}"
-        )
+    check_choice("model.affine_in", affine_in, AFFINE_IN)
     zeros = {
         "body": jnp.zeros_like(space.body_mean),
         "control": jnp.zeros_like(space.control_mean),
@@ -110,7 +108,7 @@ def affine_rates(
         # Driving inputs enter here alone, hence affinely by construction.
         return free + gain @ joined(driving, parts)
 
-    return init, rates
+    return Rates(init, rates)
 
 
 def icode(
@@ -143,27 +141,16 @@ def icode(
             paper calls an extrinsic input; "control" for f(s, e) + G(s, e) u.
 
     Raises:
-        ValueError: no hidden layer, or another `affine_in`.
+        ValueError: another `affine_in`.
 
     Source: Li et al., arXiv 2411.13914.
     """
-    # Without a hidden layer f and G would be linear, another model than the published.
-    if layers < 1:
-        raise ValueError(f"model.layers must be at least 1, got {layers}")
     # A tanh first, as published: it bounds what the unbounded softplus layers read.
     activations = (nn.tanh, *(softplus,) * (layers - 1))
-    init, rates = affine_rates(
+    rates = affine_rates(
         space, (width,) * layers, activations, last=0.1, affine_in=affine_in
     )
-    return continuous(
-        space,
-        dt=dt,
-        init=init,
-        fiber=Conditioned,
-        rates=rates,
-        environment=environment,
-        solver=solver,
-    )
+    return continuous(space, rates, dt=dt, environment=environment, solver=solver)
 
 
 def icode_mppi(
@@ -201,7 +188,7 @@ def icode_mppi(
     Source: Song et al., arXiv 2605.03260, eqs. 10 and 11.
     """
     # 1e-3, not 0.1: the known dynamics are good already, and noise would spoil them.
-    init, rates = affine_rates(
+    rates = affine_rates(
         space, hidden, (softplus,) * len(hidden), last=1e-3, affine_in=affine_in
     )
 
@@ -209,12 +196,4 @@ def icode_mppi(
         # Back in physical units: the known dynamics know no scales.
         return nominal(state, control, space.env_mean + space.env_scale * fiber.env)
 
-    return continuous(
-        space,
-        dt=dt,
-        init=init,
-        fiber=Conditioned,
-        rates=rates,
-        environment=environment,
-        known=known,
-    )
+    return continuous(space, rates, dt=dt, environment=environment, known=known)

@@ -1,16 +1,16 @@
-"""What models of a latent share: networks with a bound in z, scales and the latent."""
+"""Networks with a bound in z: sandwich layers, Gram bound, biases and the encoder."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from itertools import pairwise
+from itertools import accumulate, pairwise
 from typing import NamedTuple
 
 import flax.linen as nn
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from sfkd_jax.types import BODY, Control, Environment, Pose, Scalar, Space, State
+from sfkd_jax.types import Scalar
 
 FLOAT32_MARGIN = 1e-5
 """Relative margin for float32 rounding inside the Gram iteration (measured: 2.2e-6)."""
@@ -22,13 +22,7 @@ orthogonality in float32.
 SMALL = nn.initializers.variance_scaling(0.1, "fan_in", "truncated_normal")
 """Initial weights of heads whose output should start close to its bias."""
 FRAMES = ("body", "path")
-
-
-class PosedLatent(NamedTuple):
-    """State of a rollout: z and a pose, in the segment frame that of its start."""
-
-    pose: Pose
-    z: Float[Array, " rank"]
+"""Coordinates of a model: those of the world, or those along a path, without a pose."""
 
 
 class Weights(NamedTuple):
@@ -53,6 +47,18 @@ class Biases(NamedTuple):
 
     gains: tuple[Float[Array, "_ control"], ...] = ()
     offsets: tuple[Float[Array, " _"], ...] = ()
+
+    @classmethod
+    def cut(
+        cls,
+        gains: Float[Array, "units control"],
+        offsets: Float[Array, " units"],
+        widths: Sequence[int],
+    ) -> Biases:
+        """Cut the gains and offsets of all units into those of layers."""
+        # Inner edges only, as `split` wants them.
+        edges = list(accumulate(widths))[:-1]
+        return cls(tuple(jnp.split(gains, edges)), tuple(jnp.split(offsets, edges)))
 
     def at(self, control: Float[Array, " control"]) -> tuple[Float[Array, " _"], ...]:
         """Return the biases for one scaled control."""
@@ -128,13 +134,7 @@ class Sandwich(nn.Module):
 
 
 class Free(nn.Module):
-    """The same network without a bound, an ablation: certified only if it contracts.
-
-    Attributes:
-        inputs: number of inputs.
-        hidden: widths of the hidden layers.
-        outputs: number of outputs.
-    """
+    """`Sandwich` without a bound, an ablation: certified only if it contracts."""
 
     inputs: int
     hidden: Sequence[int]
@@ -243,43 +243,3 @@ def cayley(
     Z = square - square.T + tall.T @ tall
     inverse = jnp.linalg.inv(identity + Z)
     return ((identity - Z) @ inverse).T, (-2.0 * tall @ inverse).T
-
-
-def has_pose(frame: str) -> bool:
-    """Whether a model in this frame predicts a pose; path coordinates have none.
-
-    Raises:
-        ValueError: an unknown frame.
-    """
-    if frame not in FRAMES:
-        raise ValueError(
-            f"model.frame must be one of {', '.join(FRAMES)}, got {frame!r}"
-        )
-    return frame == "body"
-
-
-def scaled_body(space: Space, state: State) -> Float[Array, " body"]:
-    """Return the body state in scaled units.
-
-    Raises:
-        ValueError: the state has the wrong length.
-    """
-    size = 3 + space.body_mean.shape[0]
-    if state.shape != (size,):
-        raise ValueError(f"state must have shape ({size},), got {state.shape}")
-    return (state[BODY] - space.body_mean) / space.body_scale
-
-
-def scaled_control(space: Space, control: Control) -> Control:
-    """Return the control in scaled units."""
-    return (control - space.control_mean) / space.control_scale
-
-
-def scaled_env(space: Space, env: Environment, environment: bool) -> Environment:
-    """Return (e − centre) / half width, or zeros for a model that ignores e.
-
-    Inside the box E every entry lies in [-1, 1].
-    """
-    scaled = (env - space.env_mean) / space.env_scale
-    # Zeros, not nothing: the blind ablation has networks of the same size.
-    return scaled if environment else jnp.zeros_like(scaled)

@@ -11,22 +11,12 @@ from sfkd_jax.types import (
     Control,
     Environment,
     Fiber,
-    Fitting,
     Key,
     Model,
     Params,
     State,
     Step,
-    Structure,
 )
-
-NO_FITTING = Fitting()
-NO_STRUCTURE = Structure()
-
-
-def body_of(state: State) -> Float[Array, " body"]:
-    """Return the body state."""
-    return state[BODY]
 
 
 def state_model(
@@ -34,10 +24,8 @@ def state_model(
     fiber: Callable[[Params, Environment], Fiber],
     step: Callable[[Fiber, State, Control], State],
     *,
-    vector: Callable[[State], Float[Array, " body"]] = body_of,
+    vector: Callable[[State], Float[Array, " body"]] = lambda state: state[BODY],
     state_size: int | None = None,
-    fitting: Fitting = NO_FITTING,
-    structure: Structure = NO_STRUCTURE,
     along_path: bool = False,
 ) -> Model:
     """Return a model that steps the state itself, so that nothing is encoded.
@@ -46,11 +34,10 @@ def state_model(
         init: key -> params.
         fiber: (params, env) -> all that depends on e alone.
         step: (fiber, state, control) -> state one sampling period later.
-        vector: state -> the coordinates that prediction residuals are measured in.
+        vector: state -> the coordinates that prediction residuals are measured in;
+            those of the body without it.
         state_size: number of entries of a state, checked when one is encoded; None
             accepts any.
-        fitting: as in `Model`.
-        structure: as in `Model`.
         along_path: whether states and controls are those of `geometry`.
     """
 
@@ -73,8 +60,6 @@ def state_model(
         transport=lambda fiber, fiber_next, state: state,
         observe=lambda fiber, latent, state: encode(fiber, state),
         vector=vector,
-        fitting=fitting,
-        structure=structure,
         along_path=along_path,
     )
 

@@ -6,9 +6,9 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from sfkd_jax.plants._vehicle import (
-    ACCELERATION_RANGE,
+    CONTROL_HIGH,
+    CONTROL_LOW,
     GRAVITY,
-    STEERING_LIMIT,
     Vehicle,
     forward_rk4,
     nominal_derivative,
@@ -81,7 +81,7 @@ def dynamic(
         creep_speed: v_0, below it the tyres are regularised [m/s].
     """
     length = front_length + rear_length
-    bicycle = nominal_derivative(length, rear_length)
+    bicycle = nominal_derivative(length, rear_length, states=7)
 
     def derivative(state: State, control: Control, env: Environment) -> State:
         # In the order of `state_names` below.
@@ -109,6 +109,9 @@ def dynamic(
         sideways = front_mass * drive * sin + front * cos
 
         slowed = resistance(speed, mass=mass, drag=drag, rolling=rolling)
+        lag = (control[0] - steering) / (steering_lag * steering_rate)
+        # tanh limits the rate of the actuator; a clip would have no gradient.
+        turning = steering_rate * jnp.tanh(lag)
         return jnp.stack(
             [
                 speed * jnp.cos(yaw) - side_speed * jnp.sin(yaw),
@@ -119,10 +122,7 @@ def dynamic(
                 (sideways + rear + wind) / mass - speed * yaw_rate,
                 (front_length * sideways - rear_length * rear + wind_lever * wind)
                 / yaw_inertia,
-                steering_rate
-                # tanh limits the rate of the actuator
-                # smoothly; a clip would have no gradient.
-                * jnp.tanh((control[0] - steering) / (steering_lag * steering_rate)),
+                turning,
             ]
         )
 
@@ -133,11 +133,10 @@ def dynamic(
         state_names=("p_x", "p_y", "yaw", "v", "v_y", "yaw_rate", "steering"),
         step=forward_rk4(derivative, dt=dt, substeps=substeps),
         derivative=derivative,
-        # The textbook model knows no tyres: it follows the command at once.
         nominal=_quasi_steady(forward_rk4(bicycle, dt=dt), length, rear_length),
-        nominal_derivative=_padded(bicycle),
-        control_low=(-STEERING_LIMIT, ACCELERATION_RANGE[0]),
-        control_high=(STEERING_LIMIT, ACCELERATION_RANGE[1]),
+        nominal_derivative=bicycle,
+        control_low=CONTROL_LOW,
+        control_high=CONTROL_HIGH,
         wind_force=wind_force,
     )
 
@@ -185,23 +184,13 @@ def _brush(
 
 
 def _quasi_steady(bicycle: Step, length: float, rear_length: float) -> Step:
-    """A 4-state bicycle on 7 states: δ = δ_cmd, ω = v κ, v_y = l_r ω."""
+    """The bicycle knows no tyres: δ = δ_cmd, ω = v κ, v_y = l_r ω at once."""
 
     def step(state: State, control: Control, env: Environment) -> State:
-        after = bicycle(state[:4], control, env)
+        after = bicycle(state, control, env)
         # Of the new speed: the states are those at the end of the period.
         yaw_rate = after[3] * jnp.tan(control[0]) / length
-        return jnp.concatenate(
-            [after, jnp.stack([rear_length * yaw_rate, yaw_rate, control[0]])]
-        )
+        hidden = jnp.stack([rear_length * yaw_rate, yaw_rate, control[0]])
+        return after.at[4:].set(hidden)
 
     return step
-
-
-def _padded(bicycle: Step) -> Step:
-    """dx/dt of a 4-state bicycle on 7 states; the rates of v_y, ω and δ are 0."""
-
-    def derivative(state: State, control: Control, env: Environment) -> State:
-        return jnp.concatenate([bicycle(state[:4], control, env), jnp.zeros(3)])
-
-    return derivative

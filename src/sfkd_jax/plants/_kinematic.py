@@ -9,9 +9,9 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from sfkd_jax.plants._vehicle import (
-    ACCELERATION_RANGE,
+    CONTROL_HIGH,
+    CONTROL_LOW,
     GRAVITY,
-    STEERING_LIMIT,
     Vehicle,
     forward_rk4,
     nominal_derivative,
@@ -95,31 +95,22 @@ def kinematic(
             (rear_length + wind_lever) / front - (front_length - wind_lever) / rear
         ) / length
         demand = (jnp.tan(steering) + push * force) / (length + understeer * speed**2)
-        # At least a twentieth of the grip, or strong
-        # wind would make the radius negative.
-        limit = jnp.maximum(
-            friction * GRAVITY - jnp.abs(force) / mass, 0.05 * friction * GRAVITY
-        )
+        # At least a twentieth of the grip, or strong wind would make it negative.
+        left = friction * GRAVITY - jnp.abs(force) / mass
+        limit = jnp.maximum(left, 0.05 * friction * GRAVITY)
         # The root has no gradient at 0, where a car coasts straight on.
         norm = jnp.sqrt(acceleration**2 + (speed**2 * demand) ** 2 + 1e-12)
         scale = _tanhc(norm / limit)
-        # Steering and acceleration shrink by one
-        # factor: the direction of the demand stays.
+        # One factor for steering and acceleration: the direction of the demand stays.
         curvature = scale * demand
         rear_force = (
             front_length * mass * speed**2 * curvature
             - (front_length - wind_lever) * force
         ) / length
         slip = rear_length * curvature - rear_force / rear
-        return jnp.stack(
-            [
-                speed * jnp.cos(yaw + slip),
-                speed * jnp.sin(yaw + slip),
-                speed * curvature,
-                scale * acceleration
-                - resistance(speed, mass=mass, drag=drag, rolling=rolling),
-            ]
-        )
+        x, y = speed * jnp.cos(yaw + slip), speed * jnp.sin(yaw + slip)
+        slowed = resistance(speed, mass=mass, drag=drag, rolling=rolling)
+        return jnp.stack([x, y, speed * curvature, scale * acceleration - slowed])
 
     return Vehicle(
         name="kinematic" if stiffness_by_friction else "kinematic_stiff",
@@ -130,8 +121,8 @@ def kinematic(
         derivative=derivative,
         nominal=forward_rk4(bicycle, dt=dt),
         nominal_derivative=bicycle,
-        control_low=(-STEERING_LIMIT, ACCELERATION_RANGE[0]),
-        control_high=(STEERING_LIMIT, ACCELERATION_RANGE[1]),
+        control_low=CONTROL_LOW,
+        control_high=CONTROL_HIGH,
         wind_force=wind_force,
     )
 

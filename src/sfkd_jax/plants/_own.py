@@ -61,29 +61,16 @@ def own(
             "as in [-0.4,-3.0]"
         )
     # The centre of mass in the middle: logs do not tell where it is.
-    bicycle = nominal_derivative(wheelbase, 0.5 * wheelbase)
-    # Fails when it is called: learning and planning do not simulate.
-    simulate = _no_step if step is None else step
-
-    def derivative(state: State, control: Control, env: Environment) -> State:
-        # A difference quotient: the user gave a step, and its rate is all there is.
-        return (simulate(state, control, env) - state) / dt
-
-    def padded(state: State, control: Control, env: Environment) -> State:
-        return jnp.concatenate(
-            # States beyond the bicycle stay constant, for nothing is known of them.
-            [bicycle(state[:4], control, env), jnp.zeros(len(state_names) - 4)]
-        )
-
+    bicycle = nominal_derivative(wheelbase, 0.5 * wheelbase, states=len(state_names))
     return Vehicle(
         name="own",
         dt=dt,
         wheelbase=wheelbase,
         state_names=tuple(state_names),
-        step=simulate,
-        derivative=derivative,
-        nominal=forward_rk4(padded, dt=dt),
-        nominal_derivative=padded,
+        # Fails when it is called: learning and planning do not simulate.
+        step=_no_step if step is None else step,
+        nominal=forward_rk4(bicycle, dt=dt),
+        nominal_derivative=bicycle,
         control_low=tuple(control_low),
         control_high=tuple(control_high),
         wind_force=wind_force,
@@ -126,23 +113,21 @@ def check_step(plant: Vehicle) -> None:
     Raises:
         ValueError: there is no step, it fails, or it does not return a state.
     """
-    sizes = (len(plant.state_names), 2, 2)
+    size = len(plant.state_names)
+    given = f"{size} states (vehicle.state_names), 2 controls and 2 environments"
     try:
-        after = jax.eval_shape(plant.step, *(jnp.zeros(size) for size in sizes))
+        after = jax.eval_shape(plant.step, *map(jnp.zeros, (size, 2, 2)))
     # Its message names the setting already; the one below would hide it.
     except _MissingStep:
         raise
     except Exception as reason:  # a function of the user raises anything
-        given = (
-            f"{sizes[0]} states (vehicle.state_names), 2 controls and 2 environments"
-        )
         first = (str(reason).splitlines() or [type(reason).__name__])[0]
         raise ValueError(
             f"the step of vehicle {plant.name} fails on {given}: {first}"
         ) from None
-    if getattr(after, "shape", None) != (sizes[0],):
-        shape = getattr(after, "shape", type(after).__name__)
+    shape = getattr(after, "shape", type(after).__name__)
+    if shape != (size,):
         raise ValueError(
             f"the step of vehicle {plant.name} returns {shape}, "
-            f"vehicle.state_names has {sizes[0]} names"
+            f"vehicle.state_names has {size} names"
         )

@@ -9,11 +9,12 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from sfkd_jax.geometry import PathFeedback, closed_loop
+from sfkd_jax.rollout import runge_kutta
 from sfkd_jax.types import Control, Environment, State, Step
 
 GRAVITY = 9.81  # m/s²
-STEERING_LIMIT = 0.5  # rad
-ACCELERATION_RANGE = (-6.0, 3.0)  # m/s²
+CONTROL_LOW, CONTROL_HIGH = (-0.5, -6.0), (0.5, 3.0)
+"""Limits of the steering [rad] and of the acceleration [m/s²]."""
 SPEED_RANGE = (0.0, 25.0)  # m/s
 STEEPEST = 0.2
 """Largest curvature of a path [1/m]: more than any car can turn."""
@@ -28,7 +29,6 @@ class Vehicle(NamedTuple):
         wheelbase: [m].
         state_names: pose first, then the body state.
         step: (x, u, e) -> x one sampling period later.
-        derivative: dx/dt of the plant before any wrapper.
         nominal: the textbook kinematic bicycle without friction or wind, as a step on
             the same state.
         nominal_derivative: dx/dt of that bicycle, for models that add to it.
@@ -39,6 +39,8 @@ class Vehicle(NamedTuple):
             [m/s²].
         simulated: whether there is a step; False for a vehicle that is known from logs
             alone.
+        derivative: dx/dt of the plant before any wrapper; None where only its step is
+            known.
     """
 
     name: str
@@ -46,7 +48,6 @@ class Vehicle(NamedTuple):
     wheelbase: float
     state_names: tuple[str, ...]
     step: Step
-    derivative: Step
     nominal: Step
     nominal_derivative: Step
     control_low: tuple[float, ...]
@@ -54,6 +55,7 @@ class Vehicle(NamedTuple):
     wind_force: float
     speed_loop: bool = False
     simulated: bool = True
+    derivative: Step | None = None
 
 
 def side_force(wind: Float[Array, ""], *, wind_force: float) -> Float[Array, ""]:
@@ -91,10 +93,10 @@ def resistance(
     return drag * speed**2 / mass + rolling * GRAVITY * jnp.tanh(speed / 0.2)
 
 
-def nominal_derivative(length: float, rear_length: float) -> Step:
+def nominal_derivative(length: float, rear_length: float, *, states: int = 4) -> Step:
     """Return dx/dt of the kinematic bicycle without friction or wind.
 
-    κ = tan δ / L,   β = l_r κ,   x = (p_x, p_y, yaw, v)
+    κ = tan δ / L,   β = l_r κ,   x = (p_x, p_y, yaw, v); further states are constant.
     """
 
     def derivative(state: State, control: Control, env: Environment) -> State:
@@ -104,14 +106,9 @@ def nominal_derivative(length: float, rear_length: float) -> Step:
         curvature = jnp.tan(control[0]) / length
         # β ≈ l_r κ for small angles: the centre of mass moves at this angle to the car.
         course = yaw + rear_length * curvature
-        return jnp.stack(
-            [
-                speed * jnp.cos(course),
-                speed * jnp.sin(course),
-                speed * curvature,
-                control[1],
-            ]
-        )
+        x, y = speed * jnp.cos(course), speed * jnp.sin(course)
+        moved = jnp.stack([x, y, speed * curvature, control[1]])
+        return jnp.concatenate([moved, jnp.zeros(states - 4)])
 
     return derivative
 
@@ -128,11 +125,7 @@ def rk4(derivative: Step, *, dt: float, substeps: int = 1) -> Step:
 
     def step(state: State, control: Control, env: Environment) -> State:
         def substep(x: State, _: None) -> tuple[State, None]:
-            k1 = derivative(x, control, env)
-            k2 = derivative(x + 0.5 * h * k1, control, env)
-            k3 = derivative(x + 0.5 * h * k2, control, env)
-            k4 = derivative(x + h * k3, control, env)
-            return x + h / 6.0 * (k1 + 2.0 * k2 + 2.0 * k3 + k4), None
+            return runge_kutta(lambda x: derivative(x, control, env), x, h), None
 
         # Unrolled: a loop of a few substeps would cost more than it computes.
         return jax.lax.scan(
@@ -232,21 +225,16 @@ def along_path(
         )
     # The loop clips what the law and ν ask for together, as the car does.
     limits = (vehicle.control_low, vehicle.control_high)
-    step = closed_loop(vehicle.step, law, *limits)
-
-    def derivative(state: State, control: Control, env: Environment) -> State:
-        # A difference quotient: the loop is defined by its step, with the control held.
-        return (step(state, control, env) - state) / vehicle.dt
-
     nominal = closed_loop(vehicle.nominal, law, *limits)
 
     def nominal_derivative(state: State, control: Control, env: Environment) -> State:
+        # A difference quotient: the loop is defined by its step, with the control held.
         return (nominal(state, control, env) - state) / vehicle.dt
 
     return vehicle._replace(
         state_names=("p_x", "p_y", "yaw", "e_y", "e_psi", *vehicle.state_names[3:]),
-        step=step,
-        derivative=derivative,
+        step=closed_loop(vehicle.step, law, *limits),
+        derivative=None,
         nominal=nominal,
         nominal_derivative=nominal_derivative,
         # Limits of w as boxes to draw from; the loop itself clips only the control.

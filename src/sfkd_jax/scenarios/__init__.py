@@ -4,7 +4,6 @@ from sfkd_jax.scenarios._conditions import gusts as gusts
 from sfkd_jax.scenarios._conditions import held_road as held_road
 from sfkd_jax.scenarios._conditions import random_side_forces as random_side_forces
 from sfkd_jax.scenarios._conditions import random_switching as random_switching
-from sfkd_jax.scenarios._conditions import steady_road as steady_road
 from sfkd_jax.scenarios._conditions import switching_road as switching_road
 from sfkd_jax.scenarios._conditions import uniform_road as uniform_road
 from sfkd_jax.scenarios._conditions import wet_road as wet_road

@@ -14,6 +14,12 @@ Schedule = Float[Array, "time 2"]
 
 SWITCH_LEVELS = ((0.9, 0.0), (0.6, 4.0), (0.3, 8.0), (0.6, 4.0))
 """S3's order A, B, C, B, A, …: (friction, |wind|)."""
+PERIOD = 3.0
+"""Between two switches of S3 [s]."""
+PEAK_WIND = 8.0
+"""Largest gust of S2 [m/s]."""
+HOLD, RAMP = (1.0, 3.0), 0.5
+"""Of gusts: range of the time from one ramp to the next, and its duration [s]."""
 
 
 def uniform_road(key: Key, *, steps: int, friction: Range = (0.9, 0.9)) -> Schedule:
@@ -24,28 +30,8 @@ def uniform_road(key: Key, *, steps: int, friction: Range = (0.9, 0.9)) -> Sched
         steps: length.
         friction: range [-].
     """
-    level = jax.random.uniform(key, (), minval=friction[0], maxval=friction[1])
+    level = _within(friction, key)
     return jnp.stack([jnp.full(steps, level), jnp.zeros(steps)], axis=1)
-
-
-def steady_road(key: Key, *, steps: int, friction: Range, wind: Range) -> Schedule:
-    """One friction level and one wind from a random side, for a whole episode.
-
-    Args:
-        key: consumed.
-        steps: length.
-        friction: range [-].
-        wind: range of the wind speed [m/s].
-    """
-    # Friction, strength and side apart: a wider range of one leaves the others.
-    friction_key, wind_key, side_key = jax.random.split(key, 3)
-    level = jax.random.uniform(friction_key, (), minval=friction[0], maxval=friction[1])
-    strength = jax.random.uniform(wind_key, (), minval=wind[0], maxval=wind[1])
-    pair = jnp.stack(
-        # A sign drawn apart from the strength: a range that excludes 0 stays excluded.
-        [level, strength * jax.random.rademacher(side_key, (), dtype=float)]
-    )
-    return jnp.tile(pair, (steps, 1))
 
 
 def wet_road(
@@ -56,7 +42,6 @@ def wet_road(
     before: Range = (0.7, 0.7),
     after: Range = (0.35, 0.35),
     drop_time: Range = (5.0, 5.0),
-    peak_wind: float = 8.0,
 ) -> Schedule:
     """S2: friction drops abruptly once, while smooth gusts blow.
 
@@ -67,36 +52,31 @@ def wet_road(
         before: range of the friction before the drop [-].
         after: range of the friction after it [-].
         drop_time: range of its time [s].
-        peak_wind: gusts are uniform in [-peak, peak] [m/s].
     """
     before_key, after_key, time_key, gust_key = jax.random.split(key, 4)
-    high = jax.random.uniform(before_key, (), minval=before[0], maxval=before[1])
-    low = jax.random.uniform(after_key, (), minval=after[0], maxval=after[1])
-    when = jax.random.uniform(time_key, (), minval=drop_time[0], maxval=drop_time[1])
+    high, low = _within(before, before_key), _within(after, after_key)
     # A hair early: k dt may round to just below the time of the drop.
-    friction = jnp.where(jnp.arange(steps) * dt < when - 1e-6, high, low)
-    return jnp.stack(
-        [friction, gusts(gust_key, steps=steps, dt=dt, peak=peak_wind)], axis=1
-    )
+    dry = jnp.arange(steps) * dt < _within(drop_time, time_key) - 1e-6
+    wind = gusts(gust_key, steps=steps, dt=dt, peak=PEAK_WIND)
+    return jnp.stack([jnp.where(dry, high, low), wind], axis=1)
 
 
-def switching_road(key: Key, *, steps: int, dt: float, period: float = 3.0) -> Schedule:
+def switching_road(key: Key, *, steps: int, dt: float) -> Schedule:
     """S3: the next of the levels A, B, C, B, A, … every period, wind side random.
 
     Args:
         key: consumed.
         steps: length.
         dt: sampling period [s].
-        period: between two switches [s].
     """
     # One visit more, for the rest of a period at the end.
-    visits = int(steps * dt / period) + 1
+    visits = int(steps * dt / PERIOD) + 1
     sides = jax.random.rademacher(key, (visits,), dtype=float)
     levels = jnp.asarray(SWITCH_LEVELS)[jnp.arange(visits) % len(SWITCH_LEVELS)]
     # Friction is the first column and has no side.
     levels = levels.at[:, 1].multiply(sides)
     # The same hair, so that a period has the same number of steps each time.
-    visit = jnp.floor(jnp.arange(steps) * dt / period + 1e-6).astype(int)
+    visit = jnp.floor(jnp.arange(steps) * dt / PERIOD + 1e-6).astype(int)
     return levels[visit]
 
 
@@ -125,8 +105,6 @@ def gusts(
     steps: int,
     dt: float,
     peak: float,
-    hold: Range = (1.0, 3.0),
-    ramp: float = 0.5,
 ) -> Float[Array, " time"]:
     """Draw wind levels, uniform in [-peak, peak], joined by 1 − cos ramps [m/s].
 
@@ -135,21 +113,17 @@ def gusts(
         steps: length.
         dt: sampling period [s].
         peak: [m/s].
-        hold: range of the time from one ramp to the next [s].
-        ramp: duration of a ramp [s].
     """
     level_key, hold_key = jax.random.split(key)
     # Enough for the shortest holds; what is beyond the end is not used.
-    count = int(steps * dt / hold[0]) + 2
-    levels = jax.random.uniform(level_key, (count + 1,), minval=-peak, maxval=peak)
-    starts = jnp.cumsum(
-        jax.random.uniform(hold_key, (count,), minval=hold[0], maxval=hold[1])
-    )
+    count = int(steps * dt / HOLD[0]) + 2
+    levels = _within((-peak, peak), level_key, count + 1)
+    starts = jnp.cumsum(_within(HOLD, hold_key, count))
     time = jnp.arange(steps) * dt
     gust = jnp.searchsorted(starts, time, side="right")
     # Before the first ramp the level is that of gust 0, as if its ramp were over.
-    since = time - jnp.where(gust > 0, starts[gust - 1], -ramp)
-    blend = 0.5 - 0.5 * jnp.cos(jnp.pi * jnp.clip(since / ramp, 0.0, 1.0))
+    since = time - jnp.where(gust > 0, starts[gust - 1], -RAMP)
+    blend = 0.5 - 0.5 * jnp.cos(jnp.pi * jnp.clip(since / RAMP, 0.0, 1.0))
     # Gust 0 has none before it, and a negative index would wrap to the last.
     before = levels[jnp.maximum(gust - 1, 0)]
     return before + (levels[gust] - before) * blend
@@ -196,17 +170,18 @@ def random_switching(
     levels = jax.vmap(lambda key: _from_box(key, low, high))(
         jax.random.split(level_key, count)
     )
-    ends = jnp.cumsum(
-        jax.random.uniform(hold_key, (count,), minval=dwell[0], maxval=dwell[1])
-    )
+    ends = jnp.cumsum(_within(dwell, hold_key, count))
     return levels[jnp.searchsorted(ends, jnp.arange(steps) * dt, side="right")]
+
+
+def _within(bounds: Range, key: Key, *shape: int) -> Float[Array, "*shape"]:
+    """Draw uniformly from a range."""
+    return jax.random.uniform(key, shape, minval=bounds[0], maxval=bounds[1])
 
 
 def _from_box(key: Key, low: Corner, high: Corner) -> Float[Array, " environment"]:
     """A point of a box; each entry is at an end of its range with probability 1/3."""
     # A wider range, clipped: the ends, where models are worst, are drawn often.
-    share = jnp.clip(
-        jax.random.uniform(key, (len(low),), minval=-0.25, maxval=1.25), 0.0, 1.0
-    )
+    share = jnp.clip(_within((-0.25, 1.25), key, len(low)), 0.0, 1.0)
     bottom, top = jnp.asarray(low), jnp.asarray(high)
     return bottom + share * (top - bottom)

@@ -14,8 +14,6 @@ SPACING = 0.5
 """Between samples of a path [m]."""
 RUN_UP = 20.0
 """Over which the curvature of a path is blended in [m]."""
-
-
 LANE = 3.5
 """Offset of a lane change [m]."""
 SECTIONS = (30.0, 25.0, 25.0)
@@ -41,10 +39,8 @@ def smooth_path(
     key: Key,
     *,
     length: float,
-    spacing: float = SPACING,
     peak_curvature: float = 0.02,
     wavelengths: tuple[float, float] = (50.0, 160.0),
-    run_up: float = RUN_UP,
 ) -> Path:
     """Draw a path whose curvature is a sum of three sinusoids.
 
@@ -56,13 +52,11 @@ def smooth_path(
     Args:
         key: consumed.
         length: smallest length [m].
-        spacing: between samples [m].
         peak_curvature: κ_max [1/m].
         wavelengths: range of λᵢ [m].
-        run_up: length of the blend [m].
     """
     amplitude_key, wavelength_key, phase_key = jax.random.split(key, 3)
-    s = jnp.arange(int(length / spacing) + 2) * spacing
+    s = jnp.arange(int(length / SPACING) + 2) * SPACING
     # At least 0.3, or one sinusoid could be left alone.
     amplitudes = jax.random.uniform(amplitude_key, (3, 1), minval=0.3, maxval=1.0)
     waves = jax.random.uniform(
@@ -70,12 +64,12 @@ def smooth_path(
     )
     phases = jax.random.uniform(phase_key, (3, 1), maxval=2 * jnp.pi)
     curvature = jnp.sum(amplitudes * jnp.sin(2 * jnp.pi * s / waves + phases), axis=0)
-    blend = jnp.clip(s / run_up, 0.0, 1.0)
+    blend = jnp.clip(s / RUN_UP, 0.0, 1.0)
     # Smoothstep: the curvature and its slope start at 0, as does the steering.
     curvature = curvature * blend**2 * (3.0 - 2.0 * blend)
     # After the blend, so that the peak is reached on the path that is driven.
     curvature = curvature * peak_curvature / jnp.max(jnp.abs(curvature))
-    return path_from_curvature(curvature, spacing=spacing)
+    return path_from_curvature(curvature, spacing=SPACING)
 
 
 def double_lane_change(key: Key, length: float) -> Path:

@@ -11,7 +11,6 @@ import jax.numpy as jnp
 from sfkd_jax.ranges import Positive, Span
 from sfkd_jax.scenarios._conditions import (
     Schedule,
-    steady_road,
     switching_road,
     uniform_road,
     wet_road,
@@ -48,37 +47,28 @@ class Road(NamedTuple):
         conditions: (key, steps, sampling period [s]) -> e_0 … e_{T-1}.
         path: (key, length [m]) -> path from the origin along x; None for `smooth_path`
             with the curvature and the wavelengths of the settings.
-        outside: whether e may leave the box that models are trained in.
     """
 
     conditions: Callable[[Key, int, float], Schedule]
     path: Callable[[Key, float], Path] | None = None
-    outside: bool = False
-
-
-def _steady(friction: Span, wind: tuple[float, float]) -> Callable[..., Schedule]:
-    """One friction level and one wind for a whole episode."""
-    return lambda key, steps, dt: steady_road(
-        key, steps=steps, friction=friction, wind=wind
-    )
 
 
 ROADS: dict[str, Road] = {
     "s1": Road(lambda key, steps, dt: uniform_road(key, steps=steps)),
     "s2": Road(lambda key, steps, dt: wet_road(key, steps=steps, dt=dt)),
     "s3": Road(lambda key, steps, dt: switching_road(key, steps=steps, dt=dt)),
-    "seen": Road(_steady((0.55, 0.9), (0.0, 8.0))),
-    "interpolated": Road(_steady((0.5, 0.55), (4.0, 8.0))),
-    "extrapolated": Road(_steady((0.27, 0.3), (8.0, 9.0)), outside=True),
-    "double_lane_change": Road(_steady((0.6, 0.9), (0.0, 0.0)), double_lane_change),
+    "double_lane_change": Road(
+        # The first of three keys, by which its published episodes were drawn.
+        lambda key, steps, dt: uniform_road(
+            jax.random.split(key, 3)[0], steps=steps, friction=(0.6, 0.9)
+        ),
+        double_lane_change,
+    ),
 }
 """Scenarios by name; an entry is all that a new one needs.
 
-"s1" is a uniform road, "s2" a wet road with gusts, "s3" a switching road. Three more
-have one constant pair of friction and wind per episode: "seen" in the range of the
-training data, "interpolated" between friction levels that these have under wind,
-"extrapolated" outside their box. "double_lane_change" has a path of its own, friction
-from wet to dry and no wind.
+"s1" is a uniform road, "s2" a wet road with gusts, "s3" a switching road.
+"double_lane_change" has a path of its own, friction from wet to dry and no wind.
 """
 
 
@@ -121,12 +111,10 @@ def scenario(
             key, length=length, peak_curvature=peak_curvature, wavelengths=wavelengths
         )
 
-    return family(
-        lambda key: road.conditions(key, steps, dt),
-        path,
-        speed=speed,
-        state_size=state_size,
-    )
+    def conditions(key: Key) -> Schedule:
+        return road.conditions(key, steps, dt)
+
+    return family(conditions, path, speed=speed, state_size=state_size)
 
 
 def family(

@@ -3,15 +3,15 @@
 from __future__ import annotations
 
 import logging
-import sys
 from pathlib import Path
 from typing import Any
 
 import jax
+import jax.numpy as jnp
 import orbax.checkpoint as ocp
 from orbax.checkpoint import checkpoint_managers as managers
 
-RESUME_HINT = "the same command goes on from the last checkpoint"
+from sfkd_jax.store import one_line, print_message
 
 
 class Checkpoints:
@@ -24,50 +24,42 @@ class Checkpoints:
     def __init__(self, directory: Path) -> None:
         """Open a directory, which is created if it does not exist."""
 
-        def metric(metrics: dict[str, float]) -> float:
+        def score(metrics: dict[str, float]) -> float:
             return metrics["validation_loss"]
 
         # Both: the best is the result, the latest is what a resumed run starts from.
-        best = managers.BestN(get_metric_fn=metric, reverse=True, n=1)
+        best = managers.BestN(get_metric_fn=score, reverse=True, n=1)
+        kept = managers.AnyPreservationPolicy([managers.LatestN(1), best])
         options = ocp.CheckpointManagerOptions(
-            preservation_policy=managers.AnyPreservationPolicy(
-                [managers.LatestN(1), best]
-            ),
-            best_fn=metric,
+            preservation_policy=kept,
+            best_fn=score,
             best_mode="min",
             # Left by a process that was killed while it saved.
             cleanup_tmp_directories=True,
             # Synchronous: once `save` returns, a signal may end the process.
             enable_async_checkpointing=False,
         )
-        self._manager = ocp.CheckpointManager(
-            # Absolute, since a command may change its working directory.
-            Path(directory).resolve(),
-            options=options,
-        )
+        # Absolute, since a command may change its working directory.
+        self._manager = ocp.CheckpointManager(directory.resolve(), options=options)
 
-    def save(self, step: int, state: Any, *, validation_loss: float) -> None:
-        """Write the state after `step` optimiser steps, unless it exists.
+    def save(self, step: int, state: Any, validation_loss: float) -> None:
+        """Write the state after `step` optimiser steps.
 
         Raises:
             OSError: it cannot be written; the previous states remain.
         """
-        # A run interrupted right after a save would write the same state again.
-        if step in self._manager.all_steps():
-            return
-        metrics, logger = (
-            {"validation_loss": float(validation_loss)},
-            logging.getLogger("absl"),
-        )
+        metrics = {"validation_loss": float(validation_loss)}
+        logger = logging.getLogger("absl")
         level = logger.level
         logger.setLevel(logging.CRITICAL)  # orbax logs a traceback and raises as well
         try:
             self._manager.save(step, args=ocp.args.StandardSave(state), metrics=metrics)
         except Exception as reason:  # orbax raises any error of its storage
-            line = " ".join(str(reason).split()).rsplit(": ", 1)[-1][:120]
+            # The last clause says what happened; the ones before name internals.
+            line = one_line(str(reason).rsplit(": ", 1)[-1])
             raise OSError(
                 f"{self._manager.directory}: step {step} was not saved ({line}); "
-                f"{RESUME_HINT}"
+                "the same command goes on from the last checkpoint"
             ) from reason
         finally:
             logger.setLevel(level)
@@ -78,14 +70,7 @@ class Checkpoints:
 
     def best_step(self) -> int | None:
         """Return the step with the lowest validation loss, or None."""
-        scores = {
-            step: self._manager.metrics(step) for step in self._manager.all_steps()
-        }
-        losses = {
-            step: score["validation_loss"] for step, score in scores.items() if score
-        }
-        # States saved on a signal have the score inf: min prefers any validated one.
-        return min(losses, key=lambda step: losses[step]) if losses else None
+        return self._manager.best_step()
 
     def resume(self, like: Any) -> Any:
         """Return the newest readable state, or `like` if there is no state.
@@ -101,16 +86,8 @@ class Checkpoints:
             try:
                 return self.restore(step, like)
             except Exception as reason:  # orbax raises any error of its storage
-                line = (
-                    str(reason).splitlines()[0]
-                    if str(reason)
-                    else type(reason).__name__
-                )
-                print(
-                    f"checkpoint {step} cannot be read ({line[:120]}); "
-                    "trying an older one",
-                    file=sys.stderr,
-                )
+                line = one_line(str(reason) or type(reason).__name__)
+                print_message(f"checkpoint {step} cannot be read ({line})")
         if steps:
             raise OSError(
                 f"no checkpoint in {self._manager.directory} can be read; "
@@ -122,7 +99,9 @@ class Checkpoints:
         """Return the state saved at `step`, with the structure and types of `like`."""
         # Shapes and types of `like`, so that a restored state fits the compiled step.
         abstract = jax.tree.map(ocp.utils.to_shape_dtype_struct, like)
-        return self._manager.restore(step, args=ocp.args.StandardRestore(abstract))
+        state = self._manager.restore(step, args=ocp.args.StandardRestore(abstract))
+        # Free of the device that orbax commits it to, which would compile all again.
+        return jax.tree.map(jnp.asarray, jax.device_get(state))
 
     def close(self) -> None:
         """Release the directory."""

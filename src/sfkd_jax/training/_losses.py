@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from functools import partial
-from typing import TypeAlias, cast
+from typing import Any, NamedTuple, TypeAlias
 
 import jax
 import jax.numpy as jnp
@@ -16,7 +16,6 @@ from sfkd_jax.rollout import defects, rollout, state_errors
 from sfkd_jax.types import (
     BODY,
     Environment,
-    Explicit,
     Model,
     Params,
     Scalar,
@@ -24,8 +23,29 @@ from sfkd_jax.types import (
     Trajectory,
 )
 
-Loss: TypeAlias = Callable[[Params, Trajectory], tuple[Scalar, dict[str, Scalar]]]
+Parts: TypeAlias = dict[str, Scalar]
+Evaluated: TypeAlias = tuple[Scalar, Parts, Float[Array, " window"]]
 
+
+class Loss(NamedTuple):
+    """A training loss: called with parameters and windows, it returns loss and parts.
+
+    Attributes:
+        evaluate: (params, windows) -> loss, its parts, and the prediction error of each
+            window with the default weights, whatever is trained with.
+        validate: the same, compiled, so that all who validate share a program.
+    """
+
+    evaluate: Callable[[Params, Trajectory], Evaluated]
+    validate: Callable[[Params, Trajectory], Evaluated]
+
+    def __call__(self, params: Params, batch: Trajectory) -> tuple[Scalar, Parts]:
+        """Return the loss and its parts, for the gradient."""
+        return self.evaluate(params, batch)[:2]
+
+
+GROWTH = 0.5
+"""Of the weights of later steps, by default."""
 YAW_LENGTH = 5.0
 """Weight of 1 rad of yaw in the loss [m]: the distance driven in half a second at the
 benchmark's speed.
@@ -62,7 +82,7 @@ def multi_step_loss(
     consistency: float = 0.001,
     reconstruction: float = 0.1,
     transport: float = 0.1,
-    growth: float = 0.5,
+    growth: float = GROWTH,
     tube: Numbers = (),
 ) -> Loss:
     """Return the mean prediction error over windows and steps, plus four regularisers.
@@ -71,13 +91,12 @@ def multi_step_loss(
             + λ_c |d_k|² + λ_r |s − C Φ(x)|² + λ_t |Φ(x, e') − T(e → e') Φ(x, e)|²
             + Σ_i λ_i (|c_i| q(|d|) / (1 − α))²_W
 
-    W measures position in units of 0.01 m at the first step. The error of a prediction
-    grows about linearly with k; dividing by this growth gives the near steps, on which
-    the planner depends most, the same weight as the far ones. The last sum is the
+    W measures position in units of 0.01 m at the first step. Errors grow about linearly
+    with k: divided by this growth, the near steps, on which the planner depends most,
+    weigh as much as the far ones. The one-step term, in units of 0.001 m, sees what the
+    sums over a window hide: slip, a lateral millimetre per step. The last sum is the
     infinite-horizon tube of a certificate: c_i is row i of the read-out, q the 8th
-    power mean over the batch instead of the quantile that calibration takes. The
-    one-step term, in units of 0.001 m, sees errors that the sums over a window hide:
-    slip, a lateral millimetre per step.
+    power mean over the batch instead of the quantile of calibration.
 
     Args:
         model: to be trained.
@@ -87,23 +106,21 @@ def multi_step_loss(
         consistency: λ_c, of the one-step latent defect: larger gives a tighter tube and
             a less accurate model, see `docs/certificate.md`.
         reconstruction: λ_r.
-        transport: λ_t, of Φ(x, e') − T(e → e') Φ(x, e) with e' the environment of
-            another window.
+        transport: λ_t, with e' the environment of another window.
         growth: γ.
         tube: λ_i of the first entries of the body state; () for none. For a model with
             a contraction rate by construction.
 
     Returns:
-        (params, batch of windows) -> loss, its parts; with `tube` one part is the first
-        radius.
+        The loss; with `tube` one of its parts is the first radius.
 
     Raises:
         ValueError: a tube for a model without a rate, or with more entries than the
             body state.
     """
-    structure = model.structure
+    known: Any = model.structure
     # The infinite-horizon radius divides by 1 − α, so α must be known in training.
-    if tube and (structure.rate is None or structure.explicit is None):
+    if tube and None in (known.rate, known.explicit):
         raise ValueError(
             "training.loss.tube needs a model that contracts by construction: "
             "model=sfkd… or model=r2dn"
@@ -114,7 +131,7 @@ def multi_step_loss(
             f"the body state {space.body_mean.shape[0]} entries"
         )
     units = error_units(model, space)
-    window = partial(_window_parts, model, space, units, growth, bool(tube))
+    window = partial(_window_parts, model, space, units, growth)
     weights = {
         "prediction": prediction,
         "one_step": one_step,
@@ -123,26 +140,28 @@ def multi_step_loss(
         "transport": transport,
     }
 
-    def loss(params: Params, batch: Trajectory) -> tuple[Scalar, dict[str, Scalar]]:
+    def evaluate(params: Params, batch: Trajectory) -> Evaluated:
         # The e of another window: transport is trained between unlike environments.
         others = jnp.roll(batch.envs[:, -1], 1, axis=0)
         parts = jax.vmap(window, in_axes=(None, 0, 0))(params, batch, others)
-        gaps = parts.pop("gap", None)
+        scores, gaps = parts.pop("score"), parts.pop("gap")
         parts = {name: jnp.mean(part) for name, part in parts.items()}
         start = jnp.zeros(())
         # After the mean over windows: a tube belongs to the batch, not to one of them.
-        if gaps is not None:
-            radii = _tube_radii(model, params, gaps, len(tube))
-            start = jnp.sum(
-                jnp.asarray(tube) * (radii * units[BODY][: len(tube)] / 0.01) ** 2
-            )
+        if tube:
+            # |c_i| q(|d|) / (1 − α) of the first entries, in their units.
+            rows = known.explicit(params).readout[: len(tube)]
+            size = jnp.linalg.norm(rows, axis=1) * power_mean(gaps)
+            radii = size / (1.0 - known.rate(params))
+            scaled = radii * units[BODY][: len(tube)] / 0.01
+            start = jnp.sum(jnp.asarray(tube) * scaled**2)
         # A part without a weight here, the penalty, has brought its own.
         total = sum(
             (weights.get(name, 1.0) * part for name, part in parts.items()), start
         )
-        return total, parts if gaps is None else parts | {"tube": radii[0]}
+        return total, parts | {"tube": radii[0]} if tube else parts, scores
 
-    return loss
+    return Loss(evaluate, jax.jit(evaluate))
 
 
 def _window_parts(
@@ -150,7 +169,6 @@ def _window_parts(
     space: Space,
     units: Float[Array, " state"],
     growth: float,
-    with_gap: bool,
     params: Params,
     data: Trajectory,
     other: Environment,
@@ -159,9 +177,13 @@ def _window_parts(
     # One rollout for both errors: `along` are the fibers that `defects` needs.
     predicted, _, along = rollout(model, params, data)
     errors = state_errors(predicted, data.states[1:])
-    # Errors grow about linearly; without this the far steps would decide alone.
-    steps = 1.0 + growth * jnp.arange(errors.shape[0])
-    weighted = (errors * units / 0.01 / steps[:, None]) ** 2
+
+    def prediction(growth: float) -> Scalar:
+        # Errors grow about linearly; without this the far steps would decide alone.
+        steps = 1.0 + growth * jnp.arange(errors.shape[0])
+        weighted = (errors * units / 0.01 / steps[:, None]) ** 2
+        return jnp.mean(jnp.sum(weighted, axis=1))
+
     gap, single = defects(model, params, data, along)
     # In millimetres: a slip of one a step hides in the sums over a window.
     near = state_errors(single, data.states[1:]) * units / 0.001
@@ -174,26 +196,16 @@ def _window_parts(
     )
     rebuilt = (model.decode(fiber, here) - data.states[0])[BODY] / space.body_scale
     parts = {
-        "prediction": jnp.mean(jnp.sum(weighted, axis=1)),
+        "prediction": prediction(growth),
         "one_step": jnp.mean(jnp.sum(near**2, axis=1)),
         "consistency": jnp.mean(jnp.sum(gap**2, axis=1)) / 1e-4,
         "reconstruction": jnp.sum(rebuilt**2) / 1e-4,
         "transport": jnp.sum(moved**2) / 1e-4,
     }
-    if with_gap:
-        # Away from 0, where the root has no gradient.
-        parts["gap"] = jnp.sqrt(jnp.sum(gap**2, axis=1) + 1e-16)
     if model.fitting.penalty is not None:
         parts["penalty"] = model.fitting.penalty(fiber, here, data.controls[0])
-    return parts
-
-
-def _tube_radii(
-    model: Model, params: Params, gaps: Float[Array, "window time"], count: int
-) -> Float[Array, " count"]:
-    """|c_i| q(|d|) / (1 − α) of the first entries of the body state, in their units."""
-    structure = model.structure
-    explicit = cast(Callable, structure.explicit)(params)
-    rows = cast(Explicit, explicit).readout[:count]
-    rate = cast(Callable, structure.rate)(params)
-    return jnp.linalg.norm(rows, axis=1) * power_mean(gaps) / (1.0 - rate)
+    # Of free-running and of single steps, and what the model itself adds.
+    score = prediction(GROWTH) + parts["one_step"] + parts.get("penalty", 0.0)
+    # Away from 0, where the root has no gradient.
+    size = jnp.sqrt(jnp.sum(gap**2, axis=1) + 1e-16)
+    return parts | {"score": score, "gap": size}

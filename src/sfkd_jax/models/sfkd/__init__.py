@@ -6,4 +6,3 @@ it shares with the operators, `_learned.py` everything learned.
 
 from sfkd_jax.models.sfkd._model import sfkd as sfkd
 from sfkd_jax.models.sfkd._residual import RESIDUALS as RESIDUALS
-from sfkd_jax.models.sfkd._residual import Residual as Residual

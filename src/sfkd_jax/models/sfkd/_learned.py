@@ -43,41 +43,54 @@ class PerEnvironment(NamedTuple):
     embedding: Float[Array, " embedding"]
 
 
-class Learned(nn.Module):
-    """Embedding ψ(e), operators, residual, decoder and transport: all but the encoder.
+class Networks(nn.Module):
+    """What a latent model learns besides its encoder: `shared`, functions of e, `rate`.
 
     Attributes:
-        rank: r, even.
+        rank: r.
         body: size of s.
         control: size of u.
-        vertices: number of operator vertices.
-        residual_hidden: hidden widths of the residual.
-        decoder_hidden: hidden widths of the decoder.
         embedding: size of ψ(e).
-        rho: ρ.
-        beta: β.
-        kind: of the residual.
-        joint: whether operators and residual are bounded as one map by α = ρ + β;
-            otherwise A(e) is bounded by ρ and the residual by β.
-        transport: whether Q(e) is learned.
         pose: whether there is a decoder of the pose.
-        learn_alpha: whether a joint budget may choose α below ρ + β.
-        forcing_hidden: width of f(u, e), which is added to B(e) u; 0 for none.
+        transport: whether Q(e) is learned; otherwise it is the identity.
     """
 
     rank: int
     body: int
     control: int
+    embedding: int
+    pose: bool
+    transport: bool
+
+    @property
+    def bounded(self) -> bool:
+        """Whether a step contracts by construction."""
+        return True
+
+
+class Learned(Networks):
+    """Embedding ψ(e), operators, residual, decoder and transport of SFKD.
+
+    Attributes:
+        vertices: number of operator vertices.
+        residual_hidden: hidden widths of the residual.
+        decoder_hidden: hidden widths of the decoder.
+        rho: ρ.
+        beta: β.
+        kind: of the residual.
+        joint: whether operators and residual are bounded as one map by α = ρ + β;
+            otherwise A(e) is bounded by ρ and the residual by β.
+        learn_alpha: whether a joint budget may choose α below ρ + β.
+        forcing_hidden: width of f(u, e), which is added to B(e) u; 0 for none.
+    """
+
     vertices: int
     residual_hidden: Sequence[int]
     decoder_hidden: Sequence[int]
-    embedding: int
     rho: float
     beta: float
     kind: Residual
     joint: bool
-    transport: bool
-    pose: bool
     learn_alpha: bool
     forcing_hidden: int
 
@@ -130,6 +143,11 @@ class Learned(nn.Module):
                 "alpha_logit", nn.initializers.constant(ALPHA_START), ()
             )
 
+    @property
+    def bounded(self) -> bool:
+        """Whether a step contracts by construction."""
+        return self.kind.bounded
+
     def rate(self) -> Scalar:
         """Return α = ρ + β, or less if it is learned."""
         most = jnp.asarray(self.rho + self.beta)
@@ -173,12 +191,11 @@ class Learned(nn.Module):
         embedding = self.psi(env)
         residual = decoder = forcing = Biases()
         if self.kind.network is not None:
-            flat = self.residual_head(embedding)
-            residual = self._biases(flat, (*self.residual_hidden, self.rank))
+            widths = (*self.residual_hidden, self.rank)
+            residual = self._biases(self.residual_head(embedding), widths)
         if self.pose:
-            decoder = self._biases(
-                self.decoder_head(embedding), (*self.decoder_hidden, 3)
-            )
+            widths = (*self.decoder_hidden, 3)
+            decoder = self._biases(self.decoder_head(embedding), widths)
         if self.forcing_hidden:
             forcing = self._biases(self.forcing_head(embedding), (self.forcing_hidden,))
         # Evaluated in any case, so that the ablation has the same parameters.
@@ -190,7 +207,7 @@ class Learned(nn.Module):
             residual=residual,
             decoder=decoder,
             forcing=forcing,
-            tangents=tangents if self.transport else jnp.zeros_like(tangents),
+            tangents=tangents,
             embedding=embedding,
         )
 
@@ -201,11 +218,7 @@ class Learned(nn.Module):
     def _biases(self, flat: Array, widths: Sequence[int]) -> Biases:
         """Cut one flat vector into gains and offsets per layer."""
         table = flat.reshape(sum(widths), self.control + 1)
-        edges = [sum(widths[: k + 1]) for k in range(len(widths) - 1)]
-        parts = jnp.split(table, edges)
-        return Biases(
-            tuple(part[:, :-1] for part in parts), tuple(part[:, -1] for part in parts)
-        )
+        return Biases.cut(table[:, :-1], table[:, -1], widths)
 
 
 def _couplings(

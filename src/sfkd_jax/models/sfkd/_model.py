@@ -10,23 +10,16 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from sfkd_jax.geometry import between, compose
-from sfkd_jax.models._networks import (
-    Biases,
-    Encoder,
-    PosedLatent,
-    apply,
-    scaled_body,
-    scaled_control,
-    scaled_env,
-)
+from sfkd_jax.models._networks import Encoder, apply
 from sfkd_jax.models.sfkd._learned import (
     LOWEST_RATE,
     Learned,
+    Networks,
     PerEnvironment,
     SharedWeights,
 )
 from sfkd_jax.models.sfkd._residual import BUDGETS, RESIDUALS
-from sfkd_jax.ranges import Fraction, NonNegativeInt
+from sfkd_jax.ranges import Fraction, NonNegativeInt, check_choice
 from sfkd_jax.rollout import Folded, unfold
 from sfkd_jax.types import (
     POSE,
@@ -49,6 +42,13 @@ from sfkd_jax.types import (
 FRAMES = ("body", "segment", "path")
 SEGMENT_STEPS = 20.0
 """Pose increments per unit of the segment-frame pose: the paper's horizon."""
+
+
+class PosedLatent(NamedTuple):
+    """State of a rollout: z and a pose, in the segment frame that of its start."""
+
+    pose: Pose
+    z: Float[Array, " rank"]
 
 
 class Mixture(NamedTuple):
@@ -85,24 +85,26 @@ class SfkdFiber(NamedTuple):
 
 
 @dataclass(frozen=True, eq=False)
-class Sfkd:
-    """The functions of `Model`.
+class LatentModel:
+    """The functions of `Model`: of SFKD, and of its special case R2DN.
 
     Attributes:
         space: measured scales.
         learned: everything learned except the encoder.
         encoder: of the body state (and of the pose in the segment frame).
-        segment: whether the pose relative to the start of the segment is part of z.
         environment: whether e is used.
+        segment: whether the pose relative to the start of the segment is part of z.
         soft_penalty: weight of `hinge`.
+        beta: β of `hinge`.
     """
 
     space: Space
-    learned: Learned
+    learned: Networks
     encoder: Encoder
-    segment: bool
     environment: bool
-    soft_penalty: float
+    segment: bool = False
+    soft_penalty: float = 0.0
+    beta: float = 0.0
 
     @property
     def pose_scale(self) -> Float[Array, " 3"]:
@@ -117,7 +119,7 @@ class Sfkd:
         body = self.learned.body
         inputs = jnp.zeros(body + 3 if self.segment else body)
         env = jnp.zeros(self.space.env_mean.shape[0])
-        # ψ(e) has another size than e, and the encoder reads ψ(e).
+        # The encoder reads ψ(e), which may have another size than e.
         embedding = jnp.zeros(self.learned.embedding)
         return {
             "networks": self.learned.init(network_key, env)["params"],
@@ -146,7 +148,7 @@ class Sfkd:
         `Mixture`. A controller takes many steps under one environment.
         """
         shared = self.shared(params)
-        scaled = scaled_env(self.space, env, self.environment)
+        scaled = self.space.scaled_env(env, self.environment)
         local = cast(PerEnvironment, self._apply(params, "per_environment", scaled))
         operator = Mixture(local.mixture, shared.vertices)
         return SfkdFiber(
@@ -173,14 +175,17 @@ class Sfkd:
 
     def _lift(self, fiber: SfkdFiber, at: Pose, state: State) -> PosedLatent:
         """The latent of a state in the frame of a pose."""
-        inputs = scaled_body(self.space, state)
+        inputs = self.space.scaled_body(state)
         # The paper's literal reading: the pose is one more input of the lift.
         if self.segment:
             motion = between(at, state[POSE]) / self.pose_scale
             inputs = jnp.concatenate([motion, inputs])
         z = self.encoder.apply({"params": fiber.encoder}, inputs, fiber.local.embedding)
+        z = cast(jax.Array, z)
         # Rotated after the lift, so that z of two environments differ by an isometry.
-        return PosedLatent(at, rotate_planes(fiber.local.tangents, cast(jax.Array, z)))
+        if self.learned.transport:
+            z = rotate_planes(fiber.local.tangents, z)
+        return PosedLatent(at, z)
 
     def step(
         self, fiber: SfkdFiber, latent: PosedLatent, control: Control
@@ -188,7 +193,7 @@ class Sfkd:
         """Advance z and the pose by one sampling period."""
         space, local = self.space, fiber.local
         # Every function of u and e is a bias, which no Lipschitz bound in z sees.
-        u = scaled_control(space, control)
+        u = space.scaled_control(control)
         z = fiber.A @ latent.z + local.B @ u
         if fiber.forcing:
             z = z + fiber.forcing[0] @ jnp.tanh(local.forcing.at(u)[0])
@@ -218,6 +223,8 @@ class Sfkd:
         self, fiber: SfkdFiber, fiber_next: SfkdFiber, latent: PosedLatent
     ) -> PosedLatent:
         """Carry z from the fiber of e to that of e', T(e → e') z = Q(e') Q(e)' z."""
+        if not self.learned.transport:
+            return latent
         # There and back through the common coordinates: a cocycle without a matrix.
         unrotated = rotate_planes(-fiber.local.tangents, latent.z)
         return latent._replace(z=rotate_planes(fiber_next.local.tangents, unrotated))
@@ -229,6 +236,7 @@ class Sfkd:
         if learned.pose:
             # In physical units, so that a certificate needs no scales of the model.
             decoder = (*decoder[:-1], self.pose_scale[:, None] * decoder[-1])
+        transport = "rotation" if learned.transport else "identity"
         return Explicit(
             # The vertices, not a mixture: what holds at each of them holds for every e.
             operators=Polytope(shared.vertices),
@@ -237,19 +245,36 @@ class Sfkd:
             decoder=decoder,
             decoder_multipliers=shared.decoder.multipliers,
             readout=jnp.asarray(self.space.body_scale)[:, None] * shared.readout,
-            declared=Declared(
-                "tanh", "rotation" if learned.transport else "identity", learned.control
-            ),
+            declared=Declared("tanh", transport, learned.control),
         )
 
     def hinge(self, fiber: SfkdFiber, latent: PosedLatent, control: Control) -> Scalar:
         """Return the weighted penalty max(0, ||∂r/∂z||_2 − β)² (eq:contr_loss)."""
-        biases: Biases = fiber.local.residual
-        at = biases.at(scaled_control(self.space, control))
+        at = fiber.local.residual.at(self.space.scaled_control(control))
         jacobian = jax.jacobian(lambda z: apply(fiber.residual, at, z))(latent.z)
         # As the paper has it: a penalty at sampled points, which proves nothing.
-        excess = jnp.linalg.norm(jacobian, 2) - self.learned.beta
+        excess = jnp.linalg.norm(jacobian, 2) - self.beta
         return self.soft_penalty * jnp.maximum(0.0, excess) ** 2
+
+    def model(self) -> Model:
+        """Return the functions as a `Model`."""
+        return Model(
+            init=self.init,
+            fiber=self.fiber,
+            encode=self.encode,
+            step=self.step,
+            decode=self.decode,
+            transport=self.transport,
+            observe=self.observe,
+            vector=lambda latent: latent.z,
+            shared=self.shared,
+            fitting=Fitting(penalty=self.hinge if self.soft_penalty else None),
+            # A free residual may contract, but only a certificate can tell.
+            structure=Structure(
+                self.explicit, self.rate if self.learned.bounded else None
+            ),
+            along_path=not self.learned.pose,
+        )
 
 
 def sfkd(
@@ -313,22 +338,17 @@ def sfkd(
             none. It is no function of z, so every bound still holds.
 
     Raises:
-        ValueError: unknown frame or residual, odd rank, or bounds outside (0, 1).
+        ValueError: unknown frame, residual or budget, an odd rank, or a `learn_alpha`
+            or `soft_penalty` that the residual does not allow.
     """
-    for setting, value, known in (
-        ("frame", frame, FRAMES),
-        ("residual", residual, RESIDUALS),
-        ("budget", budget, BUDGETS),
-    ):
-        if value not in known:
-            raise ValueError(
-                f"model.{setting} must be one of {', '.join(known)}, got {value!r}"
-            )
+    check_choice("model.frame", frame, FRAMES)
+    check_choice("model.residual", residual, RESIDUALS)
+    check_choice("model.budget", budget, BUDGETS)
     # The one look-up: everything below asks the kind, never its name.
     kind = RESIDUALS[residual]
-    # A free residual has no bound that could be shared.
-    joint = kind.shares_budget(budget)
-    _check_bounds(rank, rho, beta, learn_alpha, joint)
+    # Planes are pairs of coordinates; of an odd number one would be left over.
+    if rank % 2:
+        raise ValueError(f"model.rank must be even, got {rank}")
     if soft_penalty and kind.network is None:
         raise ValueError("model.soft_penalty needs a residual, got model.residual=none")
     learned = Learned(
@@ -342,57 +362,25 @@ def sfkd(
         rho=rho,
         beta=beta,
         kind=kind,
-        joint=joint,
+        # A residual without a bound has none that could be shared.
+        joint=budget == "joint" and kind.bounded and kind.network is not None,
         transport=transport,
         # Along a path the offsets are part of s, and there is no pose to decode.
         pose=frame != "path",
         learn_alpha=learn_alpha,
         forcing_hidden=forcing_hidden,
     )
+    # A separate budget has α = ρ + β, with nothing to learn.
+    if learn_alpha and (not learned.joint or rho + beta <= LOWEST_RATE):
+        raise ValueError(
+            "model.learn_alpha needs model.residual=sandwich, model.budget=joint and "
+            f"model.rho + model.beta above {LOWEST_RATE}, got {rho + beta}"
+        )
     encoder = Encoder(rank, encoder_hidden, linear_lift)
     segment = frame == "segment"
-    functions = Sfkd(space, learned, encoder, segment, environment, soft_penalty)
-    return Model(
-        init=functions.init,
-        fiber=functions.fiber,
-        encode=functions.encode,
-        step=functions.step,
-        decode=functions.decode,
-        transport=functions.transport,
-        observe=functions.observe,
-        vector=lambda latent: latent.z,
-        shared=functions.shared,
-        fitting=Fitting(penalty=functions.hinge if soft_penalty else None),
-        structure=Structure(
-            # A free residual may contract, but only a certificate can tell.
-            explicit=functions.explicit,
-            rate=functions.rate if kind.bounded else None,
-        ),
-        along_path=not learned.pose,
-    )
-
-
-def _check_bounds(
-    rank: int, rho: float, beta: float, learn_alpha: bool, joint: bool
-) -> None:
-    """Raise ValueError for a rank or bounds that no such model has."""
-    # Planes are pairs of coordinates; of an odd number one would be left over.
-    if rank < 2 or rank % 2:
-        raise ValueError(f"model.rank must be even and at least 2, got {rank}")
-    if min(rho, beta) <= 0.0 or max(rho, beta) >= 1.0:
-        raise ValueError(
-            f"model.rho and model.beta must lie in (0, 1), got {rho} and {beta}"
-        )
-    # A separate budget has α = ρ + β, with nothing to learn.
-    if learn_alpha and not joint:
-        raise ValueError(
-            "model.learn_alpha needs model.residual=sandwich and model.budget=joint"
-        )
-    if learn_alpha and rho + beta <= LOWEST_RATE:
-        raise ValueError(
-            "model.learn_alpha needs model.rho + model.beta above "
-            f"{LOWEST_RATE}, got {rho + beta}"
-        )
+    return LatentModel(
+        space, learned, encoder, environment, segment, soft_penalty, beta
+    ).model()
 
 
 def rotate_planes(

@@ -3,13 +3,13 @@
 A new kind is an entry of `RESIDUALS`: a flax module called like `Sandwich`. What it
 returns is W_L σ(… W_1 z + b_1(u, e) …) + b_L(u, e), because `Explicit` can state, and
 the trusted core check, no other form. A residual for planning alone, which no
-certificate is about, would be added in `_model.Sfkd.step` and left out of `explicit`.
+certificate is about, would be added in `LatentModel.step` and left out of `explicit`.
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from typing import NamedTuple, Protocol
+from collections.abc import Callable
+from typing import NamedTuple
 
 import flax.linen as nn
 import jax
@@ -26,30 +26,18 @@ float32.
 BUDGETS = ("joint", "sum")
 
 
-class Network(Protocol):
-    """A flax module: called with a Lipschitz bound, it returns `Weights`."""
-
-    def __call__(
-        self, inputs: int, hidden: Sequence[int], outputs: int
-    ) -> nn.Module: ...
-
-
 class Residual(NamedTuple):
     """A kind of residual r(z; u, e).
 
     Attributes:
-        network: makes its weights for a Lipschitz bound; None: there is no residual.
+        network: (inputs, hidden widths, outputs) -> flax module that returns `Weights`
+            for a Lipschitz bound; None: there is no residual.
         bounded: whether a step contracts by construction. If not, a certificate exists
             only if its search finds one.
     """
 
-    network: Network | None
+    network: Callable[..., nn.Module] | None
     bounded: bool
-
-    def shares_budget(self, budget: str) -> bool:
-        """Whether operators and residual are bounded as one map."""
-        # A network without a bound cannot share one with the operators.
-        return budget == "joint" and self.bounded and self.network is not None
 
 
 RESIDUALS = {
