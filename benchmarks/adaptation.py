@@ -238,7 +238,7 @@ def main():
     shipped = Path(policy.__file__).parent / "pretrained"
     for name in given.cars:
         loaded = policy.load(shipped / f"{name}_path")
-        rows = Rows(loaded, build.build_vehicle(loaded.settings["vehicle"]))
+        rows = Rows(loaded, loaded.vehicle)
         for label in given.cases:
             case = CASES[label]
             car = changed_car(name, case)

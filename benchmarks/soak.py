@@ -17,7 +17,7 @@ import jax.numpy as jnp
 import numpy as np
 
 import sfkd_jax
-from sfkd_jax import build, scenarios
+from sfkd_jax import scenarios
 
 SHIPPED = Path(sfkd_jax.__file__).with_name("pretrained")
 HORIZON, ROAD, LOST = 20, 1000, 20.0
@@ -69,7 +69,7 @@ def main():
     parser.add_argument("--out", type=Path, default=Path(__file__).with_suffix(".json"))
     given = parser.parse_args()
     policy = sfkd_jax.load(SHIPPED / f"{given.car}_path")
-    plant = build.build_vehicle(policy.settings["vehicle"])
+    plant = policy.vehicle
     size = len(plant.state_names)
     family = jax.jit(
         scenarios.scenario(

@@ -82,7 +82,7 @@ def roads(car, paths, seconds, seed):
 
 def drive(car, driver, track, noise):
     """RMSE of the first and of the second half of every run [mm], (friction, path)."""
-    controller = adapters.commonroad_controller(driver.controller, states=7)
+    controller = adapters.commonroad_controller(driver.controller)
 
     def one(road, key):
         return evaluation.simulate(

@@ -40,7 +40,7 @@ ARROWS = {
     "evaluation": PLANT,
     "certification": PARTS | {"evaluation"},
     "build": PARTS | {"models", "settings"},
-    "policy": PARTS | {"build", "certification", "store"},
+    "policy": PARTS | {"build", "certification", "settings", "store"},
     "export": CORE | {"build", "policy", "settings", "store"},
     "adapters": PLANT | {"build"},
     "report": {"evaluation", "store"},

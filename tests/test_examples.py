@@ -171,7 +171,15 @@ def node(monkeypatch):
         "controller": {"mppi": {"horizon": 6}},
         "space": {"body_mean": [0.0]},
     }
-    policy = Policy(model, {}, controller, None, settings)
+    stored = {"law": None, "weights_sha256": "", "sha256": "", "certificate": None}
+    policy = Policy(
+        model=model,
+        params={},
+        vehicle=plant,
+        settings=settings,
+        controller=controller,
+        **stored,
+    )
     monkeypatch.setattr(sfkd_jax, "load", lambda path: policy)
     monkeypatch.setattr(
         sfkd_jax, "warm_up", lambda policy: jax.jit(policy.controller.act)

@@ -5,9 +5,10 @@ from __future__ import annotations
 import json
 import warnings
 from collections.abc import Callable, Mapping
-from functools import lru_cache, wraps
+from dataclasses import dataclass
+from functools import lru_cache, partial, wraps
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -17,6 +18,7 @@ from sfkd_jax import build, store
 from sfkd_jax.control import PathLaw, law_from_arrays
 from sfkd_jax.plants import Vehicle
 from sfkd_jax.rollout import fold, unfold
+from sfkd_jax.settings import Values
 from sfkd_jax.types import Controller, Model, Params
 
 KIND, LAW = "policy", "law"
@@ -25,49 +27,41 @@ BOXES = {"state": "body", "control": "control", "env": "env"}
 """Box of a certificate -> scales of the model that have the same size."""
 
 
-class TrainedModel(NamedTuple):
+@dataclass(frozen=True, eq=False)
+class TrainedModel:
     """A model with its weights, as stored in a run directory.
 
     Attributes:
         model: the learned rollout model.
         params: its weights.
         vehicle: that it was trained for.
-        settings: that it was made with.
+        law: that a model in path coordinates was learned around, or None.
+        settings: that it was made with, the JSON in its file.
         weights_sha256: hash of the weights.
         sha256: hash of weights and settings, to which certificates refer.
-        version: of the package that saved it.
-        law: that a model in path coordinates was learned around, or None.
     """
 
     model: Model
     params: Params
     vehicle: Vehicle
-    settings: dict[str, Any]
+    law: PathLaw | None
+    settings: Values
     weights_sha256: str
     sha256: str
-    version: str
-    law: PathLaw | None = None
 
 
-class Policy(NamedTuple):
-    """A trained controller, as `load` returns it.
+@dataclass(frozen=True, eq=False)
+class Policy(TrainedModel):
+    """A trained controller, as `load` returns it; `params` are folded for it.
 
     Attributes:
-        model: the learned rollout model.
-        params: its weights.
         controller: `Controller(init, act)`, pure; jit, vmap or scan it.
         certificate: the verified document of certificate.json, or None if it is
             missing, refused or stale.
-        settings: that it was made with.
-        law: that a model in path coordinates was learned around, or None.
     """
 
-    model: Model
-    params: Params
     controller: Controller
     certificate: dict[str, Any] | None
-    settings: dict[str, Any]
-    law: PathLaw | None = None
 
     @property
     def weights(self) -> Params:
@@ -78,9 +72,9 @@ class Policy(NamedTuple):
 def save(
     path: Path,
     params: Params,
-    settings: Mapping[str, Any],
+    settings: Values,
     *,
-    made_from: Mapping[str, str],
+    made_from: Mapping[str, str] | None = None,
     law: PathLaw | None = None,
 ) -> dict[str, Any]:
     """Write policy.safetensors and return its manifest.
@@ -120,18 +114,30 @@ def restore(path: str | Path) -> TrainedModel:
     # Before anything is built: building imports and calls what the settings name.
     with store.as_artefact_error(file, ValueError):
         build.check_imported(settings)
-    version = str(manifest.get("versions", {}).get("sfkd_jax", "unknown"))
-    with store.as_artefact_error(file, ValueError, advice=_advice(version)):
+    with store.as_artefact_error(file, ValueError, advice=_advice(manifest)):
         parts = {name: settings[name] for name in ("vehicle", "space", "model")}
-        plant, model = _build(json.dumps(parts))
-    law = None
-    if model.along_path:
-        # What is left without the law are the weights, compared name by name below.
-        names = [name for name in arrays if name.startswith(f"{LAW}/")]
-        law = _law(file, {name: arrays.pop(name) for name in names})
-    params = _weights(file, arrays, model)
-    hashes = manifest["sha256"], manifest["content_sha256"]
-    return TrainedModel(model, params, plant, settings, *hashes, version, law)
+        vehicle, model = _build(json.dumps(parts))
+        # Settings of a wrong type fail only here.
+        shapes = jax.eval_shape(model.init, jax.random.key(0))
+        for name, leaf in arrays.items():
+            if not np.all(np.isfinite(leaf)):
+                raise store.ArtefactError(f"{file}: weights {name} are not finite")
+        law = None
+        if model.along_path:
+            # What is left without the law are the weights, compared name by name.
+            names = [name for name in arrays if name.startswith(f"{LAW}/")]
+            law = law_from_arrays(
+                {name.removeprefix(f"{LAW}/"): arrays.pop(name) for name in names}
+            )
+    return TrainedModel(
+        model=model,
+        params=_weights(file, arrays, shapes),
+        vehicle=vehicle,
+        law=law,
+        settings=settings,
+        weights_sha256=manifest["sha256"],
+        sha256=manifest["content_sha256"],
+    )
 
 
 def load(
@@ -158,22 +164,17 @@ def load(
         ValueError: `controller` does not fit the policy, or an estimate is asked of a
             policy that is not in path coordinates.
     """
-    trained = restore(path)
-    file = _file(path)
+    trained, file = restore(path), _file(path)
     certificate, reason = read_certificate(path, trained)
-    settings: dict[str, Any] = trained.settings | {
-        "environment": trained.settings["environment"] | {"source": env_source}
-    }
     # A ValueError is about the file, unless the caller asked for something else.
-    errors: tuple[type[Exception], ...] = (ValueError,)
-    if controller is not None or env_source != "measured" or adaptive:
-        errors = ()
-    if controller is not None:
-        settings |= {"controller": dict(controller)}
-    with store.as_artefact_error(file, *errors, advice=_advice(trained.version)):
-        options, box = settings["controller"], settings["environment"]
+    asked = controller is not None or env_source != "measured" or adaptive
+    with store.as_artefact_error(file, *(() if asked else (ValueError,))):
+        box = trained.settings["environment"] | {"source": env_source}
+        settings = {**trained.settings, "environment": box}
+        if controller is not None:
+            settings["controller"] = dict(controller)
         planner = build.build_controller(
-            options,
+            settings["controller"],
             trained.model,
             trained.vehicle,
             env_low=box["low"],
@@ -188,8 +189,11 @@ def load(
     # A certificate speaks of float32; accelerators would multiply with ten bits.
     with jax.default_matmul_precision("float32"):
         params = jax.jit(fold, static_argnums=0)(trained.model, trained.params)
-    planner = planner._replace(act=_in_float32(planner.act))
-    return Policy(trained.model, params, planner, certificate, settings, trained.law)
+    return Policy(
+        **vars(trained) | {"params": params, "settings": settings},
+        controller=planner._replace(act=_in_float32(planner.act)),
+        certificate=certificate,
+    )
 
 
 def _in_float32(act: Callable[..., Any]) -> Callable[..., Any]:
@@ -260,51 +264,33 @@ def _file(path: str | Path) -> Path:
     return Path(path) if named else Path(path) / "policy.safetensors"
 
 
-def _advice(version: str) -> str:
-    return f"saved by sfkd_jax {version}: train again"
+def _advice(manifest: Values) -> str:
+    """What to do about a file that this version does not understand."""
+    return f"saved by sfkd_jax {manifest['versions'].get('sfkd_jax')}: train again"
 
 
-def _law(file: Path, arrays: Mapping[str, np.ndarray]) -> PathLaw:
-    """Return the law that arrays hold, or raise an ArtefactError."""
-    if not arrays:
-        raise store.ArtefactError(f"{file}: lacks the law that its model needs")
-    if not all(np.all(np.isfinite(leaf)) for leaf in arrays.values()):
-        raise store.ArtefactError(f"{file}: the law's arrays are not finite")
-    with store.as_artefact_error(file, ValueError):
-        return law_from_arrays(
-            {name.removeprefix(f"{LAW}/"): leaf for name, leaf in arrays.items()}
-        )
-
-
-def _weights(file: Path, arrays: Mapping[str, np.ndarray], model: Model) -> Params:
-    """Return arrays as the parameters of a model, or raise an ArtefactError."""
-    with store.as_artefact_error(file, ValueError):
-        # Settings of a wrong type fail only here.
-        shapes = jax.eval_shape(model.init, jax.random.key(0))
-    expected = _by_path(shapes)
+def _weights(file: Path, arrays: Mapping[str, np.ndarray], shapes: Any) -> Params:
+    """Return arrays as parameters of these shapes, or raise an ArtefactError."""
+    needed = _by_path(shapes)
+    held, fit = (
+        {name: f"{leaf.dtype}{list(leaf.shape)}" for name, leaf in leaves.items()}
+        for leaves in (arrays, needed)
+    )
     # Both ways: a weight too many is another model as well.
-    if wrong := sorted(expected.keys() ^ arrays.keys()):
-        verb = "lacks" if wrong[0] in expected else "holds"
+    if wrong := sorted(held.items() ^ fit.items()):
+        name, _ = wrong[0]
+        found, wanted = held.get(name, "missing"), fit.get(name, "none")
         raise store.ArtefactError(
-            f"{file}: {verb} weights {wrong[0]}, which does not fit the model"
+            f"{file}: weights {name} are {found}, the model has {wanted}"
         )
-    for name, leaf in arrays.items():
-        if (leaf.shape, leaf.dtype) != (expected[name].shape, expected[name].dtype):
-            wanted = f"{expected[name].dtype}{list(expected[name].shape)}"
-            raise store.ArtefactError(
-                f"{file}: weights {name} are {leaf.dtype}{list(leaf.shape)}, "
-                f"not {wanted}"
-            )
-        if not np.all(np.isfinite(leaf)):
-            raise store.ArtefactError(f"{file}: weights {name} are not finite")
     # In the order of the tree, whatever that of the file is.
-    leaves = [jnp.asarray(arrays[name]) for name in expected]
+    leaves = [jnp.asarray(arrays[name]) for name in needed]
     return jax.tree.unflatten(jax.tree.structure(shapes), leaves)
 
 
 def _by_path(tree: Any) -> dict[str, Any]:
     """Return the leaves by path, "a/b/c", in the order of the tree."""
+    name = partial(jax.tree_util.keystr, simple=True, separator="/")
     return {
-        "/".join(str(getattr(key, "key", key)) for key in path): leaf
-        for path, leaf in jax.tree_util.tree_flatten_with_path(tree)[0]
+        name(path): leaf for path, leaf in jax.tree_util.tree_leaves_with_path(tree)
     }

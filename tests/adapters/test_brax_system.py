@@ -121,5 +121,5 @@ def test_what_is_no_such_system_is_refused_in_one_line(
 
 def test_a_box_of_another_length_is_refused(key):
     box = {"env_low": (0.5,), "env_high": (1.0, 1.0, 1.0)}
-    with pytest.raises(ValueError, match="env_low must have an entry for each of grav"):
+    with pytest.raises(ValueError, match="must have an entry for each of gravity, da"):
         adapters.collect(plant(), key, trajectories=1, steps=2, **box)

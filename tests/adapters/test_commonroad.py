@@ -165,15 +165,6 @@ def test_a_wheel_that_locks_under_the_brakes_turns_again_without_them(model):
     assert np.abs(released[wheels]).max() < 0.05 * rolling
 
 
-def test_an_observation_is_that_of_the_plants_of_this_project():
-    state = moving("mb", speed=4.0, v_y=3.0, yaw=0.2)
-    observed = adapters.commonroad_observation
-    np.testing.assert_allclose(observed(state), [0, 0, 0.2, 4, 3, 0, 0], atol=1e-6)
-    np.testing.assert_allclose(observed(state, states=4), [0, 0, 0.2, 5], atol=1e-6)
-    with pytest.raises(ValueError, match="states must be 7, as of the dynamic vehicle"):
-        observed(jnp.zeros(9), states=5)
-
-
 @both
 def test_a_controller_for_our_plant_keeps_such_a_car_in_its_lane(model):
     """The law that plans are sampled around, over 5 s of a path of the benchmark, on a

@@ -43,7 +43,7 @@ def test_the_same_seed_is_the_same_episode_and_another_is_not(made):
 
 def test_it_drives_what_the_task_says(made):
     observations, taken = episode(made, 11)
-    task = adapters.tracking_task(**SETTINGS)
+    task = adapters.DrivingTask(**SETTINGS)
     key = jax.random.key(int(gymnasium.utils.seeding.np_random(11)[0].integers(2**31)))
     road, moment = jit(task.reset)(key)
     step = jit(

@@ -10,7 +10,6 @@ from typing import TYPE_CHECKING, Any
 from sfkd_jax.adapters._task import DrivingTask as DrivingTask
 from sfkd_jax.adapters._task import Moment as Moment
 from sfkd_jax.adapters._task import Transition as Transition
-from sfkd_jax.adapters._task import tracking_task as tracking_task
 
 if TYPE_CHECKING:
     from sfkd_jax.adapters._brax import BraxPlant as BraxPlant
@@ -21,41 +20,36 @@ if TYPE_CHECKING:
     from sfkd_jax.adapters._commonroad import (
         commonroad_controller as commonroad_controller,
     )
-    from sfkd_jax.adapters._commonroad import (
-        commonroad_observation as commonroad_observation,
-    )
     from sfkd_jax.adapters._commonroad import commonroad_vehicle as commonroad_vehicle
     from sfkd_jax.adapters._gymnasium import GymnasiumVehicle as GymnasiumVehicle
     from sfkd_jax.adapters._gymnasium import register_gymnasium as register_gymnasium
 
-_EXTRAS = {"_brax": "brax", "_commonroad": "plants", "_gymnasium": "gym"}
 _LAZY = {
-    "BraxVehicle": "_brax",
-    "register_brax": "_brax",
-    "BraxPlant": "_brax",
-    "brax_plant": "_brax",
-    "collect": "_brax",
-    "commonroad_controller": "_commonroad",
-    "commonroad_observation": "_commonroad",
-    "commonroad_vehicle": "_commonroad",
-    "GymnasiumVehicle": "_gymnasium",
-    "register_gymnasium": "_gymnasium",
+    ("_brax", "brax"): (
+        "BraxPlant",
+        "BraxVehicle",
+        "brax_plant",
+        "collect",
+        "register_brax",
+    ),
+    ("_commonroad", "plants"): ("commonroad_controller", "commonroad_vehicle"),
+    ("_gymnasium", "gym"): ("GymnasiumVehicle", "register_gymnasium"),
 }
-"""Public name -> its file; and file -> the extra that installs what it imports."""
+"""File and the extra that installs what it imports -> its public names."""
 
 
 def __getattr__(name: str) -> Any:
     """Import an adapter on first use; without its package, name the extra."""
     # Lazy: without brax the gymnasium adapter works, and the other way round.
-    if name not in _LAZY:
-        raise AttributeError(f"module 'sfkd_jax.adapters' has no attribute {name!r}")
-    file = _LAZY[name]
-    try:
-        module = import_module(f"sfkd_jax.adapters.{file}")
-    except ModuleNotFoundError as missing:
-        package = str(missing.name).partition(".")[0]
-        command = f'pip install "sfkd-jax[{_EXTRAS[file]}]"'
-        raise ImportError(
-            f"sfkd_jax.adapters.{name} needs {package}: {command}"
-        ) from missing
-    return getattr(module, name)
+    for (file, extra), names in _LAZY.items():
+        if name not in names:
+            continue
+        try:
+            return getattr(import_module(f"sfkd_jax.adapters.{file}"), name)
+        except ModuleNotFoundError as missing:
+            package = str(missing.name).partition(".")[0]
+            raise ImportError(
+                f"sfkd_jax.adapters.{name} needs {package}: "
+                f'pip install "sfkd-jax[{extra}]"'
+            ) from missing
+    raise AttributeError(f"module 'sfkd_jax.adapters' has no attribute {name!r}")

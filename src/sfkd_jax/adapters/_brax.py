@@ -14,7 +14,7 @@ from brax.envs.base import State as BraxState
 from brax.generalized import pipeline
 from jaxtyping import Array, Float
 
-from sfkd_jax.adapters._task import MEASURES, tracking_task
+from sfkd_jax.adapters._task import MEASURES, DrivingTask
 from sfkd_jax.types import (
     BODY,
     Control,
@@ -43,9 +43,9 @@ def register_brax(name: str = NAME) -> None:
 
 
 class BraxVehicle(Env):
-    """Path following as `brax.envs.Env`, with the settings of `tracking_task`.
+    """Path following as `brax.envs.Env`, with the settings of `DrivingTask`.
 
-    Observation, action and reward are those of `tracking_task`. Every `reset` draws a
+    Observation, action and reward are those of `DrivingTask`. Every `reset` draws a
     new road and puts it into `info["road"]`; the automatic reset of brax, which
     restores the first state of an episode, therefore repeats the road. `done` is 1 if
     the car left the lane or the road ended; `info["time_out"]` is 1 in the second case
@@ -55,11 +55,11 @@ class BraxVehicle(Env):
         task: the pure functions behind the environment.
 
     Raises:
-        ValueError: as `tracking_task`.
+        ValueError: as `DrivingTask`.
     """
 
     def __init__(self, **settings: Any) -> None:
-        self.task = tracking_task(**settings)
+        self.task = DrivingTask(**settings)
 
     def reset(self, rng: jax.Array) -> BraxState:
         """Start an episode on a new road; `rng` is a typed key or two integers."""
@@ -171,41 +171,40 @@ def brax_plant(env: Env, *, parameters: tuple[str, ...] = ("gravity",)) -> BraxP
     frames = round(float(inner.dt) / float(system.opt.timestep))
 
     def step(state: State, control: Control, env: Environment) -> State:
-        factors = {
-            field: factor
-            for name, factor in zip(parameters, env, strict=True)
-            for field in SCALED[name]
-        }
         # The same system with scaled fields; nothing is compiled anew for another e.
         changed: Any = system.tree_replace(
-            {f: factor * attrgetter(f)(system) for f, factor in factors.items()}
+            {
+                field: factor * attrgetter(field)(system)
+                for name, factor in zip(parameters, env, strict=True)
+                for field in SCALED[name]
+            }
         )
-        body = state[BODY]
-        moment = pipeline.init(changed, body[:coordinates], body[coordinates:])
-
-        def frame(moment: Any, _: None) -> tuple[Any, None]:
-            return pipeline.step(changed, moment, control), None
-
-        moment, _ = jax.lax.scan(frame, moment, None, length=frames)
+        q, qd = jnp.split(state[BODY], [coordinates])
+        moment, _ = jax.lax.scan(
+            lambda moment, _: (pipeline.step(changed, moment, control), None),
+            pipeline.init(changed, q, qd),
+            length=frames,
+        )
         return _state(moment)
 
-    def start(key: Key) -> State:
-        return _state(inner.reset(key).pipeline_state)
-
-    limits = jnp.asarray(system.actuator.ctrl_range).T.tolist()
+    low, high = system.actuator.ctrl_range.T.tolist()
     # The pose stays first, where every model expects it.
-    names = [f"q_{k}" for k in range(coordinates)] + [
-        f"qd_{k}" for k in range(system.qd_size())
-    ]
+    names = [f"q_{k}" for k in range(coordinates)]
+    names += [f"qd_{k}" for k in range(system.qd_size())]
     return BraxPlant(
         dt=float(inner.dt),
         state_names=("p_x", "p_y", "yaw", *names),
-        control_low=tuple(limits[0]),
-        control_high=tuple(limits[1]),
+        control_low=tuple(low),
+        control_high=tuple(high),
         parameters=parameters,
         step=step,
-        start=start,
+        start=lambda key: _state(inner.reset(key).pipeline_state),
     )
+
+
+def _state(moment: Any) -> State:
+    """(0, 0, 0, q, q̇) of a state of brax."""
+    return jnp.concatenate([jnp.zeros(3), moment.q, moment.qd])
 
 
 def collect(
@@ -240,20 +239,18 @@ def collect(
     Raises:
         ValueError: a box whose corners do not have one entry per parameter.
     """
-    for name, corner in (("env_low", env_low), ("env_high", env_high)):
-        if len(corner) != len(plant.parameters):
-            raise ValueError(
-                f"{name} must have an entry for each of "
-                f"{', '.join(plant.parameters)}, got {corner}"
-            )
+    if not len(env_low) == len(env_high) == len(plant.parameters):
+        raise ValueError(
+            "env_low and env_high must have an entry for each of "
+            f"{', '.join(plant.parameters)}, got {env_low} and {env_high}"
+        )
     low, high = jnp.asarray(plant.control_low), jnp.asarray(plant.control_high)
 
     def one(key: Key) -> Trajectory:
         start_key, env_key, noise_key = jax.random.split(key, 3)
         corners = jnp.asarray(env_low), jnp.asarray(env_high)
         env = jax.random.uniform(env_key, (len(env_low),), float, *corners)
-        # White noise through a low pass: motors are pushed for longer than a step.
-        fresh = excitation * jax.random.normal(noise_key, (steps, low.shape[0]))
+        white = excitation * jax.random.normal(noise_key, (steps, low.shape[0]))
 
         def advance(
             carry: tuple[State, Array], white: Float[Array, " control"]
@@ -262,19 +259,14 @@ def collect(
             wanted = 0.5 * (low + high) + 0.5 * (high - low) * noise
             control = jnp.clip(wanted, low, high)
             after = plant.step(state, control, env)
+            # White noise through a low pass: motors are pushed for longer than a step.
             noise = memory * noise + jnp.sqrt(1.0 - memory**2) * white
             return (after, noise), (after, control)
 
         initial = plant.start(start_key)
-        _, (states, controls) = jax.lax.scan(
-            advance, (initial, fresh[0]), jnp.roll(fresh, -1, axis=0)
-        )
+        carry, inputs = (initial, white[0]), jnp.roll(white, -1, axis=0)
+        _, (states, controls) = jax.lax.scan(advance, carry, inputs)
         states = jnp.concatenate([initial[None], states])
         return Trajectory(states, controls, jnp.tile(env, (steps, 1)))
 
     return jax.vmap(one)(jax.random.split(key, trajectories))
-
-
-def _state(moment: Any) -> State:
-    """(0, 0, 0, q, q̇) of a state of brax."""
-    return jnp.concatenate([jnp.zeros(3), moment.q, moment.qd])

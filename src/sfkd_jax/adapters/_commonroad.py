@@ -10,7 +10,6 @@ from typing import Any, NamedTuple, TypeAlias
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float
 from scipy.integrate import solve_ivp
 from vehiclemodels.init_mb import init_mb
 from vehiclemodels.init_std import init_std
@@ -34,7 +33,6 @@ OBSERVED = 7
 Numbers: TypeAlias = Sequence[float]
 Car: TypeAlias = Any
 """CommonRoad's VehicleParameters, whose fields are all declared optional."""
-HostStep: TypeAlias = Callable[[Numbers, Numbers, Numbers], list[float]]
 
 
 class Equations(NamedTuple):
@@ -44,39 +42,38 @@ class Equations(NamedTuple):
         rates: (x, (steering rate, acceleration), car) -> dx/dt.
         settled: ((p_x, p_y, δ, |v|, yaw, yaw rate, slip angle), car) -> x with rolling
             wheels and springs at rest.
-        seven: x -> the states of `plants.dynamic`.
-        rest: indices of the other entries of x.
+        velocity: x -> (v, v_y).
+        hidden: indices of the entries of x that are no state of `plants.dynamic`.
         wheels: indices of wheel speeds.
-        force_rates: (x, side force [N], car) -> what a force at the centre of mass adds
-            to dx/dt, by index.
+        push: (x, side force [N], car) -> what a force at the centre of mass adds to
+            dx/dt, by index.
     """
 
     rates: Callable[[list[float], list[float], Car], list[float]]
     settled: Callable[[list[float], Car], list[float]]
-    seven: Callable[[Numbers], list[float]]
-    rest: tuple[int, ...]
+    velocity: Callable[[Numbers], tuple[float, float]]
+    hidden: tuple[int, ...]
     wheels: tuple[int, ...]
-    force_rates: Callable[[Numbers, float, Car], dict[int, float]]
-
-
-def _drift_seven(x: Numbers) -> list[float]:
-    return [x[0], x[1], x[4], x[3] * math.cos(x[6]), x[3] * math.sin(x[6]), x[5], x[2]]
-
-
-def _drift_force_rates(x: Numbers, force: float, car: Car) -> dict[int, float]:
-    """m d|v|/dt has F sin β, m |v| dβ/dt has F cos β."""
-    across = force / (car.m * x[3]) * math.cos(x[6])
-    return {3: force / car.m * math.sin(x[6]), 6: across}
+    push: Callable[[Numbers, float, Car], dict[int, float]]
 
 
 MODELS = {
     "std": Equations(
-        vehicle_dynamics_std, init_std, _drift_seven, (7, 8), (7, 8), _drift_force_rates
+        vehicle_dynamics_std,
+        init_std,
+        lambda x: (x[3] * math.cos(x[6]), x[3] * math.sin(x[6])),
+        (7, 8),
+        (7, 8),
+        # m d|v|/dt has F sin β, m |v| dβ/dt has F cos β.
+        lambda x, force, car: {
+            3: force / car.m * math.sin(x[6]),
+            6: force / (car.m * x[3]) * math.cos(x[6]),
+        },
     ),
     "mb": Equations(
         vehicle_dynamics_mb,
         init_mb,
-        lambda x: [x[index] for index in (0, 1, 4, 3, 10, 5, 2)],
+        lambda x: (x[3], x[10]),
         (*range(6, 10), *range(11, 29)),
         (23, 24, 25, 26),
         # On the sprung mass; the axles follow through their joints.
@@ -141,55 +138,56 @@ def commonroad_vehicle(
     bicycle = dynamic(
         dt=dt, wind_force=wind_force, front_length=dry.a, rear_length=dry.b
     )
+    hidden = (f"hidden_{index}" for index in host.equations.hidden)
     return bicycle._replace(
         name=f"commonroad_{model}",
-        state_names=(
-            *bicycle.state_names,
-            *(f"hidden_{index}" for index in host.equations.rest),
-        ),
+        state_names=(*bicycle.state_names, *hidden),
         step=_on_host(host.step),
         derivative=_on_host(host.derivative),
-        nominal=_settled(bicycle.nominal),
-        nominal_derivative=_settled(bicycle.nominal_derivative),
+        nominal=_seven(bicycle.nominal),
+        nominal_derivative=_seven(bicycle.nominal_derivative),
     )
+
+
+def commonroad_controller(controller: Controller) -> Controller:
+    """Return a controller of `plants.dynamic`, 7 states, for such a car."""
+
+    def act(params: Any, memory: Any, state: State, *rest: Any) -> Any:
+        return controller.act(params, memory, state[..., :OBSERVED], *rest)
+
+    return controller._replace(act=act)
 
 
 @dataclass(frozen=True)
 class _HostCar:
-    """A car whose equations run on the host.
+    """A car whose equations run on the host; fields as of `commonroad_vehicle`.
 
     Attributes:
         equations: of CommonRoad.
-        car: parameters on a dry road.
-        dt: sampling period [s].
-        steering_lag: [s].
-        wind_force: c_w [N s²/m²].
-        wind_lever: l_w [m].
+        dry: parameters on a dry road.
     """
 
     equations: Equations
-    car: Car
+    dry: Car
     dt: float
     steering_lag: float
     wind_force: float
     wind_lever: float
 
-    def flow(
-        self, control: Numbers, env: Numbers
-    ) -> Callable[[np.ndarray], list[float]]:
+    def flow(self, control: Numbers, env: Numbers) -> Callable[[Any], list[float]]:
         """Return x -> dx/dt in CommonRoad's coordinates."""
-        tire = self.car.tire
+        equations, tire = self.equations, self.dry.tire
         # Friction limits the forces of the tyres, at the same stiffness.
         p_dx1 = tire.p_dx1 * env[0] / tire.p_dy1
-        car = replace(self.car, tire=replace(tire, p_dy1=env[0], p_dx1=p_dx1))
+        car = replace(self.dry, tire=replace(tire, p_dy1=env[0], p_dx1=p_dx1))
         force = self.wind_force * env[1] * abs(env[1])
 
         def rates(moment: np.ndarray) -> list[float]:
             x = moment.tolist()
             inputs = [(control[0] - x[2]) / self.steering_lag, control[1]]
             # A copy: CommonRoad stops locked wheels in the list that it is given.
-            result = self.equations.rates(list(x), inputs, car)
-            for index, change in self.equations.force_rates(x, force, car).items():
+            result = equations.rates(list(x), inputs, car)
+            for index, change in equations.push(x, force, car).items():
                 result[index] += change
             result[5] += self.wind_lever * force / car.I_z
             return [float(change) for change in result]
@@ -202,11 +200,11 @@ class _HostCar:
         if not (all(map(math.isfinite, state)) and state[3] > SLOWEST):
             return lost
         # In double precision: a wheel settles a hundred times faster than dt.
-        flow = self.flow(control, env)
+        flow, velocity = self.flow(control, env), self.equations.velocity
 
         def too_slow(time: float, x: Any) -> float:
             del time
-            return self.equations.seven(x.tolist())[3] - SLOWEST
+            return velocity(x)[0] - SLOWEST
 
         too_slow.terminal = True  # type: ignore[attr-defined]
         try:
@@ -227,20 +225,16 @@ class _HostCar:
         """Return dx/dt by a central difference along the flow."""
         x = self.to_commonroad(state)
         little = 1e-6 * np.asarray(self.flow(control, env)(x))
-        ahead, behind = (
-            np.asarray(self.from_commonroad(y)) for y in (x + little, x - little)
-        )
-        return ((ahead - behind) / 2e-6).tolist()
+        ahead, behind = map(self.from_commonroad, (x + little, x - little))
+        return ((np.asarray(ahead) - np.asarray(behind)) / 2e-6).tolist()
 
     def to_commonroad(self, state: Numbers) -> np.ndarray:
-        """Return CommonRoad's x of a state; hidden states are added to the settled x.
-
-        CommonRoad leaves a locked wheel with a speed just below 0, from which it never
-        turns again; here the speed becomes 0.
-        """
-        x = self._settled(state)
-        for index, hidden in zip(self.equations.rest, state[OBSERVED:], strict=True):
+        """Return CommonRoad's x, the settled one plus the hidden part of the state."""
+        x = self.settled(state)
+        for index, hidden in zip(self.equations.hidden, state[OBSERVED:], strict=True):
             x[index] += hidden
+        # CommonRoad leaves a locked wheel with a speed just below 0, from which it
+        # never turns again.
         for index in self.equations.wheels:
             x[index] = max(x[index], 0.0)
         return np.asarray(x)
@@ -248,67 +242,25 @@ class _HostCar:
     def from_commonroad(self, moment: np.ndarray) -> list[float]:
         """Return the state of CommonRoad's x."""
         x = moment.tolist()
-        seven = self.equations.seven(x)
-        settled = self._settled(seven)
-        return [*seven, *(x[k] - settled[k] for k in self.equations.rest)]
+        seven = [x[0], x[1], x[4], *self.equations.velocity(x), x[5], x[2]]
+        settled = self.settled(seven)
+        return [*seven, *(x[k] - settled[k] for k in self.equations.hidden)]
 
-    def _settled(self, state: Numbers) -> list[float]:
+    def settled(self, state: Numbers) -> list[float]:
         """CommonRoad's x of the first seven states, with all others at rest."""
         x, y, yaw, along, across, yaw_rate, steering = state[:OBSERVED]
         speed, slip = math.hypot(along, across), math.atan2(across, along)
         core = [x, y, steering, speed, yaw, yaw_rate, slip]
         # CommonRoad writes some of them as integers.
-        return list(map(float, self.equations.settled(core, self.car)))
+        return list(map(float, self.equations.settled(core, self.dry)))
 
 
-def commonroad_observation(
-    state: Float[Array, "*batch state"], *, states: int = OBSERVED
-) -> Float[Array, "*batch observed"]:
-    """Return the states that a model of `dynamic` (7) or `kinematic` (4) has.
-
-    The speed of `kinematic` is that along the course, √(v² + v_y²).
-
-    Args:
-        state: of `commonroad_vehicle`.
-        states: 7 or 4.
-
-    Raises:
-        ValueError: another number of states.
-    """
-    if states == OBSERVED:
-        return state[..., :OBSERVED]
-    if states != 4:
-        raise ValueError(
-            "states must be 7, as of the dynamic vehicle, or 4, as of the kinematic "
-            f"one, got {states}"
-        )
-    return jnp.concatenate(
-        [state[..., :3], jnp.linalg.norm(state[..., 3:5], axis=-1, keepdims=True)],
-        axis=-1,
-    )
-
-
-def commonroad_controller(
-    controller: Controller, *, states: int = OBSERVED
-) -> Controller:
-    """Return a controller of `dynamic` (7 states) or `kinematic` (4) for such a car."""
-
-    def act(params: Any, memory: Any, state: State, *rest: Any) -> Any:
-        return controller.act(
-            params, memory, commonroad_observation(state, states=states), *rest
-        )
-
-    return controller._replace(act=act)
-
-
-def _on_host(function: HostStep) -> Step:
+def _on_host(function: Callable[[Numbers, Numbers, Numbers], list[float]]) -> Step:
     """A function of lists as a step of arrays."""
 
     def call(*inputs: Any) -> np.ndarray:
-        return np.asarray(
-            function(*(np.asarray(each).tolist() for each in inputs)),
-            dtype=inputs[0].dtype,
-        )
+        lists = (np.asarray(each).tolist() for each in inputs)
+        return np.asarray(function(*lists), dtype=inputs[0].dtype)
 
     def step(state: State, control: Control, env: Environment) -> State:
         # One car after the other: the equations take lists of numbers.
@@ -320,14 +272,11 @@ def _on_host(function: HostStep) -> Step:
     return step
 
 
-def _settled(step: Step) -> Step:
+def _seven(step: Step) -> Step:
     """A step of the first seven states; hidden ones stay at 0."""
 
     def wider(state: State, control: Control, env: Environment) -> State:
-        return (
-            jnp.zeros_like(state)
-            .at[:OBSERVED]
-            .set(step(state[:OBSERVED], control, env))
-        )
+        after = step(state[:OBSERVED], control, env)
+        return jnp.zeros_like(state).at[:OBSERVED].set(after)
 
     return wider

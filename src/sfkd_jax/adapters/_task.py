@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from functools import cached_property
 from typing import NamedTuple
 
 import jax
@@ -63,29 +64,70 @@ class Transition(NamedTuple):
     measures: dict[str, Scalar]
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, kw_only=True, eq=False)
 class DrivingTask:
-    """Path following for one car, made by `tracking_task`; callers vmap.
+    """ℓ = q_y e_y² + q_v e_v² + q_δ̇ (Δδ / dt)², plus the cost of leaving, once.
 
-    The fields are the arguments of that function.
+    Pure functions for one car; callers vmap. Every `reset` draws a new road, friction
+    and wind. The observation is, in this order, n = state size:
+
+        e_y [m], e_ψ [rad]        distance left of the path, yaw relative to it        2
+        s                         body state, e.g. v [m/s]                         n − 3
+        a                         last action, in [-1, 1]                              2
+        e                         observed friction [-] and side wind [m/s]            2
+        (x, y, ψ, v) × preview    the next points of the path in the car's
+                                  frame, one per sampling period at the speed
+                                  to hold                                    4 · preview
+
+    An action lies in [-1, 1] and is clipped to it; u = u_low + (u_high − u_low)(a +
+    1)/2.
+
+    Attributes:
+        vehicle: "kinematic", "dynamic", or a plant.
+        scenario: "s1", "s2", "s3", …, or a family for this plant.
+        inner_loop: "none" or "speed", for a vehicle given by name.
+        duration: of a road [s].
+        preview: number of points ahead.
+        lane: half width; farther from the path the car has left it [m].
+        lateral: q_y [1/m²], as the planner has it.
+        speed: q_v [s²/m²].
+        steering_rate: q_δ̇ [s²/rad²].
+        leaving: charged once [-]; standing still costs half of it at 10 m/s and a
+            discount of 0.99.
+
+    Raises:
+        ValueError: an unknown name, a size, width or duration that is not positive, a
+            negative weight, or a family that is for another plant.
     """
 
-    plant: Vehicle
-    family: Family
-    preview: int
-    lane: float
-    lateral: float
-    speed: float
-    steering_rate: float
-    leaving: float
+    vehicle: str | Vehicle = "kinematic"
+    scenario: str | Family = "s1"
+    inner_loop: str = "none"
+    duration: float = 60.0
+    preview: int = 10
+    lane: float = 3.0
+    lateral: float = 200.0
+    speed: float = 1.0
+    steering_rate: float = 5.0
+    leaving: float = 2e4
 
-    @property
-    def steps(self) -> int:
-        """Steps of an episode, at most; from shapes alone.
-
-        Raises:
-            ValueError: the family is for another plant.
-        """
+    def __post_init__(self) -> None:
+        """Check the settings, and that scenario and plant fit."""
+        for name in ("lateral", "speed", "steering_rate", "leaving"):
+            if not (math.isfinite(weight := getattr(self, name)) and weight >= 0):
+                raise ValueError(f"{name} must be finite and at least 0, got {weight}")
+        dt = self.plant.dt
+        if not (math.isfinite(self.duration) and self.duration >= dt):
+            raise ValueError(
+                f"duration must be finite and at least one step of {dt} s, "
+                f"got {self.duration}"
+            )
+        if self.preview < 1 or self.preview != int(self.preview):
+            raise ValueError(
+                f"preview must be a whole number of at least 1, got {self.preview}"
+            )
+        if not self.lane > 0:
+            raise ValueError(f"lane must be positive, got {self.lane}")
         road = jax.eval_shape(self.family, jax.random.key(0))
         given, wanted = road.initial_state.shape, (len(self.plant.state_names),)
         if given != wanted:
@@ -93,7 +135,23 @@ class DrivingTask:
                 f"the scenario starts in a state of shape {given}, "
                 f"{self.plant.name!r} has {wanted}"
             )
-        return road.envs.shape[0]
+
+    @cached_property
+    def plant(self) -> Vehicle:
+        """The simulated car."""
+        if isinstance(self.vehicle, Vehicle):
+            return self.vehicle
+        return build.build_vehicle(
+            {"name": self.vehicle, "inner_loop": self.inner_loop, "speed_gain": 1.0}
+        )
+
+    @cached_property
+    def family(self) -> Family:
+        """A key -> a road with its schedule of friction and wind."""
+        if not isinstance(self.scenario, str):
+            return self.scenario
+        named = {"name": self.scenario}
+        return build.build_scenario(named, self.plant, duration=self.duration)
 
     @property
     def action_size(self) -> int:
@@ -101,24 +159,21 @@ class DrivingTask:
         return len(self.plant.control_low)
 
     @property
-    def observation_high(self) -> tuple[float, ...]:
-        """Largest observation: of angles and actions, else ∞."""
+    def observation_bounds(self) -> tuple[list[float], list[float]]:
+        """Smallest and largest observation."""
         inf, body = math.inf, len(self.plant.state_names) - 3
         # Angles are wrapped and actions clipped; nothing else has a limit.
-        errors, points = (inf, math.pi), (inf, inf, math.pi, inf) * self.preview
-        return (*errors, *[inf] * body, *[1.0] * self.action_size, inf, inf, *points)
-
-    @property
-    def observation_low(self) -> tuple[float, ...]:
-        """Smallest observation; only friction is not symmetric about 0."""
-        low = [-value for value in self.observation_high]
-        low[2 + len(self.plant.state_names) - 3 + self.action_size] = 0.0
-        return tuple(low)
+        errors, points = [inf, math.pi], [inf, inf, math.pi, inf] * self.preview
+        high = [*errors, *[inf] * body, *[1.0] * self.action_size, inf, inf, *points]
+        low = [-value for value in high]
+        # Only friction is not symmetric about 0.
+        low[-len(points) - 2] = 0.0
+        return low, high
 
     @property
     def observation_size(self) -> int:
         """Entries of an observation."""
-        return len(self.observation_high)
+        return len(self.observation_bounds[0])
 
     def control(self, action: Control) -> Control:
         """Return an action in [-1, 1] in physical units, clipped to the limits."""
@@ -194,7 +249,7 @@ class DrivingTask:
         return moment.state, _at(road.observed_envs, moment), reference
 
     def observe(self, road: Scenario, moment: Moment) -> Float[Array, " observation"]:
-        """Return the observation, as `tracking_task` describes it."""
+        """Return the observation, in the order that the class lists."""
         state, env, reference = self.situation(road, moment)
         # In the frame of the car: a policy need not know where it is in the world.
         ahead = jax.vmap(between, in_axes=(None, 0))(state[POSE], reference[:, :3])
@@ -202,77 +257,6 @@ class DrivingTask:
         errors = jnp.stack([moment.lateral, _heading(road, moment)])
         action = self.action(moment.control)
         return jnp.concatenate([errors, state[BODY], action, env, points])
-
-
-def tracking_task(
-    *,
-    vehicle: str | Vehicle = "kinematic",
-    scenario: str | Family = "s1",
-    inner_loop: str = "none",
-    duration: float = 60.0,
-    preview: int = 10,
-    lane: float = 3.0,
-    lateral: float = 200.0,
-    speed: float = 1.0,
-    steering_rate: float = 5.0,
-    leaving: float = 2e4,
-) -> DrivingTask:
-    """ℓ = q_y e_y² + q_v e_v² + q_δ̇ (Δδ / dt)², plus the cost of leaving, once.
-
-    Every `reset` draws a new road, friction and wind. The observation is, in this
-    order, n = state size:
-
-        e_y [m], e_ψ [rad]        distance left of the path, yaw relative to it        2
-        s                         body state, e.g. v [m/s]                         n − 3
-        a                         last action, in [-1, 1]                              2
-        e                         observed friction [-] and side wind [m/s]            2
-        (x, y, ψ, v) × preview    the next points of the path in the car's
-                                  frame, one per sampling period at the speed
-                                  to hold                                    4 · preview
-
-    An action lies in [-1, 1] and is clipped to it; u = u_low + (u_high − u_low)(a +
-    1)/2.
-
-    Args:
-        vehicle: "kinematic", "dynamic", or a plant.
-        scenario: "s1", "s2", "s3", …, or a family for this plant.
-        inner_loop: "none" or "speed", for a vehicle given by name.
-        duration: of a road [s].
-        preview: number of points ahead.
-        lane: half width; farther from the path the car has left it [m].
-        lateral: q_y [1/m²], as the planner has it.
-        speed: q_v [s²/m²].
-        steering_rate: q_δ̇ [s²/rad²].
-        leaving: charged once [-]; standing still costs half of it at 10 m/s and a
-            discount of 0.99.
-
-    Raises:
-        ValueError: an unknown name, a size, width or duration that is not positive, or
-            a negative weight.
-    """
-    weights = (lateral, speed, steering_rate, leaving)
-    names = ("lateral", "speed", "steering_rate", "leaving")
-    for name, weight in zip(names, weights, strict=True):
-        if not (math.isfinite(weight) and weight >= 0):
-            raise ValueError(f"{name} must be finite and at least 0, got {weight}")
-    named = {"name": vehicle, "inner_loop": inner_loop, "speed_gain": 1.0}
-    own = isinstance(vehicle, Vehicle)
-    plant = vehicle if own else build.build_vehicle(named)
-    if not (math.isfinite(duration) and duration >= plant.dt):
-        raise ValueError(
-            f"duration must be finite and at least one step of {plant.dt} s, "
-            f"got {duration}"
-        )
-    if preview < 1 or preview != int(preview):
-        raise ValueError(f"preview must be a whole number of at least 1, got {preview}")
-    if not lane > 0:
-        raise ValueError(f"lane must be positive, got {lane}")
-    family = scenario
-    if isinstance(family, str):
-        family = build.build_scenario({"name": family}, plant, duration=duration)
-    task = DrivingTask(plant, family, preview, lane, *weights)
-    _ = task.steps  # refuses a family that is for another plant
-    return task
 
 
 def _at(envs: Float[Array, "time environment"], moment: Moment) -> Environment:

@@ -227,7 +227,7 @@ class ComparisonSettings:
     page: dict[str, Any] = field(default_factory=dict)
 
 
-@takes(export.write_controller, skip=("made_from",))
+@takes(export.write_controller)
 class ExportSettings:
     """Arguments of `export.write_controller`."""
 

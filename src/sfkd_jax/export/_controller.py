@@ -1,0 +1,319 @@
+"""Write a controller as programs of flat arrays: StableHLO, and IREE made from it."""
+
+from __future__ import annotations
+
+import hashlib
+from collections.abc import Callable, Sequence
+from functools import partial
+from importlib import resources
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import jax
+import jax.export
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array
+
+from sfkd_jax import build, policy, store
+from sfkd_jax.policy import Policy
+from sfkd_jax.ranges import Names
+
+FORMAT = 2
+"""Version of the manifest and of the order of arguments; run_controller.py reads no
+other version.
+"""
+PLATFORMS = ("cpu", "cuda", "rocm", "tpu")
+FILES = {"act": "controller", "init": "initial_state"}
+MANIFEST, SCRIPT = "controller.json", "run_controller.py"
+
+
+class Leaf(NamedTuple):
+    """Name, shape and dtype of an array that a program takes or returns."""
+
+    name: str
+    shape: tuple[int, ...]
+    dtype: str
+
+
+class Program(NamedTuple):
+    """A function of flat arrays, with its inputs and outputs in order."""
+
+    function: Callable[..., Sequence[Array]]
+    inputs: tuple[Leaf, ...]
+    outputs: tuple[Leaf, ...]
+
+    def lower(self, *platforms: str) -> jax.export.Exported:
+        """Return the program as StableHLO for platforms, including unused arguments."""
+        shapes = [jax.ShapeDtypeStruct(leaf.shape, leaf.dtype) for leaf in self.inputs]
+        before = getattr(jax.config, limit := "jax_traceback_in_locations_limit")
+        # Source locations contain paths of this machine, and the result would depend on
+        # it. Other threads should not trace meanwhile.
+        jax.config.update(limit, 0)
+        try:
+            function = jax.jit(self.function, keep_unused=True)
+            return jax.export.export(function, platforms=platforms)(*shapes)
+        finally:
+            jax.config.update(limit, before)
+
+
+def write_controller(
+    trained: Policy,
+    folder: Path,
+    *,
+    platforms: tuple[str, ...] = ("cpu", "cuda"),
+    iree: bool = False,
+    iree_flags: Names = ("--iree-llvmcpu-target-cpu=host",),
+) -> dict[str, Any]:
+    """Write a controller for processes without sfkd_jax, and return its manifest.
+
+    Args:
+        trained: the policy to export.
+        folder: to write; an earlier export in it is replaced.
+        platforms: that the programs are compiled for.
+        iree: whether to compile for C and C++ as well.
+        iree_flags: for iree-compile.
+
+    Raises:
+        ValueError: unknown platform, a controller that cannot be exported, or IREE
+            missing or failing.
+        ArtefactError: the folder is not writable.
+    """
+    if not platforms or not set(platforms) <= set(PLATFORMS):
+        raise ValueError(
+            f"export.platforms must be some of {', '.join(PLATFORMS)}, "
+            f"got {list(platforms)}"
+        )
+    # Everything that can refuse comes before the first file is written.
+    programs = flat_programs(trained)
+    exported = {name: one.lower(*platforms) for name, one in programs.items()}
+    modules = {
+        name: _compile_iree(program.lower("cpu").mlir_module(), iree_flags)
+        for name, program in programs.items()
+        if iree
+    }
+    # First the manifest goes: a folder half written is none.
+    for stale in (MANIFEST, policy.CERTIFICATE, *(f"{f}.vmfb" for f in FILES.values())):
+        (folder / stale).unlink(missing_ok=True)
+    # The policy too, so that `load` reads an export as it reads a run.
+    stored = policy.save(
+        folder / "policy.safetensors", trained.weights, trained.settings
+    )
+    manifest = {
+        "kind": "controller",
+        "format": FORMAT,
+        "jax": jax.__version__,
+        "calling_convention_version": exported["act"].calling_convention_version,
+        "platforms": list(platforms),
+        "key_implementation": _key_implementation(),
+        "programs": {
+            name: {
+                **_write(folder / f"{FILES[name]}.stablehlo", bytes(one.serialize())),
+                "inputs": [leaf._asdict() for leaf in programs[name].inputs],
+                "outputs": [leaf._asdict() for leaf in programs[name].outputs],
+            }
+            for name, one in exported.items()
+        },
+        "iree": {
+            name: _write(folder / f"{FILES[name]}.vmfb", module)
+            for name, module in modules.items()
+        }
+        or None,
+        "iree_flags": list(iree_flags) if iree else None,
+        "weights_sha256": stored["sha256"],
+        "certificate_sha256": _certificate(trained, folder, stored["content_sha256"]),
+        **_vehicle(trained),
+        "parameters": sum(np.size(leaf) for leaf in jax.tree.leaves(trained.weights)),
+        "settings": trained.settings,
+        "versions": store.versions(),
+    }
+    script = resources.files("sfkd_jax.export").joinpath(f"_{SCRIPT}").read_bytes()
+    store.write_bytes(folder / SCRIPT, script)
+    # Last: a folder with a manifest is whole.
+    manifest["sha256"] = store.sha256(manifest)
+    store.write_json(folder / MANIFEST, manifest)
+    return manifest
+
+
+def _write(path: Path, content: bytes) -> dict[str, Any]:
+    """Write a file and return its name, size and hash."""
+    store.write_bytes(path, content)
+    digest = hashlib.sha256(content).hexdigest()
+    return {"file": path.name, "bytes": len(content), "sha256": digest}
+
+
+def _certificate(trained: Policy, folder: Path, policy_sha256: str) -> str | None:
+    """Write the verified certificate of a policy, if any, and return the file's hash.
+
+    It refers to the settings as exported, perhaps with another controller.
+    """
+    if trained.certificate is None:
+        return None
+    path = folder / policy.CERTIFICATE
+    store.write_json(path, trained.certificate | {"policy_sha256": policy_sha256})
+    return hashlib.sha256(path.read_bytes()).hexdigest()
+
+
+def _vehicle(trained: Policy) -> dict[str, Any]:
+    """Names, units and limits of controls, observation, environment and reference."""
+    plant, box = trained.vehicle, trained.settings["environment"]
+    # With a speed loop the second control is what the loop is given.
+    second = "speed command [m/s]" if plant.speed_loop else "acceleration [m/s^2]"
+    names = ("steering [rad]", second)
+    limits = zip(names, plant.control_low, plant.control_high, strict=True)
+    return {
+        "sampling_period_s": plant.dt,
+        "horizon": build.controller_horizon(trained.settings["controller"]),
+        "controls": [
+            {"name": name, "low": low, "high": high} for name, low, high in limits
+        ],
+        "observation": list(plant.state_names),
+        "environment": {
+            "names": ["friction [-]", "lateral wind [m/s]"],
+            "low": list(box["low"]),
+            "high": list(box["high"]),
+        },
+        "reference": ["x [m]", "y [m]", "yaw [rad]", "speed [m/s]"],
+    }
+
+
+# ---- programs
+
+
+def flat_programs(trained: Policy) -> dict[str, Program]:
+    """Return the programs of a controller, with folded weights inside.
+
+        init: (key) -> state leaves
+        act: (state leaves, observation, env, reference)
+             -> (control, state leaves, info leaves)
+
+    Names are paths, such as `state.plan` and `info.cost`. Keys are passed as their
+    uint32 data.
+
+    Raises:
+        ValueError: the controller's state changes its structure, shapes or dtypes from
+            step to step.
+    """
+    init, act = trained.controller
+    key, state, *measured = _example_inputs(trained)
+    wrap = partial(jax.random.wrap_key_data, impl=_key_implementation())
+    # Flat and named: other programs know neither pytrees nor keys.
+    template, structure = jax.tree.flatten(state)
+
+    def flat_init(key_data: Array) -> tuple[Array, ...]:
+        return tuple(_unpack(init(wrap(key_data))))
+
+    def flat_act(*leaves: Array) -> tuple[Array, ...]:
+        *before, observation, env, reference = leaves
+        before = [
+            wrap(leaf) if _is_key(like) else leaf
+            for like, leaf in zip(template, before, strict=True)
+        ]
+        # Without the barrier XLA evaluates functions of the weights at compile time and
+        # rounds differently.
+        params = jax.lax.optimization_barrier(trained.params)
+        control, after, info = act(
+            params, jax.tree.unflatten(structure, before), observation, env, reference
+        )
+        return control, *_unpack(after), *jax.tree.leaves(info)
+
+    control, after, info = jax.eval_shape(act, trained.params, state, *measured)
+    states = _named("state", state)
+    # Programs have fixed shapes, so a state must come out as it went in.
+    if _named("state", after) != states or jax.tree.structure(after) != structure:
+        raise ValueError(
+            "cannot export a controller whose state changes its structure, "
+            "shapes or dtypes"
+        )
+    names = ("observation", "env", "reference")
+    inputs = (*states, *map(_leaf, names, measured))
+    outputs = (_leaf("control", control), *states, *_named("info", info))
+    return {
+        "init": Program(flat_init, (_leaf("key", key),), states),
+        "act": Program(flat_act, inputs, outputs),
+    }
+
+
+def _example_inputs(trained: Policy) -> tuple[Any, ...]:
+    """The shapes of key, controller state, observation, env and reference."""
+    key = jax.eval_shape(partial(jax.random.key, 0))
+    settings = trained.settings
+    sizes = (len(trained.vehicle.state_names),), (len(settings["space"]["env_mean"]),)
+    shapes = *sizes, (build.controller_horizon(settings["controller"]), 4)
+    measured = (jax.ShapeDtypeStruct(shape, jnp.float32) for shape in shapes)
+    return key, jax.eval_shape(trained.controller.init, key), *measured
+
+
+def _key_implementation() -> str:
+    """The name of the random generator, whose key's shape a program has."""
+    return str(jax.random.key_impl(jax.random.key(0)))
+
+
+def _is_key(leaf: Any) -> bool:
+    return jnp.issubdtype(leaf.dtype, jax.dtypes.prng_key)
+
+
+def _unpack(tree: Any) -> list[Array]:
+    """Return the leaves, with keys as their data."""
+    return [
+        jax.random.key_data(leaf) if _is_key(leaf) else leaf
+        for leaf in jax.tree.leaves(tree)
+    ]
+
+
+def _leaf(name: str, value: Any) -> Leaf:
+    """Name, shape and dtype of an array, or of the data of a key."""
+    data = jax.eval_shape(jax.random.key_data, value) if _is_key(value) else value
+    return Leaf(name, tuple(data.shape), str(data.dtype))
+
+
+def _named(root: str, tree: Any) -> tuple[Leaf, ...]:
+    """Return the leaves of a tree by dotted path."""
+    name = partial(jax.tree_util.keystr, simple=True, separator=".")
+    pairs = jax.tree_util.tree_leaves_with_path(tree)
+    return tuple(_leaf(f"{root}.{name(path)}", leaf) for path, leaf in pairs)
+
+
+def _compile_iree(stablehlo: str, flags: Sequence[str]) -> bytes:
+    """Return an IREE module (.vmfb) for CPUs, with the function `main`.
+
+    Raises:
+        ValueError: IREE is not installed, or does not compile this program, with its
+            first error. It has no LAPACK, so it refuses factorisations in a control
+            step: those of `koopman_mpc` and of ControlSynth's metric.
+    """
+    try:
+        from iree import compiler  # pyright: ignore[reportMissingImports]
+    except ImportError:
+        raise ValueError(
+            "export.iree=true needs IREE: pip install 'sfkd-jax[cpp]'"
+        ) from None
+    try:
+        return compiler.compile_str(
+            stablehlo,
+            input_type="stablehlo",
+            target_backends=["llvm-cpu"],
+            extra_args=list(flags),
+        )
+    except compiler.CompilerToolError as error:
+        message = str(error).partition("Diagnostics:\n")[2] or str(error)
+        raise ValueError(f"iree-compile failed: {store.one_line(message)}") from error
+
+
+def warm_up(trained: Policy) -> jax.stages.Compiled:
+    """Compile `act` for the shapes of a policy, so that no step waits for a compiler.
+
+        act = warm_up(policy)
+        control, state, info = act(policy.params, state, observation, env, reference)
+
+    With JAX_COMPILATION_CACHE_DIR set, later processes load the machine code.
+
+    Args:
+        trained: as `load` returns it.
+
+    Returns:
+        The compiled function, for float32 arrays of the policy's shapes only.
+    """
+    _, state, *measured = _example_inputs(trained)
+    act = jax.jit(trained.controller.act)
+    return act.lower(trained.params, state, *measured).compile()
