@@ -7,12 +7,11 @@ from pathlib import Path
 from typing import Any
 
 from sfkd_jax import build, evaluation, policy, store
-from sfkd_jax.evaluation.metrics import text_table
 from sfkd_jax.experiment import data, evaluating, grid
 from sfkd_jax.experiment.command import hydra_command
 from sfkd_jax.experiment.options import Settings
 from sfkd_jax.plants import Vehicle
-from sfkd_jax.report import film_of, of_rows
+from sfkd_jax.report import film_of, of_rows, text_table
 from sfkd_jax.settings import plain, replace
 
 SHIPPED = Path(__file__).with_name("pretrained")
@@ -56,8 +55,7 @@ def run(settings: Settings) -> dict[str, Any]:
             "versions": store.versions(),
         }
         store.write_json(results / "results.json", document)
-        for line in text_table(rows, *PRINTED):
-            store.print_message(line)
+        store.print_message(text_table(rows, *PRINTED))
         path = directory / f"{results.name}.gif"
         film = film_of(path, of_rows(directory, rows), _half_width(trained))
     store.print_message(

@@ -9,15 +9,7 @@ import pytest
 from helpers import at, driven, jit, model_and_params
 
 from sfkd_jax import models
-from sfkd_jax.evaluation import (
-    ClaimedBounds,
-    Predictions,
-    predictions,
-    theorem_violations,
-    threshold_violations,
-    tube_violations,
-    violations,
-)
+from sfkd_jax.evaluation import ClaimedBounds, Predictions, predictions, violations
 from sfkd_jax.rollout import fibers_along, sliding_windows
 from sfkd_jax.types import Trajectory
 
@@ -62,12 +54,21 @@ def test_errors_of_a_constant_drift_are_its_multiples_and_yaw_is_wrapped():
     np.testing.assert_allclose(errors, expected, rtol=1e-5)
 
 
+def rates(errors=None, latent_errors=None, gaps=None, **claims):
+    """Violations of predictions of which only a part matters."""
+    shape = np.shape(latent_errors if errors is None else errors)[:3]
+    given = np.zeros((*shape, 3)) if errors is None else errors
+    latent = np.zeros(shape) if latent_errors is None else latent_errors
+    gaps = np.zeros(shape) if gaps is None else gaps
+    return violations(Predictions(given, latent, gaps), ClaimedBounds(**claims))
+
+
 def test_a_segment_leaves_its_tube_if_any_window_step_or_kind_does():
     errors = np.zeros((5, 2, 4, 3))
     errors[1, 1, 3, 0], errors[2, 0, 0, 1], errors[3, 1, 2, 2] = 1.01, 0.21, np.nan
     errors[4] = [1.0, 0.2, 3.0]  # on the edge
-    assert tube_violations(errors, tube(1.0, 0.2, 3.0)) == 0.6
-    assert tube_violations(errors, tube(2.0, 0.2, 3.0)) == 0.4
+    assert rates(errors, certified=tube(1.0, 0.2, 3.0))["v1"] == 0.6
+    assert rates(errors, certified=tube(2.0, 0.2, 3.0))["v1"] == 0.4
 
 
 def test_a_drift_of_known_size_leaves_tubes_below_it_and_no_others():
@@ -76,26 +77,29 @@ def test_a_drift_of_known_size_leaves_tubes_below_it_and_no_others():
     assert errors.shape[0] == 4
     for size, rate in ((1.0001, 0.0), (0.9999, 1.0)):
         growing = {"position_m": [0.2501, 0.5001, 0.7501, size]}
-        assert tube_violations(errors, tube(0.0) | growing) == rate
+        assert rates(errors, certified=tube(0.0) | growing)["v1"] == rate
 
 
 def test_windows_beyond_the_common_threshold_are_counted_by_window():
     errors = np.zeros((2, 3, 4, 3))
     errors[0, 0, 1, 0], errors[1, 2, 3, 0], errors[1, 1, 0, 1] = 1.1, np.inf, 9.0
-    assert threshold_violations(errors, 1.0) == 2 / 6
-    assert threshold_violations(errors, 1.2) == 1 / 6
+    assert rates(errors, threshold=1.0)["v2"] == 2 / 6
+    assert rates(errors, threshold=1.2)["v2"] == 1 / 6
+
+
+def theorem(latent_errors, gaps, latent, d_bar):
+    """V0 and the largest error over its bound."""
+    found = rates(None, latent_errors, gaps, latent=latent, d_bar=d_bar)
+    return found["v0"], found["v0_ratio"]
 
 
 def test_the_theorem_is_only_asked_about_steps_up_to_the_first_large_defect():
-    defects, lost = np.asarray([[[0.1, 0.1, 0.3, 0.1]]]), np.full((1, 1, 4), np.nan)
-    errors = np.asarray([[[0.5, 0.0, 0.5, 0.5]]])
-    ratios = pytest.approx([1.25, 0.0])
-    rate, largest = theorem_violations(errors, defects, np.full(4, 0.4), 0.2)
-    assert (rate, largest[:2], largest[2:]) == (0.5, ratios, [None, None])
-    assert theorem_violations(errors, defects, np.full(4, 0.6), 0.2)[0] == 0.0
-    assert theorem_violations(lost, defects, np.full(4, 0.6), 0.2)[0] == 1.0
-    nothing = theorem_violations(errors, defects, np.full(4, 0.4), 0.05)
-    assert nothing == (None, [None] * 4)
+    gaps, lost = np.asarray([[[0.1, 0.1, 0.3, 0.1]]]), np.full((1, 1, 4), np.nan)
+    errors = np.asarray([[[0.5, 0.0, 9.0, 9.0]]])
+    assert theorem(errors, gaps, np.full(4, 0.4), 0.2) == (0.5, pytest.approx(1.25))
+    assert theorem(errors, gaps, np.full(4, 0.6), 0.2)[0] == 0.0
+    assert theorem(lost, gaps, np.full(4, 0.6), 0.2) == (1.0, None)
+    assert theorem(errors, gaps, np.full(4, 0.4), 0.05) == (None, None)
 
 
 def radii(alpha, d_bar, horizon):
@@ -119,7 +123,7 @@ def test_defects_that_all_point_one_way_fill_the_tube_of_a_linear_model(alpha):
     np.testing.assert_allclose(result.latent_errors[0, 0], bound, rtol=1e-5)
     for size, rate in ((1.0, 0.0), (1.0 - 1e-3, 1.0)):
         measured = result.latent_errors, result.defects, size * bound, d_bar + 1e-6
-        assert theorem_violations(*measured)[0] == rate
+        assert theorem(*measured)[0] == rate
 
 
 @cache
@@ -172,8 +176,8 @@ def test_no_defect_within_the_bound_takes_the_latent_out_of_its_tube(name):
     result, d_bar = attacked(name, 0.1), 0.1
     assert np.max(result.defects) <= d_bar
     measured = result.latent_errors, result.defects
-    assert theorem_violations(*measured, radii(0.995, d_bar, 12), d_bar)[0] == 0.0
-    assert theorem_violations(*measured, radii(0.995 / 4, d_bar, 12), d_bar)[0] > 0.5
+    assert theorem(*measured, radii(0.995, d_bar, 12), d_bar)[0] == 0.0
+    assert theorem(*measured, radii(0.995 / 4, d_bar, 12), d_bar)[0] > 0.5
 
 
 def test_the_true_plant_has_no_latent_error_and_the_nominal_that_of_its_body_state():
@@ -183,30 +187,13 @@ def test_the_true_plant_has_no_latent_error_and_the_nominal_that_of_its_body_sta
     np.testing.assert_allclose(wrong.latent_errors, wrong.errors[..., 2], atol=1e-6)
 
 
-def test_the_record_names_its_tube_and_is_null_where_nothing_is_claimed():
+def test_what_is_not_claimed_or_not_predicted_is_null():
     errors = np.zeros((4, 1, 4, 3))
     errors[0, 0, 3, 0] = 1.5
     result = Predictions(errors, np.full((4, 1, 4), 0.3), np.full((4, 1, 4), 0.1))
-    everything = ClaimedBounds(
-        tube(2.0), 0.95, np.asarray([0.2, 0.4, 0.4, 0.4]), 0.1, 1.4
-    )
-    measured = {
-        "v0": 0.25,
-        "v0_reach": pytest.approx([1.5, 0.75, 0.75, 0.75]),
-        "v1": 0.0,
-        "v2": 0.25,
-        "segments": 4,
-        "window_error_m": {"median": 0.0, "p95": pytest.approx(0.85 * 1.5)},
-    }
-    claimed = {
-        "v1_radius_m": 2.0,
-        "v1_level": 0.95,
-        "v2_threshold_m": 1.4,
-    }
-    assert violations(result, everything) == measured | claimed
-    assert violations(None, everything) == dict.fromkeys(measured) | claimed
-    narrow = violations(result, ClaimedBounds(tube(1.0), level=0.95))
-    assert [narrow[name] for name in ("v0", "v1", "v2")] == [None, 0.25, None]
-    nothing = violations(result, ClaimedBounds())
-    known = {name for name, value in nothing.items() if value is not None}
-    assert known == {"segments", "window_error_m"}
+    claims = ClaimedBounds(tube(2.0), np.asarray([0.2, 0.4, 0.4, 0.4]), 0.1, 1.4)
+    rates = {"v0": 0.25, "v0_ratio": pytest.approx(1.5), "v1": 0.0, "v2": 0.25}
+    assert violations(result, claims) == rates | {"v1_radius_m": 2.0}
+    nothing = dict.fromkeys(rates)
+    assert violations(None, claims) == nothing | {"v1_radius_m": 2.0}
+    assert violations(result, ClaimedBounds()) == nothing | {"v1_radius_m": None}

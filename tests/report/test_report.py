@@ -121,7 +121,7 @@ def test_every_metric_of_the_table_is_on_the_page_of_a_run():
     values = {"mean": 0.1, "std": 0.2, "ci95": [0.1, 0.2], "median": 0.1, "p95": 0.1}
     full = made.row("sfkd") | {
         "rmse_m": values, "rmse_after_switch_m": 0.1, "departures": 1, "ess": 7.0,
-        "violation": {"v0": 0.1, "v1": 0.1, "v1_radius_m": 1.0, "v2": 0.1},
+        "violation": {"v0": 0.1, "v0_ratio": 0.5, "v1": 0.1, "v1_radius_m": 1.0, "v2": 0.1},
         "difference_to_sfkd": values, "ratio_to_oracle": 1.0, "params": 5, "alpha": 0.9,
         "unhealthy_steps": 0.1,
         "act_ms": {"p50": 1.0, "p99": 2.0},

@@ -31,7 +31,4 @@ from sfkd_jax.evaluation._statistics import summary as summary
 from sfkd_jax.evaluation._violations import ClaimedBounds as ClaimedBounds
 from sfkd_jax.evaluation._violations import Predictions as Predictions
 from sfkd_jax.evaluation._violations import predictions as predictions
-from sfkd_jax.evaluation._violations import theorem_violations as theorem_violations
-from sfkd_jax.evaluation._violations import threshold_violations as threshold_violations
-from sfkd_jax.evaluation._violations import tube_violations as tube_violations
 from sfkd_jax.evaluation._violations import violations as violations

@@ -13,12 +13,7 @@ from jaxtyping import Array, Float
 from sfkd_jax.evaluation.metrics import SIGNALS, Signal
 from sfkd_jax.plants import Vehicle, equivalent_wind
 from sfkd_jax.ranges import Real
-from sfkd_jax.scenarios import (
-    Scenario,
-    project,
-    random_side_forces,
-    reference_window,
-)
+from sfkd_jax.scenarios import Scenario, project, random_side_forces, reference_window
 from sfkd_jax.types import Controller, Key, Params, Scalar, State, Step
 
 FORCE_STREAM = 2
@@ -185,14 +180,12 @@ def disturbed_environment(
         raise ValueError(
             "evaluation.side_forces act through the wind, but vehicle.wind_force is 0"
         )
-    # A force is passed on as wind: plants have no other input from the side.
     force = random_side_forces(
         jax.random.fold_in(key, FORCE_STREAM),
         steps=envs.shape[0],
         dt=plant.dt,
         largest=largest,
     )
-    wind = jax.vmap(partial(equivalent_wind, wind_force=plant.wind_force))(
-        envs[:, 1], force
-    )
-    return envs.at[:, 1].set(wind)
+    # A force is passed on as wind: plants have no other input from the side.
+    wind = jax.vmap(partial(equivalent_wind, wind_force=plant.wind_force))
+    return envs.at[:, 1].set(wind(envs[:, 1], force))

@@ -28,7 +28,6 @@ from sfkd_jax.types import (
     Environment,
     Model,
     Params,
-    Scalar,
     State,
     Step,
     Trajectory,
@@ -61,12 +60,11 @@ def open_loop(
     Raises:
         ValueError: the horizon does not fit the trajectories.
     """
-
-    def predict(window: Trajectory) -> Float[Array, "horizon state"]:
-        return rollout(model, params, window)[0]
-
     return _prediction_rmse(
-        predict, trajectories, horizon=horizon, along_path=model.along_path
+        lambda window: rollout(model, params, window)[0],
+        trajectories,
+        horizon=horizon,
+        along_path=model.along_path,
     )
 
 
@@ -117,9 +115,7 @@ class FittedBicycle:
     def fit(cls, train: Trajectory, *, dt: float) -> FittedBicycle:
         """Fit by least squares to the single steps of a batch of trajectories."""
         states = np.asarray(train.states, dtype=np.float64)[..., :4]
-        before, after = (
-            part.reshape(-1, 4) for part in (states[:, :-1], states[:, 1:])
-        )
+        before, after = states[:, :-1].reshape(-1, 4), states[:, 1:].reshape(-1, 4)
         controls = np.asarray(train.controls, dtype=np.float64).reshape(-1, 2)
         # Logs may hold a steering command in other units than radians.
         is_angle = bool(np.abs(controls[:, 0]).max() < STEEP)
@@ -202,9 +198,7 @@ def baselines(
 def _simulate(step: Step, window: Trajectory) -> Float[Array, "horizon state"]:
     """States of a step function from the first state of a window on."""
 
-    def advance(
-        state: State, given: tuple[Control, Environment]
-    ) -> tuple[State, State]:
+    def advance(state: State, given: tuple[Control, Environment]) -> tuple[Any, Any]:
         after = step(state, *given)
         return after, after
 
@@ -233,18 +227,16 @@ def _hold_yaw_rate(
         return as_path_state(follow(state[BODY], control, control[CURVATURE], env))
 
     # Measured over the first step, which is therefore predicted with hindsight.
-    yaw_rate = _first_yaw_rate(window, dt=dt, along_path=along_path)
-    held = jnp.full_like(window.controls[:, :1], yaw_rate if measured else 0.0)
-    controls = jnp.concatenate([held, window.controls[:, 1:]], axis=1)
-    step = turn_along_path if along_path else turn
-    return _simulate(step, window._replace(controls=controls))
-
-
-def _first_yaw_rate(window: Trajectory, *, dt: float, along_path: bool) -> Scalar:
-    """Mean yaw rate of the first step of a window [rad/s]."""
     before, after = window.states[0], window.states[1]
-    if not along_path:
-        return wrap_angle(after[2] - before[2]) / dt
-    # Relative to the path, which turns as well.
-    turned = wrap_angle(after[BODY][HEADING] - before[BODY][HEADING]) / dt
-    return turned + window.controls[0, CURVATURE] * before[BODY][PATH_SPEED]
+    if along_path:
+        before, after = before[BODY], after[BODY]
+        # Relative to the path, which turns as well.
+        yaw_rate = wrap_angle(after[HEADING] - before[HEADING]) / dt
+        yaw_rate += window.controls[0, CURVATURE] * before[PATH_SPEED]
+    else:
+        yaw_rate = wrap_angle(after[2] - before[2]) / dt
+    rates = jnp.full(len(window.controls), yaw_rate if measured else 0.0)
+    step = turn_along_path if along_path else turn
+    return _simulate(
+        step, window._replace(controls=window.controls.at[:, 0].set(rates))
+    )

@@ -20,24 +20,22 @@ from sfkd_jax.evaluation.metrics import (
     as_numbers,
 )
 
-IDENTITY = (
-    "system",
+SHARED = (
     "scenario",
     "vehicle",
     "inner_loop",
     "controller",
     "planner",
     "sampling",
-    "env",
     "variation",
 )
+"""Columns that are equal in rows that are compared."""
+IDENTITY = ("system", *SHARED[:-1], "env", SHARED[-1])
 """Columns that identify a row of results.json; a new row replaces the old row of the
 same identity.
 """
 ROAD = ("envs", "path")
 """Arrays that describe the environment and the path of an episode."""
-SHARED = tuple(name for name in IDENTITY if name not in ("system", "env"))
-"""Columns that are equal in rows that are compared."""
 
 Scores: TypeAlias = dict[str, PerEpisode]
 """Numbers per episode by the name of their metric."""
@@ -79,14 +77,10 @@ def row(
         act_ms: median and 99 % quantile of one control step.
         violation: from `violations`.
     """
-    values = _pooled(scores) | {
-        "violation": violation,
-        "act_ms": None if act_ms is None else {"p50": act_ms[0], "p99": act_ms[1]},
-        **dict.fromkeys(_COMPARISONS),
-    }
-    # In the order of the table; a metric `a.b` is in the record a.
-    keys = dict.fromkeys(metric.name.split(".")[0] for metric in METRICS)
-    return about | {key: values[key] for key in keys if key in values}
+    times = None if act_ms is None else {"p50": act_ms[0], "p99": act_ms[1]}
+    compared = dict.fromkeys(("ratio_to_oracle", "difference_to_sfkd"))
+    values = _pooled(scores) | {"violation": violation, "act_ms": times}
+    return about | values | compared
 
 
 def _pooled(scores: Scores) -> Row:
@@ -113,19 +107,6 @@ def disturbed(
     }
 
 
-def _ratio(values: np.ndarray, reference: np.ndarray) -> float:
-    return float(np.mean(values) / np.mean(reference))
-
-
-_SFKD = ("sfkd", "sfkd_path")
-"""In the frame of the body and in that of a path; one sampling has one frame."""
-_COMPARISONS: dict[str, Any] = {
-    "ratio_to_oracle": (("oracle",), _ratio),
-    "difference_to_sfkd": (_SFKD, paired_difference),
-}
-"""Column -> the systems that a row is compared with, and how."""
-
-
 def compare(rows: list[Row], *, missing: int = 0) -> list[Row]:
     """Add comparisons of systems on the same episodes with the same sampling.
 
@@ -141,12 +122,15 @@ def compare(rows: list[Row], *, missing: int = 0) -> list[Row]:
         same = [other for other in rows if _episodes(other) == _episodes(entry)]
         # Of several rows of a system, the one that searches like this row.
         same.sort(key=lambda other, entry=entry: _search(other) != _search(entry))
-        for name, (systems, measure) in _COMPARISONS.items():
-            other = next((one for one in same if one["system"] in systems), None)
-            # SFKD has no difference to itself; the oracle's ratio to itself is 1.
-            if other is None or (systems == _SFKD and other is entry):
-                continue
-            entry[name] = measure(_by_seed(entry), _by_seed(other))
+        first = {other["system"]: other for other in reversed(same)}
+        if oracle := first.get("oracle"):
+            means = [float(np.mean(_by_seed(one))) for one in (entry, oracle)]
+            entry["ratio_to_oracle"] = means[0] / means[1]
+        # In the frame of the body or in that of a path; one sampling has one frame.
+        ours = first.get("sfkd", first.get("sfkd_path"))
+        if ours is not None and ours is not entry:
+            errors = _by_seed(entry), _by_seed(ours)
+            entry["difference_to_sfkd"] = paired_difference(*errors)
     # One family: every difference that a reader could pick from the table.
     differences = [entry.get("difference_to_sfkd") or {} for entry in rows]
     family = [one for one in differences if one.get("p") is not None]

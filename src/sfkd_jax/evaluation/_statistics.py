@@ -31,13 +31,9 @@ class Spread(NamedTuple):
 
     def quantile(self, p: float) -> float:
         """Two-sided p-quantile of Student's t, mixed by the shares of the variance."""
-        return sum(
-            part * -float(stdtrit(freedom, p / 2))
-            for part, freedom in zip(
-                (self.share, 1.0 - self.share), self.freedom, strict=True
-            )
-            if part > 0
-        )
+        shares = self.share, 1.0 - self.share
+        mixed = zip(shares, self.freedom, strict=True)
+        return sum(-one * float(stdtrit(df, p / 2)) for one, df in mixed if one > 0)
 
 
 def mean_interval(
@@ -85,13 +81,10 @@ def p_value(values: Float[np.ndarray, "*seed episode"]) -> float | None:
     if spread.error == 0.0:
         return 0.0 if spread.mean else 1.0
     t = abs(spread.mean) / spread.error
-    if spread.quantile(SMALLEST_P) <= t:
-        return 0.0
-    if t == 0.0:
-        return 1.0
-    return float(
-        root_scalar(lambda p: spread.quantile(p) - t, bracket=(SMALLEST_P, 1.0)).root
-    )
+    if t == 0.0 or spread.quantile(SMALLEST_P) <= t:
+        return float(t == 0.0)
+    touches = root_scalar(lambda p: spread.quantile(p) - t, bracket=(SMALLEST_P, 1.0))
+    return float(touches.root)
 
 
 def holm(p_values: list[float], *, not_made: int = 0) -> list[float]:
@@ -152,9 +145,9 @@ def _spread(values: Float[np.ndarray, "*seed episode"]) -> Spread | None:
     """The mean and its uncertainty, None if there is one value."""
     table = np.atleast_2d(np.asarray(values, dtype=np.float64))
     trainings, episodes = table.shape
-    mean = float(np.mean(table))
     if table.size == 1:
         return None
+    mean = float(np.mean(table))
     # One training says nothing about others: this is the t of episodes alone.
     if min(trainings, episodes) == 1:
         error = float(np.std(table, ddof=1) / np.sqrt(table.size))

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from decimal import ROUND_CEILING, Context, Decimal
+from functools import partial
 from typing import Any
 
 DASH = "–"
@@ -33,9 +34,11 @@ def is_pair(value: Any) -> bool:
     return pair and all(map(is_number, value))
 
 
-def number(value: Any, digits: int = 3) -> str:
-    """A number, or the mean of a record, with fixed decimals."""
+def number(value: Any, digits: int = 3, *, scale: float = 1.0) -> str:
+    """A number, or the mean of a record, times `scale`, with fixed decimals."""
     value = dig(value, "mean") if isinstance(value, dict) else value
+    # Scaled first: 1e308 m is a number, and in mm it is none.
+    value = scale * value if is_number(value) else None
     return f"{value:.{digits}f}".replace("-", "−") if is_number(value) else DASH
 
 
@@ -59,10 +62,8 @@ def upper(value: Any, digits: int = 4) -> str:
     return short(float(rounded), digits)
 
 
-def millimetres(value: Any, digits: int = 1) -> str:
-    """A length in m, or the mean of a record of lengths, as millimetres."""
-    value = dig(value, "mean") if isinstance(value, dict) else value
-    return number(1e3 * value, digits) if is_number(value) else DASH
+millimetres = partial(number, digits=1, scale=1e3)
+"""A length in m, or the mean of a record of lengths, as millimetres."""
 
 
 def percent(share: Any) -> str:
@@ -75,22 +76,18 @@ def percent(share: Any) -> str:
     return "< 0.1" if 0 < share < 5e-4 else number(100 * share, 1)
 
 
-def interval(bounds: Any, digits: int = 3) -> str:
+def interval(bounds: Any, digits: int = 3, *, scale: float = 1.0) -> str:
     """Two bounds as "low to high"."""
     if not is_pair(bounds):
         return DASH
-    return f"{number(bounds[0], digits)} to {number(bounds[1], digits)}"
+    return " to ".join(number(bound, digits, scale=scale) for bound in bounds)
 
 
-def share(value: Any) -> str:
-    """A share in percent to four significant digits, with its unit."""
-    return f"{short(100 * value, 4)} %" if is_number(value) else DASH
-
-
-def mean_std(record: Any, digits: int = 3) -> str:
+def mean_std(record: Any, digits: int = 3, *, scale: float = 1.0) -> str:
     """Mean ± standard deviation of a record."""
-    mean, std = number(record, digits), dig(record, "std")
-    return f"{mean} ± {number(std, digits)}" if is_number(std) else mean
+    mean = number(record, digits, scale=scale)
+    std = number(dig(record, "std"), digits, scale=scale)
+    return mean if std == DASH else f"{mean} ± {std}"
 
 
 def plain(value: Any) -> str:
@@ -104,16 +101,14 @@ def plain(value: Any) -> str:
         case int() | float():
             return short(value, 6)
         case dict():
-            return "; ".join(_entry(*item) for item in value.items()) or DASH
+            shown = (
+                f"{key} ({plain(one)})"
+                if isinstance(one, dict)
+                else f"{key} {plain(one)}"
+                for key, one in value.items()
+            )
+            return "; ".join(shown) or DASH
         case list() | tuple():
             shown = ", ".join(plain(entry) for entry in value[:12])
             return f"[{shown}{', …' if len(value) > 12 else ''}]"
     return str(value)
-
-
-def _entry(key: Any, value: Any) -> str:
-    return (
-        f"{key} ({plain(value)})"
-        if isinstance(value, dict)
-        else (f"{key} {plain(value)}")
-    )

@@ -76,12 +76,10 @@ class Metric(NamedTuple):
         table: which table shows it: "tracking", "spread", "planner", "cost", "claims"
             or "prediction"; "" for none.
         write: formats a JSON value; an en dash for None and for what is not finite.
-        mm: decimals as millimetres; None for what is not a length.
         measure: one number per episode; None if the value is not about one episode.
         pool: the JSON value of a row from the numbers of its episodes.
         pool_seeds: the JSON value of rows that differ in the training seed; None for
             the mean of their numbers.
-        read: the JSON value of a row, where that is more than a look-up by name.
         records: signals that `measure` needs, by name.
     """
 
@@ -90,29 +88,22 @@ class Metric(NamedTuple):
     unit: str = ""
     table: str = ""
     write: Callable[[Any], str] = number
-    mm: int | None = None
     measure: Callable[[Recording], PerEpisode] | None = None
     pool: Callable[[PerEpisode], Any] | None = None
     pool_seeds: Callable[[list[Row]], Any] | None = None
-    read: Callable[[Row], Any] | None = None
     records: dict[str, Signal] = {}  # noqa: RUF012 never changed
 
     def value(self, row: Row) -> Any:
         """The JSON value in a row, or None."""
-        return self.read(row) if self.read else dig(row, *self.name.split("."))
+        return dig(row, *self.name.split("."))
 
-    def text(self, row: Row, *, mm: bool = False) -> str:
-        """The value of a row as text, lengths in millimetres with `mm`."""
-        value = self.value(row)
-        if mm and self.mm is not None:
-            return millimetres(value, self.mm)
-        return self.write(value)
+    def text(self, row: Row) -> str:
+        """The value of a row as text, in the unit of the metric."""
+        return self.write(self.value(row))
 
-    def head(self, *, mm: bool = False) -> str:
+    def head(self) -> str:
         """Label and unit, as the head of a column."""
-        # Only lengths have decimals as millimetres.
-        unit = "mm" if mm and self.mm is not None else self.unit
-        return f"{self.label} [{unit}]" if unit else self.label
+        return f"{self.label} [{self.unit}]" if self.unit else self.label
 
 
 def _scored(run: Recording) -> np.ndarray:
@@ -128,11 +119,17 @@ def _max_deviation(run: Recording) -> np.ndarray:
     return np.max(np.abs(_scored(run)), axis=1)
 
 
+def switches(
+    envs: Float[np.ndarray, "*batch time environment"],
+) -> Bool[np.ndarray, "*batch time"]:
+    """Whether friction or wind has switched at a step; at the first it has not."""
+    jumps = np.any(np.abs(np.diff(envs, axis=-2)) > np.asarray(SWITCH), axis=-1)
+    return np.concatenate([np.zeros_like(jumps[..., :1]), jumps], axis=-1)
+
+
 def _rmse_after_switch(run: Recording) -> np.ndarray:
     """RMSE within AFTER_SWITCH of a switch; NaN for an episode without a switch."""
-    jumps = np.any(np.abs(np.diff(run.envs, axis=1)) > np.asarray(SWITCH), axis=2)
-    # The first e of an episode is no switch.
-    jumps = np.concatenate([np.zeros((len(run.envs), 1), bool), jumps], axis=1)
+    jumps = switches(run.envs)
     after = np.zeros_like(jumps)
     for lag in range(min(round(AFTER_SWITCH / run.dt), jumps.shape[1])):
         after[:, lag:] |= jumps[:, : jumps.shape[1] - lag]
@@ -181,59 +178,57 @@ def _of_trainings(rows: list[Row]) -> list[list[float]]:
     return [as_numbers(row["rmse_episodes_m"]).tolist() for row in rows]
 
 
-def _ahead(steps: int) -> Metric:
-    """Position error of open-loop predictions."""
-    label = f"{steps} step{'s' * (steps > 1)} ahead"
-    return Metric(f"open_loop_rmse_m.{steps}", label, "m", "prediction", number, 1)
-
+_MM: dict[str, Any] = {"digits": 1, "scale": 1e3}
+"""How lateral errors, in files in m, are written."""
+_TWO = partial(number, digits=2)
 
 # fmt: off
 METRICS: tuple[Metric, ...] = (
-    Metric("rmse_m", "RMSE", "m", "tracking", mean_std, 1, _rmse, summary,
+    Metric("rmse_m", "RMSE", "mm", "tracking", partial(mean_std, **_MM), _rmse, summary,
            lambda rows: summary(np.asarray(_of_trainings(rows)))),
-    Metric("rmse_m.ci95", "95 % interval", "m", "tracking", interval),
-    Metric("rmse_m.median", "Median", "m", "spread", number, 1),
-    Metric("rmse_m.p95", "95th percentile", "m", "spread", number, 1),
+    Metric("rmse_m.ci95", "95 % interval", "mm", "tracking", partial(interval, **_MM)),
+    Metric("rmse_m.median", "Median", "mm", "spread", millimetres),
+    Metric("rmse_m.p95", "95th percentile", "mm", "spread", millimetres),
     Metric("rmse_episodes_m", measure=_rmse, pool=np.ndarray.tolist,
            pool_seeds=lambda rows: [x for one in _of_trainings(rows) for x in one]),
     Metric("rmse_trainings_m",
            pool_seeds=lambda rows: [float(np.mean(x)) for x in _of_trainings(rows)]),
-    Metric("max_deviation_m", "Largest deviation", "m", "tracking", number, 0,
-           _max_deviation, lambda values: float(np.max(values)),
+    Metric("max_deviation_m", "Largest deviation", "mm", "tracking",
+           partial(millimetres, digits=0), _max_deviation,
+           lambda values: float(np.max(values)),
            lambda rows: float(np.max(as_numbers(
                [row["max_deviation_m"] for row in rows])))),
-    Metric("rmse_after_switch_m", "RMSE after a switch", "m", "spread", number, 1,
+    Metric("rmse_after_switch_m", "RMSE after a switch", "mm", "spread", millimetres,
            _rmse_after_switch, _mean_known),
     Metric("smoothness_rad_per_s", "Steering rate", "rad/s", "tracking",
            measure=_steering_rate, pool=_mean),
     Metric("violation.v0", "V0, theorem", "%", "claims", percent),
+    Metric("violation.v0_ratio", "V0, largest error over bound", "", "claims", _TWO),
     Metric("violation.v1", "V1, certified tube", "%", "claims", percent),
     Metric("violation.v1_radius_m", "Radius of the certified tube", "m", "claims"),
     Metric("violation.v2", "V2, threshold", "%", "claims", percent),
-    Metric("departures", "Left the lane", "", "spread", short, None, _departed,
+    Metric("departures", "Left the lane", "", "spread", short, _departed,
            lambda values: int(np.sum(values)),
            lambda rows: sum(row["departures"] for row in rows)),
     Metric("unhealthy_steps", "Steps with the last plan held", "%", "planner", percent,
-           measure=lambda run: 1.0 - np.mean(run.signals["healthy"], axis=1),
-           pool=_mean, records={"healthy": lambda info: info["healthy"]}),
-    Metric("ess", "Effective samples", "", "planner", partial(number, digits=0), None,
+           lambda run: 1.0 - np.mean(run.signals["healthy"], axis=1), _mean,
+           records={"healthy": lambda info: info["healthy"]}),
+    Metric("ess", "Effective samples", "", "planner", partial(number, digits=0),
            lambda run: np.median(run.signals["effective_samples"], axis=1), _median,
            records={"effective_samples": lambda info: info["effective_samples"]}),
-    Metric("act_ms.p50", "Control step, median", "ms", "cost",
-           partial(number, digits=2)),
-    Metric("act_ms.p99", "Control step, 99 %", "ms", "cost",
-           partial(number, digits=2)),
-    Metric("ratio_to_oracle", "RMSE over oracle", "", "tracking",
-           partial(number, digits=2)),
-    Metric("difference_to_sfkd.mean", "RMSE minus SFKD", "m", "spread",
-           partial(number, digits=4), 1),
-    Metric("difference_to_sfkd.ci95", "95 % interval of the difference", "m", "spread",
-           partial(interval, digits=4)),
+    Metric("act_ms.p50", "Control step, median", "ms", "cost", _TWO),
+    Metric("act_ms.p99", "Control step, 99 %", "ms", "cost", _TWO),
+    Metric("ratio_to_oracle", "RMSE over oracle", "", "tracking", _TWO),
+    Metric("difference_to_sfkd.mean", "RMSE minus SFKD", "mm", "spread", millimetres),
+    Metric("difference_to_sfkd.ci95", "95 % interval of the difference", "mm", "spread",
+           partial(interval, **_MM)),
     Metric("params", "Parameters", "", "cost", short),
     Metric("alpha", "Certified α", "", "cost", upper),
-    *map(_ahead, (1, 5, 10, 20)),
+    Metric("open_loop_rmse_m.1", "1 step ahead", "m", "prediction"),
+    *(Metric(f"open_loop_rmse_m.{steps}", f"{steps} steps ahead", "m", "prediction")
+      for steps in (5, 10, 20)),
 )
-"""All metrics, in the order of the keys of a row and of the columns of tables."""
+"""All metrics, in the order of the columns of tables."""
 # fmt: on
 
 BY_NAME: dict[str, Metric] = {metric.name: metric for metric in METRICS}
@@ -242,22 +237,3 @@ SIGNALS: dict[str, Signal] = {
     name: signal for metric in METRICS for name, signal in metric.records.items()
 }
 """Signals that the metrics need, by name."""
-
-
-def in_table(table: str) -> list[Metric]:
-    """The metrics that a table shows."""
-    return [metric for metric in METRICS if metric.table == table]
-
-
-def text_table(rows: list[Row], *names: str) -> list[str]:
-    """Metrics of rows as the lines of a table, lengths in millimetres."""
-    metrics = [BY_NAME[name] for name in names]
-    cells = [["system", *(metric.head(mm=True) for metric in metrics)]]
-    cells += [
-        [row["system"], *(one.text(row, mm=True) for one in metrics)] for row in rows
-    ]
-    widths = [max(map(len, column)) for column in zip(*cells, strict=True)]
-    return [
-        "   ".join(cell.rjust(width) for cell, width in zip(line, widths, strict=True))
-        for line in cells
-    ]

@@ -382,9 +382,7 @@ def _claims(settings: Settings, system: System) -> evaluation.ClaimedBounds:
     """Claims about a system's predictions, of its certificate."""
     options = settings.certification
     level, horizon = options.level, options.horizon
-    claims = evaluation.ClaimedBounds(
-        level=level, threshold=settings.evaluation.threshold_m
-    )
+    claims = evaluation.ClaimedBounds(threshold=settings.evaluation.threshold_m)
     proof = system.certificate
     if proof is None:
         return claims

@@ -31,7 +31,7 @@ _WRITERS = {
     "interval": formats.interval,
     "plain": plain,
     "range": lambda ends: " to ".join(map(short, ends or [None])),
-    "share": formats.share,
+    "percent": formats.percent,
     "short": short,
     "upper": formats.upper,
 }

@@ -9,7 +9,7 @@ import pandas as pd
 
 from sfkd_jax.evaluation import formats, identity
 from sfkd_jax.evaluation.formats import DASH, dig, is_number, is_pair, millimetres
-from sfkd_jax.evaluation.metrics import METRICS, Metric, Row
+from sfkd_jax.evaluation.metrics import BY_NAME, METRICS, Metric, Row
 from sfkd_jax.report.style import family, label, rank, scenario_label
 
 NO_MODEL = ("nominal", "oracle", "law")
@@ -146,6 +146,13 @@ def metric_tables(
     return [table(corner, columns, names) for columns in kinds.values()]
 
 
+def text_table(rows: list[Row], *names: str) -> str:
+    """Metrics of rows for a terminal."""
+    metrics = [BY_NAME[name] for name in names]
+    columns = {one.head(): [one.text(row) for row in rows] for one in metrics}
+    return table("", columns, [str(row["system"]) for row in rows]).to_string()
+
+
 def cross_table(group: list[Row], show: Callable[[Row], str]) -> pd.DataFrame | None:
     """One number of every system, by vehicle and scenario; None if there is none."""
     cells: dict[tuple[str, str], dict[str, str]] = {}
@@ -166,7 +173,7 @@ def rmse_cell(row: Row) -> str:
     """RMSE in mm with its 95 % interval and the mark of its difference to SFKD."""
     ends, shown = dig(row, "rmse_m", "ci95"), millimetres(row.get("rmse_m"))
     if is_pair(ends):
-        shown += f" ({formats.interval([1e3 * end for end in ends], 1)})"
+        shown += f" ({formats.interval(ends, 1, scale=1e3)})"
     return shown + {1: " *", 0: "", -1: " †"}[side(row.get("difference_to_sfkd"))]
 
 
