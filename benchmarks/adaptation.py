@@ -180,10 +180,11 @@ def systems(rows, case, car):
 
 def missed(info):
     """Of every step: whether the tube was missed, and whether that is known."""
-    if "tube" not in info:
-        return ()
     at = jnp.asarray(LEADS) - 1
-    return info["tube_missed"][at], jnp.isfinite(info["tube_errors"])[at]
+    # A controller without a tube misses none.
+    if "tube" not in info:
+        return jnp.zeros((2, len(LEADS)), bool)
+    return jnp.stack([info["tube_missed"], jnp.isfinite(info["tube_errors"])])[:, at]
 
 
 def drive(car, system, scene):
@@ -202,7 +203,7 @@ def drive(car, system, scene):
             dt=car.dt,
             horizon=HORIZON,
             observation_noise=NOISE,
-            report=missed,
+            record={"missed": missed},
         )
 
     episodes = jax.jit(jax.vmap(one))(made, keys)
@@ -215,8 +216,8 @@ def drive(car, system, scene):
         "largest_mm": round(1e3 * float(largest.max()), 1),
         "rmse_mm": np.round(errors, 3).tolist(),
     }
-    if len(episodes.report):
-        left, known = (np.asarray(part) for part in episodes.report)
+    left, known = np.moveaxis(np.asarray(episodes.signals["missed"]), 2, 0)
+    if known.any():
         inside = 1.0 - np.sum(left & known, axis=(0, 1)) / np.sum(known, axis=(0, 1))
         shares = np.round(inside, 4).tolist()
         result["coverage"] = dict(zip(map(str, LEADS), shares, strict=True))

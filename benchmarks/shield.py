@@ -42,7 +42,7 @@ class Car(NamedTuple):
     @property
     def noise(self):
         """Standard deviation of the sensors that the corridor was calibrated with."""
-        return tuple(self.certificate["corridor"]["class"]["sensor_noise"])
+        return tuple(self.certificate["corridor"]["conditions"]["sensor_noise"])
 
 
 def load(name):
