@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 from importlib import import_module
-from typing import Annotated, Any, TypeAlias
+from typing import Annotated, Any, TypeAlias, get_args, get_type_hints
 
 
 @dataclass(frozen=True)
@@ -14,9 +14,15 @@ class Interval:
 
     text: str
 
+    @property
+    def ends(self) -> tuple[float, float]:
+        """Both ends."""
+        low, high = map(float, self.text[1:-1].split(","))
+        return low, high
+
     def contains(self, value: int | float) -> bool:
         """Return whether the value lies in the interval."""
-        low, high = map(float, self.text[1:-1].split(","))
+        low, high = self.ends
         above = low < value if self.text[0] == "(" else low <= value
         below = value < high if self.text[-1] == ")" else value <= high
         return above and below
@@ -39,8 +45,10 @@ Real: TypeAlias = Annotated[float, Interval("(-inf, inf)")]
 Positive: TypeAlias = Annotated[float, Interval("(0, inf)")]
 Fraction: TypeAlias = Annotated[float, Interval("(0, 1)")]
 PositiveFraction: TypeAlias = Annotated[float, Interval("(0, 1]")]
+NonNegative: TypeAlias = Annotated[float, Interval("[0, inf)")]
 UnitInterval: TypeAlias = Annotated[float, Interval("[0, 1]")]
 NonNegativeInt: TypeAlias = Annotated[int, Interval("[0, inf)")]
+AtLeastOne: TypeAlias = Annotated[int, Interval("[1, inf)")]
 AtLeastTwo: TypeAlias = Annotated[int, Interval("[2, inf)")]
 Span: TypeAlias = Annotated[tuple[Positive, Positive], Ascending()]
 Numbers: TypeAlias = Annotated[tuple[float, ...], Entries(least=0)]
@@ -56,6 +64,28 @@ def check_choice(setting: str, value: str, known: Iterable[str]) -> None:
     words = tuple(known)
     if value not in words:
         raise ValueError(f"{setting} must be one of {', '.join(words)}, got {value!r}")
+
+
+def check_intervals(settings: object) -> None:
+    """Raise a ValueError for a number of a dataclass outside its annotated interval.
+
+    Of a sequence every entry counts, and None passes.
+    """
+    for name, hint in get_type_hints(type(settings), include_extras=True).items():
+        value = getattr(settings, name, None)
+        entries = value if isinstance(value, tuple) else (value,)
+        for interval in _intervals(hint):
+            if not all(entry is None or interval.contains(entry) for entry in entries):
+                raise ValueError(f"{name} must be in {interval.text}, got {value}")
+
+
+def _intervals(hint: Any) -> Iterator[Interval]:
+    """The intervals inside an annotation, as of `tuple[Positive, ...] | None`."""
+    for part in get_args(hint):
+        if isinstance(part, Interval):
+            yield part
+        else:
+            yield from _intervals(part)
 
 
 def imported(name: str, setting: str) -> Any:

@@ -12,7 +12,7 @@ from typing import Any, NamedTuple, Required, TypeAlias, TypedDict
 
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray
+from jaxtyping import Array, Bool, Float, PRNGKeyArray
 
 Key: TypeAlias = PRNGKeyArray
 State: TypeAlias = Float[Array, " state"]
@@ -273,9 +273,6 @@ class ControllerInfo(TypedDict, total=False):
     bound_exceeded: Bool[Array, ""]  # nominal_distance exceeds the certified bound
     outside_box: Bool[Array, ""]  # outside the boxes of the certificate
     dead_reckoning: Bool[Array, ""]  # observation or reference is not finite
-    request_finite: Bool[Array, ""]  # the filtered controller gave a finite control
-    interventions: Int[Array, ""]  # number of steps with an intervention so far
-    exceeded_steps: Int[Array, ""]  # number of steps with bound_exceeded so far
     shield_healthy: Bool[Array, ""]  # feasible, and the certificate applies
 
 

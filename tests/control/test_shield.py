@@ -198,7 +198,7 @@ def test_without_the_filter_the_same_planner_leaves_the_corridor(name):
         clipped, jnp.asarray(WORST)
     )
     assert np.max(np.abs(xi[:, 0])) > 1.5 * (WIDTH + TUBE)
-    assert attacked()[name][2]["interventions"][-1] > 10
+    assert np.sum(attacked()[name][2]["intervention"] > 0.0) > 10
 
 
 def test_who_asks_for_little_is_left_alone():
@@ -217,7 +217,6 @@ def test_who_asks_for_little_is_left_alone():
     np.testing.assert_array_equal(controls, planned)
     np.testing.assert_allclose(info["perturbation"], script, atol=1e-6)
     assert not np.any(info["intervention"])
-    assert int(info["interventions"][-1]) == 0
 
 
 def margin_of(xi, nu, road):
@@ -350,21 +349,16 @@ def test_a_switch_of_the_environment_moves_nominal_model_and_car_alike():
     assert list(np.flatnonzero(~np.asarray(inside))) == list(range(20, 25))
 
 
-def test_a_car_that_the_bound_does_not_hold_for_is_told_and_followed():
-    """Displaced by 0.5 m: one breach, then the nominal model is at the car; or breaches for ever
-    without reanchoring.
-    """
+def test_a_car_outside_its_bound_is_reported_and_followed():
+    """Displaced by 0.5 m: the bound is exceeded once, then the nominal model is there."""
     kick = np.zeros((20, 3))
     kick[9, 0] = 0.5
-    for reanchor in (True, False):
-        controller = filtered(reanchor=reanchor, width=1.0, noise_allowance=0.01)
-        xi, _, info = jit(partial(drive, controller))(jnp.zeros((20, 2)), kick)
-        broken = np.flatnonzero(info["bound_exceeded"])
-        assert list(broken) == ([10] if reanchor else list(range(10, 20)))
-        assert int(info["exceeded_steps"][-1]) == len(broken)
-        np.testing.assert_allclose(info["nominal_distance"][10], 0.5, atol=1e-4)
-        assert np.allclose(info["nominal_state"][10:], xi[10:], atol=1e-4) == reanchor
-        assert not np.any(info["shield_healthy"][broken])
+    controller = filtered(width=1.0, noise_allowance=0.01)
+    xi, _, info = jit(partial(drive, controller))(jnp.zeros((20, 2)), kick)
+    np.testing.assert_array_equal(np.flatnonzero(info["bound_exceeded"]), [10])
+    np.testing.assert_allclose(info["nominal_distance"][10], 0.5, atol=1e-4)
+    np.testing.assert_allclose(info["nominal_state"][10:], xi[10:], atol=1e-4)
+    assert not info["shield_healthy"][10]
 
 
 @pytest.mark.parametrize(
@@ -415,19 +409,19 @@ def test_before_anything_is_seen_the_planner_passes_within_the_limits():
         ):
             action, after, info = act(jnp.asarray(planned), start, *seen)
             np.testing.assert_allclose(action, passed)
-            assert not bool(after.inner.nominal.started | info["shield_healthy"])
+            assert not bool(after.inner.started | info["shield_healthy"])
             assert not bool(info["feasible"] | info["outside_box"])
             assert np.isnan(float(info["margin"]))
     _, after, info = act(jnp.asarray([0.1, 0.7]), after, xi, ENV, reference)
-    assert bool(after.inner.nominal.started & info["shield_healthy"])
+    assert bool(after.inner.started & info["shield_healthy"])
 
 
 @pytest.mark.parametrize(
     ("changes", "line"),
     [
-        ({"width": float("nan")}, "width must be positive and finite"),
-        ({"tube": float("inf")}, "tube must be positive and finite"),
-        ({"horizon": 0}, "horizon must be at least 1"),
+        ({"width": float("nan")}, r"width must be in \(0, inf\)"),
+        ({"tube": float("inf")}, r"tube must be in \(0, inf\)"),
+        ({"horizon": 0}, r"horizon must be in \[1, inf\)"),
         ({"control": ((0.5, -5.0), HIGH)}, "the box of control needs 2 lower limits"),
         (
             {"conditions": Conditions(env=((0.9, 0.0), (0.3, 1.0)))},

@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+from dataclasses import KW_ONLY, dataclass
 from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
+from sfkd_jax.control._factory import factory
+from sfkd_jax.ranges import AtLeastOne, check_intervals
 from sfkd_jax.types import (
     Control,
     Controller,
@@ -32,51 +35,55 @@ class DelayState(NamedTuple):
     sent: Float[Array, "delay control"]
 
 
-def delay_compensated(
-    controller: Controller,
-    model: Model,
-    *,
-    delay: int,
-    initial_control: tuple[float, ...] = (0.0, 0.0),
-) -> Controller:
-    """Wrap a controller for actuators that respond `delay` sampling periods late.
+@dataclass(frozen=True, eq=False)
+class DelayCompensation:
+    """A controller for actuators that respond `delay` sampling periods late.
 
         x̂_{k+d} = F(… F(x_k, u_{k−d}, e_k) …, u_{k−1}, e_k)
         u_k = act(x̂_{k+d}, e_k, reference)
 
     The model predicts the observation through the controls already sent, and the
     controller plans from the result. The reference must be that of the time at which
-    the control arrives.
+    the control arrives. `info` gains `arrival_state`, x̂_{k+d}.
 
-    Args:
-        controller: any controller.
+    Attributes:
+        inner: any controller.
         model: used for the prediction; usually that of the controller's rollouts.
         delay: d, at least 1.
         initial_control: in force before the first control arrives.
 
-    Returns:
-        A `Controller`; `info` gains `arrival_state`, x̂_{k+d}.
-
     Raises:
         ValueError: the delay is less than 1.
     """
-    if delay < 1:
-        raise ValueError(f"delay must be at least 1 sampling period, got {delay}")
 
-    def init(key: Key) -> DelayState:
-        return DelayState(
-            controller.init(key),
-            jnp.tile(jnp.asarray(initial_control, dtype=float), (delay, 1)),
-        )
+    inner: Controller
+    model: Model
+    _: KW_ONLY
+    delay: AtLeastOne
+    initial_control: tuple[float, ...] = (0.0, 0.0)
+
+    def __post_init__(self) -> None:
+        check_intervals(self)
+
+    def controller(self) -> Controller:
+        """Return the controller that plans from the arrival."""
+        return Controller(self.init, self.act)
+
+    def init(self, key: Key) -> DelayState:
+        """Return the state before the first control step."""
+        sent = jnp.asarray(self.initial_control, dtype=float)
+        return DelayState(self.inner.init(key), jnp.tile(sent, (self.delay, 1)))
 
     def act(
+        self,
         params: Params,
         state: DelayState,
         observation: State,
         env: Environment,
         reference: Any,
     ) -> tuple[Control, DelayState, ControllerInfo]:
-        fiber = model.fiber(params, env)
+        """Take one control step."""
+        model, fiber = self.model, self.model.fiber(params, env)
 
         def predict(latent: Any, control: Control) -> tuple[Any, None]:
             return model.step(fiber, latent, control), None
@@ -84,10 +91,12 @@ def delay_compensated(
         # From the oldest on, in the order in which the actuators will apply them.
         latent, _ = jax.lax.scan(predict, model.encode(fiber, observation), state.sent)
         arrival = model.decode(fiber, latent)
-        control, inner, info = controller.act(
+        control, inner, info = self.inner.act(
             params, state.inner, arrival, env, reference
         )
         sent = jnp.concatenate([state.sent[1:], control[None]])
         return control, DelayState(inner, sent), {**info, "arrival_state": arrival}
 
-    return Controller(init, act)
+
+delay_compensated = factory(DelayCompensation, DelayCompensation.controller)
+"""(controller, model, settings of `DelayCompensation`) -> `Controller`."""

@@ -1,25 +1,25 @@
 """The guard of a planner along a path: nominal model, safety filter, and their flags.
 
-Everything that decides whether the planner's control may pass is here: whether a
-measurement is believed (`Shield._nominal`), where the certificate applies
-(`Conditions`), which control a request becomes (`safety_filter`), and what drives
-instead (`Shield.law`).
+Everything that decides whether the planner's control may pass is here. In one control
+step (`Shield.act`) the measurement is compared with the nominal model
+(`Shield._compare`), the request is filtered (`safety_filter`), and both are reported.
 """
 
 from __future__ import annotations
 
-import math
 from dataclasses import dataclass
+from functools import partial
 from typing import Any, NamedTuple, TypeAlias
 
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Bool, Float, Int
+from jaxtyping import Array, Bool, Float
 
 from sfkd_jax.control.laws._path_law import PathLaw
 from sfkd_jax.control.planners._plans import all_finite
 from sfkd_jax.control.tasks._along_path import Preview
 from sfkd_jax.geometry import LATERAL, PathState, is_valid, path_state
+from sfkd_jax.ranges import AtLeastOne, NonNegative, Positive, check_intervals
 from sfkd_jax.rollout import fold
 from sfkd_jax.types import (
     BODY,
@@ -27,6 +27,7 @@ from sfkd_jax.types import (
     Controller,
     ControllerInfo,
     Environment,
+    Fiber,
     Key,
     Latent,
     Model,
@@ -60,7 +61,7 @@ class FilterResult(NamedTuple):
 
 def safety_filter(
     model: Model,
-    fiber: Any,
+    fiber: Fiber,
     latent: Latent,
     request: Control,
     preview: Float[Array, "preview 2"],
@@ -128,59 +129,6 @@ def safety_filter(
     )
 
 
-class NominalState(NamedTuple):
-    """The nominal model between two control steps.
-
-    Attributes:
-        latent: in the fibre of `env`; 0 before the start.
-        started: whether the nominal model is running.
-        env: the last finite environment, clipped to its box; NaN before the first one.
-        road: κ [1/m] and v_ref [m/s] over the next steps of the last finite reference;
-            NaN before the first one.
-    """
-
-    latent: Latent
-    started: Bool[Array, ""]
-    env: Environment
-    road: Float[Array, "preview 2"]
-
-
-class ShieldState(NamedTuple):
-    """What the shield carries from one control step to the next.
-
-    Attributes:
-        inner: state of the wrapped controller.
-        nominal: the nominal model.
-        interventions: number of steps so far at which a request was reduced.
-        exceeded_steps: number of steps so far at which the nominal model was too far
-            from the measurement.
-    """
-
-    inner: Any
-    nominal: NominalState
-    interventions: Int[Array, ""]
-    exceeded_steps: Int[Array, ""]
-
-
-class Comparison(NamedTuple):
-    """Vehicle and nominal model at one control step.
-
-    Attributes:
-        nominal: in the fibre of the current environment, moved to the measurement if
-            necessary.
-        fiber: of that environment.
-        law_control: of the law at the measurement or, without one, at the nominal ξ.
-        applicable: whether that control is finite and the nominal model is running.
-        flags: entries of `info`.
-    """
-
-    nominal: NominalState
-    fiber: Any
-    law_control: Control
-    applicable: Bool[Array, ""]
-    flags: dict[str, Any]
-
-
 @dataclass(frozen=True, kw_only=True)
 class Conditions:
     """Where a certificate applies; None: no limit.
@@ -209,6 +157,25 @@ class Conditions:
         return inside
 
 
+class ShieldState(NamedTuple):
+    """The wrapped controller and the nominal model between two control steps.
+
+    Attributes:
+        inner: state of the wrapped controller.
+        latent: of the nominal model, in the fibre of `env`; 0 before the start.
+        started: whether the nominal model is running.
+        env: the last finite environment, clipped to its box; NaN before the first one.
+        road: κ [1/m] and v_ref [m/s] over the next steps of the last finite reference;
+            NaN before the first one.
+    """
+
+    inner: Any
+    latent: Latent
+    started: Bool[Array, ""]
+    env: Environment
+    road: Float[Array, "preview 2"]
+
+
 @dataclass(frozen=True, kw_only=True)
 class Shield:
     """A filter around a controller that keeps a nominal model in its corridor.
@@ -231,15 +198,14 @@ class Shield:
     - Outside the conditions, or where the law is not finite: `outside_box`. The
       certificate does not apply, and the law drives alone; e is clipped to its box.
     - |e_y − ê_y| > tube + noise_allowance: `bound_exceeded`. The bound does not hold
-      for this vehicle.
+      for this vehicle, and the nominal model starts anew at the measurement.
 
-    `info` gains `margin` [m], `intervention` (1 − s, of the request clipped to `limit`;
-    0 if it passed, 1 outside the box or if steered back), `perturbation` ν',
-    `nominal_state` (its ξ), `nominal_distance` |e_y − ê_y| [m] (NaN without
-    comparison), `corridor` = width + tube [m], `feasible`, `bound_exceeded`,
-    `outside_box`, `dead_reckoning`, `request_finite`, `env_inside`, `interventions`,
-    `exceeded_steps`, and `shield_healthy`: feasible, and the certificate applies at
-    this step.
+    `info` gains `margin` [m], `intervention` (1 − s, of the request clipped to the
+    law's perturbation; 0 if it passed, 1 outside the box or if steered back),
+    `perturbation` ν', `nominal_state` (its ξ), `nominal_distance` |e_y − ê_y| [m] (NaN
+    without comparison), `corridor` = width + tube [m], `feasible`, `bound_exceeded`,
+    `outside_box`, `dead_reckoning`, `env_inside`, and `shield_healthy`: feasible, and
+    the certificate applies at this step.
 
     Attributes:
         inner: any controller along a path; its control is u.
@@ -250,9 +216,7 @@ class Shield:
         control: box of u.
         horizon: number of steps over which the law alone is predicted; beyond the
             preview, its last curvature and speed are used.
-        limit: largest |ν|; `law.perturbation` if None.
         noise_allowance: error of a measured e_y that is added to the tube [m].
-        reanchor: move the nominal model to the measurement when the bound is exceeded.
         conditions: where the certificate applies.
 
     Raises:
@@ -264,13 +228,11 @@ class Shield:
     inner: Controller
     model: Model
     law: PathLaw
-    width: float
-    tube: float
+    width: Positive
+    tube: Positive
     control: Box
-    horizon: int = 20
-    limit: tuple[float, ...] | None = None
-    noise_allowance: float = 0.0
-    reanchor: bool = True
+    horizon: AtLeastOne = 20
+    noise_allowance: NonNegative = 0.0
     conditions: Conditions = Conditions()
 
     def __post_init__(self) -> None:
@@ -278,27 +240,17 @@ class Shield:
             raise ValueError(
                 "a shield needs a model in path coordinates: model.frame=path"
             )
-        for name in ("width", "tube"):
-            value = getattr(self, name)
-            if not (math.isfinite(value) and value > 0.0):
-                raise ValueError(f"{name} must be positive and finite [m], got {value}")
-        if self.horizon < 1:
-            raise ValueError(f"horizon must be at least 1 step, got {self.horizon}")
-        if not 0.0 <= self.noise_allowance < math.inf:
-            raise ValueError(
-                "noise_allowance must be finite and not negative [m], "
-                f"got {self.noise_allowance}"
-            )
-        check_box("control", self.control, 2)
-        if self.limit is not None:
-            check_box("limit", (tuple(-entry for entry in self.limit), self.limit), 2)
-        check_box("env", self.conditions.env, self._environments)
-        check_box("state", self.conditions.state, self.law.gain.shape[-1])
-        check_box("road", self.conditions.road, 2)
+        check_intervals(self)
+        states, environments = self._sizes
+        _check_box("control", self.control, 2)
+        _check_box("env", self.conditions.env, environments)
+        _check_box("state", self.conditions.state, states)
+        _check_box("road", self.conditions.road, 2)
 
     @property
-    def _environments(self) -> int:
-        return self.law.low.shape[0] - 2
+    def _sizes(self) -> tuple[int, int]:
+        """Numbers of entries of ξ and of e."""
+        return self.law.gain.shape[-1], self.law.low.shape[0] - 2
 
     def controller(self) -> Controller:
         """Return the controller along a path."""
@@ -306,24 +258,22 @@ class Shield:
 
     def init(self, key: Key) -> ShieldState:
         """Return the state before the first control step."""
+        states, environments = self._sizes
 
         def encode(key: Key) -> Latent:
             params = fold(self.model, self.model.init(key))
-            fiber = self.model.fiber(params, jnp.zeros(self._environments))
-            return self.model.encode(
-                fiber, path_state(jnp.zeros(self.law.gain.shape[-1]))
-            )
+            fiber = self.model.fiber(params, jnp.zeros(environments))
+            return self.model.encode(fiber, path_state(jnp.zeros(states)))
 
         # Only shapes are evaluated.
-        latent = jax.eval_shape(encode, jax.random.key(0))
-        nominal = NominalState(
+        latent = jax.eval_shape(encode, key)
+        return ShieldState(
+            inner=self.inner.init(key),
             latent=jax.tree.map(lambda leaf: jnp.zeros(leaf.shape, leaf.dtype), latent),
             started=jnp.asarray(False),
-            env=jnp.full(self._environments, jnp.nan, dtype=float),
+            env=jnp.full(environments, jnp.nan, dtype=float),
             road=jnp.full((self.horizon, 2), jnp.nan, dtype=float),
         )
-        zero = jnp.zeros((), dtype=jnp.int32)
-        return ShieldState(self.inner.init(key), nominal, zero, zero)
 
     def act(
         self,
@@ -334,76 +284,64 @@ class Shield:
         preview: Preview,
     ) -> tuple[Control, ShieldState, ControllerInfo]:
         """Take one control step."""
-        if env.shape != (self._environments,):
-            raise ValueError(
-                f"env must have shape ({self._environments},), got {env.shape}"
-            )
         low, high = map(jnp.asarray, self.control)
         planned, inner, info = self.inner.act(
             params, state.inner, coordinates, env, preview
         )
-        now = self._compare(params, state.nominal, coordinates, env, preview)
-        nominal, flags = now.nominal, now.flags
+        now, fiber, law_control, flags = self._compare(
+            params, state._replace(inner=inner), coordinates, env, preview
+        )
         finite = all_finite(planned)
         planned = jnp.clip(jnp.where(finite, planned, 0.0), low, high)
-        request = _request(planned, now.law_control, low, high)
+        request = _request(planned, law_control, low, high)
         request = jnp.where(finite, request, 0.0)
-        limit = self.law.perturbation if self.limit is None else jnp.asarray(self.limit)
         # Outside the box no request is admissible: the law drives alone.
-        limit = jnp.where(flags["outside_box"], 0.0, limit)
+        limit = jnp.where(flags["outside_box"], 0.0, self.law.perturbation)
         chosen = safety_filter(
-            self.model,
-            now.fiber,
-            nominal.latent,
-            request,
-            nominal.road,
-            limit,
-            width=self.width,
+            self.model, fiber, now.latent, request, now.road, limit, width=self.width
         )
-        unchanged = finite & jnp.all(chosen.nu == request)
-        filtered = jnp.clip(now.law_control + chosen.nu, low, high)
         # A request that passes is returned bit for bit, not as law + (u − law).
-        control = jnp.where(now.applicable & ~unchanged, filtered, planned)
-        cut = jnp.where(flags["outside_box"], 1.0, 1.0 - chosen.scale)
-        cut = jnp.where(nominal.started & jnp.any(chosen.nu != request), cut, 0.0)
+        filtered = jnp.clip(law_control + chosen.nu, low, high)
+        changed = ~finite | jnp.any(chosen.nu != request)
+        applicable = now.started & all_finite(law_control)
+        control = jnp.where(applicable & changed, filtered, planned)
 
         # A latent that is not finite would stay so: the nominal model starts anew.
-        running = nominal.started & all_finite(chosen.latent)
-        after = ShieldState(
-            inner=inner,
-            nominal=nominal._replace(
-                latent=_where(running, chosen.latent, nominal.latent), started=running
-            ),
-            interventions=state.interventions + (cut > 0.0),
-            exceeded_steps=state.exceeded_steps + flags["bound_exceeded"],
-        )
-        feasible = nominal.started & chosen.feasible
+        running = now.started & all_finite(chosen.latent)
+        latent = jax.tree.map(partial(jnp.where, running), chosen.latent, now.latent)
+        cut = jnp.where(flags["outside_box"], 1.0, 1.0 - chosen.scale)
+        feasible = now.started & chosen.feasible
         invalid = flags["bound_exceeded"] | flags["outside_box"]
         invalid |= flags["dead_reckoning"] | ~flags["env_inside"]
         report: Any = {
             **info,
             **flags,
-            "margin": jnp.where(nominal.started, chosen.margin, jnp.nan),
-            "intervention": cut,
+            "margin": jnp.where(now.started, chosen.margin, jnp.nan),
+            "intervention": jnp.where(
+                now.started & jnp.any(chosen.nu != request), cut, 0.0
+            ),
             "perturbation": chosen.nu,
             "corridor": jnp.asarray(self.width + self.tube, dtype=float),
             "feasible": feasible,
-            "request_finite": finite,
-            "interventions": after.interventions,
-            "exceeded_steps": after.exceeded_steps,
             "shield_healthy": feasible & ~invalid,
         }
-        return control, after, report
+        return control, now._replace(latent=latent, started=running), report
 
     def _compare(
         self,
         params: Params,
-        before: NominalState,
+        before: ShieldState,
         coordinates: PathState,
         env: Environment,
         preview: Preview,
-    ) -> Comparison:
-        """Compare the nominal model with a measurement, and evaluate the law."""
+    ) -> tuple[ShieldState, Fiber, Control, dict[str, Any]]:
+        """Compare the nominal model with a measurement, and evaluate the law.
+
+        Returns:
+            The nominal model in the fibre of the current environment, moved to the
+            measurement if necessary; the fibre; the law's control at the measurement
+            or, without one, at the nominal ξ; entries of `info`.
+        """
         model = self.model
         last_env = jnp.where(all_finite(env), env, before.env)
         inside = self.conditions.nearest(last_env)
@@ -427,18 +365,17 @@ class Shield:
         distance = jnp.abs(coordinates - model.decode(fiber, latent)[BODY])[LATERAL]
         compared = believed & before.started
         exceeded = compared & ~(distance <= self.tube + self.noise_allowance)
-        started = before.started | believed
         # The bound does not hold for this vehicle: what follows is about a nominal
         # model that starts at the vehicle.
-        moved = believed & (~before.started | (exceeded & self.reanchor))
-        latent = _where(moved, anchor, latent)
+        moved = believed & (~before.started | exceeded)
+        latent = jax.tree.map(partial(jnp.where, moved), anchor, latent)
+        started = before.started | believed
 
         nominal_xi = model.decode(fiber, latent)[BODY]
         # Without a measurement the loop is closed around the nominal model.
         xi = jnp.where(believed, coordinates, nominal_xi)
         law_control = self.law(xi, road[0, 0], road[0, 1], inside)
-        applicable = started & all_finite(law_control)
-        covered = applicable & jnp.all(inside == last_env)
+        covered = all_finite(law_control) & jnp.all(inside == last_env)
         covered &= self.conditions.hold(xi, road[0])
         flags = {
             "nominal_state": jnp.where(started, nominal_xi, jnp.nan),
@@ -448,8 +385,8 @@ class Shield:
             "dead_reckoning": started & ~believed,
             "env_inside": jnp.all(inside == env),
         }
-        nominal = NominalState(latent, started, inside, road)
-        return Comparison(nominal, fiber, law_control, applicable, flags)
+        now = ShieldState(before.inner, latent, started, inside, road)
+        return now, fiber, law_control, flags
 
 
 def _request(
@@ -461,19 +398,12 @@ def _request(
     return jnp.where(above | below, 0.0, planned - law_control)
 
 
-def check_box(name: str, box: Box | None, size: int) -> None:
+def _check_box(name: str, box: Box | None, size: int) -> None:
     """Raise a ValueError if a box has the wrong size or is empty."""
-    if box is None:
-        return
-    low, high = box
+    low, high = box or ((0.0,) * size,) * 2
     sized = len(low) == len(high) == size
     if not sized or not all(a <= b for a, b in zip(low, high, strict=True)):
         raise ValueError(
             f"the box of {name} needs {size} lower limits below {size} upper ones, "
             f"got {low} and {high}"
         )
-
-
-def _where(condition: Bool[Array, ""], left: Latent, right: Latent) -> Latent:
-    """`jnp.where` for latents."""
-    return jax.tree.map(lambda a, b: jnp.where(condition, a, b), left, right)

@@ -4,14 +4,14 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from typing import Any, NamedTuple
+from typing import Annotated, Any, NamedTuple
 
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
 from sfkd_jax.control.planners._plans import all_finite
 from sfkd_jax.geometry import LATERAL, between, compose, curvature_ahead, wrap_angle
-from sfkd_jax.ranges import Fraction, Positive
+from sfkd_jax.ranges import AtLeastTwo, Fraction, Interval, Positive, check_intervals
 from sfkd_jax.types import (
     POSE,
     Control,
@@ -25,7 +25,7 @@ from sfkd_jax.types import (
     State,
 )
 
-RADIUS_RANGE = (1e-3, 1e2)
+RADIUS = Interval("[1e-3, 1e2]")
 """Least and largest radius [m]."""
 GRIP_SHARE = 0.8
 """Share of the grip that a turn must ask for to prove it."""
@@ -36,8 +36,8 @@ class OnlineTubeState(NamedTuple):
 
     Attributes:
         inner: state of the wrapped controller.
-        plans: e_y that the last plans predicted, newest first [m].
-        known: which of them were finite.
+        plans: e_y that the last plans predicted, newest first [m]; NaN where a plan is
+            not finite, and before there was one.
         radii: r_h of the tube [m].
         corridor_factor: of the reference speed, at which the corridor fits the lane.
         speed_factor: of the reference speed that is followed.
@@ -47,7 +47,6 @@ class OnlineTubeState(NamedTuple):
 
     inner: Any
     plans: Float[Array, "horizon horizon"]
-    known: Bool[Array, " horizon"]
     radii: Float[Array, " horizon"]
     corridor_factor: Scalar
     speed_factor: Scalar
@@ -105,31 +104,17 @@ class OnlineTube:
     """
 
     inner: Controller
-    horizon: int
+    horizon: AtLeastTwo
     level: Fraction = 0.95
     rate: Positive = 0.2
-    start_radius: Positive = 0.03
+    start_radius: Annotated[float, RADIUS] = 0.03
     lane: Positive | None = 0.1
     slowest: Positive = 8.0
     fall: Fraction = 0.01
     grip: Positive | None = None
 
     def __post_init__(self) -> None:
-        level, rate, start_radius = self.level, self.rate, self.start_radius
-        if not 0 < level < 1 or not 0 < rate < math.inf:
-            raise ValueError(
-                f"level must lie in (0, 1) and rate be positive, got {level} and {rate}"
-            )
-        if not RADIUS_RANGE[0] <= start_radius <= RADIUS_RANGE[1]:
-            raise ValueError(
-                f"start_radius must lie in {list(RADIUS_RANGE)}, got {start_radius}"
-            )
-        for name in ("lane", "grip"):
-            value = getattr(self, name)
-            if value is not None and not 0 < value < math.inf:
-                raise ValueError(f"{name} must be positive or None, got {value}")
-        if not 0 < self.slowest < math.inf:
-            raise ValueError(f"slowest must be positive, got {self.slowest}")
+        check_intervals(self)
 
     def controller(self) -> Controller:
         """Return the controller in the world."""
@@ -140,8 +125,7 @@ class OnlineTube:
         horizon = self.horizon
         return OnlineTubeState(
             inner=self.inner.init(key),
-            plans=jnp.zeros((horizon, horizon), dtype=float),
-            known=jnp.zeros(horizon, dtype=bool),
+            plans=jnp.full((horizon, horizon), jnp.nan, dtype=float),
             radii=jnp.full(horizon, self.start_radius, dtype=float),
             corridor_factor=jnp.ones(()),
             speed_factor=jnp.ones(()),
@@ -166,19 +150,19 @@ class OnlineTube:
         )
         # The plan of h steps ago said where the car would be now: the h-th diagonal.
         errors = jnp.abs(info["path_state"][LATERAL] - jnp.diagonal(state.plans))
-        errors = jnp.where(state.known, errors, jnp.nan)
         missed = errors > state.radii
-        radii = self._calibrated(state.radii, errors)
+        change = jnp.exp(self.rate * (missed - (1.0 - self.level)))
+        radii = jnp.clip(state.radii * change, *RADIUS.ends)
+        # Without a comparison there is nothing to learn from.
+        radii = jnp.where(jnp.isfinite(errors), radii, state.radii)
         plan = info["planned_path"][:, LATERAL]
-        known = all_finite(plan)
-        plan = jnp.where(known, plan, jnp.nan)
+        plan = jnp.where(all_finite(plan), plan, jnp.nan)
         corridor = jnp.max(jnp.abs(plan) + radii)
         fits = corridor <= (math.inf if self.lane is None else self.lane)
         corridor_factor, grip, factor = self._speeds(state, reference, fits)
         after = OnlineTubeState(
             inner=inner,
-            plans=jnp.concatenate([jnp.nan_to_num(plan)[None], state.plans[:-1]]),
-            known=jnp.append(known, state.known[:-1]),
+            plans=jnp.concatenate([plan[None], state.plans[:-1]]),
             radii=radii,
             corridor_factor=corridor_factor,
             speed_factor=factor,
@@ -226,15 +210,6 @@ class OnlineTube:
         grip = state.grip * jnp.where(fits, proved, 1.0 - self.fall)
         cap = jnp.sqrt(grip / jnp.maximum(jnp.max(ahead), 1e-6))
         return jnp.where(jnp.isfinite(cap), cap, 1.0), grip
-
-    def _calibrated(
-        self, radii: Float[Array, " horizon"], errors: Float[Array, " horizon"]
-    ) -> Float[Array, " horizon"]:
-        """The radii after a comparison; unchanged where there was none."""
-        missed = errors > radii
-        change = self.rate * (missed - (1.0 - self.level))
-        after = jnp.clip(radii * jnp.exp(change), *RADIUS_RANGE)
-        return jnp.where(jnp.isfinite(errors), after, radii)
 
 
 def slow_down(reference: Reference, factor: float | Scalar) -> Reference:
