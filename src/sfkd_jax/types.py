@@ -248,7 +248,6 @@ class ControllerInfo(TypedDict, total=False):
     causes_std: Float[Array, " 5"]  # standard deviations of the estimates
     rejected: Bool[Array, ""]  # nothing was learned from the measurement
     adapting: Bool[Array, ""]  # the causes do not predict worse than none
-    weights_changed: Bool[Array, ""]  # since the first step
     # OnlineTube
     tube: Float[Array, " horizon"]  # radius around the plan [m]
     tube_errors: Float[Array, " horizon"]  # of the plans of 1 … horizon steps ago [m]

@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cached_property
 from typing import Annotated, Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Float, UInt32
+from jaxtyping import Array, Float
 
 from sfkd_jax.control.laws._path_law import PathLaw
 from sfkd_jax.control.planners._plans import all_finite
@@ -26,7 +27,14 @@ from sfkd_jax.control.wrappers._estimator import (
     transition_matrix,
 )
 from sfkd_jax.geometry import LATERAL, PATH_SPEED, PathState, path_state
-from sfkd_jax.ranges import AtLeastTwo, Fraction, Interval, Positive
+from sfkd_jax.ranges import (
+    AtLeastOne,
+    AtLeastTwo,
+    Fraction,
+    Interval,
+    Positive,
+    check_intervals,
+)
 from sfkd_jax.rollout import Offset, fold
 from sfkd_jax.types import (
     BODY,
@@ -52,12 +60,10 @@ class AdaptiveState(NamedTuple):
     Attributes:
         inner: state of the wrapped controller.
         belief: of the estimator; the part to save and resume.
-        weights: checksum of the parameters at the first step; 0 before.
     """
 
     inner: Any
     belief: Belief
-    weights: UInt32[Array, ""]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -83,9 +89,9 @@ class Adaptation:
     θ is data of the state: nothing is compiled again.
 
     `info` gains `env_estimate` (the e planned with), `causes` (5,), `causes_std` (5,),
-    `rejected` (nothing was learned from the measurement), `adapting` (over the last
+    `rejected` (nothing was learned from the measurement) and `adapting` (over the last
     seconds the estimates did not predict worse than the model alone; otherwise they are
-    not used) and `weights_changed` (the parameters are not those of the first step).
+    not used).
 
     Attributes:
         inner: built with `with_offset(model)`; receives `Offset` parameters.
@@ -103,8 +109,8 @@ class Adaptation:
             unit], steering and relative side force in the tightest turn, before the
             first measurement.
         slow_drift: of their change over a step: the slower, the longer their memory.
-        shrinkage: s of f̂ max(0, 1 − s var f / f̂²), which leaves alone what could be
-            noise (James-Stein); not used with `estimate_env`.
+        shrinkage: of a force that could be noise, see `Estimator.causes`; not used with
+            `estimate_env`.
         friction_points: number of hypotheses on friction, with `estimate_env`.
         friction_drift: standard deviation of friction over a step.
         dwell: mean number of steps between jumps of friction.
@@ -140,15 +146,8 @@ class Adaptation:
     friction_drift: Positive = 0.01
     dwell: Annotated[float, Interval("(1, inf)")] = 30.0
     sensor_noise: tuple[float, ...] = (0.015, 0.015, 0.002, 0.03, 0.02, 0.002, 0.001)
-    model_error: tuple[Positive, ...] = (
-        0.001,
-        0.0003,
-        0.003,
-        0.003,
-        0.0015,
-        0.0005,
-    )
-    patience: int = 5
+    model_error: tuple[Positive, ...] = (1e-3, 3e-4, 3e-3, 3e-3, 1.5e-3, 5e-4)
+    patience: AtLeastOne = 5
 
     def __post_init__(self) -> None:
         low, high = self.env_low, self.env_high
@@ -167,8 +166,7 @@ class Adaptation:
                 "sensor_noise and model_error need positive numbers for "
                 f"{size} path coordinates, got {noise} and {error}"
             )
-        if self.patience < 1:
-            raise ValueError(f"patience must be at least 1, got {self.patience}")
+        check_intervals(self)
 
     @property
     def _noise(self) -> tuple[tuple[float, ...], tuple[float, ...]]:
@@ -188,7 +186,7 @@ class Adaptation:
         # A wide prior where e is unknown; elsewhere the force is only what e misses.
         force = 1.0 if self.estimate_env else 0.1
         prior = jnp.asarray([*noise, force, *self.slow_prior], dtype=float) ** 2
-        count = self._estimator().frictions.shape[0]
+        count = self._estimator.frictions.shape[0]
         unknown = jnp.full(2, jnp.nan, dtype=float)
         belief = Belief(
             bank=Bank(
@@ -201,8 +199,7 @@ class Adaptation:
             missing=jnp.zeros((), dtype=jnp.int32),
             scores=jnp.zeros(2),
         )
-        nothing = jnp.zeros((), dtype=jnp.uint32)
-        return AdaptiveState(self.inner.init(key), belief, nothing)
+        return AdaptiveState(self.inner.init(key), belief)
 
     def act(
         self,
@@ -213,11 +210,8 @@ class Adaptation:
         preview: Preview,
     ) -> tuple[Control, AdaptiveState, ControllerInfo]:
         """Take one control step."""
-        estimator, before = self._estimator(), state.belief
-        loop = estimator.loop
-        weights = _checksum(params)
-        # 0 stands for "no step yet", and a checksum is never 0.
-        changed = (state.weights != 0) & (weights != state.weights)
+        estimator, before = self._estimator, state.belief
+        loop, size = estimator.loop, coordinates.shape[0]
         params = fold(self.model, params)
         clean = all_finite((coordinates, preview.road))
         clean &= self.estimate_env | all_finite(env)
@@ -227,13 +221,10 @@ class Adaptation:
         belief, rejected = estimator.follow(params, before, coordinates, usable)
         adapting = belief.scores[0] <= TOLERANCE * belief.scores[1]
         # Causes that predict worse than none are not used, unless e depends on them.
-        causes = jnp.where(
-            adapting | self.estimate_env,
-            estimator.causes(belief, 0.0 if self.estimate_env else self.shrinkage),
-            0.0,
-        )
+        shrinkage = 0.0 if self.estimate_env else self.shrinkage
+        causes = estimator.causes(belief, shrinkage)
+        causes = jnp.where(adapting | self.estimate_env, causes, 0.0)
 
-        size = coordinates.shape[0]
         if self.estimate_env:
             friction = belief.bank.probabilities @ estimator.frictions
             env = jnp.zeros_like(env).at[FRICTION].set(friction)
@@ -249,29 +240,30 @@ class Adaptation:
         )
         correction = offset.inputs[:2] - input_error(causes, road)
         control = control + jnp.where(jnp.isfinite(correction), correction, 0.0)
-        control = jnp.clip(
-            control, jnp.asarray(self.control_low), jnp.asarray(self.control_high)
-        )
+        limits = jnp.asarray(self.control_low), jnp.asarray(self.control_high)
+        control = jnp.clip(control, *limits)
 
         report: ControllerInfo = {
             **info,
-            "healthy": info["healthy"] & clean & ~changed,
+            "healthy": info["healthy"] & clean,
             "env_estimate": inside,
             "causes": causes,
             "causes_std": jnp.sqrt(belief.bank.variance()[size:]),
             "rejected": rejected,
             "adapting": adapting,
-            "weights_changed": changed,
         }
-        belief = belief.applied_next(Applied(control, road, env))
-        first = jnp.where(state.weights == 0, weights, state.weights)
-        return control, AdaptiveState(inner, belief, first), report
+        # What is not finite acts as before, as far as is known.
+        applied = jax.tree.map(
+            lambda now, last: jnp.where(jnp.isfinite(now), now, last),
+            Applied(control, road, env),
+            belief.applied,
+        )
+        return control, AdaptiveState(inner, belief._replace(applied=applied)), report
 
+    @cached_property
     def _estimator(self) -> Estimator:
-        """The filters: for each friction one whose force stays, and one where it jumps.
-
-        Constants of the program, also where this is called while a program is traced.
-        """
+        """For each friction a filter whose force stays, and one where it jumps."""
+        # Constants of the program, also where a program is traced when they are made.
         with jax.ensure_compile_time_eval():
             noise, error = self._noise
             low = jnp.asarray(self.env_low, dtype=float)
@@ -317,15 +309,8 @@ def _compensation(
         z⁺ = F(z, w + δ; e) + ∂Φ/∂ξ d
 
     δ is the offset-free target of the closed loop (Pannocchia and Rawlings, 2003);
-    only its steering is used. A and B are the derivatives of one step of the loop.
-
-    Args:
-        loop: the model and its law.
-        params: of the model.
-        env: e in E, with the force inside E.
-        road: κ [1/m] and v_ref [m/s].
-        coordinates: ξ.
-        excess: force beyond E, relative to the largest in E.
+    only its steering is used. A and B are the derivatives of one step of the loop; e
+    has the force inside E, `excess` is what lies beyond, relative to the largest in E.
     """
     model, size = loop.model, coordinates.shape[0]
     fiber = model.fiber(params, env)
@@ -352,20 +337,3 @@ def _compensation(
     )
     latent = jax.tree.map(lambda leaf: jnp.where(jnp.isfinite(leaf), leaf, 0.0), latent)
     return Offset(params, jnp.zeros(4).at[0].set(steering), latent)
-
-
-def _checksum(params: Params) -> UInt32[Array, ""]:
-    """A sum over the bits of all weights in their order, mixed as MurmurHash3 does.
-
-    Between two steps it shows a changed weight, not a forged one: the hash of the
-    certificate does that.
-    """
-    total = jnp.ones((), dtype=jnp.uint32)
-    for leaf in jax.tree.leaves(params):
-        bits = jax.lax.bitcast_convert_type(jnp.asarray(leaf, float), jnp.uint32)
-        index = jnp.arange(bits.size, dtype=jnp.uint32)
-        mixed = bits.ravel() + jnp.uint32(0x9E3779B9) * index
-        mixed = (mixed ^ (mixed >> 16)) * jnp.uint32(0x85EBCA6B)
-        # 31 is odd: multiplication loses no bit of what came before.
-        total = 31 * total + jnp.sum(mixed ^ (mixed >> 13), dtype=jnp.uint32)
-    return jnp.maximum(total, 1)

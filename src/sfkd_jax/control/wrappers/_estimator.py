@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from functools import partial
 from typing import NamedTuple
 
 import jax
@@ -172,13 +173,7 @@ def side_force(causes: Float[Array, " cause"], road: Float[Array, " 2"]) -> Scal
 
 
 def input_error(causes: Float[Array, " cause"], road: Float[Array, " 2"]) -> Control:
-    """Return the difference between the control that acts and the one applied.
-
-    Args:
-        causes: (relative side force, steering [rad], drive [control unit], steering
-            [rad] and relative side force in the tightest turn).
-        road: κ [1/m] and v_ref [m/s].
-    """
+    """Return what acts beside the control: steering [rad], drive [control unit]."""
     steering = causes[STEERING] + causes[TURN_STEERING] * road[0] / TIGHTEST
     return jnp.stack([steering, causes[DRIVE]])
 
@@ -211,11 +206,9 @@ class Loop(NamedTuple):
     def split_force(
         self, env: Environment, force: Scalar
     ) -> tuple[Environment, Scalar]:
-        """Return the e in E with as much of a side force as fits, and the rest.
+        """Return the e in E with as much of an additional force as fits, and the rest.
 
-        Args:
-            env: e without the force.
-            force: in addition to the wind, relative to the largest in E.
+        Forces are relative to the largest in E.
         """
         total = self.relative_force(env) + force
         inside = jnp.clip(total, -1.0, 1.0)
@@ -256,13 +249,8 @@ class Loop(NamedTuple):
     ) -> tuple[PathState, Float[Array, "coordinate vector"]]:
         """Return ξ⁺ under unmeasured causes, and its Jacobian by (ξ, causes).
 
-        The force acts as wind within E and along `force_slope` beyond it.
-
-        Args:
-            params: of the model.
-            applied: e is that without the causes.
-            xi: ξ.
-            causes: see `input_error`.
+        The force acts as wind within E and along `force_slope` beyond it; the e of
+        `applied` is that without the causes.
         """
         at, road = xi.shape[0], applied.road
         env, excess = self.split_force(applied.env, side_force(causes, road))
@@ -300,13 +288,6 @@ class Belief(NamedTuple):
     started: Bool[Array, ""]
     missing: Int[Array, ""]
     scores: Float[Array, " 2"]
-
-    def applied_next(self, now: Applied) -> Belief:
-        """Return the belief when a step begins; what is not finite acts as before."""
-        applied = jax.tree.map(
-            lambda new, old: jnp.where(jnp.isfinite(new), new, old), now, self.applied
-        )
-        return self._replace(applied=applied)
 
 
 @dataclass(frozen=True)
@@ -373,13 +354,9 @@ class Estimator:
         return belief, ~learned
 
     def causes(self, belief: Belief, shrinkage: float) -> Float[Array, " cause"]:
-        """Return the estimated causes; a force that could be noise is shrunk.
+        """Return the estimated causes, with f̂ max(0, 1 − s var f / f̂²) of the force.
 
-        f̂ max(0, 1 − s var f / f̂²)
-
-        Args:
-            belief: after a measurement.
-            shrinkage: s.
+        A force that could be noise is thereby left alone (James-Stein).
         """
         size = self.sensors.shape[0]
         causes, variance = belief.bank.mean()[size:], belief.bank.variance()[size:]
@@ -433,4 +410,4 @@ def _assuming(applied: Applied, friction: Array) -> Applied:
 
 def _select(choice: Bool[Array, ""], first: Bank, second: Bank) -> Bank:
     """One of two banks."""
-    return jax.tree.map(lambda a, b: jnp.where(choice, a, b), first, second)
+    return jax.tree.map(partial(jnp.where, choice), first, second)
