@@ -227,18 +227,9 @@ class ControllerInfo(TypedDict, total=False):
     healthy: Required[Bool[Array, ""]]  # False: the last finite plan is continued
     env_inside: Required[Bool[Array, ""]]  # whether e is in its box
     predicted_states: Required[Float[Array, "horizon state"]]  # of the chosen plan
-    # planners with info_level="samples", of all candidates
-    sample_costs: Float[Array, " sample"]
-    sample_weights: Float[Array, " sample"]  # in the chosen plan
-    sample_plans: Float[Array, "horizon sample control"]  # allowed perturbations
-    sample_states: Float[Array, "horizon sample state"]  # predicted
     # planners of a constrained task
     violation: Scalar  # the largest of a constraint along the chosen plan, not below 0
     constraints_kept: Bool[Array, ""]  # it is 0
-    # planners with gain_samples
-    gains: Float[Array, "control state"]  # du/dx of the plan, see `between_plans`
-    # koopman_mpc
-    residual: Scalar  # of the quadratic program, in control units
     # along_reference
     path_state: Float[Array, " coordinate"]  # ξ; NaN where it is not known
     planned_path: Float[Array, "horizon coordinate"]  # predicted ξ of the chosen plan

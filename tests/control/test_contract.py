@@ -144,14 +144,13 @@ def online_tube():
 
 
 def constrained():
-    """With a lane as a constraint, and gains of the plan."""
+    """With a lane as a constraint."""
     task, params = along_path(FEEDBACK)
     lane = lambda data, state, u, target, at: jnp.abs(state[1:2]) - data
     planned = control.mppi(
         control.constrained(task, lane, 3.0),
         num_samples=16,
         horizon=HORIZON,
-        gain_samples=4,
         **BOX,
     )
     return planned, params
@@ -161,15 +160,13 @@ FEEDBACK = control.path_feedback(wheelbase=PLANT.wheelbase)
 PLANNERS = {name: partial(registered, name) for name in build.PLANNERS}
 VARIANTS = {
     "mppi_plain": partial(mppi, control.no_feedback(), noise_std=(0.06, 0.6)),
-    "mppi_smoothed": partial(mppi, FEEDBACK, smoothing_window=5),
     "mppi_knots": partial(
         mppi,
         FEEDBACK,
-        noise="rbf",
+        noise="spline",
         noise_knots=3,
         effective_samples=4.0,
         iterations=2,
-        info_level="samples",
     ),
     "mppi_constrained": constrained,
 }
@@ -287,8 +284,10 @@ def test_a_batch_of_controllers_acts_as_each_one_alone(name):
     assert same(
         batch,
         stack(*[act(params, *each, REFERENCE) for each in inputs]),
-        rtol=1e-4,
-        atol=1e-4 if name == "koopman_mpc" else 1e-5,  # an iterative program
+        # The quadratic program is iterative, and its predictor far from the data.
+        **dict.fromkeys(("rtol", "atol"), 1e-3)
+        if name == "koopman_mpc"
+        else {"rtol": 1e-4, "atol": 1e-5},
     )
     assert len(np.unique(np.asarray(batch[0]), axis=0)) == 3
 

@@ -9,6 +9,7 @@ import pytest
 from helpers import ENV_HIGH, ENV_LOW, jit, model_and_params, straight
 
 from sfkd_jax import control, evaluation, models, plants, scenarios
+from sfkd_jax.control.planners._noise import SamplingPlanner
 
 PLANT = plants.kinematic()
 LIMITS = {"control_low": PLANT.control_low, "control_high": PLANT.control_high}
@@ -22,13 +23,16 @@ ENV = np.float32([0.7, 3.0])
 REFERENCE = np.asarray(straight(HORIZON))
 
 
-def planner(model, law=FEEDBACK, limits="actuators", latent_weight=0.0, **settings):
+def planner_task(model=None, law=FEEDBACK, limits=LIMITS):
+    model = model or models.physics(PLANT.nominal)
+    return control.path_tracking(model, COST, law, dt=0.1, **limits)
+
+
+def planner(model, law=FEEDBACK, limits="actuators", **settings):
     limits = {"actuators": LIMITS, "wide": WIDE}[limits]
-    task = control.path_tracking(
-        model, COST, law, dt=0.1, latent_weight=latent_weight, **limits
-    )
     return control.mppi(
-        task, **{"num_samples": 64, "horizon": HORIZON, **BOX, **settings}
+        planner_task(model, law, limits),
+        **{"num_samples": 64, "horizon": HORIZON, **BOX, **settings},
     )
 
 
@@ -68,8 +72,8 @@ def test_as_the_temperature_falls_the_plan_becomes_the_best_samples():
         law=control.no_feedback(), temperature=1e-4, limits="wide"
     )
     noise_key, _ = jax.random.split(jax.random.key(0))
-    std = jnp.asarray([0.02, 0.3])
-    noise = control.noise_sampler("ar1", horizon=HORIZON)(noise_key, 64, std)
+    sampler = SamplingPlanner(planner_task(), num_samples=64, horizon=HORIZON)
+    noise = sampler.draw(noise_key, jnp.asarray([0.02, 0.3]))
     plans = np.array(noise)
     plans[:, 0] = 0.0
     step = jit(jax.vmap(PLANT.step, in_axes=(0, 0, None)))

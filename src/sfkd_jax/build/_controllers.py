@@ -45,9 +45,8 @@ PLANNERS = {
 an entry here and a file in `conf/controller`.
 """
 _DECIDED = (
-    *("dt", "wheelbase", "speed_loop", "control_low", "control_high", "actuator"),
-    *("env_low", "env_high", "estimate_env", "inner", "model", "law", "ancillary"),
-    *("several", "info_level", "sharding", "unroll"),
+    *("dt", "wheelbase", "speed_loop", "control_low", "control_high"),
+    *("env_low", "env_high", "estimate_env", "inner", "model", "law", "unroll"),
 )
 """Arguments of controllers that vehicle, environment and model decide, and those for
 programs that build their own.
@@ -102,12 +101,10 @@ class SearchSettings(ControllerSettings):
     """A planner that searches around a law, and what is built around it.
 
     Attributes:
-        ancillary: whether the law of the model corrects between plan and prediction.
         shield: whether plans are kept inside the corridor of a certificate.
         adaptive: whether unmeasured forces are estimated while driving.
     """
 
-    ancillary: bool = False
     shield: bool = False
     adaptive: bool = False
     feedback: Any = None
@@ -123,8 +120,8 @@ def _controller_schema(name: str, planner: Planner) -> type[ControllerSettings]:
         "task": control.path_tracking,
     }
     base = ControllerSettings
-    # A quadratic program has no rate limits and no latent states in its task.
-    skip = (*_DECIDED, "control_rate", "latent_weight")
+    # A quadratic program has no rate limits in its task.
+    skip = (*_DECIDED, "control_rate")
     if planner.samples:
         base, skip = SearchSettings, _DECIDED
         factories |= {
@@ -276,7 +273,6 @@ def _task(
         dt=plant.dt,
         control_low=plant.control_low,
         control_high=plant.control_high,
-        ancillary=model_law if settings.ancillary else None,
         **arguments(settings.task, control.path_tracking),
     )
 
@@ -295,13 +291,11 @@ def _planner(
         return factory(task, **options)
     return factory(
         model,
-        dt=plant.dt,
+        _cost(settings, plant),
         control_low=plant.control_low,
         control_high=plant.control_high,
-        speed_loop=plant.speed_loop,
         # Of the task's settings a quadratic program has the terminal weight alone.
         terminal_weight=settings.task.terminal_weight,
-        **arguments(settings.cost, control.tracking_cost),
         **options,
     )
 

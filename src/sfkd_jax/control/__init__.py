@@ -14,23 +14,19 @@ from sfkd_jax.control.laws._path_law import (
     derive_path_law,
     law_from_arrays,
 )
-from sfkd_jax.control.planners._autotune import autotune
 from sfkd_jax.control.planners._cem import cem
-from sfkd_jax.control.planners._gains import between_plans
 from sfkd_jax.control.planners._gradient import gradient_planner
 from sfkd_jax.control.planners._koopman_mpc import koopman_mpc
 from sfkd_jax.control.planners._mppi import mppi
-from sfkd_jax.control.planners._noise import noise_sampler
-from sfkd_jax.control.planners._planner import Planner
-from sfkd_jax.control.planners._plans import SearchResult, tuned
+from sfkd_jax.control.planners._planner import Planner, SearchResult, tuned
 from sfkd_jax.control.tasks._along_path import along_reference, following_law
 from sfkd_jax.control.tasks._constraints import (
     at_step,
     constrained,
-    inside_limits,
     outside_boxes,
     outside_circles,
 )
+from sfkd_jax.control.tasks._environments import over_environments
 from sfkd_jax.control.tasks._path_tracking import (
     Cost,
     StageInputs,
@@ -68,9 +64,9 @@ __all__ = [
     "constrained",
     "following_law",
     "free_task",
-    "inside_limits",
     "outside_boxes",
     "outside_circles",
+    "over_environments",
     "path_tracking",
     "tracking_cost",
 ]
@@ -78,14 +74,11 @@ __all__ = [
 __all__ += [
     "Planner",
     "SearchResult",
-    "autotune",
-    "between_plans",
     "cem",
     "factory",
     "gradient_planner",
     "koopman_mpc",
     "mppi",
-    "noise_sampler",
     "tuned",
 ]
 # laws

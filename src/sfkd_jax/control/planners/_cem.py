@@ -8,16 +8,15 @@ import jax
 import jax.numpy as jnp
 
 from sfkd_jax.control._factory import factory
-from sfkd_jax.control.planners._mppi import SamplingPlanner
-from sfkd_jax.control.planners._plans import (
+from sfkd_jax.control.planners._noise import SamplingPlanner
+from sfkd_jax.control.planners._planner import (
     Evaluate,
     Plan,
-    PlannerState,
     SearchResult,
-    candidate_plans,
+    Tuning,
+    iterate,
     replace_nonfinite,
 )
-from sfkd_jax.control.planners._weights import keep_constraints
 from sfkd_jax.types import Key
 
 
@@ -28,8 +27,7 @@ class Cem(SamplingPlanner):
         ν ← mean of the elites,   σ_k ← max(their standard deviation at step k, σ_min)
 
     Each iteration samples plans, keeps the elites and fits mean and standard deviation
-    to them. Sample 0 is the current mean, so the best cost never increases between
-    iterations. A rollout that is not finite is never an elite.
+    to them. A rollout that is not finite is never an elite.
 
     Attributes:
         elites: number of samples kept.
@@ -53,22 +51,21 @@ class Cem(SamplingPlanner):
                 f"got {self.elites} of {self.num_samples}"
             )
 
-    def search(self, key: Key, state: PlannerState, evaluate: Evaluate) -> SearchResult:
+    def search(
+        self, key: Key, plan: Plan, tuning: Tuning, evaluate: Evaluate
+    ) -> SearchResult:
         """Return the mean of the elites of the last iteration."""
-        std = state.tuning.noise_std
 
         def improve(
             carry: tuple[Plan, Plan], key: Key
         ) -> tuple[tuple[Plan, Plan], SearchResult]:
             plan, scale = carry
             # Narrower with every iteration, per step and control.
-            noise = self.draw(key, self.num_samples, std) * scale[:, None]
-            evaluated = evaluate(candidate_plans(plan, noise, state))
-            costs, best = replace_nonfinite(evaluated.costs, jnp.inf), None
-            if evaluated.violations is not None:
-                costs, _ = keep_constraints(costs, evaluated.violations)
-                best = evaluated.perturbations[:, jnp.argmin(costs)]
-            negated, chosen = jax.lax.top_k(-costs, self.elites)
+            noise = self.draw(key, tuning.noise_std) * scale[:, None]
+            # Sample 0 is the mean itself: the best cost never increases.
+            evaluated = evaluate(plan[:, None] + noise.at[:, 0].set(0.0))
+            ranks, _ = evaluated.ranked()
+            negated, chosen = jax.lax.top_k(-ranks, self.elites)
             # Fewer finite rollouts than elites: only those count.
             counts = jnp.isfinite(negated).astype(float)
             size = jnp.sum(counts)
@@ -77,23 +74,18 @@ class Cem(SamplingPlanner):
             mean = jnp.einsum("m,tmc->tc", weights, elite)
             squares = (elite - mean[:, None]) ** 2
             spread = jnp.sqrt(jnp.einsum("m,tmc->tc", weights, squares))
-            kept = jnp.zeros_like(costs).at[chosen].set(weights)
             result = SearchResult(
                 plan=mean,
                 usable=size > 0,
                 cost=-negated[0],
                 effective_samples=size,
-                samples=self._reported(evaluated, kept),
-                best=best,
+                best=elite[:, 0],
             )
             # A spread of zero could never grow again.
-            scale = jnp.maximum(spread / std[None], self.smallest_scale)
+            scale = jnp.maximum(spread / tuning.noise_std, self.smallest_scale)
             return (mean, scale), result
 
-        start = (state.plan, jnp.ones_like(state.plan))
-        keys = jax.random.split(key, self.iterations)
-        _, results = jax.lax.scan(improve, start, keys)
-        return jax.tree.map(lambda leaf: leaf[-1], results)
+        return iterate(improve, (plan, jnp.ones_like(plan)), key, self.iterations)
 
 
 cem = factory(Cem, Cem.controller)

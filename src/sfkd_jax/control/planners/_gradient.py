@@ -8,13 +8,13 @@ import jax
 import jax.numpy as jnp
 
 from sfkd_jax.control._factory import factory
-from sfkd_jax.control.planners._planner import Planner
-from sfkd_jax.control.planners._plans import (
+from sfkd_jax.control.planners._planner import (
     Evaluate,
     Plan,
-    PlannerState,
-    Plans,
+    Planner,
     SearchResult,
+    Tuning,
+    iterate,
     replace_nonfinite,
 )
 from sfkd_jax.ranges import AtLeastTwo, Fraction
@@ -30,8 +30,7 @@ class GradientPlanner(Planner):
     Perturbations are measured in units of noise_std (Σ = diag(σ²)), so a step of 1
     moves a control by about σ. All candidates of a line search are rolled out as one
     batch; s = 0 is one of them, so the cost never increases. The perturbations that
-    the limits allowed are kept, which projects the plan onto the limits. Proposals in
-    the state compete at the first iteration.
+    the limits allowed are kept, which projects the plan onto the limits.
 
     Nothing is random, and the key is not used. Derivatives that are not finite count
     as zero. The task must be differentiable.
@@ -54,46 +53,35 @@ class GradientPlanner(Planner):
                 "iterations >= 1, steps >= 2, 0 < shrink < 1, "
                 f"got {self.iterations}, {self.steps}, {self.shrink}"
             )
-
-    def search(self, key: Key, state: PlannerState, evaluate: Evaluate) -> SearchResult:
-        """Return the plan at the end of the descent."""
-        del key
-        std = state.tuning.noise_std
-        powers = self.shrink ** jnp.arange(self.steps - 1.0)
-        sizes = jnp.concatenate([jnp.zeros(1), powers])
-
-        def best_of(plans: Plans) -> tuple[Plan, SearchResult]:
-            evaluated = evaluate(plans)
-            costs = replace_nonfinite(evaluated.costs, jnp.inf)
-            best = jnp.argmin(costs)
-            plan = replace_nonfinite(evaluated.perturbations[:, best], 0.0)
-            chosen = (jnp.arange(costs.shape[0]) == best).astype(costs.dtype)
-            return plan, SearchResult(
-                plan=plan,
-                usable=jnp.isfinite(costs[best]),
-                cost=costs[best],
-                effective_samples=jnp.ones(()),
-                samples=self._reported(evaluated, chosen),
+        if self.task.constraint is not None:
+            raise ValueError(
+                "constraints need a search that ranks by them: mppi or cem"
             )
 
-        def descend(plan: Plan, _: None) -> tuple[Plan, SearchResult]:
-            def cost_of(plan: Plan) -> Scalar:
-                return evaluate(plan[:, None]).costs[0]
+    def search(
+        self, key: Key, plan: Plan, tuning: Tuning, evaluate: Evaluate
+    ) -> SearchResult:
+        """Return the plan at the end of the descent."""
+        std = tuning.noise_std
+        sizes = jnp.append(jnp.zeros(1), self.shrink ** jnp.arange(self.steps - 1.0))
 
+        def cost_of(plan: Plan) -> Scalar:
+            return evaluate(plan[:, None]).costs[0]
+
+        def descend(plan: Plan, _: Key) -> tuple[Plan, SearchResult]:
             slope = replace_nonfinite(jax.grad(cost_of)(plan), 0.0)
             downhill = -slope * std[None]  # in units of std
             size = jnp.sqrt(jnp.mean(downhill**2))
             # Of unit size, so that a step length means the same for every cost.
             direction = downhill / jnp.where(size > 0, size, 1.0) * std[None]
-            return best_of(plan[:, None] + sizes[None, :, None] * direction[:, None])
+            tried = evaluate(plan[:, None] + sizes[None, :, None] * direction[:, None])
+            costs, _ = tried.ranked()
+            best = jnp.argmin(costs)
+            plan = replace_nonfinite(tried.perturbations[:, best], 0.0)
+            usable = jnp.isfinite(costs[best])
+            return plan, SearchResult(plan, usable, costs[best], jnp.ones(()))
 
-        plan = state.plan
-        if state.proposals.shape[0]:
-            # They may lie in another valley: compare before descending.
-            proposals = state.proposals.swapaxes(0, 1)
-            plan, _ = best_of(jnp.concatenate([plan[:, None], proposals], axis=1))
-        _, results = jax.lax.scan(descend, plan, None, length=self.iterations)
-        return jax.tree.map(lambda leaf: leaf[-1], results)
+        return iterate(descend, plan, key, self.iterations)
 
 
 gradient_planner = factory(GradientPlanner, GradientPlanner.controller)

@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from dataclasses import KW_ONLY, dataclass
+from dataclasses import dataclass
 from typing import NamedTuple
 
 import jax
@@ -11,11 +10,22 @@ import jax.numpy as jnp
 from jax.scipy.linalg import cho_factor, cho_solve
 from jaxtyping import Array, Bool, Float
 
-from sfkd_jax.control._factory import factory
-from sfkd_jax.control.laws._feedback import path_errors
-from sfkd_jax.control.planners._plans import all_finite, clip_environment, shift
-from sfkd_jax.control.tasks._path_tracking import check_path
-from sfkd_jax.control.tasks._task import PlanningStart
+from sfkd_jax.control.laws._feedback import PathErrors, path_errors
+from sfkd_jax.control.planners._planner import (
+    Evaluate,
+    Plan,
+    Planner,
+    SearchResult,
+    Tuning,
+)
+from sfkd_jax.control.tasks._path_tracking import Cost, StageInputs, check_path
+from sfkd_jax.control.tasks._task import (
+    PlanningStart,
+    RolloutSetup,
+    StepIndex,
+    StepResult,
+    Task,
+)
 from sfkd_jax.geometry import between, compose, reference_curvature
 from sfkd_jax.ranges import AtLeastTwo
 from sfkd_jax.types import (
@@ -23,13 +33,12 @@ from sfkd_jax.types import (
     POSE,
     Control,
     Controller,
-    ControllerInfo,
     Environment,
-    Fiber,
     Key,
     LinearPredictor,
     Model,
     Params,
+    Pose,
     Reference,
     Scalar,
     State,
@@ -43,52 +52,37 @@ is positive definite in float32.
 """
 
 
-class KoopmanMpcState(NamedTuple):
-    """What the controller carries from one control step to the next.
+def koopman_mpc(
+    model: Model,
+    cost: Cost,
+    *,
+    control_low: tuple[float, ...],
+    control_high: tuple[float, ...],
+    horizon: AtLeastTwo = 20,
+    iterations: int = 12,
+    terminal_weight: float = 1.0,
+    env_low: tuple[float, ...] | None = None,
+    env_high: tuple[float, ...] | None = None,
+) -> Controller:
+    """Return the linear MPC of a lifted state, under `tracking_cost`.
 
-    Attributes:
-        plan: u_0 … u_{T-1}, shifted.
-        previous: the control applied last.
-        started: whether a control was planned before.
-    """
-
-    plan: Float[Array, "horizon control"]
-    previous: Control
-    started: Bool[Array, ""]
-
-
-@dataclass(frozen=True, eq=False)
-class KoopmanMpc:
-    """The condensed linear MPC of a lifted state, under `tracking_cost`.
-
-        min_u Σ_k q_y e_y² + q_c (Δe_y / v dt)² + q_v e_v² + q_δ̇ (Δδ / dt)² + q_a a²
+        min_u Σ_k ℓ(x_k, u_k) + w_T ℓ(x_T, u_T)
         subject to   low ≤ u_k ≤ high,   z_0 = lift(e_y, e_ψ, s),
                      z_{k+1} = A(e) z_k + B(e) u_k + d(e) κ_k + c(e),
                      (e_y, e_ψ, s)_k = C z_k + o
 
     The path enters through its previewed curvature, and e is constant over the horizon.
-    Eliminating the states leaves at most 2 T variables; `box_qp` solves for them, warm
-    started with the shifted plan. Only controls have bounds, so every QP is feasible.
+    At most 2 T controls are the variables; `box_qp` solves for them, warm started with
+    the shifted plan. Only controls have bounds, so every QP is feasible.
 
-    Values that are not finite never enter the plan. If the observation, environment,
-    reference or solution is not finite, the controller continues the last plan and
-    `info["healthy"]` is False.
-
-    Attributes:
+    Args:
         model: with `structure.linear`.
-        dt: sampling period [s].
+        cost: ℓ, quadratic.
         control_low: lower control limits.
         control_high: upper control limits.
-        speed_loop: whether the second control is a speed command; `effort` is then
-            ignored.
         horizon: T, number of steps.
         iterations: of the QP solver.
-        lateral: q_y, as in `tracking_cost`.
-        course: q_c, as in `tracking_cost`.
-        speed: q_v, as in `tracking_cost`.
-        steering_rate: q_δ̇, as in `tracking_cost`.
-        effort: q_a, as in `tracking_cost`.
-        terminal_weight: added to the weight of the last step.
+        terminal_weight: w_T, added to the weight of the last step.
         env_low: lower end of the environment box; an environment outside is clipped.
         env_high: upper end of the environment box.
 
@@ -97,267 +91,145 @@ class KoopmanMpc:
 
     Source: Korda and Mezić (2018), section 4.
     """
-
-    model: Model
-    _: KW_ONLY
-    dt: float
-    control_low: tuple[float, ...]
-    control_high: tuple[float, ...]
-    speed_loop: bool = False
-    horizon: AtLeastTwo = 20
-    iterations: int = 12
-    lateral: float = 200.0
-    course: float = 20.0
-    speed: float = 1.0
-    steering_rate: float = 5.0
-    effort: float = 0.02
-    terminal_weight: float = 1.0
-    env_low: tuple[float, ...] | None = None
-    env_high: tuple[float, ...] | None = None
-
-    def __post_init__(self) -> None:
-        """Raise a ValueError for a model without a linear predictor."""
-        _ = self._linear
-
-    @property
-    def _linear(self) -> Callable[[Fiber], LinearPredictor]:
-        if (linear := self.model.structure.linear) is not None:
-            return linear
+    if model.structure.linear is None:
         raise ValueError(
             "koopman_mpc needs a model that is linear in a lift (Structure.linear)"
         )
+    low, high = (jnp.asarray(end, dtype=float) for end in (control_low, control_high))
+    lifted = _LiftedTracking(model, cost, terminal_weight)
+    return _QuadraticProgram(
+        Task(low, high, cost.weights, lifted.prepare, lifted.step, check_path),
+        horizon=horizon,
+        noise_std=(1.0,) * len(control_low),
+        iterations=iterations,
+        env_low=env_low,
+        env_high=env_high,
+    ).controller()
 
-    def controller(self) -> Controller:
-        """Return the planner as two functions."""
-        return Controller(self.init, self.act)
 
-    def init(self, key: Key) -> KoopmanMpcState:
-        """Return the state before the first control step: a plan of zeros."""
-        del key  # nothing is random
-        channels = len(self.control_low)
-        return KoopmanMpcState(
-            plan=jnp.zeros((self.horizon, channels)),
-            previous=jnp.zeros(channels),
-            started=jnp.asarray(False),
-        )
+class _LiftedSample(NamedTuple):
+    """Lifted state; path errors and control of the last step, if there was one."""
 
-    def act(
+    z: Float[Array, " rank"]
+    errors: PathErrors
+    control: Control
+    known: Bool[Array, ""]
+
+
+class _LiftedTarget(NamedTuple):
+    """The reference of one step.
+
+    Attributes:
+        point: x, y, yaw, speed.
+        at: curvature of the path there [1/m].
+        over: mean curvature over the step [1/m].
+        behind: distance along the path from the point to the start of the plan [m].
+    """
+
+    point: Float[Array, "*horizon 4"]
+    at: Float[Array, "*horizon"]
+    over: Float[Array, "*horizon"]
+    behind: Float[Array, "*horizon"]
+
+
+@dataclass(frozen=True, eq=False)
+class _LiftedTracking:
+    """The task of tracking a path with a linear predictor, without limits."""
+
+    model: Model
+    cost: Cost
+    terminal_weight: float
+
+    def prepare(
         self,
         params: Params,
-        state: KoopmanMpcState,
         observation: State,
         env: Environment,
         reference: Reference,
-    ) -> tuple[Control, KoopmanMpcState, ControllerInfo]:
-        """Return the control of one step; `info` has the `residual` of the QP too."""
-        horizon = self.horizon
-        low, high = jnp.asarray(self.control_low), jnp.asarray(self.control_high)
-        check_path(observation, env, reference, horizon)
-        clean = all_finite((observation, env, reference))
-        inside = clip_environment(env, self.env_low, self.env_high)
+        start: PlanningStart,
+    ) -> RolloutSetup:
+        """Return the matrices of e, the lifted observation and the path ahead."""
+        assert self.model.structure.linear is not None
+        predictor = self.model.structure.linear(self.model.fiber(params, env))
         curvature = reference_curvature(reference)
         errors = path_errors(observation, reference[0], curvature[0])
         # Progress counts from here: the predictor knows the path by its curvature only.
-        start = observation.at[POSE].set(
-            jnp.stack([jnp.zeros(()), errors.lateral, errors.heading])
-        )
-        predictor = self._linear(self.model.fiber(params, inside))
-        effort = 0.0 if self.speed_loop else self.effort
-        weights = jnp.asarray(
-            [self.lateral, self.course, self.speed, self.steering_rate, effort]
-        )
-        prediction = condense(predictor, start, curvature)
-        cost = condensed_cost(
-            prediction,
-            start,
-            reference[:, 3],
-            PlanningStart(state.previous, state.started),
-            weights=weights,
-            step_weights=jnp.ones(horizon).at[-1].add(self.terminal_weight),
-            dt=self.dt,
-        )
-        H = 2 * cost.gains.T @ (cost.weights[:, None] * cost.gains)
+        place = jnp.stack([jnp.zeros(()), errors.lateral, errors.heading])
+        state = jnp.concatenate([place, observation[BODY]])
+        first = _LiftedSample(predictor.lift(state), errors, *start)
+        # The first step has the curvature of the first point, others that of both ends.
+        mean = 0.5 * (curvature[1:] + curvature[:-1])
+        steps = jnp.hypot(*jnp.diff(reference[:, :2], axis=0).T)
+        passed = jnp.concatenate([jnp.zeros(1), jnp.cumsum(steps)])
+        behind = between(reference[0, POSE], observation[POSE])[0] - passed
+        over = jnp.concatenate([curvature[:1], mean])
+        targets = _LiftedTarget(reference, curvature, over, behind)
+        return RolloutSetup(predictor._replace(lift=None), first, targets)
+
+    def step(
+        self,
+        weights: object,
+        predictor: LinearPredictor,
+        before: _LiftedSample,
+        u: Control,
+        target: _LiftedTarget,
+        at: StepIndex,
+    ) -> StepResult:
+        """Return one step of the prediction and its cost."""
+        z = predictor.A @ before.z + predictor.B @ u
+        z = z + predictor.d * target.over + predictor.c
+        x = predictor.C @ z + predictor.o
+        speed = target.point[3]
+        errors = PathErrors(x[1], x[2], x[3] - speed)
+        # Before the first control there is no steering rate.
+        last = jnp.where(before.known, before.control, u)
+        stage = StageInputs(errors, before.errors, u, last, speed)
+        cost = self.cost.stage(weights, stage) * (1.0 + self.terminal_weight * at.last)
+        sample = _LiftedSample(z, errors, u, jnp.ones_like(before.known))
+        state = jnp.concatenate([_in_world(x, target), x[BODY]])
+        return StepResult(sample, cost, u, u, state)
+
+
+def _in_world(x: State, target: _LiftedTarget) -> Pose:
+    """The pose of a predicted state, by the circle that touches the reference point."""
+    ahead, kappa = target.behind + x[0], target.at
+    foot = jnp.stack([ahead, 0.5 * kappa * ahead**2, kappa * ahead])
+    aside = jnp.stack([jnp.zeros(()), x[1], x[2]])
+    return compose(target.point[:3], compose(foot, aside))
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class _QuadraticProgram(Planner):
+    """A planner of tasks whose cost is quadratic in the plan, and convex."""
+
+    iterations: int = 12
+
+    def search(
+        self, key: Key, plan: Plan, tuning: Tuning, evaluate: Evaluate
+    ) -> SearchResult:
+        """Return the minimum within the limits; nothing is random."""
+        size = plan.size
+
+        def cost_of(u: Float[Array, " n"]) -> Scalar:
+            return evaluate(u.reshape(plan.shape)[:, None]).costs[0]
+
+        def slope_of(u: Float[Array, " n"]) -> tuple[Array, Array]:
+            slope = jax.grad(cost_of)(u)
+            return slope, slope
+
+        # Quadratic: its derivatives at 0 are all that there is to know.
+        H, f = jax.jacfwd(slope_of, has_aux=True)(jnp.zeros(size))
         # A predictor that ignores a control leaves a zero row.
-        H = H + REGULARISATION * jnp.max(jnp.diagonal(H)) * jnp.eye(H.shape[0])
-        f = 2 * cost.gains.T @ (cost.weights * cost.offsets)
-        box = jnp.tile(low, horizon), jnp.tile(high, horizon)
-        solution = box_qp(H, f, *box, state.plan.ravel(), iterations=self.iterations)
-        rows = cost.gains @ solution.primal + cost.offsets
-        total = jnp.sum(cost.weights * rows**2)
+        H = H + REGULARISATION * jnp.max(jnp.diagonal(H)) * jnp.eye(size)
+        low, high = (
+            jnp.broadcast_to(end, plan.shape).ravel()
+            for end in (self.task.low, self.task.high)
+        )
         # A solution that did not converge is still inside the box, and used.
-        healthy = clean & jnp.isfinite(total)
-
-        plan = jnp.where(healthy, solution.primal.reshape(horizon, -1), state.plan)
-        control = jnp.clip(plan[0], low, high)
-        predicted = prediction.free + prediction.gain @ plan.ravel()
-        info: ControllerInfo = {
-            "cost": total,
-            "mean_cost": total,
-            "effective_samples": jnp.asarray(jnp.nan),
-            "healthy": healthy,
-            "env_inside": jnp.all(inside == env),
-            "predicted_states": to_world(predicted, observation, reference, curvature),
-            "residual": solution.residual,
-        }
-        after = KoopmanMpcState(
-            shift(plan, jnp.ones(())), control, state.started | healthy
-        )
-        return control, after, info
-
-
-class Prediction(NamedTuple):
-    """The condensed prediction x_k = free_k + (gain u)_k, k = 1 … T.
-
-    Attributes:
-        free: response without control.
-        gain: response to the stacked controls u_0 … u_{T-1}.
-    """
-
-    free: Float[Array, "horizon state"]
-    gain: Float[Array, "horizon state inputs"]
-
-
-class LeastSquares(NamedTuple):
-    """The cost Σ_i w_i (g_iᵀ u + o_i)² of the stacked controls u.
-
-    Attributes:
-        gains: g_i.
-        offsets: o_i.
-        weights: w_i.
-    """
-
-    gains: Float[Array, "row inputs"]
-    offsets: Float[Array, " row"]
-    weights: Float[Array, " row"]
-
-
-def condensed_cost(
-    prediction: Prediction,
-    start: State,
-    speeds: Float[Array, " horizon"],
-    previous: PlanningStart,
-    *,
-    weights: Float[Array, " term"],
-    step_weights: Float[Array, " horizon"],
-    dt: float,
-) -> LeastSquares:
-    """Return `tracking_cost` as squares of affine functions of the stacked controls.
-
-    Args:
-        prediction: of the states along the path.
-        start: state along the path now.
-        speeds: of the reference [m/s].
-        previous: control, from which the first steering rate counts.
-        weights: of lateral error, course, speed, steering rate and effort.
-        step_weights: factor on all weights of each step.
-        dt: sampling period [s].
-    """
-    horizon = speeds.shape[0]
-    channels = jnp.eye(2 * horizon).reshape(horizon, 2, 2 * horizon)
-    steering, drive = channels[:, 0], channels[:, 1]
-    side, side_free = prediction.gain[:, 1], prediction.free[:, 1]
-    # A millimetre more: finite at standstill, as in `tracking_cost`.
-    travelled = speeds * dt + 1e-3
-    gains = (
-        side,
-        jnp.diff(side, axis=0, prepend=0.0) / travelled[:, None],
-        prediction.gain[:, 3],
-        jnp.diff(steering, axis=0, prepend=0.0) / dt,
-        drive,
-    )
-    offsets = (
-        side_free,
-        jnp.diff(side_free, prepend=start[1]) / travelled,
-        prediction.free[:, 3] - speeds,
-        jnp.zeros(horizon).at[0].set(-previous.control[0] / dt),
-        jnp.zeros(horizon),
-    )
-    # Before the first control there is no steering rate.
-    charged = (weights[:, None] * step_weights).at[3, 0].multiply(previous.known)
-    return LeastSquares(
-        jnp.concatenate(gains), jnp.concatenate(offsets), charged.ravel()
-    )
-
-
-def _curvature_of_steps(
-    curvature: Float[Array, " horizon"],
-) -> Float[Array, " horizon"]:
-    """Mean curvature of each step; the first step has that of the first point."""
-    return jnp.concatenate([curvature[:1], 0.5 * (curvature[1:] + curvature[:-1])])
-
-
-def condense(
-    predictor: LinearPredictor, start: State, curvature: Float[Array, " horizon"]
-) -> Prediction:
-    """Eliminate the lifted state: free response and Toeplitz matrix of C Aᵏ B.
-
-    Args:
-        predictor: of the environment.
-        start: state along the path now.
-        curvature: of the path at each reference point [1/m].
-    """
-    horizon = curvature.shape[0]
-
-    def respond(
-        carry: tuple[Array, Array], kappa: Scalar
-    ) -> tuple[tuple[Array, Array], tuple[Array, Array]]:
-        z, impulse = carry
-        z = predictor.A @ z + predictor.d * kappa + predictor.c
-        return (z, predictor.A @ impulse), (
-            predictor.C @ z + predictor.o,
-            predictor.C @ impulse,
-        )
-
-    _, (free, impulses) = jax.lax.scan(
-        respond, (predictor.lift(start), predictor.B), _curvature_of_steps(curvature)
-    )
-    lag = jnp.arange(horizon)[:, None] - jnp.arange(horizon)
-    # A control acts on later states only.
-    gain = jnp.where((lag >= 0)[:, :, None, None], impulses[jnp.maximum(lag, 0)], 0.0)
-    return Prediction(
-        free, gain.transpose(0, 2, 1, 3).reshape(horizon, start.shape[0], -1)
-    )
-
-
-def to_world(
-    along_path: Float[Array, "horizon state"],
-    observation: State,
-    reference: Reference,
-    curvature: Float[Array, " horizon"],
-) -> Float[Array, "horizon state"]:
-    """Map predictions to the world by the circle that touches each reference point.
-
-    Args:
-        along_path: progress, lateral distance, relative yaw and body state.
-        observation: state in the world now.
-        reference: x, y, yaw, speed of each step.
-        curvature: of the path at each reference point [1/m].
-    """
-    behind = between(reference[0, POSE], observation[POSE])[0]
-    steps = jnp.hypot(*jnp.diff(reference[:, :2], axis=0).T)
-    passed = jnp.concatenate([jnp.zeros(1), jnp.cumsum(steps)])
-
-    def one_step(
-        state: State, point: Float[Array, " 4"], kappa: Scalar, travelled: Scalar
-    ) -> State:
-        ahead = behind + state[0] - travelled
-        foot = jnp.stack([ahead, 0.5 * kappa * ahead**2, kappa * ahead])
-        aside = jnp.stack([jnp.zeros(()), state[1], state[2]])
-        return jnp.concatenate([compose(point[:3], compose(foot, aside)), state[BODY]])
-
-    return jax.vmap(one_step)(along_path, reference, curvature, passed)
-
-
-class BoxSolution(NamedTuple):
-    """The solution of a box-constrained quadratic program.
-
-    Attributes:
-        primal: x, inside the box.
-        residual: max_i |x − clip(x − ∇ / diag H)|_i in units of x; 0 at the optimum.
-    """
-
-    primal: Float[Array, " n"]
-    residual: Scalar
+        solution = box_qp(H, f, low, high, plan.ravel(), iterations=self.iterations)
+        cost = cost_of(solution)
+        best = solution.reshape(plan.shape)
+        return SearchResult(best, jnp.isfinite(cost), cost, jnp.full((), jnp.nan))
 
 
 def box_qp(
@@ -368,7 +240,7 @@ def box_qp(
     start: Float[Array, " n"],
     *,
     iterations: int = 12,
-) -> BoxSolution:
+) -> Float[Array, " n"]:
     """Minimise ½ xᵀ H x + fᵀ x subject to low ≤ x ≤ high, for H > 0.
 
         x_f ← clip(x_f − 2⁻ʲ H_ff⁻¹ ∇_f)
@@ -409,11 +281,4 @@ def box_qp(
         best = jnp.argmin(change)
         return jnp.where(change[best] < 0, candidates[best], x), None
 
-    x, _ = jax.lax.scan(improve, jnp.clip(start, low, high), length=iterations)
-    return BoxSolution(
-        x, jnp.max(jnp.abs(x - jnp.clip(x - (H @ x + f) / diagonal, low, high)))
-    )
-
-
-koopman_mpc = factory(KoopmanMpc, KoopmanMpc.controller)
-"""(model, settings of `KoopmanMpc`) -> `Controller`."""
+    return jax.lax.scan(improve, jnp.clip(start, low, high), length=iterations)[0]

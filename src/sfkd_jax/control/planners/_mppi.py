@@ -3,68 +3,33 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from functools import cached_property
+from typing import Any
 
 import jax
 import jax.numpy as jnp
+from jaxtyping import Array, Bool, Float
 
 from sfkd_jax.control._factory import factory
-from sfkd_jax.control.planners._noise import NoiseSampler, noise_sampler
-from sfkd_jax.control.planners._planner import Planner
-from sfkd_jax.control.planners._plans import (
+from sfkd_jax.control.planners._noise import SamplingPlanner
+from sfkd_jax.control.planners._planner import (
     Evaluate,
     Plan,
     PlannerState,
     SearchResult,
-    candidate_plans,
+    Tuning,
+    iterate,
     replace_nonfinite,
     tuned,
 )
-from sfkd_jax.control.planners._weights import weigh
-from sfkd_jax.ranges import AtLeastTwo, Positive, UnitInterval
-from sfkd_jax.types import Key
+from sfkd_jax.ranges import Positive
+from sfkd_jax.types import Key, Scalar
 
-
-@dataclass(frozen=True, eq=False, kw_only=True)
-class SamplingPlanner(Planner):
-    """A planner that perturbs a plan at random.
-
-    Attributes:
-        num_samples: M, plans that are sampled and rolled out per iteration.
-        iterations: of sampling and choosing per control step.
-        noise: "ar1", "white", "coloured", "rbf" or "spline", see `noise_sampler`.
-        noise_correlation: ρ of "ar1".
-        noise_exponent: of "coloured" noise, power ∝ 1 / f^exponent.
-        noise_knots: number of knots of "rbf" and "spline".
-    """
-
-    num_samples: int = 1500
-    iterations: int = 1
-    noise: str = "ar1"
-    noise_correlation: UnitInterval = 0.8
-    noise_exponent: float = 2.0
-    noise_knots: AtLeastTwo = 5
-
-    def __post_init__(self) -> None:
-        """Raise a ValueError that names a setting out of its range."""
-        super().__post_init__()
-        if self.num_samples < 1 or self.iterations < 1:
-            raise ValueError(
-                "num_samples and iterations must be at least 1, "
-                f"got {self.num_samples} and {self.iterations}"
-            )
-        _ = self.draw  # raises for settings out of range
-
-    @cached_property
-    def draw(self) -> NoiseSampler:
-        """(key, number of samples, standard deviation) -> perturbations."""
-        return noise_sampler(
-            self.noise,
-            horizon=self.horizon,
-            correlation=self.noise_correlation,
-            exponent=self.noise_exponent,
-            knots=self.noise_knots,
-        )
+BISECTIONS, DECADES = 24, (-12.0, 4.0)
+"""The temperature is searched between 10^-12 and 10^4 times the range of the costs. The
+lower end is that small because a single outlier widens the range.
+"""
+FEW = 10.0
+"""Effective samples where every sample violates a constraint."""
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -74,9 +39,8 @@ class Mppi(SamplingPlanner):
         ν ← Σ_m w_m ν^m,   w_m ∝ exp(−J^m / λ)
 
     Each iteration samples M plans around the current one and rolls all of them out in
-    one scan. ν^m is the perturbation that the limits allowed. Sample 0 is the shifted
-    plan itself; proposals in the planner's state are added to the samples. A rollout
-    that is not finite has weight zero.
+    one scan. ν^m is the perturbation that the limits allowed. A rollout that is not
+    finite has weight zero.
 
     Attributes:
         temperature: λ, in units of cost; initial value in `Tuning`.
@@ -109,38 +73,88 @@ class Mppi(SamplingPlanner):
             effective_samples=self.effective_samples,
         )
 
-    def search(self, key: Key, state: PlannerState, evaluate: Evaluate) -> SearchResult:
+    def search(
+        self, key: Key, plan: Plan, tuning: Tuning, evaluate: Evaluate
+    ) -> SearchResult:
         """Return the weighted mean of the sampled plans."""
 
         def improve(plan: Plan, key: Key) -> tuple[Plan, SearchResult]:
-            # Sample around the plan; sample 0 is the plan itself, so it can win.
-            noise = self.draw(key, self.num_samples, state.tuning.noise_std)
-            evaluated = evaluate(candidate_plans(plan, noise, state))
-            # Weigh by cost. λ follows from the effective sample size, if one is set.
-            solve = self.effective_samples != 0.0
-            costs, violations = evaluated.costs, evaluated.violations
-            chosen = weigh(costs, violations, state.tuning, solve=solve)
+            noise = self.draw(key, tuning.noise_std)
+            # Sample 0 is the plan itself: what was good stays among the candidates.
+            evaluated = evaluate(plan[:, None] + noise.at[:, 0].set(0.0))
+            ranks, any_kept = evaluated.ranked()
+            temperature = tuning.temperature
+            if self.effective_samples:
+                # On the cost scale of this step: robust where costs vary by decades.
+                temperature = temperature_for(ranks, tuning.effective_samples)
+            if evaluated.violations is not None:
+                # Violations are in other units than costs: where no sample keeps all
+                # constraints, average the least violated ones, sharply.
+                few = temperature_for(ranks, jnp.asarray(FEW))
+                temperature = jnp.where(any_kept, temperature, few)
+            weights, usable = softmin(ranks, temperature)
             # Average what the limits allowed, not what was sampled.
             allowed = replace_nonfinite(evaluated.perturbations, 0.0)
-            mean = jnp.einsum("m,tmc->tc", chosen.weights, allowed)
+            mean = jnp.einsum("m,tmc->tc", weights, allowed)
             return mean, SearchResult(
                 plan=mean,
-                usable=chosen.usable,
-                cost=jnp.min(replace_nonfinite(costs, jnp.inf)),
-                effective_samples=chosen.size,
-                samples=self._reported(evaluated, chosen.weights, chosen.temperature),
-                best=None
-                if violations is None
-                else evaluated.perturbations[:, chosen.best],
+                usable=usable,
+                cost=jnp.min(replace_nonfinite(evaluated.costs, jnp.inf)),
+                effective_samples=effective_sample_size(weights),
+                best=allowed[:, jnp.argmin(ranks)],
             )
 
-        # Splitting the key would change the plans of a single iteration.
-        if self.iterations == 1:
-            return improve(state.plan, key)[1]
-        keys = jax.random.split(key, self.iterations)
-        _, results = jax.lax.scan(improve, state.plan, keys)
-        return jax.tree.map(lambda leaf: leaf[-1], results)
+        return iterate(improve, plan, key, self.iterations)
 
 
 mppi = factory(Mppi, Mppi.controller)
 """(task, settings of `Mppi`) -> `Controller`."""
+
+
+def softmin(
+    costs: Float[Array, " sample"], temperature: Scalar
+) -> tuple[Float[Array, " sample"], Bool[Array, ""]]:
+    """Return weights ∝ exp(−J/λ) over the finite costs, and whether they are usable.
+
+    They are not if no cost is finite, or λ is not positive.
+    """
+    finite = jnp.isfinite(costs)
+    positive = temperature > 0
+    usable = jnp.any(finite) & positive
+    # Both branches are finite, or their derivatives would be NaN.
+    scaled = jnp.where(finite, costs, 0.0) / jnp.where(positive, temperature, 1.0)
+    scores = jnp.where(usable, jnp.where(finite, -scaled, -jnp.inf), 0.0)
+    return jax.nn.softmax(scores), usable
+
+
+def effective_sample_size(weights: Float[Array, " sample"]) -> Scalar:
+    """Return Kish's 1 / Σ w²: M for M equal weights, 1 if one sample has all weight."""
+    return 1.0 / jnp.sum(weights**2)
+
+
+def temperature_for(costs: Float[Array, " sample"], wanted: Scalar) -> Scalar:
+    """Return λ at which `effective_sample_size` is `wanted`, by bisection of log λ.
+
+    The bracket scales with the range of the finite costs, so λ scales with the costs.
+    If no λ gives `wanted`, the result is an end of the bracket. Derivatives take λ as
+    a constant.
+    """
+    costs = jax.lax.stop_gradient(costs)
+    finite = jnp.isfinite(costs)
+    lowest = jnp.min(jnp.where(finite, costs, jnp.inf))
+    spread = jnp.max(jnp.where(finite, costs, -jnp.inf)) - lowest
+    # All costs equal, or none finite: any positive scale will do.
+    spread = jnp.where(jnp.isfinite(spread) & (spread > 0), spread, 1.0)
+    # In [0, 1], whatever the units of cost.
+    scaled = jnp.where(finite, (costs - lowest) / spread, jnp.inf)
+
+    def narrow(_: Any, bracket: tuple[Scalar, Scalar]) -> tuple[Scalar, Scalar]:
+        low, high = bracket
+        middle = 0.5 * (low + high)
+        few = effective_sample_size(softmin(scaled, jnp.exp(middle))[0]) < wanted
+        return jnp.where(few, middle, low), jnp.where(few, high, middle)
+
+    # A fixed number of steps has a fixed cost, and compiles to a loop.
+    ends = jnp.log(10.0) * jnp.asarray(DECADES)
+    low, high = jax.lax.fori_loop(0, BISECTIONS, narrow, (ends[0], ends[1]))
+    return spread * jnp.exp(0.5 * (low + high))

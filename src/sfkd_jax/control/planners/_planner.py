@@ -1,51 +1,129 @@
-"""The control step that all planners share: warm start, search, limits, fallback."""
+"""The control step that all planners share: warm start, search, rollout, fallback."""
 
 from __future__ import annotations
 
-import functools
+from collections.abc import Callable
 from dataclasses import KW_ONLY, dataclass
-from typing import Any, cast
+from functools import partial
+from typing import Any, NamedTuple, TypeAlias, TypeVar
 
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Bool
+from jaxtyping import Array, Bool, Float, UInt32
 
-from sfkd_jax.control.planners._gains import feedback_gains
-from sfkd_jax.control.planners._plans import (
-    Evaluate,
-    Evaluated,
-    Plan,
-    PlannerState,
-    Samples,
-    SearchResult,
-    Tuning,
-    all_finite,
-    catch_up,
-    clip_environment,
-    replace_nonfinite,
-    shift,
-)
-from sfkd_jax.control.planners._rollouts import RiskMeasure, Rollouts, risk_measure
-from sfkd_jax.control.planners._smoothing import Smoother, plan_smoother
-from sfkd_jax.control.tasks._task import PlanningStart, Task
-from sfkd_jax.ranges import AtLeastTwo, NonNegativeInt, Positive, PositiveFraction
+from sfkd_jax.control.tasks._task import PlanningStart, RolloutSetup, StepIndex, Task
+from sfkd_jax.ranges import AtLeastTwo, Positive
 from sfkd_jax.types import Control, Controller, ControllerInfo, Key, Params, Scalar
 
-INFO_LEVELS = ("plan", "samples")
-"""What a planner reports: the chosen plan, or all candidates as well."""
-TASK_STREAM = 31324
-"""Folded into the key of a control step for the task's own noise."""
-KEY_KINDS = {2: "threefry2x32", 4: "rbg"}
-"""Implementations of random keys by the number of words of their data."""
+Plan: TypeAlias = Float[Array, "horizon control"]
+Plans: TypeAlias = Float[Array, "horizon sample control"]
+C = TypeVar("C")
+
+
+class Tuning(NamedTuple):
+    """Settings that are data of a running planner: changing them recompiles nothing.
+
+    Attributes:
+        temperature: λ of MPPI, in units of cost.
+        effective_samples: target of 1 / Σ w² from which λ follows, for planners built
+            with one.
+        noise_std: per control channel, in control units.
+        elapsed: sampling periods since the last call. The plan is shifted by as many,
+            fractions included; NaN counts as one, and so does every later call that
+            does not set it again.
+        cost: weights of the task's cost.
+        constraints: data of the task's constraints, see `constrained`.
+    """
+
+    temperature: Scalar
+    effective_samples: Scalar
+    noise_std: Control
+    elapsed: Scalar
+    cost: Any
+    constraints: Any = ()
+
+
+class PlannerState(NamedTuple):
+    """What a planner carries from one control step to the next.
+
+    Attributes:
+        plan: rows ν_0 … ν_{T-1}, perturbations of the task's law if it has one.
+        controls: the controls of the last healthy rollout of that plan.
+        previous: the control applied last.
+        started: whether a control was planned before.
+        key: data of the random key of the next samples: the state is plain arrays.
+        tuning: see `Tuning`.
+    """
+
+    plan: Plan
+    controls: Plan
+    previous: Control
+    started: Bool[Array, ""]
+    key: UInt32[Array, " word"]
+    tuning: Tuning
+
+
+class Evaluated(NamedTuple):
+    """What the rollouts of plans came to.
+
+    Attributes:
+        costs: of the whole rollouts.
+        controls: applied, within the limits.
+        perturbations: the parts of the plans that the limits allowed.
+        states: predicted, (horizon, sample, …).
+        violations: the largest of a constraint over the horizon, not above 0 where all
+            are kept; None without constraints.
+    """
+
+    costs: Float[Array, " sample"]
+    controls: Plans
+    perturbations: Plans
+    states: Any
+    violations: Float[Array, " sample"] | None
+
+    def ranked(self) -> tuple[Float[Array, " sample"], Bool[Array, ""]]:
+        """Return costs in lexicographic order, and whether a sample keeps constraints.
+
+        The rank of a sample that violates one, or is not finite, is infinite; if all
+        violate one, the ranks are the violations.
+        """
+        costs = replace_nonfinite(self.costs, jnp.inf)
+        if self.violations is None:
+            return costs, jnp.asarray(True)
+        # A rollout that is not finite keeps nothing, whatever its violation says.
+        violations = jnp.where(jnp.isfinite(costs), self.violations, jnp.inf)
+        kept = violations <= 0.0
+        any_kept = jnp.any(kept)
+        return jnp.where(
+            any_kept, jnp.where(kept, costs, jnp.inf), violations
+        ), any_kept
+
+
+Evaluate: TypeAlias = Callable[[Plans], Evaluated]
+"""Rolls out plans."""
+
+
+class SearchResult(NamedTuple):
+    """The outcome of a search.
+
+    Attributes:
+        plan: the chosen plan.
+        usable: whether any rollout had a finite cost.
+        cost: the lowest cost of all samples.
+        effective_samples: 1 / Σ w² of the sample weights; NaN if nothing is sampled.
+        best: the best single candidate, for a task with constraints.
+    """
+
+    plan: Plan
+    usable: Bool[Array, ""]
+    cost: Scalar
+    effective_samples: Scalar
+    best: Plan | None = None
 
 
 @dataclass(frozen=True, eq=False)
 class Planner:
     """The receding-horizon controller of a task; a subclass searches for its best plan.
-
-    Each control step shifts the plan, searches around it, smooths the result, rolls it
-    out within the limits, and keeps the perturbations that the limits allowed. The
-    stored plan therefore never exceeds the actuators.
 
     Values that are not finite never enter the plan. If all rollouts are not finite, or
     the observation, environment or reference is not, the controller continues the last
@@ -54,107 +132,76 @@ class Planner:
     A planner of your own is a subclass with `search`, and `factory(Mine,
     Mine.controller)` its factory; an entry in `build.PLANNERS` gives it settings.
 
-    An environment of shape (particle, ne) holds equally likely environments. The cost
-    of a plan is then the `risk` of its trajectories over them, and `info` describes
-    the chosen plan in the first one.
-
     Attributes:
         task: the planning problem.
         horizon: T, number of steps.
         noise_std: scale of a perturbation, one entry a control; initial value in
             `Tuning`.
-        num_proposals: number of user-defined plans in the state; they are zeros (the
-            law alone) until replaced.
-        smoothing_window: of the Savitzky-Golay filter, see `plan_smoother`; 0 for none.
-        smoothing_order: of the filter's polynomial.
-        risk: "mean", "worst" or "cvar", over the environments.
-        risk_level: fraction of the largest costs that "cvar" averages.
         unroll: number of steps of a rollout that are compiled as one, which saves time
             where steps are short; the plan is the same up to rounding.
-        sharding: of the samples over devices, for plans of shape (horizon, sample,
-            control). Up to the order of sums, the plan does not depend on the number
-            of devices, which must divide the number of samples.
         env_low: lower end of the environment box; an environment outside is clipped.
         env_high: upper end of the environment box.
-        several: whether the leading axis of every leaf of an environment runs over
-            equally likely ones; None if it does for a matrix alone.
-        info_level: "plan", or "samples" to report every candidate as well.
-        gain_samples: number of samples, those with the largest weights, from which the
-            feedback gains of the plan are computed, see `between_plans`; 0 for none.
     """
 
     task: Task
     _: KW_ONLY
     horizon: AtLeastTwo = 20
     noise_std: tuple[Positive, ...] = (0.02, 0.3)
-    num_proposals: NonNegativeInt = 0
-    smoothing_window: NonNegativeInt = 0
-    smoothing_order: NonNegativeInt = 2
-    risk: str = "mean"
-    risk_level: PositiveFraction = 0.25
     unroll: int = 2
-    sharding: jax.sharding.Sharding | None = None
     env_low: tuple[float, ...] | None = None
     env_high: tuple[float, ...] | None = None
-    several: bool | None = None
-    info_level: str = "plan"
-    gain_samples: NonNegativeInt = 0
 
     def __post_init__(self) -> None:
         """Raise a ValueError that names a setting out of its range."""
-        channels, std = self.task.low.shape[0], self.noise_std
-        if self.horizon < 1:
-            raise ValueError(f"horizon must be at least 1, got {self.horizon}")
-        if len(std) != channels or not all(entry > 0 for entry in std):
-            raise ValueError(f"noise_std needs {channels} positive numbers, got {std}")
-        if self.unroll < 1:
-            raise ValueError(f"unroll must be at least 1, got {self.unroll}")
-        if self.info_level not in INFO_LEVELS:
+        shape, std = self.task.low.shape, self.noise_std
+        if shape not in ((), (len(std),)) or not all(entry > 0 for entry in std):
+            raise ValueError(f"noise_std needs a positive number a control, got {std}")
+        if self.horizon < 1 or self.unroll < 1:
             raise ValueError(
-                f"info_level must be one of {', '.join(INFO_LEVELS)}, "
-                f"got {self.info_level!r}"
+                "horizon and unroll must be at least 1, "
+                f"got {self.horizon} and {self.unroll}"
             )
-        if self.gain_samples < 0:
-            raise ValueError(
-                f"gain_samples must not be negative, got {self.gain_samples}"
-            )
-        if self.gain_samples and self.smoothing_window:
-            raise ValueError("gain_samples and smoothing_window exclude each other")
-        _ = self._risk, self._smooth  # both raise for settings out of range
 
-    def search(self, key: Key, state: PlannerState, evaluate: Evaluate) -> SearchResult:
-        """Return the best plan near `state.plan`; what a subclass defines.
+    def search(
+        self, key: Key, plan: Plan, tuning: Tuning, evaluate: Evaluate
+    ) -> SearchResult:
+        """Return the best plan near another; what a subclass defines.
+
+        It sees plans and their costs alone, so it works for any task.
 
         Args:
             key: consumed.
-            state: with the shifted plan, proposals and tuning.
+            plan: the shifted one, around which to search.
+            tuning: settings that are data.
             evaluate: rolls out plans of shape (horizon, sample, control).
         """
         raise NotImplementedError
+
+    def controller(self) -> Controller:
+        """Return the planner as two functions."""
+        return Controller(self.init, self.act)
 
     def init(self, key: Key) -> PlannerState:
         """Return the state before the first step: a plan of zeros, the law alone.
 
         No two entries share a buffer, so that the state can be donated.
         """
-        task, channels = self.task, self.task.low.shape[0]
-        real = functools.partial(jnp.array, dtype=float)
+        shape = (self.horizon, len(self.noise_std))
+        real = partial(jnp.array, dtype=float)
         tuning = Tuning(
             temperature=jnp.ones(()),
             effective_samples=jnp.zeros(()),
             noise_std=real(self.noise_std),
             elapsed=jnp.ones(()),
-            cost=jax.tree.map(real, task.weights),
-            constraints=jax.tree.map(real, task.constraint_data),
+            cost=jax.tree.map(real, self.task.weights),
+            constraints=jax.tree.map(real, self.task.constraint_data),
         )
         return PlannerState(
-            plan=jnp.zeros((self.horizon, channels)),
-            controls=jnp.zeros((self.horizon, channels)),
-            previous=jnp.zeros(channels),
+            plan=jnp.zeros(shape),
+            controls=jnp.zeros(shape),
+            previous=jnp.zeros(shape[1]),
             started=jnp.asarray(False),
             key=jax.random.key_data(key),
-            past=jnp.zeros((self.smoothing_window // 2, channels)),
-            proposals=jnp.zeros((self.num_proposals, self.horizon, channels)),
             tuning=tuning,
         )
 
@@ -167,155 +214,167 @@ class Planner:
         reference: Any,
     ) -> tuple[Control, PlannerState, ControllerInfo]:
         """Return the control of one step, the next state and `ControllerInfo`."""
-        task, several = self.task, self._is_several(env)
+        task, tuning = self.task, state.tuning
         task.check(observation, env, reference, self.horizon)
         # What is not finite must be noticed even where neither model nor cost reads it.
         clean = all_finite((observation, env, reference))
-        inside = clip_environment(env, self.env_low, self.env_high)
-        key = jax.random.wrap_key_data(state.key, impl=KEY_KINDS[state.key.shape[0]])
-        # The task has a stream of its own: a search that draws more does not change it.
-        search_key, next_key = jax.random.split(key)
-        task_key = jax.random.fold_in(key, TASK_STREAM)
-        # The stored plan begins one period after the last call; this call may be later.
-        elapsed, state = catch_up(state)
+        inside = env
+        if self.env_low is not None and self.env_high is not None:
+            inside = jnp.clip(
+                env, jnp.asarray(self.env_low), jnp.asarray(self.env_high)
+            )
+        search_key, next_key = jax.random.split(jax.random.wrap_key_data(state.key))
+        # A clock that fails gives NaN; the call then counts as being in time.
+        elapsed = jnp.where(jnp.isnan(tuning.elapsed), 1.0, tuning.elapsed)
+        # The stored plan begins one period after the last call; this one may be later.
+        late = jnp.maximum(elapsed - 1.0, 0.0)
+        before, held = shift(state.plan, late), shift(state.controls, late)
 
         # Everything that all samples share is computed once, outside the rollouts.
-        prepare = task.prepare
-        start = PlanningStart(state.previous, state.started, task_key)
-        if several:
-            # Particles differ in e and in the noise of the dynamics, not in the start.
-            count = jax.tree.leaves(env)[0].shape[0]
-            start = start._replace(key=jax.random.split(task_key, count))
-            shared = jax.tree.map(lambda _: None, start)
-            axes = (None, None, 0, None, shared._replace(key=0))
-            prepare = jax.vmap(prepare, in_axes=axes)
-        setup = prepare(params, observation, inside, reference, start)
-        risk = self._risk if several else None
-        evaluate = Rollouts(task, state.tuning, setup, risk, self.unroll, self.sharding)
+        start = PlanningStart(state.previous, state.started)
+        setup = task.prepare(params, observation, inside, reference, start)
+        evaluate = partial(self._roll_out, tuning, setup)
+        result = self.search(search_key, before, tuning, evaluate)
 
-        proposed = state
-        if setup.proposals is not None:  # the task's, beside the user's
-            suggested = setup.proposals[0] if several else setup.proposals
-            proposals = jnp.concatenate([state.proposals, suggested])
-            proposed = state._replace(proposals=proposals)
-        # The search sees rollouts alone, so it works for any task.
-        result = self.search(search_key, proposed, evaluate)
-        plan = self._smooth(state.past, result.plan)
-        # The chosen plan is new (a mean, smoothed): its cost is known from its rollout.
-        rollout = evaluate(plan[:, None]).only()
-        if task.constraint is not None:
-            plan, rollout, result = _keep_constraints(evaluate, plan, rollout, result)
-        if self.smoothing_window:  # a smoothed plan can exceed the limits again
-            plan = replace_nonfinite(rollout.perturbations, 0.0)
+        # The chosen plan is new (a mean): its cost is known from its rollout.
+        plans, chosen = result.plan[:, None], 0
+        if task.constraint is not None and result.best is not None:
+            # The mean of plans that pass an obstacle on both sides hits it: the best
+            # single candidate replaces it where that violates less.
+            plans = jnp.stack([result.plan, result.best], axis=1)
+        costs, controls, _, states, violations = evaluate(plans)
+        if violations is not None:
+            chosen = jnp.argmin(violations)
 
         # Otherwise the last healthy plan continues: it was shifted, its end is held.
-        healthy = clean & result.usable & jnp.isfinite(rollout.costs)
-        plan = jnp.where(healthy, plan, state.plan)
-        controls = jnp.where(healthy, rollout.controls, state.controls)
+        healthy = clean & result.usable & jnp.isfinite(costs[chosen])
+        plan = jnp.where(healthy, plans[:, chosen], before)
+        controls = jnp.where(healthy, controls[:, chosen], held)
         # Zeros, the controls before the first plan, may lie outside the box.
         control = jnp.clip(controls[0], task.low, task.high)
-        info = self._info(result, rollout, healthy)
-        info["env_inside"] = (
-            jnp.all(inside == env) if self.env_low else jnp.asarray(True)
-        )
-        if self.gain_samples:
-            gains = feedback_gains(
-                evaluate,
-                lambda moved: prepare(params, moved, inside, reference, start).start,
-                observation,
-                result,
-                self.gain_samples,
-            )
-            info["gains"] = jnp.where(healthy, gains, 0.0)
         # Further delay is made up for by the next call.
         elapsed = jnp.minimum(elapsed, 1.0)
-        after = state._replace(
+        after = PlannerState(
             plan=shift(plan, elapsed),
             controls=shift(controls, elapsed),
             previous=control,
             started=state.started | healthy,
             key=jax.random.key_data(next_key),
-            past=jnp.concatenate([state.past, plan[:1]])[1:],
-            tuning=state.tuning._replace(elapsed=jnp.ones_like(state.tuning.elapsed)),
+            tuning=tuning._replace(elapsed=jnp.ones_like(tuning.elapsed)),
         )
-        return control, after, info
-
-    def _info(
-        self, result: SearchResult, rollout: Evaluated, healthy: Bool[Array, ""]
-    ) -> ControllerInfo:
-        """What is reported of a search and of its plan, `env_inside` excepted."""
-        info: dict[str, Any] = {
+        known = jnp.asarray(True) if inside is env else jnp.all(inside == env)
+        info: ControllerInfo = {
             "cost": result.cost,
-            "mean_cost": rollout.costs,
+            "mean_cost": costs[chosen],
             "effective_samples": result.effective_samples,
             "healthy": healthy,
-            "predicted_states": rollout.states,
+            "env_inside": known,
+            "predicted_states": jax.tree.map(lambda leaf: leaf[:, chosen], states),
         }
-        if rollout.violations is not None:
-            info["violation"] = rollout.violations
-            info["constraints_kept"] = rollout.violations <= 0.0
-        if self.info_level == "samples" and result.samples is not None:
-            evaluated = result.samples.evaluated
-            info["sample_costs"] = evaluated.costs
-            info["sample_weights"] = result.samples.weights
-            info["sample_plans"] = evaluated.perturbations
-            info["sample_states"] = evaluated.states
-        return cast(ControllerInfo, info)
+        if violations is not None:
+            info["violation"] = violations[chosen]
+            info["constraints_kept"] = violations[chosen] <= 0.0
+        return control, after, info
 
-    def controller(self) -> Controller:
-        """Return the planner as two functions."""
-        return Controller(self.init, self.act)
+    def _roll_out(self, tuning: Tuning, setup: RolloutSetup, plans: Plans) -> Evaluated:
+        """Roll out all plans in one scan over the horizon."""
+        task, count, axes = self.task, plans.shape[1], (0, 0, None, None)
+        numbers = jnp.arange(self.horizon)
+        places = StepIndex(numbers, (numbers == self.horizon - 1).astype(plans.dtype))
+        step = jax.vmap(partial(task.step, tuning.cost, setup.context), in_axes=axes)
 
-    @functools.cached_property
-    def _risk(self) -> RiskMeasure:
-        return risk_measure(self.risk, self.risk_level)
+        def violations_of(
+            state: Any, control: Array, target: Any, at: StepIndex
+        ) -> Any:
+            if task.constraint is None:
+                return None
+            every = partial(task.constraint, tuning.constraints)
+            every = jax.vmap(every, in_axes=axes)(state, control, target, at)
+            # NaN compares as kept, so it must not get through.
+            return jnp.max(jnp.where(jnp.isnan(every), jnp.inf, every), axis=1)
 
-    @functools.cached_property
-    def _smooth(self) -> Smoother:
-        return plan_smoother(
-            horizon=self.horizon,
-            window=self.smoothing_window,
-            order=self.smoothing_order,
+        def body(carry: Any, inputs: Any) -> Any:
+            costs, samples = carry
+            after = step(samples, *inputs)
+            worst = violations_of(after.state, after.control, *inputs[1:])
+            along = after.control, after.perturbation, after.state, worst
+            return (costs + after.cost, after.sample), along
+
+        samples = jax.tree.map(
+            lambda leaf: jnp.broadcast_to(leaf, (count, *jnp.shape(leaf))), setup.start
         )
-
-    def _is_several(self, env: Any) -> bool:
-        """Whether an environment is several that are equally likely."""
-        if self.several is not None:
-            return self.several
-        # A matrix is rows of environments; other trees need `several`.
-        return getattr(env, "ndim", 0) == 2
-
-    def _reported(
-        self,
-        evaluated: Evaluated,
-        weights: Array,
-        temperature: Scalar | None = None,
-    ) -> Samples | None:
-        """The candidates of a search, if anything reads them."""
-        if self.info_level == "samples" or self.gain_samples:
-            return Samples(evaluated, weights, temperature)
-        return None
+        (costs, _), (controls, allowed, states, violations) = jax.lax.scan(
+            body,
+            (jnp.zeros(count, plans.dtype), samples),
+            (plans, setup.targets, places),
+            # A single plan gains nothing from unrolling.
+            unroll=self.unroll if count > 1 else 1,
+        )
+        worst = None if violations is None else jnp.max(violations, axis=0)
+        return Evaluated(costs, controls, allowed, states, worst)
 
 
-def _keep_constraints(
-    evaluate: Evaluate, plan: Plan, rollout: Evaluated, result: SearchResult
-) -> tuple[Plan, Evaluated, SearchResult]:
-    """The chosen plan, or the best candidate where that violates less.
+def iterate(
+    improve: Callable[[C, Key], tuple[C, SearchResult]], start: C, key: Key, count: int
+) -> SearchResult:
+    """Return the result of the last of several improvements of a plan."""
+    # Splitting the key would change the plans of a single iteration.
+    if count == 1:
+        return improve(start, key)[1]
+    _, results = jax.lax.scan(improve, start, jax.random.split(key, count))
+    return jax.tree.map(lambda leaf: leaf[-1], results)
 
-    The mean of plans that pass an obstacle on both sides hits it. The gains of a single
-    candidate are those of the task's feedback law alone, as at an infinite temperature.
+
+def tuned(state: PlannerState, **changes: Any) -> PlannerState:
+    """Return the state with other entries of `Tuning`, of the types that it has.
+
+    A plain number in their place would be of a weaker type, and compile the planner
+    again.
+
+    Args:
+        state: of a planner.
+        changes: entries of `Tuning`; of `cost`, any part of a dict.
+
+    Raises:
+        ValueError: an unknown entry, or another shape.
     """
-    best, samples = result.best, result.samples
-    if best is None:
-        raise ValueError("constraints need a search that ranks by them: mppi or cem")
-    other = evaluate(best[:, None]).only()
-    assert other.violations is not None
-    assert rollout.violations is not None
-    instead = other.violations < rollout.violations
-    plan, rollout = jax.tree.map(
-        lambda a, b: jnp.where(instead, b, a), (plan, rollout), (best, other)
+    before = state.tuning
+    if isinstance(before.cost, dict):
+        # Weights that are not named keep their values.
+        changes["cost"] = before.cost | changes.get("cost", {})
+
+    def of_type(before: Array, value: Any) -> Array:
+        after = jnp.asarray(value, dtype=before.dtype)
+        if after.shape != before.shape:
+            raise ValueError(f"tuning has shape {before.shape}, got {after.shape}")
+        return after
+
+    after = jax.tree.map(of_type, before, before._replace(**changes))
+    return state._replace(tuning=after)
+
+
+def shift(plan: Plan, elapsed: Scalar) -> Plan:
+    """Shift a plan by `elapsed` periods: linear in between, the last step held."""
+    last = plan.shape[0] - 1
+    steps = jnp.arange(plan.shape[0], dtype=plan.dtype)
+    times = jnp.clip(steps + elapsed, 0, last)
+    whole = jnp.floor(times)
+    index = whole.astype(int)
+    after = plan[jnp.minimum(index + 1, last)]
+    return plan[index] + (times - whole)[:, None] * (after - plan[index])
+
+
+def replace_nonfinite(
+    values: Float[Array, "*shape"], fill: float
+) -> Float[Array, "*shape"]:
+    """Replace NaN and infinity by `fill`."""
+    return jnp.where(jnp.isfinite(values), values, fill)
+
+
+def all_finite(tree: Any) -> Bool[Array, ""]:
+    """Whether every real or complex entry of every leaf is finite."""
+    leaves = [jnp.asarray(leaf) for leaf in jax.tree.leaves(tree)]
+    real = [leaf for leaf in leaves if jnp.issubdtype(leaf.dtype, jnp.inexact)]
+    return jnp.all(
+        jnp.stack([jnp.asarray(True), *(jnp.all(jnp.isfinite(leaf)) for leaf in real)])
     )
-    if samples is not None and samples.temperature is not None:
-        temperature = jnp.where(instead, jnp.inf, samples.temperature)
-        samples = samples._replace(temperature=temperature)
-    return plan, rollout, result._replace(plan=plan, samples=samples)

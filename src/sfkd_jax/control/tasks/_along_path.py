@@ -18,7 +18,7 @@ from sfkd_jax.control._factory import factory
 from sfkd_jax.control.laws._feedback import PathErrors
 from sfkd_jax.control.laws._path_law import PathLaw
 from sfkd_jax.control.laws._steady_turn import SteadyTurn
-from sfkd_jax.control.planners._plans import all_finite
+from sfkd_jax.control.planners._planner import all_finite
 from sfkd_jax.control.tasks._path_tracking import Cost, StageInputs, check_path
 from sfkd_jax.control.tasks._task import (
     Limiter,
@@ -128,9 +128,6 @@ class AlongReference:
         info = info.copy()
         info["path_state"], info["planned_path"] = xi, planned
         info["predicted_states"] = jax.vmap(_in_world)(planned, reference)
-        if "sample_states" in info:
-            samples = jax.vmap(_in_world, in_axes=(0, None))
-            info["sample_states"] = jax.vmap(samples)(info["sample_states"], reference)
         return control, AlongReferenceState(inner, observation), info
 
 

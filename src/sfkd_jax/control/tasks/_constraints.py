@@ -27,8 +27,7 @@ def constrained(task: Task, constraint: Constraint, data: Any = ()) -> Task:
 
     Args:
         task: any task.
-        constraint: see `Constraint`; `outside_circles`, `outside_boxes` and
-            `inside_limits` help.
+        constraint: see `Constraint`; `outside_circles` and `outside_boxes` help.
         data: pytree of numbers that the constraint is given: positions of obstacles,
             margins. A planner carries it in `Tuning.constraints`, where it may change
             at every control step.
@@ -74,23 +73,6 @@ def outside_boxes(
     beyond = jnp.abs(local) - 0.5 * boxes[:, 3:]
     outside = jnp.sqrt(jnp.sum(jnp.maximum(beyond, 0.0) ** 2, axis=1) + 1e-12)
     return margin - (outside + jnp.minimum(jnp.max(beyond, axis=1), 0.0))
-
-
-def inside_limits(
-    values: Float[Array, " entry"],
-    low: Float[Array, " entry"] | float,
-    high: Float[Array, " entry"] | float,
-    margin: Scalar | float = 0.0,
-) -> Float[Array, " two_entry"]:
-    """Return how far values lie outside limits, negative inside.
-
-    Args:
-        values: of a state or anything that follows from it.
-        low: lower limits.
-        high: upper limits.
-        margin: by which the limits are narrowed.
-    """
-    return jnp.concatenate([low + margin - values, values - high + margin])
 
 
 def at_step(values: Array, at: StepIndex) -> Array:

@@ -18,9 +18,7 @@ from sfkd_jax.control.laws._feedback import (
     PathErrors,
     path_errors,
 )
-from sfkd_jax.control.laws._steady_turn import SteadyTurn
 from sfkd_jax.control.tasks._task import (
-    Actuator,
     Environments,
     Limiter,
     PlanningStart,
@@ -147,13 +145,11 @@ class PathTarget(NamedTuple):
     Attributes:
         point: x, y, yaw, speed.
         curvature: of the path there [1/m].
-        goal: latent of driving exactly along the path.
         turn: `SteadyTurn` of the law, or None if it is not a `ModelLaw`.
     """
 
     point: Float[Array, "*horizon 4"]
     curvature: Float[Array, "*horizon"]
-    goal: Any
     turn: Any
 
 
@@ -162,7 +158,7 @@ class PathTracking:
     """The task of tracking a path around a feedback law on the predicted state.
 
         u_k = limit(clip(u_ff(κ_k) + K ξ_k) + ν_k)
-        J = Σ_k ℓ(x_k, u_k) + λ_z |z_k − z_k^ref|² + w_T ℓ(x_T, u_T)
+        J = Σ_k ℓ(x_k, u_k) + w_T ℓ(x_T, u_T)
 
     Attributes:
         model: rolled out; `fiber` and `encode` are evaluated once per control step,
@@ -174,16 +170,9 @@ class PathTracking:
         control_high: upper control limits.
         control_rate: largest change of a control per second, or None.
         terminal_weight: w_T, added to the weight of the last step.
-        latent_weight: λ_z.
-        actuator: reads the actuator positions from the observation; without it, slew
-            limits count from the control applied last.
-        ancillary: a second law, whose plan along the horizon is evaluated as one more
-            sample.
 
     Raises:
         ValueError: the limits are inconsistent, see `actuator_limits`.
-
-    Source: for the ancillary law, Trevisan and Alonso-Mora (2024), Biased-MPPI.
     """
 
     model: Model
@@ -195,9 +184,6 @@ class PathTracking:
     control_high: tuple[float, ...]
     control_rate: tuple[Positive, ...] | None = None
     terminal_weight: float = 1.0
-    latent_weight: float = 0.0
-    actuator: Actuator | None = None
-    ancillary: ModelLaw | None = None
 
     def __post_init__(self) -> None:
         """Raise a ValueError for inconsistent limits."""
@@ -235,28 +221,18 @@ class PathTracking:
         # Many rollouts share this fibre; folding parameters that are folded is free.
         fiber = model.fiber(fold(model, params), env)
         curvature = reference_curvature(reference)
-        goals = jax.vmap(
-            lambda point: model.encode(fiber, _on_path(observation, point))
-        )(reference)
         errors = path_errors(observation, reference[0], curvature[0])
         turns = None
         if isinstance(law, ModelLaw):
             turns = law.prepare(model, fiber, observation, reference, curvature)
-        targets = PathTarget(reference, curvature, goals, turns)
+        targets = PathTarget(reference, curvature, turns)
         first = jax.tree.map(lambda leaf: leaf[0], targets)
         law_control = self._law_control(observation, first)
         # At the first step no control is known: assume that the law has driven.
         before = jnp.where(previous.known, previous.control, law_control)
-        if self.actuator is not None:
-            # What is measured is better than what was commanded.
-            before = self.actuator(observation)
         latent = model.encode(fiber, observation)
         start = PathSample(latent, model.decode(fiber, latent), errors, before)
-        proposals = None
-        if (ancillary := self.ancillary) is not None:
-            turns = ancillary.prepare(model, fiber, observation, reference, curvature)
-            proposals = self._ancillary_plan(ancillary, fiber, start, targets, turns)
-        return RolloutSetup(fiber, start, targets, proposals)
+        return RolloutSetup(fiber, start, targets)
 
     def step(
         self,
@@ -276,11 +252,6 @@ class PathTracking:
         errors = path_errors(after, point, target.curvature)
         inputs = StageInputs(errors, before.errors, control, before.control, point[3])
         cost = self.cost.stage(weights, inputs)
-        # Otherwise the goal is not even computed.
-        if self.latent_weight:
-            cost = cost + self.latent_weight * jnp.sum(
-                (model.vector(latent) - model.vector(target.goal)) ** 2
-            )
         cost = cost * (1.0 + self.terminal_weight * at.last)
         sample = PathSample(latent, after, errors, control)
         return StepResult(sample, cost, control, control - law_control, after)
@@ -299,37 +270,9 @@ class PathTracking:
             control = law(path_errors(state, point, curvature), curvature, point[3])
         return jnp.clip(control, *self.box())
 
-    def _ancillary_plan(
-        self,
-        ancillary: ModelLaw,
-        fiber: Any,
-        start: PathSample,
-        targets: PathTarget,
-        turns: SteadyTurn,
-    ) -> Float[Array, "1 horizon control"]:
-        """What the ancillary law adds to the law along the horizon."""
-        weights = self.cost.weights
-
-        def follow(before: PathSample, inputs: Any) -> tuple[PathSample, Control]:
-            target, turn = inputs
-            control = ancillary.control(
-                turn, before.state, target.point, target.curvature
-            )
-            nu = control - self._law_control(before.state, target)
-            anywhere = StepIndex(jnp.zeros((), int), jnp.zeros(()))
-            after = self.step(weights, fiber, before, nu, target, anywhere)
-            return after.sample, after.perturbation
-
-        return jax.lax.scan(follow, start, (targets, turns))[1][None]
-
 
 path_tracking = factory(PathTracking, PathTracking.task)
 """(model, cost, law, settings of `PathTracking`) -> `Task`."""
-
-
-def _on_path(state: State, point: Float[Array, " 4"]) -> State:
-    """The state of driving along the reference: its pose and speed, all else zero."""
-    return jnp.zeros_like(state).at[:4].set(point)
 
 
 def check_path(

@@ -2,10 +2,9 @@
 
 from __future__ import annotations
 
-import inspect
-import math
-from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Sequence
+from dataclasses import KW_ONLY, dataclass
+from functools import cached_property
 from typing import Any, NamedTuple, TypeAlias
 
 import jax
@@ -14,37 +13,26 @@ import numpy as np
 from jax.typing import ArrayLike
 from jaxtyping import Array, Bool, Float, Int
 
-from sfkd_jax.types import Control, Key, Params, Scalar, State
+from sfkd_jax.control._factory import factory
+from sfkd_jax.types import Control, Params, Scalar
 
 Environments: TypeAlias = Float[Array, "*particle environment"]
 """One environment, or several that are equally likely."""
-Actuator: TypeAlias = Callable[[State], Control]
-"""Reads the actuator positions from an observation."""
 Limiter: TypeAlias = Callable[[Control, Control], Control]
 """(wanted control, control before) -> the nearest control that the actuators allow."""
+Limit: TypeAlias = ArrayLike | Sequence[float]
+"""One number for all controls, or one for each."""
 
 
 class PlanningStart(NamedTuple):
-    """What a planner knows at the start of a control step.
-
-    Attributes:
-        control: applied at the previous control step.
-        known: False at the first step, where no control was applied before.
-        key: of this control step (and environment), for a task that is random itself.
-    """
+    """The control applied last, and whether there was one: False at the first step."""
 
     control: Control
     known: Bool[Array, ""]
-    key: Key | None = None
 
 
 class StepIndex(NamedTuple):
-    """The place of a step in the horizon.
-
-    Attributes:
-        number: 0, 1, …
-        last: 1 at the final step and 0 before it.
-    """
+    """The number of a step: 0, 1, …; and 1 at the last one, 0 before it."""
 
     number: Int[Array, ""]
     last: Scalar
@@ -57,13 +45,11 @@ class RolloutSetup(NamedTuple):
         context: shared by all samples and steps.
         start: state of one rollout before its first step.
         targets: data of each step; every leaf has the horizon as its leading axis.
-        proposals: plans suggested by the task, evaluated beside the sampled ones.
     """
 
     context: Any
     start: Any
     targets: Any
-    proposals: Float[Array, "*particle proposal horizon control"] | None = None
 
 
 class StepResult(NamedTuple):
@@ -73,8 +59,8 @@ class StepResult(NamedTuple):
         sample: state of the rollout after the step.
         cost: of the step.
         control: applied in the step.
-        perturbation: the part of the requested perturbation that the limits allowed.
-        state: predicted state after the step.
+        perturbation: the part of the row of the plan that the limits allowed.
+        state: predicted state after the step; reported, not carried.
     """
 
     sample: Any
@@ -87,15 +73,16 @@ class StepResult(NamedTuple):
 class Task(NamedTuple):
     """A planning problem as pure functions of one sample; planners vmap them.
 
+    A step takes one row of the plan. What a row means is up to the task: a control, a
+    perturbation of a feedback law, or, with `horizon=1`, the parameters of a whole
+    manoeuvre, which `step` evaluates at once and returns as `state`.
+
     Attributes:
-        low: lower control limits.
-        high: upper control limits.
-        weights: of the cost, a pytree of numbers. Planners carry them in their state,
-            so changing them does not recompile anything.
-        prepare: (params, observation, env, reference, planning start) ->
-            `RolloutSetup`.
-        step: (weights, context, sample, perturbation, target, step index) ->
-            `StepResult`.
+        low: lower limits of a control.
+        high: upper limits of a control.
+        weights: of the cost, a pytree of numbers that planners carry in their state.
+        prepare: (params, observation, env, reference, start) -> `RolloutSetup`.
+        step: (weights, context, sample, row, target, step index) -> `StepResult`.
         check: (observation, env, reference, horizon) -> None; raises a ValueError that
             names an argument of the wrong shape.
         constraint: see `constrained`; None for no constraint.
@@ -112,12 +99,7 @@ class Task(NamedTuple):
     constraint_data: Any = ()
 
 
-def actuator_limits(
-    low: tuple[float, ...],
-    high: tuple[float, ...],
-    rate: tuple[float, ...] | None,
-    dt: float,
-) -> Limiter:
+def actuator_limits(low: Limit, high: Limit, rate: Limit | None, dt: float) -> Limiter:
     """Return the projection of a control onto its box and its slew limits.
 
     Args:
@@ -129,35 +111,25 @@ def actuator_limits(
     Raises:
         ValueError: the box is empty, the sizes differ, or a rate is not positive.
     """
-    if len(low) != len(high) or not all(a < b for a, b in zip(low, high, strict=True)):
+    if np.shape(low) != np.shape(high) or not np.all(np.less(low, high)):
         raise ValueError(
             "control_low must lie below control_high, entry by entry, "
             f"got {low} and {high}"
         )
+    bottom, top = jnp.asarray(low, dtype=float), jnp.asarray(high, dtype=float)
     if rate is None:
-        return lambda wanted, before: jnp.clip(
-            wanted, jnp.asarray(low), jnp.asarray(high)
-        )
-    if len(rate) != len(low) or not all(entry > 0 for entry in rate):
-        raise ValueError(f"control_rate needs {len(low)} positive numbers, got {rate}")
-    bottom, top, reach = jnp.asarray(low), jnp.asarray(high), dt * jnp.asarray(rate)
+        return lambda wanted, before: jnp.clip(wanted, bottom, top)
+    if np.shape(rate) not in ((), np.shape(low)) or not np.all(np.greater(rate, 0)):
+        raise ValueError(f"control_rate needs positive numbers, got {rate}")
+    most = dt * jnp.asarray(rate, dtype=float)
 
     def limit(wanted: Control, before: Control) -> Control:
         # An actuator outside its box returns to it at once, whatever its slew limit.
         before = jnp.clip(before, bottom, top)
-        return jnp.clip(
-            wanted,
-            jnp.maximum(bottom, before - reach),
-            jnp.minimum(top, before + reach),
-        )
+        low, high = before - most, before + most
+        return jnp.clip(wanted, jnp.maximum(bottom, low), jnp.minimum(top, high))
 
     return limit
-
-
-Limit: TypeAlias = ArrayLike | Sequence[float] | None
-"""One number for every control, one for each, or None for no limit."""
-StageCost: TypeAlias = Callable[..., Scalar]
-"""(weights, state, control, control before, reference) -> cost of one step."""
 
 
 class FreeSample(NamedTuple):
@@ -167,91 +139,58 @@ class FreeSample(NamedTuple):
     control: Control
 
 
-class _Context(NamedTuple):
-    """What all steps of all rollouts share."""
-
-    params: Params
-    env: Any
-    key: Key | None
-
-
-def free_task(
-    dynamics: Callable[..., Any],
-    stage: StageCost,
-    *,
-    dt: float | None = None,
-    control_low: Limit = None,
-    control_high: Limit = None,
-    control_rate: Limit = None,
-    num_controls: int | None = None,
-    terminal: Callable[..., Scalar] | None = None,
-    weights: Any = (),
-    actuator: Actuator | None = None,
-) -> Task:
-    """Return the task of minimising any cost under any state equation.
+@dataclass(frozen=True, eq=False)
+class FreeTask:
+    """The task of minimising any cost under any state equation.
 
         x⁺ = f(params, x, u, e),   J = Σ_k ℓ(weights, x_{k+1}, u_k, u_{k−1}, ref_k) + φ
 
-    The state, the environment and the reference may be arrays, any other pytrees, or
-    None. A function is given `step` (number of the step), `params`, `env` and `key` as
-    keyword arguments if it has parameters of these names. The key is that of a step in
-    one environment, the same for all samples, so that they meet the same noise.
+    State, environment and reference may be arrays, any other pytrees, or None; every
+    leaf of the reference has the horizon as its leading axis.
 
-    Args:
-        dynamics: f; may take `step` and `key` besides.
-        stage: ℓ, evaluated at the state after the control; may take `params`, `env` and
-            `step` besides.
-        dt: sampling period [s]; needed with `control_rate`, and used by it alone.
-        control_low: lower control limits, one number for all controls, or None.
-        control_high: upper control limits, one number for all controls, or None.
+    Attributes:
+        dynamics: f.
+        stage: ℓ, evaluated at the state after the control.
+        control_low: lower control limits.
+        control_high: upper control limits.
         control_rate: largest change of a control per second, or None.
-        num_controls: needed if no limit has one entry per control; 1 by default.
-        terminal: φ(weights, x_T, ref_T); may take `params` and `env` besides.
-        weights: a pytree of numbers that both costs read; it can be changed at run
-            time through the planner's state.
-        actuator: reads the actuator positions from the observation; without it, slew
-            limits count from the control applied last.
-
-    Returns:
-        A `Task` whose reference has the horizon as the leading axis of every leaf.
+        dt: sampling period [s], which `control_rate` needs.
+        terminal: φ(weights, x_T, ref_T).
+        weights: a pytree of numbers that both costs read, see `Tuning.cost`.
 
     Raises:
-        ValueError: the limits are inconsistent, see `actuator_limits`, or
-            `control_rate` is given without `dt`.
+        ValueError: the limits are inconsistent, or a rate is given without `dt`.
     """
-    if control_rate is not None and dt is None:
-        raise ValueError("control_rate needs dt, the sampling period in seconds")
-    limits = (control_low, control_high, control_rate)
-    count = num_controls or max(
-        1 if limit is None else np.size(limit) for limit in limits
-    )
-    low = _filled(control_low, count, -math.inf)
-    high = _filled(control_high, count, math.inf)
-    rate = None if control_rate is None else _filled(control_rate, count, math.inf)
-    lowest, highest = jnp.asarray(low, dtype=float), jnp.asarray(high, dtype=float)
-    problem = _FreeTask(
-        dynamics=_with_extras(dynamics),
-        stage=_with_extras(stage),
-        terminal=None if terminal is None else _with_extras(terminal),
-        limit=actuator_limits(low, high, rate, dt or 1.0),
-        initial=jnp.clip(jnp.zeros(len(low)), lowest, highest),
-        actuator=actuator,
-    )
-    return Task(
-        lowest, highest, weights, problem.prepare, problem.step, _check_reference
-    )
 
+    dynamics: Callable[[Params, Any, Control, Any], Any]
+    stage: Callable[[Any, Any, Control, Control, Any], Scalar]
+    _: KW_ONLY
+    control_low: Limit = -np.inf
+    control_high: Limit = np.inf
+    control_rate: Limit | None = None
+    dt: float | None = None
+    terminal: Callable[[Any, Any, Any], Scalar] | None = None
+    weights: Any = ()
 
-@dataclass(frozen=True, eq=False)
-class _FreeTask:
-    """The functions of `free_task`."""
+    def __post_init__(self) -> None:
+        """Raise a ValueError for inconsistent limits."""
+        if self.control_rate is not None and self.dt is None:
+            raise ValueError("control_rate needs dt, the sampling period in seconds")
+        _ = self.limit
 
-    dynamics: Callable[..., Any]
-    stage: StageCost
-    terminal: Callable[..., Scalar] | None
-    limit: Limiter
-    initial: Control
-    actuator: Actuator | None
+    @cached_property
+    def limit(self) -> Limiter:
+        """The projection onto the limits of the actuators."""
+        rate = np.inf if self.control_rate is None else self.control_rate
+        low, high, rate = np.broadcast_arrays(self.control_low, self.control_high, rate)
+        return actuator_limits(low, high, rate, self.dt or 1.0)
+
+    def task(self) -> Task:
+        """Return the planning problem as functions."""
+        box = np.broadcast_arrays(self.control_low, self.control_high)
+        low, high = (jnp.asarray(end, dtype=float) for end in box)
+        steps = self.prepare, self.step, _check_reference
+        return Task(low, high, self.weights, *steps)
 
     def prepare(
         self,
@@ -263,71 +202,45 @@ class _FreeTask:
     ) -> RolloutSetup:
         """Return the first sample and what all samples share."""
         # Before the first control, slew limits count from rest.
-        before = jnp.where(start.known, start.control, self.initial)
-        if self.actuator is not None:
-            # What is measured is better than what was commanded.
-            before = self.actuator(observation)
-        first = FreeSample(jax.tree.map(jnp.asarray, observation), before)
-        return RolloutSetup(_Context(params, env, start.key), first, reference)
+        rest = self.limit(jnp.zeros_like(start.control), start.control)
+        before = jnp.where(start.known, start.control, rest)
+        state = jax.tree.map(jnp.asarray, observation)
+        # Integers become real if the dynamics make them so: a scan keeps types.
+        after = jax.eval_shape(self.dynamics, params, state, before, env)
+        state = jax.tree.map(
+            lambda leaf, like: leaf if leaf.dtype == like.dtype else leaf.astype(like),
+            state,
+            after,
+        )
+        return RolloutSetup((params, env), FreeSample(state, before), reference)
 
     def step(
         self,
         weights: Any,
-        context: _Context,
+        context: tuple[Params, Any],
         before: FreeSample,
         nu: Control,
         goal: Any,
         at: StepIndex,
     ) -> StepResult:
         """Return one step of one rollout: limits, state equation, cost."""
-        extras = context._asdict() | {"step": at.number}
-        if context.key is not None:
-            # One key a step for all samples: plans are compared under equal noise.
-            extras["key"] = jax.random.fold_in(context.key, at.number)
+        params, env = context
         control = self.limit(nu, before.control)
-        params, env = context.params, context.env
-        state = self.dynamics(extras, params, before.state, control, env)
-        cost = self.stage(extras, weights, state, control, before.control, goal)
+        state = self.dynamics(params, before.state, control, env)
+        cost = self.stage(weights, state, control, before.control, goal)
         if self.terminal is not None:
-            cost = cost + at.last * self.terminal(extras, weights, state, goal)
+            cost = cost + at.last * self.terminal(weights, state, goal)
         return StepResult(FreeSample(state, control), cost, control, control, state)
 
 
-def _with_extras(function: Callable[..., Any]) -> Callable[..., Any]:
-    """(extras, *arguments) -> the function with those extras that it names."""
-    try:
-        names = inspect.signature(function).parameters
-    except (TypeError, ValueError):  # no signature: a built-in, for example
-        names = {}
-    wanted = [
-        name for name in ("params", "env", "step", "key") if _is_extra(names, name)
-    ]
-
-    def call(extras: Mapping[str, Any], *arguments: Any) -> Any:
-        return function(*arguments, **{name: extras[name] for name in wanted})
-
-    return call
-
-
-def _is_extra(names: Mapping[str, inspect.Parameter], name: str) -> bool:
-    """Whether a parameter of this name can only be an extra."""
-    # Positional names are the caller's own; `env` may be the fourth argument.
-    return name in names and names[name].kind is inspect.Parameter.KEYWORD_ONLY
-
-
-def _filled(limit: Limit, count: int, missing: float) -> tuple[float, ...]:
-    """A limit as one number for each control."""
-    if limit is None:
-        return (missing,) * count
-    entries = tuple(float(entry) for entry in np.ravel(limit))
-    return entries * count if np.ndim(limit) == 0 else entries
+free_task = factory(FreeTask, FreeTask.task)
+"""(dynamics, stage, settings of `FreeTask`) -> `Task`."""
 
 
 def _check_reference(observation: Any, env: Any, reference: Any, horizon: int) -> None:
     """Raise a ValueError for a reference of another length than the horizon."""
     del observation, env
-    for leaf in jax.tree.leaves(reference):
-        shape = jnp.shape(leaf)
+    for shape in map(jnp.shape, jax.tree.leaves(reference)):
         if shape[:1] != (horizon,):
             raise ValueError(
                 f"reference must have {horizon} steps as its leading axis, "

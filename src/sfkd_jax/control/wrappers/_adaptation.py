@@ -11,7 +11,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from sfkd_jax.control.laws._path_law import PathLaw
-from sfkd_jax.control.planners._plans import all_finite
+from sfkd_jax.control.planners._planner import all_finite
 from sfkd_jax.control.tasks._along_path import Preview
 from sfkd_jax.control.wrappers._estimator import (
     CAUSES,

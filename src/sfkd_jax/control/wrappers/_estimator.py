@@ -16,7 +16,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
 from sfkd_jax.control.laws._path_law import PathLaw
-from sfkd_jax.control.planners._plans import all_finite
+from sfkd_jax.control.planners._planner import all_finite
 from sfkd_jax.geometry import PathState, path_state
 from sfkd_jax.types import BODY, Control, Environment, Model, Params, Scalar
 

@@ -16,7 +16,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
 from sfkd_jax.control.laws._path_law import PathLaw
-from sfkd_jax.control.planners._plans import all_finite
+from sfkd_jax.control.planners._planner import all_finite
 from sfkd_jax.control.tasks._along_path import Preview
 from sfkd_jax.geometry import LATERAL, PathState, is_valid, path_state
 from sfkd_jax.ranges import AtLeastOne, NonNegative, Positive, check_intervals

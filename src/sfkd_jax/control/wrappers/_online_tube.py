@@ -9,7 +9,7 @@ from typing import Annotated, Any, NamedTuple
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
-from sfkd_jax.control.planners._plans import all_finite
+from sfkd_jax.control.planners._planner import all_finite
 from sfkd_jax.geometry import LATERAL, between, compose, curvature_ahead, wrap_angle
 from sfkd_jax.ranges import AtLeastTwo, Fraction, Interval, Positive, check_intervals
 from sfkd_jax.types import (
