@@ -22,9 +22,11 @@ def test_an_extra_that_is_missing_or_broken_is_named_with_its_reason(
         "raise RuntimeError('its library is of another version\\nand more')"
     )
     monkeypatch.syspath_prepend(tmp_path)
-    assert doctor._extra(("json",)) is None
-    assert doctor._extra(("json", "no_such_module")) == "not installed (no_such_module)"
+    assert doctor._broken(("json",)) is None
     assert (
-        doctor._extra(("brokenextra",))
+        doctor._broken(("json", "no_such_module")) == "not installed (no_such_module)"
+    )
+    assert (
+        doctor._broken(("brokenextra",))
         == "brokenextra does not load: its library is of another version"
     )

@@ -109,14 +109,14 @@ def test_logs_are_stored_with_their_coverage_and_only_test_drives_are_held_out(
 ):
     monkeypatch.chdir(logs.parent)
     options = settings(*SMALL)
-    dataset, _ = data.ensure_dataset(data.source_of(options))
+    dataset, _ = data.ensure_dataset(options)
     assert [part.states.shape[1:] for part in dataset[:4]] == [(11, 5)] * 4
     assert sum(len(part.states) for part in dataset[:4]) == 8 * 12
-    held_out = data.held_out_parts(data.source_of(options), dataset)
+    held_out = data.held_out_parts(options, dataset)
     assert set(held_out) == {"test"}
     assert held_out["test"] is dataset.test
     covered = json.loads(
-        (data.source_of(options).path.parent / "coverage.json").read_text()
+        (data.dataset_path(options).parent / "coverage.json").read_text()
     )
     assert set(covered["state"]) == {"v", "yaw_rate"}
     assert 4.0 <= covered["state"]["v"]["low"] < covered["state"]["v"]["high"] <= 6.0

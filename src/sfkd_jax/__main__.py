@@ -34,14 +34,11 @@ def main() -> None:
         print(VERSION)
     elif command in COMMANDS:
         # The imports take seconds; the list above is quick.
-        try:
-            hydra_command = import_module("sfkd_jax.experiment.command").hydra_command
-        except ModuleNotFoundError as reason:
-            # A package that only loads policies is installed without these.
-            advice = 'pip install "sfkd-jax[train]"'
-            sys.exit(f"sfkd_jax: {command} needs {reason.name}: {advice}")
+        hydra_command = import_module("sfkd_jax.experiment.command").hydra_command
+        file = _file(command).relative_to(Path(__file__).parent)
+        module = import_module(".".join(("sfkd_jax", *file.with_suffix("").parts)))
         sys.argv = [f"sfkd {command}", *rest]
-        hydra_command(import_module(_module(command)).run)()
+        hydra_command(module.run)()
     else:
         hint = did_you_mean(command, COMMANDS) or ";"
         sys.exit(f"sfkd_jax: unknown command {command}{hint} sfkd lists them")
@@ -49,14 +46,19 @@ def main() -> None:
 
 def overview() -> str:
     """Return the page that lists the commands."""
-    width = max(map(len, COMMANDS))
+    lines = [
+        f"{VERSION}: learned dynamics with a stability certificate, driving MPPI.",
+        "",
+        "usage: sfkd COMMAND [+experiment=NAME] [GROUP=OPTION] [SETTING=VALUE]",
+        "",
+    ]
+    for name in COMMANDS:
+        # Parsed, not imported: that would take seconds.
+        text = ast.get_docstring(ast.parse(_file(name).read_text("utf-8"))) or ""
+        lines.append(f"  {name:8}  {text.partition(chr(10))[0]}")
     return "\n".join(
         [
-            f"{VERSION}: learned dynamics with a stability certificate, driving MPPI.",
-            "",
-            "usage: sfkd COMMAND [+experiment=NAME] [GROUP=OPTION] [SETTING=VALUE]",
-            "",
-            *(f"  {name:{width}}  {_summary(name)}" for name in COMMANDS),
+            *lines,
             "",
             "sfkd COMMAND --help lists groups and options, --cfg job all settings;",
             "-sc install=bash completes words; -m seed=0,1 runs a job for each value.",
@@ -64,19 +66,10 @@ def overview() -> str:
     )
 
 
-def _module(command: str) -> str:
-    """Return the name of a command's module: a package runs its `__main__`."""
-    package = Path(__file__).with_name(command) / "__main__.py"
-    return f"sfkd_jax.{command}" + (".__main__" if package.exists() else "")
-
-
-def _summary(command: str) -> str:
-    """Return the first line of a command's module docstring, without importing it."""
-    file = Path(__file__).with_name(f"{command}.py")
-    if not file.exists():
-        file = Path(__file__).with_name(command) / "__main__.py"
-    text = ast.get_docstring(ast.parse(file.read_text("utf-8"))) or ""
-    return text.split("\n")[0]
+def _file(command: str) -> Path:
+    """Return the file of a command: of a package, its `__main__`."""
+    inside = Path(__file__).with_name(command) / "__main__.py"
+    return inside if inside.exists() else Path(__file__).with_name(f"{command}.py")
 
 
 if __name__ == "__main__":

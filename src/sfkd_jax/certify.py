@@ -28,7 +28,7 @@ def run(settings: Settings) -> dict[str, Any]:
             `certification.renew` is false.
         CertificationRefused: nothing could be certified.
     """
-    if not (settings.run_dir / "policy.safetensors").is_file():
+    if not runs.policy_path(settings).is_file():
         store.print_message(_announcement(settings))
     trained = stages.ensure_policy(settings)
     path = stages.certificate_path(settings.run_dir)
@@ -42,7 +42,6 @@ def run(settings: Settings) -> dict[str, Any]:
     document = stages.certify_policy(settings)
     if not document["valid"]:
         raise CertificationRefused(document["reason"])
-    path = stages.certificate_path(settings.run_dir)
     d_bar = document.get("d_bar", {"value": None})["value"]
     keys = ("valid", "alpha", "alpha_separate", "rho", "beta", "tightness", "seconds")
     summary = {"certificate": str(path), "reason": None, "d_bar": d_bar}

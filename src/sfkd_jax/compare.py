@@ -5,16 +5,12 @@ from __future__ import annotations
 import time
 from typing import Any
 
-from hydra.errors import HydraException
-from omegaconf.errors import OmegaConfBaseException
-
 from sfkd_jax import store
-from sfkd_jax.experiment import grid
-from sfkd_jax.experiment.command import command_line, compose, hydra_command
+from sfkd_jax.experiment.command import command_line, hydra_command
 from sfkd_jax.experiment.comparing import Comparison
 from sfkd_jax.experiment.options import Settings
 from sfkd_jax.report import write_results_page
-from sfkd_jax.settings import plain, replace
+from sfkd_jax.settings import plain
 
 
 def run(settings: Settings) -> dict[str, Any]:
@@ -23,21 +19,7 @@ def run(settings: Settings) -> dict[str, Any]:
     With `comparison.share` only this share of the rows is evaluated, and nothing is
     collected.
     """
-    began = time.perf_counter()
-
-    def compose_cell(cell: grid.Cell) -> Settings:
-        """The settings of a cell, under the name of the comparison."""
-        try:
-            composed = compose(*grid.overrides(cell, settings.comparison))
-        except (HydraException, OmegaConfBaseException) as reason:
-            line = " ".join(str(reason).split("\n")[0].split())
-            raise ValueError(f"row {cell.label}: {line}") from None
-        is_varied = settings.comparison.variations[cell.variation]
-        variation = cell.variation if is_varied else None
-        protocol = replace(composed.evaluation, variation=variation)
-        return replace(composed, name=settings.name, evaluation=protocol)
-
-    table = Comparison(settings, compose_cell)
+    began, table = time.perf_counter(), Comparison(settings)
     done = table.evaluate() if settings.comparison.drive else 0
     if settings.comparison.share is not None:
         return {"results": None, "rows": done, "failed": len(table.failed)}

@@ -13,22 +13,15 @@ import jax
 import jax.numpy as jnp
 
 from sfkd_jax import store
+from sfkd_jax.experiment import TRAIN
 from sfkd_jax.experiment.command import hydra_command
 from sfkd_jax.experiment.options import Settings
 
-CORE = (
-    "jax",
-    "jaxlib",
-    "flax",
-    "optax",
-    "orbax-checkpoint",
-    "hydra-core",
-    "numpy",
-    "scipy",
-    "matplotlib",
-)
+CORE = ("jax", "jaxlib", "flax", "optax", "orbax-checkpoint", "hydra-core")
+CORE += ("numpy", "scipy", "matplotlib")
+"""Packages whose versions are shown."""
 EXTRAS = {
-    "train": ("hydra", "orbax.checkpoint", "cvxpy", "clarabel", "pyarrow", "pint"),
+    "train": TRAIN,
     "brax": ("brax",),
     "gym": ("gymnasium",),
     "docs": ("mkdocs", "material", "mkdocstrings"),
@@ -51,47 +44,36 @@ def run(settings: Settings) -> dict[str, Any]:
     Raises:
         ValueError: jax cannot compute here.
     """
-    versions = store.versions() | {name: _version(name) for name in CORE}
+    installed = {one.name.lower(): one.version for one in metadata.distributions()}
+    versions = store.versions() | {
+        name: installed.get(name, "missing") for name in CORE
+    }
     print("  ".join(f"{name} {version}" for name, version in versions.items()))
     devices = [f"{device.platform}: {device.device_kind}" for device in jax.devices()]
-    print(f"devices: {', '.join(devices)}; {_cores()} processor cores for this process")
+    affinity = getattr(os, "sched_getaffinity", lambda _: range(os.cpu_count() or 1))
+    print(
+        f"devices: {', '.join(devices)}; "
+        f"{len(affinity(0))} processor cores for this process"
+    )
     seconds = _backend_seconds()
     print(f"compiles and computes: yes, in {seconds:.1f} s")
-    extras = {name: _extra(modules) for name, modules in EXTRAS.items()}
-    for name, reason in extras.items():
-        print(
-            f"extra {name}: {reason or 'works'}"
-            + (f'; pip install "sfkd-jax[{name}]"' if reason else "")
-        )
+    broken = {name: _broken(modules) for name, modules in EXTRAS.items()}
+    for name, reason in broken.items():
+        advice = f'; pip install "sfkd-jax[{name}]"' if reason else ""
+        print(f"extra {name}: {reason or 'works'}{advice}")
     advice = _advice(Path(settings.root), devices)
     for line in advice:
         print(f"advice: {line}")
-    working = [name for name, reason in extras.items() if reason is None]
     return {
         "versions": versions,
         "devices": devices,
-        "extras": working,
+        "extras": [name for name, reason in broken.items() if reason is None],
         "advice": advice,
         "seconds": seconds,
     }
 
 
-def _cores() -> int | None:
-    return (
-        len(os.sched_getaffinity(0))
-        if hasattr(os, "sched_getaffinity")
-        else os.cpu_count()
-    )
-
-
-def _version(name: str) -> str:
-    try:
-        return metadata.version(name)
-    except metadata.PackageNotFoundError:
-        return "missing"
-
-
-def _extra(modules: tuple[str, ...]) -> str | None:
+def _broken(modules: tuple[str, ...]) -> str | None:
     """Return why an extra does not work; None if all its modules import."""
     for module in modules:
         try:
@@ -119,18 +101,14 @@ def _backend_seconds() -> float:
             lambda state, _: (permutation @ state, None), start, None, length=size
         )[0]
 
-    start = jnp.arange(size, dtype=jnp.float32)
+    start, where = jnp.arange(size, dtype=jnp.float32), jax.default_backend()
     try:
         right = bool(jnp.all(rotate(start) == start))
     except Exception as failure:
-        raise ValueError(
-            f"jax cannot compute on {jax.default_backend()}: {failure}"
-        ) from failure
+        raise ValueError(f"jax cannot compute on {where}: {failure}") from failure
+    # As many turns as there are entries lead back to the start.
     if not right:
-        raise ValueError(
-            f"jax computes wrongly on {jax.default_backend()}: "
-            "the power of a cyclic permutation is not the identity"
-        )
+        raise ValueError(f"jax computes wrongly on {where}: a full turn moves entries")
     return time.perf_counter() - began
 
 
@@ -149,9 +127,8 @@ def _advice(root: Path, devices: list[str]) -> list[str]:
             f"{free} MB are free below {directory}; "
             f"an experiment needs up to {NEEDED_MB}"
         )
-    if all(device.startswith("cpu") for device in devices) and shutil.which(
-        "nvidia-smi"
-    ):
+    on_cpu = all(device.startswith("cpu") for device in devices)
+    if on_cpu and shutil.which("nvidia-smi"):
         lines.append(
             'there is an accelerator that jax does not see; pip install "jax[cuda12]"'
         )

@@ -4,12 +4,10 @@ from __future__ import annotations
 
 from typing import Any
 
-from sfkd_jax import build
 from sfkd_jax.experiment import stages
 from sfkd_jax.experiment.command import command_line, hydra_command
 from sfkd_jax.experiment.evaluating import evaluate_run
 from sfkd_jax.experiment.options import Settings
-from sfkd_jax.plants import check_step
 
 
 def run(settings: Settings) -> dict[str, Any]:
@@ -20,9 +18,7 @@ def run(settings: Settings) -> dict[str, Any]:
     """
     if not settings.evaluation.systems:
         raise ValueError("evaluation.systems is empty: there is nothing to evaluate")
-    plant = build.build_vehicle(settings.vehicle)
-    check_step(plant)
-    stages.check_settings(settings, plant)
+    stages.check_settings(settings)
     return evaluate_run(settings, command=command_line("evaluate"))
 
 

@@ -13,10 +13,9 @@ from sfkd_jax.experiment.options import Settings
 def run(settings: Settings) -> dict[str, Any]:
     """Make the data set, unless it is stored already."""
     began = time.perf_counter()
-    source = data.source_of(settings)
-    dataset, _ = data.ensure_dataset(source)
+    dataset, _ = data.ensure_dataset(settings)
     return {
-        "dataset": str(source.path),
+        "dataset": str(data.dataset_path(settings)),
         "segments": sum(len(getattr(dataset, part).controls) for part in data.PARTS),
         "seconds": time.perf_counter() - began,
     }

@@ -3,15 +3,13 @@
 from __future__ import annotations
 
 import time
-from pathlib import Path
 from typing import Any
 
-from sfkd_jax import build, store
+from sfkd_jax import store
 from sfkd_jax.experiment import runs, stages
 from sfkd_jax.experiment.command import command_line, hydra_command
 from sfkd_jax.experiment.evaluating import evaluate_run
 from sfkd_jax.experiment.options import Settings
-from sfkd_jax.plants import check_step
 from sfkd_jax.report import write_report
 
 
@@ -22,20 +20,22 @@ def run(settings: Settings) -> dict[str, Any]:
     `evaluation.systems=[]` the model is trained alone, as a search needs it.
     """
     began = time.perf_counter()
-    plant = build.build_vehicle(settings.vehicle)
-    if plant.simulated:
-        check_step(plant)
-    stages.check_settings(settings, plant)
-    document = _run_stages(settings)
-    return document | {"seconds": time.perf_counter() - began}
+    stages.check_settings(settings)
+    return _run_stages(settings) | {"seconds": time.perf_counter() - began}
 
 
 @runs.exclusive
 def _run_stages(settings: Settings) -> dict[str, Any]:
     """Run all stages in the run directory."""
-    trained = stages.ensure_policy(settings)
-    run_dir = settings.run_dir
-    about = _about_training(run_dir)
+    trained, run_dir = stages.ensure_policy(settings), settings.run_dir
+    key = "position_rmse_m"
+    errors = store.read_json(run_dir / "open_loop.json", keys=(key,))
+    about = {
+        "run": str(run_dir),
+        "checkpoint": str(run_dir / "checkpoints"),
+        "open_loop_rmse_m": errors[key],
+        "objective": errors.get("validation_score"),
+    }
     if not settings.evaluation.systems:
         return about
     certificate = stages.certify_policy(settings)
@@ -55,18 +55,6 @@ def _run_stages(settings: Settings) -> dict[str, Any]:
         "results": results,
         "report": pages["report"],
         "alpha": certificate.get("alpha"),
-    }
-
-
-def _about_training(run_dir: Path) -> dict[str, Any]:
-    """Where the model is, its errors by steps ahead, and what a search minimises."""
-    key = "position_rmse_m"
-    errors = store.read_json(run_dir / "open_loop.json", keys=(key,))
-    return {
-        "run": str(run_dir),
-        "checkpoint": str(run_dir / "checkpoints"),
-        "open_loop_rmse_m": errors[key],
-        "objective": errors.get("validation_score"),
     }
 
 

@@ -10,7 +10,7 @@ from composing import settings
 from helpers import last_line, run_command
 
 from sfkd_jax.experiment import grid
-from sfkd_jax.experiment.provenance import source_hash
+from sfkd_jax.experiment.runs import source_hash
 from sfkd_jax.settings import replace
 from sfkd_jax.store import write_json
 

@@ -130,7 +130,7 @@ def use(option, name, value):
     chosen = parse_settings(OmegaConf.to_container(node))
     plant = build.build_vehicle(chosen.vehicle)
     build.build_scenario(chosen.scenario, plant, duration=10.0)
-    stages.check_settings(chosen, plant)
+    stages.check_settings(chosen)
 
 
 @pytest.mark.parametrize(

@@ -25,21 +25,11 @@ from sfkd_jax.experiment.runs import IDENTITY
 from sfkd_jax.settings import replace
 from sfkd_jax.store import ArtefactError
 
-FAILED = 1
-REFUSED = 2
-STALE = 3
-INTERRUPTED = 130
-"""Exit codes."""
-EXPECTED: dict[type[Exception], tuple[str, int]] = {
-    CertificationRefused: ("refused: ", REFUSED),
-    CertificateStale: ("stale: ", STALE),
-    ArtefactError: ("", FAILED),
-    ValueError: ("", FAILED),
-    training.TrainingStopped: ("", FAILED),
-    OSError: ("", FAILED),
-}
-"""Errors that become one line: what stands before it, and the exit code."""
-CACHE = "JAX_COMPILATION_CACHE_DIR"
+FAILED, INTERRUPTED = 1, 130
+OUTCOMES = {CertificationRefused: ("refused: ", 2), CertificateStale: ("stale: ", 3)}
+"""What stands before the line, and the exit code; others are `FAILED`."""
+EXPECTED = (*OUTCOMES, ArtefactError, ValueError, training.TrainingStopped, OSError)
+"""Errors that become one line."""
 LONGEST_NAME = 160
 """Characters of a directory name of a sweep; file systems allow 255."""
 
@@ -69,10 +59,8 @@ def hydra_command(run: Run) -> Callable[[], None]:
             _report("interrupted; the same command continues")
             # The interpreter would first wait for compiled code that nobody needs.
             os._exit(INTERRUPTED)
-        except tuple(EXPECTED) as reason:
-            prefix, code = next(
-                about for kind, about in EXPECTED.items() if isinstance(reason, kind)
-            )
+        except EXPECTED as reason:
+            prefix, code = OUTCOMES.get(type(reason), ("", FAILED))
             line = next(iter(str(reason).splitlines()), type(reason).__name__)
             _report(f"{prefix}{line}")
             if sweeping:  # an exit would end the jobs that follow
@@ -93,11 +81,8 @@ def hydra_command(run: Run) -> Callable[[], None]:
 def conf_path() -> str:
     """Return the folder of options: of the checkout, or of the installed package."""
     package = Path(__file__).resolve().parents[1]
-    checkout = package.parents[1]
-    inside = (checkout / "conf" / "config.yaml").exists() and (
-        checkout / "pyproject.toml"
-    ).exists()
-    return str(checkout / "conf" if inside else package / "conf")
+    installed, checkout = package / "conf", package.parents[1] / "conf"
+    return str(installed if installed.exists() else checkout)
 
 
 def settings_of(composed: DictConfig) -> Settings:
@@ -135,19 +120,13 @@ def use_compilation_cache(root: Path) -> None:
     The second run of a day then compiles nothing that the first one did.
     """
     defaults = {
-        CACHE: ("jax_compilation_cache_dir", str(root.resolve() / "compiled")),
-        "JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS": (
-            "jax_persistent_cache_min_compile_time_secs",
-            0.0,
-        ),
-        "JAX_PERSISTENT_CACHE_MIN_ENTRY_SIZE_BYTES": (
-            "jax_persistent_cache_min_entry_size_bytes",
-            -1,
-        ),
+        "jax_compilation_cache_dir": str(root.resolve() / "compiled"),
+        "jax_persistent_cache_min_compile_time_secs": 0.0,
+        "jax_persistent_cache_min_entry_size_bytes": -1,
     }
-    for variable, (option, value) in defaults.items():
+    for option, value in defaults.items():
         # What the user has set in the environment wins.
-        if variable not in os.environ:
+        if option.upper() not in os.environ:
             jax.config.update(option, value)
 
 
@@ -157,10 +136,11 @@ def named_for_sweep(settings: Settings) -> Settings:
     It contains what the job overrides and what changes the weights, so that jobs do not
     write into one directory. Model and seed are part of the path anyway.
     """
+    typed = [word.lstrip("+") for word in HydraConfig.get().overrides.task]
     overrides = [
-        word.lstrip("+")
-        for word in HydraConfig.get().overrides.task
-        if word.lstrip("+").split("=")[0].split(".")[0] in IDENTITY
+        word
+        for word in typed
+        if word.split("=")[0].split(".")[0] in IDENTITY
         and word.split("=")[0] not in ("model", "seed")
     ]
     if not overrides:

@@ -7,14 +7,16 @@ import time
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Any
 
+from hydra.errors import HydraException
 from jax.errors import JaxRuntimeError
+from omegaconf.errors import OmegaConfBaseException
 
 from sfkd_jax import build, store
-from sfkd_jax.experiment import data, evaluating, grid, runs, stages
-from sfkd_jax.experiment.grid import Cell, ComposeCell
-from sfkd_jax.experiment.options import ComparisonSettings, Settings
+from sfkd_jax.evaluation.metrics import Row
+from sfkd_jax.experiment import command, data, evaluating, grid, runs, stages
+from sfkd_jax.experiment.grid import Cell
+from sfkd_jax.experiment.options import Settings
 from sfkd_jax.plants import Vehicle
 from sfkd_jax.settings import plain, replace
 from sfkd_jax.training import TrainingStopped
@@ -29,19 +31,14 @@ class Comparison:
         failed: why a row failed, by its name.
     """
 
-    def __init__(self, settings: Settings, compose_cell: ComposeCell) -> None:
-        """List the cells.
-
-        Args:
-            settings: of the comparison.
-            compose_cell: cell -> its settings, under the name of the comparison.
-        """
+    def __init__(self, settings: Settings) -> None:
+        """List the cells of the comparison."""
         self.directory = Path(settings.root) / settings.name
         self.cells = grid.list_cells(settings.comparison)
         self.failed: dict[str, str] = {}
-        self._options: ComparisonSettings = settings.comparison
+        self._settings = settings
         # Composed once: every cell is asked for its settings several times.
-        self._compose = functools.cache(compose_cell)
+        self._compose = functools.cache(self._composed)
         self._episodes: dict[str, evaluating.EpisodeSet] = {}
 
     def evaluate(self) -> int:
@@ -52,7 +49,8 @@ class Comparison:
         evaluated.
         """
         began, done = time.perf_counter(), 0
-        groups = grid.take_share(grid.group_cells(self.cells), self._options.share)
+        share = self._settings.comparison.share
+        groups = grid.take_share(grid.group_cells(self.cells), share)
         for group in groups:
             with self._named_if_it_fails(group):
                 self._check(group)
@@ -69,7 +67,7 @@ class Comparison:
                 )
         return done
 
-    def rows(self) -> list[dict[str, Any]]:
+    def rows(self) -> list[Row]:
         """Return the rows of all stored cells.
 
         Raises:
@@ -81,6 +79,18 @@ class Comparison:
             reasons = "; ".join(self.failed.values()) or "none was requested"
             raise ValueError(f"nothing to compare: no row came out ({reasons})")
         return rows
+
+    def _composed(self, cell: Cell) -> Settings:
+        """The settings of a cell, under the name of the comparison."""
+        comparison = self._settings.comparison
+        try:
+            composed = command.compose(*grid.overrides(cell, comparison))
+        except (HydraException, OmegaConfBaseException) as reason:
+            line = " ".join(str(reason).split("\n")[0].split())
+            raise ValueError(f"row {cell.label}: {line}") from None
+        varied = cell.variation if comparison.variations[cell.variation] else None
+        protocol = replace(composed.evaluation, variation=varied)
+        return replace(composed, name=self._settings.name, evaluation=protocol)
 
     @contextmanager
     def _named_if_it_fails(self, group: list[Cell]) -> Iterator[None]:
@@ -107,7 +117,7 @@ class Comparison:
             key = grid.compilation_key(settings)
             if "self" in settings.evaluation.systems and key not in checked:
                 checked.add(key)
-                stages.check_settings(self._run_settings(cell), plant)
+                stages.check_settings(self._run_settings(cell))
 
     def _evaluate(self, group: list[Cell]) -> int:
         """Evaluate the cells of one row under one controller that are not done.
@@ -144,12 +154,12 @@ class Comparison:
 
     def _run_settings(self, cell: Cell) -> Settings:
         """The settings of a cell, under the name of the run of its policy."""
-        settings = self._compose(cell)
+        settings, comparison = self._compose(cell), self._settings.comparison
         # The first variation is the usual protocol;
         # those that train alike reuse its policy.
-        usual = cell._replace(variation=next(iter(self._options.variations)))
+        usual = cell._replace(variation=next(iter(comparison.variations)))
         retrained = runs.identity(settings) != runs.identity(self._compose(usual))
-        name = grid.policy_name(cell, self._options, retrained=retrained)
+        name = grid.policy_name(cell, comparison, retrained=retrained)
         return replace(settings, name=name)
 
     def _make_episodes(
@@ -174,5 +184,5 @@ def _compile(settings: Settings, plant: Vehicle) -> evaluating.SystemEvaluation:
     if "self" in settings.evaluation.systems:
         stages.ensure_certificate(settings)
     ((name, system),) = evaluating.load_systems(settings, plant).items()
-    dataset, _ = data.ensure_dataset(data.source_of(settings))
+    dataset, _ = data.ensure_dataset(settings)
     return evaluating.SystemEvaluation(settings, plant, name, system, dataset)

@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from functools import lru_cache, partial
+from functools import partial
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -30,15 +30,7 @@ from sfkd_jax.data import (
     segment_scenarios_along_path,
     split,
 )
-from sfkd_jax.experiment.options import (
-    AlongPathSettings,
-    CertificationSettings,
-    DatasetSettings,
-    EnvironmentSettings,
-    LogSettings,
-    Settings,
-    SimulatedSettings,
-)
+from sfkd_jax.experiment.options import LogSettings, Settings
 from sfkd_jax.plants import Vehicle, check_step
 from sfkd_jax.settings import arguments, plain
 from sfkd_jax.types import BODY, Key, Trajectory
@@ -49,148 +41,103 @@ SWITCHING = 2
 """Stream folded into the data set's seed; simulation and split use streams 0 and 1."""
 
 
-class Source(NamedTuple):
-    """What a data set depends on; runs of equal settings share it.
-
-    Attributes:
-        root: of all store.
-        vehicle: that is simulated, or that the logs are of.
-        environment: its box, and whether e is known.
-        dataset: how it is made.
-    """
-
-    root: str
-    vehicle: build.VehicleSettings
-    environment: EnvironmentSettings
-    dataset: DatasetSettings
-
-    @property
-    def logs(self) -> LogSettings | None:
-        """The settings of logs; None if the data are simulated."""
-        return self.dataset if isinstance(self.dataset, LogSettings) else None
-
-    @property
-    def along_path(self) -> AlongPathSettings | None:
-        """The settings of path coordinates; None for those of the world."""
-        return self.dataset if isinstance(self.dataset, AlongPathSettings) else None
-
-    @property
-    def knows_env(self) -> bool:
-        """Whether the environment is measured or estimated."""
-        return self.environment.source != "none"
-
-    @property
-    def config(self) -> dict[str, Any]:
-        """The settings as plain values, with the contents of logs for their path."""
-        options = plain(self.dataset)
-        if self.logs:
-            # Contents instead of the path: the same
-            # logs elsewhere make the same data set.
-            options["contents"] = fingerprint(options.pop("path"))
-            options["environment_known"] = self.knows_env
-        box = plain({"low": self.environment.low, "high": self.environment.high})
-        return {
-            "vehicle": plain(self.vehicle),
-            "environment": box,
-            "dataset": options,
-        }
-
-    @property
-    def path(self) -> Path:
-        """Of the data set."""
-        digest = store.sha256(self.config)[:8]
-        name = f"{self.vehicle.name}-{digest}"
-        return Path(self.root) / "datasets" / name / "dataset.safetensors"
-
-    @property
-    def columns(self) -> dict[str, list[str]]:
-        """Columns of the logs by box; an unused environment has none."""
-        named = self.logs.columns if self.logs else Columns()
-        return {
-            "state": list(named.state[BODY]),
-            "control": list(named.control),
-            "env": list(named.environment) if self.knows_env else [],
-        }
+def config(settings: Settings) -> dict[str, Any]:
+    """Return what the data set of a run depends on; runs of equal values share it."""
+    dataset, environment = plain(settings.dataset), settings.environment
+    if logs := settings.logs:
+        # Contents instead of the path: the same logs elsewhere make the same data set.
+        del dataset["path"]
+        dataset["contents"] = fingerprint(logs.path)
+        dataset["environment_known"] = environment.is_known
+    return {
+        "vehicle": plain(settings.vehicle),
+        "environment": plain({"low": environment.low, "high": environment.high}),
+        "dataset": dataset,
+    }
 
 
-def source_of(settings: Settings) -> Source:
-    """Return what the data set of a run depends on."""
-    return Source(
-        settings.root, settings.vehicle, settings.environment, settings.dataset
-    )
+def dataset_path(settings: Settings) -> Path:
+    """Return the path of the data set of a run."""
+    name = f"{settings.vehicle.name}-{store.sha256(config(settings))[:8]}"
+    return Path(settings.root) / "datasets" / name / "dataset.safetensors"
 
 
-def ensure_dataset(source: Source) -> tuple[Dataset, str]:
+def column_names(settings: Settings) -> dict[str, list[str]]:
+    """Return the columns of the logs by box; an unused environment has none."""
+    named = settings.logs.columns if settings.logs else Columns()
+    env = list(named.environment) if settings.environment.is_known else []
+    return {
+        "state": list(named.state[BODY]),
+        "control": list(named.control),
+        "env": env,
+    }
+
+
+def ensure_dataset(settings: Settings) -> tuple[Dataset, str]:
     """Return the data set and its hash; simulate or read it if it is missing."""
-    path = source.path
+    path = dataset_path(settings)
     if not path.is_file():
         with store.locked(path.parent, wait=True):  # other runs share the data set
             # Another run may have made it while this one waited for the lock.
             if not path.is_file():
-                logs = source.logs
-                made = _read_logs(source, logs) if logs else _simulate(source)
-                write(source, made)
+                logs = settings.logs
+                made = _read_logs(settings, logs) if logs else _simulate(settings)
+                write(settings, made)
     # Read back even if just made: every run trains on what is stored.
-    return read(source)
+    return read(settings)
 
 
-def _simulate(source: Source) -> Dataset:
+def _simulate(settings: Settings) -> Dataset:
     """Simulate a data set with the vehicle of the settings.
 
     Raises:
         ValueError: the vehicle has no step, or one that does not return a state.
     """
-    check_step(build.build_vehicle(source.vehicle))
-    options, box = source.dataset, source.environment
-    assert isinstance(options, SimulatedSettings)
+    check_step(build.build_vehicle(settings.vehicle))
+    options: Any = settings.dataset
     # A key each: other shares of the split leave the trajectories as they are.
     drive_key, split_key = jax.random.split(jax.random.key(options.seed))
     store.print_message(f"generating {options.segments} segments")
-    trajectories = jax.jit(_generator(source))(drive_key)
+    trajectories = jax.jit(_generator(settings))(drive_key)
     labels = segment_scenarios
-    if source.along_path:
+    if settings.along_path:
         check_on_path(trajectories)
         labels = segment_scenarios_along_path
     return split(
         trajectories,
         split_key,
         shares=options.shares,
-        env_low=jnp.asarray(box.low),
-        env_high=jnp.asarray(box.high),
+        env_low=jnp.asarray(settings.environment.low),
+        env_high=jnp.asarray(settings.environment.high),
         scenarios=jnp.asarray(labels(options.segments)),
     )
 
 
 def _generator(
-    source: Source, *, switching: bool = False, **changes: Any
+    settings: Settings, *, switching: bool = False, **changes: int
 ) -> Callable[[Key], Trajectory]:
-    """Return key -> the runs of a data set, or as many under the switching of S3.
-
-    Args:
-        source: simulated.
-        switching: whether the environment follows S3.
-        changes: of options of the generator.
-    """
-    plant = build.build_vehicle(source.vehicle)
-    if source.along_path is None:
-        make = generate_switching if switching else generate
-        options = arguments(source.dataset, make) | changes
-        return partial(make, plant, build.build_driver(plant), **options)
-    loop = closed_loop(source)
-    options = arguments(source.dataset, generate_along_path) | changes
-    if switching:
-        return partial(generate_s3_along_path, loop, **options)
-    box: Any = source.environment.box
-    return partial(generate_along_path, loop, **options, **box)
+    """Return key -> the runs of a data set, or as many under the switching of S3."""
+    make: Any
+    if settings.along_path:
+        loop = closed_loop(settings)
+        options = arguments(settings.dataset, generate_along_path) | changes
+        if switching:
+            return partial(generate_s3_along_path, loop, **options)
+        box: Any = settings.environment.box
+        return partial(generate_along_path, loop, **options, **box)
+    plant = build.build_vehicle(settings.vehicle)
+    make = generate_switching if switching else generate
+    options = arguments(settings.dataset, make) | changes
+    return partial(make, plant, build.build_driver(plant), **options)
 
 
-def _read_logs(source: Source, logs: LogSettings) -> Dataset:
+def _read_logs(settings: Settings, logs: LogSettings) -> Dataset:
     """Read a data set from logs, and write what it covers beside it.
 
     Raises:
         ValueError: the columns do not match the state of the vehicle.
     """
-    plant = build.build_vehicle(source.vehicle)
+    plant = build.build_vehicle(settings.vehicle)
     columns = Columns(**arguments(logs.columns, Columns))
     if len(columns.state) != len(plant.state_names):
         raise ValueError(
@@ -205,101 +152,91 @@ def _read_logs(source: Source, logs: LogSettings) -> Dataset:
         report=store.print_message,
         dt=plant.dt,
         wheelbase=plant.wheelbase,
-        needs_environment=source.knows_env,
+        needs_environment=settings.environment.is_known,
         limits=(plant.control_low or None, plant.control_high or None),
-        **source.environment.box,
+        **settings.environment.box,
         **arguments(logs, from_logs),
     )
-    store.write_json(source.path.with_name("coverage.json"), logged.coverage)
+    store.write_json(dataset_path(settings).with_name("coverage.json"), logged.coverage)
     return logged.dataset
 
 
-def write(source: Source, dataset: Dataset) -> None:
+def write(settings: Settings, dataset: Dataset) -> None:
     """Write the four parts of a data set."""
-    arrays = {
-        f"{part}/{name}": np.asarray(leaf)
+    arrays: dict[str, Any] = {
+        f"{part}/{name}": leaf
         for part in PARTS
         for name, leaf in getattr(dataset, part)._asdict().items()
     }
     if dataset.drives is not None:
-        arrays["drives"] = np.asarray([dataset.drives[part] for part in PARTS])
+        arrays["drives"] = [dataset.drives[part] for part in PARTS]
     if dataset.scenarios is not None:
         labels = dataset.scenarios
-        arrays |= {f"{part}/scenario": np.asarray(labels[part]) for part in PARTS}
-    source.path.parent.mkdir(parents=True, exist_ok=True)
-    store.write_arrays(source.path, arrays, kind=DATASET, config=source.config)
+        arrays |= {f"{part}/scenario": labels[part] for part in PARTS}
+    about = config(settings)
+    store.write_arrays(dataset_path(settings), arrays, kind=DATASET, config=about)
 
 
-def read(source: Source) -> tuple[Dataset, str]:
+def read(settings: Settings) -> tuple[Dataset, str]:
     """Return a data set and its hash.
 
     Raises:
         ArtefactError: missing, damaged, or made with other settings.
     """
-    arrays, manifest = store.read_arrays(
-        source.path, kind=DATASET, config=source.config
-    )
-    with store.as_artefact_error(source.path):
+    path, scenarios = dataset_path(settings), None
+    arrays, manifest = store.read_arrays(path, kind=DATASET, config=config(settings))
+    with store.as_artefact_error(path):
         parts = [
             Trajectory(
                 *(jnp.asarray(arrays[f"{part}/{name}"]) for name in Trajectory._fields)
             )
             for part in PARTS
         ]
-        scenarios = None
-        if source.logs is None:
+        if settings.logs is None:
             scenarios = {
                 part: jnp.asarray(arrays[f"{part}/scenario"]) for part in PARTS
             }
     # Over all parts: E does not depend on how they were split.
     envs = np.concatenate([np.asarray(part.envs) for part in parts])
-    low, high = environment_box(envs, *source.environment.box.values())
-    counts = arrays.get("drives")
-    drives = (
-        None
-        if counts is None
-        else {part: int(count) for part, count in zip(PARTS, counts, strict=True)}
-    )
+    low, high = environment_box(envs, *settings.environment.box.values())
+    drives = None
+    if (counts := arrays.get("drives")) is not None:
+        drives = dict(zip(PARTS, map(int, counts), strict=True))
     dataset = Dataset(
         *parts, env_low=low, env_high=high, drives=drives, scenarios=scenarios
     )
     return dataset, manifest["sha256"]
 
 
-def ensure_law(source: Source) -> PathLaw | None:
+def ensure_law(settings: Settings) -> PathLaw | None:
     """Return the law of the data set; derive it if it is missing.
 
     Returns:
         The law, or None if the data set is not in path coordinates.
     """
-    if source.along_path is None:
+    if settings.along_path is None:
         return None
-    path = source.path.with_name("law.safetensors")
+    path, about = dataset_path(settings).with_name("law.safetensors"), config(settings)
     if not path.is_file():
-        plant = build.build_vehicle(source.vehicle)
+        plant = build.build_vehicle(settings.vehicle)
         store.print_message(f"deriving the law of vehicle {plant.name}")
-        settings, box = source.along_path.law, source.environment.box
-        derive: Any = partial(build.build_law, settings, plant, **box)  # pyright: ignore
-        path.parent.mkdir(parents=True, exist_ok=True)
-        plain_arrays = {
-            name: np.asarray(array)
-            for name, array in jax.jit(derive)()._asdict().items()
-        }
-        store.write_arrays(path, plain_arrays, kind=LAW, config=source.config)
-    arrays, _ = store.read_arrays(path, kind=LAW, config=source.config)
-    return law_from_arrays(arrays)
+        box: Any = settings.environment.box
+        derive = partial(build.build_law, settings.along_path.law, plant, **box)
+        law = jax.device_get(jax.jit(derive)())._asdict()
+        store.write_arrays(path, law, kind=LAW, config=about)
+    return law_from_arrays(store.read_arrays(path, kind=LAW, config=about)[0])
 
 
-def closed_loop(source: Source) -> Vehicle:
+def closed_loop(settings: Settings) -> Vehicle:
     """Return the closed loop of vehicle and law, in the coordinates of `path_frame`.
 
     Raises:
         ValueError: the data set is not in path coordinates.
     """
-    law = ensure_law(source)
+    law = ensure_law(settings)
     if law is None:
         raise ValueError("a loop along a path needs dataset=path")
-    return build.build_loop(build.build_vehicle(source.vehicle), law)
+    return build.build_loop(build.build_vehicle(settings.vehicle), law)
 
 
 def boxes(dataset: Dataset) -> dict[str, list[list[float]]]:
@@ -326,49 +263,42 @@ def boxes(dataset: Dataset) -> dict[str, list[list[float]]]:
     }
 
 
-def held_out_parts(source: Source, dataset: Dataset) -> dict[str, Trajectory]:
+def held_out_parts(settings: Settings, dataset: Dataset) -> dict[str, Trajectory]:
     """Return the trajectories on which coverage is measured, by name.
 
     These are the test part, its segments of each scenario, and as many runs of S3,
     which training never uses. Logged runs have no scenario: of them it is the test part
     only.
-
-    Args:
-        source: of the data set.
-        dataset: all of its parts.
     """
+    parts = {"test": dataset.test}
     if dataset.scenarios is None:
-        return {"test": dataset.test}
-    labels = dataset.scenarios["test"]
-    segments = dataset.test.controls.shape[0]
-    parts = {"test": dataset.test, "s3": _switching(source, segments)}
+        return parts
+    key = dataset_path(settings), dataset.test.controls.shape[0]
+    if key not in _SWITCHING:
+        simulate = jax.jit(_generator(settings, switching=True, segments=key[1]))
+        seed = jax.random.key(settings.dataset.seed)
+        # A stream of its own: S3 must not repeat what the training data drew.
+        _SWITCHING[key] = simulate(jax.random.fold_in(seed, SWITCHING))
+    parts["s3"] = _SWITCHING[key]
     for code, name in enumerate(SCENARIOS):
-        if (chosen := labels == code).any():
+        if (chosen := dataset.scenarios["test"] == code).any():
             parts[name] = jax.tree.map(
                 lambda leaf, chosen=chosen: leaf[chosen], dataset.test
             )
     return parts
 
 
-@lru_cache(maxsize=4)
-def _switching(source: Source, segments: int) -> Trajectory:
-    """Simulate runs under S3; cached for rows of a comparison."""
-    simulate = jax.jit(_generator(source, switching=True, segments=segments))
-    seed = jax.random.key(source.dataset.seed)
-    # A stream of its own: S3 must not repeat what the training data drew.
-    return simulate(jax.random.fold_in(seed, SWITCHING))
+_SWITCHING: dict[tuple[Path, int], Trajectory] = {}
+"""Runs under S3 by data set and number, which rows of a comparison share."""
 
 
-def check_calibration_size(
-    dataset: Dataset, certification: CertificationSettings
-) -> None:
+def check_calibration_size(dataset: Dataset, level: float) -> None:
     """Check before training that the calibration part supports the level.
 
     Raises:
         ValueError: naming the setting, and the largest level that is possible.
     """
     count = dataset.calibration.controls.shape[0]
-    level = certification.level
     # As `conformal_quantile` will ask, but before the training.
     if math.ceil((count + 1) * level) > count:
         # Rounded down, so that the proposed level is accepted.

@@ -7,7 +7,7 @@ import time
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from functools import partial
-from typing import Any, NamedTuple, TypeAlias
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -16,10 +16,9 @@ import numpy as np
 from sfkd_jax import build, evaluation, policy, store
 from sfkd_jax.build import System
 from sfkd_jax.certification import latent_tube
-from sfkd_jax.control import PathLaw
 from sfkd_jax.data import Dataset, to_path
+from sfkd_jax.evaluation.metrics import Row
 from sfkd_jax.experiment import data, runs, stages
-from sfkd_jax.experiment.data import source_of
 from sfkd_jax.experiment.options import Settings
 from sfkd_jax.plants import Vehicle, check_step
 from sfkd_jax.rollout import fold, unfold
@@ -51,13 +50,8 @@ class EpisodeSet(NamedTuple):
 class SystemResult(NamedTuple):
     """A row of results.json before comparisons, and the arrays behind it."""
 
-    row: dict[str, Any]
+    row: Row
     arrays: dict[str, np.ndarray]
-
-
-Scored: TypeAlias = tuple[evaluation.Scores, dict[str, Any]]
-Scorer: TypeAlias = Callable[[evaluation.Episode, Scenario], Scored]
-"""(episodes, their scenarios) -> scores, and the rates of violations."""
 
 
 def make_episodes(settings: Settings, plant: Vehicle) -> EpisodeSet:
@@ -143,12 +137,12 @@ def load_systems(settings: Settings, plant: Vehicle) -> dict[str, System]:
     Raises:
         ValueError: an unknown system.
     """
-    law = data.ensure_law(source_of(settings))
+    law = data.ensure_law(settings)
     references = build.reference_systems(plant, law)
     systems = {}
     for name in settings.evaluation.systems:
         if name == "self":
-            systems[settings.model.system] = policy_system(settings)
+            systems[settings.model.system] = _policy_system(settings)
             continue
         system = choose(references, name, "evaluation.systems entry")
         if settings.environment.source == "estimated" and system.env_source != "none":
@@ -157,14 +151,14 @@ def load_systems(settings: Settings, plant: Vehicle) -> dict[str, System]:
     return systems
 
 
-def policy_system(settings: Settings) -> System:
+def _policy_system(settings: Settings) -> System:
     """Return the policy of the run as a system, with a certificate if it has one."""
     trained = stages.ensure_policy(settings)
     certificate, reason = policy.read_certificate(settings.run_dir, trained)
     if certificate is None:
         store.print_message(f"nothing is certified: {reason}")
-    reads_env = trained.settings["model"]["environment"]
     # A policy that reads no e is given no estimate of it either.
+    reads_env = trained.settings["model"]["environment"]
     env_source = settings.environment.source if reads_env else "none"
     return System(trained.model, trained.params, env_source, certificate, trained.law)
 
@@ -197,8 +191,8 @@ class SystemEvaluation:
             system: to evaluate.
             dataset: its test part gives the open-loop error, or None for none.
         """
-        self._protocol, self._plant = settings.evaluation, plant
-        self._times: list[tuple[float, float] | None] = []
+        self._settings, self._plant = settings, plant
+        self._timed: list[tuple[float, float] | None] = []
         box: Any = settings.environment.box
         # Of logs the box is measured: their settings have none.
         if dataset is not None:
@@ -212,41 +206,30 @@ class SystemEvaluation:
             env_source=system.env_source,
             law=system.law,
         )
-        self._columns = _columns(settings, name, system)
         # Folded once here; otherwise every control step would fold again.
-        folded = jax.jit(partial(fold, system.model))(system.params)
-        system, self.params = system._replace(params=folded), folded
-        self._columns["open_loop_rmse_m"] = _open_loop(settings, system, dataset)
-        self._horizon = settings.controller.horizon
+        self.params = jax.jit(partial(fold, system.model))(system.params)
+        self._system = system._replace(params=self.params)
+        self._columns = _columns(settings, name, system)
+        self._columns["open_loop_rmse_m"] = self._open_loop_rmse(dataset)
+        self._claims = _claims(settings, system)
         self._simulate = _over_episodes(self._episode)
-        self._score = _scorer(settings, system, plant.dt)
+        self._predict = jax.jit(self._predictions)
 
     def __call__(self, episodes: EpisodeSet) -> SystemResult:
         """Simulate and score one set of episodes, without and with side forces."""
         episode, scores, violation = self._scored(episodes, 0.0)
         # Timed once: a control step takes equally long on every scenario.
-        if not self._times:
-            self._times.append(self._act_ms(episodes))
+        if not self._timed:
+            self._timed.append(self._act_ms(episodes))
         about = {"scenario": episodes.name, "variation": episodes.variation}
-        row = evaluation.row(
-            scores,
-            self._columns | about,
-            self._times[0],
-            violation,
-        )
-        if self._protocol.side_forces:
-            # Without a force the episodes are those above, and are not simulated again.
-            row["disturbed"] = [
-                evaluation.disturbed(
-                    force,
-                    *(
-                        self._scored(episodes, force)[1:]
-                        if force
-                        else (scores, violation)
-                    ),
-                )
-                for force in self._protocol.side_forces
-            ]
+        row = evaluation.row(scores, self._columns | about, self._timed[0], violation)
+        if forces := self._settings.evaluation.side_forces:
+            row["disturbed"] = []
+        for force in forces:
+            # Without a force the episodes are those above, and not simulated again.
+            if force:
+                _, scores, violation = self._scored(episodes, force)
+            row["disturbed"].append(evaluation.disturbed(force, scores, violation))
         parts = ("lateral", "states", "controls")
         arrays = {part: np.asarray(getattr(episode, part)) for part in parts}
         return SystemResult(row, arrays)
@@ -258,38 +241,75 @@ class SystemEvaluation:
             self.params,
             scenario,
             key,
-            horizon=self._horizon,
+            horizon=self._settings.controller.horizon,
             dt=self._plant.dt,
-            observation_noise=self._protocol.observation_noise,
+            observation_noise=self._settings.evaluation.observation_noise,
         )
 
     def _scored(
         self, episodes: EpisodeSet, force: float
     ) -> tuple[evaluation.Episode, evaluation.Scores, dict[str, Any]]:
         """Episodes under unmeasured side forces up to `force` [N], and their scores."""
-        scenarios = episodes.scenarios
+        known = driven = episodes.scenarios
         if force:
             disturb = partial(
                 evaluation.disturbed_environment, self._plant, largest=force
             )
-            envs = jax.jit(jax.vmap(disturb))(scenarios.envs, episodes.keys)
-            scenarios = scenarios._replace(envs=envs)
-        episode = self._simulate(scenarios, episodes.keys)
+            envs = jax.jit(jax.vmap(disturb))(known.envs, episodes.keys)
+            driven = known._replace(envs=envs)
+        episode = self._simulate(driven, episodes.keys)
         # Scored against e without the force, which no model knows.
-        return episode, *self._score(episode, episodes.scenarios)
+        scores = evaluation.score(episode, np.asarray(known.envs), dt=self._plant.dt)
+        predicted = None
+        # A prediction needs as many steps as a segment of the data set has.
+        if episode.controls.shape[1] >= self._settings.dataset.steps:
+            seen = Trajectory(episode.states, episode.controls, episode.assumed_envs)
+            predicted = jax.device_get(self._predict(self.params, seen, known))
+        return episode, scores, evaluation.violations(predicted, self._claims)
+
+    def _predictions(
+        self, params: Params, seen: Trajectory, scenarios: Scenario
+    ) -> evaluation.Predictions:
+        """Errors of predictions along episodes, in the coordinates of the model."""
+
+        def convert(episode: Trajectory, scenario: Scenario) -> Trajectory:
+            if self._system.law is None:
+                return episode
+            speeds = jnp.full(episode.controls.shape[0], scenario.speed)
+            return to_path(episode, scenario.path, self._system.law, speeds)
+
+        return evaluation.predictions(
+            self._system.model,
+            params,
+            jax.vmap(convert)(seen, scenarios),
+            length=self._settings.dataset.steps,
+            horizon=self._settings.certification.horizon,
+        )
+
+    def _open_loop_rmse(self, dataset: Dataset | None) -> dict[str, float] | None:
+        """Position RMSE of predictions on the test part, by steps ahead [m]."""
+        if dataset is None:
+            return None
+        horizon = self._settings.certification.horizon
+        predict = partial(evaluation.open_loop, self._system.model, horizon=horizon)
+        errors = jax.jit(predict)(self.params, dataset.test)
+        distance = np.hypot(*np.asarray(errors, dtype=np.float64).T[:2])
+        steps = [step for step in OPEN_LOOP_STEPS if step <= horizon]
+        return {str(step): float(distance[step - 1]) for step in steps}
 
     def _act_ms(self, episodes: EpisodeSet) -> tuple[float, float] | None:
         """Median and 99 % quantile of a compiled control step [ms]; None: not timed."""
-        if not self._protocol.timed_steps:
+        steps = self._settings.evaluation.timed_steps
+        if not steps:
             return None
         scenario = jax.tree.map(lambda leaf: leaf[0], episodes.scenarios)
         reference = evaluation.first_reference(
-            scenario, horizon=self._horizon, dt=self._plant.dt
+            scenario, horizon=self._settings.controller.horizon, dt=self._plant.dt
         )
         observed = (scenario.initial_state, scenario.envs[0], reference)
         act = jax.jit(self.controller.act)
         state, times = self.controller.init(episodes.keys[0]), []
-        for _ in range(WARM_UP + self._protocol.timed_steps):
+        for _ in range(WARM_UP + steps):
             start = time.perf_counter()
             _, state, _ = jax.block_until_ready(act(self.params, state, *observed))
             times.append(1e3 * (time.perf_counter() - start))
@@ -298,7 +318,7 @@ class SystemEvaluation:
         return float(np.median(times)), float(np.quantile(times, 0.99))
 
 
-def _columns(settings: Settings, name: str, system: System) -> dict[str, Any]:
+def _columns(settings: Settings, name: str, system: System) -> Row:
     """The columns of a row that do not depend on episodes."""
     protocol, certificate = settings.evaluation, system.certificate
     leaves = jax.tree.leaves(unfold(system.params))
@@ -319,69 +339,9 @@ def _columns(settings: Settings, name: str, system: System) -> dict[str, Any]:
     }
 
 
-def _open_loop(
-    settings: Settings, system: System, dataset: Dataset | None
-) -> dict[str, float] | None:
-    """Position RMSE of predictions on the test part, by steps ahead [m]."""
-    if dataset is None:
-        return None
-    horizon = settings.certification.horizon
-    errors = jax.jit(partial(evaluation.open_loop, system.model, horizon=horizon))(
-        system.params, dataset.test
-    )
-    distance = np.hypot(*np.asarray(errors, dtype=np.float64).T[:2])
-    return {
-        str(step): float(distance[step - 1])
-        for step in OPEN_LOOP_STEPS
-        if step <= horizon
-    }
-
-
-def _scorer(settings: Settings, system: System, dt: float) -> Scorer:
-    """Return the function that scores a batch of episodes of one system.
-
-    Args:
-        settings: of the run.
-        system: its parameters folded.
-        dt: sampling period [s].
-    """
-    length, horizon = settings.dataset.steps, settings.certification.horizon
-    claims = _claims(settings, system)
-
-    @jax.jit
-    def predict(params: Params, seen: Trajectory, scenarios: Scenario) -> Any:
-        convert = partial(_model_coordinates, system.law)
-        converted = jax.vmap(convert)(seen, scenarios)
-        return evaluation.predictions(
-            system.model, params, converted, length=length, horizon=horizon
-        )
-
-    def score(episodes: evaluation.Episode, scenarios: Scenario) -> Scored:
-        seen = Trajectory(episodes.states, episodes.controls, episodes.assumed_envs)
-        errors = None
-        # A prediction needs as many steps as a segment of the data set has.
-        if seen.controls.shape[1] >= length:
-            errors = jax.device_get(predict(system.params, seen, scenarios))
-        scores = evaluation.score(episodes, np.asarray(scenarios.envs), dt=dt)
-        return scores, evaluation.violations(errors, claims)
-
-    return score
-
-
-def _model_coordinates(
-    law: PathLaw | None, episode: Trajectory, scenario: Scenario
-) -> Trajectory:
-    """An episode in the coordinates of the model: of the world, or of the path."""
-    if law is None:
-        return episode
-    speeds = jnp.full(episode.controls.shape[0], scenario.speed)
-    return to_path(episode, scenario.path, law, speeds)
-
-
 def _claims(settings: Settings, system: System) -> evaluation.ClaimedBounds:
     """Claims about a system's predictions, of its certificate."""
-    options = settings.certification
-    level, horizon = options.level, options.horizon
+    level, horizon = settings.certification.level, settings.certification.horizon
     claims = evaluation.ClaimedBounds(threshold=settings.evaluation.threshold_m)
     proof = system.certificate
     if proof is None:
@@ -392,9 +352,10 @@ def _claims(settings: Settings, system: System) -> evaluation.ClaimedBounds:
         )
         return claims
     d_bar = proof["d_bar"]["value"]
-    latent = latent_tube(proof["alpha"], d_bar, horizon)
     return claims._replace(
-        certified=proof["tube"]["physical"], latent=latent, d_bar=d_bar
+        certified=proof["tube"]["physical"],
+        latent=latent_tube(proof["alpha"], d_bar, horizon),
+        d_bar=d_bar,
     )
 
 
@@ -421,15 +382,19 @@ def evaluate_run(settings: Settings, *, command: str | None = None) -> dict[str,
     episodes = make_episodes(settings, plant)
     runs.read_results(settings.run_dir)
     compared = load_systems(settings, plant)
-    dataset, _ = data.ensure_dataset(source_of(settings))
-    rows: list[dict[str, Any]] = []
+    dataset, _ = data.ensure_dataset(settings)
+    rows: list[Row] = []
     arrays: dict[str, Any] = {"dt": plant.dt}
     length = f"{protocol.episodes} episodes of {protocol.episode_s:.0f} s"
     for name, system in compared.items():
         store.print_message(f"driving {length}: {name} on {episodes.name}")
         result = SystemEvaluation(settings, plant, name, system, dataset)(episodes)
         rows.append(result.row)
-        arrays |= _named_arrays(result, episodes)
+        # The roads under the same names: a page draws them without the settings.
+        road = (episodes.scenarios.envs, episodes.scenarios.path.points)
+        named = result.arrays | dict(zip(evaluation.ROAD, road, strict=True))
+        prefix = evaluation.episode_name(result.row)
+        arrays |= {f"{prefix}/{part}": array for part, array in named.items()}
         error, worst = result.row["rmse_m"]["mean"], result.row["max_deviation_m"]
         store.print_message(f"  rmse {error:.4f} m, worst {worst:.3f} m")
     seconds = time.perf_counter() - began
@@ -438,12 +403,3 @@ def evaluate_run(settings: Settings, *, command: str | None = None) -> dict[str,
         settings.run_dir, config, evaluation.compare(rows), arrays, seconds
     )
     return {"results": str(path), "rows": len(rows)}
-
-
-def _named_arrays(result: SystemResult, episodes: EpisodeSet) -> dict[str, Any]:
-    """The arrays of a row under the names of episodes.safetensors."""
-    scenarios = episodes.scenarios
-    road = (scenarios.envs, scenarios.path.points)
-    named = result.arrays | dict(zip(evaluation.ROAD, road, strict=True))
-    prefix = evaluation.episode_name(result.row)
-    return {f"{prefix}/{part}": array for part, array in named.items()}

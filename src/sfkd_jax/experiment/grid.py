@@ -10,10 +10,10 @@ from typing import Any, NamedTuple, TypeAlias
 import numpy as np
 
 from sfkd_jax import evaluation, store
+from sfkd_jax.evaluation.metrics import Row
 from sfkd_jax.experiment import runs
 from sfkd_jax.experiment.evaluating import EpisodeSet, SystemResult
 from sfkd_jax.experiment.options import ComparisonSettings, Settings
-from sfkd_jax.experiment.provenance import provenance, source_hash
 from sfkd_jax.settings import plain, replace
 
 KIND = "cell"
@@ -114,17 +114,14 @@ def take_share(
 
 def overrides(cell: Cell, comparison: ComparisonSettings) -> list[str]:
     """Return the overrides of a cell, beyond those of the command."""
-    row = comparison.rows[cell.label]
     tuned = comparison.tuned.get(cell.vehicle, {}).get(cell.label)
-    variation = comparison.variations[cell.variation]
+    words = comparison.rows[cell.label], tuned, comparison.variations[cell.variation]
     return [
         f"vehicle={cell.vehicle}",
         f"scenario={cell.scenario}",
         f"controller={cell.controller}",
         f"seed={cell.seed}",
-        *(row or "").split(),
-        *(tuned or "").split(),
-        *(variation or "").split(),
+        *(word for text in words for word in (text or "").split()),
     ]
 
 
@@ -150,10 +147,8 @@ def cell_path(cell: Cell, directory: Path) -> Path:
 
 
 def compilation_key(settings: Settings) -> str:
-    """Hash the settings that a compiled evaluation depends on; equal keys share it.
-
-    Neither the sensor of e nor the name of a variation is compiled in.
-    """
+    """Hash the settings that a compiled evaluation depends on; equal keys share it."""
+    # Neither the sensor of e nor the name of a variation is compiled in.
     compiled = replace(
         settings,
         environment=replace(settings.environment, sensor={}),
@@ -206,10 +201,8 @@ def write_cell(
     settings: Settings,
     episodes: EpisodeSet,
     result: SystemResult,
-) -> dict[str, Any]:
+) -> Row:
     """Write the arrays of the first episodes, then the row, and return the row.
-
-    A process that is killed in between leaves a cell that is not done.
 
     Args:
         path: of the cell, without suffix.
@@ -218,9 +211,9 @@ def write_cell(
         episodes: that were simulated.
         result: row and arrays.
     """
-    path.parent.mkdir(parents=True, exist_ok=True)
     scenarios = episodes.scenarios
     arrays = result.arrays | {"envs": scenarios.envs, "path": scenarios.path.points}
+    # Copied to the host first: slices on a device would be compiled.
     stored = {
         name: np.asarray(array)[:NUM_STORED_EPISODES] for name, array in arrays.items()
     }
@@ -229,17 +222,17 @@ def write_cell(
     store.write_arrays(file, stored, kind=KIND, config=plain(settings.scenario))
     row = result.row | {
         "arrays": str(file.relative_to(directory)),
-        "provenance": provenance(),
+        "provenance": runs.provenance(),
     }
-    document = {"row": row, "made_with": settings_hash(settings)}
     # The row last: its file is what marks a cell as done.
+    document = {"row": row, "made_with": settings_hash(settings)}
     store.write_json(_row_file(path), document)
     return row
 
 
 def collect_rows(
     cells: list[Cell], directory: Path, compose_cell: ComposeCell
-) -> list[dict[str, Any]]:
+) -> list[Row]:
     """Return the rows of all stored cells, with seeds pooled and systems compared.
 
     Prints how many cells were made with other settings, and how many by other code.
@@ -249,7 +242,7 @@ def collect_rows(
         directory: of the comparison.
         compose_cell: cell -> its settings.
     """
-    pooled: dict[Cell, list[dict[str, Any]]] = {}
+    pooled: dict[Cell, list[Row]] = {cell._replace(seed=0): [] for cell in cells}
     others, by_other_code = [], []
     for cell in cells:
         path = _row_file(cell_path(cell, directory))
@@ -262,25 +255,23 @@ def collect_rows(
             continue
         row = document["row"] | {"drives": episodes_hash(settings)}
         # Seeds of a row are pooled under one key.
-        pooled.setdefault(cell._replace(seed=0), []).append(row)
-        if row.get("provenance", {}).get("source") != source_hash():
+        pooled[cell._replace(seed=0)].append(row)
+        if row.get("provenance", {}).get("source") != runs.source_hash():
             by_other_code.append(path)
-    if others:
-        store.print_message(
-            f"{len(others)} cells were made with other settings, "
-            f"such as {others[0]}: left out"
-        )
-    if by_other_code:
-        store.print_message(
-            f"{len(by_other_code)} cells were made by other code, "
-            f"such as {by_other_code[0]}: used, and marked on the page"
-        )
-    missing = len({cell._replace(seed=0) for cell in cells}) - len(pooled)
+    for paths, who, what in (
+        (others, "with other settings", "left out"),
+        (by_other_code, "by other code", "used, and marked on the page"),
+    ):
+        if paths:
+            store.print_message(
+                f"{len(paths)} cells were made {who}, such as {paths[0]}: {what}"
+            )
     rows = []
     for cell, trainings in pooled.items():
-        with store.as_artefact_error(cell_path(cell, directory)):
-            rows.append(evaluation.pool(trainings))
-    return evaluation.compare(rows, missing=missing)
+        if trainings:
+            with store.as_artefact_error(cell_path(cell, directory)):
+                rows.append(evaluation.pool(trainings))
+    return evaluation.compare(rows, missing=len(pooled) - len(rows))
 
 
 def _row_file(path: Path) -> Path:

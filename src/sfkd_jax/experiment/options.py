@@ -61,6 +61,11 @@ class EnvironmentSettings:
         """The corners of E, as arguments of factories."""
         return {"env_low": self.low, "env_high": self.high}
 
+    @property
+    def is_known(self) -> bool:
+        """Whether e is measured or estimated."""
+        return self.source != "none"
+
 
 @takes()
 class DatasetSettings:
@@ -282,6 +287,16 @@ class Settings:
         """The directory of the run, root/name/system/seed=N."""
         return Path(self.root) / self.name / self.model.system / f"seed={self.seed}"
 
+    @property
+    def logs(self) -> LogSettings | None:
+        """The settings of logs; None if the data are simulated."""
+        return self.dataset if isinstance(self.dataset, LogSettings) else None
+
+    @property
+    def along_path(self) -> AlongPathSettings | None:
+        """The settings of path coordinates; None for those of the world."""
+        return self.dataset if isinstance(self.dataset, AlongPathSettings) else None
+
 
 def parse_settings(values: Values) -> Settings:
     """Return checked settings; with `environment.source=none` the model reads no e.
@@ -291,13 +306,13 @@ def parse_settings(values: Values) -> Settings:
             of an environment that the model does not read.
     """
     settings = parse(Settings, values)
-    source, reads = settings.environment.source, settings.model.environment
-    if source == "estimated" and not reads:
+    environment, reads = settings.environment, settings.model.environment
+    if environment.source == "estimated" and not reads:
         raise ValueError(
             "environment.source=estimated needs a model that reads the environment; "
             "drop model.environment=false"
         )
-    model = replace(settings.model, environment=reads and source != "none")
+    model = replace(settings.model, environment=reads and environment.is_known)
     return replace(settings, model=model)
 
 

@@ -1,17 +1,21 @@
-"""The directory of a run: what identifies it, its policy, and its results."""
+"""The directory of a run: what identifies it, its results, and what made them."""
 
 from __future__ import annotations
 
 import functools
+import hashlib
+import os
+import subprocess
 from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any, TypeVar
 
-import numpy as np
+import jax
 
 from sfkd_jax import evaluation, store
 from sfkd_jax.data import Dataset
-from sfkd_jax.experiment.data import boxes, source_of
+from sfkd_jax.evaluation.metrics import Row
+from sfkd_jax.experiment import data
 from sfkd_jax.experiment.options import Settings
 from sfkd_jax.settings import plain
 
@@ -20,8 +24,14 @@ IDENTITY = ("vehicle", "environment", "dataset", "model", "training", "seed")
 EPISODES = "episodes"
 UNREADABLE = frozenset("[]")
 """Characters of a path that the checkpoint library writes, but reads as a pattern."""
+PACKAGE = Path(__file__).resolve().parents[1]
 
 T = TypeVar("T")
+
+
+def policy_path(settings: Settings) -> Path:
+    """Return the path of the policy of a run, whether or not it exists."""
+    return settings.run_dir / "policy.safetensors"
 
 
 def exclusive(run: Callable[[Settings], T]) -> Callable[[Settings], T]:
@@ -37,7 +47,7 @@ def exclusive(run: Callable[[Settings], T]) -> Callable[[Settings], T]:
 
 def identity(settings: Settings) -> dict[str, Any]:
     """Return the settings that determine the weights of a run, as plain values."""
-    return source_of(settings).config | {
+    return data.config(settings) | {
         "model": plain(settings.model),
         "training": plain(settings.training),
         "seed": settings.seed,
@@ -53,32 +63,26 @@ def claim(settings: Settings) -> None:
         ArtefactError: the run was made with other settings; names the differences.
         ValueError: a path from which orbax cannot read.
     """
-    path = settings.run_dir / "settings.json"
+    run_dir = settings.run_dir
+    path, wanted = run_dir / "settings.json", identity(settings)
     if unreadable := UNREADABLE & set(str(path.resolve())):
         raise ValueError(
             "checkpoints cannot be read back from a path "
             f"with {' '.join(sorted(unreadable))}: {path}"
         )
-    wanted = identity(settings)
     if path.exists():
         changed = store.differences(store.read_json(path), wanted)
         if not changed:
             return
+        checkpoints = run_dir / "checkpoints"
+        kept = checkpoints.is_dir() and any(checkpoints.iterdir())
         # Without weights the recorded settings made nothing that could be mistaken.
-        if _has_weights(path.parent):
+        if kept or policy_path(settings).is_file():
             raise store.ArtefactError(
-                f"{path.parent} was made with other settings "
+                f"{run_dir} was made with other settings "
                 f"({'; '.join(changed[:3])}); pass name=… for another run"
             )
-    path.parent.mkdir(parents=True, exist_ok=True)
     store.write_json(path, wanted)
-
-
-def _has_weights(run_dir: Path) -> bool:
-    """Whether a run has trained weights or a checkpoint."""
-    checkpoints = run_dir / "checkpoints"
-    kept = checkpoints.is_dir() and any(checkpoints.iterdir())
-    return kept or (run_dir / "policy.safetensors").is_file()
 
 
 def policy_settings(settings: Settings, dataset: Dataset) -> dict[str, Any]:
@@ -94,18 +98,18 @@ def policy_settings(settings: Settings, dataset: Dataset) -> dict[str, Any]:
         "controller": plain(settings.controller),
         "experiment": settings.name,
     }
-    if source_of(settings).logs is None:
-        return recorded
-    # Of logs E is measured, and whoever loads the policy has no logs.
-    box = {"low": dataset.env_low.tolist(), "high": dataset.env_high.tolist()}
-    vehicle = recorded["vehicle"]
-    if vehicle["name"] == "own" and not vehicle["control_low"]:
-        low, high = boxes(dataset)["control"]
-        vehicle |= {"control_low": low, "control_high": high}
-    return recorded | {"environment": box}
+    if settings.logs:
+        # Of logs E is measured, and whoever loads the policy has no logs.
+        box = {"low": dataset.env_low.tolist(), "high": dataset.env_high.tolist()}
+        recorded["environment"] = box
+        vehicle = recorded["vehicle"]
+        if vehicle["name"] == "own" and not vehicle["control_low"]:
+            low, high = data.boxes(dataset)["control"]
+            vehicle |= {"control_low": low, "control_high": high}
+    return recorded
 
 
-def read_results(run_dir: Path) -> tuple[list[dict[str, Any]], dict[str, Any]]:
+def read_results(run_dir: Path) -> tuple[list[Row], dict[str, Any]]:
     """Return the rows and the episodes that a run already has.
 
     Raises:
@@ -124,7 +128,7 @@ def read_results(run_dir: Path) -> tuple[list[dict[str, Any]], dict[str, Any]]:
 def write_results(
     run_dir: Path,
     config: Mapping[str, Any],
-    rows: list[dict[str, Any]],
+    rows: list[Row],
     arrays: Mapping[str, Any],
     seconds: float,
 ) -> Path:
@@ -140,20 +144,65 @@ def write_results(
     Returns:
         The path of results.json.
     """
+    path, episodes = run_dir / "results.json", run_dir / "episodes.safetensors"
     about = {name: config[name] for name in ("vehicle", "controller", "evaluation")}
     # Read and written under one lock, or rows of another process would be lost.
     with store.locked(run_dir, wait=True):
         earlier, old = read_results(run_dir)
-        added = {name: np.asarray(array) for name, array in arrays.items()}
         # Arrays first: a row that is listed then has its episodes.
-        store.write_arrays(
-            run_dir / "episodes.safetensors", old | added, kind=EPISODES, config=about
-        )
+        store.write_arrays(episodes, {**old, **arrays}, kind=EPISODES, config=about)
         document = {
             "rows": evaluation.merge(earlier, rows),
             "config": config,
             "versions": store.versions(),
             "seconds": seconds,
         }
-        store.write_json(run_dir / "results.json", document)
-    return run_dir / "results.json"
+        store.write_json(path, document)
+    return path
+
+
+@functools.cache
+def source_hash() -> str:
+    """Return the SHA-256 of the package's Python files, with their paths.
+
+    They are hashed as they are at the first call.
+    """
+    digest = hashlib.sha256()
+    # Sorted, since file systems list files in any order.
+    for file in sorted(PACKAGE.rglob("*.py")):
+        # The zero byte keeps a path and what follows from running together.
+        digest.update(file.relative_to(PACKAGE).as_posix().encode() + b"\0")
+        digest.update(hashlib.sha256(file.read_bytes()).digest())
+    return digest.hexdigest()
+
+
+def provenance() -> dict[str, str | float | None]:
+    """Return what a result depends on besides its settings.
+
+    Hash of the source, the commit if the package is a checkout ("+" if its files were
+    changed since), version, jax, device, and the machine's load average.
+    """
+    device = jax.devices()[0]
+    installed = store.versions()
+    return {
+        "source": source_hash(),
+        "commit": _commit(),
+        "version": installed["sfkd_jax"],
+        "jax": installed["jax"],
+        "device": f"{device.platform} {device.device_kind}".strip(),
+        "load": os.getloadavg()[0] if hasattr(os, "getloadavg") else None,
+    }
+
+
+@functools.cache
+def _commit() -> str | None:
+    """The commit of the checkout, with "+" if its files differ; None outside one."""
+    if not (PACKAGE.parents[1] / ".git").exists():
+        return None
+    command = ["git", "-C", str(PACKAGE), "describe", "--always", "--exclude=*"]
+    command += ["--abbrev=40", "--dirty=+"]
+    try:
+        done = subprocess.run(command, capture_output=True, text=True, check=True)
+    except (OSError, subprocess.CalledProcessError):
+        return None
+    return done.stdout.strip()

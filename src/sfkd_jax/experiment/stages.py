@@ -27,9 +27,8 @@ from sfkd_jax.data import (
 )
 from sfkd_jax.evaluation import baselines, open_loop
 from sfkd_jax.experiment import data, runs
-from sfkd_jax.experiment.data import Source, source_of
-from sfkd_jax.experiment.options import Settings, TrainingSettings
-from sfkd_jax.plants import Vehicle
+from sfkd_jax.experiment.options import Settings
+from sfkd_jax.plants import Vehicle, check_step
 from sfkd_jax.ranges import imported
 from sfkd_jax.rollout import fold
 from sfkd_jax.settings import arguments, choose, plain
@@ -40,18 +39,17 @@ SCORED_SCENARIOS = ("s1", "s2")
 """Of the validation runs that trainings are compared on: S3 stays unseen."""
 
 
-def check_settings(settings: Settings, plant: Vehicle) -> None:
+def check_settings(settings: Settings) -> None:
     """Build what the settings choose, with unit scales and an arbitrary certificate.
 
     A long run then fails before its first hour, not after it.
 
-    Args:
-        settings: of the run.
-        plant: its vehicle.
-
     Raises:
         ValueError: naming the setting, or the choices.
     """
+    plant = build.build_vehicle(settings.vehicle)
+    if plant.simulated:
+        check_step(plant)
     options, window = settings.dataset, settings.training.window
     check_shares(options.shares)
     if window > options.steps:
@@ -59,9 +57,8 @@ def check_settings(settings: Settings, plant: Vehicle) -> None:
             f"training.window={window} does not fit segments "
             f"of dataset.steps={options.steps}"
         )
-    source = source_of(settings)
-    sizes = _sizes(source, plant)
-    law = _zero_law(sizes) if source.along_path else None
+    sizes = _sizes(settings, plant)
+    law = _zero_law(sizes) if settings.along_path else None
     systems = {"self": None} | build.reference_systems(plant, law)
     for name in settings.evaluation.systems:
         choose(systems, name, "evaluation.systems entry")
@@ -91,12 +88,12 @@ def check_settings(settings: Settings, plant: Vehicle) -> None:
     )
 
 
-def _sizes(source: Source, plant: Vehicle) -> dict[str, int]:
+def _sizes(settings: Settings, plant: Vehicle) -> dict[str, int]:
     """Sizes of body state, control and environment that the model reads."""
-    env = len(source.logs.columns.environment) if source.logs else 0
+    env = len(settings.logs.columns.environment) if settings.logs else 0
     state = len(plant.state_names) - 3
     # e_y and e_ψ in place of the pose; w = (ν, κ, v_ref) has four entries.
-    if source.along_path:
+    if settings.along_path:
         return {"state": state + 2, "control": 4, "env": 2}
     return {"state": state, "control": 2, "env": env or 2}
 
@@ -119,23 +116,23 @@ def ensure_policy(settings: Settings) -> policy.TrainedModel:
             trained by another process.
         ValueError: the logs are too few for the levels of the certificate.
     """
-    run_dir, source = settings.run_dir, source_of(settings)
+    path = runs.policy_path(settings)
     # Before the lock and the data: a missing module ends the command at once.
     if factory := getattr(settings.model, "factory", None):
         imported(factory, "model.factory")
-    if not (run_dir / "policy.safetensors").is_file():
+    if not path.is_file():
         # Whether logs are too few for the level is known before the training.
-        if source.logs:
-            dataset, _ = data.ensure_dataset(source)
-            data.check_calibration_size(dataset, settings.certification)
-        with store.locked(run_dir):
+        if settings.logs:
+            dataset, _ = data.ensure_dataset(settings)
+            data.check_calibration_size(dataset, settings.certification.level)
+        with store.locked(settings.run_dir):
             runs.claim(settings)
             # Once more under the lock, where nobody else can be writing.
-            if not (run_dir / "policy.safetensors").is_file():
-                _train(settings, *data.ensure_dataset(source))
+            if not path.is_file():
+                _train(settings, *data.ensure_dataset(settings))
     # Also of a policy that exists: it must have been made with these settings.
     runs.claim(settings)
-    return policy.restore(run_dir)
+    return policy.restore(settings.run_dir)
 
 
 def _train(settings: Settings, dataset: Dataset, data_hash: str) -> None:
@@ -147,77 +144,71 @@ def _train(settings: Settings, dataset: Dataset, data_hash: str) -> None:
         data_hash: of the data set.
     """
     run_dir, options = settings.run_dir, settings.training
-    source, horizon = source_of(settings), settings.training.window
     recorded = runs.policy_settings(settings, dataset)
     # After the settings are recorded, whose boxes are those of all data.
     dataset = dataset._replace(train=first_share(dataset.train, options.data_share))
     space = measure_space(dataset)
-    plant = build.build_vehicle(settings.vehicle)
-    model = build.build_model(settings.model, space, plant)
+    model = build.build_model(
+        settings.model, space, build.build_vehicle(settings.vehicle)
+    )
     loss = multi_step_loss(model, space, **arguments(options.loss, multi_step_loss))
-    key = jax.random.fold_in(jax.random.key(settings.seed), 0)
+    key, best = jax.random.fold_in(jax.random.key(settings.seed), 0), None
     if model.fitting.identify is not None:
         store.print_message(f"identifying {settings.model.system} in {run_dir}")
         params = model.fitting.identify(dataset.train, dataset.validation, key)
-        best = None
     else:
         store.print_message(
             f"training {settings.model.system}, {options.steps} steps, in {run_dir}"
         )
-        params, best = _fit(options, model, loss, dataset, key, run_dir)
-    document = _open_loop_document(model, params, source, dataset, horizon)
-    document["validation_score"] = _validation_score(loss, params, dataset, horizon)
+        params, best = _fit(settings, model, loss, dataset, key)
+    document = _open_loop_document(settings, model, params, dataset)
+    document["validation_score"] = _validation_score(
+        loss, params, dataset, options.window
+    )
     store.write_json(run_dir / "open_loop.json", document)
     recorded |= {"space": build.space_to_settings(space), "best_step": best}
     policy.save(
-        run_dir / "policy.safetensors",
+        runs.policy_path(settings),
         params,
         recorded,
         made_from={"dataset": data_hash},
-        law=data.ensure_law(source),
+        law=data.ensure_law(settings),
     )
 
 
 def _fit(
-    options: TrainingSettings,
-    model: Model,
-    loss: Loss,
-    dataset: Dataset,
-    key: Key,
-    run_dir: Path,
+    settings: Settings, model: Model, loss: Loss, dataset: Dataset, key: Key
 ) -> tuple[Params, int | None]:
     """Fit a model by gradient descent; return the best weights and their step."""
-    draw = partial(random_windows, batch=options.batch, length=options.window)
-    # Fixed windows: validation losses at different steps are comparable.
-    held_out = spread_windows(dataset.validation, length=options.window)
+    options = settings.training
     return fit(
         model,
         loss,
-        draw,
+        partial(random_windows, batch=options.batch, length=options.window),
         dataset.train,
-        held_out,
+        # Fixed windows: validation losses at different steps are comparable.
+        spread_windows(dataset.validation, length=options.window),
         key,
-        run_dir,
+        settings.run_dir,
         inspect=partial(contraction_metrics, model),
         **arguments(options, fit),
     )
 
 
 def _open_loop_document(
-    model: Model, params: Params, source: Source, dataset: Dataset, horizon: int
+    settings: Settings, model: Model, params: Params, dataset: Dataset
 ) -> dict[str, Any]:
     """The content of open_loop.json: errors by steps ahead, and of naive predictors."""
+    along, horizon = settings.along_path is not None, settings.training.window
     plant = (
-        data.closed_loop(source)
-        if source.along_path
-        else build.build_vehicle(source.vehicle)
+        data.closed_loop(settings) if along else build.build_vehicle(settings.vehicle)
     )
     naive = baselines(
         dataset.train,
         nominal=plant.nominal,
         dt=plant.dt,
         horizon=horizon,
-        along_path=source.along_path is not None,
+        along_path=along,
     )
 
     @jax.jit
@@ -225,25 +216,24 @@ def _open_loop_document(
         own = open_loop(model, fold(model, params), test, horizon=horizon)
         return own, {name: predict(test) for name, predict in naive.items()}
 
+    def columns(errors: jax.Array) -> dict[str, list[float]]:
+        """Errors by coordinate as lists over the steps ahead."""
+        along, lateral, yaw, speed, *_ = np.asarray(errors, dtype=np.float64).T
+        return {
+            "position_rmse_m": np.hypot(along, lateral).tolist(),
+            "longitudinal_rmse_m": along.tolist(),
+            "lateral_rmse_m": lateral.tolist(),
+            "yaw_rmse_rad": yaw.tolist(),
+            "speed_rmse_m_per_s": speed.tolist(),
+        }
+
     own, others = errors(params, dataset.test)
     return {
         "steps": list(range(1, horizon + 1)),
         "dt": plant.dt,
         "trajectories": dataset.test.controls.shape[0],
-        **_error_columns(own),
-        "baselines": {name: _error_columns(one) for name, one in others.items()},
-    }
-
-
-def _error_columns(errors: jax.Array) -> dict[str, list[float]]:
-    """Errors by coordinate as lists over the steps ahead."""
-    columns = np.asarray(errors, dtype=np.float64).T
-    return {
-        "position_rmse_m": np.hypot(columns[0], columns[1]).tolist(),
-        "longitudinal_rmse_m": columns[0].tolist(),
-        "lateral_rmse_m": columns[1].tolist(),
-        "yaw_rmse_rad": columns[2].tolist(),
-        "speed_rmse_m_per_s": columns[3].tolist(),
+        **columns(own),
+        "baselines": {name: columns(one) for name, one in others.items()},
     }
 
 
@@ -276,7 +266,7 @@ def certify_policy(settings: Settings) -> dict[str, Any]:
 
     A refusal is a document too: `valid` is false, and `reason` is given.
     """
-    began, run_dir = time.perf_counter(), settings.run_dir
+    began = time.perf_counter()
     trained = ensure_policy(settings)
     try:
         document = _certify_tubes(settings, trained)
@@ -291,7 +281,7 @@ def certify_policy(settings: Settings) -> dict[str, Any]:
         "versions": versions,
     }
     document["seconds"] = time.perf_counter() - began
-    store.write_json(certificate_path(run_dir), document)
+    store.write_json(certificate_path(settings.run_dir), document)
     store.print_message(f"certificate: {_verdict(document)}")
     if reason := document.get("lyapunov", {}).get("reason"):
         store.print_message(f"certificate: {reason}")
@@ -318,23 +308,23 @@ def _verdict(document: Mapping[str, Any]) -> str:
 
 def _certify_tubes(settings: Settings, trained: policy.TrainedModel) -> dict[str, Any]:
     """Certify the steps of a model, with tubes calibrated on the data of the run."""
-    source, options = source_of(settings), settings.certification
-    dataset, _ = data.ensure_dataset(source)
+    options = settings.certification
+    dataset, _ = data.ensure_dataset(settings)
     boxes: dict[str, Any] = data.boxes(dataset)
-    if source.logs:
-        boxes |= {"names": source.columns}
+    if settings.logs:
+        boxes |= {"names": data.column_names(settings)}
     document = issue(
         trained.model,
         trained.params,
         validation=dataset.validation,
         calibration=dataset.calibration,
-        held_out=data.held_out_parts(source, dataset),
+        held_out=data.held_out_parts(settings, dataset),
         boxes=boxes,
         runs=dataset.drives,
         **arguments(options, issue),
     )
     # Logs have no plant to drive: a corridor needs runs under known conditions.
-    if document["outputs"] and source.logs is None:
+    if document["outputs"] and settings.logs is None:
         loop = closed_loop(
             build.build_vehicle(settings.vehicle),
             trained.model,
@@ -357,12 +347,13 @@ def ensure_certificate(settings: Settings) -> None:
 
     A certificate of other settings of the certification is made again.
     """
-    run_dir = settings.run_dir
-    if (run_dir / "policy.safetensors").is_file() and _is_certified(settings):
+    if runs.policy_path(settings).is_file() and _is_certified(settings):
         # Called all the same: it checks that the policy has these settings.
         ensure_policy(settings)
         return
-    with store.locked(run_dir, wait=True):  # another process may be training it
+    with store.locked(
+        settings.run_dir, wait=True
+    ):  # another process may be training it
         ensure_policy(settings)
         # Once more: whoever held the lock may have certified it.
         if not _is_certified(settings):
