@@ -229,7 +229,7 @@ def test_a_forged_certificate_is_an_error_that_names_the_file(copied):
         (lambda name, leaf: leaf.astype(np.float64), "are float64"),
         (lambda name, leaf: leaf[..., :-1], "weights networks/operators are"),
         (lambda name, leaf: np.full_like(leaf, np.nan), "are not finite"),
-        (lambda name, leaf: None, "lacks weights networks/operators"),
+        (lambda name, leaf: None, "weights networks/operators are missing"),
     ],
 )
 def test_weights_that_do_not_fit_the_model_are_refused_in_one_line(
