@@ -184,7 +184,7 @@ def test_a_scenario_of_choice_adds_rows_and_keeps_the_others(copied):
     ]
     assert {(row["system"], row["scenario"]) for row in rows} == {
         (system, scenario)
-        for system in ("sfkd", "nominal", "oracle")
+        for system in ("sfkd", "nominal")
         for scenario in ("s1", "s3")
     }
     report = last_line(run_command("report", "+experiment=smoke", cwd=copied))
