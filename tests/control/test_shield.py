@@ -32,13 +32,11 @@ def toy():
     """
 
     def step(env, latent, inputs):
-        push = jnp.stack(
-            [jnp.zeros(()), 2e-4 * env[1] + 0.3 * inputs[2], 0.1 * inputs[3]]
-        )
+        heading = 2e-4 * env[1] + 0.3 * inputs[2]
+        push = jnp.stack([jnp.zeros(()), heading, 0.1 * inputs[3]])
         unit = 1.0 + env[0]
-        return unit * (
-            jnp.asarray(A) @ (latent / unit) + jnp.asarray(B) @ inputs[:2] + push
-        )
+        moved = jnp.asarray(A) @ (latent / unit) + jnp.asarray(B) @ inputs[:2]
+        return unit * (moved + push)
 
     return Model(
         init=lambda key: {},
@@ -68,15 +66,8 @@ def circle(curvature=0.0, horizon=HORIZON, speed=SPEED):
     ahead = speed * 0.1 * jnp.arange(1, horizon + 1)
     half = 0.5 * curvature * ahead
     chord = ahead * jnp.sinc(half / jnp.pi)
-    return jnp.stack(
-        [
-            chord * jnp.cos(half),
-            chord * jnp.sin(half),
-            2 * half,
-            jnp.full(horizon, speed),
-        ],
-        axis=1,
-    )
+    points = chord * jnp.cos(half), chord * jnp.sin(half), 2 * half
+    return jnp.stack([*points, jnp.full(horizon, speed)], axis=1)
 
 
 def about(xi, preview):
@@ -101,45 +92,27 @@ def filtered(**changes):
     return along_reference(shield.controller(), coordinates=3)
 
 
-def drive(
-    controller,
-    script,
-    disturbances,
-    start=(0.0, 0.0, SPEED),
-    curvature=0.0,
-    seen=None,
-    envs=None,
-):
-    """xi of the car before every step, controls and info; the plant is the disturbed
-    toy; `seen` is 1 or NaN.
-    """
-    reference = circle(curvature)
-    count = len(disturbances)
-    seen = jnp.ones(count) if seen is None else seen
-    envs = jnp.tile(ENV, (count, 1)) if envs is None else envs
+def drive(controller, script, disturbances, start=(0.0, 0.0, SPEED), seen=None):
+    """xi before every step, controls and info of the disturbed toy; `seen` is 1 or NaN."""
+    reference, env = circle(), ENV
+    seen = jnp.ones(len(disturbances)) if seen is None else seen
 
     def step(carry, inputs):
         xi, memory = carry
-        disturbance, mask, env = inputs
+        disturbance, mask = inputs
         action, memory, info = controller.act(
             script, memory, vehicle_state(xi) * mask, env, reference
         )
-        nu = action - LAW(xi, jnp.asarray(curvature), jnp.asarray(SPEED), env)
-        inputs = jnp.concatenate(
-            [nu, jnp.stack([jnp.asarray(curvature), jnp.asarray(SPEED)])]
-        )
-        after = (
-            TOY.decode(env, TOY.step(env, TOY.encode(env, path_state(xi)), inputs))[
-                BODY
-            ]
-            + disturbance
-        )
+        road = jnp.asarray([0.0, SPEED])
+        nu = action - LAW(xi, *road, env)
+        latent = TOY.encode(env, path_state(xi))
+        after = TOY.step(env, latent, jnp.concatenate([nu, road]))
+        after = TOY.decode(env, after)[BODY] + disturbance
         return (after, memory), (xi, action, info)
 
     carry = (jnp.asarray(start), controller.init(jax.random.key(0)))
-    return jax.lax.scan(
-        step, carry, (jnp.asarray(disturbances, dtype=float), seen, envs)
-    )[1]
+    steps = jnp.asarray(disturbances, dtype=float), seen
+    return jax.lax.scan(step, carry, steps)[1]
 
 
 def scripts():
@@ -191,14 +164,14 @@ def test_car_and_nominal_model_stay_in_their_corridors_whatever_is_planned(name)
     assert np.array_equal(info["shield_healthy"], np.ones(STEPS, bool))
 
 
-@pytest.mark.parametrize("name", ["resonant", "constant", "huge"])
-def test_without_the_filter_the_same_planner_leaves_the_corridor(name):
-    clipped = jnp.asarray(np.clip(scripts()[name], -LIMIT, LIMIT), dtype=float)
-    xi, _, _ = jit(partial(drive, along_reference(scripted(), coordinates=3)))(
-        clipped, jnp.asarray(WORST)
-    )
-    assert np.max(np.abs(xi[:, 0])) > 1.5 * (WIDTH + TUBE)
-    assert np.sum(attacked()[name][2]["intervention"] > 0.0) > 10
+def test_without_the_filter_the_same_planners_leave_the_corridor():
+    names = ("resonant", "constant", "huge")
+    clipped = np.stack([np.clip(scripts()[name], -LIMIT, LIMIT) for name in names])
+    alone = partial(drive, along_reference(scripted(), coordinates=3))
+    xi, _, _ = jit(jax.vmap(lambda script: alone(script, WORST)))(jnp.asarray(clipped))
+    assert np.all(np.max(np.abs(xi[:, :, 0]), axis=1) > 1.5 * (WIDTH + TUBE))
+    for name in names:
+        assert np.sum(attacked()[name][2]["intervention"] > 0.0) > 10
 
 
 def test_who_asks_for_little_is_left_alone():
@@ -252,23 +225,18 @@ def test_the_largest_scale_that_keeps_the_nominal_model_inside_is_chosen():
     random = np.random.default_rng(1)
     scales = []
     for _ in range(100):
-        xi = np.asarray(
-            [random.uniform(0.6, 1.0) * WIDTH, random.uniform(-0.02, 0.02), SPEED]
-        )
-        nu = random.uniform(-1, 1, 2) * LIMIT
-        margins = np.asarray(
-            [margin_of(xi, share * nu, ROAD) for share in control.FILTER_SCALES]
-        )
+        edge, heading = random.uniform(0.6, 1.0) * WIDTH, random.uniform(-0.02, 0.02)
+        xi, nu = np.asarray([edge, heading, SPEED]), random.uniform(-1, 1, 2) * LIMIT
+        shares = control.FILTER_SCALES
+        margins = np.asarray([margin_of(xi, share * nu, ROAD) for share in shares])
         if np.min(np.abs(margins)) < 1e-5 or np.max(margins) < 0:
             continue
         result = apply_filter(xi, nu)
-        share = control.FILTER_SCALES[np.argmax(margins >= 0)]
-        scales.append(share)
-        assert float(result.scale) == share
-        np.testing.assert_allclose(result.nu, share * nu, rtol=1e-6)
-        np.testing.assert_allclose(
-            result.margin, margin_of(xi, share * nu, ROAD), atol=1e-6
-        )
+        first = np.argmax(margins >= 0)
+        scales.append(shares[first])
+        assert float(result.scale) == shares[first]
+        np.testing.assert_allclose(result.nu, shares[first] * nu, rtol=1e-6)
+        np.testing.assert_allclose(result.margin, margins[first], atol=1e-6)
         assert bool(result.feasible)
     assert 1.0 in scales
     assert 0.0 in scales
@@ -364,6 +332,7 @@ def test_a_car_outside_its_bound_is_reported_and_followed():
 @pytest.mark.parametrize(
     ("name", "box"),
     [
+        (None, None),
         ("state", ((-5.0, -1.0, 0.0), (5.0, 1.0, SPEED + 0.5))),
         ("road", ((-0.1, 0.0), (0.001, 12.0))),
         ("env", ((0.0, -8.0), (0.5, 8.0))),
@@ -372,21 +341,17 @@ def test_a_car_outside_its_bound_is_reported_and_followed():
 def test_outside_a_box_the_law_drives_alone(name, box):
     """The certificate does not apply there; inside the box the same request passes."""
     wanted = jnp.tile(0.1 * jnp.asarray(LIMIT), (2, 1))
-    start = (0.0, 0.005, SPEED + 1.0)
-    for options in ({}, {name: box}):
-        controller = filtered(conditions=Conditions(**options))
-        act = jit(controller.act)
-        memory = controller.init(jax.random.key(0))
-        _, _, info = act(
-            wanted, memory, vehicle_state(jnp.asarray(start)), ENV, circle(0.002)
-        )
-        assert bool(info["outside_box"]) == bool(options)
-        assert bool(info["shield_healthy"]) != bool(options)
-        np.testing.assert_allclose(
-            info["perturbation"], 0 * LIMIT if options else wanted[0], atol=1e-6
-        )
-        assert float(info["intervention"]) == float(bool(options))
-        assert bool(info["env_inside"]) == (name != "env" or not options)
+    seen = vehicle_state(jnp.asarray([0.0, 0.005, SPEED + 1.0])), ENV, circle(0.002)
+    controller = filtered(conditions=Conditions(**{name: box} if name else {}))
+    memory = controller.init(jax.random.key(0))
+    _, _, info = jit(controller.act)(wanted, memory, *seen)
+    outside = name is not None
+    assert bool(info["outside_box"]) == outside
+    assert bool(info["shield_healthy"]) != outside
+    expected = 0 * LIMIT if outside else wanted[0]
+    np.testing.assert_allclose(info["perturbation"], expected, atol=1e-6)
+    assert float(info["intervention"]) == float(outside)
+    assert bool(info["env_inside"]) == (name != "env")
 
 
 def test_before_anything_is_seen_the_planner_passes_within_the_limits():
@@ -397,16 +362,11 @@ def test_before_anything_is_seen_the_planner_passes_within_the_limits():
     controller = filtered(inner=silent, control=((-0.4, 0.5), HIGH), width=1.0)
     act, start = jit(controller.act), controller.init(jax.random.key(0))
     xi, reference = vehicle_state(jnp.asarray([0.1, 0.0, SPEED])), circle()
-    for seen in (
-        (xi * jnp.nan, ENV, reference),
-        (xi, ENV * jnp.nan, reference),
-        (xi, ENV, reference * jnp.nan),
-    ):
-        for planned, passed in (
-            ([0.1, 0.7], [0.1, 0.7]),
-            ([9.0, 0.7], [0.4, 0.7]),
-            ([np.nan, 1.0], [0.0, 0.5]),
-        ):
+    # What is planned, and what passes of it.
+    cases = [([0.1, 0.7],) * 2, ([9.0, 0.7], [0.4, 0.7]), ([np.nan, 1.0], [0.0, 0.5])]
+    unknown = [(xi * jnp.nan, ENV, reference), (xi, ENV * jnp.nan, reference)]
+    for seen in (*unknown, (xi, ENV, reference * jnp.nan)):
+        for planned, passed in cases:
             action, after, info = act(jnp.asarray(planned), start, *seen)
             np.testing.assert_allclose(action, passed)
             assert not bool(after.inner.started | info["shield_healthy"])
