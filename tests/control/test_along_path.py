@@ -1,6 +1,6 @@
 """Planning in path coordinates: projection, curvature preview, and limits of ν."""
 
-from functools import partial
+from functools import cache, partial
 from pathlib import Path
 
 import jax
@@ -34,11 +34,21 @@ def bend(slope=1e-4):
     ), path
 
 
+@cache
 def planner(samples, **options):
+    """A planner around the law, as a controller in the world, and its step."""
     model = build.reference_systems(PLANT, LAW)["oracle"].model
     task = control.following_law(model, control.tracking_cost(dt=0.1), LAW, **LIMITS)
     along = control.mppi(task, num_samples=samples, noise_std=(0.01, 0.2), **options)
-    return control.along_reference(along, coordinates=3)
+    controller = control.along_reference(along, coordinates=3)
+    return controller.init(jax.random.key(0)), jax.jit(controller.act)
+
+
+def law_at(state, reference):
+    """The law's control where a window of 9 m/s begins."""
+    curvature = curvature_ahead(reference)[0]
+    xi = path_coordinates(state, reference[0], curvature)
+    return LAW(xi, curvature, jnp.asarray(9.0), ENV)
 
 
 def test_the_curvature_of_every_step_is_seen_ahead():
@@ -60,31 +70,21 @@ def test_an_observation_is_projected_on_the_circle_that_it_drives_along():
 
 def test_without_samples_the_law_alone_drives():
     reference, _ = bend()
-    controller = planner(1)
+    memory, act = planner(1)
     state = jnp.asarray([30.0, 0.4, 0.1, 8.0])
-    action, _, info = jax.jit(controller.act)(
-        {}, controller.init(jax.random.key(0)), state, ENV, reference
-    )
-    curvature = curvature_ahead(reference)[0]
-    xi = path_coordinates(state, reference[0], curvature)
-    np.testing.assert_allclose(
-        action, LAW(xi, curvature, jnp.asarray(9.0), ENV), atol=1e-6
-    )
+    action, _, info = act({}, memory, state, ENV, reference)
+    np.testing.assert_allclose(action, law_at(state, reference), atol=1e-6)
     assert bool(info["healthy"])
 
 
 def test_what_is_added_to_the_law_stays_within_its_bounds():
     """Also with large noise, and with a cost that favours more."""
     reference, _ = bend()
-    controller = planner(64, temperature=0.1)
-    loud = controller.init(jax.random.key(0))
+    loud, act = planner(64, temperature=0.1)
     noisy = control.tuned(loud.inner, noise_std=jnp.asarray([1.0, 10.0]))
-    loud = loud._replace(inner=noisy)
     state = jnp.asarray([30.0, 2.5, 0.3, 6.0])
-    action, after, _ = jax.jit(controller.act)({}, loud, state, ENV, reference)
-    curvature = curvature_ahead(reference)[0]
-    xi = path_coordinates(state, reference[0], curvature)
-    added = action - LAW(xi, curvature, jnp.asarray(9.0), ENV)
+    action, after, _ = act({}, loud._replace(inner=noisy), state, ENV, reference)
+    added = action - law_at(state, reference)
     assert np.all(np.abs(added) <= LAW.perturbation + 1e-6)
     assert np.all(np.abs(after.inner.plan) <= LAW.perturbation + 1e-6)
 
@@ -93,23 +93,14 @@ def test_predicted_states_lie_where_the_car_then_is():
     """On a bend, with the true plant as the model: within 1 cm laterally; along the
     path the speed error remains.
     """
-    reference, path = bend()
-    controller = planner(1)
-    point = jnp.asarray(
-        [
-            reference[0, 0] - 0.9 * jnp.cos(reference[0, 2]),
-            reference[0, 1],
-            reference[0, 2],
-            9.0,
-        ]
-    )
-    memory = controller.init(jax.random.key(0))
-    act = jax.jit(controller.act)
+    reference, _ = bend()
+    x, y, yaw, _ = reference[0]
+    point = jnp.stack([x - 0.9 * jnp.cos(yaw), y, yaw, jnp.asarray(9.0)])
+    memory, act = planner(1)
     action, _, info = act({}, memory, point, ENV, reference)
     after = PLANT.step(point, action, ENV)
     np.testing.assert_allclose(info["predicted_states"][0, :2], after[:2], atol=0.05)
     np.testing.assert_allclose(info["predicted_states"][0, 2:], after[2:], atol=0.01)
-    assert path.points.shape[0] == 400
 
 
 def test_a_model_of_the_world_is_refused():
@@ -124,18 +115,13 @@ def test_a_model_of_the_world_is_refused():
 def test_a_step_of_the_adaptive_policy_projects_once_and_never_back(monkeypatch):
     """Planner, shield, estimator and tube work on the same ξ."""
     calls = []
-    project = _along_path.path_coordinates
-    monkeypatch.setattr(
-        _along_path,
-        "path_coordinates",
-        lambda *given: calls.append(given) or project(*given),
-    )
+    record = lambda *given: calls.append(given) or path_coordinates(*given)
+    monkeypatch.setattr(_along_path, "path_coordinates", record)
     policy = sfkd_jax.load(SHIPPED / "kinematic_path", adaptive=True)
     observation, reference = jnp.asarray([29.1, 0.1, 0.0, 9.0]), bend()[0]
     state = policy.controller.init(jax.random.key(0))
-    jax.eval_shape(
-        policy.controller.act, policy.params, state, observation, ENV, reference
-    )
+    inputs = policy.params, state, observation, ENV, reference
+    jax.eval_shape(policy.controller.act, *inputs)
     assert len(calls) == 1
     sources = Path(control.__file__).parent.rglob("*.py")
     naming = [path.name for path in sources if "path_coordinates(" in path.read_text()]

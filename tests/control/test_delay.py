@@ -1,5 +1,7 @@
 """Delay compensation."""
 
+from functools import cache
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -24,44 +26,40 @@ def planner():
     return control.mppi(task, num_samples=64, horizon=HORIZON)
 
 
-def drive(controller, steps=12):
+@cache
+def drive():
     """A plant that applies the control sent DELAY steps before; zero until then."""
-    reference = straight(HORIZON)
+    controller = control.delay_compensated(planner(), MODEL, delay=DELAY)
 
     @jit
     def run(key):
         def step(carry, _):
             state, pipe, inner = carry
-            action, inner, info = controller.act(
-                {}, inner, state, ENV, reference.at[:, 0].add(state[0])
-            )
+            reference = straight(HORIZON).at[:, 0].add(state[0])
+            action, inner, info = controller.act({}, inner, state, ENV, reference)
             pipe = jnp.concatenate([pipe, action[None]])
             state = PLANT.step(state, pipe[0], ENV)
             return (state, pipe[1:], inner), (state, action, info)
 
         carry = (START, jnp.zeros((DELAY, 2)), controller.init(key))
-        return jax.lax.scan(step, carry, None, length=steps)[1]
+        return jax.lax.scan(step, carry, None, length=12)[1]
 
     return run(jax.random.key(0))
 
 
 def test_the_state_it_plans_from_is_the_one_that_comes():
-    states, _, info = drive(control.delay_compensated(planner(), MODEL, delay=DELAY))
+    states, _, info = drive()
     # At step k it foresees the state in which the control of step k begins to act.
-    np.testing.assert_allclose(
-        info["arrival_state"][:-DELAY], states[DELAY - 1 : -1], atol=1e-4
-    )
+    foreseen = info["arrival_state"][:-DELAY]
+    np.testing.assert_allclose(foreseen, states[DELAY - 1 : -1], atol=1e-4)
 
 
 def test_it_acts_as_the_planner_alone_would_from_that_state():
-    _, actions, info = drive(
-        control.delay_compensated(planner(), MODEL, delay=DELAY), steps=1
-    )
+    _, actions, info = drive()
     alone = planner()
     reference = straight(HORIZON).at[:, 0].add(START[0])
-    expected, _, _ = jit(alone.act)(
-        {}, alone.init(jax.random.key(0)), info["arrival_state"][0], ENV, reference
-    )
+    memory, arrival = alone.init(jax.random.key(0)), info["arrival_state"][0]
+    expected, _, _ = jit(alone.act)({}, memory, arrival, ENV, reference)
     np.testing.assert_allclose(actions[0], expected, atol=1e-6)
 
 
