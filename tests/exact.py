@@ -11,24 +11,18 @@ import numpy as np
 EXTREMES = (1e-320, 1e-308, 1e-200, 1e-150, 1e-16, 1.0, 1e16, 1e150, 1e200, 1e300)
 
 
-def integers(rows):
-    """Rational rows times one positive number that makes them integers."""
-    exact = [
-        [
-            Fraction(float(entry)) if not isinstance(entry, Fraction) else entry
-            for entry in row
-        ]
-        for row in rows
-    ]
-    common = math.lcm(*(entry.denominator for row in exact for entry in row))
-    return [[int(entry * common) for entry in row] for row in exact]
+rational = np.vectorize(Fraction, otypes=[object])
+"""A matrix of floats as one of fractions, without rounding."""
 
 
 def is_definite(rows):
     """Whether a symmetric matrix of floats or fractions is positive definite:
     Sylvester's criterion by Bareiss.
     """
-    matrix, before = integers(rows), 1
+    exact, before = rational(rows), 1
+    # Times one positive number that makes integers of them.
+    common = math.lcm(*(entry.denominator for entry in exact.flat))
+    matrix = [[int(entry * common) for entry in row] for row in exact]
     size = len(matrix)
     for k in range(size):
         pivot = matrix[k][k]  # the k-th leading minor
@@ -125,7 +119,6 @@ def hostile_network(random):
 
 def exact_witness(weights, multipliers, bound, linear, metric):
     """The matrix that has to be positive definite, in fractions."""
-    rational = np.vectorize(lambda entry: Fraction(float(entry)), otypes=[object])
     first = weights[0] if weights else linear
     inputs, outputs = first.shape[1], (weights[-1] if weights else first).shape[0]
     norm_in = rational(np.eye(inputs) if metric is None else metric)
@@ -153,34 +146,23 @@ def search(cases, seed):
     """
     from sfkd_jax.certification import check_witness, is_positive_definite
 
-    random, counts = (
-        np.random.default_rng(seed),
-        {"matrices": 0, "witnesses": 0, "true": 0, "accepted": 0},
-    )
+    random = np.random.default_rng(seed)
+    counts = {"matrices": 0, "witnesses": 0, "true": 0, "accepted": 0}
     for number in range(cases):
+        true = False
         if number % 2:
-            weights, multipliers, bound, linear, metric = hostile_network(random)
-            accepted = check_witness(weights, multipliers, bound, linear, metric)
-            numbers = all(
-                np.all(np.isfinite(part)) and np.all(part > 0) for part in multipliers
+            shown = weights, multipliers, bound, linear, metric = hostile_network(
+                random
             )
-            true = False
-            if numbers:
-                matrix, norm = exact_witness(
-                    weights, multipliers, bound, linear, metric
-                )
-                true = is_definite(matrix) and is_definite(norm)
-            shown = (weights, multipliers, bound, linear, metric)
+            accepted = check_witness(weights, multipliers, bound, linear, metric)
+            if all(np.all(np.isfinite(m)) and np.all(m > 0) for m in multipliers):
+                true = all(map(is_definite, exact_witness(*shown)))
         else:
-            matrix, error = hostile_matrix(random)
+            shown = matrix, error = hostile_matrix(random)
             accepted = is_positive_definite(matrix, error)
-            true = bool(np.all(np.isfinite(matrix)))
-            if true:
-                moved = [[Fraction(float(entry)) for entry in row] for row in matrix]
-                for k in range(len(moved)):
-                    moved[k][k] -= Fraction(error)
-                true = is_definite(moved)
-            shown = (matrix, error)
+            if np.all(np.isfinite(matrix)):
+                moved = Fraction(error) * rational(np.eye(len(matrix)))
+                true = is_definite(rational(matrix) - moved)
         counts["witnesses" if number % 2 else "matrices"] += 1
         counts["accepted"] += accepted
         counts["true"] += true

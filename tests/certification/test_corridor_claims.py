@@ -21,7 +21,7 @@ NAMES = (*JOINT, *ALONE)
 
 def scores(count, seed):
     random = np.random.default_rng(seed)
-    return dict(zip(NAMES, random.lognormal(size=(len(NAMES), count)), strict=True))
+    return random.lognormal(size=(count, len(NAMES)))
 
 
 def test_bounds_hold_together_as_often_as_they_say():
@@ -114,34 +114,28 @@ def test_a_corridor_whose_parts_do_not_go_together_is_refused(named, forge):
     assert named in str(reason.value)
 
 
-def table(*rows):
-    return {name: np.asarray(row) for name, row in zip(NAMES, rows, strict=True)}
-
-
 def test_bounds_are_units_of_other_runs_times_a_quantile():
     """Level 0.5 of three runs: the second; the lateral tube counts in its median, the
     others in their 0.95.
     """
-    reference = table(
-        *(np.asarray([0.0, 1.0, 2.0]) * scale for scale in (1.0, 10.0, 100.0, 9.0, 8.0))
-    )
-    new = table(
-        [3.0, 0.1, 0.2],
-        [1.0, 38.0, 2.0],
-        [19.0, 20.0, 190.0],
-        [7.0, 5.0, 6.0],
-        [0.3, 0.2, 0.4],
+    reference = np.outer([0.0, 1.0, 2.0], [1.0, 10.0, 100.0, 9.0, 8.0])
+    new = np.asarray(
+        [
+            [3.0, 1.0, 19.0, 7.0, 0.3],
+            [0.1, 38.0, 20.0, 5.0, 0.2],
+            [0.2, 2.0, 190.0, 6.0, 0.4],
+        ]
     )
     bounds = calibrate_corridor(reference, new, level=0.5)
-    expected = [2.0 * unit for unit in (1.0, 19.0, 190.0)]
-    assert bounds == pytest.approx(dict(zip(NAMES, [*expected, 6.0, 0.3], strict=True)))
+    assert bounds == pytest.approx(
+        dict(zip(NAMES, [2.0, 38.0, 380.0, 6.0, 0.3], strict=True))
+    )
 
 
 def test_a_run_on_its_bound_is_covered_and_one_that_leaves_any_bound_is_not():
     bounds = dict(zip(NAMES, (1.0, 2.0, 3.0, 0.1, 0.1), strict=True))
-    inside = table(*(np.full(5, value) for value in (1.0, 2.0, 3.0, 9.0, 9.0)))
-    for k, name in enumerate(JOINT):
-        inside[name][k] *= 1 + 1e-9
+    inside = np.tile([1.0, 2.0, 3.0, 9.0, 9.0], (5, 1))
+    inside[range(3), range(3)] *= 1 + 1e-9
     assert corridor_coverage(bounds, inside) == {
         "coverage": 0.4,
         "coverage_ci95": coverage_interval(0.4, 5),

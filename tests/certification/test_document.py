@@ -33,13 +33,11 @@ def honest(plant="kinematic"):
 
 def check(document, plant="kinematic"):
     trained = shipped(plant)
+    bound = {"model": trained.model, "policy_sha256": trained.sha256}
     try:
-        verify_document(
-            document, trained.params, model=trained.model, policy_sha256=trained.sha256
-        )
-    except (
-        TypeCheckError
-    ) as reason:  # under test, types are checked before anything is verified
+        verify_document(document, trained.params, **bound)
+    # Under test, types are checked before anything is verified.
+    except TypeCheckError as reason:
         raise CertificationRefused("of another type") from reason
 
 
@@ -226,29 +224,20 @@ def test_a_forged_certificate_is_an_error_that_names_the_file(copied):
 @pytest.mark.parametrize(
     ("spoil", "message"),
     [
-        (lambda name, leaf: leaf.astype(np.float64), "are float64"),
-        (lambda name, leaf: leaf[..., :-1], "weights networks/operators are"),
-        (lambda name, leaf: np.full_like(leaf, np.nan), "are not finite"),
-        (lambda name, leaf: None, "weights networks/operators are missing"),
+        (lambda leaf: leaf.astype(np.float64), "are float64"),
+        (lambda leaf: leaf[..., :-1], "weights networks/operators are"),
+        (lambda leaf: np.full_like(leaf, np.nan), "are not finite"),
+        (lambda leaf: None, "weights networks/operators are missing"),
     ],
 )
 def test_weights_that_do_not_fit_the_model_are_refused_in_one_line(
     copied, spoil, message
 ):
-    arrays, manifest = store.read_arrays(
-        copied / "policy.safetensors", kind=policy.KIND
-    )
-    changed = spoil("networks/operators", arrays["networks/operators"])
-    arrays = {
-        name: leaf for name, leaf in arrays.items() if name != "networks/operators"
-    }
+    file = copied / "policy.safetensors"
+    arrays, manifest = store.read_arrays(file, kind=policy.KIND)
+    changed = spoil(arrays.pop("networks/operators"))
     arrays |= {} if changed is None else {"networks/operators": changed}
-    store.write_arrays(
-        copied / "policy.safetensors",
-        arrays,
-        kind=policy.KIND,
-        config=manifest["config"],
-    )
+    store.write_arrays(file, arrays, kind=policy.KIND, config=manifest["config"])
     line = refusal_of(lambda: policy.load(copied))
     assert message in line
     assert "policy.safetensors" in line

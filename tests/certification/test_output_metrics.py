@@ -136,7 +136,8 @@ def test_every_distance_to_a_nominal_model_lies_within_the_radius_of_its_run():
         bounds = radii(measured(), name, proposed(name))
         assert np.all(distance <= bounds.vehicle_to_nominal * (1 + 1e-4))
         assert np.all(bounds.vehicle_to_nominal <= bounds.asymptotic * (1 + 1e-12))
-        beside = radii(measured(), name, proposed(name), np.full(len(distance), 0.3))
+        start = np.full((len(distance), OPTIONS["rank"]), 0.1)
+        beside = radii(measured(), name, proposed(name), start)
         assert np.all(beside.vehicle_to_nominal >= bounds.vehicle_to_nominal)
         assert np.all(beside.asymptotic >= bounds.asymptotic)
 
@@ -151,5 +152,5 @@ def test_radii_of_one_dimension_are_the_sums_that_they_are():
     bounds = radii(Residuals(steps, misses), "position", claim)
     assert bounds.vehicle_to_nominal == pytest.approx(1.25 + 0.3)
     assert bounds.asymptotic == pytest.approx(2.0 + 0.3)
-    later = radii(Residuals(steps, misses), "position", claim, np.asarray([8.0]))
+    later = radii(Residuals(steps, misses), "position", claim, np.asarray([[8.0]]))
     assert later.vehicle_to_nominal == pytest.approx(8.0 + 0.1)

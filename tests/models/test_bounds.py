@@ -138,7 +138,7 @@ def test_no_pattern_of_slopes_breaks_the_residual_and_its_multipliers_prove_it(
     name, scale
 ):
     weights = explicit(name, scale)
-    upper = lipschitz_upper(weights.residual, weights.residual_multipliers)
+    upper = lipschitz_upper(weights.residual, weights.residual_multipliers)[0]
     lower = steepest_pattern(weights.residual)
     assert lower <= upper <= BETA
     if scale == 1.0:

@@ -96,7 +96,7 @@ def proved_by_construction(model, params):
     )
     return certification.lipschitz_upper(
         weights.residual, weights.residual_multipliers, weights.operators.vertices[0]
-    )
+    )[0]
 
 
 def slope_at_rest(model, params):

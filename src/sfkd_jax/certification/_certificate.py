@@ -7,12 +7,12 @@ import time
 from collections.abc import Mapping
 from functools import partial
 from importlib.metadata import version
-from typing import Annotated, Any
+from typing import Any
 
 import jax
 import numpy as np
 
-from sfkd_jax.certification._attack import attack_claims, attack_slopes
+from sfkd_jax.certification._attack import attack_claims
 from sfkd_jax.certification._claims import Box, Claims, keeps_metrics, require_box
 from sfkd_jax.certification._measured import (
     KINDS,
@@ -23,7 +23,7 @@ from sfkd_jax.certification._measured import (
     supports,
 )
 from sfkd_jax.certification._metrics import prove_lyapunov
-from sfkd_jax.certification._search import joint_bound, lipschitz_upper, prove
+from sfkd_jax.certification._search import joint_bound, prove
 from sfkd_jax.certification._tubes import output_tubes, tubes
 from sfkd_jax.certification._weights import (
     CertificationRefused,
@@ -31,10 +31,12 @@ from sfkd_jax.certification._weights import (
     fingerprint,
     one_thread,
 )
-from sfkd_jax.ranges import Fraction, Interval, NonNegativeInt
+from sfkd_jax.ranges import Fraction, NonNegativeInt
 from sfkd_jax.rollout import fold
 from sfkd_jax.types import Model, Params, Trajectory
 
+MARGIN = 1e-4
+"""By which α must be below 1."""
 PRECISION = (
     "bounds on the float32 weights as real numbers, checked in float64; "
     "float32 rounding of a step counts as d"
@@ -93,7 +95,6 @@ def certify(
     params: Params,
     env_box: Box,
     *,
-    margin: float = 1e-4,
     attack_starts: int = 6,
 ) -> Certificate:
     """Prove a contraction factor for all z, u and e, and attack all proved bounds.
@@ -102,7 +103,6 @@ def certify(
         model: a model with `explicit`.
         params: its weights as exported.
         env_box: lower and upper corner of E.
-        margin: α must be at most 1 − margin.
         attack_starts: starting points of the ascent on the float32 model; with 0 there
             is no ascent and tightness is None.
 
@@ -116,10 +116,10 @@ def certify(
     weights = exported(model, params)
     with one_thread():
         claims = prove(weights)
-    if not claims.alpha <= 1.0 - margin:  # refuses NaN as well
+    if not claims.alpha <= 1.0 - MARGIN:  # refuses NaN as well
         raise CertificationRefused(
             f"alpha = {claims.alpha:.6f} (rho {claims.rho:.6f}, "
-            f"beta {claims.beta:.6f}) is not below 1 by the margin {margin:g}"
+            f"beta {claims.beta:.6f}) is not below 1 by the margin {MARGIN:g}"
         )
     # After the proof: an attack that exceeds it is a fault of the code, see there.
     attacks = attack_claims(model, params, weights, claims, box, attack_starts)
@@ -147,26 +147,18 @@ def contraction_metrics(model: Model, params: Params) -> dict[str, float]:
         params: its weights as exported.
 
     Returns:
-        "alpha", "alpha_separate" and "tightness" (α over the largest factor that an
-        attack on the slopes reaches); empty if nothing can be proved.
+        "alpha"; empty if nothing can be proved.
     """
     try:
         weights = exported(model, params)
     # A model without explicit weights trains like any other, just without this log.
     except CertificationRefused:
         return {}
-    vertices, multipliers = weights.operators.vertices, weights.residual_multipliers
-    residual = weights.residual
     with one_thread():
-        separate = max(float(np.linalg.norm(vertex, 2)) for vertex in vertices)
-        separate += lipschitz_upper(residual, multipliers) if residual else 0.0
         # Few iterations: an estimate at every checkpoint, not the certificate.
-        joint, _ = joint_bound(weights, multipliers, iterations=15)
-        slopes = max(attack_slopes(residual, vertex, starts=4) for vertex in vertices)
-    alpha = min(joint, separate)
-    values = {"alpha": alpha, "alpha_separate": separate, "tightness": alpha / slopes}
+        alpha, _ = joint_bound(weights, weights.residual_multipliers, iterations=15)
     # JSON has no infinity: what is not proved is absent.
-    return {name: value for name, value in values.items() if np.isfinite(value)}
+    return {"alpha": alpha} if np.isfinite(alpha) else {}
 
 
 def issue(
@@ -180,7 +172,6 @@ def issue(
     runs: Mapping[str, int] | None = None,
     horizon: int = 20,
     level: Fraction = 0.95,
-    margin: Annotated[float, Interval("[0, 1)")] = 1e-4,
     attack_starts: NonNegativeInt = 6,
 ) -> dict[str, Any]:
     """Certify a policy and return the certificate with its tubes as a document.
@@ -198,7 +189,6 @@ def issue(
             about new runs only if there are enough of them.
         horizon: of the tubes [steps].
         level: 1 − δ of the conformal bounds.
-        margin: α must be at most 1 − margin.
         attack_starts: starting points of the attack on the float32 model.
 
     Raises:
@@ -206,9 +196,7 @@ def issue(
     """
     began = time.perf_counter()
     # First the proof: where it refuses, nothing need be measured.
-    certificate = certify(
-        model, params, boxes["env"], margin=margin, attack_starts=attack_starts
-    )
+    certificate = certify(model, params, boxes["env"], attack_starts=attack_starts)
     weights, start = exported(model, params), None
     try:
         with one_thread():

@@ -195,11 +195,9 @@ def coverage_interval(share: float, runs: int) -> list[float]:
     return [clopper_pearson(count, runs)[side] for side, count in enumerate(counts)]
 
 
-def clopper_pearson(
-    successes: int, trials: int, *, level: float = 0.95
-) -> tuple[float, float]:
-    """Return the exact interval of a binomial share (Clopper and Pearson, 1934)."""
-    tail, failures = 0.5 * (1.0 - level), trials - successes
+def clopper_pearson(successes: int, trials: int) -> tuple[float, float]:
+    """Return the exact 95 % interval of a share (Clopper and Pearson, 1934)."""
+    tail, failures = 0.025, trials - successes
     # With no success the lower end is 0 exactly, where betaincinv is undefined.
     low = betaincinv(successes, failures + 1, tail) if successes else 0.0
     high = betaincinv(successes + 1, failures, 1.0 - tail) if failures else 1.0

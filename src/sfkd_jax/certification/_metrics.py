@@ -7,7 +7,7 @@ of least condition, L-BFGS a metric for each output. The trusted core decides.
 from __future__ import annotations
 
 import warnings
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from functools import partial
 from itertools import pairwise
 from typing import Any
@@ -41,7 +41,7 @@ MISSING = (
     "no Lyapunov matrix: cvxpy or clarabel is not installed "
     "(pip install 'sfkd_jax[certify]')"
 )
-SHARPNESS = ((16, 40), (64, 60), (256, 100))
+SHARPNESS = ((16.0, 40), (64.0, 60), (256.0, 100))
 """Exponents of the p-norms that smooth a maximum, with L-BFGS iterations for each."""
 RUNS = 8
 """Exponent of the power mean over runs, a smooth stand-in for a high quantile."""
@@ -186,37 +186,44 @@ def propose_metric(
     Raises:
         CertificationRefused: no α below 1 was found.
     """
-    vertices, rank = weights.operators.vertices, weights.operators.vertices.shape[-1]
-    multipliers = weights.residual_multipliers
+    vertices, multipliers = weights.operators.vertices, weights.residual_multipliers
+    rank, lower = vertices.shape[-1], np.tril_indices(vertices.shape[-1])
+    entries = len(lower[0])
     # Logarithms: multipliers stay positive in an unconstrained search.
     logs = [np.log(np.concatenate([*multipliers, []]))] * len(vertices)
-    lower = np.tril_indices(rank)
     begins = [np.eye(rank)]
     # Scaled to the trace of I: both starts have entries of the same size.
     if start is not None:
         begins.append(np.linalg.cholesky(start * (rank / np.trace(start))))
     candidates = [np.concatenate([begin[lower], *logs]) for begin in begins]
+    given = vertices, weights.residual, rows.T, gaps
+
+    def objective(flat: Vector, sharpness: float) -> tuple[float, Vector]:
+        loss, gradient = _log_radius(flat, sharpness, *given)
+        # NaN of the Cholesky factor: outside the cone nothing is proved
+        if not (np.isfinite(loss) and np.all(np.isfinite(gradient))):
+            return INFEASIBLE, np.zeros_like(flat)
+        return float(loss), np.asarray(gradient)
+
     # float64 for the search: near α = 1 float32 could not tell the metrics apart.
     with jax.enable_x64(True):
-        objective = _objective(weights, rows, gaps)
-        first = partial(objective, SHARPNESS[0][0])
-        flat = min(candidates, key=lambda candidate: first(candidate)[0])
+        flat = min(candidates, key=lambda each: objective(each, SHARPNESS[0][0])[0])
         # From smooth to sharp: a sharp maximum alone would stop at its first kink.
         for sharpness, iterations in SHARPNESS:
             options = {"maxiter": iterations, "maxcor": 20}
-            search = {"jac": True, "method": "L-BFGS-B", "options": options}
-            flat = minimize(partial(objective, sharpness), flat, **search).x
+            search = {"args": (sharpness,), "method": "L-BFGS-B", "options": options}
+            flat = minimize(objective, flat, jac=True, **search).x
     factor = np.zeros((rank, rank))
-    factor[lower] = flat[: len(lower[0])]
+    factor[lower] = flat[:entries]
     found = factor @ factor.T
     # The scale is free: entries of about 1 keep the core's rounding errors small.
     scale = 2.0 / (np.trace(found) / rank + np.max(np.abs(found)))
     found *= scale
     widths = np.cumsum([len(part) for part in multipliers], dtype=int)[:-1]
-    each = flat[len(lower[0]) :].reshape(len(vertices), -1)
     # P and multipliers scale together, or the matrix inequality would be another.
     joint = [
-        np.split(scale * np.exp(part), widths) if multipliers else [] for part in each
+        np.split(scale * np.exp(part), widths) if multipliers else []
+        for part in flat[entries:].reshape(len(vertices), -1)
     ]
     return accepted_metric(weights, rows, 0.5 * (found + found.T), joint)
 
@@ -249,22 +256,6 @@ def accepted_metric(
     raise refusal
 
 
-def _objective(
-    weights: Exported, rows: Matrix, gaps: Any
-) -> Callable[..., tuple[float, Vector]]:
-    """Return (sharpness, flat (L, log λ)) ↦ (log radius, gradient) for scipy."""
-    given = weights.operators.vertices, weights.residual, rows.T, gaps
-
-    def call(sharpness: int, flat: Vector) -> tuple[float, Vector]:
-        loss, gradient = _log_radius(flat, float(sharpness), *given)
-        # NaN of the Cholesky factor: outside the cone nothing is proved
-        if not (np.isfinite(loss) and np.all(np.isfinite(gradient))):
-            return INFEASIBLE, np.zeros_like(flat)
-        return float(loss), np.asarray(gradient)
-
-    return call
-
-
 @jax.jit  # one program for all outputs of a model
 @jax.value_and_grad
 def _log_radius(
@@ -291,27 +282,26 @@ def _log_radius(
 def _squares(
     weights: Sequence[Array], factor: Array, multipliers: Array, operator: Array
 ) -> Array:
-    """Eigenvalues of A'A + X H⁻¹ X' in coordinates L'z; NaN if nothing is proved."""
-    inverse = jax.scipy.linalg.solve_triangular(
-        factor, jnp.eye(len(factor)), lower=True
-    )
+    """Eigenvalues of C'S⁻¹C − K in coordinates L'z; NaN if nothing is proved."""
+    rank = len(factor)
+    inverse = jax.scipy.linalg.solve_triangular(factor, jnp.eye(rank), lower=True).T
     # L' A L'⁻¹: in these coordinates |·|_P is the 2-norm.
-    linear = factor.T @ operator @ inverse.T
-    if not weights:
-        return jnp.linalg.eigvalsh(linear.T @ linear)
-    edges = np.cumsum([0, *(len(part) for part in weights[:-1])])
+    linear, layers = factor.T @ operator @ inverse, [*weights]
+    edges = np.cumsum([0, rank, *(len(part) for part in layers[:-1])])
     blocks = [slice(a, b) for a, b in pairwise(edges)]
-    output = jnp.zeros((len(factor), edges[-1]))
-    output = output.at[:, blocks[-1]].set(factor.T @ weights[-1])
-    inner = 2 * jnp.diag(multipliers) - output.T @ output
-    for k, (before, here) in enumerate(pairwise(blocks)):
-        coupling = multipliers[here, None] * weights[k + 1]
-        inner = inner.at[here, before].add(-coupling).at[before, here].add(-coupling.T)
-    entry = multipliers[blocks[0], None] * (weights[0] @ inverse.T)
-    coupling = (linear.T @ output).at[:, blocks[0]].add(entry.T)
-    root = jnp.linalg.cholesky(inner)  # NaN if it is not positive definite
-    half = jax.scipy.linalg.solve_triangular(root, coupling.T, lower=True)
-    return jnp.linalg.eigvalsh(linear.T @ linear + half.T @ half)
+    output = jnp.zeros((rank, edges[-1])).at[:, :rank].set(linear)
+    if layers:
+        layers[0] = layers[0] @ inverse
+        output = output.at[:, blocks[-1]].add(factor.T @ layers[-1])
+    scales = jnp.concatenate([jnp.zeros(rank), multipliers])
+    matrix = 2 * jnp.diag(scales) - output.T @ output
+    for weight, (before, here) in zip(layers, pairwise(blocks), strict=False):
+        coupling = scales[here, None] * weight
+        matrix = matrix.at[here, before].add(-coupling)
+        matrix = matrix.at[before, here].add(-coupling.T)
+    root = jnp.linalg.cholesky(matrix[rank:, rank:])  # NaN if it is not definite
+    half = jax.scipy.linalg.solve_triangular(root, matrix[rank:, :rank], lower=True)
+    return jnp.linalg.eigvalsh(half.T @ half - matrix[:rank, :rank])
 
 
 def _power_mean(values: Array, power: Any, *, mean: bool) -> Array:

@@ -98,7 +98,7 @@ def joint_bound(
         start = propose_multipliers(
             weights.residual, start, vertex, iterations=iterations
         )
-        bound, witness = rescaled(weights.residual, start, vertex)
+        bound, witness = lipschitz_upper(weights.residual, start, vertex)
         bounds.append(bound)
         witnesses.append(witness)
         start = witness
@@ -114,8 +114,8 @@ def _best_multipliers(
     if len(weights) < 2 or not np.any(weights[-1]):
         return (norm_upper(weights[-1]) if weights else 0.0), []
     # The model's own multipliers prove its design bound, which L-BFGS may miss.
-    given = rescaled(weights, start) if start else (float("inf"), [])
-    proposed = rescaled(weights, propose_multipliers(weights, start))
+    given = lipschitz_upper(weights, start) if start else (float("inf"), [])
+    proposed = lipschitz_upper(weights, propose_multipliers(weights, start))
     return min(given, proposed, key=lambda pair: pair[0])
 
 
@@ -123,23 +123,17 @@ def lipschitz_upper(
     weights: Sequence[Matrix],
     multipliers: Sequence[Vector],
     linear: Matrix | None = None,
-) -> float:
+) -> tuple[float, list[Vector]]:
     """Return the smallest Lipschitz bound that scaled multipliers prove, or infinity.
 
     Args:
         weights: W_1 … W_L of a network with slopes in [0, 1].
         multipliers: proposed λ_1 … λ_{L-1}, scaled by a common factor.
         linear: A, for a bound on A z + network(z).
+
+    Returns:
+        The bound and the scaled multipliers.
     """
-    return rescaled(weights, multipliers, linear)[0]
-
-
-def rescaled(
-    weights: Sequence[Matrix],
-    multipliers: Sequence[Vector],
-    linear: Matrix | None = None,
-) -> tuple[float, list[Vector]]:
-    """Return the bound of `lipschitz_upper` and its scaled multipliers."""
     if not multipliers and len(weights) <= 1:
         parts = [
             np.asarray(part, dtype=np.float64)
@@ -190,14 +184,12 @@ def propose_multipliers(
     weights = [np.asarray(weight, dtype=np.float64) for weight in weights]
     if len(weights) < 2 or not all(np.all(np.isfinite(part)) for part in weights):
         return []
+    begin = _starting_point(weights, start, linear)
     # A network that emits a constant needs none; the search would drive them to zero
     if not np.any(weights[-1]):
-        return _starting_point(weights, (), linear)
-    begin = _starting_point(weights, start, linear)
+        return begin
     widths = np.cumsum([len(part) for part in begin])[:-1]
-    best = rescaled(weights, begin, linear)
-    # From the factor that proves most: the search begins where something is proved.
-    logs = np.log(np.concatenate(best[1] or begin))
+    logs = np.log(np.concatenate(begin))
 
     def objective(logs: Vector, sharpness: int) -> tuple[float, Vector]:
         multipliers = np.split(np.exp(logs), widths)
@@ -227,17 +219,18 @@ def propose_multipliers(
 def _starting_point(
     weights: list[Matrix], start: Sequence[Vector], linear: Matrix | None
 ) -> list[Vector]:
-    """Return `start` if it proves anything, else λ_k = Π_{j>k} ||W_j||²."""
-    begin = [np.asarray(part, dtype=np.float64) for part in start]
-    positive = begin and all(np.all(part > 0) for part in begin)
-    if positive and np.isfinite(rescaled(weights, begin, linear)[0]):
-        return begin
+    """Return `start` if it proves anything, else λ_k = Π_{j>k} ||W_j||², rescaled."""
     squares = [max(float(np.linalg.norm(weight, 2)) ** 2, 1e-6) for weight in weights]
-    return [
+    norms = [
         # A thousandth above the product of norms, so that the inequality is strict.
         np.full(len(weights[k]), 1.001 * np.prod(squares[k + 1 :]))
         for k in range(len(weights) - 1)
     ]
+    # With the factor that proves most: the search begins where something is proved.
+    for begin in (start, norms):
+        if begin and (best := lipschitz_upper(weights, begin, linear)[1]):
+            return best
+    return norms
 
 
 def reduced(

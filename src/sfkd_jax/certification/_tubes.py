@@ -28,19 +28,18 @@ WORST = 5
 
 
 def latent_tube(
-    alpha: float, d_bar: float, horizon: int, *, initial: float = 0.0
+    alpha: float, d_bar: float, horizon: int
 ) -> Float[np.ndarray, " horizon"]:
-    """Return R_1 … R_T with |z_k − ẑ_k| ≤ R_k as long as all |d_j| ≤ d̄.
+    """Return R_1 … R_T with |z_k − ẑ_k| ≤ R_k as long as all |d_j| ≤ d̄, for ẑ_0 = z_0.
 
-        R_k = α^k |e_0| + d̄ (1 − α^k)/(1 − α)
+        R_k = d̄ (1 − α^k)/(1 − α)
 
     Args:
         alpha: α.
         d_bar: d̄.
         horizon: T [steps].
-        initial: |e_0|.
     """
-    radii, radius = [], initial
+    radii, radius = [], 0.0
     # The recursion instead of the closed form, which divides by 1 − α.
     for _ in range(horizon):
         radius = alpha * radius + d_bar
@@ -150,7 +149,7 @@ def radii(
     measured: Residuals,
     name: str,
     claim: OutputMetric,
-    initial: Float[np.ndarray, " run"] | float = 0.0,
+    start: Float[np.ndarray, "run rank"] | None = None,
 ) -> Radii:
     """Return the bounds of one output for each run.
 
@@ -162,13 +161,15 @@ def radii(
         measured: residuals of the runs.
         name: one of `OUTPUTS`.
         claim: its proved metric.
-        initial: |z_0 − ẑ_0|_P; 0 if the nominal model starts at the state of the car.
+        start: z_0 − ẑ_0; None if the nominal model starts at the state of the car.
     """
     # |d|_P is the 2-norm of d'L with P = L L'.
-    sizes = np.linalg.norm(measured.gaps @ np.linalg.cholesky(claim.metric), axis=-1)
+    factor = np.linalg.cholesky(claim.metric)
+    sizes = np.linalg.norm(measured.gaps @ factor, axis=-1)
     misses = measured.outputs[..., OUTPUTS.index(name)]
-    radius = np.broadcast_to(np.asarray(initial, dtype=np.float64), sizes.shape[:1])
-    farthest = np.zeros(len(sizes))
+    farthest = radius = initial = np.zeros(len(sizes))
+    if start is not None:
+        radius = initial = np.linalg.norm(start @ factor, axis=1)
     # The output error is read before the radius takes in this step's disturbance.
     for step in range(sizes.shape[1]):
         distance = claim.lipschitz * claim.alpha * radius + misses[:, step]
@@ -212,15 +213,12 @@ def output_tubes(
         except CertificationRefused:
             return {}
         scores, unseen = (radii(part, name, claim) for part in (calibration, test))
-        bounds = [conformal_quantile(part, level) for part in scores]
-        pairs = zip(unseen, bounds, strict=True)
-        shares = [float(np.mean(part <= bound)) for part, bound in pairs]
-        count = len(test.gaps)
-        intervals = [coverage_interval(share, count) for share in shares]
-        columns = {"tube": bounds, "coverage": shares, "coverage_ci95": intervals}
-        documents[name] = claim.document() | {"coverage_runs": count}
-        for column, values in columns.items():
-            documents[name][column] = dict(zip(FORMS, values, strict=True))
+        part = documents[name] = claim.document() | {"coverage_runs": len(test.gaps)}
+        part |= {"tube": {}, "coverage": {}, "coverage_ci95": {}}
+        for form, calibrated, held_out in zip(FORMS, scores, unseen, strict=True):
+            bound = part["tube"][form] = conformal_quantile(calibrated, level)
+            share = part["coverage"][form] = float(np.mean(held_out <= bound))
+            part["coverage_ci95"][form] = coverage_interval(share, len(test.gaps))
     return documents
 
 
@@ -244,26 +242,24 @@ def run_scores(
     measured: Residuals,
     claims: Mapping[str, OutputMetric],
     nominal: Float[np.ndarray, " run"],
-    initial: Mapping[str, Float[np.ndarray, " run"]],
-) -> dict[str, Float[np.ndarray, " run"]]:
-    """Return the smallest bounds that would have held on each run, by name.
+    start: Float[np.ndarray, "run rank"],
+) -> Float[np.ndarray, "run 5"]:
+    """Return the smallest bounds that would have held on each run, `JOINT` and `ALONE`.
 
     Args:
         measured: residuals of the runs.
         claims: proved metric of every output.
         nominal: largest |ê_y| of the nominal model [m].
-        initial: |z_0 − ẑ_0|_P in the metric of every output.
+        start: z_0 − ẑ_0.
     """
-    scores = {"nominal": nominal}
-    for name, claim in claims.items():
-        bounds = radii(measured, name, claim, initial[name])._asdict()
-        scores |= {f"{form}_{name}": bounds[form] for form in FORMS}
-    return scores
+    bounds = [radii(measured, name, claims[name], start) for name in OUTPUTS]
+    farthest = [each.vehicle_to_nominal for each in bounds]
+    return np.column_stack([*farthest, nominal, *(each.asymptotic for each in bounds)])
 
 
 def calibrate_corridor(
-    reference: Mapping[str, Float[np.ndarray, " other"]],
-    scores: Mapping[str, Float[np.ndarray, " run"]],
+    reference: Float[np.ndarray, "other 5"],
+    scores: Float[np.ndarray, "run 5"],
     *,
     level: float,
 ) -> dict[str, float]:
@@ -281,25 +277,15 @@ def calibrate_corridor(
     Raises:
         ValueError: too few runs for the level, or scores that are not finite.
     """
-    joint = conformal_bounds(_joint(reference), _joint(scores), level=level)
-    alone = {name: conformal_quantile(scores[name], level) for name in ALONE}
-    return dict(zip(JOINT, joint.tolist(), strict=True)) | alone
+    together = len(JOINT)
+    joint = conformal_bounds(reference[:, :together], scores[:, :together], level=level)
+    alone = [conformal_quantile(column, level) for column in scores[:, together:].T]
+    return dict(zip((*JOINT, *ALONE), [*joint.tolist(), *alone], strict=True))
 
 
 def corridor_coverage(
-    bounds: Mapping[str, float], scores: Mapping[str, Float[np.ndarray, " run"]]
+    bounds: Mapping[str, float], scores: Float[np.ndarray, "run 5"]
 ) -> dict[str, Any]:
-    """Return the share of runs on which all bounds in `JOINT` held.
-
-    Args:
-        bounds: from `calibrate_corridor`.
-        scores: scores of independent runs.
-    """
-    return coverage(np.asarray([bounds[name] for name in JOINT]), _joint(scores))
-
-
-def _joint(
-    scores: Mapping[str, Float[np.ndarray, " run"]],
-) -> Float[np.ndarray, "run kind"]:
-    """Scores of the quantities in `JOINT`, that of the lateral tube first."""
-    return np.stack([scores[name] for name in JOINT], axis=1)
+    """Return the share of runs on which all bounds in `JOINT` held."""
+    limits = np.asarray([bounds[name] for name in JOINT])
+    return coverage(limits, scores[:, : len(JOINT)])

@@ -5,7 +5,6 @@ from __future__ import annotations
 import hashlib
 from collections.abc import Iterator
 from contextlib import AbstractContextManager, contextmanager, nullcontext
-from functools import cache
 from typing import Any, TypeAlias
 
 import jax
@@ -113,15 +112,8 @@ def one_thread() -> AbstractContextManager[object]:
 
     On busy cores two threads are a hundred times slower.
     """
-    threads = _threads()
-    return threads.limit(limits=1, user_api="blas") if threads else nullcontext()
-
-
-@cache
-def _threads() -> Any:
-    """Return the controller of the loaded BLAS libraries; finding them takes time."""
     try:
-        from threadpoolctl import ThreadpoolController
+        from threadpoolctl import threadpool_limits
     except ImportError:  # to verify a certificate, no speed is needed
-        return None
-    return ThreadpoolController()
+        return nullcontext()
+    return threadpool_limits(1, user_api="blas")

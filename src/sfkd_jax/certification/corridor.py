@@ -183,14 +183,14 @@ def certify_corridor(
     }
     # The shortest dwell: an attack switches as often as the conditions allow.
     held = max(1, round(dwell[0] / loop.plant.dt))
-    tube = Tube.of(claims["position"], bounds["vehicle_to_nominal_position"])
-    search = _Search(loop, tube, data, held, attack_steps)
+    bound = bounds["vehicle_to_nominal_position"]
+    search = _Search(loop, claims["position"], bound, data, held, attack_steps)
     return {
         "conditions": excited | conditions,
         "level": level,
         "runs": runs,
         "bounds": bounds,
-        "corridor_m": bounds["nominal"] + bounds["vehicle_to_nominal_position"],
+        "corridor_m": bounds["nominal"] + bound,
         **corridor_coverage(bounds, test),
         # S3 does not meet the conditions: reported beside the claim, never in it.
         "by_scenario": {"s3": corridor_coverage(bounds, s3)},
@@ -210,7 +210,7 @@ def _measure(
     simulate: Callable[..., Any],
     runs: Trajectory,
     key: Key,
-) -> tuple[np.ndarray, np.ndarray, dict[str, np.ndarray]]:
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """e_y of the car and ê_y of the nominal model (run, time), and scores of the runs.
 
     Args:
@@ -221,12 +221,8 @@ def _measure(
         key: for the sensors.
     """
     nominal, gaps = (np.asarray(part, np.float64) for part in simulate(runs, key))
-    initial = {
-        name: np.linalg.norm(gaps @ np.linalg.cholesky(claim.metric), axis=1)
-        for name, claim in claims.items()
-    }
     errors = residuals(loop.model, loop.params, runs)
-    scores = run_scores(errors, claims, np.max(np.abs(nominal), axis=1), initial)
+    scores = run_scores(errors, claims, np.max(np.abs(nominal), axis=1), gaps)
     lateral = np.asarray(runs.states, dtype=np.float64)[:, 1:, BODY][..., LATERAL]
     return lateral, nominal, scores
 
@@ -289,30 +285,6 @@ class Runs(NamedTuple):
     envs: Float[Array, "run time environment"]
 
 
-class Tube(NamedTuple):
-    """The claimed tube |e_y − ê_y| ≤ L α R + ε with R⁺ = α R + |d|_P.
-
-    The radius, the right-hand side, is claimed to stay below a bound.
-
-    Attributes:
-        alpha: α.
-        lipschitz: L.
-        factor: of P = factor factor'.
-        bound: of the radius [m].
-    """
-
-    alpha: float
-    lipschitz: float
-    factor: Float[Array, "rank rank"]
-    bound: float
-
-    @classmethod
-    def of(cls, claim: OutputMetric, bound: float) -> Tube:
-        """Return the tube of a proved metric and a measured bound."""
-        factor = jnp.asarray(np.linalg.cholesky(claim.metric), dtype=float)
-        return cls(claim.alpha, claim.lipschitz, factor, bound)
-
-
 class Outcome(NamedTuple):
     """Largest values over a run, (run,).
 
@@ -337,14 +309,16 @@ class _Search:
 
     Attributes:
         loop: of the policy.
-        tube: that is claimed.
+        claim: proved metric of e_y.
+        bound: of the radius of its tube, which is what is claimed [m].
         data: of the data set: `ROADS`, env_low and env_high.
         held: steps between switches of e.
         steps: in all.
     """
 
     loop: Loop
-    tube: Tube
+    claim: OutputMetric
+    bound: float
     data: Mapping[str, Any]
     held: int
     steps: int
@@ -390,7 +364,7 @@ class _Search:
         """The worst runs of one aim over all generations."""
         # However few steps are given, as many runs as are asked for.
         population = max(KEEP, self.steps // (len(AIMS) * GENERATIONS * LENGTH))
-        outcome = partial(outcome_of, self.loop, params, self.tube)
+        outcome = partial(outcome_of, self.loop, params, self.claim)
 
         def generation(carry: tuple[Array, Array], key: Key) -> tuple[Any, Any]:
             mean, spread = carry
@@ -415,7 +389,7 @@ class _Search:
         """What an aim maximises."""
         if aim == "within":
             # Outside the hypothesis nothing is claimed; nearer to it ranks higher.
-            inside = outcome.radius <= self.tube.bound
+            inside = outcome.radius <= self.bound
             return jnp.where(inside, outcome.distance, -outcome.radius)
         return getattr(outcome, aim)
 
@@ -428,22 +402,24 @@ def _unit(gene: Array) -> Array:
 def outcome_of(
     loop: Loop,
     params: Params,
-    tube: Tube,
+    claim: OutputMetric,
     run: Runs,
     nu_filter: Callable[..., Any] | None = None,
 ) -> Outcome:
     """Return the outcome of one run of plant and nominal model; callers vmap.
 
-    Both start on the path.
+    Both start on the path. The tube of e_y is |e_y − ê_y| ≤ L α R + ε with
+    R⁺ = α R + |d|_P.
 
     Args:
         loop: of the policy.
         params: of its model, folded.
-        tube: of e_y.
+        claim: proved metric of e_y.
         run: inputs of one run.
         nu_filter: (fiber, latent, ν, index) -> ν, or None for none.
     """
     model, plant = loop.model, loop.plant
+    factor = jnp.asarray(np.linalg.cholesky(claim.metric), dtype=float)
     rest = jnp.zeros(len(plant.state_names) - 3)
     start = path_state(rest.at[2].set(run.inputs[0, 3]))
     latent = model.encode(model.fiber(params, run.envs[0]), start)
@@ -461,9 +437,9 @@ def outcome_of(
         decoded = model.decode(fiber, latent), model.decode(fiber, expected)
         true, nominal, predicted = (x[BODY][LATERAL] for x in (state, *decoded))
         # The tube holds before its radius grows by the disturbance of this step.
-        radius = tube.lipschitz * tube.alpha * error + jnp.abs(true - predicted)
+        radius = claim.lipschitz * claim.alpha * error + jnp.abs(true - predicted)
         gap = model.vector(model.encode(fiber, state)) - model.vector(expected)
-        error = tube.alpha * error + jnp.linalg.norm(gap @ tube.factor)
+        error = claim.alpha * error + jnp.linalg.norm(gap @ factor)
         values = Outcome(jnp.abs(true), jnp.abs(true - nominal), radius)
         return (state, latent, error), values
 
@@ -485,7 +461,7 @@ def _attack(search: _Search, key: Key, width: float, horizon: int) -> dict[str, 
         CertificateContradicted: a car left its tube while the disturbances stayed
             within their bound, which is impossible.
     """
-    loop, bound = search.loop, search.tube.bound
+    loop, bound = search.loop, search.bound
     found, outcome = jax.jit(search)(loop.params, key)
 
     def shielded(params: Params, run: Runs) -> Outcome:
@@ -500,7 +476,7 @@ def _attack(search: _Search, key: Key, width: float, horizon: int) -> dict[str, 
                 loop.model, fiber, latent, wanted, roads[at], limit, width=width
             ).nu
 
-        return outcome_of(loop, params, search.tube, run, admissible)
+        return outcome_of(loop, params, search.claim, run, admissible)
 
     each = jax.vmap(jax.vmap(shielded, in_axes=(None, 0)), in_axes=(None, 0))
     held = jax.jit(each)(loop.params, found)
