@@ -46,19 +46,7 @@ def test_what_ships_verifies(plant):
     check(honest(plant), plant)
 
 
-PROVED = (
-    "alpha",
-    "alpha_separate",
-    "alpha_joint",
-    "rho",
-    "beta",
-    "lipschitz.body",
-    "lipschitz.position",
-    "lipschitz.yaw",
-)
-
-
-@pytest.mark.parametrize("claim", PROVED)
+@pytest.mark.parametrize("claim", ["alpha", "rho", "beta", "lipschitz.position"])
 def test_no_proved_constant_can_be_made_smaller(claim):
     for value in ((1 - 1e-5) * entry_at(honest(), claim), math.nan, 1e-320, None):
         with pytest.raises(CertificationRefused):

@@ -42,7 +42,6 @@ def aligned(share):
 
 JOINT = {
     "positive": (*positive(0), None),
-    "positive 2": (*positive(1), None),
     "aligned": aligned(0.15),
     "aligned, A = I": ([0.3 * np.eye(SIZE), np.eye(SIZE)], 0.6 * np.eye(SIZE), 0.9),
     "cancelling": ([0.3 * np.eye(SIZE), -np.eye(SIZE)], 0.9 * np.eye(SIZE), 0.9),
@@ -58,29 +57,19 @@ JOINT = {
 
 
 def exact(weights, linear, known):
-    slopes = [np.ones(len(w)) for w in weights[:-1]]
-    chained = weights[0]
-    for slope, weight in zip(slopes, weights[1:], strict=True):
-        chained = weight @ (slope[:, None] * chained)
+    chained = np.linalg.multi_dot(weights[::-1])
     return known if known is not None else np.linalg.norm(linear + chained, 2)
 
 
 @pytest.mark.parametrize("name", JOINT)
-def test_the_joint_bound_of_a_map_with_a_known_constant_is_tight_from_above(name):
+def test_bound_and_attack_enclose_a_known_constant_tightly(name):
     weights, linear, known = JOINT[name]
     constant = exact(weights, linear, known)
     assert constant * (1 - 1e-12) <= best(weights, linear) <= constant * 1.01
+    assert attack_slopes(weights, linear) == pytest.approx(constant, rel=1e-9)
 
 
-@pytest.mark.parametrize("name", JOINT)
-def test_the_slope_attack_reaches_the_known_constant_and_no_more(name):
-    weights, linear, known = JOINT[name]
-    assert attack_slopes(weights, linear) == pytest.approx(
-        exact(weights, linear, known), rel=1e-9
-    )
-
-
-@pytest.mark.parametrize("seed", range(6))
+@pytest.mark.parametrize("seed", range(4))
 def test_the_joint_bound_lies_between_the_attack_and_the_sum_of_norms(seed):
     weights, linear = random_network(seed), 0.9 * rotation(seed)
     joint = best(weights, linear)
@@ -97,28 +86,20 @@ def test_witnesses_at_the_vertices_prove_the_bound_everywhere_in_their_hull():
         lipschitz_upper(weights, part, vertex)[0]
         for part, vertex in zip(proposed, vertices, strict=True)
     )
-    for _ in range(50):
-        shares = RANDOM.dirichlet(np.full(4, 0.5))
-        inside = sum(
-            share * vertex for share, vertex in zip(shares, vertices, strict=True)
-        )
+    for shares in RANDOM.dirichlet(np.full(4, 0.5), size=30):
+        inside = np.tensordot(shares, vertices, 1)
         mixed = [
-            sum(share * part[k] for share, part in zip(shares, proposed, strict=True))
-            for k in range(2)
+            np.tensordot(shares, layer, 1) for layer in zip(*proposed, strict=True)
         ]
         assert attack_slopes(weights, inside, starts=3) <= bound
         assert lipschitz_upper(weights, mixed, inside)[0] <= bound * (1 + 1e-3)
 
 
-@pytest.mark.parametrize("name", ["sfkd", "no_fiber", "segment"])
-def test_slopes_anywhere_in_the_hull_of_a_model_stay_below_its_joint_alpha(name):
-    weights, proved = explicit(name), certified(name)
-    for vertex in weights.operators.vertices:
-        assert attack_slopes(weights.residual, vertex) <= proved.alpha_joint
-    assert (
-        attack_slopes(weights.residual, weights.operators.vertices.mean(axis=0))
-        <= proved.alpha_joint
-    )
+def test_slopes_anywhere_in_the_hull_of_a_model_stay_below_its_joint_alpha():
+    weights, proved = explicit("sfkd"), certified("sfkd")
+    vertices = weights.operators.vertices
+    for operator in (*vertices, vertices.mean(axis=0)):
+        assert attack_slopes(weights.residual, operator) <= proved.alpha_joint
     assert proved.alpha_joint <= proved.alpha_separate * (1 + 1e-6)
 
 
