@@ -213,8 +213,8 @@ def output_tubes(
         except CertificationRefused:
             return {}
         scores, unseen = (radii(part, name, claim) for part in (calibration, test))
-        part = documents[name] = claim.document() | {"coverage_runs": len(test.gaps)}
-        part |= {"tube": {}, "coverage": {}, "coverage_ci95": {}}
+        part: dict[str, Any] = {"tube": {}, "coverage": {}, "coverage_ci95": {}}
+        documents[name] = claim.document() | {"coverage_runs": len(test.gaps)} | part
         for form, calibrated, held_out in zip(FORMS, scores, unseen, strict=True):
             bound = part["tube"][form] = conformal_quantile(calibrated, level)
             share = part["coverage"][form] = float(np.mean(held_out <= bound))
