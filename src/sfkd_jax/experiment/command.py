@@ -17,6 +17,7 @@ import jax
 from hydra.core.hydra_config import HydraConfig
 from hydra.types import RunMode
 from omegaconf import DictConfig, OmegaConf
+from threadpoolctl import threadpool_limits
 
 from sfkd_jax import training
 from sfkd_jax.certification import CertificateStale, CertificationRefused
@@ -54,7 +55,10 @@ def hydra_command(run: Run) -> Callable[[], None]:
             use_compilation_cache(Path(settings.root))
             # A trial spends its time on compiling, an experiment on running.
             jax.config.update("jax_disable_most_optimizations", not settings.optimized)
-            document = run(named_for_sweep(settings) if sweeping else settings)
+            # Small factorisations, in every step of a training: threads of BLAS would
+            # wait for each other, and keep XLA's waiting, for half of the time.
+            with threadpool_limits(1, user_api="blas"):
+                document = run(named_for_sweep(settings) if sweeping else settings)
         except KeyboardInterrupt:
             _report("interrupted; the same command continues")
             # The interpreter would first wait for compiled code that nobody needs.
