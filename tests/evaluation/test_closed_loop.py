@@ -21,13 +21,14 @@ SENSORS = (0.02, 0.02, 0.005, 0.05)
 
 
 @cache
-def roads(count=2):
+def roads():
     family = scenarios.scenario(name="s3", duration=STEPS * DT, state_size=4, dt=DT)
-    return jit(jax.vmap(family))(jax.random.split(jax.random.key(0), count))
+    return jit(jax.vmap(family))(jax.random.split(jax.random.key(0), 2))
 
 
-def one_episode(step, noise=SENSORS):
-    """An episode with a planner over a one-step function."""
+@cache
+def program(step):
+    """(noise of the sensors, roads, keys) -> episodes planned with a step function."""
     task = control.path_tracking(
         models.physics(step),
         control.tracking_cost(dt=DT),
@@ -36,27 +37,28 @@ def one_episode(step, noise=SENSORS):
         control_low=PLANT.control_low,
         control_high=PLANT.control_high,
     )
-    return partial(
-        evaluation.simulate,
-        PLANT.step,
-        control.mppi(task, num_samples=96, horizon=HORIZON),
-        {},
-        dt=DT,
-        horizon=HORIZON,
-        observation_noise=noise,
-        record={"expected": lambda info: info["predicted_states"][0, :2]},
-    )
+    planner = control.mppi(task, num_samples=96, horizon=HORIZON)
 
+    def one(noise, road, key):
+        return evaluation.simulate(
+            PLANT.step,
+            planner,
+            {},
+            road,
+            key,
+            dt=DT,
+            horizon=HORIZON,
+            observation_noise=tuple(noise),
+            record={"expected": lambda info: info["predicted_states"][0, :2]},
+        )
 
-@cache
-def several(step, noise=SENSORS):
-    """Several episodes, compiled once."""
-    return jit(jax.vmap(one_episode(step, noise)))
+    return jit(jax.vmap(one, in_axes=(None, 0, 0)))
 
 
 @cache
 def episodes(step, noise=SENSORS, seed=1):
-    return several(step, noise)(roads(), jax.random.split(jax.random.key(seed), 2))
+    keys = jax.random.split(jax.random.key(seed), 2)
+    return program(step)(jnp.asarray(noise), roads(), keys)
 
 
 def missed_by(batch):
@@ -99,12 +101,12 @@ def test_the_oracle_drives_better_than_the_nominal_model_and_predicts_exactly():
     assert np.all(scores[0]["rmse_m"] < scores[1]["rmse_m"])
     assert np.all(scores[0]["rmse_m"] < 0.1)
     assert not np.any(scores[0]["departures"])
-    assert missed_by(episodes(PLANT.step, noise=())).max() < 1e-4
+    assert missed_by(episodes(PLANT.step, noise=(0.0, 0.0, 0.0, 0.0))).max() < 1e-4
     assert missed_by(episodes(PLANT.nominal)).max() > 1e-2
 
 
 def test_the_same_key_makes_the_same_episode_and_another_key_another():
-    again = several(PLANT.step)(roads(), jax.random.split(jax.random.key(1), 2))
+    again = episodes.__wrapped__(PLANT.step)
     assert same(episodes(PLANT.step), again, rtol=0, atol=0)
     assert not np.array_equal(again.controls, episodes(PLANT.step, seed=2).controls)
 
@@ -205,17 +207,17 @@ def test_a_push_is_the_wind_that_pushes_as_hard(plant, wind, force):
 
 
 def test_a_push_moves_the_car_and_is_not_observed_and_none_changes_no_bit():
-    road, key = at(roads(), 0), jax.random.key(3)
-    run = jit(partial(one_episode(PLANT.step), record={"wind": lambda info: 0.0}))
+    keys = jax.random.split(jax.random.key(1), 2)
 
     def pushed(largest):
-        envs = disturbed_environment(PLANT, road.envs, key, largest=largest)
-        return run(road._replace(envs=envs), key)
+        push = jax.vmap(partial(disturbed_environment, PLANT, largest=largest))
+        disturbed = roads()._replace(envs=push(roads().envs, keys))
+        return program(PLANT.step)(jnp.asarray(SENSORS), disturbed, keys)
 
-    alone, hard = run(road, key), pushed(800.0)
+    alone, hard = episodes(PLANT.step), pushed(800.0)
     assert same(alone, pushed(0.0), rtol=0, atol=0)
     assert float(jnp.max(jnp.abs(hard.lateral - alone.lateral))) > 0.02
-    np.testing.assert_array_equal(hard.assumed_envs, road.observed_envs)
+    np.testing.assert_array_equal(hard.assumed_envs, roads().observed_envs)
 
 
 def test_pushes_are_redrawn_every_second_evenly_within_their_bound_and_grow_with_it():

@@ -9,7 +9,7 @@ import pytest
 
 from sfkd_jax.evaluation import Episode, pool, row, score
 from sfkd_jax.evaluation.formats import DASH
-from sfkd_jax.evaluation.metrics import BY_NAME, METRICS, Metric, Recording
+from sfkd_jax.evaluation.metrics import BY_NAME, METRICS, Recording
 
 DT, STEPS = 0.1, 200
 TIME = np.arange(1, STEPS + 1) * DT
@@ -136,10 +136,6 @@ def made(seed=0):
     return row(score(*batch(), dt=DT), about, (1.5, 2.5), {})
 
 
-def mean_of(value):
-    return value["mean"] if isinstance(value, dict) else value
-
-
 @pytest.mark.parametrize("metric", MEASURED, ids=lambda metric: metric.name)
 def test_a_metric_measures_episodes_one_by_one_by_the_signals_it_names(metric):
     joined, envs = batch()
@@ -159,12 +155,13 @@ def test_a_metric_measures_episodes_one_by_one_by_the_signals_it_names(metric):
 
 @pytest.mark.parametrize("name", EXPECTED)
 def test_a_metric_of_known_episodes_is_exact_and_pools_as_stated(name):
-    metric = BY_NAME[name]
     per_episode, of_row, of_seeds = EXPECTED[name]
     pooled, values = pool([made(0), made(1)]), score(*batch(), dt=DT)[name]
     np.testing.assert_allclose(values, per_episode, rtol=1e-12)
-    np.testing.assert_allclose(mean_of(metric.value(made())), of_row, rtol=1e-12)
-    np.testing.assert_allclose(mean_of(metric.value(pooled)), of_seeds, rtol=1e-12)
+    for entry, expected in ((made(), of_row), (pooled, of_seeds)):
+        value = BY_NAME[name].value(entry)
+        value = value["mean"] if isinstance(value, dict) else value
+        np.testing.assert_allclose(value, expected, rtol=1e-12)
 
 
 @pytest.mark.parametrize("metric", SHOWN, ids=lambda metric: metric.name)
@@ -195,18 +192,3 @@ def test_a_shown_metric_has_a_table_and_writes_what_is_no_number_as_a_dash(metri
 )
 def test_a_metric_is_written_in_its_unit_with_its_digits(name, record, text):
     assert BY_NAME[name].text(record) == text
-
-
-def test_a_new_metric_takes_one_entry(monkeypatch):
-    new = Metric(
-        "largest_steering_rad",
-        "Largest steering",
-        "rad",
-        "tracking",
-        measure=lambda run: np.max(np.abs(run.controls[..., 0]), axis=1),
-        pool=lambda values: float(np.max(values)),
-    )
-    for module in ("metrics", "_rows"):
-        monkeypatch.setattr(f"sfkd_jax.evaluation.{module}.METRICS", (*METRICS, new))
-    assert made()["largest_steering_rad"] == pytest.approx(0.1 * 0.9 * STEPS * DT)
-    assert pool([made(0), made(1)])["largest_steering_rad"] == pytest.approx(1.8)

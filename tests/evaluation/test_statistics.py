@@ -83,11 +83,11 @@ def test_the_p_value_is_the_level_at_which_the_interval_touches_zero():
 
 @pytest.mark.parametrize(
     ("deviations", "least", "most"),
-    [(DEVIATIONS[1], 0, 0.012), (HARDEST, 0.018, 0.032)],
+    [(DEVIATIONS[1], 0, 0.012), (HARDEST, 0.014, 0.036)],
 )
 def test_equal_rows_are_seldom_told_apart(deviations, least, most):
     """At the level of Holm's first step in a family of 20, as the docstring has it."""
-    tables = crossed(np.random.default_rng(12), (3, 16), deviations, 5 * DRAWS)
+    tables = crossed(np.random.default_rng(12), (3, 16), deviations)
     assert least <= np.mean([p_value(table) < 0.05 / 20 for table in tables]) <= most
 
 

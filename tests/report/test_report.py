@@ -1,6 +1,5 @@
 """The pages of a run, of a comparison and of a sweep."""
 
-import importlib
 import itertools
 import json
 import re
@@ -19,8 +18,6 @@ from sfkd_jax.report.episodes import Episodes, of_rows, of_run
 from sfkd_jax.report.film import LANE, Film, film_of
 from sfkd_jax.report.pages import to_latex
 from sfkd_jax.store import ArtefactError
-
-RUN = importlib.import_module("sfkd_jax.report.run")
 
 
 @pytest.fixture(scope="module")
@@ -55,8 +52,7 @@ def no_figures(monkeypatch):
         return path
 
     monkeypatch.setattr(style, "save", save)
-    for module in ("run", "comparison"):
-        monkeypatch.setattr(f"sfkd_jax.report.{module}.film_of", lambda *_: None)
+    monkeypatch.setattr("sfkd_jax.report.run.film_of", lambda *_: None)
 
 
 # ---- every page
@@ -191,9 +187,9 @@ def test_the_certificate_is_in_words_and_numbers_that_never_round_down(run_page)
         "| Asymptotic bound d̄ / (1 − α) \\[latent\\] | 0.1812 | proved from d̄ |",
         "| env: side wind \\[m/s\\] | −8 | 8 |",
         "| 8 to 10.5 |",
+        "| command | python -m sfkd\\_jax.train |",
     ):
         assert cell in text
-    assert RUN.PROOF in text.replace("\\", "")
 
 
 @pytest.mark.parametrize(
@@ -236,14 +232,7 @@ def test_a_file_that_does_not_fit_is_named(tmp_path):
         report.write_report(run)
 
 
-def test_a_disk_that_refuses_a_page_is_one_line(tmp_path):
-    run = made.write_run(tmp_path, episodes=False)
-    (run / "report").write_text("a file")
-    with pytest.raises(ArtefactError, match="report"):
-        report.write_report(run)
-
-
-@pytest.mark.parametrize("wrong", ["word", [1], {"a": 1}, 7])
+@pytest.mark.parametrize("wrong", ["word", [1], 7])
 def test_rows_that_are_none_are_refused_by_the_name_of_their_file(tmp_path, wrong):
     run = made.write_run(tmp_path, episodes=False, results={"rows": wrong})
     with pytest.raises(ArtefactError, match=r"results\.json: malformed"):
@@ -257,12 +246,6 @@ def test_a_row_cannot_name_arrays_outside_its_folder(tmp_path):
         report.write_results_page(directory)
 
 
-def test_the_settings_and_the_command_are_on_the_page(run_page):
-    text = (run_page / "index.html").read_text()
-    assert re.search(r"<th>command</th>\s*<td>python -m sfkd_jax.train</td>", text)
-    assert "<details>" in text
-
-
 # ---- figures and films
 
 
@@ -273,11 +256,9 @@ def groups(tmp_path, **lateral):
 
 def test_the_first_episode_shows_errors_conditions_and_the_whole_corridor(tmp_path):
     figure = figures.first_episode(groups(tmp_path), corridor=0.5)
-    road, errors, friction, wind = figure.axes
-    assert [axes.get_ylabel() for axes in figure.axes] == [
-        "y [m]", "lateral error [m]", "friction\n[-]", "side wind\n[m/s]",
-    ]  # fmt: skip
-    assert road.get_aspect() == 1.0
+    errors, friction, wind = figure.axes
+    labels = [axes.get_ylabel() for axes in figure.axes]
+    assert labels == ["lateral error [m]", "friction\n[-]", "side wind\n[m/s]"]
     low, high = errors.get_ylim()
     assert low <= -0.5
     assert high >= 0.5
@@ -291,7 +272,7 @@ def test_a_system_that_leaves_the_road_does_not_flatten_the_others(tmp_path):
         [one._replace(lateral=100 * one.lateral) if one.system == "nominal" else one
          for one in groups(tmp_path)]
     )  # fmt: skip
-    assert figure.axes[1].get_ylim()[1] < 3.0
+    assert figure.axes[0].get_ylim()[1] < 3.0
 
 
 def test_many_systems_are_drawn_by_family_each_with_sfkd_and_oracle(tmp_path):

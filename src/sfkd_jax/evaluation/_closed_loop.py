@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from functools import partial
 from typing import Any, NamedTuple
 
@@ -55,7 +55,7 @@ def simulate(
     *,
     dt: float,
     horizon: int,
-    observation_noise: tuple[float, ...] = (),
+    observation_noise: Sequence[float | Scalar] = (),
     record: Mapping[str, Signal] | None = None,
 ) -> Episode:
     """Simulate one episode.

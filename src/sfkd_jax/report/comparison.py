@@ -14,7 +14,6 @@ from sfkd_jax.evaluation.metrics import Row
 from sfkd_jax.report import figures, pages, style, tables
 from sfkd_jax.report import run as runs
 from sfkd_jax.report.episodes import of_rows
-from sfkd_jax.report.film import film_of
 from sfkd_jax.report.pages import Part, Picture, Section
 from sfkd_jax.report.tables import grouped, record_table, title_of
 
@@ -81,30 +80,25 @@ def _results(results: dict[str, Any], directory: Path, images: Path) -> list[Sec
                 head = f"{metric.head()}: {title}"
                 metrics.append(Section(head, [table], folded=True))
     for number, group in enumerate(grouped(rows, _FIGURE), 1):
-        title = title_of(group, _FIGURE)
-        sections.append(Section(title, _drawn(group, directory, images, title, number)))
+        drawn = _drawn(group, directory, images, number)
+        sections.append(Section(title_of(group, _FIGURE), drawn))
     made = runs.made_with(results.get("config") or {}, results.get("versions"))
     return [*sections, *metrics, made]
 
 
-def _drawn(
-    group: list[Row], directory: Path, images: Path, title: str, number: int
-) -> list[Part]:
+def _drawn(group: list[Row], directory: Path, images: Path, number: int) -> list[Part]:
     """The paper's figures 1 and 2 and a film, of the last scenario that has them."""
-    parts: list[Part] = []
     scenarios = grouped(group, ("scenario",))
-    for rows in reversed(scenarios):
-        where = style.scenario_label(str(rows[0].get("scenario")))
-        if not parts and (episodes := of_rows(directory, rows)):
-            path = images / f"figure1_{number}.png"
-            style.save(path, figures.first_episode, episodes)
-            parts += [f"{where}.", Picture(path, f"Lateral error: {title}")]
-            film = film_of(images / f"film_{number}.gif", episodes)
-            parts += [Picture(film, f"Film: {title}")] if film else []
+    found = (of_rows(directory, rows) for rows in reversed(scenarios))
+    episodes = next((one for one in found if one), [])
+    parts: list[Part] = []
+    if episodes:
+        title = title_of([episodes[0].row], ("scenario", *_FIGURE))
+        parts += runs.draw_episodes(episodes, images, title, number)
     forced = [row for row in scenarios[-1] if dig(row, "disturbed", "0")]
     if forced:
-        path = style.save(images / f"figure2_{number}.png", figures.side_forces, forced)
-        parts.append(Picture(path, f"RMSE by unmeasured side force: {title}"))
+        path = style.save(images / f"forces_{number}.png", figures.side_forces, forced)
+        parts.append(Picture(path, "RMSE by unmeasured side force"))
     return parts
 
 

@@ -10,8 +10,8 @@ from jaxtyping import Float
 
 from sfkd_jax import store
 from sfkd_jax.evaluation import SHARED, parse_episode_name
-from sfkd_jax.evaluation.metrics import Row
-from sfkd_jax.report.style import family, rank, switches
+from sfkd_jax.evaluation.metrics import Row, switches
+from sfkd_jax.report.style import family, rank
 from sfkd_jax.report.tables import name_of
 
 CELL = "cell"
@@ -46,6 +46,11 @@ class Episodes(NamedTuple):
         """Name of the system, without its coordinates."""
         return family(str(self.row.get("system")))
 
+    @property
+    def switches(self) -> list[int]:
+        """Steps at which friction or wind switch in the first episode."""
+        return [] if self.envs is None else np.flatnonzero(switches(self.envs)).tolist()
+
 
 def of_run(run: Path) -> list[list[Episodes]]:
     """The episodes of a run, grouped by what may be compared on the same road.
@@ -68,7 +73,7 @@ def of_run(run: Path) -> list[list[Episodes]]:
             groups.setdefault(key, []).append(one)
     for group in groups.values():
         group.sort(key=lambda one: (rank(one.system), one.name))
-    return sorted(groups.values(), key=lambda group: -len(switches(group[0].envs)))
+    return sorted(groups.values(), key=lambda group: -len(group[0].switches))
 
 
 def of_rows(directory: Path, rows: list[Row]) -> list[Episodes]:

@@ -5,8 +5,9 @@ from __future__ import annotations
 from typing import Any
 
 import numpy as np
+from jaxtyping import Float
 from matplotlib.figure import Figure
-from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter
+from matplotlib.ticker import FuncFormatter, LogLocator, MaxNLocator, NullFormatter
 
 from sfkd_jax.evaluation.formats import dig, is_number, is_pair
 from sfkd_jax.evaluation.metrics import LANE_HALF_WIDTH, Row
@@ -23,33 +24,29 @@ _FEW = 6
 def first_episode(
     group: list[Episodes], corridor: float | None = None, seconds: float = 15.0
 ) -> Figure:
-    """The road from above; below it lateral errors, friction and wind over time.
+    """Lateral errors over time, and friction and wind below them.
 
     Args:
         group: of one road.
         corridor: certified half width [m].
         seconds: that are drawn.
     """
-    first, panels = group[0], _panels(group)
+    first, panels, envs = group[0], _panels(group), group[0].envs
     # As long as the shortest run: all lines end at the same time.
     last = min(round(seconds / first.dt), *(one.lateral.shape[1] for one in group))
-    road, envs = first.path is not None and first.states is not None, first.envs
-    changes = [step for step in style.switches(envs) if step < last]
-    heights = [1.5] * road + [2.2] * len(panels) + [0.7, 0.7] * (envs is not None)
+    heights = [2.4] * len(panels) + [0.7, 0.7] * (envs is not None)
     figure = style.canvas(0.8 + sum(heights))
     axes = [*figure.subplots(len(heights), height_ratios=heights, squeeze=False)[:, 0]]
-    if road:
-        _draw_road(axes.pop(0), group, changes, last)
     for panel, (title, members) in zip(axes, panels.items(), strict=False):
         panel.set_title(title)
         _draw_errors(panel, members, last, corridor)
     if envs is not None:
-        style.draw_conditions(axes[-2], axes[-1], envs[:last], first.dt)
+        _draw_conditions(axes[-2], axes[-1], envs[:last], first.dt)
     for panel in axes:
         panel.set(xlim=(0.0, last * first.dt))
         panel.grid(visible=False, axis="x")
         panel.tick_params(labelbottom=panel is axes[-1])
-        for step in changes:
+        for step in first.switches:
             panel.axvline(step * first.dt, **style.SWITCH)
     axes[-1].set_xlabel("time [s]")
     figure.align_ylabels(axes)
@@ -73,27 +70,19 @@ def _panels(group: list[Episodes]) -> dict[str, list[Episodes]]:
     return {name: members for name, members in panels.items() if members}
 
 
-def _draw_road(axes: Any, group: list[Episodes], changes: list[int], last: int) -> None:
-    """The path and the cars in true scale, with dots where conditions switch."""
-    path, own = np.asarray(group[0].path), np.asarray(group[0].states)[: last + 1, :2]
-    gone = np.linalg.norm(np.diff(own, axis=0), axis=1).sum()
-    arc = np.linalg.norm(np.diff(path[:, :2], axis=0), axis=1).cumsum()
-    # Only the road that was driven: the rest of a long path would shrink it.
-    ahead = path[: int(np.searchsorted(arc, gone)) + 2, :2]
-    # Turned so that the road runs from left to right: a wide figure wastes no height.
-    chord = ahead[-1] - ahead[0]
-    turn = style.turn_by(np.arctan2(chord[1], chord[0]))
-    look: dict[str, Any] = {"color": style.ROAD, "linewidth": 6}
-    axes.plot(*turn @ (ahead - path[0, :2]).T, **look)
-    for one in group:
-        if one.states is not None and (one.system in _ALWAYS or one is group[0]):
-            points = turn @ (one.states[: last + 1, :2] - path[0, :2]).T
-            axes.plot(*points, **style.line(one.system) | {"linewidth": 1.1})
-    marks = turn @ (own[changes] - path[0, :2]).T
-    axes.plot(*marks, "o", color=style.MUTED, markersize=4, zorder=6)
-    # True scale: an unequal one would show turns that are none.
-    axes.set(xlabel="x [m]", ylabel="y [m]", aspect="equal", adjustable="datalim")
-    axes.set_title("The road from above; dots: friction or wind switch")
+def _draw_conditions(
+    friction: Any, wind: Any, envs: Float[np.ndarray, "time 2"], dt: float
+) -> None:
+    """Draw friction and wind over time, each on its own axes."""
+    time = dt * np.arange(len(envs) + 1)
+    for axes, values in zip((friction, wind), envs.T, strict=True):
+        fill = {"baseline": 0.0, "fill": True, "color": "#b9c6d6", "linewidth": 0.0}
+        axes.stairs(values, time, **fill)
+        axes.stairs(values, time, baseline=None, color="#4a5a6d", linewidth=1.1)
+    friction.set(ylim=(0.0, 1.0), yticks=[0.0, 0.5, 1.0], ylabel="friction\n[-]")
+    peak = max(1.0, float(np.max(np.abs(envs[:, 1]))))
+    wind.set(ylim=(-1.15 * peak, 1.15 * peak), ylabel="side wind\n[m/s]")
+    wind.yaxis.set_major_locator(MaxNLocator(nbins=2, symmetric=True))
 
 
 def _draw_errors(
@@ -147,7 +136,7 @@ def open_loop(errors: dict[str, Any], radii: list[Any]) -> Figure:
     figure = style.canvas(4.0)
     grid = figure.add_gridspec(2, 2, width_ratios=[1.45, 1])
     places = grid[:, 0], grid[0, 1], grid[1, 1]
-    position, yaw, speed = panels = [figure.add_subplot(one) for one in places]
+    panels = [figure.add_subplot(one) for one in places]
     known = is_number(errors.get("dt"))
     ahead = np.asarray(errors["steps"], float) * (errors["dt"] if known else 1.0)
     key = "position_rmse_m"
@@ -156,22 +145,23 @@ def open_loop(errors: dict[str, Any], radii: list[Any]) -> Figure:
         curves[name.replace("_", " ")] = dig(record, key)
     colours = style.ACCENT, style.DARK, "#d55e00", style.THIRD, style.SECOND, "#cc79a7"
     dashes = "-", ":", "--", "-.", (0, (5, 1, 1, 1)), (0, (1, 1))
-    for (name, values), color, dash in zip(
-        curves.items(), colours, dashes, strict=False
-    ):
+    looks = zip(curves.items(), colours, dashes, strict=False)
+    for (name, values), color, dash in looks:
         if values:
-            shown = _numbers(values, len(ahead))
-            position.plot(ahead, shown, label=name, color=color, linestyle=dash)
-    for axes, name in ((yaw, "yaw_rmse_rad"), (speed, "speed_rmse_m_per_s")):
-        axes.plot(ahead, _numbers(errors.get(name), len(ahead)), color=style.ACCENT)
-        axes.set_ylim(bottom=0.0)
-    for axes, name in zip(
-        panels, ("position [m]", "yaw [rad]", "speed [m/s]"), strict=True
-    ):
+            # As floats, null is NaN: a gap in the curve.
+            look = {"label": name, "color": color, "linestyle": dash}
+            panels[0].plot(ahead, np.asarray(values, float), **look)
+    names = ("position [m]", key), ("yaw [rad]", "yaw_rmse_rad")
+    names += (("speed [m/s]", "speed_rmse_m_per_s"),)
+    for axes, (name, column) in zip(panels, names, strict=True):
         axes.set(ylabel=f"error of {name}", xlim=(0, ahead[-1]))
         axes.set_xlabel("time ahead [s]" if known else "steps ahead")
-    _plain_log(position.yaxis, position.set_yscale)
-    style.legend(figure, position)
+        if axes is not panels[0] and errors.get(column):
+            shown = np.asarray(errors[column], float)
+            axes.plot(ahead, shown, color=style.ACCENT)
+            axes.set_ylim(bottom=0.0)
+    _plain_log(panels[0].yaxis, panels[0].set_yscale)
+    style.legend(figure, panels[0])
     figure.align_ylabels(panels[1:])
     return figure
 
@@ -265,12 +255,6 @@ def against_setting(name: str, rows: list[tuple[float, Row]]) -> Figure:
     axes.set(xlabel=style.literal(name), ylabel="lateral RMSE [mm], 95 % interval")
     axes.set_ylim(bottom=0.0)
     return figure
-
-
-def _numbers(values: Any, count: int) -> np.ndarray:
-    """A list from JSON as `count` floats, with NaN for null and for what is absent."""
-    row = [float("nan") if value is None else float(value) for value in values or []]
-    return np.array((row + [float("nan")] * count)[:count], dtype=float)
 
 
 def _plain_log(axis: Any, set_scale: Any) -> None:

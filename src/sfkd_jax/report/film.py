@@ -149,7 +149,7 @@ class Film:
         dt, high = self.cars[0].dt, 1.5 * self.largest
         if self.corridor:
             style.draw_corridor(errors, self.corridor)
-        for switch in style.switches(self.cars[0].envs):
+        for switch in self.cars[0].switches:
             errors.axvline(switch * dt, **style.SWITCH)
         errors.axhline(0.0, color=style.AXIS, linewidth=0.8)
         errors.set(xlim=(0.0, self.last * dt), ylim=(-high, high))
@@ -171,7 +171,7 @@ class Film:
         """Every car on its copy of the road, seen from the first car after a step."""
         envs, whole = self.cars[0].envs, {"transform": axes.transAxes}
         friction, wind = (0.9, 0.0) if envs is None else envs[min(step, len(envs) - 1)]
-        _put(axes, Rectangle((0, 0), 1, 1, fc=style.shade(friction), **whole))
+        _put(axes, Rectangle((0, 0), 1, 1, fc=_shade(friction), **whole))
         for number in range(len(self.cars)):
             self._draw_car(axes, path, near, step + 1, number)
         _put(axes, Rectangle((0, 0), 1, 1, fill=False, clip_on=False, **whole))
@@ -190,7 +190,7 @@ class Film:
         """One car on its copy of the road, its trail and its name."""
         car, lateral, own = self.cars[number], self.deviations[number], near[number]
         centre, states = path[near[0][now]], np.asarray(car.states)
-        turn, color = style.turn_by(centre[2]), style.line(car.system)["color"]
+        turn, color = _turn_by(centre[2]), style.line(car.system)["color"]
         shift = np.array([[0.0], [-_SPACING * number]])
 
         def seen(points: Any, offset: Any) -> np.ndarray:
@@ -216,7 +216,7 @@ class Film:
         recent = slice(max(now - _TRAIL, 0), now + 1)
         trail = seen(path[own[recent]], offset[recent])
         _put(axes, Line2D(*trail, color=color, linewidth=1.8))
-        body = style.turn_by(centre[2] - states[now, 2]) @ _CAR + trail[:, -1:]
+        body = _turn_by(centre[2] - states[now, 2]) @ _CAR + trail[:, -1:]
         _put(axes, Polygon(body.T, fc=color, ec=style.DARK))
         gone = f", left its lane at {(self.left[number] + 1) * car.dt:.1f} s"
         words = style.literal(car.name) + gone * (now > self.left[number])
@@ -230,6 +230,17 @@ def _put(axes: Any, artist: Any) -> None:
     axes.add_artist(artist)
     axes.draw_artist(artist)
     artist.remove()
+
+
+def _turn_by(yaw: float | np.floating) -> Float[np.ndarray, "2 2"]:
+    """The rotation into a frame with this yaw."""
+    return np.array([[np.cos(yaw), np.sin(yaw)], [-np.sin(yaw), np.cos(yaw)]])
+
+
+def _shade(friction: float) -> tuple[float, float, float]:
+    """Background colour: white for a dry road, blue grey for a slippery one."""
+    depth = float(np.clip((0.9 - friction) / 0.6, 0.0, 1.0))
+    return 1.0 - 0.14 * depth, 1.0 - 0.10 * depth, 1.0 - 0.05 * depth
 
 
 def _nearest(

@@ -10,7 +10,7 @@ from sfkd_jax import store
 from sfkd_jax.evaluation import SHARED, formats
 from sfkd_jax.evaluation.formats import DASH, dig, is_number, is_pair, plain, short
 from sfkd_jax.report import figures, style, tables
-from sfkd_jax.report.episodes import of_run
+from sfkd_jax.report.episodes import Episodes, of_run
 from sfkd_jax.report.film import film_of
 from sfkd_jax.report.pages import Part, Picture, Section, write_page
 from sfkd_jax.report.tables import record_table, title_of
@@ -93,10 +93,8 @@ def read_optional(path: Path) -> dict[str, Any]:
 
 def read_certificate(run: Path) -> dict[str, Any]:
     """The certificate of a run; one about other weights is not valid."""
-    certificate, path = (
-        read_optional(run / "certificate.json"),
-        run / f"policy{store.SUFFIX}",
-    )
+    certificate = read_optional(run / "certificate.json")
+    path = run / f"policy{store.SUFFIX}"
     policy = store.read_manifest(path, kind="policy") if path.exists() else {}
     own, named = policy.get("sha256"), certificate.get("weights_sha256")
     # Valid for other weights is not valid here: the page must not show it.
@@ -172,17 +170,31 @@ def _episodes(run_dir: Path, system: str, half: Any, images: Path) -> list[Part]
     corridor = float(half) if is_number(half) else None
     for number, group in enumerate(of_run(run_dir), 1):
         title = title_of([group[0].row], SHARED)
-        path = images / f"first_{number}.png"
-        style.save(path, figures.first_episode, group, corridor)
-        parts += [f"{title}.", Picture(path, f"First episode: {title}")]
+        film = number == 1
+        parts += draw_episodes(group, images, title, number, corridor, film=film)
         own = [one for one in group if one.row.get("system") == system]
         if own and len(own[0].lateral) > 1:
             path = images / f"all_{number}.png"
             style.save(path, figures.all_episodes, own[0], corridor)
             parts.append(Picture(path, f"All episodes: {title}"))
-        film = film_of(images / "film.gif", group, corridor) if number == 1 else None
-        parts += [Picture(film, f"Film: {title}")] if film else []
     return parts
+
+
+def draw_episodes(
+    group: list[Episodes],
+    images: Path,
+    title: str,
+    number: int,
+    corridor: float | None = None,
+    *,
+    film: bool = True,
+) -> list[Part]:
+    """The first episode of every row of a group as a figure, and as a film."""
+    path = images / f"first_{number}.png"
+    style.save(path, figures.first_episode, group, corridor)
+    parts: list[Part] = [f"{title}.", Picture(path, f"First episode: {title}")]
+    made = film_of(images / f"film_{number}.gif", group, corridor) if film else None
+    return [*parts, Picture(made, f"Film: {title}")] if made else parts
 
 
 def _certified(record: dict[str, Any]) -> list[Part]:
@@ -222,8 +234,7 @@ def _predicted(run_dir: Path, proof: dict[str, Any], images: Path) -> list[Part]
 def _learned(run_dir: Path, images: Path) -> list[Part]:
     """The loss by optimisation step."""
     log = run_dir / "metrics.jsonl"
-    lines = store.read_jsonl(log) if log.exists() else []
-    if not lines:
+    if not (log.exists() and (lines := store.read_jsonl(log))):
         return []
     path = style.save(images / "learning.png", figures.learning, lines)
     return [Picture(path, "Loss by optimisation step")]

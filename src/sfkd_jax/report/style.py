@@ -8,14 +8,11 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 import matplotlib
-import numpy as np
-from jaxtyping import Float
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
-from matplotlib.ticker import MaxNLocator
 
 ACCENT, SECOND, THIRD, MUTED = "#0b57b0", "#e8a33d", "#009e73", "#6b7280"
-DARK, SOFT, AXIS, ROAD = "#30363d", "#57606a", "#9aa1ab", "#d5dae1"
+DARK, SOFT, AXIS = "#30363d", "#57606a", "#9aa1ab"
 BAND: dict[str, Any] = dict(fc=ACCENT, alpha=0.16, linewidth=0, zorder=0.5)
 EDGE: dict[str, Any] = dict(color=ACCENT, linewidth=1.0, zorder=2)
 """Of a certified corridor."""
@@ -69,7 +66,6 @@ SYSTEMS = {
     "sfkd_no_residual": Look("SFKD − residual", "#8b7fc7", _PART),
     "sfkd_no_contraction": Look("SFKD − contraction", "#4b3f8f", (1.2, 1.2)),
     "sfkd_soft": Look("SFKD, soft hinge", "#2f7f9e", (1.2, 1.2)),
-    "sfkd_segment": Look("SFKD, segment frame", "#9ab8d3", (1.2, 1.2)),
     "koopman_mpc": Look("Koopman MPC", "#882255", _RIVAL),
     "neural_ode": Look("Neural ODE", THIRD, _RIVAL),
     "icode": Look("ICODE", "#56b4e9", _RIVAL),
@@ -154,45 +150,6 @@ def draw_corridor(axes: Any, half_width: float) -> None:
     words = f"certified corridor ± {half_width:.3f} m"
     across = axes.get_yaxis_transform()
     axes.text(0.99, -1.04 * half_width, words, fontsize=8.5, transform=across, **look)
-
-
-def draw_conditions(
-    friction: Any, wind: Any, envs: Float[np.ndarray, "time 2"], dt: float
-) -> None:
-    """Draw friction and wind over time, each on its own axes."""
-    time = dt * np.arange(len(envs) + 1)
-    for axes, values in zip((friction, wind), envs.T, strict=True):
-        fill = {"baseline": 0.0, "fill": True, "color": "#b9c6d6", "linewidth": 0.0}
-        axes.stairs(values, time, **fill)
-        axes.stairs(values, time, baseline=None, color="#4a5a6d", linewidth=1.1)
-    friction.set(ylim=(0.0, 1.0), yticks=[0.0, 0.5, 1.0], ylabel="friction\n[-]")
-    peak = max(1.0, float(np.max(np.abs(envs[:, 1]))))
-    wind.set(ylim=(-1.15 * peak, 1.15 * peak), ylabel="side wind\n[m/s]")
-    wind.yaxis.set_major_locator(MaxNLocator(nbins=2, symmetric=True))
-
-
-def switches(envs: Float[np.ndarray, "time 2"] | None) -> list[int]:
-    """Steps at which friction jumps, or wind jumps between two steady levels.
-
-    The ramp of a gust is no jump.
-    """
-    if envs is None or len(envs) < 2:
-        return []
-    friction, wind = np.abs(np.diff(envs, axis=0)).T
-    steady = np.pad(wind, 1) < 1e-3
-    jump = (friction > 0.02) | ((wind > 0.5) & steady[:-2] & steady[2:])
-    return [int(step) + 1 for step in np.flatnonzero(jump)]
-
-
-def turn_by(yaw: float | np.floating) -> Float[np.ndarray, "2 2"]:
-    """The rotation into a frame with this yaw."""
-    return np.array([[np.cos(yaw), np.sin(yaw)], [-np.sin(yaw), np.cos(yaw)]])
-
-
-def shade(friction: float) -> tuple[float, float, float]:
-    """Background colour: white for a dry road, blue grey for a slippery one."""
-    depth = float(np.clip((0.9 - friction) / 0.6, 0.0, 1.0))
-    return 1.0 - 0.14 * depth, 1.0 - 0.10 * depth, 1.0 - 0.05 * depth
 
 
 def save(path: Path, draw: Callable[..., Figure], *inputs: Any) -> Path:
