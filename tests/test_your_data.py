@@ -1,4 +1,4 @@
-"""Recorded drives through the commands: from csv files to a policy that loads."""
+"""Recorded runs through the commands: from csv files to a policy that loads."""
 
 import json
 import shutil
@@ -17,7 +17,7 @@ from sfkd_jax import evaluate
 from sfkd_jax.experiment import data, runs, stages
 
 sys.path.append(str(Path(__file__).parent / "data"))
-from recorded import drive, write_csv
+from recorded import recorded_run, write_csv
 
 STATE = "dataset.columns.state=[p_x,p_y,yaw,v,yaw_rate]"
 SMALL = (
@@ -46,11 +46,11 @@ FAST = (
 
 @pytest.fixture(scope="module")
 def logs(tmp_path_factory):
-    """Eight drives with a yaw rate; nobody measured friction or wind."""
+    """Eight runs with a yaw rate; nobody measured friction or wind."""
     folder = tmp_path_factory.mktemp("own") / "logs"
     folder.mkdir()
     for k in range(8):
-        columns = drive(seconds=12.0, phase=0.8 * k)
+        columns = recorded_run(seconds=12.0, phase=0.8 * k)
         columns["yaw_rate"] = np.gradient(columns["yaw"], columns["t"])
         write_csv(
             folder / f"{k}.csv",
@@ -104,7 +104,7 @@ def test_logs_become_a_certified_policy_of_a_robot_that_nothing_drives(logs):
     ].shape == (2,)
 
 
-def test_logs_are_stored_with_their_coverage_and_only_test_drives_are_held_out(
+def test_logs_are_stored_with_their_coverage_and_only_test_runs_are_held_out(
     logs, monkeypatch
 ):
     monkeypatch.chdir(logs.parent)
@@ -129,7 +129,7 @@ def test_what_logs_cannot_support_is_refused_before_a_run_is_begun(logs, monkeyp
         stages.ensure_policy(options)
     with pytest.raises(
         ValueError,
-        match=r"no column friction for the environment; pass environment.source=none",
+        match=r"no column friction among .* or pass environment.source=none",
     ):
         stages.ensure_policy(
             settings(*SMALL, "environment.source=measured", "name=other")

@@ -1,4 +1,4 @@
-"""A drive that is known at every moment, and files of it as recorders write them."""
+"""A run that is known at every moment, and files of it as recorders write them."""
 
 import numpy as np
 
@@ -7,8 +7,8 @@ NAMES = ("t", *STATE, "steering", "acceleration", "friction", "wind")
 WHEELBASE = 2.7
 
 
-def drive(seconds=30.0, period=0.1, phase=0.0):
-    """Columns of a drive along v = 5 + sin 0.7 t, yaw = 0.9 sin 0.4 t; positions by
+def recorded_run(seconds=30.0, period=0.1, phase=0.0):
+    """Columns of a run along v = 5 + sin 0.7 t, yaw = 0.9 sin 0.4 t; positions by
     fine quadrature.
     """
     fine = 20

@@ -1,8 +1,8 @@
-"""Drives are cut where they jump and where slow rows are dropped, and never joined."""
+"""Runs are cut where they jump and where slow rows are dropped, and never joined."""
 
 import numpy as np
 import pytest
-from recorded import NAMES, drive, write_csv
+from recorded import NAMES, recorded_run, write_csv
 from test_files import change, jump, read, refusal, together
 
 STEPS = 10
@@ -35,14 +35,14 @@ JUMPS = {
 
 
 @pytest.mark.parametrize("kind", JUMPS)
-def test_jumps_refuse_a_drive_or_cut_it(tmp_path, kind):
+def test_jumps_refuse_a_run_or_cut_it(tmp_path, kind):
     spoil, message, pieces = JUMPS[kind]
-    columns = drive()
+    columns = recorded_run()
     spoil(columns)
     path = write_csv(tmp_path / "a.csv", columns)
     assert refusal(path).startswith(path)
     logged, lines = read(path, split_at_jumps=True)
-    (warning,) = (line for line in lines if line.endswith("the drive is cut there"))
+    (warning,) = (line for line in lines if line.endswith("the run is cut there"))
     assert warning.startswith(f"warning: {path}, line ")
     assert message in warning
     states = segments_of(logged)[0]
@@ -51,7 +51,7 @@ def test_jumps_refuse_a_drive_or_cut_it(tmp_path, kind):
 
 
 def test_a_jump_of_yaw_cuts_a_drive(tmp_path):
-    columns = drive()
+    columns = recorded_run()
     change("yaw", 150, columns["yaw"][150] + 2.5)(columns)
     path = write_csv(tmp_path / "a.csv", columns)
     assert "yaw jumps by" in refusal(path)
@@ -60,7 +60,7 @@ def test_a_jump_of_yaw_cuts_a_drive(tmp_path):
 
 
 def test_without_jumps_cutting_changes_nothing(tmp_path):
-    path = write_csv(tmp_path / "a.csv", drive())
+    path = write_csv(tmp_path / "a.csv", recorded_run())
     plain, cut = read(path)[0], read(path, split_at_jumps=True, min_speed=1.0)[0]
     for a, b in zip(segments_of(plain), segments_of(cut), strict=True):
         np.testing.assert_array_equal(a, b)
@@ -74,15 +74,15 @@ def stop(columns):
     columns["yaw"][100:105] += np.asarray([3.0, -2.0, 1.5, np.nan, 2.0])
 
 
-def test_slow_rows_are_dropped_and_the_drive_is_cut_there(tmp_path):
-    columns = drive()
+def test_slow_rows_are_dropped_and_the_run_is_cut_there(tmp_path):
+    columns = recorded_run()
     stop(columns)
     path = write_csv(tmp_path / "a.csv", columns)
     assert "yaw is nan" in refusal(path)
     logged, lines = read(path, min_speed=0.5)
     assert (
-        f"warning: {path}, line 102: v is 0 m/s, dropped by dataset.min_speed=0.5; "
-        "the drive is cut there (5 rows like this)"
+        f"warning: {path}, line 102: v is 0 m/s (5 rows like this), "
+        "dropped by dataset.min_speed=0.5; the run is cut there"
     ) in lines
     states, controls, _ = segments_of(logged)
     assert len(states) == 9 + 19  # 100 rows are 9 segments, 196 are 19
@@ -101,28 +101,28 @@ def test_slow_rows_are_dropped_and_the_drive_is_cut_there(tmp_path):
         )
 
 
-def test_a_drive_that_is_slow_throughout_is_left_out(tmp_path):
-    slow = drive(phase=0.5) | {"v": np.full(301, 0.1)}
+def test_a_run_that_is_slow_throughout_is_left_out(tmp_path):
+    slow = recorded_run(phase=0.5) | {"v": np.full(301, 0.1)}
     write_csv(tmp_path / "slow.csv", slow)
-    write_csv(tmp_path / "fast.csv", drive())
+    write_csv(tmp_path / "fast.csv", recorded_run())
     logged, lines = read(tmp_path, min_speed=0.5)
     assert len(segments_of(logged)[0]) == 30
     assert any("(301 rows like this)" in line for line in lines)
 
 
-def test_both_parts_of_a_cut_drive_stay_in_one_part_of_the_data(tmp_path):
+def test_both_parts_of_a_cut_run_stay_in_one_part_of_the_data(tmp_path):
     """Neighbours in time resemble each other, whatever is between them."""
     for k in range(8):
-        columns = drive(seconds=10.0, phase=0.3 * k)
+        columns = recorded_run(seconds=10.0, phase=0.3 * k)
         columns["p_x"] = columns["p_x"] + 100.0 * (columns["t"] > 5.05)
         write_csv(tmp_path / f"{k}.csv", columns)
     logged, lines = read(tmp_path, split_at_jumps=True)
-    assert not any("too few drives" in line for line in lines)
-    assert sum(logged.dataset.drives.values()) == 8
+    assert not any("too few runs" in line for line in lines)
+    assert sum(logged.dataset.runs.values()) == 8
 
 
-def test_cut_drives_still_have_their_units_checked(tmp_path):
-    columns = drive()
+def test_cut_runs_still_have_their_units_checked(tmp_path):
+    columns = recorded_run()
     jump(columns)
     columns["v"] = 3.6 * columns["v"]
     path = write_csv(tmp_path / "a.csv", columns)

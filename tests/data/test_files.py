@@ -1,4 +1,4 @@
-"""Recorded drives are read without loss, and implausible ones are refused in one line
+"""Recorded runs are read without loss, and implausible ones are refused in one line
 with their row.
 """
 
@@ -9,10 +9,10 @@ import numpy as np
 import pyarrow
 import pytest
 from pyarrow import parquet
-from recorded import NAMES, STATE, drive, write_csv, write_npz
+from recorded import NAMES, STATE, recorded_run, write_csv, write_npz
 
 from sfkd_jax import data as datasets
-from sfkd_jax.data import Columns, _resampling
+from sfkd_jax.data import Columns
 
 DT, STEPS = 0.1, 10
 
@@ -43,7 +43,7 @@ def together(dataset):
 
 
 def expected(columns, steps=STEPS):
-    """The same drive cut by hand: positions from the segment's first."""
+    """The same run cut by hand: positions from the segment's first."""
     rows = [slice(k, k + steps + 1) for k in range(0, len(columns["t"]) - steps, steps)]
     states = np.stack(
         [np.column_stack([columns[name] for name in STATE])[row] for row in rows]
@@ -69,33 +69,29 @@ def same_segments(result, wanted):
     )
 
 
-@pytest.mark.parametrize("separator", [",", ";", "\t", " "])
-def test_a_drive_comes_back_from_csv_to_the_last_bit(tmp_path, separator):
-    columns = drive()
+@pytest.mark.parametrize("separator", [",", "\t", " "])
+def test_a_run_comes_back_from_csv_to_the_last_bit(tmp_path, separator):
+    columns = recorded_run()
     write_csv(tmp_path / "a.csv", columns, separator)
     assert same_segments(together(read(tmp_path)[0].dataset), expected(columns))
 
 
-def test_whole_drives_as_x_u_e_come_back_to_the_last_bit(tmp_path):
-    drives = [drive(seconds=1.0, phase=0.3 * k) for k in range(12)]
+def test_whole_runs_as_x_u_e_come_back_to_the_last_bit(tmp_path):
+    runs = [recorded_run(seconds=1.0, phase=0.3 * k) for k in range(12)]
     x, u, e = (
-        np.stack(
-            [np.column_stack([one[name] for name in names])[:end] for one in drives]
-        )
+        np.stack([np.column_stack([one[name] for name in names])[:end] for one in runs])
         for names, end in ((STATE, None), (NAMES[5:7], -1), (NAMES[7:], -1))
     )
     np.savez(tmp_path / "a.npz", x=x, u=u, e=e)
-    wanted = [
-        np.concatenate(parts) for parts in zip(*map(expected, drives), strict=True)
-    ]
+    wanted = [np.concatenate(parts) for parts in zip(*map(expected, runs), strict=True)]
     logged, lines = read(tmp_path / "a.npz")
     assert same_segments(together(logged.dataset), wanted)
-    assert not [line for line in lines if "too few drives" in line]
+    assert not [line for line in lines if "too few runs" in line]
 
 
 @pytest.mark.parametrize("kind", ["npz", "parquet"])
-def test_a_drive_comes_back_from_columns_to_the_last_bit(tmp_path, kind):
-    columns, path = drive(), tmp_path / f"a.{kind}"
+def test_a_run_comes_back_from_columns_to_the_last_bit(tmp_path, kind):
+    columns, path = recorded_run(), tmp_path / f"a.{kind}"
     if kind == "npz":
         write_npz(path, columns | {"camera": np.zeros((3, 4))})
     else:
@@ -112,52 +108,33 @@ def test_parquet_without_its_package_names_the_extra(tmp_path, monkeypatch):
 
 
 def test_other_names_are_mapped(tmp_path):
-    columns = drive()
-    names = dict(
-        zip(
-            NAMES,
-            (
-                "time",
-                "x",
-                "y",
-                "heading",
-                "speed",
-                "delta",
-                "throttle",
-                "mu",
-                "side wind",
-            ),
-            strict=True,
-        )
-    )
-    write_csv(
-        tmp_path / "a.csv", {names[name]: values for name, values in columns.items()}
-    )
+    columns = recorded_run()
     mapped = Columns(
         "time",
         ("x", "y", "heading", "speed"),
         ("delta", "throttle"),
         ("mu", "side wind"),
     )
+    names = [mapped.time, *mapped.state, *mapped.control, *mapped.environment]
+    renamed = dict(zip(names, columns.values(), strict=True))
+    write_csv(tmp_path / "a.csv", renamed)
     assert same_segments(together(read(tmp_path, mapped)[0].dataset), expected(columns))
 
 
-def test_a_column_tells_drives_in_one_file_apart(tmp_path):
-    drives = [drive(seconds=5.0, phase=0.3 * k) for k in range(8)]
-    joined = {name: np.concatenate([one[name] for one in drives]) for name in NAMES}
+def test_a_column_tells_runs_in_one_file_apart(tmp_path):
+    runs = [recorded_run(seconds=5.0, phase=0.3 * k) for k in range(8)]
+    joined = {name: np.concatenate([one[name] for one in runs]) for name in NAMES}
     labels = np.repeat(np.arange(8), 51)
     write_csv(tmp_path / "a.csv", joined | {"run": labels})
-    wanted = [
-        np.concatenate(parts) for parts in zip(*map(expected, drives), strict=True)
-    ]
+    wanted = [np.concatenate(parts) for parts in zip(*map(expected, runs), strict=True)]
     assert same_segments(
-        together(read(tmp_path, Columns(drive="run"))[0].dataset), wanted
+        together(read(tmp_path, Columns(run="run"))[0].dataset), wanted
     )
 
 
 def test_an_unknown_environment_becomes_a_constant(tmp_path):
     columns = {
-        name: values for name, values in drive().items() if name not in NAMES[7:]
+        name: values for name, values in recorded_run().items() if name not in NAMES[7:]
     }
     write_csv(tmp_path / "a.csv", columns)
     logged, _ = read(tmp_path, needs_environment=False)
@@ -167,12 +144,11 @@ def test_an_unknown_environment_becomes_a_constant(tmp_path):
     assert np.all(np.asarray(logged.dataset.env_high) >= 1e6)  # nothing can be outside
 
 
-@pytest.mark.parametrize("period", [0.01, 0.03, 0.04])
+@pytest.mark.parametrize("period", [0.01, 0.03])
 def test_resampling_interpolates_states_and_holds_controls(tmp_path, period):
-    recorded = drive(period=period)
-    recorded["yaw"] = (
-        np.mod(recorded["yaw"] + 3.0 + np.pi, 2 * np.pi) - np.pi
-    )  # wraps around at ±π
+    recorded = recorded_run(period=period)
+    # It wraps around at ±π.
+    recorded["yaw"] = np.mod(recorded["yaw"] + 3.0 + np.pi, 2 * np.pi) - np.pi
     turned = np.cos(3.0), np.sin(3.0)
     x, y = recorded["p_x"], recorded["p_y"]
     recorded |= {
@@ -190,30 +166,28 @@ def test_resampling_interpolates_states_and_holds_controls(tmp_path, period):
         np.sort(controls[..., 0].ravel()), np.sort(held.astype(np.float32))
     )
     steps = np.diff(states[..., 2], axis=1)
-    assert (
-        np.abs(steps).max() < 0.37 * DT
-    )  # |d yaw / dt| ≤ 0.36: no turn by 2π between two moments
+    # |d yaw / dt| ≤ 0.36: no turn by 2π between two moments
+    assert np.abs(steps).max() < 0.37 * DT
 
 
-def test_a_gap_splits_a_drive_and_nothing_is_invented_in_it(tmp_path):
-    columns = drive()
+def test_a_gap_splits_a_run_and_nothing_is_invented_in_it(tmp_path):
+    columns = recorded_run()
     saved = (columns["t"] <= 10.0 + 1e-9) | (columns["t"] >= 20.0 - 1e-9)
     path = write_csv(
         tmp_path / "a.csv", {name: values[saved] for name, values in columns.items()}
     )
     logged, lines = read(path)
     assert (
-        f"warning: {path}, line 103: 10 s without rows; drives are split there" in lines
+        f"warning: {path}, line 103: 10 s without rows; runs are split there" in lines
     )
     states = together(logged.dataset)[0]
     assert len(states) == 20
-    assert (
-        np.linalg.norm(np.diff(states[..., :2], axis=1), axis=-1).max() < 0.61
-    )  # v ≤ 6 m/s
+    moved = np.linalg.norm(np.diff(states[..., :2], axis=1), axis=-1)
+    assert moved.max() < 0.61  # v ≤ 6 m/s
 
 
 def test_moments_of_a_clock_and_places_on_earth_lose_no_digits(tmp_path):
-    columns = drive()
+    columns = recorded_run()
     here = expected(columns)
     moved = columns | {
         "t": columns["t"] + 1.7e9,
@@ -256,7 +230,7 @@ WRONG = {
     "infinite": (change("steering", 100, np.inf), ", line 102: steering is inf"),
     "time back": (
         change("t", 50, 4.8),
-        ", line 52: t goes back from 4.9 to 4.8; two drives in one file? dataset.columns.drive",
+        ", line 52: t goes back from 4.9 to 4.8; two runs in one file? dataset.columns.run",
     ),
     "time twice": (change("t", 50, 4.9), ", line 52: t repeats 4.9"),
     "degrees": (
@@ -300,7 +274,7 @@ WRONG = {
     ),
     "short": (
         lambda c: c.update({n: c[n][:8] for n in NAMES}),
-        "the longest drive without a gap has 7 steps, a segment 10",
+        "the longest run without a gap has 7 steps, a segment 10",
     ),
     "few": (
         lambda c: c.update({n: c[n][:21] for n in NAMES}),
@@ -308,11 +282,11 @@ WRONG = {
     ),
     "missing": (
         lambda c: c.pop("yaw"),
-        "no column yaw among t, p_x, p_y, v, steering, acceleration, friction, wind; map it",
+        "no column yaw among t, p_x, p_y, v, steering, acceleration, friction, wind; map it with dataset.columns.state",
     ),
     "missing e": (
         lambda c: c.pop("wind"),
-        "no column wind for the environment; pass environment.source=none, or map",
+        "no column wind among t, p_x, p_y, yaw, v, steering, acceleration, friction; map it with dataset.columns.environment, or pass environment.source=none",
     ),
 }
 
@@ -320,7 +294,7 @@ WRONG = {
 @pytest.mark.parametrize("kind", WRONG)
 def test_what_cannot_be_right_is_one_line_with_its_place(tmp_path, kind):
     spoil, message = WRONG[kind]
-    columns = drive()
+    columns = recorded_run()
     spoil(columns)
     line = refusal(write_csv(tmp_path / "a.csv", columns))
     assert message in line
@@ -377,8 +351,8 @@ RECORDERS = {
 
 
 @pytest.mark.parametrize("kind", RECORDERS)
-def test_a_drive_comes_back_from_what_recorders_write(tmp_path, kind):
-    columns = drive()
+def test_a_run_comes_back_from_what_recorders_write(tmp_path, kind):
+    columns = recorded_run()
     text = (tmp_path / "a.csv", write_csv(tmp_path / "a.csv", columns))[0].read_text()
     (tmp_path / "a.csv").write_bytes(RECORDERS[kind](text))
     yaw = "yaw_°" if kind == "Windows-1252" else "yaw"
@@ -401,15 +375,15 @@ ARRAYS = {
     "shapes": ({"t": np.zeros(3), "p_x": np.zeros(4)}, "p_x has shape (4,), t (3,)"),
     "x alone": (
         {"x": np.zeros((2, 5, 4)), "u": np.zeros((2, 5, 2)), "e": np.zeros((2, 4, 2))},
-        "u has shape (2, 5, 2), expected (2, 4, 2)",
+        "u must be numbers of shape (2, 4, 2), got float64 (2, 5, 2)",
     ),
     "states": (
         {"x": np.zeros((2, 5, 3)), "u": np.zeros((2, 4, 2)), "e": np.zeros((2, 4, 2))},
-        "x has shape (2, 5, 3), expected (2, 5, 4)",
+        "x must be numbers of shape (2, 5, 4), got float64 (2, 5, 3)",
     ),
     "no e": (
         {"x": np.zeros((2, 5, 4)), "u": np.zeros((2, 4, 2))},
-        "no column e for the environment; pass environment.source=none",
+        "or pass environment.source=none",
     ),
 }
 
@@ -422,7 +396,7 @@ def test_a_malformed_npz_is_one_line(tmp_path, kind):
 
 def test_every_refused_file_is_reported(tmp_path):
     for name, row in (("a", 3), ("b", 8)):
-        columns = drive(phase=row)
+        columns = recorded_run(phase=row)
         change("yaw", row, np.nan)(columns)
         write_csv(tmp_path / f"{name}.csv", columns)
     lines = []
@@ -448,21 +422,21 @@ def test_a_path_that_means_no_logs_is_refused(tmp_path, monkeypatch, path, messa
     assert message in refusal(path)
 
 
-def test_the_same_drive_twice_is_refused(tmp_path):
+def test_the_same_run_twice_is_refused(tmp_path):
     for name in "ab":
-        write_csv(tmp_path / f"{name}.csv", drive())
+        write_csv(tmp_path / f"{name}.csv", recorded_run())
     assert "b.csv: the same contents as" in refusal(tmp_path)
 
 
 def test_contents_decide_which_data_set_it_is(tmp_path):
     for folder in ("here", "there"):
         (tmp_path / folder).mkdir()
-    write_csv(tmp_path / "here" / "a.csv", drive())
-    write_csv(tmp_path / "there" / "renamed.csv", drive())
+    write_csv(tmp_path / "here" / "a.csv", recorded_run())
+    write_csv(tmp_path / "there" / "renamed.csv", recorded_run())
     first, moved = (
         datasets.fingerprint(str(tmp_path / folder)) for folder in ("here", "there")
     )
-    write_csv(tmp_path / "here" / "a.csv", drive(phase=0.1))
+    write_csv(tmp_path / "here" / "a.csv", recorded_run(phase=0.1))
     assert first == moved != datasets.fingerprint(str(tmp_path / "here"))
 
 
@@ -482,7 +456,7 @@ def test_contents_decide_which_data_set_it_is(tmp_path):
     ],
 )
 def test_invalid_columns_are_refused(tmp_path, columns, message):
-    assert message in refusal(write_csv(tmp_path / "a.csv", drive()), columns)
+    assert message in refusal(write_csv(tmp_path / "a.csv", recorded_run()), columns)
 
 
 @pytest.mark.parametrize(
@@ -499,12 +473,12 @@ def test_invalid_columns_are_refused(tmp_path, columns, message):
         (
             scale("t", lambda t: t),
             {"limits": ((-0.1, -1.0), (0.1, 1.0))},
-            "outside -0.1 to 0.1 of vehicle.control_low",
+            "outside the range from -0.1 to 0.1 of vehicle.control_low",
         ),
     ],
 )
 def test_oddities_are_warned_of(tmp_path, spoil, options, message):
-    columns = drive()
+    columns = recorded_run()
     spoil(columns)
     _, lines = read(write_csv(tmp_path / "a.csv", columns), **options)
     assert any(
@@ -513,7 +487,7 @@ def test_oddities_are_warned_of(tmp_path, spoil, options, message):
 
 
 def test_the_box_of_environments_is_what_logs_reach_or_what_is_asked(tmp_path):
-    columns = drive()
+    columns = recorded_run()
     path = write_csv(tmp_path / "a.csv", columns)
     result = read(path)[0].dataset
     envs = together(result)[2]
@@ -526,39 +500,3 @@ def test_the_box_of_environments_is_what_logs_reach_or_what_is_asked(tmp_path):
     assert line.startswith(f"{path}, line {first + 2}: wind is ")
     assert "must be 2 numbers each" in refusal(path, env_low=(0.3,), env_high=(0.9,))
     assert "must be 2 numbers each" in refusal(path, env_low=(0.3, -8.0))
-
-
-def assign(drives, shares=(0.6, 0.1, 0.2, 0.1), seed=0):
-    return _resampling.assign_parts(np.asarray(drives), shares=shares, seed=seed)
-
-
-@pytest.mark.parametrize("drives", [20, 50, 200])
-def test_drives_are_assigned_whole_where_there_are_enough(drives):
-    labels = np.repeat(np.arange(drives), 7)
-    assigned = assign(labels)
-    assert assigned.whole
-    assert all(
-        len(set(assigned.parts[labels == drive])) == 1 for drive in range(drives)
-    )
-    shares = np.bincount(assigned.parts) / len(labels)
-    assert np.all(np.abs(shares - [0.6, 0.1, 0.2, 0.1]) <= 1.0 / drives + 1e-9)
-
-
-@pytest.mark.parametrize("sizes", [(40,), (20, 20), (100, 1, 1, 1, 1, 1)])
-def test_too_few_drives_are_cut_in_time(sizes):
-    assigned = assign(np.repeat(np.arange(len(sizes)), sizes))
-    assert not assigned.whole
-    first = assigned.parts[: sizes[0]]
-    assert np.all(np.diff(first) >= 0)
-    np.testing.assert_allclose(
-        np.bincount(first) / sizes[0], [0.6, 0.1, 0.2, 0.1], atol=1.0 / sizes[0]
-    )
-
-
-def test_coverage_counts_the_tenths_that_were_visited():
-    values = np.concatenate([np.linspace(0.0, 0.499, 999), [1.0]])
-    covered = datasets.coverage({"v": values, "still": np.zeros(5)})
-    assert covered["v"]["low"] == 0.0
-    assert covered["v"]["high"] == 1.0
-    assert covered["v"]["bins_visited"] == 0.6
-    assert covered["still"]["bins_visited"] == 0.0

@@ -2,11 +2,11 @@
 
 import numpy as np
 import pytest
-from recorded import drive, write_csv, write_npz
+from recorded import recorded_run, write_csv, write_npz
+from test_files import read
 
-from sfkd_jax import data as datasets
 from sfkd_jax.data import Columns
-from sfkd_jax.data._units import find_column, find_unit, split_unit
+from sfkd_jax.data._tables import find_column, find_unit, split_unit
 
 WITH_UNITS = {
     "t": ("t (ms)", 1e3),
@@ -21,12 +21,6 @@ WITH_UNITS = {
 }
 
 
-def read(path, columns=None):
-    lines = []
-    options = {"dt": 0.1, "wheelbase": 2.7, "steps": 10, "report": lines.append}
-    return datasets.from_logs(str(path), columns or Columns(), **options), lines
-
-
 def values(logged):
     part = logged.dataset.train
     return [np.asarray(leaf) for leaf in part]
@@ -39,8 +33,10 @@ def with_units(columns):
 @pytest.mark.parametrize("write", [write_csv, write_npz])
 def test_units_in_column_names_are_converted_and_reported(tmp_path, write):
     suffix = "csv" if write is write_csv else "npz"
-    plain, _ = read(write(tmp_path / f"plain.{suffix}", drive()))
-    logged, lines = read(write(tmp_path / f"units.{suffix}", with_units(drive())))
+    plain, _ = read(write(tmp_path / f"plain.{suffix}", recorded_run()))
+    logged, lines = read(
+        write(tmp_path / f"units.{suffix}", with_units(recorded_run()))
+    )
     for given, expected in zip(values(logged), values(plain), strict=True):
         np.testing.assert_allclose(given, expected, rtol=1e-5, atol=1e-5)
     (line,) = (line for line in lines if line.startswith("converted"))
@@ -52,26 +48,8 @@ def test_units_in_column_names_are_converted_and_reported(tmp_path, write):
     )
 
 
-def test_si_units_change_no_bit(tmp_path):
-    columns = drive()
-    named = {f"{name}({'s' if name == 't' else '-'})": a for name, a in columns.items()}
-    named = {
-        n.replace("p_x(-)", "p_x(m)").replace("p_y(-)", "p_y (m)"): a
-        for n, a in named.items()
-    }
-    named = {
-        n.replace("yaw(-)", "yaw[rad]").replace("v(-)", "v [m/s]"): a
-        for n, a in named.items()
-    }
-    plain, _ = read(write_csv(tmp_path / "plain.csv", columns))
-    logged, lines = read(write_csv(tmp_path / "units.csv", named))
-    for given, expected in zip(values(logged), values(plain), strict=True):
-        np.testing.assert_array_equal(given, expected)
-    assert not any(line.startswith("converted") for line in lines)
-
-
 def test_a_name_in_full_is_read_as_it_is_or_converted_if_its_unit_is_known(tmp_path):
-    columns = drive()
+    columns = recorded_run()
     columns["friction (estimate)"] = columns.pop("friction")
     columns["v [km/h]"] = 3.6 * columns.pop("v")
     names = Columns(
@@ -98,7 +76,7 @@ def test_a_name_in_full_is_read_as_it_is_or_converted_if_its_unit_is_known(tmp_p
     ],
 )
 def test_other_units_are_one_line(tmp_path, changes, message):
-    columns = {changes.get(name, name): a for name, a in drive().items()}
+    columns = {changes.get(name, name): a for name, a in recorded_run().items()}
     path = write_csv(tmp_path / "a.csv", columns)
     with pytest.raises(ValueError, match=r"^[^\n]*$") as refusal:
         read(path)
@@ -106,7 +84,7 @@ def test_other_units_are_one_line(tmp_path, changes, message):
 
 
 def test_two_columns_that_fit_are_refused(tmp_path):
-    columns = drive()
+    columns = recorded_run()
     columns["v (m/s)"] = columns["v [km/h]"] = columns.pop("v")
     with pytest.raises(ValueError, match="both fit v; configure one in full"):
         read(write_csv(tmp_path / "a.csv", columns))
@@ -124,8 +102,8 @@ def test_the_exact_name_comes_first():
         ("speed [km/h] ", ("speed", "km/h")),
         ("a  ( m/s^2 )", ("a", "m/s^2")),
         ("f()", ("f", "")),
-        ("plain", None),
-        ("(m)", None),
+        ("plain", ("plain", None)),
+        ("(m)", ("(m)", None)),
     ],
 )
 def test_units_are_split_from_names(header, parts):
@@ -161,9 +139,7 @@ def test_units_are_split_from_names(header, parts):
 )
 def test_units_have_their_dimension_and_factor(symbols, dimension, factor):
     for symbol in symbols.split():
-        unit = find_unit(symbol)
-        assert unit.dimension == dimension
-        assert unit.factor == pytest.approx(factor, rel=1e-12)
+        assert find_unit(symbol) == (dimension, pytest.approx(factor, rel=1e-12))
 
 
 @pytest.mark.parametrize("symbol", ["", "estimate", "mu", "9**9**9", "x(", "degC", "2"])

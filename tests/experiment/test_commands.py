@@ -64,7 +64,7 @@ def test_the_certificate_is_about_the_saved_weights(smoke):
     assert certificate["valid"]
     assert certificate["weights_sha256"] == manifest["sha256"]
     assert len(certificate["tube"]["latent"]) == 20
-    assert set(certificate["d_bar"]["by_scenario"]) == {"s1", "s2", "s3"}
+    assert set(certificate["d_bar"]["by_scenario"]) == {"uniform", "wet", "s3"}
     assert 1.0 <= certificate["tightness"] <= 1.1
 
 

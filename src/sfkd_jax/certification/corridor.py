@@ -28,11 +28,12 @@ from sfkd_jax.certification._tubes import (
     run_scores,
 )
 from sfkd_jax.control import PathLaw, safety_filter
-from sfkd_jax.data import drive_switching, generate_s3_along_path
+from sfkd_jax.data import drive_along_path, from_s3
 from sfkd_jax.geometry import LATERAL, PERTURBATION, path_state
 from sfkd_jax.plants import Vehicle, along_path
 from sfkd_jax.ranges import Interval, Span
 from sfkd_jax.rollout import fold, in_batches, rollout
+from sfkd_jax.scenarios import random_switching
 from sfkd_jax.types import (
     BODY,
     Control,
@@ -153,16 +154,21 @@ def certify_corridor(
     *run_keys, sensor_key, attack_key = jax.random.split(
         jax.random.fold_in(jax.random.key(data["seed"]), STREAM), 6
     )
-    options = excited | {
-        "steps": round(duration / loop.plant.dt),
-        "sensors": partial(_sensor_effect, loop),
-        "offset": (0.0, 0.0, 0.0),
-        "burn_in": 0,
-    }
+    sensors = partial(_sensor_effect, loop)
+    options = excited | {"sensors": sensors, "offset": (0.0, 0.0, 0.0), "burn_in": 0}
+    steps, dt = round(duration / loop.plant.dt), loop.plant.dt
+    low, high = box.values()
     switching = partial(
-        drive_switching, loop.plant, drives=runs, dwell=dwell, **box, **options
+        random_switching, steps=steps, dt=dt, low=low, high=high, dwell=dwell
     )
-    unseen = partial(generate_s3_along_path, loop.plant, segments=runs, **options)
+
+    def drive(conditions: Callable[[Key], Array], key: Key) -> Trajectory:
+        env_key, run_key = jax.random.split(key)
+        envs = jax.vmap(conditions)(jax.random.split(env_key, runs))
+        return drive_along_path(loop.plant, envs, run_key, **options)
+
+    unseen = partial(drive, from_s3(steps, dt))
+    switching = partial(drive, switching)
     kinds = (switching, switching, switching, unseen)
     simulate = jax.jit(partial(_simulate_nominal, loop))
     measured = [

@@ -1,15 +1,21 @@
-"""Check recorded drives row by row, and cut them where they jump or stand."""
+"""Check recorded runs row by row and against their motion; cut them where asked."""
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+import math
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
 from typing import NamedTuple, TypeAlias
 
 import numpy as np
-from jaxtyping import Bool, Float
+from jaxtyping import Bool, Float, Int
 
 from sfkd_jax.data._logs import Columns, Log
 
+Bounds: TypeAlias = tuple[tuple[float, ...] | None, tuple[float, ...] | None]
+"""Lowest and highest of every channel, or None where there is no bound."""
+SHORTEST = 3
+"""Rows that a run needs to be checked at all."""
 SLOWER = 1.2
 """A log whose period is this many times the model's is refused: rows between its own
 would be invented.
@@ -20,6 +26,28 @@ STALE = 0.2
 """Share of driving rows that repeat the position of the row before, from which
 positions count as stale.
 """
+ROUNDED = 1e-5
+"""How far outside its range a channel may be: float32 rounds."""
+LOOK = 0.5
+"""Length of the chords over which motion is compared with the columns [s]."""
+AGREE = (0.8, 1.25)
+"""Path length over integrated speed of a plausible log."""
+DEGREES = 9e-6
+"""Degrees of latitude in a metre."""
+FACTORS = (
+    (1 / 3.6, "the speed is probably in km/h"),
+    (0.44704, "the speed is probably in miles per hour"),
+    (0.3048, "the speed is probably in feet per second"),
+    (3.28084, "positions are probably in feet"),
+    (1e2, "positions are probably in cm"),
+    (1e3, "positions are probably in mm"),
+    (1e-3, "time is probably in ms, or positions in km"),
+    (1e-6, "time is probably in µs"),
+    (1e-9, "time is probably in ns"),
+    (DEGREES, "positions are probably degrees of latitude and longitude"),
+    (57.29578, "the speed is probably an angular rate, or columns changed places"),
+)
+CUT_THERE = "; the run is cut there"
 
 
 class Finding(NamedTuple):
@@ -29,227 +57,438 @@ class Finding(NamedTuple):
     refused: bool = True
 
 
-class Motion(NamedTuple):
-    """A drive step by step.
+def _warning(line: str) -> Finding:
+    """A line for which the log is not refused."""
+    return Finding(line, refused=False)
+
+
+class Chords(NamedTuple):
+    """Chords of a run over about `LOOK`, where it moves.
 
     Attributes:
-        waits: time between rows [s].
-        period: median of it [s].
-        gaps: whether a wait is longer than what is bridged.
-        moved: distance between positions [m].
-        integrated: distance by the speed [m].
+        length: of the chord [m].
+        integrated: ∫ v dt [m].
+        course: direction of the chord, reversed where v < 0 [rad].
+        middle: index of the row in the middle.
     """
 
-    waits: Float[np.ndarray, " step"]
-    period: float
-    gaps: Bool[np.ndarray, " step"]
-    moved: Float[np.ndarray, " step"]
-    integrated: Float[np.ndarray, " step"]
+    length: Float[np.ndarray, " chord"]
+    integrated: Float[np.ndarray, " chord"]
+    course: Float[np.ndarray, " chord"]
+    middle: Int[np.ndarray, " chord"]
 
 
-CUT_THERE = "; the drive is cut there"
-Jumps: TypeAlias = tuple[Bool[np.ndarray, " step"], str]
-"""The steps that jump, and a line about the first of them."""
-Cut: TypeAlias = tuple[Log, list[Finding]]
-"""A drive after cutting, and a line about every kind of cut."""
+@dataclass(frozen=True)
+class Checks:
+    """What recorded runs are checked against: the arguments of `from_logs`."""
 
+    columns: Columns
+    dt: float
+    steps: int
+    wheelbase: float
+    gap: float
+    min_speed: float
+    split_at_jumps: bool
+    limits: Bounds
+    box: Bounds
 
-def channels(log: Log, columns: Columns) -> dict[str, Float[np.ndarray, " time"]]:
-    """Return every column of a drive by its name, less an unknown environment."""
-    groups = {
-        "state": log.states,
-        "control": log.controls,
-        "environment": log.envs,
-    }
-    named = {columns.time: log.time}
-    for setting, values in groups.items():
-        names = getattr(columns, setting)
-        if len(names) == values.shape[1]:
-            named |= dict(zip(names, values.T, strict=True))
-    return named
+    def apply(self, logs: list[Log]) -> tuple[list[Log], list[Finding]]:
+        """Return the runs that can be used, after cutting, and all findings."""
+        sound: list[Log] = []
+        findings: list[Finding] = []
+        for recorded in logs:
+            log, found = self._one(recorded)
+            findings += found
+            if not any(one.refused for one in found) and _has_rows(log):
+                sound.append(log)
+        if sound:
+            findings += self._steering(sound)
+            findings += self._ranges(sound)
+        return sound, findings
 
+    def _one(self, log: Log) -> tuple[Log, list[Finding]]:
+        """A run after cutting, and the findings about it alone."""
+        log, found = self._drop_slow_rows(log)
+        wrong: list[Finding] = []
+        for name, values in log.channels(self.columns).items():
+            bad = ~np.isfinite(values) | (np.abs(values) > LARGEST)
+            wrong += _first(log, bad, lambda k, n=name, v=values: f"{n} is {v[k]}")
+        # A NaN jumps nowhere: it must be refused, not cut out.
+        if self.split_at_jumps and not wrong:
+            log, cuts = self._cut_at_jumps(log)
+            found += cuts
+        several = "; two runs in one file? dataset.columns.run, dataset.split_at_jumps"
+        wrong += self._time(log, several)
+        found += wrong
+        if wrong or not len(log.time):
+            return log, found
+        edges = np.flatnonzero(~log.joined) + 1
+        longest = max(float(np.ptp(part)) for part in np.split(log.time, edges))
+        if longest < (self.steps - 1e-3) * self.dt:
+            needed = f"a segment is {self.steps * self.dt:.4g} s; not used"
+            found.append(_warning(f"{log.whole}: only {longest:.4g} s, {needed}"))
+        if not _has_rows(log):
+            return log, found
+        found += (units := list(self._units(log)))
+        # Wrong units make every step look like a jump.
+        if not any(one.refused for one in units):
+            found += self._sampling(log)
+            found += self._motion(log)
+        return log, found
 
-def motion(log: Log, *, dt: float, gap: float) -> Motion:
-    """Measure the steps of a drive; steps across a cut count neither way.
+    def _drop_slow_rows(self, log: Log) -> tuple[Log, list[Finding]]:
+        """Drop rows slower than `min_speed` and cut the run there."""
+        speed, name = log.states[:, 3], self.columns.state[3]
+        slow, why = np.abs(speed) < self.min_speed, f"={self.min_speed:g}{CUT_THERE}"
+        found = _first(
+            log,
+            slow,
+            lambda k: f"{name} is {speed[k]:.3g} m/s",
+            hint=f", dropped by dataset.min_speed{why}",
+            refused=False,
+        )
+        return log.select(~slow), list(found)
 
-    Args:
-        log: at least two joined rows, all finite.
-        dt: of the model [s].
-        gap: the longest wait that is bridged, in periods: of the log or dt, whichever
-            is longer.
-    """
-    waits = np.diff(log.time)
-    period = float(np.median(waits[log.joined]))
-    moved = np.linalg.norm(np.diff(log.states[:, :2], axis=0), axis=1)
-    speed = np.abs(log.states[:, 3])
-    integrated = 0.5 * (speed[1:] + speed[:-1]) * waits
-    gaps = waits > gap * max(period, dt)
-    return Motion(waits, period, gaps & log.joined, moved, integrated)
+    def _cut_at_jumps(self, log: Log) -> tuple[Log, list[Finding]]:
+        """Cut a run where time goes back and where position or yaw jump.
 
+        Stale positions jump at every update: such a run is left as it is.
+        """
+        found = list(self._time(log, CUT_THERE, refused=False))
+        log = log.cut(_backwards(log))
+        if not log.joined.any() or _stale(log).any():
+            return log, found
+        for find in (self._position_jumps, self._yaw_jumps):
+            if not log.joined.any():  # the cuts have left single rows
+                break
+            jumps, text = find(log)
+            found += _first(log, jumps, text, hint=CUT_THERE, refused=False)
+            log = log.cut(jumps)
+        return log, found
 
-def check_finite(log: Log, columns: Columns) -> Iterator[Finding]:
-    """Refuse numbers that are not finite in float32."""
-    for name, values in channels(log, columns).items():
-        bad = ~np.isfinite(values) | (np.abs(values) > LARGEST)
-        if bad.any():
+    def _time(self, log: Log, hint: str, *, refused: bool = True) -> Iterator[Finding]:
+        """Time that repeats or goes back."""
+
+        def text(k: int) -> str:
+            before, after = log.time[k], log.time[k + 1]
+            if before == after:
+                return f"{self.columns.time} repeats {after:.12g}"
+            return f"{self.columns.time} goes back from {before:.12g} to {after:.12g}"
+
+        return _first(log, _backwards(log), text, hint=hint, refused=refused)
+
+    def _sampling(self, log: Log) -> Iterator[Finding]:
+        """Slow sampling, which is refused, gaps and uneven sampling."""
+        waits, period, gaps = log.waits, log.period, log.gaps(self.gap, self.dt)
+        if period > SLOWER * self.dt:
             yield Finding(
-                f"{_first(log, bad)}: {name} is {values[bad.argmax()]}{more(bad)}"
+                f"{log.whole}: recorded every {period:.4g} s, slower than "
+                f"vehicle.dt={self.dt:g}; pass vehicle.dt={period:.2g}"
+            )
+        yield from _first(
+            log,
+            gaps,
+            lambda k: f"{waits[k]:.4g} s without rows; runs are split there",
+            refused=False,
+        )
+        # A few uneven steps are usual; a gap has been reported already.
+        uneven = (np.abs(waits - period) > 0.5 * period) & ~gaps & log.joined
+        if uneven.mean() > 0.1:
+            yield from _first(
+                log,
+                uneven,
+                lambda k: f"uneven sampling, {waits[k]:.4g} s after the row before",
+                refused=False,
             )
 
+    def _motion(self, log: Log) -> Iterator[Finding]:
+        """Stale positions, else jumps of position and yaw."""
+        if (stale := _stale(log)).any():
+            speed, advice = log.states[1:, 3], "; log positions as often as "
+            yield from _first(
+                log,
+                stale,
+                lambda k: f"the position of the row before at {speed[k]:.3g} m/s",
+                hint=f"{advice}{self.columns.time}, or leave rows out",
+            )
+            return
+        for find in (self._position_jumps, self._yaw_jumps):
+            yield from _first(log, *find(log))
 
-def check_time(log: Log, columns: Columns) -> Iterator[Finding]:
-    """Refuse time that does not increase."""
-    if (back := backwards(log)).any():
-        yield Finding(
-            f"{describe_backwards(log, columns, back)}; "
-            "two drives in one file? dataset.columns.drive, dataset.split_at_jumps"
+    def _position_jumps(
+        self, log: Log
+    ) -> tuple[Bool[np.ndarray, " step"], Callable[[int], str]]:
+        """Steps much longer than the speed explains."""
+        excess = log.moved - log.integrated
+        # By the median: the jumps themselves must not widen what is usual.
+        spread = 1.4826 * np.median(np.abs(excess)[log.joined])
+        jumps = excess > log.integrated + 15.0 * spread + 1e-6
+        x, y = self.columns.state[:2]
+        return (
+            jumps & ~log.gaps(self.gap, self.dt) & log.joined,
+            lambda k: (
+                f"{x}, {y} jump {log.moved[k]:.3g} m at {log.states[k, 3]:.3g} m/s"
+            ),
         )
 
+    def _yaw_jumps(
+        self, log: Log
+    ) -> tuple[Bool[np.ndarray, " step"], Callable[[int], str]]:
+        """Steps that turn much more than the others, between rows near in time."""
+        turned = np.abs(np.diff(np.unwrap(log.states[:, 2])))
+        # Small robots turn fast: only what stands out of their own turns is a jump.
+        jumps = turned > max(1.0, 10.0 * float(np.median(turned[log.joined])))
+        return (
+            jumps & ~log.gaps(self.gap, self.dt) & log.joined,
+            lambda k: f"{self.columns.state[2]} jumps by {turned[k]:.3g} rad",
+        )
 
-def backwards(log: Log) -> Bool[np.ndarray, " step"]:
-    """Return the steps at which time repeats or goes back."""
-    return (np.diff(log.time) <= 0) & log.joined
+    def _units(self, log: Log) -> Iterator[Finding]:
+        """The speed against positions, then yaw against the direction of travel."""
+        speed, chords = self.columns.state[3], _chords(log, log.states[:, 3])
+        moved, integrated = chords.length.sum(), np.abs(chords.integrated).sum()
+        if moved == 0.0 and integrated == 0.0:
+            yield _warning(f"{log.whole}: neither position nor {speed} ever moves")
+        elif moved == 0.0 or integrated == 0.0:
+            names = ("the position", speed)
+            still, goes = names if moved == 0.0 else names[::-1]
+            yield Finding(
+                f"{log.whole}: {still} stands still while {goes} moves; "
+                "have columns changed places?"
+            )
+        elif not AGREE[0] <= (ratio := moved / integrated) <= AGREE[1]:
+            yield Finding(
+                f"{log.whole}: positions move {ratio:.3g} times as fast as "
+                f"{speed}; {self._cause(log, ratio)}"
+            )
+        else:
+            yield from self._heading(log, chords)
+
+    def _cause(self, log: Log, ratio: float) -> str:
+        """A unit that explains a factor, else a column that fits as the speed."""
+        nearest, text = min(FACTORS, key=lambda one: abs(math.log(ratio / one[0])))
+        # A degree of longitude is shorter than one of latitude.
+        tolerance = 0.5 if nearest == DEGREES else 0.1
+        if abs(math.log(ratio / nearest)) < tolerance:
+            return text
+        for name, values in log.channels(self.columns).items():
+            chords = _chords(log, values)
+            integrated = np.abs(chords.integrated).sum()
+            if (
+                name not in (self.columns.time, *self.columns.state[:2])
+                and 0.9 * integrated <= chords.length.sum() <= 1.1 * integrated
+            ):
+                return f"{name} fits as the speed: have columns changed places?"
+        return "wrong units, or columns changed places?"
+
+    def _heading(self, log: Log, chords: Chords) -> Iterator[Finding]:
+        """Yaw against the direction of travel, with a likely cause."""
+        x, y, name, speed = self.columns.state[:4]
+        yaw = log.states[chords.middle, 2]
+        agreed = _agreement(chords.course - yaw)
+        if abs(agreed) > 0.7 and abs(np.angle(agreed)) < 0.5:
+            return
+        compass = f"{name} is probably a compass heading"
+        # What yaw may be instead, and the yaw that follows.
+        readings = {
+            f"{name} is probably in degrees": np.deg2rad(yaw),
+            f"{name} probably counts clockwise": -yaw,
+            f"{compass} (from north, clockwise), or {x} and {y} changed places": (
+                0.5 * np.pi - yaw
+            ),
+            f"{compass} in degrees": 0.5 * np.pi - np.deg2rad(yaw),
+            f"{name} probably counts from the y axis": yaw + 0.5 * np.pi,
+            f"{speed} is probably of the wrong sign, or the robot drives backwards": (
+                yaw + np.pi
+            ),
+        }
+        # A mean over the whole run: single wrong rows change no reading.
+        fits = {
+            text: _agreement(chords.course - read).real
+            for text, read in readings.items()
+        }
+        best = max(fits, key=lambda text: fits[text])
+        off = f"{log.whole}: {name} and the direction of travel differ"
+        if fits[best] > 0.9:
+            yield Finding(f"{off}; {best}")
+        elif abs(agreed) > 0.7:
+            yield _warning(
+                f"{off} by {np.angle(agreed):.2f} rad throughout; "
+                "is the sensor mounted askew?"
+            )
+        else:
+            yield _warning(
+                f"{off} at random; a robot that drives sideways, "
+                "or columns that changed places?"
+            )
+
+    def _steering(self, logs: list[Log]) -> Iterator[Finding]:
+        """Yaw rates against a bicycle's, ω = v tan δ / L: sign, unit and L."""
+        expected, turned = (
+            np.concatenate(parts) for parts in zip(*map(_turns, logs), strict=True)
+        )
+        power = float(np.sqrt(np.mean(expected**2) * np.mean(turned**2)))
+        alike = float(np.mean(expected * turned)) / power if power else 0.0
+        # Not a steering angle, or too little steering to tell.
+        if abs(alike) < 0.6:
+            return
+        fits = float(np.mean(expected**2) / np.mean(expected * turned))
+        name, where = self.columns.control[0], _span(logs)
+        if alike < 0:
+            yield _warning(
+                f"{where}: the robot turns against {name}; "
+                "a positive one should turn it left"
+            )
+        elif not 0.6 < fits / self.wheelbase < 1.7:
+            unit = f" or {name} is not in rad" if fits > 10 * self.wheelbase else ""
+            yield _warning(
+                f"{where}: {name} and yaw suggest a wheelbase of {fits:.3g} m, "
+                f"vehicle.wheelbase is {self.wheelbase:g}{unit}"
+            )
+
+    def _ranges(self, logs: list[Log]) -> Iterator[Finding]:
+        """Controls that hardly vary or leave their limits; environments outside E."""
+        where, columns = _span(logs), self.columns
+        for k, name in enumerate(columns.control):
+            values = np.concatenate([log.controls[:, k] for log in logs])
+            kinds = len(np.unique(values))
+            if np.ptp(values) <= 1e-9 * max(1.0, float(np.abs(values).max())):
+                yield Finding(
+                    f"{where}: {name} is always {values[0]:.4g}; "
+                    "without excitation nothing can be learned of it"
+                )
+            elif kinds < 5:
+                yield _warning(
+                    f"{where}: {name} takes only {kinds} values; vary it more"
+                )
+        low, high = self.limits
+        if low and high:
+            found = _outside(logs, "controls", columns.control, low, high)
+            limits = "of vehicle.control_low and vehicle.control_high"
+            yield from (_warning(f"{line} {limits}") for line in found)
+        low, high = self.box
+        if low is None and high is None:
+            return
+        size = logs[0].envs.shape[1]
+        low, high = low or (), high or ()
+        if {len(low), len(high)} != {size} or np.any(np.greater(low, high)):
+            yield Finding(
+                f"environment.low and environment.high must be {size} numbers each, "
+                "the low ones not above the high"
+            )
+            return
+        names = columns.environment
+        names = names if len(names) == size else ("environment",) * size
+        found = _outside(logs, "envs", names, low, high)
+        box = "of environment.low and environment.high"
+        yield from (Finding(f"{line} {box}") for line in found)
 
 
-def describe_backwards(
-    log: Log, columns: Columns, back: Bool[np.ndarray, " step"]
-) -> str:
-    """Describe the first of such steps."""
-    k = int(back.argmax())
-    before, after = log.time[k], log.time[k + 1]
-    change = (
-        f"repeats {after:.12g}"
-        if before == after
-        else f"goes back from {before:.12g} to {after:.12g}"
-    )
-    return f"{log.at(k + 1)}: {columns.time} {change}{more(back)}"
+def _has_rows(log: Log) -> bool:
+    """Whether there are steps to check."""
+    return len(log.time) >= SHORTEST and bool(log.joined.any())
 
 
-def check_motion(
-    log: Log, columns: Columns, *, dt: float, gap: float
+def _first(
+    log: Log,
+    bad: Bool[np.ndarray, " row"],
+    text: Callable[[int], str],
+    *,
+    hint: str = "",
+    refused: bool = True,
 ) -> Iterator[Finding]:
-    """Check sampling, stale positions, and jumps of position and yaw."""
-    steps = motion(log, dt=dt, gap=gap)
-    yield from _check_sampling(log, steps, dt)
-    if (stale := stale_steps(log, steps)).any():
-        yield Finding(
-            f"{_first(log, stale, 1)}: the position of the row before "
-            f"at {log.states[stale.argmax() + 1, 3]:.3g} m/s{more(stale)}; "
-            f"log positions as often as {columns.time}, or leave rows out"
-        )
-        return
-    for find in (_position_jumps, _yaw_jumps):
-        jumps, line = find(log, columns, steps)
-        if jumps.any():
-            yield Finding(line)
-
-
-def _check_sampling(log: Log, steps: Motion, dt: float) -> Iterator[Finding]:
-    """Refuse slow sampling; warn of gaps and uneven sampling."""
-    waits, period, gaps = steps.waits, steps.period, steps.gaps
-    if period > SLOWER * dt:
-        yield Finding(
-            f"{log.whole}: recorded every {period:.4g} s, slower than "
-            f"vehicle.dt={dt:g}; pass vehicle.dt={period:.2g}"
-        )
-    if gaps.any():
-        k = int(gaps.argmax())
-        yield Finding(
-            f"{log.at(k + 1)}: {waits[k]:.4g} s without rows; "
-            f"drives are split there{more(gaps)}",
-            refused=False,
-        )
-    uneven = (np.abs(waits - period) > 0.5 * period) & ~gaps & log.joined
-    if uneven.mean() > 0.1:
-        yield Finding(
-            f"{_first(log, uneven, 1)}: uneven sampling, "
-            f"{waits[uneven.argmax()]:.4g} s after the row before{more(uneven)}",
-            refused=False,
-        )
-
-
-def stale_steps(log: Log, steps: Motion) -> Bool[np.ndarray, " step"]:
-    """Return steps without motion while driving; none if they are few."""
-    integrated = steps.integrated
-    driving = integrated > 0.1 * np.quantile(integrated[log.joined], 0.9)
-    driving &= log.joined
-    stale = driving & (steps.moved == 0.0)
-    many = stale.sum() > STALE * max(driving.sum(), 1)
-    return stale if many else np.zeros_like(stale)
-
-
-def _position_jumps(log: Log, columns: Columns, steps: Motion) -> Jumps:
-    """Steps much longer than the speed explains."""
-    moved, integrated = steps.moved, steps.integrated
-    spread = 1.4826 * np.median(np.abs(moved - integrated)[log.joined])
-    jumps = moved - integrated > integrated + 15.0 * spread + 1e-6
-    jumps &= ~steps.gaps & log.joined
-    k = int(jumps.argmax())
-    return jumps, (
-        f"{log.at(k + 1)}: {columns.state[0]}, {columns.state[1]} "
-        f"jump {moved[k]:.3g} m at {log.states[k, 3]:.3g} m/s{more(jumps)}"
-    )
-
-
-def _yaw_jumps(log: Log, columns: Columns, steps: Motion) -> Jumps:
-    """Steps that turn much more than the others, between rows near in time."""
-    turned = np.abs(np.diff(np.unwrap(log.states[:, 2])))
-    usual = float(np.median(turned[log.joined]))
-    jumps = ~steps.gaps & log.joined & (turned > max(1.0, 10.0 * usual))
-    k = int(jumps.argmax())
-    line = f"{log.at(k + 1)}: {columns.state[2]} jumps by {turned[k]:.3g} rad"
-    return jumps, line + more(jumps)
-
-
-def _first(log: Log, bad: Bool[np.ndarray, " time"], shift: int = 0) -> str:
-    """The position of the first of some rows."""
-    return log.at(int(bad.argmax()) + shift)
-
-
-def more(bad: Bool[np.ndarray, " time"]) -> str:
-    """Return how many rows there are like the first, for messages."""
-    return f" ({int(bad.sum())} rows like this)" if bad.sum() > 1 else ""
-
-
-def drop_slow_rows(log: Log, columns: Columns, *, min_speed: float) -> Cut:
-    """Drop rows slower than `min_speed` [m/s] and cut the drive there."""
-    slow = np.abs(log.states[:, 3]) < min_speed
-    if not slow.any():
-        return log, []
-    k = int(slow.argmax())
-    line = (
-        f"{log.at(k)}: {columns.state[3]} is {log.states[k, 3]:.3g} m/s, "
-        f"dropped by dataset.min_speed={min_speed:g}; the drive is cut there"
-    )
-    return log.select(~slow), [Finding(line + more(slow), refused=False)]
-
-
-def cut_at_jumps(log: Log, columns: Columns, *, dt: float, gap: float) -> Cut:
-    """Cut a drive where time goes back and where position or yaw jump.
-
-    Stale positions jump at every update: such a drive is left as it is.
+    """One line about the first of some rows or steps, and how many there are.
 
     Args:
-        log: rows that are finite.
-        columns: their names.
-        dt: of the model [s].
-        gap: see `motion`.
+        log: that they are of.
+        bad: one per row, or one per step, which is named by the row after it.
+        text: what is said of number k.
+        hint: after the number.
+        refused: whether the log is.
     """
-    findings = []
-    if (back := backwards(log)).any():
-        line = describe_backwards(log, columns, back)
-        findings.append(Finding(line + CUT_THERE, refused=False))
-        log = log.cut(back)
-    if not log.joined.any():
-        return log, findings
-    steps = motion(log, dt=dt, gap=gap)
-    if stale_steps(log, steps).any():
-        return log, findings
-    for find in (_position_jumps, _yaw_jumps):
-        if not log.joined.any():  # the cuts have left single rows
-            break
-        jumps, line = find(log, columns, steps)
-        if jumps.any():
-            findings.append(Finding(line + CUT_THERE, refused=False))
-            log = log.cut(jumps)
-    return log, findings
+    if bad.any():
+        k = int(bad.argmax())
+        row = k + len(log.time) - len(bad)
+        yield Finding(f"{log.at(row)}: {text(k)}{_more(bad)}{hint}", refused)
+
+
+def _more(bad: Bool[np.ndarray, " row"]) -> str:
+    """How many rows there are like the first."""
+    return f" ({bad.sum()} rows like this)" if bad.sum() > 1 else ""
+
+
+def _backwards(log: Log) -> Bool[np.ndarray, " step"]:
+    """The steps at which time repeats or goes back."""
+    return (log.waits <= 0) & log.joined
+
+
+def _stale(log: Log) -> Bool[np.ndarray, " step"]:
+    """Steps without motion while driving; none if they are few."""
+    usual = np.quantile(log.integrated[log.joined], 0.9)
+    # At standstill positions repeat rightly.
+    driving = (log.integrated > 0.1 * usual) & log.joined
+    stale = driving & (log.moved == 0.0)
+    return stale & (stale.sum() > STALE * max(driving.sum(), 1))
+
+
+def _chords(log: Log, speed: Float[np.ndarray, " time"]) -> Chords:
+    """Chords of a run that moved, by position or by a speed."""
+    reach = min(max(1, round(LOOK / log.period)), len(log.time) - 1)
+    along = np.cumsum(0.5 * (speed[1:] + speed[:-1]) * log.waits)
+    along = np.concatenate([[0.0], along])
+    chord = log.states[reach:, :2] - log.states[:-reach, :2]
+    length, integrated = np.linalg.norm(chord, axis=1), along[reach:] - along[:-reach]
+    lasted = log.time[reach:] - log.time[:-reach]
+    # A chord across a gap or a cut says nothing about the speed.
+    whole = lasted < 1.5 * reach * log.period
+    whole &= log.stretch[reach:] == log.stretch[:-reach]
+    # At standstill noise moves the position: the course would be random.
+    moving = np.zeros_like(whole)
+    for distance in (length, np.abs(integrated)):
+        moving |= distance > 0.2 * np.max(distance, where=whole, initial=0.0)
+    moving &= whole
+    course = np.arctan2(chord[:, 1], chord[:, 0]) + np.pi * (integrated < 0)
+    middle = np.flatnonzero(moving) + reach // 2
+    return Chords(length[moving], integrated[moving], course[moving], middle)
+
+
+def _agreement(angles: Float[np.ndarray, " chord"]) -> complex:
+    """Mean of exp(i φ): its length measures agreement, its angle is the mean angle."""
+    return complex(np.mean(np.exp(1j * angles)))
+
+
+def _turns(log: Log) -> tuple[Float[np.ndarray, " step"], Float[np.ndarray, " step"]]:
+    """v tan δ and the yaw rate of every step; large controls are taken as tan δ."""
+    steering = log.controls[:-1, 0]
+    # More than 80° is no angle of a wheel, but may be a turn command.
+    angle = np.tan(steering) if np.abs(log.controls[:, 0]).max() < 1.4 else steering
+    turned = np.diff(np.unwrap(log.states[:, 2]))[log.joined] / log.waits[log.joined]
+    return (log.states[:-1, 3] * angle)[log.joined], turned
+
+
+def _span(logs: list[Log]) -> str:
+    """The position of several runs, for messages."""
+    more = f" and {len(logs) - 1} runs more" if logs[1:] else ""
+    return logs[0].whole + more
+
+
+def _outside(
+    logs: list[Log],
+    field: str,
+    names: tuple[str, ...],
+    low: tuple[float, ...],
+    high: tuple[float, ...],
+) -> Iterator[str]:
+    """A line about the first row of every channel that is outside its range."""
+    for k, (name, least, most) in enumerate(zip(names, low, high, strict=True)):
+        slack = ROUNDED * max(1.0, abs(least), abs(most))
+        for log in logs:
+            channel = getattr(log, field)[:, k]
+            outside = (channel < least - slack) | (channel > most + slack)
+            if outside.any():
+                first = int(outside.argmax())
+                yield (
+                    f"{log.at(first)}: {name} is {channel[first]:.4g}{_more(outside)}, "
+                    f"outside the range from {least:g} to {most:g}"
+                )
+                break

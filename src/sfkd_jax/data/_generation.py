@@ -1,4 +1,4 @@
-"""Generate segments in world coordinates with persistently excited controls."""
+"""Simulated runs to learn from: random roads, environments and excited commands."""
 
 from __future__ import annotations
 
@@ -11,82 +11,56 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int
 
-from sfkd_jax.data._splits import scenario_labels
+from sfkd_jax.geometry import path_state
 from sfkd_jax.plants import Vehicle
-from sfkd_jax.ranges import Interval, Span
+from sfkd_jax.ranges import Interval, Positive, Span
+from sfkd_jax.rollout import in_batches
 from sfkd_jax.scenarios import (
-    Scenario,
     family,
+    held_road,
     project,
+    random_switching,
     reference_window,
     smooth_path,
     switching_road,
     uniform_road,
     wet_road,
 )
-from sfkd_jax.types import Key, Scalar, State, Trajectory
+from sfkd_jax.types import Control, Environment, Key, Scalar, State, Trajectory
 
 Driver: TypeAlias = Callable[
     [State, Float[Array, "horizon 4"]], Float[Array, " control"]
 ]
-
 Conditions: TypeAlias = Callable[[Key], Float[Array, "time environment"]]
+Sensors: TypeAlias = Callable[[Key, State, Control, Environment], Control]
+"""(key, path state, w, e) -> what the law adds to ν because its sensors are noisy."""
+Range: TypeAlias = tuple[float, float]
 
-BURN_IN = 10
-"""Steps simulated before a segment starts, so that slip, yaw rate and steering have
-settled.
+SCENARIOS = ("uniform", "wet", "held", "switching")
+"""Environments of generated segments: a uniform road, friction that drops under gusts,
+e held anywhere in E, and e switching anywhere in E. Their levels are drawn; those of
+the benchmark are `scenarios.ROADS`.
 """
-ROADS = partial(
+WET = {"before": (0.55, 0.9), "after": (0.3, 0.5)}
+"""Friction of a wet road, before and after it drops."""
+SWITCHES = (1.5, 6.0)
+"""Range of times between switches [s]."""
+PATHS = partial(
     smooth_path, length=150.0, peak_curvature=0.025, wavelengths=(60.0, 240.0)
 )
-"""Paths for training: other wavelengths and a wider range of curvature than those of
+"""Paths in the world: other wavelengths and a wider range of curvature than those of
 the benchmark.
 """
-
-WET = {"before": (0.55, 0.9), "after": (0.3, 0.5)}
-"""Friction of a wet road in the data, before and after it drops."""
-
-
-def benchmark_roads(
-    steps: int, dt: float, *, fixed_levels: bool = False
-) -> dict[str, Conditions]:
-    """Return schedules of S1 and S2; friction drops at a random time of the segment.
-
-    Args:
-        steps: of a segment.
-        dt: [s].
-        fixed_levels: use the levels of the benchmark only, instead of ranges around
-            them.
-    """
-    dry: dict[str, Any] = {} if fixed_levels else {"friction": (0.3, 0.9)}
-    wet: dict[str, Any] = {} if fixed_levels else WET
-    return {
-        "s1": partial(uniform_road, steps=steps, **dry),
-        "s2": partial(wet_road, steps=steps, dt=dt, drop_time=(0.0, steps * dt), **wet),
-    }
-
-
-def from_switching(steps: int, dt: float) -> Conditions:
-    """Return the schedule of S3, from a random time of it."""
-
-    def conditions(key: Key) -> Float[Array, "time 2"]:
-        road_key, moment_key = jax.random.split(key)
-        schedule = switching_road(road_key, steps=4 * steps, dt=dt)
-        return jax.lax.dynamic_slice_in_dim(
-            schedule, jax.random.randint(moment_key, (), 0, 3 * steps), steps
-        )
-
-    return conditions
-
-
-def log_uniform(
-    key: Key, limits: Float[Array, "channel 2"]
-) -> Float[Array, " channel"]:
-    """Draw one number per channel, uniform in its logarithm."""
-    logs = jnp.log(limits)
-    return jnp.exp(
-        jax.random.uniform(key, limits.shape[:1], minval=logs[:, 0], maxval=logs[:, 1])
-    )
+SETTLING = 10
+"""Steps before a segment in the world, so that slip, yaw rate and steering settle."""
+BURN_IN = 20
+"""Steps before a run along a path, so that its start has no influence."""
+CORRELATION = 0.85
+"""Of the excitation with that of the step before."""
+BATCH = 500
+"""Runs simulated at once."""
+SENSORS = 3
+"""Folded into a run's key, which is also split for road, ν and start."""
 
 
 def generate(
@@ -100,8 +74,9 @@ def generate(
     steering_excitation: Span = (0.005, 0.1),
     speed_excitation: Span = (0.1, 1.5),
     fixed_levels: bool = False,
+    held_out: bool = False,
 ) -> Trajectory:
-    """Generate independent segments: half S1 (uniform road), half S2 (drop and gusts).
+    """Generate independent segments in the world: half of them uniform, half wet.
 
     A path-following driver keeps the car on a random road while an AR(1) process
     excites both controls. Its spread is drawn log-uniformly per segment, so that the
@@ -116,123 +91,358 @@ def generate(
         speed: range of the target speed [m/s].
         steering_excitation: range of the spread [rad].
         speed_excitation: the same for the second control [m/s² or m/s].
-        fixed_levels: use the benchmark's own levels of S1 and S2 only (the training
+        fixed_levels: use the levels of the benchmark's S1 and S2 only (the training
             set as printed in the paper).
+        held_out: whether e follows S3 from a random time instead, for tests.
 
     Returns:
         A batch of trajectories, states (segment, steps + 1, state); their scenarios are
         those of `segment_scenarios`.
     """
-    halves, counts = [], _counts(segments).values()
     excitation = jnp.asarray([steering_excitation, speed_excitation])
-    schedules = benchmark_roads(steps, vehicle.dt, fixed_levels=fixed_levels).values()
-    for index, (conditions, count) in enumerate(zip(schedules, counts, strict=True)):
-        drive = partial(_segment, vehicle, driver, conditions, steps, speed, excitation)
-        keys = jax.random.split(jax.random.fold_in(key, index), count)
-        halves.append(jax.lax.map(drive, keys, batch_size=500))
-    return jax.tree.map(lambda a, b: jnp.concatenate([a, b]), *halves)
+    schedules = _schedules(steps, vehicle.dt, fixed_levels=fixed_levels)
+    planned = _planned(key, schedules, _counts(segments, along_path=False))
+    if held_out:
+        planned = [(from_s3(steps, vehicle.dt), jax.random.split(key, segments))]
+    parts = [
+        jax.lax.map(
+            partial(_segment, vehicle, driver, conditions, steps, speed, excitation),
+            keys,
+            batch_size=BATCH,
+        )
+        for conditions, keys in planned
+    ]
+    return jax.tree.map(lambda *leaves: jnp.concatenate(leaves), *parts)
 
 
-def segment_scenarios(segments: int) -> Int[np.ndarray, " segment"]:
-    """Return the scenario of every segment of `generate`, as index into `SCENARIOS`."""
-    return scenario_labels(_counts(segments))
-
-
-def _counts(segments: int) -> dict[str, int]:
-    """Number of segments by scenario, in the order in which they are generated."""
-    return {"s1": segments - segments // 2, "s2": segments // 2}
-
-
-def generate_switching(
-    vehicle: Vehicle,
-    driver: Driver,
+def generate_along_path(
+    loop: Vehicle,
     key: Key,
     *,
-    segments: int,
+    segments: Annotated[int, Interval("[4, inf)")] = 8000,
     steps: int = 50,
-    speed: tuple[float, float] = (7.0, 13.0),
-    steering_excitation: tuple[float, float] = (0.005, 0.1),
-    speed_excitation: tuple[float, float] = (0.1, 1.5),
+    speed: Span = (8.0, 10.5),
+    peak_curvature: Positive = 0.02,
+    wavelengths: Span = (50.0, 200.0),
+    lateral_acceleration: Positive = 2.0,
+    steering_excitation: Span = (0.002, 0.025),
+    speed_excitation: Span = (0.05, 0.6),
+    env_low: tuple[float, ...],
+    env_high: tuple[float, ...],
+    held_out: bool = False,
 ) -> Trajectory:
-    """Generate segments of S3's switching, from a random time of its schedule.
+    """Generate independent segments in path coordinates, a quarter of each scenario.
 
-    They are for tests, never for training.
+    In the last two quarters a third of every entry of e lies at an end of its range, so
+    that the corners of E are covered; switches are `SWITCHES` apart. Roads and ν are
+    those of `drive_along_path`.
 
     Args:
-        vehicle: the plant.
-        driver: as for `generate`.
+        loop: of `vehicle.along_path`.
         key: consumed.
         segments: their number.
         steps: of a segment.
-        speed: as for `generate`.
-        steering_excitation: as for `generate`.
-        speed_excitation: as for `generate`.
+        speed: see `drive_along_path`.
+        peak_curvature: see there.
+        wavelengths: see there.
+        lateral_acceleration: see there.
+        steering_excitation: see there.
+        speed_excitation: see there.
+        env_low: lower corner of E.
+        env_high: upper corner of E.
+        held_out: see `generate`.
+
+    Returns:
+        A batch of trajectories, states (segment, steps + 1, 3 + coordinate), controls w
+        (segment, steps, 4); their scenarios are those of `segment_scenarios`.
     """
-    conditions = from_switching(steps, vehicle.dt)
-    drive = partial(_segment, vehicle, driver, conditions, steps, speed)
-    drive = partial(drive, jnp.asarray([steering_excitation, speed_excitation]))
-    return jax.lax.map(drive, jax.random.split(key, segments), batch_size=500)
+    schedules = _schedules(steps, loop.dt)
+    box: dict[str, Any] = {"steps": steps, "low": env_low, "high": env_high}
+    schedules["held"] = partial(held_road, **box)
+    schedules["switching"] = partial(
+        random_switching, dt=loop.dt, dwell=SWITCHES, **box
+    )
+    env_key, run_key = jax.random.split(key)
+    planned = _planned(env_key, schedules, _counts(segments, along_path=True))
+    if held_out:
+        planned = [(from_s3(steps, loop.dt), jax.random.split(env_key, segments))]
+    envs = [jax.vmap(conditions)(keys) for conditions, keys in planned]
+    return drive_along_path(
+        loop,
+        jnp.concatenate(envs),
+        run_key,
+        speed=speed,
+        peak_curvature=peak_curvature,
+        wavelengths=wavelengths,
+        lateral_acceleration=lateral_acceleration,
+        steering_excitation=steering_excitation,
+        speed_excitation=speed_excitation,
+    )
+
+
+def segment_scenarios(
+    segments: int, *, along_path: bool = False
+) -> Int[np.ndarray, " segment"]:
+    """Return the scenario of every generated segment, as index into `SCENARIOS`.
+
+    Args:
+        segments: their number.
+        along_path: whether `generate_along_path` made them, instead of `generate`.
+    """
+    counts = _counts(segments, along_path=along_path)
+    return np.repeat(np.arange(len(counts), dtype=np.int32), list(counts.values()))
+
+
+def _counts(segments: int, *, along_path: bool) -> dict[str, int]:
+    """Number of segments by scenario, in the order in which they are generated."""
+    if along_path:
+        quarter = segments // 4
+        sizes = (quarter, quarter, quarter, segments - 3 * quarter)
+    else:
+        sizes = (segments - segments // 2, segments // 2)
+    return dict(zip(SCENARIOS, sizes, strict=False))
+
+
+def _schedules(
+    steps: int, dt: float, *, fixed_levels: bool = False
+) -> dict[str, Conditions]:
+    """Uniform and wet roads; friction drops at a random time of the segment."""
+    dry: dict[str, Any] = {} if fixed_levels else {"friction": (0.3, 0.9)}
+    wet: dict[str, Any] = {} if fixed_levels else WET
+    return {
+        "uniform": partial(uniform_road, steps=steps, **dry),
+        "wet": partial(
+            wet_road, steps=steps, dt=dt, drop_time=(0.0, steps * dt), **wet
+        ),
+    }
+
+
+def from_s3(steps: int, dt: float) -> Conditions:
+    """Return the schedule of S3, from a random time of it.
+
+    Args:
+        steps: of a run.
+        dt: sampling period [s].
+    """
+
+    def conditions(key: Key) -> Float[Array, "time 2"]:
+        road_key, moment_key = jax.random.split(key)
+        schedule = switching_road(road_key, steps=4 * steps, dt=dt)
+        return jax.lax.dynamic_slice_in_dim(
+            schedule, jax.random.randint(moment_key, (), 0, 3 * steps), steps
+        )
+
+    return conditions
+
+
+def _planned(
+    key: Key, schedules: dict[str, Conditions], counts: dict[str, int]
+) -> list[tuple[Conditions, Array]]:
+    """The schedule of every scenario, and a key for each of its segments."""
+    return [
+        (schedules[name], jax.random.split(jax.random.fold_in(key, index), count))
+        for index, (name, count) in enumerate(counts.items())
+    ]
+
+
+def _log_uniform(
+    key: Key, limits: Float[Array, "channel 2"]
+) -> Float[Array, " channel"]:
+    """One number per channel, uniform in its logarithm."""
+    logs = jnp.log(limits)
+    return jnp.exp(
+        jax.random.uniform(key, limits.shape[:1], minval=logs[:, 0], maxval=logs[:, 1])
+    )
+
+
+def _coloured(noise: Array, spread: float | Array, fresh: Array) -> Array:
+    """One step of an AR(1) process of a given spread, from fresh white noise."""
+    return CORRELATION * noise + jnp.sqrt(1.0 - CORRELATION**2) * spread * fresh
 
 
 def _segment(
     vehicle: Vehicle,
     driver: Driver,
-    conditions: Callable[[Key], Array],
+    conditions: Conditions,
     steps: int,
-    speed_range: tuple[float, float],
+    speeds: Range,
     excitation: Float[Array, "control 2"],
     key: Key,
 ) -> Trajectory:
-    """One segment; its first environment also applies during the burn-in."""
+    """One segment in the world."""
     road_key, speed_key, spread_key, noise_key, start_key, offset_key = (
         jax.random.split(key, 6)
     )
-    speed = jax.random.uniform(
-        speed_key, (), minval=speed_range[0], maxval=speed_range[1]
-    )
-    sample = family(
-        conditions,
-        ROADS,
-        speed=10.0,
-        state_size=len(vehicle.state_names),
-    )
-    scenario: Scenario = sample(road_key)._replace(speed=speed)
-    spread = log_uniform(spread_key, excitation)
-    offset = jax.random.uniform(start_key, (), minval=-1.0, maxval=1.0)
-    initial = scenario.initial_state.at[3].set(speed + offset)
-    envs = jnp.concatenate([jnp.tile(scenario.envs[:1], (BURN_IN, 1)), scenario.envs])
+    speed = jax.random.uniform(speed_key, (), minval=speeds[0], maxval=speeds[1])
+    sample = family(conditions, PATHS, speed=10.0, state_size=len(vehicle.state_names))
+    scenario = sample(road_key)
+    path = scenario.path
+    # The first environment also holds while the car settles.
+    envs = jnp.concatenate([jnp.tile(scenario.envs[:1], (SETTLING, 1)), scenario.envs])
+    spread = _log_uniform(spread_key, excitation)
     low, high = jnp.asarray(vehicle.control_low), jnp.asarray(vehicle.control_high)
-    white = jax.random.normal(noise_key, (steps + BURN_IN, 2))
+    white = jax.random.normal(noise_key, (steps + SETTLING, 2))
 
     def step(
         carry: tuple[State, Scalar, Array], inputs: tuple[Array, Array]
     ) -> tuple[Any, Any]:
         state, progress, noise = carry
         env, fresh = inputs
-        noise = 0.85 * noise + jnp.sqrt(1.0 - 0.85**2) * spread * fresh
-        reference = reference_window(
-            scenario.path, progress, speed, dt=vehicle.dt, horizon=2
-        )
+        noise = _coloured(noise, spread, fresh)
+        reference = reference_window(path, progress, speed, dt=vehicle.dt, horizon=2)
+        # Clipped after the excitation: the model learns the command that was applied.
         control = jnp.clip(driver(state, reference) + noise, low, high)
         after = vehicle.step(state, control, env)
-        progress, _ = project(
-            scenario.path, after[:2], progress + after[3] * vehicle.dt
-        )
+        progress, _ = project(path, after[:2], progress + after[3] * vehicle.dt)
         return (after, progress, noise), (after, control)
 
-    start = (
-        initial,
-        jnp.full((), 20.0 * jax.random.uniform(offset_key)),
-        spread * white[0],
+    progress = 20.0 * jax.random.uniform(offset_key)
+    offset = jax.random.uniform(start_key, (), minval=-1.0, maxval=1.0)
+    start = scenario.initial_state.at[3].set(speed + offset)
+    # By a window, whose rounding is part of every data set of a seed.
+    here = reference_window(path, progress, jnp.zeros(()), dt=0.0, horizon=1)[0]
+    start = start.at[:3].set(here[:3])
+    _, (states, controls) = jax.lax.scan(
+        step, (start, progress, spread * white[0]), (envs, white)
     )
-    start = (_on_path(scenario, start[1], initial), start[1], start[2])
-    _, (states, controls) = jax.lax.scan(step, start, (envs, white))
-    return Trajectory(states[BURN_IN - 1 :], controls[BURN_IN:], envs[BURN_IN:])
+    return Trajectory(states[SETTLING - 1 :], controls[SETTLING:], envs[SETTLING:])
 
 
-def _on_path(scenario: Scenario, progress: Scalar, state: State) -> State:
-    """The state placed on the path at `progress`."""
-    point = reference_window(scenario.path, progress, jnp.zeros(()), dt=0.0, horizon=1)[
-        0
-    ]
-    return state.at[:3].set(point[:3])
+def drive_along_path(
+    loop: Vehicle,
+    envs: Float[Array, "run time environment"],
+    key: Key,
+    *,
+    speed: tuple[float | Scalar, float | Scalar] = (8.0, 10.5),
+    peak_curvature: float = 0.02,
+    wavelengths: Range = (50.0, 200.0),
+    lateral_acceleration: float = 2.0,
+    steering_excitation: Range = (0.002, 0.025),
+    speed_excitation: Range = (0.05, 0.6),
+    offset: tuple[float, float, float] = (0.1, 0.02, 0.5),
+    burn_in: int = BURN_IN,
+    sensors: Sensors | None = None,
+) -> Trajectory:
+    """Simulate one run in each of the given environments.
+
+    The speed varies slowly within its range. A third of the roads are circles, the
+    curvature of the others is a sum of three sinusoids; none exceeds `peak_curvature`
+    or `lateral_acceleration`. ν of a run is an AR(1) process, as of a planner, or its
+    sign (bang-bang), with a log-uniform spread, clipped to the limits of the loop.
+
+    Args:
+        loop: of `vehicle.along_path`.
+        envs: of the plant.
+        key: consumed.
+        speed: range of v_ref [m/s].
+        peak_curvature: [1/m].
+        wavelengths: of the road [m].
+        lateral_acceleration: largest v_ref² |κ| [m/s²].
+        steering_excitation: range of the spread of ν_1 [rad].
+        speed_excitation: of ν_2 [m/s² or m/s].
+        offset: largest e_y [m], e_ψ [rad] and v − v_ref [m/s] at the start.
+        burn_in: steps simulated before a run starts.
+        sensors: noise of the law's sensors; it is not part of w.
+    """
+    limits = jnp.asarray([steering_excitation, speed_excitation])
+    road = partial(
+        _road,
+        dt=loop.dt,
+        speed=speed,
+        peak=peak_curvature,
+        wavelengths=wavelengths,
+        most=lateral_acceleration,
+    )
+
+    def one(given: tuple[Array, Key]) -> Trajectory:
+        envs = jnp.concatenate([jnp.repeat(given[0][:1], burn_in, axis=0), given[0]])
+        road_key, nu_key, start_key = jax.random.split(given[1], 3)
+        sensor_keys = jax.random.split(
+            jax.random.fold_in(given[1], SENSORS), envs.shape[0]
+        )
+        speeds, curvatures = road(road_key, steps=envs.shape[0])
+        nus = _perturbations(nu_key, steps=envs.shape[0], spread=limits)
+        nus = jnp.clip(
+            nus, jnp.asarray(loop.control_low[:2]), jnp.asarray(loop.control_high[:2])
+        )
+        inputs = jnp.concatenate([nus, curvatures[:, None], speeds[:, None]], axis=1)
+        beside = jax.random.uniform(start_key, (3,), minval=-1.0) * jnp.asarray(offset)
+        start = path_state(
+            jnp.zeros(len(loop.state_names) - 3).at[:3].set(beside.at[2].add(speeds[0]))
+        )
+
+        def step(
+            state: State, given: tuple[Control, Environment, Key]
+        ) -> tuple[State, State]:
+            inputs, env, key = given
+            if sensors is not None:
+                inputs = inputs.at[:2].add(sensors(key, state, inputs, env))
+            after = loop.step(state, inputs, env)
+            return after, after
+
+        _, states = jax.lax.scan(step, start, (inputs, envs, sensor_keys))
+        states = jnp.concatenate([start[None], states])
+        return Trajectory(states[burn_in:], inputs[burn_in:], envs[burn_in:])
+
+    keys = jax.random.split(key, envs.shape[0])
+    return in_batches(one, (envs, keys), size=BATCH)
+
+
+def _road(
+    key: Key,
+    *,
+    steps: int,
+    dt: float,
+    speed: tuple[float | Scalar, float | Scalar],
+    peak: float,
+    wavelengths: Range,
+    most: float,
+) -> tuple[Float[Array, " time"], Float[Array, " time"]]:
+    """v_ref [m/s] and κ [1/m] at every step."""
+    level_key, swing_key, wave_key, phase_key, size_key, kind_key, circle_key = (
+        jax.random.split(key, 7)
+    )
+    level = jax.random.uniform(level_key, (), minval=speed[0], maxval=speed[1])
+    swing, period, begins = jax.random.uniform(swing_key, (3,))
+    time = jnp.arange(steps) * dt
+    speeds = level + 0.8 * swing * jnp.sin(
+        2 * jnp.pi * (time / (5.0 + 15.0 * period) + begins)
+    )
+    # The swing is not scaled to the range, so that its ends are reached.
+    speeds = jnp.clip(speeds, *speed)
+    waves = jax.random.uniform(
+        wave_key, (3, 1), minval=wavelengths[0], maxval=wavelengths[1]
+    )
+    phases = jax.random.uniform(phase_key, (3, 1), maxval=2 * jnp.pi)
+    along = jnp.cumsum(speeds) * dt
+    bends = jnp.mean(jnp.sin(2 * jnp.pi * along / waves + phases), axis=0)
+    # Three sinusoids seldom peak together: twice their mean, clipped, stays at the
+    # extremes for a while as well.
+    bends = jnp.sqrt(jax.random.uniform(size_key)) * jnp.clip(2.0 * bends, -1.0, 1.0)
+    # Wider than [-1, 1], then clipped: a third of the circles are the tightest.
+    circle = jnp.clip(
+        jax.random.uniform(circle_key, minval=-1.5, maxval=1.5), -1.0, 1.0
+    )
+    # A third of the roads are circles: the steady turn is where e_y settles widest.
+    wanted = peak * jnp.where(jax.random.uniform(kind_key) < 1.0 / 3.0, circle, bends)
+    # Friction limits v² κ: a fast road has to be a straight one.
+    tightest = jnp.minimum(peak, most / speeds**2)
+    return speeds, jnp.clip(wanted, -tightest, tightest)
+
+
+def _perturbations(
+    key: Key, *, steps: int, spread: Float[Array, "2 2"]
+) -> Float[Array, "time 2"]:
+    """ν: an AR(1) process or its sign, its spread log-uniform per channel."""
+    spread_key, white_key, kind_key = jax.random.split(key, 3)
+    size = _log_uniform(spread_key, spread)
+    white = jax.random.normal(white_key, (steps, 2))
+
+    def follow(noise: Array, fresh: Array) -> tuple[Array, Array]:
+        noise = _coloured(noise, 1.0, fresh)
+        return noise, noise
+
+    noise = jax.lax.scan(follow, white[0], white)[1]
+    # A quarter is bang-bang, the worst that a planner within its limits may do.
+    bang = jax.random.uniform(kind_key) < 0.25
+    return size * jnp.where(bang, jnp.sign(noise), noise)

@@ -1,8 +1,9 @@
-"""Read recorded drives: columns by their names, in SI units, one log per drive."""
+"""Recorded runs: columns by their names, in SI units, one log per run."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from functools import cached_property
 from pathlib import Path
 from typing import NamedTuple
 
@@ -11,13 +12,13 @@ from jaxtyping import Bool, Float, Int
 
 from sfkd_jax.data._tables import (
     Table,
-    digest,
+    find_column,
     log_files,
+    name_of,
     read_csv,
     read_npz,
     read_parquet,
 )
-from sfkd_jax.data._units import find_column, name_of
 from sfkd_jax.ranges import Names
 from sfkd_jax.store import ArtefactError, one_line
 
@@ -25,6 +26,8 @@ UNKNOWN = 2
 """Entries of the constant environment that replaces one that nobody measured."""
 DIMENSIONS = ("length", "length", "angle", "speed")
 """Of the first states."""
+RUN = "number of the run"
+"""Column of tables of arrays x, u, e."""
 
 
 class Columns(NamedTuple):
@@ -36,23 +39,22 @@ class Columns(NamedTuple):
             then any others.
         control: the two commands.
         environment: any number of them, or none.
-        drive: a column that numbers the drives in one file, or None: every file is one
-            drive.
+        run: a column that numbers the runs in one file, or None: every file is one run.
     """
 
     time: str = "t"
     state: tuple[str, ...] = ("p_x", "p_y", "yaw", "v")
     control: tuple[str, ...] = ("steering", "acceleration")
     environment: Names = ("friction", "wind")
-    drive: str | None = None
+    run: str | None = None
 
 
 @dataclass(frozen=True)
 class Log:
-    """One recorded drive.
+    """One recorded run.
 
     Attributes:
-        source: file, and drive if there are several in it.
+        source: file, and run if there are several in it.
         rows: position of each row in the file.
         row_name: what `rows` counts, "line" or "row".
         time: [s].
@@ -77,13 +79,56 @@ class Log:
 
     @property
     def whole(self) -> str:
-        """The position of the drive, for messages."""
+        """The position of the run, for messages."""
         return f"{self.source}, {self.row_name}s {self.rows[0]} to {self.rows[-1]}"
 
-    @property
+    @cached_property
     def joined(self) -> Bool[np.ndarray, " step"]:
         """Whether each row but the first continues the row before it."""
         return self.stretch[1:] == self.stretch[:-1]
+
+    @cached_property
+    def waits(self) -> Float[np.ndarray, " step"]:
+        """Time between rows [s]."""
+        return np.diff(self.time)
+
+    @cached_property
+    def period(self) -> float:
+        """Median time between joined rows [s]; 0 if there are none."""
+        return float(np.median(self.waits[self.joined])) if self.joined.any() else 0.0
+
+    @cached_property
+    def moved(self) -> Float[np.ndarray, " step"]:
+        """Distance between positions [m]."""
+        return np.linalg.norm(np.diff(self.states[:, :2], axis=0), axis=1)
+
+    @cached_property
+    def integrated(self) -> Float[np.ndarray, " step"]:
+        """Distance by the speed [m]."""
+        speed = np.abs(self.states[:, 3])
+        return 0.5 * (speed[1:] + speed[:-1]) * self.waits
+
+    def gaps(self, gap: float, dt: float) -> Bool[np.ndarray, " step"]:
+        """Return the steps that are too long to be bridged.
+
+        Args:
+            gap: the longest wait that is bridged, in periods: of the log or dt,
+                whichever is longer.
+            dt: of the model [s].
+        """
+        return (self.waits > gap * max(self.period, dt)) & self.joined
+
+    def channels(self, columns: Columns) -> dict[str, Float[np.ndarray, " time"]]:
+        """Return every column by its name, less an unknown environment."""
+        named = {columns.time: self.time}
+        for names, values in (
+            (columns.state, self.states),
+            (columns.control, self.controls),
+            (columns.environment, self.envs),
+        ):
+            if len(names) == values.shape[1]:
+                named |= dict(zip(names, values.T, strict=True))
+        return named
 
     def select(self, chosen: Bool[np.ndarray, " time"]) -> Log:
         """Return the chosen rows, cut where rows between them are left out."""
@@ -104,7 +149,7 @@ class LogFiles(NamedTuple):
     """What was read from files.
 
     Attributes:
-        logs: drives, in an order that does not depend on the names of files.
+        logs: of all runs, in an order that does not depend on the names of files.
         errors: one line per file that could not be read.
         conversions: of columns to SI units.
     """
@@ -117,7 +162,7 @@ class LogFiles(NamedTuple):
 def read_logs(
     path: str, columns: Columns, *, dt: float, needs_environment: bool
 ) -> LogFiles:
-    """Read all drives of a path.
+    """Read all runs of a path.
 
     Args:
         path: a file, a folder or a glob.
@@ -130,18 +175,19 @@ def read_logs(
         ValueError: no files, or invalid names of columns.
     """
     _check_columns(columns, needs_environment)
-    read = LogFiles([], [], [])
-    # The order of contents: a data set does not depend on the names of its files.
-    for file in sorted(log_files(path), key=digest):
+    logs, errors, conversions = [], [], []
+    # A file that cannot be read is a finding beside those of the others.
+    for file in log_files(path).values():
         try:
-            logs, conversions = _read(file, columns, dt, needs_environment)
+            read, converted = _logs(
+                _table(file, columns, dt), columns, needs_environment
+            )
         except (ArtefactError, ValueError) as reason:
-            read.errors.append(one_line(reason))
+            errors.append(one_line(reason))
             continue
-        read.logs.extend(logs)
-        read.conversions.extend(conversions)
-    unique = list(dict.fromkeys(read.conversions))
-    return LogFiles(read.logs, sorted(read.errors), unique)
+        logs += read
+        conversions += converted
+    return LogFiles(logs, sorted(errors), list(dict.fromkeys(conversions)))
 
 
 def _check_columns(columns: Columns, needs_environment: bool) -> None:
@@ -155,6 +201,7 @@ def _check_columns(columns: Columns, needs_environment: bool) -> None:
         raise ValueError(
             f"dataset.columns.control must name two columns, got {len(columns.control)}"
         )
+    # A name twice would read one column as two channels.
     names = [columns.time, *columns.state, *columns.control, *columns.environment]
     if twice := [name for k, name in enumerate(names) if name in names[:k]]:
         raise ValueError(f"dataset.columns names {twice[0]} twice")
@@ -165,34 +212,20 @@ def _check_columns(columns: Columns, needs_environment: bool) -> None:
         )
 
 
-def _read(
-    file: Path, columns: Columns, dt: float, needs_environment: bool
-) -> tuple[list[Log], list[str]]:
-    """The drives of one file, and conversions of its columns."""
-    suffix = file.suffix.lower()
-    if suffix == ".npz":
-        arrays = read_npz(file)
-        if {"x", "u"} <= set(arrays) and columns.state[0] not in arrays:
-            return _stacked(str(file), arrays, columns, dt, needs_environment), []
-        table = _one_per_column(str(file), arrays, columns)
-    elif suffix == ".parquet":
-        table = read_parquet(file)
-    else:
-        table = read_csv(file, columns.time)
-    table, conversions = _in_si(table, columns)
-    return _drives(table, columns, needs_environment), conversions
-
-
-def _one_per_column(
-    source: str, arrays: dict[str, np.ndarray], columns: Columns
-) -> Table:
-    """Arrays of an npz file, one per column; its other arrays are ignored."""
+def _table(file: Path, columns: Columns, dt: float) -> Table:
+    """The columns of a file."""
+    suffix, source = file.suffix.lower(), str(file)
+    if suffix == ".csv":
+        return read_csv(file, columns.time)
+    if suffix == ".parquet":
+        return read_parquet(file)
+    arrays = read_npz(file)
+    if {"x", "u"} <= set(arrays) and columns.state[0] not in arrays:
+        return _stacked(source, arrays, columns, dt)
     wanted = {*columns.state, *columns.control, *columns.environment}
-    wanted |= {columns.time, columns.drive}
+    wanted |= {columns.time, columns.run}
     used = {
-        name: array
-        for name, array in arrays.items()
-        if name in wanted or name_of(name) in wanted
+        name: array for name, array in arrays.items() if {name, name_of(name)} & wanted
     }
     if not used:  # a later message lists what the file has
         return Table(source, dict.fromkeys(arrays, np.zeros(0)), np.arange(0))
@@ -208,150 +241,117 @@ def _one_per_column(
     return Table(source, used, np.arange(shape[0]))
 
 
-def _in_si(table: Table, columns: Columns) -> tuple[Table, list[str]]:
-    """The table under configured names in SI units, and the conversions."""
-    dimensions: dict[str, str | None] = {columns.time: "time"}
-    dimensions |= dict.fromkeys(
-        (*columns.state, *columns.control, *columns.environment)
-    )
-    dimensions |= dict(zip(columns.state, DIMENSIONS, strict=False))
-    names, factors, conversions = {}, {}, []
-    for name, dimension in dimensions.items():
-        try:
-            match = find_column(name, table.columns, dimension)
-        except ValueError as reason:
-            raise ValueError(f"{table.source}: {reason}") from None
-        if match is None:
-            continue
-        names[match.header], factors[name] = name, match.factor
-        conversions += [match.conversion] if match.conversion else []
-    held = {names.get(header, header): a for header, a in table.columns.items()}
-    return replace(table, columns=held, factors=factors), conversions
-
-
-def _drives(table: Table, columns: Columns, needs_environment: bool) -> list[Log]:
-    """A table as one log, or as one log per value of its drive column."""
-    measured = _environment(
-        table.source, columns.environment, set(table.columns), needs_environment
-    )
-    drive = () if columns.drive is None else (columns.drive,)
-    wanted = {"time": (columns.time,), "state": columns.state}
-    for setting, names in (
-        wanted | {"control": columns.control, "drive": drive}
-    ).items():
-        if absent := [name for name in names if name not in table.columns]:
-            present = ", ".join(list(table.columns)[:12])
-            raise ValueError(
-                f"{table.source}: no column {absent[0]} among {present}; "
-                f"map it with dataset.columns.{setting}"
-            )
-    time = table.numbers(columns.time)
-
-    def stacked(names: tuple[str, ...]) -> Float[np.ndarray, "time channel"]:
-        return np.column_stack([table.numbers(name) for name in names])
-
-    log = Log(
-        source=table.source,
-        rows=table.rows,
-        row_name=table.row_name,
-        time=time,
-        states=stacked(columns.state),
-        controls=stacked(columns.control),
-        envs=stacked(measured) if measured else np.zeros((len(time), UNKNOWN)),
-        stretch=np.zeros(len(time), dtype=int),
-    )
-    if columns.drive is None:
-        return [log]
-    labels = table.columns[columns.drive]
-    if labels.dtype.kind == "f" and np.isnan(labels).any():
-        raise ValueError(
-            f"{log.at(int(np.isnan(labels).argmax()))}: {columns.drive} is nan, "
-            "so its drive is unknown"
-        )
-    # Rows of one drive continue each other, whatever lies between them in the file.
-    return [
-        replace(
-            log.select(labels == label),
-            source=f"{table.source}, drive {label}",
-            stretch=np.zeros(int((labels == label).sum()), dtype=int),
-        )
-        for label in dict.fromkeys(labels.tolist())
-    ]
-
-
-def _environment(
-    source: str, names: tuple[str, ...], present: set[str], needed: bool
-) -> tuple[str, ...]:
-    """Return the environment's columns to read: all, or none if none is needed.
-
-    Raises:
-        ValueError: a column is missing.
-    """
-    absent = [name for name in names if name not in present]
-    if not absent:
-        return names
-    if not needed and len(absent) == len(names):
-        return ()
-    raise ValueError(
-        f"{source}: no column {absent[0]} for the environment; "
-        "pass environment.source=none, or map the columns with "
-        "dataset.columns.environment"
-    )
-
-
 def _stacked(
-    source: str,
-    arrays: dict[str, np.ndarray],
-    columns: Columns,
-    dt: float,
-    needs_environment: bool,
-) -> list[Log]:
-    """The drives of arrays x (drive, time + 1, state), u and e (drive, time, entry).
+    source: str, arrays: dict[str, np.ndarray], columns: Columns, dt: float
+) -> Table:
+    """Arrays x (run, time + 1, state), u and e (run, time, entry) below each other.
 
     Raises:
         ValueError: arrays of other shapes, or that are no numbers.
     """
-    measured = _environment(source, ("e",), set(arrays), needs_environment)
+    parts = {"x": columns.state, "u": columns.control, "e": columns.environment}
+    if "e" not in arrays or not columns.environment:
+        del parts["e"]
+    held = {name: arrays[name] for name in parts}
+    # One run alone may come without its first axis.
+    held = {name: a[None] if a.ndim == 2 else a for name, a in held.items()}
+    count, moments = (*held["x"].shape, 0, 0)[:2]
+    time = np.asarray(arrays.get(columns.time, dt * np.arange(moments)))
+    shapes: dict[str, tuple[int, ...]] = {
+        name: (count, moments - (name != "x"), len(names))
+        for name, names in parts.items()
+    }
+    shapes[columns.time] = (moments,) if time.ndim == 1 else (count, moments)
+    for name, array in (held | {columns.time: time}).items():
+        shape = shapes[name]
+        if array.dtype.kind not in "iuf" or array.shape != shape or 0 in shape:
+            raise ValueError(
+                f"{source}: {name} must be numbers of shape {shape}, "
+                f"got {array.dtype} {array.shape}"
+            )
+    table = {
+        columns.time: np.broadcast_to(time, (count, moments)).ravel(),
+        RUN: np.repeat(np.arange(count), moments),
+    }
+    for name, names in parts.items():
+        array = held[name]
+        if name != "x":  # u and e of the last moment are unknown and never used
+            array = np.concatenate([array, array[:, -1:]], axis=1)
+        table |= dict(zip(names, array.reshape(-1, len(names)).T, strict=True))
+    return Table(source, table, np.tile(np.arange(moments), count), run=RUN)
+
+
+def _logs(
+    table: Table, columns: Columns, needs_environment: bool
+) -> tuple[list[Log], list[str]]:
+    """The runs of a table in SI units, and the conversions.
+
+    Raises:
+        ValueError: a column is missing or has an unknown unit.
+    """
+    source, run = table.source, table.run or columns.run
     wanted = {
-        name: arrays[name][None] if arrays[name].ndim == 2 else arrays[name]
-        for name in ("x", "u", *measured)
+        "time": (columns.time,),
+        "state": columns.state,
+        "control": columns.control,
+        "environment": columns.environment,
+        "run": () if run is None else (run,),
     }
-    for name, array in wanted.items():
-        if array.ndim != 3 or array.dtype.kind not in "iuf":
-            raise ValueError(
-                f"{source}: {name} must be numbers of shape (drive, time, entry), "
-                f"got {array.shape}"
-            )
-    count, steps = wanted["x"].shape[0], wanted["x"].shape[1] - 1
-    entries = wanted["e"].shape[-1] if measured else 0
-    sizes = {
-        "x": (count, steps + 1, len(columns.state)),
-        "u": (count, steps, 2),
-        "e": (count, steps, len(columns.environment) or entries),
-    }
-    for name, array in wanted.items():
-        if array.shape != sizes[name]:
-            raise ValueError(
-                f"{source}: {name} has shape {array.shape}, expected {sizes[name]}"
-            )
-    if steps < 1 or not count:
-        raise ValueError(f"{source}: no steps in x of shape {wanted['x'].shape}")
-    time = np.asarray(arrays.get(columns.time, dt * np.arange(steps + 1)))
-    shape = (count, steps + 1)
-    if time.dtype.kind not in "iuf" or time.shape not in (shape[1:], shape):
+    needed = {name: None for names in wanted.values() for name in names}
+    needed |= {columns.time: "time"} | dict(
+        zip(columns.state, DIMENSIONS, strict=False)
+    )
+    try:
+        matches = {
+            name: find_column(name, table.columns, needed[name]) for name in needed
+        }
+    except ValueError as reason:
+        raise ValueError(f"{source}: {reason}") from None
+    found = {name: match for name, match in matches.items() if match}
+    # Nobody measured it, and no model reads it; half an environment is an error.
+    if not (needs_environment or set(wanted["environment"]) & set(found)):
+        wanted["environment"] = ()
+    for setting, names in wanted.items():
+        if absent := [name for name in names if name not in found]:
+            hint = f"map it with dataset.columns.{setting}"
+            if setting == "environment":
+                hint += ", or pass environment.source=none"
+            present = ", ".join(list(table.columns)[:12])
+            raise ValueError(f"{source}: no column {absent[0]} among {present}; {hint}")
+
+    def stacked(names: tuple[str, ...]) -> Float[np.ndarray, "time channel"]:
+        used = [found[name] for name in names]
+        return np.column_stack([table.numbers(one.header, one.factor) for one in used])
+
+    states, size = stacked(columns.state), len(table.rows)
+    log = Log(
+        source=source,
+        rows=table.rows,
+        row_name=table.row_name,
+        time=stacked(wanted["time"])[:, 0],
+        states=states,
+        controls=stacked(columns.control),
+        # Zeros: a constant that no model reads.
+        envs=stacked(wanted["environment"])
+        if wanted["environment"]
+        else np.zeros((size, UNKNOWN)),
+        stretch=np.zeros(size, dtype=int),
+    )
+    conversions = [match.conversion for match in found.values() if match.conversion]
+    if run is None:
+        return [log], conversions
+    labels = table.columns[found[run].header]
+    if labels.dtype.kind == "f" and np.isnan(labels).any():
         raise ValueError(
-            f"{source}: {columns.time} must be numbers of shape {shape}, "
-            f"got {time.dtype} {time.shape}"
+            f"{log.at(int(np.isnan(labels).argmax()))}: {run} is nan, "
+            "so its run is unknown"
         )
-    time = np.broadcast_to(time.astype(np.float64), shape)
-    x, u = (wanted[name].astype(np.float64) for name in "xu")
-    e = np.zeros((count, steps, UNKNOWN))
-    if measured:
-        e = wanted["e"].astype(np.float64)
-    # u and e of the last moment are unknown and never used.
-    u, e = (np.concatenate([part, part[:, -1:]], axis=1) for part in (u, e))
-    rows, stretch = np.arange(steps + 1), np.zeros(steps + 1, dtype=int)
+    # Rows of one run continue each other, whatever lies between them in the file.
     return [
-        Log(f"{source}, drive {k}", rows, "row", time[k], x[k], u[k], e[k], stretch)
-        for k in range(count)
-    ]
+        replace(
+            log.select(labels == label),
+            source=f"{source}, run {label}",
+            stretch=np.zeros(int((labels == label).sum()), dtype=int),
+        )
+        for label in dict.fromkeys(labels.tolist())
+    ], conversions

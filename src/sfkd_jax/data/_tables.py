@@ -1,4 +1,4 @@
-"""Tables of csv, npz and parquet files; errors name the file and the line."""
+"""Tables of csv, npz and parquet files in SI units; errors name file and line."""
 
 from __future__ import annotations
 
@@ -8,16 +8,15 @@ import hashlib
 import io
 import re
 import zipfile
-from collections.abc import Callable, Mapping
-from dataclasses import dataclass, field
+from collections.abc import Collection, Iterator, Mapping
+from contextlib import contextmanager
 from functools import cache
 from pathlib import Path
-from typing import Any, NoReturn
+from typing import Any, BinaryIO, NamedTuple
 
 import numpy as np
 from jaxtyping import Float, Int, Shaped
 
-from sfkd_jax.data._units import name_of, with_unit_row
 from sfkd_jax.store import open_regular
 
 SUFFIXES = (".csv", ".npz", ".parquet")
@@ -29,10 +28,105 @@ PREAMBLE = 50
 """Lines of a csv file among which its header is looked for."""
 QUOTED = 64
 """Characters of a cell that a message quotes."""
+DIMENSIONS = {
+    "time": "s",
+    "length": "m",
+    "angle": "rad",
+    "speed": "m/s",
+    "angular rate": "rad/s",
+    "acceleration": "m/s²",
+    "curvature": "1/m",
+    "force": "N",
+    "torque": "Nm",
+    "voltage": "V",
+    "current": "A",
+    "pressure": "Pa",
+    "ratio": "-",
+}
+"""Symbols of SI units by dimension. Other dimensions are unknown: no car logs them, and
+pint takes many a remark in brackets for a unit (mu: milli unified atomic mass).
+"""
+SPELLINGS = {
+    "-": "dimensionless",
+    "1": "dimensionless",
+    "g": "standard_gravity",
+    "G": "standard_gravity",
+    "kmh": "km/h",
+    "Nm": "N*m",
+    "kNm": "kN*m",
+}
+"""Spellings in logs that pint does not know, or takes for something else."""
+_TERM = r"[A-Za-zµμ°%]+(?:\^?[1-4]|[²³])?"
+WRITTEN = re.compile(rf"(?:1|{_TERM})(?:\s*[ */·]\s*{_TERM})*")
+"""What is shown to pint, which computes whatever is written: 9**9**9 takes for ever."""
 
 
-def log_files(path: str) -> list[Path]:
-    """Return the log files of a file, a folder or a glob, sorted by name.
+class Table(NamedTuple):
+    """Columns of equal length, as they stand in a file.
+
+    Attributes:
+        source: the file.
+        columns: by name; text where the file holds text.
+        rows: position of each row in the file.
+        row_name: what `rows` counts: "line" (csv, from 1) or "row" (npz and parquet,
+            from 0).
+        run: the column that numbers its runs, if the file has several by its form.
+    """
+
+    source: str
+    columns: Mapping[str, Shaped[np.ndarray, " time"]]
+    rows: Int[np.ndarray, " time"]
+    row_name: str = "row"
+    run: str | None = None
+
+    def numbers(self, name: str, factor: float = 1.0) -> Float[np.ndarray, " time"]:
+        """Return a column as float64; dates become seconds since the first.
+
+        Args:
+            name: of the column.
+            factor: to its SI unit.
+
+        Raises:
+            ValueError: the first cell that is not a number.
+        """
+        values = self.columns[name]
+        try:
+            if values.dtype.kind == "M":
+                return (values - values[0]) / np.timedelta64(1, "s")
+            if values.dtype.kind in "biufSUO":
+                numbers = values.astype(np.float64)
+                # Without a conversion the very numbers of the file are kept.
+                return numbers if factor == 1.0 else factor * numbers
+        except (TypeError, ValueError, OverflowError):
+            pass
+        for row, value in zip(self.rows, values, strict=True):
+            if not _is_number(value):
+                text = repr(str(value)[:QUOTED]) if str(value).strip() else "empty"
+                raise ValueError(
+                    f"{self.source}, {self.row_name} {row}: {name} is {text}, "
+                    "not a number"
+                )
+        raise ValueError(f"{self.source}: {name} cannot be read as numbers")
+
+
+class Match(NamedTuple):
+    """A column of a file that holds a configured column.
+
+    Attributes:
+        header: its name in the file.
+        factor: by which its numbers are multiplied.
+        conversion: for the user, or None if the numbers are left as they are.
+    """
+
+    header: str
+    factor: float = 1.0
+    conversion: str | None = None
+
+
+def log_files(path: str) -> dict[str, Path]:
+    """Return the logs of a file, a folder or a glob by the hash of their contents.
+
+    They are in the order of the hashes: a data set does not depend on names of files.
 
     Raises:
         ValueError: none, files of another kind, or two with the same contents.
@@ -45,32 +139,29 @@ def log_files(path: str) -> list[Path]:
         )
     here, known = Path(path).expanduser(), ", ".join(SUFFIXES)
     if here.is_dir():
-        files = [
-            file
-            for file in sorted(here.iterdir())
-            if file.suffix.lower() in SUFFIXES and file.name[0] != "."
-        ]
+        absent = f"no {known} in this folder; dataset.path takes globs such as "
+        absent += "logs/**/*.csv"
+        files = [file for file in here.iterdir() if file.suffix.lower() in SUFFIXES]
+        files = [file for file in files if not file.name.startswith(".")]
     else:
+        absent = "no such file or folder, and no file matches it"
         # A file whose name holds brackets is meant itself, not what it would match.
-        named = [str(here)] if here.is_file() else glob.glob(str(here), recursive=True)
-        files = sorted(file for file in map(Path, named) if file.is_file())
-    if not files and here.is_dir():
-        raise ValueError(
-            f"{path}: no {known} in this folder; "
-            "dataset.path takes globs such as logs/**/*.csv"
-        )
+        named = [here] if here.is_file() else glob.glob(str(here), recursive=True)
+        files = [file for file in map(Path, named) if file.is_file()]
     if not files:
-        raise ValueError(f"{path}: no such file or folder, and no file matches it")
-    if odd := [file for file in files if file.suffix.lower() not in SUFFIXES]:
-        raise ValueError(f"{odd[0]}: unknown kind of log; choose one of {known}")
-    first: dict[str, Path] = {}
-    for file in files:
-        if (same := first.setdefault(digest(file), file)) != file:
+        raise ValueError(f"{path}: {absent}")
+    found: dict[str, Path] = {}
+    for file in sorted(files):
+        if file.suffix.lower() not in SUFFIXES:
+            raise ValueError(f"{file}: unknown kind of log; choose one of {known}")
+        status = file.stat()
+        digest = _digest(file.resolve(), status.st_size, status.st_mtime_ns)
+        if (same := found.setdefault(digest, file)) != file:
             raise ValueError(
                 f"{file}: the same contents as {same}; remove one of them, "
-                "or test drives are trained on"
+                "or test runs are trained on"
             )
-    return files
+    return dict(sorted(found.items()))
 
 
 def fingerprint(path: str) -> str:
@@ -79,72 +170,15 @@ def fingerprint(path: str) -> str:
     Raises:
         ValueError: as for `log_files`.
     """
-    hashes = sorted(map(digest, log_files(path)))
-    return hashlib.sha256("".join(hashes).encode()).hexdigest()
-
-
-def digest(file: Path) -> str:
-    """Return the hash of a file's contents, cached until the file is written again."""
-    status = file.stat()
-    return _digest(file.resolve(), status.st_size, status.st_mtime_ns)
+    return hashlib.sha256("".join(log_files(path)).encode()).hexdigest()
 
 
 @cache
 def _digest(file: Path, size: int, written: int) -> str:
+    """The hash of a file's contents, cached until it is written again."""
     del size, written  # part of the key of the cache
     with open_regular(file) as stream:
-        return hashlib.file_digest(stream, "sha256").hexdigest()
-
-
-@dataclass(frozen=True)
-class Table:
-    """Columns of equal length, as they stand in a file.
-
-    Attributes:
-        source: the file.
-        columns: by name; text where the file holds text.
-        rows: position of each row in the file.
-        row_name: what `rows` counts: "line" (csv, from 1) or "row" (npz and parquet,
-            from 0).
-        decimal: the decimal point of its text.
-        factors: to SI units, by column; 1 if a column is not listed.
-    """
-
-    source: str
-    columns: Mapping[str, Shaped[np.ndarray, " time"]]
-    rows: Int[np.ndarray, " time"]
-    row_name: str = "row"
-    decimal: str = "."
-    factors: Mapping[str, float] = field(default_factory=dict)
-
-    def numbers(self, name: str) -> Float[np.ndarray, " time"]:
-        """Return a column as float64 in SI units; dates become seconds since the first.
-
-        Raises:
-            ValueError: a cell that is not a number.
-        """
-        values, factor = self.columns[name], self.factors.get(name, 1.0)
-        try:
-            if values.dtype.kind == "M":
-                return (values - values[0]) / np.timedelta64(1, "s")
-            if values.dtype.kind in "biufSUO":
-                numbers = values.astype(np.float64)
-                # Without a conversion the very numbers of the file are kept.
-                return numbers if factor == 1.0 else factor * numbers
-        except (TypeError, ValueError, OverflowError):
-            pass
-        self._raise_at(name)
-
-    def _raise_at(self, name: str) -> NoReturn:
-        """Report the first cell of a column that is not a number."""
-        for row, value in zip(self.rows, self.columns[name], strict=True):
-            if not _is_number(value, self.decimal):
-                text = repr(str(value)[:QUOTED]) if str(value).strip() else "empty"
-                raise ValueError(
-                    f"{self.source}, {self.row_name} {row}: {name} is {text}, "
-                    "not a number"
-                )
-        raise ValueError(f"{self.source}: {name} cannot be read as numbers")
+        return hashlib.file_digest(stream, "sha256").hexdigest()  # pyright: ignore
 
 
 def read_csv(file: Path, time: str) -> Table:
@@ -161,7 +195,8 @@ def read_csv(file: Path, time: str) -> Table:
         ValueError: not text, no header, no rows, or rows of another length than the
             header.
     """
-    csv = _pyarrow("csv", file)
+    with _optional("pyarrow", f"{file}: csv files need"):
+        from pyarrow import csv
     lines = _text(file).splitlines()
     filled = [k for k, line in enumerate(lines) if line.strip()]
     if not filled:
@@ -172,9 +207,13 @@ def read_csv(file: Path, time: str) -> Table:
     )
     # numpy writes headers as comments.
     names, between = _cells(lines[header].lstrip("# "))
-    _check_header(f"{file}, line {header + 1}", names)
+    where = f"{file}, line {header + 1}"
+    if all(map(_is_number, names)):
+        raise ValueError(f"{where}: numbers where the names of the columns should be")
+    if twice := [name for k, name in enumerate(names) if name in names[:k]]:
+        raise ValueError(f"{where}: the column {twice[0]} appears twice")
     kept = [k for k in filled if k > header and not lines[k].startswith("#")]
-    if kept and (units := with_unit_row(names, _cells(lines[kept[0]], between)[0])):
+    if kept and (units := _with_units(names, _cells(lines[kept[0]], between)[0])):
         names, kept = units, kept[1:]
     if not kept:
         raise ValueError(f"{file}: no rows below the header")
@@ -184,7 +223,8 @@ def read_csv(file: Path, time: str) -> Table:
         body = [" ".join(line.split()) for line in body]
     text = "\n".join([*body, ""])
     # The first rows may hold whole numbers only, so every line is looked at.
-    comma = between != "," and re.search(rf"(?:^|{between}) *-?\d+,\d", text, re.M)
+    if between != "," and re.search(rf"(?:^|{between}) *-?\d+,\d", text, re.MULTILINE):
+        text = text.replace(",", ".")
     content = text.encode()
     odd: list[Any] = []
 
@@ -203,9 +243,7 @@ def read_csv(file: Path, time: str) -> Table:
                 delimiter=between, invalid_row_handler=skip, newlines_in_values=False
             ),
             # An empty cell is an error with a line, not a number.
-            convert_options=csv.ConvertOptions(
-                null_values=[], decimal_point="," if comma else "."
-            ),
+            convert_options=csv.ConvertOptions(null_values=[]),
         )
     except (ValueError, OverflowError) as reason:
         raise ValueError(f"{file}: not a readable csv file ({reason})") from None
@@ -215,7 +253,7 @@ def read_csv(file: Path, time: str) -> Table:
             f"below a header of {len(names)}"
         )
     columns = {name: held.column(k).to_numpy() for k, name in enumerate(names)}
-    return Table(str(file), columns, rows, "line", "," if comma else ".")
+    return Table(str(file), columns, rows, "line")
 
 
 def _text(file: Path) -> str:
@@ -225,7 +263,7 @@ def _text(file: Path) -> str:
         ValueError: zeros, which no text has.
     """
     with open_regular(file) as stream:
-        content = stream.readall()
+        content = stream.read()
     encoding = "utf-8-sig"
     if content.startswith((codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE)):
         encoding = "utf-16"
@@ -248,18 +286,10 @@ def _cells(line: str, between: str | None = None) -> tuple[list[str], str]:
     return [cell.strip().strip('"').strip() for cell in cells], between
 
 
-def _check_header(where: str, names: list[str]) -> None:
-    """Refuse a header that does not name columns."""
-    if all(map(_is_number, names)):
-        raise ValueError(f"{where}: numbers where the names of the columns should be")
-    if twice := [name for k, name in enumerate(names) if name in names[:k]]:
-        raise ValueError(f"{where}: the column {twice[0]} appears twice")
-
-
-def _is_number(value: Any, decimal: str = ".") -> bool:
+def _is_number(value: Any) -> bool:
     """Whether a cell is a number."""
     try:
-        float(value.replace(decimal, ".") if isinstance(value, str) else value)
+        float(value)
     except (TypeError, ValueError, OverflowError):
         return False
     return True
@@ -272,16 +302,13 @@ def read_npz(file: Path) -> dict[str, Shaped[np.ndarray, ...]]:
         ValueError: damaged, of another kind, with objects, or larger than DECODED bytes
             once inflated.
     """
-
-    def read(stream: io.FileIO) -> dict[str, Shaped[np.ndarray, ...]]:
+    with _opened(file, "npz") as stream:
         with zipfile.ZipFile(stream) as packed:
             _check_decoded(sum(part.file_size for part in packed.infolist()))
         stream.seek(0)
         # Pickles would run code.
         with np.load(stream, allow_pickle=False) as opened:
             return {name: opened[name] for name in opened.files}
-
-    return _guarded(file, "npz", read)
 
 
 def read_parquet(file: Path) -> Table:
@@ -291,50 +318,44 @@ def read_parquet(file: Path) -> Table:
         ValueError: pyarrow is missing, the file is damaged or of another kind, or
             larger than DECODED bytes once decoded.
     """
-    parquet = _pyarrow("parquet", file)
-
-    def read(stream: io.FileIO) -> Any:
-        opened = parquet.ParquetFile(io.BufferedReader(stream))
-        _check_decoded(_declared(opened.metadata))
-        return opened.read()
-
-    held = _guarded(file, "parquet", read)
+    with _optional("pyarrow", f"{file}: parquet files need"):
+        from pyarrow import parquet
+    with _opened(file, "parquet") as stream:
+        opened = parquet.ParquetFile(stream)
+        about = opened.metadata
+        groups = [about.row_group(k) for k in range(about.num_row_groups)]
+        cells = [max(about.num_rows, 0) * about.num_columns]
+        # A hostile file may declare fewer rows in one place than in another.
+        cells += [sum(max(one.num_rows, 0) * one.num_columns for one in groups)]
+        columns = [one.column(k) for one in groups for k in range(one.num_columns)]
+        cells += [sum(max(column.num_values, 0) for column in columns)]
+        pages = sum(max(column.total_uncompressed_size, 0) for column in columns)
+        _check_decoded(max(8 * max(cells), pages))
+        held = opened.read()
     names = held.column_names
     if not held.num_rows:
         raise ValueError(f"{file}: no rows")
     if len(set(names)) < len(names):
         raise ValueError(f"{file}: two columns have one name")
-    columns = {name: held.column(name).to_numpy() for name in names}
-    return Table(str(file), columns, np.arange(held.num_rows))
+    arrays = {name: held.column(name).to_numpy() for name in names}
+    return Table(str(file), arrays, np.arange(held.num_rows))
 
 
-def _pyarrow(module: str, file: Path) -> Any:
-    """The csv or parquet module of pyarrow, which is an optional package.
-
-    Raises:
-        ValueError: it is not installed.
-    """
+@contextmanager
+def _optional(package: str, need: str) -> Iterator[None]:
+    """Name the extra of a package that is not installed."""
     try:
-        if module == "csv":
-            from pyarrow import csv as found
-        else:
-            from pyarrow import parquet as found
+        yield
     except ImportError:
-        raise ValueError(
-            f'{file}: {module} files need pyarrow: pip install "sfkd-jax[train]"'
-        ) from None
-    return found
+        raise ValueError(f'{need} {package}: pip install "sfkd-jax[train]"') from None
 
 
-def _guarded(file: Path, kind: str, read: Callable[[io.FileIO], Any]) -> Any:
-    """Read a file; a damaged one is one line, whatever the library raises.
-
-    Raises:
-        ValueError: the file cannot be read.
-    """
+@contextmanager
+def _opened(file: Path, kind: str) -> Iterator[BinaryIO]:
+    """Open a file; a damaged one is one line, whatever its library raises."""
     with open_regular(file) as stream:
         try:
-            return read(stream)
+            yield stream
         except Exception as reason:  # a damaged file raises nearly anything
             first = (str(reason).splitlines() or [type(reason).__name__])[0]
             raise ValueError(f"{file}: not a readable {kind} file ({first})") from None
@@ -348,13 +369,119 @@ def _check_decoded(size: int) -> None:
         )
 
 
-def _declared(about: Any) -> int:
-    """Decoded size that a parquet file declares, by its values and pages [bytes]."""
-    groups = [about.row_group(k) for k in range(about.num_row_groups)]
-    columns = [group.column(k) for group in groups for k in range(group.num_columns)]
-    values = sum(max(column.num_values, 0) for column in columns)
-    rows = sum(max(group.num_rows, 0) * group.num_columns for group in groups)
-    pages = sum(max(column.total_uncompressed_size, 0) for column in columns)
-    return max(
-        8 * values, 8 * rows, 8 * max(about.num_rows, 0) * about.num_columns, pages
-    )
+def find_column(
+    name: str, headers: Collection[str], dimension: str | None
+) -> Match | None:
+    """Find the column of a file that a configured name stands for.
+
+    A column of exactly this name comes first, then one that has a unit behind it. A
+    configured name that holds the unit itself is converted if the unit is known.
+
+    Args:
+        name: as configured.
+        headers: of the file.
+        dimension: of `DIMENSIONS` that the column must have; None for any.
+
+    Returns:
+        The match, or None where there is no such column.
+
+    Raises:
+        ValueError: an unknown unit, one of another dimension, or two such columns.
+    """
+    exact, fitting = name in headers, [name]
+    if not exact:
+        fitting = [one for one in headers if name_of(one) == name != one.strip()]
+    if len(fitting) > 1:
+        raise ValueError(
+            f"columns {' and '.join(fitting)} both fit {name}; configure one in full"
+        )
+    if not fitting:
+        return None
+    (header,) = fitting
+    _, symbol = split_unit(header)
+    unit = None if symbol is None else find_unit(symbol)
+    if unit is None:
+        if exact:
+            return Match(name)
+        raise ValueError(
+            f"unknown unit {symbol!r} of column {header}; "
+            "configure the name in full to read it without a conversion"
+        )
+    known, factor = unit
+    if dimension not in (None, known):
+        raise ValueError(
+            f"column {header} has a unit of {known}, {dimension} is needed"
+        )
+    if factor == 1.0:
+        return Match(header)
+    return Match(header, factor, f"{header} to {DIMENSIONS[known]} (x {factor:.6g})")
+
+
+@cache
+def find_unit(symbol: str) -> tuple[str, float] | None:
+    """Return the dimension of a unit and its factor to SI; None if it is unknown.
+
+    Args:
+        symbol: as written; small letters are tried second.
+    """
+    for spelling in (symbol, symbol.lower()):
+        written = SPELLINGS.get(spelling, spelling)
+        if not WRITTEN.fullmatch(written) and written != "standard_gravity":
+            continue
+        # m/s2 means m/s^2.
+        power = re.sub(r"(?<=[A-Za-z])([1-4])", r"^\1", written).replace("·", "*")
+        units, dimensions = _registry()
+        try:
+            factor, base = units.get_base_units(units.parse_units(power))
+        except Exception:  # of pint's parser, nearly anything
+            continue
+        if str(base) in dimensions:
+            return dimensions[str(base)], float(factor)
+    return None
+
+
+@cache
+def _registry() -> tuple[Any, dict[str, str]]:
+    """Pint's units, and the dimension of every SI unit in base units.
+
+    Raises:
+        ValueError: pint is not installed.
+    """
+    with _optional("pint", "units in column names need"):
+        import pint
+    units = pint.UnitRegistry()
+    bases = {
+        dimension: units.parse_units(SPELLINGS.get(symbol, symbol))
+        for dimension, symbol in DIMENSIONS.items()
+    }
+    return units, {str(units.get_base_units(base)[1]): d for d, base in bases.items()}
+
+
+def split_unit(header: str) -> tuple[str, str | None]:
+    """Split "x(m)" or "x [m]" into name and unit; the unit is None without one."""
+    parts = re.fullmatch(r"(.*?\S)\s*(?:\(([^()]*)\)|\[([^\[\]]*)\])", header.strip())
+    if parts is None:
+        return header, None
+    name, round_, square = parts.groups()
+    return name, (round_ if square is None else square).strip()
+
+
+def name_of(header: str) -> str:
+    """Return the name of a column without its unit."""
+    return split_unit(header)[0]
+
+
+def _with_units(names: list[str], cells: list[str]) -> list[str] | None:
+    """Names with the units of the line below them; None if that line has none."""
+    symbols = [cell.strip("()[] ") for cell in cells]
+    # A row of data has numbers; "1" and "-" alone do not make a line of units.
+    if len(cells) != len(names) or any(symbol[:1].isdigit() for symbol in symbols):
+        return None
+    if not all(symbol == "" or find_unit(symbol) for symbol in symbols):
+        return None
+    if not any(symbol.strip("-") for symbol in symbols):
+        return None
+    return [
+        f"{name} [{symbol}]" if symbol and split_unit(name)[1] is None else name
+        for name, symbol in zip(names, symbols, strict=True)
+    ]

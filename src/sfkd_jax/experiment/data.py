@@ -15,6 +15,7 @@ import numpy as np
 from sfkd_jax import build, store
 from sfkd_jax.control import PathLaw, law_from_arrays
 from sfkd_jax.data import (
+    PARTS,
     SCENARIOS,
     Columns,
     Dataset,
@@ -24,10 +25,7 @@ from sfkd_jax.data import (
     from_logs,
     generate,
     generate_along_path,
-    generate_s3_along_path,
-    generate_switching,
     segment_scenarios,
-    segment_scenarios_along_path,
     split,
 )
 from sfkd_jax.experiment.options import LogSettings, Settings
@@ -36,7 +34,6 @@ from sfkd_jax.settings import arguments, plain
 from sfkd_jax.types import BODY, Key, Trajectory
 
 DATASET, LAW = "dataset", "law"
-PARTS = Dataset._fields[:4]
 SWITCHING = 2
 """Stream folded into the data set's seed; simulation and split use streams 0 and 1."""
 
@@ -99,17 +96,17 @@ def _simulate(settings: Settings) -> Dataset:
     drive_key, split_key = jax.random.split(jax.random.key(options.seed))
     store.print_message(f"generating {options.segments} segments")
     trajectories = jax.jit(_generator(settings))(drive_key)
-    labels = segment_scenarios
-    if settings.along_path:
+    along_path = bool(settings.along_path)
+    if along_path:
         check_on_path(trajectories)
-        labels = segment_scenarios_along_path
+    labels = segment_scenarios(options.segments, along_path=along_path)
     return split(
         trajectories,
         split_key,
         shares=options.shares,
         env_low=jnp.asarray(settings.environment.low),
         env_high=jnp.asarray(settings.environment.high),
-        scenarios=jnp.asarray(labels(options.segments)),
+        scenarios=jnp.asarray(labels),
     )
 
 
@@ -117,18 +114,14 @@ def _generator(
     settings: Settings, *, switching: bool = False, **changes: int
 ) -> Callable[[Key], Trajectory]:
     """Return key -> the runs of a data set, or as many under the switching of S3."""
-    make: Any
+    changes["held_out"] = switching
     if settings.along_path:
-        loop = closed_loop(settings)
         options = arguments(settings.dataset, generate_along_path) | changes
-        if switching:
-            return partial(generate_s3_along_path, loop, **options)
         box: Any = settings.environment.box
-        return partial(generate_along_path, loop, **options, **box)
+        return partial(generate_along_path, closed_loop(settings), **options, **box)
     plant = build.build_vehicle(settings.vehicle)
-    make = generate_switching if switching else generate
-    options = arguments(settings.dataset, make) | changes
-    return partial(make, plant, build.build_driver(plant), **options)
+    options = arguments(settings.dataset, generate) | changes
+    return partial(generate, plant, build.build_driver(plant), **options)
 
 
 def _read_logs(settings: Settings, logs: LogSettings) -> Dataset:
@@ -168,8 +161,8 @@ def write(settings: Settings, dataset: Dataset) -> None:
         for part in PARTS
         for name, leaf in getattr(dataset, part)._asdict().items()
     }
-    if dataset.drives is not None:
-        arrays["drives"] = [dataset.drives[part] for part in PARTS]
+    if dataset.runs is not None:
+        arrays["runs"] = [dataset.runs[part] for part in PARTS]
     if dataset.scenarios is not None:
         labels = dataset.scenarios
         arrays |= {f"{part}/scenario": labels[part] for part in PARTS}
@@ -199,11 +192,11 @@ def read(settings: Settings) -> tuple[Dataset, str]:
     # Over all parts: E does not depend on how they were split.
     envs = np.concatenate([np.asarray(part.envs) for part in parts])
     low, high = environment_box(envs, *settings.environment.box.values())
-    drives = None
-    if (counts := arrays.get("drives")) is not None:
-        drives = dict(zip(PARTS, map(int, counts), strict=True))
+    runs = None
+    if (counts := arrays.get("runs")) is not None:
+        runs = dict(zip(PARTS, map(int, counts), strict=True))
     dataset = Dataset(
-        *parts, env_low=low, env_high=high, drives=drives, scenarios=scenarios
+        *parts, env_low=low, env_high=high, runs=runs, scenarios=scenarios
     )
     return dataset, manifest["sha256"]
 

@@ -89,14 +89,14 @@ class DatasetSettings:
         return AlongPathSettings if "law" in values else SimulatedSettings
 
 
-@takes(data.generate)
+@takes(data.generate, skip=("held_out",))
 class SimulatedSettings(DatasetSettings):
     """Simulated data; the other fields are arguments of the generator."""
 
     segments: Segments = 8000
 
 
-@takes(data.generate_along_path, skip=_BOX, law=LawSettings)
+@takes(data.generate_along_path, skip=("held_out", *_BOX), law=LawSettings)
 class AlongPathSettings(DatasetSettings):
     """Simulated data in path coordinates, around a law."""
 

@@ -35,7 +35,7 @@ from sfkd_jax.settings import arguments, choose, plain
 from sfkd_jax.training import Loss, fit, multi_step_loss
 from sfkd_jax.types import Key, Model, Params, Space, Trajectory
 
-SCORED_SCENARIOS = ("s1", "s2")
+SCORED_SCENARIOS = ("uniform", "wet")
 """Of the validation runs that trainings are compared on: S3 stays unseen."""
 
 
@@ -320,7 +320,7 @@ def _certify_tubes(settings: Settings, trained: policy.TrainedModel) -> dict[str
         calibration=dataset.calibration,
         held_out=data.held_out_parts(settings, dataset),
         boxes=boxes,
-        runs=dataset.drives,
+        runs=dataset.runs,
         **arguments(options, issue),
     )
     # Logs have no plant to drive: a corridor needs runs under known conditions.

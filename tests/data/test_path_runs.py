@@ -1,0 +1,115 @@
+"""Runs in path coordinates: within their limits, everywhere in E, and the same
+as logs of the world.
+"""
+
+from functools import partial
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from helpers import ENV_HIGH, ENV_LOW, any_law
+
+from sfkd_jax import plants
+from sfkd_jax.data import (
+    check_on_path,
+    generate_along_path,
+    to_path,
+)
+from sfkd_jax.scenarios import path_from_curvature
+from sfkd_jax.types import BODY, POSE, Trajectory
+
+PLANT = plants.kinematic()
+LAW = any_law()
+LOOP = plants.along_path(PLANT, LAW)
+BOX = {"env_low": ENV_LOW, "env_high": ENV_HIGH}
+
+
+@pytest.fixture(scope="module")
+def runs():
+    return jax.jit(partial(generate_along_path, LOOP, segments=64, steps=30, **BOX))(
+        jax.random.key(3)
+    )
+
+
+def test_roads_speeds_and_perturbations_are_as_asked(runs):
+    nu, curvature, speed = (
+        runs.controls[..., :2],
+        runs.controls[..., 2],
+        runs.controls[..., 3],
+    )
+    assert runs.states.shape == (64, 31, 6)
+    assert runs.controls.shape == (64, 30, 4)
+    assert not np.any(np.asarray(runs.states[..., POSE]))
+    assert np.all(np.abs(curvature) <= 0.02 + 1e-6)
+    assert np.all((speed >= 8.0) & (speed <= 10.5))
+    assert np.all(np.abs(curvature) * speed**2 <= 2.0 + 1e-4)
+    assert np.all(np.abs(nu) <= np.asarray(LOOP.control_high[:2]) + 1e-6)
+    assert np.ptp(speed, axis=1).max() > 0.2
+
+
+def test_a_quarter_of_the_environments_is_held_another_switches_and_both_reach_the_corners(
+    runs,
+):
+    held = runs.envs[32:]
+    assert np.all(held[:16] == held[:16, :1])
+    jumps = np.any(np.diff(held[16:], axis=1) != 0, axis=2)
+    for run in jumps:
+        assert np.all(np.diff(np.flatnonzero(run)) >= 14)  # 1.5 s, less a step
+    ends = (held[:, 0] <= np.asarray(ENV_LOW)) | (held[:, 0] >= np.asarray(ENV_HIGH))
+    assert 0.0 < np.mean(np.all(ends, axis=1)) < 0.35  # of 32, a ninth in the mean
+
+
+def test_every_step_is_one_of_the_loop(runs):
+    batch = jax.vmap(jax.vmap(LOOP.step))
+    expected = batch(runs.states[:, :-1], runs.controls, runs.envs)
+    np.testing.assert_allclose(expected, runs.states[:, 1:], atol=1e-5)
+
+
+def test_held_out_runs_keep_the_levels_of_s3():
+    make = partial(generate_along_path, LOOP, segments=4, steps=40, **BOX)
+    s3 = jax.jit(partial(make, held_out=True))(jax.random.key(0))
+    levels = np.asarray(s3.envs)[..., :1] - [0.3, 0.6, 0.9]
+    assert np.all(np.min(np.abs(levels), axis=-1) < 1e-6)
+
+
+def test_runs_that_left_their_path_are_refused(runs):
+    check_on_path(runs)
+    lost = runs._replace(states=runs.states.at[5, 3, BODY.start].set(60.0))
+    lost = lost._replace(controls=lost.controls.at[5, 3, 2].set(0.02))
+    with pytest.raises(ValueError, match="1 of 64 runs left their path"):
+        check_on_path(lost)
+
+
+def test_a_run_in_the_world_converts_to_path_coordinates():
+    """Driven by law + ν on its own projection: ν comes out again, and a loop step
+    explains every step.
+    """
+    path = path_from_curvature(0.015 * jnp.sin(0.5 * jnp.arange(300) / 25), spacing=0.5)
+    env, speed = jnp.asarray([0.8, 1.0]), jnp.asarray(9.0)
+    key = jax.random.key(0)
+    added = jnp.asarray([0.01, 0.2]) * jax.random.normal(key, (80, 2))
+
+    def step(world, nu):
+        one = to_path(
+            Trajectory(jnp.stack([world, world]), jnp.zeros((1, 2)), env[None]),
+            path,
+            LAW,
+            speed[None],
+        )
+        control = nu - one.controls[0, :2]
+        return PLANT.step(world, control, env), (world, control)
+
+    last, (states, controls) = jax.jit(partial(jax.lax.scan, step))(
+        jnp.asarray([5.0, 0.1, 0.0, 9.0]), added
+    )
+    driven = Trajectory(
+        jnp.concatenate([states, last[None]]), controls, jnp.tile(env, (80, 1))
+    )
+    along = jax.jit(lambda driven: to_path(driven, path, LAW, jnp.full(80, 9.0)))(
+        driven
+    )
+    np.testing.assert_allclose(along.controls[:, :2], added, atol=2e-3)
+    after = jax.vmap(LOOP.step)(along.states[:-1], along.controls, along.envs)
+    np.testing.assert_allclose(after[:, 3:], along.states[1:, 3:], atol=2e-3)
+    check_on_path(jax.tree.map(lambda leaf: leaf[None], along))
