@@ -138,7 +138,7 @@ def test_what_logs_cannot_support_is_refused_before_a_run_is_begun(logs, monkeyp
         ValueError,
         match="vehicle=own is known from logs alone, so it cannot be simulated",
     ):
-        evaluate.run(settings(*SMALL, "name=other"))
+        evaluate.run(settings(*SMALL, *FAST, "name=other"))
     assert not (logs.parent / "runs" / "other").exists()
 
 
