@@ -7,7 +7,6 @@ is a `Preview`. `along_reference` turns it into one that sees poses in the world
 from __future__ import annotations
 
 from dataclasses import KW_ONLY, dataclass
-from functools import cached_property
 from typing import Any, NamedTuple
 
 import jax
@@ -19,15 +18,12 @@ from sfkd_jax.control.laws._feedback import PathErrors
 from sfkd_jax.control.laws._path_law import PathLaw
 from sfkd_jax.control.laws._steady_turn import SteadyTurn
 from sfkd_jax.control.planners._planner import all_finite
-from sfkd_jax.control.tasks._path_tracking import Cost, StageInputs, check_path
+from sfkd_jax.control.tasks._path_tracking import LawTask, StageInputs, check_path
 from sfkd_jax.control.tasks._task import (
-    Limiter,
     PlanningStart,
     RolloutSetup,
     StepIndex,
     StepResult,
-    Task,
-    actuator_limits,
 )
 from sfkd_jax.geometry import (
     HEADING,
@@ -38,7 +34,6 @@ from sfkd_jax.geometry import (
     path_coordinates,
     path_state,
 )
-from sfkd_jax.ranges import Positive
 from sfkd_jax.rollout import fold
 from sfkd_jax.types import (
     BODY,
@@ -47,7 +42,6 @@ from sfkd_jax.types import (
     ControllerInfo,
     Environment,
     Key,
-    Model,
     Params,
     Reference,
     State,
@@ -159,7 +153,7 @@ class AlongTarget(NamedTuple):
 
 
 @dataclass(frozen=True, eq=False)
-class FollowingLaw:
+class FollowingLaw(LawTask):
     """The task of following a path with a model of the closed loop.
 
         ξ_{k+1} = F(ξ_k, (ν_k, κ_k, v_k); e),   u_k = limit(law(ξ_k; κ_k, v_k, e) + ν_k)
@@ -170,29 +164,14 @@ class FollowingLaw:
     `law.perturbation`, as it did in the training data.
 
     Attributes:
-        model: of the closed loop, with `along_path`.
-        cost: ℓ, see `tracking_cost`.
-        law: the one that the model was learned around.
-        dt: sampling period [s].
-        control_low: lower control limits.
-        control_high: upper control limits.
-        control_rate: largest change of a control per second, or None.
-        terminal_weight: w_T, added to the weight of the last step.
+        law: the one that the model was learned around. All others are those of
+            `LawTask`, the model in path coordinates.
 
     Raises:
-        ValueError: the model is not in path coordinates, or the limits are
-            inconsistent, see `actuator_limits`.
+        ValueError: the model is not in path coordinates.
     """
 
-    model: Model
-    cost: Cost
     law: PathLaw
-    _: KW_ONLY
-    dt: float
-    control_low: tuple[float, ...]
-    control_high: tuple[float, ...]
-    control_rate: tuple[Positive, ...] | None = None
-    terminal_weight: float = 1.0
 
     def __post_init__(self) -> None:
         if not self.model.along_path:
@@ -200,24 +179,7 @@ class FollowingLaw:
                 "controller.sampling=law needs a model in path coordinates: "
                 "model.frame=path"
             )
-        _ = self.limit
-
-    def task(self) -> Task:
-        """Return the planning problem as functions."""
-        low, high = self.box()
-        return Task(low, high, self.cost.weights, self.prepare, self.step, _check)
-
-    def box(self) -> tuple[Control, Control]:
-        """Return the lower and upper control limits."""
-        low, high = self.control_low, self.control_high
-        return jnp.asarray(low, dtype=float), jnp.asarray(high, dtype=float)
-
-    @cached_property
-    def limit(self) -> Limiter:
-        """The projection onto the limits of the actuators."""
-        return actuator_limits(
-            self.control_low, self.control_high, self.control_rate, self.dt
-        )
+        super().__post_init__()
 
     def prepare(
         self,
@@ -270,7 +232,7 @@ class FollowingLaw:
         return StepResult(sample, cost, control, effective, coordinates)
 
 
-following_law = factory(FollowingLaw, FollowingLaw.task)
+following_law = factory(FollowingLaw, lambda around: around.task(_check))
 """(model, cost, law, settings of `FollowingLaw`) -> `Task`."""
 
 

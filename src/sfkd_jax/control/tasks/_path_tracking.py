@@ -154,17 +154,14 @@ class PathTarget(NamedTuple):
 
 
 @dataclass(frozen=True, eq=False)
-class PathTracking:
-    """The task of tracking a path around a feedback law on the predicted state.
-
-        u_k = limit(clip(u_ff(κ_k) + K ξ_k) + ν_k)
-        J = Σ_k ℓ(x_k, u_k) + w_T ℓ(x_T, u_T)
+class LawTask:
+    """A task of following a path around a feedback law; a subclass rolls it out.
 
     Attributes:
         model: rolled out; `fiber` and `encode` are evaluated once per control step,
             outside the scan over the horizon.
         cost: ℓ, see `tracking_cost`.
-        law: u_ff + K ξ; see `path_feedback`, `ModelLaw` and `no_feedback`.
+        law: what a plan perturbs.
         dt: sampling period [s].
         control_low: lower control limits.
         control_high: upper control limits.
@@ -177,7 +174,7 @@ class PathTracking:
 
     model: Model
     cost: Cost
-    law: FeedbackLaw | ModelLaw
+    law: Any
     _: KW_ONLY
     dt: float
     control_low: tuple[float, ...]
@@ -189,17 +186,15 @@ class PathTracking:
         """Raise a ValueError for inconsistent limits."""
         _ = self.limit
 
-    def task(self) -> Task:
-        """Return the planning problem as functions."""
-        low, high = self.box()
-        return Task(low, high, self.cost.weights, self.prepare, self.step, check_path)
+    def task(self, check: Callable[..., None]) -> Task:
+        """Return the planning problem as functions, of which `check` is the last."""
+        own: Any = self
+        return Task(*self.box(), self.cost.weights, own.prepare, own.step, check)
 
     def box(self) -> tuple[Control, Control]:
         """Return the lower and upper control limits."""
-        return (
-            jnp.asarray(self.control_low, dtype=float),
-            jnp.asarray(self.control_high, dtype=float),
-        )
+        low, high = self.control_low, self.control_high
+        return jnp.asarray(low, dtype=float), jnp.asarray(high, dtype=float)
 
     @cached_property
     def limit(self) -> Limiter:
@@ -207,6 +202,21 @@ class PathTracking:
         return actuator_limits(
             self.control_low, self.control_high, self.control_rate, self.dt
         )
+
+
+@dataclass(frozen=True, eq=False)
+class PathTracking(LawTask):
+    """The task of tracking a path around a feedback law on the predicted state.
+
+        u_k = limit(clip(u_ff(κ_k) + K ξ_k) + ν_k)
+        J = Σ_k ℓ(x_k, u_k) + w_T ℓ(x_T, u_T)
+
+    Attributes:
+        law: u_ff + K ξ; see `path_feedback`, `ModelLaw` and `no_feedback`. All others
+            are those of `LawTask`.
+    """
+
+    law: FeedbackLaw | ModelLaw
 
     def prepare(
         self,
@@ -271,7 +281,7 @@ class PathTracking:
         return jnp.clip(control, *self.box())
 
 
-path_tracking = factory(PathTracking, PathTracking.task)
+path_tracking = factory(PathTracking, lambda around: around.task(check_path))
 """(model, cost, law, settings of `PathTracking`) -> `Task`."""
 
 
