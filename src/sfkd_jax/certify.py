@@ -13,11 +13,6 @@ from sfkd_jax.experiment import runs, stages
 from sfkd_jax.experiment.command import hydra_command
 from sfkd_jax.experiment.options import Settings
 
-SECONDS = 2.3e-5
-"""Training time on two cores per step, segment of the batch and time step of the
-window, measured with +experiment=s3.
-"""
-
 
 @runs.exclusive
 def run(settings: Settings) -> dict[str, Any]:
@@ -28,8 +23,6 @@ def run(settings: Settings) -> dict[str, Any]:
             `certification.renew` is false.
         CertificationRefused: nothing could be certified.
     """
-    if not runs.policy_path(settings).is_file():
-        store.print_message(_announcement(settings))
     trained = stages.ensure_policy(settings)
     path = stages.certificate_path(settings.run_dir)
     if path.exists() and not settings.certification.renew:
@@ -46,18 +39,6 @@ def run(settings: Settings) -> dict[str, Any]:
     keys = ("valid", "alpha", "alpha_separate", "rho", "beta", "tightness", "seconds")
     summary = {"certificate": str(path), "reason": None, "d_bar": d_bar}
     return summary | {key: document.get(key) for key in keys}
-
-
-def _announcement(settings: Settings) -> str:
-    """Return what happens before the certification of a policy that is not trained."""
-    options = settings.training
-    steps = options.steps
-    seconds = SECONDS * steps * options.batch * options.window
-    return (
-        f"{settings.run_dir} holds no trained policy: "
-        f"{settings.model.system} is trained first, at most {steps} steps, "
-        f"about {max(1, round(seconds / 60))} min on two cores; then it is certified"
-    )
 
 
 if __name__ == "__main__":

@@ -92,21 +92,15 @@ def _backend_seconds() -> float:
     Raises:
         ValueError: it fails, or its result is wrong.
     """
-    began, size = time.perf_counter(), 32
-    permutation = jnp.roll(jnp.eye(size), 1, axis=0)
-
-    @jax.jit
-    def rotate(start: jax.Array) -> jax.Array:
-        return jax.lax.scan(
-            lambda state, _: (permutation @ state, None), start, None, length=size
-        )[0]
-
-    start, where = jnp.arange(size, dtype=jnp.float32), jax.default_backend()
+    began, start = time.perf_counter(), jnp.arange(32.0)
+    turn = jnp.roll(jnp.eye(len(start)), 1, axis=0)
+    rotate = jax.jit(lambda x: jax.lax.scan(lambda x, _: (turn @ x, None), x, start)[0])
+    where = jax.default_backend()
     try:
+        # As many turns as there are entries lead back to the start.
         right = bool(jnp.all(rotate(start) == start))
     except Exception as failure:
         raise ValueError(f"jax cannot compute on {where}: {failure}") from failure
-    # As many turns as there are entries lead back to the start.
     if not right:
         raise ValueError(f"jax computes wrongly on {where}: a full turn moves entries")
     return time.perf_counter() - began

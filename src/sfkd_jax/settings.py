@@ -34,10 +34,6 @@ class BelowRoot:
     """Annotates a setting that becomes a directory below `root`."""
 
 
-class FileNames:
-    """Annotates a mapping whose keys become names of files."""
-
-
 class OneOf(tuple[str, ...]):
     """Annotates a word of which there are only these."""
 
@@ -215,10 +211,8 @@ def _checked(name: str, value: Any, hint: Any, *marks: Any) -> Any:
         return origin(_sequence(name, value, parts, marks))
     if origin is dict and isinstance(value, Mapping):
         for key in value:
-            # The key becomes a directory, with spaces replaced.
-            if any(isinstance(mark, FileNames) for mark in marks) and not _is_below(
-                "_".join(str(key).split())
-            ):
+            # A key may become a directory, with spaces replaced.
+            if not _is_below("_".join(str(key).split())):
                 raise ValueError(
                     f"{name} must have keys that are names of files, got {key!r}"
                 )

@@ -88,31 +88,6 @@ def test_other_settings_in_the_same_run_directory_are_refused(smoke):
     assert len(done.stderr.strip().splitlines()) == 1
 
 
-def test_load_gives_a_policy_without_heavy_imports(smoke):
-    directory, document = smoke
-    program = f"""
-        import sys, jax, jax.numpy as jnp, sfkd_jax
-        policy = sfkd_jax.load({document["run"]!r})
-        assert not {{"hydra", "orbax", "cvxpy", "matplotlib", "optax"}} & set(sys.modules), "heavy import"
-        state = policy.controller.init(jax.random.key(0))
-        road = jnp.stack([jnp.arange(1.0, 21.0), jnp.zeros(20), jnp.zeros(20), jnp.full(20, 10.0)], axis=1)
-        env = jnp.array([0.9, 0.0])
-        act = jax.jit(policy.controller.act)
-        control, state, info = act(policy.params, state, jnp.array([0.0, 0.3, 0.0, 10.0]), env, road)
-        assert control.shape == (2,) and bool(info["healthy"]) and policy.certificate["valid"]
-        from sfkd_jax.certification import Certificate, verify
-        verify(Certificate.from_document(policy.certificate), policy.params, model=policy.model)
-        assert "cvxpy" not in sys.modules
-    """
-    done = subprocess.run(
-        [sys.executable, "-c", textwrap.dedent(program)],
-        cwd=directory,
-        capture_output=True,
-        text=True,
-    )
-    assert done.returncode == 0, done.stderr
-
-
 def test_certify_exits_0_then_3_when_weights_changed_then_0_when_renewed(copied):
     assert last_line(run_command("certify", "+experiment=smoke", cwd=copied))["valid"]
     file = copied / "runs/smoke/sfkd/seed=0/policy.safetensors"
@@ -251,17 +226,3 @@ def test_the_same_command_again_trains_nothing_and_another_run_compiles_nothing(
     counted = last_line(done)
     assert counted["cache_hits"] > 50
     assert counted["cache_misses"] <= 5
-
-
-@pytest.mark.parametrize(
-    ("arguments", "says"),
-    [
-        (("evaluation.systems=[oracel]",), "oracle"),
-        (("training.batch=0",), "training.batch must be in [1, inf), got 0"),
-    ],
-)
-def test_bad_input_gives_one_line_with_the_choices(smoke, arguments, says):
-    name = "evaluate" if "systems" in arguments[-1] else "train"
-    done = run_command(name, "+experiment=smoke", *arguments, cwd=smoke[0], code=1)
-    assert says in done.stderr
-    assert len(done.stderr.strip().splitlines()) == 1

@@ -209,15 +209,6 @@ def test_an_unfinished_comparison_marks_no_more_than_the_finished_one(tmp_path):
     assert beside["p_holm"] == pytest.approx(10 * alone["p"])
 
 
-def test_an_error_that_is_not_finite_is_shown_and_does_not_hide_other_rows(tmp_path):
-    entries = {label: row(label, level, 0) for label, level in LEVELS.items()}
-    entries["icode"]["rmse_episodes_m"] = [3.0, None]  # as NaN is stored
-    found = collected(tmp_path, entries)
-    assert found["sfkd"]["rmse_episodes_m"] == [1.0, 2.0]
-    assert np.isnan(found["icode"]["difference_to_sfkd"]["mean"])
-    assert "p_holm" not in found["icode"]["difference_to_sfkd"]
-
-
 def test_compare_drives_every_row_names_those_that_fail_and_goes_on(tmp_path):
     small = ("training.steps=75", "training.save_every=75", "dataset.segments=200")
     asked = (

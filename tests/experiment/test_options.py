@@ -40,9 +40,12 @@ def test_every_model_builds_and_names_its_system(option):
     build.build_model(chosen, space(), plants.kinematic())
 
 
-@pytest.mark.parametrize("vehicle", of("vehicle"))
-@pytest.mark.parametrize("controller", of("controller"))
-def test_every_controller_builds_for_every_vehicle(vehicle, controller):
+@pytest.mark.parametrize(
+    ("vehicle", "controller"),
+    [(vehicle, "mppi_path") for vehicle in of("vehicle")]
+    + [("dynamic", controller) for controller in of("controller")],
+)
+def test_every_controller_builds_on_every_vehicle(vehicle, controller):
     limits = LIMITS if vehicle == "own" else ()
     chosen = settings(f"vehicle={vehicle}", f"controller={controller}", *limits)
     plant = build.build_vehicle(chosen.vehicle)

@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-from dataclasses import field
+from dataclasses import field, is_dataclass
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated, Any, get_type_hints
 
 from hydra.core.config_store import ConfigStore
 from omegaconf import DictConfig, OmegaConf
@@ -31,9 +31,9 @@ from sfkd_jax.ranges import (
     Positive,
     PositiveFraction,
 )
-from sfkd_jax.settings import FileNames, OneOf, Values, parse, replace, schema, takes
+from sfkd_jax.settings import OneOf, Values, parse, replace, schema, takes
 
-Overrides = Annotated[dict[str, str | None], FileNames()]
+Overrides = dict[str, str | None]
 Seconds = Annotated[float, Interval("(2, inf)")]
 """Of an episode; the first two seconds are not scored."""
 _BOX = ("env_low", "env_high")
@@ -217,9 +217,7 @@ class ComparisonSettings:
     controllers: dict[str, Annotated[list[str], Entries(least=0)]] = field(
         default_factory=dict
     )
-    own_controllers: Annotated[dict[str, dict[str, str | None]], FileNames()] = field(
-        default_factory=dict
-    )
+    own_controllers: dict[str, Overrides] = field(default_factory=dict)
     rows: Overrides = field(default_factory=dict)
     untrained: Names = ()
     trained_once: Names = ()
@@ -318,31 +316,26 @@ def parse_settings(values: Values) -> Settings:
 
 def register() -> None:
     """Put the dataclasses of all groups into Hydra's store, as schemas."""
-    groups: dict[str, dict[str, type]] = {
-        "vehicle": {f"{name}_schema": kind for name, kind in build.VEHICLES.items()},
-        "model": {
-            f"{name}_schema": kind for name, kind in build.MODEL_SETTINGS.items()
-        },
-        "controller": {
-            f"{name}_schema": kind for name, kind in build.CONTROLLER_SETTINGS.items()
-        },
+    variants: dict[str, dict[str, type]] = {
+        "vehicle": {**build.VEHICLES},
+        "model": {**build.MODEL_SETTINGS},
+        "controller": {**build.CONTROLLER_SETTINGS},
         "dataset": {
-            "schema": SimulatedSettings,
-            "path_schema": AlongPathSettings,
-            "files_schema": LogSettings,
+            "": SimulatedSettings,
+            "path": AlongPathSettings,
+            "files": LogSettings,
         },
-        "environment": {"schema": EnvironmentSettings},
-        "scenario": {"schema": ScenarioSettings},
-        "training": {"schema": TrainingSettings},
-        "certification": {"schema": CertificationSettings},
-        "evaluation": {"schema": EvaluationSettings},
-        "comparison": {"schema": ComparisonSettings},
-        "export": {"schema": ExportSettings},
     }
-    for group, kinds in groups.items():
-        for name, kind in kinds.items():
-            node = _writable(OmegaConf.structured(kind))
-            ConfigStore.instance().store(group=group, name=name, node=node)
+    for group, hint in get_type_hints(Settings).items():
+        # Of `report` and `demo` the primary config has the values itself.
+        if not is_dataclass(hint) or group in ("report", "demo"):
+            continue
+        for variant, kind in variants.get(group, {"": hint}).items():
+            ConfigStore.instance().store(
+                group=group,
+                name=f"{variant}_schema".removeprefix("_"),
+                node=_writable(OmegaConf.structured(kind)),
+            )
 
 
 def _writable(node: Any) -> Any:
