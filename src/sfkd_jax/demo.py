@@ -34,10 +34,10 @@ def run(settings: Settings) -> dict[str, Any]:
     trained = _load(settings, SHIPPED / shipped)
     protocol = replace(settings.evaluation, **vars(about))
     settings = replace(settings, name="demo", evaluation=protocol)
-    plant = build.build_vehicle(settings.vehicle)
-    episodes = evaluating.make_episodes(settings, plant)
+    episodes = evaluating.make_episodes(settings)
     directory = Path(settings.root) / settings.name
     results = directory / f"{episodes.name}_{shipped}"
+    plant = build.build_vehicle(settings.vehicle)
     references = build.reference_systems(plant, trained.law)
     own = build.System(
         trained.model,
@@ -54,7 +54,7 @@ def run(settings: Settings) -> dict[str, Any]:
             store.print_message(
                 f"driving {about.episodes} x {about.episode_s:.0f} s: {name}"
             )
-            evaluate = evaluating.SystemEvaluation(settings, plant, name, system, None)
+            evaluate = evaluating.SystemEvaluation(settings, name, system, None)
             result, path = evaluate(episodes), results / name
             rows.append(grid.write_cell(path, directory, settings, episodes, result))
         rows, file = evaluation.compare(rows), results / "results.json"

@@ -8,6 +8,7 @@ import shutil
 import subprocess
 import sys
 import textwrap
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -15,6 +16,9 @@ import pytest
 from helpers import last_line, run_command
 
 from sfkd_jax import store
+
+POLICY = "runs/smoke/sfkd/seed=0/policy.safetensors"
+read_policy = partial(store.read_arrays, kind="policy")
 
 
 @pytest.fixture(scope="session")
@@ -37,47 +41,31 @@ def copied(smoke, tmp_path):
 
 def test_train_goes_from_nothing_to_a_report(smoke):
     directory, document = smoke
-    keys = {
-        "run",
-        "checkpoint",
-        "certificate",
-        "results",
-        "report",
-        "open_loop_rmse_m",
-        "alpha",
-        "seconds",
-    }
-    assert set(document) == keys | {"objective"}
+    paths = ("run", "checkpoint", "certificate", "results", "report")
+    assert all((directory / document[name]).exists() for name in paths)
+    numbers = {"open_loop_rmse_m", "alpha", "seconds", "objective"}
+    assert set(document) == {*paths, *numbers}
     assert 0 < document["objective"] < np.inf
-    for name in ("run", "checkpoint", "certificate", "results", "report"):
-        assert (directory / document[name]).exists()
     assert len(document["open_loop_rmse_m"]) == 20
     assert 0.9 < document["alpha"] < 0.996
 
 
-def test_the_certificate_is_about_the_saved_weights(smoke):
+def test_the_certificate_is_about_the_weights_and_the_theorem_is_never_violated(smoke):
     directory, document = smoke
     certificate = json.loads((directory / document["certificate"]).read_text())
-    _, manifest = store.read_arrays(
-        directory / document["run"] / "policy.safetensors", kind="policy"
-    )
+    file = directory / document["run"] / "policy.safetensors"
     assert certificate["valid"]
-    assert certificate["weights_sha256"] == manifest["sha256"]
+    assert certificate["weights_sha256"] == read_policy(file)[1]["sha256"]
     assert len(certificate["tube"]["latent"]) == 20
     assert set(certificate["d_bar"]["by_scenario"]) == {"uniform", "wet", "s3"}
     assert 1.0 <= certificate["tightness"] <= 1.1
-
-
-def test_rows_count_violations_and_the_theorem_is_never_one(smoke):
-    directory, document = smoke
-    rows = {
-        row["system"]: row
+    violations = {
+        row["system"]: row["violation"]
         for row in json.loads((directory / document["results"]).read_text())["rows"]
     }
-    assert rows["sfkd"]["violation"]["v0"] == 0.0
-    assert rows["sfkd"]["violation"]["v1_radius_m"] > 0.0
-    assert rows["nominal"]["violation"]["v0"] is None
-    assert rows["nominal"]["violation"]["v1"] is None
+    assert violations["sfkd"]["v0"] == 0.0
+    assert violations["sfkd"]["v1_radius_m"] > 0.0
+    assert violations["nominal"]["v0"] is violations["nominal"]["v1"] is None
 
 
 def test_other_settings_in_the_same_run_directory_are_refused(smoke):
@@ -90,28 +78,15 @@ def test_other_settings_in_the_same_run_directory_are_refused(smoke):
 
 def test_certify_exits_0_then_3_when_weights_changed_then_0_when_renewed(copied):
     assert last_line(run_command("certify", "+experiment=smoke", cwd=copied))["valid"]
-    file = copied / "runs/smoke/sfkd/seed=0/policy.safetensors"
-    arrays, manifest = store.read_arrays(file, kind="policy")
-    changed = {
-        name: np.asarray(array) * np.float32(1.01) for name, array in arrays.items()
-    }
-    store.write_arrays(
-        file,
-        changed,
-        kind="policy",
-        config=manifest["config"],
-        made_from=manifest["made_from"],
-    )
-    assert (
-        "other weights"
-        in run_command("certify", "+experiment=smoke", cwd=copied, code=3).stderr
-    )
-    renewed = last_line(
-        run_command(
-            "certify", "+experiment=smoke", "certification.renew=true", cwd=copied
-        )
-    )
-    assert renewed["alpha"] < 1.0
+    file = copied / POLICY
+    arrays, manifest = read_policy(file)
+    changed = {name: array * np.float32(1.01) for name, array in arrays.items()}
+    about = {name: manifest[name] for name in ("config", "made_from", "kind")}
+    store.write_arrays(file, changed, **about)
+    stale = run_command("certify", "+experiment=smoke", cwd=copied, code=3)
+    assert "other weights" in stale.stderr
+    options = ("+experiment=smoke", "certification.renew=true")
+    assert last_line(run_command("certify", *options, cwd=copied))["alpha"] < 1.0
 
 
 @pytest.mark.exhaustive
@@ -132,7 +107,7 @@ def test_a_model_without_a_bound_is_evaluated_but_not_certified(smoke):
 
 
 def test_a_damaged_policy_is_named_in_one_line(copied):
-    file = copied / "runs/smoke/sfkd/seed=0/policy.safetensors"
+    file = copied / POLICY
     content = bytearray(file.read_bytes())
     content[len(content) // 2] ^= 0xFF
     file.write_bytes(content)
@@ -144,11 +119,11 @@ def test_a_damaged_policy_is_named_in_one_line(copied):
 
 @pytest.mark.exhaustive
 def test_a_lost_policy_is_finished_again_from_the_checkpoint(copied):
-    file = copied / "runs/smoke/sfkd/seed=0/policy.safetensors"
-    weights = store.read_arrays(file, kind="policy")[1]["sha256"]
+    file = copied / POLICY
+    weights = read_policy(file)[1]["sha256"]
     file.unlink()
     run_command("certify", "+experiment=smoke", cwd=copied)
-    assert store.read_arrays(file, kind="policy")[1]["sha256"] == weights
+    assert read_policy(file)[1]["sha256"] == weights
 
 
 @pytest.mark.exhaustive

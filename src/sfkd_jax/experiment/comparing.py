@@ -12,12 +12,11 @@ from hydra.errors import HydraException
 from jax.errors import JaxRuntimeError
 from omegaconf.errors import OmegaConfBaseException
 
-from sfkd_jax import build, store
+from sfkd_jax import store
 from sfkd_jax.evaluation.metrics import Row
 from sfkd_jax.experiment import command, data, evaluating, grid, runs, stages
 from sfkd_jax.experiment.grid import Cell
 from sfkd_jax.experiment.options import Settings
-from sfkd_jax.plants import Vehicle
 from sfkd_jax.settings import plain, replace
 from sfkd_jax.training import TrainingStopped
 
@@ -111,8 +110,7 @@ class Comparison:
         """Build what the cells of one row need that are not done, without training."""
         checked: set[str] = set()
         for cell, settings, _ in self._pending(group):
-            plant = build.build_vehicle(settings.vehicle)
-            self._make_episodes(settings, plant)
+            self._make_episodes(settings)
             # One check a program: cells that differ in scenario alone build the same.
             key = grid.compilation_key(settings)
             if "self" in settings.evaluation.systems and key not in checked:
@@ -131,12 +129,11 @@ class Comparison:
         done = 0
         for cell, settings, path in self._pending(group):
             run_settings = self._run_settings(cell)
-            plant = build.build_vehicle(settings.vehicle)
-            episodes = self._make_episodes(settings, plant)
+            episodes = self._make_episodes(settings)
             key = grid.compilation_key(run_settings)
             # Compiled once for all scenarios and variations that share a program.
             if key not in evaluations:
-                evaluations[key] = _compile(run_settings, plant)
+                evaluations[key] = _compile(run_settings)
             result = evaluations[key](episodes)
             grid.write_cell(path, self.directory, settings, episodes, result)
             error = 1e3 * result.row["rmse_m"]["mean"]
@@ -162,15 +159,13 @@ class Comparison:
         name = grid.policy_name(cell, comparison, retrained=retrained)
         return replace(settings, name=name)
 
-    def _make_episodes(
-        self, settings: Settings, plant: Vehicle
-    ) -> evaluating.EpisodeSet:
+    def _make_episodes(self, settings: Settings) -> evaluating.EpisodeSet:
         """The episodes of a cell; rows that are compared share them."""
         # Not the controller: rows are paired because they meet the same episodes.
         parts = (settings.vehicle, settings.scenario, settings.environment)
         key = store.sha256(plain([*parts, settings.evaluation]))
         if key not in self._episodes:
-            self._episodes[key] = evaluating.make_episodes(settings, plant)
+            self._episodes[key] = evaluating.make_episodes(settings)
         return self._episodes[key]
 
 
@@ -179,10 +174,10 @@ def _name(group: list[Cell]) -> str:
     return "/".join(map(str, group[0][:4]))
 
 
-def _compile(settings: Settings, plant: Vehicle) -> evaluating.SystemEvaluation:
+def _compile(settings: Settings) -> evaluating.SystemEvaluation:
     """Compile the only system of a row; train and certify it first if it learns."""
     if "self" in settings.evaluation.systems:
         stages.ensure_certificate(settings)
-    ((name, system),) = evaluating.load_systems(settings, plant).items()
+    ((name, system),) = evaluating.load_systems(settings).items()
     dataset, _ = data.ensure_dataset(settings)
-    return evaluating.SystemEvaluation(settings, plant, name, system, dataset)
+    return evaluating.SystemEvaluation(settings, name, system, dataset)

@@ -20,7 +20,7 @@ from sfkd_jax.data import Dataset, to_path
 from sfkd_jax.evaluation.metrics import Row
 from sfkd_jax.experiment import data, runs, stages
 from sfkd_jax.experiment.options import Settings
-from sfkd_jax.plants import Vehicle, check_step
+from sfkd_jax.plants import check_step
 from sfkd_jax.rollout import fold, unfold
 from sfkd_jax.scenarios import Scenario
 from sfkd_jax.settings import arguments, choose, plain
@@ -54,14 +54,14 @@ class SystemResult(NamedTuple):
     arrays: dict[str, np.ndarray]
 
 
-def make_episodes(settings: Settings, plant: Vehicle) -> EpisodeSet:
+def make_episodes(settings: Settings) -> EpisodeSet:
     """Draw the episodes of a scenario; several devices share them evenly.
 
     Raises:
         ValueError: a vehicle that cannot be simulated.
     """
+    plant, protocol = build.build_vehicle(settings.vehicle), settings.evaluation
     check_step(plant)
-    protocol = settings.evaluation
     family = build.build_scenario(settings.scenario, plant, duration=protocol.episode_s)
     sensor = arguments(settings.environment.sensor, evaluation.observed_environment)
 
@@ -124,21 +124,17 @@ def _over_episodes(
     return run_all
 
 
-def load_systems(settings: Settings, plant: Vehicle) -> dict[str, System]:
+def load_systems(settings: Settings) -> dict[str, System]:
     """Return the systems of `evaluation.systems` by name.
 
     "self" is the policy of the run, which is trained if it is missing. With
     `environment.source=estimated` every system that reads e estimates it.
 
-    Args:
-        settings: of the run.
-        plant: the true vehicle.
-
     Raises:
         ValueError: an unknown system.
     """
-    law = data.ensure_law(settings)
-    references = build.reference_systems(plant, law)
+    plant = build.build_vehicle(settings.vehicle)
+    references = build.reference_systems(plant, data.ensure_law(settings))
     systems = {}
     for name in settings.evaluation.systems:
         if name == "self":
@@ -177,7 +173,6 @@ class SystemEvaluation:
     def __init__(
         self,
         settings: Settings,
-        plant: Vehicle,
         name: str,
         system: System,
         dataset: Dataset | None,
@@ -186,12 +181,12 @@ class SystemEvaluation:
 
         Args:
             settings: of the run.
-            plant: the truth.
             name: of the system.
             system: to evaluate.
             dataset: its test part gives the open-loop error, or None for none.
         """
-        self._settings, self._plant = settings, plant
+        self._settings = settings
+        self._plant = plant = build.build_vehicle(settings.vehicle)
         self._timed: list[tuple[float, float] | None] = []
         box: Any = settings.environment.box
         # Of logs the box is measured: their settings have none.
@@ -364,12 +359,8 @@ def evaluate_run(settings: Settings, *, command: str | None = None) -> dict[str,
 
     Rows of other scenarios and controllers in the same run stay.
 
-    Args:
-        settings: of the run.
-        command: that was typed; it is stored with the results.
-
-    Returns:
-        `results`, the path of results.json, and the number of new `rows`.
+    `command`, as it was typed, is stored with the results. Returns the path of
+    results.json and the number of new rows.
 
     Raises:
         ValueError: settings that cannot be built, or a vehicle that cannot be
@@ -377,18 +368,17 @@ def evaluate_run(settings: Settings, *, command: str | None = None) -> dict[str,
         ArtefactError: the earlier results are damaged.
     """
     began, protocol = time.perf_counter(), settings.evaluation
-    plant = build.build_vehicle(settings.vehicle)
     # Vehicle and earlier results are checked before anything is trained.
-    episodes = make_episodes(settings, plant)
+    episodes = make_episodes(settings)
     runs.read_results(settings.run_dir)
-    compared = load_systems(settings, plant)
+    compared = load_systems(settings)
     dataset, _ = data.ensure_dataset(settings)
     rows: list[Row] = []
-    arrays: dict[str, Any] = {"dt": plant.dt}
+    arrays: dict[str, Any] = {"dt": settings.vehicle.dt}
     length = f"{protocol.episodes} episodes of {protocol.episode_s:.0f} s"
     for name, system in compared.items():
         store.print_message(f"driving {length}: {name} on {episodes.name}")
-        result = SystemEvaluation(settings, plant, name, system, dataset)(episodes)
+        result = SystemEvaluation(settings, name, system, dataset)(episodes)
         rows.append(result.row)
         # The roads under the same names: a page draws them without the settings.
         road = (episodes.scenarios.envs, episodes.scenarios.path.points)

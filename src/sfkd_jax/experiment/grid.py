@@ -93,10 +93,6 @@ def take_share(
 
     All groups of a row are in one share, because they use the same policy.
 
-    Args:
-        groups: of all cells.
-        share: [k, n], or None for all groups.
-
     Raises:
         ValueError: not 0 ≤ k < n.
     """
@@ -128,10 +124,7 @@ def overrides(cell: Cell, comparison: ComparisonSettings) -> list[str]:
 def policy_name(cell: Cell, comparison: ComparisonSettings, *, retrained: bool) -> str:
     """Return the name of the run that trains the policy of a cell.
 
-    Args:
-        cell: of the comparison.
-        comparison: its settings.
-        retrained: whether the variation changes the training, and so needs its own run.
+    A variation that is `retrained`, with other weights, needs a run of its own.
     """
     parts = [comparison.policies, cell.vehicle, cell.label]
     return "/".join([*parts, _slug(cell.variation)] if retrained else parts)
@@ -236,11 +229,6 @@ def collect_rows(
     """Return the rows of all stored cells, with seeds pooled and systems compared.
 
     Prints how many cells were made with other settings, and how many by other code.
-
-    Args:
-        cells: of the comparison.
-        directory: of the comparison.
-        compose_cell: cell -> its settings.
     """
     pooled: dict[Cell, list[Row]] = {cell._replace(seed=0): [] for cell in cells}
     others, by_other_code = [], []

@@ -89,10 +89,6 @@ def policy_settings(settings: Settings, dataset: Dataset) -> dict[str, Any]:
     """Return the settings to store with a policy, as plain values.
 
     Those of logged data include E, and the limits of controls unless they were given.
-
-    Args:
-        settings: of the run.
-        dataset: that the policy is trained on.
     """
     recorded = identity(settings) | {
         "controller": plain(settings.controller),
@@ -132,7 +128,9 @@ def write_results(
     arrays: Mapping[str, Any],
     seconds: float,
 ) -> Path:
-    """Add rows and episodes to those of a run, also while other processes add theirs.
+    """Add rows and episodes to those of a run, and return the path of results.json.
+
+    Other processes may add theirs at the same time.
 
     Args:
         run_dir: of the run.
@@ -140,9 +138,6 @@ def write_results(
         rows: replace earlier rows of the same identity.
         arrays: by the names of episodes.safetensors.
         seconds: that the evaluation took [s].
-
-    Returns:
-        The path of results.json.
     """
     path, episodes = run_dir / "results.json", run_dir / "episodes.safetensors"
     about = {name: config[name] for name in ("vehicle", "controller", "evaluation")}

@@ -136,13 +136,7 @@ def ensure_policy(settings: Settings) -> policy.TrainedModel:
 
 
 def _train(settings: Settings, dataset: Dataset, data_hash: str) -> None:
-    """Train, then write the best weights and their prediction error on the test part.
-
-    Args:
-        settings: of the run.
-        dataset: all of its parts.
-        data_hash: of the data set.
-    """
+    """Train, then write the best weights and their errors on the test part."""
     run_dir, options = settings.run_dir, settings.training
     recorded = runs.policy_settings(settings, dataset)
     # After the settings are recorded, whose boxes are those of all data.
@@ -347,23 +341,12 @@ def ensure_certificate(settings: Settings) -> None:
 
     A certificate of other settings of the certification is made again.
     """
-    if runs.policy_path(settings).is_file() and _is_certified(settings):
-        # Called all the same: it checks that the policy has these settings.
+    path, recorded = certificate_path(settings.run_dir), None
+    # Another process may be training it.
+    with store.locked(settings.run_dir, wait=True):
+        # Called in any case: it checks that the policy has these settings.
         ensure_policy(settings)
-        return
-    with store.locked(
-        settings.run_dir, wait=True
-    ):  # another process may be training it
-        ensure_policy(settings)
-        # Once more: whoever held the lock may have certified it.
-        if not _is_certified(settings):
+        if path.exists():
+            recorded = store.read_json(path).get("certification", {})
+        if recorded is None or store.differences(recorded, _asked_for(settings)):
             certify_policy(settings)
-
-
-def _is_certified(settings: Settings) -> bool:
-    """Whether there is a certificate or a refusal with these settings."""
-    path = certificate_path(settings.run_dir)
-    if not path.exists():
-        return False
-    recorded = store.read_json(path).get("certification", {})
-    return not store.differences(recorded, _asked_for(settings))
