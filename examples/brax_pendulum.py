@@ -29,11 +29,10 @@ from sfkd_jax.types import BODY, Controller
 
 LOW, HIGH = (0.6,), (1.4,)  # e: gravity, as a share of the Earth's
 LEVELS, HOLD = (1.0, 0.6, 1.4), 3.0  # e while driving, switched every 3 s
-AMPLITUDE, PERIOD = (
-    0.35,
-    5.0,
-)  # the target swings between 0 and twice the amplitude [m], [s]; the rail ends at 1 m
-FALLEN = 0.2  # angle [rad] at which the environment ends an episode
+AMPLITUDE, PERIOD = 0.35, 5.0
+"""The target swings between 0 and twice the amplitude [m], [s]; the rail has 1 m."""
+FALLEN = 0.2
+"""Angle [rad] at which the environment ends an episode."""
 
 
 def upright_gain(plant):
@@ -70,32 +69,25 @@ def under_gain(plant):
     return step
 
 
-def collect(plant, step, gain, drives: int) -> Dataset:
-    """Drives under random v, each with its own gravity."""
-    held, box = (
-        plant._replace(step=partial(step, gain)),
-        {"env_low": LOW, "env_high": HIGH},
-    )
-    options = {"trajectories": drives, "steps": 75, "excitation": 0.22, "memory": 0.97}
-    driven = jax.jit(partial(adapters.collect, held, **options, **box))(
-        jax.random.key(0)
-    )
+def collect(plant, step, gain, runs: int) -> Dataset:
+    """Runs under random v, each with its own gravity."""
+    held = plant._replace(step=partial(step, gain))
+    options = {"trajectories": runs, "steps": 75, "excitation": 0.22, "memory": 0.97}
+    options |= {"env_low": LOW, "env_high": HIGH}
+    collected = jax.jit(partial(adapters.collect, held, **options))(jax.random.key(0))
     corners = {"env_low": jnp.asarray(LOW), "env_high": jnp.asarray(HIGH)}
-    return split(driven, jax.random.key(1), shares=(0.6, 0.1, 0.2, 0.1), **corners)
+    return split(collected, jax.random.key(1), shares=(0.6, 0.1, 0.2, 0.1), **corners)
 
 
 def learn(data: Dataset, steps: int, horizon: int):
     """The model, its weights, and its certificate, checked again from its witnesses."""
-    space = measure_space(data)._replace(
-        increment_scale=jnp.full(3, 1e-6)
-    )  # no pose moves: none is to be learned
+    # No pose moves: none is to be learned.
+    space = measure_space(data)._replace(increment_scale=jnp.full(3, 1e-6))
     model = models.sfkd(
         space, rank=8, vertices=4, residual_hidden=(16,), decoder_hidden=(4,)
     )
-    loss, draw = (
-        multi_step_loss(model, space, consistency=1.0),
-        partial(random_windows, batch=64, length=16),
-    )
+    loss = multi_step_loss(model, space, consistency=1.0)
+    draw = partial(random_windows, batch=64, length=16)
     held_out, key = spread_windows(data.validation, length=16), jax.random.key(2)
     with tempfile.TemporaryDirectory() as run:
         params, _ = fit(
@@ -114,11 +106,7 @@ def learn(data: Dataset, steps: int, horizon: int):
         "calibration": data.calibration,
         "held_out": {"test": data.test},
     }
-    options = {
-        "boxes": {"env": (LOW, HIGH)},
-        "horizon": horizon,
-        "level": 0.9,
-    }
+    options = {"boxes": {"env": (LOW, HIGH)}, "horizon": horizon, "level": 0.9}
     proof = certification.issue(model, params, **splits, **options, attack_starts=0)
     certification.verify(
         certification.Certificate.from_document(proof), params, model=model
@@ -131,9 +119,8 @@ def stage(weights, state, v, v_before, target):
     limit.
     """
     beyond = jnp.maximum(jnp.abs(state[4]) - 0.75 * FALLEN, 0.0)
-    return (
-        100.0 * (state[3] - target) ** 2 + 1e4 * beyond**2 + (v[0] - v_before[0]) ** 2
-    )
+    smooth = (v[0] - v_before[0]) ** 2
+    return 100.0 * (state[3] - target) ** 2 + 1e4 * beyond**2 + smooth
 
 
 def learned_task(model, plant) -> control.Task:
@@ -163,16 +150,13 @@ def gain_alone(dt: float) -> Controller:
     """v = K s_ref, s_ref the target's position and speed: u = -K (s - s_ref)."""
 
     def act(gain, memory, state, env, targets):
-        return (
-            gain @ jnp.stack([targets[0], 0.0, (targets[1] - targets[0]) / dt, 0.0]),
-            memory,
-            {},
-        )
+        wanted = jnp.stack([targets[0], 0.0, (targets[1] - targets[0]) / dt, 0.0])
+        return gain @ wanted, memory, {}
 
     return Controller(lambda key: (), act)
 
 
-def drive(
+def follow(
     controller, params, physics, state, *, dt: float, horizon: int, seconds: float
 ):
     """Follow the target in the environment's physics while gravity switches; did the
@@ -198,18 +182,18 @@ def drive(
 
 def main(
     *,
-    drives: int = 600,
+    runs: int = 600,
     steps: int = 1500,
     samples: int = 256,
     horizon: int = 25,
     seconds: float = 12.0,
 ):
-    """Train, certify, drive: the certificate, and one row for each way of driving."""
+    """Train, certify, control: the certificate, and one row for each controller."""
     plant = adapters.brax_plant(
         envs.get_environment("inverted_pendulum", backend="generalized")
     )
     gain, step = upright_gain(plant), under_gain(plant)
-    model, params, proof = learn(collect(plant, step, gain, drives), steps, horizon)
+    model, params, proof = learn(collect(plant, step, gain, runs), steps, horizon)
     params = jax.jit(partial(fold, model))(params)  # once, not at every step
     tube = proof["tube"]["physical"]["body"]
     print(
@@ -238,24 +222,19 @@ def main(
         for each in (sfkd, true, gain_alone(plant.dt))
     )
 
-    def calm(
-        key,
+    def calm(key):
         # Without the gain the pole forgives little; the noise is data, nothing is
         # compiled again.
-    ):
         memory = true.init(key)
-        return memory._replace(
-            tuning=memory.tuning._replace(noise_std=jnp.asarray([0.06]))
-        )
+        tuning = memory.tuning._replace(noise_std=jnp.asarray([0.06]))
+        return memory._replace(tuning=tuning)
 
-    told_one = sfkd._replace(
-        act=lambda p, memory, x, e, targets: sfkd.act(
-            p, memory, x, jnp.ones(1), targets
-        )
-    )
+    def unaware(params, memory, x, e, targets):
+        return sfkd.act(params, memory, x, jnp.ones(1), targets)
+
     ways = {
         "SFKD": (sfkd, params, gain),
-        "SFKD, told e = 1": (told_one, params, gain),
+        "SFKD, given e = 1": (sfkd._replace(act=unaware), params, gain),
         "true dynamics": (true, gain, gain),
         "gain alone": (alone, gain, gain),
         "true dynamics, no gain": (true._replace(init=calm), 0.0 * gain, 0.0 * gain),
@@ -263,7 +242,7 @@ def main(
     physics, start, rows = jax.jit(step), jax.jit(plant.start)(jax.random.key(3)), {}
     sizes = {"dt": plant.dt, "horizon": horizon, "seconds": seconds}
     for way, (controller, knows, under) in ways.items():
-        row = rows[way] = drive(
+        row = rows[way] = follow(
             controller, knows, partial(physics, under), start, **sizes
         )
         end = "fallen" if row["fallen"] else "upright"

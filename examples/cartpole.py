@@ -52,8 +52,8 @@ def main(samples=512, seconds=5.0, figure=None):
         return (dynamics({}, x, u, None), memory), (x, u)
 
     start = (jnp.asarray([0.0, jnp.pi, 0.0, 0.0]), planner.init(jax.random.key(0)))
-    drive = jax.jit(lambda: jax.lax.scan(step, start, length=round(seconds / DT)))
-    _, (states, forces) = drive()
+    run = jax.jit(lambda: jax.lax.scan(step, start, length=round(seconds / DT)))
+    _, (states, forces) = run()
     if figure:
         import matplotlib.pyplot as plt
 

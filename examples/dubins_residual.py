@@ -74,7 +74,7 @@ def clear_of_the_rocks(rocks, x, u, target, at):
 def main(samples=512, seconds=14.0, figure=None):
     """Of each model, distance to the goal at the end and smallest gap [m].
 
-    Both drives sample with the same key, so that only the model differs.
+    Both runs sample with the same key, so that only the model differs.
     """
     task = control.free_task(dynamics, stage, control_low=LOW, control_high=HIGH)
     planner = control.mppi(
@@ -87,7 +87,7 @@ def main(samples=512, seconds=14.0, figure=None):
     of_training, of_planner = jax.random.split(jax.random.key(0))
 
     @jax.jit
-    def drive(params):
+    def run(params):
         def step(carry, _):
             x, memory = carry
             u, memory, _ = planner.act(params, memory, x, None, None)
@@ -97,7 +97,7 @@ def main(samples=512, seconds=14.0, figure=None):
         start = (jnp.zeros(3), planner.init(of_planner))
         return jax.lax.scan(step, start, length=round(seconds / DT))[1]
 
-    paths = {"nominal": drive(None), "learned": drive(train(of_training))}
+    paths = {"nominal": run(None), "learned": run(train(of_training))}
     if figure:
         import matplotlib.pyplot as plt
 

@@ -56,8 +56,8 @@ def main(count=64, samples=256, seconds=16.0, figure=None):
     start = jnp.stack([-edge, along, jnp.zeros(count)], axis=1)
     memory = jax.vmap(planner.init)(jax.random.split(jax.random.key(0), count))
     steps = round(seconds / DT)
-    drive = jax.jit(lambda: jax.lax.scan(step, (start, memory), length=steps)[1])
-    states = drive()
+    run = jax.jit(lambda: jax.lax.scan(step, (start, memory), length=steps)[1])
+    states = run()
     away = states[:, :, None, :2] - pillars[:, :2]
     gap = jnp.min(jnp.linalg.norm(away, axis=-1) - pillars[:, 2]) - WIDE
     if figure:

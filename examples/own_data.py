@@ -1,7 +1,7 @@
-"""SFKD on your own data: read logged drives, train, certify and plan.
+"""SFKD on your own data: read logged runs, train, certify and plan.
 
-python examples/own_data.py LOGS.npz with arrays x (drive, time + 1, state), u (drive,
-time, control) and e (drive, time, environment); the state begins with position [m] and
+python examples/own_data.py LOGS.npz with arrays x (run, time + 1, state), u (run, time,
+control) and e (run, time, environment); the state begins with position [m] and
 yaw [rad]. Without an argument it logs some first.
 """
 
@@ -22,54 +22,50 @@ from sfkd_jax.data import (
     split,
     spread_windows,
 )
+from sfkd_jax.rollout import rollout
 from sfkd_jax.training import fit, multi_step_loss
 from sfkd_jax.types import Trajectory
 
 DT = 0.1
 
 
-def log_some_drives(path: Path, drives: int) -> None:
-    """Random drives of the robot of `own_vehicle.py`; yours come from a recorder."""
+def log_some_runs(path: Path, runs: int) -> None:
+    """Random runs of the robot of `own_vehicle.py`; yours come from a recorder."""
     from own_vehicle import step
 
-    random, noise = np.random.default_rng(0), np.zeros((drives, 2))
-    x = np.zeros((drives, 51, 5), np.float32)
-    x[:, 0, 3] = random.uniform(1.0, 5.0, drives)
-    u = np.zeros((drives, 50, 2), np.float32)
-    e = np.tile(
-        random.uniform([0.3, -5.0], [0.9, 5.0], (drives, 1, 2)), (1, 50, 1)
-    ).astype(np.float32)
+    random, noise = np.random.default_rng(0), np.zeros((runs, 2))
+    x = np.zeros((runs, 51, 5), np.float32)
+    x[:, 0, 3] = random.uniform(1.0, 5.0, runs)
+    u = np.zeros((runs, 50, 2), np.float32)
+    levels = random.uniform([0.3, -5.0], [0.9, 5.0], (runs, 1, 2))
+    e = np.tile(levels, (1, 50, 1)).astype(np.float32)
     move = jax.jit(jax.vmap(step))
     for k in range(50):
-        noise = 0.8 * noise + random.normal(0, [0.2, 0.6], (drives, 2))
+        noise = 0.8 * noise + random.normal(0, [0.2, 0.6], (runs, 2))
         u[:, k] = np.clip(noise, [-1, -2], [1, 2])
         x[:, k + 1] = move(x[:, k], u[:, k], e[:, k])
     np.savez(path, x=x, u=u, e=e)
 
 
 def read(path: Path) -> Dataset:
-    """Logged drives, dealt by whole drives to training, validation, calibration and
-    test.
-    """
+    """Logged runs, dealt as wholes to training, validation, calibration and test."""
     with np.load(path) as logs:
-        drives = Trajectory(
-            *(jnp.asarray(logs[name], dtype=jnp.float32) for name in "xue")
-        )
+        runs = Trajectory(*(jnp.asarray(logs[name], jnp.float32) for name in "xue"))
     box = {
-        "env_low": drives.envs.min(axis=(0, 1)),
-        "env_high": drives.envs.max(axis=(0, 1)),
+        "env_low": runs.envs.min(axis=(0, 1)),
+        "env_high": runs.envs.max(axis=(0, 1)),
     }
-    return split(drives, jax.random.key(0), shares=(0.6, 0.1, 0.2, 0.1), **box)
+    return split(runs, jax.random.key(0), shares=(0.6, 0.1, 0.2, 0.1), **box)
 
 
 def main(
-    logs: str | None = None, drives: int = 400, steps: int = 500
+    logs: str | None = None, runs: int = 400, steps: int = 500
 ) -> dict[str, float]:
-    """Prediction error on held-out drives, the certified rate, and a first control."""
+    """Prediction error on held-out runs, the certified rate, and a first control."""
     with tempfile.TemporaryDirectory() as scratch:
         path = Path(logs or Path(scratch) / "logs.npz")
         if logs is None:
-            log_some_drives(path, drives)
+            log_some_runs(path, runs)
         data = read(path)
         model = models.sfkd(measure_space(data), rank=16)
         loss = multi_step_loss(model, measure_space(data))
@@ -104,20 +100,16 @@ def main(
     first, _, _ = jax.jit(planner.act)(
         params, planner.init(jax.random.key(2)), state, env, reference
     )
-    error = float(
-        jnp.mean(jax.vmap(partial(loss_of_position, model, params))(held_out))
-    )
+    errors = jax.vmap(partial(error_of_position, model, params))(held_out)
     return {
         "alpha": proof.alpha,
-        "position_error_m": error,
+        "position_error_m": float(jnp.mean(errors)),
         "first_control": float(first[0]),
     }
 
 
-def loss_of_position(model, params, window):
+def error_of_position(model, params, window):
     """Distance between the last predicted position and the true one [m]."""
-    from sfkd_jax.rollout import rollout
-
     predicted, _, _ = rollout(model, params, window)
     return jnp.linalg.norm(predicted[-1, :2] - window.states[-1, :2])
 

@@ -40,13 +40,13 @@ def main(samples: int = 256, seconds: float = 15.0) -> float:
     family = scenarios.scenario(name="s3", duration=seconds, state_size=5, dt=DT)
 
     @jax.jit
-    def drive(road_key, drive_key):
+    def run(road_key, drive_key):
         road = family(road_key)
         return evaluation.simulate(
             step, planner, {}, road, drive_key, dt=DT, horizon=15
         ).lateral
 
-    lateral = drive(*jax.random.split(jax.random.key(0)))
+    lateral = run(*jax.random.split(jax.random.key(0)))
     return float(jnp.sqrt(jnp.mean(lateral**2)))
 
 

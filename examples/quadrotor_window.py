@@ -62,8 +62,8 @@ def main(samples=1024, seconds=4.0, figure=None):
     hover = jnp.full((HORIZON, 2), 0.5 * MASS * GRAVITY)
     memory = planner.init(jax.random.key(0))._replace(plan=hover)
     start = (jnp.zeros(6), memory)
-    drive = jax.jit(lambda: jax.lax.scan(step, start, length=round(seconds / DT)))
-    _, (states, depths) = drive()
+    run = jax.jit(lambda: jax.lax.scan(step, start, length=round(seconds / DT)))
+    _, (states, depths) = run()
     if figure:
         import matplotlib.pyplot as plt
 

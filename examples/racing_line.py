@@ -88,8 +88,8 @@ def main(samples=512, seconds=30.0, figure=None):
         return (x, memory), (x, limits(OBSTACLES, x, u, None, None))
 
     start = (jnp.zeros(6), planner.init(jax.random.key(0)))
-    drive = jax.jit(lambda: jax.lax.scan(step, start, length=round(seconds / DT)))
-    _, (states, depths) = drive()
+    run = jax.jit(lambda: jax.lax.scan(step, start, length=round(seconds / DT)))
+    _, (states, depths) = run()
     time = DT * jnp.arange(1, len(states) + 1)
     lap = jnp.interp(LENGTH, states[:, 4], time, right=jnp.inf)
     if figure:

@@ -70,8 +70,8 @@ def test_the_delivery_robot_stays_on_its_path(monkeypatch):
 
 
 @pytest.mark.exhaustive
-def test_logged_drives_become_a_certified_model_that_plans(monkeypatch):
-    result = example("own_data", monkeypatch)["main"](drives=60, steps=100)
+def test_logged_runs_become_a_certified_model_that_plans(monkeypatch):
+    result = example("own_data", monkeypatch)["main"](runs=60, steps=100)
     assert result["alpha"] < 1.0
     assert np.isfinite(result["position_error_m"])
     assert abs(result["first_control"]) <= 1.0
@@ -82,16 +82,15 @@ def test_the_brax_pendulum_is_learned_certified_and_driven(monkeypatch, capsys):
     """In two seconds a pole left alone lies. So short a training gives a certificate,
     not yet a good driver.
     """
-    sizes = {"drives": 50, "steps": 50, "samples": 64, "horizon": 20, "seconds": 2.0}
+    sizes = {"runs": 50, "steps": 50, "samples": 64, "horizon": 20, "seconds": 2.0}
     result = example("brax_pendulum", monkeypatch)["main"](**sizes)
     proof, rows = result["certificate"], result["rows"]
     assert proof["valid"]
     assert proof["attacks"]["step_slopes"] <= proof["alpha"] < 1.0
     assert len(proof["tube"]["latent"]) == 20
     assert np.isfinite(rows["SFKD"]["rms_m"])
-    assert (
-        rows["SFKD"] == rows["SFKD, told e = 1"]
-    )  # e is 1 for the first three seconds
+    # e is 1 for the first three seconds.
+    assert rows["SFKD"] == rows["SFKD, given e = 1"]
     assert not any(
         rows[way]["fallen"]
         for way in ("true dynamics", "true dynamics, no gain", "gain alone")
