@@ -41,7 +41,7 @@ def clear_of_the_wall(data, x, u, target, at):
 
 def main(samples=1024, seconds=4.0, figure=None):
     """Distance to the goal at the end; largest violation of the clearance [m]."""
-    limits = {"control_low": 0.0, "control_high": 12.0, "num_controls": 2}
+    limits = {"control_low": (0.0, 0.0), "control_high": (12.0, 12.0)}
     task = control.constrained(
         control.free_task(dynamics, stage, **limits), clear_of_the_wall
     )
