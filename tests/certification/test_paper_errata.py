@@ -44,33 +44,23 @@ def test_scaling_p_makes_the_printed_bound_vanish(scale, printed):
 
 @pytest.mark.parametrize("scale", [1e-4, 1.0, 1e4])
 def test_the_corrected_bound_does_not_change_with_the_scale_of_p(scale):
-    pushes, beta, error, worst, bounds = (
-        np.random.default_rng(0).uniform(-1, 1, (300, 2)),
-        0.3,
-        np.zeros(2),
-        0.0,
-        [],
-    )
+    pushes, beta = np.random.default_rng(0).uniform(-1, 1, (300, 2)), 0.3
+    error, worst, bounds = np.zeros(2), 0.0, []
     for d in pushes:
-        error = (
-            SHEAR @ error + beta * np.tanh(error) + d
-        )  # beta-Lipschitz in the P-norm too, as P is diagonal
+        # beta-Lipschitz in the P-norm too, as P is diagonal
+        error = SHEAR @ error + beta * np.tanh(error) + d
         worst = max(worst, np.linalg.norm(error))
     for root in (np.sqrt(scale) * ROOT, ROOT):
         d_bar = np.max(np.linalg.norm(pushes @ root, axis=1))
-        bounds.append(
-            latent_tube(norm_in_p(SHEAR, root) + beta, d_bar, 300)[-1]
-            / np.min(np.diag(root))
-        )
+        radius = latent_tube(norm_in_p(SHEAR, root) + beta, d_bar, 300)[-1]
+        bounds.append(radius / np.min(np.diag(root)))
     assert bounds[0] == pytest.approx(bounds[1], rel=1e-9)
     assert worst <= bounds[0]
 
 
 def test_a_rate_that_mixes_two_norms_certifies_a_system_that_diverges():
-    beta, residual = (
-        0.1,
-        0.1 * np.array([[0.0, 0.0], [1.0, 0.0]]),
-    )  # beta-Lipschitz in the 2-norm
+    # beta-Lipschitz in the 2-norm
+    beta, residual = 0.1, 0.1 * np.array([[0.0, 0.0], [1.0, 0.0]])
     assert 0.70 < norm_in_p(SHEAR) + beta < 0.72
     assert printed_condition(SHEAR, ROOT @ ROOT, norm_in_p(SHEAR) + beta)
     assert max(abs(np.linalg.eigvals(SHEAR + residual))) > 1.13
@@ -81,13 +71,10 @@ def test_a_residual_bounded_in_the_2_norm_costs_the_root_of_the_condition_number
     beta, root_kappa = 0.1, np.linalg.cond(ROOT)
     residuals = np.random.default_rng(0).standard_normal((200, 2, 2))
     residuals *= beta / np.linalg.norm(residuals, 2, axis=(1, 2))[:, None, None]
-    assert (
-        max(norm_in_p(SHEAR + residual) for residual in residuals)
-        <= norm_in_p(SHEAR) + beta * root_kappa
-    )
-    assert norm_in_p(np.array([[0.0, 0.0], [beta, 0.0]])) == pytest.approx(
-        beta * root_kappa
-    )  # it is reached
+    worst = max(norm_in_p(SHEAR + residual) for residual in residuals)
+    assert worst <= norm_in_p(SHEAR) + beta * root_kappa
+    reached = norm_in_p(np.array([[0.0, 0.0], [beta, 0.0]]))
+    assert reached == pytest.approx(beta * root_kappa)
 
 
 @pytest.mark.parametrize("reach", [1.0, 10.0])
@@ -104,23 +91,15 @@ def test_the_smallest_rate_is_not_the_smallest_bound(reach):
 
 
 def test_dividing_by_the_encoders_constant_bounds_the_error_from_below():
-    encoder, decoder = (
-        np.diag([10.0, 0.1]),
-        np.diag([0.1, 10.0]),
-    )  # exact inverses: no reconstruction error
+    # Exact inverses: no reconstruction error.
+    encoder, decoder = np.diag([10.0, 0.1]), np.diag([0.1, 10.0])
     latent = np.array([0.0, 0.05])
-    true, printed = (
-        np.linalg.norm(decoder @ latent),
-        np.linalg.norm(latent) / norm_upper(encoder),
-    )
+    true = np.linalg.norm(decoder @ latent)
+    printed = np.linalg.norm(latent) / norm_upper(encoder)
     np.testing.assert_allclose([true, printed], [0.5, 0.005])
     for gap in np.random.default_rng(0).standard_normal((500, 2)):
-        there = np.linalg.norm(encoder @ gap)
-        assert (
-            there / norm_upper(encoder)
-            <= np.linalg.norm(gap)
-            <= there * norm_upper(decoder)
-        )
+        there, here = np.linalg.norm(encoder @ gap), np.linalg.norm(gap)
+        assert there / norm_upper(encoder) <= here <= there * norm_upper(decoder)
 
 
 @pytest.mark.parametrize(
@@ -130,21 +109,13 @@ def test_a_residual_without_any_penalty_on_the_samples_exceeds_beta_a_hundredfol
     centre,
 ):
     gain, sharpness, beta, samples = 0.01, 1000.0, 0.1, np.linspace(-1, 1, 64)
-    slopes = (
-        gain
-        * sharpness
-        / np.cosh(np.clip(sharpness * (samples - centre), -300, 300)) ** 2
-    )
-    assert (
-        np.mean(np.maximum(0.0, slopes - beta) ** 2) == 0.0
-    )  # eq:contr_loss is at its minimum
-    assert (
-        gain * (np.tanh(0.1) - np.tanh(-0.1)) / (0.2 / sharpness) > 99 * beta
-    )  # across the centre
-    weights, multiplier = (
-        (np.array([[sharpness]]), np.array([[gain]])),
-        np.array([gain**2]),
-    )
+    inside = np.clip(sharpness * (samples - centre), -300, 300)
+    slopes = gain * sharpness / np.cosh(inside) ** 2
+    # eq:contr_loss is at its minimum, and across the centre beta is exceeded.
+    assert np.mean(np.maximum(0.0, slopes - beta) ** 2) == 0.0
+    assert gain * (np.tanh(0.1) - np.tanh(-0.1)) / (0.2 / sharpness) > 99 * beta
+    weights = np.array([[sharpness]]), np.array([[gain]])
+    multiplier = np.array([gain**2])
     assert lipschitz_upper(weights, (multiplier,))[0] == pytest.approx(
         100 * beta
     )  # the weights do show it
@@ -162,12 +133,8 @@ def power_estimate(matrix, v, steps):
 def test_power_iteration_never_reaches_the_norm_that_it_is_to_bound(steps):
     random, rho = np.random.default_rng(0), 0.9
     for matrix in random.standard_normal((100, 32, 32)):
-        assert (
-            np.linalg.norm(matrix, 2)
-            * rho
-            / power_estimate(matrix, random.standard_normal(32), steps)
-            > rho
-        )
+        estimate = power_estimate(matrix, random.standard_normal(32), steps)
+        assert np.linalg.norm(matrix, 2) * rho / estimate > rho
         assert np.linalg.norm(matrix * rho / norm_upper(matrix), 2) <= rho
     unlucky = np.diag([1.5, 0.5])
     assert power_estimate(unlucky, np.array([0.0, 1.0]), 1000) == 0.5
@@ -184,28 +151,23 @@ def test_spectral_radii_of_zero_allow_growth_under_switching():
 def test_a_transport_that_stretches_breaks_the_tube_and_an_isometry_does_not(expansion):
     alpha, error, errors = 0.95, 0.0, []
     for _ in range(100):
-        error = (
-            expansion * alpha * error + 1.0
-        )  # along the stretched direction, a switch at every step
+        # Along the stretched direction, a switch at every step.
+        error = expansion * alpha * error + 1.0
         errors.append(error)
-    assert np.all(errors <= latent_tube(alpha, 1.0, 100) * (1 + 1e-12)) == (
-        expansion == 1.0
-    )
+    inside = np.all(errors <= latent_tube(alpha, 1.0, 100) * (1 + 1e-12))
+    assert inside == (expansion == 1.0)
     assert (errors[-1] > 1000) == (expansion > 1.0)
 
 
 @pytest.mark.parametrize("points", [25, 1001])
 def test_a_peak_between_grid_points_is_invisible_to_a_check_at_grid_points(points):
     grid = np.linspace(0.3, 0.9, points)
-    centre, width = (
-        np.mean(grid[points // 3 : points // 3 + 2]),
-        0.01 * (grid[1] - grid[0]),
-    )
+    centre = np.mean(grid[points // 3 : points // 3 + 2])
+    width = 0.01 * (grid[1] - grid[0])
 
     def operator(e):
-        bump = np.tanh((e - centre) / width + 5) - np.tanh(
-            (e - centre) / width - 5
-        )  # two units of a network
+        inside = (e - centre) / width
+        bump = np.tanh(inside + 5) - np.tanh(inside - 5)  # two units of a network
         return (0.8 + 0.25 * bump) * np.array([[0.6, -0.8], [0.8, 0.6]])
 
     assert max(norm_upper(operator(e)) for e in grid) < 0.81
@@ -218,9 +180,8 @@ def test_a_contraction_follows_an_integrator_no_better_than_the_middle_of_its_ra
     np.testing.assert_allclose([floor, np.max(np.abs(alpha * x + floor - x))], 30.0)
     for slopes in random.uniform(-alpha, alpha, (300, 60)):
         miss = x - np.concatenate([[0.0], np.cumsum(slopes * np.diff(x))])
-        assert (
-            np.ptp(miss) / 2 >= floor
-        )  # the best offset halves the range of what is missed
+        # The best offset halves the range of what is missed.
+        assert np.ptp(miss) / 2 >= floor
     assert latent_tube(alpha, floor, 1000)[-1] == pytest.approx(reach / 2)
 
 
@@ -236,13 +197,8 @@ def test_shrinking_the_latent_lowers_the_loss_and_the_disturbance_for_nothing():
         z = s * np.tanh(x @ E.T)
         r = s * 0.3 * np.tanh(z / s @ W.T)
         gaps = np.linalg.norm(z[1:] - z[:-1] @ A.T - r[:-1], axis=1)
-        return np.array(
-            [
-                np.sum(gaps**2),
-                np.linalg.norm(r[1] - r[0]) / np.linalg.norm(z[1] - z[0]),
-                np.max(gaps),
-            ]
-        )
+        slope = np.linalg.norm(r[1] - r[0]) / np.linalg.norm(z[1] - z[0])
+        return np.array([np.sum(gaps**2), slope, np.max(gaps)])
 
     np.testing.assert_allclose(losses(1e-3) / losses(1.0), [1e-6, 1.0, 1e-3], rtol=1e-9)
 
@@ -252,17 +208,13 @@ def errors_under_disturbance(d_bar, aligned, episodes=64, steps=150, size=6):
     + b_e), |d_k| = d_bar.
     """
     random, pair, errors = np.random.default_rng(0), np.zeros((2, episodes, size)), []
-    turns, biases = (
-        np.linalg.qr(random.standard_normal((3, size, size)))[0],
-        0.05 * random.standard_normal((3, size)),
-    )
+    turns = np.linalg.qr(random.standard_normal((3, size, size)))[0]
+    biases, noise = 0.05 * random.standard_normal((3, size)), 1e-12 if aligned else 1.0
     for e in random.integers(3, size=(steps, episodes)):
-        pair = np.einsum(
-            "eab,peb->pea", turns[e], 0.8 * pair + 0.1 * np.tanh(pair + biases[e])
-        )
-        push = aligned * (pair[0] - pair[1]) + (
-            1e-12 if aligned else 1.0
-        ) * random.standard_normal((episodes, size))
+        moved = 0.8 * pair + 0.1 * np.tanh(pair + biases[e])
+        pair = np.einsum("eab,peb->pea", turns[e], moved)
+        push = noise * random.standard_normal((episodes, size))
+        push += aligned * (pair[0] - pair[1])
         pair[0] += d_bar * push / np.linalg.norm(push, axis=1, keepdims=True)
         errors.append(np.linalg.norm(pair[0] - pair[1], axis=1))
     return np.array(errors)
@@ -271,11 +223,8 @@ def errors_under_disturbance(d_bar, aligned, episodes=64, steps=150, size=6):
 @pytest.mark.parametrize("aligned", [False, True])
 def test_under_the_theorems_hypotheses_the_violation_rate_is_exactly_zero(aligned):
     errors, threshold = errors_under_disturbance(1e-3, aligned), 1e-3 / (1 - 0.9)
-    assert (
-        np.sum(errors > latent_tube(0.9, 1e-3, 150)[:, None] * (1 + 1e-9))
-        == np.sum(errors > threshold)
-        == 0
-    )
+    tube = latent_tube(0.9, 1e-3, 150)[:, None] * (1 + 1e-9)
+    assert np.sum(errors > tube) == np.sum(errors > threshold) == 0
     if aligned:  # not for want of trying
         assert np.max(errors) > 0.98 * threshold
         assert np.sum(errors_under_disturbance(1.1e-3, aligned) > threshold) > 0
@@ -303,22 +252,17 @@ def test_the_papers_figures_contradict_its_table_and_its_text():
     assert np.all(node < mppi)  # the last row of the table has them the other way round
     table = [[0.181, 0.162, 0.148, 0.139, 0.127], [0.243, 0.218, 0.204, 0.192, 0.174]]
     table += [[0.182, 0.168, 0.155, 0.143, 0.134], [0.43, 0.38, 0.35, 0.18, 0.29]]
-    assert all(
-        sorted(column)[3] == column[1] for column in table
-    )  # Neural ODE is fourth of five baselines
-    needed = (
-        2 * np.array([0.22, 0.08, 0.42]) / np.array([0.1, 0.05, 0.1]) ** 2
-    )  # m/s^2 for ICODE-MPPI, SFKD, Koopman
+    # Neural ODE is fourth of five baselines.
+    assert all(sorted(column)[3] == column[1] for column in table)
+    # m/s^2 for ICODE-MPPI, SFKD, Koopman
+    needed = 2 * np.array([0.22, 0.08, 0.42]) / np.array([0.1, 0.05, 0.1]) ** 2
     np.testing.assert_allclose(needed, [44, 64, 84])
     assert min(needed) > 4.9 * 0.9 * 9.81
     time, drawn = np.array(
         [[0, 0.05, 0.2, 0.5, 1, 2, 3], [0.02, 0.10, 0.07, 0.04, 0.03, 0.02, 0.02]]
     )
-    assert (
-        np.sqrt(np.mean(np.interp(np.linspace(0, 3, 30001), time, drawn) ** 2))
-        < 0.037
-        < 0.120 - 4 * 0.018
-    )
+    curve = np.interp(np.linspace(0, 3, 30001), time, drawn)
+    assert np.sqrt(np.mean(curve**2)) < 0.037 < 0.120 - 4 * 0.018
 
 
 def test_every_test_named_on_the_page_exists_and_every_test_is_named():
