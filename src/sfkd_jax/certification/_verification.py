@@ -260,18 +260,20 @@ def _require_equal(name: str, stated: Any, derived: Any) -> None:
     Raises:
         CertificationRefused: it is another.
     """
-    if isinstance(derived, dict) and set(stated) == set(derived):
+    if isinstance(derived, dict):
         # All keys: a value that is left out here would be checked nowhere.
-        for key, value in derived.items():
-            _require_equal(f"{name}.{key}", stated[key], value)
-        return
-    if derived is None and stated is None:
-        return
-    if not isinstance(derived, dict) and derived is not None:
+        equal = set(stated) == set(derived)
+        for key in derived if equal else ():
+            _require_equal(f"{name}.{key}", stated[key], derived[key])
+    elif derived is None:
+        equal = stated is None
+    else:
         expected, actual = np.asarray(derived, np.float64), _numbers(name, stated)
         # Relative to the derived value, which an attacker cannot choose.
-        if actual.shape == expected.shape and np.all(
+        equal = actual.shape == expected.shape and np.all(
             np.abs(actual - expected) <= REPEATED * np.abs(expected)
-        ):
-            return
-    raise CertificationRefused(f"{name} does not follow from the rest of the document")
+        )
+    if not equal:
+        raise CertificationRefused(
+            f"{name} does not follow from the rest of the document"
+        )

@@ -280,12 +280,7 @@ def _spread(noise: tuple[float, ...], size: int) -> Array:
 
 
 class Runs(NamedTuple):
-    """Inputs of runs.
-
-    Attributes:
-        inputs: w, (run, time, 4).
-        envs: e, (run, time, environment).
-    """
+    """Inputs of runs, w and e."""
 
     inputs: Float[Array, "run time 4"]
     envs: Float[Array, "run time environment"]
