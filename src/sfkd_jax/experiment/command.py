@@ -53,8 +53,8 @@ def hydra_command(run: Run) -> Callable[[], None]:
         try:
             settings = settings_of(composed)
             use_compilation_cache(Path(settings.root))
-            # A trial spends its time on compiling, an experiment on running.
-            jax.config.update("jax_disable_most_optimizations", not settings.optimized)
+            if not settings.optimized:
+                compile_fast()
             # Small factorisations, in every step of a training: threads of BLAS would
             # wait for each other, and keep XLA's waiting, for half of the time.
             with threadpool_limits(1, user_api="blas"):
@@ -132,6 +132,17 @@ def use_compilation_cache(root: Path) -> None:
         # What the user has set in the environment wins.
         if option.upper() not in os.environ:
             jax.config.update(option, value)
+
+
+def compile_fast() -> None:
+    """Compile fast, not well: a trial spends its time on compiling, not on running."""
+    jax.config.update("jax_disable_most_optimizations", True)
+    flags = [os.environ.get("XLA_FLAGS", "")]
+    # Fusion by MLIR is half of the time. XLA aborts at a flag that it does not know.
+    if jax.lib.__version__.startswith("0.10."):
+        flags.append("--xla_cpu_use_fusion_emitters=false")
+    # Read when the first program is compiled, which comes later.
+    os.environ["XLA_FLAGS"] = " ".join(flags)
 
 
 def named_for_sweep(settings: Settings) -> Settings:
