@@ -153,14 +153,9 @@ def test_the_quick_softplus_is_as_exact_as_float32_and_rises_by_the_sigmoid():
 
 
 @pytest.mark.usefixtures("x64")
-@pytest.mark.parametrize(
-    "loop",
-    [lambda plant: plant, plants.with_speed_loop],
-    ids=["acceleration", "speed"],
-)
 @pytest.mark.parametrize("body", PLANTS)
-def test_without_a_residual_the_known_dynamics_are_all_that_moves(body, loop):
-    plant = loop(PLANTS[body]())
+def test_without_a_residual_the_known_dynamics_are_all_that_moves(body):
+    plant = plants.with_speed_loop(PLANTS[body]())
     model = small("icode_mppi", body, nominal=plant.nominal_derivative)
     nothing = jax.tree.map(jnp.zeros_like, drawn("icode_mppi", body))
     state, control = STATES[body].astype(jnp.float64), CONTROL.astype(jnp.float64)

@@ -120,10 +120,8 @@ def test_a_linear_plant_is_recovered():
     np.testing.assert_allclose(d, 0, atol=2e-3)
 
 
-@pytest.mark.parametrize("friction", [0.3, 0.8])
-def test_a_plant_that_varies_with_the_environment_is_recovered_at_every_environment(
-    friction,
-):
+def test_a_plant_that_varies_with_the_environment_is_recovered():
+    friction = 0.8
     model = models.koopman(two_body_space(), functions=0, ridges=(1e-10,))
     A, B, _, c = physical(
         model, identified(model, parked(switching_change)), [friction, -3.0]
@@ -192,22 +190,19 @@ def test_regression_survives_columns_that_normal_equations_do_not():
 
 
 @cache
-def driving(environment=True):
+def driving():
     """A model of the kinematic car and its parameters, from a few segments of driving."""
-    model = models.koopman(
-        datasets.measure_space(dataset()), functions=30, environment=environment
-    )
+    model = models.koopman(datasets.measure_space(dataset()), functions=30)
     return model, jit(model.fitting.identify)(
         dataset().train, dataset().validation, KEY
     )
 
 
-@pytest.mark.parametrize("environment", [True, False])
-def test_driving_is_predicted_far_better_than_by_no_change(environment):
+def test_driving_is_predicted_far_better_than_by_no_change():
     """Initial parameters predict no change; the drives are neither for fitting nor
     selection.
     """
-    model, params = driving(environment)
+    model, params = driving()
     miss = jit(
         jax.vmap(
             lambda params, drive: defects(model, params, drive)[0], in_axes=(None, 0)

@@ -4,7 +4,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from helpers import ENV_HIGH, ENV_LOW, at, driven, jit, space
+from helpers import ENV_HIGH, ENV_LOW, jit, space
 
 from sfkd_jax import certification, models
 from sfkd_jax.models._r2dn import contracting
@@ -165,30 +165,3 @@ def test_a_longer_loop_than_the_constraint_allows_has_no_certificate_and_no_cont
     )
     with pytest.raises(certification.CertificationRefused, match=r"alpha = 1\.212"):
         certified(mutant(layer), params)
-
-
-def test_two_trajectories_under_the_same_inputs_come_together_at_the_rate():
-    """The claim over many steps, with an environment that switches at every step."""
-    params, drive = drawn(1.0), at(driven(), 0)
-
-    def along(z):
-        def step(latent, inputs):
-            control, env = inputs
-            after = MODEL.step(MODEL.fiber(params, env), latent, control)
-            return after, MODEL.vector(after)
-
-        start = MODEL.encode(MODEL.fiber(params, drive.envs[0]), drive.states[0])
-        return jax.lax.scan(step, start._replace(z=z), (drive.controls, drive.envs))[1]
-
-    first, second = 3.0 * np.random.default_rng(0).standard_normal(
-        (2, 20, RANK)
-    ).astype(np.float32)
-    paths = [
-        np.asarray(jit(jax.vmap(along))(starts), np.float64)
-        for starts in (first, second)
-    ]
-    gaps = np.linalg.norm(paths[0] - paths[1], axis=-1)
-    allowed = np.linalg.norm(first - second, axis=-1)[:, None] * ALPHA ** np.arange(
-        1, gaps.shape[1] + 1
-    )
-    assert np.all(gaps <= allowed + 1e-5)

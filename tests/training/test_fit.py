@@ -76,6 +76,14 @@ def test_the_loss_falls_and_every_step_is_logged(unbroken):
     assert "validation_loss" in logged[1]
 
 
+def test_what_validates_in_training_scores_its_result(task, unbroken):
+    """One program: parameters read back are like those that were never stored."""
+    _, loss, data = task
+    before = loss.validate._cache_size()
+    loss.validate(unbroken[1], spread_windows(data.validation, length=8))
+    assert loss.validate._cache_size() == before
+
+
 def test_an_interrupted_run_ends_bit_identical_to_an_unbroken_one(
     task, tmp_path, monkeypatch, unbroken
 ):

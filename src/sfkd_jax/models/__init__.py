@@ -1,14 +1,14 @@
 """Rollout models: listed by name in `FACTORIES`."""
 
 from sfkd_jax.models._continuous import neural_ode as neural_ode
+from sfkd_jax.models._continuous import physics as physics
+from sfkd_jax.models._continuous import state_model as state_model
 from sfkd_jax.models._control_synth import control_synth as control_synth
 from sfkd_jax.models._icode import icode as icode
 from sfkd_jax.models._icode import icode_mppi as icode_mppi
 from sfkd_jax.models._koopman import koopman as koopman
 from sfkd_jax.models._own import own as own
 from sfkd_jax.models._r2dn import r2dn as r2dn
-from sfkd_jax.models._state_model import physics as physics
-from sfkd_jax.models._state_model import state_model as state_model
 from sfkd_jax.models.sfkd import sfkd as sfkd
 
 FACTORIES = {

@@ -31,38 +31,22 @@ class Synthesis(NamedTuple):
         outer: [A_1 … A_M].
         inner: [W_1; …; W_M].
         offsets: [c_1; …; c_M].
+        metric: P, in which it contracts; None where nothing is claimed.
+        multipliers: λ of the diagonal Λ that proves it; None as well.
     """
 
     linear: Float[Array, "out body"]
     outer: Float[Array, "out hidden"]
     inner: Float[Array, "hidden body"]
     offsets: Float[Array, " hidden"]
+    metric: Float[Array, "body body"] | None = None
+    multipliers: Float[Array, " hidden"] | None = None
 
     def __call__(self, body: Float[Array, " body"]) -> Float[Array, " out"]:
         """Evaluate at one scaled body state."""
         return self.linear @ body + self.outer @ jnp.tanh(
             self.inner @ body + self.offsets
         )
-
-
-class Contracting(NamedTuple):
-    """The state equation and what proves that it contracts, see `control_synth`.
-
-    ds/dt = A_0 s + A σ(W s + c) + g(u, e) in scaled units of s, per second.
-
-    Attributes:
-        linear: A_0.
-        outer: A = [A_1 … A_M].
-        inner: W = [W_1; …; W_M].
-        metric: P.
-        multipliers: λ of the diagonal Λ.
-    """
-
-    linear: Float[Array, "body body"]
-    outer: Float[Array, "body hidden"]
-    inner: Float[Array, "hidden body"]
-    metric: Float[Array, "body body"]
-    multipliers: Float[Array, " hidden"]
 
 
 class ControlSynthFiber(NamedTuple):
@@ -129,18 +113,35 @@ def control_synth(
     inputs = mlp(input_hidden, 3 + body, (nn.tanh,) * len(input_hidden), last=0.1)
 
     def init(key: Key) -> Params:
+        hidden = networks * width
         read = jnp.zeros(control + space.env_mean.shape[0])
-        return _initial(key, body, networks * width, inputs, read)
+        keys = jax.random.split(key, 6)
+        return {
+            "free": {
+                # Small: the proof costs −¼ BB', which damps the state from the start.
+                "B": 0.1 * jax.random.normal(keys[0], (body, hidden)),
+                "W": jax.random.normal(keys[1], (hidden, body)),
+                # Not X = 0, where the gradient of XX' vanishes and X would stay.
+                "X": 0.1 * jnp.eye(body),
+                # tanh 0 = 0 below the diagonal, exp 0 = 1 on it: P = I at the start.
+                "Y": jnp.zeros((body, body)),
+                "T": jnp.zeros((body, body)),
+                "log_multipliers": jnp.zeros(hidden),
+                "offsets": jax.random.uniform(keys[2], (hidden,), minval=-1.0),
+            },
+            "twist": {
+                "linear": jnp.zeros((3, body)),
+                "outer": 0.1 * hidden**-0.5 * jax.random.normal(keys[3], (3, hidden)),
+                "inner": jax.random.normal(keys[4], (hidden, body)),
+                # Spread over the range, or all units would bend at the same state.
+                "offsets": jnp.linspace(-1.0, 1.0, hidden),
+            },
+            "inputs": inputs.init(keys[5], read)["params"],
+        }
 
     def fiber(params: Params, env: Environment) -> ControlSynthFiber:
-        flow = contracting(params["free"], rate)
-        # Offsets may be free: they are outside the matrix inequality.
-        change = Synthesis(
-            flow.linear, flow.outer, flow.inner, params["free"]["offsets"]
-        )
-        return ControlSynthFiber(
-            change, Synthesis(**params["twist"]), params["inputs"], env
-        )
+        change, twist = contracting(params["free"], rate), Synthesis(**params["twist"])
+        return ControlSynthFiber(change, twist, params["inputs"], env)
 
     def rates(
         fiber: ControlSynthFiber, body: Float[Array, " body"], control: Control
@@ -154,36 +155,7 @@ def control_synth(
     return continuous(space, learned, dt=dt, environment=environment)
 
 
-def _initial(
-    key: Key, body: int, hidden: int, inputs: nn.Module, read: Float[Array, " inputs"]
-) -> Params:
-    """Random initial parameters."""
-    keys = jax.random.split(key, 6)
-    return {
-        "free": {
-            # Small: the proof costs −¼ BB', which damps the state from the start.
-            "B": 0.1 * jax.random.normal(keys[0], (body, hidden)),
-            "W": jax.random.normal(keys[1], (hidden, body)),
-            # Not X = 0, where the gradient of XX' vanishes and X would stay.
-            "X": 0.1 * jnp.eye(body),
-            # tanh 0 = 0 below the diagonal, exp 0 = 1 on it: P = I at the start.
-            "Y": jnp.zeros((body, body)),
-            "T": jnp.zeros((body, body)),
-            "log_multipliers": jnp.zeros(hidden),
-            "offsets": jax.random.uniform(keys[2], (hidden,), minval=-1.0),
-        },
-        "twist": {
-            "linear": jnp.zeros((3, body)),
-            "outer": 0.1 * hidden**-0.5 * jax.random.normal(keys[3], (3, hidden)),
-            "inner": jax.random.normal(keys[4], (hidden, body)),
-            # Spread over the range, or all hidden units would bend at the same state.
-            "offsets": jnp.linspace(-1.0, 1.0, hidden),
-        },
-        "inputs": inputs.init(keys[5], read)["params"],
-    }
-
-
-def contracting(free: Params, rate: float) -> Contracting:
+def contracting(free: Params, rate: float) -> Synthesis:
     """Map free matrices to a state equation that contracts at `rate` [1/s].
 
     See `control_synth` for the parametrisation.
@@ -205,11 +177,13 @@ def contracting(free: Params, rate: float) -> Contracting:
     slack = ROUNDING * jnp.sum(T**2) * jnp.sum(T_inverse**2) * size
     # The margin is no design variable: gradients through it only add noise.
     linear -= (rate + jax.lax.stop_gradient(slack)) * jnp.eye(body)
-    return Contracting(
+    return Synthesis(
         # Undo the congruence with T: the proof is in coordinates T s, the model in s.
         linear=T_inverse @ linear @ T,
         outer=T_inverse @ A * roots,
         inner=W @ T / roots[:, None],
+        # Free: they are outside the matrix inequality.
+        offsets=free["offsets"],
         # Symmetric up to rounding only; an eigenvalue check would read one triangle.
         metric=0.5 * (P + P.T),
         multipliers=roots**2,

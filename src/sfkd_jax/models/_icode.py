@@ -178,9 +178,8 @@ def icode_mppi(
         dt: sampling period [s], the solver's step in training and in use.
         hidden: widths of f and of G.
         environment: whether e is used; if not, e is 0.
-        affine_in: "both" as above; "env" for f(s, u) + G(s, u) e, the extrinsic input
-            of ICODE; "control" for f(s, e) + G(s, e) u, so that the gain of the
-            steering may depend on friction.
+        affine_in: as for `icode`; with "control" the gain of the steering may depend on
+            friction.
 
     Raises:
         ValueError: another `affine_in`.

@@ -107,6 +107,10 @@ class Lift:
         """Number of entries of (ξ, u, κ, 1)."""
         return self.size - 1 + self.space.control_mean.shape[0] + 2
 
+    def random_centres(self, key: Key) -> Float[Array, "function coordinate"]:
+        """Draw centres uniformly from the box [-1, 1] of ξ."""
+        return jax.random.uniform(key, (self.functions, self.size - 1), minval=-1.0)
+
     @property
     def monomials(self) -> list[tuple[int, ...]]:
         """The entries of e in each monomial; the first is the empty product, 1."""
@@ -179,14 +183,8 @@ def thin_plate(
     squares = jnp.sum((point - centres) ** 2, axis=1)
     # Both branches need a finite logarithm, or the gradient at a centre is NaN.
     positive = squares > 0
-    return jnp.where(
-        positive, 0.5 * squares * jnp.log(jnp.where(positive, squares, 1.0)), 0.0
-    )
-
-
-def random_centres(lift: Lift, key: Key) -> Float[Array, "function coordinate"]:
-    """Draw centres uniformly from the box [-1, 1] of ξ."""
-    return jax.random.uniform(key, (lift.functions, lift.size - 1), minval=-1.0)
+    logarithms = jnp.log(jnp.where(positive, squares, 1.0))
+    return jnp.where(positive, 0.5 * squares * logarithms, 0.0)
 
 
 def identify(
@@ -212,7 +210,7 @@ def identify(
     """
     # A key each: the centres do not change with the number of pairs.
     centre_key, pair_key, circle_key = jax.random.split(key, 3)
-    centres = random_centres(lift, centre_key)
+    centres = lift.random_centres(centre_key)
     # All ridges share one factorisation of the pairs, the expensive part.
     fits = ridge_regression(
         *_pairs(lift, train, centres, pair_key, transitions), jnp.asarray(ridges)
@@ -224,17 +222,13 @@ def identify(
     windows = Trajectory(
         states[:, : length + 1], *(leaf[:, :length] for leaf in inputs)
     )
-    drawn = jax.tree.map(
-        lambda leaf: VALIDATION_SHARE * leaf, _circles(lift, circle_key, count)
-    )
+    drawn = (VALIDATION_SHARE * part for part in _circles(lift, circle_key, count))
+    cases = (windows, *drawn)
 
     def error(weights: Float[Array, "regressor rank"]) -> Scalar:
         params = {"centres": centres, "weights": weights}
-        return jnp.mean(
-            jax.vmap(lambda *each: _prediction_error(lift, params, *each))(
-                windows, *drawn
-            )
-        )
+        errors = jax.vmap(lambda *each: _prediction_error(lift, params, *each))
+        return jnp.mean(errors(*cases))
 
     # By free prediction over a horizon, which is what a controller uses.
     errors = jax.lax.map(error, fits)
@@ -250,9 +244,8 @@ def _circles(
 ) -> tuple[Float[Array, "sample 2"], Float[Array, " sample"]]:
     """Draw offsets (e_y, e_ψ) from circles, and their curvatures, uniformly."""
     drawn = jax.random.uniform(key, (count, 3), minval=-1.0)
-    return drawn[:, :2] * jnp.asarray(
-        [lift.lateral_range, lift.heading_range]
-    ), lift.curvature_range * drawn[:, 2]
+    ranges = jnp.asarray([lift.lateral_range, lift.heading_range])
+    return drawn[:, :2] * ranges, lift.curvature_range * drawn[:, 2]
 
 
 def _pairs(
@@ -439,7 +432,7 @@ def koopman(
 
     def init(key: Key) -> Params:
         return {
-            "centres": random_centres(lift, key),
+            "centres": lift.random_centres(key),
             # Zero increments: before `identify` the model predicts that nothing moves.
             "weights": jnp.zeros((regressors, lift.rank)),
         }
