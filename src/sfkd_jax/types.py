@@ -247,15 +247,11 @@ class ControllerInfo(TypedDict, total=False):
     speed_factor: Scalar  # of the reference speed at the next step
     grip: Scalar  # lateral acceleration that was shown [m/s²]; 0: not limited
     # delay_compensated
-    arrival_state: Float[
-        Array, " state"
-    ]  # predicted state at which the control arrives
+    arrival_state: Float[Array, " state"]  # at which the control arrives, predicted
     # Shield
     margin: Scalar  # distance of the nominal model to the edge of its corridor [m]
     intervention: Scalar  # share of the request that was removed, in [0, 1]
-    perturbation: Float[
-        Array, " control"
-    ]  # ν applied on top of the law, in control units
+    perturbation: Float[Array, " control"]  # ν on top of the law, in control units
     nominal_state: Float[Array, " coordinate"]  # path coordinates of the nominal model
     nominal_distance: Scalar  # |e_y| between vehicle and nominal model [m]
     corridor: Scalar  # certified half width [m]

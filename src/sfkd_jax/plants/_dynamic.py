@@ -10,9 +10,9 @@ from sfkd_jax.plants._vehicle import (
     CONTROL_LOW,
     GRAVITY,
     Vehicle,
-    forward_rk4,
     nominal_derivative,
     resistance,
+    rk4,
     side_force,
 )
 from sfkd_jax.ranges import Positive, Real
@@ -131,9 +131,9 @@ def dynamic(
         dt=dt,
         wheelbase=length,
         state_names=("p_x", "p_y", "yaw", "v", "v_y", "yaw_rate", "steering"),
-        step=forward_rk4(derivative, dt=dt, substeps=substeps),
+        step=rk4(derivative, dt=dt, substeps=substeps),
         derivative=derivative,
-        nominal=_quasi_steady(forward_rk4(bicycle, dt=dt), length, rear_length),
+        nominal=_quasi_steady(rk4(bicycle, dt=dt), length, rear_length),
         nominal_derivative=bicycle,
         control_low=CONTROL_LOW,
         control_high=CONTROL_HIGH,

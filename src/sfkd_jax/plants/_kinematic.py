@@ -13,9 +13,9 @@ from sfkd_jax.plants._vehicle import (
     CONTROL_LOW,
     GRAVITY,
     Vehicle,
-    forward_rk4,
     nominal_derivative,
     resistance,
+    rk4,
     side_force,
 )
 from sfkd_jax.ranges import Positive, Real
@@ -117,9 +117,9 @@ def kinematic(
         dt=dt,
         wheelbase=length,
         state_names=("p_x", "p_y", "yaw", "v"),
-        step=forward_rk4(derivative, dt=dt, substeps=substeps),
+        step=rk4(derivative, dt=dt, substeps=substeps),
         derivative=derivative,
-        nominal=forward_rk4(bicycle, dt=dt),
+        nominal=rk4(bicycle, dt=dt),
         nominal_derivative=bicycle,
         control_low=CONTROL_LOW,
         control_high=CONTROL_HIGH,

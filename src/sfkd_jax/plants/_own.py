@@ -5,7 +5,7 @@ from __future__ import annotations
 import jax
 import jax.numpy as jnp
 
-from sfkd_jax.plants._vehicle import Vehicle, forward_rk4, nominal_derivative
+from sfkd_jax.plants._vehicle import Vehicle, nominal_derivative, rk4
 from sfkd_jax.ranges import Bounds, Positive, imported
 from sfkd_jax.types import Control, Environment, State, Step
 
@@ -69,7 +69,7 @@ def own(
         state_names=tuple(state_names),
         # Fails when it is called: learning and planning do not simulate.
         step=_no_step if step is None else step,
-        nominal=forward_rk4(bicycle, dt=dt),
+        nominal=rk4(bicycle, dt=dt),
         nominal_derivative=bicycle,
         control_low=tuple(control_low),
         control_high=tuple(control_high),
@@ -117,10 +117,10 @@ def check_step(plant: Vehicle) -> None:
     given = f"{size} states (vehicle.state_names), 2 controls and 2 environments"
     try:
         after = jax.eval_shape(plant.step, *map(jnp.zeros, (size, 2, 2)))
-    # Its message names the setting already; the one below would hide it.
-    except _MissingStep:
-        raise
     except Exception as reason:  # a function of the user raises anything
+        # Its message names the setting already; the one below would hide it.
+        if isinstance(reason, _MissingStep):
+            raise
         first = (str(reason).splitlines() or [type(reason).__name__])[0]
         raise ValueError(
             f"the step of vehicle {plant.name} fails on {given}: {first}"

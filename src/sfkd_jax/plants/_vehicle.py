@@ -114,7 +114,10 @@ def nominal_derivative(length: float, rear_length: float, *, states: int = 4) ->
 
 
 def rk4(derivative: Step, *, dt: float, substeps: int = 1) -> Step:
-    """Return a step by the classical Runge-Kutta method of order 4.
+    """Return RK4 steps of a car that brakes cannot reverse: v ≥ 0 after every step.
+
+    The derivative is evaluated at max(v, 0), so that a car whose v falls below 0 within
+    a step stands: neither its position nor its yaw moves backwards.
 
     Args:
         derivative: dx/dt = f(x, u, e).
@@ -123,38 +126,23 @@ def rk4(derivative: Step, *, dt: float, substeps: int = 1) -> Step:
     """
     h = dt / substeps
 
-    def step(state: State, control: Control, env: Environment) -> State:
-        def substep(x: State, _: None) -> tuple[State, None]:
-            return runge_kutta(lambda x: derivative(x, control, env), x, h), None
-
-        # Unrolled: a loop of a few substeps would cost more than it computes.
-        return jax.lax.scan(
-            substep, jnp.asarray(state), None, length=substeps, unroll=True
-        )[0]
-
-    return step
-
-
-def forward_rk4(derivative: Step, *, dt: float, substeps: int = 1) -> Step:
-    """Return RK4 for a car that brakes cannot reverse: v ≥ 0 after every step.
-
-    The derivative is evaluated at max(v, 0), so that a car whose v falls below 0 within
-    a step stands: neither its position nor its yaw moves backwards.
-    """
-
     def forwards(state: State) -> State:
         # Brakes stop a car; they do not reverse it.
         # Entry 3 is the speed of every plant; v_y and others may be negative.
         return jnp.where((jnp.arange(state.shape[0]) == 3) & (state < 0.0), 0.0, state)
 
-    def held(state: State, control: Control, env: Environment) -> State:
-        # Also within the stages: a stage at v < 0 would drive the position backwards.
-        return derivative(forwards(state), control, env)
-
-    integrate = rk4(held, dt=dt, substeps=substeps)
-
     def step(state: State, control: Control, env: Environment) -> State:
-        return forwards(integrate(state, control, env))
+        def held(x: State) -> State:
+            # Also in the stages: one at v < 0 would drive the position backwards.
+            return derivative(forwards(x), control, env)
+
+        def substep(x: State, _: None) -> tuple[State, None]:
+            return runge_kutta(held, x, h), None
+
+        # Unrolled: a loop of a few substeps would cost more than it computes.
+        state = jnp.asarray(state)
+        after, _ = jax.lax.scan(substep, state, None, length=substeps, unroll=True)
+        return forwards(after)
 
     return step
 
