@@ -16,10 +16,9 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from sfkd_jax import build, control, evaluation, plants, policy, scenarios
+from sfkd_jax import build, evaluation, plants, policy, scenarios
 from sfkd_jax.evaluation import metrics
 from sfkd_jax.plants import equivalent_wind
-from sfkd_jax.rollout import with_offset
 from sfkd_jax.scenarios import random_side_forces
 
 SETTLED, HORIZON = 20, 20
@@ -136,17 +135,18 @@ class Rows(NamedTuple):
             settings, model, self.plant, law=self.loaded.law, **box
         )
 
-    def adaptive(self, model, **settings):
-        """The same planner, adapting."""
-        return control.adaptive(
-            self.planner(with_offset(model)),
+    def adaptive(self, model, *, estimate_env=False, **tube):
+        """The same planner, adapting, with settings of its online tube."""
+        settings = dict(self.loaded.settings["controller"], shield=False)
+        settings["online_tube"] = dict(settings.get("online_tube") or {}, **tube)
+        return build.build_controller(
+            settings,
             model,
-            self.loaded.law,
-            coordinates=len(self.plant.state_names) - 1,
-            control_low=self.plant.control_low,
-            control_high=self.plant.control_high,
+            self.plant,
+            law=self.loaded.law,
+            env_source="estimated" if estimate_env else "measured",
+            adaptive=True,
             **self.box,
-            **settings,
         )
 
     def oracle(self, car):
@@ -157,23 +157,22 @@ class Rows(NamedTuple):
 def systems(rows, case, car):
     """Row -> (controller, parameters, whether it observes what nobody measures)."""
     model, own = rows.loaded.model, rows.loaded.params
-    adapting = rows.adaptive(model, estimate_env=case.estimate_env)
-    tube = partial(control.online_tube, horizon=HORIZON)
+    adapting = partial(rows.adaptive, model, estimate_env=case.estimate_env)
     knows = rows.planner(rows.oracle(car), bounded=False)
     made = {
         "oracle that knows": (knows, {}, True),
         "SFKD": (rows.planner(model), own, False),
-        "SFKD, adaptive": (tube(adapting, lane=None), own, False),
+        "SFKD, adaptive": (adapting(lane=None), own, False),
     }
     if not (case.car or case.steering):
-        made["SFKD, adaptive, slower"] = (tube(adapting), own, False)
+        made["SFKD, adaptive, slower"] = (adapting(), own, False)
     if case.friction or case == CASES["nothing, S3"]:
-        made["SFKD, adaptive, cautious"] = (tube(adapting, grip=GRIP), own, False)
+        made["SFKD, adaptive, cautious"] = (adapting(grip=GRIP), own, False)
     if case.force:
         unknowing = rows.planner(rows.oracle(rows.plant))
         made["oracle that does not know"] = (unknowing, {}, False)
     if case.estimate_env:
-        best = rows.adaptive(rows.oracle(rows.plant), estimate_env=True)
+        best = rows.adaptive(rows.oracle(rows.plant), estimate_env=True, lane=None)
         made["oracle, e estimated"] = (best, {}, False)
     return made
 

@@ -17,8 +17,8 @@ import jax.numpy as jnp
 import numpy as np
 
 import sfkd_jax
-from sfkd_jax import build, evaluation, policy, scenarios, store
-from sfkd_jax.geometry import LATERAL, curvature_ahead, path_coordinates
+from sfkd_jax import build, control, evaluation, policy, scenarios, store
+from sfkd_jax.geometry import LATERAL
 from sfkd_jax.rollout import fold
 from sfkd_jax.types import Controller
 
@@ -54,16 +54,15 @@ def load(name):
 
 
 def hostile(car, kind):
-    """A planner of `PLANNERS`, by its index, which may be traced."""
+    """A planner of `PLANNERS` along a path, by its index, which may be traced."""
     plant, law = car.trained.vehicle, car.trained.law
     low, high = jnp.asarray(plant.control_low), jnp.asarray(plant.control_high)
 
-    def act(params, state, observation, env, reference):
+    def act(params, state, xi, env, preview):
         key, step = state
         streams = (jax.random.fold_in(key, one) for one in (0, 1, 2 + step))
         side_key, period_key, now = streams
-        curvature = curvature_ahead(reference)[0]
-        xi = path_coordinates(observation, reference[0], curvature)
+        curvature, speed = preview.road[0]
         side = jax.random.rademacher(side_key, (2,), float)
         period = jax.random.uniform(period_key, minval=1.0, maxval=8.0)
         swing = jnp.where(jnp.mod(step * plant.dt / period, 1.0) < 0.5, 1.0, -1.0)
@@ -75,16 +74,16 @@ def hostile(car, kind):
             side,
             jnp.full(2, jnp.nan),
         )
-        lawful = law(xi, curvature, reference[0, 3], env)
+        lawful = law(xi, curvature, speed, env)
         asked = [lawful + share * law.perturbation for share in shares]
         # Full lock ignores the law; all others ask for what a planner may add to it.
-        control = jnp.stack([*asked, jnp.where(side > 0.0, high, low)])[kind]
+        command = jnp.stack([*asked, jnp.where(side > 0.0, high, low)])[kind]
         info = {
-            "predicted_states": jnp.tile(observation, (HORIZON, 1)),
+            "predicted_states": jnp.tile(xi, (HORIZON, 1)),
             "effective_samples": jnp.ones(()),
             "healthy": jnp.asarray(True),
         }
-        return jnp.clip(control, low, high), (key, step + 1), info
+        return jnp.clip(command, low, high), (key, step + 1), info
 
     return Controller(lambda key: (key, jnp.zeros((), jnp.int32)), act)
 
@@ -96,6 +95,8 @@ def lateral(car, shielded, kind, road, key):
         controller = build.in_corridor(
             controller, car.trained.model, plant, car.trained.law, car.certificate
         )
+    coordinates = len(plant.state_names) - 1
+    controller = control.along_reference(controller, coordinates=coordinates)
     episode = evaluation.simulate(
         plant.step,
         controller,
