@@ -12,6 +12,8 @@ os.environ.setdefault(
 )
 os.environ.setdefault("JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS", "0.5")
 os.environ.setdefault("JAX_PERSISTENT_CACHE_MIN_ENTRY_SIZE_BYTES", "-1")
+# Threads of BLAS wait for each other over small matrices, minutes in one test.
+os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 # What is compiled here runs once or twice: optimising it, and fusing it by MLIR, took
 # half the time of the tests.
 _fast = "--xla_backend_optimization_level=0"
