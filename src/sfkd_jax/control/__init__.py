@@ -27,6 +27,7 @@ from sfkd_jax.control.tasks._constraints import (
     outside_circles,
 )
 from sfkd_jax.control.tasks._environments import over_environments
+from sfkd_jax.control.tasks._free_task import free_task
 from sfkd_jax.control.tasks._path_tracking import (
     Cost,
     StageInputs,
@@ -38,7 +39,6 @@ from sfkd_jax.control.tasks._task import (
     RolloutSetup,
     StepResult,
     Task,
-    free_task,
 )
 from sfkd_jax.control.wrappers._adaptation import Adaptation
 from sfkd_jax.control.wrappers._delay import delay_compensated

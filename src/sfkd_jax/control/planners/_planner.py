@@ -93,10 +93,8 @@ class Evaluated(NamedTuple):
         # A rollout that is not finite keeps nothing, whatever its violation says.
         violations = jnp.where(jnp.isfinite(costs), self.violations, jnp.inf)
         kept = violations <= 0.0
-        any_kept = jnp.any(kept)
-        return jnp.where(
-            any_kept, jnp.where(kept, costs, jnp.inf), violations
-        ), any_kept
+        any_kept, costs = jnp.any(kept), jnp.where(kept, costs, jnp.inf)
+        return jnp.where(any_kept, costs, violations), any_kept
 
 
 Evaluate: TypeAlias = Callable[[Plans], Evaluated]
@@ -281,22 +279,16 @@ class Planner:
         task, count, axes = self.task, plans.shape[1], (0, 0, None, None)
         numbers = jnp.arange(self.horizon)
         places = StepIndex(numbers, (numbers == self.horizon - 1).astype(plans.dtype))
-        step = jax.vmap(partial(task.step, tuning.cost, setup.context), in_axes=axes)
-
-        def violations_of(
-            state: Any, control: Array, target: Any, at: StepIndex
-        ) -> Any:
-            if task.constraint is None:
-                return None
-            every = partial(task.constraint, tuning.constraints)
-            every = jax.vmap(every, in_axes=axes)(state, control, target, at)
-            # NaN compares as kept, so it must not get through.
-            return jnp.max(jnp.where(jnp.isnan(every), jnp.inf, every), axis=1)
+        step = jax.vmap(partial(task.step, tuning.cost, setup.context), axes)
 
         def body(carry: Any, inputs: Any) -> Any:
             costs, samples = carry
-            after = step(samples, *inputs)
-            worst = violations_of(after.state, after.control, *inputs[1:])
+            after, worst = step(samples, *inputs), None
+            if task.constraint is not None:
+                each = jax.vmap(partial(task.constraint, tuning.constraints), axes)
+                every = each(after.state, after.control, *inputs[1:])
+                # NaN compares as kept, so it must not get through.
+                worst = jnp.max(jnp.where(jnp.isnan(every), jnp.inf, every), axis=1)
             along = after.control, after.perturbation, after.state, worst
             return (costs + after.cost, after.sample), along
 
