@@ -101,7 +101,9 @@ class FreeTask:
         # Integers become real if the dynamics make them so: a scan keeps types.
         after = jax.eval_shape(self.dynamics, params, state, before, env)
         state = jax.tree.map(
-            lambda leaf, like: leaf if leaf.dtype == like.dtype else leaf.astype(like),
+            lambda leaf, like: (
+                leaf if leaf.dtype == like.dtype else leaf.astype(like.dtype)
+            ),
             state,
             after,
         )
