@@ -17,7 +17,7 @@ from sfkd_jax.store import DirectoryLocked, locked
 
 ROW = {
     "system": "sfkd", "scenario": "s3", "vehicle": "kinematic", "inner_loop": "none", "controller": "mppi",
-    "planner": "mppi", "sampling": "feedback", "env": "measured", "variation": None,
+    "planner": "mppi", "sampling": "feedback", "env": "measured",
 }  # fmt: skip
 SETTINGS = {"vehicle": {}, "controller": {}, "evaluation": {}}
 HOLD = """

@@ -20,7 +20,7 @@ def run(settings: Settings) -> dict[str, Any]:
     collected.
     """
     began, table = time.perf_counter(), Comparison(settings)
-    done = table.evaluate() if settings.comparison.drive else 0
+    done = table.evaluate()
     if settings.comparison.share is not None:
         return {"results": None, "rows": done, "failed": len(table.failed)}
     with store.locked(table.directory, wait=True):

@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import Any
 
 from sfkd_jax import build, evaluation, policy, store
-from sfkd_jax.experiment import evaluating, grid
+from sfkd_jax.experiment import comparing, evaluating
 from sfkd_jax.experiment.command import hydra_command
 from sfkd_jax.experiment.options import Settings
 from sfkd_jax.report import film_of, of_rows, text_table
@@ -55,8 +55,8 @@ def run(settings: Settings) -> dict[str, Any]:
                 f"driving {about.episodes} x {about.episode_s:.0f} s: {name}"
             )
             evaluate = evaluating.SystemEvaluation(settings, name, system, None)
-            result, path = evaluate(episodes), results / name
-            rows.append(grid.write_cell(path, directory, settings, episodes, result))
+            written = results / name, directory, settings, episodes
+            rows.append(comparing.write_cell(*written, evaluate(episodes)))
         rows, file = evaluation.compare(rows), results / "results.json"
         document = {
             "rows": rows,

@@ -23,7 +23,6 @@ def made(level, system, *, count=4, violation=None, act_ms=None, **changes):
         "vehicle": "kinematic",
         "sampling": "feedback",
         "env": "measured",
-        "variation": None,
         "seeds": [0],
         **changes,
     }
@@ -60,7 +59,6 @@ def test_comparisons_are_ratios_to_the_oracle_and_paired_differences_to_ours():
     [
         {"scenario": "s1"},
         {"vehicle": "dynamic"},
-        {"variation": "late"},
         {"sampling": "plain"},
         {"count": 3},
     ],

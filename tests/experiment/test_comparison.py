@@ -9,7 +9,7 @@ import pytest
 from composing import settings
 from helpers import last_line, run_command
 
-from sfkd_jax.experiment import grid
+from sfkd_jax.experiment import comparing
 from sfkd_jax.experiment.runs import source_hash
 from sfkd_jax.settings import replace
 from sfkd_jax.store import write_json
@@ -27,36 +27,34 @@ def plan():
         controllers={"mppi": ["s1", "s2"], "mppi_plain": ["s1"]},
         own_controllers={"program": {"mppi": "koopman_mpc", "mppi_plain": None}},
         rows={"ours": "model=sfkd", "program": "model=koopman_mpc seed=3"},
-        variations={"as it is": None, "late": "environment.sensor.delay_s=0.5"},
         policies="table",
     )
 
 
 def cells(**changes):
-    return grid.list_cells(replace(plan(), **changes))
+    return comparing.list_cells(replace(plan(), **changes))
 
 
 def test_every_row_has_every_scenario_under_each_of_its_controllers():
     found = cells()
-    assert len(found) == len(set(found)) == 2 * 2 * 2 * (3 + 2)
+    assert len(found) == len(set(found)) == 2 * 2 * (3 + 2)
     assert {c.controller for c in found if c.label == "program"} == {"koopman_mpc"}
     assert {c.scenario for c in found if c.controller == "mppi_plain"} == {"s1"}
-    groups = grid.group_cells(found)
+    groups = comparing.group_cells(found)
     assert [cell for group in groups for cell in group] == found
     assert len(groups) == 2 * 2 * (2 + 1)
 
 
-@pytest.mark.parametrize("name", ["untrained", "trained_once"])
-def test_a_row_that_is_not_trained_again_has_the_first_seed_alone(name):
-    found = cells(**{name: ["ours"]})
+def test_a_row_that_is_not_trained_again_has_the_first_seed_alone():
+    found = cells(one_seed=["ours"])
     assert {cell.seed for cell in found if cell.label == "ours"} == {0}
     assert {cell.seed for cell in found if cell.label == "program"} == {0, 1}
 
 
-def test_a_cell_composes_its_row_what_was_tuned_and_its_variation():
+def test_a_cell_composes_its_row_and_what_was_tuned():
     tuned = replace(plan(), tuned={"dynamic": {"program": "model.functions=9"}})
-    cell = grid.Cell("dynamic", "program", 1, "koopman_mpc", "late", "s2")
-    assert grid.overrides(cell, tuned) == [
+    cell = comparing.Cell("dynamic", "program", 1, "koopman_mpc", "s2")
+    assert comparing.overrides(cell, tuned) == [
         "vehicle=dynamic",
         "scenario=s2",
         "controller=koopman_mpc",
@@ -64,24 +62,22 @@ def test_a_cell_composes_its_row_what_was_tuned_and_its_variation():
         "model=koopman_mpc",
         "seed=3",
         "model.functions=9",
-        "environment.sensor.delay_s=0.5",
     ]
-    assert grid.overrides(cell._replace(vehicle="kinematic"), tuned)[-2:] == [
-        "seed=3",
-        "environment.sensor.delay_s=0.5",
-    ]
+    assert (
+        comparing.overrides(cell._replace(vehicle="kinematic"), tuned)[-1] == "seed=3"
+    )
 
 
 def test_every_row_belongs_to_exactly_one_share():
     """Two controllers of one row share its policy: no two processes may train it."""
-    groups = grid.group_cells(cells())
-    parts = [grid.take_share(groups, (k, 3)) for k in range(3)]
+    groups = comparing.group_cells(cells())
+    parts = [comparing.take_share(groups, (k, 3)) for k in range(3)]
     assert sorted(group for part in parts for group in part) == sorted(groups)
     policies = [row for part in parts for row in {group[0][:3] for group in part}]
     assert len(policies) == len(set(policies))
-    assert grid.take_share(groups, None) == groups
+    assert comparing.take_share(groups, None) == groups
     with pytest.raises(ValueError, match=r"comparison\.share"):
-        grid.take_share(groups, (3, 3))
+        comparing.take_share(groups, (3, 3))
 
 
 def rows_file(path):
@@ -89,17 +85,17 @@ def rows_file(path):
 
 
 def test_a_cell_is_done_only_with_its_own_settings_and_undamaged(tmp_path):
-    path, chosen = grid.cell_path(cells()[0], tmp_path), settings()
-    assert not grid.is_done(path, chosen)
-    made = grid.settings_hash(chosen)
+    path, chosen = cells()[0].path(tmp_path), settings()
+    assert not comparing.is_done(path, chosen)
+    made = comparing.settings_hash(chosen)
     path.parent.mkdir(parents=True)
     write_json(rows_file(path), {"row": {}, "made_with": made})
-    assert grid.is_done(path, chosen)
-    assert not grid.is_done(path, settings("evaluation.episodes=9"))
-    assert not grid.is_done(path, settings("environment.sensor.delay_s=0.5"))
-    assert not grid.is_done(path, settings("training.steps=50"))
+    assert comparing.is_done(path, chosen)
+    assert not comparing.is_done(path, settings("evaluation.episodes=9"))
+    assert not comparing.is_done(path, settings("environment.sensor.delay_s=0.5"))
+    assert not comparing.is_done(path, settings("training.steps=50"))
     rows_file(path).write_bytes(rows_file(path).read_bytes()[:-5])
-    assert not grid.is_done(path, chosen)
+    assert not comparing.is_done(path, chosen)
 
 
 def row(system, level, seed):
@@ -109,7 +105,6 @@ def row(system, level, seed):
         "scenario": "s1",
         "vehicle": "kinematic",
         "sampling": "feedback",
-        "variation": None,
         "max_deviation_m": level,
         "departures": 0,
         "ratio_to_oracle": None,
@@ -122,9 +117,11 @@ def row(system, level, seed):
 
 def keep(tmp_path, cell, entry, made):
     """A stored cell, made with these settings."""
-    path = grid.cell_path(cell, tmp_path)
+    path = cell.path(tmp_path)
     path.parent.mkdir(parents=True, exist_ok=True)
-    write_json(rows_file(path), {"row": entry, "made_with": grid.settings_hash(made)})
+    write_json(
+        rows_file(path), {"row": entry, "made_with": comparing.settings_hash(made)}
+    )
 
 
 def collected(tmp_path, entries, missing=(), changes=()):
@@ -135,10 +132,10 @@ def collected(tmp_path, entries, missing=(), changes=()):
 
     listed = []
     for label in [*entries, *missing]:
-        listed.append(grid.Cell("kinematic", label, 0, "mppi", "as it is", "s1"))
+        listed.append(comparing.Cell("kinematic", label, 0, "mppi", "s1"))
         if label in entries:
             keep(tmp_path, listed[-1], entries[label], compose(listed[-1]))
-    rows = grid.collect_rows(listed, tmp_path, compose)
+    rows = comparing.collect_rows(listed, tmp_path, compose)
     return {entry["system"]: entry for entry in rows}
 
 
@@ -149,14 +146,13 @@ def test_collecting_pools_the_seeds_and_compares_what_is_there(tmp_path, seeds):
         own_controllers={},
         vehicles=["kinematic"],
         seeds=list(range(seeds)),
-        variations={"as it is": None},
         controllers={"mppi": ["s1"]},
     )
     for cell in wanted:
         if cell.label != "missing":
             entry = row(cell.label, LEVELS[cell.label], cell.seed)
             keep(tmp_path, cell, entry, settings())
-    rows = grid.collect_rows(wanted, tmp_path, lambda cell: settings())
+    rows = comparing.collect_rows(wanted, tmp_path, lambda cell: settings())
     found = {entry["system"]: entry for entry in rows}
     assert set(found) == {"sfkd", "icode"}
     assert found["icode"]["seeds"] == list(range(seeds))
@@ -166,7 +162,7 @@ def test_collecting_pools_the_seeds_and_compares_what_is_there(tmp_path, seeds):
 
 def test_a_row_that_was_made_with_other_settings_or_code_is_announced(tmp_path, capsys):
     listed = [
-        grid.Cell("kinematic", label, 0, "mppi", "as it is", "s1")
+        comparing.Cell("kinematic", label, 0, "mppi", "s1")
         for label in ("sfkd", "icode", "nominal")
     ]
     sources = (source_hash(), source_hash(), "another")
@@ -174,7 +170,7 @@ def test_a_row_that_was_made_with_other_settings_or_code_is_announced(tmp_path, 
         made = settings("seed=9") if cell.label == "icode" else settings()
         entry = row(cell.label, 1.0, 0) | {"provenance": {"source": source}}
         keep(tmp_path, cell, entry, made)
-    rows = grid.collect_rows(listed, tmp_path, lambda cell: settings())
+    rows = comparing.collect_rows(listed, tmp_path, lambda cell: settings())
     assert {entry["system"] for entry in rows} == {"sfkd", "nominal"}
     said = capsys.readouterr().err
     assert "1 cells were made with other settings" in said

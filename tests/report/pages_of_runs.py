@@ -28,7 +28,7 @@ def row(system, env="measured", scenario="s3", vehicle="kinematic", **more):
     record = {
         "system": system, "model": system, "controller": planner, "planner": planner,
         "sampling": None if system == "koopman_mpc" else "feedback", "env": env,
-        "scenario": scenario, "vehicle": vehicle, "inner_loop": "none", "variation": None,
+        "scenario": scenario, "vehicle": vehicle, "inner_loop": "none",
         "seeds": [0], "episodes": 2, "episode_s": 12.0, "params": 12345,
         "alpha": 0.93207 if own else None,
         "rmse_m": {"mean": mean, "std": 0.1 * mean, "ci95": [0.9 * mean, 1.1 * mean], "median": mean},

@@ -163,7 +163,7 @@ def test_hostile_names_are_text_on_every_page(tmp_path):
 def test_enemy_numbers_become_dashes_or_numbers(tmp_path):
     odd = [
         made.row("sfkd", rmse_m={"mean": value, "std": value, "ci95": [value, value]},
-                 max_deviation_m=value, act_ms={"p50": value}, variation=str(value))
+                 max_deviation_m=value, act_ms={"p50": value}, inner_loop=str(value))
         for value in (None, 1e308, 5e-324, 0.0, -0.1, "x")
     ]  # fmt: skip
     run = made.write_run(tmp_path / "r", episodes=False, results={"rows": odd})
@@ -395,15 +395,15 @@ def test_a_mark_needs_a_corrected_p_value(record, side):
     assert cell.endswith({1: ") *", -1: ") †", 0: ")"}[side])
 
 
-def test_variations_of_the_protocol_are_tables_of_their_own(tmp_path, no_figures):
-    late = made.row("sfkd", variation="e late")
+def test_vehicles_under_a_speed_loop_are_a_table_of_their_own(tmp_path, no_figures):
+    loop = made.row("sfkd", inner_loop="speed")
     directory = made.write_comparison(
-        tmp_path, episodes=False, rows=[made.row("sfkd"), late]
+        tmp_path, episodes=False, rows=[made.row("sfkd"), loop]
     )
     report.write_results_page(directory)
     text = (directory / "report" / "report.md").read_text()
     assert "## Sampling around a feedback law\n" in text
-    assert "## Sampling around a feedback law, e late\n" in text
+    assert "## Under a speed loop, sampling around a feedback law\n" in text
 
 
 def test_the_numbers_that_the_paper_prints_are_on_the_page(tmp_path, no_figures):

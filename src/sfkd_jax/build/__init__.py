@@ -36,7 +36,6 @@ from sfkd_jax.settings import (
 )
 from sfkd_jax.types import (
     Control,
-    Environment,
     Model,
     Reference,
     Space,
@@ -285,34 +284,16 @@ def reference_systems(
 ) -> dict[str, System]:
     """Return the systems that need no learning, by name.
 
-    "nominal" predicts with the bicycle, "oracle" with the true plant, and "oracle_…"
-    with the true plant under a wrong environment. With a law they describe its closed
-    loop, in path coordinates; "law" is then the oracle once more, for a planner without
-    samples (`num_samples=1`), so that the law drives alone.
+    "nominal" predicts with the bicycle, "oracle" with the true plant. With a law they
+    describe its closed loop, in path coordinates; "law" is then the oracle once more,
+    for a planner without samples (`num_samples=1`), so that the law drives alone.
 
     Args:
         plant: the true vehicle.
         law: of path coordinates, or None.
     """
-
-    def biased(entry: int, factor: float) -> Callable[[Environment], Environment]:
-        return lambda env: env.at[entry].multiply(factor)
-
-    along = law is not None
     plant = plant if law is None else build_loop(plant, law)
-    oracle = partial(models.physics, plant.step, along_path=along)
-    rows = {
-        "nominal": System(models.physics(plant.nominal, along_path=along), {}, "none"),
-        "oracle": System(oracle(), {}, "measured"),
-    }
-    if along:
-        rows["law"] = rows["oracle"]
-    distortions = {
-        "friction_x0.7": (0, 0.7),
-        "friction_x1.3": (0, 1.3),
-        "wind_x0": (1, 0.0),
-        "wind_x2": (1, 2.0),
-    }
-    for name, change in distortions.items():
-        rows[f"oracle_{name}"] = System(oracle(distort=biased(*change)), {}, "measured")
-    return {name: row._replace(law=law) for name, row in rows.items()}
+    physics = partial(models.physics, along_path=law is not None)
+    oracle = System(physics(plant.step), {}, "measured", law=law)
+    nominal = System(physics(plant.nominal), {}, "none", law=law)
+    return {"nominal": nominal, "oracle": oracle} | ({"law": oracle} if law else {})

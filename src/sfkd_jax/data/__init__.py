@@ -4,7 +4,6 @@ from sfkd_jax.data._dataset import PARTS as PARTS
 from sfkd_jax.data._dataset import Dataset as Dataset
 from sfkd_jax.data._dataset import check_on_path as check_on_path
 from sfkd_jax.data._dataset import check_shares as check_shares
-from sfkd_jax.data._dataset import first_share as first_share
 from sfkd_jax.data._dataset import measure_space as measure_space
 from sfkd_jax.data._dataset import random_windows as random_windows
 from sfkd_jax.data._dataset import split as split

@@ -113,12 +113,6 @@ def split(
     return Dataset(*parts, **corners, scenarios=labels)
 
 
-def first_share(trajectories: Trajectory, share: float) -> Trajectory:
-    """Return the first share of the trajectories, at least one."""
-    count = max(1, round(share * trajectories.states.shape[0]))
-    return jax.tree.map(lambda leaf: leaf[:count], trajectories)
-
-
 def measure_space(dataset: Dataset) -> Space:
     """Measure the scales of s and u over the training part, and those of e over E."""
     train = dataset.train

@@ -27,10 +27,9 @@ SHARED = (
     "controller",
     "planner",
     "sampling",
-    "variation",
 )
 """Columns that are equal in rows that are compared."""
-IDENTITY = ("system", *SHARED[:-1], "env", SHARED[-1])
+IDENTITY = ("system", *SHARED, "env")
 """Columns that identify a row of results.json; a new row replaces the old row of the
 same identity.
 """
@@ -143,7 +142,7 @@ def compare(rows: list[Row], *, missing: int = 0) -> list[Row]:
 def _episodes(entry: Row) -> tuple[Any, ...]:
     """Key of the episodes of a row; rows with equal keys are paired."""
     return (
-        *(entry[name] for name in ("scenario", "vehicle", "variation")),
+        *(entry[name] for name in ("scenario", "vehicle")),
         # A quadratic program has no sampling; it starts from feedback too.
         entry["sampling"] or "feedback",
         entry.get("drives"),

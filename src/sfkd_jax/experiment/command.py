@@ -14,6 +14,7 @@ from typing import Any
 
 import hydra
 import jax
+import jaxlib
 from hydra.core.hydra_config import HydraConfig
 from hydra.types import RunMode
 from omegaconf import DictConfig, OmegaConf
@@ -139,7 +140,7 @@ def compile_fast() -> None:
     jax.config.update("jax_disable_most_optimizations", True)
     flags = [os.environ.get("XLA_FLAGS", "")]
     # Fusion by MLIR is half of the time. XLA aborts at a flag that it does not know.
-    if jax.lib.__version__.startswith("0.10."):
+    if jaxlib.__version__.startswith("0.10."):
         flags.append("--xla_cpu_use_fusion_emitters=false")
     # Read when the first program is compiled, which comes later.
     os.environ["XLA_FLAGS"] = " ".join(flags)

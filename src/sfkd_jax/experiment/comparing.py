@@ -3,22 +3,228 @@
 from __future__ import annotations
 
 import functools
+import itertools
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
+from typing import NamedTuple
 
+import numpy as np
 from hydra.errors import HydraException
 from jax.errors import JaxRuntimeError
 from omegaconf.errors import OmegaConfBaseException
 
-from sfkd_jax import store
+from sfkd_jax import evaluation, store
 from sfkd_jax.evaluation.metrics import Row
-from sfkd_jax.experiment import command, data, evaluating, grid, runs, stages
-from sfkd_jax.experiment.grid import Cell
-from sfkd_jax.experiment.options import Settings
+from sfkd_jax.experiment import command, data, evaluating, runs, stages
+from sfkd_jax.experiment.evaluating import EpisodeSet, SystemResult
+from sfkd_jax.experiment.options import ComparisonSettings, Settings
 from sfkd_jax.settings import plain, replace
 from sfkd_jax.training import TrainingStopped
+
+KIND = "cell"
+NUM_STORED_EPISODES = 2
+"""Episodes of a cell whose arrays are stored for figures; its row covers them all."""
+
+
+class Cell(NamedTuple):
+    """One row of the comparison on one scenario; all are words of the settings."""
+
+    vehicle: str
+    label: str
+    seed: int
+    controller: str
+    scenario: str
+
+    def path(self, directory: Path) -> Path:
+        """Return the path of the cell's files in a comparison, without suffixes."""
+        folders = self.vehicle, self.scenario, self.controller
+        return directory.joinpath("cells", *folders, f"{self.label}-seed={self.seed}")
+
+
+def list_cells(comparison: ComparisonSettings) -> list[Cell]:
+    """Return all cells in the order of evaluation; those of one system are adjacent.
+
+    Every row is evaluated from one seed before any from the next, so that a table that
+    was interrupted still compares all rows.
+
+    Raises:
+        ValueError: `only` or `one_seed` names an unknown row, or a seed is repeated.
+    """
+    rows, seeds = comparison.rows, comparison.seeds
+    for name in ("only", "one_seed"):
+        if unknown := set(getattr(comparison, name)) - set(rows):
+            raise ValueError(
+                f"unknown comparison.{name} {', '.join(sorted(unknown))}; "
+                f"choose of {', '.join(rows) or 'none'}"
+            )
+    if len(set(seeds)) < len(seeds):
+        raise ValueError(f"comparison.seeds={list(seeds)} repeats a seed")
+    labels = [label for label in rows if label in (comparison.only or rows)]
+    cells = []
+    for seed, vehicle, label in itertools.product(seeds, comparison.vehicles, labels):
+        if label in comparison.one_seed and seed != seeds[0]:
+            continue
+        for common, scenarios in comparison.controllers.items():
+            own = comparison.own_controllers.get(label, {}).get(common, common)
+            # A row may have no controller of its own for a common one.
+            chosen = scenarios if own else ()
+            cells += [Cell(vehicle, label, seed, str(own), name) for name in chosen]
+    return cells
+
+
+def group_cells(cells: list[Cell]) -> list[list[Cell]]:
+    """Group cells that differ only in the scenario: one program evaluates them."""
+    return [
+        list(group) for _, group in itertools.groupby(cells, key=lambda cell: cell[:4])
+    ]
+
+
+def take_share(
+    groups: list[list[Cell]], share: tuple[int, int] | None
+) -> list[list[Cell]]:
+    """Return the groups of every n-th row from the k-th on, share = [k, n].
+
+    All groups of a row are in one share, because they use the same policy.
+
+    Raises:
+        ValueError: not 0 ≤ k < n.
+    """
+    if share is None:
+        return groups
+    first, count = share
+    if not 0 <= first < count:
+        raise ValueError(
+            f"comparison.share must be [k, n] with 0 <= k < n, got {list(share)}"
+        )
+    # In order of appearance, so that every process counts the rows alike.
+    rows = list(dict.fromkeys(group[0][:3] for group in groups))
+    return [group for group in groups if rows.index(group[0][:3]) % count == first]
+
+
+def overrides(cell: Cell, comparison: ComparisonSettings) -> list[str]:
+    """Return the overrides of a cell, beyond those of the command."""
+    tuned = comparison.tuned.get(cell.vehicle, {}).get(cell.label)
+    return [
+        f"vehicle={cell.vehicle}",
+        f"scenario={cell.scenario}",
+        f"controller={cell.controller}",
+        f"seed={cell.seed}",
+        *(comparison.rows[cell.label] or "").split(),
+        *(tuned or "").split(),
+    ]
+
+
+def settings_hash(settings: Settings) -> str:
+    """Hash the settings that the result of a cell depends on.
+
+    Neither the code nor the location of the artefacts enters.
+    """
+    names = ("environment", "controller", "scenario", "certification", "evaluation")
+    chosen = {name: plain(getattr(settings, name)) for name in names}
+    return store.sha256(runs.identity(settings) | chosen)
+
+
+def episodes_hash(settings: Settings) -> str:
+    """Hash what the roads and the plant of a cell depend on.
+
+    Rows with another hash met other episodes, and are not paired with it.
+    """
+    protocol = settings.evaluation
+    names = ("seed", "episodes", "episode_s")
+    return store.sha256(
+        {name: getattr(protocol, name) for name in names}
+        | {"vehicle": plain(settings.vehicle), "scenario": plain(settings.scenario)}
+    )
+
+
+def is_done(path: Path, settings: Settings) -> bool:
+    """Whether an undamaged cell with exactly these settings is stored."""
+    try:
+        document = store.read_json(_row_file(path), keys=("row",))
+        return document["made_with"] == settings_hash(settings)
+    # Damaged, missing or unfinished: the cell is evaluated again.
+    except (store.ArtefactError, OSError, KeyError):
+        return False
+
+
+def write_cell(
+    path: Path,
+    directory: Path,
+    settings: Settings,
+    episodes: EpisodeSet,
+    result: SystemResult,
+) -> Row:
+    """Write the arrays of the first episodes, then the row, and return the row.
+
+    Args:
+        path: of the cell, without suffix.
+        directory: of the comparison.
+        settings: of the cell.
+        episodes: that were simulated.
+        result: row and arrays.
+    """
+    scenarios = episodes.scenarios
+    arrays = result.arrays | {"envs": scenarios.envs, "path": scenarios.path.points}
+    # Copied to the host first: slices on a device would be compiled.
+    stored = {
+        name: np.asarray(array)[:NUM_STORED_EPISODES] for name, array in arrays.items()
+    }
+    stored["dt"] = np.asarray(settings.vehicle.dt)
+    file = path.with_name(f"{path.name}.safetensors")
+    store.write_arrays(file, stored, kind=KIND, config=plain(settings.scenario))
+    row = result.row | {
+        "arrays": str(file.relative_to(directory)),
+        "provenance": runs.provenance(),
+    }
+    # The row last: its file is what marks a cell as done.
+    document = {"row": row, "made_with": settings_hash(settings)}
+    store.write_json(_row_file(path), document)
+    return row
+
+
+def collect_rows(
+    cells: list[Cell], directory: Path, compose_cell: Callable[[Cell], Settings]
+) -> list[Row]:
+    """Return the rows of all stored cells, with seeds pooled and systems compared.
+
+    Prints how many cells were made with other settings, and how many by other code.
+    """
+    pooled: dict[Cell, list[Row]] = {cell._replace(seed=0): [] for cell in cells}
+    others, by_other_code = [], []
+    for cell in cells:
+        path = _row_file(cell.path(directory))
+        if not path.exists():
+            continue
+        document = store.read_json(path, keys=("row", "made_with"))
+        settings = compose_cell(cell)
+        if document["made_with"] != settings_hash(settings):
+            others.append(path)
+            continue
+        row = document["row"] | {"drives": episodes_hash(settings)}
+        # Seeds of a row are pooled under one key.
+        pooled[cell._replace(seed=0)].append(row)
+        if row.get("provenance", {}).get("source") != runs.source_hash():
+            by_other_code.append(path)
+    for paths, who, what in (
+        (others, "with other settings", "left out"),
+        (by_other_code, "by other code", "used"),
+    ):
+        if paths:
+            store.print_message(
+                f"{len(paths)} cells were made {who}, such as {paths[0]}: {what}"
+            )
+    rows = []
+    for cell, trainings in pooled.items():
+        if trainings:
+            with store.as_artefact_error(cell.path(directory)):
+                rows.append(evaluation.pool(trainings))
+    return evaluation.compare(rows, missing=len(pooled) - len(rows))
+
+
+def _row_file(path: Path) -> Path:
+    return path.with_name(f"{path.name}.row.json")
 
 
 class Comparison:
@@ -33,12 +239,12 @@ class Comparison:
     def __init__(self, settings: Settings) -> None:
         """List the cells of the comparison."""
         self.directory = Path(settings.root) / settings.name
-        self.cells = grid.list_cells(settings.comparison)
+        self.cells = list_cells(settings.comparison)
         self.failed: dict[str, str] = {}
         self._settings = settings
         # Composed once: every cell is asked for its settings several times.
         self._compose = functools.cache(self._composed)
-        self._episodes: dict[str, evaluating.EpisodeSet] = {}
+        self._episodes: dict[str, EpisodeSet] = {}
 
     def evaluate(self) -> int:
         """Evaluate all cells that are not done, and return how many there were.
@@ -49,7 +255,7 @@ class Comparison:
         """
         began, done = time.perf_counter(), 0
         share = self._settings.comparison.share
-        groups = grid.take_share(grid.group_cells(self.cells), share)
+        groups = take_share(group_cells(self.cells), share)
         for group in groups:
             with self._named_if_it_fails(group):
                 self._check(group)
@@ -73,7 +279,7 @@ class Comparison:
             ValueError: there is none.
         """
         with store.as_artefact_error(self.directory / "cells"):
-            rows = grid.collect_rows(self.cells, self.directory, self._compose)
+            rows = collect_rows(self.cells, self.directory, self._compose)
         if not rows:
             reasons = "; ".join(self.failed.values()) or "none was requested"
             raise ValueError(f"nothing to compare: no row came out ({reasons})")
@@ -83,13 +289,11 @@ class Comparison:
         """The settings of a cell, under the name of the comparison."""
         comparison = self._settings.comparison
         try:
-            composed = command.compose(*grid.overrides(cell, comparison))
+            composed = command.compose(*overrides(cell, comparison))
         except (HydraException, OmegaConfBaseException) as reason:
             line = " ".join(str(reason).split("\n")[0].split())
             raise ValueError(f"row {cell.label}: {line}") from None
-        varied = cell.variation if comparison.variations[cell.variation] else None
-        protocol = replace(composed.evaluation, variation=varied)
-        return replace(composed, name=self._settings.name, evaluation=protocol)
+        return replace(composed, name=self._settings.name)
 
     @contextmanager
     def _named_if_it_fails(self, group: list[Cell]) -> Iterator[None]:
@@ -108,14 +312,13 @@ class Comparison:
 
     def _check(self, group: list[Cell]) -> None:
         """Build what the cells of one row need that are not done, without training."""
-        checked: set[str] = set()
-        for cell, settings, _ in self._pending(group):
+        pending = list(self._pending(group))
+        for _, settings, _ in pending:
             self._make_episodes(settings)
-            # One check a program: cells that differ in scenario alone build the same.
-            key = grid.compilation_key(settings)
-            if "self" in settings.evaluation.systems and key not in checked:
-                checked.add(key)
-                stages.check_settings(self._run_settings(cell))
+        # One check a row: its cells differ in scenario alone, and build the same.
+        for cell, settings, _ in pending[:1]:
+            if "self" in settings.evaluation.systems:
+                stages.check_settings(self._of_policy(cell, settings))
 
     def _evaluate(self, group: list[Cell]) -> int:
         """Evaluate the cells of one row under one controller that are not done.
@@ -125,17 +328,13 @@ class Comparison:
             ArtefactError: damaged files, or a policy made with other settings.
             TrainingStopped: the training of the policy diverged.
         """
-        evaluations: dict[str, evaluating.SystemEvaluation] = {}
-        done = 0
+        evaluate, done = None, 0
         for cell, settings, path in self._pending(group):
-            run_settings = self._run_settings(cell)
             episodes = self._make_episodes(settings)
-            key = grid.compilation_key(run_settings)
-            # Compiled once for all scenarios and variations that share a program.
-            if key not in evaluations:
-                evaluations[key] = _compile(run_settings)
-            result = evaluations[key](episodes)
-            grid.write_cell(path, self.directory, settings, episodes, result)
+            # Compiled once for all scenarios.
+            evaluate = evaluate or self._compiled(cell, settings)
+            result = evaluate(episodes)
+            write_cell(path, self.directory, settings, episodes, result)
             error = 1e3 * result.row["rmse_m"]["mean"]
             store.print_message(f"{' '.join(map(str, cell))}: {error:.1f} mm")
             done += 1
@@ -144,22 +343,25 @@ class Comparison:
     def _pending(self, group: list[Cell]) -> Iterator[tuple[Cell, Settings, Path]]:
         """The cells that are not done, their settings and their paths."""
         for cell in group:
-            settings = self._compose(cell)
-            path = grid.cell_path(cell, self.directory)
-            if not grid.is_done(path, settings):
+            settings, path = self._compose(cell), cell.path(self.directory)
+            if not is_done(path, settings):
                 yield cell, settings, path
 
-    def _run_settings(self, cell: Cell) -> Settings:
-        """The settings of a cell, under the name of the run of its policy."""
-        settings, comparison = self._compose(cell), self._settings.comparison
-        # The first variation is the usual protocol;
-        # those that train alike reuse its policy.
-        usual = cell._replace(variation=next(iter(comparison.variations)))
-        retrained = runs.identity(settings) != runs.identity(self._compose(usual))
-        name = grid.policy_name(cell, comparison, retrained=retrained)
-        return replace(settings, name=name)
+    def _of_policy(self, cell: Cell, settings: Settings) -> Settings:
+        """The settings of a cell under the name of the run that trains its policy."""
+        policies = self._settings.comparison.policies
+        return replace(settings, name=f"{policies}/{cell.vehicle}/{cell.label}")
 
-    def _make_episodes(self, settings: Settings) -> evaluating.EpisodeSet:
+    def _compiled(self, cell: Cell, settings: Settings) -> evaluating.SystemEvaluation:
+        """Compile the system of a row; train and certify it first if it learns."""
+        settings = self._of_policy(cell, settings)
+        if "self" in settings.evaluation.systems:
+            stages.ensure_certificate(settings)
+        ((name, system),) = evaluating.load_systems(settings).items()
+        dataset, _ = data.ensure_dataset(settings)
+        return evaluating.SystemEvaluation(settings, name, system, dataset)
+
+    def _make_episodes(self, settings: Settings) -> EpisodeSet:
         """The episodes of a cell; rows that are compared share them."""
         # Not the controller: rows are paired because they meet the same episodes.
         parts = (settings.vehicle, settings.scenario, settings.environment)
@@ -172,12 +374,3 @@ class Comparison:
 def _name(group: list[Cell]) -> str:
     """The name of a row under one controller."""
     return "/".join(map(str, group[0][:4]))
-
-
-def _compile(settings: Settings) -> evaluating.SystemEvaluation:
-    """Compile the only system of a row; train and certify it first if it learns."""
-    if "self" in settings.evaluation.systems:
-        stages.ensure_certificate(settings)
-    ((name, system),) = evaluating.load_systems(settings).items()
-    dataset, _ = data.ensure_dataset(settings)
-    return evaluating.SystemEvaluation(settings, name, system, dataset)

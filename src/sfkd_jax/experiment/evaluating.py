@@ -36,13 +36,11 @@ class EpisodeSet(NamedTuple):
 
     Attributes:
         name: of the scenario.
-        variation: of the protocol, or None.
         scenarios: one per episode, leading axis first.
         keys: one per episode, for sensors and samplers.
     """
 
     name: str
-    variation: str | None
     scenarios: Scenario
     keys: Key
 
@@ -77,7 +75,7 @@ def make_episodes(settings: Settings) -> EpisodeSet:
         jax.random.split(jax.random.key(protocol.seed))
     )
     drawn = _shard((draw(keys[0], keys[1]), keys[1]))
-    return EpisodeSet(settings.scenario.name, protocol.variation, *drawn)
+    return EpisodeSet(settings.scenario.name, *drawn)
 
 
 def _shard(batch: Any) -> Any:
@@ -216,7 +214,7 @@ class SystemEvaluation:
         # Timed once: a control step takes equally long on every scenario.
         if not self._timed:
             self._timed.append(self._act_ms(episodes))
-        about = {"scenario": episodes.name, "variation": episodes.variation}
+        about = {"scenario": episodes.name}
         row = evaluation.row(scores, self._columns | about, self._timed[0], violation)
         if forces := self._settings.evaluation.side_forces:
             row["disturbed"] = []

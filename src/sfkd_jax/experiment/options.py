@@ -29,7 +29,6 @@ from sfkd_jax.ranges import (
     NonNegativeInt,
     Numbers,
     Positive,
-    PositiveFraction,
 )
 from sfkd_jax.settings import OneOf, Values, parse, replace, schema, takes
 
@@ -127,14 +126,12 @@ class TrainingSettings:
     Attributes:
         batch: windows a step.
         window: steps of a window.
-        data_share: part of the training trajectories that is used.
         loss: weights of `training.multi_step_loss`.
     """
 
     loss: Any
     batch: int = 128
     window: int = 20
-    data_share: PositiveFraction = 1.0
     steps: int = 4000
 
 
@@ -175,7 +172,6 @@ class EvaluationSettings:
         side_forces: side forces that no model knows [N].
         threshold_m: δ* of V2 [m]: a round number below 1.15 m, the nominal model's 95 %
             error within 2 s on S1.
-        variation: name of a variation of the protocol.
     """
 
     episodes: int = 8
@@ -186,7 +182,6 @@ class EvaluationSettings:
     timed_steps: NonNegativeInt = 50
     side_forces: Numbers = ()
     threshold_m: Positive = 1.0
-    variation: str | None = None
 
 
 @takes()
@@ -200,13 +195,10 @@ class ComparisonSettings:
         controllers: controller -> scenarios.
         own_controllers: row -> controller -> what this row has instead, or None.
         rows: label -> overrides.
-        untrained: labels of rows that train nothing: the first seed only.
-        trained_once: labels of rows that are trained from the first seed only.
+        one_seed: labels of rows of the first seed only, such as untrained ones.
         tuned: vehicle -> label -> more overrides.
         only: labels of rows; empty: all.
-        drive: False: only collect and draw stored rows.
         share: [k, n]: evaluate every n-th row from the k-th on, collect nothing.
-        variations: of the protocol -> overrides.
         paper: what the paper prints.
         page: arguments of its page.
     """
@@ -219,13 +211,10 @@ class ComparisonSettings:
     )
     own_controllers: dict[str, Overrides] = field(default_factory=dict)
     rows: Overrides = field(default_factory=dict)
-    untrained: Names = ()
-    trained_once: Names = ()
+    one_seed: Names = ()
     tuned: dict[str, dict[str, str]] = field(default_factory=dict)
     only: Names = ()
-    drive: bool = True
     share: tuple[NonNegativeInt, NonNegativeInt] | None = None
-    variations: Overrides = field(default_factory=dict)
     paper: dict[str, Any] = field(default_factory=dict)
     page: dict[str, Any] = field(default_factory=dict)
 

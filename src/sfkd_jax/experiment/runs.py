@@ -4,13 +4,10 @@ from __future__ import annotations
 
 import functools
 import hashlib
-import os
 import subprocess
 from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any, TypeVar
-
-import jax
 
 from sfkd_jax import evaluation, store
 from sfkd_jax.data import Dataset
@@ -171,27 +168,16 @@ def source_hash() -> str:
     return digest.hexdigest()
 
 
-def provenance() -> dict[str, str | float | None]:
-    """Return what a result depends on besides its settings.
+def provenance() -> dict[str, str | None]:
+    """Return what made a result: the hash of the source, and its commit.
 
-    Hash of the source, the commit if the package is a checkout ("+" if its files were
-    changed since), version, jax, device, and the machine's load average.
+    The commit ends with "+" if files were changed since; outside a checkout it is None.
     """
-    device = jax.devices()[0]
-    installed = store.versions()
-    return {
-        "source": source_hash(),
-        "commit": _commit(),
-        "version": installed["sfkd_jax"],
-        "jax": installed["jax"],
-        "device": f"{device.platform} {device.device_kind}".strip(),
-        "load": os.getloadavg()[0] if hasattr(os, "getloadavg") else None,
-    }
+    return {"source": source_hash(), "commit": _commit()}
 
 
 @functools.cache
 def _commit() -> str | None:
-    """The commit of the checkout, with "+" if its files differ; None outside one."""
     if not (PACKAGE.parents[1] / ".git").exists():
         return None
     command = ["git", "-C", str(PACKAGE), "describe", "--always", "--exclude=*"]

@@ -20,7 +20,6 @@ from sfkd_jax.data import (
     SCENARIOS,
     Dataset,
     check_shares,
-    first_share,
     measure_space,
     random_windows,
     spread_windows,
@@ -139,8 +138,6 @@ def _train(settings: Settings, dataset: Dataset, data_hash: str) -> None:
     """Train, then write the best weights and their errors on the test part."""
     run_dir, options = settings.run_dir, settings.training
     recorded = runs.policy_settings(settings, dataset)
-    # After the settings are recorded, whose boxes are those of all data.
-    dataset = dataset._replace(train=first_share(dataset.train, options.data_share))
     space = measure_space(dataset)
     model = build.build_model(
         settings.model, space, build.build_vehicle(settings.vehicle)

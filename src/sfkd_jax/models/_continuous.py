@@ -75,26 +75,18 @@ def state_model(
     )
 
 
-def physics(
-    step: Step,
-    *,
-    distort: Callable[[Environment], Environment] = lambda env: env,
-    along_path: bool = False,
-) -> Model:
+def physics(step: Step, *, along_path: bool = False) -> Model:
     """Return a one-step function as a `Model` without parameters.
 
     Args:
         step: (x, u, e) -> x one sampling period later, passed in by the caller (models
             never import the vehicle).
-        distort: the environment that the model assumes instead of e; the identity for
-            the true plant.
         along_path: whether x and u are those of `geometry`.
     """
     return state_model(
         # Nothing to learn; an empty tree passes through stores and optimisers.
         init=lambda key: {},
-        # Distorted once per environment, so that a mismatch costs nothing in a step.
-        fiber=lambda params, env: distort(env),
+        fiber=lambda params, env: env,
         step=lambda env, state, control: step(state, control, env),
         along_path=along_path,
     )

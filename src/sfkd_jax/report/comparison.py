@@ -17,7 +17,7 @@ from sfkd_jax.report.episodes import of_rows
 from sfkd_jax.report.pages import Part, Picture, Section
 from sfkd_jax.report.tables import grouped, record_table, title_of
 
-_TABLE = ("inner_loop", "sampling", "variation")
+_TABLE = ("inner_loop", "sampling")
 """Rows of one table share these; its columns are vehicles and scenarios."""
 _FIGURE = ("vehicle", *_TABLE)
 """Rows of one figure share these."""

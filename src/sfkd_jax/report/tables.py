@@ -104,7 +104,6 @@ def title_of(group: list[Row], columns: Iterable[str]) -> str:
         "sampling": SAMPLINGS.get(str(known["sampling"]), known["sampling"]),
         "controller": f"controller {controller}" * (controller != "mppi"),
         "planner": f"planner {known['planner']}" * (known["planner"] is not None),
-        "variation": known["variation"],
     }
     text = ", ".join(filter(None, (words[name] for name in columns))) or "all rows"
     return text[:1].upper() + text[1:]
