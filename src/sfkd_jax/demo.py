@@ -10,7 +10,9 @@ from sfkd_jax import build, evaluation, policy, store
 from sfkd_jax.experiment import comparing, evaluating
 from sfkd_jax.experiment.command import hydra_command
 from sfkd_jax.experiment.options import Settings
-from sfkd_jax.report import film_of, of_rows, text_table
+from sfkd_jax.report.episodes import of_rows
+from sfkd_jax.report.film import film_of
+from sfkd_jax.report.tables import text_table
 from sfkd_jax.settings import plain, replace
 
 SHIPPED = Path(__file__).with_name("pretrained")

@@ -10,7 +10,7 @@ from sfkd_jax.experiment import runs, stages
 from sfkd_jax.experiment.command import command_line, hydra_command
 from sfkd_jax.experiment.evaluating import evaluate_run
 from sfkd_jax.experiment.options import Settings
-from sfkd_jax.report import write_report
+from sfkd_jax.report.run import write_report
 
 
 def run(settings: Settings) -> dict[str, Any]:

@@ -50,7 +50,7 @@ def test_jumps_refuse_a_run_or_cut_it(tmp_path, kind):
     assert longest_move(states) < 0.61  # v ≤ 6 m/s
 
 
-def test_a_jump_of_yaw_cuts_a_drive(tmp_path):
+def test_a_jump_of_yaw_cuts_a_run(tmp_path):
     columns = recorded_run()
     change("yaw", 150, columns["yaw"][150] + 2.5)(columns)
     path = write_csv(tmp_path / "a.csv", columns)

@@ -11,26 +11,27 @@ import pages_of_runs as made
 import pytest
 from PIL import Image, ImageSequence
 
-from sfkd_jax import report
 from sfkd_jax.evaluation.metrics import METRICS, Metric
 from sfkd_jax.report import figures, style, tables
+from sfkd_jax.report.comparison import write_comparison, write_results_page
 from sfkd_jax.report.episodes import Episodes, of_rows, of_run
 from sfkd_jax.report.film import LANE, Film, film_of
 from sfkd_jax.report.pages import to_latex
+from sfkd_jax.report.run import write_report
 from sfkd_jax.store import ArtefactError
 
 
 @pytest.fixture(scope="module")
 def run_page(tmp_path_factory):
     run = made.write_run(tmp_path_factory.mktemp("run"))
-    report.write_report(run)
+    write_report(run)
     return run / "report"
 
 
 @pytest.fixture(scope="module")
 def comparison_page(tmp_path_factory):
     directory = made.write_comparison(tmp_path_factory.mktemp("comparison"))
-    report.write_results_page(directory)
+    write_results_page(directory)
     return directory / "report"
 
 
@@ -40,7 +41,7 @@ def sweep(root, **changes):
         made.write_run(
             root / f"a/seed={seed}", episodes=False, settings=settings, **changes
         )
-    return report.write_comparison(root, "a/seed=*", "page")
+    return write_comparison(root, "a/seed=*", "page")
 
 
 @pytest.fixture
@@ -79,7 +80,7 @@ def test_markdown_links_every_figure(run_page, comparison_page):
 def test_the_same_files_give_the_same_bytes_whatever_the_user_set(tmp_path, run_page):
     again = made.write_run(tmp_path / "run")
     with matplotlib.rc_context({"axes.grid": False, "font.size": 3}):
-        report.write_report(again)
+        write_report(again)
     for old in run_page.rglob("*.*"):
         assert (again / "report" / old.relative_to(run_page)).read_bytes() == (
             old.read_bytes()
@@ -91,7 +92,7 @@ def test_images_of_an_earlier_page_go(tmp_path, no_figures):
     stale = run / "report" / "figures" / "old.png"
     stale.parent.mkdir(parents=True)
     stale.touch()
-    report.write_report(run)
+    write_report(run)
     assert not stale.exists()
 
 
@@ -104,8 +105,8 @@ def test_a_new_metric_is_on_every_page(tmp_path, monkeypatch, no_figures):
     own = [made.row("sfkd", novelty=7), made.row("oracle", novelty=8)]
     run = made.write_run(tmp_path / "run", episodes=False, results={"rows": own})
     compared = made.write_comparison(tmp_path / "compared", episodes=False, rows=own)
-    report.write_report(run)
-    report.write_results_page(compared)
+    write_report(run)
+    write_results_page(compared)
     sweep(tmp_path, results={"rows": own})
     for page in ("run/report", "compared/report", "page/comparison"):
         text = (tmp_path / page / "index.html").read_text()
@@ -148,8 +149,8 @@ def test_hostile_names_are_text_on_every_page(tmp_path):
     compared = made.write_comparison(
         tmp_path / "compared", episodes=False, rows=[odd], name=HOSTILE
     )
-    report.write_report(run)
-    report.write_results_page(compared)
+    write_report(run)
+    write_results_page(compared)
     for page in (run / "report/index.html", compared / "report/index.html"):
         assert "<b>" not in page.read_text()
         assert "&lt;b&gt;" in page.read_text()
@@ -167,9 +168,9 @@ def test_enemy_numbers_become_dashes_or_numbers(tmp_path):
         for value in (None, 1e308, 5e-324, 0.0, -0.1, "x")
     ]  # fmt: skip
     run = made.write_run(tmp_path / "r", episodes=False, results={"rows": odd})
-    report.write_report(run)
+    write_report(run)
     compared = made.write_comparison(tmp_path / "c", episodes=False, rows=odd)
-    report.write_results_page(compared)
+    write_results_page(compared)
     for page in (run, compared):
         text = (page / "report/index.html").read_text()
         assert not re.search(r"<td>[^<]*\b(nan|inf)\b", text)
@@ -204,7 +205,7 @@ def test_what_is_not_certified_is_said(tmp_path, no_figures, change, reason):
     run = made.write_run(
         tmp_path, episodes=False, certificate=made.certificate(**change)
     )
-    report.write_report(run)
+    write_report(run)
     text = (run / "report" / "report.md").read_text()
     assert "No contraction is certified" in text
     assert reason in text
@@ -215,7 +216,7 @@ def test_a_page_of_a_new_run_names_the_commands_that_come_next(tmp_path, no_figu
     run = made.write_run(
         tmp_path, episodes=False, results=None, certificate=None, open_loop=None
     )
-    report.write_report(run)
+    write_report(run)
     text = (run / "report" / "report.md").read_text()
     for command in ("evaluate", "certify", "train"):
         assert f"python -m sfkd\\_jax.{command} makes it" in text
@@ -223,27 +224,27 @@ def test_a_page_of_a_new_run_names_the_commands_that_come_next(tmp_path, no_figu
 
 def test_a_folder_without_a_policy_is_one_line(tmp_path):
     with pytest.raises(ArtefactError, match=r"policy\.safetensors is missing"):
-        report.write_report(tmp_path)
+        write_report(tmp_path)
 
 
 def test_a_file_that_does_not_fit_is_named(tmp_path):
     run = made.write_run(tmp_path, episodes=False, open_loop={"steps": ["one"]})
     with pytest.raises(ArtefactError, match=r"open_loop\.json"):
-        report.write_report(run)
+        write_report(run)
 
 
 @pytest.mark.parametrize("wrong", ["word", [1], 7])
 def test_rows_that_are_none_are_refused_by_the_name_of_their_file(tmp_path, wrong):
     run = made.write_run(tmp_path, episodes=False, results={"rows": wrong})
     with pytest.raises(ArtefactError, match=r"results\.json: malformed"):
-        report.write_report(run)
+        write_report(run)
 
 
 def test_a_row_cannot_name_arrays_outside_its_folder(tmp_path):
     own = [made.row("sfkd", arrays="../outside.safetensors")]
     directory = made.write_comparison(tmp_path, episodes=False, rows=own)
     with pytest.raises(ArtefactError, match="outside this folder"):
-        report.write_results_page(directory)
+        write_results_page(directory)
 
 
 # ---- figures and films
@@ -400,7 +401,7 @@ def test_vehicles_under_a_speed_loop_are_a_table_of_their_own(tmp_path, no_figur
     directory = made.write_comparison(
         tmp_path, episodes=False, rows=[made.row("sfkd"), loop]
     )
-    report.write_results_page(directory)
+    write_results_page(directory)
     text = (directory / "report" / "report.md").read_text()
     assert "## Sampling around a feedback law\n" in text
     assert "## Under a speed loop, sampling around a feedback law\n" in text
@@ -411,7 +412,7 @@ def test_the_numbers_that_the_paper_prints_are_on_the_page(tmp_path, no_figures)
     directory = made.write_comparison(
         tmp_path, episodes=False, comparison={"paper": paper}
     )
-    report.write_results_page(directory)
+    write_results_page(directory)
     assert "| SFKD | 0.12 | 0.03 |" in (directory / "report/report.md").read_text()
 
 
@@ -442,7 +443,7 @@ def test_failed_rows_are_on_the_page(tmp_path, no_figures):
     document = json.loads((directory / "results.json").read_text())
     document["failed"] = {"kinematic/icode": "diverged at step 7"}
     (directory / "results.json").write_text(json.dumps(document))
-    report.write_results_page(directory)
+    write_results_page(directory)
     assert "diverged at step 7" in (directory / "report/report.md").read_text()
 
 
@@ -470,4 +471,4 @@ def test_runs_that_were_not_driven_still_have_predictions_and_a_rate(
 
 def test_a_pattern_without_a_run_is_refused(tmp_path):
     with pytest.raises(ValueError, match="no run below"):
-        report.write_comparison(tmp_path, "none/*", "page")
+        write_comparison(tmp_path, "none/*", "page")

@@ -5,7 +5,7 @@ from importlib.util import find_spec
 
 TRAIN = (
     *("hydra", "filelock", "optax", "orbax", "cvxpy", "clarabel", "pyarrow", "pint"),
-    *("threadpoolctl", "jinja2", "matplotlib"),
+    *("threadpoolctl", "jinja2", "matplotlib", "pandas", "PIL"),
 )
 """Modules of the extra `train`."""
 

@@ -9,7 +9,8 @@ from typing import Any
 from sfkd_jax import store
 from sfkd_jax.experiment.command import hydra_command
 from sfkd_jax.experiment.options import Settings
-from sfkd_jax.report import write_comparison, write_report
+from sfkd_jax.report.comparison import write_comparison
+from sfkd_jax.report.run import write_report
 
 
 def run(settings: Settings) -> dict[str, Any]:
