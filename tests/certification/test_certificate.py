@@ -1,4 +1,4 @@
-"""Certificates of real weights: their constants, attacks and verification."""
+"""Certificates of real weights: what is proved, and what is measured."""
 
 import json
 
@@ -9,7 +9,9 @@ import pytest
 from helpers import (
     ENV_HIGH,
     ENV_LOW,
+    SHARES,
     certified,
+    dataset,
     jit,
     model_and_params,
     steepest_pattern,
@@ -17,9 +19,9 @@ from helpers import (
 
 from sfkd_jax.certification import (
     Certificate,
-    CertificateStale,
     CertificationRefused,
     certify,
+    issue,
     verify,
 )
 from sfkd_jax.geometry import between
@@ -33,10 +35,7 @@ def with_networks(params, **changes):
     return params | {"networks": params["networks"] | changes}
 
 
-every_kind = pytest.mark.parametrize("name", ["sfkd", "segment", "no_residual"])
-
-
-@every_kind
+@pytest.mark.parametrize("name", ["sfkd", "segment", "no_residual"])
 def test_alpha_is_recomputed_and_lies_below_and_close_to_what_was_requested(name):
     proved = certified(name)
     assert 0.97 * RHO < proved.rho <= RHO
@@ -47,6 +46,9 @@ def test_alpha_is_recomputed_and_lies_below_and_close_to_what_was_requested(name
         assert proved.alpha_joint == pytest.approx(proved.rho, rel=1e-9)
     else:
         assert 0.5 * BETA < proved.beta <= BETA
+    model, params = model_and_params(name)
+    restored = Certificate.from_document(json.loads(json.dumps(proved.document())))
+    verify(restored, params, model=model)
 
 
 def test_the_decoders_constants_bound_what_a_step_emits():
@@ -129,21 +131,27 @@ def test_a_decoder_that_emits_a_constant_has_constant_zero():
     verify(proved, with_networks(params, decoder_weights=silent), model=model)
 
 
-@every_kind
-def test_a_certificate_passes_its_own_check_also_after_a_walk_through_json(name):
-    model, params = model_and_params(name)
-    restored = Certificate.from_document(
-        json.loads(json.dumps(certified(name).document()))
+def test_a_document_states_what_was_proved_and_measured():
+    data, proved = dataset(), certified("sfkd")
+    document = issue(
+        *model_and_params("sfkd"),
+        validation=data.validation,
+        calibration=data.calibration,
+        held_out={"test": data.test, "s1": data.test},
+        boxes={"env": BOX},
+        level=0.9,
+        horizon=10,
+        attack_starts=0,
     )
-    assert restored == Certificate.from_document(certified(name).document())
-    verify(restored, params, model=model)
-
-
-def test_a_certificate_does_not_cover_other_weights():
-    model, params = model_and_params("sfkd")
-    for leaf in ("operators", "centre"):
-        changed = with_networks(
-            params, **{leaf: params["networks"][leaf].at[..., 0].add(1e-7)}
-        )
-        with pytest.raises(CertificateStale):
-            verify(certified("sfkd"), changed, model=model)
+    for name in ("alpha", "alpha_joint", "rho", "beta", "params_sha256"):
+        assert document[name] == getattr(proved, name)
+    assert document["decoder_lipschitz"] == proved.lipschitz["decoder"]
+    d_bar, tube = document["d_bar"], document["tube"]
+    assert d_bar["trajectories"] == round(SHARES[2] * 120)
+    assert d_bar["level"] == 0.9
+    low, high = d_bar["coverage_ci95"]
+    assert 0.0 <= low <= d_bar["coverage"] <= high <= 1.0
+    assert tube["latent"][0] == d_bar["value"] > 0
+    for radii in ([*tube["latent"], tube["ultimate"]], *tube["physical"].values()):
+        assert len(radii) >= 10
+        assert np.all(np.diff(radii) > 0)

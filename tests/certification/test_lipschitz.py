@@ -1,16 +1,16 @@
-"""Lipschitz bounds of networks with known constants, and faulty certifiers."""
+"""Lipschitz bounds of networks, alone and beside A z, with known constants."""
 
 import numpy as np
 import pytest
-from helpers import explicit, steepest_pattern
+from helpers import certified, explicit
+from networks import rotation
 
 from sfkd_jax.certification import check_witness, lipschitz_upper
+from sfkd_jax.certification._attack import attack_slopes
+from sfkd_jax.certification._search import propose_multipliers
 
-SIZE = 8
-
-
-def rotation(seed, size=SIZE):
-    return np.linalg.qr(np.random.default_rng(seed).standard_normal((size, size)))[0]
+SIZE = 6
+RANDOM = np.random.default_rng(0)
 
 
 def perron(weights):
@@ -18,9 +18,8 @@ def perron(weights):
     and with x its top singular vector, h_k = W_k … W_1 x, the multipliers Λ_k h_k =
     W_{k+1}' Λ_{k+1} h_{k+1} prove it (an M-matrix, positive null vector).
     """
-    product = np.linalg.multi_dot(weights[::-1]) if len(weights) > 1 else weights[0]
-    x = np.abs(np.linalg.svd(product)[2][0])
-    hidden = [x]
+    product = np.linalg.multi_dot(weights[::-1])
+    hidden = [np.abs(np.linalg.svd(product)[2][0])]
     for matrix in weights:
         hidden.append(matrix @ hidden[-1])
     multipliers, pulled = [], hidden[-1]
@@ -30,10 +29,8 @@ def perron(weights):
     return multipliers, np.linalg.norm(product, 2)
 
 
-def diagonal(seed):
+def diagonal(entries):
     """Every coordinate is a scalar chain of its own: max_i Π |d_i|, λ_k = Π_{j>k} d_j²."""
-    random = np.random.default_rng(seed)
-    entries = random.uniform(0.2, 2.0, (3, SIZE)) * random.choice([-1, 1], (3, SIZE))
     multipliers = [entries[1] ** 2 * entries[2] ** 2, entries[2] ** 2]
     exact = np.max(np.abs(np.prod(entries, axis=0)))
     return [np.diag(row) for row in entries], multipliers, exact
@@ -41,7 +38,7 @@ def diagonal(seed):
 
 def orthogonal(scales=(2.0, 0.5, 3.0)):
     """Aligned orthogonal factors: the product of the scales, λ_k = Π_{j>k} s_j²."""
-    weights = [scale * rotation(seed) for seed, scale in enumerate(scales)]
+    weights = [scale * rotation(SIZE, seed) for seed, scale in enumerate(scales)]
     multipliers = [
         np.full(SIZE, np.prod(np.square(scales[k + 1 :])))
         for k in range(len(scales) - 1)
@@ -49,38 +46,30 @@ def orthogonal(scales=(2.0, 0.5, 3.0)):
     return weights, multipliers, float(np.prod(scales))
 
 
-def positive(seed, shapes=((8, 5), (6, 8), (3, 6))):
+def positive(seed, shapes=((8, 6), (7, 8), (6, 7))):
     random = np.random.default_rng(seed)
-    weights = [random.uniform(0.05, 1.0, shape) for shape in shapes]
-    return weights, *perron(weights)
+    weights = [random.uniform(0.05, 0.5, shape) for shape in shapes]
+    return weights, random.uniform(0.05, 0.5, (6, 6))
 
 
-def spiky():
-    """One steep channel among many flat ones, seen by few samples."""
-    weights, _, _ = diagonal(3)
-    weights = [0.01 * weights[0], weights[1], weights[2]]
-    weights[0][4, 4], weights[1][4, 4], weights[2][4, 4] = 5.0, 1.0, 1.0
-    entries = [np.diag(matrix) for matrix in weights]
-    return weights, [entries[1] ** 2 * entries[2] ** 2, entries[2] ** 2], 5.0
-
-
+CHAINS = RANDOM.uniform(0.2, 2.0, (3, SIZE)) * RANDOM.choice([-1, 1], (3, SIZE))
+SPIKY = CHAINS * np.asarray([[0.01], [1.0], [1.0]])
+SPIKY[:, 4] = 5.0, 1.0, 1.0
+"""One steep channel among many flat ones, seen by few samples."""
 EXACT = {
     "orthogonal": orthogonal(),
     "orthogonal, five layers": orthogonal((1.1, 0.9, 2.0, 0.5, 1.0)),
-    "diagonal": diagonal(0),
-    "positive": positive(0),
-    "spiky": spiky(),
+    "diagonal": diagonal(CHAINS),
+    "positive": (positive(0)[0], *perron(positive(0)[0])),
+    "spiky": diagonal(SPIKY),
 }
 
 
 @pytest.mark.parametrize("name", EXACT)
 def test_the_bound_of_a_network_with_a_known_constant_is_tight_from_above(name):
     weights, multipliers, exact = EXACT[name]
-    assert (
-        exact * (1 - 1e-14)
-        <= lipschitz_upper(weights, multipliers)[0]
-        <= exact * (1 + 1e-3)
-    )
+    bound = lipschitz_upper(weights, multipliers)[0]
+    assert exact * (1 - 1e-14) <= bound <= exact * (1 + 1e-3)
 
 
 @pytest.mark.parametrize("factor", [0.3, 3.9])
@@ -92,27 +81,114 @@ def test_multipliers_off_by_a_common_factor_cost_little(factor):
 
 def test_useless_multipliers_prove_nothing():
     weights, multipliers, _ = EXACT["orthogonal"]
-    for spoil in (np.nan, -1.0, 0.0, np.inf):
-        assert (
-            lipschitz_upper(weights, [spoil * part for part in multipliers])[0]
-            == np.inf
-        )
-    assert lipschitz_upper(weights, multipliers[:1])[0] == np.inf
-    assert lipschitz_upper(weights, [])[0] == np.inf
+    spoiled = [
+        [spoil * part for part in multipliers] for spoil in (np.nan, -1.0, 0.0, np.inf)
+    ]
+    for useless in (*spoiled, multipliers[:1], []):
+        assert lipschitz_upper(weights, useless)[0] == np.inf
 
 
 @pytest.mark.parametrize("scale", [1.0, 3.0])
 def test_the_multipliers_that_a_sandwich_carries_prove_its_own_bound(scale):
     weights = explicit("sfkd", scale)
-    claimed = 0.1
-    assert check_witness(
-        weights.residual, weights.residual_multipliers, claimed * (1 + 1e-6)
+    residual, multipliers, claimed = weights.residual, weights.residual_multipliers, 0.1
+    assert check_witness(residual, multipliers, claimed * (1 + 1e-6))
+    assert not check_witness(residual, multipliers, 0.9 * attack_slopes(residual))
+
+
+# --- A z + network(z) -----------------------------------------------------------------
+
+
+def random_network(seed):
+    random = np.random.default_rng(seed)
+    shapes = (8, 6), (7, 8), (6, 7)
+    return [random.standard_normal(shape) / shape[1] ** 0.5 for shape in shapes]
+
+
+def best(weights, linear=None):
+    return lipschitz_upper(weights, propose_multipliers(weights, (), linear), linear)[0]
+
+
+TURN, LAST = rotation(SIZE, 3), rotation(SIZE, 4)
+POSITIVE, OPERATOR = positive(0)
+JOINT = {
+    # Every slope at 1 is the worst of positive matrices.
+    "positive": (
+        POSITIVE,
+        OPERATOR,
+        np.linalg.norm(OPERATOR + np.linalg.multi_dot(POSITIVE[::-1]), 2),
+    ),
+    # A and the residual stretch the same direction: no better than the sum of norms.
+    "aligned": ([0.15 * TURN, LAST, LAST.T], 0.8 * TURN, 0.95),
+    "aligned, A = I": ([0.3 * np.eye(SIZE), np.eye(SIZE)], 0.6 * np.eye(SIZE), 0.9),
+    "cancelling": ([0.3 * np.eye(SIZE), -np.eye(SIZE)], 0.9 * np.eye(SIZE), 0.9),
+    "diagonal": (
+        [np.diag(np.linspace(0.1, 0.6, SIZE)), np.eye(SIZE)],
+        np.diag(np.linspace(0.9, 0.2, SIZE)),
+        1.0,
+    ),
+}
+"""W, A, and the exact constant."""
+
+
+@pytest.mark.parametrize("name", JOINT)
+def test_bound_and_attack_enclose_a_known_constant_tightly(name):
+    weights, linear, constant = JOINT[name]
+    assert constant * (1 - 1e-12) <= best(weights, linear) <= constant * 1.01
+    assert attack_slopes(weights, linear) == pytest.approx(constant, rel=1e-9)
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_the_joint_bound_lies_between_the_attack_and_the_sum_of_norms(seed):
+    weights, linear = random_network(seed), 0.9 * rotation(SIZE, seed)
+    joint = best(weights, linear)
+    attack = attack_slopes(weights, linear)
+    assert attack <= joint <= 0.9 + best(weights) + 1e-6
+    assert joint <= 1.15 * attack
+
+
+def test_witnesses_at_the_vertices_prove_the_bound_everywhere_in_their_hull():
+    weights = random_network(1)
+    vertices = [0.8 * rotation(SIZE, seed) for seed in range(4)]
+    proposed = [propose_multipliers(weights, (), vertex) for vertex in vertices]
+    bound = max(
+        lipschitz_upper(weights, part, vertex)[0]
+        for part, vertex in zip(proposed, vertices, strict=True)
     )
-    true = steepest_pattern(weights.residual)
-    assert not check_witness(weights.residual, weights.residual_multipliers, 0.9 * true)
-    for spoil in (np.nan, -1.0):
-        spoiled = [spoil * part for part in weights.residual_multipliers]
-        assert not check_witness(weights.residual, spoiled, claimed * (1 + 1e-6))
-    if scale == 1.0:
-        halved = [0.5 * part for part in weights.residual_multipliers]
-        assert not check_witness(weights.residual, halved, claimed * (1 + 1e-6))
+    for shares in RANDOM.dirichlet(np.full(4, 0.5), size=30):
+        inside = np.tensordot(shares, vertices, 1)
+        mixed = [
+            np.tensordot(shares, layer, 1) for layer in zip(*proposed, strict=True)
+        ]
+        assert attack_slopes(weights, inside, starts=3) <= bound
+        assert lipschitz_upper(weights, mixed, inside)[0] <= bound * (1 + 1e-3)
+
+
+def test_slopes_anywhere_in_the_hull_of_a_model_stay_below_its_joint_alpha():
+    weights, proved = explicit("sfkd"), certified("sfkd")
+    vertices = weights.operators.vertices
+    for operator in (*vertices, vertices.mean(axis=0)):
+        assert attack_slopes(weights.residual, operator) <= proved.alpha_joint
+    assert proved.alpha_joint <= proved.alpha_separate * (1 + 1e-6)
+
+
+@pytest.mark.parametrize(
+    "garbage",
+    [
+        lambda parts: [np.full_like(part, np.nan) for part in parts],
+        lambda parts: [0.01 * part for part in parts],
+        lambda parts: [-part for part in parts],
+        lambda parts: parts[:1],
+        lambda parts: [],
+        lambda parts: [
+            part * np.exp(RANDOM.normal(0, 0.3, len(part))) for part in parts
+        ],
+    ],
+)
+def test_what_a_solver_returns_never_makes_a_bound_smaller(garbage):
+    """Whatever it calls its status: the bound is recomputed from the multipliers, or
+    there is none.
+    """
+    weights, linear, constant = JOINT["aligned"]
+    proposed = garbage(propose_multipliers(weights, (), linear))
+    assert lipschitz_upper(weights, proposed, linear)[0] >= constant * (1 - 1e-12)

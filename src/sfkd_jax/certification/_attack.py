@@ -34,6 +34,7 @@ class CertificateContradicted(CertificationRefused):
     """
 
 
+@one_thread()
 def attack_claims(
     model: Model,
     params: Params,
@@ -50,15 +51,14 @@ def attack_claims(
     # Limits before the search: a proof that states none is an error at once.
     limits, reached = attack_limits(claims, weights), {}
     networks = {"residual": weights.residual, **decoders(weights)}
-    with one_thread():
-        for name, network in networks.items():
-            if network:
-                reached[f"{name}_slopes"] = attack_slopes(network)
-        reached["step_slopes"] = max(
-            # Every vertex: by convexity the largest slope of the hull is at one.
-            attack_slopes(weights.residual, vertex, starts=8)
-            for vertex in weights.operators.vertices
-        )
+    for name, network in networks.items():
+        if network:
+            reached[f"{name}_slopes"] = attack_slopes(network)
+    reached["step_slopes"] = max(
+        # Every vertex: by convexity the largest slope of the hull is at one.
+        attack_slopes(weights.residual, vertex, starts=8)
+        for vertex in weights.operators.vertices
+    )
     if starts:
         # Folded once: each of many thousand steps would bound the weights again.
         folded = jax.jit(partial(fold, model))(params)
@@ -81,11 +81,6 @@ def attack_slopes(
     The norm is convex in each D_k, so the maximum is at slopes 0 or 1. With the top
     singular pair fixed, the slopes of one layer after another are set by the sign of
     their effect, until the norm stops growing.
-
-    Args:
-        weights: W_1 … W_L, or an empty list.
-        linear: A.
-        starts: number of starting points; the first has all slopes 1.
     """
     # Without a network the operator alone is the map, and there are no slopes.
     if not weights:
@@ -272,11 +267,6 @@ def _coordinates(
     """Return the map from z to a latent, the size of z and that of u.
 
     `model.vector` reads z from a latent; its transpose writes z into one.
-
-    Args:
-        model: a model with `explicit`.
-        params: its weights.
-        entries: size of e.
     """
     assert model.structure.explicit is not None
     # Shapes only: no weights are computed to learn sizes.

@@ -30,6 +30,7 @@ from sfkd_jax.certification._weights import (
     exported,
     fingerprint,
     one_thread,
+    require,
 )
 from sfkd_jax.ranges import Fraction, NonNegativeInt
 from sfkd_jax.rollout import fold
@@ -75,18 +76,10 @@ class Certificate(Claims):
 
     @classmethod
     def from_document(cls, document: Mapping[str, Any]) -> Certificate:
-        """Read a certificate from JSON values; other keys are ignored.
-
-        Raises:
-            CertificationRefused: a key is missing.
-        """
+        """Read a certificate from JSON values; other keys are ignored."""
         names = [field.name for field in dataclasses.fields(cls)]
-        # Read by name: a document may have more keys, such as tubes.
         missing = [name for name in names if name not in document]
-        if missing:
-            raise CertificationRefused(
-                f"not a certificate: {', '.join(missing[:3])} missing"
-            )
+        require(not missing, f"not a certificate: {', '.join(missing[:3])} missing")
         return cls(**{name: document[name] for name in names})
 
 
@@ -112,15 +105,13 @@ def certify(
     """
     began = time.perf_counter()
     box = require_box("env_box", env_box).astype(float).tolist()
-    # In float64 and on the host, before anything is searched.
     weights = exported(model, params)
-    with one_thread():
-        claims = prove(weights)
-    if not claims.alpha <= 1.0 - MARGIN:  # refuses NaN as well
-        raise CertificationRefused(
-            f"alpha = {claims.alpha:.6f} (rho {claims.rho:.6f}, "
-            f"beta {claims.beta:.6f}) is not below 1 by the margin {MARGIN:g}"
-        )
+    claims = prove(weights)
+    require(
+        claims.alpha <= 1.0 - MARGIN,  # refuses NaN as well
+        f"alpha = {claims.alpha:.6f} (rho {claims.rho:.6f}, beta {claims.beta:.6f}) "
+        f"is not below 1 by the margin {MARGIN:g}",
+    )
     # After the proof: an attack that exceeds it is a fault of the code, see there.
     attacks = attack_claims(model, params, weights, claims, box, attack_starts)
     attack = attacks.get("step")
@@ -139,24 +130,19 @@ def certify(
     )
 
 
+@one_thread()
 def contraction_metrics(model: Model, params: Params) -> dict[str, float]:
-    """Return a quick estimate of α for the log of a training run; no certificate.
+    """Return a quick estimate of "alpha" for the log of a training run; no certificate.
 
-    Args:
-        model: any model.
-        params: its weights as exported.
-
-    Returns:
-        "alpha"; empty if nothing can be proved.
+    Empty if nothing can be proved.
     """
     try:
         weights = exported(model, params)
     # A model without explicit weights trains like any other, just without this log.
     except CertificationRefused:
         return {}
-    with one_thread():
-        # Few iterations: an estimate at every checkpoint, not the certificate.
-        alpha, _ = joint_bound(weights, weights.residual_multipliers, iterations=15)
+    # Few iterations: an estimate at every checkpoint, not the certificate.
+    alpha, _ = joint_bound(weights, weights.residual_multipliers, iterations=15)
     # JSON has no infinity: what is not proved is absent.
     return {"alpha": alpha} if np.isfinite(alpha) else {}
 
@@ -199,8 +185,7 @@ def issue(
     certificate = certify(model, params, boxes["env"], attack_starts=attack_starts)
     weights, start = exported(model, params), None
     try:
-        with one_thread():
-            claim = prove_lyapunov(weights)
+        claim = prove_lyapunov(weights)
         lyapunov, start = claim.document(), claim.metric
     # Nothing else depends on it, so that a missing solver does not stop the rest.
     except CertificationRefused as reason:
@@ -254,11 +239,10 @@ def _one_step_bounds(
     units, scores = reference.largest(), measured.largest()
     # Units from validation, or the scores of calibration would not be exchangeable.
     bounds = conformal_bounds(units, scores, level=level)
+    # Only of the test part it is known how many runs it was cut from.
+    counts = {"test": runs.get("test")}
     shares = {
-        # Only of the test part it is known how many runs it was cut from.
-        name: coverage(
-            bounds, part.largest(), runs.get("test") if name == "test" else None
-        )
+        name: coverage(bounds, part.largest(), counts.get(name))
         for name, part in unseen.items()
     }
     one_step = dict(zip(KINDS, bounds.tolist(), strict=True))

@@ -21,7 +21,7 @@ from sfkd_jax.certification._core import (
     is_positive_definite,
     product,
 )
-from sfkd_jax.certification._weights import CertificationRefused, Exported
+from sfkd_jax.certification._weights import Exported, require, require_all
 
 COMPILATION_SLACK = 1.0 + 1e-6
 """Slack for rounding: another compilation of the same model may serve explicit weights
@@ -64,22 +64,18 @@ class Claims:
 
 
 def require_claims(claims: Claims, weights: Exported, box: Box) -> None:
-    """Check every claim in the 2-norm from its witness.
-
-    Raises:
-        CertificationRefused: names the first claim that does not follow.
-    """
+    """Refuse the first claim in the 2-norm that does not follow from its witness."""
     constants = {name: getattr(claims, name) for name in CONSTANTS} | claims.lipschitz
     for name, value in constants.items():
-        # NaN compares false, so it is refused here as well
-        if not (isinstance(value, int | float) and 0 <= value < math.inf):
-            raise CertificationRefused(f"{name} is not a bound: {value!r}")
+        bound = isinstance(value, int | float) and 0 <= value < math.inf
+        require(bound, f"{name} is not a bound: {value!r}")
     linear, networks = readouts(weights), decoders(weights)
     # Exactly these outputs: a missing one would be unbounded, another one meaningless.
-    if set(claims.lipschitz) != {*linear, *networks}:
-        expected = ", ".join((*linear, *networks))
-        actual = ", ".join(map(str, claims.lipschitz))
-        raise CertificationRefused(f"lipschitz must be of {expected}, got {actual}")
+    expected, actual = [*linear, *networks], [*claims.lipschitz]
+    require(
+        set(actual) == {*expected},
+        f"lipschitz must be of {', '.join(expected)}, got {actual}",
+    )
     require_box("env_box", box)
     witness, vertices = claims.witnesses, list(weights.operators.vertices)
     residual = vectors(witness["residual"])
@@ -103,9 +99,7 @@ def require_claims(claims: Claims, weights: Exported, box: Box) -> None:
         checks[name] = not np.any(rows) or check_witness((), (), bound, rows)
     for name, network in networks.items():
         checks[name] = _bounded(network, vectors(witness[name]), claims.lipschitz[name])
-    for name, holds in checks.items():
-        if not holds:
-            raise CertificationRefused(f"{name} does not follow from its witness")
+    require_all(checks)
 
 
 def require_box(name: str, box: Box) -> np.ndarray:
@@ -115,10 +109,10 @@ def require_box(name: str, box: Box) -> np.ndarray:
     # Finite: an infinite box would promise what no attack has looked at. Equal corners
     # are allowed, since a condition may be constant.
     finite = pair and np.all(np.isfinite(corners))
-    if not finite or not np.all(corners[0] <= corners[1]):
-        raise CertificationRefused(
-            f"{name} must be a lower and an upper corner, got {box!r}"
-        )
+    require(
+        finite and np.all(corners[0] <= corners[1]),
+        f"{name} must be a lower and an upper corner, got {box!r}",
+    )
     return corners
 
 
@@ -201,24 +195,22 @@ class OutputMetric(NamedTuple):
 
     def document(self) -> dict[str, Any]:
         """Return the claim as JSON values."""
-        witness = {"metric": self.metric, "joint": self.joint}
         constants = {"alpha": self.alpha, "lipschitz": self.lipschitz}
-        return constants | {"witness": listed(witness)}
+        return constants | _written(self)
 
     @classmethod
     def from_document(cls, document: Mapping[str, Any]) -> OutputMetric:
-        """Read a claim from JSON values.
-
-        Raises:
-            KeyError: a key is missing.
-            TypeError: a value is of another type.
-            ValueError: a value is not a number, or an array is ragged.
-        """
-        witness = _metric_witness(document["witness"])
+        """Read a claim from JSON values; `MALFORMED` errors if it is none."""
+        witness = _read(document["witness"])
         return cls(document["alpha"], document["lipschitz"], *witness)
 
 
-def _metric_witness(witness: Mapping[str, Any]) -> tuple[Matrix, list[list[Vector]]]:
+def _written(claim: OutputMetric | LyapunovClaim) -> dict[str, Any]:
+    """Return the witness of a metric as JSON values."""
+    return {"witness": listed({"metric": claim.metric, "joint": claim.joint})}
+
+
+def _read(witness: Mapping[str, Any]) -> tuple[Matrix, list[list[Vector]]]:
     """Read P and the multipliers of every vertex from JSON values."""
     joint = [vectors(each) for each in witness["joint"]]
     return np.asarray(witness["metric"], dtype=np.float64), joint
@@ -233,37 +225,23 @@ def keeps_metrics(weights: Exported) -> bool:
 
 
 def require_output_metric(name: str, claim: OutputMetric, weights: Exported) -> None:
-    """Check both constants from P and the multipliers, without a search.
-
-    Raises:
-        CertificationRefused: names the constant that does not follow.
-    """
+    """Refuse a constant that does not follow from P and the multipliers."""
+    where = f"outputs.{name}"
     # With a decoder the pose is no output of z, and no metric is about it.
-    if name not in OUTPUTS or not keeps_metrics(weights) or weights.decoder:
-        raise CertificationRefused(f"outputs.{name}: this model has no such metric")
-    for constant in ("alpha", "lipschitz"):
-        value = getattr(claim, constant)
-        if not (isinstance(value, float) and 0 < value < math.inf):
-            raise CertificationRefused(
-                f"outputs.{name}.{constant} is not a bound: {value!r}"
-            )
-    vertices = weights.operators.vertices
+    exists = name in OUTPUTS and keeps_metrics(weights) and not weights.decoder
+    require(exists, f"{where}: this model has no such metric")
+    for constant, value in zip(claim._fields[:2], claim[:2], strict=True):
+        bound = isinstance(value, float) and 0 < value < math.inf
+        require(bound, f"{where}.{constant} is not a bound: {value!r}")
     # Sizes first: the core multiplies matrices and would raise on others.
-    if claim.metric.shape != vertices.shape[1:]:
-        raise CertificationRefused(
-            f"outputs.{name}.witness is of another size than the weights"
-        )
+    fits = claim.metric.shape == weights.operators.vertices.shape[1:]
+    require(fits, f"{where}.witness is of another size than the weights")
+    rows = readouts(weights)[name]
     checks = {
         "alpha": claim.alpha < 1.0 and contracts(claim, weights),
-        "lipschitz": reads_within(
-            readouts(weights)[name], claim.lipschitz, claim.metric
-        ),
+        "lipschitz": reads_within(rows, claim.lipschitz, claim.metric),
     }
-    for constant, holds in checks.items():
-        if not holds:
-            raise CertificationRefused(
-                f"outputs.{name}.{constant} does not follow from its witness"
-            )
+    require_all(checks, f"{where}.")
 
 
 def contracts(claim: OutputMetric | LyapunovClaim, weights: Exported) -> bool:
@@ -314,47 +292,26 @@ class LyapunovClaim(NamedTuple):
     def document(self) -> dict[str, Any]:
         """Return the claim as JSON values."""
         # c_1 = c_2 = √κ: from |z|_P to |z| and back costs the root of the condition.
-        constant = math.sqrt(self.condition)
-        return {
-            "rho": self.rho,
-            "condition": self.condition,
-            "alpha": self.alpha,
-            "c_1": constant,
-            "c_2": constant,
-            "witness": listed({"metric": self.metric, "joint": self.joint}),
-        }
+        constants = dict(zip(self._fields[:3], self[:3], strict=True))
+        root = math.sqrt(self.condition)
+        return constants | {"c_1": root, "c_2": root} | _written(self)
 
 
 def require_lyapunov(part: Mapping[str, Any], weights: Exported) -> None:
-    """Check ρ, κ, α, c_1 and c_2 from P; without one, that a reason is given.
-
-    Args:
-        part: "lyapunov" of the document.
-        weights: explicit weights.
-
-    Raises:
-        CertificationRefused: names what does not follow.
-    """
+    """Check "lyapunov" of the document: constants from P, or a reason."""
     # A reason and nothing else: a document cannot hide a false claim beside one.
     if isinstance(part.get("reason"), str) and len(part) == 1:
         return
-    witness = _metric_witness(part["witness"])
-    claim = LyapunovClaim(part["rho"], part["condition"], part["alpha"], *witness)
+    rho, condition, alpha = (part[name] for name in LyapunovClaim._fields[:3])
+    claim = LyapunovClaim(rho, condition, alpha, *_read(part["witness"]))
     vertices = list(weights.operators.vertices)
     constants = all(isinstance(value, float) for value in claim[:3])
-    fits = claim.metric.shape == vertices[0].shape
-    if not (keeps_metrics(weights) and constants and fits):
-        raise CertificationRefused("lyapunov is not a claim about these operators")
+    fits = keeps_metrics(weights) and claim.metric.shape == vertices[0].shape
+    require(constants and fits, "lyapunov is not a claim about these operators")
     checks = {
-        "rho or condition": check_metric(
-            claim.metric, vertices, claim.rho, claim.condition
-        ),
+        "rho or condition": check_metric(claim.metric, vertices, rho, condition),
         "alpha": contracts(claim, weights),
         # Compared as a whole, so that no further key can state an unproved constant.
         "c_1 or c_2": dict(part) == claim.document() | {"witness": part["witness"]},
     }
-    for name, holds in checks.items():
-        if not holds:
-            raise CertificationRefused(
-                f"lyapunov: {name} does not follow from its witness"
-            )
+    require_all(checks, "lyapunov: ")

@@ -48,11 +48,6 @@ def residuals(model: Model, params: Params, runs: Trajectory) -> Residuals:
     """Measure the error of every step from its true state.
 
     Transport defects and switches of e count.
-
-    Args:
-        model: any model.
-        params: its weights, folded or not.
-        runs: a batch of trajectories.
     """
     count = runs.controls.shape[0]
     # The last batch is filled up, so that one program serves all batches
@@ -95,10 +90,6 @@ def conformal_quantile(scores: Float[np.ndarray, " trajectory"], level: float) -
 
     A new, exchangeable score exceeds it with probability at most 1 − level.
 
-    Args:
-        scores: of calibration trajectories or runs.
-        level: 1 − δ.
-
     Raises:
         ValueError: too few scores for the level, or scores that are not finite.
     """
@@ -130,12 +121,8 @@ def conformal_bounds(
     largest kind in units; the bound is the ⌈(n+1) level⌉-th smallest score. The unit of
     the first kind is its quantile at `level`; the other kinds exceed theirs a tenth as
     often. A tube multiplies the first bound by up to 1/(1 − α) and adds the others
-    once, so these units make it tighter than equal quantiles do.
-
-    Args:
-        reference: scores that fix the units, of a split other than `calibration`.
-        calibration: scores of the calibration split.
-        level: 1 − δ.
+    once, so these units make it tighter than equal quantiles do. `reference` are
+    scores that fix the units, of a split other than `calibration`.
 
     Raises:
         ValueError: too few trajectories for the level, a level outside (0, 1), or
@@ -160,11 +147,7 @@ def coverage(
 ) -> dict[str, Any]:
     """Return the share of held-out trajectories within all bounds, and its interval.
 
-    Args:
-        bounds: on each kind.
-        held_out: scores of independent trajectories.
-        runs: number of independent runs that they were cut from; by default every
-            trajectory is one.
+    They were cut from `runs` independent runs; by default every trajectory is one.
     """
     share = float(np.mean(np.all(held_out <= bounds, axis=1)))
     return counted(share, len(held_out), runs or len(held_out))
@@ -184,11 +167,7 @@ def counted(share: float, trajectories: int, runs: int) -> dict[str, Any]:
 def coverage_interval(share: float, runs: int) -> list[float]:
     """Return the 95 % Clopper-Pearson interval of a coverage.
 
-    If the share lies between two counts, the interval covers those of both.
-
-    Args:
-        share: of trajectories that were covered.
-        runs: number of independent runs that the trajectories were cut from.
+    If the share lies between two counts of runs, the interval covers those of both.
     """
     # Both sides rounded outwards: the interval is wider than either count's.
     counts = math.floor(share * runs + ROUNDING), math.ceil(share * runs - ROUNDING)

@@ -28,7 +28,12 @@ from sfkd_jax.certification._claims import (
 )
 from sfkd_jax.certification._core import Matrix, Vector, check_metric
 from sfkd_jax.certification._search import INFEASIBLE, SLACKS, joint_bound, reduced
-from sfkd_jax.certification._weights import CertificationRefused, Exported
+from sfkd_jax.certification._weights import (
+    CertificationRefused,
+    Exported,
+    one_thread,
+    require,
+)
 from sfkd_jax.types import Polytope
 
 MARGIN = 1e-6
@@ -47,21 +52,14 @@ RUNS = 8
 """Exponent of the power mean over runs, a smooth stand-in for a high quantile."""
 
 
+@one_thread()
 def prove_lyapunov(weights: Exported) -> LyapunovClaim:
-    """Solve the program at the smallest of the `SHARES` that has an accepted answer.
-
-    Args:
-        weights: explicit, float64, finite.
-
-    Raises:
-        CertificationRefused: no solver is installed, the model admits no metric but I,
-            or no answer was accepted; gives the reason.
-    """
+    """Solve the program at the smallest of the `SHARES` that has an accepted answer."""
     # A rotation on a switch of e keeps no ellipsoid, only the ball.
-    if not keeps_metrics(weights):
-        raise CertificationRefused(
-            "P = I is the only metric that the transport keeps: c_1 = c_2 = 1"
-        )
+    require(
+        keeps_metrics(weights),
+        "P = I is the only metric that the transport keeps: c_1 = c_2 = 1",
+    )
     vertices = list(weights.operators.vertices)
     norm = max(np.linalg.norm(vertex, 2) for vertex in vertices)
     # No P gives a rate below a spectral radius, by which the search is bounded.
@@ -80,24 +78,14 @@ def prove_lyapunov(weights: Exported) -> LyapunovClaim:
 def solve_metric(operators: Sequence[Matrix], rate: float) -> Matrix | None:
     """Return a common Lyapunov matrix of the smallest condition number by cvxpy.
 
-    Minimise κ over I ⪯ P ⪯ κ I such that A' P A ⪯ ρ² P for every operator A.
-
-    Args:
-        operators: the vertices.
-        rate: ρ.
-
-    Returns:
-        P, symmetric, or None if the solver returns no values. Its status is ignored.
-
-    Raises:
-        CertificationRefused: cvxpy or the solver is not installed.
+    Minimise κ over I ⪯ P ⪯ κ I such that A' P A ⪯ ρ² P for every operator A. None if
+    the solver returns no values; its status is ignored.
     """
     try:
         import cvxpy as cp  # an optional dependency
     except ImportError:
         raise CertificationRefused(MISSING) from None
-    if "CLARABEL" not in cp.installed_solvers():
-        raise CertificationRefused(MISSING)
+    require("CLARABEL" in cp.installed_solvers(), MISSING)
     identity = np.eye(len(operators[0]))
     metric, condition = cp.Variable(identity.shape, symmetric=True), cp.Variable()
     # I ⪯ P fixes the scale, which is free otherwise, and makes κ the condition.
@@ -160,6 +148,7 @@ def _in_coordinates(weights: Exported, metric: Matrix) -> Exported:
     return weights._replace(operators=Polytope(vertices), residual=tuple(residual))
 
 
+@one_thread()
 def propose_metric(
     weights: Exported,
     rows: Matrix,
@@ -179,12 +168,6 @@ def propose_metric(
         gaps: d of the worst steps of every run, not of the calibration split.
         start: the Lyapunov matrix of the operators; the search starts there if that
             is better than I.
-
-    Returns:
-        The metric with the smallest constants that the trusted core accepts.
-
-    Raises:
-        CertificationRefused: no α below 1 was found.
     """
     vertices, multipliers = weights.operators.vertices, weights.residual_multipliers
     rank, lower = vertices.shape[-1], np.tril_indices(vertices.shape[-1])
@@ -231,11 +214,7 @@ def propose_metric(
 def accepted_metric(
     weights: Exported, rows: Matrix, metric: Matrix, joint: list[list[Vector]]
 ) -> OutputMetric:
-    """Return the smallest constants that the core accepts in this metric.
-
-    Raises:
-        CertificationRefused: there are none.
-    """
+    """Return the smallest constants that the core accepts in this metric, or refuse."""
     refusal = CertificationRefused("no metric below 1 was found for this output")
     try:
         step = _in_coordinates(weights, metric)

@@ -25,7 +25,7 @@ from sfkd_jax.certification._core import (
     norm_upper,
     witness_matrix,
 )
-from sfkd_jax.certification._weights import CertificationRefused, Exported
+from sfkd_jax.certification._weights import Exported, one_thread, require
 
 SCALES = np.geomspace(0.25, 4.0, 33)
 SLACKS = (1e-9, 1e-7, 1e-5, 1e-3)
@@ -35,22 +35,14 @@ INFEASIBLE = 1e3
 """Value of the logarithmic objective where the multipliers prove nothing."""
 
 
+@one_thread()
 def prove(weights: Exported) -> Claims:
-    """Search for the smallest constants that the core accepts.
-
-    Args:
-        weights: explicit, float64, finite.
-
-    Raises:
-        CertificationRefused: no finite bound was found.
-    """
+    """Search for the smallest constants that the core accepts, or refuse."""
     bound, start = _best_multipliers(weights.residual, weights.residual_multipliers)
     # Another compilation may round the weights differently: the bound covers both.
     beta = COMPILATION_SLACK * bound
-    if not np.isfinite(beta):
-        raise CertificationRefused(
-            "no multipliers prove a Lipschitz bound of the residual"
-        )
+    unproved = "no multipliers prove a Lipschitz bound of the"
+    require(np.isfinite(beta), f"{unproved} residual")
     witnesses: dict[str, Any] = {"residual": start}
     norms = [norm_upper(vertex) for vertex in weights.operators.vertices]
     rho = COMPILATION_SLACK * max(norms)
@@ -62,10 +54,7 @@ def prove(weights: Exported) -> Claims:
     for name, network in decoders(weights).items():
         bound, witnesses[name] = _best_multipliers(network, weights.decoder_multipliers)
         lipschitz[name] = COMPILATION_SLACK * bound
-    if not np.all(np.isfinite(list(lipschitz.values()))):
-        raise CertificationRefused(
-            "no multipliers prove a Lipschitz bound of the decoder"
-        )
+    require(np.all(np.isfinite([*lipschitz.values()])), f"{unproved} decoder")
     # The sum needs no search of its own, and is the fallback of the joint bound.
     separate = rho + beta
     return Claims(
@@ -85,12 +74,8 @@ def joint_bound(
 ) -> tuple[float, list[list[Vector]]]:
     """Return α of z ↦ A z + r(z) as one map, and multipliers for each vertex.
 
-    The vertices are searched one after another, each from the answer of the last.
-
-    Args:
-        weights: explicit, float64, finite.
-        start: initial multipliers.
-        iterations: as in `propose_multipliers`.
+    The vertices are searched one after another from `start`, `iterations` as in
+    `propose_multipliers`.
     """
     bounds, witnesses = [], []
     for vertex in weights.operators.vertices:
@@ -98,10 +83,9 @@ def joint_bound(
         start = propose_multipliers(
             weights.residual, start, vertex, iterations=iterations
         )
-        bound, witness = lipschitz_upper(weights.residual, start, vertex)
+        bound, start = lipschitz_upper(weights.residual, start, vertex)
         bounds.append(bound)
-        witnesses.append(witness)
-        start = witness
+        witnesses.append(start)
     # The worst vertex decides: e may be at any of them.
     return COMPILATION_SLACK * max(bounds), witnesses
 
@@ -130,9 +114,6 @@ def lipschitz_upper(
         weights: W_1 … W_L of a network with slopes in [0, 1].
         multipliers: proposed λ_1 … λ_{L-1}, scaled by a common factor.
         linear: A, for a bound on A z + network(z).
-
-    Returns:
-        The bound and the scaled multipliers.
     """
     if not multipliers and len(weights) <= 1:
         parts = [

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from functools import partial
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -17,11 +18,7 @@ from sfkd_jax.certification._measured import (
     coverage_interval,
 )
 from sfkd_jax.certification._metrics import propose_metric
-from sfkd_jax.certification._weights import (
-    CertificationRefused,
-    Exported,
-    one_thread,
-)
+from sfkd_jax.certification._weights import CertificationRefused, Exported
 
 WORST = 5
 """Steps of every validation run that a metric is optimised for."""
@@ -32,12 +29,7 @@ def latent_tube(
 ) -> Float[np.ndarray, " horizon"]:
     """Return R_1 … R_T with |z_k − ẑ_k| ≤ R_k as long as all |d_j| ≤ d̄, for ẑ_0 = z_0.
 
-        R_k = d̄ (1 − α^k)/(1 − α)
-
-    Args:
-        alpha: α.
-        d_bar: d̄.
-        horizon: T [steps].
+    R_k = d̄ (1 − α^k)/(1 − α)
     """
     radii, radius = [], 0.0
     # The recursion instead of the closed form, which divides by 1 − α.
@@ -98,31 +90,24 @@ def tubes(
     horizon: int,
     largest_increment: float | None,
 ) -> dict[str, Any]:
-    """Return the tubes of a document: up to the horizon, and their limit.
-
-    Args:
-        alpha: α.
-        lipschitz: L of the outputs.
-        one_step: measured bounds, by "latent", "position", "yaw" and "body".
-        horizon: T [steps].
-        largest_increment: as in `physical_tube`.
-    """
+    """Return the tubes of a document from the measured `one_step`, by `KINDS`."""
     latent = latent_tube(alpha, one_step["latent"], horizon)
     # R_k → d̄ / (1 − α), the fixed point of R ↦ α R + d̄.
     ultimate, limit = one_step["latent"] / (1 - alpha), None
-    constants: dict[str, Any] = {
-        "alpha": alpha,
-        "lipschitz": lipschitz,
-        "residual": one_step,
-        "largest_increment": largest_increment,
-    }
+    physical = partial(
+        physical_tube,
+        alpha=alpha,
+        lipschitz=lipschitz,
+        residual=one_step,
+        largest_increment=largest_increment,
+    )
     # With increments the pose drifts; without them there is a limit of every radius.
     if largest_increment is None:
-        both = physical_tube(np.full(2, ultimate), **constants)
+        both = physical(np.full(2, ultimate))
         limit = {name: radius[-1] for name, radius in both.items()}
     return {
         "latent": latent.tolist(),
-        "physical": physical_tube(latent, **constants),
+        "physical": physical(latent),
         "ultimate": ultimate,
         "asymptotic": limit,
         "largest_increment_m": largest_increment,
@@ -157,11 +142,7 @@ def radii(
 
         |y_k − ŷ_k| ≤ |C (F(z_{k−1}) − F(ẑ_{k−1}))| + ε_k ≤ L α R_{k−1} + ε_k.
 
-    Args:
-        measured: residuals of the runs.
-        name: one of `OUTPUTS`.
-        claim: its proved metric.
-        start: z_0 − ẑ_0; None if the nominal model starts at the state of the car.
+    `start` is z_0 − ẑ_0; None if the nominal model starts at the state of the car.
     """
     # |d|_P is the 2-norm of d'L with P = L L'.
     factor = np.linalg.cholesky(claim.metric)
@@ -207,8 +188,7 @@ def output_tubes(
     for name in OUTPUTS:
         rows, gaps = readouts(weights)[name], worst_gaps(validation)
         try:
-            with one_thread():
-                claim = propose_metric(weights, rows, gaps, start)
+            claim = propose_metric(weights, rows, gaps, start)
         # Both outputs or none: a corridor needs position and heading.
         except CertificationRefused:
             return {}
@@ -238,25 +218,6 @@ ALONE = ("asymptotic_position", "asymptotic_yaw")
 """Bounds from the largest disturbance alone, which hold one by one."""
 
 
-def run_scores(
-    measured: Residuals,
-    claims: Mapping[str, OutputMetric],
-    nominal: Float[np.ndarray, " run"],
-    start: Float[np.ndarray, "run rank"],
-) -> Float[np.ndarray, "run 5"]:
-    """Return the smallest bounds that would have held on each run, `JOINT` and `ALONE`.
-
-    Args:
-        measured: residuals of the runs.
-        claims: proved metric of every output.
-        nominal: largest |ê_y| of the nominal model [m].
-        start: z_0 − ẑ_0.
-    """
-    bounds = [radii(measured, name, claims[name], start) for name in OUTPUTS]
-    farthest = [each.vehicle_to_nominal for each in bounds]
-    return np.column_stack([*farthest, nominal, *(each.asymptotic for each in bounds)])
-
-
 def calibrate_corridor(
     reference: Float[np.ndarray, "other 5"],
     scores: Float[np.ndarray, "run 5"],
@@ -267,12 +228,7 @@ def calibrate_corridor(
 
     The bounds in `JOINT` hold together with probability at least `level`, the others
     one by one. The lateral tube decides the joint score: heading and nominal corridor
-    exceed their units a tenth as often.
-
-    Args:
-        reference: scores of the runs that fix the units.
-        scores: scores of the calibration runs.
-        level: 1 − δ.
+    exceed their units a tenth as often. `reference` are the runs that fix the units.
 
     Raises:
         ValueError: too few runs for the level, or scores that are not finite.

@@ -27,11 +27,11 @@ from sfkd_jax.certification._measured import KINDS, counted, supports
 from sfkd_jax.certification._tubes import ALONE, FORMS, JOINT, tubes
 from sfkd_jax.certification._weights import (
     CertificateStale,
-    CertificationRefused,
     Exported,
     exported,
     fingerprint,
     one_thread,
+    require,
     well_formed,
 )
 from sfkd_jax.types import Model, Params
@@ -54,7 +54,7 @@ def verify(
     Args:
         certificate: from an untrusted source.
         params: the weights.
-        model: provides `explicit`.
+        model: that they belong to.
         weights: explicit weights of `params`, if already computed.
 
     Raises:
@@ -73,27 +73,27 @@ def verify(
 def _require_consistent(certificate: Certificate, weights: Exported) -> None:
     """Check that the parts of a certificate agree with each other."""
     alpha = certificate.alpha
-    if not alpha < 1.0 or certificate.transport_lipschitz != 1.0:
-        raise CertificationRefused(
-            f"alpha = {alpha} is not below 1, or the transport is not nonexpansive"
-        )
+    require(
+        alpha < 1.0 and certificate.transport_lipschitz == 1.0,
+        f"alpha = {alpha} is not below 1, or the transport is not nonexpansive",
+    )
     # A text that promises more than these checks cover must not pass.
-    if certificate.precision != PRECISION:
-        raise CertificationRefused("precision is not what is covered")
+    covered = certificate.precision == PRECISION
+    require(covered, "precision is not what is covered")
     limits = attack_limits(certificate, weights)
     for name, value in certificate.attacks.items():
+        limit = limits.get(name)
         # A stated attack above the proved bound would contradict the document itself.
-        if name not in limits or not 0 <= value <= limits[name] * (1 + FLOAT32):
-            raise CertificationRefused(
-                f"the attack {name} = {value!r} "
-                f"contradicts the bound {limits.get(name)}"
-            )
+        require(
+            limit is not None and 0 <= value <= limit * (1 + FLOAT32),
+            f"the attack {name} = {value!r} contradicts the bound {limit}",
+        )
     step = certificate.attacks.get("step")
     tightness = alpha / step if step else None
-    if certificate.attack != step or certificate.tightness != tightness:
-        raise CertificationRefused(
-            "attack or tightness does not follow from the attacks"
-        )
+    require(
+        certificate.attack == step and certificate.tightness == tightness,
+        "attack or tightness does not follow from the attacks",
+    )
 
 
 def verify_document(
@@ -112,8 +112,7 @@ def verify_document(
         CertificationRefused: it does not hold; gives the reason.
     """
     # `is not True`: a text "false" or a number must not pass for a valid certificate.
-    if document.get("valid") is not True:
-        raise CertificationRefused(str(document.get("reason")))
+    require(document.get("valid") is True, str(document.get("reason")))
     # Also the settings: the same weights under another controller are another policy.
     if document.get("policy_sha256") != policy_sha256:
         raise CertificateStale("the certificate is about other weights or settings")
@@ -129,31 +128,31 @@ def verify_document(
         with one_thread():
             require_lyapunov(document["lyapunov"], weights)
             _require_outputs(document.get("outputs", {}), weights)
-        if document["decoder_lipschitz"] != proof.lipschitz.get("decoder"):
-            raise CertificationRefused("decoder_lipschitz is not that of lipschitz")
-        if document.get("corridor") is not None:
-            if not document.get("outputs"):
-                raise CertificationRefused("a corridor needs a metric of every output")
-            require_corridor(document["corridor"])
+        require(
+            document["decoder_lipschitz"] == proof.lipschitz.get("decoder"),
+            "decoder_lipschitz is not that of lipschitz",
+        )
+        if (corridor := document.get("corridor")) is not None:
+            outputs = document.get("outputs")
+            require(outputs, "a corridor needs a metric of every output")
+            require_corridor(corridor)
 
 
 def _require_statistics(d_bar: Mapping[str, Any]) -> None:
     """Check measured bounds, level, counts, coverages and their intervals."""
     one_step = _numbers("d_bar.one_step", [d_bar["one_step"][kind] for kind in KINDS])
-    if not np.all(one_step >= 0):
-        raise CertificationRefused("d_bar.one_step must be numbers, none below 0")
+    require(np.all(one_step >= 0), "d_bar.one_step must be numbers, none below 0")
     # `value` repeats the latent bound; with two, it would be open which a tube uses.
     _require_equal("d_bar.value", d_bar["value"], d_bar["one_step"]["latent"])
     trajectories, runs, level = d_bar["trajectories"], d_bar["runs"], d_bar["level"]
-    if not 0 < level < 1 or not supports(trajectories, level):
-        raise CertificationRefused(
-            f"d_bar.level = {level!r} is not possible "
-            f"with {trajectories!r} trajectories"
-        )
-    if not 1 <= runs <= trajectories:
-        raise CertificationRefused(
-            f"d_bar.runs = {runs!r} does not fit {trajectories!r} trajectories"
-        )
+    require(
+        0 < level < 1 and supports(trajectories, level),
+        f"d_bar.level = {level!r} is not possible with {trajectories!r} trajectories",
+    )
+    require(
+        1 <= runs <= trajectories,
+        f"d_bar.runs = {runs!r} does not fit {trajectories!r} trajectories",
+    )
     for name, part in {"d_bar": d_bar, **d_bar["by_scenario"]}.items():
         _require_coverage(name, part)
 
@@ -167,8 +166,7 @@ def _require_tubes(
     if "decoder" in proof.lipschitz:
         stated = tube["largest_increment_m"]
         largest = float(_numbers("tube.largest_increment_m", stated))
-        if largest < 0:
-            raise CertificationRefused("tube.largest_increment_m is below 0")
+        require(largest >= 0, "tube.largest_increment_m is below 0")
     derived = tubes(
         alpha=proof.alpha,
         lipschitz=proof.lipschitz,
@@ -182,50 +180,42 @@ def _require_tubes(
 def _require_outputs(outputs: Mapping[str, Any], weights: Exported) -> None:
     """Check output metrics from their witnesses, and the coverage of their tubes."""
     # All or none: a corridor needs both metrics.
-    if outputs and set(outputs) != set(OUTPUTS):
-        actual = ", ".join(map(str, outputs))
-        raise CertificationRefused(
-            f"outputs must be {' and '.join(OUTPUTS)}, got {actual}"
-        )
+    require(
+        not outputs or set(outputs) == set(OUTPUTS),
+        f"outputs must be {' and '.join(OUTPUTS)}, got {', '.join(map(str, outputs))}",
+    )
     for name, part in outputs.items():
         require_output_metric(name, OutputMetric.from_document(part), weights)
         runs = part["coverage_runs"]
         for form in FORMS:
-            if not _numbers(f"outputs.{name}.tube", part["tube"][form]) > 0:
-                raise CertificationRefused(f"outputs.{name}.tube.{form} is no radius")
+            radius = _numbers(f"outputs.{name}.tube", part["tube"][form])
+            require(radius > 0, f"outputs.{name}.tube.{form} is no radius")
             stated = {key: part[key][form] for key in ("coverage", "coverage_ci95")}
             counts = {"coverage_trajectories": runs, "coverage_runs": runs}
             _require_coverage(f"outputs.{name}", stated | counts)
 
 
 def require_corridor(corridor: Mapping[str, Any]) -> None:
-    """Check sums, levels and counts of the document's corridor.
-
-    Args:
-        corridor: that part of the document.
-
-    Raises:
-        CertificationRefused: names the first value that does not follow.
-    """
+    """Check sums, level and counts of the document's corridor."""
     bounds = corridor["bounds"]
     complete = set(bounds) == {*JOINT, *ALONE}
-    if not complete or not np.all(_numbers("corridor.bounds", [*bounds.values()]) > 0):
-        raise CertificationRefused(
-            "corridor.bounds must be positive numbers, one for each measured quantity"
-        )
+    require(
+        complete and np.all(_numbers("corridor.bounds", [*bounds.values()]) > 0),
+        "corridor.bounds must be positive numbers, one for each measured quantity",
+    )
     # Car to nominal model plus nominal model to path: the triangle inequality.
     width = bounds["nominal"] + bounds["vehicle_to_nominal_position"]
     _require_equal("corridor.corridor_m", corridor["corridor_m"], width)
     runs, level = corridor["runs"], corridor["level"]
-    if not (isinstance(runs, int) and 0 < level < 1 and supports(runs, level)):
-        raise CertificationRefused(
-            f"corridor.level = {level!r} is not possible with {runs!r} runs"
-        )
+    require(
+        isinstance(runs, int) and 0 < level < 1 and supports(runs, level),
+        f"corridor.level = {level!r} is not possible with {runs!r} runs",
+    )
     # The attack kept disturbances in their bound: leaving would refute the proof.
-    if not corridor["attack"]["over_tube"] <= 1.0:
-        raise CertificationRefused(
-            "corridor.attack left the tube with disturbances within their bound"
-        )
+    require(
+        corridor["attack"]["over_tube"] <= 1.0,
+        "corridor.attack left the tube with disturbances within their bound",
+    )
     for name, part in {"corridor": corridor, **corridor["by_scenario"]}.items():
         _require_coverage(name, part)
 
@@ -235,11 +225,11 @@ def _require_coverage(name: str, part: Mapping[str, Any]) -> None:
     count, runs = part["coverage_trajectories"], part["coverage_runs"]
     share = part["coverage"]
     inside = round(share * count)
-    if not 0 <= inside <= count or not 1 <= runs <= count:
-        raise CertificationRefused(
-            f"{name}: a coverage of {share!r} is not possible with {count!r} "
-            f"trajectories of {runs!r} runs"
-        )
+    require(
+        0 <= inside <= count and 1 <= runs <= count,
+        f"{name}: a coverage of {share!r} is not possible with {count!r} trajectories "
+        f"of {runs!r} runs",
+    )
     # A share must be a count over the number of trajectories, within rounding.
     for key, value in counted(inside / count, count, runs).items():
         _require_equal(f"{name}: {key}", part[key], value)
@@ -249,17 +239,13 @@ def _numbers(name: str, values: Any) -> np.ndarray:
     """Return a part of a document as an array of finite numbers."""
     array = np.asarray(values)
     # Booleans and strings are refused by the kind, before they compare as numbers.
-    if array.dtype.kind not in "if" or not np.all(np.isfinite(array)):
-        raise CertificationRefused(f"{name} must be finite numbers")
+    finite = array.dtype.kind in "if" and np.all(np.isfinite(array))
+    require(finite, f"{name} must be finite numbers")
     return array
 
 
 def _require_equal(name: str, stated: Any, derived: Any) -> None:
-    """Check a stated value, or all values by the same keys, against the derived ones.
-
-    Raises:
-        CertificationRefused: it is another.
-    """
+    """Check a stated value, or all by the same keys, against the derived ones."""
     if isinstance(derived, dict):
         # All keys: a value that is left out here would be checked nowhere.
         equal = set(stated) == set(derived)
@@ -273,7 +259,4 @@ def _require_equal(name: str, stated: Any, derived: Any) -> None:
         equal = actual.shape == expected.shape and np.all(
             np.abs(actual - expected) <= REPEATED * np.abs(expected)
         )
-    if not equal:
-        raise CertificationRefused(
-            f"{name} does not follow from the rest of the document"
-        )
+    require(equal, f"{name} does not follow from the rest of the document")

@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import hashlib
-from collections.abc import Iterator
-from contextlib import AbstractContextManager, contextmanager, nullcontext
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
 from typing import Any, TypeAlias
 
 import jax
@@ -39,6 +39,21 @@ class CertificateStale(Exception):
     """The certificate is about other weights or settings."""
 
 
+def require(holds: object, reason: str) -> None:
+    """Refuse a certificate, with the reason, unless something holds.
+
+    Callers write a comparison that is false of a NaN.
+    """
+    if not holds:
+        raise CertificationRefused(reason)
+
+
+def require_all(checks: Mapping[str, object], where: str = "") -> None:
+    """Refuse the first claim that does not hold, by name."""
+    for name, holds in checks.items():
+        require(holds, f"{where}{name} does not follow from its witness")
+
+
 @contextmanager
 def well_formed() -> Iterator[None]:
     """Refuse a document whose values are of unexpected types, in one line."""
@@ -51,19 +66,10 @@ def well_formed() -> Iterator[None]:
 
 
 def exported(model: Model, params: Params) -> Exported:
-    """Return the explicit weights in float64, checked to be certifiable.
-
-    Args:
-        model: any model.
-        params: its weights.
-
-    Raises:
-        CertificationRefused: no explicit weights, weights that are not finite, sampled
-            operators only, or an unknown activation or transport.
-    """
-    if model.structure.explicit is None:
-        raise CertificationRefused("this model exposes no explicit weights to certify")
-    evaluate = jax.jit(model.structure.explicit, compiler_options=COMPILER_OPTIONS)
+    """Return the explicit weights in float64; refuse those that nothing is known of."""
+    explicit = model.structure.explicit
+    require(explicit is not None, "this model exposes no explicit weights to certify")
+    evaluate = jax.jit(explicit, compiler_options=COMPILER_OPTIONS)
     try:
         host = jax.local_devices(backend="cpu")[0]
     except RuntimeError:  # JAX_PLATFORMS names accelerators only
@@ -74,8 +80,8 @@ def exported(model: Model, params: Params) -> Exported:
         weights = evaluate(jax.tree.map(np.asarray, unfold(params)))
     # float32 numbers are float64 numbers exactly: nothing is rounded here.
     weights = jax.tree.map(lambda leaf: np.asarray(leaf, dtype=np.float64), weights)
-    if not all(np.all(np.isfinite(leaf)) for leaf in jax.tree.leaves(weights)):
-        raise CertificationRefused("the weights are not finite")
+    finite = all(np.all(np.isfinite(leaf)) for leaf in jax.tree.leaves(weights))
+    require(finite, "the weights are not finite")
     # A(e) between two samples is unknown, however dense they are.
     if isinstance(weights.operators, Samples):
         raise CertificationRefused(
@@ -83,14 +89,14 @@ def exported(model: Model, params: Params) -> Exported:
             "environments prove nothing about those in between"
         )
     activation, transport = weights.declared.activation, weights.declared.transport
-    if activation not in ACTIVATIONS:
-        raise CertificationRefused(
-            f"slopes of the activation {activation!r} are not known in [0, 1]"
-        )
-    if transport not in TRANSPORTS:
-        raise CertificationRefused(
-            f"the transport {transport!r} is not known to be nonexpansive"
-        )
+    require(
+        activation in ACTIVATIONS,
+        f"slopes of the activation {activation!r} are not known in [0, 1]",
+    )
+    require(
+        transport in TRANSPORTS,
+        f"the transport {transport!r} is not known to be nonexpansive",
+    )
     return weights
 
 
@@ -107,13 +113,13 @@ def fingerprint(params: Params) -> str:
     return digest.hexdigest()
 
 
-def one_thread() -> AbstractContextManager[object]:
-    """Limit BLAS to one thread, which is faster for matrices of this size.
-
-    On busy cores two threads are a hundred times slower.
-    """
+@contextmanager
+def one_thread() -> Iterator[None]:
+    """Limit BLAS to one thread: on busy cores two are a hundred times slower here."""
     try:
         from threadpoolctl import threadpool_limits
     except ImportError:  # to verify a certificate, no speed is needed
-        return nullcontext()
-    return threadpool_limits(1, user_api="blas")
+        yield
+    else:
+        with threadpool_limits(1, user_api="blas"):
+            yield

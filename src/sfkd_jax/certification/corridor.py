@@ -20,12 +20,12 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from sfkd_jax.certification._attack import CertificateContradicted
-from sfkd_jax.certification._claims import OutputMetric
+from sfkd_jax.certification._claims import OUTPUTS, OutputMetric
 from sfkd_jax.certification._measured import residuals
 from sfkd_jax.certification._tubes import (
     calibrate_corridor,
     corridor_coverage,
-    run_scores,
+    radii,
 )
 from sfkd_jax.control import PathLaw, safety_filter
 from sfkd_jax.data import drive_along_path, from_s3
@@ -90,27 +90,19 @@ def closed_loop(
     law: PathLaw | None,
     noise: Sequence[float],
 ) -> Loop:
-    """Return the closed loop of a policy, with folded weights.
-
-    Args:
-        plant: to be driven.
-        model: of the policy.
-        params: its weights.
-        law: of the policy.
-        noise: standard deviations of the sensors.
+    """Return the closed loop of a plant and a policy's parts, with folded weights.
 
     Raises:
-        ValueError: the policy has no law.
+        ValueError: the policy has no law, so that there is no closed loop.
     """
-    # Without a law there is no closed loop whose corridor could be stated.
     if law is None:
         raise ValueError(
             "a corridor needs a policy in path coordinates, with its law: "
             "model.frame=path"
         )
     folded = jax.jit(partial(fold, model))(params)
-    steering, drive = (float(largest) for largest in law.perturbation)
-    closed = along_path(plant, law, perturbation=(steering, drive))
+    steering, speed = (float(largest) for largest in law.perturbation)
+    closed = along_path(plant, law, perturbation=(steering, speed))
     return Loop(closed, law, model, folded, tuple(noise))
 
 
@@ -162,22 +154,21 @@ def certify_corridor(
         random_switching, steps=steps, dt=dt, low=low, high=high, dwell=dwell
     )
 
-    def drive(conditions: Callable[[Key], Array], key: Key) -> Trajectory:
+    def driven(conditions: Callable[[Key], Array], key: Key) -> Trajectory:
         env_key, run_key = jax.random.split(key)
         envs = jax.vmap(conditions)(jax.random.split(env_key, runs))
         return drive_along_path(loop.plant, envs, run_key, **options)
 
-    unseen = partial(drive, from_s3(steps, dt))
-    switching = partial(drive, switching)
-    kinds = (switching, switching, switching, unseen)
+    # Jitted once each: the three parts under the conditions share one program.
+    switching = jax.jit(partial(driven, switching))
+    kinds = [switching] * 3 + [jax.jit(partial(driven, from_s3(steps, dt)))]
     simulate = jax.jit(partial(_simulate_nominal, loop))
+    keys = zip(kinds, run_keys, jax.random.split(sensor_key, 4), strict=True)
     measured = [
-        _measure(loop, claims, simulate, jax.jit(kind)(run_key), key)
-        for kind, run_key, key in zip(
-            kinds, run_keys, jax.random.split(sensor_key, len(kinds)), strict=True
-        )
+        _measure(loop, claims, simulate, kind(run_key), key)
+        for kind, run_key, key in keys
     ]
-    units, calibration, test, s3 = (scores for _, _, scores in measured)
+    units, calibration, test, s3 = (scores for *_, scores in measured)
     bounds = calibrate_corridor(units, calibration, level=level)
     lateral, nominal, _ = measured[2]
     conditions = {
@@ -219,18 +210,16 @@ def _measure(
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """e_y of the car and ê_y of the nominal model (run, time), and scores of the runs.
 
-    Args:
-        loop: that was driven.
-        claims: proved metrics.
-        simulate: `_simulate_nominal`, compiled once for all batches of one size.
-        runs: of the car.
-        key: for the sensors.
+    Scores are the smallest bounds that would have held on a run, `JOINT` and `ALONE`.
+    `simulate` is `_simulate_nominal`, compiled once for all batches of one size.
     """
-    nominal, gaps = (np.asarray(part, np.float64) for part in simulate(runs, key))
+    nominal, start = (np.asarray(part, np.float64) for part in simulate(runs, key))
     errors = residuals(loop.model, loop.params, runs)
-    scores = run_scores(errors, claims, np.max(np.abs(nominal), axis=1), gaps)
+    bounds = [radii(errors, name, claims[name], start) for name in OUTPUTS]
+    scores = [each.vehicle_to_nominal for each in bounds]
+    scores += [np.max(np.abs(nominal), axis=1), *(each.asymptotic for each in bounds)]
     lateral = np.asarray(runs.states, dtype=np.float64)[:, 1:, BODY][..., LATERAL]
-    return lateral, nominal, scores
+    return lateral, nominal, np.column_stack(scores)
 
 
 def _simulate_nominal(
@@ -410,14 +399,7 @@ def outcome_of(
     """Return the outcome of one run of plant and nominal model; callers vmap.
 
     Both start on the path. The tube of e_y is |e_y − ê_y| ≤ L α R + ε with
-    R⁺ = α R + |d|_P.
-
-    Args:
-        loop: of the policy.
-        params: of its model, folded.
-        claim: proved metric of e_y.
-        run: inputs of one run.
-        nu_filter: (fiber, latent, ν, index) -> ν, or None for none.
+    R⁺ = α R + |d|_P. `nu_filter` maps (fiber, latent, ν, index) to ν; None for none.
     """
     model, plant = loop.model, loop.plant
     factor = jnp.asarray(np.linalg.cholesky(claim.metric), dtype=float)
@@ -450,13 +432,7 @@ def outcome_of(
 
 
 def _attack(search: _Search, key: Key, width: float, horizon: int) -> dict[str, Any]:
-    """Search for the worst runs, and drive them again with the shield.
-
-    Args:
-        search: for the worst runs.
-        key: consumed.
-        width: W, of the nominal corridor [m].
-        horizon: preview of the shield [steps].
+    """Search for the worst runs, and repeat them with the shield in a corridor `width`.
 
     Raises:
         CertificateContradicted: a car left its tube while the disturbances stayed
@@ -483,21 +459,22 @@ def _attack(search: _Search, key: Key, width: float, horizon: int) -> dict[str, 
     held = jax.jit(each)(loop.params, found)
     # The corridor is claimed only while the disturbances keep their bound
     within = np.asarray(held.radius) <= bound
-    worst = {
-        "lateral_m": np.max(outcome.lateral),
-        "distance_m": np.max(outcome.distance),
-        "shielded_lateral_m": np.max(held.lateral),
-        "kept_lateral_m": np.max(np.asarray(held.lateral), where=within, initial=0.0),
-        "kept_distance_m": np.max(np.asarray(held.distance), where=within, initial=0.0),
-    }
-    worst = {name: float(value) for name, value in worst.items()}
-    shares = {
-        "over_corridor": worst["kept_lateral_m"] / (width + bound),
-        "over_tube": worst["kept_distance_m"] / bound,
-    }
-    if not shares["over_tube"] <= 1.0:
+    lateral, distance = (
+        float(np.max(np.asarray(kept), where=within, initial=0.0))
+        for kept in (held.lateral, held.distance)
+    )
+    if not distance / bound <= 1.0:
         raise CertificateContradicted(
-            f"INTERNAL ERROR: {worst['kept_distance_m']:.4f} m from the nominal model, "
+            f"INTERNAL ERROR: {distance:.4f} m from the nominal model, "
             f"and the tube is {bound:.4f} m"
         )
-    return {"steps": search.steps} | worst | shares
+    return {
+        "steps": search.steps,
+        "lateral_m": float(np.max(outcome.lateral)),
+        "distance_m": float(np.max(outcome.distance)),
+        "shielded_lateral_m": float(np.max(held.lateral)),
+        "kept_lateral_m": lateral,
+        "kept_distance_m": distance,
+        "over_corridor": lateral / (width + bound),
+        "over_tube": distance / bound,
+    }

@@ -1,12 +1,16 @@
-"""The corridor: joint bounds, consistent counts, and forgeries that are refused."""
+"""The corridor: joint bounds, forgeries that are refused, and a policy end to end."""
 
 import copy
 from functools import cache
 
+import jax
 import numpy as np
 import pytest
+from helpers import TINY, any_law, path_space
 
-from sfkd_jax.certification import CertificationRefused
+from sfkd_jax import data as datasets
+from sfkd_jax import models
+from sfkd_jax.certification import CertificationRefused, issue, verify_document
 from sfkd_jax.certification._measured import coverage_interval
 from sfkd_jax.certification._tubes import (
     ALONE,
@@ -15,6 +19,8 @@ from sfkd_jax.certification._tubes import (
     corridor_coverage,
 )
 from sfkd_jax.certification._verification import require_corridor
+from sfkd_jax.certification.corridor import certify_corridor, closed_loop
+from sfkd_jax.plants import kinematic
 
 NAMES = (*JOINT, *ALONE)
 
@@ -101,13 +107,10 @@ FORGED = {
 }
 
 
-def test_an_honest_corridor_passes():
-    require_corridor(corridor())
-
-
 @pytest.mark.parametrize(("named", "forge"), FORGED.values(), ids=list(FORGED))
 def test_a_corridor_whose_parts_do_not_go_together_is_refused(named, forge):
     changed = copy.deepcopy(corridor())
+    require_corridor(changed)
     forge(changed)
     with pytest.raises(CertificationRefused) as reason:
         require_corridor(changed)
@@ -142,3 +145,54 @@ def test_a_run_on_its_bound_is_covered_and_one_that_leaves_any_bound_is_not():
         "coverage_trajectories": 5,
         "coverage_runs": 5,
     }
+
+
+# --- end to end, of an untrained policy: the claims do not depend on training ---------
+
+BOX = {"env_low": (0.3, -8.0), "env_high": (0.9, 8.0)}
+DATA = BOX | {
+    "seed": 0,
+    "speed": (8.0, 10.5),
+    "peak_curvature": 0.02,
+    "wavelengths": (50.0, 200.0),
+    "lateral_acceleration": 2.0,
+    "steering_excitation": (0.002, 0.025),
+    "speed_excitation": (0.05, 0.6),
+}
+
+
+def test_a_document_with_a_corridor_verifies():
+    """As `certify` makes it, with fewer and shorter runs."""
+    options = TINY | {"frame": "path", "transport": False, "budget": "joint"}
+    model = models.sfkd(path_space(), **options)
+    params = model.init(jax.random.key(0))
+    loop = closed_loop(kinematic(), model, params, any_law(), (0.015, 0.015, 0.002))
+    generate = datasets.generate_along_path
+    driven = jax.jit(
+        lambda key: generate(loop.plant, key, segments=120, steps=20, **BOX)
+    )(jax.random.key(1))
+    validation, calibration, test = (
+        jax.tree.map(lambda leaf, k=k: leaf[k::3], driven) for k in range(3)
+    )
+    body = np.asarray(driven.states)[..., 3:].reshape(-1, 3)
+    boxes = {
+        "state": [body.min(0).tolist(), body.max(0).tolist()],
+        "control": [[-0.03, -1.0, -0.02, 8.0], [0.03, 1.0, 0.02, 10.5]],
+        "env": [list(side) for side in BOX.values()],
+    }
+    document = issue(
+        model,
+        params,
+        validation=validation,
+        calibration=calibration,
+        held_out={"test": test},
+        boxes=boxes,
+        level=0.9,
+        attack_starts=0,
+    )
+    small = {"runs": 24, "duration": 4.0, "attack_steps": 3000}
+    document["corridor"] = certify_corridor(
+        loop, document["outputs"], DATA, 0.9, **small
+    )
+    document["policy_sha256"] = "0" * 64
+    verify_document(document, params, model=model, policy_sha256="0" * 64)

@@ -1,0 +1,248 @@
+"""Metrics of outputs: of tiny networks, forged ones, and of a model with its radii."""
+
+import inspect
+import json
+from functools import cache, partial
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from helpers import ENV_HIGH, ENV_LOW, TINY, path_space
+from networks import NETWORK, ROOT, TURNED
+
+from sfkd_jax import models
+from sfkd_jax.certification import CertificationRefused, OutputMetric
+from sfkd_jax.certification._claims import OUTPUTS, readouts, require_output_metric
+from sfkd_jax.certification._measured import Residuals, residuals
+from sfkd_jax.certification._metrics import accepted_metric, propose_metric
+from sfkd_jax.certification._tubes import radii, worst_gaps
+from sfkd_jax.certification._weights import exported
+from sfkd_jax.rollout import fold, rollout
+from sfkd_jax.types import Declared, Polytope, Trajectory
+
+JOINT = [[np.full(4, 1.2 + 0.1 * k)] for k in range(3)]
+HONEST = {
+    name: accepted_metric(TURNED, readouts(TURNED)[name], ROOT @ ROOT, JOINT)
+    for name in OUTPUTS
+}
+every_output = pytest.mark.parametrize("name", HONEST)
+require = inspect.unwrap(require_output_metric)
+"""Past the types, which test runs check."""
+
+
+def refuted(name, claim, message, weights=TURNED):
+    with pytest.raises(CertificationRefused) as reason:
+        require(name, claim, weights)
+    assert str(reason.value).startswith(f"outputs.{name}{message}")
+
+
+@every_output
+def test_what_was_found_is_proved_also_from_json(name):
+    claim = HONEST[name]
+    again = OutputMetric.from_document(json.loads(json.dumps(claim.document())))
+    require(name, again, TURNED)
+    assert again.document() == claim.document()
+    assert 0.5 < claim.alpha < 1.0
+
+
+@every_output
+def test_the_constants_are_those_of_the_matrices(name):
+    """|c|_{P⁻¹} of the row, and nothing smaller than what was found."""
+    claim, row = HONEST[name], readouts(TURNED)[name][0]
+    gain = np.sqrt(row @ np.linalg.solve(ROOT @ ROOT, row))
+    assert claim.lipschitz == pytest.approx(gain, rel=1e-5)
+    for constant in ("alpha", "lipschitz"):
+        value = getattr(claim, constant)
+        require(name, claim._replace(**{constant: 1.001 * value}), TURNED)
+        for share in (0.5, 1 - 4e-6):
+            smaller = claim._replace(**{constant: share * value})
+            refuted(name, smaller, f".{constant} does not follow")
+
+
+@pytest.mark.parametrize("constant", ["alpha", "lipschitz"])
+@pytest.mark.parametrize("value", [0.0, -5e-324, np.inf, np.nan, 1, "0.5", None, True])
+def test_what_is_no_bound_is_none(constant, value):
+    claim = HONEST["position"]._replace(**{constant: value})
+    refuted("position", claim, f".{constant} is not a bound: {value!r}")
+
+
+@pytest.mark.parametrize("alpha", [1.0, 1.0 + 1e-12, 7.0])
+def test_a_rate_that_is_proved_and_no_contraction_is_refused(alpha):
+    claim = HONEST["position"]._replace(alpha=alpha)
+    refuted("position", claim, ".alpha does not follow")
+
+
+@pytest.mark.parametrize("vertex", range(3))
+def test_every_vertex_counts(vertex):
+    claim, longer = HONEST["position"], np.array(TURNED.operators.vertices)
+    longer[vertex] *= 0.9 / (0.3, 0.5, 0.4)[vertex]
+    changed = TURNED._replace(operators=Polytope(longer))
+    refuted("position", claim, ".alpha does not follow", changed)
+    for factor in (0.0, -1.0, 0.01, np.nan):
+        joint = [*claim.joint]
+        joint[vertex] = [factor * part for part in joint[vertex]]
+        refuted("position", claim._replace(joint=joint), ".alpha does not follow")
+
+
+def test_a_rate_in_one_metric_is_none_in_another():
+    claim = HONEST["position"]
+    for metric in (
+        np.eye(3),
+        -claim.metric,
+        0 * claim.metric,
+        np.diag([1.0, 4.0, np.nan]),
+        claim.metric + np.triu(ROOT + 1, 1),
+    ):
+        refuted("position", claim._replace(metric=metric), ".alpha does not follow")
+
+
+@pytest.mark.parametrize("size", [2, 4])
+def test_a_witness_of_another_size_is_refused(size):
+    claim = HONEST["position"]
+    other = claim._replace(metric=np.eye(size))
+    refuted("position", other, ".witness is of another size")
+    other = claim._replace(joint=(2 * claim.joint)[:size])
+    refuted("position", other, ".alpha does not follow")
+
+
+def test_what_may_have_a_metric_is_a_polytope_without_transport_and_decoder():
+    claim = HONEST["position"]
+    for transport in ("rotation", "identity "):
+        other = TURNED._replace(declared=Declared("tanh", transport, 2))
+        refuted("position", claim, ": this model has no", other)
+    other = TURNED._replace(decoder=NETWORK.decoder)
+    refuted("position", claim, ": this model has no", other)
+    refuted("body", claim, ": this model has no")
+
+
+# --- of a model -----------------------------------------------------------------------
+
+OPTIONS = TINY | {
+    "frame": "path",
+    "transport": False,
+    "budget": "joint",
+    "forcing_hidden": 4,
+    "rho": 0.85,
+}
+
+
+@cache
+def trained():
+    """A model, its explicit weights, and folded ones."""
+    model, random = models.sfkd(path_space(), **OPTIONS), np.random.default_rng(1)
+    params = jax.tree.map(
+        lambda leaf: leaf + 0.3 * random.standard_normal(leaf.shape).astype("float32"),
+        model.init(jax.random.key(0)),
+    )
+    return model, exported(model, params), jax.jit(partial(fold, model))(params)
+
+
+@cache
+def runs(count=6, steps=40, seed=2):
+    """Not of any plant: smooth random path states, controls and environments."""
+    keys = jax.random.split(jax.random.key(seed), 3)
+    body = jnp.cumsum(
+        0.02 * jax.random.normal(keys[0], (count, steps + 1, 3)), axis=1
+    ) + jnp.asarray([0.0, 0.0, 9.0])
+    states = jnp.concatenate([jnp.zeros((count, steps + 1, 3)), body], axis=-1)
+    controls = jax.random.uniform(
+        keys[1], (count, steps, 4), minval=-1.0
+    ) * jnp.asarray([0.03, 1.0, 0.02, 1.0])
+    controls = controls.at[..., 3].add(9.0)
+    envs = jax.random.uniform(
+        keys[2],
+        (count, steps, 2),
+        minval=jnp.asarray(ENV_LOW),
+        maxval=jnp.asarray(ENV_HIGH),
+    )
+    return Trajectory(states, controls, envs)
+
+
+@cache
+def measured():
+    model, _, folded = trained()
+    return residuals(model, folded, runs())
+
+
+@cache
+def proposed(name="position"):
+    weights = trained()[1]
+    return propose_metric(weights, readouts(weights)[name], worst_gaps(measured()))
+
+
+@pytest.mark.parametrize("name", OUTPUTS)
+def test_what_is_proposed_is_proved(name):
+    require_output_metric(name, proposed(name), trained()[1])
+
+
+def test_no_pair_of_latents_contradicts_the_metric():
+    """The running step, float32, at scales from 1e-2 to 1e2 and where the residual is
+    steepest.
+    """
+    claim, (model, weights, folded) = proposed(), trained()
+    factor = np.linalg.cholesky(claim.metric)
+
+    @jax.jit
+    @jax.vmap
+    def distance(z, direction, control, env):
+        fiber = model.fiber(folded, env)
+        latent = model.encode(fiber, runs().states[0, 0])
+        moved = [
+            model.step(fiber, latent._replace(z=at), control).z
+            for at in (z, z + direction)
+        ]
+        return moved[1] - moved[0]
+
+    random = np.random.default_rng(3)
+    count, rank = 4000, len(factor)
+    z = random.standard_normal((count, rank)) * 10.0 ** random.uniform(
+        -2, 2, (count, 1)
+    )
+    direction = random.standard_normal((count, rank)) * 10.0 ** random.uniform(
+        -1, 1, (count, 1)
+    )
+    controls = np.asarray(runs().controls).reshape(-1, 4)[
+        random.integers(0, 240, count)
+    ]
+    envs = random.uniform(ENV_LOW, ENV_HIGH, (count, 2))
+    after = np.asarray(
+        distance(*map(jnp.float32, (z, direction, controls, envs))), dtype=np.float64
+    )
+    lengths = np.linalg.norm(direction @ factor, axis=1)
+    ratios = np.linalg.norm(after @ factor, axis=1) / lengths
+    assert 0.5 * claim.alpha < np.max(ratios) <= claim.alpha * (1 + 1e-4)
+    read = np.abs(direction @ readouts(weights)["position"][0])
+    assert np.all(read <= claim.lipschitz * lengths)
+
+
+def test_every_distance_to_a_nominal_model_lies_within_the_radius_of_its_run():
+    """For any inputs, the nominal model started where the car is or beside it; each
+    form bounds the next.
+    """
+    model, _, folded = trained()
+    predicted = jax.jit(jax.vmap(lambda run: rollout(model, folded, run)[0]))(runs())
+    for index, name in enumerate(OUTPUTS):
+        distance = np.abs(np.asarray(predicted - runs().states[:, 1:]))
+        distance = distance[..., 3 + index].max(axis=1)
+        bounds = radii(measured(), name, proposed(name))
+        assert np.all(distance <= bounds.vehicle_to_nominal * (1 + 1e-4))
+        assert np.all(bounds.vehicle_to_nominal <= bounds.asymptotic * (1 + 1e-12))
+        start = np.full((len(distance), OPTIONS["rank"]), 0.1)
+        beside = radii(measured(), name, proposed(name), start)
+        assert np.all(beside.vehicle_to_nominal >= bounds.vehicle_to_nominal)
+        assert np.all(beside.asymptotic >= bounds.asymptotic)
+
+
+def test_radii_of_one_dimension_are_the_sums_that_they_are():
+    """z⁺ = z/2, y = 2 z, |d| = 1, 0, 1, 0: R = 1, 1/2, 5/4, 5/8 and |y − ŷ| ≤ 2·½·R
+    before + ε.
+    """
+    claim = OutputMetric(0.5, 2.0, np.eye(1), [[]])
+    steps = np.asarray([1.0, 0.0, -1.0, 0.0]).reshape(1, 4, 1)
+    misses = np.asarray([0.1, 0.0, 0.0, 0.3]).reshape(1, 4, 1) * np.ones((1, 1, 3))
+    bounds = radii(Residuals(steps, misses), "position", claim)
+    assert bounds.vehicle_to_nominal == pytest.approx(1.25 + 0.3)
+    assert bounds.asymptotic == pytest.approx(2.0 + 0.3)
+    later = radii(Residuals(steps, misses), "position", claim, np.asarray([[8.0]]))
+    assert later.vehicle_to_nominal == pytest.approx(8.0 + 0.1)
