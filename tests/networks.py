@@ -11,7 +11,7 @@ from sfkd_jax.types import Declared, Explicit, Polytope
 BOX = [[-0.5, 0.0], [0.5, 0.2]]
 
 
-def rotation(size, seed):
+def rotation(size, seed=0):
     return np.linalg.qr(np.random.default_rng(seed).standard_normal((size, size)))[0]
 
 

@@ -5,6 +5,7 @@ from fractions import Fraction
 import numpy as np
 import pytest
 from exact import exact_witness, forged_witness, rational, search
+from networks import rotation
 
 from sfkd_jax.certification import (
     _core,
@@ -13,10 +14,6 @@ from sfkd_jax.certification import (
     is_positive_definite,
     norm_upper,
 )
-
-
-def rotation(size, seed=0):
-    return np.linalg.qr(np.random.default_rng(seed).standard_normal((size, size)))[0]
 
 
 def with_eigenvalues(values, seed=0):
@@ -42,13 +39,6 @@ def test_the_verdict_does_not_depend_on_the_unit(scale):
     assert not is_positive_definite(scale * bad)
 
 
-@pytest.mark.parametrize("size", [1, 3, 16, 40])
-def test_the_norm_bound_of_an_orthogonal_matrix_is_one(size):
-    for seed in range(10):
-        turn = rotation(size, seed)
-        assert 1.0 - 1e-15 * size <= norm_upper(turn) <= 1.0 + 1e-9
-
-
 def test_the_norm_bound_of_known_matrices_is_tight_from_above():
     random = np.random.default_rng(0)
     left, right = random.standard_normal(7), random.standard_normal(4)
@@ -59,11 +49,13 @@ def test_the_norm_bound_of_known_matrices_is_tight_from_above():
         (np.asarray([[1.0, 1.0], [0.0, 1.0]]), (1 + np.sqrt(5)) / 2),
         (np.ones((6, 3)), np.sqrt(18.0)),
         (rotation(9)[:4], 1.0),
+        (rotation(40), 1.0),
         (1e-100 * rotation(5), 1e-100),
         (1e60 * rotation(5), 1e60),
     ]
     for matrix, exact in cases:
-        assert exact * (1 - 1e-15) <= norm_upper(matrix) <= exact * (1 + 1e-9)
+        least = exact * (1 - 1e-15 * len(matrix))
+        assert least <= norm_upper(matrix) <= exact * (1 + 1e-9)
 
 
 def test_the_norm_bound_of_nothing_is_nothing_and_of_nonsense_is_infinite():
@@ -101,17 +93,13 @@ def test_other_multipliers_prove_nothing(spoil):
     assert not check_witness(WEIGHTS, spoil(*MULTIPLIERS), TRUE * (1 + 1e-6))
 
 
-@pytest.mark.parametrize("layer", range(3))
-def test_weights_that_are_not_finite_prove_nothing(layer):
+def test_weights_or_a_bound_that_are_not_finite_prove_nothing():
     for spoiled in (np.nan, np.inf):
-        weights = [matrix.copy() for matrix in WEIGHTS]
-        weights[layer][3, 2] = spoiled
-        assert not check_witness(weights, MULTIPLIERS, 1e6)
-
-
-def test_a_bound_that_says_nothing_is_not_proved():
-    for bound in (np.nan, np.inf, 0.0):
-        assert not check_witness(WEIGHTS, MULTIPLIERS, bound)
+        for layer in range(3):
+            weights = [matrix.copy() for matrix in WEIGHTS]
+            weights[layer][3, 2] = spoiled
+            assert not check_witness(weights, MULTIPLIERS, 1e6)
+        assert not check_witness(WEIGHTS, MULTIPLIERS, spoiled)
 
 
 # --- nothing that LAPACK, the processor or an enemy does is believed ------------------
@@ -230,15 +218,6 @@ def test_a_metric_that_is_none_proves_nothing():
         np.asarray([[1.0, 0.1], [0.2, 1.0]]),
     ):
         assert not check_witness((), (), 0.6, matrix, metric=metric)
-
-
-def test_a_rate_in_a_metric_is_not_a_rate_in_the_2_norm():
-    root = np.diag([1.0, 10.0])
-    operator = np.linalg.solve(root, 0.8 * rotation(2) @ root)
-    metric = root.T @ root
-    assert check_witness((), (), 0.8 * (1 + 1e-9), operator, metric=metric)
-    assert not check_witness((), (), 0.8 * (1 - 1e-9), operator, metric=metric)
-    assert not check_witness((), (), 0.8 * (1 + 1e-9), operator)
 
 
 def test_a_metric_of_another_condition_is_refused():

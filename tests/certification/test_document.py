@@ -18,8 +18,6 @@ from sfkd_jax.certification import (
     verify_document,
 )
 
-PLANTS = ("kinematic", "dynamic")
-
 
 @cache
 def shipped(plant="kinematic"):
@@ -41,7 +39,9 @@ def check(document, plant="kinematic"):
         raise CertificationRefused("of another type") from reason
 
 
-@pytest.mark.parametrize("plant", [*PLANTS, *(f"{plant}_path" for plant in PLANTS)])
+@pytest.mark.parametrize(
+    "plant", ["kinematic", "dynamic", "kinematic_path", "dynamic_path"]
+)
 def test_what_ships_verifies(plant):
     check(honest(plant), plant)
 
@@ -130,9 +130,8 @@ def test_what_does_not_go_together_is_refused(path, value):
 def leaves(value, path=()):
     """Where the numbers, words and switches of nested settings lie."""
     if isinstance(value, dict | list):
-        for key, entry in (
-            value.items() if isinstance(value, dict) else enumerate(value)
-        ):
+        parts = value.items() if isinstance(value, dict) else enumerate(value)
+        for key, entry in parts:
             yield from leaves(entry, (*path, str(key)))
     else:
         yield ".".join(path), value
@@ -227,11 +226,10 @@ def test_weights_that_do_not_fit_the_model_are_refused_in_one_line(
 
 
 def test_a_certificate_of_one_policy_is_stale_beside_another():
-    with pytest.raises(CertificateStale):
-        check(honest("dynamic"), "kinematic")
     forged = honest("dynamic") | {"policy_sha256": shipped("kinematic").sha256}
-    with pytest.raises((CertificationRefused, CertificateStale)):
-        check(forged, "kinematic")
+    for other in (honest("dynamic"), forged):
+        with pytest.raises(CertificateStale):
+            check(other, "kinematic")
 
 
 def test_one_weight_that_moved_by_the_smallest_step_is_noticed():

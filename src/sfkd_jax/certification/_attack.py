@@ -43,11 +43,7 @@ def attack_claims(
     box: Box,
     starts: int,
 ) -> dict[str, float]:
-    """Run all attacks and return the lower bounds that they reach, by name.
-
-    Raises:
-        CertificateContradicted: a lower bound exceeds the proved bound.
-    """
+    """Run all attacks and return the lower bounds that they reach, by name."""
     # Limits before the search: a proof that states none is an error at once.
     limits, reached = attack_limits(claims, weights), {}
     networks = {"residual": weights.residual, **decoders(weights)}
@@ -90,11 +86,8 @@ def attack_slopes(
     for start in range(starts):
         # All slopes 1 is the linearisation at the origin, often close to the worst.
         share = 1.0 if start == 0 else random.uniform(0.2, 1.0)
-        slopes = [
-            (random.uniform(size=len(weight)) < share).astype(float)
-            # Slopes are 0 or 1 from the start: by convexity the maximum is at a corner.
-            for weight in weights[:-1]
-        ]
+        widths = [len(weight) for weight in weights[:-1]]
+        slopes = [(random.uniform(size=width) < share) * 1.0 for width in widths]
         value = 0.0
         while True:
             for k in range(len(slopes)):
@@ -123,10 +116,7 @@ def _best_layer(
     left, _, right = np.linalg.svd(base + _chain(weights, slopes))
     # With (u, v) fixed the gain is a sum over units: each chooses its own sign.
     before = _chain(weights[: layer + 1], slopes[:layer]) @ right[0]
-    after = left[:, 0]
-    for k in range(len(slopes), layer, -1):
-        after = after @ weights[k]
-        after = after * slopes[k - 1] if k - 1 > layer else after
+    after = left[:, 0] @ _chain(weights[layer + 1 :], slopes[layer + 1 :])
     return (before * after > 0).astype(float)
 
 
@@ -139,13 +129,8 @@ def attack_model(
     `model.transport`; "transport" that of T alone, over random pairs (e, e'). Outputs
     are the pose increment of a step and, if the pose is part of the latent, of
     decoding: "position" [m], "yaw" [rad] and "decoder" (both); and the body state,
-    "body". e and e' stay in the box; z and u are free, as in the certificate.
-
-    Args:
-        model: a model with `explicit`.
-        params: its weights, folded or not.
-        box: lower and upper corner of E.
-        starts: number of starting points of each ascent.
+    "body". e and e' stay in the box; z and u are free, as in the certificate. Each
+    ascent has `starts` starting points.
     """
     inject, *sizes = _coordinates(model, params, len(box[0]))
     # A key each: the number of starts of one attack leaves the others as they are.
@@ -156,8 +141,7 @@ def attack_model(
         after = model.step(fiber, inject(z), control)
         return model.vector(model.transport(fiber, fiber_next, after))
 
-    def outputs(params: Params, z: Any, control: Any, env: Any, later: Any) -> Any:
-        del later
+    def outputs(params: Params, z: Any, control: Any, env: Any, _: Any) -> Any:
         fiber = model.fiber(params, env)
         latent = inject(z)  # at the origin, so that an increment is a pose
         # The step's pose and the decoding of z: two places where a pose may come from.

@@ -165,19 +165,13 @@ def counted(share: float, trajectories: int, runs: int) -> dict[str, Any]:
 
 
 def coverage_interval(share: float, runs: int) -> list[float]:
-    """Return the 95 % Clopper-Pearson interval of a coverage.
+    """Return the exact 95 % interval of a coverage (Clopper and Pearson, 1934).
 
     If the share lies between two counts of runs, the interval covers those of both.
     """
     # Both sides rounded outwards: the interval is wider than either count's.
-    counts = math.floor(share * runs + ROUNDING), math.ceil(share * runs - ROUNDING)
-    return [clopper_pearson(count, runs)[side] for side, count in enumerate(counts)]
-
-
-def clopper_pearson(successes: int, trials: int) -> tuple[float, float]:
-    """Return the exact 95 % interval of a share (Clopper and Pearson, 1934)."""
-    tail, failures = 0.025, trials - successes
-    # With no success the lower end is 0 exactly, where betaincinv is undefined.
-    low = betaincinv(successes, failures + 1, tail) if successes else 0.0
-    high = betaincinv(successes + 1, failures, 1.0 - tail) if failures else 1.0
-    return float(low), float(high)
+    few, many = math.floor(share * runs + ROUNDING), math.ceil(share * runs - ROUNDING)
+    # At 0 and 1 the ends are exact, where betaincinv is undefined.
+    low = betaincinv(few, runs - few + 1, 0.025) if few else 0.0
+    high = betaincinv(many + 1, runs - many, 0.975) if many < runs else 1.0
+    return [float(low), float(high)]

@@ -116,11 +116,8 @@ def lipschitz_upper(
         linear: A, for a bound on A z + network(z).
     """
     if not multipliers and len(weights) <= 1:
-        parts = [
-            np.asarray(part, dtype=np.float64)
-            for part in (*weights, linear)
-            if part is not None
-        ]
+        given = (part for part in (*weights, linear) if part is not None)
+        parts = [np.asarray(part, dtype=np.float64) for part in given]
         # Widened by the rounding of the sum itself, which `norm_upper` does not see.
         return norm_upper(sum(parts[1:], parts[0])) * (1 + (len(parts) - 1) * 1e-12), []
     if len(multipliers) != len(weights) - 1:
@@ -160,7 +157,7 @@ def propose_multipliers(
         weights: W_1 … W_L.
         start: initial λ; without it those that prove the product of norms.
         linear: A of a joint bound.
-        iterations: L-BFGS iterations for each exponent in `SHARPNESS`.
+        iterations: for each exponent in `SHARPNESS`.
     """
     weights = [np.asarray(weight, dtype=np.float64) for weight in weights]
     if len(weights) < 2 or not all(np.all(np.isfinite(part)) for part in weights):

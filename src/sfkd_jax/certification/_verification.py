@@ -67,33 +67,27 @@ def verify(
     weights = exported(model, params) if weights is None else weights
     with well_formed(), one_thread():
         require_claims(certificate, weights, certificate.env_box)
-        _require_consistent(certificate, weights)
-
-
-def _require_consistent(certificate: Certificate, weights: Exported) -> None:
-    """Check that the parts of a certificate agree with each other."""
-    alpha = certificate.alpha
-    require(
-        alpha < 1.0 and certificate.transport_lipschitz == 1.0,
-        f"alpha = {alpha} is not below 1, or the transport is not nonexpansive",
-    )
-    # A text that promises more than these checks cover must not pass.
-    covered = certificate.precision == PRECISION
-    require(covered, "precision is not what is covered")
-    limits = attack_limits(certificate, weights)
-    for name, value in certificate.attacks.items():
-        limit = limits.get(name)
-        # A stated attack above the proved bound would contradict the document itself.
+        alpha, limits = certificate.alpha, attack_limits(certificate, weights)
         require(
-            limit is not None and 0 <= value <= limit * (1 + FLOAT32),
-            f"the attack {name} = {value!r} contradicts the bound {limit}",
+            alpha < 1.0 and certificate.transport_lipschitz == 1.0,
+            f"alpha = {alpha} is not below 1, or the transport is not nonexpansive",
         )
-    step = certificate.attacks.get("step")
-    tightness = alpha / step if step else None
-    require(
-        certificate.attack == step and certificate.tightness == tightness,
-        "attack or tightness does not follow from the attacks",
-    )
+        # A text that promises more than these checks cover must not pass.
+        covered = certificate.precision == PRECISION
+        require(covered, "precision is not what is covered")
+        for name, value in certificate.attacks.items():
+            limit = limits.get(name)
+            # An attack above the proved bound would contradict the document itself.
+            require(
+                limit is not None and 0 <= value <= limit * (1 + FLOAT32),
+                f"the attack {name} = {value!r} contradicts the bound {limit}",
+            )
+        step = certificate.attacks.get("step")
+        tightness = alpha / step if step else None
+        require(
+            certificate.attack == step and certificate.tightness == tightness,
+            "attack or tightness does not follow from the attacks",
+        )
 
 
 def verify_document(

@@ -12,7 +12,7 @@ import time
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
-from typing import Annotated, Any, NamedTuple
+from typing import Annotated, Any, NamedTuple, TypeAlias
 
 import jax
 import jax.numpy as jnp
@@ -70,9 +70,7 @@ class Loop(NamedTuple):
 
     Attributes:
         plant: the true plant with the law around it.
-        law: of the policy.
-        model: of the policy.
-        params: of the model, folded.
+        law: of the policy, as are model and (folded) params.
         noise: standard deviations of the sensors.
     """
 
@@ -268,11 +266,8 @@ def _spread(noise: tuple[float, ...], size: int) -> Array:
     return jnp.zeros(size).at[3 : 3 + len(known)].set(jnp.asarray(known))
 
 
-class Runs(NamedTuple):
-    """Inputs of runs, w and e."""
-
-    inputs: Float[Array, "run time 4"]
-    envs: Float[Array, "run time environment"]
+Runs: TypeAlias = tuple[Array, Array]
+"""Inputs w (time, 4) and environments (time, environment) of a run."""
 
 
 class Outcome(NamedTuple):
@@ -298,7 +293,6 @@ class _Search:
     constant speed. The result is a lower bound of the worst case.
 
     Attributes:
-        loop: of the policy.
         claim: proved metric of e_y.
         bound: of the radius of its tube, which is what is claimed [m].
         data: of the data set: `ROADS`, env_low and env_high.
@@ -314,15 +308,15 @@ class _Search:
     steps: int
 
     def __call__(self, params: Params, key: Key) -> tuple[Runs, Outcome]:
-        """Return the worst runs of each aim, (aim, run, …)."""
+        """Return the worst runs of each aim, one aim after another."""
         keys = jax.random.split(key, len(AIMS))
         worst = [self._worst(params, *of) for of in zip(AIMS, keys, strict=True)]
-        return jax.tree.map(lambda *leaves: jnp.stack(leaves), *worst)
+        return jax.tree.map(lambda *leaves: jnp.concatenate(leaves), *worst)
 
     def _run(self, genes: Float[Array, " gene"]) -> Runs:
         """Inputs of one run from its genes."""
-        data, sizes = self.data, self._sizes
-        nu, env, road = jnp.split(genes, [sizes[0], sizes[0] + sizes[1]])
+        data = self.data
+        nu, env, road = jnp.split(genes, self._edges[:2])
         # Saturates: the worst ν are mostly at the limits.
         nu = jnp.repeat(jnp.tanh(2.0 * nu).reshape(-1, 2), BLOCK, axis=0)[:LENGTH]
         low, high = jnp.asarray(data["env_low"]), jnp.asarray(data["env_high"])
@@ -342,13 +336,14 @@ class _Search:
         bend = peak * jnp.clip((1.0 + tight) * sine, -1.0, 1.0)
         nu = nu * self.loop.law.perturbation
         inputs = jnp.column_stack([nu, bend, jnp.full(LENGTH, speed)])
-        return Runs(inputs, low + (high - low) * env)
+        return inputs, low + (high - low) * env
 
     @property
-    def _sizes(self) -> tuple[int, int, int]:
-        """Numbers of genes for ν, e and the road."""
+    def _edges(self) -> list[int]:
+        """Where the genes of ν, e and the road end."""
         switches = -(-LENGTH // self.held)
-        return 2 * -(-LENGTH // BLOCK), switches * len(self.data["env_low"]), 4
+        sizes = 2 * -(-LENGTH // BLOCK), switches * len(self.data["env_low"]), 4
+        return np.cumsum(sizes).tolist()
 
     def _worst(self, params: Params, aim: str, key: Key) -> tuple[Runs, Outcome]:
         """The worst runs of one aim over all generations."""
@@ -358,8 +353,7 @@ class _Search:
 
         def generation(carry: tuple[Array, Array], key: Key) -> tuple[Any, Any]:
             mean, spread = carry
-            noise = jax.random.normal(key, (population, *mean.shape))
-            genes = mean + spread * noise
+            genes = mean + spread * jax.random.normal(key, (population, *mean.shape))
             runs = jax.vmap(self._run)(genes)
             found = runs, jax.vmap(outcome)(runs)
             best = jnp.argsort(-self._score(aim, found[1]))
@@ -368,7 +362,7 @@ class _Search:
             after = jnp.mean(elite, axis=0), jnp.std(elite, axis=0) + 0.1
             return after, jax.tree.map(lambda leaf: leaf[best[:KEEP]], found)
 
-        start = jnp.zeros(sum(self._sizes)), jnp.ones(sum(self._sizes))
+        start = jnp.zeros(self._edges[-1]), jnp.ones(self._edges[-1])
         # The worst of all generations: the last one need not have it.
         _, found = jax.lax.scan(generation, start, jax.random.split(key, GENERATIONS))
         found = jax.tree.map(lambda leaf: leaf.reshape(-1, *leaf.shape[2:]), found)
@@ -401,11 +395,11 @@ def outcome_of(
     Both start on the path. The tube of e_y is |e_y − ê_y| ≤ L α R + ε with
     R⁺ = α R + |d|_P. `nu_filter` maps (fiber, latent, ν, index) to ν; None for none.
     """
-    model, plant = loop.model, loop.plant
+    model, plant, (run_inputs, envs) = loop.model, loop.plant, run
     factor = jnp.asarray(np.linalg.cholesky(claim.metric), dtype=float)
     rest = jnp.zeros(len(plant.state_names) - 3)
-    start = path_state(rest.at[2].set(run.inputs[0, 3]))
-    latent = model.encode(model.fiber(params, run.envs[0]), start)
+    start = path_state(rest.at[2].set(run_inputs[0, 3]))
+    latent = model.encode(model.fiber(params, envs[0]), start)
 
     def step(carry: Any, given: tuple[Array, Environment, Array]) -> tuple[Any, Any]:
         state, latent, error = carry
@@ -426,7 +420,7 @@ def outcome_of(
         values = Outcome(jnp.abs(true), jnp.abs(true - nominal), radius)
         return (state, latent, error), values
 
-    given = (run.inputs, run.envs, jnp.arange(len(run.inputs)))
+    given = (run_inputs, envs, jnp.arange(len(run_inputs)))
     _, outcomes = jax.lax.scan(step, (start, latent, jnp.zeros(())), given)
     return jax.tree.map(jnp.max, outcomes)
 
@@ -442,10 +436,9 @@ def _attack(search: _Search, key: Key, width: float, horizon: int) -> dict[str, 
     found, outcome = jax.jit(search)(loop.params, key)
 
     def shielded(params: Params, run: Runs) -> Outcome:
-        length = len(run.inputs)
         # The last inputs repeated: a preview at the end of a run has nothing further.
-        ahead = jnp.arange(length)[:, None] + jnp.arange(horizon)
-        roads = run.inputs[jnp.minimum(ahead, length - 1), 2:]
+        ahead = jnp.arange(LENGTH)[:, None] + jnp.arange(horizon)
+        roads = run[0][jnp.minimum(ahead, LENGTH - 1), 2:]
 
         def admissible(fiber: Any, latent: Any, wanted: Control, at: Any) -> Control:
             limit = loop.law.perturbation
@@ -455,8 +448,7 @@ def _attack(search: _Search, key: Key, width: float, horizon: int) -> dict[str, 
 
         return outcome_of(loop, params, search.claim, run, admissible)
 
-    each = jax.vmap(jax.vmap(shielded, in_axes=(None, 0)), in_axes=(None, 0))
-    held = jax.jit(each)(loop.params, found)
+    held = jax.jit(jax.vmap(shielded, in_axes=(None, 0)))(loop.params, found)
     # The corridor is claimed only while the disturbances keep their bound
     within = np.asarray(held.radius) <= bound
     lateral, distance = (
