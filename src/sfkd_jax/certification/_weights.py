@@ -68,7 +68,8 @@ def well_formed() -> Iterator[None]:
 def exported(model: Model, params: Params) -> Exported:
     """Return the explicit weights in float64; refuse those that nothing is known of."""
     explicit = model.structure.explicit
-    require(explicit is not None, "this model exposes no explicit weights to certify")
+    if explicit is None:
+        raise CertificationRefused("this model exposes no explicit weights to certify")
     evaluate = jax.jit(explicit, compiler_options=COMPILER_OPTIONS)
     try:
         host = jax.local_devices(backend="cpu")[0]
