@@ -11,6 +11,7 @@ from sfkd_jax.experiment.command import command_line, hydra_command
 from sfkd_jax.experiment.evaluating import evaluate_run
 from sfkd_jax.experiment.options import Settings
 from sfkd_jax.report.run import write_report
+from sfkd_jax.settings import plain
 
 
 def run(settings: Settings) -> dict[str, Any]:
@@ -28,6 +29,12 @@ def run(settings: Settings) -> dict[str, Any]:
 def _run_stages(settings: Settings) -> dict[str, Any]:
     """Run all stages in the run directory."""
     trained, run_dir = stages.ensure_policy(settings), settings.run_dir
+    # A policy that exists is not written again, and `load` builds what it says.
+    if store.differences(trained.settings["controller"], plain(settings.controller)):
+        store.print_message(
+            f"{run_dir}: the policy keeps the controller that it was trained with; "
+            "`load(…, controller=…)` takes another"
+        )
     key = "position_rmse_m"
     errors = store.read_json(run_dir / "open_loop.json", keys=(key,))
     about = {

@@ -127,15 +127,16 @@ def test_a_lost_policy_is_finished_again_from_the_checkpoint(copied):
 
 
 @pytest.mark.exhaustive
-def test_a_scenario_of_choice_adds_rows_and_keeps_the_others(copied):
-    run_command("evaluate", "+experiment=smoke", "scenario=s1", cwd=copied)
+def test_another_setting_of_the_controller_adds_rows_and_keeps_the_others(copied):
+    other = "controller.mppi.num_samples=8"
+    run_command("evaluate", "+experiment=smoke", other, cwd=copied)
     rows = json.loads((copied / "runs/smoke/sfkd/seed=0/results.json").read_text())[
         "rows"
     ]
-    assert {(row["system"], row["scenario"]) for row in rows} == {
-        (system, scenario)
+    assert {(row["system"], row["controller"]) for row in rows} == {
+        (system, controller)
         for system in ("sfkd", "nominal")
-        for scenario in ("s1", "s3")
+        for controller in ("mppi_tiny", "mppi_tiny,mppi.num_samples=8")
     }
     report = last_line(run_command("report", "+experiment=smoke", cwd=copied))
     assert all((copied / figure).exists() for figure in report["figures"])

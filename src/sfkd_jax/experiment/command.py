@@ -52,7 +52,7 @@ def hydra_command(run: Run) -> Callable[[], None]:
     def main(composed: DictConfig) -> Any:
         sweeping = HydraConfig.get().mode == RunMode.MULTIRUN
         try:
-            settings = settings_of(composed)
+            settings = named_for_controller(settings_of(composed))
             use_compilation_cache(Path(settings.root))
             if not settings.optimized:
                 compile_fast()
@@ -161,18 +161,41 @@ def named_for_sweep(settings: Settings) -> Settings:
     ]
     if not overrides:
         return settings
-    # Sorted: the order in which options were typed does not make another run.
+    name = _name_of(overrides)
+    # The policies of a comparison follow, unless they have a name of their own.
+    comparison = settings.comparison
+    if comparison.policies == settings.name:
+        comparison = replace(comparison, policies=f"{settings.name}/{name}")
+    return replace(settings, name=f"{settings.name}/{name}", comparison=comparison)
+
+
+def named_for_controller(settings: Settings) -> Settings:
+    """Return the settings with what was typed about the controller in its name.
+
+    Rows of results.json are told apart by names: with other samples it is another row.
+    """
+    typed = [word.lstrip("+") for word in HydraConfig.get().overrides.task]
+    changed = [
+        word.removeprefix("controller.")
+        for word in typed
+        if word.startswith("controller.") and not word.startswith("controller.name=")
+    ]
+    if not changed:
+        return settings
+    name = f"{settings.controller.name},{_name_of(changed)}"
+    return replace(settings, controller=replace(settings.controller, name=name))
+
+
+def _name_of(overrides: list[str]) -> str:
+    """Return a name of a file that says what was overridden."""
+    # Sorted: the order in which options were typed makes no difference.
     varied = ",".join(sorted(overrides))
     name = "-".join(re.findall(r"[\w.+=,-]+", varied, re.ASCII))
     # A name that was cleaned or cut needs its digest, or two jobs might share it.
     if name != varied or len(name) > LONGEST_NAME:
         digest = hashlib.sha256(varied.encode()).hexdigest()[:8]
         name = f"{name[:LONGEST_NAME]}-{digest}"
-    # The policies of a comparison follow, unless they have a name of their own.
-    comparison = settings.comparison
-    if comparison.policies == settings.name:
-        comparison = replace(comparison, policies=f"{settings.name}/{name}")
-    return replace(settings, name=f"{settings.name}/{name}", comparison=comparison)
+    return name
 
 
 def _report(line: str) -> None:

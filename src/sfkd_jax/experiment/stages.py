@@ -73,6 +73,9 @@ def check_settings(settings: Settings) -> None:
         )
     if not plant.control_low:  # known from logs alone, and not driven
         return
+    build.build_scenario(
+        settings.scenario, plant, duration=settings.evaluation.episode_s
+    )
     unit = {name: ((-1.0,) * size, (1.0,) * size) for name, size in sizes.items()}
     build.build_controller(
         settings.controller,
