@@ -8,7 +8,7 @@ from helpers import ENV_HIGH, ENV_LOW, at, certified, driven, jit, model_and_par
 
 from sfkd_jax.certification import certify, latent_tube
 from sfkd_jax.certification._measured import KINDS, residuals
-from sfkd_jax.certification._tubes import physical_tube
+from sfkd_jax.certification._tubes import tubes
 from sfkd_jax.geometry import wrap_angle
 from sfkd_jax.rollout import rollout
 
@@ -79,22 +79,24 @@ def test_with_bounded_disturbances_the_tube_is_violated_exactly_never(aligned, l
 
 
 def test_the_physical_tube_is_its_finite_sums():
-    latent = np.asarray([1.0, 2.0, 4.0])
-    tube = physical_tube(
-        latent,
-        alpha=0.5,
-        lipschitz={"position": 2.0, "yaw": 0.5, "body": 3.0},
-        residual={"position": 0.1, "yaw": 0.01, "body": 0.2},
-        largest_increment=10.0,
-    )
-    yaw = [0.01, 0.01 + 0.51, 0.01 + 0.51 + 1.01]
+    """R = 0, 2, 3: with increments, and the limits along a path."""
+    given = {
+        "alpha": 0.5,
+        "lipschitz": {"position": 2.0, "yaw": 0.5, "body": 3.0},
+        "one_step": {"latent": 2.0, "position": 0.1, "yaw": 0.01, "body": 0.2},
+        "horizon": 3,
+    }
+    tube = tubes(**given, largest_increment=10.0)["physical"]
+    yaw = [0.01, 0.02 + 1.0, 0.03 + 2.5]
     np.testing.assert_allclose(tube["yaw_rad"], yaw)
-    np.testing.assert_allclose(
-        tube["position_m"],
-        [0.1, 0.2 + 2.0 + 10 * yaw[0], 0.3 + 6.0 + 10 * (yaw[0] + yaw[1])],
-    )
-    np.testing.assert_allclose(
-        tube["body"], [0.2, 0.2 + 3.0 * 0.5 * 1.0, 0.2 + 3.0 * 0.5 * 2.0]
+    position = [0.1, 0.2 + 4.0 + 10 * yaw[0], 0.3 + 10.0 + 10 * (yaw[0] + yaw[1])]
+    np.testing.assert_allclose(tube["position_m"], position)
+    np.testing.assert_allclose(tube["body"], [0.2, 0.2 + 3.0, 0.2 + 4.5])
+    along = tubes(**given, largest_increment=None)
+    np.testing.assert_allclose(along["physical"]["position_m"], [0.1, 2.1, 3.1])
+    assert along["ultimate"] == 4.0
+    assert along["asymptotic"] == pytest.approx(
+        {"position_m": 4.1, "yaw_rad": 1.01, "body": 6.2}
     )
 
 
@@ -117,13 +119,13 @@ def test_free_running_predictions_stay_inside_the_physical_tube(name):
     body = np.linalg.norm(predicted[..., 3:] - true[..., 3:], axis=-1)
     moves = np.linalg.norm(np.diff(np.asarray(data.states)[..., :2], axis=1), axis=-1)
     for k in range(len(predicted)):
-        tube = physical_tube(
-            latent_tube(proved.alpha, measured["latent"][k], 12),
+        tube = tubes(
             alpha=proved.alpha,
             lipschitz=proved.lipschitz,
-            residual={kind: measured[kind][k] for kind in KINDS},
+            one_step={kind: float(measured[kind][k]) for kind in KINDS},
+            horizon=12,
             largest_increment=float(moves[k].max()),
-        )
+        )["physical"]
         for radii, error in zip(
             (tube["position_m"], tube["yaw_rad"], tube["body"]),
             (position, yaw, body),

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from functools import partial
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -22,6 +21,8 @@ from sfkd_jax.certification._weights import CertificationRefused, Exported
 
 WORST = 5
 """Steps of every validation run that a metric is optimised for."""
+OUTPUT_KINDS = {"position_m": "position", "yaw_rad": "yaw", "body": "body"}
+"""Radii in a document, and the errors that they bound."""
 
 
 def latent_tube(
@@ -29,7 +30,12 @@ def latent_tube(
 ) -> Float[np.ndarray, " horizon"]:
     """Return R_1 … R_T with |z_k − ẑ_k| ≤ R_k as long as all |d_j| ≤ d̄, for ẑ_0 = z_0.
 
-    R_k = d̄ (1 − α^k)/(1 − α)
+        R_k = d̄ (1 − α^k)/(1 − α)
+
+    Args:
+        alpha: contraction factor.
+        d_bar: d̄.
+        horizon: T [steps].
     """
     radii, radius = [], 0.0
     # The recursion instead of the closed form, which divides by 1 − α.
@@ -37,49 +43,6 @@ def latent_tube(
         radius = alpha * radius + d_bar
         radii.append(radius)
     return np.asarray(radii)
-
-
-def physical_tube(
-    latent: Float[np.ndarray, " horizon"],
-    *,
-    alpha: float,
-    lipschitz: Mapping[str, float],
-    residual: Mapping[str, float],
-    largest_increment: float | None,
-) -> dict[str, list[float]]:
-    """Return radii of position [m], yaw [rad] and body state for an exact z_0.
-
-    Along a path all are decoded from z, so that no error accumulates:
-
-        |e_i,k| ≤ L_i α R_{k−1} + ε_i,   k = 1 … T
-
-    Otherwise the pose is a sum of increments on SE(2), and its error is bounded by
-    finite sums over j = 0 … k − 1 instead:
-
-        |e_yaw,k| ≤ Σ_j (L_yaw R_j + ε_yaw)
-        |e_p,k|   ≤ Σ_j (L_p R_j + ε_p + |dp| |e_yaw,j|)
-
-    Args:
-        latent: R_1 … R_T.
-        alpha: contraction factor.
-        lipschitz: L of the outputs, by "position", "yaw", "body".
-        residual: ε, one-step errors at the true latent, by the same names.
-        largest_increment: |dp|, the longest step [m]; None along a path.
-    """
-    # R_0 = 0: a prediction starts at the observed state.
-    before = np.concatenate([[0.0], latent[:-1]])
-    position, yaw, body = (
-        lipschitz[kind] * alpha * before + residual[kind]
-        for kind in ("position", "yaw", "body")
-    )
-    if largest_increment is not None:
-        yaw = np.cumsum(lipschitz["yaw"] * before + residual["yaw"])
-        # An error of yaw moves only the increments that come after it.
-        turned = np.concatenate([[0.0], yaw[:-1]])
-        increments = lipschitz["position"] * before + residual["position"]
-        position = np.cumsum(increments + largest_increment * turned)
-    radii = {"position_m": position, "yaw_rad": yaw, "body": body}
-    return {name: radius.tolist() for name, radius in radii.items()}
 
 
 def tubes(
@@ -90,24 +53,47 @@ def tubes(
     horizon: int,
     largest_increment: float | None,
 ) -> dict[str, Any]:
-    """Return the tubes of a document from the measured `one_step`, by `KINDS`."""
+    """Return the tubes of a document, for an exact z_0: R_1 … R_T, outputs, limits.
+
+    Along a path all outputs are decoded from z, so that no error accumulates:
+
+        |e_i,k| ≤ L_i α R_{k−1} + ε_i,   k = 1 … T
+
+    Otherwise the pose is a sum of increments on SE(2), and its error is bounded by
+    finite sums over j = 0 … k − 1 instead:
+
+        |e_yaw,k| ≤ Σ_j (L_yaw R_j + ε_yaw)
+        |e_p,k|   ≤ Σ_j (L_p R_j + ε_p + |dp| |e_yaw,j|)
+
+    Args:
+        alpha: contraction factor.
+        lipschitz: L of the outputs, by "position", "yaw", "body".
+        one_step: measured d̄ ("latent") and ε by the same names, at the true latent.
+        horizon: T [steps].
+        largest_increment: |dp|, the longest step [m]; None along a path.
+    """
     latent = latent_tube(alpha, one_step["latent"], horizon)
     # R_k → d̄ / (1 − α), the fixed point of R ↦ α R + d̄.
     ultimate, limit = one_step["latent"] / (1 - alpha), None
-    physical = partial(
-        physical_tube,
-        alpha=alpha,
-        lipschitz=lipschitz,
-        residual=one_step,
-        largest_increment=largest_increment,
-    )
+    # R_0 = 0: a prediction starts at the observed state.
+    before = np.concatenate([[0.0], latent[:-1], [ultimate]])
+    radii = {
+        name: lipschitz[kind] * alpha * before + one_step[kind]
+        for name, kind in OUTPUT_KINDS.items()
+    }
     # With increments the pose drifts; without them there is a limit of every radius.
     if largest_increment is None:
-        both = physical(np.full(2, ultimate))
-        limit = {name: radius[-1] for name, radius in both.items()}
+        limit = {name: float(radius[-1]) for name, radius in radii.items()}
+    else:
+        yaw = np.cumsum(lipschitz["yaw"] * before + one_step["yaw"])
+        # An error of yaw moves only the increments that come after it.
+        turned = np.concatenate([[0.0], yaw[:-1]])
+        increments = lipschitz["position"] * before + one_step["position"]
+        position = np.cumsum(increments + largest_increment * turned)
+        radii |= {"position_m": position, "yaw_rad": yaw}
     return {
         "latent": latent.tolist(),
-        "physical": physical(latent),
+        "physical": {name: radius[:-1].tolist() for name, radius in radii.items()},
         "ultimate": ultimate,
         "asymptotic": limit,
         "largest_increment_m": largest_increment,
@@ -173,16 +159,9 @@ def output_tubes(
 ) -> dict[str, dict[str, Any]]:
     """Prove a metric for each of `OUTPUTS` and calibrate a bound on |y − ŷ| with it.
 
-    Args:
-        weights: explicit weights of a model whose metrics last.
-        validation: of the runs that the metric is optimised for.
-        calibration: of the runs that set the bounds.
-        test: of the runs on which coverage is counted.
-        level: of each bound, for a whole new run.
-        start: common Lyapunov matrix of the operators, to start from.
-
-    Returns:
-        α, L, their witness and the tube by output; empty if there is no metric for one.
+    The metric is optimised for the validation runs, from `start`, a common Lyapunov
+    matrix of the operators. Each bound holds at `level` for a whole new run. Empty if
+    there is no metric for one of the outputs.
     """
     documents = {}
     for name in OUTPUTS:
