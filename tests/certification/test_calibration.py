@@ -30,15 +30,6 @@ def test_the_interval_of_a_proportion_is_the_exact_one(successes, trials, lower,
     )
 
 
-def test_the_interval_covers_the_truth_at_least_as_often_as_it_says():
-    random = np.random.default_rng(0)
-    table = [coverage_interval(successes / 25, 25) for successes in range(26)]
-    for truth in (0.05, 0.5, 0.93):
-        drawn = random.binomial(25, truth, 4000)
-        hits = np.mean([table[k][0] <= truth <= table[k][1] for k in drawn])
-        assert hits >= 0.95 - 3 * np.sqrt(0.05 * 0.95 / 4000)
-
-
 def scores(random, count):
     """Exchangeable, correlated between kinds, heavy-tailed, in four different units."""
     common = random.standard_exponential((count, 1))
@@ -94,14 +85,6 @@ def test_scores_that_are_not_finite_are_refused(value):
     for pair in ((table, spoiled), (spoiled, table)):
         with pytest.raises(ValueError, match="not finite"):
             conformal_bounds(*pair, level=0.9)
-
-
-def test_coverage_counts_trajectories_inside_all_bounds():
-    held_out = np.asarray(
-        [[1.0, 1, 1, 1], [2, 1, 1, 1], [1, 1, 1, 1.0001], [0, 0, 0, 0]]
-    )
-    assert coverage(np.ones(4), held_out)["coverage"] == 0.5
-    assert coverage(np.ones(4), held_out, 2)["coverage_runs"] == 2
 
 
 def largest(data):

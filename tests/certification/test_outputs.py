@@ -226,12 +226,14 @@ def test_every_distance_to_a_nominal_model_lies_within_the_radius_of_its_run():
         distance = np.abs(np.asarray(predicted - runs().states[:, 1:]))
         distance = distance[..., 3 + index].max(axis=1)
         bounds = radii(measured(), name, proposed(name))
-        assert np.all(distance <= bounds.vehicle_to_nominal * (1 + 1e-4))
-        assert np.all(bounds.vehicle_to_nominal <= bounds.asymptotic * (1 + 1e-12))
+        assert np.all(distance <= bounds["vehicle_to_nominal"] * (1 + 1e-4))
+        assert np.all(
+            bounds["vehicle_to_nominal"] <= bounds["asymptotic"] * (1 + 1e-12)
+        )
         start = np.full((len(distance), OPTIONS["rank"]), 0.1)
         beside = radii(measured(), name, proposed(name), start)
-        assert np.all(beside.vehicle_to_nominal >= bounds.vehicle_to_nominal)
-        assert np.all(beside.asymptotic >= bounds.asymptotic)
+        assert np.all(beside["vehicle_to_nominal"] >= bounds["vehicle_to_nominal"])
+        assert np.all(beside["asymptotic"] >= bounds["asymptotic"])
 
 
 def test_radii_of_one_dimension_are_the_sums_that_they_are():
@@ -242,7 +244,7 @@ def test_radii_of_one_dimension_are_the_sums_that_they_are():
     steps = np.asarray([1.0, 0.0, -1.0, 0.0]).reshape(1, 4, 1)
     misses = np.asarray([0.1, 0.0, 0.0, 0.3]).reshape(1, 4, 1) * np.ones((1, 1, 3))
     bounds = radii(Residuals(steps, misses), "position", claim)
-    assert bounds.vehicle_to_nominal == pytest.approx(1.25 + 0.3)
-    assert bounds.asymptotic == pytest.approx(2.0 + 0.3)
+    assert bounds["vehicle_to_nominal"] == pytest.approx(1.25 + 0.3)
+    assert bounds["asymptotic"] == pytest.approx(2.0 + 0.3)
     later = radii(Residuals(steps, misses), "position", claim, np.asarray([[8.0]]))
-    assert later.vehicle_to_nominal == pytest.approx(8.0 + 0.1)
+    assert later["vehicle_to_nominal"] == pytest.approx(8.0 + 0.1)

@@ -11,13 +11,7 @@ import jax.numpy as jnp
 import numpy as np
 from scipy.optimize import minimize
 
-from sfkd_jax.certification._claims import (
-    FLOAT32,
-    Box,
-    Claims,
-    attack_limits,
-    decoders,
-)
+from sfkd_jax.certification._claims import FLOAT32, Box, Claims, attack_limits, decoders
 from sfkd_jax.certification._core import Matrix, Vector
 from sfkd_jax.certification._weights import CertificationRefused, Exported, one_thread
 from sfkd_jax.rollout import fold
@@ -255,11 +249,8 @@ def _coordinates(
     assert model.structure.explicit is not None
     # Shapes only: no weights are computed to learn sizes.
     weights = jax.eval_shape(model.structure.explicit, params)
-    state = jax.ShapeDtypeStruct((3 + weights.readout.shape[0],), jnp.float32)
-    env = jax.ShapeDtypeStruct((entries,), jnp.float32)
-    shapes = jax.eval_shape(
-        lambda env, state: model.encode(model.fiber(params, env), state), env, state
-    )
+    state, env = jnp.zeros(3 + weights.readout.shape[0]), jnp.zeros(entries)
+    shapes = jax.eval_shape(lambda: model.encode(model.fiber(params, env), state))
     origin = jax.tree.map(lambda leaf: jnp.zeros(leaf.shape, leaf.dtype), shapes)
     # `vector` is linear, so that its transpose writes z and leaves the pose at 0.
     z, back = jax.vjp(model.vector, origin)

@@ -84,11 +84,7 @@ class Certificate(Claims):
 
 
 def certify(
-    model: Model,
-    params: Params,
-    env_box: Box,
-    *,
-    attack_starts: int = 6,
+    model: Model, params: Params, env_box: Box, *, attack_starts: int = 6
 ) -> Certificate:
     """Prove a contraction factor for all z, u and e, and attack all proved bounds.
 

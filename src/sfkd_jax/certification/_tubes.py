@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 from jaxtyping import Float
@@ -100,20 +100,10 @@ def tubes(
     }
 
 
-class Radii(NamedTuple):
-    """Bounds on |y_k − ŷ_k| of vehicle and nominal model over a whole run, (run,).
-
-    Attributes:
-        asymptotic: L α max|d|_P / (1 − α) + max ε, from the largest disturbance alone.
-        vehicle_to_nominal: max_k (L α R_{k−1} + ε_k) with R_k = α R_{k−1} + |d_k|_P,
-            from the sequence of all disturbances.
-    """
-
-    asymptotic: Float[np.ndarray, " run"]
-    vehicle_to_nominal: Float[np.ndarray, " run"]
-
-
-FORMS = Radii._fields
+FORMS = ("asymptotic", "vehicle_to_nominal")
+"""Bounds on |y_k − ŷ_k| of vehicle and nominal model over a whole run: from the largest
+disturbance alone, and from the sequence of all disturbances.
+"""
 
 
 def radii(
@@ -121,12 +111,13 @@ def radii(
     name: str,
     claim: OutputMetric,
     start: Float[np.ndarray, "run rank"] | None = None,
-) -> Radii:
-    """Return the bounds of one output for each run.
+) -> dict[str, Float[np.ndarray, " run"]]:
+    """Return the bounds of one output for each run, by `FORMS`.
 
-    With |z_k − ẑ_k|_P ≤ R_k,
+    With |z_k − ẑ_k|_P ≤ R_k and R_k = α R_{k−1} + |d_k|_P,
 
-        |y_k − ŷ_k| ≤ |C (F(z_{k−1}) − F(ẑ_{k−1}))| + ε_k ≤ L α R_{k−1} + ε_k.
+        |y_k − ŷ_k| ≤ |C (F(z_{k−1}) − F(ẑ_{k−1}))| + ε_k ≤ L α R_{k−1} + ε_k
+                    ≤ L α max|d|_P / (1 − α) + max ε.
 
     `start` is z_0 − ẑ_0; None if the nominal model starts at the state of the car.
     """
@@ -145,7 +136,7 @@ def radii(
     # A start outside the limit shrinks towards it: the larger of both bounds all k.
     ultimate = np.maximum(initial, np.max(sizes, axis=1) / (1.0 - claim.alpha))
     asymptotic = claim.lipschitz * claim.alpha * ultimate + np.max(misses, axis=1)
-    return Radii(asymptotic, farthest)
+    return dict(zip(FORMS, (asymptotic, farthest), strict=True))
 
 
 def output_tubes(
@@ -174,9 +165,9 @@ def output_tubes(
         scores, unseen = (radii(part, name, claim) for part in (calibration, test))
         part: dict[str, Any] = {"tube": {}, "coverage": {}, "coverage_ci95": {}}
         documents[name] = claim.document() | {"coverage_runs": len(test.gaps)} | part
-        for form, calibrated, held_out in zip(FORMS, scores, unseen, strict=True):
-            bound = part["tube"][form] = conformal_quantile(calibrated, level)
-            share = part["coverage"][form] = float(np.mean(held_out <= bound))
+        for form in FORMS:
+            bound = part["tube"][form] = conformal_quantile(scores[form], level)
+            share = part["coverage"][form] = float(np.mean(unseen[form] <= bound))
             part["coverage_ci95"][form] = coverage_interval(share, len(test.gaps))
     return documents
 

@@ -23,6 +23,7 @@ from sfkd_jax.certification._attack import CertificateContradicted
 from sfkd_jax.certification._claims import OUTPUTS, OutputMetric
 from sfkd_jax.certification._measured import residuals
 from sfkd_jax.certification._tubes import (
+    FORMS,
     calibrate_corridor,
     corridor_coverage,
     radii,
@@ -32,7 +33,7 @@ from sfkd_jax.data import drive_along_path, from_s3
 from sfkd_jax.geometry import LATERAL, PERTURBATION, path_state
 from sfkd_jax.plants import Vehicle, along_path
 from sfkd_jax.ranges import Interval, Span
-from sfkd_jax.rollout import fold, in_batches, rollout
+from sfkd_jax.rollout import fold, rollout
 from sfkd_jax.scenarios import random_switching
 from sfkd_jax.types import (
     BODY,
@@ -47,7 +48,6 @@ from sfkd_jax.types import (
 
 ROADS = ("speed", "peak_curvature", "wavelengths", "lateral_acceleration")
 EXCITATION = ("steering_excitation", "speed_excitation")
-BATCH = 20
 STREAM = 4
 """Stream folded into the data set's seed; the data set uses streams 0 to 2."""
 BLOCK = 5
@@ -138,7 +138,7 @@ def certify_corridor(
     """
     began = time.perf_counter()
     claims = {n: OutputMetric.from_document(part) for n, part in outputs.items()}
-    box = {name: data[name] for name in ("env_low", "env_high")}
+    low, high = data["env_low"], data["env_high"]
     excited = {name: data[name] for name in (*ROADS, *EXCITATION)}
     # A stream of its own: the data set's runs must not reappear in its certificate.
     *run_keys, sensor_key, attack_key = jax.random.split(
@@ -147,7 +147,6 @@ def certify_corridor(
     sensors = partial(_sensor_effect, loop)
     options = excited | {"sensors": sensors, "offset": (0.0, 0.0, 0.0), "burn_in": 0}
     steps, dt = round(duration / loop.plant.dt), loop.plant.dt
-    low, high = box.values()
     switching = partial(
         random_switching, steps=steps, dt=dt, low=low, high=high, dwell=dwell
     )
@@ -170,14 +169,14 @@ def certify_corridor(
     bounds = calibrate_corridor(units, calibration, level=level)
     lateral, nominal, _ = measured[2]
     conditions = {
-        "env_box": [*box.values()],
+        "env_box": [low, high],
         "dwell_s": dwell,
         "duration_s": duration,
         "sensor_noise": loop.noise,
         "perturbation": loop.law.perturbation.tolist(),
     }
     # The shortest dwell: an attack switches as often as the conditions allow.
-    held = max(1, round(dwell[0] / loop.plant.dt))
+    held = max(1, round(dwell[0] / dt))
     bound = bounds["vehicle_to_nominal_position"]
     search = _Search(loop, claims["position"], bound, data, held, attack_steps)
     return {
@@ -214,8 +213,8 @@ def _measure(
     nominal, start = (np.asarray(part, np.float64) for part in simulate(runs, key))
     errors = residuals(loop.model, loop.params, runs)
     bounds = [radii(errors, name, claims[name], start) for name in OUTPUTS]
-    scores = [each.vehicle_to_nominal for each in bounds]
-    scores += [np.max(np.abs(nominal), axis=1), *(each.asymptotic for each in bounds)]
+    alone, together = ([each[form] for each in bounds] for form in FORMS)
+    scores = [*together, np.max(np.abs(nominal), axis=1), *alone]
     lateral = np.asarray(runs.states, dtype=np.float64)[:, 1:, BODY][..., LATERAL]
     return lateral, nominal, np.column_stack(scores)
 
@@ -241,7 +240,7 @@ def _simulate_nominal(
 
     keys = jax.random.split(key, len(runs.states))
     gaps = jax.vmap(gap)(runs.states[:, 0], runs.envs[:, 0], keys)
-    return in_batches(lateral, runs, size=BATCH), gaps
+    return jax.vmap(lateral)(runs), gaps
 
 
 def _sensor_effect(
