@@ -3,7 +3,6 @@ with their row.
 """
 
 import re
-import sys
 
 import numpy as np
 import pyarrow
@@ -69,10 +68,15 @@ def same_segments(result, wanted):
     )
 
 
-@pytest.mark.parametrize("separator", [",", "\t", " "])
-def test_a_run_comes_back_from_csv_to_the_last_bit(tmp_path, separator):
+@pytest.mark.parametrize("kind", [",", "\t", " ", "npz", "parquet"])
+def test_a_run_comes_back_to_the_last_bit(tmp_path, kind):
     columns = recorded_run()
-    write_csv(tmp_path / "a.csv", columns, separator)
+    if kind == "npz":
+        write_npz(tmp_path / "a.npz", columns | {"camera": np.zeros((3, 4))})
+    elif kind == "parquet":
+        parquet.write_table(pyarrow.table(columns), tmp_path / "a.parquet")
+    else:
+        write_csv(tmp_path / "a.csv", columns, kind)
     assert same_segments(together(read(tmp_path)[0].dataset), expected(columns))
 
 
@@ -87,38 +91,6 @@ def test_whole_runs_as_x_u_e_come_back_to_the_last_bit(tmp_path):
     logged, lines = read(tmp_path / "a.npz")
     assert same_segments(together(logged.dataset), wanted)
     assert not [line for line in lines if "too few runs" in line]
-
-
-@pytest.mark.parametrize("kind", ["npz", "parquet"])
-def test_a_run_comes_back_from_columns_to_the_last_bit(tmp_path, kind):
-    columns, path = recorded_run(), tmp_path / f"a.{kind}"
-    if kind == "npz":
-        write_npz(path, columns | {"camera": np.zeros((3, 4))})
-    else:
-        parquet.write_table(pyarrow.table(columns), path)
-    assert same_segments(together(read(path)[0].dataset), expected(columns))
-
-
-def test_parquet_without_its_package_names_the_extra(tmp_path, monkeypatch):
-    monkeypatch.setitem(sys.modules, "pyarrow", None)
-    (tmp_path / "a.parquet").write_bytes(b"PAR1")
-    assert refusal(tmp_path).endswith(
-        'a.parquet: parquet files need pyarrow: pip install "sfkd-jax[train]"'
-    )
-
-
-def test_other_names_are_mapped(tmp_path):
-    columns = recorded_run()
-    mapped = Columns(
-        "time",
-        ("x", "y", "heading", "speed"),
-        ("delta", "throttle"),
-        ("mu", "side wind"),
-    )
-    names = [mapped.time, *mapped.state, *mapped.control, *mapped.environment]
-    renamed = dict(zip(names, columns.values(), strict=True))
-    write_csv(tmp_path / "a.csv", renamed)
-    assert same_segments(together(read(tmp_path, mapped)[0].dataset), expected(columns))
 
 
 def test_a_column_tells_runs_in_one_file_apart(tmp_path):
@@ -324,13 +296,6 @@ TEXTS = {
 }
 
 
-@pytest.mark.parametrize("kind", TEXTS)
-def test_a_malformed_csv_is_one_line_with_its_place(tmp_path, kind):
-    text, message = TEXTS[kind]
-    (tmp_path / "a.csv").write_text(text)
-    assert refusal(tmp_path / "a.csv") == f"{tmp_path / 'a.csv'}{message}"
-
-
 def with_commas(text):
     return text.replace(",", ";").replace(".", ",")
 
@@ -388,10 +353,14 @@ ARRAYS = {
 }
 
 
-@pytest.mark.parametrize("kind", ARRAYS)
-def test_a_malformed_npz_is_one_line(tmp_path, kind):
-    arrays, message = ARRAYS[kind]
-    assert message in refusal(write_npz(tmp_path / "a.npz", arrays))
+@pytest.mark.parametrize("kind", [*TEXTS, *ARRAYS])
+def test_a_malformed_file_is_one_line_with_its_place(tmp_path, kind):
+    content, message = (TEXTS | ARRAYS)[kind]
+    if kind in ARRAYS:
+        assert message in refusal(write_npz(tmp_path / "a.npz", content))
+    else:
+        (tmp_path / "a.csv").write_text(content)
+        assert refusal(tmp_path / "a.csv") == f"{tmp_path / 'a.csv'}{message}"
 
 
 def test_every_refused_file_is_reported(tmp_path):
@@ -422,12 +391,6 @@ def test_a_path_that_means_no_logs_is_refused(tmp_path, monkeypatch, path, messa
     assert message in refusal(path)
 
 
-def test_the_same_run_twice_is_refused(tmp_path):
-    for name in "ab":
-        write_csv(tmp_path / f"{name}.csv", recorded_run())
-    assert "b.csv: the same contents as" in refusal(tmp_path)
-
-
 def test_contents_decide_which_data_set_it_is(tmp_path):
     for folder in ("here", "there"):
         (tmp_path / folder).mkdir()
@@ -438,6 +401,8 @@ def test_contents_decide_which_data_set_it_is(tmp_path):
     )
     write_csv(tmp_path / "here" / "a.csv", recorded_run(phase=0.1))
     assert first == moved != datasets.fingerprint(str(tmp_path / "here"))
+    write_csv(tmp_path / "there" / "twice.csv", recorded_run())
+    assert "twice.csv: the same contents as" in refusal(tmp_path / "there")
 
 
 @pytest.mark.parametrize(

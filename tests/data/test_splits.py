@@ -56,15 +56,17 @@ def test_the_split_is_shuffled_by_its_key():
     assert orders[0] != sorted(orders[0])
 
 
-@pytest.mark.parametrize("shares", [(0.5, 0.5, 0.1, -0.1), (0.5, 0.2, 0.2, 0.2)])
-def test_bad_shares_are_refused_by_name(shares):
-    with pytest.raises(ValueError, match=r"shares.*positive numbers of sum 1"):
-        split(numbered(43), shares=shares)
-
-
-def test_too_few_trajectories_are_refused_with_their_number():
-    with pytest.raises(ValueError, match="3 trajectories are too few"):
-        split(numbered(3))
+@pytest.mark.parametrize(
+    ("count", "shares", "message"),
+    [
+        (43, (0.5, 0.5, 0.1, -0.1), r"shares.*positive numbers of sum 1"),
+        (43, (0.5, 0.2, 0.2, 0.2), r"shares.*positive numbers of sum 1"),
+        (3, SHARES, "3 trajectories are too few"),
+    ],
+)
+def test_what_cannot_be_split_is_refused(count, shares, message):
+    with pytest.raises(ValueError, match=message):
+        split(numbered(count), shares=shares)
 
 
 @pytest.mark.parametrize("value", [9.0, -8.5, jnp.nan])
@@ -131,13 +133,10 @@ def test_scales_come_from_the_training_split_alone():
     measure = jit(datasets.measure_space)
     for honest, other in zip(measure(data), measure(poisoned), strict=True):
         np.testing.assert_array_equal(honest, other)
-
-
-def test_a_channel_that_never_moves_gets_scale_one():
-    data = numbered(43)
-    still = data._replace(controls=jnp.zeros_like(data.controls))
-    measured = datasets.measure_space(split(still))
-    np.testing.assert_array_equal(measured.control_scale, np.ones(2))
+    # A channel that never moves gets scale one.
+    still = data.train._replace(controls=jnp.zeros_like(data.train.controls))
+    scale = measure(data._replace(train=still)).control_scale
+    np.testing.assert_array_equal(scale, np.ones(2))
 
 
 def test_scenarios_of_segments_stay_with_their_trajectories():
@@ -147,19 +146,10 @@ def test_scenarios_of_segments_stay_with_their_trajectories():
         windy = np.abs(np.asarray(getattr(data, part).envs)[..., 1]).max(axis=1) > 0
         names = np.asarray(datasets.SCENARIOS)[np.asarray(data.scenarios[part])]
         np.testing.assert_array_equal(names, np.where(windy, "wet", "uniform"))
-
-
-@pytest.mark.parametrize("segments", [4, 7, 101])
-def test_every_segment_has_a_scenario(segments):
-    for labels, names in (
-        (datasets.segment_scenarios(segments), {"uniform", "wet"}),
-        (
-            datasets.segment_scenarios(segments, along_path=True),
-            set(datasets.SCENARIOS),
-        ),
-    ):
-        assert len(labels) == segments
-        assert {datasets.SCENARIOS[code] for code in labels} == names
+    for count in (4, 7, 101):
+        labels = datasets.segment_scenarios(count, along_path=True)
+        assert len(labels) == count
+        assert set(labels) == set(range(len(datasets.SCENARIOS)))
 
 
 RECORDED = (0.6, 0.1, 0.2, 0.1)

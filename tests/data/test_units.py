@@ -88,9 +88,6 @@ def test_two_columns_that_fit_are_refused(tmp_path):
     columns["v (m/s)"] = columns["v [km/h]"] = columns.pop("v")
     with pytest.raises(ValueError, match="both fit v; configure one in full"):
         read(write_csv(tmp_path / "a.csv", columns))
-
-
-def test_the_exact_name_comes_first():
     assert find_column("x", ["x(ft)", "x"], "length").header == "x"
     assert find_column("x", ["y", "xx(m)"], "length") is None
 
@@ -115,24 +112,14 @@ def test_units_are_split_from_names(header, parts):
     [
         ("s sec", "time", 1.0),
         ("ms", "time", 1e-3),
-        ("us µs", "time", 1e-6),
-        ("h", "time", 3600.0),
-        ("ft", "length", 0.3048),
-        ("in", "length", 0.0254),
         ("deg degrees °", "angle", np.pi / 180),
-        ("mrad", "angle", 1e-3),
         ("km/h kph kmh KM/H", "speed", 1 / 3.6),
-        ("mph", "speed", 0.44704),
         ("kn", "speed", 1852 / 3600),
         ("deg/s °/s", "angular rate", np.pi / 180),
         ("rpm", "angular rate", np.pi / 30),
         ("m/s² m/s^2 m/s2", "acceleration", 1.0),
         ("g", "acceleration", 9.80665),
-        ("1/km", "curvature", 1e-3),
-        ("kN", "force", 1e3),
         ("kNm", "torque", 1e3),
-        ("mV", "voltage", 1e-3),
-        ("bar", "pressure", 1e5),
         ("- 1", "ratio", 1.0),
         ("%", "ratio", 1e-2),
     ],

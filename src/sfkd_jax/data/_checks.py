@@ -159,11 +159,10 @@ class Checks:
         if not log.joined.any() or _stale(log).any():
             return log, found
         for find in (self._position_jumps, self._yaw_jumps):
-            if not log.joined.any():  # the cuts have left single rows
-                break
-            jumps, text = find(log)
-            found += _first(log, jumps, text, hint=CUT_THERE, refused=False)
-            log = log.cut(jumps)
+            if log.joined.any():  # else the cuts have left single rows
+                jumps, text = find(log)
+                found += _first(log, jumps, text, hint=CUT_THERE, refused=False)
+                log = log.cut(jumps)
         return log, found
 
     def _time(self, log: Log, hint: str, *, refused: bool = True) -> Iterator[Finding]:
@@ -303,13 +302,13 @@ class Checks:
             ),
         }
         # A mean over the whole run: single wrong rows change no reading.
-        fits = {
-            text: _agreement(chords.course - read).real
+        fits = [
+            (_agreement(chords.course - read).real, text)
             for text, read in readings.items()
-        }
-        best = max(fits, key=lambda text: fits[text])
+        ]
+        fit, best = max(fits)
         off = f"{log.whole}: {name} and the direction of travel differ"
-        if fits[best] > 0.9:
+        if fit > 0.9:
             yield Finding(f"{off}; {best}")
         elif abs(agreed) > 0.7:
             yield _warning(

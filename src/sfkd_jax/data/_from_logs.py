@@ -98,15 +98,17 @@ def from_logs(
         ValueError: the first reason why the logs are refused; the others are reported.
     """
     # All files are read and checked before any is refused: one run shows all faults.
-    files = read_logs(path, columns, dt=dt, needs_environment=needs_environment)
-    if files.conversions:
-        report(f"converted to SI units: {', '.join(files.conversions)}")
+    recorded, errors, conversions = read_logs(
+        path, columns, dt=dt, needs_environment=needs_environment
+    )
+    if conversions:
+        report(f"converted to SI units: {', '.join(conversions)}")
     box = (env_low, env_high)
     checks = Checks(
         columns, dt, steps, wheelbase, gap, min_speed, split_at_jumps, limits, box
     )
-    logs, findings = checks.apply(files.logs)
-    _report_findings([*map(Finding, files.errors), *findings], report)
+    logs, findings = checks.apply(recorded)
+    _report_findings([*map(Finding, errors), *findings], report)
     cut, runs = _segments([list(_pieces(log, dt, gap)) for log in logs], steps)
     parts, whole = assign_parts(runs, shares=shares, seed=seed)
     waits = np.concatenate([log.waits[log.joined] for log in logs])

@@ -145,23 +145,9 @@ class Log:
         return replace(self, stretch=self.stretch + cuts)
 
 
-class LogFiles(NamedTuple):
-    """What was read from files.
-
-    Attributes:
-        logs: of all runs, in an order that does not depend on the names of files.
-        errors: one line per file that could not be read.
-        conversions: of columns to SI units.
-    """
-
-    logs: list[Log]
-    errors: list[str]
-    conversions: list[str]
-
-
 def read_logs(
     path: str, columns: Columns, *, dt: float, needs_environment: bool
-) -> LogFiles:
+) -> tuple[list[Log], list[str], list[str]]:
     """Read all runs of a path.
 
     Args:
@@ -170,6 +156,10 @@ def read_logs(
         dt: the period of npz arrays x, u, e without a time [s].
         needs_environment: whether the environment must be in the files; otherwise one
             that is not becomes zeros.
+
+    Returns:
+        All runs, in an order that does not depend on the names of files; one line per
+        file that could not be read; conversions of columns to SI units.
 
     Raises:
         ValueError: no files, or invalid names of columns.
@@ -187,7 +177,7 @@ def read_logs(
             continue
         logs += read
         conversions += converted
-    return LogFiles(logs, sorted(errors), list(dict.fromkeys(conversions)))
+    return logs, sorted(errors), list(dict.fromkeys(conversions))
 
 
 def _check_columns(columns: Columns, needs_environment: bool) -> None:

@@ -41,19 +41,16 @@ def write_results_page(directory: Path) -> dict[str, Any]:
     with store.as_artefact_error(home), store.as_artefact_error(source, ValueError):
         results = store.read_json(source, keys=("rows",))
         images = runs.empty_folder(home / "figures")
-        sections = _results(results, directory, images)
-        captions = [
-            (f"{title_of(group, _TABLE)}. {tables.MARKS}", table)
-            for group in grouped(results["rows"], _TABLE)
-            if (table := tables.cross_table(group, tables.rmse_cell)) is not None
-        ]
+        sections, captions = _results(results, directory, images)
         store.write_bytes(home / "table1.tex", pages.to_latex(captions).encode())
         title = plain(dig(results, "config", "name") or "Comparison")
         return pages.write_page(title, sections, home)
 
 
-def _results(results: dict[str, Any], directory: Path, images: Path) -> list[Section]:
-    """Tables first, then figures, then every metric and what made the results."""
+def _results(
+    results: dict[str, Any], directory: Path, images: Path
+) -> tuple[list[Section], list[tuple[str, pd.DataFrame]]]:
+    """Tables, figures, every metric, what made them; then tables with captions."""
     rows: list[Row] = results["rows"]
     first: list[Part] = [tables.MARKS, tables.amount(rows)]
     if failed := results.get("failed"):
@@ -64,12 +61,14 @@ def _results(results: dict[str, Any], directory: Path, images: Path) -> list[Sec
     if paper:
         printed = {style.label(name): numbers for name, numbers in paper.items()}
         first.append(record_table("Printed in the paper", printed, *heads))
-    sections, metrics = [Section("", first)], []
+    sections, metrics, captions = [Section("", first)], [], []
     for number, group in enumerate(grouped(rows, _TABLE), 1):
         # One table over all vehicles and scenarios: a group shares all that is left.
         title = title_of(group, _TABLE)
-        table = tables.cross_table(group, tables.rmse_cell)
-        parts: list[Part] = [] if table is None else [table]
+        table, parts = tables.cross_table(group, tables.rmse_cell), list[Part]()
+        if table is not None:
+            parts.append(table)
+            captions.append((f"{title}. {tables.MARKS}", table))
         panels = grouped(group, ("vehicle", "scenario"))
         path = style.save(images / f"rmse_{number}.png", figures.rmse_chart, panels)
         parts.append(Picture(path, f"RMSE of every row: {title}"))
@@ -83,7 +82,7 @@ def _results(results: dict[str, Any], directory: Path, images: Path) -> list[Sec
         drawn = _drawn(group, directory, images, number)
         sections.append(Section(title_of(group, _FIGURE), drawn))
     made = runs.made_with(results.get("config") or {}, results.get("versions"))
-    return [*sections, *metrics, made]
+    return [*sections, *metrics, made], captions
 
 
 def _drawn(group: list[Row], directory: Path, images: Path, number: int) -> list[Part]:

@@ -171,7 +171,10 @@ class Film:
         """Every car on its copy of the road, seen from the first car after a step."""
         envs, whole = self.cars[0].envs, {"transform": axes.transAxes}
         friction, wind = (0.9, 0.0) if envs is None else envs[min(step, len(envs) - 1)]
-        _put(axes, Rectangle((0, 0), 1, 1, fc=_shade(friction), **whole))
+        # White for a dry road, blue grey for a slippery one.
+        slippery = float(np.clip((0.9 - friction) / 0.6, 0.0, 1.0))
+        shade = 1.0 - slippery * np.array([0.14, 0.10, 0.05])
+        _put(axes, Rectangle((0, 0), 1, 1, fc=tuple(shade), **whole))
         for number in range(len(self.cars)):
             self._draw_car(axes, path, near, step + 1, number)
         _put(axes, Rectangle((0, 0), 1, 1, fill=False, clip_on=False, **whole))
@@ -235,12 +238,6 @@ def _put(axes: Any, artist: Any) -> None:
 def _turn_by(yaw: float | np.floating) -> Float[np.ndarray, "2 2"]:
     """The rotation into a frame with this yaw."""
     return np.array([[np.cos(yaw), np.sin(yaw)], [-np.sin(yaw), np.cos(yaw)]])
-
-
-def _shade(friction: float) -> tuple[float, float, float]:
-    """Background colour: white for a dry road, blue grey for a slippery one."""
-    depth = float(np.clip((0.9 - friction) / 0.6, 0.0, 1.0))
-    return 1.0 - 0.14 * depth, 1.0 - 0.10 * depth, 1.0 - 0.05 * depth
 
 
 def _nearest(
