@@ -92,10 +92,8 @@ def hostile_network(random):
     inputs, hidden, outputs = (int(n) for n in random.integers(1, 4, 3))
     linear = random.choice([0, 1]) * random.integers(-3, 4, (outputs, inputs)) / 4 * 1.0
     layers = int(random.integers(0, 4))
-    widths = [inputs, *[hidden] * max(layers - 1, 0), outputs]
-    weights = [
-        random.integers(-3, 4, (b, a)) / 4 * 1.0 for a, b in itertools.pairwise(widths)
-    ][:layers]
+    widths = itertools.pairwise([inputs, *[hidden] * max(layers - 1, 0), outputs])
+    weights = [random.integers(-3, 4, (b, a)) / 4 * 1.0 for a, b in widths][:layers]
     scale = random.choice([1.0, 1.0, 1.0, 1e-7, 1e7, 1e-150, 1e150])
     multipliers = [
         random.choice([1e-7, 0.5, 0.51, 1.0, 2.5], len(part)) * scale
@@ -108,19 +106,14 @@ def hostile_network(random):
         metric = half.T @ half * random.choice([1.0, 1.0, 1e-12, 1e12, -1.0])
     if not random.integers(12) and multipliers:
         multipliers[0][0] = random.choice([np.nan, np.inf, 0.0, -1.0, 5e-324])
-    return (
-        weights,
-        multipliers,
-        bound,
-        linear if layers == 0 or random.integers(2) else None,
-        metric,
-    )
+    linear = linear if layers == 0 or random.integers(2) else None
+    return weights, multipliers, bound, linear, metric
 
 
 def exact_witness(weights, multipliers, bound, linear, metric):
     """The matrix that has to be positive definite, in fractions."""
     first = weights[0] if weights else linear
-    inputs, outputs = first.shape[1], (weights[-1] if weights else first).shape[0]
+    inputs, outputs = first.shape[1], len(weights[-1] if weights else first)
     norm_in = rational(np.eye(inputs) if metric is None else metric)
     norm_out = rational(np.eye(outputs) if metric is None else metric)
     edges = np.cumsum([0, inputs, *(len(part) for part in multipliers)])
@@ -151,11 +144,9 @@ def search(cases, seed):
     for number in range(cases):
         true = False
         if number % 2:
-            shown = weights, multipliers, bound, linear, metric = hostile_network(
-                random
-            )
-            accepted = check_witness(weights, multipliers, bound, linear, metric)
-            if all(np.all(np.isfinite(m)) and np.all(m > 0) for m in multipliers):
+            shown = hostile_network(random)
+            accepted = check_witness(*shown)
+            if all(np.all(np.isfinite(m)) and np.all(m > 0) for m in shown[1]):
                 true = all(map(is_definite, exact_witness(*shown)))
         else:
             shown = matrix, error = hostile_matrix(random)

@@ -66,21 +66,18 @@ def test_the_decoders_constants_bound_what_a_step_emits():
         fiber = model.fiber(params, env)
         latent = model.encode(fiber, jnp.asarray([0.0, 0.0, 0.0, 10.0]))._replace(z=z)
         after = model.step(fiber, latent, control)
-        return between(latent.pose, model.decode(fiber, after)[POSE]), model.decode(
-            fiber, latent
-        )[3:]
+        moved = between(latent.pose, model.decode(fiber, after)[POSE])
+        return moved, model.decode(fiber, latent)[3:]
 
-    both = [
-        jit(jax.vmap(emitted))(side.astype(np.float32), envs, controls) for side in z
-    ]
+    each = jit(jax.vmap(emitted))
+    both = [each(side.astype(np.float32), envs, controls) for side in z]
     motion, body = (
         np.asarray(a, np.float64) - np.asarray(b) for a, b in zip(*both, strict=True)
     )
     gap = np.linalg.norm(z[0] - z[1], axis=1)
     rounding = 3e-6 * (1 + np.linalg.norm(z, axis=2).max(axis=0))
-    assert np.all(
-        np.linalg.norm(motion[:, :2], axis=1) <= proved["position"] * gap + rounding
-    )
+    moved = np.linalg.norm(motion[:, :2], axis=1)
+    assert np.all(moved <= proved["position"] * gap + rounding)
     assert np.all(np.abs(motion[:, 2]) <= proved["yaw"] * gap + rounding)
     assert np.all(np.linalg.norm(body, axis=1) <= proved["body"] * gap + rounding)
 

@@ -132,14 +132,14 @@ def test_an_answer_slightly_off_or_of_any_scale_gets_the_constants_that_it_has(
     require_lyapunov(json.loads(json.dumps(found.document())), TURNED)
 
 
-def scaled(part, scale):
-    with np.errstate(over="ignore"):
-        metric = (scale * np.asarray(part["witness"]["metric"])).tolist()
-    return with_witness(part, metric=metric)
-
-
 def with_witness(part, **changes):
     return part | {"witness": part["witness"] | changes}
+
+
+@np.errstate(over="ignore")
+def scaled(part, scale):
+    metric = scale * np.asarray(part["witness"]["metric"])
+    return with_witness(part, metric=metric.tolist())
 
 
 FORGED = {
@@ -170,9 +170,7 @@ def test_a_forged_claim_is_refused(name, part):
         require_lyapunov(FORGED[name](part), TURNED)
 
 
-def test_a_claim_is_about_these_operators_and_about_latents_that_keep_their_metric(
-    part,
-):
+def test_a_claim_is_about_these_operators_and_latents_that_keep_their_metric(part):
     longer = np.array(TURNED.operators.vertices)
     longer[1] *= 1.001
     other = TURNED._replace(operators=TURNED.operators._replace(vertices=longer))
@@ -191,10 +189,8 @@ def test_a_claim_is_about_these_operators_and_about_latents_that_keep_their_metr
 
 def test_without_a_solver_the_reason_is_one_line(monkeypatch):
     monkeypatch.setitem(sys.modules, "cvxpy", None)
-    with pytest.raises(CertificationRefused) as reason:
+    with pytest.raises(CertificationRefused, match=r"^[^\n]*cvxpy[^\n]*$"):
         prove_lyapunov(TURNED)
-    assert "cvxpy" in str(reason.value)
-    assert "\n" not in str(reason.value)
 
 
 def test_a_residual_of_a_single_layer_and_none_have_claims_too():

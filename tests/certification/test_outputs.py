@@ -142,20 +142,14 @@ def trained():
 def runs(count=6, steps=40, seed=2):
     """Not of any plant: smooth random path states, controls and environments."""
     keys = jax.random.split(jax.random.key(seed), 3)
-    body = jnp.cumsum(
-        0.02 * jax.random.normal(keys[0], (count, steps + 1, 3)), axis=1
-    ) + jnp.asarray([0.0, 0.0, 9.0])
+    walk = 0.02 * jax.random.normal(keys[0], (count, steps + 1, 3))
+    body = jnp.cumsum(walk, axis=1) + jnp.asarray([0.0, 0.0, 9.0])
     states = jnp.concatenate([jnp.zeros((count, steps + 1, 3)), body], axis=-1)
-    controls = jax.random.uniform(
-        keys[1], (count, steps, 4), minval=-1.0
-    ) * jnp.asarray([0.03, 1.0, 0.02, 1.0])
+    spread = jnp.asarray([0.03, 1.0, 0.02, 1.0])
+    controls = spread * jax.random.uniform(keys[1], (count, steps, 4), minval=-1.0)
     controls = controls.at[..., 3].add(9.0)
-    envs = jax.random.uniform(
-        keys[2],
-        (count, steps, 2),
-        minval=jnp.asarray(ENV_LOW),
-        maxval=jnp.asarray(ENV_HIGH),
-    )
+    low, high = jnp.asarray(ENV_LOW), jnp.asarray(ENV_HIGH)
+    envs = low + (high - low) * jax.random.uniform(keys[2], (count, steps, 2))
     return Trajectory(states, controls, envs)
 
 
@@ -194,17 +188,12 @@ def test_no_pair_of_latents_contradicts_the_metric():
         ]
         return moved[1] - moved[0]
 
-    random = np.random.default_rng(3)
-    count, rank = 4000, len(factor)
-    z = random.standard_normal((count, rank)) * 10.0 ** random.uniform(
-        -2, 2, (count, 1)
-    )
-    direction = random.standard_normal((count, rank)) * 10.0 ** random.uniform(
-        -1, 1, (count, 1)
-    )
-    controls = np.asarray(runs().controls).reshape(-1, 4)[
-        random.integers(0, 240, count)
-    ]
+    random, count = np.random.default_rng(3), 4000
+    z, direction = random.standard_normal((2, count, len(factor)))
+    z *= 10.0 ** random.uniform(-2, 2, (count, 1))
+    direction *= 10.0 ** random.uniform(-1, 1, (count, 1))
+    drawn = random.integers(0, 240, count)
+    controls = np.asarray(runs().controls).reshape(-1, 4)[drawn]
     envs = random.uniform(ENV_LOW, ENV_HIGH, (count, 2))
     after = np.asarray(
         distance(*map(jnp.float32, (z, direction, controls, envs))), dtype=np.float64
@@ -227,9 +216,8 @@ def test_every_distance_to_a_nominal_model_lies_within_the_radius_of_its_run():
         distance = distance[..., 3 + index].max(axis=1)
         bounds = radii(measured(), name, proposed(name))
         assert np.all(distance <= bounds["vehicle_to_nominal"] * (1 + 1e-4))
-        assert np.all(
-            bounds["vehicle_to_nominal"] <= bounds["asymptotic"] * (1 + 1e-12)
-        )
+        further = bounds["asymptotic"] * (1 + 1e-12)
+        assert np.all(bounds["vehicle_to_nominal"] <= further)
         start = np.full((len(distance), OPTIONS["rank"]), 0.1)
         beside = radii(measured(), name, proposed(name), start)
         assert np.all(beside["vehicle_to_nominal"] >= bounds["vehicle_to_nominal"])

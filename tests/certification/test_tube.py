@@ -68,9 +68,8 @@ def test_with_bounded_disturbances_the_tube_is_violated_exactly_never(aligned, l
         return jax.lax.scan(step, (start, start), (fibers, later, controls, pushes))[1]
 
     keys = jax.random.split(jax.random.key(4), episodes)
-    errors = np.asarray(
-        jit(jax.vmap(episode, in_axes=(None, 0)))(params, keys), dtype=np.float64
-    )
+    errors = jit(jax.vmap(episode, in_axes=(None, 0)))(params, keys)
+    errors = np.asarray(errors, dtype=np.float64)
     tube = latent_tube(alpha, d_bar, steps)
     assert int(np.sum(errors > tube)) == 0
     if aligned and limit:
@@ -110,9 +109,8 @@ def test_free_running_predictions_stay_inside_the_physical_tube(name):
     data = driven(24)
     proved = certified(name)
     measured = dict(zip(KINDS, residuals(model, params, data).largest().T, strict=True))
-    predicted = np.asarray(
-        jit(jax.vmap(lambda one: rollout(model, params, one)[0]))(data)
-    )
+    each = jit(jax.vmap(lambda one: rollout(model, params, one)[0]))
+    predicted = np.asarray(each(data))
     true = np.asarray(data.states)[:, 1:]
     position = np.linalg.norm(predicted[..., :2] - true[..., :2], axis=-1)
     yaw = np.abs(wrap_angle(jnp.asarray(predicted[..., 2] - true[..., 2])))
@@ -126,9 +124,5 @@ def test_free_running_predictions_stay_inside_the_physical_tube(name):
             horizon=12,
             largest_increment=float(moves[k].max()),
         )["physical"]
-        for radii, error in zip(
-            (tube["position_m"], tube["yaw_rad"], tube["body"]),
-            (position, yaw, body),
-            strict=True,
-        ):
+        for radii, error in zip(tube.values(), (position, yaw, body), strict=True):
             assert np.all(error[k] <= np.asarray(radii) + 2e-5)
