@@ -89,9 +89,6 @@ def conformal_quantile(scores: Float[np.ndarray, " trajectory"], level: float) -
     """Return the ⌈(n+1) level⌉-th smallest of n scores.
 
     A new, exchangeable score exceeds it with probability at most 1 − level.
-
-    Raises:
-        ValueError: too few scores for the level, or scores that are not finite.
     """
     # An infinite score would be sorted last and silently dropped from the quantile.
     if not np.all(np.isfinite(scores)):

@@ -162,12 +162,8 @@ def propose_metric(
     Schur complement of the hidden layers gives α² as a largest eigenvalue, which is
     differentiable.
 
-    Args:
-        weights: explicit, float64.
-        rows: C, (output, rank).
-        gaps: d of the worst steps of every run, not of the calibration split.
-        start: the Lyapunov matrix of the operators; the search starts there if that
-            is better than I.
+    `rows` is C, `gaps` are d of the worst steps of every run, not of the calibration
+    split. The search starts at `start`, the Lyapunov matrix of the operators, or at I.
     """
     vertices, multipliers = weights.operators.vertices, weights.residual_multipliers
     rank, lower = vertices.shape[-1], np.tril_indices(vertices.shape[-1])

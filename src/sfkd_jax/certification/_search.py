@@ -153,11 +153,8 @@ def propose_multipliers(
     Schur complement C'S⁻¹C − K. With a top eigenvector v and the hidden values
     y = −S⁻¹Cv, its gradient is dλ_k ↦ −2 y_k ∘ (y_k − W_k y_{k−1}).
 
-    Args:
-        weights: W_1 … W_L.
-        start: initial λ; without it those that prove the product of norms.
-        linear: A of a joint bound.
-        iterations: for each exponent in `SHARPNESS`.
+    Without `start` the search begins at those that prove the product of norms;
+    `iterations` are for each exponent in `SHARPNESS`.
     """
     weights = [np.asarray(weight, dtype=np.float64) for weight in weights]
     if len(weights) < 2 or not all(np.all(np.isfinite(part)) for part in weights):

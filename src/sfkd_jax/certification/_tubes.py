@@ -199,9 +199,6 @@ def calibrate_corridor(
     The bounds in `JOINT` hold together with probability at least `level`, the others
     one by one. The lateral tube decides the joint score: heading and nominal corridor
     exceed their units a tenth as often. `reference` are the runs that fix the units.
-
-    Raises:
-        ValueError: too few runs for the level, or scores that are not finite.
     """
     together = len(JOINT)
     joint = conformal_bounds(reference[:, :together], scores[:, :together], level=level)
