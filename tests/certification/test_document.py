@@ -124,6 +124,15 @@ def test_what_does_not_go_together_is_refused(path, value):
         check(put(honest(), path, value))
 
 
+def test_a_sum_that_overflows_proves_no_width():
+    bounds = {"nominal": 1.5e308, "vehicle_to_nominal_position": 1.5e308}
+    document = honest("dynamic_path")
+    for name, bound in bounds.items():
+        document = put(document, f"corridor.bounds.{name}", bound)
+    with pytest.raises(CertificationRefused, match="corridor_m must be finite"):
+        check(document, "dynamic_path")
+
+
 # --- bound to everything that model and controller compute with -----------------------
 
 
