@@ -229,7 +229,8 @@ def read_certificate(
         return None, f"{CERTIFICATE} is missing"
     document = store.read_json(file, keys=("valid",))
     if document["valid"] is not True:
-        return None, f"the certificate was refused: {document.get('reason')}"
+        reason = store.one_line(document.get("reason"))
+        return None, f"the certificate was refused: {reason}"
     try:
         with store.as_artefact_error(file):
             bound = {"model": trained.model, "policy_sha256": trained.sha256}

@@ -209,6 +209,13 @@ def test_a_forged_certificate_is_an_error_that_names_the_file(copied):
     assert "certificate.json: " in refusal_of(lambda: policy.load(copied))
 
 
+def test_the_reason_of_a_refusal_is_told_in_one_printable_line(copied):
+    refused = {"valid": False, "reason": "no\nbound\x1b[31m"}
+    store.write_json(copied / "certificate.json", refused)
+    with pytest.warns(UserWarning, match=r"was refused: no bound\\x1b\[31m$"):
+        policy.load(copied)
+
+
 # --- weights --------------------------------------------------------------------------
 
 
