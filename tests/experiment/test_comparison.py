@@ -209,7 +209,7 @@ def test_compare_drives_every_row_names_those_that_fail_and_goes_on(tmp_path):
     small = ("training.steps=75", "training.save_every=75", "dataset.segments=200")
     asked = (
         "+experiment=smoke",
-        "evaluation.systems=[self]",
+        "+comparison.rows.two='evaluation.systems=[nominal,oracle]'",
         "+comparison.rows.wrong='training.step=3'",
         "+comparison.rows.unknown='certification.mode=boxes'",
         "name=table",
@@ -222,8 +222,9 @@ def test_compare_drives_every_row_names_those_that_fail_and_goes_on(tmp_path):
     assert set(rows) == {"oracle", "sfkd"}
     assert rows["oracle"]["difference_to_sfkd"]["mean"] < 0
     assert set(rows["sfkd"]["open_loop_rmse_m"]) == {"1", "5", "10", "20"}
-    assert len(document["failed"]) == first["failed"] == 2
+    assert len(document["failed"]) == first["failed"] == 3
     assert "row wrong: " in done.stderr
+    assert "row two: evaluation.systems must be one system" in done.stderr
     assert "certification.mode" in done.stderr
     stored = tmp_path / "runs/table/cells"
     before = {file: file.read_bytes() for file in stored.rglob("*.row.json")}

@@ -317,7 +317,13 @@ class Comparison:
             self._make_episodes(settings)
         # One check a row: its cells differ in scenario alone, and build the same.
         for cell, settings, _ in pending[:1]:
-            if "self" in settings.evaluation.systems:
+            systems = settings.evaluation.systems
+            if len(systems) != 1:
+                raise ValueError(
+                    f"row {cell.label}: evaluation.systems must be one system, "
+                    f"got {list(systems)}"
+                )
+            if "self" in systems:
                 stages.check_settings(self._of_policy(cell, settings))
 
     def _evaluate(self, group: list[Cell]) -> int:
