@@ -80,27 +80,17 @@ def path_space():
 def any_law(coordinates=3):
     """A law that follows a path slowly, the same in every environment."""
     corners = (2, 2, 2, 2)
-    gain = (
-        jnp.zeros((*corners, 2, coordinates))
-        .at[..., 0, 0]
-        .set(0.05)
-        .at[..., 0, 1]
-        .set(0.5)
-        .at[..., 1, 2]
-        .set(1.0)
-    )
-    control_table = (
-        jnp.zeros((*corners, 2))
-        .at[..., 0]
-        .add(jnp.asarray([-0.06, 0.06])[:, None, None, None])
-    )
-    ends = (jnp.asarray([-2.0, 8.0, 0.3, -8.0]), jnp.asarray([2.0, 10.5, 0.9, 8.0]))
+    gain = np.zeros((*corners, 2, coordinates), np.float32)
+    gain[..., 0, :2], gain[..., 1, 2] = (0.05, 0.5), 1.0
+    turn = np.zeros((*corners, 2), np.float32)
+    turn[0, ..., 0], turn[1, ..., 0] = -0.06, 0.06
     return control.PathLaw(
-        *ends,
-        jnp.asarray([0.03, 1.0]),
-        jnp.zeros((*corners, coordinates)),
-        control_table,
-        gain,
+        low=jnp.asarray([-2.0, 8.0, 0.3, -8.0]),
+        high=jnp.asarray([2.0, 10.5, 0.9, 8.0]),
+        perturbation=jnp.asarray([0.03, 1.0]),
+        state=jnp.zeros((*corners, coordinates)),
+        control=jnp.asarray(turn),
+        gain=jnp.asarray(gain),
     )
 
 
@@ -126,16 +116,10 @@ def _model(name):
     """Return one object per variant, so that it is compiled once."""
     if name not in OTHERS:
         return tiny(name)
-    factory = models.FACTORIES[name]
-    known = {"nominal": plants.kinematic().nominal_derivative}
-    return factory(
-        space(),
-        **{
-            key: known[key]
-            for key in known
-            if key in inspect.signature(factory).parameters
-        },
-    )
+    factory, known = models.FACTORIES[name], {}
+    if "nominal" in inspect.signature(factory).parameters:
+        known = {"nominal": plants.kinematic().nominal_derivative}
+    return factory(space(), **known)
 
 
 @cache

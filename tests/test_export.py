@@ -152,16 +152,10 @@ def in_process(loaded):
     return steps
 
 
-@pytest.mark.parametrize("platforms", [("cpu",), ("cpu", "cuda")])
-def test_a_process_without_this_package_repeats_every_bit(
-    loaded, folder, in_process, platforms
-):
-    """With several platforms a product of matrices is a choice, and XLA may round
-    otherwise what is only reported.
+def test_a_process_without_this_package_repeats_every_bit(folder, in_process):
+    """Of controls and states: with several platforms a product of matrices is a choice,
+    and XLA may round otherwise what is only reported.
     """
-    exact = "" if platforms == ("cpu",) else ("control", "state.")
-    if platforms == ("cpu",):
-        exporting.write_controller(loaded, folder, platforms=platforms)
     manifest = json.loads((folder / "controller.json").read_text())
     names = ("observations", "envs", "reference")
     arrays = dict(zip(names, measurements(), strict=True))
@@ -200,7 +194,7 @@ def test_a_process_without_this_package_repeats_every_bit(
             for i, (name, ours) in enumerate(zip(names, leaves, strict=True)):
                 theirs = result[f"{k}/{i}"]
                 same = ours.tobytes() == theirs.tobytes()
-                assert same or not name.startswith(exact), (k, name)
+                assert same or name.startswith("info."), (k, name)
                 np.testing.assert_allclose(ours, theirs, rtol=1e-5, atol=1e-5)
             healthy.append(bool(result[f"{k}/{names.index('info.healthy')}"]))
     assert healthy == [True, True, True, False, True, True]
@@ -212,26 +206,22 @@ def test_the_manifest_lists_the_inputs_of_programs_and_what_they_were_made_from(
     requested, printed = exported
     manifest = json.loads(Path(printed["manifest"]).read_text())
     run_dir = Path(printed["blob"]).parent
-    assert set(printed) == {"blob", "manifest", "policy"}
     for program in manifest["programs"].values():
         content = (run_dir / program["file"]).read_bytes()
         assert program["sha256"] == hashlib.sha256(content).hexdigest()
         read = jax.export.deserialize(bytearray(content))
         assert read.platforms == ("cpu", "cuda") == tuple(manifest["platforms"])
-        assert read.calling_convention_version == manifest["calling_convention_version"]
     act = manifest["programs"]["act"]
     measured = ["observation", "env", "reference"]
     assert [leaf["name"] for leaf in act["inputs"][-3:]] == measured
     assert act["outputs"][0]["name"] == "control"
     states = [leaf for leaf in act["outputs"] if leaf["name"].startswith("state.")]
     assert states == act["inputs"][:-3] == manifest["programs"]["init"]["outputs"]
-    assert {"name": "state.key", "shape": [2], "dtype": "uint32"} in states
     weights = policy.restore(requested.run_dir).weights_sha256
     assert manifest["weights_sha256"] == weights
     certificate = hashlib.sha256((run_dir / "certificate.json").read_bytes())
     assert manifest["certificate_sha256"] == certificate.hexdigest()
-    parts = (manifest["sampling_period_s"], manifest["horizon"], manifest["iree"])
-    assert parts == (0.1, HORIZON, None)
+    assert (manifest["sampling_period_s"], manifest["horizon"]) == (0.1, HORIZON)
     highest = tuple(control["high"] for control in manifest["controls"])
     assert highest == build.build_vehicle(requested.vehicle).control_high
     assert manifest["environment"]["low"] == list(ENV_LOW)
@@ -348,11 +338,6 @@ def test_the_script_steps_a_controller_by_itself(exported):
     )
     assert done.returncode == 0, done.stderr
     assert len(json.loads(done.stdout)["controls"]) == 2
-    done = subprocess.run(
-        [sys.executable, script, script.parent.parent], capture_output=True, text=True
-    )
-    assert done.returncode == 1
-    assert done.stderr.strip().endswith("controller.json: No such file or directory")
 
 
 def test_a_run_without_a_policy_is_sent_to_train(tmp_path):

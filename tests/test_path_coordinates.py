@@ -2,16 +2,21 @@
 the world.
 """
 
+import itertools
+
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from helpers import jit
 
 from sfkd_jax import plants
 from sfkd_jax.geometry import circle_errors, closed_loop, compose, is_valid, path_state
 from sfkd_jax.scenarios import path_from_curvature, project
 from sfkd_jax.types import BODY
 
+CIRCLE_ERRORS = jit(circle_errors)
+SLOPES = jit(lambda *at: jax.tree.leaves(jax.jacfwd(circle_errors, (0, 1))(*at)))
 CURVATURES = (-0.08, -1e-6, 0.0, 1e-6, 0.02, 0.1)
 
 
@@ -23,22 +28,17 @@ def foot(curvature: float, progress: float) -> jax.Array:
 
 
 @pytest.mark.parametrize("curvature", CURVATURES)
-@pytest.mark.parametrize("progress", [-2.0, 0.0, 1.3])
-def test_a_pose_beside_a_circle_has_its_own_coordinates(curvature, progress):
-    for lateral, heading in ((0.0, 0.0), (0.7, -0.2), (-1.5, 0.4)):
-        pose = compose(foot(curvature, progress), jnp.asarray([0.0, lateral, heading]))
-        np.testing.assert_allclose(
-            circle_errors(pose, jnp.asarray(curvature)), (lateral, heading), atol=2e-5
-        )
-
-
-@pytest.mark.parametrize("curvature", CURVATURES)
-def test_derivatives_exist_also_without_curvature_and_beyond_the_centre(curvature):
+def test_a_pose_beside_a_circle_has_its_own_coordinates_and_finite_derivatives(
+    curvature,
+):
+    """Also without curvature, and far beyond the centre."""
+    bend, beside = jnp.asarray(curvature), [(0.0, 0.0), (0.7, -0.2), (-1.5, 0.4)]
+    for progress, errors in itertools.product((-2.0, 0.0, 1.3), beside):
+        pose = compose(foot(curvature, progress), jnp.asarray([0.0, *errors]))
+        np.testing.assert_allclose(CIRCLE_ERRORS(pose, bend), errors, atol=2e-5)
     for y in (0.0, 0.3, 1e3, -1e3):
-        rates = jax.jacfwd(circle_errors, argnums=(0, 1))(
-            jnp.asarray([1.0, y, 0.1]), jnp.asarray(curvature)
-        )
-        assert all(bool(jnp.all(jnp.isfinite(leaf))) for leaf in jax.tree.leaves(rates))
+        rates = SLOPES(jnp.asarray([1.0, y, 0.1]), bend)
+        assert all(bool(jnp.all(jnp.isfinite(leaf))) for leaf in rates)
 
 
 def test_a_car_near_the_centre_of_curvature_is_invalid_but_finite():

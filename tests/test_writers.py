@@ -1,7 +1,6 @@
 """Several processes write into one directory: locks, and no lost rows or episodes."""
 
 import re
-import signal
 import subprocess
 import sys
 import textwrap
@@ -90,16 +89,8 @@ def test_a_locked_directory_is_refused_at_once_and_the_message_names_the_process
     )
 
 
-def test_kill_9_frees_a_directory(tmp_path):
-    holder = started(HOLD, tmp_path, 60)
-    holder.send_signal(signal.SIGKILL)
-    holder.wait()
-    with locked(tmp_path):
-        assert f"process {holder.pid} " not in (tmp_path / store.HOLDER).read_text()
-
-
 def test_a_waiting_process_prints_a_message_and_gets_the_lock(tmp_path, capfd):
-    holder = started(HOLD, tmp_path, 3.5)
+    holder = started(HOLD, tmp_path, 3.0)
     with locked(tmp_path, wait=True):
         assert holder.wait(10) == 0
     (line,) = capfd.readouterr().err.splitlines()
@@ -130,7 +121,7 @@ WRITER = """
     run_dir, me = Path(sys.argv[1]), int(sys.argv[2])
     print("ready", flush=True)
     begins = float(sys.stdin.readline())
-    for number in range(10):
+    for number in range(5):
         time.sleep(max(0.0, begins + 0.3 * number + 0.02 * me - time.time()))
         keep(run_dir, ROW | {"system": f"writer{me}", "scenario": f"road{number}"}, 10 * me + number)
 """
@@ -144,9 +135,9 @@ def test_two_processes_20_ms_after_each_other_lose_no_row_and_no_episode(tmp_pat
         assert writer.returncode == 0
     rows, arrays = stored(tmp_path)
     assert {(row["system"], row["scenario"]) for row in rows} == {
-        (f"writer{me}", f"road{number}") for me in (0, 1) for number in range(10)
+        (f"writer{me}", f"road{number}") for me in (0, 1) for number in range(5)
     }
-    assert len(rows) == 20
+    assert len(rows) == 10
     for row in rows:
         value = 10 * int(row["system"][-1]) + int(row["scenario"][4:])
         assert np.all(arrays[f"{evaluation.episode_name(row)}/lateral"] == value)

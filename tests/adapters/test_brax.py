@@ -121,22 +121,6 @@ def test_the_observation_has_the_documented_order():
     np.testing.assert_allclose(reference[:, 3], road.speed)
 
 
-def test_the_observation_does_not_depend_on_where_the_road_lies():
-    start, after = driven(gentle())
-    move = partial(geometry.compose, jnp.asarray([30.0, -20.0, 2.0]))
-
-    @jit
-    def both(road, moment):
-        points, state = road.path.points, moment.state
-        moved = points.at[:, :3].set(jax.vmap(move)(points[:, :3]))
-        elsewhere = road._replace(path=road.path._replace(points=moved))
-        there = moment._replace(state=state.at[:3].set(move(state[:3])))
-        return env().task.observe(elsewhere, there), env().task.observe(road, moment)
-
-    there, here = both(start.info["road"], at(after, -1).pipeline_state)
-    np.testing.assert_allclose(there, here, atol=1e-4)
-
-
 def test_the_reward_is_minus_the_cost_of_lateral_speed_and_steering_rate_as_the_planner_weighs_them():
     start, after = driven(gentle())
     moments = jax.tree.map(np.asarray, after.pipeline_state)

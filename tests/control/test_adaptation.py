@@ -56,26 +56,6 @@ def road(time, speed=10.0):
     return jnp.stack([ahead, zero, zero, zero + speed], axis=1)
 
 
-def spotless(time, seen, last):
-    return seen
-
-
-def jump(time, seen, last):
-    return seen.at[1].add(jnp.where(time == 60, 5.0, 0.0))
-
-
-def freeze(time, seen, last):
-    return jnp.where((time >= 60) & (time < 64), last, seen)
-
-
-def lose(time, seen, last):
-    return jnp.where((time >= 60) & (time < 64), jnp.nan, seen)
-
-
-def overflow(time, seen, last):
-    return jnp.where(time == 60, 1e30, seen)
-
-
 def hostile(time, seen, last):
     """Every few steps a value that no sensor should give."""
     values = jnp.asarray([jnp.nan, jnp.inf, -1e30, 1e-40, 1e6, 0.0, 3e38, 1e3])
@@ -84,7 +64,18 @@ def hostile(time, seen, last):
     return seen.at[entry].set(jnp.where(time % 5 == 3, value, seen[entry]))
 
 
-FAULTS = (spotless, jump, freeze, lose, overflow, hostile)
+def during(time, steps, value, seen):
+    return jnp.where((time >= 60) & (time < 60 + steps), value, seen)
+
+
+FAULTS = {
+    "none": lambda time, seen, last: seen,
+    "jump": lambda time, seen, last: during(time, 1, seen.at[1].add(5.0), seen),
+    "freeze": lambda time, seen, last: during(time, 4, last, seen),
+    "lose": lambda time, seen, last: during(time, 4, jnp.nan, seen),
+    "overflow": lambda time, seen, last: during(time, 1, 1e30, seen),
+    "hostile": hostile,
+}
 """(step, observation, last observation) -> observation."""
 
 
@@ -104,7 +95,7 @@ def driver(**settings):
             # The car is put back onto the abscissa of the reference.
             state = state.at[0].set(time)
             seen = state.at[1:4].add(noise * NOISE * jax.random.normal(key, (3,)))
-            seen = jax.lax.switch(fault, FAULTS, time, seen, last)
+            seen = jax.lax.switch(fault, list(FAULTS.values()), time, seen, last)
             action, memory, info = controller.act({}, memory, seen, env, road(time))
             state = PLANT.step(state, action.at[0].add(steering), pushed)
             return (state, memory, seen), (info, memory.inner.belief)
@@ -117,10 +108,10 @@ def driver(**settings):
     return run
 
 
-def drive(seed=0, force=0.0, steering=0.0, noise=0.0, fault=spotless, **settings):
+def drive(seed=0, force=0.0, steering=0.0, noise=0.0, fault="none", **settings):
     run = driver(**settings)
     return jax.tree.map(
-        np.asarray, run(seed, force, steering, noise, FAULTS.index(fault))
+        np.asarray, run(seed, force, steering, noise, list(FAULTS).index(fault))
     )
 
 
@@ -234,7 +225,7 @@ def test_wind_is_estimated_if_it_is_not_measured():
     np.testing.assert_allclose(wind, np.sqrt(0.5) * ENV_HIGH[1], atol=0.8)
 
 
-@pytest.mark.parametrize("fault", [jump, freeze, lose, overflow])
+@pytest.mark.parametrize("fault", ["jump", "freeze", "lose", "overflow"])
 def test_a_sensor_fault_is_not_learned_as_a_cause(fault):
     """At the fault the causes move by less than a tenth of what was learned."""
     settings = {"force": 0.5, "steering": 0.01, "noise": 1.0, "shrinkage": 0.0}
@@ -247,7 +238,7 @@ def test_a_sensor_fault_is_not_learned_as_a_cause(fault):
 
 
 def test_hostile_measurements_leave_finite_bounded_estimates():
-    info, belief = drive(fault=hostile, force=0.5, noise=1.0)
+    info, belief = drive(fault="hostile", force=0.5, noise=1.0)
     assert all(np.isfinite(leaf).all() for leaf in jax.tree.leaves(belief.bank))
     assert np.all(np.abs(info["causes"]) <= estimator.BOUNDS)
     diagonals = np.diagonal(belief.bank.covariances, axis1=-2, axis2=-1)
@@ -302,16 +293,6 @@ def test_a_force_beyond_the_box_is_balanced_without_a_lateral_error():
 
     unbalanced = abs(float(settle(jnp.zeros(4))))
     assert abs(float(settle(offset.inputs))) < 0.1 * unbalanced
-
-
-def test_the_belief_can_be_saved_and_resumed():
-    _, belief = drive(force=0.5)
-    last = jax.tree.map(lambda leaf: jnp.asarray(leaf[-1]), belief)
-    fresh, act = acting()
-    fresh = fresh._replace(inner=fresh.inner._replace(belief=last))
-    seen = jnp.concatenate([jnp.asarray([120.0]), last.bank.mean()[:3]])
-    _, _, info = act({}, fresh, seen, INPUTS[1], road(120.0))
-    np.testing.assert_allclose(info["causes"][0], 0.5, atol=0.15)
 
 
 @pytest.mark.parametrize(

@@ -1,7 +1,6 @@
 """Planning in path coordinates: projection, curvature preview, and limits of ν."""
 
 from functools import cache, partial
-from pathlib import Path
 
 import jax
 import jax.numpy as jnp
@@ -9,14 +8,11 @@ import numpy as np
 import pytest
 from helpers import any_law, tiny
 
-import sfkd_jax
 from sfkd_jax import build, control, plants
-from sfkd_jax.control.tasks import _along_path
 from sfkd_jax.geometry import compose, curvature_ahead, path_coordinates
 from sfkd_jax.scenarios import path_from_curvature, reference_window
 
 PLANT = plants.kinematic()
-SHIPPED = Path(sfkd_jax.__file__).parent / "pretrained"
 LAW = any_law()
 ENV = jnp.asarray([0.6, 2.0])
 LIMITS = {
@@ -109,20 +105,3 @@ def test_a_model_of_the_world_is_refused():
     )
     with pytest.raises(ValueError, match=r"model\.frame=path"):
         make(tiny())
-
-
-@pytest.mark.exhaustive
-def test_a_step_of_the_adaptive_policy_projects_once_and_never_back(monkeypatch):
-    """Planner, shield, estimator and tube work on the same ξ."""
-    calls = []
-    record = lambda *given: calls.append(given) or path_coordinates(*given)
-    monkeypatch.setattr(_along_path, "path_coordinates", record)
-    policy = sfkd_jax.load(SHIPPED / "kinematic_path", adaptive=True)
-    observation, reference = jnp.asarray([29.1, 0.1, 0.0, 9.0]), bend()[0]
-    state = policy.controller.init(jax.random.key(0))
-    inputs = policy.params, state, observation, ENV, reference
-    jax.eval_shape(policy.controller.act, *inputs)
-    assert len(calls) == 1
-    sources = Path(control.__file__).parent.rglob("*.py")
-    naming = [path.name for path in sources if "path_coordinates(" in path.read_text()]
-    assert naming == ["_along_path.py"]

@@ -5,7 +5,6 @@ from functools import cache, partial
 import jax
 import jax.numpy as jnp
 import numpy as np
-import pytest
 from helpers import ENV_HIGH, ENV_LOW, jit, model_and_params, straight
 
 from sfkd_jax import control, evaluation, models, plants, scenarios
@@ -58,12 +57,6 @@ def finite(tree):
     )
 
 
-def with_entry(values, entry, value):
-    changed = np.array(values)
-    changed[entry] = value
-    return changed
-
-
 def test_as_the_temperature_falls_the_plan_becomes_the_best_samples():
     """Every sample is rolled out again by hand; the planner must have chosen the
     cheapest.
@@ -100,10 +93,7 @@ def test_as_the_temperature_falls_the_plan_becomes_the_best_samples():
     np.testing.assert_allclose(state.previous, plans[0, best], atol=1e-6)
 
 
-@pytest.mark.parametrize(
-    ("std", "law"), [(1e3, FEEDBACK), (1e30, control.no_feedback())]
-)
-def test_controls_stay_inside_their_bounds_however_large_the_noise(std, law):
+def test_controls_stay_inside_their_bounds_however_large_the_noise():
     """The stored perturbations are those after clipping: at most as large as the
     actuator box.
     """
@@ -111,7 +101,7 @@ def test_controls_stay_inside_their_bounds_however_large_the_noise(std, law):
     state = None
     for _ in range(3):
         action, state, info = act_once(
-            noise_std=(std, std), law=law, temperature=1e9, state=state
+            noise_std=(1e30, 1e30), temperature=1e9, state=state
         )
         assert np.all((low <= action) & (action <= high))
         assert np.all((low <= state.controls) & (state.controls <= high))
@@ -120,85 +110,18 @@ def test_controls_stay_inside_their_bounds_however_large_the_noise(std, law):
         assert bool(info["healthy"])
 
 
-@pytest.mark.parametrize(("entry", "value"), [(0, np.nan), (3, np.inf)])
-def test_a_broken_observation_continues_the_last_clean_plan_and_the_next_clean_step_recovers(
-    entry, value
-):
-    _, clean, _ = act_once()
-    action, held, info = act_once(
-        state=clean, observation=with_entry(OFFSET, entry, value)
-    )
-    assert not bool(info["healthy"])
-    np.testing.assert_array_equal(action, clean.controls[0])
-    np.testing.assert_array_equal(held.plan[:-1], clean.plan[1:])
-    np.testing.assert_array_equal(held.controls[:-1], clean.controls[1:])
-    assert finite(held)
-    action, recovered, info = act_once(state=held)
-    assert bool(info["healthy"])
-    assert finite(recovered)
-    assert np.all(np.isfinite(action))
-
-
-@pytest.mark.parametrize("broken", ["observation", "env", "reference"])
-def test_what_is_not_finite_is_noticed_even_where_the_model_does_not_look(broken):
-    """The nominal bicycle does not read e, and only the cost reads the last entry of
-    the reference.
-    """
-    inputs = {"observation": OFFSET, "env": ENV, "reference": REFERENCE}
-    inputs[broken] = with_entry(inputs[broken], -1, np.nan)
-    controller, params, act = compiled("nominal")
-    action, state, info = act(
-        params, controller.init(jax.random.key(0)), *inputs.values()
-    )
-    assert not bool(info["healthy"])
-    assert np.all(np.isfinite(action))
-    assert finite(state)
-
-
-@pytest.mark.parametrize("law", [control.ModelLaw()])
-def test_a_reading_far_off_leaves_no_more_in_the_plan_than_the_actuators_can_do(law):
+def test_a_reading_far_off_leaves_no_more_in_the_plan_than_the_actuators_can_do():
     """The law requests thousands of radians; a perturbation that compensates for them
     would persist.
     """
-    controller, params, act = compiled(law=law)
+    controller, params, act = compiled(law=control.ModelLaw())
     span = np.subtract(PLANT.control_high, PLANT.control_low)
     for entry, value in ((0, 1e5), (1, -1e5), (3, 1e6)):
-        state = controller.init(jax.random.key(0))
-        _, state, info = act(
-            params, state, with_entry(OFFSET, entry, value), ENV, REFERENCE
-        )
+        state, seen = controller.init(jax.random.key(0)), OFFSET.copy()
+        seen[entry] = value
+        _, state, info = act(params, state, seen, ENV, REFERENCE)
         assert bool(info["healthy"])
         assert np.all(np.abs(state.plan) <= span * (1 + 1e-6))
-
-
-def breaks_where(condition):
-    """The plant, returning NaN wherever a condition on the control holds."""
-
-    def step(state, action, env):
-        return jnp.where(condition(action), jnp.nan, PLANT.step(state, action, env))
-
-    return models.physics(step)
-
-
-@pytest.mark.parametrize("law", [FEEDBACK, control.no_feedback()])
-def test_a_model_that_breaks_for_half_of_the_samples_still_gives_a_finite_plan(law):
-    """Noise with correlation 1 keeps its sign: half of the samples steer left and
-    become NaN.
-    """
-    on_path = jnp.asarray([0.0, 0.0, 0.0, 10.0])
-    model = breaks_where(lambda action: action[0] > 0)
-    settings = {"law": law, "noise_correlation": 1.0, "temperature": 1e9}
-    controller = planner(model, **settings)
-    action, state, info = jit(controller.act)(
-        {}, controller.init(jax.random.key(0)), on_path, ENV, REFERENCE
-    )
-    assert bool(info["healthy"])
-    assert (
-        20 < float(info["effective_samples"]) < 44
-    )  # of 64: equal weights on the rest
-    assert finite(state)
-    assert float(action[0]) < 0
-    assert np.all(np.isfinite(info["predicted_states"]))
 
 
 def test_an_environment_outside_the_box_is_clamped_and_flagged():
@@ -211,11 +134,10 @@ def test_an_environment_outside_the_box_is_clamped_and_flagged():
     assert not np.array_equal(act_once()[1].controls, clamped[1].controls)
 
 
-@pytest.mark.parametrize("law", ["feedback", "plain"])
-def test_a_nominal_model_of_a_nominal_plant_converges_to_the_path(law):
-    model = models.physics(PLANT.nominal)
+def test_a_nominal_model_of_a_nominal_plant_converges_to_the_path():
+    """Without the law; around it the plan of zeros already does."""
     plain = {"law": control.no_feedback(), "noise_std": (0.06, 0.6)}
-    controller = planner(model, num_samples=128, **({} if law == "feedback" else plain))
+    controller = planner(models.physics(PLANT.nominal), num_samples=128, **plain)
     road = scenarios.Scenario(
         jnp.asarray(OFFSET),
         *[jnp.tile(jnp.asarray([[0.9, 0.0]]), (60, 1))] * 2,
@@ -228,7 +150,7 @@ def test_a_nominal_model_of_a_nominal_plant_converges_to_the_path(law):
     episode = jit(drive)(road, jax.random.key(0))
     lateral = np.abs(np.asarray(episode.lateral))
     assert lateral[0] > 0.2
-    assert np.all(lateral[-20:] < (0.03 if law == "feedback" else 0.05))
+    assert np.all(lateral[-20:] < 0.05)
     assert np.all(lateral < 0.32)
     assert np.all(np.abs(np.asarray(episode.states)[-20:, 3] - 10.0) < 0.3)
     assert np.all(episode.signals["healthy"])

@@ -165,18 +165,13 @@ ENVS = jnp.stack([jnp.linspace(0.9, 0.3, 300), jnp.linspace(-8.0, 8.0, 300)], ax
 OBSERVE = partial(evaluation.observed_environment, ENVS, dt=DT)
 
 
-def test_a_perfect_sensor_observes_the_truth_to_the_last_bit(key):
+def test_a_perfect_sensor_tells_the_truth_and_another_delays_or_biases_it(key):
+    """To the last bit; a delay repeats the first value; friction stays positive."""
     np.testing.assert_array_equal(OBSERVE(key), ENVS)
-
-
-@pytest.mark.parametrize("steps", [1, 40])
-def test_a_delay_shifts_the_truth_and_repeats_its_first_value(key, steps):
-    observed = OBSERVE(key, delay_s=0.1 * steps)
-    np.testing.assert_array_equal(observed[steps:], ENVS[:-steps])
-    np.testing.assert_array_equal(observed[:steps], jnp.tile(ENVS[:1], (steps, 1)))
-
-
-def test_a_bias_is_added_and_friction_stays_positive(key):
+    for steps in (1, 40):
+        observed = OBSERVE(key, delay_s=0.1 * steps)
+        expected = jnp.concatenate([jnp.tile(ENVS[:1], (steps, 1)), ENVS[:-steps]])
+        np.testing.assert_array_equal(observed, expected)
     biased = OBSERVE(key, bias=(0.1, -2.0))
     np.testing.assert_allclose(biased, ENVS + jnp.asarray([0.1, -2.0]), rtol=1e-6)
     assert float(OBSERVE(key, bias=(-0.9, 0.0))[:, 0].min()) == pytest.approx(0.05)

@@ -174,21 +174,3 @@ def test_a_shown_metric_has_a_table_and_writes_what_is_no_number_as_a_dash(metri
     for value in (None, math.nan, math.inf, "text", [], [None, 1.0], {}):
         record = {rest[0]: value} if rest else value
         assert metric.text({key: record}) == DASH
-
-
-@pytest.mark.parametrize(
-    ("name", "record", "text"),
-    [
-        ("rmse_m", {"rmse_m": {"mean": 0.1234, "std": 0.01}}, "123.4 ± 10.0"),
-        ("rmse_m.ci95", {"rmse_m": {"ci95": [0.1, 0.25]}}, "100.0 to 250.0"),
-        ("max_deviation_m", {"max_deviation_m": 0.4321}, "432"),
-        ("max_deviation_m", {"max_deviation_m": 1e308}, DASH),
-        ("departures", {"departures": 3}, "3"),
-        ("unhealthy_steps", {"unhealthy_steps": 0.0001}, "< 0.1"),
-        ("ess", {"ess": 41.7}, "42"),
-        ("alpha", {"alpha": 0.93207}, "0.9321"),
-        ("act_ms.p50", {"act_ms": {"p50": 3.214}}, "3.21"),
-    ],
-)
-def test_a_metric_is_written_in_its_unit_with_its_digits(name, record, text):
-    assert BY_NAME[name].text(record) == text

@@ -83,21 +83,15 @@ def test_beyond_the_range_of_float32_squares_the_bounds_stay_sound(scale):
     assert np.all(spectral(BOUNDED(matrices)) <= 0.9)
 
 
-@pytest.mark.parametrize("scale", [0.0, 1e-20, 1e-6, 1.0, 3.0, 1e6])
-def test_gradients_are_finite_where_singular_values_coincide(scale):
-    corners = np.stack(
-        [
-            np.eye(6),
-            np.outer(np.eye(6)[0], np.eye(6)[1]),
-            np.ones((6, 6)),
-            np.eye(6)[::-1],
-        ]
-    )
-    for function in (gram_bound, lambda matrix: jnp.sum(bounded(matrix, 0.9) ** 2)):
-        gradients = jit(jax.vmap(jax.grad(function)))(
-            (scale * corners).astype(np.float32)
-        )
-        assert np.all(np.isfinite(gradients))
+@pytest.mark.parametrize(
+    "function", [gram_bound, lambda matrix: jnp.sum(bounded(matrix, 0.9) ** 2)]
+)
+def test_gradients_are_finite_where_singular_values_coincide(function):
+    eye = np.eye(6)
+    corners = np.stack([eye, np.outer(eye[0], eye[1]), np.ones((6, 6)), eye[::-1]])
+    gradient = jit(jax.vmap(jax.grad(function)))
+    for scale in (0.0, 1e-20, 1e-6, 1.0, 3.0, 1e6):
+        assert np.all(np.isfinite(gradient((scale * corners).astype(np.float32))))
 
 
 def environments(count=200):
@@ -109,24 +103,27 @@ def environments(count=200):
     ).astype(np.float32)
 
 
-@pytest.mark.parametrize("scale", [1.0, 100.0])
 @pytest.mark.parametrize("name", ["sfkd", "no_residual", "segment"])
-def test_the_operator_is_bounded_for_every_environment_and_every_weight(name, scale):
-    model, params = model_and_params(name, scale)
-    operators = jit(jax.vmap(lambda env: model.fiber(fold(model, params), env).A))(
-        environments()
-    )
-    assert np.all(spectral(operators) <= RHO)
-    assert np.all(
-        spectral(explicit(name, scale).operators.vertices) > 0.97 * RHO
-    )  # and the bound is used, not wasted
+def test_the_operator_is_bounded_for_every_environment_and_every_weight(name):
+    model, _ = model_and_params(name)
+
+    @jit
+    def operators(params):
+        folded = fold(model, params)
+        return jax.vmap(lambda env: model.fiber(folded, env).A)(environments())
+
+    for scale in (1.0, 100.0):
+        params = model_and_params(name, scale)[1]
+        assert np.all(spectral(operators(params)) <= RHO)
+        # And the bound is used, not wasted.
+        vertices = explicit(name, scale).operators.vertices
+        assert np.all(spectral(vertices) > 0.97 * RHO)
 
 
-@pytest.mark.parametrize("scale", [1.0, 30.0])
-def test_the_step_keeps_its_factor_under_attack(scale):
+def test_the_step_keeps_its_factor_under_attack():
     """Gradient ascent over z, u, e and e' on the slope of the running model."""
     attacked = attack_model(
-        *model_and_params("sfkd", scale), (ENV_LOW, ENV_HIGH), starts=2
+        *model_and_params("sfkd", 30.0), (ENV_LOW, ENV_HIGH), starts=2
     )
     assert attacked["step"] <= (RHO + BETA) * (1 + MARGIN)
     assert attacked["transport"] <= 1 + MARGIN
@@ -145,22 +142,17 @@ def test_no_pattern_of_slopes_breaks_the_residual_and_its_multipliers_prove_it(
         assert lower > 0.5 * BETA  # the budget can be used
 
 
-@pytest.mark.parametrize("scale", [0.1, 5.0])
 @pytest.mark.parametrize(("out", "inputs"), [(4, 9), (9, 4), (1, 3)])
-def test_the_rows_of_a_cayley_block_are_orthonormal(out, inputs, scale):
-    random = np.random.default_rng(0)
-    square = scale / np.sqrt(out) * random.standard_normal((20, out, out))
-    tall = scale / np.sqrt(inputs) * random.standard_normal((20, inputs, out))
-    A, B = (
-        np.asarray(part, np.float64)
-        for part in jit(jax.vmap(cayley))(
-            square.astype(np.float32), tall.astype(np.float32)
-        )
-    )
-    gram = A @ A.swapaxes(1, 2) + B @ B.swapaxes(1, 2)
-    np.testing.assert_allclose(
-        gram, np.broadcast_to(np.eye(out), gram.shape), atol=MARGIN
-    )
+def test_the_rows_of_a_cayley_block_are_orthonormal(out, inputs):
+    random, block = np.random.default_rng(0), jit(jax.vmap(cayley))
+    for scale in (0.1, 5.0):
+        square = scale / np.sqrt(out) * random.standard_normal((20, out, out))
+        tall = scale / np.sqrt(inputs) * random.standard_normal((20, inputs, out))
+        made = block(square.astype(np.float32), tall.astype(np.float32))
+        A, B = (np.asarray(part, np.float64) for part in made)
+        gram = A @ A.swapaxes(1, 2) + B @ B.swapaxes(1, 2)
+        expected = np.broadcast_to(np.eye(out), gram.shape)
+        np.testing.assert_allclose(gram, expected, atol=MARGIN)
 
 
 def test_the_sandwich_bound_survives_ill_conditioned_weights():
@@ -278,7 +270,7 @@ def test_where_the_residual_takes_a_direction_the_operator_has_none_of_it_and_ke
     )
 
 
-@pytest.mark.parametrize("scale", [0.3, 1.0, 3.0, 10.0])
+@pytest.mark.parametrize("scale", [1.0, 10.0])
 def test_the_certificate_proves_the_budget_from_the_networks_own_multipliers(scale):
     proved = certified("joint", scale)
     assert proved.alpha <= 0.995 * (1 + 2e-6)
@@ -290,44 +282,38 @@ ENVS = RANDOM.uniform(ENV_LOW, ENV_HIGH, (60, 3, 2)).astype(np.float32)
 LATENTS = (5.0 * RANDOM.standard_normal((60, 8))).astype(np.float32)
 
 
-def transported(name, scale=1.0):
+@pytest.mark.parametrize("name", ["sfkd", "segment"])
+def test_transport_is_an_isometry_with_inverse_and_a_cocycle(name):
     """T(e1 → e2), T(e2 → e3) T(e1 → e2), T(e1 → e3), there and back, and T(e1 → e1),
     all applied to z.
     """
-    model, params = model_and_params(name, scale)
+    model, _ = model_and_params(name)
 
-    def one(envs, z):
+    def one(params, envs, z):
         a, b, c = (model.fiber(params, env) for env in envs)
         latent = model.encode(a, jnp.asarray([1.0, 2.0, 3.0, 10.0]))._replace(z=z)
         there = model.transport(a, b, latent)
-        outcome = {
-            "there": there,
-            "on": model.transport(b, c, there),
-            "direct": model.transport(a, c, latent),
-            "back": model.transport(b, a, there),
-            "home": model.transport(a, a, latent),
-        }
-        assert all(part.pose is latent.pose for part in outcome.values())
-        return {way: part.z for way, part in outcome.items()}
+        moved = (
+            there,
+            model.transport(b, c, there),
+            model.transport(a, c, latent),
+            model.transport(b, a, there),
+            model.transport(a, a, latent),
+        )
+        assert all(part.pose is latent.pose for part in moved)
+        return tuple(part.z for part in moved)
 
-    results = jit(jax.vmap(one))(ENVS, LATENTS)
-    return {way: np.asarray(z, dtype=np.float64) for way, z in results.items()}
-
-
-@pytest.mark.parametrize("scale", [1.0, 30.0])
-@pytest.mark.parametrize("name", ["sfkd", "segment"])
-def test_transport_is_an_isometry_with_inverse_and_a_cocycle(name, scale):
-    results = transported(name, scale)
+    run = jit(jax.vmap(one, in_axes=(None, 0, 0)))
     close = {"rtol": 0, "atol": 2e-5}
-    np.testing.assert_allclose(
-        np.linalg.norm(results["there"], axis=1),
-        np.linalg.norm(LATENTS, axis=1),
-        rtol=1e-6,
-    )
-    np.testing.assert_allclose(results["home"], LATENTS, **close)
-    np.testing.assert_allclose(results["back"], LATENTS, **close)
-    np.testing.assert_allclose(results["on"], results["direct"], **close)
-    assert np.abs(results["there"] - LATENTS).max() > 1e-3  # and it does turn something
+    for scale in (1.0, 30.0):
+        moved = run(model_and_params(name, scale)[1], ENVS, LATENTS)
+        there, on, direct, back, home = (np.asarray(z, np.float64) for z in moved)
+        lengths = [np.linalg.norm(z, axis=1) for z in (there, LATENTS)]
+        np.testing.assert_allclose(*lengths, rtol=1e-6)
+        np.testing.assert_allclose(home, LATENTS, **close)
+        np.testing.assert_allclose(back, LATENTS, **close)
+        np.testing.assert_allclose(on, direct, **close)
+        assert np.abs(there - LATENTS).max() > 1e-3  # and it does turn something
 
 
 def test_rotation_is_the_cayley_transform_of_a_skew_matrix():
@@ -341,9 +327,10 @@ def test_rotation_is_the_cayley_transform_of_a_skew_matrix():
     np.testing.assert_allclose(expected @ expected.T, np.eye(8), atol=1e-12)
 
 
-@pytest.mark.parametrize("size", [0.0, 1e-3, 1e3, 1e15])
-def test_rotation_keeps_length_however_large_its_tangents(size):
-    tangents = (size * RANDOM.standard_normal((60, 4))).astype(np.float32)
-    turned = jit(jax.vmap(rotate_planes))(tangents, LATENTS)
-    lengths = np.linalg.norm(np.asarray(turned, np.float64), axis=1)
-    np.testing.assert_allclose(lengths, np.linalg.norm(LATENTS, axis=1), rtol=1e-6)
+def test_rotation_keeps_length_however_large_its_tangents():
+    turn, directions = jit(jax.vmap(rotate_planes)), RANDOM.standard_normal((60, 4))
+    for size in (0.0, 1e-3, 1e3, 1e15):
+        turned = turn((size * directions).astype(np.float32), LATENTS)
+        lengths = np.linalg.norm(np.asarray(turned, np.float64), axis=1)
+        expected = np.linalg.norm(LATENTS, axis=1)
+        np.testing.assert_allclose(lengths, expected, rtol=1e-6)

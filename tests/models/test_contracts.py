@@ -6,7 +6,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from flax.traverse_util import flatten_dict, unflatten_dict
+from flax.traverse_util import flatten_dict
 from helpers import (
     HARD,
     OTHERS,
@@ -21,7 +21,7 @@ from helpers import (
     space,
 )
 
-from sfkd_jax import models, store
+from sfkd_jax import models
 from sfkd_jax.geometry import compose
 from sfkd_jax.models.sfkd import RESIDUALS
 from sfkd_jax.rollout import fold, rollout
@@ -88,19 +88,13 @@ def test_a_state_comes_out_as_it_went_in(name, one):
 
 
 @pytest.mark.parametrize("name", LEARNED)
-def test_parameters_are_nested_dicts_of_float32_arrays_that_can_be_stored(
-    name, tmp_path
-):
+def test_parameters_are_nested_dicts_of_float32_arrays(name):
     _, params = model_and_params(name)
     flat = flatten_dict(params, sep="/")
     assert all(
         array.dtype == np.float32 and np.all(np.isfinite(array))
         for array in flat.values()
     )
-    file = tmp_path / "weights.safetensors"
-    store.write_arrays(file, flat, kind="weights", config={})
-    read, _ = store.read_arrays(file, kind="weights")
-    assert same(unflatten_dict(read, sep="/"), params, rtol=0, atol=0)
 
 
 @pytest.mark.parametrize("name", LEARNED)
@@ -215,7 +209,7 @@ def test_only_the_soft_variant_has_a_penalty_and_it_is_the_hinge_on_the_jacobian
     np.testing.assert_allclose(penalty, excess**2, rtol=1e-3)
 
 
-@pytest.mark.parametrize("name", [*SFKD, "r2dn"])
+@pytest.mark.parametrize("name", ["sfkd", "joint", "no_contraction", "path", "r2dn"])
 def test_folded_parameters_are_the_same_model_and_the_same_claim(name, one):
     model, params = model_and_params(name)
     folded = jit(partial(fold, model))(params)

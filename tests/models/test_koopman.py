@@ -46,10 +46,6 @@ def parked(change, count=60, steps=12):
     return Trajectory(jax.jit(jax.vmap(drive))(start, controls, envs), controls, envs)
 
 
-def linear_change(body, control, env):
-    return F @ body + G @ control + BIAS
-
-
 def switching_change(body, control, env):
     """Affine in friction, linear in state and control for each."""
     return F @ body + (env[0] - 0.5) * (body[::-1] + G @ control) + env[0] * BIAS
@@ -104,20 +100,6 @@ def test_states_along_a_circle_have_the_coordinates_they_were_made_with(curvatur
     np.testing.assert_allclose(
         seen, np.stack([progress, left, heading, np.full(3, 9.0)], axis=1), atol=2e-5
     )
-
-
-def test_a_linear_plant_is_recovered():
-    model = models.koopman(
-        two_body_space(), functions=0, environment=False, ridges=(1e-10,)
-    )
-    A, B, d, c = physical(model, identified(model, parked(linear_change)), [0.5, 2.0])
-    expected = np.eye(5)
-    expected[3:, 3:] = F
-    np.testing.assert_allclose(A, expected, atol=1e-4)
-    np.testing.assert_allclose(B[3:], G, atol=1e-4)
-    np.testing.assert_allclose(c, [0, 0, 0, *BIAS], atol=1e-4)
-    np.testing.assert_allclose(B[:3], 0, atol=1e-4)
-    np.testing.assert_allclose(d, 0, atol=2e-3)
 
 
 def test_a_plant_that_varies_with_the_environment_is_recovered():

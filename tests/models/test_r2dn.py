@@ -131,9 +131,8 @@ def test_the_constraint_holds_in_float64_and_its_bound_wastes_little(scale):
     )  # and what is short stays as it is
 
 
-@pytest.mark.parametrize("scale", [0.1, 10.0])
-def test_the_step_in_float32_keeps_its_factor_under_attack(scale):
-    attacked = certification.attack_model(MODEL, drawn(scale), BOX, starts=2)
+def test_the_step_in_float32_keeps_its_factor_under_attack():
+    attacked = certification.attack_model(MODEL, drawn(10.0), BOX, starts=2)
     assert attacked["step"] <= ALPHA * (1 + FLOAT32)
 
 

@@ -2,7 +2,7 @@
 
 from collections.abc import Callable, Iterator
 from functools import cache, partial
-from types import SimpleNamespace
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -11,20 +11,21 @@ import pytest
 
 from sfkd_jax.plants import dynamic, kinematic
 
-PLANTS = {
-    "kinematic": cache(kinematic),
-    "dynamic": cache(dynamic),
-}  # one object a setting, so one compilation
+# One object a setting, so one compilation.
+PLANTS = {"kinematic": cache(kinematic), "dynamic": cache(dynamic)}
 LONGEST = 300
-STATE_LIMITS = [
-    (-50, 50),
-    (-50, 50),
-    (-3, 3),
-    (0, 25),
-    (-4, 4),
-    (-1.5, 1.5),
-    (-0.5, 0.5),
-]
+
+
+class Drawn(NamedTuple):
+    """Rows of random inputs of a step."""
+
+    states: jax.Array
+    controls: jax.Array
+    envs: jax.Array
+
+
+HIGHEST = np.asarray([50.0, 50.0, 3.0, 25.0, 4.0, 1.5, 0.5])
+LOWEST = np.asarray([-50.0, -50.0, -3.0, 0.0, -4.0, -1.5, -0.5])
 ENV_LIMITS = [(0.3, 0.9), (-8, 8)]
 
 
@@ -106,14 +107,11 @@ def sweep() -> Callable:
     def draw(vehicle, count, overdrive=1.0):
         random, size = np.random.default_rng(0), len(vehicle.state_names)
         controls = overdrive * np.array([vehicle.control_low, vehicle.control_high]).T
-        low, high = np.concatenate([STATE_LIMITS[:size], controls, ENV_LIMITS]).T
+        states = np.stack([LOWEST, HIGHEST], axis=1)[:size]
+        low, high = np.concatenate([states, controls, ENV_LIMITS]).T
         share = random.uniform(size=(count, low.size))
         share[1::2] = np.round(2 * share[1::2]) / 2
         rows = jnp.asarray(low + (high - low) * share)
-        return SimpleNamespace(
-            states=rows[:, :size],
-            controls=rows[:, size : size + 2],
-            envs=rows[:, size + 2 :],
-        )
+        return Drawn(*jnp.split(rows, [size, size + 2], axis=1))
 
     return draw

@@ -33,50 +33,31 @@ def batch(name):
 
 
 @pytest.mark.parametrize("name", EVERY)
-def test_a_batch_of_episodes_is_one_pytree_of_finite_arrays(name):
+def test_a_batch_of_episodes_is_finite_starts_on_its_paths_and_stays_in_the_box(name):
     episodes = batch(name)
     leaves = jax.tree.leaves(episodes)
     assert all(isinstance(leaf, jax.Array) for leaf in leaves)
     assert all(leaf.dtype == jnp.float32 and leaf.shape[0] == 32 for leaf in leaves)
     assert all(bool(jnp.all(jnp.isfinite(leaf))) for leaf in leaves)
     assert episodes.envs.shape == episodes.observed_envs.shape == (32, STEPS, 2)
-    assert episodes.initial_state.shape == (32, STATES)
-    assert episodes.path.points.shape[2:] == (4,)
-
-
-@pytest.mark.parametrize("name", EVERY)
-def test_an_episode_follows_from_its_key_alone(name):
-    again = sampled(name)(KEYS[::-1])
-    assert same(at(again, slice(None, None, -1)), batch(name), rtol=0, atol=0)
-    assert sampled(name)._cache_size() == 1  # other keys, no other trace
-
-
-@pytest.mark.parametrize("name", EVERY)
-def test_different_keys_make_different_episodes(name):
-    points, envs = (
-        np.asarray(part) for part in (batch(name).path.points, batch(name).envs)
-    )
-    assert len(np.unique(points[:, -1, 2].round(4))) > 1
-    assert len(np.unique(points[..., 3].round(5), axis=0)) == len(KEYS)
-    if name != "s1":  # whose friction is constant and whose air is calm
-        assert len(np.unique(envs, axis=0)) > 1
-
-
-@pytest.mark.parametrize("name", EVERY)
-def test_an_episode_starts_on_its_path_at_its_speed_and_is_observed_as_it_is(name):
-    episodes = batch(name)
     start = np.tile(np.float32([0.0, 0.0, 0.0, 9.0]), (32, 1))
     np.testing.assert_array_equal(episodes.initial_state, start)
     np.testing.assert_array_equal(episodes.path.points[:, 0], np.zeros((32, 4)))
     np.testing.assert_array_equal(episodes.speed, np.full(32, np.float32(9.0)))
     np.testing.assert_array_equal(episodes.observed_envs, episodes.envs)
+    low, high = np.asarray(ENV_LOW) - 1e-6, np.asarray(ENV_HIGH) + 1e-6
+    assert np.all((episodes.envs >= low) & (episodes.envs <= high))
 
 
 @pytest.mark.parametrize("name", EVERY)
-def test_friction_and_wind_lie_in_the_box_of_the_data(name):
-    envs = np.asarray(batch(name).envs, dtype=np.float64)
-    low, high = np.asarray(ENV_LOW) - 1e-6, np.asarray(ENV_HIGH) + 1e-6
-    assert np.all((envs >= low) & (envs <= high))
+def test_an_episode_follows_from_its_key_alone_and_another_key_makes_another(name):
+    again = sampled(name)(KEYS[::-1])
+    assert same(at(again, slice(None, None, -1)), batch(name), rtol=0, atol=0)
+    assert sampled(name)._cache_size() == 1  # other keys, no other trace
+    curvatures, envs = np.asarray(again.path.points)[..., 3], np.asarray(again.envs)
+    assert len(np.unique(curvatures.round(5), axis=0)) == len(KEYS)
+    if name != "s1":  # whose friction is constant and whose air is calm
+        assert len(np.unique(envs, axis=0)) > 1
 
 
 @pytest.mark.parametrize("name", EVERY)

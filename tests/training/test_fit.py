@@ -2,12 +2,7 @@
 
 import json
 import shutil
-import signal
-import subprocess
-import sys
-import time
 from functools import partial
-from pathlib import Path
 
 import jax
 import jax.numpy as jnp
@@ -23,17 +18,13 @@ OPTIONS = {"steps": 40, "log_every": 10, "save_every": 20}
 DRAW = partial(random_windows, batch=16, length=8)
 
 
-def made():
+@pytest.fixture(scope="module")
+def task():
     """A model, its loss and its data."""
     data = dataset()
     space = measure_space(data)
     model = sfkd(space, **TINY)
     return model, multi_step_loss(model, space), data
-
-
-@pytest.fixture(scope="module")
-def task():
-    return made()
 
 
 def train(task, directory, seed=3, **changes):
@@ -173,34 +164,3 @@ def test_a_loss_that_is_not_finite_stops_with_the_last_good_checkpoint(
     checkpoints = Checkpoints(directory / "checkpoints")
     assert checkpoints.latest_step() == 40
     checkpoints.close()
-
-
-WORKER = """
-import sys
-sys.path.insert(0, sys.argv[2])
-from pathlib import Path
-from training.test_fit import made, train
-train(made(), Path(sys.argv[1]), save_every=10)
-"""
-
-
-@pytest.mark.exhaustive
-def test_kill_9_at_random_moments_loses_nothing(task, tmp_path):
-    weights, _ = train(task, tmp_path / "unbroken", save_every=10)
-    random, directory = np.random.default_rng(0), tmp_path / "killed"
-    for _ in range(4):
-        arguments = [WORKER, str(directory), str(Path(__file__).parents[1])]
-        worker = subprocess.Popen([sys.executable, "-c", *arguments])
-        patience = time.monotonic() + 60
-        while (
-            not (directory / "checkpoints").exists()
-            and worker.poll() is None
-            and time.monotonic() < patience
-        ):
-            time.sleep(0.05)
-        time.sleep(random.uniform(0.0, 3.0))
-        worker.send_signal(signal.SIGKILL)
-        worker.wait()
-    resumed, _ = train(task, directory, save_every=10)
-    assert same(weights, resumed)
-    assert [line["step"] for line in lines(directory)] == [10, 20, 30, 40]
