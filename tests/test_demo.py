@@ -8,6 +8,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from composing import settings
 from helpers import last_line, run_command, straight
 
 from sfkd_jax import demo, policy
@@ -48,9 +49,9 @@ def test_the_demo_drives_without_training_and_draws_an_animation(
 
 
 def test_a_vehicle_without_a_shipped_policy_is_refused_at_once(tmp_path):
-    done = run_command("demo", "vehicle.mass=900.0", cwd=tmp_path, code=1)
-    assert done.stderr.startswith("sfkd_jax: controllers ship for ")
-    assert len(done.stderr.strip().splitlines()) == 1
+    with pytest.raises(ValueError, match="controllers ship for ") as refusal:
+        demo.run(settings("vehicle.mass=900.0", f"root={tmp_path}"))
+    assert "\n" not in str(refusal.value)
     assert list(tmp_path.iterdir()) == []
 
 

@@ -63,7 +63,7 @@ def logs(tmp_path_factory):
     return folder
 
 
-@pytest.mark.slow
+@pytest.mark.exhaustive
 def test_logs_become_a_certified_policy_of_a_robot_that_nothing_drives(logs):
     document = last_line(
         done := run_command(

@@ -4,6 +4,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from helpers import jit
 
 from sfkd_jax import control
 
@@ -46,7 +47,7 @@ def drive(controller, start, steps=25, env=NOTHING):
 def test_an_obstacle_on_the_line_to_the_goal_is_passed():
     data = {"circles": CIRCLE, "margin": 0.05}
     controller = point_mass(circles, data, effective_samples=30.0)
-    places, _, kept = jax.jit(lambda: drive(controller, jnp.zeros(2)))()
+    places, _, kept = jit(lambda: drive(controller, jnp.zeros(2)))()
     clearance = np.linalg.norm(places - CIRCLE[0, :2], axis=1) - 0.4
     assert clearance.min() >= 0.05 - 1e-5
     assert np.linalg.norm(places[-1] - GOAL) < 0.2
@@ -59,7 +60,7 @@ def test_the_mean_of_passing_on_both_sides_is_not_driven():
         circles, {"circles": CIRCLE, "margin": 0.0}, temperature=1e3
     )
     state = controller.init(jax.random.key(1))
-    _, state, info = jax.jit(controller.act)(
+    _, state, info = jit(controller.act)(
         {}, state, jnp.asarray([0.3, 0.0]), NOTHING, ()
     )
     assert info["constraints_kept"]
@@ -71,9 +72,7 @@ def test_where_nothing_is_feasible_the_violation_falls():
     """From inside the obstacle, whose goal's cost would keep the point there."""
     data = {"circles": jnp.asarray([[2.0, 0.0, 0.8]]), "margin": 0.0}
     controller = point_mass(circles, data)
-    places, violations, kept = jax.jit(
-        lambda: drive(controller, jnp.asarray([1.9, 0.0]))
-    )()
+    places, violations, kept = jit(lambda: drive(controller, jnp.asarray([1.9, 0.0])))()
     assert not kept[0]
     assert kept[-1]
     assert violations[-1] <= 0.0 < violations[0]
@@ -82,7 +81,7 @@ def test_where_nothing_is_feasible_the_violation_falls():
 
 def test_obstacles_move_and_change_without_another_compilation():
     controller = point_mass(circles, {"circles": CIRCLE, "margin": 0.0})
-    act = jax.jit(controller.act)
+    act = jit(controller.act)
     state = controller.init(jax.random.key(0))
     for shift in (0.0, 0.3, 0.6):
         moved = {"circles": CIRCLE + jnp.asarray([shift, 0.0, 0.0]), "margin": 0.1}
@@ -112,7 +111,7 @@ def test_the_worst_of_several_environments_counts():
         noise_std=(0.7, 0.7),
     )
     start, state = jnp.zeros(3), controller.init(jax.random.key(0))
-    _, _, info = controller.act({}, state, start, jnp.asarray([[0.0], [1.0]]), ())
+    _, _, info = jit(controller.act)({}, state, start, jnp.asarray([[0.0], [1.0]]), ())
     places = info["predicted_states"][:, 0, :2]
     clearance = jnp.linalg.norm(places - CIRCLE[0, :2], axis=1)
     assert info["constraints_kept"]
@@ -121,9 +120,8 @@ def test_the_worst_of_several_environments_counts():
 
 def test_a_violation_that_is_not_a_number_is_not_kept():
     controller = point_mass(lambda data, x, u, target, at: jnp.full(1, jnp.nan), ())
-    u, _, info = controller.act(
-        {}, controller.init(jax.random.key(0)), GOAL, NOTHING, ()
-    )
+    state = controller.init(jax.random.key(0))
+    u, _, info = jit(controller.act)({}, state, GOAL, NOTHING, ())
     assert not info["constraints_kept"]
     assert jnp.all(jnp.isfinite(u))
 
@@ -137,7 +135,7 @@ def test_cem_keeps_constraints_too():
         horizon=HORIZON,
         noise_std=(0.7, 0.7),
     )
-    places, _, kept = jax.jit(lambda: drive(controller, jnp.zeros(2)))()
+    places, _, kept = jit(lambda: drive(controller, jnp.zeros(2)))()
     assert kept.all()
     assert np.linalg.norm(places - CIRCLE[0, :2], axis=1).min() >= 0.45 - 1e-5
 

@@ -52,9 +52,10 @@ def test_a_steady_turn_stays_what_it_is_on_the_path_at_the_reference_speed(name)
 def test_the_textbook_bicycle_turns_as_its_geometry_requires():
     plant = PLANTS["kinematic"]
     model = models.physics(plant.nominal)
-    turn = LAW.prepare(
-        model, model.fiber({}, ENV), jnp.zeros(4), straight(3), CURVATURE
+    prepare = lambda curvature: LAW.prepare(
+        model, model.fiber({}, ENV), jnp.zeros(4), straight(3), curvature
     )
+    turn = jit(prepare)(CURVATURE)
     _, _, speed = turn.state[1]
     np.testing.assert_allclose(speed, 10.0)
     np.testing.assert_allclose(turn.control[:, 1], 0.0, atol=1e-5)
@@ -67,9 +68,7 @@ def test_the_textbook_bicycle_turns_as_its_geometry_requires():
 def test_the_gain_is_that_of_the_riccati_equation_and_stabilises(name):
     turn, step = turns(name)
     at = (turn.state[0], turn.control[0], CURVATURE[0])
-    A, B = (
-        np.asarray(part, dtype=float) for part in jax.jacfwd(step, argnums=(0, 1))(*at)
-    )
+    A, B = (np.asarray(part, float) for part in jax.jacfwd(step, argnums=(0, 1))(*at))
     Q = np.zeros((len(A), len(A)))
     Q[:3, :3] = np.diag([LAW.lateral, LAW.heading, LAW.speed])
     R = np.diag([LAW.steering, LAW.drive])

@@ -6,6 +6,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from helpers import jit
 
 from sfkd_jax import plants
 from sfkd_jax.control import derive_path_law, law_from_arrays
@@ -22,12 +23,12 @@ def derived(request):
     derive = partial(
         derive_path_law, plant.step, coordinates=len(plant.state_names) - 1, **BOX
     )
-    return plant, jax.jit(partial(derive, points=(7, 2, 4)))()
+    return plant, jit(partial(derive, points=(7, 2, 4)))()
 
 
 def test_a_turn_at_a_point_of_the_tables_is_steady(derived):
     plant, law = derived
-    along = jax.jit(path_step(plant.step))
+    along = jit(path_step(plant.step))
     env = jnp.asarray([0.5, 8.0])
     curvature = jnp.asarray(2.2 * 2 / 3 / 8.0**2)
     turn = law.turn(curvature, jnp.asarray(8.0), env)
@@ -48,7 +49,7 @@ def test_the_law_alone_keeps_the_car_on_its_path(derived, env):
     start = path_state(
         jnp.zeros(len(plant.state_names) - 1).at[0].set(0.4).at[2].set(9.0)
     )
-    drive = jax.jit(
+    drive = jit(
         lambda x: jax.lax.scan(
             lambda x, _: (loop.step(x, inputs, jnp.asarray(env)), x), x, length=80
         )
@@ -64,12 +65,11 @@ def test_the_loop_contracts_alike_where_tyres_give_little(derived):
     """
     plant, law = derived
     loop = plants.along_path(plant, law)
+    inputs = jnp.asarray([0.0, 0.0, 0.02, 10.0])
+    step = lambda xi, e: loop.step(path_state(xi), inputs, e)[BODY]
+    slopes = jit(lambda e: jax.jacfwd(step)(law.turn(*inputs[2:], e).state, e))
     for env in ((0.3, 8.0), (0.9, 0.0)):
-        turn = law.turn(jnp.asarray(0.02), jnp.asarray(10.0), jnp.asarray(env))
-        inputs = jnp.asarray([0.0, 0.0, 0.02, 10.0])
-        slope = jax.jacfwd(lambda xi, w, e: loop.step(path_state(xi), w, e)[BODY])(
-            turn.state, inputs, jnp.asarray(env)
-        )
+        slope = slopes(jnp.asarray(env))
         assert np.max(np.abs(np.linalg.eigvals(np.asarray(slope, np.float64)))) < 0.92
 
 

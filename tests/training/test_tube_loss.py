@@ -8,7 +8,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from helpers import TINY, any_law
+from helpers import TINY, any_law, jit
 
 from sfkd_jax import models, plants
 from sfkd_jax.data import generate_along_path, measure_space, random_windows, split
@@ -22,7 +22,7 @@ LOW, HIGH = (0.3, -8.0), (0.9, 8.0)
 @pytest.fixture(scope="module")
 def learned():
     loop = plants.along_path(plants.kinematic(), any_law())
-    drives = jax.jit(
+    drives = jit(
         partial(
             generate_along_path, loop, segments=32, steps=12, env_low=LOW, env_high=HIGH
         )
@@ -36,15 +36,16 @@ def learned():
         space, **TINY | {"frame": "path", "budget": "joint", "learn_alpha": True}
     )
     batch = random_windows(data.train, jax.random.key(2), batch=8, length=5)
-    return model, space, model.init(jax.random.key(3)), batch
+    return model, space, jit(model.init)(jax.random.key(3)), batch
 
 
 def test_the_tube_in_the_loss_is_the_read_out_times_the_defect_over_what_contracts(
     learned,
 ):
     model, space, params, batch = learned
-    total, parts = multi_step_loss(model, space, tube=(0.5,))(params, batch)
-    gaps = jax.vmap(lambda drive: defects(model, params, drive)[0])(batch)
+    loss = multi_step_loss(model, space, tube=(0.5,))
+    total, parts, _ = loss.validate(params, batch)
+    gaps = jit(jax.vmap(lambda drive: defects(model, params, drive)[0]))(batch)
     largest = float(power_mean(jnp.linalg.norm(gaps, axis=-1)))
     row = float(jnp.linalg.norm(model.structure.explicit(params).readout[0]))
     np.testing.assert_allclose(
@@ -52,7 +53,7 @@ def test_the_tube_in_the_loss_is_the_read_out_times_the_defect_over_what_contrac
         row * largest / (1.0 - float(model.structure.rate(params))),
         rtol=1e-4,
     )
-    without, _ = multi_step_loss(model, space)(params, batch)
+    without, _, _ = multi_step_loss(model, space).validate(params, batch)
     np.testing.assert_allclose(
         total - without, 0.5 * (float(parts["tube"]) / 0.01) ** 2, rtol=1e-3
     )
@@ -71,7 +72,7 @@ def test_alpha_follows_the_loss_and_stays_below_its_largest(learned):
         transport=0.0,
         tube=(1.0,),
     )
-    slope = jax.jit(jax.grad(lambda params: loss(params, batch)[0]))(params)
+    slope = jit(jax.grad(lambda params: loss(params, batch)[0]))(params)
     assert float(slope["networks"]["alpha_logit"]) > 0
     assert 0.5 < float(model.structure.rate(params)) < 0.995
     for logit in (-5.0, 5.0):
