@@ -28,15 +28,10 @@ class Interval:
         return above and below
 
 
-@dataclass(frozen=True)
-class Entries:
-    """The number of entries of a sequence: at least `least`, or exactly `exactly`."""
-
-    least: int = 1
-    exactly: int | None = None
+class MayBeEmpty:
+    """The sequence may have no entries; without it, it has at least one."""
 
 
-@dataclass(frozen=True)
 class Ascending:
     """The entries of a sequence are in ascending order."""
 
@@ -51,11 +46,11 @@ NonNegativeInt: TypeAlias = Annotated[int, Interval("[0, inf)")]
 AtLeastOne: TypeAlias = Annotated[int, Interval("[1, inf)")]
 AtLeastTwo: TypeAlias = Annotated[int, Interval("[2, inf)")]
 Span: TypeAlias = Annotated[tuple[Positive, Positive], Ascending()]
-Numbers: TypeAlias = Annotated[tuple[float, ...], Entries(least=0)]
+Numbers: TypeAlias = Annotated[tuple[float, ...], MayBeEmpty()]
 """Any number of numbers, none included."""
-Names: TypeAlias = Annotated[tuple[str, ...], Entries(least=0)]
+Names: TypeAlias = Annotated[tuple[str, ...], MayBeEmpty()]
 """Any number of names, none included."""
-Bounds: TypeAlias = Annotated[tuple[Real, ...], Entries(least=0)]
+Bounds: TypeAlias = Annotated[tuple[Real, ...], MayBeEmpty()]
 """Lower or upper ends of intervals; none where they are unknown."""
 
 

@@ -17,7 +17,7 @@ from dataclasses import MISSING, dataclass, field, fields, is_dataclass
 from functools import cache
 from typing import Any, TypeVar
 
-from sfkd_jax.ranges import Ascending, Entries, Interval
+from sfkd_jax.ranges import Ascending, Interval, MayBeEmpty
 
 LARGEST = {int: 2**31 - 1, float: 3e38}
 """What int32 and float32 hold."""
@@ -134,20 +134,13 @@ def parse(kind: type[T], values: Values | T, above: str = "") -> T:
 
 def replace(settings: T, **changes: Any) -> T:
     """Return settings with changes of some fields, checked as `parse` does."""
-    values: Any = {
-        entry.name: getattr(settings, entry.name)
-        for entry in fields(typing.cast(Any, settings))
-    }
-    return parse(type(settings), values | changes)
+    return parse(type(settings), vars(settings) | changes)
 
 
 def plain(settings: Any) -> Any:
     """Return an object of settings as plain values, with tuples as lists."""
     if is_dataclass(settings):
-        return {
-            entry.name: plain(getattr(settings, entry.name))
-            for entry in fields(settings)
-        }
+        settings = vars(settings)
     if isinstance(settings, Mapping):
         return {name: plain(value) for name, value in settings.items()}
     return [*map(plain, settings)] if isinstance(settings, list | tuple) else settings
@@ -220,12 +213,9 @@ def _checked(name: str, value: Any, hint: Any, *marks: Any) -> Any:
             key: _checked(f"{name}.{key}", inner, parts[1])
             for key, inner in value.items()
         }
-    if (
-        problem := "settings by name"
-        if origin is dict
-        else _problem(value, hint, marks)
-    ):
-        raise ValueError(f"{name} must be {problem}, got {value!r}")
+    wrong = "settings by name" if origin is dict else _problem(value, hint, marks)
+    if wrong:
+        raise ValueError(f"{name} must be {wrong}, got {value!r}")
     return value
 
 
@@ -234,14 +224,12 @@ def _sequence(
 ) -> list[Any]:
     """Return the entries of a list, all of them checked; see `_checked`."""
     inner, count = parts[0], len(parts)
-    fixed = count if count > 1 and Ellipsis not in parts else None
-    least = next((mark.least for mark in marks if isinstance(mark, Entries)), 1)
     problem = None
     if not isinstance(value, list | tuple):
         problem = "a list"
-    elif fixed and len(value) != fixed:
-        problem = f"{fixed} entries"
-    elif len(value) < least:
+    elif count > 1 and Ellipsis not in parts and len(value) != count:
+        problem = f"{count} entries"
+    elif not value and not any(isinstance(mark, MayBeEmpty) for mark in marks):
         problem = "at least one entry"
     if problem:
         raise ValueError(f"{name} must be {problem}, got {value!r}")
@@ -266,24 +254,17 @@ def _problem(value: Any, kind: Any, marks: tuple[Any, ...]) -> str | None:
     right = (int, float) if kind is float else kind
     if is_truth != (kind is bool) or not isinstance(value, right):
         return _WORDS[kind]
-    if isinstance(value, str):
-        return _wrong_word(value, marks)
-    if is_truth:
-        return None
-    given = (mark for mark in marks if isinstance(mark, Interval))
-    interval = next(given, DEFAULT[kind])
-    inside = math.isfinite(value) and abs(value) <= LARGEST[kind]
-    return None if inside and interval.contains(value) else f"in {interval.text}"
-
-
-def _wrong_word(value: str, marks: tuple[Any, ...]) -> str | None:
-    """Return what a word must be, if it is not."""
     for mark in marks:
         if isinstance(mark, OneOf) and value not in mark:
             return f"one of {', '.join(mark)}"
         if isinstance(mark, BelowRoot) and not _is_below(value):
             return "a path below root without '..', empty parts or \\"
-    return None if value.strip() else "words, not nothing"
+    if is_truth or isinstance(value, str):
+        return None if is_truth or value.strip() else "words, not nothing"
+    given = (mark for mark in marks if isinstance(mark, Interval))
+    interval = next(given, DEFAULT[kind])
+    inside = math.isfinite(value) and abs(value) <= LARGEST[kind]
+    return None if inside and interval.contains(value) else f"in {interval.text}"
 
 
 def _check_boxes(above: str, settings: Values) -> None:
@@ -292,11 +273,10 @@ def _check_boxes(above: str, settings: Values) -> None:
         high = low.removesuffix("low") + "high"
         if not low.endswith("low") or high not in settings:
             continue
-        ends = lower or (), settings[high] or ()
-        if len(ends[0]) != len(ends[1]) or any(
-            a > b for a, b in zip(*ends, strict=True)
-        ):
+        ends = list(lower or ()), list(settings[high] or ())
+        crossed = any(a > b for a, b in zip(*ends, strict=False))
+        if crossed or len(ends[0]) != len(ends[1]):
             raise ValueError(
                 f"{above}{low} must not lie above {above}{high}, entry by entry, "
-                f"got {list(ends[0])} and {list(ends[1])}"
+                f"got {ends[0]} and {ends[1]}"
             )

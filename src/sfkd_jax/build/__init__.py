@@ -18,7 +18,6 @@ from sfkd_jax.build._controllers import CONTROLLER_SETTINGS as CONTROLLER_SETTIN
 from sfkd_jax.build._controllers import ENV_SOURCES as ENV_SOURCES
 from sfkd_jax.build._controllers import PLANNERS as PLANNERS
 from sfkd_jax.build._controllers import ControllerSettings as ControllerSettings
-from sfkd_jax.build._controllers import Planner as Planner
 from sfkd_jax.build._controllers import build_controller as build_controller
 from sfkd_jax.build._controllers import controller_horizon as controller_horizon
 from sfkd_jax.build._controllers import in_corridor as in_corridor

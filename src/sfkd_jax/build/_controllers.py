@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from typing import Any, NamedTuple
+from typing import Any
 
 from sfkd_jax import control, plants
 from sfkd_jax.geometry import LATERAL
@@ -23,27 +23,17 @@ Corner = Sequence[float] | None
 """Lower or upper ends of the environment box E, if they are known."""
 
 
-class Planner(NamedTuple):
-    """A planner, and whose arguments are its settings.
-
-    Attributes:
-        factory: its keyword-only arguments are the settings `controller.NAME`.
-        samples: whether it searches around a law (`controller.sampling`).
-    """
-
-    factory: Callable[..., Controller]
-    samples: bool = True
-
-
-PLANNERS = {
-    "mppi": Planner(control.mppi),
-    "cem": Planner(control.cem),
-    "gradient": Planner(control.gradient_planner),
-    "koopman_mpc": Planner(control.koopman_mpc, samples=False),
+PLANNERS: dict[str, Callable[..., Controller]] = {
+    "mppi": control.mppi,
+    "cem": control.cem,
+    "gradient": control.gradient_planner,
+    "koopman_mpc": control.koopman_mpc,
 }
-"""Planners by the name under which a controller's settings hold their own. A new one is
-an entry here and a file in `conf/controller`.
+"""Planners by the name under which a controller's settings hold their own: the
+keyword-only arguments. A new one is an entry here and a file in `conf/controller`.
 """
+QUADRATIC = ("koopman_mpc",)
+"""Planners that solve a quadratic program: they search around no law."""
 _DECIDED = (
     *("dt", "wheelbase", "speed_loop", "control_low", "control_high"),
     *("env_low", "env_high", "estimate_env", "inner", "model", "law", "unroll"),
@@ -113,16 +103,15 @@ class SearchSettings(ControllerSettings):
     online_tube: Any = None
 
 
-def _controller_schema(name: str, planner: Planner) -> type[ControllerSettings]:
+def _controller_schema(planner: str) -> type[ControllerSettings]:
     """One dataclass a planner: its own settings, and those of what is around it."""
     factories: dict[str, Callable[..., Any]] = {
         "cost": control.tracking_cost,
         "task": control.path_tracking,
     }
-    base = ControllerSettings
     # A quadratic program has no rate limits in its task.
-    skip = (*_DECIDED, "control_rate")
-    if planner.samples:
+    base, skip = ControllerSettings, (*_DECIDED, "control_rate")
+    if planner not in QUADRATIC:
         base, skip = SearchSettings, _DECIDED
         factories |= {
             "feedback": control.path_feedback,
@@ -139,13 +128,11 @@ def _controller_schema(name: str, planner: Planner) -> type[ControllerSettings]:
         *arguments(parts["cost"], control.tracking_cost),
         *arguments(parts["task"], control.path_tracking),
     }
-    own = schema("Planner", object, planner.factory, skip=(*_DECIDED, *shared))
-    return schema("Controller", base, **{name: own}, **parts)
+    own = schema("Planner", object, PLANNERS[planner], skip=(*_DECIDED, *shared))
+    return schema("Controller", base, **{planner: own}, **parts)
 
 
-CONTROLLER_SETTINGS = {
-    name: _controller_schema(name, planner) for name, planner in PLANNERS.items()
-}
+CONTROLLER_SETTINGS = {planner: _controller_schema(planner) for planner in PLANNERS}
 
 
 def controller_horizon(settings: ControllerSettings | Values) -> int:
@@ -198,10 +185,17 @@ def build_controller(
         "env_low": None if env_low is None else tuple(map(float, env_low)),
         "env_high": None if env_high is None else tuple(map(float, env_high)),
     }
-    # Whoever estimates e learns the unmeasured forces with the same filter.
-    estimates = env_source == "estimated"
+    factory = PLANNERS[settings.planner]
+    cost = control.tracking_cost(
+        dt=plant.dt,
+        speed_loop=plant.speed_loop,
+        **arguments(settings.cost, control.tracking_cost),
+    )
+    own = {**box, **arguments(settings.own, factory)}
     # A quadratic program samples nothing: no law, shield or adaptation around it.
     searches = settings if isinstance(settings, SearchSettings) else None
+    # Whoever estimates e learns the unmeasured forces with the same filter.
+    estimates = env_source == "estimated"
     adaptive |= estimates or (searches is not None and searches.adaptive)
     if not model.along_path:
         if adaptive:
@@ -209,8 +203,11 @@ def build_controller(
                 "adaptation and environment.source=estimated need a model "
                 "in path coordinates: model.frame=path"
             )
-        task = None if searches is None else _task(searches, model, plant)
-        return _planner(settings, task, model, plant, box)
+        if searches is not None:
+            return factory(_task(searches, model, plant, cost, limits), **own)
+        # Of the task's settings a quadratic program has the terminal weight alone.
+        weight = settings.task.terminal_weight
+        return factory(model, cost, **limits, terminal_weight=weight, **own)
     if searches is None or searches.sampling != "law" or law is None:
         raise ValueError(
             "a model in path coordinates needs controller.sampling=law and its law"
@@ -219,13 +216,13 @@ def build_controller(
     planned = with_offset(model) if adaptive else model
     task = control.following_law(
         planned,
-        _cost(settings, plant),
+        cost,
         law,
         dt=plant.dt,
         **limits,
         **arguments(settings.task, control.following_law),
     )
-    along = _planner(settings, task, planned, plant, box)
+    along = factory(task, **own)
     # A shield needs a certified corridor; without one the planner drives alone.
     if certificate and certificate.get("corridor") and searches.shield:
         along = in_corridor(along, planned, plant, law, certificate)
@@ -246,58 +243,27 @@ def build_controller(
     return tube.controller()
 
 
-def _cost(settings: ControllerSettings, plant: plants.Vehicle) -> control.Cost:
-    return control.tracking_cost(
-        dt=plant.dt,
-        speed_loop=plant.speed_loop,
-        **arguments(settings.cost, control.tracking_cost),
-    )
-
-
 def _task(
-    settings: SearchSettings, model: Model, plant: plants.Vehicle
+    settings: SearchSettings,
+    model: Model,
+    plant: plants.Vehicle,
+    cost: control.Cost,
+    limits: Any,
 ) -> control.Task:
     """Return the task of tracking a path around the law that `sampling` names."""
-    model_law = control.ModelLaw(**arguments(settings.model_law, control.ModelLaw))
     feedback = control.path_feedback(
         wheelbase=plant.wheelbase,
         speed_loop=plant.speed_loop,
         **arguments(settings.feedback, control.path_feedback),
     )
-    plain = control.no_feedback(speed_loop=plant.speed_loop)
-    laws = {"feedback": feedback, "model": model_law, "plain": plain}
-    return control.path_tracking(
-        model,
-        _cost(settings, plant),
-        choose(laws, settings.sampling, "controller.sampling"),
-        dt=plant.dt,
-        control_low=plant.control_low,
-        control_high=plant.control_high,
-        **arguments(settings.task, control.path_tracking),
-    )
-
-
-def _planner(
-    settings: ControllerSettings,
-    task: control.Task | None,
-    model: Model,
-    plant: plants.Vehicle,
-    box: Mapping[str, Any],
-) -> Controller:
-    """Return the planner itself; without a task it is a quadratic program."""
-    factory = PLANNERS[settings.planner].factory
-    options = {**box, **arguments(settings.own, factory)}
-    if task is not None:
-        return factory(task, **options)
-    return factory(
-        model,
-        _cost(settings, plant),
-        control_low=plant.control_low,
-        control_high=plant.control_high,
-        # Of the task's settings a quadratic program has the terminal weight alone.
-        terminal_weight=settings.task.terminal_weight,
-        **options,
-    )
+    laws = {
+        "feedback": feedback,
+        "model": control.ModelLaw(**arguments(settings.model_law, control.ModelLaw)),
+        "plain": control.no_feedback(speed_loop=plant.speed_loop),
+    }
+    law = choose(laws, settings.sampling, "controller.sampling")
+    options = arguments(settings.task, control.path_tracking)
+    return control.path_tracking(model, cost, law, dt=plant.dt, **limits, **options)
 
 
 def in_corridor(

@@ -22,9 +22,9 @@ from sfkd_jax.certification import issue
 from sfkd_jax.certification.corridor import certify_corridor
 from sfkd_jax.ranges import (
     Bounds,
-    Entries,
     Fraction,
     Interval,
+    MayBeEmpty,
     Names,
     NonNegativeInt,
     Numbers,
@@ -205,8 +205,8 @@ class ComparisonSettings:
 
     policies: Directory
     vehicles: Names = ()
-    seeds: Annotated[tuple[NonNegativeInt, ...], Entries(least=0)] = (0,)
-    controllers: dict[str, Annotated[list[str], Entries(least=0)]] = field(
+    seeds: Annotated[tuple[NonNegativeInt, ...], MayBeEmpty()] = (0,)
+    controllers: dict[str, Annotated[list[str], MayBeEmpty()]] = field(
         default_factory=dict
     )
     own_controllers: dict[str, Overrides] = field(default_factory=dict)
