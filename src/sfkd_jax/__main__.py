@@ -10,17 +10,8 @@ from pathlib import Path
 from sfkd_jax import __version__
 from sfkd_jax.settings import did_you_mean
 
-COMMANDS = (
-    "demo",
-    "train",
-    "generate",
-    "certify",
-    "evaluate",
-    "compare",
-    "report",
-    "export",
-    "doctor",
-)
+COMMANDS = ("demo", "train", "generate", "certify", "evaluate", "compare")
+COMMANDS += ("report", "export", "doctor")
 """Modules that are commands, in the order in which they are listed."""
 VERSION = f"sfkd_jax {__version__}"
 
@@ -35,8 +26,8 @@ def main() -> None:
     elif command in COMMANDS:
         # The imports take seconds; the list above is quick.
         hydra_command = import_module("sfkd_jax.experiment.command").hydra_command
-        file = _file(command).relative_to(Path(__file__).parent)
-        module = import_module(".".join(("sfkd_jax", *file.with_suffix("").parts)))
+        package = _file(command).stem == "__main__"
+        module = import_module(f"sfkd_jax.{command}{'.__main__' * package}")
         sys.argv = [f"sfkd {command}", *rest]
         hydra_command(module.run)()
     else:
@@ -46,24 +37,22 @@ def main() -> None:
 
 def overview() -> str:
     """Return the page that lists the commands."""
+    listed = []
+    for name in COMMANDS:
+        # Parsed, not imported: that would take seconds.
+        text = ast.get_docstring(ast.parse(_file(name).read_text("utf-8"))) or ""
+        listed.append(f"  {name:8}  {text.partition(chr(10))[0]}")
     lines = [
         f"{VERSION}: learned dynamics with a stability certificate, driving MPPI.",
         "",
         "usage: sfkd COMMAND [+experiment=NAME] [GROUP=OPTION] [SETTING=VALUE]",
         "",
+        *listed,
+        "",
+        "sfkd COMMAND --help lists groups and options, --cfg job all settings;",
+        "-sc install=bash completes words; -m seed=0,1 runs a job for each value.",
     ]
-    for name in COMMANDS:
-        # Parsed, not imported: that would take seconds.
-        text = ast.get_docstring(ast.parse(_file(name).read_text("utf-8"))) or ""
-        lines.append(f"  {name:8}  {text.partition(chr(10))[0]}")
-    return "\n".join(
-        [
-            *lines,
-            "",
-            "sfkd COMMAND --help lists groups and options, --cfg job all settings;",
-            "-sc install=bash completes words; -m seed=0,1 runs a job for each value.",
-        ]
-    )
+    return "\n".join(lines)
 
 
 def _file(command: str) -> Path:

@@ -9,12 +9,11 @@ from typing import Any
 
 from sfkd_jax import store
 from sfkd_jax.certification import CertificateStale, CertificationRefused
-from sfkd_jax.experiment import runs, stages
+from sfkd_jax.experiment import stages
 from sfkd_jax.experiment.command import hydra_command
 from sfkd_jax.experiment.options import Settings
 
 
-@runs.exclusive
 def run(settings: Settings) -> dict[str, Any]:
     """Certify the policy of the run, which is trained if it is missing.
 
@@ -23,16 +22,16 @@ def run(settings: Settings) -> dict[str, Any]:
             `certification.renew` is false.
         CertificationRefused: nothing could be certified.
     """
-    trained = stages.ensure_policy(settings)
-    path = stages.certificate_path(settings.run_dir)
-    if path.exists() and not settings.certification.renew:
-        certified = store.read_json(path).get("policy_sha256")
-        if certified != trained.sha256:
+    path = settings.certificate_path
+    with store.locked(settings.run_dir):
+        trained = stages.ensure_policy(settings)
+        is_kept = path.exists() and not settings.certification.renew
+        if is_kept and store.read_json(path).get("policy_sha256") != trained.sha256:
             raise CertificateStale(
                 f"{path} is about other weights or settings; "
                 "certification.renew=true replaces it"
             )
-    document = stages.certify_policy(settings)
+        document = stages.certify_policy(settings)
     if not document["valid"]:
         raise CertificationRefused(document["reason"])
     d_bar = document.get("d_bar", {"value": None})["value"]

@@ -41,15 +41,14 @@ def run(settings: Settings) -> dict[str, Any]:
     results = directory / f"{episodes.name}_{shipped}"
     plant = build.build_vehicle(settings.vehicle)
     references = build.reference_systems(plant, trained.law)
-    own = build.System(
-        trained.model,
-        trained.params,
-        settings.environment.source,
-        trained.certificate,
-        trained.law,
-    )
-    systems = {trained.settings["model"]["system"]: own}
-    systems |= {name: references[name] for name in ("nominal", "oracle")}
+    source, proof = settings.environment.source, trained.certificate
+    systems = {
+        trained.settings["model"]["system"]: build.System(
+            trained.model, trained.params, source, proof, trained.law
+        ),
+        "nominal": references["nominal"],
+        "oracle": references["oracle"],
+    }
     with store.locked(results):
         rows = []
         for name, system in systems.items():
@@ -60,14 +59,10 @@ def run(settings: Settings) -> dict[str, Any]:
             written = results / name, directory, settings, episodes
             rows.append(comparing.write_cell(*written, evaluate(episodes)))
         rows, file = evaluation.compare(rows), results / "results.json"
-        document = {
-            "rows": rows,
-            "config": plain(settings),
-            "versions": store.versions(),
-        }
-        store.write_json(file, document)
+        made_by = {"config": plain(settings), "versions": store.versions()}
+        store.write_json(file, {"rows": rows} | made_by)
         store.print_message(text_table(rows, *PRINTED))
-        half_width = (trained.certificate or {}).get("corridor", {}).get("corridor_m")
+        half_width = (proof or {}).get("corridor", {}).get("corridor_m")
         path = directory / f"{results.name}.gif"
         film = film_of(path, of_rows(directory, rows), half_width)
     seconds = time.perf_counter() - began

@@ -17,9 +17,8 @@ from sfkd_jax.experiment import TRAIN
 from sfkd_jax.experiment.command import hydra_command
 from sfkd_jax.experiment.options import Settings
 
-CORE = ("jax", "jaxlib", "flax", "optax", "orbax-checkpoint", "hydra-core")
-CORE += ("numpy", "scipy", "matplotlib")
-"""Packages whose versions are shown."""
+CORE = ("jaxlib", "flax", "optax", "orbax-checkpoint", "hydra-core", "scipy")
+"""Packages whose versions are shown, beside those that every result records."""
 EXTRAS = {
     "train": TRAIN,
     "brax": ("brax",),
@@ -45,9 +44,8 @@ def run(settings: Settings) -> dict[str, Any]:
         ValueError: jax cannot compute here.
     """
     installed = {one.name.lower(): one.version for one in metadata.distributions()}
-    versions = store.versions() | {
-        name: installed.get(name, "missing") for name in CORE
-    }
+    core = {name: installed.get(name, "missing") for name in CORE}
+    versions = store.versions() | core
     print("  ".join(f"{name} {version}" for name, version in versions.items()))
     devices = [f"{device.platform}: {device.device_kind}" for device in jax.devices()]
     affinity = getattr(os, "sched_getaffinity", lambda _: range(os.cpu_count() or 1))
@@ -108,25 +106,23 @@ def _backend_seconds() -> float:
 
 def _advice(root: Path, devices: list[str]) -> list[str]:
     """Return what would improve the installation, the most important first."""
-    lines, directory = [], root.resolve()
+    directory = root.resolve()
     while not directory.exists():
         directory = directory.parent
-    if not os.access(directory, os.W_OK):
-        lines.append(
-            f"{directory} cannot be written; choose another directory with root=DIR"
-        )
     free = shutil.disk_usage(directory).free // 2**20
-    if free < NEEDED_MB:
-        lines.append(
-            f"{free} MB are free below {directory}; "
-            f"an experiment needs up to {NEEDED_MB}"
-        )
     on_cpu = all(device.startswith("cpu") for device in devices)
-    if on_cpu and shutil.which("nvidia-smi"):
-        lines.append(
-            'there is an accelerator that jax does not see; pip install "jax[cuda12]"'
-        )
-    return lines
+    advice = {
+        f"{directory} cannot be written; choose another directory with root=DIR": (
+            not os.access(directory, os.W_OK)
+        ),
+        f"{free} MB are free below {directory}; an experiment needs {NEEDED_MB}": (
+            free < NEEDED_MB
+        ),
+        'there is an accelerator that jax does not see; pip install "jax[cuda12]"': (
+            on_cpu and shutil.which("nvidia-smi") is not None
+        ),
+    }
+    return [line for line, applies in advice.items() if applies]
 
 
 if __name__ == "__main__":

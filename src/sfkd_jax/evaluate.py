@@ -19,7 +19,8 @@ def run(settings: Settings) -> dict[str, Any]:
     if not settings.evaluation.systems:
         raise ValueError("evaluation.systems is empty: there is nothing to evaluate")
     stages.check_settings(settings)
-    return evaluate_run(settings, command=command_line("evaluate"))
+    path = evaluate_run(settings, command=command_line("evaluate"))
+    return {"results": str(path), "rows": len(settings.evaluation.systems)}
 
 
 if __name__ == "__main__":

@@ -6,7 +6,7 @@ import time
 from typing import Any
 
 from sfkd_jax import store
-from sfkd_jax.experiment import runs, stages
+from sfkd_jax.experiment import stages
 from sfkd_jax.experiment.command import command_line, hydra_command
 from sfkd_jax.experiment.evaluating import evaluate_run
 from sfkd_jax.experiment.options import Settings
@@ -22,10 +22,10 @@ def run(settings: Settings) -> dict[str, Any]:
     """
     began = time.perf_counter()
     stages.check_settings(settings)
-    return _run_stages(settings) | {"seconds": time.perf_counter() - began}
+    with store.locked(settings.run_dir):
+        return _run_stages(settings) | {"seconds": time.perf_counter() - began}
 
 
-@runs.exclusive
 def _run_stages(settings: Settings) -> dict[str, Any]:
     """Run all stages in the run directory."""
     trained, run_dir = stages.ensure_policy(settings), settings.run_dir
@@ -48,7 +48,7 @@ def _run_stages(settings: Settings) -> dict[str, Any]:
     certificate = stages.certify_policy(settings)
     results = None
     if trained.vehicle.simulated:
-        results = evaluate_run(settings, command=command_line("train"))["results"]
+        results = str(evaluate_run(settings, command=command_line("train")))
     else:
         store.print_message(
             "not driven: vehicle=own is known from logs alone; "
@@ -58,7 +58,7 @@ def _run_stages(settings: Settings) -> dict[str, Any]:
         pages = write_report(run_dir)
     store.print_message(f"report: {pages['report']}")
     return about | {
-        "certificate": str(stages.certificate_path(run_dir)),
+        "certificate": str(settings.certificate_path),
         "results": results,
         "report": pages["report"],
         "alpha": certificate.get("alpha"),

@@ -110,13 +110,10 @@ def command_line(name: str) -> str | None:
     """Return the running command as typed in a shell, without `root=`."""
     if not HydraConfig.initialized():
         return None
-    typed = [
-        word
-        for word in HydraConfig.get().overrides.task
-        # A path of this machine means nothing to whoever repeats the command.
-        if not word.startswith("root=")
-    ]
-    return " ".join(["python -m", f"sfkd_jax.{name}", shlex.join(typed)]).strip()
+    typed = HydraConfig.get().overrides.task
+    # A path of this machine means nothing to whoever repeats the command.
+    kept = [word for word in typed if not word.startswith("root=")]
+    return " ".join(["python -m", f"sfkd_jax.{name}", shlex.join(kept)]).strip()
 
 
 def use_compilation_cache(root: Path) -> None:
@@ -152,12 +149,13 @@ def named_for_sweep(settings: Settings) -> Settings:
     It contains what the job overrides and what changes the weights, so that jobs do not
     write into one directory. Model and seed are part of the path anyway.
     """
-    typed = [word.lstrip("+") for word in HydraConfig.get().overrides.task]
+    overrides = [word.lstrip("+") for word in HydraConfig.get().overrides.task]
+    # By setting, such as "training.steps": model and seed choose directories already.
+    changed = {word: word.split("=")[0] for word in overrides}
     overrides = [
         word
-        for word in typed
-        if word.split("=")[0].split(".")[0] in IDENTITY
-        and word.split("=")[0] not in ("model", "seed")
+        for word, setting in changed.items()
+        if setting.split(".")[0] in IDENTITY and setting not in ("model", "seed")
     ]
     if not overrides:
         return settings

@@ -21,7 +21,6 @@ from sfkd_jax.experiment import command, data, evaluating, runs, stages
 from sfkd_jax.experiment.evaluating import EpisodeSet, SystemResult
 from sfkd_jax.experiment.options import ComparisonSettings, Settings
 from sfkd_jax.settings import plain, replace
-from sfkd_jax.training import TrainingStopped
 
 KIND = "cell"
 NUM_STORED_EPISODES = 2
@@ -207,14 +206,13 @@ def collect_rows(
         pooled[cell._replace(seed=0)].append(row)
         if row.get("provenance", {}).get("source") != runs.source_hash():
             by_other_code.append(path)
-    for paths, who, what in (
-        (others, "with other settings", "left out"),
-        (by_other_code, "by other code", "used"),
-    ):
+    notes = {
+        "with other settings: left out": others,
+        "by other code: used": by_other_code,
+    }
+    for note, paths in notes.items():
         if paths:
-            store.print_message(
-                f"{len(paths)} cells were made {who}, such as {paths[0]}: {what}"
-            )
+            store.print_message(f"{len(paths)} cells were made {note}: {paths[0]}, …")
     rows = []
     for cell, trainings in pooled.items():
         if trainings:
@@ -300,12 +298,8 @@ class Comparison:
         """Print and store why a row failed, and go on with the others."""
         try:
             yield
-        except (
-            TrainingStopped,
-            ValueError,
-            store.ArtefactError,
-            JaxRuntimeError,  # such as memory that does not suffice
-        ) as reason:
+        # JAX raises if memory does not suffice, which another row may not need.
+        except (*command.EXPECTED, JaxRuntimeError) as reason:
             line = next(iter(str(reason).splitlines()), type(reason).__name__)
             self.failed[_name(group)] = line
             store.print_message(f"failed: {line}")

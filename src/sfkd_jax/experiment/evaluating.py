@@ -7,6 +7,7 @@ import time
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from functools import partial
+from pathlib import Path
 from typing import Any, NamedTuple
 
 import jax
@@ -24,7 +25,7 @@ from sfkd_jax.plants import check_step
 from sfkd_jax.rollout import fold, unfold
 from sfkd_jax.scenarios import Scenario
 from sfkd_jax.settings import arguments, choose, plain
-from sfkd_jax.types import Controller, Key, Params, Trajectory
+from sfkd_jax.types import Key, Params, Trajectory
 
 WARM_UP = 10
 """Control steps before timing starts."""
@@ -165,15 +166,8 @@ class SystemEvaluation:
         params: of its model, folded.
     """
 
-    controller: Controller
-    params: Params
-
     def __init__(
-        self,
-        settings: Settings,
-        name: str,
-        system: System,
-        dataset: Dataset | None,
+        self, settings: Settings, name: str, system: System, dataset: Dataset | None
     ) -> None:
         """Build the controller and what scores it.
 
@@ -203,9 +197,18 @@ class SystemEvaluation:
         self.params = jax.jit(partial(fold, system.model))(system.params)
         self._system = system._replace(params=self.params)
         self._columns = _columns(settings, name, system)
-        self._columns["open_loop_rmse_m"] = self._open_loop_rmse(dataset)
+        self._columns["open_loop_rmse_m"] = dataset and self._open_loop_rmse(dataset)
         self._claims = _claims(settings, system)
-        self._simulate = _over_episodes(self._episode)
+        simulate = partial(
+            evaluation.simulate,
+            plant.step,
+            self.controller,
+            self.params,
+            horizon=settings.controller.horizon,
+            dt=plant.dt,
+            observation_noise=settings.evaluation.observation_noise,
+        )
+        self._simulate = _over_episodes(simulate)
         self._predict = jax.jit(self._predictions)
 
     def __call__(self, episodes: EpisodeSet) -> SystemResult:
@@ -226,18 +229,6 @@ class SystemEvaluation:
         parts = ("lateral", "states", "controls")
         arrays = {part: np.asarray(getattr(episode, part)) for part in parts}
         return SystemResult(row, arrays)
-
-    def _episode(self, scenario: Scenario, key: Key) -> evaluation.Episode:
-        return evaluation.simulate(
-            self._plant.step,
-            self.controller,
-            self.params,
-            scenario,
-            key,
-            horizon=self._settings.controller.horizon,
-            dt=self._plant.dt,
-            observation_noise=self._settings.evaluation.observation_noise,
-        )
 
     def _scored(
         self, episodes: EpisodeSet, force: float
@@ -279,10 +270,8 @@ class SystemEvaluation:
             horizon=self._settings.certification.horizon,
         )
 
-    def _open_loop_rmse(self, dataset: Dataset | None) -> dict[str, float] | None:
+    def _open_loop_rmse(self, dataset: Dataset) -> dict[str, float]:
         """Position RMSE of predictions on the test part, by steps ahead [m]."""
-        if dataset is None:
-            return None
         horizon = self._settings.certification.horizon
         predict = partial(evaluation.open_loop, self._system.model, horizon=horizon)
         errors = jax.jit(predict)(self.params, dataset.test)
@@ -336,29 +325,26 @@ def _claims(settings: Settings, system: System) -> evaluation.ClaimedBounds:
     """Claims about a system's predictions, of its certificate."""
     level, horizon = settings.certification.level, settings.certification.horizon
     claims = evaluation.ClaimedBounds(threshold=settings.evaluation.threshold_m)
-    proof = system.certificate
-    if proof is None:
+    if system.certificate is None:
         return claims
-    if (len(proof["tube"]["latent"]), proof["d_bar"]["level"]) != (horizon, level):
+    tube, d_bar = system.certificate["tube"], system.certificate["d_bar"]
+    if (len(tube["latent"]), d_bar["level"]) != (horizon, level):
         store.print_message(
             "  the certificate is of another horizon or level and is not compared"
         )
         return claims
-    d_bar = proof["d_bar"]["value"]
-    return claims._replace(
-        certified=proof["tube"]["physical"],
-        latent=latent_tube(proof["alpha"], d_bar, horizon),
-        d_bar=d_bar,
-    )
+    latent = latent_tube(system.certificate["alpha"], d_bar["value"], horizon)
+    own = {"latent": latent, "d_bar": d_bar["value"], "certified": tube["physical"]}
+    return claims._replace(**own)
 
 
-def evaluate_run(settings: Settings, *, command: str | None = None) -> dict[str, Any]:
+def evaluate_run(settings: Settings, *, command: str | None = None) -> Path:
     """Evaluate every system of `evaluation.systems` and add its rows to the results.
 
     Rows of other scenarios and controllers in the same run stay.
 
     `command`, as it was typed, is stored with the results. Returns the path of
-    results.json and the number of new rows.
+    results.json.
 
     Raises:
         ValueError: settings that cannot be built, or a vehicle that cannot be
@@ -374,20 +360,18 @@ def evaluate_run(settings: Settings, *, command: str | None = None) -> dict[str,
     rows: list[Row] = []
     arrays: dict[str, Any] = {"dt": settings.vehicle.dt}
     length = f"{protocol.episodes} episodes of {protocol.episode_s:.0f} s"
+    # The roads under the same names: a page draws them without the settings.
+    road = (episodes.scenarios.envs, episodes.scenarios.path.points)
+    named = dict(zip(evaluation.ROAD, road, strict=True))
     for name, system in compared.items():
         store.print_message(f"driving {length}: {name} on {episodes.name}")
-        result = SystemEvaluation(settings, name, system, dataset)(episodes)
-        rows.append(result.row)
-        # The roads under the same names: a page draws them without the settings.
-        road = (episodes.scenarios.envs, episodes.scenarios.path.points)
-        named = result.arrays | dict(zip(evaluation.ROAD, road, strict=True))
-        prefix = evaluation.episode_name(result.row)
-        arrays |= {f"{prefix}/{part}": array for part, array in named.items()}
-        error, worst = result.row["rmse_m"]["mean"], result.row["max_deviation_m"]
+        row, own = SystemEvaluation(settings, name, system, dataset)(episodes)
+        rows.append(row)
+        prefix = evaluation.episode_name(row)
+        arrays |= {f"{prefix}/{part}": array for part, array in (own | named).items()}
+        error, worst = row["rmse_m"]["mean"], row["max_deviation_m"]
         store.print_message(f"  rmse {error:.4f} m, worst {worst:.3f} m")
     seconds = time.perf_counter() - began
     config = plain(settings) | ({"command": command} if command else {})
-    path = runs.write_results(
-        settings.run_dir, config, evaluation.compare(rows), arrays, seconds
-    )
-    return {"results": str(path), "rows": len(rows)}
+    rows = evaluation.compare(rows)
+    return runs.write_results(settings.run_dir, config, rows, arrays, seconds)

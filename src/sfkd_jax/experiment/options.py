@@ -20,6 +20,7 @@ from sfkd_jax.build import (
 )
 from sfkd_jax.certification import issue
 from sfkd_jax.certification.corridor import certify_corridor
+from sfkd_jax.policy import CERTIFICATE
 from sfkd_jax.ranges import (
     Bounds,
     Fraction,
@@ -273,6 +274,16 @@ class Settings:
     def run_dir(self) -> Path:
         """The directory of the run, root/name/system/seed=N."""
         return Path(self.root) / self.name / self.model.system / f"seed={self.seed}"
+
+    @property
+    def policy_path(self) -> Path:
+        """The policy of the run, whether or not it exists."""
+        return self.run_dir / "policy.safetensors"
+
+    @property
+    def certificate_path(self) -> Path:
+        """The certificate of the run, whether or not it exists."""
+        return self.run_dir / CERTIFICATE
 
     @property
     def logs(self) -> LogSettings | None:

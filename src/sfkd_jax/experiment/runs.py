@@ -5,9 +5,9 @@ from __future__ import annotations
 import functools
 import hashlib
 import subprocess
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Any
 
 from sfkd_jax import evaluation, store
 from sfkd_jax.data import Dataset
@@ -22,24 +22,6 @@ EPISODES = "episodes"
 UNREADABLE = frozenset("[]")
 """Characters of a path that the checkpoint library writes, but reads as a pattern."""
 PACKAGE = Path(__file__).resolve().parents[1]
-
-T = TypeVar("T")
-
-
-def policy_path(settings: Settings) -> Path:
-    """Return the path of the policy of a run, whether or not it exists."""
-    return settings.run_dir / "policy.safetensors"
-
-
-def exclusive(run: Callable[[Settings], T]) -> Callable[[Settings], T]:
-    """Wrap `run(settings)` so that it holds the lock of the run directory."""
-
-    @functools.wraps(run)
-    def locked(settings: Settings) -> T:
-        with store.locked(settings.run_dir):
-            return run(settings)
-
-    return locked
 
 
 def identity(settings: Settings) -> dict[str, Any]:
@@ -74,7 +56,7 @@ def claim(settings: Settings) -> None:
         checkpoints = run_dir / "checkpoints"
         kept = checkpoints.is_dir() and any(checkpoints.iterdir())
         # Without weights the recorded settings made nothing that could be mistaken.
-        if kept or policy_path(settings).is_file():
+        if kept or settings.policy_path.is_file():
             raise store.ArtefactError(
                 f"{run_dir} was made with other settings "
                 f"({'; '.join(changed[:3])}); pass name=… for another run"

@@ -5,7 +5,6 @@ from __future__ import annotations
 import time
 from collections.abc import Mapping
 from functools import partial
-from pathlib import Path
 from typing import Any
 
 import jax
@@ -32,7 +31,7 @@ from sfkd_jax.ranges import imported
 from sfkd_jax.rollout import fold
 from sfkd_jax.settings import arguments, choose, plain
 from sfkd_jax.training import Loss, fit, multi_step_loss
-from sfkd_jax.types import Key, Model, Params, Space, Trajectory
+from sfkd_jax.types import Model, Params, Space, Trajectory
 
 SCORED_SCENARIOS = ("uniform", "wet")
 """Of the validation runs that trainings are compared on: S3 stays unseen."""
@@ -118,11 +117,10 @@ def ensure_policy(settings: Settings) -> policy.TrainedModel:
             trained by another process.
         ValueError: the logs are too few for the levels of the certificate.
     """
-    path = runs.policy_path(settings)
     # Before the lock and the data: a missing module ends the command at once.
     if factory := getattr(settings.model, "factory", None):
         imported(factory, "model.factory")
-    if not path.is_file():
+    if not settings.policy_path.is_file():
         # Whether logs are too few for the level is known before the training.
         if settings.logs:
             dataset, _ = data.ensure_dataset(settings)
@@ -130,7 +128,7 @@ def ensure_policy(settings: Settings) -> policy.TrainedModel:
         with store.locked(settings.run_dir):
             runs.claim(settings)
             # Once more under the lock, where nobody else can be writing.
-            if not path.is_file():
+            if not settings.policy_path.is_file():
                 _train(settings, *data.ensure_dataset(settings))
     # Also of a policy that exists: it must have been made with these settings.
     runs.claim(settings)
@@ -154,38 +152,29 @@ def _train(settings: Settings, dataset: Dataset, data_hash: str) -> None:
         store.print_message(
             f"training {settings.model.system}, {options.steps} steps, in {run_dir}"
         )
-        params, best = _fit(settings, model, loss, dataset, key)
+        params, best = fit(
+            model,
+            loss,
+            partial(random_windows, batch=options.batch, length=options.window),
+            dataset.train,
+            # Fixed windows: validation losses at different steps are comparable.
+            spread_windows(dataset.validation, length=options.window),
+            key,
+            run_dir,
+            inspect=partial(contraction_metrics, model),
+            **arguments(options, fit),
+        )
     document = _open_loop_document(settings, model, params, dataset)
-    document["validation_score"] = _validation_score(
-        loss, params, dataset, options.window
-    )
+    score = _validation_score(loss, params, dataset, options.window)
+    document["validation_score"] = score
     store.write_json(run_dir / "open_loop.json", document)
     recorded |= {"space": build.space_to_settings(space), "best_step": best}
     policy.save(
-        runs.policy_path(settings),
+        settings.policy_path,
         params,
         recorded,
         made_from={"dataset": data_hash},
         law=data.ensure_law(settings),
-    )
-
-
-def _fit(
-    settings: Settings, model: Model, loss: Loss, dataset: Dataset, key: Key
-) -> tuple[Params, int | None]:
-    """Fit a model by gradient descent; return the best weights and their step."""
-    options = settings.training
-    return fit(
-        model,
-        loss,
-        partial(random_windows, batch=options.batch, length=options.window),
-        dataset.train,
-        # Fixed windows: validation losses at different steps are comparable.
-        spread_windows(dataset.validation, length=options.window),
-        key,
-        settings.run_dir,
-        inspect=partial(contraction_metrics, model),
-        **arguments(options, fit),
     )
 
 
@@ -250,11 +239,6 @@ def _validation_score(
     return float(scores.reshape(-1, rows.size)[:, rows].mean())
 
 
-def certificate_path(run_dir: Path) -> Path:
-    """Return the path of the certificate of a run, whether or not it exists."""
-    return run_dir / policy.CERTIFICATE
-
-
 def certify_policy(settings: Settings) -> dict[str, Any]:
     """Certify the policy of the run, and write and return the document.
 
@@ -275,10 +259,15 @@ def certify_policy(settings: Settings) -> dict[str, Any]:
         "versions": versions,
     }
     document["seconds"] = time.perf_counter() - began
-    store.write_json(certificate_path(settings.run_dir), document)
-    store.print_message(f"certificate: {_verdict(document)}")
-    if reason := document.get("lyapunov", {}).get("reason"):
-        store.print_message(f"certificate: {reason}")
+    store.write_json(settings.certificate_path, document)
+    verdict = f"refused: {document.get('reason')}"
+    if document["valid"]:
+        verdict = f"alpha {document['alpha']:.6f}"
+    if d_bar := document.get("d_bar"):
+        verdict += f"; d_bar {d_bar['value']:.4g} holds for {d_bar['holds_for']}"
+    for line in (verdict, document.get("lyapunov", {}).get("reason")):
+        if line:
+            store.print_message(f"certificate: {line}")
     return document
 
 
@@ -287,17 +276,6 @@ def _asked_for(settings: Settings) -> dict[str, Any]:
     asked = plain(settings.certification)
     # `renew` says what to do, not what is claimed.
     return {name: value for name, value in asked.items() if name != "renew"}
-
-
-def _verdict(document: Mapping[str, Any]) -> str:
-    """Summarise a document in one line."""
-    if not document["valid"]:
-        return f"refused: {document['reason']}"
-    verdict = f"alpha {document['alpha']:.6f}"
-    if "d_bar" in document:
-        d_bar = document["d_bar"]
-        verdict += f"; d_bar {d_bar['value']:.4g} holds for {d_bar['holds_for']}"
-    return verdict
 
 
 def _certify_tubes(settings: Settings, trained: policy.TrainedModel) -> dict[str, Any]:
@@ -341,12 +319,13 @@ def ensure_certificate(settings: Settings) -> None:
 
     A certificate of other settings of the certification is made again.
     """
-    path, recorded = certificate_path(settings.run_dir), None
     # Another process may be training it.
     with store.locked(settings.run_dir, wait=True):
         # Called in any case: it checks that the policy has these settings.
         ensure_policy(settings)
-        if path.exists():
-            recorded = store.read_json(path).get("certification", {})
-        if recorded is None or store.differences(recorded, _asked_for(settings)):
-            certify_policy(settings)
+        if settings.certificate_path.exists():
+            recorded = store.read_json(settings.certificate_path)
+            recorded = recorded.get("certification", {})
+            if not store.differences(recorded, _asked_for(settings)):
+                return
+        certify_policy(settings)
