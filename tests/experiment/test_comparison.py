@@ -173,7 +173,7 @@ def test_a_row_that_was_made_with_other_settings_or_code_is_announced(tmp_path, 
     rows = comparing.collect_rows(listed, tmp_path, lambda cell: settings())
     assert {entry["system"] for entry in rows} == {"sfkd", "nominal"}
     said = capsys.readouterr().err
-    assert "1 cells were made with other settings" in said
+    assert "1 cells were made by other settings: left out" in said
     assert "icode-seed=0" in said
     assert "1 cells were made by other code" in said
 

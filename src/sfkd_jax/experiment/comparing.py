@@ -21,8 +21,11 @@ from sfkd_jax.experiment import command, data, evaluating, runs, stages
 from sfkd_jax.experiment.evaluating import EpisodeSet, SystemResult
 from sfkd_jax.experiment.options import ComparisonSettings, Settings
 from sfkd_jax.settings import plain, replace
+from sfkd_jax.training import TrainingStopped
 
 KIND = "cell"
+OF_A_ROW = (TrainingStopped, ValueError, store.ArtefactError, JaxRuntimeError)
+"""Errors that end a row and not the table; JAX's is of memory that does not suffice."""
 NUM_STORED_EPISODES = 2
 """Episodes of a cell whose arrays are stored for figures; its row covers them all."""
 
@@ -206,13 +209,12 @@ def collect_rows(
         pooled[cell._replace(seed=0)].append(row)
         if row.get("provenance", {}).get("source") != runs.source_hash():
             by_other_code.append(path)
-    notes = {
-        "with other settings: left out": others,
-        "by other code: used": by_other_code,
-    }
+    notes = {"other settings: left out": others, "other code: used": by_other_code}
     for note, paths in notes.items():
         if paths:
-            store.print_message(f"{len(paths)} cells were made {note}: {paths[0]}, …")
+            store.print_message(
+                f"{len(paths)} cells were made by {note}, such as {paths[0]}"
+            )
     rows = []
     for cell, trainings in pooled.items():
         if trainings:
@@ -298,8 +300,7 @@ class Comparison:
         """Print and store why a row failed, and go on with the others."""
         try:
             yield
-        # JAX raises if memory does not suffice, which another row may not need.
-        except (*command.EXPECTED, JaxRuntimeError) as reason:
+        except OF_A_ROW as reason:
             line = next(iter(str(reason).splitlines()), type(reason).__name__)
             self.failed[_name(group)] = line
             store.print_message(f"failed: {line}")
@@ -321,13 +322,7 @@ class Comparison:
                 stages.check_settings(self._of_policy(cell, settings))
 
     def _evaluate(self, group: list[Cell]) -> int:
-        """Evaluate the cells of one row under one controller that are not done.
-
-        Raises:
-            ValueError: settings that cannot be built.
-            ArtefactError: damaged files, or a policy made with other settings.
-            TrainingStopped: the training of the policy diverged.
-        """
+        """Evaluate the cells of one row under one controller that are not done."""
         evaluate, done = None, 0
         for cell, settings, path in self._pending(group):
             episodes = self._make_episodes(settings)
