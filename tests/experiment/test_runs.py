@@ -5,7 +5,7 @@ import json
 import numpy as np
 import pytest
 from composing import settings
-from helpers import dataset, last_line, run_command
+from helpers import dataset
 
 from sfkd_jax.experiment import data, runs, stages
 from sfkd_jax.settings import replace
@@ -94,14 +94,3 @@ def test_path_coordinates_for_data_and_model_or_for_neither():
     for overrides in (("dataset=standard",), ("model=sfkd", "controller=mppi")):
         with pytest.raises(ValueError, match="go together"):
             check(*overrides)
-
-
-@pytest.mark.exhaustive
-def test_a_sweep_of_data_sets_makes_each(tmp_path):
-    done = run_command(
-        "generate",
-        *("-m", "+experiment=smoke", "dataset.segments=40", "dataset.seed=0,1"),
-        cwd=tmp_path,
-    )
-    assert last_line(done)["segments"] == 40
-    assert len(list((tmp_path / "runs/datasets").iterdir())) == 2

@@ -48,7 +48,7 @@ def config(settings: Settings) -> dict[str, Any]:
         dataset["environment_known"] = environment.is_known
     return {
         "vehicle": plain(settings.vehicle),
-        "environment": plain({"low": environment.low, "high": environment.high}),
+        "environment": {"low": plain(environment.low), "high": plain(environment.high)},
         "dataset": dataset,
     }
 
@@ -62,12 +62,9 @@ def dataset_path(settings: Settings) -> Path:
 def column_names(settings: Settings) -> dict[str, list[str]]:
     """Return the columns of the logs by box; an unused environment has none."""
     named = settings.logs.columns if settings.logs else Columns()
-    env = list(named.environment) if settings.environment.is_known else []
-    return {
-        "state": list(named.state[BODY]),
-        "control": list(named.control),
-        "env": env,
-    }
+    env = named.environment if settings.environment.is_known else ()
+    columns = {"state": named.state[BODY], "control": named.control, "env": env}
+    return {box: list(names) for box, names in columns.items()}
 
 
 def ensure_dataset(settings: Settings) -> tuple[Dataset, str]:
@@ -239,20 +236,16 @@ def boxes(dataset: Dataset) -> dict[str, list[list[float]]]:
     of the environment is E.
     """
 
-    def hull(pick: Callable[[Trajectory], jax.Array]) -> list[list[float]]:
-        values = np.concatenate(
-            [np.asarray(pick(part)) for part in (dataset.train, dataset.calibration)]
-        )
-        flat = values.reshape(-1, values.shape[-1])
+    def hull(*values: Any) -> list[list[float]]:
+        flat = np.concatenate([np.reshape(one, (-1, one.shape[-1])) for one in values])
         return [flat.min(axis=0).tolist(), flat.max(axis=0).tolist()]
 
+    train, calibration = dataset.train, dataset.calibration
+    corners = dataset.env_low, dataset.env_high
     return {
-        "state": hull(lambda part: part.states[..., BODY]),
-        "control": hull(lambda part: part.controls),
-        "env": [
-            np.asarray(dataset.env_low).tolist(),
-            np.asarray(dataset.env_high).tolist(),
-        ],
+        "state": hull(train.states[..., BODY], calibration.states[..., BODY]),
+        "control": hull(train.controls, calibration.controls),
+        "env": [np.asarray(corner).tolist() for corner in corners],
     }
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import field, is_dataclass
+from functools import partial
 from pathlib import Path
 from typing import Annotated, Any, get_type_hints
 
@@ -36,6 +37,7 @@ from sfkd_jax.settings import OneOf, Values, parse, replace, schema, takes
 Overrides = dict[str, str | None]
 Seconds = Annotated[float, Interval("(2, inf)")]
 """Of an episode; the first two seconds are not scored."""
+empty: Any = partial(field, default_factory=dict)
 _BOX = ("env_low", "env_high")
 Segments = Annotated[int, Interval("[4, inf)")]
 
@@ -207,17 +209,15 @@ class ComparisonSettings:
     policies: Directory
     vehicles: Names = ()
     seeds: Annotated[tuple[NonNegativeInt, ...], MayBeEmpty()] = (0,)
-    controllers: dict[str, Annotated[list[str], MayBeEmpty()]] = field(
-        default_factory=dict
-    )
-    own_controllers: dict[str, Overrides] = field(default_factory=dict)
-    rows: Overrides = field(default_factory=dict)
+    controllers: dict[str, Annotated[list[str], MayBeEmpty()]] = empty()
+    own_controllers: dict[str, Overrides] = empty()
+    rows: Overrides = empty()
     one_seed: Names = ()
-    tuned: dict[str, dict[str, str]] = field(default_factory=dict)
+    tuned: dict[str, dict[str, str]] = empty()
     only: Names = ()
     share: tuple[NonNegativeInt, NonNegativeInt] | None = None
-    paper: dict[str, Any] = field(default_factory=dict)
-    page: dict[str, Any] = field(default_factory=dict)
+    paper: dict[str, Any] = empty()
+    page: dict[str, Any] = empty()
 
 
 @takes(export.write_controller)
@@ -316,15 +316,12 @@ def parse_settings(values: Values) -> Settings:
 
 def register() -> None:
     """Put the dataclasses of all groups into Hydra's store, as schemas."""
-    variants: dict[str, dict[str, type]] = {
-        "vehicle": {**build.VEHICLES},
-        "model": {**build.MODEL_SETTINGS},
-        "controller": {**build.CONTROLLER_SETTINGS},
-        "dataset": {
-            "": SimulatedSettings,
-            "path": AlongPathSettings,
-            "files": LogSettings,
-        },
+    datasets = {"": SimulatedSettings, "path": AlongPathSettings, "files": LogSettings}
+    variants: dict[str, Any] = {
+        "vehicle": build.VEHICLES,
+        "model": build.MODEL_SETTINGS,
+        "controller": build.CONTROLLER_SETTINGS,
+        "dataset": datasets,
     }
     for group, hint in get_type_hints(Settings).items():
         # Of `report` and `demo` the primary config has the values itself.
