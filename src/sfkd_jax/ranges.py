@@ -39,7 +39,6 @@ class Ascending:
 Real: TypeAlias = Annotated[float, Interval("(-inf, inf)")]
 Positive: TypeAlias = Annotated[float, Interval("(0, inf)")]
 Fraction: TypeAlias = Annotated[float, Interval("(0, 1)")]
-PositiveFraction: TypeAlias = Annotated[float, Interval("(0, 1]")]
 NonNegative: TypeAlias = Annotated[float, Interval("[0, inf)")]
 UnitInterval: TypeAlias = Annotated[float, Interval("[0, 1]")]
 NonNegativeInt: TypeAlias = Annotated[int, Interval("[0, inf)")]

@@ -179,7 +179,7 @@ class SystemEvaluation:
         """
         self._settings = settings
         self._plant = plant = build.build_vehicle(settings.vehicle)
-        self._timed: list[tuple[float, float] | None] = []
+        self._times: tuple[float, float] | None = None
         box: Any = settings.environment.box
         # Of logs the box is measured: their settings have none.
         if dataset is not None:
@@ -215,10 +215,10 @@ class SystemEvaluation:
         """Simulate and score one set of episodes, without and with side forces."""
         episode, scores, violation = self._scored(episodes, 0.0)
         # Timed once: a control step takes equally long on every scenario.
-        if not self._timed:
-            self._timed.append(self._act_ms(episodes))
+        if self._settings.evaluation.timed_steps and self._times is None:
+            self._times = self._act_ms(episodes)
         about = {"scenario": episodes.name}
-        row = evaluation.row(scores, self._columns | about, self._timed[0], violation)
+        row = evaluation.row(scores, self._columns | about, self._times, violation)
         if forces := self._settings.evaluation.side_forces:
             row["disturbed"] = []
         for force in forces:
@@ -279,11 +279,8 @@ class SystemEvaluation:
         steps = [step for step in OPEN_LOOP_STEPS if step <= horizon]
         return {str(step): float(distance[step - 1]) for step in steps}
 
-    def _act_ms(self, episodes: EpisodeSet) -> tuple[float, float] | None:
-        """Median and 99 % quantile of a compiled control step [ms]; None: not timed."""
-        steps = self._settings.evaluation.timed_steps
-        if not steps:
-            return None
+    def _act_ms(self, episodes: EpisodeSet) -> tuple[float, float]:
+        """Median and 99 % quantile of a compiled control step [ms]."""
         scenario = jax.tree.map(lambda leaf: leaf[0], episodes.scenarios)
         reference = evaluation.first_reference(
             scenario, horizon=self._settings.controller.horizon, dt=self._plant.dt
@@ -291,7 +288,7 @@ class SystemEvaluation:
         observed = (scenario.initial_state, scenario.envs[0], reference)
         act = jax.jit(self.controller.act)
         state, times = self.controller.init(episodes.keys[0]), []
-        for _ in range(WARM_UP + steps):
+        for _ in range(WARM_UP + self._settings.evaluation.timed_steps):
             start = time.perf_counter()
             _, state, _ = jax.block_until_ready(act(self.params, state, *observed))
             times.append(1e3 * (time.perf_counter() - start))
