@@ -14,9 +14,8 @@ from helpers import last_line, run_command, straight
 from sfkd_jax import demo, policy
 from sfkd_jax.certification import Certificate, verify
 
+KEY = jax.random.key(0)
 VEHICLES = sorted(entry.name for entry in demo.SHIPPED.iterdir())
-
-
 BODY = ("+experiment=s3_body", "controller=mppi_tiny")
 PATH = ("controller.mppi.num_samples=30",)
 
@@ -69,18 +68,10 @@ def test_shipped_policies_also_work_with_an_estimated_environment():
     with pytest.raises(ValueError, match="path coordinates"):
         policy.load(demo.SHIPPED / "kinematic", env_source="estimated")
     trained = policy.load(demo.SHIPPED / "kinematic_path", env_source="estimated")
-    act, state = (
-        jax.jit(trained.controller.act),
-        trained.controller.init(jax.random.key(0)),
-    )
-    observation, reference = jnp.asarray([0.0, 0.3, 0.0, 10.0]), straight(20)
-    control, _, info = act(
-        trained.params, state, observation, jnp.full(2, jnp.nan), reference
-    )
-    other, _, _ = act(
-        trained.params, state, observation, jnp.asarray([0.3, 8.0]), reference
-    )
+    act, state = jax.jit(trained.controller.act), trained.controller.init(KEY)
+    known = trained.params, state, jnp.asarray([0.0, 0.3, 0.0, 10.0])
+    control, _, info = act(*known, jnp.full(2, jnp.nan), straight(20))
+    other, _, _ = act(*known, jnp.asarray([0.3, 8.0]), straight(20))
     np.testing.assert_array_equal(control, other)
-    np.testing.assert_allclose(
-        info["env_estimate"], [0.6, 0.0], atol=1e-4
-    )  # nothing has moved yet
+    # Nothing has moved yet.
+    np.testing.assert_allclose(info["env_estimate"], [0.6, 0.0], atol=1e-4)

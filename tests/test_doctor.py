@@ -18,15 +18,14 @@ def test_it_reports_the_installation_and_writes_nothing(tmp_path):
 def test_an_extra_that_is_missing_or_broken_is_named_with_its_reason(
     monkeypatch, tmp_path
 ):
-    (tmp_path / "brokenextra.py").write_text(
+    (tmp_path / "broken_one.py").write_text(
         "raise RuntimeError('its library is of another version\\nand more')"
     )
     monkeypatch.syspath_prepend(tmp_path)
     assert doctor._broken(("json",)) is None
-    assert (
-        doctor._broken(("json", "no_such_module")) == "not installed (no_such_module)"
+    missing, broken = (
+        doctor._broken(("json", "no_such")),
+        doctor._broken(("broken_one",)),
     )
-    assert (
-        doctor._broken(("brokenextra",))
-        == "brokenextra does not load: its library is of another version"
-    )
+    assert missing == "not installed (no_such)"
+    assert broken == "broken_one does not load: its library is of another version"

@@ -9,6 +9,7 @@ import subprocess
 import sys
 import textwrap
 from functools import partial
+from itertools import product
 from pathlib import Path
 
 import numpy as np
@@ -98,10 +99,8 @@ def test_a_model_without_a_bound_is_evaluated_but_not_certified(smoke):
         "training.save_every=25",
         "evaluation.systems=[self]",
     )
-    trained = last_line(
-        run_command("train", "+experiment=smoke", *small, cwd=directory)
-    )
-    assert trained["alpha"] is None
+    done = run_command("train", "+experiment=smoke", *small, cwd=directory)
+    assert last_line(done)["alpha"] is None
     done = run_command("certify", "+experiment=smoke", *small, cwd=directory, code=2)
     assert done.stderr.strip().splitlines()[-1].startswith("sfkd_jax: refused:")
 
@@ -130,25 +129,20 @@ def test_a_lost_policy_is_finished_again_from_the_checkpoint(copied):
 def test_another_setting_of_the_controller_adds_rows_and_keeps_the_others(copied):
     other = "controller.mppi.num_samples=8"
     run_command("evaluate", "+experiment=smoke", other, cwd=copied)
-    rows = json.loads((copied / "runs/smoke/sfkd/seed=0/results.json").read_text())[
-        "rows"
-    ]
-    assert {(row["system"], row["controller"]) for row in rows} == {
-        (system, controller)
-        for system in ("sfkd", "nominal")
-        for controller in ("mppi_tiny", "mppi_tiny,mppi.num_samples=8")
-    }
+    text = (copied / "runs/smoke/sfkd/seed=0/results.json").read_text()
+    rows = {(row["system"], row["controller"]) for row in json.loads(text)["rows"]}
+    controllers = "mppi_tiny", "mppi_tiny,mppi.num_samples=8"
+    assert rows == set(product(("sfkd", "nominal"), controllers))
     report = last_line(run_command("report", "+experiment=smoke", cwd=copied))
     assert all((copied / figure).exists() for figure in report["figures"])
 
 
 @pytest.mark.exhaustive
 def test_without_systems_a_model_is_trained_alone_and_scored_for_a_search(smoke):
-    done = last_line(
-        run_command("train", "+experiment=smoke", "evaluation.systems=[]", cwd=smoke[0])
-    )
-    assert done["objective"] > 0
-    assert "certificate" not in done
+    asked = "+experiment=smoke", "evaluation.systems=[]"
+    document = last_line(run_command("train", *asked, cwd=smoke[0]))
+    assert document["objective"] > 0
+    assert "certificate" not in document
 
 
 def test_the_example_in_the_readme_runs_with_a_policy_of_its_first_command():
