@@ -27,9 +27,8 @@ EXTRAS = {
     "plants": ("vehiclemodels",),
     "cpp": ("iree.compiler", "iree.runtime"),
     "sweeps": (
-        "hydra_plugins.hydra_joblib_launcher",
+        *("hydra_plugins.hydra_joblib_launcher", "submitit"),
         "hydra_plugins.hydra_optuna_sweeper",
-        "submitit",
     ),
 }
 """Extra -> the modules that it installs."""

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import inspect
 import sys
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Mapping
 from functools import partial
 from typing import Annotated, Any, NamedTuple
 
@@ -33,13 +33,7 @@ from sfkd_jax.settings import (
     schema,
     takes,
 )
-from sfkd_jax.types import (
-    Control,
-    Model,
-    Reference,
-    Space,
-    State,
-)
+from sfkd_jax.types import Control, Model, Reference, Space, State
 
 PLANTS = {
     "kinematic": plants.kinematic,
@@ -97,12 +91,10 @@ def build_vehicle(settings: VehicleSettings | Values) -> plants.Vehicle:
     if options.get("step") is not None:
         options["step"] = plants.step_named(options["step"])
     plant = factory(**options)
+    if settings.inner_loop == "none":
+        return plant
     # Only the speed loop changes what the second control means.
-    return (
-        plants.with_speed_loop(plant, gain=settings.speed_gain)
-        if settings.inner_loop == "speed"
-        else plant
-    )
+    return plants.with_speed_loop(plant, gain=settings.speed_gain)
 
 
 @takes(scenarios.scenario, skip=("state_size", "dt", "duration"))
@@ -234,24 +226,6 @@ def build_driver(plant: plants.Vehicle) -> Driver:
 @takes(control.derive_path_law, skip=("coordinates", "env_low", "env_high"))
 class LawSettings:
     """The law of path coordinates, as arguments of `derive_path_law`."""
-
-
-def build_law(
-    settings: LawSettings | Values,
-    plant: plants.Vehicle,
-    *,
-    env_low: Sequence[float],
-    env_high: Sequence[float],
-) -> control.PathLaw:
-    """Derive the law of path coordinates from the vehicle's step, for e in E."""
-    settings = parse(LawSettings, settings, "dataset.law.")
-    return control.derive_path_law(
-        plant.step,
-        coordinates=len(plant.state_names) - 1,
-        env_low=tuple(map(float, env_low)),
-        env_high=tuple(map(float, env_high)),
-        **arguments(settings, control.derive_path_law),
-    )
 
 
 def build_loop(plant: plants.Vehicle, law: control.PathLaw) -> plants.Vehicle:

@@ -13,7 +13,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from sfkd_jax import build, store
-from sfkd_jax.control import PathLaw, law_from_arrays
+from sfkd_jax.control import PathLaw, derive_path_law, law_from_arrays
 from sfkd_jax.data import (
     PARTS,
     SCENARIOS,
@@ -211,7 +211,13 @@ def ensure_law(settings: Settings) -> PathLaw | None:
         plant = build.build_vehicle(settings.vehicle)
         store.print_message(f"deriving the law of vehicle {plant.name}")
         box: Any = settings.environment.box
-        derive = partial(build.build_law, settings.along_path.law, plant, **box)
+        derive = partial(
+            derive_path_law,
+            plant.step,
+            coordinates=len(plant.state_names) - 1,
+            **{name: tuple(map(float, ends)) for name, ends in box.items()},
+            **arguments(settings.along_path.law, derive_path_law),
+        )
         law = jax.device_get(jax.jit(derive)())._asdict()
         store.write_arrays(path, law, kind=LAW, config=about)
     return law_from_arrays(store.read_arrays(path, kind=LAW, config=about)[0])
