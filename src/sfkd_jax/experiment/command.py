@@ -9,12 +9,12 @@ import re
 import shlex
 import sys
 from collections.abc import Callable
+from importlib import metadata
 from pathlib import Path
 from typing import Any
 
 import hydra
 import jax
-import jaxlib
 from hydra.core.hydra_config import HydraConfig
 from hydra.types import RunMode
 from omegaconf import DictConfig, OmegaConf
@@ -137,7 +137,7 @@ def compile_fast() -> None:
     jax.config.update("jax_disable_most_optimizations", True)
     flags = [os.environ.get("XLA_FLAGS", "")]
     # Fusion by MLIR is half of the time. XLA aborts at a flag that it does not know.
-    if jaxlib.__version__.startswith("0.10."):
+    if metadata.version("jaxlib").startswith("0.10."):
         flags.append("--xla_cpu_use_fusion_emitters=false")
     # Read when the first program is compiled, which comes later.
     os.environ["XLA_FLAGS"] = " ".join(flags)
