@@ -1,12 +1,14 @@
-"""The results in the repository: what the pages say of them."""
+"""The results in the repository: docs/results.md says what its files hold."""
 
 import json
+import re
 
 import numpy as np
 import pytest
 
 from experiments import results
 
+PAGE = (results.HOME.parent / "docs" / "results.md").read_text("utf-8")
 PRETRAINED = results.HOME.parent / "src" / "sfkd_jax" / "pretrained"
 
 
@@ -43,6 +45,18 @@ def test_what_the_bound_costs_along_a_path():
             assert behind("benchmark_path", scenario, "oracle", vehicle) < 0.15
 
 
+def test_what_observing_the_environment_brings():
+    ratios = []
+    for vehicle in results.VEHICLES:
+        blind, sfkd = (
+            np.mean(row("benchmark", "s3", label, vehicle, "mppi")["rmse_mm"])
+            for label in ("sfkd_no_fiber", "sfkd")
+        )
+        ratios.append(blind / sfkd)
+    assert np.round([min(ratios), max(ratios)], 1).tolist() == [1.6, 3.3]
+    assert "1.6 to 3.3 times as large" in re.sub(r"\s+", " ", PAGE)
+
+
 @pytest.mark.parametrize(
     ("plant", "corridor", "error", "over_oracle"),
     [("dynamic", 0.143, 7.1, 1.012), ("kinematic", 0.380, 14.4, 1.096)],
@@ -60,6 +74,21 @@ def test_the_corridor_and_what_was_driven_in_it(plant, corridor, error, over_ora
     assert round(sfkd / oracle, 3) == over_oracle
 
 
+def test_adapting_on_cars_that_no_model_has_seen():
+    rows = json.loads((results.HOME / "commonroad.json").read_text("utf-8"))["rows"]
+    error = {
+        (one["row"], one["car"], one["friction"]): np.mean(one["second_half_mm"])
+        for one in rows
+    }
+    ratios = [
+        value / error["nominal", *where]
+        for (label, *where), value in error.items()
+        if label == "SFKD, adaptive"
+    ]
+    assert np.round([min(ratios), max(ratios)], 2).tolist() == [0.23, 0.34]
+    assert "0.23 to 0.34 times" in PAGE
+
+
 def test_what_the_bound_costs_in_the_body_frame():
     """The first page: up to 4.5 mm behind the oracle, of 8.3, and most rivals better."""
     rows = results.of_scenario("benchmark", "s2", ("mppi", "koopman_mpc"))
@@ -74,3 +103,32 @@ def test_what_the_bound_costs_in_the_body_frame():
         error[label] for label in error if label not in ("oracle", "nominal", "sfkd")
     ]
     assert sum(one < error["sfkd"] for one in rivals) > len(rivals) / 2
+
+
+def test_what_adaptation_brings():
+    """The sentences of docs/adaptation.md."""
+    file = results.HOME.parent / "benchmarks" / "adaptation.json"
+    rows = json.loads(file.read_text("utf-8"))["rows"]
+    found = {(one["car"], one["case"], one["row"]): one for one in rows}
+
+    def ratio(car, case):
+        knows, ours = (
+            np.mean(np.square(found[car, case, label]["rmse_mm"])) ** 0.5
+            for label in ("oracle that knows", "SFKD, adaptive")
+        )
+        return ours / knows
+
+    for car in ("dynamic", "kinematic"):
+        knows, blind, ours = (
+            np.mean(np.square(found[car, "force, 3 s", label]["rmse_mm"])) ** 0.5
+            for label in ("oracle that knows", "SFKD", "SFKD, adaptive")
+        )
+        assert (blind - ours) / (blind - knows) > 0.8
+    for case in ("mass + 30 %", "steering + 1 degree", "wheelbase + 5 %"):
+        assert ratio("dynamic", case) < 1.205
+    assert round(ratio("dynamic", "stiffness - 30 %"), 2) == 1.25
+    assert round(ratio("dynamic", "e not measured"), 1) == 1.2
+    assert 2.0 < ratio("kinematic", "e not measured") < 2.2
+    wrong = "friction 0.2, told 0.9, 12 m/s"
+    assert found["dynamic", wrong, "SFKD, adaptive, cautious"]["left_the_lane"] == 0
+    assert found["dynamic", wrong, "SFKD, adaptive"]["left_the_lane"] == 24

@@ -319,3 +319,14 @@ def test_kills_at_random_moments_leave_one_whole_file(path):
             rest = process.stdout.read().split()
         seen = version(path)
         assert not rest or seen >= int(rest[-1])
+
+
+def test_two_writers_and_a_reader_of_one_path_do_not_disturb_each_other(path):
+    code = "for n in range(1, 40): write(n)"
+    with child(path, code) as first, child(path, code) as second:
+        while first.poll() is None or second.poll() is None:
+            if path.exists():
+                version(path)
+    assert (first.returncode, second.returncode) == (0, 0)
+    assert version(path) == 39
+    assert names(path.parent) == [path.name]
