@@ -157,7 +157,8 @@ def load(
         env_source: "estimated" for a policy in path coordinates that estimates the
             environment and ignores the one it is given.
         adaptive: whether a policy in path coordinates estimates unmeasured forces and
-            errors of its inputs while driving, see `control.Adaptation`.
+            errors of its inputs while driving, see `control.Adaptation`, and slows down
+            where its plans are too far off for the lane, see `control.OnlineTube`.
 
     Raises:
         ArtefactError: as `restore`, or a certificate that does not hold.

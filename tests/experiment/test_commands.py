@@ -131,7 +131,7 @@ def test_another_setting_of_the_controller_adds_rows_and_keeps_the_others(copied
     run_command("evaluate", "+experiment=smoke", other, cwd=copied)
     text = (copied / "runs/smoke/sfkd/seed=0/results.json").read_text()
     rows = {(row["system"], row["controller"]) for row in json.loads(text)["rows"]}
-    controllers = "mppi_tiny", "mppi_tiny,mppi.num_samples=8"
+    controllers = "mppi", "mppi,mppi.num_samples=8"
     assert rows == set(product(("sfkd", "nominal"), controllers))
     report = last_line(run_command("report", "+experiment=smoke", cwd=copied))
     assert all((copied / figure).exists() for figure in report["figures"])
