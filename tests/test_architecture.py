@@ -81,15 +81,15 @@ HEAVY = {
 }
 """What `import sfkd_jax.control` does not load."""
 
-LINES = {"src": 28_700, "tests": 18_000, "benchmarks, experiments": 1_800}
-"""As they are. Asked: 20 000 and 15 000."""
-FILES_IN_SRC = 142
-"""Asked: 130."""
+LINES = {"src": 23_750, "tests": 15_300, "benchmarks, experiments": 1_800}
+"""As they are; 20 000 and 15 000 are aimed at."""
+FILES_IN_SRC = 123
+
 OPTIONS, EXPERIMENTS = 65, 10
-COMMITTED = {"*.json": 700_000, "figures": 2_700_000}
+COMMITTED = {"*.json": 660_000, "figures": 2_600_000}
 COMMENTS = 0.03
 """Share of the lines of src that are comments."""
-LONGEST_FILE, LONGEST_FUNCTION, MEDIAN_FUNCTION = 550, 80, 9
+LONGEST_FILE, LONGEST_FUNCTION, MEDIAN_FUNCTION = 500, 80, 9
 UNTYPED_SETTINGS = 0
 """Annotations `settings: dict[str, Any]` below the commands."""
 

@@ -1,6 +1,7 @@
 """A law derived from a plant's step: it stabilises the car and can be stored."""
 
 from functools import partial
+from pathlib import Path
 
 import jax
 import jax.numpy as jnp
@@ -8,12 +9,14 @@ import numpy as np
 import pytest
 from helpers import jit
 
-from sfkd_jax import plants
+import sfkd_jax
+from sfkd_jax import plants, policy
 from sfkd_jax.control import derive_path_law, law_from_arrays
 from sfkd_jax.geometry import path_state, path_step
 from sfkd_jax.types import BODY
 
 BOX = {"env_low": (0.3, -8.0), "env_high": (0.9, 8.0)}
+SHIPPED = Path(sfkd_jax.__file__).parent / "pretrained"
 PLANTS = {"kinematic": plants.kinematic(), "dynamic": plants.dynamic()}
 
 
@@ -84,3 +87,27 @@ def test_a_law_survives_being_stored(derived):
         jnp.asarray([0.42, -3.0]),
     )
     np.testing.assert_array_equal(again(*given), law(*given))
+
+
+@pytest.mark.exhaustive
+@pytest.mark.parametrize("name", PLANTS)
+def test_a_law_derived_again_is_that_of_the_shipped_policy(name):
+    """Friction and wind at their ends and centres; the stored tables are finer."""
+    stored = policy.restore(SHIPPED / f"{name}_path")
+    settings = stored.settings["dataset"]
+    options = {key: tuple(value) for key, value in BOX.items()}
+    options |= {
+        key: tuple(value) if isinstance(value, list) else value
+        for key, value in settings["law"].items()
+    }
+    options["points"] = (*options["points"][:2], 3)
+    size = stored.law.state.shape[-1]
+    derive = partial(derive_path_law, stored.vehicle.step, coordinates=size, **options)
+    law = jax.jit(derive)()
+    for entry in ("state", "control"):
+        table = getattr(stored.law, entry)[:, :, ::3, ::3]
+        np.testing.assert_allclose(getattr(law, entry), table, atol=1e-4)
+    # Differences in float32 round: hardly for the steering, by 0.01 for the speed.
+    for row, tolerance in ((0, 3e-4), (1, 1e-2)):
+        table = stored.law.gain[:, :, ::3, ::3, row]
+        np.testing.assert_allclose(law.gain[..., row, :], table, atol=tolerance)
