@@ -65,18 +65,19 @@ def mppi(law, **settings):
 
 def registered(name):
     """A planner as it is registered, with small settings and slew limits."""
-    planner = build.PLANNERS[name]
-    known = signature(planner.factory).parameters
+    known = signature(build.PLANNERS[name]).parameters
+    # One that takes no task solves a quadratic program of its own.
+    samples = "task" in known
     settings = {
         "name": name,
         "planner": name,
         name: {key: value for key, value in SMALL.items() if key in known},
         "task": {"terminal_weight": 1.0},
     }
-    if planner.samples:
+    if samples:
         settings |= {"sampling": "feedback"}
         settings["task"] |= {"control_rate": (0.5, 20.0)}
-    model, params = model_and_params("nominal" if planner.samples else "koopman_mpc")
+    model, params = model_and_params("nominal" if samples else "koopman_mpc")
     return build.build_controller(settings, model, PLANT, **BOX), params
 
 
