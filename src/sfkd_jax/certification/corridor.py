@@ -46,7 +46,7 @@ from sfkd_jax.types import (
     Trajectory,
 )
 
-ROADS = ("speed", "peak_curvature", "wavelengths", "lateral_acceleration")
+ROAD_SETTINGS = ("speed", "peak_curvature", "wavelengths", "lateral_acceleration")
 EXCITATION = ("steering_excitation", "speed_excitation")
 STREAM = 4
 """Stream folded into the data set's seed; the data set uses streams 0 to 2."""
@@ -124,7 +124,8 @@ def certify_corridor(
     Args:
         loop: of the policy.
         outputs: that part of the document, with a proved metric of each.
-        data: of the data set: `ROADS`, `EXCITATION`, env_low, env_high and seed.
+        data: of the data set: `ROAD_SETTINGS`, `EXCITATION`, env_low, env_high and
+            seed.
         level: 1 − δ.
         runs: number of runs of each part.
         duration: of a run [s].
@@ -139,7 +140,7 @@ def certify_corridor(
     began = time.perf_counter()
     claims = {n: OutputMetric.from_document(part) for n, part in outputs.items()}
     low, high = data["env_low"], data["env_high"]
-    excited = {name: data[name] for name in (*ROADS, *EXCITATION)}
+    excited = {name: data[name] for name in (*ROAD_SETTINGS, *EXCITATION)}
     # A stream of its own: the data set's runs must not reappear in its certificate.
     *run_keys, sensor_key, attack_key = jax.random.split(
         jax.random.fold_in(jax.random.key(data["seed"]), STREAM), 6
@@ -294,7 +295,7 @@ class _Search:
     Attributes:
         claim: proved metric of e_y.
         bound: of the radius of its tube, which is what is claimed [m].
-        data: of the data set: `ROADS`, env_low and env_high.
+        data: of the data set: `ROAD_SETTINGS`, env_low and env_high.
         held: steps between switches of e.
         steps: in all.
     """

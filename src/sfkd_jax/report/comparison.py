@@ -140,7 +140,8 @@ def _sweep(found: dict[str, Path], images: Path) -> list[Section]:
     shown = {name: own for name, own in shown.items() if len(set(own)) > 1}
     parts: list[Part] = [tables.table("Run", shown, [*found])]
     reasons = {
-        name: runs.read_certificate(run).get("reason") for name, run in found.items()
+        name: runs.certificate_document(run).get("reason")
+        for name, run in found.items()
     }
     refused = {name: reason for name, reason in reasons.items() if reason}
     if refused:
@@ -178,5 +179,5 @@ def _own_rows(run: Path, system: str) -> list[Row]:
     errors = runs.read_optional(run / "open_loop.json")
     ahead = [errors.get(key) or [] for key in ("steps", "position_rmse_m")]
     known = dict(zip(map(str, ahead[0]), ahead[1], strict=False))
-    alpha = runs.read_certificate(run).get("alpha")
+    alpha = runs.certificate_document(run).get("alpha")
     return [{"open_loop_rmse_m": known, "alpha": alpha, "scenario": "not evaluated"}]

@@ -91,7 +91,7 @@ def read_optional(path: Path) -> dict[str, Any]:
     return store.read_json(path) if path.exists() else {}
 
 
-def read_certificate(run: Path) -> dict[str, Any]:
+def certificate_document(run: Path) -> dict[str, Any]:
     """The certificate of a run; one about other weights is not valid."""
     certificate = read_optional(run / "certificate.json")
     path = run / f"policy{store.SUFFIX}"
@@ -131,7 +131,7 @@ def _sections(
 ) -> list[Section]:
     """All sections of the page; a file whose content does not fit is named."""
     results = read_optional(run_dir / "results.json")
-    certificate = read_certificate(run_dir)
+    certificate = certificate_document(run_dir)
     # Numbers of a certificate that does not hold are nowhere drawn.
     proof = certificate if holds(certificate) else {}
     half = dig(proof, "corridor", "corridor_m")

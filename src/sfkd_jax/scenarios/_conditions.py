@@ -14,7 +14,7 @@ Schedule = Float[Array, "time 2"]
 
 SWITCH_LEVELS = ((0.9, 0.0), (0.6, 4.0), (0.3, 8.0), (0.6, 4.0))
 """S3's order A, B, C, B, A, …: (friction, |wind|)."""
-PERIOD = 3.0
+SWITCH_PERIOD = 3.0
 """Between two switches of S3 [s]."""
 PEAK_WIND = 8.0
 """Largest gust of S2 [m/s]."""
@@ -70,13 +70,13 @@ def switching_road(key: Key, *, steps: int, dt: float) -> Schedule:
         dt: sampling period [s].
     """
     # One visit more, for the rest of a period at the end.
-    visits = int(steps * dt / PERIOD) + 1
+    visits = int(steps * dt / SWITCH_PERIOD) + 1
     sides = jax.random.rademacher(key, (visits,), dtype=float)
     levels = jnp.asarray(SWITCH_LEVELS)[jnp.arange(visits) % len(SWITCH_LEVELS)]
     # Friction is the first column and has no side.
     levels = levels.at[:, 1].multiply(sides)
     # The same hair, so that a period has the same number of steps each time.
-    visit = jnp.floor(jnp.arange(steps) * dt / PERIOD + 1e-6).astype(int)
+    visit = jnp.floor(jnp.arange(steps) * dt / SWITCH_PERIOD + 1e-6).astype(int)
     return levels[visit]
 
 

@@ -18,7 +18,7 @@ LANE = 3.5
 """Offset of a lane change [m]."""
 SECTIONS = (30.0, 25.0, 25.0)
 """Lengths of the change, the other lane and the change back [m], as in ISO 3888-1."""
-PERIOD = 150.0
+LANE_CHANGE_SPACING = 150.0
 """From one lane change to the next [m]."""
 
 
@@ -85,7 +85,7 @@ def double_lane_change(key: Key, length: float) -> Path:
     start_key, side_key = jax.random.split(key)
     start = jax.random.uniform(start_key, (), minval=20.0, maxval=50.0)
     s = jnp.arange(int(length / SPACING) + 2) * SPACING - start
-    s = jnp.where(s > 0, s % PERIOD, s)  # straight until the first change
+    s = jnp.where(s > 0, s % LANE_CHANGE_SPACING, s)  # straight until the first change
 
     def change(begin: float, over: float, towards: float) -> Float[Array, " point"]:
         share = jnp.clip((s - begin) / over, 0.0, 1.0)
