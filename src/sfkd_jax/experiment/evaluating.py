@@ -100,7 +100,10 @@ def _over_episodes(
     """
     if jax.default_backend() != "cpu":
         return jax.jit(jax.vmap(run))
-    compiled = jax.jit(run)
+    compiled, cores = jax.jit(run), os.cpu_count() or 1
+    # A process may be kept to some cores, as each of a comparison is.
+    if hasattr(os, "sched_getaffinity"):
+        cores = len(os.sched_getaffinity(0))
 
     def run_all(scenarios: Scenario, keys: Key) -> evaluation.Episode:
         count = len(keys)
@@ -110,7 +113,7 @@ def _over_episodes(
         ]
         # Ahead of the threads, which would compile the same program side by side.
         program = compiled.lower(*batch[0]).compile()
-        pool = ThreadPoolExecutor(min(count, os.cpu_count() or 1))
+        pool = ThreadPoolExecutor(min(count, cores))
         try:
             done = list(
                 pool.map(lambda one: jax.block_until_ready(program(*one)), batch)
