@@ -40,10 +40,9 @@ VARIANTS = {
     "no_residual": {"residual": "none"},
     "no_contraction": {"residual": "free"},
     "soft": {"residual": "free", "soft_penalty": 1.0},
-    "segment": {"frame": "segment"},
     "path": {"frame": "path"},
 }
-HARD = ("sfkd", "no_fiber", "no_transport", "segment")
+HARD = ("sfkd", "no_fiber", "no_transport")
 """Variants whose operator and residual are each bounded by construction (and are
 there).
 """

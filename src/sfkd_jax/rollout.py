@@ -253,7 +253,7 @@ def defects(
         along: the result of `fibers_along`, if it is available.
     """
     fibers, later = along or fibers_along(model, params, trajectory)
-    # One frame for all times, or z of the segment frame could not be compared.
+    # One frame for all times, or latents in a frame could not be compared.
     origin = model.encode(_at(fibers, 0), trajectory.states[0])
     observe = jax.vmap(model.observe, in_axes=(0, None, 0))
     now = observe(fibers, origin, trajectory.states[:-1])

@@ -99,15 +99,13 @@ def test_the_physical_tube_is_its_finite_sums():
     )
 
 
-@pytest.mark.parametrize("name", ["sfkd", "segment"])
-def test_free_running_predictions_stay_inside_the_physical_tube(name):
+def test_free_running_predictions_stay_inside_the_physical_tube():
     """Trajectories whose one-step disturbances are bounded as measured: position, yaw
     and body state for 12 steps, with a switch of the environment at every one of them.
     The theorem leaves no exception.
     """
-    model, params = model_and_params(name)
-    data = driven(24)
-    proved = certified(name)
+    model, params = model_and_params("sfkd")
+    data, proved = driven(24), certified("sfkd")
     measured = dict(zip(KINDS, residuals(model, params, data).largest().T, strict=True))
     each = jit(jax.vmap(lambda one: rollout(model, params, one)[0]))
     predicted = np.asarray(each(data))

@@ -76,13 +76,12 @@ def test_every_registered_model_is_tested_here():
 
 @pytest.mark.parametrize("name", EVERY)
 def test_a_state_comes_out_as_it_went_in(name, one):
-    """Shapes, finite numbers, and the pose; the segment frame learns its pose."""
+    """Shapes, finite numbers, and the pose."""
     out = run(name, one)
     assert out["start"].shape == out["stepped"].shape == out["moved"].shape == (4,)
     assert out["gap"].ndim == 1
     assert all(np.all(np.isfinite(leaf)) for leaf in jax.tree.leaves(out))
-    if name != "segment":
-        np.testing.assert_array_equal(out["start"][POSE], one.states[0, POSE])
+    np.testing.assert_array_equal(out["start"][POSE], one.states[0, POSE])
     # Observing the state that was encoded gives its latent.
     np.testing.assert_allclose(out["seen again"], 0.0, atol=1e-6)
 
@@ -162,9 +161,7 @@ def test_what_is_certified_is_what_is_multiplied_by(name, one):
     assert same(explicit.decoder[:-1], fiber.decoder[:-1], rtol=0, atol=0)
     assert bool(explicit.decoder) == (not model.along_path)
     if explicit.decoder:
-        scale = np.asarray(space().increment_scale) * (
-            20.0 if name == "segment" else 1.0
-        )
+        scale = np.asarray(space().increment_scale)
         np.testing.assert_allclose(
             explicit.decoder[-1],
             scale[:, None] * np.asarray(fiber.decoder[-1]),

@@ -27,8 +27,6 @@ from sfkd_jax.types import (
     Step,
 )
 
-SOLVERS = ("rk4", "euler")
-
 
 def state_model(
     init: Callable[[Key], Params],
@@ -76,11 +74,10 @@ def state_model(
 
 
 def physics(step: Step, *, along_path: bool = False) -> Model:
-    """Return a one-step function as a `Model` without parameters.
+    """Return (x, u, e) -> x one sampling period later as a `Model` without parameters.
 
     Args:
-        step: (x, u, e) -> x one sampling period later, passed in by the caller (models
-            never import the vehicle).
+        step: passed in by the caller (models never import the vehicle).
         along_path: whether x and u are those of `geometry`.
     """
     return state_model(
@@ -93,12 +90,7 @@ def physics(step: Step, *, along_path: bool = False) -> Model:
 
 
 class Conditioned(NamedTuple):
-    """The fiber of a model that reads e as one more input: nothing is precomputed.
-
-    Attributes:
-        params: of the networks.
-        env: scaled e.
-    """
+    """The fiber of a model that reads the scaled e as one more input."""
 
     params: Params
     env: Environment
@@ -125,7 +117,7 @@ def continuous(
     *,
     dt: float,
     environment: bool = True,
-    solver: str = "rk4",
+    solve: Callable[[Callable[[State], State], State, float], State] = runge_kutta,
     known: Callable[[Fiber, State, Control], State] | None = None,
     frame: str = "body",
 ) -> Model:
@@ -143,7 +135,7 @@ def continuous(
         rates: learned.
         dt: sampling period [s], the solver's step in training and in use.
         environment: whether e is used; if not, the fiber is that of zeros.
-        solver: "rk4" or "euler", in training and in use.
+        solve: (x -> dx/dt, x, dt) -> x after dt, in training and in use.
         known: (fiber, state, control) -> known dx/dt in the world frame and physical
             units, equivariant under SE(2). The rates are added to it, and m_g is
             omitted.
@@ -151,10 +143,8 @@ def continuous(
             ignored.
 
     Raises:
-        ValueError: an unknown solver or frame; a state of the wrong length, when it is
-            encoded.
+        ValueError: an unknown frame; a state of the wrong length, when it is encoded.
     """
-    check_choice("model.solver", solver, SOLVERS)
     check_choice("model.frame", frame, FRAMES)
     pose = frame == "body"
     # Known dynamics bring their own mean motion; learned rates start from the data's.
@@ -174,13 +164,7 @@ def continuous(
         return change if known is None else change + known(at, state, control)
 
     def step(at: Fiber, state: State, control: Control) -> State:
-        def rate(x: State) -> State:
-            return derivative(at, x, control)
-
-        # What the authors of ICODE use; with learned increments it loses nothing.
-        if solver == "euler":
-            return state + dt * rate(state)
-        return runge_kutta(rate, state, dt)
+        return solve(lambda x: derivative(at, x, control), state, dt)
 
     return state_model(
         rates.init,
@@ -201,11 +185,7 @@ def mlp(
 ) -> nn.Sequential:
     """Return the network W_L σ_{L-1}(… σ_1(W_1 x + b_1) …) + b_L.
 
-    Args:
-        hidden: widths of the hidden layers.
-        outputs: number of outputs.
-        activations: σ_1 … σ_{L-1}.
-        last: factor of the initial W_L; near 0, the initial rates vanish.
+    `last` is the factor of the initial W_L; near 0, the initial rates vanish.
     """
     layers = [
         part
@@ -251,8 +231,7 @@ def neural_ode(
     def rates(
         fiber: Conditioned, body: Float[Array, " body"], control: Control
     ) -> Float[Array, " rates"]:
-        # e is an input like any other: nothing of
-        # the network is fixed by the environment.
+        # e is an input like any other: nothing of the network is fixed by it.
         read = jnp.concatenate([body, control, fiber.env])
         return cast(jax.Array, network.apply({"params": fiber.params}, read))
 

@@ -9,8 +9,8 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from sfkd_jax.geometry import between, compose
-from sfkd_jax.models._networks import Encoder, apply
+from sfkd_jax.geometry import compose
+from sfkd_jax.models._networks import FRAMES, Encoder, apply
 from sfkd_jax.models.sfkd._learned import (
     LOWEST_RATE,
     Learned,
@@ -39,13 +39,9 @@ from sfkd_jax.types import (
     Structure,
 )
 
-FRAMES = ("body", "segment", "path")
-SEGMENT_STEPS = 20.0
-"""Pose increments per unit of the segment-frame pose: the paper's horizon."""
-
 
 class PosedLatent(NamedTuple):
-    """State of a rollout: z and a pose, in the segment frame that of its start."""
+    """State of a rollout: z and the pose."""
 
     pose: Pose
     z: Float[Array, " rank"]
@@ -91,9 +87,8 @@ class LatentModel:
     Attributes:
         space: measured scales.
         learned: everything learned except the encoder.
-        encoder: of the body state (and of the pose in the segment frame).
+        encoder: of the body state.
         environment: whether e is used.
-        segment: whether the pose relative to the start of the segment is part of z.
         soft_penalty: weight of `hinge`.
         beta: β of `hinge`.
     """
@@ -102,28 +97,19 @@ class LatentModel:
     learned: Networks
     encoder: Encoder
     environment: bool
-    segment: bool = False
     soft_penalty: float = 0.0
     beta: float = 0.0
-
-    @property
-    def pose_scale(self) -> Float[Array, " 3"]:
-        """Units of what the decoder predicts: a step's motion, or a segment's."""
-        # A segment sums up about that many increments.
-        scale = jnp.asarray(self.space.increment_scale)
-        return scale * SEGMENT_STEPS if self.segment else scale
 
     def init(self, key: Key) -> Params:
         """Draw initial parameters."""
         network_key, encoder_key = jax.random.split(key)
-        body = self.learned.body
-        inputs = jnp.zeros(body + 3 if self.segment else body)
+        body = jnp.zeros(self.learned.body)
         env = jnp.zeros(self.space.env_mean.shape[0])
         # The encoder reads ψ(e), which may have another size than e.
         embedding = jnp.zeros(self.learned.embedding)
         return {
             "networks": self.learned.init(network_key, env)["params"],
-            "encoder": self.encoder.init(encoder_key, inputs, embedding)["params"],
+            "encoder": self.encoder.init(encoder_key, body, embedding)["params"],
         }
 
     def _apply(self, params: Params, method: str, *inputs: Array) -> Any:
@@ -163,29 +149,14 @@ class LatentModel:
         )
 
     def encode(self, fiber: SfkdFiber, state: State) -> PosedLatent:
-        """Return the latent of a state, in a frame that starts at its pose."""
-        return self._lift(fiber, state[POSE], state)
-
-    def observe(
-        self, fiber: SfkdFiber, latent: PosedLatent, state: State
-    ) -> PosedLatent:
-        """Return the latent of a state, in the frame of `latent`."""
-        # Of the frames only the segment's has the pose in z, relative to its start.
-        return self._lift(fiber, latent.pose if self.segment else state[POSE], state)
-
-    def _lift(self, fiber: SfkdFiber, at: Pose, state: State) -> PosedLatent:
-        """The latent of a state in the frame of a pose."""
-        inputs = self.space.scaled_body(state)
-        # The paper's literal reading: the pose is one more input of the lift.
-        if self.segment:
-            motion = between(at, state[POSE]) / self.pose_scale
-            inputs = jnp.concatenate([motion, inputs])
-        z = self.encoder.apply({"params": fiber.encoder}, inputs, fiber.local.embedding)
+        """Return the latent of a state, beside its pose."""
+        body = self.space.scaled_body(state)
+        z = self.encoder.apply({"params": fiber.encoder}, body, fiber.local.embedding)
         z = cast(jax.Array, z)
         # Rotated after the lift, so that z of two environments differ by an isometry.
         if self.learned.transport:
             z = rotate_planes(fiber.local.tangents, z)
-        return PosedLatent(at, z)
+        return PosedLatent(state[POSE], z)
 
     def step(
         self, fiber: SfkdFiber, latent: PosedLatent, control: Control
@@ -200,24 +171,20 @@ class LatentModel:
         # Decided by the shape of the weights, that is, when the program is traced.
         if fiber.residual:
             z = z + apply(fiber.residual, local.residual.at(u), latent.z)
-        if self.segment or not fiber.decoder:
-            # The pose is part of z, or there is none: that of the start stays.
+        # Along a path there is no pose: that of the start stays.
+        if not fiber.decoder:
             return PosedLatent(latent.pose, z)
         # From z before the step: the motion during the period starts there.
         motion = apply(fiber.decoder, local.decoder.at(u), latent.z)
         # Mean plus scale: an output of 0 is the average motion of the data.
-        motion = space.increment_mean + self.pose_scale * motion
+        motion = space.increment_mean + space.increment_scale * motion
         return PosedLatent(compose(latent.pose, motion), z)
 
     def decode(self, fiber: SfkdFiber, latent: PosedLatent) -> State:
         """Return the state of a latent."""
-        pose, space = latent.pose, self.space
-        if self.segment:
-            # A read-out of a state, so without the control of a step.
-            offset = apply(fiber.decoder, fiber.local.decoder.offsets, latent.z)
-            pose = compose(pose, self.pose_scale * offset)
         scaled = fiber.readout @ latent.z + fiber.centre
-        return jnp.concatenate([pose, space.body_mean + space.body_scale * scaled])
+        body = self.space.body_mean + self.space.body_scale * scaled
+        return jnp.concatenate([latent.pose, body])
 
     def transport(
         self, fiber: SfkdFiber, fiber_next: SfkdFiber, latent: PosedLatent
@@ -235,7 +202,8 @@ class LatentModel:
         decoder = shared.decoder.matrices
         if learned.pose:
             # In physical units, so that a certificate needs no scales of the model.
-            decoder = (*decoder[:-1], self.pose_scale[:, None] * decoder[-1])
+            scale = jnp.asarray(self.space.increment_scale)[:, None]
+            decoder = (*decoder[:-1], scale * decoder[-1])
         transport = "rotation" if learned.transport else "identity"
         return Explicit(
             # The vertices, not a mixture: what holds at each of them holds for every e.
@@ -265,7 +233,8 @@ class LatentModel:
             step=self.step,
             decode=self.decode,
             transport=self.transport,
-            observe=self.observe,
+            # z holds nothing of an earlier pose.
+            observe=lambda fiber, latent, state: self.encode(fiber, state),
             vector=lambda latent: latent.z,
             shared=self.shared,
             fitting=Fitting(penalty=self.hinge if self.soft_penalty else None),
@@ -322,9 +291,8 @@ def sfkd(
         encoder_hidden: hidden width of φ.
         linear_lift: whether φ contains W_0 s, see `Encoder`.
         embedding: size of ψ(e).
-        frame: "body" composes the pose on SE(2) outside z; "segment" is the paper's
-            reading, the pose relative to the start of the window inside z; "path" has
-            path coordinates as body (see `geometry`) and no pose.
+        frame: "body" composes the pose on SE(2) outside z; "path" has path coordinates
+            as body (see `geometry`) and no pose.
         residual: "sandwich", "free" (no bound by construction; ||A_j|| ≤ ρ) or "none"
             (||A_j|| ≤ ρ).
         budget: "joint" or "sum", of a sandwich residual.
@@ -377,10 +345,7 @@ def sfkd(
             f"model.rho + model.beta above {LOWEST_RATE}, got {rho + beta}"
         )
     encoder = Encoder(rank, encoder_hidden, linear_lift)
-    segment = frame == "segment"
-    return LatentModel(
-        space, learned, encoder, environment, segment, soft_penalty, beta
-    ).model()
+    return LatentModel(space, learned, encoder, environment, soft_penalty, beta).model()
 
 
 def rotate_planes(
