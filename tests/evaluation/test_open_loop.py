@@ -57,32 +57,10 @@ def rolled(step, start, controls):
     return jax.tree.map(lambda leaf: leaf[None], Trajectory(states, controls, envs))
 
 
-def circle(yaw_rate, speed=8.0):
-    """States on a circle at constant speed, exact."""
-    t = DT * np.arange(STEPS + 1)
-    h = 0.5 * yaw_rate * t
-    chord = speed * t * np.sinc(h / np.pi)
-    x, y = chord * np.cos(0.3 + h), chord * np.sin(0.3 + h)
-    states = np.stack([x, y, 0.3 + yaw_rate * t, np.full_like(t, speed)], axis=1)
-    zeros = jnp.zeros((1, STEPS, 2))
-    return Trajectory(jnp.asarray(states, dtype=jnp.float32)[None], zeros, zeros)
-
-
 def errors(test, **options):
     options = {"nominal": PLANT.nominal, "dt": DT, "horizon": HORIZON} | options
     result = evaluation.baselines(dataset().train, **options)
     return {name: np.asarray(jit(rmse)(test)) for name, rmse in result.items()}
-
-
-def test_on_a_circle_a_constant_turn_is_exact_and_a_constant_velocity_is_not():
-    result = errors(circle(0.5))
-    nothing = np.zeros((HORIZON, 4))
-    np.testing.assert_allclose(result["constant_turn"], nothing, atol=2e-4)
-    turning, missed = result["constant_velocity"], 0.05 * np.arange(1, HORIZON + 1)
-    np.testing.assert_allclose(turning[:, 2], missed, rtol=1e-3)
-    assert turning[-1, 1] > 1.0
-    straight = errors(circle(0.0))["constant_velocity"]
-    np.testing.assert_allclose(straight, nothing, atol=1e-4)
 
 
 @pytest.mark.parametrize(
@@ -105,21 +83,16 @@ def test_the_fit_finds_the_parameters_of_a_bicycle(curvature, slip, spread, is_a
         np.testing.assert_allclose(result, wanted, rtol=2e-2, atol=2e-3)
 
 
-def test_the_fitted_bicycle_errs_least_on_the_plant():
+def test_the_fitted_bicycle_errs_less_than_the_nominal_one():
     rmse = {name: np.hypot(*e[-1, :2]) for name, e in errors(dataset().test).items()}
-    assert min(rmse, key=rmse.get) == "fitted_bicycle"
-    assert rmse["fitted_bicycle"] < 0.8 * rmse["constant_velocity"]
+    assert rmse["fitted_bicycle"] < 0.9 * rmse["kinematic_bicycle"]
 
 
-def test_in_path_coordinates_a_straight_course_beside_a_straight_path_is_exact():
+def test_in_path_coordinates_there_is_the_nominal_bicycle_alone():
     coordinates = jnp.asarray([[0.0, 0.0, 0.0, 0.5, 0.0, 8.0]])
     states = jnp.tile(coordinates, (STEPS + 1, 1))[None]
     controls = jnp.tile(jnp.asarray([0.0, 0.0, 0.0, 8.0]), (1, STEPS, 1))
     data = Trajectory(states, controls, jnp.zeros((1, STEPS, 2)))
-    loop = {"nominal": build.build_loop(PLANT, any_law(3)).nominal, "along_path": True}
-    result = errors(data, **loop)
-    assert set(result) == {"constant_velocity", "constant_turn", "kinematic_bicycle"}
-    for name in ("constant_velocity", "constant_turn"):
-        np.testing.assert_allclose(result[name], np.zeros((HORIZON, 4)), atol=1e-4)
-    bent = data._replace(controls=controls.at[..., 2].set(0.02))
-    assert errors(bent, **loop)["constant_velocity"][-1, 1] > 0.1
+    loop = build.build_loop(PLANT, any_law(3))
+    (result,) = errors(data, nominal=loop.nominal, along_path=True).values()
+    np.testing.assert_array_equal(result[:, 0], np.zeros(HORIZON))

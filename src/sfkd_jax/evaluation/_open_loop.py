@@ -1,4 +1,4 @@
-"""Open-loop prediction errors by horizon, of models and of naive predictors."""
+"""Open-loop prediction errors by horizon, of models and of bicycles."""
 
 from __future__ import annotations
 
@@ -12,15 +12,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from sfkd_jax.geometry import (
-    CURVATURE,
-    HEADING,
-    LATERAL,
-    PATH_SPEED,
-    path_step,
-    wrap_angle,
-)
-from sfkd_jax.geometry import path_state as as_path_state
+from sfkd_jax.geometry import HEADING, LATERAL, PATH_SPEED, wrap_angle
 from sfkd_jax.rollout import in_batches, rollout, sliding_windows, state_errors
 from sfkd_jax.types import (
     BODY,
@@ -71,7 +63,7 @@ def open_loop(
 def _prediction_rmse(
     predict: Predictor, trajectories: Trajectory, *, horizon: int, along_path: bool
 ) -> Float[Array, "horizon 4"]:
-    """The RMSE of any predictor; `along_path`: states are those of `path_step`."""
+    """The RMSE of any predictor, in the world or along a path."""
     cut = jax.vmap(partial(sliding_windows, horizon=horizon, stride=horizon))
     windows = jax.tree.map(
         lambda leaf: leaf.reshape(-1, *leaf.shape[2:]), cut(trajectories)
@@ -161,37 +153,26 @@ def baselines(
     horizon: int,
     along_path: bool = False,
 ) -> dict[str, Callable[[Trajectory], Float[Array, "horizon 4"]]]:
-    """Return naive predictors as trajectories -> RMSE on the windows of `open_loop`.
-
-    "constant_velocity" keeps course and speed, "constant_turn" also the yaw rate,
-    measured over the first step. "kinematic_bicycle" is the nominal model,
-    "fitted_bicycle" one with parameters fitted to the training data (not in path
-    coordinates, where controls are perturbations of a law).
+    """Return bicycles as trajectories -> RMSE on the windows of `open_loop`, by name.
 
     Args:
         train: for the fit.
         nominal: step of the kinematic bicycle on these states and controls.
         dt: sampling period [s].
         horizon: steps.
-        along_path: whether states are those of `path_step`.
+        along_path: whether states are those of path coordinates.
 
     Raises:
         ValueError: the horizon does not fit the trajectories.
     """
-    turn = partial(_hold_yaw_rate, dt=dt, along_path=along_path)
-    # Ordered by what they know: nothing, the yaw rate, the bicycle, the data.
-    predictors: dict[str, Predictor] = {
-        "constant_velocity": partial(turn, measured=False),
-        "constant_turn": partial(turn, measured=True),
-        "kinematic_bicycle": partial(_simulate, nominal),
-    }
+    steps = {"kinematic_bicycle": nominal}
     # Controls along a path are perturbations of a law: no bicycle explains them.
     if not along_path:
-        fitted = FittedBicycle.fit(train, dt=dt)
-        predictors["fitted_bicycle"] = partial(_simulate, fitted.step)
+        steps["fitted_bicycle"] = FittedBicycle.fit(train, dt=dt).step
+    common: dict[str, Any] = {"horizon": horizon, "along_path": along_path}
     return {
-        name: partial(_prediction_rmse, predict, horizon=horizon, along_path=along_path)
-        for name, predict in predictors.items()
+        name: partial(_prediction_rmse, partial(_simulate, step), **common)
+        for name, step in steps.items()
     }
 
 
@@ -203,40 +184,3 @@ def _simulate(step: Step, window: Trajectory) -> Float[Array, "horizon state"]:
         return after, after
 
     return jax.lax.scan(advance, window.states[0], (window.controls, window.envs))[1]
-
-
-def _hold_yaw_rate(
-    window: Trajectory, *, dt: float, along_path: bool, measured: bool
-) -> Float[Array, "horizon state"]:
-    """States at constant speed on a circle, or straight on where nothing is measured.
-
-    The yaw rate takes the place of the first control; along a path the curvature stays
-    that of the controls.
-    """
-
-    def turn(state: State, control: Control, env: Environment) -> State:
-        del env
-        half = 0.5 * control[0] * dt
-        length, course = state[3] * dt * jnp.sinc(half / jnp.pi), state[2] + half
-        move = [length * jnp.cos(course), length * jnp.sin(course), 2.0 * half]
-        return state.at[:3].add(jnp.stack(move))
-
-    follow = path_step(turn)
-
-    def turn_along_path(state: State, control: Control, env: Environment) -> State:
-        return as_path_state(follow(state[BODY], control, control[CURVATURE], env))
-
-    # Measured over the first step, which is therefore predicted with hindsight.
-    before, after = window.states[0], window.states[1]
-    if along_path:
-        before, after = before[BODY], after[BODY]
-        # Relative to the path, which turns as well.
-        yaw_rate = wrap_angle(after[HEADING] - before[HEADING]) / dt
-        yaw_rate += window.controls[0, CURVATURE] * before[PATH_SPEED]
-    else:
-        yaw_rate = wrap_angle(after[2] - before[2]) / dt
-    rates = jnp.full(len(window.controls), yaw_rate if measured else 0.0)
-    step = turn_along_path if along_path else turn
-    return _simulate(
-        step, window._replace(controls=window.controls.at[:, 0].set(rates))
-    )

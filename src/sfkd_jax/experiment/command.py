@@ -41,10 +41,9 @@ Run = Callable[[Settings], dict[str, Any]]
 def hydra_command(run: Run) -> Callable[[], None]:
     """Make `run(settings) -> document` a command.
 
-    The command composes its settings, works, and prints one JSON object as the last
-    line of stdout. Expected errors become one line on stderr and an exit code. A job of
-    a sweep returns the document's "objective" to the sweeper; one that fails raises,
-    which Hydra reports after all other jobs.
+    The command prints the document as JSON in the last line of stdout. Expected errors
+    become one line on stderr and an exit code. A job of a sweep returns "objective" to
+    the sweeper; one that fails raises, which Hydra reports after all other jobs.
     """
     # Before Hydra composes, since it checks options against these schemas.
     register()
@@ -53,13 +52,14 @@ def hydra_command(run: Run) -> Callable[[], None]:
         sweeping = HydraConfig.get().mode == RunMode.MULTIRUN
         try:
             settings = named_for_controller(settings_of(composed))
+            settings = named_for_sweep(settings) if sweeping else settings
             use_compilation_cache(Path(settings.root))
             if not settings.optimized:
                 compile_fast()
             # Small factorisations, in every step of a training: threads of BLAS would
             # wait for each other, and keep XLA's waiting, for half of the time.
             with threadpool_limits(1, user_api="blas"):
-                document = run(named_for_sweep(settings) if sweeping else settings)
+                document = run(settings)
         except KeyboardInterrupt:
             _report("interrupted; the same command continues")
             # The interpreter would first wait for compiled code that nobody needs.
@@ -91,36 +91,30 @@ def conf_path() -> str:
 
 
 def settings_of(composed: DictConfig) -> Settings:
-    """Return composed options as checked settings.
-
-    Raises:
-        ValueError: naming the setting.
-    """
+    """Return composed options as checked settings."""
     values: Any = OmegaConf.to_container(composed, resolve=True)
     return parse_settings(values)
 
 
+def _typed() -> list[str]:
+    """The overrides of the running command, as they were typed."""
+    return [*HydraConfig.get().overrides.task]
+
+
 def compose(*overrides: str) -> Settings:
     """Return the settings of the running command under further overrides."""
-    typed = HydraConfig.get().overrides.task
-    return settings_of(hydra.compose("config", [*typed, *overrides]))
+    return settings_of(hydra.compose("config", [*_typed(), *overrides]))
 
 
-def command_line(name: str) -> str | None:
+def command_line(name: str) -> str:
     """Return the running command as typed in a shell, without `root=`."""
-    if not HydraConfig.initialized():
-        return None
-    typed = HydraConfig.get().overrides.task
     # A path of this machine means nothing to whoever repeats the command.
-    kept = [word for word in typed if not word.startswith("root=")]
+    kept = [word for word in _typed() if not word.startswith("root=")]
     return " ".join(["python -m", f"sfkd_jax.{name}", shlex.join(kept)]).strip()
 
 
 def use_compilation_cache(root: Path) -> None:
-    """Keep compiled programs below `root`, or where the user has said.
-
-    The second run of a day then compiles nothing that the first one did.
-    """
+    """Keep compiled programs below `root`, or where the user has said."""
     defaults = {
         "jax_compilation_cache_dir": str(root.resolve() / "compiled"),
         "jax_persistent_cache_min_compile_time_secs": 0.0,
@@ -146,12 +140,10 @@ def compile_fast() -> None:
 def named_for_sweep(settings: Settings) -> Settings:
     """Return the settings of a job of a sweep under a run name of its own.
 
-    It contains what the job overrides and what changes the weights, so that jobs do not
-    write into one directory. Model and seed are part of the path anyway.
+    It says what changes the weights, so that jobs do not write into one directory.
     """
-    overrides = [word.lstrip("+") for word in HydraConfig.get().overrides.task]
     # By setting, such as "training.steps": model and seed choose directories already.
-    changed = {word: word.split("=")[0] for word in overrides}
+    changed = {word.lstrip("+"): word.lstrip("+").split("=")[0] for word in _typed()}
     overrides = [
         word
         for word, setting in changed.items()
@@ -172,11 +164,11 @@ def named_for_controller(settings: Settings) -> Settings:
 
     Rows of results.json are told apart by names: with other samples it is another row.
     """
-    typed = [word.lstrip("+") for word in HydraConfig.get().overrides.task]
+    typed = [word.lstrip("+").partition("controller.") for word in _typed()]
     changed = [
-        word.removeprefix("controller.")
-        for word in typed
-        if word.startswith("controller.") and not word.startswith("controller.name=")
+        word
+        for before, group, word in typed
+        if group and not before and not word.startswith("name=")
     ]
     if not changed:
         return settings

@@ -50,9 +50,6 @@ def list_cells(comparison: ComparisonSettings) -> list[Cell]:
 
     Every row is evaluated from one seed before any from the next, so that a table that
     was interrupted still compares all rows.
-
-    Raises:
-        ValueError: `only` or `one_seed` names an unknown row, or a seed is repeated.
     """
     rows, seeds = comparison.rows, comparison.seeds
     for name in ("only", "one_seed"):
@@ -89,9 +86,6 @@ def take_share(
     """Return the groups of every n-th row from the k-th on, share = [k, n].
 
     All groups of a row are in one share, because they use the same policy.
-
-    Raises:
-        ValueError: not 0 ≤ k < n.
     """
     if share is None:
         return groups
@@ -119,10 +113,7 @@ def overrides(cell: Cell, comparison: ComparisonSettings) -> list[str]:
 
 
 def settings_hash(settings: Settings) -> str:
-    """Hash the settings that the result of a cell depends on.
-
-    Neither the code nor the location of the artefacts enters.
-    """
+    """Hash the settings that the result of a cell depends on, not the code."""
     names = ("environment", "controller", "scenario", "certification", "evaluation")
     chosen = {name: plain(getattr(settings, name)) for name in names}
     return store.sha256(runs.identity(settings) | chosen)
@@ -134,11 +125,8 @@ def episodes_hash(settings: Settings) -> str:
     Rows with another hash met other episodes, and are not paired with it.
     """
     protocol = settings.evaluation
-    names = ("seed", "episodes", "episode_s")
-    return store.sha256(
-        {name: getattr(protocol, name) for name in names}
-        | {"vehicle": plain(settings.vehicle), "scenario": plain(settings.scenario)}
-    )
+    counts = protocol.seed, protocol.episodes, protocol.episode_s
+    return store.sha256([*counts, plain(settings.vehicle), plain(settings.scenario)])
 
 
 def is_done(path: Path, settings: Settings) -> bool:
@@ -160,18 +148,12 @@ def write_cell(
 ) -> Row:
     """Write the arrays of the first episodes, then the row, and return the row.
 
-    Args:
-        path: of the cell, without suffix.
-        directory: of the comparison.
-        settings: of the cell.
-        episodes: that were simulated.
-        result: row and arrays.
+    `path` is that of the cell without suffix, `directory` that of the comparison.
     """
-    scenarios = episodes.scenarios
-    arrays = result.arrays | {"envs": scenarios.envs, "path": scenarios.path.points}
     # Copied to the host first: slices on a device would be compiled.
     stored = {
-        name: np.asarray(array)[:NUM_STORED_EPISODES] for name, array in arrays.items()
+        name: np.asarray(array)[:NUM_STORED_EPISODES]
+        for name, array in (result.arrays | episodes.road).items()
     }
     stored["dt"] = np.asarray(settings.vehicle.dt)
     file = path.with_name(f"{path.name}.safetensors")
@@ -189,10 +171,7 @@ def write_cell(
 def collect_rows(
     cells: list[Cell], directory: Path, compose_cell: Callable[[Cell], Settings]
 ) -> list[Row]:
-    """Return the rows of all stored cells, with seeds pooled and systems compared.
-
-    Prints how many cells were made with other settings, and how many by other code.
-    """
+    """Return the rows of all stored cells, with seeds pooled and systems compared."""
     pooled: dict[Cell, list[Row]] = {cell._replace(seed=0): [] for cell in cells}
     others, by_other_code = [], []
     for cell in cells:
@@ -247,15 +226,11 @@ class Comparison:
         self._episodes: dict[str, EpisodeSet] = {}
 
     def evaluate(self) -> int:
-        """Evaluate all cells that are not done, and return how many there were.
-
-        Every row is built before the first one is trained; those that cannot be built
-        are named and left out. With `comparison.share` only this share of the rows is
-        evaluated.
-        """
+        """Evaluate all cells that are not done, and return how many there were."""
         began, done = time.perf_counter(), 0
         share = self._settings.comparison.share
         groups = take_share(group_cells(self.cells), share)
+        # Every row is built before the first one is trained.
         for group in groups:
             with self._named_if_it_fails(group):
                 self._check(group)
@@ -273,11 +248,7 @@ class Comparison:
         return done
 
     def rows(self) -> list[Row]:
-        """Return the rows of all stored cells.
-
-        Raises:
-            ValueError: there is none.
-        """
+        """Return the rows of all stored cells; a ValueError if there is none."""
         with store.as_artefact_error(self.directory / "cells"):
             rows = collect_rows(self.cells, self.directory, self._compose)
         if not rows:

@@ -82,11 +82,7 @@ def ensure_dataset(settings: Settings) -> tuple[Dataset, str]:
 
 
 def _simulate(settings: Settings) -> Dataset:
-    """Simulate a data set with the vehicle of the settings.
-
-    Raises:
-        ValueError: the vehicle has no step, or one that does not return a state.
-    """
+    """Simulate a data set with the vehicle of the settings."""
     check_step(build.build_vehicle(settings.vehicle))
     options: Any = settings.dataset
     # A key each: other shares of the split leave the trajectories as they are.
@@ -122,11 +118,7 @@ def _generator(
 
 
 def _read_logs(settings: Settings, logs: LogSettings) -> Dataset:
-    """Read a data set from logs, and write what it covers beside it.
-
-    Raises:
-        ValueError: the columns do not match the state of the vehicle.
-    """
+    """Read a data set from logs, and write what it covers beside it."""
     plant = build.build_vehicle(settings.vehicle)
     columns = Columns(**arguments(logs.columns, Columns))
     if len(columns.state) != len(plant.state_names):
@@ -168,24 +160,18 @@ def write(settings: Settings, dataset: Dataset) -> None:
 
 
 def read(settings: Settings) -> tuple[Dataset, str]:
-    """Return a data set and its hash.
-
-    Raises:
-        ArtefactError: missing, damaged, or made with other settings.
-    """
+    """Return a data set and its hash."""
     path, scenarios = dataset_path(settings), None
     arrays, manifest = store.read_arrays(path, kind=DATASET, config=config(settings))
+
+    def named(name: str) -> list[jax.Array]:
+        return [jnp.asarray(arrays[f"{part}/{name}"]) for part in PARTS]
+
     with store.as_artefact_error(path):
-        parts = [
-            Trajectory(
-                *(jnp.asarray(arrays[f"{part}/{name}"]) for name in Trajectory._fields)
-            )
-            for part in PARTS
-        ]
+        fields = map(named, Trajectory._fields)
+        parts = [Trajectory(*own) for own in zip(*fields, strict=True)]
         if settings.logs is None:
-            scenarios = {
-                part: jnp.asarray(arrays[f"{part}/scenario"]) for part in PARTS
-            }
+            scenarios = dict(zip(PARTS, named("scenario"), strict=True))
     # Over all parts: E does not depend on how they were split.
     envs = np.concatenate([np.asarray(part.envs) for part in parts])
     low, high = environment_box(envs, *settings.environment.box.values())
@@ -199,11 +185,7 @@ def read(settings: Settings) -> tuple[Dataset, str]:
 
 
 def ensure_law(settings: Settings) -> PathLaw | None:
-    """Return the law of the data set; derive it if it is missing.
-
-    Returns:
-        The law, or None if the data set is not in path coordinates.
-    """
+    """Return the law of the data set, derived if it is missing; None in the world."""
     if settings.along_path is None:
         return None
     path, about = dataset_path(settings).with_name("law.safetensors"), config(settings)
@@ -224,11 +206,7 @@ def ensure_law(settings: Settings) -> PathLaw | None:
 
 
 def closed_loop(settings: Settings) -> Vehicle:
-    """Return the closed loop of vehicle and law, in the coordinates of `path_frame`.
-
-    Raises:
-        ValueError: the data set is not in path coordinates.
-    """
+    """Return the closed loop of vehicle and law, in path coordinates."""
     law = ensure_law(settings)
     if law is None:
         raise ValueError("a loop along a path needs dataset=path")
@@ -285,11 +263,7 @@ _SWITCHING: dict[tuple[Path, int], Trajectory] = {}
 
 
 def check_calibration_size(dataset: Dataset, level: float) -> None:
-    """Check before training that the calibration part supports the level.
-
-    Raises:
-        ValueError: naming the setting, and the largest level that is possible.
-    """
+    """Check before training that the calibration part supports the level."""
     count = dataset.calibration.controls.shape[0]
     # As `conformal_quantile` will ask, but before the training.
     if math.ceil((count + 1) * level) > count:

@@ -33,17 +33,20 @@ OPEN_LOOP_STEPS = (1, 5, 10, 20)
 
 
 class EpisodeSet(NamedTuple):
-    """Paired episodes that every system is evaluated on.
+    """Paired episodes of a scenario that every system is evaluated on.
 
-    Attributes:
-        name: of the scenario.
-        scenarios: one per episode, leading axis first.
-        keys: one per episode, for sensors and samplers.
+    Scenarios and keys, of sensors and samplers, have one entry per episode.
     """
 
     name: str
     scenarios: Scenario
     keys: Key
+
+    @property
+    def road(self) -> dict[str, Any]:
+        """Environments and paths, so that a page draws them without the settings."""
+        road = self.scenarios.envs, self.scenarios.path.points
+        return dict(zip(evaluation.ROAD, road, strict=True))
 
 
 class SystemResult(NamedTuple):
@@ -54,11 +57,7 @@ class SystemResult(NamedTuple):
 
 
 def make_episodes(settings: Settings) -> EpisodeSet:
-    """Draw the episodes of a scenario; several devices share them evenly.
-
-    Raises:
-        ValueError: a vehicle that cannot be simulated.
-    """
+    """Draw the episodes of a scenario; several devices share them evenly."""
     plant, protocol = build.build_vehicle(settings.vehicle), settings.evaluation
     check_step(plant)
     family = build.build_scenario(settings.scenario, plant, duration=protocol.episode_s)
@@ -131,9 +130,6 @@ def load_systems(settings: Settings) -> dict[str, System]:
 
     "self" is the policy of the run, which is trained if it is missing. With
     `environment.source=estimated` every system that reads e estimates it.
-
-    Raises:
-        ValueError: an unknown system.
     """
     plant = build.build_vehicle(settings.vehicle)
     references = build.reference_systems(plant, data.ensure_law(settings))
@@ -172,14 +168,7 @@ class SystemEvaluation:
     def __init__(
         self, settings: Settings, name: str, system: System, dataset: Dataset | None
     ) -> None:
-        """Build the controller and what scores it.
-
-        Args:
-            settings: of the run.
-            name: of the system.
-            system: to evaluate.
-            dataset: its test part gives the open-loop error, or None for none.
-        """
+        """Build the controller; the test part of a data set gives open-loop errors."""
         self._settings = settings
         self._plant = plant = build.build_vehicle(settings.vehicle)
         self._times: tuple[float, float] | None = None
@@ -341,15 +330,8 @@ def _claims(settings: Settings, system: System) -> evaluation.ClaimedBounds:
 def evaluate_run(settings: Settings, *, command: str | None = None) -> Path:
     """Evaluate every system of `evaluation.systems` and add its rows to the results.
 
-    Rows of other scenarios and controllers in the same run stay.
-
-    `command`, as it was typed, is stored with the results. Returns the path of
-    results.json.
-
-    Raises:
-        ValueError: settings that cannot be built, or a vehicle that cannot be
-            simulated.
-        ArtefactError: the earlier results are damaged.
+    Rows of other scenarios and controllers in the same run stay. `command`, as it was
+    typed, is stored with the results. Returns the path of results.json.
     """
     began, protocol = time.perf_counter(), settings.evaluation
     # Vehicle and earlier results are checked before anything is trained.
@@ -360,15 +342,12 @@ def evaluate_run(settings: Settings, *, command: str | None = None) -> Path:
     rows: list[Row] = []
     arrays: dict[str, Any] = {"dt": settings.vehicle.dt}
     length = f"{protocol.episodes} episodes of {protocol.episode_s:.0f} s"
-    # The roads under the same names: a page draws them without the settings.
-    road = (episodes.scenarios.envs, episodes.scenarios.path.points)
-    named = dict(zip(evaluation.ROAD, road, strict=True))
     for name, system in compared.items():
         store.print_message(f"driving {length}: {name} on {episodes.name}")
         row, own = SystemEvaluation(settings, name, system, dataset)(episodes)
         rows.append(row)
-        prefix = evaluation.episode_name(row)
-        arrays |= {f"{prefix}/{part}": array for part, array in (own | named).items()}
+        prefix, own = evaluation.episode_name(row), own | episodes.road
+        arrays |= {f"{prefix}/{part}": array for part, array in own.items()}
         error, worst = row["rmse_m"]["mean"], row["max_deviation_m"]
         store.print_message(f"  rmse {error:.4f} m, worst {worst:.3f} m")
     seconds = time.perf_counter() - began

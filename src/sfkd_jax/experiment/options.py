@@ -203,7 +203,6 @@ class ComparisonSettings:
         only: labels of rows; empty: all.
         share: [k, n]: evaluate every n-th row from the k-th on, collect nothing.
         paper: what the paper prints.
-        page: arguments of its page.
     """
 
     policies: Directory
@@ -217,7 +216,6 @@ class ComparisonSettings:
     only: Names = ()
     share: tuple[NonNegativeInt, NonNegativeInt] | None = None
     paper: dict[str, Any] = empty()
-    page: dict[str, Any] = empty()
 
 
 @takes(export.write_controller)
@@ -297,12 +295,7 @@ class Settings:
 
 
 def parse_settings(values: Values) -> Settings:
-    """Return checked settings; with `environment.source=none` the model reads no e.
-
-    Raises:
-        ValueError: a setting that does not exist or is out of its range, or an estimate
-            of an environment that the model does not read.
-    """
+    """Return checked settings; with `environment.source=none` the model reads no e."""
     settings = parse(Settings, values)
     environment, reads = settings.environment, settings.model.environment
     if environment.source == "estimated" and not reads:

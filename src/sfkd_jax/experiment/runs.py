@@ -6,6 +6,7 @@ import functools
 import hashlib
 import subprocess
 from collections.abc import Mapping
+from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
@@ -37,10 +38,6 @@ def claim(settings: Settings) -> None:
     """Record the settings of a run in its directory, or check the recorded ones.
 
     Those of a run that failed before it kept anything are replaced.
-
-    Raises:
-        ArtefactError: the run was made with other settings; names the differences.
-        ValueError: a path from which orbax cannot read.
     """
     run_dir = settings.run_dir
     path, wanted = run_dir / "settings.json", identity(settings)
@@ -85,11 +82,7 @@ def policy_settings(settings: Settings, dataset: Dataset) -> dict[str, Any]:
 
 
 def read_results(run_dir: Path) -> tuple[list[Row], dict[str, Any]]:
-    """Return the rows and the episodes that a run already has.
-
-    Raises:
-        ArtefactError: they are damaged.
-    """
+    """Return the rows and the episodes that a run already has."""
     results, episodes = run_dir / "results.json", run_dir / "episodes.safetensors"
     rows, arrays = [], {}
     if results.exists():
@@ -109,14 +102,8 @@ def write_results(
 ) -> Path:
     """Add rows and episodes to those of a run, and return the path of results.json.
 
-    Other processes may add theirs at the same time.
-
-    Args:
-        run_dir: of the run.
-        config: plain settings that made the rows, and the command that was typed.
-        rows: replace earlier rows of the same identity.
-        arrays: by the names of episodes.safetensors.
-        seconds: that the evaluation took [s].
+    Rows replace earlier ones of the same identity; other processes may add theirs at
+    the same time. `config` are plain settings and the command that was typed.
     """
     path, episodes = run_dir / "results.json", run_dir / "episodes.safetensors"
     about = {name: config[name] for name in ("vehicle", "controller", "evaluation")}
@@ -137,10 +124,7 @@ def write_results(
 
 @functools.cache
 def source_hash() -> str:
-    """Return the SHA-256 of the package's Python files, with their paths.
-
-    They are hashed as they are at the first call.
-    """
+    """Return the SHA-256 of the package's Python files, with their paths."""
     digest = hashlib.sha256()
     # Sorted, since file systems list files in any order.
     for file in sorted(PACKAGE.rglob("*.py")):
@@ -150,22 +134,17 @@ def source_hash() -> str:
     return digest.hexdigest()
 
 
+@functools.cache
 def provenance() -> dict[str, str | None]:
     """Return what made a result: the hash of the source, and its commit.
 
     The commit ends with "+" if files were changed since; outside a checkout it is None.
     """
-    return {"source": source_hash(), "commit": _commit()}
-
-
-@functools.cache
-def _commit() -> str | None:
-    if not (PACKAGE.parents[1] / ".git").exists():
-        return None
-    command = ["git", "-C", str(PACKAGE), "describe", "--always", "--exclude=*"]
-    command += ["--abbrev=40", "--dirty=+"]
-    try:
-        done = subprocess.run(command, capture_output=True, text=True, check=True)
-    except (OSError, subprocess.CalledProcessError):
-        return None
-    return done.stdout.strip()
+    commit, command = None, ["git", "-C", str(PACKAGE), "describe", "--always"]
+    command += ["--exclude=*", "--abbrev=40", "--dirty=+"]
+    # An installed package may lie inside the checkout of somebody else.
+    if (PACKAGE.parents[1] / ".git").exists():
+        with suppress(OSError, subprocess.CalledProcessError):
+            done = subprocess.run(command, capture_output=True, text=True, check=True)
+            commit = done.stdout.strip()
+    return {"source": source_hash(), "commit": commit}

@@ -41,9 +41,6 @@ def check_settings(settings: Settings) -> None:
     """Build what the settings choose, with unit scales and without a certificate.
 
     A long run then fails before its first hour, not after it.
-
-    Raises:
-        ValueError: naming the setting, or the choices.
     """
     plant = build.build_vehicle(settings.vehicle)
     if plant.simulated:
@@ -110,7 +107,6 @@ def ensure_policy(settings: Settings) -> policy.TrainedModel:
     Raises:
         ArtefactError: the run was made with other settings, is damaged, or is being
             trained by another process.
-        ValueError: the logs are too few for the levels of the certificate.
     """
     # Before the lock and the data: a missing module ends the command at once.
     if factory := getattr(settings.model, "factory", None):
@@ -218,11 +214,7 @@ def _open_loop_document(
 def _validation_score(
     loss: Loss, params: Params, dataset: Dataset, window: int
 ) -> float:
-    """Prediction loss on validation runs of S1 and S2, or on all recorded ones.
-
-    Its weights are the defaults whatever was trained with, so that trainings with
-    different weights can be compared.
-    """
+    """Prediction loss on validation runs of S1 and S2, or on all recorded ones."""
     # The program and the windows of the training's own validation.
     held_out = spread_windows(dataset.validation, length=window)
     scores = np.asarray(loss.validate(params, held_out)[2])

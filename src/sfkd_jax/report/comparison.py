@@ -9,7 +9,7 @@ import pandas as pd
 
 from sfkd_jax import store
 from sfkd_jax.evaluation import SHARED
-from sfkd_jax.evaluation.formats import dig, is_number, plain
+from sfkd_jax.evaluation.formats import dig, plain
 from sfkd_jax.evaluation.metrics import Row
 from sfkd_jax.report import figures, pages, style, tables
 from sfkd_jax.report import run as runs
@@ -26,16 +26,8 @@ _FIGURE = ("vehicle", *_TABLE)
 def write_results_page(directory: Path) -> dict[str, Any]:
     """Write `directory/report/`: index.html, report.md, table1.tex, figures, films.
 
-    Args:
-        directory: of a comparison, with results.json; the arrays of its rows may be
-            missing.
-
-    Returns:
-        `report`: path of the page. `figures`: paths of its images.
-
-    Raises:
-        ArtefactError: results.json is missing, not JSON or without usable rows; the
-            arrays of a row are damaged; or the page cannot be written.
+    `directory` is that of a comparison, with results.json; the arrays of its rows may
+    be missing. Returns the paths of the page and of its images.
     """
     source, home = directory / "results.json", directory / "report"
     with store.as_artefact_error(home), store.as_artefact_error(source, ValueError):
@@ -102,22 +94,10 @@ def _drawn(group: list[Row], directory: Path, images: Path, number: int) -> list
 
 
 def write_comparison(root: Path, pattern: str, name: str) -> dict[str, Any]:
-    """Write a page about many runs: settings that differ, a figure, all metrics.
+    """Write `root/name/comparison/` about many runs: what differs, and all metrics.
 
-    Its files are in `root/name/comparison/`. Files of a run may be missing, except for
-    settings.json.
-
-    Args:
-        root: of all artefacts.
-        pattern: of run directories below it, as `s3/*/seed=*`.
-        name: of the page.
-
-    Returns:
-        `report`: path of the page. `figures`: paths of its images.
-
-    Raises:
-        ValueError: no run matches.
-        ArtefactError: a file that is not JSON, or the disk refuses the page.
+    `pattern` is of run directories below the root, as `s3/*/seed=*`. Files of a run may
+    be missing, except for settings.json.
     """
     home = root / name / "comparison"
     with store.as_artefact_error(home):
@@ -125,20 +105,17 @@ def write_comparison(root: Path, pattern: str, name: str) -> dict[str, Any]:
         found = sorted(path.parent for path in root.glob(f"{pattern}/settings.json"))
         if not found:
             raise ValueError(f"no run below {root} matches {pattern}")
-        images = runs.empty_folder(home / "figures")
-        sections = _sweep({str(run.relative_to(root)): run for run in found}, images)
+        sections = _sweep({str(run.relative_to(root)): run for run in found})
         return pages.write_page(f"Comparison of runs: {name}", sections, home)
 
 
-def _sweep(found: dict[str, Path], images: Path) -> list[Section]:
-    """The settings that differ, one figure, and every metric of every run."""
+def _sweep(found: dict[str, Path]) -> list[Section]:
+    """The settings that differ, and every metric of every run."""
     records = {run: store.read_json(run / "settings.json") for run in found.values()}
-    flat = pd.json_normalize([*records.values()])
-    settings: dict[str, list[Any]] = flat.to_dict("list")
     # As shown: a setting that reads alike in all runs does not differ.
-    shown = {name: [*map(plain, own)] for name, own in settings.items()}
-    shown = {name: own for name, own in shown.items() if len(set(own)) > 1}
-    parts: list[Part] = [tables.table("Run", shown, [*found])]
+    shown = pd.json_normalize([*records.values()]).map(plain)
+    shown = shown.loc[:, shown.nunique() > 1].set_axis([*found])
+    parts: list[Part] = [shown.rename_axis("Run", axis=1)]
     reasons = {
         name: runs.certificate_document(run).get("reason")
         for name, run in found.items()
@@ -146,17 +123,10 @@ def _sweep(found: dict[str, Path], images: Path) -> list[Section]:
     refused = {name: reason for name, reason in reasons.items() if reason}
     if refused:
         parts.append(record_table("Without a certificate", refused, "reason"))
-    rows = [_own_rows(run, tables.model_of(one)) for run, one in records.items()]
-    # A figure needs an axis of numbers; the first such setting is the swept one.
-    numeric = [name for name in shown if all(map(is_number, settings[name]))]
-    for name in numeric[:1]:
-        points = [(x, own[-1]) for x, own in zip(settings[name], rows, strict=True)]
-        path = style.save(images / "rmse.png", figures.against_setting, name, points)
-        parts.append(Picture(path, f"RMSE by {name}"))
     sections = [Section("Settings that differ", parts)]
     places: dict[str, list[tuple[str, Row]]] = {}
-    for name, own in zip(found, rows, strict=True):
-        for row in own:
+    for name, (run, settings) in zip(found, records.items(), strict=True):
+        for row in _own_rows(run, tables.model_of(settings)):
             places.setdefault(title_of([row], SHARED), []).append((name, row))
     for title, group in places.items():
         sections.append(Section(title, [*tables.metric_tables(group, "Run")]))

@@ -24,13 +24,7 @@ _FEW = 6
 def first_episode(
     group: list[Episodes], corridor: float | None = None, seconds: float = 15.0
 ) -> Figure:
-    """Lateral errors over time, and friction and wind below them.
-
-    Args:
-        group: of one road.
-        corridor: certified half width [m].
-        seconds: that are drawn.
-    """
+    """Lateral errors on one road over time [s], and friction and wind below them."""
     first, panels, envs = group[0], _panels(group), group[0].envs
     # As long as the shortest run: all lines end at the same time.
     last = min(round(seconds / first.dt), *(one.lateral.shape[1] for one in group))
@@ -129,9 +123,7 @@ def all_episodes(one: Episodes, corridor: float | None = None) -> Figure:
 def open_loop(errors: dict[str, Any], radii: list[Any]) -> Figure:
     """RMSE of prediction without feedback by time ahead: position, yaw, speed.
 
-    Args:
-        errors: open_loop.json.
-        radii: certified position tube [m], by step; empty without one.
+    `radii` are those of the certified position tube [m] by step, if there is one.
     """
     figure = style.canvas(4.0)
     grid = figure.add_gridspec(2, 2, width_ratios=[1.45, 1])
@@ -209,11 +201,7 @@ def rmse_chart(groups: list[list[Row]]) -> Figure:
 
 
 def side_forces(rows: list[Row]) -> Figure:
-    """RMSE of every system under unmeasured side forces; larger dots: larger forces.
-
-    Args:
-        rows: that may be compared, each with `disturbed`.
-    """
+    """RMSE of every system under unmeasured side forces; larger dots: larger forces."""
     figure = style.canvas(1.1 + 0.24 * len(rows))
     axes, forces = figure.subplots(), {}
     for height, row in enumerate(rows):
@@ -240,21 +228,6 @@ def _name_rows(axes: Any, names: list[str]) -> None:
     """Write the names of rows beside them, the first above."""
     axes.set_yticks(range(len(names)), [style.literal(name) for name in names])
     axes.set_ylim(len(names) - 0.4, -0.6)
-
-
-def against_setting(name: str, rows: list[tuple[float, Row]]) -> Figure:
-    """RMSE with its 95 % interval against a setting in which runs differ."""
-    figure = style.canvas(3.2)
-    axes = figure.subplots()
-    for value, row in rows:
-        mean, ends = (dig(row, "rmse_m", key) for key in ("mean", "ci95"))
-        if is_number(mean):
-            axes.plot(value, 1e3 * mean, "o", color=style.ACCENT)
-            span = [1e3 * end for end in (ends if is_pair(ends) else [mean, mean])]
-            axes.plot([value] * 2, span, color=style.ACCENT)
-    axes.set(xlabel=style.literal(name), ylabel="lateral RMSE [mm], 95 % interval")
-    axes.set_ylim(bottom=0.0)
-    return figure
 
 
 def _plain_log(axis: Any, set_scale: Any) -> None:

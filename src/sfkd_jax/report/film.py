@@ -40,13 +40,7 @@ def film_of(
 ) -> Path | None:
     """Write a GIF of SFKD, nominal and one other learned system, in real time.
 
-    Args:
-        path: of the file.
-        group: of one road.
-        corridor: certified half width [m].
-
-    Returns:
-        The file; None if no row has states and a path.
+    Returns the file; None if no row of the group has states and a path.
     """
     whole = [one for one in group if one.states is not None and one.path is not None]
     # ICODE-MPPI is the paper's strongest rival.

@@ -57,18 +57,8 @@ _PATH = _BODY | {
 def write_report(run_dir: Path) -> dict[str, Any]:
     """Write `run_dir/report/`: index.html, report.md, figures and a film.
 
-    Reads the files of a run and recomputes none of their numbers; the same inputs give
-    the same bytes.
-
-    Args:
-        run_dir: of a run. All but policy.safetensors may be missing.
-
-    Returns:
-        `report`: path of the page. `figures`: paths of its images.
-
-    Raises:
-        ArtefactError: no policy.safetensors; a file that cannot be read, or does not
-            fit on a page; or the disk refuses the page.
+    Recomputes no number of the run, whose files may be missing but for the policy; the
+    same inputs give the same bytes. Returns the paths of the page and of its images.
     """
     home, weights = run_dir / "report", run_dir / f"policy{store.SUFFIX}"
     with store.as_artefact_error(home):
@@ -221,7 +211,7 @@ def _certified(record: dict[str, Any]) -> list[Part]:
 
 
 def _predicted(run_dir: Path, proof: dict[str, Any], images: Path) -> list[Part]:
-    """Errors of predictions by time ahead, beside naive predictors."""
+    """Errors of predictions by time ahead, beside bicycles."""
     errors = read_optional(run_dir / "open_loop.json")
     if not errors.get("steps"):
         return []

@@ -63,10 +63,7 @@ def name_of(row: Row) -> str:
 def grouped(rows: Iterable[Row], columns: Iterable[str]) -> list[list[Row]]:
     """Rows in the order of tables, by what they have in common.
 
-    Args:
-        rows: of results.json.
-        columns: of their identity; a row that does not sample has no controller of
-            which others must have the same.
+    A row that does not sample has no controller of which others must have the same.
     """
     rows, columns = [*rows], [*columns]
     rows.sort(key=lambda row: (rank(str(row.get("system"))), name_of(row)))
