@@ -458,6 +458,16 @@ def test_the_box_of_environments_is_what_logs_reach_or_what_is_asked(tmp_path):
     envs = together(result)[2]
     np.testing.assert_array_equal(result.env_low, envs.min(axis=(0, 1)))
     np.testing.assert_array_equal(result.env_high, envs.max(axis=(0, 1)))
+    # What was measured is what it says, zeros included, unless nobody measured it.
+    for value in (0.0, 0.8):
+        constant = columns | {name: np.full(301, value) for name in NAMES[7:]}
+        path_of = write_csv(tmp_path / "constant.csv", constant)
+        logged, unknown = read(path_of)[0], read(path_of, needs_environment=False)[0]
+        np.testing.assert_array_equal(logged.dataset.env_low, np.float32([value] * 2))
+        np.testing.assert_array_equal(logged.dataset.env_high, np.float32([value] * 2))
+        assert set(logged.coverage["environment"]) == set(NAMES[7:])
+        np.testing.assert_array_equal(unknown.dataset.env_high, np.float32([1e6] * 2))
+        assert unknown.coverage["environment"] == {}
     chosen = read(path, env_low=(0.3, -8.0), env_high=(0.9, 8.0))[0].dataset
     np.testing.assert_array_equal(chosen.env_low, np.float32([0.3, -8.0]))
     first = int(np.argmax(columns["wind"] > 1.0 + 1e-5))

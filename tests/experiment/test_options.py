@@ -79,6 +79,11 @@ def test_a_wrong_option_is_refused_by_name(override, says):
     [
         (["environment.source=guessed"], "measured, estimated, none"),
         (["environment=estimated", "model=sfkd_no_fiber"], "reads the environment"),
+        (["environment=estimated", "environment.high=[0.3,-8]"], "is always"),
+        (
+            ["dataset=files", "dataset.path=x", "environment=estimated"],
+            "logs train none; pass environment.source=measured or none",
+        ),
     ],
 )
 def test_an_environment_that_nobody_can_learn_of_is_refused(overrides, says):

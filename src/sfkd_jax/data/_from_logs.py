@@ -82,7 +82,8 @@ def from_logs(
         dt: of the model [s].
         wheelbase: that steering is compared with [m].
         limits: of the controls, low and high.
-        needs_environment: whether the environment must be in the logs.
+        needs_environment: whether the environment must be in the logs; otherwise it is
+            unknown, whatever they hold.
         report: receives every line for the user.
         steps: of a segment.
         gap: the longest wait between rows that is bridged, in periods.
@@ -103,7 +104,7 @@ def from_logs(
     )
     if conversions:
         report(f"converted to SI units: {', '.join(conversions)}")
-    box = (env_low, env_high)
+    box = (env_low, env_high) if needs_environment else (None, None)
     checks = Checks(
         columns, dt, steps, wheelbase, gap, min_speed, split_at_jumps, limits, box
     )
@@ -127,7 +128,7 @@ def from_logs(
             "coverage is that of the same runs only"
         )
     # From what is used: rows that were dropped do not widen E.
-    low, high = environment_box(cut.envs, *box)
+    low, high = environment_box(cut.envs, *box, known=needs_environment)
     dataset = Dataset(
         *(
             Trajectory(*(jnp.asarray(a[parts == k], dtype=jnp.float32) for a in cut))
@@ -140,8 +141,7 @@ def from_logs(
     groups = {
         "state": (columns.state[BODY], cut.states[..., BODY]),
         "control": (columns.control, cut.controls),
-        # Zeros throughout: nobody measured it.
-        "environment": (columns.environment if cut.envs.any() else (), cut.envs),
+        "environment": (columns.environment if needs_environment else (), cut.envs),
     }
     covered = {
         group: coverage(
@@ -172,23 +172,23 @@ def environment_box(
     envs: Float[Array, "*batch environment"] | Float[np.ndarray, "*batch environment"],
     low: Sequence[float] | None = None,
     high: Sequence[float] | None = None,
+    *,
+    known: bool,
 ) -> tuple[Float[Array, " environment"], Float[Array, " environment"]]:
     """Return the corners of E: as given, or as far as the environments reach.
-
-    Environments that are all zero are unknown; E is then wide.
 
     Args:
         envs: of all segments.
         low: lower corner, or None.
         high: upper corner, or None.
+        known: whether somebody measured them; E is wide otherwise.
     """
     values = np.asarray(envs).reshape(-1, np.shape(envs)[-1])
     corners: Iterable[Any] = (low, high)
     if low is None or high is None:
         wide = np.full(values.shape[1], UNBOUNDED)
-        corners = (-wide, wide)
-        if values.any():
-            corners = (values.min(axis=0), values.max(axis=0))
+        # Not by the values: a slope that is 0 throughout was measured to be 0.
+        corners = (values.min(axis=0), values.max(axis=0)) if known else (-wide, wide)
     lower, upper = (jnp.asarray(corner, dtype=jnp.float32) for corner in corners)
     return lower, upper
 

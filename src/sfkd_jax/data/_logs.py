@@ -154,8 +154,8 @@ def read_logs(
         path: a file, a folder or a glob.
         columns: their names.
         dt: the period of npz arrays x, u, e without a time [s].
-        needs_environment: whether the environment must be in the files; otherwise one
-            that is not becomes zeros.
+        needs_environment: whether the environment must be in the files; otherwise
+            nobody measured it, and it becomes zeros.
 
     Returns:
         All runs, in an order that does not depend on the names of files; one line per
@@ -284,7 +284,7 @@ def _logs(
         "time": (columns.time,),
         "state": columns.state,
         "control": columns.control,
-        "environment": columns.environment,
+        "environment": columns.environment if needs_environment else (),
         "run": () if run is None else (run,),
     }
     needed = {name: None for names in wanted.values() for name in names}
@@ -298,9 +298,6 @@ def _logs(
     except ValueError as reason:
         raise ValueError(f"{source}: {reason}") from None
     found = {name: match for name, match in matches.items() if match}
-    # Nobody measured it, and no model reads it; half an environment is an error.
-    if not (needs_environment or set(wanted["environment"]) & set(found)):
-        wanted["environment"] = ()
     for setting, names in wanted.items():
         if absent := [name for name in names if name not in found]:
             hint = f"map it with dataset.columns.{setting}"

@@ -174,7 +174,9 @@ def read(settings: Settings) -> tuple[Dataset, str]:
             scenarios = dict(zip(PARTS, named("scenario"), strict=True))
     # Over all parts: E does not depend on how they were split.
     envs = np.concatenate([np.asarray(part.envs) for part in parts])
-    low, high = environment_box(envs, *settings.environment.box.values())
+    known = settings.logs is None or settings.environment.is_known
+    box = settings.environment.box.values() if known else (None, None)
+    low, high = environment_box(envs, *box, known=known)
     runs = None
     if (counts := arrays.get("runs")) is not None:
         runs = dict(zip(PARTS, map(int, counts), strict=True))

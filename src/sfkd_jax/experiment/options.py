@@ -303,6 +303,14 @@ def parse_settings(values: Values) -> Settings:
             "environment.source=estimated needs a model that reads the environment; "
             "drop model.environment=false"
         )
+    # Whoever estimates e follows a path, and tells apart what differs.
+    constant = bool(environment.low) and environment.low == environment.high
+    if environment.source == "estimated" and (settings.logs or constant):
+        why = "logs train none" if settings.logs else f"e is always {environment.low}"
+        raise ValueError(
+            "environment.source=estimated needs a model in path coordinates and an "
+            f"environment that varies: {why}; pass environment.source=measured or none"
+        )
     model = replace(settings.model, environment=reads and environment.is_known)
     return replace(settings, model=model)
 
