@@ -1,21 +1,13 @@
-"""The demo: shipped policies are evaluated, their certificates hold, and they beat the
-nominal model.
-"""
+"""The demo: shipped policies are evaluated, and beat the nominal model."""
 
 import json
 
-import jax
-import jax.numpy as jnp
-import numpy as np
 import pytest
 from composing import settings
-from helpers import last_line, run_command, straight
+from helpers import last_line, run_command
 
-from sfkd_jax import demo, policy
-from sfkd_jax.certification import Certificate, verify
+from sfkd_jax import demo
 
-KEY = jax.random.key(0)
-VEHICLES = sorted(entry.name for entry in demo.SHIPPED.iterdir())
 BODY = ("+experiment=s3_body", "controller=mppi_tiny")
 PATH = ("controller.mppi.num_samples=30",)
 
@@ -52,26 +44,3 @@ def test_a_vehicle_without_a_shipped_policy_is_refused_at_once(tmp_path):
         demo.run(settings("vehicle.mass=900.0", f"root={tmp_path}"))
     assert "\n" not in str(refusal.value)
     assert list(tmp_path.iterdir()) == []
-
-
-@pytest.mark.parametrize("vehicle", VEHICLES)
-def test_shipped_policies_load_and_their_certificates_follow_from_witnesses(vehicle):
-    trained = policy.load(demo.SHIPPED / vehicle)
-    proof = Certificate.from_document(trained.certificate)
-    verify(proof, trained.params, model=trained.model)
-    assert proof.alpha < 1.0
-    assert trained.settings["vehicle"]["name"] == vehicle.removesuffix("_path")
-    assert ("corridor" in trained.certificate) == vehicle.endswith("_path")
-
-
-def test_shipped_policies_also_work_with_an_estimated_environment():
-    with pytest.raises(ValueError, match="path coordinates"):
-        policy.load(demo.SHIPPED / "kinematic", env_source="estimated")
-    trained = policy.load(demo.SHIPPED / "kinematic_path", env_source="estimated")
-    act, state = jax.jit(trained.controller.act), trained.controller.init(KEY)
-    known = trained.params, state, jnp.asarray([0.0, 0.3, 0.0, 10.0])
-    control, _, info = act(*known, jnp.full(2, jnp.nan), straight(20))
-    other, _, _ = act(*known, jnp.asarray([0.3, 8.0]), straight(20))
-    np.testing.assert_array_equal(control, other)
-    # Nothing has moved yet.
-    np.testing.assert_allclose(info["env_estimate"], [0.6, 0.0], atol=1e-4)

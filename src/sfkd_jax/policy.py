@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import json
 import warnings
-from collections.abc import Callable, Mapping
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager, nullcontext
 from dataclasses import dataclass
 from functools import lru_cache, partial, wraps
 from pathlib import Path
@@ -97,6 +98,17 @@ def save(
     )
 
 
+@contextmanager
+def _numerics() -> Iterator[None]:
+    """Numerical settings of a policy, whatever those of the caller are."""
+    # A certificate speaks of float32; accelerators would multiply with ten bits.
+    precise = jax.default_matmul_precision("float32")
+    ranks, types = jax.numpy_rank_promotion("allow"), jax.numpy_dtype_promotion
+    with precise, ranks, types("standard"):
+        yield
+
+
+@_numerics()
 def restore(path: str | Path) -> TrainedModel:
     """Return the model and weights in a run directory.
 
@@ -140,6 +152,7 @@ def restore(path: str | Path) -> TrainedModel:
     )
 
 
+@_numerics()
 def load(
     path: str | Path,
     *,
@@ -154,26 +167,35 @@ def load(
     Args:
         path: of the directory, or of a policy.safetensors.
         controller: settings of a controller to build instead of the saved one.
-        env_source: "estimated" for a policy in path coordinates that estimates the
-            environment and ignores the one it is given.
+        env_source: one of `build.ENV_SOURCES`. "estimated" for a policy in path
+            coordinates that estimates the environment and ignores the one it is given;
+            "none" for a policy that reads none.
         adaptive: whether a policy in path coordinates estimates unmeasured forces and
             errors of its inputs while driving, see `control.Adaptation`, and slows down
             where its plans are too far off for the lane, see `control.OnlineTube`.
 
     Raises:
         ArtefactError: as `restore`, or a certificate that does not hold.
-        ValueError: `controller` does not fit the policy, or an estimate is asked of a
-            policy that is not in path coordinates.
+        ValueError: `controller` or `env_source` does not fit the policy, or an estimate
+            is asked of a policy that is not in path coordinates.
     """
     trained, file = restore(path), _file(path)
     certificate, reason = read_certificate(path, trained)
-    # A ValueError is about the file, unless the caller asked for something else.
-    asked = controller is not None or env_source != "measured" or adaptive
-    with store.as_artefact_error(file, *(() if asked else (ValueError,))):
+    with store.as_artefact_error(file):
+        reads = trained.settings["model"].get("environment", True)
         box = trained.settings["environment"] | {"source": env_source}
         settings = {**trained.settings, "environment": box}
-        if controller is not None:
-            settings["controller"] = dict(controller)
+        settings["controller"] = controller or trained.settings["controller"]
+    # What a model reads must come from somewhere; what it does not is not estimated.
+    sources = [s for s in build.ENV_SOURCES if s != ("none" if reads else "estimated")]
+    if env_source not in sources:
+        raise ValueError(
+            f"env_source must be {' or '.join(sources)} for a policy that "
+            f"{'reads' if reads else 'ignores'} the environment, got {env_source!r}"
+        )
+    # Errors are about the file, unless the caller asked for something else.
+    asked = controller is not None or env_source != "measured" or adaptive
+    with nullcontext() if asked else store.as_artefact_error(file, ValueError):
         planner = build.build_controller(
             settings["controller"],
             trained.model,
@@ -186,26 +208,36 @@ def load(
             adaptive=adaptive,
         )
     if certificate is None:
-        warnings.warn(f"{file}: nothing is certified; {reason}", stacklevel=2)
-    # A certificate speaks of float32; accelerators would multiply with ten bits.
-    with jax.default_matmul_precision("float32"):
-        params = jax.jit(fold, static_argnums=0)(trained.model, trained.params)
+        # 3: `_numerics` stands between this function and its caller.
+        warnings.warn(f"{file}: nothing is certified; {reason}", stacklevel=3)
+    params = jax.jit(fold, static_argnums=0)(trained.model, trained.params)
     return Policy(
         **vars(trained) | {"params": params, "settings": settings},
-        controller=planner._replace(act=_in_float32(planner.act)),
+        controller=_entrance(planner, trained),
         certificate=certificate,
     )
 
 
-def _in_float32(act: Callable[..., Any]) -> Callable[..., Any]:
-    """Return the same function, whose products are float32 on any device."""
+def _entrance(controller: Controller, trained: TrainedModel) -> Controller:
+    """Return the same controller, with `_numerics` and a check of its arguments."""
+    names = trained.vehicle.state_names
+    shape, env_shape = (len(names),), (len(trained.settings["space"]["env_mean"]),)
 
-    @wraps(act)
-    def precise(*arguments: Any) -> Any:
-        with jax.default_matmul_precision("float32"):
-            return act(*arguments)
+    @wraps(controller.act)
+    def act(
+        params: Params, state: Any, observation: Any, env: Any, reference: Any
+    ) -> Any:
+        # Broadcasting would accept some, and others fail far from here.
+        if jnp.shape(observation) != shape:
+            raise ValueError(
+                f"observation must have shape {shape}: {', '.join(names)}; "
+                f"got {jnp.shape(observation)}"
+            )
+        if jnp.shape(env) != env_shape:
+            raise ValueError(f"env must have shape {env_shape}, got {jnp.shape(env)}")
+        return controller.act(params, state, observation, env, reference)
 
-    return precise
+    return Controller(_numerics()(controller.init), _numerics()(act))
 
 
 def read_certificate(

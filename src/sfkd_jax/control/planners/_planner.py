@@ -18,6 +18,7 @@ from sfkd_jax.types import Control, Controller, ControllerInfo, Key, Params, Sca
 Plan: TypeAlias = Float[Array, "horizon control"]
 Plans: TypeAlias = Float[Array, "horizon sample control"]
 C = TypeVar("C")
+Memory = TypeVar("Memory")
 
 
 class Tuning(NamedTuple):
@@ -317,23 +318,28 @@ def iterate(
     return jax.tree.map(lambda leaf: leaf[-1], results)
 
 
-def tuned(state: PlannerState, **changes: Any) -> PlannerState:
+def tuned(state: Memory, **changes: Any) -> Memory:
     """Return the state with other entries of `Tuning`, of the types that it has.
 
     A plain number in their place would be of a weaker type, and compile the planner
     again.
 
     Args:
-        state: of a planner.
+        state: of a controller, in which a planner's is found however deep it lies.
         changes: entries of `Tuning`; of `cost`, any part of a dict.
 
     Raises:
-        ValueError: an unknown entry, or another shape.
+        ValueError: no planner, an unknown entry, or another shape.
     """
-    before = state.tuning
-    if isinstance(before.cost, dict):
-        # Weights that are not named keep their values.
-        changes["cost"] = before.cost | changes.get("cost", {})
+
+    def is_planner(node: Any) -> bool:
+        return isinstance(node, PlannerState)
+
+    if not any(map(is_planner, jax.tree.leaves(state, is_leaf=is_planner))):
+        raise ValueError(f"{type(state).__name__} holds no state of a planner to tune")
+    if unknown := sorted(set(changes) - set(Tuning._fields)):
+        known = ", ".join(Tuning._fields)
+        raise ValueError(f"unknown entry of tuning {unknown[0]}; there are {known}")
 
     def of_type(before: Array, value: Any) -> Array:
         after = jnp.asarray(value, dtype=before.dtype)
@@ -341,8 +347,17 @@ def tuned(state: PlannerState, **changes: Any) -> PlannerState:
             raise ValueError(f"tuning has shape {before.shape}, got {after.shape}")
         return after
 
-    after = jax.tree.map(of_type, before, before._replace(**changes))
-    return state._replace(tuning=after)
+    def change(node: Any) -> Any:
+        if not is_planner(node):
+            return node
+        before, wanted = node.tuning, dict(changes)
+        if isinstance(before.cost, dict):
+            # Weights that are not named keep their values.
+            wanted["cost"] = before.cost | changes.get("cost", {})
+        after = jax.tree.map(of_type, before, before._replace(**wanted))
+        return node._replace(tuning=after)
+
+    return jax.tree.map(change, state, is_leaf=is_planner)
 
 
 def shift(plan: Plan, elapsed: Scalar) -> Plan:

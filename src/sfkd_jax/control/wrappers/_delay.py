@@ -53,7 +53,7 @@ class DelayCompensation:
         initial_control: in force before the first control arrives.
 
     Raises:
-        ValueError: the delay is less than 1.
+        ValueError: the delay is less than 1, or the model is in path coordinates.
     """
 
     inner: Controller
@@ -64,6 +64,12 @@ class DelayCompensation:
 
     def __post_init__(self) -> None:
         check_intervals(self)
+        # Sent are controls of the vehicle, which its closed loop does not take.
+        if self.model.along_path:
+            raise ValueError(
+                "delay compensation predicts the vehicle from its controls, and this "
+                "model its closed loop along a path: use models.physics(plant.step)"
+            )
 
     def controller(self) -> Controller:
         """Return the controller that plans from the arrival."""

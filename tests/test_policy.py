@@ -1,0 +1,109 @@
+"""What `sfkd_jax.load` returns: it drives, is tuned, and refuses what does not fit it in
+words about the right cause.
+"""
+
+from functools import cache, partial
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from helpers import straight
+
+from sfkd_jax import control, demo, models, plants, policy
+from sfkd_jax.certification import Certificate, verify
+
+KEY, ENV = jax.random.key(0), jnp.asarray([0.7, 0.0])
+VEHICLES = sorted(entry.name for entry in demo.SHIPPED.iterdir())
+load = cache(lambda name, **options: policy.load(demo.SHIPPED / name, **options))
+
+
+def start(vehicle):
+    """On a straight road at 10 m/s."""
+    return jnp.zeros(4 if vehicle.startswith("kinematic") else 7).at[3].set(10.0)
+
+
+@pytest.mark.parametrize("vehicle", VEHICLES)
+def test_shipped_policies_load_and_their_certificates_follow_from_witnesses(vehicle):
+    trained = load(vehicle)
+    proof = Certificate.from_document(trained.certificate)
+    verify(proof, trained.params, model=trained.model)
+    assert proof.alpha < 1.0
+    assert trained.settings["vehicle"]["name"] == vehicle.removesuffix("_path")
+    assert ("corridor" in trained.certificate) == vehicle.endswith("_path")
+
+
+def test_shipped_policies_also_work_with_an_estimated_environment():
+    """And are tuned in flight, however deep the planner lies, without a compilation."""
+    trained = load("kinematic_path", env_source="estimated")
+    act, state = jax.jit(trained.controller.act), trained.controller.init(KEY)
+    known = trained.params, state, jnp.asarray([0.0, 0.3, 0.0, 10.0])
+    control_1, _, info = act(*known, jnp.full(2, jnp.nan, float), straight(20))
+    other, after, _ = act(*known, jnp.asarray([0.3, 8.0]), straight(20))
+    np.testing.assert_array_equal(control_1, other)
+    # Nothing has moved yet.
+    np.testing.assert_allclose(info["env_estimate"], [0.6, 0.0], atol=1e-4)
+    tuned = control.tuned(after, noise_std=[1e-6, 1e-6], elapsed=2)
+    assert type(tuned) is type(after)
+    _, later, quiet = act(trained.params, tuned, known[2], ENV, straight(20))
+    assert act._cache_size() == 1
+    # All samples are the plan itself.
+    np.testing.assert_allclose(quiet["cost"], quiet["mean_cost"], rtol=1e-3)
+    with pytest.raises(ValueError, match="unknown entry of tuning temprature"):
+        control.tuned(later, temprature=1.0)
+    with pytest.raises(ValueError, match="holds no state of a planner"):
+        control.tuned((), elapsed=1.0)
+
+
+@pytest.mark.parametrize("vehicle", VEHICLES)
+def test_arguments_of_another_shape_are_refused_by_name(vehicle):
+    trained = load(vehicle)
+    act = partial(trained.controller.act, trained.params, trained.controller.init(KEY))
+    x, r = start(vehicle), straight(20)
+    for wrong, name in (
+        ((jnp.zeros(11 - x.size), ENV, r), r"observation .*p_x, p_y, yaw, v.*got"),
+        ((x[None], ENV, r), "observation"),
+        ((x, jnp.zeros(3), r), r"env must have shape \(2,\), got \(3,\)"),
+        ((x, ENV, r[:10]), r"reference must have shape \(20, 4\)"),
+    ):
+        with pytest.raises(ValueError, match=name):
+            jax.eval_shape(act, *wrong)
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        ({"adaptive": True}, "^adaptation .* need a model in path coordinates"),
+        ({"env_source": "estimated"}, "^adaptation .* need a model in path coord"),
+        ({"env_source": "estimate"}, "^env_source must be measured or estimated"),
+        ({"env_source": "none"}, "^env_source must .* reads .*, got 'none'"),
+        ({"controller": {"planner": "mpi"}}, "^unknown controller.planner .mpi"),
+    ],
+)
+def test_what_the_caller_asked_for_is_not_blamed_on_the_file(options, message):
+    with pytest.raises(ValueError, match=message):
+        policy.load(demo.SHIPPED / "kinematic", **options)
+
+
+@pytest.mark.parametrize(
+    ("setting", "value"),
+    [("numpy_rank_promotion", "raise"), ("numpy_dtype_promotion", "strict")],
+)
+def test_strict_numerics_of_the_caller_reach_no_policy(setting, value):
+    policy._build.cache_clear()
+    inputs = start("kinematic"), ENV, straight(20)
+    with getattr(jax, setting)(value):
+        trained = policy.load(demo.SHIPPED / "kinematic_path")
+        state, act = trained.controller.init(KEY), trained.controller.act
+        jax.eval_shape(act, trained.params, state, *inputs)
+
+
+def test_late_controls_are_predicted_by_the_vehicle_not_by_its_closed_loop():
+    trained = load("kinematic_path")
+    with pytest.raises(ValueError, match=r"use models.physics\(plant.step\)"):
+        control.delay_compensated(trained.controller, trained.model, delay=1)
+    known = models.physics(plants.kinematic().step)
+    late = control.delay_compensated(trained.controller, known, delay=2)
+    state = control.tuned(late.init(KEY), effective_samples=20.0)
+    arguments = trained.params, state, start("kinematic"), ENV, straight(20)
+    assert jax.eval_shape(late.act, *arguments)[2]["arrival_state"].shape == (4,)
