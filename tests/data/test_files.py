@@ -12,6 +12,7 @@ from recorded import NAMES, STATE, recorded_run, write_csv, write_npz
 
 from sfkd_jax import data as datasets
 from sfkd_jax.data import Columns
+from sfkd_jax.data._tables import read_csv
 
 DT, STEPS = 0.1, 10
 
@@ -78,6 +79,8 @@ def test_a_run_comes_back_to_the_last_bit(tmp_path, kind):
     else:
         write_csv(tmp_path / "a.csv", columns, kind)
     assert same_segments(together(read(tmp_path)[0].dataset), expected(columns))
+    if kind == ",":  # what nobody asked for stays in the file
+        assert list(read_csv(tmp_path / "a.csv", ["v", "t"]).columns) == ["t", "v"]
 
 
 def test_whole_runs_as_x_u_e_come_back_to_the_last_bit(tmp_path):
@@ -280,6 +283,11 @@ TEXTS = {
         "0,1,2\n1,2,3\n",
         ", line 1: numbers where the names of the columns should be",
     ),
+    "a logger alone": (
+        '"Format","MoTeC CSV File"\n\n' + "0," * 8 + "0\n",
+        f", line 1 is no header: 2 cells above rows of 9, and no line has one of the "
+        f"names {', '.join(NAMES)}; set dataset.columns",
+    ),
     "twice": ("t,t\n0,1\n", ", line 1: the column t appears twice"),
     "ragged": (
         ",".join(NAMES) + "\n" + "0," * 8 + "0\n0,1,2\n",
@@ -307,6 +315,7 @@ RECORDERS = {
     "decimal commas": lambda text: with_commas(text).encode(),
     "line ends of Windows": lambda text: text.replace("\n", "\r\n").encode(),
     "a preamble": lambda text: f"Recorder 3.1\nrun 7, dry\n\n{text}".encode(),
+    "a logger's head": lambda text: f"# logger X1, t in s\n#v 2\n{text}".encode(),
     "a header of numpy": lambda text: f"# {text}".encode(),
     "comments": lambda text: f"# made by us\n{text}# the end\n\n".encode(),
     "units": lambda text: text.replace(

@@ -9,7 +9,7 @@ import pytest
 from helpers import ENV_HIGH, ENV_LOW, SHARES, dataset, jit, segments
 
 from sfkd_jax import data as datasets
-from sfkd_jax.data._from_logs import assign_parts
+from sfkd_jax.data._dataset import assign_parts
 from sfkd_jax.types import Trajectory
 
 LOW, HIGH = jnp.asarray(ENV_LOW), jnp.asarray(ENV_HIGH)

@@ -43,6 +43,13 @@ class Dataset(NamedTuple):
 
 PARTS = Dataset._fields[:4]
 """Names of the parts of a data set."""
+ATTEMPTS = 200
+"""Orders of the runs that are tried before runs are cut."""
+TOLERANCE = 2.0
+"""A part may be this many times larger or smaller than its share."""
+BINS = 10
+VISITED = 0.001
+"""Share of all samples from which a bin counts as visited."""
 
 
 def check_shares(shares: tuple[float, ...]) -> None:
@@ -111,6 +118,56 @@ def split(
         }
     corners = {"env_low": jnp.asarray(env_low), "env_high": jnp.asarray(env_high)}
     return Dataset(*parts, **corners, scenarios=labels)
+
+
+def assign_parts(
+    runs: Int[np.ndarray, " segment"], *, shares: tuple[float, ...], seed: int
+) -> tuple[Int[np.ndarray, " segment"], bool]:
+    """Assign whole runs at random if the parts come near their shares.
+
+    Otherwise cut each run into four stretches of time. Parts made of whole runs share
+    no run. Parts made of stretches are neighbours in time, and what is measured on them
+    holds for more of the same runs, not for new ones.
+
+    Args:
+        runs: number of the run of every segment.
+        shares: of the parts.
+        seed: of the random order of runs.
+
+    Returns:
+        The part of every segment, in the order of `PARTS`, and whether every run is in
+        one part only.
+
+    Raises:
+        ValueError: shares that are not four positive numbers of sum 1, or too few
+            segments for them.
+    """
+    check_shares(shares)
+    numbers, sizes = np.unique(runs, return_counts=True)
+    random = np.random.default_rng(seed)
+    # Fewer runs than parts: one part would be empty in every order.
+    for _ in range(ATTEMPTS if len(numbers) >= len(shares) else 0):
+        lacking, owner = np.multiply(shares, len(runs)), np.empty(len(sizes), dtype=int)
+        # Each run in turn goes to the part that lacks most of its share.
+        for run in random.permutation(len(numbers)):
+            owner[run] = lacking.argmax()
+            lacking[owner[run]] -= sizes[run]
+        reached = np.bincount(owner, weights=sizes, minlength=len(shares))
+        relative = reached / len(runs) / np.asarray(shares)
+        if relative.min() >= 1 / TOLERANCE and relative.max() <= TOLERANCE:
+            return owner[np.searchsorted(numbers, runs)], True
+    # In time within each run: training first, so that the test is the latest.
+    order = np.concatenate([(np.arange(size) + 0.5) / size for size in sizes])
+    parts = np.empty(len(runs), dtype=int)
+    parts[np.argsort(runs, kind="stable")] = np.searchsorted(
+        np.cumsum(shares)[:-1], order
+    )
+    if len(np.unique(parts)) < len(shares):
+        raise ValueError(
+            f"{len(runs)} segments are too few for "
+            f"dataset.shares={list(shares)}; record more"
+        )
+    return parts, False
 
 
 def measure_space(dataset: Dataset) -> Space:
@@ -249,3 +306,31 @@ def check_on_path(trajectories: Trajectory) -> None:
             f"{int(jnp.sum(~valid))} of {valid.size} runs left their path "
             "(1 - kappa e_y <= 0.2): dataset.law does not stabilise the car"
         )
+
+
+def coverage(
+    values: Mapping[str, Float[np.ndarray, " sample"]],
+) -> dict[str, dict[str, float]]:
+    """Return range, middle 99.8 % and the share of visited bins of every channel.
+
+    A bin is a tenth of the range; it is visited if it holds 0.1 % of the samples.
+
+    Returns:
+        name -> {"low", "high", "low_998", "high_998", "bins_visited"}; a constant
+        channel visits no bin.
+    """
+    covered = {}
+    for name, samples in values.items():
+        low, high = float(samples.min()), float(samples.max())
+        middle = np.quantile(samples, [0.001, 0.999]).tolist()
+        counts = np.zeros(BINS)
+        if high > low:
+            counts = np.histogram(samples, BINS, (low, high))[0]
+        covered[name] = {
+            "low": low,
+            "high": high,
+            "low_998": middle[0],
+            "high_998": middle[1],
+            "bins_visited": float(np.mean(counts >= max(1, VISITED * len(samples)))),
+        }
+    return covered

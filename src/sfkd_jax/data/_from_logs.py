@@ -2,7 +2,11 @@
 
 from __future__ import annotations
 
+import glob
+import hashlib
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from functools import cache
+from pathlib import Path
 from typing import Any, NamedTuple
 
 import jax.numpy as jnp
@@ -10,24 +14,19 @@ import numpy as np
 from jaxtyping import Array, Float, Int
 
 from sfkd_jax.data._checks import Bounds, Checks, Finding
-from sfkd_jax.data._dataset import PARTS, Dataset, check_shares
+from sfkd_jax.data._dataset import PARTS, Dataset, assign_parts, coverage
 from sfkd_jax.data._logs import Columns, Log, read_logs
 from sfkd_jax.ranges import Fraction, NonNegativeInt, Positive, Real
+from sfkd_jax.store import open_regular
 from sfkd_jax.types import BODY, Trajectory
 
+SUFFIXES = (".csv", ".npz", ".parquet")
 UNBOUNDED = 1e6
 """Half width of E where nobody measured the environment and no model reads it."""
 MOST_LINES = 20
 """Warnings that are reported in full; of more, only their number."""
-ATTEMPTS = 200
-"""Orders of the runs that are tried before runs are cut."""
-TOLERANCE = 2.0
-"""A part may be this many times larger or smaller than its share."""
 SAME_MOMENT = 1e-5
 """Rows within this share of a period of a moment are taken without interpolation."""
-BINS = 10
-VISITED = 0.001
-"""Share of all samples from which a bin counts as visited."""
 
 
 class LoggedDataset(NamedTuple):
@@ -100,7 +99,7 @@ def from_logs(
     """
     # All files are read and checked before any is refused: one run shows all faults.
     recorded, errors, conversions = read_logs(
-        path, columns, dt=dt, needs_environment=needs_environment
+        log_files(path).values(), columns, dt=dt, needs_environment=needs_environment
     )
     if conversions:
         report(f"converted to SI units: {', '.join(conversions)}")
@@ -166,6 +165,64 @@ def _report_findings(findings: list[Finding], report: Callable[[str], None]) -> 
     if refused:
         more = f" (the first of {len(refused)} findings)" if refused[1:] else ""
         raise ValueError(f"{refused[0]}{more}")
+
+
+def log_files(path: str) -> dict[str, Path]:
+    """Return the logs of a file, a folder or a glob by the hash of their contents.
+
+    They are in the order of the hashes: a data set does not depend on names of files.
+
+    Raises:
+        ValueError: none, files of another kind, or two with the same contents.
+        ArtefactError: one is a pipe, a device or a folder, or cannot be read.
+    """
+    if path in ("", "???"):
+        raise ValueError(
+            "dataset.path is not set: pass dataset.path=FILE, dataset.path=FOLDER or "
+            "'dataset.path=GLOB'"
+        )
+    here, known = Path(path).expanduser(), ", ".join(SUFFIXES)
+    if here.is_dir():
+        absent = f"no {known} in this folder; dataset.path takes globs such as "
+        absent += "logs/**/*.csv"
+        files = [file for file in here.iterdir() if file.suffix.lower() in SUFFIXES]
+        files = [file for file in files if not file.name.startswith(".")]
+    else:
+        absent = "no such file or folder, and no file matches it"
+        # A file whose name holds brackets is meant itself, not what it would match.
+        named = [here] if here.is_file() else glob.glob(str(here), recursive=True)
+        files = [file for file in map(Path, named) if file.is_file()]
+    if not files:
+        raise ValueError(f"{path}: {absent}")
+    found: dict[str, Path] = {}
+    for file in sorted(files):
+        if file.suffix.lower() not in SUFFIXES:
+            raise ValueError(f"{file}: unknown kind of log; choose one of {known}")
+        status = file.stat()
+        digest = _digest(file.resolve(), status.st_size, status.st_mtime_ns)
+        if (same := found.setdefault(digest, file)) != file:
+            raise ValueError(
+                f"{file}: the same contents as {same}; remove one of them, "
+                "or test runs are trained on"
+            )
+    return dict(sorted(found.items()))
+
+
+def fingerprint(path: str) -> str:
+    """Return a hash of the contents of all logs of a path, whatever their names.
+
+    Raises:
+        ValueError: as for `log_files`.
+    """
+    return hashlib.sha256("".join(log_files(path)).encode()).hexdigest()
+
+
+@cache
+def _digest(file: Path, size: int, written: int) -> str:
+    """The hash of a file's contents, cached until it is written again."""
+    del size, written  # part of the key of the cache
+    with open_regular(file) as stream:
+        return hashlib.file_digest(stream, "sha256").hexdigest()  # pyright: ignore
 
 
 def environment_box(
@@ -249,84 +306,6 @@ def _segments(
             f"a segment {steps}; pass dataset.steps"
         )
     return Piece(*map(np.stack, zip(*cut, strict=True))), np.array(runs)
-
-
-def assign_parts(
-    runs: Int[np.ndarray, " segment"], *, shares: tuple[float, ...], seed: int
-) -> tuple[Int[np.ndarray, " segment"], bool]:
-    """Assign whole runs at random if the parts come near their shares.
-
-    Otherwise cut each run into four stretches of time. Parts made of whole runs share
-    no run. Parts made of stretches are neighbours in time, and what is measured on them
-    holds for more of the same runs, not for new ones.
-
-    Args:
-        runs: number of the run of every segment.
-        shares: of the parts.
-        seed: of the random order of runs.
-
-    Returns:
-        The part of every segment, in the order of `PARTS`, and whether every run is in
-        one part only.
-
-    Raises:
-        ValueError: shares that are not four positive numbers of sum 1, or too few
-            segments for them.
-    """
-    check_shares(shares)
-    numbers, sizes = np.unique(runs, return_counts=True)
-    random = np.random.default_rng(seed)
-    # Fewer runs than parts: one part would be empty in every order.
-    for _ in range(ATTEMPTS if len(numbers) >= len(shares) else 0):
-        lacking, owner = np.multiply(shares, len(runs)), np.empty(len(sizes), dtype=int)
-        # Each run in turn goes to the part that lacks most of its share.
-        for run in random.permutation(len(numbers)):
-            owner[run] = lacking.argmax()
-            lacking[owner[run]] -= sizes[run]
-        reached = np.bincount(owner, weights=sizes, minlength=len(shares))
-        relative = reached / len(runs) / np.asarray(shares)
-        if relative.min() >= 1 / TOLERANCE and relative.max() <= TOLERANCE:
-            return owner[np.searchsorted(numbers, runs)], True
-    # In time within each run: training first, so that the test is the latest.
-    order = np.concatenate([(np.arange(size) + 0.5) / size for size in sizes])
-    parts = np.empty(len(runs), dtype=int)
-    parts[np.argsort(runs, kind="stable")] = np.searchsorted(
-        np.cumsum(shares)[:-1], order
-    )
-    if len(np.unique(parts)) < len(shares):
-        raise ValueError(
-            f"{len(runs)} segments are too few for "
-            f"dataset.shares={list(shares)}; record more"
-        )
-    return parts, False
-
-
-def coverage(
-    values: Mapping[str, Float[np.ndarray, " sample"]],
-) -> dict[str, dict[str, float]]:
-    """Return range, middle 99.8 % and the share of visited bins of every channel.
-
-    A bin is a tenth of the range; it is visited if it holds 0.1 % of the samples.
-
-    Returns:
-        name -> {"low", "high", "low_998", "high_998", "bins_visited"}; a constant
-        channel visits no bin.
-    """
-    covered = {}
-    for name, samples in values.items():
-        low, high = float(samples.min()), float(samples.max())
-        middle = np.quantile(samples, [0.001, 0.999]).tolist()
-        counts = np.zeros(BINS)
-        if high > low:
-            counts = np.histogram(samples, BINS, (low, high))[0]
-        covered[name] = {
-            "low": low,
-            "high": high,
-            "low_998": middle[0],
-            "high_998": middle[1],
-            "bins_visited": float(np.mean(counts >= max(1, VISITED * len(samples)))),
-        }
-    return covered
 
 
 def _coverage_lines(

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
@@ -12,9 +13,8 @@ from jaxtyping import Bool, Float, Int
 
 from sfkd_jax.data._tables import (
     Table,
+    among,
     find_column,
-    log_files,
-    name_of,
     read_csv,
     read_npz,
     read_parquet,
@@ -146,28 +146,28 @@ class Log:
 
 
 def read_logs(
-    path: str, columns: Columns, *, dt: float, needs_environment: bool
+    files: Iterable[Path], columns: Columns, *, dt: float, needs_environment: bool
 ) -> tuple[list[Log], list[str], list[str]]:
-    """Read all runs of a path.
+    """Read all runs of some files.
 
     Args:
-        path: a file, a folder or a glob.
+        files: csv, npz and parquet.
         columns: their names.
         dt: the period of npz arrays x, u, e without a time [s].
         needs_environment: whether the environment must be in the files; otherwise
             nobody measured it, and it becomes zeros.
 
     Returns:
-        All runs, in an order that does not depend on the names of files; one line per
-        file that could not be read; conversions of columns to SI units.
+        All runs, in the order of the files; one line per file that could not be read;
+        conversions of columns to SI units.
 
     Raises:
-        ValueError: no files, or invalid names of columns.
+        ValueError: invalid names of columns.
     """
     _check_columns(columns, needs_environment)
     logs, errors, conversions = [], [], []
     # A file that cannot be read is a finding beside those of the others.
-    for file in log_files(path).values():
+    for file in files:
         try:
             read, converted = _logs(
                 _table(file, columns, dt), columns, needs_environment
@@ -205,21 +205,20 @@ def _check_columns(columns: Columns, needs_environment: bool) -> None:
 def _table(file: Path, columns: Columns, dt: float) -> Table:
     """The columns of a file."""
     suffix, source = file.suffix.lower(), str(file)
+    wanted = [columns.time, *columns.state, *columns.control, *columns.environment]
+    wanted += [columns.run] if columns.run else []
     if suffix == ".csv":
-        return read_csv(file, columns.time)
+        return read_csv(file, wanted)
     if suffix == ".parquet":
-        return read_parquet(file)
+        return read_parquet(file, wanted)
     arrays = read_npz(file)
     if {"x", "u"} <= set(arrays) and columns.state[0] not in arrays:
         return _stacked(source, arrays, columns, dt)
-    wanted = {*columns.state, *columns.control, *columns.environment}
-    wanted |= {columns.time, columns.run}
-    used = {
-        name: array for name, array in arrays.items() if {name, name_of(name)} & wanted
-    }
-    if not used:  # a later message lists what the file has
-        return Table(source, dict.fromkeys(arrays, np.zeros(0)), np.arange(0))
-    first, shape = next((name, array.shape) for name, array in used.items())
+    used = {name: arrays[name] for name in among(arrays, wanted)}
+    # Without any, a later message lists what the file has.
+    first, shape = next(
+        ((name, array.shape) for name, array in used.items()), ("", (1,))
+    )
     for name, array in used.items():
         if array.ndim != 1 or array.shape != shape:
             raise ValueError(
@@ -228,7 +227,7 @@ def _table(file: Path, columns: Columns, dt: float) -> Table:
             )
     if not shape[0]:
         raise ValueError(f"{source}: no rows")
-    return Table(source, used, np.arange(shape[0]))
+    return Table(source, used, tuple(arrays), np.arange(shape[0]))
 
 
 def _stacked(
@@ -268,7 +267,8 @@ def _stacked(
         if name != "x":  # u and e of the last moment are unknown and never used
             array = np.concatenate([array, array[:, -1:]], axis=1)
         table |= dict(zip(names, array.reshape(-1, len(names)).T, strict=True))
-    return Table(source, table, np.tile(np.arange(moments), count), run=RUN)
+    rows = np.tile(np.arange(moments), count)
+    return Table(source, table, tuple(arrays), rows, run=RUN)
 
 
 def _logs(
@@ -303,7 +303,7 @@ def _logs(
             hint = f"map it with dataset.columns.{setting}"
             if setting == "environment":
                 hint += ", or pass environment.source=none"
-            present = ", ".join(list(table.columns)[:12])
+            present = ", ".join(table.headers[:12])
             raise ValueError(f"{source}: no column {absent[0]} among {present}; {hint}")
 
     def stacked(names: tuple[str, ...]) -> Float[np.ndarray, "time channel"]:

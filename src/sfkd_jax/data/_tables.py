@@ -3,12 +3,10 @@
 from __future__ import annotations
 
 import codecs
-import glob
-import hashlib
 import io
 import re
 import zipfile
-from collections.abc import Collection, Iterator, Mapping
+from collections.abc import Collection, Iterable, Iterator, Mapping
 from contextlib import contextmanager
 from functools import cache
 from pathlib import Path
@@ -19,7 +17,6 @@ from jaxtyping import Float, Int, Shaped
 
 from sfkd_jax.store import open_regular
 
-SUFFIXES = (".csv", ".npz", ".parquet")
 DECODED = 1 << 29
 """Largest decoded size of an npz or parquet file [bytes]: few bytes may encode any
 number of equal values.
@@ -66,7 +63,8 @@ class Table(NamedTuple):
 
     Attributes:
         source: the file.
-        columns: by name; text where the file holds text.
+        columns: those that are configured, by name; text where the file holds text.
+        headers: names of all its columns.
         rows: position of each row in the file.
         row_name: what `rows` counts: "line" (csv, from 1) or "row" (npz and parquet,
             from 0).
@@ -75,6 +73,7 @@ class Table(NamedTuple):
 
     source: str
     columns: Mapping[str, Shaped[np.ndarray, " time"]]
+    headers: tuple[str, ...]
     rows: Int[np.ndarray, " time"]
     row_name: str = "row"
     run: str | None = None
@@ -123,73 +122,15 @@ class Match(NamedTuple):
     conversion: str | None = None
 
 
-def log_files(path: str) -> dict[str, Path]:
-    """Return the logs of a file, a folder or a glob by the hash of their contents.
-
-    They are in the order of the hashes: a data set does not depend on names of files.
-
-    Raises:
-        ValueError: none, files of another kind, or two with the same contents.
-        ArtefactError: one is a pipe, a device or a folder, or cannot be read.
-    """
-    if path in ("", "???"):
-        raise ValueError(
-            "dataset.path is not set: pass dataset.path=FILE, dataset.path=FOLDER or "
-            "'dataset.path=GLOB'"
-        )
-    here, known = Path(path).expanduser(), ", ".join(SUFFIXES)
-    if here.is_dir():
-        absent = f"no {known} in this folder; dataset.path takes globs such as "
-        absent += "logs/**/*.csv"
-        files = [file for file in here.iterdir() if file.suffix.lower() in SUFFIXES]
-        files = [file for file in files if not file.name.startswith(".")]
-    else:
-        absent = "no such file or folder, and no file matches it"
-        # A file whose name holds brackets is meant itself, not what it would match.
-        named = [here] if here.is_file() else glob.glob(str(here), recursive=True)
-        files = [file for file in map(Path, named) if file.is_file()]
-    if not files:
-        raise ValueError(f"{path}: {absent}")
-    found: dict[str, Path] = {}
-    for file in sorted(files):
-        if file.suffix.lower() not in SUFFIXES:
-            raise ValueError(f"{file}: unknown kind of log; choose one of {known}")
-        status = file.stat()
-        digest = _digest(file.resolve(), status.st_size, status.st_mtime_ns)
-        if (same := found.setdefault(digest, file)) != file:
-            raise ValueError(
-                f"{file}: the same contents as {same}; remove one of them, "
-                "or test runs are trained on"
-            )
-    return dict(sorted(found.items()))
-
-
-def fingerprint(path: str) -> str:
-    """Return a hash of the contents of all logs of a path, whatever their names.
-
-    Raises:
-        ValueError: as for `log_files`.
-    """
-    return hashlib.sha256("".join(log_files(path)).encode()).hexdigest()
-
-
-@cache
-def _digest(file: Path, size: int, written: int) -> str:
-    """The hash of a file's contents, cached until it is written again."""
-    del size, written  # part of the key of the cache
-    with open_regular(file) as stream:
-        return hashlib.file_digest(stream, "sha256").hexdigest()  # pyright: ignore
-
-
-def read_csv(file: Path, time: str) -> Table:
-    """Read a csv file.
+def read_csv(file: Path, wanted: Collection[str]) -> Table:
+    """Read the configured columns of a csv file.
 
     Cells are separated by commas, semicolons, tabs or blanks; # begins a comment. Lines
     before the header are skipped, a line of units below it is added to the names.
 
     Args:
         file: as UTF-8, UTF-16 with its mark, or else Windows-1252.
-        time: the column by which the header is known; without it the first line is.
+        wanted: names of columns; the header is the line that has most of them.
 
     Raises:
         ValueError: not text, no header, no rows, or rows of another length than the
@@ -197,19 +138,14 @@ def read_csv(file: Path, time: str) -> Table:
     """
     with _optional("pyarrow", f"{file}: csv files need"):
         from pyarrow import csv
+    # A log may be half as large as the memory: no copy outlives its use.
     lines = _text(file).splitlines()
     filled = [k for k, line in enumerate(lines) if line.strip()]
     if not filled:
         raise ValueError(f"{file}: the file is empty")
-    heads = {k: _cells(lines[k].lstrip("# "))[0] for k in filled[:PREAMBLE]}
-    header = next(
-        (k for k, cells in heads.items() if time in map(name_of, cells)), filled[0]
-    )
-    # numpy writes headers as comments.
+    header = _header(file, lines, filled, wanted)
     names, between = _cells(lines[header].lstrip("# "))
     where = f"{file}, line {header + 1}"
-    if all(map(_is_number, names)):
-        raise ValueError(f"{where}: numbers where the names of the columns should be")
     if twice := [name for k, name in enumerate(names) if name in names[:k]]:
         raise ValueError(f"{where}: the column {twice[0]} appears twice")
     kept = [k for k in filled if k > header and not lines[k].startswith("#")]
@@ -219,13 +155,16 @@ def read_csv(file: Path, time: str) -> Table:
         raise ValueError(f"{file}: no rows below the header")
     rows = np.array(kept) + 1
     body = [lines[k] for k in kept]
+    del lines
     if between == " ":
         body = [" ".join(line.split()) for line in body]
     text = "\n".join([*body, ""])
+    del body
     # The first rows may hold whole numbers only, so every line is looked at.
     if between != "," and re.search(rf"(?:^|{between}) *-?\d+,\d", text, re.MULTILINE):
         text = text.replace(",", ".")
     content = text.encode()
+    del text
     odd: list[Any] = []
 
     def skip(row: Any) -> str:
@@ -242,8 +181,11 @@ def read_csv(file: Path, time: str) -> Table:
             parse_options=csv.ParseOptions(
                 delimiter=between, invalid_row_handler=skip, newlines_in_values=False
             ),
-            # An empty cell is an error with a line, not a number.
-            convert_options=csv.ConvertOptions(null_values=[]),
+            # An empty cell is an error with a line, not a number. What nobody asked
+            # for, such as text, would fill the memory.
+            convert_options=csv.ConvertOptions(
+                null_values=[], include_columns=among(names, wanted)
+            ),
         )
     except (ValueError, OverflowError) as reason:
         raise ValueError(f"{file}: not a readable csv file ({reason})") from None
@@ -252,8 +194,40 @@ def read_csv(file: Path, time: str) -> Table:
             f"{file}, line {rows[odd[0].number - 1]}: {odd[0].actual_columns} cells "
             f"below a header of {len(names)}"
         )
-    columns = {name: held.column(k).to_numpy() for k, name in enumerate(names)}
-    return Table(str(file), columns, rows, "line")
+    columns = {name: held.column(name).to_numpy() for name in held.column_names}
+    return Table(str(file), columns, tuple(names), rows, "line")
+
+
+def _header(
+    file: Path, lines: list[str], filled: list[int], wanted: Collection[str]
+) -> int:
+    """The index of the line that has most of the configured names.
+
+    Without any it is the first that is no comment, if it is as long as a row.
+
+    Raises:
+        ValueError: there is no header.
+    """
+    # numpy writes headers as comments.
+    heads = {k: _cells(lines[k].lstrip("# "))[0] for k in filled[:PREAMBLE]}
+    held = {k: len(among(cells, wanted)) for k, cells in heads.items()}
+    if max(held.values()):
+        return max(held, key=lambda k: held[k])
+    first = next((k for k in heads if not lines[k].startswith("#")), filled[0])
+    where = f"{file}, line {first + 1}"
+    if all(map(_is_number, heads[first])):
+        raise ValueError(f"{where}: numbers where the names of the columns should be")
+    if len(heads[first]) != (cells := len(_cells(lines[filled[-1]])[0])):
+        raise ValueError(
+            f"{where} is no header: {len(heads[first])} cells above rows of {cells}, "
+            f"and no line has one of the names {', '.join(wanted)}; set dataset.columns"
+        )
+    return first
+
+
+def among(headers: Iterable[str], wanted: Collection[str]) -> list[str]:
+    """Those headers that are a configured name, with or without a unit behind it."""
+    return [one for one in headers if one in wanted or name_of(one) in wanted]
 
 
 def _text(file: Path) -> str:
@@ -311,8 +285,8 @@ def read_npz(file: Path) -> dict[str, Shaped[np.ndarray, ...]]:
             return {name: opened[name] for name in opened.files}
 
 
-def read_parquet(file: Path) -> Table:
-    """Read a parquet file.
+def read_parquet(file: Path, wanted: Collection[str]) -> Table:
+    """Read the configured columns of a parquet file.
 
     Raises:
         ValueError: pyarrow is missing, the file is damaged or of another kind, or
@@ -331,14 +305,14 @@ def read_parquet(file: Path) -> Table:
         cells += [sum(max(column.num_values, 0) for column in columns)]
         pages = sum(max(column.total_uncompressed_size, 0) for column in columns)
         _check_decoded(max(8 * max(cells), pages))
-        held = opened.read()
-    names = held.column_names
-    if not held.num_rows:
+        names = opened.schema_arrow.names
+        held = opened.read(among(names, wanted))
+    if not about.num_rows:
         raise ValueError(f"{file}: no rows")
     if len(set(names)) < len(names):
         raise ValueError(f"{file}: two columns have one name")
-    arrays = {name: held.column(name).to_numpy() for name in names}
-    return Table(str(file), arrays, np.arange(held.num_rows))
+    arrays = {name: held.column(name).to_numpy() for name in held.column_names}
+    return Table(str(file), arrays, tuple(names), np.arange(about.num_rows))
 
 
 @contextmanager
