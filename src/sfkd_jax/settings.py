@@ -45,8 +45,7 @@ def takes(
 
     Args:
         factories: functions, whose settings are the keyword-only arguments, and
-            classes, whose settings are the fields. The class itself, then the first
-            factory that has a name, defines it.
+            classes, whose settings are the fields. The first that has a name wins.
         skip: names that something else decides.
         parts: name -> dataclass of a nested group of settings.
     """
@@ -103,10 +102,6 @@ def parse(kind: type[T], values: Values | T, above: str = "") -> T:
             subclass that fits the values.
         values: plain values, or an object of `kind`, which is returned.
         above: name of the group with a dot, for messages.
-
-    Raises:
-        ValueError: naming a setting that does not exist, is missing or is out of its
-            range.
     """
     if isinstance(values, kind):
         return values
@@ -158,11 +153,7 @@ def did_you_mean(name: str, known: Iterable[str]) -> str:
 
 
 def choose(table: Mapping[str, T], name: Any, what: str) -> T:
-    """Return `table[name]`.
-
-    Raises:
-        ValueError: there is no such `what`; the message lists the choices.
-    """
+    """Return `table[name]`, or raise a ValueError that lists the choices of `what`."""
     if not isinstance(name, str) or name not in table:
         raise ValueError(
             f"unknown {what} {name!r}; choose one of {', '.join(sorted(table))}"
@@ -179,14 +170,7 @@ def _is_below(path: str) -> bool:
 def _checked(name: str, value: Any, hint: Any, *marks: Any) -> Any:
     """Return a value as its annotation states it, with lists as tuples.
 
-    Args:
-        name: of the setting, for messages.
-        value: plain.
-        hint: annotation.
-        marks: what stood beside it in `Annotated`.
-
-    Raises:
-        ValueError: what the setting may be, and what it is.
+    `marks` are what stood beside the annotation `hint` in `Annotated`.
     """
     origin, parts = typing.get_origin(hint), typing.get_args(hint)
     if origin is typing.Annotated:

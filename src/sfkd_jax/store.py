@@ -116,14 +116,7 @@ def content_hash(manifest: Mapping[str, Any]) -> str:
 
 
 def differences(old: Mapping[str, Any], new: Mapping[str, Any]) -> list[str]:
-    """List where settings differ, by dotted key; 1 and 1.0 are equal.
-
-    An entry reads "training.steps was 4000, is now 100".
-
-    Args:
-        old: recorded settings.
-        new: current settings.
-    """
+    """List where settings differ, as "steps was 4000, is now 100"; 1 equals 1.0."""
 
     def short(value: Any) -> str:
         text = "absent" if value is ... else str(plain(value))
@@ -175,12 +168,7 @@ def read_bytes(path: Path) -> bytes:
 
 
 def write_bytes(path: Path, content: bytes) -> None:
-    """Replace `path` atomically.
-
-    Raises:
-        ArtefactError: the disk is full or not writable; an earlier file stays as it
-            was.
-    """
+    """Replace `path` atomically; if the disk refuses, an earlier file stays."""
     part = path.with_name(f".{path.name}.{secrets.token_hex(8)}.part")
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
@@ -215,15 +203,10 @@ def write_arrays(
 
     Args:
         path: of the file, ending in .safetensors.
-        arrays: numbers or truth values, by name.
+        arrays: numbers or truth values, by name; nothing else has a portable form.
         kind: of artefact, such as "policy".
         config: settings that the arrays were made with.
         made_from: hashes of the artefacts that they were made from.
-
-    Raises:
-        ArtefactError: the disk is full or not writable (an earlier file stays as it
-            was), `path` does not end in .safetensors, a dtype has no portable form
-            (text, objects, bfloat16), or `config` is not JSON.
     """
     if path.suffix != SUFFIX:
         raise failure(path, f"not written, the name must end in {SUFFIX}")
@@ -255,11 +238,6 @@ def read_arrays(
     path: Path, *, kind: str, config: Mapping[str, Any] | None = None
 ) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
     """Return the arrays of `path` and their manifest; nothing is ever unpickled.
-
-    Args:
-        path: of the file.
-        kind: that the artefact must have.
-        config: settings that it must have been made with, or None for any.
 
     Raises:
         ArtefactError: the file is missing, truncated, damaged or foreign; the artefact
@@ -319,12 +297,7 @@ def _manifest(path: Path, kind: str, file: Any) -> dict[str, Any]:
 
 
 def write_json(path: Path, document: Mapping[str, Any]) -> None:
-    """Replace `path` atomically; arrays become lists, NaN and infinities null.
-
-    Raises:
-        ArtefactError: the disk is full or not writable (an earlier file stays as it
-            was), or a value is not JSON.
-    """
+    """Replace `path` atomically; arrays become lists, NaN and infinities null."""
     with as_artefact_error(path, ValueError, advice="not written"):
         text = json.dumps(plain(document), indent=2)
     write_bytes(path, text.encode())
@@ -401,9 +374,6 @@ def read_jsonl(path: Path, *, keys: Sequence[str] = ()) -> list[dict[str, Any]]:
 
     A line that is damaged or lacks one of `keys` is left out with a message. The last
     line is left out silently if it has no end: its writer was killed.
-
-    Raises:
-        ArtefactError: the file is missing, no regular file or too large.
     """
     records = []
     for number, line in enumerate(read_bytes(path).split(b"\n")[:-1], 1):
@@ -431,15 +401,8 @@ def locked(directory: Path, *, wait: bool = False) -> Iterator[None]:
     """Hold the lock of `directory`, which is created if it is missing.
 
     The lock is reentrant. The system frees it when the process ends, however it ends;
-    it also holds between hosts that share the directory.
-
-    Args:
-        directory: of a run, a data set or a comparison.
-        wait: wait until the lock is free and print a message, instead of raising.
-
-    Raises:
-        DirectoryLocked: another process holds the lock, and `wait` is false.
-        ArtefactError: the directory or its lock cannot be made.
+    it also holds between hosts that share the directory. With `wait` a message is
+    printed while another process holds it; otherwise that raises `DirectoryLocked`.
     """
     from filelock import FileLock, Timeout  # only writers need it
 

@@ -197,7 +197,7 @@ def test_a_controller_for_our_plant_keeps_such_a_car_in_its_lane(model):
 @pytest.mark.parametrize(
     ("settings", "message"),
     [
-        ({"model": "st"}, "unknown model 'st'; choose one of std, mb"),
+        ({"model": "st"}, "model must be one of std, mb, got 'st'"),
         ({"car": 4}, "car must be one of 1, 2, 3, got 4"),
         ({"dt": 0.0}, "dt and steering_lag must be positive, got 0.0 and 0.1"),
     ],

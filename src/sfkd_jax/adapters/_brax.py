@@ -45,17 +45,11 @@ def register_brax(name: str = NAME) -> None:
 class BraxVehicle(Env):
     """Path following as `brax.envs.Env`, with the settings of `DrivingTask`.
 
-    Observation, action and reward are those of `DrivingTask`. Every `reset` draws a
-    new road and puts it into `info["road"]`; the automatic reset of brax, which
-    restores the first state of an episode, therefore repeats the road. `done` is 1 if
-    the car left the lane or the road ended; `info["time_out"]` is 1 in the second case
-    only, as PPO's `bootstrap_on_timeout` expects.
-
-    Attributes:
-        task: the pure functions behind the environment.
-
-    Raises:
-        ValueError: as `DrivingTask`.
+    Observation, action and reward are those of `DrivingTask`, which is in `task`. Every
+    `reset` draws a new road and puts it into `info["road"]`; the automatic reset of
+    brax, which restores the first state of an episode, therefore repeats the road.
+    `done` is 1 if the car left the lane or the road ended; `info["time_out"]` is 1 in
+    the second case only, as PPO's `bootstrap_on_timeout` expects.
     """
 
     def __init__(self, **settings: Any) -> None:
@@ -235,9 +229,6 @@ def collect(
 
     Returns:
         A batch of trajectories, states (trajectory, steps + 1, state).
-
-    Raises:
-        ValueError: a box whose corners do not have one entry per parameter.
     """
     if not len(env_low) == len(env_high) == len(plant.parameters):
         raise ValueError(

@@ -18,6 +18,7 @@ from vehiclemodels.vehicle_dynamics_std import vehicle_dynamics_std
 from vehiclemodels.vehicle_parameters import setup_vehicle_parameters
 
 from sfkd_jax.plants import Vehicle, dynamic
+from sfkd_jax.ranges import check_choice
 from sfkd_jax.types import Control, Controller, Environment, State, Step
 
 SLOWEST = 0.5  # m/s; the multi-body car divides by the speed over ground at every wheel
@@ -119,13 +120,9 @@ def commonroad_vehicle(
         wind_force: c_w [N s²/m²].
         wind_lever: l_w [m].
 
-    Raises:
-        ValueError: an unknown model or car, a period or lag that is not positive.
-
     Source: Althoff and Würsching, CommonRoad: Vehicle Models.
     """
-    if model not in MODELS:
-        raise ValueError(f"unknown model {model!r}; choose one of {', '.join(MODELS)}")
+    check_choice("model", model, MODELS)
     if car not in CARS:
         raise ValueError(f"car must be one of {', '.join(map(str, CARS))}, got {car}")
     if not (dt > 0 and steering_lag > 0):
@@ -160,12 +157,7 @@ def commonroad_controller(controller: Controller) -> Controller:
 
 @dataclass(frozen=True)
 class _HostCar:
-    """A car whose equations run on the host; fields as of `commonroad_vehicle`.
-
-    Attributes:
-        equations: of CommonRoad.
-        dry: parameters on a dry road.
-    """
+    """A car whose equations run on the host; `dry` are its parameters on a dry road."""
 
     equations: Equations
     dry: Car

@@ -72,11 +72,7 @@ def prove(weights: Exported) -> Claims:
 def joint_bound(
     weights: Exported, start: Sequence[Vector], *, iterations: int = 150
 ) -> tuple[float, list[list[Vector]]]:
-    """Return α of z ↦ A z + r(z) as one map, and multipliers for each vertex.
-
-    The vertices are searched one after another from `start`, `iterations` as in
-    `propose_multipliers`.
-    """
+    """Return α of z ↦ A z + r(z) as one map, and multipliers for each vertex."""
     bounds, witnesses = [], []
     for vertex in weights.operators.vertices:
         # From the answer of the last vertex: operators and multipliers are alike.
@@ -110,10 +106,8 @@ def lipschitz_upper(
 ) -> tuple[float, list[Vector]]:
     """Return the smallest Lipschitz bound that scaled multipliers prove, or infinity.
 
-    Args:
-        weights: W_1 … W_L of a network with slopes in [0, 1].
-        multipliers: proposed λ_1 … λ_{L-1}, scaled by a common factor.
-        linear: A, for a bound on A z + network(z).
+    The network W_1 … W_L has slopes in [0, 1]; with `linear` the bound is on A z plus
+    the network.
     """
     if not multipliers and len(weights) <= 1:
         given = (part for part in (*weights, linear) if part is not None)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from itertools import accumulate
 from typing import Any
 
 import numpy as np
@@ -30,19 +31,11 @@ def latent_tube(
 ) -> Float[np.ndarray, " horizon"]:
     """Return R_1 … R_T with |z_k − ẑ_k| ≤ R_k as long as all |d_j| ≤ d̄, for ẑ_0 = z_0.
 
-        R_k = d̄ (1 − α^k)/(1 − α)
-
-    Args:
-        alpha: contraction factor.
-        d_bar: d̄.
-        horizon: T [steps].
+    R_k = d̄ (1 − α^k)/(1 − α) = α R_{k−1} + d̄, T the horizon [steps].
     """
-    radii, radius = [], 0.0
     # The recursion instead of the closed form, which divides by 1 − α.
-    for _ in range(horizon):
-        radius = alpha * radius + d_bar
-        radii.append(radius)
-    return np.asarray(radii)
+    steps = accumulate([d_bar] * horizon, lambda radius, d: alpha * radius + d)
+    return np.asarray([*steps])
 
 
 def tubes(

@@ -172,9 +172,6 @@ def disturbed_environment(
         envs: the environment without these forces.
         key: of the episode, not consumed: its other streams stay what they are.
         largest: F, forces lie in [-F, F] [N].
-
-    Raises:
-        ValueError: a plant on which wind has no force.
     """
     if not plant.wind_force:
         raise ValueError(

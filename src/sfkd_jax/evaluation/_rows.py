@@ -43,13 +43,7 @@ Scores: TypeAlias = dict[str, PerEpisode]
 def score(
     episodes: Episode, envs: Float[np.ndarray, "episode time 2"], *, dt: float
 ) -> Scores:
-    """Measure every metric on a batch of episodes, leading axis first.
-
-    Args:
-        episodes: from `simulate`, batched.
-        envs: the true environments.
-        dt: sampling period [s].
-    """
+    """Measure every metric on a batch of episodes in the true environments."""
     recording = Recording(
         dt=dt,
         envs=np.asarray(envs),
@@ -90,13 +84,7 @@ def _pooled(scores: Scores) -> Row:
 def disturbed(
     force: float, scores: Scores, violation: dict[str, Any]
 ) -> dict[str, Any]:
-    """The part of a row that is also measured under unmeasured side forces up to F [N].
-
-    Args:
-        force: F.
-        scores: per episode.
-        violation: from `violations`.
-    """
+    """The part of a row that is also measured under side forces up to `force` [N]."""
     pooled = _pooled(scores)
     return {
         "force_n": force,
@@ -161,12 +149,9 @@ def _by_seed(entry: Row) -> np.ndarray:
 
 
 def pool(rows: list[Row]) -> Row:
-    """Pool rows that differ in the training seed alone.
+    """Pool rows of the same episodes that differ in the training seed alone.
 
     Metrics are pooled as in their table, by default averaged.
-
-    Args:
-        rows: at least one, in the order of their seeds, of the same episodes.
     """
     first, *rest = rows
     if not rest:

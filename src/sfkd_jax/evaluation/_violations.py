@@ -68,11 +68,8 @@ def predictions(
         model: any model.
         params: of the model.
         runs: a batch; the environments are those that the model observes.
-        length: of a segment, that of a calibration trajectory.
-        horizon: steps.
-
-    Raises:
-        ValueError: runs shorter than a segment, or segments shorter than the horizon.
+        length: of a segment [steps].
+        horizon: of a prediction [steps].
     """
     cut = jax.vmap(partial(sliding_windows, horizon=length, stride=length))
     # V1 counts segments, because calibration did.
@@ -100,19 +97,14 @@ def _along_window(model: Model, params: Params, window: Trajectory) -> Predictio
 
 
 def violations(predicted: Predictions | None, claims: ClaimedBounds) -> dict[str, Any]:
-    """Return how often predictions violate claims, as results.json has it.
-
-    Args:
-        predicted: on the host; None of runs that are too short.
-        claims: a rate without a claim is None.
+    """Return how often predictions, None of too short runs, violate claims.
 
     Returns:
         `v0`: the part of the steps before the first defect above d̄ with |e_k| > R_k,
-        which the theorem excludes. `v0_ratio`: the largest |e_k| / R_k of these steps;
-        the rate is 0 for any bound that is loose enough, the ratio shows how tight it
-        is. `v1`: the part of the segments that leave the tube anywhere; `v1_radius_m`:
-        its mean position radius. `v2`: the part of the windows with a position error
-        above δ*.
+        which the theorem excludes. `v0_ratio`: the largest |e_k| / R_k of these steps.
+        `v1`: the part of the segments that leave the tube anywhere; `v1_radius_m`: its
+        mean position radius. `v2`: the part of the windows with a position error above
+        δ*. A rate without a claim is None.
     """
     tube, found = claims.certified, dict.fromkeys(("v0", "v0_ratio", "v1", "v2"))
     radius = float(np.mean(tube["position_m"])) if tube else None

@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from functools import partial
 from itertools import combinations_with_replacement
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -57,21 +57,13 @@ class KoopmanLatent(NamedTuple):
     z: Float[Array, " rank"]
 
 
-@dataclass(frozen=True)
+@dataclass(eq=False)
 class Lift:
     """The lift z = (x, rbf(ξ)) and the regressors of its increment.
 
         z⁺ − z = Wᵀ (rbf, m(e) ⊗ (ξ, u, κ, 1)),   x = (progress, ξ),   ξ = (e_y, e_ψ, s)
 
-    x and ξ are scaled.
-
-    Attributes:
-        space: measured scales.
-        functions: number of radial functions.
-        degree: of the monomials m(e).
-        lateral_range: unit of e_y [m].
-        heading_range: unit of e_ψ [rad].
-        curvature_range: unit of κ [1/m].
+    x and ξ are scaled; `degree` is that of m(e), other fields are as in `koopman`.
     """
 
     space: Space
@@ -81,31 +73,16 @@ class Lift:
     heading_range: float
     curvature_range: float
 
-    @property
-    def scale(self) -> State:
-        """The units of x."""
+    def __post_init__(self) -> None:
+        """Derive units, centre and sizes."""
         path = jnp.asarray([1.0, self.lateral_range, self.heading_range])
-        return jnp.concatenate([path, self.space.body_scale])
-
-    @property
-    def centre(self) -> State:
-        """The value of x that is scaled to 0."""
-        return jnp.concatenate([jnp.zeros(3), self.space.body_mean])
-
-    @property
-    def size(self) -> int:
-        """Number of entries of x."""
-        return 3 + self.space.body_mean.shape[0]
-
-    @property
-    def rank(self) -> int:
-        """Number of entries of z."""
-        return self.size + self.functions
-
-    @property
-    def columns(self) -> int:
-        """Number of entries of (ξ, u, κ, 1)."""
-        return self.size - 1 + self.space.control_mean.shape[0] + 2
+        # The units of x, and the value of x that is scaled to 0.
+        self.scale = jnp.concatenate([path, self.space.body_scale])
+        self.centre = jnp.concatenate([jnp.zeros(3), self.space.body_mean])
+        # Entries of x, of z and of (ξ, u, κ, 1).
+        self.size = 3 + self.space.body_mean.shape[0]
+        self.rank = self.size + self.functions
+        self.columns = self.size - 1 + self.space.control_mean.shape[0] + 2
 
     def random_centres(self, key: Key) -> Float[Array, "function coordinate"]:
         """Draw centres uniformly from the box [-1, 1] of ξ."""
@@ -199,14 +176,8 @@ def identify(
 ) -> Params:
     """Fit the weights by ridge regression, with the ridge that predicts best.
 
-    Args:
-        lift: with random centres, drawn here.
-        train: trajectories that the pairs come from.
-        validation: trajectories that choose the ridge.
-        key: consumed.
-        ridges: to choose from.
-        transitions: largest number of pairs.
-        horizon: of the validation predictions, steps.
+    Pairs are of the training runs; those of validation choose the ridge. The centres of
+    the lift are drawn here, and the key is consumed.
     """
     # A key each: the centres do not change with the number of pairs.
     centre_key, pair_key, circle_key = jax.random.split(key, 3)
@@ -313,15 +284,13 @@ def along_circle(
         e_ψ = Θ − κ s,   D = |(κX, 1 − κY)|,
 
     (X, Y, Θ) the pose in the frame of the circle's point closest to the first state.
+    Returns (s, e_y, e_ψ, body state) at every time: exact, and finite up to the centre
+    of the circle.
 
     Args:
         states: x_0 … x_T.
         offset: e_y [m] and e_ψ [rad] of x_0.
         curvature: κ [1/m].
-
-    Returns:
-        (s, e_y, e_ψ, body state) at every time: exact, and finite up to the centre of
-        the circle.
     """
     # A straight path is a circle so large that float32 sees no difference.
     kappa = jnp.where(jnp.abs(curvature) < STRAIGHT, STRAIGHT, curvature)
@@ -350,15 +319,10 @@ def ridge_regression(
     targets: Float[Array, "sample q"],
     ridges: Float[Array, " ridge"],
 ) -> Float[Array, "ridge p q"]:
-    """Return W = argmin |X W − Y|² + λ N |D W|² for every λ.
+    """Return W = argmin |X W − Y|² + λ N |D W|² for inputs X, targets Y, ridges λ > 0.
 
     D are the root mean squares of the columns of X. Solved by an orthogonal
     factorisation of [X D⁻¹, Y] instead of X'X, which float32 cannot resolve.
-
-    Args:
-        inputs: X.
-        targets: Y.
-        ridges: λ > 0.
     """
     count = inputs.shape[1]
     spread = jnp.sqrt(jnp.mean(inputs**2, axis=0))
@@ -429,6 +393,7 @@ def koopman(
     degree = environment_degree if environment else 0
     lift = Lift(space, functions, degree, lateral_range, heading_range, curvature_range)
     regressors = functions + len(lift.monomials) * lift.columns
+    about: Any = {"ridges": ridges, "transitions": transitions, "horizon": horizon}
 
     def init(key: Key) -> Params:
         return {
@@ -479,14 +444,6 @@ def koopman(
         observe=observe,
         # Without the progress, which no other entry of z depends on.
         vector=lambda latent: latent.z[1 : lift.size],
-        fitting=Fitting(
-            identify=partial(
-                identify,
-                lift,
-                ridges=ridges,
-                transitions=transitions,
-                horizon=horizon,
-            )
-        ),
+        fitting=Fitting(identify=partial(identify, lift, **about)),
         structure=Structure(linear=linear),
     )

@@ -26,11 +26,9 @@ FRAMES = ("body", "path")
 
 
 class Weights(NamedTuple):
-    """Matrices of W_L σ(… σ(W_1 z + b_1) …) + b_L and the multipliers of its bound.
+    """W_1 … W_L of W_L σ(… σ(W_1 z + b_1) …) + b_L and λ_1 … λ_{L-1} of its bound.
 
-    Attributes:
-        matrices: W_1 … W_L, each (out, in); () for the function 0.
-        multipliers: λ_1 … λ_{L-1}, one vector per hidden layer; () without a bound.
+    Without matrices it is the function 0; without a bound there are no multipliers.
     """
 
     matrices: tuple[Float[Array, "_ _"], ...] = ()
@@ -38,12 +36,7 @@ class Weights(NamedTuple):
 
 
 class Biases(NamedTuple):
-    """b_k(u, e) = gain_k(e) u + offset_k(e) for every layer of a network and one e.
-
-    Attributes:
-        gains: (out, control) per layer.
-        offsets: (out,) per layer.
-    """
+    """b_k(u, e) = gain_k(e) u + offset_k(e) for every layer of a network and one e."""
 
     gains: tuple[Float[Array, "_ control"], ...] = ()
     offsets: tuple[Float[Array, " _"], ...] = ()
@@ -88,13 +81,8 @@ class Sandwich(nn.Module):
         W_1 = √(2γ) Ψ_1⁻¹ B_1,   W_k = 2 Ψ_k⁻¹ B_k A_{k-1}' Ψ_{k-1},
         W_L = √(2γ) B_L A_{L-1}' Ψ_{L-1},
 
-    and Λ_k = γ Ψ_k² is the witness of the bound. Source: Wang and Manchester, arXiv
-    2301.11526.
-
-    Attributes:
-        inputs: number of inputs.
-        hidden: widths of the hidden layers, at least one.
-        outputs: number of outputs.
+    and Λ_k = γ Ψ_k² is the witness of the bound. There is at least one hidden layer.
+    Source: Wang and Manchester, arXiv 2301.11526.
     """
 
     inputs: int
@@ -159,12 +147,7 @@ class Encoder(nn.Module):
     """φ(s, ψ(e)) = W_0 s + W_2 tanh(W_1 [s; ψ(e)] + b_1) + b_2.
 
     The read-out of s is linear in z: a lift that contains s itself, W_0 s, need not
-    reconstruct it from saturating functions.
-
-    Attributes:
-        rank: r.
-        hidden: width.
-        linear: whether W_0 s is part of the lift.
+    reconstruct it from saturating functions. Without `linear` it is left out.
     """
 
     rank: int
@@ -192,10 +175,6 @@ def gram_bound(
     Gram iteration: G_0 = M, G_{k+1} = G_k' G_k rescaled to unit Frobenius norm; ||M||_2
     ≤ ||G_k||_F^(1/2^k), scales undone. It needs no singular vectors, so the gradient is
     finite at repeated singular values. Source: Delattre et al., arXiv 2305.16173.
-
-    Args:
-        matrix: any shape.
-        iterations: k.
     """
     scale = _frobenius(matrix)
     # Unit norm first: squaring very large or small entries leaves float32.

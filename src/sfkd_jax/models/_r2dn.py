@@ -24,13 +24,7 @@ from sfkd_jax.types import Model, Scalar, Space
 
 
 class Interconnection(Networks):
-    """The linear system, the feedback φ and the decoder; ψ(e) = e.
-
-    Attributes:
-        hidden: hidden widths of φ.
-        decoder_hidden: hidden widths of the decoder.
-        alpha: α.
-    """
+    """The linear system, the feedback φ and the decoder; ψ(e) = e; see `r2dn`."""
 
     hidden: Sequence[int]
     decoder_hidden: Sequence[int]

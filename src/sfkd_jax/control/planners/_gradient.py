@@ -17,7 +17,7 @@ from sfkd_jax.control.planners._planner import (
     iterate,
     replace_nonfinite,
 )
-from sfkd_jax.ranges import AtLeastTwo, Fraction
+from sfkd_jax.ranges import AtLeastOne, AtLeastTwo, Fraction, check_intervals
 from sfkd_jax.types import Key, Scalar
 
 
@@ -41,18 +41,14 @@ class GradientPlanner(Planner):
         shrink: c in (0, 1).
     """
 
-    iterations: int = 5
+    iterations: AtLeastOne = 5
     steps: AtLeastTwo = 8
     shrink: Fraction = 0.4
 
     def __post_init__(self) -> None:
         """Raise a ValueError that names a setting out of its range."""
         super().__post_init__()
-        if self.iterations < 1 or self.steps < 2 or not 0 < self.shrink < 1:
-            raise ValueError(
-                "iterations >= 1, steps >= 2, 0 < shrink < 1, "
-                f"got {self.iterations}, {self.steps}, {self.shrink}"
-            )
+        check_intervals(self)
         if self.task.constraint is not None:
             raise ValueError(
                 "constraints need a search that ranks by them: mppi or cem"

@@ -248,16 +248,8 @@ def box_qp(
     The active set holds the entries at a bound where descent points outward; the free
     entries f take a Newton step of the reduced problem, with the j of the lowest cost.
     The solution is exact one step after the active set is right, so a good warm start
-    needs one iteration. The cost never increases, and a step that is not finite is not
-    taken.
-
-    Args:
-        H: Hessian of the cost, positive definite.
-        f: linear term of the cost.
-        low: lower bounds.
-        high: upper bounds, high ≥ low.
-        start: initial guess, clipped to the box.
-        iterations: fixed number; each is one Cholesky factorisation.
+    needs one iteration, a Cholesky factorisation. The cost never increases, and a step
+    that is not finite is not taken. `start` is clipped to the box.
 
     Source: Bertsekas (1982); Tassa, Mansard and Todorov (2014), section III.
     """

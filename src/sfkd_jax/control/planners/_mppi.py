@@ -57,8 +57,6 @@ class Mppi(SamplingPlanner):
     def __post_init__(self) -> None:
         """Raise a ValueError that names a setting out of its range."""
         super().__post_init__()
-        if not self.temperature > 0:
-            raise ValueError(f"temperature must be positive, got {self.temperature}")
         size, most = self.effective_samples, self.num_samples
         if size and not 1 <= size <= most:
             raise ValueError(

@@ -11,7 +11,13 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from sfkd_jax.control.planners._planner import Planner
-from sfkd_jax.ranges import AtLeastTwo, UnitInterval
+from sfkd_jax.ranges import (
+    AtLeastOne,
+    AtLeastTwo,
+    UnitInterval,
+    check_choice,
+    check_intervals,
+)
 from sfkd_jax.types import Control, Key
 
 Noise: TypeAlias = Float[Array, "horizon sample control"]
@@ -34,8 +40,8 @@ class SamplingPlanner(Planner):
         noise_knots: number of knots, at most one a step.
     """
 
-    num_samples: int = 1500
-    iterations: int = 1
+    num_samples: AtLeastOne = 1500
+    iterations: AtLeastOne = 1
     noise: str = "ar1"
     noise_correlation: UnitInterval = 0.8
     noise_knots: AtLeastTwo = 5
@@ -43,17 +49,9 @@ class SamplingPlanner(Planner):
     def __post_init__(self) -> None:
         """Raise a ValueError that names a setting out of its range."""
         super().__post_init__()
-        if self.num_samples < 1 or self.iterations < 1:
-            raise ValueError(
-                "num_samples and iterations must be at least 1, "
-                f"got {self.num_samples} and {self.iterations}"
-            )
-        if self.noise not in KINDS or not 0 <= self.noise_correlation <= 1:
-            raise ValueError(
-                f"noise must be one of {', '.join(KINDS)}, noise_correlation lie in "
-                f"[0, 1], got {self.noise!r} and {self.noise_correlation}"
-            )
-        if self.noise == "spline" and not 2 <= self.noise_knots <= self.horizon:
+        check_intervals(self)
+        check_choice("noise", self.noise, KINDS)
+        if self.noise == "spline" and self.noise_knots > self.horizon:
             raise ValueError(
                 f"noise_knots must lie in [2, {self.horizon}], got {self.noise_knots}"
             )

@@ -69,19 +69,12 @@ class Networks(nn.Module):
 
 
 class Learned(Networks):
-    """Embedding ψ(e), operators, residual, decoder and transport of SFKD.
+    """Embedding ψ(e), operators, residual, decoder and transport; fields as of `sfkd`.
 
     Attributes:
-        vertices: number of operator vertices.
-        residual_hidden: hidden widths of the residual.
-        decoder_hidden: hidden widths of the decoder.
-        rho: ρ.
-        beta: β.
         kind: of the residual.
         joint: whether operators and residual are bounded as one map by α = ρ + β;
             otherwise A(e) is bounded by ρ and the residual by β.
-        learn_alpha: whether a joint budget may choose α below ρ + β.
-        forcing_hidden: width of f(u, e), which is added to B(e) u; 0 for none.
     """
 
     vertices: int

@@ -84,13 +84,7 @@ class SfkdFiber(NamedTuple):
 class LatentModel:
     """The functions of `Model`: of SFKD, and of its special case R2DN.
 
-    Attributes:
-        space: measured scales.
-        learned: everything learned except the encoder.
-        encoder: of the body state.
-        environment: whether e is used.
-        soft_penalty: weight of `hinge`.
-        beta: β of `hinge`.
+    `learned` is all that is learned but the encoder; the last two are of `hinge`.
     """
 
     space: Space
@@ -358,10 +352,6 @@ def rotate_planes(
     Q(e): in the coordinates Q(e)' z the transport is the identity and A(e), B(e) and
     the networks are conjugated, which a model with free A(e), B(e) represents anyway.
     What matters is that T(e → e') is an isometry, T(e → e) = I, and a cocycle.
-
-    Args:
-        tangents: t, one entry per plane.
-        z: of even length.
     """
     first, second = jnp.split(z, 2)
     # Rational in t: no trigonometry, and c² + s² = 1 up to rounding.

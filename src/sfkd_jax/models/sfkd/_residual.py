@@ -72,14 +72,8 @@ def share_budget(
     + Lip r may exceed 1, but their sum as one map cannot. By convexity the same holds
     for every mixture of the A_j. The multipliers of φ are a witness of the joint bound.
 
-    Args:
-        operators: M_j before bounding.
-        couplings: (G, H) before bounding.
-        network: φ, bounded by 1.
-        alpha: α in (0, 1).
-
-    Returns:
-        A_j, and the residual with G and α H folded into its last and first weights.
+    `operators` M_j and `couplings` (G, H) are bounded here, `network` φ is. Returns A_j
+    and the residual with G and α H folded into its last and first weights.
     """
     # Kept apart from 1, or the factors below would be singular.
     out, into = (bounded(matrix, LARGEST_COUPLING) for matrix in couplings)
