@@ -18,7 +18,6 @@ ROW = {
     "system": "sfkd", "scenario": "s3", "vehicle": "kinematic", "inner_loop": "none", "controller": "mppi",
     "planner": "mppi", "sampling": "feedback", "env": "measured",
 }  # fmt: skip
-SETTINGS = {"vehicle": {}, "controller": {}, "evaluation": {}}
 HOLD = """
     import sys, time
     from pathlib import Path
@@ -39,32 +38,9 @@ def started(program, *arguments):
     return process
 
 
-def driven(row, value=0.0, episodes=2, steps=40):
-    """Arrays of a row as `evaluate` stores them, filled with a value."""
-    shapes = {
-        "lateral": (steps,),
-        "states": (steps + 1, 4),
-        "controls": (steps, 2),
-        "envs": (steps, 2),
-        "path": (9, 4),
-    }
-    name = evaluation.episode_name(row)
-    return {
-        f"{name}/{part}": np.full((episodes, *shape), float(value))
-        for part, shape in shapes.items()
-    }
-
-
 def keep(run_dir, row, value=0.0):
-    runs.write_results(
-        run_dir, SETTINGS, [row], driven(row, value) | {"dt": np.asarray(0.1)}, 0.0
-    )
-
-
-def stored(run_dir):
-    """Rows, and the arrays by the name of their drive."""
-    rows = store.read_json(run_dir / "results.json")["rows"]
-    return rows, store.read_arrays(run_dir / "episodes.safetensors", kind="episodes")[0]
+    arrays = {"lateral": np.full((2, 40), float(value)), "dt": np.asarray(0.1)}
+    runs.write_results(run_dir, {}, [(row, arrays)], 0.0)
 
 
 # ---- the lock
@@ -133,14 +109,15 @@ def test_two_processes_20_ms_after_each_other_lose_no_row_and_no_episode(tmp_pat
     for writer in writers:
         writer.communicate(f"{begins}\n", timeout=120)
         assert writer.returncode == 0
-    rows, arrays = stored(tmp_path)
+    rows = store.read_json(tmp_path / "results.json")["rows"]
     assert {(row["system"], row["scenario"]) for row in rows} == {
         (f"writer{me}", f"road{number}") for me in (0, 1) for number in range(5)
     }
     assert len(rows) == 10
     for row in rows:
         value = 10 * int(row["system"][-1]) + int(row["scenario"][4:])
-        assert np.all(arrays[f"{evaluation.episode_name(row)}/lateral"] == value)
+        arrays, _ = store.read_arrays(tmp_path / row["arrays"], kind="episodes")
+        assert np.all(arrays["lateral"] == value)
 
 
 @pytest.mark.parametrize("name", list(ROW))
@@ -148,10 +125,4 @@ def test_rows_that_differ_in_one_part_of_their_identity_are_two(name):
     other = ROW | {name: "other"}
     assert evaluation.merge([ROW], [other]) == [ROW, other]
     assert evaluation.merge([ROW], [dict(ROW)]) == [ROW]
-    assert evaluation.episode_name(ROW) != evaluation.episode_name(other)
-    known = {
-        key: value
-        for key, value in evaluation.identity(other).items()
-        if value is not None
-    }
-    assert evaluation.parse_episode_name(evaluation.episode_name(other)) == known
+    assert evaluation.identity(ROW) != evaluation.identity(other)

@@ -56,8 +56,8 @@ def run(settings: Settings) -> dict[str, Any]:
                 f"driving {about.episodes} x {about.episode_s:.0f} s: {name}"
             )
             evaluate = evaluating.SystemEvaluation(settings, name, system, None)
-            written = results / name, directory, settings, episodes
-            rows.append(comparing.write_cell(*written, evaluate(episodes)))
+            written = results / name, directory, settings, evaluate(episodes)
+            rows.append(comparing.write_cell(*written))
         rows, file = evaluation.compare(rows), results / "results.json"
         made_by = {"config": plain(settings), "versions": store.versions()}
         store.write_json(file, {"rows": rows} | made_by)

@@ -5,7 +5,7 @@ import json
 import numpy as np
 from helpers import write_policy
 
-from sfkd_jax import evaluation, store
+from sfkd_jax import store
 
 STEPS, DT = 60, 0.1
 RMSE = {
@@ -80,6 +80,12 @@ def certificate(**more):
     } | more  # fmt: skip
 
 
+def keep_arrays(path, size):
+    path.parent.mkdir(exist_ok=True)
+    stored = arrays(size) | {"dt": np.asarray(DT)}
+    store.write_arrays(path, stored, kind="episodes", config={})
+
+
 def write_run(run, *, episodes=True, **changes):
     """A run directory; `results=None` leaves results.json out."""
     run.mkdir(parents=True, exist_ok=True)
@@ -87,6 +93,9 @@ def write_run(run, *, episodes=True, **changes):
     settings = {"experiment": "s3", "seed": 0, "model": {"system": "sfkd"}}
     systems = ("sfkd", "measured"), ("nominal", "none"), ("oracle", "measured")
     rows = [row(*one) for one in systems]
+    for one, size in zip(rows, (0.05, 2.0, 0.02) if episodes else (), strict=False):
+        one["arrays"] = f"episodes/{one['system']}.safetensors"
+        keep_arrays(run / one["arrays"], size)
     documents = {
         "policy": {"config": settings, "sha256": "ab" * 32, "versions": {"jax": "1"}},
         "settings": settings,
@@ -107,16 +116,6 @@ def write_run(run, *, episodes=True, **changes):
             (run / f"{name}.json").write_text(json.dumps(document))
     lines = [{"step": k, "loss": 10.0 / k, "validation_loss": None} for k in (1, 2, 3)]
     (run / "metrics.jsonl").write_text("".join(json.dumps(one) + "\n" for one in lines))
-    if episodes:
-        stored = {
-            f"{evaluation.episode_name(one)}/{part}": values
-            for one, size in zip(rows, (0.05, 2.0, 0.02), strict=True)
-            for part, values in arrays(size).items()
-        }
-        stored["dt"] = np.asarray(DT)
-        store.write_arrays(
-            run / "episodes.safetensors", stored, kind="episodes", config={}
-        )
     return run
 
 
@@ -132,8 +131,5 @@ def write_comparison(directory, *, episodes=True, rows=None, **config):
     document = {"rows": rows, "config": {"name": "table1"} | config, "failed": {}}
     (directory / "results.json").write_text(json.dumps(document))
     for number in range(len(RMSE)) if episodes else ():
-        path = directory / f"cells/{number}.safetensors"
-        path.parent.mkdir(exist_ok=True)
-        stored = arrays(0.02 * (1 + number)) | {"dt": np.asarray(DT)}
-        store.write_arrays(path, stored, kind="cell", config={})
+        keep_arrays(directory / f"cells/{number}.safetensors", 0.02 * (1 + number))
     return directory

@@ -14,7 +14,7 @@ from PIL import Image, ImageSequence
 from sfkd_jax.evaluation.metrics import METRICS, Metric
 from sfkd_jax.report import figures, style, tables
 from sfkd_jax.report.comparison import write_comparison, write_results_page
-from sfkd_jax.report.episodes import Episodes, of_rows, of_run
+from sfkd_jax.report.episodes import Episodes, by_road, of_rows
 from sfkd_jax.report.film import LANE, Film, film_of
 from sfkd_jax.report.pages import to_latex
 from sfkd_jax.report.run import write_report
@@ -221,7 +221,9 @@ def test_a_row_cannot_name_arrays_outside_its_folder(tmp_path):
 
 
 def groups(tmp_path, **lateral):
-    (group,) = of_run(made.write_run(tmp_path))
+    run = made.write_run(tmp_path)
+    rows = json.loads((run / "results.json").read_text())["rows"]
+    (group,) = by_road(of_rows(run, rows))
     return [one._replace(**lateral) for one in group]
 
 

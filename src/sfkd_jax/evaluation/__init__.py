@@ -11,15 +11,12 @@ from sfkd_jax.evaluation._closed_loop import (
 from sfkd_jax.evaluation._closed_loop import simulate as simulate
 from sfkd_jax.evaluation._open_loop import baselines as baselines
 from sfkd_jax.evaluation._open_loop import open_loop as open_loop
-from sfkd_jax.evaluation._rows import ROAD as ROAD
 from sfkd_jax.evaluation._rows import SHARED as SHARED
 from sfkd_jax.evaluation._rows import Scores as Scores
 from sfkd_jax.evaluation._rows import compare as compare
 from sfkd_jax.evaluation._rows import disturbed as disturbed
-from sfkd_jax.evaluation._rows import episode_name as episode_name
 from sfkd_jax.evaluation._rows import identity as identity
 from sfkd_jax.evaluation._rows import merge as merge
-from sfkd_jax.evaluation._rows import parse_episode_name as parse_episode_name
 from sfkd_jax.evaluation._rows import pool as pool
 from sfkd_jax.evaluation._rows import row as row
 from sfkd_jax.evaluation._rows import score as score

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Mapping
 from typing import Any, TypeAlias
-from urllib.parse import parse_qsl, urlencode
 
 import numpy as np
 from jaxtyping import Float
@@ -33,8 +32,6 @@ IDENTITY = ("system", *SHARED, "env")
 """Columns that identify a row of results.json; a new row replaces the old row of the
 same identity.
 """
-ROAD = ("envs", "path")
-"""Arrays that describe the environment and the path of an episode."""
 
 Scores: TypeAlias = dict[str, PerEpisode]
 """Numbers per episode by the name of their metric."""
@@ -195,13 +192,3 @@ def merge(
     fresh = list(new)
     replaced = [identity(row) for row in fresh]
     return [row for row in old if identity(row) not in replaced] + fresh
-
-
-def episode_name(row: Mapping[str, Any]) -> str:
-    """Return the prefix of a row's arrays, such as "system=sfkd&scenario=s3"."""
-    return urlencode({name: text for name, text in identity(row).items() if text})
-
-
-def parse_episode_name(name: str) -> dict[str, str]:
-    """Return the identity in a name."""
-    return dict(parse_qsl(name))

@@ -10,7 +10,6 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import NamedTuple
 
-import numpy as np
 from hydra.errors import HydraException
 from jax.errors import JaxRuntimeError
 from omegaconf.errors import OmegaConfBaseException
@@ -23,7 +22,6 @@ from sfkd_jax.experiment.options import ComparisonSettings, Settings
 from sfkd_jax.settings import plain, replace
 from sfkd_jax.training import TrainingStopped
 
-KIND = "cell"
 OF_A_ROW = (TrainingStopped, ValueError, store.ArtefactError, JaxRuntimeError)
 """Errors that end a row and not the table; JAX's is of memory that does not suffice."""
 NUM_STORED_EPISODES = 2
@@ -140,28 +138,19 @@ def is_done(path: Path, settings: Settings) -> bool:
 
 
 def write_cell(
-    path: Path,
-    directory: Path,
-    settings: Settings,
-    episodes: EpisodeSet,
-    result: SystemResult,
+    path: Path, directory: Path, settings: Settings, result: SystemResult
 ) -> Row:
     """Write the arrays of the first episodes, then the row, and return the row.
 
     `path` is that of the cell without suffix, `directory` that of the comparison.
     """
-    # Copied to the host first: slices on a device would be compiled.
     stored = {
-        name: np.asarray(array)[:NUM_STORED_EPISODES]
-        for name, array in (result.arrays | episodes.road).items()
+        name: array[:NUM_STORED_EPISODES] if array.ndim else array
+        for name, array in result.arrays.items()
     }
-    stored["dt"] = np.asarray(settings.vehicle.dt)
-    file = path.with_name(f"{path.name}.safetensors")
-    store.write_arrays(file, stored, kind=KIND, config=plain(settings.scenario))
-    row = result.row | {
-        "arrays": str(file.relative_to(directory)),
-        "provenance": runs.provenance(),
-    }
+    name = str(path.with_name(f"{path.name}{store.SUFFIX}").relative_to(directory))
+    row = runs.keep_episodes(directory, name, result.row, stored)
+    row["provenance"] = runs.provenance()
     # The row last: its file is what marks a cell as done.
     document = {"row": row, "made_with": settings_hash(settings)}
     store.write_json(_row_file(path), document)
@@ -300,7 +289,7 @@ class Comparison:
             # Compiled once for all scenarios.
             evaluate = evaluate or self._compiled(cell, settings)
             result = evaluate(episodes)
-            write_cell(path, self.directory, settings, episodes, result)
+            write_cell(path, self.directory, settings, result)
             error = 1e3 * result.row["rmse_m"]["mean"]
             store.print_message(f"{' '.join(map(str, cell))}: {error:.1f} mm")
             done += 1

@@ -42,12 +42,6 @@ class EpisodeSet(NamedTuple):
     scenarios: Scenario
     keys: Key
 
-    @property
-    def road(self) -> dict[str, Any]:
-        """Environments and paths, so that a page draws them without the settings."""
-        road = self.scenarios.envs, self.scenarios.path.points
-        return dict(zip(evaluation.ROAD, road, strict=True))
-
 
 class SystemResult(NamedTuple):
     """A row of results.json before comparisons, and the arrays behind it."""
@@ -219,8 +213,11 @@ class SystemEvaluation:
                 _, scores, violation = self._scored(episodes, force)
             row["disturbed"].append(evaluation.disturbed(force, scores, violation))
         parts = ("lateral", "states", "controls")
-        arrays = {part: np.asarray(getattr(episode, part)) for part in parts}
-        return SystemResult(row, arrays)
+        arrays = {part: getattr(episode, part) for part in parts}
+        # With the roads: a page draws them without the settings.
+        known = episodes.scenarios
+        arrays |= {"envs": known.envs, "path": known.path.points, "dt": self._plant.dt}
+        return SystemResult(row, jax.tree.map(np.asarray, arrays))
 
     def _scored(
         self, episodes: EpisodeSet, force: float
@@ -339,18 +336,15 @@ def evaluate_run(settings: Settings, *, command: str | None = None) -> Path:
     runs.read_results(settings.run_dir)
     compared = load_systems(settings)
     dataset, _ = data.ensure_dataset(settings)
-    rows: list[Row] = []
-    arrays: dict[str, Any] = {"dt": settings.vehicle.dt}
+    found: list[SystemResult] = []
     length = f"{protocol.episodes} episodes of {protocol.episode_s:.0f} s"
     for name, system in compared.items():
         store.print_message(f"driving {length}: {name} on {episodes.name}")
-        row, own = SystemEvaluation(settings, name, system, dataset)(episodes)
-        rows.append(row)
-        prefix, own = evaluation.episode_name(row), own | episodes.road
-        arrays |= {f"{prefix}/{part}": array for part, array in own.items()}
-        error, worst = row["rmse_m"]["mean"], row["max_deviation_m"]
+        result = SystemEvaluation(settings, name, system, dataset)(episodes)
+        found.append(result)
+        error, worst = result.row["rmse_m"]["mean"], result.row["max_deviation_m"]
         store.print_message(f"  rmse {error:.4f} m, worst {worst:.3f} m")
     seconds = time.perf_counter() - began
     config = plain(settings) | ({"command": command} if command else {})
-    rows = evaluation.compare(rows)
-    return runs.write_results(settings.run_dir, config, rows, arrays, seconds)
+    evaluation.compare([result.row for result in found])
+    return runs.write_results(settings.run_dir, config, found, seconds)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import functools
 import hashlib
 import subprocess
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from contextlib import suppress
 from pathlib import Path
 from typing import Any
@@ -81,39 +81,42 @@ def policy_settings(settings: Settings, dataset: Dataset) -> dict[str, Any]:
     return recorded
 
 
-def read_results(run_dir: Path) -> tuple[list[Row], dict[str, Any]]:
-    """Return the rows and the episodes that a run already has."""
-    results, episodes = run_dir / "results.json", run_dir / "episodes.safetensors"
-    rows, arrays = [], {}
-    if results.exists():
-        rows = store.read_json(results, keys=("rows",))["rows"]
-    if episodes.is_file():
-        arrays, _ = store.read_arrays(episodes, kind=EPISODES)
+def read_results(run_dir: Path) -> list[Row]:
+    """Return the rows that a run already has."""
+    results = run_dir / "results.json"
+    if not results.exists():
+        return []
     with store.as_artefact_error(results):
-        return evaluation.merge([], rows), dict(arrays)
+        return evaluation.merge([], store.read_json(results, keys=("rows",))["rows"])
+
+
+def keep_episodes(directory: Path, name: str, row: Row, arrays: Any) -> Row:
+    """Write the arrays of a row to a file below `directory`; return the row with it."""
+    about = evaluation.identity(row)
+    store.write_arrays(directory / name, arrays, kind=EPISODES, config=about)
+    return row | {"arrays": name}
 
 
 def write_results(
     run_dir: Path,
     config: Mapping[str, Any],
-    rows: list[Row],
-    arrays: Mapping[str, Any],
+    found: Sequence[tuple[Row, Mapping[str, Any]]],
     seconds: float,
 ) -> Path:
-    """Add rows and episodes to those of a run, and return the path of results.json.
+    """Add rows and their arrays to those of a run; return the path of results.json.
 
     Rows replace earlier ones of the same identity; other processes may add theirs at
     the same time. `config` are plain settings and the command that was typed.
     """
-    path, episodes = run_dir / "results.json", run_dir / "episodes.safetensors"
-    about = {name: config[name] for name in ("vehicle", "controller", "evaluation")}
+    path, rows = run_dir / "results.json", list[Row]()
     # Read and written under one lock, or rows of another process would be lost.
     with store.locked(run_dir, wait=True):
-        earlier, old = read_results(run_dir)
         # Arrays first: a row that is listed then has its episodes.
-        store.write_arrays(episodes, {**old, **arrays}, kind=EPISODES, config=about)
+        for row, arrays in found:
+            name = f"episodes/{store.sha256(evaluation.identity(row))[:16]}.safetensors"
+            rows.append(keep_episodes(run_dir, name, row, arrays))
         document = {
-            "rows": evaluation.merge(earlier, rows),
+            "rows": evaluation.merge(read_results(run_dir), rows),
             "config": config,
             "versions": store.versions(),
             "seconds": seconds,

@@ -1,4 +1,4 @@
-"""Stored episodes of rows: those of a run, and those of the cells of a comparison."""
+"""Stored episodes of the rows of a run or of a comparison."""
 
 from __future__ import annotations
 
@@ -9,12 +9,10 @@ import numpy as np
 from jaxtyping import Float
 
 from sfkd_jax import store
-from sfkd_jax.evaluation import SHARED, parse_episode_name
+from sfkd_jax.evaluation import SHARED
 from sfkd_jax.evaluation.metrics import Row, switches
 from sfkd_jax.report.style import family, rank
 from sfkd_jax.report.tables import name_of
-
-CELL = "cell"
 
 
 class Episodes(NamedTuple):
@@ -52,36 +50,19 @@ class Episodes(NamedTuple):
         return [] if self.envs is None else np.flatnonzero(switches(self.envs)).tolist()
 
 
-def of_run(run: Path) -> list[list[Episodes]]:
-    """The episodes of a run, grouped by what may be compared on the same road.
-
-    The group with most switches comes first; empty without a file.
-    """
-    path = run / f"episodes{store.SUFFIX}"
-    arrays = store.read_arrays(path, kind="episodes")[0] if path.exists() else {}
-    dt = float(arrays.pop("dt", 0.1))
-    parts: dict[str, dict[str, np.ndarray]] = {}
-    for name, values in arrays.items():
-        episode, _, part = name.rpartition("/")
-        parts.setdefault(episode, {})[part] = values
+def by_road(episodes: list[Episodes]) -> list[list[Episodes]]:
+    """Episodes that may be compared, on one road; the one with most switches first."""
     groups: dict[tuple[Any, ...], list[Episodes]] = {}
-    for name, own in parts.items():
-        if one := _episodes(parse_episode_name(name), dt, own):
-            # By content: rows met the same road only if every byte of it is equal.
-            road = (None if a is None else a.tobytes() for a in (one.envs, one.path))
-            key = (*(one.row.get(column) for column in SHARED), *road)
-            groups.setdefault(key, []).append(one)
-    for group in groups.values():
-        group.sort(key=lambda one: (rank(one.system), one.name))
+    for one in sorted(episodes, key=lambda one: (rank(one.system), one.name)):
+        # By content: rows met the same road only if every byte of it is equal.
+        road = (None if a is None else a.tobytes() for a in (one.envs, one.path))
+        key = (*(one.row.get(column) for column in SHARED), *road)
+        groups.setdefault(key, []).append(one)
     return sorted(groups.values(), key=lambda group: -len(group[0].switches))
 
 
 def of_rows(directory: Path, rows: list[Row]) -> list[Episodes]:
-    """The episodes of those rows of a comparison whose arrays exist.
-
-    Raises:
-        ArtefactError: arrays are damaged, or a row names some outside of the directory.
-    """
+    """The episodes of those rows whose arrays exist below the directory."""
     found = []
     for row in rows:
         name = PurePath(str(row.get("arrays")))
@@ -90,14 +71,15 @@ def of_rows(directory: Path, rows: list[Row]) -> list[Episodes]:
             outside = "arrays of a row lie outside this folder"
             raise store.ArtefactError(f"{directory / 'results.json'}: {outside}")
         if (directory / name).is_file():
-            arrays = store.read_arrays(directory / name, kind=CELL)[0]
-            one = _episodes(row, float(arrays.get("dt", 0.1)), arrays)
+            arrays = store.read_arrays(directory / name, kind="episodes")[0]
+            one = _episodes(row, arrays)
             found += [one] if one else []
     return found
 
 
-def _episodes(row: Row, dt: float, arrays: dict[str, np.ndarray]) -> Episodes | None:
+def _episodes(row: Row, arrays: dict[str, np.ndarray]) -> Episodes | None:
     """The episodes of a row, None without a finite deviation."""
+    dt = float(arrays.get("dt", 0.1))
     lateral = np.asarray(arrays.get("lateral", np.zeros((0, 0))), dtype=float)
     # All NaN, as of a run that diverged at once: there is nothing to draw.
     if not np.any(np.isfinite(lateral)):

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from functools import partial
 from importlib import resources
 from pathlib import Path
 from typing import Any
@@ -9,8 +10,9 @@ from typing import Any
 from sfkd_jax import store
 from sfkd_jax.evaluation import SHARED, formats
 from sfkd_jax.evaluation.formats import DASH, dig, is_number, is_pair, plain, short
+from sfkd_jax.evaluation.metrics import Row
 from sfkd_jax.report import figures, style, tables
-from sfkd_jax.report.episodes import Episodes, of_run
+from sfkd_jax.report.episodes import Episodes, by_road, of_rows
 from sfkd_jax.report.film import film_of
 from sfkd_jax.report.pages import Part, Picture, Section, write_page
 from sfkd_jax.report.tables import record_table, title_of
@@ -130,10 +132,11 @@ def _sections(
         for name, command in MADE_BY.items()
         if not (run_dir / name).exists()
     ]
-    sections, episodes = [Section("", missing)], f"episodes{store.SUFFIX}"
+    drawn = partial(_driven, run_dir, system, half, images)
+    sections = [Section("", missing)]
     for title, file, make in (
         ("Closed loop", "results.json", lambda: _scores(results)),
-        ("Episodes", episodes, lambda: _episodes(run_dir, system, half, images)),
+        ("Episodes", "results.json", lambda: drawn(results.get("rows"))),
         ("Certificate", "certificate.json", lambda: _certified(certificate)),
         ("Open loop", "open_loop.json", lambda: _predicted(run_dir, proof, images)),
         ("Training", "metrics.jsonl", lambda: _learned(run_dir, images)),
@@ -154,11 +157,13 @@ def _scores(results: dict[str, Any]) -> list[Part]:
     return parts
 
 
-def _episodes(run_dir: Path, system: str, half: Any, images: Path) -> list[Part]:
+def _driven(
+    run_dir: Path, system: str, half: Any, images: Path, rows: list[Row] | None
+) -> list[Part]:
     """Figures of every group of episodes, and a film of the first one."""
     parts: list[Part] = []
     corridor = float(half) if is_number(half) else None
-    for number, group in enumerate(of_run(run_dir), 1):
+    for number, group in enumerate(by_road(of_rows(run_dir, rows or [])), 1):
         title = title_of([group[0].row], SHARED)
         film = number == 1
         parts += draw_episodes(group, images, title, number, corridor, film=film)
