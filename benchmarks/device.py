@@ -22,13 +22,15 @@ PRETRAINED = Path(sfkd_jax.__file__).with_name("pretrained")
 HORIZON = 20
 
 
-def loaded(name: str, samples: int):
-    """The shipped policy with another number of samples."""
+def loaded(name: str, samples: int, **changes):
+    """The shipped policy with another number of samples, and other settings."""
     directory = PRETRAINED / name
     trained = policy.restore(directory)
     settings = trained.settings["controller"]
     mppi = settings["mppi"] | {"num_samples": samples}
-    return trained, sfkd_jax.load(directory, controller=settings | {"mppi": mppi})
+    return trained, sfkd_jax.load(
+        directory, controller=settings | {"mppi": mppi} | changes
+    )
 
 
 def family(trained: policy.TrainedModel, duration: float):
@@ -40,9 +42,9 @@ def family(trained: policy.TrainedModel, duration: float):
     )
 
 
-def control_step(name: str, samples: int, steps: int) -> dict[str, float]:
+def control_step(name: str, samples: int, steps: int, **changes) -> dict[str, float]:
     """Wall time of one control step, transfers of state and control included."""
-    trained, loaded_policy = loaded(name, samples)
+    trained, loaded_policy = loaded(name, samples, **changes)
     episode = jax.jit(family(trained, 10.0))(jax.random.key(0))
     reference = evaluation.first_reference(
         episode, horizon=HORIZON, dt=trained.vehicle.dt
@@ -65,6 +67,7 @@ def control_step(name: str, samples: int, steps: int) -> dict[str, float]:
         "median_ms": float(np.median(times)),
         "p99_ms": float(np.quantile(times, 0.99)),
         "first_s": compiled,
+        "compilations": act._cache_size(),
     }
 
 

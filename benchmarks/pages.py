@@ -5,6 +5,7 @@ python -m benchmarks.pages    writes every block `<!-- NAME -->` … `<!-- end -
 
 import json
 import re
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -79,17 +80,21 @@ def corridor():
     return table(["", *CARS], lines)
 
 
+def measured():
+    """What `benchmarks.recovery` found: (car, row) -> numbers."""
+    rows = read("benchmarks/recovery.json")["rows"]
+    return {(row["car"], row["row"]): row for row in rows}
+
+
 def shield():
     """Hostile planners inside the filter, and without it."""
-    cars = read("benchmarks/shield.json")["cars"]
-    kinds = ("worst", "bang-bang", "random", "NaN", "full lock")
+    rows = measured()
 
     def cells(car, kind):
-        both = cars[car]["scripts"][kind]
-        free, kept = both["without"]["departures"], both["with"]
-        count = kept["drives"]
+        kept = rows[car, f"planner {kind}: guard"]
+        free = rows[car, f"planner {kind}: bare"]["left_the_lane"]
         return [
-            f"{free} of {count} → {kept['departures']}",
+            f"{free} of {kept['runs']} → {kept['left_the_lane']}",
             f"{kept['largest_m']:.3f} m, {100 * kept['inside']:.1f} %",
         ]
 
@@ -99,9 +104,75 @@ def shield():
             f"{car}: left the lane, without → with",
             "largest distance, runs inside",
         ]
+    kinds = ("worst", "bang-bang", "random", "NaN", "full lock")
     return table(
         head,
         [[kind, *cells("dynamic", kind), *cells("kinematic", kind)] for kind in kinds],
+    )
+
+
+def recovery():
+    """Starts, wrong measurements and stops outside the box."""
+    rows = measured()
+
+    def starts(car, name):
+        new, old = (
+            rows[car, f"{name}: {way}"]
+            for way in ("planner in the guard", "law of the box")
+        )
+        return f"{old['back']} → {new['back']} of {new['runs']}"
+
+    def faults(car, length, *kinds):
+        found = [rows[car, f"{kind}, {length}"] for kind in kinds]
+        gone, runs, back = (
+            sum(row[name] for row in found) for name in ("departures", "runs", "back")
+        )
+        largest = max(row["largest_m"] or np.inf for row in found)
+        return f"{largest:.2f} m; {gone} of {runs}; {back}"
+
+    def stop(car, friction):
+        kept, bare = (
+            rows[car, f"brake, friction {friction}: {way}"] for way in ("guard", "bare")
+        )
+        return f"{kept['longest_m']:.1f}; {bare['longest_m']:.1f}"
+
+    def beyond(car):
+        unseen = ("bias", "drift", "basin", "planner")
+        counted = [
+            row
+            for (whose, name), row in rows.items()
+            if whose == car and "steps" in row and not any(w in name for w in unseen)
+        ]
+        counts = (sum(row[n] for row in counted) for n in ("beyond_claim", "steps"))
+        return "{:,} of {:,}".format(*counts)
+
+    def flagged(car):
+        row = rows[car, "class"]
+        return f"{row['runs_not_healthy']} of {row['runs']}; {1 - row['healthy']:.2%}"
+
+    jumps, silent = ("jump", "alternating", "yaw"), ("frozen", "late", "lost")
+    cells = {
+        "starts that come back, law of the box alone → policy": partial(
+            starts, name="grid"
+        ),
+        "the same, random to 20 m, any yaw, S3 roads": partial(
+            starts, name="random starts"
+        ),
+        "pose jumps to 2 s: largest distance; departures; back": lambda car: faults(
+            car, "brief", *jumps
+        ),
+        "frozen, late, lost to 2 s": lambda car: faults(car, "brief", *silent),
+        "either, for 5 s": lambda car: faults(car, "5 s", *jumps, *silent),
+        "full braking from 10 m/s, friction 0.7 [m]; unfiltered": partial(
+            stop, friction=0.7
+        ),
+        "the same, friction 0.3": partial(stop, friction=0.3),
+        "steps beyond the distance that `info` claims": beyond,
+        "runs under the conditions with a flag; steps": flagged,
+    }
+    return table(
+        ["outside the box", *CARS],
+        [[name, *(cell(car) for car in CARS)] for name, cell in cells.items()],
     )
 
 
@@ -170,7 +241,11 @@ def peers():
 
 BLOCKS = {
     "README.md": {"corridor": corridor},
-    "docs/corridor.md": {"corridor": corridor, "shield": shield},
+    "docs/corridor.md": {
+        "corridor": corridor,
+        "shield": shield,
+        "recovery": recovery,
+    },
     "docs/planner.md": {"timing": timing},
     "docs/adaptation.md": {"adaptation": adaptation},
     "docs/results.md": results.TABLES | {"peers": peers},

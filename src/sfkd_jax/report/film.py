@@ -54,7 +54,11 @@ def film_of(
     if not chosen:
         return None
     dt, length = chosen[0].dt, min(one.lateral.shape[1] for one in chosen)
-    film = Film(chosen, min(round(SECONDS / dt), length), corridor)
+    return write(path, Film(chosen, min(round(SECONDS / dt), length), corridor))
+
+
+def write(path: Path, film: Film) -> Path:
+    """Write the GIF of a film, in real time."""
     # Defaults: a user's style file would move axes that are placed by hand.
     with matplotlib.rc_context():
         matplotlib.rcdefaults()
@@ -65,7 +69,7 @@ def film_of(
     first, *rest = [
         one.quantize(palette=palette, dither=Image.Dither.NONE) for one in frames
     ]
-    pause = round(1e3 * EVERY * dt)
+    pause = round(1e3 * EVERY * film.cars[0].dt)
     first.save(path, save_all=True, append_images=rest, duration=pause, loop=0)
     return path
 

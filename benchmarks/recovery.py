@@ -1,0 +1,677 @@
+"""What the shipped path policies do outside their box: far away, deceived, braking.
+
+    python -m benchmarks.recovery [--runs 16 --samples 64 --rows starts faults]
+
+The true cars, seen through sensors that fail in named ways, at any call rate. Every run
+is a row of arrays (`Runs`), so that each of three controllers compiles once: the policy,
+a request inside its guard, the same request without one. Writes benchmarks/recovery.json,
+one line a row.
+"""
+
+import argparse
+import json
+import time
+from functools import partial
+from itertools import product
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+import sfkd_jax
+from benchmarks import device
+from sfkd_jax import build, control, geometry, plants, scenarios
+from sfkd_jax.evaluation.metrics import LANE_HALF_WIDTH, VEHICLE_HALF_WIDTH
+from sfkd_jax.geometry import LATERAL, wrap_angle
+from sfkd_jax.types import Controller
+
+SHIPPED = Path(sfkd_jax.__file__).with_name("pretrained")
+CARS = ("dynamic", "kinematic")
+NOISE = (0.015, 0.015, 0.002, 0.03, 0.02, 0.002, 0.001)
+HORIZON, SPACING, PERIOD, TICK = 20, 0.5, 0.1, 0.02
+"""Steps of a plan; of path points [m]; of the policies; of the cars between calls [s]."""
+PART, PAST, NEAR, LONGEST = 50, 51, 100, 600
+"""Steps of a compiled part; readings kept; path points searched to each side; steps of
+the roads.
+"""
+DEPARTED, BACK, LANE = 2.0, 0.3, LANE_HALF_WIDTH - VEHICLE_HALF_WIDTH
+"""Distance that counts as a departure [m]; as being back [m, rad]; at which a car leaves its
+lane [m].
+"""
+KINDS = ("law", "worst", "brake", "evade", "linear", "NaN", "lock")
+"""Of requests: law + ν; ν outwards; −6 m/s²; a path 1 m to the left; the law of the box
+without recovery; not a number; full lock.
+"""
+
+
+class Now(NamedTuple):
+    """What a run meets at every call; arrays begin (run, time).
+
+    Attributes:
+        env: that the car is in.
+        told: that the controller is told.
+        speed: v_ref [m/s].
+        aside: the reference, moved to the left [m].
+        steering: added to the steering angle [rad].
+        offset: of the measured pose: ahead, to the left [m], yaw [rad].
+        lag: calls since the reading that the sensor shows.
+        lost: whether it shows NaN.
+        kind: of the request, index of `KINDS`.
+        nu: as a share of its limit.
+    """
+
+    env: Any
+    told: Any
+    speed: Any
+    aside: Any
+    steering: Any
+    offset: Any
+    lag: Any
+    lost: Any
+    kind: Any
+    nu: Any
+
+
+class Runs(NamedTuple):
+    """Runs of one length; arrays begin with the run.
+
+    Attributes:
+        start: state.
+        foot: arc length beside it [m].
+        road: points of the path.
+        noise: standard deviations of the readings.
+        ticks: `TICK`s between calls.
+        elapsed: periods between calls, as told to the planner.
+        seed: of noise and samples.
+        now: of every call.
+    """
+
+    start: Any
+    foot: Any
+    road: Any
+    noise: Any
+    ticks: Any
+    elapsed: Any
+    seed: Any
+    now: Now
+
+
+def request(law, low, high, now):
+    """A planner along a path that asks for one kind, whatever is measured."""
+    low, high = jnp.asarray(low), jnp.asarray(high)
+
+    def act(params, memory, xi, env, preview):
+        curvature, speed = preview.road[0]
+        lawful = law(xi, curvature, speed, env)
+        turn = law.turn(curvature, speed, env)
+        outwards = jnp.stack([jnp.where(xi[LATERAL] < 0.0, -1.0, 1.0), 1.0])
+        asked = (
+            lawful + now.nu * law.perturbation,
+            lawful + outwards * law.perturbation,
+            lawful.at[1].set(low[1]),
+            law(xi.at[LATERAL].add(-1.0), curvature, speed, env),
+            turn.control - turn.gain @ (xi - turn.state),
+            jnp.full(2, jnp.nan),
+            jnp.where(now.nu > 0.0, high, low),
+        )
+        info = {
+            "predicted_states": jnp.tile(xi, (HORIZON, 1)),
+            "effective_samples": jnp.ones(()),
+            "healthy": jnp.asarray(True),
+        }
+        return jnp.clip(jnp.stack(asked)[now.kind], low, high), memory, info
+
+    return Controller(lambda key: (), act)
+
+
+class Car:
+    """A shipped policy, its true car, and three programs that drive it."""
+
+    def __init__(self, name, samples, batch):
+        directory = SHIPPED / f"{name}_path"
+        planner = sfkd_jax.load(directory).settings["controller"]
+        mppi = planner["mppi"] | {"num_samples": samples}
+        self.loaded = sfkd_jax.load(directory, controller=planner | {"mppi": mppi})
+        self.name, self.batch = name, batch
+        self.step = getattr(plants, name)(dt=TICK, substeps=1).step
+        self.corridor = self.loaded.certificate["corridor"]["corridor_m"]
+        self.states = len(self.loaded.vehicle.state_names)
+        self.noise = np.asarray(NOISE[: self.states], np.float32)
+        self.policy = self.program(self.make_policy)
+        self.guarded = self.program(partial(self.asking, guard=True))
+        self.bare = self.program(partial(self.asking, guard=False))
+
+    def make_policy(self, now):
+        """The loaded controller, which needs no request."""
+        return self.loaded.controller
+
+    def asking(self, now, *, guard):
+        """A request of `KINDS` in the world, inside the policy's guard or without it."""
+        plant, law = self.loaded.vehicle, self.loaded.law
+        planner = request(law, plant.control_low, plant.control_high, now)
+        if guard:
+            around = self.loaded.model, plant, law, self.loaded.certificate
+            planner = build.in_corridor(planner, *around)
+        return control.along_reference(planner, coordinates=law.gain.shape[-1])
+
+    def program(self, make):
+        """(runs) -> what is recorded of every call, (run, time, …)."""
+        part = jax.jit(jax.vmap(partial(part_of_run, self, make)))
+        nothing = Now(*[0] * len(Now._fields))
+        begin = jax.jit(jax.vmap(lambda seed: make(nothing).init(jax.random.key(seed))))
+
+        def batch(runs, rows):
+            runs = jax.tree.map(lambda leaf: leaf[rows], runs)
+            past = np.repeat(runs.start[:, None], PAST, axis=1)
+            number = np.zeros(len(rows), np.int32)
+            carry, parts = (number, runs.start, runs.foot, begin(runs.seed), past), []
+            for at in range(0, steps := runs.now.lost.shape[1], PART):
+                at = np.minimum(at + np.arange(PART), steps - 1)
+                now = jax.tree.map(lambda leaf, at=at: leaf[:, at], runs.now)
+                carry, recorded = part(runs._replace(now=now), carry)
+                parts.append(jax.tree.map(np.asarray, recorded))
+            return jax.tree.map(lambda *p: np.concatenate(p, 1)[:, :steps], *parts)
+
+        def drive(runs):
+            # Batches and parts of one size: every call is the compiled program.
+            count, each = len(runs.seed), np.arange(self.batch)
+            firsts = range(0, count, self.batch)
+            made = [batch(runs, np.minimum(one + each, count - 1)) for one in firsts]
+            return jax.tree.map(lambda *all_: np.concatenate(all_)[:count], *made)
+
+        return drive
+
+
+def foot_of(path, position, before):
+    """Arc length and distance of the nearest point of the path near the last foot."""
+    last = path.points.shape[0] - 2 * NEAR
+    first = jnp.clip((before / SPACING).astype(int) - NEAR, 0, last)
+    near = jax.lax.dynamic_slice_in_dim(path.points, first, 2 * NEAR)
+    best = jnp.argmin(jnp.sum((near[:, :2] - position) ** 2, axis=1))
+    return scenarios.project(path, position, SPACING * (first + best))
+
+
+def part_of_run(car, make, runs, carry):
+    """`PART` calls of one run, whose arrays have lost their first axis."""
+    path = scenarios.Path(runs.road, jnp.asarray(SPACING))
+    key = jax.random.key(runs.seed + 1)
+
+    def step(carry, now):
+        number, state, foot, memory, past = carry
+        foot, left = foot_of(path, state[:2], foot)
+        yaw = scenarios.point_at(path, foot)[2]
+        ahead = scenarios.reference_window(
+            path, foot, now.speed, dt=PERIOD, horizon=HORIZON
+        )
+        normals = jnp.stack([-jnp.sin(ahead[:, 2]), jnp.cos(ahead[:, 2])], axis=1)
+        ahead = ahead.at[:, :2].add(now.aside * normals)
+        fresh = jax.random.normal(jax.random.fold_in(key, number), state.shape)
+        past = jnp.concatenate([(state + runs.noise * fresh)[None], past[:-1]])
+        shift = geometry.rotate(yaw, now.offset[:2])
+        seen = past[now.lag].at[:2].add(shift).at[2].add(now.offset[2])
+        seen = jnp.where(now.lost, jnp.nan, seen)
+        # A request is no plan that could be shifted.
+        if make == car.make_policy:
+            memory = control.tuned(memory, elapsed=runs.elapsed)
+        acted, memory, info = make(now).act(
+            car.loaded.params, memory, seen, now.told, ahead
+        )
+        turned = acted.at[0].add(now.steering)
+        after = jax.lax.fori_loop(
+            0, runs.ticks, lambda _, x: car.step(x, turned, now.env), state
+        )
+        flags = {
+            name: leaf
+            for name, leaf in info.items()
+            if jnp.shape(leaf) == () and jnp.result_type(leaf) == jnp.bool_
+        }
+        recorded = {
+            "left": left - now.aside,
+            "turned": wrap_angle(state[2] - yaw),
+            "along": foot,
+            "state": state,
+            "corridor": info.get("corridor", jnp.nan),
+            "healthy": flags["healthy"] & flags.get("shield_healthy", True),
+            "flags": flags,
+        }
+        return (number + 1, after, foot, memory, past), recorded
+
+    return jax.lax.scan(step, carry, runs.now)
+
+
+def roads(count, seed, conditions=None, bends=None):
+    """Points of paths, (run, point, 4), and schedules of e, (run, 600, 2); S3's own, or
+    others.
+    """
+    family = scenarios.scenario(
+        name="s3", duration=LONGEST * PERIOD, state_size=4, dt=PERIOD
+    )
+    keys = jax.random.split(jax.random.key(seed), count)
+    made = jax.jit(jax.vmap(family))(keys)
+    points, envs = np.asarray(made.path.points), np.asarray(made.envs)
+    if conditions is not None:
+        envs = np.asarray(jax.jit(jax.vmap(conditions))(keys))
+    if bends is not None:
+        bent = partial(scenarios.path_from_curvature, spacing=SPACING)
+        turns = bends * np.ones(points.shape[:2])
+        points = np.asarray(jax.jit(jax.vmap(lambda one: bent(one).points))(turns))
+    return points, envs
+
+
+def runs_on(car, road, steps, seed, *, ticks=5, foot=0.0, beside=(), **now):
+    """Runs on roads from `foot` [m] on; beside = (e_y, yaw, speed, body …) at the start.
+
+    What a call is not given is 0, but v_ref and e; e is told as it is.
+    """
+    (points, envs), count = road, len(road[0])
+    # e at the time of each call; beyond the schedule its last value stays.
+    at = np.floor(np.arange(steps) * ticks * TICK / PERIOD + 1e-6).astype(int)
+    given = {"speed": 10.0, "env": envs[:, np.minimum(at, LONGEST - 1)]} | now
+    given = {"told": given["env"]} | given
+    shapes = {"offset": (3,), "nu": (2,), "env": (2,), "told": (2,)}
+    kinds = {"lag": np.int32, "kind": np.int32, "lost": bool}
+    filled = Now(
+        *(
+            np.broadcast_to(
+                np.asarray(given.get(name, 0), kinds.get(name, np.float32)),
+                (count, steps, *shapes.get(name, ())),
+            )
+            for name in Now._fields
+        )
+    )
+    every = partial(np.full, count)
+    foot = np.asarray(foot + np.zeros(count), np.float32)
+    here = points[np.arange(count), np.round(foot / SPACING).astype(int)]
+    usual = (0.0, 0.0, filled.speed[:, 0])
+    left, turned, speed, *body = (*beside, *usual[len(beside) :])
+    start = np.zeros((count, car.states), np.float32)
+    start[:, 0] = here[:, 0] - left * np.sin(here[:, 2])
+    start[:, 1] = here[:, 1] + left * np.cos(here[:, 2])
+    start[:, 2], start[:, 3] = here[:, 2] + turned, speed
+    start[:, 4:] = np.zeros((count, car.states - 4)) if not body else np.transpose(body)
+    return Runs(
+        start=start,
+        foot=foot,
+        road=points.astype(np.float32),
+        noise=np.tile(car.noise, (count, 1)),
+        ticks=every(ticks, np.int32),
+        elapsed=every(ticks * TICK / PERIOD, np.float32),
+        seed=np.arange(count) + 1000 * seed,
+        now=filled,
+    )
+
+
+def driven(drive, parts):
+    """What is recorded of several rows that are driven as one."""
+    ends = np.cumsum([0, *(len(one.seed) for one in parts.values())])
+    made = drive(jax.tree.map(lambda *p: np.concatenate(p), *parts.values()))
+    places = zip(parts, ends, ends[1:], strict=False)
+    return {k: jax.tree.map(lambda leaf: leaf[a:b], made) for k, a, b in places}
+
+
+def distance(made):
+    """|e_y|, infinite where it is not a number."""
+    return np.where(np.isfinite(made["left"]), np.abs(made["left"]), np.inf)
+
+
+def shown(value, digits=3):
+    """A number as JSON has it: None if there is none."""
+    return round(float(value), digits) if np.isfinite(value) else None
+
+
+def back(made):
+    """Whether each run is back at its end, and when it was last away [s]."""
+    away, turned = distance(made) > BACK, np.abs(made["turned"]) > BACK
+    settled = ~(away | turned)[:, -20:].any(axis=1)
+    last = away.shape[1] - np.argmax(away[:, ::-1], axis=1)
+    return settled, PERIOD * np.where(away.any(axis=1), last, 0)
+
+
+def returned(made, runs):
+    """How many runs are back, when, and how the worst of them began."""
+    settled, times = back(made)
+    order = np.argsort(np.where(settled, times, np.inf))[::-1]
+    worst = [
+        {"left": shown(made["left"][run, 0]), "yaw": shown(made["turned"][run, 0])}
+        | {"rest": np.round(runs.start[run, 3:], 3).tolist()}
+        | {"friction, wind": np.round(runs.now.env[run, 0], 2).tolist()}
+        for run in order[: max(1, min(5, np.sum(~settled)))]
+    ]
+    return {
+        "runs": len(settled),
+        "back": int(settled.sum()),
+        "median_s": shown(np.median(times[settled]), 1),
+        "worst_s": shown(np.max(times[settled], initial=0.0), 1),
+        "slowest" if settled.all() else "failed": json.loads(
+            json.dumps(worst), parse_float=lambda text: round(float(text), 3)
+        ),
+    }
+
+
+def claimed(made, corridor):
+    """Steps outside the certified corridor, of them healthy; beyond a claim."""
+    far, healthy, claims = distance(made), made["healthy"], made["corridor"]
+    return {
+        "runs": len(far),
+        "steps": far.size,
+        "outside": int((far > corridor).sum()),
+        "healthy_outside": int(((far > corridor) & healthy).sum()),
+        "beyond_claim": int((np.isfinite(claims) & (far > claims)).sum()),
+        "claimed": shown(np.isfinite(claims).mean(), 4),
+        "healthy": shown(healthy.mean(), 4),
+        "departures": int((far > DEPARTED).any(axis=1).sum()),
+        "largest_m": shown(far.max()),
+    }
+
+
+OFFSETS, HEADINGS = np.linspace(-20.0, 20.0, 21), np.linspace(-np.pi, np.pi, 17)
+"""Starts of the figure, at friction 0.6 without wind and 10 m/s."""
+
+
+def starts(car, most):
+    """The grid of 420; that of the figure; random ones on curved roads."""
+    axes = (
+        (0.3, 1.0, 1.5, 3.0, 8.0, 20.0, -20.0),
+        (0.0, 0.5, -0.5, np.pi / 2, np.pi - 0.01),
+        (6.0, 10.0),
+        (0.3, 0.6, 0.9),
+        (0.0, 8.0),
+    )
+    at = np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, 5)
+    at = at[np.linspace(0, len(at) - 1, min(most, len(at))).astype(int)]
+    seen = np.stack(np.meshgrid(OFFSETS, HEADINGS, indexing="ij"), -1).reshape(-1, 2)
+    seen, many, random = seen[:most], min(most, 2000), np.random.default_rng(3)
+    low, high = np.asarray(car.loaded.certificate["boxes"]["state"])[:, 3:]
+    beside = random.uniform(
+        (-20.0, -np.pi, 2.0, *low), (20.0, np.pi, 12.0, *high), (many, 3 + len(low))
+    )
+    make = partial(runs_on, car, steps=200, seed=3)
+    straight = partial(roads, seed=3, bends=0.0)
+    quiet = np.asarray([0.6, 0.0])
+    return {
+        "grid": make(straight(len(at)), beside=(*at.T[:3],), env=at[:, None, 3:]),
+        "basin": make(straight(len(seen)), beside=(*seen.T,), env=quiet),
+        "random starts": make(
+            roads(many, 3), foot=random.uniform(20, 150, many), beside=(*beside.T,)
+        ),
+    }
+
+
+def start_rows(car, most):
+    """Who comes back, from where, and when: planner, law, law of the box."""
+    parts, boxed = starts(car, most), KINDS.index("linear")
+    linear = {
+        name: one._replace(now=one.now._replace(kind=one.now.kind + boxed))
+        for name, one in parts.items()
+    }
+    ways = {
+        "planner in the guard": driven(car.policy, parts),
+        "law in the guard": driven(car.guarded, parts),
+        "law of the box": driven(car.bare, linear),
+    }
+    for way, made in ways.items():
+        for name in ("grid", "random starts"):
+            yield f"{name}: {way}", returned(made[name], parts[name])
+        times = np.where(*back(made["basin"]), -1)
+        yield f"basin: {way}", {"s": np.ceil(times).astype(int).tolist()}
+
+
+FAULTS = ("jump", "alternating", "yaw", "frozen", "late", "lost", "no e")
+
+
+def faulty(car, many, longest):
+    """One fault a run on S3, for `longest` s or up to 2 s (a delay up to 1 s)."""
+    random, fault, steps = np.random.default_rng(4), np.arange(many) % len(FAULTS), 250
+    is_ = {name: (fault == number)[:, None] for number, name in enumerate(FAULTS)}
+    brief = random.uniform(0.1, np.where(is_["frozen"] | is_["late"], 1.0, 2.0))
+    length = longest or brief
+    step = np.arange(steps) - random.integers(50, 80, (many, 1))
+    on = (step >= 0) & (PERIOD * step < length)
+    size, angle = random.uniform((0.5, -np.pi), (10.0, np.pi), (many, 2)).T[..., None]
+    moved = size * on * (is_["jump"] | (is_["alternating"] & (step % 2 == 0)))
+    ways = moved * np.cos(angle), moved * np.sin(angle), on * is_["yaw"] * angle
+    lag = np.where(is_["frozen"], step + 1, random.integers(1, 11, (many, 1)))
+    road = roads(many, 4)
+    unknown = is_["no e"] & (np.arange(steps) < 50)
+    runs = runs_on(
+        car,
+        road,
+        steps,
+        4,
+        offset=np.stack(ways, axis=-1),
+        lag=np.where(on & (is_["frozen"] | is_["late"]), lag, 0),
+        lost=on & is_["lost"],
+        told=np.where(unknown[..., None], np.nan, road[1][:, :steps]),
+    )
+    return runs, fault
+
+
+def fault_rows(car, most):
+    """What each fault of the sensors does."""
+    for label, longest in (("brief", None), ("5 s", 5.0)):
+        runs, faults = faulty(car, min(most, 1000), longest)
+        whole = car.policy(runs)
+        for number, fault in enumerate(FAULTS[: most + 1]):
+            mine = faults == number
+            made = jax.tree.map(lambda leaf, mine=mine: leaf[mine], whole)
+            spins = (np.abs(made["turned"]) > np.pi / 2).any(axis=1).sum()
+            more = {"spins": int(spins), "back": int(back(made)[0].sum())}
+            yield f"{fault}, {label}", claimed(made, car.corridor) | more
+
+
+def stop_rows(car, most):
+    """Requests to brake and to evade, at a random time of S3 under the law."""
+    many, steps = min(most, 1000), 200
+    road, onset = roads(many, 5), np.random.default_rng(5).integers(30, 90, (many, 1))
+    for kind, friction in product(("brake", "evade"), (0.3, 0.7, "S3")):
+        envs, time_ = road[1][:, :steps].copy(), np.arange(steps)
+        if friction != "S3":
+            envs[..., 0] = friction
+        asked = np.where(time_ < onset, 0, KINDS.index(kind))
+        runs = runs_on(car, road, steps, 5, env=envs, kind=asked)
+        for way, drive in (("guard", car.guarded), ("bare", car.bare)):
+            made = drive(runs)
+            found = claimed(made, car.corridor)
+            if kind == "brake":
+                # Where it does not stand, the way until the end.
+                stands = (made["state"][..., 3] < 0.1) & (time_ > onset)
+                stands[:, -1] = True
+                first = np.argmax(stands, axis=1)[:, None]
+                along = partial(np.take_along_axis, made["along"], axis=1)
+                far = np.where((time_ < onset) | (time_ > first), 0, distance(made))
+                way_m = along(first) - along(onset)
+                found["stand"] = int((first < steps - 1).sum())
+                found |= {"mean_m": shown(way_m.mean(), 2)}
+                found |= {"longest_m": shown(way_m.max(), 2)}
+                found["largest_m"] = shown(far.max())
+            yield f"{kind}, friction {friction}: {way}", found
+
+
+def deceptions(steps):
+    """Errors that stay: label -> entries of `Now`."""
+    time_ = PERIOD * np.arange(steps)[:, None]
+    _, left, yaw = np.eye(3)
+    side = np.where(np.floor(time_[:, 0] / 2.0) % 2 == 0, 0.0, 0.1)
+    biases = {f"position bias {b} m": {"offset": b * left} for b in (0.05, 0.15)}
+    steering = {
+        f"steering offset {d} degrees": {"steering": np.deg2rad(d)}
+        for d in (0.5, 1.0, 1.25, 1.5, 3.0)
+    }
+    return (
+        biases
+        | steering
+        | {
+            "nothing": {},
+            "drift 1 cm/s": {"offset": 0.01 * time_ * left},
+            "yaw bias 0.03 rad": {"offset": 0.03 * yaw},
+            "reference moves 0.1 m": {"aside": side},
+            "NaN for good": {"lost": time_[:, 0] >= 5.0},
+        }
+    )
+
+
+def in_class(car, many):
+    """Runs under the conditions of the certificate."""
+    about = car.loaded.certificate["corridor"]["conditions"]
+    random = np.random.default_rng(6)
+    (slow, fast), time_ = about["speed"], PERIOD * np.arange(LONGEST)
+    period, phase, swing, level = random.uniform(size=(4, many, 1))
+    swung = 0.8 * swing * np.sin(2 * np.pi * (time_ / (5 + 15 * period) + phase))
+    speeds = np.clip(slow + level * (fast - slow) + swung, slow, fast)
+    most = about["lateral_acceleration"] / speeds.max(axis=1, keepdims=True) ** 2
+    # Curvature as in the data: clipped sinusoids, or for a third of the roads circles.
+    along, draw = SPACING * np.arange(1422), partial(random.uniform, size=(many, 1))
+    waves = random.uniform(*about["wavelengths"], (3, many, 1))
+    turns = 2 * np.pi * (along / waves + random.uniform(size=(3, many, 1)))
+    bent = np.sqrt(draw()) * np.clip(2 * np.sin(turns).mean(axis=0), -1, 1)
+    bent = np.where(draw() < 1 / 3, np.clip(draw(-1.5, 1.5), -1, 1), bent)
+    bends = np.minimum(about["peak_curvature"], most) * bent
+    switching = partial(
+        scenarios.random_switching,
+        steps=LONGEST,
+        dt=PERIOD,
+        low=about["env_box"][0],
+        high=about["env_box"][1],
+        dwell=about["dwell_s"],
+    )
+    road = roads(many, 6, switching, bends * np.clip(along / 20.0, 0, 1))
+    return runs_on(car, road, LONGEST, 6, speed=speeds)
+
+
+def table_rows(car, most):
+    """Lasting errors, and the class itself: what is claimed, and which flags rise."""
+    road = roads(min(most, 24), 7)
+    parts = {
+        label: runs_on(car, road, LONGEST, 7, **now)
+        for label, now in deceptions(LONGEST).items()
+    }
+    parts["class"] = in_class(car, min(most, 150))
+    for label, made in driven(car.policy, parts).items():
+        found = claimed(made, car.corridor)
+        found["rmse_mm"] = shown(1e3 * np.sqrt(np.mean(made["left"][:, 20:] ** 2)), 2)
+        found["runs_not_healthy"] = int((~made["healthy"]).any(axis=1).sum())
+        # A flag is raised where it differs from what it usually is.
+        raised = {
+            name: (flag != (flag.mean() > 0.5))[:, 1:].any(axis=1).sum()
+            for name, flag in made["flags"].items()
+        }
+        found["raised_in_runs"] = {name: int(n) for name, n in raised.items() if n}
+        yield label, found
+    yield "search over nu and e", searched(car, min(most, 512))
+
+
+def rate_rows(car, most):
+    """S3 at other call rates: ticks between calls, told to the planner or not."""
+    parts = {}
+    for ticks, tells in product((25, 10, 5, 2, 1), (True, False)):
+        runs = runs_on(car, roads(min(most, 48), 8), 400, 8, ticks=ticks)
+        told_ = runs.elapsed if tells else np.ones_like(runs.elapsed)
+        parts[ticks, tells] = runs._replace(elapsed=told_)
+    for (ticks, tells), made in driven(car.policy, parts).items():
+        # Slow ones would reach the end of their road.
+        end = min(400, round(LONGEST * PERIOD / (ticks * TICK)))
+        made = jax.tree.map(lambda leaf, end=end: leaf[:, :end], made)
+        label = f"{round(1 / (ticks * TICK))} calls/s, {'told' if tells else 'untold'}"
+        yield label, claimed(made, car.corridor)
+
+
+def searched(car, many, generations=10, steps=200):
+    """Cross-entropy search for the largest |e_y| over ν and a schedule of e."""
+    random, road = np.random.default_rng(9), roads(1, 9)
+    road = [np.repeat(one, many, axis=0) for one in road]
+    low, high = np.asarray(car.loaded.certificate["env_box"])
+    held, visits = {"nu": 5, "env": 30}, -(-steps // 30)
+    cut = 2 * steps // held["nu"]
+    mean, spread, found = np.zeros(cut + 2 * visits), 1.0, []
+    for _ in range(generations if many > 100 else 2):
+        genes = mean + spread * random.normal(size=(many, len(mean)))
+        nu, env = np.split(np.clip(genes, -1.0, 1.0), [cut], axis=1)
+        env = low + (env.reshape(many, -1, 2) + 1.0) / 2.0 * (high - low)
+        env = np.repeat(env, held["env"], axis=1)[:, :steps]
+        nu = np.repeat(nu.reshape(many, -1, 2), held["nu"], axis=1)
+        made = car.guarded(runs_on(car, road, steps, 9, env=env, nu=nu))
+        found.append(claimed(made, car.corridor))
+        elite = genes[np.argsort(distance(made).max(axis=1))[-max(2, many // 10) :]]
+        mean, spread = elite.mean(axis=0), np.maximum(elite.std(axis=0), 0.1)
+    whole = {k: sum(f[k] for f in found) for k in found[0] if type(found[0][k]) is int}
+    return found[-1] | whole | {"largest_m": max(f["largest_m"] or 1e9 for f in found)}
+
+
+def planner_rows(car, most):
+    """Planners that try to drive the car off its road."""
+    random, many = np.random.default_rng(10), min(most, 200)
+    side = random.choice((-1.0, 1.0), (many, 1, 2))
+    share = PERIOD * np.arange(LONGEST)[:, None] / random.uniform(1, 8, (many, 1, 1))
+    asked = {
+        "nothing": ("law", 0.0),
+        "worst": ("worst", 0.0),
+        "bang-bang": ("law", side * np.where(share % 1.0 < 0.5, 1.0, -1.0)),
+        "random": ("law", random.choice((-1.0, 1.0), (many, LONGEST, 2))),
+        "constant": ("law", side),
+        "NaN": ("NaN", 0.0),
+        "full lock": ("lock", side),
+    }
+    road = roads(many, 10)
+    parts = {
+        label: runs_on(car, road, LONGEST, 10, kind=KINDS.index(kind), nu=nu)
+        for label, (kind, nu) in asked.items()
+    }
+    for way, drive in (("guard", car.guarded), ("bare", car.bare)):
+        for label, made in driven(drive, parts).items():
+            worst = distance(made).max(axis=1)
+            inside = {"inside": shown((worst <= car.corridor).mean(), 4)}
+            lane = {"left_the_lane": int((worst > LANE).sum())}
+            yield f"planner {label}: {way}", claimed(made, car.corridor) | inside | lane
+
+
+def cost_rows(car, most):
+    """A call with the guard and without it."""
+    samples = car.loaded.settings["controller"]["mppi"]["num_samples"]
+    for way in (True, False):
+        step = device.control_step(
+            f"{car.name}_path", samples, min(most, 300), shield=way
+        )
+        yield f"a call {'in the guard' if way else 'without it'}", step
+
+
+ROWS = {
+    "starts": start_rows,
+    "faults": fault_rows,
+    "stops": stop_rows,
+    "tables": table_rows,
+    "rates": rate_rows,
+    "planners": planner_rows,
+    "costs": cost_rows,
+}
+
+
+def main():
+    """Drive, print and write."""
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument("--cars", nargs="*", choices=CARS, default=CARS)
+    parser.add_argument("--rows", nargs="*", choices=ROWS, default=[*ROWS])
+    parser.add_argument("--runs", type=int, default=10_000, help="of a row, at most")
+    parser.add_argument("--samples", type=int, default=1500)
+    at_once = 16 if jax.default_backend() == "cpu" else 512
+    parser.add_argument("--batch", type=int, default=at_once, help="runs at once")
+    parser.add_argument("--out", type=Path, default=Path(__file__).with_suffix(".json"))
+    given, lines, began = parser.parse_args(), [], time.perf_counter()
+    head = {"samples": given.samples, "device": jax.devices()[0].device_kind}
+    for name, group in product(given.cars, given.rows):
+        if group == given.rows[0]:
+            car = Car(name, given.samples, given.batch)
+        for label, found in ROWS[group](car, given.runs):
+            lines.append(json.dumps({"car": name, "row": label} | found))
+            print(f"{time.perf_counter() - began:6.1f} s", lines[-1], flush=True)
+        # After every group: a run that is cut off has what it measured.
+        body = ",\n  ".join(lines)
+        text = f'{json.dumps(head)[:-1]}, "rows": [\n  {body}\n]}}\n'
+        given.out.write_text(text, "utf-8")
+
+
+if __name__ == "__main__":
+    main()
