@@ -137,7 +137,8 @@ def recovery():
         return f"{kept['longest_m']:.1f}; {bare['longest_m']:.1f}"
 
     def beyond(car):
-        unseen = ("bias", "drift", "basin", "planner")
+        # What no sensor contradicts, and what claims nothing.
+        unseen = ("position bias", "drift", "yaw bias", ": bare")
         counted = [
             row
             for (whose, name), row in rows.items()

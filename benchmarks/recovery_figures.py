@@ -16,13 +16,13 @@ from benchmarks.recovery import HEADINGS, KINDS, OFFSETS, PERIOD, Car, roads, ru
 from sfkd_jax.report import film, style
 from sfkd_jax.report.episodes import Episodes
 
-SECONDS, BEGIN, LENGTH, SIZE = 9.0, 2.0, 0.5, 1.0
+SECONDS, BEGIN, LENGTH, SIZE = 7.0, 2.0, 0.5, 1.0
 """Of the film; when the position is wrong, for how long [s], and by how much [m]."""
 
 
 def basin():
     """Time until a car is back, by its start, for the law of the box and the policy."""
-    figure, rows = style.canvas(5.0), measured()
+    figure, rows = style.canvas(4.6), measured()
     axes = figure.subplots(2, 2, sharex=True, sharey=True)
     colours = style.matplotlib.colormaps["Blues_r"](np.linspace(0.1, 0.85, 20))
     look = {"cmap": ListedColormap(colours), "vmin": 0, "vmax": 20}
@@ -33,9 +33,8 @@ def basin():
             never = np.ma.masked_less(times, 0).T
             drawn = panel.pcolormesh(OFFSETS, np.rad2deg(HEADINGS), never, **look)
             panel.set_facecolor(style.SECOND)
-            name = ("before: law of the box", "after: policy")[down]
-            panel.set_title(f"{car}, {name}")
-            panel.set_yticks((-180, -90, 0, 90, 180))
+            panel.set_title(f"{car}, {('before', 'after')[down]}")
+            panel.set(yticks=(-180, -90, 0, 90, 180), xticks=(-20, -10, 0, 10, 20))
             panel.grid(visible=False)
     figure.supxlabel("start beside the path [m]", fontsize=10)
     figure.supylabel("start heading [degrees]", fontsize=10)
@@ -51,7 +50,7 @@ def jump(path):
     offset = SIZE * wrong[:, None] * np.eye(3)[1]
     runs = runs_on(car, road, steps, 11, offset=offset, kind=KINDS.index("linear"))
     cars = []
-    for name, drive in (("sfkd", car.policy), ("its law without gate", car.bare)):
+    for name, drive in (("sfkd", car.policy), ("no gate", car.bare)):
         made = jax.tree.map(lambda leaf: leaf[0], drive(runs))
         row = {"system": name, "scenario": f"GPS {SIZE:.0f} m off for {LENGTH} s"}
         about = made["left"][None, 1:], made["state"], runs.now.env[0], runs.road[0]
