@@ -356,16 +356,21 @@ def returned(made, runs):
 def claimed(made, corridor):
     """Steps outside the certified corridor, of them healthy; beyond a claim."""
     far, healthy, claims = distance(made), made["healthy"], made["corridor"]
-    return {
+    whole = {
         "runs": len(far),
+        "departures": int((far > DEPARTED).any(axis=1).sum()),
+        "largest_m": shown(far.max()),
+    }
+    # Without a guard nothing is claimed.
+    if not np.isfinite(claims).any():
+        return whole
+    return whole | {
         "steps": far.size,
         "outside": int((far > corridor).sum()),
         "healthy_outside": int(((far > corridor) & healthy).sum()),
         "beyond_claim": int((np.isfinite(claims) & (far > claims)).sum()),
         "claimed": shown(np.isfinite(claims).mean(), 4),
         "healthy": shown(healthy.mean(), 4),
-        "departures": int((far > DEPARTED).any(axis=1).sum()),
-        "largest_m": shown(far.max()),
     }
 
 
@@ -417,8 +422,10 @@ def start_rows(car, most):
     for way, made in ways.items():
         for name in ("grid", "random starts"):
             yield f"{name}: {way}", returned(made[name], parts[name])
-        times = np.where(*back(made["basin"]), -1)
-        yield f"basin: {way}", {"s": np.ceil(times).astype(int).tolist()}
+        # A letter a start: a for at once, b for 1 s, …; ~ for those that never return.
+        settled, times = back(made["basin"])
+        letters = np.where(settled, ord("a") + np.ceil(times), ord("~")).astype(int)
+        yield f"basin: {way}", {"s": "".join(map(chr, letters))}
 
 
 FAULTS = ("jump", "alternating", "yaw", "frozen", "late", "lost", "no e")
@@ -667,11 +674,12 @@ def main():
         if group == given.rows[0]:
             car = Car(name, given.samples, given.batch)
         for label, found in ROWS[group](car, given.runs):
-            lines.append(json.dumps({"car": name, "row": label} | found))
+            row = {"car": name, "row": label} | found
+            lines.append(json.dumps(row, ensure_ascii=False, separators=(",", ":")))
             print(f"{time.perf_counter() - began:6.1f} s", lines[-1], flush=True)
         # After every group: a run that is cut off has what it measured.
-        body = ",\n  ".join(lines)
-        text = f'{json.dumps(head)[:-1]}, "rows": [\n  {body}\n]}}\n'
+        body = ",\n".join(lines)
+        text = f'{json.dumps(head)[:-1]}, "rows": [\n{body}\n]}}\n'
         given.out.write_text(text, "utf-8")
 
 

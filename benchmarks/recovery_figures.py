@@ -28,10 +28,10 @@ def basin():
     look = {"cmap": ListedColormap(colours), "vmin": 0, "vmax": 20}
     for across, car in enumerate(CARS):
         for down, way in enumerate(("law of the box", "planner in the guard")):
-            times = np.reshape(rows[car, f"basin: {way}"]["s"], (len(OFFSETS), -1))
-            panel = axes[down, across]
-            never = np.ma.masked_less(times, 0).T
-            drawn = panel.pcolormesh(OFFSETS, np.rad2deg(HEADINGS), never, **look)
+            letters = np.frombuffer(rows[car, f"basin: {way}"]["s"].encode(), np.uint8)
+            times = np.reshape(letters - ord("a"), (len(OFFSETS), -1)).T
+            times, panel = np.ma.masked_greater(times, 20), axes[down, across]
+            drawn = panel.pcolormesh(OFFSETS, np.rad2deg(HEADINGS), times, **look)
             panel.set_facecolor(style.SECOND)
             panel.set_title(f"{car}, {('before', 'after')[down]}")
             panel.set(yticks=(-180, -90, 0, 90, 180), xticks=(-20, -10, 0, 10, 20))

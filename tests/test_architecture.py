@@ -81,12 +81,12 @@ HEAVY = {
 }
 """What `import sfkd_jax.control` does not load."""
 
-LINES = {"src": 23_750, "tests": 15_300, "benchmarks, experiments": 1_800}
+LINES = {"src": 23_750, "tests": 15_300, "benchmarks, experiments": 2_300}
 """As they are; 20 000 and 15 000 are aimed at."""
 FILES_IN_SRC = 123
 
 OPTIONS, EXPERIMENTS = 65, 10
-COMMITTED = {"*.json": 660_000, "figures": 2_600_000}
+COMMITTED = {"*.json": 685_000, "figures": 2_600_000}
 COMMENTS = 0.03
 """Share of the lines of src that are comments."""
 LONGEST_FILE, LONGEST_FUNCTION, MEDIAN_FUNCTION = 500, 80, 9
