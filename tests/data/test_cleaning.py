@@ -101,6 +101,27 @@ def test_slow_rows_are_dropped_and_the_run_is_cut_there(tmp_path):
         )
 
 
+def test_rows_with_missing_numbers_are_dropped_and_the_run_is_cut_there(tmp_path):
+    columns = recorded_run()
+    change("yaw", 100, np.nan)(columns)
+    path = tmp_path / "a.csv"
+    text = (write_csv(path, columns), path.read_text())[1].splitlines()
+    cells = text[203].split(",")  # row 202
+    text[203] = ",".join([*cells[:5], "", *cells[6:]])
+    path.write_text("\n".join(text))
+    assert refusal(path).startswith(f"{path}, line 204: steering is empty")
+    logged, lines = read(path, missing="drop")
+    assert (
+        f"warning: {path}, line 102: yaw is nan (2 rows like this), 0.66 % of the "
+        "rows, dropped by dataset.missing=drop; the run is cut there"
+    ) in lines
+    states = segments_of(logged)[0]
+    assert len(states) == 9 + 10 + 9  # of 100, 101 and 98 rows
+    assert np.isfinite(states).all()
+    assert longest_move(states) < 0.61
+    assert "must be one of refuse, drop, got 'keep'" in refusal(path, missing="keep")
+
+
 def test_a_run_that_is_slow_throughout_is_left_out(tmp_path):
     slow = recorded_run(phase=0.5) | {"v": np.full(301, 0.1)}
     write_csv(tmp_path / "slow.csv", slow)

@@ -120,7 +120,7 @@ def test_an_unknown_environment_becomes_a_constant(tmp_path):
 
 
 @pytest.mark.parametrize("period", [0.01, 0.03])
-def test_resampling_interpolates_states_and_holds_controls(tmp_path, period):
+def test_resampling_interpolates_states_and_averages_controls(tmp_path, period):
     recorded = recorded_run(period=period)
     # It wraps around at ±π.
     recorded["yaw"] = np.mod(recorded["yaw"] + 3.0 + np.pi, 2 * np.pi) - np.pi
@@ -136,13 +136,37 @@ def test_resampling_interpolates_states_and_holds_controls(tmp_path, period):
     moments = DT * np.arange(len(states) * STEPS)
     speed = np.sort(np.interp(moments, t, recorded["v"]).astype(np.float32))
     np.testing.assert_allclose(np.sort(states[:, :-1, 3].ravel()), speed, rtol=1e-6)
-    held = recorded["steering"][np.searchsorted(t, moments + 1e-9, side="right") - 1]
-    np.testing.assert_array_equal(
-        np.sort(controls[..., 0].ravel()), np.sort(held.astype(np.float32))
+    fine = np.arange(round(t[-1] / 1e-3)) * 1e-3 + 5e-4
+    held = recorded["steering"][np.searchsorted(t, fine, side="right") - 1]
+    mean = held[: 100 * len(moments)].reshape(-1, 100).mean(axis=1)
+    np.testing.assert_allclose(
+        np.sort(controls[..., 0].ravel()), np.sort(mean), rtol=0, atol=1e-6
     )
     steps = np.diff(states[..., 2], axis=1)
     # |d yaw / dt| ≤ 0.36: no turn by 2π between two moments
     assert np.abs(steps).max() < 0.37 * DT
+
+
+def test_commands_that_are_logged_with_jitter_explain_the_next_state(tmp_path):
+    """Rows are up to 30 ms off the grid; each command acts from its row on."""
+    rng = np.random.default_rng(0)
+    columns = recorded_run()
+    times = DT * np.arange(301) + rng.uniform(0.0, 0.03, 301)
+    states = {n: np.interp(times, columns["t"], columns[n]) for n in NAMES[1:4]}
+    pushes = 0.3 * rng.choice([-1.0, 1.0], 301)
+    gained = np.concatenate([[0.0], np.cumsum(pushes[:-1] * np.diff(times))])
+    columns |= states | {"t": times, "v": 5.0 + gained, "acceleration": pushes}
+    speed = 5.0 + np.concatenate(
+        [
+            [0.0],
+            np.cumsum(0.5 * (columns["v"][1:] + columns["v"][:-1]) * np.diff(times)),
+        ]
+    )
+    columns |= {"p_x": speed, "p_y": 0.0 * speed, "yaw": 0.0 * speed}
+    write_csv(tmp_path / "a.csv", columns)
+    states, controls, _ = together(read(tmp_path)[0].dataset)
+    gained = np.diff(states[..., 3], axis=1)
+    np.testing.assert_allclose(gained, DT * controls[..., 1], atol=2e-6)
 
 
 def test_a_gap_splits_a_run_and_nothing_is_invented_in_it(tmp_path):
@@ -201,7 +225,10 @@ def stale(columns):
 
 
 WRONG = {
-    "nan": (change("yaw", 7, np.nan), ", line 9: yaw is nan"),
+    "nan": (
+        change("yaw", 7, np.nan),
+        ", line 9: yaw is nan; dataset.missing=drop leaves such rows out",
+    ),
     "infinite": (change("steering", 100, np.inf), ", line 102: steering is inf"),
     "time back": (
         change("t", 50, 4.8),
@@ -295,7 +322,7 @@ TEXTS = {
     ),
     "empty cell": (
         ",".join(NAMES) + "\n" + "0," * 8 + "0\n1,,0,0,0,0,0,0,0\n",
-        ", line 3: p_x is empty, not a number",
+        ", line 3: p_x is empty, not a number; dataset.missing=drop leaves such rows out",
     ),
     "word": (
         ",".join(NAMES) + "\n" + "0," * 8 + "off\n",
@@ -378,10 +405,10 @@ def test_every_refused_file_is_reported(tmp_path):
         change("yaw", row, np.nan)(columns)
         write_csv(tmp_path / f"{name}.csv", columns)
     lines = []
-    with pytest.raises(ValueError, match=r"yaw is nan \(the first of 2 findings\)"):
+    with pytest.raises(ValueError, match=r"yaw is nan; .* \(the first of 2 findings\)"):
         read(tmp_path, report=lines.append)
     assert len(lines) == 1
-    assert re.search(r"[ab]\.csv, line (5|10): yaw is nan$", lines[0])
+    assert re.search(r"[ab]\.csv, line (5|10): yaw is nan;", lines[0])
 
 
 @pytest.mark.parametrize(

@@ -8,9 +8,10 @@ from dataclasses import dataclass
 from typing import NamedTuple, TypeAlias
 
 import numpy as np
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Bool, Float
 
-from sfkd_jax.data._logs import Columns, Log
+from sfkd_jax.data._logs import Chords, Columns, Log, agreement, find_chords
+from sfkd_jax.data._tables import DROP
 
 Bounds: TypeAlias = tuple[tuple[float, ...] | None, tuple[float, ...] | None]
 """Lowest and highest of every channel, or None where there is no bound."""
@@ -28,8 +29,6 @@ positions count as stale.
 """
 ROUNDED = 1e-5
 """How far outside its range a channel may be: float32 rounds."""
-LOOK = 0.5
-"""Length of the chords over which motion is compared with the columns [s]."""
 AGREE = (0.8, 1.25)
 """Path length over integrated speed of a plausible log."""
 DEGREES = 9e-6
@@ -62,22 +61,6 @@ def _warning(line: str) -> Finding:
     return Finding(line, refused=False)
 
 
-class Chords(NamedTuple):
-    """Chords of a run over about `LOOK`, where it moves.
-
-    Attributes:
-        length: of the chord [m].
-        integrated: ∫ v dt [m].
-        course: direction of the chord, reversed where v < 0 [rad].
-        middle: index of the row in the middle.
-    """
-
-    length: Float[np.ndarray, " chord"]
-    integrated: Float[np.ndarray, " chord"]
-    course: Float[np.ndarray, " chord"]
-    middle: Int[np.ndarray, " chord"]
-
-
 @dataclass(frozen=True)
 class Checks:
     """What recorded runs are checked against: the arguments of `from_logs`."""
@@ -89,6 +72,7 @@ class Checks:
     gap: float
     min_speed: float
     split_at_jumps: bool
+    drop_missing: bool
     limits: Bounds
     box: Bounds
 
@@ -108,11 +92,19 @@ class Checks:
 
     def _one(self, log: Log) -> tuple[Log, list[Finding]]:
         """A run after cutting, and the findings about it alone."""
-        log, found = self._drop_slow_rows(log)
+        log, found = self._drop_missing_rows(log)
+        log, slow = self._drop_slow_rows(log)
+        found += slow
         wrong: list[Finding] = []
         for name, values in log.channels(self.columns).items():
             bad = ~np.isfinite(values) | (np.abs(values) > LARGEST)
-            wrong += _first(log, bad, lambda k, n=name, v=values: f"{n} is {v[k]}")
+            wrong += _first(
+                log,
+                bad,
+                lambda k, n=name, v=values: (
+                    f"{n} is {v[k]}{DROP * bool(np.isnan(v[k]))}"
+                ),
+            )
         # A NaN jumps nowhere: it must be refused, not cut out.
         if self.split_at_jumps and not wrong:
             log, cuts = self._cut_at_jumps(log)
@@ -135,6 +127,23 @@ class Checks:
             found += self._sampling(log)
             found += self._motion(log)
         return log, found
+
+    def _drop_missing_rows(self, log: Log) -> tuple[Log, list[Finding]]:
+        """Drop rows in which a number is missing, if asked, and cut the run there."""
+        if not self.drop_missing:
+            return log, []
+        named = log.channels(self.columns)
+        missing = np.isnan(np.column_stack([*named.values()]))
+        rows: Bool[np.ndarray, " time"] = np.any(missing, axis=1)
+        share = f"{100 * rows.mean():.2g} % of the rows"
+        found = _first(
+            log,
+            rows,
+            lambda k: f"{[*named][int(missing[k].argmax())]} is nan",
+            hint=f", {share}, dropped by dataset.missing=drop{CUT_THERE}",
+            refused=False,
+        )
+        return log.select(~rows), list(found)
 
     def _drop_slow_rows(self, log: Log) -> tuple[Log, list[Finding]]:
         """Drop rows slower than `min_speed` and cut the run there."""
@@ -244,7 +253,7 @@ class Checks:
 
     def _units(self, log: Log) -> Iterator[Finding]:
         """The speed against positions, then yaw against the direction of travel."""
-        speed, chords = self.columns.state[3], _chords(log, log.states[:, 3])
+        speed, chords = self.columns.state[3], find_chords(log, log.states[:, 3])
         moved, integrated = chords.length.sum(), np.abs(chords.integrated).sum()
         if moved == 0.0 and integrated == 0.0:
             yield _warning(f"{log.whole}: neither position nor {speed} ever moves")
@@ -271,7 +280,7 @@ class Checks:
         if abs(math.log(ratio / nearest)) < tolerance:
             return text
         for name, values in log.channels(self.columns).items():
-            chords = _chords(log, values)
+            chords = find_chords(log, values)
             integrated = np.abs(chords.integrated).sum()
             if (
                 name not in (self.columns.time, *self.columns.state[:2])
@@ -284,7 +293,7 @@ class Checks:
         """Yaw against the direction of travel, with a likely cause."""
         x, y, name, speed = self.columns.state[:4]
         yaw = log.states[chords.middle, 2]
-        agreed = _agreement(chords.course - yaw)
+        agreed = agreement(chords.course - yaw)
         if abs(agreed) > 0.7 and abs(np.angle(agreed)) < 0.5:
             return
         compass = f"{name} is probably a compass heading"
@@ -303,7 +312,7 @@ class Checks:
         }
         # A mean over the whole run: single wrong rows change no reading.
         fits = [
-            (_agreement(chords.course - read).real, text)
+            (agreement(chords.course - read).real, text)
             for text, read in readings.items()
         ]
         fit, best = max(fits)
@@ -428,32 +437,6 @@ def _stale(log: Log) -> Bool[np.ndarray, " step"]:
     driving = (log.integrated > 0.1 * usual) & log.joined
     stale = driving & (log.moved == 0.0)
     return stale & (stale.sum() > STALE * max(driving.sum(), 1))
-
-
-def _chords(log: Log, speed: Float[np.ndarray, " time"]) -> Chords:
-    """Chords of a run that moved, by position or by a speed."""
-    reach = min(max(1, round(LOOK / log.period)), len(log.time) - 1)
-    along = np.cumsum(0.5 * (speed[1:] + speed[:-1]) * log.waits)
-    along = np.concatenate([[0.0], along])
-    chord = log.states[reach:, :2] - log.states[:-reach, :2]
-    length, integrated = np.linalg.norm(chord, axis=1), along[reach:] - along[:-reach]
-    lasted = log.time[reach:] - log.time[:-reach]
-    # A chord across a gap or a cut says nothing about the speed.
-    whole = lasted < 1.5 * reach * log.period
-    whole &= log.stretch[reach:] == log.stretch[:-reach]
-    # At standstill noise moves the position: the course would be random.
-    moving = np.zeros_like(whole)
-    for distance in (length, np.abs(integrated)):
-        moving |= distance > 0.2 * np.max(distance, where=whole, initial=0.0)
-    moving &= whole
-    course = np.arctan2(chord[:, 1], chord[:, 0]) + np.pi * (integrated < 0)
-    middle = np.flatnonzero(moving) + reach // 2
-    return Chords(length[moving], integrated[moving], course[moving], middle)
-
-
-def _agreement(angles: Float[np.ndarray, " chord"]) -> complex:
-    """Mean of exp(i φ): its length measures agreement, its angle is the mean angle."""
-    return complex(np.mean(np.exp(1j * angles)))
 
 
 def _turns(log: Log) -> tuple[Float[np.ndarray, " step"], Float[np.ndarray, " step"]]:

@@ -16,7 +16,7 @@ from jaxtyping import Array, Float, Int
 from sfkd_jax.data._checks import Bounds, Checks, Finding
 from sfkd_jax.data._dataset import PARTS, Dataset, assign_parts, coverage
 from sfkd_jax.data._logs import Columns, Log, read_logs
-from sfkd_jax.ranges import Fraction, NonNegativeInt, Positive, Real
+from sfkd_jax.ranges import Fraction, NonNegativeInt, Positive, Real, check_choice
 from sfkd_jax.store import open_regular
 from sfkd_jax.types import BODY, Trajectory
 
@@ -68,6 +68,7 @@ def from_logs(
     gap: Positive = 2.5,
     min_speed: float = 0.0,
     split_at_jumps: bool = False,
+    missing: str = "refuse",
     shares: tuple[Fraction, Fraction, Fraction, Fraction] = (0.6, 0.1, 0.2, 0.1),
     seed: NonNegativeInt = 0,
     env_low: tuple[Real, ...] | None = None,
@@ -89,6 +90,8 @@ def from_logs(
         min_speed: slower rows are dropped, and the run is cut there [m/s].
         split_at_jumps: whether a run is cut where time, position or yaw jump; otherwise
             it is refused.
+        missing: "refuse" or "drop" rows in which a number is missing; the run is cut
+            where they are dropped.
         shares: of training, validation, calibration and test.
         seed: of the random order of runs.
         env_low: lower corner of E; None: as far as the logs reach.
@@ -97,16 +100,21 @@ def from_logs(
     Raises:
         ValueError: the first reason why the logs are refused; the others are reported.
     """
+    check_choice("dataset.missing", missing, ("refuse", "drop"))
+    drop = missing == "drop"
     # All files are read and checked before any is refused: one run shows all faults.
     recorded, errors, conversions = read_logs(
-        log_files(path).values(), columns, dt=dt, needs_environment=needs_environment
+        log_files(path).values(),
+        columns,
+        dt=dt,
+        needs_environment=needs_environment,
+        blanks=drop,
     )
     if conversions:
         report(f"converted to SI units: {', '.join(conversions)}")
     box = (env_low, env_high) if needs_environment else (None, None)
-    checks = Checks(
-        columns, dt, steps, wheelbase, gap, min_speed, split_at_jumps, limits, box
-    )
+    cuts = (gap, min_speed, split_at_jumps, drop)
+    checks = Checks(columns, dt, steps, wheelbase, *cuts, limits, box)
     logs, findings = checks.apply(recorded)
     _report_findings([*map(Finding, errors), *findings], report)
     cut, runs = _segments([list(_pieces(log, dt, gap)) for log in logs], steps)
@@ -117,9 +125,9 @@ def from_logs(
     used = 100 * len(runs) * steps * dt / seconds
     report(
         f"{len(logs)} runs, {seconds:.0f} s at {1 / np.median(waits):.4g} Hz; "
-        f"sampled every {dt:g} s (states linearly, yaw unwrapped; controls and "
-        f"environment held); {len(runs)} segments of {steps} steps, "
-        f"{used:.0f} % of the time: {', '.join(sizes)}"
+        f"sampled every {dt:g} s (states linearly, yaw unwrapped; controls "
+        f"averaged over each step, environment held); {len(runs)} segments "
+        f"of {steps} steps, {used:.0f} % of the time: {', '.join(sizes)}"
     )
     if not whole:
         report(
@@ -253,8 +261,8 @@ def environment_box(
 def _pieces(log: Log, dt: float, gap: float) -> Iterator[Piece]:
     """Split a run at its gaps and cuts, and sample each piece at 0, dt, 2 dt, ….
 
-    States are interpolated linearly, yaw after unwrapping; controls and environments
-    are held from the row before (zero order).
+    States are interpolated linearly, yaw after unwrapping; environments are held from
+    the row before (zero order), controls averaged over the step as they were held.
     """
     edges = np.flatnonzero(log.gaps(gap, dt) | ~log.joined) + 1
     for rows in np.split(np.arange(len(log.time)), edges):
@@ -266,10 +274,19 @@ def _pieces(log: Log, dt: float, gap: float) -> Iterator[Piece]:
         moments = np.where(same, nearest, moments)
         # Interpolated through a wrap, yaw would turn by 2π between two rows.
         states[:, 2] = np.unwrap(states[:, 2])
-        # Controls of the row before: a later one was not yet known to the robot.
-        held = rows[np.searchsorted(time, moments, side="right")[:-1] - 1]
         sampled = [np.interp(moments, time, channel) for channel in states.T]
-        yield Piece(np.column_stack(sampled), log.controls[held], log.envs[held])
+        # Of the row before: a later one was not yet known to the robot.
+        held = np.searchsorted(time, moments[:-1], side="right") - 1
+        last = np.searchsorted(time, moments[1:], side="left") - 1
+        # Rows jitter around the moments, and the robot follows a command from its row.
+        commands = log.controls[rows]
+        given = np.cumsum(np.diff(time)[:, None] * commands[:-1], axis=0)
+        given = np.concatenate([np.zeros((1, commands.shape[1])), given])
+        given = np.column_stack([np.interp(moments, time, total) for total in given.T])
+        mean = np.diff(given, axis=0) / np.diff(moments)[:, None]
+        # One that did not change is kept to the last bit.
+        controls = np.where((held == last)[:, None], commands[held], mean)
+        yield Piece(np.column_stack(sampled), controls, log.envs[rows[held]])
 
 
 def _segments(

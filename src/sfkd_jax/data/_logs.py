@@ -26,6 +26,8 @@ UNKNOWN = 2
 """Entries of the constant environment that replaces one that nobody measured."""
 DIMENSIONS = ("length", "length", "angle", "speed")
 """Of the first states."""
+LOOK = 0.5
+"""Length of the chords over which motion is compared with the columns [s]."""
 RUN = "number of the run"
 """Column of tables of arrays x, u, e."""
 
@@ -145,8 +147,55 @@ class Log:
         return replace(self, stretch=self.stretch + cuts)
 
 
+class Chords(NamedTuple):
+    """Chords of a run over about `LOOK`, where it moves.
+
+    Attributes:
+        length: of the chord [m].
+        integrated: ∫ v dt [m].
+        course: direction of the chord, reversed where v < 0 [rad].
+        middle: index of the row in the middle.
+    """
+
+    length: Float[np.ndarray, " chord"]
+    integrated: Float[np.ndarray, " chord"]
+    course: Float[np.ndarray, " chord"]
+    middle: Int[np.ndarray, " chord"]
+
+
+def find_chords(log: Log, speed: Float[np.ndarray, " time"]) -> Chords:
+    """Chords of a run that moved, by position or by a speed."""
+    reach = min(max(1, round(LOOK / log.period)), len(log.time) - 1)
+    along = np.cumsum(0.5 * (speed[1:] + speed[:-1]) * log.waits)
+    along = np.concatenate([[0.0], along])
+    chord = log.states[reach:, :2] - log.states[:-reach, :2]
+    length, integrated = np.linalg.norm(chord, axis=1), along[reach:] - along[:-reach]
+    lasted = log.time[reach:] - log.time[:-reach]
+    # A chord across a gap or a cut says nothing about the speed.
+    whole = lasted < 1.5 * reach * log.period
+    whole &= log.stretch[reach:] == log.stretch[:-reach]
+    # At standstill noise moves the position: the course would be random.
+    moving = np.zeros_like(whole)
+    for distance in (length, np.abs(integrated)):
+        moving |= distance > 0.2 * np.max(distance, where=whole, initial=0.0)
+    moving &= whole
+    course = np.arctan2(chord[:, 1], chord[:, 0]) + np.pi * (integrated < 0)
+    middle = np.flatnonzero(moving) + reach // 2
+    return Chords(length[moving], integrated[moving], course[moving], middle)
+
+
+def agreement(angles: Float[np.ndarray, " chord"]) -> complex:
+    """Mean of exp(i φ): its length measures agreement, its angle is the mean angle."""
+    return complex(np.mean(np.exp(1j * angles)))
+
+
 def read_logs(
-    files: Iterable[Path], columns: Columns, *, dt: float, needs_environment: bool
+    files: Iterable[Path],
+    columns: Columns,
+    *,
+    dt: float,
+    needs_environment: bool,
+    blanks: bool = False,
 ) -> tuple[list[Log], list[str], list[str]]:
     """Read all runs of some files.
 
@@ -156,6 +205,7 @@ def read_logs(
         dt: the period of npz arrays x, u, e without a time [s].
         needs_environment: whether the environment must be in the files; otherwise
             nobody measured it, and it becomes zeros.
+        blanks: whether empty cells are NaN; otherwise they are errors.
 
     Returns:
         All runs, in the order of the files; one line per file that could not be read;
@@ -170,7 +220,7 @@ def read_logs(
     for file in files:
         try:
             read, converted = _logs(
-                _table(file, columns, dt), columns, needs_environment
+                _table(file, columns, dt, blanks), columns, needs_environment
             )
         except (ArtefactError, ValueError) as reason:
             errors.append(one_line(reason))
@@ -202,13 +252,13 @@ def _check_columns(columns: Columns, needs_environment: bool) -> None:
         )
 
 
-def _table(file: Path, columns: Columns, dt: float) -> Table:
+def _table(file: Path, columns: Columns, dt: float, blanks: bool) -> Table:
     """The columns of a file."""
     suffix, source = file.suffix.lower(), str(file)
     wanted = [columns.time, *columns.state, *columns.control, *columns.environment]
     wanted += [columns.run] if columns.run else []
     if suffix == ".csv":
-        return read_csv(file, wanted)
+        return read_csv(file, wanted, blanks=blanks)
     if suffix == ".parquet":
         return read_parquet(file, wanted)
     arrays = read_npz(file)

@@ -23,6 +23,7 @@ number of equal values.
 """
 PREAMBLE = 50
 """Lines of a csv file among which its header is looked for."""
+DROP = "; dataset.missing=drop leaves such rows out"
 QUOTED = 64
 """Characters of a cell that a message quotes."""
 DIMENSIONS = {
@@ -100,10 +101,12 @@ class Table(NamedTuple):
             pass
         for row, value in zip(self.rows, values, strict=True):
             if not _is_number(value):
-                text = repr(str(value)[:QUOTED]) if str(value).strip() else "empty"
+                text, advice = repr(str(value)[:QUOTED]), ""
+                if not str(value).strip():
+                    text, advice = "empty", DROP
                 raise ValueError(
                     f"{self.source}, {self.row_name} {row}: {name} is {text}, "
-                    "not a number"
+                    f"not a number{advice}"
                 )
         raise ValueError(f"{self.source}: {name} cannot be read as numbers")
 
@@ -122,7 +125,7 @@ class Match(NamedTuple):
     conversion: str | None = None
 
 
-def read_csv(file: Path, wanted: Collection[str]) -> Table:
+def read_csv(file: Path, wanted: Collection[str], *, blanks: bool = False) -> Table:
     """Read the configured columns of a csv file.
 
     Cells are separated by commas, semicolons, tabs or blanks; # begins a comment. Lines
@@ -131,6 +134,7 @@ def read_csv(file: Path, wanted: Collection[str]) -> Table:
     Args:
         file: as UTF-8, UTF-16 with its mark, or else Windows-1252.
         wanted: names of columns; the header is the line that has most of them.
+        blanks: whether empty cells are NaN; otherwise they are text.
 
     Raises:
         ValueError: not text, no header, no rows, or rows of another length than the
@@ -184,7 +188,8 @@ def read_csv(file: Path, wanted: Collection[str]) -> Table:
             # An empty cell is an error with a line, not a number. What nobody asked
             # for, such as text, would fill the memory.
             convert_options=csv.ConvertOptions(
-                null_values=[], include_columns=among(names, wanted)
+                null_values=[""] if blanks else [],
+                include_columns=among(names, wanted),
             ),
         )
     except (ValueError, OverflowError) as reason:
