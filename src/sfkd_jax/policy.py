@@ -138,8 +138,8 @@ def _return_request(
     del params, env
     unknown = jnp.asarray(jnp.nan, dtype=float)
     states = jnp.full((preview.road.shape[0], xi.shape[0]), unknown)
-    about: ControllerInfo = {
-        **dict.fromkeys(("cost", "mean_cost", "effective_samples"), unknown),
+    about: Any = {
+        **dict.fromkeys(_PLANNED, unknown),
         "healthy": request.healthy,
         "env_inside": jnp.asarray(True),
         "predicted_states": states,
@@ -174,8 +174,9 @@ def _guarded(
 
     asked = jax.tree.map(put, state.guard, is_leaf=is_request)
     control, after, info = guard.act(params, asked, *inputs)
-    known: Any = {name: about[name] for name in _PLANNED if name in about}
-    return control, GuardedState(memory, after), {**about, **info, **known}
+    known = {name: about[name] for name in _PLANNED if name in about}
+    merged: Any = {**about, **info, **known}
+    return control, GuardedState(memory, after), merged
 
 
 def save(

@@ -184,10 +184,8 @@ def build_controller(
             "as in [-0.4,-3.0]"
         )
     limits = {"control_low": plant.control_low, "control_high": plant.control_high}
-    box = {
-        "env_low": None if env_low is None else tuple(map(float, env_low)),
-        "env_high": None if env_high is None else tuple(map(float, env_high)),
-    }
+    ends = {"env_low": env_low, "env_high": env_high}.items()
+    box = {k: None if end is None else tuple(map(float, end)) for k, end in ends}
     factory = PLANNERS[settings.planner]
     cost = control.tracking_cost(
         dt=plant.dt,

@@ -6,6 +6,7 @@ import json
 import math
 import time
 from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 from typing import Any, NamedTuple, TypeAlias
 
@@ -97,13 +98,8 @@ def fit(
     # Batches have a stream of their own: a resumed run draws the same ones.
     init_key, data_key = jax.random.split(key)
     transform, schedule = _optimizer(steps, learning_rate, clip_norm)
-
     # Compiled, since initialisers op by op take seconds for many small matrices.
-    @jax.jit
-    def begin(key: Key) -> TrainState:
-        params = model.init(key)
-        return TrainState(jnp.zeros((), jnp.int32), params, transform.init(params))
-
+    begin = jax.jit(partial(_begin, model, transform))
     record = {
         "key": jax.random.key_data(key).tolist(),
         "data": store.sha256_of_arrays(data._asdict()),
@@ -125,9 +121,6 @@ def fit(
         # Of a new run it is the state as it was.
         state = checkpoints.resume(begin(init_key))
         start, began = int(state.step), time.perf_counter()
-        if start:
-            finished = ", finished" if start >= steps else ""
-            store.print_message(f"training {start} / {steps}  resumed{finished}")
         # Lines of steps after the checkpoint would be there twice.
         store.truncate_jsonl(
             log, lambda line: line["step"] in range(start + 1), keys=("step",)
@@ -161,6 +154,12 @@ def fit(
         checkpoints.close()
 
 
+def _begin(model: Model, transform: Any, key: Key) -> TrainState:
+    """The state before the first step."""
+    params = model.init(key)
+    return TrainState(jnp.zeros((), jnp.int32), params, transform.init(params))
+
+
 def _claim(
     directory: Path,
     record: dict[str, Any],
@@ -188,6 +187,8 @@ def _claim(
             f"{directory} holds another training ({'; '.join(changed[:3])}); "
             "choose another directory, or remove its checkpoints"
         )
+    finished = ", finished" if latest >= record["steps"] else ""
+    store.print_message(f"training {latest} / {record['steps']}  resumed{finished}")
 
 
 def _append(path: Path, record: dict[str, float], steps: int) -> None:
