@@ -44,7 +44,7 @@ ARROWS = {
     "export": CORE | {"build", "policy", "settings", "store"},
     "adapters": PLANT | {"build"},
     "report": {"evaluation", "store"},
-    "__init__": {"export", "policy", "store"},
+    "__init__": {"export", "geometry", "policy", "store"},
 }
 ARROWS |= {"experiment": set(ARROWS)}
 ARROWS |= {name: set(ARROWS) for name in COMMANDS | {"__main__"}}
@@ -52,6 +52,7 @@ ARROWS |= {name: set(ARROWS) for name in COMMANDS | {"__main__"}}
 ALLOWED_EVERYWHERE = set(sys.stdlib_module_names) | {PACKAGE, "jax", "jaxtyping"}
 COMMAND_LINE = {"hydra", "omegaconf", "numpy"}
 THIRD_PARTY = {
+    "geometry": {"numpy"},
     "store": {"numpy", "filelock", "safetensors"},
     "data": {"numpy", "pyarrow", "pint"},
     "models": {"flax"},

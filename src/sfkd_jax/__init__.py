@@ -5,6 +5,7 @@ from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
     from sfkd_jax.export import warm_up as warm_up
+    from sfkd_jax.geometry import relative as relative
     from sfkd_jax.policy import Policy as Policy
     from sfkd_jax.policy import load as load
     from sfkd_jax.store import ArtefactError as ArtefactError
@@ -14,6 +15,7 @@ __version__ = "0.1.0"
 _LAZY = {
     "load": "policy",
     "Policy": "policy",
+    "relative": "geometry",
     "warm_up": "export",
     "ArtefactError": "store",
 }

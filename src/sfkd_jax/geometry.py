@@ -10,9 +10,11 @@ the reference speed [m/s].
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import TypeAlias
+from typing import Any, TypeAlias
 
+import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Bool, Float
 
 from sfkd_jax.types import (
@@ -56,6 +58,60 @@ def between(
     # Differences before the rotation: far from the origin float32 loses less.
     position = rotate(-pose[2], pose_next[:2] - pose[:2])
     return jnp.concatenate([position, wrap_angle(pose_next[2:] - pose[2:])])
+
+
+FAR = 5e4
+"""Distance from the origin up to which float32 resolves positions well enough, to 4 mm
+[m].
+"""
+CELL = 2048.0
+"""Spacing of the origins of `relative` [m]."""
+
+
+Places: TypeAlias = Float[Array | np.ndarray, "..."]
+"""States or points of a reference, p_x and p_y first."""
+
+
+def relative(observation: Places, reference: Places) -> tuple[Places, Places, Places]:
+    """Return both with positions relative to an origin near the reference, and it.
+
+    For positions on Earth in double precision, outside `jax.jit`, which rounds its
+    arguments. Nothing changes within 1 km of the origin, and for float32.
+
+    Args:
+        observation: p_x, p_y, yaw, v, ….
+        reference: x, y, yaw, speed of each step.
+    """
+    given = (observation, reference)
+    if any(one.dtype.itemsize < 8 for one in given):
+        return observation, reference, np.zeros(2)
+    xp: Any = jnp if any(isinstance(one, jax.Array) for one in given) else np
+    near = reference[..., 0, :2]
+    # On a grid, or a sensor that freezes would seem to move against the reference.
+    origin = CELL * xp.round(xp.where(xp.isfinite(near), near, 0.0) / CELL)
+    return (
+        shifted(observation, -origin),
+        shifted(reference, -origin[..., None, :]),
+        origin,
+    )
+
+
+def shifted(states: Any, by: Places) -> Any:
+    """Return states at positions moved `by`; in numpy if both allow it."""
+    host = isinstance(by, np.ndarray) and not isinstance(states, jax.core.Tracer)  # pyright: ignore
+    xp, states = (np, np.asarray(states, by.dtype)) if host else (jnp, states)
+    return xp.concatenate([states[..., :2] + by, states[..., 2:]], axis=-1)
+
+
+def is_precise(observation: State, reference: Reference) -> Bool[Array, ""]:
+    """Whether positions are as near to the origin as their precision needs."""
+    step = jnp.asarray(0.0)
+    for places in (observation, reference):
+        largest = jnp.max(jnp.abs(places[..., :2]))
+        # float64 reaches the same step 5e8 times farther away.
+        step = jnp.maximum(step, largest * jnp.finfo(largest.dtype).eps)
+    # Not `<=`: NaN is somebody else's finding.
+    return ~(step > FAR * jnp.finfo(jnp.float32).eps)
 
 
 PathState: TypeAlias = Float[Array, " coordinate"]

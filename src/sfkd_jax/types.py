@@ -227,6 +227,7 @@ class ControllerInfo(TypedDict, total=False):
     healthy: Required[Bool[Array, ""]]  # False: the last finite plan is continued
     env_inside: Required[Bool[Array, ""]]  # whether e is in its box
     predicted_states: Required[Float[Array, "horizon state"]]  # of the chosen plan
+    precision: Bool[Array, ""]  # float32 resolves these positions; else not healthy
     # planners of a constrained task
     violation: Scalar  # the largest of a constraint along the chosen plan, not below 0
     constraints_kept: Bool[Array, ""]  # it is 0

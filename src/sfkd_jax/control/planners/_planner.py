@@ -214,7 +214,7 @@ class Planner:
     ) -> tuple[Control, PlannerState, ControllerInfo]:
         """Return the control of one step, the next state and `ControllerInfo`."""
         task, tuning = self.task, state.tuning
-        task.check(observation, env, reference, self.horizon)
+        precise = task.check(observation, env, reference, self.horizon)
         # What is not finite must be noticed even where neither model nor cost reads it.
         clean = all_finite((observation, env, reference))
         inside = env
@@ -270,6 +270,9 @@ class Planner:
             "env_inside": known,
             "predicted_states": jax.tree.map(lambda leaf: leaf[:, chosen], states),
         }
+        if precise is not None:
+            # A coarse plan is driven, not replaced: it is better than the last one.
+            info["precision"], info["healthy"] = precise, healthy & precise
         if violations is not None:
             info["violation"] = violations[chosen]
             info["constraints_kept"] = violations[chosen] <= 0.0

@@ -107,7 +107,7 @@ class AlongReference:
         reference: Reference,
     ) -> tuple[Control, AlongReferenceState, ControllerInfo]:
         """Take one control step."""
-        check_path(observation, env, reference, reference.shape[0])
+        precise = check_path(observation, env, reference, reference.shape[0])
         curvature = curvature_ahead(reference)
         xi = path_coordinates(observation, reference[0], curvature[0])
         road = jnp.stack([curvature, reference[:, 3]], axis=1)
@@ -121,6 +121,9 @@ class AlongReference:
         planned = info["predicted_states"]
         info = info.copy()
         info["path_state"], info["planned_path"] = xi, planned
+        info["precision"] = precise
+        for flag in {"healthy", "shield_healthy"} & info.keys():
+            info[flag] &= precise
         info["predicted_states"] = jax.vmap(_in_world)(planned, reference)
         return control, AlongReferenceState(inner, observation), info
 

@@ -66,10 +66,10 @@ class _Several:
         largest = math.ceil(self.cvar * costs.shape[0])
         return jnp.mean(jax.lax.top_k(costs, largest)[0])
 
-    def check(self, observation: Any, env: Any, reference: Any, horizon: int) -> None:
+    def check(self, observation: Any, env: Any, reference: Any, horizon: int) -> Any:
         """Check the arguments in the first environment."""
         first = jax.tree.map(lambda leaf: leaf[0], env)
-        self.task.check(observation, first, reference, horizon)
+        return self.task.check(observation, first, reference, horizon)
 
     def prepare(
         self,

@@ -9,7 +9,7 @@ from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Float
+from jaxtyping import Array, Bool, Float
 
 from sfkd_jax.control._factory import factory
 from sfkd_jax.control.laws._feedback import (
@@ -28,7 +28,7 @@ from sfkd_jax.control.tasks._task import (
     Task,
     actuator_limits,
 )
-from sfkd_jax.geometry import reference_curvature
+from sfkd_jax.geometry import is_precise, reference_curvature
 from sfkd_jax.ranges import Positive
 from sfkd_jax.rollout import fold
 from sfkd_jax.types import (
@@ -186,7 +186,7 @@ class LawTask:
         """Raise a ValueError for inconsistent limits."""
         _ = self.limit
 
-    def task(self, check: Callable[..., None]) -> Task:
+    def task(self, check: Callable[..., Any]) -> Task:
         """Return the planning problem as functions, of which `check` is the last."""
         own: Any = self
         return Task(*self.box(), self.cost.weights, own.prepare, own.step, check)
@@ -287,8 +287,8 @@ path_tracking = factory(PathTracking, lambda around: around.task(check_path))
 
 def check_path(
     observation: State, env: Environments, reference: Any, horizon: int
-) -> None:
-    """Raise a ValueError that names an argument of the wrong shape."""
+) -> Bool[Array, ""]:
+    """Return `is_precise`; a ValueError names an argument of the wrong shape."""
     if observation.ndim != 1 or observation.shape[0] < 4:
         raise ValueError(
             "observation must be (p_x, p_y, yaw, v, …), shape (nx,), "
@@ -303,3 +303,4 @@ def check_path(
             f"reference must have shape ({horizon}, 4): x, y, yaw, speed; "
             f"got {reference.shape}"
         )
+    return is_precise(observation, reference)

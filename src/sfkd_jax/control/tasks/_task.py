@@ -79,7 +79,8 @@ class Task(NamedTuple):
         weights: of the cost, a pytree of numbers that planners carry in their state.
         prepare: (params, observation, env, reference, start) -> `RolloutSetup`.
         step: (weights, context, sample, row, target, step index) -> `StepResult`.
-        check: (observation, env, reference, horizon) -> None; raises a ValueError that
+        check: (observation, env, reference, horizon) -> whether the positions are
+            precise, or None where there are none; raises a ValueError that
             names an argument of the wrong shape.
         constraint: see `constrained`; None for no constraint.
         constraint_data: that the constraint is given.
@@ -90,7 +91,7 @@ class Task(NamedTuple):
     weights: Any
     prepare: Callable[[Params, Any, Any, Any, PlanningStart], RolloutSetup]
     step: Callable[[Any, Any, Any, Control, Any, StepIndex], StepResult]
-    check: Callable[[Any, Any, Any, int], None]
+    check: Callable[[Any, Any, Any, int], Bool[Array, ""] | None]
     constraint: Callable[[Any, Any, Control, Any, StepIndex], Array] | None = None
     constraint_data: Any = ()
 
