@@ -15,13 +15,7 @@ from sfkd_jax.experiment.options import Settings
 
 
 def run(settings: Settings) -> dict[str, Any]:
-    """Certify the policy of the run, which is trained if it is missing.
-
-    Raises:
-        CertificateStale: there is a certificate of another policy, and
-            `certification.renew` is false.
-        CertificationRefused: nothing could be certified.
-    """
+    """Certify the policy of the run, which is trained if it is missing."""
     path = settings.certificate_path
     with store.locked(settings.run_dir):
         trained = stages.ensure_policy(settings)

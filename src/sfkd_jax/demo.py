@@ -25,12 +25,7 @@ PRINTED = ("rmse_m", "max_deviation_m", "smoothness_rad_per_s", "violation.v0")
 
 
 def run(settings: Settings) -> dict[str, Any]:
-    """Simulate a shipped policy beside nominal and oracle; print a table, animate.
-
-    Raises:
-        ArtefactError: the shipped policy was changed.
-        ValueError: no policy ships for this vehicle or for these settings of it.
-    """
+    """Simulate a shipped policy beside nominal and oracle; print a table, animate."""
     began, about = time.perf_counter(), settings.demo
     shipped = settings.vehicle.name + ALONG_PATH * bool(settings.along_path)
     trained = _load(settings, SHIPPED / shipped)

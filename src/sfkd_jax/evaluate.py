@@ -11,11 +11,7 @@ from sfkd_jax.experiment.options import Settings
 
 
 def run(settings: Settings) -> dict[str, Any]:
-    """Evaluate the systems of the run and add their rows to its results.
-
-    Raises:
-        ValueError: there is no system to evaluate.
-    """
+    """Evaluate the systems of the run and add their rows to its results."""
     if not settings.evaluation.systems:
         raise ValueError("evaluation.systems is empty: there is nothing to evaluate")
     stages.check_settings(settings)

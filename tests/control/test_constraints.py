@@ -33,10 +33,10 @@ def circles(data, x, u, target, at):
     return control.outside_circles(x, data["circles"], data["margin"])
 
 
-def drive(controller, start, steps=25, env=NOTHING):
+def drive(controller, start, steps=25):
     def step(carry, _):
         x, state = carry
-        u, state, info = controller.act({}, state, x, env, ())
+        u, state, info = controller.act({}, state, x, NOTHING, ())
         x = x + 0.25 * u
         return (x, state), (x, info["violation"], info["constraints_kept"])
 
@@ -90,32 +90,6 @@ def test_obstacles_move_and_change_without_another_compilation():
     assert act._cache_size() == 1
     with pytest.raises(ValueError, match="shape"):
         control.tuned(state, constraints={"circles": jnp.zeros((2, 3)), "margin": 0.1})
-
-
-def test_the_worst_of_several_environments_counts():
-    """An obstacle that the first environment does not have."""
-
-    def seen(data, x, u, target, at):
-        return control.outside_circles(x[:2], CIRCLE) + jnp.where(x[2] > 0.5, 0.0, -9.0)
-
-    task = control.free_task(
-        lambda params, x, u, e: jnp.concatenate([x[:2] + 0.25 * u, e]),
-        lambda weights, x, u, before, target: jnp.sum((x[:2] - GOAL) ** 2),
-        control_low=(-1.0, -1.0),
-        control_high=(1.0, 1.0),
-    )
-    controller = control.mppi(
-        control.over_environments(control.constrained(task, seen)),
-        num_samples=256,
-        horizon=HORIZON,
-        noise_std=(0.7, 0.7),
-    )
-    start, state = jnp.zeros(3), controller.init(jax.random.key(0))
-    _, _, info = jit(controller.act)({}, state, start, jnp.asarray([[0.0], [1.0]]), ())
-    places = info["predicted_states"][:, 0, :2]
-    clearance = jnp.linalg.norm(places - CIRCLE[0, :2], axis=1)
-    assert info["constraints_kept"]
-    assert clearance.min() >= 0.4
 
 
 def test_a_violation_that_is_not_a_number_is_not_kept():

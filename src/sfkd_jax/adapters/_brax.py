@@ -140,11 +140,6 @@ def brax_plant(env: Env, *, parameters: tuple[str, ...] = ("gravity",)) -> BraxP
         env: from `brax.envs.get_environment(name, backend="generalized")`; wrappers are
             removed.
         parameters: that the entries of e scale, of "gravity", "damping", "motor".
-
-    Raises:
-        ValueError: an unknown or repeated parameter, an environment without a brax
-            system, or a backend other than "generalized", where (q, q̇) is the whole
-            state.
     """
     inner = env.unwrapped
     if not isinstance(inner, PipelineEnv):

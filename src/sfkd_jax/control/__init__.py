@@ -23,7 +23,6 @@ from sfkd_jax.control.tasks._constraints import at_step as at_step
 from sfkd_jax.control.tasks._constraints import constrained as constrained
 from sfkd_jax.control.tasks._constraints import outside_boxes as outside_boxes
 from sfkd_jax.control.tasks._constraints import outside_circles as outside_circles
-from sfkd_jax.control.tasks._environments import over_environments as over_environments
 from sfkd_jax.control.tasks._free_task import free_task as free_task
 from sfkd_jax.control.tasks._path_tracking import Cost as Cost
 from sfkd_jax.control.tasks._path_tracking import StageInputs as StageInputs

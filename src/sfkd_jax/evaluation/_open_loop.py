@@ -48,9 +48,6 @@ def open_loop(
         params: of the model.
         trajectories: held out from training.
         horizon: steps.
-
-    Raises:
-        ValueError: the horizon does not fit the trajectories.
     """
     return _prediction_rmse(
         lambda window: rollout(model, params, window)[0],
@@ -161,9 +158,6 @@ def baselines(
         dt: sampling period [s].
         horizon: steps.
         along_path: whether states are those of path coordinates.
-
-    Raises:
-        ValueError: the horizon does not fit the trajectories.
     """
     steps = {"kinematic_bicycle": nominal}
     # Controls along a path are perturbations of a law: no bicycle explains them.

@@ -20,4 +20,9 @@ FACTORIES = {
     "r2dn": r2dn,
     "koopman_mpc": koopman,
 }
-"""Learned models: name -> factory(space, *, settings)."""
+"""Learned models: name -> factory(space, *, settings).
+
+`space` holds measured scales, which fix all sizes. Settings that several have: `dt`,
+the sampling period and the solver's step [s]; `environment`, whether e is used (if not,
+e is 0); `frame`, "body", or "path" for path coordinates, which have no pose.
+"""

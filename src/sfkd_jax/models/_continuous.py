@@ -141,9 +141,6 @@ def continuous(
             omitted.
         frame: "body", or "path" for path coordinates, which have no pose: r_g is
             ignored.
-
-    Raises:
-        ValueError: an unknown frame; a state of the wrong length, when it is encoded.
     """
     check_choice("model.frame", frame, FRAMES)
     pose = frame == "body"
@@ -212,10 +209,7 @@ def neural_ode(
     The original has no inputs; here u and e are held over dt and are inputs like s.
 
     Args:
-        space: measured scales; fixes all sizes.
-        dt: sampling period [s], the solver's step in training and in use.
         hidden: widths.
-        environment: whether e is used.
         frame: "body", or "path" for path coordinates.
 
     Source: Chen et al., NeurIPS 2018, arXiv 1806.07366.

@@ -98,13 +98,10 @@ def control_synth(
     The offsets c_j and d_j do not affect the proof.
 
     Args:
-        space: measured scales; fixes all sizes.
-        dt: sampling period [s], the solver's step in training and in use.
         networks: M, number of networks of the state and of the output.
         width: of each network.
         rate: γ [1/s].
         input_hidden: widths of the network that holds g and h.
-        environment: whether e is used.
 
     Source: Mei, Zheng and Li, NeurIPS 2024, arXiv 2411.02292.
     """

@@ -113,16 +113,10 @@ def icode(
     body frame, an Euler step composes learned increments and loses nothing.
 
     Args:
-        space: measured scales; fixes all sizes.
-        dt: sampling period [s], the solver's step in training and in use.
         width: of the hidden layers of f and of G.
         layers: number of hidden layers of f and of G.
-        environment: whether e is used; if not, e is 0.
         affine_in: "both" as above; "env" for f(s, u) + G(s, u) e, where e is what the
             paper calls an extrinsic input; "control" for f(s, e) + G(s, e) u.
-
-    Raises:
-        ValueError: another `affine_in`.
 
     Source: Li et al., arXiv 2411.13914.
     """
@@ -158,18 +152,12 @@ def icode_mppi(
     the original is f(x) + G(x) u; here e joins u.
 
     Args:
-        space: measured scales; fixes all sizes.
         nominal: (x, u, e) -> dx/dt of the known dynamics in physical units, passed in
             by the caller (models never import the vehicle). A model that ignores e
             gives it the centre of the environment box.
-        dt: sampling period [s], the solver's step in training and in use.
         hidden: widths of f and of G.
-        environment: whether e is used; if not, e is 0.
         affine_in: as for `icode`; with "control" the gain of the steering may depend on
             friction.
-
-    Raises:
-        ValueError: another `affine_in`.
 
     Source: Song et al., arXiv 2605.03260, eqs. 10 and 11.
     """

@@ -376,9 +376,7 @@ def koopman(
     follows a straight path from its initial pose.
 
     Args:
-        space: measured scales; fixes all sizes.
         functions: number of thin-plate functions.
-        environment: whether e is used.
         environment_degree: of m(e).
         ridges: to choose from, for columns scaled to mean square 1, per sample.
         lateral_range: largest |e_y| of the pairs [m]; also its scale.

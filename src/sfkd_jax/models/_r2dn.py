@@ -169,17 +169,12 @@ def r2dn(
     observations are ours, as for SFKD.
 
     Args:
-        space: measured scales; fixes all sizes.
         rank: of z, and number of inputs and outputs of φ.
         alpha: α, below 1 for a certificate.
         hidden: hidden widths of φ.
         decoder_hidden: hidden widths of D.
         encoder_hidden: hidden width of the encoder.
-        environment: whether e is used.
         frame: "body", or "path" for path coordinates, which have no pose.
-
-    Raises:
-        ValueError: an unknown frame.
     """
     check_choice("model.frame", frame, FRAMES)
     learned = Interconnection(

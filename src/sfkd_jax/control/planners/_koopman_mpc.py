@@ -86,9 +86,6 @@ def koopman_mpc(
         env_low: lower end of the environment box; an environment outside is clipped.
         env_high: upper end of the environment box.
 
-    Raises:
-        ValueError: the model has no linear predictor.
-
     Source: Korda and Mezić (2018), section 4.
     """
     if model.structure.linear is None:

@@ -275,7 +275,6 @@ def sfkd(
     which contains all of those and more.
 
     Args:
-        space: measured scales; fixes all sizes.
         rank: r, even.
         rho: ρ; ρ + β < 1 for a certificate. Of a joint budget only the sum counts.
         beta: β.
@@ -291,17 +290,12 @@ def sfkd(
             (||A_j|| ≤ ρ).
         budget: "joint" or "sum", of a sandwich residual.
         transport: learn Q(e); otherwise it is the identity.
-        environment: whether e is used.
         soft_penalty: weight of the paper's hinge max(0, ||∂r/∂z||_2 − β)² in the
             training loss (eq:contr_loss).
         learn_alpha: let training choose α of a joint budget between `LOWEST_RATE` and ρ
             + β, starting close to the latter.
         forcing_hidden: width of f(u, e) = V tanh(G(e) u + h(e)), added to B(e) u; 0 for
             none. It is no function of z, so every bound still holds.
-
-    Raises:
-        ValueError: unknown frame, residual or budget, an odd rank, or a `learn_alpha`
-            or `soft_penalty` that the residual does not allow.
     """
     check_choice("model.frame", frame, FRAMES)
     check_choice("model.residual", residual, RESIDUALS)
