@@ -93,7 +93,7 @@ def test_settings_of_the_wrong_type_or_size_are_refused_in_one_line_that_names_t
     for option in OPTIONS:
         for name, value in leaves(plain_settings(option)):
             group = name.partition(".")[0]
-            if group in ("comparison", "report") or value is None:
+            if group == "comparison" or value is None:
                 continue
             cases += [(option, name, wrong) for wrong in impossible(value)]
     accepted, odd = [], []

@@ -1,9 +1,8 @@
-"""The pages of a run, of a comparison and of a sweep."""
+"""The pages of a run and of a comparison."""
 
 import itertools
 import json
 import re
-from pathlib import Path
 
 import matplotlib
 import numpy as np
@@ -13,7 +12,7 @@ from PIL import Image, ImageSequence
 
 from sfkd_jax.evaluation.metrics import METRICS, Metric
 from sfkd_jax.report import figures, style, tables
-from sfkd_jax.report.comparison import write_comparison, write_results_page
+from sfkd_jax.report.comparison import write_results_page
 from sfkd_jax.report.episodes import Episodes, by_road, of_rows
 from sfkd_jax.report.film import LANE, Film, film_of
 from sfkd_jax.report.pages import to_latex
@@ -33,15 +32,6 @@ def comparison_page(tmp_path_factory):
     directory = made.write_comparison(tmp_path_factory.mktemp("comparison"))
     write_results_page(directory)
     return directory / "report"
-
-
-def sweep(root, **changes):
-    for seed in range(3):
-        settings = {"seed": 0, "model": {"system": "sfkd", "rho": 0.9 + seed / 100}}
-        made.write_run(
-            root / f"a/seed={seed}", episodes=False, settings=settings, **changes
-        )
-    return write_comparison(root, "a/seed=*", "page")
 
 
 @pytest.fixture
@@ -94,8 +84,7 @@ def test_a_new_metric_is_on_every_page(tmp_path, monkeypatch, no_figures):
     compared = made.write_comparison(tmp_path / "compared", episodes=False, rows=own)
     write_report(run)
     write_results_page(compared)
-    sweep(tmp_path, results={"rows": own})
-    for page in ("run/report", "compared/report", "page/comparison"):
+    for page in ("run/report", "compared/report"):
         text = (tmp_path / page / "index.html").read_text()
         assert "Novelty [kg]" in text
         assert "7 new" in text
@@ -384,27 +373,3 @@ def test_figure_2_has_a_row_for_every_system_under_forces():
     assert [text.get_text() for text in axes.get_yticklabels()] == ["SFKD", "Oracle"]
     for line in axes.get_lines():
         np.testing.assert_allclose(line.get_xdata(), [100.0, 150.0])
-
-
-# ---- the page of a sweep
-
-
-def test_a_sweep_shows_the_settings_that_differ_and_every_run(tmp_path):
-    pages = sweep(tmp_path)
-    text = Path(pages["report"]).with_name("report.md").read_text()
-    assert "| Run | model.rho |" in text
-    assert "| seed |" not in text
-    assert text.count("a/seed=2") > 3
-    assert pages["figures"] == []
-    with pytest.raises(ValueError, match="no run below"):
-        write_comparison(tmp_path, "none/*", "page")
-
-
-def test_runs_that_were_not_driven_still_have_predictions_and_a_rate(
-    tmp_path, no_figures
-):
-    refused = made.certificate(valid=False, alpha=None, reason="too large a gain")
-    pages = sweep(tmp_path, results=None, certificate=refused)
-    text = Path(pages["report"]).with_name("report.md").read_text()
-    assert "too large a gain" in text
-    assert "20 steps ahead" in text

@@ -233,13 +233,6 @@ class DemoSettings:
 
 
 @takes()
-class ReportSettings:
-    """What `report` compares: a pattern of run directories, or None."""
-
-    compare: str | None
-
-
-@takes()
 class Settings:
     """All settings of a command.
 
@@ -266,7 +259,6 @@ class Settings:
     comparison: ComparisonSettings
     export: ExportSettings
     demo: DemoSettings
-    report: ReportSettings
 
     @property
     def run_dir(self) -> Path:
@@ -325,8 +317,8 @@ def register() -> None:
         "dataset": datasets,
     }
     for group, hint in get_type_hints(Settings).items():
-        # Of `report` and `demo` the primary config has the values itself.
-        if not is_dataclass(hint) or group in ("report", "demo"):
+        # Of `demo` the primary config has the values itself.
+        if not is_dataclass(hint) or group == "demo":
             continue
         for variant, kind in variants.get(group, {"": hint}).items():
             ConfigStore.instance().store(

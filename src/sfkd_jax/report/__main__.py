@@ -1,30 +1,23 @@
-"""Write the page, tables and figures of a run, or of many runs."""
+"""Write the page, tables and figures of a run."""
 
 from __future__ import annotations
 
 from contextlib import nullcontext
-from pathlib import Path
 from typing import Any
 
 from sfkd_jax import store
 from sfkd_jax.experiment.command import hydra_command
 from sfkd_jax.experiment.options import Settings
-from sfkd_jax.report.comparison import write_comparison
 from sfkd_jax.report.run import write_report
 
 
 def run(settings: Settings) -> dict[str, Any]:
-    """Write the report of the run, or of all runs that `report.compare` matches."""
-    pattern = settings.report.compare
-    directory = Path(settings.root) if pattern else settings.run_dir
+    """Write the report of the run."""
+    directory = settings.run_dir
     # A lock would make a directory that does not exist.
     exclusive = store.locked(directory) if directory.exists() else nullcontext()
     with exclusive, store.as_artefact_error(directory):
-        pages = (
-            write_comparison(directory, pattern, settings.name)
-            if pattern
-            else write_report(directory)
-        )
+        pages = write_report(directory)
     store.print_message(f"report: {pages['report']}")
     return pages
 

@@ -1,4 +1,4 @@
-"""Pages about many rows: a comparison, and a sweep over run directories."""
+"""The page of a comparison."""
 
 from __future__ import annotations
 
@@ -8,7 +8,6 @@ from typing import Any
 import pandas as pd
 
 from sfkd_jax import store
-from sfkd_jax.evaluation import SHARED
 from sfkd_jax.evaluation.formats import dig, plain
 from sfkd_jax.evaluation.metrics import Row
 from sfkd_jax.report import figures, pages, style, tables
@@ -91,63 +90,3 @@ def _drawn(group: list[Row], directory: Path, images: Path, number: int) -> list
         path = style.save(images / f"forces_{number}.png", figures.side_forces, forced)
         parts.append(Picture(path, "RMSE by unmeasured side force"))
     return parts
-
-
-def write_comparison(root: Path, pattern: str, name: str) -> dict[str, Any]:
-    """Write `root/name/comparison/` about many runs: what differs, and all metrics.
-
-    `pattern` is of run directories below the root, as `s3/*/seed=*`. Files of a run may
-    be missing, except for settings.json.
-    """
-    home = root / name / "comparison"
-    with store.as_artefact_error(home):
-        # Sorted, so that the same runs make the same page on every file system.
-        found = sorted(path.parent for path in root.glob(f"{pattern}/settings.json"))
-        if not found:
-            raise ValueError(f"no run below {root} matches {pattern}")
-        sections = _sweep({str(run.relative_to(root)): run for run in found})
-        return pages.write_page(f"Comparison of runs: {name}", sections, home)
-
-
-def _sweep(found: dict[str, Path]) -> list[Section]:
-    """The settings that differ, and every metric of every run."""
-    records = {run: store.read_json(run / "settings.json") for run in found.values()}
-    # As shown: a setting that reads alike in all runs does not differ.
-    shown = pd.json_normalize([*records.values()]).map(plain)
-    shown = shown.loc[:, shown.nunique() > 1].set_axis([*found])
-    parts: list[Part] = [shown.rename_axis("Run", axis=1)]
-    reasons = {
-        name: runs.certificate_document(run).get("reason")
-        for name, run in found.items()
-    }
-    refused = {name: reason for name, reason in reasons.items() if reason}
-    if refused:
-        parts.append(record_table("Without a certificate", refused, "reason"))
-    sections = [Section("Settings that differ", parts)]
-    places: dict[str, list[tuple[str, Row]]] = {}
-    for name, (run, settings) in zip(found, records.items(), strict=True):
-        for row in _own_rows(run, tables.model_of(settings)):
-            places.setdefault(title_of([row], SHARED), []).append((name, row))
-    for title, group in places.items():
-        sections.append(Section(title, [*tables.metric_tables(group, "Run")]))
-    return sections
-
-
-def _own_rows(run: Path, system: str) -> list[Row]:
-    """The rows of the system that a run trained."""
-    with store.as_artefact_error(run / "results.json", ValueError):
-        rows = runs.read_optional(run / "results.json").get("rows") or []
-        own = [row for row in rows if row.get("system") == system]
-        # Of a system that measures e and estimates it, the first is meant.
-        first = [
-            min(group, key=lambda row: row.get("env") != "measured")
-            for group in grouped(own, SHARED)
-        ]
-    if first:
-        return first
-    # A run that was not evaluated still has its predictions and its certificate.
-    errors = runs.read_optional(run / "open_loop.json")
-    ahead = [errors.get(key) or [] for key in ("steps", "position_rmse_m")]
-    known = dict(zip(map(str, ahead[0]), ahead[1], strict=False))
-    alpha = runs.certificate_document(run).get("alpha")
-    return [{"open_loop_rmse_m": known, "alpha": alpha, "scenario": "not evaluated"}]

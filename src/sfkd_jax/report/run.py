@@ -153,7 +153,7 @@ def _scores(results: dict[str, Any]) -> list[Part]:
     parts: list[Part] = []
     for group in tables.grouped(results.get("rows") or [], SHARED):
         parts.append(f"{title_of(group, SHARED)}: {tables.amount(group)}")
-        parts += tables.metric_tables([(tables.name_of(row), row) for row in group])
+        parts += tables.metric_tables(group)
     return parts
 
 

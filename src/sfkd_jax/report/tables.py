@@ -128,18 +128,16 @@ def shown_metrics() -> list[Metric]:
     return [metric for metric in METRICS if metric.label]
 
 
-def metric_tables(
-    group: list[tuple[str, Row]], corner: str = "System"
-) -> list[pd.DataFrame]:
-    """All metrics of named rows that any has: one table for each `Metric.table`."""
+def metric_tables(group: list[Row]) -> list[pd.DataFrame]:
+    """All metrics of rows that any has: one table for each `Metric.table`."""
     kinds: dict[str, dict[Any, list[str]]] = {}
     for metric in shown_metrics():
-        cells = [metric.text(row) for _, row in group]
+        cells = [metric.text(row) for row in group]
         # A metric that no row has would be a column of dashes.
         if set(cells) != {DASH}:
             kinds.setdefault(metric.table, {})[metric.head()] = cells
-    names = [name for name, _ in group]
-    return [table(corner, columns, names) for columns in kinds.values()]
+    names = [name_of(row) for row in group]
+    return [table("System", columns, names) for columns in kinds.values()]
 
 
 def text_table(rows: list[Row], *names: str) -> str:
