@@ -6,8 +6,8 @@ import time
 from pathlib import Path
 from typing import Any
 
-from sfkd_jax import build, evaluation, policy, store
-from sfkd_jax.experiment import comparing, evaluating
+from sfkd_jax import build, policy, store
+from sfkd_jax.experiment import evaluating, runs
 from sfkd_jax.experiment.command import hydra_command
 from sfkd_jax.experiment.options import Settings
 from sfkd_jax.report.episodes import of_rows
@@ -32,38 +32,27 @@ def run(settings: Settings) -> dict[str, Any]:
     protocol = replace(settings.evaluation, **vars(about))
     settings = replace(settings, name="demo", evaluation=protocol)
     episodes = evaluating.make_episodes(settings)
-    directory = Path(settings.root) / settings.name
-    results = directory / f"{episodes.name}_{shipped}"
+    home = Path(settings.root) / settings.name / f"{episodes.name}_{shipped}"
     plant = build.build_vehicle(settings.vehicle)
     references = build.reference_systems(plant, trained.law)
     source, proof = settings.environment.source, trained.certificate
-    systems = {
-        trained.settings["model"]["system"]: build.System(
-            trained.model, trained.params, source, proof, trained.law
-        ),
-        "nominal": references["nominal"],
-        "oracle": references["oracle"],
-    }
-    with store.locked(results):
-        rows = []
-        for name, system in systems.items():
-            store.print_message(
-                f"driving {about.episodes} x {about.episode_s:.0f} s: {name}"
-            )
-            evaluate = evaluating.SystemEvaluation(settings, name, system, None)
-            written = results / name, directory, settings, evaluate(episodes)
-            rows.append(comparing.write_cell(*written))
-        rows, file = evaluation.compare(rows), results / "results.json"
-        made_by = {"config": plain(settings), "versions": store.versions()}
-        store.write_json(file, {"rows": rows} | made_by)
+    own = build.System(trained.model, trained.params, source, proof, trained.law)
+    systems = {trained.settings["model"]["system"]: own}
+    systems |= {name: references[name] for name in ("nominal", "oracle")}
+    with store.locked(home):
+        found = evaluating.drive(settings, systems, episodes, None)
+        seconds = time.perf_counter() - began
+        results = runs.write_results(home, plain(settings), found, seconds)
+        # The last ones: those of an earlier demo with other settings come before.
+        rows = runs.read_results(home)[-len(found) :]
         store.print_message(text_table(rows, *PRINTED))
         half_width = (proof or {}).get("corridor", {}).get("corridor_m")
-        path = directory / f"{results.name}.gif"
-        film = film_of(path, of_rows(directory, rows), half_width)
+        path = home.with_name(f"{home.name}.gif")
+        film = film_of(path, of_rows(home, rows), half_width)
     seconds = time.perf_counter() - began
     store.print_message(f"animation: {film}; {seconds:.0f} s in all")
     animation = film and str(film)
-    return {"animation": animation, "rows": len(rows), "results": str(file)}
+    return {"animation": animation, "rows": len(rows), "results": str(results)}
 
 
 def _load(settings: Settings, directory: Path) -> policy.Policy:

@@ -199,7 +199,7 @@ def test_a_controller_for_our_plant_keeps_such_a_car_in_its_lane(model):
     [
         ({"model": "st"}, "model must be one of std, mb, got 'st'"),
         ({"car": 4}, "car must be one of 1, 2, 3, got 4"),
-        ({"dt": 0.0}, "dt and steering_lag must be positive, got 0.0 and 0.1"),
+        ({"dt": 0.0}, "dt must be positive, got 0.0"),
     ],
 )
 def test_an_unknown_car_is_refused_in_one_line(settings, message):

@@ -51,23 +51,6 @@ def test_a_row_that_is_not_trained_again_has_the_first_seed_alone():
     assert {cell.seed for cell in found if cell.label == "program"} == {0, 1}
 
 
-def test_a_cell_composes_its_row_and_what_was_tuned():
-    tuned = replace(plan(), tuned={"dynamic": {"program": "model.functions=9"}})
-    cell = comparing.Cell("dynamic", "program", 1, "koopman_mpc", "s2")
-    assert comparing.overrides(cell, tuned) == [
-        "vehicle=dynamic",
-        "scenario=s2",
-        "controller=koopman_mpc",
-        "seed=1",
-        "model=koopman_mpc",
-        "seed=3",
-        "model.functions=9",
-    ]
-    assert (
-        comparing.overrides(cell._replace(vehicle="kinematic"), tuned)[-1] == "seed=3"
-    )
-
-
 def test_every_row_belongs_to_exactly_one_share():
     """Two controllers of one row share its policy: no two processes may train it."""
     groups = comparing.group_cells(cells())

@@ -237,17 +237,6 @@ def test_a_system_that_leaves_the_road_does_not_flatten_the_others(tmp_path):
     assert figure.axes[0].get_ylim()[1] < 3.0
 
 
-def test_many_systems_are_drawn_by_family_each_with_sfkd_and_oracle(tmp_path):
-    directory = made.write_comparison(tmp_path)
-    found = json.loads((directory / "results.json").read_text())["rows"]
-    here = [r for r in found if (r["scenario"], r["vehicle"]) == ("s3", "kinematic")]
-    figure = figures.first_episode(of_rows(directory, here))
-    legends = [axes.get_legend() for axes in figure.axes if axes.get_legend()]
-    assert len(legends) == 3
-    for legend in legends:
-        assert {"SFKD", "Oracle"} <= {text.get_text() for text in legend.get_texts()}
-
-
 def test_figures_of_states_that_are_not_finite(tmp_path):
     group = groups(tmp_path)
     broken = group[0].lateral.copy()
@@ -255,13 +244,6 @@ def test_figures_of_states_that_are_not_finite(tmp_path):
     group[0] = group[0]._replace(lateral=broken)
     style.save(tmp_path / "a.png", figures.first_episode, group)
     style.save(tmp_path / "b.png", figures.all_episodes, group[0])
-
-
-def test_systems_look_different():
-    looks = [(look.colour, look.dashes) for look in style.SYSTEMS.values()]
-    assert len(set(looks)) == len(looks)
-    labels = [look.label for look in style.SYSTEMS.values()]
-    assert len(set(labels)) == len(labels)
 
 
 def film(size, corridor=None, cars=1, **changes):
@@ -283,13 +265,6 @@ def test_a_film_runs_in_real_time_and_is_small(tmp_path):
         ]
     assert all(np.any(a != b) for a, b in itertools.pairwise(frames))
     assert path.stat().st_size < 2e6
-
-
-def test_the_scale_of_a_film_shows_the_corridor_and_cars_in_their_lane():
-    assert film(0.05, 0.1).largest == 0.1
-    assert film(0.3, 0.1).largest == pytest.approx(0.3, rel=1e-2)
-    assert film(5.0, 0.1).largest == 0.1
-    assert film(5.0).largest == LANE
 
 
 def test_a_car_leaves_its_lane_at_the_first_value_outside_or_not_finite():

@@ -28,6 +28,8 @@ implicit steps fail at a locked wheel.
 """
 CARS = (1, 2, 3)
 """CommonRoad's numbers of the Ford Escort, the BMW 320i and the VW Vanagon."""
+STEERING_LAG, WIND_LEVER = 0.1, 0.4
+"""τ of the steering [s]; of the wind ahead of the centre of mass [m]."""
 OBSERVED = 7
 """Number of leading states, in the order of `plants.dynamic`."""
 
@@ -88,9 +90,7 @@ def commonroad_vehicle(
     model: str = "std",
     car: int = 2,
     dt: float = 0.1,
-    steering_lag: float = 0.1,
     wind_force: float = 10.0,
-    wind_lever: float = 0.4,
 ) -> Vehicle:
     """Return a car of CommonRoad as a plant.
 
@@ -99,8 +99,8 @@ def commonroad_vehicle(
     the multi-body car also roll, pitch, heave and the axles, relative to freely rolling
     wheels and springs at rest: a start with zeros there is in equilibrium.
 
-        δ̇ = clip((δ_cmd − δ)/τ, ±δ̇_max), δ̇_max = 0.4 rad/s as in CommonRoad,
-        F = c_w w|w| at l_w ahead of the centre of mass
+        δ̇ = clip((δ_cmd − δ) / 0.1 s, ±δ̇_max), δ̇_max = 0.4 rad/s as in CommonRoad,
+        F = c_w w|w| at 0.4 m ahead of the centre of mass
 
     The acceleration is applied directly. CommonRoad has no wind; F is added here. The
     tyres' lateral force peaks at friction × load (1.0489 in CommonRoad's tyre), the
@@ -116,21 +116,17 @@ def commonroad_vehicle(
             states).
         car: 1 Ford Escort, 2 BMW 320i, 3 VW Vanagon.
         dt: sampling period [s].
-        steering_lag: τ [s].
         wind_force: c_w [N s²/m²].
-        wind_lever: l_w [m].
 
     Source: Althoff and Würsching, CommonRoad: Vehicle Models.
     """
     check_choice("model", model, MODELS)
     if car not in CARS:
         raise ValueError(f"car must be one of {', '.join(map(str, CARS))}, got {car}")
-    if not (dt > 0 and steering_lag > 0):
-        raise ValueError(
-            f"dt and steering_lag must be positive, got {dt} and {steering_lag}"
-        )
+    if not dt > 0:
+        raise ValueError(f"dt must be positive, got {dt}")
     dry: Car = setup_vehicle_parameters(car)
-    host = _HostCar(MODELS[model], dry, dt, steering_lag, wind_force, wind_lever)
+    host = _HostCar(MODELS[model], dry, dt, wind_force)
     # The nominal model is that of our dynamic car with these axle distances.
     bicycle = dynamic(
         dt=dt, wind_force=wind_force, front_length=dry.a, rear_length=dry.b
@@ -162,9 +158,7 @@ class _HostCar:
     equations: Equations
     dry: Car
     dt: float
-    steering_lag: float
     wind_force: float
-    wind_lever: float
 
     def flow(self, control: Numbers, env: Numbers) -> Callable[[Any], list[float]]:
         """Return x -> dx/dt in CommonRoad's coordinates."""
@@ -176,12 +170,12 @@ class _HostCar:
 
         def rates(moment: np.ndarray) -> list[float]:
             x = moment.tolist()
-            inputs = [(control[0] - x[2]) / self.steering_lag, control[1]]
+            inputs = [(control[0] - x[2]) / STEERING_LAG, control[1]]
             # A copy: CommonRoad stops locked wheels in the list that it is given.
             result = equations.rates(list(x), inputs, car)
             for index, change in equations.push(x, force, car).items():
                 result[index] += change
-            result[5] += self.wind_lever * force / car.I_z
+            result[5] += WIND_LEVER * force / car.I_z
             return [float(change) for change in result]
 
         return rates

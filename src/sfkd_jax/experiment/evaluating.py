@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import os
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from concurrent.futures import ThreadPoolExecutor
 from functools import partial
 from pathlib import Path
@@ -330,21 +330,32 @@ def evaluate_run(settings: Settings, *, command: str | None = None) -> Path:
     Rows of other scenarios and controllers in the same run stay. `command`, as it was
     typed, is stored with the results. Returns the path of results.json.
     """
-    began, protocol = time.perf_counter(), settings.evaluation
+    began = time.perf_counter()
     # Vehicle and earlier results are checked before anything is trained.
     episodes = make_episodes(settings)
     runs.read_results(settings.run_dir)
     compared = load_systems(settings)
     dataset, _ = data.ensure_dataset(settings)
-    found: list[SystemResult] = []
+    found = drive(settings, compared, episodes, dataset)
+    seconds = time.perf_counter() - began
+    config = plain(settings) | ({"command": command} if command else {})
+    return runs.write_results(settings.run_dir, config, found, seconds)
+
+
+def drive(
+    settings: Settings,
+    systems: Mapping[str, System],
+    episodes: EpisodeSet,
+    dataset: Dataset | None,
+) -> list[SystemResult]:
+    """Simulate, score and compare systems on the same episodes, with messages."""
+    protocol, found = settings.evaluation, list[SystemResult]()
     length = f"{protocol.episodes} episodes of {protocol.episode_s:.0f} s"
-    for name, system in compared.items():
+    for name, system in systems.items():
         store.print_message(f"driving {length}: {name} on {episodes.name}")
         result = SystemEvaluation(settings, name, system, dataset)(episodes)
         found.append(result)
         error, worst = result.row["rmse_m"]["mean"], result.row["max_deviation_m"]
         store.print_message(f"  rmse {error:.4f} m, worst {worst:.3f} m")
-    seconds = time.perf_counter() - began
-    config = plain(settings) | ({"command": command} if command else {})
     evaluation.compare([result.row for result in found])
-    return runs.write_results(settings.run_dir, config, found, seconds)
+    return found

@@ -20,30 +20,7 @@ SWITCH: dict[str, Any] = dict(color=MUTED, ls=(0, (4, 3)), linewidth=0.9, zorder
 """Line at a switch of the environment, or at a level."""
 WIDTH = 6.9
 """Of every figure [in]: text of 10 pt stays legible at the width of a phone."""
-RC: Any = {
-    "axes.axisbelow": True,
-    "axes.edgecolor": AXIS,
-    "axes.grid": True,
-    "axes.labelcolor": DARK,
-    "axes.linewidth": 0.7,
-    "axes.spines.right": False,
-    "axes.spines.top": False,
-    "axes.titlelocation": "left",
-    "axes.titlesize": 10.5,
-    "axes.titleweight": "bold",
-    "figure.constrained_layout.h_pad": 0.09,
-    "figure.constrained_layout.w_pad": 0.1,
-    "font.size": 10,
-    "grid.color": "#e3e6ea",
-    "grid.linewidth": 0.6,
-    "legend.fontsize": 9,
-    "legend.frameon": False,
-    "savefig.dpi": 150,
-    "xtick.color": AXIS,
-    "xtick.labelcolor": DARK,
-    "ytick.color": AXIS,
-    "ytick.labelcolor": DARK,
-}
+STYLE = Path(__file__).parent / "templates" / "figures.mplstyle"
 """Settings of matplotlib beyond its defaults."""
 
 
@@ -156,7 +133,6 @@ def save(path: Path, draw: Callable[..., Figure], *inputs: Any) -> Path:
     """Draw in the common style and write a PNG that depends on the inputs alone."""
     with matplotlib.rc_context():
         # Not what the user has set: the same inputs give the same bytes.
-        matplotlib.rcdefaults()
-        matplotlib.rcParams.update(RC)
+        matplotlib.rc_file(STYLE)
         draw(*inputs).savefig(path, format="png", metadata={"Software": None})
     return path
