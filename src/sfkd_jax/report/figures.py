@@ -16,26 +16,28 @@ from sfkd_jax.report.episodes import Episodes
 from sfkd_jax.report.tables import name_of
 
 _ALWAYS = ("sfkd", "oracle")
-"""Systems that every panel shows."""
-_FEW = 6
-"""So many systems fit into one panel."""
+"""Systems whose errors are always inside the frame."""
+_FEW = (*_ALWAYS, "nominal", "koopman_mpc", "neural_ode", "icode_mppi")
+"""Systems that are drawn if there are more of them."""
 
 
 def first_episode(
     group: list[Episodes], corridor: float | None = None, seconds: float = 15.0
 ) -> Figure:
     """Lateral errors on one road over time [s], and friction and wind below them."""
-    first, panels, envs = group[0], _panels(group), group[0].envs
+    first, envs = group[0], group[0].envs
+    # Many lines in one panel hide each other.
+    if len(group) > len(_FEW):
+        group = [one for one in group if one.system in _FEW] or group
     # As long as the shortest run: all lines end at the same time.
     last = min(round(seconds / first.dt), *(one.lateral.shape[1] for one in group))
-    heights = [2.4] * len(panels) + [0.7, 0.7] * (envs is not None)
+    heights = [2.4] + [0.7, 0.7] * (envs is not None)
     figure = style.canvas(0.8 + sum(heights))
     axes = [*figure.subplots(len(heights), height_ratios=heights, squeeze=False)[:, 0]]
-    for panel, (title, members) in zip(axes, panels.items(), strict=False):
-        panel.set_title(title)
-        _draw_errors(panel, members, last, corridor)
+    axes[0].set_title("Lateral error in the first episode")
+    _draw_errors(axes[0], group, last, corridor)
     if envs is not None:
-        _draw_conditions(axes[-2], axes[-1], envs[:last], first.dt)
+        _draw_conditions(axes[1], axes[2], envs[:last], first.dt)
     for panel in axes:
         panel.set(xlim=(0.0, last * first.dt))
         panel.grid(visible=False, axis="x")
@@ -45,23 +47,6 @@ def first_episode(
     axes[-1].set_xlabel("time [s]")
     figure.align_ylabels(axes)
     return figure
-
-
-def _panels(group: list[Episodes]) -> dict[str, list[Episodes]]:
-    """The systems of every panel, by its title; a small group is one panel."""
-    title = "Lateral error in the first episode"
-    # Many lines in one panel hide each other: by what they observe instead.
-    if len(group) <= _FEW:
-        return {title: group}
-    kinds = "SFKD and its parts", "friction and wind observed", "neither observed"
-    panels: dict[str, list[Episodes]] = {f"{title}: {kind}": [] for kind in kinds}
-    for one in group:
-        blind = 2 if one.row.get("env") == "none" else 1
-        own = 0 if one.system.startswith("sfkd") else blind
-        for number, members in enumerate(panels.values()):
-            if number == own or one.system in _ALWAYS:
-                members.append(one)
-    return {name: members for name, members in panels.items() if members}
 
 
 def _draw_conditions(
