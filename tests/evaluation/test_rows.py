@@ -56,12 +56,7 @@ def test_comparisons_are_ratios_to_the_oracle_and_paired_differences_to_ours():
 
 @pytest.mark.parametrize(
     "change",
-    [
-        {"scenario": "s1"},
-        {"vehicle": "dynamic"},
-        {"sampling": "plain"},
-        {"count": 3},
-    ],
+    [{"scenario": "s1"}, {"vehicle": "dynamic"}, {"sampling": "plain"}, {"count": 3}],
 )
 def test_rows_of_other_episodes_or_another_sampling_are_not_paired(change):
     (_, other) = compare([made(0.2, "sfkd"), made(0.5, "icode", **change)])

@@ -4,13 +4,7 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from sfkd_jax.evaluation import (
-    holm,
-    mean_interval,
-    p_value,
-    paired_difference,
-    summary,
-)
+from sfkd_jax.evaluation import holm, mean_interval, p_value, paired_difference, summary
 
 DRAWS = 2000
 SIZES = [(3, 16), (5, 16), (10, 200)]

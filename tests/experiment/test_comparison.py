@@ -163,11 +163,7 @@ def test_a_row_that_was_made_with_other_settings_or_code_is_announced(tmp_path, 
 
 @pytest.mark.parametrize(
     ("changes", "are_paired"),
-    [
-        ((), True),
-        (("scenario.speed=5.0",), False),
-        (("evaluation.seed=2",), False),
-    ],
+    [((), True), (("scenario.speed=5.0",), False), (("evaluation.seed=2",), False)],
 )
 def test_rows_that_met_other_roads_are_not_paired(tmp_path, changes, are_paired):
     entries = {label: row(label, level, 0) for label, level in LEVELS.items()}

@@ -63,11 +63,7 @@ def test_every_learned_model_and_every_planner_has_an_option_file():
 
 
 @pytest.mark.parametrize(
-    ("override", "says"),
-    [
-        ("model=sfdk", "sfkd_no_fiber"),
-        ("model.rnk=3", "rnk"),
-    ],
+    ("override", "says"), [("model=sfdk", "sfkd_no_fiber"), ("model.rnk=3", "rnk")]
 )
 def test_a_wrong_option_is_refused_by_name(override, says):
     with pytest.raises((HydraException, OmegaConfBaseException), match=says):

@@ -86,11 +86,7 @@ MODELS = {
 
 
 def commonroad_vehicle(
-    *,
-    model: str = "std",
-    car: int = 2,
-    dt: float = 0.1,
-    wind_force: float = 10.0,
+    *, model: str = "std", car: int = 2, dt: float = 0.1, wind_force: float = 10.0
 ) -> Vehicle:
     """Return a car of CommonRoad as a plant.
 

@@ -19,14 +19,7 @@ from sfkd_jax.evaluation.metrics import (
     as_numbers,
 )
 
-SHARED = (
-    "scenario",
-    "vehicle",
-    "inner_loop",
-    "controller",
-    "planner",
-    "sampling",
-)
+SHARED = ("scenario", "vehicle", "inner_loop", "controller", "planner", "sampling")
 """Columns that are equal in rows that are compared."""
 IDENTITY = ("system", *SHARED, "env")
 """Columns that identify a row of results.json; a new row replaces the old row of the
