@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import dataclass
-from functools import cached_property
 from pathlib import Path
 from typing import Any
 
@@ -74,44 +72,26 @@ def write(path: Path, film: Film) -> Path:
     return path
 
 
-@dataclass(frozen=True, eq=False)
 class Film:
-    """Episodes on one road.
+    """Episodes on one road, with states and a path; the first car is followed."""
 
-    Attributes:
-        cars: with states and a path; the camera follows the first one.
-        last: steps that are shown.
-        corridor: certified half width [m].
-    """
-
-    cars: list[Episodes]
-    last: int
-    corridor: float | None = None
-
-    @cached_property
-    def deviations(self) -> list[Float[np.ndarray, " time"]]:
-        """Signed deviation of every car [m], left positive."""
-        return [car.lateral[0, : self.last] for car in self.cars]
-
-    @cached_property
-    def left(self) -> list[int]:
-        """First step at which each car is outside of its lane, or not finite."""
-        inside = [np.abs(one) <= LANE for one in self.deviations]
+    def __init__(
+        self, cars: list[Episodes], last: int, corridor: float | None = None
+    ) -> None:
+        """Measure what is drawn of the first steps, beside a certified half width."""
+        self.cars, self.last, self.corridor = cars, last, corridor
+        # Signed, left positive [m].
+        self.deviations = [car.lateral[0, :last] for car in cars]
         # A comparison with NaN is False: a car that is not finite is outside as well.
-        return [int(np.argmin(np.append(one, False))) for one in inside]
-
-    @cached_property
-    def largest(self) -> float:
-        """Largest deviation of the corridor and of the cars in their lanes [m]."""
+        inside = [np.abs(one) <= LANE for one in self.deviations]
+        # First step at which each car is outside of its lane.
+        self.left = [int(np.argmin(np.append(one, False))) for one in inside]
         peaks = [float(np.max(np.abs(one))) for one in self.deviations]
         # A car that leaves its lane would make all others look motionless.
-        shown = [self.corridor or 0.0, *(one for one in peaks if one <= LANE)]
-        return max(shown) or LANE
-
-    @cached_property
-    def factor(self) -> int:
-        """Widening of deviations; the same for all cars, so that they compare."""
-        return int(np.clip(_HALF / self.largest, 1, _MOST))
+        shown = [corridor or 0.0, *(one for one in peaks if one <= LANE)]
+        self.largest = max(shown) or LANE
+        # The same widening for all cars, so that they compare.
+        self.factor = int(np.clip(_HALF / self.largest, 1, _MOST))
 
     def frames(self) -> Iterator[Image.Image]:
         """The frames, each drawn over what is the same in all of them."""
