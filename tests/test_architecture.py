@@ -261,23 +261,6 @@ def test_settings_below_the_commands_have_types():
     assert found.total() <= UNTYPED_SETTINGS, found
 
 
-def test_public_functions_are_annotated():
-    def bare(function: ast.FunctionDef) -> bool:
-        given = function.args
-        arguments = [*given.posonlyargs, *given.args, *given.kwonlyargs]
-        arguments += [one for one in (given.vararg, given.kwarg) if one]
-        named = [one for one in arguments if one.arg not in ("self", "cls")]
-        return function.returns is None or any(one.annotation is None for one in named)
-
-    scopes = [(n, s) for n in FILES for s in (FILES[n], *nodes(n, ast.ClassDef))]
-    assert [
-        (name, node.name)
-        for name, scope in scopes
-        for node in scope.body
-        if isinstance(node, FUNCTION) and not node.name.startswith("_") and bare(node)
-    ] == []
-
-
 def test_only_host_packages_compile():
     files = [name for name in LIBRARY if PACKAGE_OF[name] not in COMPILES]
     assert {

@@ -216,19 +216,6 @@ def groups(tmp_path, **lateral):
     return [one._replace(**lateral) for one in group]
 
 
-def test_the_first_episode_shows_errors_conditions_and_the_whole_corridor(tmp_path):
-    figure = figures.first_episode(groups(tmp_path), corridor=0.5)
-    errors, friction, wind = figure.axes
-    labels = [axes.get_ylabel() for axes in figure.axes]
-    assert labels == ["lateral error [m]", "friction\n[-]", "side wind\n[m/s]"]
-    low, high = errors.get_ylim()
-    assert low <= -0.5
-    assert high >= 0.5
-    assert wind.get_xlim() == (0.0, made.STEPS * made.DT)
-    assert friction.get_ylim() == (0.0, 1.0)
-    assert any("0.500 m" in text.get_text() for text in errors.texts)
-
-
 def test_a_system_that_leaves_the_road_does_not_flatten_the_others(tmp_path):
     figure = figures.first_episode(
         [one._replace(lateral=100 * one.lateral) if one.system == "nominal" else one
@@ -338,13 +325,3 @@ def test_latex_has_a_cell_for_every_column_and_balanced_braces(comparison_page):
     assert {line.count("&") for line in lines} == {4}
     assert r"\multicolumn{2}{c}{kinematic}" in table
     assert to_latex([]).count("tabular") == 0
-
-
-def test_figure_2_has_a_row_for_every_system_under_forces():
-    forces = [{"force_n": n, "rmse_m": {"mean": 0.1 + n / 1e4}} for n in (0.0, 500.0)]
-    lost = [*forces, {"force_n": 1000.0, "rmse_m": {"mean": float("nan")}}]
-    own = [made.row("sfkd", disturbed=forces), made.row("oracle", disturbed=lost)]
-    (axes,) = figures.side_forces(own).axes
-    assert [text.get_text() for text in axes.get_yticklabels()] == ["SFKD", "Oracle"]
-    for line in axes.get_lines():
-        np.testing.assert_allclose(line.get_xdata(), [100.0, 150.0])

@@ -83,11 +83,9 @@ def read_optional(path: Path) -> dict[str, Any]:
     return store.read_json(path) if path.exists() else {}
 
 
-def certificate_document(run: Path) -> dict[str, Any]:
+def certificate_document(run: Path, policy: dict[str, Any]) -> dict[str, Any]:
     """The certificate of a run; one about other weights is not valid."""
     certificate = read_optional(run / "certificate.json")
-    path = run / f"policy{store.SUFFIX}"
-    policy = store.read_manifest(path, kind="policy") if path.exists() else {}
     own, named = policy.get("sha256"), certificate.get("weights_sha256")
     # Valid for other weights is not valid here: the page must not show it.
     if own and named and own != named:
@@ -123,7 +121,7 @@ def _sections(
 ) -> list[Section]:
     """All sections of the page; a file whose content does not fit is named."""
     results = read_optional(run_dir / "results.json")
-    certificate = certificate_document(run_dir)
+    certificate = certificate_document(run_dir, policy)
     # Numbers of a certificate that does not hold are nowhere drawn.
     proof = certificate if holds(certificate) else {}
     half = dig(proof, "corridor", "corridor_m")
