@@ -12,6 +12,7 @@ from helpers import straight
 
 from sfkd_jax import control, demo, models, plants, policy
 from sfkd_jax.certification import Certificate, verify
+from sfkd_jax.types import Controller
 
 KEY, ENV = jax.random.key(0), jnp.asarray([0.7, 0.0])
 VEHICLES = sorted(entry.name for entry in demo.SHIPPED.iterdir())
@@ -107,3 +108,74 @@ def test_late_controls_are_predicted_by_the_vehicle_not_by_its_closed_loop():
     state = control.tuned(late.init(KEY), effective_samples=20.0)
     arguments = trained.params, state, start("kinematic"), ENV, straight(20)
     assert jax.eval_shape(late.act, *arguments)[2]["arrival_state"].shape == (4,)
+
+
+def scripted(controls):
+    """A planner in the world that gives these controls one after another, whatever it
+    sees.
+    """
+
+    def act(params, memory, observation, env, reference):
+        script, k = memory
+        return script[k], (script, k + 1), {"mine": observation[0]}
+
+    return Controller(lambda key: (controls, jnp.zeros((), int)), act)
+
+
+@pytest.mark.parametrize("vehicle", ["dynamic_path", "kinematic_path"])
+def test_any_planner_stays_in_the_corridor_behind_the_guard(vehicle):
+    """On the true plant, while friction and wind jump; one program for all planners."""
+    trained, steps, draw = load(vehicle), 150, np.random.default_rng(0)
+    swerving = np.sign(np.sin(2 * np.pi * np.arange(steps) / 40))
+    scripts = {
+        "nothing": np.full((steps, 2), np.nan),
+        "garbage": 10.0 ** draw.uniform(-3, 30, (steps, 2)) * draw.choice([-1, 1], 2),
+        "full lock": np.tile([0.5, 0.0], (steps, 1)),
+        "swerving": np.stack([swerving, 0.0 * swerving], 1),
+        "coasting": np.zeros((steps, 2)),
+    }
+    controls = jnp.asarray(np.stack([*scripts.values()]), jnp.float32)
+    envs = jnp.asarray([[0.9, 8.0], [0.3, 8.0], [0.3, -8.0], [0.6, 0.0]])
+    plant = trained.vehicle
+
+    @jax.jit
+    @jax.vmap
+    def drive(script):
+        guarded = trained.guard(scripted(script))
+
+        def step(carry, k):
+            x, memory = carry
+            e, road = envs[k // 40], straight(20, speed=9.5).at[:, 0].add(x[0])
+            u, memory, info = guarded.act(trained.params, memory, x, e, road)
+            return (plant.step(x, u, e), memory), (x[1], info)
+
+        begin = start(vehicle).at[3].set(9.5), guarded.init(KEY)
+        return jax.lax.scan(step, begin, jnp.arange(steps))[1]
+
+    lateral, info = drive(controls)
+    worst = np.max(np.abs(lateral), axis=1)
+    assert np.all(worst <= trained.certificate["corridor"]["corridor_m"]), worst
+    assert not np.any(info["healthy"][0])
+    assert np.all(worst[2:4] > 0.02)  # as far as the filter lets them
+    assert info["mine"].shape == lateral.shape
+
+
+def test_a_guard_needs_a_corridor_and_a_control_of_the_vehicle():
+    with pytest.raises(ValueError, match="no certified corridor"):
+        load("dynamic").guard(scripted(jnp.zeros((1, 2))))
+    trained = load("kinematic_path")
+    inputs = start("kinematic"), ENV, straight(20)
+    for planner, message in (
+        (scripted(jnp.zeros((1, 3))), r"control has shape \(3,\), not \(2,\)"),
+        (trained.controller, None),
+    ):
+        guarded = trained.guard(planner)
+        call = partial(jax.eval_shape, guarded.act, trained.params, guarded.init(KEY))
+        if message:
+            with pytest.raises(ValueError, match=message):
+                call(*inputs)
+        else:
+            _, state, info = call(*inputs)
+            same = jax.eval_shape(guarded.init, KEY)
+            assert jax.tree.structure(state) == jax.tree.structure(same)
+            assert info["predicted_states"].shape == (20, 4)

@@ -4,16 +4,17 @@ from __future__ import annotations
 
 import json
 import warnings
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager, nullcontext
 from dataclasses import dataclass
 from functools import lru_cache, partial, wraps
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jaxtyping import Array, Bool
 
 from sfkd_jax import build, store
 from sfkd_jax.control import PathLaw, law_from_arrays
@@ -21,10 +22,21 @@ from sfkd_jax.geometry import relative, shifted
 from sfkd_jax.plants import Vehicle
 from sfkd_jax.rollout import fold, unfold
 from sfkd_jax.settings import Values
-from sfkd_jax.types import Controller, Key, Model, Params
+from sfkd_jax.types import (
+    Control,
+    Controller,
+    ControllerInfo,
+    Environment,
+    Key,
+    Model,
+    Params,
+    State,
+)
 
 KIND, LAW = "policy", "law"
 CERTIFICATE = "certificate.json"
+_PLANNED = ("cost", "mean_cost", "effective_samples", "predicted_states")
+"""Entries of `info` that a planner alone can give."""
 BOXES = {"state": "body", "control": "control", "env": "env"}
 """Box of a certificate -> scales of the model that have the same size."""
 
@@ -60,15 +72,112 @@ class Policy(TrainedModel):
         controller: `Controller(init, act)`, pure; jit, vmap or scan it.
         certificate: the verified document of certificate.json, or None if it is
             missing, refused or stale.
+        around: (planner=another along a path) -> controller, see
+            `build.build_controller`.
     """
 
     controller: Controller
     certificate: dict[str, Any] | None
+    around: Callable[..., Controller]
+
+    def guard(self, planner: Controller, *, along_path: bool = False) -> Controller:
+        """Return any planner behind the shield of this policy, to be called like it.
+
+        Args:
+            planner: its `act` receives the params of the policy (bind others with
+                `partial`), the observation, e and the reference, and returns a control
+                of the vehicle. Entries of its `info` appear in that of the guard.
+            along_path: whether it takes ξ and a preview instead of observation and
+                reference, see `control.along_reference`.
+
+        Raises:
+            ValueError: the policy has no certified corridor.
+        """
+        if not (self.certificate and self.certificate.get("corridor")):
+            raise ValueError(
+                "this policy has no certified corridor to keep a planner in: load one "
+                "in path coordinates with its certificate, as pretrained/dynamic_path"
+            )
+        if along_path:
+            return _entrance(self.around(planner=planner), self)
+        guard = self.around(planner=Controller(_no_request, _return_request))
+        guarded = Controller(
+            lambda key: GuardedState(planner.init(key), guard.init(key)),
+            partial(_guarded, planner, guard),
+        )
+        return _entrance(guarded, self)
 
     @property
     def weights(self) -> Params:
         """The learned parameters as they were saved, to train on or to save again."""
         return unfold(self.params)
+
+
+class Request(NamedTuple):
+    """What a planner in the world asks for: the state of its stand-in along a path."""
+
+    control: Control
+    healthy: Bool[Array, ""]
+
+
+class GuardedState(NamedTuple):
+    """States of a planner in the world and of the guard around its `Request`."""
+
+    planner: Any
+    guard: Any
+
+
+def _no_request(key: Key) -> Request:
+    del key
+    return Request(jnp.zeros(2), jnp.asarray(True))
+
+
+def _return_request(
+    params: Params, request: Request, xi: Any, env: Any, preview: Any
+) -> tuple[Control, Request, ControllerInfo]:
+    """Act as a planner along a path that knows nothing but what was asked for."""
+    del params, env
+    unknown = jnp.asarray(jnp.nan, dtype=float)
+    states = jnp.full((preview.road.shape[0], xi.shape[0]), unknown)
+    about: Any = {
+        **dict.fromkeys(_PLANNED, unknown),
+        "healthy": request.healthy,
+        "env_inside": jnp.asarray(True),
+        "predicted_states": states,
+    }
+    return request.control, request, about
+
+
+def _guarded(
+    planner: Controller,
+    guard: Controller,
+    params: Params,
+    state: GuardedState,
+    observation: State,
+    env: Environment,
+    reference: Any,
+) -> tuple[Control, GuardedState, ControllerInfo]:
+    """Take one control step of a planner in the world behind a guard along the path."""
+    inputs = observation, env, reference
+    planned, memory, about = planner.act(params, state.planner, *inputs)
+    planned = jnp.asarray(planned, dtype=float)
+    if planned.shape != (2,):
+        raise ValueError(f"the planner's control has shape {planned.shape}, not (2,)")
+    healthy = jnp.all(jnp.isfinite(planned)) & about.get("healthy", True)
+
+    # Projection loses the pose in the world that the planner needs, so it acts before:
+    # its request lies in the state of the stand-in, at whatever depth.
+    def is_request(node: Any) -> bool:
+        return isinstance(node, Request)
+
+    def put(node: Any) -> Any:
+        return Request(planned, healthy) if is_request(node) else node
+
+    asked = jax.tree.map(put, state.guard, is_leaf=is_request)
+    control, after, info = guard.act(params, asked, *inputs)
+    known = {name: about[name] for name in _PLANNED if name in about}
+    merged: Any = {**about, **info, **known}
+    return control, GuardedState(memory, after), merged
 
 
 def save(
@@ -197,7 +306,8 @@ def load(
     # Errors are about the file, unless the caller asked for something else.
     asked = controller is not None or env_source != "measured" or adaptive
     with nullcontext() if asked else store.as_artefact_error(file, ValueError):
-        planner = build.build_controller(
+        around = partial(
+            build.build_controller,
             settings["controller"],
             trained.model,
             trained.vehicle,
@@ -208,6 +318,7 @@ def load(
             law=trained.law,
             adaptive=adaptive,
         )
+        planner = around()
     if certificate is None:
         # 3: `_numerics` stands between this function and its caller.
         warnings.warn(f"{file}: nothing is certified; {reason}", stacklevel=3)
@@ -216,6 +327,7 @@ def load(
         **vars(trained) | {"params": params, "settings": settings},
         controller=_entrance(planner, trained),
         certificate=certificate,
+        around=around,
     )
 
 

@@ -92,15 +92,40 @@ def test_an_interrupted_run_ends_bit_identical_to_an_unbroken_one(
         train(task, tmp_path / "broken")
     monkeypatch.undo()
     model, loss, data = task
-    states = data.train.states.at[..., 3].set(jnp.nan)
-    poisoned = data._replace(train=data.train._replace(states=states))
+    poisoned = loss._replace(
+        evaluate=lambda *inputs: jax.tree.map(jnp.sqrt, (-1.0, {}, 0.0))
+    )
     with pytest.raises(TrainingStopped, match="last good checkpoint is step 20"):
-        train((model, loss, poisoned), tmp_path / "broken")
+        train((model, poisoned, data), tmp_path / "broken")
     resumed, best_again = train(task, tmp_path / "broken")
     assert saves == [20]
     assert same(weights, resumed)
     assert best == best_again
     assert [line["step"] for line in lines(tmp_path / "broken")] == [10, 20, 30, 40]
+
+
+def test_a_directory_holds_one_training_and_says_so(task, unbroken, capfd):
+    """A cell of a notebook that is run again with a change gets no old weights."""
+    directory, weights, best = unbroken
+    model, loss, data = task
+    resumed, best_again = train(task, str(directory))
+    assert same(weights, resumed)
+    assert best == best_again
+    assert "training 40 / 40  resumed, finished" in capfd.readouterr().err
+    other = data._replace(train=data.train._replace(controls=data.train.controls + 1))
+    smaller = sfkd(measure_space(data), **TINY | {"rank": TINY["rank"] - 2})
+    heavier = multi_step_loss(model, measure_space(data), one_step=2.0)
+    for changed, options, message in (
+        (task, {"seed": 4}, "key was"),
+        (task, {"learning_rate": 1e-4}, "learning_rate was 0.003, is now 0.0001"),
+        (task, {"steps": 60}, "steps was 40, is now 60"),
+        ((model, loss, other), {}, "data was"),
+        ((smaller, loss, data), {}, "parameters was"),
+        ((model, heavier, data), {}, "loss before the first step was"),
+    ):
+        with pytest.raises(ValueError, match=f"holds another training .*{message}"):
+            train(changed, directory, **options)
+    assert capfd.readouterr().err == ""
 
 
 def test_the_score_of_a_window_does_not_depend_on_the_weights(task):

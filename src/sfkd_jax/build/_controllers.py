@@ -151,6 +151,7 @@ def build_controller(
     env_source: str = "measured",
     law: control.PathLaw | None = None,
     adaptive: bool = False,
+    planner: Controller | None = None,
 ) -> Controller:
     """Return the planner of the settings with its shield and adaptation.
 
@@ -167,6 +168,8 @@ def build_controller(
             errors of its inputs while driving, and slows down while its online tube
             does not fit the lane, even if the settings do not say so; with "estimated"
             it always does.
+        planner: along a path, to be shielded in place of that of the settings. Its
+            speed is its own: there is no online tube.
 
     Raises:
         ValueError: an unknown planner, a vehicle without limits of its controls, a
@@ -181,10 +184,8 @@ def build_controller(
             "as in [-0.4,-3.0]"
         )
     limits = {"control_low": plant.control_low, "control_high": plant.control_high}
-    box = {
-        "env_low": None if env_low is None else tuple(map(float, env_low)),
-        "env_high": None if env_high is None else tuple(map(float, env_high)),
-    }
+    ends = {"env_low": env_low, "env_high": env_high}.items()
+    box = {k: None if end is None else tuple(map(float, end)) for k, end in ends}
     factory = PLANNERS[settings.planner]
     cost = control.tracking_cost(
         dt=plant.dt,
@@ -222,9 +223,9 @@ def build_controller(
         **limits,
         **arguments(settings.task, control.following_law),
     )
-    along = factory(task, **own)
+    along = planner or factory(task, **own)
     # A shield needs a certified corridor; without one the planner drives alone.
-    if certificate and certificate.get("corridor") and searches.shield:
+    if certificate and certificate.get("corridor") and (planner or searches.shield):
         along = in_corridor(along, planned, plant, law, certificate)
     if adaptive:
         # The filter relates forces to the largest one in E, which the box defines.
@@ -236,7 +237,7 @@ def build_controller(
         along = adaptation.controller()
     # Here and nowhere else observation and reference become ξ and preview.
     controller = control.along_reference(along, coordinates=law.gain.shape[-1])
-    if not adaptive:
+    if planner or not adaptive:
         return controller
     options = arguments(searches.online_tube, control.OnlineTube)
     tube = control.OnlineTube(inner=controller, horizon=searches.horizon, **options)

@@ -250,6 +250,8 @@ def certify_policy(settings: Settings) -> dict[str, Any]:
     verdict = f"refused: {document.get('reason')}"
     if document["valid"]:
         verdict = f"alpha {document['alpha']:.6f}"
+    if corridor := document.get("corridor"):
+        verdict += f"; corridor {corridor['corridor_m']:.3f} m to each side, measured"
     if d_bar := document.get("d_bar"):
         verdict += f"; d_bar {d_bar['value']:.4g} holds for {d_bar['holds_for']}"
     for line in (verdict, document.get("lyapunov", {}).get("reason")):

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import logging
+from contextlib import redirect_stderr
+from io import StringIO
 from pathlib import Path
 from typing import Any
 
@@ -83,11 +85,13 @@ class Checkpoints:
         # From the newest on: a damaged state costs the steps since the one before.
         steps = sorted(self._manager.all_steps(), reverse=True)
         for step in steps:
-            try:
-                return self.restore(step, like)
-            except Exception as reason:  # orbax raises any error of its storage
-                line = one_line(str(reason) or type(reason).__name__)
-                print_message(f"checkpoint {step} cannot be read ({line})")
+            # Every array that orbax had not read yet prints a traceback of its own.
+            with redirect_stderr(StringIO()):
+                try:
+                    return self.restore(step, like)
+                except Exception as reason:  # orbax raises any error of its storage
+                    line = one_line(str(reason) or type(reason).__name__)
+            print_message(f"checkpoint {step} cannot be read ({line})")
         if steps:
             raise OSError(
                 f"no checkpoint in {self._manager.directory} can be read; "

@@ -6,6 +6,7 @@ import json
 import math
 import time
 from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 from typing import Any, NamedTuple, TypeAlias
 
@@ -13,8 +14,8 @@ import jax
 import jax.numpy as jnp
 import optax
 
+from sfkd_jax import store
 from sfkd_jax.ranges import Positive
-from sfkd_jax.store import print_message, truncate_jsonl
 from sfkd_jax.training._checkpoints import Checkpoints
 from sfkd_jax.training._losses import Loss
 from sfkd_jax.types import Key, Model, Params, Trajectory
@@ -22,7 +23,7 @@ from sfkd_jax.types import Key, Model, Params, Trajectory
 Draw: TypeAlias = Callable[[Trajectory, Key], Trajectory]
 WARM_UP = 100
 """Steps until the largest learning rate, in all but short runs."""
-LOG = "metrics.jsonl"
+LOG, RECORD = "metrics.jsonl", "training.json"
 FINAL_RATE = 0.01
 """Last learning rate relative to the largest."""
 
@@ -46,7 +47,7 @@ def fit(
     data: Trajectory,
     held_out: Trajectory,
     key: Key,
-    directory: Path,
+    directory: str | Path,
     *,
     steps: int = 4000,
     learning_rate: Positive = 3e-3,
@@ -57,9 +58,10 @@ def fit(
 ) -> tuple[Params, int]:
     """Train and return the parameters with the lowest validation loss.
 
-    Adam with linear warm-up and cosine decay. A run that `directory` contains is
-    resumed from its last checkpoint. Batches depend on the key and the step only, so a
-    run that was interrupted, however, ends bit-identical to one that was not.
+    Adam with linear warm-up and cosine decay. This training is resumed from its last
+    checkpoint in `directory`, and another one is refused there. Batches depend on the
+    key and the step only, so a run that was interrupted, however, ends bit-identical to
+    one that was not.
 
     Args:
         model: to be trained. To train on from given parameters, a model whose `init`
@@ -69,7 +71,8 @@ def fit(
         data: the training trajectories.
         held_out: windows of the validation loss.
         key: for the initial parameters and the batches.
-        directory: for checkpoints/ and metrics.jsonl.
+        directory: for checkpoints/, metrics.jsonl, and training.json, which tells one
+            training from another.
         steps: optimiser steps.
         learning_rate: the largest.
         clip_norm: largest global gradient norm.
@@ -83,8 +86,10 @@ def fit(
 
     Raises:
         TrainingStopped: the loss or a gradient is not finite.
-        ValueError: steps or save_every are no multiples of log_every.
+        ValueError: steps or save_every are no multiples of log_every, or `directory`
+            holds a training with another key, model, loss, data or settings.
     """
+    directory = Path(directory)
     if save_every % log_every or steps % log_every:
         raise ValueError(
             "training.steps and save_every must be multiples of "
@@ -93,20 +98,31 @@ def fit(
     # Batches have a stream of their own: a resumed run draws the same ones.
     init_key, data_key = jax.random.split(key)
     transform, schedule = _optimizer(steps, learning_rate, clip_norm)
-
     # Compiled, since initialisers op by op take seconds for many small matrices.
-    @jax.jit
-    def begin(key: Key) -> TrainState:
-        params = model.init(key)
-        return TrainState(jnp.zeros((), jnp.int32), params, transform.init(params))
+    begin = jax.jit(partial(_begin, model, transform))
+    record = {
+        "key": jax.random.key_data(key).tolist(),
+        "data": store.sha256_of_arrays(data._asdict()),
+        "windows": str(jax.eval_shape(draw, data, data_key)),
+        "parameters": str(jax.eval_shape(model.init, init_key)),
+        "steps": steps,
+        "learning_rate": learning_rate,
+        "clip_norm": clip_norm,
+        "save_every": save_every,
+    }
+
+    # One number for what no hash of a function tells: loss, model, held-out data.
+    def first_loss() -> float:
+        return float(loss.validate(begin(init_key).params, held_out)[0])
 
     checkpoints, log = Checkpoints(directory / "checkpoints"), directory / LOG
     try:
+        _claim(directory, record, first_loss, checkpoints.latest_step())
         # Of a new run it is the state as it was.
         state = checkpoints.resume(begin(init_key))
         start, began = int(state.step), time.perf_counter()
         # Lines of steps after the checkpoint would be there twice.
-        truncate_jsonl(
+        store.truncate_jsonl(
             log, lambda line: line["step"] in range(start + 1), keys=("step",)
         )
         advance = _chunk(loss, transform, schedule, draw, length=log_every)
@@ -138,6 +154,43 @@ def fit(
         checkpoints.close()
 
 
+def _begin(model: Model, transform: Any, key: Key) -> TrainState:
+    """The state before the first step."""
+    params = model.init(key)
+    return TrainState(jnp.zeros((), jnp.int32), params, transform.init(params))
+
+
+def _claim(
+    directory: Path,
+    record: dict[str, Any],
+    first_loss: Callable[[], float],
+    latest: int | None,
+) -> None:
+    """Record a training beside its checkpoints, or compare it with the recorded one.
+
+    Raises:
+        ValueError: the checkpoints are those of another one.
+    """
+    path, loss = directory / RECORD, "loss before the first step"
+    if latest is None:
+        # As text: it may be no number that JSON knows.
+        store.write_json(path, record | {loss: f"{first_loss():.6g}"})
+        return
+    recorded = dict(store.read_json(path)) if path.is_file() else {}
+    before = float(recorded.pop(loss, "nan"))
+    changed = store.differences(recorded, record)
+    # Another device rounds differently.
+    if not changed and not math.isclose(before, now := first_loss(), rel_tol=1e-3):
+        changed = [f"{loss} was {before:.4g}, is now {now:.4g}"]
+    if changed:
+        raise ValueError(
+            f"{directory} holds another training ({'; '.join(changed[:3])}); "
+            "choose another directory, or remove its checkpoints"
+        )
+    finished = ", finished" if latest >= record["steps"] else ""
+    store.print_message(f"training {latest} / {record['steps']}  resumed{finished}")
+
+
 def _append(path: Path, record: dict[str, float], steps: int) -> None:
     """Append one record to the log, and print its losses when they are validated."""
     # Opened for each line: whatever ends the process, whole lines are on disk.
@@ -145,7 +198,7 @@ def _append(path: Path, record: dict[str, float], steps: int) -> None:
         file.write(json.dumps(record) + "\n")
     if "validation_loss" in record:
         losses = (f"{name} {record[name]:.3g}" for name in ("loss", "validation_loss"))
-        print_message(f"training {record['step']} / {steps}  {' '.join(losses)}")
+        store.print_message(f"training {record['step']} / {steps}  {' '.join(losses)}")
 
 
 def _optimizer(
