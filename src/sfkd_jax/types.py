@@ -224,7 +224,7 @@ class ControllerInfo(TypedDict, total=False):
     cost: Required[Scalar]  # lowest cost of all samples
     mean_cost: Required[Scalar]  # cost of the chosen plan
     effective_samples: Required[Scalar]  # 1 / Σ w²; NaN if nothing is sampled
-    healthy: Required[Bool[Array, ""]]  # False: the last finite plan is continued
+    healthy: Required[Bool[Array, ""]]  # the control is the plan of a working planner
     env_inside: Required[Bool[Array, ""]]  # whether e is in its box
     predicted_states: Required[Float[Array, "horizon state"]]  # of the chosen plan
     precision: Bool[Array, ""]  # float32 resolves these positions; else not healthy
@@ -234,6 +234,11 @@ class ControllerInfo(TypedDict, total=False):
     # along_reference
     path_state: Float[Array, " coordinate"]  # ξ; NaN where it is not known
     planned_path: Float[Array, "horizon coordinate"]  # predicted ξ of the chosen plan
+    # Gate
+    measured: Bool[Array, " coordinate"]  # which of ξ is measured, not predicted
+    dead_reckoning: Bool[Array, ""]  # some of it is predicted
+    innovation: Float[Array, " coordinate"]  # measured less predicted ξ
+    trusted: Bool[Array, ""]  # on time, and no unexplained measurement of late
     # Adaptation
     env_estimate: Float[Array, " environment"]  # the e planned with
     causes: Float[Array, " 5"]  # force, steering, drive; steering and force in turns
@@ -255,11 +260,11 @@ class ControllerInfo(TypedDict, total=False):
     perturbation: Float[Array, " control"]  # ν on top of the law, in control units
     nominal_state: Float[Array, " coordinate"]  # path coordinates of the nominal model
     nominal_distance: Scalar  # |e_y| between vehicle and nominal model [m]
-    corridor: Scalar  # certified half width [m]
+    corridor: Scalar  # bound of |e_y| at this step [m]; NaN where none holds
     feasible: Bool[Array, ""]  # margin is not negative
     bound_exceeded: Bool[Array, ""]  # nominal_distance exceeds the certified bound
     outside_box: Bool[Array, ""]  # outside the boxes of the certificate
-    dead_reckoning: Bool[Array, ""]  # observation or reference is not finite
+    braking: Bool[Array, ""]  # the planner brakes beyond the class
     shield_healthy: Bool[Array, ""]  # feasible, and the certificate applies
 
 

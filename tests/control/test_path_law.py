@@ -89,6 +89,59 @@ def test_a_law_survives_being_stored(derived):
     np.testing.assert_array_equal(again(*given), law(*given))
 
 
+def test_the_law_is_linear_near_the_path_and_continuous_beyond(derived):
+    law = derived[1]
+    given = jnp.asarray(0.01), jnp.asarray(9.0), jnp.asarray([0.42, -3.0])
+    turn = law.turn(*given)
+    random = np.random.default_rng(0)
+    xi = np.asarray(turn.state) + random.uniform(-1, 1, (300, turn.state.size)) * 0.1
+    xi[:, :2] += random.uniform(-1, 1, (300, 2)) * (0.4, 0.15)
+    linear = jax.vmap(lambda xi: turn.control - turn.gain @ (xi - turn.state))
+    np.testing.assert_array_equal(jax.vmap(turn.feedback)(xi), linear(xi))
+    # Along lines out to 20 m no step is larger than its slope allows. Only where the
+    # car may turn either way, with its back to where it has to go, there is a jump.
+    ends = np.tile(np.asarray(turn.state), (40, 1))
+    ends[:, :3] += random.uniform(-1, 1, (40, 3)) * (20.0, 1.5, 4.0)
+    shares = np.linspace(0.0, 1.0, 4001)[:, None, None]
+    along = turn.state + shares * (ends - turn.state)
+    controls = np.asarray(jax.vmap(jax.vmap(turn.feedback))(jnp.asarray(along)))
+    assert np.all(np.isfinite(controls))
+    assert np.max(np.abs(np.diff(controls, axis=0))) < 0.05
+
+
+@pytest.mark.parametrize("name", PLANTS)
+def test_from_far_away_the_shipped_law_comes_back(name):
+    """Up to 20 m away, heading anywhere, on ice and in wind: within 20 s, on a curve."""
+    policy_of = policy.restore(SHIPPED / f"{name}_path")
+    plant, law = policy_of.vehicle, policy_of.law
+    loop = plants.along_path(plant, law)
+    random, count = np.random.default_rng(1), 60
+    xi = np.zeros((count, law.state.shape[-1]), np.float32)
+    xi[:, :3] = random.uniform((-20, -np.pi, 4), (20, np.pi, 12), (count, 3))
+    env = random.uniform((0.3, -8), (0.9, 8), (count, 2)).astype(np.float32)
+    bend = random.uniform(-0.02, 0.02, count).astype(np.float32)
+
+    def last_second(xi, env, curvature):
+        inputs = jnp.stack([0.0, 0.0, curvature, 9.0])
+        step = lambda x, _: (loop.step(x, inputs, env), x[BODY][:2])
+        return jax.lax.scan(step, path_state(xi), length=210)[1][-10:]
+
+    ends = np.asarray(jit(jax.vmap(last_second))(xi, env, bend))
+    assert np.max(np.abs(ends[..., 0])) < 0.3
+    assert np.max(np.abs(np.sin(0.5 * ends[..., 1]))) < 0.15
+
+
+def test_the_law_brakes_to_a_standstill_and_stays_there():
+    policy_of = policy.restore(SHIPPED / "dynamic_path")
+    loop = plants.along_path(policy_of.vehicle, policy_of.law)
+    inputs, env = jnp.zeros(4), jnp.asarray([0.5, 4.0])
+    start = path_state(jnp.zeros(6).at[0].set(0.1).at[2].set(8.0))
+    step = lambda x, _: (loop.step(x, inputs, env), x[BODY])
+    track = np.asarray(jit(lambda x: jax.lax.scan(step, x, length=300)[1])(start))
+    assert np.max(np.abs(track[:, 0])) < 0.2
+    assert np.max(np.abs(track[100:, 2])) < 1e-3
+
+
 @pytest.mark.exhaustive
 @pytest.mark.parametrize("name", PLANTS)
 def test_a_law_derived_again_is_that_of_the_shipped_policy(name):

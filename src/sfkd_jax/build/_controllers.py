@@ -5,8 +5,10 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
+import numpy as np
+
 from sfkd_jax import control, plants
-from sfkd_jax.geometry import LATERAL
+from sfkd_jax.geometry import HEADING, LATERAL, PATH_SPEED
 from sfkd_jax.rollout import with_offset
 from sfkd_jax.settings import Values, arguments, choose, parse, schema, takes
 from sfkd_jax.types import Controller, Model
@@ -16,6 +18,10 @@ ENV_SOURCES = ("measured", "estimated", "none")
 ROAD_MARGIN = 0.05
 """Relative enlargement of the box of κ and v_ref, since the curvature of a reference is
 computed from its points.
+"""
+STATE_MARGIN = 0.25
+"""Relative enlargement of the box of ξ: the runs on which a corridor is calibrated
+leave the box of the data as well.
 """
 ALLOWANCE = 3.0
 """Standard deviations of a measured position by which the tube is enlarged."""
@@ -37,6 +43,7 @@ QUADRATIC = ("koopman_mpc",)
 _DECIDED = (
     *("dt", "wheelbase", "speed_loop", "control_low", "control_high"),
     *("env_low", "env_high", "estimate_env", "inner", "model", "law", "unroll"),
+    *("conditions", "reads_env"),
 )
 """Arguments of controllers that vehicle, environment and model decide, and those for
 programs that build their own.
@@ -99,6 +106,7 @@ class SearchSettings(ControllerSettings):
     adaptive: bool = False
     feedback: Any = None
     model_law: Any = None
+    gate: Any = None
     adaptation: Any = None
     online_tube: Any = None
 
@@ -116,6 +124,7 @@ def _controller_schema(planner: str) -> type[ControllerSettings]:
         factories |= {
             "feedback": control.path_feedback,
             "model_law": control.ModelLaw,
+            "gate": control.Gate,
             "adaptation": control.Adaptation,
             "online_tube": control.OnlineTube,
         }
@@ -235,8 +244,20 @@ def build_controller(
         options = arguments(searches.adaptation, control.Adaptation)
         adaptation = control.Adaptation(**around, estimate_env=estimates, **options)
         along = adaptation.controller()
+    gate = control.Gate(
+        inner=along,
+        model=model,
+        law=law,
+        dt=plant.dt,
+        horizon=searches.horizon,
+        conditions=_conditions(law, certificate, env_low, env_high),
+        reads_env=not estimates,
+        **arguments(searches.gate, control.Gate),
+    )
     # Here and nowhere else observation and reference become ξ and preview.
-    controller = control.along_reference(along, coordinates=law.gain.shape[-1])
+    controller = control.along_reference(
+        gate.controller(), coordinates=law.gain.shape[-1]
+    )
     if planner or not adaptive:
         return controller
     options = arguments(searches.online_tube, control.OnlineTube)
@@ -276,9 +297,6 @@ def in_corridor(
 ) -> Controller:
     """Return the planner with a shield that keeps the corridor of a certificate.
 
-    Outside the boxes of ξ, e, κ and v_ref the law acts alone. The box of e_y contains
-    the corridor, since the claim holds there, whether or not the data reach that far.
-
     Args:
         planner: any controller along a path, see `control.along_reference`.
         model: in path coordinates.
@@ -286,18 +304,10 @@ def in_corridor(
         law: around which the model was learned.
         certificate: with a corridor.
     """
-    corridor, boxes = certificate["corridor"], certificate["boxes"]
-    bounds, sensors = corridor["bounds"], corridor["conditions"]["sensor_noise"]
-    # [2:] are κ and v_ref; ν has its limits in the law.
-    low = tuple(edge - ROAD_MARGIN * abs(edge) for edge in boxes["control"][0][2:])
-    high = tuple(edge + ROAD_MARGIN * abs(edge) for edge in boxes["control"][1][2:])
-    # The larger entry of a position: which one is lateral depends on the road.
-    allowance = ALLOWANCE * max(sensors[:2], default=0.0)
-    edge = corridor["corridor_m"] + allowance
-    state_low, state_high = (list(side) for side in boxes["state"])
-    state_low[LATERAL] = min(state_low[LATERAL], -edge)
-    state_high[LATERAL] = max(state_high[LATERAL], edge)
-    env_low, env_high = map(tuple, boxes["env"])
+    corridor = certificate["corridor"]
+    bounds, sensors = corridor["bounds"], _sensors(corridor)
+    # What the heading's noise moves the car sideways until the law has turned it back.
+    ratio = float(np.max(law.gain[..., 0, HEADING] / law.gain[..., 0, LATERAL]))
     return control.Shield(
         inner=planner,
         model=model,
@@ -305,11 +315,59 @@ def in_corridor(
         width=bounds["nominal"],
         tube=bounds["vehicle_to_nominal_position"],
         horizon=corridor["shield_horizon"],
-        noise_allowance=allowance,
+        noise_allowance=ALLOWANCE * sensors[LATERAL],
+        start_error=ALLOWANCE * (sensors[LATERAL] + ratio * sensors[HEADING]),
+        decay=certificate["alpha"],
         control=(plant.control_low, plant.control_high),
-        conditions=control.Conditions(
-            env=(env_low, env_high),
-            state=(tuple(state_low), tuple(state_high)),
-            road=(low, high),
-        ),
+        conditions=_conditions(law, certificate),
     ).controller()
+
+
+def _sensors(corridor: Mapping[str, Any]) -> tuple[float, float]:
+    """Standard deviations of the measured e_y [m] and e_ψ [rad]."""
+    noise = (*corridor["conditions"]["sensor_noise"], 0.0, 0.0, 0.0)
+    # The larger entry of a position: which one is lateral depends on the road.
+    return max(noise[:2]), noise[2]
+
+
+def _conditions(
+    law: control.PathLaw,
+    certificate: Mapping[str, Any] | None,
+    env_low: Corner = None,
+    env_high: Corner = None,
+) -> control.Conditions:
+    """Where the model predicts: the box of a certificate, or that of the law.
+
+    The box of e_y contains the corridor, since the claim holds there, whether or not
+    the data reach that far. The other boxes are those of the data, somewhat enlarged:
+    the runs on which a corridor is calibrated leave them as well.
+    """
+    size = law.gain.shape[-1]
+    if certificate:
+        corridor, boxes = certificate.get("corridor"), certificate["boxes"]
+        low, high = (np.asarray(side, float) for side in boxes["state"])
+        margin = STATE_MARGIN * (high - low)
+        edge = 0.0
+        if corridor:
+            edge = corridor["corridor_m"] + ALLOWANCE * _sensors(corridor)[LATERAL]
+        margin[LATERAL] = 0.0
+        low, high = low - margin, high + margin
+        low[LATERAL] = min(low[LATERAL], -edge)
+        high[LATERAL] = max(high[LATERAL], edge)
+        env, road = boxes["env"], np.asarray(boxes["control"], float)[:, 2:]
+        # [2:] are κ and v_ref; ν has its limits in the law.
+        road = road + ROAD_MARGIN * np.abs(road) * np.asarray([[-1.0], [1.0]])
+        return control.Conditions(
+            env=_box(*env), state=_box(low, high), road=_box(*road)
+        )
+    wide = np.full(size, np.inf)
+    wide[[LATERAL, HEADING]] = control.NEAR
+    low, high = -wide, wide
+    low[PATH_SPEED], high[PATH_SPEED] = law.low[1] - 1.0, law.high[1] + 1.0
+    env = None if env_low is None or env_high is None else _box(env_low, env_high)
+    return control.Conditions(env=env, state=_box(low, high))
+
+
+def _box(low: Any, high: Any) -> control.Box:
+    """Limits as plain numbers."""
+    return tuple(map(float, low)), tuple(map(float, high))

@@ -10,6 +10,7 @@ from sfkd_jax.control.laws._feedback import path_feedback as path_feedback
 from sfkd_jax.control.laws._path_law import PathLaw as PathLaw
 from sfkd_jax.control.laws._path_law import derive_path_law as derive_path_law
 from sfkd_jax.control.laws._path_law import law_from_arrays as law_from_arrays
+from sfkd_jax.control.laws._steady_turn import NEAR as NEAR
 from sfkd_jax.control.planners._cem import cem as cem
 from sfkd_jax.control.planners._gradient import gradient_planner as gradient_planner
 from sfkd_jax.control.planners._koopman_mpc import koopman_mpc as koopman_mpc
@@ -34,8 +35,10 @@ from sfkd_jax.control.tasks._task import StepResult as StepResult
 from sfkd_jax.control.tasks._task import Task as Task
 from sfkd_jax.control.wrappers._adaptation import Adaptation as Adaptation
 from sfkd_jax.control.wrappers._delay import delay_compensated as delay_compensated
+from sfkd_jax.control.wrappers._gate import Box as Box
+from sfkd_jax.control.wrappers._gate import Conditions as Conditions
+from sfkd_jax.control.wrappers._gate import Gate as Gate
 from sfkd_jax.control.wrappers._guard import FILTER_SCALES as FILTER_SCALES
-from sfkd_jax.control.wrappers._guard import Conditions as Conditions
 from sfkd_jax.control.wrappers._guard import Shield as Shield
 from sfkd_jax.control.wrappers._guard import safety_filter as safety_filter
 from sfkd_jax.control.wrappers._online_tube import OnlineTube as OnlineTube

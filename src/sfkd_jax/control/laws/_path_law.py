@@ -64,22 +64,39 @@ class PathLaw(NamedTuple):
 
         Args:
             curvature: κ [1/m].
-            speed: reference speed [m/s]; it is also the speed of the steady turn.
+            speed: reference speed [m/s], also that of the steady turn; below 0 it
+                counts as 0, since the tables are about driving forward.
             env: e.
         """
-        # Over v² κ: the limit of the tyres is the same at every speed of the table.
-        at = jnp.concatenate([jnp.stack([curvature * speed**2, speed]), env])
+        speed, sharpest = jnp.maximum(speed, 0.0), self.high[0]
         counts = self.control.shape[:-1]
-        rows, weights = _corners(at, self.low, self.high, counts)
 
-        def interpolate(table: Array) -> Array:
-            corners = table.reshape(-1, *table.shape[len(counts) :])[rows]
-            return jnp.tensordot(weights, corners, axes=1)
+        def interpolate(acceleration: Scalar, *tables: Array) -> list[Array]:
+            # Over v² κ: the limit of the tyres is the same at every speed of the table.
+            at = jnp.concatenate([jnp.stack([acceleration, speed]), env])
+            rows, weights = _corners(at, self.low, self.high, counts)
+            corners = (
+                table.reshape(-1, *table.shape[len(counts) :])[rows] for table in tables
+            )
+            return [jnp.tensordot(weights, corner, axes=1) for corner in corners]
 
-        state, control, gain = (
-            interpolate(table) for table in (self.state, self.control, self.gain)
+        state, control, gain = interpolate(
+            curvature * speed**2, self.state, self.control, self.gain
         )
-        return SteadyTurn(state.at[PATH_SPEED].set(speed), control, gain)
+        # Below the table less drive keeps the speed, and at rest none.
+        share = jnp.clip(speed / self.low[1], 0.0, 1.0)
+        control = control.at[1].multiply(share)
+        left, right = (
+            interpolate(side * sharpest, self.control)[0][0] for side in (1.0, -1.0)
+        )
+        tabled = jnp.clip(speed, self.low[1], self.high[1])
+        slope = 0.5 * (left - right) * tabled**2 / sharpest
+        return SteadyTurn(
+            state.at[PATH_SPEED].set(speed),
+            control,
+            gain,
+            grip=jnp.stack([slope, sharpest]),
+        )
 
     def __call__(
         self, coordinates: PathState, curvature: Scalar, speed: Scalar, env: Environment

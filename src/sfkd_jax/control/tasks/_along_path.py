@@ -56,10 +56,17 @@ class Preview(NamedTuple):
             finite.
         repeated: whether the observation is bit for bit the last one, as of a sensor
             that freezes.
+        measured: which entries of ξ are measured; behind a `Gate` the others are
+            predicted.
+        on_time: whether the last call was one period ago.
+        trusted: whether the certificate may be claimed, see `Gate`.
     """
 
     road: Float[Array, "horizon 2"]
     repeated: Bool[Array, ""]
+    measured: Bool[Array, " coordinate"]
+    on_time: Bool[Array, ""]
+    trusted: Bool[Array, ""]
 
 
 class AlongReferenceState(NamedTuple):
@@ -116,14 +123,17 @@ class AlongReference:
         readable = all_finite(reference)
         road = jnp.where(readable, road, jnp.nan)
         xi = jnp.where(readable & all_finite(observation), xi, jnp.nan)
-        preview = Preview(road, jnp.all(observation == state.observation))
+        repeated = jnp.all(observation == state.observation)
+        preview = Preview(
+            road, repeated, jnp.isfinite(xi), on_time=jnp.asarray(True), trusted=precise
+        )
         control, inner, info = self.inner.act(params, state.inner, xi, env, preview)
         planned = info["predicted_states"]
-        info = info.copy()
-        info["path_state"], info["planned_path"] = xi, planned
+        # A gate has already said which of ξ is believed.
+        info: Any = {"path_state": xi, **info, "planned_path": planned}
         info["precision"] = precise
-        for flag in {"healthy", "shield_healthy"} & info.keys():
-            info[flag] &= precise
+        if "healthy" in info:
+            info["healthy"] &= precise
         info["predicted_states"] = jax.vmap(_in_world)(planned, reference)
         return control, AlongReferenceState(inner, observation), info
 

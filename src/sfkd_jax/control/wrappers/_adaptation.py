@@ -28,7 +28,6 @@ from sfkd_jax.control.wrappers._estimator import (
 )
 from sfkd_jax.geometry import LATERAL, PATH_SPEED, PathState, path_state
 from sfkd_jax.ranges import (
-    AtLeastOne,
     AtLeastTwo,
     Fraction,
     Interval,
@@ -118,9 +117,6 @@ class Adaptation:
             ignored.
         model_error: standard deviation of one step of the model, per entry of ξ;
             further entries are ignored.
-        patience: number of steps without a usable measurement that are bridged by the
-            estimate; after them the controller receives the observation as it is.
-            `healthy` is False in either case.
 
     Raises:
         ValueError: a setting is out of its range or has the wrong number of entries.
@@ -147,7 +143,6 @@ class Adaptation:
     dwell: Annotated[float, Interval("(1, inf)")] = 30.0
     sensor_noise: tuple[float, ...] = (0.015, 0.015, 0.002, 0.03, 0.02, 0.002, 0.001)
     model_error: tuple[Positive, ...] = (1e-3, 3e-4, 3e-3, 3e-3, 1.5e-3, 5e-4)
-    patience: AtLeastOne = 5
 
     def __post_init__(self) -> None:
         low, high = self.env_low, self.env_high
@@ -196,7 +191,6 @@ class Adaptation:
             ),
             applied=Applied(jnp.zeros(2), unknown, jnp.array(unknown)),
             started=jnp.asarray(False),
-            missing=jnp.zeros((), dtype=jnp.int32),
             scores=jnp.zeros(2),
         )
         return AdaptiveState(self.inner.init(key), belief)
@@ -216,8 +210,9 @@ class Adaptation:
         clean = all_finite((coordinates, preview.road))
         clean &= self.estimate_env | all_finite(env)
         env, road = self._known_environment(before, env), preview.road[0]
-        # A sensor that freezes repeats itself bit for bit: nothing is learned from it.
-        usable = all_finite((coordinates, env, preview.road)) & ~preview.repeated
+        # Nothing is learned from what the gate did not believe, nor at another rate.
+        usable = jnp.all(preview.measured) & preview.on_time
+        usable &= all_finite((coordinates, env, preview.road))
         belief, rejected = estimator.follow(params, before, coordinates, usable)
         adapting = belief.scores[0] <= TOLERANCE * belief.scores[1]
         # Causes that predict worse than none are not used, unless e depends on them.
@@ -231,12 +226,8 @@ class Adaptation:
         inside, excess = loop.split_force(env, side_force(causes, road))
         estimate = belief.bank.mean()[:size]
         offset = _compensation(loop, params, inside, road, estimate, excess)
-        # A short gap is bridged by the estimate; a long one is left to the guard.
-        bridged = (belief.missing > 0) & (belief.missing <= self.patience)
-        bridged &= belief.started & all_finite((estimate, preview.road))
-        seen = jnp.where(bridged, estimate, coordinates)
         control, inner, info = self.inner.act(
-            offset, state.inner, seen, inside, preview
+            offset, state.inner, coordinates, inside, preview
         )
         correction = offset.inputs[:2] - input_error(causes, road)
         control = control + jnp.where(jnp.isfinite(correction), correction, 0.0)

@@ -13,7 +13,7 @@ from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Bool, Float, Int
+from jaxtyping import Array, Bool, Float
 
 from sfkd_jax.control.laws._path_law import PathLaw
 from sfkd_jax.control.planners._planner import all_finite
@@ -278,7 +278,6 @@ class Belief(NamedTuple):
         bank: of (ξ, causes).
         applied: what acted on the vehicle since the last step.
         started: whether ξ was ever measured.
-        missing: number of consecutive measurements that were not usable.
         scores: squared normalised errors of one-step predictions, with the causes and
             without, averaged over the last seconds.
     """
@@ -286,7 +285,6 @@ class Belief(NamedTuple):
     bank: Bank
     applied: Applied
     started: Bool[Array, ""]
-    missing: Int[Array, ""]
     scores: Float[Array, " 2"]
 
 
@@ -326,7 +324,7 @@ class Estimator:
             params: of the model, folded.
             belief: before.
             measured: ξ at the end of the step, may be not finite.
-            usable: whether it is finite and not a repetition of the last one.
+            usable: whether it is measured, see `Gate`.
         """
         size = measured.shape[0]
         expected = self._advanced(params, belief)
@@ -348,7 +346,6 @@ class Estimator:
         belief = belief._replace(
             bank=bank,
             started=belief.started | usable,
-            missing=jnp.where(usable, 0, belief.missing + 1),
             scores=jnp.where(learned & all_finite(scores), scores, belief.scores),
         )
         return belief, ~learned

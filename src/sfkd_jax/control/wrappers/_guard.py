@@ -1,15 +1,16 @@
 """The guard of a planner along a path: nominal model, safety filter, and their flags.
 
 Everything that decides whether the planner's control may pass is here. In one control
-step (`Shield.act`) the measurement is compared with the nominal model
-(`Shield._compare`), the request is filtered (`safety_filter`), and both are reported.
+step (`Shield.act`) the measurement, which passed the `Gate`, is compared with the
+nominal model (`Shield._compare`), the request is filtered (`safety_filter`), and both
+are reported.
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import partial
-from typing import Any, NamedTuple, TypeAlias
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -18,8 +19,15 @@ from jaxtyping import Array, Bool, Float
 from sfkd_jax.control.laws._path_law import PathLaw
 from sfkd_jax.control.planners._planner import all_finite
 from sfkd_jax.control.tasks._along_path import Preview
-from sfkd_jax.geometry import LATERAL, PathState, is_valid, path_state
-from sfkd_jax.ranges import AtLeastOne, NonNegative, Positive, check_intervals
+from sfkd_jax.control.wrappers._gate import ANYWHERE, Box, Conditions
+from sfkd_jax.geometry import LATERAL, PathState, path_state
+from sfkd_jax.ranges import (
+    AtLeastOne,
+    Fraction,
+    NonNegative,
+    Positive,
+    check_intervals,
+)
 from sfkd_jax.rollout import fold
 from sfkd_jax.types import (
     BODY,
@@ -35,8 +43,6 @@ from sfkd_jax.types import (
     Scalar,
 )
 
-Box: TypeAlias = tuple[tuple[float, ...], tuple[float, ...]]
-"""Lower and upper limits."""
 FILTER_SCALES = (1.0, 0.875, 0.75, 0.625, 0.5, 0.375, 0.25, 0.125, 0.0)
 """Scales of a request that are tried, largest first; 0 is the law alone."""
 
@@ -129,51 +135,23 @@ def safety_filter(
     )
 
 
-@dataclass(frozen=True, kw_only=True)
-class Conditions:
-    """Where a certificate applies; None: no limit.
-
-    Attributes:
-        env: box of e.
-        state: box of ξ.
-        road: box of (κ, v_ref).
-    """
-
-    env: Box | None = None
-    state: Box | None = None
-    road: Box | None = None
-
-    def nearest(self, env: Environment) -> Environment:
-        """Return e, clipped to its box."""
-        return env if self.env is None else jnp.clip(env, *map(jnp.asarray, self.env))
-
-    def hold(self, xi: PathState, road: Float[Array, " 2"]) -> Bool[Array, ""]:
-        """Whether ξ, κ and v_ref are inside; False for NaN."""
-        inside = is_valid(xi[LATERAL], road[0])
-        for box, point in ((self.state, xi), (self.road, road)):
-            if box is not None:
-                low, high = map(jnp.asarray, box)
-                inside &= jnp.all((low <= point) & (point <= high))
-        return inside
-
-
 class ShieldState(NamedTuple):
     """The wrapped controller and the nominal model between two control steps.
 
     Attributes:
         inner: state of the wrapped controller.
         latent: of the nominal model, in the fibre of `env`; 0 before the start.
-        started: whether the nominal model is running.
-        env: the last finite environment, clipped to its box; NaN before the first one.
-        road: κ [1/m] and v_ref [m/s] over the next steps of the last finite reference;
-            NaN before the first one.
+        started: whether the nominal model is running and the loop was closed around the
+            vehicle since; otherwise it starts anew at the next measurement.
+        env: that of the last step, clipped to its box; NaN before the first one.
+        offset: what the start adds to the bound of |e_y − ê_y| [m].
     """
 
     inner: Any
     latent: Latent
     started: Bool[Array, ""]
     env: Environment
-    road: Float[Array, "preview 2"]
+    offset: Scalar
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -182,30 +160,33 @@ class Shield:
 
         ν = u − law(ξ; κ_0, v_0, e),   ν' = safety_filter(ν)
         u' = clip(law(ξ; κ_0, v_0, e) + ν'),   ẑ⁺ = F(ẑ; (ν', κ_0, v_0), e)
-        |ê_y| ≤ width,   |e_y| ≤ width + tube
+        |ê_y| ≤ width,   |e_y| ≤ width + tube + offset,   offset⁺ = decay · offset
 
     ẑ is the nominal model, driven with the vehicle's own inputs, without correction.
     `tube` is a certified bound of |e_y − ê_y|; `safety_filter` chooses ν'. A control
     whose request passes unchanged is returned bit for bit. Slew limits of the actuators
-    are not considered.
+    are not considered. It belongs behind a `Gate`, which repairs what is not finite.
 
-    - ξ or preview not finite: ξ is that of the nominal model (`dead_reckoning`). The
-      certificate does not apply, since the loop is not closed around the vehicle.
-      Without a preview the last one moves on. Environment not finite: the last finite
-      one is used.
-    - Before the first step at which all three were finite there is no nominal model.
-      The control of the wrapped controller passes, clipped, or 0 if it is not finite.
-    - Outside the conditions, or where the law is not finite: `outside_box`. The
-      certificate does not apply, and the law drives alone; e is clipped to its box.
-    - |e_y − ê_y| > tube + noise_allowance: `bound_exceeded`. The bound does not hold
-      for this vehicle, and the nominal model starts anew at the measurement.
+    - A planner that is not healthy, or whose control is not finite: the law alone.
+    - Outside the conditions: `outside_box`. The certificate does not apply, and the law
+      drives alone, back to the path.
+    - A drive below that of the law by more than its perturbation: `braking`. It passes,
+      everywhere; the steering stays filtered. The certificate does not apply.
+    - |e_y − ê_y| > tube + offset + noise_allowance: `bound_exceeded`. The bound does
+      not hold for this vehicle.
+    - After any of these, and after steps that the gate did not measure or trust, the
+      nominal model starts anew at the next measurement, with `offset` = start_error for
+      the noise in it.
+    - Before the first measurement there is no nominal model. The control of the wrapped
+      controller passes, clipped, or 0 if it is not finite.
 
     `info` gains `margin` [m], `intervention` (1 − s, of the request clipped to the
     law's perturbation; 0 if it passed, 1 outside the box or if steered back),
     `perturbation` ν', `nominal_state` (its ξ), `nominal_distance` |e_y − ê_y| [m] (NaN
-    without comparison), `corridor` = width + tube [m], `feasible`, `bound_exceeded`,
-    `outside_box`, `dead_reckoning`, `env_inside`, and `shield_healthy`: feasible, and
-    the certificate applies at this step.
+    without comparison), `feasible`, `bound_exceeded`, `outside_box`, `braking`,
+    `env_inside`, `corridor` (the bound of |e_y| at this step [m]; NaN where none
+    holds), `shield_healthy` (there is one), and `healthy` is False unless the control
+    is the plan of a healthy planner inside the corridor.
 
     Attributes:
         inner: any controller along a path; its control is u.
@@ -217,6 +198,8 @@ class Shield:
         horizon: number of steps over which the law alone is predicted; beyond the
             preview, its last curvature and speed are used.
         noise_allowance: error of a measured e_y that is added to the tube [m].
+        start_error: `offset` of a nominal model that starts at a measurement [m].
+        decay: of `offset` per step, the certified rate.
         conditions: where the certificate applies.
 
     Raises:
@@ -233,7 +216,9 @@ class Shield:
     control: Box
     horizon: AtLeastOne = 20
     noise_allowance: NonNegative = 0.0
-    conditions: Conditions = Conditions()
+    start_error: NonNegative = 0.0
+    decay: Fraction = 0.9
+    conditions: Conditions = ANYWHERE
 
     def __post_init__(self) -> None:
         if not self.model.along_path:
@@ -272,7 +257,7 @@ class Shield:
             latent=jax.tree.map(lambda leaf: jnp.zeros(leaf.shape, leaf.dtype), latent),
             started=jnp.asarray(False),
             env=jnp.full(environments, jnp.nan, dtype=float),
-            road=jnp.full((self.horizon, 2), jnp.nan, dtype=float),
+            offset=jnp.zeros(()),
         )
 
     def act(
@@ -291,41 +276,58 @@ class Shield:
         now, fiber, law_control, flags = self._compare(
             params, state._replace(inner=inner), coordinates, env, preview
         )
-        finite = all_finite(planned)
-        planned = jnp.clip(jnp.where(finite, planned, 0.0), low, high)
+        # A plan that continues an old one is worse than the law, which sees the car.
+        usable = all_finite(planned) & info.get("healthy", True)
+        planned = jnp.clip(jnp.where(all_finite(planned), planned, 0.0), low, high)
         request = _request(planned, law_control, low, high)
-        request = jnp.where(finite, request, 0.0)
+        request = jnp.where(usable, request, 0.0)
         # Outside the box no request is admissible: the law drives alone.
         limit = jnp.where(flags["outside_box"], 0.0, self.law.perturbation)
+        road = self._road(preview)
         chosen = safety_filter(
-            self.model, fiber, now.latent, request, now.road, limit, width=self.width
+            self.model, fiber, now.latent, request, road, limit, width=self.width
         )
         # A request that passes is returned bit for bit, not as law + (u − law).
         filtered = jnp.clip(law_control + chosen.nu, low, high)
-        changed = ~finite | jnp.any(chosen.nu != request)
-        applicable = now.started & all_finite(law_control)
-        control = jnp.where(applicable & changed, filtered, planned)
+        changed = ~usable | jnp.any(chosen.nu != request)
+        control = jnp.where(now.started & changed, filtered, planned)
+        # Whoever brakes knows of something that no certificate does.
+        gentlest = jnp.clip(law_control, low, high) - self.law.perturbation
+        braking = usable & now.started & (planned[1] < gentlest[1] - 1e-3)
+        control = control.at[1].set(jnp.where(braking, planned[1], control[1]))
 
-        # A latent that is not finite would stay so: the nominal model starts anew.
-        running = now.started & all_finite(chosen.latent)
-        latent = jax.tree.map(partial(jnp.where, running), chosen.latent, now.latent)
         cut = jnp.where(flags["outside_box"], 1.0, 1.0 - chosen.scale)
         feasible = now.started & chosen.feasible
-        invalid = flags["bound_exceeded"] | flags["outside_box"]
-        invalid |= flags["dead_reckoning"] | ~flags["env_inside"]
+        applies = now.started & ~(flags["outside_box"] | flags["bound_exceeded"])
+        applies &= ~braking & flags["env_inside"] & preview.trusted
+        applies &= jnp.all(preview.measured)
+        holds = applies & feasible
+        intervention = jnp.where(now.started & jnp.any(chosen.nu != request), cut, 0.0)
+        corridor = self.width + self.tube + now.offset
         report: Any = {
             **info,
             **flags,
             "margin": jnp.where(now.started, chosen.margin, jnp.nan),
-            "intervention": jnp.where(
-                now.started & jnp.any(chosen.nu != request), cut, 0.0
-            ),
+            "intervention": intervention,
             "perturbation": chosen.nu,
-            "corridor": jnp.asarray(self.width + self.tube, dtype=float),
+            "braking": braking,
             "feasible": feasible,
-            "shield_healthy": feasible & ~invalid,
+            "corridor": jnp.where(holds, corridor, jnp.nan),
+            "shield_healthy": holds,
+            "healthy": usable & holds & (intervention == 0.0),
         }
-        return control, now._replace(latent=latent, started=running), report
+        # A latent that is not finite would stay so: the nominal model starts anew.
+        running = applies & all_finite(chosen.latent)
+        latent = jax.tree.map(partial(jnp.where, running), chosen.latent, now.latent)
+        after = now._replace(
+            latent=latent, started=running, offset=self.decay * now.offset
+        )
+        return control, after, report
+
+    def _road(self, preview: Preview) -> Float[Array, "preview 2"]:
+        """κ and v_ref over the horizon of the filter."""
+        last = preview.road.shape[0] - 1
+        return preview.road[jnp.minimum(jnp.arange(self.horizon), last)]
 
     def _compare(
         self,
@@ -338,17 +340,11 @@ class Shield:
         """Compare the nominal model with a measurement, and evaluate the law.
 
         Returns:
-            The nominal model in the fibre of the current environment, moved to the
-            measurement if necessary; the fibre; the law's control at the measurement
-            or, without one, at the nominal ξ; entries of `info`.
+            The nominal model in the fibre of the current environment, at the measured
+            ξ if it starts anew; the fibre; the law's control; entries of `info`.
         """
-        model = self.model
-        last_env = jnp.where(all_finite(env), env, before.env)
-        inside = self.conditions.nearest(last_env)
-        readable = all_finite(preview.road)
-        ahead = jnp.minimum(jnp.arange(self.horizon), preview.road.shape[0] - 1)
-        moved_on = jnp.concatenate([before.road[1:], before.road[-1:]])
-        road = jnp.where(readable, preview.road[ahead], moved_on)
+        model, road = self.model, preview.road[0]
+        inside = self.conditions.nearest(env)
         folded = fold(model, params)
         fiber = model.fiber(folded, inside)
 
@@ -360,32 +356,29 @@ class Shield:
             jnp.all(inside == before.env), lambda: before.latent, switched
         )
         anchor = model.encode(fiber, path_state(coordinates))
-        # Every finite measurement is believed; a gate would belong here.
-        believed = readable & all_finite((coordinates, anchor))
+        law_control = self.law(coordinates, road[0], road[1], inside)
+        readable = all_finite((anchor, law_control))
+        compared = before.started & preview.measured[LATERAL]
         distance = jnp.abs(coordinates - model.decode(fiber, latent)[BODY])[LATERAL]
-        compared = believed & before.started
-        exceeded = compared & ~(distance <= self.tube + self.noise_allowance)
+        allowed = self.tube + self.noise_allowance + before.offset
+        exceeded = compared & ~(distance <= allowed)
         # The bound does not hold for this vehicle: what follows is about a nominal
         # model that starts at the vehicle.
-        moved = believed & (~before.started | exceeded)
+        moved = ~before.started | exceeded
         latent = jax.tree.map(partial(jnp.where, moved), anchor, latent)
-        started = before.started | believed
-
-        nominal_xi = model.decode(fiber, latent)[BODY]
-        # Without a measurement the loop is closed around the nominal model.
-        xi = jnp.where(believed, coordinates, nominal_xi)
-        law_control = self.law(xi, road[0, 0], road[0, 1], inside)
-        covered = all_finite(law_control) & jnp.all(inside == last_env)
-        covered &= self.conditions.hold(xi, road[0])
+        started = readable & all_finite(latent)
+        covered = self.conditions.hold(coordinates, road) & jnp.all(inside == env)
         flags = {
-            "nominal_state": jnp.where(started, nominal_xi, jnp.nan),
+            "nominal_state": jnp.where(
+                started, model.decode(fiber, latent)[BODY], jnp.nan
+            ),
             "nominal_distance": jnp.where(compared, distance, jnp.nan),
             "bound_exceeded": exceeded,
             "outside_box": started & ~covered,
-            "dead_reckoning": started & ~believed,
             "env_inside": jnp.all(inside == env),
         }
-        now = ShieldState(before.inner, latent, started, inside, road)
+        offset = jnp.where(moved, self.start_error, before.offset)
+        now = ShieldState(before.inner, latent, started, inside, offset)
         return now, fiber, law_control, flags
 
 

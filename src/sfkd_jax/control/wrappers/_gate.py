@@ -1,0 +1,293 @@
+"""The gate of the measurements along a path: what one step cannot explain is not used.
+
+One gate for all layers behind it: estimator, shield and planner receive a state, an
+environment and a road that are finite, and which coordinates were measured.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any, NamedTuple, TypeAlias
+
+import jax.numpy as jnp
+from jaxtyping import Array, Bool, Float, Int
+
+from sfkd_jax.control.laws._path_law import PathLaw
+from sfkd_jax.control.planners._planner import all_finite
+from sfkd_jax.control.tasks._along_path import Preview
+from sfkd_jax.geometry import (
+    HEADING,
+    LATERAL,
+    PATH_SPEED,
+    PathState,
+    is_valid,
+    path_state,
+    wrap_angle,
+)
+from sfkd_jax.ranges import AtLeastOne, Fraction, Positive, check_intervals
+from sfkd_jax.rollout import fold
+from sfkd_jax.types import (
+    BODY,
+    Control,
+    Controller,
+    ControllerInfo,
+    Environment,
+    Key,
+    Model,
+    Params,
+    Scalar,
+)
+
+Box: TypeAlias = tuple[tuple[float, ...], tuple[float, ...]]
+"""Lower and upper limits."""
+MOVING = 0.3
+"""Speed [m/s] above which a repeated observation is that of a sensor that froze."""
+SLOWING = 0.8
+"""Speed [m/s] by which a lost vehicle's reference is below its speed: braking."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Conditions:
+    """Where a certificate applies; None: no limit.
+
+    Attributes:
+        env: box of e.
+        state: box of ξ.
+        road: box of (κ, v_ref).
+    """
+
+    env: Box | None = None
+    state: Box | None = None
+    road: Box | None = None
+
+    def nearest(self, env: Environment) -> Environment:
+        """Return e, clipped to its box."""
+        return env if self.env is None else jnp.clip(env, *map(jnp.asarray, self.env))
+
+    def hold(self, xi: PathState, road: Float[Array, " 2"]) -> Bool[Array, ""]:
+        """Whether ξ, κ and v_ref are inside; False for NaN."""
+        inside = is_valid(xi[LATERAL], road[0])
+        for box, point in ((self.state, xi), (self.road, road)):
+            if box is not None:
+                low, high = map(jnp.asarray, box)
+                inside &= jnp.all((low <= point) & (point <= high))
+        return inside
+
+
+ANYWHERE = Conditions()
+"""No limits."""
+
+
+class GateState(NamedTuple):
+    """What the gate carries from one control step to the next.
+
+    Attributes:
+        inner: state of the wrapped controller.
+        expected: ξ predicted for this step; NaN before the first measurement.
+        modelled: whether the model predicted it, inside the conditions.
+        missing: number of steps since a coordinate was last used.
+        doubt: number of steps until the certificate may be claimed again, after a
+            measurement was believed that nothing explains.
+        env: the last finite environment.
+        road: κ [1/m] and v_ref [m/s] over the next steps of the last finite reference;
+            NaN before the first one.
+    """
+
+    inner: Any
+    expected: PathState
+    modelled: Bool[Array, ""]
+    missing: Int[Array, " coordinate"]
+    doubt: Int[Array, ""]
+    env: Environment
+    road: Float[Array, "preview 2"]
+
+
+@dataclass(frozen=True, kw_only=True)
+class Gate:
+    """A controller along a path that follows plausible measurements only.
+
+        ξ⁻ = F(ξ̂; u − law(ξ̂), κ, v_ref, e),   |ξ_i − ξ⁻_i| ≤ limit_i
+        ξ̂ = ξ⁻ + L (ξ − ξ⁻) where ξ_i passes, else ξ⁻
+
+    A coordinate that does not pass, is not finite, or belongs to an observation that
+    repeats the last one bit for bit while the vehicle moves, is replaced by ξ⁻: the
+    vehicle drives on its nominal model, with the other coordinates measured. After
+    `patience` a finite measurement is believed, whatever it says, and the certificate
+    is not claimed for a `trial`; without one the reference speed falls, and the vehicle
+    stops. Outside the conditions ξ⁻ is a point that keeps its heading and speed, and
+    the limits are what a vehicle can reach.
+
+    An environment or reference that is not finite is replaced by the last one, and by
+    the middle of the box of e before the first; the road moves on with every step.
+
+    `info` gains `measured` (coordinate,), `dead_reckoning` (a coordinate is not
+    measured), `innovation` ξ − ξ⁻ (coordinate,; NaN without comparison), `path_state`
+    (ξ where it is measured, else NaN) and `trusted` (the last call was one period ago,
+    e and reference are finite, and there is no trial). `healthy` is False unless all
+    of it is measured and trusted.
+
+    Attributes:
+        inner: controller along a path.
+        model: of the closed loop, with `along_path`.
+        law: around which the model was learned.
+        dt: sampling period [s].
+        conditions: where the model predicts.
+        horizon: number of steps of the preview.
+        reads_env: whether `inner` reads the environment that it is given.
+        patience: longest time on the nominal model [s].
+        trial: time without a claim after an implausible measurement was believed [s].
+        share: of the half widths of the box of ξ that one step may be off.
+        gain: L of the estimate from which the next step is predicted.
+        growth: of the limits per step without a measurement.
+    """
+
+    inner: Controller
+    model: Model
+    law: PathLaw
+    dt: Positive
+    horizon: AtLeastOne
+    conditions: Conditions = ANYWHERE
+    reads_env: bool = True
+    patience: Positive = 2.0
+    trial: Positive = 10.0
+    share: Positive = 0.7
+    gain: Fraction = 0.4
+    growth: Positive = 0.1
+
+    def __post_init__(self) -> None:
+        check_intervals(self)
+
+    def controller(self) -> Controller:
+        """Return the controller along a path."""
+        return Controller(self.init, self.act)
+
+    def init(self, key: Key) -> GateState:
+        """Return the state before the first control step."""
+        size, box = self.law.gain.shape[-1], self.conditions.env
+        unknown = jnp.full(self.law.low.shape[0] - 2, jnp.nan, dtype=float)
+        middle = unknown if box is None else 0.5 * jnp.sum(jnp.asarray(box), axis=0)
+        return GateState(
+            inner=self.inner.init(key),
+            expected=jnp.full(size, jnp.nan, dtype=float),
+            modelled=jnp.asarray(False),
+            missing=jnp.zeros(size, jnp.int32),
+            doubt=jnp.zeros((), jnp.int32),
+            env=middle,
+            road=jnp.full((self.horizon, 2), jnp.nan, dtype=float),
+        )
+
+    def act(
+        self,
+        params: Params,
+        state: GateState,
+        coordinates: PathState,
+        env: Environment,
+        preview: Preview,
+    ) -> tuple[Control, GateState, ControllerInfo]:
+        """Take one control step."""
+        readable = all_finite(preview.road)
+        moved_on = jnp.concatenate([state.road[1:], state.road[-1:]])
+        road = jnp.where(readable, preview.road, moved_on)
+        env_known = all_finite(env) | (not self.reads_env)
+        known = jnp.where(all_finite(env), env, state.env)
+        periods = _elapsed(state.inner)
+        on_time = jnp.abs(periods - 1.0) < 1e-3
+
+        expected, compared = state.expected, all_finite(state.expected)
+        innovation = _difference(coordinates, expected)
+        limit = self._limit(state, expected, periods)
+        stale = preview.repeated & (jnp.abs(expected[PATH_SPEED]) > MOVING)
+        usable = jnp.isfinite(coordinates) & readable & ~stale
+        plausible = jnp.abs(innovation) <= limit
+        # What stays implausible for so long is true: the prediction was wrong.
+        late = state.missing >= round(self.patience / self.dt)
+        measured = usable & (plausible | late | ~compared)
+        # Either it or all that was believed before is wrong, and nothing says which.
+        forced = compared & jnp.any(measured & ~plausible)
+        doubt = jnp.where(forced, round(self.trial / self.dt), state.doubt)
+        trusted = preview.trusted & on_time & (doubt == 0) & readable & env_known
+        missing = jnp.where(measured, 0, state.missing + 1)
+        xi = jnp.where(measured, coordinates, expected)
+        # Nothing to believe and nothing to rely on: stop.
+        lost = jnp.any(missing > round(self.patience / self.dt))
+        slower = jnp.minimum(road[:, 1], jnp.maximum(xi[PATH_SPEED] - SLOWING, 0.0))
+        road = jnp.where(lost, road.at[:, 1].set(slower), road)
+
+        seen = preview._replace(
+            road=road, measured=measured, on_time=on_time, trusted=trusted
+        )
+        control, inner, info = self.inner.act(params, state.inner, xi, known, seen)
+
+        # A believed outlier starts anew; noise is averaged.
+        estimate = expected + self.gain * innovation
+        estimate = jnp.where(measured & compared & plausible, estimate, xi)
+        acting = info.get("env_estimate", known)
+        ahead, modelled = self._predict(params, estimate, control, road[0], acting)
+        clean = jnp.all(measured) & trusted
+        report: Any = {
+            **info,
+            "healthy": info.get("healthy", True) & clean,
+            "measured": measured,
+            "dead_reckoning": compared & ~jnp.all(measured),
+            "innovation": jnp.where(measured, innovation, jnp.nan),
+            "path_state": jnp.where(measured, coordinates, jnp.nan),
+            "trusted": trusted,
+            "env_inside": info.get("env_inside", True) & env_known,
+        }
+        after = GateState(
+            inner, ahead, modelled, missing, jnp.maximum(doubt - 1, 0), known, road
+        )
+        return control, after, report
+
+    def _limit(
+        self, state: GateState, expected: PathState, periods: Scalar
+    ) -> Float[Array, " coordinate"]:
+        """The largest difference that one step explains, entry by entry."""
+        # What a vehicle can reach in a step without knowing its model: sideways what
+        # it drives, and more than any tyre turns, accelerates and slides.
+        speed = jnp.abs(expected[PATH_SPEED])
+        wide = jnp.full(expected.shape, jnp.inf, dtype=float)
+        wide = wide.at[LATERAL].set(1.3 * speed * self.dt + 0.2)
+        wide = wide.at[HEADING].set(0.35).at[PATH_SPEED].set(1.5)
+        limit = wide * jnp.maximum(periods, 1.0)
+        if self.conditions.state is not None:
+            low, high = map(jnp.asarray, self.conditions.state)
+            tight = 0.5 * self.share * (high - low)
+            inside = state.modelled & (jnp.abs(periods - 1.0) < 1e-3)
+            limit = jnp.where(inside, jnp.minimum(tight, wide), limit)
+        return limit * (1.0 + self.growth * state.missing)
+
+    def _predict(
+        self,
+        params: Params,
+        xi: PathState,
+        control: Control,
+        road: Float[Array, " 2"],
+        env: Environment,
+    ) -> tuple[PathState, Bool[Array, ""]]:
+        """ξ one step later, and whether it is the model that says so."""
+        model = self.model
+        nearest = self.conditions.nearest(env)
+        fiber = model.fiber(fold(model, params), nearest)
+        nu = control - self.law(xi, road[0], road[1], nearest)
+        latent = model.encode(fiber, path_state(xi))
+        after = model.step(fiber, latent, jnp.concatenate([nu, road]))
+        ahead = model.decode(fiber, after)[BODY]
+        inside = self.conditions.hold(xi, road) & all_finite(ahead)
+        sideways = self.dt * xi[PATH_SPEED] * jnp.sin(xi[HEADING])
+        return jnp.where(inside, ahead, xi.at[LATERAL].add(sideways)), inside
+
+
+def _difference(xi: PathState, other: PathState) -> PathState:
+    """ξ − ξ', the heading wrapped."""
+    gap = xi - other
+    return gap.at[HEADING].set(wrap_angle(gap[HEADING]))
+
+
+def _elapsed(state: Any) -> Scalar:
+    """Periods since the last call, from the state of the planner inside."""
+    while hasattr(state, "inner"):
+        state = state.inner
+    # Only a planner of this package has a clock; others are called every period.
+    elapsed = state.tuning.elapsed if hasattr(state, "tuning") else jnp.ones(())
+    return jnp.where(jnp.isnan(elapsed), 1.0, elapsed)
