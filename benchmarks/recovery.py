@@ -22,7 +22,7 @@ import numpy as np
 
 import sfkd_jax
 from benchmarks import device
-from sfkd_jax import build, control, geometry, plants, scenarios
+from sfkd_jax import control, geometry, plants, scenarios
 from sfkd_jax.evaluation.metrics import LANE_HALF_WIDTH, VEHICLE_HALF_WIDTH
 from sfkd_jax.geometry import LATERAL, wrap_angle
 from sfkd_jax.types import Controller
@@ -152,8 +152,9 @@ class Car:
         plant, law = self.loaded.vehicle, self.loaded.law
         planner = request(law, plant.control_low, plant.control_high, now)
         if guard:
-            around = self.loaded.model, plant, law, self.loaded.certificate
-            planner = build.in_corridor(planner, *around)
+            # The guard is made of numbers, also while a program is traced.
+            with jax.ensure_compile_time_eval():
+                return self.loaded.guard(planner, along_path=True)
         return control.along_reference(planner, coordinates=law.gain.shape[-1])
 
     def program(self, make):
@@ -347,7 +348,7 @@ def returned(made, runs):
     return {
         "runs": len(settled),
         "back": int(settled.sum()),
-        "median_s": shown(np.median(times[settled]), 1),
+        "median_s": shown(np.median(times[settled]), 1) if settled.any() else None,
         "worst_s": shown(np.max(times[settled], initial=0.0), 1),
         "slowest" if settled.all() else "failed": worst,
     }
@@ -559,8 +560,8 @@ def table_rows(car, most):
         found["rmse_mm"] = shown(1e3 * np.sqrt(np.mean(made["left"][:, 20:] ** 2)), 2)
         flagged = ~made["healthy"]
         found["runs_not_healthy"] = int(flagged.any(axis=1).sum())
-        when = np.where(flagged.any(axis=1), np.argmax(flagged, axis=1), np.nan)
-        found["flagged_s"] = shown(PERIOD * np.nanmedian(when), 1)
+        when = PERIOD * np.argmax(flagged, axis=1)[flagged.any(axis=1)]
+        found["flagged_s"] = shown(np.median(when), 1) if len(when) else None
         # A flag is raised where it differs from what it usually is.
         raised = {
             name: (flag != (flag.mean() > 0.5))[:, 1:].any(axis=1).sum()
