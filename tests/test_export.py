@@ -325,6 +325,22 @@ def test_arguments_of_the_wrong_shape_are_named(exported):
         controller.act(state, observations[0, :3], envs[0], reference)
     with pytest.raises(ValueError, match=r"reference must have shape \(5, 4\)"):
         controller.act(state, observations[0], envs[0], reference[:-1])
+    # On Earth it drives as at home if it is told in float64, and says so if not.
+    far, home = np.asarray([2048.0 * 250, 2048.0 * 2200]), (observations[0], reference)
+    there = [np.float64(one) + np.append(far, [0.0, 0.0]) for one in home]
+    near, _, _ = controller.act(state, home[0], envs[0], home[1])
+    away, _, info = controller.act(state, there[0], envs[0], there[1], elapsed=1)
+    np.testing.assert_array_equal(away, near)
+    assert info["healthy"]
+    assert np.abs(info["predicted_states"][:, :2] - far).max() < 100.0
+    rounded = [one.astype(np.float32) for one in there]
+    assert not controller.act(state, rounded[0], envs[0], rounded[1])[2]["healthy"]
+    (elapsed,) = (name for name in state if name.endswith("tuning.elapsed"))
+    late = state | {elapsed: np.float32(2.5)}
+    for one, options in ((state, {"elapsed": 2.5}), (late, {})):
+        after = controller.act(one, home[0], envs[0], home[1], **options)[1]
+        assert float(after[elapsed]) == 1.0
+        assert np.any(np.asarray(after[elapsed.replace("tuning.elapsed", "plan")]))
     with pytest.raises(ValueError, match="state must be"):
         controller.act(
             dict(list(state.items())[1:]), observations[0], envs[0], reference

@@ -2,6 +2,7 @@
 words about the right cause.
 """
 
+import pickle
 from functools import cache, partial
 
 import jax
@@ -10,6 +11,7 @@ import numpy as np
 import pytest
 from helpers import straight
 
+import sfkd_jax
 from sfkd_jax import control, demo, models, plants, policy
 from sfkd_jax.certification import Certificate, verify
 from sfkd_jax.types import Controller
@@ -179,3 +181,67 @@ def test_a_guard_needs_a_corridor_and_a_control_of_the_vehicle():
             same = jax.eval_shape(guarded.init, KEY)
             assert jax.tree.structure(state) == jax.tree.structure(same)
             assert info["predicted_states"].shape == (20, 4)
+
+
+@pytest.mark.parametrize("vehicle", ["kinematic", "kinematic_path"])
+def test_a_policy_drives_on_earth_as_it_does_at_the_origin(vehicle):
+    """On a road of any yaw, told in float64; in float32 alone it says that it cannot."""
+    trained = load(vehicle)
+    act, step = jax.jit(trained.controller.act), jax.jit(trained.vehicle.step)
+
+    def drive(far, yaw, convert):
+        turn = np.asarray([[np.cos(yaw), np.sin(yaw)], [-np.sin(yaw), np.cos(yaw)]])
+
+        def away(points):
+            points = np.asarray(points, np.float64)
+            turned = points[..., :2] @ turn + far
+            return np.concatenate([turned, points[..., 2:3] + yaw, points[..., 3:]], -1)
+
+        x, state, errors = (
+            start(vehicle).at[1].set(0.5),
+            trained.controller.init(KEY),
+            [],
+        )
+        for k in range(25):
+            ahead = np.add(straight(20), [float(k), 0.0, 0.0, 0.0])
+            seen, ahead, _ = convert(away(x), away(ahead))
+            u, state, info = act(trained.params, state, seen, ENV, ahead)
+            x = step(x, u, ENV)
+            errors.append(float(x[1]))
+        assert bool(info["precision"]) == bool(info["healthy"])
+        return np.sqrt(np.mean(np.square(errors))), bool(info["precision"])
+
+    home, _ = drive(np.zeros(2), 0.0, sfkd_jax.relative)
+    utm = np.asarray([500000.13, 4500000.23])
+    there, precise = drive(utm, 0.7, sfkd_jax.relative)
+    assert precise
+    assert there <= 1.01 * home
+    assert not drive(utm, 0.7, lambda *places: (*places, None))[1]
+
+
+def test_positions_are_relative_before_the_cast_and_reported_in_the_world():
+    trained = load("kinematic_path")
+
+    def act(params, state, observation, env, reference):
+        info = {"predicted_states": jnp.tile(observation, (2, 1))}
+        return reference[0, :2] - observation[:2], state, info
+
+    echo = policy._entrance(Controller(lambda key: key, act), trained)
+    near = np.float64(straight(20))
+    far = np.add(near, [5e5 + 0.13, 4.5e6, 0.0, 0.0])
+    expected = near[0, :2] - near[1, :2]
+    ahead, _, info = echo.act({}, (), far[1], ENV, far)
+    np.testing.assert_allclose(ahead, expected, atol=1e-4)
+    np.testing.assert_allclose(info["predicted_states"][0], far[1], atol=1e-4)
+    with jax.enable_x64(True):
+        ahead, _, info = jax.jit(echo.act)({}, (), far[1], ENV, far)
+        np.testing.assert_allclose(ahead, expected, atol=1e-4)
+        np.testing.assert_allclose(info["predicted_states"][0], far[1], atol=1e-4)
+    # A reference that is not finite moves nothing; near the origin nothing changes.
+    assert not sfkd_jax.relative(far[1], np.nan * far)[2].any()
+    kept = sfkd_jax.relative(near[1], near)
+    np.testing.assert_array_equal(kept[1], near)
+    with jax.debug_nans(True), pytest.raises(ValueError, match="jax_debug_nans"):
+        echo.init(KEY)
+    with pytest.raises(TypeError, match="load it in that process"):
+        pickle.dumps(trained)

@@ -107,6 +107,10 @@ class Policy(TrainedModel):
         )
         return _entrance(guarded, self)
 
+    def __reduce__(self) -> Any:
+        """Refuse to be pickled; functions of a closure say less clearly why."""
+        raise TypeError("a Policy cannot be pickled: sfkd_jax.load it in that process")
+
     @property
     def weights(self) -> Params:
         """The learned parameters as they were saved, to train on or to save again."""

@@ -76,6 +76,8 @@ def test_an_image_shows_the_car_and_changes_as_it_drives():
     with pytest.raises(gymnasium.error.ResetNeeded):
         env.unwrapped.step(ACTION)
     env.reset(seed=0)
+    with pytest.raises(ValueError, match=r"action must have shape \(2,\), got \(1,\)"):
+        env.unwrapped.step(ACTION[:1])
     first = env.render()
     for _ in range(5):
         env.step(ACTION)
@@ -88,7 +90,11 @@ def test_an_image_shows_the_car_and_changes_as_it_drives():
     check_env(env.unwrapped)
 
 
-def test_it_refuses_bad_settings():
+def test_it_refuses_bad_settings_and_a_forked_process(monkeypatch):
+    inside = adapters.GymnasiumVehicle(**SETTINGS)
+    monkeypatch.setattr("os.getpid", lambda: 0)
+    with pytest.raises(RuntimeError, match=r'vector_kwargs=\{"context": "spawn"\}'):
+        inside.reset(seed=0)
     with pytest.raises(ValueError, match="unknown scenario 's9'; choose one of"):
         gymnasium.make("sfkd_jax/Vehicle-v0", scenario="s9")
     with pytest.raises(ValueError, match="render_mode must be one of human, rgb_array"):

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from typing import Any
 
 import gymnasium
@@ -13,6 +14,8 @@ from sfkd_jax.adapters._task import DrivingTask, Moment
 from sfkd_jax.scenarios import Scenario, point_at
 
 NAME = "sfkd_jax/Vehicle-v0"
+PROCESS = os.getpid()
+"""That imported this file, and started jax; a forked one inherits the number."""
 MODES = ("human", "rgb_array")
 SIZE, DPI = (6.4, 4.8), 100
 """Of the image [inch], pixels an inch."""
@@ -69,6 +72,12 @@ class GymnasiumVehicle(gymnasium.Env):
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
     ) -> tuple[np.ndarray, dict[str, Any]]:
         """Start an episode on a new road; there are no options."""
+        # Not in __init__: gymnasium passes on what a worker raises from here on.
+        if os.getpid() != PROCESS:
+            raise RuntimeError(
+                "jax hangs in a forked process: pass "
+                'vector_kwargs={"context": "spawn"} to gymnasium.make_vec'
+            )
         super().reset(seed=seed, options=options)
         # gymnasium's generator decides, as its contract on seeds asks for.
         seed = int(self.np_random.integers(2**31))

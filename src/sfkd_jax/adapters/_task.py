@@ -178,6 +178,9 @@ class DrivingTask:
     def control(self, action: Control) -> Control:
         """Return an action in [-1, 1] in physical units, clipped to the limits."""
         low, high = map(jnp.asarray, (self.plant.control_low, self.plant.control_high))
+        # A single number would be broadcast to steering and drive.
+        if action.shape != low.shape:
+            raise ValueError(f"action must have shape {low.shape}, got {action.shape}")
         return low + (high - low) * 0.5 * (jnp.clip(action, -1.0, 1.0) + 1.0)
 
     def action(self, control: Control) -> Control:

@@ -31,6 +31,8 @@ import numpy as np
 
 FORMAT = 2
 """Version of controller.json that this file reads."""
+CELL = 2048.0
+"""Spacing of the origins that positions are made relative to [m]."""
 MAX_BYTES = 1 << 24
 """Size of controller.json, which has about 20 kB."""
 MALFORMED = (
@@ -88,18 +90,25 @@ class ExportedController:
         return self._named("init", "state", self._init(self._key(seed)))
 
     def act(
-        self, state: dict[str, jax.Array], observation: Any, env: Any, reference: Any
-    ) -> tuple[jax.Array, dict[str, jax.Array], dict[str, jax.Array]]:
+        self,
+        state: dict[str, jax.Array],
+        observation: Any,
+        env: Any,
+        reference: Any,
+        *,
+        elapsed: float | None = None,
+    ) -> tuple[jax.Array, dict[str, jax.Array], dict[str, Any]]:
         """Return (control, next state, info) of one control step.
 
         Values that are not finite are passed on; the controller then continues its last
-        plan, and `info` reports it.
+        plan, and `info` reports it. Positions on Earth must be float64.
 
         Args:
             state: from `init` or the previous step.
             observation: (p_x [m], p_y [m], yaw [rad], v [m/s], …).
             env: (friction [-], lateral wind [m/s]).
             reference: (horizon, 4): x, y, yaw, speed at the next steps.
+            elapsed: sampling periods since the last call; None for one.
 
         Raises:
             ValueError: an argument of the wrong shape, or a state of another
@@ -107,7 +116,7 @@ class ExportedController:
         """
         measured = {"observation": observation, "env": env, "reference": reference}
         given = {f"state.{name}": value for name, value in state.items()} | {
-            name: np.asarray(value, np.float32) for name, value in measured.items()
+            name: np.asarray(value) for name, value in measured.items()
         }
         expected = self.manifest["programs"]["act"]["inputs"]
         # By name and order: two states may have the same shapes.
@@ -121,8 +130,24 @@ class ExportedController:
                     f"{leaf['name']} must have shape {tuple(leaf['shape'])}, "
                     f"got {value.shape}"
                 )
+        places = [given[name] for name in ("observation", "reference")]
+        origin = np.zeros(2)
+        # As `sfkd_jax.relative`: before the cast, and never of what was float32 before.
+        if min(place.dtype.itemsize for place in places) == 8:
+            near = np.nan_to_num(places[1][0, :2], posinf=0.0, neginf=0.0)
+            origin = CELL * np.round(near / CELL)
+            given["observation"], given["reference"] = (
+                _shifted(place, -origin) for place in places
+            )
+        for name in given:
+            if name in measured:
+                given[name] = given[name].astype(np.float32)
+            elif name.endswith("tuning.elapsed") and elapsed is not None:
+                given[name] = np.float32(elapsed)
         values = self._act(*given.values())
         state, info = (self._named("act", root, values) for root in ("state", "info"))
+        if origin.any():
+            info["predicted_states"] = _shifted(info["predicted_states"], origin)
         return values[0], state, info
 
     def _key(self, seed: int) -> jax.Array:
@@ -138,6 +163,13 @@ class ExportedController:
             for name, value in zip(names, values, strict=True)
             if name.startswith(f"{root}.")
         }
+
+
+def _shifted(states: Any, by: np.ndarray) -> np.ndarray:
+    """Return states at positions moved `by`, in float64."""
+    moved = np.array(states, np.float64)
+    moved[..., :2] += by
+    return moved
 
 
 def _manifest(path: Path) -> dict[str, Any]:
