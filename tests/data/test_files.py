@@ -85,11 +85,7 @@ def test_a_run_comes_back_to_the_last_bit(tmp_path, kind):
 
 def test_whole_runs_as_x_u_e_come_back_to_the_last_bit(tmp_path):
     runs = [recorded_run(seconds=1.0, phase=0.3 * k) for k in range(12)]
-    x, u, e = (
-        np.stack([np.column_stack([one[name] for name in names])[:end] for one in runs])
-        for names, end in ((STATE, None), (NAMES[5:7], -1), (NAMES[7:], -1))
-    )
-    np.savez(tmp_path / "a.npz", x=x, u=u, e=e)
+    stacked(runs, tmp_path)
     wanted = [np.concatenate(parts) for parts in zip(*map(expected, runs), strict=True)]
     logged, lines = read(tmp_path / "a.npz")
     assert same_segments(together(logged.dataset), wanted)
@@ -439,6 +435,57 @@ def test_contents_decide_which_data_set_it_is(tmp_path):
     assert first == moved != datasets.fingerprint(str(tmp_path / "here"))
     write_csv(tmp_path / "there" / "twice.csv", recorded_run())
     assert "twice.csv: the same contents as" in refusal(tmp_path / "there")
+
+
+def elsewhere(columns):
+    """The same numbers by another clock, from another origin."""
+    shifts = {"t": 500.0, "p_x": 3e5, "p_y": 5e6, "yaw": 0.0}
+    return columns | {name: columns[name] + by for name, by in shifts.items()}
+
+
+def overlapping(columns):
+    longer = recorded_run(seconds=60.0)
+    return elsewhere({name: longer[name][250:] for name in NAMES})
+
+
+def stacked(runs, folder):
+    x, u, e = (
+        np.stack([np.column_stack([one[n] for n in names])[:end] for one in runs])
+        for names, end in ((STATE, None), (NAMES[5:7], -1), (NAMES[7:], -1))
+    )
+    return write_npz(folder / "a.npz", {"x": x, "u": u, "e": e})
+
+
+COPIES = {
+    "text": ("a.csv, lines 2 to 302", "b.csv, lines 2 to 302"),
+    "npz": ("a.csv, lines 2 to 302", "b.npz, rows 0 to 300"),
+    "part": ("a.csv, lines 252 to 302", "b.npz, rows 0 to 50"),
+    "labels": ("run 0, lines 2 to 302", "run 2, lines 604 to 904"),
+    "stacked": ("run 0, rows 0 to 300", "run 2, rows 0 to 300"),
+}
+
+
+@pytest.mark.parametrize("how", COPIES)
+def test_the_same_run_twice_is_found_by_its_numbers(tmp_path, how):
+    columns, other, options = recorded_run(), recorded_run(phase=0.4), {}
+    if how == "stacked":
+        stacked([columns, other, elsewhere(columns)], tmp_path)
+    elif how == "labels":
+        parts = [columns, other, elsewhere(columns)]
+        joined = {n: np.concatenate([part[n] for part in parts]) for n in columns}
+        write_csv(tmp_path / "a.csv", joined | {"run": np.repeat(np.arange(3), 301)})
+        options = {"columns": Columns(run="run")}
+    else:
+        write_csv(tmp_path / "a.csv", columns)
+        text = (tmp_path / "a.csv").read_text().replace("\n", "\r\n")
+        if how == "text":
+            (tmp_path / "b.csv").write_text(text)
+        else:
+            copy = elsewhere(columns) if how == "npz" else overlapping(columns)
+            write_npz(tmp_path / "b.npz", copy)
+    line = refusal(tmp_path, **options)
+    assert all(part in line for part in COPIES[how]), line
+    assert ": the same numbers as " in line
 
 
 @pytest.mark.parametrize(

@@ -11,7 +11,8 @@ from typing import Any, NamedTuple
 
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float, Int
+from jaxtyping import Array, Float, Int, Shaped
+from numpy.lib.stride_tricks import sliding_window_view
 
 from sfkd_jax.data._checks import Bounds, Checks, Finding
 from sfkd_jax.data._dataset import PARTS, Dataset, assign_parts, coverage
@@ -25,6 +26,10 @@ UNBOUNDED = 1e6
 """Half width of E where nobody measured the environment and no model reads it."""
 MOST_LINES = 20
 """Warnings that are reported in full; of more, only their number."""
+ALIKE = 1e-3
+"""Of a channel's standard deviation: to this step numbers are rounded and compared."""
+IN_A_ROW = 10
+"""Steps that are compared at once: single ones are alike by chance."""
 SAME_MOMENT = 1e-5
 """Rows within this share of a period of a moment are taken without interpolation."""
 
@@ -116,6 +121,7 @@ def from_logs(
     cuts = (gap, min_speed, split_at_jumps, drop)
     checks = Checks(columns, dt, steps, wheelbase, *cuts, limits, box)
     logs, findings = checks.apply(recorded)
+    findings += _repeats(logs, steps * dt)
     _report_findings([*map(Finding, errors), *findings], report)
     cut, runs = _segments([list(_pieces(log, dt, gap)) for log in logs], steps)
     parts, whole = assign_parts(runs, shares=shares, seed=seed)
@@ -159,6 +165,55 @@ def from_logs(
     for line in _coverage_lines(covered):
         report(line)
     return LoggedDataset(dataset, covered)
+
+
+def _repeats(logs: list[Log], shortest: float) -> Iterator[Finding]:
+    """Stretches that two runs have in common, from a length in seconds on.
+
+    Their numbers are compared: a copy may have another format, clock and origin.
+    """
+    if not logs:
+        return
+    spread = np.std(np.concatenate([log.steps for log in logs]), axis=0)
+    scale = ALIKE * np.where(spread > 0.0, spread, 1.0)
+    found = [_marks(log, scale) for log in logs]
+    marks, rows = (np.concatenate(part) for part in zip(*found, strict=True))
+    owners = np.repeat(np.arange(len(logs)), [len(one) for one, _ in found])
+    _, first, group = np.unique(marks, return_index=True, return_inverse=True)
+    origins = first[group]
+    pairs = np.column_stack([owners[origins], owners])
+    for one, other in np.unique(pairs[pairs[:, 0] != pairs[:, 1]], axis=0):
+        copies = np.flatnonzero((pairs == (one, other)).all(axis=1))
+        if (len(copies) + IN_A_ROW) * logs[other].period < shortest:
+            continue
+        here, there = (
+            log.between(int(places.min()), int(places.max()) + IN_A_ROW)
+            for log, places in (
+                (logs[other], rows[copies]),
+                (logs[one], rows[origins[copies]]),
+            )
+        )
+        yield Finding(
+            f"{here}: the same numbers as {there}; remove one of them, "
+            "or test runs are trained on"
+        )
+
+
+def _marks(
+    log: Log, scale: Float[np.ndarray, " channel"]
+) -> tuple[Shaped[np.ndarray, " mark"], Int[np.ndarray, " mark"]]:
+    """A hash of every few steps that vary, and the row at which they begin."""
+    words = np.rint(log.steps / scale).astype(np.int64).view(np.uint64)
+    if len(words) < IN_A_ROW:
+        return np.zeros(0, np.uint64), np.zeros(0, int)
+    random = np.random.default_rng(0)
+    weights = random.integers(1, 1 << 63, (len(scale), IN_A_ROW), dtype=np.uint64)
+    # Where nothing changes, as at standstill, all runs are alike.
+    varied = np.append(False, np.any(words[1:] != words[:-1], axis=1))
+    kept = sliding_window_view(varied, IN_A_ROW).sum(axis=-1) >= IN_A_ROW // 2
+    kept &= sliding_window_view(log.joined, IN_A_ROW).all(axis=-1)
+    several = sliding_window_view(words, IN_A_ROW, axis=0)
+    return np.einsum("kcs,cs->k", several, weights)[kept], np.flatnonzero(kept)
 
 
 def _report_findings(findings: list[Finding], report: Callable[[str], None]) -> None:

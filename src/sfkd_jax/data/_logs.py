@@ -79,10 +79,28 @@ class Log:
         """Return the position of a row, for messages."""
         return f"{self.source}, {self.row_name} {self.rows[index]}"
 
+    def between(self, first: int, last: int) -> str:
+        """Return the position of several rows, for messages."""
+        rows = self.rows[first], self.rows[last]
+        return f"{self.source}, {self.row_name}s {rows[0]} to {rows[1]}"
+
     @property
     def whole(self) -> str:
         """The position of the run, for messages."""
-        return f"{self.source}, {self.row_name}s {self.rows[0]} to {self.rows[-1]}"
+        return self.between(0, -1)
+
+    @property
+    def steps(self) -> Float[np.ndarray, "step channel"]:
+        """Motion in the frame of every row, and what the row holds beside its pose.
+
+        A copy keeps it, wherever and whenever it begins.
+        """
+        yaw, (x, y) = self.states[:-1, 2], np.diff(self.states[:, :2], axis=0).T
+        ahead = np.cos(yaw) * x + np.sin(yaw) * y
+        aside = np.cos(yaw) * y - np.sin(yaw) * x
+        turned = np.diff(np.unwrap(self.states[:, 2]))
+        held = np.column_stack([self.states[:, 3:], self.controls, self.envs])[:-1]
+        return np.column_stack([ahead, aside, turned, held])
 
     @cached_property
     def joined(self) -> Bool[np.ndarray, " step"]:
